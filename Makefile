@@ -1,0 +1,38 @@
+# Everything runs in .venv, which the first target makes; the system Python is only needed for that.
+PYTHON ?= python3
+BIN := .venv/bin
+READY := .venv/.ready
+OCLGRIND := /usr/lib/x86_64-linux-gnu/oclgrind/liboclgrind-rt-icd.so
+
+.PHONY: help setup demo test test-intel bench lint oclgrind clean
+
+help: ## print this list
+	@sed -n 's/^\([a-z-]*\):.*## \(.*\)/\1	\2/p' Makefile | expand -t 12
+
+setup: $(READY) ## make .venv with pp-cl in it, and see to a working OpenCL device
+
+$(READY): setup.cfg pyproject.toml tools/setup_venv.sh tools/setup_opencl.py
+	@tools/setup_venv.sh $(PYTHON)
+	@$(BIN)/python tools/setup_opencl.py
+	@touch $@
+
+demo: $(READY) ## train the demo scene into runs/demo and evaluate it: minutes on a CPU
+	$(BIN)/pp-cl train demo --preset tiny --out runs/demo
+	$(BIN)/pp-cl eval runs/demo --metrics
+
+test: $(READY) ## run the tests on the device of PP_DEVICE, else the default one
+	@$(BIN)/python -m pytest $(ARGS)
+
+test-intel: $(READY) ## the same on Intel's CPU runtime, installed into .venv if need be (x86-64)
+	@$(BIN)/python tools/setup_opencl.py --intel
+	@PP_DEVICE="Intel(R) OpenCL" $(BIN)/python -m pytest $(ARGS)
+
+bench: $(READY) ## measure time and error of every operation
+	$(BIN)/pp-cl bench $(ARGS)
+
+lint: $(READY) ## check the style of the Python files
+	@$(BIN)/ruff check
+
+clean: ## remove .venv and everything built; runs/ stays
+	rm -rf .venv build dist *.egg-info .pytest_cache .ruff_cache
+	find . -name __pycache__ -type d -prune -exec rm -rf {} +

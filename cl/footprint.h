@@ -1,0 +1,126 @@
+// Which pixels a point covers, how centrally, and at what depth: the one place that knows the three kinds of footprint.
+#ifndef PP_FOOTPRINT_H
+#define PP_FOOTPRINT_H
+
+#include "camera.h"
+
+#define DISC 0                   // hard disc of the paper: d = 1 everywhere
+#define SOFT 1                   // d falls linearly from the centre to the rim (ours)
+#define SPHERE 2                 // Pulsar's sphere: depth of its front, sub-pixel rule, any radius
+
+#ifndef FOOTPRINT
+#define FOOTPRINT SOFT
+#endif
+#ifndef RADIUS_IN_PIXELS
+#define RADIUS_IN_PIXELS 0       // 1: radii are pixels at the image's centre instead of world units
+#endif
+
+// Counting and filling must find the same hits: no compiler may round the two differently.
+#pragma OPENCL FP_CONTRACT OFF
+
+#define BLOCK_SIDE 4             // pixels are tested in blocks of 4 x 4, one lane each
+#define LANE_X (float16)(0, 1, 2, 3, 0, 1, 2, 3, 0, 1, 2, 3, 0, 1, 2, 3)
+#define LANE_Y (float16)(0, 0, 0, 0, 1, 1, 1, 1, 2, 2, 2, 2, 3, 3, 3, 3)
+#define LANE_BIT (int16)(1, 2, 4, 8, 16, 32, 64, 128, 256, 512, 1024, 2048, 4096, 8192, 16384, 32768)
+
+// Half the width of the smallest footprint, in pixels: a disc of this radius always reaches a pixel's centre, because the
+// farthest point of a pixel is sqrt(1/2) away (Pulsar: 1.5 half pixels).
+#define LEAST_RADIUS 0.75f
+
+typedef struct {
+    float3 centre;               // camera axes
+    float t;                     // its distance from the eye; < 0: the point is left out
+    float radius;                // world units
+    float least;                 // LEAST_RADIUS pixels at range t, world units
+    int tiny;                    // the radius is below one pixel
+} Footprint;
+
+// Width of a pixel at range t; the smaller focal length has the wider pixels.
+inline float pixel_width(const Camera *k, const float t) {
+    return t / fmin(k->fx, k->fy);
+}
+
+inline float world_radius(const Camera *k, const float radius, const float t) {
+    return RADIUS_IN_PIXELS ? radius * pixel_width(k, t) : radius;
+}
+
+inline Footprint footprint_load(const Camera *k, const float4 point, const float radius) {
+    Footprint f;
+    const float width = pixel_width(k, point.w);
+    f.centre = point.xyz;
+    f.t = point.w;
+    f.radius = world_radius(k, radius, point.w);
+    f.least = LEAST_RADIUS * width;
+    f.tiny = f.radius < width;
+    return f;
+}
+
+// Bounds of the slopes m = u/z of the tangents from the eye to a circle of this radius at (u, z): (m z - u)^2 = r^2 (1 + m^2).
+// Unbounded where the circle reaches the eye's plane.
+inline float2 tangent_slopes(const float u, const float z, const float radius) {
+    const float scale = z * z - radius * radius;
+    if (z <= radius) return (float2)(-INFINITY, INFINITY);
+    const float root = radius * sqrt(u * u + scale);
+    return (float2)(u * z - root, u * z + root) / scale;
+}
+
+// First and last pixel of an interval of one image axis, given in slopes; empty where last < first.
+inline int2 pixel_range(const float2 slopes, const float focal, const float centre, const int size) {
+    const float2 limits = slopes * focal + (centre - 0.5f);
+#if FOOTPRINT == SPHERE
+    const float first = floor(limits.x), last = ceil(limits.y);              // Pulsar's box, part of its hit rule
+#else
+    const float margin = 0.01f;                                              // pixels; far above the rounding of `limits`
+    const float first = ceil(limits.x - margin), last = floor(limits.y + margin);
+#endif
+    return (int2)((int)clamp(first, 0.0f, (float)size), (int)clamp(last, -1.0f, size - 1.0f));
+}
+
+// Pixels that may be hit: first x, first y, last x, last y, inside the image; empty where last < first.
+inline int4 footprint_box(const Camera *k, const Footprint *f) {
+    const float reach = FOOTPRINT == SPHERE ? f->radius : fmax(f->radius, f->least);
+    const int2 x = pixel_range(tangent_slopes(f->centre.x, f->centre.z, reach), k->fx, k->cx, k->width);
+    const int2 y = pixel_range(tangent_slopes(f->centre.y, f->centre.z, reach), k->fy, k->cy, k->height);
+    return (int4)(x.x, y.x, x.y, y.y);
+}
+
+// Tests the 4 x 4 pixels from (x, y) on that lie in the box: the result has bit 4 j + i set where pixel (x + i, y + j) is hit.
+inline uint footprint_block(const Camera *k, const Footprint *f, const int4 box, const int x, const int y,
+                            float16 *closeness, float16 *depth) {
+    const float16 px = LANE_X + (float)x, py = LANE_Y + (float)y;
+    const float16 mx = (px + (0.5f - k->cx)) / k->fx, my = (py + (0.5f - k->cy)) / k->fy;
+    const float16 inverse = 1.0f / sqrt(mx * mx + my * my + 1.0f);           // the unit ray is (mx, my, 1) * inverse
+    const float16 range = f->t * inverse;
+    const float16 ex = f->centre.x - range * mx, ey = f->centre.y - range * my, ez = f->centre.z - range;
+    const float16 rho2 = ex * ex + ey * ey + ez * ez;                        // |c - t r|^2; the expanded square would cancel
+    int16 hit = px <= (float)box.z && py <= (float)box.w;
+#if FOOTPRINT == DISC
+    // differs from Pulsar: its d falls off once the radius exceeds a pixel, and its depth is the front's, up to R nearer.
+    const float reach = fmax(f->radius, f->least);
+    hit = hit && rho2 < reach * reach;
+    *closeness = 1.0f;
+    *depth = f->t;
+#elif FOOTPRINT == SOFT
+    const float reach = fmax(f->radius, f->least);
+    hit = hit && rho2 < reach * reach;
+    *closeness = 1.0f - sqrt(rho2) / reach;
+    *depth = f->t;
+#else
+    const float16 rho = sqrt(rho2);
+    const int16 through = rho < f->least;
+    hit = hit && (rho <= f->radius || through);
+    *closeness = select(clamp(1.0f - rho / f->radius, 0.0f, 1.0f), (float16)(1.0f), through && f->tiny);
+    const float16 along = fmin((f->centre.x * mx + f->centre.y * my + f->centre.z) * inverse, f->t);
+    const float16 wx = f->centre.x - along * inverse * mx, wy = f->centre.y - along * inverse * my;
+    const float16 wz = f->centre.z - along * inverse;
+    const float16 w = sqrt(wx * wx + wy * wy + wz * wz);                     // distance of the centre from the ray
+    *depth = fmax(along - sqrt((f->radius + w) * fmax(f->radius - w, 0.0f)), 0.0f);
+#endif
+    const int16 bits = hit & LANE_BIT;
+    const int8 b8 = bits.lo | bits.hi;
+    const int4 b4 = b8.lo | b8.hi;
+    const int2 b2 = b4.lo | b4.hi;
+    return (uint)(b2.x | b2.y);
+}
+
+#endif

@@ -1,0 +1,15 @@
+// The regular grid of the points, read from one buffer of 8 floats; pp_cl/points.py writes it.
+#ifndef PP_GRID_H
+#define PP_GRID_H
+
+#define GRID_FLOATS 8            // origin x, y, z; edge; nx, ny, nz; 0
+
+// World position of grid vertex `id` = i + nx*(j + ny*k).
+inline float3 grid_position(global const float *grid, const uint id) {
+    const uint nx = (uint)grid[4], ny = (uint)grid[5];
+    const uint row = id / nx;
+    const float3 ijk = (float3)((float)(id - row * nx), (float)(row % ny), (float)(row / ny));
+    return (float3)(grid[0], grid[1], grid[2]) + grid[3] * ijk;
+}
+
+#endif

@@ -1,0 +1,131 @@
+// Pairs: every (point, pixel) hit. Those of one point lie together, in the order of the points; each pixel has a list of
+// keys (depth << 32 | pair), sorted by depth, then by pair and so by point.
+#include "common.h"
+#include "footprint.h"
+
+#define RUN 64                   // keys ranked at once by comparing all with all, 8 a step; longer lists are merged
+
+// One work-item per point: reads its camera position and radius, writes its number of hits, adds them to their pixels.
+kernel void pairs_count(
+    const uint n,                            // points
+    const uint k,                            // radii: 1 (all alike) or n
+    global const float *camera,              // (20) camera.h
+    global const float *point_radius,        // (K)
+    global const float4 *point_camera,       // (N, 4) x, y, z, t; t < 0: left out
+    global uint *point_count,                // (N)
+    global volatile uint *pixel_count)       // (HW) accumulates
+{
+    const uint i = get_global_id(0);
+    if (i >= n) return;
+    const float4 point = point_camera[i];
+    uint count = 0;
+    if (point.w >= 0.0f) {
+        const Camera view = camera_load(camera);
+        const Footprint f = footprint_load(&view, point, point_radius[k == 1 ? 0 : i]);
+        const int4 box = footprint_box(&view, &f);
+        for (int y = box.y; y <= box.w; y += BLOCK_SIDE)
+            for (int x = box.x; x <= box.z; x += BLOCK_SIDE) {
+                float16 closeness, depth;
+                uint hits = footprint_block(&view, &f, box, x, y, &closeness, &depth);
+                count += popcount(hits);
+                for (; hits; hits &= hits - 1) {
+                    const int lane = 31 - clz(hits & -hits);
+                    atomic_inc(&pixel_count[(y + lane / BLOCK_SIDE) * view.width + x + lane % BLOCK_SIDE]);
+                }
+            }
+    }
+    point_count[i] = count;
+}
+
+// One work-item per point: finds its hits again, writes its pairs and drops a key of each into its pixel's list, in any order.
+kernel void pairs_fill(
+    const uint n,                            // points
+    const uint k,                            // radii: 1 (all alike) or n
+    global const float *camera,              // (20) camera.h
+    global const float *point_radius,        // (K)
+    global const float4 *point_camera,       // (N, 4) x, y, z, t; t < 0: left out
+    global const uint *point_offset,         // (N+1) first pair of each point
+    global const uint *pixel_offset,         // (HW+1) first key of each pixel
+    global volatile uint *pixel_count,       // (HW) free places of each pixel's list; counted down to 0
+    global uint *pair_pixel,                 // (P)
+    global float *pair_closeness,            // (P) d in [0, 1]
+    global uint *point_from_pair,            // (P)
+    global ulong *pair_key)                  // (P) unsorted within a pixel
+{
+    const uint i = get_global_id(0);
+    if (i >= n) return;
+    uint pair = point_offset[i];
+    if (pair == point_offset[i + 1]) return;
+    const Camera view = camera_load(camera);
+    const Footprint f = footprint_load(&view, point_camera[i], point_radius[k == 1 ? 0 : i]);
+    const int4 box = footprint_box(&view, &f);
+    for (int y = box.y; y <= box.w; y += BLOCK_SIDE)
+        for (int x = box.x; x <= box.z; x += BLOCK_SIDE) {
+            float16 closeness, depth;
+            float lane_closeness[16], lane_depth[16];
+            uint hits = footprint_block(&view, &f, box, x, y, &closeness, &depth);
+            vstore16(closeness, 0, lane_closeness);
+            vstore16(depth, 0, lane_depth);
+            for (; hits; hits &= hits - 1, pair++) {
+                const int lane = 31 - clz(hits & -hits);
+                const uint pixel = (y + lane / BLOCK_SIDE) * view.width + x + lane % BLOCK_SIDE;
+                pair_pixel[pair] = pixel;
+                pair_closeness[pair] = lane_closeness[lane];
+                point_from_pair[pair] = i;
+                // bits of floats >= 0 sort like the floats
+                const uint place = pixel_offset[pixel] + atomic_dec(&pixel_count[pixel]) - 1;
+                pair_key[place] = upsample(as_uint(lane_depth[lane]), pair);
+            }
+        }
+}
+
+// Sorts `count` <= RUN keys into `sorted`, which may be the same memory: each key's place is the number of smaller keys.
+inline void sort_run(global const ulong *keys, const uint count, global ulong *sorted) {
+    ulong run[RUN];
+    for (uint i = 0; i < RUN; i++)
+        run[i] = i < count ? keys[i] : ULONG_MAX;
+    for (uint i = 0; i < count; i += 8) {
+        const ulong8 key = vload8(0, run + i);
+        long8 place = 0;
+        for (uint j = 0; j < count; j++)
+            place -= (ulong8)(run[j]) < key;                                 // a true lane is -1
+        long places[8];
+        vstore8(place, 0, places);
+        for (uint j = 0; j < min(8u, count - i); j++)
+            sorted[places[j]] = run[i + j];
+    }
+}
+
+// Merges two sorted neighbours, [0, middle) and [middle, count) of `keys`, into `merged`.
+inline void merge(global const ulong *keys, const uint middle, const uint count, global ulong *merged) {
+    uint a = 0, b = middle;
+    for (uint i = 0; i < count; i++) {
+        const int first = b >= count || (a < middle && keys[a] < keys[b]);
+        merged[i] = first ? keys[a++] : keys[b++];
+    }
+}
+
+// One work-item per pixel: reads its unsorted keys, writes them sorted; the unsorted ones are scratch.
+kernel void pairs_sort(
+    const uint hw,                           // pixels
+    global const uint *pixel_offset,         // (HW+1)
+    global ulong *unsorted_key,              // (P)
+    global ulong *pair_key)                  // (P)
+{
+    const uint q = get_global_id(0);
+    if (q >= hw) return;
+    const uint begin = pixel_offset[q], count = pixel_offset[q + 1] - begin;
+    global ulong *from = unsorted_key + begin, *to = pair_key + begin;
+    uint passes = 0;
+    for (uint width = RUN; width < count; width *= 2)
+        passes++;
+    if (passes % 2) to = from;               // so that the last pass ends in pair_key
+    for (uint first = 0; first < count; first += RUN)
+        sort_run(from + first, min((uint)RUN, count - first), to + first);
+    for (uint width = RUN; width < count; width *= 2) {
+        from = to;
+        to = from == pair_key + begin ? unsorted_key + begin : pair_key + begin;
+        for (uint first = 0; first < count; first += 2 * width)
+            merge(from + first, min(width, count - first), min(2 * width, count - first), to + first);
+    }
+}

@@ -1,0 +1,64 @@
+// Points to camera axes, and which of them are left out.
+#include "common.h"
+#include "camera.h"
+#include "grid.h"
+#include "footprint.h"
+
+// Written for a point that is left out.
+#define LEFT_OUT (float4)(0.0f, 0.0f, 0.0f, -1.0f)
+
+// Least cosine between a point's direction and the optical axis (Pulsar): nothing behind or beside the eye.
+#define LEAST_COSINE 1e-6f
+
+// A well mixed integer (lowbias32 by Chris Wellons).
+inline uint mix(uint x) {
+    x ^= x >> 16;
+    x *= 0x7feb352du;
+    x ^= x >> 15;
+    x *= 0x846ca68bu;
+    return x ^ (x >> 16);
+}
+
+// (x, y, z, t) in camera axes, or LEFT_OUT: too near, too far (both measured at the sphere's front, as Pulsar does), behind
+// the eye, or not finite, for which every comparison is false.
+inline float4 project(const Camera *k, const float3 position, const float radius) {
+    const float3 c = camera_from_world(k, position);
+    const float t = sqrt(c.x * c.x + c.y * c.y + c.z * c.z);
+    const float front = t - world_radius(k, radius, t);
+    const int kept = front >= k->near && front <= k->far && t > 0.0f && c.z >= LEAST_COSINE * t;
+    return kept ? (float4)(c, t) : LEFT_OUT;
+}
+
+// One work-item per point: reads its grid index, writes its camera-space position and distance.
+kernel void project_grid(
+    const uint n,                        // points
+    const float radius,                  // of every point
+    const uint dropout,                  // a point is left out where its random uint is below this
+    const uint seed,                     // of the random uints
+    global const float *camera,          // (20) camera.h
+    global const float *grid,            // (8) grid.h
+    global const uint *point_id,         // (N)
+    global float4 *point_camera)         // (N, 4) x, y, z, t; t = -1: left out
+{
+    const uint i = get_global_id(0);
+    if (i >= n) return;
+    const Camera k = camera_load(camera);
+    const uint id = point_id[i];
+    const float4 point = project(&k, grid_position(grid, id), radius);
+    point_camera[i] = mix(id + mix(seed)) >= dropout ? point : LEFT_OUT;
+}
+
+// One work-item per sphere: reads its position and radius, writes its camera-space position and distance.
+kernel void project_spheres(
+    const uint n,                        // spheres
+    const uint k,                        // radii: 1 (all alike) or n
+    global const float *camera,          // (20) camera.h
+    global const float *positions,       // (N, 3) world
+    global const float *point_radius,    // (K)
+    global float4 *point_camera)         // (N, 4) x, y, z, t; t = -1: left out
+{
+    const uint i = get_global_id(0);
+    if (i >= n) return;
+    const Camera view = camera_load(camera);
+    point_camera[i] = project(&view, vload3(i, positions), point_radius[k == 1 ? 0 : i]);
+}

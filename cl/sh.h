@@ -1,0 +1,25 @@
+// Real spherical harmonics of degrees 0 to 2 in the order and with the signs of PlenOctrees (PAPER.md 1.5).
+#ifndef PP_SH_H
+#define PP_SH_H
+
+#define SH_0 0.28209479f         // 1 / (2 sqrt(pi))
+#define SH_1 0.48860251f         // sqrt(3 / (4 pi))
+#define SH_2A 1.09254843f        // sqrt(15 / (4 pi))
+#define SH_2B 0.94617470f        // 3/4 sqrt(5 / pi)
+#define SH_2C 0.31539157f        // 1/4 sqrt(5 / pi)
+#define SH_2D 0.54627422f        // 1/4 sqrt(15 / pi)
+
+// basis[0..8] of the unit direction d
+inline void sh_basis(const float3 d, float *basis) {
+    basis[0] = SH_0;
+    basis[1] = -SH_1 * d.y;
+    basis[2] = SH_1 * d.z;
+    basis[3] = -SH_1 * d.x;
+    basis[4] = SH_2A * d.x * d.y;
+    basis[5] = -SH_2A * d.y * d.z;
+    basis[6] = SH_2B * d.z * d.z - SH_2C;
+    basis[7] = -SH_2A * d.x * d.z;
+    basis[8] = SH_2D * (d.x * d.x - d.y * d.y);
+}
+
+#endif

@@ -1,0 +1,83 @@
+// Smoothing of the SH coefficients over the grid, apart from Adam: f += amount * (mean of the neighbours - f).
+#include "common.h"
+
+// Index of `id` in ids[first, last), ascending; NONE where it is missing.
+inline uint find(global const uint *ids, const uint id, uint first, uint last) {
+    const uint end = last;
+    while (first < last) {
+        const uint middle = first + (last - first) / 2;
+        if (ids[middle] < id)
+            first = middle + 1;
+        else
+            last = middle;
+    }
+    return first < end && ids[first] == id ? first : NONE;
+}
+
+// One work-item per point: reads the ascending grid ids, writes the indices of its neighbours -x, +x, -y, +y, -z, +z.
+kernel void neighbour_table(
+    const uint n,                         // points
+    global const float *grid,             // (8)
+    global const uint *ids,               // (N) grid ids, ascending
+    global uint *neighbours)              // (N, 6)
+{
+    const uint i = get_global_id(0);
+    if (i >= n)
+        return;
+    const uint nx = grid[4], ny = grid[5], nz = grid[6], plane = nx * ny;
+    const uint id = ids[i], x = id % nx, y = id / nx % ny, z = id / plane;
+    global uint *row = neighbours + 6 * (size_t)i;
+    row[0] = x > 0 ? find(ids, id - 1, 0, i) : NONE;
+    row[1] = x + 1 < nx ? find(ids, id + 1, i + 1, n) : NONE;
+    row[2] = y > 0 ? find(ids, id - nx, 0, i) : NONE;
+    row[3] = y + 1 < ny ? find(ids, id + nx, i + 1, n) : NONE;
+    row[4] = z > 0 ? find(ids, id - plane, 0, i) : NONE;
+    row[5] = z + 1 < nz ? find(ids, id + plane, i + 1, n) : NONE;
+}
+
+// One work-item per point of a chunk: reads all its coefficients and its neighbours', writes the smoothed ones.
+kernel void smooth_gather(
+    const uint n,                         // points
+    const uint first,                     // point of the chunk
+    const uint count,                     // points in the chunk
+    const uint k,                         // coefficients of a point
+    const float amount,                   // 0 to 1
+    global const uint *neighbours,        // (N, 6)
+    global const float16 *sh,             // (N, K, 16)
+    global float16 *smoothed)             // (?, 16) K rows a point of the chunk
+{
+    const size_t slot = get_global_id(0), i = first + slot;
+    if (slot >= count)
+        return;
+    uint around[6];
+    float weight = 0.0f;
+    for (int side = 0; side < 6; side++) {
+        const uint j = neighbours[6 * i + side];
+        around[side] = j == NONE ? i : j;
+        weight += j == NONE ? 0.0f : 1.0f;
+    }
+    weight = amount / fmax(weight, 1.0f);
+    for (size_t c = 0; c < k; c++) {
+        const float16 f = sh[i * k + c];
+        float16 sum = 0.0f;
+        for (int side = 0; side < 6; side++)
+            sum += sh[(size_t)around[side] * k + c] - f;  // 0 for a missing neighbour
+        smoothed[slot * k + c] = f + weight * sum;
+    }
+}
+
+// One work-item per point of a chunk: writes its coefficients back.
+kernel void smooth_scatter(
+    const uint n,                         // points
+    const uint first,                     // point of the chunk
+    const uint count,                     // points in the chunk
+    const uint k,                         // coefficients of a point
+    global const float16 *smoothed,       // (?, 16) K rows a point of the chunk
+    global float16 *sh)                   // (N, K, 16)
+{
+    const size_t slot = get_global_id(0);
+    if (slot >= count)
+        return;
+    for (size_t c = 0; c < k; c++)
+        sh[(first + slot) * k + c] = smoothed[slot * k + c];
+}

@@ -1,0 +1,27 @@
+// float16 access to flat arrays whose length is no multiple of 16.
+#ifndef PP_VECTOR_H
+#define PP_VECTOR_H
+
+// The 16 values at p, of which `count` exist; the others read as 0.
+inline float16 load16(global const float *p, const int count) {
+    if (count >= 16)
+        return vload16(0, p);
+    float x[16];
+    for (int i = 0; i < 16; i++)
+        x[i] = i < count ? p[i] : 0.0f;
+    return vload16(0, x);
+}
+
+// Write the first `count` of 16 values to p.
+inline void store16(const float16 value, global float *p, const int count) {
+    if (count >= 16) {
+        vstore16(value, 0, p);
+        return;
+    }
+    float x[16];
+    vstore16(value, 0, x);
+    for (int i = 0; i < count; i++)
+        p[i] = x[i];
+}
+
+#endif

@@ -1,0 +1,173 @@
+"""The command line: pp-cl devices | train | eval | compare. Bad input is one line on stderr and exit status 2."""
+
+import argparse
+import json
+import sys
+from pathlib import Path
+
+from pp_cl import __version__
+from pp_cl.config import PRESETS, assign, help_lines, load_config, preset, validate
+from pp_cl.errors import UserError
+
+METRICS = ("psnr", "ssim", "lpips")
+
+
+class _Parser(argparse.ArgumentParser):
+    """argparse with one-line errors."""
+
+    def error(self, message):
+        raise UserError(f"{self.prog}: {message}; see {self.prog} --help")
+
+
+def main(argv=None):
+    """Run a command; returns the exit status."""
+    try:
+        options = _parser().parse_args(argv)
+        return options.run(options) or 0
+    except UserError as error:
+        print(f"pp-cl: {error}", file=sys.stderr)
+        return 2
+    except KeyboardInterrupt:
+        print("pp-cl: interrupted; the same command goes on from the last checkpoint", file=sys.stderr)
+        return 130
+
+
+def _parser():
+    parser = _Parser(prog="pp-cl", description="PlenopticPoints on any OpenCL device.", allow_abbrev=False)
+    parser.add_argument("--version", action="version", version=f"pp-cl {__version__}")
+    commands = parser.add_subparsers(dest="command", required=True, parser_class=_Parser)
+
+    devices = _command(commands, "devices", _devices, "list the OpenCL devices and whether they work")
+    devices.add_argument("--json", action="store_true", help="print JSON")
+
+    train = _command(commands, "train", _train, "learn a scene; the same command resumes an unfinished run",
+                     epilog="settings (--set), with the tiny preset's values:\n" + "\n".join(help_lines()))
+    train.add_argument("scene", metavar="SCENE", help="folder with transforms_train.json, or the word demo")
+    train.add_argument("--out", required=True, metavar="RUN", help="folder of the run")
+    train.add_argument("--preset", choices=PRESETS, help="tiny (default): minutes on a CPU; small: 400x400; paper: its numbers")
+    train.add_argument("--iterations", metavar="N", help="steps of training")
+    train.add_argument("--points", metavar="N", help="wanted points on the grid")
+    train.add_argument("--downscale", metavar="K", help="reduce the images K times (demo: 2, others: 1)")
+    train.add_argument("--seed", metavar="S", help="of everything random (0)")
+    train.add_argument("--set", action="append", default=[], metavar="SECTION.KEY=VALUE", help="any other setting, see below")
+    _device_option(train)
+
+    evaluate = _command(commands, "eval", _eval, "render a run's views and measure them")
+    evaluate.add_argument("run_folder", metavar="RUN", help="folder of the run")
+    evaluate.add_argument("--metrics", nargs="?", const=",".join(METRICS), default="psnr,ssim", metavar="A,B",
+                          help="of psnr, ssim, lpips; bare = all three (default psnr,ssim)")
+    evaluate.add_argument("--split", default="test", help="train, val or test (default)")
+    evaluate.add_argument("--save-images", action="store_true", help="write every view to RUN/eval/")
+    _device_option(evaluate)
+
+    compare = _command(commands, "compare", _compare, "measure one image, or a folder of images, against the truth")
+    compare.add_argument("prediction", metavar="PRED")
+    compare.add_argument("truth", metavar="TRUTH")
+    compare.add_argument("--metrics", nargs="?", const=",".join(METRICS), default="psnr,ssim", metavar="A,B")
+    compare.add_argument("--json", metavar="FILE", help="also write the result there")
+    _device_option(compare)
+    return parser
+
+
+def _command(commands, name, run, text, **extra):
+    parser = commands.add_parser(name, help=text, description=text, allow_abbrev=False,
+                                 formatter_class=argparse.RawDescriptionHelpFormatter, **extra)
+    parser.set_defaults(run=run)
+    return parser
+
+
+def _device_option(parser):
+    parser.add_argument("--device", metavar="D", help="index or part of a name, as `pp-cl devices` prints them")
+
+
+def _metric_names(text):
+    names = tuple(n.strip() for n in text.split(",") if n.strip())
+    if not names or set(names) - set(METRICS):
+        raise UserError(f"--metrics {text}: choose from {', '.join(METRICS)}")
+    return names
+
+
+def _devices(options):
+    from pp_cl.device import MEND, describe, list_devices
+
+    found = list_devices()
+    if options.json:
+        print(json.dumps([{"index": i, **describe(d), "problem": problem} for i, d, problem in found], indent=1))
+    else:
+        for i, d, problem in found:
+            info = describe(d)
+            print(f"{i}  {info['name']}  [{info['platform']}]  {info['compute_units']} units, {info['memory_bytes'] / 2**30:.1f} GiB: "
+                  f"{problem or 'works'}")
+    if not any(problem is None for _, _, problem in found):
+        raise UserError(f"no working OpenCL device: {MEND}")
+
+
+def _given_settings(options):
+    """[(key, text, origin)] of every setting on the command line."""
+    given = []
+    for option, key in (("iterations", "train.iterations"), ("points", "points.count"), ("downscale", "scene.downscale"),
+                        ("seed", "train.seed")):
+        value = getattr(options, option)
+        if value is not None:
+            given.append((key, value, f"--{option}"))
+    for text in options.set:
+        key, equals, value = text.partition("=")
+        if not equals:
+            raise UserError(f"--set {text}: write --set section.key=value")
+        given.append((key.strip(), value.strip(), "--set"))
+    return given
+
+
+def _resolve_config(options):
+    """Config of the command line; on top of the stored one when the run exists, with which it must then agree."""
+    stored_file = Path(options.out) / "config.json"
+    given = _given_settings(options)
+    scene = options.scene if options.scene == "demo" else str(Path(options.scene).resolve())
+    if stored_file.exists():
+        config, stored = load_config(stored_file), load_config(stored_file)
+        if options.preset and options.preset != stored.preset:
+            raise UserError(f"{stored_file}: preset is {stored.preset} there, {options.preset} asked for; use another --out")
+    else:
+        config, stored = preset(options.preset or "tiny"), None
+        config.scene.downscale = 2 if scene == "demo" else 1
+    config.scene.path = scene
+    for key, value, origin in given:
+        assign(config, key, value, origin)
+    validate(config, "settings")
+    if stored and config != stored:
+        raise UserError(f"{stored_file}: {_first_difference(config, stored)}; use another --out, or the settings of the run")
+    return config
+
+
+def _first_difference(asked, stored):
+    """`section.key is A there, B asked for` of the first setting that differs."""
+    for section in ("scene", "points", "network", "train"):
+        for name, value in vars(getattr(stored, section)).items():
+            other = getattr(getattr(asked, section), name)
+            if other != value:
+                return f"{section}.{name} is {value} there, {other} asked for"
+    return "settings differ"
+
+
+def _train(options):
+    from pp_cl.run import train_run
+
+    train_run(Path(options.out), _resolve_config(options), options.device)
+
+
+def _eval(options):
+    from pp_cl.evaluate import evaluate_run
+
+    evaluate_run(Path(options.run_folder), _metric_names(options.metrics), options.split, options.save_images, options.device)
+
+
+def _compare(options):
+    from pp_cl.checkpoint import write_json
+    from pp_cl.compare import compare
+    from pp_cl.device import open_device
+
+    result = compare(lambda: open_device(options.device), Path(options.prediction), Path(options.truth), _metric_names(options.metrics))
+    if options.json:
+        write_json(options.json, result)
+    for name, value in result["mean"].items():
+        print(f"{name:6s} {value:.4f}")

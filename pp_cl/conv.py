@@ -1,0 +1,72 @@
+"""Convolutions K x K (K = 1 or 3), stride 1, zero padding K // 2, and the layout of their weights."""
+
+import numpy as np
+
+LANES = 16  # output channels in one float16
+
+
+def pack_weights(weight, dtype=np.float32):
+    """(CO, CI, K, K) numpy array -> (ceil(CO / 16), K, K, CI, 16), output channels beyond CO zero."""
+    co, ci, k, _ = weight.shape
+    packed = np.zeros((-(-co // LANES) * LANES, ci, k, k), dtype)
+    packed[:co] = weight
+    return np.ascontiguousarray(packed.reshape(-1, LANES, ci, k, k).transpose(0, 3, 4, 2, 1))
+
+
+def unpack_weights(packed, co):
+    """The inverse of pack_weights: (CO, CI, K, K)."""
+    blocks, k, _, ci, _ = packed.shape
+    return packed.transpose(0, 4, 3, 1, 2).reshape(blocks * LANES, ci, k, k)[:co]
+
+
+def pack_bias(bias, dtype=np.float32):
+    """(CO,) numpy array -> (ceil(CO / 16) * 16,), padded with zeros."""
+    return np.pad(np.asarray(bias, dtype), (0, -len(bias) % LANES))
+
+
+def tiling(dev, width, channels_out):
+    """(TILE, BLOCKS, work-group) of cl/conv.cl for an image `width` wide.
+
+    On a CPU two blocks of 16 channels share each input value where the channels allow it: 16 accumulators + 6 weights of
+    the 32 vector registers; one block takes 12 pixels. On a GPU, registers are a work-item's own: 4 pixels.
+    """
+    blocks = 2 if dev.is_cpu and -(-channels_out // LANES) % 2 == 0 else 1
+    tiles = (4, 1) if not dev.is_cpu else (8, 4, 1) if blocks == 2 else (12, 8, 4, 1)
+    tile = next(t for t in tiles if t <= width)
+    return tile, blocks, (1, 1, 1) if dev.is_cpu else (16, 4, 1)
+
+
+def conv_forward(dev, x, weight, bias, out, relu, x2=None):
+    """out = convolution of [x, x2] + bias, then max(., 0) if relu.
+
+    x: (H, W, C1), x2: None or (H, W, C2); weight: (ceil(CO/16), K, K, C1 + C2, 16); bias: (ceil(CO/16) * 16,);
+    out: (H, W, CO), all float32. Raises ValueError when shapes do not fit together.
+    """
+    height, width, co = out.shape
+    c1, c2 = x.shape[2], 0 if x2 is None else x2.shape[2]
+    blocks = -(-co // LANES)
+    if weight.shape[0] != blocks or weight.shape[3] != c1 + c2 or bias.shape != (blocks * LANES,):
+        raise ValueError(f"convolution of {c1} + {c2} to {co} channels: weight is {weight.shape}, bias {bias.shape}")
+    program, size, local = _program(dev, weight.shape[1], height, width, co)
+    program.launch("conv_forward", size, local=local, height=height, width=width, c1=c1, c2=c2, co=co, relu=relu,
+                   x=x, x2=x if x2 is None else x2, weight=weight, bias=bias, out=out)
+
+
+def conv_backward_input(dev, x, flipped, grad_out, grad_x, masked):
+    """grad_x = gradient of the convolution's input; where masked, of the input of the ReLU that made x (zero where x <= 0).
+
+    x, grad_x: (H, W, C), grad_out: (H, W, CO); flipped: (ceil(C/16), K, K, CO, 16) from conv_weights.flip_weights.
+    x is read only where masked. Raises ValueError when shapes do not fit together.
+    """
+    height, width, c = grad_x.shape
+    if flipped.shape[0] != -(-c // LANES):
+        raise ValueError(f"input gradient of {c} channels: flipped weights are {flipped.shape}")
+    program, size, local = _program(dev, flipped.shape[1], height, width, c)
+    program.launch("conv_backward_input", size, local=local, height=height, width=width, c=c, co=grad_out.shape[2],
+                   masked=masked, x=x, flipped=flipped, grad_out=grad_out, grad_x=grad_x)
+
+
+def _program(dev, k, height, width, channels_out):
+    tile, blocks, local = tiling(dev, width, channels_out)
+    size = (-(-width // tile), height, -(-channels_out // (LANES * blocks)))
+    return dev.program("conv", K=k, TILE=tile, BLOCKS=blocks), size, local

@@ -1,0 +1,86 @@
+"""Evaluation of a run: every view of a split, rendered, rounded to 8 bits, measured."""
+
+import time
+from dataclasses import replace
+
+import numpy as np
+
+from pp_cl.checkpoint import load_checkpoint, remove_leftovers, write_json
+from pp_cl.config import load_config
+from pp_cl.device import open_device
+from pp_cl.errors import UserError
+from pp_cl.image import write_png
+from pp_cl.metrics import Metrics, mean
+from pp_cl.model import Model
+from pp_cl.preview import write_comparison
+from pp_cl.render import Renderer
+from pp_cl.run import CHECKPOINT, open_scene
+from pp_cl.target import Target
+
+PICTURE_VIEWS = 4  # rows of the comparison picture
+
+
+def evaluate_run(folder, metrics, split, save_images, device_choice):
+    """Measure a run; writes RUN/eval/metrics.json and comparison.png, prints a table, returns the metrics.
+
+    metrics: names out of psnr, ssim, lpips. Raises UserError for a missing or broken run or split.
+    """
+    config = load_config(folder / "config.json")
+    header, arrays = load_checkpoint(folder / CHECKPOINT)
+    dev = open_device(device_choice)
+    scene = open_scene(dev, config, (split,))
+    if not scene.splits.get(split):
+        raise UserError(f"--split {split}: {scene.name} has {', '.join(scene.splits)}")
+    measure = Metrics(dev, metrics)
+    model = Model.load(dev, header, arrays, config.network.widths, folder / CHECKPOINT)
+    views = scene.splits[split]
+    if not scene.depth_range_stored:
+        near, far = model.depth_range
+        views = [replace(v, camera=replace(v.camera, near=near, far=far)) for v in views]
+
+    target_folder = folder / "eval"
+    target_folder.mkdir(exist_ok=True)
+    remove_leftovers(target_folder)
+    rows, pictures, seconds = [], [], []
+    for view, picture, truth, duration in _render_all(dev, config, model, views):
+        rows.append({"name": view.name} | measure(picture, truth))
+        seconds.append(duration)
+        if len(pictures) < PICTURE_VIEWS * 8:
+            pictures.append((picture, truth))
+        if save_images:
+            write_png(target_folder / f"{len(rows) - 1:04d}.png", picture)
+    result = {
+        "split": split, "device": dev.name, "step": header["step"], "finished": header["finished"], "mean": mean(rows), "per_image": rows,
+        "points": {"initial": header["initial_points"], "final": model.count, "grid": header["grid"]["dims"]},
+        "seconds_per_frame": float(np.median(seconds)), "published": scene.published,
+    }
+    write_json(target_folder / "metrics.json", result)
+    chosen = pictures[:: max(1, len(pictures) // PICTURE_VIEWS)][:PICTURE_VIEWS]
+    write_comparison(target_folder / "comparison.png", [p for p, _ in chosen], [t for _, t in chosen])
+    _print_table(result, folder)
+    print(f"wrote {target_folder / 'metrics.json'} and {target_folder / 'comparison.png'} (prediction | truth | 4 x error)")
+    return result
+
+
+def _render_all(dev, config, model, views):
+    """Yield (view, prediction (H,W,3), truth (H,W,3), seconds of the rendering) as float32 in [0, 1]."""
+    renderer, target = Renderer(dev, model, config.points), Target(dev, config.scene.downscale)
+    gamma = config.points.gamma[1]
+    renderer.picture(views[0].camera.downscaled(config.scene.downscale), gamma)  # builds the programs
+    for view in views:
+        camera = view.camera.downscaled(config.scene.downscale)
+        start = time.perf_counter()
+        picture = renderer.picture(camera, gamma)
+        seconds = time.perf_counter() - start
+        target.load(view)
+        yield view, picture, target.crop(0, 0, camera.width, camera.height).get(), seconds
+
+
+def _print_table(result, folder):
+    names = list(result["mean"])
+    print(f"{'':28s}" + "".join(f"{n:>9s}" for n in names))
+    rows = {f"{folder} ({len(result['per_image'])} views)": result["mean"]} | {f"{k} (published)": v for k, v in result["published"].items()}
+    for label, values in rows.items():
+        print(f"{label:28s}" + "".join(f"{values[n]:9.4f}" if n in values else f"{'':9s}" for n in names))
+    points = result["points"]
+    print(f"{points['final']} of {points['initial']} points, {result['seconds_per_frame'] * 1e3:.0f} ms per frame on {result['device']}")

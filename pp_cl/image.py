@@ -1,0 +1,74 @@
+"""8-bit images on disk."""
+
+import io
+from contextlib import contextmanager
+from pathlib import Path
+
+import numpy as np
+from PIL import Image
+
+from pp_cl.checkpoint import atomic_file
+from pp_cl.errors import UserError
+
+FORMATS = ("PNG", "JPEG", "WEBP")
+EIGHT_BIT_MODES = ("RGBA", "RGB", "LA", "L", "PA", "P", "1")  # Pillow's names of what converts to RGBA without loss
+PNG_SIGNATURE, PNG_DEPTH_BYTE = b"\x89PNG\r\n\x1a\n", 24  # bits per channel stand in the header chunk, the first of all
+
+
+def read_rgba(path):
+    """(H, W, 4) uint8 straight RGBA of an image file; gray and palette colours are expanded, no alpha means 255.
+
+    Raises UserError naming a file that is missing, truncated, no image, or has other than 8 bits a channel.
+    """
+    with _opened(path) as image:
+        if image.mode not in EIGHT_BIT_MODES or _is_deep_png(path):
+            raise UserError(f"{path}: not 8 bits a channel of gray or RGB ({image.mode}); convert it to 8-bit RGBA PNG")
+        return np.array(image if image.mode == "RGBA" else image.convert("RGBA"))
+
+
+def image_size(path):
+    """(width, height) from the header of an image file. Raises UserError as read_rgba does."""
+    with _opened(path) as image:
+        return image.size
+
+
+@contextmanager
+def _opened(path):
+    """The image file, opened; what goes wrong with it inside the block becomes a UserError."""
+    try:
+        with Image.open(path, formats=FORMATS) as image:
+            yield image
+    except UserError:
+        raise
+    except FileNotFoundError:
+        raise UserError(f"{path}: no such image; copy it there") from None
+    except Exception as error:  # decoders meet broken bytes with whatever comes up: OSError, SyntaxError, struct.error
+        reason = " ".join(str(error).split())[:120] or type(error).__name__
+        raise UserError(f"{path}: cannot be read as {', '.join(FORMATS)} ({reason}); copy it anew") from error
+
+
+def _is_deep_png(path):
+    """True for a PNG of 16 bits a channel, of which Pillow silently drops the low byte."""
+    with open(path, "rb") as file:
+        head = file.read(PNG_DEPTH_BYTE + 1)
+    return head.startswith(PNG_SIGNATURE) and head[PNG_DEPTH_BYTE] == 16
+
+
+def to_8bit(image):
+    """uint8 image of a float image: clamped to [0, 1], rounded to the nearest of 256 levels. Raises ValueError for NaN."""
+    image = np.asarray(image)
+    if np.isnan(image).any():
+        raise ValueError("the image holds NaN")
+    return (np.clip(image, 0, 1) * 255 + 0.5).astype(np.uint8)
+
+
+def write_png(path, image):
+    """Write a uint8 or float [0, 1] image of shape (H, W), (H, W, 3) or (H, W, 4), atomically.
+
+    Raises UserError naming the file when the disk is full or may not be written, ValueError for NaN.
+    """
+    image = np.asarray(image)
+    encoded = io.BytesIO()
+    Image.fromarray(image if image.dtype == np.uint8 else to_8bit(image)).save(encoded, "PNG")
+    with atomic_file(Path(path)) as file:
+        file.write(encoded.getbuffer())

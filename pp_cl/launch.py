@@ -1,0 +1,178 @@
+"""Kernels launched by argument name, with shapes checked against the comments of their signatures.
+
+The signature is parsed from the source, so that it works the same on drivers that give no argument info; the tests
+compare it with the driver's own (-cl-kernel-arg-info).
+"""
+
+import operator
+import re
+from dataclasses import dataclass
+
+import numpy as np
+import pyopencl as cl
+import pyopencl.array as cl_array
+
+SCALARS = {"char": np.int8, "uchar": np.uint8, "short": np.int16, "ushort": np.uint16, "int": np.int32, "uint": np.uint32,
+           "long": np.int64, "ulong": np.uint64, "half": np.float16, "float": np.float32, "double": np.float64}
+
+# Work-group sizes when the caller names none. They are fixed, and the global size is rounded up to them, because PoCL
+# compiles a kernel again for every new work-group size; hence the tail guards.
+DEFAULT_LOCAL = {1: (64,), 2: (16, 4), 3: (16, 4, 1)}
+
+_KERNEL = re.compile(r"^(?:__)?kernel\s+(?:__attribute__\s*\(\(.*?\)\)\s*)?void\s+(\w+)\s*\(", re.MULTILINE)
+_PARAMETER = re.compile(r"^(?:(global|constant|local)\s+)?((?:(?:const|restrict|volatile)\s+)*)"
+                        r"([a-z]+?)(\d*)\s*(\*?)\s*(?:restrict\s+)?(\w+)$")
+_SHAPE = re.compile(r"^\(([^()]*(?:\([^()]*\)[^()]*)*)\)")
+
+
+@dataclass(frozen=True)
+class Parameter:
+    """One kernel parameter. shape: dimension words of its comment, None for a scalar or for `(...)`."""
+
+    name: str
+    space: str  # "global", "constant", "local", or "" for a scalar
+    dtype: type
+    width: int  # of the OpenCL vector
+    const: bool  # what it points at
+    shape: tuple | None
+
+
+def parse_signatures(source, file):
+    """{kernel name: [Parameter, ...]} of an OpenCL C source that follows docs/conventions.md.
+
+    Raises ValueError naming the file, kernel and line of a parameter that does not.
+    """
+    signatures = {}
+    for match in _KERNEL.finditer(source):
+        parameters = []
+        for line in source[match.end():].split("\n"):
+            code, _, comment = line.partition("//")
+            code = code.strip()
+            last = code.rstrip(" {").endswith(")")
+            code = code.rstrip(" {").rstrip(")").rstrip(",").strip()
+            if code:
+                parameters.append(_parse_parameter(code, comment.strip(), f"{file}: {match.group(1)}"))
+            if last:
+                break
+        signatures[match.group(1)] = parameters
+    return signatures
+
+
+def _parse_parameter(code, comment, where):
+    found = _PARAMETER.match(code)
+    if not found or found.group(3) not in SCALARS:
+        raise ValueError(f"{where}: cannot read parameter {code!r}; one parameter per line")
+    space, qualifiers, base, width, star, name = found.groups()
+    if bool(space) != bool(star) or (width and not star):
+        raise ValueError(f"{where}: {code!r} is neither a global, constant or local pointer nor a scalar")
+    shape = None
+    if star:
+        words = _SHAPE.match(comment)
+        if not words:
+            raise ValueError(f"{where}: buffer {name!r} has no shape in its comment")
+        shape = tuple(w.strip() for w in words.group(1).split(",") if w.strip())
+        shape = None if shape == ("...",) else shape
+    return Parameter(name, space or "", SCALARS[base], int(width or 1), "const" in qualifiers, shape)
+
+
+class Kernel:
+    """A compiled kernel that is called with named arguments."""
+
+    def __init__(self, kernel, parameters, defines, label):
+        self.kernel = kernel
+        self.parameters = parameters
+        self.names = [p.name for p in parameters]
+        self.defines = defines
+        self.label = label
+        self._letters = {word.lower() for p in parameters for word in p.shape or ()}
+        self._checked = set()  # shapes and sizes already found right
+
+    def arguments(self, values):
+        """OpenCL arguments in order, from {name: pyopencl Array, number or cl.LocalMemory}. Raises TypeError, ValueError."""
+        if values.keys() != set(self.names):
+            missing = [n for n in self.names if n not in values]
+            unknown = [n for n in values if n not in self.names]
+            raise TypeError(f"{self.label}: missing {missing}, unknown {unknown}")
+        arguments, shapes, sizes = [], [], {}
+        for p in self.parameters:
+            value = values[p.name]
+            if p.space in ("global", "constant"):
+                if not isinstance(value, cl_array.Array) or value.dtype != p.dtype:
+                    raise TypeError(f"{self.label}: {p.name} is {_kind(value)}, expected a device array of "
+                                    f"{np.dtype(p.dtype)}")
+                arguments.append(value.data)
+                shapes.append((value.shape, value.strides))
+            elif p.space == "local":
+                arguments.append(value)
+            else:
+                arguments.append(self._scalar(p, value))
+                if p.name.lower() in self._letters:
+                    sizes[p.name.lower()] = int(value)
+        key = (*shapes, *sizes.values())
+        if key not in self._checked:
+            for p in self.parameters:
+                if p.space in ("global", "constant"):
+                    self._check_buffer(p, values[p.name], sizes)
+            if len(self._checked) > 4096:
+                self._checked.clear()
+            self._checked.add(key)
+        return arguments
+
+    def _scalar(self, p, value):
+        try:  # index() refuses the 2.5 that numpy would cut to 2
+            return p.dtype(operator.index(value) if issubclass(p.dtype, np.integer) else float(value))
+        except (TypeError, OverflowError) as error:
+            raise TypeError(f"{self.label}: {p.name} = {value!r} is no {np.dtype(p.dtype)}: {error}") from error
+
+    def _check_buffer(self, p, array, sizes):
+        """Compare one array with its parameter; sizes: {letter: size} so far, new letters are added."""
+        has = f"{self.label}: {p.name} has shape {array.shape}"
+        if not array.flags.c_contiguous:
+            raise ValueError(f"{has} and strides {array.strides}: not contiguous")
+        if p.shape is None:
+            return
+        if len(array.shape) != len(p.shape):
+            raise ValueError(f"{has}, expected rank {len(p.shape)} {p.shape}")
+        for word, size in zip(p.shape, array.shape, strict=True):
+            word = str(self.defines.get(word, word))
+            expected = int(word) if word.isdigit() else sizes.setdefault(word.lower(), size)
+            if word != "?" and size != expected:
+                raise ValueError(f"{has}, expected {p.shape} with {word} = {expected}")
+
+
+def _kind(value):
+    return f"an array of {value.dtype}" if isinstance(value, cl_array.Array) else f"a {type(value).__name__}"
+
+
+class Program:
+    """One built cl/*.cl file."""
+
+    def __init__(self, device, name, source, options, defines):
+        self.device = device
+        self.name = name
+        signatures = parse_signatures(source, f"cl/{name}.cl")
+        try:
+            built = cl.Program(device.context, source).build(options=options)
+        except cl.RuntimeError as error:
+            raise RuntimeError(f"cl/{name}.cl does not build on {device.name} with {' '.join(options)}:\n{error}") from error
+        self.built = built
+        self.kernels = {k: Kernel(getattr(built, k), p, defines, f"{name}.cl:{k}") for k, p in signatures.items()}
+
+    def launch(self, kernel_name, size, local=None, **arguments):
+        """Enqueue one kernel.
+
+        size: int or tuple of work-items, rounded up to the work-group size (kernels guard their tail); nothing is
+        launched when it is 0. local: work-group size; None = DEFAULT_LOCAL. arguments: by parameter name.
+        Raises TypeError (names, dtypes) and ValueError (shapes) before anything is enqueued, UserError when the driver
+        gives up.
+        """
+        kernel = self.kernels[kernel_name]
+        values = kernel.arguments(arguments)
+        size = (int(size),) if np.isscalar(size) else tuple(int(s) for s in size)
+        local = DEFAULT_LOCAL[len(size)] if local is None else ((local,) if np.isscalar(local) else tuple(local))
+        if 0 in size:
+            return
+        size = tuple(-(-s // group) * group for s, group in zip(size, local, strict=True))
+        event = self.device.attempt(f"run {kernel.label}", kernel.kernel, self.device.queue, size, local, *values)
+        if self.device.debug:
+            self.device.observe(kernel, event, arguments)

@@ -1,0 +1,56 @@
+"""Pooling, bilinear upsampling and a straight line on (H, W, C) float32 feature maps."""
+
+LOCAL = (16, 4, 1)  # channels, x, y
+
+
+def avgpool2_forward(dev, x, out):
+    """out (H, W, C) = mean of 2x2 pixels of x (2H, 2W, C). Raises ValueError for other shapes."""
+    h, w, c = _check_double(out, x)
+    _launch(dev, "avgpool2_forward", (c, w, h), h=h, w=w, c=c, x=x, out=out)
+
+
+def avgpool2_backward(dev, x, grad_out, grad_x):
+    """Adds the gradient of avgpool2_forward to grad_x (2H, 2W, C), then sets grad_x to 0 where x <= 0.
+
+    x: the ReLU's output that was pooled; grad_x: gradient from its other use; grad_out: (H, W, C).
+    """
+    h, w, c = _check_double(grad_out, grad_x)
+    _launch(dev, "avgpool2_backward", (c, 2 * w, 2 * h), h=h, w=w, c=c, x=x, grad_out=grad_out, grad_x=grad_x)
+
+
+def maxpool2_forward(dev, x, out):
+    """out (H // 2, W // 2, C) = largest of 2x2 pixels of x (H, W, C). Raises ValueError for other shapes."""
+    h, w, c = out.shape
+    if (x.shape[0] // 2, x.shape[1] // 2, x.shape[2]) != out.shape:
+        raise ValueError(f"max pooling of {x.shape} to {out.shape}")
+    _launch(dev, "maxpool2_forward", (c, w, h), h=h, w=w, c=c, x_width=x.shape[1], x=x, out=out)
+
+
+def upsample2_forward(dev, x, out):
+    """out (2H, 2W, C) = x (H, W, C), bilinear, align_corners False, border repeated."""
+    h, w, c = _check_double(x, out)
+    _launch(dev, "upsample2_forward", (c, 2 * w, 2 * h), h=h, w=w, c=c, x=x, out=out)
+
+
+def upsample2_backward(dev, grad_out, grad_x):
+    """grad_x (H, W, C) = gradient of upsample2_forward, given grad_out (2H, 2W, C)."""
+    h, w, c = _check_double(grad_x, grad_out)
+    _launch(dev, "upsample2_backward", (c, w, h), h=h, w=w, c=c, grad_out=grad_out, grad_x=grad_x)
+
+
+def affine(dev, scale, offset, x, out):
+    """out = scale * x + offset; both of any one shape, out may be x."""
+    if x.shape != out.shape:
+        raise ValueError(f"affine of {x.shape} to {out.shape}")
+    dev.program("layers").launch("affine", x.size, n=x.size, scale=scale, offset=offset, x=x, out=out)
+
+
+def _launch(dev, kernel, size, **arguments):
+    dev.program("layers").launch(kernel, size, local=LOCAL, **arguments)
+
+
+def _check_double(small, large):
+    h, w, c = small.shape
+    if large.shape != (2 * h, 2 * w, c):
+        raise ValueError(f"a layer between {small.shape} and {large.shape}: expected {(2 * h, 2 * w, c)}")
+    return h, w, c

@@ -1,0 +1,57 @@
+"""PSNR, SSIM and LPIPS of 8-bit images, with the settings behind the tables of this field."""
+
+import numpy as np
+from skimage.metrics import structural_similarity
+
+from pp_cl.errors import UserError
+from pp_cl.image import to_8bit
+from pp_cl.lpips import Lpips
+
+PSNR_CAP = 100.0  # dB of identical images: JSON has no infinity
+SSIM_WINDOW = 11  # pixels
+
+
+def psnr(a, b):
+    """-10 log10 of the mean squared error over all values of two uint8 images, in dB, at most PSNR_CAP."""
+    mse = np.mean((a.astype(np.float64) - b) ** 2) / 255**2
+    return float(min(PSNR_CAP, -10 * np.log10(max(mse, 1e-30))))
+
+
+def ssim(a, b):
+    """Structural similarity (Wang et al. 2004) of two uint8 (H, W, 3) images.
+
+    Gaussian window 11x11 of sigma 1.5, population variances; mean over the channels and the pixels whose window lies
+    inside the image. Raises UserError for images smaller than the window.
+    """
+    height, width = a.shape[:2]
+    if min(height, width) < SSIM_WINDOW:
+        raise UserError(f"{width}x{height} pixels, SSIM needs {SSIM_WINDOW}x{SSIM_WINDOW}: "
+                        "take larger images or leave ssim out of --metrics")
+    return float(structural_similarity(a / 255.0, b / 255.0, gaussian_weights=True, sigma=1.5, use_sample_covariance=False,
+                                       data_range=1.0, channel_axis=-1))
+
+
+class Metrics:
+    """The named metrics of image pairs. dev: a Device; only lpips needs one."""
+
+    def __init__(self, dev, names=("psnr", "ssim", "lpips")):
+        self.functions = {"psnr": psnr, "ssim": ssim}
+        if "lpips" in names:
+            distance = Lpips(dev).distance
+            self.functions["lpips"] = lambda a, b: distance(a / 255.0, b / 255.0)
+        self.names = names
+
+    def __call__(self, prediction, truth):
+        """{name: number} of two float (H, W, 3) images in [0, 1], both rounded to 8 bits first.
+
+        Raises ValueError if the shapes differ, UserError if they are too small for a metric.
+        """
+        if prediction.shape != truth.shape:
+            raise ValueError(f"prediction {prediction.shape}, truth {truth.shape}")
+        a, b = to_8bit(prediction), to_8bit(truth)
+        return {name: self.functions[name](a, b) for name in self.names}
+
+
+def mean(rows):
+    """{name: mean over the rows} of dicts of numbers with the same keys; the key "name" is left out."""
+    return {key: float(np.mean([row[key] for row in rows])) for key in rows[0] if key != "name"}

@@ -1,0 +1,77 @@
+"""All that is learned: the points on the grid, and the U-Net that turns their features into colours."""
+
+import numpy as np
+
+from pp_cl.errors import UserError
+from pp_cl.points import SH_DEGREES, Grid
+from pp_cl.unet import UNet
+
+POINT_KEYS = ("opacity", *(f"sh{d}" for d in SH_DEGREES))  # the learned arrays of a point
+
+
+class Model:
+    """Points and network on a device.
+
+    grid: Grid. depth_range: (near, far), world units, of cameras that bring none. points: {"ids" (N) uint32 ascending,
+    "opacity" (N), "sh0" (N,1,16), "sh1" (N,3,16), "sh2" (N,5,16)} device arrays; training adds rows of its own.
+    """
+
+    def __init__(self, dev, grid, depth_range, points, net):
+        self.dev = dev
+        self.grid = grid
+        self.grid_buffer = dev.upload(grid.packed())
+        self.depth_range = depth_range
+        self.points = points
+        self.net = net
+
+    @property
+    def count(self):
+        """Number of points."""
+        return self.points["ids"].shape[0]
+
+    @classmethod
+    def create(cls, dev, grid, ids, depth_range, widths, seed):
+        """Fresh model: opacity 1, SH coefficients 0, network at its random start.
+
+        ids: (N) uint32 ascending grid vertices.
+        """
+        n = len(ids)
+        points = {"ids": dev.upload(ids, np.uint32), "opacity": dev.upload(np.ones(n, np.float32))}
+        for degree in SH_DEGREES:
+            points[f"sh{degree}"] = dev.zeros((n, 2 * degree + 1, 16))
+        return cls(dev, grid, depth_range, points, UNet(dev, widths=widths, seed=seed))
+
+    def header(self):
+        """JSON-able description that load() needs beside the arrays."""
+        return {"grid": {"origin": [float(x) for x in self.grid.origin], "edge": float(self.grid.edge), "dims": [int(d) for d in self.grid.dims]},
+                "depth_range": [float(x) for x in self.depth_range]}
+
+    def arrays(self):
+        """{name: numpy array} of everything learned."""
+        stored = {f"points.{name}": self.points[name].get() for name in ("ids", *POINT_KEYS)}
+        return stored | {f"net.{name}": array.get() for name, array in self.net.parameters.items()}
+
+    @classmethod
+    def load(cls, dev, header, arrays, widths, file):
+        """Model of a checkpoint's header and arrays. Raises UserError naming the file and the array that does not fit."""
+        try:
+            grid = Grid(tuple(header["grid"]["origin"]), header["grid"]["edge"], tuple(header["grid"]["dims"]))
+            depth_range = tuple(header["depth_range"])
+        except (KeyError, TypeError):
+            raise UserError(f"{file}: its header is incomplete; train anew") from None
+        net = UNet(dev, widths=widths, seed=0)
+        n = len(arrays.get("points.ids", ()))
+        shapes = {"ids": (n,), "opacity": (n,)} | {f"sh{d}": (n, 2 * d + 1, 16) for d in SH_DEGREES}
+        points = {name: dev.upload(_fitting(arrays, f"points.{name}", shape, file)) for name, shape in shapes.items()}
+        for name, parameter in net.parameters.items():
+            parameter.set(_fitting(arrays, f"net.{name}", parameter.shape, file))
+        return cls(dev, grid, depth_range, points, net)
+
+
+def _fitting(arrays, name, shape, file):
+    expected = np.uint32 if name == "points.ids" else np.float32
+    array = arrays.get(name)
+    if array is None or array.shape != tuple(shape) or array.dtype != expected:
+        found = "missing" if array is None else f"{array.dtype} {array.shape}"
+        raise UserError(f"{file}: {name} is {found}, expected {np.dtype(expected)} {tuple(shape)}; its config.json may belong to another run")
+    return np.ascontiguousarray(array)

@@ -1,0 +1,100 @@
+"""Adam for everything learned, and the averaged (EMA) copy of it.
+
+The moments and averages of the points lie beside them in model.points, so that pruning moves all rows alike.
+"""
+
+from dataclasses import dataclass
+
+from pp_cl.adam import adam_sh_update, adam_update, ema_update
+from pp_cl.model import POINT_KEYS
+from pp_cl.points import SH_DEGREES
+from pp_cl.schedule import learning_rate
+
+OPACITY_EPS = 1e-15  # opacity gradients span many decades; clamping bounds the step instead
+NETWORK_EPS = 1e-8  # PyTorch's default
+
+
+@dataclass(frozen=True)
+class Rates:
+    """Adam's rates at one step. sh: of the degrees 0, 1, 2."""
+
+    sh: tuple
+    opacity: float
+    network: float
+
+    @classmethod
+    def at(cls, step, network, train):
+        """The rates of a step from 0 on. network, train: config.NetworkConfig, config.TrainConfig."""
+        steps = train.iterations
+        sh = tuple(learning_rate(step, steps, first, first * train.sh_rate_decay, round(delay * steps))
+                   for first, delay in zip(train.sh_rate, train.sh_delay, strict=True))
+        return cls(sh, learning_rate(step, steps, *train.opacity_rate), learning_rate(step, steps, *network.rate))
+
+
+class Optimiser:
+    """Moments of the points and the network, and their updates."""
+
+    def __init__(self, dev, model):
+        self.dev = dev
+        self.model = model
+        self.moments = {f"{kind}.{name}": dev.zeros(array.shape) for name, array in model.net.parameters.items() for kind in "mv"}
+        for name in POINT_KEYS:
+            for kind in "mv":
+                model.points[f"{kind}.{name}"] = dev.zeros(model.points[name].shape)
+        self.averages = {}  # of the network; those of the points are model.points["a.*"]
+
+    def update(self, step, rates, grads, camera, feature_eps):
+        """One Adam step.
+
+        step: from 1. grads: (grad_point_features (N,16), grad_opacity (N)); the network's own gradients lie in it.
+        camera: (20) device buffer of the view. feature_eps: Adam's eps of the SH coefficients.
+        """
+        dev, model, points = self.dev, self.model, self.model.points
+        grad_features, grad_opacity = grads
+        for degree, rate in zip(SH_DEGREES, rates.sh, strict=True):
+            name = f"sh{degree}"
+            adam_sh_update(dev, model.grid_buffer, camera, points["ids"], grad_features, points[name], points[f"m.{name}"],
+                           points[f"v.{name}"], step, rate, feature_eps)
+        adam_update(dev, points["opacity"], grad_opacity, points["m.opacity"], points["v.opacity"], step, rates.opacity,
+                    OPACITY_EPS, low=0.0, high=1.0)
+        for name, parameter in model.net.parameters.items():
+            adam_update(dev, parameter, model.net.gradients[name], self.moments[f"m.{name}"], self.moments[f"v.{name}"],
+                        step, rates.network, NETWORK_EPS)
+
+    def average(self, weight):
+        """Move the averages towards the present values by `weight`; a weight of 1 starts them there."""
+        for parameter, store, key in self._averaged():
+            if key not in store:
+                store[key] = self.dev.empty(parameter.shape)
+            ema_update(self.dev, store[key], parameter, weight)
+
+    def adopt_averages(self):
+        """Make the averages, where there are any, the model's values."""
+        for parameter, store, key in self._averaged():
+            if key in store:
+                self.dev.copy(parameter, store.pop(key))
+
+    def _averaged(self):
+        points = self.model.points
+        for name in POINT_KEYS:
+            yield points[name], points, f"a.{name}"
+        for name, parameter in self.model.net.parameters.items():
+            yield parameter, self.averages, name
+
+    def arrays(self):
+        """{name: numpy array} of the state beside the model's own arrays."""
+        own = {f"moment.{name}": a.get() for name, a in self.moments.items()}
+        own |= {f"average.{name}": a.get() for name, a in self.averages.items()}
+        learned = {"ids", *POINT_KEYS}
+        return own | {f"state.{name}": a.get() for name, a in self.model.points.items() if name not in learned}
+
+    def restore(self, arrays):
+        """Take the state of a checkpoint, as written by arrays()."""
+        for name, array in arrays.items():
+            kind, _, rest = name.partition(".")
+            if kind == "moment":
+                self.moments[rest].set(array)
+            elif kind == "average":
+                self.averages[rest] = self.dev.upload(array)
+            elif kind == "state":
+                self.model.points[rest] = self.dev.upload(array)

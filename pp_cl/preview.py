@@ -1,0 +1,38 @@
+"""Pictures that show how well views are predicted."""
+
+import numpy as np
+from PIL import Image, ImageDraw
+
+from pp_cl.image import to_8bit, write_png
+
+ERROR_GAIN = 4
+GAP = 2  # pixels between the images
+HEADER = 14  # pixels for the captions
+CAPTIONS = ("prediction", "truth", f"error x{ERROR_GAIN}")
+LINE, INK = 200, (60, 60, 60)
+
+
+def comparison(predictions, truths):
+    """uint8 picture of equally large float (H, W, 3) images in [0, 1]: a row of prediction, truth and error for each view.
+
+    The error is the absolute difference, mean of the channels, ERROR_GAIN times; white is none, as around the object.
+    """
+    rows = [np.stack([p, t, _error(p, t)]) for p, t in zip(predictions, truths, strict=True)]
+    tiles = np.pad(to_8bit(rows), ((0, 0), (0, 0), (0, GAP), (0, GAP), (0, 0)), constant_values=LINE)
+    n, columns, height, width, _ = tiles.shape
+    table = tiles.transpose(0, 2, 1, 3, 4).reshape(n * height, columns * width, 3)[:-GAP, :-GAP]
+    picture = Image.fromarray(np.pad(table, ((HEADER, 0), (0, 0), (0, 0)), constant_values=255))
+    draw = ImageDraw.Draw(picture)
+    for column, caption in enumerate(CAPTIONS):
+        draw.text((column * width + 3, 1), caption, fill=INK)
+    return np.array(picture)
+
+
+def _error(prediction, truth):
+    error = np.abs(np.asarray(prediction, np.float64) - truth).mean(axis=2, keepdims=True)
+    return np.repeat(1 - ERROR_GAIN * error, 3, axis=2)
+
+
+def write_comparison(path, predictions, truths):
+    """Write comparison(...) as a PNG file."""
+    write_png(path, comparison(predictions, truths))

@@ -1,0 +1,94 @@
+"""From a model and a camera to a picture, and back to gradients: the one place that writes the order of the stages.
+
+    project -> pairs -> blend weights -> shade what is seen -> blend features -> U-Net
+"""
+
+import numpy as np
+
+from pp_cl.blend import Blend
+from pp_cl.pairs import Pairs
+from pp_cl.points import SH_DEGREES
+from pp_cl.project import Footprint, project_grid
+from pp_cl.shade import shade_forward
+
+NETWORK_MULTIPLE = 4  # the U-Net halves its input twice
+PAPER_DEPTH_RANGE = 4.0  # far - near of the scenes for which the paper's radius of 0.0015 was chosen
+
+
+class Renderer:
+    """Renders a model; holds what the backward pass needs of the last forward pass.
+
+    settings: config.PointsConfig. offset: (left, top) of the asked-for picture in the padded one. camera: (20,) device
+    buffer of the padded camera.
+    """
+
+    def __init__(self, dev, model, settings):
+        self.dev = dev
+        self.model = model
+        self.settings = settings
+        self.footprint = Footprint(settings.footprint)
+        self.pairs = Pairs(dev, self.footprint)
+        self.blend = Blend(dev, self.footprint, mean=settings.mean_gradient)
+        self.offset = (0, 0)
+        self.camera, self.radius_buffer = dev.empty((20,)), dev.empty((1,))
+        self._count = self._size = None
+
+    def forward(self, camera, gamma, dropout=0.0, seed=0, training=False):
+        """(H, W, 3) device array, unclamped, of the camera padded to a multiple of 4; see `offset`.
+
+        dropout: share of the points left out, at random by `seed`. training: keep what backward() needs.
+        """
+        self.blend_weights(camera, gamma, dropout, seed)
+        points = self.model.points
+        shade_forward(self.dev, self.camera, self.point_camera, self.pairs.seen, [points[f"sh{d}"] for d in SH_DEGREES], self.point_features)
+        self.blend.forward(self.pairs, self.point_features, self.features)
+        return self.model.net.forward(self.features, training=training)
+
+    def blend_weights(self, camera, gamma, dropout=0.0, seed=0):
+        """The first stages of forward(): who covers which pixel, and how much."""
+        padded, *self.offset = camera.padded(NETWORK_MULTIPLE)
+        self._allocate(padded.height, padded.width)
+        self.camera.set(padded.packed())
+        points, settings = self.model.points, self.settings
+        radius = self._radius(padded)
+        self.radius_buffer.set(np.array([radius], np.float32))
+        project_grid(self.dev, self.footprint, self.camera, self.model.grid_buffer, points["ids"], radius, self.point_camera, dropout, seed)
+        self.pairs.build(self.camera, (padded.height, padded.width), self.point_camera, self.radius_buffer)
+        self.blend.weights(self.pairs, self.camera, points["opacity"], gamma, settings.max_tracked, settings.stop)
+
+    def backward(self, grad_image):
+        """(grad_point_features (N,16), grad_opacity (N)) from the gradient of forward()'s picture.
+
+        The gradients of the network's parameters lie in model.net.gradients; those of the SH coefficients are rank one in
+        grad_point_features, and the optimiser never forms them.
+        """
+        grad_features = self.model.net.backward(grad_image)
+        self.blend.backward(self.pairs, self.point_features, self.features, grad_features, self.grad_point_features, self.grad_opacity)
+        return self.grad_point_features, self.grad_opacity
+
+    def add_point_weights(self, total):
+        """Add each point's blend weight in the last picture to total (N)."""
+        self.blend.add_point_weights(self.pairs, total)
+
+    def picture(self, camera, gamma):
+        """(H, W, 3) float32 numpy picture of the camera, clamped to [0, 1]."""
+        image = self.forward(camera, gamma).get()
+        left, top = self.offset
+        return np.clip(image[top:top + camera.height, left:left + camera.width], 0, 1)
+
+    def _radius(self, camera):
+        """The points' radius in world units for a camera."""
+        if self.settings.footprint == "soft":
+            return self.settings.radius * self.model.grid.edge
+        return self.settings.radius * (camera.far - camera.near) / PAPER_DEPTH_RANGE
+
+    def _allocate(self, height, width):
+        """Buffers for the model's present number of points and this size."""
+        n = self.model.count
+        if n != self._count:
+            self._count = n
+            self.point_camera, self.point_features = self.dev.empty((n, 4)), self.dev.empty((n, 16))
+            self.grad_point_features, self.grad_opacity = self.dev.empty((n, 16)), self.dev.empty((n,))
+        if (height, width) != self._size:
+            self._size = (height, width)
+            self.features = self.dev.empty((height, width, 16))

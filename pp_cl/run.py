@@ -1,0 +1,174 @@
+"""The folder of a run: starting, resuming, logging, previews and checkpoints around the training loop."""
+
+import hashlib
+import json
+import sys
+import time
+
+import numpy as np
+from tqdm import tqdm
+
+from pp_cl.checkpoint import load_checkpoint, remove_leftovers, save_checkpoint, write_text
+from pp_cl.device import open_device
+from pp_cl.errors import UserError
+from pp_cl.hull import build_grid, depth_range
+from pp_cl.memory import memory_plan, print_plan
+from pp_cl.model import Model
+from pp_cl.preview import write_comparison
+from pp_cl.scene import load_scene, reduced_camera
+from pp_cl.train import Trainer
+
+CHECKPOINT = "checkpoint.npz"
+
+
+def open_scene(dev, config, splits):
+    """Scene of config.scene.path with the given splits; `demo` is rendered on the device."""
+    if config.scene.path != "demo":
+        return load_scene(config.scene.path, splits)
+    from pp_cl.demo import demo_scene
+
+    return demo_scene(dev)
+
+
+def fingerprint(views):
+    """Hex digest of the views' names, cameras and sizes, by which a checkpoint knows its scene."""
+    digest = hashlib.sha256()
+    for view in views:
+        camera = view.camera
+        digest.update(f"{view.name} {camera.width}x{camera.height} ".encode())
+        digest.update(np.round(np.append(camera.pose.ravel(), [camera.fx, camera.fy, camera.cx, camera.cy]), 6).tobytes())
+    return digest.hexdigest()
+
+
+def with_depth_range(views, near_far):
+    """The views with (near, far) in their cameras, for scenes that store none."""
+    from dataclasses import replace
+
+    return [replace(v, camera=replace(v.camera, near=near_far[0], far=near_far[1])) for v in views]
+
+
+def train_run(folder, config, device_choice):
+    """Train into `folder`, from its last checkpoint where there is one.
+
+    config: config.Config. Raises UserError for a scene, folder or checkpoint that does not fit; a start that fails
+    writes nothing.
+    """
+    checkpoint = folder / CHECKPOINT
+    _check_folder(folder)
+    stored = load_checkpoint(checkpoint) if checkpoint.exists() else None
+    if stored and stored[0].get("finished"):
+        print(f"{folder} is finished ({stored[0]['step']} steps); `pp-cl eval {folder} --metrics` measures it")
+        return
+    dev = open_device(device_choice)
+    print(f"device: {dev.name} [{dev.info['platform']}]")
+    scene = open_scene(dev, config, ("train",))
+    trainer, info = _resume(dev, config, scene, *stored, checkpoint) if stored else _start(dev, config, scene)
+    print_plan(memory_plan(dev, config, trainer.model, trainer.views), dev)
+
+    folder.mkdir(parents=True, exist_ok=True)
+    remove_leftovers(folder)
+    write_text(folder / "config.json", config.to_json() + "\n")
+    _optimise(trainer, config, folder, info)
+
+
+def _check_folder(folder):
+    if folder.exists() and not folder.is_dir():
+        raise UserError(f"{folder}: is not a folder; choose another --out")
+    if folder.is_dir() and not (folder / "config.json").exists() and any(p for p in folder.iterdir() if not p.name.startswith(".")):
+        raise UserError(f"{folder}: holds other files and no config.json; choose an empty or new folder for --out")
+
+
+def _start(dev, config, scene):
+    """(Trainer, info) of a run from its beginning."""
+    views = scene.splits["train"]
+    reduced_camera(views[0], config.scene.downscale)  # refuses a reduction that leaves too little
+    start = time.perf_counter()
+    hull = build_grid(dev, views, config.points.count)
+    near_far = depth_range(views, hull) if not scene.depth_range_stored else (views[0].camera.near, views[0].camera.far)
+    if not scene.depth_range_stored:
+        views = with_depth_range(views, near_far)
+    dims = "x".join(str(d) for d in hull.grid.dims)
+    print(f"hull: {len(hull.ids)} points on a {dims} grid, edge {hull.grid.edge:.6g}, depth {near_far[0]:.3f} to {near_far[1]:.3f} "
+          f"({time.perf_counter() - start:.1f} s)")
+    model = Model.create(dev, hull.grid, hull.ids, near_far, config.network.widths, config.train.seed)
+    info = {"scene": fingerprint(scene.splits["train"]), "initial_points": len(hull.ids), "depth_range_stored": scene.depth_range_stored}
+    return Trainer(dev, config, model, views), info
+
+
+def _resume(dev, config, scene, header, arrays, file):
+    """(Trainer, info) of a run that goes on."""
+    views = scene.splits["train"]
+    if header["scene"] != fingerprint(views):
+        raise UserError(f"{file}: belongs to another scene than {config.scene.path}; use another --out")
+    model = Model.load(dev, header, arrays, config.network.widths, file)
+    if not header["depth_range_stored"]:
+        views = with_depth_range(views, model.depth_range)
+    trainer = Trainer(dev, config, model, views)
+    trainer.restore(header["step"], arrays)
+    print(f"resuming at step {header['step']} with {model.count} points")
+    return trainer, {key: header[key] for key in ("scene", "initial_points", "depth_range_stored")}
+
+
+def _optimise(trainer, config, folder, info):
+    """The loop over steps, with its log, previews and checkpoints."""
+    settings = config.train
+    log, seconds = _open_log(folder / "log.jsonl", trainer.step)
+    preview_every = -(-settings.iterations // settings.previews) if settings.previews else settings.iterations + 1
+    bar = tqdm(total=settings.iterations, initial=trainer.step, unit="step", mininterval=1 if sys.stderr.isatty() else 30, file=sys.stderr)
+    with log, bar:
+        while trainer.step < settings.iterations:
+            start = time.perf_counter()
+            terms = trainer.train_step()
+            t = trainer.step
+            last = t == settings.iterations
+            seconds += time.perf_counter() - start
+            bar.update()
+            if t % settings.log_every == 0 or last:
+                _log(log, {"step": t, "seconds": round(seconds, 3), **terms, "points": trainer.model.count, "rates": trainer.rates()})
+                bar.set_postfix(psnr=f"{terms['psnr']:.2f}", points=trainer.model.count)
+            if t % settings.checkpoint_every == 0 and not last:
+                _save(trainer, folder, info, finished=False)
+            if t % preview_every == 0 or last:
+                _preview(trainer, folder, f"step_{t:06d}.png")
+        start = time.perf_counter()
+        trainer.finish()
+        seconds += time.perf_counter() - start
+        _save(trainer, folder, info, finished=True)
+        _log(log, {"step": trainer.step, "seconds": round(seconds, 3), "points": trainer.model.count, "finished": True})
+    print(f"trained {trainer.step} steps in {seconds:.1f} s; {trainer.model.count} of {info['initial_points']} points remain; wrote {folder / CHECKPOINT}")
+
+
+def _open_log(path, step):
+    """(file open for appending, training seconds so far): rows after `step` are cut off, they will be made again."""
+    rows = []
+    if path.exists():
+        for line in path.read_text().splitlines():
+            try:
+                row = json.loads(line)
+            except ValueError:
+                break  # the line that a kill cut short
+            if row["step"] > step or row.get("finished"):
+                break
+            rows.append(row)
+    write_text(path, "".join(json.dumps(row) + "\n" for row in rows))
+    return open(path, "a"), rows[-1]["seconds"] if rows else 0.0
+
+
+def _log(file, row):
+    try:
+        file.write(json.dumps(row, allow_nan=False) + "\n")
+        file.flush()
+    except OSError as error:
+        raise UserError(f"{file.name}: cannot be written ({error.strerror}); free some space, the same command goes on") from error
+
+
+def _save(trainer, folder, info, finished):
+    header = trainer.model.header() | info | {"step": trainer.step, "finished": finished}
+    save_checkpoint(folder / CHECKPOINT, header, trainer.model.arrays() if finished else trainer.arrays())
+
+
+def _preview(trainer, folder, name):
+    """Prediction, truth and error of the first training view."""
+    (folder / "previews").mkdir(exist_ok=True)
+    view = trainer.views[0]
+    write_comparison(folder / "previews" / name, [trainer.picture(view)], [trainer.truth(view)])

@@ -1,0 +1,41 @@
+"""Exclusive prefix sums on the device, and the list of the non-zero entries."""
+
+import numpy as np
+import pyopencl as cl
+
+BLOCK = 512  # of cl/scan.cl
+
+
+def exclusive_scan(dev, values, offsets, flags=False):
+    """Write offsets[i] = sum of values[:i], so that offsets[N] is the total.
+
+    values: (N) uint32, N >= 1. offsets: (N+1) uint32. flags: every non-zero value counts as one.
+    """
+    n = values.size
+    blocks = -(-n // BLOCK)
+    program = dev.program("scan", FLAGS=int(flags))
+    if blocks == 1:
+        block_offset = dev.zeros((2,), np.uint32)
+    else:
+        block_sum = dev.empty((blocks,), np.uint32)
+        block_offset = dev.empty((blocks + 1,), np.uint32)
+        program.launch("scan_sums", blocks, n=n, b=blocks, values=values, block_sum=block_sum)
+        exclusive_scan(dev, block_sum, block_offset)
+    program.launch("scan_offsets", blocks, n=n, b=blocks, values=values, block_offset=block_offset, offsets=offsets)
+
+
+def read_total(dev, offsets):
+    """The last entry of `offsets` as an int; waits for the device."""
+    total = np.empty(1, np.uint32)
+    cl.enqueue_copy(dev.queue, total, offsets.data, src_offset=offsets.nbytes - total.nbytes)
+    return int(total[0])
+
+
+def nonzero(dev, values, offsets, indices):
+    """Number of non-zero values; writes their indices, ascending, to the front of `indices`. Waits for the device.
+
+    values: (N) uint32, N >= 1. offsets: (N+1) uint32 scratch, left holding each value's number. indices: (N) uint32.
+    """
+    exclusive_scan(dev, values, offsets, flags=True)
+    dev.program("scan", FLAGS=1).launch("scan_nonzero", values.size, n=values.size, values=values, offsets=offsets, indices=indices)
+    return read_total(dev, offsets)

@@ -1,0 +1,52 @@
+"""Smoothing of the SH coefficients over the grid: a total-variation step outside Adam, where it does not disturb the moments."""
+
+import numpy as np
+
+NONE = 0xFFFFFFFF
+CHUNK = 16384  # points smoothed at a time: their new values stay in a CPU's cache until they are written back
+MOST_COEFFICIENTS = 5  # of one point in one degree
+
+
+def neighbour_table(dev, grid, ids):
+    """(N, 6) uint32: index of each point's neighbours -x, +x, -y, +y, -z, +z; 0xffffffff where the grid has no point.
+
+    grid: (8,) of Grid.packed(). ids: (N,) uint32 grid ids, ascending.
+    """
+    neighbours = dev.empty((len(ids), 6), np.uint32)
+    dev.program("smooth").launch("neighbour_table", len(ids), n=len(ids), grid=grid, ids=ids, neighbours=neighbours)
+    return neighbours
+
+
+class Smoother:
+    """Smooths per-point coefficients over the grid; made anew when the points change.
+
+    grid: (8,) of Grid.packed(). ids: (N,) uint32 grid ids, ascending.
+    """
+
+    def __init__(self, dev, grid, ids):
+        self.dev = dev
+        self.neighbours = neighbour_table(dev, grid, ids)
+        # A chunk is written back once the next one is computed, so no neighbour may lie further than one chunk away.
+        after = self.neighbours.get()[:, 1::2]
+        reach = np.where(after == NONE, 0, after - np.arange(len(ids), dtype=np.uint32)[:, None]).max(initial=0)
+        self.chunk = min(max(int(reach), CHUNK), len(ids))
+        self._slots = [dev.empty((self.chunk * MOST_COEFFICIENTS, 16)) for _ in range(2)]
+
+    def smooth(self, sh, amount):
+        """f += amount * (mean of the existing neighbours' f - f), in place.
+
+        All reads see the old values; a point without neighbours stays as it is. amount: 0 to 1; 4 * lambda * learning rate
+        for every fourth step. sh: (N, K, 16) float32, K up to 5.
+        """
+        launch = self.dev.program("smooth").launch
+        n, coefficients, _ = sh.shape
+        waiting = None
+        for start in range(0, n, self.chunk):
+            part = {"first": start, "count": min(self.chunk, n - start), "smoothed": self._slots[start // self.chunk % 2],
+                    "n": n, "k": coefficients, "sh": sh}
+            launch("smooth_gather", part["count"], neighbours=self.neighbours, amount=amount, **part)
+            if waiting:
+                launch("smooth_scatter", waiting["count"], **waiting)
+            waiting = part
+        if waiting:
+            launch("smooth_scatter", waiting["count"], **waiting)

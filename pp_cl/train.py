@@ -1,0 +1,158 @@
+"""The training loop: what one step does, in the order of the paper."""
+
+import math
+
+import numpy as np
+
+from pp_cl.errors import UserError
+from pp_cl.loss import Loss
+from pp_cl.model import POINT_KEYS
+from pp_cl.optimiser import Optimiser, Rates
+from pp_cl.points import SH_DEGREES
+from pp_cl.prune import keep_indices, prune
+from pp_cl.render import Renderer
+from pp_cl.scene import object_box, reduced_camera
+from pp_cl.schedule import average_weight, gamma
+from pp_cl.smooth import neighbour_table, smooth
+from pp_cl.target import Target
+
+BOX_MARGIN = 8  # pixels around the object from which crops are drawn
+
+
+class Trainer:
+    """Optimises a model on views; every random choice is a function of (seed, step), so a run can start at any step."""
+
+    def __init__(self, dev, config, model, views):
+        self.dev = dev
+        self.config = config.train
+        self.network = config.network
+        self.gamma = config.points.gamma
+        self.downscale = config.scene.downscale
+        self.model = model
+        self.views = views
+        self.step = 0
+        self.renderer = Renderer(dev, model, config.points)
+        self.target = Target(dev, self.downscale)
+        self.loss = Loss(dev, self.config.ssim_weight)
+        self.optimiser = Optimiser(dev, model)
+        self.boxes = object_box(views, self.downscale, BOX_MARGIN)
+        model.points["weight"] = dev.zeros((model.count,))
+        self._neighbours = self._scratch = None
+
+    # ---------------------------------------------------------------------------------------------- one step
+
+    def train_step(self):
+        """One step; returns {"loss", "l1", "ssim", "psnr"} of its crop. Raises UserError if the loss is not finite."""
+        t, config = self.step, self.config
+        rng = np.random.default_rng((config.seed, t))
+        rates = Rates.at(t, self.network, config)
+        view_index, box, phase = self.draw(rng)
+
+        view = self.views[view_index]
+        camera = self.target.camera(view, *box, phase)
+        self.target.load(view)
+        target = self.target.crop(*box, phase)
+
+        image = self.renderer.forward(camera, gamma(t, config.iterations, *self.gamma), dropout=config.dropout,
+                                      seed=int(rng.integers(2**32)), training=True)
+        grad_image = self.loss.forward_backward(image, target, *self.renderer.offset)
+        grads = self.renderer.backward(grad_image)
+        self.optimiser.update(t + 1, rates, grads, self.renderer.camera, config.feature_eps / target.size)
+        self.renderer.add_point_weights(self.model.points["weight"])
+
+        self.step = t + 1
+        self._regularise(rates)
+        return self._terms()
+
+    def draw(self, rng):
+        """(view index, (x0, y0, width, height), phase) of this step: views in a new random order every epoch."""
+        config, n = self.config, len(self.views)
+        epoch, place = divmod(self.step, n)
+        index = int(np.random.default_rng((config.seed, epoch, n)).permutation(n)[place])
+        camera = reduced_camera(self.views[index], self.downscale)
+        phases = self.downscale if config.phases else 1
+        phase = tuple(int(p) for p in rng.integers(phases, size=2))
+        if config.crop == 0:
+            return index, (0, 0, camera.width, camera.height), phase
+        x0, y0, x1, y1 = self.boxes[index]
+        width, height = min(config.crop, camera.width), min(config.crop, camera.height)
+        return index, (_draw_start(rng, x0, x1, width, camera.width), _draw_start(rng, y0, y1, height, camera.height), width, height), phase
+
+    def _terms(self):
+        total, l1, dissimilarity, mse = (float(x) for x in self.loss.terms.get())
+        if not math.isfinite(total):
+            raise UserError(f"the loss is not finite at step {self.step}; the last checkpoint is kept: lower train.sh_rate or network.rate")
+        return {"loss": total, "l1": l1, "ssim": 1 - dissimilarity, "psnr": -10 * math.log10(max(mse, 1e-10))}
+
+    # ------------------------------------------------------------------------------- between the steps
+
+    def _regularise(self, rates):
+        """Grid smoothing, averaging and pruning, where they are due after this step."""
+        config, t = self.config, self.step
+        if config.smooth > 0 and t % config.smooth_every == 0:
+            self._smooth(rates)
+        weight = average_weight(t, config.iterations) if config.average else 0
+        if weight > 0:
+            self.optimiser.average(weight)
+        if t % config.prune_every == 0 and t < config.iterations:
+            self._prune(self.model.points["weight"], config.prune_weight * config.prune_every)
+            self.dev.fill(self.model.points["weight"], 0)
+
+    def _smooth(self, rates):
+        """Pull every SH coefficient towards the mean of its grid neighbours, outside Adam."""
+        points = self.model.points
+        if self._neighbours is None:
+            self._neighbours = neighbour_table(self.dev, self.model.grid_buffer, points["ids"])
+            self._scratch = self.dev.empty((self.model.count, 16))
+        for degree in SH_DEGREES:
+            smooth(self.dev, points[f"sh{degree}"], self._neighbours, self.config.smooth * self.config.smooth_every * rates.sh[degree],
+                   self._scratch)
+
+    def _prune(self, weights, least):
+        """Drop the points whose weight, or opacity, is too low; moments and averages go with them."""
+        points = self.model.points
+        keep = keep_indices(self.dev, weights, least, points["opacity"], self.config.prune_opacity)
+        if len(keep) < self.model.count:
+            prune(self.dev, points, keep)
+            self._neighbours = self._scratch = None
+
+    def finish(self):
+        """Adopt the averages, and drop the points that hardly weigh anything in any training view."""
+        self.optimiser.adopt_averages()
+        if self.config.final_weight > 0:
+            total = self.dev.zeros((self.model.count,))
+            for view in self.views:
+                self.renderer.blend_weights(reduced_camera(view, self.downscale), self.gamma[1])
+                self.renderer.add_point_weights(total)
+            self._prune(total, self.config.final_weight)
+        self.model.points = {name: self.model.points[name] for name in ("ids", *POINT_KEYS)}
+
+    def rates(self):
+        """The learning rates of the last step, for the log."""
+        return vars(Rates.at(max(self.step - 1, 0), self.network, self.config))
+
+    def picture(self, view):
+        """(H,W,3) float32 in [0, 1]: the present model's picture of a view."""
+        return self.renderer.picture(reduced_camera(view, self.downscale), gamma(self.step, self.config.iterations, *self.gamma))
+
+    def truth(self, view):
+        """(H,W,3) float32 in [0, 1]: what the picture should be."""
+        camera = reduced_camera(view, self.downscale)
+        self.target.load(view)
+        return self.target.crop(0, 0, camera.width, camera.height).get()
+
+    def arrays(self):
+        """{name: numpy array} of the whole state."""
+        return self.model.arrays() | self.optimiser.arrays()
+
+    def restore(self, step, arrays):
+        """Go on after `step` steps with the arrays of a checkpoint; the model has been loaded already."""
+        self.step = step
+        self.optimiser.restore(arrays)
+
+
+def _draw_start(rng, low, high, size, limit):
+    """First pixel of a crop of `size` that shows a part of [low, high) as large as possible, inside [0, limit)."""
+    first, last = sorted((low, high - size))
+    first, last = max(first, 0), min(last, limit - size)
+    return int(rng.integers(min(first, last), max(first, last) + 1))

@@ -1,0 +1,57 @@
+"""Fixtures: one guarded device a session; the count of kernels launched and of tests that had real data."""
+
+import numpy as np
+import pytest
+from helpers import DATA, GuardedDevice
+
+from pp_cl.device import open_device
+from pp_cl.launch import Program
+
+COUNTS = {"launches": 0, "data": 0}
+
+
+@pytest.fixture(scope="session")
+def session_device():
+    """The device of PP_DEVICE, else the default one, with guarded buffers."""
+    return GuardedDevice(open_device().device)
+
+
+@pytest.fixture
+def dev(session_device, monkeypatch):
+    """The guarded device; the canaries are checked when the test ends."""
+    launch = Program.launch
+
+    def counted(self, *args, **kwargs):
+        COUNTS["launches"] += 1
+        return launch(self, *args, **kwargs)
+
+    monkeypatch.setattr(Program, "launch", counted)
+    yield session_device
+    session_device.finish()
+    session_device.check()
+
+
+@pytest.fixture
+def rng():
+    """A seeded numpy generator."""
+    return np.random.default_rng(7)
+
+
+@pytest.fixture
+def data():
+    """The folder of real data (PP_DATA); skips where there is none."""
+    if not DATA.is_dir():
+        pytest.skip(f"no real data at {DATA}; set PP_DATA")
+    COUNTS["data"] += 1
+    return DATA
+
+
+def pytest_terminal_summary(terminalreporter):
+    """Say what really ran."""
+    terminalreporter.write_line(f"kernel launches: {COUNTS['launches']}; tests on real data: {COUNTS['data']}")
+
+
+def pytest_sessionfinish(session, exitstatus):
+    """A whole run that launched no kernel has tested nothing."""
+    if session.testscollected > 100 and COUNTS["launches"] == 0:
+        session.exitstatus = 1

@@ -1,0 +1,31 @@
+"""Float64 twin of cl/hull.cl: the mask of a view, and which positions the masks keep."""
+
+import numpy as np
+
+
+def dilated_mask(alpha, threshold):
+    """(H, W) bool: some pixel of the 3x3 neighbourhood has an alpha above the threshold."""
+    height, width = alpha.shape
+    mask = np.zeros((height, width), bool)
+    for y in range(height):
+        for x in range(width):
+            mask[y, x] = (alpha[max(y - 1, 0):y + 2, max(x - 1, 0):x + 2] > threshold).any()
+    return mask
+
+
+def kept(views, positions, threshold):
+    """((N,) bool kept, (N,) pixels to the nearest pixel border of any view that has the position before it)."""
+    seen = np.zeros(len(positions), bool)
+    alive = np.ones(len(positions), bool)
+    border = np.full(len(positions), np.inf)
+    for view in views:
+        camera, mask = view.camera, dilated_mask(view.image[..., 3], threshold)
+        x, y, z = camera.pose[:, :3].T @ (positions - camera.eye).T
+        for n in np.flatnonzero(z > 0):
+            u = camera.fx * x[n] / z[n] + camera.cx
+            v = camera.fy * y[n] / z[n] + camera.cy
+            border[n] = min(border[n], abs(u - round(u)), abs(v - round(v)))
+            if 0 <= u < camera.width and 0 <= v < camera.height:
+                seen[n] = True
+                alive[n] &= mask[int(v), int(u)]
+    return alive & seen, border

@@ -1,0 +1,56 @@
+"""Float64 twin of cl/loss.cl: the textbook SSIM with 2-D windows, and gradients derived from that form."""
+
+import numpy as np
+
+C1, C2 = 0.01**2, 0.03**2
+
+
+def _window():
+    x = np.arange(-5, 6)
+    g = np.exp(-x * x / (2 * 1.5**2))
+    return np.outer(g, g) / g.sum() ** 2
+
+
+WINDOW = _window()
+
+
+def windowed(image):
+    """(H-10, W-10, 3) weighted mean of each 11x11 window of an (H, W, 3) image."""
+    h, w, _ = image.shape
+    return sum(WINDOW[j, i] * image[j:h - 10 + j, i:w - 10 + i] for j in range(11) for i in range(11))
+
+
+def unwindowed(slopes, shape):
+    """The adjoint of windowed."""
+    h, w, _ = shape
+    image = np.zeros(shape)
+    for j in range(11):
+        for i in range(11):
+            image[j:h - 10 + j, i:w - 10 + i] += WINDOW[j, i] * slopes
+    return image
+
+
+def ssim(x, y):
+    """(mean SSIM, its gradient with respect to x)."""
+    mx, my = windowed(x), windowed(y)
+    vx, vy, cov = windowed(x * x) - mx**2, windowed(y * y) - my**2, windowed(x * y) - mx * my
+    a1, a2, b1, b2 = 2 * mx * my + C1, 2 * cov + C2, mx**2 + my**2 + C1, vx + vy + C2
+    similarity = a1 * a2 / (b1 * b2)
+    d_mx = 2 * my * a2 / (b1 * b2) - 2 * mx * similarity / b1
+    d_vx = -similarity / b2
+    d_cov = 2 * a1 / (b1 * b2)
+    gradient = (unwindowed(d_mx - 2 * mx * d_vx - my * d_cov, x.shape)
+                + 2 * x * unwindowed(d_vx, x.shape) + y * unwindowed(d_cov, x.shape))
+    return similarity.mean(), gradient / similarity.size
+
+
+def loss(prediction, target, weight):
+    """(terms (4,): L, L1, 1 - SSIM, mean squared error; gradient (H, W, 3)) of equally large images."""
+    x, y = np.asarray(prediction, np.float64), np.asarray(target, np.float64)
+    l1, gradient = np.abs(x - y).mean(), np.sign(x - y) / x.size
+    dissimilarity = 0.0
+    if weight and min(x.shape[:2]) >= 11:
+        similarity, d_x = ssim(x, y)
+        dissimilarity = 1 - similarity
+        gradient = gradient - weight * d_x
+    return np.array([l1 + weight * dissimilarity, l1, dissimilarity, ((x - y) ** 2).mean()]), gradient

@@ -1,0 +1,58 @@
+"""Float64 twins of what changes parameters: Adam as torch computes it, the SH gradient written out, grid smoothing."""
+
+import numpy as np
+
+
+class Adam:
+    """torch.optim.Adam without weight decay, for one array."""
+
+    def __init__(self, parameter, beta1=0.9, beta2=0.999):
+        self.parameter = np.array(parameter, np.float64)
+        self.m, self.v, self.t = np.zeros_like(self.parameter), np.zeros_like(self.parameter), 0
+        self.betas = beta1, beta2
+
+    def step(self, grad, rate, eps, low=-np.inf, high=np.inf):
+        beta1, beta2 = self.betas
+        grad = np.asarray(grad, np.float64)
+        self.t += 1
+        self.m = beta1 * self.m + (1 - beta1) * grad
+        self.v = beta2 * self.v + (1 - beta2) * grad * grad
+        denominator = np.sqrt(self.v) / np.sqrt(1 - beta2**self.t) + eps
+        self.parameter = np.clip(self.parameter - rate / (1 - beta1**self.t) * self.m / denominator, low, high)
+
+
+def sh_basis(direction):
+    """(9, ...) PlenOctrees' real basis at unit directions (..., 3)."""
+    x, y, z = np.moveaxis(direction, -1, 0)
+    pi = np.pi
+    return np.stack([
+        0 * x + np.sqrt(1 / (4 * pi)), -np.sqrt(3 / (4 * pi)) * y, np.sqrt(3 / (4 * pi)) * z, -np.sqrt(3 / (4 * pi)) * x,
+        np.sqrt(15 / (4 * pi)) * x * y, -np.sqrt(15 / (4 * pi)) * y * z, np.sqrt(5 / (16 * pi)) * (3 * z * z - 1),
+        -np.sqrt(15 / (4 * pi)) * x * z, np.sqrt(15 / (16 * pi)) * (x * x - y * y)])
+
+
+def sh_gradient(positions, eye, grad_point_features, degree):
+    """(N, 2*degree + 1, 16) gradient of the SH coefficients of one degree."""
+    towards = positions - eye
+    basis = sh_basis(towards / np.linalg.norm(towards, axis=-1, keepdims=True))[degree**2:(degree + 1) ** 2]
+    return basis.T[:, :, None] * np.asarray(grad_point_features, np.float64)[:, None, :]
+
+
+def neighbours(ids, dims):
+    """Per point the indices of its neighbours -x, +x, -y, +y, -z, +z, None where there is none."""
+    nx, ny, nz = dims
+    index = {(int(i) % nx, int(i) // nx % ny, int(i) // (nx * ny)): n for n, i in enumerate(ids)}
+    assert all(z < nz for _, _, z in index)
+    offsets = [(-1, 0, 0), (1, 0, 0), (0, -1, 0), (0, 1, 0), (0, 0, -1), (0, 0, 1)]
+    return [[index.get((x + a, y + b, z + c)) for a, b, c in offsets] for x, y, z in index]
+
+
+def smoothed(values, ids, dims, amount):
+    """values (N, ...) moved by `amount` towards the mean of their neighbours."""
+    old = np.asarray(values, np.float64)
+    new = old.copy()
+    for i, around in enumerate(neighbours(ids, dims)):
+        around = [j for j in around if j is not None]
+        if around:
+            new[i] += amount * (old[around].mean(axis=0) - old[i])
+    return new

@@ -1,0 +1,52 @@
+"""The camera and its device layout, crops, phases, downscaling and padding."""
+
+import numpy as np
+import pytest
+
+from pp_cl.camera import CAMERA_FLOATS, Camera
+
+
+def make_camera(rng, width=40, height=30):
+    rotation, _ = np.linalg.qr(rng.normal(size=(3, 3)))
+    rotation *= np.sign(np.linalg.det(rotation))
+    return Camera(np.c_[rotation, rng.normal(size=3)], 50.0, 55.0, 19.0, 16.5, width, height, 1.0, 5.0)
+
+
+def project(camera, points):
+    """(N, 2) float64 pixel coordinates (pixel centres at +0.5)."""
+    c = (points - camera.eye) @ camera.pose[:, :3]
+    return np.stack([camera.fx * c[:, 0] / c[:, 2] + camera.cx, camera.fy * c[:, 1] / c[:, 2] + camera.cy], -1)
+
+
+def points_in_front(camera, rng, n=20):
+    return camera.eye + (rng.uniform([-1, -1, 2], [1, 1, 4], (n, 3))) @ camera.pose[:, :3].T
+
+
+def test_packed_layout(rng):
+    camera = make_camera(rng)
+    packed = camera.packed()
+    assert packed.shape == (CAMERA_FLOATS,) and packed.dtype == np.float32
+    point = points_in_front(camera, rng, 1)[0]
+    in_camera = packed[:9].reshape(3, 3) @ (point - packed[9:12])
+    np.testing.assert_allclose(in_camera, (point - camera.eye) @ camera.pose[:, :3], rtol=1e-5)
+    np.testing.assert_allclose(packed[12:], [50, 55, 19, 16.5, 1, 5, 40, 30])
+
+
+def test_crop_shift_and_downscale_move_pixels_as_they_say(rng):
+    camera = make_camera(rng)
+    points = points_in_front(camera, rng)
+    uv = project(camera, points)
+    np.testing.assert_allclose(project(camera.crop(3, -2, 10, 10), points), uv - [3, -2])
+    np.testing.assert_allclose(project(camera.shifted(0.25, 0.75), points), uv - [0.25, 0.75])
+    np.testing.assert_allclose(project(camera.downscaled(4), points), uv / 4)
+    assert (camera.downscaled(4).width, camera.downscaled(4).height) == (10, 7)
+
+
+@pytest.mark.parametrize("width, height", [(40, 30), (1, 1), (33, 31), (4, 8)])
+def test_padding_keeps_every_pixel(rng, width, height):
+    camera = make_camera(rng, width, height)
+    padded, left, top = camera.padded(4)
+    assert padded.width % 4 == padded.height % 4 == 0
+    assert 0 <= padded.width - width < 4 and 0 <= padded.height - height < 4
+    points = points_in_front(camera, rng)
+    np.testing.assert_allclose(project(padded, points), project(camera, points) + [left, top])

@@ -1,0 +1,109 @@
+"""Checkpoints: same content, same bytes; nothing half-written; nothing untrusted is believed."""
+
+import errno
+import io
+
+import numpy as np
+import pytest
+
+from pp_cl import checkpoint
+from pp_cl.checkpoint import atomic_file, load_checkpoint, remove_leftovers, save_checkpoint, write_json
+from pp_cl.errors import UserError
+
+ARRAYS = {"points.ids": np.arange(5, dtype=np.uint32), "points.opacity": np.linspace(0, 1, 5, dtype=np.float32)}
+
+
+def test_round_trip_and_equal_bytes(tmp_path):
+    a, b = tmp_path / "a.npz", tmp_path / "b.npz"
+    save_checkpoint(a, {"step": 3}, ARRAYS)
+    save_checkpoint(b, {"step": 3}, ARRAYS)
+    assert a.read_bytes() == b.read_bytes()
+    header, arrays = load_checkpoint(a)
+    assert header["step"] == 3 and set(arrays) == set(ARRAYS)
+    for name, array in ARRAYS.items():
+        np.testing.assert_array_equal(arrays[name], array)
+
+
+def test_bytes_do_not_depend_on_the_clock(tmp_path, monkeypatch):
+    save_checkpoint(tmp_path / "a.npz", {}, ARRAYS)
+    monkeypatch.setattr("time.time", lambda: 2e9)
+    save_checkpoint(tmp_path / "b.npz", {}, ARRAYS)
+    assert (tmp_path / "a.npz").read_bytes() == (tmp_path / "b.npz").read_bytes()
+
+
+@pytest.mark.parametrize("damage", ["truncate", "flip", "empty", "text"])
+def test_corrupt_checkpoint_is_one_clear_line(tmp_path, damage):
+    path = tmp_path / "checkpoint.npz"
+    save_checkpoint(path, {}, ARRAYS)
+    content = bytearray(path.read_bytes())
+    if damage == "flip":
+        content[content.find(b"\x93NUMPY") + 140] ^= 0xFF
+    path.write_bytes({"truncate": content[: len(content) // 2], "flip": content, "empty": b"", "text": b"hello"}[damage])
+    with pytest.raises(UserError, match="corrupt checkpoint") as caught:
+        load_checkpoint(path)
+    assert str(path) in str(caught.value) and "\n" not in str(caught.value)
+
+
+def test_pickled_arrays_are_refused(tmp_path):
+    path = tmp_path / "checkpoint.npz"
+    np.savez(path, header=np.frombuffer(b'{"format": 1}', np.uint8), bad=np.array([{"a": 1}], dtype=object))
+    with pytest.raises(UserError, match="corrupt"):
+        load_checkpoint(path)
+
+
+def test_nan_other_format_and_absence_are_refused(tmp_path):
+    path = tmp_path / "checkpoint.npz"
+    with pytest.raises(UserError, match="no such checkpoint"):
+        load_checkpoint(path)
+    save_checkpoint(path, {}, {"x": np.array([np.nan], np.float32)})
+    with pytest.raises(UserError, match="x holds NaN"):
+        load_checkpoint(path)
+    save_checkpoint(path, {"format": 99}, ARRAYS)
+    with pytest.raises(UserError, match="format 99"):
+        load_checkpoint(path)
+
+
+def test_full_disk_keeps_the_old_file(tmp_path, monkeypatch):
+    path = tmp_path / "checkpoint.npz"
+    save_checkpoint(path, {"step": 1}, ARRAYS)
+    before = path.read_bytes()
+
+    def full(*_args, **_kwargs):
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(checkpoint.os, "fsync", full)
+    with pytest.raises(UserError, match="free some space") as caught:
+        save_checkpoint(path, {"step": 2}, ARRAYS)
+    assert str(path) in str(caught.value)
+    assert path.read_bytes() == before and [p.name for p in tmp_path.iterdir()] == [path.name]
+
+
+def test_an_error_inside_the_block_leaves_nothing(tmp_path):
+    with pytest.raises(ZeroDivisionError), atomic_file(tmp_path / "x"):
+        raise ZeroDivisionError
+    assert not list(tmp_path.iterdir())
+
+
+def test_missing_folder_names_the_file(tmp_path):
+    with pytest.raises(UserError, match="no/x"), atomic_file(tmp_path / "no" / "x"):
+        pass
+
+
+def test_leftovers_of_a_killed_process_are_removed(tmp_path):
+    (tmp_path / ".checkpoint.npz.123.tmp").write_bytes(b"half")
+    (tmp_path / "log.jsonl").write_text("")
+    remove_leftovers(tmp_path)
+    assert [p.name for p in tmp_path.iterdir()] == ["log.jsonl"]
+
+
+def test_json_never_holds_nan(tmp_path):
+    with pytest.raises(ValueError):
+        write_json(tmp_path / "a.json", {"x": float("nan")})
+    assert not (tmp_path / "a.json").exists()
+
+
+def test_savez_stores_without_compression():
+    # bit-equal resumption relies on it: compressed bytes could change with the zlib version
+    file = io.BytesIO()
+    np.savez(file, a=np.zeros(1000))
+    assert len(file.getvalue()) > 8000

@@ -1,0 +1,88 @@
+"""Comparing images on disk."""
+
+import numpy as np
+import pytest
+
+from pp_cl import compare as compare_module
+from pp_cl.compare import compare, read_over_white
+from pp_cl.errors import UserError
+from pp_cl.image import write_png
+from pp_cl.metrics import Metrics, mean
+
+
+def no_device():
+    """A device that nobody may ask for."""
+    pytest.fail("a device was opened")
+
+
+@pytest.fixture
+def folders(rng, tmp_path):
+    """Two folders, pred and truth, each with b.png, a.png and a text file."""
+    for folder in ("pred", "truth"):
+        (tmp_path / folder).mkdir()
+        (tmp_path / folder / "notes.txt").write_text("no image")
+        for name in ("b.png", "a.png"):
+            write_png(tmp_path / folder / name, rng.integers(0, 256, (12, 14, 3), np.uint8))
+    return tmp_path / "pred", tmp_path / "truth"
+
+
+def test_two_images(folders):
+    pred, truth = folders[0] / "a.png", folders[1] / "b.png"
+    result = compare(no_device, pred, truth, ("psnr", "ssim"))
+    expected = Metrics(None, ("psnr", "ssim"))(read_over_white(pred), read_over_white(truth))
+    assert result == {"mean": expected, "per_image": [{"name": "a.png", **expected}]}
+
+
+def test_two_folders_by_name(folders):
+    pred, truth = folders
+    result = compare(no_device, str(pred), str(truth), ("psnr",))
+    assert [row["name"] for row in result["per_image"]] == ["a.png", "b.png"]
+    for row in result["per_image"]:
+        assert row == compare(no_device, pred / row["name"], truth / row["name"], ("psnr",))["per_image"][0]
+    assert result["mean"] == mean(result["per_image"])
+
+
+def test_a_device_is_opened_for_lpips_alone(folders, monkeypatch):
+    asked = []
+
+    def metrics(dev, names):
+        asked.append((dev, names))
+        return lambda a, b: {"lpips": 0.5}
+
+    monkeypatch.setattr(compare_module, "Metrics", metrics)
+    assert compare(lambda: "device", *folders, ("lpips",))["mean"] == {"lpips": 0.5}
+    assert asked == [("device", ("lpips",))]
+
+
+def test_transparent_images_lie_over_white(tmp_path):
+    rgba = np.array([[[0, 0, 0, 0], [255, 0, 0, 255], [0, 0, 200, 51]]], np.uint8)
+    write_png(tmp_path / "rgba.png", rgba)
+    expected = [[[255, 255, 255], [255, 0, 0], [204, 204, 244]]]
+    np.testing.assert_allclose(read_over_white(tmp_path / "rgba.png") * 255, expected, atol=1e-9)
+
+
+def test_bad_input_names_the_file(folders, tmp_path):
+    pred, truth = folders
+
+    def refuse(a, b, match, metrics=("psnr", "ssim")):
+        with pytest.raises(UserError, match=match):
+            compare(no_device, a, b, metrics)
+
+    refuse(pred, truth / "a.png", "truth/a.png: not a folder")
+    refuse(pred / "a.png", truth, "pred/a.png: not a folder")
+    refuse(pred / "c.png", truth / "a.png", "pred/c.png: ")
+    refuse(tmp_path / "x", tmp_path / "y", "/x: ")
+    refuse(pred, tmp_path / "y", "/y: not a folder")
+    (tmp_path / "empty").mkdir()
+    refuse(tmp_path / "empty", tmp_path / "empty", "empty: no images")
+    refuse(pred, tmp_path / "empty", "empty/a.png: missing")
+
+    write_png(pred / "a.png", np.zeros((12, 13, 3), np.uint8))
+    refuse(pred, truth, "pred/a.png: 13x12 pixels, .*truth/a.png has 14x12")
+    for folder in folders:
+        write_png(folder / "a.png", np.zeros((9, 9, 3), np.uint8))
+    refuse(pred, truth, "pred/a.png: 9x9 pixels, SSIM needs 11x11")
+    (truth / "a.png").write_bytes((truth / "a.png").read_bytes()[:20])
+    refuse(pred, truth, "truth/a.png: ")
+    (pred / "b.png").unlink()
+    refuse(pred, truth, "pred/b.png: missing")

@@ -1,0 +1,119 @@
+"""cl/conv.cl against float64."""
+
+import numpy as np
+import pytest
+from helpers import numeric_gradient, relative_error
+from oracle_conv import conv, conv_gradients
+
+from pp_cl.conv import conv_backward_input, conv_forward, pack_bias, pack_weights, unpack_weights
+from pp_cl.conv_weights import flip_weights
+
+# (height, width, channels in, channels out): tiles of every width, tails, channels beside the multiples of 16
+SHAPES = [(1, 1, 3, 16), (1, 5, 16, 3), (5, 1, 20, 20), (31, 33, 16, 48), (257, 3, 32, 16), (6, 31, 3, 64), (4, 257, 48, 32),
+          (3, 12, 1, 1), (8, 8, 512, 32), (16, 24, 32, 512)]
+
+
+def layer(rng, ci, co, k):
+    """Random weights and bias of PyTorch's initial size: (CO, CI, K, K), (CO,)."""
+    bound = 1 / np.sqrt(ci * k * k)
+    return rng.uniform(-bound, bound, (co, ci, k, k)).astype(np.float32), rng.uniform(-bound, bound, co).astype(np.float32)
+
+
+def run_forward(dev, x, weight, bias, relu, x2=None):
+    out = dev.empty((*x.shape[:2], len(bias)))
+    conv_forward(dev, dev.upload(x), dev.upload(pack_weights(weight)), dev.upload(pack_bias(bias)), out, relu,
+                 None if x2 is None else dev.upload(x2))
+    return out.get()
+
+
+def run_backward_input(dev, x, weight, grad_out, masked, first=0):
+    co, _, k, _ = weight.shape
+    flipped = dev.empty((-(-x.shape[2] // 16), k, k, co, 16))
+    flip_weights(dev, dev.upload(pack_weights(weight)), first, flipped)
+    grad_x = dev.empty(x.shape)
+    conv_backward_input(dev, dev.upload(x), flipped, dev.upload(grad_out), grad_x, masked)
+    return grad_x.get()
+
+
+def test_packing_is_exact(rng):
+    weight = rng.normal(size=(20, 5, 3, 3)).astype(np.float32)
+    packed = pack_weights(weight)
+    assert packed.shape == (2, 3, 3, 5, 16)
+    assert packed[1, 2, 0, 4, 3] == weight[19, 4, 2, 0]
+    assert not packed[1, ..., 4:].any()
+    np.testing.assert_array_equal(unpack_weights(packed, 20), weight)
+
+
+@pytest.mark.parametrize("k", [1, 3])
+@pytest.mark.parametrize("shape", SHAPES)
+def test_forward(dev, rng, shape, k):
+    height, width, ci, co = shape
+    x = rng.normal(size=(height, width, ci)).astype(np.float32)
+    weight, bias = layer(rng, ci, co, k)
+    assert relative_error(run_forward(dev, x, weight, bias, False), conv(x, weight, bias)) < 3e-6
+    assert relative_error(run_forward(dev, x, weight, bias, True), conv(x, weight, bias, True)) < 3e-6
+
+
+@pytest.mark.parametrize("c1, c2", [(16, 16), (16, 48), (3, 20)])
+def test_two_sources_are_a_concatenation(dev, rng, c1, c2):
+    x = rng.normal(size=(7, 29, c1 + c2)).astype(np.float32)
+    weight, bias = layer(rng, c1 + c2, 32, 3)
+    actual = run_forward(dev, np.ascontiguousarray(x[..., :c1]), weight, bias, True, np.ascontiguousarray(x[..., c1:]))
+    assert relative_error(actual, conv(x, weight, bias, True)) < 3e-6
+
+
+@pytest.mark.parametrize("k", [1, 3])
+@pytest.mark.parametrize("shape", SHAPES)
+def test_backward_input(dev, rng, shape, k):
+    height, width, ci, co = shape
+    x = np.maximum(rng.normal(size=(height, width, ci)), 0).astype(np.float32)
+    weight, _ = layer(rng, ci, co, k)
+    grad_out = rng.normal(size=(height, width, co)).astype(np.float32)
+    expected = conv_gradients(x, weight, grad_out)[0]
+    assert relative_error(run_backward_input(dev, x, weight, grad_out, False), expected) < 3e-6
+    assert relative_error(run_backward_input(dev, x, weight, grad_out, True), expected * (x > 0)) < 3e-6
+
+
+def test_backward_input_of_the_second_source(dev, rng):
+    x2 = rng.normal(size=(9, 14, 20)).astype(np.float32)
+    weight, _ = layer(rng, 16 + 20, 48, 3)
+    grad_out = rng.normal(size=(9, 14, 48)).astype(np.float32)
+    expected = conv_gradients(np.concatenate([np.zeros((9, 14, 16)), x2], 2), weight, grad_out)[0][..., 16:]
+    assert relative_error(run_backward_input(dev, x2, weight, grad_out, False, first=16), expected) < 3e-6
+
+
+def test_backward_input_by_finite_differences(dev, rng):
+    x = rng.normal(size=(3, 4, 3))
+    weight, bias = layer(rng, 3, 5, 3)
+    grad_out = rng.normal(size=(3, 4, 5)).astype(np.float32)
+    numeric = numeric_gradient(lambda v: (conv(v, weight, bias) * grad_out).sum(), x, 1e-4)
+    actual = run_backward_input(dev, x.astype(np.float32), weight, grad_out, False)
+    assert relative_error(actual.ravel(), numeric) < 3e-6
+
+
+def test_hard_inputs(dev, rng):
+    weight, bias = layer(rng, 16, 16, 3)
+    offset = (1e3 + rng.normal(size=(13, 17, 16))).astype(np.float32)
+    assert relative_error(run_forward(dev, offset, weight, bias, False), conv(offset, weight, bias)) < 3e-6
+    zeros = np.zeros_like(offset)
+    np.testing.assert_array_equal(run_forward(dev, zeros, weight, bias, False), np.broadcast_to(bias, zeros.shape))
+    assert not run_backward_input(dev, zeros, weight, offset, True).any()  # a ReLU at exactly 0 passes nothing
+
+
+def test_same_bits_twice(dev, rng):
+    x = rng.normal(size=(31, 50, 32)).astype(np.float32)
+    weight, bias = layer(rng, 32, 48, 3)
+    np.testing.assert_array_equal(run_forward(dev, x, weight, bias, True), run_forward(dev, x, weight, bias, True))
+
+
+def test_wrong_shapes_are_refused(dev):
+    x, out = dev.zeros((4, 4, 16)), dev.zeros((4, 4, 32))
+    weight, bias = dev.zeros((2, 3, 3, 16, 16)), dev.zeros(32)
+    with pytest.raises(ValueError, match="16 \\+ 16 to 32 channels"):
+        conv_forward(dev, x, weight, bias, out, False, x2=x)
+    with pytest.raises(ValueError, match="bias"):
+        conv_forward(dev, x, weight, dev.zeros(16), out, False)
+    with pytest.raises(ValueError, match="width"):
+        conv_forward(dev, x, weight, bias, dev.zeros((4, 5, 32)), False)
+    with pytest.raises(ValueError, match="flipped"):
+        conv_backward_input(dev, x, weight, out, x, False)

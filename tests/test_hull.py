@@ -1,0 +1,238 @@
+"""Visual hull and grid: the kernels against the float64 oracle, the search for the edge, the errors."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from helpers import AWKWARD_SIZES
+from oracle_hull import dilated_mask, kept
+
+from pp_cl import hull
+from pp_cl.camera import Camera
+from pp_cl.errors import UserError
+from pp_cl.hull import Carver, bounding_box, build_grid, depth_range, spacing_pixels
+from pp_cl.points import Grid
+from pp_cl.scene import MASK_THRESHOLD, View, load_scene
+
+BORDER = 1e-4  # pixels to a pixel border within which float32 may choose the other pixel
+CENTRE, RADIUS = np.array([-0.5, 1.3, 1.7]), 0.8  # of the ball that most tests carve
+
+
+def look_at(eye, target, size=(64, 64), focal=1.5):
+    """Camera at `eye` that looks at `target`; focal: in image widths."""
+    forward = (target - eye) / np.linalg.norm(target - eye)
+    right = np.cross(forward, [0.3, 0.2, 1])
+    right /= np.linalg.norm(right)
+    pose = np.column_stack([right, np.cross(forward, right), forward, eye])
+    return Camera(pose, focal * size[0], focal * size[0], size[0] / 2, size[1] / 2, *size)
+
+
+def ball_view(name, camera, centre=CENTRE, radius=RADIUS):
+    """View of a ball: alpha 255 where the ray through the pixel's centre meets it."""
+    x, y = np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5)
+    rays = np.stack([(x - camera.cx) / camera.fx, (y - camera.cy) / camera.fy, np.ones_like(x)], -1)
+    to_centre = camera.pose[:, :3].T @ (centre - camera.eye)
+    along = rays @ to_centre
+    hit = (along > 0) & (to_centre @ to_centre - along**2 / (rays**2).sum(-1) <= radius**2)
+    return View(name, camera, np.where(hit, 255, 0)[..., None].repeat(4, -1).astype(np.uint8))
+
+
+def ball_views(count=12, size=(64, 64), focal=1.5, distance=4.0):
+    """Views of the ball from directions spread over the sphere."""
+    n = np.arange(count)
+    z, angle = 1 - (2 * n + 1) / count, n * np.pi * (3 - 5**0.5)
+    directions = np.column_stack([np.sqrt(1 - z**2) * np.cos(angle), np.sqrt(1 - z**2) * np.sin(angle), z])
+    cameras = [look_at(CENTRE + distance * d, CENTRE, size, focal) for d in directions]
+    return [ball_view(f"train/r_{i}.png", camera) for i, camera in enumerate(cameras)]
+
+
+def positions_of(found):
+    return found.grid.positions(found.ids)
+
+
+def noise_view(rng, eye, size, share):
+    """View with `share` of its pixels in the mask, at random, alphas at and beside the threshold among them."""
+    alpha = np.where(rng.random(size[::-1]) < share, MASK_THRESHOLD + 1, MASK_THRESHOLD)
+    return View("noise", look_at(eye, np.zeros(3), size), alpha[..., None].repeat(4, -1).astype(np.uint8))
+
+
+@pytest.mark.parametrize("width", AWKWARD_SIZES)
+@pytest.mark.parametrize("height", (1, 2, 33))
+def test_masks_are_dilated_and_packed(dev, rng, width, height):
+    views = [noise_view(rng, np.array([4.0, 0, 0]), (width, height), share) for share in (0.05, 0.0, 1.0)]
+    masks = Carver(dev, views).masks.get().reshape(3, height, -1)
+    bits = np.unpackbits(masks.view(np.uint8), axis=-1, bitorder="little")[..., :width]
+    for view, packed in zip(views, bits, strict=True):
+        np.testing.assert_array_equal(packed, dilated_mask(view.image[..., 3], MASK_THRESHOLD))
+
+
+@pytest.mark.parametrize("nx", AWKWARD_SIZES)
+@pytest.mark.parametrize("ny, nz", ((1, 1), (7, 5)))
+def test_carving_equals_the_oracle(dev, rng, nx, ny, nz):
+    """Views of three sizes, one of them close, with vertices beside and behind it."""
+    views = [noise_view(rng, np.array(eye), size, 0.15)
+             for eye, size in (((3.0, 1, 0.5), (64, 48)), ((-2.0, 2, 1), (31, 33)), ((0.3, -0.4, 0.2), (40, 64)))]
+    edge = 2 / nx
+    grid = Grid((-edge * nx / 2, -edge * ny / 2, -edge * nz / 2 + 0.1), edge, (nx, ny, nz))
+    positions = grid.positions(np.arange(nx * ny * nz))
+    expected, border = kept(views, positions, MASK_THRESHOLD)
+    carver = Carver(dev, views)
+    carving = carver.carve(grid)
+    bits = np.unpackbits(carving.bits.get().view(np.uint8), axis=-1, bitorder="little")
+    assert not bits[:, nx:].any(), "vertices behind the end of a row"
+    wrong = bits[:, :nx].ravel() != expected
+    assert not wrong[border > BORDER].any()
+    assert (border <= BORDER).mean() <= 0.01
+    if nx * ny * nz > 300:
+        assert 0.1 < expected.mean() < 0.9
+    if carving.count:
+        tight, ids = carver.points(carving)
+        assert (np.diff(ids.astype(np.int64)) > 0).all() and ids[-1] < np.prod(tight.dims)
+        np.testing.assert_allclose(tight.positions(ids), positions[bits[:, :nx].ravel() == 1], atol=1e-12)
+
+
+def test_a_vertex_no_image_sees_is_dropped(dev):
+    full = View("full", look_at(np.array([4.0, 0, 0]), np.zeros(3)), np.full((64, 64, 4), 255, np.uint8))
+    carver = Carver(dev, [full])
+    assert carver.carve(Grid((0, 0, 0), 0.1, (1, 1, 1))).count == 1
+    assert carver.carve(Grid((0, 9, 0), 0.1, (1, 1, 1))).count == 0  # beside
+    assert carver.carve(Grid((5, 0, 0), 0.1, (1, 1, 1))).count == 0  # behind
+
+
+@pytest.mark.parametrize("points", (1000, 3000, 40000))
+def test_the_edge_is_found(dev, points):
+    found = build_grid(dev, ball_views(), points)
+    assert points <= len(found.ids) <= hull.TOLERANCE * points and not found.capped
+    assert found.rounds[-1]["points"] == len(found.ids) and len(found.rounds) <= 1 + hull.ROUNDS
+    assert found.ids.dtype == np.uint32 and (np.diff(found.ids.astype(np.int64)) > 0).all()
+    lattice = positions_of(replace(found, ids=np.arange(np.prod(found.grid.dims))))
+    kept_here = np.zeros(len(lattice), bool)
+    kept_here[found.ids] = True
+    from_centre = np.linalg.norm(lattice - CENTRE, axis=1)
+    assert kept_here[from_centre < RADIUS].all(), "a vertex inside the ball is lost"
+    pixel = 4 / 96
+    assert from_centre[kept_here].max() < 1.6 * RADIUS + 2 * pixel  # the hull of 12 tangent cones
+    for axis in range(3):  # the grid is tight
+        reached = positions_of(found)[:, axis]
+        np.testing.assert_allclose([reached.min(), reached.max()], [lattice[:, axis].min(), lattice[:, axis].max()])
+
+
+def test_the_smallest_counts(dev):
+    for points in (1, 2):
+        assert len(build_grid(dev, ball_views(), points).ids) >= points
+
+
+def test_two_runs_give_the_same_bits(dev):
+    first, second = (build_grid(dev, ball_views(), 5000) for _ in range(2))
+    assert first.grid == second.grid
+    np.testing.assert_array_equal(first.ids, second.ids)
+
+
+def test_the_cell_cap_limits_the_grid(dev):
+    """The ball fills about half of its box, so 8000 cells hold some 4000 of the 7000 points asked for."""
+    found = build_grid(dev, ball_views(), 7000, cell_cap=8000)
+    assert found.capped and 3000 < len(found.ids) < 7000
+    assert all(np.prod(r["dims"]) <= 8000 for r in found.rounds[1:])
+
+
+def test_the_box_holds_the_object_and_is_tight():
+    box = bounding_box(ball_views())
+    assert (box[0] <= CENTRE - RADIUS).all() and (box[1] >= CENTRE + RADIUS).all()
+    assert (box[1] - box[0]).max() < 3.2 * RADIUS
+
+
+@pytest.mark.parametrize("focal", (2.7, 6.0))
+def test_an_object_cut_off_by_the_images_keeps_what_they_show(dev, focal):
+    """focal 2.7: only the corners are free; 6: one pixel, so that no side of any image bounds the object."""
+    views = ball_views(focal=focal)
+    for view in views:
+        view.image[0, 0] = 0
+    box = bounding_box(views)
+    assert np.isfinite(box).all() and (box[1] > box[0]).all()
+    found = positions_of(build_grid(dev, views, 3000))
+    shown = CENTRE + 0.5 * min(RADIUS, 4 / (2 * focal)) * np.random.default_rng(1).uniform(-1, 1, (100, 3))
+    nearest = np.linalg.norm(found[None] - shown[:, None], axis=-1).min(1)
+    assert nearest.max() < 0.2 * RADIUS
+
+
+def test_depth_range_holds_every_point(dev):
+    views = ball_views()
+    found = build_grid(dev, views, 2000)
+    distances = np.stack([np.linalg.norm(positions_of(found) - view.camera.eye, axis=1) for view in views])
+    near, far = depth_range(views, found)
+    assert 0 < near < distances.min() and far > distances.max()
+    half_diagonal = found.grid.edge * np.linalg.norm(found.grid.dims) / 2
+    assert far - near == pytest.approx(2 * hull.DEPTH_MARGIN * half_diagonal, rel=0.05)
+
+
+@pytest.mark.parametrize("distance", (1.6, 0.5))
+def test_depth_range_of_close_cameras(dev, distance):
+    """1.6: outside the hull's box, inside the enlarged ball; 0.5: inside the box."""
+    found = build_grid(dev, ball_views(), 2000)
+    close = [replace(ball_views()[0], camera=look_at(CENTRE + np.array([distance, 0, 0]), CENTRE))]
+    near, far = depth_range(close, found)
+    distances = np.linalg.norm(positions_of(found) - close[0].camera.eye, axis=1)
+    assert near > 0 and far > distances.max()
+    assert near < distances.min() if distance > 1 else near == found.grid.edge
+
+
+def test_spacing_is_what_two_projected_neighbours_are_apart(dev):
+    views = ball_views()
+    found = build_grid(dev, views, 2000)
+    camera = views[0].camera
+    centre = found.grid.origin + found.grid.edge * (np.array(found.grid.dims) - 1) / 2
+    towards = camera.pose[:, :3].T @ (centre - camera.eye)
+    along = towards + [found.grid.edge, 0, 0]
+    expected = camera.fx * (along[0] / along[2] - towards[0] / towards[2])
+    assert spacing_pixels(found, views[:1]) == pytest.approx(expected, rel=1e-3)
+    assert spacing_pixels(found, views[:1], 4) == pytest.approx(expected / 4, rel=1e-3)
+
+
+@pytest.mark.parametrize("points", (0, -3, 2**27 + 1))
+def test_impossible_counts(dev, points):
+    with pytest.raises(UserError, match="--points .*between 1 and"):
+        build_grid(dev, ball_views(), points)
+
+
+def test_a_view_without_mask_is_named(dev):
+    views = ball_views()
+    views[3].image[..., 3] = 255
+    with pytest.raises(UserError, match=r"^train/r_3\.png: .*alpha channel"):
+        build_grid(dev, views, 100)
+
+
+def test_a_view_that_removes_everything_is_named(dev):
+    views = ball_views()
+    views[5].image[..., 3] = 0
+    with pytest.raises(UserError, match=r"^train/r_5\.png: the mask is empty"):
+        build_grid(dev, views, 100)
+    views[5].image[4:9, 4:9, 3] = 255
+    with pytest.raises(UserError, match=r"^train/r_5\.png: .*check its alpha and its camera"):
+        build_grid(dev, views, 100)
+
+
+@pytest.mark.parametrize("flat", (False, True))
+def test_wrong_axes_are_told(dev, flat):
+    """flat: the cameras lie in one plane."""
+    views = ball_views()
+    if flat:
+        angles = np.arange(8) * np.pi / 4
+        views = [ball_view("r", look_at(CENTRE + [4 * np.cos(a), 4 * np.sin(a), 0], CENTRE)) for a in angles]
+    views = [replace(v, camera=replace(v.camera, pose=v.camera.pose * [1, -1, -1, 1])) for v in views]
+    with pytest.raises(UserError, match="leave no point.*camera-to-world"):
+        build_grid(dev, views, 100)
+
+
+def test_views_from_one_place_do_not_bound(dev):
+    with pytest.raises(UserError, match="from several sides"):
+        build_grid(dev, ball_views()[:1], 100)
+
+
+def test_lego_has_the_published_shape(dev, data):
+    """Its grid of 4.04 million points has 194x345x232 vertices (PlenopticPoints supplemental, Table 4)."""
+    views = load_scene(data / "nerf_synthetic/lego").splits["train"]
+    found = build_grid(dev, views, 20000)
+    assert 20000 <= len(found.ids) <= hull.TOLERANCE * 20000
+    edges = np.array(found.grid.dims) / (np.array([194, 345, 232]) * (20000 / 4e6) ** (1 / 3))
+    assert np.abs(edges - 1).max() < 0.06
+    assert depth_range(views, found) == pytest.approx((2, 6), abs=0.15)

@@ -1,0 +1,144 @@
+"""Images on disk: every kind of PNG, broken files, writing without leaving halves behind."""
+
+import resource
+import zlib
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from pp_cl.errors import UserError
+from pp_cl.image import image_size, read_rgba, to_8bit, write_png
+
+
+@pytest.fixture
+def rgba(rng):
+    """(5, 7, 4) random image."""
+    return rng.integers(0, 256, (5, 7, 4), np.uint8)
+
+
+def test_modes_become_rgba(tmp_path, rgba):
+    opaque = rgba.copy()
+    opaque[..., 3] = 255
+    gray = np.repeat(rgba[..., :1], 4, -1)
+    gray[..., 3] = 255
+    gray_alpha = np.concatenate([gray[..., :3], rgba[..., 3:]], -1)
+    bilevel = np.where(gray > 127, 255, 0).astype(np.uint8)
+    bilevel[..., 3] = 255
+    palette = Image.fromarray(np.arange(35, dtype=np.uint8).reshape(5, 7))
+    palette.putpalette(rgba[..., :3].tobytes())
+    keyed = opaque.copy()
+    keyed[2, 3, 3] = 0
+    for name, image, options, expected in (
+        ("rgba", Image.fromarray(rgba), {}, rgba),
+        ("rgb", Image.fromarray(rgba[..., :3]), {}, opaque),
+        ("gray", Image.fromarray(rgba[..., 0]), {}, gray),
+        ("gray_alpha", Image.fromarray(gray_alpha[..., 2:], "LA"), {}, gray_alpha),
+        ("bilevel", Image.fromarray(rgba[..., 0] > 127), {}, bilevel),
+        ("palette", palette, {}, opaque),
+        ("palette_with_transparency", palette, {"transparency": 2 * 7 + 3}, keyed),
+    ):
+        path = tmp_path / f"{name}.png"
+        image.save(path, **options)
+        assert image_size(path) == (7, 5), name
+        result = read_rgba(path)
+        assert result.dtype == np.uint8 and np.array_equal(result, expected), name
+
+
+def test_jpeg(tmp_path):
+    Image.new("RGB", (9, 8), (10, 200, 30)).save(tmp_path / "a.jpg")
+    result = read_rgba(tmp_path / "a.jpg")
+    assert result.shape == (8, 9, 4) and np.abs(result.astype(int) - [10, 200, 30, 255]).max() <= 3
+
+
+def test_sixteen_bits_are_refused(tmp_path, rgba):
+    Image.fromarray(rgba[..., 0].astype(np.uint16) * 257).save(tmp_path / "gray.png")
+    Image.fromarray(rgba).save(tmp_path / "rgba.png")
+    content = bytearray((tmp_path / "rgba.png").read_bytes())
+    content[24] = 16  # bits a channel; the header chunk ends with its CRC
+    content[29:33] = zlib.crc32(content[12:29]).to_bytes(4, "big")
+    (tmp_path / "rgba.png").write_bytes(content)
+    for name in ("gray", "rgba"):
+        with pytest.raises(UserError, match=rf"{name}\.png: not 8 bits a channel.*convert"):
+            read_rgba(tmp_path / f"{name}.png")
+
+
+def test_file_cut_anywhere(tmp_path, rgba):
+    """A truncated file is an error or, where only its end mark is lost, the whole image; never a part of it."""
+    whole, cut = tmp_path / "whole.png", tmp_path / "cut.png"
+    write_png(whole, rgba)
+    content = whole.read_bytes()
+    errors = 0
+    for length in range(len(content)):
+        cut.write_bytes(content[:length])
+        try:
+            assert np.array_equal(read_rgba(cut), rgba), length
+        except UserError as error:
+            errors += 1
+            assert str(cut) in str(error) and "\n" not in str(error)
+    assert errors > len(content) - 25
+
+
+def test_bytes_changed_anywhere(tmp_path, rgba, rng):
+    """Whatever a broken file makes the decoder raise, the user gets one line that names the file."""
+    path = tmp_path / "broken.png"
+    write_png(path, rgba)
+    content = np.frombuffer(path.read_bytes(), np.uint8)
+    errors = 0
+    for _ in range(300):
+        broken = content.copy()
+        broken[rng.integers(len(broken), size=2)] = rng.integers(256, size=2)
+        path.write_bytes(broken.tobytes())
+        try:
+            assert read_rgba(path).ndim == 3
+        except UserError as error:
+            errors += 1
+            assert str(path) in str(error) and "\n" not in str(error)
+    assert errors > 100
+
+
+@pytest.mark.parametrize("read", (read_rgba, image_size))
+def test_not_an_image(tmp_path, read):
+    (tmp_path / "text.png").write_text("not an image")
+    (tmp_path / "empty.png").touch()
+    for path, words in ((tmp_path / "text.png", "cannot be read"), (tmp_path / "empty.png", "cannot be read"),
+                        (tmp_path / "none.png", "no such image"), (tmp_path, "cannot be read")):
+        with pytest.raises(UserError, match=words) as caught:
+            read(path)
+        assert str(path) in str(caught.value)
+
+
+@pytest.mark.parametrize("shape", ((5, 7), (5, 7, 3), (5, 7, 4)))
+def test_written_image_comes_back(tmp_path, rng, shape):
+    image = rng.random(shape)
+    write_png(tmp_path / "float.png", image)
+    write_png(tmp_path / "bytes.png", to_8bit(image))
+    stored = np.array(Image.open(tmp_path / "float.png"))
+    assert stored.shape == shape and np.abs(stored / 255 - image).max() <= 0.5 / 255 + 1e-12
+    assert np.array_equal(stored, np.array(Image.open(tmp_path / "bytes.png")))
+
+
+def test_to_8bit():
+    assert to_8bit([-1.0, 0.0, 0.49 / 255, 0.51 / 255, 254.4 / 255, 1.0, np.inf]).tolist() == [0, 0, 0, 1, 254, 255, 255]
+    with pytest.raises(ValueError, match="NaN"):
+        to_8bit([0.5, np.nan])
+
+
+def test_failed_write_keeps_the_old_image(tmp_path, rgba, rng):
+    """With room for a part of the new file only, the old one stays, and nothing else."""
+    path = tmp_path / "image.png"
+    write_png(path, rgba)
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (1000, limits[1]))
+    try:
+        with pytest.raises(UserError, match=r"image\.png: cannot be written"):
+            write_png(path, rng.integers(0, 256, (50, 50, 3), np.uint8))
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+    assert np.array_equal(read_rgba(path), rgba)
+    assert [p.name for p in tmp_path.iterdir()] == ["image.png"]
+
+
+def test_write_into_nowhere(tmp_path, rgba):
+    with pytest.raises(UserError, match=r"none/image\.png: cannot be written"):
+        write_png(tmp_path / "none" / "image.png", rgba)

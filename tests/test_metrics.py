@@ -1,0 +1,95 @@
+"""PSNR and SSIM against their definitions; everything is measured on 8-bit images."""
+
+import numpy as np
+import pytest
+from oracle_lpips import random_weights
+
+from pp_cl import lpips
+from pp_cl.errors import UserError
+from pp_cl.metrics import PSNR_CAP, Metrics, mean, psnr, ssim
+
+
+def ssim_oracle(a, b):
+    """SSIM by its definition: one 11x11 Gaussian window at a time, float64."""
+    offsets = np.arange(-5, 6)
+    window = np.exp(-(offsets[:, None] ** 2 + offsets**2) / (2 * 1.5**2))
+    window /= window.sum()
+    values = []
+    for y in range(a.shape[0] - 10):
+        for x in range(a.shape[1] - 10):
+            for c in range(3):
+                p, t = a[y : y + 11, x : x + 11, c], b[y : y + 11, x : x + 11, c]
+                mp, mt = (window * p).sum(), (window * t).sum()
+                vp, vt = (window * (p - mp) ** 2).sum(), (window * (t - mt) ** 2).sum()
+                covariance = (window * (p - mp) * (t - mt)).sum()
+                luminance = (2 * mp * mt + 0.01**2) / (mp**2 + mt**2 + 0.01**2)
+                values.append(luminance * (2 * covariance + 0.03**2) / (vp + vt + 0.03**2))
+    return np.mean(values)
+
+
+@pytest.fixture
+def pair(rng):
+    """Two uint8 images that resemble each other."""
+    a = rng.integers(0, 256, (19, 23, 3))
+    return a.astype(np.uint8), np.clip(a + rng.integers(-60, 60, a.shape), 0, 255).astype(np.uint8)
+
+
+def test_psnr_of_known_errors(pair):
+    a, b = pair
+    black = np.zeros((4, 5, 3), np.uint8)
+    assert psnr(black, black + 1) == pytest.approx(20 * np.log10(255))
+    assert psnr(black, black + 255) == pytest.approx(0, abs=1e-12)
+    assert psnr(a, b) == psnr(b, a) == pytest.approx(-10 * np.log10(np.mean((a / 255 - b / 255) ** 2)))
+
+
+def test_psnr_is_capped_so_that_it_stays_a_number():
+    a = np.zeros((1000, 1000, 3), np.uint8)
+    assert psnr(a, a) == PSNR_CAP
+    b = a.copy()
+    b[0, 0, 0] = 1  # 113 dB
+    assert psnr(a, b) == PSNR_CAP
+
+
+def test_ssim_equals_its_definition(pair):
+    a, b = pair
+    assert ssim(a, b) == pytest.approx(ssim_oracle(a / 255, b / 255), abs=1e-12)
+    assert ssim(a, a) == 1
+
+
+def test_ssim_needs_a_whole_window():
+    assert ssim(np.zeros((11, 11, 3), np.uint8), np.zeros((11, 11, 3), np.uint8)) == 1
+    with pytest.raises(UserError, match="30x10 pixels, SSIM needs 11x11"):
+        ssim(np.zeros((10, 30, 3), np.uint8), np.zeros((10, 30, 3), np.uint8))
+
+
+def test_images_are_rounded_to_8_bits_first(pair):
+    measure = Metrics(None, ("psnr", "ssim"))
+    a, b = pair
+    expected = {"psnr": psnr(a, b), "ssim": ssim(a, b)}
+    assert measure(a / 255, b / 255) == expected
+    assert measure(np.float32(a / 255 + 0.49 / 255), np.float32(b / 255 - 0.49 / 255)) == expected
+    assert measure(np.where(a == 255, 7.0, a / 255), np.where(b == 0, -3.0, b / 255)) == expected
+
+
+def test_nan_and_other_shapes_are_refused():
+    measure = Metrics(None, ("psnr",))
+    image = np.zeros((12, 12, 3))
+    with pytest.raises(ValueError, match="NaN"):
+        measure(np.full_like(image, np.nan), image)
+    with pytest.raises(ValueError, match="truth"):
+        measure(image, image[1:])
+
+
+def test_only_the_named_metrics_are_computed_in_their_order(dev, rng, pair, monkeypatch):
+    weights = random_weights(rng)
+    monkeypatch.setattr(lpips, "load_weights", lambda: weights)
+    a, b = (image / 255 for image in pair)
+    measured = Metrics(dev, ("lpips", "psnr"))(a, b)
+    assert list(measured) == ["lpips", "psnr"]
+    assert measured["lpips"] == lpips.Lpips(dev, weights).distance(a, b) > 0
+    assert list(Metrics(None, ("ssim",))(a, b)) == ["ssim"]
+
+
+def test_mean_leaves_names_out():
+    rows = [{"name": "a", "psnr": 30.0, "ssim": 0.5}, {"name": "b", "psnr": 31.0, "ssim": 1.0}]
+    assert mean(rows) == {"psnr": 30.5, "ssim": 0.75}

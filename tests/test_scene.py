@@ -1,0 +1,383 @@
+"""Reading scenes: conventions of the format, every kind of bad input, masks; two real scenes."""
+
+import json
+import math
+import shutil
+
+import numpy as np
+import pytest
+
+from pp_cl.camera import Camera
+from pp_cl.errors import UserError
+from pp_cl.image import read_rgba, write_png
+from pp_cl.scene import MASK_THRESHOLD, View, load_scene, object_box, reduced_camera
+
+SIZE = (24, 18)  # width, height of the images written here
+
+
+def look_at(eye):
+    """4x4 camera-to-world in OpenGL axes of a camera that looks from `eye` to the origin, z up."""
+    backward = np.array(eye) / np.linalg.norm(eye)
+    right = np.cross([0, 0, 1], backward)
+    right /= np.linalg.norm(right)
+    matrix = np.eye(4)
+    matrix[:3] = np.stack([right, np.cross(backward, right), backward, eye], 1)
+    return matrix
+
+
+def write_scene(folder, split="train", count=3, edit=None):
+    """A NeRF-synthetic split of `count` random views; edit(data) changes the JSON before it is written. Returns its data."""
+    rng = np.random.default_rng(3)
+    frames = []
+    for i in range(count):
+        write_png(folder / f"{split}_{i}.png", rng.integers(0, 256, (SIZE[1], SIZE[0], 4), np.uint8))
+        angle = 2 * np.pi * i / count
+        matrix = look_at([3 * np.cos(angle), 3 * np.sin(angle), 1.2])
+        frames.append({"file_path": f"./{split}_{i}", "transform_matrix": matrix.tolist()})
+    data = {"camera_angle_x": 0.7, "frames": frames}
+    if edit:
+        edit(data)
+    (folder / f"transforms_{split}.json").write_text(json.dumps(data))
+    return data
+
+
+def train_views(folder, **keys):
+    """Views of a new scene of which `keys` are added to every frame."""
+    write_scene(folder, edit=lambda data: [frame.update(keys) for frame in data["frames"]])
+    return load_scene(folder).splits["train"]
+
+
+def refused(folder, *words, splits=("train",)):
+    """Loading fails with one line that has all the words."""
+    with pytest.raises(UserError) as caught:
+        load_scene(folder, splits)
+    message = str(caught.value)
+    assert "\n" not in message
+    for word in words:
+        assert str(word) in message, message
+
+
+# ------------------------------------------------------------------------------------------------- conventions
+
+
+def test_views_and_names(tmp_path, capfd):
+    write_scene(tmp_path)
+    write_scene(tmp_path, "test", count=2)
+    scene = load_scene(tmp_path, ("train", "test"))
+    assert scene.name == tmp_path.name and scene.folder == tmp_path and scene.published == {}
+    assert [v.name for v in scene.splits["train"]] == ["train_0.png", "train_1.png", "train_2.png"]
+    assert [v.name for v in scene.splits["test"]] == ["test_0.png", "test_1.png"]
+    for view in scene.splits["train"] + scene.splits["test"]:
+        assert np.array_equal(view.image, read_rgba(tmp_path / view.name))
+        assert (view.camera.width, view.camera.height) == SIZE
+    assert list(load_scene(str(tmp_path)).splits) == ["train"]
+    assert capfd.readouterr().err == "", "a progress bar without a terminal"
+
+
+def test_projection_follows_opengl(tmp_path, rng):
+    """A world point lands where the format's own rules (y up, looking along -z) put it."""
+    data = write_scene(tmp_path)
+    focal = 0.5 * SIZE[0] / math.tan(0.35)
+    for frame, view in zip(data["frames"], load_scene(tmp_path).splits["train"], strict=True):
+        point = rng.normal(size=3) * 0.3
+        x, y, z, _ = np.linalg.inv(frame["transform_matrix"]) @ [*point, 1]
+        expected = [SIZE[0] / 2 + focal * x / -z, SIZE[1] / 2 - focal * y / -z]
+        camera = view.camera
+        x, y, z = camera.pose[:, :3].T @ (point - camera.eye)
+        assert z > 0
+        assert np.allclose([camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy], expected, rtol=0, atol=1e-9)
+
+
+def test_defaults_of_nerf_synthetic(tmp_path):
+    write_scene(tmp_path)
+    scene = load_scene(tmp_path)
+    camera = scene.splits["train"][0].camera
+    assert camera.fx == camera.fy == 0.5 * SIZE[0] / math.tan(0.35)
+    assert (camera.cx, camera.cy) == (SIZE[0] / 2, SIZE[1] / 2)
+    assert not scene.depth_range_stored and not scene.splits["train"][0].has_depth_range and math.isnan(camera.near)
+
+
+def test_nerfstudio_names(tmp_path):
+    """A frame's own key goes before the file's."""
+
+    def edit(data):
+        data.update(fl_x=31.0, fl_y=32.5, cx=11.25, cy=8.5, w=SIZE[0], h=float(SIZE[1]), near=2.0, far=5)
+        data.update(k1=0, p2=0.0, camera_model="OPENCV")
+        data["frames"][1].update(fl_x=33.0, cy=0, near=1.5, far=None)
+
+    write_scene(tmp_path, edit=edit)
+    scene = load_scene(tmp_path)
+    got = [[getattr(v.camera, k) for k in ("fx", "fy", "cx", "cy", "near", "far")] for v in scene.splits["train"]]
+    assert got == [[31, 32.5, 11.25, 8.5, 2, 5], [33, 32.5, 11.25, 0, 1.5, 5], [31, 32.5, 11.25, 8.5, 2, 5]]
+    assert scene.depth_range_stored and scene.splits["train"][0].has_depth_range
+
+
+def test_angle_of_height_and_single_focal_length(tmp_path):
+    camera = train_views(tmp_path, camera_angle_y=0.5)[0].camera
+    assert camera.fy == 0.5 * SIZE[1] / math.tan(0.25) != camera.fx
+    camera = train_views(tmp_path, fl_x=40)[0].camera
+    assert camera.fx == camera.fy == 40
+
+
+@pytest.mark.parametrize("given", ("train_1", "./train_1.png", "sub/../train_1", "{folder}/train_1", "linked"))
+def test_ways_to_name_an_image(tmp_path, given):
+    (tmp_path / "sub").mkdir()
+    (tmp_path / "linked.png").symlink_to("train_1.png")
+    view = train_views(tmp_path, file_path=given.format(folder=tmp_path))[0]
+    assert view.name == "train_1.png" and np.array_equal(view.image, read_rgba(tmp_path / "train_1.png"))
+
+
+def test_json_in_utf8_with_byte_order_mark(tmp_path):
+    data = write_scene(tmp_path, count=1)
+    (tmp_path / "train_0.png").rename(tmp_path / "köpfe.png")
+    data["frames"][0]["file_path"] = "köpfe"
+    (tmp_path / "transforms_train.json").write_text(json.dumps(data, ensure_ascii=False), encoding="utf-8-sig")
+    assert load_scene(tmp_path).splits["train"][0].name == "köpfe.png"
+
+
+def test_scene_behind_a_link(tmp_path):
+    write_scene(tmp_path)
+    link = tmp_path.parent / f"{tmp_path.name}_link"
+    link.symlink_to(tmp_path)
+    assert len(load_scene(link).splits["train"]) == 3
+
+
+def test_rows_and_rounding_of_the_pose(tmp_path, rng):
+    """3x4 is read as 4x4 is; a rotation that is off by rounding comes out orthonormal."""
+    exact = look_at([1, 2, 0.5])
+    rough = exact.copy()
+    rough[:3, :3] += rng.uniform(-1e-4, 1e-4, (3, 3))
+    for matrix in (exact[:3], rough):
+        pose = train_views(tmp_path, transform_matrix=matrix.tolist())[0].camera.pose
+        rotation = pose[:, :3]
+        assert np.abs(rotation.T @ rotation - np.eye(3)).max() < 1e-14 and np.linalg.det(rotation) > 0
+        assert np.abs(rotation - exact[:3, :3] * [1, -1, -1]).max() < 2e-4
+        assert np.array_equal(pose[:, 3], exact[:3, 3])
+
+
+def test_image_without_alpha_is_all_object(tmp_path):
+    write_scene(tmp_path, count=1)
+    write_png(tmp_path / "train_0.png", np.zeros((SIZE[1], SIZE[0], 3), np.uint8))
+    assert (load_scene(tmp_path).splits["train"][0].image[..., 3] == 255).all()
+
+
+# --------------------------------------------------------------------------------------------------- bad input
+
+MATRIX = look_at([3, 0, 1])
+NAN_MATRIX = MATRIX * np.where(np.eye(4) == 1, np.nan, 1)
+
+BAD_FRAMES = {
+    "no path": ({"file_path": None}, "file_path", "must be the path"),
+    "path is a number": ({"file_path": 3}, "file_path", "must be the path"),
+    "no such image": ({"file_path": "./train_9"}, "file_path", "train_9"),
+    "folder as image": ({"file_path": "."}, "file_path", "no image"),
+    "zero byte": ({"file_path": "a\0b"}, "file_path", "not a usable path"),
+    "endless name": ({"file_path": "a" * 5000}, "file_path", "not a usable path"),
+    "parent folder": ({"file_path": "../secret.png"}, "file_path", "leaves the scene's folder"),
+    "parent folder without ending": ({"file_path": "./x/../../secret"}, "file_path", "leaves the scene's folder"),
+    "absolute": ({"file_path": "/etc/hostname"}, "file_path", "leaves the scene's folder"),
+    "link out": ({"file_path": "link_out"}, "file_path", "leaves the scene's folder"),
+    "loop of links": ({"file_path": "loop"}, "file_path", "not a usable path"),
+    "no matrix": ({"transform_matrix": None}, "transform_matrix", "4x4 or 3x4"),
+    "NaN": ({"transform_matrix": NAN_MATRIX.tolist()}, "transform_matrix", "NaN"),
+    "infinite": ({"transform_matrix": (MATRIX[:3] + math.inf).tolist()}, "transform_matrix", "Inf"),
+    "3x3": ({"transform_matrix": MATRIX[:3, :3].tolist()}, "transform_matrix", "(3, 3)"),
+    "ragged": ({"transform_matrix": [[1, 2], [3]]}, "transform_matrix", "4x4 or 3x4"),
+    "words": ({"transform_matrix": "unknown"}, "transform_matrix", "4x4 or 3x4"),
+    "huge": ({"transform_matrix": [[10**400] * 4] * 4}, "transform_matrix", "4x4 or 3x4"),
+    "scaled": ({"transform_matrix": (MATRIX * [1.01, 1.01, 1.01, 1]).tolist()}, "transform_matrix", "no rotation"),
+    "mirrored": ({"transform_matrix": (MATRIX * [-1, 1, 1, 1]).tolist()}, "transform_matrix", "no rotation"),
+    "zero": ({"transform_matrix": (MATRIX * [0, 0, 0, 1]).tolist()}, "transform_matrix", "no rotation"),
+    "transposed": ({"transform_matrix": MATRIX.T.tolist()}, "transform_matrix", "last row"),
+    "negative focal length": ({"fl_x": -5}, "fl_x", "above 0"),
+    "focal length in words": ({"fl_x": "50mm"}, "fl_x", '"50mm"'),
+    "true": ({"fl_x": True}, "fl_x", "true"),
+    "NaN number": ({"cx": math.nan}, "cx", "NaN"),
+    "infinite number": ({"cy": -math.inf}, "cy", "-Infinity"),
+    "huge number": ({"fl_y": 10**400}, "fl_y", "finite"),
+    "angle over pi": ({"camera_angle_x": 40}, "camera_angle_x", "below 3.14"),
+    "width": ({"w": 48}, "w", "24x18", "train_1.png"),
+    "height": ({"h": 19}, "h", "24x18", "train_1.png"),
+    "distortion": ({"k1": 0.01}, "k1", "undistort"),
+    "fisheye": ({"camera_model": "OPENCV_FISHEYE"}, "camera_model", "undistort"),
+    "near only": ({"near": 1.0}, "far", "missing"),
+    "far only": ({"far": 1.0}, "near", "missing"),
+    "near 0": ({"near": 0, "far": 2}, "near", "above 0"),
+    "far before near": ({"near": 3, "far": 2}, "far", "above near"),
+}
+
+
+@pytest.mark.parametrize("case", BAD_FRAMES)
+def test_bad_frame(tmp_path, case):
+    """The message names the file, the frame and the key."""
+    folder = tmp_path / "scene"
+    folder.mkdir()
+    write_png(tmp_path / "secret.png", np.zeros((SIZE[1], SIZE[0], 4), np.uint8))
+    (folder / "link_out.png").symlink_to(tmp_path / "secret.png")
+    (folder / "loop").symlink_to("loop")
+    change, key, *words = BAD_FRAMES[case]
+    write_scene(folder, edit=lambda data: data["frames"][1].update(change))
+    refused(folder, folder / "transforms_train.json", f"frames[1].{key}:", *words)
+
+
+def test_bad_key_of_the_whole_file(tmp_path):
+    write_scene(tmp_path, edit=lambda data: data.update(camera_angle_x="wide"))
+    refused(tmp_path, f"{tmp_path / 'transforms_train.json'}: camera_angle_x:", '"wide"')
+
+
+def test_no_focal_length(tmp_path):
+    write_scene(tmp_path, edit=lambda data: data.pop("camera_angle_x"))
+    refused(tmp_path, "transforms_train.json: frames[0].fl_x:", "camera_angle_x")
+
+
+@pytest.mark.parametrize("frames", ([], {}, None, "all"))
+def test_no_frames(tmp_path, frames):
+    write_scene(tmp_path, edit=lambda data: data.update(frames=frames))
+    refused(tmp_path, "transforms_train.json: frames:")
+
+
+def test_frame_that_is_no_object(tmp_path):
+    write_scene(tmp_path, edit=lambda data: data["frames"].append([1, 2]))
+    refused(tmp_path, "transforms_train.json: frames[3]:")
+
+
+@pytest.mark.parametrize(("text", "words"), (
+    ('{\n "frames": [,]\n}', ("line 2", "column 13")), ("", ("line 1", "column 1")), ("[1, 2]", ("object",)),
+    ("[" * 100_000, ("JSON",)), ('{"w": ' + "9" * 5000 + "}", ("JSON",)), ("\udcff\udcfe", ("JSON",)),
+))
+def test_broken_json(tmp_path, text, words):
+    (tmp_path / "transforms_train.json").write_text(text, errors="surrogateescape")
+    refused(tmp_path, tmp_path / "transforms_train.json", *words)
+
+
+def test_json_cut_anywhere(tmp_path):
+    write_scene(tmp_path, count=1)
+    file = tmp_path / "transforms_train.json"
+    content = file.read_text()
+    for length in range(0, len(content), 7):
+        file.write_text(content[:length])
+        refused(tmp_path, file, "line 1")
+
+
+def test_missing_folder_format_and_split(tmp_path):
+    refused(tmp_path / "none", tmp_path / "none", "no such folder", "demo")
+    refused(tmp_path, tmp_path, "no scene in it", "transforms_train.json")
+    write_scene(tmp_path)
+    refused(tmp_path / "transforms_train.json", "no such folder")
+    write_scene(tmp_path, "val")
+    refused(tmp_path, tmp_path / "transforms_test.json", "train, val", splits=("test",))
+
+
+def test_missing_image(tmp_path):
+    write_scene(tmp_path)
+    (tmp_path / "train_2.png").unlink()
+    refused(tmp_path, "transforms_train.json: frames[2].file_path:", "train_2")
+
+
+def test_truncated_image(tmp_path):
+    write_scene(tmp_path)
+    file = tmp_path / "train_1.png"
+    file.write_bytes(file.read_bytes()[:-200])
+    refused(tmp_path, file, "truncated", "copy")
+
+
+def test_views_of_different_sizes(tmp_path):
+    write_scene(tmp_path)
+    write_scene(tmp_path, "test")
+    write_png(tmp_path / "test_2.png", np.zeros((SIZE[1] + 1, SIZE[0], 4), np.uint8))
+    load_scene(tmp_path)
+    refused(tmp_path, tmp_path / "train_0.png", tmp_path / "test_2.png", "24x19", "24x18", splits=("train", "test"))
+
+
+def test_depth_range_of_some_views_only(tmp_path):
+    write_scene(tmp_path, edit=lambda data: data["frames"][2].update(near=1, far=2))
+    refused(tmp_path, "near and far", "train_0.png", "train_2.png")
+
+
+# ----------------------------------------------------------------------------------------- reduction and masks
+
+
+@pytest.fixture
+def view():
+    """A view of 70x50 pixels, all transparent."""
+    return View("a.png", Camera(np.eye(3, 4), 60, 60, 35, 25, 70, 50), np.zeros((50, 70, 4), np.uint8))
+
+
+def test_reduced_camera(view):
+    camera = reduced_camera(view, 3)
+    assert (camera.width, camera.height, camera.fx, camera.cx) == (23, 16, 20, 35 / 3)
+
+
+@pytest.mark.parametrize("downscale", (0, -1, 4, 1.5, "2", None))
+def test_reduced_too_far(view, downscale):
+    with pytest.raises(UserError, match=r"--downscale .*from 1 to 3.*70x50 pixels of a\.png"):
+        reduced_camera(view, downscale)
+
+
+def test_image_too_small_for_any_reduction():
+    with pytest.raises(UserError, match=r"a\.png: 70x15 pixels"):
+        reduced_camera(View("a.png", Camera(np.eye(3, 4), 60, 60, 35, 25, 70, 15), np.zeros((15, 70, 4), np.uint8)), 1)
+
+
+@pytest.mark.parametrize("downscale", (1, 2, 3))
+@pytest.mark.parametrize("margin", (0, 2, 100))
+def test_object_box_is_the_tightest(view, rng, downscale, margin):
+    """Against a search over the reduced pixels one by one; the image's leftover columns and rows do not count."""
+    for _ in range(5):
+        view.image[..., 3] = rng.integers(0, MASK_THRESHOLD + 1, view.image.shape[:2])
+        view.image[rng.integers(5, 50, 4), rng.integers(9, 70, 4), 3] = MASK_THRESHOLD + 1
+        width, height = 70 // downscale, 50 // downscale
+        hit = [(x, y) for x in range(width) for y in range(height)
+               if view.image[y * downscale:(y + 1) * downscale, x * downscale:(x + 1) * downscale, 3].max() > MASK_THRESHOLD]
+        x, y = zip(*hit, strict=True)
+        expected = (max(min(x) - margin, 0), max(min(y) - margin, 0),
+                    min(max(x) + 1 + margin, width), min(max(y) + 1 + margin, height))
+        assert object_box([view], downscale, margin) == [expected]
+
+
+def test_object_box_without_object(view):
+    assert object_box([view, view], 3, 5) == [(0, 0, 23, 16)] * 2
+
+
+# --------------------------------------------------------------------------------------------------- real data
+
+
+def test_lego(data):
+    """The view's mask lies where the model's extent says; the published row belongs to this scene."""
+    scene = load_scene(data / "nerf_synthetic/lego", ("test",))
+    views = scene.splits["test"]
+    assert len(views) == 25 and views[1].name == "test/r_8.png" and not scene.depth_range_stored
+    assert scene.published == {"PlenopticPoints": {"psnr": 33.00, "ssim": 0.975, "lpips": 0.026}}
+    for view in views:
+        assert view.camera.fx == pytest.approx(1111.111, abs=1e-3) and view.image.shape == (800, 800, 4)
+        assert np.linalg.norm(view.camera.eye) == pytest.approx(4.031, abs=1e-2)
+        assert alpha_at(view, [0, 0, 0.3]) == 255
+
+
+def test_ethiopian_head(data):
+    """An object away from the origin: its centre is seen in every photograph."""
+    scene = load_scene(data / "ethiopian_head", ("train", "test"))
+    assert scene.depth_range_stored and scene.published == {}
+    assert [len(v) for v in scene.splits.values()] == [57, 9]
+    for view in scene.splits["train"] + scene.splits["test"]:
+        assert alpha_at(view, [-0.521, 1.297, 1.718]) > 250
+        assert 3.3 < view.camera.near < 3.7 and 3.9 < view.camera.far < 5.1
+        x0, y0, x1, y1 = object_box([view], 2, 0)[0]
+        assert 40 < x1 - x0 < 200 and 40 < y1 - y0 <= 200
+
+
+def alpha_at(view, point):
+    """Alpha of the pixel that shows a world point."""
+    camera = view.camera
+    x, y, z = camera.pose[:, :3].T @ (point - camera.eye)
+    return view.image[int(camera.fy * y / z + camera.cy), int(camera.fx * x / z + camera.cx), 3]
+
+
+def test_published_rows_need_the_benchmark_itself(tmp_path):
+    """A scene that is only named like it gets none."""
+    folder = tmp_path / "lego"
+    folder.mkdir()
+    write_scene(folder)
+    assert load_scene(folder).published == {}
+    shutil.move(folder, tmp_path / "other")
+    assert load_scene(tmp_path / "other").name == "other"

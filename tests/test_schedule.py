@@ -1,0 +1,47 @@
+"""pp_cl/schedule.py: the values of the formulas, worked out by hand."""
+
+import math
+
+import pytest
+
+from pp_cl.schedule import average_weight, gamma, learning_rate
+
+SH_RATES = [((0.5, 0.05, 0), {0: 0.5, 250: 0.49428, 500: 0.48862, 1000: 0.4775, 25000: 0.15811, 50000: 0.05}),
+            ((0.25, 0.025, 500), {0: 0.0025, 250: 0.17548, 500: 0.24431, 1000: 0.23875, 25000: 0.07906, 50000: 0.025}),
+            ((0.125, 0.0125, 1000), {0: 0.00125, 250: 0.04805, 500: 0.08673, 1000: 0.11937, 25000: 0.03953, 50000: 0.0125})]
+
+
+@pytest.mark.parametrize(("arguments", "values"), SH_RATES)
+def test_published_rates(arguments, values):
+    for step, value in values.items():
+        assert learning_rate(step, 50000, *arguments) == pytest.approx(value, abs=6e-6)
+
+
+def test_delay_factor_zero_starts_at_exactly_zero():
+    assert learning_rate(0, 100, 0.5, 0.05, delay_steps=10, delay_factor=0) == 0
+    assert learning_rate(1, 100, 0.5, 0.05, delay_steps=10, delay_factor=0) > 0
+
+
+def test_rate_stays_after_the_end():
+    assert learning_rate(200, 100, 0.5, 0.05) == pytest.approx(0.05)
+
+
+def test_gamma():
+    assert gamma(0, 50000) == pytest.approx(0.1)
+    assert gamma(25000, 50000) == pytest.approx(0.031623, abs=5e-7)
+    assert gamma(50000, 50000) == pytest.approx(0.01)
+
+
+def test_average_weight():
+    weights = [average_weight(step, 3500) for step in range(3500)]
+    due = [step for step, weight in enumerate(weights) if weight]
+    assert due == list(range(2450, 3500, 10))
+    assert weights[2450] == 1
+    assert weights[2460] == weights[3490] == pytest.approx(1 - math.exp(-10 / 175))
+
+
+@pytest.mark.parametrize("steps", [1, 2, 7, 100])
+def test_short_trainings_average_too(steps):
+    weights = [average_weight(step, steps) for step in range(steps)]
+    assert [w for w in weights if w][0] == 1
+    assert all(0 <= w <= 1 for w in weights)

@@ -1,0 +1,76 @@
+"""cl/smooth.cl against dictionaries and loops."""
+
+import numpy as np
+import oracle_optim
+import pytest
+from helpers import AWKWARD_SIZES, relative_error
+
+from pp_cl.points import Grid
+from pp_cl.smooth import neighbour_table, smooth
+
+NONE = 0xFFFFFFFF
+
+
+def table(dev, ids, dims):
+    grid = dev.upload(Grid((0, 0, 0), 1, dims).packed())
+    return neighbour_table(dev, grid, dev.upload(np.asarray(ids, np.uint32)))
+
+
+def some_ids(rng, n, dims):
+    return np.sort(rng.choice(np.prod(dims), n, replace=False)).astype(np.uint32)
+
+
+def expected_table(ids, dims):
+    return [[NONE if j is None else j for j in row] for row in oracle_optim.neighbours(ids, dims)]
+
+
+@pytest.mark.parametrize("n", AWKWARD_SIZES)
+@pytest.mark.parametrize("dims", [(7, 8, 9), (300, 1, 1), (1, 300, 1), (1, 1, 300), (2, 11, 13)])
+def test_table_matches_dictionary(dev, rng, n, dims):
+    ids = some_ids(rng, n, dims)
+    np.testing.assert_array_equal(table(dev, ids, dims).get(), expected_table(ids, dims))
+
+
+def test_full_grid_does_not_wrap(dev):
+    dims = (4, 3, 5)
+    ids = np.arange(60)
+    found = table(dev, ids, dims).get()
+    np.testing.assert_array_equal(found, expected_table(ids, dims))
+    assert (found == NONE).sum() == 2 * (3 * 5 + 4 * 5 + 4 * 3)  # one a face cell
+
+
+def test_table_of_a_huge_grid(dev):
+    """Ids of the largest allowed grid, 2^27 vertices, whose float32 sizes must stay exact."""
+    dims = (517, 512, 507)
+    last = 517 * 512 * 507 - 1
+    ids = [0, 1, 516, 517, 517 * 512 - 1, 517 * 512, last - 517 * 512, last - 517, last - 1, last]
+    np.testing.assert_array_equal(table(dev, ids, dims).get(), expected_table(ids, dims))
+
+
+@pytest.mark.parametrize("n", AWKWARD_SIZES)
+@pytest.mark.parametrize("coefficients", [1, 3, 5])
+def test_smooth_matches_oracle(dev, rng, n, coefficients):
+    dims = (7, 8, 9)
+    ids = some_ids(rng, n, dims)
+    values = rng.standard_normal((n, coefficients, 16)).astype(np.float32)
+    sh = dev.upload(values)
+    smooth(dev, sh, table(dev, ids, dims), 0.06, dev.empty((n, 16)))
+    expected = oracle_optim.smoothed(values, ids, dims, 0.06)
+    assert relative_error(sh.get(), expected) < 3e-7
+
+
+def test_lonely_points_stay(dev, rng):
+    dims = (9, 9, 9)
+    ids = [0, 2, 8, 9 * 2, 9 * 9 * 2, 9**3 - 1]
+    values = rng.standard_normal((6, 3, 16)).astype(np.float32)
+    sh = dev.upload(values)
+    smooth(dev, sh, table(dev, ids, dims), 1.0, dev.empty((6, 16)))
+    np.testing.assert_array_equal(sh.get(), values)
+
+
+def test_amount_one_is_the_mean_of_old_values(dev):
+    """A row 0 1 2 3 becomes 1 1 2 2 only if nobody reads a new value."""
+    values = np.repeat(np.arange(4, dtype=np.float32), 16).reshape(4, 1, 16)
+    sh = dev.upload(values)
+    smooth(dev, sh, table(dev, range(4), (4, 1, 1)), 1.0, dev.empty((4, 16)))
+    np.testing.assert_array_equal(sh.get()[:, 0, 0], [1, 1, 2, 2])

@@ -1,0 +1,105 @@
+"""Makes sure that this virtual environment has a working OpenCL device; `make setup` runs it.
+
+A device counts when a test build runs on it. Tried in turn until one does: what is there already, Debian's PoCL (as
+root), Intel's CPU runtime (x86-64), PyPI's PoCL 3.0. With --intel: Intel's runtime, whatever else is there.
+"""
+
+import argparse
+import os
+import platform
+import shutil
+import subprocess
+import sys
+from importlib.metadata import PackageNotFoundError, files
+from importlib.util import find_spec
+from pathlib import Path
+
+LIST = "from pp_cl.device import list_devices\nfor i, d, problem in list_devices(): print(i, d.platform.name, d.name, problem or 'works')"
+INTEL = ("intel-opencl-rt", "intel-cmplr-lib-rt")
+POCL = "pocl-binary-distribution"
+
+
+def devices():
+    """One line for each OpenCL device; asked in a process of its own, as drivers are looked for once a process."""
+    listed = subprocess.run([sys.executable, "-c", LIST], capture_output=True, text=True)
+    if listed.returncode:
+        print(listed.stderr, file=sys.stderr)
+    return listed.stdout.splitlines()
+
+
+def works(lines, name=""):
+    """Whether a device whose line contains `name` works."""
+    return any(line.endswith(" works") and name in line for line in lines)
+
+
+def install_debian():
+    """Debian's and Ubuntu's PoCL."""
+    env = {**os.environ, "DEBIAN_FRONTEND": "noninteractive"}
+    for command in ("update", "install --yes --no-install-recommends pocl-opencl-icd"):
+        subprocess.run(["apt-get", "-qq", *command.split()], env=env, stdout=subprocess.DEVNULL, check=True)
+
+
+def pip(*arguments):
+    subprocess.run([sys.executable, "-m", "pip", "--disable-pip-version-check", "--quiet", *arguments], check=True)
+
+
+def install_intel():
+    """Intel's CPU runtime, inside the virtual environment."""
+    pip("install", *INTEL)
+    register_intel()
+
+
+def register_intel():
+    """Write the .icd file by which pyopencl's own loader finds Intel's runtime; the one in Intel's wheel has a wrong path.
+
+    The loader of pyopencl's wheels reads pyopencl/.libs besides the system's folder, so no variable needs setting.
+    """
+    library = next(f.locate().resolve() for f in files(INTEL[0]) if f.name == "libintelocl.so")
+    folder = Path(find_spec("pyopencl").origin).parent / ".libs"
+    if folder.is_dir():
+        (folder / "intel-cpu.icd").write_text(f"{library}\n")
+    else:
+        print(f"this pyopencl uses the system's OpenCL loader: set OCL_ICD_VENDORS={library}", file=sys.stderr)
+
+
+def install_pocl():
+    """PyPI's PoCL 3.0: old, and unknown to it are current processors."""
+    pip("install", POCL)
+    if not works(devices()):
+        pip("uninstall", "--yes", POCL)
+
+
+def main():
+    """Exit status 0 when a device works at the end, else 1."""
+    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
+    parser.add_argument("--intel", action="store_true", help="install Intel's CPU runtime, whatever else is there")
+    only_intel = parser.parse_args().intel
+    wanted = "Intel(R) OpenCL" if only_intel else ""
+
+    steps = []
+    if os.geteuid() == 0 and shutil.which("apt-get") and not only_intel:
+        steps.append(install_debian)
+    if platform.machine() == "x86_64":
+        steps.append(install_intel)
+    if not only_intel:
+        steps.append(install_pocl)
+
+    found = devices()
+    for step in steps:
+        if works(found, wanted):
+            break
+        print(f"no working OpenCL device yet; trying: {step.__doc__}")
+        try:
+            step()
+        except (subprocess.CalledProcessError, PackageNotFoundError, StopIteration) as error:
+            print(f"  that did not work: {error}", file=sys.stderr)
+        found = devices()
+    print("\n".join(found) or "no OpenCL device found")
+    if works(found, wanted):
+        return 0
+    print("no working OpenCL device: docs/devices.md says how to install one", file=sys.stderr)
+    return 1
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,27 @@
+#!/bin/sh
+# Makes .venv with the package in it (editable, with its test extra): tools/setup_venv.sh PYTHON
+set -eu
+python=$1
+
+"$python" -c 'import sys; sys.exit(sys.version_info < (3, 10))' || {
+    echo "$python does not run, or is older than Python 3.10: name another with \`make setup PYTHON=...\`" >&2
+    exit 2
+}
+
+if ! .venv/bin/python -m pip --version >/dev/null 2>&1; then
+    if ! "$python" -c 'import ensurepip, venv' 2>/dev/null; then  # Debian keeps them in a package of their own
+        package=python$("$python" -c 'import sys; print("%d.%d" % sys.version_info[:2])')-venv
+        if [ "$(id -u)" != 0 ] || ! command -v apt-get >/dev/null; then
+            echo "$python cannot make virtual environments: run \`apt-get install $package\` as root" \
+                 "or name another with \`make setup PYTHON=...\`" >&2
+            exit 2
+        fi
+        echo "installing $package ..."
+        apt-get -qq update >/dev/null
+        DEBIAN_FRONTEND=noninteractive apt-get -qq install --yes --no-install-recommends "$package" >/dev/null
+    fi
+    echo "making .venv ..."
+    "$python" -m venv --clear .venv
+fi
+echo "installing pp-cl and what it needs into .venv ..."
+.venv/bin/python -m pip install --quiet --disable-pip-version-check --editable '.[test]'
