@@ -1,7 +1,9 @@
 // The layers between convolutions, on (H, W, C) feature maps: pooling, bilinear upsampling, a straight line.
-// In all of them the first global index is the channel: neighbouring work-items touch neighbouring floats.
+// But for the last, a work-item is (16 channels, x, y): one vector of a pixel, shorter where C ends.
+#include "common.h"
+#include "lanes.h"
 
-// One work-item per (channel, x, y) of out: reads the 2x2 pixels it covers, writes their mean.
+// One work-item per (16 channels, x, y) of out: reads the 2x2 pixels it covers, writes their mean.
 kernel void avgpool2_forward(
     const int h,                         // of out
     const int w,
@@ -9,14 +11,16 @@ kernel void avgpool2_forward(
     global const float *x,               // (?, ?, c) twice the height and width of out
     global float *out)                   // (h, w, c)
 {
-    const int i = get_global_id(0), column = get_global_id(1), row = get_global_id(2);
-    if (i >= c || column >= w || row >= h)
+    const int first = get_global_id(0) * CHANNELS, column = get_global_id(1), row = get_global_id(2), lanes = c - first;
+    if (lanes <= 0 || column >= w || row >= h)
         return;
-    const size_t stride = (size_t)2 * w * c, at = 2 * row * stride + 2 * column * c + i;
-    out[((size_t)row * w + column) * c + i] = 0.25f * ((x[at] + x[at + c]) + (x[at + stride] + x[at + stride + c]));
+    global const float *upper = x + ((size_t)row * 4 * w + column * 2) * c + first, *lower = upper + 2 * w * c;
+    const float16 sum = (load_lanes(upper, lanes) + load_lanes(upper + c, lanes))
+                      + (load_lanes(lower, lanes) + load_lanes(lower + c, lanes));
+    store_lanes(0.25f * sum, out + ((size_t)row * w + column) * c + first, lanes);
 }
 
-// One work-item per (channel, x, y) of x: ADDS its share of grad_out to grad_x, which holds the gradient from x's other
+// One work-item per (16 channels, x, y) of x: ADDS its share of grad_out to grad_x, which holds the gradient from x's other
 // use, and then sets it to 0 where x <= 0: x is the output of a ReLU, grad_x becomes the gradient of that ReLU's input.
 kernel void avgpool2_backward(
     const int h,                         // of out
@@ -26,16 +30,17 @@ kernel void avgpool2_backward(
     global const float *grad_out,        // (h, w, c)
     global float *grad_x)                // (?, ?, c)
 {
-    const int i = get_global_id(0), column = get_global_id(1), row = get_global_id(2);
-    if (i >= c || column >= 2 * w || row >= 2 * h)
+    const int first = get_global_id(0) * CHANNELS, column = get_global_id(1), row = get_global_id(2), lanes = c - first;
+    if (lanes <= 0 || column >= 2 * w || row >= 2 * h)
         return;
-    const size_t at = ((size_t)row * 2 * w + column) * c + i;
-    const float dL_dx = grad_x[at] + 0.25f * grad_out[((size_t)(row / 2) * w + column / 2) * c + i];
-    grad_x[at] = x[at] > 0.0f ? dL_dx : 0.0f;
+    const size_t at = ((size_t)row * 2 * w + column) * c + first;
+    const float16 dL_dout = load_lanes(grad_out + ((size_t)(row / 2) * w + column / 2) * c + first, lanes);
+    const float16 dL_dx = load_lanes(grad_x + at, lanes) + 0.25f * dL_dout;
+    store_lanes(select((float16)0.0f, dL_dx, load_lanes(x + at, lanes) > 0.0f), grad_x + at, lanes);
 }
 
-// One work-item per (channel, x, y) of out: reads the 2x2 pixels it covers, writes their largest; an odd last row or column
-// of x is left out, as PyTorch does.
+// One work-item per (16 channels, x, y) of out: reads the 2x2 pixels it covers, writes their largest; an odd last row or
+// column of x is left out, as PyTorch does.
 kernel void maxpool2_forward(
     const int h,                         // of out
     const int w,
@@ -44,16 +49,18 @@ kernel void maxpool2_forward(
     global const float *x,               // (?, x_width, c)
     global float *out)                   // (h, w, c)
 {
-    const int i = get_global_id(0), column = get_global_id(1), row = get_global_id(2);
-    if (i >= c || column >= w || row >= h)
+    const int first = get_global_id(0) * CHANNELS, column = get_global_id(1), row = get_global_id(2), lanes = c - first;
+    if (lanes <= 0 || column >= w || row >= h)
         return;
-    const size_t stride = (size_t)x_width * c, at = 2 * row * stride + 2 * column * c + i;
-    out[((size_t)row * w + column) * c + i] = fmax(fmax(x[at], x[at + c]), fmax(x[at + stride], x[at + stride + c]));
+    global const float *upper = x + ((size_t)row * 2 * x_width + column * 2) * c + first, *lower = upper + x_width * c;
+    const float16 largest = fmax(fmax(load_lanes(upper, lanes), load_lanes(upper + c, lanes)),
+                                 fmax(load_lanes(lower, lanes), load_lanes(lower + c, lanes)));
+    store_lanes(largest, out + ((size_t)row * w + column) * c + first, lanes);
 }
 
-// One work-item per (channel, x, y) of out, which is twice as high and wide as x: reads the nearest pixel and its
-// neighbours towards out's centre, writes them weighted 3/4 and 1/4 along each axis (bilinear, align_corners False, the
-// border repeated).
+// One work-item per (16 channels, x, y) of out, which is twice as high and wide as x: reads the pixel of x that out's
+// centre lies in and the nearest ones beside it, writes them weighted 3/4 and 1/4 along each axis (bilinear, align_corners
+// False, the border repeated).
 kernel void upsample2_forward(
     const int h,                         // of x
     const int w,
@@ -61,17 +68,18 @@ kernel void upsample2_forward(
     global const float *x,               // (h, w, c)
     global float *out)                   // (?, ?, c)
 {
-    const int i = get_global_id(0), column = get_global_id(1), row = get_global_id(2);
-    if (i >= c || column >= 2 * w || row >= 2 * h)
+    const int first = get_global_id(0) * CHANNELS, column = get_global_id(1), row = get_global_id(2), lanes = c - first;
+    if (lanes <= 0 || column >= 2 * w || row >= 2 * h)
         return;
-    const int x0 = column / 2, x1 = clamp(x0 - 1 + 2 * (column & 1), 0, w - 1);
-    const int y0 = row / 2, y1 = clamp(y0 - 1 + 2 * (row & 1), 0, h - 1);
-    global const float *near = x + (size_t)y0 * w * c + i, *far = x + (size_t)y1 * w * c + i;
-    out[((size_t)row * 2 * w + column) * c + i] = 0.75f * (0.75f * near[x0 * c] + 0.25f * near[x1 * c])
-                                                + 0.25f * (0.75f * far[x0 * c] + 0.25f * far[x1 * c]);
+    const int near = column / 2 * c, beside = clamp(column / 2 - 1 + 2 * (column & 1), 0, w - 1) * c;
+    const int other = clamp(row / 2 - 1 + 2 * (row & 1), 0, h - 1);
+    global const float *a = x + (size_t)(row / 2) * w * c + first, *b = x + (size_t)other * w * c + first;
+    const float16 upper = 0.75f * load_lanes(a + near, lanes) + 0.25f * load_lanes(a + beside, lanes);
+    const float16 lower = 0.75f * load_lanes(b + near, lanes) + 0.25f * load_lanes(b + beside, lanes);
+    store_lanes(0.75f * upper + 0.25f * lower, out + ((size_t)row * 2 * w + column) * c + first, lanes);
 }
 
-// One work-item per (channel, x, y) of x: gathers the 4x4 pixels of grad_out that read it, writes their weighted sum.
+// One work-item per (16 channels, x, y) of x: gathers the 4x4 pixels of grad_out that read it, writes their weighted sum.
 kernel void upsample2_backward(
     const int h,                         // of x
     const int w,
@@ -79,21 +87,21 @@ kernel void upsample2_backward(
     global const float *grad_out,        // (?, ?, c) twice the height and width of x
     global float *grad_x)                // (h, w, c)
 {
-    const int i = get_global_id(0), column = get_global_id(1), row = get_global_id(2);
-    if (i >= c || column >= w || row >= h)
+    const int first = get_global_id(0) * CHANNELS, column = get_global_id(1), row = get_global_id(2), lanes = c - first;
+    if (lanes <= 0 || column >= w || row >= h)
         return;
-    const float tap[4] = {0.25f, 0.75f, 0.75f, 0.25f};
-    float dL_dx = 0.0f;
-    // Rows and columns outside out are, in the repeated border, a quarter more of the row or column that is its edge.
+    // The outermost row or column reads its own edge of x with weight 1: it counts once more in place of the one outside.
+    const int x0 = max(2 * column - 1, 0) * c, x1 = 2 * column * c, x2 = x1 + c, x3 = min(2 * column + 2, 2 * w - 1) * c;
+    float16 dL_dx = 0.0f;
+    #pragma unroll
     for (int dy = 0; dy < 4; dy++) {
         const int y = clamp(2 * row - 1 + dy, 0, 2 * h - 1);
-        global const float *grad = grad_out + (size_t)y * 2 * w * c + i;
-        float sum = 0.0f;
-        for (int dx = 0; dx < 4; dx++)
-            sum += tap[dx] * grad[clamp(2 * column - 1 + dx, 0, 2 * w - 1) * c];
-        dL_dx += tap[dy] * sum;
+        global const float *grad = grad_out + (size_t)y * 2 * w * c + first;
+        const float16 outer = load_lanes(grad + x0, lanes) + load_lanes(grad + x3, lanes);
+        const float16 inner = load_lanes(grad + x1, lanes) + load_lanes(grad + x2, lanes);
+        dL_dx += (dy == 0 || dy == 3 ? 0.25f : 0.75f) * (0.25f * outer + 0.75f * inner);
     }
-    grad_x[((size_t)row * w + column) * c + i] = dL_dx;
+    store_lanes(dL_dx, grad_x + ((size_t)row * w + column) * c + first, lanes);
 }
 
 // One work-item per element: reads x, writes scale * x + offset.

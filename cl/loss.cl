@@ -5,8 +5,9 @@
 // P = (E[d]^2 + E[s]^2)/2 + C1, Q = (Var[d] + Var[s])/2 + C2: the usual formula, but one that does not cancel where p = t.
 // An image row is a flat vector of 3 values a pixel, so a step of one pixel is a step of 3 values.
 //
-// Five launches: moments of the windows along y; along x, then SSIM and its slopes; slopes spread along x; along y, with
-// the gradient; and sums. Scratch rows are BLOCKS float16 long, 2 more than 3W values need, so that no tap needs a test.
+// The kernels run in their order here: moments of the windows along y; along x, then SSIM and its slopes; slopes spread
+// along x; along y, with the gradient; sums. Scratch rows are BLOCKS float16 long, 2 more than 3W values need, so that no
+// tap along x needs a test.
 #include "common.h"
 #include "vector.h"
 

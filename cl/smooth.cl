@@ -1,4 +1,4 @@
-// Smoothing of the SH coefficients over the grid, apart from Adam: f += amount * (mean of the neighbours - f).
+// Smoothing of the SH coefficients over the grid, outside Adam: f += amount * (mean of the neighbours - f).
 #include "common.h"
 
 // Index of `id` in ids[first, last), ascending; NONE where it is missing.
@@ -24,15 +24,15 @@ kernel void neighbour_table(
     const uint i = get_global_id(0);
     if (i >= n)
         return;
-    const uint nx = grid[4], ny = grid[5], nz = grid[6], plane = nx * ny;
-    const uint id = ids[i], x = id % nx, y = id / nx % ny, z = id / plane;
+    const uint nx = grid[4], ny = grid[5], plane = nx * ny;
+    const uint id = ids[i], x = id % nx, y = id / nx % ny;
     global uint *row = neighbours + 6 * (size_t)i;
     row[0] = x > 0 ? find(ids, id - 1, 0, i) : NONE;
     row[1] = x + 1 < nx ? find(ids, id + 1, i + 1, n) : NONE;
     row[2] = y > 0 ? find(ids, id - nx, 0, i) : NONE;
     row[3] = y + 1 < ny ? find(ids, id + nx, i + 1, n) : NONE;
-    row[4] = z > 0 ? find(ids, id - plane, 0, i) : NONE;
-    row[5] = z + 1 < nz ? find(ids, id + plane, i + 1, n) : NONE;
+    row[4] = id >= plane ? find(ids, id - plane, 0, i) : NONE;
+    row[5] = find(ids, id + plane, i + 1, n);
 }
 
 // One work-item per point of a chunk: reads all its coefficients and its neighbours', writes the smoothed ones.

@@ -9,7 +9,7 @@ BETA1, BETA2 = 0.9, 0.999  # Kingma & Ba 2015
 
 
 def _step_arguments(step, rate, eps, beta1, beta2):
-    """The kernels' scalars. rate*m^/(sqrt(v^) + eps) with m^ = m/c1, v^ = v/c2 is (rate sqrt(c2)/c1) m/(sqrt(v) + eps sqrt(c2))."""
+    """The kernels' scalars: rate (m/c1) / (sqrt(v/c2) + eps) is (rate sqrt(c2)/c1) m / (sqrt(v) + eps sqrt(c2))."""
     root = math.sqrt(1 - beta2**step)
     return {"decay1": 1 - beta1, "decay2": 1 - beta2, "rate": rate * root / (1 - beta1**step), "eps": eps * root}
 
@@ -44,7 +44,7 @@ def adam_sh_update(dev, grid, camera, ids, grad_point_features, sh, m, v, step, 
 
 
 def ema_update(dev, average, parameter, weight):
-    """average += weight * (parameter - average), in place; a weight of 1 copies, whatever `average` held.
+    """Move an average, in place: average += weight * (parameter - average). A weight of 1 copies, whatever it held.
 
     average, parameter: float32 arrays of one shape, any. Raises ValueError when the shapes differ.
     """

@@ -57,7 +57,7 @@ def _parser():
     evaluate.add_argument("--metrics", nargs="?", const=",".join(METRICS), default="psnr,ssim", metavar="A,B",
                           help="of psnr, ssim, lpips; bare = all three (default psnr,ssim)")
     evaluate.add_argument("--split", default="test", help="train, val or test (default)")
-    evaluate.add_argument("--save-images", action="store_true", help="write every view to RUN/eval/")
+    evaluate.add_argument("--save-images", action="store_true", help="write every view to RUN/eval/images/")
     _device_option(evaluate)
 
     compare = _command(commands, "compare", _compare, "measure one image, or a folder of images, against the truth")

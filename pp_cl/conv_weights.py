@@ -38,9 +38,11 @@ def weight_gradient(dev, x, grad_out, grad_weight, grad_bias, partial, x2=None):
     blocks, k, _, ci, _ = grad_weight.shape
     sources = [x] if x2 is None else [x, x2]
     if sum(s.shape[2] for s in sources) != ci or blocks != -(-co // LANES) or grad_bias.shape != (blocks * LANES,):
-        raise ValueError(f"weight gradient of {[s.shape for s in sources]} to {co} channels: {grad_weight.shape}, {grad_bias.shape}")
-    if partial.size < partial_floats(height, grad_weight.shape):
-        raise ValueError(f"weight gradient: scratch has {partial.size} floats, needs {partial_floats(height, grad_weight.shape)}")
+        raise ValueError(f"weight gradient of {[s.shape for s in sources]} to {co} channels: "
+                         f"weight is {grad_weight.shape}, bias {grad_bias.shape}")
+    needed = partial_floats(height, grad_weight.shape)
+    if partial.size < needed:
+        raise ValueError(f"weight gradient: scratch has {partial.size} floats, needs {needed}")
     parts, rows = _parts(height, grad_weight.shape)
     first = 0
     for source in sources:

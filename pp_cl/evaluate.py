@@ -1,7 +1,7 @@
 """Evaluation of a run: every view of a split, rendered, rounded to 8 bits, measured."""
 
 import time
-from dataclasses import replace
+from pathlib import PurePosixPath
 
 import numpy as np
 
@@ -14,7 +14,8 @@ from pp_cl.metrics import Metrics, mean
 from pp_cl.model import Model
 from pp_cl.preview import write_comparison
 from pp_cl.render import Renderer
-from pp_cl.run import CHECKPOINT, open_scene
+from pp_cl.run import CHECKPOINT, open_scene, with_depth_range
+from pp_cl.scene import reduced_camera
 from pp_cl.target import Target
 
 PICTURE_VIEWS = 4  # rows of the comparison picture
@@ -33,14 +34,13 @@ def evaluate_run(folder, metrics, split, save_images, device_choice):
         raise UserError(f"--split {split}: {scene.name} has {', '.join(scene.splits)}")
     measure = Metrics(dev, metrics)
     model = Model.load(dev, header, arrays, config.network.widths, folder / CHECKPOINT)
-    views = scene.splits[split]
-    if not scene.depth_range_stored:
-        near, far = model.depth_range
-        views = [replace(v, camera=replace(v.camera, near=near, far=far)) for v in views]
+    views = with_depth_range(scene.splits[split], model.depth_range)
 
     target_folder = folder / "eval"
     target_folder.mkdir(exist_ok=True)
     remove_leftovers(target_folder)
+    if save_images:
+        (target_folder / "images").mkdir(exist_ok=True)
     rows, pictures, seconds = [], [], []
     for view, picture, truth, duration in _render_all(dev, config, model, views):
         rows.append({"name": view.name} | measure(picture, truth))
@@ -48,7 +48,7 @@ def evaluate_run(folder, metrics, split, save_images, device_choice):
         if len(pictures) < PICTURE_VIEWS * 8:
             pictures.append((picture, truth))
         if save_images:
-            write_png(target_folder / f"{len(rows) - 1:04d}.png", picture)
+            write_png(target_folder / "images" / f"{PurePosixPath(view.name).stem}.png", picture)
     result = {
         "split": split, "device": dev.name, "step": header["step"], "finished": header["finished"], "mean": mean(rows), "per_image": rows,
         "points": {"initial": header["initial_points"], "final": model.count, "grid": header["grid"]["dims"]},
@@ -66,9 +66,9 @@ def _render_all(dev, config, model, views):
     """Yield (view, prediction (H,W,3), truth (H,W,3), seconds of the rendering) as float32 in [0, 1]."""
     renderer, target = Renderer(dev, model, config.points), Target(dev, config.scene.downscale)
     gamma = config.points.gamma[1]
-    renderer.picture(views[0].camera.downscaled(config.scene.downscale), gamma)  # builds the programs
+    renderer.picture(reduced_camera(views[0], config.scene.downscale), gamma)  # builds the programs
     for view in views:
-        camera = view.camera.downscaled(config.scene.downscale)
+        camera = reduced_camera(view, config.scene.downscale)
         start = time.perf_counter()
         picture = renderer.picture(camera, gamma)
         seconds = time.perf_counter() - start

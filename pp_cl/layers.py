@@ -1,6 +1,8 @@
 """Pooling, bilinear upsampling and a straight line on (H, W, C) float32 feature maps."""
 
-LOCAL = (16, 4, 1)  # channels, x, y
+from pp_cl.conv import LANES
+
+LOCAL = (1, 16, 4)  # 16 channels, x, y
 
 
 def avgpool2_forward(dev, x, out):
@@ -46,7 +48,8 @@ def affine(dev, scale, offset, x, out):
 
 
 def _launch(dev, kernel, size, **arguments):
-    dev.program("layers").launch(kernel, size, local=LOCAL, **arguments)
+    channels, width, height = size
+    dev.program("layers").launch(kernel, (-(-channels // LANES), width, height), local=LOCAL, **arguments)
 
 
 def _check_double(small, large):

@@ -28,7 +28,7 @@ class Loss:
         """
         (height, width, _), (prediction_height, prediction_width, _) = target.shape, prediction.shape
         if min(left, top) < 0 or left + width > prediction_width or top + height > prediction_height:
-            raise ValueError(f"the target {target.shape} at ({left}, {top}) reaches outside of the prediction {prediction.shape}")
+            raise ValueError(f"target {target.shape} at ({left}, {top}) reaches outside the prediction {prediction.shape}")
         self._prepare(prediction.shape, target.shape)
         b = self._buffers
         images = {"prediction": prediction, "target": target, "pw": prediction_width, "w": width,

@@ -21,11 +21,12 @@ def gather_rows(dev, source, indices):
 
     source: (N, ...) of a 4-byte dtype. indices: (M,) uint32, each below N. Result: (M, ...) of the same dtype.
     """
-    target = dev.empty((len(indices), *source.shape[1:]), source.dtype)
+    m = len(indices)
+    target = dev.empty((m, *source.shape[1:]), source.dtype)
     words = int(np.prod(source.shape[1:], dtype=np.int64))
-    dev.program("prune").launch(
-        "gather_rows", len(indices), m=len(indices), r=words, indices=indices,
-        source=source.view(np.uint32).reshape(len(source), words), target=target.view(np.uint32).reshape(len(indices), words))
+    dev.program("prune").launch("gather_rows", m, m=m, r=words, indices=indices,
+                                source=source.view(np.uint32).reshape(len(source), words),
+                                target=target.view(np.uint32).reshape(m, words))
     return target
 
 

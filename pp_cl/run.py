@@ -4,6 +4,7 @@ import hashlib
 import json
 import sys
 import time
+from dataclasses import replace
 
 import numpy as np
 from tqdm import tqdm
@@ -41,10 +42,9 @@ def fingerprint(views):
 
 
 def with_depth_range(views, near_far):
-    """The views with (near, far) in their cameras, for scenes that store none."""
-    from dataclasses import replace
-
-    return [replace(v, camera=replace(v.camera, near=near_far[0], far=near_far[1])) for v in views]
+    """The views with one (near, far) in all their cameras."""
+    near, far = near_far
+    return [replace(v, camera=replace(v.camera, near=near, far=far)) for v in views]
 
 
 def train_run(folder, config, device_choice):
@@ -84,15 +84,12 @@ def _start(dev, config, scene):
     reduced_camera(views[0], config.scene.downscale)  # refuses a reduction that leaves too little
     start = time.perf_counter()
     hull = build_grid(dev, views, config.points.count)
-    near_far = depth_range(views, hull) if not scene.depth_range_stored else (views[0].camera.near, views[0].camera.far)
-    if not scene.depth_range_stored:
-        views = with_depth_range(views, near_far)
+    near_far = depth_range(views, hull)
     dims = "x".join(str(d) for d in hull.grid.dims)
     print(f"hull: {len(hull.ids)} points on a {dims} grid, edge {hull.grid.edge:.6g}, depth {near_far[0]:.3f} to {near_far[1]:.3f} "
           f"({time.perf_counter() - start:.1f} s)")
     model = Model.create(dev, hull.grid, hull.ids, near_far, config.network.widths, config.train.seed)
-    info = {"scene": fingerprint(scene.splits["train"]), "initial_points": len(hull.ids), "depth_range_stored": scene.depth_range_stored}
-    return Trainer(dev, config, model, views), info
+    return Trainer(dev, config, model, with_depth_range(views, near_far)), {"scene": fingerprint(views), "initial_points": len(hull.ids)}
 
 
 def _resume(dev, config, scene, header, arrays, file):
@@ -101,12 +98,10 @@ def _resume(dev, config, scene, header, arrays, file):
     if header["scene"] != fingerprint(views):
         raise UserError(f"{file}: belongs to another scene than {config.scene.path}; use another --out")
     model = Model.load(dev, header, arrays, config.network.widths, file)
-    if not header["depth_range_stored"]:
-        views = with_depth_range(views, model.depth_range)
-    trainer = Trainer(dev, config, model, views)
+    trainer = Trainer(dev, config, model, with_depth_range(views, model.depth_range))
     trainer.restore(header["step"], arrays)
     print(f"resuming at step {header['step']} with {model.count} points")
-    return trainer, {key: header[key] for key in ("scene", "initial_points", "depth_range_stored")}
+    return trainer, {key: header[key] for key in ("scene", "initial_points")}
 
 
 def _optimise(trainer, config, folder, info):

@@ -1,4 +1,4 @@
-"""Smoothing of the SH coefficients over the grid: a total-variation step outside Adam, where it does not disturb the moments."""
+"""Smoothing of the SH coefficients over the grid, outside Adam: its moments know nothing of it."""
 
 import numpy as np
 
@@ -33,7 +33,7 @@ class Smoother:
         self._slots = [dev.empty((self.chunk * MOST_COEFFICIENTS, 16)) for _ in range(2)]
 
     def smooth(self, sh, amount):
-        """f += amount * (mean of the existing neighbours' f - f), in place.
+        """Move every coefficient f, in place: f += amount * (mean of the existing neighbours' f - f).
 
         All reads see the old values; a point without neighbours stays as it is. amount: 0 to 1; 4 * lambda * learning rate
         for every fourth step. sh: (N, K, 16) float32, K up to 5.

@@ -13,7 +13,7 @@ from pp_cl.prune import keep_indices, prune
 from pp_cl.render import Renderer
 from pp_cl.scene import object_box, reduced_camera
 from pp_cl.schedule import average_weight, gamma
-from pp_cl.smooth import neighbour_table, smooth
+from pp_cl.smooth import Smoother
 from pp_cl.target import Target
 
 BOX_MARGIN = 8  # pixels around the object from which crops are drawn
@@ -37,7 +37,7 @@ class Trainer:
         self.optimiser = Optimiser(dev, model)
         self.boxes = object_box(views, self.downscale, BOX_MARGIN)
         model.points["weight"] = dev.zeros((model.count,))
-        self._neighbours = self._scratch = None
+        self._smoother = None
 
     # ---------------------------------------------------------------------------------------------- one step
 
@@ -101,12 +101,10 @@ class Trainer:
     def _smooth(self, rates):
         """Pull every SH coefficient towards the mean of its grid neighbours, outside Adam."""
         points = self.model.points
-        if self._neighbours is None:
-            self._neighbours = neighbour_table(self.dev, self.model.grid_buffer, points["ids"])
-            self._scratch = self.dev.empty((self.model.count, 16))
+        if self._smoother is None:
+            self._smoother = Smoother(self.dev, self.model.grid_buffer, points["ids"])
         for degree in SH_DEGREES:
-            smooth(self.dev, points[f"sh{degree}"], self._neighbours, self.config.smooth * self.config.smooth_every * rates.sh[degree],
-                   self._scratch)
+            self._smoother.smooth(points[f"sh{degree}"], self.config.smooth * self.config.smooth_every * rates.sh[degree])
 
     def _prune(self, weights, least):
         """Drop the points whose weight, or opacity, is too low; moments and averages go with them."""
@@ -114,7 +112,7 @@ class Trainer:
         keep = keep_indices(self.dev, weights, least, points["opacity"], self.config.prune_opacity)
         if len(keep) < self.model.count:
             prune(self.dev, points, keep)
-            self._neighbours = self._scratch = None
+            self._smoother = None
 
     def finish(self):
         """Adopt the averages, and drop the points that hardly weigh anything in any training view."""

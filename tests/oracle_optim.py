@@ -48,7 +48,7 @@ def neighbours(ids, dims):
 
 
 def smoothed(values, ids, dims, amount):
-    """values (N, ...) moved by `amount` towards the mean of their neighbours."""
+    """Array (N, ...) moved by `amount` towards the mean of their neighbours."""
     old = np.asarray(values, np.float64)
     new = old.copy()
     for i, around in enumerate(neighbours(ids, dims)):

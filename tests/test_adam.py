@@ -29,7 +29,7 @@ def train(dev, start, grads, rate, eps, **options):
     return parameter.get(), m.get(), v.get(), oracle
 
 
-@pytest.mark.parametrize("n", (*AWKWARD_SIZES, 16))
+@pytest.mark.parametrize("n", [*AWKWARD_SIZES, 16])
 @pytest.mark.parametrize("eps", [1e-8, 1e-15])
 def test_matches_oracle(dev, rng, n, eps):
     start = rng.standard_normal(n).astype(np.float32)

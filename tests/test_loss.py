@@ -46,12 +46,14 @@ def test_oracle_gradient_is_the_derivative(rng):
 def test_ssim_is_scikit_images(dev, rng):
     prediction, target = images(rng, 37, 64)
     terms, _ = run(dev, prediction, target, 0.2)
-    expected = structural_similarity(prediction.astype(np.float64), target.astype(np.float64), gaussian_weights=True, sigma=1.5,
-                                     use_sample_covariance=False, data_range=1.0, channel_axis=-1)
+    expected = structural_similarity(
+        prediction.astype(np.float64), target.astype(np.float64), gaussian_weights=True, sigma=1.5,
+        use_sample_covariance=False, data_range=1.0, channel_axis=-1)
     assert terms[2] == pytest.approx(1 - expected, rel=2e-6)
 
 
-@pytest.mark.parametrize(("size", "weight"), [((10, 40), 0.2), ((40, 10), 0.2), ((1, 1), 0.2), ((1, 257), 0.2), ((33, 31), 0.0)])
+@pytest.mark.parametrize(("size", "weight"),
+                         [((10, 40), 0.2), ((40, 10), 0.2), ((1, 1), 0.2), ((1, 257), 0.2), ((33, 31), 0.0)])
 def test_without_ssim(dev, rng, size, weight):
     prediction, target = images(rng, *size)
     terms, grad = run(dev, prediction, target, weight)

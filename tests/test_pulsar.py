@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 from helpers import relative_error
+from oracle_raster import camera_space, pulsar_box
 
 from pp_cl.blend import Blend
 from pp_cl.camera import Camera
@@ -88,6 +89,11 @@ class Case:
         t = np.linalg.norm(self["in_positions"] - self["in_cam_pos"], axis=1)
         return self["in_radius"] * self.camera.fx / t >= 1
 
+    def boxed(self):
+        """(N,) bool: the box covers 3 columns and 3 rows of the image; Pulsar gives other spheres no position gradients."""
+        box = pulsar_box(self.camera, camera_space(self.camera, self["in_positions"] * MIRROR), self["in_radius"]).reshape(-1, *self.shape)
+        return (box.any(axis=1).sum(axis=1) >= 3) & (box.any(axis=2).sum(axis=1) >= 3)
+
     def all_but(self, table):
         """(N,) bool: False for this case's spheres in a table of exceptions."""
         keep = np.ones(self.n, bool)
@@ -106,7 +112,7 @@ def test_picture_and_hits(dev, data, name):
     assert np.array_equal(hits, case["exact_n_hits"])
     difference = np.abs(case.image - case["exact_image"]).max()
     assert difference < (3e-3 if name.startswith("c_") else 1e-4)
-    assert np.abs(case.image - case["ref64_image"]).max() < 1e-4  # where Pulsar itself is off by 2e-3 in case c
+    assert np.abs(case.image - case["ref64_image"]).max() < 2e-4  # Pulsar itself is off by 2e-3 in case c
 
 
 def test_early_stop_changes_as_little_as_in_pulsar(dev, data, name):
@@ -116,18 +122,21 @@ def test_early_stop_changes_as_little_as_in_pulsar(dev, data, name):
 
 def test_gradient_sums(dev, data, name):
     case = Case(dev, data, name, max_tracked=0)
-    gradients, solid = case.gradients(), case.solid()
-    for key in ("features", "opacity", "positions", "radius"):
-        keep = solid if key in ("positions", "radius") else slice(None)
-        print(name, key, relative_error(gradients[key][keep], case[f"ref64_gradsum_{key}"][keep]))
-
-
-@pytest.mark.parametrize("tracked,prefix", [(64, "exact"), (5, "exact_k5")])
-def test_gradient_means(dev, data, name, tracked, prefix):
-    case = Case(dev, data, name, mean=True, max_tracked=tracked)
     gradients = case.gradients()
-    keep = case.all_but(DAMPED) & (case.all_but(TIED) if tracked == 5 else True)
-    for key in ("features", "opacity", "positions", "radius"):
-        k = keep & case.solid() if key in ("positions", "radius") else keep
-        e=np.abs(gradients[key]-case[f"{prefix}_grad_{key}"]); e=e.reshape(len(e),-1).max(1)/np.abs(case[f"{prefix}_grad_{key}"][k]).max()
-        print(name, key, tracked, e[k].max(), np.flatnonzero((e>1e-3)&k))
+    for key in ("features", "opacity"):
+        assert relative_error(gradients[key], case[f"ref64_gradsum_{key}"]) < 1e-3, key
+    for key in ("positions", "radius"):
+        assert relative_error(gradients[key][case.solid()], case[f"ref64_gradsum_{key}"][case.solid()]) < 1e-3, key
+
+
+@pytest.mark.parametrize("max_tracked,prefix", [(64, "exact"), (5, "exact_k5")])
+def test_gradient_means(dev, data, name, max_tracked, prefix):
+    case = Case(dev, data, name, mean=True, max_tracked=max_tracked)
+    gradients = case.gradients()
+    compared = case.all_but(DAMPED) & (case.all_but(TIED) | (max_tracked == 64))
+    for key in ("features", "opacity"):
+        assert relative_error(gradients[key][compared], case[f"{prefix}_grad_{key}"][compared]) < 1e-3, key
+    compared &= case.solid() & case.boxed()
+    assert compared.sum() > 5
+    for key in ("positions", "radius"):
+        assert relative_error(gradients[key][compared], case[f"{prefix}_grad_{key}"][compared]) < 1e-3, key

@@ -6,14 +6,14 @@ import pytest
 from helpers import AWKWARD_SIZES, relative_error
 
 from pp_cl.points import Grid
-from pp_cl.smooth import neighbour_table, smooth
+from pp_cl.smooth import Smoother, neighbour_table
 
 NONE = 0xFFFFFFFF
 
 
-def table(dev, ids, dims):
-    grid = dev.upload(Grid((0, 0, 0), 1, dims).packed())
-    return neighbour_table(dev, grid, dev.upload(np.asarray(ids, np.uint32)))
+def cloud(dev, ids, dims):
+    """(device, grid, ids) on the device: the arguments of neighbour_table and Smoother."""
+    return dev, dev.upload(Grid((0, 0, 0), 1, dims).packed()), dev.upload(np.asarray(ids, np.uint32))
 
 
 def some_ids(rng, n, dims):
@@ -28,13 +28,13 @@ def expected_table(ids, dims):
 @pytest.mark.parametrize("dims", [(7, 8, 9), (300, 1, 1), (1, 300, 1), (1, 1, 300), (2, 11, 13)])
 def test_table_matches_dictionary(dev, rng, n, dims):
     ids = some_ids(rng, n, dims)
-    np.testing.assert_array_equal(table(dev, ids, dims).get(), expected_table(ids, dims))
+    np.testing.assert_array_equal(neighbour_table(*cloud(dev, ids, dims)).get(), expected_table(ids, dims))
 
 
 def test_full_grid_does_not_wrap(dev):
     dims = (4, 3, 5)
     ids = np.arange(60)
-    found = table(dev, ids, dims).get()
+    found = neighbour_table(*cloud(dev, ids, dims)).get()
     np.testing.assert_array_equal(found, expected_table(ids, dims))
     assert (found == NONE).sum() == 2 * (3 * 5 + 4 * 5 + 4 * 3)  # one a face cell
 
@@ -44,7 +44,13 @@ def test_table_of_a_huge_grid(dev):
     dims = (517, 512, 507)
     last = 517 * 512 * 507 - 1
     ids = [0, 1, 516, 517, 517 * 512 - 1, 517 * 512, last - 517 * 512, last - 517, last - 1, last]
-    np.testing.assert_array_equal(table(dev, ids, dims).get(), expected_table(ids, dims))
+    np.testing.assert_array_equal(neighbour_table(*cloud(dev, ids, dims)).get(), expected_table(ids, dims))
+
+
+def smoothed(dev, values, ids, dims, amount):
+    sh = dev.upload(values)
+    Smoother(*cloud(dev, ids, dims)).smooth(sh, amount)
+    return sh.get()
 
 
 @pytest.mark.parametrize("n", AWKWARD_SIZES)
@@ -53,24 +59,29 @@ def test_smooth_matches_oracle(dev, rng, n, coefficients):
     dims = (7, 8, 9)
     ids = some_ids(rng, n, dims)
     values = rng.standard_normal((n, coefficients, 16)).astype(np.float32)
-    sh = dev.upload(values)
-    smooth(dev, sh, table(dev, ids, dims), 0.06, dev.empty((n, 16)))
     expected = oracle_optim.smoothed(values, ids, dims, 0.06)
-    assert relative_error(sh.get(), expected) < 3e-7
+    assert relative_error(smoothed(dev, values, ids, dims, 0.06), expected) < 3e-7
+
+
+@pytest.mark.parametrize("dims", [(6, 5, 40), (3, 2, 100), (40, 30, 1), (600, 1, 1)])
+def test_chunks_read_old_values_only(dev, rng, monkeypatch, dims):
+    """Chunks as short as the neighbours allow, and an amount that shows every new value read too early."""
+    monkeypatch.setattr("pp_cl.smooth.CHUNK", 1)
+    n = np.prod(dims) * 9 // 10
+    ids = some_ids(rng, n, dims)
+    assert Smoother(*cloud(dev, ids, dims)).chunk < n / 10
+    values = rng.standard_normal((n, 5, 16)).astype(np.float32)
+    expected = oracle_optim.smoothed(values, ids, dims, 1.0)
+    assert relative_error(smoothed(dev, values, ids, dims, 1.0), expected) < 5e-7
 
 
 def test_lonely_points_stay(dev, rng):
     dims = (9, 9, 9)
     ids = [0, 2, 8, 9 * 2, 9 * 9 * 2, 9**3 - 1]
     values = rng.standard_normal((6, 3, 16)).astype(np.float32)
-    sh = dev.upload(values)
-    smooth(dev, sh, table(dev, ids, dims), 1.0, dev.empty((6, 16)))
-    np.testing.assert_array_equal(sh.get(), values)
+    np.testing.assert_array_equal(smoothed(dev, values, ids, dims, 1.0), values)
 
 
-def test_amount_one_is_the_mean_of_old_values(dev):
-    """A row 0 1 2 3 becomes 1 1 2 2 only if nobody reads a new value."""
+def test_amount_one_is_the_mean(dev):
     values = np.repeat(np.arange(4, dtype=np.float32), 16).reshape(4, 1, 16)
-    sh = dev.upload(values)
-    smooth(dev, sh, table(dev, range(4), (4, 1, 1)), 1.0, dev.empty((4, 16)))
-    np.testing.assert_array_equal(sh.get()[:, 0, 0], [1, 1, 2, 2])
+    np.testing.assert_array_equal(smoothed(dev, values, range(4), (4, 1, 1), 1.0)[:, 0, 0], [1, 1, 2, 2])

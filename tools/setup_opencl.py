@@ -14,7 +14,11 @@ from importlib.metadata import PackageNotFoundError, files
 from importlib.util import find_spec
 from pathlib import Path
 
-LIST = "from pp_cl.device import list_devices\nfor i, d, problem in list_devices(): print(i, d.platform.name, d.name, problem or 'works')"
+LIST = """
+from pp_cl.device import list_devices
+for index, device, problem in list_devices():
+    print(index, device.platform.name, device.name, problem or "works")
+"""
 INTEL = ("intel-opencl-rt", "intel-cmplr-lib-rt")
 POCL = "pocl-binary-distribution"
 
@@ -23,7 +27,7 @@ def devices():
     """One line for each OpenCL device; asked in a process of its own, as drivers are looked for once a process."""
     listed = subprocess.run([sys.executable, "-c", LIST], capture_output=True, text=True)
     if listed.returncode:
-        print(listed.stderr, file=sys.stderr)
+        print(f"asking for the devices ended with status {listed.returncode}: {listed.stderr.strip()}", file=sys.stderr)
     return listed.stdout.splitlines()
 
 

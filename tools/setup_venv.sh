@@ -8,8 +8,10 @@ python=$1
     exit 2
 }
 
+can() { "$python" -c "import $1" 2>/dev/null; }
+
 if ! .venv/bin/python -m pip --version >/dev/null 2>&1; then
-    if ! "$python" -c 'import ensurepip, venv' 2>/dev/null; then  # Debian keeps them in a package of their own
+    if ! can ensurepip && ! can pip; then  # Debian keeps both in packages of their own
         package=python$("$python" -c 'import sys; print("%d.%d" % sys.version_info[:2])')-venv
         if [ "$(id -u)" != 0 ] || ! command -v apt-get >/dev/null; then
             echo "$python cannot make virtual environments: run \`apt-get install $package\` as root" \
@@ -21,7 +23,12 @@ if ! .venv/bin/python -m pip --version >/dev/null 2>&1; then
         DEBIAN_FRONTEND=noninteractive apt-get -qq install --yes --no-install-recommends "$package" >/dev/null
     fi
     echo "making .venv ..."
-    "$python" -m venv --clear .venv
+    if can ensurepip; then
+        "$python" -m venv --clear .venv
+    else
+        "$python" -m venv --clear --without-pip .venv
+        "$python" -m pip --python .venv/bin/python install --quiet --disable-pip-version-check pip
+    fi
 fi
 echo "installing pp-cl and what it needs into .venv ..."
-.venv/bin/python -m pip install --quiet --disable-pip-version-check --editable '.[test]'
+PYTHONWARNINGS=ignore .venv/bin/python -m pip install --quiet --disable-pip-version-check --editable '.[test]'

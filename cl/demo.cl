@@ -1,0 +1,263 @@
+// The demo's object: an armillary sphere, brass rings and a wheel with thin lacquered spokes around a chequered globe, on an
+// inlaid wooden base. It is a signed distance field, and pictures of it are sphere-traced (Hart 1996), 4x4 rays a pixel.
+// Everything is computed for 16 places or rays at a time, one in each lane of a float16.
+#include "camera.h"
+#include "common.h"
+
+// Centre and radius of a ball that holds the object
+#define BOUND_Z -0.05f
+#define BOUND_RADIUS 1.0f
+
+#define MARCH_STEPS 96
+#define SHADOW_STEPS 16
+#define HIT 4e-4f                // a quarter of the space between the rays of a 400-pixel image, at the object
+#define KEY (float3)(0.40f, -0.52f, 0.7547f)         // unit directions of the two lights
+#define FILL (float3)(-0.80f, 0.45f, 0.3969f)
+
+// The globe's centre is the origin of all parts; the rings' normals are unit vectors.
+#define GLOBE_Z 0.15f
+#define GLOBE_RADIUS 0.30f
+#define MERIDIAN (float3)(0.819152f, 0.573576f, 0.0f)
+#define ECLIPTIC (float3)(-0.350438f, 0.750939f, 0.559700f)
+#define WHEEL (float3)(0.397131f, -0.144544f, 0.906308f)
+#define WHEEL_U (float3)(0.915959f, 0.0f, -0.401360f)
+#define WHEEL_V (float3)(0.058014f, 0.989498f, 0.132396f)
+
+// Parts in the order of their distances in `parts`
+#define PARTS 5
+#define BASE 0
+#define BRASS 1
+#define BAND 2
+#define SPOKES 3
+#define GLOBE 4
+
+typedef struct {
+    float16 x, y, z;
+} Vector16;
+
+inline float16 dot_axis(const Vector16 a, const float3 n) {
+    return a.x * n.x + a.y * n.y + a.z * n.z;
+}
+
+inline float16 dot_lanes(const Vector16 a, const Vector16 b) {
+    return a.x * b.x + a.y * b.y + a.z * b.z;
+}
+
+inline Vector16 advance(const Vector16 from, const Vector16 direction, const float16 t) {
+    return (Vector16){from.x + t * direction.x, from.y + t * direction.y, from.z + t * direction.z};
+}
+
+inline Vector16 normalize_lanes(const Vector16 a) {
+    const float16 scale = 1.0f / sqrt(dot_lanes(a, a));
+    return (Vector16){a.x * scale, a.y * scale, a.z * scale};
+}
+
+// Rounded box in two dimensions: (a, b) measured from the centre, half sides ha and hb with rounding r outside of them.
+inline float16 rounded_box(const float16 a, const float16 b, const float ha, const float hb, const float r) {
+    const float16 u = fabs(a) - ha, v = fabs(b) - hb;
+    const float16 s = max(u, 0.0f), t = max(v, 0.0f);
+    return sqrt(s * s + t * t) + min(max(u, v), 0.0f) - r;
+}
+
+// Distances of p to all parts, each exact outside of its part.
+inline void parts(const Vector16 position, float16 *distances) {
+    const Vector16 p = {position.x, position.y, position.z - GLOBE_Z};
+    const float16 square = dot_lanes(p, p), from_axis = sqrt(p.x * p.x + p.y * p.y);
+
+    distances[GLOBE] = sqrt(square) - GLOBE_RADIUS;
+    distances[BASE] = rounded_box(from_axis, p.z + 1.03f, 0.50f, 0.05f, 0.03f);
+
+    // The stem and its knob, the axle through the globe, and two rings of round wire.
+    const float16 knob = sqrt(from_axis * from_axis + (p.z + 0.88f) * (p.z + 0.88f)) - 0.07f;
+    const float16 stem_z = p.z - clamp(p.z, -1.0f, -0.72f);
+    const float16 stem = sqrt(from_axis * from_axis + stem_z * stem_z) - 0.03f;
+    const float16 wheel_height = dot_axis(p, WHEEL), ecliptic_height = dot_axis(p, ECLIPTIC);
+    const float16 wheel_radius = sqrt(max(square - wheel_height * wheel_height, 0.0f));
+    const float16 ecliptic_radius = sqrt(max(square - ecliptic_height * ecliptic_height, 0.0f));
+    const float16 beyond = wheel_height - clamp(wheel_height, -0.62f, 0.62f);
+    const float16 axle = sqrt(wheel_radius * wheel_radius + beyond * beyond) - 0.014f;
+    const float16 wheel_rim = wheel_radius - 0.54f, ecliptic_rim = ecliptic_radius - 0.62f;
+    const float16 wheel = sqrt(wheel_rim * wheel_rim + wheel_height * wheel_height) - 0.024f;
+    const float16 ecliptic = sqrt(ecliptic_rim * ecliptic_rim + ecliptic_height * ecliptic_height) - 0.018f;
+    distances[BRASS] = min(min(min(knob, stem), min(axle, wheel)), ecliptic);
+
+    const float16 band_height = dot_axis(p, MERIDIAN);
+    const float16 band_radius = sqrt(max(square - band_height * band_height, 0.0f));
+    distances[BAND] = rounded_box(band_radius - 0.70f, band_height, 0.018f, 0.05f, 0.006f);
+
+    // 12 spokes: the wheel's plane is folded into the 15 degrees beside the first one.
+    float16 u = fabs(dot_axis(p, WHEEL_U)), v = fabs(dot_axis(p, WHEEL_V));
+    const float16 larger = max(u, v);
+    v = min(u, v);
+    u = larger;
+    const float16 over = max(0.965926f * v - 0.258819f * u, 0.0f);  // beyond the bisector to the next one
+    u += 2 * 0.258819f * over;
+    v -= 2 * 0.965926f * over;
+    const float16 off = u - clamp(u, 0.2f, 0.54f);
+    distances[SPOKES] = sqrt(off * off + v * v + wheel_height * wheel_height) - 0.011f;
+}
+
+inline float16 scene_distance(const Vector16 p) {
+    float16 d[PARTS];
+    parts(p, d);
+    return min(min(min(d[BASE], d[BRASS]), min(d[BAND], d[SPOKES])), d[GLOBE]);
+}
+
+inline Vector16 scene_normal(const Vector16 p) {
+    const float h = 5e-4f;
+    Vector16 n = {0, 0, 0};
+    for (int i = 0; i < 4; i++) {        // the corners of a tetrahedron
+        const float x = i & 1 ? 1 : -1, y = i & 2 ? 1 : -1, z = x * y;
+        const float16 d = scene_distance((Vector16){p.x + h * x, p.y + h * y, p.z + h * z});
+        n = (Vector16){n.x + d * x, n.y + d * y, n.z + d * z};
+    }
+    return normalize_lanes(n);
+}
+
+// Share of the key light that reaches p: a soft shadow, its penumbra from the closest approach to another part.
+inline float16 key_visibility(const Vector16 p) {
+    float16 lit = 1.0f, t = 0.02f;
+    for (int step = 0; step < SHADOW_STEPS; step++) {
+        const float16 d = scene_distance((Vector16){p.x + t * KEY.x, p.y + t * KEY.y, p.z + t * KEY.z});
+        lit = min(lit, 12.0f * d / t);
+        t += clamp(d, 0.02f, 0.3f);
+    }
+    return max(lit, 0.0f);
+}
+
+// Share of the surroundings that p sees, from the distances along its normal n.
+inline float16 openness(const Vector16 p, const Vector16 n) {
+    const float16 near = scene_distance(advance(p, n, 0.05f)), far = scene_distance(advance(p, n, 0.15f));
+    return clamp(0.4f + 6.0f * near + 2.0f * far, 0.0f, 1.0f);
+}
+
+inline Vector16 mix_colours(const float3 a, const float3 b, const float16 share) {
+    return (Vector16){a.x + (b.x - a.x) * share, a.y + (b.y - a.y) * share, a.z + (b.z - a.z) * share};
+}
+
+inline Vector16 select_colour(const Vector16 otherwise, const Vector16 chosen, const int16 where) {
+    return (Vector16){select(otherwise.x, chosen.x, where), select(otherwise.y, chosen.y, where),
+                      select(otherwise.z, chosen.z, where)};
+}
+
+// 0 and 1 in turn, in cells of size 1.
+inline float16 chequer(const float16 a, const float16 b) {
+    const float16 cell = floor(a) + floor(b);
+    return cell - 2.0f * floor(0.5f * cell);
+}
+
+// Linear colour of the part nearest to each place, and which places are metal.
+inline Vector16 surface_colour(const Vector16 position, int16 *metal) {
+    float16 d[PARTS];
+    parts(position, d);
+    const float16 nearest = min(min(min(d[BASE], d[BRASS]), min(d[BAND], d[SPOKES])), d[GLOBE]);
+    const Vector16 p = {position.x, position.y, position.z - GLOBE_Z};
+
+    const float16 from_axis = sqrt(p.x * p.x + p.y * p.y);
+    const float16 grain = 0.5f + 0.5f * sin(60.0f * p.x + 5.0f * sin(7.0f * p.y));
+    const float16 inlay = chequer(from_axis / 0.06f, atan2pi(p.y, p.x) * 18.0f);
+    Vector16 colour = select_colour(mix_colours((float3)(0.15f, 0.05f, 0.02f), (float3)(0.32f, 0.13f, 0.05f), grain),
+                                    mix_colours((float3)(0.03f, 0.02f, 0.02f), (float3)(0.80f, 0.72f, 0.55f), inlay),
+                                    fabs(from_axis - 0.36f) < 0.06f);
+
+    const int16 brass = d[BRASS] <= nearest, band = d[BAND] <= nearest;
+    const float16 height = dot_axis(p, MERIDIAN), degree = atan2pi(p.z, p.y * MERIDIAN.x - p.x * MERIDIAN.y);
+    const float16 engraved = select((float16)0.0f, chequer(degree * 60.0f, 0.0f), band & (fabs(height) > 0.022f));
+    colour = select_colour(colour, mix_colours((float3)(0.95f, 0.64f, 0.25f), (float3)(0.10f, 0.05f, 0.03f), engraved), brass | band);
+
+    const float16 u = dot_axis(p, WHEEL_U), v = dot_axis(p, WHEEL_V);
+    const float16 striped = chequer(sqrt(u * u + v * v) / 0.055f, 0.0f);
+    colour = select_colour(colour, mix_colours((float3)(0.62f, 0.02f, 0.03f), (float3)(0.85f, 0.80f, 0.70f), striped), d[SPOKES] <= nearest);
+
+    const float16 tiled = chequer(dot_axis(p, WHEEL) * (5.0f / GLOBE_RADIUS), atan2pi(v, u) * 10.0f);
+    colour = select_colour(colour, mix_colours((float3)(0.01f, 0.10f, 0.22f), (float3)(0.80f, 0.68f, 0.42f), tiled), d[GLOBE] <= nearest);
+    *metal = brass | band;
+    return colour;
+}
+
+// What a mirror shows in `direction`: ground below a soft horizon, sky, and a lamp around the key light.
+inline Vector16 environment(const Vector16 direction) {
+    const float16 above = smoothstep(-0.25f, 0.25f, direction.z), lamp = 2.5f * smoothstep(0.80f, 0.97f, dot_axis(direction, KEY));
+    const Vector16 seen = mix_colours((float3)(0.20f, 0.16f, 0.14f), (float3)(0.80f, 0.82f, 0.86f), above);
+    return (Vector16){seen.x + lamp, seen.y + lamp, seen.z + lamp};
+}
+
+// Linear colour of places p seen along unit rays: two lights, the environment's reflection, Schlick's Fresnel term.
+inline Vector16 shade(const Vector16 p, const Vector16 ray) {
+    int16 metal;
+    const Vector16 colour = surface_colour(p, &metal);
+    const Vector16 n = scene_normal(p);
+    const float16 open = openness(p, n), lit = key_visibility(advance(p, n, 4e-3f));
+    const float16 facing = max(-dot_lanes(n, ray), 0.0f);
+    const Vector16 reflected = advance(ray, n, 2.0f * facing);
+
+    const float16 ambient = open * (0.30f + 0.15f * n.z);
+    const float16 diffuse = ambient + 0.85f * lit * max(dot_axis(n, KEY), 0.0f) + 0.22f * open * max(dot_axis(n, FILL), 0.0f);
+    const float16 grazing = 1.0f - facing, grazing2 = grazing * grazing;
+    const float16 fresnel = grazing2 * grazing2 * grazing;
+    const Vector16 mirror = environment(reflected);
+
+    // A metal mirrors in its own colour; lacquer has 6 percent of clear reflection on top of its colour.
+    const float16 matte = select((float16)1.0f, (float16)0.25f, metal);
+    const float16 clear = open * select(0.06f + 0.94f * fresnel, 0.3f * fresnel, metal);
+    const float16 tinted = open * select((float16)0.0f, (float16)0.75f, metal);
+    return (Vector16){colour.x * (matte * diffuse + tinted * mirror.x) + clear * mirror.x,
+                      colour.y * (matte * diffuse + tinted * mirror.y) + clear * mirror.y,
+                      colour.z * (matte * diffuse + tinted * mirror.z) + clear * mirror.z};
+}
+
+// One work-item per pixel: traces 4x4 rays, writes the mean displayed colour of those that hit, and their share as alpha.
+kernel void render_demo(
+    const uint width,
+    const uint height,
+    global const float *camera,          // (20) cl/camera.h
+    global uchar4 *image)                // (height, width, 4) straight RGBA
+{
+    const uint x = get_global_id(0), y = get_global_id(1);
+    if (x >= width || y >= height)
+        return;
+    const Camera k = camera_load(camera);
+    const float16 across = (float16)(1, 3, 5, 7, 1, 3, 5, 7, 1, 3, 5, 7, 1, 3, 5, 7) / 8.0f;
+    const float16 along = (float16)(1, 1, 1, 1, 3, 3, 3, 3, 5, 5, 5, 5, 7, 7, 7, 7) / 8.0f;
+    const float16 right = (x + across - k.cx) / k.fx, down = (y + along - k.cy) / k.fy;
+    const Vector16 ray = normalize_lanes((Vector16){
+        k.right.x * right + k.down.x * down + k.forward.x, k.right.y * right + k.down.y * down + k.forward.y,
+        k.right.z * right + k.down.z * down + k.forward.z});
+    const Vector16 eye = {k.eye.x, k.eye.y, k.eye.z};
+
+    const Vector16 from_bound = {eye.x, eye.y, eye.z - BOUND_Z};
+    const float16 middle = -dot_lanes(from_bound, ray);
+    const float16 chord = BOUND_RADIUS * BOUND_RADIUS - dot_lanes(from_bound, from_bound) + middle * middle;
+    const float16 end = middle + sqrt(max(chord, 0.0f));
+    float16 t = middle - sqrt(max(chord, 0.0f));
+    int16 marching = chord > 0.0f, hit = 0;
+    for (int step = 0; step < MARCH_STEPS && any(marching); step++) {
+        const float16 d = scene_distance(advance(eye, ray, t));
+        hit |= marching & (d < HIT);
+        t = select(t, t + d, marching & ~hit);
+        marching &= ~hit & (t < end);
+    }
+    if (!any(hit)) {
+        image[y * width + x] = 0;
+        return;
+    }
+    const Vector16 colour = shade(advance(eye, ray, t), ray);
+    const float16 weight = select((float16)0.0f, (float16)1.0f, hit);
+    const float hits = dot16(weight, 1.0f);
+    // Display values are square roots of linear ones, nearly sRGB.
+    const float3 display = (float3)(dot16(weight, sqrt(clamp(colour.x, 0.0f, 1.0f))), dot16(weight, sqrt(clamp(colour.y, 0.0f, 1.0f))),
+                                    dot16(weight, sqrt(clamp(colour.z, 0.0f, 1.0f)))) / hits;
+    image[y * width + x] = convert_uchar4_sat_rte(255.0f * (float4)(display, hits / 16.0f));
+}
+
+// One work-item per place: writes its distance to the object, which is negative inside.
+kernel void demo_distances(
+    const uint n,
+    global const float *positions,       // (n, 3)
+    global float *distances)             // (n)
+{
+    const uint i = get_global_id(0);
+    if (i >= n)
+        return;
+    distances[i] = scene_distance((Vector16){positions[3 * i], positions[3 * i + 1], positions[3 * i + 2]}).s0;
+}

@@ -1,0 +1,223 @@
+"""The network that turns feature maps into images: a U-Net of three levels (PlenopticPoints supplemental, decoder).
+
+Each level is two 3x3 convolutions with ReLU; levels are joined by 2x2 average pooling on the way down, by bilinear
+upsampling with a 1x1 convolution and a concatenation [upsampled, skip] on the way up; the image is 0.5 + 0.5 * (1x1
+convolution). The 1x1 convolution runs before the upsampling: both are linear and the upsampling weights of a pixel add up
+to 1, so they commute, bias included, and it costs a quarter.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from pp_cl import layers
+from pp_cl.conv import LANES, conv_backward_input, conv_forward, pack_bias, pack_weights
+from pp_cl.conv_weights import flip_weights, partial_floats, weight_gradient
+
+
+@dataclass(frozen=True)
+class Step:
+    """One operation of the network, named like its output: conv3 (with ReLU), conv1 (without), pool, up."""
+
+    kind: str
+    name: str
+    inputs: tuple  # names of one step, or of the two that a convolution reads as one; "x" is the network's input
+    level: int     # of the output: height and width are those of x divided by 2**level
+    channels: int  # of the output
+
+
+def unet_steps(widths, channels_out):
+    """The network in the order of its forward pass."""
+    w0, w1, w2 = widths
+    return [
+        Step("conv3", "enc0.a", ("x",), 0, w0),
+        Step("conv3", "enc0.b", ("enc0.a",), 0, w0),
+        Step("pool", "pool0", ("enc0.b",), 1, w0),
+        Step("conv3", "enc1.a", ("pool0",), 1, w1),
+        Step("conv3", "enc1.b", ("enc1.a",), 1, w1),
+        Step("pool", "pool1", ("enc1.b",), 2, w1),
+        Step("conv3", "enc2.a", ("pool1",), 2, w2),
+        Step("conv3", "enc2.b", ("enc2.a",), 2, w2),
+        Step("conv1", "up1", ("enc2.b",), 2, w1),
+        Step("up", "wide1", ("up1",), 1, w1),
+        Step("conv3", "dec1.a", ("wide1", "enc1.b"), 1, w1),
+        Step("conv3", "dec1.b", ("dec1.a",), 1, w1),
+        Step("conv1", "up0", ("dec1.b",), 1, w0),
+        Step("up", "wide0", ("up0",), 0, w0),
+        Step("conv3", "dec0.a", ("wide0", "enc0.b"), 0, w0),
+        Step("conv3", "dec0.b", ("dec0.a",), 0, w0),
+        Step("conv1", "out", ("dec0.b",), 0, channels_out),
+    ]
+
+
+class UNet:
+    """The network, its parameters and gradients, and the buffers it works in.
+
+    widths: channels of the three levels. parameters, gradients: {"enc0.a.weight": (ceil(CO/16), K, K, CI, 16),
+    "enc0.a.bias": (ceil(CO/16) * 16,), ...} float32 on the device. Weights and biases start uniform in +-1/sqrt(CI K K)
+    (PyTorch's default for Conv2d), output channels beyond CO at 0, with gradient 0.
+    """
+
+    def __init__(self, dev, widths=(16, 32, 64), channels_in=16, channels_out=3, seed=0):
+        self.dev = dev
+        self.steps = unet_steps(widths, channels_out)
+        self.channels = {"x": channels_in} | {s.name: s.channels for s in self.steps}
+        self.parameters, self._flipped = {}, {}
+        rng = np.random.default_rng(seed)
+        for step in self._convolutions():
+            k, ci = int(step.kind[-1]), sum(self.channels[i] for i in step.inputs)
+            bound = 1 / np.sqrt(ci * k * k)
+            weight = rng.uniform(-bound, bound, (step.channels, ci, k, k))
+            self.parameters[step.name + ".weight"] = dev.upload(pack_weights(weight))
+            self.parameters[step.name + ".bias"] = dev.upload(pack_bias(rng.uniform(-bound, bound, step.channels)))
+            for name in step.inputs:
+                self._flipped[step.name, name] = dev.empty((-(-self.channels[name] // LANES), k, k, step.channels, LANES))
+        self.gradients = {name: dev.zeros(p.shape) for name, p in self.parameters.items()}
+        uses = [name for step in self.steps for name in step.inputs]
+        self._relu_outputs = {s.name for s in self.steps if s.kind == "conv3"}
+        self._skips = {name for name in uses if uses.count(name) > 1}
+        self._buffers = {}  # {training: (size, {name: array}, the buffers they are views of)}
+        self._trained = None  # the arrays of the last forward(training=True)
+
+    def forward(self, x, training=True):
+        """(H, W, 3) image of the features x (H, W, channels_in); H and W are multiples of 4.
+
+        The result lives in a buffer of the network: the next call overwrites it. training: keep what backward needs.
+        Raises ValueError for other sizes.
+        """
+        height, width, channels = x.shape
+        if height % 4 or width % 4 or channels != self.channels["x"]:
+            raise ValueError(f"the network takes (4n, 4m, {self.channels['x']}) features, not {x.shape}")
+        arrays = self._arrays(height, width, training)
+        arrays["x"] = x
+        for step in self.steps:
+            sources, out = [arrays[name] for name in step.inputs], arrays[step.name]
+            if step.kind == "pool":
+                layers.avgpool2_forward(self.dev, sources[0], out)
+            elif step.kind == "up":
+                layers.upsample2_forward(self.dev, sources[0], out)
+            else:
+                weight, bias = self.parameters[step.name + ".weight"], self.parameters[step.name + ".bias"]
+                conv_forward(self.dev, sources[0], weight, bias, out, step.kind == "conv3", *sources[1:])
+        layers.affine(self.dev, 0.5, 0.5, out, out)
+        self._trained = arrays if training else None
+        return out
+
+    def backward(self, grad_y):
+        """(H, W, channels_in) gradient of x in the last forward(x, training=True), given dL/dy (H, W, 3).
+
+        Overwrites the gradients of all parameters; parameters and x must be as they were in forward. The result lives in
+        a buffer of the network. Raises RuntimeError without such a forward.
+        """
+        arrays = self._trained
+        if arrays is None:
+            raise RuntimeError("UNet.backward needs forward(training=True) just before it")
+        self._trained = None
+        layers.affine(self.dev, 0.5, 0.0, grad_y, arrays["grad out"])
+        for step in reversed(self.steps):
+            grad_out, name = arrays["grad " + step.name], step.inputs[0]
+            if step.kind == "pool":  # comes after the skip's gradient, and ends what that leaves open
+                layers.avgpool2_backward(self.dev, arrays[name], grad_out, arrays["grad " + name])
+            elif step.kind == "up":
+                layers.upsample2_backward(self.dev, grad_out, arrays["grad " + name])
+            else:
+                self._backward_convolution(step, arrays, grad_out)
+        return arrays["grad x"]
+
+    def _backward_convolution(self, step, arrays, grad_out):
+        weight = self.parameters[step.name + ".weight"]
+        sources = [arrays[name] for name in step.inputs]
+        weight_gradient(self.dev, sources[0], grad_out, self.gradients[step.name + ".weight"],
+                        self.gradients[step.name + ".bias"], arrays["partial"], *sources[1:])
+        first = 0
+        for name, source in zip(step.inputs, sources, strict=True):
+            flipped = self._flipped[step.name, name]
+            flip_weights(self.dev, weight, first, flipped)
+            masked = name in self._relu_outputs and name not in self._skips
+            conv_backward_input(self.dev, source, flipped, grad_out, arrays["grad " + name], masked)
+            first += self.channels[name]
+
+    def memory_plan(self, height, width, training):
+        """[(name, shape, bytes)] of all device buffers that forward (and, in training, backward) uses at this size."""
+        plan = [(" = ".join(slot.names), (slot.floats,), slot.floats * 4)
+                for slot in assign_slots(self._lifetimes(training), self._shapes(height, width))]
+        plan += [(name, p.shape, p.nbytes) for name, p in self.parameters.items()]
+        if training:
+            plan += [(f"grad {name}", g.shape, g.nbytes) for name, g in self.gradients.items()]
+            plan += [(f"flipped {layer} {source}", f.shape, f.nbytes) for (layer, source), f in self._flipped.items()]
+            floats = self._partial_floats(height)
+            plan.append(("partial", (floats,), floats * 4))
+        return plan
+
+    def _convolutions(self):
+        return [s for s in self.steps if s.kind.startswith("conv")]
+
+    def _shapes(self, height, width):
+        shapes = {s.name: (height >> s.level, width >> s.level, s.channels) for s in self.steps}
+        shapes["x"] = (height, width, self.channels["x"])
+        return shapes | {"grad " + name: shape for name, shape in shapes.items()}
+
+    def _partial_floats(self, height):
+        return max(partial_floats(height >> s.level, self.gradients[s.name + ".weight"].shape)
+                   for s in self._convolutions())
+
+    def _lifetimes(self, training):
+        """[(name, first, last)] of all arrays, in steps of the forward and backward pass, by first use."""
+        schedule = [(*step.inputs, step.name) for step in self.steps]
+        if training:
+            for step in reversed(self.steps):
+                activations = () if step.kind == "up" else step.inputs
+                schedule.append((*activations, "grad " + step.name, *("grad " + name for name in step.inputs)))
+        lifetimes = {}
+        for time, names in enumerate(schedule):
+            for name in names:
+                lifetimes[name] = (lifetimes.get(name, (time,))[0], time)
+        del lifetimes["x"]  # the caller's
+        lifetimes["out"] = (lifetimes["out"][0], len(schedule))  # the caller may read it after backward
+        return [(name, *lifetime) for name, lifetime in lifetimes.items()]
+
+    def _arrays(self, height, width, training):
+        """{name: array} for this size, allocated anew only when the size changes."""
+        if training not in self._buffers or self._buffers[training][0] != (height, width):
+            self._buffers.pop(training, None)  # frees the old buffers before the new ones are there
+            self._trained = None
+            shapes, arrays = self._shapes(height, width), {}
+            slots = assign_slots(self._lifetimes(training), shapes)
+            buffers = [self.dev.empty(slot.floats) for slot in slots]
+            for slot, buffer in zip(slots, buffers, strict=True):
+                arrays |= {name: buffer[:int(np.prod(shapes[name]))].reshape(shapes[name]) for name in slot.names}
+            if training:
+                arrays["partial"] = self.dev.empty(self._partial_floats(height))
+            self._buffers[training] = ((height, width), arrays, buffers)
+        return self._buffers[training][1]
+
+
+@dataclass
+class Slot:
+    """One buffer that holds several arrays, one after the other."""
+
+    floats: int
+    names: list
+    free_from: int
+
+
+def assign_slots(lifetimes, shapes):
+    """[Slot] such that no two arrays of one slot live at the same time.
+
+    lifetimes: [(name, first, last)] by first use. An array takes the free slot that fits it best; if none is large enough,
+    the largest free one grows.
+    """
+    slots = []
+    for name, first, last in lifetimes:
+        floats = int(np.prod(shapes[name]))
+        free = [s for s in slots if s.free_from <= first]
+        large = [s for s in free if s.floats >= floats]
+        if free:
+            slot = min(large, key=lambda s: s.floats) if large else max(free, key=lambda s: s.floats)
+        else:
+            slot = Slot(0, [], 0)
+            slots.append(slot)
+        slot.floats = max(slot.floats, floats)
+        slot.names.append(name)
+        slot.free_from = last + 1
+    return slots

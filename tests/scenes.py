@@ -1,0 +1,50 @@
+"""Small scenes on disk for the tests of training and of the command line."""
+
+import json
+
+import numpy as np
+from PIL import Image
+
+from pp_cl.camera import Camera
+
+
+def look_at(eye, target=(0, 0, 0)):
+    """(3, 4) camera-to-world of OpenCV axes, looking from eye to target with world z up."""
+    forward = np.subtract(target, eye) / np.linalg.norm(np.subtract(target, eye))
+    right = np.cross(forward, [0, 0, 1])
+    right /= np.linalg.norm(right)
+    return np.stack([right, np.cross(forward, right), forward, eye], 1)
+
+
+def ring_cameras(n, size, distance=4.0, field_of_view=0.7):
+    """n cameras on two rings around the origin that look at it."""
+    focal = 0.5 * size / np.tan(0.5 * field_of_view)
+    eyes = [distance * np.array([np.cos(a) * np.cos(h), np.sin(a) * np.cos(h), np.sin(h)])
+            for a, h in zip(np.linspace(0, 2 * np.pi, n, endpoint=False), np.tile([0.2, 0.7], n)[:n], strict=True)]
+    return [Camera(look_at(eye), focal, focal, size / 2, size / 2, size, size, 2.0, 6.0) for eye in eyes]
+
+
+def ball_image(camera, radius=0.8):
+    """(H, W, 4) uint8 picture of a ball at the origin whose colour varies with the surface position."""
+    y, x = np.mgrid[:camera.height, :camera.width] + 0.5
+    rays = np.stack([(x - camera.cx) / camera.fx, (y - camera.cy) / camera.fy, np.ones_like(x)], -1) @ camera.pose[:, :3].T
+    rays /= np.linalg.norm(rays, axis=-1, keepdims=True)
+    b = rays @ camera.eye
+    disc = b**2 - (camera.eye @ camera.eye - radius**2)
+    surface = camera.eye + rays * (-b - np.sqrt(np.maximum(disc, 0)))[..., None]
+    colour = 0.5 + 0.4 * np.sin(4 * surface + [0, 1, 2])
+    return np.rint(255 * np.dstack([colour, disc > 0])).astype(np.uint8)
+
+
+def write_ball_scene(folder, views=8, size=48, splits=("train", "test")):
+    """A NeRF-synthetic folder of the ball; returns the folder as text."""
+    folder.mkdir(parents=True, exist_ok=True)
+    for split in splits:
+        (folder / split).mkdir(exist_ok=True)
+        frames = []
+        for i, camera in enumerate(ring_cameras(views if split == "train" else 2, size)):
+            Image.fromarray(ball_image(camera)).save(folder / split / f"r_{i}.png")
+            pose = np.vstack([camera.pose * [1, -1, -1, 1], [0, 0, 0, 1]])  # OpenGL axes
+            frames.append({"file_path": f"./{split}/r_{i}", "transform_matrix": pose.tolist()})
+        (folder / f"transforms_{split}.json").write_text(json.dumps({"camera_angle_x": 0.7, "frames": frames}))
+    return str(folder)

@@ -1,0 +1,143 @@
+"""pp_cl/unet.py against a float64 network."""
+
+import numpy as np
+import pytest
+from helpers import numeric_gradient, relative_error
+from oracle_unet import unet, unet_gradients
+
+from pp_cl.conv import unpack_weights
+from pp_cl.unet import UNet, assign_slots
+
+
+def plain_parameters(net, arrays):
+    """{name: float64 array} in the oracle's layout; asserts that the padding is zero."""
+    plain = {}
+    for name, array in arrays.items():
+        values, channels = array.get().astype(np.float64), net.channels[name.rsplit(".", 1)[0]]
+        plain[name] = unpack_weights(values, channels) if values.ndim == 5 else values[:channels]
+        assert np.abs(values).sum() == pytest.approx(np.abs(plain[name]).sum(), rel=1e-12)
+    return plain
+
+
+@pytest.mark.parametrize("widths", [(16, 32, 48), (20, 16, 40)])
+def test_forward_and_backward(dev, rng, widths):
+    net = UNet(dev, widths, seed=1)
+    x, grad_y = rng.normal(size=(12, 16, 16)).astype(np.float32), rng.normal(size=(12, 16, 3)).astype(np.float32)
+    parameters = plain_parameters(net, net.parameters)
+    y = net.forward(dev.upload(x)).get()
+    grad_x = net.backward(dev.upload(grad_y)).get()
+    expected_x, expected = unet_gradients(x, parameters, grad_y)
+    assert relative_error(y, unet(x, parameters)[0]) < 3e-6
+    assert relative_error(grad_x, expected_x) < 1e-5
+    gradients = plain_parameters(net, net.gradients)
+    assert gradients.keys() == expected.keys()
+    errors = {name: relative_error(gradients[name], expected[name]) for name in expected}
+    assert max(errors.values()) < 1e-5, errors
+
+
+def test_gradients_by_finite_differences(dev, rng):
+    """Steps this small cross no kink of a ReLU: the network is piecewise linear, so the differences are exact there."""
+    net = UNet(dev, (4, 5, 6), channels_in=3, seed=2)
+    x, grad_y = rng.normal(size=(8, 4, 3)).astype(np.float32), rng.normal(size=(8, 4, 3)).astype(np.float32)
+    parameters = plain_parameters(net, net.parameters)
+    net.forward(dev.upload(x))
+    grad_x = net.backward(dev.upload(grad_y)).get()
+
+    def loss(values, changed):
+        return (unet(x, parameters | {changed: values})[0] * grad_y).sum()
+
+    numeric = numeric_gradient(lambda v: (unet(v, parameters)[0] * grad_y).sum(), x, 1e-6)
+    assert relative_error(grad_x.ravel(), numeric) < 1e-5
+    gradients = plain_parameters(net, net.gradients)
+    for name, values in parameters.items():
+        flat = gradients[name].ravel()
+        some = [*np.argsort(-np.abs(flat))[:6], *rng.integers(0, flat.size, 6)]
+        numeric = numeric_gradient(lambda v, name=name: loss(v, name), values, 1e-6, some)
+        assert relative_error(flat[some], numeric) < 1e-5, name
+
+
+def test_inference_equals_training(dev, rng):
+    net = UNet(dev, seed=3)
+    x = dev.upload(rng.normal(size=(20, 24, 16)).astype(np.float32))
+    np.testing.assert_array_equal(net.forward(x, training=False).get(), net.forward(x, training=True).get())
+
+
+def test_sizes_may_change_between_calls(dev, rng):
+    net = UNet(dev, seed=3)
+    small, large = (dev.upload(rng.normal(size=(*s, 16)).astype(np.float32)) for s in ((4, 8), (16, 12)))
+    first = net.forward(small).get()
+    net.forward(large)
+    net.forward(large, training=False)
+    np.testing.assert_array_equal(net.forward(small).get(), first)
+
+
+def test_same_bits_twice_and_for_equal_seeds(dev, rng):
+    x = dev.upload(rng.normal(size=(32, 36, 16)).astype(np.float32))
+    grad_y = dev.upload(rng.normal(size=(32, 36, 3)).astype(np.float32))
+    runs = []
+    for seed in (5, 5, 6):
+        net = UNet(dev, (16, 32, 64), seed=seed)
+        y = net.forward(x).get()
+        runs.append([y, net.backward(grad_y).get(), *[g.get() for g in net.gradients.values()]])
+    for first, second in zip(runs[0], runs[1], strict=True):
+        np.testing.assert_array_equal(first, second)
+    assert not np.array_equal(runs[0][0], runs[2][0])
+
+
+def test_initial_values_are_pytorchs(dev):
+    net = UNet(dev, (16, 32, 64), seed=0)
+    for name, values in plain_parameters(net, net.parameters).items():
+        layer = name.rsplit(".", 1)[0]
+        weight = net.parameters[layer + ".weight"].shape
+        bound = 1 / np.sqrt(weight[3] * weight[1] ** 2)
+        assert np.abs(values).max() <= bound * (1 + 1e-6), name
+        if values.size > 500:
+            assert values.std() == pytest.approx(bound / np.sqrt(3), rel=0.1), name
+
+
+def test_hard_inputs(dev, rng):
+    net = UNet(dev, (16, 16, 16), seed=4)
+    parameters = plain_parameters(net, net.parameters)
+    for x in (np.zeros((8, 8, 16), np.float32), (1e3 + rng.normal(size=(8, 8, 16))).astype(np.float32)):
+        assert relative_error(net.forward(dev.upload(x)).get(), unet(x, parameters)[0]) < 5e-6
+
+
+def test_wrong_use_is_refused(dev):
+    net = UNet(dev, (16, 16, 16))
+    with pytest.raises(ValueError, match="\\(10, 8, 16\\)"):
+        net.forward(dev.zeros((10, 8, 16)))
+    with pytest.raises(ValueError, match="4n"):
+        net.forward(dev.zeros((8, 8, 3)))
+    net.forward(dev.zeros((8, 8, 16)), training=False)
+    with pytest.raises(RuntimeError, match="forward"):
+        net.backward(dev.zeros((8, 8, 3)))
+
+
+def test_memory_plan_is_what_is_allocated(dev, rng):
+    before = dev.bytes
+    net = UNet(dev, (16, 32, 48))
+    x, grad_y = dev.zeros((16, 20, 16)), dev.zeros((16, 20, 3))
+    net.forward(x)
+    net.backward(grad_y)
+    assert dev.bytes - before == sum(row[2] for row in net.memory_plan(16, 20, True)) + x.nbytes + grad_y.nbytes
+
+
+def test_memory_of_the_papers_network(dev):
+    net = UNet(dev, (128, 256, 512))
+    inference, training = net.memory_plan(800, 800, False), net.memory_plan(800, 800, True)
+    assert sum(row[2] for row in inference) < 1.5e9
+    assert sum(row[2] for row in training) < 5e9
+    assert max(row[2] for row in inference + training) <= 1 << 30
+
+
+def test_slots_never_overlap(rng):
+    firsts = np.sort(rng.integers(0, 20, 40))
+    lifetimes = [(i, first, first + rng.integers(0, 6)) for i, first in enumerate(firsts)]
+    shapes = {i: (rng.integers(1, 9), 3) for i in range(40)}
+    slots = assign_slots(lifetimes, shapes)
+    assert sorted(name for slot in slots for name in slot.names) == list(range(40))
+    assert len(slots) < 20
+    for slot in slots:
+        held = [lifetimes[name] for name in slot.names]
+        assert all(a[2] < b[1] for a, b in zip(held, held[1:], strict=False))
+        assert slot.floats == max(np.prod(shapes[name]) for name in slot.names)
