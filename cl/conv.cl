@@ -83,7 +83,7 @@ kernel void conv_forward(
     global float *out)                   // (height, width, co)
 {
     const int tile_x = get_global_id(0) * TILE, y = get_global_id(1), block = get_global_id(2) * BLOCKS;
-    if (tile_x >= width || y >= height)
+    if (tile_x >= width || y >= height || block * 16 >= co)
         return;
     const int x0 = min(tile_x, width - TILE);    // the last tile moves left, and stores only what its neighbour does not
     float16 acc[BLOCKS][TILE];
@@ -122,7 +122,7 @@ kernel void conv_backward_input(
     global float *grad_x)                // (height, width, c)
 {
     const int tile_x = get_global_id(0) * TILE, y = get_global_id(1), block = get_global_id(2) * BLOCKS;
-    if (tile_x >= width || y >= height)
+    if (tile_x >= width || y >= height || block * 16 >= c)
         return;
     const int x0 = min(tile_x, width - TILE);
     float16 acc[BLOCKS][TILE];

@@ -3,33 +3,37 @@
 // Everything is computed for 16 places or rays at a time, one in each lane of a float16.
 #include "camera.h"
 #include "common.h"
+#include "grid.h"
+#include "vector.h"
 
-// Centre and radius of a ball that holds the object
-#define BOUND_Z -0.05f
-#define BOUND_RADIUS 1.0f
+// A ball that holds the object.
+#define BOUND_Z -0.08f
+#define BOUND_RADIUS 1.05f
 
 #define MARCH_STEPS 96
 #define SHADOW_STEPS 16
 #define HIT 4e-4f                // a quarter of the space between the rays of a 400-pixel image, at the object
-#define KEY (float3)(0.40f, -0.52f, 0.7547f)         // unit directions of the two lights
-#define FILL (float3)(-0.80f, 0.45f, 0.3969f)
 
-// The globe's centre is the origin of all parts; the rings' normals are unit vectors.
+// Unit directions of the two lights.
+#define KEY ((float3)(0.40f, -0.52f, 0.7547f))
+#define FILL ((float3)(-0.80f, 0.45f, 0.3969f))
+
+// The globe's centre is the origin of all parts. Its axle, WHEEL, lies in the planes of the other two rings, whose unit
+// normals are MERIDIAN and ECLIPTIC; MERIDIAN, WHEEL_V and WHEEL are at right angles.
 #define GLOBE_Z 0.15f
 #define GLOBE_RADIUS 0.30f
-#define MERIDIAN (float3)(0.819152f, 0.573576f, 0.0f)
-#define ECLIPTIC (float3)(-0.350438f, 0.750939f, 0.559700f)
-#define WHEEL (float3)(0.397131f, -0.144544f, 0.906308f)
-#define WHEEL_U (float3)(0.915959f, 0.0f, -0.401360f)
-#define WHEEL_V (float3)(0.058014f, 0.989498f, 0.132396f)
+#define WHEEL ((float3)(-0.242404f, 0.346188f, 0.906308f))
+#define WHEEL_V ((float3)(-0.519837f, 0.742404f, -0.422618f))
+#define MERIDIAN ((float3)(0.819152f, 0.573576f, 0.0f))
+#define ECLIPTIC ((float3)(-0.040616f, 0.929729f, -0.365998f))
 
-// Parts in the order of their distances in `parts`
-#define PARTS 5
+// Indices of the parts' distances.
 #define BASE 0
 #define BRASS 1
 #define BAND 2
 #define SPOKES 3
 #define GLOBE 4
+#define PARTS 5
 
 typedef struct {
     float16 x, y, z;
@@ -52,49 +56,45 @@ inline Vector16 normalize_lanes(const Vector16 a) {
     return (Vector16){a.x * scale, a.y * scale, a.z * scale};
 }
 
-// Rounded box in two dimensions: (a, b) measured from the centre, half sides ha and hb with rounding r outside of them.
-inline float16 rounded_box(const float16 a, const float16 b, const float ha, const float hb, const float r) {
-    const float16 u = fabs(a) - ha, v = fabs(b) - hb;
-    const float16 s = max(u, 0.0f), t = max(v, 0.0f);
-    return sqrt(s * s + t * t) + min(max(u, v), 0.0f) - r;
+inline float16 length_lanes(const float16 a, const float16 b) {
+    return sqrt(a * a + b * b);
 }
 
-// Distances of p to all parts, each exact outside of its part.
+// Distance of a rounded rectangle of half sides ha + r and hb + r from (a, b), measured from its centre.
+inline float16 rectangle(const float16 a, const float16 b, const float ha, const float hb, const float r) {
+    const float16 u = fabs(a) - ha, v = fabs(b) - hb;
+    return length_lanes(max(u, 0.0f), max(v, 0.0f)) + min(max(u, v), 0.0f) - r;
+}
+
+// Distance of a rod with round ends: `along` and `off` are the coordinates along its axis and from it.
+inline float16 rod(const float16 along, const float16 off, const float from, const float to, const float radius) {
+    return length_lanes(along - clamp(along, from, to), off) - radius;
+}
+
+// Distances of a place to all parts, each exact outside of its part.
 inline void parts(const Vector16 position, float16 *distances) {
     const Vector16 p = {position.x, position.y, position.z - GLOBE_Z};
-    const float16 square = dot_lanes(p, p), from_axis = sqrt(p.x * p.x + p.y * p.y);
+    const float16 square = dot_lanes(p, p), from_axis = length_lanes(p.x, p.y);
+    // Every ring has a height over its plane and a radius in it.
+    const float16 wheel_h = dot_axis(p, WHEEL), wheel_r = sqrt(max(square - wheel_h * wheel_h, 0.0f));
+    const float16 ecliptic_h = dot_axis(p, ECLIPTIC), ecliptic_r = sqrt(max(square - ecliptic_h * ecliptic_h, 0.0f));
+    const float16 meridian_h = dot_axis(p, MERIDIAN), meridian_r = sqrt(max(square - meridian_h * meridian_h, 0.0f));
 
     distances[GLOBE] = sqrt(square) - GLOBE_RADIUS;
-    distances[BASE] = rounded_box(from_axis, p.z + 1.03f, 0.50f, 0.05f, 0.03f);
+    distances[BASE] = rectangle(from_axis, p.z + 1.03f, 0.50f, 0.05f, 0.03f);
+    distances[BAND] = rectangle(meridian_r - 0.70f, meridian_h, 0.018f, 0.05f, 0.006f);
 
-    // The stem and its knob, the axle through the globe, and two rings of round wire.
-    const float16 knob = sqrt(from_axis * from_axis + (p.z + 0.88f) * (p.z + 0.88f)) - 0.07f;
-    const float16 stem_z = p.z - clamp(p.z, -1.0f, -0.72f);
-    const float16 stem = sqrt(from_axis * from_axis + stem_z * stem_z) - 0.03f;
-    const float16 wheel_height = dot_axis(p, WHEEL), ecliptic_height = dot_axis(p, ECLIPTIC);
-    const float16 wheel_radius = sqrt(max(square - wheel_height * wheel_height, 0.0f));
-    const float16 ecliptic_radius = sqrt(max(square - ecliptic_height * ecliptic_height, 0.0f));
-    const float16 beyond = wheel_height - clamp(wheel_height, -0.62f, 0.62f);
-    const float16 axle = sqrt(wheel_radius * wheel_radius + beyond * beyond) - 0.014f;
-    const float16 wheel_rim = wheel_radius - 0.54f, ecliptic_rim = ecliptic_radius - 0.62f;
-    const float16 wheel = sqrt(wheel_rim * wheel_rim + wheel_height * wheel_height) - 0.024f;
-    const float16 ecliptic = sqrt(ecliptic_rim * ecliptic_rim + ecliptic_height * ecliptic_height) - 0.018f;
+    const float16 knob = length_lanes(from_axis, p.z + 0.88f) - 0.07f;
+    const float16 stem = rod(p.z, from_axis, -1.0f, -0.72f, 0.03f);
+    const float16 axle = rod(wheel_h, wheel_r, -0.69f, 0.69f, 0.014f);
+    const float16 wheel = length_lanes(wheel_r - 0.54f, wheel_h) - 0.024f;
+    const float16 ecliptic = length_lanes(ecliptic_r - 0.62f, ecliptic_h) - 0.018f;
     distances[BRASS] = min(min(min(knob, stem), min(axle, wheel)), ecliptic);
 
-    const float16 band_height = dot_axis(p, MERIDIAN);
-    const float16 band_radius = sqrt(max(square - band_height * band_height, 0.0f));
-    distances[BAND] = rounded_box(band_radius - 0.70f, band_height, 0.018f, 0.05f, 0.006f);
-
-    // 12 spokes: the wheel's plane is folded into the 15 degrees beside the first one.
-    float16 u = fabs(dot_axis(p, WHEEL_U)), v = fabs(dot_axis(p, WHEEL_V));
-    const float16 larger = max(u, v);
-    v = min(u, v);
-    u = larger;
-    const float16 over = max(0.965926f * v - 0.258819f * u, 0.0f);  // beyond the bisector to the next one
-    u += 2 * 0.258819f * over;
-    v -= 2 * 0.965926f * over;
-    const float16 off = u - clamp(u, 0.2f, 0.54f);
-    distances[SPOKES] = sqrt(off * off + v * v + wheel_height * wheel_height) - 0.011f;
+    // 12 spokes: the wheel's plane is folded to the 15 degrees beside the first one.
+    const float16 a = fabs(meridian_h), b = fabs(dot_axis(p, WHEEL_V)), u = max(a, b), v = min(a, b);
+    const float16 over = 2.0f * max(0.965926f * v - 0.258819f * u, 0.0f);  // beyond the bisector to the next spoke, twice
+    distances[SPOKES] = rod(u + 0.258819f * over, length_lanes(v - 0.965926f * over, wheel_h), 0.2f, 0.54f, 0.011f);
 }
 
 inline float16 scene_distance(const Vector16 p) {
@@ -135,9 +135,10 @@ inline Vector16 mix_colours(const float3 a, const float3 b, const float16 share)
     return (Vector16){a.x + (b.x - a.x) * share, a.y + (b.y - a.y) * share, a.z + (b.z - a.z) * share};
 }
 
-inline Vector16 select_colour(const Vector16 otherwise, const Vector16 chosen, const int16 where) {
-    return (Vector16){select(otherwise.x, chosen.x, where), select(otherwise.y, chosen.y, where),
-                      select(otherwise.z, chosen.z, where)};
+// `colour`, and where asked for instead of it a mixture of a and b.
+inline Vector16 paint(const Vector16 colour, const int16 where, const float3 a, const float3 b, const float16 share) {
+    const Vector16 c = mix_colours(a, b, share);
+    return (Vector16){select(colour.x, c.x, where), select(colour.y, c.y, where), select(colour.z, c.z, where)};
 }
 
 // 0 and 1 in turn, in cells of size 1.
@@ -151,38 +152,47 @@ inline Vector16 surface_colour(const Vector16 position, int16 *metal) {
     float16 d[PARTS];
     parts(position, d);
     const float16 nearest = min(min(min(d[BASE], d[BRASS]), min(d[BAND], d[SPOKES])), d[GLOBE]);
+    const int16 brass = d[BRASS] <= nearest, band = d[BAND] <= nearest;
+    const int16 spokes = d[SPOKES] <= nearest, globe = d[GLOBE] <= nearest;
     const Vector16 p = {position.x, position.y, position.z - GLOBE_Z};
 
-    const float16 from_axis = sqrt(p.x * p.x + p.y * p.y);
     const float16 grain = 0.5f + 0.5f * sin(60.0f * p.x + 5.0f * sin(7.0f * p.y));
-    const float16 inlay = chequer(from_axis / 0.06f, atan2pi(p.y, p.x) * 18.0f);
-    Vector16 colour = select_colour(mix_colours((float3)(0.15f, 0.05f, 0.02f), (float3)(0.32f, 0.13f, 0.05f), grain),
-                                    mix_colours((float3)(0.03f, 0.02f, 0.02f), (float3)(0.80f, 0.72f, 0.55f), inlay),
-                                    fabs(from_axis - 0.36f) < 0.06f);
+    Vector16 colour = mix_colours((float3)(0.15f, 0.05f, 0.02f), (float3)(0.32f, 0.13f, 0.05f), grain);
 
-    const int16 brass = d[BRASS] <= nearest, band = d[BAND] <= nearest;
-    const float16 height = dot_axis(p, MERIDIAN), degree = atan2pi(p.z, p.y * MERIDIAN.x - p.x * MERIDIAN.y);
-    const float16 engraved = select((float16)0.0f, chequer(degree * 60.0f, 0.0f), band & (fabs(height) > 0.022f));
-    colour = select_colour(colour, mix_colours((float3)(0.95f, 0.64f, 0.25f), (float3)(0.10f, 0.05f, 0.03f), engraved), brass | band);
+    const float16 from_axis = length_lanes(p.x, p.y);
+    const float16 inlaid = chequer(from_axis / 0.06f, atan2pi(p.y, p.x) * 18.0f);
+    const int16 inlay = fabs(from_axis - 0.36f) < 0.06f;
+    colour = paint(colour, inlay, (float3)(0.03f, 0.02f, 0.02f), (float3)(0.80f, 0.72f, 0.55f), inlaid);
 
-    const float16 u = dot_axis(p, WHEEL_U), v = dot_axis(p, WHEEL_V);
-    const float16 striped = chequer(sqrt(u * u + v * v) / 0.055f, 0.0f);
-    colour = select_colour(colour, mix_colours((float3)(0.62f, 0.02f, 0.03f), (float3)(0.85f, 0.80f, 0.70f), striped), d[SPOKES] <= nearest);
+    const float16 u = dot_axis(p, MERIDIAN), v = dot_axis(p, WHEEL_V);
+    const float16 degrees = atan2pi(p.z, p.y * MERIDIAN.x - p.x * MERIDIAN.y) * 60.0f;
+    const int16 scale = band & (fabs(u) > 0.022f);
+    const float16 engraved = select((float16)0.0f, chequer(degrees, 0.0f), scale);
+    colour = paint(colour, brass | band, (float3)(0.95f, 0.64f, 0.25f), (float3)(0.10f, 0.05f, 0.03f), engraved);
+
+    const float16 striped = chequer(length_lanes(u, v) / 0.055f, 0.0f);
+    colour = paint(colour, spokes, (float3)(0.62f, 0.02f, 0.03f), (float3)(0.85f, 0.80f, 0.70f), striped);
 
     const float16 tiled = chequer(dot_axis(p, WHEEL) * (5.0f / GLOBE_RADIUS), atan2pi(v, u) * 10.0f);
-    colour = select_colour(colour, mix_colours((float3)(0.01f, 0.10f, 0.22f), (float3)(0.80f, 0.68f, 0.42f), tiled), d[GLOBE] <= nearest);
+    colour = paint(colour, globe, (float3)(0.01f, 0.10f, 0.22f), (float3)(0.80f, 0.68f, 0.42f), tiled);
     *metal = brass | band;
     return colour;
 }
 
 // What a mirror shows in `direction`: ground below a soft horizon, sky, and a lamp around the key light.
 inline Vector16 environment(const Vector16 direction) {
-    const float16 above = smoothstep(-0.25f, 0.25f, direction.z), lamp = 2.5f * smoothstep(0.80f, 0.97f, dot_axis(direction, KEY));
+    const float16 above = smoothstep(-0.25f, 0.25f, direction.z);
+    const float16 lamp = 3.5f * smoothstep(0.82f, 0.97f, dot_axis(direction, KEY));
     const Vector16 seen = mix_colours((float3)(0.20f, 0.16f, 0.14f), (float3)(0.80f, 0.82f, 0.86f), above);
     return (Vector16){seen.x + lamp, seen.y + lamp, seen.z + lamp};
 }
 
-// Linear colour of places p seen along unit rays: two lights, the environment's reflection, Schlick's Fresnel term.
+// Display value of a linear one: the square root is close to sRGB.
+inline float16 displayed(const float16 linear) {
+    return sqrt(clamp(linear, 0.0f, 1.0f));
+}
+
+// Displayed colour of places p seen along unit rays: two lights, the environment's reflection, Schlick's Fresnel term.
 inline Vector16 shade(const Vector16 p, const Vector16 ray) {
     int16 metal;
     const Vector16 colour = surface_colour(p, &metal);
@@ -191,8 +201,8 @@ inline Vector16 shade(const Vector16 p, const Vector16 ray) {
     const float16 facing = max(-dot_lanes(n, ray), 0.0f);
     const Vector16 reflected = advance(ray, n, 2.0f * facing);
 
-    const float16 ambient = open * (0.30f + 0.15f * n.z);
-    const float16 diffuse = ambient + 0.85f * lit * max(dot_axis(n, KEY), 0.0f) + 0.22f * open * max(dot_axis(n, FILL), 0.0f);
+    const float16 soft = open * (0.30f + 0.15f * n.z + 0.22f * max(dot_axis(n, FILL), 0.0f));
+    const float16 diffuse = soft + 0.85f * lit * max(dot_axis(n, KEY), 0.0f);
     const float16 grazing = 1.0f - facing, grazing2 = grazing * grazing;
     const float16 fresnel = grazing2 * grazing2 * grazing;
     const Vector16 mirror = environment(reflected);
@@ -201,9 +211,9 @@ inline Vector16 shade(const Vector16 p, const Vector16 ray) {
     const float16 matte = select((float16)1.0f, (float16)0.25f, metal);
     const float16 clear = open * select(0.06f + 0.94f * fresnel, 0.3f * fresnel, metal);
     const float16 tinted = open * select((float16)0.0f, (float16)0.75f, metal);
-    return (Vector16){colour.x * (matte * diffuse + tinted * mirror.x) + clear * mirror.x,
-                      colour.y * (matte * diffuse + tinted * mirror.y) + clear * mirror.y,
-                      colour.z * (matte * diffuse + tinted * mirror.z) + clear * mirror.z};
+    return (Vector16){displayed(colour.x * (matte * diffuse + tinted * mirror.x) + clear * mirror.x),
+                      displayed(colour.y * (matte * diffuse + tinted * mirror.y) + clear * mirror.y),
+                      displayed(colour.z * (matte * diffuse + tinted * mirror.z) + clear * mirror.z)};
 }
 
 // One work-item per pixel: traces 4x4 rays, writes the mean displayed colour of those that hit, and their share as alpha.
@@ -244,20 +254,25 @@ kernel void render_demo(
     const Vector16 colour = shade(advance(eye, ray, t), ray);
     const float16 weight = select((float16)0.0f, (float16)1.0f, hit);
     const float hits = dot16(weight, 1.0f);
-    // Display values are square roots of linear ones, nearly sRGB.
-    const float3 display = (float3)(dot16(weight, sqrt(clamp(colour.x, 0.0f, 1.0f))), dot16(weight, sqrt(clamp(colour.y, 0.0f, 1.0f))),
-                                    dot16(weight, sqrt(clamp(colour.z, 0.0f, 1.0f)))) / hits;
-    image[y * width + x] = convert_uchar4_sat_rte(255.0f * (float4)(display, hits / 16.0f));
+    const float3 shown = (float3)(dot16(weight, colour.x), dot16(weight, colour.y), dot16(weight, colour.z)) / hits;
+    image[y * width + x] = convert_uchar4_sat_rte(255.0f * (float4)(shown, hits / 16.0f));
 }
 
-// One work-item per place: writes its distance to the object, which is negative inside.
+// One work-item per 16 vertices of a grid: writes their distances to the object, which are negative inside.
 kernel void demo_distances(
-    const uint n,
-    global const float *positions,       // (n, 3)
+    const uint n,                        // vertices
+    global const float *grid,            // (8) cl/grid.h
     global float *distances)             // (n)
 {
-    const uint i = get_global_id(0);
-    if (i >= n)
+    const uint first = 16 * get_global_id(0);
+    if (first >= n)
         return;
-    distances[i] = scene_distance((Vector16){positions[3 * i], positions[3 * i + 1], positions[3 * i + 2]}).s0;
+    float x[16], y[16], z[16];
+    for (uint lane = 0; lane < 16; lane++) {
+        const float3 p = grid_position(grid, first + lane);
+        x[lane] = p.x;
+        y[lane] = p.y;
+        z[lane] = p.z;
+    }
+    store16(scene_distance((Vector16){vload16(0, x), vload16(0, y), vload16(0, z)}), distances + first, n - first);
 }

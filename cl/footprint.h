@@ -18,6 +18,7 @@
 // Counting and filling must find the same hits: no compiler may round the two differently.
 #pragma OPENCL FP_CONTRACT OFF
 
+#define ALWAYS_INLINE __attribute__((always_inline)) inline
 #define BLOCK_SIDE 4             // pixels are tested in blocks of 4 x 4, one lane each
 #define LANE_X (float16)(0, 1, 2, 3, 0, 1, 2, 3, 0, 1, 2, 3, 0, 1, 2, 3)
 #define LANE_Y (float16)(0, 0, 0, 0, 1, 1, 1, 1, 2, 2, 2, 2, 3, 3, 3, 3)
@@ -44,7 +45,7 @@ inline float world_radius(const Camera *k, const float radius, const float t) {
     return RADIUS_IN_PIXELS ? radius * pixel_width(k, t) : radius;
 }
 
-inline Footprint footprint_load(const Camera *k, const float4 point, const float radius) {
+ALWAYS_INLINE Footprint footprint_load(const Camera *k, const float4 point, const float radius) {
     Footprint f;
     const float width = pixel_width(k, point.w);
     f.centre = point.xyz;
@@ -55,37 +56,32 @@ inline Footprint footprint_load(const Camera *k, const float4 point, const float
     return f;
 }
 
-// Bounds of the slopes m = u/z of the tangents from the eye to a circle of this radius at (u, z): (m z - u)^2 = r^2 (1 + m^2).
-// Unbounded where the circle reaches the eye's plane.
-inline float2 tangent_slopes(const float u, const float z, const float radius) {
-    const float scale = z * z - radius * radius;
-    if (z <= radius) return (float2)(-INFINITY, INFINITY);
-    const float root = radius * sqrt(u * u + scale);
-    return (float2)(u * z - root, u * z + root) / scale;
-}
-
-// First and last pixel of an interval of one image axis, given in slopes; empty where last < first.
-inline int2 pixel_range(const float2 slopes, const float focal, const float centre, const int size) {
-    const float2 limits = slopes * focal + (centre - 0.5f);
+// Pixels that may be hit: first x, first y, last x, last y, inside the image; no pixel is where last < first.
+//
+// The tangents from the eye to a circle of radius r at (u, z), u = x or y, have the slopes m with (m z - u)^2 = r^2 (1 + m^2);
+// there are none where the circle reaches the eye's plane, and so no bounds.
+ALWAYS_INLINE int4 footprint_box(const Camera *k, const Footprint *f) {
+    const float z = f->centre.z, reach = FOOTPRINT == SPHERE ? f->radius : fmax(f->radius, f->least);
+    const float scale = z * z - reach * reach;
+    const float2 root = reach * sqrt(f->centre.xy * f->centre.xy + scale);
+    const float4 slopes = (float4)(f->centre.xy * z - root, f->centre.xy * z + root) / scale;
+    const float4 size = (float4)(k->width, k->height, k->width, k->height);
+    const float4 limits = slopes * (float4)(k->fx, k->fy, k->fx, k->fy) + ((float4)(k->cx, k->cy, k->cx, k->cy) - 0.5f);
 #if FOOTPRINT == SPHERE
-    const float first = floor(limits.x), last = ceil(limits.y);              // Pulsar's box, part of its hit rule
+    const float4 margin = 0.0f;              // from floor(first) to ceil(last): Pulsar's box is part of its hit rule
+    const int4 step = (int4)(-1, -1, 0, 0);
 #else
-    const float margin = 0.01f;                                              // pixels; far above the rounding of `limits`
-    const float first = ceil(limits.x - margin), last = floor(limits.y + margin);
+    const float4 margin = 0.01f;             // pixels; far above the rounding of `limits`
+    const int4 step = (int4)(0, 0, -1, -1);
 #endif
-    return (int2)((int)clamp(first, 0.0f, (float)size), (int)clamp(last, -1.0f, size - 1.0f));
-}
-
-// Pixels that may be hit: first x, first y, last x, last y, inside the image; empty where last < first.
-inline int4 footprint_box(const Camera *k, const Footprint *f) {
-    const float reach = FOOTPRINT == SPHERE ? f->radius : fmax(f->radius, f->least);
-    const int2 x = pixel_range(tangent_slopes(f->centre.x, f->centre.z, reach), k->fx, k->cx, k->width);
-    const int2 y = pixel_range(tangent_slopes(f->centre.y, f->centre.z, reach), k->fy, k->cy, k->height);
-    return (int4)(x.x, y.x, x.y, y.y);
+    const float4 wide = limits + (float4)(-margin.xy, margin.xy);
+    const float4 bounded = clamp(z > reach ? wide : (float4)(-1.0f, -1.0f, size.zw), -1.0f, size);
+    const int4 box = convert_int4(bounded + 1.0f) + step;                    // truncation of x + 1 >= 0: floor(x) + 1
+    return (int4)(max(box.xy, 0), min(box.zw, (int2)(k->width - 1, k->height - 1)));
 }
 
 // Tests the 4 x 4 pixels from (x, y) on that lie in the box: the result has bit 4 j + i set where pixel (x + i, y + j) is hit.
-inline uint footprint_block(const Camera *k, const Footprint *f, const int4 box, const int x, const int y,
+ALWAYS_INLINE uint footprint_block(const Camera *k, const Footprint *f, const int4 box, const int x, const int y,
                             float16 *closeness, float16 *depth) {
     const float16 px = LANE_X + (float)x, py = LANE_Y + (float)y;
     const float16 mx = (px + (0.5f - k->cx)) / k->fx, my = (py + (0.5f - k->cy)) / k->fy;

@@ -12,7 +12,7 @@ kernel void avgpool2_forward(
     global float *out)                   // (h, w, c)
 {
     const int first = get_global_id(0) * CHANNELS, column = get_global_id(1), row = get_global_id(2), lanes = c - first;
-    if (lanes <= 0 || column >= w || row >= h)
+    if (first >= c || column >= w || row >= h)
         return;
     global const float *upper = x + ((size_t)row * 4 * w + column * 2) * c + first, *lower = upper + 2 * w * c;
     const float16 sum = (load_lanes(upper, lanes) + load_lanes(upper + c, lanes))
@@ -31,7 +31,7 @@ kernel void avgpool2_backward(
     global float *grad_x)                // (?, ?, c)
 {
     const int first = get_global_id(0) * CHANNELS, column = get_global_id(1), row = get_global_id(2), lanes = c - first;
-    if (lanes <= 0 || column >= 2 * w || row >= 2 * h)
+    if (first >= c || column >= 2 * w || row >= 2 * h)
         return;
     const size_t at = ((size_t)row * 2 * w + column) * c + first;
     const float16 dL_dout = load_lanes(grad_out + ((size_t)(row / 2) * w + column / 2) * c + first, lanes);
@@ -50,7 +50,7 @@ kernel void maxpool2_forward(
     global float *out)                   // (h, w, c)
 {
     const int first = get_global_id(0) * CHANNELS, column = get_global_id(1), row = get_global_id(2), lanes = c - first;
-    if (lanes <= 0 || column >= w || row >= h)
+    if (first >= c || column >= w || row >= h)
         return;
     global const float *upper = x + ((size_t)row * 2 * x_width + column * 2) * c + first, *lower = upper + x_width * c;
     const float16 largest = fmax(fmax(load_lanes(upper, lanes), load_lanes(upper + c, lanes)),
@@ -69,7 +69,7 @@ kernel void upsample2_forward(
     global float *out)                   // (?, ?, c)
 {
     const int first = get_global_id(0) * CHANNELS, column = get_global_id(1), row = get_global_id(2), lanes = c - first;
-    if (lanes <= 0 || column >= 2 * w || row >= 2 * h)
+    if (first >= c || column >= 2 * w || row >= 2 * h)
         return;
     const int near = column / 2 * c, beside = clamp(column / 2 - 1 + 2 * (column & 1), 0, w - 1) * c;
     const int other = clamp(row / 2 - 1 + 2 * (row & 1), 0, h - 1);
@@ -88,7 +88,7 @@ kernel void upsample2_backward(
     global float *grad_x)                // (h, w, c)
 {
     const int first = get_global_id(0) * CHANNELS, column = get_global_id(1), row = get_global_id(2), lanes = c - first;
-    if (lanes <= 0 || column >= w || row >= h)
+    if (first >= c || column >= w || row >= h)
         return;
     // The outermost row or column reads its own edge of x with weight 1: it counts once more in place of the one outside.
     const int x0 = max(2 * column - 1, 0) * c, x1 = 2 * column * c, x2 = x1 + c, x3 = min(2 * column + 2, 2 * w - 1) * c;

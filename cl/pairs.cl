@@ -5,52 +5,45 @@
 
 #define RUN 64                   // keys ranked at once by comparing all with all, 8 a step; longer lists are merged
 
-// One work-item per point: reads its camera position and radius, writes its number of hits, adds them to their pixels.
+// One work-item per point: reads where it is, writes its number of hits.
 kernel void pairs_count(
     const uint n,                            // points
     const uint k,                            // radii: 1 (all alike) or n
     global const float *camera,              // (20) camera.h
     global const float *point_radius,        // (K)
-    global const float4 *point_camera,       // (N, 4) x, y, z, t; t < 0: left out
-    global uint *point_count,                // (N)
-    global volatile uint *pixel_count)       // (HW) accumulates
+    global const float4 *point_camera,       // (N, 4) x, y, z, t
+    global const ushort4 *point_box,         // (N, 4) first x, first y, last x, last y
+    global uint *point_count)                // (N)
 {
     const uint i = get_global_id(0);
     if (i >= n) return;
-    const float4 point = point_camera[i];
+    const int4 box = convert_int4(point_box[i]);
     uint count = 0;
-    if (point.w >= 0.0f) {
+    if (box.x <= box.z) {
         const Camera view = camera_load(camera);
-        const Footprint f = footprint_load(&view, point, point_radius[k == 1 ? 0 : i]);
-        const int4 box = footprint_box(&view, &f);
+        const Footprint f = footprint_load(&view, point_camera[i], point_radius[k == 1 ? 0 : i]);
+        float16 closeness, depth;
         for (int y = box.y; y <= box.w; y += BLOCK_SIDE)
-            for (int x = box.x; x <= box.z; x += BLOCK_SIDE) {
-                float16 closeness, depth;
-                uint hits = footprint_block(&view, &f, box, x, y, &closeness, &depth);
-                count += popcount(hits);
-                for (; hits; hits &= hits - 1) {
-                    const int lane = 31 - clz(hits & -hits);
-                    atomic_inc(&pixel_count[(y + lane / BLOCK_SIDE) * view.width + x + lane % BLOCK_SIDE]);
-                }
-            }
+            for (int x = box.x; x <= box.z; x += BLOCK_SIDE)
+                count += popcount(footprint_block(&view, &f, box, x, y, &closeness, &depth));
     }
     point_count[i] = count;
 }
 
-// One work-item per point: finds its hits again, writes its pairs and drops a key of each into its pixel's list, in any order.
+// One work-item per point: finds its hits again, writes them as pairs and counts them at their pixels.
 kernel void pairs_fill(
     const uint n,                            // points
     const uint k,                            // radii: 1 (all alike) or n
     global const float *camera,              // (20) camera.h
     global const float *point_radius,        // (K)
-    global const float4 *point_camera,       // (N, 4) x, y, z, t; t < 0: left out
+    global const float4 *point_camera,       // (N, 4) x, y, z, t
+    global const ushort4 *point_box,         // (N, 4) first x, first y, last x, last y
     global const uint *point_offset,         // (N+1) first pair of each point
-    global const uint *pixel_offset,         // (HW+1) first key of each pixel
-    global volatile uint *pixel_count,       // (HW) free places of each pixel's list; counted down to 0
     global uint *pair_pixel,                 // (P)
     global float *pair_closeness,            // (P) d in [0, 1]
     global uint *point_from_pair,            // (P)
-    global ulong *pair_key)                  // (P) unsorted within a pixel
+    global ulong *pair_key,                  // (P) by pair
+    global volatile uint *pixel_count)       // (HW) accumulates
 {
     const uint i = get_global_id(0);
     if (i >= n) return;
@@ -58,7 +51,7 @@ kernel void pairs_fill(
     if (pair == point_offset[i + 1]) return;
     const Camera view = camera_load(camera);
     const Footprint f = footprint_load(&view, point_camera[i], point_radius[k == 1 ? 0 : i]);
-    const int4 box = footprint_box(&view, &f);
+    const int4 box = convert_int4(point_box[i]);
     for (int y = box.y; y <= box.w; y += BLOCK_SIDE)
         for (int x = box.x; x <= box.z; x += BLOCK_SIDE) {
             float16 closeness, depth;
@@ -72,18 +65,33 @@ kernel void pairs_fill(
                 pair_pixel[pair] = pixel;
                 pair_closeness[pair] = lane_closeness[lane];
                 point_from_pair[pair] = i;
-                // bits of floats >= 0 sort like the floats
-                const uint place = pixel_offset[pixel] + atomic_dec(&pixel_count[pixel]) - 1;
-                pair_key[place] = upsample(as_uint(lane_depth[lane]), pair);
+                pair_key[pair] = upsample(as_uint(lane_depth[lane]), pair);  // bits of floats >= 0 sort like the floats
+                atomic_inc(&pixel_count[pixel]);
             }
         }
 }
 
+// One work-item per pair: drops its key into its pixel's list, in any order.
+kernel void pairs_scatter(
+    const uint pairs,                        // at most P
+    global const uint *pair_pixel,           // (P)
+    global const ulong *pair_key,            // (P) by pair
+    global const uint *pixel_offset,         // (HW+1) first key of each pixel
+    global volatile uint *pixel_count,       // (HW) places left in each pixel's list; counted down to 0
+    global ulong *unsorted_key)              // (P) by pixel
+{
+    const uint pair = get_global_id(0);
+    if (pair >= pairs) return;
+    const uint q = pair_pixel[pair];
+    unsorted_key[pixel_offset[q] + atomic_dec(&pixel_count[q]) - 1] = pair_key[pair];
+}
+
 // Sorts `count` <= RUN keys into `sorted`, which may be the same memory: each key's place is the number of smaller keys.
 inline void sort_run(global const ulong *keys, const uint count, global ulong *sorted) {
-    ulong run[RUN];
-    for (uint i = 0; i < RUN; i++)
-        run[i] = i < count ? keys[i] : ULONG_MAX;
+    ulong run[RUN + 8];
+    for (uint i = 0; i < count; i++)
+        run[i] = keys[i];
+    vstore8((ulong8)(ULONG_MAX), 0, run + count);                            // the lanes behind the last key
     for (uint i = 0; i < count; i += 8) {
         const ulong8 key = vload8(0, run + i);
         long8 place = 0;
@@ -105,26 +113,26 @@ inline void merge(global const ulong *keys, const uint middle, const uint count,
     }
 }
 
-// One work-item per pixel: reads its unsorted keys, writes them sorted; the unsorted ones are scratch.
+// One work-item per pixel: sorts its keys in place.
 kernel void pairs_sort(
     const uint hw,                           // pixels
     global const uint *pixel_offset,         // (HW+1)
-    global ulong *unsorted_key,              // (P)
-    global ulong *pair_key)                  // (P)
+    global ulong *scratch,                   // (P)
+    global ulong *pair_key)                  // (P) by pixel
 {
     const uint q = get_global_id(0);
     if (q >= hw) return;
     const uint begin = pixel_offset[q], count = pixel_offset[q + 1] - begin;
-    global ulong *from = unsorted_key + begin, *to = pair_key + begin;
+    global ulong *keys = pair_key + begin, *other = scratch + begin;
     uint passes = 0;
     for (uint width = RUN; width < count; width *= 2)
         passes++;
-    if (passes % 2) to = from;               // so that the last pass ends in pair_key
+    global ulong *from = keys, *to = passes % 2 ? other : keys;              // so that the last pass ends in pair_key
     for (uint first = 0; first < count; first += RUN)
         sort_run(from + first, min((uint)RUN, count - first), to + first);
     for (uint width = RUN; width < count; width *= 2) {
         from = to;
-        to = from == pair_key + begin ? unsorted_key + begin : pair_key + begin;
+        to = from == keys ? other : keys;
         for (uint first = 0; first < count; first += 2 * width)
             merge(from + first, min(width, count - first), min(2 * width, count - first), to + first);
     }

@@ -36,8 +36,10 @@ def adam_sh_update(dev, grid, camera, ids, grad_point_features, sh, m, v, step, 
 
     grid: (8,) of Grid.packed(). camera: (20,) of the view the gradient belongs to. ids: (N,) uint32 grid ids.
     grad_point_features: (N, 16) gradient of the points' features in that view, 0 for unseen points.
-    sh, m, v: (N, 2*degree + 1, 16) with degree 0, 1 or 2. step: from 1 on.
+    sh, m, v: (N, 2*degree + 1, 16) with degree 0, 1 or 2. step: from 1 on. Raises ValueError for another number.
     """
+    if sh.shape[1] not in (1, 3, 5):
+        raise ValueError(f"coefficients of one degree wanted: {sh.shape}")
     program = dev.program("adam", DEGREE=sh.shape[1] // 2)
     program.launch("adam_sh_update", len(sh), n=len(sh), grid=grid, camera=camera, ids=ids, sh=sh, m=m, v=v,
                    grad_point_features=grad_point_features, **_step_arguments(step, rate, eps, beta1, beta2))

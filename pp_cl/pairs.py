@@ -18,29 +18,31 @@ class Pairs:
 
     def __init__(self, dev, footprint):
         self.dev = dev
-        self.footprint = footprint
+        self.program = dev.program("pairs", **footprint.defines)
         self.points = self.pixels = self.capacity = 0
 
-    def build(self, view, size, point_camera, point_radius):
+    def build(self, view, size, projection, point_radius):
         """Find and sort the hits of projected points. Waits for the device twice, to learn how many there are.
 
-        view: (20) packed camera. size: its (height, width). point_camera: (N,4) from project. point_radius: (1) or (N).
+        view: (20) packed camera. size: its (height, width). projection: Projection with N points. point_radius: (1) or (N).
         """
-        dev, program = self.dev, self.dev.program("pairs", **self.footprint.defines)
-        n, hw = point_camera.shape[0], size[0] * size[1]
+        dev, program = self.dev, self.program
+        n, hw = projection.point_camera.shape[0], size[0] * size[1]
         self._resize(n, hw)
-        common = dict(n=n, k=point_radius.size, camera=view, point_radius=point_radius, point_camera=point_camera,
-                      pixel_count=self.pixel_count)
-        dev.fill(self.pixel_count, 0)
-        program.launch("pairs_count", n, point_count=self.point_count, **common)
-        exclusive_scan(dev, self.pixel_count, self.pixel_offset)
+        points = {"n": n, "k": point_radius.size, "camera": view, "point_radius": point_radius,
+                  "point_camera": projection.point_camera, "point_box": projection.point_box}
+        program.launch("pairs_count", n, point_count=self.point_count, **points)
         self.seen = self.seen_index[:nonzero(dev, self.point_count, self.point_offset, self.seen_index)]
         exclusive_scan(dev, self.point_count, self.point_offset)
         self.total = read_total(dev, self.point_offset)
         self._reserve(self.total)
-        program.launch("pairs_fill", n, point_offset=self.point_offset, pixel_offset=self.pixel_offset, pair_pixel=self.pair_pixel,
-                       pair_closeness=self.pair_closeness, point_from_pair=self.point_from_pair, pair_key=self.hit, **common)
-        program.launch("pairs_sort", hw, hw=hw, pixel_offset=self.pixel_offset, unsorted_key=self.hit, pair_key=self.pair_key)
+        dev.fill(self.pixel_count, 0)
+        program.launch("pairs_fill", n, point_offset=self.point_offset, pair_pixel=self.pair_pixel, pair_key=self.hit,
+                       pair_closeness=self.pair_closeness, point_from_pair=self.point_from_pair, pixel_count=self.pixel_count, **points)
+        exclusive_scan(dev, self.pixel_count, self.pixel_offset)
+        program.launch("pairs_scatter", self.total, pairs=self.total, pair_pixel=self.pair_pixel, pair_key=self.hit,
+                       pixel_offset=self.pixel_offset, pixel_count=self.pixel_count, unsorted_key=self.pair_key)
+        program.launch("pairs_sort", hw, hw=hw, pixel_offset=self.pixel_offset, scratch=self.hit, pair_key=self.pair_key)
 
     def _resize(self, n, hw):
         """Buffers for n points and hw pixels."""
@@ -57,7 +59,7 @@ class Pairs:
 
     def _reserve(self, total):
         """Buffers for at least `total` pairs, and never none at all."""
-        if 0 < self.capacity and total <= self.capacity:
+        if self.capacity > 0 and total <= self.capacity:
             return
         dev, self.capacity = self.dev, max(1, int(total * GROWTH))
         self.pair_key = self.hit = self.pair_pixel = self.pair_closeness = self.point_from_pair = None  # release before allocating

@@ -2,6 +2,8 @@
 
 from dataclasses import dataclass
 
+import numpy as np
+
 KINDS = ("disc", "soft", "sphere")
 
 
@@ -22,21 +24,37 @@ class Footprint:
         return {"FOOTPRINT": KINDS.index(self.kind), "RADIUS_IN_PIXELS": int(self.in_pixels)}
 
 
-def project_grid(dev, footprint, view, grid, point_id, radius, point_camera, dropout=0.0, seed=0):
-    """Write (x, y, z, distance) in camera axes; distance -1 where a point is left out (Pulsar's culling rule).
+class Projection:
+    """Where the points of one view are; the buffers are kept from view to view.
 
-    view: (20) packed camera. grid: (8) packed Grid. point_id: (N) uint32. radius: one number. point_camera: (N,4).
-    dropout: probability in [0, 1) with which each point is left out, at random by (seed, grid id).
+    point_camera: (N,4) float32, x, y, z in camera axes and the distance; (0, 0, 0, -1) for a point left out by Pulsar's culling
+    rule. point_box: (N,4) uint16, first x, first y, last x, last y of the pixels that may be hit; none where last < first.
     """
-    n = point_id.size
-    dev.program("project", **footprint.defines).launch(
-        "project_grid", n, n=n, radius=radius, dropout=round(dropout * 2**32), seed=seed, camera=view, grid=grid,
-        point_id=point_id, point_camera=point_camera)
 
+    def __init__(self, dev, footprint):
+        self.dev = dev
+        self.program = dev.program("project", **footprint.defines)
+        self.point_camera = self.point_box = None
 
-def project_spheres(dev, footprint, view, positions, point_radius, point_camera):
-    """The same for positions (N,3) in world coordinates and radii (1) or (N)."""
-    n = positions.shape[0]
-    dev.program("project", **footprint.defines).launch(
-        "project_spheres", n, n=n, k=point_radius.size, camera=view, positions=positions, point_radius=point_radius,
-        point_camera=point_camera)
+    def grid(self, view, grid, point_id, radius, dropout=0.0, seed=0):
+        """Project vertices of a grid.
+
+        view: (20) packed camera. grid: (8) packed Grid. point_id: (N) uint32. radius: one number for all.
+        dropout: probability in [0, 1) with which each point is left out, at random by (seed, id).
+        """
+        n = point_id.size
+        self._resize(n)
+        self.program.launch("project_grid", n, n=n, radius=radius, dropout=round(dropout * 2**32), seed=seed, camera=view, grid=grid,
+                            point_id=point_id, point_camera=self.point_camera, point_box=self.point_box)
+
+    def spheres(self, view, positions, point_radius):
+        """Project spheres. positions: (N,3) float32, world. point_radius: (1) or (N) float32."""
+        n = positions.shape[0]
+        self._resize(n)
+        self.program.launch("project_spheres", n, n=n, k=point_radius.size, camera=view, positions=positions,
+                            point_radius=point_radius, point_camera=self.point_camera, point_box=self.point_box)
+
+    def _resize(self, n):
+        if self.point_camera is None or self.point_camera.shape[0] != n:
+            self.point_camera = self.dev.empty((n, 4))
+            self.point_box = self.dev.empty((n, 4), np.uint16)

@@ -8,7 +8,7 @@ import numpy as np
 from pp_cl.blend import Blend
 from pp_cl.pairs import Pairs
 from pp_cl.points import SH_DEGREES
-from pp_cl.project import Footprint, project_grid
+from pp_cl.project import Footprint, Projection
 from pp_cl.shade import shade_forward
 
 NETWORK_MULTIPLE = 4  # the U-Net halves its input twice
@@ -27,6 +27,7 @@ class Renderer:
         self.model = model
         self.settings = settings
         self.footprint = Footprint(settings.footprint)
+        self.projection = Projection(dev, self.footprint)
         self.pairs = Pairs(dev, self.footprint)
         self.blend = Blend(dev, self.footprint, mean=settings.mean_gradient)
         self.offset = (0, 0)
@@ -40,7 +41,7 @@ class Renderer:
         """
         self.blend_weights(camera, gamma, dropout, seed)
         points = self.model.points
-        shade_forward(self.dev, self.camera, self.point_camera, self.pairs.seen, [points[f"sh{d}"] for d in SH_DEGREES], self.point_features)
+        shade_forward(self.dev, self.camera, self.projection.point_camera, self.pairs.seen, [points[f"sh{d}"] for d in SH_DEGREES], self.point_features)
         self.blend.forward(self.pairs, self.point_features, self.features)
         return self.model.net.forward(self.features, training=training)
 
@@ -52,8 +53,8 @@ class Renderer:
         points, settings = self.model.points, self.settings
         radius = self._radius(padded)
         self.radius_buffer.set(np.array([radius], np.float32))
-        project_grid(self.dev, self.footprint, self.camera, self.model.grid_buffer, points["ids"], radius, self.point_camera, dropout, seed)
-        self.pairs.build(self.camera, (padded.height, padded.width), self.point_camera, self.radius_buffer)
+        self.projection.grid(self.camera, self.model.grid_buffer, points["ids"], radius, dropout, seed)
+        self.pairs.build(self.camera, (padded.height, padded.width), self.projection, self.radius_buffer)
         self.blend.weights(self.pairs, self.camera, points["opacity"], gamma, settings.max_tracked, settings.stop)
 
     def backward(self, grad_image):
@@ -87,7 +88,7 @@ class Renderer:
         n = self.model.count
         if n != self._count:
             self._count = n
-            self.point_camera, self.point_features = self.dev.empty((n, 4)), self.dev.empty((n, 16))
+            self.point_features = self.dev.empty((n, 16))
             self.grad_point_features, self.grad_opacity = self.dev.empty((n, 16)), self.dev.empty((n,))
         if (height, width) != self._size:
             self._size = (height, width)

@@ -36,10 +36,12 @@ class Smoother:
         """Move every coefficient f, in place: f += amount * (mean of the existing neighbours' f - f).
 
         All reads see the old values; a point without neighbours stays as it is. amount: 0 to 1; 4 * lambda * learning rate
-        for every fourth step. sh: (N, K, 16) float32, K up to 5.
+        for every fourth step. sh: (N, K, 16) float32, K up to 5; ValueError beyond.
         """
         launch = self.dev.program("smooth").launch
         n, coefficients, _ = sh.shape
+        if coefficients > MOST_COEFFICIENTS:
+            raise ValueError(f"at most {MOST_COEFFICIENTS} coefficients a point: {sh.shape}")
         waiting = None
         for start in range(0, n, self.chunk):
             part = {"first": start, "count": min(self.chunk, n - start), "smoothed": self._slots[start // self.chunk % 2],

@@ -135,6 +135,13 @@ def test_sh_is_dense_adam(dev, rng, n, degree):
         assert relative_error(v.get(), oracle.v) < 2e-6
 
 
+def test_sh_refuses_a_mix_of_degrees(dev):
+    arrays = [dev.zeros((2, 4, 16)) for _ in range(3)]
+    with pytest.raises(ValueError, match="one degree"):
+        adam_sh_update(dev, dev.zeros((8,)), dev.zeros((20,)), dev.zeros((2,), np.uint32), dev.zeros((2, 16)), *arrays,
+                       step=1, rate=0.1, eps=0)
+
+
 def test_sh_of_a_point_in_the_eye_stays_finite(dev):
     """No pixel sees it, so its gradient is 0; its direction is undefined."""
     grid, camera = Grid((0, 0, 0), 0.5, (5, 5, 5)), Camera(np.column_stack([np.eye(3), [1.0, 0.5, 0]]), 9, 9, 4, 4, 8, 8)

@@ -82,6 +82,11 @@ def test_lonely_points_stay(dev, rng):
     np.testing.assert_array_equal(smoothed(dev, values, ids, dims, 1.0), values)
 
 
+def test_refuses_what_its_scratch_cannot_hold(dev):
+    with pytest.raises(ValueError, match="at most 5"):
+        Smoother(*cloud(dev, [0, 1], (2, 1, 1))).smooth(dev.zeros((2, 9, 16)), 0.1)
+
+
 def test_amount_one_is_the_mean(dev):
     values = np.repeat(np.arange(4, dtype=np.float32), 16).reshape(4, 1, 16)
     np.testing.assert_array_equal(smoothed(dev, values, range(4), (4, 1, 1), 1.0)[:, 0, 0], [1, 1, 2, 2])

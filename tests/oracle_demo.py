@@ -1,0 +1,71 @@
+"""Float64 twin of the object in cl/demo.cl, built from segments and circles, and of the rays' hits."""
+
+import numpy as np
+
+CENTRE = np.array([0, 0, 0.15])  # of the globe
+MERIDIAN = np.array([0.819152, 0.573576, 0])
+WHEEL = np.array([-0.242404, 0.346188, 0.906308])
+WHEEL_V = np.cross(WHEEL, MERIDIAN)
+ECLIPTIC = np.cos(np.pi / 3) * MERIDIAN + np.sin(np.pi / 3) * WHEEL_V
+
+
+def segment(p, a, b):
+    """Distances of (N, 3) places to the segment from a to b."""
+    share = np.clip((p - a) @ (b - a) / ((b - a) @ (b - a)), 0, 1)
+    return np.linalg.norm(p - a - share[:, None] * (b - a), axis=1)
+
+
+def circle(p, normal, radius):
+    """Distances of (N, 3) places to a circle around the origin."""
+    height = p @ normal
+    in_plane = np.linalg.norm(p - height[:, None] * normal, axis=1)
+    return np.hypot(in_plane - radius, height)
+
+
+def rounded_rectangle(a, b, half_a, half_b, radius):
+    """Signed distances of (a, b) to a rectangle grown by a radius."""
+    u, v = np.abs(a) - half_a, np.abs(b) - half_b
+    outside = np.hypot(np.maximum(u, 0), np.maximum(v, 0))
+    return np.where((u > 0) | (v > 0), outside, np.maximum(u, v)) - radius
+
+
+def distance(positions):
+    """(N,) signed distances of (N, 3) world positions to the object."""
+    p = positions - CENTRE
+    z = np.array([0, 0, 1.0])
+    height = p @ MERIDIAN
+    from_axis = np.hypot(p[:, 0], p[:, 1])
+    in_band = np.linalg.norm(p - height[:, None] * MERIDIAN, axis=1)
+    solids = [
+        np.linalg.norm(p, axis=1) - 0.30,
+        rounded_rectangle(from_axis, p[:, 2] + 1.03, 0.50, 0.05, 0.03),
+        rounded_rectangle(in_band - 0.70, height, 0.018, 0.05, 0.006),
+        np.linalg.norm(p + 0.88 * z, axis=1) - 0.07,
+        segment(p, -1.0 * z, -0.72 * z) - 0.03,
+        segment(p, -0.69 * WHEEL, 0.69 * WHEEL) - 0.014,
+        circle(p, WHEEL, 0.54) - 0.024,
+        circle(p, ECLIPTIC, 0.62) - 0.018,
+    ]
+    for angle in np.arange(12) * np.pi / 6:
+        spoke = np.cos(angle) * MERIDIAN + np.sin(angle) * WHEEL_V
+        solids.append(segment(p, 0.2 * spoke, 0.54 * spoke) - 0.011)
+    return np.min(solids, axis=0)
+
+
+def coverage(camera):
+    """((H, W) share of 4x4 rays a pixel that come within 4e-4 of the object, (H, W) the same for 1e-5)."""
+    sub = (np.arange(4) + 0.5) / 4
+    x = (np.arange(camera.width)[:, None] + sub).ravel()
+    y = (np.arange(camera.height)[:, None] + sub).ravel()
+    x, y = np.meshgrid((x - camera.cx) / camera.fx, (y - camera.cy) / camera.fy)
+    rays = np.stack([x, y, np.ones_like(x)], -1).reshape(-1, 3)
+    rays = rays / np.linalg.norm(rays, axis=1, keepdims=True) @ camera.pose[:, :3].T
+    t, closest = np.full(len(rays), 1.0), np.full(len(rays), np.inf)
+    marching = np.arange(len(rays))
+    for _ in range(400):
+        d = distance(camera.eye + t[marching, None] * rays[marching])
+        closest[marching] = np.minimum(closest[marching], d)
+        t[marching] += d
+        marching = marching[(d > 1e-5) & (t[marching] < 8)]
+    closest = closest.reshape(camera.height, 4, camera.width, 4)
+    return (closest < 4e-4).mean((1, 3)), (closest <= 1e-5).mean((1, 3))

@@ -1,0 +1,141 @@
+"""The command line as a user meets it: what it prints, its exit status, and one line for whatever is wrong."""
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+from scenes import write_ball_scene
+
+from pp_cl.cli import main
+
+
+def failure(capsys, *words):
+    """The one line on stderr of a command that must end with exit status 2."""
+    capsys.readouterr()
+    assert main([str(w) for w in words]) == 2
+    captured = capsys.readouterr()
+    lines = [line for line in captured.err.splitlines() if line.startswith("pp-cl: ")]
+    assert len(lines) == 1 and captured.err.rstrip().endswith(lines[0]) and "Traceback" not in captured.err
+    return lines[0]
+
+
+@pytest.fixture
+def scene(tmp_path):
+    """A small scene to be damaged."""
+    return Path(write_ball_scene(tmp_path / "ball", views=4, size=32))
+
+
+def edit(scene, change):
+    """Apply change(dict) to the training json."""
+    path = scene / "transforms_train.json"
+    content = json.loads(path.read_text())
+    change(content)
+    path.write_text(json.dumps(content))
+
+
+def set_matrix(value):
+    def change(content):
+        content["frames"][1]["transform_matrix"] = value
+    return change
+
+
+def set_path(value):
+    def change(content):
+        content["frames"][1]["file_path"] = value
+    return change
+
+
+DAMAGE = {
+    "no such folder": (lambda s: s.rename(s.parent / "elsewhere"), "ball"),
+    "missing json": (lambda s: (s / "transforms_train.json").unlink(), "transforms_train.json"),
+    "broken json": (lambda s: (s / "transforms_train.json").write_text('{"frames": ['), "transforms_train.json"),
+    "missing key": (lambda s: edit(s, lambda c: c.pop("camera_angle_x")), "camera_angle_x"),
+    "missing matrix": (lambda s: edit(s, lambda c: c["frames"][1].pop("transform_matrix")), "transform_matrix"),
+    "zero frames": (lambda s: edit(s, lambda c: c.update(frames=[])), "frames"),
+    "nan matrix": (lambda s: edit(s, set_matrix([[float("nan")] * 4] * 4)), "transform_matrix"),
+    "wrong shape": (lambda s: edit(s, set_matrix([[1, 0], [0, 1]])), "transform_matrix"),
+    "path leaves": (lambda s: edit(s, set_path("../../secret")), "file_path"),
+    "missing image": (lambda s: (s / "train" / "r_1.png").unlink(), "r_1.png"),
+    "truncated image": (lambda s: (s / "train" / "r_1.png").write_bytes((s / "train" / "r_1.png").read_bytes()[:200]), "r_1.png"),
+    "other size": (lambda s: Image.new("RGBA", (20, 20)).save(s / "train" / "r_1.png"), "r_1.png"),
+    "empty mask": (lambda s: Image.new("RGBA", (32, 32)).save(s / "train" / "r_1.png"), "r_1.png"),
+}
+
+
+@pytest.mark.parametrize("name", DAMAGE)
+def test_a_damaged_scene_is_one_line_and_writes_nothing(name, scene, tmp_path, capsys):
+    damage, named = DAMAGE[name]
+    damage(scene)
+    assert named in failure(capsys, "train", scene, "--out", tmp_path / "run", "--points", 500, "--iterations", 2)
+    assert not (tmp_path / "run").exists()
+
+
+@pytest.mark.parametrize("words, named", [
+    (["--iterations", "0"], "train.iterations"), (["--iterations", "x"], "--iterations"), (["--points", "0"], "points.count"),
+    (["--downscale", "20"], "--downscale"), (["--set", "train.sped=1"], "train.sped"), (["--set", "nonsense"], "--set nonsense"),
+    (["--preset", "huge"], "--preset"), (["--speed", "9"], "--speed"), (["--device", "abacus"], "abacus"), (["--seed", "-1"], "train.seed"),
+])
+def test_bad_options_are_one_line_and_write_nothing(words, named, scene, tmp_path, capsys):
+    assert named in failure(capsys, "train", scene, "--out", tmp_path / "run", *words)
+    assert not (tmp_path / "run").exists()
+
+
+def test_a_foreign_folder_is_not_written_into(scene, tmp_path, capsys):
+    out = tmp_path / "photos"
+    out.mkdir()
+    (out / "holiday.jpg").write_bytes(b"")
+    assert "photos" in failure(capsys, "train", scene, "--out", out)
+    assert [p.name for p in out.iterdir()] == ["holiday.jpg"]
+    (tmp_path / "file").write_text("")
+    assert "file" in failure(capsys, "train", scene, "--out", tmp_path / "file")
+
+
+def test_no_device_says_what_to_install(scene, tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr("pp_cl.device.list_devices", lambda: [])
+    assert "pocl" in failure(capsys, "train", scene, "--out", tmp_path / "run")
+    assert "pocl" in failure(capsys, "devices")
+
+
+def test_devices_lists_a_working_one(capsys):
+    assert main(["devices"]) == 0
+    assert "works" in capsys.readouterr().out
+    assert main(["devices", "--json"]) == 0
+    assert any(d["problem"] is None and d["name"] for d in json.loads(capsys.readouterr().out))
+
+
+def test_without_a_command_or_with_an_unknown_one(capsys):
+    assert "command" in failure(capsys)
+    assert "paint" in failure(capsys, "paint")
+
+
+def test_help_lists_settings_and_the_module_runs():
+    run = subprocess.run([sys.executable, "-m", "pp_cl", "train", "--help"], capture_output=True, text=True,
+                         cwd=Path(__file__).parents[1], check=True)
+    assert "train.sh_rate" in run.stdout and "--downscale" in run.stdout
+
+
+def test_eval_of_nothing_and_of_broken_runs(tmp_path, capsys):
+    assert "config.json" in failure(capsys, "eval", tmp_path / "none")
+    run = tmp_path / "run"
+    run.mkdir()
+    (run / "config.json").write_text("{}")
+    assert "preset" in failure(capsys, "eval", run)
+    (run / "config.json").write_text('{"preset": "tiny"}')
+    assert "checkpoint.npz" in failure(capsys, "eval", run)
+    (run / "checkpoint.npz").write_bytes(b"PK\x03\x04 not really")
+    assert "corrupt" in failure(capsys, "eval", run)
+    assert "--metrics" in failure(capsys, "eval", run, "--metrics", "beauty")
+
+
+def test_compare_writes_the_table_and_the_file(tmp_path, capsys):
+    rng = np.random.default_rng(0)
+    for name in ("a", "b"):
+        Image.fromarray(rng.integers(0, 256, (24, 24, 3), np.uint8)).save(tmp_path / f"{name}.png")
+    assert main(["compare", str(tmp_path / "a.png"), str(tmp_path / "b.png"), "--json", str(tmp_path / "m.json")]) == 0
+    result = json.loads((tmp_path / "m.json").read_text())
+    assert f"{result['mean']['psnr']:.4f}" in capsys.readouterr().out
+    assert "none.png" in failure(capsys, "compare", tmp_path / "none.png", tmp_path / "b.png")

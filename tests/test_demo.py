@@ -1,0 +1,161 @@
+"""The demo's object and pictures: distances and silhouettes against the float64 oracle, mesh, gloss, the written folder."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import trimesh
+from helpers import AWKWARD_SIZES
+from oracle_demo import CENTRE, coverage, distance
+
+from pp_cl.camera import Camera
+from pp_cl.demo import OBJECT_BOX, demo_mesh, demo_scene, distances, render, write_scene
+from pp_cl.errors import UserError
+from pp_cl.hull import build_grid
+from pp_cl.points import Grid
+from pp_cl.scene import load_scene
+
+KEY = np.array([0.40, -0.52, 0.7547])  # direction of the key light
+
+
+def look_at(eye, target, size, focal):
+    """Camera at `eye` that looks at `target`; size: (width, height); focal: pixels."""
+    forward = (target - eye) / np.linalg.norm(target - eye)
+    right = np.cross(forward, [0, 0, 1])
+    right /= np.linalg.norm(right)
+    pose = np.column_stack([right, np.cross(forward, right), forward, eye])
+    return Camera(pose, focal, focal, size[0] / 2, size[1] / 2, *size)
+
+
+@pytest.mark.parametrize("n", AWKWARD_SIZES)
+@pytest.mark.parametrize("start", ((-0.8, 0.02, 0.1), (-0.5, -0.45, -0.9)))
+def test_distances_equal_the_oracle(dev, n, start):
+    grid = Grid(start, 1.6 / n, (n, 1, 1))
+    expected = distance(grid.positions(np.arange(n)))
+    np.testing.assert_allclose(distances(dev, grid).ravel(), expected, atol=2e-6, rtol=0)
+
+
+def test_distances_change_no_faster_than_places(dev):
+    """Sphere tracing passes no surface."""
+    grid = Grid((-0.8, -0.8, -1.1), 0.05, (33, 33, 45))
+    found = distances(dev, grid)
+    np.testing.assert_allclose(found.ravel(), distance(grid.positions(np.arange(found.size))), atol=2e-6, rtol=0)
+    for axis in range(3):
+        assert np.abs(np.diff(found, axis=axis)).max() <= 0.05 * (1 + 1e-4)
+
+
+@pytest.mark.parametrize("width, height", ((31, 33), (33, 18)))
+def test_silhouettes_equal_the_oracle(dev, width, height):
+    """Alpha lies between the shares of the rays that touch and of those that come within the tracer's tolerance."""
+    camera = look_at(np.array([1.5, -2.8, 1.2]), np.zeros(3), (width, height), 40)
+    image = render(dev, camera)
+    near, touching = coverage(camera)
+    alpha = image[..., 3] / 255 * 16
+    assert ((alpha < near * 16 + 0.5) & (alpha > touching * 16 - 0.5)).mean() > 0.995
+    assert 0.1 < (alpha > 0).mean() < 0.9 and (near != touching).mean() < 0.05
+    assert (image[image[..., 3] == 0] == 0).all()
+
+
+def test_a_crop_shows_the_same_pixels(dev):
+    camera = look_at(np.array([-2.0, 2.0, 1.5]), np.zeros(3), (64, 64), 80)
+    whole, part = render(dev, camera), render(dev, camera.crop(13, 21, 33, 29))
+    differing = (np.abs(whole[21:50, 13:46].astype(int) - part) > 1).any(-1)  # rays that graze an edge may choose otherwise
+    assert differing.mean() < 0.01 and (part[..., 3] > 0).mean() > 0.3
+    np.testing.assert_array_equal(render(dev, camera), whole)
+
+
+def test_the_globe_is_glossy(dev):
+    """The place that faces the key light is brighter where it mirrors the lamp to the camera than from the side."""
+    facing = CENTRE + 0.30 * KEY
+    side = np.cross(KEY, [0, 0, 1.0])
+    colours = []
+    for eye in (KEY, KEY + side, KEY - side):
+        image = render(dev, look_at(CENTRE + 0.2 * KEY + 0.4 * eye / np.linalg.norm(eye), facing, (3, 3), 2000))
+        assert (image[..., 3] == 255).all()
+        colours.append(image[1, 1, :3] / 255)
+    mirrored, *others = colours
+    for other in others:
+        assert (mirrored - other > 0.05).all()
+
+
+def test_the_mesh_is_the_object(dev):
+    vertices, faces = demo_mesh(dev, 192)
+    mesh = trimesh.Trimesh(vertices, faces, process=False)
+    assert mesh.is_watertight and mesh.body_count == 1 and mesh.volume > 0.25
+    assert mesh.euler_number < -20, "rings and spokes enclose holes"
+    edge = 1.92 / 191
+    assert np.abs(distance(vertices.astype(np.float64))).max() < edge / 2
+    assert (vertices.min(0) > OBJECT_BOX[0]).all() and (vertices.max(0) < OBJECT_BOX[1]).all()
+    assert np.linalg.norm(vertices - [0, 0, -0.08], axis=1).max() < 1.05, "the tracer's ball cuts the object"
+
+
+def test_the_scene_shows_the_whole_mesh(dev):
+    """64 + 16 views; the mesh projects onto the masks, which carve a hull that holds it."""
+    scene = demo_scene(dev, size=64)
+    assert (scene.name, scene.folder, scene.depth_range_stored) == ("demo", None, False)
+    assert {split: len(views) for split, views in scene.splits.items()} == {"train": 64, "test": 16}
+    vertices, _ = demo_mesh(dev, 64)
+    eyes = []
+    for view in scene.splits["train"] + scene.splits["test"]:
+        camera, alpha = view.camera, np.pad(view.image[..., 3], 1)
+        np.testing.assert_allclose(camera.pose[:, :3].T @ camera.pose[:, :3], np.eye(3), atol=1e-12)
+        assert np.linalg.det(camera.pose[:, :3]) > 0 and not view.has_depth_range
+        assert not alpha[[1, -2]].any() and not alpha[:, [1, -2]].any(), f"{view.name} cuts the object off"
+        x, y, z = camera.pose[:, :3].T @ (vertices - camera.eye).T
+        u = (camera.fx * x / z + camera.cx).astype(int) + 1
+        v = (camera.fy * y / z + camera.cy).astype(int) + 1
+        around = np.max([alpha[v + dv, u + du] for dv in (-1, 0, 1) for du in (-1, 0, 1)], axis=0)
+        assert (around > 0).all()
+        eyes.append(camera.eye)
+    gaps = np.linalg.norm(np.array(eyes)[:, None] - eyes, axis=-1) + 9 * np.eye(80)
+    assert gaps.min() > 0.1, "two views are nearly the same"
+
+    hull = build_grid(dev, scene.splits["train"], 20000)
+    lattice = hull.grid.positions(np.arange(np.prod(hull.grid.dims)))
+    inside = distance(lattice) < 0
+    kept = np.isin(np.arange(len(lattice)), hull.ids)
+    assert inside.sum() > 2000 and kept[inside].all()
+
+
+def test_a_split_can_be_made_alone(dev):
+    test, both = demo_scene(dev, ("test",), size=16), demo_scene(dev, size=16)
+    assert list(test.splits) == ["test"]
+    np.testing.assert_array_equal(test.splits["test"][5].image, both.splits["test"][5].image)
+
+
+def test_a_written_scene_is_read_back(dev, tmp_path):
+    scene = demo_scene(dev, size=24)
+    folder = tmp_path / "new" / "demo"
+    write_scene(scene, folder)
+    again = load_scene(folder, ("train", "test"))
+    assert not again.depth_range_stored and again.name == "demo"
+    for split, views in scene.splits.items():
+        assert [v.name for v in again.splits[split]] == [v.name for v in views]
+        for view, read in zip(views, again.splits[split], strict=True):
+            np.testing.assert_array_equal(read.image, view.image)
+            np.testing.assert_allclose(read.camera.pose, view.camera.pose, atol=1e-12)
+            assert replace(read.camera, pose=None, near=0, far=0) == replace(view.camera, pose=None, near=0, far=0)
+    angle = json.loads((folder / "transforms_test.json").read_text())["camera_angle_x"]
+    assert angle == pytest.approx(0.6911112)
+
+
+def test_a_depth_range_is_written(dev, tmp_path):
+    scene = demo_scene(dev, ("train",), size=16)
+    scene.splits["train"] = [replace(v, camera=replace(v.camera, near=1.5, far=5.25)) for v in scene.splits["train"][:2]]
+    write_scene(scene, tmp_path / "demo")
+    again = load_scene(tmp_path / "demo")
+    assert again.depth_range_stored and [(v.camera.near, v.camera.far) for v in again.splits["train"]] == [(1.5, 5.25)] * 2
+
+
+def test_only_an_empty_folder_is_written(dev, tmp_path):
+    scene = demo_scene(dev, ("test",), size=16)
+    (tmp_path / "empty").mkdir()
+    write_scene(scene, tmp_path / "empty")
+    (tmp_path / "file").write_text("x")
+    for taken in ("empty", "file"):
+        with pytest.raises(UserError, match=f"{taken}: exists already"):
+            write_scene(scene, tmp_path / taken)
+    with pytest.raises(UserError, match="cannot be written"):
+        write_scene(scene, tmp_path / "file" / "inside")
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["empty", "file"]

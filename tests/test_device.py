@@ -1,0 +1,337 @@
+"""Choosing a device, its buffers, its errors and its debug levels."""
+
+import atexit
+import json
+import os
+import subprocess
+import sys
+from types import SimpleNamespace
+
+import numpy as np
+import pyopencl as cl
+import pytest
+from helpers import GuardedDevice
+
+from pp_cl import device as device_module
+from pp_cl.device import Device, describe, kernel_folder, list_devices, open_device
+from pp_cl.errors import UserError
+
+TINY = """
+// One work-item per element: overwrites y with 0 / x.
+kernel void divide(
+    const uint n,              // elements
+    global const float *x,     // (N)
+    global float *y)           // (N)
+{
+    const uint i = get_global_id(0);
+    if (i >= n) return;
+    y[i] = 0.0f / x[i];
+}
+"""
+
+
+def fake(platform, name, gpu=False, problem=None, index="0:0"):
+    """An entry of list_devices() that is never opened."""
+    kind = cl.device_type.GPU if gpu else cl.device_type.CPU
+    return index, SimpleNamespace(name=name, platform=SimpleNamespace(name=platform), type=kind), problem
+
+
+@pytest.fixture
+def listed(monkeypatch):
+    """Sets what list_devices() returns; open_device() then returns the cl.Device in place of a Device."""
+    monkeypatch.setattr(device_module, "Device", lambda d: d)
+    monkeypatch.delenv("PP_DEVICE", raising=False)
+    return lambda *entries: monkeypatch.setattr(device_module, "list_devices", lambda: list(entries))
+
+
+@pytest.fixture
+def tiny(tmp_path, monkeypatch):
+    """A kernel folder of the test's own."""
+    (tmp_path / "tiny.cl").write_text(TINY)
+    monkeypatch.setattr(device_module, "kernel_folder", lambda: tmp_path)
+    return tmp_path
+
+
+@pytest.fixture
+def plain(session_device):
+    """The tests' device without guards."""
+    return Device(session_device.device)
+
+
+# ---- choosing
+
+def test_listed_devices_are_probed(session_device):
+    found = list_devices()
+    assert any(d == session_device.device and problem is None for _, d, problem in found)
+    assert len({i for i, _, _ in found}) == len(found)
+
+
+def test_description_is_json(session_device):
+    info = json.loads(json.dumps(describe(session_device.device)))
+    assert info["type"] in ("CPU", "GPU", "ACCELERATOR", "OTHER")
+    assert info["compute_units"] >= 1
+    assert 2**27 <= info["max_allocation_bytes"] <= 2**50
+    assert 2**27 <= info["memory_bytes"] <= 2**50
+
+
+@pytest.mark.parametrize("result", ["wrong", "error"])
+def test_probe_names_the_problem(session_device, monkeypatch, result):
+    change = {"wrong": ("2.0f", "3.0f"), "error": ("2.0f", "undeclared")}
+    monkeypatch.setattr(device_module, "PROBE", device_module.PROBE.replace(*change[result]))
+    problem = device_module._probe(session_device.device)
+    assert {"wrong": "computes a wrong result", "error": "does not run: "}[result] in problem
+    assert "\n" not in problem
+
+
+def test_a_gpu_comes_first(listed):
+    cpu, gpu = fake("Portable Computing Language", "cpu"), fake("NVIDIA CUDA", "H200", gpu=True, index="1:0")
+    listed(cpu, gpu)
+    assert open_device() is gpu[1]
+
+
+def test_a_gpu_that_fails_its_test_build_is_passed_over(listed):
+    cpu = fake("Portable Computing Language", "cpu")
+    listed(fake("rusticl", "llvmpipe", gpu=True, problem="does not run: x", index="1:0"), cpu)
+    assert open_device() is cpu[1]
+
+
+@pytest.mark.parametrize("choice, wanted", [("0:0", 0), ("1:0", 1), ("1:1", 2), ("intel", 1), ("Portable", 0), ("h200", 2),
+                                            ("xeon", 0), ("cuda", 2)])
+@pytest.mark.parametrize("variable", [False, True])
+def test_choice_by_index_and_name(listed, monkeypatch, choice, wanted, variable):
+    entries = [fake("Portable Computing Language", "cpu-haswell-Intel(R) Xeon(R)"),
+               fake("Intel(R) OpenCL", "Intel(R) Xeon(R)", index="1:0"),
+               fake("NVIDIA CUDA", "NVIDIA H200", gpu=True, index="1:1")]
+    listed(*entries)
+    if variable:
+        monkeypatch.setenv("PP_DEVICE", choice)
+    assert open_device(None if variable else choice) is entries[wanted][1]
+
+
+def test_an_argument_beats_the_variable(listed, monkeypatch):
+    entries = [fake("A", "a"), fake("B", "b", index="1:0")]
+    listed(*entries)
+    monkeypatch.setenv("PP_DEVICE", "0:0")
+    assert open_device("1:0") is entries[1][1]
+
+
+def test_unknown_choice_lists_what_was_found(listed):
+    listed(fake("Portable Computing Language", "cpu"))
+    with pytest.raises(UserError, match=r"^device 'radeon': no such OpenCL device; found 0:0 cpu \(Portable .*\) works$"):
+        open_device("radeon")
+
+
+def test_a_chosen_device_that_does_not_work_is_not_replaced(listed):
+    listed(fake("A", "good"), fake("B", "bad", problem="does not run: no target", index="1:0"))
+    with pytest.raises(UserError, match=r"device 'bad': no working OpenCL device .*1:0 bad \(B\) does not run: no target"):
+        open_device("bad")
+
+
+@pytest.mark.parametrize("entries", [[], [fake("A", "a", problem="does not run: x")]])
+def test_no_device_says_how_to_get_one(listed, entries):
+    listed(*entries)
+    with pytest.raises(UserError, match="no working OpenCL device") as error:
+        open_device()
+    assert "apt install pocl-opencl-icd" in str(error.value)
+    assert "\n" not in str(error.value)
+
+
+def test_without_a_driver_nothing_is_listed(monkeypatch):
+    def none():
+        raise cl.LogicError("clGetPlatformIDs failed: PLATFORM_NOT_FOUND_KHR")
+
+    monkeypatch.setattr(cl, "get_platforms", none)
+    assert list_devices() == []
+
+
+def test_real_choice_by_index(session_device):
+    index = next(i for i, d, _ in list_devices() if d == session_device.device)
+    assert open_device(index).device == session_device.device
+
+
+# ---- buffers
+
+def test_upload_fill_zeros_copy(dev, rng):
+    values = rng.random((31, 16)).astype(np.float32)
+    a, b = dev.upload(values), dev.zeros((31, 16))
+    assert np.array_equal(b.get(), np.zeros_like(values))
+    dev.copy(b, a)
+    assert np.array_equal(b.get(), values)
+    dev.fill(a, 2.5)
+    assert np.array_equal(a.get(), np.full_like(values, 2.5))
+    assert np.array_equal(b.get(), values)
+
+
+@pytest.mark.parametrize("dtype", [np.uint8, np.int32, np.uint32, np.float32, np.uint64])
+def test_fill_every_dtype(dev, dtype):
+    a = dev.empty((257,), dtype)
+    dev.fill(a, 7)
+    assert a.dtype == dtype
+    assert np.array_equal(a.get(), np.full(257, 7, dtype))
+
+
+def test_upload_converts_and_takes_views(dev):
+    values = np.arange(12.0).reshape(3, 4).T  # float64, not contiguous
+    a = dev.upload(values, np.float32)
+    assert a.dtype == np.float32
+    assert np.array_equal(a.get(), values)
+
+
+def test_zero_size_arrays(dev):
+    a, b = dev.empty((0, 16)), dev.zeros((0, 16))
+    dev.fill(a, 1)
+    dev.copy(a, b)
+    assert a.get().shape == dev.upload(np.empty((0, 16), np.float32)).get().shape == (0, 16)
+
+
+def test_copy_refuses_another_size_or_dtype(dev):
+    with pytest.raises(ValueError, match="copy"):
+        dev.copy(dev.zeros((3,)), dev.zeros((4,)))
+    with pytest.raises(ValueError, match="copy"):
+        dev.copy(dev.zeros((3,)), dev.zeros((3,), np.uint32))
+
+
+def test_memory_is_counted_and_given_back(plain):
+    a = plain.zeros((1000,))
+    b = plain.empty((500, 2), np.uint64)
+    assert plain.bytes == plain.peak_bytes == 4000 + 8000
+    del b
+    assert (plain.bytes, plain.peak_bytes) == (4000, 12000)
+    del a
+    assert (plain.bytes, plain.peak_bytes) == (0, 12000)
+
+
+def test_a_buffer_over_the_largest_allocation_is_refused(plain):
+    plain.info["max_allocation_bytes"] = 1000
+    plain.empty((250,))
+    with pytest.raises(UserError, match=r"a buffer of shape \(251,\) needs .*lower --points"):
+        plain.empty((251,))
+    with pytest.raises(UserError, match="allocates at most"):
+        plain.upload(np.zeros(251, np.float32))
+
+
+def test_all_buffers_together_are_held_to_the_memory(plain):
+    plain.info["memory_bytes"] = 1000
+    kept = plain.empty((200,))
+    with pytest.raises(UserError, match="in use"):
+        plain.empty((51,))
+    assert plain.bytes == kept.nbytes
+    plain.empty((50,))
+
+
+@pytest.mark.parametrize("error", [cl.MemoryError, cl.RuntimeError])
+def test_a_driver_that_gives_up_is_a_user_error(plain, error):
+    def refuse(*_):
+        raise error("clEnqueueNDRangeKernel failed: OUT_OF_RESOURCES")
+
+    with pytest.raises(UserError, match=r"cannot run x.cl:y \(.*OUT_OF_RESOURCES.*lower --points") as caught:
+        plain.attempt("run x.cl:y", refuse, 1)
+    assert "\n" not in str(caught.value)
+
+
+def test_a_wrong_call_of_the_driver_keeps_its_traceback(plain):
+    def refuse():
+        raise cl.LogicError("INVALID_KERNEL_ARGS")
+
+    with pytest.raises(cl.LogicError):
+        plain.attempt("run", refuse)
+
+
+def test_fresh_guarded_buffers_are_nan(dev):
+    assert np.isnan(dev.empty((33,)).get()).all()
+    assert (dev.empty((33,), np.uint32).get() == 0xFFFFFFFF).all()
+
+
+# ---- programs and debug levels
+
+def test_kernel_folder_holds_the_headers():
+    assert (kernel_folder() / "common.h").is_file()
+
+
+def test_programs_are_built_once_for_each_define(plain, tiny):
+    assert plain.program("tiny") is plain.program("tiny")
+    assert plain.program("tiny", A=1) is not plain.program("tiny", A=2)
+    assert plain.program("tiny", A=1, B=2) is plain.program("tiny", B=2, A=1)
+
+
+def test_a_build_error_names_file_options_and_cause(plain, tiny):
+    (tiny / "broken.cl").write_text("kernel void f(\n    global float *x)  // (N)\n{ x[0] = undeclared_thing; }\n")
+    with pytest.raises(RuntimeError, match=r"cl/broken\.cl does not build on .* with .*-DDEGREE=2") as error:
+        plain.program("broken", DEGREE=2)
+    assert "undeclared_thing" in str(error.value)
+
+
+def test_a_kernel_folder_with_a_space_is_refused(plain, tmp_path, monkeypatch):
+    monkeypatch.setattr(device_module, "kernel_folder", lambda: tmp_path / "a b")
+    with pytest.raises(UserError, match="a b: .*space"):
+        plain.program("tiny")
+
+
+@pytest.fixture
+def debugged(session_device, tiny, monkeypatch):
+    """Makes a device of a given PP_DEBUG that runs TINY on some values."""
+    made = []
+
+    def make(level, values, guarded=False):
+        monkeypatch.setenv("PP_DEBUG", level)
+        device = (GuardedDevice if guarded else Device)(session_device.device)
+        made.append(device)
+        x = device.upload(np.array(values, np.float32))
+        device.program("tiny").launch("divide", x.size, n=x.size, x=x, y=device.empty(x.shape))
+        device.finish()
+        return device
+
+    yield make
+    for device in made:
+        atexit.unregister(device.print_profile)
+
+
+def test_debug_0_measures_nothing(debugged):
+    assert debugged("0", [1]).profile() == {}
+
+
+@pytest.mark.parametrize("level, label", [("1", "tiny.cl "), ("2", "tiny.cl:divide ")])
+def test_debug_1_times_files_and_2_times_kernels(debugged, capsys, level, label):
+    device = debugged(level, [1, 2, 0])
+    seconds = device.profile()["tiny.cl:divide"]
+    assert len(seconds) == 1
+    assert 0 <= seconds[0] < 10
+    device.print_profile()
+    shown = capsys.readouterr()
+    assert "tiny.cl" in shown.err and "built in" in shown.err
+    assert shown.err.splitlines()[-1].startswith(label)
+    assert shown.out == ""
+
+
+@pytest.mark.parametrize("guarded", [False, True])
+def test_debug_3_finds_a_nan(debugged, guarded):
+    with pytest.raises(FloatingPointError, match="tiny.cl:divide: y has 2 NaN or Inf, first at 1"):
+        debugged("3", [1, 0, 2, 0], guarded)
+
+
+def test_debug_3_is_content_with_numbers(debugged):
+    assert list(debugged("3", [1, 2, 3]).profile()) == ["tiny.cl:divide"]
+
+
+@pytest.mark.parametrize("text", ["4", "-1", "yes", "1.5"])
+def test_a_bad_debug_level_is_a_user_error(session_device, monkeypatch, text):
+    monkeypatch.setenv("PP_DEBUG", text)
+    with pytest.raises(UserError, match=f"PP_DEBUG={text}"):
+        Device(session_device.device)
+
+
+def test_the_profile_is_printed_at_exit(session_device, tiny):
+    script = f"""
+import sys
+import numpy as np
+from pathlib import Path
+from pp_cl import device
+device.kernel_folder = lambda: Path({str(tiny)!r})
+d = device.open_device({next(i for i, d, _ in list_devices() if d == session_device.device)!r})
+x = d.upload(np.ones(3, np.float32))
+d.program("tiny").launch("divide", 3, n=3, x=x, y=d.empty((3,)))
+"""
+    ran = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, env={**os.environ, "PP_DEBUG": "2"})
+    assert ran.returncode == 0, ran.stderr
+    assert ran.stderr.splitlines()[-1].startswith("tiny.cl:divide ")
+    assert ran.stdout == ""

@@ -1,0 +1,61 @@
+"""Evaluation: the file it writes, the pictures, and that it measures what it shows."""
+
+import json
+
+import numpy as np
+import pytest
+from PIL import Image
+from scenes import write_ball_scene
+
+from pp_cl.cli import main
+from pp_cl.image import read_rgba
+from pp_cl.metrics import psnr
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory):
+    """A finished run on the ball, at a size whose reduction is no multiple of 4."""
+    folder = tmp_path_factory.mktemp("evaluate")
+    scene = write_ball_scene(folder / "ball", size=60)
+    assert main(["train", scene, "--out", str(folder / "run"), "--downscale", "2", "--points", "1500", "--iterations", "40",
+                 "--set", "train.crop=28", "--set", "network.widths=16,16,16", "--set", "train.final_weight=0"]) == 0
+    return folder / "run"
+
+
+def test_metrics_file_and_pictures(run, capsys):
+    assert main(["eval", str(run), "--save-images"]) == 0
+    result = json.loads((run / "eval" / "metrics.json").read_text())
+    assert result["split"] == "test" and len(result["per_image"]) == 2 and set(result["mean"]) == {"psnr", "ssim"}
+    assert result["points"]["final"] <= result["points"]["initial"] and len(result["points"]["grid"]) == 3
+    assert result["seconds_per_frame"] > 0 and result["published"] == {} and result["finished"]
+    assert result["mean"]["psnr"] == pytest.approx(np.mean([r["psnr"] for r in result["per_image"]]))
+    assert f"{result['mean']['psnr']:.4f}" in capsys.readouterr().out
+    assert (run / "eval" / "comparison.png").is_file()
+
+
+def test_saved_images_are_what_was_measured(run):
+    assert main(["eval", str(run), "--save-images"]) == 0
+    result = json.loads((run / "eval" / "metrics.json").read_text())
+    scene = json.loads((run / "config.json").read_text())["scene"]["path"]
+    for i, row in enumerate(result["per_image"]):
+        picture = np.asarray(Image.open(run / "eval" / "images" / f"r_{i}.png").convert("RGB"))
+        rgba = read_rgba(f"{scene}/test/r_{i}.png").astype(np.float64) / 255
+        over_white = rgba[..., :3] * rgba[..., 3:] + 1 - rgba[..., 3:]
+        truth = np.rint(255 * over_white.reshape(30, 2, 30, 2, 3).mean((1, 3))).astype(np.uint8)
+        assert picture.shape == (30, 30, 3)
+        assert psnr(picture, truth) == pytest.approx(row["psnr"], abs=0.02)
+
+
+def test_twice_gives_the_same_numbers_and_other_splits_work(run):
+    results = []
+    for _ in range(2):
+        assert main(["eval", str(run)]) == 0
+        results.append(json.loads((run / "eval" / "metrics.json").read_text())["per_image"])
+    assert results[0] == results[1]
+    assert main(["eval", str(run), "--split", "train"]) == 0
+    assert len(json.loads((run / "eval" / "metrics.json").read_text())["per_image"]) == 8
+
+
+def test_a_missing_split_is_one_line(run, capsys):
+    assert main(["eval", str(run), "--split", "val"]) == 2
+    assert "transforms_val.json" in capsys.readouterr().err

@@ -1,0 +1,251 @@
+"""The signature parser and the launcher's refusals."""
+
+import numpy as np
+import pyopencl as cl
+import pytest
+
+from pp_cl import device as device_module
+from pp_cl.launch import DEFAULT_LOCAL, parse_signatures
+
+KERNEL_FOLDER = device_module.kernel_folder()  # before any test replaces it
+STEMS = sorted(p.stem for p in KERNEL_FOLDER.glob("*.cl"))
+
+SOURCE = """
+#ifndef WIDTH
+#define WIDTH 4
+#endif
+
+// One work-item per row: writes scale * the sum of a row of x, plus k of its row.
+kernel void rows(
+    const uint n,                  // rows
+    const float scale,
+    global const float4 *x,        // (N, WIDTH)
+    constant uint *k,              // (3)
+    global float *y)               // (N, 1) result
+{
+    const uint i = get_global_id(0);
+    if (i >= n) return;
+    const float4 v = x[i];
+    y[i] = scale * (v.x + v.y + v.z + v.w) + k[i % 3];
+}
+
+// One work-item per element, with local memory: copies x to y.
+kernel void copied(
+    global const float *x,         // (M)
+    local float *scratch,          // (64)
+    global float *y)               // (...) any shape
+{
+    scratch[get_local_id(0)] = x[get_global_id(0)];
+    y[get_global_id(0)] = scratch[get_local_id(0)];
+}
+
+// One work-item: writes one float behind y.
+kernel void behind(
+    const uint n,                  // size of y
+    global float *y)               // (N)
+{
+    if (get_global_id(0) == 0) y[n] = 1.0f;
+}
+"""
+
+
+@pytest.fixture
+def program(dev, tmp_path, monkeypatch):
+    """SOURCE built on the guarded device."""
+    (tmp_path / "toy.cl").write_text(SOURCE)
+    monkeypatch.setattr(device_module, "kernel_folder", lambda: tmp_path)
+    dev._programs.pop(("toy", ()), None)
+    yield dev.program("toy")
+    dev._programs.pop(("toy", ()), None)
+
+
+@pytest.fixture
+def rows(dev, rng):
+    """Good arguments of the kernel `rows`, n = 33."""
+    return {"n": 33, "scale": 2.0, "x": dev.upload(rng.random((33, 4)), np.float32),
+            "k": dev.upload(np.arange(3), np.uint32), "y": dev.empty((33, 1))}
+
+
+# ---- the parser
+
+def test_parsed_signature():
+    n, scale, x, k, y = parse_signatures(SOURCE, "toy.cl")["rows"]
+    assert (n.name, n.space, n.dtype, n.shape) == ("n", "", np.uint32, None)
+    assert (scale.name, scale.dtype) == ("scale", np.float32)
+    assert (x.space, x.dtype, x.width, x.const, x.shape) == ("global", np.float32, 4, True, ("N", "WIDTH"))
+    assert (k.space, k.dtype, k.width, k.shape) == ("constant", np.uint32, 1, ("3",))
+    assert (y.const, y.shape) == (False, ("N", "1"))
+
+
+def test_all_kernels_of_a_file_are_found():
+    signatures = parse_signatures(SOURCE, "toy.cl")
+    assert list(signatures) == ["rows", "copied", "behind"]
+    assert [p.space for p in signatures["copied"]] == ["global", "local", "global"]
+    assert signatures["copied"][2].shape is None
+
+
+@pytest.mark.parametrize("head, names", [
+    ("kernel void f() {", []),
+    ("__kernel void f(\n    const int a)\n{", ["a"]),
+    ("kernel __attribute__((reqd_work_group_size(1, 1, 1))) void f(\n    const int a,\n    const uchar b) {", ["a", "b"]),
+    ("kernel void f(\n    global float *restrict x  // (N, (H-1)/2, ?) nested\n) {", ["x"]),
+])
+def test_heads_that_are_understood(head, names):
+    assert [p.name for p in parse_signatures(head + "\n}\n", "f.cl")["f"]] == names
+
+
+def test_nested_brackets_in_a_shape():
+    (x,) = parse_signatures("kernel void f(\n    global float *x)  // (N, (H-1)/2, ?) nested\n{}", "f.cl")["f"]
+    assert x.shape == ("N", "(H-1)/2", "?")
+
+
+@pytest.mark.parametrize("parameters, message", [
+    ("    global float *x)  // no shape", "f.cl: f: buffer 'x' has no shape"),
+    ("    global float *x, const uint n)  // (N)", "one parameter per line"),
+    ("    image2d_t picture)  // (N)", "cannot read parameter"),
+    ("    const size_t n)", "cannot read parameter"),
+    ("    const unsigned int n)", "cannot read parameter"),
+    ("    const float4 colour)", "neither a global"),
+    ("    float *x)  // (N)", "neither a global"),
+])
+def test_heads_that_are_refused(parameters, message):
+    with pytest.raises(ValueError, match=message):
+        parse_signatures(f"kernel void f(\n{parameters}\n{{}}", "f.cl")
+
+
+# ---- launching
+
+def test_a_launch_computes(program, rows):
+    program.launch("rows", 33, **rows)
+    expected = 2 * rows["x"].get().sum(1) + np.arange(33) % 3
+    np.testing.assert_allclose(rows["y"].get()[:, 0], expected, rtol=1e-6)
+
+
+def test_numpy_scalars_and_tuples_are_taken(program, rows):
+    program.launch("rows", (np.uint32(33),), local=(8,), **{**rows, "n": np.int64(33), "scale": np.float64(2)})
+    np.testing.assert_allclose(rows["y"].get()[:, 0], 2 * rows["x"].get().sum(1) + np.arange(33) % 3, rtol=1e-6)
+
+
+def test_local_memory_and_any_shape(program, dev, rng):
+    x = dev.upload(rng.random(128), np.float32)
+    y = dev.empty((2, 8, 8))
+    program.launch("copied", 128, x=x, scratch=cl.LocalMemory(4 * 64), y=y)
+    assert np.array_equal(y.get().ravel(), x.get())
+
+
+@pytest.mark.parametrize("size, local, enqueued", [
+    (1, None, ((64,), (64,))), (65, None, ((128,), (64,))), (5, 4, ((8,), (4,))), ((17, 5), None, ((32, 8), (16, 4))),
+    ((np.uint32(3), 1, 1), None, ((16, 4, 1), (16, 4, 1))),
+])
+def test_sizes_are_rounded_up_to_the_work_group(program, rows, size, local, enqueued):
+    seen = []
+    program.kernels["rows"].kernel = lambda queue, *args: seen.append(args[:2])
+    program.launch("rows", size, local=local, **rows)
+    assert seen == [enqueued]
+
+
+@pytest.mark.parametrize("size", [0, (0, 4), (4, 0)])
+def test_a_size_of_zero_launches_nothing(program, rows, size):
+    program.launch("rows", size, **rows)
+    assert np.isnan(rows["y"].get()).all()
+
+
+def test_default_work_groups_match_their_rank():
+    assert all(len(local) == rank for rank, local in DEFAULT_LOCAL.items())
+
+
+def without(arguments, name):
+    """The arguments but one."""
+    return {k: v for k, v in arguments.items() if k != name}
+
+
+REFUSED = {
+    "missing": (lambda d, a: without(a, "scale"), TypeError, r"missing \['scale'\], unknown \[\]"),
+    "unknown": (lambda d, a: {**a, "z": 1}, TypeError, r"missing \[\], unknown \['z'\]"),
+    "misspelt": (lambda d, a: {**without(a, "k"), "K": a["k"]}, TypeError, r"missing \['k'\], unknown \['K'\]"),
+    "dtype": (lambda d, a: {**a, "k": d.zeros((3,), np.int32)}, TypeError, "k is an array of int32, expected .*uint32"),
+    "number for a buffer": (lambda d, a: {**a, "x": 1.0}, TypeError, "x is a float, expected a device array"),
+    "host array": (lambda d, a: {**a, "x": np.zeros((33, 4), np.float32)}, TypeError, "x is a ndarray, expected"),
+    "buffer for a number": (lambda d, a: {**a, "n": a["k"]}, TypeError, "n = .*is no uint32"),
+    "fraction for an integer": (lambda d, a: {**a, "n": 33.0}, TypeError, "n = 33.0 is no uint32"),
+    "negative for unsigned": (lambda d, a: {**a, "n": -1}, TypeError, "n = -1 is no uint32"),
+    "rank": (lambda d, a: {**a, "y": d.zeros((33,))}, ValueError, r"y has shape \(33,\), expected rank 2"),
+    "fixed size": (lambda d, a: {**a, "k": d.zeros((4,), np.uint32)}, ValueError, r"k has shape \(4,\), expected \('3',\)"),
+    "fixed size of 1": (lambda d, a: {**a, "y": d.zeros((33, 2))}, ValueError, r"y has .* with 1 = 1"),
+    "letter against scalar": (lambda d, a: {**a, "n": 32}, ValueError, r"x has shape \(33, 4\), expected .* with N = 32"),
+    "letter against letter": (lambda d, a: {**a, "y": d.zeros((32, 1))}, ValueError, "y has shape .* with N = 33"),
+    "transposed": (lambda d, a: {**a, "x": d.zeros((4, 33)).T}, ValueError, "x has shape .*not contiguous"),
+}
+
+
+@pytest.mark.parametrize("case", REFUSED)
+def test_refused_before_the_enqueue(program, dev, rows, case):
+    change, error, message = REFUSED[case]
+    program.launch("rows", 33, **rows)  # a good launch before must not hide a bad one
+    dev.fill(rows["y"], -1)
+    enqueued = []
+    program.kernels["rows"].kernel = lambda *args: enqueued.append(args)
+    with pytest.raises(error, match=f"^toy.cl:rows: {message}"):
+        program.launch("rows", 33, **change(dev, rows))
+    assert enqueued == []
+
+
+def test_a_define_in_a_shape_is_checked(dev, tmp_path, monkeypatch, rows):
+    (tmp_path / "toy.cl").write_text(SOURCE)
+    monkeypatch.setattr(device_module, "kernel_folder", lambda: tmp_path)
+    dev.program("toy", WIDTH=4).launch("rows", 33, **rows)
+    with pytest.raises(ValueError, match="with 5 = 5"):
+        dev.program("toy", WIDTH=5).launch("rows", 33, **rows)
+
+
+def test_a_letter_stands_for_one_size_only_within_a_launch(program, dev, rows, rng):
+    program.launch("rows", 33, **rows)
+    more = {**rows, "n": 31, "x": dev.upload(rng.random((31, 4)), np.float32), "y": dev.empty((31, 1))}
+    program.launch("rows", 31, **more)
+    np.testing.assert_allclose(more["y"].get()[:, 0], 2 * more["x"].get().sum(1) + np.arange(31) % 3, rtol=1e-6)
+
+
+# ---- guards
+
+@pytest.mark.parametrize("n", [1, 33, 257])
+def test_a_write_behind_a_buffer_is_caught(program, dev, n):
+    y = dev.zeros((n,))
+    program.launch("behind", 1, n=n, y=y)
+    with pytest.raises(AssertionError, match=f"behind a buffer of {4 * n} bytes"):
+        dev.check()
+    dev._guarded = [g for g in dev._guarded if g[0]() is not y.base_data]
+
+
+# ---- every kernel file
+
+INFO, ADDRESS = cl.kernel_arg_info, cl.kernel_arg_address_qualifier
+TYPES = {np.int8: "char", np.uint8: "uchar", np.int16: "short", np.uint16: "ushort", np.int32: "int", np.uint32: "uint",
+         np.int64: "long", np.uint64: "ulong", np.float16: "half", np.float32: "float", np.float64: "double"}
+
+
+SPACES = {"global": ADDRESS.GLOBAL, "constant": ADDRESS.CONSTANT, "local": ADDRESS.LOCAL, "": ADDRESS.PRIVATE}
+
+
+def driver_says(kernel, i):
+    """(name, type, address space, pointer to const) of a parameter, from -cl-kernel-arg-info."""
+    name, kind, space, qualifiers = (kernel.get_arg_info(i, what) for what in (
+        INFO.NAME, INFO.TYPE_NAME, INFO.ADDRESS_QUALIFIER, INFO.TYPE_QUALIFIER))
+    const = bool(qualifiers & cl.kernel_arg_type_qualifier.CONST)
+    return name.removeprefix("_cl_"), kind, space, const and space == ADDRESS.GLOBAL  # PoCL renames all built-in functions
+
+
+def launcher_says(p):
+    """The same from the parsed signature."""
+    kind = TYPES[p.dtype] + (str(p.width) if p.width > 1 else "") + ("*" if p.space else "")
+    return p.name, kind, SPACES[p.space], p.const and p.space == "global"
+
+
+@pytest.mark.parametrize("stem", STEMS)
+def test_file_builds_alone_and_its_signatures_agree_with_the_driver(dev, stem):
+    program = dev.program(stem)
+    assert program.kernels, f"cl/{stem}.cl has no kernel that the launcher can read"
+    assert set(program.kernels) == set(program.built.kernel_names.split(";"))
+    for name, kernel in program.kernels.items():
+        assert kernel.kernel.num_args == len(kernel.parameters), name
+        for i, p in enumerate(kernel.parameters):
+            assert driver_says(kernel.kernel, i) == launcher_says(p), f"{stem}.cl:{name}"

@@ -1,0 +1,177 @@
+"""Training: it learns, it is deterministic, and a run that was killed ends like one that was not."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scenes import write_ball_scene
+
+from pp_cl.checkpoint import load_checkpoint, save_checkpoint
+from pp_cl.cli import main
+from pp_cl.errors import UserError
+from pp_cl.train import Trainer, _draw_start
+
+# Every mechanism of the loop is due several times within 60 steps.
+SETTINGS = {
+    "train.iterations": 60, "points.count": 1500, "network.widths": "16,16,16", "train.crop": 24, "train.prune_every": 10,
+    "train.checkpoint_every": 10, "train.log_every": 5, "train.previews": 2, "train.final_weight": 0.5,
+}
+
+
+def arguments(scene, out, **changes):
+    """Command line of a small training."""
+    settings = SETTINGS | {k.replace("__", "."): v for k, v in changes.items()}
+    sets = [word for key, value in settings.items() for word in ("--set", f"{key}={value}")]
+    return ["train", scene, "--out", str(out), "--downscale", "2", *sets]
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory):
+    """Folder of a small scene."""
+    return write_ball_scene(tmp_path_factory.mktemp("scene") / "ball")
+
+
+@pytest.fixture(scope="module")
+def finished(scene, tmp_path_factory):
+    """Folder of an uninterrupted run."""
+    out = tmp_path_factory.mktemp("runs") / "whole"
+    assert main(arguments(scene, out)) == 0
+    return out
+
+
+def rows(out):
+    return [json.loads(line) for line in (out / "log.jsonl").read_text().splitlines()]
+
+
+def test_a_run_learns_and_leaves_its_files(finished):
+    log = rows(finished)
+    assert [r["step"] for r in log] == [*range(5, 61, 5), 60] and log[-1]["finished"]
+    losses = [r["loss"] for r in log[:-1]]
+    assert np.mean(losses[-3:]) < 0.6 * losses[0]
+    assert {p.name for p in (finished / "previews").iterdir()} == {"step_000030.png", "step_000060.png"}
+    header, arrays = load_checkpoint(finished / "checkpoint.npz")
+    assert header["finished"] and header["step"] == 60
+    assert 0 < len(arrays["points.ids"]) < header["initial_points"]
+    assert not any(name.startswith(("moment", "state", "average")) for name in arrays)
+    assert (np.diff(arrays["points.ids"].astype(np.int64)) > 0).all()
+
+
+def test_the_same_seed_gives_the_same_bytes_and_another_does_not(scene, finished, tmp_path):
+    assert main(arguments(scene, tmp_path / "again")) == 0
+    assert (tmp_path / "again" / "checkpoint.npz").read_bytes() == (finished / "checkpoint.npz").read_bytes()
+    assert main(arguments(scene, tmp_path / "other", train__seed=1)) == 0
+    assert (tmp_path / "other" / "checkpoint.npz").read_bytes() != (finished / "checkpoint.npz").read_bytes()
+
+
+@pytest.mark.parametrize("steps", [3, 25, 47, 59])
+def test_stopped_at_any_step_it_resumes_to_the_same_bytes(scene, finished, tmp_path, monkeypatch, steps):
+    train_step, done = Trainer.train_step, []
+
+    def stopping(self):
+        if len(done) == steps:
+            raise KeyboardInterrupt
+        done.append(0)
+        return train_step(self)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Trainer, "train_step", stopping)
+        assert main(arguments(scene, tmp_path / "run")) == 130
+    assert main(arguments(scene, tmp_path / "run")) == 0
+    assert (tmp_path / "run" / "checkpoint.npz").read_bytes() == (finished / "checkpoint.npz").read_bytes()
+    strip = [{k: v for k, v in r.items() if k != "seconds"} for r in rows(tmp_path / "run")]
+    assert strip == [{k: v for k, v in r.items() if k != "seconds"} for r in rows(finished)]
+
+
+def test_killed_again_and_again_it_ends_with_the_same_bytes(scene, finished, tmp_path):
+    out = tmp_path / "killed"
+    command = [sys.executable, "-m", "pp_cl", *arguments(scene, out)]
+    environment = os.environ | {"PYTHONPATH": str(Path(__file__).parents[1])}
+    kills = 0
+    for wait in (0.3, 0.05, 0.6, 0.0):
+        process = subprocess.Popen(command, env=environment, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+        before = (out / "log.jsonl").stat().st_size if (out / "log.jsonl").exists() else 0
+        while process.poll() is None and not ((out / "log.jsonl").exists() and (out / "log.jsonl").stat().st_size > before):
+            time.sleep(0.01)
+        time.sleep(wait)
+        if process.poll() is None:
+            process.send_signal(signal.SIGKILL)
+            kills += 1
+        process.wait()
+    assert kills >= 2, "the run ended before it could be killed"
+    subprocess.run(command, env=environment, check=True, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    assert (out / "checkpoint.npz").read_bytes() == (finished / "checkpoint.npz").read_bytes()
+    assert not list(out.glob(".*.tmp"))
+
+
+def test_a_finished_run_is_left_alone(scene, finished, capsys):
+    before = (finished / "checkpoint.npz").stat().st_mtime_ns
+    assert main(arguments(scene, finished)) == 0
+    assert "is finished" in capsys.readouterr().out
+    assert (finished / "checkpoint.npz").stat().st_mtime_ns == before
+
+
+def test_settings_are_taken_from_the_run_and_may_not_change(scene, finished, capsys):
+    assert main(["train", scene, "--out", str(finished)]) == 0
+    assert main(["train", scene, "--out", str(finished), "--iterations", "61"]) == 2
+    assert "train.iterations is 60 there, 61 asked for" in capsys.readouterr().err
+
+
+def test_a_checkpoint_of_another_scene_is_refused(scene, tmp_path, capsys):
+    out = tmp_path / "run"
+    assert main(arguments(scene, out)) == 0
+    header, arrays = load_checkpoint(out / "checkpoint.npz")
+    header.pop("format")
+    save_checkpoint(out / "checkpoint.npz", header | {"finished": False, "scene": "0" * 64}, arrays)
+    before = (out / "checkpoint.npz").read_bytes()
+    assert main(arguments(scene, out)) == 2
+    assert "belongs to another scene" in capsys.readouterr().err
+    assert (out / "checkpoint.npz").read_bytes() == before
+
+
+def test_a_full_disk_while_logging_is_one_line(scene, tmp_path, capsys, monkeypatch):
+    def full(_file, _row):
+        raise UserError("log.jsonl: cannot be written (No space left on device); free some space")
+
+    monkeypatch.setattr("pp_cl.run._log", full)
+    assert main(arguments(scene, tmp_path / "run")) == 2
+    assert "No space left" in capsys.readouterr().err
+
+
+def test_a_loss_that_is_not_finite_stops_the_run_and_keeps_the_checkpoint(scene, tmp_path, capsys, monkeypatch):
+    update, steps = __import__("pp_cl.optimiser").optimiser.Optimiser.update, []
+
+    def poisoned(self, *args):
+        update(self, *args)
+        steps.append(0)
+        if len(steps) == 15:
+            self.dev.fill(self.model.points["sh0"], np.nan)
+
+    monkeypatch.setattr("pp_cl.optimiser.Optimiser.update", poisoned)
+    assert main(arguments(scene, tmp_path / "run")) == 2
+    assert "the loss is not finite at step 16" in capsys.readouterr().err
+    assert load_checkpoint(tmp_path / "run" / "checkpoint.npz")[0]["step"] == 10
+
+
+@pytest.mark.parametrize("footprint, radius", [("disc", 0.0015), ("sphere", 0.05)])
+def test_the_other_footprints_train_too(scene, tmp_path, footprint, radius):
+    out = tmp_path / "run"
+    assert main(arguments(scene, out, points__footprint=footprint, points__radius=radius, points__max_tracked=64, points__stop=0.001,
+                          points__mean_gradient="true", train__iterations=30, train__crop=0, train__final_weight=0)) == 0
+    losses = [r["loss"] for r in rows(out)[:-1]]
+    assert losses[-1] < losses[0]
+
+
+@pytest.mark.parametrize("low, high, size, limit", [(10, 50, 16, 64), (20, 30, 16, 64), (0, 5, 16, 64), (60, 64, 16, 64), (0, 64, 64, 64), (3, 60, 64, 64)])
+def test_crops_stay_inside_and_show_the_object(low, high, size, limit):
+    starts = {_draw_start(np.random.default_rng(i), low, high, size, limit) for i in range(300)}
+    assert min(starts) >= 0 and max(starts) + size <= limit
+    for start in starts:
+        shown = min(high, start + size) - max(low, start)
+        assert shown == min(size, high - low)
+    assert len(starts) == max(1, min(max(low, high - size), limit - size) - max(min(low, high - size), 0) + 1)
