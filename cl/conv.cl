@@ -75,7 +75,7 @@ kernel void conv_forward(
     const int c1,
     const int c2,                        // channels of x2; 0 = x2 is not read
     const int co,
-    const int relu,                      // out = max(out, 0)
+    const int relu,                      // negative results become 0
     global const float *x,               // (height, width, c1)
     global const float *x2,              // (height, width, ?)
     global const float16 *weight,        // (blocks, K, K, c1 + c2, 16)
@@ -103,7 +103,7 @@ kernel void conv_forward(
         #pragma unroll
         for (int p = 0; p < TILE; p++)
             if (x0 + p >= tile_x)
-                store_lanes(relu ? max(acc[b][p], 0.0f) : acc[b][p],
+                store_lanes(relu ? select(acc[b][p], (float16)(0.0f), acc[b][p] < 0.0f) : acc[b][p],  // keeps NaN, as max would not
                             out + ((size_t)y * width + x0 + p) * co + (block + b) * 16, co - (block + b) * 16);
 }
 

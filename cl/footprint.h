@@ -69,14 +69,14 @@ ALWAYS_INLINE int4 footprint_box(const Camera *k, const Footprint *f) {
     const float4 limits = slopes * (float4)(k->fx, k->fy, k->fx, k->fy) + ((float4)(k->cx, k->cy, k->cx, k->cy) - 0.5f);
 #if FOOTPRINT == SPHERE
     const float4 margin = 0.0f;              // from floor(first) to ceil(last): Pulsar's box is part of its hit rule
-    const int4 step = (int4)(-1, -1, 0, 0);
+    const int4 step = (int4)(0, 0, 1, 1);
 #else
     const float4 margin = 0.01f;             // pixels; far above the rounding of `limits`
-    const int4 step = (int4)(0, 0, -1, -1);
+    const int4 step = (int4)(1, 1, 0, 0);
 #endif
     const float4 wide = limits + (float4)(-margin.xy, margin.xy);
-    const float4 bounded = clamp(z > reach ? wide : (float4)(-1.0f, -1.0f, size.zw), -1.0f, size);
-    const int4 box = convert_int4(bounded + 1.0f) + step;                    // truncation of x + 1 >= 0: floor(x) + 1
+    const float4 bounded = clamp(z > reach ? wide : (float4)(-2.0f, -2.0f, size.zw), -2.0f, size);
+    const int4 box = convert_int4(bounded + 2.0f) - 2 + step;                // x + 2 >= 0, so truncation is floor
     return (int4)(max(box.xy, 0), min(box.zw, (int2)(k->width - 1, k->height - 1)));
 }
 

@@ -42,7 +42,7 @@ kernel void pairs_fill(
     global uint *pair_pixel,                 // (P)
     global float *pair_closeness,            // (P) d in [0, 1]
     global uint *point_from_pair,            // (P)
-    global ulong *pair_key,                  // (P) by pair
+    global ulong *pair_place,                // (P) depth << 32 | place in the list of the pixel, first come first served
     global volatile uint *pixel_count)       // (HW) accumulates
 {
     const uint i = get_global_id(0);
@@ -65,25 +65,23 @@ kernel void pairs_fill(
                 pair_pixel[pair] = pixel;
                 pair_closeness[pair] = lane_closeness[lane];
                 point_from_pair[pair] = i;
-                pair_key[pair] = upsample(as_uint(lane_depth[lane]), pair);  // bits of floats >= 0 sort like the floats
-                atomic_inc(&pixel_count[pixel]);
+                pair_place[pair] = upsample(as_uint(lane_depth[lane]), atomic_inc(&pixel_count[pixel]));
             }
         }
 }
 
-// One work-item per pair: drops its key into its pixel's list, in any order.
+// One work-item per pair: writes its key at its place. Bits of floats >= 0 sort like the floats.
 kernel void pairs_scatter(
     const uint pairs,                        // at most P
     global const uint *pair_pixel,           // (P)
-    global const ulong *pair_key,            // (P) by pair
+    global const ulong *pair_place,          // (P) depth << 32 | place in the list of the pixel
     global const uint *pixel_offset,         // (HW+1) first key of each pixel
-    global volatile uint *pixel_count,       // (HW) places left in each pixel's list; counted down to 0
-    global ulong *unsorted_key)              // (P) by pixel
+    global ulong *pair_key)                  // (P) depth << 32 | pair, by pixel
 {
     const uint pair = get_global_id(0);
     if (pair >= pairs) return;
-    const uint q = pair_pixel[pair];
-    unsorted_key[pixel_offset[q] + atomic_dec(&pixel_count[q]) - 1] = pair_key[pair];
+    const ulong place = pair_place[pair];
+    pair_key[pixel_offset[pair_pixel[pair]] + (uint)place] = upsample((uint)(place >> 32), pair);
 }
 
 // Sorts `count` <= RUN keys into `sorted`, which may be the same memory: each key's place is the number of smaller keys.

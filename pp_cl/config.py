@@ -22,7 +22,7 @@ class PointsConfig:
 
     count: int = 250_000  # wanted points on the grid inside the visual hull
     footprint: str = "soft"  # soft: d = 1 - rho/R; disc: the paper's hard disc; sphere: Pulsar's rules for any radius
-    radius: float = 0.65  # soft: in point spacings; disc and sphere: world units at a depth range of 4
+    radius: float = 0.75  # soft: in point spacings; disc and sphere: world units at a depth range of 4
     gamma: tuple = (0.1, 0.01)  # depth sharpness of the blend, first and last step
     max_tracked: int = 0  # nearest hits of a pixel that get gradients, 0 = all (paper: 64)
     stop: float = 0.0  # stop a pixel where a hit could change it by less than this, 0 = never (paper: 0.001)

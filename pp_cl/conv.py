@@ -27,13 +27,16 @@ def pack_bias(bias, dtype=np.float32):
 def tiling(dev, width, channels_out):
     """(TILE, BLOCKS, work-group) of cl/conv.cl for an image `width` wide.
 
-    On a CPU two blocks of 16 channels share each input value where the channels allow it: 16 accumulators + 6 weights of
-    the 32 vector registers; one block takes 12 pixels. On a GPU, registers are a work-item's own: 4 pixels.
+    A CPU core has 32 vector registers. Where the blocks of 16 channels pair up, two share each input value and take
+    8 pixels: 16 accumulators and 6 weights; else one takes 12. A GPU's work-item has about 255 scalar registers: 4 pixels.
     """
-    blocks = 2 if dev.is_cpu and -(-channels_out // LANES) % 2 == 0 else 1
-    tiles = (4, 1) if not dev.is_cpu else (8, 4, 1) if blocks == 2 else (12, 8, 4, 1)
-    tile = next(t for t in tiles if t <= width)
-    return tile, blocks, (1, 1, 1) if dev.is_cpu else (16, 4, 1)
+    if not dev.is_cpu:
+        tiles, blocks, local = (4, 1), 1, (16, 4, 1)
+    elif -(-channels_out // LANES) % 2 == 0:
+        tiles, blocks, local = (8, 4, 1), 2, (1, 1, 1)
+    else:
+        tiles, blocks, local = (12, 8, 4, 1), 1, (1, 1, 1)
+    return next(t for t in tiles if t <= width), blocks, local
 
 
 def conv_forward(dev, x, weight, bias, out, relu, x2=None):

@@ -16,7 +16,7 @@ def flip_weights(dev, weight, first, flipped):
     """
     k, ci = weight.shape[1], weight.shape[3]
     blocks, co = flipped.shape[0], flipped.shape[3]
-    dev.program("conv_weights", K=k, CI_TILE=_ci_tile(k, ci)).launch(
+    dev.program("conv_weights", K=k, CI_TILE=_ci_tile(dev, k, ci)).launch(
         "conv_flip_weights", (co, k * k, blocks), c=min(ci - first, blocks * LANES), co=co, first=first, ci=ci,
         weight=weight, flipped=flipped)
 
@@ -47,7 +47,7 @@ def weight_gradient(dev, x, grad_out, grad_weight, grad_bias, partial, x2=None):
     first = 0
     for source in sources:
         c = source.shape[2]
-        tile = _ci_tile(k, c)
+        tile = _ci_tile(dev, k, c)
         program = dev.program("conv_weights", K=k, CI_TILE=tile)
         program.launch("conv_backward_weights", (c // tile * k, blocks, parts), local=(1, 1, 1) if dev.is_cpu else None,
                        height=height, width=width, c=c, co=co, first=first, ci=ci, rows=rows, x=source, grad_out=grad_out,
@@ -65,6 +65,10 @@ def _parts(height, weight_shape):
     return -(-height // rows), rows
 
 
-def _ci_tile(k, channels):
-    """Input channels of one work-item: the largest divisor of the channels whose accumulators fit 32 registers."""
-    return next(t for t in ((8, 4, 2, 1) if k == 3 else (16, 8, 4, 2, 1)) if channels % t == 0)
+def _ci_tile(dev, k, channels):
+    """Input channels of one work-item: a divisor of the channels whose k * tile accumulators fit the registers.
+
+    A CPU core has 32 vector registers; a GPU's work-item has about 255 scalar ones, and a vector takes 16 of them.
+    """
+    accumulators = 24 if dev.is_cpu else 6
+    return next(t for t in (16, 8, 4, 2, 1) if t * k <= accumulators and channels % t == 0)

@@ -141,18 +141,22 @@ def build_grid(dev, views, points, cell_cap=CELL_CAP):
 
 
 def depth_range(views, hull):
-    """(near, far) for scenes that state none, as Euclidean distances in world units (docs/scene_scale.md).
+    """(near, far) of all views, as Euclidean distances in world units (docs/scene_scale.md).
 
     The ball around the hull, DEPTH_MARGIN times enlarged, lies between them for every view. Where a camera is closer than
-    that, near is half its distance from the hull's box, and inside the box one grid edge.
+    that, near is half its distance from the hull's box, and inside the box one grid edge. A stated range is kept, but widened
+    to the ball itself, since points outside of it would be missing.
     """
+    stated = all(view.has_depth_range for view in views)
     half = hull.grid.edge * np.asarray(hull.grid.dims) / 2  # of the box of the vertices' cells
     offsets = np.stack([view.camera.eye for view in views]) - _centre(hull.grid)
     from_centre = np.linalg.norm(offsets, axis=1)
     from_box = np.linalg.norm(np.maximum(np.abs(offsets) - half, 0), axis=1)
-    radius = DEPTH_MARGIN * np.linalg.norm(half)
-    near = max(from_centre.min() - radius, from_box.min() / 2, hull.grid.edge)
-    return float(near), float(from_centre.max() + radius)
+    radius = (1 if stated else DEPTH_MARGIN) * np.linalg.norm(half)
+    near, far = max(from_centre.min() - radius, from_box.min() / 2, hull.grid.edge), from_centre.max() + radius
+    if stated:
+        near, far = min(near, *(view.camera.near for view in views)), max(far, *(view.camera.far for view in views))
+    return float(near), float(far)
 
 
 def spacing_pixels(hull, views, downscale=1):

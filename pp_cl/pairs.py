@@ -37,11 +37,11 @@ class Pairs:
         self.total = read_total(dev, self.point_offset)
         self._reserve(self.total)
         dev.fill(self.pixel_count, 0)
-        program.launch("pairs_fill", n, point_offset=self.point_offset, pair_pixel=self.pair_pixel, pair_key=self.hit,
+        program.launch("pairs_fill", n, point_offset=self.point_offset, pair_pixel=self.pair_pixel, pair_place=self.hit,
                        pair_closeness=self.pair_closeness, point_from_pair=self.point_from_pair, pixel_count=self.pixel_count, **points)
         exclusive_scan(dev, self.pixel_count, self.pixel_offset)
-        program.launch("pairs_scatter", self.total, pairs=self.total, pair_pixel=self.pair_pixel, pair_key=self.hit,
-                       pixel_offset=self.pixel_offset, pixel_count=self.pixel_count, unsorted_key=self.pair_key)
+        program.launch("pairs_scatter", self.total, pairs=self.total, pair_pixel=self.pair_pixel, pair_place=self.hit,
+                       pixel_offset=self.pixel_offset, pair_key=self.pair_key)
         program.launch("pairs_sort", hw, hw=hw, pixel_offset=self.pixel_offset, scratch=self.hit, pair_key=self.pair_key)
 
     def _resize(self, n, hw):

@@ -12,7 +12,7 @@ from tqdm import tqdm
 from pp_cl.checkpoint import load_checkpoint, remove_leftovers, save_checkpoint, write_text
 from pp_cl.device import open_device
 from pp_cl.errors import UserError
-from pp_cl.hull import build_grid, depth_range
+from pp_cl.hull import build_grid, depth_range, spacing_pixels
 from pp_cl.memory import memory_plan, print_plan
 from pp_cl.model import Model
 from pp_cl.preview import write_comparison
@@ -86,7 +86,8 @@ def _start(dev, config, scene):
     hull = build_grid(dev, views, config.points.count)
     near_far = depth_range(views, hull)
     dims = "x".join(str(d) for d in hull.grid.dims)
-    print(f"hull: {len(hull.ids)} points on a {dims} grid, edge {hull.grid.edge:.6g}, depth {near_far[0]:.3f} to {near_far[1]:.3f} "
+    print(f"hull: {len(hull.ids)} points on a {dims} grid, edge {hull.grid.edge:.6g} "
+          f"({spacing_pixels(hull, views, config.scene.downscale):.2f} pixels), depth {near_far[0]:.3f} to {near_far[1]:.3f} "
           f"({time.perf_counter() - start:.1f} s)")
     model = Model.create(dev, hull.grid, hull.ids, near_far, config.network.widths, config.train.seed)
     return Trainer(dev, config, model, with_depth_range(views, near_far)), {"scene": fingerprint(views), "initial_points": len(hull.ids)}

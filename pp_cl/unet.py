@@ -73,9 +73,7 @@ class UNet:
             for name in step.inputs:
                 self._flipped[step.name, name] = dev.empty((-(-self.channels[name] // LANES), k, k, step.channels, LANES))
         self.gradients = {name: dev.zeros(p.shape) for name, p in self.parameters.items()}
-        uses = [name for step in self.steps for name in step.inputs]
         self._relu_outputs = {s.name for s in self.steps if s.kind == "conv3"}
-        self._skips = {name for name in uses if uses.count(name) > 1}
         self._buffers = {}  # {training: (size, {name: array}, the buffers they are views of)}
         self._trained = None  # the arrays of the last forward(training=True)
 
@@ -100,7 +98,8 @@ class UNet:
                 weight, bias = self.parameters[step.name + ".weight"], self.parameters[step.name + ".bias"]
                 conv_forward(self.dev, sources[0], weight, bias, out, step.kind == "conv3", *sources[1:])
         layers.affine(self.dev, 0.5, 0.5, out, out)
-        self._trained = arrays if training else None
+        if training:
+            self._trained = arrays
         return out
 
     def backward(self, grad_y):
@@ -111,12 +110,12 @@ class UNet:
         """
         arrays = self._trained
         if arrays is None:
-            raise RuntimeError("UNet.backward needs forward(training=True) just before it")
+            raise RuntimeError("UNet.backward needs a forward(training=True) before it")
         self._trained = None
         layers.affine(self.dev, 0.5, 0.0, grad_y, arrays["grad out"])
         for step in reversed(self.steps):
             grad_out, name = arrays["grad " + step.name], step.inputs[0]
-            if step.kind == "pool":  # comes after the skip's gradient, and ends what that leaves open
+            if step.kind == "pool":  # comes after the other use of its input, the skip, and adds to that one's gradient
                 layers.avgpool2_backward(self.dev, arrays[name], grad_out, arrays["grad " + name])
             elif step.kind == "up":
                 layers.upsample2_backward(self.dev, grad_out, arrays["grad " + name])
@@ -133,18 +132,20 @@ class UNet:
         for name, source in zip(step.inputs, sources, strict=True):
             flipped = self._flipped[step.name, name]
             flip_weights(self.dev, weight, first, flipped)
-            masked = name in self._relu_outputs and name not in self._skips
-            conv_backward_input(self.dev, source, flipped, grad_out, arrays["grad " + name], masked)
+            conv_backward_input(self.dev, source, flipped, grad_out, arrays["grad " + name], name in self._relu_outputs)
             first += self.channels[name]
 
     def memory_plan(self, height, width, training):
-        """[(name, shape, bytes)] of all device buffers that forward (and, in training, backward) uses at this size."""
+        """[(name, shape, bytes)] of all device buffers of this network once it has run at this size.
+
+        Gradients of parameters are among them without training too: they are made with the network.
+        """
         plan = [(" = ".join(slot.names), (slot.floats,), slot.floats * 4)
                 for slot in assign_slots(self._lifetimes(training), self._shapes(height, width))]
         plan += [(name, p.shape, p.nbytes) for name, p in self.parameters.items()]
+        plan += [(f"grad {name}", g.shape, g.nbytes) for name, g in self.gradients.items()]
+        plan += [(f"flipped {layer} {source}", f.shape, f.nbytes) for (layer, source), f in self._flipped.items()]
         if training:
-            plan += [(f"grad {name}", g.shape, g.nbytes) for name, g in self.gradients.items()]
-            plan += [(f"flipped {layer} {source}", f.shape, f.nbytes) for (layer, source), f in self._flipped.items()]
             floats = self._partial_floats(height)
             plan.append(("partial", (floats,), floats * 4))
         return plan
@@ -179,8 +180,9 @@ class UNet:
     def _arrays(self, height, width, training):
         """{name: array} for this size, allocated anew only when the size changes."""
         if training not in self._buffers or self._buffers[training][0] != (height, width):
-            self._buffers.pop(training, None)  # frees the old buffers before the new ones are there
-            self._trained = None
+            self._buffers.pop(training, None)  # the old buffers go before the new ones come
+            if training:
+                self._trained = None
             shapes, arrays = self._shapes(height, width), {}
             slots = assign_slots(self._lifetimes(training), shapes)
             buffers = [self.dev.empty(slot.floats) for slot in slots]

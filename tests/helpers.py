@@ -36,21 +36,16 @@ class GuardedDevice(Device):
         self.bytes += nbytes
         self.peak_bytes = max(self.peak_bytes, self.bytes)
         weakref.finalize(array, self._released, nbytes)
-        self._guarded.append((weakref.ref(array), nbytes))
+        self._guarded.append((buffer, nbytes))
         return array
 
     def check(self):
-        """Fail if a kernel wrote behind a buffer that is still alive."""
-        alive = []
-        for reference, nbytes in self._guarded:
-            array = reference()  # a Buffer takes no weak reference
-            if array is None:
-                continue
-            tail = np.empty(CANARY_BYTES, np.uint8)
-            cl.enqueue_copy(self.queue, tail, array.base_data, src_offset=nbytes)
+        """Fail if a kernel wrote behind a buffer allocated since the last check, temporary ones included."""
+        guarded, self._guarded = self._guarded, []
+        tail = np.empty(CANARY_BYTES, np.uint8)
+        for buffer, nbytes in guarded:
+            cl.enqueue_copy(self.queue, tail, buffer, src_offset=nbytes)
             assert (tail == CANARY).all(), f"a kernel wrote behind a buffer of {nbytes} bytes"
-            alive.append((reference, nbytes))
-        self._guarded = alive
 
 
 def relative_error(actual, expected):

@@ -69,7 +69,7 @@ def pulsar_box(camera, c, radius):
     inside = np.ones((len(c), x.size), bool)
     for u, focal, centre, pixel in ((c[:, 0], camera.fx, camera.cx, x), (c[:, 1], camera.fy, camera.cy, y)):
         reach = np.hypot(u, c[:, 2])
-        with np.errstate(invalid="ignore"):
+        with np.errstate(divide="ignore", invalid="ignore"):
             alpha, theta = np.arctan2(u, c[:, 2]), np.arcsin(radius / reach)
         free = c[:, 2] <= radius
         low = np.where(free, -np.inf, np.floor(np.tan(alpha - theta) * focal + centre - 0.5))
@@ -93,7 +93,7 @@ def blend(camera, geometry_, opacity, gamma, stop=0.0):
     z = 1 - (geometry_["depth"] - camera.near) / (camera.far - camera.near)
     if stop > 0:
         hit = hit & ~stopped(hit, d, o, z, order(geometry_), gamma, stop)
-    with np.errstate(divide="ignore"):
+    with np.errstate(divide="ignore", invalid="ignore"):  # outside the hits
         log_weight = np.where(hit, np.log(o * d) + o * z / gamma, -np.inf)
         log_share = np.where(hit, np.log(d) + o * z / gamma, -np.inf)
     m = np.maximum(EPS / gamma, log_weight.max(axis=0, initial=-np.inf))

@@ -59,7 +59,7 @@ DAMAGE = {
     "nan matrix": (lambda s: edit(s, set_matrix([[float("nan")] * 4] * 4)), "transform_matrix"),
     "wrong shape": (lambda s: edit(s, set_matrix([[1, 0], [0, 1]])), "transform_matrix"),
     "path leaves": (lambda s: edit(s, set_path("../../secret")), "file_path"),
-    "missing image": (lambda s: (s / "train" / "r_1.png").unlink(), "r_1.png"),
+    "missing image": (lambda s: (s / "train" / "r_1.png").unlink(), "train/r_1"),
     "truncated image": (lambda s: (s / "train" / "r_1.png").write_bytes((s / "train" / "r_1.png").read_bytes()[:200]), "r_1.png"),
     "other size": (lambda s: Image.new("RGBA", (20, 20)).save(s / "train" / "r_1.png"), "r_1.png"),
     "empty mask": (lambda s: Image.new("RGBA", (32, 32)).save(s / "train" / "r_1.png"), "r_1.png"),

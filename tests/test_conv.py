@@ -100,6 +100,17 @@ def test_hard_inputs(dev, rng):
     assert not run_backward_input(dev, zeros, weight, offset, True).any()  # a ReLU at exactly 0 passes nothing
 
 
+def test_work_groups_of_a_gpu(dev, rng, monkeypatch):
+    """The tiles and work-groups that other devices get: their tails reach beyond the image and the channels."""
+    monkeypatch.setattr(dev, "is_cpu", False)
+    for height, width, ci, co in ((5, 37, 16, 48), (3, 2, 3, 20)):
+        x, grad_out = (rng.normal(size=(height, width, c)).astype(np.float32) for c in (ci, co))
+        weight, bias = layer(rng, ci, co, 3)
+        assert relative_error(run_forward(dev, x, weight, bias, False), conv(x, weight, bias)) < 3e-6
+        expected = conv_gradients(x, weight, grad_out)[0]
+        assert relative_error(run_backward_input(dev, x, weight, grad_out, False), expected) < 3e-6
+
+
 def test_same_bits_twice(dev, rng):
     x = rng.normal(size=(31, 50, 32)).astype(np.float32)
     weight, bias = layer(rng, 32, 48, 3)
@@ -117,3 +128,13 @@ def test_wrong_shapes_are_refused(dev):
         conv_forward(dev, x, weight, bias, dev.zeros((4, 5, 32)), False)
     with pytest.raises(ValueError, match="flipped"):
         conv_backward_input(dev, x, weight, out, x, False)
+
+
+def test_relu_hides_no_nan(dev, rng):
+    x = rng.normal(size=(5, 7, 16)).astype(np.float32)
+    x[2, 3, 4] = np.nan
+    out = dev.empty((5, 7, 16))
+    weight, bias = pack_weights(rng.normal(size=(16, 16, 3, 3))), pack_bias(np.zeros(16))
+    conv_forward(dev, dev.upload(x), dev.upload(weight), dev.upload(bias), out, relu=True)
+    bad = np.isnan(out.get()).all(axis=2)
+    assert bad[1:4, 2:5].all() and bad.sum() == 9

@@ -79,6 +79,15 @@ def test_hard_inputs(dev, rng):
     assert not weight.any() and not bias.any()
 
 
+def test_work_groups_of_a_gpu(dev, rng, monkeypatch):
+    monkeypatch.setattr(dev, "is_cpu", False)
+    x, grad_out = (rng.normal(size=(19, 10, c)).astype(np.float32) for c in (20, 48))
+    weight, bias = run_weight_gradient(dev, grad_out, 3, x)
+    _, expected_weight, expected_bias = conv_gradients(x, np.zeros((48, 20, 3, 3)), grad_out)
+    assert relative_error(weight, expected_weight) < 5e-6
+    assert relative_error(bias, expected_bias) < 5e-6
+
+
 def test_same_bits_twice(dev, rng):
     x = rng.normal(size=(57, 40, 32)).astype(np.float32)
     grad_out = rng.normal(size=(57, 40, 16)).astype(np.float32)

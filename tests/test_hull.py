@@ -99,6 +99,15 @@ def test_a_vertex_no_image_sees_is_dropped(dev):
     assert carver.carve(Grid((5, 0, 0), 0.1, (1, 1, 1))).count == 0  # behind
 
 
+def test_the_left_and_upper_borders_belong_to_an_image(dev):
+    """Numbers that float32 holds exactly: the 5x5 vertices project to pixels 0, 16, 32, 48, 64 of 64."""
+    camera = Camera(np.eye(3, 4), 64, 64, 32, 32, 64, 64)
+    carver = Carver(dev, [View("full", camera, np.full((64, 64, 4), 255, np.uint8))])
+    grid, ids = carver.points(carver.carve(Grid((-0.5, -0.5, 1.0), 0.25, (5, 5, 1))))
+    assert grid == Grid((-0.5, -0.5, 1.0), 0.25, (4, 4, 1))
+    np.testing.assert_array_equal(ids, np.arange(16))
+
+
 @pytest.mark.parametrize("points", (1000, 3000, 40000))
 def test_the_edge_is_found(dev, points):
     found = build_grid(dev, ball_views(), points)
@@ -159,17 +168,34 @@ def test_depth_range_holds_every_point(dev):
     views = ball_views()
     found = build_grid(dev, views, 2000)
     distances = np.stack([np.linalg.norm(positions_of(found) - view.camera.eye, axis=1) for view in views])
-    near, far = depth_range(views, found)
+    near, far = depth_range([without_range(view) for view in views], found)
     assert 0 < near < distances.min() and far > distances.max()
     half_diagonal = found.grid.edge * np.linalg.norm(found.grid.dims) / 2
     assert far - near == pytest.approx(2 * hull.DEPTH_MARGIN * half_diagonal, rel=0.05)
+
+
+@pytest.mark.parametrize("stated", [(1.0, 9.0), (3.9, 4.1)])
+def test_a_stated_depth_range_is_kept_or_widened(dev, stated):
+    views = [replace(v, camera=replace(v.camera, near=stated[0], far=stated[1])) for v in ball_views()]
+    found = build_grid(dev, views, 2000)
+    distances = np.stack([np.linalg.norm(positions_of(found) - view.camera.eye, axis=1) for view in views])
+    near, far = depth_range(views, found)
+    if stated == (1.0, 9.0):
+        assert (near, far) == stated
+    else:
+        assert 0 < near < distances.min() and far > distances.max()
+
+
+def without_range(view):
+    """The view with an unknown depth range."""
+    return replace(view, camera=replace(view.camera, near=np.nan, far=np.nan))
 
 
 @pytest.mark.parametrize("distance", (1.6, 0.5))
 def test_depth_range_of_close_cameras(dev, distance):
     """1.6: outside the hull's box, inside the enlarged ball; 0.5: inside the box."""
     found = build_grid(dev, ball_views(), 2000)
-    close = [replace(ball_views()[0], camera=look_at(CENTRE + np.array([distance, 0, 0]), CENTRE))]
+    close = [without_range(replace(ball_views()[0], camera=look_at(CENTRE + np.array([distance, 0, 0]), CENTRE)))]
     near, far = depth_range(close, found)
     distances = np.linalg.norm(positions_of(found) - close[0].camera.eye, axis=1)
     assert near > 0 and far > distances.max()

@@ -46,14 +46,14 @@ def test_gradients_by_finite_differences(dev, rng):
     def loss(values, changed):
         return (unet(x, parameters | {changed: values})[0] * grad_y).sum()
 
-    numeric = numeric_gradient(lambda v: (unet(v, parameters)[0] * grad_y).sum(), x, 1e-6)
-    assert relative_error(grad_x.ravel(), numeric) < 1e-5
+    numeric = numeric_gradient(lambda v: (unet(v, parameters)[0] * grad_y).sum(), x, 1e-5)
+    assert relative_error(grad_x.ravel(), numeric) < 5e-6
     gradients = plain_parameters(net, net.gradients)
     for name, values in parameters.items():
         flat = gradients[name].ravel()
         some = [*np.argsort(-np.abs(flat))[:6], *rng.integers(0, flat.size, 6)]
-        numeric = numeric_gradient(lambda v, name=name: loss(v, name), values, 1e-6, some)
-        assert relative_error(flat[some], numeric) < 1e-5, name
+        numeric = numeric_gradient(lambda v, name=name: loss(v, name), values, 1e-5, some)
+        assert relative_error(flat[some], numeric) < 5e-6, name
 
 
 def test_inference_equals_training(dev, rng):
@@ -113,13 +113,15 @@ def test_wrong_use_is_refused(dev):
         net.backward(dev.zeros((8, 8, 3)))
 
 
-def test_memory_plan_is_what_is_allocated(dev, rng):
+@pytest.mark.parametrize("training", [False, True])
+def test_memory_plan_is_what_is_allocated(dev, training):
+    x, grad_y = dev.zeros((16, 20, 16)), dev.zeros((16, 20, 3))
     before = dev.bytes
     net = UNet(dev, (16, 32, 48))
-    x, grad_y = dev.zeros((16, 20, 16)), dev.zeros((16, 20, 3))
-    net.forward(x)
-    net.backward(grad_y)
-    assert dev.bytes - before == sum(row[2] for row in net.memory_plan(16, 20, True)) + x.nbytes + grad_y.nbytes
+    net.forward(x, training)
+    if training:
+        net.backward(grad_y)
+    assert dev.bytes - before == sum(row[2] for row in net.memory_plan(16, 20, training))
 
 
 def test_memory_of_the_papers_network(dev):

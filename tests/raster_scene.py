@@ -1,0 +1,84 @@
+"""Runs the rasteriser's stages on explicit points, for the tests: what render.py does, with every intermediate at hand."""
+
+import numpy as np
+
+from pp_cl.blend import Blend
+from pp_cl.camera import Camera
+from pp_cl.pairs import Pairs
+from pp_cl.project import Footprint, Projection
+
+
+def look_at(eye, target):
+    """(3, 4) float64 pose of a camera at `eye` that looks at `target`, world z up."""
+    forward = np.subtract(target, eye) / np.linalg.norm(np.subtract(target, eye))
+    right = np.cross(forward, [0.0, 0.0, 1.0])
+    right /= np.linalg.norm(right)
+    return np.stack([right, np.cross(forward, right), forward, eye], 1)
+
+
+def make_camera(width=24, height=20, focal=30.0):
+    """A camera four units away from the origin, off the axes, with different focal lengths and an odd principal point."""
+    return Camera(look_at([2.3, -2.6, 1.9], [0.0, 0.1, 0.0]), focal, focal * 1.1, width * 0.45, height * 0.55, width, height)
+
+
+def make_points(rng, n):
+    """(N, 3) points around the origin; some lie outside the view, or nearer or farther than allowed."""
+    return rng.normal(size=(n, 3)) * [0.9, 0.9, 0.8]
+
+
+class Scene:
+    """Points projected and paired with the pixels of a camera; arrays are float64 or float32 numpy.
+
+    positions: (N, 3). radius: one number or (N,), world units, or pixels with in_pixels.
+    """
+
+    def __init__(self, dev, camera, positions, radius, kind="soft", in_pixels=False):
+        self.dev, self.camera, self.n = dev, camera, len(positions)
+        self.shape = (camera.height, camera.width)
+        self.footprint = Footprint(kind, in_pixels)
+        self.view = dev.upload(camera.packed())
+        self.radius = dev.upload(np.atleast_1d(radius), np.float32)
+        self.projection = Projection(dev, self.footprint)
+        self.projection.spheres(self.view, dev.upload(positions, np.float32), self.radius)
+        self.pairs = Pairs(dev, self.footprint)
+        self.pairs.build(self.view, self.shape, self.projection, self.radius)
+
+    def pair_points(self):
+        """(P,) the point of each pair, from the offsets alone."""
+        return np.repeat(np.arange(self.n), np.diff(self.pairs.point_offset.get().astype(np.int64)))
+
+    def dense(self, pair_values, missing=0.0):
+        """(N, HW) of values by pair: (capacity, ...) on the host."""
+        total = self.pairs.total
+        matrix = np.full((self.n, self.camera.width * self.camera.height), missing, pair_values.dtype)
+        matrix[self.pair_points(), self.pairs.pair_pixel.get()[:total]] = pair_values[:total]
+        return matrix
+
+    def hits(self):
+        """(N, HW) bool."""
+        return self.dense(np.ones(self.pairs.capacity, bool), False)
+
+    def blend(self, opacity, gamma, point_features, mean=False, max_tracked=0, stop=0.0):
+        """(H, W, 16) blended features."""
+        self.gamma, self.opacity = gamma, self.dev.upload(opacity, np.float32)
+        self.point_features = self.dev.upload(point_features, np.float32)
+        self.blending = Blend(self.dev, self.footprint, mean)
+        self.blending.weights(self.pairs, self.view, self.opacity, gamma, max_tracked, stop)
+        self.features = self.dev.empty((*self.shape, 16))
+        self.blending.forward(self.pairs, self.point_features, self.features)
+        return self.features.get()
+
+    def gradients(self, grad_features):
+        """{"features": (N, 16), "opacity": (N,)} of sum(features * grad_features) after blend()."""
+        grad_point_features, grad_opacity = self.dev.empty((self.n, 16)), self.dev.empty((self.n,))
+        self.grad = self.dev.upload(np.reshape(grad_features, (*self.shape, 16)), np.float32)
+        self.blending.backward(self.pairs, self.point_features, self.features, self.grad, grad_point_features, grad_opacity)
+        return {"features": grad_point_features.get(), "opacity": grad_opacity.get()}
+
+    def sphere_gradients(self, grad_features):
+        """{"positions": (N, 3), "radius": (N,)} of the same."""
+        grad_positions, grad_radius = self.dev.empty((self.n, 3)), self.dev.empty((self.n,))
+        self.grad = self.dev.upload(np.reshape(grad_features, (*self.shape, 16)), np.float32)
+        self.blending.backward_spheres(self.pairs, self.view, self.gamma, self.radius, self.projection.point_camera, self.opacity,
+                                       self.point_features, self.features, self.grad, grad_positions, grad_radius)
+        return {"positions": grad_positions.get(), "radius": grad_radius.get()}

@@ -1,0 +1,151 @@
+"""The blend against its float64 twin, and its gradients against finite differences of that twin."""
+
+import numpy as np
+import oracle_raster as oracle
+import pytest
+from helpers import AWKWARD_SIZES, numeric_gradient, relative_error
+from raster_scene import Scene, make_camera, make_points
+
+from pp_cl.project import KINDS
+
+GAMMAS = (0.1, 0.01)
+
+
+class Blended:
+    """A random scene blended by the kernels and by the oracle, both with the kernels' hits."""
+
+    def __init__(self, dev, rng, n=257, kind="soft", gamma=0.1, radius=None, size=(24, 20), **blend):
+        self.camera, self.gamma, self.kind = make_camera(*size), gamma, kind
+        self.positions = make_points(rng, n)
+        self.radius = np.float32(rng.uniform(0.05, 0.5, n) if radius is None else np.full(n, radius))
+        self.opacity = np.float32(rng.uniform(0, 1, n))
+        self.opacity[::7] = 0
+        self.opacity[1::7] = 1
+        self.point_features = rng.normal(size=(n, 16))
+        self.grad = rng.normal(size=(size[0] * size[1], 16))
+        self.scene = Scene(dev, self.camera, self.positions, self.radius, kind)
+        self.features = self.scene.blend(self.opacity, gamma, self.point_features, **blend).reshape(-1, 16)
+        self.geometry = oracle.geometry(self.camera, self.positions, self.radius, kind) | {"hit": self.scene.hits()}
+        self.blend = oracle.blend(self.camera, self.geometry, self.opacity, gamma, blend.get("stop", 0.0))
+
+    def gradients(self):
+        """The kernels' gradients of sum(features * grad)."""
+        return self.scene.gradients(self.grad)
+
+    def oracle_gradients(self, max_tracked=0, mean=False):
+        """The same by the oracle: (features, opacity, by pair and logit)."""
+        return oracle.blend_gradients(self.geometry, self.blend, self.opacity, self.point_features, self.grad, self.gamma,
+                                      max_tracked, mean)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("gamma", GAMMAS)
+def test_weights_and_features(dev, rng, kind, gamma):
+    blended = Blended(dev, rng, kind=kind, gamma=gamma)
+    weight = np.abs(blended.scene.dense(blended.scene.blending.pair_weight.get()[:, 0]))
+    assert np.abs(weight - blended.blend["weight"]).max() < 2e-4
+    assert relative_error(blended.features, oracle.features(blended.blend, blended.point_features)) < 2e-4
+    assert (blended.features[~blended.geometry["hit"].any(axis=0)] == 1).all()
+
+
+@pytest.mark.parametrize("n", AWKWARD_SIZES)
+@pytest.mark.parametrize("size", [(1, 1), (31, 33)])
+def test_sizes(dev, rng, n, size):
+    blended = Blended(dev, rng, n=n, size=size)
+    assert relative_error(blended.features, oracle.features(blended.blend, blended.point_features)) < 1e-4
+    gradients, expected = blended.gradients(), blended.oracle_gradients()
+    assert relative_error(gradients["features"], expected[0]) < 1e-4
+    assert relative_error(gradients["opacity"], expected[1]) < 1e-4
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("gamma", GAMMAS)
+@pytest.mark.parametrize("mean", [False, True])
+@pytest.mark.parametrize("max_tracked", [0, 3])
+def test_gradients(dev, rng, kind, gamma, mean, max_tracked):
+    blended = Blended(dev, rng, kind=kind, gamma=gamma, mean=mean, max_tracked=max_tracked)
+    gradients, expected = blended.gradients(), blended.oracle_gradients(max_tracked, mean)
+    assert relative_error(gradients["features"], expected[0]) < 2e-4
+    assert relative_error(gradients["opacity"], expected[1]) < 5e-4
+    unseen = ~blended.geometry["hit"].any(axis=1)
+    assert unseen.any()
+    assert (gradients["features"][unseen] == 0).all() and (gradients["opacity"][unseen] == 0).all()
+
+
+@pytest.mark.parametrize("gamma", GAMMAS)
+def test_gradients_against_finite_differences(dev, rng, gamma):
+    blended = Blended(dev, rng, n=60, gamma=gamma)
+    gradients = blended.gradients()
+
+    def loss(opacity, point_features):
+        blend = oracle.blend(blended.camera, blended.geometry, opacity, gamma)
+        return (oracle.features(blend, point_features) * blended.grad).sum()
+
+    opacity = blended.opacity.astype(np.float64)
+    inside = np.flatnonzero(opacity > 0)  # the oracle has no logarithm of what lies below 0
+    numeric = numeric_gradient(lambda o: loss(o, blended.point_features), opacity, 1e-6, inside)
+    assert relative_error(gradients["opacity"][inside], numeric) < 5e-4
+    zero = np.flatnonzero(opacity == 0)
+    one_sided = [(loss(opacity + 1e-7 * (np.arange(60) == i), blended.point_features) - loss(opacity, blended.point_features)) / 1e-7
+                 for i in zero]
+    assert relative_error(gradients["opacity"][zero], one_sided) < 1e-3
+    assert np.abs(one_sided).max() > 0.1
+
+    some = rng.choice(60 * 16, 50, replace=False)
+    numeric = numeric_gradient(lambda f: loss(opacity, f), blended.point_features, 1e-4, some)
+    assert relative_error(gradients["features"].ravel()[some], numeric) < 1e-4
+
+
+@pytest.mark.parametrize("gamma", GAMMAS)
+@pytest.mark.parametrize("mean", [False, True])
+def test_sphere_gradients_against_finite_differences(dev, rng, gamma, mean):
+    n, step = 30, 1e-6
+    blended = Blended(dev, rng, n=n, kind="sphere", gamma=gamma, mean=mean)
+    blended.radius[-1] = 0.01  # below a pixel
+    blended.positions[-1] = 0
+    opacity = blended.opacity
+    blended.scene = Scene(dev, blended.camera, blended.positions, blended.radius, "sphere")
+    blended.scene.blend(opacity, gamma, blended.point_features, mean=mean)
+    hit = blended.scene.hits()
+    gradients = blended.scene.sphere_gradients(blended.grad)
+
+    def loss(positions, radius):
+        geometry = oracle.geometry(blended.camera, positions, radius, "sphere") | {"hit": hit}
+        blend = oracle.blend(blended.camera, geometry, opacity, gamma)
+        return (oracle.features(blend, blended.point_features) * blended.grad).sum()
+
+    scale = np.maximum(hit.sum(axis=1), 1) if mean else np.ones(n)
+    radius = blended.radius.astype(np.float64)
+    numeric = numeric_gradient(lambda p: loss(p, radius), blended.positions, step).reshape(n, 3) / scale[:, None]
+    assert relative_error(gradients["positions"], numeric) < 2e-3
+    assert np.abs(gradients["positions"][-1]).max() > 0
+    numeric = numeric_gradient(lambda r: loss(blended.positions, r), radius, step) / scale
+    assert relative_error(gradients["radius"], numeric) < 2e-3
+
+
+@pytest.mark.parametrize("stop", [0.001, 0.05, 0.5])
+def test_early_stop(dev, rng, stop):
+    blended = Blended(dev, rng, n=500, gamma=0.02, radius=0.4, stop=stop)
+    dropped = blended.geometry["hit"] & ~blended.blend["hit"]
+    assert dropped.sum() > 100 and (blended.blend["hit"].sum(axis=0) > 16).any()
+    assert relative_error(blended.features, oracle.features(blended.blend, blended.point_features)) < 1e-4
+    gradients, expected = blended.gradients(), blended.oracle_gradients()
+    assert relative_error(gradients["features"], expected[0]) < 1e-4
+    assert relative_error(gradients["opacity"], expected[1]) < 2e-4
+    whole = oracle.blend(blended.camera, blended.geometry, blended.opacity, 0.02)
+    assert whole["weight"][dropped].max() < stop
+
+
+def test_point_weights_accumulate(dev, rng):
+    blended = Blended(dev, rng, max_tracked=2)
+    point_weight = dev.upload(np.arange(257, dtype=np.float32))
+    blended.scene.blending.add_point_weights(blended.scene.pairs, point_weight)
+    assert relative_error(point_weight.get() - np.arange(257), blended.blend["weight"].sum(axis=1)) < 1e-4
+
+
+def test_two_runs_give_the_same_bits(dev):
+    runs = []
+    for _ in range(2):
+        blended = Blended(dev, np.random.default_rng(3), n=3000, radius=0.2)
+        runs.append([blended.features, *blended.gradients().values()])
+    assert all(np.array_equal(a, b) for a, b in zip(*runs, strict=True))

@@ -1,0 +1,109 @@
+"""Hits: which there are, how close and deep they are, and in which order they lie."""
+
+from dataclasses import replace
+
+import numpy as np
+import oracle_raster as oracle
+import pytest
+from helpers import AWKWARD_SIZES, relative_error
+from raster_scene import Scene, make_camera, make_points
+
+from pp_cl.project import KINDS
+
+BAND = 1e-4  # pixels beside the edge of a footprint where rounding may decide
+
+
+def check(scene, expected):
+    """Compare a scene's pairs with oracle.geometry: hits, closeness, depth, and all orders."""
+    pairs, total = scene.pairs, scene.pairs.total
+    hits = scene.hits()
+    clear = expected["margin"] > BAND
+    assert np.array_equal(hits[clear], expected["hit"][clear])
+    assert hits.sum() == total and (~clear).mean() < 0.01
+
+    points, pixels = scene.pair_points(), pairs.pair_pixel.get()[:total].astype(np.int64)
+    assert np.array_equal(pairs.point_from_pair.get()[:total], points)
+    assert relative_error(pairs.pair_closeness.get()[:total], expected["closeness"][points, pixels]) < 1e-4
+
+    offsets, keys = pairs.pixel_offset.get().astype(np.int64), pairs.pair_key.get()[:total]
+    assert np.array_equal(np.diff(offsets), hits.sum(axis=0))
+    pair = (keys & 0xFFFFFFFF).astype(np.int64)
+    depth = (keys >> 32).astype(np.uint32).view(np.float32)
+    assert np.array_equal(np.sort(pair), np.arange(total))
+    assert np.array_equal(pixels[pair], np.repeat(np.arange(len(offsets) - 1), np.diff(offsets)))
+    assert relative_error(depth, expected["depth"][points[pair], pixels[pair]]) < 1e-3  # at the rim of a sphere it is steep
+    inner = pixels[pair][1:] == pixels[pair][:-1]
+    assert (keys[1:] > keys[:-1])[inner].all()
+    assert np.array_equal(pairs.seen.get(), np.flatnonzero(hits.any(axis=1)))
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("radius", [1e-3, 0.08, 0.5])
+def test_equal_radii(dev, rng, kind, radius):
+    camera, positions = make_camera(), make_points(rng, 300)
+    check(Scene(dev, camera, positions, radius, kind), oracle.geometry(camera, positions, radius, kind))
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("n", AWKWARD_SIZES)
+def test_radii_of_all_sizes(dev, rng, kind, n):
+    camera, positions = make_camera(33, 31), make_points(rng, n)
+    radius = np.float32(10.0 ** rng.uniform(-3, 0, n))
+    check(Scene(dev, camera, positions, radius, kind), oracle.geometry(camera, positions, radius, kind))
+
+
+@pytest.mark.parametrize("kind", ["disc", "soft"])
+def test_radii_in_pixels(dev, rng, kind):
+    camera, positions = make_camera(), make_points(rng, 300)
+    world = 1.7 * oracle.pixel_width(camera, np.linalg.norm(oracle.camera_space(camera, positions), axis=1))
+    check(Scene(dev, camera, positions, 1.7, kind, in_pixels=True), oracle.geometry(camera, positions, world, kind))
+
+
+def test_a_crop_sees_the_same_hits(dev, rng):
+    camera, positions = make_camera(40, 36), make_points(rng, 300)
+    whole = Scene(dev, camera, positions, 0.1).hits().reshape(-1, 36, 40)
+    crop = Scene(dev, camera.crop(11, 7, 13, 17), positions, 0.1).hits().reshape(-1, 17, 13)
+    assert np.array_equal(crop, whole[:, 7:24, 11:24])
+    assert crop.any()
+
+
+def test_every_visible_point_hits_a_pixel(dev, rng):
+    camera = replace(make_camera(40, 36), fy=30.0)
+    slopes = rng.uniform(-0.3, 0.3, (2000, 2))
+    positions = camera.eye + 4 * np.column_stack([slopes, np.ones(2000)]) @ camera.pose[:, :3].T
+    assert len(Scene(dev, camera, positions, 1e-3, "disc").pairs.seen) == 2000
+
+
+@pytest.mark.parametrize("n", [63, 64, 65, 128, 129, 1000, 100_000])
+def test_lists_of_any_length_are_sorted(dev, rng, n):
+    camera = replace(make_camera(1, 1), pose=np.eye(3, 4), cx=0.5, cy=0.5)
+    positions = np.zeros((n, 3))
+    positions[:, 2] = np.round(rng.uniform(2.2, 5.9, n), 3)  # many equal depths
+    pairs = Scene(dev, camera, positions, 0.1).pairs
+    assert pairs.total == n
+    expected = np.argsort(positions[:, 2].astype(np.float32), kind="stable")
+    assert np.array_equal(pairs.pair_key.get()[:n] & 0xFFFFFFFF, expected)
+
+
+def test_buffers_serve_views_of_any_size(dev, rng):
+    camera = make_camera(33, 31)
+    few, many = make_points(rng, 31), make_points(rng, 257)
+    scene = Scene(dev, camera, few, 0.3)
+    capacity = scene.pairs.capacity
+    for positions, size in ((many, (33, 31)), (few, (5, 9)), (many[:1], (1, 1)), (many, (33, 31))):
+        view = replace(make_camera(*size), cx=size[0] / 2, cy=size[1] / 2)
+        other = Scene(dev, view, positions, 0.3)
+        other.pairs = scene.pairs
+        other.pairs.build(other.view, other.shape, other.projection, other.radius)
+        check(other, oracle.geometry(view, positions, 0.3, "soft"))
+        assert scene.pairs.capacity >= capacity
+        capacity = scene.pairs.capacity
+
+
+def test_two_builds_give_the_same_bits(dev, rng):
+    camera, positions = make_camera(40, 36), make_points(rng, 5000)
+    first, second = (Scene(dev, camera, positions, 0.15).pairs for _ in range(2))
+    total = first.total
+    for name in ("pair_pixel", "pair_closeness", "point_from_pair", "pair_key"):
+        assert np.array_equal(getattr(first, name).get()[:total], getattr(second, name).get()[:total]), name
+    assert total > 20_000

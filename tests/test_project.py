@@ -1,0 +1,108 @@
+"""Points to camera axes: positions, culling, dropout and boxes."""
+
+from dataclasses import replace
+
+import numpy as np
+import oracle_raster as oracle
+import pytest
+from helpers import AWKWARD_SIZES, relative_error
+from raster_scene import make_camera, make_points
+
+from pp_cl.points import Grid
+from pp_cl.project import KINDS, Footprint, Projection
+
+GRID = Grid((-1.1, -0.9, -0.7), 0.05, (45, 37, 29))
+
+
+def project_grid(dev, camera, ids, radius=0.0, **options):
+    """(N, 4) positions in camera axes and distances of grid vertices."""
+    projection = Projection(dev, Footprint("disc"))
+    projection.grid(dev.upload(camera.packed()), dev.upload(GRID.packed()), dev.upload(ids, np.uint32), radius, **options)
+    return projection.point_camera.get()
+
+
+def project_spheres(dev, camera, positions, radius, kind="soft", in_pixels=False):
+    """((N, 4) camera positions, (N, 4) boxes)."""
+    projection = Projection(dev, Footprint(kind, in_pixels))
+    projection.spheres(dev.upload(camera.packed()), dev.upload(positions, np.float32), dev.upload(np.atleast_1d(radius), np.float32))
+    return projection.point_camera.get(), projection.point_box.get()
+
+
+@pytest.mark.parametrize("n", AWKWARD_SIZES)
+def test_grid_vertices_are_where_the_grid_says(dev, rng, n):
+    camera = make_camera()
+    ids = rng.choice(np.prod(GRID.dims), n, replace=False)
+    ids[0] = np.prod(GRID.dims) - 1
+    points = project_grid(dev, camera, ids)
+    expected = oracle.camera_space(camera, GRID.positions(ids))
+    assert (points[:, 3] > 0).all()
+    assert relative_error(points[:, :3], expected) < 1e-6
+    assert relative_error(points[:, 3], np.linalg.norm(expected, axis=1)) < 1e-6
+
+
+@pytest.mark.parametrize("n", AWKWARD_SIZES)
+def test_spheres_are_culled_at_their_front(dev, rng, n):
+    camera = replace(make_camera(), near=3.5, far=4.8)
+    positions, radius = make_points(rng, n), rng.uniform(0.01, 0.3, n)
+    points, _ = project_spheres(dev, camera, positions, radius)
+    kept = oracle.kept(camera, positions, radius)
+    assert np.array_equal(points[:, 3] >= 0, kept)
+    assert n < 257 or 20 < kept.sum() < n - 20
+    assert relative_error(points[kept, :3], oracle.camera_space(camera, positions)[kept]) < 1e-6 or not kept.any()
+    assert (points[~kept] == [0, 0, 0, -1]).all()
+
+
+def test_near_and_far_are_inclusive_and_radii_in_pixels_count(dev):
+    camera = replace(make_camera(focal=32.0), pose=np.eye(3, 4), fy=32.0, near=2.0, far=4.0)
+    positions = np.array([[0, 0, 2.0], [0, 0, 1.9999], [0, 0, 4.0], [0, 0, 4.0001]])
+    assert (project_spheres(dev, camera, positions, 0.0)[0][:, 3] > 0).tolist() == [True, False, True, False]
+    # a radius of 8 pixels is a quarter of the distance, so the front is at 0.75 t
+    positions = np.array([[0, 0, 2.66], [0, 0, 2.67], [0, 0, 5.33], [0, 0, 5.34]])
+    assert (project_spheres(dev, camera, positions, 8.0, in_pixels=True)[0][:, 3] > 0).tolist() == [False, True, True, False]
+
+
+def test_one_radius_means_all_alike(dev, rng):
+    camera, positions = make_camera(), make_points(rng, 33)
+    one, many = (project_spheres(dev, camera, positions, radius) for radius in (0.1, np.full(33, 0.1)))
+    assert np.array_equal(one[0], many[0])
+    assert np.array_equal(one[1], many[1])
+
+
+def test_dropout_is_a_function_of_seed_and_id(dev):
+    camera = make_camera()
+    ids = np.arange(20000)
+    dropped = project_grid(dev, camera, ids, dropout=0.15, seed=5)[:, 3] < 0
+    assert abs(dropped.mean() - 0.15) < 0.01
+    some = ids[::7][::-1]
+    assert np.array_equal(project_grid(dev, camera, some, dropout=0.15, seed=5)[:, 3] < 0, dropped[some])
+    other = project_grid(dev, camera, ids, dropout=0.15, seed=6)[:, 3] < 0
+    assert abs((other & dropped).mean() - 0.15**2) < 0.005
+    assert (project_grid(dev, camera, ids, dropout=0.0, seed=5)[:, 3] > 0).all()
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_boxes_hold_the_hits_and_little_more(dev, rng, kind):
+    camera = make_camera()
+    n = 400
+    positions, radius = make_points(rng, n) * 1.5, rng.uniform(0.001, 0.4, n)
+    points, boxes = project_spheres(dev, camera, positions, radius, kind)
+    boxes = boxes.astype(np.int64)
+    c, t = oracle.camera_space(camera, positions), points[:, 3].astype(np.float64)
+    reach = radius if kind == "sphere" else np.maximum(radius, oracle.LEAST_RADIUS * oracle.pixel_width(camera, t))
+    expected = np.empty((n, 4))
+    for axis, (focal, centre, size) in enumerate(((camera.fx, camera.cx, camera.width), (camera.fy, camera.cy, camera.height))):
+        alpha, theta = np.arctan2(c[:, axis], c[:, 2]), np.arcsin(reach / np.hypot(c[:, axis], c[:, 2]))
+        low, high = (np.tan(alpha + sign * theta) * focal + centre - 0.5 for sign in (-1, 1))
+        low, high = (np.floor(low), np.ceil(high)) if kind == "sphere" else (np.ceil(low - 0.01), np.floor(high + 0.01))
+        expected[:, axis], expected[:, 2 + axis] = np.maximum(low, 0), np.minimum(high, size - 1)
+    empty = (t < 0) | (expected[:, 0] > expected[:, 2]) | (expected[:, 1] > expected[:, 3])
+    assert 20 < empty.sum() < n - 100
+    assert np.array_equal((boxes[:, 0] > boxes[:, 2]) | (boxes[:, 1] > boxes[:, 3]), empty)
+    assert np.array_equal(boxes[~empty], expected[~empty])
+
+
+def test_boxes_reach_all_over_the_image_beside_the_eye(dev):
+    camera = replace(make_camera(), pose=np.eye(3, 4), near=0.1)
+    points, boxes = project_spheres(dev, camera, np.array([[1.0, 0.0, 0.5]]), 0.6, "sphere")
+    assert points[0, 3] > 0
+    assert boxes[0].tolist() == [0, 0, camera.width - 1, camera.height - 1]

@@ -1,0 +1,36 @@
+"""Prefix sums and the list of non-zero entries."""
+
+import numpy as np
+import pytest
+from helpers import AWKWARD_SIZES
+
+from pp_cl.scan import BLOCK, exclusive_scan, nonzero, read_total
+
+# one block, its edges, two levels and three
+SIZES = (*AWKWARD_SIZES, BLOCK - 1, BLOCK, BLOCK + 1, BLOCK * BLOCK, BLOCK * BLOCK + 1)
+
+
+@pytest.mark.parametrize("n", SIZES)
+def test_exclusive_scan(dev, rng, n):
+    values = rng.integers(0, 9, n, dtype=np.uint32)
+    offsets = dev.empty((n + 1,), np.uint32)
+    exclusive_scan(dev, dev.upload(values), offsets)
+    assert np.array_equal(offsets.get(), np.concatenate([[0], np.cumsum(values)]))
+    assert read_total(dev, offsets) == values.sum()
+
+
+@pytest.mark.parametrize("n", SIZES)
+@pytest.mark.parametrize("share", [0.0, 0.3, 1.0])
+def test_nonzero(dev, rng, n, share):
+    values = rng.integers(1, 9, n, dtype=np.uint32) * (rng.random(n) < share).astype(np.uint32)
+    offsets, indices = dev.empty((n + 1,), np.uint32), dev.empty((n,), np.uint32)
+    count = nonzero(dev, dev.upload(values), offsets, indices)
+    assert np.array_equal(indices.get()[:count], np.flatnonzero(values))
+    assert np.array_equal(offsets.get(), np.concatenate([[0], np.cumsum(values > 0)]))
+
+
+def test_values_are_summed_exactly_up_to_32_bits(dev):
+    values = np.array([2**31, 2**31 - 1, 0], np.uint32)
+    offsets = dev.empty((4,), np.uint32)
+    exclusive_scan(dev, dev.upload(values), offsets)
+    assert offsets.get().tolist() == [0, 2**31, 2**32 - 1, 2**32 - 1]

@@ -1,0 +1,63 @@
+"""Spherical harmonics shading against its float64 twin, forwards and backwards."""
+
+import numpy as np
+import oracle_raster as oracle
+import pytest
+from helpers import AWKWARD_SIZES, relative_error
+from raster_scene import Scene, make_camera, make_points
+
+from pp_cl.shade import shade_backward, shade_forward
+
+
+class Shaded:
+    """Random coefficients of a random scene up to `degree`."""
+
+    def __init__(self, dev, rng, n, degree):
+        self.camera, self.positions = make_camera(), make_points(rng, n)
+        self.scene = Scene(dev, self.camera, self.positions, 0.1)
+        self.sh = [np.float32(rng.normal(size=(n, 2 * d + 1, 16))) for d in range(degree + 1)]
+
+    def features(self):
+        """(N, 16) by the oracle."""
+        return oracle.shade(self.positions, self.camera.eye, np.concatenate(self.sh, axis=1))
+
+
+@pytest.mark.parametrize("degree", [0, 1, 2])
+@pytest.mark.parametrize("n", AWKWARD_SIZES)
+def test_forward(dev, rng, n, degree):
+    shaded = Shaded(dev, rng, n, degree)
+    seen = np.sort(rng.choice(np.flatnonzero(oracle.kept(shaded.camera, shaded.positions, 0.1)), (n + 1) // 2, replace=False))
+    features = dev.upload(np.full((n, 16), 7.0), np.float32)
+    shade_forward(dev, shaded.scene.view, shaded.scene.projection.point_camera, dev.upload(seen, np.uint32),
+                  [dev.upload(c) for c in shaded.sh], features)
+    assert relative_error(features.get()[seen], shaded.features()[seen]) < 1e-5
+    assert (np.delete(features.get(), seen, axis=0) == 7).all()
+
+
+@pytest.mark.parametrize("degree", [0, 1, 2])
+@pytest.mark.parametrize("n", AWKWARD_SIZES)
+def test_backward_is_the_transpose(dev, rng, n, degree):
+    shaded = Shaded(dev, rng, n, degree)
+    kept = oracle.kept(shaded.camera, shaded.positions, 0.1)
+    dL_df = rng.normal(size=(n, 16)) * kept[:, None]
+    grads = [dev.empty(c.shape) for c in shaded.sh]
+    shade_backward(dev, shaded.scene.view, shaded.scene.projection.point_camera, dev.upload(dL_df, np.float32), grads)
+    inner = sum(np.vdot(g.get().astype(np.float64), c) for g, c in zip(grads, shaded.sh, strict=True))
+    assert abs(inner - np.vdot(dL_df, shaded.features())) < 1e-5 * np.abs(dL_df * shaded.features()).sum()
+    basis = oracle.sh_basis(oracle.camera_space(shaded.camera, shaded.positions) @ shaded.camera.pose[:, :3].T
+                            / np.linalg.norm(shaded.positions - shaded.camera.eye, axis=1, keepdims=True))
+    expected = basis[:, : (degree + 1) ** 2, None] * dL_df[:, None]
+    assert relative_error(np.concatenate([g.get() for g in grads], axis=1), expected) < 1e-5
+
+
+def test_the_basis_is_orthonormal(rng):
+    directions = rng.normal(size=(400_000, 3))
+    basis = oracle.sh_basis(directions / np.linalg.norm(directions, axis=1, keepdims=True))
+    assert np.abs(4 * np.pi * basis.T @ basis / len(basis) - np.eye(9)).max() < 0.02
+
+
+def test_wrong_shapes_are_refused(dev, rng):
+    shaded = Shaded(dev, rng, 31, 1)
+    with pytest.raises(ValueError, match="sh1 has shape"):
+        shade_forward(dev, shaded.scene.view, shaded.scene.projection.point_camera, shaded.scene.pairs.seen,
+                      [dev.upload(shaded.sh[0]), dev.empty((31, 5, 16))], dev.empty((31, 16)))
