@@ -4,7 +4,7 @@ BIN := .venv/bin
 READY := .venv/.ready
 OCLGRIND := /usr/lib/x86_64-linux-gnu/oclgrind/liboclgrind-rt-icd.so
 
-.PHONY: help setup demo test test-intel bench lint oclgrind clean
+.PHONY: help setup demo test test-intel lint oclgrind clean
 
 help: ## print this list
 	@sed -n 's/^\([a-z-]*\):.*## \(.*\)/\1	\2/p' Makefile | expand -t 12
@@ -26,9 +26,6 @@ test: $(READY) ## run the tests on the device of PP_DEVICE, else the default one
 test-intel: $(READY) ## the same on Intel's CPU runtime, installed into .venv if need be (x86-64)
 	@$(BIN)/python tools/setup_opencl.py --intel
 	@PP_DEVICE="Intel(R) OpenCL" $(BIN)/python -m pytest $(ARGS)
-
-bench: $(READY) ## measure time and error of every operation
-	$(BIN)/pp-cl bench $(ARGS)
 
 lint: $(READY) ## check the style of the Python files
 	@$(BIN)/ruff check

@@ -15,10 +15,8 @@
 #define RADIUS_IN_PIXELS 0       // 1: radii are pixels at the image's centre instead of world units
 #endif
 
-// Counting and filling must find the same hits: no compiler may round the two differently.
-#pragma OPENCL FP_CONTRACT OFF
+#define ALWAYS_INLINE __attribute__((always_inline)) inline  // PoCL calls larger functions, passing the structs in memory
 
-#define ALWAYS_INLINE __attribute__((always_inline)) inline
 #define BLOCK_SIDE 4             // pixels are tested in blocks of 4 x 4, one lane each
 #define LANE_X (float16)(0, 1, 2, 3, 0, 1, 2, 3, 0, 1, 2, 3, 0, 1, 2, 3)
 #define LANE_Y (float16)(0, 0, 0, 0, 1, 1, 1, 1, 2, 2, 2, 2, 3, 3, 3, 3)
@@ -82,7 +80,9 @@ ALWAYS_INLINE int4 footprint_box(const Camera *k, const Footprint *f) {
 
 // Tests the 4 x 4 pixels from (x, y) on that lie in the box: the result has bit 4 j + i set where pixel (x + i, y + j) is hit.
 ALWAYS_INLINE uint footprint_block(const Camera *k, const Footprint *f, const int4 box, const int x, const int y,
-                            float16 *closeness, float16 *depth) {
+                                   float16 *closeness, float16 *depth) {
+    // Counting and filling must find the same hits, so no compiler may round here in one way and there in another.
+    #pragma OPENCL FP_CONTRACT OFF
     const float16 px = LANE_X + (float)x, py = LANE_Y + (float)y;
     const float16 mx = (px + (0.5f - k->cx)) / k->fx, my = (py + (0.5f - k->cy)) / k->fy;
     const float16 inverse = 1.0f / sqrt(mx * mx + my * my + 1.0f);           // the unit ray is (mx, my, 1) * inverse

@@ -31,10 +31,13 @@ class Camera:
 
     def packed(self):
         """(20,) float32, the layout of cl/camera.h."""
-        return np.concatenate([
-            self.pose[:, :3].T.ravel(), self.eye,
-            [self.fx, self.fy, self.cx, self.cy, self.near, self.far, self.width, self.height],
-        ]).astype(np.float32)
+        return np.concatenate(
+            [
+                self.pose[:, :3].T.ravel(),
+                self.eye,
+                [self.fx, self.fy, self.cx, self.cy, self.near, self.far, self.width, self.height],
+            ]
+        ).astype(np.float32)
 
     def crop(self, x0, y0, width, height):
         """The camera that sees columns [x0, x0+width) and rows [y0, y0+height); may reach outside this one."""
@@ -46,8 +49,15 @@ class Camera:
 
     def downscaled(self, k):
         """The camera of the image reduced k times by averaging k x k blocks; rows and columns left over are cut off."""
-        return replace(self, fx=self.fx / k, fy=self.fy / k, cx=self.cx / k, cy=self.cy / k,
-                       width=self.width // k, height=self.height // k)
+        return replace(
+            self,
+            fx=self.fx / k,
+            fy=self.fy / k,
+            cx=self.cx / k,
+            cy=self.cy / k,
+            width=self.width // k,
+            height=self.height // k,
+        )
 
     def padded(self, multiple):
         """(camera, left, top): enlarged so that both sides divide by `multiple`; crop the picture at (left, top)."""

@@ -84,8 +84,9 @@ def load_checkpoint(path):
             arrays = {name: stored[name] for name in stored.files}
         header = json.loads(arrays.pop("header").tobytes())
     except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile, NotImplementedError) as error:
-        raise UserError(f"{path}: corrupt checkpoint ({' '.join(str(error).split())[:100]}); "
-                        "delete it to train anew, or restore a copy") from None
+        raise UserError(
+            f"{path}: corrupt checkpoint ({' '.join(str(error).split())[:100]}); delete it to train anew, or restore a copy"
+        ) from None
     if header.get("format") != FORMAT:
         raise UserError(f"{path}: format {header.get('format')}, this version reads {FORMAT}; train anew")
     for name, array in arrays.items():

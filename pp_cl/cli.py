@@ -40,22 +40,37 @@ def _parser():
     devices = _command(commands, "devices", _devices, "list the OpenCL devices and whether they work")
     devices.add_argument("--json", action="store_true", help="print JSON")
 
-    train = _command(commands, "train", _train, "learn a scene; the same command resumes an unfinished run",
-                     epilog="settings (--set), with the tiny preset's values:\n" + "\n".join(help_lines()))
+    train = _command(
+        commands,
+        "train",
+        _train,
+        "learn a scene; the same command resumes an unfinished run",
+        epilog="settings (--set), with the tiny preset's values:\n" + "\n".join(help_lines()),
+    )
     train.add_argument("scene", metavar="SCENE", help="folder with transforms_train.json, or the word demo")
     train.add_argument("--out", required=True, metavar="RUN", help="folder of the run")
-    train.add_argument("--preset", choices=PRESETS, help="tiny (default): minutes on a CPU; small: 400x400; paper: its numbers")
+    train.add_argument(
+        "--preset", choices=PRESETS, help="tiny (default): minutes on a CPU; small: 400x400; paper: its numbers"
+    )
     train.add_argument("--iterations", metavar="N", help="steps of training")
     train.add_argument("--points", metavar="N", help="wanted points on the grid")
     train.add_argument("--downscale", metavar="K", help="reduce the images K times (demo: 2, others: 1)")
     train.add_argument("--seed", metavar="S", help="of everything random (0)")
-    train.add_argument("--set", action="append", default=[], metavar="SECTION.KEY=VALUE", help="any other setting, see below")
+    train.add_argument(
+        "--set", action="append", default=[], metavar="SECTION.KEY=VALUE", help="any other setting, see below"
+    )
     _device_option(train)
 
     evaluate = _command(commands, "eval", _eval, "render a run's views and measure them")
     evaluate.add_argument("run_folder", metavar="RUN", help="folder of the run")
-    evaluate.add_argument("--metrics", nargs="?", const=",".join(METRICS), default="psnr,ssim", metavar="A,B",
-                          help="of psnr, ssim, lpips; bare = all three (default psnr,ssim)")
+    evaluate.add_argument(
+        "--metrics",
+        nargs="?",
+        const=",".join(METRICS),
+        default="psnr,ssim",
+        metavar="A,B",
+        help="of psnr, ssim, lpips; bare = all three (default psnr,ssim)",
+    )
     evaluate.add_argument("--split", default="test", help="train, val or test (default)")
     evaluate.add_argument("--save-images", action="store_true", help="write every view to RUN/eval/images/")
     _device_option(evaluate)
@@ -70,8 +85,9 @@ def _parser():
 
 
 def _command(commands, name, run, text, **extra):
-    parser = commands.add_parser(name, help=text, description=text, allow_abbrev=False,
-                                 formatter_class=argparse.RawDescriptionHelpFormatter, **extra)
+    parser = commands.add_parser(
+        name, help=text, description=text, allow_abbrev=False, formatter_class=argparse.RawDescriptionHelpFormatter, **extra
+    )
     parser.set_defaults(run=run)
     return parser
 
@@ -96,8 +112,11 @@ def _devices(options):
     else:
         for i, d, problem in found:
             info = describe(d)
-            print(f"{i}  {info['name']}  [{info['platform']}]  {info['compute_units']} units, {info['memory_bytes'] / 2**30:.1f} GiB: "
-                  f"{problem or 'works'}")
+            print(
+                f"{i}  {info['name']}  [{info['platform']}]  "
+                f"{info['compute_units']} units, {info['memory_bytes'] / 2**30:.1f} GiB: "
+                f"{problem or 'works'}"
+            )
     if not any(problem is None for _, _, problem in found):
         raise UserError(f"no working OpenCL device: {MEND}")
 
@@ -105,8 +124,12 @@ def _devices(options):
 def _given_settings(options):
     """[(key, text, origin)] of every setting on the command line."""
     given = []
-    for option, key in (("iterations", "train.iterations"), ("points", "points.count"), ("downscale", "scene.downscale"),
-                        ("seed", "train.seed")):
+    for option, key in (
+        ("iterations", "train.iterations"),
+        ("points", "points.count"),
+        ("downscale", "scene.downscale"),
+        ("seed", "train.seed"),
+    ):
         value = getattr(options, option)
         if value is not None:
             given.append((key, value, f"--{option}"))
@@ -158,7 +181,9 @@ def _train(options):
 def _eval(options):
     from pp_cl.evaluate import evaluate_run
 
-    evaluate_run(Path(options.run_folder), _metric_names(options.metrics), options.split, options.save_images, options.device)
+    evaluate_run(
+        Path(options.run_folder), _metric_names(options.metrics), options.split, options.save_images, options.device
+    )
 
 
 def _compare(options):
@@ -166,7 +191,9 @@ def _compare(options):
     from pp_cl.compare import compare
     from pp_cl.device import open_device
 
-    result = compare(lambda: open_device(options.device), Path(options.prediction), Path(options.truth), _metric_names(options.metrics))
+    result = compare(
+        lambda: open_device(options.device), Path(options.prediction), Path(options.truth), _metric_names(options.metrics)
+    )
     if options.json:
         write_json(options.json, result)
     for name, value in result["mean"].items():

@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import math
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -86,10 +87,22 @@ PRESETS = {
     "small": {"points.count": 600_000, "network.widths": (32, 64, 128), "train.iterations": 20_000, "train.crop": 192},
     # the supplemental's own numbers; what it does not state is as above
     "paper": {
-        "points.count": 4_000_000, "points.footprint": "disc", "points.radius": 0.0015, "points.max_tracked": 64, "points.stop": 0.001,
-        "network.widths": (128, 256, 512), "network.rate": (3e-4, 5e-5), "train.iterations": 50_000, "train.crop": 0,
-        "train.phases": False, "train.dropout": 0.0, "train.smooth": 0.0, "train.average": False, "train.prune_weight": 1e-4,
-        "train.prune_every": 500, "train.checkpoint_every": 5000,
+        "points.count": 4_000_000,
+        "points.footprint": "disc",
+        "points.radius": 0.0015,
+        "points.max_tracked": 64,
+        "points.stop": 0.001,
+        "network.widths": (128, 256, 512),
+        "network.rate": (3e-4, 5e-5),
+        "train.iterations": 50_000,
+        "train.crop": 0,
+        "train.phases": False,
+        "train.dropout": 0.0,
+        "train.smooth": 0.0,
+        "train.average": False,
+        "train.prune_weight": 1e-4,
+        "train.prune_every": 500,
+        "train.checkpoint_every": 5000,
     },
 }
 
@@ -117,34 +130,66 @@ def assign(config, key, value, origin):
 
 
 def _convert(value, example, where):
-    """The value, or its text, as the type of the example."""
+    """The value, or its text, as the type of the example. Raises UserError."""
+    if isinstance(example, tuple):
+        items = value.split(",") if isinstance(value, str) else list(value) if isinstance(value, (list, tuple)) else [value]
+        if len(items) != len(example):
+            raise UserError(
+                f"{where}: {value!r} is not {len(example)} values separated by commas, like {','.join(map(str, example))}"
+            )
+        return tuple(_convert(v, e, where) for v, e in zip(items, example, strict=True))
+    kind, convert = KINDS[type(example)]
     try:
-        if isinstance(example, bool):
-            words = {"true": True, "1": True, "false": False, "0": False}
-            return words[str(value).lower()]
-        if isinstance(example, tuple):
-            items = value.split(",") if isinstance(value, str) else list(value)
-            if len(items) != len(example):
-                raise ValueError
-            return tuple(_convert(v, e, where) for v, e in zip(items, example, strict=True))
-        if isinstance(example, int) and float(value) != int(float(value)):
-            raise ValueError
-        converted = int(float(value)) if isinstance(example, int) else type(example)(value)
+        return convert(value)
     except (KeyError, TypeError, ValueError, OverflowError):
-        raise UserError(f"{where}: {value!r} is not like {example!r}") from None
-    if isinstance(converted, float) and not abs(converted) < float("inf"):
-        raise UserError(f"{where}: {value!r} is not a finite number")
-    return converted
+        raise UserError(f"{where}: {value!r} is not {kind}") from None
 
+
+def _whole(value):
+    number = float(value)
+    if number != int(number):
+        raise ValueError
+    return int(number)
+
+
+def _finite(value):
+    number = float(value)
+    if not math.isfinite(number):
+        raise ValueError
+    return number
+
+
+# type of a setting: (what it is called, conversion of a value or its text)
+KINDS = {
+    int: ("a whole number", _whole),
+    float: ("a finite number", _finite),
+    str: ("a word", str),
+    bool: ("true or false", lambda value: {"true": True, "1": True, "false": False, "0": False}[str(value).lower()]),
+}
 
 # section.key: (least, largest) allowed
 LIMITS = {
-    "scene.downscale": (1, 64), "points.count": (1, 2**27), "points.radius": (1e-6, 100), "points.max_tracked": (0, 2**31 - 1),
-    "points.stop": (0, 0.5), "train.iterations": (1, 10**8), "train.seed": (0, 2**32 - 1), "train.crop": (0, 2**14),
-    "train.ssim_weight": (0, 10), "train.dropout": (0, 0.95), "train.smooth": (0, 0.25), "train.smooth_every": (1, 10**8),
-    "train.prune_weight": (0, 1e6), "train.prune_opacity": (0, 1), "train.prune_every": (1, 10**8),
-    "train.checkpoint_every": (1, 10**8), "train.log_every": (1, 10**8), "train.previews": (0, 1000),
-    "train.sh_rate_decay": (1e-6, 1), "train.feature_eps": (1e-30, 1e3), "train.final_weight": (0, 1e9),
+    "scene.downscale": (1, 64),
+    "points.count": (1, 2**27),
+    "points.radius": (1e-6, 100),
+    "points.max_tracked": (0, 2**31 - 1),
+    "points.stop": (0, 0.5),
+    "train.iterations": (1, 10**8),
+    "train.seed": (0, 2**32 - 1),
+    "train.crop": (0, 2**14),
+    "train.ssim_weight": (0, 10),
+    "train.dropout": (0, 0.95),
+    "train.smooth": (0, 0.25),
+    "train.smooth_every": (1, 10**8),
+    "train.prune_weight": (0, 1e6),
+    "train.prune_opacity": (0, 1),
+    "train.prune_every": (1, 10**8),
+    "train.checkpoint_every": (1, 10**8),
+    "train.log_every": (1, 10**8),
+    "train.previews": (0, 1000),
+    "train.sh_rate_decay": (1e-6, 1),
+    "train.feature_eps": (1e-30, 1e3),
+    "train.final_weight": (0, 1e9),
 }
 
 

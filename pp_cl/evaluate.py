@@ -50,9 +50,15 @@ def evaluate_run(folder, metrics, split, save_images, device_choice):
         if save_images:
             write_png(target_folder / "images" / f"{PurePosixPath(view.name).stem}.png", picture)
     result = {
-        "split": split, "device": dev.name, "step": header["step"], "finished": header["finished"], "mean": mean(rows), "per_image": rows,
+        "split": split,
+        "device": dev.name,
+        "step": header["step"],
+        "finished": header["finished"],
+        "mean": mean(rows),
+        "per_image": rows,
         "points": {"initial": header["initial_points"], "final": model.count, "grid": header["grid"]["dims"]},
-        "seconds_per_frame": float(np.median(seconds)), "published": scene.published,
+        "seconds_per_frame": float(np.median(seconds)),
+        "published": scene.published,
     }
     write_json(target_folder / "metrics.json", result)
     chosen = pictures[:: max(1, len(pictures) // PICTURE_VIEWS)][:PICTURE_VIEWS]
@@ -79,8 +85,13 @@ def _render_all(dev, config, model, views):
 def _print_table(result, folder):
     names = list(result["mean"])
     print(f"{'':28s}" + "".join(f"{n:>9s}" for n in names))
-    rows = {f"{folder} ({len(result['per_image'])} views)": result["mean"]} | {f"{k} (published)": v for k, v in result["published"].items()}
+    rows = {f"{folder} ({len(result['per_image'])} views)": result["mean"]} | {
+        f"{k} (published)": v for k, v in result["published"].items()
+    }
     for label, values in rows.items():
         print(f"{label:28s}" + "".join(f"{values[n]:9.4f}" if n in values else f"{'':9s}" for n in names))
     points = result["points"]
-    print(f"{points['final']} of {points['initial']} points, {result['seconds_per_frame'] * 1e3:.0f} ms per frame on {result['device']}")
+    print(
+        f"{points['final']} of {points['initial']} points, {result['seconds_per_frame'] * 1e3:.0f} ms per frame "
+        f"on {result['device']}"
+    )

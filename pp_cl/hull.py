@@ -144,8 +144,8 @@ def depth_range(views, hull):
     """(near, far) of all views, as Euclidean distances in world units (docs/scene_scale.md).
 
     The ball around the hull, DEPTH_MARGIN times enlarged, lies between them for every view. Where a camera is closer than
-    that, near is half its distance from the hull's box, and inside the box one grid edge. A stated range is kept, but widened
-    to the ball itself, since points outside of it would be missing.
+    that, near is half its distance from the hull's box, and inside the box one grid edge. A stated range is kept, but
+    widened to the ball itself, since points outside of it would be missing.
     """
     stated = all(view.has_depth_range for view in views)
     half = hull.grid.edge * np.asarray(hull.grid.dims) / 2  # of the box of the vertices' cells

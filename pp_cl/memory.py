@@ -16,13 +16,20 @@ def memory_plan(dev, config, model, views):
     """[(what, shape text, bytes)] of the device buffers of a training with this model on these views."""
     n, train = model.count, config.train
     camera = reduced_camera(views[0], config.scene.downscale)
-    width, height = ((camera.width, camera.height) if train.crop == 0 else
-                     (min(train.crop, camera.width), min(train.crop, camera.height)))
+    width, height = (
+        (camera.width, camera.height) if train.crop == 0 else (min(train.crop, camera.width), min(train.crop, camera.height))
+    )
     width, height = width + -width % 4, height + -height % 4
     copies = 1 + MOMENTS + (1 if train.average else 0)
     rows = [("point ids, opacities", f"({n}) x {1 + copies}", 4 * n * (1 + copies))]
-    rows += [(f"SH degree {d}, moments" + (", average" if train.average else ""), f"({n}, {2 * d + 1}, 16) x {copies}",
-              64 * n * (2 * d + 1) * copies) for d in SH_DEGREES]
+    rows += [
+        (
+            f"SH degree {d}, moments" + (", average" if train.average else ""),
+            f"({n}, {2 * d + 1}, 16) x {copies}",
+            64 * n * (2 * d + 1) * copies,
+        )
+        for d in SH_DEGREES
+    ]
     rows.append(("points of one view", f"({n}, {POINT_VIEW_FLOATS})", 4 * n * POINT_VIEW_FLOATS))
     if train.smooth > 0:
         rows.append(("grid neighbours, scratch", f"({n}, 22)", 4 * n * 22))
@@ -47,10 +54,15 @@ def _pixels_per_point(config, model, camera):
 def print_plan(rows, dev):
     """Print the table against the device's limits. Raises UserError naming the knobs when it does not fit."""
     total = sum(size for _, _, size in rows)
-    print(f"memory plan ({dev.name}: {dev.info['memory_bytes'] / MIB:.0f} MiB, at most {dev.info['max_allocation_bytes'] / MIB:.0f} at once)")
+    print(
+        f"memory plan ({dev.name}: {dev.info['memory_bytes'] / MIB:.0f} MiB, "
+        f"at most {dev.info['max_allocation_bytes'] / MIB:.0f} at once)"
+    )
     for what, shape, size in rows:
         print(f"  {what:36s} {shape:28s} {size / MIB:9.1f} MiB")
     print(f"  {'total':36s} {'':28s} {total / MIB:9.1f} MiB")
     if total > dev.info["memory_bytes"]:
-        raise UserError(f"the training needs {total / MIB:.0f} MiB, {dev.name} has {dev.info['memory_bytes'] / MIB:.0f}: "
-                        "lower --points, raise --downscale, or set train.crop or smaller network.widths")
+        raise UserError(
+            f"the training needs {total / MIB:.0f} MiB, {dev.name} has {dev.info['memory_bytes'] / MIB:.0f}: "
+            "lower --points, raise --downscale, or set train.crop or smaller network.widths"
+        )

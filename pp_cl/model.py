@@ -43,8 +43,14 @@ class Model:
 
     def header(self):
         """JSON-able description that load() needs beside the arrays."""
-        return {"grid": {"origin": [float(x) for x in self.grid.origin], "edge": float(self.grid.edge), "dims": [int(d) for d in self.grid.dims]},
-                "depth_range": [float(x) for x in self.depth_range]}
+        return {
+            "grid": {
+                "origin": [float(x) for x in self.grid.origin],
+                "edge": float(self.grid.edge),
+                "dims": [int(d) for d in self.grid.dims],
+            },
+            "depth_range": [float(x) for x in self.depth_range],
+        }
 
     def arrays(self):
         """{name: numpy array} of everything learned."""
@@ -73,5 +79,8 @@ def _fitting(arrays, name, shape, file):
     array = arrays.get(name)
     if array is None or array.shape != tuple(shape) or array.dtype != expected:
         found = "missing" if array is None else f"{array.dtype} {array.shape}"
-        raise UserError(f"{file}: {name} is {found}, expected {np.dtype(expected)} {tuple(shape)}; its config.json may belong to another run")
+        raise UserError(
+            f"{file}: {name} is {found}, expected {np.dtype(expected)} {tuple(shape)}; "
+            "its config.json may belong to another run"
+        )
     return np.ascontiguousarray(array)

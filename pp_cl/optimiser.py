@@ -26,8 +26,10 @@ class Rates:
     def at(cls, step, network, train):
         """The rates of a step from 0 on. network, train: config.NetworkConfig, config.TrainConfig."""
         steps = train.iterations
-        sh = tuple(learning_rate(step, steps, first, first * train.sh_rate_decay, round(delay * steps))
-                   for first, delay in zip(train.sh_rate, train.sh_delay, strict=True))
+        sh = tuple(
+            learning_rate(step, steps, first, first * train.sh_rate_decay, round(delay * steps))
+            for first, delay in zip(train.sh_rate, train.sh_delay, strict=True)
+        )
         return cls(sh, learning_rate(step, steps, *train.opacity_rate), learning_rate(step, steps, *network.rate))
 
 
@@ -37,7 +39,9 @@ class Optimiser:
     def __init__(self, dev, model):
         self.dev = dev
         self.model = model
-        self.moments = {f"{kind}.{name}": dev.zeros(array.shape) for name, array in model.net.parameters.items() for kind in "mv"}
+        self.moments = {
+            f"{kind}.{name}": dev.zeros(array.shape) for name, array in model.net.parameters.items() for kind in "mv"
+        }
         for name in POINT_KEYS:
             for kind in "mv":
                 model.points[f"{kind}.{name}"] = dev.zeros(model.points[name].shape)
@@ -53,13 +57,42 @@ class Optimiser:
         grad_features, grad_opacity = grads
         for degree, rate in zip(SH_DEGREES, rates.sh, strict=True):
             name = f"sh{degree}"
-            adam_sh_update(dev, model.grid_buffer, camera, points["ids"], grad_features, points[name], points[f"m.{name}"],
-                           points[f"v.{name}"], step, rate, feature_eps)
-        adam_update(dev, points["opacity"], grad_opacity, points["m.opacity"], points["v.opacity"], step, rates.opacity,
-                    OPACITY_EPS, low=0.0, high=1.0)
+            adam_sh_update(
+                dev,
+                model.grid_buffer,
+                camera,
+                points["ids"],
+                grad_features,
+                points[name],
+                points[f"m.{name}"],
+                points[f"v.{name}"],
+                step,
+                rate,
+                feature_eps,
+            )
+        adam_update(
+            dev,
+            points["opacity"],
+            grad_opacity,
+            points["m.opacity"],
+            points["v.opacity"],
+            step,
+            rates.opacity,
+            OPACITY_EPS,
+            low=0.0,
+            high=1.0,
+        )
         for name, parameter in model.net.parameters.items():
-            adam_update(dev, parameter, model.net.gradients[name], self.moments[f"m.{name}"], self.moments[f"v.{name}"],
-                        step, rates.network, NETWORK_EPS)
+            adam_update(
+                dev,
+                parameter,
+                model.net.gradients[name],
+                self.moments[f"m.{name}"],
+                self.moments[f"v.{name}"],
+                step,
+                rates.network,
+                NETWORK_EPS,
+            )
 
     def average(self, weight):
         """Move the averages towards the present values by `weight`; a weight of 1 starts them there."""

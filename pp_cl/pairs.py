@@ -10,10 +10,13 @@ GROWTH = 1.25  # spare room of the pair buffers, so that they are not replaced a
 class Pairs:
     """The hits of the view built last, with the buffers they live in; these grow and are kept from view to view.
 
-    total: number of pairs; P >= total is the length of the pair buffers. seen: (S) uint32, the points with a pair, ascending.
-    point_offset: (N+1) uint32, point i owns the pairs point_offset[i] to point_offset[i+1]. pixel_offset: (HW+1) uint32.
-    pair_pixel: (P) uint32. pair_closeness: (P) float32, the d of Eq. (1). point_from_pair: (P) uint32.
-    pair_key: (P) uint64, depth bits << 32 | pair, by pixel and sorted within it. hit: (P) uint64, free for the blend.
+    total: number of pairs; the pair buffers have a length P >= total, at least 1.
+    seen: (S) uint32, the points with a pair, ascending.
+    point_offset: (N+1) uint32, point i owns the pairs point_offset[i] to point_offset[i+1].
+    pair_pixel: (P) uint32, y*W + x. pair_closeness: (P) float32, the d of Eq. (1). point_from_pair: (P) uint32.
+    pixel_offset: (HW+1) uint32, pixel q owns the keys pixel_offset[q] to pixel_offset[q+1].
+    pair_key: (P) uint64, depth bits << 32 | pair, sorted within each pixel: by depth, then by point.
+    hit: (P) uint64, scratch here; the blend lists each pixel's weights and points in it.
     """
 
     def __init__(self, dev, footprint):
@@ -22,49 +25,51 @@ class Pairs:
         self.points = self.pixels = self.capacity = 0
 
     def build(self, view, size, projection, point_radius):
-        """Find and sort the hits of projected points. Waits for the device twice, to learn how many there are.
+        """Find and sort the hits of projected points. Waits for the device, to learn how many there are.
 
-        view: (20) packed camera. size: its (height, width). projection: Projection with N points. point_radius: (1) or (N).
+        view: (20) packed camera. size: its (height, width). projection: Projection of N points. point_radius: (1) or (N)
+        float32, the radii they were projected with.
         """
-        dev, program = self.dev, self.program
         n, hw = projection.point_camera.shape[0], size[0] * size[1]
+        launch = self.program.launch
         self._resize(n, hw)
         points = {"n": n, "k": point_radius.size, "camera": view, "point_radius": point_radius,
                   "point_camera": projection.point_camera, "point_box": projection.point_box}
-        program.launch("pairs_count", n, point_count=self.point_count, **points)
-        self.seen = self.seen_index[:nonzero(dev, self.point_count, self.point_offset, self.seen_index)]
-        exclusive_scan(dev, self.point_count, self.point_offset)
-        self.total = read_total(dev, self.point_offset)
-        self._reserve(self.total)
-        dev.fill(self.pixel_count, 0)
-        program.launch("pairs_fill", n, point_offset=self.point_offset, pair_pixel=self.pair_pixel, pair_place=self.hit,
-                       pair_closeness=self.pair_closeness, point_from_pair=self.point_from_pair, pixel_count=self.pixel_count, **points)
-        exclusive_scan(dev, self.pixel_count, self.pixel_offset)
-        program.launch("pairs_scatter", self.total, pairs=self.total, pair_pixel=self.pair_pixel, pair_place=self.hit,
-                       pixel_offset=self.pixel_offset, pair_key=self.pair_key)
-        program.launch("pairs_sort", hw, hw=hw, pixel_offset=self.pixel_offset, scratch=self.hit, pair_key=self.pair_key)
+
+        launch("pairs_count", n, point_count=self.point_count, **points)
+        self.seen = self.seen_index[:nonzero(self.dev, self.point_count, self.point_offset, self.seen_index)]
+        exclusive_scan(self.dev, self.point_count, self.point_offset)
+        self._reserve(read_total(self.dev, self.point_offset))
+
+        self.dev.fill(self.pixel_count, 0)
+        launch("pairs_fill", n, point_offset=self.point_offset, pair_pixel=self.pair_pixel, pair_closeness=self.pair_closeness,
+               point_from_pair=self.point_from_pair, pair_place=self.hit, pixel_count=self.pixel_count, **points)
+        exclusive_scan(self.dev, self.pixel_count, self.pixel_offset)
+        launch("pairs_scatter", self.total, pairs=self.total, pair_pixel=self.pair_pixel, pair_place=self.hit,
+               pixel_offset=self.pixel_offset, pair_key=self.pair_key)
+        launch("pairs_sort", hw, hw=hw, pixel_offset=self.pixel_offset, scratch=self.hit, pair_key=self.pair_key)
 
     def _resize(self, n, hw):
         """Buffers for n points and hw pixels."""
-        dev = self.dev
         if n != self.points:
             self.points = n
-            self.point_count = dev.empty((n,), np.uint32)
-            self.point_offset = dev.empty((n + 1,), np.uint32)
-            self.seen_index = dev.empty((n,), np.uint32)
+            self.point_count = self.dev.empty((n,), np.uint32)
+            self.point_offset = self.dev.empty((n + 1,), np.uint32)
+            self.seen_index = self.dev.empty((n,), np.uint32)
         if hw != self.pixels:
             self.pixels = hw
-            self.pixel_count = dev.empty((hw,), np.uint32)
-            self.pixel_offset = dev.empty((hw + 1,), np.uint32)
+            self.pixel_count = self.dev.empty((hw,), np.uint32)
+            self.pixel_offset = self.dev.empty((hw + 1,), np.uint32)
 
     def _reserve(self, total):
-        """Buffers for at least `total` pairs, and never none at all."""
-        if self.capacity > 0 and total <= self.capacity:
+        """Buffers for `total` pairs; old ones are released before larger ones are allocated."""
+        self.total = total
+        if self.capacity >= max(1, total):
             return
-        dev, self.capacity = self.dev, max(1, int(total * GROWTH))
-        self.pair_key = self.hit = self.pair_pixel = self.pair_closeness = self.point_from_pair = None  # release before allocating
-        self.pair_key = dev.empty((self.capacity,), np.uint64)
-        self.hit = dev.empty((self.capacity,), np.uint64)
-        self.pair_pixel = dev.empty((self.capacity,), np.uint32)
-        self.pair_closeness = dev.empty((self.capacity,))
-        self.point_from_pair = dev.empty((self.capacity,), np.uint32)
+        self.capacity = max(1, int(total * GROWTH))
+        dtypes = {"pair_pixel": np.uint32, "pair_closeness": np.float32, "point_from_pair": np.uint32, "pair_key": np.uint64,
+                  "hit": np.uint64}
+        for name in dtypes:
+            setattr(self, name, None)
+        for name, dtype in dtypes.items():
+            setattr(self, name, self.dev.empty((self.capacity,), dtype))

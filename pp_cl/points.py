@@ -9,7 +9,7 @@ SH_DEGREES = (0, 1, 2)
 
 @dataclass(frozen=True)
 class Grid:
-    """A regular grid. origin: (3,) world position of vertex (0, 0, 0); edge: spacing, world units; dims: vertices per axis."""
+    """A regular grid. origin: (3,) world position of vertex (0, 0, 0); edge: spacing, world units; dims: vertices."""
 
     origin: tuple
     edge: float

@@ -1,6 +1,6 @@
 """From a model and a camera to a picture, and back to gradients: the one place that writes the order of the stages.
 
-    project -> pairs -> blend weights -> shade what is seen -> blend features -> U-Net
+project -> pairs -> blend weights -> shade what is seen -> blend features -> U-Net
 """
 
 import numpy as np
@@ -41,7 +41,14 @@ class Renderer:
         """
         self.blend_weights(camera, gamma, dropout, seed)
         points = self.model.points
-        shade_forward(self.dev, self.camera, self.projection.point_camera, self.pairs.seen, [points[f"sh{d}"] for d in SH_DEGREES], self.point_features)
+        shade_forward(
+            self.dev,
+            self.camera,
+            self.projection.point_camera,
+            self.pairs.seen,
+            [points[f"sh{d}"] for d in SH_DEGREES],
+            self.point_features,
+        )
         self.blend.forward(self.pairs, self.point_features, self.features)
         return self.model.net.forward(self.features, training=training)
 
@@ -64,7 +71,9 @@ class Renderer:
         grad_point_features, and the optimiser never forms them.
         """
         grad_features = self.model.net.backward(grad_image)
-        self.blend.backward(self.pairs, self.point_features, self.features, grad_features, self.grad_point_features, self.grad_opacity)
+        self.blend.backward(
+            self.pairs, self.point_features, self.features, grad_features, self.grad_point_features, self.grad_opacity
+        )
         return self.grad_point_features, self.grad_opacity
 
     def add_point_weights(self, total):
@@ -75,7 +84,7 @@ class Renderer:
         """(H, W, 3) float32 numpy picture of the camera, clamped to [0, 1]."""
         image = self.forward(camera, gamma).get()
         left, top = self.offset
-        return np.clip(image[top:top + camera.height, left:left + camera.width], 0, 1)
+        return np.clip(image[top : top + camera.height, left : left + camera.width], 0, 1)
 
     def _radius(self, camera):
         """The points' radius in world units for a camera."""

@@ -74,7 +74,11 @@ def train_run(folder, config, device_choice):
 def _check_folder(folder):
     if folder.exists() and not folder.is_dir():
         raise UserError(f"{folder}: is not a folder; choose another --out")
-    if folder.is_dir() and not (folder / "config.json").exists() and any(p for p in folder.iterdir() if not p.name.startswith(".")):
+    if (
+        folder.is_dir()
+        and not (folder / "config.json").exists()
+        and any(p for p in folder.iterdir() if not p.name.startswith("."))
+    ):
         raise UserError(f"{folder}: holds other files and no config.json; choose an empty or new folder for --out")
 
 
@@ -86,11 +90,16 @@ def _start(dev, config, scene):
     hull = build_grid(dev, views, config.points.count)
     near_far = depth_range(views, hull)
     dims = "x".join(str(d) for d in hull.grid.dims)
-    print(f"hull: {len(hull.ids)} points on a {dims} grid, edge {hull.grid.edge:.6g} "
-          f"({spacing_pixels(hull, views, config.scene.downscale):.2f} pixels), depth {near_far[0]:.3f} to {near_far[1]:.3f} "
-          f"({time.perf_counter() - start:.1f} s)")
+    print(
+        f"hull: {len(hull.ids)} points on a {dims} grid, edge {hull.grid.edge:.6g} "
+        f"({spacing_pixels(hull, views, config.scene.downscale):.2f} pixels), depth {near_far[0]:.3f} to {near_far[1]:.3f} "
+        f"({time.perf_counter() - start:.1f} s)"
+    )
     model = Model.create(dev, hull.grid, hull.ids, near_far, config.network.widths, config.train.seed)
-    return Trainer(dev, config, model, with_depth_range(views, near_far)), {"scene": fingerprint(views), "initial_points": len(hull.ids)}
+    return Trainer(dev, config, model, with_depth_range(views, near_far)), {
+        "scene": fingerprint(views),
+        "initial_points": len(hull.ids),
+    }
 
 
 def _resume(dev, config, scene, header, arrays, file):
@@ -110,7 +119,13 @@ def _optimise(trainer, config, folder, info):
     settings = config.train
     log, seconds = _open_log(folder / "log.jsonl", trainer.step)
     preview_every = -(-settings.iterations // settings.previews) if settings.previews else settings.iterations + 1
-    bar = tqdm(total=settings.iterations, initial=trainer.step, unit="step", mininterval=1 if sys.stderr.isatty() else 30, file=sys.stderr)
+    bar = tqdm(
+        total=settings.iterations,
+        initial=trainer.step,
+        unit="step",
+        mininterval=1 if sys.stderr.isatty() else 30,
+        file=sys.stderr,
+    )
     with log, bar:
         while trainer.step < settings.iterations:
             start = time.perf_counter()
@@ -120,7 +135,16 @@ def _optimise(trainer, config, folder, info):
             seconds += time.perf_counter() - start
             bar.update()
             if t % settings.log_every == 0 or last:
-                _log(log, {"step": t, "seconds": round(seconds, 3), **terms, "points": trainer.model.count, "rates": trainer.rates()})
+                _log(
+                    log,
+                    {
+                        "step": t,
+                        "seconds": round(seconds, 3),
+                        **terms,
+                        "points": trainer.model.count,
+                        "rates": trainer.rates(),
+                    },
+                )
                 bar.set_postfix(psnr=f"{terms['psnr']:.2f}", points=trainer.model.count)
             if t % settings.checkpoint_every == 0 and not last:
                 _save(trainer, folder, info, finished=False)
@@ -131,7 +155,10 @@ def _optimise(trainer, config, folder, info):
         seconds += time.perf_counter() - start
         _save(trainer, folder, info, finished=True)
         _log(log, {"step": trainer.step, "seconds": round(seconds, 3), "points": trainer.model.count, "finished": True})
-    print(f"trained {trainer.step} steps in {seconds:.1f} s; {trainer.model.count} of {info['initial_points']} points remain; wrote {folder / CHECKPOINT}")
+    print(
+        f"trained {trainer.step} steps in {seconds:.1f} s; {trainer.model.count} of {info['initial_points']} points remain; "
+        f"wrote {folder / CHECKPOINT}"
+    )
 
 
 def _open_log(path, step):
@@ -155,7 +182,9 @@ def _log(file, row):
         file.write(json.dumps(row, allow_nan=False) + "\n")
         file.flush()
     except OSError as error:
-        raise UserError(f"{file.name}: cannot be written ({error.strerror}); free some space, the same command goes on") from error
+        raise UserError(
+            f"{file.name}: cannot be written ({error.strerror}); free some space, the same command goes on"
+        ) from error
 
 
 def _save(trainer, folder, info, finished):

@@ -36,6 +36,7 @@ def nonzero(dev, values, offsets, indices):
 
     values: (N) uint32, N >= 1. offsets: (N+1) uint32 scratch, left holding each value's number. indices: (N) uint32.
     """
+    n = values.size
     exclusive_scan(dev, values, offsets, flags=True)
-    dev.program("scan", FLAGS=1).launch("scan_nonzero", values.size, n=values.size, values=values, offsets=offsets, indices=indices)
+    dev.program("scan", FLAGS=1).launch("scan_nonzero", n, n=n, values=values, offsets=offsets, indices=indices)
     return read_total(dev, offsets)

@@ -4,12 +4,12 @@
 def shade_forward(dev, view, point_camera, seen, sh, point_features):
     """Write the rows `seen` of point_features (N,16).
 
-    view: (20) packed camera. point_camera: (N,4) from project. seen: (S) uint32. sh: the coefficients by degree, one to three of
-    (N,1,16), (N,3,16), (N,5,16); the directions are normalize(point - eye) in world axes.
+    view: (20) packed camera. point_camera: (N,4) from project; the direction of a point is normalize(point - eye) in world
+    axes. seen: (S) uint32. sh: the coefficients by degree, the first one to three of (N,1,16), (N,3,16), (N,5,16).
     """
     dev.program("shade", DEGREE=len(sh) - 1).launch(
-        "shade_forward", seen.size, s=seen.size, seen=seen, camera=view, point_camera=point_camera, point_features=point_features,
-        **_by_degree("sh", point_camera, sh))
+        "shade_forward", seen.size, s=seen.size, seen=seen, camera=view, point_camera=point_camera,
+        point_features=point_features, **_by_degree("sh", point_camera, sh))
 
 
 def shade_backward(dev, view, point_camera, grad_point_features, grad_sh):
@@ -21,8 +21,9 @@ def shade_backward(dev, view, point_camera, grad_point_features, grad_sh):
 
 
 def _by_degree(name, point_camera, arrays):
-    """Arguments name0, name1, name2; the first array stands in for degrees that are absent. Raises ValueError on a wrong shape."""
+    """{name0, name1, name2: array}; the first stands in for absent degrees. Raises ValueError on a wrong shape."""
     for degree, array in enumerate(arrays):
-        if array.shape != (point_camera.shape[0], 2 * degree + 1, 16):
-            raise ValueError(f"{name}{degree} has shape {array.shape}, expected {(point_camera.shape[0], 2 * degree + 1, 16)}")
-    return {f"{name}{degree}": arrays[min(degree, len(arrays) - 1) and degree if degree < len(arrays) else 0] for degree in range(3)}
+        expected = (point_camera.shape[0], 2 * degree + 1, 16)
+        if array.shape != expected:
+            raise ValueError(f"{name}{degree} has shape {array.shape}, expected {expected}")
+    return {f"{name}{degree}": arrays[degree if degree < len(arrays) else 0] for degree in range(3)}

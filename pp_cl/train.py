@@ -53,8 +53,13 @@ class Trainer:
         self.target.load(view)
         target = self.target.crop(*box, phase)
 
-        image = self.renderer.forward(camera, gamma(t, config.iterations, *self.gamma), dropout=config.dropout,
-                                      seed=int(rng.integers(2**32)), training=True)
+        image = self.renderer.forward(
+            camera,
+            gamma(t, config.iterations, *self.gamma),
+            dropout=config.dropout,
+            seed=int(rng.integers(2**32)),
+            training=True,
+        )
         grad_image = self.loss.forward_backward(image, target, *self.renderer.offset)
         grads = self.renderer.backward(grad_image)
         self.optimiser.update(t + 1, rates, grads, self.renderer.camera, config.feature_eps / target.size)
@@ -76,12 +81,19 @@ class Trainer:
             return index, (0, 0, camera.width, camera.height), phase
         x0, y0, x1, y1 = self.boxes[index]
         width, height = min(config.crop, camera.width), min(config.crop, camera.height)
-        return index, (_draw_start(rng, x0, x1, width, camera.width), _draw_start(rng, y0, y1, height, camera.height), width, height), phase
+        return (
+            index,
+            (_draw_start(rng, x0, x1, width, camera.width), _draw_start(rng, y0, y1, height, camera.height), width, height),
+            phase,
+        )
 
     def _terms(self):
         total, l1, dissimilarity, mse = (float(x) for x in self.loss.terms.get())
         if not math.isfinite(total):
-            raise UserError(f"the loss is not finite at step {self.step}; the last checkpoint is kept: lower train.sh_rate or network.rate")
+            raise UserError(
+                f"the loss is not finite at step {self.step}; the last checkpoint is kept: "
+                "lower train.sh_rate or network.rate"
+            )
         return {"loss": total, "l1": l1, "ssim": 1 - dissimilarity, "psnr": -10 * math.log10(max(mse, 1e-10))}
 
     # ------------------------------------------------------------------------------- between the steps
@@ -131,7 +143,9 @@ class Trainer:
 
     def picture(self, view):
         """(H,W,3) float32 in [0, 1]: the present model's picture of a view."""
-        return self.renderer.picture(reduced_camera(view, self.downscale), gamma(self.step, self.config.iterations, *self.gamma))
+        return self.renderer.picture(
+            reduced_camera(view, self.downscale), gamma(self.step, self.config.iterations, *self.gamma)
+        )
 
     def truth(self, view):
         """(H,W,3) float32 in [0, 1]: what the picture should be."""

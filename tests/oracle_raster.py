@@ -87,7 +87,7 @@ def order(geometry_):
 
 
 def blend(camera, geometry_, opacity, gamma, stop=0.0):
-    """Dict of the blend: weight (N, HW) b; share (N, HW) b/o with its limit at o = 0; z (N, HW); background (HW,) b_0; hit (N, HW)."""
+    """Dict: weight (N, HW) b; share (N, HW) b/o, with its limit at o = 0; z (N, HW); background (HW,) b_0; hit (N, HW) used."""
     hit, d = geometry_["hit"], geometry_["closeness"]
     o = np.asarray(opacity, np.float64)[:, None]
     z = 1 - (geometry_["depth"] - camera.near) / (camera.far - camera.near)
@@ -107,10 +107,11 @@ def stopped(hit, d, o, z, ranks, gamma, stop):
     result = np.zeros_like(hit)
     for q in np.flatnonzero(hit.any(axis=0)):
         points = np.flatnonzero(hit[:, q])
+        points = points[np.argsort(ranks[points, q])]
         log_total = EPS / gamma
-        for place, i in enumerate(points[np.argsort(ranks[points, q])]):
+        for place, i in enumerate(points):
             if max(z[i, q], 0) / gamma < log_total + np.log(stop / (1 - stop)):
-                result[points[np.argsort(ranks[points, q])][place:], q] = True
+                result[points[place:], q] = True
                 break
             with np.errstate(divide="ignore"):
                 log_total = np.logaddexp(log_total, np.log(o[i, 0] * d[i, q]) + o[i, 0] * z[i, q] / gamma)
@@ -123,7 +124,7 @@ def features(blend_, point_features):
 
 
 def blend_gradients(geometry_, blend_, opacity, point_features, grad_features, gamma, max_tracked=0, mean=False):
-    """(dL/df (N, C), dL/do (N,), dL/dl (N, HW)); grad_features: (HW, C). Only the max_tracked nearest hits count (0: all)."""
+    """(dL/df (N, C), dL/do (N,), dL/dl (N, HW)) of grad_features (HW, C) for the max_tracked nearest hits (0: all)."""
     G, f = np.asarray(grad_features, np.float64), np.asarray(point_features, np.float64)
     s = f @ G.T - (G * features(blend_, f)).sum(axis=1)
     tracked = blend_["hit"] & (order(geometry_) < max_tracked) if max_tracked else blend_["hit"]
@@ -133,7 +134,8 @@ def blend_gradients(geometry_, blend_, opacity, point_features, grad_features, g
     return scale[:, None] * (weight @ G), scale * dL_do, scale[:, None] * weight * s
 
 
-SH = (0.28209479177387814, 0.4886025119029199, 1.0925484305920792, 0.9461746957575601, 0.31539156525252005, 0.5462742152960396)
+SH = (0.28209479177387814, 0.4886025119029199, 1.0925484305920792, 0.9461746957575601, 0.31539156525252005,
+      0.5462742152960396)
 
 
 def sh_basis(directions):

@@ -79,6 +79,7 @@ class Scene:
         """{"positions": (N, 3), "radius": (N,)} of the same."""
         grad_positions, grad_radius = self.dev.empty((self.n, 3)), self.dev.empty((self.n,))
         self.grad = self.dev.upload(np.reshape(grad_features, (*self.shape, 16)), np.float32)
-        self.blending.backward_spheres(self.pairs, self.view, self.gamma, self.radius, self.projection.point_camera, self.opacity,
-                                       self.point_features, self.features, self.grad, grad_positions, grad_radius)
+        self.blending.backward_spheres(
+            self.pairs, self.view, self.gamma, self.radius, self.projection.point_camera, self.opacity, self.point_features,
+            self.features, self.grad, grad_positions, grad_radius)
         return {"positions": grad_positions.get(), "radius": grad_radius.get()}

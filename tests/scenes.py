@@ -19,14 +19,16 @@ def look_at(eye, target=(0, 0, 0)):
 def ring_cameras(n, size, distance=4.0, field_of_view=0.7):
     """n cameras on two rings around the origin that look at it."""
     focal = 0.5 * size / np.tan(0.5 * field_of_view)
-    eyes = [distance * np.array([np.cos(a) * np.cos(h), np.sin(a) * np.cos(h), np.sin(h)])
-            for a, h in zip(np.linspace(0, 2 * np.pi, n, endpoint=False), np.tile([0.2, 0.7], n)[:n], strict=True)]
+    eyes = [
+        distance * np.array([np.cos(a) * np.cos(h), np.sin(a) * np.cos(h), np.sin(h)])
+        for a, h in zip(np.linspace(0, 2 * np.pi, n, endpoint=False), np.tile([0.2, 0.7], n)[:n], strict=True)
+    ]
     return [Camera(look_at(eye), focal, focal, size / 2, size / 2, size, size, 2.0, 6.0) for eye in eyes]
 
 
 def ball_image(camera, radius=0.8):
     """(H, W, 4) uint8 picture of a ball at the origin whose colour varies with the surface position."""
-    y, x = np.mgrid[:camera.height, :camera.width] + 0.5
+    y, x = np.mgrid[: camera.height, : camera.width] + 0.5
     rays = np.stack([(x - camera.cx) / camera.fx, (y - camera.cy) / camera.fy, np.ones_like(x)], -1) @ camera.pose[:, :3].T
     rays /= np.linalg.norm(rays, axis=-1, keepdims=True)
     b = rays @ camera.eye

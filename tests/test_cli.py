@@ -40,12 +40,14 @@ def edit(scene, change):
 def set_matrix(value):
     def change(content):
         content["frames"][1]["transform_matrix"] = value
+
     return change
 
 
 def set_path(value):
     def change(content):
         content["frames"][1]["file_path"] = value
+
     return change
 
 
@@ -60,7 +62,10 @@ DAMAGE = {
     "wrong shape": (lambda s: edit(s, set_matrix([[1, 0], [0, 1]])), "transform_matrix"),
     "path leaves": (lambda s: edit(s, set_path("../../secret")), "file_path"),
     "missing image": (lambda s: (s / "train" / "r_1.png").unlink(), "train/r_1"),
-    "truncated image": (lambda s: (s / "train" / "r_1.png").write_bytes((s / "train" / "r_1.png").read_bytes()[:200]), "r_1.png"),
+    "truncated image": (
+        lambda s: (s / "train" / "r_1.png").write_bytes((s / "train" / "r_1.png").read_bytes()[:200]),
+        "r_1.png",
+    ),
     "other size": (lambda s: Image.new("RGBA", (20, 20)).save(s / "train" / "r_1.png"), "r_1.png"),
     "empty mask": (lambda s: Image.new("RGBA", (32, 32)).save(s / "train" / "r_1.png"), "r_1.png"),
 }
@@ -74,11 +79,21 @@ def test_a_damaged_scene_is_one_line_and_writes_nothing(name, scene, tmp_path, c
     assert not (tmp_path / "run").exists()
 
 
-@pytest.mark.parametrize("words, named", [
-    (["--iterations", "0"], "train.iterations"), (["--iterations", "x"], "--iterations"), (["--points", "0"], "points.count"),
-    (["--downscale", "20"], "--downscale"), (["--set", "train.sped=1"], "train.sped"), (["--set", "nonsense"], "--set nonsense"),
-    (["--preset", "huge"], "--preset"), (["--speed", "9"], "--speed"), (["--device", "abacus"], "abacus"), (["--seed", "-1"], "train.seed"),
-])
+@pytest.mark.parametrize(
+    "words, named",
+    [
+        (["--iterations", "0"], "train.iterations"),
+        (["--iterations", "x"], "--iterations"),
+        (["--points", "0"], "points.count"),
+        (["--downscale", "20"], "--downscale"),
+        (["--set", "train.sped=1"], "train.sped"),
+        (["--set", "nonsense"], "--set nonsense"),
+        (["--preset", "huge"], "--preset"),
+        (["--speed", "9"], "--speed"),
+        (["--device", "abacus"], "abacus"),
+        (["--seed", "-1"], "train.seed"),
+    ],
+)
 def test_bad_options_are_one_line_and_write_nothing(words, named, scene, tmp_path, capsys):
     assert named in failure(capsys, "train", scene, "--out", tmp_path / "run", *words)
     assert not (tmp_path / "run").exists()
@@ -113,8 +128,13 @@ def test_without_a_command_or_with_an_unknown_one(capsys):
 
 
 def test_help_lists_settings_and_the_module_runs():
-    run = subprocess.run([sys.executable, "-m", "pp_cl", "train", "--help"], capture_output=True, text=True,
-                         cwd=Path(__file__).parents[1], check=True)
+    run = subprocess.run(
+        [sys.executable, "-m", "pp_cl", "train", "--help"],
+        capture_output=True,
+        text=True,
+        cwd=Path(__file__).parents[1],
+        check=True,
+    )
     assert "train.sh_rate" in run.stdout and "--downscale" in run.stdout
 
 

@@ -29,10 +29,16 @@ def test_paper_preset_keeps_the_supplementals_numbers():
     assert [d * paper.train.iterations for d in paper.train.sh_delay] == [0, 500, 1000]
 
 
-@pytest.mark.parametrize("key, text, value", [
-    ("train.iterations", "1e3", 1000), ("points.radius", "0.5", 0.5), ("network.widths", "8,16,32", (8, 16, 32)),
-    ("train.phases", "false", False), ("points.footprint", "disc", "disc"),
-])
+@pytest.mark.parametrize(
+    "key, text, value",
+    [
+        ("train.iterations", "1e3", 1000),
+        ("points.radius", "0.5", 0.5),
+        ("network.widths", "8,16,32", (8, 16, 32)),
+        ("train.phases", "false", False),
+        ("points.footprint", "disc", "disc"),
+    ],
+)
 def test_assign_converts_text(key, text, value):
     config = Config()
     assign(config, key, text, "--set")
@@ -40,21 +46,41 @@ def test_assign_converts_text(key, text, value):
     assert getattr(getattr(config, section), name) == value
 
 
-@pytest.mark.parametrize("key, text, message", [
-    ("train.iteration", "5", "unknown key"), ("trains.iterations", "5", "unknown key"), ("preset", "x", "unknown key"),
-    ("train.iterations", "many", "not like"), ("train.iterations", "1.5", "not like"), ("train.iterations", "inf", "not like"),
-    ("network.widths", "8,16", "not like"), ("train.phases", "perhaps", "not like"), ("points.radius", "nan", "finite"),
-])
+@pytest.mark.parametrize(
+    "key, text, message",
+    [
+        ("train.iteration", "5", "unknown key"),
+        ("trains.iterations", "5", "unknown key"),
+        ("preset", "x", "unknown key"),
+        ("train.iterations", "many", "whole number"),
+        ("train.iterations", "1.5", "whole number"),
+        ("train.iterations", "inf", "whole number"),
+        ("network.widths", "8,16", "3 values"),
+        ("network.widths", 8, "3 values"),
+        ("train.phases", "perhaps", "true or false"),
+        ("points.radius", "nan", "finite number"),
+        ("points.gamma", "0.1,x", "finite number"),
+    ],
+)
 def test_assign_refuses(key, text, message):
     with pytest.raises(UserError, match=message) as caught:
         assign(Config(), key, text, "--set")
     assert key in str(caught.value)
 
 
-@pytest.mark.parametrize("key, value", [
-    ("train.iterations", 0), ("train.crop", 130), ("points.footprint", "gauss"), ("points.gamma", (0.1, 0.0)),
-    ("network.widths", (0, 1, 1)), ("train.dropout", 1.0), ("points.count", 2**28), ("network.rate", (0.0, 0.0)),
-])
+@pytest.mark.parametrize(
+    "key, value",
+    [
+        ("train.iterations", 0),
+        ("train.crop", 130),
+        ("points.footprint", "gauss"),
+        ("points.gamma", (0.1, 0.0)),
+        ("network.widths", (0, 1, 1)),
+        ("train.dropout", 1.0),
+        ("points.count", 2**28),
+        ("network.rate", (0.0, 0.0)),
+    ],
+)
 def test_validate_refuses(key, value):
     config = Config()
     section, name = key.split(".")
@@ -63,9 +89,15 @@ def test_validate_refuses(key, value):
         validate(config, "settings")
 
 
-@pytest.mark.parametrize("text, message", [
-    ("{", "not JSON"), ("[]", "preset"), ('{"preset": "tiny", "train": 3}', "train"), ('{"preset": "tiny", "train": {"x": 3}}', "train.x"),
-])
+@pytest.mark.parametrize(
+    "text, message",
+    [
+        ("{", "not JSON"),
+        ("[]", "preset"),
+        ('{"preset": "tiny", "train": 3}', "train"),
+        ('{"preset": "tiny", "train": {"x": 3}}', "train.x"),
+    ],
+)
 def test_broken_config_file_names_file_and_key(tmp_path, text, message):
     path = tmp_path / "config.json"
     path.write_text(text)

@@ -17,8 +17,29 @@ def run(tmp_path_factory):
     """A finished run on the ball, at a size whose reduction is no multiple of 4."""
     folder = tmp_path_factory.mktemp("evaluate")
     scene = write_ball_scene(folder / "ball", size=60)
-    assert main(["train", scene, "--out", str(folder / "run"), "--downscale", "2", "--points", "1500", "--iterations", "40",
-                 "--set", "train.crop=28", "--set", "network.widths=16,16,16", "--set", "train.final_weight=0"]) == 0
+    assert (
+        main(
+            [
+                "train",
+                scene,
+                "--out",
+                str(folder / "run"),
+                "--downscale",
+                "2",
+                "--points",
+                "1500",
+                "--iterations",
+                "40",
+                "--set",
+                "train.crop=28",
+                "--set",
+                "network.widths=16,16,16",
+                "--set",
+                "train.final_weight=0",
+            ]
+        )
+        == 0
+    )
     return folder / "run"
 
 

@@ -18,7 +18,7 @@ def depth_at(z):
 
 
 def blend_on_axis(dev, z, opacity, gamma, camera=CAMERA, **options):
-    """(Scene, weights): points at normalised depths z, straight ahead of a one-pixel camera, each with its own feature channel."""
+    """(Scene, weights): points at normalised depths z, straight ahead of a one-pixel camera, each in its own channel."""
     positions = np.stack([np.zeros(len(z)), np.zeros(len(z)), depth_at(z)], -1)
     scene = Scene(dev, camera, positions, 0.001)
     scene.blend(np.asarray(opacity), gamma, np.resize(np.eye(16), (len(z), 16)), **options)
@@ -132,7 +132,8 @@ def test_thousands_of_hits_in_one_pixel(dev, rng, gamma):
     scene, weight = blend_on_axis(dev, z, opacity, gamma)
     blend = oracle.blend(CAMERA, dense_geometry(scene), opacity, gamma)
     assert relative_error(weight, blend["weight"][:, 0]) < 1e-4
-    assert relative_error(scene.features.get().reshape(1, 16), oracle.features(blend, np.resize(np.eye(16), (20_000, 16)))) < 1e-4
+    expected = oracle.features(blend, np.resize(np.eye(16), (20_000, 16)))
+    assert relative_error(scene.features.get().reshape(1, 16), expected) < 1e-4
 
 
 def test_an_empty_view(dev):

@@ -24,7 +24,8 @@ def project_grid(dev, camera, ids, radius=0.0, **options):
 def project_spheres(dev, camera, positions, radius, kind="soft", in_pixels=False):
     """((N, 4) camera positions, (N, 4) boxes)."""
     projection = Projection(dev, Footprint(kind, in_pixels))
-    projection.spheres(dev.upload(camera.packed()), dev.upload(positions, np.float32), dev.upload(np.atleast_1d(radius), np.float32))
+    radius = dev.upload(np.atleast_1d(radius), np.float32)
+    projection.spheres(dev.upload(camera.packed()), dev.upload(positions, np.float32), radius)
     return projection.point_camera.get(), projection.point_box.get()
 
 
@@ -90,7 +91,8 @@ def test_boxes_hold_the_hits_and_little_more(dev, rng, kind):
     c, t = oracle.camera_space(camera, positions), points[:, 3].astype(np.float64)
     reach = radius if kind == "sphere" else np.maximum(radius, oracle.LEAST_RADIUS * oracle.pixel_width(camera, t))
     expected = np.empty((n, 4))
-    for axis, (focal, centre, size) in enumerate(((camera.fx, camera.cx, camera.width), (camera.fy, camera.cy, camera.height))):
+    axes = ((camera.fx, camera.cx, camera.width), (camera.fy, camera.cy, camera.height))
+    for axis, (focal, centre, size) in enumerate(axes):
         alpha, theta = np.arctan2(c[:, axis], c[:, 2]), np.arcsin(reach / np.hypot(c[:, axis], c[:, 2]))
         low, high = (np.tan(alpha + sign * theta) * focal + centre - 0.5 for sign in (-1, 1))
         low, high = (np.floor(low), np.ceil(high)) if kind == "sphere" else (np.ceil(low - 0.01), np.floor(high + 0.01))

@@ -31,7 +31,8 @@ def read_camera(fixture):
     pose = MIRROR[:, None] * np.concatenate([axes, fixture["in_cam_pos"][:, None]], 1)
     assert np.allclose(np.linalg.det(pose[:, :3]), 1, atol=1e-5)
     focal = float(fixture["in_focal_length"]) / pixel
-    return Camera(pose, focal, focal, width / 2, height / 2, width, height, float(fixture["in_min_depth"]), float(fixture["in_max_depth"]))
+    near, far = float(fixture["in_min_depth"]), float(fixture["in_max_depth"])
+    return Camera(pose, focal, focal, width / 2, height / 2, width, height, near, far)
 
 
 class Case:
@@ -46,7 +47,8 @@ class Case:
         self.scene = Scene(dev, self.camera, self.positions, self.radius, "sphere")
         # The weights sum to one, so features shifted from Pulsar's background to ours shift the picture alike.
         self.shift = 1 - self["in_bg"].astype(np.float64)
-        features = self.scene.blend(self["in_opacity"], float(self["in_gamma"]), self._padded(self["in_features"] + self.shift), **blend)
+        point_features = self._padded(self["in_features"] + self.shift)
+        features = self.scene.blend(self["in_opacity"], float(self["in_gamma"]), point_features, **blend)
         self.image = features[..., : len(self.shift)] - self.shift
 
     def __getitem__(self, key):

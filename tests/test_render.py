@@ -50,7 +50,8 @@ def chained(model, settings, camera, opacity=None, sh=None, tracked=0):
     def backward(grad_picture):
         grad_features, grad_net = unet_gradients(features.reshape(*shape, 16), parameters, grad_picture)
         grad_shaded, grad_opacity, _ = oracle_raster.blend_gradients(
-            geometry, blend, opacity, shaded, grad_features.reshape(-1, 16), GAMMA, tracked, settings.mean_gradient)
+            geometry, blend, opacity, shaded, grad_features.reshape(-1, 16), GAMMA, tracked, settings.mean_gradient
+        )
         directions = positions - padded.eye
         basis = oracle_raster.sh_basis(directions / np.linalg.norm(directions, axis=1, keepdims=True))
         return grad_shaded, grad_opacity, basis[:, :, None] * grad_shaded[:, None], grad_net
@@ -59,10 +60,12 @@ def chained(model, settings, camera, opacity=None, sh=None, tracked=0):
 
 
 SETTINGS = {
-    "soft": PointsConfig(), "soft, wide": PointsConfig(radius=1.4), "disc": PointsConfig(footprint="disc", radius=0.0015),
+    "soft": PointsConfig(),
+    "soft, wide": PointsConfig(radius=1.4),
+    "disc": PointsConfig(footprint="disc", radius=0.0015),
     "disc, the paper's gradients": PointsConfig(footprint="disc", radius=0.0015, max_tracked=3, stop=0.001),
-    "sphere": PointsConfig(footprint="sphere", radius=0.11), "sphere, Pulsar's gradients": PointsConfig(footprint="sphere", radius=0.11, max_tracked=5,
-                                                                                                  mean_gradient=True),
+    "sphere": PointsConfig(footprint="sphere", radius=0.11),
+    "sphere, Pulsar's gradients": PointsConfig(footprint="sphere", radius=0.11, max_tracked=5, mean_gradient=True),
 }
 
 
@@ -115,7 +118,7 @@ def test_padding_does_not_move_the_picture(dev, rng):
     odd = camera.crop(5, 7, 21, 19)
     assert renderer.picture(odd, GAMMA).shape == (19, 21, 3)
     left, top = renderer.offset
-    inner = renderer.features.get()[top:top + 19, left:left + 21]
+    inner = renderer.features.get()[top : top + 19, left : left + 21]
     np.testing.assert_allclose(inner, whole[7:26, 5:26], atol=2e-5)
 
 

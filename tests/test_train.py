@@ -19,8 +19,15 @@ from pp_cl.train import Trainer, _draw_start
 
 # Every mechanism of the loop is due several times within 60 steps.
 SETTINGS = {
-    "train.iterations": 60, "points.count": 1500, "network.widths": "16,16,16", "train.crop": 24, "train.prune_every": 10,
-    "train.checkpoint_every": 10, "train.log_every": 5, "train.previews": 2, "train.final_weight": 0.5,
+    "train.iterations": 60,
+    "points.count": 1500,
+    "network.widths": "16,16,16",
+    "train.crop": 24,
+    "train.prune_every": 10,
+    "train.checkpoint_every": 10,
+    "train.log_every": 5,
+    "train.previews": 2,
+    "train.final_weight": 0.5,
 }
 
 
@@ -161,13 +168,31 @@ def test_a_loss_that_is_not_finite_stops_the_run_and_keeps_the_checkpoint(scene,
 @pytest.mark.parametrize("footprint, radius", [("disc", 0.0015), ("sphere", 0.05)])
 def test_the_other_footprints_train_too(scene, tmp_path, footprint, radius):
     out = tmp_path / "run"
-    assert main(arguments(scene, out, points__footprint=footprint, points__radius=radius, points__max_tracked=64, points__stop=0.001,
-                          points__mean_gradient="true", train__iterations=30, train__crop=0, train__final_weight=0)) == 0
+    assert (
+        main(
+            arguments(
+                scene,
+                out,
+                points__footprint=footprint,
+                points__radius=radius,
+                points__max_tracked=64,
+                points__stop=0.001,
+                points__mean_gradient="true",
+                train__iterations=30,
+                train__crop=0,
+                train__final_weight=0,
+            )
+        )
+        == 0
+    )
     losses = [r["loss"] for r in rows(out)[:-1]]
     assert losses[-1] < losses[0]
 
 
-@pytest.mark.parametrize("low, high, size, limit", [(10, 50, 16, 64), (20, 30, 16, 64), (0, 5, 16, 64), (60, 64, 16, 64), (0, 64, 64, 64), (3, 60, 64, 64)])
+@pytest.mark.parametrize(
+    "low, high, size, limit",
+    [(10, 50, 16, 64), (20, 30, 16, 64), (0, 5, 16, 64), (60, 64, 16, 64), (0, 64, 64, 64), (3, 60, 64, 64)],
+)
 def test_crops_stay_inside_and_show_the_object(low, high, size, limit):
     starts = {_draw_start(np.random.default_rng(i), low, high, size, limit) for i in range(300)}
     assert min(starts) >= 0 and max(starts) + size <= limit
