@@ -44,10 +44,10 @@ inline Hits load_hits(const Camera *k, global const ulong *key, const uint count
 
 // One work-item per pixel: reads its hits, nearest first, writes their weights by pair and, with their points, by pixel.
 //
-// pair_weight: (b, db'/do), where b' is b for a fixed denominator, so that dL/do = sum db'/do G.(f - F); b is negative (-0
-// included) where the pair gets no gradient: beyond the max_tracked nearest, or behind the early stop, where it is -0.
-// The stop: once even a sphere with o = d = 1 would get less than the fraction `least` of everything so far; all that
-// follows is dropped. differs from Pulsar: it looks only when its buffer is flushed.
+// By pair: b, and b (1/o + z/gamma), finite at o = 0, whose sum with G.(f - F) is dL/do. b is negative, -0 included, where
+// the pair gets no gradient: beyond the max_tracked nearest hits, or dropped.
+// Dropped, with b = 0, are a hit and all behind it if even o = d = 1 would give it less than the fraction `least` of what
+// lies in front. differs from Pulsar: it looks only when its buffer is flushed.
 kernel void blend_weights(
     const uint hw,                           // pixels
     const uint max_tracked,                  // hits of a pixel that get gradients
@@ -79,18 +79,15 @@ kernel void blend_weights(
         D *= exp(M - m);
         M = m;
         for (uint j = 0; j < count && first + j < stop; j++) {
-            if (best[j] < least / (1.0f - least) * D)
-                stop = first + j;
-            else
-                D += term[j];
+            if (best[j] < least / (1.0f - least) * D) stop = first + j;
+            else D += term[j];
         }
     }
     for (uint first = begin; first < end; first += BATCH) {
         const uint count = min((uint)BATCH, end - first);
         const Hits h = load_hits(&k, pair_key + first, count, point_from_pair, opacity, pair_closeness);
         const float16 a = h.opacity * h.z / gamma;
-        // b/o. The exponent is large only where o d is tiny; the bound keeps 0 * exp() at 0.
-        const float16 share = h.closeness * exp(fmin(a - M, 87.0f)) / D;
+        const float16 share = h.closeness * exp(fmin(a - M, 87.0f)) / D;     // b/o; a > M only where o d is tiny or 0
         float b[BATCH], slope[BATCH];
         vstore16(h.opacity * share, 0, b);
         vstore16(share * (1.0f + a), 0, slope);
@@ -136,7 +133,7 @@ kernel void blend_backward_pixels(
     pixel_dot[q] = dot16(grad_features[q], features[q]);
 }
 
-// One work-item per point: reads its pairs and the gradients of their pixels, writes the gradients of its features and opacity.
+// One work-item per point: reads its pairs and their pixels' gradients, writes the gradients of its features and opacity.
 kernel void blend_backward(
     const uint n,                            // points
     global const float16 *point_features,    // (N, 16)
@@ -150,18 +147,16 @@ kernel void blend_backward(
 {
     const uint i = get_global_id(0);
     if (i >= n) return;
-    const uint begin = point_offset[i], end = point_offset[i + 1];
     float16 dL_df = 0.0f;
     float dL_do = 0.0f;
     uint tracked = 0;
-    const float16 f = begin < end ? point_features[i] : 0.0f;
-    for (uint pair = begin; pair < end; pair++) {
+    for (uint pair = point_offset[i]; pair < point_offset[i + 1]; pair++) {
         const float2 weight = pair_weight[pair];
         if (signbit(weight.x)) continue;
         const uint q = pair_pixel[pair];
         const float16 G = grad_features[q];
         dL_df += weight.x * G;
-        dL_do += weight.y * (dot16(G, f) - pixel_dot[q]);
+        dL_do += weight.y * (dot16(G, point_features[i]) - pixel_dot[q]);
         tracked++;
     }
     const float scale = MEAN && tracked ? 1.0f / tracked : 1.0f;
@@ -169,7 +164,7 @@ kernel void blend_backward(
     grad_opacity[i] = scale * dL_do;
 }
 
-// One work-item per point: reads what blend_backward reads, writes dL/dl of each of its pairs, l as at the top of this file.
+// One work-item per point: reads what blend_backward reads, writes dL/dl and dL/dd = dL/dl / d of its pairs (see the top).
 kernel void blend_backward_pairs(
     const uint n,                            // points
     global const float16 *point_features,    // (N, 16)
@@ -178,7 +173,8 @@ kernel void blend_backward_pairs(
     global const float2 *pair_weight,        // (P, 2)
     global const float16 *grad_features,     // (H, W, 16) G
     global const float *pixel_dot,           // (HW) G.F
-    global float *grad_pair)                 // (P)
+    global const float *pair_closeness,      // (P) d
+    global float2 *grad_pair)                // (P, 2) dL/dl, dL/dd
 {
     const uint i = get_global_id(0);
     if (i >= n) return;
@@ -187,13 +183,14 @@ kernel void blend_backward_pairs(
         tracked += !signbit(pair_weight[pair].x);
     const float scale = MEAN && tracked ? 1.0f / tracked : 1.0f;
     for (uint pair = point_offset[i]; pair < point_offset[i + 1]; pair++) {
-        const float b = pair_weight[pair].x;
         const uint q = pair_pixel[pair];
-        grad_pair[pair] = signbit(b) ? 0.0f : scale * b * (dot16(grad_features[q], point_features[i]) - pixel_dot[q]);
+        const float b = fmax(pair_weight[pair].x, 0.0f), d = pair_closeness[pair];
+        const float dL_dl = scale * b * (dot16(grad_features[q], point_features[i]) - pixel_dot[q]);
+        grad_pair[pair] = (float2)(dL_dl, d > 0.0f ? dL_dl / d : 0.0f);
     }
 }
 
-// One work-item per sphere: reads dL/dl of its pairs, writes the gradients of its position and radius.
+// One work-item per sphere: reads the gradients of its pairs, writes those of its position and radius.
 kernel void blend_backward_spheres(
     const uint n,                            // spheres
     const uint k,                            // radii: 1 (all alike) or n
@@ -204,7 +201,7 @@ kernel void blend_backward_spheres(
     global const float *opacity,             // (N)
     global const uint *point_offset,         // (N+1)
     global const uint *pair_pixel,           // (P)
-    global const float *grad_pair,           // (P) dL/dl
+    global const float2 *grad_pair,          // (P, 2) dL/dl, dL/dd
     global float *grad_positions,            // (N, 3) world
     global float *grad_radius)               // (N)
 {
@@ -227,14 +224,13 @@ kernel void blend_backward_spheres(
 
         // depth = along - half_chord; half_chord is the constant 0 where the ray misses the sphere itself
         const float per_chord = half_chord > 0.0f ? 1.0f / half_chord : 0.0f;
-        const float dL_ddepth = grad_pair[pair] * dl_ddepth;
+        const float dL_ddepth = grad_pair[pair].x * dl_ddepth;
         dL_dc += dL_ddepth * (ray + per_chord * across);
         dL_dR -= dL_ddepth * f.radius * per_chord;
 
-        // d = 1 - rho/R; the constant 1 for tiny spheres, 0 beyond the rim; no direction at the very centre
-        const float d = 1.0f - rho / f.radius;
-        if (d > 0.0f && rho > 0.0f && !(f.tiny && rho < f.least)) {
-            const float dL_dd = grad_pair[pair] / d;
+        // d = 1 - rho/R, but the constant 1 near the centre of tiny spheres; at the very centre it has no slope
+        if (rho > 0.0f && !(f.tiny && rho < f.least)) {
+            const float dL_dd = grad_pair[pair].y;
             dL_dc += dL_dd * (f.centre / f.t * dot(ray, delta) - delta) / (rho * f.radius);
             dL_dR += dL_dd * rho / (f.radius * f.radius);
         }

@@ -28,7 +28,7 @@
 
 typedef struct {
     float3 centre;               // camera axes
-    float t;                     // its distance from the eye; < 0: the point is left out
+    float t;                     // its distance from the eye
     float radius;                // world units
     float least;                 // LEAST_RADIUS pixels at range t, world units
     int tiny;                    // the radius is below one pixel
@@ -56,8 +56,8 @@ ALWAYS_INLINE Footprint footprint_load(const Camera *k, const float4 point, cons
 
 // Pixels that may be hit: first x, first y, last x, last y, inside the image; no pixel is where last < first.
 //
-// The tangents from the eye to a circle of radius r at (u, z), u = x or y, have the slopes m with (m z - u)^2 = r^2 (1 + m^2);
-// there are none where the circle reaches the eye's plane, and so no bounds.
+// The tangents from the eye to a circle of radius r at (u, z), u = x or y, have slopes m with (m z - u)^2 = r^2 (1 + m^2); a
+// circle that reaches the eye's plane has no bounds.
 ALWAYS_INLINE int4 footprint_box(const Camera *k, const Footprint *f) {
     const float z = f->centre.z, reach = FOOTPRINT == SPHERE ? f->radius : fmax(f->radius, f->least);
     const float scale = z * z - reach * reach;
@@ -66,19 +66,19 @@ ALWAYS_INLINE int4 footprint_box(const Camera *k, const Footprint *f) {
     const float4 size = (float4)(k->width, k->height, k->width, k->height);
     const float4 limits = slopes * (float4)(k->fx, k->fy, k->fx, k->fy) + ((float4)(k->cx, k->cy, k->cx, k->cy) - 0.5f);
 #if FOOTPRINT == SPHERE
-    const float4 margin = 0.0f;              // from floor(first) to ceil(last): Pulsar's box is part of its hit rule
+    const float margin = 0.0f;               // from floor(first) to ceil(last): Pulsar's box is part of its hit rule
     const int4 step = (int4)(0, 0, 1, 1);
 #else
-    const float4 margin = 0.01f;             // pixels; far above the rounding of `limits`
+    const float margin = 0.01f;              // pixels; far above the rounding of `limits`
     const int4 step = (int4)(1, 1, 0, 0);
 #endif
-    const float4 wide = limits + (float4)(-margin.xy, margin.xy);
+    const float4 wide = limits + (float4)(-margin, -margin, margin, margin);
     const float4 bounded = clamp(z > reach ? wide : (float4)(-2.0f, -2.0f, size.zw), -2.0f, size);
     const int4 box = convert_int4(bounded + 2.0f) - 2 + step;                // x + 2 >= 0, so truncation is floor
     return (int4)(max(box.xy, 0), min(box.zw, (int2)(k->width - 1, k->height - 1)));
 }
 
-// Tests the 4 x 4 pixels from (x, y) on that lie in the box: the result has bit 4 j + i set where pixel (x + i, y + j) is hit.
+// Tests the 4 x 4 pixels from (x, y) on that lie in the box: bit 4 j + i of the result is pixel (x + i, y + j).
 ALWAYS_INLINE uint footprint_block(const Camera *k, const Footprint *f, const int4 box, const int x, const int y,
                                    float16 *closeness, float16 *depth) {
     // Counting and filling must find the same hits, so no compiler may round here in one way and there in another.
@@ -90,16 +90,11 @@ ALWAYS_INLINE uint footprint_block(const Camera *k, const Footprint *f, const in
     const float16 ex = f->centre.x - range * mx, ey = f->centre.y - range * my, ez = f->centre.z - range;
     const float16 rho2 = ex * ex + ey * ey + ez * ez;                        // |c - t r|^2; the expanded square would cancel
     int16 hit = px <= (float)box.z && py <= (float)box.w;
-#if FOOTPRINT == DISC
-    // differs from Pulsar: its d falls off once the radius exceeds a pixel, and its depth is the front's, up to R nearer.
+#if FOOTPRINT != SPHERE
+    // differs from Pulsar: its depth is the front's, up to R nearer, and the d of its discs falls off from a pixel's radius on.
     const float reach = fmax(f->radius, f->least);
     hit = hit && rho2 < reach * reach;
-    *closeness = 1.0f;
-    *depth = f->t;
-#elif FOOTPRINT == SOFT
-    const float reach = fmax(f->radius, f->least);
-    hit = hit && rho2 < reach * reach;
-    *closeness = 1.0f - sqrt(rho2) / reach;
+    *closeness = FOOTPRINT == DISC ? (float16)(1.0f) : 1.0f - sqrt(rho2) / reach;
     *depth = f->t;
 #else
     const float16 rho = sqrt(rho2);

@@ -20,8 +20,8 @@ inline uint mix(uint x) {
     return x ^ (x >> 16);
 }
 
-// Writes (x, y, z, t) in camera axes and the box of pixels that may be hit, or LEFT_OUT and NO_PIXEL: too near, too far (both
-// measured at the sphere's front, as Pulsar does), behind the eye, or not finite, for which every comparison is false.
+// Writes (x, y, z, t) in camera axes and the box of pixels that may be hit. A point is left out if it is too near or too far
+// (measured at the sphere's front, as in Pulsar), behind the eye, or not finite, for which every comparison is false.
 inline void project(const Camera *k, const float3 position, const float radius, const int wanted,
                     global float4 *point_camera, global ushort4 *point_box) {
     const float3 c = camera_from_world(k, position);
@@ -54,7 +54,7 @@ kernel void project_grid(
     project(&k, grid_position(grid, id), radius, mix(id + mix(seed)) >= dropout, point_camera + i, point_box + i);
 }
 
-// One work-item per sphere: reads its position and radius, writes its camera-space position and distance, and its box of pixels.
+// One work-item per sphere: reads its position and radius, writes the same as project_grid.
 kernel void project_spheres(
     const uint n,                        // spheres
     const uint k,                        // radii: 1 (all alike) or n

@@ -48,8 +48,8 @@ class Blend:
 
         point_radius: (1) or (N). point_camera: (N,4) from project. The rest as for weights and backward.
         """
-        n, grad_pair = pairs.points, self.dev.empty((pairs.capacity,))
-        self.program.launch("blend_backward_pairs", n, n=n, grad_pair=grad_pair,
+        n, grad_pair = pairs.points, self.dev.empty((pairs.capacity, 2))
+        self.program.launch("blend_backward_pairs", n, n=n, pair_closeness=pairs.pair_closeness, grad_pair=grad_pair,
                             **self._slopes(pairs, point_features, features, grad_features))
         self.program.launch(
             "blend_backward_spheres", n, n=n, k=point_radius.size, gamma=gamma, camera=view, point_radius=point_radius,

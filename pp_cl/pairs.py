@@ -42,8 +42,9 @@ class Pairs:
         self._reserve(read_total(self.dev, self.point_offset))
 
         self.dev.fill(self.pixel_count, 0)
-        launch("pairs_fill", n, point_offset=self.point_offset, pair_pixel=self.pair_pixel, pair_closeness=self.pair_closeness,
-               point_from_pair=self.point_from_pair, pair_place=self.hit, pixel_count=self.pixel_count, **points)
+        launch("pairs_fill", n, point_offset=self.point_offset, pair_pixel=self.pair_pixel,
+               pair_closeness=self.pair_closeness, point_from_pair=self.point_from_pair, pair_place=self.hit,
+               pixel_count=self.pixel_count, **points)
         exclusive_scan(self.dev, self.pixel_count, self.pixel_offset)
         launch("pairs_scatter", self.total, pairs=self.total, pair_pixel=self.pair_pixel, pair_place=self.hit,
                pixel_offset=self.pixel_offset, pair_key=self.pair_key)

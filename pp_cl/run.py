@@ -145,7 +145,7 @@ def _optimise(trainer, config, folder, info):
                         "rates": trainer.rates(),
                     },
                 )
-                bar.set_postfix(psnr=f"{terms['psnr']:.2f}", points=trainer.model.count)
+                bar.set_postfix(psnr=f"{terms['psnr']:.2f}", points=trainer.model.count, refresh=False)
             if t % settings.checkpoint_every == 0 and not last:
                 _save(trainer, folder, info, finished=False)
             if t % preview_every == 0 or last:

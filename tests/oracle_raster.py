@@ -87,7 +87,7 @@ def order(geometry_):
 
 
 def blend(camera, geometry_, opacity, gamma, stop=0.0):
-    """Dict: weight (N, HW) b; share (N, HW) b/o, with its limit at o = 0; z (N, HW); background (HW,) b_0; hit (N, HW) used."""
+    """Dict: weight (N, HW) b; share (N, HW) b/o, its limit at o = 0; z (N, HW); background (HW,) b_0; hit (N, HW) used."""
     hit, d = geometry_["hit"], geometry_["closeness"]
     o = np.asarray(opacity, np.float64)[:, None]
     z = 1 - (geometry_["depth"] - camera.near) / (camera.far - camera.near)

@@ -126,6 +126,30 @@ def test_a_ray_through_the_centre_of_a_sphere_has_gradients(dev):
     assert gradients["radius"][0] > 0
 
 
+def test_a_hit_on_the_very_rim(dev):
+    """d = 0 with an exponent above that of the largest float: no weight, no gradient, no NaN."""
+    camera = replace(CAMERA, near=1.8, far=10.0)
+    scene = Scene(dev, camera, np.array([[3.0, 0, 4.0]]), np.sqrt(10.0), "sphere")  # rho = |(3, 0, 4) - 5 (0, 0, 1)|
+    assert scene.pairs.total == 1 and scene.pairs.pair_closeness.get()[0] == 0
+    assert (scene.blend([1.0], 0.005, np.full((1, 16), 2.0)) == 1).all()
+    gradients = scene.gradients(np.ones((1, 1, 16))) | scene.sphere_gradients(np.ones((1, 1, 16)))
+    assert all((g == 0).all() for g in gradients.values())
+
+
+def test_the_early_stop_spares_points_beyond_far(dev):
+    """At z < 0 a lower opacity has more weight than the opacity 1."""
+    scene = Scene(dev, CAMERA, np.array([[0, 0, FAR + 0.3]]), 0.4)
+    weight = 1 - scene.blend([0.133], 0.01, np.zeros((1, 16)), stop=0.01)[0, 0, 0]
+    expected = 0.133 * np.exp(-0.133 * 0.075 / 0.01)
+    assert relative_error(weight, expected / (1 + expected)) < 1e-3
+
+
+def test_a_point_at_the_eye(dev):
+    """It has no direction, and is left out even where near = 0 would let it in."""
+    scene = Scene(dev, replace(CAMERA, near=0.0), np.zeros((1, 3)), 0.0)
+    assert scene.projection.point_camera.get().tolist() == [[0, 0, 0, -1]]
+
+
 @pytest.mark.parametrize("gamma", [0.1, 0.01])
 def test_thousands_of_hits_in_one_pixel(dev, rng, gamma):
     z, opacity = rng.uniform(0.1, 0.99, 20_000), np.float32(rng.uniform(0, 1, 20_000))

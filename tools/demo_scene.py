@@ -1,0 +1,32 @@
+"""Write the demo scene as a NeRF-synthetic folder, with its mesh: python tools/demo_scene.py FOLDER [--size S]."""
+
+import argparse
+import sys
+from pathlib import Path
+
+import trimesh
+
+from pp_cl.demo import SIZE, demo_mesh, demo_scene, write_scene
+from pp_cl.device import open_device
+from pp_cl.errors import UserError
+
+
+def main():
+    """Render, write, and say what was written; returns the exit status."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("folder", type=Path, help="where to; must not exist, or be empty")
+    parser.add_argument("--size", type=int, default=SIZE, help=f"side of the images in pixels ({SIZE})")
+    options = parser.parse_args()
+    try:
+        dev = open_device()
+        write_scene(demo_scene(dev, size=options.size), options.folder)
+    except UserError as error:
+        print(f"demo_scene: {error}", file=sys.stderr)
+        return 2
+    trimesh.Trimesh(*demo_mesh(dev)).export(options.folder / "mesh.ply")
+    print(f"wrote {options.folder}: transforms_*.json, images, mesh.ply")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
