@@ -67,14 +67,14 @@ ALWAYS_INLINE int4 footprint_box(const Camera *k, const Footprint *f) {
     const float4 limits = slopes * (float4)(k->fx, k->fy, k->fx, k->fy) + ((float4)(k->cx, k->cy, k->cx, k->cy) - 0.5f);
 #if FOOTPRINT == SPHERE
     const float margin = 0.0f;               // from floor(first) to ceil(last): Pulsar's box is part of its hit rule
-    const int4 step = (int4)(0, 0, 1, 1);
+    const int4 rounding = (int4)(0, 0, 1, 1);
 #else
     const float margin = 0.01f;              // pixels; far above the rounding of `limits`
-    const int4 step = (int4)(1, 1, 0, 0);
+    const int4 rounding = (int4)(1, 1, 0, 0);
 #endif
     const float4 wide = limits + (float4)(-margin, -margin, margin, margin);
-    const float4 bounded = clamp(z > reach ? wide : (float4)(-2.0f, -2.0f, size.zw), -2.0f, size);
-    const int4 box = convert_int4(bounded + 2.0f) - 2 + step;                // x + 2 >= 0, so truncation is floor
+    const float4 bounded = clamp(z > reach ? wide : (float4)(-2.0f, -2.0f, size.zw), (float4)(-2.0f), size);
+    const int4 box = convert_int4(bounded + 2.0f) - 2 + rounding;            // x + 2 >= 0, so truncation is floor
     return (int4)(max(box.xy, 0), min(box.zw, (int2)(k->width - 1, k->height - 1)));
 }
 
@@ -91,7 +91,7 @@ ALWAYS_INLINE uint footprint_block(const Camera *k, const Footprint *f, const in
     const float16 rho2 = ex * ex + ey * ey + ez * ez;                        // |c - t r|^2; the expanded square would cancel
     int16 hit = px <= (float)box.z && py <= (float)box.w;
 #if FOOTPRINT != SPHERE
-    // differs from Pulsar: its depth is the front's, up to R nearer, and the d of its discs falls off from a pixel's radius on.
+    // differs from Pulsar: its depth is the front's, up to R nearer, and from a radius of a pixel on no d is constant.
     const float reach = fmax(f->radius, f->least);
     hit = hit && rho2 < reach * reach;
     *closeness = FOOTPRINT == DISC ? (float16)(1.0f) : 1.0f - sqrt(rho2) / reach;

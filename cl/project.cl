@@ -12,7 +12,7 @@
 #define LEAST_COSINE 1e-6f
 
 // A well mixed integer (lowbias32 by Chris Wellons).
-inline uint mix(uint x) {
+inline uint scramble(uint x) {
     x ^= x >> 16;
     x *= 0x7feb352du;
     x ^= x >> 15;
@@ -51,7 +51,7 @@ kernel void project_grid(
     if (i >= n) return;
     const Camera k = camera_load(camera);
     const uint id = point_id[i];
-    project(&k, grid_position(grid, id), radius, mix(id + mix(seed)) >= dropout, point_camera + i, point_box + i);
+    project(&k, grid_position(grid, id), radius, scramble(id + scramble(seed)) >= dropout, point_camera + i, point_box + i);
 }
 
 // One work-item per sphere: reads its position and radius, writes the same as project_grid.

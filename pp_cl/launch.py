@@ -119,8 +119,13 @@ class Kernel:
         return arguments
 
     def _scalar(self, p, value):
-        try:  # index() refuses the 2.5 that numpy would cut to 2
-            return p.dtype(operator.index(value) if issubclass(p.dtype, np.integer) else float(value))
+        try:
+            if not issubclass(p.dtype, np.integer):
+                return p.dtype(float(value))
+            number = p.dtype(operator.index(value))  # index() refuses the 2.5 that numpy would cut to 2
+            if number != value:
+                raise OverflowError("out of range")  # numpy before 2 wraps around
+            return number
         except (TypeError, OverflowError) as error:
             raise TypeError(f"{self.label}: {p.name} = {value!r} is no {np.dtype(p.dtype)}: {error}") from error
 

@@ -108,3 +108,10 @@ def test_boxes_reach_all_over_the_image_beside_the_eye(dev):
     points, boxes = project_spheres(dev, camera, np.array([[1.0, 0.0, 0.5]]), 0.6, "sphere")
     assert points[0, 3] > 0
     assert boxes[0].tolist() == [0, 0, camera.width - 1, camera.height - 1]
+
+
+def test_unknown_footprints_are_refused():
+    with pytest.raises(ValueError, match="no such footprint"):
+        Footprint("square")
+    with pytest.raises(ValueError, match="no such footprint"):
+        Footprint("sphere", in_pixels=True)
