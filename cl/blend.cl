@@ -2,6 +2,8 @@
 //
 // l_i = ln(o_i d_i) + o_i z_i/gamma,  b_i = exp(l_i - M)/D,  b_0 = exp(EPS/gamma - M)/D,  F = sum b_i f_i + b_0 * 1
 // with M = max(EPS/gamma, max l_i) and D the sum of the exponentials, so that no exponent is positive and D >= 1.
+//
+// vec_type_hint: the vectors are written out; Intel's compiler would merge work-items into wider ones, up to 8 times slower.
 #include "common.h"
 #include "footprint.h"
 
@@ -48,7 +50,7 @@ inline Hits load_hits(const Camera *k, global const ulong *key, const uint count
 // the pair gets no gradient: beyond the max_tracked nearest hits, or dropped.
 // Dropped, with b = 0, are a hit and all behind it if even o = d = 1 would give it less than the fraction `least` of what
 // lies in front. differs from Pulsar: it looks only when its buffer is flushed.
-kernel void blend_weights(
+kernel __attribute__((vec_type_hint(float16))) void blend_weights(
     const uint hw,                           // pixels
     const uint max_tracked,                  // hits of a pixel that get gradients
     const float gamma,
@@ -134,7 +136,7 @@ kernel void blend_backward_pixels(
 }
 
 // One work-item per point: reads its pairs and their pixels' gradients, writes the gradients of its features and opacity.
-kernel void blend_backward(
+kernel __attribute__((vec_type_hint(float16))) void blend_backward(
     const uint n,                            // points
     global const float16 *point_features,    // (N, 16)
     global const uint *point_offset,         // (N+1)

@@ -1,12 +1,14 @@
 // Pairs: every (point, pixel) hit. Those of one point lie together, in the order of the points; each pixel has a list of
 // keys (depth << 32 | pair), sorted by depth, then by pair and so by point.
+//
+// vec_type_hint: the vectors are written out; Intel's compiler would merge work-items into wider ones, which is slower.
 #include "common.h"
 #include "footprint.h"
 
 #define RUN 64                   // keys ranked at once by comparing all with all, 8 a step; longer lists are merged
 
 // One work-item per point: reads where it is, writes its number of hits.
-kernel void pairs_count(
+kernel __attribute__((vec_type_hint(float16))) void pairs_count(
     const uint n,                            // points
     const uint k,                            // radii: 1 (all alike) or n
     global const float *camera,              // (20) camera.h
@@ -31,7 +33,7 @@ kernel void pairs_count(
 }
 
 // One work-item per point: finds its hits again, writes them as pairs and counts them at their pixels.
-kernel void pairs_fill(
+kernel __attribute__((vec_type_hint(float16))) void pairs_fill(
     const uint n,                            // points
     const uint k,                            // radii: 1 (all alike) or n
     global const float *camera,              // (20) camera.h
@@ -112,7 +114,7 @@ inline void merge(global const ulong *keys, const uint middle, const uint count,
 }
 
 // One work-item per pixel: sorts its keys in place.
-kernel void pairs_sort(
+kernel __attribute__((vec_type_hint(ulong8))) void pairs_sort(
     const uint hw,                           // pixels
     global const uint *pixel_offset,         // (HW+1)
     global ulong *scratch,                   // (P)
