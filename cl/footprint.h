@@ -11,9 +11,6 @@
 #ifndef FOOTPRINT
 #define FOOTPRINT SOFT
 #endif
-#ifndef RADIUS_IN_PIXELS
-#define RADIUS_IN_PIXELS 0       // 1: radii are pixels at the image's centre instead of world units
-#endif
 
 #define ALWAYS_INLINE __attribute__((always_inline)) inline  // PoCL calls larger functions, passing the structs in memory
 
@@ -39,16 +36,12 @@ inline float pixel_width(const Camera *k, const float t) {
     return t / fmin(k->fx, k->fy);
 }
 
-inline float world_radius(const Camera *k, const float radius, const float t) {
-    return RADIUS_IN_PIXELS ? radius * pixel_width(k, t) : radius;
-}
-
 ALWAYS_INLINE Footprint footprint_load(const Camera *k, const float4 point, const float radius) {
     Footprint f;
     const float width = pixel_width(k, point.w);
     f.centre = point.xyz;
     f.t = point.w;
-    f.radius = world_radius(k, radius, point.w);
+    f.radius = radius;
     f.least = LEAST_RADIUS * width;
     f.tiny = f.radius < width;
     return f;

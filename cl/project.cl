@@ -26,7 +26,7 @@ inline void project(const Camera *k, const float3 position, const float radius, 
                     global float4 *point_camera, global ushort4 *point_box) {
     const float3 c = camera_from_world(k, position);
     const float t = sqrt(c.x * c.x + c.y * c.y + c.z * c.z);
-    const float front = t - world_radius(k, radius, t);
+    const float front = t - radius;
     const int kept = wanted & (front >= k->near) & (front <= k->far) & (t > 0.0f) & (c.z >= LEAST_COSINE * t);
     const Footprint f = footprint_load(k, (float4)(c, t), radius);
     const int4 box = footprint_box(k, &f);

@@ -8,8 +8,8 @@ from pp_cl.scene import reduced_camera
 
 MIB = 2**20
 MOMENTS = 2  # Adam's
-PAIR_BYTES = 28  # pixel, closeness, point, weight: 4 each; key and sort scratch: 6 each on average, with spare room
-POINT_VIEW_FLOATS = 4 + 16 + 16 + 1 + 4  # camera position, features, their gradient, opacity gradient, offsets and lists
+PAIR_BYTES = 45  # two keys of 8, pixel, closeness, point and two weights of 4 bytes, a quarter of spare room
+POINT_VIEW_FLOATS = 4 + 2 + 16 + 16 + 1 + 3  # camera position, box, features, their gradient, opacity's, lists
 
 
 def memory_plan(dev, config, model, views):

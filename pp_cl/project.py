@@ -12,21 +12,19 @@ class Footprint:
     """What a point covers (cl/footprint.h).
 
     kind: "disc" (the paper's hard disc: 0.75 pixels, or the radius if that is more), "soft" (closeness falls linearly to
-    the same rim) or "sphere" (Pulsar's general spheres). in_pixels: radii are pixels at the image's centre, not world units.
-    Raises ValueError for an unknown kind, and for spheres in pixels.
+    the same rim) or "sphere" (Pulsar's general spheres). Raises ValueError for another kind.
     """
 
     kind: str = "soft"
-    in_pixels: bool = False
 
     def __post_init__(self):
-        if self.kind not in KINDS or (self.kind == "sphere" and self.in_pixels):
+        if self.kind not in KINDS:
             raise ValueError(f"no such footprint: {self}")
 
     @property
     def defines(self):
         """{macro: value} for the programs that include footprint.h."""
-        return {"FOOTPRINT": KINDS.index(self.kind), "RADIUS_IN_PIXELS": int(self.in_pixels)}
+        return {"FOOTPRINT": KINDS.index(self.kind)}
 
 
 class Projection:

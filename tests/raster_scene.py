@@ -29,13 +29,13 @@ def make_points(rng, n):
 class Scene:
     """Points projected and paired with the pixels of a camera; arrays are float64 or float32 numpy.
 
-    positions: (N, 3). radius: one number or (N,), world units, or pixels with in_pixels.
+    positions: (N, 3). radius: one number or (N,), world units.
     """
 
-    def __init__(self, dev, camera, positions, radius, kind="soft", in_pixels=False):
+    def __init__(self, dev, camera, positions, radius, kind="soft"):
         self.dev, self.camera, self.n = dev, camera, len(positions)
         self.shape = (camera.height, camera.width)
-        self.footprint = Footprint(kind, in_pixels)
+        self.footprint = Footprint(kind)
         self.view = dev.upload(camera.packed())
         self.radius = dev.upload(np.atleast_1d(radius), np.float32)
         self.projection = Projection(dev, self.footprint)

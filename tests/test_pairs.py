@@ -52,13 +52,6 @@ def test_radii_of_all_sizes(dev, rng, kind, n):
     check(Scene(dev, camera, positions, radius, kind), oracle.geometry(camera, positions, radius, kind))
 
 
-@pytest.mark.parametrize("kind", ["disc", "soft"])
-def test_radii_in_pixels(dev, rng, kind):
-    camera, positions = make_camera(), make_points(rng, 300)
-    world = 1.7 * oracle.pixel_width(camera, np.linalg.norm(oracle.camera_space(camera, positions), axis=1))
-    check(Scene(dev, camera, positions, 1.7, kind, in_pixels=True), oracle.geometry(camera, positions, world, kind))
-
-
 def test_a_crop_sees_the_same_hits(dev, rng):
     camera, positions = make_camera(40, 36), make_points(rng, 300)
     whole = Scene(dev, camera, positions, 0.1).hits().reshape(-1, 36, 40)

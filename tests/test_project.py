@@ -21,9 +21,9 @@ def project_grid(dev, camera, ids, radius=0.0, **options):
     return projection.point_camera.get()
 
 
-def project_spheres(dev, camera, positions, radius, kind="soft", in_pixels=False):
+def project_spheres(dev, camera, positions, radius, kind="soft"):
     """((N, 4) camera positions, (N, 4) boxes)."""
-    projection = Projection(dev, Footprint(kind, in_pixels))
+    projection = Projection(dev, Footprint(kind))
     radius = dev.upload(np.atleast_1d(radius), np.float32)
     projection.spheres(dev.upload(camera.packed()), dev.upload(positions, np.float32), radius)
     return projection.point_camera.get(), projection.point_box.get()
@@ -53,13 +53,11 @@ def test_spheres_are_culled_at_their_front(dev, rng, n):
     assert (points[~kept] == [0, 0, 0, -1]).all()
 
 
-def test_near_and_far_are_inclusive_and_radii_in_pixels_count(dev):
+def test_near_and_far_are_inclusive_and_the_radius_counts(dev):
     camera = replace(make_camera(focal=32.0), pose=np.eye(3, 4), fy=32.0, near=2.0, far=4.0)
     positions = np.array([[0, 0, 2.0], [0, 0, 1.9999], [0, 0, 4.0], [0, 0, 4.0001]])
     assert (project_spheres(dev, camera, positions, 0.0)[0][:, 3] > 0).tolist() == [True, False, True, False]
-    # a radius of 8 pixels is a quarter of the distance, so the front is at 0.75 t
-    positions = np.array([[0, 0, 2.66], [0, 0, 2.67], [0, 0, 5.33], [0, 0, 5.34]])
-    assert (project_spheres(dev, camera, positions, 8.0, in_pixels=True)[0][:, 3] > 0).tolist() == [False, True, True, False]
+    assert (project_spheres(dev, camera, positions + [0, 0, 0.5], 0.5)[0][:, 3] > 0).tolist() == [True, False, True, False]
 
 
 def test_one_radius_means_all_alike(dev, rng):
@@ -113,5 +111,3 @@ def test_boxes_reach_all_over_the_image_beside_the_eye(dev):
 def test_unknown_footprints_are_refused():
     with pytest.raises(ValueError, match="no such footprint"):
         Footprint("square")
-    with pytest.raises(ValueError, match="no such footprint"):
-        Footprint("sphere", in_pixels=True)
