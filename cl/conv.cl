@@ -4,7 +4,7 @@
 // K weight vectors per block and TILE + K - 1 scalars, and does K * BLOCKS * TILE vector multiply-adds with them. TILE and
 // BLOCKS are chosen so that accumulators and weights fit the 32 vector registers of AVX-512 (pp_cl/conv.py).
 #include "common.h"
-#include "lanes.h"
+#include "vector.h"
 
 #ifndef K
 #define K 3                  // side of the kernel: 1 or 3
@@ -102,9 +102,12 @@ kernel void conv_forward(
     for (int b = 0; b < BLOCKS; b++)
         #pragma unroll
         for (int p = 0; p < TILE; p++)
-            if (x0 + p >= tile_x)
-                store_lanes(relu ? select(acc[b][p], (float16)(0.0f), acc[b][p] < 0.0f) : acc[b][p],  // keeps NaN, as max would not
-                            out + ((size_t)y * width + x0 + p) * co + (block + b) * 16, co - (block + b) * 16);
+            if (x0 + p >= tile_x) {
+                // max(., 0) would hide a NaN
+                const float16 value = relu ? select(acc[b][p], (float16)(0.0f), acc[b][p] < 0.0f) : acc[b][p];
+                store16(value, out + ((size_t)y * width + x0 + p) * co + (block + b) * 16,
+                        co - (block + b) * 16);
+            }
 }
 
 // One work-item per (tile, row, BLOCKS * 16 input channels): reads grad_out, and writes its tile of grad_x, which is the
@@ -141,7 +144,7 @@ kernel void conv_backward_input(
             if (x0 + p >= tile_x) {
                 const size_t at = ((size_t)y * width + x0 + p) * c + (block + b) * 16;
                 const int lanes = c - (block + b) * 16;
-                const float16 dL_dx = masked ? select((float16)0.0f, acc[b][p], load_lanes(x + at, lanes) > 0.0f) : acc[b][p];
-                store_lanes(dL_dx, grad_x + at, lanes);
+                const float16 dL_dx = masked ? select((float16)0.0f, acc[b][p], load16(x + at, lanes) > 0.0f) : acc[b][p];
+                store16(dL_dx, grad_x + at, lanes);
             }
 }

@@ -1,6 +1,6 @@
 // The weight side of a K x K convolution: its weight and bias gradients, and the weights its input gradient is made with.
 #include "common.h"
-#include "lanes.h"
+#include "vector.h"
 
 #ifndef K
 #define K 3                  // side of the kernel: 1 or 3
@@ -70,12 +70,12 @@ kernel void conv_backward_weights(
         for (int kx = 0; kx < K; kx++)
             window[kx] = 0.0f;
         if (PAD)
-            window[0] = load_lanes(grad, lanes);
+            window[0] = load16(grad, lanes);
         for (int column = 0; column < width; column++) {
             #pragma unroll
             for (int kx = K - 1; kx > 0; kx--)
                 window[kx] = window[kx - 1];
-            window[0] = column + PAD < width ? load_lanes(grad + (column + PAD) * co, lanes) : (float16)0.0f;
+            window[0] = column + PAD < width ? load16(grad + (column + PAD) * co, lanes) : (float16)0.0f;
             #pragma unroll
             for (int i = 0; i < CI_TILE; i++) {
                 const float value = pixel[column * c + i];

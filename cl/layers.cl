@@ -1,7 +1,7 @@
 // The layers between convolutions, on (H, W, C) feature maps: pooling, bilinear upsampling, a straight line.
 // But for the last, a work-item is (16 channels, x, y): one vector of a pixel, shorter where C ends.
 #include "common.h"
-#include "lanes.h"
+#include "vector.h"
 
 // One work-item per (16 channels, x, y) of out: reads the 2x2 pixels it covers, writes their mean.
 kernel void avgpool2_forward(
@@ -15,9 +15,9 @@ kernel void avgpool2_forward(
     if (first >= c || column >= w || row >= h)
         return;
     global const float *upper = x + ((size_t)row * 4 * w + column * 2) * c + first, *lower = upper + 2 * w * c;
-    const float16 sum = (load_lanes(upper, lanes) + load_lanes(upper + c, lanes))
-                      + (load_lanes(lower, lanes) + load_lanes(lower + c, lanes));
-    store_lanes(0.25f * sum, out + ((size_t)row * w + column) * c + first, lanes);
+    const float16 sum = (load16(upper, lanes) + load16(upper + c, lanes))
+                      + (load16(lower, lanes) + load16(lower + c, lanes));
+    store16(0.25f * sum, out + ((size_t)row * w + column) * c + first, lanes);
 }
 
 // One work-item per (16 channels, x, y) of x: ADDS its share of grad_out to grad_x, which holds the gradient from x's other
@@ -34,9 +34,9 @@ kernel void avgpool2_backward(
     if (first >= c || column >= 2 * w || row >= 2 * h)
         return;
     const size_t at = ((size_t)row * 2 * w + column) * c + first;
-    const float16 dL_dout = load_lanes(grad_out + ((size_t)(row / 2) * w + column / 2) * c + first, lanes);
-    const float16 dL_dx = load_lanes(grad_x + at, lanes) + 0.25f * dL_dout;
-    store_lanes(select((float16)0.0f, dL_dx, load_lanes(x + at, lanes) > 0.0f), grad_x + at, lanes);
+    const float16 dL_dout = load16(grad_out + ((size_t)(row / 2) * w + column / 2) * c + first, lanes);
+    const float16 dL_dx = load16(grad_x + at, lanes) + 0.25f * dL_dout;
+    store16(select((float16)0.0f, dL_dx, load16(x + at, lanes) > 0.0f), grad_x + at, lanes);
 }
 
 // One work-item per (16 channels, x, y) of out: reads the 2x2 pixels it covers, writes their largest; an odd last row or
@@ -53,9 +53,9 @@ kernel void maxpool2_forward(
     if (first >= c || column >= w || row >= h)
         return;
     global const float *upper = x + ((size_t)row * 2 * x_width + column * 2) * c + first, *lower = upper + x_width * c;
-    const float16 largest = fmax(fmax(load_lanes(upper, lanes), load_lanes(upper + c, lanes)),
-                                 fmax(load_lanes(lower, lanes), load_lanes(lower + c, lanes)));
-    store_lanes(largest, out + ((size_t)row * w + column) * c + first, lanes);
+    const float16 largest = fmax(fmax(load16(upper, lanes), load16(upper + c, lanes)),
+                                 fmax(load16(lower, lanes), load16(lower + c, lanes)));
+    store16(largest, out + ((size_t)row * w + column) * c + first, lanes);
 }
 
 // One work-item per (16 channels, x, y) of out, which is twice as high and wide as x: reads the pixel of x that out's
@@ -74,9 +74,9 @@ kernel void upsample2_forward(
     const int near = column / 2 * c, beside = clamp(column / 2 - 1 + 2 * (column & 1), 0, w - 1) * c;
     const int other = clamp(row / 2 - 1 + 2 * (row & 1), 0, h - 1);
     global const float *a = x + (size_t)(row / 2) * w * c + first, *b = x + (size_t)other * w * c + first;
-    const float16 upper = 0.75f * load_lanes(a + near, lanes) + 0.25f * load_lanes(a + beside, lanes);
-    const float16 lower = 0.75f * load_lanes(b + near, lanes) + 0.25f * load_lanes(b + beside, lanes);
-    store_lanes(0.75f * upper + 0.25f * lower, out + ((size_t)row * 2 * w + column) * c + first, lanes);
+    const float16 upper = 0.75f * load16(a + near, lanes) + 0.25f * load16(a + beside, lanes);
+    const float16 lower = 0.75f * load16(b + near, lanes) + 0.25f * load16(b + beside, lanes);
+    store16(0.75f * upper + 0.25f * lower, out + ((size_t)row * 2 * w + column) * c + first, lanes);
 }
 
 // One work-item per (16 channels, x, y) of x: gathers the 4x4 pixels of grad_out that read it, writes their weighted sum.
@@ -97,11 +97,11 @@ kernel void upsample2_backward(
     for (int dy = 0; dy < 4; dy++) {
         const int y = clamp(2 * row - 1 + dy, 0, 2 * h - 1);
         global const float *grad = grad_out + (size_t)y * 2 * w * c + first;
-        const float16 outer = load_lanes(grad + x0, lanes) + load_lanes(grad + x3, lanes);
-        const float16 inner = load_lanes(grad + x1, lanes) + load_lanes(grad + x2, lanes);
+        const float16 outer = load16(grad + x0, lanes) + load16(grad + x3, lanes);
+        const float16 inner = load16(grad + x1, lanes) + load16(grad + x2, lanes);
         dL_dx += (dy == 0 || dy == 3 ? 0.25f : 0.75f) * (0.25f * outer + 0.75f * inner);
     }
-    store_lanes(dL_dx, grad_x + ((size_t)row * w + column) * c + first, lanes);
+    store16(dL_dx, grad_x + ((size_t)row * w + column) * c + first, lanes);
 }
 
 // One work-item per element: reads x, writes scale * x + offset.

@@ -1,4 +1,4 @@
-// float16 access to flat arrays whose length is no multiple of 16.
+// Sixteen neighbouring values as one vector, where arrays or channels need not come in multiples of 16.
 #ifndef PP_VECTOR_H
 #define PP_VECTOR_H
 
