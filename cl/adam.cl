@@ -65,7 +65,8 @@ kernel void adam_sh_update(
         return;
     const Camera view = camera_load(camera);
     float basis[9];
-    sh_basis(normalize(grid_position(grid, ids[i]) - view.eye), basis);
+    const float3 direction = grid_position(grid, ids[i]) - view.eye;
+    sh_basis(direction * rsqrt(fmax(dot(direction, direction), FLT_MIN)), basis);  // normalize(0) is NaN on some devices
     const float16 dL_df = grad_point_features[i];
     for (size_t k = 0; k < K; k++) {
         const size_t at = i * K + k;

@@ -2,7 +2,9 @@
 
 import atexit
 import os
+import shutil
 import sys
+import tempfile
 import time
 import warnings
 import weakref
@@ -37,6 +39,7 @@ def kernel_folder():
 
 def list_devices():
     """[(index "platform:device", cl.Device, problem or None)] of all OpenCL devices; each is probed with a test build."""
+    _give_cache()
     try:
         platforms = cl.get_platforms()
     except cl.Error:
@@ -60,6 +63,19 @@ def _probe(device):
         return None if np.array_equal(x.get(), [0, 2, 4, 6]) else "computes a wrong result"
     except cl.Error as error:
         return "does not run: " + " ".join(str(error).split())[:160]
+
+
+def _give_cache():
+    """Drivers and pyopencl fail where the user's cache cannot be written (containers, service accounts): a temporary one."""
+    folder = os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache")
+    try:
+        os.makedirs(folder, exist_ok=True)
+        with tempfile.TemporaryFile(dir=folder) as probe:
+            probe.write(bytes(2**20))  # a full disk is noticed as well
+    except OSError as error:
+        temporary = os.environ["XDG_CACHE_HOME"] = tempfile.mkdtemp(prefix="pp-cl-cache-")
+        atexit.register(shutil.rmtree, temporary, ignore_errors=True)
+        print(f"{folder}: {error.strerror}; kernels are built anew: set XDG_CACHE_HOME to keep them", file=sys.stderr)
 
 
 def describe(device):

@@ -335,3 +335,16 @@ d.program("tiny").launch("divide", 3, n=3, x=x, y=d.empty((3,)))
     assert ran.returncode == 0, ran.stderr
     assert ran.stderr.splitlines()[-1].startswith("tiny.cl:divide ")
     assert ran.stdout == ""
+
+
+def test_a_cache_folder_that_cannot_be_written_is_replaced(session_device, tmp_path):
+    blocked = tmp_path / "file"
+    blocked.write_text("")
+    index = next(i for i, d, _ in list_devices() if d == session_device.device)
+    script = ("import os; from pp_cl.device import open_device; "
+              f"open_device({index!r}).program('adam'); print(os.environ['XDG_CACHE_HOME'])")
+    ran = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True,
+                         env={**os.environ, "XDG_CACHE_HOME": str(blocked / "cache")})
+    assert ran.returncode == 0, ran.stderr
+    assert "set XDG_CACHE_HOME to keep them" in ran.stderr
+    assert not os.path.exists(ran.stdout.strip())  # gone with the process

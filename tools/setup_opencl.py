@@ -92,7 +92,7 @@ def main():
     for step in steps:
         if works(found, wanted):
             break
-        print(f"no working OpenCL device yet; trying: {step.__doc__}")
+        print(f"no working OpenCL device yet; trying: {step.__doc__.splitlines()[0]}", flush=True)
         try:
             step()
         except (subprocess.CalledProcessError, PackageNotFoundError, StopIteration) as error:
