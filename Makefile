@@ -19,7 +19,7 @@ $(READY): setup.cfg pyproject.toml tools/setup_venv.sh tools/setup_opencl.py
 	@touch $@
 
 demo: $(READY) ## train the demo scene into runs/demo and evaluate it: minutes on a CPU
-	$(BIN)/pp-cl train demo --preset tiny --out runs/demo
+	$(BIN)/pp-cl train demo --preset tiny --iterations 1500 --out runs/demo
 	$(BIN)/pp-cl eval runs/demo --metrics
 
 test: $(READY) ## run the tests on the device of PP_DEVICE, else the default one

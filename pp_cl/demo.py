@@ -15,6 +15,7 @@ from pp_cl.image import write_png
 from pp_cl.points import Grid
 from pp_cl.scene import Scene, View
 
+SPLITS = ("train", "test")
 SIZE = 400  # pixels
 ANGLE = 0.6911112  # of view across the image, radians: NeRF-synthetic's
 DISTANCE = 3.4  # of the cameras from the origin; the object fills the picture
@@ -22,7 +23,7 @@ TRAIN_VIEWS, TEST_VIEWS = 64, 16
 OBJECT_BOX = ((-0.8, -0.8, -1.0), (0.8, 0.8, 0.92))  # holds the object
 
 
-def demo_scene(dev, splits=("train", "test"), size=SIZE):
+def demo_scene(dev, splits=SPLITS, size=SIZE):
     """Scene `demo` of 64 training and 16 test views of size x size pixels, rendered on the device; no depth range.
 
     The training views spread evenly from a little below the horizon to the pole, the test views circle the object.

@@ -8,7 +8,6 @@ import numpy as np
 from pp_cl.checkpoint import load_checkpoint, remove_leftovers, write_json
 from pp_cl.config import load_config
 from pp_cl.device import open_device
-from pp_cl.errors import UserError
 from pp_cl.image import write_png
 from pp_cl.metrics import Metrics, mean
 from pp_cl.model import Model
@@ -16,6 +15,7 @@ from pp_cl.preview import write_comparison
 from pp_cl.render import Renderer
 from pp_cl.run import CHECKPOINT, open_scene, with_depth_range
 from pp_cl.scene import reduced_camera
+from pp_cl.schedule import gamma
 from pp_cl.target import Target
 
 PICTURE_VIEWS = 4  # rows of the comparison picture
@@ -30,22 +30,20 @@ def evaluate_run(folder, metrics, split, save_images, device_choice):
     header, arrays = load_checkpoint(folder / CHECKPOINT)
     dev = open_device(device_choice)
     scene = open_scene(dev, config, (split,))
-    if not scene.splits.get(split):
-        raise UserError(f"--split {split}: {scene.name} has {', '.join(scene.splits)}")
     measure = Metrics(dev, metrics)
     model = Model.load(dev, header, arrays, config.network.widths, folder / CHECKPOINT)
     views = with_depth_range(scene.splits[split], model.depth_range)
 
     target_folder = folder / "eval"
-    target_folder.mkdir(exist_ok=True)
+    (target_folder / "images" if save_images else target_folder).mkdir(parents=True, exist_ok=True)
     remove_leftovers(target_folder)
-    if save_images:
-        (target_folder / "images").mkdir(exist_ok=True)
+    gamma_now = gamma(header["step"], config.train.iterations, *config.points.gamma)
+    shown = {len(views) * i // PICTURE_VIEWS for i in range(PICTURE_VIEWS)}
     rows, pictures, seconds = [], [], []
-    for view, picture, truth, duration in _render_all(dev, config, model, views):
+    for i, (view, picture, truth, duration) in enumerate(_render_all(dev, config, model, views, gamma_now)):
         rows.append({"name": view.name} | measure(picture, truth))
         seconds.append(duration)
-        if len(pictures) < PICTURE_VIEWS * 8:
+        if i in shown:
             pictures.append((picture, truth))
         if save_images:
             write_png(target_folder / "images" / f"{PurePosixPath(view.name).stem}.png", picture)
@@ -61,22 +59,20 @@ def evaluate_run(folder, metrics, split, save_images, device_choice):
         "published": scene.published,
     }
     write_json(target_folder / "metrics.json", result)
-    chosen = pictures[:: max(1, len(pictures) // PICTURE_VIEWS)][:PICTURE_VIEWS]
-    write_comparison(target_folder / "comparison.png", [p for p, _ in chosen], [t for _, t in chosen])
+    write_comparison(target_folder / "comparison.png", *zip(*pictures, strict=True))
     _print_table(result, folder)
     print(f"wrote {target_folder / 'metrics.json'} and {target_folder / 'comparison.png'} (prediction | truth | 4 x error)")
     return result
 
 
-def _render_all(dev, config, model, views):
+def _render_all(dev, config, model, views, gamma_now):
     """Yield (view, prediction (H,W,3), truth (H,W,3), seconds of the rendering) as float32 in [0, 1]."""
     renderer, target = Renderer(dev, model, config.points), Target(dev, config.scene.downscale)
-    gamma = config.points.gamma[1]
-    renderer.picture(reduced_camera(views[0], config.scene.downscale), gamma)  # builds the programs
+    renderer.picture(reduced_camera(views[0], config.scene.downscale), gamma_now)  # builds the programs
     for view in views:
         camera = reduced_camera(view, config.scene.downscale)
         start = time.perf_counter()
-        picture = renderer.picture(camera, gamma)
+        picture = renderer.picture(camera, gamma_now)
         seconds = time.perf_counter() - start
         target.load(view)
         yield view, picture, target.crop(0, 0, camera.width, camera.height).get(), seconds

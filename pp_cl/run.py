@@ -26,8 +26,11 @@ def open_scene(dev, config, splits):
     """Scene of config.scene.path with the given splits; `demo` is rendered on the device."""
     if config.scene.path != "demo":
         return load_scene(config.scene.path, splits)
-    from pp_cl.demo import demo_scene
+    from pp_cl.demo import SPLITS, demo_scene
 
+    unknown = set(splits) - set(SPLITS)
+    if unknown:
+        raise UserError(f"--split {', '.join(unknown)}: demo has {', '.join(SPLITS)}")
     return demo_scene(dev)
 
 

@@ -8,8 +8,11 @@ from PIL import Image
 from scenes import write_ball_scene
 
 from pp_cl.cli import main
+from pp_cl.config import Config
+from pp_cl.errors import UserError
 from pp_cl.image import read_rgba
 from pp_cl.metrics import psnr
+from pp_cl.run import open_scene
 
 
 @pytest.fixture(scope="module")
@@ -80,3 +83,10 @@ def test_twice_gives_the_same_numbers_and_other_splits_work(run):
 def test_a_missing_split_is_one_line(run, capsys):
     assert main(["eval", str(run), "--split", "val"]) == 2
     assert "transforms_val.json" in capsys.readouterr().err
+
+
+def test_the_demo_has_no_validation_views(dev, capsys):
+    config = Config()
+    config.scene.path = "demo"
+    with pytest.raises(UserError, match="--split val: demo has train, test"):
+        open_scene(dev, config, ("val",))
