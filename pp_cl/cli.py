@@ -50,7 +50,9 @@ def _parser():
     train.add_argument("scene", metavar="SCENE", help="folder with transforms_train.json, or the word demo")
     train.add_argument("--out", required=True, metavar="RUN", help="folder of the run")
     train.add_argument(
-        "--preset", choices=PRESETS, help="tiny (default): minutes on a CPU; small: 400x400; paper: its numbers"
+        "--preset",
+        choices=PRESETS,
+        help="tiny (default): 200x200, minutes on a CPU; small: 400x400, an hour or two; paper: the paper's numbers",
     )
     train.add_argument("--iterations", metavar="N", help="steps of training")
     train.add_argument("--points", metavar="N", help="wanted points on the grid")

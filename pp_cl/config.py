@@ -84,7 +84,7 @@ class Config:
 PRESETS = {
     "tiny": {},
     # 400 x 400 in an hour or two on a CPU
-    "small": {"points.count": 600_000, "train.iterations": 20_000, "train.crop": 192},
+    "small": {"points.count": 1_000_000, "train.iterations": 20_000, "train.crop": 192},
     # the supplemental's own numbers; what it does not state is as above
     "paper": {
         "points.count": 4_000_000,
