@@ -27,8 +27,17 @@ def main(argv=None):
     except UserError as error:
         print(f"pp-cl: {error}", file=sys.stderr)
         return 2
+    except OSError as error:
+        print(
+            f"pp-cl: {error.filename or 'file'}: {error.strerror or error}; check the path, permissions and free space",
+            file=sys.stderr,
+        )
+        return 2
+    except MemoryError:
+        print("pp-cl: the host has no memory left; lower --points or raise --downscale", file=sys.stderr)
+        return 2
     except KeyboardInterrupt:
-        print("pp-cl: interrupted; the same command goes on from the last checkpoint", file=sys.stderr)
+        print("pp-cl: interrupted; the same command takes a training up from its last checkpoint", file=sys.stderr)
         return 130
 
 

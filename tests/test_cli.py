@@ -109,6 +109,12 @@ def test_a_foreign_folder_is_not_written_into(scene, tmp_path, capsys):
     assert "file" in failure(capsys, "train", scene, "--out", tmp_path / "file")
 
 
+def test_a_folder_that_cannot_be_made_is_one_line(scene, tmp_path, capsys):
+    (tmp_path / "file").write_text("")
+    line = failure(capsys, "train", scene, "--out", tmp_path / "file" / "run", "--points", 500, "--iterations", 2)
+    assert "file/run" in line
+
+
 def test_no_device_says_what_to_install(scene, tmp_path, capsys, monkeypatch):
     monkeypatch.setattr("pp_cl.device.list_devices", lambda: [])
     assert "pocl" in failure(capsys, "train", scene, "--out", tmp_path / "run")
