@@ -10,9 +10,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pp_cl import layers
-from pp_cl.conv import LANES, conv_backward_input, conv_forward, pack_bias, pack_weights
-from pp_cl.conv_weights import flip_weights, partial_floats, weight_gradient
+from pp_cl import layers, variants
+from pp_cl.conv import pack_bias, pack_weights
 
 
 @dataclass(frozen=True)
@@ -56,13 +55,18 @@ class UNet:
     widths: channels of the three levels. parameters, gradients: {"enc0.a.weight": (ceil(CO/16), K, K, CI, 16),
     "enc0.a.bias": (ceil(CO/16) * 16,), ...} float32 on the device. Weights and biases start uniform in +-1/sqrt(CI K K)
     (PyTorch's default for Conv2d), output channels beyond CO at 0, with gradient 0.
+
+    variant: of all 3x3 convolutions that it fits, a name in variants.VARIANTS; "auto" takes the fastest for each.
     """
 
-    def __init__(self, dev, widths=(16, 32, 64), channels_in=16, channels_out=3, seed=0):
+    def __init__(self, dev, widths=(16, 32, 64), channels_in=16, channels_out=3, seed=0, variant="auto"):
+        if variant not in ("auto", *variants.VARIANTS):
+            raise ValueError(f"variant {variant!r}: must be auto, {', '.join(variants.VARIANTS)}")
         self.dev = dev
+        self.variant = variant
         self.steps = unet_steps(widths, channels_out)
         self.channels = {"x": channels_in} | {s.name: s.channels for s in self.steps}
-        self.parameters, self._flipped = {}, {}
+        self.parameters = {}
         rng = np.random.default_rng(seed)
         for step in self._convolutions():
             k, ci = int(step.kind[-1]), sum(self.channels[i] for i in step.inputs)
@@ -70,8 +74,6 @@ class UNet:
             weight = rng.uniform(-bound, bound, (step.channels, ci, k, k))
             self.parameters[step.name + ".weight"] = dev.upload(pack_weights(weight))
             self.parameters[step.name + ".bias"] = dev.upload(pack_bias(rng.uniform(-bound, bound, step.channels)))
-            for name in step.inputs:
-                self._flipped[step.name, name] = dev.empty((-(-self.channels[name] // LANES), k, k, step.channels, LANES))
         self.gradients = {name: dev.zeros(p.shape) for name, p in self.parameters.items()}
         self._relu_outputs = {s.name for s in self.steps if s.kind == "conv3"}
         self._buffers = {}  # {training: (size, {name: array}, the buffers they are views of)}
@@ -96,7 +98,9 @@ class UNet:
                 layers.upsample2_forward(self.dev, sources[0], out)
             else:
                 weight, bias = self.parameters[step.name + ".weight"], self.parameters[step.name + ".bias"]
-                conv_forward(self.dev, sources[0], weight, bias, out, step.kind == "conv3", *sources[1:])
+                variant = self._variant_of(step, "forward", height, width)
+                variants.forward(self.dev, variant, sources[0], weight, bias, out, step.kind == "conv3", arrays["work"],
+                                 *sources[1:])
         layers.affine(self.dev, 0.5, 0.5, out, out)
         if training:
             self._trained = arrays
@@ -124,16 +128,26 @@ class UNet:
         return arrays["grad x"]
 
     def _backward_convolution(self, step, arrays, grad_out):
-        weight = self.parameters[step.name + ".weight"]
+        weight, work = self.parameters[step.name + ".weight"], arrays["work"]
         sources = [arrays[name] for name in step.inputs]
-        weight_gradient(self.dev, sources[0], grad_out, self.gradients[step.name + ".weight"],
-                        self.gradients[step.name + ".bias"], arrays["partial"], *sources[1:])
+        height, width, _ = arrays["x"].shape
+        variants.backward_weights(self.dev, self._variant_of(step, "weights", height, width), sources[0], grad_out,
+                                  self.gradients[step.name + ".weight"], self.gradients[step.name + ".bias"], work,
+                                  *sources[1:])
         first = 0
         for name, source in zip(step.inputs, sources, strict=True):
-            flipped = self._flipped[step.name, name]
-            flip_weights(self.dev, weight, first, flipped)
-            conv_backward_input(self.dev, source, flipped, grad_out, arrays["grad " + name], name in self._relu_outputs)
+            variant = self._variant_of(step, "input", height, width, name)
+            variants.backward_input(self.dev, variant, source, weight, first, grad_out, arrays["grad " + name],
+                                    name in self._relu_outputs, work)
             first += self.channels[name]
+
+    def _variant_of(self, step, direction, height, width, name=None):
+        """Variant of a convolution in an image of this size; name: of the input whose gradient is computed."""
+        channels, co, variant = [self.channels[i] for i in step.inputs], step.channels, self.variant
+        if variant == "auto":
+            ci = self.channels[name] if name else sum(channels)
+            variant = variants.pick_variant(self.dev, direction, ci, co, height >> step.level, width >> step.level)
+        return variants.applicable(variant, int(step.kind[-1]), *channels, co)
 
     def memory_plan(self, height, width, training):
         """[(name, shape, bytes)] of all device buffers of this network once it has run at this size.
@@ -144,10 +158,7 @@ class UNet:
                 for slot in assign_slots(self._lifetimes(training), self._shapes(height, width))]
         plan += [(name, p.shape, p.nbytes) for name, p in self.parameters.items()]
         plan += [(f"grad {name}", g.shape, g.nbytes) for name, g in self.gradients.items()]
-        plan += [(f"flipped {layer} {source}", f.shape, f.nbytes) for (layer, source), f in self._flipped.items()]
-        if training:
-            floats = self._partial_floats(height)
-            plan.append(("partial", (floats,), floats * 4))
+        plan += [("convolutions at work", (floats,), floats * 4) for floats in self._work_floats(height, width, training)]
         return plan
 
     def _convolutions(self):
@@ -158,9 +169,17 @@ class UNet:
         shapes["x"] = (height, width, self.channels["x"])
         return shapes | {"grad " + name: shape for name, shape in shapes.items()}
 
-    def _partial_floats(self, height):
-        return max(partial_floats(height >> s.level, self.gradients[s.name + ".weight"].shape)
-                   for s in self._convolutions())
+    def _work_floats(self, height, width, training):
+        """Floats of Work's two arrays that the convolutions of this size share."""
+        uses = [(step, "forward", None) for step in self._convolutions()]
+        if training:
+            uses += [(step, "weights", None) for step in self._convolutions()]
+            uses += [(step, "input", name) for step in self._convolutions() for name in step.inputs]
+        needs = [variants.work_floats(self.dev, self._variant_of(step, direction, height, width, name), direction,
+                                      height >> step.level, self.parameters[step.name + ".weight"].shape,
+                                      self.channels.get(name))
+                 for step, direction, name in uses]
+        return [max(1, *floats) for floats in zip(*needs, strict=True)]
 
     def _lifetimes(self, training):
         """[(name, first, last)] of all arrays, in steps of the forward and backward pass, by first use."""
@@ -188,8 +207,7 @@ class UNet:
             buffers = [self.dev.empty(slot.floats) for slot in slots]
             for slot, buffer in zip(slots, buffers, strict=True):
                 arrays |= {name: buffer[:int(np.prod(shapes[name]))].reshape(shapes[name]) for name in slot.names}
-            if training:
-                arrays["partial"] = self.dev.empty(self._partial_floats(height))
+            arrays["work"] = variants.Work(*[self.dev.empty(n) for n in self._work_floats(height, width, training)])
             self._buffers[training] = ((height, width), arrays, buffers)
         return self._buffers[training][1]
 

@@ -19,9 +19,10 @@ def plain_parameters(net, arrays):
     return plain
 
 
-@pytest.mark.parametrize("widths", [(16, 32, 48), (20, 16, 40)])
-def test_forward_and_backward(dev, rng, widths):
-    net = UNet(dev, widths, seed=1)
+@pytest.mark.parametrize("widths, variant", [((16, 32, 48), "direct"), ((16, 32, 48), "winograd2"),
+                                             ((16, 32, 48), "winograd4"), ((20, 16, 40), "auto")])
+def test_forward_and_backward(dev, rng, widths, variant):
+    net = UNet(dev, widths, seed=1, variant=variant)
     x, grad_y = rng.normal(size=(12, 16, 16)).astype(np.float32), rng.normal(size=(12, 16, 3)).astype(np.float32)
     parameters = plain_parameters(net, net.parameters)
     y = net.forward(dev.upload(x)).get()
@@ -103,6 +104,8 @@ def test_hard_inputs(dev, rng):
 
 
 def test_wrong_use_is_refused(dev):
+    with pytest.raises(ValueError, match="fft.*auto, direct, winograd2, winograd4"):
+        UNet(dev, variant="fft")
     net = UNet(dev, (16, 16, 16))
     with pytest.raises(ValueError, match="\\(10, 8, 16\\)"):
         net.forward(dev.zeros((10, 8, 16)))
@@ -113,11 +116,12 @@ def test_wrong_use_is_refused(dev):
         net.backward(dev.zeros((8, 8, 3)))
 
 
+@pytest.mark.parametrize("variant", ["direct", "winograd4"])
 @pytest.mark.parametrize("training", [False, True])
-def test_memory_plan_is_what_is_allocated(dev, training):
+def test_memory_plan_is_what_is_allocated(dev, training, variant):
     x, grad_y = dev.zeros((16, 20, 16)), dev.zeros((16, 20, 3))
     before = dev.bytes
-    net = UNet(dev, (16, 32, 48))
+    net = UNet(dev, (16, 32, 48), variant=variant)
     net.forward(x, training)
     if training:
         net.backward(grad_y)

@@ -1,0 +1,237 @@
+// 3x3 convolution by Winograd's minimal filtering (winograd.h): the forward pass and the gradient of its input.
+//
+// The image is cut into tiles of M x M outputs. A work-item takes an equal share of them, TILES at a time, through three
+// stages: the input tiles are transformed, multiplied position by position as matrices (tiles x CI) (CI x CO), and
+// transformed back. What lies between the stages stays in its own slice of `scratch`, small enough for the caches.
+//
+// One work-item per compute unit (work-groups of 1): an image's tiles are many, and each slice is used over and over.
+#include "winograd.h"
+
+#ifndef BLOCKS
+#define BLOCKS 2             // groups of 16 output channels multiplied together; divides their number
+#endif
+#ifndef GROUP
+#define GROUP 8              // tiles multiplied together: BLOCKS * GROUP accumulators and BLOCKS weights fit AVX-512
+#endif
+// Vectors of a work-item's scratch: the values of ci channels, their products of co channels, a patch for load_tile.
+#define SLICE(ci, co) (POSITIONS * (PITCH(ci) + PITCH(co) + 1))
+
+// Three rows of three weights in t -> their values at all positions, to every `stride`-th vector of transformed.
+__attribute__((always_inline))
+inline void store_kernel(
+    float16 *t,
+    global float16 *transformed,
+    const int stride)
+{
+    #pragma unroll
+    for (int i = 0; i < 3; i++)
+        transform_kernel(t + i, S);
+    #pragma unroll
+    for (int i = 0; i < S; i++)
+        transform_kernel(t + i * S, 1);
+    #pragma unroll
+    for (int i = 0; i < POSITIONS; i++)
+        transformed[i * stride] = t[i];
+}
+
+// One work-item per (input channel, 16 output channels): reads 3 x 3 weights, writes their values at all positions.
+kernel void winograd_weights(
+    const int ci,
+    const int blocks,
+    global const float16 *weight,        // (blocks, 3, 3, ci, 16)
+    global float16 *transformed)         // (...) at least (POSITIONS, blocks, ci, 16)
+{
+    const int c = get_global_id(0), block = get_global_id(1);
+    if (c >= ci || block >= blocks)
+        return;
+    float16 t[POSITIONS];
+    #pragma unroll
+    for (int i = 0; i < 9; i++)
+        t[i / 3 * S + i % 3] = weight[(block * 9 + i) * ci + c];
+    store_kernel(t, transformed + block * ci + c, blocks * ci);
+}
+
+// One work-item per (output channel, 16 input channels from `first` on): the same for the mirrored kernels with the roles of
+// input and output channels exchanged, which the input gradient is made with.
+kernel void winograd_flipped_weights(
+    const int co,
+    const int blocks,                    // of input channels taken
+    const int first,                     // input channel
+    const int ci,                        // channels of weight
+    global const float *weight,          // (?, 3, 3, ci, 16)
+    global float16 *transformed)         // (...) at least (POSITIONS, blocks, co, 16)
+{
+    const int o = get_global_id(0), block = get_global_id(1);
+    if (o >= co || block >= blocks)
+        return;
+    float16 t[POSITIONS];
+    #pragma unroll
+    for (int i = 0; i < 9; i++) {
+        global const float *tap = weight + ((o / 16 * 9 + 8 - i) * ci + first + block * 16) * 16 + o % 16;
+        t[i / 3 * S + i % 3] = (float16)(tap[0], tap[16], tap[32], tap[48], tap[64], tap[80], tap[96], tap[112],
+                                         tap[128], tap[144], tap[160], tap[176], tap[192], tap[208], tap[224], tap[240]);
+    }
+    store_kernel(t, transformed + block * co + o, blocks * co);
+}
+
+// Stage 2: m (position, 16 of co, tile) = v (position, 16 of ci, tile) times weight (position, 16 of co, ci, 16).
+__attribute__((always_inline))
+inline void multiply(
+    global float16 *m,
+    global const float16 *v,
+    global const float16 *weight,
+    const int ci,
+    const int blocks,
+    const int padded)
+{
+    for (int position = 0; position < POSITIONS; position++)
+        for (int block = 0; block < blocks; block += BLOCKS)
+            for (int tile = 0; tile < padded; tile += GROUP) {
+                float16 acc[BLOCKS][GROUP];
+                #pragma unroll
+                for (int b = 0; b < BLOCKS; b++)
+                    #pragma unroll
+                    for (int i = 0; i < GROUP; i++)
+                        acc[b][i] = 0.0f;
+                for (int chunk = 0; chunk < ci / 16; chunk++) {
+                    global const float *value = (global const float *)(v + position * PITCH(ci) + chunk * TILES + tile);
+                    global const float16 *w = weight + (position * blocks + block) * ci + chunk * 16;
+                    #pragma unroll 4
+                    for (int c = 0; c < 16; c++) {
+                        float16 wc[BLOCKS];
+                        #pragma unroll
+                        for (int b = 0; b < BLOCKS; b++)
+                            wc[b] = w[b * ci + c];
+                        #pragma unroll
+                        for (int i = 0; i < GROUP; i++)
+                            #pragma unroll
+                            for (int b = 0; b < BLOCKS; b++)
+                                acc[b][i] += value[i * 16 + c] * wc[b];
+                    }
+                }
+                #pragma unroll
+                for (int b = 0; b < BLOCKS; b++)
+                    #pragma unroll
+                    for (int i = 0; i < GROUP; i++)
+                        m[position * PITCH(blocks * 16) + (block + b) * TILES + tile + i] = acc[b][i];
+            }
+}
+
+// Stage 3: the outputs of `count` tiles from `first` on, plus bias (0 = none); with relu, max(., 0) of them; with mask, 0
+// where mask is not positive.
+__attribute__((always_inline))
+inline void transform_back(
+    global float *out,
+    global const float16 *m,
+    global const float16 *bias,
+    const int relu,
+    global const float *mask,
+    const int co,
+    const int first,
+    const int count,
+    const int height,
+    const int width)
+{
+    const int columns = (width + M - 1) / M, pitch = PITCH(co);
+    for (int tile = 0; tile < count; tile++) {
+        const int x0 = (first + tile) % columns * M, y0 = (first + tile) / columns * M;
+        for (int block = 0; block < co / 16; block++) {
+            float16 t[POSITIONS];
+            #pragma unroll
+            for (int i = 0; i < POSITIONS; i++)
+                t[i] = m[i * pitch + block * TILES + tile];
+            #pragma unroll
+            for (int i = 0; i < S; i++)
+                transform_output(t + i, S);
+            #pragma unroll
+            for (int i = 0; i < M; i++)
+                transform_output(t + i * S, 1);
+            const float16 offset = bias ? bias[block] : (float16)0.0f;
+            #pragma unroll
+            for (int i = 0; i < M; i++)
+                #pragma unroll
+                for (int j = 0; j < M; j++)
+                    if (y0 + i < height && x0 + j < width) {
+                        const size_t at = ((size_t)(y0 + i) * width + x0 + j) * co + block * 16;
+                        float16 value = t[i * S + j] + offset;
+                        if (relu)                            // max(., 0) would hide a NaN
+                            value = select(value, (float16)0.0f, value < 0.0f);
+                        if (mask)
+                            value = select((float16)0.0f, value, vload16(0, mask + at) > 0.0f);
+                        vstore16(value, 0, out + at);
+                    }
+        }
+    }
+}
+
+// The whole convolution of [x, x2] (c2 = 0: of x) for this work-item's tiles; bias, relu, mask: as in transform_back.
+__attribute__((always_inline))
+inline void convolve(
+    global const float *x,
+    global const float *x2,
+    const int c1,
+    const int c2,
+    global const float16 *weight,
+    global const float16 *bias,
+    const int relu,
+    global const float *mask,
+    global float *out,
+    const int co,
+    global float16 *scratch,             // all work-items'
+    const int height,
+    const int width)
+{
+    const int ci = c1 + c2;
+    global float16 *v = scratch + get_global_id(0) * SLICE(ci, co), *m = v + POSITIONS * PITCH(ci);
+    global float *patch = (global float *)(m + POSITIONS * PITCH(co));
+
+    const long tiles = ((height + M - 1) / M) * ((width + M - 1) / M);
+    const int begin = tiles * get_global_id(0) / get_global_size(0);
+    const int end = tiles * (get_global_id(0) + 1) / get_global_size(0);
+    const int rounds = max(1, (end - begin + TILES - 1) / TILES);      // of about the same size
+    const int step = ((end - begin + rounds - 1) / rounds + GROUP - 1) / GROUP * GROUP;
+    for (int first = begin; first < end; first += step) {
+        const int count = min(step, end - first), padded = (count + GROUP - 1) / GROUP * GROUP;
+        for (int source = 0; source < (c2 ? 2 : 1); source++)
+            transform_tiles(v + (source ? c1 / 16 * TILES : 0), PITCH(ci), patch, source ? x2 : x, source ? c2 : c1,
+                            (source ? c2 : c1) / 16, first, count, padded, height, width);
+        multiply(m, v, weight, ci, co / 16, padded);
+        transform_back(out, m, bias, relu, mask, co, first, count, height, width);
+    }
+}
+
+// One work-item per compute unit: reads its tiles' neighbourhood in x, then in x2 (the concatenation [x, x2] without making
+// it), and writes its tiles of out.
+kernel void winograd_forward(
+    const int height,
+    const int width,
+    const int c1,
+    const int c2,                        // channels of x2; 0 = x2 is not read
+    const int co,
+    const int relu,                      // negative results become 0
+    global const float *x,               // (height, width, c1)
+    global const float *x2,              // (height, width, ?)
+    global const float16 *weight,        // (...) at least (POSITIONS, blocks, c1 + c2, 16)
+    global const float16 *bias,          // (?)
+    global float *out,                   // (height, width, co)
+    global float16 *scratch)             // (...) work-items times SLICE(c1 + c2, co) vectors
+{
+    convolve(x, x2, c1, c2, weight, bias, relu, 0, out, co, scratch, height, width);
+}
+
+// One work-item per compute unit: reads its tiles' neighbourhood in grad_out, and writes its tiles of grad_x, which is the
+// convolution of grad_out with the flipped weights. masked: x is the output of a ReLU and grad_x the gradient of its input.
+kernel void winograd_backward_input(
+    const int height,
+    const int width,
+    const int c,
+    const int co,
+    const int masked,
+    global const float *x,               // (height, width, c)
+    global const float16 *flipped,       // (...) at least (POSITIONS, blocks, co, 16)
+    global const float *grad_out,        // (height, width, co)
+    global float *grad_x,                // (height, width, c)
+    global float16 *scratch)             // (...) work-items times SLICE(co, c) vectors
+{
+    convolve(grad_out, 0, co, 0, flipped, 0, 0, masked ? x : 0, grad_x, c, scratch, height, width);
+}

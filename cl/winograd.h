@@ -1,0 +1,192 @@
+// Winograd's minimal filtering F(M x M, 3 x 3) (Lavin and Gray 2016, arXiv 1509.09308) on tiles of 16 channels a vector.
+//
+// Along one line, M outputs y of a kernel w over S = M + 2 samples d are a product of polynomials, evaluated at S points:
+// y = A^T [(G w) o (B^T d)]. The functions below apply one matrix to S or fewer values `step` apart, in place; a tile takes
+// them along its columns, then along its rows. Points: 0, -1, 1, infinity for M = 2; 0, -P, P, -Q, Q, infinity for M = 4,
+// where 3/4 and 3/2 halve the float32 error of the usual 1 and 2 and are exact in binary (cf. Barabasz et al. 2020,
+// arXiv 1803.10986).
+#ifndef PP_WINOGRAD_H
+#define PP_WINOGRAD_H
+#include "common.h"
+
+#ifndef M
+#define M 4                  // side of a tile of outputs: 2 or 4
+#endif
+#ifndef TILES
+#define TILES 64             // tiles transformed and multiplied at a time
+#endif
+#define S (M + 2)            // side of a tile of inputs
+#define POSITIONS (S * S)
+
+#define P 0.75f
+#define Q 1.5f
+#define PP (P * P)
+#define QQ (Q * Q)
+#define N0 (1 / (PP * QQ))                 // 1 / product of the distances of a point to the others
+#define NP (1 / (2 * PP * (PP - QQ)))
+#define NQ (1 / (2 * QQ * (QQ - PP)))
+
+// B^T: S samples -> S values.
+__attribute__((always_inline))
+inline void transform_input(float16 *t, const int step) {
+    const float16 d0 = t[0], d1 = t[step], d2 = t[2 * step], d3 = t[3 * step];
+#if M == 4
+    const float16 d4 = t[4 * step], d5 = t[5 * step];
+    const float16 even_p = d4 - QQ * d2, odd_p = d3 - QQ * d1, even_q = d4 - PP * d2, odd_q = d3 - PP * d1;
+    t[0] = PP * QQ * d0 + (d4 - (PP + QQ) * d2);
+    t[step] = even_p + P * odd_p;
+    t[2 * step] = even_p - P * odd_p;
+    t[3 * step] = even_q + Q * odd_q;
+    t[4 * step] = even_q - Q * odd_q;
+    t[5 * step] = PP * QQ * d1 + (d5 - (PP + QQ) * d3);
+#else
+    t[0] = d0 - d2;
+    t[step] = d1 + d2;
+    t[2 * step] = d2 - d1;
+    t[3 * step] = d3 - d1;
+#endif
+}
+
+// A^T: S values -> M outputs.
+__attribute__((always_inline))
+inline void transform_output(float16 *t, const int step) {
+    const float16 m0 = t[0], sum_p = t[step] + t[2 * step], diff_p = t[step] - t[2 * step];
+#if M == 4
+    const float16 sum_q = t[3 * step] + t[4 * step], diff_q = t[3 * step] - t[4 * step];
+    t[0] = m0 + (sum_p + sum_q);
+    t[step] = P * diff_p + Q * diff_q;
+    t[2 * step] = PP * sum_p + QQ * sum_q;
+    t[3 * step] = P * PP * diff_p + (Q * QQ * diff_q + t[5 * step]);
+#else
+    t[0] = m0 + sum_p;
+    t[step] = diff_p + t[3 * step];
+#endif
+}
+
+// A: gradients of M outputs -> those of S values.
+__attribute__((always_inline))
+inline void transform_gradient(float16 *t, const int step) {
+    const float16 g0 = t[0], g1 = t[step];
+#if M == 4
+    const float16 g2 = t[2 * step], g3 = t[3 * step];
+    const float16 even_p = g0 + PP * g2, odd_p = g1 + PP * g3, even_q = g0 + QQ * g2, odd_q = g1 + QQ * g3;
+    t[step] = even_p + P * odd_p;
+    t[2 * step] = even_p - P * odd_p;
+    t[3 * step] = even_q + Q * odd_q;
+    t[4 * step] = even_q - Q * odd_q;
+    t[5 * step] = g3;
+#else
+    t[step] = g0 + g1;
+    t[2 * step] = g0 - g1;
+    t[3 * step] = g1;
+#endif
+}
+
+// G: 3 weights -> S values.
+__attribute__((always_inline))
+inline void transform_kernel(float16 *t, const int step) {
+    const float16 w0 = t[0], w1 = t[step], w2 = t[2 * step];
+#if M == 4
+    const float16 even_p = NP * (w0 + PP * w2), even_q = NQ * (w0 + QQ * w2);
+    t[0] = N0 * w0;
+    t[step] = even_p + NP * P * w1;
+    t[2 * step] = even_p - NP * P * w1;
+    t[3 * step] = even_q + NQ * Q * w1;
+    t[4 * step] = even_q - NQ * Q * w1;
+    t[5 * step] = w2;
+#else
+    t[step] = 0.5f * (w0 + w1 + w2);
+    t[2 * step] = 0.5f * (w0 - w1 + w2);
+    t[3 * step] = w2;
+#endif
+}
+
+// G^T: gradients of S values -> those of 3 weights.
+__attribute__((always_inline))
+inline void transform_kernel_gradient(float16 *t, const int step) {
+    const float16 sum_p = t[step] + t[2 * step], diff_p = t[step] - t[2 * step];
+#if M == 4
+    const float16 sum_q = t[3 * step] + t[4 * step], diff_q = t[3 * step] - t[4 * step];
+    t[0] = N0 * t[0] + (NP * sum_p + NQ * sum_q);
+    t[step] = NP * P * diff_p + NQ * Q * diff_q;
+    t[2 * step] = NP * PP * sum_p + (NQ * QQ * sum_q + t[5 * step]);
+#else
+    t[0] = t[0] + 0.5f * sum_p;
+    t[step] = 0.5f * diff_p;
+    t[2 * step] = 0.5f * sum_p + t[3 * step];
+#endif
+}
+
+// Values of many tiles at once are laid out (position, 16 channels, TILES tiles); vectors from one position to the next.
+// The odd one keeps the positions apart in the sets of a cache.
+#define PITCH(channels) ((channels) / 16 * TILES + 1)
+
+// The `side` x `side` pixels from (x0, y0) on, 16 channels each, into rows of t that are S apart; 0 outside the image. A
+// tile across the border is gathered in `patch` first, so that one piece of straight code loads them all.
+__attribute__((always_inline))
+inline void load_tile(
+    float16 *t,
+    const int side,                  // S or M
+    global float *patch,             // POSITIONS vectors
+    global const float *image,       // at the first of the 16 channels
+    const int channels,              // of a pixel
+    const int x0,
+    const int y0,
+    const int height,
+    const int width)
+{
+    global const float *corner = image + ((long)y0 * width + x0) * channels;
+    int row = width * channels, column = channels;
+    if (x0 < 0 || y0 < 0 || x0 + side > width || y0 + side > height) {
+        for (int i = 0; i < POSITIONS; i++) {
+            const int x = x0 + i % S, y = y0 + i / S;
+            float16 pixel = 0.0f;
+            if (x >= 0 && x < width && y >= 0 && y < height)
+                pixel = vload16(0, corner + i / S * row + i % S * column);
+            vstore16(pixel, i, patch);
+        }
+        corner = patch;
+        row = S * 16;
+        column = 16;
+    }
+    #pragma unroll
+    for (int i = 0; i < POSITIONS; i++)
+        if (i % S < side && i / S < side)
+            t[i] = vload16(0, corner + i / S * row + i % S * column);
+}
+
+// v = B^T d B of the inputs d of `padded` tiles from `first` on, 16 * chunks channels; the last of `count` is repeated.
+__attribute__((always_inline))
+inline void transform_tiles(
+    global float16 *v,
+    const int pitch,
+    global float *patch,             // POSITIONS vectors
+    global const float *x,           // at the first of the channels
+    const int channels,              // of a pixel
+    const int chunks,
+    const int first,
+    const int count,
+    const int padded,
+    const int height,
+    const int width)
+{
+    const int columns = (width + M - 1) / M;
+    for (int tile = 0; tile < padded; tile++) {
+        const int at = first + min(tile, count - 1), x0 = at % columns * M - 1, y0 = at / columns * M - 1;
+        for (int chunk = 0; chunk < chunks; chunk++) {
+            float16 t[POSITIONS];
+            load_tile(t, S, patch, x + chunk * 16, channels, x0, y0, height, width);
+            #pragma unroll
+            for (int i = 0; i < S; i++)
+                transform_input(t + i, S);
+            #pragma unroll
+            for (int i = 0; i < S; i++)
+                transform_input(t + i * S, 1);
+            #pragma unroll
+            for (int i = 0; i < POSITIONS; i++)
+                v[i * pitch + chunk * TILES + tile] = t[i];
+        }
+    }
+}
+
+#endif

@@ -1,0 +1,48 @@
+"""Weight and bias gradients of 3x3 convolutions by Winograd's minimal filtering."""
+
+from pp_cl.conv import LANES
+from pp_cl.winograd import fits, pair_blocks, positions
+
+# Tiles of one round and, at most, input and output channels of one part of the weights: smaller parts transform the same
+# tiles more often, larger ones outgrow a core's cache.
+TILES, CI_PART, CO_PART = 32, 128, 128
+
+
+def gradient_scratch_floats(dev, m):
+    """Floats of scratch memory that winograd_weight_gradient needs."""
+    vectors = positions(m) * ((CI_PART + CO_PART) // LANES * TILES + 3 + CI_PART * CO_PART // LANES) + CO_PART // LANES
+    return dev.info["compute_units"] * vectors * LANES
+
+
+def winograd_weight_gradient(dev, m, x, grad_out, grad_weight, grad_bias, scratch, x2=None):
+    """Overwrite grad_weight and grad_bias with the gradients of winograd_forward(..., x, ..., x2): see
+    conv_weights.weight_gradient for the shapes.
+
+    scratch: at least gradient_scratch_floats. The sums run in an order that depends on the shapes alone. Raises ValueError
+    when shapes do not fit together.
+    """
+    height, width, co = grad_out.shape
+    blocks, _, _, ci, _ = grad_weight.shape
+    sources = [x] if x2 is None else [x, x2]
+    channels = [s.shape[2] for s in sources]
+    if not fits(*channels, co) or sum(channels) != ci or blocks != co // LANES or grad_bias.shape != (co,):
+        raise ValueError(f"Winograd weight gradient of {channels} to {co} channels: weight is {grad_weight.shape}, "
+                         f"bias {grad_bias.shape}")
+    if scratch.size < gradient_scratch_floats(dev, m):
+        raise ValueError(f"Winograd weight gradient: scratch has {scratch.size} floats, "
+                         f"needs {gradient_scratch_floats(dev, m)}")
+    program = dev.program("winograd_weights", M=m, TILES=TILES, CO_PART=CO_PART, BLOCKS=pair_blocks(blocks))
+    first = 0
+    for source, c in zip(sources, channels, strict=True):
+        ci_part = _ci_part(dev, c, co)
+        items = min(dev.info["compute_units"], -(-c // ci_part) * -(-co // CO_PART))
+        program.launch("winograd_backward_weights", items, local=1, height=height, width=width, c=c, co=co, first=first,
+                       ci=ci, ci_part=ci_part, x=source, grad_out=grad_out, grad_weight=grad_weight, grad_bias=grad_bias,
+                       scratch=scratch)
+        first += c
+
+
+def _ci_part(dev, c, co):
+    """Input channels of one part: as many as leave every compute unit a part."""
+    wanted = -(-dev.info["compute_units"] // -(-co // CO_PART))
+    return min(CI_PART, max(1, c // (LANES * wanted)) * LANES)
