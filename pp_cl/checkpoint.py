@@ -83,7 +83,7 @@ def load_checkpoint(path):
         with np.load(path, allow_pickle=False) as stored:
             arrays = {name: stored[name] for name in stored.files}
         header = json.loads(arrays.pop("header").tobytes())
-    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile, NotImplementedError) as error:
+    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile, RuntimeError) as error:
         raise UserError(
             f"{path}: corrupt checkpoint ({' '.join(str(error).split())[:100]}); delete it to train anew, or restore a copy"
         ) from None
