@@ -6,7 +6,7 @@ READY := .venv/.ready
 # What Oclgrind 21.10 simulates right and in seconds. It computes max(int2, int) and comparisons of ulong8 wrongly.
 OCLGRIND := adam conv_weights launch layers loss lpips prune scan smooth target
 
-.PHONY: help setup demo test test-intel lint oclgrind clean
+.PHONY: help setup demo test test-intel bench lint oclgrind clean
 
 help: ## print this list
 	@sed -n 's/^\([a-z-]*\):.*## \(.*\)/\1	\2/p' Makefile | expand -t 12
@@ -28,6 +28,10 @@ test: $(READY) ## run the tests on the device of PP_DEVICE, else the default one
 test-intel: $(READY) ## the same on Intel's CPU runtime, installed into .venv if need be (x86-64)
 	@$(BIN)/python tools/setup_opencl.py --intel
 	@PP_DEVICE="Intel(R) OpenCL" $(BIN)/python -m pytest $(ARGS)
+
+bench: $(READY) ## time and error of the network and of its layers; ARGS="--size 200 --widths 32,64,128" for others
+	$(BIN)/pp-cl bench unet $(ARGS)
+	$(BIN)/pp-cl bench conv $(ARGS)
 
 lint: $(READY) ## check the style of the Python files
 	@$(BIN)/ruff check

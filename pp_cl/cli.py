@@ -1,4 +1,4 @@
-"""The command line: pp-cl devices | train | eval | compare. Bad input is one line on stderr and exit status 2."""
+"""The command line: pp-cl devices | train | eval | compare | bench. Bad input is one line on stderr and exit status 2."""
 
 import argparse
 import json
@@ -92,6 +92,16 @@ def _parser():
     compare.add_argument("--metrics", nargs="?", const=",".join(METRICS), default="psnr,ssim", metavar="A,B")
     compare.add_argument("--json", metavar="FILE", help="also write the result there")
     _device_option(compare)
+
+    bench = _command(commands, "bench", _bench, "time against error of the convolutions and of the network")
+    bench.add_argument("what", choices=("conv", "unet"), help="conv: every layer of the network; unet: all of it")
+    bench.add_argument("--size", default="256", metavar="S", help="side of the image in pixels, a multiple of 4 (256)")
+    bench.add_argument(
+        "--widths", default="128,256,512", metavar="A,B,C", help="channels of the levels (128,256,512: the paper's)"
+    )
+    bench.add_argument("--json", metavar="FILE", help="also write the rows there")
+    bench.add_argument("--plot", metavar="FILE", help="also draw time against error there (.png, .svg, .pdf)")
+    _device_option(bench)
     return parser
 
 
@@ -209,3 +219,9 @@ def _compare(options):
         write_json(options.json, result)
     for name, value in result["mean"].items():
         print(f"{name:6s} {value:.4f}")
+
+
+def _bench(options):
+    from pp_cl.bench import run_bench
+
+    run_bench(options.what, options.size, options.widths, options.json, options.plot, options.device)

@@ -1,0 +1,34 @@
+// The most multiply-adds that a device does: what the speed of convolutions is measured against.
+#include "common.h"
+
+#ifndef CHAINS
+#define CHAINS 16            // independent sums of 16 lanes: enough to hide an FMA's latency, few enough for the registers
+#endif
+
+// One work-item per row of out: does `rounds` times `CHAINS` multiply-adds x = x * factor + term in registers, and writes
+// the sum of the chains. They begin at first, first + 1, ... so that no two are the same.
+kernel void peak(
+    const uint n,
+    const int rounds,
+    const float first,
+    const float factor,
+    const float term,
+    global float16 *out)                 // (n, 16)
+{
+    const uint i = get_global_id(0);
+    if (i >= n)
+        return;
+    float16 chain[CHAINS];
+    #pragma unroll
+    for (int c = 0; c < CHAINS; c++)
+        chain[c] = first + c;
+    for (int round = 0; round < rounds; round++)
+        #pragma unroll
+        for (int c = 0; c < CHAINS; c++)
+            chain[c] = chain[c] * factor + term;
+    float16 sum = 0.0f;
+    #pragma unroll
+    for (int c = 0; c < CHAINS; c++)
+        sum += chain[c];
+    out[i] = sum;
+}

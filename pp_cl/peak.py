@@ -1,0 +1,38 @@
+"""The measured peak of a device: a loop of independent multiply-adds that never leave the registers."""
+
+import time
+
+LANES = 16
+SECONDS = 0.02  # of one run: long against the 30 us of a launch, short enough to be run between any two others
+
+
+class Peak:
+    """The loop, long enough to be timed on the device at hand. flops: floating-point operations of one run()."""
+
+    def __init__(self, dev):
+        self.dev = dev
+        # A CPU core needs 2 units x 4 cycles of chains and has 32 vector registers. On a GPU the 16 lanes of one chain are
+        # 16 chains already, and many work-items share a unit.
+        self.chains, per_unit, self.local = (16, 64, 1) if dev.is_cpu else (2, 2048, 64)
+        self.out = dev.empty((per_unit * dev.info["compute_units"], LANES))
+        self.rounds = 64
+        self.run()  # builds the kernel
+        while self._seconds() < SECONDS:
+            self.rounds *= 2
+
+    @property
+    def flops(self):
+        """A multiply-add counts as two."""
+        return 2 * self.out.size * self.chains * self.rounds
+
+    def run(self, first=0.0, factor=0.5, term=1.0):
+        """Run the loop and wait for it. The chains tend to term / (1 - factor): they neither overflow nor vanish."""
+        self.dev.program("peak", CHAINS=self.chains).launch(
+            "peak", len(self.out), local=self.local, n=len(self.out), rounds=self.rounds, first=first, factor=factor,
+            term=term, out=self.out)
+        self.dev.finish()
+
+    def _seconds(self):
+        start = time.perf_counter()
+        self.run()
+        return time.perf_counter() - start

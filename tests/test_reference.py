@@ -1,0 +1,43 @@
+"""pp_cl/reference.py against the tests' own float64 twins, which are written another way."""
+
+import numpy as np
+import pytest
+from helpers import relative_error
+from oracle_conv import conv, conv_gradients
+from oracle_unet import unet, unet_gradients
+
+from pp_cl.reference import convolution, convolution_at, flipped, network, network_gradients, weight_gradient
+from pp_cl.unet import unet_steps
+
+
+@pytest.mark.parametrize("k", [1, 3])
+@pytest.mark.parametrize("height, width, ci, co", [(1, 1, 1, 1), (5, 1, 3, 16), (6, 9, 20, 7)])
+def test_convolution_and_its_gradients(rng, height, width, ci, co, k):
+    x, grad_out = (rng.normal(size=(height, width, c)).astype(np.float32) for c in (ci, co))
+    weight, bias = rng.normal(size=(co, ci, k, k)).astype(np.float32), rng.normal(size=co)
+    expected, (grad_x, grad_weight, _) = conv(x, weight, bias), conv_gradients(x, weight, grad_out)
+    assert relative_error(convolution(x, weight, bias), expected) < 1e-13
+    assert relative_error(convolution(grad_out, flipped(weight)), grad_x) < 1e-13
+    assert relative_error(weight_gradient(x, grad_out, k), grad_weight) < 1e-13
+    pixels = rng.integers(0, height, 12), rng.integers(0, width, 12)
+    assert relative_error(convolution_at(x, weight, bias, pixels), expected[pixels]) < 1e-13
+
+
+def test_network_and_its_gradients(rng):
+    widths, steps = (4, 5, 6), unet_steps((4, 5, 6), 3)
+    channels = {"x": 7} | {s.name: s.channels for s in steps}
+    parameters = {}
+    for step in (s for s in steps if s.kind.startswith("conv")):
+        shape = (step.channels, sum(channels[n] for n in step.inputs), *[int(step.kind[-1])] * 2)
+        parameters |= {step.name + ".weight": rng.normal(size=shape), step.name + ".bias": rng.normal(size=step.channels)}
+    x, grad_image = rng.normal(size=(8, 12, 7)), rng.normal(size=(8, 12, 3))
+    outputs = network(steps, parameters, x)
+    assert outputs["enc2.a"].shape == (2, 3, widths[2])
+    assert relative_error(outputs["image"], unet(x, parameters)[0]) < 1e-13
+    active = {name: values > 0 for name, values in outputs.items()}
+    gradients = network_gradients(steps, parameters, outputs, active, grad_image)
+    expected_x, expected = unet_gradients(x, parameters, grad_image)
+    assert relative_error(gradients.pop("x"), expected_x) < 1e-13
+    assert gradients.keys() == expected.keys()
+    for name, gradient in gradients.items():
+        assert relative_error(gradient, expected[name]) < 1e-12, name

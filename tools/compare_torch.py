@@ -1,0 +1,154 @@
+"""The same network in pp-cl and in PyTorch: times in turn, and the error against float64.
+
+    python tools/compare_torch.py --widths 128,256,512 --size 256 --json FILE
+
+PyTorch (development extra `torch`) runs the same operations in the same order, in channels_last, on the CPU.
+"""
+
+import argparse
+import sys
+
+import numpy as np
+
+from pp_cl import bench
+from pp_cl.checkpoint import write_json
+from pp_cl.device import open_device
+from pp_cl.errors import UserError
+
+# Seconds before each timed call. OpenMP's threads go on spinning for some milliseconds after PyTorch is done, on cores
+# that our device's threads need.
+PAUSE = 0.03
+
+
+class TorchNetwork:
+    """PyTorch's twin of a UNet, with the same parameters, in float32 channels_last or in float64."""
+
+    def __init__(self, torch, net, dtype):
+        self.torch, self.dtype, self.steps = torch, dtype, net.steps
+        plain = bench.plain_parameters(net, net.parameters)
+        self.parameters = {name: self._tensor(values) for name, values in plain.items()}
+
+    def _tensor(self, values):
+        tensor = self.torch.from_numpy(np.array(values)).to(self.dtype)
+        if tensor.ndim == 4:
+            tensor = tensor.contiguous(memory_format=self.torch.channels_last)
+        return tensor.requires_grad_()
+
+    def input(self, values):
+        """Tensor (1, C, H, W) of an (H, W, C) array."""
+        return self._tensor(values[None].transpose(0, 3, 1, 2))
+
+    def image(self, x):
+        """(1, 3, H, W) of the features x (1, C, H, W)."""
+        functional, outputs = self.torch.nn.functional, {"x": x}
+        for step in self.steps:
+            source = outputs[step.inputs[0]]
+            if len(step.inputs) > 1:
+                source = self.torch.cat([outputs[name] for name in step.inputs], 1)
+            if step.kind == "pool":
+                out = functional.avg_pool2d(source, 2)
+            elif step.kind == "up":
+                out = functional.interpolate(source, scale_factor=2, mode="bilinear", align_corners=False)
+            else:
+                weight, bias = self.parameters[step.name + ".weight"], self.parameters[step.name + ".bias"]
+                out = functional.conv2d(source, weight, bias, padding=weight.shape[2] // 2)
+                if step.kind == "conv3":
+                    out = functional.relu(out, inplace=True)
+            outputs[step.name] = out
+        return 0.5 + 0.5 * outputs["out"]
+
+    def forward(self, x):
+        """The image without what a backward pass needs."""
+        with self.torch.inference_mode():
+            return self.image(x)
+
+    def train(self, x, grad_image):
+        """{"x" or parameter: its gradient}."""
+        names = ["x", *self.parameters]
+        gradients = self.torch.autograd.grad(self.image(x), [x, *self.parameters.values()], grad_image)
+        return dict(zip(names, gradients, strict=True))
+
+
+def compare(torch, dev, widths, size, variant, rounds):
+    """The measurement as a dictionary for JSON: see main()."""
+    rng = np.random.default_rng(0)
+    values = np.maximum(rng.normal(size=(size, size, bench.CHANNELS_IN)), 0).astype(np.float32)
+    grads = rng.normal(size=(size, size, bench.CHANNELS_OUT)).astype(np.float32)
+    net = bench.make_network(dev, widths, variant)
+    x, grad_image = dev.upload(values), dev.upload(grads)
+    twin = TorchNetwork(torch, net, torch.float32)
+    torch_x = twin.input(values)
+    torch_grad = twin.input(grads).detach()
+
+    exact = TorchNetwork(torch, net, torch.float64)
+    expected = exact.forward(exact.input(values)).numpy()[0].transpose(1, 2, 0)
+    rel_l2 = bench.errors(net.forward(x, training=False).get(), expected)[0]
+    torch_rel_l2 = bench.errors(twin.forward(torch_x).numpy()[0].transpose(1, 2, 0), expected)[0]
+
+    times = bench.interleave({
+        ("forward", "ours"): bench.forward_runner(dev, net, x, grad_image),
+        ("forward", "torch"): lambda: twin.forward(torch_x),
+        ("train", "ours"): bench.train_runner(dev, net, x, grad_image),
+        ("train", "torch"): lambda: twin.train(torch_x, torch_grad),
+    }, rounds, PAUSE)
+    return {
+        "device": dev.name, "platform": dev.info["platform"], "variant": variant, "torch": torch.__version__,
+        "threads": torch.get_num_threads(), "widths": list(widths), "size": size, "runs": rounds,
+        "rel_l2": rel_l2, "torch_rel_l2": torch_rel_l2,
+        "forward": _summary(times, "forward"), "train": _summary(times, "train"),
+    }
+
+
+def _summary(times, direction):
+    """Medians and quartiles of both, and how many times faster than PyTorch we are."""
+    summary = {}
+    for name in ("ours", "torch"):
+        low, median, high = np.percentile(times[direction, name], (25, 50, 75))
+        summary |= {f"{name}_ms": float(median), f"{name}_quartiles": [float(low), float(high)]}
+    return summary | {"ratio": summary["torch_ms"] / summary["ours_ms"]}
+
+
+def main(argv=None):
+    """Measure, print, write; returns the exit status.
+
+    The JSON holds {"rel_l2": ours against float64, "forward": {"ours_ms", "torch_ms", "ratio"}, "train": the same}: medians,
+    ratio = torch_ms / ours_ms, train = forward and backward to the input and the weights.
+    """
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--widths", default="128,256,512", metavar="A,B,C", help="channels of the levels (128,256,512)")
+    parser.add_argument("--size", default="256", metavar="S", help="side of the image in pixels, a multiple of 4 (256)")
+    parser.add_argument("--variant", choices=bench.NETWORK_VARIANTS, default="auto", help="of our convolutions (auto)")
+    parser.add_argument("--threads", type=int, default=2, metavar="N", help="PyTorch's (2)")
+    parser.add_argument("--runs", type=int, default=15, metavar="N", help="timed runs of each (15)")
+    parser.add_argument("--device", metavar="D", help="ours, as `pp-cl devices` prints them")
+    parser.add_argument("--json", metavar="FILE", help="also write the result there")
+    options = parser.parse_args(argv)
+    try:
+        size, widths = bench.read_shape(options.size, options.widths)
+        if min(options.threads, options.runs) < 1:
+            raise UserError("--threads, --runs: must be at least 1")
+        torch = _import_torch()
+        torch.set_num_threads(options.threads)
+        result = compare(torch, open_device(options.device), widths, size, options.variant, options.runs)
+        if options.json:
+            write_json(options.json, result)
+    except UserError as error:
+        print(f"compare_torch: {error}", file=sys.stderr)
+        return 2
+    print(f"relative L2 error: ours {result['rel_l2']:.1e}, PyTorch's {result['torch_rel_l2']:.1e}")
+    for direction in ("forward", "train"):
+        row = result[direction]
+        print(f"{direction:8} ours {row['ours_ms']:9.2f} ms, PyTorch {row['torch_ms']:9.2f} ms, ratio {row['ratio']:.2f}")
+    return 0
+
+
+def _import_torch():
+    try:
+        import torch
+    except ImportError:
+        raise UserError("PyTorch is missing; install it with `pip install torch==2.13.0`") from None
+    return torch
+
+
+if __name__ == "__main__":
+    sys.exit(main())
