@@ -106,6 +106,10 @@ class UNet:
             self._trained = arrays
         return out
 
+    def output(self, name):
+        """(H, W, C) output of the step `name` in the last forward(training=True), until its backward pass."""
+        return self._trained[name]
+
     def backward(self, grad_y):
         """(H, W, channels_in) gradient of x in the last forward(x, training=True), given dL/dy (H, W, 3).
 
