@@ -1,4 +1,4 @@
-// Real spherical harmonics of degrees 0 to 2 in the order and with the signs of PlenOctrees (PAPER.md 1.5).
+// Real spherical harmonics of degrees 0 to 2 in the order and with the signs of PlenOctrees (Yu et al. 2021).
 #ifndef PP_SH_H
 #define PP_SH_H
 

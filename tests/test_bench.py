@@ -72,7 +72,7 @@ def test_rows_of_the_network(dev, monkeypatch, check_size):
 
 
 def test_operations_of_the_papers_network():
-    """PAPER.md's network takes about 1.0 TMAC at 800x800."""
+    """The paper's network takes about 1.0 TMAC at 800x800."""
     steps = unet_steps((128, 256, 512), 3)
     channels = {"x": 16} | {s.name: s.channels for s in steps}
     flops = sum(flops_of(s, channels, 800, 800) for s in steps if s.kind.startswith("conv"))
