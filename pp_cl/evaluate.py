@@ -5,7 +5,7 @@ from pathlib import PurePosixPath
 
 import numpy as np
 
-from pp_cl.checkpoint import load_checkpoint, remove_leftovers, write_json
+from pp_cl.checkpoint import remove_leftovers, write_json
 from pp_cl.config import load_config
 from pp_cl.device import open_device
 from pp_cl.image import write_png
@@ -13,7 +13,7 @@ from pp_cl.metrics import Metrics, mean
 from pp_cl.model import Model
 from pp_cl.preview import write_comparison
 from pp_cl.render import Renderer
-from pp_cl.run import CHECKPOINT, open_scene, with_depth_range
+from pp_cl.run import CHECKPOINT, load_run, open_scene, with_depth_range
 from pp_cl.scene import reduced_camera
 from pp_cl.schedule import gamma
 from pp_cl.target import Target
@@ -27,7 +27,7 @@ def evaluate_run(folder, metrics, split, save_images, device_choice):
     metrics: names out of psnr, ssim, lpips. Raises UserError for a missing or broken run or split.
     """
     config = load_config(folder / "config.json")
-    header, arrays = load_checkpoint(folder / CHECKPOINT)
+    header, arrays = load_run(folder / CHECKPOINT)
     dev = open_device(device_choice)
     scene = open_scene(dev, config, (split,))
     measure = Metrics(dev, metrics)

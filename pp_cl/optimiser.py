@@ -122,12 +122,15 @@ class Optimiser:
         return own | {f"state.{name}": a.get() for name, a in self.model.points.items() if name not in learned}
 
     def restore(self, arrays):
-        """Take the state of a checkpoint, as written by arrays()."""
-        for name, array in arrays.items():
-            kind, _, rest = name.partition(".")
-            if kind == "moment":
-                self.moments[rest].set(array)
-            elif kind == "average":
-                self.averages[rest] = self.dev.upload(array)
-            elif kind == "state":
-                self.model.points[rest] = self.dev.upload(array)
+        """Take the state of a checkpoint, as written by arrays(). Raises KeyError and ValueError for what does not fit."""
+        for name in self.moments:
+            self.moments[name].set(arrays[f"moment.{name}"])
+        points = self.model.points
+        for name in [n for n in points if n not in ("ids", *POINT_KEYS)]:
+            if arrays[f"state.{name}"].shape != points[name].shape:
+                raise ValueError(f"state.{name} has shape {arrays[f'state.{name}'].shape}")
+            points[name].set(arrays[f"state.{name}"])
+        for parameter, store, key in list(self._averaged()):
+            name = f"state.{key}" if store is points else f"average.{key}"
+            if name in arrays:
+                store[key] = self.dev.upload(arrays[name].reshape(parameter.shape))

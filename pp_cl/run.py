@@ -22,6 +22,18 @@ from pp_cl.train import Trainer
 CHECKPOINT = "checkpoint.npz"
 
 
+HEADER = ("scene", "step", "finished", "initial_points", "grid", "depth_range")  # of a run's checkpoint
+
+
+def load_run(path):
+    """(header, arrays) of a run's checkpoint. Raises UserError as load_checkpoint does, and for an incomplete header."""
+    header, arrays = load_checkpoint(path)
+    missing = [key for key in HEADER if key not in header]
+    if missing:
+        raise UserError(f"{path}: its header lacks {', '.join(missing)}; delete it to train anew, or restore a copy")
+    return header, arrays
+
+
 def open_scene(dev, config, splits):
     """Scene of config.scene.path with the given splits; `demo` is rendered on the device."""
     if config.scene.path != "demo":
@@ -58,8 +70,8 @@ def train_run(folder, config, device_choice):
     """
     checkpoint = folder / CHECKPOINT
     _check_folder(folder)
-    stored = load_checkpoint(checkpoint) if checkpoint.exists() else None
-    if stored and stored[0].get("finished"):
+    stored = load_run(checkpoint) if checkpoint.exists() else None
+    if stored and stored[0]["finished"]:
         print(f"{folder} is finished ({stored[0]['step']} steps); `pp-cl eval {folder} --metrics` measures it")
         return
     dev = open_device(device_choice)
@@ -112,7 +124,12 @@ def _resume(dev, config, scene, header, arrays, file):
         raise UserError(f"{file}: belongs to another scene than {config.scene.path}; use another --out")
     model = Model.load(dev, header, arrays, config.network.widths, file)
     trainer = Trainer(dev, config, model, with_depth_range(views, model.depth_range))
-    trainer.restore(header["step"], arrays)
+    try:
+        trainer.restore(header["step"], arrays)
+    except (KeyError, ValueError) as error:
+        raise UserError(
+            f"{file}: its training state is incomplete ({error}); delete it to train anew, or restore a copy"
+        ) from None
     print(f"resuming at step {header['step']} with {model.count} points")
     return trainer, {key: header[key] for key in ("scene", "initial_points")}
 

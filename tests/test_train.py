@@ -141,6 +141,29 @@ def test_a_checkpoint_of_another_scene_is_refused(scene, tmp_path, capsys):
     assert (out / "checkpoint.npz").read_bytes() == before
 
 
+@pytest.mark.parametrize("lost", ["moment.m.enc0.a.weight", "state.v.sh1", "state.weight"])
+def test_a_checkpoint_without_its_training_state_is_refused(scene, tmp_path, capsys, monkeypatch, lost):
+    steps, train_step = [], Trainer.train_step
+
+    def stopping(self):
+        if len(steps) == 15:
+            raise KeyboardInterrupt
+        steps.append(0)
+        return train_step(self)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Trainer, "train_step", stopping)
+        assert main(arguments(scene, tmp_path / "run")) == 130
+    header, arrays = load_checkpoint(tmp_path / "run" / "checkpoint.npz")
+    arrays.pop(lost)
+    save_checkpoint(tmp_path / "run" / "checkpoint.npz", {k: v for k, v in header.items() if k != "format"}, arrays)
+    assert main(arguments(scene, tmp_path / "run")) == 2
+    assert lost in capsys.readouterr().err
+    save_checkpoint(tmp_path / "run" / "checkpoint.npz", {"step": 10}, arrays)
+    assert main(arguments(scene, tmp_path / "run")) == 2
+    assert "header lacks scene" in capsys.readouterr().err
+
+
 def test_a_full_disk_while_logging_is_one_line(scene, tmp_path, capsys, monkeypatch):
     def full(_file, _row):
         raise UserError("log.jsonl: cannot be written (No space left on device); free some space")
