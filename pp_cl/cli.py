@@ -61,7 +61,7 @@ def _parser():
     train.add_argument(
         "--preset",
         choices=PRESETS,
-        help="tiny (default): 200x200, minutes on a CPU; small: 400x400, an hour or two; paper: the paper's numbers",
+        help="tiny (default): 200x200, minutes on a CPU; small: 400x400, longer; paper: the paper's numbers",
     )
     train.add_argument("--iterations", metavar="N", help="steps of training")
     train.add_argument("--points", metavar="N", help="wanted points on the grid")

@@ -83,7 +83,7 @@ class Config:
 # What differs from the defaults above, which are the tiny preset: minutes on a CPU.
 PRESETS = {
     "tiny": {},
-    # 400 x 400 in an hour or two on a CPU
+    # for 400 x 400; meant for an hour or two on a CPU, not timed yet
     "small": {"points.count": 1_000_000, "train.iterations": 20_000, "train.crop": 192},
     # the supplemental's own numbers; what it does not state is as above
     "paper": {

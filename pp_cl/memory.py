@@ -32,7 +32,7 @@ def memory_plan(dev, config, model, views):
     ]
     rows.append(("points of one view", f"({n}, {POINT_VIEW_FLOATS})", 4 * n * POINT_VIEW_FLOATS))
     if train.smooth > 0:
-        rows.append(("grid neighbours, scratch", f"({n}, 22)", 4 * n * 22))
+        rows.append(("neighbours, scratch (estimate)", f"({n}, 22)", 4 * n * 22))
     pairs = round(n * _pixels_per_point(config, model, camera))
     rows.append(("point-pixel pairs (estimate)", f"({pairs})", PAIR_BYTES * pairs))
     network = model.net.memory_plan(height, width, True)

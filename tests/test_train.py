@@ -15,6 +15,7 @@ from scenes import write_ball_scene
 from pp_cl.checkpoint import load_checkpoint, save_checkpoint
 from pp_cl.cli import main
 from pp_cl.errors import UserError
+from pp_cl.optimiser import Optimiser
 from pp_cl.train import Trainer, _draw_start
 
 # Every mechanism of the loop is due several times within 60 steps.
@@ -52,6 +53,21 @@ def finished(scene, tmp_path_factory):
     return out
 
 
+def train_and_interrupt(scene, out, steps, monkeypatch):
+    """A small training that ends with Ctrl-C after `steps` steps."""
+    train_step, done = Trainer.train_step, []
+
+    def stopping(self):
+        if len(done) == steps:
+            raise KeyboardInterrupt
+        done.append(0)
+        return train_step(self)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Trainer, "train_step", stopping)
+        assert main(arguments(scene, out)) == 130
+
+
 def rows(out):
     return [json.loads(line) for line in (out / "log.jsonl").read_text().splitlines()]
 
@@ -78,17 +94,7 @@ def test_the_same_seed_gives_the_same_bytes_and_another_does_not(scene, finished
 
 @pytest.mark.parametrize("steps", [3, 25, 47, 59])
 def test_stopped_at_any_step_it_resumes_to_the_same_bytes(scene, finished, tmp_path, monkeypatch, steps):
-    train_step, done = Trainer.train_step, []
-
-    def stopping(self):
-        if len(done) == steps:
-            raise KeyboardInterrupt
-        done.append(0)
-        return train_step(self)
-
-    with monkeypatch.context() as patch:
-        patch.setattr(Trainer, "train_step", stopping)
-        assert main(arguments(scene, tmp_path / "run")) == 130
+    train_and_interrupt(scene, tmp_path / "run", steps, monkeypatch)
     assert main(arguments(scene, tmp_path / "run")) == 0
     assert (tmp_path / "run" / "checkpoint.npz").read_bytes() == (finished / "checkpoint.npz").read_bytes()
     strip = [{k: v for k, v in r.items() if k != "seconds"} for r in rows(tmp_path / "run")]
@@ -143,17 +149,7 @@ def test_a_checkpoint_of_another_scene_is_refused(scene, tmp_path, capsys):
 
 @pytest.mark.parametrize("lost", ["moment.m.enc0.a.weight", "state.v.sh1", "state.weight"])
 def test_a_checkpoint_without_its_training_state_is_refused(scene, tmp_path, capsys, monkeypatch, lost):
-    steps, train_step = [], Trainer.train_step
-
-    def stopping(self):
-        if len(steps) == 15:
-            raise KeyboardInterrupt
-        steps.append(0)
-        return train_step(self)
-
-    with monkeypatch.context() as patch:
-        patch.setattr(Trainer, "train_step", stopping)
-        assert main(arguments(scene, tmp_path / "run")) == 130
+    train_and_interrupt(scene, tmp_path / "run", 15, monkeypatch)
     header, arrays = load_checkpoint(tmp_path / "run" / "checkpoint.npz")
     arrays.pop(lost)
     save_checkpoint(tmp_path / "run" / "checkpoint.npz", {k: v for k, v in header.items() if k != "format"}, arrays)
@@ -174,7 +170,7 @@ def test_a_full_disk_while_logging_is_one_line(scene, tmp_path, capsys, monkeypa
 
 
 def test_a_loss_that_is_not_finite_stops_the_run_and_keeps_the_checkpoint(scene, tmp_path, capsys, monkeypatch):
-    update, steps = __import__("pp_cl.optimiser").optimiser.Optimiser.update, []
+    update, steps = Optimiser.update, []
 
     def poisoned(self, *args):
         update(self, *args)
@@ -182,7 +178,7 @@ def test_a_loss_that_is_not_finite_stops_the_run_and_keeps_the_checkpoint(scene,
         if len(steps) == 15:
             self.dev.fill(self.model.points["sh0"], np.nan)
 
-    monkeypatch.setattr("pp_cl.optimiser.Optimiser.update", poisoned)
+    monkeypatch.setattr(Optimiser, "update", poisoned)
     assert main(arguments(scene, tmp_path / "run")) == 2
     assert "the loss is not finite at step 16" in capsys.readouterr().err
     assert load_checkpoint(tmp_path / "run" / "checkpoint.npz")[0]["step"] == 10
