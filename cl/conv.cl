@@ -1,9 +1,10 @@
 // Direct K x K convolution, stride 1, zero padding K/2: the forward pass and the gradient of its input.
 //
-// A work-item keeps BLOCKS x 16 output channels of TILE neighbouring pixels in registers. For each input channel it loads
-// K weight vectors per block and TILE + K - 1 scalars, and does K * BLOCKS * TILE vector multiply-adds with them. TILE and
-// BLOCKS are chosen so that accumulators and weights fit the 32 vector registers of AVX-512 (pp_cl/conv.py).
+// A work-item keeps BLOCKS x 16 output channels of TILE neighbouring pixels of a row in registers. For each input channel it
+// loads K weight vectors per block and TILE + K - 1 scalars, and does K * BLOCKS * TILE vector multiply-adds with them. TILE
+// and BLOCKS are chosen so that accumulators and weights fit the 32 vector registers of AVX-512 (pp_cl/conv.py).
 #include "common.h"
+#include "tiles.h"
 #include "vector.h"
 
 #ifndef K
@@ -67,8 +68,16 @@ inline void convolve(
     }
 }
 
-// One work-item per (tile, row, BLOCKS * 16 output channels): reads the tile's neighbourhood in x, then in x2 (the
-// concatenation [x, x2] without making it), and writes its tile of out.
+// Whether any of the TILE pixels from (x0, y) on lies in a tile that is computed.
+inline bool any_is_computed(global const float *tile_count, const int x0, const int y, const int width) {
+    bool any = false;
+    for (int x = x0; x < x0 + TILE + SIDE - 1; x += SIDE)
+        any |= tile_is_computed(tile_count, min(x, x0 + TILE - 1), y, width);
+    return any;
+}
+
+// One work-item per (TILE pixels, row, BLOCKS * 16 output channels): reads their neighbourhood in x, then in x2 (the
+// concatenation [x, x2] without making it), and writes those of out that lie in a tile to compute.
 kernel void conv_forward(
     const int height,
     const int width,
@@ -80,12 +89,15 @@ kernel void conv_forward(
     global const float *x2,              // (height, width, ?)
     global const float16 *weight,        // (blocks, K, K, c1 + c2, 16)
     global const float16 *bias,          // (?)
+    global const float *tile_count,      // (?, ?) 0 = not computed
     global float *out)                   // (height, width, co)
 {
     const int tile_x = get_global_id(0) * TILE, y = get_global_id(1), block = get_global_id(2) * BLOCKS;
     if (tile_x >= width || y >= height || block * 16 >= co)
         return;
-    const int x0 = min(tile_x, width - TILE);    // the last tile moves left, and stores only what its neighbour does not
+    const int x0 = min(tile_x, width - TILE);    // the last ones move left, and store only what their neighbours do not
+    if (!any_is_computed(tile_count, x0, y, width))
+        return;
     float16 acc[BLOCKS][TILE];
     #pragma unroll
     for (int b = 0; b < BLOCKS; b++)
@@ -102,7 +114,7 @@ kernel void conv_forward(
     for (int b = 0; b < BLOCKS; b++)
         #pragma unroll
         for (int p = 0; p < TILE; p++)
-            if (x0 + p >= tile_x) {
+            if (x0 + p >= tile_x && tile_is_computed(tile_count, x0 + p, y, width)) {
                 // max(., 0) would hide a NaN
                 const float16 value = relu ? select(acc[b][p], (float16)(0.0f), acc[b][p] < 0.0f) : acc[b][p];
                 store16(value, out + ((size_t)y * width + x0 + p) * co + (block + b) * 16,
@@ -110,9 +122,9 @@ kernel void conv_forward(
             }
 }
 
-// One work-item per (tile, row, BLOCKS * 16 input channels): reads grad_out, and writes its tile of grad_x, which is the
-// convolution of grad_out with the flipped and transposed weights (conv_weights.cl). masked: x is the output of a ReLU and
-// grad_x the gradient of that ReLU's input, so that the mask costs no pass of its own.
+// One work-item per (TILE pixels, row, BLOCKS * 16 input channels): reads grad_out, and writes those of grad_x that lie in a
+// tile to compute: the convolution of grad_out with the flipped and transposed weights (conv_weights.cl). masked: x is the
+// output of a ReLU and grad_x the gradient of that ReLU's input, so that the mask costs no pass of its own.
 kernel void conv_backward_input(
     const int height,
     const int width,
@@ -122,12 +134,15 @@ kernel void conv_backward_input(
     global const float *x,               // (height, width, c)
     global const float16 *flipped,       // (blocks, K, K, co, 16)
     global const float *grad_out,        // (height, width, co)
+    global const float *tile_count,      // (?, ?) of grad_x, 0 = not computed
     global float *grad_x)                // (height, width, c)
 {
     const int tile_x = get_global_id(0) * TILE, y = get_global_id(1), block = get_global_id(2) * BLOCKS;
     if (tile_x >= width || y >= height || block * 16 >= c)
         return;
     const int x0 = min(tile_x, width - TILE);
+    if (!any_is_computed(tile_count, x0, y, width))
+        return;
     float16 acc[BLOCKS][TILE];
     #pragma unroll
     for (int b = 0; b < BLOCKS; b++)
@@ -141,7 +156,7 @@ kernel void conv_backward_input(
     for (int b = 0; b < BLOCKS; b++)
         #pragma unroll
         for (int p = 0; p < TILE; p++)
-            if (x0 + p >= tile_x) {
+            if (x0 + p >= tile_x && tile_is_computed(tile_count, x0 + p, y, width)) {
                 const size_t at = ((size_t)y * width + x0 + p) * c + (block + b) * 16;
                 const int lanes = c - (block + b) * 16;
                 const float16 dL_dx = masked ? select((float16)0.0f, acc[b][p], load16(x + at, lanes) > 0.0f) : acc[b][p];

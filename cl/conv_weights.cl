@@ -1,5 +1,6 @@
 // The weight side of a K x K convolution: its weight and bias gradients, and the weights its input gradient is made with.
 #include "common.h"
+#include "tiles.h"
 #include "vector.h"
 
 #ifndef K
@@ -31,9 +32,15 @@ kernel void conv_flip_weights(
     flipped[(block * K * K + K * K - 1 - tap) * co + o] = vload16(0, lane);
 }
 
+// The gradients of 16 channels, `count` times; 0 where count is, whatever they are.
+inline float16 counted(global const float *grad, const float count, const int lanes) {
+    return count > 0.0f ? count * load16(grad, lanes) : (float16)0.0f;
+}
+
 // One work-item per (CI_TILE input channels and ky, 16 output channels, `rows` rows of the image): walks its rows of x with
 // the gradients of the K output pixels that see each pixel, and writes its part of the sums: dL/dweight in rows
-// (ky, kx, channel) of partial, dL/dbias in the last row. Needs no border test: it visits only pixels that exist.
+// (ky, kx, channel) of partial, dL/dbias in the last row. Needs no border test: it visits only pixels that exist. A gradient
+// counts as often as its tile.
 kernel void conv_backward_weights(
     const int height,
     const int width,
@@ -44,6 +51,7 @@ kernel void conv_backward_weights(
     const int rows,
     global const float *x,               // (height, width, c)
     global const float *grad_out,        // (height, width, co)
+    global const float *tile_count,      // (?, ?) of grad_out, 0 = not read
     global float16 *partial)             // (...) at least (parts, co / 16 rounded up, K * K * ci + 1, 16)
 {
     const int groups = c / CI_TILE, item = get_global_id(0), blocks = (co + 15) / 16;
@@ -51,12 +59,14 @@ kernel void conv_backward_weights(
     if (item >= K * groups || block >= blocks)
         return;
     const int ky = item / groups, c0 = item % groups * CI_TILE, lanes = co - block * 16;
-    float16 acc[K][CI_TILE], sum = 0.0f;
-    #pragma unroll
+    const bool with_bias = ky == PAD && first + c0 == 0;
+    global float16 *out = partial + ((size_t)part * blocks + block) * (K * K * ci + 1), *bias = out + K * K * ci;
+    out += ky * K * ci + first + c0;
     for (int kx = 0; kx < K; kx++)
-        #pragma unroll
         for (int i = 0; i < CI_TILE; i++)
-            acc[kx][i] = 0.0f;
+            out[kx * ci + i] = 0.0f;
+    if (with_bias)
+        *bias = 0.0f;
 
     const int end = min(height, (part + 1) * rows);
     for (int y = part * rows; y < end; y++) {
@@ -65,17 +75,27 @@ kernel void conv_backward_weights(
             continue;
         global const float *pixel = x + (size_t)row * width * c + c0;
         global const float *grad = grad_out + (size_t)y * width * co + block * 16;
+        global const float *count = tile_count + y / SIDE * tile_columns(width);
+        float16 acc[K][CI_TILE], sum = 0.0f;     // of one row: a single sum over all of them would lose digits
+        #pragma unroll
+        for (int kx = 0; kx < K; kx++)
+            #pragma unroll
+            for (int i = 0; i < CI_TILE; i++)
+                acc[kx][i] = 0.0f;
         float16 window[K];                       // window[kx]: dL/dout at column + PAD - kx
         #pragma unroll
         for (int kx = 0; kx < K; kx++)
             window[kx] = 0.0f;
         if (PAD)
-            window[0] = load16(grad, lanes);
+            window[0] = counted(grad, count[0], lanes);
         for (int column = 0; column < width; column++) {
             #pragma unroll
             for (int kx = K - 1; kx > 0; kx--)
                 window[kx] = window[kx - 1];
-            window[0] = column + PAD < width ? load16(grad + (column + PAD) * co, lanes) : (float16)0.0f;
+            const int ahead = column + PAD;
+            window[0] = ahead < width ? counted(grad + ahead * co, count[ahead / SIDE], lanes) : (float16)0.0f;
+            if (!PAD && count[column / SIDE] == 0.0f)
+                continue;
             #pragma unroll
             for (int i = 0; i < CI_TILE; i++) {
                 const float value = pixel[column * c + i];
@@ -85,16 +105,14 @@ kernel void conv_backward_weights(
             }
             sum += window[PAD];
         }
-    }
-
-    global float16 *out = partial + ((size_t)part * blocks + block) * (K * K * ci + 1);
-    #pragma unroll
-    for (int kx = 0; kx < K; kx++)
         #pragma unroll
-        for (int i = 0; i < CI_TILE; i++)
-            out[(ky * K + kx) * ci + first + c0 + i] = acc[kx][i];
-    if (ky == PAD && first + c0 == 0)
-        out[K * K * ci] = sum;
+        for (int kx = 0; kx < K; kx++)
+            #pragma unroll
+            for (int i = 0; i < CI_TILE; i++)
+                out[kx * ci + i] += acc[kx][i];
+        if (with_bias)
+            *bias += sum;
+    }
 }
 
 // One work-item per (row of partial, 16 output channels): adds the parts in order; writes one vector of a gradient.

@@ -1,6 +1,8 @@
 // The layers between convolutions, on (H, W, C) feature maps: pooling, bilinear upsampling, a straight line.
-// But for the last, a work-item is (16 channels, x, y): one vector of a pixel, shorter where C ends.
+// But for the last, a work-item is (16 channels, x, y): one vector of a pixel, shorter where C ends. It writes where the
+// pixel's tile is computed (tiles.h); max pooling everywhere.
 #include "common.h"
+#include "tiles.h"
 #include "vector.h"
 
 // One work-item per (16 channels, x, y) of out: reads the 2x2 pixels it covers, writes their mean.
@@ -9,10 +11,11 @@ kernel void avgpool2_forward(
     const int w,
     const int c,
     global const float *x,               // (?, ?, c) twice the height and width of out
+    global const float *tile_count,      // (?, ?) of out, 0 = not computed
     global float *out)                   // (h, w, c)
 {
     const int first = get_global_id(0) * CHANNELS, column = get_global_id(1), row = get_global_id(2), lanes = c - first;
-    if (first >= c || column >= w || row >= h)
+    if (first >= c || column >= w || row >= h || !tile_is_computed(tile_count, column, row, w))
         return;
     global const float *upper = x + ((size_t)row * 4 * w + column * 2) * c + first, *lower = upper + 2 * w * c;
     const float16 sum = (load16(upper, lanes) + load16(upper + c, lanes))
@@ -28,10 +31,11 @@ kernel void avgpool2_backward(
     const int c,
     global const float *x,               // (?, ?, c)
     global const float *grad_out,        // (h, w, c)
+    global const float *tile_count,      // (?, ?) of grad_x, 0 = not computed
     global float *grad_x)                // (?, ?, c)
 {
     const int first = get_global_id(0) * CHANNELS, column = get_global_id(1), row = get_global_id(2), lanes = c - first;
-    if (first >= c || column >= 2 * w || row >= 2 * h)
+    if (first >= c || column >= 2 * w || row >= 2 * h || !tile_is_computed(tile_count, column, row, 2 * w))
         return;
     const size_t at = ((size_t)row * 2 * w + column) * c + first;
     const float16 dL_dout = load16(grad_out + ((size_t)(row / 2) * w + column / 2) * c + first, lanes);
@@ -66,10 +70,11 @@ kernel void upsample2_forward(
     const int w,
     const int c,
     global const float *x,               // (h, w, c)
+    global const float *tile_count,      // (?, ?) of out, 0 = not computed
     global float *out)                   // (?, ?, c)
 {
     const int first = get_global_id(0) * CHANNELS, column = get_global_id(1), row = get_global_id(2), lanes = c - first;
-    if (first >= c || column >= 2 * w || row >= 2 * h)
+    if (first >= c || column >= 2 * w || row >= 2 * h || !tile_is_computed(tile_count, column, row, 2 * w))
         return;
     const int near = column / 2 * c, beside = clamp(column / 2 - 1 + 2 * (column & 1), 0, w - 1) * c;
     const int other = clamp(row / 2 - 1 + 2 * (row & 1), 0, h - 1);
@@ -85,10 +90,11 @@ kernel void upsample2_backward(
     const int w,
     const int c,
     global const float *grad_out,        // (?, ?, c) twice the height and width of x
+    global const float *tile_count,      // (?, ?) of grad_x, 0 = not computed
     global float *grad_x)                // (h, w, c)
 {
     const int first = get_global_id(0) * CHANNELS, column = get_global_id(1), row = get_global_id(2), lanes = c - first;
-    if (first >= c || column >= w || row >= h)
+    if (first >= c || column >= w || row >= h || !tile_is_computed(tile_count, column, row, w))
         return;
     // The outermost row or column reads its own edge of x with weight 1: it counts once more in place of the one outside.
     const int x0 = max(2 * column - 1, 0) * c, x1 = 2 * column * c, x2 = x1 + c, x3 = min(2 * column + 2, 2 * w - 1) * c;

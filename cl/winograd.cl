@@ -1,8 +1,8 @@
 // 3x3 convolution by Winograd's minimal filtering (winograd.h): the forward pass and the gradient of its input.
 //
-// The image is cut into tiles of M x M outputs. A work-item takes an equal share of them, TILES at a time, through three
-// stages: the input tiles are transformed, multiplied position by position as matrices (tiles x CI) (CI x CO), and
-// transformed back. What lies between the stages stays in its own slice of `scratch`, small enough for the caches.
+// The image is cut into tiles of M x M outputs. A work-item takes an equal share of those to compute, TILES at a time,
+// through three stages: the input tiles are transformed, multiplied position by position as matrices (tiles x CI) (CI x CO),
+// and transformed back. What lies between the stages stays in its own slice of `scratch`, small enough for the caches.
 //
 // One work-item per compute unit (work-groups of 1): an image's tiles are many, and each slice is used over and over.
 #include "winograd.h"
@@ -117,8 +117,8 @@ inline void multiply(
             }
 }
 
-// Stage 3: the outputs of `count` tiles from `first` on, plus bias (0 = none); with relu, max(., 0) of them; with mask, 0
-// where mask is not positive.
+// Stage 3: the outputs of `count` tiles of tile_list from `first` on, plus bias (0 = none); with relu, max(., 0) of them;
+// with mask, 0 where mask is not positive.
 __attribute__((always_inline))
 inline void transform_back(
     global float *out,
@@ -127,14 +127,13 @@ inline void transform_back(
     const int relu,
     global const float *mask,
     const int co,
+    global const int *tile_list,
     const int first,
-    const int count,
-    const int height,
-    const int width)
+    const int count)
 {
-    const int columns = (width + M - 1) / M, pitch = PITCH(co);
+    const int height = tile_list[0], width = tile_list[1], pitch = PITCH(co);
     for (int tile = 0; tile < count; tile++) {
-        const int x0 = (first + tile) % columns * M, y0 = (first + tile) / columns * M;
+        const int2 corner = tile_corner(tile_list, first + tile);
         for (int block = 0; block < co / 16; block++) {
             float16 t[POSITIONS];
             #pragma unroll
@@ -151,8 +150,8 @@ inline void transform_back(
             for (int i = 0; i < M; i++)
                 #pragma unroll
                 for (int j = 0; j < M; j++)
-                    if (y0 + i < height && x0 + j < width) {
-                        const size_t at = ((size_t)(y0 + i) * width + x0 + j) * co + block * 16;
+                    if (corner.y + i < height && corner.x + j < width) {
+                        const size_t at = ((size_t)(corner.y + i) * width + corner.x + j) * co + block * 16;
                         float16 value = t[i * S + j] + offset;
                         if (relu)                            // max(., 0) would hide a NaN
                             value = select(value, (float16)0.0f, value < 0.0f);
@@ -177,15 +176,14 @@ inline void convolve(
     global const float *mask,
     global float *out,
     const int co,
-    global float16 *scratch,             // all work-items'
-    const int height,
-    const int width)
+    global const int *tile_list,
+    global float16 *scratch)             // all work-items'
 {
     const int ci = c1 + c2;
     global float16 *v = scratch + get_global_id(0) * SLICE(ci, co), *m = v + POSITIONS * PITCH(ci);
     global float *patch = (global float *)(m + POSITIONS * PITCH(co));
 
-    const long tiles = ((height + M - 1) / M) * ((width + M - 1) / M);
+    const long tiles = tile_list[2] * PER_SIDE * PER_SIDE;
     const int begin = tiles * get_global_id(0) / get_global_size(0);
     const int end = tiles * (get_global_id(0) + 1) / get_global_size(0);
     const int rounds = max(1, (end - begin + TILES - 1) / TILES);      // of about the same size
@@ -194,17 +192,15 @@ inline void convolve(
         const int count = min(step, end - first), padded = (count + GROUP - 1) / GROUP * GROUP;
         for (int source = 0; source < (c2 ? 2 : 1); source++)
             transform_tiles(v + (source ? c1 / 16 * TILES : 0), PITCH(ci), patch, source ? x2 : x, source ? c2 : c1,
-                            (source ? c2 : c1) / 16, first, count, padded, height, width);
+                            (source ? c2 : c1) / 16, tile_list, first, count, padded);
         multiply(m, v, weight, ci, co / 16, padded);
-        transform_back(out, m, bias, relu, mask, co, first, count, height, width);
+        transform_back(out, m, bias, relu, mask, co, tile_list, first, count);
     }
 }
 
 // One work-item per compute unit: reads its tiles' neighbourhood in x, then in x2 (the concatenation [x, x2] without making
 // it), and writes its tiles of out.
 kernel void winograd_forward(
-    const int height,
-    const int width,
     const int c1,
     const int c2,                        // channels of x2; 0 = x2 is not read
     const int co,
@@ -213,25 +209,25 @@ kernel void winograd_forward(
     global const float *x2,              // (height, width, ?)
     global const float16 *weight,        // (...) at least (POSITIONS, blocks, c1 + c2, 16)
     global const float16 *bias,          // (?)
+    global const int *tile_list,         // (?)
     global float *out,                   // (height, width, co)
     global float16 *scratch)             // (...) work-items times SLICE(c1 + c2, co) vectors
 {
-    convolve(x, x2, c1, c2, weight, bias, relu, 0, out, co, scratch, height, width);
+    convolve(x, x2, c1, c2, weight, bias, relu, 0, out, co, tile_list, scratch);
 }
 
 // One work-item per compute unit: reads its tiles' neighbourhood in grad_out, and writes its tiles of grad_x, which is the
 // convolution of grad_out with the flipped weights. masked: x is the output of a ReLU and grad_x the gradient of its input.
 kernel void winograd_backward_input(
-    const int height,
-    const int width,
     const int c,
     const int co,
     const int masked,
     global const float *x,               // (height, width, c)
     global const float16 *flipped,       // (...) at least (POSITIONS, blocks, co, 16)
     global const float *grad_out,        // (height, width, co)
+    global const int *tile_list,         // (?) of grad_x
     global float *grad_x,                // (height, width, c)
     global float16 *scratch)             // (...) work-items times SLICE(co, c) vectors
 {
-    convolve(grad_out, 0, co, 0, flipped, 0, 0, masked ? x : 0, grad_x, c, scratch, height, width);
+    convolve(grad_out, 0, co, 0, flipped, 0, 0, masked ? x : 0, grad_x, c, tile_list, scratch);
 }

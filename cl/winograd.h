@@ -8,6 +8,7 @@
 #ifndef PP_WINOGRAD_H
 #define PP_WINOGRAD_H
 #include "common.h"
+#include "tiles.h"
 
 #ifndef M
 #define M 4                  // side of a tile of outputs: 2 or 4
@@ -17,6 +18,7 @@
 #endif
 #define S (M + 2)            // side of a tile of inputs
 #define POSITIONS (S * S)
+#define PER_SIDE (SIDE / M)   // of tiles.h's tiles
 
 #define P 0.75f
 #define Q 1.5f
@@ -121,6 +123,13 @@ inline void transform_kernel_gradient(float16 *t, const int step) {
 // The odd one keeps the positions apart in the sets of a cache.
 #define PITCH(channels) ((channels) / 16 * TILES + 1)
 
+// The corner of the i-th tile of outputs among those of tile_list: height, width, number, and the tiles of tiles.h.
+inline int2 tile_corner(global const int *tile_list, const int i) {
+    const int columns = tile_columns(tile_list[1]), tile = tile_list[3 + i / (PER_SIDE * PER_SIDE)];
+    const int inside = i % (PER_SIDE * PER_SIDE);
+    return (int2)(tile % columns * SIDE + inside % PER_SIDE * M, tile / columns * SIDE + inside / PER_SIDE * M);
+}
+
 // The `side` x `side` pixels from (x0, y0) on, 16 channels each, into rows of t that are S apart; 0 outside the image. A
 // tile across the border is gathered in `patch` first, so that one piece of straight code loads them all.
 __attribute__((always_inline))
@@ -155,7 +164,8 @@ inline void load_tile(
             t[i] = vload16(0, corner + i / S * row + i % S * column);
 }
 
-// v = B^T d B of the inputs d of `padded` tiles from `first` on, 16 * chunks channels; the last of `count` is repeated.
+// v = B^T d B of the inputs d of `padded` tiles of tile_list from `first` on, 16 * chunks channels; the last of `count` is
+// repeated.
 __attribute__((always_inline))
 inline void transform_tiles(
     global float16 *v,
@@ -164,18 +174,17 @@ inline void transform_tiles(
     global const float *x,           // at the first of the channels
     const int channels,              // of a pixel
     const int chunks,
+    global const int *tile_list,
     const int first,
     const int count,
-    const int padded,
-    const int height,
-    const int width)
+    const int padded)
 {
-    const int columns = (width + M - 1) / M;
+    const int height = tile_list[0], width = tile_list[1];
     for (int tile = 0; tile < padded; tile++) {
-        const int at = first + min(tile, count - 1), x0 = at % columns * M - 1, y0 = at / columns * M - 1;
+        const int2 corner = tile_corner(tile_list, first + min(tile, count - 1)) - 1;
         for (int chunk = 0; chunk < chunks; chunk++) {
             float16 t[POSITIONS];
-            load_tile(t, S, patch, x + chunk * 16, channels, x0, y0, height, width);
+            load_tile(t, S, patch, x + chunk * 16, channels, corner.x, corner.y, height, width);
             #pragma unroll
             for (int i = 0; i < S; i++)
                 transform_input(t + i, S);

@@ -14,7 +14,8 @@
 #define SLICE(ci_part) (POSITIONS * (PITCH(ci_part) + PITCH(CO_PART) + (ci_part) * (CO_PART / 16) + 1) + CO_PART / 16)
 #define ROWS 8               // input channels multiplied together: ROWS * BLOCKS accumulators and BLOCKS vectors fit AVX-512
 
-// z = A g A^T of `count` tiles of gradients from `first` on; sums (16 channels each) += all gradients.
+// z = A g A^T of the gradients of `count` tiles of tile_list from `first` on, each times its tile_count; sums (16 channels
+// each) += all of these gradients.
 __attribute__((always_inline))
 inline void transform_gradients(
     global float16 *z,
@@ -23,23 +24,25 @@ inline void transform_gradients(
     global const float *grad_out,        // at the first of the channels
     const int channels,                  // of a pixel
     const int blocks,
+    global const int *tile_list,
+    global const float *tile_count,
     const int first,
-    const int count,
-    const int height,
-    const int width)
+    const int count)
 {
-    const int columns = (width + M - 1) / M;
-    for (int tile = 0; tile < count; tile++) {
-        const int x0 = (first + tile) % columns * M, y0 = (first + tile) / columns * M;
-        for (int block = 0; block < blocks; block++) {
+    const int height = tile_list[0], width = tile_list[1];
+    for (int block = 0; block < blocks; block++) {
+        float16 round = 0.0f;                // summed apart: one sum over the whole image would lose digits
+        for (int tile = 0; tile < count; tile++) {
+            const int2 corner = tile_corner(tile_list, first + tile);
+            const float times = tile_count[tile_list[3 + (first + tile) / (PER_SIDE * PER_SIDE)]];
             float16 t[POSITIONS], sum = 0.0f;
-            load_tile(t, M, patch, grad_out + block * 16, channels, x0, y0, height, width);
+            load_tile(t, M, patch, grad_out + block * 16, channels, corner.x, corner.y, height, width);
             #pragma unroll
             for (int i = 0; i < M; i++)
                 #pragma unroll
                 for (int j = 0; j < M; j++)
-                    sum += t[i * S + j];
-            sums[block] += sum;
+                    sum += t[i * S + j] *= times;
+            round += sum;
             #pragma unroll
             for (int i = 0; i < M; i++)
                 transform_gradient(t + i, S);
@@ -50,6 +53,7 @@ inline void transform_gradients(
             for (int i = 0; i < POSITIONS; i++)
                 z[i * PITCH(CO_PART) + block * TILES + tile] = t[i];
         }
+        sums[block] += round;
     }
 }
 
@@ -98,11 +102,9 @@ inline void multiply_gradients(
             }
 }
 
-// One work-item per compute unit (work-groups of 1): takes parts of ci_part x CO_PART channels in turn, walks all tiles of x
-// and grad_out for each, and writes that part of the gradients. No part is added to by two work-items.
+// One work-item per compute unit (work-groups of 1): takes parts of ci_part x CO_PART channels in turn, walks the tiles of
+// tile_list in x and grad_out for each, and writes that part of the gradients. No part is added to by two work-items.
 kernel void winograd_backward_weights(
-    const int height,
-    const int width,
     const int c,
     const int co,
     const int first,                     // channel of the weights where x begins; with 0 the bias gradient is written too
@@ -110,11 +112,13 @@ kernel void winograd_backward_weights(
     const int ci_part,                   // a multiple of 16
     global const float *x,               // (height, width, c)
     global const float *grad_out,        // (height, width, co)
+    global const int *tile_list,         // (?) of grad_out
+    global const float *tile_count,      // (?, ?) of grad_out
     global float16 *grad_weight,         // (?, 3, 3, ci, 16)
     global float16 *grad_bias,           // (?)
     global float16 *scratch)             // (...) work-items times SLICE(ci_part) vectors
 {
-    const int tiles = ((height + M - 1) / M) * ((width + M - 1) / M), items = get_global_size(0);
+    const int tiles = tile_list[2] * PER_SIDE * PER_SIDE, items = get_global_size(0);
     const int co_parts = (co + CO_PART - 1) / CO_PART, parts = (c + ci_part - 1) / ci_part * co_parts;
     global float16 *v = scratch + (size_t)get_global_id(0) * SLICE(ci_part);
     global float16 *z = v + POSITIONS * PITCH(ci_part), *sums = z + POSITIONS * PITCH(CO_PART);
@@ -127,8 +131,8 @@ kernel void winograd_backward_weights(
             bias[block] = 0.0f;
         for (int tile = 0; tile < tiles; tile += TILES) {
             const int count = min(TILES, tiles - tile);
-            transform_tiles(v, PITCH(ci_part), patch, x + c0, c, rows / 16, tile, count, count, height, width);
-            transform_gradients(z, bias, patch, grad_out + block0 * 16, co, blocks, tile, count, height, width);
+            transform_tiles(v, PITCH(ci_part), patch, x + c0, c, rows / 16, tile_list, tile, count, count);
+            transform_gradients(z, bias, patch, grad_out + block0 * 16, co, blocks, tile_list, tile_count, tile, count);
             multiply_gradients(sums, v, z, ci_part, rows, blocks, count, tile == 0);
         }
         for (int block = 0; block < blocks; block++) {

@@ -1,6 +1,7 @@
 """The blend of Eq. (1): weights, features, and their gradients."""
 
 ALL = 2**32 - 1
+BACKGROUND = 1.0  # every feature of a pixel without hits (cl/blend.cl)
 
 
 class Blend:

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-LANES = 16  # output channels in one float16
+from pp_cl.tiles import LANES, checked_tiles
 
 
 def pack_weights(weight, dtype=np.float32):
@@ -39,11 +39,12 @@ def tiling(dev, width, channels_out):
     return next(t for t in tiles if t <= width), blocks, local
 
 
-def conv_forward(dev, x, weight, bias, out, relu, x2=None):
+def conv_forward(dev, x, weight, bias, out, relu, x2=None, tiles=None):
     """out = convolution of [x, x2] + bias, then max(., 0) if relu.
 
     x: (H, W, C1), x2: None or (H, W, C2); weight: (ceil(CO/16), K, K, C1 + C2, 16); bias: (ceil(CO/16) * 16,);
-    out: (H, W, CO), all float32. Raises ValueError when shapes do not fit together.
+    out: (H, W, CO), all float32; tiles: tiles.Tiles of out that are written, None = all. Raises ValueError when shapes do
+    not fit together.
     """
     height, width, co = out.shape
     c1, c2 = x.shape[2], 0 if x2 is None else x2.shape[2]
@@ -52,21 +53,24 @@ def conv_forward(dev, x, weight, bias, out, relu, x2=None):
         raise ValueError(f"convolution of {c1} + {c2} to {co} channels: weight is {weight.shape}, bias {bias.shape}")
     program, size, local = _program(dev, weight.shape[1], height, width, co)
     program.launch("conv_forward", size, local=local, height=height, width=width, c1=c1, c2=c2, co=co, relu=relu,
-                   x=x, x2=x if x2 is None else x2, weight=weight, bias=bias, out=out)
+                   x=x, x2=x if x2 is None else x2, weight=weight, bias=bias, out=out,
+                   tile_count=checked_tiles(dev, tiles, height, width).count)
 
 
-def conv_backward_input(dev, x, flipped, grad_out, grad_x, masked):
+def conv_backward_input(dev, x, flipped, grad_out, grad_x, masked, tiles=None):
     """grad_x = gradient of the convolution's input; where masked, of the input of the ReLU that made x (zero where x <= 0).
 
     x, grad_x: (H, W, C), grad_out: (H, W, CO); flipped: (ceil(C/16), K, K, CO, 16) from conv_weights.flip_weights.
-    x is read only where masked. Raises ValueError when shapes do not fit together.
+    x is read only where masked. tiles: tiles.Tiles of grad_x that are written, None = all. Raises ValueError when shapes do
+    not fit together.
     """
     height, width, c = grad_x.shape
     if flipped.shape[0] != -(-c // LANES):
         raise ValueError(f"input gradient of {c} channels: flipped weights are {flipped.shape}")
     program, size, local = _program(dev, flipped.shape[1], height, width, c)
     program.launch("conv_backward_input", size, local=local, height=height, width=width, c=c, co=grad_out.shape[2],
-                   masked=masked, x=x, flipped=flipped, grad_out=grad_out, grad_x=grad_x)
+                   masked=masked, x=x, flipped=flipped, grad_out=grad_out, grad_x=grad_x,
+                   tile_count=checked_tiles(dev, tiles, height, width).count)
 
 
 def _program(dev, k, height, width, channels_out):

@@ -1,6 +1,7 @@
 """Weight and bias gradients of convolutions, and the flipped weights their input gradients are made with."""
 
 from pp_cl.conv import LANES
+from pp_cl.tiles import checked_tiles
 
 # Rows of the image that one work-item adds up: few enough to stay in a core's cache, and enough parts for all cores.
 ROWS_PER_PART = 8
@@ -27,12 +28,13 @@ def partial_floats(height, weight_shape):
     return _parts(height, weight_shape)[0] * blocks * (k * k * ci + 1) * LANES
 
 
-def weight_gradient(dev, x, grad_out, grad_weight, grad_bias, partial, x2=None):
+def weight_gradient(dev, x, grad_out, grad_weight, grad_bias, partial, x2=None, tiles=None):
     """Overwrite grad_weight and grad_bias with the gradients of conv_forward(x, ..., x2), given dL/dout before the ReLU.
 
     x: (H, W, C1), x2: None or (H, W, C2), grad_out: (H, W, CO); grad_weight: (ceil(CO/16), K, K, C1 + C2, 16);
-    grad_bias: (ceil(CO/16) * 16,); partial: scratch of at least partial_floats(H, grad_weight.shape). The sums run in an
-    order that depends on the shapes alone. Raises ValueError when shapes do not fit together.
+    grad_bias: (ceil(CO/16) * 16,); partial: scratch of at least partial_floats(H, grad_weight.shape). tiles: tiles.Tiles
+    of grad_out that are read, each as often as it counts, None = all, once. The sums run in an order that depends on the
+    shapes alone. Raises ValueError when shapes do not fit together.
     """
     height, width, co = grad_out.shape
     blocks, k, _, ci, _ = grad_weight.shape
@@ -51,7 +53,7 @@ def weight_gradient(dev, x, grad_out, grad_weight, grad_bias, partial, x2=None):
         program = dev.program("conv_weights", K=k, CI_TILE=tile)
         program.launch("conv_backward_weights", (c // tile * k, blocks, parts), local=(1, 1, 1) if dev.is_cpu else None,
                        height=height, width=width, c=c, co=co, first=first, ci=ci, rows=rows, x=source, grad_out=grad_out,
-                       partial=partial)
+                       tile_count=checked_tiles(dev, tiles, height, width).count, partial=partial)
         first += c
     program.launch("conv_sum_parts", (k * k * ci + 1, blocks), per_block=k * k * ci, blocks=blocks, parts=parts,
                    partial=partial, grad_weight=grad_weight, grad_bias=grad_bias)

@@ -1,23 +1,29 @@
-"""Pooling, bilinear upsampling and a straight line on (H, W, C) float32 feature maps."""
+"""Pooling, bilinear upsampling and a straight line on (H, W, C) float32 feature maps.
+
+tiles: tiles.Tiles of the result that are written, None = all.
+"""
 
 from pp_cl.conv import LANES
+from pp_cl.tiles import checked_tiles
 
 LOCAL = (1, 16, 4)  # 16 channels, x, y
 
 
-def avgpool2_forward(dev, x, out):
+def avgpool2_forward(dev, x, out, tiles=None):
     """out (H, W, C) = mean of 2x2 pixels of x (2H, 2W, C). Raises ValueError for other shapes."""
     h, w, c = _check_double(out, x)
-    _launch(dev, "avgpool2_forward", (c, w, h), h=h, w=w, c=c, x=x, out=out)
+    _launch(dev, "avgpool2_forward", (c, w, h), h=h, w=w, c=c, x=x, out=out,
+            tile_count=checked_tiles(dev, tiles, h, w).count)
 
 
-def avgpool2_backward(dev, x, grad_out, grad_x):
+def avgpool2_backward(dev, x, grad_out, grad_x, tiles=None):
     """Adds the gradient of avgpool2_forward to grad_x (2H, 2W, C), then sets grad_x to 0 where x <= 0.
 
     x: the ReLU's output that was pooled; grad_x: gradient from its other use; grad_out: (H, W, C).
     """
     h, w, c = _check_double(grad_out, grad_x)
-    _launch(dev, "avgpool2_backward", (c, 2 * w, 2 * h), h=h, w=w, c=c, x=x, grad_out=grad_out, grad_x=grad_x)
+    _launch(dev, "avgpool2_backward", (c, 2 * w, 2 * h), h=h, w=w, c=c, x=x, grad_out=grad_out, grad_x=grad_x,
+            tile_count=checked_tiles(dev, tiles, 2 * h, 2 * w).count)
 
 
 def maxpool2_forward(dev, x, out):
@@ -28,16 +34,18 @@ def maxpool2_forward(dev, x, out):
     _launch(dev, "maxpool2_forward", (c, w, h), h=h, w=w, c=c, x_width=x.shape[1], x=x, out=out)
 
 
-def upsample2_forward(dev, x, out):
+def upsample2_forward(dev, x, out, tiles=None):
     """out (2H, 2W, C) = x (H, W, C), bilinear, align_corners False, border repeated."""
     h, w, c = _check_double(x, out)
-    _launch(dev, "upsample2_forward", (c, 2 * w, 2 * h), h=h, w=w, c=c, x=x, out=out)
+    _launch(dev, "upsample2_forward", (c, 2 * w, 2 * h), h=h, w=w, c=c, x=x, out=out,
+            tile_count=checked_tiles(dev, tiles, 2 * h, 2 * w).count)
 
 
-def upsample2_backward(dev, grad_out, grad_x):
+def upsample2_backward(dev, grad_out, grad_x, tiles=None):
     """grad_x (H, W, C) = gradient of upsample2_forward, given grad_out (2H, 2W, C)."""
     h, w, c = _check_double(grad_x, grad_out)
-    _launch(dev, "upsample2_backward", (c, w, h), h=h, w=w, c=c, grad_out=grad_out, grad_x=grad_x)
+    _launch(dev, "upsample2_backward", (c, w, h), h=h, w=w, c=c, grad_out=grad_out, grad_x=grad_x,
+            tile_count=checked_tiles(dev, tiles, h, w).count)
 
 
 def affine(dev, scale, offset, x, out):

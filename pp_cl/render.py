@@ -5,7 +5,7 @@ project -> pairs -> blend weights -> shade what is seen -> blend features -> U-N
 
 import numpy as np
 
-from pp_cl.blend import Blend
+from pp_cl.blend import BACKGROUND, Blend
 from pp_cl.pairs import Pairs
 from pp_cl.points import SH_DEGREES
 from pp_cl.project import Footprint, Projection
@@ -50,7 +50,7 @@ class Renderer:
             self.point_features,
         )
         self.blend.forward(self.pairs, self.point_features, self.features)
-        return self.model.net.forward(self.features, training=training)
+        return self.model.net.forward(self.features, training, BACKGROUND)
 
     def blend_weights(self, camera, gamma, dropout=0.0, seed=0):
         """The first stages of forward(): who covers which pixel, and how much."""

@@ -6,12 +6,19 @@ convolution). The 1x1 convolution runs before the upsampling: both are linear an
 to 1, so they commute, bias included, and it costs a quarter.
 """
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
 
 from pp_cl import layers, variants
+from pp_cl.active import ActiveBackward, ActiveForward, Everything
 from pp_cl.conv import pack_bias, pack_weights
+from pp_cl.tiles import grid_shape, tiles_find
+
+# Tiles are chosen in images of so many pixels or more, if that leaves at most such a share of the multiplications: choosing
+# takes time as well.
+LEAST_PIXELS, MOST_SHARE = 1 << 16, 0.8
 
 
 @dataclass(frozen=True)
@@ -57,6 +64,7 @@ class UNet:
     (PyTorch's default for Conv2d), output channels beyond CO at 0, with gradient 0.
 
     variant: of all 3x3 convolutions that it fits, a name in variants.VARIANTS; "auto" takes the fastest for each.
+    share: of the last forward pass's multiplications that were computed; see forward's background.
     """
 
     def __init__(self, dev, widths=(16, 32, 64), channels_in=16, channels_out=3, seed=0, variant="auto"):
@@ -77,12 +85,15 @@ class UNet:
         self.gradients = {name: dev.zeros(p.shape) for name, p in self.parameters.items()}
         self._relu_outputs = {s.name for s in self.steps if s.kind == "conv3"}
         self._buffers = {}  # {training: (size, {name: array}, the buffers they are views of)}
-        self._trained = None  # the arrays of the last forward(training=True)
+        self._trained = None  # (arrays, pass) of the last forward(training=True)
+        self.share = 1.0
 
-    def forward(self, x, training=True):
+    def forward(self, x, training=True, background=None):
         """(H, W, 3) image of the features x (H, W, channels_in); H and W are multiples of 4.
 
         The result lives in a buffer of the network: the next call overwrites it. training: keep what backward needs.
+        background: the value of x where there is nothing; where the network sees that alone, in large images, one tile is
+        computed in place of many equal ones (active.py), with the same result. None = compute everything.
         Raises ValueError for other sizes.
         """
         height, width, channels = x.shape
@@ -90,25 +101,27 @@ class UNet:
             raise ValueError(f"the network takes (4n, 4m, {self.channels['x']}) features, not {x.shape}")
         arrays = self._arrays(height, width, training)
         arrays["x"] = x
+        active = self._active_forward(arrays, background)
         for step in self.steps:
-            sources, out = [arrays[name] for name in step.inputs], arrays[step.name]
+            sources, out, tiles = [arrays[name] for name in step.inputs], arrays[step.name], active.tiles(step.name)
             if step.kind == "pool":
-                layers.avgpool2_forward(self.dev, sources[0], out)
+                layers.avgpool2_forward(self.dev, sources[0], out, tiles)
             elif step.kind == "up":
-                layers.upsample2_forward(self.dev, sources[0], out)
+                layers.upsample2_forward(self.dev, sources[0], out, tiles)
             else:
                 weight, bias = self.parameters[step.name + ".weight"], self.parameters[step.name + ".bias"]
                 variant = self._variant_of(step, "forward", height, width)
                 variants.forward(self.dev, variant, sources[0], weight, bias, out, step.kind == "conv3", arrays["work"],
-                                 *sources[1:])
+                                 sources[1] if len(sources) > 1 else None, tiles)
+            active.complete(step.name, out)
         layers.affine(self.dev, 0.5, 0.5, out, out)
         if training:
-            self._trained = arrays
+            self._trained = arrays, active
         return out
 
     def output(self, name):
         """(H, W, C) output of the step `name` in the last forward(training=True), until its backward pass."""
-        return self._trained[name]
+        return self._trained[0][name]
 
     def backward(self, grad_y):
         """(H, W, channels_in) gradient of x in the last forward(x, training=True), given dL/dy (H, W, 3).
@@ -116,33 +129,61 @@ class UNet:
         Overwrites the gradients of all parameters; parameters and x must be as they were in forward. The result lives in
         a buffer of the network. Raises RuntimeError without such a forward.
         """
-        arrays = self._trained
-        if arrays is None:
+        if self._trained is None:
             raise RuntimeError("UNet.backward needs a forward(training=True) before it")
-        self._trained = None
+        (arrays, active), self._trained = self._trained, None
         layers.affine(self.dev, 0.5, 0.0, grad_y, arrays["grad out"])
+        if isinstance(active, ActiveForward):
+            active = self._active_backward(arrays, active)
         for step in reversed(self.steps):
             grad_out, name = arrays["grad " + step.name], step.inputs[0]
+            active.complete(step.name, grad_out)
             if step.kind == "pool":  # comes after the other use of its input, the skip, and adds to that one's gradient
-                layers.avgpool2_backward(self.dev, arrays[name], grad_out, arrays["grad " + name])
+                layers.avgpool2_backward(self.dev, arrays[name], grad_out, arrays["grad " + name], active.tiles(name))
             elif step.kind == "up":
-                layers.upsample2_backward(self.dev, grad_out, arrays["grad " + name])
+                layers.upsample2_backward(self.dev, grad_out, arrays["grad " + name], active.tiles(name))
             else:
-                self._backward_convolution(step, arrays, grad_out)
+                self._backward_convolution(step, arrays, grad_out, active)
+        active.complete("x", arrays["grad x"])
         return arrays["grad x"]
 
-    def _backward_convolution(self, step, arrays, grad_out):
+    def _active_forward(self, arrays, background):
+        """The pass over the tiles that this input needs."""
+        x, self.share = arrays["x"], 1.0
+        if background is None or x.shape[0] * x.shape[1] < LEAST_PIXELS:
+            return arrays["everything"]
+        active = ActiveForward(self.dev, self.steps, x.shape[:2], tiles_find(self.dev, x, background))
+        share = self._share_of(active)
+        if share > MOST_SHARE:
+            return arrays["everything"]
+        self.share = share
+        return active
+
+    def _active_backward(self, arrays, forward):
+        """The pass backward; all activations that it reads are there."""
+        active = ActiveBackward(self.dev, self.steps, forward, arrays["grad out"])
+        for name, read in active.activations.items():
+            forward.complete(name, arrays[name], read)
+        return active
+
+    def _share_of(self, active):
+        """Share of the convolutions' multiplications that a pass computes."""
+        count = {s.name: int(s.kind[-1]) ** 2 * sum(self.channels[i] for i in s.inputs) * s.channels >> 2 * s.level
+                 for s in self._convolutions()}
+        return sum(n * active.layouts[name].computed.mean() for name, n in count.items()) / sum(count.values())
+
+    def _backward_convolution(self, step, arrays, grad_out, active):
         weight, work = self.parameters[step.name + ".weight"], arrays["work"]
         sources = [arrays[name] for name in step.inputs]
         height, width, _ = arrays["x"].shape
         variants.backward_weights(self.dev, self._variant_of(step, "weights", height, width), sources[0], grad_out,
                                   self.gradients[step.name + ".weight"], self.gradients[step.name + ".bias"], work,
-                                  *sources[1:])
+                                  sources[1] if len(sources) > 1 else None, active.tiles(step.name))
         first = 0
         for name, source in zip(step.inputs, sources, strict=True):
             variant = self._variant_of(step, "input", height, width, name)
             variants.backward_input(self.dev, variant, source, weight, first, grad_out, arrays["grad " + name],
-                                    name in self._relu_outputs, work)
+                                    name in self._relu_outputs, work, active.tiles(name))
             first += self.channels[name]
 
     def _variant_of(self, step, direction, height, width, name=None):
@@ -163,7 +204,13 @@ class UNet:
         plan += [(name, p.shape, p.nbytes) for name, p in self.parameters.items()]
         plan += [(f"grad {name}", g.shape, g.nbytes) for name, g in self.gradients.items()]
         plan += [("convolutions at work", (floats,), floats * 4) for floats in self._work_floats(height, width, training)]
+        for level in set(self._levels().values()):
+            number = math.prod(grid_shape(height >> level, width >> level))
+            plan += [(f"tiles of level {level}", (2 * number + 3,), (2 * number + 3) * 4)]
         return plan
+
+    def _levels(self):
+        return {"x": 0} | {step.name: step.level for step in self.steps}
 
     def _convolutions(self):
         return [s for s in self.steps if s.kind.startswith("conv")]
@@ -212,6 +259,7 @@ class UNet:
             for slot, buffer in zip(slots, buffers, strict=True):
                 arrays |= {name: buffer[:int(np.prod(shapes[name]))].reshape(shapes[name]) for name in slot.names}
             arrays["work"] = variants.Work(*[self.dev.empty(n) for n in self._work_floats(height, width, training)])
+            arrays["everything"] = Everything(self.dev, (height, width), self._levels())
             self._buffers[training] = ((height, width), arrays, buffers)
         return self._buffers[training][1]
 

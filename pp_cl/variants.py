@@ -68,36 +68,36 @@ def pick_variant(dev, direction, ci, co, height, width):
     return applicable(next(name for pixels, name in FASTEST[direction] if height * width >= pixels), 3, ci, co)
 
 
-def forward(dev, variant, x, weight, bias, out, relu, work, x2=None):
+def forward(dev, variant, x, weight, bias, out, relu, work, x2=None, tiles=None):
     """conv.conv_forward by a variant."""
     m = VARIANTS[variant]
     if m is None:
-        conv_forward(dev, x, weight, bias, out, relu, x2)
+        conv_forward(dev, x, weight, bias, out, relu, x2, tiles)
     else:
         transform_weights(dev, m, weight, work.weights)
-        winograd_forward(dev, m, x, work.weights, bias, out, relu, work.scratch, x2)
+        winograd_forward(dev, m, x, work.weights, bias, out, relu, work.scratch, x2, tiles)
 
 
-def backward_input(dev, variant, x, weight, first, grad_out, grad_x, masked, work):
+def backward_input(dev, variant, x, weight, first, grad_out, grad_x, masked, work, tiles=None):
     """conv.conv_backward_input by a variant; weight as in forward, `first`: the channel of it where x begins."""
     m, c, co = VARIANTS[variant], grad_x.shape[2], grad_out.shape[2]
     if m is None:
         shape = _flipped_shape(weight.shape, c, co)
         flipped = work.weights[:math.prod(shape)].reshape(shape)
         flip_weights(dev, weight, first, flipped)
-        conv_backward_input(dev, x, flipped, grad_out, grad_x, masked)
+        conv_backward_input(dev, x, flipped, grad_out, grad_x, masked, tiles)
     else:
         transform_flipped_weights(dev, m, weight, first, c, work.weights)
-        winograd_backward_input(dev, m, x, work.weights, grad_out, grad_x, masked, work.scratch)
+        winograd_backward_input(dev, m, x, work.weights, grad_out, grad_x, masked, work.scratch, tiles)
 
 
-def backward_weights(dev, variant, x, grad_out, grad_weight, grad_bias, work, x2=None):
+def backward_weights(dev, variant, x, grad_out, grad_weight, grad_bias, work, x2=None, tiles=None):
     """conv_weights.weight_gradient by a variant."""
     m = VARIANTS[variant]
     if m is None:
-        weight_gradient(dev, x, grad_out, grad_weight, grad_bias, work.scratch, x2)
+        weight_gradient(dev, x, grad_out, grad_weight, grad_bias, work.scratch, x2, tiles)
     else:
-        winograd_weight_gradient(dev, m, x, grad_out, grad_weight, grad_bias, work.scratch, x2)
+        winograd_weight_gradient(dev, m, x, grad_out, grad_weight, grad_bias, work.scratch, x2, tiles)
 
 
 def _flipped_shape(weight_shape, c, co):

@@ -5,6 +5,7 @@ come in multiples of 16. transform_weights makes ready what any number of convol
 """
 
 from pp_cl.conv import LANES
+from pp_cl.tiles import SIDE, checked_tiles
 
 # Tiles transformed and multiplied at a time. More of them use the weights better, fewer leave more room in the caches.
 TILES = 64
@@ -51,11 +52,12 @@ def transform_flipped_weights(dev, m, weight, first, c, transformed):
                                         blocks=c // LANES, first=first, ci=ci, weight=weight, transformed=transformed)
 
 
-def winograd_forward(dev, m, x, transformed, bias, out, relu, scratch, x2=None):
+def winograd_forward(dev, m, x, transformed, bias, out, relu, scratch, x2=None, tiles=None):
     """out = convolution of [x, x2] + bias, then max(., 0) if relu: conv.conv_forward with transformed weights.
 
-    x: (H, W, C1), x2: None or (H, W, C2), bias: (CO,), out: (H, W, CO); scratch: at least scratch_floats. The result does
-    not depend on the number of compute units. Raises ValueError when shapes do not fit together.
+    x: (H, W, C1), x2: None or (H, W, C2), bias: (CO,), out: (H, W, CO); scratch: at least scratch_floats; tiles:
+    tiles.Tiles of out that are written, None = all. The result does not depend on the number of compute units. Raises
+    ValueError when shapes do not fit together.
     """
     height, width, co = out.shape
     c1, c2 = x.shape[2], 0 if x2 is None else x2.shape[2]
@@ -64,16 +66,17 @@ def winograd_forward(dev, m, x, transformed, bias, out, relu, scratch, x2=None):
                          f"channels come in multiples of {LANES}")
     _check_size("transformed weights", transformed, transformed_floats(m, c1 + c2, co))
     _check_size("scratch", scratch, scratch_floats(dev, m, c1 + c2, co))
+    tiles = checked_tiles(dev, tiles, height, width)
     _program(dev, m, co // LANES).launch(
-        "winograd_forward", work_items(dev, m, height, width), local=1, height=height, width=width, c1=c1, c2=c2, co=co,
-        relu=relu, x=x, x2=x if x2 is None else x2, weight=transformed, bias=bias, out=out, scratch=scratch)
+        "winograd_forward", work_items(dev, m, tiles), local=1, c1=c1, c2=c2, co=co, relu=relu, x=x,
+        x2=x if x2 is None else x2, weight=transformed, bias=bias, tile_list=tiles.list, out=out, scratch=scratch)
 
 
-def winograd_backward_input(dev, m, x, transformed, grad_out, grad_x, masked, scratch):
+def winograd_backward_input(dev, m, x, transformed, grad_out, grad_x, masked, scratch, tiles=None):
     """grad_x = gradient of the convolution's input: conv.conv_backward_input by transform_flipped_weights.
 
-    x, grad_x: (H, W, C), grad_out: (H, W, CO); scratch: at least scratch_floats. x is read only where masked. Raises
-    ValueError when shapes do not fit together.
+    x, grad_x: (H, W, C), grad_out: (H, W, CO); scratch: at least scratch_floats. x is read only where masked. tiles:
+    tiles.Tiles of grad_x that are written, None = all. Raises ValueError when shapes do not fit together.
     """
     height, width, c = grad_x.shape
     co = grad_out.shape[2]
@@ -81,14 +84,15 @@ def winograd_backward_input(dev, m, x, transformed, grad_out, grad_x, masked, sc
         raise ValueError(f"Winograd input gradient of {c} from {co} channels: channels come in multiples of {LANES}")
     _check_size("transformed weights", transformed, transformed_floats(m, c, co))
     _check_size("scratch", scratch, scratch_floats(dev, m, c, co))
+    tiles = checked_tiles(dev, tiles, height, width)
     _program(dev, m, c // LANES).launch(
-        "winograd_backward_input", work_items(dev, m, height, width), local=1, height=height, width=width, c=c, co=co,
-        masked=masked, x=x, flipped=transformed, grad_out=grad_out, grad_x=grad_x, scratch=scratch)
+        "winograd_backward_input", work_items(dev, m, tiles), local=1, c=c, co=co, masked=masked, x=x, flipped=transformed,
+        grad_out=grad_out, tile_list=tiles.list, grad_x=grad_x, scratch=scratch)
 
 
-def work_items(dev, m, height, width):
+def work_items(dev, m, tiles):
     """One a compute unit, but none without tiles."""
-    return min(dev.info["compute_units"], -(-height // m) * -(-width // m))
+    return min(dev.info["compute_units"], tiles.number * (SIDE // m) ** 2)
 
 
 def pair_blocks(blocks):

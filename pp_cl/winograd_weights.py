@@ -1,6 +1,7 @@
 """Weight and bias gradients of 3x3 convolutions by Winograd's minimal filtering."""
 
 from pp_cl.conv import LANES
+from pp_cl.tiles import checked_tiles
 from pp_cl.winograd import fits, pair_blocks, positions
 
 # Tiles of one round and, at most, input and output channels of one part of the weights: smaller parts transform the same
@@ -14,9 +15,9 @@ def gradient_scratch_floats(dev, m):
     return dev.info["compute_units"] * vectors * LANES
 
 
-def winograd_weight_gradient(dev, m, x, grad_out, grad_weight, grad_bias, scratch, x2=None):
+def winograd_weight_gradient(dev, m, x, grad_out, grad_weight, grad_bias, scratch, x2=None, tiles=None):
     """Overwrite grad_weight and grad_bias with the gradients of winograd_forward(..., x, ..., x2): see
-    conv_weights.weight_gradient for the shapes.
+    conv_weights.weight_gradient for the shapes and the tiles.
 
     scratch: at least gradient_scratch_floats. The sums run in an order that depends on the shapes alone. Raises ValueError
     when shapes do not fit together.
@@ -32,13 +33,14 @@ def winograd_weight_gradient(dev, m, x, grad_out, grad_weight, grad_bias, scratc
         raise ValueError(f"Winograd weight gradient: scratch has {scratch.size} floats, "
                          f"needs {gradient_scratch_floats(dev, m)}")
     program = dev.program("winograd_weights", M=m, TILES=TILES, CO_PART=CO_PART, BLOCKS=pair_blocks(blocks))
+    tiles = checked_tiles(dev, tiles, height, width)
     first = 0
     for source, c in zip(sources, channels, strict=True):
         ci_part = _ci_part(dev, c, co)
         items = min(dev.info["compute_units"], -(-c // ci_part) * -(-co // CO_PART))
-        program.launch("winograd_backward_weights", items, local=1, height=height, width=width, c=c, co=co, first=first,
-                       ci=ci, ci_part=ci_part, x=source, grad_out=grad_out, grad_weight=grad_weight, grad_bias=grad_bias,
-                       scratch=scratch)
+        program.launch("winograd_backward_weights", items, local=1, c=c, co=co, first=first, ci=ci, ci_part=ci_part,
+                       x=source, grad_out=grad_out, tile_list=tiles.list, tile_count=tiles.count, grad_weight=grad_weight,
+                       grad_bias=grad_bias, scratch=scratch)
         first += c
 
 

@@ -1,0 +1,147 @@
+"""cl/tiles.cl against numpy, and the kernels that compute some tiles only."""
+
+import numpy as np
+import pytest
+from helpers import relative_error
+from oracle_conv import conv, conv_gradients
+from oracle_layers import avgpool2, avgpool2_gradient, upsample2, upsample2_gradient
+from test_conv import layer
+
+from pp_cl import layers
+from pp_cl.conv import pack_bias, pack_weights, unpack_weights
+from pp_cl.tiles import SIDE, all_tiles, checked_tiles, grid_shape, some_tiles, tiles_compare, tiles_copy, tiles_find
+from pp_cl.variants import VARIANTS, Work, backward_input, backward_weights, forward, work_floats
+
+# (height, width, channels): less than a tile, cut-off tiles, several work-groups
+SHAPES = [(1, 1, 1), (3, 5, 16), (31, 33, 3), (4, 257, 20), (257, 8, 16)]
+
+
+def pixels_of(tiles, height, width):
+    """(height, width) of what (rows, columns) says of the tiles."""
+    return tiles.repeat(SIDE, 0).repeat(SIDE, 1)[:height, :width]
+
+
+def by_tile(image):
+    """{(row, column): pixels} of an image's tiles."""
+    rows, columns = grid_shape(*image.shape[:2])
+    return {(r, c): image[r * SIDE:(r + 1) * SIDE, c * SIDE:(c + 1) * SIDE] for r in range(rows) for c in range(columns)}
+
+
+def random_counts(rng, height, width):
+    """(rows, columns) of 0 (half of them), 1 and 7; at least one is not 0."""
+    counts = rng.choice([0, 0, 1, 7], grid_shape(height, width))
+    counts[-1, -1] = 7
+    return counts
+
+
+@pytest.mark.parametrize("shape", SHAPES)
+def test_find(dev, rng, shape):
+    x = np.where(rng.random(shape) < 0.02, rng.choice([0.0, np.nan, np.inf, 1 + 2**-23], shape), 1).astype(np.float32)
+    found = tiles_find(dev, dev.upload(x), 1.0)
+    assert found.shape == grid_shape(*shape[:2])
+    for place, tile in by_tile(x).items():
+        assert found[place] == (tile != 1).any()
+
+
+@pytest.mark.parametrize("shape", SHAPES)
+def test_compare(dev, rng, shape):
+    x = np.where(rng.random(shape) < 0.02, rng.choice([-0.0, np.nan, 1e-45], shape), 0).astype(np.float32)
+    tiles = by_tile(x)
+    source = np.arange(len(tiles)).reshape(grid_shape(*shape[:2]))
+    whole = [place for place, tile in tiles.items() if tile.shape[:2] == (SIDE, SIDE)]
+    for place in whole:
+        source[place] = source[whole[rng.integers(len(whole))]]
+    differs = tiles_compare(dev, dev.upload(x), source)
+    flat = list(tiles.values())
+    for place, tile in tiles.items():
+        assert differs[place] == (tile.tobytes() != flat[source[place]].tobytes())
+
+
+@pytest.mark.parametrize("shape", SHAPES)
+def test_copy(dev, rng, shape):
+    x = rng.normal(size=shape).astype(np.float32)
+    expected = x.copy()
+    tiles, copies = by_tile(x), by_tile(expected)
+    places = list(tiles)
+    source, chosen = np.zeros(grid_shape(*shape[:2]), int), rng.random(grid_shape(*shape[:2])) < 0.5
+    for place, tile in tiles.items():
+        source[place] = places.index(place)
+        like = [p for p in places if tiles[p].shape == tile.shape and not chosen[p]]
+        chosen[place] &= bool(like)
+        if chosen[place]:
+            other = like[rng.integers(len(like))]
+            source[place] = places.index(other)
+            copies[place][:] = tiles[other]
+    device_x = dev.upload(x)
+    tiles_copy(dev, device_x, source, chosen)
+    np.testing.assert_array_equal(device_x.get(), expected)
+
+
+def test_lists_and_wrong_sizes(dev):
+    tiles = some_tiles(dev, (9, 6), np.array([[0, 2], [1, 0], [0, 5]]))
+    np.testing.assert_array_equal(tiles.list.get(), [9, 6, 3, 1, 2, 5])
+    np.testing.assert_array_equal(tiles.count.get(), [[0, 2], [1, 0], [0, 5]])
+    assert checked_tiles(dev, tiles, 9, 6) is tiles
+    assert checked_tiles(dev, None, 9, 6) is all_tiles(dev, 9, 6)
+    assert all_tiles(dev, 9, 6).number == 6
+    with pytest.raises(ValueError, match="\\(9, 6\\).*\\(9, 7\\)"):
+        checked_tiles(dev, tiles, 9, 7)
+    with pytest.raises(ValueError, match="no tile"):
+        some_tiles(dev, (9, 6), np.zeros((3, 2)))
+
+
+@pytest.mark.parametrize("k, variant", [(1, "direct"), *[(3, variant) for variant in VARIANTS]])
+@pytest.mark.parametrize("height, width", [(3, 2), (11, 14), (31, 33), (6, 70)])
+def test_convolutions_compute_the_chosen_tiles(dev, rng, k, variant, height, width):
+    """The other tiles of the results keep their NaN; those of a gradient that do not count may hold NaN."""
+    c1, c2, co = 16, 32, 48
+    weight, bias = layer(rng, c1 + c2, co, k)
+    x = np.maximum(rng.normal(size=(height, width, c1 + c2)), 0).astype(np.float32)
+    grad_out = rng.normal(size=(height, width, co)).astype(np.float32)
+    counts = random_counts(rng, height, width)
+    chosen = pixels_of(counts > 0, height, width)
+    tiles = some_tiles(dev, (height, width), counts)
+    sources = [dev.upload(np.ascontiguousarray(s)) for s in np.split(x, [c1], 2)]
+    device_weight, device_grad = dev.upload(pack_weights(weight)), dev.upload(grad_out)
+
+    def work(direction, c=None):
+        return Work(*[dev.empty(max(1, n)) for n in work_floats(dev, variant, direction, height, device_weight.shape, c)])
+
+    out = dev.empty((height, width, co))
+    forward(dev, variant, sources[0], device_weight, dev.upload(pack_bias(bias)), out, True, work("forward"), sources[1],
+            tiles)
+    assert np.isnan(out.get()[~chosen]).all()
+    assert relative_error(out.get()[chosen], conv(x, weight, bias, True)[chosen]) < 1e-5
+
+    grad_x = dev.empty((height, width, c2))
+    backward_input(dev, variant, sources[1], device_weight, c1, device_grad, grad_x, True, work("input", c2), tiles)
+    expected = (conv_gradients(x, weight, grad_out)[0] * (x > 0))[..., c1:]
+    assert np.isnan(grad_x.get()[~chosen]).all()
+    assert relative_error(grad_x.get()[chosen], expected[chosen]) < 1e-5
+
+    grad_weight, grad_bias = dev.empty(device_weight.shape), dev.empty(co)
+    poisoned = dev.upload(np.where(chosen[..., None], grad_out, np.nan), np.float32)
+    backward_weights(dev, variant, sources[0], poisoned, grad_weight, grad_bias, work("weights"), sources[1], tiles)
+    counted = grad_out * pixels_of(counts, height, width)[..., None]
+    expected = conv_gradients(x, weight, counted.astype(np.float64))
+    assert relative_error(unpack_weights(grad_weight.get(), co), expected[1]) < 1e-5
+    assert relative_error(grad_bias.get(), expected[2]) < 1e-5
+
+
+@pytest.mark.parametrize("height, width, channels", [(1, 1, 16), (5, 7, 20), (33, 6, 16)])
+def test_layers_compute_the_chosen_tiles(dev, rng, height, width, channels):
+    low, high = (rng.normal(size=(f * height, f * width, channels)).astype(np.float32) for f in (1, 2))
+    other = rng.normal(size=high.shape).astype(np.float32)
+
+    def check(call, shape, expected, *inputs, start=None):
+        counts = random_counts(rng, *shape[:2])
+        result = dev.empty(shape) if start is None else dev.upload(start)
+        call(dev, *[dev.upload(i) for i in inputs], result, some_tiles(dev, shape[:2], counts))
+        chosen, untouched = pixels_of(counts > 0, *shape[:2]), np.full(shape, np.nan) if start is None else start
+        np.testing.assert_array_equal(result.get()[~chosen], untouched[~chosen])
+        assert relative_error(result.get()[chosen], expected[chosen]) < 2e-6
+
+    check(layers.avgpool2_forward, low.shape, avgpool2(high), high)
+    check(layers.upsample2_forward, high.shape, upsample2(low), low)
+    check(layers.upsample2_backward, low.shape, upsample2_gradient(high), high)
+    check(layers.avgpool2_backward, high.shape, (other + avgpool2_gradient(low)) * (high > 0), high, low, start=other)
