@@ -10,6 +10,7 @@
 #define CI_TILE 8            // input channels of one work-item; divides the channels. K * CI_TILE accumulators fit AVX-512
 #endif
 #define PAD (K / 2)
+#define SUMMED 128           // pixels of a row summed in registers: one sum over an image of background would lose digits
 
 // One work-item per (output channel, ky * K + kx, 16 input channels from `first` on): reads 16 weights, writes them as one
 // vector at the mirrored place. Lanes beyond c are 0.
@@ -76,42 +77,44 @@ kernel void conv_backward_weights(
         global const float *pixel = x + (size_t)row * width * c + c0;
         global const float *grad = grad_out + (size_t)y * width * co + block * 16;
         global const float *count = tile_count + y / SIDE * tile_columns(width);
-        float16 acc[K][CI_TILE], sum = 0.0f;     // of one row: a single sum over all of them would lose digits
-        #pragma unroll
-        for (int kx = 0; kx < K; kx++)
-            #pragma unroll
-            for (int i = 0; i < CI_TILE; i++)
-                acc[kx][i] = 0.0f;
         float16 window[K];                       // window[kx]: dL/dout at column + PAD - kx
         #pragma unroll
         for (int kx = 0; kx < K; kx++)
             window[kx] = 0.0f;
         if (PAD)
             window[0] = counted(grad, count[0], lanes);
-        for (int column = 0; column < width; column++) {
+        for (int begin = 0; begin < width; begin += SUMMED) {
+            float16 acc[K][CI_TILE], sum = 0.0f;
             #pragma unroll
-            for (int kx = K - 1; kx > 0; kx--)
-                window[kx] = window[kx - 1];
-            const int ahead = column + PAD;
-            window[0] = ahead < width ? counted(grad + ahead * co, count[ahead / SIDE], lanes) : (float16)0.0f;
-            if (!PAD && count[column / SIDE] == 0.0f)
-                continue;
-            #pragma unroll
-            for (int i = 0; i < CI_TILE; i++) {
-                const float value = pixel[column * c + i];
+            for (int kx = 0; kx < K; kx++)
                 #pragma unroll
-                for (int kx = 0; kx < K; kx++)
-                    acc[kx][i] += value * window[kx];
+                for (int i = 0; i < CI_TILE; i++)
+                    acc[kx][i] = 0.0f;
+            for (int column = begin; column < min(begin + SUMMED, width); column++) {
+                #pragma unroll
+                for (int kx = K - 1; kx > 0; kx--)
+                    window[kx] = window[kx - 1];
+                const int ahead = column + PAD;
+                window[0] = ahead < width ? counted(grad + ahead * co, count[ahead / SIDE], lanes) : (float16)0.0f;
+                if (!PAD && count[column / SIDE] == 0.0f)
+                    continue;
+                #pragma unroll
+                for (int i = 0; i < CI_TILE; i++) {
+                    const float value = pixel[column * c + i];
+                    #pragma unroll
+                    for (int kx = 0; kx < K; kx++)
+                        acc[kx][i] += value * window[kx];
+                }
+                sum += window[PAD];
             }
-            sum += window[PAD];
-        }
-        #pragma unroll
-        for (int kx = 0; kx < K; kx++)
             #pragma unroll
-            for (int i = 0; i < CI_TILE; i++)
-                out[kx * ci + i] += acc[kx][i];
-        if (with_bias)
-            *bias += sum;
+            for (int kx = 0; kx < K; kx++)
+                #pragma unroll
+                for (int i = 0; i < CI_TILE; i++)
+                    out[kx * ci + i] += acc[kx][i];
+            if (with_bias)
+                *bias += sum;
+        }
     }
 }
 

@@ -12,6 +12,7 @@
 #endif
 // Vectors of one work-item's scratch: values, gradients, the sums of weights' and biases' gradients, a patch for load_tile.
 #define SLICE(ci_part) (POSITIONS * (PITCH(ci_part) + PITCH(CO_PART) + (ci_part) * (CO_PART / 16) + 1) + CO_PART / 16)
+#define SUMMED (32 * TILES)  // tiles summed before their sum joins the rest: one sum over a large image would lose digits
 #define ROWS 8               // input channels multiplied together: ROWS * BLOCKS accumulators and BLOCKS vectors fit AVX-512
 
 // z = A g A^T of the gradients of `count` tiles of tile_list from `first` on, each times its tile_count; sums (16 channels
@@ -102,6 +103,34 @@ inline void multiply_gradients(
             }
 }
 
+// Gradients of 3 x 3 weights of `rows` input channels and 16 output channels from those of their transforms: written with
+// first_sum, else added.
+__attribute__((always_inline))
+inline void store_gradients(
+    global float16 *grad_weight,
+    global const float16 *sums,
+    const int ci,
+    const int ci_part,
+    const int rows,
+    const int first_sum)
+{
+    for (int row = 0; row < rows; row++) {
+        float16 t[POSITIONS];
+        #pragma unroll
+        for (int i = 0; i < POSITIONS; i++)
+            t[i] = sums[i * (CO_PART / 16) * ci_part + row];
+        #pragma unroll
+        for (int i = 0; i < S; i++)
+            transform_kernel_gradient(t + i, S);
+        #pragma unroll
+        for (int i = 0; i < 3; i++)
+            transform_kernel_gradient(t + i * S, 1);
+        #pragma unroll
+        for (int i = 0; i < 9; i++)
+            grad_weight[i * ci + row] = first_sum ? t[i / 3 * S + i % 3] : grad_weight[i * ci + row] + t[i / 3 * S + i % 3];
+    }
+}
+
 // One work-item per compute unit (work-groups of 1): takes parts of ci_part x CO_PART channels in turn, walks the tiles of
 // tile_list in x and grad_out for each, and writes that part of the gradients. No part is added to by two work-items.
 kernel void winograd_backward_weights(
@@ -127,32 +156,22 @@ kernel void winograd_backward_weights(
     for (int part = get_global_id(0); part < parts; part += items) {
         const int c0 = part / co_parts * ci_part, rows = min(ci_part, c - c0);
         const int block0 = part % co_parts * (CO_PART / 16), blocks = min(CO_PART / 16, co / 16 - block0);
-        for (int block = 0; block < blocks; block++)
-            bias[block] = 0.0f;
-        for (int tile = 0; tile < tiles; tile += TILES) {
-            const int count = min(TILES, tiles - tile);
-            transform_tiles(v, PITCH(ci_part), patch, x + c0, c, rows / 16, tile_list, tile, count, count);
-            transform_gradients(z, bias, patch, grad_out + block0 * 16, co, blocks, tile_list, tile_count, tile, count);
-            multiply_gradients(sums, v, z, ci_part, rows, blocks, count, tile == 0);
-        }
-        for (int block = 0; block < blocks; block++) {
-            for (int row = 0; row < rows; row++) {
-                float16 t[POSITIONS];
-                #pragma unroll
-                for (int i = 0; i < POSITIONS; i++)
-                    t[i] = sums[(i * (CO_PART / 16) + block) * ci_part + row];
-                #pragma unroll
-                for (int i = 0; i < S; i++)
-                    transform_kernel_gradient(t + i, S);
-                #pragma unroll
-                for (int i = 0; i < 3; i++)
-                    transform_kernel_gradient(t + i * S, 1);
-                #pragma unroll
-                for (int i = 0; i < 9; i++)
-                    grad_weight[((block0 + block) * 9 + i) * ci + first + c0 + row] = t[i / 3 * S + i % 3];
+        for (int begin = 0; begin < tiles; begin += SUMMED) {
+            for (int block = 0; block < blocks; block++)
+                bias[block] = 0.0f;
+            for (int tile = begin; tile < min(begin + SUMMED, tiles); tile += TILES) {
+                const int count = min(TILES, tiles - tile);
+                transform_tiles(v, PITCH(ci_part), patch, x + c0, c, rows / 16, tile_list, tile, count, count);
+                transform_gradients(z, bias, patch, grad_out + block0 * 16, co, blocks, tile_list, tile_count, tile, count);
+                multiply_gradients(sums, v, z, ci_part, rows, blocks, count, tile == begin);
             }
-            if (first + c0 == 0)
-                grad_bias[block0 + block] = bias[block];
+            for (int block = 0; block < blocks; block++) {
+                const int out = block0 + block;
+                store_gradients(grad_weight + out * 9 * ci + first + c0, sums + block * ci_part, ci, ci_part, rows,
+                                begin == 0);
+                if (first + c0 == 0)
+                    grad_bias[out] = begin == 0 ? bias[block] : grad_bias[out] + bias[block];
+            }
         }
     }
 }

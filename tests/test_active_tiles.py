@@ -1,0 +1,49 @@
+"""tools/active_tiles.py: the rows it prints are measurements of the run, and bad input is told."""
+
+import importlib.util
+import json
+from pathlib import Path
+
+import pytest
+from scenes import write_ball_scene
+
+from pp_cl.cli import main
+
+SPEC = importlib.util.spec_from_file_location("active_tiles", Path(__file__).parents[1] / "tools" / "active_tiles.py")
+TOOL = importlib.util.module_from_spec(SPEC)
+SPEC.loader.exec_module(TOOL)
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory):
+    """A run of a few steps on a ball in large pictures."""
+    folder = tmp_path_factory.mktemp("active_tiles")
+    scene = write_ball_scene(folder / "ball", size=300)
+    assert main(["train", scene, "--out", str(folder / "run"), "--points", "1500", "--iterations", "2",
+                 "--set", "train.crop=28", "--set", "network.widths=16,16,16"]) == 0
+    return folder / "run"
+
+
+def test_rows(run, tmp_path, capsys):
+    file = tmp_path / "a.json"
+    assert TOOL.main([str(run), "--views", "2", "--runs", "1", "--json", str(file)]) == 0
+    rows = json.loads(file.read_text())["rows"]
+    assert len(rows) == 2
+    for row in rows:
+        assert row["size"] == [300, 300] and 0 < row["share"] < 0.8
+        assert row["forward_ratio"] == pytest.approx(row["forward_dense_ms"] / row["forward_active_ms"])
+        assert max(row["image_difference"], row["grad_features_difference"]) < 1e-6
+        assert row["grad_parameters_difference"] < 5e-6
+    assert "of the multiplications remain" in capsys.readouterr().out
+    assert TOOL.main([str(run), "--views", "1", "--runs", "1", "--downscale", "2", "--widths", "16,16,32"]) == 0
+
+
+@pytest.mark.parametrize("arguments, word", [(["--views", "0"], "--views"), (["--widths", "3"], "--widths")])
+def test_bad_input(run, capsys, arguments, word):
+    assert TOOL.main([str(run), *arguments]) == 2
+    assert word in capsys.readouterr().err
+
+
+def test_a_missing_run(tmp_path, capsys):
+    assert TOOL.main([str(tmp_path)]) == 2
+    assert str(tmp_path) in capsys.readouterr().err

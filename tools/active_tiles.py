@@ -1,0 +1,116 @@
+"""What the network saves where a run's views are background: share of the work, time, and difference from the dense one.
+
+    python tools/active_tiles.py RUN --downscale 1 --widths 128,256,512 --views 4 --json FILE
+
+Each view's features go through the same network with all tiles and with the active ones (pp_cl/active.py), in turn. The
+gradient of the image is the training loss's against the photograph. Without --widths it is the run's own network.
+"""
+
+import argparse
+import sys
+from pathlib import Path
+
+import numpy as np
+
+from pp_cl import bench
+from pp_cl.blend import BACKGROUND
+from pp_cl.checkpoint import write_json
+from pp_cl.config import load_config
+from pp_cl.device import open_device
+from pp_cl.errors import UserError
+from pp_cl.loss import Loss
+from pp_cl.model import Model
+from pp_cl.render import Renderer
+from pp_cl.run import CHECKPOINT, load_run, open_scene, with_depth_range
+from pp_cl.scene import reduced_camera
+from pp_cl.target import Target
+
+
+class Comparison:
+    """A run's model, and the network that its views go through."""
+
+    def __init__(self, dev, folder, split, downscale, widths):
+        self.dev = dev
+        self.config = load_config(folder / "config.json")
+        header, arrays = load_run(folder / CHECKPOINT)
+        model = Model.load(dev, header, arrays, self.config.network.widths, folder / CHECKPOINT)
+        self.views = with_depth_range(open_scene(dev, self.config, (split,)).splits[split], model.depth_range)
+        self.downscale = downscale or self.config.scene.downscale
+        self.net = bench.make_network(dev, widths, "auto") if widths else model.net
+        self.renderer = Renderer(dev, model, self.config.points)
+        self.target = Target(dev, self.downscale)
+        self.loss = Loss(dev, self.config.train.ssim_weight)
+
+    def row(self, view, runs):
+        """{"view", "size", "share", times in ms, ratios, largest differences} of one view."""
+        camera = reduced_camera(view, self.downscale)
+        self.renderer.forward(camera, self.config.points.gamma[1])
+        x = self.renderer.features
+        self.target.load(view)
+        target = self.target.crop(0, 0, camera.width, camera.height)
+        grad = self.loss.forward_backward(self.net.forward(x, False, BACKGROUND), target, *self.renderer.offset)
+
+        results = [self._results(x, grad, background) for background in (None, BACKGROUND)]
+        share = self.net.share
+        differences = [float(np.abs(a - b).max() / np.abs(a).max()) for a, b in zip(*results, strict=True)]
+        times = bench.interleave({
+            (direction, name): self._runner(x, grad if direction == "train" else None, background)
+            for direction in ("forward", "train") for name, background in (("dense", None), ("active", BACKGROUND))}, runs)
+        ms = {key: float(np.median(values)) for key, values in times.items()}
+        return {
+            "view": view.name, "size": list(x.shape[:2]), "share": float(share),
+            **{f"{direction}_{name}_ms": value for (direction, name), value in ms.items()},
+            **{f"{d}_ratio": ms[d, "dense"] / ms[d, "active"] for d in ("forward", "train")},
+            "image_difference": differences[0], "grad_features_difference": differences[1],
+            "grad_parameters_difference": max(differences[2:]),
+        }
+
+    def _results(self, x, grad, background):
+        image = self.net.forward(x, True, background).get()
+        return [image, self.net.backward(grad).get(), *[g.get() for g in self.net.gradients.values()]]
+
+    def _runner(self, x, grad, background):
+        def run():
+            self.net.forward(x, grad is not None, background)
+            if grad is not None:
+                self.net.backward(grad)
+            self.dev.finish()
+        return run
+
+
+def main(argv=None):
+    """Measure, print, write; returns the exit status. Differences: the largest over the dense result's largest value."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("run", metavar="RUN", help="the folder of a run")
+    parser.add_argument("--split", default="test", metavar="S", help="of the scene (test)")
+    parser.add_argument("--downscale", type=int, metavar="N", help="reduction of the photographs (the run's)")
+    parser.add_argument("--widths", metavar="A,B,C", help="another network of these widths, with random weights (the run's)")
+    parser.add_argument("--views", type=int, default=4, metavar="N", help="views, evenly spread (4)")
+    parser.add_argument("--runs", type=int, default=3, metavar="N", help="timed runs of each (3)")
+    parser.add_argument("--device", metavar="D", help="as `pp-cl devices` prints them")
+    parser.add_argument("--json", metavar="FILE", help="also write the result there")
+    options = parser.parse_args(argv)
+    try:
+        if min(options.views, options.runs, options.downscale or 1) < 1:
+            raise UserError("--views, --runs, --downscale: must be at least 1")
+        widths = bench.read_shape("4", options.widths)[1] if options.widths else None
+        dev = open_device(options.device)
+        comparison = Comparison(dev, Path(options.run), options.split, options.downscale, widths)
+        number = min(options.views, len(comparison.views))
+        rows = []
+        for i in range(number):
+            rows.append(comparison.row(comparison.views[len(comparison.views) * i // number], options.runs))
+            print("  ".join(f"{k} {v:.3g}" if isinstance(v, float) else f"{k} {v}" for k, v in rows[-1].items()), flush=True)
+        if options.json:
+            write_json(options.json, {"device": dev.name, "platform": dev.info["platform"], "rows": rows})
+    except UserError as error:
+        print(f"active_tiles: {error}", file=sys.stderr)
+        return 2
+    mean = {k: float(np.mean([row[k] for row in rows])) for k in ("share", "forward_ratio", "train_ratio")}
+    print(f"{number} views: {mean['share']:.0%} of the multiplications remain; forward {mean['forward_ratio']:.2f} times as "
+          f"fast as dense, with backward {mean['train_ratio']:.2f}")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
