@@ -39,10 +39,11 @@ def evaluate_run(folder, metrics, split, save_images, device_choice):
     remove_leftovers(target_folder)
     gamma_now = gamma(header["step"], config.train.iterations, *config.points.gamma)
     shown = {len(views) * i // PICTURE_VIEWS for i in range(PICTURE_VIEWS)}
-    rows, pictures, seconds = [], [], []
+    rows, pictures, seconds, shares = [], [], [], []
     for i, (view, picture, truth, duration) in enumerate(_render_all(dev, config, model, views, gamma_now)):
         rows.append({"name": view.name} | measure(picture, truth))
         seconds.append(duration)
+        shares.append(model.net.share)
         if i in shown:
             pictures.append((picture, truth))
         if save_images:
@@ -56,6 +57,7 @@ def evaluate_run(folder, metrics, split, save_images, device_choice):
         "per_image": rows,
         "points": {"initial": header["initial_points"], "final": model.count, "grid": header["grid"]["dims"]},
         "seconds_per_frame": float(np.median(seconds)),
+        "network_share": float(np.mean(shares)),  # of the network's multiplications; the rest saw background alone
         "published": scene.published,
     }
     write_json(target_folder / "metrics.json", result)
@@ -67,6 +69,7 @@ def evaluate_run(folder, metrics, split, save_images, device_choice):
 
 def _render_all(dev, config, model, views, gamma_now):
     """Yield (view, prediction (H,W,3), truth (H,W,3), seconds of the rendering) as float32 in [0, 1]."""
+    model.net.freeze()
     renderer, target = Renderer(dev, model, config.points), Target(dev, config.scene.downscale)
     renderer.picture(reduced_camera(views[0], config.scene.downscale), gamma_now)  # builds the programs
     for view in views:
@@ -87,7 +90,8 @@ def _print_table(result, folder):
     for label, values in rows.items():
         print(f"{label:28s}" + "".join(f"{values[n]:9.4f}" if n in values else f"{'':9s}" for n in names))
     points = result["points"]
+    share = f"{result['network_share']:.0%} of the network's work, " if result["network_share"] < 1 else ""
     print(
-        f"{points['final']} of {points['initial']} points, {result['seconds_per_frame'] * 1e3:.0f} ms per frame "
-        f"on {result['device']}"
+        f"{points['final']} of {points['initial']} points, {share}"
+        f"{result['seconds_per_frame'] * 1e3:.0f} ms per frame on {result['device']}"
     )

@@ -14,6 +14,7 @@ import numpy as np
 from pp_cl import layers, variants
 from pp_cl.active import ActiveBackward, ActiveForward, Everything
 from pp_cl.conv import pack_bias, pack_weights
+from pp_cl.slots import assign_slots, lifetimes
 from pp_cl.tiles import grid_shape, tiles_find
 
 # Tiles are chosen in images of so many pixels or more, if that leaves at most such a share of the multiplications: choosing
@@ -86,6 +87,7 @@ class UNet:
         self._relu_outputs = {s.name for s in self.steps if s.kind == "conv3"}
         self._buffers = {}  # {training: (size, {name: array}, the buffers they are views of)}
         self._trained = None  # (arrays, pass) of the last forward(training=True)
+        self._laid_out = None  # {(step, variant): weights} once frozen
         self.share = 1.0
 
     def forward(self, x, training=True, background=None):
@@ -94,8 +96,10 @@ class UNet:
         The result lives in a buffer of the network: the next call overwrites it. training: keep what backward needs.
         background: the value of x where there is nothing; where the network sees that alone, in large images, one tile is
         computed in place of many equal ones (active.py), with the same result. None = compute everything.
-        Raises ValueError for other sizes.
+        Raises ValueError for other sizes, RuntimeError for training once frozen.
         """
+        if training and self._laid_out is not None:
+            raise RuntimeError("UNet.freeze() was called: the network can no longer be trained")
         height, width, channels = x.shape
         if height % 4 or width % 4 or channels != self.channels["x"]:
             raise ValueError(f"the network takes (4n, 4m, {self.channels['x']}) features, not {x.shape}")
@@ -112,12 +116,24 @@ class UNet:
                 weight, bias = self.parameters[step.name + ".weight"], self.parameters[step.name + ".bias"]
                 variant = self._variant_of(step, "forward", height, width)
                 variants.forward(self.dev, variant, sources[0], weight, bias, out, step.kind == "conv3", arrays["work"],
-                                 sources[1] if len(sources) > 1 else None, tiles)
+                                 sources[1] if len(sources) > 1 else None, tiles, self._weights_of(step, variant))
             active.complete(step.name, out)
         layers.affine(self.dev, 0.5, 0.5, out, out)
         if training:
             self._trained = arrays, active
         return out
+
+    def freeze(self):
+        """From now on the parameters stay as they are: the weights are laid out for the kernels once, not for each image."""
+        self._laid_out = {}
+
+    def _weights_of(self, step, variant):
+        """The weights as a variant wants them, if the network is frozen."""
+        if self._laid_out is None:
+            return None
+        if (step, variant) not in self._laid_out:
+            self._laid_out[step, variant] = variants.lay_out(self.dev, variant, self.parameters[step.name + ".weight"])
+        return self._laid_out[step, variant]
 
     def output(self, name):
         """(H, W, C) output of the step `name` in the last forward(training=True), until its backward pass."""
@@ -200,7 +216,7 @@ class UNet:
         Gradients of parameters are among them without training too: they are made with the network.
         """
         plan = [(" = ".join(slot.names), (slot.floats,), slot.floats * 4)
-                for slot in assign_slots(self._lifetimes(training), self._shapes(height, width))]
+                for slot in assign_slots(lifetimes(self.steps, training), self._shapes(height, width))]
         plan += [(name, p.shape, p.nbytes) for name, p in self.parameters.items()]
         plan += [(f"grad {name}", g.shape, g.nbytes) for name, g in self.gradients.items()]
         plan += [("convolutions at work", (floats,), floats * 4) for floats in self._work_floats(height, width, training)]
@@ -232,21 +248,6 @@ class UNet:
                  for step, direction, name in uses]
         return [max(1, *floats) for floats in zip(*needs, strict=True)]
 
-    def _lifetimes(self, training):
-        """[(name, first, last)] of all arrays, in steps of the forward and backward pass, by first use."""
-        schedule = [(*step.inputs, step.name) for step in self.steps]
-        if training:
-            for step in reversed(self.steps):
-                activations = () if step.kind == "up" else step.inputs
-                schedule.append((*activations, "grad " + step.name, *("grad " + name for name in step.inputs)))
-        lifetimes = {}
-        for time, names in enumerate(schedule):
-            for name in names:
-                lifetimes[name] = (lifetimes.get(name, (time,))[0], time)
-        del lifetimes["x"]  # the caller's
-        lifetimes["out"] = (lifetimes["out"][0], len(schedule))  # the caller may read it after backward
-        return [(name, *lifetime) for name, lifetime in lifetimes.items()]
-
     def _arrays(self, height, width, training):
         """{name: array} for this size, allocated anew only when the size changes."""
         if training not in self._buffers or self._buffers[training][0] != (height, width):
@@ -254,7 +255,7 @@ class UNet:
             if training:
                 self._trained = None
             shapes, arrays = self._shapes(height, width), {}
-            slots = assign_slots(self._lifetimes(training), shapes)
+            slots = assign_slots(lifetimes(self.steps, training), shapes)
             buffers = [self.dev.empty(slot.floats) for slot in slots]
             for slot, buffer in zip(slots, buffers, strict=True):
                 arrays |= {name: buffer[:int(np.prod(shapes[name]))].reshape(shapes[name]) for name in slot.names}
@@ -262,34 +263,3 @@ class UNet:
             arrays["everything"] = Everything(self.dev, (height, width), self._levels())
             self._buffers[training] = ((height, width), arrays, buffers)
         return self._buffers[training][1]
-
-
-@dataclass
-class Slot:
-    """One buffer that holds several arrays, one after the other."""
-
-    floats: int
-    names: list
-    free_from: int
-
-
-def assign_slots(lifetimes, shapes):
-    """[Slot] such that no two arrays of one slot live at the same time.
-
-    lifetimes: [(name, first, last)] by first use. An array takes the free slot that fits it best; if none is large enough,
-    the largest free one grows.
-    """
-    slots = []
-    for name, first, last in lifetimes:
-        floats = int(np.prod(shapes[name]))
-        free = [s for s in slots if s.free_from <= first]
-        large = [s for s in free if s.floats >= floats]
-        if free:
-            slot = min(large, key=lambda s: s.floats) if large else max(free, key=lambda s: s.floats)
-        else:
-            slot = Slot(0, [], 0)
-            slots.append(slot)
-        slot.floats = max(slot.floats, floats)
-        slot.names.append(name)
-        slot.free_from = last + 1
-    return slots

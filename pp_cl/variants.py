@@ -68,14 +68,25 @@ def pick_variant(dev, direction, ci, co, height, width):
     return applicable(next(name for pixels, name in FASTEST[direction] if height * width >= pixels), 3, ci, co)
 
 
-def forward(dev, variant, x, weight, bias, out, relu, work, x2=None, tiles=None):
-    """conv.conv_forward by a variant."""
+def lay_out(dev, variant, weight):
+    """Weights as forward() lays them out each time, in an array of their own; None where it takes them as they are."""
+    m, (blocks, _, _, ci, _) = VARIANTS[variant], weight.shape
+    if m is None:
+        return None
+    laid_out = dev.empty(transformed_floats(m, ci, blocks * LANES))
+    transform_weights(dev, m, weight, laid_out)
+    return laid_out
+
+
+def forward(dev, variant, x, weight, bias, out, relu, work, x2=None, tiles=None, laid_out=None):
+    """conv.conv_forward by a variant. laid_out: lay_out(variant, weight), if it is there already."""
     m = VARIANTS[variant]
     if m is None:
         conv_forward(dev, x, weight, bias, out, relu, x2, tiles)
-    else:
+        return
+    if laid_out is None:
         transform_weights(dev, m, weight, work.weights)
-        winograd_forward(dev, m, x, work.weights, bias, out, relu, work.scratch, x2, tiles)
+    winograd_forward(dev, m, x, work.weights if laid_out is None else laid_out, bias, out, relu, work.scratch, x2, tiles)
 
 
 def backward_input(dev, variant, x, weight, first, grad_out, grad_x, masked, work, tiles=None):

@@ -6,7 +6,8 @@ from helpers import numeric_gradient, relative_error
 from oracle_unet import unet, unet_gradients
 
 from pp_cl.conv import unpack_weights
-from pp_cl.unet import UNet, assign_slots
+from pp_cl.slots import assign_slots
+from pp_cl.unet import UNet
 
 
 def plain_parameters(net, arrays):
@@ -61,6 +62,21 @@ def test_inference_equals_training(dev, rng):
     net = UNet(dev, seed=3)
     x = dev.upload(rng.normal(size=(20, 24, 16)).astype(np.float32))
     np.testing.assert_array_equal(net.forward(x, training=False).get(), net.forward(x, training=True).get())
+
+
+@pytest.mark.parametrize("variant", ["direct", "winograd2", "auto"])
+def test_frozen_weights_are_laid_out_once(dev, rng, variant):
+    net = UNet(dev, seed=3, variant=variant)
+    small, large = (dev.upload(rng.normal(size=(*s, 16)).astype(np.float32)) for s in ((16, 12), (32, 36)))
+    expected = [net.forward(x, training=False).get() for x in (small, large)]
+    net.freeze()
+    for _ in range(2):
+        for x, image in zip((small, large), expected, strict=True):
+            np.testing.assert_array_equal(net.forward(x, training=False).get(), image)
+    net.parameters["enc1.a.weight"].fill(0)  # forbidden, and unseen where the weights are laid out
+    assert np.array_equal(net.forward(large, training=False).get(), expected[1]) == (variant != "direct")
+    with pytest.raises(RuntimeError, match="freeze"):
+        net.forward(small)
 
 
 def test_sizes_may_change_between_calls(dev, rng):
