@@ -6,7 +6,6 @@ from helpers import numeric_gradient, relative_error
 from oracle_unet import unet, unet_gradients
 
 from pp_cl.conv import unpack_weights
-from pp_cl.slots import assign_slots
 from pp_cl.unet import UNet
 
 
@@ -150,16 +149,3 @@ def test_memory_of_the_papers_network(dev):
     assert sum(row[2] for row in inference) < 1.5e9
     assert sum(row[2] for row in training) < 5e9
     assert max(row[2] for row in inference + training) <= 1 << 30
-
-
-def test_slots_never_overlap(rng):
-    firsts = np.sort(rng.integers(0, 20, 40))
-    lifetimes = [(i, first, first + rng.integers(0, 6)) for i, first in enumerate(firsts)]
-    shapes = {i: (rng.integers(1, 9), 3) for i in range(40)}
-    slots = assign_slots(lifetimes, shapes)
-    assert sorted(name for slot in slots for name in slot.names) == list(range(40))
-    assert len(slots) < 20
-    for slot in slots:
-        held = [lifetimes[name] for name in slot.names]
-        assert all(a[2] < b[1] for a, b in zip(held, held[1:], strict=False))
-        assert slot.floats == max(np.prod(shapes[name]) for name in slot.names)
