@@ -16,70 +16,12 @@
 // Vectors of a work-item's scratch: the values of ci channels, their products of co channels, a patch for load_tile.
 #define SLICE(ci, co) (POSITIONS * (PITCH(ci) + PITCH(co) + 1))
 
-// Three rows of three weights in t -> their values at all positions, to every `stride`-th vector of transformed.
-__attribute__((always_inline))
-inline void store_kernel(
-    float16 *t,
-    global float16 *transformed,
-    const int stride)
-{
-    #pragma unroll
-    for (int i = 0; i < 3; i++)
-        transform_kernel(t + i, S);
-    #pragma unroll
-    for (int i = 0; i < S; i++)
-        transform_kernel(t + i * S, 1);
-    #pragma unroll
-    for (int i = 0; i < POSITIONS; i++)
-        transformed[i * stride] = t[i];
-}
-
-// One work-item per (input channel, 16 output channels): reads 3 x 3 weights, writes their values at all positions.
-kernel void winograd_weights(
-    const int ci,
-    const int blocks,
-    global const float16 *weight,        // (blocks, 3, 3, ci, 16)
-    global float16 *transformed)         // (...) at least (POSITIONS, blocks, ci, 16)
-{
-    const int c = get_global_id(0), block = get_global_id(1);
-    if (c >= ci || block >= blocks)
-        return;
-    float16 t[POSITIONS];
-    #pragma unroll
-    for (int i = 0; i < 9; i++)
-        t[i / 3 * S + i % 3] = weight[(block * 9 + i) * ci + c];
-    store_kernel(t, transformed + block * ci + c, blocks * ci);
-}
-
-// One work-item per (output channel, 16 input channels from `first` on): the same for the mirrored kernels with the roles of
-// input and output channels exchanged, which the input gradient is made with.
-kernel void winograd_flipped_weights(
-    const int co,
-    const int blocks,                    // of input channels taken
-    const int first,                     // input channel
-    const int ci,                        // channels of weight
-    global const float *weight,          // (?, 3, 3, ci, 16)
-    global float16 *transformed)         // (...) at least (POSITIONS, blocks, co, 16)
-{
-    const int o = get_global_id(0), block = get_global_id(1);
-    if (o >= co || block >= blocks)
-        return;
-    float16 t[POSITIONS];
-    #pragma unroll
-    for (int i = 0; i < 9; i++) {
-        global const float *tap = weight + ((o / 16 * 9 + 8 - i) * ci + first + block * 16) * 16 + o % 16;
-        t[i / 3 * S + i % 3] = (float16)(tap[0], tap[16], tap[32], tap[48], tap[64], tap[80], tap[96], tap[112],
-                                         tap[128], tap[144], tap[160], tap[176], tap[192], tap[208], tap[224], tap[240]);
-    }
-    store_kernel(t, transformed + block * co + o, blocks * co);
-}
-
-// Stage 2: m (position, 16 of co, tile) = v (position, 16 of ci, tile) times weight (position, 16 of co, ci, 16).
+// Stage 2: m (position, 16 of co, tile) = v (position, 16 of ci, tile) times the transformed weights.
 __attribute__((always_inline))
 inline void multiply(
     global float16 *m,
     global const float16 *v,
-    global const float16 *weight,
+    global const float16 *transformed,
     const int ci,
     const int blocks,
     const int padded)
@@ -95,13 +37,13 @@ inline void multiply(
                         acc[b][i] = 0.0f;
                 for (int chunk = 0; chunk < ci / 16; chunk++) {
                     global const float *value = (global const float *)(v + position * PITCH(ci) + chunk * TILES + tile);
-                    global const float16 *w = weight + (position * blocks + block) * ci + chunk * 16;
+                    const int weight = WEIGHT_AT(position, block, blocks, ci) + chunk * 16;
                     #pragma unroll 4
                     for (int c = 0; c < 16; c++) {
                         float16 wc[BLOCKS];
                         #pragma unroll
                         for (int b = 0; b < BLOCKS; b++)
-                            wc[b] = w[b * ci + c];
+                            wc[b] = LOAD_WEIGHT(transformed, weight + b * ci + c);
                         #pragma unroll
                         for (int i = 0; i < GROUP; i++)
                             #pragma unroll
@@ -113,7 +55,8 @@ inline void multiply(
                 for (int b = 0; b < BLOCKS; b++)
                     #pragma unroll
                     for (int i = 0; i < GROUP; i++)
-                        m[position * PITCH(blocks * 16) + (block + b) * TILES + tile + i] = acc[b][i];
+                        m[position * PITCH(blocks * 16) + (block + b) * TILES + tile + i] =
+                            HALF ? acc[b][i] * transformed[block + b] : acc[b][i];
             }
 }
 
@@ -170,7 +113,7 @@ inline void convolve(
     global const float *x2,
     const int c1,
     const int c2,
-    global const float16 *weight,
+    global const float16 *transformed,
     global const float16 *bias,
     const int relu,
     global const float *mask,
@@ -193,7 +136,7 @@ inline void convolve(
         for (int source = 0; source < (c2 ? 2 : 1); source++)
             transform_tiles(v + (source ? c1 / 16 * TILES : 0), PITCH(ci), patch, source ? x2 : x, source ? c2 : c1,
                             (source ? c2 : c1) / 16, tile_list, first, count, padded);
-        multiply(m, v, weight, ci, co / 16, padded);
+        multiply(m, v, transformed, ci, co / 16, padded);
         transform_back(out, m, bias, relu, mask, co, tile_list, first, count);
     }
 }
@@ -207,13 +150,13 @@ kernel void winograd_forward(
     const int relu,                      // negative results become 0
     global const float *x,               // (height, width, c1)
     global const float *x2,              // (height, width, ?)
-    global const float16 *weight,        // (...) at least (POSITIONS, blocks, c1 + c2, 16)
+    global const float16 *transformed,   // (...) weights, laid out as winograd.h says
     global const float16 *bias,          // (?)
     global const int *tile_list,         // (?)
     global float *out,                   // (height, width, co)
     global float16 *scratch)             // (...) work-items times SLICE(c1 + c2, co) vectors
 {
-    convolve(x, x2, c1, c2, weight, bias, relu, 0, out, co, tile_list, scratch);
+    convolve(x, x2, c1, c2, transformed, bias, relu, 0, out, co, tile_list, scratch);
 }
 
 // One work-item per compute unit: reads its tiles' neighbourhood in grad_out, and writes its tiles of grad_x, which is the
@@ -223,7 +166,7 @@ kernel void winograd_backward_input(
     const int co,
     const int masked,
     global const float *x,               // (height, width, c)
-    global const float16 *flipped,       // (...) at least (POSITIONS, blocks, co, 16)
+    global const float16 *flipped,       // (...) transformed weights, laid out as winograd.h says
     global const float *grad_out,        // (height, width, co)
     global const int *tile_list,         // (?) of grad_x
     global float *grad_x,                // (height, width, c)

@@ -16,9 +16,25 @@
 #ifndef TILES
 #define TILES 64             // tiles transformed and multiplied at a time
 #endif
+#ifndef HALF
+#define HALF 0               // 1: transformed weights are stored as half (IEEE 754's 16 bits) and computed with as float
+#endif
 #define S (M + 2)            // side of a tile of inputs
 #define POSITIONS (S * S)
 #define PER_SIDE (SIDE / M)   // of tiles.h's tiles
+
+// Transformed weights are laid out (position, 16 output channels a block, input channel, 16). One vector more between two
+// positions keeps these apart in the sets of a cache. With HALF they are multiples of their output channel's unit, a power
+// of two (winograd_filter.cl), and the units of all blocks come first, float16 a block: as long as two vectors of weights.
+#define WEIGHT_AT(position, block, blocks, channels) \
+    (2 * HALF * (blocks) + (position) * ((blocks) * (channels) + 1) + (block) * (channels))
+#if HALF
+#define LOAD_WEIGHT(transformed, at) vloada_half16(at, (global const half *)(transformed))
+#define STORE_WEIGHT(value, transformed, at) vstorea_half16(value, at, (global half *)(transformed))
+#else
+#define LOAD_WEIGHT(transformed, at) (transformed)[at]
+#define STORE_WEIGHT(value, transformed, at) (transformed)[at] = value
+#endif
 
 #define P 0.75f
 #define Q 1.5f

@@ -187,7 +187,7 @@ def _rows(about, runs, found, flops, peak):
     return rows
 
 
-COLUMNS = "{:8} {:26} {:9} {:10} {:>9} {:>8} {:>5} {:>8} {:>8}".format
+COLUMNS = "{:8} {:26} {:9} {:14} {:>9} {:>8} {:>5} {:>8} {:>8}".format
 HEAD = COLUMNS("layer", "shape", "direction", "variant", "ms", "GFLOP/s", "peak", "rel. L2", "max")
 
 

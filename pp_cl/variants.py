@@ -14,18 +14,18 @@ from pp_cl.conv_weights import flip_weights, partial_floats, weight_gradient
 from pp_cl.winograd import (
     fits,
     scratch_floats,
-    transform_flipped_weights,
-    transform_weights,
     transformed_floats,
     winograd_backward_input,
     winograd_forward,
 )
+from pp_cl.winograd_filter import transform_flipped_weights, transform_weights
 from pp_cl.winograd_weights import gradient_scratch_floats, winograd_weight_gradient
 
-# By name: the side m of Winograd's tiles of outputs, None for the direct convolution.
-VARIANTS = {"direct": None, "winograd2": 2, "winograd4": 4}
+# By name: the side m of Winograd's tiles of outputs, None for the direct convolution; whether weights are stored as half.
+VARIANTS = {"direct": (None, False), "winograd2": (2, False), "winograd4": (4, False), "winograd4_half": (4, True)}
 # By what is computed: the variants that are fastest from so many pixels on, measured on 2 cores with AVX-512. Below, too few
-# tiles share the cost of transforming the weights. Channels matter less: from 16 on, all of them gain.
+# tiles share the cost of transforming the weights. Channels matter less: from 16 on, all of them gain. Half's is for those
+# who ask for it: faster from 512 channels on, at several hundred times the error.
 FASTEST = {
     "forward": ((900, "winograd4"), (256, "winograd2"), (0, "direct")),
     "input": ((900, "winograd4"), (256, "winograd2"), (0, "direct")),
@@ -46,13 +46,13 @@ def work_floats(dev, variant, direction, height, weight_shape, c=None):
 
     weight_shape: (ceil(CO/16), K, K, CI, 16); c: the input channels of a gradient of the input.
     """
-    m = VARIANTS[variant]
+    m, half = VARIANTS[variant]
     blocks, k, _, ci, _ = weight_shape
     if direction == "weights":
         return partial_floats(height, weight_shape) if m is None else gradient_scratch_floats(dev, m), 0
     ci, co = c or ci, blocks * LANES
     if m:
-        return scratch_floats(dev, m, ci, co), transformed_floats(m, ci, co)
+        return scratch_floats(dev, m, ci, co), transformed_floats(m, ci, co, half)
     return 0, math.prod(_flipped_shape(weight_shape, c, co)) if direction == "input" else 0
 
 
@@ -70,41 +70,42 @@ def pick_variant(dev, direction, ci, co, height, width):
 
 def lay_out(dev, variant, weight):
     """Weights as forward() lays them out each time, in an array of their own; None where it takes them as they are."""
-    m, (blocks, _, _, ci, _) = VARIANTS[variant], weight.shape
+    (m, half), (blocks, _, _, ci, _) = VARIANTS[variant], weight.shape
     if m is None:
         return None
-    laid_out = dev.empty(transformed_floats(m, ci, blocks * LANES))
-    transform_weights(dev, m, weight, laid_out)
+    laid_out = dev.empty(transformed_floats(m, ci, blocks * LANES, half))
+    transform_weights(dev, m, weight, laid_out, half)
     return laid_out
 
 
 def forward(dev, variant, x, weight, bias, out, relu, work, x2=None, tiles=None, laid_out=None):
     """conv.conv_forward by a variant. laid_out: lay_out(variant, weight), if it is there already."""
-    m = VARIANTS[variant]
+    m, half = VARIANTS[variant]
     if m is None:
         conv_forward(dev, x, weight, bias, out, relu, x2, tiles)
         return
     if laid_out is None:
-        transform_weights(dev, m, weight, work.weights)
-    winograd_forward(dev, m, x, work.weights if laid_out is None else laid_out, bias, out, relu, work.scratch, x2, tiles)
+        transform_weights(dev, m, weight, work.weights, half)
+    winograd_forward(dev, m, x, work.weights if laid_out is None else laid_out, bias, out, relu, work.scratch, x2, tiles, half)
 
 
 def backward_input(dev, variant, x, weight, first, grad_out, grad_x, masked, work, tiles=None):
     """conv.conv_backward_input by a variant; weight as in forward, `first`: the channel of it where x begins."""
-    m, c, co = VARIANTS[variant], grad_x.shape[2], grad_out.shape[2]
+    m, half = VARIANTS[variant]
+    c, co = grad_x.shape[2], grad_out.shape[2]
     if m is None:
         shape = _flipped_shape(weight.shape, c, co)
         flipped = work.weights[:math.prod(shape)].reshape(shape)
         flip_weights(dev, weight, first, flipped)
         conv_backward_input(dev, x, flipped, grad_out, grad_x, masked, tiles)
     else:
-        transform_flipped_weights(dev, m, weight, first, c, work.weights)
-        winograd_backward_input(dev, m, x, work.weights, grad_out, grad_x, masked, work.scratch, tiles)
+        transform_flipped_weights(dev, m, weight, first, c, work.weights, half)
+        winograd_backward_input(dev, m, x, work.weights, grad_out, grad_x, masked, work.scratch, tiles, half)
 
 
 def backward_weights(dev, variant, x, grad_out, grad_weight, grad_bias, work, x2=None, tiles=None):
-    """conv_weights.weight_gradient by a variant."""
-    m = VARIANTS[variant]
+    """conv_weights.weight_gradient by a variant; it reads no weights, so that half changes nothing."""
+    m, _ = VARIANTS[variant]
     if m is None:
         weight_gradient(dev, x, grad_out, grad_weight, grad_bias, work.scratch, x2, tiles)
     else:

@@ -1,7 +1,8 @@
 """3x3 convolutions by Winograd's minimal filtering F(m x m, 3 x 3): variants of conv.py's with fewer multiplications.
 
 m = 2 takes 2.25 times fewer than the direct variant, m = 4 takes 4 times fewer at two or three times the error. Channels
-come in multiples of 16. transform_weights makes ready what any number of convolutions then use.
+come in multiples of 16. winograd_filter.py makes ready the weights that any number of convolutions then use; `half` says
+that they are stored in 16 bits.
 """
 
 from pp_cl.conv import LANES
@@ -23,9 +24,10 @@ def positions(m):
     return (m + 2) ** 2
 
 
-def transformed_floats(m, ci, co):
-    """Floats of the transformed weights of ci to co channels."""
-    return positions(m) * ci * co
+def transformed_floats(m, ci, co, half=False):
+    """Floats of the transformed weights, as cl/winograd.h lays them out, of ci to co channels or the other way round."""
+    floats = positions(m) * (ci * co + LANES)
+    return max(ci, co) + floats // 2 if half else floats
 
 
 def scratch_floats(dev, m, ci, co):
@@ -33,27 +35,8 @@ def scratch_floats(dev, m, ci, co):
     return dev.info["compute_units"] * positions(m) * ((ci + co) * TILES + 3 * LANES)
 
 
-def transform_weights(dev, m, weight, transformed):
-    """Fill transformed, of at least transformed_floats, from weight (CO/16, 3, 3, CI, 16) for winograd_forward."""
-    blocks, _, _, ci, _ = weight.shape
-    _check_size("transformed weights", transformed, transformed_floats(m, ci, blocks * LANES))
-    _program(dev, m, blocks).launch("winograd_weights", (ci, blocks), local=(LANES, 1), ci=ci, blocks=blocks, weight=weight,
-                                    transformed=transformed)
-
-
-def transform_flipped_weights(dev, m, weight, first, c, transformed):
-    """The same for winograd_backward_input to c input channels from `first` on, multiples of 16 like all channels."""
-    blocks, _, _, ci, _ = weight.shape
-    co = blocks * LANES
-    if not fits(c) or first % LANES or first + c > ci:
-        raise ValueError(f"Winograd input gradient of {c} channels from {first} on: channels come in multiples of {LANES}")
-    _check_size("transformed weights", transformed, transformed_floats(m, c, co))
-    _program(dev, m, c // LANES).launch("winograd_flipped_weights", (co, c // LANES), local=(LANES, 1), co=co,
-                                        blocks=c // LANES, first=first, ci=ci, weight=weight, transformed=transformed)
-
-
-def winograd_forward(dev, m, x, transformed, bias, out, relu, scratch, x2=None, tiles=None):
-    """out = convolution of [x, x2] + bias, then max(., 0) if relu: conv.conv_forward with transformed weights.
+def winograd_forward(dev, m, x, transformed, bias, out, relu, scratch, x2=None, tiles=None, half=False):
+    """out = convolution of [x, x2] + bias, then max(., 0) if relu: conv.conv_forward by winograd_filter.transform_weights.
 
     x: (H, W, C1), x2: None or (H, W, C2), bias: (CO,), out: (H, W, CO); scratch: at least scratch_floats; tiles:
     tiles.Tiles of out that are written, None = all. The result does not depend on the number of compute units. Raises
@@ -64,16 +47,16 @@ def winograd_forward(dev, m, x, transformed, bias, out, relu, scratch, x2=None, 
     if not fits(c1, co) or c2 % LANES or bias.shape != (co,):
         raise ValueError(f"Winograd convolution of {c1} + {c2} to {co} channels, bias {bias.shape}: "
                          f"channels come in multiples of {LANES}")
-    _check_size("transformed weights", transformed, transformed_floats(m, c1 + c2, co))
-    _check_size("scratch", scratch, scratch_floats(dev, m, c1 + c2, co))
+    check_size("transformed weights", transformed, transformed_floats(m, c1 + c2, co, half))
+    check_size("scratch", scratch, scratch_floats(dev, m, c1 + c2, co))
     tiles = checked_tiles(dev, tiles, height, width)
-    _program(dev, m, co // LANES).launch(
+    _program(dev, m, co // LANES, half).launch(
         "winograd_forward", work_items(dev, m, tiles), local=1, c1=c1, c2=c2, co=co, relu=relu, x=x,
-        x2=x if x2 is None else x2, weight=transformed, bias=bias, tile_list=tiles.list, out=out, scratch=scratch)
+        x2=x if x2 is None else x2, transformed=transformed, bias=bias, tile_list=tiles.list, out=out, scratch=scratch)
 
 
-def winograd_backward_input(dev, m, x, transformed, grad_out, grad_x, masked, scratch, tiles=None):
-    """grad_x = gradient of the convolution's input: conv.conv_backward_input by transform_flipped_weights.
+def winograd_backward_input(dev, m, x, transformed, grad_out, grad_x, masked, scratch, tiles=None, half=False):
+    """grad_x = gradient of the convolution's input: conv.conv_backward_input by winograd_filter.transform_flipped_weights.
 
     x, grad_x: (H, W, C), grad_out: (H, W, CO); scratch: at least scratch_floats. x is read only where masked. tiles:
     tiles.Tiles of grad_x that are written, None = all. Raises ValueError when shapes do not fit together.
@@ -82,10 +65,10 @@ def winograd_backward_input(dev, m, x, transformed, grad_out, grad_x, masked, sc
     co = grad_out.shape[2]
     if not fits(c, co):
         raise ValueError(f"Winograd input gradient of {c} from {co} channels: channels come in multiples of {LANES}")
-    _check_size("transformed weights", transformed, transformed_floats(m, c, co))
-    _check_size("scratch", scratch, scratch_floats(dev, m, c, co))
+    check_size("transformed weights", transformed, transformed_floats(m, c, co, half))
+    check_size("scratch", scratch, scratch_floats(dev, m, c, co))
     tiles = checked_tiles(dev, tiles, height, width)
-    _program(dev, m, c // LANES).launch(
+    _program(dev, m, c // LANES, half).launch(
         "winograd_backward_input", work_items(dev, m, tiles), local=1, c=c, co=co, masked=masked, x=x, flipped=transformed,
         grad_out=grad_out, tile_list=tiles.list, grad_x=grad_x, scratch=scratch)
 
@@ -100,10 +83,11 @@ def pair_blocks(blocks):
     return 1 if blocks % 2 else 2
 
 
-def _program(dev, m, blocks):
-    return dev.program("winograd", M=m, TILES=TILES, GROUP=GROUP, BLOCKS=pair_blocks(blocks))
-
-
-def _check_size(what, array, floats):
+def check_size(what, array, floats):
+    """Raise ValueError if an array is too small."""
     if array.size < floats:
         raise ValueError(f"Winograd: {what} of {array.size} floats, needs {floats}")
+
+
+def _program(dev, m, blocks, half):
+    return dev.program("winograd", M=m, TILES=TILES, GROUP=GROUP, BLOCKS=pair_blocks(blocks), HALF=int(half))

@@ -5,6 +5,7 @@ import sys
 
 import numpy as np
 import pytest
+from oracle_winograd import rounding_share
 
 from pp_cl import bench, peak
 from pp_cl.bench import NETWORK_VARIANTS, bench_conv, bench_unet, errors, flops_of, interleave, run_bench
@@ -15,6 +16,7 @@ from pp_cl.unet import unet_steps
 from pp_cl.variants import VARIANTS
 
 SMALL = ("--size", "8", "--widths", "16,16,16")
+HALF = {"winograd4_half": rounding_share(4)}  # relative L2 error of a layer with weights stored as half
 KEYS = {"variant", "direction", "shape", "ms", "gflops", "peak_share", "rel_l2", "max_err"}
 
 
@@ -35,7 +37,7 @@ def test_a_layer_is_compared_with_the_truth(dev, direction, k, sources, co, coun
         actual, expected = layer.result(variant, direction)
         assert actual.shape == expected.shape and expected.dtype == np.float64
         assert np.abs(expected).max() > 0.1
-        assert errors(actual, expected)[0] < 1e-5
+        assert errors(actual, expected)[0] < (HALF.get(variant, 1e-5) if direction != "weights" else 1e-5)
 
 
 def test_rows_of_the_layers(dev):
@@ -48,7 +50,7 @@ def test_rows_of_the_layers(dev):
     shapes = {row["layer"]: row["shape"] for row in rows}
     assert shapes["dec1.a"] == [4, 4, 32, 16, 3] and shapes["out"] == [8, 8, 16, 3, 1]
     for row in rows:
-        assert row["rel_l2"] < 1e-5
+        assert row["rel_l2"] < HALF.get(row["variant"], 1e-5)
         assert row["peak_share"] == pytest.approx(row["gflops"] / row["peak_gflops"])
         height, width, ci, co, k = row["shape"]
         assert row["gflops"] == pytest.approx(2e-6 * k * k * ci * co * height * width / row["ms"])
@@ -63,7 +65,7 @@ def test_rows_of_the_network(dev, monkeypatch, check_size):
     for row in rows:
         assert row.keys() >= KEYS
         assert row["shape"] == [16, 16, 16, 16, 16, 32, 3]
-        assert 0 < row["rel_l2"] < 2e-5 and row["max_err"] > 0
+        assert 0 < row["rel_l2"] < 10 * HALF.get(row["variant"], 2e-6) and row["max_err"] > 0  # ten layers
     steps = unet_steps((16, 16, 32), 3)
     channels = {"x": 16} | {s.name: s.channels for s in steps}
     flops = sum(flops_of(s, channels, 16, 16) for s in steps if s.kind.startswith("conv"))

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from helpers import numeric_gradient, relative_error
 from oracle_unet import unet, unet_gradients
+from oracle_winograd import rounding_share
 
 from pp_cl.conv import unpack_weights
 from pp_cl.unet import UNet
@@ -34,6 +35,14 @@ def test_forward_and_backward(dev, rng, widths, variant):
     assert gradients.keys() == expected.keys()
     errors = {name: relative_error(gradients[name], expected[name]) for name in expected}
     assert max(errors.values()) < 1e-5, errors
+
+
+def test_weights_stored_as_half(dev, rng):
+    """The image; of the gradients test_bench.py, as the places where a ReLU passes them depend on the rounding."""
+    net = UNet(dev, (16, 32, 48), seed=1, variant="winograd4_half")
+    x = rng.normal(size=(12, 16, 16)).astype(np.float32)
+    expected = unet(x, plain_parameters(net, net.parameters))[0]
+    assert 1e-6 < relative_error(net.forward(dev.upload(x)).get(), expected) < 10 * rounding_share(4)
 
 
 def test_gradients_by_finite_differences(dev, rng):
@@ -131,7 +140,7 @@ def test_wrong_use_is_refused(dev):
         net.backward(dev.zeros((8, 8, 3)))
 
 
-@pytest.mark.parametrize("variant", ["direct", "winograd4"])
+@pytest.mark.parametrize("variant", ["direct", "winograd4", "winograd4_half"])
 @pytest.mark.parametrize("training", [False, True])
 def test_memory_plan_is_what_is_allocated(dev, training, variant):
     x, grad_y = dev.zeros((16, 20, 16)), dev.zeros((16, 20, 3))

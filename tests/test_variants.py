@@ -2,11 +2,13 @@
 
 import numpy as np
 import pytest
-from helpers import relative_error
+from hard_layers import hard_layers
 from oracle_conv import conv, conv_gradients
+from oracle_winograd import rounding_bound
 from test_conv import layer
 
 from pp_cl.conv import pack_bias, pack_weights, unpack_weights
+from pp_cl.reference import flipped
 from pp_cl.variants import (
     FASTEST,
     VARIANTS,
@@ -20,31 +22,53 @@ from pp_cl.variants import (
 )
 
 
-@pytest.mark.parametrize("k, variant", [(1, "direct"), *[(3, variant) for variant in VARIANTS]])
-def test_all_directions(dev, rng, k, variant):
-    c1, c2, co, height, width = 16, 32, 48, 11, 14
-    weight, bias = layer(rng, c1 + c2, co, k)
-    x = np.maximum(rng.normal(size=(height, width, c1 + c2)), 0).astype(np.float32)
-    plain_grad = rng.normal(size=(height, width, co)).astype(np.float32)
-    sources = [dev.upload(np.ascontiguousarray(s)) for s in np.split(x, [c1], 2)]
-    device_weight, out, grad_out = dev.upload(pack_weights(weight)), dev.empty((height, width, co)), dev.upload(plain_grad)
-    grad_weight, grad_bias = dev.empty(device_weight.shape), dev.empty(co)
+def check(variant, actual, expected, x=None, weight=None):
+    """Within 1e-5 of the largest value (of a channel, if a convolution of x by weight), plus half's rounding of weight."""
+    bound = 1e-5 * np.abs(expected).max((0, 1) if x is not None else None)
+    if x is not None and VARIANTS[variant][1]:
+        bound = bound + rounding_bound(4, x, weight)
+    assert (np.abs(actual - expected) <= bound).all()
+
+
+def check_all_directions(dev, variant, parts, weight, bias, grad_out, relu):
+    """Forward, with ReLU or without, of the concatenation of `parts`, and all gradients, masked as relu says."""
+    x, co = np.concatenate(parts, 2), len(weight)
+    sources, device_grad = [dev.upload(p) for p in parts], dev.upload(grad_out)
+    device_weight = dev.upload(pack_weights(weight))
+    out, grad_weight, grad_bias = dev.empty(grad_out.shape), dev.empty(device_weight.shape), dev.empty(-(-co // 16) * 16)
 
     def work(direction, c=None):
-        floats = work_floats(dev, variant, direction, height, device_weight.shape, c)
+        floats = work_floats(dev, variant, direction, len(x), device_weight.shape, c)
         return Work(*[dev.empty(max(1, n)) for n in floats])
 
-    forward(dev, variant, sources[0], device_weight, dev.upload(pack_bias(bias)), out, True, work("forward"), sources[1])
-    assert relative_error(out.get(), conv(x, weight, bias, True)) < 1e-5
-    expected = conv_gradients(x, weight, plain_grad)
-    backward_weights(dev, variant, sources[0], grad_out, grad_weight, grad_bias, work("weights"), sources[1])
-    assert relative_error(unpack_weights(grad_weight.get(), co), expected[1]) < 1e-5
-    assert relative_error(grad_bias.get(), expected[2]) < 1e-5
-    for source, first, c in ((sources[0], 0, c1), (sources[1], c1, c2)):
-        grad_x = dev.empty(source.shape)
-        backward_input(dev, variant, source, device_weight, first, grad_out, grad_x, True, work("input", c))
-        part = slice(first, first + c)
-        assert relative_error(grad_x.get(), (expected[0] * (x > 0))[..., part]) < 1e-5
+    forward(dev, variant, sources[0], device_weight, dev.upload(pack_bias(bias)), out, relu, work("forward"), *sources[1:])
+    check(variant, out.get(), conv(x, weight, bias, relu), x, weight)
+    expected = conv_gradients(x, weight, grad_out)
+    backward_weights(dev, variant, sources[0], device_grad, grad_weight, grad_bias, work("weights"), *sources[1:])
+    check(variant, unpack_weights(grad_weight.get(), co), expected[1])
+    check(variant, grad_bias.get()[:co], expected[2])
+    first = 0
+    for source, plain in zip(sources, parts, strict=True):
+        part = slice(first, first + plain.shape[2])
+        grad_x = dev.empty(plain.shape)
+        backward_input(dev, variant, source, device_weight, first, device_grad, grad_x, relu,
+                       work("input", plain.shape[2]))
+        check(variant, grad_x.get(), (expected[0] * (x > 0 if relu else 1))[..., part], grad_out, flipped(weight)[part])
+        first = part.stop
+
+
+@pytest.mark.parametrize("k, variant", [(1, "direct"), *[(3, variant) for variant in VARIANTS]])
+def test_all_directions(dev, rng, k, variant):
+    weight, bias = layer(rng, 16 + 32, 48, k)
+    parts = [np.maximum(rng.normal(size=(11, 14, c)), 0).astype(np.float32) for c in (16, 32)]
+    check_all_directions(dev, variant, parts, weight, bias, rng.normal(size=(11, 14, 48)).astype(np.float32), True)
+
+
+@pytest.mark.parametrize("variant", VARIANTS)
+@pytest.mark.parametrize("name", hard_layers(np.random.default_rng(7)))
+def test_hard_layers(dev, rng, name, variant):
+    x, weight, bias, grad_out = hard_layers(rng)[name]
+    check_all_directions(dev, variant, [x], weight, bias, grad_out, False)
 
 
 def test_a_variant_is_taken_where_it_can_be():
@@ -60,3 +84,7 @@ def test_shipped_choice(dev, monkeypatch, direction):
     assert pick_variant(dev, direction, 128, 128, 1, 63) == "direct"
     monkeypatch.setattr(dev, "is_cpu", False)
     assert pick_variant(dev, direction, 128, 128, 64, 64) == "direct"  # one work-item a compute unit suits no GPU
+
+
+def test_auto_never_takes_half(dev):
+    assert not any(VARIANTS[name][1] for choices in FASTEST.values() for _, name in choices)

@@ -4,18 +4,14 @@ import numpy as np
 import pytest
 from helpers import relative_error
 from oracle_conv import conv, conv_gradients
+from oracle_winograd import convolve
 from test_conv import layer
+from test_winograd_filter import transformed_by_device
 
 from pp_cl import winograd
 from pp_cl.conv import pack_bias, pack_weights
-from pp_cl.winograd import (
-    scratch_floats,
-    transform_flipped_weights,
-    transform_weights,
-    transformed_floats,
-    winograd_backward_input,
-    winograd_forward,
-)
+from pp_cl.winograd import scratch_floats, transformed_floats, winograd_backward_input, winograd_forward
+from pp_cl.winograd_filter import transform_flipped_weights, transform_weights
 
 # (height, width, channels in, channels out): less than a tile, tails of tiles, groups and rounds, odd blocks of channels
 SHAPES = [(1, 1, 16, 16), (1, 5, 16, 32), (5, 1, 32, 48), (31, 33, 16, 48), (257, 3, 32, 16), (6, 31, 48, 64),
@@ -24,22 +20,22 @@ SHAPES = [(1, 1, 16, 16), (1, 5, 16, 32), (5, 1, 32, 48), (31, 33, 16, 48), (257
 BOUNDS = {2: 3e-6, 4: 8e-6}
 
 
-def run_forward(dev, m, x, weight, bias, relu, x2=None):
+def run_forward(dev, m, x, weight, bias, relu, x2=None, half=False):
     co, ci = weight.shape[:2]
-    out, transformed = dev.empty((*x.shape[:2], co)), dev.empty(transformed_floats(m, ci, co))
-    transform_weights(dev, m, dev.upload(pack_weights(weight)), transformed)
+    out, transformed = dev.empty((*x.shape[:2], co)), dev.empty(transformed_floats(m, ci, co, half))
+    transform_weights(dev, m, dev.upload(pack_weights(weight)), transformed, half)
     winograd_forward(dev, m, dev.upload(x), transformed, dev.upload(pack_bias(bias)), out, relu,
-                     dev.empty(scratch_floats(dev, m, ci, co)), None if x2 is None else dev.upload(x2))
+                     dev.empty(scratch_floats(dev, m, ci, co)), None if x2 is None else dev.upload(x2), half)
     return out.get()
 
 
-def run_backward_input(dev, m, x, weight, grad_out, masked, first=0):
+def run_backward_input(dev, m, x, weight, grad_out, masked, first=0, half=False):
     co, c = weight.shape[0], x.shape[2]
-    transformed = dev.empty(transformed_floats(m, c, co))
-    transform_flipped_weights(dev, m, dev.upload(pack_weights(weight)), first, c, transformed)
+    transformed = dev.empty(transformed_floats(m, c, co, half))
+    transform_flipped_weights(dev, m, dev.upload(pack_weights(weight)), first, c, transformed, half)
     grad_x = dev.empty(x.shape)
     winograd_backward_input(dev, m, dev.upload(x), transformed, dev.upload(grad_out), grad_x, masked,
-                            dev.empty(scratch_floats(dev, m, c, co)))
+                            dev.empty(scratch_floats(dev, m, c, co)), half)
     return grad_x.get()
 
 
@@ -107,6 +103,29 @@ def test_weights_over_six_decades(dev, rng, m):
     assert relative_error(run_forward(dev, m, x, by_input, np.zeros(32), False), conv(x, by_input, np.zeros(32))) < BOUNDS[m]
 
 
+@pytest.mark.parametrize("shape", SHAPES)
+def test_weights_stored_as_half_are_convolved_in_float32(dev, rng, shape):
+    """Rounded weights are other weights (test_winograd_filter.py: which); from there on nothing more is rounded."""
+    height, width, ci, co = shape
+    x = np.maximum(rng.normal(size=(height, width, ci)), 0).astype(np.float32)
+    weight, bias = layer(rng, ci, co, 3)
+    grad_out = rng.normal(size=(height, width, co)).astype(np.float32)
+    expected = np.maximum(convolve(4, x, transformed_by_device(dev, 4, True, weight)[1]) + bias, 0)
+    assert relative_error(run_forward(dev, 4, x, weight, bias, True, half=True), expected) < BOUNDS[4]
+    expected = convolve(4, grad_out, transformed_by_device(dev, 4, True, weight, True, 0, ci)[1]) * (x > 0)
+    assert relative_error(run_backward_input(dev, 4, x, weight, grad_out, True, half=True), expected) < BOUNDS[4]
+
+
+def test_half_of_two_sources(dev, rng):
+    x, x2 = (rng.normal(size=(9, 14, c)).astype(np.float32) for c in (16, 48))
+    weight, bias = layer(rng, 16 + 48, 32, 3)
+    grad_out = rng.normal(size=(9, 14, 32)).astype(np.float32)
+    expected = convolve(4, np.concatenate([x, x2], 2), transformed_by_device(dev, 4, True, weight)[1]) + bias
+    assert relative_error(run_forward(dev, 4, x, weight, bias, False, x2, half=True), expected) < BOUNDS[4]
+    expected = convolve(4, grad_out, transformed_by_device(dev, 4, True, weight, True, 16, 48)[1])
+    assert relative_error(run_backward_input(dev, 4, x2, weight, grad_out, False, 16, half=True), expected) < BOUNDS[4]
+
+
 @pytest.mark.parametrize("units", [1, 3, 100])
 def test_same_bits_for_any_number_of_compute_units(dev, rng, monkeypatch, units):
     x = rng.normal(size=(31, 50, 32)).astype(np.float32)
@@ -143,11 +162,6 @@ def test_wrong_shapes_are_refused(dev):
         winograd_backward_input(dev, 4, x, transformed, out, x, False, dev.zeros(10))
     with pytest.raises(ValueError, match="from 20 channels"):
         winograd_backward_input(dev, 4, x, transformed, dev.zeros((4, 4, 20)), x, False, scratch)
-    with pytest.raises(ValueError, match="transformed weights of 10 floats"):
-        transform_weights(dev, 4, dev.zeros((2, 3, 3, 16, 16)), dev.zeros(10))
-    for first, c in ((0, 3), (8, 16), (16, 16)):
-        with pytest.raises(ValueError, match=f"{c} channels from {first}"):
-            transform_flipped_weights(dev, 4, dev.zeros((2, 3, 3, 16, 16)), first, c, transformed)
 
 
 def test_groups_divide_rounds():

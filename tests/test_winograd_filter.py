@@ -1,0 +1,120 @@
+"""cl/winograd_filter.cl against float64: every transformed weight, the powers of two that half is scaled by."""
+
+import numpy as np
+import pytest
+from oracle_conv import conv
+from oracle_winograd import ROUNDING, SMALLEST, convolve, matrices
+from oracle_winograd import transform_weights as exact_weights
+from test_conv import layer
+
+from pp_cl.conv import pack_weights
+from pp_cl.reference import flipped
+from pp_cl.variants import VARIANTS
+from pp_cl.winograd import positions, transformed_floats
+from pp_cl.winograd_filter import transform_flipped_weights, transform_weights
+
+FORMS = [form for form in VARIANTS.values() if form[0]]
+SHAPES = [(16, 16), (48, 16), (16, 80), (64, 32), (272, 144)]  # channels in, out
+FLOAT = 2.0**-24 * 12  # float32's rounding times the operations, in a row, that make one transformed weight
+
+
+def stored_weights(array, m, ci, co, half):
+    """(units (CO,), transformed weights (S, S, CO, CI)) in float64 from what cl/winograd.h lays out."""
+    array = array.get()
+    units, weights = (array[:co], array[co:].view(np.float16)) if half else (np.ones(co), array)
+    weights = weights[:positions(m) * (ci * co + 16)].reshape(m + 2, m + 2, -1)[..., :-16]
+    weights = weights.reshape(m + 2, m + 2, co // 16, ci, 16)
+    return units.astype(np.float64), weights.swapaxes(3, 4).reshape(m + 2, m + 2, co, ci) * units.astype(np.float64)[:, None]
+
+
+def transformed_by_device(dev, m, half, weight, flip=False, first=0, c=None):
+    """stored_weights of weight (CO, CI, 3, 3); flip: for the gradient of c input channels from `first` on."""
+    co, ci = weight.shape[:2]
+    ci, co = (co, c) if flip else (ci, co)
+    transformed = dev.empty(transformed_floats(m, ci, co, half))
+    if flip:
+        transform_flipped_weights(dev, m, dev.upload(pack_weights(weight)), first, c, transformed, half)
+    else:
+        transform_weights(dev, m, dev.upload(pack_weights(weight)), transformed, half)
+    return stored_weights(transformed, m, ci, co, half)
+
+
+def check(m, half, units, actual, weight):
+    """Every transformed weight is within its own rounding of float64's; units are powers of two."""
+    assert (np.frexp(units)[0] == 0.5).all()
+    expected, terms = exact_weights(m, weight), exact_weights(m, weight, magnitude=True)
+    bound = FLOAT * terms
+    if half:
+        bound = bound * (1 + ROUNDING) + np.maximum(ROUNDING * np.abs(expected), SMALLEST / 2 * units[:, None])
+    assert (np.abs(actual - expected) <= bound).all()
+
+
+def test_the_oracle():
+    """The matrices are Winograd's, and the sums the convolution's."""
+    rng = np.random.default_rng(0)
+    x, weight = rng.normal(size=(7, 10, 3)), rng.normal(size=(4, 3, 3, 3))
+    for m in (2, 4):
+        np.testing.assert_allclose(convolve(m, x, exact_weights(m, weight)), conv(x, weight, np.zeros(4)), atol=1e-12)
+    np.testing.assert_allclose(matrices(2)[2], [[1, 0, -1, 0], [0, 1, 1, 0], [0, -1, 1, 0], [0, -1, 0, 1]], atol=1e-12)
+
+
+@pytest.mark.parametrize("m, half", FORMS)
+@pytest.mark.parametrize("ci, co", SHAPES)
+def test_weights(dev, rng, ci, co, m, half):
+    weight, _ = layer(rng, ci, co, 3)
+    check(m, half, *transformed_by_device(dev, m, half, weight), weight)
+
+
+@pytest.mark.parametrize("m, half", FORMS)
+@pytest.mark.parametrize("ci, co", SHAPES)
+def test_flipped_weights(dev, rng, ci, co, m, half):
+    weight, _ = layer(rng, ci, co, 3)
+    for first, c in {(0, ci), (ci - 16, 16), (ci // 32 * 16, ci - ci // 32 * 16)}:
+        check(m, half, *transformed_by_device(dev, m, half, weight, True, first, c), flipped(weight)[first:first + c])
+
+
+@pytest.mark.parametrize("flip", [False, True])
+@pytest.mark.parametrize("exponent", [-100, -17, 24, 120])
+def test_no_size_of_weights_changes_what_half_keeps(dev, rng, exponent, flip):
+    weight, _ = layer(rng, 32, 48, 3)
+    part = (True, 0, 32) if flip else ()
+    units, expected = transformed_by_device(dev, 4, True, weight, *part)
+    larger_units, actual = transformed_by_device(dev, 4, True, np.ldexp(weight, exponent), *part)
+    np.testing.assert_array_equal(larger_units, np.ldexp(units, exponent))
+    np.testing.assert_array_equal(actual, np.ldexp(expected, exponent))
+
+
+@pytest.mark.parametrize("flip", [False, True])
+def test_half_at_the_limits(dev, rng, flip):
+    """Beyond half's own range on both sides, up to float's; zeros; small weights beside large ones."""
+    sizes = np.array([0, 1e-45, 1e-38, 1e-7, 6e4, 65504, 65520, 1e5, 3.4e38])
+    weight = np.zeros((32, 32, 3, 3), np.float32)
+    for i, size in enumerate(sizes):
+        weight[i, i] = size * rng.choice([-1, 1], (3, 3))
+    weight[20, 20], weight[20, 21], weight[21, 20] = 6e4, 1e-7, 1e-7  # in one output and in one input channel
+    units, stored = transformed_by_device(dev, 4, True, weight, *((True, 0, 32) if flip else ()))
+    check(4, True, units, stored, flipped(weight) if flip else weight)
+    assert (stored[..., range(4, 9), range(4, 9)] != 0).any((0, 1)).all()
+    assert (stored[..., 3, 3] != 0).any() and not stored[..., 9:20, :].any()
+
+
+@pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
+@pytest.mark.parametrize("flip", [False, True])
+def test_half_hides_nothing_that_is_not_finite(dev, rng, flip, bad):
+    weight, _ = layer(rng, 32, 32, 3)
+    weight[5, 6, 1, 1] = bad
+    _, stored = transformed_by_device(dev, 4, True, weight, *((True, 0, 32) if flip else ()))
+    wrong = ~np.isfinite(stored)
+    assert wrong[1, 1].sum() == 1 and wrong[1, 1, 6 if flip else 5, 5 if flip else 6]
+    assert wrong.sum() == wrong.any((2, 3)).sum()
+
+
+def test_wrong_shapes_are_refused(dev):
+    weight, transformed = dev.zeros((2, 3, 3, 16, 16)), dev.zeros(transformed_floats(4, 16, 32))
+    with pytest.raises(ValueError, match="transformed weights of 10 floats"):
+        transform_weights(dev, 4, weight, dev.zeros(10))
+    with pytest.raises(ValueError, match="transformed weights"):
+        transform_weights(dev, 4, weight, dev.zeros(transformed_floats(4, 16, 32, True) - 1), True)
+    for first, c in ((0, 3), (8, 16), (16, 16)):
+        with pytest.raises(ValueError, match=f"{c} channels from {first}"):
+            transform_flipped_weights(dev, 4, weight, first, c, transformed)
