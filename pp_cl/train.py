@@ -115,8 +115,9 @@ class Trainer:
         points = self.model.points
         if self._smoother is None:
             self._smoother = Smoother(self.dev, self.model.grid_buffer, points["ids"])
-        for degree in SH_DEGREES:
-            self._smoother.smooth(points[f"sh{degree}"], self.config.smooth * self.config.smooth_every * rates.sh[degree])
+        for degree, rate in zip(SH_DEGREES, rates.sh, strict=True):
+            if rate > 0:
+                self._smoother.smooth(points[f"sh{degree}"], self.config.smooth * self.config.smooth_every * rate)
 
     def _prune(self, weights, least):
         """Drop the points whose weight, or opacity, is too low; moments and averages go with them."""

@@ -85,8 +85,9 @@ def forward(dev, variant, x, weight, bias, out, relu, work, x2=None, tiles=None,
         conv_forward(dev, x, weight, bias, out, relu, x2, tiles)
         return
     if laid_out is None:
-        transform_weights(dev, m, weight, work.weights, half)
-    winograd_forward(dev, m, x, work.weights if laid_out is None else laid_out, bias, out, relu, work.scratch, x2, tiles, half)
+        laid_out = work.weights
+        transform_weights(dev, m, weight, laid_out, half)
+    winograd_forward(dev, m, x, laid_out, bias, out, relu, work.scratch, x2, half, tiles)
 
 
 def backward_input(dev, variant, x, weight, first, grad_out, grad_x, masked, work, tiles=None):
@@ -100,7 +101,7 @@ def backward_input(dev, variant, x, weight, first, grad_out, grad_x, masked, wor
         conv_backward_input(dev, x, flipped, grad_out, grad_x, masked, tiles)
     else:
         transform_flipped_weights(dev, m, weight, first, c, work.weights, half)
-        winograd_backward_input(dev, m, x, work.weights, grad_out, grad_x, masked, work.scratch, tiles, half)
+        winograd_backward_input(dev, m, x, work.weights, grad_out, grad_x, masked, work.scratch, half, tiles)
 
 
 def backward_weights(dev, variant, x, grad_out, grad_weight, grad_bias, work, x2=None, tiles=None):

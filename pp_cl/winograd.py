@@ -35,7 +35,7 @@ def scratch_floats(dev, m, ci, co):
     return dev.info["compute_units"] * positions(m) * ((ci + co) * TILES + 3 * LANES)
 
 
-def winograd_forward(dev, m, x, transformed, bias, out, relu, scratch, x2=None, tiles=None, half=False):
+def winograd_forward(dev, m, x, transformed, bias, out, relu, scratch, x2=None, half=False, tiles=None):
     """out = convolution of [x, x2] + bias, then max(., 0) if relu: conv.conv_forward by winograd_filter.transform_weights.
 
     x: (H, W, C1), x2: None or (H, W, C2), bias: (CO,), out: (H, W, CO); scratch: at least scratch_floats; tiles:
@@ -55,7 +55,7 @@ def winograd_forward(dev, m, x, transformed, bias, out, relu, scratch, x2=None, 
         x2=x if x2 is None else x2, transformed=transformed, bias=bias, tile_list=tiles.list, out=out, scratch=scratch)
 
 
-def winograd_backward_input(dev, m, x, transformed, grad_out, grad_x, masked, scratch, tiles=None, half=False):
+def winograd_backward_input(dev, m, x, transformed, grad_out, grad_x, masked, scratch, half=False, tiles=None):
     """grad_x = gradient of the convolution's input: conv.conv_backward_input by winograd_filter.transform_flipped_weights.
 
     x, grad_x: (H, W, C), grad_out: (H, W, CO); scratch: at least scratch_floats. x is read only where masked. tiles:
