@@ -5,29 +5,32 @@
 #include "sh.h"
 #include "vector.h"
 
-#ifndef DEGREE
-#define DEGREE 2
+#ifndef FIRST
+#define FIRST 0                  // of the SH coefficients in one array: its index in the basis
 #endif
-#define K (2 * DEGREE + 1)       // coefficients of one degree
-#define FIRST (DEGREE * DEGREE)  // the first of them in the basis
+#ifndef K
+#define K 1                      // and their number
+#endif
 
-// New moments and the step of 16 values. The decays come as 1 - beta: 1 - 0.999f is off by 1e-5 of itself.
-inline float16 adam_step(const float16 g, float16 *m, float16 *v,
-                         const float decay1, const float decay2, const float rate, const float eps) {
-    *m += decay1 * (g - *m);
-    *v += decay2 * (g * g - *v);
-    return rate * *m / (sqrt(*v) + eps);
-}
+// 1 - beta, for 1 - 0.999f is off by 1e-5 of itself; pp_cl/adam.py knows the betas too
+#define DECAY1 0.1f
+#define DECAY2 0.001f
 
-// One work-item per 16 values: moves a parameter and its two moments one step, then clamps the parameter.
+// New moments and the step of one value, or of 16: T is float or float16.
+#define ADAM_STEP(T, name)                                                                        \
+    inline T name(const T g, T *m, T *v, const float rate, const float eps) {                     \
+        *m += DECAY1 * (g - *m);                                                                  \
+        *v += DECAY2 * (g * g - *v);                                                              \
+        return rate * *m / (sqrt(*v) + eps);                                                      \
+    }
+ADAM_STEP(float, adam_step)
+ADAM_STEP(float16, adam_step16)
+
+// One work-item per 16 values: moves a parameter and its two moments one step.
 kernel void adam_update(
     const uint n,                         // values
-    const float decay1,                   // 1 - beta1
-    const float decay2,                   // 1 - beta2
     const float rate,                     // learning rate * sqrt(1 - beta2^t) / (1 - beta1^t)
     const float eps,                      // eps * sqrt(1 - beta2^t)
-    const float low,                      // bounds of the parameter
-    const float high,
     global const float *grad,             // (...) n values, as the next three
     global float *parameter,              // (...)
     global float *m,                      // (...) first moment
@@ -38,31 +41,75 @@ kernel void adam_update(
         return;
     const int count = min(n - (uint)i, 16u);
     float16 m16 = load16(m + i, count), v16 = load16(v + i, count);
-    const float16 step = adam_step(load16(grad + i, count), &m16, &v16, decay1, decay2, rate, eps);
+    const float16 step = adam_step16(load16(grad + i, count), &m16, &v16, rate, eps);
     store16(m16, m + i, count);
     store16(v16, v + i, count);
-    store16(clamp(load16(parameter + i, count) - step, low, high), parameter + i, count);
+    store16(load16(parameter + i, count) - step, parameter + i, count);
 }
 
-// One work-item per point: moves its SH coefficients of one degree and their moments one step.
+// One work-item per listed point: reads its last step, writes the present one, and what its moments have lost in the steps
+// between, in which its gradient was 0.
+kernel void adam_decay(
+    const uint s,                         // listed points
+    const uint step,                      // from 1
+    const float log_beta1,                // log2(beta1)
+    const float log_beta2,
+    global const uint *rows,              // (S) their indices
+    global uint *last,                    // (N) step of the last update, 0: none
+    global float2 *decay)                 // (?, 2) S rows: beta1^missed, beta2^missed
+{
+    const uint g = get_global_id(0);
+    if (g >= s)
+        return;
+    const uint i = rows[g];
+    const float missed = step - last[i] - 1;
+    decay[g] = (float2)(exp2(missed * log_beta1), exp2(missed * log_beta2));
+    last[i] = step;
+}
+
+// One work-item per listed point: moves its opacity, which stays in [0, 1], and the moments.
+kernel void adam_opacity_update(
+    const uint s,                         // listed points
+    const float rate,                     // as in adam_update
+    const float eps,
+    global const uint *rows,              // (S) their indices
+    global const float2 *decay,           // (?, 2) of adam_decay
+    global const float *grad_opacity,     // (N) only the listed are read
+    global float *opacity,                // (N)
+    global float *m,                      // (N)
+    global float *v)                      // (N)
+{
+    const uint g = get_global_id(0);
+    if (g >= s)
+        return;
+    const uint i = rows[g];
+    float m1 = decay[g].x * m[i], v1 = decay[g].y * v[i];
+    const float moved = opacity[i] - adam_step(grad_opacity[i], &m1, &v1, rate, eps);
+    m[i] = m1;
+    v[i] = v1;
+    opacity[i] = moved < 0.0f ? 0.0f : moved > 1.0f ? 1.0f : moved;  // clamp() would hide a NaN
+}
+
+// One work-item per listed point: moves some of its SH coefficients and their moments one step.
 // The gradient of coefficient k is basis[k] * grad_point_features and is never stored.
 kernel void adam_sh_update(
-    const uint n,                               // points
-    const float decay1,                         // as in adam_update
-    const float decay2,
-    const float rate,
+    const uint s,                               // listed points
+    const float rate,                           // as in adam_update
     const float eps,
+    global const uint *rows,                    // (S) their indices
+    global const float2 *decay,                 // (?, 2) of adam_decay
     global const float *grid,                   // (8)
     global const float *camera,                 // (20)
     global const uint *ids,                     // (N) grid ids
-    global const float16 *grad_point_features,  // (N, 16) 0 for unseen points
+    global const float16 *grad_point_features,  // (N, 16) only the listed are read
     global float16 *sh,                         // (N, K, 16)
     global float16 *m,                          // (N, K, 16)
     global float16 *v)                          // (N, K, 16)
 {
-    const size_t i = get_global_id(0);
-    if (i >= n)
+    const size_t g = get_global_id(0);
+    if (g >= s)
         return;
+    const size_t i = rows[g];
     const Camera view = camera_load(camera);
     float basis[9];
     const float3 direction = grid_position(grid, ids[i]) - view.eye;
@@ -70,8 +117,8 @@ kernel void adam_sh_update(
     const float16 dL_df = grad_point_features[i];
     for (size_t k = 0; k < K; k++) {
         const size_t at = i * K + k;
-        float16 m16 = m[at], v16 = v[at];
-        sh[at] -= adam_step(basis[FIRST + k] * dL_df, &m16, &v16, decay1, decay2, rate, eps);
+        float16 m16 = decay[g].x * m[at], v16 = decay[g].y * v[at];
+        sh[at] -= adam_step16(basis[FIRST + k] * dL_df, &m16, &v16, rate, eps);
         m[at] = m16;
         v[at] = v16;
     }

@@ -23,7 +23,8 @@ kernel void shade_forward(
     global const float4 *point_camera,       // (N, 4) x, y, z, distance
     global const float16 *sh0,               // (N, 1, 16)
     global const float16 *sh1,               // (?, ?, 16) (N, 3, 16), not read at degree 0
-    global const float16 *sh2,               // (?, ?, 16) (N, 5, 16), not read below degree 2
+    global const float16 *sh4,               // (?, ?, 16) (N, 3, 16), not read below degree 2
+    global const float16 *sh7,               // (?, ?, 16) (N, 2, 16), not read below degree 2
     global float16 *point_features)          // (N, 16) only the seen rows are written
 {
     const uint g = get_global_id(0);
@@ -35,9 +36,12 @@ kernel void shade_forward(
     if (DEGREE >= 1)
         for (uint b = 0; b < 3; b++)
             f += basis[1 + b] * sh1[3 * i + b];
-    if (DEGREE >= 2)
-        for (uint b = 0; b < 5; b++)
-            f += basis[4 + b] * sh2[5 * i + b];
+    if (DEGREE >= 2) {
+        for (uint b = 0; b < 3; b++)
+            f += basis[4 + b] * sh4[3 * i + b];
+        for (uint b = 0; b < 2; b++)
+            f += basis[7 + b] * sh7[2 * i + b];
+    }
     point_features[i] = f;
 }
 
@@ -49,7 +53,8 @@ kernel void shade_backward(
     global const float16 *grad_point_features,   // (N, 16)
     global float16 *grad_sh0,                // (N, 1, 16)
     global float16 *grad_sh1,                // (?, ?, 16) (N, 3, 16), not written at degree 0
-    global float16 *grad_sh2)                // (?, ?, 16) (N, 5, 16), not written below degree 2
+    global float16 *grad_sh4,                // (?, ?, 16) (N, 3, 16), not written below degree 2
+    global float16 *grad_sh7)                // (?, ?, 16) (N, 2, 16), not written below degree 2
 {
     const uint i = get_global_id(0);
     if (i >= n) return;
@@ -60,7 +65,10 @@ kernel void shade_backward(
     if (DEGREE >= 1)
         for (uint b = 0; b < 3; b++)
             grad_sh1[3 * i + b] = basis[1 + b] * dL_df;
-    if (DEGREE >= 2)
-        for (uint b = 0; b < 5; b++)
-            grad_sh2[5 * i + b] = basis[4 + b] * dL_df;
+    if (DEGREE >= 2) {
+        for (uint b = 0; b < 3; b++)
+            grad_sh4[3 * i + b] = basis[4 + b] * dL_df;
+        for (uint b = 0; b < 2; b++)
+            grad_sh7[2 * i + b] = basis[7 + b] * dL_df;
+    }
 }

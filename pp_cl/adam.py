@@ -1,17 +1,19 @@
-"""Adam, dense for every parameter, and exponential averages of the weights.
+"""Adam of the network and of listed points, and exponential averages of the weights.
 
-Every row moves in every step by its momentum, seen or not: torch's semantics, which the published rates assume.
+A list of all points is dense Adam, torch's: every row moves in every step by its momentum, seen or not. A list of the
+points that a picture touches is lazy Adam: a row rests while it is not listed, and its moments have decayed when it is
+listed again. docs/maths.md states the difference.
 """
 
 import math
 
-BETA1, BETA2 = 0.9, 0.999  # Kingma & Ba 2015
+BETA1, BETA2 = 0.9, 0.999  # Kingma & Ba 2015; cl/adam.cl knows them too
 
 
-def _step_arguments(step, rate, eps, beta1, beta2):
+def _step_arguments(step, rate, eps):
     """The kernels' scalars: rate (m/c1) / (sqrt(v/c2) + eps) is (rate sqrt(c2)/c1) m / (sqrt(v) + eps sqrt(c2))."""
-    root = math.sqrt(1 - beta2**step)
-    return {"decay1": 1 - beta1, "decay2": 1 - beta2, "rate": rate * root / (1 - beta1**step), "eps": eps * root}
+    root = math.sqrt(1 - BETA2**step)
+    return {"rate": rate * root / (1 - BETA1**step), "eps": eps * root}
 
 
 def _same_shape(**arrays):
@@ -20,29 +22,52 @@ def _same_shape(**arrays):
         raise ValueError(f"arrays of one shape wanted: {shapes}")
 
 
-def adam_update(dev, parameter, grad, m, v, step, rate, eps, beta1=BETA1, beta2=BETA2, low=-math.inf, high=math.inf):
-    """One Adam step of `parameter`, in place, then a clamp to [low, high].
+def adam_update(dev, parameter, grad, m, v, step, rate, eps):
+    """One Adam step of `parameter`, in place.
 
     parameter, grad, m, v: float32 arrays of one shape, any; m and v start as zeros. step: from 1 on.
     Raises ValueError when the shapes differ.
     """
     _same_shape(parameter=parameter, grad=grad, m=m, v=v)
     dev.program("adam").launch("adam_update", -(-parameter.size // 16), n=parameter.size, grad=grad, parameter=parameter,
-                               m=m, v=v, low=low, high=high, **_step_arguments(step, rate, eps, beta1, beta2))
+                               m=m, v=v, **_step_arguments(step, rate, eps))
 
 
-def adam_sh_update(dev, grid, camera, ids, grad_point_features, sh, m, v, step, rate, eps, beta1=BETA1, beta2=BETA2):
-    """One Adam step of the SH coefficients of one degree, in place.
+class PointAdam:
+    """Adam of the rows of per-point arrays that one step lists: begin() the step, then update each array."""
 
-    grid: (8,) of Grid.packed(). camera: (20,) of the view the gradient belongs to. ids: (N,) uint32 grid ids.
-    grad_point_features: (N, 16) gradient of the points' features in that view, 0 for unseen points.
-    sh, m, v: (N, 2*degree + 1, 16) with degree 0, 1 or 2. step: from 1 on. Raises ValueError for another number.
-    """
-    if sh.shape[1] not in (1, 3, 5):
-        raise ValueError(f"coefficients of one degree wanted: {sh.shape}")
-    program = dev.program("adam", DEGREE=sh.shape[1] // 2)
-    program.launch("adam_sh_update", len(sh), n=len(sh), grid=grid, camera=camera, ids=ids, sh=sh, m=m, v=v,
-                   grad_point_features=grad_point_features, **_step_arguments(step, rate, eps, beta1, beta2))
+    def __init__(self, dev):
+        self.dev = dev
+        self.decay = dev.empty((0, 2))
+
+    def begin(self, step, rows, last):
+        """List the rows of a step, and note it as their last one.
+
+        step: from 1 on. rows: (S) uint32 point indices, each once. last: (N) uint32, each point's last step, 0 at first.
+        """
+        self.step, self.rows = step, rows
+        if len(self.decay) != len(last):
+            self.decay = self.dev.empty((len(last), 2))
+        self._launch("adam_decay", step=step, log_beta1=math.log2(BETA1), log_beta2=math.log2(BETA2), last=last)
+
+    def update_opacity(self, grad_opacity, opacity, m, v, rate, eps):
+        """Update opacities, which stay in [0, 1]. All arrays: (N); m and v start as zeros."""
+        self._launch("adam_opacity_update", grad_opacity=grad_opacity, opacity=opacity, m=m, v=v,
+                     **_step_arguments(self.step, rate, eps))
+
+    def update_sh(self, block, grid, camera, ids, grad_point_features, sh, m, v, rate, eps):
+        """Update the SH coefficients of one block.
+
+        block: points.ShBlock. grid: (8,) of Grid.packed(). camera: (20,) of the view the gradient belongs to. ids: (N,)
+        uint32 grid ids. grad_point_features: (N, 16) gradient of the points' features in that view. sh, m, v:
+        (N, block.count, 16).
+        """
+        self._launch("adam_sh_update", {"FIRST": block.first, "K": block.count}, grid=grid, camera=camera, ids=ids, sh=sh,
+                     m=m, v=v, grad_point_features=grad_point_features, **_step_arguments(self.step, rate, eps))
+
+    def _launch(self, kernel, defines=None, **arguments):
+        s = len(self.rows)
+        self.dev.program("adam", **defines or {}).launch(kernel, s, s=s, rows=self.rows, decay=self.decay, **arguments)
 
 
 def ema_update(dev, average, parameter, weight):

@@ -3,17 +3,18 @@
 import numpy as np
 
 from pp_cl.errors import UserError
-from pp_cl.points import SH_DEGREES, Grid
+from pp_cl.points import SH_BLOCKS, SH_DEGREES, Grid
 from pp_cl.unet import UNet
 
-POINT_KEYS = ("opacity", *(f"sh{d}" for d in SH_DEGREES))  # the learned arrays of a point
+POINT_KEYS = ("opacity", *(block.name for block in SH_BLOCKS))  # the learned arrays of a point
 
 
 class Model:
     """Points and network on a device.
 
     grid: Grid. depth_range: (near, far), world units, of cameras that bring none. points: {"ids" (N) uint32 ascending,
-    "opacity" (N), "sh0" (N,1,16), "sh1" (N,3,16), "sh2" (N,5,16)} device arrays; training adds rows of its own.
+    "opacity" (N), "sh0" (N,1,16), "sh1" (N,3,16), "sh4" (N,3,16), "sh7" (N,2,16)} device arrays, see points.SH_BLOCKS;
+    training adds rows of its own.
     """
 
     def __init__(self, dev, grid, depth_range, points, net):
@@ -37,8 +38,8 @@ class Model:
         """
         n = len(ids)
         points = {"ids": dev.upload(ids, np.uint32), "opacity": dev.upload(np.ones(n, np.float32))}
-        for degree in SH_DEGREES:
-            points[f"sh{degree}"] = dev.zeros((n, 2 * degree + 1, 16))
+        for block in SH_BLOCKS:
+            points[block.name] = dev.zeros((n, block.count, 16))
         return cls(dev, grid, depth_range, points, UNet(dev, widths=widths, seed=seed))
 
     def header(self):
@@ -53,8 +54,11 @@ class Model:
         }
 
     def arrays(self):
-        """{name: numpy array} of everything learned."""
-        stored = {f"points.{name}": self.points[name].get() for name in ("ids", *POINT_KEYS)}
+        """{name: numpy array} of everything learned; the SH coefficients by degree, (N,1,16), (N,3,16), (N,5,16)."""
+        stored = {f"points.{name}": self.points[name].get() for name in ("ids", "opacity")}
+        for degree in SH_DEGREES:
+            parts = [self.points[block.name].get() for block in SH_BLOCKS if block.degree == degree]
+            stored[f"points.sh{degree}"] = np.concatenate(parts, 1)
         return stored | {f"net.{name}": array.get() for name, array in self.net.parameters.items()}
 
     @classmethod
@@ -68,7 +72,11 @@ class Model:
         net = UNet(dev, widths=widths, seed=0)
         n = len(arrays.get("points.ids", ()))
         shapes = {"ids": (n,), "opacity": (n,)} | {f"sh{d}": (n, 2 * d + 1, 16) for d in SH_DEGREES}
-        points = {name: dev.upload(_fitting(arrays, f"points.{name}", shape, file)) for name, shape in shapes.items()}
+        stored = {name: _fitting(arrays, f"points.{name}", shape, file) for name, shape in shapes.items()}
+        points = {name: dev.upload(stored[name]) for name in ("ids", "opacity")}
+        for block in SH_BLOCKS:
+            start = block.first - block.degree**2  # in its degree
+            points[block.name] = dev.upload(stored[f"sh{block.degree}"][:, start : start + block.count])
         for name, parameter in net.parameters.items():
             parameter.set(_fitting(arrays, f"net.{name}", parameter.shape, file))
         return cls(dev, grid, depth_range, points, net)

@@ -5,9 +5,11 @@ The moments and averages of the points lie beside them in model.points, so that 
 
 from dataclasses import dataclass
 
-from pp_cl.adam import adam_sh_update, adam_update, ema_update
+import numpy as np
+
+from pp_cl.adam import PointAdam, adam_update, ema_update
 from pp_cl.model import POINT_KEYS
-from pp_cl.points import SH_DEGREES
+from pp_cl.points import SH_BLOCKS
 from pp_cl.schedule import learning_rate
 
 OPACITY_EPS = 1e-15  # opacity gradients span many decades; clamping bounds the step instead
@@ -34,65 +36,68 @@ class Rates:
 
 
 class Optimiser:
-    """Moments of the points and the network, and their updates."""
+    """Moments of the points and the network, and their updates.
 
-    def __init__(self, dev, model):
+    lazy: a step updates only the points of its picture; else all of them.
+    """
+
+    def __init__(self, dev, model, lazy):
         self.dev = dev
         self.model = model
+        self.lazy = lazy
         self.moments = {
             f"{kind}.{name}": dev.zeros(array.shape) for name, array in model.net.parameters.items() for kind in "mv"
         }
         for name in POINT_KEYS:
             for kind in "mv":
                 model.points[f"{kind}.{name}"] = dev.zeros(model.points[name].shape)
+        model.points["last"] = dev.zeros((model.count,), np.uint32)
+        self.point_adam = PointAdam(dev)
         self.averages = {}  # of the network; those of the points are model.points["a.*"]
+        self._all = None
 
-    def update(self, step, rates, grads, camera, feature_eps):
+    def update(self, step, rates, grads, camera, feature_eps, seen):
         """One Adam step.
 
-        step: from 1. grads: (grad_point_features (N,16), grad_opacity (N)); the network's own gradients lie in it.
-        camera: (20) device buffer of the view. feature_eps: Adam's eps of the SH coefficients.
+        step: from 1. grads: (grad_point_features (N,16), grad_opacity (N)); the network's own gradients lie in it. Lazy
+        steps read only the rows seen. camera: (20) device buffer of the view. feature_eps: Adam's eps of the SH
+        coefficients. seen: (S) uint32, the points of the picture.
         """
-        dev, model, points = self.dev, self.model, self.model.points
         grad_features, grad_opacity = grads
-        for degree, rate in zip(SH_DEGREES, rates.sh, strict=True):
-            name = f"sh{degree}"
-            adam_sh_update(
-                dev,
-                model.grid_buffer,
+        points, adam = self.model.points, self.point_adam
+        adam.begin(step, seen if self.lazy else self._all_rows(), points["last"])
+        for block in SH_BLOCKS:
+            adam.update_sh(
+                block,
+                self.model.grid_buffer,
                 camera,
                 points["ids"],
                 grad_features,
-                points[name],
-                points[f"m.{name}"],
-                points[f"v.{name}"],
-                step,
-                rate,
+                *self._with_moments(block.name),
+                rates.sh[block.degree],
                 feature_eps,
             )
-        adam_update(
-            dev,
-            points["opacity"],
-            grad_opacity,
-            points["m.opacity"],
-            points["v.opacity"],
-            step,
-            rates.opacity,
-            OPACITY_EPS,
-            low=0.0,
-            high=1.0,
-        )
-        for name, parameter in model.net.parameters.items():
+        adam.update_opacity(grad_opacity, *self._with_moments("opacity"), rates.opacity, OPACITY_EPS)
+        for name, parameter in self.model.net.parameters.items():
             adam_update(
-                dev,
+                self.dev,
                 parameter,
-                model.net.gradients[name],
+                self.model.net.gradients[name],
                 self.moments[f"m.{name}"],
                 self.moments[f"v.{name}"],
                 step,
                 rates.network,
                 NETWORK_EPS,
             )
+
+    def _with_moments(self, name):
+        return [self.model.points[key] for key in (name, f"m.{name}", f"v.{name}")]
+
+    def _all_rows(self):
+        """(N) uint32, the indices of all points."""
+        if self._all is None or len(self._all) != self.model.count:
+            self._all = self.dev.upload(np.arange(self.model.count, dtype=np.uint32))
+        return self._all
 
     def average(self, weight):
         """Move the averages towards the present values by `weight`; a weight of 1 starts them there."""

@@ -7,7 +7,7 @@ import numpy as np
 
 from pp_cl.blend import BACKGROUND, Blend
 from pp_cl.pairs import Pairs
-from pp_cl.points import SH_DEGREES
+from pp_cl.points import SH_BLOCKS
 from pp_cl.project import Footprint, Projection
 from pp_cl.shade import shade_forward
 
@@ -46,7 +46,7 @@ class Renderer:
             self.camera,
             self.projection.point_camera,
             self.pairs.seen,
-            [points[f"sh{d}"] for d in SH_DEGREES],
+            [points[block.name] for block in SH_BLOCKS],
             self.point_features,
         )
         self.blend.forward(self.pairs, self.point_features, self.features)

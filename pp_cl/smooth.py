@@ -2,9 +2,11 @@
 
 import numpy as np
 
+from pp_cl.points import SH_BLOCKS
+
 NONE = 0xFFFFFFFF
 CHUNK = 16384  # points smoothed at a time: their new values stay in a CPU's cache until they are written back
-MOST_COEFFICIENTS = 5  # of one point in one degree
+MOST_COEFFICIENTS = max(block.count for block in SH_BLOCKS)  # of one point in one array
 
 
 def neighbour_table(dev, grid, ids):
@@ -36,7 +38,7 @@ class Smoother:
         """Move every coefficient f, in place: f += amount * (mean of the existing neighbours' f - f).
 
         All reads see the old values; a point without neighbours stays as it is. amount: 0 to 1; 4 * lambda * learning rate
-        for every fourth step. sh: (N, K, 16) float32, K up to 5; ValueError beyond.
+        for every fourth step. sh: (N, K, 16) float32, K up to 3; ValueError beyond.
         """
         launch = self.dev.program("smooth").launch
         n, coefficients, _ = sh.shape

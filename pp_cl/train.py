@@ -8,7 +8,7 @@ from pp_cl.errors import UserError
 from pp_cl.loss import Loss
 from pp_cl.model import POINT_KEYS
 from pp_cl.optimiser import Optimiser, Rates
-from pp_cl.points import SH_DEGREES
+from pp_cl.points import SH_BLOCKS
 from pp_cl.prune import keep_indices, prune
 from pp_cl.render import Renderer
 from pp_cl.scene import object_box, reduced_camera
@@ -34,7 +34,7 @@ class Trainer:
         self.renderer = Renderer(dev, model, config.points)
         self.target = Target(dev, self.downscale)
         self.loss = Loss(dev, self.config.ssim_weight)
-        self.optimiser = Optimiser(dev, model)
+        self.optimiser = Optimiser(dev, model, self.config.lazy)
         self.boxes = object_box(views, self.downscale, BOX_MARGIN)
         model.points["weight"] = dev.zeros((model.count,))
         self._smoother = None
@@ -62,7 +62,8 @@ class Trainer:
         )
         grad_image = self.loss.forward_backward(image, target, *self.renderer.offset)
         grads = self.renderer.backward(grad_image)
-        self.optimiser.update(t + 1, rates, grads, self.renderer.camera, config.feature_eps / target.size)
+        seen = self.renderer.pairs.seen
+        self.optimiser.update(t + 1, rates, grads, self.renderer.camera, config.feature_eps / target.size, seen)
         self.renderer.add_point_weights(self.model.points["weight"])
 
         self.step = t + 1
@@ -115,9 +116,10 @@ class Trainer:
         points = self.model.points
         if self._smoother is None:
             self._smoother = Smoother(self.dev, self.model.grid_buffer, points["ids"])
-        for degree, rate in zip(SH_DEGREES, rates.sh, strict=True):
-            if rate > 0:
-                self._smoother.smooth(points[f"sh{degree}"], self.config.smooth * self.config.smooth_every * rate)
+        pull = self.config.smooth * self.config.smooth_every
+        for block in SH_BLOCKS:
+            if rates.sh[block.degree] > 0:
+                self._smoother.smooth(points[block.name], pull * rates.sh[block.degree])
 
     def _prune(self, weights, least):
         """Drop the points whose weight, or opacity, is too low; moments and averages go with them."""

@@ -4,21 +4,26 @@ import numpy as np
 
 
 class Adam:
-    """torch.optim.Adam without weight decay, for one array."""
+    """torch.optim.Adam without weight decay, for one array; lazy where a step lists rows."""
 
     def __init__(self, parameter, beta1=0.9, beta2=0.999):
         self.parameter = np.array(parameter, np.float64)
         self.m, self.v, self.t = np.zeros_like(self.parameter), np.zeros_like(self.parameter), 0
+        self.last = np.zeros(len(self.parameter), int)
         self.betas = beta1, beta2
 
-    def step(self, grad, rate, eps, low=-np.inf, high=np.inf):
+    def step(self, grad, rate, eps, low=-np.inf, high=np.inf, rows=slice(None)):
+        """rows: those that this step updates. Their moments decay as if the gradient had been 0 since their last step."""
         beta1, beta2 = self.betas
-        grad = np.asarray(grad, np.float64)
         self.t += 1
-        self.m = beta1 * self.m + (1 - beta1) * grad
-        self.v = beta2 * self.v + (1 - beta2) * grad * grad
-        denominator = np.sqrt(self.v) / np.sqrt(1 - beta2**self.t) + eps
-        self.parameter = np.clip(self.parameter - rate / (1 - beta1**self.t) * self.m / denominator, low, high)
+        missed = (self.t - 1 - self.last[rows]).reshape(-1, *[1] * (self.parameter.ndim - 1))
+        self.last[rows] = self.t
+        grad = np.asarray(grad, np.float64)[rows]
+        self.m[rows] = beta1 * beta1**missed * self.m[rows] + (1 - beta1) * grad
+        self.v[rows] = beta2 * beta2**missed * self.v[rows] + (1 - beta2) * grad * grad
+        denominator = np.sqrt(self.v[rows]) / np.sqrt(1 - beta2**self.t) + eps
+        moved = self.parameter[rows] - rate / (1 - beta1**self.t) * self.m[rows] / denominator
+        self.parameter[rows] = np.clip(moved, low, high)
 
 
 def sh_basis(direction):
@@ -31,10 +36,10 @@ def sh_basis(direction):
         -np.sqrt(15 / (4 * pi)) * x * z, np.sqrt(15 / (16 * pi)) * (x * x - y * y)])
 
 
-def sh_gradient(positions, eye, grad_point_features, degree):
-    """(N, 2*degree + 1, 16) gradient of the SH coefficients of one degree."""
+def sh_gradient(positions, eye, grad_point_features, block):
+    """(N, block.count, 16) gradient of the SH coefficients of one points.ShBlock."""
     towards = positions - eye
-    basis = sh_basis(towards / np.linalg.norm(towards, axis=-1, keepdims=True))[degree**2:(degree + 1) ** 2]
+    basis = sh_basis(towards / np.linalg.norm(towards, axis=-1, keepdims=True))[block.first:block.first + block.count]
     return basis.T[:, :, None] * np.asarray(grad_point_features, np.float64)[:, None, :]
 
 

@@ -5,9 +5,9 @@ import oracle_optim
 import pytest
 from helpers import AWKWARD_SIZES, relative_error
 
-from pp_cl.adam import adam_sh_update, adam_update, ema_update
+from pp_cl.adam import PointAdam, adam_update, ema_update
 from pp_cl.camera import Camera
-from pp_cl.points import Grid
+from pp_cl.points import SH_BLOCKS, Grid
 
 GRID = Grid((-0.7, -0.5, -0.6), 0.05, (23, 19, 31))
 EYE = np.array([1.5, -2.5, 1.2])
@@ -18,14 +18,14 @@ def moments(dev, parameter):
     return dev.zeros(parameter.shape), dev.zeros(parameter.shape)
 
 
-def train(dev, start, grads, rate, eps, **options):
+def train(dev, start, grads, rate, eps):
     """(parameter, m, v) after a step with each gradient, and the oracle."""
     parameter = dev.upload(start)
     m, v = moments(dev, start)
     oracle = oracle_optim.Adam(start)
     for step, grad in enumerate(grads, 1):
-        adam_update(dev, parameter, dev.upload(grad), m, v, step, rate, eps, **options)
-        oracle.step(grad, rate, eps, **options)
+        adam_update(dev, parameter, dev.upload(grad), m, v, step, rate, eps)
+        oracle.step(grad, rate, eps)
     return parameter.get(), m.get(), v.get(), oracle
 
 
@@ -85,24 +85,6 @@ def test_zero_gradient_moves_nothing_but_momentum_does(dev, rng):
     assert relative_error(parameter, oracle.parameter) < 1e-6
 
 
-def test_clamp(dev, rng):
-    start = rng.random(257).astype(np.float32)
-    grads = rng.standard_normal((30, 257)).astype(np.float32)
-    parameter, _, _, oracle = train(dev, start, grads, 0.2, 1e-15, low=0, high=1)
-    assert parameter.min() == 0
-    assert parameter.max() == 1
-    np.testing.assert_allclose(parameter, oracle.parameter, atol=2e-6)
-
-
-def test_other_betas(dev, rng):
-    start, grads = rng.standard_normal(33).astype(np.float32), rng.standard_normal((5, 33)).astype(np.float32)
-    parameter, (m, v), oracle = dev.upload(start), moments(dev, start), oracle_optim.Adam(start, 0.5, 0.9)
-    for step, grad in enumerate(grads, 1):
-        adam_update(dev, parameter, dev.upload(grad), m, v, step, 0.1, 1e-8, beta1=0.5, beta2=0.9)
-        oracle.step(grad, 0.1, 1e-8)
-    assert relative_error(parameter.get(), oracle.parameter) < 3e-7
-
-
 def test_refuses_different_shapes(dev):
     a, b = dev.zeros((4, 3)), dev.zeros((3, 4))
     with pytest.raises(ValueError, match="one shape"):
@@ -111,45 +93,133 @@ def test_refuses_different_shapes(dev):
         ema_update(dev, a, b, 0.5)
 
 
-def cloud(rng, n, degree):
-    """ids, a gradient a step (every third point unseen), start coefficients."""
-    ids = np.sort(rng.choice(np.prod(GRID.dims), n, replace=False)).astype(np.uint32)
-    grads = 1e-4 * rng.standard_normal((4, n, 16)).astype(np.float32)
-    grads[:, ::3] = 0
-    return ids, grads, rng.standard_normal((n, 2 * degree + 1, 16)).astype(np.float32)
+class Cloud:
+    """Points whose opacities and SH coefficients of one block are trained, and their oracles."""
+
+    def __init__(self, dev, rng, n, block=SH_BLOCKS[0]):
+        self.dev, self.n, self.block = dev, n, block
+        self.ids = np.sort(rng.choice(np.prod(GRID.dims), n, replace=False)).astype(np.uint32)
+        self.start = {"opacity": rng.random(n).astype(np.float32),
+                      "sh": rng.standard_normal((n, block.count, 16)).astype(np.float32)}
+        self.arrays = {name: [dev.upload(start), *moments(dev, start)] for name, start in self.start.items()}
+        self.oracles = {name: oracle_optim.Adam(start) for name, start in self.start.items()}
+        self.adam, self.last, self.steps = PointAdam(dev), dev.zeros((n,), np.uint32), 0
+        self.scene = [dev.upload(GRID.packed()), dev.upload(CAMERA.packed()), dev.upload(self.ids)]
+
+    def step(self, grad_features, grad_opacity, rows, step=None):
+        """Update the rows; the kernels must not read the gradients of the others, which are NaN."""
+        self.steps = step or self.steps + 1
+        for oracle in self.oracles.values():
+            oracle.t = self.steps - 1
+        listed = np.isin(np.arange(self.n), rows)
+        features, opacities = (self.dev.upload(np.where(listed.reshape(-1, *[1] * (g.ndim - 1)), g, np.nan), np.float32)
+                               for g in (grad_features, grad_opacity))
+        self.adam.begin(self.steps, self.dev.upload(rows, np.uint32), self.last)
+        self.adam.update_sh(self.block, *self.scene, features, *self.arrays["sh"], 0.1, 4e-7)
+        self.adam.update_opacity(opacities, *self.arrays["opacity"], 0.03, 1e-15)
+        gradient = oracle_optim.sh_gradient(GRID.positions(self.ids), EYE, grad_features, self.block)
+        self.oracles["sh"].step(gradient, 0.1, 4e-7, rows=rows)
+        self.oracles["opacity"].step(grad_opacity, 0.03, 1e-15, low=0, high=1, rows=rows)
+
+    def check(self):
+        """Compare parameters and moments with the oracle's."""
+        for name, (parameter, m, v) in self.arrays.items():
+            oracle = self.oracles[name]
+            assert relative_error(parameter.get(), oracle.parameter) < 1e-6
+            assert relative_error(m.get(), oracle.m) < 1e-6
+            assert relative_error(v.get(), oracle.v) < 3e-6
+
+
+def gradients(rng, n):
+    """(of the features, of the opacity); every third point's are 0."""
+    features, opacity = 1e-4 * rng.standard_normal((n, 16)), 1e-5 * rng.standard_normal(n)
+    features[::3], opacity[::3] = 0, 0
+    return features.astype(np.float32), opacity.astype(np.float32)
 
 
 @pytest.mark.parametrize("n", AWKWARD_SIZES)
-@pytest.mark.parametrize("degree", [0, 1, 2])
-def test_sh_is_dense_adam(dev, rng, n, degree):
-    ids, grads, start = cloud(rng, n, degree)
-    sh, (m, v), oracle = dev.upload(start), moments(dev, start), oracle_optim.Adam(start)
-    device_ids, grid, camera = dev.upload(ids), dev.upload(GRID.packed()), dev.upload(CAMERA.packed())
-    for step, grad in enumerate(grads, 1):
-        adam_sh_update(dev, grid, camera, device_ids, dev.upload(grad), sh, m, v, step, 0.1, 4e-7)
-        oracle.step(oracle_optim.sh_gradient(GRID.positions(ids), EYE, grad, degree), 0.1, 4e-7)
-    assert relative_error(sh.get(), oracle.parameter) < 1e-6
-    np.testing.assert_array_equal(sh.get()[::3], start[::3])
-    if n > 1:
-        assert relative_error(m.get(), oracle.m) < 1e-6
-        assert relative_error(v.get(), oracle.v) < 2e-6
+@pytest.mark.parametrize("block", SH_BLOCKS, ids=lambda b: b.name)
+def test_all_points_listed_is_dense_adam(dev, rng, n, block):
+    cloud = Cloud(dev, rng, n, block)
+    for _ in range(5):
+        cloud.step(*gradients(rng, n), np.arange(n))
+    cloud.check()
+    np.testing.assert_array_equal(cloud.arrays["sh"][0].get()[::3], cloud.start["sh"][::3])
+    assert (cloud.last.get() == 5).all()
 
 
-def test_sh_refuses_a_mix_of_degrees(dev):
-    arrays = [dev.zeros((2, 4, 16)) for _ in range(3)]
-    with pytest.raises(ValueError, match="one degree"):
-        adam_sh_update(dev, dev.zeros((8,)), dev.zeros((20,)), dev.zeros((2,), np.uint32), dev.zeros((2, 16)), *arrays,
-                       step=1, rate=0.1, eps=0)
+@pytest.mark.parametrize("n", AWKWARD_SIZES)
+@pytest.mark.parametrize("block", SH_BLOCKS, ids=lambda b: b.name)
+def test_lazy_matches_oracle(dev, rng, n, block):
+    cloud = Cloud(dev, rng, n, block)
+    for _ in range(12):
+        cloud.step(*gradients(rng, n), np.flatnonzero(rng.random(n) < 0.4))
+    cloud.check()
+    np.testing.assert_array_equal(cloud.last.get(), cloud.oracles["sh"].last)
+
+
+def test_rows_that_are_not_listed_rest(dev, rng):
+    cloud = Cloud(dev, rng, 257)
+    cloud.step(*gradients(rng, 257), np.arange(257))
+    before = [[array.get() for array in arrays] for arrays in cloud.arrays.values()]
+    rows = np.arange(0, 257, 2)
+    cloud.step(*gradients(rng, 257), rows)
+    for arrays, olds in zip(cloud.arrays.values(), before, strict=True):
+        for array, old in zip(arrays, olds, strict=True):
+            np.testing.assert_array_equal(array.get()[1::2], old[1::2])
+            assert (array.get()[rows] != old[rows]).any()
+    cloud.step(*gradients(rng, 257), [])
+    assert (cloud.last.get()[1::2] == 1).all() and (cloud.last.get()[::2] == 2).all()
+
+
+def test_lazy_moments_are_dense_ones(dev, rng):
+    """At every step that lists a row, its moments are those of dense Adam with gradients of 0 in between."""
+    cloud, dense = Cloud(dev, rng, 33), oracle_optim.Adam(np.zeros(33))
+    for _ in range(40):
+        grad = gradients(rng, 33)[1]
+        rows = np.flatnonzero(rng.random(33) < 0.2)
+        cloud.step(np.zeros((33, 16)), grad, rows)
+        dense.step(np.where(np.isin(np.arange(33), rows), grad, 0), 0.03, 1e-15)
+        _, m, v = (array.get()[rows] for array in cloud.arrays["opacity"])
+        np.testing.assert_allclose(m, dense.m[rows], rtol=3e-6, atol=1e-10)
+        np.testing.assert_allclose(v, dense.v[rows], rtol=3e-6)
+
+
+@pytest.mark.parametrize("step", [100, 3000, 50_000, 10**8])
+def test_long_rests(dev, rng, step):
+    cloud = Cloud(dev, rng, 33)
+    for at in (1, step, step + 1):
+        cloud.step(*gradients(rng, 33), np.arange(33), at)
+    cloud.check()
+
+
+def test_opacity_stays_in_its_bounds(dev, rng):
+    cloud = Cloud(dev, rng, 257)
+    for step in range(40):
+        cloud.step(np.zeros((257, 16)), rng.standard_normal(257) + np.linspace(-2, 2, 257), np.arange(step % 2, 257, 2))
+    opacity = cloud.arrays["opacity"][0].get()
+    assert opacity.min() == 0
+    assert opacity.max() == 1
+    np.testing.assert_allclose(opacity, cloud.oracles["opacity"].parameter, atol=2e-6)
+
+
+def test_a_nan_is_not_hidden(dev, rng):
+    cloud = Cloud(dev, rng, 31)
+    cloud.adam.begin(1, dev.upload(np.arange(31), np.uint32), cloud.last)
+    cloud.adam.update_opacity(dev.upload(np.full(31, np.nan), np.float32), *cloud.arrays["opacity"], 0.1, 1e-15)
+    assert np.isnan(cloud.arrays["opacity"][0].get()).all()
 
 
 def test_sh_of_a_point_in_the_eye_stays_finite(dev):
     """No pixel sees it, so its gradient is 0; its direction is undefined."""
     grid, camera = Grid((0, 0, 0), 0.5, (5, 5, 5)), Camera(np.column_stack([np.eye(3), [1.0, 0.5, 0]]), 9, 9, 4, 4, 8, 8)
     ids = np.array([2 + 5, 3], np.uint32)
-    start = np.ones((2, 5, 16), np.float32)
+    start = np.ones((2, 3, 16), np.float32)
     sh, (m, v) = dev.upload(start), moments(dev, start)
-    adam_sh_update(dev, dev.upload(grid.packed()), dev.upload(camera.packed()), dev.upload(ids), dev.zeros((2, 16)),
-                   sh, m, v, 1, 0.5, 1e-15)
+    adam = PointAdam(dev)
+    adam.begin(1, dev.upload(np.arange(2), np.uint32), dev.zeros((2,), np.uint32))
+    adam.update_sh(SH_BLOCKS[2], dev.upload(grid.packed()), dev.upload(camera.packed()), dev.upload(ids), dev.zeros((2, 16)),
+                   sh, m, v, 0.5, 1e-15)
     np.testing.assert_array_equal(sh.get(), start)
     assert not m.get().any()
 

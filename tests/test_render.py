@@ -12,7 +12,7 @@ from test_unet import plain_parameters
 
 from pp_cl.config import PointsConfig
 from pp_cl.model import Model
-from pp_cl.points import SH_DEGREES, Grid
+from pp_cl.points import SH_BLOCKS, Grid
 from pp_cl.render import PAPER_DEPTH_RANGE, Renderer
 
 GRID = Grid((-0.5, -0.45, -0.4), 0.13, (8, 7, 6))
@@ -27,8 +27,8 @@ def make_model(dev, rng, n=90):
     opacity = rng.uniform(0.2, 1, n).astype(np.float32)
     opacity[::9], opacity[4::9] = 0, 1
     model.points["opacity"].set(opacity)
-    for degree in SH_DEGREES:
-        model.points[f"sh{degree}"].set(rng.normal(size=(n, 2 * degree + 1, 16)).astype(np.float32))
+    for block in SH_BLOCKS:
+        model.points[block.name].set(rng.normal(size=(n, block.count, 16)).astype(np.float32))
     return model
 
 
@@ -37,7 +37,7 @@ def chained(model, settings, camera, opacity=None, sh=None, tracked=0):
     padded, _, _ = camera.padded(4)
     positions = GRID.positions(model.points["ids"].get())
     opacity = model.points["opacity"].get().astype(np.float64) if opacity is None else opacity
-    sh = np.concatenate([model.points[f"sh{d}"].get() for d in SH_DEGREES], 1).astype(np.float64) if sh is None else sh
+    sh = np.concatenate([model.points[block.name].get() for block in SH_BLOCKS], 1).astype(np.float64) if sh is None else sh
     spacing_or_world = GRID.edge if settings.footprint == "soft" else (camera.far - camera.near) / PAPER_DEPTH_RANGE
     geometry = oracle_raster.geometry(padded, positions, settings.radius * spacing_or_world, settings.footprint)
     blend = oracle_raster.blend(padded, geometry, opacity, GAMMA, settings.stop)
@@ -95,7 +95,7 @@ def test_the_chain_is_the_derivative(dev, rng):
     _, backward = chained(model, settings, camera)
     _, grad_opacity, grad_sh, _ = backward(grad)
     opacity = model.points["opacity"].get().astype(np.float64)
-    sh = np.concatenate([model.points[f"sh{d}"].get() for d in SH_DEGREES], 1).astype(np.float64)
+    sh = np.concatenate([model.points[block.name].get() for block in SH_BLOCKS], 1).astype(np.float64)
 
     def loss(o, s):
         return (chained(model, settings, camera, o, s)[0] * grad).sum()

@@ -6,6 +6,7 @@ import pytest
 from helpers import AWKWARD_SIZES, relative_error
 from raster_scene import Scene, make_camera, make_points
 
+from pp_cl.points import SH_BLOCKS
 from pp_cl.shade import shade_backward, shade_forward
 
 
@@ -15,7 +16,7 @@ class Shaded:
     def __init__(self, dev, rng, n, degree):
         self.camera, self.positions = make_camera(), make_points(rng, n)
         self.scene = Scene(dev, self.camera, self.positions, 0.1)
-        self.sh = [np.float32(rng.normal(size=(n, 2 * d + 1, 16))) for d in range(degree + 1)]
+        self.sh = [np.float32(rng.normal(size=(n, b.count, 16))) for b in SH_BLOCKS if b.degree <= degree]
 
     def features(self):
         """(N, 16) by the oracle."""
@@ -62,3 +63,10 @@ def test_wrong_shapes_are_refused(dev, rng):
     with pytest.raises(ValueError, match="sh1 has shape"):
         shade_forward(dev, shaded.scene.view, shaded.scene.projection.point_camera, shaded.scene.pairs.seen,
                       [dev.upload(shaded.sh[0]), dev.empty((31, 5, 16))], dev.empty((31, 16)))
+
+
+def test_half_a_degree_is_refused(dev, rng):
+    shaded = Shaded(dev, rng, 31, 2)
+    with pytest.raises(ValueError, match="3 arrays of coefficients end within degree 2"):
+        shade_forward(dev, shaded.scene.view, shaded.scene.projection.point_camera, shaded.scene.pairs.seen,
+                      [dev.upload(c) for c in shaded.sh[:3]], dev.empty((31, 16)))

@@ -54,7 +54,7 @@ def smoothed(dev, values, ids, dims, amount):
 
 
 @pytest.mark.parametrize("n", AWKWARD_SIZES)
-@pytest.mark.parametrize("coefficients", [1, 3, 5])
+@pytest.mark.parametrize("coefficients", [1, 2, 3])
 def test_smooth_matches_oracle(dev, rng, n, coefficients):
     dims = (7, 8, 9)
     ids = some_ids(rng, n, dims)
@@ -70,7 +70,7 @@ def test_chunks_read_old_values_only(dev, rng, monkeypatch, dims):
     n = np.prod(dims) * 9 // 10
     ids = some_ids(rng, n, dims)
     assert Smoother(*cloud(dev, ids, dims)).chunk < n / 10
-    values = rng.standard_normal((n, 5, 16)).astype(np.float32)
+    values = rng.standard_normal((n, 3, 16)).astype(np.float32)
     expected = oracle_optim.smoothed(values, ids, dims, 1.0)
     assert relative_error(smoothed(dev, values, ids, dims, 1.0), expected) < 5e-7
 
@@ -83,7 +83,7 @@ def test_lonely_points_stay(dev, rng):
 
 
 def test_refuses_what_its_scratch_cannot_hold(dev):
-    with pytest.raises(ValueError, match="at most 5"):
+    with pytest.raises(ValueError, match="at most 3"):
         Smoother(*cloud(dev, [0, 1], (2, 1, 1))).smooth(dev.zeros((2, 9, 16)), 0.1)
 
 

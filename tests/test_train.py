@@ -53,7 +53,7 @@ def finished(scene, tmp_path_factory):
     return out
 
 
-def train_and_interrupt(scene, out, steps, monkeypatch):
+def train_and_interrupt(scene, out, steps, monkeypatch, **changes):
     """A small training that ends with Ctrl-C after `steps` steps."""
     train_step, done = Trainer.train_step, []
 
@@ -65,7 +65,7 @@ def train_and_interrupt(scene, out, steps, monkeypatch):
 
     with monkeypatch.context() as patch:
         patch.setattr(Trainer, "train_step", stopping)
-        assert main(arguments(scene, out)) == 130
+        assert main(arguments(scene, out, **changes)) == 130
 
 
 def rows(out):
@@ -99,6 +99,17 @@ def test_stopped_at_any_step_it_resumes_to_the_same_bytes(scene, finished, tmp_p
     assert (tmp_path / "run" / "checkpoint.npz").read_bytes() == (finished / "checkpoint.npz").read_bytes()
     strip = [{k: v for k, v in r.items() if k != "seconds"} for r in rows(tmp_path / "run")]
     assert strip == [{k: v for k, v in r.items() if k != "seconds"} for r in rows(finished)]
+
+
+def test_lazy_adam_learns_another_way_and_resumes_to_the_same_bytes(scene, finished, tmp_path, monkeypatch):
+    assert main(arguments(scene, tmp_path / "whole", train__lazy="true")) == 0
+    losses = [r["loss"] for r in rows(tmp_path / "whole")[:-1]]
+    assert np.mean(losses[-3:]) < 0.6 * losses[0]
+    train_and_interrupt(scene, tmp_path / "run", 47, monkeypatch, train__lazy="true")
+    assert main(arguments(scene, tmp_path / "run", train__lazy="true")) == 0
+    whole = (tmp_path / "whole" / "checkpoint.npz").read_bytes()
+    assert (tmp_path / "run" / "checkpoint.npz").read_bytes() == whole
+    assert (finished / "checkpoint.npz").read_bytes() != whole
 
 
 def test_killed_again_and_again_it_ends_with_the_same_bytes(scene, finished, tmp_path):
@@ -147,7 +158,7 @@ def test_a_checkpoint_of_another_scene_is_refused(scene, tmp_path, capsys):
     assert (out / "checkpoint.npz").read_bytes() == before
 
 
-@pytest.mark.parametrize("lost", ["moment.m.enc0.a.weight", "state.v.sh1", "state.weight"])
+@pytest.mark.parametrize("lost", ["moment.m.enc0.a.weight", "state.v.sh1", "state.last", "state.weight"])
 def test_a_checkpoint_without_its_training_state_is_refused(scene, tmp_path, capsys, monkeypatch, lost):
     train_and_interrupt(scene, tmp_path / "run", 15, monkeypatch)
     header, arrays = load_checkpoint(tmp_path / "run" / "checkpoint.npz")
