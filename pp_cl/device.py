@@ -83,7 +83,7 @@ def describe(device):
     return {
         "name": device.name.strip(), "platform": device.platform.name.strip(), "version": device.version.strip(),
         "type": _type_name(device), "compute_units": device.max_compute_units,
-        "memory_bytes": _memory_bytes(device), "max_allocation_bytes": device.max_mem_alloc_size,
+        "memory_bytes": _memory_bytes(device), "max_allocation_bytes": _max_allocation_bytes(device),
     }
 
 
@@ -101,6 +101,18 @@ def _memory_bytes(device):
             text = Path(limit).read_text().strip()
             sizes += [int(text)] if text.isdigit() else []  # "max": no limit
     return min(sizes)
+
+
+def _max_allocation_bytes(device):
+    """What the device allocates at once, or PP_MAX_ALLOCATION (MiB) if that is less."""
+    text = os.environ.get("PP_MAX_ALLOCATION") or "inf"
+    try:
+        mebibytes = float(text)
+    except ValueError:
+        mebibytes = 0.0
+    if not mebibytes > 0:
+        raise UserError(f"PP_MAX_ALLOCATION={text}: must be a number of MiB above 0")
+    return int(min(device.max_mem_alloc_size, mebibytes * 2**20))
 
 
 def open_device(choice=None):
@@ -207,10 +219,24 @@ class Device:
 
     def copy(self, target, source):
         """Copy one array of this device into another of the same size."""
-        if target.nbytes != source.nbytes or target.dtype != source.dtype:
+        if target.nbytes != source.nbytes:
             raise ValueError(f"copy: {source.shape} {source.dtype} into {target.shape} {target.dtype}")
-        if source.nbytes:
-            self.attempt("copy a buffer", cl.enqueue_copy, self.queue, target.data, source.data, byte_count=source.nbytes)
+        self.copy_rows(target, 0, source, len(source))
+
+    def copy_rows(self, target, start, source, count):
+        """Copy the first `count` rows of one array of this device over those of another from row `start` on."""
+        row_bytes = source[:1].nbytes
+        if target[:1].nbytes != row_bytes or target.dtype != source.dtype:
+            raise ValueError(f"copy: {source.shape} {source.dtype} into {target.shape} {target.dtype}")
+        if count:
+            self.attempt("copy a buffer", cl.enqueue_copy, self.queue, target.data, source.data,
+                         byte_count=count * row_bytes, dst_offset=start * row_bytes)
+
+    def front(self, array, count):
+        """The first `count` rows of an array of this device. Its buffer stays as large as it was, and is counted so."""
+        rows = array[:count]
+        rows.whole = getattr(array, "whole", array)  # alive as long as this part of it
+        return rows
 
     def finish(self):
         """Wait until everything enqueued is done."""

@@ -2,6 +2,8 @@
 
 import numpy as np
 
+SCRATCH_BYTES = 2**27  # what pruning takes at most beside the arrays: 1.4 % of a training with 4 million points
+
 
 def keep_indices(dev, weights, least_weight, opacities, least_opacity):
     """(M,) uint32, ascending: the points with weight >= least_weight and opacity >= least_opacity.
@@ -16,25 +18,34 @@ def keep_indices(dev, weights, least_weight, opacities, least_opacity):
     return dev.upload(keep, np.uint32)
 
 
-def gather_rows(dev, source, indices):
-    """The rows `indices` of `source` as a new array.
+def compact_rows(dev, array, indices, scratch_bytes):
+    """The rows `indices` of `array`, which is used up, without a second array of its size.
 
-    source: (N, ...) of a 4-byte dtype. indices: (M,) uint32, each below N. Result: (M, ...) of the same dtype.
+    Rows that fit the scratch become an array of their own. Others move to the front of the same buffer, piece by piece:
+    ascending indices never lie before their new place, so a piece overwrites nothing that a later one reads.
+    array: (N, ...), rows of whole 4-byte words. indices: (M,) uint32, ascending.
     """
-    m = len(indices)
-    target = dev.empty((m, *source.shape[1:]), source.dtype)
-    words = int(np.prod(source.shape[1:], dtype=np.int64))
-    dev.program("prune").launch("gather_rows", m, m=m, r=words, indices=indices,
-                                source=source.view(np.uint32).reshape(len(source), words),
-                                target=target.view(np.uint32).reshape(m, words))
-    return target
+    m, row_bytes = len(indices), array.nbytes // len(array)
+    piece = min(m, max(1, scratch_bytes // row_bytes))
+    scratch = dev.empty((piece, *array.shape[1:]), array.dtype)
+    for start in range(0, m, piece):
+        count = min(piece, m - start)
+        dev.program("prune").launch("gather_rows", count, first=start, m=count, r=row_bytes // 4, indices=indices,
+                                    source=_words(array), target=_words(scratch))
+        if piece < m:
+            dev.copy_rows(array, start, scratch, count)
+    return scratch if piece == m else dev.front(array, m)
+
+
+def _words(array):
+    """The same memory as (rows, words) uint32."""
+    return array.reshape(len(array), -1).view(np.uint32)
 
 
 def prune(dev, arrays, indices):
-    """Replace every array of the dict `arrays` by its rows `indices`, in place.
+    """Replace every array of the dict `arrays` by its rows `indices`, in place and one after the other.
 
-    One after the other, so that an old array nobody else holds is released before the next is copied.
-    arrays: {name: (N, ...)} of 4-byte dtypes. indices: (M,) uint32.
+    arrays: {name: (N, ...)}, rows of whole 4-byte words. indices: (M,) uint32, ascending.
     """
     for name in arrays:
-        arrays[name] = gather_rows(dev, arrays[name], indices)
+        arrays[name] = compact_rows(dev, arrays[name], indices, SCRATCH_BYTES)

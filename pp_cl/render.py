@@ -97,6 +97,7 @@ class Renderer:
         n = self.model.count
         if n != self._count:
             self._count = n
+            self.point_features = self.grad_point_features = self.grad_opacity = None  # released first
             self.point_features = self.dev.empty((n, 16))
             self.grad_point_features, self.grad_opacity = self.dev.empty((n, 16)), self.dev.empty((n,))
         if (height, width) != self._size:

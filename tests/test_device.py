@@ -210,6 +210,21 @@ def test_a_buffer_over_the_largest_allocation_is_refused(plain):
         plain.upload(np.zeros(251, np.float32))
 
 
+def test_a_smaller_largest_allocation_can_be_asked_for(monkeypatch):
+    largest = open_device().info["max_allocation_bytes"]
+    monkeypatch.setenv("PP_MAX_ALLOCATION", "0.5")
+    assert open_device().info["max_allocation_bytes"] == 2**19
+    monkeypatch.setenv("PP_MAX_ALLOCATION", "1e9")
+    assert open_device().info["max_allocation_bytes"] == largest
+
+
+@pytest.mark.parametrize("text", ["0", "-1", "nan", "much"])
+def test_a_bad_largest_allocation_is_one_line(monkeypatch, text):
+    monkeypatch.setenv("PP_MAX_ALLOCATION", text)
+    with pytest.raises(UserError, match=f"PP_MAX_ALLOCATION={text}: must be a number of MiB"):
+        open_device()
+
+
 def test_all_buffers_together_are_held_to_the_memory(plain):
     plain.info["memory_bytes"] = 1000
     kept = plain.empty((200,))

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from helpers import AWKWARD_SIZES
 
-from pp_cl.prune import gather_rows, keep_indices, prune
+from pp_cl.prune import compact_rows, keep_indices, prune
 
 
 def kept(dev, weights, least_weight, opacities, least_opacity):
@@ -26,34 +26,50 @@ def test_one_point_always_survives(dev, weights, survivor):
 
 
 @pytest.mark.parametrize("n", AWKWARD_SIZES)
-@pytest.mark.parametrize("shape", [(), (1,), (16,), (3, 16), (5, 16), (7,)])
-def test_gather(dev, rng, n, shape):
+@pytest.mark.parametrize("shape", [(), (1,), (16,), (3, 16), (2, 16), (7,)])
+@pytest.mark.parametrize("pieces", [1, 3, 1000])
+def test_compact(dev, rng, n, shape, pieces):
+    """As a new array, in place by a few pieces, and in place row by row."""
     source = rng.standard_normal((n, *shape)).astype(np.float32)
     indices = np.flatnonzero(rng.random(n) < 0.6).astype(np.uint32)
     if not indices.size:
         indices = np.zeros(1, np.uint32)
-    rows = gather_rows(dev, dev.upload(source), dev.upload(indices))
+    scratch_bytes = 4 * int(np.prod(shape)) * -(-len(indices) // pieces)
+    before, array = dev.bytes, dev.upload(source)
+    rows = compact_rows(dev, array, dev.upload(indices), scratch_bytes)
     assert rows.dtype == np.float32
     np.testing.assert_array_equal(rows.get(), source[indices])
+    in_place = pieces > 1 and len(indices) > 1
+    assert (rows.base_data is array.base_data) == in_place
+    del array
+    assert dev.bytes == before + (source.nbytes if in_place else rows.nbytes)
+    again = compact_rows(dev, rows, dev.upload(np.zeros(1, np.uint32)), scratch_bytes)
+    del rows
+    np.testing.assert_array_equal(again.get(), source[indices[:1]])
+    assert dev.bytes == before + again.nbytes
 
 
-def test_gather_keeps_every_bit(dev):
-    source = np.array([0, 0x7FC00001, 0xFFFFFFFF, 1, 0x80000000], np.uint32)
-    indices = dev.upload(np.array([4, 1, 2, 3], np.uint32))
-    np.testing.assert_array_equal(gather_rows(dev, dev.upload(source), indices).get(), source[[4, 1, 2, 3]])
-    bits = gather_rows(dev, dev.upload(source.view(np.float32)), indices).get().view(np.uint32)
-    np.testing.assert_array_equal(bits, source[[4, 1, 2, 3]])
+@pytest.mark.parametrize("dtype", [np.uint32, np.float32, np.float16])
+@pytest.mark.parametrize("scratch_bytes", [1, 2**20])
+def test_compact_keeps_every_bit(dev, dtype, scratch_bytes):
+    bits = np.array([0, 0x7FC00001, 0xFFFFFFFF, 1, 0x80000000, 0x7FF87C01], np.uint32)[:, None]
+    indices = dev.upload(np.array([1, 2, 4, 5], np.uint32))
+    rows = compact_rows(dev, dev.upload(bits.view(dtype)), indices, scratch_bytes)
+    np.testing.assert_array_equal(rows.get().view(np.uint32), bits[[1, 2, 4, 5]])
 
 
-def test_prune_replaces_everything_and_releases(dev, rng):
+@pytest.mark.parametrize("share", [2, 10])
+def test_prune_never_takes_more_than_its_scratch(dev, rng, monkeypatch, share):
+    scratch = 40_000
+    monkeypatch.setattr("pp_cl.prune.SCRATCH_BYTES", scratch)
     host = {"ids": np.arange(1000, dtype=np.uint32), "opacity": rng.random(1000).astype(np.float32),
-            "sh2": rng.random((1000, 5, 16)).astype(np.float32), "m_sh2": rng.random((1000, 5, 16)).astype(np.float32)}
+            "sh1": rng.random((1000, 3, 16)).astype(np.float32), "m.sh1": rng.random((1000, 3, 16)).astype(np.float32)}
     arrays = {name: dev.upload(values) for name, values in host.items()}
+    keep = np.arange(0, 1000, share, dtype=np.uint32)
+    indices = dev.upload(keep)
     before, dev.peak_bytes = dev.bytes, dev.bytes
-    keep = np.arange(0, 1000, 4, dtype=np.uint32)
-    prune(dev, arrays, dev.upload(keep))
+    prune(dev, arrays, indices)
     for name, values in host.items():
         np.testing.assert_array_equal(arrays[name].get(), values[keep])
-    held = sum(values.nbytes for values in host.values())
-    assert dev.bytes <= before - held + held // 4 + 16
-    assert dev.peak_bytes <= before + keep.nbytes + host["sh2"].nbytes // 4
+    assert dev.peak_bytes <= before + scratch
+    assert before - dev.bytes == sum(v.nbytes - v[keep].nbytes for v in host.values() if v[keep].nbytes <= scratch)

@@ -112,6 +112,21 @@ def test_lazy_adam_learns_another_way_and_resumes_to_the_same_bytes(scene, finis
     assert (finished / "checkpoint.npz").read_bytes() != whole
 
 
+def test_bounded_memory_gives_the_same_bytes(scene, tmp_path, capsys, monkeypatch):
+    """No buffer larger than 200 bytes a point, and pruning in place by many pieces."""
+    changes = {"points__count": 50_000, "train__iterations": 24, "train__prune_every": 8}
+    assert main(arguments(scene, tmp_path / "free", **changes)) == 0
+    points = load_checkpoint(tmp_path / "free" / "checkpoint.npz")[0]["initial_points"]
+    monkeypatch.setattr("pp_cl.prune.SCRATCH_BYTES", 100_000)
+    monkeypatch.setenv("PP_MAX_ALLOCATION", str(200 * points / 2**20))
+    assert main(arguments(scene, tmp_path / "bounded", **changes)) == 0
+    assert (tmp_path / "bounded" / "checkpoint.npz").read_bytes() == (tmp_path / "free" / "checkpoint.npz").read_bytes()
+    monkeypatch.setenv("PP_MAX_ALLOCATION", str(150 * points / 2**20))
+    assert main(arguments(scene, tmp_path / "smaller", **changes)) == 2
+    assert "lower --points" in capsys.readouterr().err
+    assert not (tmp_path / "smaller").exists()
+
+
 def test_killed_again_and_again_it_ends_with_the_same_bytes(scene, finished, tmp_path):
     out = tmp_path / "killed"
     command = [sys.executable, "-m", "pp_cl", *arguments(scene, out)]
