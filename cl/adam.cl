@@ -47,6 +47,21 @@ kernel void adam_update(
     store16(load16(parameter + i, count) - step, parameter + i, count);
 }
 
+// One work-item per seen point: writes whether it received a gradient; a NaN is one.
+kernel void adam_touched(
+    const uint s,                               // seen points
+    global const uint *seen,                    // (S) their indices
+    global const float16 *grad_point_features,  // (N, 16) only the seen are read
+    global const float *grad_opacity,           // (N)
+    global uint *touched)                       // (N) only the seen are written
+{
+    const uint g = get_global_id(0);
+    if (g >= s)
+        return;
+    const uint i = seen[g];
+    touched[i] = any(grad_point_features[i] != 0.0f) || grad_opacity[i] != 0.0f;
+}
+
 // One work-item per listed point: reads its last step, writes the present one, and what its moments have lost in the steps
 // between, in which its gradient was 0.
 kernel void adam_decay(

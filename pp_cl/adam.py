@@ -1,11 +1,15 @@
 """Adam of the network and of listed points, and exponential averages of the weights.
 
-A list of all points is dense Adam, torch's: every row moves in every step by its momentum, seen or not. A list of the
-points that a picture touches is lazy Adam: a row rests while it is not listed, and its moments have decayed when it is
-listed again. docs/maths.md states the difference.
+A list of all points is dense Adam, torch's: every row moves in every step by its momentum, seen or not. A list of those
+that received a gradient is lazy Adam: a row rests while it is not listed, and its moments have decayed when it is listed
+again. docs/maths.md states the difference.
 """
 
 import math
+
+import numpy as np
+
+from pp_cl.scan import nonzero
 
 BETA1, BETA2 = 0.9, 0.999  # Kingma & Ba 2015; cl/adam.cl knows them too
 
@@ -33,22 +37,50 @@ def adam_update(dev, parameter, grad, m, v, step, rate, eps):
                                m=m, v=v, **_step_arguments(step, rate, eps))
 
 
+class Touched:
+    """Lists the points that received a gradient; its scratch is kept from step to step."""
+
+    def __init__(self, dev):
+        self.dev = dev
+        self.flags = None
+
+    def rows(self, seen, grad_point_features, grad_opacity):
+        """(S) uint32, ascending: the seen points with a gradient that is not 0. Waits for the device.
+
+        seen: (?) uint32 indices. grad_point_features: (N, 16). grad_opacity: (N). Only the rows seen are read.
+        """
+        n = len(grad_opacity)
+        if self.flags is None or len(self.flags) != n:
+            self.flags = self.offsets = self.indices = None  # released first
+            self.flags, self.indices = self.dev.empty((n,), np.uint32), self.dev.empty((n,), np.uint32)
+            self.offsets = self.dev.empty((n + 1,), np.uint32)
+        self.dev.fill(self.flags, 0)
+        self.dev.program("adam").launch("adam_touched", len(seen), s=len(seen), seen=seen, touched=self.flags,
+                                        grad_point_features=grad_point_features, grad_opacity=grad_opacity)
+        return self.indices[:nonzero(self.dev, self.flags, self.offsets, self.indices)]
+
+
 class PointAdam:
     """Adam of the rows of per-point arrays that one step lists: begin() the step, then update each array."""
 
     def __init__(self, dev):
         self.dev = dev
-        self.decay = dev.empty((0, 2))
+        self.decay = None
 
-    def begin(self, step, rows, last):
-        """List the rows of a step, and note it as their last one.
+    def begin(self, step, rows, last=None):
+        """List the rows of a step.
 
-        step: from 1 on. rows: (S) uint32 point indices, each once. last: (N) uint32, each point's last step, 0 at first.
+        step: from 1 on. rows: (S) uint32 point indices, each once. last: (N) uint32, each point's last step, 0 at first;
+        the present one is noted. Without it the rows are all points in every step.
         """
         self.step, self.rows = step, rows
-        if len(self.decay) != len(last):
-            self.decay = self.dev.empty((len(last), 2))
-        self._launch("adam_decay", step=step, log_beta1=math.log2(BETA1), log_beta2=math.log2(BETA2), last=last)
+        n = len(rows if last is None else last)
+        if self.decay is None or len(self.decay) != n:
+            self.decay = None  # released first
+            self.decay = self.dev.empty((n, 2))
+            self.dev.fill(self.decay, 1)
+        if last is not None:
+            self._launch("adam_decay", step=step, log_beta1=math.log2(BETA1), log_beta2=math.log2(BETA2), last=last)
 
     def update_opacity(self, grad_opacity, opacity, m, v, rate, eps):
         """Update opacities, which stay in [0, 1]. All arrays: (N); m and v start as zeros."""

@@ -52,7 +52,7 @@ class TrainConfig:
     sh_delay: tuple = (0.0, 0.01, 0.02)  # warm-up of each degree, as a share of the iterations
     feature_eps: float = 0.0197  # Adam's eps of SH, times the number of values the loss averages
     opacity_rate: tuple = (3e-2, 3e-3)  # Adam's rate, first and last step
-    lazy: bool = False  # a step updates only the points in its picture; else their momentum moves the others too
+    lazy: bool = False  # update only the points that received a gradient; false: momentum moves the others too
     dropout: float = 0.15  # share of the points left out at random in a step
     smooth: float = 0.03  # pull towards the mean of the grid neighbours, in units of the SH rate, 0 = off
     smooth_every: int = 4  # steps between two such pulls

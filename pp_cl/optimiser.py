@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pp_cl.adam import PointAdam, adam_update, ema_update
+from pp_cl.adam import PointAdam, Touched, adam_update, ema_update
 from pp_cl.model import POINT_KEYS
 from pp_cl.points import SH_BLOCKS
 from pp_cl.schedule import learning_rate
@@ -38,7 +38,7 @@ class Rates:
 class Optimiser:
     """Moments of the points and the network, and their updates.
 
-    lazy: a step updates only the points of its picture; else all of them.
+    lazy: a step updates only the points that received a gradient; else all of them.
     """
 
     def __init__(self, dev, model, lazy):
@@ -51,21 +51,23 @@ class Optimiser:
         for name in POINT_KEYS:
             for kind in "mv":
                 model.points[f"{kind}.{name}"] = dev.zeros(model.points[name].shape)
-        model.points["last"] = dev.zeros((model.count,), np.uint32)
-        self.point_adam = PointAdam(dev)
+        if lazy:
+            model.points["last"] = dev.zeros((model.count,), np.uint32)
+        self.point_adam, self.touched = PointAdam(dev), Touched(dev)
         self.averages = {}  # of the network; those of the points are model.points["a.*"]
         self._all = None
 
     def update(self, step, rates, grads, camera, feature_eps, seen):
         """One Adam step.
 
-        step: from 1. grads: (grad_point_features (N,16), grad_opacity (N)); the network's own gradients lie in it. Lazy
-        steps read only the rows seen. camera: (20) device buffer of the view. feature_eps: Adam's eps of the SH
-        coefficients. seen: (S) uint32, the points of the picture.
+        step: from 1. grads: (grad_point_features (N,16), grad_opacity (N)); the network's own gradients lie in it. camera:
+        (20) device buffer of the view. feature_eps: Adam's eps of the SH coefficients. seen: (S) uint32, the points of the
+        picture; a lazy update reads the gradients of no others.
         """
         grad_features, grad_opacity = grads
         points, adam = self.model.points, self.point_adam
-        adam.begin(step, seen if self.lazy else self._all_rows(), points["last"])
+        rows = self.touched.rows(seen, *grads) if self.lazy else self._all_rows()
+        adam.begin(step, rows, points.get("last"))
         for block in SH_BLOCKS:
             adam.update_sh(
                 block,

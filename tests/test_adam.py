@@ -5,7 +5,7 @@ import oracle_optim
 import pytest
 from helpers import AWKWARD_SIZES, relative_error
 
-from pp_cl.adam import PointAdam, adam_update, ema_update
+from pp_cl.adam import PointAdam, Touched, adam_update, ema_update
 from pp_cl.camera import Camera
 from pp_cl.points import SH_BLOCKS, Grid
 
@@ -146,6 +146,10 @@ def test_all_points_listed_is_dense_adam(dev, rng, n, block):
     cloud.check()
     np.testing.assert_array_equal(cloud.arrays["sh"][0].get()[::3], cloud.start["sh"][::3])
     assert (cloud.last.get() == 5).all()
+    again = Cloud(dev, rng, n, block)
+    again.last = None
+    again.step(*gradients(rng, n), np.arange(n))
+    again.check()
 
 
 @pytest.mark.parametrize("n", AWKWARD_SIZES)
@@ -183,6 +187,21 @@ def test_lazy_moments_are_dense_ones(dev, rng):
         _, m, v = (array.get()[rows] for array in cloud.arrays["opacity"])
         np.testing.assert_allclose(m, dense.m[rows], rtol=3e-6, atol=1e-10)
         np.testing.assert_allclose(v, dense.v[rows], rtol=3e-6)
+
+
+@pytest.mark.parametrize("n", AWKWARD_SIZES)
+def test_touched_are_those_with_a_gradient(dev, rng, n):
+    seen = np.flatnonzero(rng.random(n) < 0.8)
+    features, opacity = np.full((n, 16), np.nan, np.float32), np.full(n, np.nan, np.float32)
+    features[seen], opacity[seen] = 0, 0
+    expected = [i for place, i in enumerate(seen) if place % 3]
+    for place, i in enumerate(seen):
+        features[i, place % 16] = (0, 1e-37, np.nan)[place % 3] if place % 2 else 0
+        opacity[i] = 0 if place % 2 else (-0.0, -1e-30, np.inf)[place % 3]
+    touched = Touched(dev)
+    for _ in range(2):
+        rows = touched.rows(dev.upload(seen, np.uint32), dev.upload(features), dev.upload(opacity))
+        np.testing.assert_array_equal(rows.get(), np.array(expected, np.uint32))
 
 
 @pytest.mark.parametrize("step", [100, 3000, 50_000, 10**8])
