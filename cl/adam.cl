@@ -2,6 +2,7 @@
 #include "camera.h"
 #include "common.h"
 #include "grid.h"
+#include "half16.h"
 #include "sh.h"
 #include "vector.h"
 
@@ -10,6 +11,10 @@
 #endif
 #ifndef K
 #define K 1                      // and their number
+#endif
+
+#ifndef SCALE
+#define SCALE 1.0f               // of moments in 16 bits
 #endif
 
 // 1 - beta, for 1 - 0.999f is off by 1e-5 of itself; pp_cl/adam.py knows the betas too
@@ -105,6 +110,13 @@ kernel void adam_opacity_update(
     opacity[i] = moved < 0.0f ? 0.0f : moved > 1.0f ? 1.0f : moved;  // clamp() would hide a NaN
 }
 
+// Harmonics of the direction from the eye to a grid vertex.
+inline void adam_basis(global const float *grid, global const float *camera, const uint id, float *basis) {
+    const Camera view = camera_load(camera);
+    const float3 direction = grid_position(grid, id) - view.eye;
+    sh_basis(direction * rsqrt(fmax(dot(direction, direction), FLT_MIN)), basis);  // normalize(0) is NaN on some devices
+}
+
 // One work-item per listed point: moves some of its SH coefficients and their moments one step.
 // The gradient of coefficient k is basis[k] * grad_point_features and is never stored.
 kernel void adam_sh_update(
@@ -125,10 +137,8 @@ kernel void adam_sh_update(
     if (g >= s)
         return;
     const size_t i = rows[g];
-    const Camera view = camera_load(camera);
     float basis[9];
-    const float3 direction = grid_position(grid, ids[i]) - view.eye;
-    sh_basis(direction * rsqrt(fmax(dot(direction, direction), FLT_MIN)), basis);  // normalize(0) is NaN on some devices
+    adam_basis(grid, camera, ids[i], basis);
     const float16 dL_df = grad_point_features[i];
     for (size_t k = 0; k < K; k++) {
         const size_t at = i * K + k;
@@ -136,6 +146,40 @@ kernel void adam_sh_update(
         sh[at] -= adam_step16(basis[FIRST + k] * dL_df, &m16, &v16, rate, eps);
         m[at] = m16;
         v[at] = v16;
+    }
+}
+
+// The same with SCALE * m and SCALE * sqrt(v) in 16 bits each: the square root halves the range of exponents of v.
+kernel void adam_sh_update_half(
+    const uint s,                               // listed points
+    const uint seed,                            // of the rounding: another one in each step
+    const float rate,                           // as in adam_update
+    const float eps,
+    global const uint *rows,                    // (S) their indices
+    global const float2 *decay,                 // (?, 2) of adam_decay
+    global const float *grid,                   // (8)
+    global const float *camera,                 // (20)
+    global const uint *ids,                     // (N) grid ids
+    global const float16 *grad_point_features,  // (N, 16) only the listed are read
+    global float16 *sh,                         // (N, K, 16)
+    global half *moments)                       // (N, K, 2, 16)
+{
+    const size_t g = get_global_id(0);
+    if (g >= s)
+        return;
+    const size_t i = rows[g];
+    float basis[9];
+    adam_basis(grid, camera, ids[i], basis);
+    const float16 dL_df = SCALE * grad_point_features[i];
+    for (size_t k = 0; k < K; k++) {
+        const size_t at = i * K + k;
+        global half *pair = moments + 32 * at;
+        const float16 root = vload_half16(1, pair);
+        float16 m16 = decay[g].x * vload_half16(0, pair), v16 = decay[g].y * root * root;
+        sh[at] -= adam_step16(basis[FIRST + k] * dL_df, &m16, &v16, rate, SCALE * eps);
+        const uint16 random = random16(seed + 9 * (uint)i + FIRST + k);
+        store_half16(m16, random >> 19, pair);
+        store_half16(sqrt(v16), random >> 6, pair + 16);
     }
 }
 

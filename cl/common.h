@@ -7,6 +7,15 @@
 // 16 channels of one pixel or point
 #define CHANNELS 16
 
+// A well mixed integer (lowbias32 by Chris Wellons).
+inline uint scramble(uint x) {
+    x ^= x >> 16;
+    x *= 0x7feb352du;
+    x ^= x >> 15;
+    x *= 0x846ca68bu;
+    return x ^ (x >> 16);
+}
+
 // Sum of the products of two 16-vectors; the order of the sum is fixed by the tree below.
 inline float dot16(const float16 a, const float16 b) {
     const float16 p = a * b;

@@ -11,15 +11,6 @@
 // Least cosine between a point's direction and the optical axis (Pulsar): nothing behind or beside the eye.
 #define LEAST_COSINE 1e-6f
 
-// A well mixed integer (lowbias32 by Chris Wellons).
-inline uint scramble(uint x) {
-    x ^= x >> 16;
-    x *= 0x7feb352du;
-    x ^= x >> 15;
-    x *= 0x846ca68bu;
-    return x ^ (x >> 16);
-}
-
 // Writes (x, y, z, t) in camera axes and the box of pixels that may be hit. A point is left out if it is too near or too far
 // (measured at the sphere's front, as in Pulsar), behind the eye, or not finite, for which every comparison is false.
 inline void project(const Camera *k, const float3 position, const float radius, const int wanted,

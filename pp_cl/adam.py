@@ -12,6 +12,16 @@ import numpy as np
 from pp_cl.scan import nonzero
 
 BETA1, BETA2 = 0.9, 0.999  # Kingma & Ba 2015; cl/adam.cl knows them too
+GOLDEN = 0x9E3779B1  # 2^32 over the golden ratio: seeds of successive steps lie far apart
+
+
+def moment_scale(eps):
+    """The power of two by which moments in 16 bits are multiplied: it takes eps to about 2^-6.
+
+    A half holds 2^-14 to 2^16 with all its bits, so these are eps/256 to 4 million eps; below, the gradient hardly moves
+    anything.
+    """
+    return 2.0 ** (-6 - round(math.log2(eps)))
 
 
 def _step_arguments(step, rate, eps):
@@ -61,10 +71,15 @@ class Touched:
 
 
 class PointAdam:
-    """Adam of the rows of per-point arrays that one step lists: begin() the step, then update each array."""
+    """Adam of the rows of per-point arrays that one step lists: begin() the step, then update each array.
 
-    def __init__(self, dev):
+    scale: of SH moments in 16 bits (moment_scale); None: they have 32.
+    """
+
+    def __init__(self, dev, scale=None):
         self.dev = dev
+        self.scale = scale
+        self.kinds = ("m", "v") if scale is None else ("mv",)
         self.decay = None
 
     def begin(self, step, rows, last=None):
@@ -87,15 +102,25 @@ class PointAdam:
         self._launch("adam_opacity_update", grad_opacity=grad_opacity, opacity=opacity, m=m, v=v,
                      **_step_arguments(self.step, rate, eps))
 
-    def update_sh(self, block, grid, camera, ids, grad_point_features, sh, m, v, rate, eps):
+    def sh_moments(self, block, n):
+        """{kind: zeros} for n points: "m" and "v" (N, count, 16) or, in 16 bits, both as "mv" (N, count, 2, 16)."""
+        if self.scale is None:
+            return {kind: self.dev.zeros((n, block.count, 16)) for kind in self.kinds}
+        return {kind: self.dev.zeros((n, block.count, 2, 16), np.float16) for kind in self.kinds}
+
+    def update_sh(self, block, grid, camera, ids, grad_point_features, sh, moments, rate, eps):
         """Update the SH coefficients of one block.
 
         block: points.ShBlock. grid: (8,) of Grid.packed(). camera: (20,) of the view the gradient belongs to. ids: (N,)
-        uint32 grid ids. grad_point_features: (N, 16) gradient of the points' features in that view. sh, m, v:
-        (N, block.count, 16).
+        uint32 grid ids. grad_point_features: (N, 16) gradient of the points' features in that view. sh:
+        (N, block.count, 16). moments: as sh_moments() made them.
         """
-        self._launch("adam_sh_update", {"FIRST": block.first, "K": block.count}, grid=grid, camera=camera, ids=ids, sh=sh,
-                     m=m, v=v, grad_point_features=grad_point_features, **_step_arguments(self.step, rate, eps))
+        kernel, defines = "adam_sh_update", {"FIRST": block.first, "K": block.count}
+        if self.scale is not None:
+            kernel, defines["SCALE"] = "adam_sh_update_half", f"{self.scale!r}f"
+            moments = {"moments": moments["mv"], "seed": self.step * GOLDEN % 2**32}
+        self._launch(kernel, defines, grid=grid, camera=camera, ids=ids, sh=sh, grad_point_features=grad_point_features,
+                     **moments, **_step_arguments(self.step, rate, eps))
 
     def _launch(self, kernel, defines=None, **arguments):
         s = len(self.rows)

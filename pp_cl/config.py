@@ -53,6 +53,7 @@ class TrainConfig:
     feature_eps: float = 0.0197  # Adam's eps of SH, times the number of values the loss averages
     opacity_rate: tuple = (3e-2, 3e-3)  # Adam's rate, first and last step
     lazy: bool = False  # update only the points that received a gradient; false: momentum moves the others too
+    half_moments: bool = False  # keep Adam's moments of the SH coefficients in 16 bits
     dropout: float = 0.15  # share of the points left out at random in a step
     smooth: float = 0.03  # pull towards the mean of the grid neighbours, in units of the SH rate, 0 = off
     smooth_every: int = 4  # steps between two such pulls
@@ -64,6 +65,10 @@ class TrainConfig:
     checkpoint_every: int = 1000  # steps
     log_every: int = 50  # steps
     previews: int = 4  # pictures over the whole run
+
+    def crop_size(self, width, height):
+        """(width, height) of what a step trains on, of a picture of width x height."""
+        return (min(self.crop, width), min(self.crop, height)) if self.crop else (width, height)
 
 
 @dataclass

@@ -38,22 +38,24 @@ class Rates:
 class Optimiser:
     """Moments of the points and the network, and their updates.
 
-    lazy: a step updates only the points that received a gradient; else all of them.
+    lazy: a step updates only the points that received a gradient; else all of them. scale: see PointAdam.
     """
 
-    def __init__(self, dev, model, lazy):
+    def __init__(self, dev, model, lazy=False, scale=None):
         self.dev = dev
         self.model = model
         self.lazy = lazy
         self.moments = {
             f"{kind}.{name}": dev.zeros(array.shape) for name, array in model.net.parameters.items() for kind in "mv"
         }
-        for name in POINT_KEYS:
-            for kind in "mv":
-                model.points[f"{kind}.{name}"] = dev.zeros(model.points[name].shape)
+        self.point_adam, self.touched = PointAdam(dev, scale), Touched(dev)
+        for block in SH_BLOCKS:
+            for kind, array in self.point_adam.sh_moments(block, model.count).items():
+                model.points[f"{kind}.{block.name}"] = array
+        for kind in "mv":
+            model.points[f"{kind}.opacity"] = dev.zeros((model.count,))
         if lazy:
             model.points["last"] = dev.zeros((model.count,), np.uint32)
-        self.point_adam, self.touched = PointAdam(dev), Touched(dev)
         self.averages = {}  # of the network; those of the points are model.points["a.*"]
         self._all = None
 
@@ -75,11 +77,13 @@ class Optimiser:
                 camera,
                 points["ids"],
                 grad_features,
-                *self._with_moments(block.name),
+                points[block.name],
+                {kind: points[f"{kind}.{block.name}"] for kind in adam.kinds},
                 rates.sh[block.degree],
                 feature_eps,
             )
-        adam.update_opacity(grad_opacity, *self._with_moments("opacity"), rates.opacity, OPACITY_EPS)
+        opacity = [points[name] for name in ("opacity", "m.opacity", "v.opacity")]
+        adam.update_opacity(grad_opacity, *opacity, rates.opacity, OPACITY_EPS)
         for name, parameter in self.model.net.parameters.items():
             adam_update(
                 self.dev,
@@ -91,9 +95,6 @@ class Optimiser:
                 rates.network,
                 NETWORK_EPS,
             )
-
-    def _with_moments(self, name):
-        return [self.model.points[key] for key in (name, f"m.{name}", f"v.{name}")]
 
     def _all_rows(self):
         """(N) uint32, the indices of all points."""

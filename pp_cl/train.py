@@ -4,6 +4,7 @@ import math
 
 import numpy as np
 
+from pp_cl.adam import moment_scale
 from pp_cl.errors import UserError
 from pp_cl.loss import Loss
 from pp_cl.model import POINT_KEYS
@@ -34,10 +35,17 @@ class Trainer:
         self.renderer = Renderer(dev, model, config.points)
         self.target = Target(dev, self.downscale)
         self.loss = Loss(dev, self.config.ssim_weight)
-        self.optimiser = Optimiser(dev, model, self.config.lazy)
+        self.optimiser = Optimiser(dev, model, self.config.lazy, self._moment_scale())
         self.boxes = object_box(views, self.downscale, BOX_MARGIN)
         model.points["weight"] = dev.zeros((model.count,))
         self._smoother = None
+
+    def _moment_scale(self):
+        """Of moments in 16 bits, from the eps of the first view: powers of two, so that others may differ from it."""
+        if not self.config.half_moments:
+            return None
+        camera = reduced_camera(self.views[0], self.downscale)
+        return moment_scale(self.config.feature_eps / (3 * math.prod(self.config.crop_size(camera.width, camera.height))))
 
     # ---------------------------------------------------------------------------------------------- one step
 
@@ -81,7 +89,7 @@ class Trainer:
         if config.crop == 0:
             return index, (0, 0, camera.width, camera.height), phase
         x0, y0, x1, y1 = self.boxes[index]
-        width, height = min(config.crop, camera.width), min(config.crop, camera.height)
+        width, height = config.crop_size(camera.width, camera.height)
         return (
             index,
             (_draw_start(rng, x0, x1, width, camera.width), _draw_start(rng, y0, y1, height, camera.height), width, height),

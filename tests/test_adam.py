@@ -2,14 +2,17 @@
 
 import numpy as np
 import oracle_optim
+import pyopencl as cl
 import pytest
 from helpers import AWKWARD_SIZES, relative_error
 
-from pp_cl.adam import PointAdam, Touched, adam_update, ema_update
+from pp_cl.adam import PointAdam, Touched, adam_update, ema_update, moment_scale
 from pp_cl.camera import Camera
+from pp_cl.device import kernel_folder
 from pp_cl.points import SH_BLOCKS, Grid
 
 GRID = Grid((-0.7, -0.5, -0.6), 0.05, (23, 19, 31))
+SH_EPS = 4e-7  # of the tiny preset
 EYE = np.array([1.5, -2.5, 1.2])
 CAMERA = Camera(np.column_stack([np.eye(3), EYE]), 100, 100, 50, 50, 100, 100)
 
@@ -96,14 +99,15 @@ def test_refuses_different_shapes(dev):
 class Cloud:
     """Points whose opacities and SH coefficients of one block are trained, and their oracles."""
 
-    def __init__(self, dev, rng, n, block=SH_BLOCKS[0]):
-        self.dev, self.n, self.block = dev, n, block
+    def __init__(self, dev, rng, n, block=SH_BLOCKS[0], scale=None):
+        self.dev, self.n, self.block, self.scale = dev, n, block, scale
         self.ids = np.sort(rng.choice(np.prod(GRID.dims), n, replace=False)).astype(np.uint32)
         self.start = {"opacity": rng.random(n).astype(np.float32),
                       "sh": rng.standard_normal((n, block.count, 16)).astype(np.float32)}
-        self.arrays = {name: [dev.upload(start), *moments(dev, start)] for name, start in self.start.items()}
         self.oracles = {name: oracle_optim.Adam(start) for name, start in self.start.items()}
-        self.adam, self.last, self.steps = PointAdam(dev), dev.zeros((n,), np.uint32), 0
+        self.adam, self.last, self.steps = PointAdam(dev, scale), dev.zeros((n,), np.uint32), 0
+        self.opacity = [dev.upload(self.start["opacity"]), *moments(dev, self.start["opacity"])]
+        self.sh, self.sh_moments = dev.upload(self.start["sh"]), self.adam.sh_moments(block, n)
         self.scene = [dev.upload(GRID.packed()), dev.upload(CAMERA.packed()), dev.upload(self.ids)]
 
     def step(self, grad_features, grad_opacity, rows, step=None):
@@ -115,19 +119,28 @@ class Cloud:
         features, opacities = (self.dev.upload(np.where(listed.reshape(-1, *[1] * (g.ndim - 1)), g, np.nan), np.float32)
                                for g in (grad_features, grad_opacity))
         self.adam.begin(self.steps, self.dev.upload(rows, np.uint32), self.last)
-        self.adam.update_sh(self.block, *self.scene, features, *self.arrays["sh"], 0.1, 4e-7)
-        self.adam.update_opacity(opacities, *self.arrays["opacity"], 0.03, 1e-15)
+        self.adam.update_sh(self.block, *self.scene, features, self.sh, self.sh_moments, 0.1, SH_EPS)
+        self.adam.update_opacity(opacities, *self.opacity, 0.03, 1e-15)
         gradient = oracle_optim.sh_gradient(GRID.positions(self.ids), EYE, grad_features, self.block)
-        self.oracles["sh"].step(gradient, 0.1, 4e-7, rows=rows)
+        self.oracles["sh"].step(gradient, 0.1, SH_EPS, rows=rows)
         self.oracles["opacity"].step(grad_opacity, 0.03, 1e-15, low=0, high=1, rows=rows)
+
+    def state(self):
+        """{name: (parameter, m, v)} on the host."""
+        if self.scale is None:
+            sh = [self.sh.get(), *(array.get() for array in self.sh_moments.values())]
+        else:
+            m, root = np.moveaxis(self.sh_moments["mv"].get().astype(np.float64), 2, 0) / self.scale
+            sh = [self.sh.get(), m, root**2]
+        return {"sh": sh, "opacity": [array.get() for array in self.opacity]}
 
     def check(self):
         """Compare parameters and moments with the oracle's."""
-        for name, (parameter, m, v) in self.arrays.items():
+        for name, (parameter, m, v) in self.state().items():
             oracle = self.oracles[name]
-            assert relative_error(parameter.get(), oracle.parameter) < 1e-6
-            assert relative_error(m.get(), oracle.m) < 1e-6
-            assert relative_error(v.get(), oracle.v) < 3e-6
+            assert relative_error(parameter, oracle.parameter) < 1e-6
+            assert relative_error(m, oracle.m) < 1e-6
+            assert relative_error(v, oracle.v) < 3e-6
 
 
 def gradients(rng, n):
@@ -144,7 +157,7 @@ def test_all_points_listed_is_dense_adam(dev, rng, n, block):
     for _ in range(5):
         cloud.step(*gradients(rng, n), np.arange(n))
     cloud.check()
-    np.testing.assert_array_equal(cloud.arrays["sh"][0].get()[::3], cloud.start["sh"][::3])
+    np.testing.assert_array_equal(cloud.sh.get()[::3], cloud.start["sh"][::3])
     assert (cloud.last.get() == 5).all()
     again = Cloud(dev, rng, n, block)
     again.last = None
@@ -165,13 +178,13 @@ def test_lazy_matches_oracle(dev, rng, n, block):
 def test_rows_that_are_not_listed_rest(dev, rng):
     cloud = Cloud(dev, rng, 257)
     cloud.step(*gradients(rng, 257), np.arange(257))
-    before = [[array.get() for array in arrays] for arrays in cloud.arrays.values()]
+    before = cloud.state()
     rows = np.arange(0, 257, 2)
     cloud.step(*gradients(rng, 257), rows)
-    for arrays, olds in zip(cloud.arrays.values(), before, strict=True):
-        for array, old in zip(arrays, olds, strict=True):
-            np.testing.assert_array_equal(array.get()[1::2], old[1::2])
-            assert (array.get()[rows] != old[rows]).any()
+    for name, arrays in cloud.state().items():
+        for array, old in zip(arrays, before[name], strict=True):
+            np.testing.assert_array_equal(array[1::2], old[1::2])
+            assert (array[rows] != old[rows]).any()
     cloud.step(*gradients(rng, 257), [])
     assert (cloud.last.get()[1::2] == 1).all() and (cloud.last.get()[::2] == 2).all()
 
@@ -184,7 +197,7 @@ def test_lazy_moments_are_dense_ones(dev, rng):
         rows = np.flatnonzero(rng.random(33) < 0.2)
         cloud.step(np.zeros((33, 16)), grad, rows)
         dense.step(np.where(np.isin(np.arange(33), rows), grad, 0), 0.03, 1e-15)
-        _, m, v = (array.get()[rows] for array in cloud.arrays["opacity"])
+        _, m, v = (array[rows] for array in cloud.state()["opacity"])
         np.testing.assert_allclose(m, dense.m[rows], rtol=3e-6, atol=1e-10)
         np.testing.assert_allclose(v, dense.v[rows], rtol=3e-6)
 
@@ -216,7 +229,7 @@ def test_opacity_stays_in_its_bounds(dev, rng):
     cloud = Cloud(dev, rng, 257)
     for step in range(40):
         cloud.step(np.zeros((257, 16)), rng.standard_normal(257) + np.linspace(-2, 2, 257), np.arange(step % 2, 257, 2))
-    opacity = cloud.arrays["opacity"][0].get()
+    opacity = cloud.opacity[0].get()
     assert opacity.min() == 0
     assert opacity.max() == 1
     np.testing.assert_allclose(opacity, cloud.oracles["opacity"].parameter, atol=2e-6)
@@ -225,8 +238,8 @@ def test_opacity_stays_in_its_bounds(dev, rng):
 def test_a_nan_is_not_hidden(dev, rng):
     cloud = Cloud(dev, rng, 31)
     cloud.adam.begin(1, dev.upload(np.arange(31), np.uint32), cloud.last)
-    cloud.adam.update_opacity(dev.upload(np.full(31, np.nan), np.float32), *cloud.arrays["opacity"], 0.1, 1e-15)
-    assert np.isnan(cloud.arrays["opacity"][0].get()).all()
+    cloud.adam.update_opacity(dev.upload(np.full(31, np.nan), np.float32), *cloud.opacity, 0.1, 1e-15)
+    assert np.isnan(cloud.opacity[0].get()).all()
 
 
 def test_sh_of_a_point_in_the_eye_stays_finite(dev):
@@ -234,13 +247,70 @@ def test_sh_of_a_point_in_the_eye_stays_finite(dev):
     grid, camera = Grid((0, 0, 0), 0.5, (5, 5, 5)), Camera(np.column_stack([np.eye(3), [1.0, 0.5, 0]]), 9, 9, 4, 4, 8, 8)
     ids = np.array([2 + 5, 3], np.uint32)
     start = np.ones((2, 3, 16), np.float32)
-    sh, (m, v) = dev.upload(start), moments(dev, start)
     adam = PointAdam(dev)
+    sh, sh_moments = dev.upload(start), adam.sh_moments(SH_BLOCKS[2], 2)
     adam.begin(1, dev.upload(np.arange(2), np.uint32), dev.zeros((2,), np.uint32))
     adam.update_sh(SH_BLOCKS[2], dev.upload(grid.packed()), dev.upload(camera.packed()), dev.upload(ids), dev.zeros((2, 16)),
-                   sh, m, v, 0.5, 1e-15)
+                   sh, sh_moments, 0.5, 1e-15)
     np.testing.assert_array_equal(sh.get(), start)
-    assert not m.get().any()
+    assert not sh_moments["m"].get().any()
+
+
+@pytest.mark.parametrize("n", AWKWARD_SIZES)
+@pytest.mark.parametrize("block", SH_BLOCKS, ids=lambda b: b.name)
+def test_half_moments_follow_the_oracle(dev, rng, n, block):
+    """A half is off by up to 2^-10, and each step rounds again."""
+    cloud = Cloud(dev, rng, n, block, moment_scale(SH_EPS))
+    for _ in range(12):
+        cloud.step(*gradients(rng, n), np.flatnonzero(rng.random(n) < 0.4))
+    parameter, m, v = cloud.state()["sh"]
+    oracle = cloud.oracles["sh"]
+    moved = np.abs(oracle.parameter - cloud.start["sh"]).max()
+    assert np.abs(parameter - oracle.parameter).max() < 0.01 * moved + 1e-7
+    assert relative_error(m, oracle.m) < 0.005
+    assert relative_error(np.sqrt(v), np.sqrt(oracle.v)) < 0.005
+    np.testing.assert_array_equal(cloud.last.get(), oracle.last)
+
+
+@pytest.mark.parametrize("size", [1e-2, 1e-4, 1e-6])
+def test_half_moments_decay_as_they_should(dev, rng, size):
+    """A thousand steps each take less from sqrt(v) than half a unit in its last place: rounding to nearest keeps all."""
+    cloud = Cloud(dev, rng, 64, scale=moment_scale(SH_EPS))
+    grad, none = size * (1 + rng.random((64, 16))), np.zeros((64, 16))
+    cloud.step(grad, np.zeros(64), np.arange(64))
+    for _ in range(1000):
+        cloud.step(none, np.zeros(64), np.arange(64))
+    _, m, v = cloud.state()["sh"]
+    ratio = np.sqrt(v) / np.sqrt(cloud.oracles["sh"].v)
+    assert abs(ratio.mean() - 1) < 0.005
+    assert ratio.std() < 0.05
+    assert not m.any()
+
+
+@pytest.mark.parametrize("eps", [1e-12, 4e-7, 1.0])
+def test_moment_scale_puts_eps_into_the_range_of_a_half(eps):
+    assert 2**-6.5 <= eps * moment_scale(eps) <= 2**-5.5
+    assert np.log2(moment_scale(eps)) % 1 == 0
+
+
+def test_rounding_to_half(dev):
+    """Each value becomes one of its two neighbours, and on the average itself; the largest half bounds, NaN stays."""
+    values = np.float32([0, 1, -1.0003, 0.1, 6e-5, -3e-8, 1e-8, 6.1035e-5, 65519, 70000, -1e30, np.inf, np.nan, 1e3, -7e-6, 2])
+    source = """#include "half16.h"
+        kernel void to_half(global const float16 *value, global half *rounded) {
+            const uint i = get_global_id(0);
+            store_half16(value[0], random16(77 + i) >> 19, rounded + 16 * i);
+        }"""
+    kernel = cl.Program(dev.context, source).build(["-I", str(kernel_folder())]).to_half
+    rounded = dev.empty((20_000, 16), np.float16)
+    kernel(dev.queue, (20_000,), None, dev.upload(values).data, rounded.data)
+    rounded = rounded.get().astype(np.float64)
+    exact = np.clip(values, -65504, 65504).astype(np.float64)
+    assert np.isnan(rounded[:, 12]).all()
+    rounded, exact = np.delete(rounded, 12, 1), np.delete(exact, 12)
+    step = np.maximum(2.0 ** np.floor(np.log2(np.maximum(np.abs(exact), 1e-30)) - 10), 2.0**-24)
+    assert (np.abs(rounded - exact) < step).all()
+    assert (np.abs(rounded.mean(axis=0) - exact) < 0.02 * step).all()
 
 
 @pytest.mark.parametrize("n", AWKWARD_SIZES)

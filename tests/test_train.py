@@ -101,12 +101,14 @@ def test_stopped_at_any_step_it_resumes_to_the_same_bytes(scene, finished, tmp_p
     assert strip == [{k: v for k, v in r.items() if k != "seconds"} for r in rows(finished)]
 
 
-def test_lazy_adam_learns_another_way_and_resumes_to_the_same_bytes(scene, finished, tmp_path, monkeypatch):
-    assert main(arguments(scene, tmp_path / "whole", train__lazy="true")) == 0
+@pytest.mark.parametrize("changes", [{"train__lazy": "true"}, {"train__half_moments": "true"},
+                                     {"train__lazy": "true", "train__half_moments": "true"}])
+def test_other_ways_of_adam_learn_and_resume_to_the_same_bytes(scene, finished, tmp_path, monkeypatch, changes):
+    assert main(arguments(scene, tmp_path / "whole", **changes)) == 0
     losses = [r["loss"] for r in rows(tmp_path / "whole")[:-1]]
     assert np.mean(losses[-3:]) < 0.6 * losses[0]
-    train_and_interrupt(scene, tmp_path / "run", 47, monkeypatch, train__lazy="true")
-    assert main(arguments(scene, tmp_path / "run", train__lazy="true")) == 0
+    train_and_interrupt(scene, tmp_path / "run", 47, monkeypatch, **changes)
+    assert main(arguments(scene, tmp_path / "run", **changes)) == 0
     whole = (tmp_path / "whole" / "checkpoint.npz").read_bytes()
     assert (tmp_path / "run" / "checkpoint.npz").read_bytes() == whole
     assert (finished / "checkpoint.npz").read_bytes() != whole
