@@ -3,38 +3,43 @@
 import math
 
 from pp_cl.errors import UserError
-from pp_cl.points import SH_DEGREES
+from pp_cl.points import SH_BLOCKS
+from pp_cl.prune import SCRATCH_BYTES
+from pp_cl.render import NETWORK_MULTIPLE
 from pp_cl.scene import reduced_camera
+from pp_cl.smooth import CHUNK
 
 MIB = 2**20
-MOMENTS = 2  # Adam's
 PAIR_BYTES = 45  # two keys of 8, pixel, closeness, point and two weights of 4 bytes, a quarter of spare room
-POINT_VIEW_FLOATS = 4 + 2 + 16 + 16 + 1 + 3  # camera position, box, features, their gradient, opacity's, lists
+
+
+def point_bytes(train):
+    """{what: bytes on the device} of one point of a training. train: config.TrainConfig."""
+    coefficients = 16 * sum(block.count for block in SH_BLOCKS)
+    learned = 4 * (1 + coefficients)
+    return {
+        "ids, opacities, SH coefficients": 4 + learned,
+        "Adam's moments": 2 * (4 + (2 if train.half_moments else 4) * coefficients),
+        "averages": learned if train.average else 0,
+        "weights, Adam's lists": 4 * (3 + (4 if train.lazy else 1)),  # weight, decay; last steps, flags, offsets, rows
+        "points of one view": 4 * (4 + 2 + 16 + 16 + 1 + 3),  # position, box, features, gradients, offsets and lists
+        "neighbours": 4 * 6 if train.smooth > 0 else 0,
+    }
 
 
 def memory_plan(dev, config, model, views):
     """[(what, shape text, bytes)] of the device buffers of a training with this model on these views."""
     n, train = model.count, config.train
     camera = reduced_camera(views[0], config.scene.downscale)
-    width, height = (
-        (camera.width, camera.height) if train.crop == 0 else (min(train.crop, camera.width), min(train.crop, camera.height))
-    )
-    width, height = width + -width % 4, height + -height % 4
-    copies = 1 + MOMENTS + (1 if train.average else 0)
-    rows = [("point ids, opacities", f"({n}) x {1 + copies}", 4 * n * (1 + copies))]
-    rows += [
-        (
-            f"SH degree {d}, moments" + (", average" if train.average else ""),
-            f"({n}, {2 * d + 1}, 16) x {copies}",
-            64 * n * (2 * d + 1) * copies,
-        )
-        for d in SH_DEGREES
-    ]
-    rows.append(("points of one view", f"({n}, {POINT_VIEW_FLOATS})", 4 * n * POINT_VIEW_FLOATS))
+    width, height = (side + -side % NETWORK_MULTIPLE for side in train.crop_size(camera.width, camera.height))
+    rows = [(what, f"({n}) x {size} bytes", n * size) for what, size in point_bytes(train).items() if size]
+    row_bytes = max(64 * block.count for block in SH_BLOCKS)  # of the largest array of a point
     if train.smooth > 0:
-        rows.append(("neighbours, scratch (estimate)", f"({n}, 22)", 4 * n * 22))
+        chunk = min(n, max(CHUNK, n // model.grid.dims[2]))  # the points of a layer, about
+        rows.append(("smoothing (estimate)", f"2 x ({chunk}) x {row_bytes} bytes", 2 * chunk * row_bytes))
+    rows.append(("pruning", "at most", min(SCRATCH_BYTES, n * row_bytes)))
     pairs = round(n * _pixels_per_point(config, model, camera))
-    rows.append(("point-pixel pairs (estimate)", f"({pairs})", PAIR_BYTES * pairs))
+    rows.append(("point-pixel pairs (estimate)", f"({pairs}) x {PAIR_BYTES} bytes", PAIR_BYTES * pairs))
     network = model.net.memory_plan(height, width, True)
     rows.append((f"network at {width}x{height}", f"{len(network)} buffers", sum(size for _, _, size in network)))
     image = views[0].image
@@ -64,5 +69,5 @@ def print_plan(rows, dev):
     if total > dev.info["memory_bytes"]:
         raise UserError(
             f"the training needs {total / MIB:.0f} MiB, {dev.name} has {dev.info['memory_bytes'] / MIB:.0f}: "
-            "lower --points, raise --downscale, or set train.crop or smaller network.widths"
+            "lower --points, raise --downscale, or set train.half_moments, train.crop or smaller network.widths"
         )
