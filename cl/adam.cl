@@ -13,6 +13,9 @@
 #define K 1                      // and their number
 #endif
 
+#ifndef LAZY
+#define LAZY 0                   // 1: only listed points are updated; 0: all, and nobody reads a list
+#endif
 #ifndef SCALE
 #define SCALE 1.0f               // of moments in 16 bits
 #endif
@@ -21,13 +24,17 @@
 #define DECAY1 0.1f
 #define DECAY2 0.001f
 
-// New moments and the step of one value, or of 16: T is float or float16.
+// New moments and the step of one value, or of 16: T is float or float16. rest: of adam_rest.
 #define ADAM_STEP(T, name)                                                                        \
-    inline T name(const T g, T *m, T *v, const float rate, const float eps) {                     \
+    inline T name(const T g, const float4 rest, T *m, T *v, const float rate, const float eps) {  \
+        const T missed = rest.z > 0.0f ? rest.z * rate * *m / (sqrt(*v) + eps) : (T)(0.0f);       \
+        *m *= rest.x;                                                                             \
+        *v *= rest.y;                                                                             \
         *m += DECAY1 * (g - *m);                                                                  \
         *v += DECAY2 * (g * g - *v);                                                              \
-        return rate * *m / (sqrt(*v) + eps);                                                      \
+        return missed + rate * *m / (sqrt(*v) + eps);                                             \
     }
+#define NO_REST (float4)(1.0f, 1.0f, 0.0f, 0.0f)
 ADAM_STEP(float, adam_step)
 ADAM_STEP(float16, adam_step16)
 
@@ -46,7 +53,7 @@ kernel void adam_update(
         return;
     const int count = min(n - (uint)i, 16u);
     float16 m16 = load16(m + i, count), v16 = load16(v + i, count);
-    const float16 step = adam_step16(load16(grad + i, count), &m16, &v16, rate, eps);
+    const float16 step = adam_step16(load16(grad + i, count), NO_REST, &m16, &v16, rate, eps);
     store16(m16, m + i, count);
     store16(v16, v + i, count);
     store16(load16(parameter + i, count) - step, parameter + i, count);
@@ -67,33 +74,44 @@ kernel void adam_touched(
     touched[i] = any(grad_point_features[i] != 0.0f) || grad_opacity[i] != 0.0f;
 }
 
-// One work-item per listed point: reads its last step, writes the present one, and what its moments have lost in the steps
-// between, in which its gradient was 0.
-kernel void adam_decay(
+// One work-item per listed point: reads its last step, writes the present one, and what the k steps between, with
+// gradients of 0, did: the decay of its moments, and how many times rate m/(sqrt(v) + eps) they would have moved it,
+// sum over j = 1..k of rho^j with rho = beta1/sqrt(beta2).
+kernel void adam_rest(
     const uint s,                         // listed points
     const uint step,                      // from 1
     const float log_beta1,                // log2(beta1)
     const float log_beta2,
     global const uint *rows,              // (S) their indices
     global uint *last,                    // (N) step of the last update, 0: none
-    global float2 *decay)                 // (?, 2) S rows: beta1^missed, beta2^missed
+    global float4 *rest)                  // (?, 4) S rows: beta1^k, beta2^k, moves, 0
 {
     const uint g = get_global_id(0);
     if (g >= s)
         return;
     const uint i = rows[g];
-    const float missed = step - last[i] - 1;
-    decay[g] = (float2)(exp2(missed * log_beta1), exp2(missed * log_beta2));
+    const float k = step - last[i] - 1;
+    const float log_rho = log_beta1 - 0.5f * log_beta2, rho = exp2(log_rho);
+    const float moves = rho * (1.0f - exp2(k * log_rho)) / (1.0f - rho);
+    rest[g] = (float4)(exp2(k * log_beta1), exp2(k * log_beta2), moves, 0.0f);
     last[i] = step;
+}
+
+inline size_t row_of(global const uint *rows, const size_t g) {
+    return LAZY ? rows[g] : g;
+}
+
+inline float4 rest_of(global const float4 *rest, const size_t g) {
+    return LAZY ? rest[g] : NO_REST;
 }
 
 // One work-item per listed point: moves its opacity, which stays in [0, 1], and the moments.
 kernel void adam_opacity_update(
-    const uint s,                         // listed points
+    const uint s,                         // listed points, or all
     const float rate,                     // as in adam_update
     const float eps,
-    global const uint *rows,              // (S) their indices
-    global const float2 *decay,           // (?, 2) of adam_decay
+    global const uint *rows,              // (?) their S indices
+    global const float4 *rest,            // (?, 4) of adam_rest
     global const float *grad_opacity,     // (N) only the listed are read
     global float *opacity,                // (N)
     global float *m,                      // (N)
@@ -102,9 +120,9 @@ kernel void adam_opacity_update(
     const uint g = get_global_id(0);
     if (g >= s)
         return;
-    const uint i = rows[g];
-    float m1 = decay[g].x * m[i], v1 = decay[g].y * v[i];
-    const float moved = opacity[i] - adam_step(grad_opacity[i], &m1, &v1, rate, eps);
+    const size_t i = row_of(rows, g);
+    float m1 = m[i], v1 = v[i];
+    const float moved = opacity[i] - adam_step(grad_opacity[i], rest_of(rest, g), &m1, &v1, rate, eps);
     m[i] = m1;
     v[i] = v1;
     opacity[i] = moved < 0.0f ? 0.0f : moved > 1.0f ? 1.0f : moved;  // clamp() would hide a NaN
@@ -120,11 +138,11 @@ inline void adam_basis(global const float *grid, global const float *camera, con
 // One work-item per listed point: moves some of its SH coefficients and their moments one step.
 // The gradient of coefficient k is basis[k] * grad_point_features and is never stored.
 kernel void adam_sh_update(
-    const uint s,                               // listed points
+    const uint s,                               // listed points, or all
     const float rate,                           // as in adam_update
     const float eps,
-    global const uint *rows,                    // (S) their indices
-    global const float2 *decay,                 // (?, 2) of adam_decay
+    global const uint *rows,                    // (?) their S indices
+    global const float4 *rest,                  // (?, 4) of adam_rest
     global const float *grid,                   // (8)
     global const float *camera,                 // (20)
     global const uint *ids,                     // (N) grid ids
@@ -136,14 +154,15 @@ kernel void adam_sh_update(
     const size_t g = get_global_id(0);
     if (g >= s)
         return;
-    const size_t i = rows[g];
+    const size_t i = row_of(rows, g);
+    const float4 missed = rest_of(rest, g);
     float basis[9];
     adam_basis(grid, camera, ids[i], basis);
     const float16 dL_df = grad_point_features[i];
     for (size_t k = 0; k < K; k++) {
         const size_t at = i * K + k;
-        float16 m16 = decay[g].x * m[at], v16 = decay[g].y * v[at];
-        sh[at] -= adam_step16(basis[FIRST + k] * dL_df, &m16, &v16, rate, eps);
+        float16 m16 = m[at], v16 = v[at];
+        sh[at] -= adam_step16(basis[FIRST + k] * dL_df, missed, &m16, &v16, rate, eps);
         m[at] = m16;
         v[at] = v16;
     }
@@ -151,12 +170,12 @@ kernel void adam_sh_update(
 
 // The same with SCALE * m and SCALE * sqrt(v) in 16 bits each: the square root halves the range of exponents of v.
 kernel void adam_sh_update_half(
-    const uint s,                               // listed points
+    const uint s,                               // listed points, or all
     const uint seed,                            // of the rounding: another one in each step
     const float rate,                           // as in adam_update
     const float eps,
-    global const uint *rows,                    // (S) their indices
-    global const float2 *decay,                 // (?, 2) of adam_decay
+    global const uint *rows,                    // (?) their S indices
+    global const float4 *rest,                  // (?, 4) of adam_rest
     global const float *grid,                   // (8)
     global const float *camera,                 // (20)
     global const uint *ids,                     // (N) grid ids
@@ -167,7 +186,8 @@ kernel void adam_sh_update_half(
     const size_t g = get_global_id(0);
     if (g >= s)
         return;
-    const size_t i = rows[g];
+    const size_t i = row_of(rows, g);
+    const float4 missed = rest_of(rest, g);
     float basis[9];
     adam_basis(grid, camera, ids[i], basis);
     const float16 dL_df = SCALE * grad_point_features[i];
@@ -175,8 +195,8 @@ kernel void adam_sh_update_half(
         const size_t at = i * K + k;
         global half *pair = moments + 32 * at;
         const float16 root = vload_half16(1, pair);
-        float16 m16 = decay[g].x * vload_half16(0, pair), v16 = decay[g].y * root * root;
-        sh[at] -= adam_step16(basis[FIRST + k] * dL_df, &m16, &v16, rate, SCALE * eps);
+        float16 m16 = vload_half16(0, pair), v16 = root * root;
+        sh[at] -= adam_step16(basis[FIRST + k] * dL_df, missed, &m16, &v16, rate, SCALE * eps);
         const uint16 random = random16(seed + 9 * (uint)i + FIRST + k);
         store_half16(m16, random >> 19, pair);
         store_half16(sqrt(v16), random >> 6, pair + 16);

@@ -1,8 +1,7 @@
-"""Adam of the network and of listed points, and exponential averages of the weights.
+"""Adam of the network and of the points, and exponential averages of the weights.
 
-A list of all points is dense Adam, torch's: every row moves in every step by its momentum, seen or not. A list of those
-that received a gradient is lazy Adam: a row rests while it is not listed, and its moments have decayed when it is listed
-again. docs/maths.md states the difference.
+Dense Adam is torch's: every row moves in every step by its momentum, seen or not. Lazy Adam leaves a row alone until it
+receives a gradient again, and then makes up for the steps between. docs/maths.md states the difference.
 """
 
 import math
@@ -71,31 +70,33 @@ class Touched:
 
 
 class PointAdam:
-    """Adam of the rows of per-point arrays that one step lists: begin() the step, then update each array.
+    """Adam of per-point arrays: begin() a step, then update each array.
 
-    scale: of SH moments in 16 bits (moment_scale); None: they have 32.
+    lazy: a step updates the rows that it lists; else all. scale: of SH moments in 16 bits (moment_scale); None: in 32.
     """
 
-    def __init__(self, dev, scale=None):
+    def __init__(self, dev, lazy=False, scale=None):
         self.dev = dev
+        self.defines = {"LAZY": int(lazy)}
         self.scale = scale
         self.kinds = ("m", "v") if scale is None else ("mv",)
-        self.decay = None
+        self.rows, self.rest = dev.zeros((1,), np.uint32), dev.zeros((1, 4))  # nobody reads these
 
-    def begin(self, step, rows, last=None):
-        """List the rows of a step.
+    def begin(self, step, n):
+        """Begin a step, from 1 on, that updates all n points."""
+        self.step, self.count = step, n
 
-        step: from 1 on. rows: (S) uint32 point indices, each once. last: (N) uint32, each point's last step, 0 at first;
-        the present one is noted. Without it the rows are all points in every step.
+    def begin_lazy(self, step, rows, last):
+        """Begin a step that updates listed rows.
+
+        rows: (S) uint32 point indices, each once. last: (N) uint32, each point's last step, 0 at first; the present one is
+        noted.
         """
-        self.step, self.rows = step, rows
-        n = len(rows if last is None else last)
-        if self.decay is None or len(self.decay) != n:
-            self.decay = None  # released first
-            self.decay = self.dev.empty((n, 2))
-            self.dev.fill(self.decay, 1)
-        if last is not None:
-            self._launch("adam_decay", step=step, log_beta1=math.log2(BETA1), log_beta2=math.log2(BETA2), last=last)
+        self.step, self.count, self.rows = step, len(rows), rows
+        if len(self.rest) != len(last):
+            self.rest = None  # released first
+            self.rest = self.dev.empty((len(last), 4))
+        self._launch("adam_rest", step=step, log_beta1=math.log2(BETA1), log_beta2=math.log2(BETA2), last=last)
 
     def update_opacity(self, grad_opacity, opacity, m, v, rate, eps):
         """Update opacities, which stay in [0, 1]. All arrays: (N); m and v start as zeros."""
@@ -123,8 +124,8 @@ class PointAdam:
                      **moments, **_step_arguments(self.step, rate, eps))
 
     def _launch(self, kernel, defines=None, **arguments):
-        s = len(self.rows)
-        self.dev.program("adam", **defines or {}).launch(kernel, s, s=s, rows=self.rows, decay=self.decay, **arguments)
+        self.dev.program("adam", **self.defines, **defines or {}).launch(kernel, self.count, s=self.count, rows=self.rows,
+                                                                         rest=self.rest, **arguments)
 
 
 def ema_update(dev, average, parameter, weight):

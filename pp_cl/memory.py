@@ -21,7 +21,7 @@ def point_bytes(train):
         "ids, opacities, SH coefficients": 4 + learned,
         "Adam's moments": 2 * (4 + (2 if train.half_moments else 4) * coefficients),
         "averages": learned if train.average else 0,
-        "weights, Adam's lists": 4 * (3 + (4 if train.lazy else 1)),  # weight, decay; last steps, flags, offsets, rows
+        "weights, Adam's lists": 4 * (1 + (8 if train.lazy else 0)),  # 4 of adam_rest; last steps, flags, offsets, rows
         "points of one view": 4 * (4 + 2 + 16 + 16 + 1 + 3),  # position, box, features, gradients, offsets and lists
         "neighbours": 4 * 6 if train.smooth > 0 else 0,
     }

@@ -48,7 +48,7 @@ class Optimiser:
         self.moments = {
             f"{kind}.{name}": dev.zeros(array.shape) for name, array in model.net.parameters.items() for kind in "mv"
         }
-        self.point_adam, self.touched = PointAdam(dev, scale), Touched(dev)
+        self.point_adam, self.touched = PointAdam(dev, lazy, scale), Touched(dev)
         for block in SH_BLOCKS:
             for kind, array in self.point_adam.sh_moments(block, model.count).items():
                 model.points[f"{kind}.{block.name}"] = array
@@ -57,7 +57,6 @@ class Optimiser:
         if lazy:
             model.points["last"] = dev.zeros((model.count,), np.uint32)
         self.averages = {}  # of the network; those of the points are model.points["a.*"]
-        self._all = None
 
     def update(self, step, rates, grads, camera, feature_eps, seen):
         """One Adam step.
@@ -68,8 +67,10 @@ class Optimiser:
         """
         grad_features, grad_opacity = grads
         points, adam = self.model.points, self.point_adam
-        rows = self.touched.rows(seen, *grads) if self.lazy else self._all_rows()
-        adam.begin(step, rows, points.get("last"))
+        if self.lazy:
+            adam.begin_lazy(step, self.touched.rows(seen, *grads), points["last"])
+        else:
+            adam.begin(step, self.model.count)
         for block in SH_BLOCKS:
             adam.update_sh(
                 block,
@@ -95,12 +96,6 @@ class Optimiser:
                 rates.network,
                 NETWORK_EPS,
             )
-
-    def _all_rows(self):
-        """(N) uint32, the indices of all points."""
-        if self._all is None or len(self._all) != self.model.count:
-            self._all = self.dev.upload(np.arange(self.model.count, dtype=np.uint32))
-        return self._all
 
     def average(self, weight):
         """Move the averages towards the present values by `weight`; a weight of 1 starts them there."""

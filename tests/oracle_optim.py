@@ -13,17 +13,24 @@ class Adam:
         self.betas = beta1, beta2
 
     def step(self, grad, rate, eps, low=-np.inf, high=np.inf, rows=slice(None)):
-        """rows: those that this step updates. Their moments decay as if the gradient had been 0 since their last step."""
+        """rows: those that this step updates. They first make up for the steps since their last one, as if the gradient
+        had been 0 in these: the moments exactly, the moves with the present rate and eps."""
         beta1, beta2 = self.betas
         self.t += 1
         missed = (self.t - 1 - self.last[rows]).reshape(-1, *[1] * (self.parameter.ndim - 1))
         self.last[rows] = self.t
+        c1, c2 = 1 - beta1**self.t, 1 - beta2**self.t
+        m, v, moved = self.m[rows], self.v[rows], self.parameter[rows].copy()
+        for j in range(1, missed.max(initial=0) + 1):
+            with_decay = rate / c1 * m * beta1**j / (np.sqrt(v / c2) + eps) / np.sqrt(beta2) ** j
+            moved -= np.where(j <= missed, with_decay, 0)
+            if beta1**j < 1e-30:
+                break
         grad = np.asarray(grad, np.float64)[rows]
-        self.m[rows] = beta1 * beta1**missed * self.m[rows] + (1 - beta1) * grad
-        self.v[rows] = beta2 * beta2**missed * self.v[rows] + (1 - beta2) * grad * grad
-        denominator = np.sqrt(self.v[rows]) / np.sqrt(1 - beta2**self.t) + eps
-        moved = self.parameter[rows] - rate / (1 - beta1**self.t) * self.m[rows] / denominator
-        self.parameter[rows] = np.clip(moved, low, high)
+        m = beta1 * beta1**missed * m + (1 - beta1) * grad
+        v = beta2 * beta2**missed * v + (1 - beta2) * grad * grad
+        moved -= rate / c1 * m / (np.sqrt(v / c2) + eps)
+        self.m[rows], self.v[rows], self.parameter[rows] = m, v, np.clip(moved, low, high)
 
 
 def sh_basis(direction):
