@@ -47,7 +47,7 @@ class TrainConfig:
     crop: int = 128  # side of the square trained on in a step, 0 = whole images
     phases: bool = True  # draw the sub-pixel phase of the downscaled image anew in each step
     ssim_weight: float = 0.2  # loss = L1 + ssim_weight * (1 - SSIM)
-    sh_rate: tuple = (0.5, 0.25, 0.125)  # Adam's rate of SH degrees 0, 1, 2 at the first step
+    sh_rate: tuple = (0.5, 0.25, 0.125)  # Adam's first rate of SH degrees 0, 1, 2; one of rate 0 stays 0 and is not updated
     sh_rate_decay: float = 0.1  # last over first rate
     sh_delay: tuple = (0.0, 0.01, 0.02)  # warm-up of each degree, as a share of the iterations
     feature_eps: float = 0.0197  # Adam's eps of SH, times the number of values the loss averages
@@ -214,9 +214,11 @@ def validate(config, origin):
         raise UserError(f"{origin}: points.gamma = {config.points.gamma}; both must lie in [1e-5, 1]")
     if not all(1 <= w <= 4096 for w in config.network.widths):
         raise UserError(f"{origin}: network.widths = {config.network.widths}; each must lie in [1, 4096]")
-    rates = config.network.rate + config.train.opacity_rate + config.train.sh_rate
-    if not all(0 < r <= 100 for r in rates) or not all(0 <= d <= 1 for d in config.train.sh_delay):
-        raise UserError(f"{origin}: rates must lie in (0, 100] and sh_delay in [0, 1]")
+    rates = config.network.rate + config.train.opacity_rate
+    if not all(0 < r <= 100 for r in rates) or not all(0 <= r <= 100 for r in config.train.sh_rate):
+        raise UserError(f"{origin}: rates must lie in (0, 100], sh_rate in [0, 100]")
+    if not all(0 <= d <= 1 for d in config.train.sh_delay):
+        raise UserError(f"{origin}: sh_delay must lie in [0, 1]")
 
 
 def load_config(path):

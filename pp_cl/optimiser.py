@@ -29,7 +29,7 @@ class Rates:
         """The rates of a step from 0 on. network, train: config.NetworkConfig, config.TrainConfig."""
         steps = train.iterations
         sh = tuple(
-            learning_rate(step, steps, first, first * train.sh_rate_decay, round(delay * steps))
+            learning_rate(step, steps, first, first * train.sh_rate_decay, round(delay * steps)) if first else 0.0
             for first, delay in zip(train.sh_rate, train.sh_delay, strict=True)
         )
         return cls(sh, learning_rate(step, steps, *train.opacity_rate), learning_rate(step, steps, *network.rate))
@@ -72,6 +72,8 @@ class Optimiser:
         else:
             adam.begin(step, self.model.count)
         for block in SH_BLOCKS:
+            if rates.sh[block.degree] == 0:
+                continue  # its moments are not even read
             adam.update_sh(
                 block,
                 self.model.grid_buffer,

@@ -295,11 +295,11 @@ def test_half_moments_follow_the_oracle(dev, rng, n, block):
 @pytest.mark.parametrize("size", [1e-2, 1e-4, 1e-6])
 def test_half_moments_decay_as_they_should(dev, rng, size):
     """A thousand steps each take less from sqrt(v) than half a unit in its last place: rounding to nearest keeps all."""
-    cloud = Cloud(dev, rng, 64, scale=moment_scale(SH_EPS))
-    grad, none = size * (1 + rng.random((64, 16))), np.zeros((64, 16))
-    cloud.step(grad, np.zeros(64), np.arange(64))
+    cloud = Cloud(dev, rng, 16, scale=moment_scale(SH_EPS))
+    grad, none = size * (1 + rng.random((16, 16))), np.zeros((16, 16))
+    cloud.step(grad, np.zeros(16), np.arange(16))
     for _ in range(1000):
-        cloud.step(none, np.zeros(64), np.arange(64))
+        cloud.step(none, np.zeros(16), np.arange(16))
     _, m, v = cloud.state()["sh"]
     ratio = np.sqrt(v) / np.sqrt(cloud.oracles["sh"].v)
     assert abs(ratio.mean() - 1) < 0.005

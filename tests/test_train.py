@@ -114,6 +114,17 @@ def test_other_ways_of_adam_learn_and_resume_to_the_same_bytes(scene, finished, 
     assert (finished / "checkpoint.npz").read_bytes() != whole
 
 
+def test_a_degree_of_rate_0_is_left_alone(scene, tmp_path, monkeypatch):
+    changes = {"train__sh_rate": "0.5,0.25,0"}
+    train_and_interrupt(scene, tmp_path / "run", 25, monkeypatch, **changes)
+    _, arrays = load_checkpoint(tmp_path / "run" / "checkpoint.npz")
+    for name in ("points.sh2", "state.m.sh4", "state.v.sh4", "state.m.sh7", "state.v.sh7"):
+        assert not arrays[name].any()
+    for name in ("points.sh0", "points.sh1", "state.m.sh1", "state.v.sh1"):
+        assert arrays[name].any()
+    assert main(arguments(scene, tmp_path / "run", **changes)) == 0
+
+
 def test_bounded_memory_gives_the_same_bytes(scene, tmp_path, capsys, monkeypatch):
     """No buffer larger than 200 bytes a point, and pruning in place by many pieces."""
     changes = {"points__count": 50_000, "train__iterations": 24, "train__prune_every": 8}
