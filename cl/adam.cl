@@ -34,7 +34,7 @@
         *v += DECAY2 * (g * g - *v);                                                              \
         return missed + rate * *m / (sqrt(*v) + eps);                                             \
     }
-#define NO_REST (float4)(1.0f, 1.0f, 0.0f, 0.0f)
+#define NO_REST (float4)(1.0f, 1.0f, 0.0f, 0.0f)  // no step missed
 ADAM_STEP(float, adam_step)
 ADAM_STEP(float16, adam_step16)
 
@@ -80,20 +80,21 @@ kernel void adam_touched(
 kernel void adam_rest(
     const uint s,                         // listed points
     const uint step,                      // from 1
-    const float log_beta1,                // log2(beta1)
-    const float log_beta2,
+    const uint t,                         // rows of the table
+    const float log_beta2,                // log2(beta2)
+    global const float4 *table,           // (T, 4) by k: beta1^k, beta2^k, moves, 0; all but beta2^k stand still at its end
     global const uint *rows,              // (S) their indices
     global uint *last,                    // (N) step of the last update, 0: none
-    global float4 *rest)                  // (?, 4) S rows: beta1^k, beta2^k, moves, 0
+    global float4 *rest)                  // (?, 4) S rows of the table
 {
     const uint g = get_global_id(0);
     if (g >= s)
         return;
-    const uint i = rows[g];
-    const float k = step - last[i] - 1;
-    const float log_rho = log_beta1 - 0.5f * log_beta2, rho = exp2(log_rho);
-    const float moves = rho * (1.0f - exp2(k * log_rho)) / (1.0f - rho);
-    rest[g] = (float4)(exp2(k * log_beta1), exp2(k * log_beta2), moves, 0.0f);
+    const uint i = rows[g], k = step - last[i] - 1;
+    float4 row = table[min(k, t - 1)];
+    if (k >= t)
+        row.y = exp2(k * log_beta2);
+    rest[g] = row;
     last[i] = step;
 }
 

@@ -69,6 +69,15 @@ class Touched:
         return self.indices[:nonzero(self.dev, self.flags, self.offsets, self.indices)]
 
 
+def rest_table():
+    """(1024, 4) float32: what k = 0, 1, ... steps without a gradient do, as cl/adam.cl's adam_rest reads it.
+
+    beta1^1024 is 0 in float32.
+    """
+    k, rho = np.arange(1024.0), BETA1 / math.sqrt(BETA2)
+    return np.stack([BETA1**k, BETA2**k, rho * (1 - rho**k) / (1 - rho), 0 * k], 1).astype(np.float32)
+
+
 class PointAdam:
     """Adam of per-point arrays: begin() a step, then update each array.
 
@@ -81,6 +90,7 @@ class PointAdam:
         self.scale = scale
         self.kinds = ("m", "v") if scale is None else ("mv",)
         self.rows, self.rest = dev.zeros((1,), np.uint32), dev.zeros((1, 4))  # nobody reads these
+        self.table = dev.upload(rest_table())
 
     def begin(self, step, n):
         """Begin a step, from 1 on, that updates all n points."""
@@ -96,7 +106,7 @@ class PointAdam:
         if len(self.rest) != len(last):
             self.rest = None  # released first
             self.rest = self.dev.empty((len(last), 4))
-        self._launch("adam_rest", step=step, log_beta1=math.log2(BETA1), log_beta2=math.log2(BETA2), last=last)
+        self._launch("adam_rest", step=step, t=len(self.table), log_beta2=math.log2(BETA2), table=self.table, last=last)
 
     def update_opacity(self, grad_opacity, opacity, m, v, rate, eps):
         """Update opacities, which stay in [0, 1]. All arrays: (N); m and v start as zeros."""
