@@ -4,7 +4,7 @@ BIN := .venv/bin
 READY := .venv/.ready
 
 # What Oclgrind 21.10 simulates right and in seconds. It computes max(int2, int) and comparisons of ulong8 wrongly.
-OCLGRIND := adam conv_weights launch layers loss lpips prune scan smooth target
+OCLGRIND := adam conv_local conv_weights launch layers loss lpips prune scan smooth target
 
 .PHONY: help setup demo test test-intel bench lint oclgrind clean
 

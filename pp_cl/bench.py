@@ -19,8 +19,9 @@ from pp_cl.device import open_device
 from pp_cl.errors import UserError
 from pp_cl.layers import affine
 from pp_cl.peak import Peak
+from pp_cl.tuning import adopt_stored
 from pp_cl.unet import UNet, unet_steps
-from pp_cl.variants import VARIANTS
+from pp_cl.variants import VARIANTS, offered
 
 NETWORK_VARIANTS = ("auto", *VARIANTS)
 CHANNELS_IN, CHANNELS_OUT = 16, 3
@@ -69,7 +70,7 @@ def flops_of(step, channels, height, width):
 def bench_conv(dev, size, widths):
     """Rows of every distinct convolution of the network at size x size: forward, input gradient, weight gradient."""
     peak, rows, seen = Peak(dev), [], set()
-    steps, channels = _network_shape(widths)
+    steps, channels = network_shape(widths)
     for step in (s for s in steps if s.kind.startswith("conv")):
         sources = tuple(channels[name] for name in step.inputs)
         side = size >> step.level
@@ -92,10 +93,10 @@ def bench_unet(dev, size, widths):
     The errors of train are those of the gradient (input's, or a weight's or bias's) where they are largest.
     """
     peak, rng = Peak(dev), np.random.default_rng(0)
-    steps, channels = _network_shape(widths)
+    steps, channels = network_shape(widths)
     x = np.maximum(rng.normal(size=(size, size, CHANNELS_IN)), 0).astype(np.float32)
     grad_image = rng.normal(size=(size, size, CHANNELS_OUT)).astype(np.float32)
-    networks = {variant: make_network(dev, widths, variant) for variant in NETWORK_VARIANTS}
+    networks = {variant: make_network(dev, widths, variant) for variant in ("auto", *offered(dev))}
     found = _network_errors(dev, networks, x[:CHECK_SIZE, :CHECK_SIZE], grad_image[:CHECK_SIZE, :CHECK_SIZE])
     device_x, device_grad = dev.upload(x), dev.upload(grad_image)
     flops = sum(flops_of(step, channels, size, size) for step in steps if step.kind.startswith("conv"))
@@ -147,7 +148,8 @@ def plain_parameters(net, arrays):
     return plain
 
 
-def _network_shape(widths):
+def network_shape(widths):
+    """(steps, {name of a step or "x": its channels}) of the network."""
     steps = unet_steps(widths, CHANNELS_OUT)
     return steps, {"x": CHANNELS_IN} | {s.name: s.channels for s in steps}
 
@@ -210,8 +212,9 @@ def read_shape(size, widths):
     return int(size), tuple(numbers)
 
 
-def run_bench(what, size, widths, json_file=None, plot_file=None, device=None):
-    """Measure, print the table, write the files asked for. what: a key of BENCHES; size, widths: as read_shape().
+def run_bench(what, size, widths, json_file=None, plot_file=None, device=None, tolerance=1e-5):
+    """Measure, print the table, write the files asked for. what: a key of BENCHES; size, widths: as read_shape();
+    tolerance: of the variant auto.
 
     Raises UserError, before anything is measured, also for files that cannot be written.
     """
@@ -221,7 +224,9 @@ def run_bench(what, size, widths, json_file=None, plot_file=None, device=None):
             raise UserError(f"{option} {file}: no such folder; make it first")
     figure = _figure(plot_file) if plot_file else None
     dev = open_device(device)
-    print(f"{dev.name} [{dev.info['platform']}]\n{HEAD}")
+    print(f"{dev.name} [{dev.info['platform']}]")
+    adopt_stored(dev, tolerance)
+    print(HEAD)
     rows = BENCHES[what](dev, size, widths)
     if json_file:
         write_json(json_file, {"device": dev.name, "platform": dev.info["platform"], "rows": rows})

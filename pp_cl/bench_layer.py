@@ -34,10 +34,15 @@ class Layer:
         self.weight, self.bias = dev.upload(pack_weights(self.plain_weight)), dev.upload(pack_bias(self.plain_bias))
         self.grad_weight, self.grad_bias = dev.empty(self.weight.shape), dev.empty(self.bias.shape)
         self.out, self.grad_out = dev.empty((side, side, co)), dev.upload(self.plain_grad_out)
-        self.variants = [v for v in variants.VARIANTS if variants.applicable(v, k, *sources, co) == v]
-        floats = [variants.work_floats(dev, variant, direction, side, self.weight.shape, c if direction == "input" else None)
-                  for variant in self.variants for direction in DIRECTIONS for c in sources]
-        self.work = variants.Work(*[dev.empty(max(1, *n)) for n in zip(*floats, strict=True)])
+        self.variants = [v for v in variants.offered(dev) if variants.applicable(v, k, *sources, co) == v]
+        self.work = self.make_work()
+
+    def make_work(self):
+        """Memory for all variants and directions to work in, with the device's present tile shapes."""
+        floats = [variants.work_floats(self.dev, variant, direction, self.out.shape[0], self.weight.shape,
+                                       x.shape[2] if direction == "input" else None)
+                  for variant in self.variants for direction in DIRECTIONS for x in self.x]
+        return variants.Work(*[self.dev.empty(max(1, *n)) for n in zip(*floats, strict=True)])
 
     def runner(self, variant, direction):
         """A function that computes a direction in a variant, as the network does, and waits for it."""

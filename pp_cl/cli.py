@@ -1,4 +1,7 @@
-"""The command line: pp-cl devices | train | eval | compare | bench. Bad input is one line on stderr and exit status 2."""
+"""The command line: pp-cl devices | train | eval | compare | bench | tune.
+
+Bad input is one line on stderr and exit status 2.
+"""
 
 import argparse
 import json
@@ -67,6 +70,7 @@ def _parser():
     train.add_argument("--points", metavar="N", help="wanted points on the grid")
     train.add_argument("--downscale", metavar="K", help="reduce the images K times (demo: 2, others: 1)")
     train.add_argument("--seed", metavar="S", help="of everything random (0)")
+    _tolerance_option(train)
     train.add_argument(
         "--set", action="append", default=[], metavar="SECTION.KEY=VALUE", help="any other setting, see below"
     )
@@ -84,6 +88,7 @@ def _parser():
     )
     evaluate.add_argument("--split", default="test", help="train, val or test (default)")
     evaluate.add_argument("--save-images", action="store_true", help="write every view to RUN/eval/images/")
+    _tolerance_option(evaluate)
     _device_option(evaluate)
 
     compare = _command(commands, "compare", _compare, "measure one image, or a folder of images, against the truth")
@@ -101,7 +106,15 @@ def _parser():
     )
     bench.add_argument("--json", metavar="FILE", help="also write the rows there")
     bench.add_argument("--plot", metavar="FILE", help="also draw time against error there (.png, .svg, .pdf)")
+    _tolerance_option(bench)
     _device_option(bench)
+
+    tune = _command(commands, "tune", _tune, "time the variants of the convolutions on this device, keep the fastest")
+    tune.add_argument("--preset", choices=PRESETS, help="whose network and sizes (tiny)")
+    tune.add_argument("--widths", metavar="A,B,C", help="channels of the levels, if not the preset's")
+    tune.add_argument("--size", metavar="S", help="side of the image in pixels, a multiple of 4, if not the preset's")
+    _tolerance_option(tune)
+    _device_option(tune)
     return parser
 
 
@@ -115,6 +128,10 @@ def _command(commands, name, run, text, **extra):
 
 def _device_option(parser):
     parser.add_argument("--device", metavar="D", help="index or part of a name, as `pp-cl devices` prints them")
+
+
+def _tolerance_option(parser):
+    parser.add_argument("--tolerance", metavar="E", help="relative L2 error allowed for a convolution (1e-5)")
 
 
 def _metric_names(text):
@@ -150,6 +167,7 @@ def _given_settings(options):
         ("points", "points.count"),
         ("downscale", "scene.downscale"),
         ("seed", "train.seed"),
+        ("tolerance", "network.tolerance"),
     ):
         value = getattr(options, option)
         if value is not None:
@@ -203,7 +221,8 @@ def _eval(options):
     from pp_cl.evaluate import evaluate_run
 
     evaluate_run(
-        Path(options.run_folder), _metric_names(options.metrics), options.split, options.save_images, options.device
+        Path(options.run_folder), _metric_names(options.metrics), options.split, options.save_images, options.device,
+        options.tolerance,
     )
 
 
@@ -221,7 +240,31 @@ def _compare(options):
         print(f"{name:6s} {value:.4f}")
 
 
+def _read_tolerance(options):
+    """The number of --tolerance, else the default."""
+    config = preset("tiny")
+    if options.tolerance is not None:
+        assign(config, "network.tolerance", options.tolerance, "--tolerance")
+        validate(config, "--tolerance")
+    return config.network.tolerance
+
+
 def _bench(options):
     from pp_cl.bench import run_bench
 
-    run_bench(options.what, options.size, options.widths, options.json, options.plot, options.device)
+    if options.what == "conv" and options.tolerance is not None:
+        raise UserError("--tolerance: bench conv shows every variant; give it to bench unet, whose auto picks among them")
+    run_bench(
+        options.what, options.size, options.widths, options.json, options.plot, options.device, _read_tolerance(options)
+    )
+
+
+def _tune(options):
+    from pp_cl.bench import read_shape
+    from pp_cl.tune import EVALUATED, run_tune
+
+    config, tolerance = preset(options.preset or "tiny"), _read_tolerance(options)
+    evaluated = EVALUATED[config.preset]
+    size, widths = read_shape(options.size or str(evaluated), options.widths or ",".join(map(str, config.network.widths)))
+    training = size if options.size else config.train.crop or evaluated
+    run_tune(widths, training, size, tolerance, options.device)

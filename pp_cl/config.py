@@ -36,6 +36,7 @@ class NetworkConfig:
 
     widths: tuple = (32, 64, 128)  # channels of its three levels
     rate: tuple = (1e-3, 1e-4)  # Adam's rate, first and last step
+    tolerance: float = 1e-5  # relative L2 error that the fastest way to compute a convolution may have
 
 
 @dataclass
@@ -180,6 +181,7 @@ LIMITS = {
     "points.radius": (1e-6, 100),
     "points.max_tracked": (0, 2**31 - 1),
     "points.stop": (0, 0.5),
+    "network.tolerance": (0, 1),
     "train.iterations": (1, 10**8),
     "train.seed": (0, 2**32 - 1),
     "train.crop": (0, 2**14),

@@ -20,6 +20,7 @@ from pp_cl.launch import Program
 
 MEND = ("install one with `apt install pocl-opencl-icd` (Debian, Ubuntu), `conda install pocl` or your GPU vendor's driver; "
         "without root, `make setup` in a checkout puts Intel's CPU runtime into .venv")
+TEMPORARY_CACHE = "pp-cl-cache-"
 SMALLER = "lower --points or raise --downscale"
 
 # pyopencl 2026.1 reads this variable unasked when its cache folder cannot be written, and dies of a KeyError.
@@ -73,16 +74,18 @@ def _give_cache():
         with tempfile.TemporaryFile(dir=folder) as probe:
             probe.write(bytes(2**20))  # a full disk is noticed as well
     except OSError as error:
-        temporary = os.environ["XDG_CACHE_HOME"] = tempfile.mkdtemp(prefix="pp-cl-cache-")
+        temporary = os.environ["XDG_CACHE_HOME"] = tempfile.mkdtemp(prefix=TEMPORARY_CACHE)
         atexit.register(shutil.rmtree, temporary, ignore_errors=True)
         print(f"{folder}: {error.strerror}; kernels are built anew: set XDG_CACHE_HOME to keep them", file=sys.stderr)
 
 
 def describe(device):
-    """{"name", "platform", "version", "type", "compute_units", "memory_bytes", "max_allocation_bytes"} of a cl.Device."""
+    """A cl.Device's "name", "platform", "version", "driver", "type", "compute_units", "memory_bytes",
+    "max_allocation_bytes" in a dictionary.
+    """
     return {
         "name": device.name.strip(), "platform": device.platform.name.strip(), "version": device.version.strip(),
-        "type": _type_name(device), "compute_units": device.max_compute_units,
+        "driver": device.driver_version.strip(), "type": _type_name(device), "compute_units": device.max_compute_units,
         "memory_bytes": _memory_bytes(device), "max_allocation_bytes": _max_allocation_bytes(device),
     }
 
@@ -155,7 +158,10 @@ def _debug_level():
 
 
 class Device:
-    """One OpenCL device with its queue, programs and buffers. debug: PP_DEBUG (docs/environment.md)."""
+    """One OpenCL device with its queue, programs and buffers. debug: PP_DEBUG (docs/environment.md).
+
+    tuning, tile_shapes: what tuning.adopt() set for the convolutions; None and {} = as shipped.
+    """
 
     def __init__(self, device):
         self.device = device
@@ -163,6 +169,7 @@ class Device:
         self.info = describe(device)
         self.is_cpu = bool(device.type & cl.device_type.CPU)
         self.debug = _debug_level()
+        self.tuning, self.tile_shapes = None, {}
         self.context = cl.Context([device])
         properties = cl.command_queue_properties.PROFILING_ENABLE if self.debug else 0
         self.queue = cl.CommandQueue(self.context, properties=properties)

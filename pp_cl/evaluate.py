@@ -6,7 +6,7 @@ from pathlib import PurePosixPath
 import numpy as np
 
 from pp_cl.checkpoint import remove_leftovers, write_json
-from pp_cl.config import load_config
+from pp_cl.config import assign, load_config, validate
 from pp_cl.device import open_device
 from pp_cl.image import write_png
 from pp_cl.metrics import Metrics, mean
@@ -17,18 +17,24 @@ from pp_cl.run import CHECKPOINT, load_run, open_scene, with_depth_range
 from pp_cl.scene import reduced_camera
 from pp_cl.schedule import gamma
 from pp_cl.target import Target
+from pp_cl.tuning import adopt_stored
 
 PICTURE_VIEWS = 4  # rows of the comparison picture
 
 
-def evaluate_run(folder, metrics, split, save_images, device_choice):
+def evaluate_run(folder, metrics, split, save_images, device_choice, tolerance=None):
     """Measure a run; writes RUN/eval/metrics.json and comparison.png, prints a table, returns the metrics.
 
-    metrics: names out of psnr, ssim, lpips. Raises UserError for a missing or broken run or split.
+    metrics: names out of psnr, ssim, lpips; tolerance: text for network.tolerance, None = the run's. Raises UserError for a
+    missing or broken run or split.
     """
     config = load_config(folder / "config.json")
+    if tolerance is not None:
+        assign(config, "network.tolerance", tolerance, "--tolerance")
+        validate(config, "--tolerance")
     header, arrays = load_run(folder / CHECKPOINT)
     dev = open_device(device_choice)
+    adopt_stored(dev, config.network.tolerance)
     scene = open_scene(dev, config, (split,))
     measure = Metrics(dev, metrics)
     model = Model.load(dev, header, arrays, config.network.widths, folder / CHECKPOINT)

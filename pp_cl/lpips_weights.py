@@ -16,8 +16,8 @@ import tempfile
 from pathlib import Path
 
 import numpy as np
-from platformdirs import user_cache_dir
 
+from pp_cl.cache import cache_folder, make_cache_folder
 from pp_cl.checkpoint import atomic_file
 from pp_cl.errors import UserError
 
@@ -58,11 +58,6 @@ def load_weights():
     return weights
 
 
-def cache_folder():
-    """PP_CACHE, else the user's cache folder of the system."""
-    return Path(os.environ.get("PP_CACHE") or user_cache_dir("pp-cl"))
-
-
 def digest(weights):
     """SHA-256 of names, shapes and values."""
     sha = hashlib.sha256()
@@ -83,11 +78,7 @@ def _read_cache(path):
 
 
 def _write_cache(path, weights):
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise UserError(f"{path.parent}: cannot be made ({error.strerror}); "
-                        "set PP_CACHE to a folder that can be written") from None
+    make_cache_folder()
     with atomic_file(path) as file:
         np.savez(file, **weights)
 

@@ -18,6 +18,7 @@ from pp_cl.model import Model
 from pp_cl.preview import write_comparison
 from pp_cl.scene import load_scene, reduced_camera
 from pp_cl.train import Trainer
+from pp_cl.tuning import adopt_of_run, adopt_stored
 
 CHECKPOINT = "checkpoint.npz"
 
@@ -76,8 +77,11 @@ def train_run(folder, config, device_choice):
         return
     dev = open_device(device_choice)
     print(f"device: {dev.name} [{dev.info['platform']}]")
+    tolerance = config.network.tolerance
+    tuning = adopt_of_run(dev, tolerance, stored[0].get("tuning"), checkpoint) if stored else adopt_stored(dev, tolerance)
     scene = open_scene(dev, config, ("train",))
     trainer, info = _resume(dev, config, scene, *stored, checkpoint) if stored else _start(dev, config, scene)
+    info["tuning"] = tuning
     print_plan(memory_plan(dev, config, trainer.model, trainer.views), dev)
 
     folder.mkdir(parents=True, exist_ok=True)

@@ -204,11 +204,11 @@ class UNet:
 
     def _variant_of(self, step, direction, height, width, name=None):
         """Variant of a convolution in an image of this size; name: of the input whose gradient is computed."""
-        channels, co, variant = [self.channels[i] for i in step.inputs], step.channels, self.variant
-        if variant == "auto":
+        channels, co, k = [self.channels[i] for i in step.inputs], step.channels, int(step.kind[-1])
+        if self.variant == "auto":
             ci = self.channels[name] if name else sum(channels)
-            variant = variants.pick_variant(self.dev, direction, ci, co, height >> step.level, width >> step.level)
-        return variants.applicable(variant, int(step.kind[-1]), *channels, co)
+            return variants.pick_variant(self.dev, direction, ci, co, height >> step.level, width >> step.level, k, channels)
+        return variants.applicable(self.variant, k, *channels, co)
 
     def memory_plan(self, height, width, training):
         """[(name, shape, bytes)] of all device buffers of this network once it has run at this size.

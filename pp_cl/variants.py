@@ -21,8 +21,10 @@ from pp_cl.winograd import (
 from pp_cl.winograd_filter import transform_flipped_weights, transform_weights
 from pp_cl.winograd_weights import gradient_scratch_floats, winograd_weight_gradient
 
-# By name: the side m of Winograd's tiles of outputs, None for the direct convolution; whether weights are stored as half.
-VARIANTS = {"direct": (None, False), "winograd2": (2, False), "winograd4": (4, False), "winograd4_half": (4, True)}
+# By name: the side m of Winograd's tiles of outputs, None for the direct convolutions, of which "local" goes through local
+# memory; whether weights are stored as half.
+VARIANTS = {"direct": (None, False), "winograd2": (2, False), "winograd4": (4, False), "winograd4_half": (4, True),
+            "local": (None, False)}
 # By what is computed: the variants that are fastest from so many pixels on, measured on 2 cores with AVX-512. Below, too few
 # tiles share the cost of transforming the weights. Channels matter less: from 16 on, all of them gain. Half's is for those
 # who ask for it: faster from 512 channels on, at several hundred times the error.
@@ -31,6 +33,15 @@ FASTEST = {
     "input": ((900, "winograd4"), (256, "winograd2"), (0, "direct")),
     "weights": ((64, "winograd4"), (0, "direct")),
 }
+# By what is computed: a bound on the relative L2 errors of 3x3 layers that bench_layer.py measured, of a ReLU's outputs or
+# normal gradients, with up to 512 channels and 800 x 800 pixels; then of 1x1 layers. docs/convolutions.md has hard inputs.
+# For the weights, "local" and half have no kernels of their own.
+ERRORS = {
+    "forward": {"direct": 9e-7, "winograd2": 7e-7, "winograd4": 2.2e-6, "winograd4_half": 1.5e-3, "local": 9e-7},
+    "input": {"direct": 1.3e-6, "winograd2": 8e-7, "winograd4": 2.6e-6, "winograd4_half": 1.5e-3, "local": 1.3e-6},
+    "weights": {"direct": 3.5e-7, "winograd2": 4e-7, "winograd4": 8.5e-7},
+}
+ERRORS_1X1 = {"forward": 3.5e-7, "input": 4.5e-7, "weights": 4e-7}
 
 
 @dataclass
@@ -61,11 +72,31 @@ def applicable(variant, k, *channels):
     return variant if k == 3 and fits(*channels) else "direct"
 
 
-def pick_variant(dev, direction, ci, co, height, width):
-    """The variant that is shipped as the fastest for a 3x3 convolution of ci to co channels; direction: a key of FASTEST."""
-    if not dev.is_cpu:
-        return "direct"
-    return applicable(next(name for pixels, name in FASTEST[direction] if height * width >= pixels), 3, ci, co)
+def offered(dev):
+    """The variants worth trying on a class of devices: what a CPU calls local memory is no faster than the rest."""
+    return [name for name in VARIANTS if not (dev.is_cpu and name == "local")]
+
+
+def shipped_order(dev, direction, k, channels, pixels):
+    """The variants that can take a convolution and have a kernel of their own for it, the shipped choice first.
+
+    direction: a key of FASTEST; channels: of each source and of the output; pixels: of the image.
+    """
+    names = offered(dev)  # "direct" first: what a GPU takes, where nobody has measured yet
+    if dev.is_cpu:
+        first = [name for least, name in FASTEST[direction] if pixels >= least]
+        names = list(dict.fromkeys([*first, *names]))
+    return [name for name in names if name in ERRORS[direction] and applicable(name, k, *channels) == name]
+
+
+def pick_variant(dev, direction, ci, co, height, width, k=3, sources=()):
+    """The variant for a K x K convolution of ci to co channels: as tuned for the device, else the shipped choice.
+
+    direction: a key of FASTEST; sources: the channels of each source, where the convolution reads two. Raises UserError
+    where no variant is as exact as the tolerance that the device was given.
+    """
+    order = shipped_order(dev, direction, k, (*(sources or (ci,)), co), height * width)
+    return dev.tuning.pick(direction, k, ci, co, height * width, order) if dev.tuning else order[0]
 
 
 def lay_out(dev, variant, weight):
@@ -82,7 +113,7 @@ def forward(dev, variant, x, weight, bias, out, relu, work, x2=None, tiles=None,
     """conv.conv_forward by a variant. laid_out: lay_out(variant, weight), if it is there already."""
     m, half = VARIANTS[variant]
     if m is None:
-        conv_forward(dev, x, weight, bias, out, relu, x2, tiles)
+        conv_forward(dev, x, weight, bias, out, relu, x2, tiles, variant == "local")
         return
     if laid_out is None:
         laid_out = work.weights
@@ -98,14 +129,14 @@ def backward_input(dev, variant, x, weight, first, grad_out, grad_x, masked, wor
         shape = _flipped_shape(weight.shape, c, co)
         flipped = work.weights[:math.prod(shape)].reshape(shape)
         flip_weights(dev, weight, first, flipped)
-        conv_backward_input(dev, x, flipped, grad_out, grad_x, masked, tiles)
+        conv_backward_input(dev, x, flipped, grad_out, grad_x, masked, tiles, variant == "local")
     else:
         transform_flipped_weights(dev, m, weight, first, c, work.weights, half)
         winograd_backward_input(dev, m, x, work.weights, grad_out, grad_x, masked, work.scratch, half, tiles)
 
 
 def backward_weights(dev, variant, x, grad_out, grad_weight, grad_bias, work, x2=None, tiles=None):
-    """conv_weights.weight_gradient by a variant; it reads no weights, so that half changes nothing."""
+    """conv_weights.weight_gradient by a variant; half changes nothing, as it reads no weights, and "local" is direct."""
     m, _ = VARIANTS[variant]
     if m is None:
         weight_gradient(dev, x, grad_out, grad_weight, grad_bias, work.scratch, x2, tiles)

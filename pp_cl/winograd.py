@@ -8,6 +8,7 @@ that they are stored in 16 bits.
 from pp_cl.conv import LANES
 from pp_cl.tiles import SIDE, checked_tiles
 
+# As shipped; Device.tile_shapes["winograd"] has others where the device was tuned.
 # Tiles transformed and multiplied at a time. More of them use the weights better, fewer leave more room in the caches.
 TILES = 64
 # Tiles whose sums are held in registers together, a divisor of TILES: with 2 x 16 channels, 16 of AVX-512's 32 vectors.
@@ -32,7 +33,7 @@ def transformed_floats(m, ci, co, half=False):
 
 def scratch_floats(dev, m, ci, co):
     """Floats of scratch memory of a convolution of ci to co channels or, the other way round, its input gradient."""
-    return dev.info["compute_units"] * positions(m) * ((ci + co) * TILES + 3 * LANES)
+    return dev.info["compute_units"] * positions(m) * ((ci + co) * _tile_shape(dev)[0] + 3 * LANES)
 
 
 def winograd_forward(dev, m, x, transformed, bias, out, relu, scratch, x2=None, half=False, tiles=None):
@@ -90,4 +91,9 @@ def check_size(what, array, floats):
 
 
 def _program(dev, m, blocks, half):
-    return dev.program("winograd", M=m, TILES=TILES, GROUP=GROUP, BLOCKS=pair_blocks(blocks), HALF=int(half))
+    tiles, group = _tile_shape(dev)
+    return dev.program("winograd", M=m, TILES=tiles, GROUP=group, BLOCKS=pair_blocks(blocks), HALF=int(half))
+
+
+def _tile_shape(dev):
+    return dev.tile_shapes.get("winograd") or (TILES, GROUP)

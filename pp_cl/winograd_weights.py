@@ -5,13 +5,14 @@ from pp_cl.tiles import checked_tiles
 from pp_cl.winograd import fits, pair_blocks, positions
 
 # Tiles of one round and, at most, input and output channels of one part of the weights: smaller parts transform the same
-# tiles more often, larger ones outgrow a core's cache.
+# tiles more often, larger ones outgrow a core's cache. Device.tile_shapes may have other TILES.
 TILES, CI_PART, CO_PART = 32, 128, 128
 
 
 def gradient_scratch_floats(dev, m):
     """Floats of scratch memory that winograd_weight_gradient needs."""
-    vectors = positions(m) * ((CI_PART + CO_PART) // LANES * TILES + 3 + CI_PART * CO_PART // LANES) + CO_PART // LANES
+    values = (CI_PART + CO_PART) // LANES * _tile_shape(dev)
+    vectors = positions(m) * (values + 3 + CI_PART * CO_PART // LANES) + CO_PART // LANES
     return dev.info["compute_units"] * vectors * LANES
 
 
@@ -32,7 +33,7 @@ def winograd_weight_gradient(dev, m, x, grad_out, grad_weight, grad_bias, scratc
     if scratch.size < gradient_scratch_floats(dev, m):
         raise ValueError(f"Winograd weight gradient: scratch has {scratch.size} floats, "
                          f"needs {gradient_scratch_floats(dev, m)}")
-    program = dev.program("winograd_weights", M=m, TILES=TILES, CO_PART=CO_PART, BLOCKS=pair_blocks(blocks))
+    program = dev.program("winograd_weights", M=m, TILES=_tile_shape(dev), CO_PART=CO_PART, BLOCKS=pair_blocks(blocks))
     tiles = checked_tiles(dev, tiles, height, width)
     first = 0
     for source, c in zip(sources, channels, strict=True):
@@ -42,6 +43,10 @@ def winograd_weight_gradient(dev, m, x, grad_out, grad_weight, grad_bias, scratc
                        x=source, grad_out=grad_out, tile_list=tiles.list, tile_count=tiles.count, grad_weight=grad_weight,
                        grad_bias=grad_bias, scratch=scratch)
         first += c
+
+
+def _tile_shape(dev):
+    return dev.tile_shapes.get("winograd_weights") or TILES
 
 
 def _ci_part(dev, c, co):

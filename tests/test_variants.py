@@ -17,6 +17,7 @@ from pp_cl.variants import (
     backward_input,
     backward_weights,
     forward,
+    offered,
     pick_variant,
     work_floats,
 )
@@ -82,7 +83,12 @@ def test_shipped_choice(dev, monkeypatch, direction):
     assert pick_variant(dev, direction, 128, 128, 64, 64) == "winograd4"
     assert pick_variant(dev, direction, 128, 128, 20, 20) == ("winograd4" if direction == "weights" else "winograd2")
     assert pick_variant(dev, direction, 128, 128, 1, 63) == "direct"
+    assert pick_variant(dev, direction, 128, 128, 64, 64, k=1) == "direct"
+    assert pick_variant(dev, direction, 48, 16, 64, 64, sources=(24, 24)) == "direct"
+    assert pick_variant(dev, direction, 48, 16, 64, 64, sources=(16, 32)) == "winograd4"
+    assert "local" not in offered(dev)
     monkeypatch.setattr(dev, "is_cpu", False)
+    assert offered(dev) == list(VARIANTS)
     assert pick_variant(dev, direction, 128, 128, 64, 64) == "direct"  # one work-item a compute unit suits no GPU
 
 
