@@ -96,16 +96,28 @@ def bench_unet(dev, size, widths):
     steps, channels = network_shape(widths)
     x = np.maximum(rng.normal(size=(size, size, CHANNELS_IN)), 0).astype(np.float32)
     grad_image = rng.normal(size=(size, size, CHANNELS_OUT)).astype(np.float32)
-    networks = {variant: make_network(dev, widths, variant) for variant in ("auto", *offered(dev))}
-    found = _network_errors(dev, networks, x[:CHECK_SIZE, :CHECK_SIZE], grad_image[:CHECK_SIZE, :CHECK_SIZE])
+    net, names = make_network(dev, widths, "auto"), ("auto", *offered(dev))  # one for all, so that large images fit
+    found = _network_errors(dev, net, names, x[:CHECK_SIZE, :CHECK_SIZE], grad_image[:CHECK_SIZE, :CHECK_SIZE])
     device_x, device_grad = dev.upload(x), dev.upload(grad_image)
     flops = sum(flops_of(step, channels, size, size) for step in steps if step.kind.startswith("conv"))
     rows = []
     for direction, factor, run in (("forward", 1, forward_runner), ("train", 3, train_runner)):
-        runs = {variant: run(dev, net, device_x, device_grad) for variant, net in networks.items()}
-        about = {"layer": "network", "shape": [size, size, CHANNELS_IN, *widths, CHANNELS_OUT], "direction": direction}
-        rows += _rows(about, runs, {variant: found[variant][direction] for variant in networks}, factor * flops, peak)
+        net.variant = "auto"
+        memory = sum(row[2] for row in net.memory_plan(size, size, direction == "train"))
+        print(f"the network's memory, {direction}: {memory / 2**20:.0f} MiB")
+        runs = {variant: _as_variant(net, variant, run(dev, net, device_x, device_grad)) for variant in names}
+        about = {"layer": "network", "shape": [size, size, CHANNELS_IN, *widths, CHANNELS_OUT], "direction": direction,
+                 "memory_bytes": memory}
+        rows += _rows(about, runs, {variant: found[variant][direction] for variant in names}, factor * flops, peak)
     return rows
+
+
+def _as_variant(net, variant, run):
+    """`run` of the network, as a function that has it compute by a variant."""
+    def changed():
+        net.variant = variant
+        run()
+    return changed
 
 
 def make_network(dev, widths, variant):
@@ -154,13 +166,12 @@ def network_shape(widths):
     return steps, {"x": CHANNELS_IN} | {s.name: s.channels for s in steps}
 
 
-def _network_errors(dev, networks, x, grad_image):
+def _network_errors(dev, net, names, x, grad_image):
     """{variant: {"forward": errors, "train": errors}}."""
-    found, outputs = {}, None
-    for variant, net in networks.items():
-        parameters = plain_parameters(net, net.parameters)
-        outputs = outputs or reference.network(net.steps, parameters, x)
-        device_x = dev.upload(x)
+    found, device_x, parameters = {}, dev.upload(x), plain_parameters(net, net.parameters)
+    outputs = reference.network(net.steps, parameters, x)
+    for variant in names:
+        net.variant = variant
         image = net.forward(device_x).get()
         active = {s.name: net.output(s.name).get() > 0 for s in net.steps if s.kind == "conv3"}
         actual = {"x": net.backward(dev.upload(grad_image)).get()} | plain_parameters(net, net.gradients)

@@ -64,7 +64,8 @@ class UNet:
     "enc0.a.bias": (ceil(CO/16) * 16,), ...} float32 on the device. Weights and biases start uniform in +-1/sqrt(CI K K)
     (PyTorch's default for Conv2d), output channels beyond CO at 0, with gradient 0.
 
-    variant: of all 3x3 convolutions that it fits, a name in variants.VARIANTS; "auto" takes the fastest for each.
+    variant: of all 3x3 convolutions that it fits, a name in variants.VARIANTS; "auto" takes the fastest for each. It may be
+    set to another one between two images.
     share: of the last forward pass's multiplications that were computed; see forward's background.
     """
 
@@ -85,7 +86,7 @@ class UNet:
             self.parameters[step.name + ".bias"] = dev.upload(pack_bias(rng.uniform(-bound, bound, step.channels)))
         self.gradients = {name: dev.zeros(p.shape) for name, p in self.parameters.items()}
         self._relu_outputs = {s.name for s in self.steps if s.kind == "conv3"}
-        self._buffers = {}  # {training: (size, {name: array}, the buffers they are views of)}
+        self._buffers = {}  # {training: (size, {name: array}, the buffers they are views of, variants that "work" suits)}
         self._trained = None  # (arrays, pass) of the last forward(training=True)
         self._laid_out = None  # {(step, variant): weights} once frozen
         self.share = 1.0
@@ -259,7 +260,11 @@ class UNet:
             buffers = [self.dev.empty(slot.floats) for slot in slots]
             for slot, buffer in zip(slots, buffers, strict=True):
                 arrays |= {name: buffer[:int(np.prod(shapes[name]))].reshape(shapes[name]) for name in slot.names}
-            arrays["work"] = variants.Work(*[self.dev.empty(n) for n in self._work_floats(height, width, training)])
+            arrays["work"] = variants.Work(self.dev.empty(1), self.dev.empty(1))
             arrays["everything"] = Everything(self.dev, (height, width), self._levels())
-            self._buffers[training] = ((height, width), arrays, buffers)
-        return self._buffers[training][1]
+            self._buffers[training] = ((height, width), arrays, buffers, set())
+        _, arrays, _, suited = self._buffers[training]
+        if self.variant not in suited:  # it may be changed between two images
+            arrays["work"].grow(self.dev, *self._work_floats(height, width, training))
+            suited.add(self.variant)
+        return arrays

@@ -51,6 +51,13 @@ class Work:
     scratch: Array  # float32, any number of floats that suffices
     weights: Array  # weights as a kernel wants them
 
+    def grow(self, dev, scratch, weights):
+        """Make room for as many floats, if there is less."""
+        for name, floats in (("scratch", scratch), ("weights", weights)):
+            if getattr(self, name).size < floats:
+                setattr(self, name, None)  # the old one goes before the new one comes
+                setattr(self, name, dev.empty(floats))
+
 
 def work_floats(dev, variant, direction, height, weight_shape, c=None):
     """(floats of Work.scratch, floats of Work.weights) that a convolution of an image `height` high needs.

@@ -158,3 +158,13 @@ def test_memory_of_the_papers_network(dev):
     assert sum(row[2] for row in inference) < 1.5e9
     assert sum(row[2] for row in training) < 5e9
     assert max(row[2] for row in inference + training) <= 1 << 30
+
+
+def test_the_variant_may_change_between_images(dev, rng):
+    x, grad_y = dev.upload(rng.normal(size=(12, 16, 16)).astype(np.float32)), dev.zeros((12, 16, 3))
+    net = UNet(dev, (16, 32, 48), seed=1, variant="direct")
+    for variant in ("winograd4", "direct", "winograd2"):
+        alone = UNet(dev, (16, 32, 48), seed=1, variant=variant)
+        net.variant = variant
+        np.testing.assert_array_equal(net.forward(x).get(), alone.forward(x).get())
+        np.testing.assert_array_equal(net.backward(grad_y).get(), alone.backward(grad_y).get())
