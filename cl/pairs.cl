@@ -42,8 +42,7 @@ kernel __attribute__((vec_type_hint(float16))) void pairs_fill(
     global const ushort4 *point_box,         // (N, 4) first x, first y, last x, last y
     global const uint *point_offset,         // (N+1) first pair of each point
     global uint *pair_pixel,                 // (P)
-    global float *pair_closeness,            // (P) d in [0, 1]
-    global uint *point_from_pair,            // (P)
+    global uint2 *pair_source,               // (P, 2) point, bits of d in [0, 1]
     global ulong *pair_place,                // (P) depth << 32 | place in the list of the pixel, first come first served
     global volatile uint *pixel_count)       // (HW) accumulates
 {
@@ -65,8 +64,7 @@ kernel __attribute__((vec_type_hint(float16))) void pairs_fill(
                 const int lane = 31 - clz(hits & -hits);
                 const uint pixel = (y + lane / BLOCK_SIDE) * view.width + x + lane % BLOCK_SIDE;
                 pair_pixel[pair] = pixel;
-                pair_closeness[pair] = lane_closeness[lane];
-                point_from_pair[pair] = i;
+                pair_source[pair] = (uint2)(i, as_uint(lane_closeness[lane]));
                 pair_place[pair] = upsample(as_uint(lane_depth[lane]), atomic_inc(&pixel_count[pixel]));
             }
         }

@@ -27,6 +27,7 @@ class PointsConfig:
     gamma: tuple = (0.1, 0.01)  # depth sharpness of the blend, first and last step
     max_tracked: int = 0  # nearest hits of a pixel that get gradients, 0 = all (paper: 64)
     stop: float = 0.0  # stop a pixel where a hit could change it by less than this, 0 = never (paper: 0.001)
+    tau: float = 0.0  # drop a pixel's hits, from the back on, up to this sum of weights, 0 = none
     mean_gradient: bool = False  # divide a point's gradients by its number of pixels, as Pulsar does
 
 
@@ -181,6 +182,7 @@ LIMITS = {
     "points.radius": (1e-6, 100),
     "points.max_tracked": (0, 2**31 - 1),
     "points.stop": (0, 0.5),
+    "points.tau": (0, 0.5),
     "network.tolerance": (0, 1),
     "train.iterations": (1, 10**8),
     "train.seed": (0, 2**32 - 1),

@@ -13,10 +13,10 @@ class Pairs:
     total: number of pairs; the pair buffers have a length P >= total, at least 1.
     seen: (S) uint32, the points with a pair, ascending.
     point_offset: (N+1) uint32, point i owns the pairs point_offset[i] to point_offset[i+1].
-    pair_pixel: (P) uint32, y*W + x. pair_closeness: (P) float32, the d of Eq. (1). point_from_pair: (P) uint32.
+    pair_pixel: (P) uint32, y*W + x. pair_source: (P,2) uint32, the point, and the bits of the d of Eq. (1).
     pixel_offset: (HW+1) uint32, pixel q owns the keys pixel_offset[q] to pixel_offset[q+1].
     pair_key: (P) uint64, depth bits << 32 | pair, sorted within each pixel: by depth, then by point.
-    hit: (P) uint64, scratch here; the blend lists each pixel's weights and points in it.
+    hit: (P) uint64, scratch here; Weights lists each pixel's weights and points in it.
     """
 
     def __init__(self, dev, footprint):
@@ -43,7 +43,7 @@ class Pairs:
 
         self.dev.fill(self.pixel_count, 0)
         launch("pairs_fill", n, point_offset=self.point_offset, pair_pixel=self.pair_pixel,
-               pair_closeness=self.pair_closeness, point_from_pair=self.point_from_pair, pair_place=self.hit,
+               pair_source=self.pair_source, pair_place=self.hit,
                pixel_count=self.pixel_count, **points)
         exclusive_scan(self.dev, self.pixel_count, self.pixel_offset)
         launch("pairs_scatter", self.total, pairs=self.total, pair_pixel=self.pair_pixel, pair_place=self.hit,
@@ -68,9 +68,9 @@ class Pairs:
         if self.capacity >= max(1, total):
             return
         self.capacity = max(1, int(total * GROWTH))
-        dtypes = {"pair_pixel": np.uint32, "pair_closeness": np.float32, "point_from_pair": np.uint32, "pair_key": np.uint64,
-                  "hit": np.uint64}
-        for name in dtypes:
+        buffers = {"pair_pixel": ((), np.uint32), "pair_source": ((2,), np.uint32), "pair_key": ((), np.uint64),
+                   "hit": ((), np.uint64)}
+        for name in buffers:
             setattr(self, name, None)
-        for name, dtype in dtypes.items():
-            setattr(self, name, self.dev.empty((self.capacity,), dtype))
+        for name, (row, dtype) in buffers.items():
+            setattr(self, name, self.dev.empty((self.capacity, *row), dtype))

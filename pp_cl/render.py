@@ -1,6 +1,6 @@
 """From a model and a camera to a picture, and back to gradients: the one place that writes the order of the stages.
 
-project -> pairs -> blend weights -> shade what is seen -> blend features -> U-Net
+project -> pairs -> weights -> shade what is seen -> blend features -> U-Net
 """
 
 import numpy as np
@@ -10,6 +10,7 @@ from pp_cl.pairs import Pairs
 from pp_cl.points import SH_BLOCKS
 from pp_cl.project import Footprint, Projection
 from pp_cl.shade import shade_forward
+from pp_cl.weights import Weights
 
 NETWORK_MULTIPLE = 4  # the U-Net halves its input twice
 PAPER_DEPTH_RANGE = 4.0  # far - near of the scenes for which the paper's radius of 0.0015 was chosen
@@ -29,6 +30,7 @@ class Renderer:
         self.footprint = Footprint(settings.footprint)
         self.projection = Projection(dev, self.footprint)
         self.pairs = Pairs(dev, self.footprint)
+        self.weights = Weights(dev)
         self.blend = Blend(dev, self.footprint, mean=settings.mean_gradient)
         self.offset = (0, 0)
         self.camera, self.radius_buffer = dev.empty((20,)), dev.empty((1,))
@@ -45,7 +47,7 @@ class Renderer:
             self.dev,
             self.camera,
             self.projection.point_camera,
-            self.pairs.seen,
+            self.weights.kept,
             [points[block.name] for block in SH_BLOCKS],
             self.point_features,
         )
@@ -62,7 +64,9 @@ class Renderer:
         self.radius_buffer.set(np.array([radius], np.float32))
         self.projection.grid(self.camera, self.model.grid_buffer, points["ids"], radius, dropout, seed)
         self.pairs.build(self.camera, (padded.height, padded.width), self.projection, self.radius_buffer)
-        self.blend.weights(self.pairs, self.camera, points["opacity"], gamma, settings.max_tracked, settings.stop)
+        self.weights.weigh(
+            self.pairs, self.camera, points["opacity"], gamma, settings.max_tracked, settings.stop, settings.tau
+        )
 
     def backward(self, grad_image):
         """(grad_point_features (N,16), grad_opacity (N)) from the gradient of forward()'s picture.
@@ -72,13 +76,19 @@ class Renderer:
         """
         grad_features = self.model.net.backward(grad_image)
         self.blend.backward(
-            self.pairs, self.point_features, self.features, grad_features, self.grad_point_features, self.grad_opacity
+            self.pairs,
+            self.weights.pair_weight,
+            self.point_features,
+            self.features,
+            grad_features,
+            self.grad_point_features,
+            self.grad_opacity,
         )
         return self.grad_point_features, self.grad_opacity
 
     def add_point_weights(self, total):
         """Add each point's blend weight in the last picture to total (N)."""
-        self.blend.add_point_weights(self.pairs, total)
+        self.weights.add_point_weights(self.pairs, total)
 
     def picture(self, camera, gamma):
         """(H, W, 3) float32 numpy picture of the camera, clamped to [0, 1]."""

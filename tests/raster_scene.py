@@ -6,6 +6,7 @@ from pp_cl.blend import Blend
 from pp_cl.camera import Camera
 from pp_cl.pairs import Pairs
 from pp_cl.project import Footprint, Projection
+from pp_cl.weights import Weights
 
 
 def look_at(eye, target):
@@ -58,12 +59,13 @@ class Scene:
         """(N, HW) bool."""
         return self.dense(np.ones(self.pairs.capacity, bool), False)
 
-    def blend(self, opacity, gamma, point_features, mean=False, max_tracked=0, stop=0.0):
-        """(H, W, 16) blended features."""
+    def blend(self, opacity, gamma, point_features, mean=False, max_tracked=0, stop=0.0, tau=0.0):
+        """(H, W, 16) blended features; those of the points that are not kept are set to NaN first."""
         self.gamma, self.opacity = gamma, self.dev.upload(opacity, np.float32)
-        self.point_features = self.dev.upload(point_features, np.float32)
-        self.blending = Blend(self.dev, self.footprint, mean)
-        self.blending.weights(self.pairs, self.view, self.opacity, gamma, max_tracked, stop)
+        self.weights, self.blending = Weights(self.dev), Blend(self.dev, self.footprint, mean)
+        self.weights.weigh(self.pairs, self.view, self.opacity, gamma, max_tracked, stop, tau)
+        kept = np.isin(np.arange(self.n), self.weights.kept.get())
+        self.point_features = self.dev.upload(np.where(kept[:, None], point_features, np.nan), np.float32)
         self.features = self.dev.empty((*self.shape, 16))
         self.blending.forward(self.pairs, self.point_features, self.features)
         return self.features.get()
@@ -72,7 +74,8 @@ class Scene:
         """{"features": (N, 16), "opacity": (N,)} of sum(features * grad_features) after blend()."""
         grad_point_features, grad_opacity = self.dev.empty((self.n, 16)), self.dev.empty((self.n,))
         self.grad = self.dev.upload(np.reshape(grad_features, (*self.shape, 16)), np.float32)
-        self.blending.backward(self.pairs, self.point_features, self.features, self.grad, grad_point_features, grad_opacity)
+        self.blending.backward(self.pairs, self.weights.pair_weight, self.point_features, self.features, self.grad,
+                               grad_point_features, grad_opacity)
         return {"features": grad_point_features.get(), "opacity": grad_opacity.get()}
 
     def sphere_gradients(self, grad_features):
@@ -80,6 +83,6 @@ class Scene:
         grad_positions, grad_radius = self.dev.empty((self.n, 3)), self.dev.empty((self.n,))
         self.grad = self.dev.upload(np.reshape(grad_features, (*self.shape, 16)), np.float32)
         self.blending.backward_spheres(
-            self.pairs, self.view, self.gamma, self.radius, self.projection.point_camera, self.opacity, self.point_features,
-            self.features, self.grad, grad_positions, grad_radius)
+            self.pairs, self.weights.pair_weight, self.view, self.gamma, self.radius, self.projection.point_camera,
+            self.opacity, self.point_features, self.features, self.grad, grad_positions, grad_radius)
         return {"positions": grad_positions.get(), "radius": grad_radius.get()}

@@ -22,7 +22,7 @@ def blend_on_axis(dev, z, opacity, gamma, camera=CAMERA, **options):
     positions = np.stack([np.zeros(len(z)), np.zeros(len(z)), depth_at(z)], -1)
     scene = Scene(dev, camera, positions, 0.001)
     scene.blend(np.asarray(opacity), gamma, np.resize(np.eye(16), (len(z), 16)), **options)
-    return scene, scene.dense(np.abs(scene.blending.pair_weight.get()[:, 0]))[:, 0]
+    return scene, scene.dense(np.abs(scene.weights.pair_weight.get()[:, 0]))[:, 0]
 
 
 def test_nearest_possible_point_at_the_final_gamma(dev):
@@ -130,7 +130,7 @@ def test_a_hit_on_the_very_rim(dev):
     """d = 0 with an exponent above that of the largest float: no weight, no gradient, no NaN."""
     camera = replace(CAMERA, near=1.8, far=10.0)
     scene = Scene(dev, camera, np.array([[3.0, 0, 4.0]]), np.sqrt(10.0), "sphere")  # rho = |(3, 0, 4) - 5 (0, 0, 1)|
-    assert scene.pairs.total == 1 and scene.pairs.pair_closeness.get()[0] == 0
+    assert scene.pairs.total == 1 and scene.pairs.pair_source.get()[0, 1] == 0
     assert (scene.blend([1.0], 0.005, np.full((1, 16), 2.0)) == 1).all()
     gradients = scene.gradients(np.ones((1, 1, 16))) | scene.sphere_gradients(np.ones((1, 1, 16)))
     assert all((g == 0).all() for g in gradients.values())
