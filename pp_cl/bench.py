@@ -230,10 +230,7 @@ def run_bench(what, size, widths, json_file=None, plot_file=None, device=None, t
     Raises UserError, before anything is measured, also for files that cannot be written.
     """
     size, widths = read_shape(size, widths)
-    for option, file in (("--json", json_file), ("--plot", plot_file)):
-        if file and not Path(file).resolve().parent.is_dir():
-            raise UserError(f"{option} {file}: no such folder; make it first")
-    figure = _figure(plot_file) if plot_file else None
+    figure = check_files(json_file, plot_file)
     dev = open_device(device)
     print(f"{dev.name} [{dev.info['platform']}]")
     adopt_stored(dev, tolerance)
@@ -243,6 +240,14 @@ def run_bench(what, size, widths, json_file=None, plot_file=None, device=None, t
         write_json(json_file, {"device": dev.name, "platform": dev.info["platform"], "rows": rows})
     if figure:
         _plot(figure, plot_file, f"{what}, {size} x {size}, {dev.name}", rows)
+
+
+def check_files(json_file, plot_file):
+    """A figure for the plot, None where there is none. Raises UserError if a file cannot be written."""
+    for option, file in (("--json", json_file), ("--plot", plot_file)):
+        if file and not Path(file).resolve().parent.is_dir():
+            raise UserError(f"{option} {file}: no such folder; make it first")
+    return _figure(plot_file) if plot_file else None
 
 
 def _figure(path):
@@ -266,7 +271,13 @@ def _plot(figure, path, title, rows):
             # an error of 0 has no logarithm: draw it far below float32's
             axes.plot([row["ms"] for row in some], [max(row["rel_l2"], 1e-9) for row in some], "os^"[d], color=f"C{v}",
                       label=f"{variant}, {direction}")
-    axes.grid(True, which="both", alpha=0.3)
-    axes.legend()
+    save_figure(figure, path)
+
+
+def save_figure(figure, path):
+    """Write a figure whose axes are drawn, with a grid and a legend."""
+    for axes in figure.axes:
+        axes.grid(True, which="both", alpha=0.3)
+        axes.legend(fontsize="small")
     with atomic_file(path) as file:
         figure.savefig(file, format=Path(path).suffix[1:].lower())

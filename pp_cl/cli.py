@@ -98,12 +98,16 @@ def _parser():
     compare.add_argument("--json", metavar="FILE", help="also write the result there")
     _device_option(compare)
 
-    bench = _command(commands, "bench", _bench, "time against error of the convolutions and of the network")
-    bench.add_argument("what", choices=("conv", "unet"), help="conv: every layer of the network; unet: all of it")
-    bench.add_argument("--size", default="256", metavar="S", help="side of the image in pixels, a multiple of 4 (256)")
+    bench = _command(commands, "bench", _bench, "time against error of the convolutions, the network, the rasteriser")
     bench.add_argument(
-        "--widths", default="128,256,512", metavar="A,B,C", help="channels of the levels (128,256,512: the paper's)"
+        "what", choices=("conv", "unet", "raster"), help="conv: every layer of the network; unet: all of it; raster: points"
     )
+    bench.add_argument("--size", metavar="S", help="side of the image in pixels, a multiple of 4 (256; raster: 200,400,800)")
+    bench.add_argument("--widths", metavar="A,B,C", help="conv, unet: channels of the levels (128,256,512: the paper's)")
+    bench.add_argument("--scene", choices=("grid", "pulsar"), help="raster: discs on a grid (default), or Pulsar's spheres")
+    bench.add_argument("--points", metavar="N,...", help="raster: numbers of points (10 thousand to 4 million)")
+    bench.add_argument("--tau", metavar="T,...", help="raster: weight that a pixel may drop (0,1e-4,1e-3,1e-2)")
+    bench.add_argument("--gamma", metavar="G", help="raster: depth sharpness of the blend (0.01)")
     bench.add_argument("--json", metavar="FILE", help="also write the rows there")
     bench.add_argument("--plot", metavar="FILE", help="also draw time against error there (.png, .svg, .pdf)")
     _tolerance_option(bench)
@@ -250,12 +254,31 @@ def _read_tolerance(options):
 
 
 def _bench(options):
+    for_raster = {name: getattr(options, name) for name in ("scene", "points", "size", "tau", "gamma")}
+    foreign = [name for name, value in for_raster.items() if value is not None and name != "size"]
+    if options.what == "raster":
+        from pp_cl.bench_raster import DEFAULTS, run_raster
+
+        for name in ("widths", "tolerance"):
+            if getattr(options, name) is not None:
+                raise UserError(f"--{name}: the rasteriser has none; leave it out")
+        given = {name: value for name, value in for_raster.items() if value is not None}
+        run_raster(**(DEFAULTS | given), json_file=options.json, plot_file=options.plot, device=options.device)
+        return
     from pp_cl.bench import run_bench
 
+    if foreign:
+        raise UserError(f"--{foreign[0]}: only for pp-cl bench raster; leave it out")
     if options.what == "conv" and options.tolerance is not None:
         raise UserError("--tolerance: bench conv shows every variant; give it to bench unet, whose auto picks among them")
     run_bench(
-        options.what, options.size, options.widths, options.json, options.plot, options.device, _read_tolerance(options)
+        options.what,
+        options.size or "256",
+        options.widths or "128,256,512",
+        options.json,
+        options.plot,
+        options.device,
+        _read_tolerance(options),
     )
 
 

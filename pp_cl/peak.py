@@ -1,9 +1,11 @@
-"""The measured peak of a device: a loop of independent multiply-adds that never leave the registers."""
+"""The measured peaks of a device: multiply-adds that never leave the registers, and copies far larger than any cache."""
 
 import time
 
 LANES = 16
 SECONDS = 0.02  # of one run: long against the 30 us of a launch, short enough to be run between any two others
+
+COPY_BYTES = 2**28  # caches of processors and GPUs hold up to an eighth of it; above, the copy would be too fast
 
 
 class Peak:
@@ -36,3 +38,19 @@ class Peak:
         start = time.perf_counter()
         self.run()
         return time.perf_counter() - start
+
+
+class Copy:
+    """A copy of COPY_BYTES. bytes: moved by one run(), read and written."""
+
+    def __init__(self, dev):
+        self.dev = dev
+        self.source = dev.zeros((COPY_BYTES // (4 * LANES), LANES))
+        self.target = dev.zeros(self.source.shape)
+        self.bytes = self.source.nbytes + self.target.nbytes
+
+    def run(self):
+        """Copy and wait for it."""
+        self.dev.program("peak").launch("peak_copy", len(self.source), n=len(self.source), source=self.source,
+                                        target=self.target)
+        self.dev.finish()

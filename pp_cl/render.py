@@ -13,6 +13,7 @@ from pp_cl.shade import shade_forward
 from pp_cl.weights import Weights
 
 NETWORK_MULTIPLE = 4  # the U-Net halves its input twice
+WEIGHING = ("project", "pairs", "weights")  # the stages that need no features
 PAPER_DEPTH_RANGE = 4.0  # far - near of the scenes for which the paper's radius of 0.0015 was chosen
 
 
@@ -41,32 +42,39 @@ class Renderer:
 
         dropout: share of the points left out, at random by `seed`. training: keep what backward() needs.
         """
-        self.blend_weights(camera, gamma, dropout, seed)
-        points = self.model.points
-        shade_forward(
-            self.dev,
-            self.camera,
-            self.projection.point_camera,
-            self.weights.kept,
-            [points[block.name] for block in SH_BLOCKS],
-            self.point_features,
-        )
-        self.blend.forward(self.pairs, self.point_features, self.features)
+        for stage in self.stages(camera, gamma, dropout, seed).values():
+            stage()
         return self.model.net.forward(self.features, training, BACKGROUND)
 
-    def blend_weights(self, camera, gamma, dropout=0.0, seed=0):
+    def blend_weights(self, camera, gamma):
         """The first stages of forward(): who covers which pixel, and how much."""
+        stages = self.stages(camera, gamma)
+        for name in WEIGHING:
+            stages[name]()
+
+    def stages(self, camera, gamma, dropout=0.0, seed=0):
+        """{name: function} of forward()'s stages from the points to self.features (H, W, 16), in their order."""
         padded, *self.offset = camera.padded(NETWORK_MULTIPLE)
-        self._allocate(padded.height, padded.width)
+        size = (padded.height, padded.width)
+        self._allocate(*size)
         self.camera.set(padded.packed())
-        points, settings = self.model.points, self.settings
+        points, settings, pairs, weights = self.model.points, self.settings, self.pairs, self.weights
         radius = self._radius(padded)
         self.radius_buffer.set(np.array([radius], np.float32))
-        self.projection.grid(self.camera, self.model.grid_buffer, points["ids"], radius, dropout, seed)
-        self.pairs.build(self.camera, (padded.height, padded.width), self.projection, self.radius_buffer)
-        self.weights.weigh(
-            self.pairs, self.camera, points["opacity"], gamma, settings.max_tracked, settings.stop, settings.tau
-        )
+        sh = [points[block.name] for block in SH_BLOCKS]
+        return {
+            "project": lambda: self.projection.grid(
+                self.camera, self.model.grid_buffer, points["ids"], radius, dropout, seed
+            ),
+            "pairs": lambda: pairs.build(self.camera, size, self.projection, self.radius_buffer),
+            "weights": lambda: weights.weigh(
+                pairs, self.camera, points["opacity"], gamma, settings.max_tracked, settings.stop, settings.tau
+            ),
+            "shade": lambda: shade_forward(
+                self.dev, self.camera, self.projection.point_camera, weights.kept, sh, self.point_features
+            ),
+            "blend": lambda: self.blend.forward(pairs, self.point_features, self.features),
+        }
 
     def backward(self, grad_image):
         """(grad_point_features (N,16), grad_opacity (N)) from the gradient of forward()'s picture.
@@ -74,7 +82,10 @@ class Renderer:
         The gradients of the network's parameters lie in model.net.gradients; those of the SH coefficients are rank one in
         grad_point_features, and the optimiser never forms them.
         """
-        grad_features = self.model.net.backward(grad_image)
+        return self.backward_features(self.model.net.backward(grad_image))
+
+    def backward_features(self, grad_features):
+        """The same from the gradient of self.features (H, W, 16)."""
         self.blend.backward(
             self.pairs,
             self.weights.pair_weight,

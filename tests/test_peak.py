@@ -1,10 +1,10 @@
-"""cl/peak.cl: it does the multiply-adds it is credited with."""
+"""cl/peak.cl: it does the multiply-adds, and copies the bytes, it is credited with."""
 
 import numpy as np
 import pytest
 
 from pp_cl import peak
-from pp_cl.peak import Peak
+from pp_cl.peak import Copy, Peak
 
 
 @pytest.fixture
@@ -31,3 +31,12 @@ def test_a_run_is_long_enough_to_be_timed(dev, monkeypatch):
     seconds = iter([0.001, 0.004, 0.021])
     monkeypatch.setattr(Peak, "_seconds", lambda self: next(seconds))
     assert Peak(dev).rounds == 64 * 4
+
+
+def test_the_copy_copies_all_that_it_counts(dev, monkeypatch, rng):
+    monkeypatch.setattr(peak, "COPY_BYTES", 64 * 257)
+    copy = Copy(dev)
+    assert copy.bytes == 2 * 64 * 257
+    copy.source.set(rng.normal(size=(257, 16)).astype(np.float32))
+    copy.run()
+    np.testing.assert_array_equal(copy.target.get(), copy.source.get())
