@@ -1,4 +1,4 @@
-// Exclusive prefix sums of uint32, and the list of the non-zero entries.
+// Exclusive prefix sums of uint32, and the list of the non-zero entries. A sum above the largest uint is the largest uint.
 #include "common.h"
 
 #ifndef FLAGS
@@ -22,7 +22,7 @@ kernel void scan_sums(
     const uint end = min(n, (block + 1) * BLOCK);
     uint sum = 0;
     for (uint i = block * BLOCK; i < end; i++)
-        sum += scan_value(values[i]);
+        sum = add_sat(sum, scan_value(values[i]));
     block_sum[block] = sum;
 }
 
@@ -41,7 +41,7 @@ kernel void scan_offsets(
     uint sum = block_offset[block];
     for (uint i = block * BLOCK; i < end; i++) {
         offsets[i] = sum;
-        sum += scan_value(values[i]);
+        sum = add_sat(sum, scan_value(values[i]));
     }
     if (block == b - 1) offsets[n] = sum;
 }

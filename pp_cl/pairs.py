@@ -2,8 +2,10 @@
 
 import numpy as np
 
+from pp_cl.errors import UserError
 from pp_cl.scan import exclusive_scan, nonzero, read_total
 
+MOST_PAIRS = 2**32 - 1  # that can be numbered
 GROWTH = 1.25  # spare room of the pair buffers, so that they are not replaced at every view
 
 
@@ -26,6 +28,8 @@ class Pairs:
 
     def build(self, view, size, projection, point_radius):
         """Find and sort the hits of projected points. Waits for the device, to learn how many there are.
+
+        Raises UserError for more than can be numbered or kept in the device's memory.
 
         view: (20) packed camera. size: its (height, width). projection: Projection of N points. point_radius: (1) or (N)
         float32, the radii they were projected with.
@@ -64,6 +68,9 @@ class Pairs:
 
     def _reserve(self, total):
         """Buffers for `total` pairs; old ones are released before larger ones are allocated."""
+        if total >= MOST_PAIRS:
+            raise UserError(f"the points of one view cover more than {MOST_PAIRS} pixels in all: lower --points, "
+                            "raise --downscale, or lower points.radius")
         self.total = total
         if self.capacity >= max(1, total):
             return

@@ -7,7 +7,7 @@ BLOCK = 512  # of cl/scan.cl
 
 
 def exclusive_scan(dev, values, offsets, flags=False):
-    """Write offsets[i] = sum of values[:i], so that offsets[N] is the total.
+    """Write offsets[i] = sum of values[:i], so that offsets[N] is the total; at most 2^32 - 1, where sums stay.
 
     values: (N) uint32, N >= 1. offsets: (N+1) uint32. flags: every non-zero value counts as one.
     """
