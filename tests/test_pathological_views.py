@@ -17,8 +17,8 @@ TAUS = (0.0, 0.01)
 
 
 def check(dev, rng, camera, positions, radius, kind, tau=0.0, gamma=0.05):
-    """A scene's hits, features and gradients against the oracle; returns the scene. Pixels at whose rims rounding decides over
-    a hit, or makes up most of a closeness, are left out."""
+    """A scene's hits, features and gradients against the oracle; returns the scene. Left out are pixels where rounding
+    decides over a hit, or makes up most of a closeness."""
     n = len(positions)
     opacity, point_features = np.float32(rng.uniform(0, 1, n)), rng.normal(size=(n, 16))
     scene = Scene(dev, camera, positions, radius, kind)
