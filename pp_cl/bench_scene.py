@@ -16,7 +16,7 @@ from pp_cl.weights import Weights
 SAMPLES = 64  # pixels compared with float64
 CHANNELS = 16
 ROW = 4 * CHANNELS  # bytes of the features of a point or a pixel
-HIGHER_SH = {1: 0.1, 2: -0.05}  # every coefficient of these degrees; random ones would take minutes for 4 million points
+HIGHER_SH = 0.1  # every coefficient of degrees 1 and 2; random ones would take minutes for 4 million points
 
 
 class _Scene:
@@ -96,8 +96,9 @@ class GridScene(_Scene):
         self.sh0 = rng.standard_normal((self.count, 1, CHANNELS), np.float32)
         model.points["opacity"].set(self.opacity)
         model.points["sh0"].set(self.sh0)
-        for degree, value in HIGHER_SH.items():
-            dev.fill(model.points[f"sh{degree}"], value)
+        for name, coefficients in model.points.items():
+            if name.startswith("sh") and name != "sh0":
+                dev.fill(coefficients, HIGHER_SH)
         self.settings = PointsConfig(footprint="disc", radius=0.0015)
         self.renderer = Renderer(dev, model, self.settings)
         self.pairs, self.weights = self.renderer.pairs, self.renderer.weights
@@ -132,11 +133,10 @@ class GridScene(_Scene):
     def shaded(self, points):
         """(S, 16) float64 features of some points."""
         x, y, z = (self.reference.points[points] / self.reference.range[points, None] @ self.camera.pose[:, :3].T).T
-        first = 0.4886025119029199 * (z - y - x)  # the sums of each degree's basis, cl/sh.h
-        second = (1.0925484305920792 * (x * y - y * z - x * z) + 0.9461746957575601 * z**2 - 0.31539156525252005
-                  + 0.5462742152960396 * (x**2 - y**2))
-        higher = HIGHER_SH[1] * first + HIGHER_SH[2] * second
-        return 0.28209479177387814 * self.sh0[points, 0].astype(np.float64) + higher[:, None]
+        # the sum of the harmonics 1 to 8 of cl/sh.h
+        higher = (0.4886025119029199 * (z - y - x) + 1.0925484305920792 * (x * y - y * z - x * z)
+                  + 0.9461746957575601 * z**2 - 0.31539156525252005 + 0.5462742152960396 * (x**2 - y**2))
+        return 0.28209479177387814 * self.sh0[points, 0].astype(np.float64) + HIGHER_SH * higher[:, None]
 
     def moved(self):
         """As _Scene, with the stages of a grid and of harmonics."""

@@ -35,7 +35,7 @@ class Blend:
 
         point_radius: (1) or (N). point_camera: (N,4) from project. The rest as for Weights.weigh and backward.
         """
-        n, grad_pair = pairs.points, self.dev.empty((pairs.capacity, 2))
+        n, grad_pair = pairs.points, self.dev.empty(pair_weight.shape)
         self.program.launch("blend_backward_pairs", n, n=n, pair_source=pairs.pair_source, grad_pair=grad_pair,
                             **self._slopes(pairs, pair_weight, point_features, features, grad_features))
         self.program.launch(

@@ -70,6 +70,7 @@ def _parser():
     train.add_argument("--points", metavar="N", help="wanted points on the grid")
     train.add_argument("--downscale", metavar="K", help="reduce the images K times (demo: 2, others: 1)")
     train.add_argument("--seed", metavar="S", help="of everything random (0)")
+    train.add_argument("--memory", metavar="GIB", help="device memory to take; what is left saves time where views stay")
     _tolerance_option(train)
     train.add_argument(
         "--set", action="append", default=[], metavar="SECTION.KEY=VALUE", help="any other setting, see below"
@@ -171,6 +172,7 @@ def _given_settings(options):
         ("points", "points.count"),
         ("downscale", "scene.downscale"),
         ("seed", "train.seed"),
+        ("memory", "train.memory"),
         ("tolerance", "network.tolerance"),
     ):
         value = getattr(options, option)

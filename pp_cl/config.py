@@ -65,6 +65,7 @@ class TrainConfig:
     final_weight: float = 1.0  # at the end drop points whose summed weight over the training views is lower
     average: bool = True  # keep averaged (EMA) weights over the last 30 % and deliver these
     checkpoint_every: int = 1000  # steps
+    memory: float = 0.0  # GiB of device memory to take; what is not needed keeps the hits of views that stay, 0 = none kept
     log_every: int = 50  # steps
     previews: int = 4  # pictures over the whole run
 
@@ -195,6 +196,7 @@ LIMITS = {
     "train.prune_opacity": (0, 1),
     "train.prune_every": (1, 10**8),
     "train.checkpoint_every": (1, 10**8),
+    "train.memory": (0, 2**20),
     "train.log_every": (1, 10**8),
     "train.previews": (0, 1000),
     "train.sh_rate_decay": (1e-6, 1),

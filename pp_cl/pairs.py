@@ -6,13 +6,17 @@ from pp_cl.errors import UserError
 from pp_cl.scan import exclusive_scan, nonzero, read_total
 
 MOST_PAIRS = 2**32 - 1  # that can be numbered
+PAIR_ARRAYS = {"pair_pixel": ((), np.uint32), "pair_source": ((2,), np.uint32), "pair_key": ((), np.uint64),
+               "hit": ((), np.uint64)}  # shape and dtype of a pair's row
+# What build() makes and no later stage changes.
+LASTING = ("seen", "point_offset", "pixel_offset", "pair_pixel", "pair_source", "pair_key")
 GROWTH = 1.25  # spare room of the pair buffers, so that they are not replaced at every view
 
 
 class Pairs:
-    """The hits of the view built last, with the buffers they live in; these grow and are kept from view to view.
+    """The hits of the view built or adopted last; the buffers grow and are kept from view to view.
 
-    total: number of pairs; the pair buffers have a length P >= total, at least 1.
+    total: number of pairs; P = max(1, total).
     seen: (S) uint32, the points with a pair, ascending.
     point_offset: (N+1) uint32, point i owns the pairs point_offset[i] to point_offset[i+1].
     pair_pixel: (P) uint32, y*W + x. pair_source: (P,2) uint32, the point, and the bits of the d of Eq. (1).
@@ -25,6 +29,7 @@ class Pairs:
         self.dev = dev
         self.program = dev.program("pairs", **footprint.defines)
         self.points = self.pixels = self.capacity = 0
+        self._of_points, self._of_pixels, self._of_pairs = {}, {}, {}
 
     def build(self, view, size, projection, point_radius):
         """Find and sort the hits of projected points. Waits for the device, to learn how many there are.
@@ -40,44 +45,54 @@ class Pairs:
         points = {"n": n, "k": point_radius.size, "camera": view, "point_radius": point_radius,
                   "point_camera": projection.point_camera, "point_box": projection.point_box}
 
-        launch("pairs_count", n, point_count=self.point_count, **points)
-        self.seen = self.seen_index[:nonzero(self.dev, self.point_count, self.point_offset, self.seen_index)]
-        exclusive_scan(self.dev, self.point_count, self.point_offset)
+        point_count, seen_index = self._of_points["count"], self._of_points["seen"]
+        launch("pairs_count", n, point_count=point_count, **points)
+        self.seen = seen_index[:nonzero(self.dev, point_count, self.point_offset, seen_index)]
+        exclusive_scan(self.dev, point_count, self.point_offset)
         self._reserve(read_total(self.dev, self.point_offset))
 
-        self.dev.fill(self.pixel_count, 0)
-        launch("pairs_fill", n, point_offset=self.point_offset, pair_pixel=self.pair_pixel,
-               pair_source=self.pair_source, pair_place=self.hit,
-               pixel_count=self.pixel_count, **points)
-        exclusive_scan(self.dev, self.pixel_count, self.pixel_offset)
+        pixel_count = self._of_pixels["count"]
+        self.dev.fill(pixel_count, 0)
+        launch("pairs_fill", n, point_offset=self.point_offset, pair_pixel=self.pair_pixel, pair_source=self.pair_source,
+               pair_place=self.hit, pixel_count=pixel_count, **points)
+        exclusive_scan(self.dev, pixel_count, self.pixel_offset)
         launch("pairs_scatter", self.total, pairs=self.total, pair_pixel=self.pair_pixel, pair_place=self.hit,
                pixel_offset=self.pixel_offset, pair_key=self.pair_key)
         launch("pairs_sort", hw, hw=hw, pixel_offset=self.pixel_offset, scratch=self.hit, pair_key=self.pair_key)
+
+    def adopt(self, total, arrays):
+        """Take over what build() once made, as {name: array}: the names of LASTING, and these sizes."""
+        n, hw = arrays["point_offset"].size - 1, arrays["pixel_offset"].size - 1
+        self._resize(n, hw)
+        self._reserve(total)
+        for name in LASTING:
+            setattr(self, name, arrays[name])
 
     def _resize(self, n, hw):
         """Buffers for n points and hw pixels."""
         if n != self.points:
             self.points = n
-            self.point_count = self.dev.empty((n,), np.uint32)
-            self.point_offset = self.dev.empty((n + 1,), np.uint32)
-            self.seen_index = self.dev.empty((n,), np.uint32)
+            sizes = {"count": n, "offset": n + 1, "seen": n}
+            self._of_points = {}  # released first
+            self._of_points = {name: self.dev.empty((size,), np.uint32) for name, size in sizes.items()}
         if hw != self.pixels:
             self.pixels = hw
-            self.pixel_count = self.dev.empty((hw,), np.uint32)
-            self.pixel_offset = self.dev.empty((hw + 1,), np.uint32)
+            sizes = {"count": hw, "offset": hw + 1}
+            self._of_pixels = {name: self.dev.empty((size,), np.uint32) for name, size in sizes.items()}
+        self.point_offset, self.pixel_offset = self._of_points["offset"], self._of_pixels["offset"]
 
     def _reserve(self, total):
-        """Buffers for `total` pairs; old ones are released before larger ones are allocated."""
+        """Arrays for `total` pairs; old buffers are released before larger ones are allocated."""
         if total >= MOST_PAIRS:
             raise UserError(f"the points of one view cover more than {MOST_PAIRS} pixels in all: lower --points, "
                             "raise --downscale, or lower points.radius")
-        self.total = total
-        if self.capacity >= max(1, total):
-            return
-        self.capacity = max(1, int(total * GROWTH))
-        buffers = {"pair_pixel": ((), np.uint32), "pair_source": ((2,), np.uint32), "pair_key": ((), np.uint64),
-                   "hit": ((), np.uint64)}
-        for name in buffers:
-            setattr(self, name, None)
-        for name, (row, dtype) in buffers.items():
-            setattr(self, name, self.dev.empty((self.capacity, *row), dtype))
+        self.total, p = total, max(1, total)
+        if self.capacity < p:
+            self.capacity = max(1, int(total * GROWTH))
+            for name in PAIR_ARRAYS:
+                setattr(self, name, None)
+            self._of_pairs = {}
+            for name, (row, dtype) in PAIR_ARRAYS.items():
+                self._of_pairs[name] = self.dev.empty((self.capacity, *row), dtype)
+        for name in PAIR_ARRAYS:
+            setattr(self, name, self._of_pairs[name][:p])

@@ -6,6 +6,7 @@ project -> pairs -> weights -> shade what is seen -> blend features -> U-Net
 import numpy as np
 
 from pp_cl.blend import BACKGROUND, Blend
+from pp_cl.pair_cache import PairCache
 from pp_cl.pairs import Pairs
 from pp_cl.points import SH_BLOCKS
 from pp_cl.project import Footprint, Projection
@@ -20,8 +21,8 @@ PAPER_DEPTH_RANGE = 4.0  # far - near of the scenes for which the paper's radius
 class Renderer:
     """Renders a model; holds what the backward pass needs of the last forward pass.
 
-    settings: config.PointsConfig. offset: (left, top) of the asked-for picture in the padded one. camera: (20,) device
-    buffer of the padded camera.
+    settings: config.PointsConfig. cache: keeps the hits of views with a key. offset: (left, top) of the asked-for picture in
+    the padded one. camera: (20,) device buffer of the padded camera.
     """
 
     def __init__(self, dev, model, settings):
@@ -31,18 +32,20 @@ class Renderer:
         self.footprint = Footprint(settings.footprint)
         self.projection = Projection(dev, self.footprint)
         self.pairs = Pairs(dev, self.footprint)
+        self.cache = PairCache(dev)
         self.weights = Weights(dev)
         self.blend = Blend(dev, self.footprint, mean=settings.mean_gradient)
         self.offset = (0, 0)
         self.camera, self.radius_buffer = dev.empty((20,)), dev.empty((1,))
         self._count = self._size = None
 
-    def forward(self, camera, gamma, dropout=0.0, seed=0, training=False):
+    def forward(self, camera, gamma, dropout=0.0, seed=0, training=False, key=None):
         """(H, W, 3) device array, unclamped, of the camera padded to a multiple of 4; see `offset`.
 
-        dropout: share of the points left out, at random by `seed`. training: keep what backward() needs.
+        dropout: share of the points left out, at random by `seed`. training: keep what backward() needs. key: of a view
+        whose camera and points are the same in every call until cache.clear(), so that its hits may be kept.
         """
-        for stage in self.stages(camera, gamma, dropout, seed).values():
+        for stage in self.stages(camera, gamma, dropout, seed, key).values():
             stage()
         return self.model.net.forward(self.features, training, BACKGROUND)
 
@@ -52,7 +55,7 @@ class Renderer:
         for name in WEIGHING:
             stages[name]()
 
-    def stages(self, camera, gamma, dropout=0.0, seed=0):
+    def stages(self, camera, gamma, dropout=0.0, seed=0, key=None):
         """{name: function} of forward()'s stages from the points to self.features (H, W, 16), in their order."""
         padded, *self.offset = camera.padded(NETWORK_MULTIPLE)
         size = (padded.height, padded.width)
@@ -66,7 +69,7 @@ class Renderer:
             "project": lambda: self.projection.grid(
                 self.camera, self.model.grid_buffer, points["ids"], radius, dropout, seed
             ),
-            "pairs": lambda: pairs.build(self.camera, size, self.projection, self.radius_buffer),
+            "pairs": lambda: self.cache.build(key, pairs, self.camera, size, self.projection, self.radius_buffer),
             "weights": lambda: weights.weigh(
                 pairs, self.camera, points["opacity"], gamma, settings.max_tracked, settings.stop, settings.tau
             ),

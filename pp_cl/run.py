@@ -21,7 +21,7 @@ from pp_cl.train import Trainer
 from pp_cl.tuning import adopt_of_run, adopt_stored
 
 CHECKPOINT = "checkpoint.npz"
-
+GIB = 2**30
 
 HEADER = ("scene", "step", "finished", "initial_points", "grid", "depth_range")  # of a run's checkpoint
 
@@ -82,12 +82,23 @@ def train_run(folder, config, device_choice):
     scene = open_scene(dev, config, ("train",))
     trainer, info = _resume(dev, config, scene, *stored, checkpoint) if stored else _start(dev, config, scene)
     info["tuning"] = tuning
-    print_plan(memory_plan(dev, config, trainer.model, trainer.views), dev)
+    plan = memory_plan(dev, config, trainer.model, trainer.views)
+    print_plan(plan, dev)
+    trainer.renderer.cache.budget = spare_memory(plan, config.train.memory)
 
     folder.mkdir(parents=True, exist_ok=True)
     remove_leftovers(folder)
     write_text(folder / "config.json", config.to_json() + "\n")
     _optimise(trainer, config, folder, info)
+
+
+def spare_memory(plan, limit):
+    """Bytes that a plan, rows (what, shape, bytes), leaves of `limit` GiB; 0 without a limit. Raises UserError below 0."""
+    needed = sum(size for _, _, size in plan)
+    if limit and limit * GIB < needed:
+        raise UserError(f"--memory {limit:g}: the training needs {needed / GIB:.2f} GiB; raise it, lower --points, raise "
+                        "--downscale, or set train.crop or smaller network.widths")
+    return max(0, int(limit * GIB) - needed)
 
 
 def _check_folder(folder):

@@ -67,6 +67,7 @@ class Trainer:
             dropout=config.dropout,
             seed=int(rng.integers(2**32)),
             training=True,
+            key=view_index if self.views_stay() else None,
         )
         grad_image = self.loss.forward_backward(image, target, *self.renderer.offset)
         grads = self.renderer.backward(grad_image)
@@ -77,6 +78,11 @@ class Trainer:
         self.step = t + 1
         self._regularise(rates)
         return self._terms()
+
+    def views_stay(self):
+        """Whether every step sees a view as the last one did: whole images without phases, all points."""
+        config = self.config
+        return config.crop == 0 and config.dropout == 0 and not (config.phases and self.downscale > 1)
 
     def draw(self, rng):
         """(view index, (x0, y0, width, height), phase) of this step: views in a new random order every epoch."""
@@ -134,6 +140,7 @@ class Trainer:
         points = self.model.points
         keep = keep_indices(self.dev, weights, least, points["opacity"], self.config.prune_opacity)
         if len(keep) < self.model.count:
+            self.renderer.cache.clear()
             prune(self.dev, points, keep)
             self._smoother = None
 

@@ -17,7 +17,7 @@ class Weights:
     def __init__(self, dev):
         self.dev = dev
         self.program = dev.program("weights")
-        self.pair_weight = self.kept = self._lists = None
+        self.pair_weight = self.kept = self._buffer = self._lists = None
 
     def weigh(self, pairs, view, opacity, gamma, max_tracked=0, stop=0.0, tau=0.0):
         """Weigh all pairs. Overwrites pairs.hit with each pixel's list of weights and points.
@@ -28,9 +28,10 @@ class Weights:
         back on, hits whose weights sum to no more than this; no feature of the pixel changes by more than tau times the
         range of that feature over the pixel's points and the background. 0: none.
         """
-        if self.pair_weight is None or len(self.pair_weight) != pairs.capacity:
-            self.pair_weight = None  # released first
-            self.pair_weight = self.dev.empty((pairs.capacity, 2))
+        if self._buffer is None or len(self._buffer) != pairs.capacity:
+            self.pair_weight = self._buffer = None  # released first
+            self._buffer = self.dev.empty((pairs.capacity, 2))
+        self.pair_weight = self._buffer[: len(pairs.hit)]
         self.program.launch(
             "weights_of_hits", pairs.pixels, hw=pairs.pixels, max_tracked=max_tracked or ALL, gamma=gamma, least=stop,
             tau=tau, camera=view, pixel_offset=pairs.pixel_offset, pair_key=pairs.pair_key, pair_source=pairs.pair_source,

@@ -49,7 +49,7 @@ class Scene:
         return np.repeat(np.arange(self.n), np.diff(self.pairs.point_offset.get().astype(np.int64)))
 
     def dense(self, pair_values, missing=0.0):
-        """(N, HW) of values by pair: (capacity, ...) on the host."""
+        """(N, HW) of values by pair: (P, ...) on the host."""
         total = self.pairs.total
         matrix = np.full((self.n, self.camera.width * self.camera.height), missing, pair_values.dtype)
         matrix[self.pair_points(), self.pairs.pair_pixel.get()[:total]] = pair_values[:total]
@@ -57,7 +57,7 @@ class Scene:
 
     def hits(self):
         """(N, HW) bool."""
-        return self.dense(np.ones(self.pairs.capacity, bool), False)
+        return self.dense(np.ones(max(1, self.pairs.total), bool), False)
 
     def blend(self, opacity, gamma, point_features, mean=False, max_tracked=0, stop=0.0, tau=0.0):
         """(H, W, 16) blended features; those of the points that are not kept are set to NaN first."""

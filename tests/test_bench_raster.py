@@ -38,7 +38,7 @@ def test_float64_values_are_the_oracles(dev, name):
     blend = oracle_raster.blend(camera, geometry, scene.opacity, 0.05)
     everyone = np.arange(scene.count)
     if name == "grid":
-        sh = np.concatenate([scene.renderer.model.points[f"sh{d}"].get() for d in range(3)], 1)
+        sh = np.concatenate([v.get() for k, v in scene.renderer.model.points.items() if k.startswith("sh")], 1)
         np.testing.assert_allclose(scene.shaded(everyone), oracle_raster.shade(positions, camera.eye, sh), atol=1e-6)
     expected, compared = oracle_raster.features(blend, scene.shaded(everyone)), 0
     for pixel in range(256):

@@ -7,6 +7,7 @@ import subprocess
 import sys
 import time
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -221,6 +222,47 @@ def test_a_loss_that_is_not_finite_stops_the_run_and_keeps_the_checkpoint(scene,
     assert main(arguments(scene, tmp_path / "run")) == 2
     assert "the loss is not finite at step 16" in capsys.readouterr().err
     assert load_checkpoint(tmp_path / "run" / "checkpoint.npz")[0]["step"] == 10
+
+
+def test_a_training_that_keeps_its_hits_ends_with_the_same_bytes(scene, tmp_path, monkeypatch):
+    """Of whole images without phases; also where there is room for some views only, and over prunings."""
+    whole = {"train__crop": 0, "train__phases": "false", "train__dropout": 0}
+    whole |= {"train__iterations": 40, "train__prune_every": 15}
+    results, caches = [], []
+    for budget in (0, 300_000, 10**9):
+        monkeypatch.setattr("pp_cl.run.spare_memory", lambda plan, limit, budget=budget: budget)
+        monkeypatch.setattr("pp_cl.train.Trainer.finish", _noting(caches, Trainer.finish))
+        out = tmp_path / str(budget)
+        assert main(arguments(scene, out, **whole)) == 0
+        results.append((out / "checkpoint.npz").read_bytes())
+        monkeypatch.undo()
+    assert results[0] == results[1] == results[2]
+    (none, _), (some, some_bytes), (all_views, _) = caches
+    assert none == 0 < some < all_views and some_bytes <= 300_000
+
+
+def _noting(caches, finish):
+    """Trainer.finish that first notes (views kept, bytes)."""
+    def noting(self):
+        caches.append((len(self.renderer.cache), self.renderer.cache.bytes))
+        finish(self)
+    return noting
+
+
+@pytest.mark.parametrize("changes, stay", [
+    ({}, True), ({"crop": 64}, False), ({"dropout": 0.1}, False), ({"phases": True}, False),
+])
+def test_views_stay_only_where_nothing_is_drawn(changes, stay):
+    settings = {"crop": 0, "dropout": 0.0, "phases": False} | changes
+    trainer = SimpleNamespace(config=SimpleNamespace(**settings), downscale=2)
+    assert Trainer.views_stay(trainer) == stay
+
+
+def test_a_memory_that_is_too_small_is_one_line(scene, tmp_path, capsys):
+    assert main([*arguments(scene, tmp_path / "run"), "--memory", "0.001"]) == 2
+    captured = capsys.readouterr()
+    assert "--memory 0.001" in captured.err and captured.err.count("\n") == 1
+    assert not (tmp_path / "run").exists()
 
 
 @pytest.mark.parametrize("footprint, radius", [("disc", 0.0015), ("sphere", 0.05)])

@@ -1,0 +1,94 @@
+"""Hits that are kept: the same bits as those found anew, within the budget, forgotten when the points change."""
+
+import numpy as np
+import pytest
+from raster_scene import Scene, make_camera, make_points
+from scenes import ring_cameras
+from test_render import make_model
+
+from pp_cl.config import PointsConfig
+from pp_cl.errors import UserError
+from pp_cl.pair_cache import PairCache
+from pp_cl.pairs import LASTING
+from pp_cl.render import Renderer
+from pp_cl.run import spare_memory
+
+GAMMA = 0.03
+
+
+def state(pairs):
+    """Host copies of everything that build() leaves; without pairs, their arrays hold one row that means nothing."""
+    arrays = {name: getattr(pairs, name).get() for name in LASTING}
+    rows = [array[: pairs.total] if name.startswith("pair_") else array for name, array in arrays.items()]
+    return [pairs.total, pairs.points, pairs.pixels, *rows]
+
+
+def build(cache, key, scene, pairs):
+    """What is in `pairs` after building a scene's view through the cache."""
+    cache.build(key, pairs, scene.view, scene.shape, scene.projection, scene.radius)
+    return state(pairs)
+
+
+def same(first, second):
+    """Whether two states are the same bits."""
+    return all(np.array_equal(a, b) for a, b in zip(first, second, strict=True))
+
+
+@pytest.mark.parametrize("budget", [0, 30_000, 10**9])
+def test_kept_hits_are_the_same_bits(dev, rng, budget):
+    """Views of different sizes in changing order, one of them empty."""
+    sizes = [(24, 20), (31, 33), (1, 1), (24, 20), (16, 8)]
+    scenes = [Scene(dev, make_camera(*size), make_points(rng, 257) + 1e6 * (i == 4), 0.2) for i, size in enumerate(sizes)]
+    expected = [state(scene.pairs) for scene in scenes]
+    assert expected[4][0] == 0 < expected[0][0]
+    cache, pairs = PairCache(dev, budget), Scene(dev, make_camera(), make_points(rng, 3), 0.1).pairs
+    for turn in range(3):
+        for i in np.random.default_rng(turn).permutation(5):
+            assert same(build(cache, int(i), scenes[i], pairs), expected[i])
+        assert len(cache) == 5 if budget == 10**9 else len(cache) < 5
+        assert cache.bytes <= budget
+    assert (len(cache) > 0) == (budget > 0)
+
+
+def test_a_kept_view_is_not_built_again(dev, rng):
+    scene, other = (Scene(dev, make_camera(), make_points(rng, 60), 0.2) for _ in range(2))
+    cache, pairs = PairCache(dev, 10**9), scene.pairs
+    first = build(cache, "a", scene, pairs)
+    assert not same(build(cache, None, other, pairs), first) and len(cache) == 1
+    assert same(build(cache, "a", other, pairs), first)
+    cache.clear()
+    assert cache.bytes == 0 and not same(build(cache, "a", other, pairs), first)
+
+
+@pytest.mark.parametrize("footprint", ["soft", "disc"])
+@pytest.mark.parametrize("tau", [0.0, 1e-3])
+def test_pictures_and_gradients_are_the_same_bits(dev, rng, footprint, tau):
+    """With opacities that change from step to step, and points that go."""
+    model, cameras = make_model(dev, rng), ring_cameras(3, 24)
+    settings = PointsConfig(footprint=footprint, radius=0.75 if footprint == "soft" else 0.0015, tau=tau)
+    kept, anew = Renderer(dev, model, settings), Renderer(dev, model, settings)
+    kept.cache.budget = 10**9
+    grad = dev.upload(rng.normal(size=(24, 24, 16)), np.float32)
+    for step in range(8):
+        if step == 5:
+            kept.cache.clear()
+            for name in ("ids", "opacity", "sh0", "sh1", "sh2"):
+                model.points[name] = dev.upload(model.points[name].get()[::2])
+        model.points["opacity"].set(rng.uniform(0, 1, model.count).astype(np.float32))
+        results = []
+        for renderer, key in ((kept, step % 3), (anew, None)):
+            for run in renderer.stages(cameras[step % 3], GAMMA, key=key).values():
+                run()
+            gradients = [g.get() for g in renderer.backward_features(grad)]
+            weights = dev.zeros((model.count,))
+            renderer.add_point_weights(weights)
+            results.append([renderer.features.get(), weights.get(), *gradients])
+        assert same(*results)
+    assert len(kept.cache) == 3 and len(anew.cache) == 0
+
+
+def test_what_a_plan_leaves():
+    plan = [("a", "", 2**30), ("b", "", 2**29)]
+    assert spare_memory(plan, 0) == 0 and spare_memory(plan, 2) == 2**29
+    with pytest.raises(UserError, match="--memory 1: .* 1.50 GiB"):
+        spare_memory(plan, 1)
