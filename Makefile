@@ -3,8 +3,9 @@ PYTHON ?= python3
 BIN := .venv/bin
 READY := .venv/.ready
 
-# What Oclgrind 21.10 simulates right and in seconds. It computes max(int2, int) and comparisons of ulong8 wrongly.
-OCLGRIND := adam conv_local conv_weights launch layers loss lpips prune scan smooth target
+# What Oclgrind 21.10 simulates right and in seconds.
+OCLGRIND := adam blend conv_local conv_weights hard_cases hull launch layers loss lpips pair_cache pairs project prune scan shade \
+	smooth target weights
 
 .PHONY: help setup demo test test-intel bench lint oclgrind clean
 

@@ -68,7 +68,7 @@ ALWAYS_INLINE int4 footprint_box(const Camera *k, const Footprint *f) {
     const float4 wide = limits + (float4)(-margin, -margin, margin, margin);
     const float4 bounded = clamp(z > reach ? wide : (float4)(-2.0f, -2.0f, size.zw), (float4)(-2.0f), size);
     const int4 box = convert_int4(bounded + 2.0f) - 2 + rounding;            // x + 2 >= 0, so truncation is floor
-    return (int4)(max(box.xy, 0), min(box.zw, (int2)(k->width - 1, k->height - 1)));
+    return (int4)(max(box.xy, (int2)(0)), min(box.zw, (int2)(k->width - 1, k->height - 1)));
 }
 
 // Tests the 4 x 4 pixels from (x, y) on that lie in the box: bit 4 j + i of the result is pixel (x + i, y + j).
@@ -93,7 +93,8 @@ ALWAYS_INLINE uint footprint_block(const Camera *k, const Footprint *f, const in
     const float16 rho = sqrt(rho2);
     const int16 through = rho < f->least;
     hit = hit && (rho <= f->radius || through);
-    *closeness = select(clamp(1.0f - rho / f->radius, 0.0f, 1.0f), (float16)(1.0f), through && f->tiny);
+    *closeness = clamp(1.0f - rho / f->radius, 0.0f, 1.0f);
+    if (f->tiny) *closeness = select(*closeness, (float16)(1.0f), through);
     const float16 along = fmin((f->centre.x * mx + f->centre.y * my + f->centre.z) * inverse, f->t);
     const float16 wx = f->centre.x - along * inverse * mx, wy = f->centre.y - along * inverse * my;
     const float16 wz = f->centre.z - along * inverse;

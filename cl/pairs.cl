@@ -84,7 +84,8 @@ kernel void pairs_scatter(
     pair_key[pixel_offset[pair_pixel[pair]] + (uint)place] = upsample((uint)(place >> 32), pair);
 }
 
-// Sorts `count` <= RUN keys into `sorted`, which may be the same memory: each key's place is the number of smaller keys.
+// Sorts `count` <= RUN keys into `sorted`, which may be the same memory: each key's place is the number of smaller keys. No
+// key has its highest bit set, the sign of a depth, so that of a difference says which one is smaller.
 inline void sort_run(global const ulong *keys, const uint count, global ulong *sorted) {
     ulong run[RUN + 8];
     for (uint i = 0; i < count; i++)
@@ -92,10 +93,10 @@ inline void sort_run(global const ulong *keys, const uint count, global ulong *s
     vstore8((ulong8)(ULONG_MAX), 0, run + count);                            // the lanes behind the last key
     for (uint i = 0; i < count; i += 8) {
         const ulong8 key = vload8(0, run + i);
-        long8 place = 0;
+        ulong8 place = 0;
         for (uint j = 0; j < count; j++)
-            place -= (ulong8)(run[j]) < key;                                 // a true lane is -1
-        long places[8];
+            place += ((ulong8)(run[j]) - key) >> 63;
+        ulong places[8];
         vstore8(place, 0, places);
         for (uint j = 0; j < min(8u, count - i); j++)
             sorted[places[j]] = run[i + j];
