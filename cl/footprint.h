@@ -47,30 +47,6 @@ ALWAYS_INLINE Footprint footprint_load(const Camera *k, const float4 point, cons
     return f;
 }
 
-// Pixels that may be hit: first x, first y, last x, last y, inside the image; no pixel is where last < first.
-//
-// The tangents from the eye to a circle of radius r at (u, z), u = x or y, have slopes m with (m z - u)^2 = r^2 (1 + m^2); a
-// circle that reaches the eye's plane has no bounds.
-ALWAYS_INLINE int4 footprint_box(const Camera *k, const Footprint *f) {
-    const float z = f->centre.z, reach = FOOTPRINT == SPHERE ? f->radius : fmax(f->radius, f->least);
-    const float scale = z * z - reach * reach;
-    const float2 root = reach * sqrt(f->centre.xy * f->centre.xy + scale);
-    const float4 slopes = (float4)(f->centre.xy * z - root, f->centre.xy * z + root) / scale;
-    const float4 size = (float4)(k->width, k->height, k->width, k->height);
-    const float4 limits = slopes * (float4)(k->fx, k->fy, k->fx, k->fy) + ((float4)(k->cx, k->cy, k->cx, k->cy) - 0.5f);
-#if FOOTPRINT == SPHERE
-    const float margin = 0.0f;               // from floor(first) to ceil(last): Pulsar's box is part of its hit rule
-    const int4 rounding = (int4)(0, 0, 1, 1);
-#else
-    const float margin = 0.01f;              // pixels; far above the rounding of `limits`
-    const int4 rounding = (int4)(1, 1, 0, 0);
-#endif
-    const float4 wide = limits + (float4)(-margin, -margin, margin, margin);
-    const float4 bounded = clamp(z > reach ? wide : (float4)(-2.0f, -2.0f, size.zw), (float4)(-2.0f), size);
-    const int4 box = convert_int4(bounded + 2.0f) - 2 + rounding;            // x + 2 >= 0, so truncation is floor
-    return (int4)(max(box.xy, (int2)(0)), min(box.zw, (int2)(k->width - 1, k->height - 1)));
-}
-
 // Tests the 4 x 4 pixels from (x, y) on that lie in the box: bit 4 j + i of the result is pixel (x + i, y + j).
 ALWAYS_INLINE uint footprint_block(const Camera *k, const Footprint *f, const int4 box, const int x, const int y,
                                    float16 *closeness, float16 *depth) {

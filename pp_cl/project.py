@@ -4,6 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+LANES = 16  # of cl/project.cl
 KINDS = ("disc", "soft", "sphere")
 
 
@@ -49,7 +50,7 @@ class Projection:
         n = point_id.size
         self._resize(n)
         self.program.launch(
-            "project_grid", n, n=n, radius=radius, dropout=round(dropout * 2**32), seed=seed, camera=view, grid=grid,
+            "project_grid", -(-n // LANES), n=n, radius=radius, dropout=round(dropout * 2**32), seed=seed, camera=view, grid=grid,
             point_id=point_id, point_camera=self.point_camera, point_box=self.point_box)
 
     def spheres(self, view, positions, point_radius):
@@ -57,7 +58,7 @@ class Projection:
         n = positions.shape[0]
         self._resize(n)
         self.program.launch(
-            "project_spheres", n, n=n, k=point_radius.size, camera=view, positions=positions, point_radius=point_radius,
+            "project_spheres", -(-n // LANES), n=n, k=point_radius.size, camera=view, positions=positions, point_radius=point_radius,
             point_camera=self.point_camera, point_box=self.point_box)
 
     def _resize(self, n):
