@@ -4,7 +4,7 @@ BIN := .venv/bin
 READY := .venv/.ready
 
 # What Oclgrind 21.10 simulates right and in seconds.
-OCLGRIND := adam blend conv_local conv_weights hard_cases hull launch layers loss lpips pair_cache pairs project prune scan shade \
+OCLGRIND := adam blend conv_local conv_weights hard_cases launch layers loss lpips pair_cache pairs project prune scan shade \
 	smooth target weights
 
 .PHONY: help setup demo test test-intel bench lint oclgrind clean

@@ -50,16 +50,16 @@ class Projection:
         n = point_id.size
         self._resize(n)
         self.program.launch(
-            "project_grid", -(-n // LANES), n=n, radius=radius, dropout=round(dropout * 2**32), seed=seed, camera=view, grid=grid,
-            point_id=point_id, point_camera=self.point_camera, point_box=self.point_box)
+            "project_grid", -(-n // LANES), n=n, radius=radius, dropout=round(dropout * 2**32), seed=seed, camera=view,
+            grid=grid, point_id=point_id, point_camera=self.point_camera, point_box=self.point_box)
 
     def spheres(self, view, positions, point_radius):
         """Project spheres. positions: (N,3) float32, world. point_radius: (1) or (N) float32."""
         n = positions.shape[0]
         self._resize(n)
         self.program.launch(
-            "project_spheres", -(-n // LANES), n=n, k=point_radius.size, camera=view, positions=positions, point_radius=point_radius,
-            point_camera=self.point_camera, point_box=self.point_box)
+            "project_spheres", -(-n // LANES), n=n, k=point_radius.size, camera=view, positions=positions,
+            point_radius=point_radius, point_camera=self.point_camera, point_box=self.point_box)
 
     def _resize(self, n):
         if self.point_camera is None or self.point_camera.shape[0] != n:
