@@ -72,8 +72,7 @@ def test_pictures_and_gradients_are_the_same_bits(dev, rng, footprint, tau):
     for step in range(8):
         if step == 5:
             kept.cache.clear()
-            for name in ("ids", "opacity", "sh0", "sh1", "sh2"):
-                model.points[name] = dev.upload(model.points[name].get()[::2])
+            model.points |= {name: dev.upload(array.get()[::2]) for name, array in model.points.items()}
         model.points["opacity"].set(rng.uniform(0, 1, model.count).astype(np.float32))
         results = []
         for renderer, key in ((kept, step % 3), (anew, None)):
