@@ -29,12 +29,6 @@ inline Camera camera_load(global const float *c) {
     return k;
 }
 
-// World position -> camera axes, relative to the eye.
-inline float3 camera_from_world(const Camera *k, const float3 position) {
-    const float3 v = position - k->eye;
-    return (float3)(dot(k->right, v), dot(k->down, v), dot(k->forward, v));
-}
-
 // Unit ray through the centre of pixel (x, y), in camera axes.
 inline float3 camera_ray(const Camera *k, const int x, const int y) {
     return normalize((float3)((x + 0.5f - k->cx) / k->fx, (y + 0.5f - k->cy) / k->fy, 1.0f));

@@ -132,10 +132,19 @@ def test_numbers_are_read_ascending():
         read_numbers("--points", "", int, 1, 10**6)
 
 
+class Tensor(np.ndarray):
+    """What pulsar_row() needs of PyTorch's."""
+
+    def requires_grad_(self, _):
+        self.learned = True
+
+    def backward(self, grad):
+        assert grad.shape == self.shape
+
+
 def test_pulsars_row(monkeypatch):
-    """With a stand-in for PyTorch3D, whose renderer gets the scene of PulsarScene."""
-    torch = pytest.importorskip("torch", reason="Pulsar needs the extra `torch`")
-    monkeypatch.setitem(sys.modules, "pytorch3d", None)
+    """With stand-ins for PyTorch and PyTorch3D, whose renderer gets the scene of PulsarScene."""
+    monkeypatch.setitem(sys.modules, "torch", None)
     assert pulsar_row(5, 4, 0.1) is None
     seen = {}
 
@@ -144,12 +153,18 @@ def test_pulsars_row(monkeypatch):
             seen["shape"] = (width, height, n, n_channels)
 
         def __call__(self, positions, features, radius, camera, gamma, max_depth, min_depth):
-            seen["scene"] = (positions.detach().numpy(), radius.tolist(), camera.tolist(), gamma, max_depth, min_depth)
-            return (positions.sum() + features.sum() + radius.sum()) * torch.ones(4, 4, 16)
+            assert positions.learned and features.learned and radius.learned and features.shape == (5, bench_scene.CHANNELS)
+            seen["scene"] = (positions, radius, camera.tolist(), gamma, max_depth, min_depth)
+            return np.ones((4, 4, 16)).view(Tensor)
 
-    for name in ("pytorch3d", "pytorch3d.renderer", "pytorch3d.renderer.points", "pytorch3d.renderer.points.pulsar"):
+    rng = np.random.default_rng(0)
+    names = ("torch", "pytorch3d", "pytorch3d.renderer", "pytorch3d.renderer.points", "pytorch3d.renderer.points.pulsar")
+    for name in names:
         monkeypatch.setitem(sys.modules, name, types.ModuleType(name))
-    sys.modules["pytorch3d.renderer.points.pulsar"].Renderer = Renderer
+    vars(sys.modules["torch"]).update(
+        manual_seed=lambda _: None, rand=lambda *shape: rng.random(shape).view(Tensor), randn_like=np.ones_like,
+        tensor=lambda values: np.array(values).view(Tensor), full=lambda shape, value: np.full(shape, value).view(Tensor))
+    sys.modules[names[-1]].Renderer = Renderer
     row = pulsar_row(5, 4, 0.1)
     assert row["forward_ms"] > 0 and row["backward_ms"] > 0 and (row["points"], row["size"]) == (5, 4)
     assert seen["shape"] == (4, 4, 5, bench_scene.CHANNELS)
