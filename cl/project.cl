@@ -96,8 +96,8 @@ kernel __attribute__((vec_type_hint(float16))) void project_grid(
         z[j] = position.z;
         wanted[j] = -(scramble(id + stream) >= dropout);
     }
-    project(&k, vload16(0, x), vload16(0, y), vload16(0, z), radius, vload16(0, wanted), count, point_camera + first,
-            point_box + first);
+    project(&k, vload16(0, x), vload16(0, y), vload16(0, z), (float16)(radius), vload16(0, wanted), count,
+            point_camera + first, point_box + first);
 }
 
 // One work-item per 16 spheres: reads their positions and radii, writes the same as project_grid.
@@ -122,6 +122,6 @@ kernel __attribute__((vec_type_hint(float16))) void project_spheres(
         z[j] = positions[3 * i + 2];
         radius[j] = point_radius[k == 1 ? 0 : i];
     }
-    project(&view, vload16(0, x), vload16(0, y), vload16(0, z), vload16(0, radius), -1, count, point_camera + first,
-            point_box + first);
+    project(&view, vload16(0, x), vload16(0, y), vload16(0, z), vload16(0, radius), (int16)(-1), count,
+            point_camera + first, point_box + first);
 }
