@@ -38,6 +38,8 @@ def memory_plan(dev, config, model, views):
         chunk = min(n, max(CHUNK, n // model.grid.dims[2]))  # the points of a layer, about
         rows.append(("smoothing (estimate)", f"2 x ({chunk}) x {row_bytes} bytes", 2 * chunk * row_bytes))
     rows.append(("pruning", "at most", min(SCRATCH_BYTES, n * row_bytes)))
+    if config.points.stop > 0 or config.points.tau > 0:
+        rows.append(("points kept in one view", f"({n}) x 12 bytes", 12 * n))
     pairs = round(n * _pixels_per_point(config, model, camera))
     rows.append(("point-pixel pairs (estimate)", f"({pairs}) x {PAIR_BYTES} bytes", PAIR_BYTES * pairs))
     network = model.net.memory_plan(height, width, True)

@@ -58,17 +58,17 @@ class Optimiser:
             model.points["last"] = dev.zeros((model.count,), np.uint32)
         self.averages = {}  # of the network; those of the points are model.points["a.*"]
 
-    def update(self, step, rates, grads, camera, feature_eps, seen):
+    def update(self, step, rates, grads, camera, feature_eps, kept):
         """One Adam step.
 
         step: from 1. grads: (grad_point_features (N,16), grad_opacity (N)); the network's own gradients lie in it. camera:
-        (20) device buffer of the view. feature_eps: Adam's eps of the SH coefficients. seen: (S) uint32, the points of the
+        (20) device buffer of the view. feature_eps: Adam's eps of the SH coefficients. kept: (S) uint32, the points of the
         picture; a lazy update reads the gradients of no others.
         """
         grad_features, grad_opacity = grads
         points, adam = self.model.points, self.point_adam
         if self.lazy:
-            adam.begin_lazy(step, self.touched.rows(seen, *grads), points["last"])
+            adam.begin_lazy(step, self.touched.rows(kept, *grads), points["last"])
         else:
             adam.begin(step, self.model.count)
         for block in SH_BLOCKS:

@@ -71,8 +71,8 @@ class Trainer:
         )
         grad_image = self.loss.forward_backward(image, target, *self.renderer.offset)
         grads = self.renderer.backward(grad_image)
-        seen = self.renderer.pairs.seen
-        self.optimiser.update(t + 1, rates, grads, self.renderer.camera, config.feature_eps / target.size, seen)
+        kept = self.renderer.weights.kept
+        self.optimiser.update(t + 1, rates, grads, self.renderer.camera, config.feature_eps / target.size, kept)
         self.renderer.add_point_weights(self.model.points["weight"])
 
         self.step = t + 1

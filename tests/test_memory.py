@@ -13,7 +13,8 @@ from pp_cl.run import open_scene, with_depth_range
 from pp_cl.train import Trainer
 
 PAPER_POINTS = 4_040_533  # lego, supplemental Table 4
-WAYS = [{}, {"train.lazy": "true"}, {"train.half_moments": "true", "train.average": "false", "train.smooth": "0"}]
+WAYS = [{}, {"train.lazy": "true", "points.stop": "0.001"},
+        {"train.half_moments": "true", "train.average": "false", "train.smooth": "0"}]
 
 
 def trained(dev, folder, changes):
