@@ -1,6 +1,7 @@
 """Evaluation of a run: every view of a split, rendered, rounded to 8 bits, measured."""
 
 import time
+from dataclasses import replace
 from pathlib import PurePosixPath
 
 import numpy as np
@@ -46,8 +47,8 @@ def evaluate_run(folder, metrics, split, save_images, device_choice, tolerance=N
     gamma_now = gamma(header["step"], config.train.iterations, *config.points.gamma)
     shown = {len(views) * i // PICTURE_VIEWS for i in range(PICTURE_VIEWS)}
     rows, pictures, seconds, shares = [], [], [], []
-    for i, (view, picture, truth, duration) in enumerate(_render_all(dev, config, model, views, gamma_now)):
-        rows.append({"name": view.name} | measure(picture, truth))
+    for i, (view, picture, truth, duration, dropped) in enumerate(_render_all(dev, config, model, views, gamma_now)):
+        rows.append({"name": view.name} | measure(picture, truth) | dropped)
         seconds.append(duration)
         shares.append(model.net.share)
         if i in shown:
@@ -59,7 +60,7 @@ def evaluate_run(folder, metrics, split, save_images, device_choice, tolerance=N
         "device": dev.name,
         "step": header["step"],
         "finished": header["finished"],
-        "mean": mean(rows),
+        "mean": mean([{name: row[name] for name in ("name", *metrics)} for row in rows]),
         "per_image": rows,
         "points": {"initial": header["initial_points"], "final": model.count, "grid": header["grid"]["dims"]},
         "seconds_per_frame": float(np.median(seconds)),
@@ -74,8 +75,9 @@ def evaluate_run(folder, metrics, split, save_images, device_choice, tolerance=N
 
 
 def _render_all(dev, config, model, views, gamma_now):
-    """Yield (view, prediction (H,W,3), truth (H,W,3), seconds of the rendering) as float32 in [0, 1]."""
+    """Yield (view, prediction (H,W,3), truth (H,W,3), seconds of the rendering, what tau did) as float32 in [0, 1]."""
     model.net.freeze()
+    exact = Renderer(dev, model, replace(config.points, tau=0.0)) if config.points.tau > 0 else None
     renderer, target = Renderer(dev, model, config.points), Target(dev, config.scene.downscale)
     renderer.picture(reduced_camera(views[0], config.scene.downscale), gamma_now)  # builds the programs
     for view in views:
@@ -84,7 +86,24 @@ def _render_all(dev, config, model, views, gamma_now):
         picture = renderer.picture(camera, gamma_now)
         seconds = time.perf_counter() - start
         target.load(view)
-        yield view, picture, target.crop(0, 0, camera.width, camera.height).get(), seconds
+        truth = target.crop(0, 0, camera.width, camera.height).get()
+        yield view, picture, truth, seconds, _dropped(renderer, picture, exact, camera, gamma_now) if exact else {}
+
+
+def _dropped(renderer, picture, exact, camera, gamma_now):
+    """{"tau_bound", "tau_feature_error", "tau_picture_error"} of the view rendered last.
+
+    The largest weight that a pixel dropped (or its bound), and the largest differences from `exact`, which renders at tau 0:
+    of a feature over the features' range, and of the picture.
+    """
+    bound, features = renderer.weights.dropped(renderer.pairs).get().max(initial=0), renderer.features.get()
+    exact_picture = exact.picture(camera, gamma_now)
+    exact_features = exact.features.get()
+    return {
+        "tau_bound": float(bound),
+        "tau_feature_error": float(np.abs(features - exact_features).max() / max(np.ptp(exact_features), 1e-30)),
+        "tau_picture_error": float(np.abs(picture - exact_picture).max()),
+    }
 
 
 def _print_table(result, folder):
@@ -96,6 +115,11 @@ def _print_table(result, folder):
     for label, values in rows.items():
         print(f"{label:28s}" + "".join(f"{values[n]:9.4f}" if n in values else f"{'':9s}" for n in names))
     points = result["points"]
+    errors = {name: max(row.get(name, 0.0) for row in result["per_image"])
+              for name in ("tau_bound", "tau_feature_error", "tau_picture_error")}
+    if any(errors.values()):
+        print("points.tau: dropped at most {:.1e} of a pixel; features off by {:.1e} of their range, the picture by {:.1e}"
+              .format(*errors.values()))
     share = f"{result['network_share']:.0%} of the network's work, " if result["network_share"] < 1 else ""
     print(
         f"{points['final']} of {points['initial']} points, {share}"

@@ -1,6 +1,7 @@
 """Evaluation: the file it writes, the pictures, and that it measures what it shows."""
 
 import json
+import shutil
 
 import numpy as np
 import pytest
@@ -68,6 +69,20 @@ def test_saved_images_are_what_was_measured(run):
         truth = np.rint(255 * over_white.reshape(30, 2, 30, 2, 3).mean((1, 3))).astype(np.uint8)
         assert picture.shape == (30, 30, 3)
         assert psnr(picture, truth) == pytest.approx(row["psnr"], abs=0.02)
+
+
+def test_what_tau_did_is_told(run, tmp_path, capsys):
+    copy = tmp_path / "run"
+    shutil.copytree(run, copy)
+    config = json.loads((copy / "config.json").read_text())
+    config["points"]["tau"] = 1e-2
+    (copy / "config.json").write_text(json.dumps(config))
+    assert main(["eval", str(copy)]) == 0
+    result = json.loads((copy / "eval" / "metrics.json").read_text())
+    assert set(result["mean"]) == {"psnr", "ssim"}
+    for row in result["per_image"]:
+        assert 0 < row["tau_bound"] <= 1e-2 and 0 < row["tau_feature_error"] <= 1e-2 and 0 < row["tau_picture_error"] < 0.1
+    assert "points.tau: dropped at most" in capsys.readouterr().out
 
 
 def test_twice_gives_the_same_numbers_and_other_splits_work(run):
