@@ -44,6 +44,34 @@ def test_packing_is_exact(rng):
     np.testing.assert_array_equal(unpack_weights(packed, 20), weight)
 
 
+def check_backward_input(dev, rng, shape, k, backward):
+    """backward: run_backward_input of a kernel; shape: (height, width, channels in, channels out)."""
+    height, width, ci, co = shape
+    x = np.maximum(rng.normal(size=(height, width, ci)), 0).astype(np.float32)
+    weight, _ = layer(rng, ci, co, k)
+    grad_out = rng.normal(size=(height, width, co)).astype(np.float32)
+    expected = conv_gradients(x, weight, grad_out)[0]
+    assert relative_error(backward(dev, x, weight, grad_out, False), expected) < 3e-6
+    assert relative_error(backward(dev, x, weight, grad_out, True), expected * (x > 0)) < 3e-6
+
+
+def check_hard_inputs(dev, rng, forward, backward):
+    """Large means; nothing but zeros."""
+    weight, bias = layer(rng, 16, 16, 3)
+    offset = (1e3 + rng.normal(size=(13, 17, 16))).astype(np.float32)
+    assert relative_error(forward(dev, offset, weight, bias, False), conv(offset, weight, bias)) < 3e-6
+    zeros = np.zeros_like(offset)
+    np.testing.assert_array_equal(forward(dev, zeros, weight, bias, False), np.broadcast_to(bias, zeros.shape))
+    assert not backward(dev, zeros, weight, offset, True).any()  # a ReLU at exactly 0 passes nothing
+
+
+def check_same_bits(dev, rng, forward):
+    """In two runs."""
+    x = rng.normal(size=(31, 50, 32)).astype(np.float32)
+    weight, bias = layer(rng, 32, 48, 3)
+    np.testing.assert_array_equal(forward(dev, x, weight, bias, True), forward(dev, x, weight, bias, True))
+
+
 @pytest.mark.parametrize("k", [1, 3])
 @pytest.mark.parametrize("shape", SHAPES)
 def test_forward(dev, rng, shape, k):
@@ -65,13 +93,7 @@ def test_two_sources_are_a_concatenation(dev, rng, c1, c2):
 @pytest.mark.parametrize("k", [1, 3])
 @pytest.mark.parametrize("shape", SHAPES)
 def test_backward_input(dev, rng, shape, k):
-    height, width, ci, co = shape
-    x = np.maximum(rng.normal(size=(height, width, ci)), 0).astype(np.float32)
-    weight, _ = layer(rng, ci, co, k)
-    grad_out = rng.normal(size=(height, width, co)).astype(np.float32)
-    expected = conv_gradients(x, weight, grad_out)[0]
-    assert relative_error(run_backward_input(dev, x, weight, grad_out, False), expected) < 3e-6
-    assert relative_error(run_backward_input(dev, x, weight, grad_out, True), expected * (x > 0)) < 3e-6
+    check_backward_input(dev, rng, shape, k, run_backward_input)
 
 
 def test_backward_input_of_the_second_source(dev, rng):
@@ -92,12 +114,7 @@ def test_backward_input_by_finite_differences(dev, rng):
 
 
 def test_hard_inputs(dev, rng):
-    weight, bias = layer(rng, 16, 16, 3)
-    offset = (1e3 + rng.normal(size=(13, 17, 16))).astype(np.float32)
-    assert relative_error(run_forward(dev, offset, weight, bias, False), conv(offset, weight, bias)) < 3e-6
-    zeros = np.zeros_like(offset)
-    np.testing.assert_array_equal(run_forward(dev, zeros, weight, bias, False), np.broadcast_to(bias, zeros.shape))
-    assert not run_backward_input(dev, zeros, weight, offset, True).any()  # a ReLU at exactly 0 passes nothing
+    check_hard_inputs(dev, rng, run_forward, run_backward_input)
 
 
 def test_work_groups_of_a_gpu(dev, rng, monkeypatch):
@@ -112,9 +129,7 @@ def test_work_groups_of_a_gpu(dev, rng, monkeypatch):
 
 
 def test_same_bits_twice(dev, rng):
-    x = rng.normal(size=(31, 50, 32)).astype(np.float32)
-    weight, bias = layer(rng, 32, 48, 3)
-    np.testing.assert_array_equal(run_forward(dev, x, weight, bias, True), run_forward(dev, x, weight, bias, True))
+    check_same_bits(dev, rng, run_forward)
 
 
 def test_wrong_shapes_are_refused(dev):

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from helpers import relative_error
 from oracle_conv import conv, conv_gradients
-from test_conv import layer
+from test_conv import check_backward_input, check_hard_inputs, check_same_bits, layer
 
 from pp_cl.conv import conv_backward_input, conv_forward, pack_bias, pack_weights
 from pp_cl.conv_local import COLUMNS, ROWS
@@ -51,13 +51,7 @@ def test_two_sources_are_a_concatenation(dev, rng, c1, c2):
 
 @pytest.mark.parametrize("shape", SHAPES)
 def test_backward_input(dev, rng, shape):
-    height, width, ci, co = shape
-    x = np.maximum(rng.normal(size=(height, width, ci)), 0).astype(np.float32)
-    weight, _ = layer(rng, ci, co, 3)
-    grad_out = rng.normal(size=(height, width, co)).astype(np.float32)
-    expected = conv_gradients(x, weight, grad_out)[0]
-    assert relative_error(run_backward_input(dev, x, weight, grad_out, False), expected) < 3e-6
-    assert relative_error(run_backward_input(dev, x, weight, grad_out, True), expected * (x > 0)) < 3e-6
+    check_backward_input(dev, rng, shape, 3, run_backward_input)
 
 
 def test_backward_input_of_the_second_source(dev, rng):
@@ -87,18 +81,11 @@ def test_only_computed_tiles_are_written(dev, rng):
 
 
 def test_hard_inputs(dev, rng):
-    weight, bias = layer(rng, 16, 16, 3)
-    offset = (1e3 + rng.normal(size=(13, 17, 16))).astype(np.float32)
-    assert relative_error(run_forward(dev, offset, weight, bias, False), conv(offset, weight, bias)) < 3e-6
-    zeros = np.zeros_like(offset)
-    np.testing.assert_array_equal(run_forward(dev, zeros, weight, bias, False), np.broadcast_to(bias, zeros.shape))
-    assert not run_backward_input(dev, zeros, weight, offset, True).any()  # a ReLU at exactly 0 passes nothing
+    check_hard_inputs(dev, rng, run_forward, run_backward_input)
 
 
 def test_same_bits_twice(dev, rng):
-    x = rng.normal(size=(31, 50, 32)).astype(np.float32)
-    weight, bias = layer(rng, 32, 48, 3)
-    np.testing.assert_array_equal(run_forward(dev, x, weight, bias, True), run_forward(dev, x, weight, bias, True))
+    check_same_bits(dev, rng, run_forward)
 
 
 def test_relu_hides_no_nan(dev, rng):
