@@ -9,7 +9,7 @@ from pp_cl.render import NETWORK_MULTIPLE
 from pp_cl.scene import reduced_camera
 from pp_cl.smooth import CHUNK
 
-MIB = 2**20
+MIB, GIB = 2**20, 2**30
 PAIR_BYTES = 45  # two keys of 8, pixel, closeness, point and two weights of 4 bytes, a quarter of spare room
 
 
@@ -73,3 +73,12 @@ def print_plan(rows, dev):
             f"the training needs {total / MIB:.0f} MiB, {dev.name} has {dev.info['memory_bytes'] / MIB:.0f}: "
             "lower --points, raise --downscale, or set train.half_moments, train.crop or smaller network.widths"
         )
+
+
+def spare_memory(plan, limit):
+    """Bytes that a plan, rows (what, shape, bytes), leaves of `limit` GiB; 0 without a limit. Raises UserError below 0."""
+    needed = sum(size for _, _, size in plan)
+    if limit and limit * GIB < needed:
+        raise UserError(f"--memory {limit:g}: the training needs {needed / GIB:.2f} GiB; raise it, lower --points, raise "
+                        "--downscale, or set train.crop or smaller network.widths")
+    return max(0, int(limit * GIB) - needed)

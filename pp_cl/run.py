@@ -13,7 +13,7 @@ from pp_cl.checkpoint import load_checkpoint, remove_leftovers, save_checkpoint,
 from pp_cl.device import open_device
 from pp_cl.errors import UserError
 from pp_cl.hull import build_grid, depth_range, spacing_pixels
-from pp_cl.memory import memory_plan, print_plan
+from pp_cl.memory import memory_plan, print_plan, spare_memory
 from pp_cl.model import Model
 from pp_cl.preview import write_comparison
 from pp_cl.scene import load_scene, reduced_camera
@@ -21,8 +21,6 @@ from pp_cl.train import Trainer
 from pp_cl.tuning import adopt_of_run, adopt_stored
 
 CHECKPOINT = "checkpoint.npz"
-GIB = 2**30
-
 HEADER = ("scene", "step", "finished", "initial_points", "grid", "depth_range")  # of a run's checkpoint
 
 
@@ -90,15 +88,6 @@ def train_run(folder, config, device_choice):
     remove_leftovers(folder)
     write_text(folder / "config.json", config.to_json() + "\n")
     _optimise(trainer, config, folder, info)
-
-
-def spare_memory(plan, limit):
-    """Bytes that a plan, rows (what, shape, bytes), leaves of `limit` GiB; 0 without a limit. Raises UserError below 0."""
-    needed = sum(size for _, _, size in plan)
-    if limit and limit * GIB < needed:
-        raise UserError(f"--memory {limit:g}: the training needs {needed / GIB:.2f} GiB; raise it, lower --points, raise "
-                        "--downscale, or set train.crop or smaller network.widths")
-    return max(0, int(limit * GIB) - needed)
 
 
 def _check_folder(folder):

@@ -8,10 +8,10 @@ from test_render import make_model
 
 from pp_cl.config import PointsConfig
 from pp_cl.errors import UserError
+from pp_cl.memory import spare_memory
 from pp_cl.pair_cache import PairCache
 from pp_cl.pairs import LASTING
 from pp_cl.render import Renderer
-from pp_cl.run import spare_memory
 
 GAMMA = 0.03
 
