@@ -21,8 +21,7 @@
 // acc += convolution of x at pixels (x0 .. x0 + TILE - 1, y). weight: (block, ky, kx, channel) of x's first channel;
 // kx_stride and block_stride: float16 between two kx, two blocks. Inlined by force: called out of line, PoCL's LLVM keeps
 // acc in memory and halves the vector width.
-__attribute__((always_inline))
-inline void convolve(
+ALWAYS_INLINE void convolve(
     float16 acc[BLOCKS][TILE],
     global const float *x,
     global const float16 *weight,

@@ -56,8 +56,7 @@ inline void load_weights(
 }
 
 // acc += convolution of x, `channels` wide, at this item's pixels. Called by all items of a work-group alike.
-__attribute__((always_inline))
-inline void convolve(
+ALWAYS_INLINE void convolve(
     float8 acc[SPAN],
     local float *values,
     local float *weights,

@@ -12,8 +12,6 @@
 #define FOOTPRINT SOFT
 #endif
 
-#define ALWAYS_INLINE __attribute__((always_inline)) inline  // PoCL calls larger functions, passing the structs in memory
-
 #define BLOCK_SIDE 4             // pixels are tested in blocks of 4 x 4, one lane each
 #define LANE_X (float16)(0, 1, 2, 3, 0, 1, 2, 3, 0, 1, 2, 3, 0, 1, 2, 3)
 #define LANE_Y (float16)(0, 0, 0, 0, 1, 1, 1, 1, 2, 2, 2, 2, 3, 3, 3, 3)
@@ -78,7 +76,7 @@ ALWAYS_INLINE uint footprint_block(const Camera *k, const Footprint *f, const in
     *depth = fmax(along - sqrt((f->radius + w) * fmax(f->radius - w, 0.0f)), 0.0f);
 #endif
     const int16 bits = hit & LANE_BIT;
-    const int8 b8 = bits.lo | bits.hi;
+    const int8 b8 = bits.lo | (int8)(UPPER_HALF(bits));
     const int4 b4 = b8.lo | b8.hi;
     const int2 b2 = b4.lo | b4.hi;
     return (uint)(b2.x | b2.y);

@@ -14,7 +14,7 @@
 #define DROPPED ((float2)(-0.0f))    // weight and slope of a hit that is no part of the picture; both signs tell it
 
 inline float max16(const float16 v) {
-    const float8 a = fmax(v.lo, v.hi);
+    const float8 a = fmax(v.lo, (float8)(UPPER_HALF(v)));
     const float4 b = fmax(a.lo, a.hi);
     const float2 c = fmax(b.lo, b.hi);
     return fmax(c.x, c.y);
@@ -25,8 +25,7 @@ typedef struct {
     float16 opacity, closeness, z;
 } Hits;
 
-__attribute__((always_inline))
-inline Hits load_hits(const Camera *k, global const ulong *key, const uint count, global const uint2 *pair_source,
+ALWAYS_INLINE Hits load_hits(const Camera *k, global const ulong *key, const uint count, global const uint2 *pair_source,
                       global const float *opacity) {
     float o[BATCH] = {0.0f}, d[BATCH] = {0.0f}, depth[BATCH] = {0.0f};
     for (uint j = 0; j < count; j++) {

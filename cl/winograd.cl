@@ -17,8 +17,7 @@
 #define SLICE(ci, co) (POSITIONS * (PITCH(ci) + PITCH(co) + 1))
 
 // Stage 2: m (position, 16 of co, tile) = v (position, 16 of ci, tile) times the transformed weights.
-__attribute__((always_inline))
-inline void multiply(
+ALWAYS_INLINE void multiply(
     global float16 *m,
     global const float16 *v,
     global const float16 *transformed,
@@ -62,8 +61,7 @@ inline void multiply(
 
 // Stage 3: the outputs of `count` tiles of tile_list from `first` on, plus bias (0 = none); with relu, max(., 0) of them;
 // with mask, 0 where mask is not positive.
-__attribute__((always_inline))
-inline void transform_back(
+ALWAYS_INLINE void transform_back(
     global float *out,
     global const float16 *m,
     global const float16 *bias,
@@ -107,8 +105,7 @@ inline void transform_back(
 }
 
 // The whole convolution of [x, x2] (c2 = 0: of x) for this work-item's tiles; bias, relu, mask: as in transform_back.
-__attribute__((always_inline))
-inline void convolve(
+ALWAYS_INLINE void convolve(
     global const float *x,
     global const float *x2,
     const int c1,

@@ -45,8 +45,7 @@
 #define NQ (1 / (2 * QQ * (QQ - PP)))
 
 // B^T: S samples -> S values.
-__attribute__((always_inline))
-inline void transform_input(float16 *t, const int step) {
+ALWAYS_INLINE void transform_input(float16 *t, const int step) {
     const float16 d0 = t[0], d1 = t[step], d2 = t[2 * step], d3 = t[3 * step];
 #if M == 4
     const float16 d4 = t[4 * step], d5 = t[5 * step];
@@ -66,8 +65,7 @@ inline void transform_input(float16 *t, const int step) {
 }
 
 // A^T: S values -> M outputs.
-__attribute__((always_inline))
-inline void transform_output(float16 *t, const int step) {
+ALWAYS_INLINE void transform_output(float16 *t, const int step) {
     const float16 m0 = t[0], sum_p = t[step] + t[2 * step], diff_p = t[step] - t[2 * step];
 #if M == 4
     const float16 sum_q = t[3 * step] + t[4 * step], diff_q = t[3 * step] - t[4 * step];
@@ -82,8 +80,7 @@ inline void transform_output(float16 *t, const int step) {
 }
 
 // A: gradients of M outputs -> those of S values.
-__attribute__((always_inline))
-inline void transform_gradient(float16 *t, const int step) {
+ALWAYS_INLINE void transform_gradient(float16 *t, const int step) {
     const float16 g0 = t[0], g1 = t[step];
 #if M == 4
     const float16 g2 = t[2 * step], g3 = t[3 * step];
@@ -101,8 +98,7 @@ inline void transform_gradient(float16 *t, const int step) {
 }
 
 // G: 3 weights -> S values.
-__attribute__((always_inline))
-inline void transform_kernel(float16 *t, const int step) {
+ALWAYS_INLINE void transform_kernel(float16 *t, const int step) {
     const float16 w0 = t[0], w1 = t[step], w2 = t[2 * step];
 #if M == 4
     const float16 even_p = NP * (w0 + PP * w2), even_q = NQ * (w0 + QQ * w2);
@@ -120,8 +116,7 @@ inline void transform_kernel(float16 *t, const int step) {
 }
 
 // G^T: gradients of S values -> those of 3 weights.
-__attribute__((always_inline))
-inline void transform_kernel_gradient(float16 *t, const int step) {
+ALWAYS_INLINE void transform_kernel_gradient(float16 *t, const int step) {
     const float16 sum_p = t[step] + t[2 * step], diff_p = t[step] - t[2 * step];
 #if M == 4
     const float16 sum_q = t[3 * step] + t[4 * step], diff_q = t[3 * step] - t[4 * step];
@@ -148,8 +143,7 @@ inline int2 tile_corner(global const int *tile_list, const int i) {
 
 // The `side` x `side` pixels from (x0, y0) on, 16 channels each, into rows of t that are S apart; 0 outside the image. A
 // tile across the border is gathered in `patch` first, so that one piece of straight code loads them all.
-__attribute__((always_inline))
-inline void load_tile(
+ALWAYS_INLINE void load_tile(
     float16 *t,
     const int side,                  // S or M
     global float *patch,             // POSITIONS vectors
@@ -182,8 +176,7 @@ inline void load_tile(
 
 // v = B^T d B of the inputs d of `padded` tiles of tile_list from `first` on, 16 * chunks channels; the last of `count` is
 // repeated.
-__attribute__((always_inline))
-inline void transform_tiles(
+ALWAYS_INLINE void transform_tiles(
     global float16 *v,
     const int pitch,
     global float *patch,             // POSITIONS vectors

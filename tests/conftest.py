@@ -1,11 +1,16 @@
 """Fixtures: one guarded device a session; the count of kernels launched and of tests that had real data."""
 
+import os
+import shutil
+
 import numpy as np
 import pytest
-from helpers import DATA, GuardedDevice
+from helpers import DATA, GuardedDevice, TracedDevice
 
+from pp_cl.cache import cache_folder, make_cache_folder
 from pp_cl.device import open_device
 from pp_cl.launch import Program
+from pp_cl.lpips_weights import WEIGHTS_FILE
 
 COUNTS = {"launches": 0, "data": 0}
 _launch = Program.launch
@@ -19,10 +24,29 @@ def _counted_launch(self, *args, **kwargs):
 Program.launch = _counted_launch
 
 
+@pytest.fixture(scope="session", autouse=True)
+def cache_of_its_own(tmp_path_factory):
+    """What the user has tuned stays unread: a cache folder for the session, with nothing in it but the weights of LPIPS."""
+    kept = cache_folder() / WEIGHTS_FILE
+    folder = tmp_path_factory.mktemp("cache")
+    lent = folder / WEIGHTS_FILE
+    if kept.exists():
+        lent.symlink_to(kept.resolve())
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("PP_CACHE", str(folder))
+        yield
+    if lent.exists() and not lent.is_symlink() and not kept.exists():  # fetched by a test
+        shutil.move(lent, make_cache_folder() / WEIGHTS_FILE)
+
+
 @pytest.fixture(scope="session")
-def session_device():
-    """The device of PP_DEVICE, else the default one, with guarded buffers."""
-    return GuardedDevice(open_device().device)
+def session_device(tmp_path_factory):
+    """The device of PP_DEVICE, else the default one, with guarded buffers; with traced ones where Oclgrind watches reads."""
+    if os.environ.get("OCLGRIND_UNINITIALIZED") != "1":
+        return GuardedDevice(open_device().device)
+    log = tmp_path_factory.mktemp("oclgrind") / "log"
+    os.environ["OCLGRIND_LOG"] = str(log)
+    return TracedDevice(open_device().device, log)
 
 
 @pytest.fixture

@@ -292,6 +292,7 @@ def test_half_moments_follow_the_oracle(dev, rng, n, block):
     np.testing.assert_array_equal(cloud.last.get(), oracle.last)
 
 
+@pytest.mark.large
 def test_half_moments_decay_as_they_should(dev, rng):
     """A thousand steps each take less from sqrt(v) than half a unit in its last place: rounding to nearest keeps all."""
     cloud, none = Cloud(dev, rng, 33, scale=moment_scale(SH_EPS)), np.zeros((33, 16))

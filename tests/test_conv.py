@@ -2,15 +2,16 @@
 
 import numpy as np
 import pytest
-from helpers import numeric_gradient, relative_error
+from helpers import large, numeric_gradient, relative_error
 from oracle_conv import conv, conv_gradients
 
 from pp_cl.conv import conv_backward_input, conv_forward, pack_bias, pack_weights, unpack_weights
 from pp_cl.conv_weights import flip_weights
 
 # (height, width, channels in, channels out): tiles of every width, tails, channels beside the multiples of 16
-SHAPES = [(1, 1, 3, 16), (1, 5, 16, 3), (5, 1, 20, 20), (31, 33, 16, 48), (257, 3, 32, 16), (6, 31, 3, 64), (4, 257, 48, 32),
-          (3, 12, 1, 1), (8, 8, 512, 32), (16, 24, 32, 512)]
+SHAPES = [(1, 1, 3, 16), (1, 5, 16, 3), (5, 1, 20, 20), (3, 12, 1, 1),
+          *map(large, [(31, 33, 16, 48), (257, 3, 32, 16), (6, 31, 3, 64), (4, 257, 48, 32), (8, 8, 512, 32),
+                       (16, 24, 32, 512)])]
 
 
 def layer(rng, ci, co, k):
@@ -128,6 +129,7 @@ def test_work_groups_of_a_gpu(dev, rng, monkeypatch):
         assert relative_error(run_backward_input(dev, x, weight, grad_out, False), expected) < 3e-6
 
 
+@pytest.mark.large
 def test_same_bits_twice(dev, rng):
     check_same_bits(dev, rng, run_forward)
 

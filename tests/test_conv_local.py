@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from helpers import relative_error
+from helpers import large, relative_error
 from oracle_conv import conv, conv_gradients
 from test_conv import check_backward_input, check_hard_inputs, check_same_bits, layer
 
@@ -12,8 +12,8 @@ from pp_cl.conv_weights import flip_weights
 from pp_cl.tiles import grid_shape, some_tiles
 
 # (height, width, channels in, channels out): less than a work-group's pixels, tails of both kinds, half its channels
-SHAPES = [(1, 1, 16, 16), (1, 5, 16, 32), (ROWS, COLUMNS, 32, 32), (ROWS + 1, COLUMNS + 1, 16, 48), (31, 33, 16, 48),
-          (257, 3, 32, 16), (8, 8, 512, 32), (6, 17, 32, 512)]
+SHAPES = [(1, 1, 16, 16), (1, 5, 16, 32), large((ROWS, COLUMNS, 32, 32)), (ROWS + 1, COLUMNS + 1, 16, 48),
+          *map(large, [(31, 33, 16, 48), (257, 3, 32, 16), (8, 8, 512, 32), (6, 17, 32, 512)])]
 
 
 def run_forward(dev, x, weight, bias, relu, x2=None, tiles=None):
@@ -41,7 +41,7 @@ def test_forward(dev, rng, shape):
         assert relative_error(run_forward(dev, x, weight, bias, relu), conv(x, weight, bias, relu)) < 3e-6
 
 
-@pytest.mark.parametrize("c1, c2", [(16, 16), (16, 48), (64, 32)])
+@pytest.mark.parametrize("c1, c2", [(16, 16), large(16, 48), large(64, 32)])
 def test_two_sources_are_a_concatenation(dev, rng, c1, c2):
     x = rng.normal(size=(9, 29, c1 + c2)).astype(np.float32)
     weight, bias = layer(rng, c1 + c2, 48, 3)
@@ -84,6 +84,7 @@ def test_hard_inputs(dev, rng):
     check_hard_inputs(dev, rng, run_forward, run_backward_input)
 
 
+@pytest.mark.large
 def test_same_bits_twice(dev, rng):
     check_same_bits(dev, rng, run_forward)
 

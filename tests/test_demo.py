@@ -57,6 +57,7 @@ def test_silhouettes_equal_the_oracle(dev, width, height):
     assert (image[image[..., 3] == 0] == 0).all()
 
 
+@pytest.mark.large
 def test_a_crop_shows_the_same_pixels(dev):
     camera = look_at(np.array([-2.0, 2.0, 1.5]), np.zeros(3), (64, 64), 80)
     whole, part = render(dev, camera), render(dev, camera.crop(13, 21, 33, 29))
@@ -79,6 +80,7 @@ def test_the_globe_is_glossy(dev):
         assert (mirrored - other > 0.05).all()
 
 
+@pytest.mark.large
 def test_the_mesh_is_the_object(dev):
     vertices, faces = demo_mesh(dev, 192)
     mesh = trimesh.Trimesh(vertices, faces, process=False)
@@ -90,6 +92,7 @@ def test_the_mesh_is_the_object(dev):
     assert np.linalg.norm(vertices - [0, 0, -0.08], axis=1).max() < 1.05, "the tracer's ball cuts the object"
 
 
+@pytest.mark.large
 def test_the_scene_shows_the_whole_mesh(dev):
     """64 + 16 views; the mesh projects onto the masks, which carve a hull that holds it."""
     scene = demo_scene(dev, size=64)
@@ -118,12 +121,14 @@ def test_the_scene_shows_the_whole_mesh(dev):
     assert inside.sum() > 2000 and kept[inside].all()
 
 
+@pytest.mark.large
 def test_a_split_can_be_made_alone(dev):
     test, both = demo_scene(dev, ("test",), size=16), demo_scene(dev, size=16)
     assert list(test.splits) == ["test"]
     np.testing.assert_array_equal(test.splits["test"][5].image, both.splits["test"][5].image)
 
 
+@pytest.mark.large
 def test_a_written_scene_is_read_back(dev, tmp_path):
     scene = demo_scene(dev, size=24)
     folder = tmp_path / "new" / "demo"
@@ -140,6 +145,7 @@ def test_a_written_scene_is_read_back(dev, tmp_path):
     assert angle == pytest.approx(0.6911112)
 
 
+@pytest.mark.large
 def test_a_depth_range_is_written(dev, tmp_path):
     scene = demo_scene(dev, ("train",), size=16)
     scene.splits["train"] = [replace(v, camera=replace(v.camera, near=1.5, far=5.25)) for v in scene.splits["train"][:2]]
@@ -148,6 +154,7 @@ def test_a_depth_range_is_written(dev, tmp_path):
     assert again.depth_range_stored and [(v.camera.near, v.camera.far) for v in again.splits["train"]] == [(1.5, 5.25)] * 2
 
 
+@pytest.mark.large
 def test_only_an_empty_folder_is_written(dev, tmp_path):
     scene = demo_scene(dev, ("test",), size=16)
     (tmp_path / "empty").mkdir()

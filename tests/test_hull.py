@@ -108,6 +108,7 @@ def test_the_left_and_upper_borders_belong_to_an_image(dev):
     np.testing.assert_array_equal(ids, np.arange(16))
 
 
+@pytest.mark.large
 @pytest.mark.parametrize("points", (1000, 3000, 40000))
 def test_the_edge_is_found(dev, points):
     found = build_grid(dev, ball_views(), points)
@@ -126,17 +127,20 @@ def test_the_edge_is_found(dev, points):
         np.testing.assert_allclose([reached.min(), reached.max()], [lattice[:, axis].min(), lattice[:, axis].max()])
 
 
+@pytest.mark.large
 def test_the_smallest_counts(dev):
     for points in (1, 2):
         assert len(build_grid(dev, ball_views(), points).ids) >= points
 
 
+@pytest.mark.large
 def test_two_runs_give_the_same_bits(dev):
     first, second = (build_grid(dev, ball_views(), 5000) for _ in range(2))
     assert first.grid == second.grid
     np.testing.assert_array_equal(first.ids, second.ids)
 
 
+@pytest.mark.large
 def test_the_cell_cap_limits_the_grid(dev):
     """The ball fills about half of its box, so 8000 cells hold some 4000 of the 7000 points asked for."""
     found = build_grid(dev, ball_views(), 7000, cell_cap=8000)
@@ -150,6 +154,7 @@ def test_the_box_holds_the_object_and_is_tight():
     assert (box[1] - box[0]).max() < 3.2 * RADIUS
 
 
+@pytest.mark.large
 @pytest.mark.parametrize("focal", (2.7, 6.0))
 def test_an_object_cut_off_by_the_images_keeps_what_they_show(dev, focal):
     """focal 2.7: only the corners are free; 6: one pixel, so that no side of any image bounds the object."""
@@ -164,6 +169,7 @@ def test_an_object_cut_off_by_the_images_keeps_what_they_show(dev, focal):
     assert nearest.max() < 0.2 * RADIUS
 
 
+@pytest.mark.large
 def test_depth_range_holds_every_point(dev):
     views = ball_views()
     found = build_grid(dev, views, 2000)
@@ -174,6 +180,7 @@ def test_depth_range_holds_every_point(dev):
     assert far - near == pytest.approx(2 * hull.DEPTH_MARGIN * half_diagonal, rel=0.05)
 
 
+@pytest.mark.large
 @pytest.mark.parametrize("stated", [(1.0, 9.0), (3.9, 4.1)])
 def test_a_stated_depth_range_is_kept_or_widened(dev, stated):
     views = [replace(v, camera=replace(v.camera, near=stated[0], far=stated[1])) for v in ball_views()]
@@ -191,6 +198,7 @@ def without_range(view):
     return replace(view, camera=replace(view.camera, near=np.nan, far=np.nan))
 
 
+@pytest.mark.large
 @pytest.mark.parametrize("distance", (1.6, 0.5))
 def test_depth_range_of_close_cameras(dev, distance):
     """1.6: outside the hull's box, inside the enlarged ball; 0.5: inside the box."""
@@ -202,6 +210,7 @@ def test_depth_range_of_close_cameras(dev, distance):
     assert near < distances.min() if distance > 1 else near == found.grid.edge
 
 
+@pytest.mark.large
 def test_spacing_is_what_two_projected_neighbours_are_apart(dev):
     views = ball_views()
     found = build_grid(dev, views, 2000)
@@ -227,6 +236,7 @@ def test_a_view_without_mask_is_named(dev):
         build_grid(dev, views, 100)
 
 
+@pytest.mark.large
 def test_a_view_that_removes_everything_is_named(dev):
     views = ball_views()
     views[5].image[..., 3] = 0

@@ -51,6 +51,7 @@ def test_network_equals_oracle(dev, rng, size):
     assert Lpips(dev, weights).distance(a, b) == pytest.approx(expected, rel=1e-5)
 
 
+@pytest.mark.large
 def test_same_images_are_at_distance_zero_and_runs_agree_bit_for_bit(dev, rng):
     network = Lpips(dev, random_weights(rng))
     a, b = rng.uniform(0, 1, (2, 35, 50, 3))

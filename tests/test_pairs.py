@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import oracle_raster as oracle
 import pytest
-from helpers import AWKWARD_SIZES, relative_error
+from helpers import AWKWARD_SIZES, large, relative_error
 from raster_scene import Scene, make_camera, make_points
 
 from pp_cl.project import KINDS
@@ -68,7 +68,7 @@ def test_every_visible_point_hits_a_pixel(dev, rng):
     assert len(Scene(dev, camera, positions, 1e-3, "disc").pairs.seen) == 2000
 
 
-@pytest.mark.parametrize("n", [63, 64, 65, 128, 129, 1000, 100_000])
+@pytest.mark.parametrize("n", [63, 64, 65, 128, 129, 1000, large(100_000)])
 def test_lists_of_any_length_are_sorted(dev, rng, n):
     camera = replace(make_camera(1, 1), pose=np.eye(3, 4), cx=0.5, cy=0.5)
     positions = np.zeros((n, 3))

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from helpers import relative_error
+from helpers import large, relative_error
 from oracle_conv import conv_gradients
 from oracle_layers import avgpool2, avgpool2_gradient, upsample2, upsample2_gradient
 from test_conv import layer
@@ -91,7 +91,7 @@ def test_lists_and_wrong_sizes(dev):
 
 
 @pytest.mark.parametrize("k, variant", [(1, "direct"), *[(3, variant) for variant in VARIANTS]])
-@pytest.mark.parametrize("height, width", [(3, 2), (11, 14), (31, 33), (6, 70)])
+@pytest.mark.parametrize("height, width", [(3, 2), (11, 14), large(31, 33), large(6, 70)])
 def test_convolutions_compute_the_chosen_tiles(dev, rng, k, variant, height, width):
     """The other tiles of the results keep their NaN; those of a gradient that do not count may hold NaN."""
     c1, c2, co = 16, 32, 48

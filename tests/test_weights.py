@@ -3,7 +3,7 @@
 import numpy as np
 import oracle_raster as oracle
 import pytest
-from helpers import AWKWARD_SIZES, relative_error
+from helpers import AWKWARD_SIZES, large, relative_error
 from test_blend import GAMMAS, Blended
 
 from pp_cl.project import KINDS
@@ -39,7 +39,7 @@ def test_point_weights_accumulate(dev, rng):
     assert relative_error(point_weight.get() - np.arange(257), blended.blend["weight"].sum(axis=1)) < 1e-4
 
 
-@pytest.mark.parametrize("n", [*AWKWARD_SIZES, 3000])
+@pytest.mark.parametrize("n", [*AWKWARD_SIZES, large(3000)])
 @pytest.mark.parametrize("gamma", GAMMAS)
 @pytest.mark.parametrize("tau", TAUS)
 def test_tau(dev, n, gamma, tau):

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from helpers import relative_error
+from helpers import large, relative_error
 from oracle_conv import conv, conv_gradients
 from oracle_winograd import convolve
 from test_conv import layer
@@ -14,8 +14,8 @@ from pp_cl.winograd import scratch_floats, transformed_floats, winograd_backward
 from pp_cl.winograd_filter import transform_flipped_weights, transform_weights
 
 # (height, width, channels in, channels out): less than a tile, tails of tiles, groups and rounds, odd blocks of channels
-SHAPES = [(1, 1, 16, 16), (1, 5, 16, 32), (5, 1, 32, 48), (31, 33, 16, 48), (257, 3, 32, 16), (6, 31, 48, 64),
-          (4, 257, 64, 32), (8, 8, 512, 32), (16, 24, 32, 512)]
+SHAPES = [(1, 1, 16, 16), (1, 5, 16, 32), (5, 1, 32, 48), (31, 33, 16, 48),
+          *map(large, [(257, 3, 32, 16), (6, 31, 48, 64), (4, 257, 64, 32), (8, 8, 512, 32), (16, 24, 32, 512)])]
 # Float32's largest error over the largest value; F(4x4)'s transforms cost more of it than the sums do.
 BOUNDS = {2: 3e-6, 4: 8e-6}
 
@@ -126,6 +126,7 @@ def test_half_of_two_sources(dev, rng):
     assert relative_error(run_backward_input(dev, 4, x2, weight, grad_out, False, 16, half=True), expected) < BOUNDS[4]
 
 
+@pytest.mark.large
 @pytest.mark.parametrize("units", [1, 3, 100])
 def test_same_bits_for_any_number_of_compute_units(dev, rng, monkeypatch, units):
     x = rng.normal(size=(31, 50, 32)).astype(np.float32)

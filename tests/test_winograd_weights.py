@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from helpers import relative_error
+from helpers import large, relative_error
 from oracle_conv import conv_gradients
 from test_winograd import BOUNDS, SHAPES
 
@@ -10,7 +10,7 @@ from pp_cl.conv import unpack_weights
 from pp_cl.winograd_weights import gradient_scratch_floats, winograd_weight_gradient
 
 # With parts of 128 x 128 channels: several, and tails of both kinds
-PARTS = [(5, 6, 80, 144), (9, 7, 144, 48), (12, 20, 272, 256)]
+PARTS = [*map(large, [(5, 6, 80, 144), (9, 7, 144, 48), (12, 20, 272, 256)])]
 
 
 def run_weight_gradient(dev, m, grad_out, *sources):
@@ -34,7 +34,7 @@ def test_weight_gradient(dev, rng, shape, m):
 
 
 @pytest.mark.parametrize("m", BOUNDS)
-@pytest.mark.parametrize("c1, c2", [(16, 48), (80, 16)])
+@pytest.mark.parametrize("c1, c2", [(16, 48), large(80, 16)])
 def test_two_sources(dev, rng, c1, c2, m):
     x, x2 = (rng.normal(size=(33, 10, c)).astype(np.float32) for c in (c1, c2))
     grad_out = rng.normal(size=(33, 10, 32)).astype(np.float32)
@@ -57,6 +57,7 @@ def test_hard_inputs(dev, rng, m):
     assert not weight.any() and not bias.any()
 
 
+@pytest.mark.large
 @pytest.mark.parametrize("units", [1, 3, 100])
 def test_same_bits_for_any_number_of_compute_units(dev, rng, monkeypatch, units):
     x = rng.normal(size=(37, 40, 144)).astype(np.float32)
@@ -67,6 +68,7 @@ def test_same_bits_for_any_number_of_compute_units(dev, rng, monkeypatch, units)
         np.testing.assert_array_equal(actual, value)
 
 
+@pytest.mark.large
 def test_wrong_shapes_are_refused(dev):
     x, grad_out, scratch = dev.zeros((4, 4, 16)), dev.zeros((4, 4, 32)), dev.zeros(gradient_scratch_floats(dev, 4))
     grad_weight, grad_bias = dev.zeros((2, 3, 3, 16, 16)), dev.zeros(32)
