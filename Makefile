@@ -4,8 +4,8 @@ BIN := .venv/bin
 READY := .venv/.ready
 
 # The tests of all kernels, the longest in Oclgrind first.
-OCLGRIND := tiles conv_local weights winograd blend adam pair_cache lpips hard_cases winograd_weights pairs loss conv scan \
-	conv_weights smooth winograd_filter layers demo project prune target hull shade peak
+OCLGRIND := tiles conv_local weights winograd blend adam pair_cache lpips hard_cases pathological_views \
+	winograd_weights pairs loss conv scan conv_weights smooth winograd_filter layers demo project prune target hull shade peak
 # Its check for uninitialised reads knows no optimised code and no forced inlining; it takes its options from here, where
 # pyopencl's cache does not see them.
 ON_OCLGRIND := OCL_ICD_VENDORS=/usr/lib/oclgrind/liboclgrind-rt-icd.so OCLGRIND_DATA_RACES=1 OCLGRIND_UNINITIALIZED=1 \

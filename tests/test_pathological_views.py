@@ -96,6 +96,7 @@ def test_an_image_of_one_pixel(dev, rng, n):
         assert scene.pairs.total == 0 and (scene.blend([1.0], 0.1, np.zeros((1, 16))) == 1).all()
 
 
+@pytest.mark.large
 def test_an_image_of_millions_of_pixels(dev):
     """4096 x 4096: the corners and the middle are those of small images cut out of it."""
     side, patch = 4096, 24
@@ -121,6 +122,7 @@ def test_an_image_of_millions_of_pixels(dev):
     assert found > 1000
 
 
+@pytest.mark.large
 def test_long_lists_do_not_take_quadratic_time(dev):
     """Eight times the hits in one pixel, 8 log-ish times the time; 64 if it were quadratic. The best of some runs."""
     camera = replace(make_camera(1, 1), pose=np.eye(3, 4), cx=0.5, cy=0.5)
@@ -139,6 +141,7 @@ def test_long_lists_do_not_take_quadratic_time(dev):
     assert best(160_000) < 30 * best(20_000)
 
 
+@pytest.mark.large
 def test_more_pairs_than_can_be_numbered(dev):
     """2^32 - 1 and more pairs: one line, and nothing is written."""
     camera = replace(make_camera(1024, 1024), fx=9e4, fy=9e4, cx=512.0, cy=512.0)
@@ -147,6 +150,7 @@ def test_more_pairs_than_can_be_numbered(dev):
         Scene(dev, camera, np.repeat(straight, 4097, axis=0), 1.9)
 
 
+@pytest.mark.large
 def test_the_tau_of_a_real_scene_is_a_bound(dev):
     """From inside a ball of points, with the weights of neighbouring pixels all different."""
     exact, dropped = (Blended(dev, np.random.default_rng(9), 2000, gamma=0.03, radius=0.4, tau=t) for t in (0.0, 1e-3))

@@ -40,6 +40,11 @@ def test_rule_of_three(path):
     assert (ROOT / "tests" / f"test_{path.stem}.py").is_file(), "no test of the same stem"
 
 
+def test_oclgrind_checks_every_kernel_file():
+    checked = re.search(r"^OCLGRIND := ((?:.*\\\n)*.*)$", (ROOT / "Makefile").read_text("utf-8"), re.MULTILINE)[1].split()
+    assert {p.stem for p in KERNEL_FILES} <= set(checked)
+
+
 @pytest.mark.parametrize("path", **by_stem(HEADERS))
 def test_headers_are_included(path):
     assert any(f'#include "{path.name}"' in p.read_text("utf-8") for p in KERNEL_FILES + HEADERS), "nobody includes it"
