@@ -22,6 +22,7 @@ class PointsConfig:
     """The cloud of points."""
 
     count: int = 250_000  # wanted points on the grid inside the visual hull
+    sh_degree: int = 2  # of the spherical harmonics that shade a point: 0 (the same from all sides), 1 or 2
     footprint: str = "soft"  # soft: d = 1 - rho/R; disc: the paper's hard disc; sphere: Pulsar's rules for any radius
     radius: float = 0.75  # soft: in point spacings; disc and sphere: world units at a depth range of 4
     gamma: tuple = (0.1, 0.01)  # depth sharpness of the blend, first and last step
@@ -180,6 +181,7 @@ KINDS = {
 LIMITS = {
     "scene.downscale": (1, 64),
     "points.count": (1, 2**27),
+    "points.sh_degree": (0, 2),
     "points.radius": (1e-6, 100),
     "points.max_tracked": (0, 2**31 - 1),
     "points.stop": (0, 0.5),

@@ -38,7 +38,7 @@ def evaluate_run(folder, metrics, split, save_images, device_choice, tolerance=N
     adopt_stored(dev, config.network.tolerance)
     scene = open_scene(dev, config, (split,))
     measure = Metrics(dev, metrics)
-    model = Model.load(dev, header, arrays, config.network.widths, folder / CHECKPOINT)
+    model = Model.load(dev, header, arrays, config.network.widths, config.points.sh_degree, folder / CHECKPOINT)
     views = with_depth_range(scene.splits[split], model.depth_range)
 
     target_folder = folder / "eval"

@@ -3,7 +3,7 @@
 import math
 
 from pp_cl.errors import UserError
-from pp_cl.points import SH_BLOCKS
+from pp_cl.points import sh_blocks
 from pp_cl.prune import SCRATCH_BYTES
 from pp_cl.render import NETWORK_MULTIPLE
 from pp_cl.scene import reduced_camera
@@ -13,9 +13,9 @@ MIB, GIB = 2**20, 2**30
 PAIR_BYTES = 45  # two keys of 8, pixel, closeness, point and two weights of 4 bytes, a quarter of spare room
 
 
-def point_bytes(train):
-    """{what: bytes on the device} of one point of a training. train: config.TrainConfig."""
-    coefficients = 16 * sum(block.count for block in SH_BLOCKS)
+def point_bytes(train, degree):
+    """{what: bytes on the device} of one point of a training. train: config.TrainConfig. degree: of the SH."""
+    coefficients = 16 * sum(block.count for block in sh_blocks(degree))
     learned = 4 * (1 + coefficients)
     return {
         "ids, opacities, SH coefficients": 4 + learned,
@@ -32,8 +32,8 @@ def memory_plan(dev, config, model, views):
     n, train = model.count, config.train
     camera = reduced_camera(views[0], config.scene.downscale)
     width, height = (side + -side % NETWORK_MULTIPLE for side in train.crop_size(camera.width, camera.height))
-    rows = [(what, f"({n}) x {size} bytes", n * size) for what, size in point_bytes(train).items() if size]
-    row_bytes = max(64 * block.count for block in SH_BLOCKS)  # of the largest array of a point
+    rows = [(what, f"({n}) x {size} bytes", n * size) for what, size in point_bytes(train, model.degree).items() if size]
+    row_bytes = max(64 * block.count for block in model.blocks)  # of the largest array of a point
     if train.smooth > 0:
         chunk = min(n, max(CHUNK, n // model.grid.dims[2]))  # the points of a layer, about
         rows.append(("smoothing (estimate)", f"2 x ({chunk}) x {row_bytes} bytes", 2 * chunk * row_bytes))

@@ -3,22 +3,24 @@
 import numpy as np
 
 from pp_cl.errors import UserError
-from pp_cl.points import SH_BLOCKS, SH_DEGREES, Grid
+from pp_cl.points import SH_DEGREES, Grid, sh_blocks
 from pp_cl.unet import UNet
-
-POINT_KEYS = ("opacity", *(block.name for block in SH_BLOCKS))  # the learned arrays of a point
 
 
 class Model:
     """Points and network on a device.
 
-    grid: Grid. depth_range: (near, far), world units, of cameras that bring none. points: {"ids" (N) uint32 ascending,
-    "opacity" (N), "sh0" (N,1,16), "sh1" (N,3,16), "sh4" (N,3,16), "sh7" (N,2,16)} device arrays, see points.SH_BLOCKS;
-    training adds rows of its own.
+    degree: of the SH, 0 to 2. blocks: points.ShBlock of each array of coefficients. grid: Grid.
+    depth_range: (near, far), world units, of cameras that bring none. points: {"ids" (N) uint32 ascending,
+    "opacity" (N), "sh0" (N,1,16), "sh1" (N,3,16), "sh4" (N,3,16), "sh7" (N,2,16)} device arrays, see points.SH_BLOCKS,
+    as far as the degree goes; training adds rows of its own. keys: of the learned ones, all but "ids".
     """
 
-    def __init__(self, dev, grid, depth_range, points, net):
+    def __init__(self, dev, grid, depth_range, points, net, degree):
         self.dev = dev
+        self.degree = degree
+        self.blocks = sh_blocks(degree)
+        self.keys = ("opacity", *(block.name for block in self.blocks))
         self.grid = grid
         self.grid_buffer = dev.upload(grid.packed())
         self.depth_range = depth_range
@@ -31,16 +33,16 @@ class Model:
         return self.points["ids"].shape[0]
 
     @classmethod
-    def create(cls, dev, grid, ids, depth_range, widths, seed):
+    def create(cls, dev, grid, ids, depth_range, widths, seed, degree=SH_DEGREES[-1]):
         """Fresh model: opacity 1, SH coefficients 0, network at its random start.
 
         ids: (N) uint32 ascending grid vertices.
         """
         n = len(ids)
         points = {"ids": dev.upload(ids, np.uint32), "opacity": dev.upload(np.ones(n, np.float32))}
-        for block in SH_BLOCKS:
+        for block in sh_blocks(degree):
             points[block.name] = dev.zeros((n, block.count, 16))
-        return cls(dev, grid, depth_range, points, UNet(dev, widths=widths, seed=seed))
+        return cls(dev, grid, depth_range, points, UNet(dev, widths=widths, seed=seed), degree)
 
     def header(self):
         """JSON-able description that load() needs beside the arrays."""
@@ -56,13 +58,13 @@ class Model:
     def arrays(self):
         """{name: numpy array} of everything learned; the SH coefficients by degree, (N,1,16), (N,3,16), (N,5,16)."""
         stored = {f"points.{name}": self.points[name].get() for name in ("ids", "opacity")}
-        for degree in SH_DEGREES:
-            parts = [self.points[block.name].get() for block in SH_BLOCKS if block.degree == degree]
+        for degree in SH_DEGREES[: self.degree + 1]:
+            parts = [self.points[block.name].get() for block in self.blocks if block.degree == degree]
             stored[f"points.sh{degree}"] = np.concatenate(parts, 1)
         return stored | {f"net.{name}": array.get() for name, array in self.net.parameters.items()}
 
     @classmethod
-    def load(cls, dev, header, arrays, widths, file):
+    def load(cls, dev, header, arrays, widths, degree, file):
         """Model of a checkpoint's header and arrays. Raises UserError naming the file and the array that does not fit."""
         try:
             grid = Grid(tuple(header["grid"]["origin"]), header["grid"]["edge"], tuple(header["grid"]["dims"]))
@@ -71,15 +73,15 @@ class Model:
             raise UserError(f"{file}: its header is incomplete; train anew") from None
         net = UNet(dev, widths=widths, seed=0)
         n = len(arrays.get("points.ids", ()))
-        shapes = {"ids": (n,), "opacity": (n,)} | {f"sh{d}": (n, 2 * d + 1, 16) for d in SH_DEGREES}
+        shapes = {"ids": (n,), "opacity": (n,)} | {f"sh{d}": (n, 2 * d + 1, 16) for d in SH_DEGREES[: degree + 1]}
         stored = {name: _fitting(arrays, f"points.{name}", shape, file) for name, shape in shapes.items()}
         points = {name: dev.upload(stored[name]) for name in ("ids", "opacity")}
-        for block in SH_BLOCKS:
+        for block in sh_blocks(degree):
             start = block.first - block.degree**2  # in its degree
             points[block.name] = dev.upload(stored[f"sh{block.degree}"][:, start : start + block.count])
         for name, parameter in net.parameters.items():
             parameter.set(_fitting(arrays, f"net.{name}", parameter.shape, file))
-        return cls(dev, grid, depth_range, points, net)
+        return cls(dev, grid, depth_range, points, net, degree)
 
 
 def _fitting(arrays, name, shape, file):

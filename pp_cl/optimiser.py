@@ -8,8 +8,6 @@ from dataclasses import dataclass
 import numpy as np
 
 from pp_cl.adam import PointAdam, Touched, adam_update, ema_update
-from pp_cl.model import POINT_KEYS
-from pp_cl.points import SH_BLOCKS
 from pp_cl.schedule import learning_rate
 
 OPACITY_EPS = 1e-15  # opacity gradients span many decades; clamping bounds the step instead
@@ -49,7 +47,7 @@ class Optimiser:
             f"{kind}.{name}": dev.zeros(array.shape) for name, array in model.net.parameters.items() for kind in "mv"
         }
         self.point_adam, self.touched = PointAdam(dev, lazy, scale), Touched(dev)
-        for block in SH_BLOCKS:
+        for block in model.blocks:
             for kind, array in self.point_adam.sh_moments(block, model.count).items():
                 model.points[f"{kind}.{block.name}"] = array
         for kind in "mv":
@@ -71,7 +69,7 @@ class Optimiser:
             adam.begin_lazy(step, self.touched.rows(kept, *grads), points["last"])
         else:
             adam.begin(step, self.model.count)
-        for block in SH_BLOCKS:
+        for block in self.model.blocks:
             if rates.sh[block.degree] == 0:
                 continue  # its moments are not even read
             adam.update_sh(
@@ -114,7 +112,7 @@ class Optimiser:
 
     def _averaged(self):
         points = self.model.points
-        for name in POINT_KEYS:
+        for name in self.model.keys:
             yield points[name], points, f"a.{name}"
         for name, parameter in self.model.net.parameters.items():
             yield parameter, self.averages, name
@@ -123,7 +121,7 @@ class Optimiser:
         """{name: numpy array} of the state beside the model's own arrays."""
         own = {f"moment.{name}": a.get() for name, a in self.moments.items()}
         own |= {f"average.{name}": a.get() for name, a in self.averages.items()}
-        learned = {"ids", *POINT_KEYS}
+        learned = {"ids", *self.model.keys}
         return own | {f"state.{name}": a.get() for name, a in self.model.points.items() if name not in learned}
 
     def restore(self, arrays):
@@ -131,7 +129,7 @@ class Optimiser:
         for name in self.moments:
             self.moments[name].set(arrays[f"moment.{name}"])
         points = self.model.points
-        for name in [n for n in points if n not in ("ids", *POINT_KEYS)]:
+        for name in [n for n in points if n not in ("ids", *self.model.keys)]:
             if arrays[f"state.{name}"].shape != points[name].shape:
                 raise ValueError(f"state.{name} has shape {arrays[f'state.{name}'].shape}")
             points[name].set(arrays[f"state.{name}"])

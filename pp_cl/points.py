@@ -5,8 +5,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-SH_DEGREES = (0, 1, 2)
-
 
 @dataclass(frozen=True)
 class ShBlock:
@@ -29,6 +27,12 @@ class ShBlock:
 # Degree 2 lies in two arrays: no array takes more than 192 bytes a point, so that 4.04 million points fit devices that
 # allocate at most 1 GiB at once. The layout is the same everywhere, and so are the bits.
 SH_BLOCKS = (ShBlock(0, 1), ShBlock(1, 3), ShBlock(4, 3), ShBlock(7, 2))
+SH_DEGREES = (0, 1, 2)
+
+
+def sh_blocks(degree):
+    """Those of SH_BLOCKS up to a degree."""
+    return tuple(block for block in SH_BLOCKS if block.degree <= degree)
 
 
 @dataclass(frozen=True)

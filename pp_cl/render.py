@@ -8,7 +8,6 @@ import numpy as np
 from pp_cl.blend import BACKGROUND, Blend
 from pp_cl.pair_cache import PairCache
 from pp_cl.pairs import Pairs
-from pp_cl.points import SH_BLOCKS
 from pp_cl.project import Footprint, Projection
 from pp_cl.shade import shade_forward
 from pp_cl.weights import Weights
@@ -64,7 +63,7 @@ class Renderer:
         points, settings, pairs, weights = self.model.points, self.settings, self.pairs, self.weights
         radius = self._radius(padded)
         self.radius_buffer.set(np.array([radius], np.float32))
-        sh = [points[block.name] for block in SH_BLOCKS]
+        sh = [points[block.name] for block in self.model.blocks]
         return {
             "project": lambda: self.projection.grid(
                 self.camera, self.model.grid_buffer, points["ids"], radius, dropout, seed

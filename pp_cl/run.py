@@ -114,7 +114,8 @@ def _start(dev, config, scene):
         f"({spacing_pixels(hull, views, config.scene.downscale):.2f} pixels), depth {near_far[0]:.3f} to {near_far[1]:.3f} "
         f"({time.perf_counter() - start:.1f} s)"
     )
-    model = Model.create(dev, hull.grid, hull.ids, near_far, config.network.widths, config.train.seed)
+    model = Model.create(dev, hull.grid, hull.ids, near_far, config.network.widths, config.train.seed,
+                         config.points.sh_degree)
     return Trainer(dev, config, model, with_depth_range(views, near_far)), {
         "scene": fingerprint(views),
         "initial_points": len(hull.ids),
@@ -126,7 +127,7 @@ def _resume(dev, config, scene, header, arrays, file):
     views = scene.splits["train"]
     if header["scene"] != fingerprint(views):
         raise UserError(f"{file}: belongs to another scene than {config.scene.path}; use another --out")
-    model = Model.load(dev, header, arrays, config.network.widths, file)
+    model = Model.load(dev, header, arrays, config.network.widths, config.points.sh_degree, file)
     trainer = Trainer(dev, config, model, with_depth_range(views, model.depth_range))
     try:
         trainer.restore(header["step"], arrays)

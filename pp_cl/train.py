@@ -7,9 +7,7 @@ import numpy as np
 from pp_cl.adam import moment_scale
 from pp_cl.errors import UserError
 from pp_cl.loss import Loss
-from pp_cl.model import POINT_KEYS
 from pp_cl.optimiser import Optimiser, Rates
-from pp_cl.points import SH_BLOCKS
 from pp_cl.prune import keep_indices, prune
 from pp_cl.render import Renderer
 from pp_cl.scene import object_box, reduced_camera
@@ -131,7 +129,7 @@ class Trainer:
         if self._smoother is None:
             self._smoother = Smoother(self.dev, self.model.grid_buffer, points["ids"])
         pull = self.config.smooth * self.config.smooth_every
-        for block in SH_BLOCKS:
+        for block in self.model.blocks:
             if rates.sh[block.degree] > 0:
                 self._smoother.smooth(points[block.name], pull * rates.sh[block.degree])
 
@@ -153,7 +151,7 @@ class Trainer:
                 self.renderer.blend_weights(reduced_camera(view, self.downscale), self.gamma[1])
                 self.renderer.add_point_weights(total)
             self._prune(total, self.config.final_weight)
-        self.model.points = {name: self.model.points[name] for name in ("ids", *POINT_KEYS)}
+        self.model.points = {name: self.model.points[name] for name in ("ids", *self.model.keys)}
 
     def rates(self):
         """The learning rates of the last step, for the log."""

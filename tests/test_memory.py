@@ -62,10 +62,10 @@ def test_pruning_stays_within_the_plan(dev, tmp_path, monkeypatch):
 def test_the_papers_scale_fits_nine_gibibytes(lazy):
     train = preset("paper").train
     train.lazy = lazy
-    single = PAPER_POINTS * sum(point_bytes(train).values())
+    single = PAPER_POINTS * sum(point_bytes(train, 2).values())
     assert single + 2 * 45 * PAPER_POINTS < 9 * 2**30  # two hits a point; a disc of 0.75 pixels covers 1.77
     train.half_moments = True
-    assert single - PAPER_POINTS * sum(point_bytes(train).values()) == PAPER_POINTS * 576
+    assert single - PAPER_POINTS * sum(point_bytes(train, 2).values()) == PAPER_POINTS * 576
 
 
 def test_a_plan_over_the_memory_names_the_knobs(dev, capsys):

@@ -126,6 +126,23 @@ def test_a_degree_of_rate_0_is_left_alone(scene, tmp_path, monkeypatch):
     assert main(arguments(scene, tmp_path / "run", **changes)) == 0
 
 
+@pytest.mark.parametrize("degree", [0, 1])
+def test_a_lower_degree_learns_what_zero_rates_above_it_learn(scene, tmp_path, degree):
+    lower, zero = tmp_path / "lower", tmp_path / "zero"
+    rates = ",".join(["0.5", "0.25", "0.125"][: degree + 1] + ["0"] * (2 - degree))
+    assert main(arguments(scene, lower, points__sh_degree=degree)) == 0
+    assert main(arguments(scene, zero, train__sh_rate=rates)) == 0
+    _, arrays = load_checkpoint(lower / "checkpoint.npz")
+    _, expected = load_checkpoint(zero / "checkpoint.npz")
+    assert set(expected) - set(arrays) == {f"points.sh{d}" for d in range(degree + 1, 3)}
+    for name, array in arrays.items():
+        np.testing.assert_array_equal(array, expected[name])
+    for run in (lower, zero):
+        assert main(["eval", str(run), "--metrics", "psnr"]) == 0
+    pictures = [sorted((run / "eval").rglob("*.png")) for run in (lower, zero)]
+    assert pictures[0] and all(a.read_bytes() == b.read_bytes() for a, b in zip(*pictures, strict=True))
+
+
 def test_bounded_memory_gives_the_same_bytes(scene, tmp_path, capsys, monkeypatch):
     """No buffer larger than 200 bytes a point, and pruning in place by many pieces."""
     changes = {"points__count": 50_000, "train__iterations": 24, "train__prune_every": 8}

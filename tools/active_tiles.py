@@ -33,7 +33,8 @@ class Comparison:
         self.dev = dev
         self.config = load_config(folder / "config.json")
         header, arrays = load_run(folder / CHECKPOINT)
-        model = Model.load(dev, header, arrays, self.config.network.widths, folder / CHECKPOINT)
+        widths, degree = self.config.network.widths, self.config.points.sh_degree
+        model = Model.load(dev, header, arrays, widths, degree, folder / CHECKPOINT)
         self.views = with_depth_range(open_scene(dev, self.config, (split,)).splits[split], model.depth_range)
         self.downscale = downscale or self.config.scene.downscale
         self.net = bench.make_network(dev, widths, "auto") if widths else model.net

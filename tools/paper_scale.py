@@ -32,7 +32,8 @@ def make_trainer(dev, config):
     views = open_scene(dev, config, ("train",)).splits["train"]
     hull = build_grid(dev, views, config.points.count)
     near_far = depth_range(views, hull)
-    model = Model.create(dev, hull.grid, hull.ids, near_far, config.network.widths, config.train.seed)
+    model = Model.create(dev, hull.grid, hull.ids, near_far, config.network.widths, config.train.seed,
+                         config.points.sh_degree)
     model.points["opacity"].set(np.random.default_rng(0).uniform(0.3, 1, model.count).astype(np.float32))
     return Trainer(dev, config, model, with_depth_range(views, near_far))
 
