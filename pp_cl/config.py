@@ -93,7 +93,7 @@ class Config:
 # What differs from the defaults above, which are the tiny preset: minutes on a CPU.
 PRESETS = {
     "tiny": {},
-    # for 400 x 400; meant for an hour or two on a CPU, not timed yet
+    # for 400 x 400; 8000 steps take a quarter of an hour on a CPU, the whole schedule has not been timed
     "small": {"points.count": 1_000_000, "train.iterations": 20_000, "train.crop": 192},
     # the supplemental's own numbers; what it does not state is as above
     "paper": {
