@@ -26,7 +26,7 @@ typedef struct {
 } Hits;
 
 ALWAYS_INLINE Hits load_hits(const Camera *k, global const ulong *key, const uint count, global const uint2 *pair_source,
-                      global const float *opacity) {
+                             global const float *opacity) {
     float o[BATCH] = {0.0f}, d[BATCH] = {0.0f}, depth[BATCH] = {0.0f};
     for (uint j = 0; j < count; j++) {
         const ulong entry = key[j];
