@@ -4,8 +4,32 @@ BIN := .venv/bin
 READY := .venv/.ready
 
 # The tests of all kernels, the longest in Oclgrind first.
-OCLGRIND := tiles conv_local weights winograd blend adam pair_cache lpips hard_cases pathological_views \
-	winograd_weights pairs loss conv scan conv_weights smooth winograd_filter layers demo project prune target hull shade peak
+OCLGRIND := tests/layers/test_tiles.py \
+	tests/layers/test_conv_local.py \
+	tests/raster/test_blend_weights.py \
+	tests/layers/test_winograd.py \
+	tests/raster/test_blend.py \
+	tests/training/test_adam.py \
+	tests/raster/test_pair_cache.py \
+	tests/metrics/test_lpips.py \
+	tests/raster/test_hard_cases.py \
+	tests/raster/test_pathological_views.py \
+	tests/layers/test_winograd_backward_weights.py \
+	tests/raster/test_pairs.py \
+	tests/training/test_loss.py \
+	tests/layers/test_conv.py \
+	tests/device/test_scan.py \
+	tests/layers/test_conv_backward_weights.py \
+	tests/training/test_smooth.py \
+	tests/layers/test_winograd_transform.py \
+	tests/layers/test_resample.py \
+	tests/scene/test_demo.py \
+	tests/raster/test_project.py \
+	tests/training/test_prune.py \
+	tests/scene/test_target.py \
+	tests/scene/test_hull.py \
+	tests/raster/test_shade.py \
+	tests/bench/test_peak.py
 # Its check for uninitialised reads knows no optimised code and no forced inlining; it takes its options from here, where
 # pyopencl's cache does not see them.
 ON_OCLGRIND := OCL_ICD_VENDORS=/usr/lib/oclgrind/liboclgrind-rt-icd.so OCLGRIND_DATA_RACES=1 OCLGRIND_UNINITIALIZED=1 \
@@ -43,7 +67,7 @@ lint: $(READY) ## check the style of the Python files
 	@$(BIN)/ruff check
 
 oclgrind: $(READY) ## run the tests of all kernels in Oclgrind (Debian's package): stray accesses, data races, uninitialised reads
-	@printf 'tests/test_%s.py\n' $(OCLGRIND) | $(ON_OCLGRIND) xargs -P $$(nproc) -I{} \
+	@printf '%s\n' $(OCLGRIND) | $(ON_OCLGRIND) xargs -P $$(nproc) -I{} \
 		$(BIN)/python -m pytest -q -p no:cacheprovider -m "not large" $(ARGS) {}
 
 clean: ## remove .venv and everything built; runs/ stays

@@ -1,14 +1,15 @@
-// A pinhole camera read from one buffer of 20 floats (docs/conventions.md); pp_cl/camera.py writes it.
+// A pinhole camera read from one buffer of 20 floats (docs/conventions.md); pp_cl/scene/camera.py
+// writes it.
 #ifndef PP_CAMERA_H
 #define PP_CAMERA_H
 
 #define CAMERA_FLOATS 20
 
 typedef struct {
-    float3 right, down, forward;     // camera axes in world coordinates
+    float3 right, down, forward;  // camera axes in world coordinates
     float3 eye;
-    float fx, fy, cx, cy;            // pixels; the centre of pixel (x, y) is (x + 0.5, y + 0.5)
-    float near, far;                 // Euclidean distance from the eye
+    float fx, fy, cx, cy;  // pixels; the centre of pixel (x, y) is (x + 0.5, y + 0.5)
+    float near, far;       // Euclidean distance from the eye
     int width, height;
 } Camera;
 

@@ -2,9 +2,10 @@
 #ifndef PP_COMMON_H
 #define PP_COMMON_H
 
-#define NONE 0xffffffffu         // "no such index"
+#define NONE 0xffffffffu  // "no such index"
 
-// PoCL calls functions it finds large, passing structs and vectors in memory; a simulator may define this as inline.
+// PoCL calls functions it finds large, passing structs and vectors in memory; a simulator may
+// define this as inline.
 #ifndef ALWAYS_INLINE
 #define ALWAYS_INLINE __attribute__((always_inline)) inline
 #endif
@@ -21,7 +22,8 @@ inline uint scramble(uint x) {
     return x ^ (x >> 16);
 }
 
-// The upper half of a 16-vector lane by lane, for (float8)(...): Oclgrind 21.10 takes lane 11 of a shuffle for undefined.
+// The upper half of a 16-vector lane by lane, for (float8)(...): Oclgrind 21.10 takes lane 11 of a
+// shuffle for undefined.
 #define UPPER_HALF(v) (v).s8, (v).s9, (v).sa, (v).sb, (v).sc, (v).sd, (v).se, (v).sf
 
 // Sum of the products of two 16-vectors; the order of the sum is fixed by the tree below.

@@ -1,8 +1,8 @@
-// The regular grid of the points, read from one buffer of 8 floats; pp_cl/points.py writes it.
+// The regular grid of the points, read from one buffer of 8 floats; pp_cl/scene/grid.py writes it.
 #ifndef PP_GRID_H
 #define PP_GRID_H
 
-#define GRID_FLOATS 8            // origin x, y, z; edge; nx, ny, nz; 0
+#define GRID_FLOATS 8  // origin x, y, z; edge; nx, ny, nz; 0
 
 // World position of grid vertex `id` = i + nx*(j + ny*k).
 inline float3 grid_position(global const float *grid, const uint id) {

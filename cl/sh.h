@@ -1,13 +1,14 @@
-// Real spherical harmonics of degrees 0 to 2 in the order and with the signs of PlenOctrees (Yu et al. 2021).
+// Real spherical harmonics of degrees 0 to 2 in the order and with the signs of PlenOctrees (Yu et
+// al. 2021).
 #ifndef PP_SH_H
 #define PP_SH_H
 
-#define SH_0 0.28209479f         // 1 / (2 sqrt(pi))
-#define SH_1 0.48860251f         // sqrt(3 / (4 pi))
-#define SH_2A 1.09254843f        // sqrt(15 / (4 pi))
-#define SH_2B 0.94617470f        // 3/4 sqrt(5 / pi)
-#define SH_2C 0.31539157f        // 1/4 sqrt(5 / pi)
-#define SH_2D 0.54627422f        // 1/4 sqrt(15 / pi)
+#define SH_0 0.28209479f   // 1 / (2 sqrt(pi))
+#define SH_1 0.48860251f   // sqrt(3 / (4 pi))
+#define SH_2A 1.09254843f  // sqrt(15 / (4 pi))
+#define SH_2B 0.94617470f  // 3/4 sqrt(5 / pi)
+#define SH_2C 0.31539157f  // 1/4 sqrt(5 / pi)
+#define SH_2D 0.54627422f  // 1/4 sqrt(15 / pi)
 
 // basis[0..8] of the unit direction d
 inline void sh_basis(const float3 d, float *basis) {

@@ -1,11 +1,11 @@
-// Sixteen neighbouring values as one vector, where arrays or channels need not come in multiples of 16.
+// Sixteen neighbouring values as one vector, where arrays or channels need not come in multiples of
+// 16.
 #ifndef PP_VECTOR_H
 #define PP_VECTOR_H
 
 // The 16 values at p, of which `count` exist; the others read as 0.
 inline float16 load16(global const float *p, const int count) {
-    if (count >= 16)
-        return vload16(0, p);
+    if (count >= 16) return vload16(0, p);
     float x[16];
     for (int i = 0; i < 16; i++)
         x[i] = i < count ? p[i] : 0.0f;

@@ -2,4 +2,6 @@
 
 
 class UserError(Exception):
-    """Bad input or environment. The message is one line that names the file (and key) and the mend."""
+    """Bad input or environment. The message is one line that names the file (and key) and the
+    mend.
+    """

@@ -6,28 +6,29 @@ from pathlib import PurePosixPath
 
 import numpy as np
 
-from pp_cl.checkpoint import remove_leftovers, write_json
 from pp_cl.config import assign, load_config, validate
-from pp_cl.device import open_device
-from pp_cl.image import write_png
-from pp_cl.metrics import Metrics, mean
+from pp_cl.device.discover import open_device
+from pp_cl.files.atomic import remove_leftovers, write_json
+from pp_cl.files.contact_sheet import write_comparison
+from pp_cl.files.image import write_png
+from pp_cl.layers.tuning import adopt_stored
+from pp_cl.metrics.psnr_ssim import Metrics, mean
 from pp_cl.model import Model
-from pp_cl.preview import write_comparison
 from pp_cl.render import Renderer
 from pp_cl.run import CHECKPOINT, load_run, open_scene, with_depth_range
-from pp_cl.scene import reduced_camera
-from pp_cl.schedule import gamma
-from pp_cl.target import Target
-from pp_cl.tuning import adopt_stored
+from pp_cl.scene.target import Target
+from pp_cl.scene.views import reduced_camera
+from pp_cl.training.schedule import gamma
 
 PICTURE_VIEWS = 4  # rows of the comparison picture
 
 
 def evaluate_run(folder, metrics, split, save_images, device_choice, tolerance=None):
-    """Measure a run; writes RUN/eval/metrics.json and comparison.png, prints a table, returns the metrics.
+    """Measure a run; writes RUN/eval/metrics.json and comparison.png, prints a table, returns the
+    metrics.
 
-    metrics: names out of psnr, ssim, lpips; tolerance: text for network.tolerance, None = the run's. Raises UserError for a
-    missing or broken run or split.
+    metrics: names out of psnr, ssim, lpips; tolerance: text for network.tolerance, None = the
+    run's. Raises UserError for a missing or broken run or split.
     """
     config = load_config(folder / "config.json")
     if tolerance is not None:
@@ -38,7 +39,9 @@ def evaluate_run(folder, metrics, split, save_images, device_choice, tolerance=N
     adopt_stored(dev, config.network.tolerance)
     scene = open_scene(dev, config, (split,))
     measure = Metrics(dev, metrics)
-    model = Model.load(dev, header, arrays, config.network.widths, config.points.sh_degree, folder / CHECKPOINT)
+    model = Model.load(
+        dev, header, arrays, config.network.widths, config.points.sh_degree, folder / CHECKPOINT
+    )
     views = with_depth_range(scene.splits[split], model.depth_range)
 
     target_folder = folder / "eval"
@@ -47,7 +50,9 @@ def evaluate_run(folder, metrics, split, save_images, device_choice, tolerance=N
     gamma_now = gamma(header["step"], config.train.iterations, *config.points.gamma)
     shown = {len(views) * i // PICTURE_VIEWS for i in range(PICTURE_VIEWS)}
     rows, pictures, seconds, shares = [], [], [], []
-    for i, (view, picture, truth, duration, dropped) in enumerate(_render_all(dev, config, model, views, gamma_now)):
+    for i, (view, picture, truth, duration, dropped) in enumerate(
+        _render_all(dev, config, model, views, gamma_now)
+    ):
         rows.append({"name": view.name} | measure(picture, truth) | dropped)
         seconds.append(duration)
         shares.append(model.net.share)
@@ -62,24 +67,35 @@ def evaluate_run(folder, metrics, split, save_images, device_choice, tolerance=N
         "finished": header["finished"],
         "mean": mean([{name: row[name] for name in ("name", *metrics)} for row in rows]),
         "per_image": rows,
-        "points": {"initial": header["initial_points"], "final": model.count, "grid": header["grid"]["dims"]},
+        "points": {
+            "initial": header["initial_points"],
+            "final": model.count,
+            "grid": header["grid"]["dims"],
+        },
         "seconds_per_frame": float(np.median(seconds)),
-        "network_share": float(np.mean(shares)),  # of the network's multiplications; the rest saw background alone
+        # of the network's multiplications; the rest saw background alone
+        "network_share": float(np.mean(shares)),
         "published": scene.published,
     }
     write_json(target_folder / "metrics.json", result)
     write_comparison(target_folder / "comparison.png", *zip(*pictures, strict=True))
     _print_table(result, folder)
-    print(f"wrote {target_folder / 'metrics.json'} and {target_folder / 'comparison.png'} (prediction | truth | 4 x error)")
+    print(
+        f"wrote {target_folder / 'metrics.json'} and {target_folder / 'comparison.png'} (prediction"
+        " | truth | 4 x error)"
+    )
     return result
 
 
 def _render_all(dev, config, model, views, gamma_now):
-    """Yield (view, prediction (H,W,3), truth (H,W,3), seconds of the rendering, what tau did) as float32 in [0, 1]."""
+    """Yield (view, prediction (H,W,3), truth (H,W,3), seconds of the rendering, what tau did) as
+    float32 in [0, 1].
+    """
     model.net.freeze()
     exact = Renderer(dev, model, replace(config.points, tau=0.0)) if config.points.tau > 0 else None
     renderer, target = Renderer(dev, model, config.points), Target(dev, config.scene.downscale)
-    renderer.picture(reduced_camera(views[0], config.scene.downscale), gamma_now)  # builds the programs
+    # builds the programs
+    renderer.picture(reduced_camera(views[0], config.scene.downscale), gamma_now)
     for view in views:
         camera = reduced_camera(view, config.scene.downscale)
         start = time.perf_counter()
@@ -87,21 +103,32 @@ def _render_all(dev, config, model, views, gamma_now):
         seconds = time.perf_counter() - start
         target.load(view)
         truth = target.crop(0, 0, camera.width, camera.height).get()
-        yield view, picture, truth, seconds, _dropped(renderer, picture, exact, camera, gamma_now) if exact else {}
+        yield (
+            view,
+            picture,
+            truth,
+            seconds,
+            _dropped(renderer, picture, exact, camera, gamma_now) if exact else {},
+        )
 
 
 def _dropped(renderer, picture, exact, camera, gamma_now):
     """{"tau_bound", "tau_feature_error", "tau_picture_error"} of the view rendered last.
 
-    The largest weight that a pixel dropped (or its bound), and the largest differences from `exact`, which renders at tau 0:
-    of a feature over the features' range, and of the picture.
+    The largest weight that a pixel dropped (or its bound), and the largest differences from
+    `exact`, which renders at tau 0: of a feature over the features' range, and of the picture.
     """
-    bound, features = renderer.weights.dropped(renderer.pairs).get().max(initial=0), renderer.features.get()
+    bound, features = (
+        renderer.weights.dropped(renderer.pairs).get().max(initial=0),
+        renderer.features.get(),
+    )
     exact_picture = exact.picture(camera, gamma_now)
     exact_features = exact.features.get()
     return {
         "tau_bound": float(bound),
-        "tau_feature_error": float(np.abs(features - exact_features).max() / max(np.ptp(exact_features), 1e-30)),
+        "tau_feature_error": float(
+            np.abs(features - exact_features).max() / max(np.ptp(exact_features), 1e-30)
+        ),
         "tau_picture_error": float(np.abs(picture - exact_picture).max()),
     }
 
@@ -113,14 +140,25 @@ def _print_table(result, folder):
         f"{k} (published)": v for k, v in result["published"].items()
     }
     for label, values in rows.items():
-        print(f"{label:28s}" + "".join(f"{values[n]:9.4f}" if n in values else f"{'':9s}" for n in names))
+        print(
+            f"{label:28s}"
+            + "".join(f"{values[n]:9.4f}" if n in values else f"{'':9s}" for n in names)
+        )
     points = result["points"]
-    errors = {name: max(row.get(name, 0.0) for row in result["per_image"])
-              for name in ("tau_bound", "tau_feature_error", "tau_picture_error")}
+    errors = {
+        name: max(row.get(name, 0.0) for row in result["per_image"])
+        for name in ("tau_bound", "tau_feature_error", "tau_picture_error")
+    }
     if any(errors.values()):
-        print("points.tau: dropped at most {:.1e} of a pixel; features off by {:.1e} of their range, the picture by {:.1e}"
-              .format(*errors.values()))
-    share = f"{result['network_share']:.0%} of the network's work, " if result["network_share"] < 1 else ""
+        print(
+            "points.tau: dropped at most {:.1e} of a pixel; features off by {:.1e} of their range,"
+            " the picture by {:.1e}".format(*errors.values())
+        )
+    share = (
+        f"{result['network_share']:.0%} of the network's work, "
+        if result["network_share"] < 1
+        else ""
+    )
     print(
         f"{points['final']} of {points['initial']} points, {share}"
         f"{result['seconds_per_frame'] * 1e3:.0f} ms per frame on {result['device']}"

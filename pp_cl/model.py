@@ -1,19 +1,23 @@
-"""All that is learned: the points on the grid, and the U-Net that turns their features into colours."""
+"""All that is learned: the points on the grid, and the U-Net that turns their features into
+colours.
+"""
 
 import numpy as np
 
 from pp_cl.errors import UserError
-from pp_cl.points import SH_DEGREES, Grid, sh_blocks
-from pp_cl.unet import UNet
+from pp_cl.network.unet import UNet
+from pp_cl.raster.sh import SH_DEGREES, sh_blocks
+from pp_cl.scene.grid import Grid
 
 
 class Model:
     """Points and network on a device.
 
     degree: of the SH, 0 to 2. blocks: points.ShBlock of each array of coefficients. grid: Grid.
-    depth_range: (near, far), world units, of cameras that bring none. points: {"ids" (N) uint32 ascending,
-    "opacity" (N), "sh0" (N,1,16), "sh1" (N,3,16), "sh4" (N,3,16), "sh7" (N,2,16)} device arrays, see points.SH_BLOCKS,
-    as far as the degree goes; training adds rows of its own. keys: of the learned ones, all but "ids".
+    depth_range: (near, far), world units, of cameras that bring none. points: {"ids" (N) uint32
+    ascending, "opacity" (N), "sh0" (N,1,16), "sh1" (N,3,16), "sh4" (N,3,16), "sh7" (N,2,16)} device
+    arrays, see points.SH_BLOCKS, as far as the degree goes; training adds rows of its own. keys: of
+    the learned ones, all but "ids".
     """
 
     def __init__(self, dev, grid, depth_range, points, net, degree):
@@ -56,29 +60,45 @@ class Model:
         }
 
     def arrays(self):
-        """{name: numpy array} of everything learned; the SH coefficients by degree, (N,1,16), (N,3,16), (N,5,16)."""
+        """{name: numpy array} of everything learned; the SH coefficients by degree, (N,1,16),
+        (N,3,16), (N,5,16).
+        """
         stored = {f"points.{name}": self.points[name].get() for name in ("ids", "opacity")}
         for degree in SH_DEGREES[: self.degree + 1]:
-            parts = [self.points[block.name].get() for block in self.blocks if block.degree == degree]
+            parts = [
+                self.points[block.name].get() for block in self.blocks if block.degree == degree
+            ]
             stored[f"points.sh{degree}"] = np.concatenate(parts, 1)
         return stored | {f"net.{name}": array.get() for name, array in self.net.parameters.items()}
 
     @classmethod
     def load(cls, dev, header, arrays, widths, degree, file):
-        """Model of a checkpoint's header and arrays. Raises UserError naming the file and the array that does not fit."""
+        """Model of a checkpoint's header and arrays. Raises UserError naming the file and the array
+        that does not fit.
+        """
         try:
-            grid = Grid(tuple(header["grid"]["origin"]), header["grid"]["edge"], tuple(header["grid"]["dims"]))
+            grid = Grid(
+                tuple(header["grid"]["origin"]),
+                header["grid"]["edge"],
+                tuple(header["grid"]["dims"]),
+            )
             depth_range = tuple(header["depth_range"])
         except (KeyError, TypeError):
             raise UserError(f"{file}: its header is incomplete; train anew") from None
         net = UNet(dev, widths=widths, seed=0)
         n = len(arrays.get("points.ids", ()))
-        shapes = {"ids": (n,), "opacity": (n,)} | {f"sh{d}": (n, 2 * d + 1, 16) for d in SH_DEGREES[: degree + 1]}
-        stored = {name: _fitting(arrays, f"points.{name}", shape, file) for name, shape in shapes.items()}
+        shapes = {"ids": (n,), "opacity": (n,)} | {
+            f"sh{d}": (n, 2 * d + 1, 16) for d in SH_DEGREES[: degree + 1]
+        }
+        stored = {
+            name: _fitting(arrays, f"points.{name}", shape, file) for name, shape in shapes.items()
+        }
         points = {name: dev.upload(stored[name]) for name in ("ids", "opacity")}
         for block in sh_blocks(degree):
             start = block.first - block.degree**2  # in its degree
-            points[block.name] = dev.upload(stored[f"sh{block.degree}"][:, start : start + block.count])
+            points[block.name] = dev.upload(
+                stored[f"sh{block.degree}"][:, start : start + block.count]
+            )
         for name, parameter in net.parameters.items():
             parameter.set(_fitting(arrays, f"net.{name}", parameter.shape, file))
         return cls(dev, grid, depth_range, points, net, degree)

@@ -4,22 +4,24 @@ import math
 
 import numpy as np
 
-from pp_cl.adam import moment_scale
 from pp_cl.errors import UserError
-from pp_cl.loss import Loss
-from pp_cl.optimiser import Optimiser, Rates
-from pp_cl.prune import keep_indices, prune
 from pp_cl.render import Renderer
-from pp_cl.scene import object_box, reduced_camera
-from pp_cl.schedule import average_weight, gamma
-from pp_cl.smooth import Smoother
-from pp_cl.target import Target
+from pp_cl.scene.target import Target
+from pp_cl.scene.views import object_box, reduced_camera
+from pp_cl.training.adam import moment_scale
+from pp_cl.training.loss import Loss
+from pp_cl.training.optimiser import Optimiser, Rates
+from pp_cl.training.prune import keep_indices, prune
+from pp_cl.training.schedule import average_weight, gamma
+from pp_cl.training.smooth import Smoother
 
 BOX_MARGIN = 8  # pixels around the object from which crops are drawn
 
 
 class Trainer:
-    """Optimises a model on views; every random choice is a function of (seed, step), so a run can start at any step."""
+    """Optimises a model on views; every random choice is a function of (seed, step), so a run can
+    start at any step.
+    """
 
     def __init__(self, dev, config, model, views):
         self.dev = dev
@@ -39,16 +41,23 @@ class Trainer:
         self._smoother = None
 
     def _moment_scale(self):
-        """Of moments in 16 bits, from the eps of the first view: powers of two, so that others may differ from it."""
+        """Of moments in 16 bits, from the eps of the first view: powers of two, so that others may
+        differ from it.
+        """
         if not self.config.half_moments:
             return None
         camera = reduced_camera(self.views[0], self.downscale)
-        return moment_scale(self.config.feature_eps / (3 * math.prod(self.config.crop_size(camera.width, camera.height))))
+        return moment_scale(
+            self.config.feature_eps
+            / (3 * math.prod(self.config.crop_size(camera.width, camera.height)))
+        )
 
-    # ---------------------------------------------------------------------------------------------- one step
+    # ----------------------------------------------------------------------------------------------
 
     def train_step(self):
-        """One step; returns {"loss", "l1", "ssim", "psnr"} of its crop. Raises UserError if the loss is not finite."""
+        """One step; returns {"loss", "l1", "ssim", "psnr"} of its crop. Raises UserError if the
+        loss is not finite.
+        """
         t, config = self.step, self.config
         rng = np.random.default_rng((config.seed, t))
         rates = Rates.at(t, self.network, config)
@@ -70,7 +79,9 @@ class Trainer:
         grad_image = self.loss.forward_backward(image, target, *self.renderer.offset)
         grads = self.renderer.backward(grad_image)
         kept = self.renderer.weights.kept
-        self.optimiser.update(t + 1, rates, grads, self.renderer.camera, config.feature_eps / target.size, kept)
+        self.optimiser.update(
+            t + 1, rates, grads, self.renderer.camera, config.feature_eps / target.size, kept
+        )
         self.renderer.add_point_weights(self.model.points["weight"])
 
         self.step = t + 1
@@ -78,12 +89,18 @@ class Trainer:
         return self._terms()
 
     def views_stay(self):
-        """Whether every step sees a view as the last one did: whole images without phases, all points."""
+        """Whether every step sees a view as the last one did: whole images without phases, all
+        points.
+        """
         config = self.config
-        return config.crop == 0 and config.dropout == 0 and not (config.phases and self.downscale > 1)
+        return (
+            config.crop == 0 and config.dropout == 0 and not (config.phases and self.downscale > 1)
+        )
 
     def draw(self, rng):
-        """(view index, (x0, y0, width, height), phase) of this step: views in a new random order every epoch."""
+        """(view index, (x0, y0, width, height), phase) of this step: views in a new random order
+        every epoch.
+        """
         config, n = self.config, len(self.views)
         epoch, place = divmod(self.step, n)
         index = int(np.random.default_rng((config.seed, epoch, n)).permutation(n)[place])
@@ -96,7 +113,12 @@ class Trainer:
         width, height = config.crop_size(camera.width, camera.height)
         return (
             index,
-            (_draw_start(rng, x0, x1, width, camera.width), _draw_start(rng, y0, y1, height, camera.height), width, height),
+            (
+                _draw_start(rng, x0, x1, width, camera.width),
+                _draw_start(rng, y0, y1, height, camera.height),
+                width,
+                height,
+            ),
             phase,
         )
 
@@ -107,9 +129,14 @@ class Trainer:
                 f"the loss is not finite at step {self.step}; the last checkpoint is kept: "
                 "lower train.sh_rate or network.rate"
             )
-        return {"loss": total, "l1": l1, "ssim": 1 - dissimilarity, "psnr": -10 * math.log10(max(mse, 1e-10))}
+        return {
+            "loss": total,
+            "l1": l1,
+            "ssim": 1 - dissimilarity,
+            "psnr": -10 * math.log10(max(mse, 1e-10)),
+        }
 
-    # ------------------------------------------------------------------------------- between the steps
+    # ------------------------------------------------------------------------------- between the st
 
     def _regularise(self, rates):
         """Grid smoothing, averaging and pruning, where they are due after this step."""
@@ -134,7 +161,9 @@ class Trainer:
                 self._smoother.smooth(points[block.name], pull * rates.sh[block.degree])
 
     def _prune(self, weights, least):
-        """Drop the points whose weight, or opacity, is too low; moments and averages go with them."""
+        """Drop the points whose weight, or opacity, is too low; moments and averages go with
+        them.
+        """
         points = self.model.points
         keep = keep_indices(self.dev, weights, least, points["opacity"], self.config.prune_opacity)
         if len(keep) < self.model.count:
@@ -143,7 +172,9 @@ class Trainer:
             self._smoother = None
 
     def finish(self):
-        """Adopt the averages, and drop the points that hardly weigh anything in any training view."""
+        """Adopt the averages, and drop the points that hardly weigh anything in any training
+        view.
+        """
         self.optimiser.adopt_averages()
         if self.config.final_weight > 0:
             total = self.dev.zeros((self.model.count,))
@@ -160,7 +191,8 @@ class Trainer:
     def picture(self, view):
         """(H,W,3) float32 in [0, 1]: the present model's picture of a view."""
         return self.renderer.picture(
-            reduced_camera(view, self.downscale), gamma(self.step, self.config.iterations, *self.gamma)
+            reduced_camera(view, self.downscale),
+            gamma(self.step, self.config.iterations, *self.gamma),
         )
 
     def truth(self, view):
@@ -174,13 +206,17 @@ class Trainer:
         return self.model.arrays() | self.optimiser.arrays()
 
     def restore(self, step, arrays):
-        """Go on after `step` steps with the arrays of a checkpoint; the model has been loaded already."""
+        """Go on after `step` steps with the arrays of a checkpoint; the model has been loaded
+        already.
+        """
         self.step = step
         self.optimiser.restore(arrays)
 
 
 def _draw_start(rng, low, high, size, limit):
-    """First pixel of a crop of `size` that shows a part of [low, high) as large as possible, inside [0, limit)."""
+    """First pixel of a crop of `size` that shows a part of [low, high) as large as possible, inside
+    [0, limit).
+    """
     first, last = sorted((low, high - size))
     first, last = max(first, 0), min(last, limit - size)
     return int(rng.integers(min(first, last), max(first, last) + 1))

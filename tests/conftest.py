@@ -1,16 +1,18 @@
-"""Fixtures: one guarded device a session; the count of kernels launched and of tests that had real data."""
+"""Fixtures: one guarded device a session; the count of kernels launched and of tests that had real
+data.
+"""
 
 import os
 import shutil
 
 import numpy as np
 import pytest
-from helpers import DATA, GuardedDevice, TracedDevice
+from support.guarded import DATA, GuardedDevice, TracedDevice
 
-from pp_cl.cache import cache_folder, make_cache_folder
-from pp_cl.device import open_device
-from pp_cl.launch import Program
-from pp_cl.lpips_weights import WEIGHTS_FILE
+from pp_cl.device.discover import open_device
+from pp_cl.device.launch import Program
+from pp_cl.files.cache import cache_folder, make_cache_folder
+from pp_cl.metrics.lpips_weights import WEIGHTS_FILE
 
 COUNTS = {"launches": 0, "data": 0}
 _launch = Program.launch
@@ -26,7 +28,9 @@ Program.launch = _counted_launch
 
 @pytest.fixture(scope="session", autouse=True)
 def cache_of_its_own(tmp_path_factory):
-    """What the user has tuned stays unread: a cache folder for the session, with nothing in it but the weights of LPIPS."""
+    """What the user has tuned stays unread: a cache folder for the session, with nothing in it but
+    the weights of LPIPS.
+    """
     kept = cache_folder() / WEIGHTS_FILE
     folder = tmp_path_factory.mktemp("cache")
     lent = folder / WEIGHTS_FILE
@@ -41,7 +45,9 @@ def cache_of_its_own(tmp_path_factory):
 
 @pytest.fixture(scope="session")
 def session_device(tmp_path_factory):
-    """The device of PP_DEVICE, else the default one, with guarded buffers; with traced ones where Oclgrind watches reads."""
+    """The device of PP_DEVICE, else the default one, with guarded buffers; with traced ones where
+    Oclgrind watches reads.
+    """
     if os.environ.get("OCLGRIND_UNINITIALIZED") != "1":
         return GuardedDevice(open_device().device)
     log = tmp_path_factory.mktemp("oclgrind") / "log"
@@ -74,7 +80,9 @@ def data():
 
 def pytest_terminal_summary(terminalreporter):
     """Say what really ran."""
-    terminalreporter.write_line(f"kernel launches: {COUNTS['launches']}; tests on real data: {COUNTS['data']}")
+    terminalreporter.write_line(
+        f"kernel launches: {COUNTS['launches']}; tests on real data: {COUNTS['data']}"
+    )
 
 
 def pytest_sessionfinish(session, exitstatus):

@@ -1,4 +1,6 @@
-"""The command line as a user meets it: what it prints, its exit status, and one line for whatever is wrong."""
+"""The command line as a user meets it: what it prints, its exit status, and one line for whatever
+is wrong.
+"""
 
 import json
 import subprocess
@@ -8,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from PIL import Image
-from scenes import write_ball_scene
+from support.scenes import write_ball_scene
 
 from pp_cl.cli import main
 
@@ -19,7 +21,11 @@ def failure(capsys, *words):
     assert main([str(w) for w in words]) == 2
     captured = capsys.readouterr()
     lines = [line for line in captured.err.splitlines() if line.startswith("pp-cl: ")]
-    assert len(lines) == 1 and captured.err.rstrip().endswith(lines[0]) and "Traceback" not in captured.err
+    assert (
+        len(lines) == 1
+        and captured.err.rstrip().endswith(lines[0])
+        and "Traceback" not in captured.err
+    )
     return lines[0]
 
 
@@ -54,16 +60,24 @@ def set_path(value):
 DAMAGE = {
     "no such folder": (lambda s: s.rename(s.parent / "elsewhere"), "ball"),
     "missing json": (lambda s: (s / "transforms_train.json").unlink(), "transforms_train.json"),
-    "broken json": (lambda s: (s / "transforms_train.json").write_text('{"frames": ['), "transforms_train.json"),
+    "broken json": (
+        lambda s: (s / "transforms_train.json").write_text('{"frames": ['),
+        "transforms_train.json",
+    ),
     "missing key": (lambda s: edit(s, lambda c: c.pop("camera_angle_x")), "camera_angle_x"),
-    "missing matrix": (lambda s: edit(s, lambda c: c["frames"][1].pop("transform_matrix")), "transform_matrix"),
+    "missing matrix": (
+        lambda s: edit(s, lambda c: c["frames"][1].pop("transform_matrix")),
+        "transform_matrix",
+    ),
     "zero frames": (lambda s: edit(s, lambda c: c.update(frames=[])), "frames"),
     "nan matrix": (lambda s: edit(s, set_matrix([[float("nan")] * 4] * 4)), "transform_matrix"),
     "wrong shape": (lambda s: edit(s, set_matrix([[1, 0], [0, 1]])), "transform_matrix"),
     "path leaves": (lambda s: edit(s, set_path("../../secret")), "file_path"),
     "missing image": (lambda s: (s / "train" / "r_1.png").unlink(), "train/r_1"),
     "truncated image": (
-        lambda s: (s / "train" / "r_1.png").write_bytes((s / "train" / "r_1.png").read_bytes()[:200]),
+        lambda s: (s / "train" / "r_1.png").write_bytes(
+            (s / "train" / "r_1.png").read_bytes()[:200]
+        ),
         "r_1.png",
     ),
     "other size": (lambda s: Image.new("RGBA", (20, 20)).save(s / "train" / "r_1.png"), "r_1.png"),
@@ -75,7 +89,9 @@ DAMAGE = {
 def test_a_damaged_scene_is_one_line_and_writes_nothing(name, scene, tmp_path, capsys):
     damage, named = DAMAGE[name]
     damage(scene)
-    assert named in failure(capsys, "train", scene, "--out", tmp_path / "run", "--points", 500, "--iterations", 2)
+    assert named in failure(
+        capsys, "train", scene, "--out", tmp_path / "run", "--points", 500, "--iterations", 2
+    )
     assert not (tmp_path / "run").exists()
 
 
@@ -111,12 +127,22 @@ def test_a_foreign_folder_is_not_written_into(scene, tmp_path, capsys):
 
 def test_a_folder_that_cannot_be_made_is_one_line(scene, tmp_path, capsys):
     (tmp_path / "file").write_text("")
-    line = failure(capsys, "train", scene, "--out", tmp_path / "file" / "run", "--points", 500, "--iterations", 2)
+    line = failure(
+        capsys,
+        "train",
+        scene,
+        "--out",
+        tmp_path / "file" / "run",
+        "--points",
+        500,
+        "--iterations",
+        2,
+    )
     assert "file/run" in line
 
 
 def test_no_device_says_what_to_install(scene, tmp_path, capsys, monkeypatch):
-    monkeypatch.setattr("pp_cl.device.list_devices", lambda: [])
+    monkeypatch.setattr("pp_cl.device.discover.list_devices", lambda: [])
     assert "pocl" in failure(capsys, "train", scene, "--out", tmp_path / "run")
     assert "pocl" in failure(capsys, "devices")
 
@@ -161,7 +187,18 @@ def test_compare_writes_the_table_and_the_file(tmp_path, capsys):
     rng = np.random.default_rng(0)
     for name in ("a", "b"):
         Image.fromarray(rng.integers(0, 256, (24, 24, 3), np.uint8)).save(tmp_path / f"{name}.png")
-    assert main(["compare", str(tmp_path / "a.png"), str(tmp_path / "b.png"), "--json", str(tmp_path / "m.json")]) == 0
+    assert (
+        main(
+            [
+                "compare",
+                str(tmp_path / "a.png"),
+                str(tmp_path / "b.png"),
+                "--json",
+                str(tmp_path / "m.json"),
+            ]
+        )
+        == 0
+    )
     result = json.loads((tmp_path / "m.json").read_text())
     assert f"{result['mean']['psnr']:.4f}" in capsys.readouterr().out
     assert "none.png" in failure(capsys, "compare", tmp_path / "none.png", tmp_path / "b.png")

@@ -22,8 +22,16 @@ def test_tiny_is_the_default():
 
 def test_paper_preset_keeps_the_supplementals_numbers():
     paper = preset("paper")
-    assert paper.points.count == 4_000_000 and paper.points.footprint == "disc" and paper.points.radius == 0.0015
-    assert paper.points.gamma == (0.1, 0.01) and paper.points.max_tracked == 64 and paper.points.stop == 0.001
+    assert (
+        paper.points.count == 4_000_000
+        and paper.points.footprint == "disc"
+        and paper.points.radius == 0.0015
+    )
+    assert (
+        paper.points.gamma == (0.1, 0.01)
+        and paper.points.max_tracked == 64
+        and paper.points.stop == 0.001
+    )
     assert paper.network.widths == (128, 256, 512) and paper.train.iterations == 50_000
     assert paper.train.sh_rate == (0.5, 0.25, 0.125) and paper.train.sh_rate_decay == 0.1
     assert [d * paper.train.iterations for d in paper.train.sh_delay] == [0, 500, 1000]

@@ -6,13 +6,13 @@ import shutil
 import numpy as np
 import pytest
 from PIL import Image
-from scenes import write_ball_scene
+from support.scenes import write_ball_scene
 
 from pp_cl.cli import main
 from pp_cl.config import Config
 from pp_cl.errors import UserError
-from pp_cl.image import read_rgba
-from pp_cl.metrics import psnr
+from pp_cl.files.image import read_rgba
+from pp_cl.metrics.psnr_ssim import psnr
 from pp_cl.run import open_scene
 
 
@@ -50,10 +50,19 @@ def run(tmp_path_factory):
 def test_metrics_file_and_pictures(run, capsys):
     assert main(["eval", str(run), "--save-images"]) == 0
     result = json.loads((run / "eval" / "metrics.json").read_text())
-    assert result["split"] == "test" and len(result["per_image"]) == 2 and set(result["mean"]) == {"psnr", "ssim"}
-    assert result["points"]["final"] <= result["points"]["initial"] and len(result["points"]["grid"]) == 3
+    assert (
+        result["split"] == "test"
+        and len(result["per_image"]) == 2
+        and set(result["mean"]) == {"psnr", "ssim"}
+    )
+    assert (
+        result["points"]["final"] <= result["points"]["initial"]
+        and len(result["points"]["grid"]) == 3
+    )
     assert result["seconds_per_frame"] > 0 and result["published"] == {} and result["finished"]
-    assert result["mean"]["psnr"] == pytest.approx(np.mean([r["psnr"] for r in result["per_image"]]))
+    assert result["mean"]["psnr"] == pytest.approx(
+        np.mean([r["psnr"] for r in result["per_image"]])
+    )
     assert f"{result['mean']['psnr']:.4f}" in capsys.readouterr().out
     assert (run / "eval" / "comparison.png").is_file()
 
@@ -81,7 +90,11 @@ def test_what_tau_did_is_told(run, tmp_path, capsys):
     result = json.loads((copy / "eval" / "metrics.json").read_text())
     assert set(result["mean"]) == {"psnr", "ssim"}
     for row in result["per_image"]:
-        assert 0 < row["tau_bound"] <= 1e-2 and 0 < row["tau_feature_error"] <= 1e-2 and 0 < row["tau_picture_error"] < 0.1
+        assert (
+            0 < row["tau_bound"] <= 1e-2
+            and 0 < row["tau_feature_error"] <= 1e-2
+            and 0 < row["tau_picture_error"] < 0.1
+        )
     assert "points.tau: dropped at most" in capsys.readouterr().out
 
 

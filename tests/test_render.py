@@ -1,45 +1,47 @@
-"""The stages in their order: whole pictures and their gradients against the float64 twins chained together."""
+"""The stages in their order: whole pictures and their gradients against the float64 twins chained
+together.
+"""
 
 from dataclasses import replace
 
 import numpy as np
-import oracle_raster
 import pytest
-from helpers import relative_error
-from oracle_unet import unet, unet_gradients
-from scenes import ring_cameras
-from test_unet import plain_parameters
+from oracle import raster as oracle_raster
+from oracle.unet import unet, unet_gradients
+from support.comparisons import relative_error
+from support.models import GRID, make_model
+from support.networks import plain_parameters
+from support.scenes import ring_cameras
 
 from pp_cl.config import PointsConfig
-from pp_cl.model import Model
-from pp_cl.points import SH_BLOCKS, Grid
+from pp_cl.raster.sh import SH_BLOCKS
 from pp_cl.render import PAPER_DEPTH_RANGE, Renderer
 
-GRID = Grid((-0.5, -0.45, -0.4), 0.13, (8, 7, 6))
 GAMMA = 0.03
-WIDTHS = (16, 16, 16)
-
-
-def make_model(dev, rng, n=90):
-    """A model with random parameters and some opacities of 0 and 1."""
-    ids = np.sort(rng.choice(np.prod(GRID.dims), n, replace=False)).astype(np.uint32)
-    model = Model.create(dev, GRID, ids, (2.0, 6.0), WIDTHS, seed=3)
-    opacity = rng.uniform(0.2, 1, n).astype(np.float32)
-    opacity[::9], opacity[4::9] = 0, 1
-    model.points["opacity"].set(opacity)
-    for block in SH_BLOCKS:
-        model.points[block.name].set(rng.normal(size=(n, block.count, 16)).astype(np.float32))
-    return model
 
 
 def chained(model, settings, camera, opacity=None, sh=None, tracked=0):
-    """Float64 (picture, function from its gradient to (grad_opacity, grad_sh, network gradients)) of the padded camera."""
+    """Float64 (picture, function from its gradient to (grad_opacity, grad_sh, network gradients))
+    of the padded camera.
+    """
     padded, _, _ = camera.padded(4)
     positions = GRID.positions(model.points["ids"].get())
     opacity = model.points["opacity"].get().astype(np.float64) if opacity is None else opacity
-    sh = np.concatenate([model.points[block.name].get() for block in SH_BLOCKS], 1).astype(np.float64) if sh is None else sh
-    spacing_or_world = GRID.edge if settings.footprint == "soft" else (camera.far - camera.near) / PAPER_DEPTH_RANGE
-    geometry = oracle_raster.geometry(padded, positions, settings.radius * spacing_or_world, settings.footprint)
+    sh = (
+        np.concatenate([model.points[block.name].get() for block in SH_BLOCKS], 1).astype(
+            np.float64
+        )
+        if sh is None
+        else sh
+    )
+    spacing_or_world = (
+        GRID.edge
+        if settings.footprint == "soft"
+        else (camera.far - camera.near) / PAPER_DEPTH_RANGE
+    )
+    geometry = oracle_raster.geometry(
+        padded, positions, settings.radius * spacing_or_world, settings.footprint
+    )
     blend = oracle_raster.blend(padded, geometry, opacity, GAMMA, settings.stop)
     shaded = oracle_raster.shade(positions, padded.eye, sh)
     features = oracle_raster.features(blend, shaded)
@@ -48,12 +50,23 @@ def chained(model, settings, camera, opacity=None, sh=None, tracked=0):
     picture, _ = unet(features.reshape(*shape, 16), parameters)
 
     def backward(grad_picture):
-        grad_features, grad_net = unet_gradients(features.reshape(*shape, 16), parameters, grad_picture)
+        grad_features, grad_net = unet_gradients(
+            features.reshape(*shape, 16), parameters, grad_picture
+        )
         grad_shaded, grad_opacity, _ = oracle_raster.blend_gradients(
-            geometry, blend, opacity, shaded, grad_features.reshape(-1, 16), GAMMA, tracked, settings.mean_gradient
+            geometry,
+            blend,
+            opacity,
+            shaded,
+            grad_features.reshape(-1, 16),
+            GAMMA,
+            tracked,
+            settings.mean_gradient,
         )
         directions = positions - padded.eye
-        basis = oracle_raster.sh_basis(directions / np.linalg.norm(directions, axis=1, keepdims=True))
+        basis = oracle_raster.sh_basis(
+            directions / np.linalg.norm(directions, axis=1, keepdims=True)
+        )
         return grad_shaded, grad_opacity, basis[:, :, None] * grad_shaded[:, None], grad_net
 
     return picture, backward
@@ -63,9 +76,13 @@ SETTINGS = {
     "soft": PointsConfig(),
     "soft, wide": PointsConfig(radius=1.4),
     "disc": PointsConfig(footprint="disc", radius=0.0015),
-    "disc, the paper's gradients": PointsConfig(footprint="disc", radius=0.0015, max_tracked=3, stop=0.001),
+    "disc, the paper's gradients": PointsConfig(
+        footprint="disc", radius=0.0015, max_tracked=3, stop=0.001
+    ),
     "sphere": PointsConfig(footprint="sphere", radius=0.11),
-    "sphere, Pulsar's gradients": PointsConfig(footprint="sphere", radius=0.11, max_tracked=5, mean_gradient=True),
+    "sphere, Pulsar's gradients": PointsConfig(
+        footprint="sphere", radius=0.11, max_tracked=5, mean_gradient=True
+    ),
 }
 
 
@@ -95,22 +112,30 @@ def test_the_chain_is_the_derivative(dev, rng):
     _, backward = chained(model, settings, camera)
     _, grad_opacity, grad_sh, _ = backward(grad)
     opacity = model.points["opacity"].get().astype(np.float64)
-    sh = np.concatenate([model.points[block.name].get() for block in SH_BLOCKS], 1).astype(np.float64)
+    sh = np.concatenate([model.points[block.name].get() for block in SH_BLOCKS], 1).astype(
+        np.float64
+    )
 
     def loss(o, s):
         return (chained(model, settings, camera, o, s)[0] * grad).sum()
 
     for direction in rng.normal(size=(3, n)):
         direction = np.where((opacity > 0) & (opacity < 1), direction, 0)
-        numeric = (loss(opacity + 1e-6 * direction, sh) - loss(opacity - 1e-6 * direction, sh)) / 2e-6
+        numeric = (
+            loss(opacity + 1e-6 * direction, sh) - loss(opacity - 1e-6 * direction, sh)
+        ) / 2e-6
         assert numeric == pytest.approx((grad_opacity * direction).sum(), rel=1e-4)
     for direction in rng.normal(size=(3, *sh.shape)):
-        numeric = (loss(opacity, sh + 1e-6 * direction) - loss(opacity, sh - 1e-6 * direction)) / 2e-6
+        numeric = (
+            loss(opacity, sh + 1e-6 * direction) - loss(opacity, sh - 1e-6 * direction)
+        ) / 2e-6
         assert numeric == pytest.approx((grad_sh * direction).sum(), rel=1e-4)
 
 
 def test_padding_does_not_move_the_picture(dev, rng):
-    """A camera whose size is no multiple of 4 shows the same features as the larger one, cropped."""
+    """A camera whose size is no multiple of 4 shows the same features as the larger one,
+    cropped.
+    """
     model, camera = make_model(dev, rng), ring_cameras(1, 32)[0]
     renderer = Renderer(dev, model, PointsConfig())
     renderer.forward(camera, GAMMA)
@@ -142,4 +167,6 @@ def test_dropout_leaves_out_its_share_and_pictures_are_repeatable(dev, rng):
     assert 0.35 * everyone < renderer.pairs.seen.size < 0.65 * everyone
     first = renderer.picture(camera, GAMMA)
     np.testing.assert_array_equal(first, renderer.picture(camera, GAMMA))
-    np.testing.assert_array_equal(first, Renderer(dev, model, PointsConfig()).picture(camera, GAMMA))
+    np.testing.assert_array_equal(
+        first, Renderer(dev, model, PointsConfig()).picture(camera, GAMMA)
+    )

@@ -1,4 +1,6 @@
-"""Training: it learns, it is deterministic, and a run that was killed ends like one that was not."""
+"""Training: it learns, it is deterministic, and a run that was killed ends like one that was
+not.
+"""
 
 import json
 import os
@@ -11,33 +13,14 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from scenes import write_ball_scene
+from support.runs import arguments, train_and_interrupt
+from support.scenes import write_ball_scene
 
-from pp_cl.checkpoint import load_checkpoint, save_checkpoint
 from pp_cl.cli import main
 from pp_cl.errors import UserError
-from pp_cl.optimiser import Optimiser
+from pp_cl.files.checkpoint import load_checkpoint, save_checkpoint
 from pp_cl.train import Trainer, _draw_start
-
-# Every mechanism of the loop is due several times within 60 steps.
-SETTINGS = {
-    "train.iterations": 60,
-    "points.count": 1500,
-    "network.widths": "16,16,16",
-    "train.crop": 24,
-    "train.prune_every": 10,
-    "train.checkpoint_every": 10,
-    "train.log_every": 5,
-    "train.previews": 2,
-    "train.final_weight": 0.5,
-}
-
-
-def arguments(scene, out, **changes):
-    """Command line of a small training."""
-    settings = SETTINGS | {k.replace("__", "."): v for k, v in changes.items()}
-    sets = [word for key, value in settings.items() for word in ("--set", f"{key}={value}")]
-    return ["train", scene, "--out", str(out), "--downscale", "2", *sets]
+from pp_cl.training.optimiser import Optimiser
 
 
 @pytest.fixture(scope="module")
@@ -54,21 +37,6 @@ def finished(scene, tmp_path_factory):
     return out
 
 
-def train_and_interrupt(scene, out, steps, monkeypatch, **changes):
-    """A small training that ends with Ctrl-C after `steps` steps."""
-    train_step, done = Trainer.train_step, []
-
-    def stopping(self):
-        if len(done) == steps:
-            raise KeyboardInterrupt
-        done.append(0)
-        return train_step(self)
-
-    with monkeypatch.context() as patch:
-        patch.setattr(Trainer, "train_step", stopping)
-        assert main(arguments(scene, out, **changes)) == 130
-
-
 def rows(out):
     return [json.loads(line) for line in (out / "log.jsonl").read_text().splitlines()]
 
@@ -78,7 +46,10 @@ def test_a_run_learns_and_leaves_its_files(finished):
     assert [r["step"] for r in log] == [*range(5, 61, 5), 60] and log[-1]["finished"]
     losses = [r["loss"] for r in log[:-1]]
     assert np.mean(losses[-3:]) < 0.6 * losses[0]
-    assert {p.name for p in (finished / "previews").iterdir()} == {"step_000030.png", "step_000060.png"}
+    assert {p.name for p in (finished / "previews").iterdir()} == {
+        "step_000030.png",
+        "step_000060.png",
+    }
     header, arrays = load_checkpoint(finished / "checkpoint.npz")
     assert header["finished"] and header["step"] == 60
     assert 0 < len(arrays["points.ids"]) < header["initial_points"]
@@ -88,23 +59,39 @@ def test_a_run_learns_and_leaves_its_files(finished):
 
 def test_the_same_seed_gives_the_same_bytes_and_another_does_not(scene, finished, tmp_path):
     assert main(arguments(scene, tmp_path / "again")) == 0
-    assert (tmp_path / "again" / "checkpoint.npz").read_bytes() == (finished / "checkpoint.npz").read_bytes()
+    assert (tmp_path / "again" / "checkpoint.npz").read_bytes() == (
+        finished / "checkpoint.npz"
+    ).read_bytes()
     assert main(arguments(scene, tmp_path / "other", train__seed=1)) == 0
-    assert (tmp_path / "other" / "checkpoint.npz").read_bytes() != (finished / "checkpoint.npz").read_bytes()
+    assert (tmp_path / "other" / "checkpoint.npz").read_bytes() != (
+        finished / "checkpoint.npz"
+    ).read_bytes()
 
 
 @pytest.mark.parametrize("steps", [3, 25, 47, 59])
-def test_stopped_at_any_step_it_resumes_to_the_same_bytes(scene, finished, tmp_path, monkeypatch, steps):
+def test_stopped_at_any_step_it_resumes_to_the_same_bytes(
+    scene, finished, tmp_path, monkeypatch, steps
+):
     train_and_interrupt(scene, tmp_path / "run", steps, monkeypatch)
     assert main(arguments(scene, tmp_path / "run")) == 0
-    assert (tmp_path / "run" / "checkpoint.npz").read_bytes() == (finished / "checkpoint.npz").read_bytes()
+    assert (tmp_path / "run" / "checkpoint.npz").read_bytes() == (
+        finished / "checkpoint.npz"
+    ).read_bytes()
     strip = [{k: v for k, v in r.items() if k != "seconds"} for r in rows(tmp_path / "run")]
     assert strip == [{k: v for k, v in r.items() if k != "seconds"} for r in rows(finished)]
 
 
-@pytest.mark.parametrize("changes", [{"train__lazy": "true"}, {"train__half_moments": "true"},
-                                     {"train__lazy": "true", "train__half_moments": "true"}])
-def test_other_ways_of_adam_learn_and_resume_to_the_same_bytes(scene, finished, tmp_path, monkeypatch, changes):
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"train__lazy": "true"},
+        {"train__half_moments": "true"},
+        {"train__lazy": "true", "train__half_moments": "true"},
+    ],
+)
+def test_other_ways_of_adam_learn_and_resume_to_the_same_bytes(
+    scene, finished, tmp_path, monkeypatch, changes
+):
     assert main(arguments(scene, tmp_path / "whole", **changes)) == 0
     losses = [r["loss"] for r in rows(tmp_path / "whole")[:-1]]
     assert np.mean(losses[-3:]) < 0.6 * losses[0]
@@ -140,7 +127,9 @@ def test_a_lower_degree_learns_what_zero_rates_above_it_learn(scene, tmp_path, d
     for run in (lower, zero):
         assert main(["eval", str(run), "--metrics", "psnr"]) == 0
     pictures = [sorted((run / "eval").rglob("*.png")) for run in (lower, zero)]
-    assert pictures[0] and all(a.read_bytes() == b.read_bytes() for a, b in zip(*pictures, strict=True))
+    assert pictures[0] and all(
+        a.read_bytes() == b.read_bytes() for a, b in zip(*pictures, strict=True)
+    )
 
 
 def test_bounded_memory_gives_the_same_bytes(scene, tmp_path, capsys, monkeypatch):
@@ -148,10 +137,12 @@ def test_bounded_memory_gives_the_same_bytes(scene, tmp_path, capsys, monkeypatc
     changes = {"points__count": 50_000, "train__iterations": 24, "train__prune_every": 8}
     assert main(arguments(scene, tmp_path / "free", **changes)) == 0
     points = load_checkpoint(tmp_path / "free" / "checkpoint.npz")[0]["initial_points"]
-    monkeypatch.setattr("pp_cl.prune.SCRATCH_BYTES", 100_000)
+    monkeypatch.setattr("pp_cl.training.prune.SCRATCH_BYTES", 100_000)
     monkeypatch.setenv("PP_MAX_ALLOCATION", str(200 * points / 2**20))
     assert main(arguments(scene, tmp_path / "bounded", **changes)) == 0
-    assert (tmp_path / "bounded" / "checkpoint.npz").read_bytes() == (tmp_path / "free" / "checkpoint.npz").read_bytes()
+    assert (tmp_path / "bounded" / "checkpoint.npz").read_bytes() == (
+        tmp_path / "free" / "checkpoint.npz"
+    ).read_bytes()
     monkeypatch.setenv("PP_MAX_ALLOCATION", str(150 * points / 2**20))
     assert main(arguments(scene, tmp_path / "smaller", **changes)) == 2
     assert "lower --points" in capsys.readouterr().err
@@ -164,9 +155,13 @@ def test_killed_again_and_again_it_ends_with_the_same_bytes(scene, finished, tmp
     environment = os.environ | {"PYTHONPATH": str(Path(__file__).parents[1])}
     kills = 0
     for wait in (0.3, 0.05, 0.6, 0.0):
-        process = subprocess.Popen(command, env=environment, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+        process = subprocess.Popen(
+            command, env=environment, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
+        )
         before = (out / "log.jsonl").stat().st_size if (out / "log.jsonl").exists() else 0
-        while process.poll() is None and not ((out / "log.jsonl").exists() and (out / "log.jsonl").stat().st_size > before):
+        while process.poll() is None and not (
+            (out / "log.jsonl").exists() and (out / "log.jsonl").stat().st_size > before
+        ):
             time.sleep(0.01)
         time.sleep(wait)
         if process.poll() is None:
@@ -174,7 +169,9 @@ def test_killed_again_and_again_it_ends_with_the_same_bytes(scene, finished, tmp
             kills += 1
         process.wait()
     assert kills >= 2, "the run ended before it could be killed"
-    subprocess.run(command, env=environment, check=True, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    subprocess.run(
+        command, env=environment, check=True, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
+    )
     assert (out / "checkpoint.npz").read_bytes() == (finished / "checkpoint.npz").read_bytes()
     assert not list(out.glob(".*.tmp"))
 
@@ -204,12 +201,20 @@ def test_a_checkpoint_of_another_scene_is_refused(scene, tmp_path, capsys):
     assert (out / "checkpoint.npz").read_bytes() == before
 
 
-@pytest.mark.parametrize("lost", ["moment.m.enc0.a.weight", "state.v.sh1", "state.last", "state.weight"])
-def test_a_checkpoint_without_its_training_state_is_refused(scene, tmp_path, capsys, monkeypatch, lost):
+@pytest.mark.parametrize(
+    "lost", ["moment.m.enc0.a.weight", "state.v.sh1", "state.last", "state.weight"]
+)
+def test_a_checkpoint_without_its_training_state_is_refused(
+    scene, tmp_path, capsys, monkeypatch, lost
+):
     train_and_interrupt(scene, tmp_path / "run", 15, monkeypatch, train__lazy="true")
     header, arrays = load_checkpoint(tmp_path / "run" / "checkpoint.npz")
     arrays.pop(lost)
-    save_checkpoint(tmp_path / "run" / "checkpoint.npz", {k: v for k, v in header.items() if k != "format"}, arrays)
+    save_checkpoint(
+        tmp_path / "run" / "checkpoint.npz",
+        {k: v for k, v in header.items() if k != "format"},
+        arrays,
+    )
     assert main(arguments(scene, tmp_path / "run", train__lazy="true")) == 2
     assert lost in capsys.readouterr().err
     save_checkpoint(tmp_path / "run" / "checkpoint.npz", {"step": 10}, arrays)
@@ -226,7 +231,9 @@ def test_a_full_disk_while_logging_is_one_line(scene, tmp_path, capsys, monkeypa
     assert "No space left" in capsys.readouterr().err
 
 
-def test_a_loss_that_is_not_finite_stops_the_run_and_keeps_the_checkpoint(scene, tmp_path, capsys, monkeypatch):
+def test_a_loss_that_is_not_finite_stops_the_run_and_keeps_the_checkpoint(
+    scene, tmp_path, capsys, monkeypatch
+):
     update, steps = Optimiser.update, []
 
     def poisoned(self, *args):
@@ -242,7 +249,9 @@ def test_a_loss_that_is_not_finite_stops_the_run_and_keeps_the_checkpoint(scene,
 
 
 def test_a_training_that_keeps_its_hits_ends_with_the_same_bytes(scene, tmp_path, monkeypatch):
-    """Of whole images without phases; also where there is room for some views only, and over prunings."""
+    """Of whole images without phases; also where there is room for some views only, and over
+    prunings.
+    """
     whole = {"train__crop": 0, "train__phases": "false", "train__dropout": 0}
     whole |= {"train__iterations": 40, "train__prune_every": 15}
     results, caches = [], []
@@ -260,15 +269,23 @@ def test_a_training_that_keeps_its_hits_ends_with_the_same_bytes(scene, tmp_path
 
 def _noting(caches, finish):
     """Trainer.finish that first notes (views kept, bytes)."""
+
     def noting(self):
         caches.append((len(self.renderer.cache), self.renderer.cache.bytes))
         finish(self)
+
     return noting
 
 
-@pytest.mark.parametrize("changes, stay", [
-    ({}, True), ({"crop": 64}, False), ({"dropout": 0.1}, False), ({"phases": True}, False),
-])
+@pytest.mark.parametrize(
+    "changes, stay",
+    [
+        ({}, True),
+        ({"crop": 64}, False),
+        ({"dropout": 0.1}, False),
+        ({"phases": True}, False),
+    ],
+)
 def test_views_stay_only_where_nothing_is_drawn(changes, stay):
     settings = {"crop": 0, "dropout": 0.0, "phases": False} | changes
     trainer = SimpleNamespace(config=SimpleNamespace(**settings), downscale=2)
@@ -308,7 +325,14 @@ def test_the_other_footprints_train_too(scene, tmp_path, footprint, radius):
 
 @pytest.mark.parametrize(
     "low, high, size, limit",
-    [(10, 50, 16, 64), (20, 30, 16, 64), (0, 5, 16, 64), (60, 64, 16, 64), (0, 64, 64, 64), (3, 60, 64, 64)],
+    [
+        (10, 50, 16, 64),
+        (20, 30, 16, 64),
+        (0, 5, 16, 64),
+        (60, 64, 16, 64),
+        (0, 64, 64, 64),
+        (3, 60, 64, 64),
+    ],
 )
 def test_crops_stay_inside_and_show_the_object(low, high, size, limit):
     starts = {_draw_start(np.random.default_rng(i), low, high, size, limit) for i in range(300)}
@@ -316,4 +340,6 @@ def test_crops_stay_inside_and_show_the_object(low, high, size, limit):
     for start in starts:
         shown = min(high, start + size) - max(low, start)
         assert shown == min(size, high - low)
-    assert len(starts) == max(1, min(max(low, high - size), limit - size) - max(min(low, high - size), 0) + 1)
+    assert len(starts) == max(
+        1, min(max(low, high - size), limit - size) - max(min(low, high - size), 0) + 1
+    )

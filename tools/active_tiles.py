@@ -1,9 +1,11 @@
-"""What the network saves where a run's views are background: share of the work, time, and difference from the dense one.
+"""What the network saves where a run's views are background: share of the work, time, and
+difference from the dense one.
 
     python tools/active_tiles.py RUN --downscale 1 --widths 128,256,512 --views 4 --json FILE
 
-Each view's features go through the same network with all tiles and with the active ones (pp_cl/active.py), in turn. The
-gradient of the image is the training loss's against the photograph. Without --widths it is the run's own network.
+Each view's features go through the same network with all tiles and with the active ones
+(pp_cl/network/sparse_tiles.py), in turn. The gradient of the image is the training loss's against
+the photograph. Without --widths it is the run's own network.
 """
 
 import argparse
@@ -12,18 +14,18 @@ from pathlib import Path
 
 import numpy as np
 
-from pp_cl import bench
-from pp_cl.blend import BACKGROUND
-from pp_cl.checkpoint import write_json
+from pp_cl.bench import network as bench
 from pp_cl.config import load_config
-from pp_cl.device import open_device
+from pp_cl.device.discover import open_device
 from pp_cl.errors import UserError
-from pp_cl.loss import Loss
+from pp_cl.files.atomic import write_json
 from pp_cl.model import Model
+from pp_cl.raster.blend import BACKGROUND
 from pp_cl.render import Renderer
 from pp_cl.run import CHECKPOINT, load_run, open_scene, with_depth_range
-from pp_cl.scene import reduced_camera
-from pp_cl.target import Target
+from pp_cl.scene.target import Target
+from pp_cl.scene.views import reduced_camera
+from pp_cl.training.loss import Loss
 
 
 class Comparison:
@@ -35,7 +37,9 @@ class Comparison:
         header, arrays = load_run(folder / CHECKPOINT)
         widths, degree = self.config.network.widths, self.config.points.sh_degree
         model = Model.load(dev, header, arrays, widths, degree, folder / CHECKPOINT)
-        self.views = with_depth_range(open_scene(dev, self.config, (split,)).splits[split], model.depth_range)
+        self.views = with_depth_range(
+            open_scene(dev, self.config, (split,)).splits[split], model.depth_range
+        )
         self.downscale = downscale or self.config.scene.downscale
         self.net = bench.make_network(dev, widths, "auto") if widths else model.net
         self.renderer = Renderer(dev, model, self.config.points)
@@ -49,26 +53,44 @@ class Comparison:
         x = self.renderer.features
         self.target.load(view)
         target = self.target.crop(0, 0, camera.width, camera.height)
-        grad = self.loss.forward_backward(self.net.forward(x, False, BACKGROUND), target, *self.renderer.offset)
+        grad = self.loss.forward_backward(
+            self.net.forward(x, False, BACKGROUND), target, *self.renderer.offset
+        )
 
         results = [self._results(x, grad, background) for background in (None, BACKGROUND)]
         share = self.net.share
-        differences = [float(np.abs(a - b).max() / np.abs(a).max()) for a, b in zip(*results, strict=True)]
-        times = bench.interleave({
-            (direction, name): self._runner(x, grad if direction == "train" else None, background)
-            for direction in ("forward", "train") for name, background in (("dense", None), ("active", BACKGROUND))}, runs)
+        differences = [
+            float(np.abs(a - b).max() / np.abs(a).max()) for a, b in zip(*results, strict=True)
+        ]
+        times = bench.interleave(
+            {
+                (direction, name): self._runner(
+                    x, grad if direction == "train" else None, background
+                )
+                for direction in ("forward", "train")
+                for name, background in (("dense", None), ("active", BACKGROUND))
+            },
+            runs,
+        )
         ms = {key: float(np.median(values)) for key, values in times.items()}
         return {
-            "view": view.name, "size": list(x.shape[:2]), "share": float(share),
+            "view": view.name,
+            "size": list(x.shape[:2]),
+            "share": float(share),
             **{f"{direction}_{name}_ms": value for (direction, name), value in ms.items()},
             **{f"{d}_ratio": ms[d, "dense"] / ms[d, "active"] for d in ("forward", "train")},
-            "image_difference": differences[0], "grad_features_difference": differences[1],
+            "image_difference": differences[0],
+            "grad_features_difference": differences[1],
             "grad_parameters_difference": max(differences[2:]),
         }
 
     def _results(self, x, grad, background):
         image = self.net.forward(x, True, background).get()
-        return [image, self.net.backward(grad).get(), *[g.get() for g in self.net.gradients.values()]]
+        return [
+            image,
+            self.net.backward(grad).get(),
+            *[g.get() for g in self.net.gradients.values()],
+        ]
 
     def _runner(self, x, grad, background):
         def run():
@@ -76,17 +98,30 @@ class Comparison:
             if grad is not None:
                 self.net.backward(grad)
             self.dev.finish()
+
         return run
 
 
 def main(argv=None):
-    """Measure, print, write; returns the exit status. Differences: the largest over the dense result's largest value."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    """Measure, print, write; returns the exit status. Differences: the largest over the dense
+    result's largest value.
+    """
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("run", metavar="RUN", help="the folder of a run")
     parser.add_argument("--split", default="test", metavar="S", help="of the scene (test)")
-    parser.add_argument("--downscale", type=int, metavar="N", help="reduction of the photographs (the run's)")
-    parser.add_argument("--widths", metavar="A,B,C", help="another network of these widths, with random weights (the run's)")
-    parser.add_argument("--views", type=int, default=4, metavar="N", help="views, evenly spread (4)")
+    parser.add_argument(
+        "--downscale", type=int, metavar="N", help="reduction of the photographs (the run's)"
+    )
+    parser.add_argument(
+        "--widths",
+        metavar="A,B,C",
+        help="another network of these widths, with random weights (the run's)",
+    )
+    parser.add_argument(
+        "--views", type=int, default=4, metavar="N", help="views, evenly spread (4)"
+    )
     parser.add_argument("--runs", type=int, default=3, metavar="N", help="timed runs of each (3)")
     parser.add_argument("--device", metavar="D", help="as `pp-cl devices` prints them")
     parser.add_argument("--json", metavar="FILE", help="also write the result there")
@@ -100,16 +135,32 @@ def main(argv=None):
         number = min(options.views, len(comparison.views))
         rows = []
         for i in range(number):
-            rows.append(comparison.row(comparison.views[len(comparison.views) * i // number], options.runs))
-            print("  ".join(f"{k} {v:.3g}" if isinstance(v, float) else f"{k} {v}" for k, v in rows[-1].items()), flush=True)
+            rows.append(
+                comparison.row(comparison.views[len(comparison.views) * i // number], options.runs)
+            )
+            print(
+                "  ".join(
+                    f"{k} {v:.3g}" if isinstance(v, float) else f"{k} {v}"
+                    for k, v in rows[-1].items()
+                ),
+                flush=True,
+            )
         if options.json:
-            write_json(options.json, {"device": dev.name, "platform": dev.info["platform"], "rows": rows})
+            write_json(
+                options.json, {"device": dev.name, "platform": dev.info["platform"], "rows": rows}
+            )
     except UserError as error:
         print(f"active_tiles: {error}", file=sys.stderr)
         return 2
-    mean = {k: float(np.mean([row[k] for row in rows])) for k in ("share", "forward_ratio", "train_ratio")}
-    print(f"{number} views: {mean['share']:.0%} of the multiplications remain; forward {mean['forward_ratio']:.2f} times as "
-          f"fast as dense, with backward {mean['train_ratio']:.2f}")
+    mean = {
+        k: float(np.mean([row[k] for row in rows]))
+        for k in ("share", "forward_ratio", "train_ratio")
+    }
+    print(
+        f"{number} views: {mean['share']:.0%} of the multiplications remain; forward"
+        f" {mean['forward_ratio']:.2f} times as fast as dense, with backward"
+        f" {mean['train_ratio']:.2f}"
+    )
     return 0
 
 

@@ -2,7 +2,8 @@
 
     python tools/compare_torch.py --widths 128,256,512 --size 256 --json FILE
 
-PyTorch (development extra `torch`) runs the same operations in the same order, in channels_last, on the CPU.
+PyTorch (development extra `torch`) runs the same operations in the same order, in channels_last, on
+the CPU.
 """
 
 import argparse
@@ -10,18 +11,20 @@ import sys
 
 import numpy as np
 
-from pp_cl import bench
-from pp_cl.checkpoint import write_json
-from pp_cl.device import open_device
+from pp_cl.bench import network as bench
+from pp_cl.device.discover import open_device
 from pp_cl.errors import UserError
+from pp_cl.files.atomic import write_json
 
-# Seconds before each timed call. OpenMP's threads go on spinning for some milliseconds after PyTorch is done, on cores
-# that our device's threads need.
+# Seconds before each timed call. OpenMP's threads go on spinning for some milliseconds after
+# PyTorch is done, on cores that our device's threads need.
 PAUSE = 0.03
 
 
 class TorchNetwork:
-    """PyTorch's twin of a UNet, with the same parameters, in float32 channels_last or in float64."""
+    """PyTorch's twin of a UNet, with the same parameters, in float32 channels_last or in
+    float64.
+    """
 
     def __init__(self, torch, net, dtype):
         self.torch, self.dtype, self.steps = torch, dtype, net.steps
@@ -48,9 +51,14 @@ class TorchNetwork:
             if step.kind == "pool":
                 out = functional.avg_pool2d(source, 2)
             elif step.kind == "up":
-                out = functional.interpolate(source, scale_factor=2, mode="bilinear", align_corners=False)
+                out = functional.interpolate(
+                    source, scale_factor=2, mode="bilinear", align_corners=False
+                )
             else:
-                weight, bias = self.parameters[step.name + ".weight"], self.parameters[step.name + ".bias"]
+                weight, bias = (
+                    self.parameters[step.name + ".weight"],
+                    self.parameters[step.name + ".bias"],
+                )
                 out = functional.conv2d(source, weight, bias, padding=weight.shape[2] // 2)
                 if step.kind == "conv3":
                     out = functional.relu(out, inplace=True)
@@ -65,7 +73,9 @@ class TorchNetwork:
     def train(self, x, grad_image):
         """{"x" or parameter: its gradient}."""
         names = ["x", *self.parameters]
-        gradients = self.torch.autograd.grad(self.image(x), [x, *self.parameters.values()], grad_image)
+        gradients = self.torch.autograd.grad(
+            self.image(x), [x, *self.parameters.values()], grad_image
+        )
         return dict(zip(names, gradients, strict=True))
 
 
@@ -85,17 +95,29 @@ def compare(torch, dev, widths, size, variant, rounds):
     rel_l2 = bench.errors(net.forward(x, training=False).get(), expected)[0]
     torch_rel_l2 = bench.errors(twin.forward(torch_x).numpy()[0].transpose(1, 2, 0), expected)[0]
 
-    times = bench.interleave({
-        ("forward", "ours"): bench.forward_runner(dev, net, x, grad_image),
-        ("forward", "torch"): lambda: twin.forward(torch_x),
-        ("train", "ours"): bench.train_runner(dev, net, x, grad_image),
-        ("train", "torch"): lambda: twin.train(torch_x, torch_grad),
-    }, rounds, PAUSE)
+    times = bench.interleave(
+        {
+            ("forward", "ours"): bench.forward_runner(dev, net, x, grad_image),
+            ("forward", "torch"): lambda: twin.forward(torch_x),
+            ("train", "ours"): bench.train_runner(dev, net, x, grad_image),
+            ("train", "torch"): lambda: twin.train(torch_x, torch_grad),
+        },
+        rounds,
+        PAUSE,
+    )
     return {
-        "device": dev.name, "platform": dev.info["platform"], "variant": variant, "torch": torch.__version__,
-        "threads": torch.get_num_threads(), "widths": list(widths), "size": size, "runs": rounds,
-        "rel_l2": rel_l2, "torch_rel_l2": torch_rel_l2,
-        "forward": _summary(times, "forward"), "train": _summary(times, "train"),
+        "device": dev.name,
+        "platform": dev.info["platform"],
+        "variant": variant,
+        "torch": torch.__version__,
+        "threads": torch.get_num_threads(),
+        "widths": list(widths),
+        "size": size,
+        "runs": rounds,
+        "rel_l2": rel_l2,
+        "torch_rel_l2": torch_rel_l2,
+        "forward": _summary(times, "forward"),
+        "train": _summary(times, "train"),
     }
 
 
@@ -111,13 +133,31 @@ def _summary(times, direction):
 def main(argv=None):
     """Measure, print, write; returns the exit status.
 
-    The JSON holds {"rel_l2": ours against float64, "forward": {"ours_ms", "torch_ms", "ratio"}, "train": the same}: medians,
-    ratio = torch_ms / ours_ms, train = forward and backward to the input and the weights.
+    The JSON holds {"rel_l2": ours against float64, "forward": {"ours_ms", "torch_ms", "ratio"},
+    "train": the same}: medians, ratio = torch_ms / ours_ms, train = forward and backward to the
+    input and the weights.
     """
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--widths", default="128,256,512", metavar="A,B,C", help="channels of the levels (128,256,512)")
-    parser.add_argument("--size", default="256", metavar="S", help="side of the image in pixels, a multiple of 4 (256)")
-    parser.add_argument("--variant", choices=bench.NETWORK_VARIANTS, default="auto", help="of our convolutions (auto)")
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument(
+        "--widths",
+        default="128,256,512",
+        metavar="A,B,C",
+        help="channels of the levels (128,256,512)",
+    )
+    parser.add_argument(
+        "--size",
+        default="256",
+        metavar="S",
+        help="side of the image in pixels, a multiple of 4 (256)",
+    )
+    parser.add_argument(
+        "--variant",
+        choices=bench.NETWORK_VARIANTS,
+        default="auto",
+        help="of our convolutions (auto)",
+    )
     parser.add_argument("--threads", type=int, default=2, metavar="N", help="PyTorch's (2)")
     parser.add_argument("--runs", type=int, default=15, metavar="N", help="timed runs of each (15)")
     parser.add_argument("--device", metavar="D", help="ours, as `pp-cl devices` prints them")
@@ -129,7 +169,9 @@ def main(argv=None):
             raise UserError("--threads, --runs: must be at least 1")
         torch = _import_torch()
         torch.set_num_threads(options.threads)
-        result = compare(torch, open_device(options.device), widths, size, options.variant, options.runs)
+        result = compare(
+            torch, open_device(options.device), widths, size, options.variant, options.runs
+        )
         if options.json:
             write_json(options.json, result)
     except UserError as error:
@@ -138,7 +180,10 @@ def main(argv=None):
     print(f"relative L2 error: ours {result['rel_l2']:.1e}, PyTorch's {result['torch_rel_l2']:.1e}")
     for direction in ("forward", "train"):
         row = result[direction]
-        print(f"{direction:8} ours {row['ours_ms']:9.2f} ms, PyTorch {row['torch_ms']:9.2f} ms, ratio {row['ratio']:.2f}")
+        print(
+            f"{direction:8} ours {row['ours_ms']:9.2f} ms, PyTorch {row['torch_ms']:9.2f} ms, ratio"
+            f" {row['ratio']:.2f}"
+        )
     return 0
 
 

@@ -1,4 +1,6 @@
-"""Write the demo scene as a NeRF-synthetic folder, with its mesh: python tools/demo_scene.py FOLDER [--size S]."""
+"""Write the demo scene as a NeRF-synthetic folder, with its mesh: python tools/demo_scene.py FOLDER
+[--size S].
+"""
 
 import argparse
 import sys
@@ -6,16 +8,18 @@ from pathlib import Path
 
 import trimesh
 
-from pp_cl.demo import SIZE, demo_mesh, demo_scene, write_scene
-from pp_cl.device import open_device
+from pp_cl.device.discover import open_device
 from pp_cl.errors import UserError
+from pp_cl.scene.demo import SIZE, demo_mesh, demo_scene, write_scene
 
 
 def main():
     """Render, write, and say what was written; returns the exit status."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("folder", type=Path, help="where to; must not exist, or be empty")
-    parser.add_argument("--size", type=int, default=SIZE, help=f"side of the images in pixels ({SIZE})")
+    parser.add_argument(
+        "--size", type=int, default=SIZE, help=f"side of the images in pixels ({SIZE})"
+    )
     options = parser.parse_args()
     try:
         dev = open_device()

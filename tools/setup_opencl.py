@@ -1,7 +1,8 @@
 """Makes sure that this virtual environment has a working OpenCL device; `make setup` runs it.
 
-A device counts when a test build runs on it. Tried in turn until one does: what is there already, Debian's PoCL (as
-root), Intel's CPU runtime (x86-64), PyPI's PoCL 3.0. With --intel: Intel's runtime, whatever else is there.
+A device counts when a test build runs on it. Tried in turn until one does: what is there already,
+Debian's PoCL (as root), Intel's CPU runtime (x86-64), PyPI's PoCL 3.0. With --intel: Intel's
+runtime, whatever else is there.
 """
 
 import argparse
@@ -15,7 +16,7 @@ from importlib.util import find_spec
 from pathlib import Path
 
 LIST = """
-from pp_cl.device import list_devices
+from pp_cl.device.discover import list_devices
 for index, device, problem in list_devices():
     print(index, device.platform.name, device.name, problem or "works")
 """
@@ -24,10 +25,16 @@ POCL = "pocl-binary-distribution"
 
 
 def devices():
-    """One line for each OpenCL device; asked in a process of its own, as drivers are looked for once a process."""
+    """One line for each OpenCL device; asked in a process of its own, as drivers are looked for
+    once a process.
+    """
     listed = subprocess.run([sys.executable, "-c", LIST], capture_output=True, text=True)
     if listed.returncode:
-        print(f"asking for the devices ended with status {listed.returncode}: {listed.stderr.strip()}", file=sys.stderr)
+        print(
+            f"asking for the devices ended with status {listed.returncode}:"
+            f" {listed.stderr.strip()}",
+            file=sys.stderr,
+        )
     return listed.stdout.splitlines()
 
 
@@ -40,11 +47,16 @@ def install_debian():
     """Debian's and Ubuntu's PoCL."""
     env = {**os.environ, "DEBIAN_FRONTEND": "noninteractive"}
     for command in ("update", "install --yes --no-install-recommends pocl-opencl-icd"):
-        subprocess.run(["apt-get", "-qq", *command.split()], env=env, stdout=subprocess.DEVNULL, check=True)
+        subprocess.run(
+            ["apt-get", "-qq", *command.split()], env=env, stdout=subprocess.DEVNULL, check=True
+        )
 
 
 def pip(*arguments):
-    subprocess.run([sys.executable, "-m", "pip", "--disable-pip-version-check", "--quiet", *arguments], check=True)
+    subprocess.run(
+        [sys.executable, "-m", "pip", "--disable-pip-version-check", "--quiet", *arguments],
+        check=True,
+    )
 
 
 def install_intel():
@@ -54,16 +66,21 @@ def install_intel():
 
 
 def register_intel():
-    """Write the .icd file by which pyopencl's own loader finds Intel's runtime; the one in Intel's wheel has a wrong path.
+    """Write the .icd file by which pyopencl's own loader finds Intel's runtime; the one in Intel's
+    wheel has a wrong path.
 
-    The loader of pyopencl's wheels reads pyopencl/.libs besides the system's folder, so no variable needs setting.
+    The loader of pyopencl's wheels reads pyopencl/.libs besides the system's folder, so no variable
+    needs setting.
     """
     library = next(f.locate().resolve() for f in files(INTEL[0]) if f.name == "libintelocl.so")
     folder = Path(find_spec("pyopencl").origin).parent / ".libs"
     if folder.is_dir():
         (folder / "intel-cpu.icd").write_text(f"{library}\n")
     else:
-        print(f"this pyopencl uses the system's OpenCL loader: set OCL_ICD_VENDORS={library}", file=sys.stderr)
+        print(
+            f"this pyopencl uses the system's OpenCL loader: set OCL_ICD_VENDORS={library}",
+            file=sys.stderr,
+        )
 
 
 def install_pocl():
@@ -76,7 +93,9 @@ def install_pocl():
 def main():
     """Exit status 0 when a device works at the end, else 1."""
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
-    parser.add_argument("--intel", action="store_true", help="install Intel's CPU runtime, whatever else is there")
+    parser.add_argument(
+        "--intel", action="store_true", help="install Intel's CPU runtime, whatever else is there"
+    )
     only_intel = parser.parse_args().intel
     wanted = "Intel(R) OpenCL" if only_intel else ""
 

@@ -1,33 +1,35 @@
-// The most that a device does: multiply-adds, and bytes copied. What the speed of kernels is measured against.
+// The most that a device does: multiply-adds, and bytes copied. What the speed of kernels is
+// measured against.
 #include "common.h"
 
 #ifndef CHAINS
-#define CHAINS 16            // independent sums of 16 lanes: enough to hide an FMA's latency, few enough for the registers
+// independent sums of 16 lanes: enough to hide an FMA's latency, few enough for the registers
+#define CHAINS 16
 #endif
 
-// One work-item per row of out: does `rounds` times `CHAINS` multiply-adds x = x * factor + term in registers, and writes
-// the sum of the chains. They begin at first, first + 1, ... so that no two are the same.
+// One work-item per row of out: does `rounds` times `CHAINS` multiply-adds x = x * factor + term in
+// registers, and writes the sum of the chains. They begin at first, first + 1, ... so that no two
+// are the same.
 kernel void peak(
     const uint n,
     const int rounds,
     const float first,
     const float factor,
     const float term,
-    global float16 *out)                 // (n, 16)
+    global float16 *out)  // (n, 16)
 {
     const uint i = get_global_id(0);
-    if (i >= n)
-        return;
+    if (i >= n) return;
     float16 chain[CHAINS];
-    #pragma unroll
+#pragma unroll
     for (int c = 0; c < CHAINS; c++)
         chain[c] = first + c;
     for (int round = 0; round < rounds; round++)
-        #pragma unroll
+#pragma unroll
         for (int c = 0; c < CHAINS; c++)
             chain[c] = chain[c] * factor + term;
     float16 sum = 0.0f;
-    #pragma unroll
+#pragma unroll
     for (int c = 0; c < CHAINS; c++)
         sum += chain[c];
     out[i] = sum;
@@ -36,11 +38,10 @@ kernel void peak(
 // One work-item per row of 16 floats: copies it.
 kernel void peak_copy(
     const uint n,
-    global const float16 *source,        // (n, 16)
-    global float16 *target)              // (n, 16)
+    global const float16 *source,  // (n, 16)
+    global float16 *target)        // (n, 16)
 {
     const uint i = get_global_id(0);
-    if (i >= n)
-        return;
+    if (i >= n) return;
     target[i] = source[i];
 }

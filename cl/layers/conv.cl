@@ -1,26 +1,28 @@
-// Direct K x K convolution, stride 1, zero padding K/2: the forward pass and the gradient of its input.
+// Direct K x K convolution, stride 1, zero padding K/2: the forward pass and the gradient of its
+// input.
 //
-// A work-item keeps BLOCKS x 16 output channels of TILE neighbouring pixels of a row in registers. For each input channel it
-// loads K weight vectors per block and TILE + K - 1 scalars, and does K * BLOCKS * TILE vector multiply-adds with them. TILE
-// and BLOCKS are chosen so that accumulators and weights fit the 32 vector registers of AVX-512 (pp_cl/conv.py).
+// A work-item keeps BLOCKS x 16 output channels of TILE neighbouring pixels of a row in registers.
+// For each input channel it loads K weight vectors per block and TILE + K - 1 scalars, and does K *
+// BLOCKS * TILE vector multiply-adds with them. TILE and BLOCKS are chosen so that accumulators and
+// weights fit the 32 vector registers of AVX-512 (pp_cl/layers/conv.py).
 #include "common.h"
-#include "tiles.h"
+#include "layers/tiles.h"
 #include "vector.h"
 
 #ifndef K
-#define K 3                  // side of the kernel: 1 or 3
+#define K 3  // side of the kernel: 1 or 3
 #endif
 #ifndef TILE
-#define TILE 8               // pixels of one row, at most the width of the image
+#define TILE 8  // pixels of one row, at most the width of the image
 #endif
 #ifndef BLOCKS
-#define BLOCKS 1             // groups of 16 output channels
+#define BLOCKS 1  // groups of 16 output channels
 #endif
 #define PAD (K / 2)
 
-// acc += convolution of x at pixels (x0 .. x0 + TILE - 1, y). weight: (block, ky, kx, channel) of x's first channel;
-// kx_stride and block_stride: float16 between two kx, two blocks. Inlined by force: called out of line, PoCL's LLVM keeps
-// acc in memory and halves the vector width.
+// acc += convolution of x at pixels (x0 .. x0 + TILE - 1, y). weight: (block, ky, kx, channel) of
+// x's first channel; kx_stride and block_stride: float16 between two kx, two blocks. Inlined by
+// force: called out of line, PoCL's LLVM keeps acc in memory and halves the vector width.
 ALWAYS_INLINE void convolve(
     float16 acc[BLOCKS][TILE],
     global const float *x,
@@ -31,34 +33,33 @@ ALWAYS_INLINE void convolve(
     const int x0,
     const int y,
     const int height,
-    const int width)
-{
+    const int width) {
     // Columns -1 and TILE may lie outside: then the column beside them is read, and masked to zero.
     const int left_mask = x0 > 0 ? -1 : 0, right_mask = x0 + TILE < width ? -1 : 0;
     const int left = -channels & left_mask, right = (TILE - 1) * channels + (channels & right_mask);
     for (int ky = 0; ky < K; ky++) {
         const int row = y + ky - PAD;
-        if (row < 0 || row >= height)
-            continue;
+        if (row < 0 || row >= height) continue;
         global const float *pixel = x + ((size_t)row * width + x0) * channels;
         global const float16 *w = weight + ky * K * kx_stride;
         for (int c = 0; c < channels; c++) {
             float16 wc[BLOCKS][K];
-            #pragma unroll
+#pragma unroll
             for (int b = 0; b < BLOCKS; b++)
-                #pragma unroll
+#pragma unroll
                 for (int kx = 0; kx < K; kx++)
                     wc[b][kx] = w[b * block_stride + kx * kx_stride + c];
-            #pragma unroll
+#pragma unroll
             for (int column = -PAD; column < TILE + PAD; column++) {
-                const float value = column < 0     ? as_float(as_int(pixel[left + c]) & left_mask)
-                                  : column >= TILE ? as_float(as_int(pixel[right + c]) & right_mask)
-                                                   : pixel[column * channels + c];
-                #pragma unroll
+                const float value = column < 0 ? as_float(as_int(pixel[left + c]) & left_mask)
+                                    : column >= TILE
+                                        ? as_float(as_int(pixel[right + c]) & right_mask)
+                                        : pixel[column * channels + c];
+#pragma unroll
                 for (int kx = 0; kx < K; kx++) {
                     const int p = column - kx + PAD;
                     if (p >= 0 && p < TILE)
-                        #pragma unroll
+#pragma unroll
                         for (int b = 0; b < BLOCKS; b++)
                             acc[b][p] += value * wc[b][kx];
                 }
@@ -68,97 +69,104 @@ ALWAYS_INLINE void convolve(
 }
 
 // Whether any of the TILE pixels from (x0, y) on lies in a tile that is computed.
-inline bool any_is_computed(global const float *tile_count, const int x0, const int y, const int width) {
+inline bool
+any_is_computed(global const float *tile_count, const int x0, const int y, const int width) {
     bool any = false;
     for (int x = x0; x < x0 + TILE + SIDE - 1; x += SIDE)
         any |= tile_is_computed(tile_count, min(x, x0 + TILE - 1), y, width);
     return any;
 }
 
-// One work-item per (TILE pixels, row, BLOCKS * 16 output channels): reads their neighbourhood in x, then in x2 (the
-// concatenation [x, x2] without making it), and writes those of out that lie in a tile to compute.
+// One work-item per (TILE pixels, row, BLOCKS * 16 output channels): reads their neighbourhood in
+// x, then in x2 (the concatenation [x, x2] without making it), and writes those of out that lie in
+// a tile to compute.
 kernel void conv_forward(
     const int height,
     const int width,
     const int c1,
-    const int c2,                        // channels of x2; 0 = x2 is not read
+    const int c2,  // channels of x2; 0 = x2 is not read
     const int co,
-    const int relu,                      // negative results become 0
-    global const float *x,               // (height, width, c1)
-    global const float *x2,              // (height, width, ?)
-    global const float16 *weight,        // (blocks, K, K, c1 + c2, 16)
-    global const float16 *bias,          // (?)
-    global const float *tile_count,      // (?, ?) 0 = not computed
-    global float *out)                   // (height, width, co)
+    const int relu,                  // negative results become 0
+    global const float *x,           // (height, width, c1)
+    global const float *x2,          // (height, width, ?)
+    global const float16 *weight,    // (blocks, K, K, c1 + c2, 16)
+    global const float16 *bias,      // (?)
+    global const float *tile_count,  // (?, ?) 0 = not computed
+    global float *out)               // (height, width, co)
 {
-    const int tile_x = get_global_id(0) * TILE, y = get_global_id(1), block = get_global_id(2) * BLOCKS;
-    if (tile_x >= width || y >= height || block * 16 >= co)
-        return;
-    const int x0 = min(tile_x, width - TILE);    // the last ones move left, and store only what their neighbours do not
-    if (!any_is_computed(tile_count, x0, y, width))
-        return;
+    const int tile_x = get_global_id(0) * TILE, y = get_global_id(1),
+              block = get_global_id(2) * BLOCKS;
+    if (tile_x >= width || y >= height || block * 16 >= co) return;
+    // the last ones move left, and store only what their neighbours do not
+    const int x0 = min(tile_x, width - TILE);
+    if (!any_is_computed(tile_count, x0, y, width)) return;
     float16 acc[BLOCKS][TILE];
-    #pragma unroll
+#pragma unroll
     for (int b = 0; b < BLOCKS; b++)
-        #pragma unroll
+#pragma unroll
         for (int p = 0; p < TILE; p++)
             acc[b][p] = bias[block + b];
 
     const int kx_stride = c1 + c2, block_stride = K * K * kx_stride;
     for (int source = 0; source < (c2 ? 2 : 1); source++)
-        convolve(acc, source ? x2 : x, weight + block * block_stride + source * c1, source ? c2 : c1,
-                 kx_stride, block_stride, x0, y, height, width);
+        convolve(
+            acc, source ? x2 : x, weight + block * block_stride + source * c1, source ? c2 : c1,
+            kx_stride, block_stride, x0, y, height, width);
 
-    #pragma unroll
+#pragma unroll
     for (int b = 0; b < BLOCKS; b++)
-        #pragma unroll
+#pragma unroll
         for (int p = 0; p < TILE; p++)
             if (x0 + p >= tile_x && tile_is_computed(tile_count, x0 + p, y, width)) {
                 // max(., 0) would hide a NaN
-                const float16 value = relu ? select(acc[b][p], (float16)(0.0f), acc[b][p] < 0.0f) : acc[b][p];
-                store16(value, out + ((size_t)y * width + x0 + p) * co + (block + b) * 16,
-                        co - (block + b) * 16);
+                const float16 value =
+                    relu ? select(acc[b][p], (float16)(0.0f), acc[b][p] < 0.0f) : acc[b][p];
+                store16(
+                    value, out + ((size_t)y * width + x0 + p) * co + (block + b) * 16,
+                    co - (block + b) * 16);
             }
 }
 
-// One work-item per (TILE pixels, row, BLOCKS * 16 input channels): reads grad_out, and writes those of grad_x that lie in a
-// tile to compute: the convolution of grad_out with the flipped and transposed weights (conv_weights.cl). masked: x is the
-// output of a ReLU and grad_x the gradient of that ReLU's input, so that the mask costs no pass of its own.
+// One work-item per (TILE pixels, row, BLOCKS * 16 input channels): reads grad_out, and writes
+// those of grad_x that lie in a tile to compute: the convolution of grad_out with the flipped and
+// transposed weights (conv_weights.cl). masked: x is the output of a ReLU and grad_x the gradient
+// of that ReLU's input, so that the mask costs no pass of its own.
 kernel void conv_backward_input(
     const int height,
     const int width,
     const int c,
     const int co,
     const int masked,
-    global const float *x,               // (height, width, c)
-    global const float16 *flipped,       // (blocks, K, K, co, 16)
-    global const float *grad_out,        // (height, width, co)
-    global const float *tile_count,      // (?, ?) of grad_x, 0 = not computed
-    global float *grad_x)                // (height, width, c)
+    global const float *x,           // (height, width, c)
+    global const float16 *flipped,   // (blocks, K, K, co, 16)
+    global const float *grad_out,    // (height, width, co)
+    global const float *tile_count,  // (?, ?) of grad_x, 0 = not computed
+    global float *grad_x)            // (height, width, c)
 {
-    const int tile_x = get_global_id(0) * TILE, y = get_global_id(1), block = get_global_id(2) * BLOCKS;
-    if (tile_x >= width || y >= height || block * 16 >= c)
-        return;
+    const int tile_x = get_global_id(0) * TILE, y = get_global_id(1),
+              block = get_global_id(2) * BLOCKS;
+    if (tile_x >= width || y >= height || block * 16 >= c) return;
     const int x0 = min(tile_x, width - TILE);
-    if (!any_is_computed(tile_count, x0, y, width))
-        return;
+    if (!any_is_computed(tile_count, x0, y, width)) return;
     float16 acc[BLOCKS][TILE];
-    #pragma unroll
+#pragma unroll
     for (int b = 0; b < BLOCKS; b++)
-        #pragma unroll
+#pragma unroll
         for (int p = 0; p < TILE; p++)
             acc[b][p] = 0.0f;
 
     convolve(acc, grad_out, flipped + block * K * K * co, co, co, K * K * co, x0, y, height, width);
 
-    #pragma unroll
+#pragma unroll
     for (int b = 0; b < BLOCKS; b++)
-        #pragma unroll
+#pragma unroll
         for (int p = 0; p < TILE; p++)
             if (x0 + p >= tile_x && tile_is_computed(tile_count, x0 + p, y, width)) {
                 const size_t at = ((size_t)y * width + x0 + p) * c + (block + b) * 16;
                 const int lanes = c - (block + b) * 16;
-                const float16 dL_dx = masked ? select((float16)0.0f, acc[b][p], load16(x + at, lanes) > 0.0f) : acc[b][p];
+                const float16 dL_dx =
+                    masked ? select((float16)0.0f, acc[b][p], load16(x + at, lanes) > 0.0f)
+                           : acc[b][p];
                 store16(dL_dx, grad_x + at, lanes);
             }
 }

@@ -1,105 +1,122 @@
-// The layers between convolutions, on (H, W, C) feature maps: pooling, bilinear upsampling, a straight line.
-// But for the last, a work-item is (16 channels, x, y): one vector of a pixel, shorter where C ends. It writes where the
-// pixel's tile is computed (tiles.h); max pooling everywhere.
+// The layers between convolutions, on (H, W, C) feature maps: pooling, bilinear upsampling, a
+// straight line. But for the last, a work-item is (16 channels, x, y): one vector of a pixel,
+// shorter where C ends. It writes where the pixel's tile is computed (tiles.h); max pooling
+// everywhere.
 #include "common.h"
-#include "tiles.h"
+#include "layers/tiles.h"
 #include "vector.h"
 
 // One work-item per (16 channels, x, y) of out: reads the 2x2 pixels it covers, writes their mean.
 kernel void avgpool2_forward(
-    const int h,                         // of out
+    const int h,  // of out
     const int w,
     const int c,
-    global const float *x,               // (?, ?, c) twice the height and width of out
-    global const float *tile_count,      // (?, ?) of out, 0 = not computed
-    global float *out)                   // (h, w, c)
+    global const float *x,           // (?, ?, c) twice the height and width of out
+    global const float *tile_count,  // (?, ?) of out, 0 = not computed
+    global float *out)               // (h, w, c)
 {
-    const int first = get_global_id(0) * CHANNELS, column = get_global_id(1), row = get_global_id(2), lanes = c - first;
+    const int first = get_global_id(0) * CHANNELS, column = get_global_id(1),
+              row = get_global_id(2), lanes = c - first;
     if (first >= c || column >= w || row >= h || !tile_is_computed(tile_count, column, row, w))
         return;
-    global const float *upper = x + ((size_t)row * 4 * w + column * 2) * c + first, *lower = upper + 2 * w * c;
-    const float16 sum = (load16(upper, lanes) + load16(upper + c, lanes))
-                      + (load16(lower, lanes) + load16(lower + c, lanes));
+    global const float *upper = x + ((size_t)row * 4 * w + column * 2) * c + first,
+                       *lower = upper + 2 * w * c;
+    const float16 sum = (load16(upper, lanes) + load16(upper + c, lanes)) +
+                        (load16(lower, lanes) + load16(lower + c, lanes));
     store16(0.25f * sum, out + ((size_t)row * w + column) * c + first, lanes);
 }
 
-// One work-item per (16 channels, x, y) of x: ADDS its share of grad_out to grad_x, which holds the gradient from x's other
-// use, and then sets it to 0 where x <= 0: x is the output of a ReLU, grad_x becomes the gradient of that ReLU's input.
+// One work-item per (16 channels, x, y) of x: ADDS its share of grad_out to grad_x, which holds the
+// gradient from x's other use, and then sets it to 0 where x <= 0: x is the output of a ReLU,
+// grad_x becomes the gradient of that ReLU's input.
 kernel void avgpool2_backward(
-    const int h,                         // of out
+    const int h,  // of out
     const int w,
     const int c,
-    global const float *x,               // (?, ?, c)
-    global const float *grad_out,        // (h, w, c)
-    global const float *tile_count,      // (?, ?) of grad_x, 0 = not computed
-    global float *grad_x)                // (?, ?, c)
+    global const float *x,           // (?, ?, c)
+    global const float *grad_out,    // (h, w, c)
+    global const float *tile_count,  // (?, ?) of grad_x, 0 = not computed
+    global float *grad_x)            // (?, ?, c)
 {
-    const int first = get_global_id(0) * CHANNELS, column = get_global_id(1), row = get_global_id(2), lanes = c - first;
-    if (first >= c || column >= 2 * w || row >= 2 * h || !tile_is_computed(tile_count, column, row, 2 * w))
+    const int first = get_global_id(0) * CHANNELS, column = get_global_id(1),
+              row = get_global_id(2), lanes = c - first;
+    if (first >= c || column >= 2 * w || row >= 2 * h ||
+        !tile_is_computed(tile_count, column, row, 2 * w))
         return;
     const size_t at = ((size_t)row * 2 * w + column) * c + first;
-    const float16 dL_dout = load16(grad_out + ((size_t)(row / 2) * w + column / 2) * c + first, lanes);
+    const float16 dL_dout =
+        load16(grad_out + ((size_t)(row / 2) * w + column / 2) * c + first, lanes);
     const float16 dL_dx = load16(grad_x + at, lanes) + 0.25f * dL_dout;
     store16(select((float16)0.0f, dL_dx, load16(x + at, lanes) > 0.0f), grad_x + at, lanes);
 }
 
-// One work-item per (16 channels, x, y) of out: reads the 2x2 pixels it covers, writes their largest; an odd last row or
-// column of x is left out, as PyTorch does.
+// One work-item per (16 channels, x, y) of out: reads the 2x2 pixels it covers, writes their
+// largest; an odd last row or column of x is left out, as PyTorch does.
 kernel void maxpool2_forward(
-    const int h,                         // of out
+    const int h,  // of out
     const int w,
     const int c,
     const int x_width,
-    global const float *x,               // (?, x_width, c)
-    global float *out)                   // (h, w, c)
+    global const float *x,  // (?, x_width, c)
+    global float *out)      // (h, w, c)
 {
-    const int first = get_global_id(0) * CHANNELS, column = get_global_id(1), row = get_global_id(2), lanes = c - first;
-    if (first >= c || column >= w || row >= h)
-        return;
-    global const float *upper = x + ((size_t)row * 2 * x_width + column * 2) * c + first, *lower = upper + x_width * c;
-    const float16 largest = fmax(fmax(load16(upper, lanes), load16(upper + c, lanes)),
-                                 fmax(load16(lower, lanes), load16(lower + c, lanes)));
+    const int first = get_global_id(0) * CHANNELS, column = get_global_id(1),
+              row = get_global_id(2), lanes = c - first;
+    if (first >= c || column >= w || row >= h) return;
+    global const float *upper = x + ((size_t)row * 2 * x_width + column * 2) * c + first,
+                       *lower = upper + x_width * c;
+    const float16 largest = fmax(
+        fmax(load16(upper, lanes), load16(upper + c, lanes)),
+        fmax(load16(lower, lanes), load16(lower + c, lanes)));
     store16(largest, out + ((size_t)row * w + column) * c + first, lanes);
 }
 
-// One work-item per (16 channels, x, y) of out, which is twice as high and wide as x: reads the pixel of x that out's
-// centre lies in and the nearest ones beside it, writes them weighted 3/4 and 1/4 along each axis (bilinear, align_corners
-// False, the border repeated).
+// One work-item per (16 channels, x, y) of out, which is twice as high and wide as x: reads the
+// pixel of x that out's centre lies in and the nearest ones beside it, writes them weighted 3/4 and
+// 1/4 along each axis (bilinear, align_corners False, the border repeated).
 kernel void upsample2_forward(
-    const int h,                         // of x
+    const int h,  // of x
     const int w,
     const int c,
-    global const float *x,               // (h, w, c)
-    global const float *tile_count,      // (?, ?) of out, 0 = not computed
-    global float *out)                   // (?, ?, c)
+    global const float *x,           // (h, w, c)
+    global const float *tile_count,  // (?, ?) of out, 0 = not computed
+    global float *out)               // (?, ?, c)
 {
-    const int first = get_global_id(0) * CHANNELS, column = get_global_id(1), row = get_global_id(2), lanes = c - first;
-    if (first >= c || column >= 2 * w || row >= 2 * h || !tile_is_computed(tile_count, column, row, 2 * w))
+    const int first = get_global_id(0) * CHANNELS, column = get_global_id(1),
+              row = get_global_id(2), lanes = c - first;
+    if (first >= c || column >= 2 * w || row >= 2 * h ||
+        !tile_is_computed(tile_count, column, row, 2 * w))
         return;
-    const int near = column / 2 * c, beside = clamp(column / 2 - 1 + 2 * (column & 1), 0, w - 1) * c;
+    const int near = column / 2 * c,
+              beside = clamp(column / 2 - 1 + 2 * (column & 1), 0, w - 1) * c;
     const int other = clamp(row / 2 - 1 + 2 * (row & 1), 0, h - 1);
-    global const float *a = x + (size_t)(row / 2) * w * c + first, *b = x + (size_t)other * w * c + first;
+    global const float *a = x + (size_t)(row / 2) * w * c + first,
+                       *b = x + (size_t)other * w * c + first;
     const float16 upper = 0.75f * load16(a + near, lanes) + 0.25f * load16(a + beside, lanes);
     const float16 lower = 0.75f * load16(b + near, lanes) + 0.25f * load16(b + beside, lanes);
     store16(0.75f * upper + 0.25f * lower, out + ((size_t)row * 2 * w + column) * c + first, lanes);
 }
 
-// One work-item per (16 channels, x, y) of x: gathers the 4x4 pixels of grad_out that read it, writes their weighted sum.
+// One work-item per (16 channels, x, y) of x: gathers the 4x4 pixels of grad_out that read it,
+// writes their weighted sum.
 kernel void upsample2_backward(
-    const int h,                         // of x
+    const int h,  // of x
     const int w,
     const int c,
-    global const float *grad_out,        // (?, ?, c) twice the height and width of x
-    global const float *tile_count,      // (?, ?) of grad_x, 0 = not computed
-    global float *grad_x)                // (h, w, c)
+    global const float *grad_out,    // (?, ?, c) twice the height and width of x
+    global const float *tile_count,  // (?, ?) of grad_x, 0 = not computed
+    global float *grad_x)            // (h, w, c)
 {
-    const int first = get_global_id(0) * CHANNELS, column = get_global_id(1), row = get_global_id(2), lanes = c - first;
+    const int first = get_global_id(0) * CHANNELS, column = get_global_id(1),
+              row = get_global_id(2), lanes = c - first;
     if (first >= c || column >= w || row >= h || !tile_is_computed(tile_count, column, row, w))
         return;
-    // The outermost row or column reads its own edge of x with weight 1: it counts once more in place of the one outside.
-    const int x0 = max(2 * column - 1, 0) * c, x1 = 2 * column * c, x2 = x1 + c, x3 = min(2 * column + 2, 2 * w - 1) * c;
+    // The outermost row or column reads its own edge of x with weight 1: it counts once more in
+    // place of the one outside.
+    const int x0 = max(2 * column - 1, 0) * c, x1 = 2 * column * c, x2 = x1 + c,
+              x3 = min(2 * column + 2, 2 * w - 1) * c;
     float16 dL_dx = 0.0f;
-    #pragma unroll
+#pragma unroll
     for (int dy = 0; dy < 4; dy++) {
         const int y = clamp(2 * row - 1 + dy, 0, 2 * h - 1);
         global const float *grad = grad_out + (size_t)y * 2 * w * c + first;
@@ -115,11 +132,10 @@ kernel void affine(
     const uint n,
     const float scale,
     const float offset,
-    global const float *x,               // (...)
-    global float *out)                   // (...)
+    global const float *x,  // (...)
+    global float *out)      // (...)
 {
     const uint i = get_global_id(0);
-    if (i >= n)
-        return;
+    if (i >= n) return;
     out[i] = scale * x[i] + offset;
 }

@@ -1,22 +1,23 @@
-// Tiles of a feature map (tiles.h): those that hold something, those that equal another, and copying one to another.
+// Tiles of a feature map (tiles.h): those that hold something, those that equal another, and
+// copying one to another.
 #include "common.h"
-#include "tiles.h"
+#include "layers/tiles.h"
 #include "vector.h"
 
-// One work-item per tile: reads its pixels, writes 1 if any channel of any is not `background`, a NaN included, else 0.
+// One work-item per tile: reads its pixels, writes 1 if any channel of any is not `background`, a
+// NaN included, else 0.
 kernel void tiles_find(
     const int h,
     const int w,
     const int c,
     const float background,
-    global const float *x,               // (h, w, c)
-    global int *found)                   // (?, ?) tiles
+    global const float *x,  // (h, w, c)
+    global int *found)      // (?, ?) tiles
 {
     const int tile = get_global_id(0), columns = tile_columns(w), rows = tile_columns(h);
-    if (tile >= columns * rows)
-        return;
+    if (tile >= columns * rows) return;
     const int x0 = tile % columns * SIDE, y0 = tile / columns * SIDE;
-    const int values = min(SIDE, w - x0) * c;    // of one line of the tile
+    const int values = min(SIDE, w - x0) * c;  // of one line of the tile
     int other = 0;
     for (int y = y0; y < min(y0 + SIDE, h); y++) {
         global const float *line = x + ((size_t)y * w + x0) * c;
@@ -26,21 +27,21 @@ kernel void tiles_find(
     found[tile] = other;
 }
 
-// One work-item per tile: compares its bits with those of the tile it stands beside in `source`, of the same shape; writes 1
-// if they differ, else 0.
+// One work-item per tile: compares its bits with those of the tile it stands beside in `source`, of
+// the same shape; writes 1 if they differ, else 0.
 kernel void tiles_compare(
     const int h,
     const int w,
     const int c,
-    global const int *source,            // (?, ?) tiles
-    global const float *x,               // (h, w, c)
-    global int *differs)                 // (?, ?) tiles
+    global const int *source,  // (?, ?) tiles
+    global const float *x,     // (h, w, c)
+    global int *differs)       // (?, ?) tiles
 {
     const int tile = get_global_id(0), columns = tile_columns(w), rows = tile_columns(h);
-    if (tile >= columns * rows)
-        return;
+    if (tile >= columns * rows) return;
     const int x0 = tile % columns * SIDE, y0 = tile / columns * SIDE;
-    const long shift = ((long)(source[tile] / columns * SIDE - y0) * w + source[tile] % columns * SIDE - x0) * c;
+    const long shift =
+        ((long)(source[tile] / columns * SIDE - y0) * w + source[tile] % columns * SIDE - x0) * c;
     const int values = min(SIDE, w - x0) * c;
     int other = 0;
     for (int y = y0; y < min(y0 + SIDE, h); y++) {
@@ -51,23 +52,25 @@ kernel void tiles_compare(
     differs[tile] = other;
 }
 
-// One work-item per (16 channels, pixel of a tile, copy): writes the pixel of the tile `to` as it is in the tile `from`.
-// Both have the same shape, and nothing is copied to `from`.
+// One work-item per (16 channels, pixel of a tile, copy): writes the pixel of the tile `to` as it
+// is in the tile `from`. Both have the same shape, and nothing is copied to `from`.
 kernel void tiles_copy(
     const int h,
     const int w,
     const int c,
-    const int n,                         // copies
-    global const int *from_to,           // (2, n) tiles: from, to
-    global float *x)                     // (h, w, c)
+    const int n,                // copies
+    global const int *from_to,  // (2, n) tiles: from, to
+    global float *x)            // (h, w, c)
 {
-    const int first = get_global_id(0) * CHANNELS, pixel = get_global_id(1), i = get_global_id(2), columns = tile_columns(w);
-    if (first >= c || pixel >= SIDE * SIDE || i >= n)
-        return;
+    const int first = get_global_id(0) * CHANNELS, pixel = get_global_id(1), i = get_global_id(2),
+              columns = tile_columns(w);
+    if (first >= c || pixel >= SIDE * SIDE || i >= n) return;
     const int from = from_to[i], to = from_to[n + i];
     const int column = to % columns * SIDE + pixel % SIDE, row = to / columns * SIDE + pixel / SIDE;
-    if (column >= w || row >= h)
-        return;
-    const size_t read = (size_t)(from / columns * SIDE + pixel / SIDE) * w + from % columns * SIDE + pixel % SIDE;
-    store16(load16(x + read * c + first, c - first), x + ((size_t)row * w + column) * c + first, c - first);
+    if (column >= w || row >= h) return;
+    const size_t read =
+        (size_t)(from / columns * SIDE + pixel / SIDE) * w + from % columns * SIDE + pixel % SIDE;
+    store16(
+        load16(x + read * c + first, c - first), x + ((size_t)row * w + column) * c + first,
+        c - first);
 }

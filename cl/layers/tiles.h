@@ -1,4 +1,5 @@
-// A feature map cut into tiles of SIDE x SIDE pixels, numbered row by row; which of them a kernel computes (pp_cl/tiles.py).
+// A feature map cut into tiles of SIDE x SIDE pixels, numbered row by row; which of them a kernel
+// computes (pp_cl/layers/tiles.py).
 #ifndef PP_TILES_H
 #define PP_TILES_H
 
@@ -8,8 +9,9 @@ inline int tile_columns(const int width) {
     return (width + SIDE - 1) / SIDE;
 }
 
-// Whether the tile of pixel (x, y) is computed; tile_count: see pp_cl/tiles.py.
-inline bool tile_is_computed(global const float *tile_count, const int x, const int y, const int width) {
+// Whether the tile of pixel (x, y) is computed; tile_count: see pp_cl/layers/tiles.py.
+inline bool
+tile_is_computed(global const float *tile_count, const int x, const int y, const int width) {
     return tile_count[y / SIDE * tile_columns(width) + x / SIDE] > 0.0f;
 }
 

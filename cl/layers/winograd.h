@@ -1,32 +1,36 @@
-// Winograd's minimal filtering F(M x M, 3 x 3) (Lavin and Gray 2016, arXiv 1509.09308) on tiles of 16 channels a vector.
+// Winograd's minimal filtering F(M x M, 3 x 3) (Lavin and Gray 2016, arXiv 1509.09308) on tiles of
+// 16 channels a vector.
 //
-// Along one line, M outputs y of a kernel w over S = M + 2 samples d are a product of polynomials, evaluated at S points:
-// y = A^T [(G w) o (B^T d)]. The functions below apply one matrix to S or fewer values `step` apart, in place; a tile takes
-// them along its columns, then along its rows. Points: 0, -1, 1, infinity for M = 2; 0, -P, P, -Q, Q, infinity for M = 4,
-// where 3/4 and 3/2 halve the float32 error of the usual 1 and 2 and are exact in binary (cf. Barabasz et al. 2020,
+// Along one line, M outputs y of a kernel w over S = M + 2 samples d are a product of polynomials,
+// evaluated at S points: y = A^T [(G w) o (B^T d)]. The functions below apply one matrix to S or
+// fewer values `step` apart, in place; a tile takes them along its columns, then along its rows.
+// Points: 0, -1, 1, infinity for M = 2; 0, -P, P, -Q, Q, infinity for M = 4, where 3/4 and 3/2
+// halve the float32 error of the usual 1 and 2 and are exact in binary (cf. Barabasz et al. 2020,
 // arXiv 1803.10986).
 #ifndef PP_WINOGRAD_H
 #define PP_WINOGRAD_H
 #include "common.h"
-#include "tiles.h"
+#include "layers/tiles.h"
 
 #ifndef M
-#define M 4                  // side of a tile of outputs: 2 or 4
+#define M 4  // side of a tile of outputs: 2 or 4
 #endif
 #ifndef TILES
-#define TILES 64             // tiles transformed and multiplied at a time
+#define TILES 64  // tiles transformed and multiplied at a time
 #endif
 #ifndef HALF
-#define HALF 0               // 1: transformed weights are stored as half (IEEE 754's 16 bits) and computed with as float
+// 1: transformed weights are stored as half (IEEE 754's 16 bits) and computed with as float
+#define HALF 0
 #endif
-#define S (M + 2)            // side of a tile of inputs
+#define S (M + 2)  // side of a tile of inputs
 #define POSITIONS (S * S)
-#define PER_SIDE (SIDE / M)   // of tiles.h's tiles
+#define PER_SIDE (SIDE / M)  // of tiles.h's tiles
 
-// Transformed weights are laid out (position, 16 output channels a block, input channel, 16). One vector more between two
-// positions keeps these apart in the sets of a cache. With HALF they are multiples of their output channel's unit, a power
-// of two (winograd_filter.cl), and the units of all blocks come first, float16 a block: as long as two vectors of weights.
-#define WEIGHT_AT(position, block, blocks, channels) \
+// Transformed weights are laid out (position, 16 output channels a block, input channel, 16). One
+// vector more between two positions keeps these apart in the sets of a cache. With HALF they are
+// multiples of their output channel's unit, a power of two (winograd_filter.cl), and the units of
+// all blocks come first, float16 a block: as long as two vectors of weights.
+#define WEIGHT_AT(position, block, blocks, channels)                                               \
     (2 * HALF * (blocks) + (position) * ((blocks) * (channels) + 1) + (block) * (channels))
 #if HALF
 #define LOAD_WEIGHT(transformed, at) vloada_half16(at, (global const half *)(transformed))
@@ -40,7 +44,7 @@
 #define Q 1.5f
 #define PP (P * P)
 #define QQ (Q * Q)
-#define N0 (1 / (PP * QQ))                 // 1 / product of the distances of a point to the others
+#define N0 (1 / (PP * QQ))  // 1 / product of the distances of a point to the others
 #define NP (1 / (2 * PP * (PP - QQ)))
 #define NQ (1 / (2 * QQ * (QQ - PP)))
 
@@ -49,7 +53,8 @@ ALWAYS_INLINE void transform_input(float16 *t, const int step) {
     const float16 d0 = t[0], d1 = t[step], d2 = t[2 * step], d3 = t[3 * step];
 #if M == 4
     const float16 d4 = t[4 * step], d5 = t[5 * step];
-    const float16 even_p = d4 - QQ * d2, odd_p = d3 - QQ * d1, even_q = d4 - PP * d2, odd_q = d3 - PP * d1;
+    const float16 even_p = d4 - QQ * d2, odd_p = d3 - QQ * d1, even_q = d4 - PP * d2,
+                  odd_q = d3 - PP * d1;
     t[0] = PP * QQ * d0 + (d4 - (PP + QQ) * d2);
     t[step] = even_p + P * odd_p;
     t[2 * step] = even_p - P * odd_p;
@@ -84,7 +89,8 @@ ALWAYS_INLINE void transform_gradient(float16 *t, const int step) {
     const float16 g0 = t[0], g1 = t[step];
 #if M == 4
     const float16 g2 = t[2 * step], g3 = t[3 * step];
-    const float16 even_p = g0 + PP * g2, odd_p = g1 + PP * g3, even_q = g0 + QQ * g2, odd_q = g1 + QQ * g3;
+    const float16 even_p = g0 + PP * g2, odd_p = g1 + PP * g3, even_q = g0 + QQ * g2,
+                  odd_q = g1 + QQ * g3;
     t[step] = even_p + P * odd_p;
     t[2 * step] = even_p - P * odd_p;
     t[3 * step] = even_q + Q * odd_q;
@@ -130,30 +136,32 @@ ALWAYS_INLINE void transform_kernel_gradient(float16 *t, const int step) {
 #endif
 }
 
-// Values of many tiles at once are laid out (position, 16 channels, TILES tiles); vectors from one position to the next.
-// The odd one keeps the positions apart in the sets of a cache.
+// Values of many tiles at once are laid out (position, 16 channels, TILES tiles); vectors from one
+// position to the next. The odd one keeps the positions apart in the sets of a cache.
 #define PITCH(channels) ((channels) / 16 * TILES + 1)
 
-// The corner of the i-th tile of outputs among those of tile_list: height, width, number, and the tiles of tiles.h.
+// The corner of the i-th tile of outputs among those of tile_list: height, width, number, and the
+// tiles of tiles.h.
 inline int2 tile_corner(global const int *tile_list, const int i) {
     const int columns = tile_columns(tile_list[1]), tile = tile_list[3 + i / (PER_SIDE * PER_SIDE)];
     const int inside = i % (PER_SIDE * PER_SIDE);
-    return (int2)(tile % columns * SIDE + inside % PER_SIDE * M, tile / columns * SIDE + inside / PER_SIDE * M);
+    return (int2)(tile % columns * SIDE + inside % PER_SIDE * M,
+                  tile / columns * SIDE + inside / PER_SIDE * M);
 }
 
-// The `side` x `side` pixels from (x0, y0) on, 16 channels each, into rows of t that are S apart; 0 outside the image. A
-// tile across the border is gathered in `patch` first, so that one piece of straight code loads them all.
+// The `side` x `side` pixels from (x0, y0) on, 16 channels each, into rows of t that are S apart; 0
+// outside the image. A tile across the border is gathered in `patch` first, so that one piece of
+// straight code loads them all.
 ALWAYS_INLINE void load_tile(
     float16 *t,
-    const int side,                  // S or M
-    global float *patch,             // POSITIONS vectors
-    global const float *image,       // at the first of the 16 channels
-    const int channels,              // of a pixel
+    const int side,             // S or M
+    global float *patch,        // POSITIONS vectors
+    global const float *image,  // at the first of the 16 channels
+    const int channels,         // of a pixel
     const int x0,
     const int y0,
     const int height,
-    const int width)
-{
+    const int width) {
     global const float *corner = image + ((long)y0 * width + x0) * channels;
     int row = width * channels, column = channels;
     if (x0 < 0 || y0 < 0 || x0 + side > width || y0 + side > height) {
@@ -168,39 +176,37 @@ ALWAYS_INLINE void load_tile(
         row = S * 16;
         column = 16;
     }
-    #pragma unroll
+#pragma unroll
     for (int i = 0; i < POSITIONS; i++)
-        if (i % S < side && i / S < side)
-            t[i] = vload16(0, corner + i / S * row + i % S * column);
+        if (i % S < side && i / S < side) t[i] = vload16(0, corner + i / S * row + i % S * column);
 }
 
-// v = B^T d B of the inputs d of `padded` tiles of tile_list from `first` on, 16 * chunks channels; the last of `count` is
-// repeated.
+// v = B^T d B of the inputs d of `padded` tiles of tile_list from `first` on, 16 * chunks channels;
+// the last of `count` is repeated.
 ALWAYS_INLINE void transform_tiles(
     global float16 *v,
     const int pitch,
-    global float *patch,             // POSITIONS vectors
-    global const float *x,           // at the first of the channels
-    const int channels,              // of a pixel
+    global float *patch,    // POSITIONS vectors
+    global const float *x,  // at the first of the channels
+    const int channels,     // of a pixel
     const int chunks,
     global const int *tile_list,
     const int first,
     const int count,
-    const int padded)
-{
+    const int padded) {
     const int height = tile_list[0], width = tile_list[1];
     for (int tile = 0; tile < padded; tile++) {
         const int2 corner = tile_corner(tile_list, first + min(tile, count - 1)) - 1;
         for (int chunk = 0; chunk < chunks; chunk++) {
             float16 t[POSITIONS];
             load_tile(t, S, patch, x + chunk * 16, channels, corner.x, corner.y, height, width);
-            #pragma unroll
+#pragma unroll
             for (int i = 0; i < S; i++)
                 transform_input(t + i, S);
-            #pragma unroll
+#pragma unroll
             for (int i = 0; i < S; i++)
                 transform_input(t + i * S, 1);
-            #pragma unroll
+#pragma unroll
             for (int i = 0; i < POSITIONS; i++)
                 v[i * pitch + chunk * TILES + tile] = t[i];
         }

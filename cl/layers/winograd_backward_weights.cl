@@ -1,55 +1,61 @@
 // Weight and bias gradients of a 3x3 convolution by Winograd's minimal filtering (winograd.h).
 //
-// With inputs V = B^T d B and gradients Z = A g A^T of a tile, the gradient of the transformed weights is the sum of V o Z
-// over all tiles: position by position a product of matrices (CI x tiles) (tiles x CO). The weights' own is G^T ... G of it.
-#include "winograd.h"
+// With inputs V = B^T d B and gradients Z = A g A^T of a tile, the gradient of the transformed
+// weights is the sum of V o Z over all tiles: position by position a product of matrices (CI x
+// tiles) (tiles x CO). The weights' own is G^T ... G of it.
+#include "layers/winograd.h"
 
 #ifndef BLOCKS
-#define BLOCKS 2             // groups of 16 output channels multiplied together; divides their number
+#define BLOCKS 2  // groups of 16 output channels multiplied together; divides their number
 #endif
 #ifndef CO_PART
-#define CO_PART 128          // output channels of one part of the weights, a multiple of 16 * BLOCKS
+#define CO_PART 128  // output channels of one part of the weights, a multiple of 16 * BLOCKS
 #endif
-// Vectors of one work-item's scratch: values, gradients, the sums of weights' and biases' gradients, a patch for load_tile.
-#define SLICE(ci_part) (POSITIONS * (PITCH(ci_part) + PITCH(CO_PART) + (ci_part) * (CO_PART / 16) + 1) + CO_PART / 16)
-#define SUMMED (32 * TILES)  // tiles summed before their sum joins the rest: one sum over a large image would lose digits
-#define ROWS 8               // input channels multiplied together: ROWS * BLOCKS accumulators and BLOCKS vectors fit AVX-512
+// Vectors of one work-item's scratch: values, gradients, the sums of weights' and biases'
+// gradients, a patch for load_tile.
+#define SLICE(ci_part)                                                                             \
+    (POSITIONS * (PITCH(ci_part) + PITCH(CO_PART) + (ci_part) * (CO_PART / 16) + 1) + CO_PART / 16)
+// tiles summed before their sum joins the rest: one sum over a large image would lose digits
+#define SUMMED (32 * TILES)
+// input channels multiplied together: ROWS * BLOCKS accumulators and BLOCKS vectors fit AVX-512
+#define ROWS 8
 
-// z = A g A^T of the gradients of `count` tiles of tile_list from `first` on, each times its tile_count; sums (16 channels
-// each) += all of these gradients.
+// z = A g A^T of the gradients of `count` tiles of tile_list from `first` on, each times its
+// tile_count; sums (16 channels each) += all of these gradients.
 ALWAYS_INLINE void transform_gradients(
     global float16 *z,
     global float16 *sums,
-    global float *patch,                 // POSITIONS vectors
-    global const float *grad_out,        // at the first of the channels
-    const int channels,                  // of a pixel
+    global float *patch,           // POSITIONS vectors
+    global const float *grad_out,  // at the first of the channels
+    const int channels,            // of a pixel
     const int blocks,
     global const int *tile_list,
     global const float *tile_count,
     const int first,
-    const int count)
-{
+    const int count) {
     const int height = tile_list[0], width = tile_list[1];
     for (int block = 0; block < blocks; block++) {
-        float16 round = 0.0f;                // summed apart: one sum over the whole image would lose digits
+        // summed apart: one sum over the whole image would lose digits
+        float16 round = 0.0f;
         for (int tile = 0; tile < count; tile++) {
             const int2 corner = tile_corner(tile_list, first + tile);
             const float times = tile_count[tile_list[3 + (first + tile) / (PER_SIDE * PER_SIDE)]];
             float16 t[POSITIONS], sum = 0.0f;
-            load_tile(t, M, patch, grad_out + block * 16, channels, corner.x, corner.y, height, width);
-            #pragma unroll
+            load_tile(
+                t, M, patch, grad_out + block * 16, channels, corner.x, corner.y, height, width);
+#pragma unroll
             for (int i = 0; i < M; i++)
-                #pragma unroll
+#pragma unroll
                 for (int j = 0; j < M; j++)
                     sum += t[i * S + j] *= times;
             round += sum;
-            #pragma unroll
+#pragma unroll
             for (int i = 0; i < M; i++)
                 transform_gradient(t + i, S);
-            #pragma unroll
+#pragma unroll
             for (int i = 0; i < S; i++)
                 transform_gradient(t + i * S, 1);
-            #pragma unroll
+#pragma unroll
             for (int i = 0; i < POSITIONS; i++)
                 z[i * PITCH(CO_PART) + block * TILES + tile] = t[i];
         }
@@ -57,8 +63,8 @@ ALWAYS_INLINE void transform_gradients(
     }
 }
 
-// sums (position, 16 of co, ci) = or, after the first round, += v (position, 16 of ci, tile) times z (position, 16 of co,
-// tile).
+// sums (position, 16 of co, ci) = or, after the first round, += v (position, 16 of ci, tile) times
+// z (position, 16 of co, tile).
 ALWAYS_INLINE void multiply_gradients(
     global float16 *sums,
     global const float16 *v,
@@ -67,105 +73,113 @@ ALWAYS_INLINE void multiply_gradients(
     const int rows,
     const int blocks,
     const int count,
-    const int first_round)
-{
+    const int first_round) {
     for (int position = 0; position < POSITIONS; position++)
         for (int block = 0; block < blocks; block += BLOCKS)
             for (int row = 0; row < rows; row += ROWS) {
                 float16 acc[BLOCKS][ROWS];
-                #pragma unroll
+#pragma unroll
                 for (int b = 0; b < BLOCKS; b++)
-                    #pragma unroll
+#pragma unroll
                     for (int i = 0; i < ROWS; i++)
                         acc[b][i] = 0.0f;
                 global const float16 *grad = z + position * PITCH(CO_PART) + block * TILES;
-                global const float *value = (global const float *)(v + position * PITCH(ci_part) + row / 16 * TILES);
-                #pragma unroll 4
+                global const float *value =
+                    (global const float *)(v + position * PITCH(ci_part) + row / 16 * TILES);
+#pragma unroll 4
                 for (int tile = 0; tile < count; tile++) {
                     float16 g[BLOCKS];
-                    #pragma unroll
+#pragma unroll
                     for (int b = 0; b < BLOCKS; b++)
                         g[b] = grad[b * TILES + tile];
-                    #pragma unroll
+#pragma unroll
                     for (int i = 0; i < ROWS; i++)
-                        #pragma unroll
+#pragma unroll
                         for (int b = 0; b < BLOCKS; b++)
                             acc[b][i] += value[tile * 16 + row % 16 + i] * g[b];
                 }
                 global float16 *sum = sums + (position * (CO_PART / 16) + block) * ci_part + row;
-                #pragma unroll
+#pragma unroll
                 for (int b = 0; b < BLOCKS; b++)
-                    #pragma unroll
+#pragma unroll
                     for (int i = 0; i < ROWS; i++)
-                        sum[b * ci_part + i] = first_round ? acc[b][i] : sum[b * ci_part + i] + acc[b][i];
+                        sum[b * ci_part + i] =
+                            first_round ? acc[b][i] : sum[b * ci_part + i] + acc[b][i];
             }
 }
 
-// Gradients of 3 x 3 weights of `rows` input channels and 16 output channels from those of their transforms: written with
-// first_sum, else added.
+// Gradients of 3 x 3 weights of `rows` input channels and 16 output channels from those of their
+// transforms: written with first_sum, else added.
 ALWAYS_INLINE void store_gradients(
     global float16 *grad_weight,
     global const float16 *sums,
     const int ci,
     const int ci_part,
     const int rows,
-    const int first_sum)
-{
+    const int first_sum) {
     for (int row = 0; row < rows; row++) {
         float16 t[POSITIONS];
-        #pragma unroll
+#pragma unroll
         for (int i = 0; i < POSITIONS; i++)
             t[i] = sums[i * (CO_PART / 16) * ci_part + row];
-        #pragma unroll
+#pragma unroll
         for (int i = 0; i < S; i++)
             transform_kernel_gradient(t + i, S);
-        #pragma unroll
+#pragma unroll
         for (int i = 0; i < 3; i++)
             transform_kernel_gradient(t + i * S, 1);
-        #pragma unroll
+#pragma unroll
         for (int i = 0; i < 9; i++)
-            grad_weight[i * ci + row] = first_sum ? t[i / 3 * S + i % 3] : grad_weight[i * ci + row] + t[i / 3 * S + i % 3];
+            grad_weight[i * ci + row] =
+                first_sum ? t[i / 3 * S + i % 3] : grad_weight[i * ci + row] + t[i / 3 * S + i % 3];
     }
 }
 
-// One work-item per compute unit (work-groups of 1): takes parts of ci_part x CO_PART channels in turn, walks the tiles of
-// tile_list in x and grad_out for each, and writes that part of the gradients. No part is added to by two work-items.
+// One work-item per compute unit (work-groups of 1): takes parts of ci_part x CO_PART channels in
+// turn, walks the tiles of tile_list in x and grad_out for each, and writes that part of the
+// gradients. No part is added to by two work-items.
 kernel void winograd_backward_weights(
     const int c,
     const int co,
-    const int first,                     // channel of the weights where x begins; with 0 the bias gradient is written too
-    const int ci,                        // channels of the weights
-    const int ci_part,                   // a multiple of 16
-    global const float *x,               // (height, width, c)
-    global const float *grad_out,        // (height, width, co)
-    global const int *tile_list,         // (?) of grad_out
-    global const float *tile_count,      // (?, ?) of grad_out
-    global float16 *grad_weight,         // (?, 3, 3, ci, 16)
-    global float16 *grad_bias,           // (?)
-    global float16 *scratch)             // (...) work-items times SLICE(ci_part) vectors
+    const int first,        // channel of the weights where x begins; 0 writes the bias gradient too
+    const int ci,           // channels of the weights
+    const int ci_part,      // a multiple of 16
+    global const float *x,  // (height, width, c)
+    global const float *grad_out,    // (height, width, co)
+    global const int *tile_list,     // (?) of grad_out
+    global const float *tile_count,  // (?, ?) of grad_out
+    global float16 *grad_weight,     // (?, 3, 3, ci, 16)
+    global float16 *grad_bias,       // (?)
+    global float16 *scratch)         // (...) work-items times SLICE(ci_part) vectors
 {
     const int tiles = tile_list[2] * PER_SIDE * PER_SIDE, items = get_global_size(0);
-    const int co_parts = (co + CO_PART - 1) / CO_PART, parts = (c + ci_part - 1) / ci_part * co_parts;
+    const int co_parts = (co + CO_PART - 1) / CO_PART,
+              parts = (c + ci_part - 1) / ci_part * co_parts;
     global float16 *v = scratch + (size_t)get_global_id(0) * SLICE(ci_part);
     global float16 *z = v + POSITIONS * PITCH(ci_part), *sums = z + POSITIONS * PITCH(CO_PART);
     global float16 *bias = sums + POSITIONS * ci_part * (CO_PART / 16);
     global float *patch = (global float *)(bias + CO_PART / 16);
     for (int part = get_global_id(0); part < parts; part += items) {
         const int c0 = part / co_parts * ci_part, rows = min(ci_part, c - c0);
-        const int block0 = part % co_parts * (CO_PART / 16), blocks = min(CO_PART / 16, co / 16 - block0);
+        const int block0 = part % co_parts * (CO_PART / 16),
+                  blocks = min(CO_PART / 16, co / 16 - block0);
         for (int begin = 0; begin < tiles; begin += SUMMED) {
             for (int block = 0; block < blocks; block++)
                 bias[block] = 0.0f;
             for (int tile = begin; tile < min(begin + SUMMED, tiles); tile += TILES) {
                 const int count = min(TILES, tiles - tile);
-                transform_tiles(v, PITCH(ci_part), patch, x + c0, c, rows / 16, tile_list, tile, count, count);
-                transform_gradients(z, bias, patch, grad_out + block0 * 16, co, blocks, tile_list, tile_count, tile, count);
+                transform_tiles(
+                    v, PITCH(ci_part), patch, x + c0, c, rows / 16, tile_list, tile, count, count);
+                transform_gradients(
+                    z, bias, patch, grad_out + block0 * 16, co, blocks, tile_list, tile_count, tile,
+                    count);
                 multiply_gradients(sums, v, z, ci_part, rows, blocks, count, tile == begin);
             }
             for (int block = 0; block < blocks; block++) {
                 const int out = block0 + block;
-                store_gradients(grad_weight + out * 9 * ci + first + c0, sums + block * ci_part, ci, ci_part, rows,
-                                begin == 0);
+                store_gradients(
+                    grad_weight + out * 9 * ci + first + c0, sums + block * ci_part, ci, ci_part,
+                    rows, begin == 0);
                 if (first + c0 == 0)
                     grad_bias[out] = begin == 0 ? bias[block] : grad_bias[out] + bias[block];
             }

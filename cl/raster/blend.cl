@@ -1,22 +1,25 @@
-// Eq. (1) of the PlenopticPoints supplemental: features blended by the weights of weights.cl, and gradients by gathering.
+// Eq. (1) of the PlenopticPoints supplemental: features blended by the weights of weights.cl, and
+// gradients by gathering.
 //
-// F = sum b_i f_i + b_0 * 1,  dL/df_i = sum b_i G,  dL/do_i = sum G.(f_i - F) b_i (1/o_i + z_i/gamma)  with G = dL/dF
+// F = sum b_i f_i + b_0 * 1,  dL/df_i = sum b_i G,  dL/do_i = sum G.(f_i - F) b_i (1/o_i +
+// z_i/gamma)  with G = dL/dF
 //
-// vec_type_hint: the vectors are written out; Intel's compiler would merge work-items into wider ones, up to 8 times slower.
+// vec_type_hint: the vectors are written out; Intel's compiler would merge work-items into wider
+// ones, up to 8 times slower.
 #include "common.h"
-#include "footprint.h"
+#include "raster/footprint.h"
 
 #ifndef MEAN
-#define MEAN 0                   // 1: gradients are divided by the number of pixels that track the point (Pulsar)
+#define MEAN 0  // 1: gradients are divided by the number of pixels that track the point (Pulsar)
 #endif
 
 // One work-item per pixel: reads its hits and their points' features, writes the blended features.
 kernel void blend_forward(
-    const uint hw,                           // pixels
-    global const uint *pixel_offset,         // (HW+1)
-    global const ulong *hit,                 // (P) weight << 32 | point; no point: the list ends
-    global const float16 *point_features,    // (N, 16)
-    global float16 *features)                // (H, W, 16)
+    const uint hw,                         // pixels
+    global const uint *pixel_offset,       // (HW+1)
+    global const ulong *hit,               // (P) weight << 32 | point; no point: the list ends
+    global const float16 *point_features,  // (N, 16)
+    global float16 *features)              // (H, W, 16)
 {
     const uint q = get_global_id(0);
     if (q >= hw) return;
@@ -27,32 +30,34 @@ kernel void blend_forward(
         sum += b * point_features[(uint)hit[i]];
         weights += b;
     }
-    features[q] = sum + (1.0f - weights);    // the background's features are 1, its weight is what is left
+    // the background's features are 1, its weight is what is left
+    features[q] = sum + (1.0f - weights);
 }
 
 // One work-item per pixel: writes G.F, the part of G.(f - F) that all its points share.
 kernel void blend_backward_pixels(
-    const uint hw,                           // pixels
-    global const float16 *features,          // (H, W, 16) F
-    global const float16 *grad_features,     // (H, W, 16) G
-    global float *pixel_dot)                 // (HW)
+    const uint hw,                        // pixels
+    global const float16 *features,       // (H, W, 16) F
+    global const float16 *grad_features,  // (H, W, 16) G
+    global float *pixel_dot)              // (HW)
 {
     const uint q = get_global_id(0);
     if (q >= hw) return;
     pixel_dot[q] = dot16(grad_features[q], features[q]);
 }
 
-// One work-item per point: reads its pairs and their pixels' gradients, writes the gradients of its features and opacity.
+// One work-item per point: reads its pairs and their pixels' gradients, writes the gradients of its
+// features and opacity.
 kernel __attribute__((vec_type_hint(float16))) void blend_backward(
-    const uint n,                            // points
-    global const float16 *point_features,    // (N, 16)
-    global const uint *point_offset,         // (N+1)
-    global const uint *pair_pixel,           // (P)
-    global const float2 *pair_weight,        // (P, 2)
-    global const float16 *grad_features,     // (H, W, 16) G
-    global const float *pixel_dot,           // (HW) G.F
-    global float16 *grad_point_features,     // (N, 16)
-    global float *grad_opacity)              // (N)
+    const uint n,                          // points
+    global const float16 *point_features,  // (N, 16)
+    global const uint *point_offset,       // (N+1)
+    global const uint *pair_pixel,         // (P)
+    global const float2 *pair_weight,      // (P, 2)
+    global const float16 *grad_features,   // (H, W, 16) G
+    global const float *pixel_dot,         // (HW) G.F
+    global float16 *grad_point_features,   // (N, 16)
+    global float *grad_opacity)            // (N)
 {
     const uint i = get_global_id(0);
     if (i >= n) return;
@@ -73,17 +78,18 @@ kernel __attribute__((vec_type_hint(float16))) void blend_backward(
     grad_opacity[i] = scale * dL_do;
 }
 
-// One work-item per point: reads what blend_backward reads, writes dL/dl and dL/dd = dL/dl / d of its pairs (see the top).
+// One work-item per point: reads what blend_backward reads, writes dL/dl and dL/dd = dL/dl / d of
+// its pairs (see the top).
 kernel void blend_backward_pairs(
-    const uint n,                            // points
-    global const float16 *point_features,    // (N, 16)
-    global const uint *point_offset,         // (N+1)
-    global const uint *pair_pixel,           // (P)
-    global const float2 *pair_weight,        // (P, 2)
-    global const float16 *grad_features,     // (H, W, 16) G
-    global const float *pixel_dot,           // (HW) G.F
-    global const uint2 *pair_source,         // (P, 2) point, bits of d
-    global float2 *grad_pair)                // (P, 2) dL/dl, dL/dd
+    const uint n,                          // points
+    global const float16 *point_features,  // (N, 16)
+    global const uint *point_offset,       // (N+1)
+    global const uint *pair_pixel,         // (P)
+    global const float2 *pair_weight,      // (P, 2)
+    global const float16 *grad_features,   // (H, W, 16) G
+    global const float *pixel_dot,         // (HW) G.F
+    global const uint2 *pair_source,       // (P, 2) point, bits of d
+    global float2 *grad_pair)              // (P, 2) dL/dl, dL/dd
 {
     const uint i = get_global_id(0);
     if (i >= n) return;
@@ -95,25 +101,27 @@ kernel void blend_backward_pairs(
         const uint q = pair_pixel[pair];
         const float b = pair_weight[pair].x, d = as_float(pair_source[pair].y);
         float dL_dl = 0.0f;
-        if (!signbit(b)) dL_dl = scale * b * (dot16(grad_features[q], point_features[i]) - pixel_dot[q]);
+        if (!signbit(b))
+            dL_dl = scale * b * (dot16(grad_features[q], point_features[i]) - pixel_dot[q]);
         grad_pair[pair] = (float2)(dL_dl, d > 0.0f ? dL_dl / d : 0.0f);
     }
 }
 
-// One work-item per sphere: reads the gradients of its pairs, writes those of its position and radius.
+// One work-item per sphere: reads the gradients of its pairs, writes those of its position and
+// radius.
 kernel void blend_backward_spheres(
-    const uint n,                            // spheres
-    const uint k,                            // radii: 1 (all alike) or n
+    const uint n,  // spheres
+    const uint k,  // radii: 1 (all alike) or n
     const float gamma,
-    global const float *camera,              // (20) camera.h
-    global const float *point_radius,        // (K)
-    global const float4 *point_camera,       // (N, 4) x, y, z, t
-    global const float *opacity,             // (N)
-    global const uint *point_offset,         // (N+1)
-    global const uint *pair_pixel,           // (P)
-    global const float2 *grad_pair,          // (P, 2) dL/dl, dL/dd
-    global float *grad_positions,            // (N, 3) world
-    global float *grad_radius)               // (N)
+    global const float *camera,         // (20) camera.h
+    global const float *point_radius,   // (K)
+    global const float4 *point_camera,  // (N, 4) x, y, z, t
+    global const float *opacity,        // (N)
+    global const uint *point_offset,    // (N+1)
+    global const uint *pair_pixel,      // (P)
+    global const float2 *grad_pair,     // (P, 2) dL/dl, dL/dd
+    global float *grad_positions,       // (N, 3) world
+    global float *grad_radius)          // (N)
 {
     const uint i = get_global_id(0);
     if (i >= n) return;
@@ -132,13 +140,15 @@ kernel void blend_backward_spheres(
         const float w = length(across);
         const float half_chord = sqrt((f.radius + w) * fmax(f.radius - w, 0.0f));
 
-        // depth = along - half_chord; half_chord is the constant 0 where the ray misses the sphere itself
+        // depth = along - half_chord; half_chord is the constant 0 where the ray misses the sphere
+        // itself
         const float per_chord = half_chord > 0.0f ? 1.0f / half_chord : 0.0f;
         const float dL_ddepth = grad_pair[pair].x * dl_ddepth;
         dL_dc += dL_ddepth * (ray + per_chord * across);
         dL_dR -= dL_ddepth * f.radius * per_chord;
 
-        // d = 1 - rho/R, but the constant 1 near the centre of tiny spheres; at the very centre it has no slope
+        // d = 1 - rho/R, but the constant 1 near the centre of tiny spheres; at the very centre it
+        // has no slope
         if (rho > 0.0f && !(f.tiny && rho < f.least)) {
             const float dL_dd = grad_pair[pair].y;
             dL_dc += dL_dd * (f.centre / f.t * dot(ray, delta) - delta) / (rho * f.radius);

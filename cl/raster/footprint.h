@@ -1,32 +1,34 @@
-// Which pixels a point covers, how centrally, and at what depth: the one place that knows the three kinds of footprint.
+// Which pixels a point covers, how centrally, and at what depth: the one place that knows the three
+// kinds of footprint.
 #ifndef PP_FOOTPRINT_H
 #define PP_FOOTPRINT_H
 
 #include "camera.h"
 
-#define DISC 0                   // hard disc of the paper: d = 1 everywhere
-#define SOFT 1                   // d falls linearly from the centre to the rim (ours)
-#define SPHERE 2                 // Pulsar's sphere: depth of its front, sub-pixel rule, any radius
+#define DISC 0    // hard disc of the paper: d = 1 everywhere
+#define SOFT 1    // d falls linearly from the centre to the rim (ours)
+#define SPHERE 2  // Pulsar's sphere: depth of its front, sub-pixel rule, any radius
 
 #ifndef FOOTPRINT
 #define FOOTPRINT SOFT
 #endif
 
-#define BLOCK_SIDE 4             // pixels are tested in blocks of 4 x 4, one lane each
+#define BLOCK_SIDE 4  // pixels are tested in blocks of 4 x 4, one lane each
 #define LANE_X (float16)(0, 1, 2, 3, 0, 1, 2, 3, 0, 1, 2, 3, 0, 1, 2, 3)
 #define LANE_Y (float16)(0, 0, 0, 0, 1, 1, 1, 1, 2, 2, 2, 2, 3, 3, 3, 3)
-#define LANE_BIT (int16)(1, 2, 4, 8, 16, 32, 64, 128, 256, 512, 1024, 2048, 4096, 8192, 16384, 32768)
-
-// Half the width of the smallest footprint, in pixels: a disc of this radius always reaches a pixel's centre, because the
-// farthest point of a pixel is sqrt(1/2) away (Pulsar: 1.5 half pixels).
+// Half the width of the smallest footprint, in pixels: a disc of this radius always reaches a
+#define LANE_BIT                                                                                   \
+    (int16)(1, 2, 4, 8, 16, 32, 64, 128, 256, 512, 1024, 2048, 4096, 8192, 16384, 32768)
+// pixel's centre, because the farthest point of a pixel is sqrt(1/2) away (Pulsar: 1.5 half
+// pixels).
 #define LEAST_RADIUS 0.75f
 
 typedef struct {
-    float3 centre;               // camera axes
-    float t;                     // its distance from the eye
-    float radius;                // world units
-    float least;                 // LEAST_RADIUS pixels at range t, world units
-    int tiny;                    // the radius is below one pixel
+    float3 centre;  // camera axes
+    float t;        // its distance from the eye
+    float radius;   // world units
+    float least;    // LEAST_RADIUS pixels at range t, world units
+    int tiny;       // the radius is below one pixel
 } Footprint;
 
 // Width of a pixel at range t; the smaller focal length has the wider pixels.
@@ -45,20 +47,32 @@ ALWAYS_INLINE Footprint footprint_load(const Camera *k, const float4 point, cons
     return f;
 }
 
-// Tests the 4 x 4 pixels from (x, y) on that lie in the box: bit 4 j + i of the result is pixel (x + i, y + j).
-ALWAYS_INLINE uint footprint_block(const Camera *k, const Footprint *f, const int4 box, const int x, const int y,
-                                   float16 *closeness, float16 *depth) {
-    // Counting and filling must find the same hits, so no compiler may round here in one way and there in another.
-    #pragma OPENCL FP_CONTRACT OFF
+// Tests the 4 x 4 pixels from (x, y) on that lie in the box: bit 4 j + i of the result is pixel (x
+// + i, y + j).
+ALWAYS_INLINE uint footprint_block(
+    const Camera *k,
+    const Footprint *f,
+    const int4 box,
+    const int x,
+    const int y,
+    float16 *closeness,
+    float16 *depth) {
+// Counting and filling must find the same hits, so no compiler may round here in one way and
+// there in another.
+#pragma OPENCL FP_CONTRACT OFF
     const float16 px = LANE_X + (float)x, py = LANE_Y + (float)y;
     const float16 mx = (px + (0.5f - k->cx)) / k->fx, my = (py + (0.5f - k->cy)) / k->fy;
-    const float16 inverse = 1.0f / sqrt(mx * mx + my * my + 1.0f);           // the unit ray is (mx, my, 1) * inverse
+    // the unit ray is (mx, my, 1) * inverse
+    const float16 inverse = 1.0f / sqrt(mx * mx + my * my + 1.0f);
     const float16 range = f->t * inverse;
-    const float16 ex = f->centre.x - range * mx, ey = f->centre.y - range * my, ez = f->centre.z - range;
-    const float16 rho2 = ex * ex + ey * ey + ez * ez;                        // |c - t r|^2; the expanded square would cancel
+    const float16 ex = f->centre.x - range * mx, ey = f->centre.y - range * my,
+                  ez = f->centre.z - range;
+    // |c - t r|^2; the expanded square would cancel
+    const float16 rho2 = ex * ex + ey * ey + ez * ez;
     int16 hit = px <= (float)box.z && py <= (float)box.w;
 #if FOOTPRINT != SPHERE
-    // differs from Pulsar: its depth is the front's, up to R nearer, and from a radius of a pixel on no d is constant.
+    // differs from Pulsar: its depth is the front's, up to R nearer, and from a radius of a pixel
+    // on no d is constant.
     const float reach = fmax(f->radius, f->least);
     hit = hit && rho2 < reach * reach;
     *closeness = FOOTPRINT == DISC ? (float16)(1.0f) : 1.0f - sqrt(rho2) / reach;
@@ -72,7 +86,8 @@ ALWAYS_INLINE uint footprint_block(const Camera *k, const Footprint *f, const in
     const float16 along = fmin((f->centre.x * mx + f->centre.y * my + f->centre.z) * inverse, f->t);
     const float16 wx = f->centre.x - along * inverse * mx, wy = f->centre.y - along * inverse * my;
     const float16 wz = f->centre.z - along * inverse;
-    const float16 w = sqrt(wx * wx + wy * wy + wz * wz);                     // distance of the centre from the ray
+    // distance of the centre from the ray
+    const float16 w = sqrt(wx * wx + wy * wy + wz * wz);
     *depth = fmax(along - sqrt((f->radius + w) * fmax(f->radius - w, 0.0f)), 0.0f);
 #endif
     const int16 bits = hit & LANE_BIT;

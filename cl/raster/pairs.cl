@@ -1,21 +1,23 @@
-// Pairs: every (point, pixel) hit. Those of one point lie together, in the order of the points; each pixel has a list of
-// keys (depth << 32 | pair), sorted by depth, then by pair and so by point.
+// Pairs: every (point, pixel) hit. Those of one point lie together, in the order of the points;
+// each pixel has a list of keys (depth << 32 | pair), sorted by depth, then by pair and so by
+// point.
 //
-// vec_type_hint: the vectors are written out; Intel's compiler would merge work-items into wider ones, which is slower.
+// vec_type_hint: the vectors are written out; Intel's compiler would merge work-items into wider
+// ones, which is slower.
 #include "common.h"
-#include "footprint.h"
+#include "raster/footprint.h"
 
-#define RUN 64                   // keys ranked at once by comparing all with all, 8 a step; longer lists are merged
+#define RUN 64  // keys ranked at once by comparing all with all, 8 a step; longer lists are merged
 
 // One work-item per point: reads where it is, writes its number of hits.
 kernel __attribute__((vec_type_hint(float16))) void pairs_count(
-    const uint n,                            // points
-    const uint k,                            // radii: 1 (all alike) or n
-    global const float *camera,              // (20) camera.h
-    global const float *point_radius,        // (K)
-    global const float4 *point_camera,       // (N, 4) x, y, z, t
-    global const ushort4 *point_box,         // (N, 4) first x, first y, last x, last y
-    global uint *point_count)                // (N)
+    const uint n,                       // points
+    const uint k,                       // radii: 1 (all alike) or n
+    global const float *camera,         // (20) camera.h
+    global const float *point_radius,   // (K)
+    global const float4 *point_camera,  // (N, 4) x, y, z, t
+    global const ushort4 *point_box,    // (N, 4) first x, first y, last x, last y
+    global uint *point_count)           // (N)
 {
     const uint i = get_global_id(0);
     if (i >= n) return;
@@ -32,19 +34,20 @@ kernel __attribute__((vec_type_hint(float16))) void pairs_count(
     point_count[i] = count;
 }
 
-// One work-item per point: finds its hits again, writes them as pairs and counts them at their pixels.
+// One work-item per point: finds its hits again, writes them as pairs and counts them at their
+// pixels.
 kernel __attribute__((vec_type_hint(float16))) void pairs_fill(
-    const uint n,                            // points
-    const uint k,                            // radii: 1 (all alike) or n
-    global const float *camera,              // (20) camera.h
-    global const float *point_radius,        // (K)
-    global const float4 *point_camera,       // (N, 4) x, y, z, t
-    global const ushort4 *point_box,         // (N, 4) first x, first y, last x, last y
-    global const uint *point_offset,         // (N+1) first pair of each point
-    global uint *pair_pixel,                 // (P)
-    global uint2 *pair_source,               // (P, 2) point, bits of d in [0, 1]
-    global ulong *pair_place,                // (P) depth << 32 | place in the list of the pixel, first come first served
-    global volatile uint *pixel_count)       // (HW) accumulates
+    const uint n,                       // points
+    const uint k,                       // radii: 1 (all alike) or n
+    global const float *camera,         // (20) camera.h
+    global const float *point_radius,   // (K)
+    global const float4 *point_camera,  // (N, 4) x, y, z, t
+    global const ushort4 *point_box,    // (N, 4) first x, first y, last x, last y
+    global const uint *point_offset,    // (N+1) first pair of each point
+    global uint *pair_pixel,            // (P)
+    global uint2 *pair_source,          // (P, 2) point, bits of d in [0, 1]
+    global ulong *pair_place,           // (P) depth << 32 | place in the list of the pixel
+    global volatile uint *pixel_count)  // (HW) accumulates
 {
     const uint i = get_global_id(0);
     if (i >= n) return;
@@ -65,18 +68,19 @@ kernel __attribute__((vec_type_hint(float16))) void pairs_fill(
                 const uint pixel = (y + lane / BLOCK_SIDE) * view.width + x + lane % BLOCK_SIDE;
                 pair_pixel[pair] = pixel;
                 pair_source[pair] = (uint2)(i, as_uint(lane_closeness[lane]));
-                pair_place[pair] = upsample(as_uint(lane_depth[lane]), atomic_inc(&pixel_count[pixel]));
+                pair_place[pair] =
+                    upsample(as_uint(lane_depth[lane]), atomic_inc(&pixel_count[pixel]));
             }
         }
 }
 
 // One work-item per pair: writes its key at its place. Bits of floats >= 0 sort like the floats.
 kernel void pairs_scatter(
-    const uint pairs,                        // at most P
-    global const uint *pair_pixel,           // (P)
-    global const ulong *pair_place,          // (P) depth << 32 | place in the list of the pixel
-    global const uint *pixel_offset,         // (HW+1) first key of each pixel
-    global ulong *pair_key)                  // (P) depth << 32 | pair, by pixel
+    const uint pairs,                 // at most P
+    global const uint *pair_pixel,    // (P)
+    global const ulong *pair_place,   // (P) depth << 32 | place in the list of the pixel
+    global const uint *pixel_offset,  // (HW+1) first key of each pixel
+    global ulong *pair_key)           // (P) depth << 32 | pair, by pixel
 {
     const uint pair = get_global_id(0);
     if (pair >= pairs) return;
@@ -84,13 +88,15 @@ kernel void pairs_scatter(
     pair_key[pixel_offset[pair_pixel[pair]] + (uint)place] = upsample((uint)(place >> 32), pair);
 }
 
-// Sorts `count` <= RUN keys into `sorted`, which may be the same memory: each key's place is the number of smaller keys. No
-// key has its highest bit set, the sign of a depth, so that of a difference says which one is smaller.
+// Sorts `count` <= RUN keys into `sorted`, which may be the same memory: each key's place is the
+// number of smaller keys. No key has its highest bit set, the sign of a depth, so that of a
+// difference says which one is smaller.
 inline void sort_run(global const ulong *keys, const uint count, global ulong *sorted) {
     ulong run[RUN + 8];
     for (uint i = 0; i < count; i++)
         run[i] = keys[i];
-    vstore8((ulong8)(ULONG_MAX), 0, run + count);                            // the lanes behind the last key
+    // the lanes behind the last key
+    vstore8((ulong8)(ULONG_MAX), 0, run + count);
     for (uint i = 0; i < count; i += 8) {
         const ulong8 key = vload8(0, run + i);
         ulong8 place = 0;
@@ -104,7 +110,8 @@ inline void sort_run(global const ulong *keys, const uint count, global ulong *s
 }
 
 // Merges two sorted neighbours, [0, middle) and [middle, count) of `keys`, into `merged`.
-inline void merge(global const ulong *keys, const uint middle, const uint count, global ulong *merged) {
+inline void
+merge(global const ulong *keys, const uint middle, const uint count, global ulong *merged) {
     uint a = 0, b = middle;
     for (uint i = 0; i < count; i++) {
         const int first = b >= count || (a < middle && keys[a] < keys[b]);
@@ -114,10 +121,10 @@ inline void merge(global const ulong *keys, const uint middle, const uint count,
 
 // One work-item per pixel: sorts its keys in place.
 kernel __attribute__((vec_type_hint(ulong8))) void pairs_sort(
-    const uint hw,                           // pixels
-    global const uint *pixel_offset,         // (HW+1)
-    global ulong *scratch,                   // (P)
-    global ulong *pair_key)                  // (P) by pixel
+    const uint hw,                    // pixels
+    global const uint *pixel_offset,  // (HW+1)
+    global ulong *scratch,            // (P)
+    global ulong *pair_key)           // (P) by pixel
 {
     const uint q = get_global_id(0);
     if (q >= hw) return;
@@ -126,13 +133,15 @@ kernel __attribute__((vec_type_hint(ulong8))) void pairs_sort(
     uint passes = 0;
     for (uint width = RUN; width < count; width *= 2)
         passes++;
-    global ulong *from = keys, *to = passes % 2 ? other : keys;              // so that the last pass ends in pair_key
+    // so that the last pass ends in pair_key
+    global ulong *from = keys, *to = passes % 2 ? other : keys;
     for (uint first = 0; first < count; first += RUN)
         sort_run(from + first, min((uint)RUN, count - first), to + first);
     for (uint width = RUN; width < count; width *= 2) {
         from = to;
         to = from == keys ? other : keys;
         for (uint first = 0; first < count; first += 2 * width)
-            merge(from + first, min(width, count - first), min(2 * width, count - first), to + first);
+            merge(
+                from + first, min(width, count - first), min(2 * width, count - first), to + first);
     }
 }

@@ -2,24 +2,34 @@
 #include "common.h"
 #include "camera.h"
 #include "grid.h"
-#include "footprint.h"
+#include "raster/footprint.h"
 
-#define LANES 16                 // points of a work-item, one lane each: one by one, a CPU's vectors stay empty
+#define LANES 16  // points of a work-item, one lane each: one by one, a CPU's vectors stay empty
 
-// Least cosine between a point's direction and the optical axis (Pulsar): nothing behind or beside the eye.
+// Least cosine between a point's direction and the optical axis (Pulsar): nothing behind or beside
+// the eye.
 #define LEAST_COSINE 1e-6f
 
-// First and last pixel that may be hit along one axis, from -2 to size + 1: before they are cut to the image.
+// First and last pixel that may be hit along one axis, from -2 to size + 1: before they are cut to
+// the image.
 //
-// The tangents from the eye to a circle of radius r at (u, z), u = x or y, have slopes m with (m z - u)^2 = r^2 (1 + m^2); a
-// circle that reaches the eye's plane has no bounds.
-ALWAYS_INLINE void tangents(const float16 u, const float16 z, const float16 reach, const float focal, const float centre,
-                            const float size, int16 *first, int16 *last) {
+// The tangents from the eye to a circle of radius r at (u, z), u = x or y, have slopes m with (m z
+// - u)^2 = r^2 (1 + m^2); a circle that reaches the eye's plane has no bounds.
+ALWAYS_INLINE void tangents(
+    const float16 u,
+    const float16 z,
+    const float16 reach,
+    const float focal,
+    const float centre,
+    const float size,
+    int16 *first,
+    int16 *last) {
 #if FOOTPRINT == SPHERE
-    const float margin = 0.0f;               // from floor(first) to ceil(last): Pulsar's box is part of its hit rule
+    // from floor(first) to ceil(last): Pulsar's box is part of its hit rule
+    const float margin = 0.0f;
     const int round_first = 0, round_last = 1;
 #else
-    const float margin = 0.01f;              // pixels; far above the rounding of the slopes
+    const float margin = 0.01f;  // pixels; far above the rounding of the slopes
     const int round_first = 1, round_last = 0;
 #endif
     const float16 scale = z * z - reach * reach, root = reach * sqrt(u * u + scale);
@@ -28,23 +38,35 @@ ALWAYS_INLINE void tangents(const float16 u, const float16 z, const float16 reac
     const int16 bounded = z > reach;
     const float16 from = clamp(select((float16)(-2.0f), low, bounded), -2.0f, size);
     const float16 to = clamp(select((float16)(size), high, bounded), -2.0f, size);
-    *first = convert_int16(from + 2.0f) - 2 + round_first;                   // x + 2 >= 0, so truncation is floor
+    // x + 2 >= 0, so truncation is floor
+    *first = convert_int16(from + 2.0f) - 2 + round_first;
     *last = convert_int16(to + 2.0f) - 2 + round_last;
 }
 
-// Writes (x, y, z, t) in camera axes of `count` points in world axes, and the box of pixels that each may hit. A point is
-// left out, with (0, 0, 0, -1), if it is too near or too far (measured at the sphere's front, as in Pulsar), behind the eye,
-// or not finite, for which every comparison is false.
-ALWAYS_INLINE void project(const Camera *k, const float16 x, const float16 y, const float16 z, const float16 radius,
-                           const int16 wanted, const uint count, global float4 *point_camera, global ushort4 *point_box) {
+// Writes (x, y, z, t) in camera axes of `count` points in world axes, and the box of pixels that
+// each may hit. A point is left out, with (0, 0, 0, -1), if it is too near or too far (measured at
+// the sphere's front, as in Pulsar), behind the eye, or not finite, for which every comparison is
+// false.
+ALWAYS_INLINE void project(
+    const Camera *k,
+    const float16 x,
+    const float16 y,
+    const float16 z,
+    const float16 radius,
+    const int16 wanted,
+    const uint count,
+    global float4 *point_camera,
+    global ushort4 *point_box) {
     const float16 vx = x - k->eye.x, vy = y - k->eye.y, vz = z - k->eye.z;
     const float16 cx = k->right.x * vx + k->right.y * vy + k->right.z * vz;
     const float16 cy = k->down.x * vx + k->down.y * vy + k->down.z * vz;
     const float16 cz = k->forward.x * vx + k->forward.y * vy + k->forward.z * vz;
     const float16 t = sqrt(cx * cx + cy * cy + cz * cz);
     const float16 front = t - radius;
-    const int16 kept = wanted & (front >= k->near) & (front <= k->far) & (t > 0.0f) & (cz >= LEAST_COSINE * t);
-    const float16 reach = FOOTPRINT == SPHERE ? radius : fmax(radius, LEAST_RADIUS * t / fmin(k->fx, k->fy));
+    const int16 kept =
+        wanted & (front >= k->near) & (front <= k->far) & (t > 0.0f) & (cz >= LEAST_COSINE * t);
+    const float16 reach =
+        FOOTPRINT == SPHERE ? radius : fmax(radius, LEAST_RADIUS * t / fmin(k->fx, k->fy));
     int16 x0, y0, x1, y1;
     tangents(cx, cz, reach, k->fx, k->cx, k->width, &x0, &x1);
     tangents(cy, cz, reach, k->fy, k->cy, k->height, &y0, &y1);
@@ -60,7 +82,8 @@ ALWAYS_INLINE void project(const Camera *k, const float16 x, const float16 y, co
     vstore16(select((float16)(0.0f), cy, kept), 0, place[1]);
     vstore16(select((float16)(0.0f), cz, kept), 0, place[2]);
     vstore16(select((float16)(-1.0f), t, kept), 0, place[3]);
-    vstore16(select((int16)(1), x0, visible), 0, box[0]);                    // no pixel: last before first
+    // no pixel: last before first
+    vstore16(select((int16)(1), x0, visible), 0, box[0]);
     vstore16(select((int16)(1), y0, visible), 0, box[1]);
     vstore16(select((int16)(0), x1, visible), 0, box[2]);
     vstore16(select((int16)(0), y1, visible), 0, box[3]);
@@ -70,17 +93,18 @@ ALWAYS_INLINE void project(const Camera *k, const float16 x, const float16 y, co
     }
 }
 
-// One work-item per 16 points: reads their grid indices, writes their camera-space positions and distances, and their boxes.
+// One work-item per 16 points: reads their grid indices, writes their camera-space positions and
+// distances, and their boxes.
 kernel __attribute__((vec_type_hint(float16))) void project_grid(
-    const uint n,                        // points
-    const float radius,                  // of every point
-    const uint dropout,                  // a point is left out where its random uint is below this
-    const uint seed,                     // of the random uints
-    global const float *camera,          // (20) camera.h
-    global const float *grid,            // (8) grid.h
-    global const uint *point_id,         // (N)
-    global float4 *point_camera,         // (N, 4) x, y, z, t; t = -1: left out
-    global ushort4 *point_box)           // (N, 4) first x, first y, last x, last y; none where last < first
+    const uint n,                 // points
+    const float radius,           // of every point
+    const uint dropout,           // a point is left out where its random uint is below this
+    const uint seed,              // of the random uints
+    global const float *camera,   // (20) camera.h
+    global const float *grid,     // (8) grid.h
+    global const uint *point_id,  // (N)
+    global float4 *point_camera,  // (N, 4) x, y, z, t; t = -1: left out
+    global ushort4 *point_box)  // (N, 4) first x, first y, last x, last y; none where last < first
 {
     const uint first = get_global_id(0) * LANES;
     if (first >= n) return;
@@ -96,19 +120,20 @@ kernel __attribute__((vec_type_hint(float16))) void project_grid(
         z[j] = position.z;
         wanted[j] = -(scramble(id + stream) >= dropout);
     }
-    project(&k, vload16(0, x), vload16(0, y), vload16(0, z), (float16)(radius), vload16(0, wanted), count,
-            point_camera + first, point_box + first);
+    project(
+        &k, vload16(0, x), vload16(0, y), vload16(0, z), (float16)(radius), vload16(0, wanted),
+        count, point_camera + first, point_box + first);
 }
 
 // One work-item per 16 spheres: reads their positions and radii, writes the same as project_grid.
 kernel __attribute__((vec_type_hint(float16))) void project_spheres(
-    const uint n,                        // spheres
-    const uint k,                        // radii: 1 (all alike) or n
-    global const float *camera,          // (20) camera.h
-    global const float *positions,       // (N, 3) world
-    global const float *point_radius,    // (K)
-    global float4 *point_camera,         // (N, 4) x, y, z, t; t = -1: left out
-    global ushort4 *point_box)           // (N, 4) first x, first y, last x, last y; none where last < first
+    const uint n,                      // spheres
+    const uint k,                      // radii: 1 (all alike) or n
+    global const float *camera,        // (20) camera.h
+    global const float *positions,     // (N, 3) world
+    global const float *point_radius,  // (K)
+    global float4 *point_camera,       // (N, 4) x, y, z, t; t = -1: left out
+    global ushort4 *point_box)  // (N, 4) first x, first y, last x, last y; none where last < first
 {
     const uint first = get_global_id(0) * LANES;
     if (first >= n) return;
@@ -122,6 +147,7 @@ kernel __attribute__((vec_type_hint(float16))) void project_spheres(
         z[j] = positions[3 * i + 2];
         radius[j] = point_radius[k == 1 ? 0 : i];
     }
-    project(&view, vload16(0, x), vload16(0, y), vload16(0, z), vload16(0, radius), (int16)(-1), count,
-            point_camera + first, point_box + first);
+    project(
+        &view, vload16(0, x), vload16(0, y), vload16(0, z), vload16(0, radius), (int16)(-1), count,
+        point_camera + first, point_box + first);
 }

@@ -4,11 +4,12 @@
 #include "sh.h"
 
 #ifndef DEGREE
-#define DEGREE 2                 // of the highest harmonics in use: 0, 1 or 2
+#define DEGREE 2  // of the highest harmonics in use: 0, 1 or 2
 #endif
 #define BASES ((DEGREE + 1) * (DEGREE + 1))
 
-// Harmonics of the direction, in world axes, of a point given in camera axes. A point that was left out is (0, 0, 0, -1).
+// Harmonics of the direction, in world axes, of a point given in camera axes. A point that was left
+// out is (0, 0, 0, -1).
 inline void shade_basis(global const float *camera, const float4 point, float *basis) {
     const Camera k = camera_load(camera);
     const float3 c = point.xyz / point.w;
@@ -17,15 +18,15 @@ inline void shade_basis(global const float *camera, const float4 point, float *b
 
 // One work-item per seen point: reads its coefficients and where it is, writes its features.
 kernel void shade_forward(
-    const uint s,                            // seen points
-    global const uint *seen,                 // (S) their indices
-    global const float *camera,              // (20) camera.h
-    global const float4 *point_camera,       // (N, 4) x, y, z, distance
-    global const float16 *sh0,               // (N, 1, 16)
-    global const float16 *sh1,               // (?, ?, 16) (N, 3, 16), not read at degree 0
-    global const float16 *sh4,               // (?, ?, 16) (N, 3, 16), not read below degree 2
-    global const float16 *sh7,               // (?, ?, 16) (N, 2, 16), not read below degree 2
-    global float16 *point_features)          // (N, 16) only the seen rows are written
+    const uint s,                       // seen points
+    global const uint *seen,            // (S) their indices
+    global const float *camera,         // (20) camera.h
+    global const float4 *point_camera,  // (N, 4) x, y, z, distance
+    global const float16 *sh0,          // (N, 1, 16)
+    global const float16 *sh1,          // (?, ?, 16) (N, 3, 16), not read at degree 0
+    global const float16 *sh4,          // (?, ?, 16) (N, 3, 16), not read below degree 2
+    global const float16 *sh7,          // (?, ?, 16) (N, 2, 16), not read below degree 2
+    global float16 *point_features)     // (N, 16) only the seen rows are written
 {
     const uint g = get_global_id(0);
     if (g >= s) return;
@@ -45,16 +46,17 @@ kernel void shade_forward(
     point_features[i] = f;
 }
 
-// One work-item per point: reads the gradient of its features, writes that of its coefficients (0 where the first is 0).
+// One work-item per point: reads the gradient of its features, writes that of its coefficients (0
+// where the first is 0).
 kernel void shade_backward(
-    const uint n,                            // points
-    global const float *camera,              // (20) camera.h
-    global const float4 *point_camera,       // (N, 4) x, y, z, distance
-    global const float16 *grad_point_features,   // (N, 16)
-    global float16 *grad_sh0,                // (N, 1, 16)
-    global float16 *grad_sh1,                // (?, ?, 16) (N, 3, 16), not written at degree 0
-    global float16 *grad_sh4,                // (?, ?, 16) (N, 3, 16), not written below degree 2
-    global float16 *grad_sh7)                // (?, ?, 16) (N, 2, 16), not written below degree 2
+    const uint n,                               // points
+    global const float *camera,                 // (20) camera.h
+    global const float4 *point_camera,          // (N, 4) x, y, z, distance
+    global const float16 *grad_point_features,  // (N, 16)
+    global float16 *grad_sh0,                   // (N, 1, 16)
+    global float16 *grad_sh1,                   // (?, ?, 16) (N, 3, 16), not written at degree 0
+    global float16 *grad_sh4,                   // (?, ?, 16) (N, 3, 16), not written below degree 2
+    global float16 *grad_sh7)                   // (?, ?, 16) (N, 2, 16), not written below degree 2
 {
     const uint i = get_global_id(0);
     if (i >= n) return;

@@ -1,5 +1,6 @@
-// The shape of the demo's object as a signed distance field: an armillary sphere, that is a globe on an axle between a brass
-// band, a ring and a wheel with thin spokes, on a base. Everything is computed for 16 places at a time, one in each lane.
+// The shape of the demo's object as a signed distance field: an armillary sphere, that is a globe
+// on an axle between a brass band, a ring and a wheel with thin spokes, on a base. Everything is
+// computed for 16 places at a time, one in each lane.
 #ifndef PP_DEMO_OBJECT_H
 #define PP_DEMO_OBJECT_H
 
@@ -7,8 +8,9 @@
 #define BOUND_Z -0.08f
 #define BOUND_RADIUS 1.05f
 
-// The globe's centre is the origin of all parts. Its axle, WHEEL, lies in the planes of the other two rings, whose unit
-// normals are MERIDIAN and ECLIPTIC; MERIDIAN, WHEEL_V and WHEEL are at right angles.
+// The globe's centre is the origin of all parts. Its axle, WHEEL, lies in the planes of the other
+// two rings, whose unit normals are MERIDIAN and ECLIPTIC; MERIDIAN, WHEEL_V and WHEEL are at right
+// angles.
 #define GLOBE_Z 0.15f
 #define GLOBE_RADIUS 0.30f
 #define WHEEL ((float3)(-0.242404f, 0.346188f, 0.906308f))
@@ -49,14 +51,18 @@ inline float16 length_lanes(const float16 a, const float16 b) {
     return sqrt(a * a + b * b);
 }
 
-// Distance of a rounded rectangle of half sides ha + r and hb + r from (a, b), measured from its centre.
-inline float16 rectangle(const float16 a, const float16 b, const float ha, const float hb, const float r) {
+// Distance of a rounded rectangle of half sides ha + r and hb + r from (a, b), measured from its
+// centre.
+inline float16
+rectangle(const float16 a, const float16 b, const float ha, const float hb, const float r) {
     const float16 u = fabs(a) - ha, v = fabs(b) - hb;
     return length_lanes(max(u, 0.0f), max(v, 0.0f)) + min(max(u, v), 0.0f) - r;
 }
 
-// Distance of a rod with round ends: `along` and `off` are the coordinates along its axis and from it.
-inline float16 rod(const float16 along, const float16 off, const float from, const float to, const float radius) {
+// Distance of a rod with round ends: `along` and `off` are the coordinates along its axis and from
+// it.
+inline float16
+rod(const float16 along, const float16 off, const float from, const float to, const float radius) {
     return length_lanes(along - clamp(along, from, to), off) - radius;
 }
 
@@ -65,9 +71,12 @@ inline void parts(const Vector16 position, float16 *distances) {
     const Vector16 p = {position.x, position.y, position.z - GLOBE_Z};
     const float16 square = dot_lanes(p, p), from_axis = length_lanes(p.x, p.y);
     // Every ring has a height over its plane and a radius in it.
-    const float16 wheel_h = dot_axis(p, WHEEL), wheel_r = sqrt(max(square - wheel_h * wheel_h, 0.0f));
-    const float16 ecliptic_h = dot_axis(p, ECLIPTIC), ecliptic_r = sqrt(max(square - ecliptic_h * ecliptic_h, 0.0f));
-    const float16 meridian_h = dot_axis(p, MERIDIAN), meridian_r = sqrt(max(square - meridian_h * meridian_h, 0.0f));
+    const float16 wheel_h = dot_axis(p, WHEEL),
+                  wheel_r = sqrt(max(square - wheel_h * wheel_h, 0.0f));
+    const float16 ecliptic_h = dot_axis(p, ECLIPTIC),
+                  ecliptic_r = sqrt(max(square - ecliptic_h * ecliptic_h, 0.0f));
+    const float16 meridian_h = dot_axis(p, MERIDIAN),
+                  meridian_r = sqrt(max(square - meridian_h * meridian_h, 0.0f));
 
     distances[GLOBE] = sqrt(square) - GLOBE_RADIUS;
     distances[BASE] = rectangle(from_axis, p.z + 1.03f, 0.50f, 0.05f, 0.03f);
@@ -81,9 +90,12 @@ inline void parts(const Vector16 position, float16 *distances) {
     distances[BRASS] = min(min(min(knob, stem), min(axle, wheel)), ecliptic);
 
     // 12 spokes: the wheel's plane is folded to the 15 degrees beside the first one.
-    const float16 a = fabs(meridian_h), b = fabs(dot_axis(p, WHEEL_V)), u = max(a, b), v = min(a, b);
-    const float16 over = 2.0f * max(0.965926f * v - 0.258819f * u, 0.0f);  // beyond the bisector to the next spoke, twice
-    distances[SPOKES] = rod(u + 0.258819f * over, length_lanes(v - 0.965926f * over, wheel_h), 0.2f, 0.54f, 0.011f);
+    const float16 a = fabs(meridian_h), b = fabs(dot_axis(p, WHEEL_V)), u = max(a, b),
+                  v = min(a, b);
+    // beyond the bisector to the next spoke, twice
+    const float16 over = 2.0f * max(0.965926f * v - 0.258819f * u, 0.0f);
+    distances[SPOKES] =
+        rod(u + 0.258819f * over, length_lanes(v - 0.965926f * over, wheel_h), 0.2f, 0.54f, 0.011f);
 }
 
 // Distance of a place to the object; negative inside.

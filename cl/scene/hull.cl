@@ -1,52 +1,55 @@
-// The visual hull: which vertices of a regular grid no mask contradicts. Sets of pixels and of vertices are bitsets whose
-// rows start at a new word: bit b of word w in a row is element 32 w + b.
+// The visual hull: which vertices of a regular grid no mask contradicts. Sets of pixels and of
+// vertices are bitsets whose rows start at a new word: bit b of word w in a row is element 32 w +
+// b.
 #include "common.h"
 
-// One work-item per word of a mask's row: reads the alpha of its 32 pixels and of their neighbours, writes the set of
-// pixels with an alpha above `threshold` in their 3x3 neighbourhood. The 1 pixel keeps what touches the silhouette.
+// One work-item per word of a mask's row: reads the alpha of its 32 pixels and of their neighbours,
+// writes the set of pixels with an alpha above `threshold` in their 3x3 neighbourhood. The 1 pixel
+// keeps what touches the silhouette.
 kernel void pack_mask(
-    const uint width,                    // pixels
+    const uint width,  // pixels
     const uint height,
-    const uint words,                    // words per row
-    const uint first,                    // the mask's first word in `masks`
+    const uint words,  // words per row
+    const uint first,  // the mask's first word in `masks`
     const uint threshold,
-    global const uchar *alpha,           // (height, width)
-    global uint *masks)                  // (M)
+    global const uchar *alpha,  // (height, width)
+    global uint *masks)         // (M)
 {
     const uint word = get_global_id(0), y = get_global_id(1);
-    if (word >= words || y >= height)
-        return;
-    ulong columns = 0;                   // bit b: column 32 word - 1 + b has such a pixel in the three rows
+    if (word >= words || y >= height) return;
+    // bit b: column 32 word - 1 + b has such a pixel in the three rows
+    ulong columns = 0;
     for (uint v = max(y, 1u) - 1; v <= min(y + 1, height - 1); v++)
         for (uint b = 0; b < 34; b++) {
-            const uint x = 32 * word + b - 1;    // wraps left of the image, so it is no smaller than the width there
-            if (x < width && alpha[v * width + x] > threshold)
-                columns |= 1ul << b;
+            // wraps left of the image, so it is no smaller than the width there
+            const uint x = 32 * word + b - 1;
+            if (x < width && alpha[v * width + x] > threshold) columns |= 1ul << b;
         }
     masks[first + y * words + word] = (uint)(columns | columns >> 1 | columns >> 2);
 }
 
-// One work-item per word of 32 vertices along x: projects them into the views, one view after the other until none is left,
-// writes the set of those that some image sees and no mask rejects. Outside an image and behind a camera is no evidence.
+// One work-item per word of 32 vertices along x: projects them into the views, one view after the
+// other until none is left, writes the set of those that some image sees and no mask rejects.
+// Outside an image and behind a camera is no evidence.
 kernel void carve(
     const uint nx,
     const uint ny,
-    const uint rows,                     // grid rows: ny * nz
-    const uint words,                    // words per grid row
+    const uint rows,   // grid rows: ny * nz
+    const uint words,  // words per grid row
     const uint views,
-    global const float4 *projections,    // (views, 3, 4) vertex (i, j, k, 1) -> (u w, v w, w), pixel (u, v), depth w
-    global const uint4 *view_masks,      // (views, 4) width, height, words per row, first word in `masks`
-    global const uint *masks,            // (M)
-    global uint *bits)                   // (rows, words)
+    global const float4 *projections,  // (views, 3, 4) (i, j, k, 1) -> (u w, v w, w)
+    global const uint4 *view_masks,    // (views, 4) width, height, words per row, first word
+    global const uint *masks,          // (M)
+    global uint *bits)                 // (rows, words)
 {
     const uint word = get_global_id(0), row = get_global_id(1);
-    if (word >= words || row >= rows)
-        return;
+    if (word >= words || row >= rows) return;
     const float4 first = (float4)(32.0f * word, row % ny, row / ny, 1.0f);
     uint alive = nx - 32 * word < 32 ? (1u << (nx - 32 * word)) - 1 : ~0u;
     uint seen = 0;
     for (uint view = 0; view < views && alive; view++) {
-        const float4 pu = projections[3 * view], pv = projections[3 * view + 1], pw = projections[3 * view + 2];
+        const float4 pu = projections[3 * view], pv = projections[3 * view + 1],
+                     pw = projections[3 * view + 2];
         const float u0 = dot(pu, first), v0 = dot(pv, first), w0 = dot(pw, first);
         const uint4 mask = view_masks[view];
         const float width = mask.x, height = mask.y;
@@ -66,16 +69,16 @@ kernel void carve(
     bits[row * words + word] = alive & seen;
 }
 
-// One work-item per grid row: reads its words, writes how many vertices are set, the first and the last.
+// One work-item per grid row: reads its words, writes how many vertices are set, the first and the
+// last.
 kernel void row_extents(
     const uint rows,
     const uint words,
-    global const uint *bits,             // (rows, words)
-    global uint *extents)                // (rows, 3) count, first, last; first > last in an empty row
+    global const uint *bits,  // (rows, words)
+    global uint *extents)     // (rows, 3) count, first, last; first > last in an empty row
 {
     const uint row = get_global_id(0);
-    if (row >= rows)
-        return;
+    if (row >= rows) return;
     uint count = 0, first = NONE, last = 0;
     for (uint word = 0; word < words; word++) {
         const uint set = bits[row * words + word];
@@ -94,14 +97,13 @@ kernel void row_extents(
 kernel void expand_rows(
     const uint rows,
     const uint words,
-    global const uint *bits,             // (rows, words)
-    global const uint *row_starts,       // (rows) vertices in the rows before
-    global const uint *row_bases,        // (rows) id of the row's vertex 0
-    global uint *ids)                    // (N)
+    global const uint *bits,        // (rows, words)
+    global const uint *row_starts,  // (rows) vertices in the rows before
+    global const uint *row_bases,   // (rows) id of the row's vertex 0
+    global uint *ids)               // (N)
 {
     const uint row = get_global_id(0);
-    if (row >= rows)
-        return;
+    if (row >= rows) return;
     uint next = row_starts[row];
     for (uint word = 0; word < words; word++)
         for (uint set = bits[row * words + word]; set; set &= set - 1)

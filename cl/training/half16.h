@@ -1,5 +1,5 @@
-// Sixteen values kept in 16 bits each, rounded up or down at random so that the mean stays: a decay of less than half a
-// unit in the last place would otherwise never happen.
+// Sixteen values kept in 16 bits each, rounded up or down at random so that the mean stays: a decay
+// of less than half a unit in the last place would otherwise never happen.
 #ifndef PP_HALF16_H
 #define PP_HALF16_H
 
@@ -15,12 +15,14 @@ inline uint16 random16(const uint number) {
     return scramble(number) * (uint16)(1, 3, 5, 7, 9, 11, 13, 15, 17, 19, 21, 23, 25, 27, 29, 31);
 }
 
-// Write 16 values to p; the lowest 13 bits of `random` decide. Too large ones become the largest, NaN stays.
+// Write 16 values to p; the lowest 13 bits of `random` decide. Too large ones become the largest,
+// NaN stays.
 inline void store_half16(const float16 value, const uint16 random, global half *p) {
     const uint16 dither = random & CUT_BITS;
     const float16 size = fabs(value) > HALF_MAX ? HALF_MAX : fabs(value);  // a NaN is not larger
     const float16 normal = as_float16((as_uint16(size) + dither) & ~CUT_BITS);
-    const float16 tiny = floor(size * HALF_STEPS + convert_float16(dither) / (CUT_BITS + 1.0f)) / HALF_STEPS;
+    const float16 tiny =
+        floor(size * HALF_STEPS + convert_float16(dither) / (CUT_BITS + 1.0f)) / HALF_STEPS;
     vstore_half16(copysign(size < HALF_NORMAL ? tiny : normal, value), 0, p);
 }
 

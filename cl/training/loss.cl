@@ -1,24 +1,26 @@
 // L = mean |p - t| + weight * (1 - mean SSIM) of a prediction p and a target t, and dL/dp.
 //
-// SSIM (Wang et al. 2004): 11x11 Gaussian windows of sigma 1.5 that lie inside the target, population variances, per
-// channel. With d = p - t and s = p + t it is (1 - a)(1 - b), a = E[d]^2 / P, b = Var[d] / Q,
-// P = (E[d]^2 + E[s]^2)/2 + C1, Q = (Var[d] + Var[s])/2 + C2: the usual formula, but one that does not cancel where p = t.
-// An image row is a flat vector of 3 values a pixel, so a step of one pixel is a step of 3 values.
+// SSIM (Wang et al. 2004): 11x11 Gaussian windows of sigma 1.5 that lie inside the target,
+// population variances, per channel. With d = p - t and s = p + t it is (1 - a)(1 - b), a = E[d]^2
+// / P, b = Var[d] / Q, P = (E[d]^2 + E[s]^2)/2 + C1, Q = (Var[d] + Var[s])/2 + C2: the usual
+// formula, but one that does not cancel where p = t. An image row is a flat vector of 3 values a
+// pixel, so a step of one pixel is a step of 3 values.
 //
-// The kernels run in their order here: moments of the windows along y; along x, then SSIM and its slopes; slopes spread
-// along x; along y, with the gradient; sums. Scratch rows are BLOCKS float16 long, 2 more than 3W values need, so that no
-// tap along x needs a test.
+// The kernels run in their order here: moments of the windows along y; along x, then SSIM and its
+// slopes; slopes spread along x; along y, with the gradient; sums. Scratch rows are BLOCKS float16
+// long, 2 more than 3W values need, so that no tap along x needs a test.
 #include "common.h"
 #include "vector.h"
 
 #define TAPS 11
-#define MARGIN 2                 // float16 blocks, >= 3 * (TAPS - 1) values
-#define C1 1e-4f                 // (0.01 * 1)^2: the constants of Wang et al. for a range of 1
-#define C2 9e-4f                 // (0.03 * 1)^2
+#define MARGIN 2  // float16 blocks, >= 3 * (TAPS - 1) values
+#define C1 1e-4f  // (0.01 * 1)^2: the constants of Wang et al. for a range of 1
+#define C2 9e-4f  // (0.03 * 1)^2
 
-constant float WINDOW[TAPS] = {  // exp(-x^2 / (2 * 1.5^2)), normalised
-    0.00102838008f, 0.00759875814f, 0.0360007721f, 0.109360689f, 0.213005538f, 0.266011725f,
-    0.213005538f, 0.109360689f, 0.0360007721f, 0.00759875814f, 0.00102838008f};
+constant float WINDOW[TAPS] = {// exp(-x^2 / (2 * 1.5^2)), normalised
+                               0.00102838008f, 0.00759875814f, 0.0360007721f, 0.109360689f,
+                               0.213005538f,   0.266011725f,   0.213005538f,  0.109360689f,
+                               0.0360007721f,  0.00759875814f, 0.00102838008f};
 
 // s is kept 1 lower: the moments of numbers around 0 lose the least
 #define SUM_SHIFT 1.0f
@@ -32,20 +34,20 @@ inline int16 lanes_below(const int count) {
     return (int16)(0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15) < count;
 }
 
-// One work-item per 16 values of a row of windows: writes the moments of d, s, d^2, s^2 over 11 image rows.
+// One work-item per 16 values of a row of windows: writes the moments of d, s, d^2, s^2 over 11
+// image rows.
 kernel void loss_moments(
-    const uint v,                         // rows of windows, H - 10
-    const uint w,                         // width of the target
-    const uint pw,                        // width of the prediction
-    const uint corner,                    // first value of the prediction under the target
-    const uint blocks,                    // float16 in a scratch row
-    global const float *prediction,       // (PH, PW, 3)
-    global const float *target,           // (H, W, 3)
-    global float16 *moments)              // (V, 4, BLOCKS, 16)
+    const uint v,                    // rows of windows, H - 10
+    const uint w,                    // width of the target
+    const uint pw,                   // width of the prediction
+    const uint corner,               // first value of the prediction under the target
+    const uint blocks,               // float16 in a scratch row
+    global const float *prediction,  // (PH, PW, 3)
+    global const float *target,      // (H, W, 3)
+    global float16 *moments)         // (V, 4, BLOCKS, 16)
 {
     const int b = get_global_id(0), y = get_global_id(1);
-    if (b >= blocks || y >= v)
-        return;
+    if (b >= blocks || y >= v) return;
     const int count = 3 * (int)w - 16 * b;
     float16 m_d = 0.0f, m_s = 0.0f, m_dd = 0.0f, m_ss = 0.0f;
     for (int k = 0; k < TAPS && count > 0; k++) {
@@ -64,7 +66,8 @@ kernel void loss_moments(
     row[3 * blocks] = m_ss;
 }
 
-// 16 values of a scratch row blurred from value i on; each tap lies `step` values beside the one before.
+// 16 values of a scratch row blurred from value i on; each tap lies `step` values beside the one
+// before.
 inline float16 blur_along_x(global const float16 *row, const int i, const int step) {
     global const float *values = (global const float *)row + i;
     float16 sum = 0.0f;
@@ -73,20 +76,20 @@ inline float16 blur_along_x(global const float16 *row, const int i, const int st
     return sum;
 }
 
-// One work-item per 16 values of a row of windows, shifted right by MARGIN: finishes the moments along x, writes what the
-// windows give to the loss and its slopes: dL/dp of a pixel is the window-weighted sum of [0] + [1] d + [2] s.
+// One work-item per 16 values of a row of windows, shifted right by MARGIN: finishes the moments
+// along x, writes what the windows give to the loss and its slopes: dL/dp of a pixel is the
+// window-weighted sum of [0] + [1] d + [2] s.
 kernel void loss_similarity(
-    const uint v,                         // rows of windows
-    const uint w,                         // width of the target
-    const uint blocks,                    // float16 in a scratch row
-    const float weight,                   // of 1 - SSIM
-    global const float16 *moments,        // (V, 4, BLOCKS, 16)
-    global float16 *slopes,               // (V, 3, BLOCKS, 16) 0 outside the windows
-    global float4 *partial_terms)         // (ROWS, BLOCKS, 4) rows 0 to V - 1
+    const uint v,                   // rows of windows
+    const uint w,                   // width of the target
+    const uint blocks,              // float16 in a scratch row
+    const float weight,             // of 1 - SSIM
+    global const float16 *moments,  // (V, 4, BLOCKS, 16)
+    global float16 *slopes,         // (V, 3, BLOCKS, 16) 0 outside the windows
+    global float4 *partial_terms)   // (ROWS, BLOCKS, 4) rows 0 to V - 1
 {
     const int b = get_global_id(0), y = get_global_id(1);
-    if (b >= blocks || y >= v)
-        return;
+    if (b >= blocks || y >= v) return;
     float16 slope_0 = 0.0f, slope_d = 0.0f, slope_s = 0.0f;
     float dissimilarity = 0.0f;
     if (b >= MARGIN) {
@@ -117,43 +120,44 @@ kernel void loss_similarity(
     row[0] = slope_0;
     row[blocks] = slope_d;
     row[2 * blocks] = slope_s;
-    partial_terms[(size_t)blocks * y + b] = (float4)(weight * dissimilarity, 0.0f, dissimilarity, 0.0f);
+    partial_terms[(size_t)blocks * y + b] =
+        (float4)(weight * dissimilarity, 0.0f, dissimilarity, 0.0f);
 }
 
-// One work-item per 16 values of a row of windows: sums the slopes of the 11 windows of the row that see each value.
+// One work-item per 16 values of a row of windows: sums the slopes of the 11 windows of the row
+// that see each value.
 kernel void loss_spread(
-    const uint v,                         // rows of windows
-    const uint blocks,                    // float16 in a scratch row
-    global const float16 *slopes,         // (V, 3, BLOCKS, 16)
-    global float16 *spread)               // (V, 3, BLOCKS, 16) without the last MARGIN blocks
+    const uint v,                  // rows of windows
+    const uint blocks,             // float16 in a scratch row
+    global const float16 *slopes,  // (V, 3, BLOCKS, 16)
+    global float16 *spread)        // (V, 3, BLOCKS, 16) without the last MARGIN blocks
 {
     const int b = get_global_id(0), y = get_global_id(1);
-    if (b + MARGIN >= blocks || y >= v)
-        return;
+    if (b + MARGIN >= blocks || y >= v) return;
     for (int f = 0; f < 3; f++) {
         const size_t row = ((size_t)y * 3 + f) * blocks;
         spread[row + b] = blur_along_x(slopes + row, 16 * (b + MARGIN), -3);
     }
 }
 
-// One work-item per 16 values of a target row: sums the slopes of the 11 rows of windows that see it, writes dL/dp and
-// what the values give to the loss. Leaves the gradient outside the target as it is.
+// One work-item per 16 values of a target row: sums the slopes of the 11 rows of windows that see
+// it, writes dL/dp and what the values give to the loss. Leaves the gradient outside the target as
+// it is.
 kernel void loss_gradient(
-    const uint v,                         // rows of windows, 0 where there is no SSIM
-    const uint h,                         // height of the target
-    const uint w,                         // width of the target
-    const uint pw,                        // width of the prediction
-    const uint corner,                    // first value of the prediction under the target
-    const uint blocks,                    // float16 in a scratch row
-    global const float *prediction,       // (PH, PW, 3)
-    global const float *target,           // (H, W, 3)
-    global const float16 *spread,         // (V, 3, BLOCKS, 16)
-    global float *grad_prediction,        // (PH, PW, 3)
-    global float4 *partial_terms)         // (ROWS, BLOCKS, 4) rows V to V + H - 1
+    const uint v,                    // rows of windows, 0 where there is no SSIM
+    const uint h,                    // height of the target
+    const uint w,                    // width of the target
+    const uint pw,                   // width of the prediction
+    const uint corner,               // first value of the prediction under the target
+    const uint blocks,               // float16 in a scratch row
+    global const float *prediction,  // (PH, PW, 3)
+    global const float *target,      // (H, W, 3)
+    global const float16 *spread,    // (V, 3, BLOCKS, 16)
+    global float *grad_prediction,   // (PH, PW, 3)
+    global float4 *partial_terms)    // (ROWS, BLOCKS, 4) rows V to V + H - 1
 {
     const int b = get_global_id(0), y = get_global_id(1);
-    if (b >= blocks || y >= h)
-        return;
+    if (b >= blocks || y >= h) return;
     const int count = 3 * (int)w - 16 * b;
     float absolute = 0.0f, squared = 0.0f;
     if (count > 0) {
@@ -179,13 +183,12 @@ kernel void loss_gradient(
 // One work-item per row: the sum of its terms.
 kernel void loss_sum(
     const uint rows,
-    const uint m,                         // terms in a row
-    global const float4 *terms,           // (ROWS, M, 4)
-    global float4 *sums)                  // (ROWS, 4)
+    const uint m,                // terms in a row
+    global const float4 *terms,  // (ROWS, M, 4)
+    global float4 *sums)         // (ROWS, 4)
 {
     const size_t row = get_global_id(0);
-    if (row >= rows)
-        return;
+    if (row >= rows) return;
     float4 sum = 0.0f;
     for (size_t i = 0; i < m; i++)
         sum += terms[row * m + i];

@@ -2,16 +2,15 @@
 
 // One work-item per kept row: copies it from its old place.
 kernel void gather_rows(
-    const uint first,                     // of the kept rows that are copied: its place in the list
-    const uint m,                         // rows to copy
-    const uint r,                         // words in a row
-    global const uint *indices,           // (?) old places of all kept rows
-    global const uint *source,            // (?, R)
-    global uint *target)                  // (?, R) at least M rows
+    const uint first,            // of the kept rows that are copied: its place in the list
+    const uint m,                // rows to copy
+    const uint r,                // words in a row
+    global const uint *indices,  // (?) old places of all kept rows
+    global const uint *source,   // (?, R)
+    global uint *target)         // (?, R) at least M rows
 {
     const size_t i = get_global_id(0);
-    if (i >= m)
-        return;
+    if (i >= m) return;
     global const uint *from = source + (size_t)indices[first + i] * r;
     global uint *to = target + i * r;
     for (uint c = 0; c < r; c++)

@@ -1,4 +1,5 @@
-// Smoothing of the SH coefficients over the grid, outside Adam: f += amount * (mean of the neighbours - f).
+// Smoothing of the SH coefficients over the grid, outside Adam: f += amount * (mean of the
+// neighbours - f).
 #include "common.h"
 
 // Index of `id` in ids[first, last), ascending; NONE where it is missing.
@@ -14,16 +15,16 @@ inline uint find(global const uint *ids, const uint id, uint first, uint last) {
     return first < end && ids[first] == id ? first : NONE;
 }
 
-// One work-item per point: reads the ascending grid ids, writes the indices of its neighbours -x, +x, -y, +y, -z, +z.
+// One work-item per point: reads the ascending grid ids, writes the indices of its neighbours -x,
+// +x, -y, +y, -z, +z.
 kernel void neighbour_table(
-    const uint n,                         // points
-    global const float *grid,             // (8)
-    global const uint *ids,               // (N) grid ids, ascending
-    global uint *neighbours)              // (N, 6)
+    const uint n,              // points
+    global const float *grid,  // (8)
+    global const uint *ids,    // (N) grid ids, ascending
+    global uint *neighbours)   // (N, 6)
 {
     const uint i = get_global_id(0);
-    if (i >= n)
-        return;
+    if (i >= n) return;
     const uint nx = grid[4], ny = grid[5], plane = nx * ny;
     const uint id = ids[i], x = id % nx, y = id / nx % ny;
     global uint *row = neighbours + 6 * (size_t)i;
@@ -35,20 +36,20 @@ kernel void neighbour_table(
     row[5] = find(ids, id + plane, i + 1, n);
 }
 
-// One work-item per point of a chunk: reads all its coefficients and its neighbours', writes the smoothed ones.
+// One work-item per point of a chunk: reads all its coefficients and its neighbours', writes the
+// smoothed ones.
 kernel void smooth_gather(
-    const uint n,                         // points
-    const uint first,                     // point of the chunk
-    const uint count,                     // points in the chunk
-    const uint k,                         // coefficients of a point
-    const float amount,                   // 0 to 1
-    global const uint *neighbours,        // (N, 6)
-    global const float16 *sh,             // (N, K, 16)
-    global float16 *smoothed)             // (?, 16) K rows a point of the chunk
+    const uint n,                   // points
+    const uint first,               // point of the chunk
+    const uint count,               // points in the chunk
+    const uint k,                   // coefficients of a point
+    const float amount,             // 0 to 1
+    global const uint *neighbours,  // (N, 6)
+    global const float16 *sh,       // (N, K, 16)
+    global float16 *smoothed)       // (?, 16) K rows a point of the chunk
 {
     const size_t slot = get_global_id(0), i = first + slot;
-    if (slot >= count)
-        return;
+    if (slot >= count) return;
     uint around[6];
     float weight = 0.0f;
     for (int side = 0; side < 6; side++) {
@@ -68,16 +69,15 @@ kernel void smooth_gather(
 
 // One work-item per point of a chunk: writes its coefficients back.
 kernel void smooth_scatter(
-    const uint n,                         // points
-    const uint first,                     // point of the chunk
-    const uint count,                     // points in the chunk
-    const uint k,                         // coefficients of a point
-    global const float16 *smoothed,       // (?, 16) K rows a point of the chunk
-    global float16 *sh)                   // (N, K, 16)
+    const uint n,                    // points
+    const uint first,                // point of the chunk
+    const uint count,                // points in the chunk
+    const uint k,                    // coefficients of a point
+    global const float16 *smoothed,  // (?, 16) K rows a point of the chunk
+    global float16 *sh)              // (N, K, 16)
 {
     const size_t slot = get_global_id(0);
-    if (slot >= count)
-        return;
+    if (slot >= count) return;
     for (size_t c = 0; c < k; c++)
         sh[(first + slot) * k + c] = smoothed[slot * k + c];
 }

@@ -1,20 +1,26 @@
-"""The measured peaks of a device: multiply-adds that never leave the registers, and copies far larger than any cache."""
+"""The measured peaks of a device: multiply-adds that never leave the registers, and copies far
+larger than any cache.
+"""
 
 import time
 
 LANES = 16
-SECONDS = 0.02  # of one run: long against the 30 us of a launch, short enough to be run between any two others
+# of one run: long against the 30 us of a launch, short enough to be run between any two others
+SECONDS = 0.02
 
-COPY_BYTES = 2**28  # caches of processors and GPUs hold up to an eighth of it; above, the copy would be too fast
+# caches of processors and GPUs hold up to an eighth of it; above, the copy would be too fast
+COPY_BYTES = 2**28
 
 
 class Peak:
-    """The loop, long enough to be timed on the device at hand. flops: floating-point operations of one run()."""
+    """The loop, long enough to be timed on the device at hand. flops: floating-point operations of
+    one run().
+    """
 
     def __init__(self, dev):
         self.dev = dev
-        # A CPU core needs 2 units x 4 cycles of chains and has 32 vector registers. On a GPU the 16 lanes of one chain are
-        # 16 chains already, and many work-items share a unit.
+        # A CPU core needs 2 units x 4 cycles of chains and has 32 vector registers. On a GPU the 16
+        # lanes of one chain are 16 chains already, and many work-items share a unit.
         self.chains, per_unit, self.local = (16, 64, 1) if dev.is_cpu else (2, 2048, 64)
         self.out = dev.empty((per_unit * dev.info["compute_units"], LANES))
         self.rounds = 64
@@ -28,10 +34,20 @@ class Peak:
         return 2 * self.out.size * self.chains * self.rounds
 
     def run(self, first=0.0, factor=0.5, term=1.0):
-        """Run the loop and wait for it. The chains tend to term / (1 - factor): they neither overflow nor vanish."""
-        self.dev.program("peak", CHAINS=self.chains).launch(
-            "peak", len(self.out), local=self.local, n=len(self.out), rounds=self.rounds, first=first, factor=factor,
-            term=term, out=self.out)
+        """Run the loop and wait for it. The chains tend to term / (1 - factor): they neither
+        overflow nor vanish.
+        """
+        self.dev.program("bench/peak", CHAINS=self.chains).launch(
+            "peak",
+            len(self.out),
+            local=self.local,
+            n=len(self.out),
+            rounds=self.rounds,
+            first=first,
+            factor=factor,
+            term=term,
+            out=self.out,
+        )
         self.dev.finish()
 
     def _seconds(self):
@@ -51,6 +67,11 @@ class Copy:
 
     def run(self):
         """Copy and wait for it."""
-        self.dev.program("peak").launch("peak_copy", len(self.source), n=len(self.source), source=self.source,
-                                        target=self.target)
+        self.dev.program("bench/peak").launch(
+            "peak_copy",
+            len(self.source),
+            n=len(self.source),
+            source=self.source,
+            target=self.target,
+        )
         self.dev.finish()

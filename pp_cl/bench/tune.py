@@ -1,9 +1,10 @@
-"""`pp-cl tune`: times what can be chosen for a network's convolutions on the device at hand, and stores it (tuning.py).
+"""`pp-cl tune`: times what can be chosen for a network's convolutions on the device at hand, and
+stores it (tuning.py).
 
-First the tile shapes, one choice for all layers: they depend on a core's registers and caches, and the best one was the same
-for every layer wherever we measured. Then, with these, every variant for every distinct convolution and direction: a
-training step at the crop's size, a forward pass at the evaluation's. Times are medians of interleaved runs, errors are
-against float64 (bench_layer.py).
+First the tile shapes, one choice for all layers: they depend on a core's registers and caches, and
+the best one was the same for every layer wherever we measured. Then, with these, every variant for
+every distinct convolution and direction: a training step at the crop's size, a forward pass at the
+evaluation's. Times are medians of interleaved runs, errors are against float64 (bench_layer.py).
 """
 
 import time
@@ -12,28 +13,44 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pp_cl.bench import errors, interleave, network_shape
-from pp_cl.bench_layer import DIRECTIONS, Layer
-from pp_cl.cache import make_cache_folder
-from pp_cl.checkpoint import write_json
-from pp_cl.device import TEMPORARY_CACHE, open_device
+from pp_cl.bench.layer import DIRECTIONS, Layer
+from pp_cl.bench.network import errors, interleave, network_shape
+from pp_cl.device.discover import TEMPORARY_CACHE, open_device
 from pp_cl.errors import UserError
-from pp_cl.tuning import FORMAT, MARGIN, Tuning, device_key, fastest, read_tuning, shape_choices, tuning_file
-from pp_cl.variants import shipped_order
+from pp_cl.files.atomic import write_json
+from pp_cl.files.cache import make_cache_folder
+from pp_cl.layers.tuning import (
+    FORMAT,
+    MARGIN,
+    Tuning,
+    device_key,
+    fastest,
+    read_tuning,
+    shape_choices,
+    tuning_file,
+)
+from pp_cl.layers.variants import shipped_order
 
 # Sides of a preset's pictures, in pixels, where they are evaluated; trainings take crops of them.
 EVALUATED = {"tiny": 200, "small": 400, "paper": 800}
-# What takes HOPELESS times the best one's time in the best of its first PROBES runs is not run again.
+# What takes HOPELESS times the best one's time in the best of its first PROBES runs is not run
+# again.
 HOPELESS, PROBES = 3, 2
-SHAPES_SIDE = 96  # of the images that tile shapes are tried on, whatever the network's: they belong to the device
+# of the images that tile shapes are tried on, whatever the network's: they belong to the device
+SHAPES_SIDE = 96
 # What the tile shapes of a kernel file are tried with: (variant, directions).
-TRIED = {"winograd": ("winograd4", ("forward", "input")), "winograd_weights": ("winograd4", ("weights",)),
-         "direct": ("direct", ("forward", "input"))}
+TRIED = {
+    "winograd": ("winograd4", ("forward", "input")),
+    "winograd_weights": ("winograd4", ("weights",)),
+    "direct": ("direct", ("forward", "input")),
+}
 
 
 @dataclass(frozen=True)
 class Case:
-    """A convolution in one direction, as often as the network has it. side: of its square image, in pixels."""
+    """A convolution in one direction, as often as the network has it. side: of its square image, in
+    pixels.
+    """
 
     name: str
     direction: str
@@ -60,14 +77,19 @@ def network_cases(widths, train_side, evaluated_side):
         name, count, before = found.get(key, (step.name, 0, training))
         found[key] = (name, count + (training == before), before)
 
-    for side, training, directions in ((train_side, True, DIRECTIONS), (evaluated_side, False, DIRECTIONS[:1])):
+    for side, training, directions in (
+        (train_side, True, DIRECTIONS),
+        (evaluated_side, False, DIRECTIONS[:1]),
+    ):
         for step in (s for s in steps if s.kind.startswith("conv")):
             sources = tuple(channels[name] for name in step.inputs)
             for direction in directions:
                 for part in [(c,) for c in sources] if direction == "input" else [sources]:
                     add(side, training, step, direction, part)
-    return [Case(name, direction, k, sources, co, side, count, training)
-            for (direction, k, sources, co, side), (name, count, training) in found.items()]
+    return [
+        Case(name, direction, k, sources, co, side, count, training)
+        for (direction, k, sources, co, side), (name, count, training) in found.items()
+    ]
 
 
 def time_runs(runs):
@@ -89,7 +111,9 @@ def shaped(dev, shapes):
 
 
 def with_shapes(layer, shapes, run):
-    """`run` of the layer as a function that runs with the device's tile shapes replaced by `shapes`."""
+    """`run` of the layer as a function that runs with the device's tile shapes replaced by
+    `shapes`.
+    """
     with shaped(layer.dev, shapes):
         work = layer.make_work()
 
@@ -98,11 +122,13 @@ def with_shapes(layer, shapes, run):
         with shaped(layer.dev, shapes):
             run()
         layer.work = before
+
     return changed
 
 
 def tune_shapes(dev, cases):
-    """{kernel file: tile shape} of the least total time over the training's 3x3 layers, where it is not the shipped one.
+    """{kernel file: tile shape} of the least total time over the training's 3x3 layers, where it is
+    not the shipped one.
 
     As in measure(), what seems faster than the shipped shape must be so again.
     """
@@ -114,13 +140,18 @@ def tune_shapes(dev, cases):
         totals[name] |= ms
         best[name] = fastest(ms, shipped[name])
     for name, ms in totals.items():
-        shown = [f"{_text(shape)} {total:.2f}{' (taken)' if shape == best[name] else ''}" for shape, total in ms.items()]
+        shown = [
+            f"{_text(shape)} {total:.2f}{' (taken)' if shape == best[name] else ''}"
+            for shape, total in ms.items()
+        ]
         print(f"tile shapes of {name}, ms: {', '.join(shown)}", flush=True)
     return {name: shape for name, shape in best.items() if shape != shipped[name]}
 
 
 def time_shapes(dev, cases, shapes):
-    """{kernel file: {tile shape: total milliseconds}} of the training's 3x3 layers, for some shapes of some files."""
+    """{kernel file: {tile shape: total milliseconds}} of the training's 3x3 layers, for some shapes
+    of some files.
+    """
     totals = {}
     for case in (c for c in cases if c.training and c.k == 3):
         used = [name for name in shapes if case.direction in TRIED[name][1]]
@@ -129,7 +160,9 @@ def time_shapes(dev, cases, shapes):
             variant = TRIED[name][0]
             if variant in layer.variants:
                 run = layer.runner(variant, case.direction)
-                times = time_runs({shape: with_shapes(layer, {name: shape}, run) for shape in shapes[name]})
+                times = time_runs(
+                    {shape: with_shapes(layer, {name: shape}, run) for shape in shapes[name]}
+                )
                 total = totals.setdefault(name, dict.fromkeys(shapes[name], 0.0))
                 for shape, ms in times.items():
                     total[shape] += case.count * ms
@@ -143,27 +176,43 @@ def _text(shape):
 
 
 def measure(dev, case, layer):
-    """(row of a tuning, milliseconds as shipped) of a case: times and errors of all variants that can take it.
+    """(row of a tuning, milliseconds as shipped) of a case: times and errors of all variants that
+    can take it.
 
-    Those that seem faster than the shipped one must be so in a second measurement, whose times count: the best of several
-    noisy numbers is too good.
+    Those that seem faster than the shipped one must be so in a second measurement, whose times
+    count: the best of several noisy numbers is too good.
     """
     shipped = shipped_variant(dev, case)
-    runs = {variant: layer.runner(variant, case.direction) for variant in layer.variants if variant in _order(dev, case)}
+    runs = {
+        variant: layer.runner(variant, case.direction)
+        for variant in layer.variants
+        if variant in _order(dev, case)
+    }
     found = {variant: errors(*layer.result(variant, case.direction))[0] for variant in runs}
     ms = time_runs(runs)
-    again = {name: runs[name] for name in runs if name == shipped or ms[name] * MARGIN < ms[shipped]}
+    again = {
+        name: runs[name] for name in runs if name == shipped or ms[name] * MARGIN < ms[shipped]
+    }
     if dev.tile_shapes:
         again[None] = with_shapes(layer, {}, runs[shipped])
     if len(again) > 1:
         ms |= time_runs(again)
     shipped_ms = ms.pop(None, ms[shipped])
-    return {"direction": case.direction, "k": case.k, "ci": sum(case.sources), "co": case.co, "pixels": case.side**2,
-            "ms": ms, "rel_l2": found}, shipped_ms
+    return {
+        "direction": case.direction,
+        "k": case.k,
+        "ci": sum(case.sources),
+        "co": case.co,
+        "pixels": case.side**2,
+        "ms": ms,
+        "rel_l2": found,
+    }, shipped_ms
 
 
 def tune_layers(dev, cases, tolerance):
-    """(rows of all cases, their milliseconds as shipped); prints each, with what is taken within the tolerance."""
+    """(rows of all cases, their milliseconds as shipped); prints each, with what is taken within
+    the tolerance.
+    """
     rows, shipped_ms, layer, shape = [], [], None, None
     for case in cases:
         if case.shape != shape:
@@ -191,19 +240,29 @@ def shipped_variant(dev, case):
 
 def picked(dev, case, tuning):
     """The variant that a tuning picks for a case."""
-    return tuning.pick(case.direction, case.k, sum(case.sources), case.co, case.side**2, _order(dev, case))
+    return tuning.pick(
+        case.direction, case.k, sum(case.sources), case.co, case.side**2, _order(dev, case)
+    )
 
 
 def summary(dev, cases, rows, shipped_ms, tuning):
-    """Lines that say what the tuning gains. Raises UserError where no variant keeps its tolerance."""
+    """Lines that say what the tuning gains. Raises UserError where no variant keeps its
+    tolerance.
+    """
     lines = []
     for training, what in ((True, "a training step"), (False, "a picture of the evaluation")):
-        some = [(c, row, ms) for c, row, ms in zip(cases, rows, shipped_ms, strict=True) if c.training == training]
+        some = [
+            (c, row, ms)
+            for c, row, ms in zip(cases, rows, shipped_ms, strict=True)
+            if c.training == training
+        ]
         shipped = sum(c.count * ms for c, _, ms in some)
         tuned = sum(c.count * row["ms"][picked(dev, c, tuning)] for c, row, _ in some)
         if some:
-            lines.append(f"convolutions of {what}: {shipped:.2f} ms as shipped, {tuned:.2f} ms as tuned, "
-                         f"{shipped / tuned:.2f} times as fast")
+            lines.append(
+                f"convolutions of {what}: {shipped:.2f} ms as shipped, {tuned:.2f} ms as tuned, "
+                f"{shipped / tuned:.2f} times as fast"
+            )
     return lines
 
 
@@ -217,16 +276,26 @@ def line(case, row, taken, shipped):
     shape = f"{case.side}x{case.side}x{row['ci']}x{case.co}x{case.k}"
     if taken is None:
         return COLUMNS(case.name, shape, case.direction, ms, "", "none")
-    return COLUMNS(case.name, shape, case.direction, ms, f"{row['rel_l2'][taken]:.1e}",
-                   taken if taken == shipped else f"{taken} instead of {shipped}")
+    return COLUMNS(
+        case.name,
+        shape,
+        case.direction,
+        ms,
+        f"{row['rel_l2'][taken]:.1e}",
+        taken if taken == shipped else f"{taken} instead of {shipped}",
+    )
 
 
 def merge(tuning, earlier):
-    """The tuning, with the rows of an earlier one for other layers, if both were measured with the same tile shapes."""
+    """The tuning, with the rows of an earlier one for other layers, if both were measured with the
+    same tile shapes.
+    """
     if earlier["tile_shapes"] != tuning["tile_shapes"]:
         return tuning
     mine = {_key(row) for row in tuning["rows"]}
-    return tuning | {"rows": tuning["rows"] + [row for row in earlier["rows"] if _key(row) not in mine]}
+    return tuning | {
+        "rows": tuning["rows"] + [row for row in earlier["rows"] if _key(row) not in mine]
+    }
 
 
 def _key(row):
@@ -236,18 +305,29 @@ def _key(row):
 def run_tune(widths, train_side, evaluated_side, tolerance, device=None):
     """Measure a network's convolutions, print the tables, store the tuning.
 
-    Raises UserError, before anything is measured, where it cannot be stored; and where no variant keeps the tolerance.
+    Raises UserError, before anything is measured, where it cannot be stored; and where no variant
+    keeps the tolerance.
     """
     dev = open_device(device)
     if make_cache_folder().parent.name.startswith(TEMPORARY_CACHE):
-        raise UserError("the user's cache cannot be written, so nothing would be kept; set PP_CACHE to a folder that stays")
-    print(f"{dev.name} [{dev.info['platform']}], widths {','.join(map(str, widths))}, "
-          f"training at {train_side}x{train_side}, evaluation at {evaluated_side}x{evaluated_side}")
+        raise UserError(
+            "the user's cache cannot be written, so nothing would be kept; set PP_CACHE to a folder"
+            " that stays"
+        )
+    print(
+        f"{dev.name} [{dev.info['platform']}], widths {','.join(map(str, widths))}, "
+        f"training at {train_side}x{train_side}, evaluation at {evaluated_side}x{evaluated_side}"
+    )
     start, cases = time.perf_counter(), network_cases(widths, train_side, evaluated_side)
     dev.tile_shapes = tune_shapes(dev, cases)
     print(HEAD)
     rows, shipped_ms = tune_layers(dev, cases, tolerance)
-    tuning = {"format": FORMAT, "device": device_key(dev), "tile_shapes": dev.tile_shapes, "rows": rows}
+    tuning = {
+        "format": FORMAT,
+        "device": device_key(dev),
+        "tile_shapes": dev.tile_shapes,
+        "rows": rows,
+    }
     with suppress(OSError, ValueError):  # there is none, or one that this replaces
         tuning = merge(tuning, read_tuning(dev))
     write_json(tuning_file(dev), tuning)

@@ -1,10 +1,10 @@
-"""OpenCL devices: choosing one, building programs, allocating buffers. All vendor quirks live here."""
+"""OpenCL devices: choosing one, building programs, allocating buffers. All vendor quirks live
+here.
+"""
 
 import atexit
 import os
-import shutil
 import sys
-import tempfile
 import time
 import warnings
 import weakref
@@ -15,87 +15,52 @@ import numpy as np
 import pyopencl as cl
 import pyopencl.array as cl_array
 
+from pp_cl.device.launch import Program
 from pp_cl.errors import UserError
-from pp_cl.launch import Program
 
-MEND = ("install one with `apt install pocl-opencl-icd` (Debian, Ubuntu), `conda install pocl` or your GPU vendor's driver; "
-        "without root, `make setup` in a checkout puts Intel's CPU runtime into .venv")
-TEMPORARY_CACHE = "pp-cl-cache-"
 SMALLER = "lower --points or raise --downscale"
 
-# pyopencl 2026.1 reads this variable unasked when its cache folder cannot be written, and dies of a KeyError.
+# pyopencl 2026.1 reads this variable unasked when its cache folder cannot be written, and dies of a
+# KeyError.
 os.environ.setdefault("PYOPENCL_CACHE_FAILURE_FATAL", "")
-# Intel's runtime reports every build, a good one too; PYOPENCL_COMPILER_OUTPUT=1 shows what a compiler really says.
+# Intel's runtime reports every build, a good one too; PYOPENCL_COMPILER_OUTPUT=1 shows what a
+# compiler really says.
 warnings.filterwarnings("ignore", "Non-empty compiler output", cl.CompilerWarning)
-
-# A device is accepted only after this ran on it: PyPI's PoCL 3.0 is listed on current CPUs and fails every build.
-PROBE = "kernel void probe(global float *x) { x[get_global_id(0)] *= 2.0f; }"
 
 
 def kernel_folder():
     """The folder of the .cl files: inside the installed package, or beside it in a checkout."""
-    inside = Path(__file__).parent / "cl"
-    return inside if inside.is_dir() else Path(__file__).parent.parent / "cl"
-
-
-def list_devices():
-    """[(index "platform:device", cl.Device, problem or None)] of all OpenCL devices; each is probed with a test build."""
-    _give_cache()
-    try:
-        platforms = cl.get_platforms()
-    except cl.Error:
-        return []
-    found = []
-    for p, platform in enumerate(platforms):
-        try:
-            devices = platform.get_devices()
-        except cl.Error:
-            continue  # a platform without devices says so with an error
-        found += [(f"{p}:{d}", device, _probe(device)) for d, device in enumerate(devices)]
-    return found
-
-
-def _probe(device):
-    try:
-        context = cl.Context([device])
-        queue = cl.CommandQueue(context)
-        x = cl_array.to_device(queue, np.arange(4, dtype=np.float32))
-        cl.Program(context, PROBE).build().probe(queue, (4,), None, x.data)
-        return None if np.array_equal(x.get(), [0, 2, 4, 6]) else "computes a wrong result"
-    except cl.Error as error:
-        return "does not run: " + " ".join(str(error).split())[:160]
-
-
-def _give_cache():
-    """Drivers and pyopencl fail where the user's cache cannot be written (containers, service accounts): a temporary one."""
-    folder = os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache")
-    try:
-        os.makedirs(folder, exist_ok=True)
-        with tempfile.TemporaryFile(dir=folder) as probe:
-            probe.write(bytes(2**20))  # a full disk is noticed as well
-    except OSError as error:
-        temporary = os.environ["XDG_CACHE_HOME"] = tempfile.mkdtemp(prefix=TEMPORARY_CACHE)
-        atexit.register(shutil.rmtree, temporary, ignore_errors=True)
-        print(f"{folder}: {error.strerror}; kernels are built anew: set XDG_CACHE_HOME to keep them", file=sys.stderr)
+    inside = Path(__file__).parents[1] / "cl"
+    return inside if inside.is_dir() else Path(__file__).parents[2] / "cl"
 
 
 def describe(device):
-    """A cl.Device's "name", "platform", "version", "driver", "type", "compute_units", "memory_bytes",
-    "max_allocation_bytes" in a dictionary.
+    """A cl.Device's "name", "platform", "version", "driver", "type", "compute_units",
+    "memory_bytes", "max_allocation_bytes" in a dictionary.
     """
     return {
-        "name": device.name.strip(), "platform": device.platform.name.strip(), "version": device.version.strip(),
-        "driver": device.driver_version.strip(), "type": _type_name(device), "compute_units": device.max_compute_units,
-        "memory_bytes": _memory_bytes(device), "max_allocation_bytes": _max_allocation_bytes(device),
+        "name": device.name.strip(),
+        "platform": device.platform.name.strip(),
+        "version": device.version.strip(),
+        "driver": device.driver_version.strip(),
+        "type": _type_name(device),
+        "compute_units": device.max_compute_units,
+        "memory_bytes": _memory_bytes(device),
+        "max_allocation_bytes": _max_allocation_bytes(device),
     }
 
 
 def _type_name(device):
-    return next((t for t in ("GPU", "CPU", "ACCELERATOR") if device.type & getattr(cl.device_type, t)), "OTHER")
+    return next(
+        (t for t in ("GPU", "CPU", "ACCELERATOR") if device.type & getattr(cl.device_type, t)),
+        "OTHER",
+    )
 
 
 def _memory_bytes(device):
-    """A GPU's memory; for a CPU the machine's or its container's, as PoCL reports a fraction that it does not keep to."""
+    """A GPU's memory; for a CPU the machine's or its container's, as PoCL reports a fraction that
+    it does not keep to.
+    """
     if not (device.type & cl.device_type.CPU and hasattr(os, "sysconf")):
         return device.global_mem_size
     sizes = [os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")]
@@ -118,38 +83,6 @@ def _max_allocation_bytes(device):
     return int(min(device.max_mem_alloc_size, mebibytes * 2**20))
 
 
-def open_device(choice=None):
-    """Device chosen by `choice`, else PP_DEVICE, else the first GPU that works, else the first other device that works.
-
-    choice: "platform:device" as printed by `pp-cl devices`, or a part of the platform's or device's name; a platform's
-    comes first, as PoCL's devices carry the name of the processor ("intel" means Intel's driver wherever there is one).
-    Raises UserError when nothing matches or nothing works; never takes another device than the one asked for.
-    """
-    choice = choice or os.environ.get("PP_DEVICE")
-    found = list_devices()
-    wanted = sorted((f for f in found if _rank(f, choice)[0] < 3), key=lambda f: _rank(f, choice))
-    for _, device, problem in wanted:
-        if problem is None:
-            return Device(device)
-    listed = "; ".join(f"{i} {d.name.strip()} ({d.platform.name.strip()}) {problem or 'works'}" for i, d, problem in found)
-    if choice and not wanted and found:
-        raise UserError(f"device {choice!r}: no such OpenCL device; found {listed}")
-    asked = f"device {choice!r}: " if choice else ""
-    raise UserError(f"{asked}no working OpenCL device (found {listed or 'none'}): {MEND}")
-
-
-def _rank(found, choice):
-    """Sort key of one list_devices() entry: (0-2 how it matches `choice`, 3 not at all; GPUs first)."""
-    index, device, _ = found
-    if not choice or choice == index:
-        match = 0
-    elif choice.lower() in device.platform.name.lower():
-        match = 1
-    else:
-        match = 2 if choice.lower() in device.name.lower() else 3
-    return match, not device.type & cl.device_type.GPU
-
-
 def _debug_level():
     text = os.environ.get("PP_DEBUG") or "0"
     if text not in ("0", "1", "2", "3"):
@@ -158,7 +91,8 @@ def _debug_level():
 
 
 class Device:
-    """One OpenCL device with its queue, programs and buffers. debug: PP_DEBUG (docs/environment.md).
+    """One OpenCL device with its queue, programs and buffers. debug: PP_DEBUG
+    (docs/environment.md).
 
     tuning, tile_shapes: what tuning.adopt() set for the convolutions; None and {} = as shipped.
     """
@@ -182,23 +116,35 @@ class Device:
     def program(self, name, **defines):
         """The Program of cl/<name>.cl built with -D for each define; built once.
 
-        Raises RuntimeError with the file, the options and the compiler's words when it does not build.
+        Raises RuntimeError with the file, the options and the compiler's words when it does not
+        build.
         """
         key = (name, tuple(sorted(defines.items())))
         if key not in self._programs:
             folder = kernel_folder()
             if " " in str(folder):  # PoCL 3.1 splits its options at spaces, quoted or not
-                raise UserError(f"{folder}: OpenCL compilers cannot include from a folder with a space in its path; move it")
+                raise UserError(
+                    f"{folder}: OpenCL compilers cannot include from a folder with a space in its"
+                    " path; move it"
+                )
             options = ["-cl-std=CL1.2", "-cl-kernel-arg-info", "-I", str(folder)]
             options += [f"-D{k}={v}" for k, v in key[1]]
             start = time.perf_counter()
-            self._programs[key] = Program(self, name, (folder / f"{name}.cl").read_text("utf-8"), options, defines)
+            self._programs[key] = Program(
+                self, name, (folder / f"{name}.cl").read_text("utf-8"), options, defines
+            )
             if self.debug:
-                print(f"cl/{name}.cl {' '.join(options[4:])} built in {time.perf_counter() - start:.2f} s", file=sys.stderr)
+                print(
+                    f"cl/{name}.cl {' '.join(options[4:])} built in"
+                    f" {time.perf_counter() - start:.2f} s",
+                    file=sys.stderr,
+                )
         return self._programs[key]
 
     def empty(self, shape, dtype=np.float32):
-        """Uninitialised array on the device; zeros under PP_DEBUG=3, so that its scan sees only what kernels wrote."""
+        """Uninitialised array on the device; zeros under PP_DEBUG=3, so that its scan sees only
+        what kernels wrote.
+        """
         array = self._allocate(shape, dtype)
         if self.debug >= 3 and array.nbytes:
             self.fill(array, 0)
@@ -221,26 +167,48 @@ class Device:
     def fill(self, array, value):
         """Set all elements of an array of this device to one value."""
         if array.size:
-            self.attempt("fill a buffer", cl.enqueue_fill_buffer, self.queue, array.data, array.dtype.type(value), 0,
-                         array.nbytes)
+            self.attempt(
+                "fill a buffer",
+                cl.enqueue_fill_buffer,
+                self.queue,
+                array.data,
+                array.dtype.type(value),
+                0,
+                array.nbytes,
+            )
 
     def copy(self, target, source):
         """Copy one array of this device into another of the same size."""
         if target.nbytes != source.nbytes:
-            raise ValueError(f"copy: {source.shape} {source.dtype} into {target.shape} {target.dtype}")
+            raise ValueError(
+                f"copy: {source.shape} {source.dtype} into {target.shape} {target.dtype}"
+            )
         self.copy_rows(target, 0, source, len(source))
 
     def copy_rows(self, target, start, source, count):
-        """Copy the first `count` rows of one array of this device over those of another from row `start` on."""
+        """Copy the first `count` rows of one array of this device over those of another from row
+        `start` on.
+        """
         row_bytes = source[:1].nbytes
         if target[:1].nbytes != row_bytes or target.dtype != source.dtype:
-            raise ValueError(f"copy: {source.shape} {source.dtype} into {target.shape} {target.dtype}")
+            raise ValueError(
+                f"copy: {source.shape} {source.dtype} into {target.shape} {target.dtype}"
+            )
         if count:
-            self.attempt("copy a buffer", cl.enqueue_copy, self.queue, target.data, source.data,
-                         byte_count=count * row_bytes, dst_offset=start * row_bytes)
+            self.attempt(
+                "copy a buffer",
+                cl.enqueue_copy,
+                self.queue,
+                target.data,
+                source.data,
+                byte_count=count * row_bytes,
+                dst_offset=start * row_bytes,
+            )
 
     def front(self, array, count):
-        """The first `count` rows of an array of this device. Its buffer stays as large as it was, and is counted so."""
+        """The first `count` rows of an array of this device. Its buffer stays as large as it was,
+        and is counted so.
+        """
         rows = array[:count]
         rows.whole = getattr(array, "whole", array)  # alive as long as this part of it
         return rows
@@ -250,22 +218,31 @@ class Device:
         self.queue.finish()
 
     def attempt(self, what, function, *args, **kwargs):
-        """function(*args, **kwargs); UserError when the driver gives up (many allocate only at the first use)."""
+        """function(*args, **kwargs); UserError when the driver gives up (many allocate only at the
+        first use).
+        """
         try:
             return function(*args, **kwargs)
         except (cl.MemoryError, cl.RuntimeError) as error:
-            raise UserError(f"{self.name} cannot {what} ({error}; {self.bytes / 2**20:.0f} MiB in use): {SMALLER}, "
-                            "or choose another device (`pp-cl devices`)") from error
+            raise UserError(
+                f"{self.name} cannot {what} ({error}; {self.bytes / 2**20:.0f} MiB in use):"
+                f" {SMALLER}, or choose another device (`pp-cl devices`)"
+            ) from error
 
     def _allocate(self, shape, dtype):
         dtype = np.dtype(dtype)
         nbytes = int(np.prod(shape, dtype=np.int64)) * dtype.itemsize
         largest, total = self.info["max_allocation_bytes"], self.info["memory_bytes"]
         if nbytes > largest or self.bytes + nbytes > total:
-            raise UserError(f"a buffer of shape {tuple(np.atleast_1d(shape).tolist())} needs {nbytes / 2**30:.2f} GiB; "
-                            f"{self.name} allocates at most {largest / 2**30:.2f} GiB at once and {total / 2**30:.2f} GiB "
-                            f"in all, {self.bytes / 2**30:.2f} GiB are in use: {SMALLER}")
-        array = self.attempt(f"allocate {nbytes / 2**20:.0f} MiB", cl_array.empty, self.queue, shape, dtype)
+            raise UserError(
+                f"a buffer of shape {tuple(np.atleast_1d(shape).tolist())} needs"
+                f" {nbytes / 2**30:.2f} GiB; {self.name} allocates at most {largest / 2**30:.2f}"
+                f" GiB at once and {total / 2**30:.2f} GiB in all, {self.bytes / 2**30:.2f} GiB are"
+                f" in use: {SMALLER}"
+            )
+        array = self.attempt(
+            f"allocate {nbytes / 2**20:.0f} MiB", cl_array.empty, self.queue, shape, dtype
+        )
         self.bytes += nbytes
         self.peak_bytes = max(self.peak_bytes, self.bytes)
         weakref.finalize(array, self._released, nbytes)
@@ -275,7 +252,9 @@ class Device:
         self.bytes -= nbytes
 
     def observe(self, kernel, event, arguments):
-        """PP_DEBUG 1, 2: wait, note the kernel's time. PP_DEBUG 3: stop at the first NaN or Inf in an output as well."""
+        """PP_DEBUG 1, 2: wait, note the kernel's time. PP_DEBUG 3: stop at the first NaN or Inf in
+        an output as well.
+        """
         event.wait()
         self._seconds[kernel.label].append((event.profile.end - event.profile.start) * 1e-9)
         if self.debug < 3:
@@ -284,17 +263,24 @@ class Device:
             if p.space == "global" and not p.const and p.dtype is np.float32:
                 bad = np.flatnonzero(~np.isfinite(arguments[p.name].get()))
                 if bad.size:
-                    raise FloatingPointError(f"{kernel.label}: {p.name} has {bad.size} NaN or Inf, first at {bad[0]}")
+                    raise FloatingPointError(
+                        f"{kernel.label}: {p.name} has {bad.size} NaN or Inf, first at {bad[0]}"
+                    )
 
     def profile(self):
         """{kernel label "file.cl:kernel": [seconds of each launch]} gathered at PP_DEBUG >= 1."""
         return dict(self._seconds)
 
     def print_profile(self):
-        """A table on stderr, longest first: launches, median and total time; by file at PP_DEBUG 1, else by kernel."""
+        """A table on stderr, longest first: launches, median and total time; by file at PP_DEBUG 1,
+        else by kernel.
+        """
         rows = defaultdict(list)
         for label, seconds in self._seconds.items():
             rows[label if self.debug >= 2 else label.partition(":")[0]] += seconds
         for label, seconds in sorted(rows.items(), key=lambda r: -sum(r[1])):
             median, total = np.median(seconds) * 1e3, sum(seconds)
-            print(f"{label:40s} {len(seconds):7d} x {median:9.3f} ms, {total:9.3f} s in all", file=sys.stderr)
+            print(
+                f"{label:40s} {len(seconds):7d} x {median:9.3f} ms, {total:9.3f} s in all",
+                file=sys.stderr,
+            )

@@ -1,7 +1,7 @@
 """Kernels launched by argument name, with shapes checked against the comments of their signatures.
 
-The signature is parsed from the source, so that it works the same on drivers that give no argument info; the tests
-compare it with the driver's own (-cl-kernel-arg-info).
+The signature is parsed from the source, so that it works the same on drivers that give no argument
+info; the tests compare it with the driver's own (-cl-kernel-arg-info).
 """
 
 import operator
@@ -12,22 +12,39 @@ import numpy as np
 import pyopencl as cl
 import pyopencl.array as cl_array
 
-SCALARS = {"char": np.int8, "uchar": np.uint8, "short": np.int16, "ushort": np.uint16, "int": np.int32, "uint": np.uint32,
-           "long": np.int64, "ulong": np.uint64, "half": np.float16, "float": np.float32, "double": np.float64}
+SCALARS = {
+    "char": np.int8,
+    "uchar": np.uint8,
+    "short": np.int16,
+    "ushort": np.uint16,
+    "int": np.int32,
+    "uint": np.uint32,
+    "long": np.int64,
+    "ulong": np.uint64,
+    "half": np.float16,
+    "float": np.float32,
+    "double": np.float64,
+}
 
-# Work-group sizes when the caller names none. They are fixed, and the global size is rounded up to them, because PoCL
-# compiles a kernel again for every new work-group size; hence the tail guards.
+# Work-group sizes when the caller names none. They are fixed, and the global size is rounded up to
+# them, because PoCL compiles a kernel again for every new work-group size; hence the tail guards.
 DEFAULT_LOCAL = {1: (64,), 2: (16, 4), 3: (16, 4, 1)}
 
-_KERNEL = re.compile(r"^(?:__)?kernel\s+(?:__attribute__\s*\(\(.*?\)\)\s*)?void\s+(\w+)\s*\(", re.MULTILINE)
-_PARAMETER = re.compile(r"^(?:(global|constant|local)\s+)?((?:(?:const|restrict|volatile)\s+)*)"
-                        r"([a-z]+?)(\d*)\s*(\*?)\s*(?:restrict\s+)?(\w+)$")
+_KERNEL = re.compile(
+    r"^(?:__)?kernel\s+(?:__attribute__\s*\(\(.*?\)\)\s*)?void\s+(\w+)\s*\(", re.MULTILINE
+)
+_PARAMETER = re.compile(
+    r"^(?:(global|constant|local)\s+)?((?:(?:const|restrict|volatile)\s+)*)"
+    r"([a-z]+?)(\d*)\s*(\*?)\s*(?:restrict\s+)?(\w+)$"
+)
 _SHAPE = re.compile(r"^\(([^()]*(?:\([^()]*\)[^()]*)*)\)")
 
 
 @dataclass(frozen=True)
 class Parameter:
-    """One kernel parameter. shape: dimension words of its comment, None for a scalar or for `(...)`."""
+    """One kernel parameter. shape: dimension words of its comment, None for a scalar or for
+    `(...)`.
+    """
 
     name: str
     space: str  # "global", "constant", "local", or "" for a scalar
@@ -45,13 +62,15 @@ def parse_signatures(source, file):
     signatures = {}
     for match in _KERNEL.finditer(source):
         parameters = []
-        for line in source[match.end():].split("\n"):
+        for line in source[match.end() :].split("\n"):
             code, _, comment = line.partition("//")
             code = code.strip()
             last = code.rstrip(" {").endswith(")")
             code = code.rstrip(" {").rstrip(")").rstrip(",").strip()
             if code:
-                parameters.append(_parse_parameter(code, comment.strip(), f"{file}: {match.group(1)}"))
+                parameters.append(
+                    _parse_parameter(code, comment.strip(), f"{file}: {match.group(1)}")
+                )
             if last:
                 break
         signatures[match.group(1)] = parameters
@@ -64,7 +83,9 @@ def _parse_parameter(code, comment, where):
         raise ValueError(f"{where}: cannot read parameter {code!r}; one parameter per line")
     space, qualifiers, base, width, star, name = found.groups()
     if bool(space) != bool(star) or (width and not star):
-        raise ValueError(f"{where}: {code!r} is neither a global, constant or local pointer nor a scalar")
+        raise ValueError(
+            f"{where}: {code!r} is neither a global, constant or local pointer nor a scalar"
+        )
     shape = None
     if star:
         words = _SHAPE.match(comment)
@@ -72,7 +93,9 @@ def _parse_parameter(code, comment, where):
             raise ValueError(f"{where}: buffer {name!r} has no shape in its comment")
         shape = tuple(w.strip() for w in words.group(1).split(",") if w.strip())
         shape = None if shape == ("...",) else shape
-    return Parameter(name, space or "", SCALARS[base], int(width or 1), "const" in qualifiers, shape)
+    return Parameter(
+        name, space or "", SCALARS[base], int(width or 1), "const" in qualifiers, shape
+    )
 
 
 class Kernel:
@@ -88,7 +111,9 @@ class Kernel:
         self._checked = set()  # shapes and sizes already found right
 
     def arguments(self, values):
-        """OpenCL arguments in order, from {name: pyopencl Array, number or cl.LocalMemory}. Raises TypeError, ValueError."""
+        """OpenCL arguments in order, from {name: pyopencl Array, number or cl.LocalMemory}. Raises
+        TypeError, ValueError.
+        """
         if values.keys() != set(self.names):
             missing = [n for n in self.names if n not in values]
             unknown = [n for n in values if n not in self.names]
@@ -98,8 +123,10 @@ class Kernel:
             value = values[p.name]
             if p.space in ("global", "constant"):
                 if not isinstance(value, cl_array.Array) or value.dtype != p.dtype:
-                    raise TypeError(f"{self.label}: {p.name} is {_kind(value)}, expected a device array of "
-                                    f"{np.dtype(p.dtype)}")
+                    raise TypeError(
+                        f"{self.label}: {p.name} is {_kind(value)}, expected a device array of "
+                        f"{np.dtype(p.dtype)}"
+                    )
                 arguments.append(value.data)
                 shapes.append((value.shape, value.strides))
             elif p.space == "local":
@@ -122,15 +149,20 @@ class Kernel:
         try:
             if not issubclass(p.dtype, np.integer):
                 return p.dtype(float(value))
-            number = p.dtype(operator.index(value))  # index() refuses the 2.5 that numpy would cut to 2
+            # index() refuses the 2.5 that numpy would cut to 2
+            number = p.dtype(operator.index(value))
             if number != value:
                 raise OverflowError("out of range")  # numpy before 2 wraps around
             return number
         except (TypeError, OverflowError) as error:
-            raise TypeError(f"{self.label}: {p.name} = {value!r} is no {np.dtype(p.dtype)}: {error}") from error
+            raise TypeError(
+                f"{self.label}: {p.name} = {value!r} is no {np.dtype(p.dtype)}: {error}"
+            ) from error
 
     def _check_buffer(self, p, array, sizes):
-        """Compare one array with its parameter; sizes: {letter: size} so far, new letters are added."""
+        """Compare one array with its parameter; sizes: {letter: size} so far, new letters are
+        added.
+        """
         has = f"{self.label}: {p.name} has shape {array.shape}"
         if not array.flags.c_contiguous:
             raise ValueError(f"{has} and strides {array.strides}: not contiguous")
@@ -146,7 +178,11 @@ class Kernel:
 
 
 def _kind(value):
-    return f"an array of {value.dtype}" if isinstance(value, cl_array.Array) else f"a {type(value).__name__}"
+    return (
+        f"an array of {value.dtype}"
+        if isinstance(value, cl_array.Array)
+        else f"a {type(value).__name__}"
+    )
 
 
 class Program:
@@ -159,25 +195,36 @@ class Program:
         try:
             built = cl.Program(device.context, source).build(options=options)
         except cl.RuntimeError as error:
-            raise RuntimeError(f"cl/{name}.cl does not build on {device.name} with {' '.join(options)}:\n{error}") from error
+            raise RuntimeError(
+                f"cl/{name}.cl does not build on {device.name} with {' '.join(options)}:\n{error}"
+            ) from error
         self.built = built
-        self.kernels = {k: Kernel(getattr(built, k), p, defines, f"{name}.cl:{k}") for k, p in signatures.items()}
+        self.kernels = {
+            k: Kernel(getattr(built, k), p, defines, f"{name}.cl:{k}")
+            for k, p in signatures.items()
+        }
 
     def launch(self, kernel_name, size, local=None, **arguments):
         """Enqueue one kernel.
 
-        size: int or tuple of work-items, rounded up to the work-group size (kernels guard their tail); nothing is
-        launched when it is 0. local: work-group size; None = DEFAULT_LOCAL. arguments: by parameter name.
-        Raises TypeError (names, dtypes) and ValueError (shapes) before anything is enqueued, UserError when the driver
-        gives up.
+        size: int or tuple of work-items, rounded up to the work-group size (kernels guard their
+        tail); nothing is launched when it is 0. local: work-group size; None = DEFAULT_LOCAL.
+        arguments: by parameter name. Raises TypeError (names, dtypes) and ValueError (shapes)
+        before anything is enqueued, UserError when the driver gives up.
         """
         kernel = self.kernels[kernel_name]
         values = kernel.arguments(arguments)
         size = (int(size),) if np.isscalar(size) else tuple(int(s) for s in size)
-        local = DEFAULT_LOCAL[len(size)] if local is None else ((local,) if np.isscalar(local) else tuple(local))
+        local = (
+            DEFAULT_LOCAL[len(size)]
+            if local is None
+            else ((local,) if np.isscalar(local) else tuple(local))
+        )
         if 0 in size:
             return
         size = tuple(-(-s // group) * group for s, group in zip(size, local, strict=True))
-        event = self.device.attempt(f"run {kernel.label}", kernel.kernel, self.device.queue, size, local, *values)
+        event = self.device.attempt(
+            f"run {kernel.label}", kernel.kernel, self.device.queue, size, local, *values
+        )
         if self.device.debug:
             self.device.observe(kernel, event, arguments)

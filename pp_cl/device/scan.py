@@ -3,17 +3,18 @@
 import numpy as np
 import pyopencl as cl
 
-BLOCK = 512  # of cl/scan.cl
+BLOCK = 512  # of cl/device/scan.cl
 
 
 def exclusive_scan(dev, values, offsets, flags=False):
-    """Write offsets[i] = sum of values[:i], so that offsets[N] is the total; at most 2^32 - 1, where sums stay.
+    """Write offsets[i] = sum of values[:i], so that offsets[N] is the total; at most 2^32 - 1,
+    where sums stay.
 
     values: (N) uint32, N >= 1. offsets: (N+1) uint32. flags: every non-zero value counts as one.
     """
     n = values.size
     blocks = -(-n // BLOCK)
-    program = dev.program("scan", FLAGS=int(flags))
+    program = dev.program("device/scan", FLAGS=int(flags))
     if blocks == 1:
         block_offset = dev.zeros((2,), np.uint32)
     else:
@@ -21,7 +22,15 @@ def exclusive_scan(dev, values, offsets, flags=False):
         block_offset = dev.empty((blocks + 1,), np.uint32)
         program.launch("scan_sums", blocks, n=n, b=blocks, values=values, block_sum=block_sum)
         exclusive_scan(dev, block_sum, block_offset)
-    program.launch("scan_offsets", blocks, n=n, b=blocks, values=values, block_offset=block_offset, offsets=offsets)
+    program.launch(
+        "scan_offsets",
+        blocks,
+        n=n,
+        b=blocks,
+        values=values,
+        block_offset=block_offset,
+        offsets=offsets,
+    )
 
 
 def read_total(dev, offsets):
@@ -32,11 +41,15 @@ def read_total(dev, offsets):
 
 
 def nonzero(dev, values, offsets, indices):
-    """Number of non-zero values; writes their indices, ascending, to the front of `indices`. Waits for the device.
+    """Number of non-zero values; writes their indices, ascending, to the front of `indices`. Waits
+    for the device.
 
-    values: (N) uint32, N >= 1. offsets: (N+1) uint32 scratch, left holding each value's number. indices: (N) uint32.
+    values: (N) uint32, N >= 1. offsets: (N+1) uint32 scratch, left holding each value's number.
+    indices: (N) uint32.
     """
     n = values.size
     exclusive_scan(dev, values, offsets, flags=True)
-    dev.program("scan", FLAGS=1).launch("scan_nonzero", n, n=n, values=values, offsets=offsets, indices=indices)
+    dev.program("device/scan", FLAGS=1).launch(
+        "scan_nonzero", n, n=n, values=values, offsets=offsets, indices=indices
+    )
     return read_total(dev, offsets)

@@ -1,4 +1,6 @@
-"""The folder that keeps what is fetched or measured once: PP_CACHE, else `pp-cl` in the user's cache."""
+"""The folder that keeps what is fetched or measured once: PP_CACHE, else `pp-cl` in the user's
+cache.
+"""
 
 import os
 from pathlib import Path
@@ -19,6 +21,8 @@ def make_cache_folder():
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise UserError(f"{folder}: cannot be made ({error.strerror}); "
-                        "set PP_CACHE to a folder that can be written") from None
+        raise UserError(
+            f"{folder}: cannot be made ({error.strerror}); "
+            "set PP_CACHE to a folder that can be written"
+        ) from None
     return folder

@@ -3,7 +3,7 @@
 import numpy as np
 from PIL import Image, ImageDraw
 
-from pp_cl.image import to_8bit, write_png
+from pp_cl.files.image import to_8bit, write_png
 
 ERROR_GAIN = 4
 GAP = 2  # pixels between the images
@@ -13,12 +13,16 @@ LINE, INK = 200, (60, 60, 60)
 
 
 def comparison(predictions, truths):
-    """uint8 picture of equally large float (H, W, 3) images in [0, 1]: a row of prediction, truth and error for each view.
+    """uint8 picture of equally large float (H, W, 3) images in [0, 1]: a row of prediction, truth
+    and error for each view.
 
-    The error is the absolute difference, mean of the channels, ERROR_GAIN times; white is none, as around the object.
+    The error is the absolute difference, mean of the channels, ERROR_GAIN times; white is none, as
+    around the object.
     """
     rows = [np.stack([p, t, _error(p, t)]) for p, t in zip(predictions, truths, strict=True)]
-    tiles = np.pad(to_8bit(rows), ((0, 0), (0, 0), (0, GAP), (0, GAP), (0, 0)), constant_values=LINE)
+    tiles = np.pad(
+        to_8bit(rows), ((0, 0), (0, 0), (0, GAP), (0, GAP), (0, 0)), constant_values=LINE
+    )
     n, columns, height, width, _ = tiles.shape
     table = tiles.transpose(0, 2, 1, 3, 4).reshape(n * height, columns * width, 3)[:-GAP, :-GAP]
     picture = Image.fromarray(np.pad(table, ((HEADER, 0), (0, 0), (0, 0)), constant_values=255))

@@ -7,22 +7,29 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
-from pp_cl.checkpoint import atomic_file
 from pp_cl.errors import UserError
+from pp_cl.files.atomic import atomic_file
 
 FORMATS = ("PNG", "JPEG", "WEBP")
-EIGHT_BIT_MODES = ("RGBA", "RGB", "LA", "L", "PA", "P", "1")  # Pillow's names of what converts to RGBA without loss
-PNG_SIGNATURE, PNG_DEPTH_BYTE = b"\x89PNG\r\n\x1a\n", 24  # bits per channel stand in the header chunk, the first of all
+# Pillow's names of what converts to RGBA without loss
+EIGHT_BIT_MODES = ("RGBA", "RGB", "LA", "L", "PA", "P", "1")
+# bits per channel stand in the header chunk, the first of all
+PNG_SIGNATURE, PNG_DEPTH_BYTE = b"\x89PNG\r\n\x1a\n", 24
 
 
 def read_rgba(path):
-    """(H, W, 4) uint8 straight RGBA of an image file; gray and palette colours are expanded, no alpha means 255.
+    """(H, W, 4) uint8 straight RGBA of an image file; gray and palette colours are expanded, no
+    alpha means 255.
 
-    Raises UserError naming a file that is missing, truncated, no image, or has other than 8 bits a channel.
+    Raises UserError naming a file that is missing, truncated, no image, or has other than 8 bits a
+    channel.
     """
     with _opened(path) as image:
         if image.mode not in EIGHT_BIT_MODES or _is_deep_png(path):
-            raise UserError(f"{path}: not 8 bits a channel of gray or RGB ({image.mode}); convert it to 8-bit RGBA PNG")
+            raise UserError(
+                f"{path}: not 8 bits a channel of gray or RGB ({image.mode}); convert it to 8-bit"
+                " RGBA PNG"
+            )
         return np.array(image if image.mode == "RGBA" else image.convert("RGBA"))
 
 
@@ -42,9 +49,12 @@ def _opened(path):
         raise
     except FileNotFoundError:
         raise UserError(f"{path}: no such image; copy it there") from None
-    except Exception as error:  # decoders meet broken bytes with whatever comes up: OSError, SyntaxError, struct.error
+    # decoders meet broken bytes with whatever comes up: OSError, SyntaxError, struct.error
+    except Exception as error:
         reason = " ".join(str(error).split())[:120] or type(error).__name__
-        raise UserError(f"{path}: cannot be read as {', '.join(FORMATS)} ({reason}); copy it anew") from error
+        raise UserError(
+            f"{path}: cannot be read as {', '.join(FORMATS)} ({reason}); copy it anew"
+        ) from error
 
 
 def _is_deep_png(path):
@@ -55,7 +65,9 @@ def _is_deep_png(path):
 
 
 def to_8bit(image):
-    """uint8 image of a float image: clamped to [0, 1], rounded to the nearest of 256 levels. Raises ValueError for NaN."""
+    """uint8 image of a float image: clamped to [0, 1], rounded to the nearest of 256 levels. Raises
+    ValueError for NaN.
+    """
     image = np.asarray(image)
     if np.isnan(image).any():
         raise ValueError("the image holds NaN")
@@ -65,7 +77,8 @@ def to_8bit(image):
 def write_png(path, image):
     """Write a uint8 or float [0, 1] image of shape (H, W), (H, W, 3) or (H, W, 4), atomically.
 
-    Raises UserError naming the file when the disk is full or may not be written, ValueError for NaN.
+    Raises UserError naming the file when the disk is full or may not be written, ValueError for
+    NaN.
     """
     image = np.asarray(image)
     encoded = io.BytesIO()

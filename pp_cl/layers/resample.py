@@ -3,8 +3,8 @@
 tiles: tiles.Tiles of the result that are written, None = all.
 """
 
-from pp_cl.conv import LANES
-from pp_cl.tiles import checked_tiles
+from pp_cl.layers.conv import LANES
+from pp_cl.layers.tiles import checked_tiles
 
 LOCAL = (1, 16, 4)  # 16 channels, x, y
 
@@ -12,22 +12,44 @@ LOCAL = (1, 16, 4)  # 16 channels, x, y
 def avgpool2_forward(dev, x, out, tiles=None):
     """out (H, W, C) = mean of 2x2 pixels of x (2H, 2W, C). Raises ValueError for other shapes."""
     h, w, c = _check_double(out, x)
-    _launch(dev, "avgpool2_forward", (c, w, h), h=h, w=w, c=c, x=x, out=out,
-            tile_count=checked_tiles(dev, tiles, h, w).count)
+    _launch(
+        dev,
+        "avgpool2_forward",
+        (c, w, h),
+        h=h,
+        w=w,
+        c=c,
+        x=x,
+        out=out,
+        tile_count=checked_tiles(dev, tiles, h, w).count,
+    )
 
 
 def avgpool2_backward(dev, x, grad_out, grad_x, tiles=None):
-    """Adds the gradient of avgpool2_forward to grad_x (2H, 2W, C), then sets grad_x to 0 where x <= 0.
+    """Adds the gradient of avgpool2_forward to grad_x (2H, 2W, C), then sets grad_x to 0 where x <=
+    0.
 
     x: the ReLU's output that was pooled; grad_x: gradient from its other use; grad_out: (H, W, C).
     """
     h, w, c = _check_double(grad_out, grad_x)
-    _launch(dev, "avgpool2_backward", (c, 2 * w, 2 * h), h=h, w=w, c=c, x=x, grad_out=grad_out, grad_x=grad_x,
-            tile_count=checked_tiles(dev, tiles, 2 * h, 2 * w).count)
+    _launch(
+        dev,
+        "avgpool2_backward",
+        (c, 2 * w, 2 * h),
+        h=h,
+        w=w,
+        c=c,
+        x=x,
+        grad_out=grad_out,
+        grad_x=grad_x,
+        tile_count=checked_tiles(dev, tiles, 2 * h, 2 * w).count,
+    )
 
 
 def maxpool2_forward(dev, x, out):
-    """out (H // 2, W // 2, C) = largest of 2x2 pixels of x (H, W, C). Raises ValueError for other shapes."""
+    """out (H // 2, W // 2, C) = largest of 2x2 pixels of x (H, W, C). Raises ValueError for other
+    shapes.
+    """
     h, w, c = out.shape
     if (x.shape[0] // 2, x.shape[1] // 2, x.shape[2]) != out.shape:
         raise ValueError(f"max pooling of {x.shape} to {out.shape}")
@@ -37,31 +59,55 @@ def maxpool2_forward(dev, x, out):
 def upsample2_forward(dev, x, out, tiles=None):
     """out (2H, 2W, C) = x (H, W, C), bilinear, align_corners False, border repeated."""
     h, w, c = _check_double(x, out)
-    _launch(dev, "upsample2_forward", (c, 2 * w, 2 * h), h=h, w=w, c=c, x=x, out=out,
-            tile_count=checked_tiles(dev, tiles, 2 * h, 2 * w).count)
+    _launch(
+        dev,
+        "upsample2_forward",
+        (c, 2 * w, 2 * h),
+        h=h,
+        w=w,
+        c=c,
+        x=x,
+        out=out,
+        tile_count=checked_tiles(dev, tiles, 2 * h, 2 * w).count,
+    )
 
 
 def upsample2_backward(dev, grad_out, grad_x, tiles=None):
     """grad_x (H, W, C) = gradient of upsample2_forward, given grad_out (2H, 2W, C)."""
     h, w, c = _check_double(grad_x, grad_out)
-    _launch(dev, "upsample2_backward", (c, w, h), h=h, w=w, c=c, grad_out=grad_out, grad_x=grad_x,
-            tile_count=checked_tiles(dev, tiles, h, w).count)
+    _launch(
+        dev,
+        "upsample2_backward",
+        (c, w, h),
+        h=h,
+        w=w,
+        c=c,
+        grad_out=grad_out,
+        grad_x=grad_x,
+        tile_count=checked_tiles(dev, tiles, h, w).count,
+    )
 
 
 def affine(dev, scale, offset, x, out):
     """out = scale * x + offset; both of any one shape, out may be x."""
     if x.shape != out.shape:
         raise ValueError(f"affine of {x.shape} to {out.shape}")
-    dev.program("layers").launch("affine", x.size, n=x.size, scale=scale, offset=offset, x=x, out=out)
+    dev.program("layers/resample").launch(
+        "affine", x.size, n=x.size, scale=scale, offset=offset, x=x, out=out
+    )
 
 
 def _launch(dev, kernel, size, **arguments):
     channels, width, height = size
-    dev.program("layers").launch(kernel, (-(-channels // LANES), width, height), local=LOCAL, **arguments)
+    dev.program("layers/resample").launch(
+        kernel, (-(-channels // LANES), width, height), local=LOCAL, **arguments
+    )
 
 
 def _check_double(small, large):
     h, w, c = small.shape
     if large.shape != (2 * h, 2 * w, c):
-        raise ValueError(f"a layer between {small.shape} and {large.shape}: expected {(2 * h, 2 * w, c)}")
+        raise ValueError(
+            f"a layer between {small.shape} and {large.shape}: expected {(2 * h, 2 * w, c)}"
+        )
     return h, w, c

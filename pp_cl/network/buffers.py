@@ -6,15 +6,19 @@ import numpy as np
 
 
 def lifetimes(steps, training):
-    """[(name, first, last)] of the arrays of a network, in steps of its forward and backward pass, by first use.
+    """[(name, first, last)] of the arrays of a network, in steps of its forward and backward pass,
+    by first use.
 
-    steps: unet.Step. The input and the passes' gradients are named as in unet.UNet; the input itself is the caller's.
+    steps: unet.Step. The input and the passes' gradients are named as in unet.UNet; the input
+    itself is the caller's.
     """
     schedule = [(*step.inputs, step.name) for step in steps]
     if training:
         for step in reversed(steps):
             activations = () if step.kind == "up" else step.inputs
-            schedule.append((*activations, "grad " + step.name, *("grad " + name for name in step.inputs)))
+            schedule.append(
+                (*activations, "grad " + step.name, *("grad " + name for name in step.inputs))
+            )
     found = {}
     for time, names in enumerate(schedule):
         for name in names:
@@ -37,8 +41,8 @@ class Slot:
 def assign_slots(lifetimes, shapes):
     """[Slot] such that no two arrays of one slot live at the same time.
 
-    lifetimes: [(name, first, last)] by first use. An array takes the free slot that fits it best; if none is large enough,
-    the largest free one grows.
+    lifetimes: [(name, first, last)] by first use. An array takes the free slot that fits it best;
+    if none is large enough, the largest free one grows.
     """
     slots = []
     for name, first, last in lifetimes:
@@ -46,7 +50,9 @@ def assign_slots(lifetimes, shapes):
         free = [s for s in slots if s.free_from <= first]
         large = [s for s in free if s.floats >= floats]
         if free:
-            slot = min(large, key=lambda s: s.floats) if large else max(free, key=lambda s: s.floats)
+            slot = (
+                min(large, key=lambda s: s.floats) if large else max(free, key=lambda s: s.floats)
+            )
         else:
             slot = Slot(0, [], 0)
             slots.append(slot)

@@ -1,13 +1,15 @@
-"""The hits of views that never change, kept in device memory from step to step: positions do not move, only opacities do."""
+"""The hits of views that never change, kept in device memory from step to step: positions do not
+move, only opacities do.
+"""
 
-from pp_cl.pairs import LASTING
+from pp_cl.raster.pairs import LASTING
 
 
 class PairCache:
     """Builds Pairs, or takes them from what it keeps. Results are the same bits either way.
 
-    What came first stays: views are drawn in turn, so that dropping the one used longest ago would always drop the next.
-    budget: bytes of device memory. bytes: in use, of len(cache) views.
+    What came first stays: views are drawn in turn, so that dropping the one used longest ago would
+    always drop the next. budget: bytes of device memory. bytes: in use, of len(cache) views.
     """
 
     def __init__(self, dev, budget=0):
@@ -23,7 +25,8 @@ class PairCache:
         self._views, self.bytes = {}, 0
 
     def build(self, key, pairs, view, size, projection, point_radius):
-        """pairs.build(view, size, projection, point_radius) of the view called `key`; None: of one that may change.
+        """pairs.build(view, size, projection, point_radius) of the view called `key`; None: of one
+        that may change.
 
         Of one key, all but the opacities must be the same until clear().
         """

@@ -1,4 +1,6 @@
-"""Eq. (1) in float64 at single pixels, for discs and spheres: what `pp-cl bench raster` measures errors against."""
+"""Eq. (1) in float64 at single pixels, for discs and spheres: what `pp-cl bench raster` measures
+errors against.
+"""
 
 import numpy as np
 
@@ -8,9 +10,11 @@ ROUNDING = 4 * np.finfo(np.float32).eps  # of the distance from a ray, in shares
 
 
 class PixelReference:
-    """Points, all in front of a camera and between near and far, of which some pixels are asked for.
+    """Points, all in front of a camera and between near and far, of which some pixels are asked
+    for.
 
-    positions: (N, 3), world. radius: one number, world units. kind: disc or sphere, no larger than a few pixels.
+    positions: (N, 3), world. radius: one number, world units. kind: disc or sphere, no larger than
+    a few pixels.
     """
 
     def __init__(self, camera, positions, radius, kind):
@@ -23,32 +27,48 @@ class PixelReference:
         self.window = 1 + 1.5 * max(LEAST_RADIUS, radius * max(camera.fx, camera.fy) / z.min())
 
     def hits(self, column, row):
-        """(points (S,), closeness (S,), depth (S,)) of a pixel, or None where float32's rounding may decide over a hit."""
+        """(points (S,), closeness (S,), depth (S,)) of a pixel, or None where float32's rounding
+        may decide over a hit.
+        """
         camera, radius = self.camera, self.radius
-        near = (np.abs(self.column - column - 0.5) < self.window) & (np.abs(self.row - row - 0.5) < self.window)
+        near = (np.abs(self.column - column - 0.5) < self.window) & (
+            np.abs(self.row - row - 0.5) < self.window
+        )
         points = np.flatnonzero(near)
         c, t = self.points[points], self.range[points]
-        ray = np.array([(column + 0.5 - camera.cx) / camera.fx, (row + 0.5 - camera.cy) / camera.fy, 1])
+        ray = np.array(
+            [(column + 0.5 - camera.cx) / camera.fx, (row + 0.5 - camera.cy) / camera.fy, 1]
+        )
         ray /= np.linalg.norm(ray)
         rho = np.linalg.norm(c - t[:, None] * ray, axis=1)
         width = t / min(camera.fx, camera.fy)
         least = LEAST_RADIUS * width
-        edges = [np.maximum(radius, least)] if self.kind == "disc" else [np.full_like(t, radius), least]
+        edges = (
+            [np.maximum(radius, least)] if self.kind == "disc" else [np.full_like(t, radius), least]
+        )
         if any((np.abs(rho - edge) < ROUNDING * t).any() for edge in edges):
             return None
         hit = (rho < edges[0]) | (rho < edges[-1])
         closeness, depth = np.ones_like(rho), t
         if self.kind == "sphere":
-            closeness = np.where((rho < least) & (radius < width), 1.0, np.clip(1 - rho / radius, 0, 1))
+            closeness = np.where(
+                (rho < least) & (radius < width), 1.0, np.clip(1 - rho / radius, 0, 1)
+            )
             along = np.minimum(c @ ray, t)
             across = np.linalg.norm(c - along[:, None] * ray, axis=1)
             depth = along - np.sqrt(np.maximum(radius**2 - across**2, 0))
         return points[hit], closeness[hit], depth[hit]
 
     def features(self, hits, opacity, point_features, gamma):
-        """(C,) blended features of hits(); opacity: (S,), point_features: (S, C) of these points; the background is 1."""
+        """(C,) blended features of hits(); opacity: (S,), point_features: (S, C) of these points;
+        the background is 1.
+        """
         _, closeness, depth = hits
         z = 1 - (depth - self.camera.near) / (self.camera.far - self.camera.near)
         exponent = np.append(opacity * z / gamma, EPS / gamma)
         weight = np.append(opacity * closeness, 1.0) * np.exp(exponent - exponent.max())
-        return weight / weight.sum() @ np.vstack([point_features, np.ones((1, point_features.shape[1]))])
+        return (
+            weight
+            / weight.sum()
+            @ np.vstack([point_features, np.ones((1, point_features.shape[1]))])
+        )

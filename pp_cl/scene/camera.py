@@ -11,7 +11,8 @@ CAMERA_FLOATS = 20
 class Camera:
     """A pinhole camera, OpenCV axes (x right, y down, z forward), pixel centres at +0.5.
 
-    pose: (3, 4) float64 camera-to-world, orthonormal rotation. near, far: Euclidean distance from the eye, world units.
+    pose: (3, 4) float64 camera-to-world, orthonormal rotation. near, far: Euclidean distance from
+    the eye, world units.
     """
 
     pose: np.ndarray
@@ -40,7 +41,9 @@ class Camera:
         ).astype(np.float32)
 
     def crop(self, x0, y0, width, height):
-        """The camera that sees columns [x0, x0+width) and rows [y0, y0+height); may reach outside this one."""
+        """The camera that sees columns [x0, x0+width) and rows [y0, y0+height); may reach outside
+        this one.
+        """
         return replace(self, cx=self.cx - x0, cy=self.cy - y0, width=width, height=height)
 
     def shifted(self, dx, dy):
@@ -48,7 +51,9 @@ class Camera:
         return replace(self, cx=self.cx - dx, cy=self.cy - dy)
 
     def downscaled(self, k):
-        """The camera of the image reduced k times by averaging k x k blocks; rows and columns left over are cut off."""
+        """The camera of the image reduced k times by averaging k x k blocks; rows and columns left
+        over are cut off.
+        """
         return replace(
             self,
             fx=self.fx / k,
@@ -60,7 +65,9 @@ class Camera:
         )
 
     def padded(self, multiple):
-        """(camera, left, top): enlarged so that both sides divide by `multiple`; crop the picture at (left, top)."""
+        """(camera, left, top): enlarged so that both sides divide by `multiple`; crop the picture
+        at (left, top).
+        """
         extra_w, extra_h = -self.width % multiple, -self.height % multiple
         left, top = extra_w // 2, extra_h // 2
         return self.crop(-left, -top, self.width + extra_w, self.height + extra_h), left, top

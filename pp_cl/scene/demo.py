@@ -1,4 +1,6 @@
-"""The scene `demo`: pictures and a mesh of an object that cl/demo.cl makes up, so that nothing must be downloaded."""
+"""The scene `demo`: pictures and a mesh of an object that cl/scene/demo.cl makes up, so that
+nothing must be downloaded.
+"""
 
 import math
 import os
@@ -8,12 +10,13 @@ from pathlib import Path
 import numpy as np
 from skimage.measure import marching_cubes
 
-from pp_cl.camera import Camera
-from pp_cl.checkpoint import write_json
 from pp_cl.errors import UserError
-from pp_cl.image import write_png
-from pp_cl.points import Grid
-from pp_cl.scene import Scene, View
+from pp_cl.files.atomic import write_json
+from pp_cl.files.image import write_png
+from pp_cl.scene.camera import Camera
+from pp_cl.scene.grid import Grid
+from pp_cl.scene.load import Scene
+from pp_cl.scene.views import View
 
 SPLITS = ("train", "test")
 SIZE = 400  # pixels
@@ -24,33 +27,52 @@ OBJECT_BOX = ((-0.8, -0.8, -1.0), (0.8, 0.8, 0.92))  # holds the object
 
 
 def demo_scene(dev, splits=SPLITS, size=SIZE):
-    """Scene `demo` of 64 training and 16 test views of size x size pixels, rendered on the device; no depth range.
+    """Scene `demo` of 64 training and 16 test views of size x size pixels, rendered on the device;
+    no depth range.
 
-    The training views spread evenly from a little below the horizon to the pole, the test views circle the object.
+    The training views spread evenly from a little below the horizon to the pole, the test views
+    circle the object.
     """
     cameras = {"train": _spread_cameras(size), "test": _circling_cameras(size)}
-    views = {split: [View(f"{split}/r_{i}.png", camera, render(dev, camera)) for i, camera in enumerate(cameras[split])]
-             for split in splits}
+    views = {
+        split: [
+            View(f"{split}/r_{i}.png", camera, render(dev, camera))
+            for i, camera in enumerate(cameras[split])
+        ]
+        for split in splits
+    }
     return Scene("demo", None, views, False)
 
 
 def render(dev, camera):
-    """(H, W, 4) uint8 straight RGBA picture of the object; alpha is the share of 4x4 rays that hit it."""
+    """(H, W, 4) uint8 straight RGBA picture of the object; alpha is the share of 4x4 rays that hit
+    it.
+    """
     image = dev.empty((camera.height, camera.width, 4), np.uint8)
-    dev.program("demo").launch("render_demo", (camera.width, camera.height), width=camera.width, height=camera.height,
-                               camera=dev.upload(camera.packed()), image=image)
+    dev.program("scene/demo").launch(
+        "render_demo",
+        (camera.width, camera.height),
+        width=camera.width,
+        height=camera.height,
+        camera=dev.upload(camera.packed()),
+        image=image,
+    )
     return image.get()
 
 
 def demo_mesh(dev, resolution=256):
-    """((V, 3) float32 vertices, (F, 3) int32 faces, counter-clockwise from outside) of the object, by marching cubes.
+    """((V, 3) float32 vertices, (F, 3) int32 faces, counter-clockwise from outside) of the object,
+    by marching cubes.
 
-    resolution: grid vertices along the box's longest side; the thinnest parts are 0.022 wide, the box is 1.92 long.
+    resolution: grid vertices along the box's longest side; the thinnest parts are 0.022 wide, the
+    box is 1.92 long.
     """
     low, high = np.array(OBJECT_BOX)
     edge = (high - low).max() / (resolution - 1)
     dims = tuple(int(n) for n in np.ceil((high - low) / edge - 1e-6) + 1)
-    vertices, faces, _, _ = marching_cubes(distances(dev, Grid(tuple(low), edge, dims)), 0, gradient_direction="ascent")
+    vertices, faces, _, _ = marching_cubes(
+        distances(dev, Grid(tuple(low), edge, dims)), 0, gradient_direction="ascent"
+    )
     return (low + edge * vertices[:, ::-1]).astype(np.float32), faces
 
 
@@ -58,15 +80,19 @@ def distances(dev, grid):
     """(nz, ny, nx) float32 signed distances of a Grid's vertices to the object, negative inside."""
     n = math.prod(grid.dims)
     out = dev.empty((n,))
-    dev.program("demo").launch("demo_distances", -(-n // 16), n=n, grid=dev.upload(grid.packed()), distances=out)
+    dev.program("scene/demo").launch(
+        "demo_distances", -(-n // 16), n=n, grid=dev.upload(grid.packed()), distances=out
+    )
     return out.get().reshape(grid.dims[::-1])
 
 
 def write_scene(scene, folder):
-    """Write a Scene as a NeRF-synthetic folder (transforms_<split>.json and PNG images) that load_scene reads.
+    """Write a Scene as a NeRF-synthetic folder (transforms_<split>.json and PNG images) that
+    load_scene reads.
 
-    Nerfstudio's fl_x, fl_y, cx, cy, w, h (and near, far where the scene has them) stand in every frame. The folder appears
-    when it is complete. Raises UserError if it exists and is not empty, or cannot be written.
+    Nerfstudio's fl_x, fl_y, cx, cy, w, h (and near, far where the scene has them) stand in every
+    frame. The folder appears when it is complete. Raises UserError if it exists and is not empty,
+    or cannot be written.
     """
     folder = Path(folder).resolve()
     if folder.is_file() or folder.is_dir() and any(folder.iterdir()):
@@ -81,7 +107,9 @@ def write_scene(scene, folder):
             write_json(unfinished / f"transforms_{split}.json", _transforms(views))
         os.replace(unfinished, folder)
     except OSError as error:
-        raise UserError(f"{folder}: cannot be written ({error.strerror}); check permissions and free space") from error
+        raise UserError(
+            f"{folder}: cannot be written ({error.strerror}); check permissions and free space"
+        ) from error
     finally:
         shutil.rmtree(unfinished, ignore_errors=True)
 
@@ -89,21 +117,34 @@ def write_scene(scene, folder):
 def _transforms(views):
     """Content of a transforms_<split>.json."""
     camera = views[0].camera
-    return {"camera_angle_x": 2 * math.atan(0.5 * camera.width / camera.fx), "frames": [_frame(view) for view in views]}
+    return {
+        "camera_angle_x": 2 * math.atan(0.5 * camera.width / camera.fx),
+        "frames": [_frame(view) for view in views],
+    }
 
 
 def _frame(view):
     camera = view.camera
     pose = np.vstack([camera.pose * [1, -1, -1, 1], [0, 0, 0, 1]])  # OpenGL: y up, z backward
-    frame = {"file_path": "./" + Path(view.name).with_suffix("").as_posix(), "transform_matrix": pose.tolist(),
-             "fl_x": camera.fx, "fl_y": camera.fy, "cx": camera.cx, "cy": camera.cy, "w": camera.width, "h": camera.height}
+    frame = {
+        "file_path": "./" + Path(view.name).with_suffix("").as_posix(),
+        "transform_matrix": pose.tolist(),
+        "fl_x": camera.fx,
+        "fl_y": camera.fy,
+        "cx": camera.cx,
+        "cy": camera.cy,
+        "w": camera.width,
+        "h": camera.height,
+    }
     return frame | ({"near": camera.near, "far": camera.far} if view.has_depth_range else {})
 
 
 def _spread_cameras(size):
     """Cameras on a spiral whose steps have equal areas of the sphere."""
     heights = np.linspace(0.95, -0.15, TRAIN_VIEWS)
-    return [_camera(i * math.pi * (3 - math.sqrt(5)), math.asin(h), size) for i, h in enumerate(heights)]
+    return [
+        _camera(i * math.pi * (3 - math.sqrt(5)), math.asin(h), size) for i, h in enumerate(heights)
+    ]
 
 
 def _circling_cameras(size):

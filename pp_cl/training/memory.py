@@ -3,49 +3,78 @@
 import math
 
 from pp_cl.errors import UserError
-from pp_cl.points import sh_blocks
-from pp_cl.prune import SCRATCH_BYTES
+from pp_cl.raster.sh import sh_blocks
 from pp_cl.render import NETWORK_MULTIPLE
-from pp_cl.scene import reduced_camera
-from pp_cl.smooth import CHUNK
+from pp_cl.scene.views import reduced_camera
+from pp_cl.training.prune import SCRATCH_BYTES
+from pp_cl.training.smooth import CHUNK
 
 MIB, GIB = 2**20, 2**30
-PAIR_BYTES = 45  # two keys of 8, pixel, closeness, point and two weights of 4 bytes, a quarter of spare room
+# two keys of 8, pixel, closeness, point and two weights of 4 bytes, a quarter of spare room
+PAIR_BYTES = 45
 
 
 def point_bytes(train, degree):
-    """{what: bytes on the device} of one point of a training. train: config.TrainConfig. degree: of the SH."""
+    """{what: bytes on the device} of one point of a training. train: config.TrainConfig. degree: of
+    the SH.
+    """
     coefficients = 16 * sum(block.count for block in sh_blocks(degree))
     learned = 4 * (1 + coefficients)
     return {
         "ids, opacities, SH coefficients": 4 + learned,
         "Adam's moments": 2 * (4 + (2 if train.half_moments else 4) * coefficients),
         "averages": learned if train.average else 0,
-        "weights, Adam's lists": 4 * (1 + (8 if train.lazy else 0)),  # 4 of adam_rest; last steps, flags, offsets, rows
-        "points of one view": 4 * (4 + 2 + 16 + 16 + 1 + 3),  # position, box, features, gradients, offsets and lists
+        # 4 of adam_rest; last steps, flags, offsets, rows
+        "weights, Adam's lists": 4 * (1 + (8 if train.lazy else 0)),
+        # position, box, features, gradients, offsets and lists
+        "points of one view": 4 * (4 + 2 + 16 + 16 + 1 + 3),
         "neighbours": 4 * 6 if train.smooth > 0 else 0,
     }
 
 
 def memory_plan(dev, config, model, views):
-    """[(what, shape text, bytes)] of the device buffers of a training with this model on these views."""
+    """[(what, shape text, bytes)] of the device buffers of a training with this model on these
+    views.
+    """
     n, train = model.count, config.train
     camera = reduced_camera(views[0], config.scene.downscale)
-    width, height = (side + -side % NETWORK_MULTIPLE for side in train.crop_size(camera.width, camera.height))
-    rows = [(what, f"({n}) x {size} bytes", n * size) for what, size in point_bytes(train, model.degree).items() if size]
+    width, height = (
+        side + -side % NETWORK_MULTIPLE for side in train.crop_size(camera.width, camera.height)
+    )
+    rows = [
+        (what, f"({n}) x {size} bytes", n * size)
+        for what, size in point_bytes(train, model.degree).items()
+        if size
+    ]
     row_bytes = max(64 * block.count for block in model.blocks)  # of the largest array of a point
     if train.smooth > 0:
         chunk = min(n, max(CHUNK, n // model.grid.dims[2]))  # the points of a layer, about
-        rows.append(("smoothing (estimate)", f"2 x ({chunk}) x {row_bytes} bytes", 2 * chunk * row_bytes))
+        rows.append(
+            ("smoothing (estimate)", f"2 x ({chunk}) x {row_bytes} bytes", 2 * chunk * row_bytes)
+        )
     rows.append(("pruning", "at most", min(SCRATCH_BYTES, n * row_bytes)))
     if config.points.stop > 0 or config.points.tau > 0:
         rows.append(("points kept in one view", f"({n}) x 12 bytes", 12 * n))
     pairs = round(n * _pixels_per_point(config, model, camera))
-    rows.append(("point-pixel pairs (estimate)", f"({pairs}) x {PAIR_BYTES} bytes", PAIR_BYTES * pairs))
+    rows.append(
+        ("point-pixel pairs (estimate)", f"({pairs}) x {PAIR_BYTES} bytes", PAIR_BYTES * pairs)
+    )
     network = model.net.memory_plan(height, width, True)
-    rows.append((f"network at {width}x{height}", f"{len(network)} buffers", sum(size for _, _, size in network)))
+    rows.append(
+        (
+            f"network at {width}x{height}",
+            f"{len(network)} buffers",
+            sum(size for _, _, size in network),
+        )
+    )
     image = views[0].image
-    rows.append(("image, target, loss", f"({height}, {width}, 3) x 12", image.nbytes + 4 * height * width * 3 * 12))
+    rows.append(
+        (
+            "image, target, loss",
+            f"({height}, {width}, 3) x 12",
+            image.nbytes + 4 * height * width * 3 * 12,
+        )
+    )
     return rows
 
 
@@ -59,7 +88,9 @@ def _pixels_per_point(config, model, camera):
 
 
 def print_plan(rows, dev):
-    """Print the table against the device's limits. Raises UserError naming the knobs when it does not fit."""
+    """Print the table against the device's limits. Raises UserError naming the knobs when it does
+    not fit.
+    """
     total = sum(size for _, _, size in rows)
     print(
         f"memory plan ({dev.name}: {dev.info['memory_bytes'] / MIB:.0f} MiB, "
@@ -70,15 +101,20 @@ def print_plan(rows, dev):
     print(f"  {'total':36s} {'':28s} {total / MIB:9.1f} MiB")
     if total > dev.info["memory_bytes"]:
         raise UserError(
-            f"the training needs {total / MIB:.0f} MiB, {dev.name} has {dev.info['memory_bytes'] / MIB:.0f}: "
-            "lower --points, raise --downscale, or set train.half_moments, train.crop or smaller network.widths"
+            f"the training needs {total / MIB:.0f} MiB, {dev.name} has"
+            f" {dev.info['memory_bytes'] / MIB:.0f}: lower --points, raise --downscale, or set"
+            " train.half_moments, train.crop or smaller network.widths"
         )
 
 
 def spare_memory(plan, limit):
-    """Bytes that a plan, rows (what, shape, bytes), leaves of `limit` GiB; 0 without a limit. Raises UserError below 0."""
+    """Bytes that a plan, rows (what, shape, bytes), leaves of `limit` GiB; 0 without a limit.
+    Raises UserError below 0.
+    """
     needed = sum(size for _, _, size in plan)
     if limit and limit * GIB < needed:
-        raise UserError(f"--memory {limit:g}: the training needs {needed / GIB:.2f} GiB; raise it, lower --points, raise "
-                        "--downscale, or set train.crop or smaller network.widths")
+        raise UserError(
+            f"--memory {limit:g}: the training needs {needed / GIB:.2f} GiB; raise it, lower"
+            " --points, raise --downscale, or set train.crop or smaller network.widths"
+        )
     return max(0, int(limit * GIB) - needed)

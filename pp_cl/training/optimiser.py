@@ -1,14 +1,15 @@
 """Adam for everything learned, and the averaged (EMA) copy of it.
 
-The moments and averages of the points lie beside them in model.points, so that pruning moves all rows alike.
+The moments and averages of the points lie beside them in model.points, so that pruning moves all
+rows alike.
 """
 
 from dataclasses import dataclass
 
 import numpy as np
 
-from pp_cl.adam import PointAdam, Touched, adam_update, ema_update
-from pp_cl.schedule import learning_rate
+from pp_cl.training.adam import PointAdam, Touched, adam_update, ema_update
+from pp_cl.training.schedule import learning_rate
 
 OPACITY_EPS = 1e-15  # opacity gradients span many decades; clamping bounds the step instead
 NETWORK_EPS = 1e-8  # PyTorch's default
@@ -24,19 +25,28 @@ class Rates:
 
     @classmethod
     def at(cls, step, network, train):
-        """The rates of a step from 0 on. network, train: config.NetworkConfig, config.TrainConfig."""
+        """The rates of a step from 0 on. network, train: config.NetworkConfig,
+        config.TrainConfig.
+        """
         steps = train.iterations
         sh = tuple(
-            learning_rate(step, steps, first, first * train.sh_rate_decay, round(delay * steps)) if first else 0.0
+            learning_rate(step, steps, first, first * train.sh_rate_decay, round(delay * steps))
+            if first
+            else 0.0
             for first, delay in zip(train.sh_rate, train.sh_delay, strict=True)
         )
-        return cls(sh, learning_rate(step, steps, *train.opacity_rate), learning_rate(step, steps, *network.rate))
+        return cls(
+            sh,
+            learning_rate(step, steps, *train.opacity_rate),
+            learning_rate(step, steps, *network.rate),
+        )
 
 
 class Optimiser:
     """Moments of the points and the network, and their updates.
 
-    lazy: a step updates only the points that received a gradient; else all of them. scale: see PointAdam.
+    lazy: a step updates only the points that received a gradient; else all of them. scale: see
+    PointAdam.
     """
 
     def __init__(self, dev, model, lazy=False, scale=None):
@@ -44,7 +54,9 @@ class Optimiser:
         self.model = model
         self.lazy = lazy
         self.moments = {
-            f"{kind}.{name}": dev.zeros(array.shape) for name, array in model.net.parameters.items() for kind in "mv"
+            f"{kind}.{name}": dev.zeros(array.shape)
+            for name, array in model.net.parameters.items()
+            for kind in "mv"
         }
         self.point_adam, self.touched = PointAdam(dev, lazy, scale), Touched(dev)
         for block in model.blocks:
@@ -59,9 +71,10 @@ class Optimiser:
     def update(self, step, rates, grads, camera, feature_eps, kept):
         """One Adam step.
 
-        step: from 1. grads: (grad_point_features (N,16), grad_opacity (N)); the network's own gradients lie in it. camera:
-        (20) device buffer of the view. feature_eps: Adam's eps of the SH coefficients. kept: (S) uint32, the points of the
-        picture; a lazy update reads the gradients of no others.
+        step: from 1. grads: (grad_point_features (N,16), grad_opacity (N)); the network's own
+        gradients lie in it. camera: (20) device buffer of the view. feature_eps: Adam's eps of the
+        SH coefficients. kept: (S) uint32, the points of the picture; a lazy update reads the
+        gradients of no others.
         """
         grad_features, grad_opacity = grads
         points, adam = self.model.points, self.point_adam
@@ -98,7 +111,9 @@ class Optimiser:
             )
 
     def average(self, weight):
-        """Move the averages towards the present values by `weight`; a weight of 1 starts them there."""
+        """Move the averages towards the present values by `weight`; a weight of 1 starts them
+        there.
+        """
         for parameter, store, key in self._averaged():
             if key not in store:
                 store[key] = self.dev.empty(parameter.shape)
@@ -122,10 +137,14 @@ class Optimiser:
         own = {f"moment.{name}": a.get() for name, a in self.moments.items()}
         own |= {f"average.{name}": a.get() for name, a in self.averages.items()}
         learned = {"ids", *self.model.keys}
-        return own | {f"state.{name}": a.get() for name, a in self.model.points.items() if name not in learned}
+        return own | {
+            f"state.{name}": a.get() for name, a in self.model.points.items() if name not in learned
+        }
 
     def restore(self, arrays):
-        """Take the state of a checkpoint, as written by arrays(). Raises KeyError and ValueError for what does not fit."""
+        """Take the state of a checkpoint, as written by arrays(). Raises KeyError and ValueError
+        for what does not fit.
+        """
         for name in self.moments:
             self.moments[name].set(arrays[f"moment.{name}"])
         points = self.model.points

@@ -1,23 +1,27 @@
-"""pp_cl/bench.py and bench_layer.py: every variant is right, its numbers are what they say, bad input is one line."""
+"""pp_cl/bench/network.py and bench_layer.py: every variant is right, its numbers are what they say,
+bad input is one line.
+"""
 
 import json
 import sys
 
 import numpy as np
 import pytest
-from oracle_winograd import rounding_share
+from oracle.winograd import rounding_share
 
-from pp_cl import bench, peak
-from pp_cl.bench import bench_conv, bench_unet, errors, flops_of, interleave, run_bench
-from pp_cl.bench_layer import DIRECTIONS, Layer
+from pp_cl.bench import network as bench
+from pp_cl.bench import peak
+from pp_cl.bench.layer import DIRECTIONS, Layer
+from pp_cl.bench.network import bench_conv, bench_unet, errors, flops_of, interleave, run_bench
 from pp_cl.cli import main
-from pp_cl.device import open_device
+from pp_cl.device.discover import open_device
 from pp_cl.errors import UserError
-from pp_cl.unet import unet_steps
-from pp_cl.variants import offered
+from pp_cl.layers.variants import offered
+from pp_cl.network.unet import unet_steps
 
 SMALL = ("--size", "8", "--widths", "16,16,16")
-HALF = {"winograd4_half": rounding_share(4)}  # relative L2 error of a layer with weights stored as half
+# relative L2 error of a layer with weights stored as half
+HALF = {"winograd4_half": rounding_share(4)}
 KEYS = {"variant", "direction", "shape", "ms", "gflops", "peak_share", "rel_l2", "max_err"}
 
 
@@ -29,7 +33,9 @@ def quick(monkeypatch):
     monkeypatch.setattr(bench, "LEAST_ROUNDS", 2)
 
 
-@pytest.mark.parametrize("k, sources, co, choice", [(3, (16, 48), 32, True), (3, (3,), 16, False), (1, (32,), 3, False)])
+@pytest.mark.parametrize(
+    "k, sources, co, choice", [(3, (16, 48), 32, True), (3, (3,), 16, False), (1, (32,), 3, False)]
+)
 @pytest.mark.parametrize("direction", DIRECTIONS)
 def test_a_layer_is_compared_with_the_truth(dev, direction, k, sources, co, choice):
     layer = Layer(dev, k, 13, sources, co)
@@ -38,7 +44,9 @@ def test_a_layer_is_compared_with_the_truth(dev, direction, k, sources, co, choi
         actual, expected = layer.result(variant, direction)
         assert actual.shape == expected.shape and expected.dtype == np.float64
         assert np.abs(expected).max() > 0.1
-        assert errors(actual, expected)[0] < (HALF.get(variant, 1e-5) if direction != "weights" else 1e-5)
+        assert errors(actual, expected)[0] < (
+            HALF.get(variant, 1e-5) if direction != "weights" else 1e-5
+        )
 
 
 def test_rows_of_the_layers(dev):
@@ -46,8 +54,20 @@ def test_rows_of_the_layers(dev):
     assert all(row.keys() >= KEYS for row in rows)
     assert {row["direction"] for row in rows} == {"forward", "input", "weights"}
     # enc0.b and dec0.b are one layer, as are enc1.b and dec1.b
-    layers = [row["layer"] for row in rows if row["direction"] == "forward" and row["variant"] == "direct"]
-    assert layers == ["enc0.a", "enc1.a", "enc2.a", "enc2.b", "up1", "dec1.a", "up0", "dec0.a", "out"]
+    layers = [
+        row["layer"] for row in rows if row["direction"] == "forward" and row["variant"] == "direct"
+    ]
+    assert layers == [
+        "enc0.a",
+        "enc1.a",
+        "enc2.a",
+        "enc2.b",
+        "up1",
+        "dec1.a",
+        "up0",
+        "dec0.a",
+        "out",
+    ]
     shapes = {row["layer"]: row["shape"] for row in rows}
     assert shapes["dec1.a"] == [4, 4, 32, 16, 3] and shapes["out"] == [8, 8, 16, 3, 1]
     for row in rows:
@@ -67,7 +87,8 @@ def test_rows_of_the_network(dev, monkeypatch, check_size):
     for row in rows:
         assert row.keys() >= KEYS
         assert row["shape"] == [16, 16, 16, 16, 16, 32, 3]
-        assert 0 < row["rel_l2"] < 10 * HALF.get(row["variant"], 2e-6) and row["max_err"] > 0  # ten layers
+        # ten layers
+        assert 0 < row["rel_l2"] < 10 * HALF.get(row["variant"], 2e-6) and row["max_err"] > 0
     steps = unet_steps((16, 16, 32), 3)
     channels = {"x": 16} | {s.name: s.channels for s in steps}
     flops = sum(flops_of(s, channels, 16, 16) for s in steps if s.kind.startswith("conv"))
@@ -109,12 +130,20 @@ def test_files_and_table(tmp_path, capsys):
     assert printed.count("enc0.a") == 3 * len(offered(open_device())) and "GFLOP/s" in printed
 
 
-@pytest.mark.parametrize("words, named", [
-    (("--size", "30"), "--size 30"), (("--size", "0"), "--size 0"), (("--size", "big"), "--size big"),
-    (("--widths", "16,32"), "--widths 16,32"), (("--widths", "16,0,32"), "16,0,32"), (("--widths", "1,2,3,x"), "1,2,3,x"),
-    (("--json", "/nowhere/b.json"), "--json /nowhere/b.json"), (("--plot", "/nowhere/b.png"), "--plot /nowhere/b.png"),
-    (("--device", "abacus"), "abacus"),
-])
+@pytest.mark.parametrize(
+    "words, named",
+    [
+        (("--size", "30"), "--size 30"),
+        (("--size", "0"), "--size 0"),
+        (("--size", "big"), "--size big"),
+        (("--widths", "16,32"), "--widths 16,32"),
+        (("--widths", "16,0,32"), "16,0,32"),
+        (("--widths", "1,2,3,x"), "1,2,3,x"),
+        (("--json", "/nowhere/b.json"), "--json /nowhere/b.json"),
+        (("--plot", "/nowhere/b.png"), "--plot /nowhere/b.png"),
+        (("--device", "abacus"), "abacus"),
+    ],
+)
 def test_bad_input_is_one_line(words, named, capsys):
     assert main(["bench", "unet", *SMALL, *words]) == 2
     captured = capsys.readouterr()

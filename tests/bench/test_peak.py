@@ -1,10 +1,10 @@
-"""cl/peak.cl: it does the multiply-adds, and copies the bytes, it is credited with."""
+"""cl/bench/peak.cl: it does the multiply-adds, and copies the bytes, it is credited with."""
 
 import numpy as np
 import pytest
 
-from pp_cl import peak
-from pp_cl.peak import Copy, Peak
+from pp_cl.bench import peak
+from pp_cl.bench.peak import Copy, Peak
 
 
 @pytest.fixture

@@ -1,4 +1,6 @@
-"""pp_cl/bench_raster.py: its float64 values are the oracle's, its numbers are what they say, bad input is one line."""
+"""pp_cl/bench/raster.py: its float64 values are the oracle's, its numbers are what they say, bad
+input is one line.
+"""
 
 import json
 import sys
@@ -6,17 +8,19 @@ import types
 from dataclasses import replace
 
 import numpy as np
-import oracle_raster
 import pytest
-from helpers import relative_error
+from oracle import raster as oracle_raster
+from support.comparisons import relative_error
 
-from pp_cl import bench, bench_scene, peak
-from pp_cl.bench_pulsar import pulsar_row
-from pp_cl.bench_raster import bench_raster, growth, read_numbers
-from pp_cl.bench_scene import SCENES
+from pp_cl.bench import network as bench
+from pp_cl.bench import peak
+from pp_cl.bench import raster_scenes as bench_scene
+from pp_cl.bench.pulsar import pulsar_row
+from pp_cl.bench.raster import bench_raster, growth, read_numbers
+from pp_cl.bench.raster_scenes import SCENES
 from pp_cl.cli import main
 from pp_cl.errors import UserError
-from pp_cl.reference_raster import PixelReference
+from pp_cl.reference.raster import PixelReference
 
 SMALL = ("--points", "60,500", "--size", "12,20", "--tau", "0,1e-2")
 
@@ -38,8 +42,12 @@ def test_float64_values_are_the_oracles(dev, name):
     blend = oracle_raster.blend(camera, geometry, scene.opacity, 0.05)
     everyone = np.arange(scene.count)
     if name == "grid":
-        sh = np.concatenate([v.get() for k, v in scene.renderer.model.points.items() if k.startswith("sh")], 1)
-        np.testing.assert_allclose(scene.shaded(everyone), oracle_raster.shade(positions, camera.eye, sh), atol=1e-6)
+        sh = np.concatenate(
+            [v.get() for k, v in scene.renderer.model.points.items() if k.startswith("sh")], 1
+        )
+        np.testing.assert_allclose(
+            scene.shaded(everyone), oracle_raster.shade(positions, camera.eye, sh), atol=1e-6
+        )
     expected, compared = oracle_raster.features(blend, scene.shaded(everyone)), 0
     for pixel in range(256):
         hits = reference.hits(pixel % 16, pixel // 16)
@@ -52,7 +60,9 @@ def test_float64_values_are_the_oracles(dev, name):
 
 @pytest.mark.parametrize("offset, clear", [(0.74, True), (0.75, False), (0.76, True)])
 def test_pixels_that_rounding_decides_are_left_out(dev, offset, clear):
-    """A point whose disc's rim passes through a pixel's centre: 1/1600 of a radian is the width of a pixel."""
+    """A point whose disc's rim passes through a pixel's centre: 1/1600 of a radian is the width of
+    a pixel.
+    """
     camera = replace(SCENES["pulsar"](dev, 8, 16, 0.1).camera, fx=1600.0, fy=1600.0, cx=8.5, cy=8.5)
     angle = 2 * np.arcsin(offset / 3200)  # the chord to the ray straight ahead is offset / 1600
     position = 1.5 * np.array([[np.sin(angle), 0, np.cos(angle)]])
@@ -62,20 +72,34 @@ def test_pixels_that_rounding_decides_are_left_out(dev, offset, clear):
 @pytest.mark.parametrize("name", SCENES)
 def test_rows(dev, name):
     rows = bench_raster(dev, name, [60, 500], [12, 20], [0.0, 1e-2], 0.05)
-    assert [(row["size"], row["tau"]) for row in rows] == [(12, 0), (12, 1e-2), (20, 0), (20, 1e-2)] * 2
-    assert all(abs(row["points"] / n - 1) < 0.25 for row, n in zip(rows, [60] * 4 + [500] * 4, strict=True))
+    assert [(row["size"], row["tau"]) for row in rows] == [
+        (12, 0),
+        (12, 1e-2),
+        (20, 0),
+        (20, 1e-2),
+    ] * 2
+    assert all(
+        abs(row["points"] / n - 1) < 0.25 for row, n in zip(rows, [60] * 4 + [500] * 4, strict=True)
+    )
     for row in rows:
         stages = row["stages_ms"]
-        assert stages.keys() == row["stages_bytes"].keys() and min(*stages.values(), *row["stages_bytes"].values()) > 0
+        assert (
+            stages.keys() == row["stages_bytes"].keys()
+            and min(*stages.values(), *row["stages_bytes"].values()) > 0
+        )
         assert row["forward_ms"] + row["backward_ms"] == pytest.approx(sum(stages.values()))
         assert row["forward_ms"] > stages["weights"] and row["backward_ms"] >= stages["backward"]
         moved = sum(row["stages_bytes"].values())
-        assert row["copy_share"] == pytest.approx(moved / (row["forward_ms"] + row["backward_ms"]) * 1e-6 / row["copy_gbs"])
+        assert row["copy_share"] == pytest.approx(
+            moved / (row["forward_ms"] + row["backward_ms"]) * 1e-6 / row["copy_gbs"]
+        )
         assert 0 < row["shaded"] <= row["points"] and row["peak_device_bytes"] > 64 * row["points"]
         if row["tau"] == 0:
             assert row["max_err"] < 1e-4 and row["tau_err"] == row["tau_bound"] == 0
         else:
-            assert row["max_err"] < row["tau"] and row["tau_err"] <= row["tau_bound"] * (1 + 1e-3) <= row["tau"] * (1 + 1e-3)
+            assert row["max_err"] < row["tau"] and row["tau_err"] <= row["tau_bound"] * (
+                1 + 1e-3
+            ) <= row["tau"] * (1 + 1e-3)
     assert any(row["tau_err"] > 0 for row in rows)
 
 
@@ -88,12 +112,29 @@ def test_a_wrong_picture_is_found(dev):
 
 
 def test_growth_is_fitted():
-    rows = [{"size": s, "tau": 0.0, "points": n, "forward_ms": 0.5 * c * n**p, "backward_ms": 0.5 * c * n**p}
-            for s, c, p in ((8, 1.0, 1.0), (16, 3.0, 0.5)) for n in (10, 100, 1000)]
+    rows = [
+        {
+            "size": s,
+            "tau": 0.0,
+            "points": n,
+            "forward_ms": 0.5 * c * n**p,
+            "backward_ms": 0.5 * c * n**p,
+        }
+        for s, c, p in ((8, 1.0, 1.0), (16, 3.0, 0.5))
+        for n in (10, 100, 1000)
+    ]
     rows[2]["forward_ms"] *= 3
     first, second = growth(rows)
-    assert second == {"size": 16, "tau": 0.0, "exponent": pytest.approx(0.5), "steepest": pytest.approx(0.5)}
-    assert first["steepest"] == pytest.approx(1 + np.log10(2)) and 1 < first["exponent"] < first["steepest"]
+    assert second == {
+        "size": 16,
+        "tau": 0.0,
+        "exponent": pytest.approx(0.5),
+        "steepest": pytest.approx(0.5),
+    }
+    assert (
+        first["steepest"] == pytest.approx(1 + np.log10(2))
+        and 1 < first["exponent"] < first["steepest"]
+    )
     assert growth(rows[:1]) == []
 
 
@@ -108,12 +149,22 @@ def test_files_and_table(tmp_path, capsys):
     assert printed.count("grid ") == 8 and printed.count("time grows as") == 4
 
 
-@pytest.mark.parametrize("words, named", [
-    (("--points", "many"), "--points many"), (("--points", "0"), "--points 0"), (("--size", "30"), "--size 30"),
-    (("--size", "8192"), "--size 8192"), (("--tau", "0,1"), "--tau 0,1"), (("--tau", "nan"), "--tau nan"),
-    (("--gamma", "0.1,0.2"), "--gamma"), (("--widths", "16,16,16"), "--widths"), (("--scene", "moon"), "--scene"),
-    (("--json", "/nowhere/b.json"), "--json /nowhere/b.json"), (("--device", "abacus"), "abacus"),
-])
+@pytest.mark.parametrize(
+    "words, named",
+    [
+        (("--points", "many"), "--points many"),
+        (("--points", "0"), "--points 0"),
+        (("--size", "30"), "--size 30"),
+        (("--size", "8192"), "--size 8192"),
+        (("--tau", "0,1"), "--tau 0,1"),
+        (("--tau", "nan"), "--tau nan"),
+        (("--gamma", "0.1,0.2"), "--gamma"),
+        (("--widths", "16,16,16"), "--widths"),
+        (("--scene", "moon"), "--scene"),
+        (("--json", "/nowhere/b.json"), "--json /nowhere/b.json"),
+        (("--device", "abacus"), "abacus"),
+    ],
+)
 def test_bad_input_is_one_line(words, named, capsys):
     assert main(["bench", "raster", *SMALL, *words]) == 2
     captured = capsys.readouterr()
@@ -153,21 +204,44 @@ def test_pulsars_row(monkeypatch):
             seen["shape"] = (width, height, n, n_channels)
 
         def __call__(self, positions, features, radius, camera, gamma, max_depth, min_depth):
-            assert positions.learned and features.learned and radius.learned and features.shape == (5, bench_scene.CHANNELS)
+            assert (
+                positions.learned
+                and features.learned
+                and radius.learned
+                and features.shape == (5, bench_scene.CHANNELS)
+            )
             seen["scene"] = (positions, radius, camera.tolist(), gamma, max_depth, min_depth)
             return np.ones((4, 4, 16)).view(Tensor)
 
     rng = np.random.default_rng(0)
-    names = ("torch", "pytorch3d", "pytorch3d.renderer", "pytorch3d.renderer.points", "pytorch3d.renderer.points.pulsar")
+    names = (
+        "torch",
+        "pytorch3d",
+        "pytorch3d.renderer",
+        "pytorch3d.renderer.points",
+        "pytorch3d.renderer.points.pulsar",
+    )
     for name in names:
         monkeypatch.setitem(sys.modules, name, types.ModuleType(name))
     vars(sys.modules["torch"]).update(
-        manual_seed=lambda _: None, rand=lambda *shape: rng.random(shape).view(Tensor), randn_like=np.ones_like,
-        tensor=lambda values: np.array(values).view(Tensor), full=lambda shape, value: np.full(shape, value).view(Tensor))
+        manual_seed=lambda _: None,
+        rand=lambda *shape: rng.random(shape).view(Tensor),
+        randn_like=np.ones_like,
+        tensor=lambda values: np.array(values).view(Tensor),
+        full=lambda shape, value: np.full(shape, value).view(Tensor),
+    )
     sys.modules[names[-1]].Renderer = Renderer
     row = pulsar_row(5, 4, 0.1)
-    assert row["forward_ms"] > 0 and row["backward_ms"] > 0 and (row["points"], row["size"]) == (5, 4)
+    assert (
+        row["forward_ms"] > 0 and row["backward_ms"] > 0 and (row["points"], row["size"]) == (5, 4)
+    )
     assert seen["shape"] == (4, 4, 5, bench_scene.CHANNELS)
     positions, radius, camera, *rest = seen["scene"]
-    assert (positions.min(axis=0) >= [-0.5, -0.5, 1]).all() and (positions.max(axis=0) <= [0.5, 0.5, 2]).all()
-    assert relative_error(radius, [0.0015] * 5) < 1e-6 and camera == [0] * 6 + [0.5, 0.5] and rest == [0.1, 2.5, 0.6]
+    assert (positions.min(axis=0) >= [-0.5, -0.5, 1]).all() and (
+        positions.max(axis=0) <= [0.5, 0.5, 2]
+    ).all()
+    assert (
+        relative_error(radius, [0.0015] * 5) < 1e-6
+        and camera == [0] * 6 + [0.5, 0.5]
+        and rest == [0.1, 2.5, 0.6]
+    )

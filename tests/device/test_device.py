@@ -10,10 +10,12 @@ from types import SimpleNamespace
 import numpy as np
 import pyopencl as cl
 import pytest
-from helpers import GuardedDevice
+from support.guarded import GuardedDevice
 
-from pp_cl import device as device_module
-from pp_cl.device import Device, describe, kernel_folder, list_devices, open_device
+from pp_cl.device import device as device_module
+from pp_cl.device import discover
+from pp_cl.device.device import Device, describe, kernel_folder
+from pp_cl.device.discover import list_devices, open_device
 from pp_cl.errors import UserError
 
 TINY = """
@@ -33,15 +35,21 @@ kernel void divide(
 def fake(platform, name, gpu=False, problem=None, index="0:0"):
     """An entry of list_devices() that is never opened."""
     kind = cl.device_type.GPU if gpu else cl.device_type.CPU
-    return index, SimpleNamespace(name=name, platform=SimpleNamespace(name=platform), type=kind), problem
+    return (
+        index,
+        SimpleNamespace(name=name, platform=SimpleNamespace(name=platform), type=kind),
+        problem,
+    )
 
 
 @pytest.fixture
 def listed(monkeypatch):
-    """Sets what list_devices() returns; open_device() then returns the cl.Device in place of a Device."""
-    monkeypatch.setattr(device_module, "Device", lambda d: d)
+    """Sets what list_devices() returns; open_device() then returns the cl.Device in place of a
+    Device.
+    """
+    monkeypatch.setattr(discover, "Device", lambda d: d)
     monkeypatch.delenv("PP_DEVICE", raising=False)
-    return lambda *entries: monkeypatch.setattr(device_module, "list_devices", lambda: list(entries))
+    return lambda *entries: monkeypatch.setattr(discover, "list_devices", lambda: list(entries))
 
 
 @pytest.fixture
@@ -60,6 +68,7 @@ def plain(session_device):
 
 # ---- choosing
 
+
 def test_listed_devices_are_probed(session_device):
     found = list_devices()
     assert any(d == session_device.device and problem is None for _, d, problem in found)
@@ -77,14 +86,17 @@ def test_description_is_json(session_device):
 @pytest.mark.parametrize("result", ["wrong", "error"])
 def test_probe_names_the_problem(session_device, monkeypatch, result):
     change = {"wrong": ("2.0f", "3.0f"), "error": ("2.0f", "undeclared")}
-    monkeypatch.setattr(device_module, "PROBE", device_module.PROBE.replace(*change[result]))
-    problem = device_module._probe(session_device.device)
+    monkeypatch.setattr(discover, "PROBE", discover.PROBE.replace(*change[result]))
+    problem = discover._probe(session_device.device)
     assert {"wrong": "computes a wrong result", "error": "does not run: "}[result] in problem
     assert "\n" not in problem
 
 
 def test_a_gpu_comes_first(listed):
-    cpu, gpu = fake("Portable Computing Language", "cpu"), fake("NVIDIA CUDA", "H200", gpu=True, index="1:0")
+    cpu, gpu = (
+        fake("Portable Computing Language", "cpu"),
+        fake("NVIDIA CUDA", "H200", gpu=True, index="1:0"),
+    )
     listed(cpu, gpu)
     assert open_device() is gpu[1]
 
@@ -95,13 +107,26 @@ def test_a_gpu_that_fails_its_test_build_is_passed_over(listed):
     assert open_device() is cpu[1]
 
 
-@pytest.mark.parametrize("choice, wanted", [("0:0", 0), ("1:0", 1), ("1:1", 2), ("intel", 1), ("Portable", 0), ("h200", 2),
-                                            ("xeon", 0), ("cuda", 2)])
+@pytest.mark.parametrize(
+    "choice, wanted",
+    [
+        ("0:0", 0),
+        ("1:0", 1),
+        ("1:1", 2),
+        ("intel", 1),
+        ("Portable", 0),
+        ("h200", 2),
+        ("xeon", 0),
+        ("cuda", 2),
+    ],
+)
 @pytest.mark.parametrize("variable", [False, True])
 def test_choice_by_index_and_name(listed, monkeypatch, choice, wanted, variable):
-    entries = [fake("Portable Computing Language", "cpu-haswell-Intel(R) Xeon(R)"),
-               fake("Intel(R) OpenCL", "Intel(R) Xeon(R)", index="1:0"),
-               fake("NVIDIA CUDA", "NVIDIA H200", gpu=True, index="1:1")]
+    entries = [
+        fake("Portable Computing Language", "cpu-haswell-Intel(R) Xeon(R)"),
+        fake("Intel(R) OpenCL", "Intel(R) Xeon(R)", index="1:0"),
+        fake("NVIDIA CUDA", "NVIDIA H200", gpu=True, index="1:1"),
+    ]
     listed(*entries)
     if variable:
         monkeypatch.setenv("PP_DEVICE", choice)
@@ -117,13 +142,19 @@ def test_an_argument_beats_the_variable(listed, monkeypatch):
 
 def test_unknown_choice_lists_what_was_found(listed):
     listed(fake("Portable Computing Language", "cpu"))
-    with pytest.raises(UserError, match=r"^device 'radeon': no such OpenCL device; found 0:0 cpu \(Portable .*\) works$"):
+    with pytest.raises(
+        UserError,
+        match=r"^device 'radeon': no such OpenCL device; found 0:0 cpu \(Portable .*\) works$",
+    ):
         open_device("radeon")
 
 
 def test_a_chosen_device_that_does_not_work_is_not_replaced(listed):
     listed(fake("A", "good"), fake("B", "bad", problem="does not run: no target", index="1:0"))
-    with pytest.raises(UserError, match=r"device 'bad': no working OpenCL device .*1:0 bad \(B\) does not run: no target"):
+    with pytest.raises(
+        UserError,
+        match=r"device 'bad': no working OpenCL device .*1:0 bad \(B\) does not run: no target",
+    ):
         open_device("bad")
 
 
@@ -150,6 +181,7 @@ def test_real_choice_by_index(session_device):
 
 
 # ---- buffers
+
 
 def test_upload_fill_zeros_copy(dev, rng):
     values = rng.random((31, 16)).astype(np.float32)
@@ -239,7 +271,9 @@ def test_a_driver_that_gives_up_is_a_user_error(plain, error):
     def refuse(*_):
         raise error("clEnqueueNDRangeKernel failed: OUT_OF_RESOURCES")
 
-    with pytest.raises(UserError, match=r"cannot run x.cl:y \(.*OUT_OF_RESOURCES.*lower --points") as caught:
+    with pytest.raises(
+        UserError, match=r"cannot run x.cl:y \(.*OUT_OF_RESOURCES.*lower --points"
+    ) as caught:
         plain.attempt("run x.cl:y", refuse, 1)
     assert "\n" not in str(caught.value)
 
@@ -259,6 +293,7 @@ def test_fresh_guarded_buffers_are_nan(dev):
 
 # ---- programs and debug levels
 
+
 def test_kernel_folder_holds_the_headers():
     assert (kernel_folder() / "common.h").is_file()
 
@@ -270,8 +305,12 @@ def test_programs_are_built_once_for_each_define(plain, tiny):
 
 
 def test_a_build_error_names_file_options_and_cause(plain, tiny):
-    (tiny / "broken.cl").write_text("kernel void f(\n    global float *x)  // (N)\n{ x[0] = undeclared_thing; }\n")
-    with pytest.raises(RuntimeError, match=r"cl/broken\.cl does not build on .* with .*-DDEGREE=2") as error:
+    (tiny / "broken.cl").write_text(
+        "kernel void f(\n    global float *x)  // (N)\n{ x[0] = undeclared_thing; }\n"
+    )
+    with pytest.raises(
+        RuntimeError, match=r"cl/broken\.cl does not build on .* with .*-DDEGREE=2"
+    ) as error:
         plain.program("broken", DEGREE=2)
     assert "undeclared_thing" in str(error.value)
 
@@ -340,13 +379,18 @@ def test_the_profile_is_printed_at_exit(session_device, tiny):
 import sys
 import numpy as np
 from pathlib import Path
-from pp_cl import device
+from pp_cl.device import device, discover
 device.kernel_folder = lambda: Path({str(tiny)!r})
-d = device.open_device({next(i for i, d, _ in list_devices() if d == session_device.device)!r})
+d = discover.open_device({next(i for i, d, _ in list_devices() if d == session_device.device)!r})
 x = d.upload(np.ones(3, np.float32))
 d.program("tiny").launch("divide", 3, n=3, x=x, y=d.empty((3,)))
 """
-    ran = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, env={**os.environ, "PP_DEBUG": "2"})
+    ran = subprocess.run(
+        [sys.executable, "-c", script],
+        capture_output=True,
+        text=True,
+        env={**os.environ, "PP_DEBUG": "2"},
+    )
     assert ran.returncode == 0, ran.stderr
     assert ran.stderr.splitlines()[-1].startswith("tiny.cl:divide ")
     assert ran.stdout == ""
@@ -356,10 +400,16 @@ def test_a_cache_folder_that_cannot_be_written_is_replaced(session_device, tmp_p
     blocked = tmp_path / "file"
     blocked.write_text("")
     index = next(i for i, d, _ in list_devices() if d == session_device.device)
-    script = ("import os; from pp_cl.device import open_device; "
-              f"open_device({index!r}).program('adam'); print(os.environ['XDG_CACHE_HOME'])")
-    ran = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True,
-                         env={**os.environ, "XDG_CACHE_HOME": str(blocked / "cache")})
+    script = (
+        "import os; from pp_cl.device.discover import open_device; "
+        f"open_device({index!r}).program('training/adam'); print(os.environ['XDG_CACHE_HOME'])"
+    )
+    ran = subprocess.run(
+        [sys.executable, "-c", script],
+        capture_output=True,
+        text=True,
+        env={**os.environ, "XDG_CACHE_HOME": str(blocked / "cache")},
+    )
     assert ran.returncode == 0, ran.stderr
     assert "set XDG_CACHE_HOME to keep them" in ran.stderr
     assert not os.path.exists(ran.stdout.strip())  # gone with the process

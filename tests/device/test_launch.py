@@ -4,16 +4,18 @@ import numpy as np
 import pyopencl as cl
 import pytest
 
-from pp_cl import device as device_module
-from pp_cl.launch import DEFAULT_LOCAL, parse_signatures
+from pp_cl.device import device as device_module
+from pp_cl.device.launch import DEFAULT_LOCAL, parse_signatures
 
 KERNEL_FOLDER = device_module.kernel_folder()  # before any test replaces it
-STEMS = sorted(p.stem for p in KERNEL_FOLDER.glob("*.cl"))
+STEMS = sorted(
+    p.relative_to(KERNEL_FOLDER).with_suffix("").as_posix() for p in KERNEL_FOLDER.rglob("*.cl")
+)
 
 SOURCE = """
-#ifndef WIDTH
-#define WIDTH 4
-#endif
+# ifndef WIDTH
+# define WIDTH 4
+# endif
 
 // One work-item per row: writes scale * the sum of a row of x, plus k of its row.
 kernel void rows(
@@ -62,17 +64,29 @@ def program(dev, tmp_path, monkeypatch):
 @pytest.fixture
 def rows(dev, rng):
     """Good arguments of the kernel `rows`, n = 33."""
-    return {"n": 33, "scale": 2.0, "x": dev.upload(rng.random((33, 4)), np.float32),
-            "k": dev.upload(np.arange(3), np.uint32), "y": dev.empty((33, 1))}
+    return {
+        "n": 33,
+        "scale": 2.0,
+        "x": dev.upload(rng.random((33, 4)), np.float32),
+        "k": dev.upload(np.arange(3), np.uint32),
+        "y": dev.empty((33, 1)),
+    }
 
 
 # ---- the parser
+
 
 def test_parsed_signature():
     n, scale, x, k, y = parse_signatures(SOURCE, "toy.cl")["rows"]
     assert (n.name, n.space, n.dtype, n.shape) == ("n", "", np.uint32, None)
     assert (scale.name, scale.dtype) == ("scale", np.float32)
-    assert (x.space, x.dtype, x.width, x.const, x.shape) == ("global", np.float32, 4, True, ("N", "WIDTH"))
+    assert (x.space, x.dtype, x.width, x.const, x.shape) == (
+        "global",
+        np.float32,
+        4,
+        True,
+        ("N", "WIDTH"),
+    )
     assert (k.space, k.dtype, k.width, k.shape) == ("constant", np.uint32, 1, ("3",))
     assert (y.const, y.shape) == (False, ("N", "1"))
 
@@ -84,36 +98,51 @@ def test_all_kernels_of_a_file_are_found():
     assert signatures["copied"][2].shape is None
 
 
-@pytest.mark.parametrize("head, names", [
-    ("kernel void f() {", []),
-    ("__kernel void f(\n    const int a)\n{", ["a"]),
-    ("kernel __attribute__((reqd_work_group_size(1, 1, 1))) void f(\n    const int a,\n    const uchar b) {", ["a", "b"]),
-    ("kernel void f(\n    global float *restrict x  // (N, (H-1)/2, ?) nested\n) {", ["x"]),
-])
+@pytest.mark.parametrize(
+    "head, names",
+    [
+        ("kernel void f() {", []),
+        ("__kernel void f(\n    const int a)\n{", ["a"]),
+        (
+            (
+                "kernel __attribute__((reqd_work_group_size(1, 1, 1))) void f(\n    const int a,\n "
+                "   const uchar b) {"
+            ),
+            ["a", "b"],
+        ),
+        ("kernel void f(\n    global float *restrict x  // (N, (H-1)/2, ?) nested\n) {", ["x"]),
+    ],
+)
 def test_heads_that_are_understood(head, names):
     assert [p.name for p in parse_signatures(head + "\n}\n", "f.cl")["f"]] == names
 
 
 def test_nested_brackets_in_a_shape():
-    (x,) = parse_signatures("kernel void f(\n    global float *x)  // (N, (H-1)/2, ?) nested\n{}", "f.cl")["f"]
+    (x,) = parse_signatures(
+        "kernel void f(\n    global float *x)  // (N, (H-1)/2, ?) nested\n{}", "f.cl"
+    )["f"]
     assert x.shape == ("N", "(H-1)/2", "?")
 
 
-@pytest.mark.parametrize("parameters, message", [
-    ("    global float *x)  // no shape", "f.cl: f: buffer 'x' has no shape"),
-    ("    global float *x, const uint n)  // (N)", "one parameter per line"),
-    ("    image2d_t picture)  // (N)", "cannot read parameter"),
-    ("    const size_t n)", "cannot read parameter"),
-    ("    const unsigned int n)", "cannot read parameter"),
-    ("    const float4 colour)", "neither a global"),
-    ("    float *x)  // (N)", "neither a global"),
-])
+@pytest.mark.parametrize(
+    "parameters, message",
+    [
+        ("    global float *x)  // no shape", "f.cl: f: buffer 'x' has no shape"),
+        ("    global float *x, const uint n)  // (N)", "one parameter per line"),
+        ("    image2d_t picture)  // (N)", "cannot read parameter"),
+        ("    const size_t n)", "cannot read parameter"),
+        ("    const unsigned int n)", "cannot read parameter"),
+        ("    const float4 colour)", "neither a global"),
+        ("    float *x)  // (N)", "neither a global"),
+    ],
+)
 def test_heads_that_are_refused(parameters, message):
     with pytest.raises(ValueError, match=message):
         parse_signatures(f"kernel void f(\n{parameters}\n{{}}", "f.cl")
 
 
 # ---- launching
+
 
 def test_a_launch_computes(program, rows):
     program.launch("rows", 33, **rows)
@@ -122,8 +151,12 @@ def test_a_launch_computes(program, rows):
 
 
 def test_numpy_scalars_and_tuples_are_taken(program, rows):
-    program.launch("rows", (np.uint32(33),), local=(8,), **{**rows, "n": np.int64(33), "scale": np.float64(2)})
-    np.testing.assert_allclose(rows["y"].get()[:, 0], 2 * rows["x"].get().sum(1) + np.arange(33) % 3, rtol=1e-6)
+    program.launch(
+        "rows", (np.uint32(33),), local=(8,), **{**rows, "n": np.int64(33), "scale": np.float64(2)}
+    )
+    np.testing.assert_allclose(
+        rows["y"].get()[:, 0], 2 * rows["x"].get().sum(1) + np.arange(33) % 3, rtol=1e-6
+    )
 
 
 def test_local_memory_and_any_shape(program, dev, rng):
@@ -133,10 +166,16 @@ def test_local_memory_and_any_shape(program, dev, rng):
     assert np.array_equal(y.get().ravel(), x.get())
 
 
-@pytest.mark.parametrize("size, local, enqueued", [
-    (1, None, ((64,), (64,))), (65, None, ((128,), (64,))), (5, 4, ((8,), (4,))), ((17, 5), None, ((32, 8), (16, 4))),
-    ((np.uint32(3), 1, 1), None, ((16, 4, 1), (16, 4, 1))),
-])
+@pytest.mark.parametrize(
+    "size, local, enqueued",
+    [
+        (1, None, ((64,), (64,))),
+        (65, None, ((128,), (64,))),
+        (5, 4, ((8,), (4,))),
+        ((17, 5), None, ((32, 8), (16, 4))),
+        ((np.uint32(3), 1, 1), None, ((16, 4, 1), (16, 4, 1))),
+    ],
+)
 def test_sizes_are_rounded_up_to_the_work_group(program, rows, size, local, enqueued):
     seen = []
     program.kernels["rows"].kernel = lambda queue, *args: seen.append(args[:2])
@@ -162,19 +201,59 @@ def without(arguments, name):
 REFUSED = {
     "missing": (lambda d, a: without(a, "scale"), TypeError, r"missing \['scale'\], unknown \[\]"),
     "unknown": (lambda d, a: {**a, "z": 1}, TypeError, r"missing \[\], unknown \['z'\]"),
-    "misspelt": (lambda d, a: {**without(a, "k"), "K": a["k"]}, TypeError, r"missing \['k'\], unknown \['K'\]"),
-    "dtype": (lambda d, a: {**a, "k": d.zeros((3,), np.int32)}, TypeError, "k is an array of int32, expected .*uint32"),
-    "number for a buffer": (lambda d, a: {**a, "x": 1.0}, TypeError, "x is a float, expected a device array"),
-    "host array": (lambda d, a: {**a, "x": np.zeros((33, 4), np.float32)}, TypeError, "x is a ndarray, expected"),
+    "misspelt": (
+        lambda d, a: {**without(a, "k"), "K": a["k"]},
+        TypeError,
+        r"missing \['k'\], unknown \['K'\]",
+    ),
+    "dtype": (
+        lambda d, a: {**a, "k": d.zeros((3,), np.int32)},
+        TypeError,
+        "k is an array of int32, expected .*uint32",
+    ),
+    "number for a buffer": (
+        lambda d, a: {**a, "x": 1.0},
+        TypeError,
+        "x is a float, expected a device array",
+    ),
+    "host array": (
+        lambda d, a: {**a, "x": np.zeros((33, 4), np.float32)},
+        TypeError,
+        "x is a ndarray, expected",
+    ),
     "buffer for a number": (lambda d, a: {**a, "n": a["k"]}, TypeError, "n = .*is no uint32"),
     "fraction for an integer": (lambda d, a: {**a, "n": 33.0}, TypeError, "n = 33.0 is no uint32"),
     "negative for unsigned": (lambda d, a: {**a, "n": -1}, TypeError, "n = -1 is no uint32"),
-    "rank": (lambda d, a: {**a, "y": d.zeros((33,))}, ValueError, r"y has shape \(33,\), expected rank 2"),
-    "fixed size": (lambda d, a: {**a, "k": d.zeros((4,), np.uint32)}, ValueError, r"k has shape \(4,\), expected \('3',\)"),
-    "fixed size of 1": (lambda d, a: {**a, "y": d.zeros((33, 2))}, ValueError, r"y has .* with 1 = 1"),
-    "letter against scalar": (lambda d, a: {**a, "n": 32}, ValueError, r"x has shape \(33, 4\), expected .* with N = 32"),
-    "letter against letter": (lambda d, a: {**a, "y": d.zeros((32, 1))}, ValueError, "y has shape .* with N = 33"),
-    "transposed": (lambda d, a: {**a, "x": d.zeros((4, 33)).T}, ValueError, "x has shape .*not contiguous"),
+    "rank": (
+        lambda d, a: {**a, "y": d.zeros((33,))},
+        ValueError,
+        r"y has shape \(33,\), expected rank 2",
+    ),
+    "fixed size": (
+        lambda d, a: {**a, "k": d.zeros((4,), np.uint32)},
+        ValueError,
+        r"k has shape \(4,\), expected \('3',\)",
+    ),
+    "fixed size of 1": (
+        lambda d, a: {**a, "y": d.zeros((33, 2))},
+        ValueError,
+        r"y has .* with 1 = 1",
+    ),
+    "letter against scalar": (
+        lambda d, a: {**a, "n": 32},
+        ValueError,
+        r"x has shape \(33, 4\), expected .* with N = 32",
+    ),
+    "letter against letter": (
+        lambda d, a: {**a, "y": d.zeros((32, 1))},
+        ValueError,
+        "y has shape .* with N = 33",
+    ),
+    "transposed": (
+        lambda d, a: {**a, "x": d.zeros((4, 33)).T},
+        ValueError,
+        "x has shape .*not contiguous",
+    ),
 }
 
 
@@ -200,12 +279,20 @@ def test_a_define_in_a_shape_is_checked(dev, tmp_path, monkeypatch, rows):
 
 def test_a_letter_stands_for_one_size_only_within_a_launch(program, dev, rows, rng):
     program.launch("rows", 33, **rows)
-    more = {**rows, "n": 31, "x": dev.upload(rng.random((31, 4)), np.float32), "y": dev.empty((31, 1))}
+    more = {
+        **rows,
+        "n": 31,
+        "x": dev.upload(rng.random((31, 4)), np.float32),
+        "y": dev.empty((31, 1)),
+    }
     program.launch("rows", 31, **more)
-    np.testing.assert_allclose(more["y"].get()[:, 0], 2 * more["x"].get().sum(1) + np.arange(31) % 3, rtol=1e-6)
+    np.testing.assert_allclose(
+        more["y"].get()[:, 0], 2 * more["x"].get().sum(1) + np.arange(31) % 3, rtol=1e-6
+    )
 
 
 # ---- guards
+
 
 @pytest.mark.parametrize("n", [1, 33, 257])
 def test_a_write_behind_a_buffer_is_caught(program, dev, n):
@@ -218,19 +305,38 @@ def test_a_write_behind_a_buffer_is_caught(program, dev, n):
 # ---- every kernel file
 
 INFO, ADDRESS = cl.kernel_arg_info, cl.kernel_arg_address_qualifier
-TYPES = {np.int8: "char", np.uint8: "uchar", np.int16: "short", np.uint16: "ushort", np.int32: "int", np.uint32: "uint",
-         np.int64: "long", np.uint64: "ulong", np.float16: "half", np.float32: "float", np.float64: "double"}
+TYPES = {
+    np.int8: "char",
+    np.uint8: "uchar",
+    np.int16: "short",
+    np.uint16: "ushort",
+    np.int32: "int",
+    np.uint32: "uint",
+    np.int64: "long",
+    np.uint64: "ulong",
+    np.float16: "half",
+    np.float32: "float",
+    np.float64: "double",
+}
 
 
-SPACES = {"global": ADDRESS.GLOBAL, "constant": ADDRESS.CONSTANT, "local": ADDRESS.LOCAL, "": ADDRESS.PRIVATE}
+SPACES = {
+    "global": ADDRESS.GLOBAL,
+    "constant": ADDRESS.CONSTANT,
+    "local": ADDRESS.LOCAL,
+    "": ADDRESS.PRIVATE,
+}
 
 
 def driver_says(kernel, i):
     """(name, type, address space, pointer to const) of a parameter, from -cl-kernel-arg-info."""
-    name, kind, space, qualifiers = (kernel.get_arg_info(i, what) for what in (
-        INFO.NAME, INFO.TYPE_NAME, INFO.ADDRESS_QUALIFIER, INFO.TYPE_QUALIFIER))
+    name, kind, space, qualifiers = (
+        kernel.get_arg_info(i, what)
+        for what in (INFO.NAME, INFO.TYPE_NAME, INFO.ADDRESS_QUALIFIER, INFO.TYPE_QUALIFIER)
+    )
     const = bool(qualifiers & cl.kernel_arg_type_qualifier.CONST)
-    return name.removeprefix("_cl_"), kind, space, const and space == ADDRESS.GLOBAL  # PoCL renames all built-in functions
+    # PoCL renames all built-in functions
+    return name.removeprefix("_cl_"), kind, space, const and space == ADDRESS.GLOBAL
 
 
 def launcher_says(p):
@@ -244,10 +350,13 @@ def test_file_builds_alone_and_its_signatures_agree_with_the_driver(dev, stem):
     source = (KERNEL_FOLDER / f"{stem}.cl").read_text("utf-8")
     parsed = parse_signatures(source, f"cl/{stem}.cl")
     assert parsed, "no kernel that the launcher can read"
-    # Intel's runtime has no names for a program out of pyopencl's cache; hence the parser, and this build without it.
+    # Intel's runtime has no names for a program out of pyopencl's cache; hence the parser, and this
+    # build without it.
     options = ["-cl-std=CL1.2", "-cl-kernel-arg-info", "-I", str(KERNEL_FOLDER)]
     built = cl.Program(dev.context, source).build(options=options, cache_dir=False)
     assert set(built.kernel_names.split(";")) == set(parsed)
     for name, parameters in parsed.items():
         kernel = getattr(built, name)
-        assert [driver_says(kernel, i) for i in range(kernel.num_args)] == [launcher_says(p) for p in parameters], name
+        assert [driver_says(kernel, i) for i in range(kernel.num_args)] == [
+            launcher_says(p) for p in parameters
+        ], name

@@ -2,9 +2,9 @@
 
 import numpy as np
 import pytest
-from helpers import AWKWARD_SIZES
+from support.guarded import AWKWARD_SIZES
 
-from pp_cl.scan import BLOCK, exclusive_scan, nonzero, read_total
+from pp_cl.device.scan import BLOCK, exclusive_scan, nonzero, read_total
 
 # one block, its edges, two levels and three
 SIZES = (*AWKWARD_SIZES, BLOCK - 1, BLOCK, BLOCK + 1, BLOCK * BLOCK, BLOCK * BLOCK + 1)

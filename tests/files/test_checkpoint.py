@@ -6,11 +6,15 @@ import io
 import numpy as np
 import pytest
 
-from pp_cl import checkpoint
-from pp_cl.checkpoint import atomic_file, load_checkpoint, remove_leftovers, save_checkpoint, write_json
 from pp_cl.errors import UserError
+from pp_cl.files import atomic
+from pp_cl.files.atomic import atomic_file, remove_leftovers, write_json
+from pp_cl.files.checkpoint import load_checkpoint, save_checkpoint
 
-ARRAYS = {"points.ids": np.arange(5, dtype=np.uint32), "points.opacity": np.linspace(0, 1, 5, dtype=np.float32)}
+ARRAYS = {
+    "points.ids": np.arange(5, dtype=np.uint32),
+    "points.opacity": np.linspace(0, 1, 5, dtype=np.float32),
+}
 
 
 def test_round_trip_and_equal_bytes(tmp_path):
@@ -38,7 +42,11 @@ def test_corrupt_checkpoint_is_one_clear_line(tmp_path, damage):
     content = bytearray(path.read_bytes())
     if damage == "flip":
         content[content.find(b"\x93NUMPY") + 140] ^= 0xFF
-    path.write_bytes({"truncate": content[: len(content) // 2], "flip": content, "empty": b"", "text": b"hello"}[damage])
+    path.write_bytes(
+        {"truncate": content[: len(content) // 2], "flip": content, "empty": b"", "text": b"hello"}[
+            damage
+        ]
+    )
     with pytest.raises(UserError, match="corrupt checkpoint") as caught:
         load_checkpoint(path)
     assert str(path) in str(caught.value) and "\n" not in str(caught.value)
@@ -46,7 +54,11 @@ def test_corrupt_checkpoint_is_one_clear_line(tmp_path, damage):
 
 def test_pickled_arrays_are_refused(tmp_path):
     path = tmp_path / "checkpoint.npz"
-    np.savez(path, header=np.frombuffer(b'{"format": 1}', np.uint8), bad=np.array([{"a": 1}], dtype=object))
+    np.savez(
+        path,
+        header=np.frombuffer(b'{"format": 1}', np.uint8),
+        bad=np.array([{"a": 1}], dtype=object),
+    )
     with pytest.raises(UserError, match="corrupt"):
         load_checkpoint(path)
 
@@ -71,7 +83,7 @@ def test_full_disk_keeps_the_old_file(tmp_path, monkeypatch):
     def full(*_args, **_kwargs):
         raise OSError(errno.ENOSPC, "No space left on device")
 
-    monkeypatch.setattr(checkpoint.os, "fsync", full)
+    monkeypatch.setattr(atomic.os, "fsync", full)
     with pytest.raises(UserError, match="free some space") as caught:
         save_checkpoint(path, {"step": 2}, ARRAYS)
     assert str(path) in str(caught.value)

@@ -2,8 +2,8 @@
 
 import numpy as np
 
-from pp_cl.image import read_rgba
-from pp_cl.preview import GAP, HEADER, comparison, write_comparison
+from pp_cl.files.contact_sheet import GAP, HEADER, comparison, write_comparison
+from pp_cl.files.image import read_rgba
 
 
 def tile(picture, row, column, height, width):
@@ -18,14 +18,20 @@ def test_tiles_stand_in_their_places(rng):
     truths[0, :5] = predictions[0, :5]
     truths[1, :5] = 1 - np.round(predictions[1, :5])
     picture = comparison(list(predictions), list(truths))
-    assert picture.dtype == np.uint8 and picture.shape == (HEADER + 2 * 30 + GAP, 3 * 40 + 2 * GAP, 3)
+    assert picture.dtype == np.uint8 and picture.shape == (
+        HEADER + 2 * 30 + GAP,
+        3 * 40 + 2 * GAP,
+        3,
+    )
     for row in range(2):
         assert np.abs(tile(picture, row, 0, 30, 40) - predictions[row] * 255).max() <= 0.5 + 1e-4
         assert np.abs(tile(picture, row, 1, 30, 40) - truths[row] * 255).max() <= 0.5 + 1e-4
         error = np.abs(predictions[row] - truths[row]).mean(axis=2)
         expected = 255 * np.clip(1 - 4 * error, 0, 1)
         assert np.abs(tile(picture, row, 2, 30, 40) - expected[..., None]).max() <= 0.5 + 1e-4
-    assert (tile(picture, 0, 2, 30, 40)[:5] == 255).all() and (tile(picture, 1, 2, 30, 40)[:5] == 0).all()
+    assert (tile(picture, 0, 2, 30, 40)[:5] == 255).all() and (
+        tile(picture, 1, 2, 30, 40)[:5] == 0
+    ).all()
     assert (picture[:HEADER] < 128).any(), "no captions"
 
 

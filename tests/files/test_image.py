@@ -8,7 +8,7 @@ import pytest
 from PIL import Image
 
 from pp_cl.errors import UserError
-from pp_cl.image import image_size, read_rgba, to_8bit, write_png
+from pp_cl.files.image import image_size, read_rgba, to_8bit, write_png
 
 
 @pytest.fixture
@@ -64,7 +64,9 @@ def test_sixteen_bits_are_refused(tmp_path, rgba):
 
 
 def test_file_cut_anywhere(tmp_path, rgba):
-    """A truncated file is an error or, where only its end mark is lost, the whole image; never a part of it."""
+    """A truncated file is an error or, where only its end mark is lost, the whole image; never a
+    part of it.
+    """
     whole, cut = tmp_path / "whole.png", tmp_path / "cut.png"
     write_png(whole, rgba)
     content = whole.read_bytes()
@@ -80,7 +82,9 @@ def test_file_cut_anywhere(tmp_path, rgba):
 
 
 def test_bytes_changed_anywhere(tmp_path, rgba, rng):
-    """Whatever a broken file makes the decoder raise, the user gets one line that names the file."""
+    """Whatever a broken file makes the decoder raise, the user gets one line that names the
+    file.
+    """
     path = tmp_path / "broken.png"
     write_png(path, rgba)
     content = np.frombuffer(path.read_bytes(), np.uint8)
@@ -101,8 +105,12 @@ def test_bytes_changed_anywhere(tmp_path, rgba, rng):
 def test_not_an_image(tmp_path, read):
     (tmp_path / "text.png").write_text("not an image")
     (tmp_path / "empty.png").touch()
-    for path, words in ((tmp_path / "text.png", "cannot be read"), (tmp_path / "empty.png", "cannot be read"),
-                        (tmp_path / "none.png", "no such image"), (tmp_path, "cannot be read")):
+    for path, words in (
+        (tmp_path / "text.png", "cannot be read"),
+        (tmp_path / "empty.png", "cannot be read"),
+        (tmp_path / "none.png", "no such image"),
+        (tmp_path, "cannot be read"),
+    ):
         with pytest.raises(UserError, match=words) as caught:
             read(path)
         assert str(path) in str(caught.value)
@@ -119,7 +127,15 @@ def test_written_image_comes_back(tmp_path, rng, shape):
 
 
 def test_to_8bit():
-    assert to_8bit([-1.0, 0.0, 0.49 / 255, 0.51 / 255, 254.4 / 255, 1.0, np.inf]).tolist() == [0, 0, 0, 1, 254, 255, 255]
+    assert to_8bit([-1.0, 0.0, 0.49 / 255, 0.51 / 255, 254.4 / 255, 1.0, np.inf]).tolist() == [
+        0,
+        0,
+        0,
+        1,
+        254,
+        255,
+        255,
+    ]
     with pytest.raises(ValueError, match="NaN"):
         to_8bit([0.5, np.nan])
 

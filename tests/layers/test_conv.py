@@ -1,29 +1,38 @@
-"""cl/conv.cl against float64."""
+"""cl/layers/conv.cl against float64."""
 
 import numpy as np
 import pytest
-from helpers import large, numeric_gradient, relative_error
-from oracle_conv import conv, conv_gradients
+from oracle.conv import conv, conv_gradients
+from support.comparisons import numeric_gradient, relative_error
+from support.conv_layers import (
+    SHAPES,
+    check_backward_input,
+    check_hard_inputs,
+    check_same_bits,
+    layer,
+)
 
-from pp_cl.conv import conv_backward_input, conv_forward, pack_bias, pack_weights, unpack_weights
-from pp_cl.conv_weights import flip_weights
-
-# (height, width, channels in, channels out): tiles of every width, tails, channels beside the multiples of 16
-SHAPES = [(1, 1, 3, 16), (1, 5, 16, 3), (5, 1, 20, 20), (3, 12, 1, 1),
-          *map(large, [(31, 33, 16, 48), (257, 3, 32, 16), (6, 31, 3, 64), (4, 257, 48, 32), (8, 8, 512, 32),
-                       (16, 24, 32, 512)])]
-
-
-def layer(rng, ci, co, k):
-    """Random weights and bias of PyTorch's initial size: (CO, CI, K, K), (CO,)."""
-    bound = 1 / np.sqrt(ci * k * k)
-    return rng.uniform(-bound, bound, (co, ci, k, k)).astype(np.float32), rng.uniform(-bound, bound, co).astype(np.float32)
+from pp_cl.layers.conv import (
+    conv_backward_input,
+    conv_forward,
+    pack_bias,
+    pack_weights,
+    unpack_weights,
+)
+from pp_cl.layers.conv_backward_weights import flip_weights
 
 
 def run_forward(dev, x, weight, bias, relu, x2=None):
     out = dev.empty((*x.shape[:2], len(bias)))
-    conv_forward(dev, dev.upload(x), dev.upload(pack_weights(weight)), dev.upload(pack_bias(bias)), out, relu,
-                 None if x2 is None else dev.upload(x2))
+    conv_forward(
+        dev,
+        dev.upload(x),
+        dev.upload(pack_weights(weight)),
+        dev.upload(pack_bias(bias)),
+        out,
+        relu,
+        None if x2 is None else dev.upload(x2),
+    )
     return out.get()
 
 
@@ -45,34 +54,6 @@ def test_packing_is_exact(rng):
     np.testing.assert_array_equal(unpack_weights(packed, 20), weight)
 
 
-def check_backward_input(dev, rng, shape, k, backward):
-    """backward: run_backward_input of a kernel; shape: (height, width, channels in, channels out)."""
-    height, width, ci, co = shape
-    x = np.maximum(rng.normal(size=(height, width, ci)), 0).astype(np.float32)
-    weight, _ = layer(rng, ci, co, k)
-    grad_out = rng.normal(size=(height, width, co)).astype(np.float32)
-    expected = conv_gradients(x, weight, grad_out)[0]
-    assert relative_error(backward(dev, x, weight, grad_out, False), expected) < 3e-6
-    assert relative_error(backward(dev, x, weight, grad_out, True), expected * (x > 0)) < 3e-6
-
-
-def check_hard_inputs(dev, rng, forward, backward):
-    """Large means; nothing but zeros."""
-    weight, bias = layer(rng, 16, 16, 3)
-    offset = (1e3 + rng.normal(size=(13, 17, 16))).astype(np.float32)
-    assert relative_error(forward(dev, offset, weight, bias, False), conv(offset, weight, bias)) < 3e-6
-    zeros = np.zeros_like(offset)
-    np.testing.assert_array_equal(forward(dev, zeros, weight, bias, False), np.broadcast_to(bias, zeros.shape))
-    assert not backward(dev, zeros, weight, offset, True).any()  # a ReLU at exactly 0 passes nothing
-
-
-def check_same_bits(dev, rng, forward):
-    """In two runs."""
-    x = rng.normal(size=(31, 50, 32)).astype(np.float32)
-    weight, bias = layer(rng, 32, 48, 3)
-    np.testing.assert_array_equal(forward(dev, x, weight, bias, True), forward(dev, x, weight, bias, True))
-
-
 @pytest.mark.parametrize("k", [1, 3])
 @pytest.mark.parametrize("shape", SHAPES)
 def test_forward(dev, rng, shape, k):
@@ -80,14 +61,23 @@ def test_forward(dev, rng, shape, k):
     x = rng.normal(size=(height, width, ci)).astype(np.float32)
     weight, bias = layer(rng, ci, co, k)
     assert relative_error(run_forward(dev, x, weight, bias, False), conv(x, weight, bias)) < 3e-6
-    assert relative_error(run_forward(dev, x, weight, bias, True), conv(x, weight, bias, True)) < 3e-6
+    assert (
+        relative_error(run_forward(dev, x, weight, bias, True), conv(x, weight, bias, True)) < 3e-6
+    )
 
 
 @pytest.mark.parametrize("c1, c2", [(16, 16), (16, 48), (3, 20)])
 def test_two_sources_are_a_concatenation(dev, rng, c1, c2):
     x = rng.normal(size=(7, 29, c1 + c2)).astype(np.float32)
     weight, bias = layer(rng, c1 + c2, 32, 3)
-    actual = run_forward(dev, np.ascontiguousarray(x[..., :c1]), weight, bias, True, np.ascontiguousarray(x[..., c1:]))
+    actual = run_forward(
+        dev,
+        np.ascontiguousarray(x[..., :c1]),
+        weight,
+        bias,
+        True,
+        np.ascontiguousarray(x[..., c1:]),
+    )
     assert relative_error(actual, conv(x, weight, bias, True)) < 3e-6
 
 
@@ -101,8 +91,13 @@ def test_backward_input_of_the_second_source(dev, rng):
     x2 = rng.normal(size=(9, 14, 20)).astype(np.float32)
     weight, _ = layer(rng, 16 + 20, 48, 3)
     grad_out = rng.normal(size=(9, 14, 48)).astype(np.float32)
-    expected = conv_gradients(np.concatenate([np.zeros((9, 14, 16)), x2], 2), weight, grad_out)[0][..., 16:]
-    assert relative_error(run_backward_input(dev, x2, weight, grad_out, False, first=16), expected) < 3e-6
+    expected = conv_gradients(np.concatenate([np.zeros((9, 14, 16)), x2], 2), weight, grad_out)[0][
+        ..., 16:
+    ]
+    assert (
+        relative_error(run_backward_input(dev, x2, weight, grad_out, False, first=16), expected)
+        < 3e-6
+    )
 
 
 def test_backward_input_by_finite_differences(dev, rng):
@@ -119,12 +114,16 @@ def test_hard_inputs(dev, rng):
 
 
 def test_work_groups_of_a_gpu(dev, rng, monkeypatch):
-    """The tiles and work-groups that other devices get: their tails reach beyond the image and the channels."""
+    """The tiles and work-groups that other devices get: their tails reach beyond the image and the
+    channels.
+    """
     monkeypatch.setattr(dev, "is_cpu", False)
     for height, width, ci, co in ((5, 37, 16, 48), (3, 2, 3, 20)):
         x, grad_out = (rng.normal(size=(height, width, c)).astype(np.float32) for c in (ci, co))
         weight, bias = layer(rng, ci, co, 3)
-        assert relative_error(run_forward(dev, x, weight, bias, False), conv(x, weight, bias)) < 3e-6
+        assert (
+            relative_error(run_forward(dev, x, weight, bias, False), conv(x, weight, bias)) < 3e-6
+        )
         expected = conv_gradients(x, weight, grad_out)[0]
         assert relative_error(run_backward_input(dev, x, weight, grad_out, False), expected) < 3e-6
 

@@ -1,23 +1,32 @@
-"""cl/conv_weights.cl against float64."""
+"""cl/layers/conv_backward_weights.cl against float64."""
 
 import numpy as np
 import pytest
-from helpers import numeric_gradient, relative_error
-from oracle_conv import conv, conv_gradients
-from test_conv import SHAPES, layer
+from oracle.conv import conv, conv_gradients
+from support.comparisons import numeric_gradient, relative_error
+from support.conv_layers import SHAPES, layer
 
-from pp_cl import conv_weights
-from pp_cl.conv import pack_bias, pack_weights, unpack_weights
-from pp_cl.conv_weights import flip_weights, partial_floats, weight_gradient
+from pp_cl.layers import conv_backward_weights as conv_weights
+from pp_cl.layers.conv import pack_bias, pack_weights, unpack_weights
+from pp_cl.layers.conv_backward_weights import flip_weights, partial_floats, weight_gradient
 
 
 def run_weight_gradient(dev, grad_out, k, *sources):
-    """((CO, CI, K, K), (CO,)) gradients from the device; asserts that the padding of both is zero."""
+    """((CO, CI, K, K), (CO,)) gradients from the device; asserts that the padding of both is
+    zero.
+    """
     co, ci = grad_out.shape[2], sum(s.shape[2] for s in sources)
     grad_weight, grad_bias = dev.empty((-(-co // 16), k, k, ci, 16)), dev.empty(-(-co // 16) * 16)
     partial = dev.empty(partial_floats(len(grad_out), grad_weight.shape))
-    weight_gradient(dev, dev.upload(sources[0]), dev.upload(grad_out), grad_weight, grad_bias, partial,
-                    *[dev.upload(s) for s in sources[1:]])
+    weight_gradient(
+        dev,
+        dev.upload(sources[0]),
+        dev.upload(grad_out),
+        grad_weight,
+        grad_bias,
+        partial,
+        *[dev.upload(s) for s in sources[1:]],
+    )
     weight, bias = unpack_weights(grad_weight.get(), co), grad_bias.get()[:co]
     np.testing.assert_array_equal(pack_weights(weight), grad_weight.get())
     np.testing.assert_array_equal(pack_bias(bias), grad_bias.get())
@@ -42,7 +51,9 @@ def test_two_sources_and_few_parts(dev, rng, monkeypatch, limit):
     monkeypatch.setattr(conv_weights, "PARTIAL_FLOATS", limit)
     x, x2 = (rng.normal(size=(33, 10, c)).astype(np.float32) for c in (16, 20))
     grad_out = rng.normal(size=(33, 10, 32)).astype(np.float32)
-    _, expected_weight, expected_bias = conv_gradients(np.concatenate([x, x2], 2), np.zeros((32, 36, 3, 3)), grad_out)
+    _, expected_weight, expected_bias = conv_gradients(
+        np.concatenate([x, x2], 2), np.zeros((32, 36, 3, 3)), grad_out
+    )
     weight, bias = run_weight_gradient(dev, grad_out, 3, x, x2)
     assert relative_error(weight, expected_weight) < 5e-6
     assert relative_error(bias, expected_bias) < 5e-6
@@ -59,12 +70,14 @@ def test_weight_gradient_by_finite_differences(dev, rng):
     assert relative_error(grad_bias, numeric) < 3e-6
 
 
-@pytest.mark.parametrize("k, ci, co, first, c", [(3, 16, 16, 0, 16), (3, 48, 3, 16, 32), (1, 20, 32, 16, 4)])
+@pytest.mark.parametrize(
+    "k, ci, co, first, c", [(3, 16, 16, 0, 16), (3, 48, 3, 16, 32), (1, 20, 32, 16, 4)]
+)
 def test_flip(dev, rng, k, ci, co, first, c):
     weight = rng.normal(size=(co, ci, k, k)).astype(np.float32)
     flipped = dev.empty((-(-c // 16), k, k, co, 16))
     flip_weights(dev, dev.upload(pack_weights(weight)), first, flipped)
-    expected = weight[:, first:first + c, ::-1, ::-1].transpose(1, 0, 2, 3)
+    expected = weight[:, first : first + c, ::-1, ::-1].transpose(1, 0, 2, 3)
     np.testing.assert_array_equal(flipped.get(), pack_weights(expected))
 
 
@@ -91,7 +104,10 @@ def test_work_groups_of_a_gpu(dev, rng, monkeypatch):
 def test_same_bits_twice(dev, rng):
     x = rng.normal(size=(57, 40, 32)).astype(np.float32)
     grad_out = rng.normal(size=(57, 40, 16)).astype(np.float32)
-    first, second = run_weight_gradient(dev, grad_out, 3, x), run_weight_gradient(dev, grad_out, 3, x)
+    first, second = (
+        run_weight_gradient(dev, grad_out, 3, x),
+        run_weight_gradient(dev, grad_out, 3, x),
+    )
     np.testing.assert_array_equal(first[0], second[0])
     np.testing.assert_array_equal(first[1], second[1])
 

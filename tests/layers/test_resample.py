@@ -1,11 +1,11 @@
-"""cl/layers.cl against float64."""
+"""cl/layers/resample.cl against float64."""
 
 import numpy as np
-import oracle_layers as oracle
 import pytest
-from helpers import numeric_gradient, relative_error
+from oracle import layers as oracle
+from support.comparisons import numeric_gradient, relative_error
 
-from pp_cl import layers
+from pp_cl.layers import resample as layers
 
 SHAPES = [(1, 1, 16), (1, 5, 3), (31, 33, 17), (3, 257, 32), (12, 1, 48)]
 
@@ -23,10 +23,15 @@ def test_avgpool(dev, rng, shape):
 def test_avgpool_backward_adds_and_masks(dev, rng, shape):
     h, w, c = shape
     x = np.maximum(rng.normal(size=(2 * h, 2 * w, c)), 0).astype(np.float32)
-    other, grad_out = rng.normal(size=x.shape).astype(np.float32), rng.normal(size=shape).astype(np.float32)
+    other, grad_out = (
+        rng.normal(size=x.shape).astype(np.float32),
+        rng.normal(size=shape).astype(np.float32),
+    )
     grad_x = dev.upload(other)
     layers.avgpool2_backward(dev, dev.upload(x), dev.upload(grad_out), grad_x)
-    assert relative_error(grad_x.get(), (other + oracle.avgpool2_gradient(grad_out)) * (x > 0)) < 5e-7
+    assert (
+        relative_error(grad_x.get(), (other + oracle.avgpool2_gradient(grad_out)) * (x > 0)) < 5e-7
+    )
 
 
 @pytest.mark.parametrize("shape", [(2, 2, 16), (3, 5, 3), (31, 33, 17), (257, 2, 32), (1, 9, 16)])
@@ -40,7 +45,10 @@ def test_maxpool_drops_odd_borders(dev, rng, shape):
 @pytest.mark.parametrize("shape", SHAPES)
 def test_upsample(dev, rng, shape):
     h, w, c = shape
-    x, grad_out = rng.normal(size=shape).astype(np.float32), rng.normal(size=(2 * h, 2 * w, c)).astype(np.float32)
+    x, grad_out = (
+        rng.normal(size=shape).astype(np.float32),
+        rng.normal(size=(2 * h, 2 * w, c)).astype(np.float32),
+    )
     out, grad_x = dev.empty(grad_out.shape), dev.empty(shape)
     layers.upsample2_forward(dev, dev.upload(x), out)
     layers.upsample2_backward(dev, dev.upload(grad_out), grad_x)

@@ -1,16 +1,33 @@
-"""cl/tiles.cl against numpy, and the kernels that compute some tiles only."""
+"""cl/layers/tiles.cl against numpy, and the kernels that compute some tiles only."""
 
 import numpy as np
 import pytest
-from helpers import large, relative_error
-from oracle_conv import conv_gradients
-from oracle_layers import avgpool2, avgpool2_gradient, upsample2, upsample2_gradient
-from test_conv import layer
+from oracle.conv import conv_gradients
+from oracle.layers import avgpool2, avgpool2_gradient, upsample2, upsample2_gradient
+from support.comparisons import relative_error
+from support.conv_layers import layer
+from support.guarded import large
 
-from pp_cl import layers
-from pp_cl.conv import pack_bias, pack_weights, unpack_weights
-from pp_cl.tiles import SIDE, all_tiles, checked_tiles, grid_shape, some_tiles, tiles_compare, tiles_copy, tiles_find
-from pp_cl.variants import VARIANTS, Work, backward_input, backward_weights, forward, work_floats
+from pp_cl.layers import resample as layers
+from pp_cl.layers.conv import pack_bias, pack_weights, unpack_weights
+from pp_cl.layers.tiles import (
+    SIDE,
+    all_tiles,
+    checked_tiles,
+    grid_shape,
+    some_tiles,
+    tiles_compare,
+    tiles_copy,
+    tiles_find,
+)
+from pp_cl.layers.variants import (
+    VARIANTS,
+    Work,
+    backward_input,
+    backward_weights,
+    forward,
+    work_floats,
+)
 
 # (height, width, channels): less than a tile, cut-off tiles, several work-groups
 SHAPES = [(1, 1, 1), (3, 5, 16), (31, 33, 3), (4, 257, 20), (257, 8, 16)]
@@ -24,7 +41,11 @@ def pixels_of(tiles, height, width):
 def by_tile(image):
     """{(row, column): pixels} of an image's tiles."""
     rows, columns = grid_shape(*image.shape[:2])
-    return {(r, c): image[r * SIDE:(r + 1) * SIDE, c * SIDE:(c + 1) * SIDE] for r in range(rows) for c in range(columns)}
+    return {
+        (r, c): image[r * SIDE : (r + 1) * SIDE, c * SIDE : (c + 1) * SIDE]
+        for r in range(rows)
+        for c in range(columns)
+    }
 
 
 def random_counts(rng, height, width):
@@ -36,7 +57,9 @@ def random_counts(rng, height, width):
 
 @pytest.mark.parametrize("shape", SHAPES)
 def test_find(dev, rng, shape):
-    x = np.where(rng.random(shape) < 0.02, rng.choice([0.0, np.nan, np.inf, 1 + 2**-23], shape), 1).astype(np.float32)
+    x = np.where(
+        rng.random(shape) < 0.02, rng.choice([0.0, np.nan, np.inf, 1 + 2**-23], shape), 1
+    ).astype(np.float32)
     found = tiles_find(dev, dev.upload(x), 1.0)
     assert found.shape == grid_shape(*shape[:2])
     for place, tile in by_tile(x).items():
@@ -45,7 +68,9 @@ def test_find(dev, rng, shape):
 
 @pytest.mark.parametrize("shape", SHAPES)
 def test_compare(dev, rng, shape):
-    x = np.where(rng.random(shape) < 0.02, rng.choice([-0.0, np.nan, 1e-45], shape), 0).astype(np.float32)
+    x = np.where(rng.random(shape) < 0.02, rng.choice([-0.0, np.nan, 1e-45], shape), 0).astype(
+        np.float32
+    )
     tiles = by_tile(x)
     source = np.arange(len(tiles)).reshape(grid_shape(*shape[:2]))
     whole = [place for place, tile in tiles.items() if tile.shape[:2] == (SIDE, SIDE)]
@@ -93,7 +118,9 @@ def test_lists_and_wrong_sizes(dev):
 @pytest.mark.parametrize("k, variant", [(1, "direct"), *[(3, variant) for variant in VARIANTS]])
 @pytest.mark.parametrize("height, width", [(3, 2), (11, 14), large(31, 33), large(6, 70)])
 def test_convolutions_compute_the_chosen_tiles(dev, rng, k, variant, height, width):
-    """The other tiles of the results keep their NaN; those of a gradient that do not count may hold NaN."""
+    """The other tiles of the results keep their NaN; those of a gradient that do not count may hold
+    NaN.
+    """
     c1, c2, co = 16, 32, 48
     weight, bias = layer(rng, c1 + c2, co, k)
     x = np.maximum(rng.normal(size=(height, width, c1 + c2)), 0).astype(np.float32)
@@ -105,22 +132,59 @@ def test_convolutions_compute_the_chosen_tiles(dev, rng, k, variant, height, wid
     device_weight, device_grad = dev.upload(pack_weights(weight)), dev.upload(grad_out)
 
     def work(direction, c=None):
-        return Work(*[dev.empty(max(1, n)) for n in work_floats(dev, variant, direction, height, device_weight.shape, c)])
+        return Work(
+            *[
+                dev.empty(max(1, n))
+                for n in work_floats(dev, variant, direction, height, device_weight.shape, c)
+            ]
+        )
 
     bias = dev.upload(pack_bias(bias))
     whole, out = dev.empty((height, width, co)), dev.empty((height, width, co))
     for result, which in ((whole, None), (out, tiles)):
-        forward(dev, variant, sources[0], device_weight, bias, result, True, work("forward"), sources[1], which)
+        forward(
+            dev,
+            variant,
+            sources[0],
+            device_weight,
+            bias,
+            result,
+            True,
+            work("forward"),
+            sources[1],
+            which,
+        )
     np.testing.assert_array_equal(out.get(), np.where(chosen[..., None], whole.get(), np.nan))
 
     whole, grad_x = dev.empty((height, width, c2)), dev.empty((height, width, c2))
     for result, which in ((whole, None), (grad_x, tiles)):
-        backward_input(dev, variant, sources[1], device_weight, c1, device_grad, result, True, work("input", c2), which)
+        backward_input(
+            dev,
+            variant,
+            sources[1],
+            device_weight,
+            c1,
+            device_grad,
+            result,
+            True,
+            work("input", c2),
+            which,
+        )
     np.testing.assert_array_equal(grad_x.get(), np.where(chosen[..., None], whole.get(), np.nan))
 
     grad_weight, grad_bias = dev.empty(device_weight.shape), dev.empty(co)
     poisoned = dev.upload(np.where(chosen[..., None], grad_out, np.nan), np.float32)
-    backward_weights(dev, variant, sources[0], poisoned, grad_weight, grad_bias, work("weights"), sources[1], tiles)
+    backward_weights(
+        dev,
+        variant,
+        sources[0],
+        poisoned,
+        grad_weight,
+        grad_bias,
+        work("weights"),
+        sources[1],
+        tiles,
+    )
     counted = grad_out * pixels_of(counts, height, width)[..., None]
     expected = conv_gradients(x, weight, counted.astype(np.float64))
     assert relative_error(unpack_weights(grad_weight.get(), co), expected[1]) < 1e-5
@@ -129,18 +193,30 @@ def test_convolutions_compute_the_chosen_tiles(dev, rng, k, variant, height, wid
 
 @pytest.mark.parametrize("height, width, channels", [(1, 1, 16), (5, 7, 20), (33, 6, 16)])
 def test_layers_compute_the_chosen_tiles(dev, rng, height, width, channels):
-    low, high = (rng.normal(size=(f * height, f * width, channels)).astype(np.float32) for f in (1, 2))
+    low, high = (
+        rng.normal(size=(f * height, f * width, channels)).astype(np.float32) for f in (1, 2)
+    )
     other = rng.normal(size=high.shape).astype(np.float32)
 
     def check(call, shape, expected, *inputs, start=None):
         counts = random_counts(rng, *shape[:2])
         result = dev.empty(shape) if start is None else dev.upload(start)
         call(dev, *[dev.upload(i) for i in inputs], result, some_tiles(dev, shape[:2], counts))
-        chosen, untouched = pixels_of(counts > 0, *shape[:2]), np.full(shape, np.nan) if start is None else start
+        chosen, untouched = (
+            pixels_of(counts > 0, *shape[:2]),
+            np.full(shape, np.nan) if start is None else start,
+        )
         np.testing.assert_array_equal(result.get()[~chosen], untouched[~chosen])
         assert relative_error(result.get()[chosen], expected[chosen]) < 2e-6
 
     check(layers.avgpool2_forward, low.shape, avgpool2(high), high)
     check(layers.upsample2_forward, high.shape, upsample2(low), low)
     check(layers.upsample2_backward, low.shape, upsample2_gradient(high), high)
-    check(layers.avgpool2_backward, high.shape, (other + avgpool2_gradient(low)) * (high > 0), high, low, start=other)
+    check(
+        layers.avgpool2_backward,
+        high.shape,
+        (other + avgpool2_gradient(low)) * (high > 0),
+        high,
+        low,
+        start=other,
+    )

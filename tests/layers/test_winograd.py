@@ -1,32 +1,22 @@
-"""cl/winograd.cl against float64."""
+"""cl/layers/winograd.cl against float64."""
 
 import numpy as np
 import pytest
-from helpers import large, relative_error
-from oracle_conv import conv, conv_gradients
-from oracle_winograd import convolve
-from test_conv import layer
-from test_winograd_filter import transformed_by_device
+from oracle.conv import conv, conv_gradients
+from oracle.winograd import convolve
+from support.comparisons import relative_error
+from support.conv_layers import layer
+from support.winograd_layers import BOUNDS, SHAPES, run_forward, transformed_by_device
 
-from pp_cl import winograd
-from pp_cl.conv import pack_bias, pack_weights
-from pp_cl.winograd import scratch_floats, transformed_floats, winograd_backward_input, winograd_forward
-from pp_cl.winograd_filter import transform_flipped_weights, transform_weights
-
-# (height, width, channels in, channels out): less than a tile, tails of tiles, groups and rounds, odd blocks of channels
-SHAPES = [(1, 1, 16, 16), (1, 5, 16, 32), (5, 1, 32, 48), (31, 33, 16, 48),
-          *map(large, [(257, 3, 32, 16), (6, 31, 48, 64), (4, 257, 64, 32), (8, 8, 512, 32), (16, 24, 32, 512)])]
-# Float32's largest error over the largest value; F(4x4)'s transforms cost more of it than the sums do.
-BOUNDS = {2: 3e-6, 4: 8e-6}
-
-
-def run_forward(dev, m, x, weight, bias, relu, x2=None, half=False):
-    co, ci = weight.shape[:2]
-    out, transformed = dev.empty((*x.shape[:2], co)), dev.empty(transformed_floats(m, ci, co, half))
-    transform_weights(dev, m, dev.upload(pack_weights(weight)), transformed, half)
-    winograd_forward(dev, m, dev.upload(x), transformed, dev.upload(pack_bias(bias)), out, relu,
-                     dev.empty(scratch_floats(dev, m, ci, co)), None if x2 is None else dev.upload(x2), half)
-    return out.get()
+from pp_cl.layers import winograd
+from pp_cl.layers.conv import pack_weights
+from pp_cl.layers.winograd import (
+    scratch_floats,
+    transformed_floats,
+    winograd_backward_input,
+    winograd_forward,
+)
+from pp_cl.layers.winograd_transform import transform_flipped_weights
 
 
 def run_backward_input(dev, m, x, weight, grad_out, masked, first=0, half=False):
@@ -34,8 +24,17 @@ def run_backward_input(dev, m, x, weight, grad_out, masked, first=0, half=False)
     transformed = dev.empty(transformed_floats(m, c, co, half))
     transform_flipped_weights(dev, m, dev.upload(pack_weights(weight)), first, c, transformed, half)
     grad_x = dev.empty(x.shape)
-    winograd_backward_input(dev, m, dev.upload(x), transformed, dev.upload(grad_out), grad_x, masked,
-                            dev.empty(scratch_floats(dev, m, c, co)), half)
+    winograd_backward_input(
+        dev,
+        m,
+        dev.upload(x),
+        transformed,
+        dev.upload(grad_out),
+        grad_x,
+        masked,
+        dev.empty(scratch_floats(dev, m, c, co)),
+        half,
+    )
     return grad_x.get()
 
 
@@ -46,7 +45,10 @@ def test_forward(dev, rng, shape, m):
     x = rng.normal(size=(height, width, ci)).astype(np.float32)
     weight, bias = layer(rng, ci, co, 3)
     for relu in (False, True):
-        assert relative_error(run_forward(dev, m, x, weight, bias, relu), conv(x, weight, bias, relu)) < BOUNDS[m]
+        assert (
+            relative_error(run_forward(dev, m, x, weight, bias, relu), conv(x, weight, bias, relu))
+            < BOUNDS[m]
+        )
 
 
 @pytest.mark.parametrize("m", BOUNDS)
@@ -54,7 +56,15 @@ def test_forward(dev, rng, shape, m):
 def test_two_sources_are_a_concatenation(dev, rng, c1, c2, m):
     x = rng.normal(size=(7, 29, c1 + c2)).astype(np.float32)
     weight, bias = layer(rng, c1 + c2, 32, 3)
-    actual = run_forward(dev, m, np.ascontiguousarray(x[..., :c1]), weight, bias, True, np.ascontiguousarray(x[..., c1:]))
+    actual = run_forward(
+        dev,
+        m,
+        np.ascontiguousarray(x[..., :c1]),
+        weight,
+        bias,
+        True,
+        np.ascontiguousarray(x[..., c1:]),
+    )
     assert relative_error(actual, conv(x, weight, bias, True)) < BOUNDS[m]
 
 
@@ -66,8 +76,13 @@ def test_backward_input(dev, rng, shape, m):
     weight, _ = layer(rng, ci, co, 3)
     grad_out = rng.normal(size=(height, width, co)).astype(np.float32)
     expected = conv_gradients(x, weight, grad_out)[0]
-    assert relative_error(run_backward_input(dev, m, x, weight, grad_out, False), expected) < BOUNDS[m]
-    assert relative_error(run_backward_input(dev, m, x, weight, grad_out, True), expected * (x > 0)) < BOUNDS[m]
+    assert (
+        relative_error(run_backward_input(dev, m, x, weight, grad_out, False), expected) < BOUNDS[m]
+    )
+    assert (
+        relative_error(run_backward_input(dev, m, x, weight, grad_out, True), expected * (x > 0))
+        < BOUNDS[m]
+    )
 
 
 @pytest.mark.parametrize("m", BOUNDS)
@@ -75,55 +90,96 @@ def test_backward_input_of_the_second_source(dev, rng, m):
     x2 = rng.normal(size=(9, 14, 48)).astype(np.float32)
     weight, _ = layer(rng, 16 + 48, 32, 3)
     grad_out = rng.normal(size=(9, 14, 32)).astype(np.float32)
-    expected = conv_gradients(np.concatenate([np.zeros((9, 14, 16)), x2], 2), weight, grad_out)[0][..., 16:]
-    assert relative_error(run_backward_input(dev, m, x2, weight, grad_out, False, first=16), expected) < BOUNDS[m]
+    expected = conv_gradients(np.concatenate([np.zeros((9, 14, 16)), x2], 2), weight, grad_out)[0][
+        ..., 16:
+    ]
+    assert (
+        relative_error(run_backward_input(dev, m, x2, weight, grad_out, False, first=16), expected)
+        < BOUNDS[m]
+    )
 
 
 @pytest.mark.parametrize("m", BOUNDS)
 def test_hard_inputs(dev, rng, m):
     weight, bias = layer(rng, 32, 32, 3)
     offset = (1e3 + rng.normal(size=(13, 17, 32))).astype(np.float32)
-    assert relative_error(run_forward(dev, m, offset, weight, bias, False), conv(offset, weight, bias)) < BOUNDS[m]
+    assert (
+        relative_error(run_forward(dev, m, offset, weight, bias, False), conv(offset, weight, bias))
+        < BOUNDS[m]
+    )
     zeros = np.zeros_like(offset)
-    np.testing.assert_array_equal(run_forward(dev, m, zeros, weight, bias, False), np.broadcast_to(bias, zeros.shape))
-    assert not run_backward_input(dev, m, zeros, weight, offset, True).any()  # a ReLU at exactly 0 passes nothing
+    np.testing.assert_array_equal(
+        run_forward(dev, m, zeros, weight, bias, False), np.broadcast_to(bias, zeros.shape)
+    )
+    # a ReLU at exactly 0 passes nothing
+    assert not run_backward_input(dev, m, zeros, weight, offset, True).any()
 
 
 @pytest.mark.parametrize("m", BOUNDS)
 def test_weights_over_six_decades(dev, rng, m):
-    """Each output channel keeps its own accuracy; among input channels the error is small against the largest."""
+    """Each output channel keeps its own accuracy; among input channels the error is small against
+    the largest.
+    """
     x = rng.normal(size=(13, 17, 32)).astype(np.float32)
     decades = np.logspace(-3, 3, 32)
     weight, _ = layer(rng, 32, 32, 3)
     by_output = (weight * decades[:, None, None, None]).astype(np.float32)
-    actual, expected = run_forward(dev, m, x, by_output, np.zeros(32), False), conv(x, by_output, np.zeros(32))
+    actual, expected = (
+        run_forward(dev, m, x, by_output, np.zeros(32), False),
+        conv(x, by_output, np.zeros(32)),
+    )
     for channel in range(32):
         assert relative_error(actual[..., channel], expected[..., channel]) < BOUNDS[m]
     by_input = (weight * decades[:, None, None]).astype(np.float32)
-    assert relative_error(run_forward(dev, m, x, by_input, np.zeros(32), False), conv(x, by_input, np.zeros(32))) < BOUNDS[m]
+    assert (
+        relative_error(
+            run_forward(dev, m, x, by_input, np.zeros(32), False), conv(x, by_input, np.zeros(32))
+        )
+        < BOUNDS[m]
+    )
 
 
 @pytest.mark.parametrize("shape", SHAPES)
 def test_weights_stored_as_half_are_convolved_in_float32(dev, rng, shape):
-    """Rounded weights are other weights (test_winograd_filter.py: which); from there on nothing more is rounded."""
+    """Rounded weights are other weights (test_winograd_filter.py: which); from there on nothing
+    more is rounded.
+    """
     height, width, ci, co = shape
     x = np.maximum(rng.normal(size=(height, width, ci)), 0).astype(np.float32)
     weight, bias = layer(rng, ci, co, 3)
     grad_out = rng.normal(size=(height, width, co)).astype(np.float32)
     expected = np.maximum(convolve(4, x, transformed_by_device(dev, 4, True, weight)[1]) + bias, 0)
-    assert relative_error(run_forward(dev, 4, x, weight, bias, True, half=True), expected) < BOUNDS[4]
-    expected = convolve(4, grad_out, transformed_by_device(dev, 4, True, weight, True, 0, ci)[1]) * (x > 0)
-    assert relative_error(run_backward_input(dev, 4, x, weight, grad_out, True, half=True), expected) < BOUNDS[4]
+    assert (
+        relative_error(run_forward(dev, 4, x, weight, bias, True, half=True), expected) < BOUNDS[4]
+    )
+    expected = convolve(
+        4, grad_out, transformed_by_device(dev, 4, True, weight, True, 0, ci)[1]
+    ) * (x > 0)
+    assert (
+        relative_error(run_backward_input(dev, 4, x, weight, grad_out, True, half=True), expected)
+        < BOUNDS[4]
+    )
 
 
 def test_half_of_two_sources(dev, rng):
     x, x2 = (rng.normal(size=(9, 14, c)).astype(np.float32) for c in (16, 48))
     weight, bias = layer(rng, 16 + 48, 32, 3)
     grad_out = rng.normal(size=(9, 14, 32)).astype(np.float32)
-    expected = convolve(4, np.concatenate([x, x2], 2), transformed_by_device(dev, 4, True, weight)[1]) + bias
-    assert relative_error(run_forward(dev, 4, x, weight, bias, False, x2, half=True), expected) < BOUNDS[4]
+    expected = (
+        convolve(4, np.concatenate([x, x2], 2), transformed_by_device(dev, 4, True, weight)[1])
+        + bias
+    )
+    assert (
+        relative_error(run_forward(dev, 4, x, weight, bias, False, x2, half=True), expected)
+        < BOUNDS[4]
+    )
     expected = convolve(4, grad_out, transformed_by_device(dev, 4, True, weight, True, 16, 48)[1])
-    assert relative_error(run_backward_input(dev, 4, x2, weight, grad_out, False, 16, half=True), expected) < BOUNDS[4]
+    assert (
+        relative_error(
+            run_backward_input(dev, 4, x2, weight, grad_out, False, 16, half=True), expected
+        )
+        < BOUNDS[4]
+    )
 
 
 @pytest.mark.large
@@ -148,11 +204,16 @@ def test_relu_hides_no_nan(dev, rng, m):
 
 def test_wrong_shapes_are_refused(dev):
     x, out, bias = dev.zeros((4, 4, 16)), dev.zeros((4, 4, 32)), dev.zeros(32)
-    transformed, scratch = dev.zeros(transformed_floats(4, 16, 32)), dev.zeros(scratch_floats(dev, 4, 16, 32))
+    transformed, scratch = (
+        dev.zeros(transformed_floats(4, 16, 32)),
+        dev.zeros(scratch_floats(dev, 4, 16, 32)),
+    )
     with pytest.raises(ValueError, match="3 \\+ 0 to 32 channels"):
         winograd_forward(dev, 4, dev.zeros((4, 4, 3)), transformed, bias, out, False, scratch)
     with pytest.raises(ValueError, match="16 \\+ 20"):
-        winograd_forward(dev, 4, x, transformed, bias, out, False, scratch, x2=dev.zeros((4, 4, 20)))
+        winograd_forward(
+            dev, 4, x, transformed, bias, out, False, scratch, x2=dev.zeros((4, 4, 20))
+        )
     with pytest.raises(ValueError, match="bias"):
         winograd_forward(dev, 4, x, transformed, dev.zeros(16), out, False, scratch)
     with pytest.raises(ValueError, match="width"):

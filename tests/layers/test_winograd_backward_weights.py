@@ -1,24 +1,16 @@
-"""cl/winograd_weights.cl against float64."""
+"""cl/layers/winograd_backward_weights.cl against float64."""
 
 import numpy as np
 import pytest
-from helpers import large, relative_error
-from oracle_conv import conv_gradients
-from test_winograd import BOUNDS, SHAPES
+from oracle.conv import conv_gradients
+from support.comparisons import relative_error
+from support.guarded import large
+from support.winograd_layers import BOUNDS, SHAPES, run_weight_gradient
 
-from pp_cl.conv import unpack_weights
-from pp_cl.winograd_weights import gradient_scratch_floats, winograd_weight_gradient
+from pp_cl.layers.winograd_backward_weights import gradient_scratch_floats, winograd_weight_gradient
 
 # With parts of 128 x 128 channels: several, and tails of both kinds
 PARTS = [*map(large, [(5, 6, 80, 144), (9, 7, 144, 48), (12, 20, 272, 256)])]
-
-
-def run_weight_gradient(dev, m, grad_out, *sources):
-    co, ci = grad_out.shape[2], sum(s.shape[2] for s in sources)
-    grad_weight, grad_bias = dev.empty((co // 16, 3, 3, ci, 16)), dev.empty(co)
-    winograd_weight_gradient(dev, m, dev.upload(sources[0]), dev.upload(grad_out), grad_weight, grad_bias,
-                             dev.empty(gradient_scratch_floats(dev, m)), *[dev.upload(s) for s in sources[1:]])
-    return unpack_weights(grad_weight.get(), co), grad_bias.get()
 
 
 @pytest.mark.parametrize("m", BOUNDS)
@@ -39,7 +31,9 @@ def test_two_sources(dev, rng, c1, c2, m):
     x, x2 = (rng.normal(size=(33, 10, c)).astype(np.float32) for c in (c1, c2))
     grad_out = rng.normal(size=(33, 10, 32)).astype(np.float32)
     joined = np.concatenate([x, x2], 2)
-    _, expected_weight, expected_bias = conv_gradients(joined, np.zeros((32, c1 + c2, 3, 3)), grad_out)
+    _, expected_weight, expected_bias = conv_gradients(
+        joined, np.zeros((32, c1 + c2, 3, 3)), grad_out
+    )
     weight, bias = run_weight_gradient(dev, m, grad_out, x, x2)
     assert relative_error(weight, expected_weight) < BOUNDS[m]
     assert relative_error(bias, expected_bias) < BOUNDS[m]
@@ -70,13 +64,19 @@ def test_same_bits_for_any_number_of_compute_units(dev, rng, monkeypatch, units)
 
 @pytest.mark.large
 def test_wrong_shapes_are_refused(dev):
-    x, grad_out, scratch = dev.zeros((4, 4, 16)), dev.zeros((4, 4, 32)), dev.zeros(gradient_scratch_floats(dev, 4))
+    x, grad_out, scratch = (
+        dev.zeros((4, 4, 16)),
+        dev.zeros((4, 4, 32)),
+        dev.zeros(gradient_scratch_floats(dev, 4)),
+    )
     grad_weight, grad_bias = dev.zeros((2, 3, 3, 16, 16)), dev.zeros(32)
     with pytest.raises(ValueError, match="\\[16, 16\\] to 32 channels"):
         winograd_weight_gradient(dev, 4, x, grad_out, grad_weight, grad_bias, scratch, x2=x)
     with pytest.raises(ValueError, match="bias \\(16,\\)"):
         winograd_weight_gradient(dev, 4, x, grad_out, grad_weight, dev.zeros(16), scratch)
     with pytest.raises(ValueError, match="\\[3\\] to 32"):
-        winograd_weight_gradient(dev, 4, dev.zeros((4, 4, 3)), grad_out, dev.zeros((2, 3, 3, 3, 16)), grad_bias, scratch)
+        winograd_weight_gradient(
+            dev, 4, dev.zeros((4, 4, 3)), grad_out, dev.zeros((2, 3, 3, 3, 16)), grad_bias, scratch
+        )
     with pytest.raises(ValueError, match="scratch has 10 floats"):
         winograd_weight_gradient(dev, 4, x, grad_out, grad_weight, grad_bias, dev.zeros(10))

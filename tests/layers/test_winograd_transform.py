@@ -1,57 +1,46 @@
-"""cl/winograd_filter.cl against float64: every transformed weight, the powers of two that half is scaled by."""
+"""cl/layers/winograd_transform.cl against float64: every transformed weight, the powers of two that
+half is scaled by.
+"""
 
 import numpy as np
 import pytest
-from oracle_conv import conv
-from oracle_winograd import ROUNDING, SMALLEST, convolve, matrices
-from oracle_winograd import transform_weights as exact_weights
+from oracle.conv import conv
+from oracle.winograd import ROUNDING, SMALLEST, convolve, matrices
+from oracle.winograd import transform_weights as exact_weights
+from support.winograd_layers import transformed_by_device
 
-from pp_cl.conv import pack_weights
-from pp_cl.reference import flipped
-from pp_cl.variants import VARIANTS
-from pp_cl.winograd import positions, transformed_floats
-from pp_cl.winograd_filter import transform_flipped_weights, transform_weights
+from pp_cl.layers.variants import VARIANTS
+from pp_cl.layers.winograd import transformed_floats
+from pp_cl.layers.winograd_transform import transform_flipped_weights, transform_weights
+from pp_cl.reference.network import flipped
 
 FORMS = [form for form in VARIANTS.values() if form[0]]
 SHAPES = [(16, 16), (48, 16), (16, 80), (64, 32), (272, 144)]  # channels in, out
-FLOAT = 2.0**-24 * 12  # float32's rounding times the operations, in a row, that make one transformed weight
-
-
-def stored_weights(array, m, ci, co, half):
-    """(units (CO,), transformed weights (S, S, CO, CI)) in float64 from what cl/winograd.h lays out."""
-    array = array.get()
-    units, weights = (array[:co], array[co:].view(np.float16)) if half else (np.ones(co), array)
-    weights = weights[:positions(m) * (ci * co + 16)].reshape(m + 2, m + 2, -1)[..., :-16]
-    weights = weights.reshape(m + 2, m + 2, co // 16, ci, 16)
-    return units.astype(np.float64), weights.swapaxes(3, 4).reshape(m + 2, m + 2, co, ci) * units.astype(np.float64)[:, None]
-
-
-def transformed_by_device(dev, m, half, weight, flip=False, first=0, c=None):
-    """stored_weights of weight (CO, CI, 3, 3); flip: for the gradient of c input channels from `first` on."""
-    co, ci = weight.shape[:2]
-    ci, co = (co, c) if flip else (ci, co)
-    transformed = dev.empty(transformed_floats(m, ci, co, half))
-    if flip:
-        transform_flipped_weights(dev, m, dev.upload(pack_weights(weight)), first, c, transformed, half)
-    else:
-        transform_weights(dev, m, dev.upload(pack_weights(weight)), transformed, half)
-    return stored_weights(transformed, m, ci, co, half)
+# float32's rounding times the operations, in a row, that make one transformed weight
+FLOAT = 2.0**-24 * 12
 
 
 def wide_layer(rng, ci, co):
     """Weights over twelve decades: the largest of a channel is one of a kind."""
-    return (10**rng.uniform(-6, 6, (co, ci, 3, 3)) * rng.choice([-1, 1], (co, ci, 3, 3))).astype(np.float32)
+    return (10 ** rng.uniform(-6, 6, (co, ci, 3, 3)) * rng.choice([-1, 1], (co, ci, 3, 3))).astype(
+        np.float32
+    )
 
 
 def check(m, half, units, actual, weight):
-    """Every transformed weight is within its own rounding of float64's; units are what brings the largest to 2^13."""
+    """Every transformed weight is within its own rounding of float64's; units are what brings the
+    largest to 2^13.
+    """
     if half:
-        _, exponents = np.frexp(np.abs(weight).max((1, 2, 3)).astype(np.float64) + 2.0**-130)  # 2^13 is 0.5 * 2^14
+        # 2^13 is 0.5 * 2^14
+        _, exponents = np.frexp(np.abs(weight).max((1, 2, 3)).astype(np.float64) + 2.0**-130)
         np.testing.assert_array_equal(units, np.ldexp(1.0, np.maximum(exponents - 14, -126)))
     expected, terms = exact_weights(m, weight), exact_weights(m, weight, magnitude=True)
     bound = FLOAT * terms
     if half:
-        bound = bound * (1 + ROUNDING) + np.maximum(ROUNDING * np.abs(expected), SMALLEST / 2 * units[:, None])
+        bound = bound * (1 + ROUNDING) + np.maximum(
+            ROUNDING * np.abs(expected), SMALLEST / 2 * units[:, None]
+        )
     assert (np.abs(actual - expected) <= bound).all()
 
 
@@ -60,8 +49,12 @@ def test_the_oracle():
     rng = np.random.default_rng(0)
     x, weight = rng.normal(size=(7, 10, 3)), rng.normal(size=(4, 3, 3, 3))
     for m in (2, 4):
-        np.testing.assert_allclose(convolve(m, x, exact_weights(m, weight)), conv(x, weight, np.zeros(4)), atol=1e-12)
-    np.testing.assert_allclose(matrices(2)[2], [[1, 0, -1, 0], [0, 1, 1, 0], [0, -1, 1, 0], [0, -1, 0, 1]], atol=1e-12)
+        np.testing.assert_allclose(
+            convolve(m, x, exact_weights(m, weight)), conv(x, weight, np.zeros(4)), atol=1e-12
+        )
+    np.testing.assert_allclose(
+        matrices(2)[2], [[1, 0, -1, 0], [0, 1, 1, 0], [0, -1, 1, 0], [0, -1, 0, 1]], atol=1e-12
+    )
 
 
 @pytest.mark.parametrize("m, half", FORMS)
@@ -76,7 +69,12 @@ def test_weights(dev, rng, ci, co, m, half):
 def test_flipped_weights(dev, rng, ci, co, m, half):
     weight = wide_layer(rng, ci, co)
     for first, c in {(0, ci), (ci - 16, 16), (ci // 32 * 16, ci - ci // 32 * 16)}:
-        check(m, half, *transformed_by_device(dev, m, half, weight, True, first, c), flipped(weight)[first:first + c])
+        check(
+            m,
+            half,
+            *transformed_by_device(dev, m, half, weight, True, first, c),
+            flipped(weight)[first : first + c],
+        )
 
 
 @pytest.mark.parametrize("flip", [False, True])
@@ -92,12 +90,15 @@ def test_no_size_of_weights_changes_what_half_keeps(dev, rng, exponent, flip):
 
 @pytest.mark.parametrize("flip", [False, True])
 def test_half_at_the_limits(dev, rng, flip):
-    """Beyond half's own range on both sides, up to float's; zeros; small weights beside large ones."""
+    """Beyond half's own range on both sides, up to float's; zeros; small weights beside large
+    ones.
+    """
     sizes = np.array([0, 1e-45, 1e-38, 1e-7, 6e4, 65504, 65520, 1e5, 3.4e38])
     weight = np.zeros((32, 32, 3, 3), np.float32)
     for i, size in enumerate(sizes):
         weight[i, i] = size * rng.choice([-1, 1], (3, 3))
-    weight[20, 20], weight[20, 21], weight[21, 20] = 6e4, 1e-7, 1e-7  # in one output and in one input channel
+    # in one output and in one input channel
+    weight[20, 20], weight[20, 21], weight[21, 20] = 6e4, 1e-7, 1e-7
     units, stored = transformed_by_device(dev, 4, True, weight, *((True, 0, 32) if flip else ()))
     check(4, True, units, stored, flipped(weight) if flip else weight)
     assert (stored[..., range(4, 9), range(4, 9)] != 0).any((0, 1)).all()

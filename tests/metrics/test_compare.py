@@ -3,11 +3,11 @@
 import numpy as np
 import pytest
 
-from pp_cl import compare as compare_module
-from pp_cl.compare import compare, read_over_white
 from pp_cl.errors import UserError
-from pp_cl.image import write_png
-from pp_cl.metrics import Metrics, mean
+from pp_cl.files.image import write_png
+from pp_cl.metrics import compare as compare_module
+from pp_cl.metrics.compare import compare, read_over_white
+from pp_cl.metrics.psnr_ssim import Metrics, mean
 
 
 def no_device():
@@ -38,7 +38,12 @@ def test_two_folders_by_name(folders):
     result = compare(no_device, str(pred), str(truth), ("psnr",))
     assert [row["name"] for row in result["per_image"]] == ["a.png", "b.png"]
     for row in result["per_image"]:
-        assert row == compare(no_device, pred / row["name"], truth / row["name"], ("psnr",))["per_image"][0]
+        assert (
+            row
+            == compare(no_device, pred / row["name"], truth / row["name"], ("psnr",))["per_image"][
+                0
+            ]
+        )
     assert result["mean"] == mean(result["per_image"])
 
 

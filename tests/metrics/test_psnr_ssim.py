@@ -2,11 +2,11 @@
 
 import numpy as np
 import pytest
-from oracle_lpips import random_weights
+from oracle.lpips import random_weights
 
-from pp_cl import lpips
 from pp_cl.errors import UserError
-from pp_cl.metrics import PSNR_CAP, Metrics, mean, psnr, ssim
+from pp_cl.metrics import lpips
+from pp_cl.metrics.psnr_ssim import PSNR_CAP, Metrics, mean, psnr, ssim
 
 
 def ssim_oracle(a, b):
@@ -39,7 +39,9 @@ def test_psnr_of_known_errors(pair):
     black = np.zeros((4, 5, 3), np.uint8)
     assert psnr(black, black + 1) == pytest.approx(20 * np.log10(255))
     assert psnr(black, black + 255) == pytest.approx(0, abs=1e-12)
-    assert psnr(a, b) == psnr(b, a) == pytest.approx(-10 * np.log10(np.mean((a / 255 - b / 255) ** 2)))
+    assert (
+        psnr(a, b) == psnr(b, a) == pytest.approx(-10 * np.log10(np.mean((a / 255 - b / 255) ** 2)))
+    )
 
 
 def test_psnr_is_capped_so_that_it_stays_a_number():

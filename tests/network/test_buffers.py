@@ -1,9 +1,9 @@
-"""pp_cl/slots.py: arrays that share a buffer never live at the same time."""
+"""pp_cl/network/buffers.py: arrays that share a buffer never live at the same time."""
 
 import numpy as np
 
-from pp_cl.slots import assign_slots, lifetimes
-from pp_cl.unet import unet_steps
+from pp_cl.network.buffers import assign_slots, lifetimes
+from pp_cl.network.unet import unet_steps
 
 
 def test_slots_never_overlap(rng):
@@ -21,8 +21,11 @@ def test_slots_never_overlap(rng):
 
 def test_lifetimes_of_the_network():
     steps = unet_steps((16, 32, 48), 3)
-    inference, training = ({name: span for name, *span in lifetimes(steps, t)} for t in (False, True))
-    assert inference["enc0.b"] == [1, 14] and inference["enc0.a"] == [0, 1]  # the skip lives longest
+    inference, training = (
+        {name: span for name, *span in lifetimes(steps, t)} for t in (False, True)
+    )
+    # the skip lives longest
+    assert inference["enc0.b"] == [1, 14] and inference["enc0.a"] == [0, 1]
     assert "x" not in training and set(inference) == {s.name for s in steps}
     assert training["out"][1] == 2 * len(steps) and training["grad x"][1] == 2 * len(steps) - 1
     assert training["enc0.a"][1] > training["enc0.b"][1] - 2  # read again by the backward pass

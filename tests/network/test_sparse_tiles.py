@@ -1,22 +1,34 @@
-"""pp_cl/active.py: the same network with fewer tiles, against the one that computes all and against float64."""
+"""pp_cl/network/sparse_tiles.py: the same network with fewer tiles, against the one that computes
+all and against float64.
+"""
 
 import numpy as np
 import pytest
-from helpers import relative_error
-from oracle_unet import unet, unet_gradients
-from test_unet import plain_parameters
+from oracle.unet import unet, unet_gradients
+from support.comparisons import relative_error
+from support.networks import plain_parameters
 
-import pp_cl.unet
-from pp_cl.active import LOSS_BORDER, ActiveForward, backward_reach, double, forward_reach, grow, halve, layout
-from pp_cl.blend import BACKGROUND
+import pp_cl.network.unet
 from pp_cl.config import preset
-from pp_cl.hull import build_grid, depth_range
+from pp_cl.layers.tiles import SIDE, grid_shape, tiles_find
 from pp_cl.model import Model
+from pp_cl.network.sparse_tiles import (
+    LOSS_BORDER,
+    ActiveForward,
+    backward_reach,
+    double,
+    forward_reach,
+    grow,
+    halve,
+    layout,
+)
+from pp_cl.network.unet import UNet, unet_steps
+from pp_cl.raster.blend import BACKGROUND
 from pp_cl.render import Renderer
 from pp_cl.run import with_depth_range
-from pp_cl.scene import load_scene, reduced_camera
-from pp_cl.tiles import SIDE, grid_shape, tiles_find
-from pp_cl.unet import UNet, unet_steps
+from pp_cl.scene.hull import build_grid, depth_range
+from pp_cl.scene.load import load_scene
+from pp_cl.scene.views import reduced_camera
 
 STEPS = unet_steps((16, 16, 16), 3)
 SIZE = (148, 180)  # room for a class inside; levels 1 and 2 end in tiles that are cut off
@@ -33,13 +45,18 @@ OBJECTS = {  # (rows, columns) that are not background
 @pytest.fixture
 def always(monkeypatch):
     """Choose tiles in small images, too, and however many remain."""
-    monkeypatch.setattr(pp_cl.unet, "LEAST_PIXELS", 0)
-    monkeypatch.setattr(pp_cl.unet, "MOST_SHARE", 1)
+    monkeypatch.setattr(pp_cl.network.unet, "LEAST_PIXELS", 0)
+    monkeypatch.setattr(pp_cl.network.unet, "MOST_SHARE", 1)
 
 
 def scene(rng, place, size=SIZE):
-    """(features, gradient of the image): background and one colour, but for `place` and, in the gradient, another one."""
-    x, grad_y = np.full((*size, 16), BACKGROUND, np.float32), np.full((*size, 3), (0.3, -0.2, 0.1), np.float32)
+    """(features, gradient of the image): background and one colour, but for `place` and, in the
+    gradient, another one.
+    """
+    x, grad_y = (
+        np.full((*size, 16), BACKGROUND, np.float32),
+        np.full((*size, 3), (0.3, -0.2, 0.1), np.float32),
+    )
     x[place] = rng.normal(size=x[place].shape)
     grad_y[place] = rng.normal(size=grad_y[place].shape)
     grad_y[10:30, 120:150] = rng.normal(size=(20, 30, 3))
@@ -65,7 +82,8 @@ def test_equals_the_dense_network(dev, rng, always, name, variant):
         np.testing.assert_array_equal(actual[0], expected[0])
     for a, b in zip(actual[:2], expected[:2], strict=True):
         assert np.abs(a - b).max() <= 1e-6 * np.abs(b).max()
-    for a, b in zip(actual[2:], expected[2:], strict=True):  # sums over 26,640 pixels, added up in another order
+    # sums over 26,640 pixels, added up in another order
+    for a, b in zip(actual[2:], expected[2:], strict=True):
         assert relative_error(a, b) < 5e-6
 
 
@@ -96,19 +114,28 @@ def test_nan_comes_through(dev, rng, always):
 def test_few_tiles_in_large_images_only(dev, rng):
     net = UNet(dev, (16, 16, 16))
     for height, end, chosen in ((256, 60, True), (256, 240, False), (252, 60, False)):
-        net.forward(dev.upload(scene(rng, (slice(40, end), slice(40, end)), (height, 256))[0]), False, BACKGROUND)
+        net.forward(
+            dev.upload(scene(rng, (slice(40, end), slice(40, end)), (height, 256))[0]),
+            False,
+            BACKGROUND,
+        )
         assert (net.share < 1) == chosen
         if chosen:
-            assert net.share <= pp_cl.unet.MOST_SHARE
+            assert net.share <= pp_cl.network.unet.MOST_SHARE
 
 
 def test_reach_is_what_a_change_reaches(rng):
-    """In float64, for a change at every place of a period of the pooling and the border far away."""
+    """In float64, for a change at every place of a period of the pooling and the border far
+    away.
+    """
     parameters = {}
     steps, size, centre = unet_steps((1, 1, 1), 1), 96, 48
     for step in (s for s in steps if s.kind.startswith("conv")):
         shape = 1, len(step.inputs), int(step.kind[-1]), int(step.kind[-1])
-        parameters |= {f"{step.name}.weight": rng.uniform(0.5, 1, shape), f"{step.name}.bias": np.ones(1)}
+        parameters |= {
+            f"{step.name}.weight": rng.uniform(0.5, 1, shape),
+            f"{step.name}.bias": np.ones(1),
+        }
     before = unet(np.ones((size, size, 1)), parameters)[1]
     felt = dict.fromkeys(before, 0)
     grad = np.zeros((size, size, 1))
@@ -121,9 +148,14 @@ def test_reach_is_what_a_change_reaches(rng):
             if name not in ("wide1", "wide0", "up1", "up0"):  # the oracle enlarges first
                 scale = size // len(value)
                 rows = np.flatnonzero(np.abs(value - before[name])[..., 0].max(1) > 1e-9)
-                felt[name] = max(felt[name], place - rows[0] * scale, rows[-1] * scale + scale - 1 - place)
+                felt[name] = max(
+                    felt[name], place - rows[0] * scale, rows[-1] * scale + scale - 1 - place
+                )
         grad[:], grad[place, place] = 0, 1
-        rows = np.flatnonzero(np.abs(unet_gradients(np.ones((size, size, 1)), parameters, grad)[0])[..., 0].max(1) > 1e-12)
+        rows = np.flatnonzero(
+            np.abs(unet_gradients(np.ones((size, size, 1)), parameters, grad)[0])[..., 0].max(1)
+            > 1e-12
+        )
         felt_back = max(felt_back, place - rows[0], rows[-1] - place)
     reach = forward_reach(steps)
     for name in felt:
@@ -137,10 +169,13 @@ def test_grow_halve_and_double(rng, n):
     tiles = rng.random((31, 17)) < 0.01
     grown = grow(tiles, n)
     for r, c in np.ndindex(tiles.shape):
-        assert grown[r, c] == tiles[max(r - n, 0):r + n + 1, max(c - n, 0):c + n + 1].any()
+        assert grown[r, c] == tiles[max(r - n, 0) : r + n + 1, max(c - n, 0) : c + n + 1].any()
     half = halve(tiles)
     assert half.shape == (16, 9)
-    assert all(half[r, c] == tiles[2 * r:2 * r + 2, 2 * c:2 * c + 2].any() for r, c in np.ndindex(half.shape))
+    assert all(
+        half[r, c] == tiles[2 * r : 2 * r + 2, 2 * c : 2 * c + 2].any()
+        for r, c in np.ndindex(half.shape)
+    )
     np.testing.assert_array_equal(halve(tiles, 2), halve(half))
     np.testing.assert_array_equal(halve(double(half, tiles.shape)), half)
     assert double(half, tiles.shape).shape == tiles.shape
@@ -162,13 +197,20 @@ def test_layout(rng, level, border):
     np.testing.assert_array_equal(found.count() > 0, found.computed)
     side = SIDE << level
     for place, source in np.ndenumerate(found.source):
-        for index, other, length in zip(place, divmod(source, shape[1]), (height, width), strict=True):
-            inner = [border * SIDE <= i * side and (i + 1) * side <= length - border * SIDE for i in (index, other)]
+        for index, other, length in zip(
+            place, divmod(source, shape[1]), (height, width), strict=True
+        ):
+            inner = [
+                border * SIDE <= i * side and (i + 1) * side <= length - border * SIDE
+                for i in (index, other)
+            ]
             assert other == index or all(inner)
 
 
 def test_the_loss_sees_the_border_no_further(dev):
-    """The margin that is compared tile by tile holds what the forward pass and a window of the SSIM's gradient reach."""
+    """The margin that is compared tile by tile holds what the forward pass and a window of the
+    SSIM's gradient reach.
+    """
     assert forward_reach(STEPS)["out"] + 2 * 5 <= LOSS_BORDER
 
 
@@ -182,13 +224,25 @@ def test_lego(dev, data, rng, always):
     for view in with_depth_range(views[:2], near_far):
         renderer.forward(reduced_camera(view, 2), 0.01)
         x = renderer.features
-        share = np.mean([of.computed.mean() for of in ActiveForward(
-            dev, model.net.steps, x.shape[:2], tiles_find(dev, x, BACKGROUND)).layouts.values()])
+        share = np.mean(
+            [
+                of.computed.mean()
+                for of in ActiveForward(
+                    dev, model.net.steps, x.shape[:2], tiles_find(dev, x, BACKGROUND)
+                ).layouts.values()
+            ]
+        )
         grad_y = dev.upload(np.full((*x.shape[:2], 3), 0.1, np.float32))
         results = []
         for background in (None, BACKGROUND):
             y = model.net.forward(x, True, background).get()
-            results.append((y, model.net.backward(grad_y).get(), *[g.get() for g in model.net.gradients.values()]))
+            results.append(
+                (
+                    y,
+                    model.net.backward(grad_y).get(),
+                    *[g.get() for g in model.net.gradients.values()],
+                )
+            )
         assert 0.1 < share < 0.6
         assert np.abs(results[0][0] - results[1][0]).max() <= 1e-6 * np.abs(results[0][0]).max()
         assert np.linalg.norm(results[0][1] - results[1][1]) <= 1e-6 * np.linalg.norm(results[0][1])

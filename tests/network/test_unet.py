@@ -1,30 +1,30 @@
-"""pp_cl/unet.py against a float64 network."""
+"""pp_cl/network/unet.py against a float64 network."""
 
 import numpy as np
 import pytest
-from helpers import numeric_gradient, relative_error
-from oracle_unet import unet, unet_gradients
-from oracle_winograd import rounding_share
+from oracle.unet import unet, unet_gradients
+from oracle.winograd import rounding_share
+from support.comparisons import numeric_gradient, relative_error
+from support.networks import plain_parameters
 
-from pp_cl.conv import unpack_weights
-from pp_cl.unet import UNet
-
-
-def plain_parameters(net, arrays):
-    """{name: float64 array} in the oracle's layout; asserts that the padding is zero."""
-    plain = {}
-    for name, array in arrays.items():
-        values, channels = array.get().astype(np.float64), net.channels[name.rsplit(".", 1)[0]]
-        plain[name] = unpack_weights(values, channels) if values.ndim == 5 else values[:channels]
-        assert np.abs(values).sum() == pytest.approx(np.abs(plain[name]).sum(), rel=1e-12)
-    return plain
+from pp_cl.network.unet import UNet
 
 
-@pytest.mark.parametrize("widths, variant", [((16, 32, 48), "direct"), ((16, 32, 48), "winograd2"),
-                                             ((16, 32, 48), "winograd4"), ((20, 16, 40), "auto")])
+@pytest.mark.parametrize(
+    "widths, variant",
+    [
+        ((16, 32, 48), "direct"),
+        ((16, 32, 48), "winograd2"),
+        ((16, 32, 48), "winograd4"),
+        ((20, 16, 40), "auto"),
+    ],
+)
 def test_forward_and_backward(dev, rng, widths, variant):
     net = UNet(dev, widths, seed=1, variant=variant)
-    x, grad_y = rng.normal(size=(12, 16, 16)).astype(np.float32), rng.normal(size=(12, 16, 3)).astype(np.float32)
+    x, grad_y = (
+        rng.normal(size=(12, 16, 16)).astype(np.float32),
+        rng.normal(size=(12, 16, 3)).astype(np.float32),
+    )
     parameters = plain_parameters(net, net.parameters)
     y = net.forward(dev.upload(x)).get()
     grad_x = net.backward(dev.upload(grad_y)).get()
@@ -38,17 +38,26 @@ def test_forward_and_backward(dev, rng, widths, variant):
 
 
 def test_weights_stored_as_half(dev, rng):
-    """The image; of the gradients test_bench.py, as the places where a ReLU passes them depend on the rounding."""
+    """The image; of the gradients test_bench.py, as the places where a ReLU passes them depend on
+    the rounding.
+    """
     net = UNet(dev, (16, 32, 48), seed=1, variant="winograd4_half")
     x = rng.normal(size=(12, 16, 16)).astype(np.float32)
     expected = unet(x, plain_parameters(net, net.parameters))[0]
-    assert 1e-6 < relative_error(net.forward(dev.upload(x)).get(), expected) < 10 * rounding_share(4)
+    assert (
+        1e-6 < relative_error(net.forward(dev.upload(x)).get(), expected) < 10 * rounding_share(4)
+    )
 
 
 def test_gradients_by_finite_differences(dev, rng):
-    """Steps this small cross no kink of a ReLU: the network is piecewise linear, so the differences are exact there."""
+    """Steps this small cross no kink of a ReLU: the network is piecewise linear, so the differences
+    are exact there.
+    """
     net = UNet(dev, (4, 5, 6), channels_in=3, seed=2)
-    x, grad_y = rng.normal(size=(8, 4, 3)).astype(np.float32), rng.normal(size=(8, 4, 3)).astype(np.float32)
+    x, grad_y = (
+        rng.normal(size=(8, 4, 3)).astype(np.float32),
+        rng.normal(size=(8, 4, 3)).astype(np.float32),
+    )
     parameters = plain_parameters(net, net.parameters)
     net.forward(dev.upload(x))
     grad_x = net.backward(dev.upload(grad_y)).get()
@@ -69,27 +78,35 @@ def test_gradients_by_finite_differences(dev, rng):
 def test_inference_equals_training(dev, rng):
     net = UNet(dev, seed=3)
     x = dev.upload(rng.normal(size=(20, 24, 16)).astype(np.float32))
-    np.testing.assert_array_equal(net.forward(x, training=False).get(), net.forward(x, training=True).get())
+    np.testing.assert_array_equal(
+        net.forward(x, training=False).get(), net.forward(x, training=True).get()
+    )
 
 
 @pytest.mark.parametrize("variant", ["direct", "winograd2", "auto"])
 def test_frozen_weights_are_laid_out_once(dev, rng, variant):
     net = UNet(dev, seed=3, variant=variant)
-    small, large = (dev.upload(rng.normal(size=(*s, 16)).astype(np.float32)) for s in ((16, 12), (32, 36)))
+    small, large = (
+        dev.upload(rng.normal(size=(*s, 16)).astype(np.float32)) for s in ((16, 12), (32, 36))
+    )
     expected = [net.forward(x, training=False).get() for x in (small, large)]
     net.freeze()
     for _ in range(2):
         for x, image in zip((small, large), expected, strict=True):
             np.testing.assert_array_equal(net.forward(x, training=False).get(), image)
     net.parameters["enc1.a.weight"].fill(0)  # forbidden, and unseen where the weights are laid out
-    assert np.array_equal(net.forward(large, training=False).get(), expected[1]) == (variant != "direct")
+    assert np.array_equal(net.forward(large, training=False).get(), expected[1]) == (
+        variant != "direct"
+    )
     with pytest.raises(RuntimeError, match="freeze"):
         net.forward(small)
 
 
 def test_sizes_may_change_between_calls(dev, rng):
     net = UNet(dev, seed=3)
-    small, large = (dev.upload(rng.normal(size=(*s, 16)).astype(np.float32)) for s in ((4, 8), (16, 12)))
+    small, large = (
+        dev.upload(rng.normal(size=(*s, 16)).astype(np.float32)) for s in ((4, 8), (16, 12))
+    )
     first = net.forward(small).get()
     net.forward(large)
     net.forward(large, training=False)
@@ -123,7 +140,10 @@ def test_initial_values_are_pytorchs(dev):
 def test_hard_inputs(dev, rng):
     net = UNet(dev, (16, 16, 16), seed=4)
     parameters = plain_parameters(net, net.parameters)
-    for x in (np.zeros((8, 8, 16), np.float32), (1e3 + rng.normal(size=(8, 8, 16))).astype(np.float32)):
+    for x in (
+        np.zeros((8, 8, 16), np.float32),
+        (1e3 + rng.normal(size=(8, 8, 16))).astype(np.float32),
+    ):
         assert relative_error(net.forward(dev.upload(x)).get(), unet(x, parameters)[0]) < 5e-6
 
 

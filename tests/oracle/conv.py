@@ -1,4 +1,6 @@
-"""Float64 twins of cl/conv.cl and cl/conv_weights.cl, in the plain (CO, CI, K, K) layout of weights."""
+"""Float64 twins of cl/layers/conv.cl and cl/layers/conv_backward_weights.cl, in the plain (CO, CI,
+K, K) layout of weights.
+"""
 
 import numpy as np
 
@@ -9,7 +11,7 @@ def _shifted(x, k):
     padded = np.pad(np.asarray(x, np.float64), ((k // 2, k // 2), (k // 2, k // 2), (0, 0)))
     for ky in range(k):
         for kx in range(k):
-            yield ky, kx, padded[ky:ky + height, kx:kx + width]
+            yield ky, kx, padded[ky : ky + height, kx : kx + width]
 
 
 def conv(x, weight, bias, relu=False):
@@ -28,6 +30,8 @@ def conv_gradients(x, weight, grad_out):
     grad_padded = np.zeros((height + k - 1, width + k - 1, x.shape[2]))
     for ky, kx, seen in _shifted(x, k):
         grad_weight[:, :, ky, kx] = np.einsum("yxo,yxi->oi", grad_out, seen, optimize=True)
-        grad_padded[ky:ky + height, kx:kx + width] += grad_out @ np.asarray(weight[:, :, ky, kx], np.float64)
-    grad_x = grad_padded[k // 2:k // 2 + height, k // 2:k // 2 + width]
+        grad_padded[ky : ky + height, kx : kx + width] += grad_out @ np.asarray(
+            weight[:, :, ky, kx], np.float64
+        )
+    grad_x = grad_padded[k // 2 : k // 2 + height, k // 2 : k // 2 + width]
     return grad_x, grad_weight, grad_out.sum((0, 1))

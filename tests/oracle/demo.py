@@ -1,4 +1,6 @@
-"""Float64 twin of the object in cl/demo.cl, built from segments and circles, and of the rays' hits."""
+"""Float64 twin of the object in cl/scene/demo.cl, built from segments and circles, and of the rays'
+hits.
+"""
 
 import numpy as np
 
@@ -53,7 +55,9 @@ def distance(positions):
 
 
 def coverage(camera):
-    """((H, W) share of 4x4 rays a pixel that come within 4e-4 of the object, (H, W) the same for 1e-5)."""
+    """((H, W) share of 4x4 rays a pixel that come within 4e-4 of the object, (H, W) the same for
+    1e-5).
+    """
     sub = (np.arange(4) + 0.5) / 4
     x = (np.arange(camera.width)[:, None] + sub).ravel()
     y = (np.arange(camera.height)[:, None] + sub).ravel()

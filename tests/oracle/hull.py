@@ -1,4 +1,4 @@
-"""Float64 twin of cl/hull.cl: the mask of a view, and which positions the masks keep."""
+"""Float64 twin of cl/scene/hull.cl: the mask of a view, and which positions the masks keep."""
 
 import numpy as np
 
@@ -9,12 +9,14 @@ def dilated_mask(alpha, threshold):
     mask = np.zeros((height, width), bool)
     for y in range(height):
         for x in range(width):
-            mask[y, x] = (alpha[max(y - 1, 0):y + 2, max(x - 1, 0):x + 2] > threshold).any()
+            mask[y, x] = (alpha[max(y - 1, 0) : y + 2, max(x - 1, 0) : x + 2] > threshold).any()
     return mask
 
 
 def kept(views, positions, threshold):
-    """((N,) bool kept, (N,) pixels to the nearest pixel border of any view that has the position before it)."""
+    """((N,) bool kept, (N,) pixels to the nearest pixel border of any view that has the position
+    before it).
+    """
     seen = np.zeros(len(positions), bool)
     alive = np.ones(len(positions), bool)
     border = np.full(len(positions), np.inf)

@@ -1,4 +1,4 @@
-"""Float64 twins of cl/layers.cl."""
+"""Float64 twins of cl/layers/resample.cl."""
 
 import numpy as np
 
@@ -17,11 +17,13 @@ def avgpool2_gradient(grad_out):
 def maxpool2(x):
     """(H, W, C) -> (H // 2, W // 2, C)."""
     h, w, c = x.shape[0] // 2, x.shape[1] // 2, x.shape[2]
-    return np.asarray(x, np.float64)[:2 * h, :2 * w].reshape(h, 2, w, 2, c).max((1, 3))
+    return np.asarray(x, np.float64)[: 2 * h, : 2 * w].reshape(h, 2, w, 2, c).max((1, 3))
 
 
 def upsample_matrix(n):
-    """(2n, n): row i holds the weights of output i, from the definition by coordinates (i + 0.5) / 2 - 0.5."""
+    """(2n, n): row i holds the weights of output i, from the definition by coordinates (i + 0.5) /
+    2 - 0.5.
+    """
     matrix = np.zeros((2 * n, n))
     for i in range(2 * n):
         position = min(max((i + 0.5) / 2 - 0.5, 0), n - 1)
@@ -34,12 +36,18 @@ def upsample_matrix(n):
 
 def upsample2(x):
     """(H, W, C) -> (2H, 2W, C)."""
-    return np.einsum("Yy,Xx,yxc->YXc", upsample_matrix(x.shape[0]), upsample_matrix(x.shape[1]), np.asarray(x, np.float64),
-                     optimize=True)
+    return np.einsum(
+        "Yy,Xx,yxc->YXc",
+        upsample_matrix(x.shape[0]),
+        upsample_matrix(x.shape[1]),
+        np.asarray(x, np.float64),
+        optimize=True,
+    )
 
 
 def upsample2_gradient(grad_out):
     """(2H, 2W, C) -> (H, W, C)."""
     rows, columns = upsample_matrix(grad_out.shape[0] // 2), upsample_matrix(grad_out.shape[1] // 2)
-    return np.einsum("Yy,Xx,YXc->yxc", rows, columns, np.asarray(grad_out, np.float64), optimize=True)
-
+    return np.einsum(
+        "Yy,Xx,YXc->yxc", rows, columns, np.asarray(grad_out, np.float64), optimize=True
+    )

@@ -1,4 +1,6 @@
-"""Float64 twin of cl/loss.cl: the textbook SSIM with 2-D windows, and gradients derived from that form."""
+"""Float64 twin of cl/training/loss.cl: the textbook SSIM with 2-D windows, and gradients derived
+from that form.
+"""
 
 import numpy as np
 
@@ -17,7 +19,9 @@ WINDOW = _window()
 def windowed(image):
     """(H-10, W-10, 3) weighted mean of each 11x11 window of an (H, W, 3) image."""
     h, w, _ = image.shape
-    return sum(WINDOW[j, i] * image[j:h - 10 + j, i:w - 10 + i] for j in range(11) for i in range(11))
+    return sum(
+        WINDOW[j, i] * image[j : h - 10 + j, i : w - 10 + i] for j in range(11) for i in range(11)
+    )
 
 
 def unwindowed(slopes, shape):
@@ -26,7 +30,7 @@ def unwindowed(slopes, shape):
     image = np.zeros(shape)
     for j in range(11):
         for i in range(11):
-            image[j:h - 10 + j, i:w - 10 + i] += WINDOW[j, i] * slopes
+            image[j : h - 10 + j, i : w - 10 + i] += WINDOW[j, i] * slopes
     return image
 
 
@@ -39,13 +43,18 @@ def ssim(x, y):
     d_mx = 2 * my * a2 / (b1 * b2) - 2 * mx * similarity / b1
     d_vx = -similarity / b2
     d_cov = 2 * a1 / (b1 * b2)
-    gradient = (unwindowed(d_mx - 2 * mx * d_vx - my * d_cov, x.shape)
-                + 2 * x * unwindowed(d_vx, x.shape) + y * unwindowed(d_cov, x.shape))
+    gradient = (
+        unwindowed(d_mx - 2 * mx * d_vx - my * d_cov, x.shape)
+        + 2 * x * unwindowed(d_vx, x.shape)
+        + y * unwindowed(d_cov, x.shape)
+    )
     return similarity.mean(), gradient / similarity.size
 
 
 def loss(prediction, target, weight):
-    """(terms (4,): L, L1, 1 - SSIM, mean squared error; gradient (H, W, 3)) of equally large images."""
+    """(terms (4,): L, L1, 1 - SSIM, mean squared error; gradient (H, W, 3)) of equally large
+    images.
+    """
     x, y = np.asarray(prediction, np.float64), np.asarray(target, np.float64)
     l1, gradient = np.abs(x - y).mean(), np.sign(x - y) / x.size
     dissimilarity = 0.0
@@ -53,4 +62,6 @@ def loss(prediction, target, weight):
         similarity, d_x = ssim(x, y)
         dissimilarity = 1 - similarity
         gradient = gradient - weight * d_x
-    return np.array([l1 + weight * dissimilarity, l1, dissimilarity, ((x - y) ** 2).mean()]), gradient
+    return np.array(
+        [l1 + weight * dissimilarity, l1, dissimilarity, ((x - y) ** 2).mean()]
+    ), gradient

@@ -36,7 +36,9 @@ def pixel_distance(a, b, head):
 
 
 def lpips(a, b, weights):
-    """Distance of two (H, W, 3) images in [0, 1]; weights as pp_cl.lpips_weights.load_weights() names them."""
+    """Distance of two (H, W, 3) images in [0, 1]; weights as pp_cl.lpips_weights.load_weights()
+    names them.
+    """
     weights = {name: array.astype(np.float64) for name, array in weights.items()}
     x, y = scaled_input(a), scaled_input(b)
     layer, total = 0, 0.0
@@ -57,7 +59,9 @@ def random_weights(rng):
     for block, (convolutions, width) in enumerate(zip(BLOCKS, WIDTHS, strict=True)):
         for _ in range(convolutions):
             deviation = np.sqrt(2 / (9 * channels))
-            weights[f"kernel{layer}"] = rng.normal(0, deviation, (width, channels, 3, 3)).astype(np.float32)
+            weights[f"kernel{layer}"] = rng.normal(0, deviation, (width, channels, 3, 3)).astype(
+                np.float32
+            )
             weights[f"bias{layer}"] = rng.normal(0, 0.1, width).astype(np.float32)
             channels, layer = width, layer + 1
         weights[f"head{block}"] = rng.uniform(0, 1, width).astype(np.float32)

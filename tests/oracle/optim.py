@@ -1,4 +1,6 @@
-"""Float64 twins of what changes parameters: Adam as torch computes it, the SH gradient written out, grid smoothing."""
+"""Float64 twins of what changes parameters: Adam as torch computes it, the SH gradient written out,
+grid smoothing.
+"""
 
 import numpy as np
 
@@ -13,8 +15,10 @@ class Adam:
         self.betas = beta1, beta2
 
     def step(self, grad, rate, eps, low=-np.inf, high=np.inf, rows=slice(None)):
-        """rows: those that this step updates. They first make up for the steps since their last one, as if the gradient
-        had been 0 in these: the moments exactly, the moves with the present rate and eps."""
+        """rows: those that this step updates. They first make up for the steps since their last
+        one, as if the gradient had been 0 in these: the moments exactly, the moves with the
+        present rate and eps.
+        """
         beta1, beta2 = self.betas
         self.t += 1
         missed = (self.t - 1 - self.last[rows]).reshape(-1, *[1] * (self.parameter.ndim - 1))
@@ -37,16 +41,27 @@ def sh_basis(direction):
     """(9, ...) PlenOctrees' real basis at unit directions (..., 3)."""
     x, y, z = np.moveaxis(direction, -1, 0)
     pi = np.pi
-    return np.stack([
-        0 * x + np.sqrt(1 / (4 * pi)), -np.sqrt(3 / (4 * pi)) * y, np.sqrt(3 / (4 * pi)) * z, -np.sqrt(3 / (4 * pi)) * x,
-        np.sqrt(15 / (4 * pi)) * x * y, -np.sqrt(15 / (4 * pi)) * y * z, np.sqrt(5 / (16 * pi)) * (3 * z * z - 1),
-        -np.sqrt(15 / (4 * pi)) * x * z, np.sqrt(15 / (16 * pi)) * (x * x - y * y)])
+    return np.stack(
+        [
+            0 * x + np.sqrt(1 / (4 * pi)),
+            -np.sqrt(3 / (4 * pi)) * y,
+            np.sqrt(3 / (4 * pi)) * z,
+            -np.sqrt(3 / (4 * pi)) * x,
+            np.sqrt(15 / (4 * pi)) * x * y,
+            -np.sqrt(15 / (4 * pi)) * y * z,
+            np.sqrt(5 / (16 * pi)) * (3 * z * z - 1),
+            -np.sqrt(15 / (4 * pi)) * x * z,
+            np.sqrt(15 / (16 * pi)) * (x * x - y * y),
+        ]
+    )
 
 
 def sh_gradient(positions, eye, grad_point_features, block):
     """(N, block.count, 16) gradient of the SH coefficients of one points.ShBlock."""
     towards = positions - eye
-    basis = sh_basis(towards / np.linalg.norm(towards, axis=-1, keepdims=True))[block.first:block.first + block.count]
+    basis = sh_basis(towards / np.linalg.norm(towards, axis=-1, keepdims=True))[
+        block.first : block.first + block.count
+    ]
     return basis.T[:, :, None] * np.asarray(grad_point_features, np.float64)[:, None, :]
 
 

@@ -1,4 +1,6 @@
-"""Float64 twins of project, pairs, blend and shade: every point against every pixel, as matrices (N, HW)."""
+"""Float64 twins of project, pairs, blend and shade: every point against every pixel, as matrices
+(N, HW).
+"""
 
 import numpy as np
 
@@ -22,20 +24,30 @@ def kept(camera, positions, radius):
         c = camera_space(camera, positions)
         t = np.linalg.norm(c, axis=1)
         front = t - radius
-        return np.isfinite(t) & (t > 0) & (front >= camera.near) & (front <= camera.far) & (c[:, 2] >= 1e-6 * t)
+        return (
+            np.isfinite(t)
+            & (t > 0)
+            & (front >= camera.near)
+            & (front <= camera.far)
+            & (c[:, 2] >= 1e-6 * t)
+        )
 
 
 def rays(camera):
     """(HW, 3) unit rays through the pixel centres, in camera axes."""
     y, x = np.mgrid[: camera.height, : camera.width]
-    r = np.stack([(x + 0.5 - camera.cx) / camera.fx, (y + 0.5 - camera.cy) / camera.fy, np.ones(x.shape)], -1).reshape(-1, 3)
+    r = np.stack(
+        [(x + 0.5 - camera.cx) / camera.fx, (y + 0.5 - camera.cy) / camera.fy, np.ones(x.shape)], -1
+    ).reshape(-1, 3)
     return r / np.linalg.norm(r, axis=1, keepdims=True)
 
 
 def geometry(camera, positions, radius, kind):
-    """Dict of (N, HW) arrays: hit, closeness, depth, and margin = distance of the hit test from its edge, in pixels.
+    """Dict of (N, HW) arrays: hit, closeness, depth, and margin = distance of the hit test from its
+    edge, in pixels.
 
-    radius: (N,) world units. Points that are left out hit nothing. Pulsar's box, part of the sphere's rule, is included.
+    radius: (N,) world units. Points that are left out hit nothing. Pulsar's box, part of the
+    sphere's rule, is included.
     """
     radius = np.broadcast_to(np.asarray(radius, np.float64), (len(positions),))
     c, r = camera_space(camera, positions), rays(camera)
@@ -64,10 +76,15 @@ def geometry(camera, positions, radius, kind):
 
 
 def pulsar_box(camera, c, radius):
-    """(N, HW) bool: the pixel lies in the sphere's box [floor(min), ceil(max)] of Pulsar; unbounded at the eye's plane."""
+    """(N, HW) bool: the pixel lies in the sphere's box [floor(min), ceil(max)] of Pulsar; unbounded
+    at the eye's plane.
+    """
     y, x = np.mgrid[: camera.height, : camera.width]
     inside = np.ones((len(c), x.size), bool)
-    for u, focal, centre, pixel in ((c[:, 0], camera.fx, camera.cx, x), (c[:, 1], camera.fy, camera.cy, y)):
+    for u, focal, centre, pixel in (
+        (c[:, 0], camera.fx, camera.cx, x),
+        (c[:, 1], camera.fy, camera.cy, y),
+    ):
         reach = np.hypot(u, c[:, 2])
         with np.errstate(divide="ignore", invalid="ignore"):
             alpha, theta = np.arctan2(u, c[:, 2]), np.arcsin(radius / reach)
@@ -79,15 +96,21 @@ def pulsar_box(camera, c, radius):
 
 
 def order(geometry_):
-    """(N, HW) int: each hit's place in its pixel by (depth, index), from 0; other entries are meaningless."""
+    """(N, HW) int: each hit's place in its pixel by (depth, index), from 0; other entries are
+    meaningless.
+    """
     depth = np.where(geometry_["hit"], geometry_["depth"], np.inf)
     ranks = np.empty(depth.shape, np.int64)
-    np.put_along_axis(ranks, np.argsort(depth, axis=0, kind="stable"), np.arange(len(depth))[:, None], axis=0)
+    np.put_along_axis(
+        ranks, np.argsort(depth, axis=0, kind="stable"), np.arange(len(depth))[:, None], axis=0
+    )
     return ranks
 
 
 def blend(camera, geometry_, opacity, gamma, stop=0.0):
-    """Dict: weight (N, HW) b; share (N, HW) b/o, its limit at o = 0; z (N, HW); background (HW,) b_0; hit (N, HW) used."""
+    """Dict: weight (N, HW) b; share (N, HW) b/o, its limit at o = 0; z (N, HW); background (HW,)
+    b_0; hit (N, HW) used.
+    """
     hit, d = geometry_["hit"], geometry_["closeness"]
     o = np.asarray(opacity, np.float64)[:, None]
     z = 1 - (geometry_["depth"] - camera.near) / (camera.far - camera.near)
@@ -98,8 +121,13 @@ def blend(camera, geometry_, opacity, gamma, stop=0.0):
         log_share = np.where(hit, np.log(d) + o * z / gamma, -np.inf)
     m = np.maximum(EPS / gamma, log_weight.max(axis=0, initial=-np.inf))
     total = m + np.log(np.exp(EPS / gamma - m) + np.exp(log_weight - m).sum(axis=0))
-    return {"weight": np.exp(log_weight - total), "share": np.exp(log_share - total), "z": z, "hit": hit,
-            "background": np.exp(EPS / gamma - total)}
+    return {
+        "weight": np.exp(log_weight - total),
+        "share": np.exp(log_share - total),
+        "z": z,
+        "hit": hit,
+        "background": np.exp(EPS / gamma - total),
+    }
 
 
 def stopped(hit, d, o, z, ranks, gamma, stop):
@@ -114,35 +142,63 @@ def stopped(hit, d, o, z, ranks, gamma, stop):
                 result[points[place:], q] = True
                 break
             with np.errstate(divide="ignore"):
-                log_total = np.logaddexp(log_total, np.log(o[i, 0] * d[i, q]) + o[i, 0] * z[i, q] / gamma)
+                log_total = np.logaddexp(
+                    log_total, np.log(o[i, 0] * d[i, q]) + o[i, 0] * z[i, q] / gamma
+                )
     return result
 
 
 def features(blend_, point_features):
     """(HW, C) blended features over a background of 1."""
-    return blend_["weight"].T @ np.asarray(point_features, np.float64) + blend_["background"][:, None]
+    return (
+        blend_["weight"].T @ np.asarray(point_features, np.float64) + blend_["background"][:, None]
+    )
 
 
-def blend_gradients(geometry_, blend_, opacity, point_features, grad_features, gamma, max_tracked=0, mean=False):
-    """(dL/df (N, C), dL/do (N,), dL/dl (N, HW)) of grad_features (HW, C) for the max_tracked nearest hits (0: all)."""
+def blend_gradients(
+    geometry_, blend_, opacity, point_features, grad_features, gamma, max_tracked=0, mean=False
+):
+    """(dL/df (N, C), dL/do (N,), dL/dl (N, HW)) of grad_features (HW, C) for the max_tracked
+    nearest hits (0: all).
+    """
     G, f = np.asarray(grad_features, np.float64), np.asarray(point_features, np.float64)
     s = f @ G.T - (G * features(blend_, f)).sum(axis=1)
     tracked = blend_["hit"] & (order(geometry_) < max_tracked) if max_tracked else blend_["hit"]
     scale = 1 / np.maximum(tracked.sum(axis=1), 1) if mean else np.ones(len(f))
     weight, share = np.where(tracked, blend_["weight"], 0), np.where(tracked, blend_["share"], 0)
-    dL_do = (share * (1 + np.asarray(opacity, np.float64)[:, None] * blend_["z"] / gamma) * s).sum(axis=1)
+    dL_do = (share * (1 + np.asarray(opacity, np.float64)[:, None] * blend_["z"] / gamma) * s).sum(
+        axis=1
+    )
     return scale[:, None] * (weight @ G), scale * dL_do, scale[:, None] * weight * s
 
 
-SH = (0.28209479177387814, 0.4886025119029199, 1.0925484305920792, 0.9461746957575601, 0.31539156525252005,
-      0.5462742152960396)
+SH = (
+    0.28209479177387814,
+    0.4886025119029199,
+    1.0925484305920792,
+    0.9461746957575601,
+    0.31539156525252005,
+    0.5462742152960396,
+)
 
 
 def sh_basis(directions):
     """(N, 9) real harmonics of degrees 0 to 2 of unit directions (N, 3)."""
     x, y, z = np.asarray(directions, np.float64).T
-    return np.stack([np.full_like(x, SH[0]), -SH[1] * y, SH[1] * z, -SH[1] * x, SH[2] * x * y, -SH[2] * y * z,
-                     SH[3] * z * z - SH[4], -SH[2] * x * z, SH[5] * (x * x - y * y)], -1)
+    return np.stack(
+        [
+            np.full_like(x, SH[0]),
+            -SH[1] * y,
+            SH[1] * z,
+            -SH[1] * x,
+            SH[2] * x * y,
+            -SH[2] * y * z,
+            SH[3] * z * z - SH[4],
+            -SH[2] * x * z,
+            SH[5] * (x * x - y * y),
+        ],
+        -1,
+    )
 
 
 def shade(positions, eye, coefficients):

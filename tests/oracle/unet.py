@@ -1,14 +1,24 @@
-"""Float64 twin of the network, written out layer by layer, in the plain (CO, CI, K, K) layout of weights."""
+"""Float64 twin of the network, written out layer by layer, in the plain (CO, CI, K, K) layout of
+weights.
+"""
 
 import numpy as np
-from oracle_conv import conv, conv_gradients
-from oracle_layers import avgpool2, avgpool2_gradient, upsample2, upsample2_gradient
+from oracle.conv import conv, conv_gradients
+from oracle.layers import avgpool2, avgpool2_gradient, upsample2, upsample2_gradient
 
 
 def unet(x, parameters):
-    """(y (H, W, 3), {layer: its output}) for parameters {"enc0.a.weight": (CO, CI, K, K), "enc0.a.bias": (CO,), ...}."""
+    """(y (H, W, 3), {layer: its output}) for parameters {"enc0.a.weight": (CO, CI, K, K),
+    "enc0.a.bias": (CO,), ...}.
+    """
+
     def layer(name, *sources, relu=True):
-        return conv(np.concatenate(sources, 2), parameters[name + ".weight"], parameters[name + ".bias"], relu)
+        return conv(
+            np.concatenate(sources, 2),
+            parameters[name + ".weight"],
+            parameters[name + ".bias"],
+            relu,
+        )
 
     a = {"x": np.asarray(x, np.float64)}
     a["enc0.a"] = layer("enc0.a", a["x"])
@@ -19,7 +29,8 @@ def unet(x, parameters):
     a["pool1"] = avgpool2(a["enc1.b"])
     a["enc2.a"] = layer("enc2.a", a["pool1"])
     a["enc2.b"] = layer("enc2.b", a["enc2.a"])
-    a["wide1"] = upsample2(a["enc2.b"])  # enlarged before the 1x1 convolution, as the paper has it: the same function
+    # enlarged before the 1x1 convolution, as the paper has it: the same function
+    a["wide1"] = upsample2(a["enc2.b"])
     a["up1"] = layer("up1", a["wide1"], relu=False)
     a["dec1.a"] = layer("dec1.a", a["up1"], a["enc1.b"])
     a["dec1.b"] = layer("dec1.b", a["dec1.a"])
@@ -38,7 +49,9 @@ def unet_gradients(x, parameters, grad_y):
     def back(name, grad_out, *sources):
         """Gradient of the sources' concatenation; grad_out is that of the layer before its ReLU."""
         joined = np.concatenate([a[s] for s in sources], 2)
-        grad, grad_weight, grad_bias = conv_gradients(joined, parameters[name + ".weight"], grad_out)
+        grad, grad_weight, grad_bias = conv_gradients(
+            joined, parameters[name + ".weight"], grad_out
+        )
         gradients[name + ".weight"], gradients[name + ".bias"] = grad_weight, grad_bias
         return grad
 

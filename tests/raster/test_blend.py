@@ -1,49 +1,23 @@
 """The blend against its float64 twin, and its gradients against finite differences of that twin."""
 
 import numpy as np
-import oracle_raster as oracle
 import pytest
-from helpers import AWKWARD_SIZES, numeric_gradient, relative_error
-from raster_scene import Scene, make_camera, make_points
+from oracle import raster as oracle
+from support.comparisons import numeric_gradient, relative_error
+from support.guarded import AWKWARD_SIZES
+from support.raster_scene import GAMMAS, Blended, Scene
 
-from pp_cl.project import KINDS
-
-GAMMAS = (0.1, 0.01)
-
-
-class Blended:
-    """A random scene blended by the kernels and by the oracle, both with the kernels' hits."""
-
-    def __init__(self, dev, rng, n=257, kind="soft", gamma=0.1, radius=None, size=(24, 20), **blend):
-        self.camera, self.gamma, self.kind = make_camera(*size), gamma, kind
-        self.positions = make_points(rng, n)
-        self.radius = np.float32(rng.uniform(0.05, 0.5, n) if radius is None else np.full(n, radius))
-        self.opacity = np.float32(rng.uniform(0, 1, n))
-        self.opacity[::7] = 0
-        self.opacity[1::7] = 1
-        self.point_features = rng.normal(size=(n, 16))
-        self.grad = rng.normal(size=(size[0] * size[1], 16))
-        self.scene = Scene(dev, self.camera, self.positions, self.radius, kind)
-        self.features = self.scene.blend(self.opacity, gamma, self.point_features, **blend).reshape(-1, 16)
-        self.geometry = oracle.geometry(self.camera, self.positions, self.radius, kind) | {"hit": self.scene.hits()}
-        self.blend = oracle.blend(self.camera, self.geometry, self.opacity, gamma, blend.get("stop", 0.0))
-        self.weight = self.scene.dense(self.scene.weights.pair_weight.get()[:, 0])
-
-    def gradients(self):
-        """The kernels' gradients of sum(features * grad)."""
-        return self.scene.gradients(self.grad)
-
-    def oracle_gradients(self, max_tracked=0, mean=False):
-        """The same by the oracle: (features, opacity, by pair and logit)."""
-        return oracle.blend_gradients(self.geometry, self.blend, self.opacity, self.point_features, self.grad, self.gamma,
-                                      max_tracked, mean)
+from pp_cl.raster.project import KINDS
 
 
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("gamma", GAMMAS)
 def test_features(dev, rng, kind, gamma):
     blended = Blended(dev, rng, kind=kind, gamma=gamma)
-    assert relative_error(blended.features, oracle.features(blended.blend, blended.point_features)) < 2e-4
+    assert (
+        relative_error(blended.features, oracle.features(blended.blend, blended.point_features))
+        < 2e-4
+    )
     assert (blended.features[~blended.geometry["hit"].any(axis=0)] == 1).all()
 
 
@@ -51,7 +25,10 @@ def test_features(dev, rng, kind, gamma):
 @pytest.mark.parametrize("size", [(1, 1), (31, 33)])
 def test_sizes(dev, rng, n, size):
     blended = Blended(dev, rng, n=n, size=size)
-    assert relative_error(blended.features, oracle.features(blended.blend, blended.point_features)) < 1e-4
+    assert (
+        relative_error(blended.features, oracle.features(blended.blend, blended.point_features))
+        < 1e-4
+    )
     gradients, expected = blended.gradients(), blended.oracle_gradients()
     assert relative_error(gradients["features"], expected[0]) < 1e-4
     assert relative_error(gradients["opacity"], expected[1]) < 1e-4
@@ -86,7 +63,10 @@ def test_gradients_against_finite_differences(dev, rng, gamma):
     assert relative_error(gradients["opacity"][inside], numeric) < 5e-4
     zero = np.flatnonzero(opacity == 0)
     start = loss(opacity, blended.point_features)
-    one_sided = [(loss(opacity + 1e-7 * (np.arange(60) == i), blended.point_features) - start) / 1e-7 for i in zero]
+    one_sided = [
+        (loss(opacity + 1e-7 * (np.arange(60) == i), blended.point_features) - start) / 1e-7
+        for i in zero
+    ]
     assert relative_error(gradients["opacity"][zero], one_sided) < 1e-3
     assert np.abs(one_sided).max() > 0.1
 
@@ -115,7 +95,10 @@ def test_sphere_gradients_against_finite_differences(dev, rng, gamma, mean):
 
     scale = np.maximum(hit.sum(axis=1), 1) if mean else np.ones(n)
     radius = blended.radius.astype(np.float64)
-    numeric = numeric_gradient(lambda p: loss(p, radius), blended.positions, step).reshape(n, 3) / scale[:, None]
+    numeric = (
+        numeric_gradient(lambda p: loss(p, radius), blended.positions, step).reshape(n, 3)
+        / scale[:, None]
+    )
     assert relative_error(gradients["positions"], numeric) < 2e-3
     assert np.abs(gradients["positions"][-1]).max() > 0
     numeric = numeric_gradient(lambda r: loss(blended.positions, r), radius, step) / scale

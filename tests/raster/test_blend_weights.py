@@ -1,12 +1,13 @@
 """The weights against their float64 twin, and what is dropped of them."""
 
 import numpy as np
-import oracle_raster as oracle
 import pytest
-from helpers import AWKWARD_SIZES, large, relative_error
-from test_blend import GAMMAS, Blended
+from oracle import raster as oracle
+from support.comparisons import relative_error
+from support.guarded import AWKWARD_SIZES, large
+from support.raster_scene import GAMMAS, Blended
 
-from pp_cl.project import KINDS
+from pp_cl.raster.project import KINDS
 
 TAUS = (1e-4, 1e-2, 0.3)
 
@@ -24,7 +25,10 @@ def test_early_stop(dev, rng, stop):
     blended = Blended(dev, rng, n=500, gamma=0.02, radius=0.4, stop=stop)
     dropped = blended.geometry["hit"] & ~blended.blend["hit"]
     assert dropped.sum() > 100 and (blended.blend["hit"].sum(axis=0) > 16).any()
-    assert relative_error(blended.features, oracle.features(blended.blend, blended.point_features)) < 1e-4
+    assert (
+        relative_error(blended.features, oracle.features(blended.blend, blended.point_features))
+        < 1e-4
+    )
     gradients, expected = blended.gradients(), blended.oracle_gradients()
     assert relative_error(gradients["features"], expected[0]) < 1e-4
     assert relative_error(gradients["opacity"], expected[1]) < 2e-4
@@ -36,20 +40,29 @@ def test_point_weights_accumulate(dev, rng):
     blended = Blended(dev, rng, max_tracked=2)
     point_weight = dev.upload(np.arange(257, dtype=np.float32))
     blended.scene.weights.add_point_weights(blended.scene.pairs, point_weight)
-    assert relative_error(point_weight.get() - np.arange(257), blended.blend["weight"].sum(axis=1)) < 1e-4
+    assert (
+        relative_error(point_weight.get() - np.arange(257), blended.blend["weight"].sum(axis=1))
+        < 1e-4
+    )
 
 
 @pytest.mark.parametrize("n", [*AWKWARD_SIZES, large(3000)])
 @pytest.mark.parametrize("gamma", GAMMAS)
 @pytest.mark.parametrize("tau", TAUS)
 def test_tau(dev, n, gamma, tau):
-    """What is left hardly changes, what is dropped weighs no more than is said, and that is at most tau."""
-    exact, blended = (Blended(dev, np.random.default_rng(5), n, gamma=gamma, radius=0.3, tau=t) for t in (0.0, tau))
+    """What is left hardly changes, what is dropped weighs no more than is said, and that is at most
+    tau.
+    """
+    exact, blended = (
+        Blended(dev, np.random.default_rng(5), n, gamma=gamma, radius=0.3, tau=t)
+        for t in (0.0, tau)
+    )
     hit = exact.geometry["hit"]
     slope = blended.scene.dense(blended.scene.weights.pair_weight.get()[:, 1])
     dropped = hit & np.signbit(blended.weight) & np.signbit(slope)
     left = blended.weight[hit & ~dropped] / exact.weight[hit & ~dropped]
-    assert (left >= 1 - 1e-6).all() and (left <= 1 + tau).all()  # a tail that was never weighed is missing in their sum
+    # a tail that was never weighed is missing in their sum
+    assert (left >= 1 - 1e-6).all() and (left <= 1 + tau).all()
     if n > 1:
         assert dropped.any()
 
@@ -69,7 +82,9 @@ def test_tau(dev, n, gamma, tau):
 
 
 def test_tau_drops_from_the_back(dev, rng):
-    """The last hit that is left would not fit; an eighth of tau may go to a bound of what was never weighed."""
+    """The last hit that is left would not fit; an eighth of tau may go to a bound of what was never
+    weighed.
+    """
     blended = Blended(dev, rng, n=500, gamma=0.1, radius=0.4, tau=0.05)
     whole, order = blended.blend["weight"], oracle.order(blended.geometry)
     said, fits = blended.scene.weights.dropped(blended.scene.pairs).get(), 0
@@ -105,7 +120,9 @@ def test_tau_with_gradients_of_spheres(dev, rng):
 
 
 def test_untracked_hits_without_weight_are_kept(dev, rng):
-    """A weight may underflow to 0 beyond max_tracked; its point is in the picture's lists, so it must be shaded."""
+    """A weight may underflow to 0 beyond max_tracked; its point is in the picture's lists, so it
+    must be shaded.
+    """
     blended = Blended(dev, rng, n=300, gamma=1e-3, radius=0.4, max_tracked=1, stop=1e-30)
     untracked_zero = blended.geometry["hit"] & np.signbit(blended.weight) & (blended.weight == 0)
     assert untracked_zero.any() and np.isfinite(blended.features).all()

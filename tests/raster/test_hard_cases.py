@@ -1,15 +1,19 @@
-"""Numerically hard cases of the blend, one by one: where a naive Eq. (1) overflows, divides by zero, or hangs."""
+"""Numerically hard cases of the blend, one by one: where a naive Eq. (1) overflows, divides by
+zero, or hangs.
+"""
 
 from dataclasses import replace
 
 import numpy as np
-import oracle_raster as oracle
 import pytest
-from helpers import relative_error
-from raster_scene import Scene, make_camera
+from oracle import raster as oracle
+from support.comparisons import relative_error
+from support.raster_scene import Scene, make_camera
 
 NEAR, FAR = 2.0, 6.0
-CAMERA = replace(make_camera(1, 1), pose=np.eye(3, 4), fx=100.0, fy=100.0, cx=0.5, cy=0.5, near=NEAR, far=FAR)
+CAMERA = replace(
+    make_camera(1, 1), pose=np.eye(3, 4), fx=100.0, fy=100.0, cx=0.5, cy=0.5, near=NEAR, far=FAR
+)
 
 
 def depth_at(z):
@@ -18,7 +22,9 @@ def depth_at(z):
 
 
 def blend_on_axis(dev, z, opacity, gamma, camera=CAMERA, **options):
-    """(Scene, weights): points at normalised depths z, straight ahead of a one-pixel camera, each in its own channel."""
+    """(Scene, weights): points at normalised depths z, straight ahead of a one-pixel camera, each
+    in its own channel.
+    """
     positions = np.stack([np.zeros(len(z)), np.zeros(len(z)), depth_at(z)], -1)
     scene = Scene(dev, camera, positions, 0.001)
     scene.blend(np.asarray(opacity), gamma, np.resize(np.eye(16), (len(z), 16)), **options)
@@ -37,11 +43,15 @@ def test_nearest_possible_point_at_the_final_gamma(dev):
 
 @pytest.mark.parametrize("opacity", [1.0, 0.3, 1e-3, 1e-38])
 def test_the_smallest_gamma(dev, opacity):
-    """gamma = 1e-5: exponents of 1e5; the nearest of equal opacities takes all, or shares with the background."""
+    """gamma = 1e-5: exponents of 1e5; the nearest of equal opacities takes all, or shares with the
+    background.
+    """
     scene, weight = blend_on_axis(dev, [0.9, 0.8, 0.1], [opacity] * 3, 1e-5)
     gradients = scene.gradients(np.ones((1, 1, 16)))
     assert np.isfinite(weight).all() and all(np.isfinite(g).all() for g in gradients.values())
-    expected = oracle.blend(CAMERA, dense_geometry(scene), [np.float32(opacity)] * 3, 1e-5)["weight"][:, 0]
+    expected = oracle.blend(CAMERA, dense_geometry(scene), [np.float32(opacity)] * 3, 1e-5)[
+        "weight"
+    ][:, 0]
     assert np.allclose(weight, expected, rtol=1e-2, atol=1e-30)
 
 
@@ -66,7 +76,9 @@ def test_equal_depths_are_tracked_in_index_order(dev):
 
 @pytest.mark.parametrize("gamma", [0.1, 0.01, 1e-5])
 def test_all_opacities_zero(dev, gamma):
-    """The picture is the background, and yet every opacity has a gradient by which it can come back."""
+    """The picture is the background, and yet every opacity has a gradient by which it can come
+    back.
+    """
     scene, weight = blend_on_axis(dev, [0.9, 0.5, 0.2], [0.0, 0.0, 0.0], gamma)
     assert (weight == 0).all() and (scene.features.get() == 1).all()
     gradients = scene.gradients(np.ones((1, 1, 16)))
@@ -129,7 +141,8 @@ def test_a_ray_through_the_centre_of_a_sphere_has_gradients(dev):
 def test_a_hit_on_the_very_rim(dev):
     """d = 0 with an exponent above that of the largest float: no weight, no gradient, no NaN."""
     camera = replace(CAMERA, near=1.8, far=10.0)
-    scene = Scene(dev, camera, np.array([[3.0, 0, 4.0]]), np.sqrt(10.0), "sphere")  # rho = |(3, 0, 4) - 5 (0, 0, 1)|
+    # rho = |(3, 0, 4) - 5 (0, 0, 1)|
+    scene = Scene(dev, camera, np.array([[3.0, 0, 4.0]]), np.sqrt(10.0), "sphere")
     assert scene.pairs.total == 1 and scene.pairs.pair_source.get()[0, 1] == 0
     assert (scene.blend([1.0], 0.005, np.full((1, 16), 2.0)) == 1).all()
     gradients = scene.gradients(np.ones((1, 1, 16))) | scene.sphere_gradients(np.ones((1, 1, 16)))
@@ -161,7 +174,9 @@ def test_thousands_of_hits_in_one_pixel(dev, rng, gamma):
 
 
 def test_an_empty_view(dev):
-    scene = Scene(dev, replace(CAMERA, width=31, height=33), np.array([[100.0, 0, 3.0], [0, 0, 300.0]]), 0.01)
+    scene = Scene(
+        dev, replace(CAMERA, width=31, height=33), np.array([[100.0, 0, 3.0], [0, 0, 300.0]]), 0.01
+    )
     assert scene.pairs.total == 0 and scene.pairs.seen.size == 0
     assert (scene.blend([1, 1], 0.01, np.zeros((2, 16))) == 1).all()
     gradients = scene.gradients(np.ones((33, 31, 16)))

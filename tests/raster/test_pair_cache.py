@@ -1,25 +1,32 @@
-"""Hits that are kept: the same bits as those found anew, within the budget, forgotten when the points change."""
+"""Hits that are kept: the same bits as those found anew, within the budget, forgotten when the
+points change.
+"""
 
 import numpy as np
 import pytest
-from raster_scene import Scene, make_camera, make_points
-from scenes import ring_cameras
-from test_render import make_model
+from support.models import make_model
+from support.raster_scene import Scene, make_camera, make_points
+from support.scenes import ring_cameras
 
 from pp_cl.config import PointsConfig
 from pp_cl.errors import UserError
-from pp_cl.memory import spare_memory
-from pp_cl.pair_cache import PairCache
-from pp_cl.pairs import LASTING
+from pp_cl.raster.pair_cache import PairCache
+from pp_cl.raster.pairs import LASTING
 from pp_cl.render import Renderer
+from pp_cl.training.memory import spare_memory
 
 GAMMA = 0.03
 
 
 def state(pairs):
-    """Host copies of everything that build() leaves; without pairs, their arrays hold one row that means nothing."""
+    """Host copies of everything that build() leaves; without pairs, their arrays hold one row that
+    means nothing.
+    """
     arrays = {name: getattr(pairs, name).get() for name in LASTING}
-    rows = [array[: pairs.total] if name.startswith("pair_") else array for name, array in arrays.items()]
+    rows = [
+        array[: pairs.total] if name.startswith("pair_") else array
+        for name, array in arrays.items()
+    ]
     return [pairs.total, pairs.points, pairs.pixels, *rows]
 
 
@@ -38,7 +45,10 @@ def same(first, second):
 def test_kept_hits_are_the_same_bits(dev, rng, budget):
     """Views of different sizes in changing order, one of them empty."""
     sizes = [(24, 20), (31, 33), (1, 1), (24, 20), (16, 8)]
-    scenes = [Scene(dev, make_camera(*size), make_points(rng, 257) + 1e6 * (i == 4), 0.2) for i, size in enumerate(sizes)]
+    scenes = [
+        Scene(dev, make_camera(*size), make_points(rng, 257) + 1e6 * (i == 4), 0.2)
+        for i, size in enumerate(sizes)
+    ]
     expected = [state(scene.pairs) for scene in scenes]
     assert expected[4][0] == 0 < expected[0][0]
     cache, pairs = PairCache(dev, budget), Scene(dev, make_camera(), make_points(rng, 3), 0.1).pairs
@@ -65,14 +75,18 @@ def test_a_kept_view_is_not_built_again(dev, rng):
 def test_pictures_and_gradients_are_the_same_bits(dev, rng, footprint, tau):
     """With opacities that change from step to step, and points that go."""
     model, cameras = make_model(dev, rng), ring_cameras(3, 24)
-    settings = PointsConfig(footprint=footprint, radius=0.75 if footprint == "soft" else 0.0015, tau=tau)
+    settings = PointsConfig(
+        footprint=footprint, radius=0.75 if footprint == "soft" else 0.0015, tau=tau
+    )
     kept, anew = Renderer(dev, model, settings), Renderer(dev, model, settings)
     kept.cache.budget = 10**9
     grad = dev.upload(rng.normal(size=(24, 24, 16)), np.float32)
     for step in range(8):
         if step == 5:
             kept.cache.clear()
-            model.points |= {name: dev.upload(array.get()[::2]) for name, array in model.points.items()}
+            model.points |= {
+                name: dev.upload(array.get()[::2]) for name, array in model.points.items()
+            }
         model.points["opacity"].set(rng.uniform(0, 1, model.count).astype(np.float32))
         results = []
         for renderer, key in ((kept, step % 3), (anew, None)):

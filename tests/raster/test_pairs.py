@@ -3,12 +3,13 @@
 from dataclasses import replace
 
 import numpy as np
-import oracle_raster as oracle
 import pytest
-from helpers import AWKWARD_SIZES, large, relative_error
-from raster_scene import Scene, make_camera, make_points
+from oracle import raster as oracle
+from support.comparisons import relative_error
+from support.guarded import AWKWARD_SIZES, large
+from support.raster_scene import Scene, make_camera, make_points
 
-from pp_cl.project import KINDS
+from pp_cl.raster.project import KINDS
 
 BAND = 1e-4  # pixels beside the edge of a footprint where rounding may decide
 
@@ -24,7 +25,9 @@ def check(scene, expected):
     points, pixels = scene.pair_points(), pairs.pair_pixel.get()[:total].astype(np.int64)
     source = pairs.pair_source.get()[:total]
     assert np.array_equal(source[:, 0], points)
-    assert relative_error(source[:, 1].view(np.float32), expected["closeness"][points, pixels]) < 1e-4
+    assert (
+        relative_error(source[:, 1].view(np.float32), expected["closeness"][points, pixels]) < 1e-4
+    )
 
     offsets, keys = pairs.pixel_offset.get().astype(np.int64), pairs.pair_key.get()[:total]
     assert np.array_equal(np.diff(offsets), hits.sum(axis=0))
@@ -32,7 +35,8 @@ def check(scene, expected):
     depth = (keys >> 32).astype(np.uint32).view(np.float32)
     assert np.array_equal(np.sort(pair), np.arange(total))
     assert np.array_equal(pixels[pair], np.repeat(np.arange(len(offsets) - 1), np.diff(offsets)))
-    assert relative_error(depth, expected["depth"][points[pair], pixels[pair]]) < 1e-3  # at the rim of a sphere it is steep
+    # at the rim of a sphere it is steep
+    assert relative_error(depth, expected["depth"][points[pair], pixels[pair]]) < 1e-3
     inner = pixels[pair][1:] == pixels[pair][:-1]
     assert (keys[1:] > keys[:-1])[inner].all()
     assert np.array_equal(pairs.seen.get(), np.flatnonzero(hits.any(axis=1)))
@@ -42,7 +46,10 @@ def check(scene, expected):
 @pytest.mark.parametrize("radius", [1e-3, 0.08, 0.5])
 def test_equal_radii(dev, rng, kind, radius):
     camera, positions = make_camera(), make_points(rng, 300)
-    check(Scene(dev, camera, positions, radius, kind), oracle.geometry(camera, positions, radius, kind))
+    check(
+        Scene(dev, camera, positions, radius, kind),
+        oracle.geometry(camera, positions, radius, kind),
+    )
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -50,7 +57,10 @@ def test_equal_radii(dev, rng, kind, radius):
 def test_radii_of_all_sizes(dev, rng, kind, n):
     camera, positions = replace(make_camera(33, 31), fy=26.0), make_points(rng, n)
     radius = np.float32(10.0 ** rng.uniform(-3, 0, n))
-    check(Scene(dev, camera, positions, radius, kind), oracle.geometry(camera, positions, radius, kind))
+    check(
+        Scene(dev, camera, positions, radius, kind),
+        oracle.geometry(camera, positions, radius, kind),
+    )
 
 
 def test_a_crop_sees_the_same_hits(dev, rng):
@@ -99,5 +109,7 @@ def test_two_builds_give_the_same_bits(dev, rng):
     first, second = (Scene(dev, camera, positions, 0.15).pairs for _ in range(2))
     total = first.total
     for name in ("pair_pixel", "pair_source", "pair_key"):
-        assert np.array_equal(getattr(first, name).get()[:total], getattr(second, name).get()[:total]), name
+        assert np.array_equal(
+            getattr(first, name).get()[:total], getattr(second, name).get()[:total]
+        ), name
     assert total > 20_000

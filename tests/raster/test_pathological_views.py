@@ -1,24 +1,26 @@
-"""Views that no photographer takes: from inside the object, of one pixel or of millions, through one huge point."""
+"""Views that no photographer takes: from inside the object, of one pixel or of millions, through
+one huge point.
+"""
 
 import time
 from dataclasses import replace
 
 import numpy as np
-import oracle_raster as oracle
 import pytest
-from helpers import relative_error
-from raster_scene import Scene, make_camera
-from test_blend import Blended
+from oracle import raster as oracle
+from support.comparisons import relative_error
+from support.raster_scene import Blended, Scene, make_camera
 
 from pp_cl.errors import UserError
-from pp_cl.project import KINDS
+from pp_cl.raster.project import KINDS
 
 TAUS = (0.0, 0.01)
 
 
 def check(dev, rng, camera, positions, radius, kind, tau=0.0, gamma=0.05):
-    """A scene's hits, features and gradients against the oracle; returns the scene. Left out are pixels where rounding
-    decides over a hit, or makes up most of a closeness."""
+    """A scene's hits, features and gradients against the oracle; returns the scene. Left out are
+    pixels where rounding decides over a hit, or makes up most of a closeness.
+    """
     n = len(positions)
     opacity, point_features = np.float32(rng.uniform(0, 1, n)), rng.normal(size=(n, 16))
     scene = Scene(dev, camera, positions, radius, kind)
@@ -34,7 +36,9 @@ def check(dev, rng, camera, positions, radius, kind, tau=0.0, gamma=0.05):
     assert np.abs(features - oracle.features(blend, point_features))[inner].max() < 1e-3 + slack
     grad = rng.normal(size=(len(inner), 16)) * inner[:, None]
     gradients = scene.gradients(grad)
-    expected = oracle.blend_gradients(geometry | {"hit": hits}, blend, opacity, point_features, grad, gamma)
+    expected = oracle.blend_gradients(
+        geometry | {"hit": hits}, blend, opacity, point_features, grad, gamma
+    )
     if tau == 0:
         assert relative_error(gradients["features"], expected[0]) < 1e-3
         assert relative_error(gradients["opacity"], expected[1]) < 2e-3
@@ -46,7 +50,9 @@ def check(dev, rng, camera, positions, radius, kind, tau=0.0, gamma=0.05):
 @pytest.mark.parametrize("tau", TAUS)
 @pytest.mark.parametrize("radius", [0.01, 0.3])
 def test_from_inside_the_object(dev, rng, kind, tau, radius):
-    """Points on all sides, also behind and beside the eye, and very near; an angle of view of 130 degrees."""
+    """Points on all sides, also behind and beside the eye, and very near; an angle of view of 130
+    degrees.
+    """
     camera = replace(make_camera(28, 20), fx=6.5, fy=6.5, near=0.05, far=4.0)
     positions = camera.eye + rng.uniform(-1, 1, (400, 3))
     scene = check(dev, rng, camera, positions, radius, kind, tau)
@@ -55,13 +61,17 @@ def test_from_inside_the_object(dev, rng, kind, tau, radius):
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_across_the_near_sphere_and_the_plane_of_the_eye(dev, rng, kind):
-    """Spheres whose front is just before and just behind `near`, and some that reach beside and behind the eye."""
+    """Spheres whose front is just before and just behind `near`, and some that reach beside and
+    behind the eye.
+    """
     camera = replace(make_camera(24, 24), fx=5.0, fy=5.0, near=0.5, far=3.0)
     directions = rng.normal(size=(300, 3))
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
     radius = np.float32(rng.uniform(0.01, 0.8, 300))
     front = 0.5 + rng.uniform(-0.1, 0.1, 300)
-    scene = check(dev, rng, camera, camera.eye + directions * (front + radius)[:, None], radius, kind)
+    scene = check(
+        dev, rng, camera, camera.eye + directions * (front + radius)[:, None], radius, kind
+    )
     placed = scene.projection.point_camera.get()
     left_out = placed[:, 3] < 0
     assert (left_out[front < 0.5 - 1e-4]).all() and (~left_out).sum() > 40
@@ -101,15 +111,26 @@ def test_an_image_of_millions_of_pixels(dev):
     """4096 x 4096: the corners and the middle are those of small images cut out of it."""
     side, patch = 4096, 24
     camera = replace(make_camera(side, side, 3000.0), fy=3000.0, cx=side / 2, cy=side / 2)
-    places = [(0, 0), (side - patch, 0), (0, side - patch), (side - patch, side - patch), (2000, 2040)]
+    places = [
+        (0, 0),
+        (side - patch, 0),
+        (0, side - patch),
+        (side - patch, side - patch),
+        (2000, 2040),
+    ]
     centres = np.array(places)[:, None] + np.random.default_rng(2).uniform(0, patch, (5, 40, 2))
     slopes = (centres.reshape(-1, 2) - side / 2) / 3000.0
     rays = np.column_stack([slopes, np.ones(len(slopes))])
     depth = np.linspace(2.5, 5.5, len(rays))[:, None]
-    positions = camera.eye + depth * (rays / np.linalg.norm(rays, axis=1, keepdims=True)) @ camera.pose[:, :3].T
+    positions = (
+        camera.eye
+        + depth * (rays / np.linalg.norm(rays, axis=1, keepdims=True)) @ camera.pose[:, :3].T
+    )
     scene = Scene(dev, camera, positions, 0.004, "disc")
     offsets = scene.pairs.pixel_offset.get().astype(np.int64)
-    points = scene.pairs.pair_source.get()[:, 0][scene.pairs.pair_key.get()[: scene.pairs.total] & 0xFFFFFFFF]
+    points = scene.pairs.pair_source.get()[:, 0][
+        scene.pairs.pair_key.get()[: scene.pairs.total] & 0xFFFFFFFF
+    ]
     found = 0
     for x0, y0 in places:
         cut = camera.crop(x0, y0, patch, patch)
@@ -124,7 +145,9 @@ def test_an_image_of_millions_of_pixels(dev):
 
 @pytest.mark.large
 def test_long_lists_do_not_take_quadratic_time(dev):
-    """Eight times the hits in one pixel, 8 log-ish times the time; 64 if it were quadratic. The best of some runs."""
+    """Eight times the hits in one pixel, 8 log-ish times the time; 64 if it were quadratic. The
+    best of some runs.
+    """
     camera = replace(make_camera(1, 1), pose=np.eye(3, 4), cx=0.5, cy=0.5)
 
     def best(n):
@@ -153,6 +176,12 @@ def test_more_pairs_than_can_be_numbered(dev):
 @pytest.mark.large
 def test_the_tau_of_a_real_scene_is_a_bound(dev):
     """From inside a ball of points, with the weights of neighbouring pixels all different."""
-    exact, dropped = (Blended(dev, np.random.default_rng(9), 2000, gamma=0.03, radius=0.4, tau=t) for t in (0.0, 1e-3))
+    exact, dropped = (
+        Blended(dev, np.random.default_rng(9), 2000, gamma=0.03, radius=0.4, tau=t)
+        for t in (0.0, 1e-3)
+    )
     values = np.vstack([exact.point_features, np.ones((1, 16))])
-    assert (np.abs(exact.features - dropped.features).max(axis=0) <= 1e-3 * np.ptp(values, axis=0) + 1e-6).all()
+    assert (
+        np.abs(exact.features - dropped.features).max(axis=0)
+        <= 1e-3 * np.ptp(values, axis=0) + 1e-6
+    ).all()

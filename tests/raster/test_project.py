@@ -3,13 +3,14 @@
 from dataclasses import replace
 
 import numpy as np
-import oracle_raster as oracle
 import pytest
-from helpers import AWKWARD_SIZES, relative_error
-from raster_scene import make_camera, make_points
+from oracle import raster as oracle
+from support.comparisons import relative_error
+from support.guarded import AWKWARD_SIZES
+from support.raster_scene import make_camera, make_points
 
-from pp_cl.points import Grid
-from pp_cl.project import KINDS, Footprint, Projection
+from pp_cl.raster.project import KINDS, Footprint, Projection
+from pp_cl.scene.grid import Grid
 
 GRID = Grid((-1.1, -0.9, -0.7), 0.05, (45, 37, 29))
 
@@ -17,7 +18,13 @@ GRID = Grid((-1.1, -0.9, -0.7), 0.05, (45, 37, 29))
 def project_grid(dev, camera, ids, radius=0.0, **options):
     """(N, 4) positions in camera axes and distances of grid vertices."""
     projection = Projection(dev, Footprint("disc"))
-    projection.grid(dev.upload(camera.packed()), dev.upload(GRID.packed()), dev.upload(ids, np.uint32), radius, **options)
+    projection.grid(
+        dev.upload(camera.packed()),
+        dev.upload(GRID.packed()),
+        dev.upload(ids, np.uint32),
+        radius,
+        **options,
+    )
     return projection.point_camera.get()
 
 
@@ -49,20 +56,35 @@ def test_spheres_are_culled_at_their_front(dev, rng, n):
     kept = oracle.kept(camera, positions, radius)
     assert np.array_equal(points[:, 3] >= 0, kept)
     assert n < 257 or 20 < kept.sum() < n - 20
-    assert relative_error(points[kept, :3], oracle.camera_space(camera, positions)[kept]) < 1e-6 or not kept.any()
+    assert (
+        relative_error(points[kept, :3], oracle.camera_space(camera, positions)[kept]) < 1e-6
+        or not kept.any()
+    )
     assert (points[~kept] == [0, 0, 0, -1]).all()
 
 
 def test_near_and_far_are_inclusive_and_the_radius_counts(dev):
     camera = replace(make_camera(focal=32.0), pose=np.eye(3, 4), fy=32.0, near=2.0, far=4.0)
     positions = np.array([[0, 0, 2.0], [0, 0, 1.9999], [0, 0, 4.0], [0, 0, 4.0001]])
-    assert (project_spheres(dev, camera, positions, 0.0)[0][:, 3] > 0).tolist() == [True, False, True, False]
-    assert (project_spheres(dev, camera, positions + [0, 0, 0.5], 0.5)[0][:, 3] > 0).tolist() == [True, False, True, False]
+    assert (project_spheres(dev, camera, positions, 0.0)[0][:, 3] > 0).tolist() == [
+        True,
+        False,
+        True,
+        False,
+    ]
+    assert (project_spheres(dev, camera, positions + [0, 0, 0.5], 0.5)[0][:, 3] > 0).tolist() == [
+        True,
+        False,
+        True,
+        False,
+    ]
 
 
 def test_one_radius_means_all_alike(dev, rng):
     camera, positions = make_camera(), make_points(rng, 33)
-    one, many = (project_spheres(dev, camera, positions, radius) for radius in (0.1, np.full(33, 0.1)))
+    one, many = (
+        project_spheres(dev, camera, positions, radius) for radius in (0.1, np.full(33, 0.1))
+    )
     assert np.array_equal(one[0], many[0])
     assert np.array_equal(one[1], many[1])
 
@@ -73,7 +95,9 @@ def test_dropout_is_a_function_of_seed_and_id(dev):
     dropped = project_grid(dev, camera, ids, dropout=0.15, seed=5)[:, 3] < 0
     assert abs(dropped.mean() - 0.15) < 0.01
     some = ids[::7][::-1]
-    assert np.array_equal(project_grid(dev, camera, some, dropout=0.15, seed=5)[:, 3] < 0, dropped[some])
+    assert np.array_equal(
+        project_grid(dev, camera, some, dropout=0.15, seed=5)[:, 3] < 0, dropped[some]
+    )
     other = project_grid(dev, camera, ids, dropout=0.15, seed=6)[:, 3] < 0
     assert abs((other & dropped).mean() - 0.15**2) < 0.005
     assert (project_grid(dev, camera, ids, dropout=0.0, seed=5)[:, 3] > 0).all()
@@ -87,13 +111,24 @@ def test_boxes_hold_the_hits_and_little_more(dev, rng, kind):
     points, boxes = project_spheres(dev, camera, positions, radius, kind)
     boxes = boxes.astype(np.int64)
     c, t = oracle.camera_space(camera, positions), points[:, 3].astype(np.float64)
-    reach = radius if kind == "sphere" else np.maximum(radius, oracle.LEAST_RADIUS * oracle.pixel_width(camera, t))
+    reach = (
+        radius
+        if kind == "sphere"
+        else np.maximum(radius, oracle.LEAST_RADIUS * oracle.pixel_width(camera, t))
+    )
     expected = np.empty((n, 4))
     axes = ((camera.fx, camera.cx, camera.width), (camera.fy, camera.cy, camera.height))
     for axis, (focal, centre, size) in enumerate(axes):
-        alpha, theta = np.arctan2(c[:, axis], c[:, 2]), np.arcsin(reach / np.hypot(c[:, axis], c[:, 2]))
+        alpha, theta = (
+            np.arctan2(c[:, axis], c[:, 2]),
+            np.arcsin(reach / np.hypot(c[:, axis], c[:, 2])),
+        )
         low, high = (np.tan(alpha + sign * theta) * focal + centre - 0.5 for sign in (-1, 1))
-        low, high = (np.floor(low), np.ceil(high)) if kind == "sphere" else (np.ceil(low - 0.01), np.floor(high + 0.01))
+        low, high = (
+            (np.floor(low), np.ceil(high))
+            if kind == "sphere"
+            else (np.ceil(low - 0.01), np.floor(high + 0.01))
+        )
         expected[:, axis], expected[:, 2 + axis] = np.maximum(low, 0), np.minimum(high, size - 1)
     empty = (t < 0) | (expected[:, 0] > expected[:, 2]) | (expected[:, 1] > expected[:, 3])
     assert 20 < empty.sum() < n - 100

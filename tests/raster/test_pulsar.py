@@ -1,18 +1,26 @@
-"""Parity with Pulsar (PyTorch3D, compiled with exact exp and log): pictures, hit counts and gradients of its fixtures."""
+"""Parity with Pulsar (PyTorch3D, compiled with exact exp and log): pictures, hit counts and
+gradients of its fixtures.
+"""
 
 import numpy as np
 import pytest
-from helpers import relative_error
-from oracle_raster import camera_space, pulsar_box
-from raster_scene import Scene
+from oracle.raster import camera_space, pulsar_box
+from support.comparisons import relative_error
+from support.raster_scene import Scene
 
-from pp_cl.camera import Camera
+from pp_cl.scene.camera import Camera
 
-CASES = ("a_tiny_32_n50_c3", "b_64_n500_c16_g0.1", "c_64_n500_c16_g0.01", "d_degenerate_64_c16_g0.05",
-         "e_rot_48x40_n300_c16_g0.05", "f_deep_32_n600_c4_g0.3")
+CASES = (
+    "a_tiny_32_n50_c3",
+    "b_64_n500_c16_g0.1",
+    "c_64_n500_c16_g0.01",
+    "d_degenerate_64_c16_g0.05",
+    "e_rot_48x40_n300_c16_g0.05",
+    "f_deep_32_n600_c4_g0.3",
+)
 
-# Where its denominator is below 1e-3, Pulsar damps the gradients of these spheres by up to 10; they are compared with the
-# float64 sums only.
+# Where its denominator is below 1e-3, Pulsar damps the gradients of these spheres by up to 10; they
+# are compared with the float64 sums only.
 DAMPED = {"c_64_n500_c16_g0.01": [251], "d_degenerate_64_c16_g0.05": [29, 41, 50]}
 
 # Spheres with the same centre: which of them Pulsar tracks first is arbitrary.
@@ -22,11 +30,21 @@ MIRROR = np.array([1.0, -1.0, 1.0])  # Pulsar's left-handed world to our right-h
 
 
 def read_camera(fixture):
-    """Our Camera: Pulsar's integer pixel centres become ours at +0.5, its y axis turns over with the world."""
+    """Our Camera: Pulsar's integer pixel centres become ours at +0.5, its y axis turns over with
+    the world.
+    """
     width, height = int(fixture["in_width"]), int(fixture["in_height"])
-    step_x, step_y = fixture["in_pixel_vec_x"].astype(np.float64), fixture["in_pixel_vec_y"].astype(np.float64)
+    step_x, step_y = (
+        fixture["in_pixel_vec_x"].astype(np.float64),
+        fixture["in_pixel_vec_y"].astype(np.float64),
+    )
     pixel = np.linalg.norm(step_x)
-    centre = fixture["in_pixel_0_0_center"] + step_x * (width - 1) / 2 + step_y * (height - 1) / 2 - fixture["in_cam_pos"]
+    centre = (
+        fixture["in_pixel_0_0_center"]
+        + step_x * (width - 1) / 2
+        + step_y * (height - 1) / 2
+        - fixture["in_cam_pos"]
+    )
     axes = np.stack([step_x / pixel, step_y / pixel, centre / np.linalg.norm(centre)], 1)
     pose = MIRROR[:, None] * np.concatenate([axes, fixture["in_cam_pos"][:, None]], 1)
     assert np.allclose(np.linalg.det(pose[:, :3]), 1, atol=1e-5)
@@ -45,10 +63,13 @@ class Case:
         self.camera = read_camera(self)
         self.positions, self.radius = self["in_positions"] * MIRROR, self["in_radius"]
         self.scene = Scene(dev, self.camera, self.positions, self.radius, "sphere")
-        # The weights sum to one, so features shifted from Pulsar's background to ours shift the picture alike.
+        # The weights sum to one, so features shifted from Pulsar's background to ours shift the
+        # picture alike.
         self.shift = 1 - self["in_bg"].astype(np.float64)
         point_features = self._padded(self["in_features"] + self.shift)
-        features = self.scene.blend(self["in_opacity"], float(self["in_gamma"]), point_features, **blend)
+        features = self.scene.blend(
+            self["in_opacity"], float(self["in_gamma"]), point_features, **blend
+        )
         self.image = features[..., : len(self.shift)] - self.shift
 
     def __getitem__(self, key):
@@ -66,12 +87,23 @@ class Case:
         return gradients
 
     def solid(self):
-        """(N,) bool: at least one pixel in radius; for smaller spheres Pulsar's position gradients mean nothing."""
-        return self.radius * self.camera.fx / np.linalg.norm(camera_space(self.camera, self.positions), axis=1) >= 1
+        """(N,) bool: at least one pixel in radius; for smaller spheres Pulsar's position gradients
+        mean nothing.
+        """
+        return (
+            self.radius
+            * self.camera.fx
+            / np.linalg.norm(camera_space(self.camera, self.positions), axis=1)
+            >= 1
+        )
 
     def boxed(self):
-        """(N,) bool: the box covers 3 columns and 3 rows of the image; Pulsar gives other spheres no position gradients."""
-        box = pulsar_box(self.camera, camera_space(self.camera, self.positions), self.radius).reshape(-1, *self.scene.shape)
+        """(N,) bool: the box covers 3 columns and 3 rows of the image; Pulsar gives other spheres
+        no position gradients.
+        """
+        box = pulsar_box(
+            self.camera, camera_space(self.camera, self.positions), self.radius
+        ).reshape(-1, *self.scene.shape)
         return (box.any(axis=1).sum(axis=1) >= 3) & (box.any(axis=2).sum(axis=1) >= 3)
 
     def all_but(self, exceptions):
@@ -90,8 +122,11 @@ def test_picture_and_hits(dev, data, name):
     case = Case(dev, data, name)
     hits = np.diff(case.scene.pairs.pixel_offset.get().astype(np.int64)).reshape(case.scene.shape)
     assert np.array_equal(hits, case["exact_n_hits"])
-    assert np.abs(case.image - case["exact_image"]).max() < (3e-3 if name.startswith("c_") else 1e-4)
-    assert np.abs(case.image - case["ref64_image"]).max() < 2e-4  # Pulsar itself is off by 2e-3 in case c
+    assert np.abs(case.image - case["exact_image"]).max() < (
+        3e-3 if name.startswith("c_") else 1e-4
+    )
+    # Pulsar itself is off by 2e-3 in case c
+    assert np.abs(case.image - case["ref64_image"]).max() < 2e-4
 
 
 def test_early_stop_drops_no_more_than_in_pulsar(dev, data, name):
@@ -105,7 +140,10 @@ def test_gradient_sums(dev, data, name):
     for key in ("features", "opacity"):
         assert relative_error(gradients[key], case[f"ref64_gradsum_{key}"]) < 1e-3, key
     for key in ("positions", "radius"):
-        assert relative_error(gradients[key][case.solid()], case[f"ref64_gradsum_{key}"][case.solid()]) < 1e-3, key
+        assert (
+            relative_error(gradients[key][case.solid()], case[f"ref64_gradsum_{key}"][case.solid()])
+            < 1e-3
+        ), key
 
 
 @pytest.mark.parametrize("max_tracked,prefix", [(64, "exact"), (5, "exact_k5")])
@@ -114,8 +152,12 @@ def test_gradient_means(dev, data, name, max_tracked, prefix):
     gradients = case.gradients()
     compared = case.all_but(DAMPED) & (case.all_but(TIED) | (max_tracked == 64))
     for key in ("features", "opacity"):
-        assert relative_error(gradients[key][compared], case[f"{prefix}_grad_{key}"][compared]) < 1e-3, key
+        assert (
+            relative_error(gradients[key][compared], case[f"{prefix}_grad_{key}"][compared]) < 1e-3
+        ), key
     compared &= case.solid() & case.boxed()
     assert compared.sum() > 5
     for key in ("positions", "radius"):
-        assert relative_error(gradients[key][compared], case[f"{prefix}_grad_{key}"][compared]) < 1e-3, key
+        assert (
+            relative_error(gradients[key][compared], case[f"{prefix}_grad_{key}"][compared]) < 1e-3
+        ), key

@@ -1,13 +1,22 @@
-"""pp_cl/reference.py against the tests' own float64 twins, which are written another way."""
+"""pp_cl/reference/network.py against the tests' own float64 twins, which are written another
+way.
+"""
 
 import numpy as np
 import pytest
-from helpers import relative_error
-from oracle_conv import conv, conv_gradients
-from oracle_unet import unet, unet_gradients
+from oracle.conv import conv, conv_gradients
+from oracle.unet import unet, unet_gradients
+from support.comparisons import relative_error
 
-from pp_cl.reference import convolution, convolution_at, flipped, network, network_gradients, weight_gradient
-from pp_cl.unet import unet_steps
+from pp_cl.network.unet import unet_steps
+from pp_cl.reference.network import (
+    convolution,
+    convolution_at,
+    flipped,
+    network,
+    network_gradients,
+    weight_gradient,
+)
 
 
 @pytest.mark.parametrize("k", [1, 3])
@@ -29,7 +38,10 @@ def test_network_and_its_gradients(rng):
     parameters = {}
     for step in (s for s in steps if s.kind.startswith("conv")):
         shape = (step.channels, sum(channels[n] for n in step.inputs), *[int(step.kind[-1])] * 2)
-        parameters |= {step.name + ".weight": rng.normal(size=shape), step.name + ".bias": rng.normal(size=step.channels)}
+        parameters |= {
+            step.name + ".weight": rng.normal(size=shape),
+            step.name + ".bias": rng.normal(size=step.channels),
+        }
     x, grad_image = rng.normal(size=(8, 12, 7)), rng.normal(size=(8, 12, 3))
     outputs = network(steps, parameters, x)
     assert outputs["enc2.a"].shape == (2, 3, widths[2])

@@ -3,19 +3,23 @@
 import numpy as np
 import pytest
 
-from pp_cl.camera import CAMERA_FLOATS, Camera
+from pp_cl.scene.camera import CAMERA_FLOATS, Camera
 
 
 def make_camera(rng, width=40, height=30):
     rotation, _ = np.linalg.qr(rng.normal(size=(3, 3)))
     rotation *= np.sign(np.linalg.det(rotation))
-    return Camera(np.c_[rotation, rng.normal(size=3)], 50.0, 55.0, 19.0, 16.5, width, height, 1.0, 5.0)
+    return Camera(
+        np.c_[rotation, rng.normal(size=3)], 50.0, 55.0, 19.0, 16.5, width, height, 1.0, 5.0
+    )
 
 
 def project(camera, points):
     """(N, 2) float64 pixel coordinates (pixel centres at +0.5)."""
     c = (points - camera.eye) @ camera.pose[:, :3]
-    return np.stack([camera.fx * c[:, 0] / c[:, 2] + camera.cx, camera.fy * c[:, 1] / c[:, 2] + camera.cy], -1)
+    return np.stack(
+        [camera.fx * c[:, 0] / c[:, 2] + camera.cx, camera.fy * c[:, 1] / c[:, 2] + camera.cy], -1
+    )
 
 
 def points_in_front(camera, rng, n=20):

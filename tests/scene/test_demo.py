@@ -1,4 +1,6 @@
-"""The demo's object and pictures: distances and silhouettes against the float64 oracle, mesh, gloss, the written folder."""
+"""The demo's object and pictures: distances and silhouettes against the float64 oracle, mesh,
+gloss, the written folder.
+"""
 
 import json
 from dataclasses import replace
@@ -6,15 +8,15 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import trimesh
-from helpers import AWKWARD_SIZES
-from oracle_demo import CENTRE, coverage, distance
+from oracle.demo import CENTRE, coverage, distance
+from support.guarded import AWKWARD_SIZES
 
-from pp_cl.camera import Camera
-from pp_cl.demo import OBJECT_BOX, demo_mesh, demo_scene, distances, render, write_scene
 from pp_cl.errors import UserError
-from pp_cl.hull import build_grid
-from pp_cl.points import Grid
-from pp_cl.scene import load_scene
+from pp_cl.scene.camera import Camera
+from pp_cl.scene.demo import OBJECT_BOX, demo_mesh, demo_scene, distances, render, write_scene
+from pp_cl.scene.grid import Grid
+from pp_cl.scene.hull import build_grid
+from pp_cl.scene.load import load_scene
 
 KEY = np.array([0.40, -0.52, 0.7547])  # direction of the key light
 
@@ -40,14 +42,18 @@ def test_distances_change_no_faster_than_places(dev):
     """Sphere tracing passes no surface."""
     grid = Grid((-0.8, -0.8, -1.1), 0.05, (33, 33, 45))
     found = distances(dev, grid)
-    np.testing.assert_allclose(found.ravel(), distance(grid.positions(np.arange(found.size))), atol=2e-6, rtol=0)
+    np.testing.assert_allclose(
+        found.ravel(), distance(grid.positions(np.arange(found.size))), atol=2e-6, rtol=0
+    )
     for axis in range(3):
         assert np.abs(np.diff(found, axis=axis)).max() <= 0.05 * (1 + 1e-4)
 
 
 @pytest.mark.parametrize("width, height", ((31, 33), (33, 18)))
 def test_silhouettes_equal_the_oracle(dev, width, height):
-    """Alpha lies between the shares of the rays that touch and of those that come within the tracer's tolerance."""
+    """Alpha lies between the shares of the rays that touch and of those that come within the
+    tracer's tolerance.
+    """
     camera = look_at(np.array([1.5, -2.8, 1.2]), np.zeros(3), (width, height), 40)
     image = render(dev, camera)
     near, touching = coverage(camera)
@@ -61,18 +67,23 @@ def test_silhouettes_equal_the_oracle(dev, width, height):
 def test_a_crop_shows_the_same_pixels(dev):
     camera = look_at(np.array([-2.0, 2.0, 1.5]), np.zeros(3), (64, 64), 80)
     whole, part = render(dev, camera), render(dev, camera.crop(13, 21, 33, 29))
-    differing = (np.abs(whole[21:50, 13:46].astype(int) - part) > 1).any(-1)  # rays that graze an edge may choose otherwise
+    # rays that graze an edge may choose otherwise
+    differing = (np.abs(whole[21:50, 13:46].astype(int) - part) > 1).any(-1)
     assert differing.mean() < 0.01 and (part[..., 3] > 0).mean() > 0.3
     np.testing.assert_array_equal(render(dev, camera), whole)
 
 
 def test_the_globe_is_glossy(dev):
-    """The place that faces the key light is brighter where it mirrors the lamp to the camera than from the side."""
+    """The place that faces the key light is brighter where it mirrors the lamp to the camera than
+    from the side.
+    """
     facing = CENTRE + 0.30 * KEY
     side = np.cross(KEY, [0, 0, 1.0])
     colours = []
     for eye in (KEY, KEY + side, KEY - side):
-        image = render(dev, look_at(CENTRE + 0.2 * KEY + 0.4 * eye / np.linalg.norm(eye), facing, (3, 3), 2000))
+        image = render(
+            dev, look_at(CENTRE + 0.2 * KEY + 0.4 * eye / np.linalg.norm(eye), facing, (3, 3), 2000)
+        )
         assert (image[..., 3] == 255).all()
         colours.append(image[1, 1, :3] / 255)
     mirrored, *others = colours
@@ -89,7 +100,9 @@ def test_the_mesh_is_the_object(dev):
     edge = 1.92 / 191
     assert np.abs(distance(vertices.astype(np.float64))).max() < edge / 2
     assert (vertices.min(0) > OBJECT_BOX[0]).all() and (vertices.max(0) < OBJECT_BOX[1]).all()
-    assert np.linalg.norm(vertices - [0, 0, -0.08], axis=1).max() < 1.05, "the tracer's ball cuts the object"
+    assert np.linalg.norm(vertices - [0, 0, -0.08], axis=1).max() < 1.05, (
+        "the tracer's ball cuts the object"
+    )
 
 
 @pytest.mark.large
@@ -104,7 +117,9 @@ def test_the_scene_shows_the_whole_mesh(dev):
         camera, alpha = view.camera, np.pad(view.image[..., 3], 1)
         np.testing.assert_allclose(camera.pose[:, :3].T @ camera.pose[:, :3], np.eye(3), atol=1e-12)
         assert np.linalg.det(camera.pose[:, :3]) > 0 and not view.has_depth_range
-        assert not alpha[[1, -2]].any() and not alpha[:, [1, -2]].any(), f"{view.name} cuts the object off"
+        assert not alpha[[1, -2]].any() and not alpha[:, [1, -2]].any(), (
+            f"{view.name} cuts the object off"
+        )
         x, y, z = camera.pose[:, :3].T @ (vertices - camera.eye).T
         u = (camera.fx * x / z + camera.cx).astype(int) + 1
         v = (camera.fy * y / z + camera.cy).astype(int) + 1
@@ -140,7 +155,9 @@ def test_a_written_scene_is_read_back(dev, tmp_path):
         for view, read in zip(views, again.splits[split], strict=True):
             np.testing.assert_array_equal(read.image, view.image)
             np.testing.assert_allclose(read.camera.pose, view.camera.pose, atol=1e-12)
-            assert replace(read.camera, pose=None, near=0, far=0) == replace(view.camera, pose=None, near=0, far=0)
+            assert replace(read.camera, pose=None, near=0, far=0) == replace(
+                view.camera, pose=None, near=0, far=0
+            )
     angle = json.loads((folder / "transforms_test.json").read_text())["camera_angle_x"]
     assert angle == pytest.approx(0.6911112)
 
@@ -148,10 +165,15 @@ def test_a_written_scene_is_read_back(dev, tmp_path):
 @pytest.mark.large
 def test_a_depth_range_is_written(dev, tmp_path):
     scene = demo_scene(dev, ("train",), size=16)
-    scene.splits["train"] = [replace(v, camera=replace(v.camera, near=1.5, far=5.25)) for v in scene.splits["train"][:2]]
+    scene.splits["train"] = [
+        replace(v, camera=replace(v.camera, near=1.5, far=5.25)) for v in scene.splits["train"][:2]
+    ]
     write_scene(scene, tmp_path / "demo")
     again = load_scene(tmp_path / "demo")
-    assert again.depth_range_stored and [(v.camera.near, v.camera.far) for v in again.splits["train"]] == [(1.5, 5.25)] * 2
+    assert (
+        again.depth_range_stored
+        and [(v.camera.near, v.camera.far) for v in again.splits["train"]] == [(1.5, 5.25)] * 2
+    )
 
 
 @pytest.mark.large

@@ -1,18 +1,21 @@
-"""Visual hull and grid: the kernels against the float64 oracle, the search for the edge, the errors."""
+"""Visual hull and grid: the kernels against the float64 oracle, the search for the edge, the
+errors.
+"""
 
 from dataclasses import replace
 
 import numpy as np
 import pytest
-from helpers import AWKWARD_SIZES
-from oracle_hull import dilated_mask, kept
+from oracle.hull import dilated_mask, kept
+from support.guarded import AWKWARD_SIZES
 
-from pp_cl import hull
-from pp_cl.camera import Camera
 from pp_cl.errors import UserError
-from pp_cl.hull import Carver, bounding_box, build_grid, depth_range, spacing_pixels
-from pp_cl.points import Grid
-from pp_cl.scene import MASK_THRESHOLD, View, load_scene
+from pp_cl.scene import hull
+from pp_cl.scene.camera import Camera
+from pp_cl.scene.grid import Grid
+from pp_cl.scene.hull import Carver, bounding_box, build_grid, depth_range, spacing_pixels
+from pp_cl.scene.load import load_scene
+from pp_cl.scene.views import MASK_THRESHOLD, View
 
 BORDER = 1e-4  # pixels to a pixel border within which float32 may choose the other pixel
 CENTRE, RADIUS = np.array([-0.5, 1.3, 1.7]), 0.8  # of the ball that most tests carve
@@ -41,7 +44,9 @@ def ball_views(count=12, size=(64, 64), focal=1.5, distance=4.0):
     """Views of the ball from directions spread over the sphere."""
     n = np.arange(count)
     z, angle = 1 - (2 * n + 1) / count, n * np.pi * (3 - 5**0.5)
-    directions = np.column_stack([np.sqrt(1 - z**2) * np.cos(angle), np.sqrt(1 - z**2) * np.sin(angle), z])
+    directions = np.column_stack(
+        [np.sqrt(1 - z**2) * np.cos(angle), np.sqrt(1 - z**2) * np.sin(angle), z]
+    )
     cameras = [look_at(CENTRE + distance * d, CENTRE, size, focal) for d in directions]
     return [ball_view(f"train/r_{i}.png", camera) for i, camera in enumerate(cameras)]
 
@@ -51,15 +56,21 @@ def positions_of(found):
 
 
 def noise_view(rng, eye, size, share):
-    """View with `share` of its pixels in the mask, at random, alphas at and beside the threshold among them."""
+    """View with `share` of its pixels in the mask, at random, alphas at and beside the threshold
+    among them.
+    """
     alpha = np.where(rng.random(size[::-1]) < share, MASK_THRESHOLD + 1, MASK_THRESHOLD)
-    return View("noise", look_at(eye, np.zeros(3), size), alpha[..., None].repeat(4, -1).astype(np.uint8))
+    return View(
+        "noise", look_at(eye, np.zeros(3), size), alpha[..., None].repeat(4, -1).astype(np.uint8)
+    )
 
 
 @pytest.mark.parametrize("width", AWKWARD_SIZES)
 @pytest.mark.parametrize("height", (1, 2, 33))
 def test_masks_are_dilated_and_packed(dev, rng, width, height):
-    views = [noise_view(rng, np.array([4.0, 0, 0]), (width, height), share) for share in (0.05, 0.0, 1.0)]
+    views = [
+        noise_view(rng, np.array([4.0, 0, 0]), (width, height), share) for share in (0.05, 0.0, 1.0)
+    ]
     masks = Carver(dev, views).masks.get().reshape(3, height, -1)
     bits = np.unpackbits(masks.view(np.uint8), axis=-1, bitorder="little")[..., :width]
     for view, packed in zip(views, bits, strict=True):
@@ -70,8 +81,14 @@ def test_masks_are_dilated_and_packed(dev, rng, width, height):
 @pytest.mark.parametrize("ny, nz", ((1, 1), (7, 5)))
 def test_carving_equals_the_oracle(dev, rng, nx, ny, nz):
     """Views of three sizes, one of them close, with vertices beside and behind it."""
-    views = [noise_view(rng, np.array(eye), size, 0.15)
-             for eye, size in (((3.0, 1, 0.5), (64, 48)), ((-2.0, 2, 1), (31, 33)), ((0.3, -0.4, 0.2), (40, 64)))]
+    views = [
+        noise_view(rng, np.array(eye), size, 0.15)
+        for eye, size in (
+            ((3.0, 1, 0.5), (64, 48)),
+            ((-2.0, 2, 1), (31, 33)),
+            ((0.3, -0.4, 0.2), (40, 64)),
+        )
+    ]
     edge = 2 / nx
     grid = Grid((-edge * nx / 2, -edge * ny / 2, -edge * nz / 2 + 0.1), edge, (nx, ny, nz))
     positions = grid.positions(np.arange(nx * ny * nz))
@@ -88,11 +105,15 @@ def test_carving_equals_the_oracle(dev, rng, nx, ny, nz):
     if carving.count:
         tight, ids = carver.points(carving)
         assert (np.diff(ids.astype(np.int64)) > 0).all() and ids[-1] < np.prod(tight.dims)
-        np.testing.assert_allclose(tight.positions(ids), positions[bits[:, :nx].ravel() == 1], atol=1e-12)
+        np.testing.assert_allclose(
+            tight.positions(ids), positions[bits[:, :nx].ravel() == 1], atol=1e-12
+        )
 
 
 def test_a_vertex_no_image_sees_is_dropped(dev):
-    full = View("full", look_at(np.array([4.0, 0, 0]), np.zeros(3)), np.full((64, 64, 4), 255, np.uint8))
+    full = View(
+        "full", look_at(np.array([4.0, 0, 0]), np.zeros(3)), np.full((64, 64, 4), 255, np.uint8)
+    )
     carver = Carver(dev, [full])
     assert carver.carve(Grid((0, 0, 0), 0.1, (1, 1, 1))).count == 1
     assert carver.carve(Grid((0, 9, 0), 0.1, (1, 1, 1))).count == 0  # beside
@@ -100,7 +121,9 @@ def test_a_vertex_no_image_sees_is_dropped(dev):
 
 
 def test_the_left_and_upper_borders_belong_to_an_image(dev):
-    """Numbers that float32 holds exactly: the 5x5 vertices project to pixels 0, 16, 32, 48, 64 of 64."""
+    """Numbers that float32 holds exactly: the 5x5 vertices project to pixels 0, 16, 32, 48, 64 of
+    64.
+    """
     camera = Camera(np.eye(3, 4), 64, 64, 32, 32, 64, 64)
     carver = Carver(dev, [View("full", camera, np.full((64, 64, 4), 255, np.uint8))])
     grid, ids = carver.points(carver.carve(Grid((-0.5, -0.5, 1.0), 0.25, (5, 5, 1))))
@@ -124,7 +147,9 @@ def test_the_edge_is_found(dev, points):
     assert from_centre[kept_here].max() < 1.6 * RADIUS + 2 * pixel  # the hull of 12 tangent cones
     for axis in range(3):  # the grid is tight
         reached = positions_of(found)[:, axis]
-        np.testing.assert_allclose([reached.min(), reached.max()], [lattice[:, axis].min(), lattice[:, axis].max()])
+        np.testing.assert_allclose(
+            [reached.min(), reached.max()], [lattice[:, axis].min(), lattice[:, axis].max()]
+        )
 
 
 @pytest.mark.large
@@ -142,7 +167,9 @@ def test_two_runs_give_the_same_bits(dev):
 
 @pytest.mark.large
 def test_the_cell_cap_limits_the_grid(dev):
-    """The ball fills about half of its box, so 8000 cells hold some 4000 of the 7000 points asked for."""
+    """The ball fills about half of its box, so 8000 cells hold some 4000 of the 7000 points asked
+    for.
+    """
     found = build_grid(dev, ball_views(), 7000, cell_cap=8000)
     assert found.capped and 3000 < len(found.ids) < 7000
     assert all(np.prod(r["dims"]) <= 8000 for r in found.rounds[1:])
@@ -157,14 +184,18 @@ def test_the_box_holds_the_object_and_is_tight():
 @pytest.mark.large
 @pytest.mark.parametrize("focal", (2.7, 6.0))
 def test_an_object_cut_off_by_the_images_keeps_what_they_show(dev, focal):
-    """focal 2.7: only the corners are free; 6: one pixel, so that no side of any image bounds the object."""
+    """focal 2.7: only the corners are free; 6: one pixel, so that no side of any image bounds the
+    object.
+    """
     views = ball_views(focal=focal)
     for view in views:
         view.image[0, 0] = 0
     box = bounding_box(views)
     assert np.isfinite(box).all() and (box[1] > box[0]).all()
     found = positions_of(build_grid(dev, views, 3000))
-    shown = CENTRE + 0.5 * min(RADIUS, 4 / (2 * focal)) * np.random.default_rng(1).uniform(-1, 1, (100, 3))
+    shown = CENTRE + 0.5 * min(RADIUS, 4 / (2 * focal)) * np.random.default_rng(1).uniform(
+        -1, 1, (100, 3)
+    )
     nearest = np.linalg.norm(found[None] - shown[:, None], axis=-1).min(1)
     assert nearest.max() < 0.2 * RADIUS
 
@@ -173,7 +204,9 @@ def test_an_object_cut_off_by_the_images_keeps_what_they_show(dev, focal):
 def test_depth_range_holds_every_point(dev):
     views = ball_views()
     found = build_grid(dev, views, 2000)
-    distances = np.stack([np.linalg.norm(positions_of(found) - view.camera.eye, axis=1) for view in views])
+    distances = np.stack(
+        [np.linalg.norm(positions_of(found) - view.camera.eye, axis=1) for view in views]
+    )
     near, far = depth_range([without_range(view) for view in views], found)
     assert 0 < near < distances.min() and far > distances.max()
     half_diagonal = found.grid.edge * np.linalg.norm(found.grid.dims) / 2
@@ -183,9 +216,13 @@ def test_depth_range_holds_every_point(dev):
 @pytest.mark.large
 @pytest.mark.parametrize("stated", [(1.0, 9.0), (3.9, 4.1)])
 def test_a_stated_depth_range_is_kept_or_widened(dev, stated):
-    views = [replace(v, camera=replace(v.camera, near=stated[0], far=stated[1])) for v in ball_views()]
+    views = [
+        replace(v, camera=replace(v.camera, near=stated[0], far=stated[1])) for v in ball_views()
+    ]
     found = build_grid(dev, views, 2000)
-    distances = np.stack([np.linalg.norm(positions_of(found) - view.camera.eye, axis=1) for view in views])
+    distances = np.stack(
+        [np.linalg.norm(positions_of(found) - view.camera.eye, axis=1) for view in views]
+    )
     near, far = depth_range(views, found)
     if stated == (1.0, 9.0):
         assert (near, far) == stated
@@ -203,7 +240,11 @@ def without_range(view):
 def test_depth_range_of_close_cameras(dev, distance):
     """1.6: outside the hull's box, inside the enlarged ball; 0.5: inside the box."""
     found = build_grid(dev, ball_views(), 2000)
-    close = [without_range(replace(ball_views()[0], camera=look_at(CENTRE + np.array([distance, 0, 0]), CENTRE)))]
+    close = [
+        without_range(
+            replace(ball_views()[0], camera=look_at(CENTRE + np.array([distance, 0, 0]), CENTRE))
+        )
+    ]
     near, far = depth_range(close, found)
     distances = np.linalg.norm(positions_of(found) - close[0].camera.eye, axis=1)
     assert near > 0 and far > distances.max()
@@ -253,8 +294,13 @@ def test_wrong_axes_are_told(dev, flat):
     views = ball_views()
     if flat:
         angles = np.arange(8) * np.pi / 4
-        views = [ball_view("r", look_at(CENTRE + [4 * np.cos(a), 4 * np.sin(a), 0], CENTRE)) for a in angles]
-    views = [replace(v, camera=replace(v.camera, pose=v.camera.pose * [1, -1, -1, 1])) for v in views]
+        views = [
+            ball_view("r", look_at(CENTRE + [4 * np.cos(a), 4 * np.sin(a), 0], CENTRE))
+            for a in angles
+        ]
+    views = [
+        replace(v, camera=replace(v.camera, pose=v.camera.pose * [1, -1, -1, 1])) for v in views
+    ]
     with pytest.raises(UserError, match="leave no point.*camera-to-world"):
         build_grid(dev, views, 100)
 
@@ -265,7 +311,9 @@ def test_views_from_one_place_do_not_bound(dev):
 
 
 def test_lego_has_the_published_shape(dev, data):
-    """Its grid of 4.04 million points has 194x345x232 vertices (PlenopticPoints supplemental, Table 4)."""
+    """Its grid of 4.04 million points has 194x345x232 vertices (PlenopticPoints supplemental, Table
+    4).
+    """
     views = load_scene(data / "nerf_synthetic/lego").splits["train"]
     found = build_grid(dev, views, 20000)
     assert 20000 <= len(found.ids) <= hull.TOLERANCE * 20000

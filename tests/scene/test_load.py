@@ -7,10 +7,11 @@ import shutil
 import numpy as np
 import pytest
 
-from pp_cl.camera import Camera
 from pp_cl.errors import UserError
-from pp_cl.image import read_rgba, write_png
-from pp_cl.scene import MASK_THRESHOLD, View, load_scene, object_box, reduced_camera
+from pp_cl.files.image import read_rgba, write_png
+from pp_cl.scene.camera import Camera
+from pp_cl.scene.load import load_scene
+from pp_cl.scene.views import MASK_THRESHOLD, View, object_box, reduced_camera
 
 SIZE = (24, 18)  # width, height of the images written here
 
@@ -26,11 +27,15 @@ def look_at(eye):
 
 
 def write_scene(folder, split="train", count=3, edit=None):
-    """A NeRF-synthetic split of `count` random views; edit(data) changes the JSON before it is written. Returns its data."""
+    """A NeRF-synthetic split of `count` random views; edit(data) changes the JSON before it is
+    written. Returns its data.
+    """
     rng = np.random.default_rng(3)
     frames = []
     for i in range(count):
-        write_png(folder / f"{split}_{i}.png", rng.integers(0, 256, (SIZE[1], SIZE[0], 4), np.uint8))
+        write_png(
+            folder / f"{split}_{i}.png", rng.integers(0, 256, (SIZE[1], SIZE[0], 4), np.uint8)
+        )
         angle = 2 * np.pi * i / count
         matrix = look_at([3 * np.cos(angle), 3 * np.sin(angle), 1.2])
         frames.append({"file_path": f"./{split}_{i}", "transform_matrix": matrix.tolist()})
@@ -57,7 +62,7 @@ def refused(folder, *words, splits=("train",)):
         assert str(word) in message, message
 
 
-# ------------------------------------------------------------------------------------------------- conventions
+# -------------------------------------------------------------------------------------------------
 
 
 def test_views_and_names(tmp_path, capfd):
@@ -85,7 +90,12 @@ def test_projection_follows_opengl(tmp_path, rng):
         camera = view.camera
         x, y, z = camera.pose[:, :3].T @ (point - camera.eye)
         assert z > 0
-        assert np.allclose([camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy], expected, rtol=0, atol=1e-9)
+        assert np.allclose(
+            [camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy],
+            expected,
+            rtol=0,
+            atol=1e-9,
+        )
 
 
 def test_defaults_of_nerf_synthetic(tmp_path):
@@ -94,21 +104,34 @@ def test_defaults_of_nerf_synthetic(tmp_path):
     camera = scene.splits["train"][0].camera
     assert camera.fx == camera.fy == 0.5 * SIZE[0] / math.tan(0.35)
     assert (camera.cx, camera.cy) == (SIZE[0] / 2, SIZE[1] / 2)
-    assert not scene.depth_range_stored and not scene.splits["train"][0].has_depth_range and math.isnan(camera.near)
+    assert (
+        not scene.depth_range_stored
+        and not scene.splits["train"][0].has_depth_range
+        and math.isnan(camera.near)
+    )
 
 
 def test_nerfstudio_names(tmp_path):
     """A frame's own key goes before the file's."""
 
     def edit(data):
-        data.update(fl_x=31.0, fl_y=32.5, cx=11.25, cy=8.5, w=SIZE[0], h=float(SIZE[1]), near=2.0, far=5)
+        data.update(
+            fl_x=31.0, fl_y=32.5, cx=11.25, cy=8.5, w=SIZE[0], h=float(SIZE[1]), near=2.0, far=5
+        )
         data.update(k1=0, p2=0.0, camera_model="OPENCV")
         data["frames"][1].update(fl_x=33.0, cy=0, near=1.5, far=None)
 
     write_scene(tmp_path, edit=edit)
     scene = load_scene(tmp_path)
-    got = [[getattr(v.camera, k) for k in ("fx", "fy", "cx", "cy", "near", "far")] for v in scene.splits["train"]]
-    assert got == [[31, 32.5, 11.25, 8.5, 2, 5], [33, 32.5, 11.25, 0, 1.5, 5], [31, 32.5, 11.25, 8.5, 2, 5]]
+    got = [
+        [getattr(v.camera, k) for k in ("fx", "fy", "cx", "cy", "near", "far")]
+        for v in scene.splits["train"]
+    ]
+    assert got == [
+        [31, 32.5, 11.25, 8.5, 2, 5],
+        [33, 32.5, 11.25, 0, 1.5, 5],
+        [31, 32.5, 11.25, 8.5, 2, 5],
+    ]
     assert scene.depth_range_stored and scene.splits["train"][0].has_depth_range
 
 
@@ -119,19 +142,25 @@ def test_angle_of_height_and_single_focal_length(tmp_path):
     assert camera.fx == camera.fy == 40
 
 
-@pytest.mark.parametrize("given", ("train_1", "./train_1.png", "sub/../train_1", "{folder}/train_1", "linked"))
+@pytest.mark.parametrize(
+    "given", ("train_1", "./train_1.png", "sub/../train_1", "{folder}/train_1", "linked")
+)
 def test_ways_to_name_an_image(tmp_path, given):
     (tmp_path / "sub").mkdir()
     (tmp_path / "linked.png").symlink_to("train_1.png")
     view = train_views(tmp_path, file_path=given.format(folder=tmp_path))[0]
-    assert view.name == "train_1.png" and np.array_equal(view.image, read_rgba(tmp_path / "train_1.png"))
+    assert view.name == "train_1.png" and np.array_equal(
+        view.image, read_rgba(tmp_path / "train_1.png")
+    )
 
 
 def test_json_in_utf8_with_byte_order_mark(tmp_path):
     data = write_scene(tmp_path, count=1)
     (tmp_path / "train_0.png").rename(tmp_path / "köpfe.png")
     data["frames"][0]["file_path"] = "köpfe"
-    (tmp_path / "transforms_train.json").write_text(json.dumps(data, ensure_ascii=False), encoding="utf-8-sig")
+    (tmp_path / "transforms_train.json").write_text(
+        json.dumps(data, ensure_ascii=False), encoding="utf-8-sig"
+    )
     assert load_scene(tmp_path).splits["train"][0].name == "köpfe.png"
 
 
@@ -150,7 +179,9 @@ def test_rows_and_rounding_of_the_pose(tmp_path, rng):
     for matrix in (exact[:3], rough):
         pose = train_views(tmp_path, transform_matrix=matrix.tolist())[0].camera.pose
         rotation = pose[:, :3]
-        assert np.abs(rotation.T @ rotation - np.eye(3)).max() < 1e-14 and np.linalg.det(rotation) > 0
+        assert (
+            np.abs(rotation.T @ rotation - np.eye(3)).max() < 1e-14 and np.linalg.det(rotation) > 0
+        )
         assert np.abs(rotation - exact[:3, :3] * [1, -1, -1]).max() < 2e-4
         assert np.array_equal(pose[:, 3], exact[:3, 3])
 
@@ -161,7 +192,7 @@ def test_image_without_alpha_is_all_object(tmp_path):
     assert (load_scene(tmp_path).splits["train"][0].image[..., 3] == 255).all()
 
 
-# --------------------------------------------------------------------------------------------------- bad input
+# --------------------------------------------------------------------------------------------------
 
 MATRIX = look_at([3, 0, 1])
 NAN_MATRIX = MATRIX * np.where(np.eye(4) == 1, np.nan, 1)
@@ -174,7 +205,11 @@ BAD_FRAMES = {
     "zero byte": ({"file_path": "a\0b"}, "file_path", "not a usable path"),
     "endless name": ({"file_path": "a" * 5000}, "file_path", "not a usable path"),
     "parent folder": ({"file_path": "../secret.png"}, "file_path", "leaves the scene's folder"),
-    "parent folder without ending": ({"file_path": "./x/../../secret"}, "file_path", "leaves the scene's folder"),
+    "parent folder without ending": (
+        {"file_path": "./x/../../secret"},
+        "file_path",
+        "leaves the scene's folder",
+    ),
     "absolute": ({"file_path": "/etc/hostname"}, "file_path", "leaves the scene's folder"),
     "link out": ({"file_path": "link_out"}, "file_path", "leaves the scene's folder"),
     "loop of links": ({"file_path": "loop"}, "file_path", "not a usable path"),
@@ -185,9 +220,21 @@ BAD_FRAMES = {
     "ragged": ({"transform_matrix": [[1, 2], [3]]}, "transform_matrix", "4x4 or 3x4"),
     "words": ({"transform_matrix": "unknown"}, "transform_matrix", "4x4 or 3x4"),
     "huge": ({"transform_matrix": [[10**400] * 4] * 4}, "transform_matrix", "4x4 or 3x4"),
-    "scaled": ({"transform_matrix": (MATRIX * [1.01, 1.01, 1.01, 1]).tolist()}, "transform_matrix", "no rotation"),
-    "mirrored": ({"transform_matrix": (MATRIX * [-1, 1, 1, 1]).tolist()}, "transform_matrix", "no rotation"),
-    "zero": ({"transform_matrix": (MATRIX * [0, 0, 0, 1]).tolist()}, "transform_matrix", "no rotation"),
+    "scaled": (
+        {"transform_matrix": (MATRIX * [1.01, 1.01, 1.01, 1]).tolist()},
+        "transform_matrix",
+        "no rotation",
+    ),
+    "mirrored": (
+        {"transform_matrix": (MATRIX * [-1, 1, 1, 1]).tolist()},
+        "transform_matrix",
+        "no rotation",
+    ),
+    "zero": (
+        {"transform_matrix": (MATRIX * [0, 0, 0, 1]).tolist()},
+        "transform_matrix",
+        "no rotation",
+    ),
     "transposed": ({"transform_matrix": MATRIX.T.tolist()}, "transform_matrix", "last row"),
     "negative focal length": ({"fl_x": -5}, "fl_x", "above 0"),
     "focal length in words": ({"fl_x": "50mm"}, "fl_x", '"50mm"'),
@@ -241,10 +288,17 @@ def test_frame_that_is_no_object(tmp_path):
     refused(tmp_path, "transforms_train.json: frames[3]:")
 
 
-@pytest.mark.parametrize(("text", "words"), (
-    ('{\n "frames": [,]\n}', ("line 2", "column 13")), ("", ("line 1", "column 1")), ("[1, 2]", ("object",)),
-    ("[" * 100_000, ("JSON",)), ('{"w": ' + "9" * 5000 + "}", ("JSON",)), ("\udcff\udcfe", ("JSON",)),
-))
+@pytest.mark.parametrize(
+    ("text", "words"),
+    (
+        ('{\n "frames": [,]\n}', ("line 2", "column 13")),
+        ("", ("line 1", "column 1")),
+        ("[1, 2]", ("object",)),
+        ("[" * 100_000, ("JSON",)),
+        ('{"w": ' + "9" * 5000 + "}", ("JSON",)),
+        ("\udcff\udcfe", ("JSON",)),
+    ),
+)
 def test_broken_json(tmp_path, text, words):
     (tmp_path / "transforms_train.json").write_text(text, errors="surrogateescape")
     refused(tmp_path, tmp_path / "transforms_train.json", *words)
@@ -286,7 +340,14 @@ def test_views_of_different_sizes(tmp_path):
     write_scene(tmp_path, "test")
     write_png(tmp_path / "test_2.png", np.zeros((SIZE[1] + 1, SIZE[0], 4), np.uint8))
     load_scene(tmp_path)
-    refused(tmp_path, tmp_path / "train_0.png", tmp_path / "test_2.png", "24x19", "24x18", splits=("train", "test"))
+    refused(
+        tmp_path,
+        tmp_path / "train_0.png",
+        tmp_path / "test_2.png",
+        "24x19",
+        "24x18",
+        splits=("train", "test"),
+    )
 
 
 def test_depth_range_of_some_views_only(tmp_path):
@@ -294,13 +355,15 @@ def test_depth_range_of_some_views_only(tmp_path):
     refused(tmp_path, "near and far", "train_0.png", "train_2.png")
 
 
-# ----------------------------------------------------------------------------------------- reduction and masks
+# ----------------------------------------------------------------------------------------- reductio
 
 
 @pytest.fixture
 def view():
     """A view of 70x50 pixels, all transparent."""
-    return View("a.png", Camera(np.eye(3, 4), 60, 60, 35, 25, 70, 50), np.zeros((50, 70, 4), np.uint8))
+    return View(
+        "a.png", Camera(np.eye(3, 4), 60, 60, 35, 25, 70, 50), np.zeros((50, 70, 4), np.uint8)
+    )
 
 
 def test_reduced_camera(view):
@@ -316,22 +379,42 @@ def test_reduced_too_far(view, downscale):
 
 def test_image_too_small_for_any_reduction():
     with pytest.raises(UserError, match=r"a\.png: 70x15 pixels"):
-        reduced_camera(View("a.png", Camera(np.eye(3, 4), 60, 60, 35, 25, 70, 15), np.zeros((15, 70, 4), np.uint8)), 1)
+        reduced_camera(
+            View(
+                "a.png",
+                Camera(np.eye(3, 4), 60, 60, 35, 25, 70, 15),
+                np.zeros((15, 70, 4), np.uint8),
+            ),
+            1,
+        )
 
 
 @pytest.mark.parametrize("downscale", (1, 2, 3))
 @pytest.mark.parametrize("margin", (0, 2, 100))
 def test_object_box_is_the_tightest(view, rng, downscale, margin):
-    """Against a search over the reduced pixels one by one; the image's leftover columns and rows do not count."""
+    """Against a search over the reduced pixels one by one; the image's leftover columns and rows do
+    not count.
+    """
     for _ in range(5):
         view.image[..., 3] = rng.integers(0, MASK_THRESHOLD + 1, view.image.shape[:2])
         view.image[rng.integers(5, 50, 4), rng.integers(9, 70, 4), 3] = MASK_THRESHOLD + 1
         width, height = 70 // downscale, 50 // downscale
-        hit = [(x, y) for x in range(width) for y in range(height)
-               if view.image[y * downscale:(y + 1) * downscale, x * downscale:(x + 1) * downscale, 3].max() > MASK_THRESHOLD]
+        hit = [
+            (x, y)
+            for x in range(width)
+            for y in range(height)
+            if view.image[
+                y * downscale : (y + 1) * downscale, x * downscale : (x + 1) * downscale, 3
+            ].max()
+            > MASK_THRESHOLD
+        ]
         x, y = zip(*hit, strict=True)
-        expected = (max(min(x) - margin, 0), max(min(y) - margin, 0),
-                    min(max(x) + 1 + margin, width), min(max(y) + 1 + margin, height))
+        expected = (
+            max(min(x) - margin, 0),
+            max(min(y) - margin, 0),
+            min(max(x) + 1 + margin, width),
+            min(max(y) + 1 + margin, height),
+        )
         assert object_box([view], downscale, margin) == [expected]
 
 
@@ -339,17 +422,23 @@ def test_object_box_without_object(view):
     assert object_box([view, view], 3, 5) == [(0, 0, 23, 16)] * 2
 
 
-# --------------------------------------------------------------------------------------------------- real data
+# --------------------------------------------------------------------------------------------------
 
 
 def test_lego(data):
-    """The view's mask lies where the model's extent says; the published row belongs to this scene."""
+    """The view's mask lies where the model's extent says; the published row belongs to this
+    scene.
+    """
     scene = load_scene(data / "nerf_synthetic/lego", ("test",))
     views = scene.splits["test"]
     assert len(views) == 25 and views[1].name == "test/r_8.png" and not scene.depth_range_stored
     assert scene.published == {"PlenopticPoints": {"psnr": 33.00, "ssim": 0.975, "lpips": 0.026}}
     for view in views:
-        assert view.camera.fx == pytest.approx(1111.111, abs=1e-3) and view.image.shape == (800, 800, 4)
+        assert view.camera.fx == pytest.approx(1111.111, abs=1e-3) and view.image.shape == (
+            800,
+            800,
+            4,
+        )
         assert np.linalg.norm(view.camera.eye) == pytest.approx(4.031, abs=1e-2)
         assert alpha_at(view, [0, 0, 0.3]) == 255
 

@@ -1,14 +1,17 @@
-"""Targets of crops at reduced resolution against the float64 oracle, and against the geometry of their cameras."""
+"""Targets of crops at reduced resolution against the float64 oracle, and against the geometry of
+their cameras.
+"""
 
 import numpy as np
-import oracle_target as oracle
 import pytest
-from helpers import AWKWARD_SIZES
+from oracle import target as oracle
+from support.guarded import AWKWARD_SIZES
 
-from pp_cl.camera import Camera
 from pp_cl.errors import UserError
-from pp_cl.scene import View, load_scene
-from pp_cl.target import Target
+from pp_cl.scene.camera import Camera
+from pp_cl.scene.load import load_scene
+from pp_cl.scene.target import Target
+from pp_cl.scene.views import View
 
 TOLERANCE = 5e-7  # a few roundings of a float32 in [0, 1]
 
@@ -23,7 +26,9 @@ def make_view(image, name="image.png"):
 def random_view(rng, width, height):
     """A View of random colours and alphas, a third of them 0 and a third 255."""
     image = rng.integers(0, 256, (height, width, 4), np.uint8)
-    image[..., 3] = rng.choice([0, 255, 7, 130, 254], (height, width), p=[0.33, 0.33, 0.1, 0.14, 0.1])
+    image[..., 3] = rng.choice(
+        [0, 255, 7, 130, 254], (height, width), p=[0.33, 0.33, 0.1, 0.14, 0.1]
+    )
     return make_view(image)
 
 
@@ -32,7 +37,9 @@ def check(dev, view, k, x0, y0, width, height, phase):
     target = Target(dev, k)
     target.load(view)
     result = target.crop(x0, y0, width, height, phase).get()
-    expected = oracle.target_forward(view.image, k, k * x0 + phase[0], k * y0 + phase[1], width, height)
+    expected = oracle.target_forward(
+        view.image, k, k * x0 + phase[0], k * y0 + phase[1], width, height
+    )
     assert result.shape == expected.shape
     assert np.abs(result - expected).max() < TOLERANCE
 
@@ -45,7 +52,9 @@ def test_sizes(dev, rng, size):
 
 @pytest.mark.parametrize("k", (1, 2, 4, 5, 20))
 def test_reductions_and_phases(dev, rng, k):
-    """Every phase of a crop whose blocks end inside, at and beyond the image's right and lower edges."""
+    """Every phase of a crop whose blocks end inside, at and beyond the image's right and lower
+    edges.
+    """
     view = random_view(rng, 16 * k + 3, 17 * k + 1)
     for phase in {(0, 0), (k - 1, 0), (0, k - 1), (k // 2, k - 1)}:
         check(dev, view, k, 0, 0, 16, 17, phase)
@@ -77,7 +86,9 @@ def test_transparent_is_exactly_white_whatever_its_colour(dev, rng):
 
 @pytest.mark.parametrize("phase", ((0, 0), (1, 0), (0, 3), (3, 2)))
 def test_camera_sees_what_the_target_shows(dev, phase):
-    """Colours that are linear in the stored pixel's position come back where the target's camera says they are."""
+    """Colours that are linear in the stored pixel's position come back where the target's camera
+    says they are.
+    """
     x, y = np.meshgrid(np.arange(80), np.arange(64))
     view = make_view(np.stack([3 * x, 4 * y, x + y, np.full_like(x, 255)], -1).astype(np.uint8))
     target = Target(dev, 4)

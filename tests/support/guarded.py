@@ -9,9 +9,11 @@ import pyopencl as cl
 import pyopencl.array as cl_array
 import pytest
 
-from pp_cl.device import Device
+from pp_cl.device.device import Device
 
-DATA = Path(os.environ.get("PP_DATA") or Path(__file__).parents[1] / ".." / "shared" / "data").resolve()
+DATA = Path(
+    os.environ.get("PP_DATA") or Path(__file__).parents[2] / ".." / "shared" / "data"
+).resolve()
 
 AWKWARD_SIZES = (1, 31, 33, 257)  # below, at and beside every vector width and work-group size
 CANARY_BYTES = 256
@@ -24,7 +26,9 @@ def large(*values):
 
 
 class GuardedDevice(Device):
-    """A Device whose fresh buffers hold NaN (0xff bytes) and are followed by canary bytes that check() compares."""
+    """A Device whose fresh buffers hold NaN (0xff bytes) and are followed by canary bytes that
+    check() compares.
+    """
 
     canary_bytes = CANARY_BYTES
 
@@ -39,7 +43,9 @@ class GuardedDevice(Device):
             return super()._allocate(shape, dtype)
         poison = np.full(nbytes + self.canary_bytes, 0xFF, np.uint8)
         poison[nbytes:] = CANARY
-        buffer = cl.Buffer(self.context, cl.mem_flags.READ_WRITE | cl.mem_flags.COPY_HOST_PTR, hostbuf=poison)
+        buffer = cl.Buffer(
+            self.context, cl.mem_flags.READ_WRITE | cl.mem_flags.COPY_HOST_PTR, hostbuf=poison
+        )
         array = cl_array.Array(self.queue, shape, dtype, data=buffer)
         self.bytes += nbytes
         self.peak_bytes = max(self.peak_bytes, self.bytes)
@@ -48,7 +54,9 @@ class GuardedDevice(Device):
         return array
 
     def check(self):
-        """Fail if a kernel wrote behind a buffer allocated since the last check, temporary ones included."""
+        """Fail if a kernel wrote behind a buffer allocated since the last check, temporary ones
+        included.
+        """
         guarded, self._guarded = self._guarded, []
         tail = np.empty(CANARY_BYTES, np.uint8)
         for buffer, nbytes in guarded:
@@ -57,10 +65,12 @@ class GuardedDevice(Device):
 
 
 class TracedDevice(GuardedDevice):
-    """The guarded device in Oclgrind 21.10's search for reads of what nobody wrote: its reports fail the test.
+    """The guarded device in Oclgrind 21.10's search for reads of what nobody wrote: its reports
+    fail the test.
 
-    Oclgrind knows what kernels and whole uploads write, not what fills and copies do, and takes what stood at a freed
-    buffer's address for written: here kernels fill and copy, and no buffer is freed. It sees strays without canaries.
+    Oclgrind knows what kernels and whole uploads write, not what fills and copies do, and takes
+    what stood at a freed buffer's address for written: here kernels fill and copy, and no buffer is
+    freed. It sees strays without canaries.
     """
 
     canary_bytes = 0
@@ -83,37 +93,27 @@ class TracedDevice(GuardedDevice):
         """As Device.fill."""
         if array.size:
             value = self.upload(np.full(1, value, array.dtype))
-            self._fill(self.queue, (array.nbytes,), None, array.data, value.data, np.uint32(value.nbytes))
+            self._fill(
+                self.queue, (array.nbytes,), None, array.data, value.data, np.uint32(value.nbytes)
+            )
 
     def copy_rows(self, target, start, source, count):
         """As Device.copy_rows."""
         row_bytes = source[:1].nbytes
         if count:
-            self._copy(self.queue, (count * row_bytes,), None, target.data, np.uint32(start * row_bytes), source.data)
+            self._copy(
+                self.queue,
+                (count * row_bytes,),
+                None,
+                target.data,
+                np.uint32(start * row_bytes),
+                source.data,
+            )
 
     def check(self):
-        """Fail if Oclgrind has reported anything since the last check; all buffers stay in _guarded."""
+        """Fail if Oclgrind has reported anything since the last check; all buffers stay in
+        _guarded.
+        """
         reports = self._log.read_text()
-        new, self._reported = reports[self._reported:], len(reports)
+        new, self._reported = reports[self._reported :], len(reports)
         assert not new, new[:2000]
-
-
-def relative_error(actual, expected):
-    """Largest absolute difference over the largest absolute expected value (both as float64)."""
-    actual, expected = np.asarray(actual, np.float64), np.asarray(expected, np.float64)
-    assert actual.shape == expected.shape, (actual.shape, expected.shape)
-    assert np.isfinite(actual).all(), "NaN or Inf in the result"
-    return np.abs(actual - expected).max(initial=0) / max(np.abs(expected).max(initial=0), 1e-30)
-
-
-def numeric_gradient(function, values, step, indices=None):
-    """Central differences of a scalar function of a float64 array, at flat `indices` (all by default): (len(indices),)."""
-    values = np.array(values, np.float64)
-    indices = range(values.size) if indices is None else indices
-    gradient = []
-    for i in indices:
-        upper, lower = values.copy(), values.copy()
-        upper.flat[i] += step
-        lower.flat[i] -= step
-        gradient.append((function(upper) - function(lower)) / (2 * step))
-    return np.array(gradient)

@@ -5,7 +5,7 @@ import json
 import numpy as np
 from PIL import Image
 
-from pp_cl.camera import Camera
+from pp_cl.scene.camera import Camera
 
 
 def look_at(eye, target=(0, 0, 0)):
@@ -21,15 +21,24 @@ def ring_cameras(n, size, distance=4.0, field_of_view=0.7):
     focal = 0.5 * size / np.tan(0.5 * field_of_view)
     eyes = [
         distance * np.array([np.cos(a) * np.cos(h), np.sin(a) * np.cos(h), np.sin(h)])
-        for a, h in zip(np.linspace(0, 2 * np.pi, n, endpoint=False), np.tile([0.2, 0.7], n)[:n], strict=True)
+        for a, h in zip(
+            np.linspace(0, 2 * np.pi, n, endpoint=False), np.tile([0.2, 0.7], n)[:n], strict=True
+        )
     ]
-    return [Camera(look_at(eye), focal, focal, size / 2, size / 2, size, size, 2.0, 6.0) for eye in eyes]
+    return [
+        Camera(look_at(eye), focal, focal, size / 2, size / 2, size, size, 2.0, 6.0) for eye in eyes
+    ]
 
 
 def ball_image(camera, radius=0.8):
-    """(H, W, 4) uint8 picture of a ball at the origin whose colour varies with the surface position."""
+    """(H, W, 4) uint8 picture of a ball at the origin whose colour varies with the surface
+    position.
+    """
     y, x = np.mgrid[: camera.height, : camera.width] + 0.5
-    rays = np.stack([(x - camera.cx) / camera.fx, (y - camera.cy) / camera.fy, np.ones_like(x)], -1) @ camera.pose[:, :3].T
+    rays = (
+        np.stack([(x - camera.cx) / camera.fx, (y - camera.cy) / camera.fy, np.ones_like(x)], -1)
+        @ camera.pose[:, :3].T
+    )
     rays /= np.linalg.norm(rays, axis=-1, keepdims=True)
     b = rays @ camera.eye
     disc = b**2 - (camera.eye @ camera.eye - radius**2)
@@ -48,5 +57,7 @@ def write_ball_scene(folder, views=8, size=48, splits=("train", "test")):
             Image.fromarray(ball_image(camera)).save(folder / split / f"r_{i}.png")
             pose = np.vstack([camera.pose * [1, -1, -1, 1], [0, 0, 0, 1]])  # OpenGL axes
             frames.append({"file_path": f"./{split}/r_{i}", "transform_matrix": pose.tolist()})
-        (folder / f"transforms_{split}.json").write_text(json.dumps({"camera_angle_x": 0.7, "frames": frames}))
+        (folder / f"transforms_{split}.json").write_text(
+            json.dumps({"camera_angle_x": 0.7, "frames": frames})
+        )
     return str(folder)

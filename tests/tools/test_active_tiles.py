@@ -5,11 +5,13 @@ import json
 from pathlib import Path
 
 import pytest
-from scenes import write_ball_scene
+from support.scenes import write_ball_scene
 
 from pp_cl.cli import main
 
-SPEC = importlib.util.spec_from_file_location("active_tiles", Path(__file__).parents[1] / "tools" / "active_tiles.py")
+SPEC = importlib.util.spec_from_file_location(
+    "active_tiles", Path(__file__).parents[2] / "tools" / "active_tiles.py"
+)
 TOOL = importlib.util.module_from_spec(SPEC)
 SPEC.loader.exec_module(TOOL)
 
@@ -19,8 +21,25 @@ def run(tmp_path_factory):
     """A run of a few steps on a ball in large pictures."""
     folder = tmp_path_factory.mktemp("active_tiles")
     scene = write_ball_scene(folder / "ball", size=300)
-    assert main(["train", scene, "--out", str(folder / "run"), "--points", "1500", "--iterations", "2",
-                 "--set", "train.crop=28", "--set", "network.widths=16,16,16"]) == 0
+    assert (
+        main(
+            [
+                "train",
+                scene,
+                "--out",
+                str(folder / "run"),
+                "--points",
+                "1500",
+                "--iterations",
+                "2",
+                "--set",
+                "train.crop=28",
+                "--set",
+                "network.widths=16,16,16",
+            ]
+        )
+        == 0
+    )
     return folder / "run"
 
 
@@ -31,14 +50,23 @@ def test_rows(run, tmp_path, capsys):
     assert len(rows) == 2
     for row in rows:
         assert row["size"] == [300, 300] and 0 < row["share"] < 0.8
-        assert row["forward_ratio"] == pytest.approx(row["forward_dense_ms"] / row["forward_active_ms"])
+        assert row["forward_ratio"] == pytest.approx(
+            row["forward_dense_ms"] / row["forward_active_ms"]
+        )
         assert max(row["image_difference"], row["grad_features_difference"]) < 1e-6
         assert row["grad_parameters_difference"] < 5e-6
     assert "of the multiplications remain" in capsys.readouterr().out
-    assert TOOL.main([str(run), "--views", "1", "--runs", "1", "--downscale", "2", "--widths", "16,16,32"]) == 0
+    assert (
+        TOOL.main(
+            [str(run), "--views", "1", "--runs", "1", "--downscale", "2", "--widths", "16,16,32"]
+        )
+        == 0
+    )
 
 
-@pytest.mark.parametrize("arguments, word", [(["--views", "0"], "--views"), (["--widths", "3"], "--widths")])
+@pytest.mark.parametrize(
+    "arguments, word", [(["--views", "0"], "--views"), (["--widths", "3"], "--widths")]
+)
 def test_bad_input(run, capsys, arguments, word):
     assert TOOL.main([str(run), *arguments]) == 2
     assert word in capsys.readouterr().err

@@ -1,4 +1,6 @@
-"""tools/compare_torch.py: PyTorch's twin is the same network, and the file holds what the tool promises."""
+"""tools/compare_torch.py: PyTorch's twin is the same network, and the file holds what the tool
+promises.
+"""
 
 import importlib.util
 import json
@@ -7,11 +9,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from helpers import relative_error
+from support.comparisons import relative_error
 
-from pp_cl.bench import NETWORK_VARIANTS, make_network, plain_parameters
+from pp_cl.bench.network import NETWORK_VARIANTS, make_network, plain_parameters
 
-SPEC = importlib.util.spec_from_file_location("compare_torch", Path(__file__).parents[1] / "tools" / "compare_torch.py")
+SPEC = importlib.util.spec_from_file_location(
+    "compare_torch", Path(__file__).parents[2] / "tools" / "compare_torch.py"
+)
 TOOL = importlib.util.module_from_spec(SPEC)
 SPEC.loader.exec_module(TOOL)
 
@@ -19,16 +23,23 @@ SPEC.loader.exec_module(TOOL)
 @pytest.fixture
 def torch():
     """PyTorch, or a skip."""
-    return pytest.importorskip("torch", reason="PyTorch is not installed: the development extra `torch`")
+    return pytest.importorskip(
+        "torch", reason="PyTorch is not installed: the development extra `torch`"
+    )
 
 
 @pytest.mark.parametrize("variant", [v for v in NETWORK_VARIANTS if not v.endswith("half")])
 def test_the_twin_is_the_same_network(torch, dev, rng, variant):
     net = make_network(dev, (16, 32, 48), variant)
-    x, grad_image = rng.normal(size=(16, 16, 16)).astype(np.float32), rng.normal(size=(16, 16, 3)).astype(np.float32)
+    x, grad_image = (
+        rng.normal(size=(16, 16, 16)).astype(np.float32),
+        rng.normal(size=(16, 16, 3)).astype(np.float32),
+    )
     twin = TOOL.TorchNetwork(torch, net, torch.float64)
     image = net.forward(dev.upload(x)).get()
-    actual = {"x": net.backward(dev.upload(grad_image)).get()} | plain_parameters(net, net.gradients)
+    actual = {"x": net.backward(dev.upload(grad_image)).get()} | plain_parameters(
+        net, net.gradients
+    )
     expected = twin.train(twin.input(x), twin.input(grad_image).detach())
     assert relative_error(image, twin.forward(twin.input(x))[0].numpy().transpose(1, 2, 0)) < 1e-5
     assert relative_error(actual.pop("x"), expected.pop("x")[0].numpy().transpose(1, 2, 0)) < 1e-5
@@ -39,7 +50,23 @@ def test_the_twin_is_the_same_network(torch, dev, rng, variant):
 
 def test_the_file(torch, tmp_path, capsys):
     file = tmp_path / "t.json"
-    assert TOOL.main(["--widths", "16,16,16", "--size", "8", "--runs", "3", "--threads", "1", "--json", str(file)]) == 0
+    assert (
+        TOOL.main(
+            [
+                "--widths",
+                "16,16,16",
+                "--size",
+                "8",
+                "--runs",
+                "3",
+                "--threads",
+                "1",
+                "--json",
+                str(file),
+            ]
+        )
+        == 0
+    )
     result = json.loads(file.read_text())
     assert 0 < result["rel_l2"] < 1e-5 and result["threads"] == 1
     for direction in ("forward", "train"):

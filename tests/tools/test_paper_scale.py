@@ -4,9 +4,11 @@ import importlib.util
 from pathlib import Path
 
 import pytest
-from scenes import write_ball_scene
+from support.scenes import write_ball_scene
 
-SPEC = importlib.util.spec_from_file_location("paper_scale", Path(__file__).parents[1] / "tools" / "paper_scale.py")
+SPEC = importlib.util.spec_from_file_location(
+    "paper_scale", Path(__file__).parents[2] / "tools" / "paper_scale.py"
+)
 TOOL = importlib.util.module_from_spec(SPEC)
 SPEC.loader.exec_module(TOOL)
 
@@ -18,7 +20,15 @@ def test_a_small_scene(tmp_path, capsys, ways):
     first, second = capsys.readouterr().out.splitlines()[-2:]
     assert 1500 <= int(first.split()[0]) < 1600 and "shaded" in first
     assert [w for w in second.split() if w.isalpha() and w != "ms"] == [
-        "project", "pairs", "weights", "shade", "blend", "gradients", "update", "forward"]
+        "project",
+        "pairs",
+        "weights",
+        "shade",
+        "blend",
+        "gradients",
+        "update",
+        "forward",
+    ]
 
 
 def test_bad_input(tmp_path, capsys):

@@ -1,15 +1,17 @@
-"""cl/adam.cl against Adam in float64."""
+"""cl/training/adam.cl against Adam in float64."""
 
 import numpy as np
-import oracle_optim
 import pyopencl as cl
 import pytest
-from helpers import AWKWARD_SIZES, relative_error
+from oracle import optim as oracle_optim
+from support.comparisons import relative_error
+from support.guarded import AWKWARD_SIZES
 
-from pp_cl.adam import PointAdam, Touched, adam_update, ema_update, moment_scale
-from pp_cl.camera import Camera
-from pp_cl.device import kernel_folder
-from pp_cl.points import SH_BLOCKS, Grid
+from pp_cl.device.device import kernel_folder
+from pp_cl.raster.sh import SH_BLOCKS
+from pp_cl.scene.camera import Camera
+from pp_cl.scene.grid import Grid
+from pp_cl.training.adam import PointAdam, Touched, adam_update, ema_update, moment_scale
 
 GRID = Grid((-0.7, -0.5, -0.6), 0.05, (23, 19, 31))
 SH_EPS = 4e-7  # of the tiny preset
@@ -102,10 +104,16 @@ class Cloud:
     def __init__(self, dev, rng, n, block=SH_BLOCKS[0], lazy=True, scale=None):
         self.dev, self.n, self.block, self.lazy, self.scale = dev, n, block, lazy, scale
         self.ids = np.sort(rng.choice(np.prod(GRID.dims), n, replace=False)).astype(np.uint32)
-        self.start = {"opacity": rng.random(n).astype(np.float32),
-                      "sh": rng.standard_normal((n, block.count, 16)).astype(np.float32)}
+        self.start = {
+            "opacity": rng.random(n).astype(np.float32),
+            "sh": rng.standard_normal((n, block.count, 16)).astype(np.float32),
+        }
         self.oracles = {name: oracle_optim.Adam(start) for name, start in self.start.items()}
-        self.adam, self.last, self.steps = PointAdam(dev, lazy, scale), dev.zeros((n,), np.uint32), 0
+        self.adam, self.last, self.steps = (
+            PointAdam(dev, lazy, scale),
+            dev.zeros((n,), np.uint32),
+            0,
+        )
         self.opacity = [dev.upload(self.start["opacity"]), *moments(dev, self.start["opacity"])]
         self.sh, self.sh_moments = dev.upload(self.start["sh"]), self.adam.sh_moments(block, n)
         self.scene = [dev.upload(GRID.packed()), dev.upload(CAMERA.packed()), dev.upload(self.ids)]
@@ -116,15 +124,23 @@ class Cloud:
         for oracle in self.oracles.values():
             oracle.t = self.steps - 1
         listed = np.isin(np.arange(self.n), rows)
-        features, opacities = (self.dev.upload(np.where(listed.reshape(-1, *[1] * (g.ndim - 1)), g, np.nan), np.float32)
-                               for g in (grad_features, grad_opacity))
+        features, opacities = (
+            self.dev.upload(
+                np.where(listed.reshape(-1, *[1] * (g.ndim - 1)), g, np.nan), np.float32
+            )
+            for g in (grad_features, grad_opacity)
+        )
         if self.lazy:
             self.adam.begin_lazy(self.steps, self.dev.upload(rows, np.uint32), self.last)
         else:
             self.adam.begin(self.steps, self.n)
-        self.adam.update_sh(self.block, *self.scene, features, self.sh, self.sh_moments, 0.1, SH_EPS)
+        self.adam.update_sh(
+            self.block, *self.scene, features, self.sh, self.sh_moments, 0.1, SH_EPS
+        )
         self.adam.update_opacity(opacities, *self.opacity, 0.03, 1e-15)
-        gradient = oracle_optim.sh_gradient(GRID.positions(self.ids), EYE, grad_features, self.block)
+        gradient = oracle_optim.sh_gradient(
+            GRID.positions(self.ids), EYE, grad_features, self.block
+        )
         self.oracles["sh"].step(gradient, 0.1, SH_EPS, rows=rows)
         self.oracles["opacity"].step(grad_opacity, 0.03, 1e-15, low=0, high=1, rows=rows)
 
@@ -196,7 +212,9 @@ def test_rows_that_are_not_listed_rest(dev, rng):
 
 
 def test_lazy_moments_are_dense_ones(dev, rng):
-    """At every step that lists a row, its moments are those of dense Adam with gradients of 0 in between."""
+    """At every step that lists a row, its moments are those of dense Adam with gradients of 0 in
+    between.
+    """
     cloud, dense = Cloud(dev, rng, 33), oracle_optim.Adam(np.zeros(33))
     for _ in range(40):
         grad = gradients(rng, 33)[1]
@@ -224,7 +242,9 @@ def test_touched_are_those_with_a_gradient(dev, rng, n):
 
 
 def test_a_row_that_rested_is_where_dense_adam_has_moved_it(dev, rng):
-    """Late in training, where the bias corrections stand still, at a constant rate and a small eps: nothing is lost."""
+    """Late in training, where the bias corrections stand still, at a constant rate and a small eps:
+    nothing is lost.
+    """
     cloud, dense = Cloud(dev, rng, 257), oracle_optim.Adam(np.zeros((257, 1, 16)))
     dense.t, start = 20_000, cloud.sh.get().astype(np.float64)
     cloud.last.set(np.full(257, 20_000, np.uint32))
@@ -233,7 +253,11 @@ def test_a_row_that_rested_is_where_dense_adam_has_moved_it(dev, rng):
         rows = np.arange(257) if step == 20_040 else np.flatnonzero(rng.random(257) < 0.1)
         cloud.step(features, np.zeros(257), rows, step)
         features[~np.isin(np.arange(257), rows)] = 0
-        dense.step(oracle_optim.sh_gradient(GRID.positions(cloud.ids), EYE, features, cloud.block), 0.1, SH_EPS)
+        dense.step(
+            oracle_optim.sh_gradient(GRID.positions(cloud.ids), EYE, features, cloud.block),
+            0.1,
+            SH_EPS,
+        )
     assert relative_error(cloud.sh.get() - start, dense.parameter) < 1e-3
 
 
@@ -248,7 +272,11 @@ def test_long_rests(dev, rng, step):
 def test_opacity_stays_in_its_bounds(dev, rng):
     cloud = Cloud(dev, rng, 257)
     for step in range(40):
-        cloud.step(np.zeros((257, 16)), rng.standard_normal(257) + np.linspace(-2, 2, 257), np.arange(step % 2, 257, 2))
+        cloud.step(
+            np.zeros((257, 16)),
+            rng.standard_normal(257) + np.linspace(-2, 2, 257),
+            np.arange(step % 2, 257, 2),
+        )
     opacity = cloud.opacity[0].get()
     assert opacity.min() == 0
     assert opacity.max() == 1
@@ -258,20 +286,34 @@ def test_opacity_stays_in_its_bounds(dev, rng):
 def test_a_nan_is_not_hidden(dev, rng):
     cloud = Cloud(dev, rng, 31)
     cloud.adam.begin_lazy(1, dev.upload(np.arange(31), np.uint32), cloud.last)
-    cloud.adam.update_opacity(dev.upload(np.full(31, np.nan), np.float32), *cloud.opacity, 0.1, 1e-15)
+    cloud.adam.update_opacity(
+        dev.upload(np.full(31, np.nan), np.float32), *cloud.opacity, 0.1, 1e-15
+    )
     assert np.isnan(cloud.opacity[0].get()).all()
 
 
 def test_sh_of_a_point_in_the_eye_stays_finite(dev):
     """No pixel sees it, so its gradient is 0; its direction is undefined."""
-    grid, camera = Grid((0, 0, 0), 0.5, (5, 5, 5)), Camera(np.column_stack([np.eye(3), [1.0, 0.5, 0]]), 9, 9, 4, 4, 8, 8)
+    grid, camera = (
+        Grid((0, 0, 0), 0.5, (5, 5, 5)),
+        Camera(np.column_stack([np.eye(3), [1.0, 0.5, 0]]), 9, 9, 4, 4, 8, 8),
+    )
     ids = np.array([2 + 5, 3], np.uint32)
     start = np.ones((2, 3, 16), np.float32)
     adam = PointAdam(dev)
     sh, sh_moments = dev.upload(start), adam.sh_moments(SH_BLOCKS[2], 2)
     adam.begin(1, 2)
-    adam.update_sh(SH_BLOCKS[2], dev.upload(grid.packed()), dev.upload(camera.packed()), dev.upload(ids), dev.zeros((2, 16)),
-                   sh, sh_moments, 0.5, 1e-15)
+    adam.update_sh(
+        SH_BLOCKS[2],
+        dev.upload(grid.packed()),
+        dev.upload(camera.packed()),
+        dev.upload(ids),
+        dev.zeros((2, 16)),
+        sh,
+        sh_moments,
+        0.5,
+        1e-15,
+    )
     np.testing.assert_array_equal(sh.get(), start)
     assert not sh_moments["m"].get().any()
 
@@ -294,7 +336,9 @@ def test_half_moments_follow_the_oracle(dev, rng, n, block):
 
 @pytest.mark.large
 def test_half_moments_decay_as_they_should(dev, rng):
-    """A thousand steps each take less from sqrt(v) than half a unit in its last place: rounding to nearest keeps all."""
+    """A thousand steps each take less from sqrt(v) than half a unit in its last place: rounding to
+    nearest keeps all.
+    """
     cloud, none = Cloud(dev, rng, 33, scale=moment_scale(SH_EPS)), np.zeros((33, 16))
     grad = np.logspace(-6, -2, 33)[:, None] * (1 + rng.random((33, 16)))
     cloud.step(grad, np.zeros(33), np.arange(33))
@@ -314,9 +358,30 @@ def test_moment_scale_puts_eps_into_the_range_of_a_half(eps):
 
 
 def test_rounding_to_half(dev):
-    """Each value becomes one of its two neighbours, and on the average itself; the largest half bounds, NaN stays."""
-    values = np.float32([0, 1, -1.0003, 0.1, 6e-5, -3e-8, 1e-8, 6.1035e-5, 65519, 7e4, -1e30, np.inf, np.nan, 9, -7e-6, 2])
-    source = """#include "half16.h"
+    """Each value becomes one of its two neighbours, and on the average itself; the largest half
+    bounds, NaN stays.
+    """
+    values = np.float32(
+        [
+            0,
+            1,
+            -1.0003,
+            0.1,
+            6e-5,
+            -3e-8,
+            1e-8,
+            6.1035e-5,
+            65519,
+            7e4,
+            -1e30,
+            np.inf,
+            np.nan,
+            9,
+            -7e-6,
+            2,
+        ]
+    )
+    source = """#include "training/half16.h"
         kernel void to_half(global const float16 *value, global half *rounded) {
             const uint i = get_global_id(0);
             store_half16(value[0], random16(77 + i) >> 19, rounded + 16 * i);

@@ -1,12 +1,12 @@
-"""cl/loss.cl against its float64 twin, scikit-image and finite differences."""
+"""cl/training/loss.cl against its float64 twin, scikit-image and finite differences."""
 
 import numpy as np
-import oracle_loss
 import pytest
-from helpers import numeric_gradient, relative_error
+from oracle import loss as oracle_loss
 from skimage.metrics import structural_similarity
+from support.comparisons import numeric_gradient, relative_error
 
-from pp_cl.loss import Loss
+from pp_cl.training.loss import Loss
 
 SIZES = [(11, 11), (12, 33), (31, 16), (33, 31), (40, 257)]
 
@@ -14,7 +14,11 @@ SIZES = [(11, 11), (12, 33), (31, 16), (33, 31), (40, 257)]
 def images(rng, height, width, noise=0.1):
     """A smooth target with texture, and a prediction that leaves [0, 1]."""
     y, x = np.mgrid[:height, :width][..., None] / 9.0
-    target = 0.5 + 0.4 * np.sin(x + y + np.arange(3)) * np.cos(2 * y) + 0.05 * rng.standard_normal((height, width, 3))
+    target = (
+        0.5
+        + 0.4 * np.sin(x + y + np.arange(3)) * np.cos(2 * y)
+        + 0.05 * rng.standard_normal((height, width, 3))
+    )
     prediction = target + noise * rng.standard_normal(target.shape)
     return prediction.astype(np.float32), target.astype(np.float32)
 
@@ -47,13 +51,21 @@ def test_ssim_is_scikit_images(dev, rng):
     prediction, target = images(rng, 37, 64)
     terms, _ = run(dev, prediction, target, 0.2)
     expected = structural_similarity(
-        prediction.astype(np.float64), target.astype(np.float64), gaussian_weights=True, sigma=1.5,
-        use_sample_covariance=False, data_range=1.0, channel_axis=-1)
+        prediction.astype(np.float64),
+        target.astype(np.float64),
+        gaussian_weights=True,
+        sigma=1.5,
+        use_sample_covariance=False,
+        data_range=1.0,
+        channel_axis=-1,
+    )
     assert terms[2] == pytest.approx(1 - expected, rel=2e-6)
 
 
-@pytest.mark.parametrize(("size", "weight"),
-                         [((10, 40), 0.2), ((40, 10), 0.2), ((1, 1), 0.2), ((1, 257), 0.2), ((33, 31), 0.0)])
+@pytest.mark.parametrize(
+    ("size", "weight"),
+    [((10, 40), 0.2), ((40, 10), 0.2), ((1, 1), 0.2), ((1, 257), 0.2), ((33, 31), 0.0)],
+)
 def test_without_ssim(dev, rng, size, weight):
     prediction, target = images(rng, *size)
     terms, grad = run(dev, prediction, target, weight)
@@ -71,18 +83,23 @@ def test_equal_images_have_no_loss_and_no_gradient(dev, rng, level):
         assert not grad.any()
 
 
-@pytest.mark.parametrize("levels", [(0.0, 1.0), (1.0, 0.0), (1.0, 0.999), (0.3, 0.3001), (-2.0, 0.0)])
+@pytest.mark.parametrize(
+    "levels", [(0.0, 1.0), (1.0, 0.0), (1.0, 0.999), (0.3, 0.3001), (-2.0, 0.0)]
+)
 def test_flat_images(dev, levels):
     prediction, target = (np.full((20, 30, 3), level, np.float32) for level in levels)
     terms, grad = run(dev, prediction, target, 0.2)
     expected_terms, expected_grad = oracle_loss.loss(prediction, target, 0.2)
-    np.testing.assert_allclose(terms, expected_terms, rtol=3e-6, atol=1e-10)  # 1 - SSIM: rounding of Var[d] over C2
+    # 1 - SSIM: rounding of Var[d] over C2
+    np.testing.assert_allclose(terms, expected_terms, rtol=3e-6, atol=1e-10)
     assert relative_error(grad, expected_grad) < 3e-6
 
 
 @pytest.mark.parametrize("level", [0.0, 1.0])
 def test_almost_flat_images(dev, rng, level):
-    """Variances far below the squares they are the difference of: the textbook form in float32 is off by 2e-3 at level 1."""
+    """Variances far below the squares they are the difference of: the textbook form in float32 is
+    off by 2e-3 at level 1.
+    """
     target = level + 1e-3 * rng.standard_normal((24, 35, 3))
     prediction = target + 1e-3 * rng.standard_normal(target.shape)
     prediction, target = prediction.astype(np.float32), target.astype(np.float32)
@@ -97,7 +114,7 @@ def test_target_inside_a_larger_prediction(dev, rng, left, top):
     prediction, target = images(rng, 22, 29)
     expected_terms, expected_grad = run(dev, prediction, target, 0.2)
     padded = np.full((24, 32, 3), np.nan, np.float32)  # poison: nothing outside may be read
-    inner = np.s_[top:top + 22, left:left + 29]
+    inner = np.s_[top : top + 22, left : left + 29]
     padded[inner] = prediction
     terms, grad = run(dev, padded, target, 0.2, left=left, top=top)
     np.testing.assert_array_equal(terms, expected_terms)
@@ -109,7 +126,9 @@ def test_target_inside_a_larger_prediction(dev, rng, left, top):
 @pytest.mark.parametrize(("left", "top"), [(4, 0), (0, 3), (-1, 0)])
 def test_refuses_a_target_outside(dev, left, top):
     with pytest.raises(ValueError, match="reaches outside"):
-        Loss(dev, 0.2).forward_backward(dev.zeros((24, 32, 3)), dev.zeros((22, 29, 3)), left=left, top=top)
+        Loss(dev, 0.2).forward_backward(
+            dev.zeros((24, 32, 3)), dev.zeros((22, 29, 3)), left=left, top=top
+        )
 
 
 def test_sizes_may_change_between_calls(dev, rng):

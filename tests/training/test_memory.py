@@ -2,26 +2,38 @@
 
 import numpy as np
 import pytest
-from scenes import write_ball_scene
+from support.scenes import write_ball_scene
 
 from pp_cl.config import Config, assign, preset
 from pp_cl.errors import UserError
-from pp_cl.memory import memory_plan, point_bytes, print_plan
 from pp_cl.model import Model
-from pp_cl.points import Grid
 from pp_cl.run import open_scene, with_depth_range
+from pp_cl.scene.grid import Grid
 from pp_cl.train import Trainer
+from pp_cl.training.memory import memory_plan, point_bytes, print_plan
 
 PAPER_POINTS = 4_040_533  # lego, supplemental Table 4
-WAYS = [{}, {"train.lazy": "true", "points.stop": "0.001"},
-        {"train.half_moments": "true", "train.average": "false", "train.smooth": "0"}]
+WAYS = [
+    {},
+    {"train.lazy": "true", "points.stop": "0.001"},
+    {"train.half_moments": "true", "train.average": "false", "train.smooth": "0"},
+]
 
 
 def trained(dev, folder, changes):
-    """(Trainer, its plan, peak bytes) after some steps on a ball scene with a grid full of points."""
+    """(Trainer, its plan, peak bytes) after some steps on a ball scene with a grid full of
+    points.
+    """
     config = Config()
-    settings = {"scene.path": write_ball_scene(folder), "scene.downscale": 2, "points.count": 27_000, "train.crop": 24,
-                "network.widths": "16,16,16", "train.iterations": 30, "train.prune_every": 10} | changes
+    settings = {
+        "scene.path": write_ball_scene(folder),
+        "scene.downscale": 2,
+        "points.count": 27_000,
+        "train.crop": 24,
+        "network.widths": "16,16,16",
+        "train.iterations": 30,
+        "train.prune_every": 10,
+    } | changes
     for key, value in settings.items():
         assign(config, key, value, "test")
     before, dev.peak_bytes = dev.bytes, dev.bytes
@@ -45,11 +57,13 @@ def test_the_plan_is_what_a_training_takes(dev, tmp_path, changes):
     assert 0.97 * peak < sum(planned.values()) < 1.03 * peak
     held = sum(array.nbytes for array in trainer.model.points.values())
     stored = ("ids, opacities, SH coefficients", "Adam's moments", "averages")
-    assert held == sum(planned.get(what, 0) for what in stored) + 27_000 * (8 if trainer.optimiser.lazy else 4)
+    assert held == sum(planned.get(what, 0) for what in stored) + 27_000 * (
+        8 if trainer.optimiser.lazy else 4
+    )
 
 
 def test_pruning_stays_within_the_plan(dev, tmp_path, monkeypatch):
-    monkeypatch.setattr("pp_cl.prune.SCRATCH_BYTES", 10**6)
+    monkeypatch.setattr("pp_cl.training.prune.SCRATCH_BYTES", 10**6)
     trainer, plan, _ = trained(dev, tmp_path / "ball", {"train.prune_every": 1000})
     before, dev.peak_bytes = dev.bytes, dev.bytes
     trainer._prune(dev.upload(np.arange(27_000), np.float32), 1.0)
@@ -63,7 +77,8 @@ def test_the_papers_scale_fits_nine_gibibytes(lazy):
     train = preset("paper").train
     train.lazy = lazy
     single = PAPER_POINTS * sum(point_bytes(train, 2).values())
-    assert single + 2 * 45 * PAPER_POINTS < 9 * 2**30  # two hits a point; a disc of 0.75 pixels covers 1.77
+    # two hits a point; a disc of 0.75 pixels covers 1.77
+    assert single + 2 * 45 * PAPER_POINTS < 9 * 2**30
     train.half_moments = True
     assert single - PAPER_POINTS * sum(point_bytes(train, 2).values()) == PAPER_POINTS * 576
 

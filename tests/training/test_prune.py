@@ -1,10 +1,10 @@
-"""cl/prune.cl against numpy indexing."""
+"""cl/training/prune.cl against numpy indexing."""
 
 import numpy as np
 import pytest
-from helpers import AWKWARD_SIZES
+from support.guarded import AWKWARD_SIZES
 
-from pp_cl.prune import compact_rows, keep_indices, prune
+from pp_cl.training.prune import compact_rows, keep_indices, prune
 
 
 def kept(dev, weights, least_weight, opacities, least_opacity):
@@ -20,7 +20,10 @@ def test_keep_needs_weight_and_opacity(dev):
     assert kept(dev, [np.nan, 1, 1], 0, [1, 1, np.nan], 0) == [1]
 
 
-@pytest.mark.parametrize(("weights", "survivor"), [([1, 3, 2], 1), ([0, 0, 0], 0), ([np.nan, 1, 2], 2), ([np.nan] * 3, 0)])
+@pytest.mark.parametrize(
+    ("weights", "survivor"),
+    [([1, 3, 2], 1), ([0, 0, 0], 0), ([np.nan, 1, 2], 2), ([np.nan] * 3, 0)],
+)
 def test_one_point_always_survives(dev, weights, survivor):
     assert kept(dev, weights, 5, [0, 0, 0], 0.01) == [survivor]
 
@@ -61,9 +64,13 @@ def test_compact_keeps_every_bit(dev, dtype, scratch_bytes):
 @pytest.mark.parametrize("share", [2, 10])
 def test_prune_never_takes_more_than_its_scratch(dev, rng, monkeypatch, share):
     scratch = 40_000
-    monkeypatch.setattr("pp_cl.prune.SCRATCH_BYTES", scratch)
-    host = {"ids": np.arange(1000, dtype=np.uint32), "opacity": rng.random(1000).astype(np.float32),
-            "sh1": rng.random((1000, 3, 16)).astype(np.float32), "m.sh1": rng.random((1000, 3, 16)).astype(np.float32)}
+    monkeypatch.setattr("pp_cl.training.prune.SCRATCH_BYTES", scratch)
+    host = {
+        "ids": np.arange(1000, dtype=np.uint32),
+        "opacity": rng.random(1000).astype(np.float32),
+        "sh1": rng.random((1000, 3, 16)).astype(np.float32),
+        "m.sh1": rng.random((1000, 3, 16)).astype(np.float32),
+    }
     arrays = {name: dev.upload(values) for name, values in host.items()}
     keep = np.arange(0, 1000, share, dtype=np.uint32)
     indices = dev.upload(keep)
@@ -72,4 +79,6 @@ def test_prune_never_takes_more_than_its_scratch(dev, rng, monkeypatch, share):
     for name, values in host.items():
         np.testing.assert_array_equal(arrays[name].get(), values[keep])
     assert dev.peak_bytes <= before + scratch
-    assert before - dev.bytes == sum(v.nbytes - v[keep].nbytes for v in host.values() if v[keep].nbytes <= scratch)
+    assert before - dev.bytes == sum(
+        v.nbytes - v[keep].nbytes for v in host.values() if v[keep].nbytes <= scratch
+    )

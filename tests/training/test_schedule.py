@@ -1,14 +1,25 @@
-"""pp_cl/schedule.py: the values of the formulas, worked out by hand."""
+"""pp_cl/training/schedule.py: the values of the formulas, worked out by hand."""
 
 import math
 
 import pytest
 
-from pp_cl.schedule import average_weight, gamma, learning_rate
+from pp_cl.training.schedule import average_weight, gamma, learning_rate
 
-SH_RATES = [((0.5, 0.05, 0), {0: 0.5, 250: 0.49428, 500: 0.48862, 1000: 0.4775, 25000: 0.15811, 50000: 0.05}),
-            ((0.25, 0.025, 500), {0: 0.0025, 250: 0.17548, 500: 0.24431, 1000: 0.23875, 25000: 0.07906, 50000: 0.025}),
-            ((0.125, 0.0125, 1000), {0: 0.00125, 250: 0.04805, 500: 0.08673, 1000: 0.11937, 25000: 0.03953, 50000: 0.0125})]
+SH_RATES = [
+    (
+        (0.5, 0.05, 0),
+        {0: 0.5, 250: 0.49428, 500: 0.48862, 1000: 0.4775, 25000: 0.15811, 50000: 0.05},
+    ),
+    (
+        (0.25, 0.025, 500),
+        {0: 0.0025, 250: 0.17548, 500: 0.24431, 1000: 0.23875, 25000: 0.07906, 50000: 0.025},
+    ),
+    (
+        (0.125, 0.0125, 1000),
+        {0: 0.00125, 250: 0.04805, 500: 0.08673, 1000: 0.11937, 25000: 0.03953, 50000: 0.0125},
+    ),
+]
 
 
 @pytest.mark.parametrize(("arguments", "values"), SH_RATES)

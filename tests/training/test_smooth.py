@@ -1,19 +1,24 @@
-"""cl/smooth.cl against dictionaries and loops."""
+"""cl/training/smooth.cl against dictionaries and loops."""
 
 import numpy as np
-import oracle_optim
 import pytest
-from helpers import AWKWARD_SIZES, relative_error
+from oracle import optim as oracle_optim
+from support.comparisons import relative_error
+from support.guarded import AWKWARD_SIZES
 
-from pp_cl.points import Grid
-from pp_cl.smooth import Smoother, neighbour_table
+from pp_cl.scene.grid import Grid
+from pp_cl.training.smooth import Smoother, neighbour_table
 
 NONE = 0xFFFFFFFF
 
 
 def cloud(dev, ids, dims):
     """(device, grid, ids) on the device: the arguments of neighbour_table and Smoother."""
-    return dev, dev.upload(Grid((0, 0, 0), 1, dims).packed()), dev.upload(np.asarray(ids, np.uint32))
+    return (
+        dev,
+        dev.upload(Grid((0, 0, 0), 1, dims).packed()),
+        dev.upload(np.asarray(ids, np.uint32)),
+    )
 
 
 def some_ids(rng, n, dims):
@@ -28,7 +33,9 @@ def expected_table(ids, dims):
 @pytest.mark.parametrize("dims", [(7, 8, 9), (300, 1, 1), (1, 300, 1), (1, 1, 300), (2, 11, 13)])
 def test_table_matches_dictionary(dev, rng, n, dims):
     ids = some_ids(rng, n, dims)
-    np.testing.assert_array_equal(neighbour_table(*cloud(dev, ids, dims)).get(), expected_table(ids, dims))
+    np.testing.assert_array_equal(
+        neighbour_table(*cloud(dev, ids, dims)).get(), expected_table(ids, dims)
+    )
 
 
 def test_full_grid_does_not_wrap(dev):
@@ -44,7 +51,9 @@ def test_table_of_a_huge_grid(dev):
     dims = (517, 512, 507)
     last = 517 * 512 * 507 - 1
     ids = [0, 1, 516, 517, 517 * 512 - 1, 517 * 512, last - 517 * 512, last - 517, last - 1, last]
-    np.testing.assert_array_equal(neighbour_table(*cloud(dev, ids, dims)).get(), expected_table(ids, dims))
+    np.testing.assert_array_equal(
+        neighbour_table(*cloud(dev, ids, dims)).get(), expected_table(ids, dims)
+    )
 
 
 def smoothed(dev, values, ids, dims, amount):
@@ -65,8 +74,10 @@ def test_smooth_matches_oracle(dev, rng, n, coefficients):
 
 @pytest.mark.parametrize("dims", [(6, 5, 40), (3, 2, 100), (40, 30, 1), (600, 1, 1)])
 def test_chunks_read_old_values_only(dev, rng, monkeypatch, dims):
-    """Chunks as short as the neighbours allow, and an amount that shows every new value read too early."""
-    monkeypatch.setattr("pp_cl.smooth.CHUNK", 1)
+    """Chunks as short as the neighbours allow, and an amount that shows every new value read too
+    early.
+    """
+    monkeypatch.setattr("pp_cl.training.smooth.CHUNK", 1)
     n = np.prod(dims) * 9 // 10
     ids = some_ids(rng, n, dims)
     assert Smoother(*cloud(dev, ids, dims)).chunk < n / 10
@@ -89,4 +100,6 @@ def test_refuses_what_its_scratch_cannot_hold(dev):
 
 def test_amount_one_is_the_mean(dev):
     values = np.repeat(np.arange(4, dtype=np.float32), 16).reshape(4, 1, 16)
-    np.testing.assert_array_equal(smoothed(dev, values, range(4), (4, 1, 1), 1.0)[:, 0, 0], [1, 1, 2, 2])
+    np.testing.assert_array_equal(
+        smoothed(dev, values, range(4), (4, 1, 1), 1.0)[:, 0, 0], [1, 1, 2, 2]
+    )

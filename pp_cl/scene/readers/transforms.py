@@ -1,4 +1,6 @@
-"""Scenes in the format of NeRF-synthetic, transforms_<split>.json, with nerfstudio's names for what it does not know."""
+"""Scenes in the format of NeRF-synthetic, transforms_<split>.json, with nerfstudio's names for what
+it does not know.
+"""
 
 import json
 import math
@@ -7,25 +9,33 @@ from pathlib import Path
 
 import numpy as np
 
-from pp_cl.camera import Camera
 from pp_cl.errors import UserError
-from pp_cl.image import image_size
+from pp_cl.files.image import image_size
+from pp_cl.scene.camera import Camera
 
 FILES = "transforms_train.json"
 
 # Lens distortion is not modelled, so its coefficients must be absent or 0.
 DISTORTION = ("k1", "k2", "k3", "k4", "p1", "p2")
-PINHOLES = ("PERSPECTIVE", "PINHOLE", "SIMPLE_PINHOLE", "OPENCV", "SIMPLE_RADIAL", "RADIAL")  # without distortion, that is
+# without distortion, that is
+PINHOLES = ("PERSPECTIVE", "PINHOLE", "SIMPLE_PINHOLE", "OPENCV", "SIMPLE_RADIAL", "RADIAL")
 
 MOST = 1e30  # numbers beyond are refused: they have no float32
-ROTATION_TOLERANCE = 1e-3  # largest eigenvalue of R^T R - 1 that passes as rounding; NeRF-synthetic has 1e-6
+# largest eigenvalue of R^T R - 1 that passes as rounding; NeRF-synthetic has 1e-6
+ROTATION_TOLERANCE = 1e-3
 CV_FROM_GL = np.diag([1.0, -1.0, -1.0])  # OpenGL: y up, z backward; OpenCV: y down, z forward
 
-# PlenopticPoints supplemental, Tables 5 to 7: PSNR, SSIM, LPIPS (VGG) over the 200 test views of 800x800.
+# PlenopticPoints supplemental, Tables 5 to 7: PSNR, SSIM, LPIPS (VGG) over the 200 test views of
+# 800x800.
 PLENOPTIC_POINTS = {
-    "chair": (35.35, 0.986, 0.016), "drums": (25.59, 0.947, 0.050), "ficus": (32.68, 0.982, 0.016),
-    "hotdog": (37.18, 0.985, 0.022), "lego": (33.00, 0.975, 0.026), "materials": (29.27, 0.960, 0.041),
-    "mic": (35.07, 0.991, 0.007), "ship": (28.40, 0.891, 0.125),
+    "chair": (35.35, 0.986, 0.016),
+    "drums": (25.59, 0.947, 0.050),
+    "ficus": (32.68, 0.982, 0.016),
+    "hotdog": (37.18, 0.985, 0.022),
+    "lego": (33.00, 0.975, 0.026),
+    "materials": (29.27, 0.960, 0.041),
+    "mic": (35.07, 0.991, 0.007),
+    "ship": (28.40, 0.891, 0.125),
 }
 SYNTHETIC_SIZE, SYNTHETIC_FOCAL = 800, 1111.11  # pixels, of all eight
 
@@ -36,34 +46,49 @@ def recognises(folder):
 
 
 def published(name, cameras):
-    """{"PlenopticPoints": {"psnr", "ssim", "lpips"}} for a NeRF-synthetic scene, told by name and cameras; else {}."""
-    synthetic = all(c.width == c.height == SYNTHETIC_SIZE and abs(c.fx - SYNTHETIC_FOCAL) < 0.01 for c in cameras)
+    """{"PlenopticPoints": {"psnr", "ssim", "lpips"}} for a NeRF-synthetic scene, told by name and
+    cameras; else {}.
+    """
+    synthetic = all(
+        c.width == c.height == SYNTHETIC_SIZE and abs(c.fx - SYNTHETIC_FOCAL) < 0.01
+        for c in cameras
+    )
     if name not in PLENOPTIC_POINTS or not synthetic:
         return {}
-    return {"PlenopticPoints": dict(zip(("psnr", "ssim", "lpips"), PLENOPTIC_POINTS[name], strict=True))}
+    return {
+        "PlenopticPoints": dict(zip(("psnr", "ssim", "lpips"), PLENOPTIC_POINTS[name], strict=True))
+    }
 
 
 def read_split(folder, split):
     """[(image path relative to the folder, Camera)] of transforms_<split>.json.
 
-    near and far are NaN where they are not given. Raises UserError naming the file and the key of what is wrong.
+    near and far are NaN where they are not given. Raises UserError naming the file and the key of
+    what is wrong.
     """
     file = folder / f"transforms_{split}.json"
     if not file.is_file():
-        present = ", ".join(sorted(f.stem.removeprefix("transforms_") for f in folder.glob("transforms_*.json")))
+        present = ", ".join(
+            sorted(f.stem.removeprefix("transforms_") for f in folder.glob("transforms_*.json"))
+        )
         raise UserError(f"{file}: no such file; the splits of this scene are {present}")
     data = _read_json(file)
     frames = data.get("frames")
     if not isinstance(frames, list) or not frames:
         raise UserError(f"{file}: frames: must be a list of one frame or more")
-    return [_read_frame(folder, _Frame(file, data, frame, index)) for index, frame in enumerate(frames)]
+    return [
+        _read_frame(folder, _Frame(file, data, frame, index)) for index, frame in enumerate(frames)
+    ]
 
 
 def _read_json(file):
     try:
         data = json.loads(file.read_text(encoding="utf-8-sig"))
     except json.JSONDecodeError as error:
-        raise UserError(f"{file}: line {error.lineno}, column {error.colno}: {error.msg}; correct the JSON there") from None
+        raise UserError(
+            f"{file}: line {error.lineno}, column {error.colno}: {error.msg}; correct the JSON"
+            " there"
+        ) from None
     except (OSError, ValueError, RecursionError) as error:
         raise UserError(f"{file}: cannot be read as JSON ({error}); copy it anew") from error
     if not isinstance(data, dict):
@@ -101,7 +126,9 @@ class _Frame:
             return None
         is_number = isinstance(value, (int, float)) and not isinstance(value, bool)
         if not is_number or not max(above, -MOST) < value < min(below, MOST):
-            bounds = f" above {above:g}" * (above > -math.inf) + f" and below {below:g}" * (below < math.inf)
+            bounds = f" above {above:g}" * (above > -math.inf) + f" and below {below:g}" * (
+                below < math.inf
+            )
             raise self.error(key, f"is {json.dumps(value)[:40]}; must be a finite number{bounds}")
         return float(value)
 
@@ -118,7 +145,9 @@ def _read_frame(folder, frame):
 
 
 def _image_name(folder, frame):
-    """Path of the frame's image relative to the folder, which it may not leave, not even by a symbolic link."""
+    """Path of the frame's image relative to the folder, which it may not leave, not even by a
+    symbolic link.
+    """
     given = frame.get("file_path")
     if not isinstance(given, str) or not given:
         raise frame.error("file_path", "must be the path of an image")
@@ -126,37 +155,56 @@ def _image_name(folder, frame):
         root = folder.resolve()
         paths = [(root / candidate).resolve() for candidate in (given, given + ".png")]
         if not all(path.is_relative_to(root) for path in paths):
-            raise frame.error("file_path", f"{given!r} leaves the scene's folder; move the image into it")
+            raise frame.error(
+                "file_path", f"{given!r} leaves the scene's folder; move the image into it"
+            )
         found = [path for path in paths if path.is_file()]
-    except (OSError, RuntimeError, ValueError) as error:  # a loop of links, a name too long, a zero byte
+    # a loop of links, a name too long, a zero byte
+    except (OSError, RuntimeError, ValueError) as error:
         raise frame.error("file_path", f"{given[:80]!r} is not a usable path ({error})") from error
     if not found:
-        raise frame.error("file_path", f"no image at {given!r}, nor with .png added; copy it there or remove the frame")
+        raise frame.error(
+            "file_path",
+            f"no image at {given!r}, nor with .png added; copy it there or remove the frame",
+        )
     return found[0].relative_to(root).as_posix()
 
 
 def _size(folder, name, frame):
-    """(width, height) of the image; w and h must agree, since the other intrinsics are in the same pixels."""
+    """(width, height) of the image; w and h must agree, since the other intrinsics are in the same
+    pixels.
+    """
     size = image_size(folder / name)
     for key, actual in zip(("w", "h"), size, strict=True):
         stated = frame.number(key)
         if stated is not None and stated != actual:
-            raise frame.error(key, f"is {stated:g}, but {name} has {size[0]}x{size[1]} pixels; restore the image's size, "
-                                   "or scale fl_x, fl_y, cx, cy, w and h to it")
+            raise frame.error(
+                key,
+                f"is {stated:g}, but {name} has {size[0]}x{size[1]} pixels; restore the image's"
+                " size, or scale fl_x, fl_y, cx, cy, w and h to it",
+            )
     return size
 
 
 def _refuse_distortion(frame):
     for key in DISTORTION:
         if frame.number(key):
-            raise frame.error(key, "lens distortion is not modelled; undistort the images and leave the coefficient out")
+            raise frame.error(
+                key,
+                "lens distortion is not modelled; undistort the images and leave the"
+                " coefficient out",
+            )
     model = frame.get("camera_model")
     if model is not None and model not in PINHOLES:
-        raise frame.error("camera_model", f"{model!r} is not modelled; undistort the images to PINHOLE")
+        raise frame.error(
+            "camera_model", f"{model!r} is not modelled; undistort the images to PINHOLE"
+        )
 
 
 def _focal_lengths(frame, width, height):
-    """(fx, fy) in pixels from fl_x, fl_y or, where these are absent, the angles of view; fy is fx if not given."""
+    """(fx, fy) in pixels from fl_x, fl_y or, where these are absent, the angles of view; fy is fx
+    if not given.
+    """
     fx = _focal_length(frame, "fl_x", "camera_angle_x", width)
     if fx is None:
         raise frame.error("fl_x", "is missing, and so is camera_angle_x; add one of them")
@@ -165,7 +213,10 @@ def _focal_lengths(frame, width, height):
 
 
 def _focal_length(frame, length_key, angle_key, size):
-    length, angle = frame.number(length_key, above=0), frame.number(angle_key, above=0, below=math.pi)
+    length, angle = (
+        frame.number(length_key, above=0),
+        frame.number(angle_key, above=0, below=math.pi),
+    )
     if length is None and angle is not None:
         length = 0.5 * size / math.tan(0.5 * angle)
     return length
@@ -177,14 +228,18 @@ def _depth_range(frame):
     if near is None and far is None:
         return math.nan, math.nan
     if near is None or far is None:
-        raise frame.error("near" if near is None else "far", "is missing; give both near and far, or neither")
+        raise frame.error(
+            "near" if near is None else "far", "is missing; give both near and far, or neither"
+        )
     if far <= near:
         raise frame.error("far", f"is {far:g}; must be above near, {near:g}")
     return near, far
 
 
 def _pose(frame):
-    """(3, 4) camera-to-world, OpenCV axes, of transform_matrix, which has OpenGL's; the rotation is made orthonormal."""
+    """(3, 4) camera-to-world, OpenCV axes, of transform_matrix, which has OpenGL's; the rotation is
+    made orthonormal.
+    """
     key = "transform_matrix"
     try:
         matrix = np.array(frame.get(key), np.float64)
@@ -198,6 +253,9 @@ def _pose(frame):
         raise frame.error(key, f"its last row is {matrix[3].tolist()}; must be [0, 0, 0, 1]")
     u, scale, vt = np.linalg.svd(matrix[:3, :3])
     if np.abs(scale**2 - 1).max() > ROTATION_TOLERANCE or np.linalg.det(u @ vt) < 0:
-        raise frame.error(key, f"its 3x3 part is no rotation (scales {scale.round(4).tolist()}, "
-                               f"determinant {np.linalg.det(matrix[:3, :3]):.4f}); remove scale, shear and mirroring")
+        raise frame.error(
+            key,
+            f"its 3x3 part is no rotation (scales {scale.round(4).tolist()}, "
+            f"determinant {np.linalg.det(matrix[:3, :3]):.4f}); remove scale, shear and mirroring",
+        )
     return np.hstack([u @ vt @ CV_FROM_GL, matrix[:3, 3:]])

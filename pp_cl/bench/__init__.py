@@ -1,0 +1,1 @@
+"""Timing of kernels, layers, the network and the rasteriser, with their errors."""

@@ -1,0 +1,1 @@
+"""OpenCL: choosing a device, launching kernels, allocating buffers."""

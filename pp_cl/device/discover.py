@@ -1,0 +1,115 @@
+"""OpenCL devices: listing those that work, choosing one."""
+
+import atexit
+import os
+import shutil
+import sys
+import tempfile
+
+import numpy as np
+import pyopencl as cl
+import pyopencl.array as cl_array
+
+from pp_cl.device.device import Device
+from pp_cl.errors import UserError
+
+MEND = (
+    "install one with `apt install pocl-opencl-icd` (Debian, Ubuntu), `conda install pocl` or your"
+    " GPU vendor's driver; without root, `make setup` in a checkout puts Intel's CPU runtime into"
+    " .venv"
+)
+
+
+TEMPORARY_CACHE = "pp-cl-cache-"
+
+
+# A device is accepted only after this ran on it: PyPI's PoCL 3.0 is listed on current CPUs and
+# fails every build.
+PROBE = "kernel void probe(global float *x) { x[get_global_id(0)] *= 2.0f; }"
+
+
+def list_devices():
+    """[(index "platform:device", cl.Device, problem or None)] of all OpenCL devices; each is probed
+    with a test build.
+    """
+    _give_cache()
+    try:
+        platforms = cl.get_platforms()
+    except cl.Error:
+        return []
+    found = []
+    for p, platform in enumerate(platforms):
+        try:
+            devices = platform.get_devices()
+        except cl.Error:
+            continue  # a platform without devices says so with an error
+        found += [(f"{p}:{d}", device, _probe(device)) for d, device in enumerate(devices)]
+    return found
+
+
+def _probe(device):
+    try:
+        context = cl.Context([device])
+        queue = cl.CommandQueue(context)
+        x = cl_array.to_device(queue, np.arange(4, dtype=np.float32))
+        cl.Program(context, PROBE).build().probe(queue, (4,), None, x.data)
+        return None if np.array_equal(x.get(), [0, 2, 4, 6]) else "computes a wrong result"
+    except cl.Error as error:
+        return "does not run: " + " ".join(str(error).split())[:160]
+
+
+def _give_cache():
+    """Drivers and pyopencl fail where the user's cache cannot be written (containers, service
+    accounts): a temporary one.
+    """
+    folder = os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache")
+    try:
+        os.makedirs(folder, exist_ok=True)
+        with tempfile.TemporaryFile(dir=folder) as probe:
+            probe.write(bytes(2**20))  # a full disk is noticed as well
+    except OSError as error:
+        temporary = os.environ["XDG_CACHE_HOME"] = tempfile.mkdtemp(prefix=TEMPORARY_CACHE)
+        atexit.register(shutil.rmtree, temporary, ignore_errors=True)
+        print(
+            f"{folder}: {error.strerror}; kernels are built anew: set XDG_CACHE_HOME to keep them",
+            file=sys.stderr,
+        )
+
+
+def open_device(choice=None):
+    """Device chosen by `choice`, else PP_DEVICE, else the first GPU that works, else the first
+    other device that works.
+
+    choice: "platform:device" as printed by `pp-cl devices`, or a part of the platform's or device's
+    name; a platform's comes first, as PoCL's devices carry the name of the processor ("intel" means
+    Intel's driver wherever there is one). Raises UserError when nothing matches or nothing works;
+    never takes another device than the one asked for.
+    """
+    choice = choice or os.environ.get("PP_DEVICE")
+    found = list_devices()
+    wanted = sorted((f for f in found if _rank(f, choice)[0] < 3), key=lambda f: _rank(f, choice))
+    for _, device, problem in wanted:
+        if problem is None:
+            return Device(device)
+    listed = "; ".join(
+        f"{i} {d.name.strip()} ({d.platform.name.strip()}) {problem or 'works'}"
+        for i, d, problem in found
+    )
+    if choice and not wanted and found:
+        raise UserError(f"device {choice!r}: no such OpenCL device; found {listed}")
+    asked = f"device {choice!r}: " if choice else ""
+    raise UserError(f"{asked}no working OpenCL device (found {listed or 'none'}): {MEND}")
+
+
+def _rank(found, choice):
+    """Sort key of one list_devices() entry: (0-2 how it matches `choice`, 3 not at all; GPUs
+    first).
+    """
+    index, device, _ = found
+    if not choice or choice == index:
+        match = 0
+    elif choice.lower() in device.platform.name.lower():
+        match = 1
+    else:
+        match = 2 if choice.lower() in device.name.lower() else 3
+    return match, not device.type & cl.device_type.GPU

@@ -1,0 +1,1 @@
+"""Files of a run and images, written atomically, read without trust."""

@@ -1,0 +1,64 @@
+"""Files written to a temporary name, synced, renamed: all of one or nothing."""
+
+import errno
+import json
+import os
+from contextlib import contextmanager
+from pathlib import Path
+
+from pp_cl.errors import UserError
+
+
+@contextmanager
+def atomic_file(path):
+    """A binary file object whose content appears under `path` only when the block ends well.
+
+    Raises UserError naming the file when the disk is full or may not be written; nothing
+    half-written stays behind.
+    """
+    path = Path(path)
+    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+    try:
+        with open(temporary, "wb") as file:
+            yield file
+            file.flush()
+            os.fsync(file.fileno())
+        os.replace(temporary, path)
+        _sync_folder(path.parent)
+    except OSError as error:
+        mend = (
+            "free some space"
+            if error.errno in (errno.ENOSPC, errno.EDQUOT)
+            else "check the folder and its permissions"
+        )
+        raise UserError(f"{path}: cannot be written ({error.strerror}); {mend}") from error
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+def _sync_folder(folder):
+    """Make a rename in the folder survive a power cut, where the system knows how."""
+    if not hasattr(os, "O_DIRECTORY"):
+        return
+    descriptor = os.open(folder, os.O_DIRECTORY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
+
+
+def write_text(path, text):
+    """Write a text file atomically."""
+    with atomic_file(path) as file:
+        file.write(text.encode())
+
+
+def write_json(path, value):
+    """Write JSON atomically; NaN and Inf are refused with ValueError."""
+    write_text(path, json.dumps(value, indent=1, allow_nan=False) + "\n")
+
+
+def remove_leftovers(folder):
+    """Delete temporary files that a killed process left in the folder."""
+    for leftover in Path(folder).glob(".*.tmp"):
+        leftover.unlink(missing_ok=True)

@@ -1,0 +1,1 @@
+"""Convolutions and resampling: the network's operations, in variants."""

@@ -1,0 +1,1 @@
+"""From points to blended features, and back to gradients."""

@@ -1,0 +1,1 @@
+"""Float64 twins that benches measure errors against."""

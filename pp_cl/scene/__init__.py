@@ -1,0 +1,1 @@
+"""Photographs, cameras, the visual hull."""

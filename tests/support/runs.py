@@ -1,0 +1,39 @@
+"""Trainings started, interrupted and resumed as a user does."""
+
+from pp_cl.cli import main
+from pp_cl.train import Trainer
+
+# Every mechanism of the loop is due several times within 60 steps.
+SETTINGS = {
+    "train.iterations": 60,
+    "points.count": 1500,
+    "network.widths": "16,16,16",
+    "train.crop": 24,
+    "train.prune_every": 10,
+    "train.checkpoint_every": 10,
+    "train.log_every": 5,
+    "train.previews": 2,
+    "train.final_weight": 0.5,
+}
+
+
+def arguments(scene, out, **changes):
+    """Command line of a small training."""
+    settings = SETTINGS | {k.replace("__", "."): v for k, v in changes.items()}
+    sets = [word for key, value in settings.items() for word in ("--set", f"{key}={value}")]
+    return ["train", scene, "--out", str(out), "--downscale", "2", *sets]
+
+
+def train_and_interrupt(scene, out, steps, monkeypatch, **changes):
+    """A small training that ends with Ctrl-C after `steps` steps."""
+    train_step, done = Trainer.train_step, []
+
+    def stopping(self):
+        if len(done) == steps:
+            raise KeyboardInterrupt
+        done.append(0)
+        return train_step(self)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Trainer, "train_step", stopping)
+        assert main(arguments(scene, out, **changes)) == 130
