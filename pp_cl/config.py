@@ -22,14 +22,22 @@ class PointsConfig:
     """The cloud of points."""
 
     count: int = 250_000  # wanted points on the grid inside the visual hull
-    sh_degree: int = 2  # of the spherical harmonics that shade a point: 0 (the same from all sides), 1 or 2
+    sh_degree: int = (
+        2  # of the spherical harmonics that shade a point: 0 (the same from all sides), 1 or 2
+    )
     footprint: str = "soft"  # soft: d = 1 - rho/R; disc: the paper's hard disc; sphere: Pulsar's rules for any radius
-    radius: float = 0.75  # soft: in point spacings; disc and sphere: world units at a depth range of 4
+    radius: float = (
+        0.75  # soft: in point spacings; disc and sphere: world units at a depth range of 4
+    )
     gamma: tuple = (0.1, 0.01)  # depth sharpness of the blend, first and last step
     max_tracked: int = 0  # nearest hits of a pixel that get gradients, 0 = all (paper: 64)
-    stop: float = 0.0  # stop a pixel where a hit could change it by less than this, 0 = never (paper: 0.001)
+    stop: float = (
+        0.0  # stop a pixel where a hit could change it by less than this, 0 = never (paper: 0.001)
+    )
     tau: float = 0.0  # drop a pixel's hits, from the back on, up to this sum of weights, 0 = none
-    mean_gradient: bool = False  # divide a point's gradients by its number of pixels, as Pulsar does
+    mean_gradient: bool = (
+        False  # divide a point's gradients by its number of pixels, as Pulsar does
+    )
 
 
 @dataclass
@@ -38,7 +46,9 @@ class NetworkConfig:
 
     widths: tuple = (32, 64, 128)  # channels of its three levels
     rate: tuple = (1e-3, 1e-4)  # Adam's rate, first and last step
-    tolerance: float = 1e-5  # relative L2 error that the fastest way to compute a convolution may have
+    tolerance: float = (
+        1e-5  # relative L2 error that the fastest way to compute a convolution may have
+    )
 
 
 @dataclass
@@ -50,7 +60,11 @@ class TrainConfig:
     crop: int = 128  # side of the square trained on in a step, 0 = whole images
     phases: bool = True  # draw the sub-pixel phase of the downscaled image anew in each step
     ssim_weight: float = 0.2  # loss = L1 + ssim_weight * (1 - SSIM)
-    sh_rate: tuple = (0.5, 0.25, 0.125)  # Adam's first rate of SH degrees 0, 1, 2; one of rate 0 stays 0 and is not updated
+    sh_rate: tuple = (
+        0.5,
+        0.25,
+        0.125,
+    )  # Adam's first rate of SH degrees 0, 1, 2; one of rate 0 stays 0 and is not updated
     sh_rate_decay: float = 0.1  # last over first rate
     sh_delay: tuple = (0.0, 0.01, 0.02)  # warm-up of each degree, as a share of the iterations
     feature_eps: float = 0.0197  # Adam's eps of SH, times the number of values the loss averages
@@ -58,12 +72,16 @@ class TrainConfig:
     lazy: bool = False  # update only the points that received a gradient; false: momentum moves the others too
     half_moments: bool = False  # keep Adam's moments of the SH coefficients in 16 bits
     dropout: float = 0.15  # share of the points left out at random in a step
-    smooth: float = 0.03  # pull towards the mean of the grid neighbours, in units of the SH rate, 0 = off
+    smooth: float = (
+        0.03  # pull towards the mean of the grid neighbours, in units of the SH rate, 0 = off
+    )
     smooth_every: int = 4  # steps between two such pulls
     prune_weight: float = 1e-3  # drop points whose mean blend weight a step is lower, 0 = off
     prune_opacity: float = 0.01  # drop points less opaque than this
     prune_every: int = 250  # steps between two prunings
-    final_weight: float = 1.0  # at the end drop points whose summed weight over the training views is lower
+    final_weight: float = (
+        1.0  # at the end drop points whose summed weight over the training views is lower
+    )
     average: bool = True  # keep averaged (EMA) weights over the last 30 % and deliver these
     checkpoint_every: int = 1000  # steps
     memory: float = 0.0  # GiB of device memory to take; what is not needed keeps the hits of views that stay, 0 = none kept
@@ -142,7 +160,13 @@ def assign(config, key, value, origin):
 def _convert(value, example, where):
     """The value, or its text, as the type of the example. Raises UserError."""
     if isinstance(example, tuple):
-        items = value.split(",") if isinstance(value, str) else list(value) if isinstance(value, (list, tuple)) else [value]
+        items = (
+            value.split(",")
+            if isinstance(value, str)
+            else list(value)
+            if isinstance(value, (list, tuple))
+            else [value]
+        )
         if len(items) != len(example):
             raise UserError(
                 f"{where}: {value!r} is not {len(example)} values separated by commas, like {','.join(map(str, example))}"
@@ -174,7 +198,10 @@ KINDS = {
     int: ("a whole number", _whole),
     float: ("a finite number", _finite),
     str: ("a word", str),
-    bool: ("true or false", lambda value: {"true": True, "1": True, "false": False, "0": False}[str(value).lower()]),
+    bool: (
+        "true or false",
+        lambda value: {"true": True, "1": True, "false": False, "0": False}[str(value).lower()],
+    ),
 }
 
 # section.key: (least, largest) allowed
@@ -215,13 +242,21 @@ def validate(config, origin):
         if not least <= value <= largest:
             raise UserError(f"{origin}: {key} = {value}; it must lie in [{least}, {largest}]")
     if config.points.footprint not in ("soft", "disc", "sphere"):
-        raise UserError(f"{origin}: points.footprint = {config.points.footprint!r}; choose soft, disc or sphere")
+        raise UserError(
+            f"{origin}: points.footprint = {config.points.footprint!r}; choose soft, disc or sphere"
+        )
     if config.train.crop % 4:
-        raise UserError(f"{origin}: train.crop = {config.train.crop}; it must be a multiple of 4 (0 = whole images)")
+        raise UserError(
+            f"{origin}: train.crop = {config.train.crop}; it must be a multiple of 4 (0 = whole images)"
+        )
     if not all(1e-5 <= g <= 1 for g in config.points.gamma):
-        raise UserError(f"{origin}: points.gamma = {config.points.gamma}; both must lie in [1e-5, 1]")
+        raise UserError(
+            f"{origin}: points.gamma = {config.points.gamma}; both must lie in [1e-5, 1]"
+        )
     if not all(1 <= w <= 4096 for w in config.network.widths):
-        raise UserError(f"{origin}: network.widths = {config.network.widths}; each must lie in [1, 4096]")
+        raise UserError(
+            f"{origin}: network.widths = {config.network.widths}; each must lie in [1, 4096]"
+        )
     rates = config.network.rate + config.train.opacity_rate
     if not all(0 < r <= 100 for r in rates) or not all(0 <= r <= 100 for r in config.train.sh_rate):
         raise UserError(f"{origin}: rates must lie in (0, 100], sh_rate in [0, 100]")
@@ -253,7 +288,12 @@ def load_config(path):
 def help_lines():
     """Lines `section.key = default  # comment` of all settings, read from this file: the text of `--help`."""
     lines, section = [], None
-    names = {"SceneConfig": "scene", "PointsConfig": "points", "NetworkConfig": "network", "TrainConfig": "train"}
+    names = {
+        "SceneConfig": "scene",
+        "PointsConfig": "points",
+        "NetworkConfig": "network",
+        "TrainConfig": "train",
+    }
     for line in Path(__file__).read_text().splitlines():
         if line.startswith("class "):
             section = names.get(line[6:].rstrip(":"))

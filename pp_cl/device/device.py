@@ -9,6 +9,7 @@ import time
 import warnings
 import weakref
 from collections import defaultdict
+from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
@@ -110,6 +111,7 @@ class Device:
         self.bytes = self.peak_bytes = 0
         self._programs = {}
         self._seconds = defaultdict(list)
+        self._stage_seconds = defaultdict(list) if self.debug else None
         if self.debug:
             atexit.register(self.print_profile)
 
@@ -229,6 +231,30 @@ class Device:
                 f" {SMALLER}, or choose another device (`pp-cl devices`)"
             ) from error
 
+    @contextmanager
+    def stage(self, name: str):
+        """Times the part of a pass called `name` under PP_DEBUG >= 1 and timed_stages().
+
+        When timed, the queue is drained before and after, so that stages do not overlap.
+        """
+        if self._stage_seconds is None:
+            yield
+            return
+        self.finish()
+        start = time.perf_counter()
+        yield
+        self.finish()
+        self._stage_seconds[name].append(time.perf_counter() - start)
+
+    @contextmanager
+    def timed_stages(self):
+        """Yields {stage name: [seconds of each pass]}, filled by the stages inside the block."""
+        before, self._stage_seconds = self._stage_seconds, defaultdict(list)
+        try:
+            yield self._stage_seconds
+        finally:
+            self._stage_seconds = before
+
     def _allocate(self, shape, dtype):
         dtype = np.dtype(dtype)
         nbytes = int(np.prod(shape, dtype=np.int64)) * dtype.itemsize
@@ -272,10 +298,11 @@ class Device:
         return dict(self._seconds)
 
     def print_profile(self):
-        """A table on stderr, longest first: launches, median and total time; by file at PP_DEBUG 1,
-        else by kernel.
+        """A table on stderr, longest first: passes, median and total time of stages and, at
+        PP_DEBUG 1, of kernel files, else of kernels.
         """
         rows = defaultdict(list)
+        rows |= {f"stage {name}": seconds for name, seconds in self._stage_seconds.items()}
         for label, seconds in self._seconds.items():
             rows[label if self.debug >= 2 else label.partition(":")[0]] += seconds
         for label, seconds in sorted(rows.items(), key=lambda r: -sum(r[1])):

@@ -5,6 +5,7 @@ import json
 import os
 import subprocess
 import sys
+import time
 from types import SimpleNamespace
 
 import numpy as np
@@ -413,3 +414,21 @@ def test_a_cache_folder_that_cannot_be_written_is_replaced(session_device, tmp_p
     assert ran.returncode == 0, ran.stderr
     assert "set XDG_CACHE_HOME to keep them" in ran.stderr
     assert not os.path.exists(ran.stdout.strip())  # gone with the process
+
+
+# ---- stages
+
+
+def test_stages_are_timed_only_when_asked_for(session_device):
+    device = GuardedDevice(session_device.device)
+    with device.stage("before"):
+        pass
+    with device.timed_stages() as seconds:
+        for _ in range(2):
+            with device.stage("blend"):
+                time.sleep(0.01)
+    with device.stage("after"):
+        pass
+    assert list(seconds) == ["blend"]
+    assert len(seconds["blend"]) == 2
+    assert min(seconds["blend"]) >= 0.01
