@@ -91,7 +91,7 @@ def _parser():
     train.add_argument(
         "--memory",
         metavar="GIB",
-        help="device memory to take; what is left saves time where views stay",
+        help="device memory to use; what is not needed caches the hits of repeating views",
     )
     _tolerance_option(train)
     train.add_argument(
@@ -255,7 +255,7 @@ def _given_settings(options):
         ("points", "points.count"),
         ("downscale", "scene.downscale"),
         ("seed", "train.seed"),
-        ("memory", "train.memory"),
+        ("memory", "train.memory_gib"),
         ("tolerance", "network.tolerance"),
     ):
         value = getattr(options, option)
@@ -290,6 +290,8 @@ def _resolve_config(options):
     for key, value, origin in given:
         assign(config, key, value, origin)
     validate(config, "settings")
+    for note in config.notes:
+        print(f"pp-cl: {note}", file=sys.stderr)
     if stored and config != stored:
         raise UserError(
             f"{stored_file}: {_first_difference(config, stored)}; use another --out, or the"
@@ -300,7 +302,7 @@ def _resolve_config(options):
 
 def _first_difference(asked, stored):
     """`section.key is A there, B asked for` of the first setting that differs."""
-    for section in ("scene", "points", "network", "train"):
+    for section in ("scene", "points", "raster", "network", "train"):
         for name, value in vars(getattr(stored, section)).items():
             other = getattr(getattr(asked, section), name)
             if other != value:

@@ -1,42 +1,87 @@
-"""Settings: one dataclass a concern, their comments are the help text, their JSON is written beside the result."""
+"""Settings: one dataclass a section, one line a setting; their JSON lies beside the result."""
 
 import dataclasses
 import json
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 from pp_cl.errors import UserError
 
 
+def setting(
+    default: Any,
+    help: str,
+    least: float | None = None,
+    most: float | None = None,
+    choices: tuple[str, ...] = (),
+) -> Any:
+    """A dataclass field with its line of --help and the values allowed: [least, most], for a tuple
+    of each element, or one of `choices`.
+    """
+    metadata = {"help": help, "least": least, "most": most, "choices": choices}
+    return field(default=default, metadata=metadata)
+
+
 @dataclass
 class SceneConfig:
-    """What is learned from."""
+    """The photographs."""
 
-    path: str = ""  # folder of the scene, or the word demo
-    downscale: int = 1  # train and evaluate on images this many times smaller
+    path: str = setting("", "folder of the scene, or the word demo")
+    downscale: int = setting(1, "reduce the images this many times to train and evaluate", 1, 64)
 
 
 @dataclass
 class PointsConfig:
-    """The cloud of points."""
+    """The point cloud."""
 
-    count: int = 250_000  # wanted points on the grid inside the visual hull
-    sh_degree: int = (
-        2  # of the spherical harmonics that shade a point: 0 (the same from all sides), 1 or 2
+    count: int = setting(250_000, "number of grid points aimed at in the visual hull", 1, 2**27)
+    sh_degree: int = setting(
+        2, "degree of the spherical harmonics (SH): 0 (the same from all sides), 1 or 2", 0, 2
     )
-    footprint: str = "soft"  # soft: d = 1 - rho/R; disc: the paper's hard disc; sphere: Pulsar's rules for any radius
-    radius: float = (
-        0.75  # soft: in point spacings; disc and sphere: world units at a depth range of 4
+
+
+@dataclass
+class RasterConfig:
+    """From points to a feature image."""
+
+    footprint: str = setting(
+        "soft",
+        "soft: d = 1 - rho/R; disc: the paper's hard disc; sphere: Pulsar's rules for any radius",
+        choices=("soft", "disc", "sphere"),
     )
-    gamma: tuple = (0.1, 0.01)  # depth sharpness of the blend, first and last step
-    max_tracked: int = 0  # nearest hits of a pixel that get gradients, 0 = all (paper: 64)
-    stop: float = (
-        0.0  # stop a pixel where a hit could change it by less than this, 0 = never (paper: 0.001)
+    radius: float = setting(
+        0.75,
+        "soft: in point spacings; disc, sphere: in world units at a depth range of 4",
+        1e-6,
+        100,
     )
-    tau: float = 0.0  # drop a pixel's hits, from the back on, up to this sum of weights, 0 = none
-    mean_gradient: bool = (
-        False  # divide a point's gradients by its number of pixels, as Pulsar does
+    gamma: tuple = setting(
+        (0.1, 0.01), "depth sharpness of the blend at the first and the last step", 1e-5, 1
+    )
+    max_tracked: int = setting(
+        0,
+        "number of a pixel's nearest hits that receive gradients (0: all; paper: 64)",
+        0,
+        2**31 - 1,
+    )
+    early_stop: float = setting(
+        0.0,
+        "early termination: stop blending a pixel once no further hit can contribute more than"
+        " this share (0: never; paper: 0.001)",
+        0,
+        0.5,
+    )
+    tau: float = setting(
+        0.0,
+        "drop hits of a pixel whose blend weights sum to at most this (0: none)",
+        0,
+        0.5,
+    )
+    mean_gradient: bool = setting(
+        False, "divide a point's gradients by the number of its pixels, as Pulsar does"
     )
 
 
@@ -44,98 +89,163 @@ class PointsConfig:
 class NetworkConfig:
     """The U-Net that turns features into colours."""
 
-    widths: tuple = (32, 64, 128)  # channels of its three levels
-    rate: tuple = (1e-3, 1e-4)  # Adam's rate, first and last step
-    tolerance: float = (
-        1e-5  # relative L2 error that the fastest way to compute a convolution may have
+    widths: tuple = setting((32, 64, 128), "channels of its three levels", 1, 4096)
+    rate: tuple = setting(
+        (1e-3, 1e-4), "Adam's learning rate at the first and the last step", 1e-12, 100
+    )
+    tolerance: float = setting(
+        1e-5, "relative L2 error allowed for a convolution; the fastest variant is taken", 0, 1
     )
 
 
 @dataclass
 class TrainConfig:
-    """The course of the optimisation."""
+    """The optimisation."""
 
-    iterations: int = 8_000  # steps; every schedule ends here
-    seed: int = 0  # of everything random
-    crop: int = 128  # side of the square trained on in a step, 0 = whole images
-    phases: bool = True  # draw the sub-pixel phase of the downscaled image anew in each step
-    ssim_weight: float = 0.2  # loss = L1 + ssim_weight * (1 - SSIM)
-    sh_rate: tuple = (
-        0.5,
+    iterations: int = setting(8_000, "training steps; every schedule ends at the last", 1, 10**8)
+    seed: int = setting(0, "seed of all random choices", 0, 2**32 - 1)
+    crop: int = setting(
+        128, "side in pixels of the square crop that a step trains on (0: whole images)", 0, 2**14
+    )
+    pixel_jitter: bool = setting(
+        True, "shift the pixel grid of the downscaled image by a random sub-pixel offset each step"
+    )
+    ssim_weight: float = setting(0.2, "loss = L1 + ssim_weight * (1 - SSIM)", 0, 10)
+    sh_rate: tuple = setting(
+        (0.5, 0.25, 0.125),
+        "Adam's first learning rate of SH degrees 0, 1, 2; at rate 0 a degree stays 0",
+        0,
+        100,
+    )
+    sh_rate_decay: float = setting(0.1, "last over first learning rate of the SH", 1e-6, 1)
+    sh_delay: tuple = setting(
+        (0.0, 0.01, 0.02), "warm-up of SH degrees 0, 1, 2, as a share of the iterations", 0, 1
+    )
+    sh_eps: float = setting(
+        0.0197,
+        "Adam's eps for the SH coefficients, multiplied by 3*H*W of the training image, so that"
+        " it does not depend on the crop size",
+        1e-30,
+        1e3,
+    )
+    opacity_rate: tuple = setting(
+        (3e-2, 3e-3), "Adam's learning rate at the first and the last step", 1e-12, 100
+    )
+    lazy_adam: bool = setting(
+        False, "update only points that received a gradient; false: momentum moves the others too"
+    )
+    moments_16bit: bool = setting(False, "store Adam's moments of the SH coefficients in 16 bits")
+    dropout: float = setting(0.15, "share of the points left out at random in each step", 0, 0.95)
+    sh_smoothing: float = setting(
+        0.03,
+        "per step, pull the SH towards the mean of the grid neighbours by this times the SH"
+        " learning rate (0: off)",
+        0,
         0.25,
-        0.125,
-    )  # Adam's first rate of SH degrees 0, 1, 2; one of rate 0 stays 0 and is not updated
-    sh_rate_decay: float = 0.1  # last over first rate
-    sh_delay: tuple = (0.0, 0.01, 0.02)  # warm-up of each degree, as a share of the iterations
-    feature_eps: float = 0.0197  # Adam's eps of SH, times the number of values the loss averages
-    opacity_rate: tuple = (3e-2, 3e-3)  # Adam's rate, first and last step
-    lazy: bool = False  # update only the points that received a gradient; false: momentum moves the others too
-    half_moments: bool = False  # keep Adam's moments of the SH coefficients in 16 bits
-    dropout: float = 0.15  # share of the points left out at random in a step
-    smooth: float = (
-        0.03  # pull towards the mean of the grid neighbours, in units of the SH rate, 0 = off
     )
-    smooth_every: int = 4  # steps between two such pulls
-    prune_weight: float = 1e-3  # drop points whose mean blend weight a step is lower, 0 = off
-    prune_opacity: float = 0.01  # drop points less opaque than this
-    prune_every: int = 250  # steps between two prunings
-    final_weight: float = (
-        1.0  # at the end drop points whose summed weight over the training views is lower
+    sh_smoothing_every: int = setting(4, "steps between two smoothings", 1, 10**8)
+    prune_weight: float = setting(
+        1e-3, "prune points whose mean blend weight per step is below this (0: off)", 0, 1e6
     )
-    average: bool = True  # keep averaged (EMA) weights over the last 30 % and deliver these
-    checkpoint_every: int = 1000  # steps
-    memory: float = 0.0  # GiB of device memory to take; what is not needed keeps the hits of views that stay, 0 = none kept
-    log_every: int = 50  # steps
-    previews: int = 4  # pictures over the whole run
+    prune_opacity: float = setting(0.01, "prune points with an opacity below this", 0, 1)
+    prune_every: int = setting(250, "steps between two prunings", 1, 10**8)
+    final_prune_weight: float = setting(
+        1.0,
+        "after the last step, prune points whose blend weights over all training views sum to"
+        " less than this (0: off)",
+        0,
+        1e9,
+    )
+    ema: bool = setting(
+        True, "average the parameters (EMA) over the last 30 % of the steps and keep the averages"
+    )
+    checkpoint_every: int = setting(1000, "steps between two checkpoints", 1, 10**8)
+    memory_gib: float = setting(
+        0.0,
+        "device memory that training may use, in GiB; what it does not need caches the hits of"
+        " repeating views (0: no cache)",
+        0,
+        2**20,
+    )
+    log_every: int = setting(50, "steps between two rows of log.jsonl", 1, 10**8)
+    previews: int = setting(4, "preview images written in the course of the run", 0, 1000)
 
-    def crop_size(self, width, height):
-        """(width, height) of what a step trains on, of a picture of width x height."""
+    def crop_size(self, width: int, height: int) -> tuple[int, int]:
+        """(width, height) in pixels that a step trains on, of an image of width x height."""
         return (min(self.crop, width), min(self.crop, height)) if self.crop else (width, height)
 
 
 @dataclass
 class Config:
-    """All settings of a run."""
+    """All settings of a run. notes: what the user should be told about how they were read."""
 
     preset: str = "tiny"
     scene: SceneConfig = field(default_factory=SceneConfig)
     points: PointsConfig = field(default_factory=PointsConfig)
+    raster: RasterConfig = field(default_factory=RasterConfig)
     network: NetworkConfig = field(default_factory=NetworkConfig)
     train: TrainConfig = field(default_factory=TrainConfig)
+    notes: list[str] = field(default_factory=list, compare=False)
 
-    def to_json(self):
-        """The settings as JSON text."""
-        return json.dumps(dataclasses.asdict(self), indent=1)
+    def to_json(self) -> str:
+        """The settings as JSON text: {"preset": name, section: {name: value}}."""
+        stored = dataclasses.asdict(self)
+        del stored["notes"]
+        return json.dumps(stored, indent=1)
 
 
 # What differs from the defaults above, which are the tiny preset: minutes on a CPU.
 PRESETS = {
     "tiny": {},
-    # for 400 x 400; 8000 steps take a quarter of an hour on a CPU, the whole schedule has not been timed
+    # for 400 x 400; 8000 steps take a quarter of an hour on a CPU, all 20,000 were not timed
     "small": {"points.count": 1_000_000, "train.iterations": 20_000, "train.crop": 192},
-    # the supplemental's own numbers; what it does not state is as above
     "paper": {
+        # Stated by the supplemental, as are the defaults of raster.gamma, train.sh_rate and its
+        # decay, and the delays of 0, 500 and 1000 steps.
         "points.count": 4_000_000,
-        "points.footprint": "disc",
-        "points.radius": 0.0015,
-        "points.max_tracked": 64,
-        "points.stop": 0.001,
+        "raster.footprint": "disc",
+        "raster.radius": 0.0015,
+        "raster.max_tracked": 64,
+        "raster.early_stop": 0.001,
         "network.widths": (128, 256, 512),
+        # Inferred from the same authors' next method, INPC: the supplemental gives no number.
         "network.rate": (3e-4, 5e-5),
         "train.iterations": 50_000,
         "train.crop": 0,
-        "train.phases": False,
+        # Ours: the supplemental mentions no jitter, dropout, smoothing or averaging, and no rule
+        # of pruning.
+        "train.pixel_jitter": False,
         "train.dropout": 0.0,
-        "train.smooth": 0.0,
-        "train.average": False,
+        "train.sh_smoothing": 0.0,
+        "train.ema": False,
         "train.prune_weight": 1e-4,
         "train.prune_every": 500,
         "train.checkpoint_every": 5000,
     },
 }
 
+# Old key: new key. Old keys are accepted in this version and noted in Config.notes.
+RENAMED = {
+    "points.footprint": "raster.footprint",
+    "points.radius": "raster.radius",
+    "points.gamma": "raster.gamma",
+    "points.max_tracked": "raster.max_tracked",
+    "points.stop": "raster.early_stop",
+    "points.tau": "raster.tau",
+    "points.mean_gradient": "raster.mean_gradient",
+    "train.phases": "train.pixel_jitter",
+    "train.feature_eps": "train.sh_eps",
+    "train.lazy": "train.lazy_adam",
+    "train.half_moments": "train.moments_16bit",
+    "train.smooth": "train.sh_smoothing",
+    "train.smooth_every": "train.sh_smoothing_every",
+    "train.final_weight": "train.final_prune_weight",
+    "train.average": "train.ema",
+    "train.memory": "train.memory_gib",
+}
 
-def preset(name):
+
+def preset(name: str) -> Config:
     """Config of a preset. Raises UserError for an unknown name."""
     if name not in PRESETS:
         raise UserError(f"--preset {name}: unknown; choose from {', '.join(PRESETS)}")
@@ -145,31 +255,36 @@ def preset(name):
     return config
 
 
-def assign(config, key, value, origin):
-    """Set section.key from a value or its text. Raises UserError naming the origin and the key."""
-    section, _, name = key.partition(".")
-    owner = getattr(config, section, None)
-    if not dataclasses.is_dataclass(owner):
+def sections(config: Config) -> Iterator[tuple[str, Any]]:
+    """(name, dataclass) of each section, in their order."""
+    for name, value in vars(config).items():
+        if dataclasses.is_dataclass(value):
+            yield name, value
+
+
+def assign(config: Config, key: str, value: Any, origin: str) -> None:
+    """Set section.key from a value or its text; an old key sets the new one and leaves a note.
+    Raises UserError naming the origin and the key.
+    """
+    if key in RENAMED:
+        config.notes.append(f"{origin}: {key} is called {RENAMED[key]} now")
+    section, _, name = RENAMED.get(key, key).partition(".")
+    owner = dict(sections(config)).get(section)
+    if owner is None:
         raise UserError(f"{origin}: unknown key {key!r}; keys look like train.iterations")
-    known = {f.name for f in dataclasses.fields(owner)}
-    if name not in known:
-        raise UserError(f"{origin}: unknown key {key!r}; {section} has {', '.join(sorted(known))}")
+    if name not in vars(owner):
+        raise UserError(f"{origin}: unknown key {key!r}; {section} has {', '.join(vars(owner))}")
     setattr(owner, name, _convert(value, getattr(owner, name), f"{origin}: {key}"))
 
 
 def _convert(value, example, where):
     """The value, or its text, as the type of the example. Raises UserError."""
     if isinstance(example, tuple):
-        items = (
-            value.split(",")
-            if isinstance(value, str)
-            else list(value)
-            if isinstance(value, (list, tuple))
-            else [value]
-        )
-        if len(items) != len(example):
+        items = value.split(",") if isinstance(value, str) else value
+        if not isinstance(items, (list, tuple)) or len(items) != len(example):
             raise UserError(
-                f"{where}: {value!r} is not {len(example)} values separated by commas, like {','.join(map(str, example))}"
+                f"{where}: {value!r} is not {len(example)} values separated by commas, like"
+                f" {_text(example)}"
             )
         return tuple(_convert(v, e, where) for v, e in zip(items, example, strict=True))
     kind, convert = KINDS[type(example)]
@@ -193,79 +308,44 @@ def _finite(value):
     return number
 
 
-# type of a setting: (what it is called, conversion of a value or its text)
+def _truth(value):
+    return {"true": True, "1": True, "false": False, "0": False}[str(value).lower()]
+
+
+# type of a setting: (its name in errors, conversion of a value or its text)
 KINDS = {
     int: ("a whole number", _whole),
     float: ("a finite number", _finite),
     str: ("a word", str),
-    bool: (
-        "true or false",
-        lambda value: {"true": True, "1": True, "false": False, "0": False}[str(value).lower()],
-    ),
-}
-
-# section.key: (least, largest) allowed
-LIMITS = {
-    "scene.downscale": (1, 64),
-    "points.count": (1, 2**27),
-    "points.sh_degree": (0, 2),
-    "points.radius": (1e-6, 100),
-    "points.max_tracked": (0, 2**31 - 1),
-    "points.stop": (0, 0.5),
-    "points.tau": (0, 0.5),
-    "network.tolerance": (0, 1),
-    "train.iterations": (1, 10**8),
-    "train.seed": (0, 2**32 - 1),
-    "train.crop": (0, 2**14),
-    "train.ssim_weight": (0, 10),
-    "train.dropout": (0, 0.95),
-    "train.smooth": (0, 0.25),
-    "train.smooth_every": (1, 10**8),
-    "train.prune_weight": (0, 1e6),
-    "train.prune_opacity": (0, 1),
-    "train.prune_every": (1, 10**8),
-    "train.checkpoint_every": (1, 10**8),
-    "train.memory": (0, 2**20),
-    "train.log_every": (1, 10**8),
-    "train.previews": (0, 1000),
-    "train.sh_rate_decay": (1e-6, 1),
-    "train.feature_eps": (1e-30, 1e3),
-    "train.final_weight": (0, 1e9),
+    bool: ("true or false", _truth),
 }
 
 
-def validate(config, origin):
-    """Raise UserError naming the first key whose value makes no sense."""
-    for key, (least, largest) in LIMITS.items():
-        section, name = key.split(".")
-        value = getattr(getattr(config, section), name)
-        if not least <= value <= largest:
-            raise UserError(f"{origin}: {key} = {value}; it must lie in [{least}, {largest}]")
-    if config.points.footprint not in ("soft", "disc", "sphere"):
-        raise UserError(
-            f"{origin}: points.footprint = {config.points.footprint!r}; choose soft, disc or sphere"
-        )
+def validate(config: Config, origin: str) -> None:
+    """Raise UserError naming the origin and the first key whose value is not allowed."""
+    for section, values in sections(config):
+        for item in dataclasses.fields(values):
+            _check(getattr(values, item.name), f"{origin}: {section}.{item.name}", **item.metadata)
     if config.train.crop % 4:
         raise UserError(
-            f"{origin}: train.crop = {config.train.crop}; it must be a multiple of 4 (0 = whole images)"
+            f"{origin}: train.crop = {config.train.crop}; it must be a multiple of 4"
+            " (0: whole images)"
         )
-    if not all(1e-5 <= g <= 1 for g in config.points.gamma):
-        raise UserError(
-            f"{origin}: points.gamma = {config.points.gamma}; both must lie in [1e-5, 1]"
-        )
-    if not all(1 <= w <= 4096 for w in config.network.widths):
-        raise UserError(
-            f"{origin}: network.widths = {config.network.widths}; each must lie in [1, 4096]"
-        )
-    rates = config.network.rate + config.train.opacity_rate
-    if not all(0 < r <= 100 for r in rates) or not all(0 <= r <= 100 for r in config.train.sh_rate):
-        raise UserError(f"{origin}: rates must lie in (0, 100], sh_rate in [0, 100]")
-    if not all(0 <= d <= 1 for d in config.train.sh_delay):
-        raise UserError(f"{origin}: sh_delay must lie in [0, 1]")
 
 
-def load_config(path):
-    """Config of a config.json. Raises UserError naming the file and the key."""
+def _check(value, where, help, least, most, choices):
+    if choices and value not in choices:
+        raise UserError(f"{where} = {value!r}; choose from {', '.join(choices)}")
+    several = isinstance(value, tuple)
+    if least is not None and not all(least <= v <= most for v in (value if several else (value,))):
+        which = "each" if several else "it"
+        raise UserError(f"{where} = {_text(value)}; {which} must lie in [{least}, {most}]")
+
+
+def load_config(path: Path | str) -> Config:
+    """Config of a config.json; old keys leave one note in all. Raises UserError naming the file
+    and the key.
+    """
     path = Path(path)
     try:
         stored = json.loads(path.read_text())
@@ -273,32 +353,34 @@ def load_config(path):
         raise UserError(f"{path}: {error.strerror}; is this the folder of a run?") from None
     except ValueError as error:
         raise UserError(f"{path}: not JSON ({error}); restore it or start a new run") from None
-    if not isinstance(stored, dict) or not isinstance(stored.get("preset"), str):
-        raise UserError(f"{path}: key preset is missing; restore it or start a new run")
-    config = Config(preset=stored.pop("preset"))
+    if not isinstance(stored, dict) or stored.get("preset") not in tuple(PRESETS):
+        raise UserError(
+            f"{path}: key preset is missing or none of {', '.join(PRESETS)}; restore it or start a"
+            " new run"
+        )
+    config = preset(stored.pop("preset"))
     for section, values in stored.items():
         if not isinstance(values, dict):
             raise UserError(f"{path}: {section} is not an object")
         for name, value in values.items():
             assign(config, f"{section}.{name}", value, str(path))
+    if len(config.notes) > 1:
+        config.notes = [f"{config.notes[0]}, {len(config.notes) - 1} other keys were renamed too"]
     validate(config, str(path))
     return config
 
 
-def help_lines():
-    """Lines `section.key = default  # comment` of all settings, read from this file: the text of `--help`."""
-    lines, section = [], None
-    names = {
-        "SceneConfig": "scene",
-        "PointsConfig": "points",
-        "NetworkConfig": "network",
-        "TrainConfig": "train",
-    }
-    for line in Path(__file__).read_text().splitlines():
-        if line.startswith("class "):
-            section = names.get(line[6:].rstrip(":"))
-        elif section and line.startswith("    ") and ":" in line and "  # " in line:
-            code, _, comment = line.partition("  # ")
-            name, _, rest = code.strip().partition(":")
-            lines.append(f"  {section}.{name} = {rest.partition('=')[2].strip()}  ({comment})")
-    return lines
+def _text(value):
+    """A value as --set takes it."""
+    if isinstance(value, tuple):
+        return ",".join(map(_text, value))
+    return str(value).lower() if isinstance(value, bool) else str(value)
+
+
+def help_lines() -> list[str]:
+    """Lines `section.key = default  (help)` of all settings: the text of `--help`."""
+    return [
+        f"  {section}.{item.name} = {_text(item.default)}  ({item.metadata['help']})"
+        for section, values in sections(Config())
+        for item in dataclasses.fields(values)
+    ]

@@ -47,7 +47,7 @@ def evaluate_run(folder, metrics, split, save_images, device_choice, tolerance=N
     target_folder = folder / "eval"
     (target_folder / "images" if save_images else target_folder).mkdir(parents=True, exist_ok=True)
     remove_leftovers(target_folder)
-    gamma_now = gamma(header["step"], config.train.iterations, *config.points.gamma)
+    gamma_now = gamma(header["step"], config.train.iterations, *config.raster.gamma)
     shown = {len(views) * i // PICTURE_VIEWS for i in range(PICTURE_VIEWS)}
     rows, pictures, seconds, shares = [], [], [], []
     for i, (view, picture, truth, duration, dropped) in enumerate(
@@ -92,8 +92,8 @@ def _render_all(dev, config, model, views, gamma_now):
     float32 in [0, 1].
     """
     model.net.freeze()
-    exact = Renderer(dev, model, replace(config.points, tau=0.0)) if config.points.tau > 0 else None
-    renderer, target = Renderer(dev, model, config.points), Target(dev, config.scene.downscale)
+    exact = Renderer(dev, model, replace(config.raster, tau=0.0)) if config.raster.tau > 0 else None
+    renderer, target = Renderer(dev, model, config.raster), Target(dev, config.scene.downscale)
     # builds the programs
     renderer.picture(reduced_camera(views[0], config.scene.downscale), gamma_now)
     for view in views:
@@ -151,7 +151,7 @@ def _print_table(result, folder):
     }
     if any(errors.values()):
         print(
-            "points.tau: dropped at most {:.1e} of a pixel; features off by {:.1e} of their range,"
+            "raster.tau: dropped at most {:.1e} of a pixel; features off by {:.1e} of their range,"
             " the picture by {:.1e}".format(*errors.values())
         )
     share = (

@@ -22,7 +22,7 @@ PAPER_DEPTH_RANGE = 4.0
 class Renderer:
     """Renders a model; holds what the backward pass needs of the last forward pass.
 
-    settings: config.PointsConfig. cache: keeps the hits of views with a key. offset: (left, top) of
+    settings: config.RasterConfig. cache: keeps the hits of views with a key. offset: (left, top) of
     the asked-for picture in the padded one. camera: (20,) device buffer of the padded camera.
     """
 
@@ -87,7 +87,7 @@ class Renderer:
                 points["opacity"],
                 gamma,
                 settings.max_tracked,
-                settings.stop,
+                settings.early_stop,
                 settings.tau,
             ),
             "shade": lambda: shade_forward(

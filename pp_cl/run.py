@@ -105,7 +105,7 @@ def train_run(folder, config, device_choice):
     info["tuning"] = tuning
     plan = memory_plan(dev, config, trainer.model, trainer.views)
     print_plan(plan, dev)
-    trainer.renderer.cache.budget = spare_memory(plan, config.train.memory)
+    trainer.renderer.cache.budget = spare_memory(plan, config.train.memory_gib)
 
     folder.mkdir(parents=True, exist_ok=True)
     remove_leftovers(folder)

@@ -27,15 +27,15 @@ class Trainer:
         self.dev = dev
         self.config = config.train
         self.network = config.network
-        self.gamma = config.points.gamma
+        self.gamma = config.raster.gamma
         self.downscale = config.scene.downscale
         self.model = model
         self.views = views
         self.step = 0
-        self.renderer = Renderer(dev, model, config.points)
+        self.renderer = Renderer(dev, model, config.raster)
         self.target = Target(dev, self.downscale)
         self.loss = Loss(dev, self.config.ssim_weight)
-        self.optimiser = Optimiser(dev, model, self.config.lazy, self._moment_scale())
+        self.optimiser = Optimiser(dev, model, self.config.lazy_adam, self._moment_scale())
         self.boxes = object_box(views, self.downscale, BOX_MARGIN)
         model.points["weight"] = dev.zeros((model.count,))
         self._smoother = None
@@ -44,12 +44,11 @@ class Trainer:
         """Of moments in 16 bits, from the eps of the first view: powers of two, so that others may
         differ from it.
         """
-        if not self.config.half_moments:
+        if not self.config.moments_16bit:
             return None
         camera = reduced_camera(self.views[0], self.downscale)
         return moment_scale(
-            self.config.feature_eps
-            / (3 * math.prod(self.config.crop_size(camera.width, camera.height)))
+            self.config.sh_eps / (3 * math.prod(self.config.crop_size(camera.width, camera.height)))
         )
 
     # ----------------------------------------------------------------------------------------------
@@ -80,7 +79,7 @@ class Trainer:
         grads = self.renderer.backward(grad_image)
         kept = self.renderer.weights.kept
         self.optimiser.update(
-            t + 1, rates, grads, self.renderer.camera, config.feature_eps / target.size, kept
+            t + 1, rates, grads, self.renderer.camera, config.sh_eps / target.size, kept
         )
         self.renderer.add_point_weights(self.model.points["weight"])
 
@@ -94,7 +93,9 @@ class Trainer:
         """
         config = self.config
         return (
-            config.crop == 0 and config.dropout == 0 and not (config.phases and self.downscale > 1)
+            config.crop == 0
+            and config.dropout == 0
+            and not (config.pixel_jitter and self.downscale > 1)
         )
 
     def draw(self, rng):
@@ -105,7 +106,7 @@ class Trainer:
         epoch, place = divmod(self.step, n)
         index = int(np.random.default_rng((config.seed, epoch, n)).permutation(n)[place])
         camera = reduced_camera(self.views[index], self.downscale)
-        phases = self.downscale if config.phases else 1
+        phases = self.downscale if config.pixel_jitter else 1
         phase = tuple(int(p) for p in rng.integers(phases, size=2))
         if config.crop == 0:
             return index, (0, 0, camera.width, camera.height), phase
@@ -141,9 +142,9 @@ class Trainer:
     def _regularise(self, rates):
         """Grid smoothing, averaging and pruning, where they are due after this step."""
         config, t = self.config, self.step
-        if config.smooth > 0 and t % config.smooth_every == 0:
+        if config.sh_smoothing > 0 and t % config.sh_smoothing_every == 0:
             self._smooth(rates)
-        weight = average_weight(t, config.iterations) if config.average else 0
+        weight = average_weight(t, config.iterations) if config.ema else 0
         if weight > 0:
             self.optimiser.average(weight)
         if t % config.prune_every == 0 and t < config.iterations:
@@ -155,7 +156,7 @@ class Trainer:
         points = self.model.points
         if self._smoother is None:
             self._smoother = Smoother(self.dev, self.model.grid_buffer, points["ids"])
-        pull = self.config.smooth * self.config.smooth_every
+        pull = self.config.sh_smoothing * self.config.sh_smoothing_every
         for block in self.model.blocks:
             if rates.sh[block.degree] > 0:
                 self._smoother.smooth(points[block.name], pull * rates.sh[block.degree])
@@ -176,12 +177,12 @@ class Trainer:
         view.
         """
         self.optimiser.adopt_averages()
-        if self.config.final_weight > 0:
+        if self.config.final_prune_weight > 0:
             total = self.dev.zeros((self.model.count,))
             for view in self.views:
                 self.renderer.blend_weights(reduced_camera(view, self.downscale), self.gamma[1])
                 self.renderer.add_point_weights(total)
-            self._prune(total, self.config.final_weight)
+            self._prune(total, self.config.final_prune_weight)
         self.model.points = {name: self.model.points[name] for name in ("ids", *self.model.keys)}
 
     def rates(self):

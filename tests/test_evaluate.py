@@ -39,7 +39,7 @@ def run(tmp_path_factory):
                 "--set",
                 "network.widths=16,16,16",
                 "--set",
-                "train.final_weight=0",
+                "train.final_prune_weight=0",
             ]
         )
         == 0
@@ -84,7 +84,7 @@ def test_what_tau_did_is_told(run, tmp_path, capsys):
     copy = tmp_path / "run"
     shutil.copytree(run, copy)
     config = json.loads((copy / "config.json").read_text())
-    config["points"]["tau"] = 1e-2
+    config["raster"]["tau"] = 1e-2
     (copy / "config.json").write_text(json.dumps(config))
     assert main(["eval", str(copy)]) == 0
     result = json.loads((copy / "eval" / "metrics.json").read_text())
@@ -95,7 +95,7 @@ def test_what_tau_did_is_told(run, tmp_path, capsys):
             and 0 < row["tau_feature_error"] <= 1e-2
             and 0 < row["tau_picture_error"] < 0.1
         )
-    assert "points.tau: dropped at most" in capsys.readouterr().out
+    assert "raster.tau: dropped at most" in capsys.readouterr().out
 
 
 def test_twice_gives_the_same_numbers_and_other_splits_work(run):

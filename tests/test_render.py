@@ -13,7 +13,7 @@ from support.models import GRID, make_model
 from support.networks import plain_parameters
 from support.scenes import ring_cameras
 
-from pp_cl.config import PointsConfig
+from pp_cl.config import RasterConfig
 from pp_cl.raster.sh import SH_BLOCKS
 from pp_cl.render import PAPER_DEPTH_RANGE, Renderer
 
@@ -42,7 +42,7 @@ def chained(model, settings, camera, opacity=None, sh=None, tracked=0):
     geometry = oracle_raster.geometry(
         padded, positions, settings.radius * spacing_or_world, settings.footprint
     )
-    blend = oracle_raster.blend(padded, geometry, opacity, GAMMA, settings.stop)
+    blend = oracle_raster.blend(padded, geometry, opacity, GAMMA, settings.early_stop)
     shaded = oracle_raster.shade(positions, padded.eye, sh)
     features = oracle_raster.features(blend, shaded)
     parameters = plain_parameters(model.net, model.net.parameters)
@@ -73,14 +73,14 @@ def chained(model, settings, camera, opacity=None, sh=None, tracked=0):
 
 
 SETTINGS = {
-    "soft": PointsConfig(),
-    "soft, wide": PointsConfig(radius=1.4),
-    "disc": PointsConfig(footprint="disc", radius=0.0015),
-    "disc, the paper's gradients": PointsConfig(
-        footprint="disc", radius=0.0015, max_tracked=3, stop=0.001
+    "soft": RasterConfig(),
+    "soft, wide": RasterConfig(radius=1.4),
+    "disc": RasterConfig(footprint="disc", radius=0.0015),
+    "disc, the paper's gradients": RasterConfig(
+        footprint="disc", radius=0.0015, max_tracked=3, early_stop=0.001
     ),
-    "sphere": PointsConfig(footprint="sphere", radius=0.11),
-    "sphere, Pulsar's gradients": PointsConfig(
+    "sphere": RasterConfig(footprint="sphere", radius=0.11),
+    "sphere, Pulsar's gradients": RasterConfig(
         footprint="sphere", radius=0.11, max_tracked=5, mean_gradient=True
     ),
 }
@@ -107,7 +107,7 @@ def test_picture_and_gradients(dev, rng, name):
 
 def test_the_chain_is_the_derivative(dev, rng):
     model, camera = make_model(dev, rng, 40), ring_cameras(1, 20)[0].crop(4, 4, 12, 12)
-    settings, n = PointsConfig(), 40
+    settings, n = RasterConfig(), 40
     grad = rng.normal(size=(12, 12, 3))
     _, backward = chained(model, settings, camera)
     _, grad_opacity, grad_sh, _ = backward(grad)
@@ -137,7 +137,7 @@ def test_padding_does_not_move_the_picture(dev, rng):
     cropped.
     """
     model, camera = make_model(dev, rng), ring_cameras(1, 32)[0]
-    renderer = Renderer(dev, model, PointsConfig())
+    renderer = Renderer(dev, model, RasterConfig())
     renderer.forward(camera, GAMMA)
     whole = renderer.features.get()
     odd = camera.crop(5, 7, 21, 19)
@@ -150,7 +150,7 @@ def test_padding_does_not_move_the_picture(dev, rng):
 def test_an_empty_view_is_the_background(dev, rng):
     model, camera = make_model(dev, rng), ring_cameras(1, 16)[0]
     away = replace(camera, pose=camera.pose * [-1, 1, -1, 1])  # turned round
-    renderer = Renderer(dev, model, PointsConfig())
+    renderer = Renderer(dev, model, RasterConfig())
     picture = renderer.forward(away, GAMMA, training=True).get()
     np.testing.assert_array_equal(renderer.features.get(), np.ones((16, 16, 16), np.float32))
     assert np.isfinite(picture).all()
@@ -160,7 +160,7 @@ def test_an_empty_view_is_the_background(dev, rng):
 
 def test_dropout_leaves_out_its_share_and_pictures_are_repeatable(dev, rng):
     model, camera = make_model(dev, rng, 300), ring_cameras(1, 32)[0]
-    renderer = Renderer(dev, model, PointsConfig())
+    renderer = Renderer(dev, model, RasterConfig())
     renderer.forward(camera, GAMMA)
     everyone = renderer.pairs.seen.size
     renderer.forward(camera, GAMMA, dropout=0.5, seed=1)
@@ -168,5 +168,5 @@ def test_dropout_leaves_out_its_share_and_pictures_are_repeatable(dev, rng):
     first = renderer.picture(camera, GAMMA)
     np.testing.assert_array_equal(first, renderer.picture(camera, GAMMA))
     np.testing.assert_array_equal(
-        first, Renderer(dev, model, PointsConfig()).picture(camera, GAMMA)
+        first, Renderer(dev, model, RasterConfig()).picture(camera, GAMMA)
     )

@@ -84,9 +84,9 @@ def test_stopped_at_any_step_it_resumes_to_the_same_bytes(
 @pytest.mark.parametrize(
     "changes",
     [
-        {"train__lazy": "true"},
-        {"train__half_moments": "true"},
-        {"train__lazy": "true", "train__half_moments": "true"},
+        {"train__lazy_adam": "true"},
+        {"train__moments_16bit": "true"},
+        {"train__lazy_adam": "true", "train__moments_16bit": "true"},
     ],
 )
 def test_other_ways_of_adam_learn_and_resume_to_the_same_bytes(
@@ -207,7 +207,7 @@ def test_a_checkpoint_of_another_scene_is_refused(scene, tmp_path, capsys):
 def test_a_checkpoint_without_its_training_state_is_refused(
     scene, tmp_path, capsys, monkeypatch, lost
 ):
-    train_and_interrupt(scene, tmp_path / "run", 15, monkeypatch, train__lazy="true")
+    train_and_interrupt(scene, tmp_path / "run", 15, monkeypatch, train__lazy_adam="true")
     header, arrays = load_checkpoint(tmp_path / "run" / "checkpoint.npz")
     arrays.pop(lost)
     save_checkpoint(
@@ -215,10 +215,10 @@ def test_a_checkpoint_without_its_training_state_is_refused(
         {k: v for k, v in header.items() if k != "format"},
         arrays,
     )
-    assert main(arguments(scene, tmp_path / "run", train__lazy="true")) == 2
+    assert main(arguments(scene, tmp_path / "run", train__lazy_adam="true")) == 2
     assert lost in capsys.readouterr().err
     save_checkpoint(tmp_path / "run" / "checkpoint.npz", {"step": 10}, arrays)
-    assert main(arguments(scene, tmp_path / "run", train__lazy="true")) == 2
+    assert main(arguments(scene, tmp_path / "run", train__lazy_adam="true")) == 2
     assert "header lacks scene" in capsys.readouterr().err
 
 
@@ -252,7 +252,7 @@ def test_a_training_that_keeps_its_hits_ends_with_the_same_bytes(scene, tmp_path
     """Of whole images without phases; also where there is room for some views only, and over
     prunings.
     """
-    whole = {"train__crop": 0, "train__phases": "false", "train__dropout": 0}
+    whole = {"train__crop": 0, "train__pixel_jitter": "false", "train__dropout": 0}
     whole |= {"train__iterations": 40, "train__prune_every": 15}
     results, caches = [], []
     for budget in (0, 300_000, 10**9):
@@ -283,11 +283,11 @@ def _noting(caches, finish):
         ({}, True),
         ({"crop": 64}, False),
         ({"dropout": 0.1}, False),
-        ({"phases": True}, False),
+        ({"pixel_jitter": True}, False),
     ],
 )
 def test_views_stay_only_where_nothing_is_drawn(changes, stay):
-    settings = {"crop": 0, "dropout": 0.0, "phases": False} | changes
+    settings = {"crop": 0, "dropout": 0.0, "pixel_jitter": False} | changes
     trainer = SimpleNamespace(config=SimpleNamespace(**settings), downscale=2)
     assert Trainer.views_stay(trainer) == stay
 
@@ -307,14 +307,14 @@ def test_the_other_footprints_train_too(scene, tmp_path, footprint, radius):
             arguments(
                 scene,
                 out,
-                points__footprint=footprint,
-                points__radius=radius,
-                points__max_tracked=64,
-                points__stop=0.001,
-                points__mean_gradient="true",
+                raster__footprint=footprint,
+                raster__radius=radius,
+                raster__max_tracked=64,
+                raster__early_stop=0.001,
+                raster__mean_gradient="true",
                 train__iterations=30,
                 train__crop=0,
-                train__final_weight=0,
+                train__final_prune_weight=0,
             )
         )
         == 0

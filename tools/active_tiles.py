@@ -42,14 +42,14 @@ class Comparison:
         )
         self.downscale = downscale or self.config.scene.downscale
         self.net = bench.make_network(dev, widths, "auto") if widths else model.net
-        self.renderer = Renderer(dev, model, self.config.points)
+        self.renderer = Renderer(dev, model, self.config.raster)
         self.target = Target(dev, self.downscale)
         self.loss = Loss(dev, self.config.train.ssim_weight)
 
     def row(self, view, runs):
         """{"view", "size", "share", times in ms, ratios, largest differences} of one view."""
         camera = reduced_camera(view, self.downscale)
-        self.renderer.forward(camera, self.config.points.gamma[1])
+        self.renderer.forward(camera, self.config.raster.gamma[1])
         x = self.renderer.features
         self.target.load(view)
         target = self.target.crop(0, 0, camera.width, camera.height)

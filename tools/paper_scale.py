@@ -70,7 +70,7 @@ def measure(dev, config, views, rounds):
         for i in range(views):
             view = trainer.views[len(trainer.views) * i // views]
             stages = renderer.stages(
-                reduced_camera(view, config.scene.downscale), config.points.gamma[1], key=i
+                reduced_camera(view, config.scene.downscale), config.raster.gamma[1], key=i
             )
             for name, stage in stages.items():
                 timed(name, stage)
@@ -123,7 +123,7 @@ def main(argv=None):
             ("scene.downscale", options.downscale),
             ("points.count", options.points),
             ("network.widths", "16,16,16"),
-            ("train.lazy", options.lazy),
+            ("train.lazy_adam", options.lazy),
         ):
             assign(config, key, value, "paper_scale")
         result = measure(open_device(options.device), config, options.views, options.rounds)

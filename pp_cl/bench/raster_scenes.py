@@ -4,7 +4,7 @@ sampled pixels.
 
 import numpy as np
 
-from pp_cl.config import PointsConfig
+from pp_cl.config import RasterConfig
 from pp_cl.model import Model
 from pp_cl.raster.blend import Blend
 from pp_cl.raster.blend_weights import Weights
@@ -122,7 +122,7 @@ class GridScene(_Scene):
         for name, coefficients in model.points.items():
             if name.startswith("sh") and name != "sh0":
                 dev.fill(coefficients, HIGHER_SH)
-        self.settings = PointsConfig(footprint="disc", radius=0.0015)
+        self.settings = RasterConfig(footprint="disc", radius=0.0015)
         self.renderer = Renderer(dev, model, self.settings)
         self.pairs, self.weights = self.renderer.pairs, self.renderer.weights
         self.grad = dev.upload(rng.standard_normal((size, size, CHANNELS), np.float32))

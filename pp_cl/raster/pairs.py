@@ -125,7 +125,7 @@ class Pairs:
         if total >= MOST_PAIRS:
             raise UserError(
                 f"the points of one view cover more than {MOST_PAIRS} pixels in all: lower"
-                " --points, raise --downscale, or lower points.radius"
+                " --points, raise --downscale, or lower raster.radius"
             )
         self.total, p = total, max(1, total)
         if self.capacity < p:

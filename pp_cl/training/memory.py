@@ -22,13 +22,13 @@ def point_bytes(train, degree):
     learned = 4 * (1 + coefficients)
     return {
         "ids, opacities, SH coefficients": 4 + learned,
-        "Adam's moments": 2 * (4 + (2 if train.half_moments else 4) * coefficients),
-        "averages": learned if train.average else 0,
+        "Adam's moments": 2 * (4 + (2 if train.moments_16bit else 4) * coefficients),
+        "averages": learned if train.ema else 0,
         # 4 of adam_rest; last steps, flags, offsets, rows
-        "weights, Adam's lists": 4 * (1 + (8 if train.lazy else 0)),
+        "weights, Adam's lists": 4 * (1 + (8 if train.lazy_adam else 0)),
         # position, box, features, gradients, offsets and lists
         "points of one view": 4 * (4 + 2 + 16 + 16 + 1 + 3),
-        "neighbours": 4 * 6 if train.smooth > 0 else 0,
+        "neighbours": 4 * 6 if train.sh_smoothing > 0 else 0,
     }
 
 
@@ -47,13 +47,13 @@ def memory_plan(dev, config, model, views):
         if size
     ]
     row_bytes = max(64 * block.count for block in model.blocks)  # of the largest array of a point
-    if train.smooth > 0:
+    if train.sh_smoothing > 0:
         chunk = min(n, max(CHUNK, n // model.grid.dims[2]))  # the points of a layer, about
         rows.append(
             ("smoothing (estimate)", f"2 x ({chunk}) x {row_bytes} bytes", 2 * chunk * row_bytes)
         )
     rows.append(("pruning", "at most", min(SCRATCH_BYTES, n * row_bytes)))
-    if config.points.stop > 0 or config.points.tau > 0:
+    if config.raster.early_stop > 0 or config.raster.tau > 0:
         rows.append(("points kept in one view", f"({n}) x 12 bytes", 12 * n))
     pairs = round(n * _pixels_per_point(config, model, camera))
     rows.append(
@@ -82,8 +82,8 @@ def _pixels_per_point(config, model, camera):
     """Mean area of a footprint in pixels, seen from the middle of the depth range."""
     middle = sum(model.depth_range) / 2
     radius = 0.75  # the hard disc
-    if config.points.footprint == "soft":
-        radius = max(radius, config.points.radius * model.grid.edge * camera.fx / middle)
+    if config.raster.footprint == "soft":
+        radius = max(radius, config.raster.radius * model.grid.edge * camera.fx / middle)
     return math.pi * radius**2
 
 
@@ -103,7 +103,7 @@ def print_plan(rows, dev):
         raise UserError(
             f"the training needs {total / MIB:.0f} MiB, {dev.name} has"
             f" {dev.info['memory_bytes'] / MIB:.0f}: lower --points, raise --downscale, or set"
-            " train.half_moments, train.crop or smaller network.widths"
+            " train.moments_16bit, train.crop or smaller network.widths"
         )
 
 

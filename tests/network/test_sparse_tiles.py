@@ -220,7 +220,7 @@ def test_lego(dev, data, rng, always):
     near_far = depth_range(views, hull)
     model = Model.create(dev, hull.grid, hull.ids, near_far, (16, 32, 48), 1)
     model.points["sh0"].set(rng.normal(size=model.points["sh0"].shape).astype(np.float32))
-    renderer = Renderer(dev, model, preset("tiny").points)
+    renderer = Renderer(dev, model, preset("tiny").raster)
     for view in with_depth_range(views[:2], near_far):
         renderer.forward(reduced_camera(view, 2), 0.01)
         x = renderer.features

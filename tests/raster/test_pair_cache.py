@@ -8,7 +8,7 @@ from support.models import make_model
 from support.raster_scene import Scene, make_camera, make_points
 from support.scenes import ring_cameras
 
-from pp_cl.config import PointsConfig
+from pp_cl.config import RasterConfig
 from pp_cl.errors import UserError
 from pp_cl.raster.pair_cache import PairCache
 from pp_cl.raster.pairs import LASTING
@@ -75,7 +75,7 @@ def test_a_kept_view_is_not_built_again(dev, rng):
 def test_pictures_and_gradients_are_the_same_bits(dev, rng, footprint, tau):
     """With opacities that change from step to step, and points that go."""
     model, cameras = make_model(dev, rng), ring_cameras(3, 24)
-    settings = PointsConfig(
+    settings = RasterConfig(
         footprint=footprint, radius=0.75 if footprint == "soft" else 0.0015, tau=tau
     )
     kept, anew = Renderer(dev, model, settings), Renderer(dev, model, settings)

@@ -13,7 +13,7 @@ SETTINGS = {
     "train.checkpoint_every": 10,
     "train.log_every": 5,
     "train.previews": 2,
-    "train.final_weight": 0.5,
+    "train.final_prune_weight": 0.5,
 }
 
 

@@ -15,8 +15,8 @@ from pp_cl.training.memory import memory_plan, point_bytes, print_plan
 PAPER_POINTS = 4_040_533  # lego, supplemental Table 4
 WAYS = [
     {},
-    {"train.lazy": "true", "points.stop": "0.001"},
-    {"train.half_moments": "true", "train.average": "false", "train.smooth": "0"},
+    {"train.lazy_adam": "true", "raster.early_stop": "0.001"},
+    {"train.moments_16bit": "true", "train.ema": "false", "train.sh_smoothing": "0"},
 ]
 
 
@@ -75,16 +75,16 @@ def test_pruning_stays_within_the_plan(dev, tmp_path, monkeypatch):
 @pytest.mark.parametrize("lazy", [False, True])
 def test_the_papers_scale_fits_nine_gibibytes(lazy):
     train = preset("paper").train
-    train.lazy = lazy
+    train.lazy_adam = lazy
     single = PAPER_POINTS * sum(point_bytes(train, 2).values())
     # two hits a point; a disc of 0.75 pixels covers 1.77
     assert single + 2 * 45 * PAPER_POINTS < 9 * 2**30
-    train.half_moments = True
+    train.moments_16bit = True
     assert single - PAPER_POINTS * sum(point_bytes(train, 2).values()) == PAPER_POINTS * 576
 
 
 def test_a_plan_over_the_memory_names_the_knobs(dev, capsys):
     print_plan([("points", "(3) x 4", dev.info["memory_bytes"])], dev)
     assert "total" in capsys.readouterr().out
-    with pytest.raises(UserError, match="lower --points, .* train.half_moments"):
+    with pytest.raises(UserError, match="lower --points, .* train.moments_16bit"):
         print_plan([("points", "(3) x 4", dev.info["memory_bytes"] + 1)], dev)
