@@ -13,7 +13,7 @@ typedef struct {
     int width, height;
 } Camera;
 
-inline Camera camera_load(global const float *c) {
+static inline Camera camera_load(global const float *c) {
     Camera k;
     k.right = (float3)(c[0], c[1], c[2]);
     k.down = (float3)(c[3], c[4], c[5]);
@@ -31,7 +31,7 @@ inline Camera camera_load(global const float *c) {
 }
 
 // Unit ray through the centre of pixel (x, y), in camera axes.
-inline float3 camera_ray(const Camera *k, const int x, const int y) {
+static inline float3 camera_ray(const Camera *k, const int x, const int y) {
     return normalize((float3)((x + 0.5f - k->cx) / k->fx, (y + 0.5f - k->cy) / k->fy, 1.0f));
 }
 

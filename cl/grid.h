@@ -5,7 +5,7 @@
 #define GRID_FLOATS 8  // origin x, y, z; edge; nx, ny, nz; 0
 
 // World position of grid vertex `id` = i + nx*(j + ny*k).
-inline float3 grid_position(global const float *grid, const uint id) {
+static inline float3 grid_position(global const float *grid, const uint id) {
     const uint nx = (uint)grid[4], ny = (uint)grid[5];
     const uint row = id / nx;
     const float3 ijk = (float3)((float)(id - row * nx), (float)(row % ny), (float)(row / ny));

@@ -11,7 +11,7 @@
 #define SH_2D 0.54627422f  // 1/4 sqrt(15 / pi)
 
 // basis[0..8] of the unit direction d
-inline void sh_basis(const float3 d, float *basis) {
+static inline void sh_basis(const float3 d, float *basis) {
     basis[0] = SH_0;
     basis[1] = -SH_1 * d.y;
     basis[2] = SH_1 * d.z;

@@ -4,7 +4,7 @@
 #define PP_VECTOR_H
 
 // The 16 values at p, of which `count` exist; the others read as 0.
-inline float16 load16(global const float *p, const int count) {
+static inline float16 load16(global const float *p, const int count) {
     if (count >= 16) return vload16(0, p);
     float x[16];
     for (int i = 0; i < 16; i++)
@@ -13,7 +13,7 @@ inline float16 load16(global const float *p, const int count) {
 }
 
 // Write the first `count` of 16 values to p.
-inline void store16(const float16 value, global float *p, const int count) {
+static inline void store16(const float16 value, global float *p, const int count) {
     if (count >= 16) {
         vstore16(value, 0, p);
         return;

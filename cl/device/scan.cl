@@ -8,7 +8,7 @@
 // values per work-item: a million values take two levels; pp_cl/device/scan.py knows it too
 #define BLOCK 512
 
-inline uint scan_value(const uint value) {
+static inline uint scan_value(const uint value) {
     return FLAGS ? (value != 0) : value;
 }
 

@@ -69,7 +69,7 @@ ALWAYS_INLINE void convolve(
 }
 
 // Whether any of the TILE pixels from (x0, y) on lies in a tile that is computed.
-inline bool
+static inline bool
 any_is_computed(global const float *tile_count, const int x0, const int y, const int width) {
     bool any = false;
     for (int x = x0; x < x0 + TILE + SIDE - 1; x += SIDE)

@@ -38,7 +38,7 @@ kernel void conv_flip_weights(
 }
 
 // The gradients of 16 channels, `count` times; 0 where count is, whatever they are.
-inline float16 counted(global const float *grad, const float count, const int lanes) {
+static inline float16 counted(global const float *grad, const float count, const int lanes) {
     return count > 0.0f ? count * load16(grad, lanes) : (float16)0.0f;
 }
 

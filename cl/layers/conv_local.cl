@@ -21,7 +21,7 @@
 
 // Bring channels c0 .. c0 + CHUNK - 1 of the neighbourhood of the pixels from (x0, y0) on to
 // values[channel][row][column]; zero where there is no pixel.
-inline void load_values(
+static inline void load_values(
     local float *values,
     global const float *x,
     const int channels,
@@ -42,7 +42,7 @@ inline void load_values(
 // Bring the weights of those input channels and 32 output channels to weights[channel][tap][output
 // channel]; zero where there is no output channel. weight: of the first of `blocks` blocks of 16
 // output channels and of x's first channel, ci of which make a row.
-inline void load_weights(
+static inline void load_weights(
     local float *weights,
     global const float *weight,
     const int blocks,
@@ -99,7 +99,7 @@ ALWAYS_INLINE void convolve(
 }
 
 // Whether any tile of the work-group's pixels is computed.
-inline bool any_is_computed(
+static inline bool any_is_computed(
     global const float *tile_count,
     const int x0,
     const int y0,

@@ -5,12 +5,12 @@
 
 #define SIDE 4
 
-inline int tile_columns(const int width) {
+static inline int tile_columns(const int width) {
     return (width + SIDE - 1) / SIDE;
 }
 
 // Whether the tile of pixel (x, y) is computed; tile_count: see pp_cl/layers/tiles.py.
-inline bool
+static inline bool
 tile_is_computed(global const float *tile_count, const int x, const int y, const int width) {
     return tile_count[y / SIDE * tile_columns(width) + x / SIDE] > 0.0f;
 }

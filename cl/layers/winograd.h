@@ -142,7 +142,7 @@ ALWAYS_INLINE void transform_kernel_gradient(float16 *t, const int step) {
 
 // The corner of the i-th tile of outputs among those of tile_list: height, width, number, and the
 // tiles of tiles.h.
-inline int2 tile_corner(global const int *tile_list, const int i) {
+static inline int2 tile_corner(global const int *tile_list, const int i) {
     const int columns = tile_columns(tile_list[1]), tile = tile_list[3 + i / (PER_SIDE * PER_SIDE)];
     const int inside = i % (PER_SIDE * PER_SIDE);
     return (int2)(tile % columns * SIDE + inside % PER_SIDE * M,

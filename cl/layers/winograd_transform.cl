@@ -7,6 +7,7 @@
 // below half's largest number 65504; what is larger than 2^-27 of the largest keeps all of half's
 // 11 bits.
 #include "layers/winograd.h"
+#include "reduce.h"
 
 #define EXPONENT 23  // position of a float's exponent, biased by 127
 #define LARGEST 13   // exponent of the largest weight in units
@@ -47,10 +48,7 @@ kernel void winograd_flipped_units(
     int16 all = 0;
     for (int i = 0; i < co / 16 * 9; i++)
         all = max(all, as_int16(weight[(size_t)i * ci + first + c]) & 0x7fffffff);
-    const int8 by8 = max(all.lo, (int8)(UPPER_HALF(all)));
-    const int4 by4 = max(by8.lo, by8.hi);
-    const int2 by2 = max(by4.lo, by4.hi);
-    transformed[c] = unit_of((int16)(max(by2.x, by2.y))).x;
+    transformed[c] = unit_of((int16)(max_int16(all))).x;
 }
 
 // Three rows of three weights in t -> their values at all positions, of one input channel and 16

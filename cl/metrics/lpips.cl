@@ -1,6 +1,6 @@
 // LPIPS v0.1 (Zhang et al. 2018) around the layers of VGG16: the input's scaling and the distance
 // of two feature maps.
-#include "common.h"
+#include "reduce.h"
 
 // A fused a*s - b*t rounds one product only: the same image would differ from itself by 1e-15, and
 // a from b unlike b from a.
@@ -42,13 +42,13 @@ kernel void lpips_distance(
         bb += b[k] * b[k];
     }
     // 1e-10: LPIPS's own guard for pixels without features
-    const float scale_a = 1.0f / (sqrt(dot16(aa, 1.0f)) + 1e-10f);
-    const float scale_b = 1.0f / (sqrt(dot16(bb, 1.0f)) + 1e-10f);
+    const float scale_a = 1.0f / (sqrt(sum16(aa)) + 1e-10f);
+    const float scale_b = 1.0f / (sqrt(sum16(bb)) + 1e-10f);
 
     float16 sum = 0.0f;
     for (uint k = 0; k < blocks; k++) {
         const float16 d = a[k] * scale_a - b[k] * scale_b;
         sum += head[k] * d * d;
     }
-    distance[i] = dot16(sum, 1.0f);
+    distance[i] = sum16(sum);
 }

@@ -8,6 +8,7 @@
 // ones, up to 8 times slower.
 #include "common.h"
 #include "raster/footprint.h"
+#include "reduce.h"
 
 #ifndef MEAN
 #define MEAN 0  // 1: gradients are divided by the number of pixels that track the point (Pulsar)

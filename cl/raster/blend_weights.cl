@@ -10,19 +10,13 @@
 // ones, up to 8 times slower.
 #include "common.h"
 #include "camera.h"
+#include "reduce.h"
 
 #define EPS 1e-6f    // depth of the background, as a z (Pulsar's background_normalized_depth)
 #define BATCH 16     // hits of a pixel handled at once, one lane each
 #define TAIL 0.125f  // share of tau for a bound of hits at the end that are not even weighed
 // weight and slope of a hit that is no part of the picture; both signs tell it
 #define DROPPED ((float2)(-0.0f))
-
-inline float max16(const float16 v) {
-    const float8 a = fmax(v.lo, (float8)(UPPER_HALF(v)));
-    const float4 b = fmax(a.lo, a.hi);
-    const float2 c = fmax(b.lo, b.hi);
-    return fmax(c.x, c.y);
-}
 
 // What Eq. (1) needs of a batch of hits. Lanes without a hit have opacity and closeness 0, hence no
 // weight.
@@ -54,7 +48,7 @@ ALWAYS_INLINE Hits load_hits(
 // The weights of a pixel's hits [begin, stop) lie in `hit`; the weight `dropped` is gone already.
 // Drops, from the back on, every hit with which `dropped` stays within tau; the others move up.
 // Returns where they end.
-inline uint drop_hits(
+static inline uint drop_hits(
     const uint begin,
     const uint stop,
     const float tau,

@@ -4,6 +4,7 @@
 #define PP_FOOTPRINT_H
 
 #include "camera.h"
+#include "reduce.h"
 
 #define DISC 0    // hard disc of the paper: d = 1 everywhere
 #define SOFT 1    // d falls linearly from the centre to the rim (ours)
@@ -16,9 +17,9 @@
 #define BLOCK_SIDE 4  // pixels are tested in blocks of 4 x 4, one lane each
 #define LANE_X (float16)(0, 1, 2, 3, 0, 1, 2, 3, 0, 1, 2, 3, 0, 1, 2, 3)
 #define LANE_Y (float16)(0, 0, 0, 0, 1, 1, 1, 1, 2, 2, 2, 2, 3, 3, 3, 3)
-// Half the width of the smallest footprint, in pixels: a disc of this radius always reaches a
 #define LANE_BIT                                                                                   \
     (int16)(1, 2, 4, 8, 16, 32, 64, 128, 256, 512, 1024, 2048, 4096, 8192, 16384, 32768)
+// Half the width of the smallest footprint, in pixels: a disc of this radius always reaches a
 // pixel's centre, because the farthest point of a pixel is sqrt(1/2) away (Pulsar: 1.5 half
 // pixels).
 #define LEAST_RADIUS 0.75f
@@ -32,7 +33,7 @@ typedef struct {
 } Footprint;
 
 // Width of a pixel at range t; the smaller focal length has the wider pixels.
-inline float pixel_width(const Camera *k, const float t) {
+static inline float pixel_width(const Camera *k, const float t) {
     return t / fmin(k->fx, k->fy);
 }
 
@@ -90,11 +91,7 @@ ALWAYS_INLINE uint footprint_block(
     const float16 w = sqrt(wx * wx + wy * wy + wz * wz);
     *depth = fmax(along - sqrt((f->radius + w) * fmax(f->radius - w, 0.0f)), 0.0f);
 #endif
-    const int16 bits = hit & LANE_BIT;
-    const int8 b8 = bits.lo | (int8)(UPPER_HALF(bits));
-    const int4 b4 = b8.lo | b8.hi;
-    const int2 b2 = b4.lo | b4.hi;
-    return (uint)(b2.x | b2.y);
+    return (uint)or_int16(hit & LANE_BIT);
 }
 
 #endif

@@ -91,7 +91,7 @@ kernel void pairs_scatter(
 // Sorts `count` <= RUN keys into `sorted`, which may be the same memory: each key's place is the
 // number of smaller keys. No key has its highest bit set, the sign of a depth, so that of a
 // difference says which one is smaller.
-inline void sort_run(global const ulong *keys, const uint count, global ulong *sorted) {
+static inline void sort_run(global const ulong *keys, const uint count, global ulong *sorted) {
     ulong run[RUN + 8];
     for (uint i = 0; i < count; i++)
         run[i] = keys[i];
@@ -110,7 +110,7 @@ inline void sort_run(global const ulong *keys, const uint count, global ulong *s
 }
 
 // Merges two sorted neighbours, [0, middle) and [middle, count) of `keys`, into `merged`.
-inline void
+static inline void
 merge(global const ulong *keys, const uint middle, const uint count, global ulong *merged) {
     uint a = 0, b = middle;
     for (uint i = 0; i < count; i++) {

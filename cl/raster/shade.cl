@@ -10,7 +10,7 @@
 
 // Harmonics of the direction, in world axes, of a point given in camera axes. A point that was left
 // out is (0, 0, 0, -1).
-inline void shade_basis(global const float *camera, const float4 point, float *basis) {
+static inline void shade_basis(global const float *camera, const float4 point, float *basis) {
     const Camera k = camera_load(camera);
     const float3 c = point.xyz / point.w;
     sh_basis(c.x * k.right + c.y * k.down + c.z * k.forward, basis);

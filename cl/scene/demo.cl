@@ -5,6 +5,7 @@
 #include "common.h"
 #include "scene/demo_object.h"
 #include "grid.h"
+#include "reduce.h"
 #include "vector.h"
 
 #define MARCH_STEPS 96
@@ -15,7 +16,7 @@
 #define KEY ((float3)(0.40f, -0.52f, 0.7547f))
 #define FILL ((float3)(-0.80f, 0.45f, 0.3969f))
 
-inline Vector16 scene_normal(const Vector16 p) {
+static inline Vector16 scene_normal(const Vector16 p) {
     const float h = 5e-4f;
     Vector16 n = {0};
     for (int i = 0; i < 4; i++) {  // the corners of a tetrahedron
@@ -28,7 +29,7 @@ inline Vector16 scene_normal(const Vector16 p) {
 
 // Share of the key light that reaches p: a soft shadow, its penumbra from the closest approach to
 // another part.
-inline float16 key_visibility(const Vector16 p) {
+static inline float16 key_visibility(const Vector16 p) {
     float16 lit = 1.0f, t = 0.02f;
     for (int step = 0; step < SHADOW_STEPS; step++) {
         const float16 d =
@@ -40,19 +41,19 @@ inline float16 key_visibility(const Vector16 p) {
 }
 
 // Share of the surroundings that p sees, from the distances along its normal n.
-inline float16 openness(const Vector16 p, const Vector16 n) {
+static inline float16 openness(const Vector16 p, const Vector16 n) {
     const float16 near = scene_distance(advance(p, n, 0.05f)),
                   far = scene_distance(advance(p, n, 0.15f));
     return clamp(0.4f + 6.0f * near + 2.0f * far, 0.0f, 1.0f);
 }
 
-inline Vector16 mix_colours(const float3 a, const float3 b, const float16 share) {
+static inline Vector16 mix_colours(const float3 a, const float3 b, const float16 share) {
     return (Vector16){
         a.x + (b.x - a.x) * share, a.y + (b.y - a.y) * share, a.z + (b.z - a.z) * share};
 }
 
 // `colour`, and where asked for instead of it a mixture of a and b.
-inline Vector16 paint(
+static inline Vector16 paint(
     const Vector16 colour,
     const int16 where,
     const float3 a,
@@ -64,13 +65,13 @@ inline Vector16 paint(
 }
 
 // 0 and 1 in turn, in cells of size 1.
-inline float16 chequer(const float16 a, const float16 b) {
+static inline float16 chequer(const float16 a, const float16 b) {
     const float16 cell = floor(a) + floor(b);
     return cell - 2.0f * floor(0.5f * cell);
 }
 
 // Linear colour of the part nearest to each place, and which places are metal.
-inline Vector16 surface_colour(const Vector16 position, int16 *metal) {
+static inline Vector16 surface_colour(const Vector16 position, int16 *metal) {
     float16 d[PARTS];
     parts(position, d);
     const float16 nearest = min(min(min(d[BASE], d[BRASS]), min(d[BAND], d[SPOKES])), d[GLOBE]);
@@ -110,7 +111,7 @@ inline Vector16 surface_colour(const Vector16 position, int16 *metal) {
 
 // What a mirror shows in `direction`: ground below a soft horizon, sky, and a lamp around the key
 // light.
-inline Vector16 environment(const Vector16 direction) {
+static inline Vector16 environment(const Vector16 direction) {
     const float16 above = smoothstep(-0.25f, 0.25f, direction.z);
     const float16 lamp = 3.5f * smoothstep(0.82f, 0.97f, dot_axis(direction, KEY));
     const Vector16 seen =
@@ -119,13 +120,13 @@ inline Vector16 environment(const Vector16 direction) {
 }
 
 // Display value of a linear one: the square root is close to sRGB.
-inline float16 displayed(const float16 linear) {
+static inline float16 displayed(const float16 linear) {
     return sqrt(clamp(linear, 0.0f, 1.0f));
 }
 
 // Displayed colour of places p seen along unit rays: two lights, the environment's reflection,
 // Schlick's Fresnel term.
-inline Vector16 shade(const Vector16 p, const Vector16 ray) {
+static inline Vector16 shade(const Vector16 p, const Vector16 ray) {
     int16 metal;
     const Vector16 colour = surface_colour(p, &metal);
     const Vector16 n = scene_normal(p);
@@ -189,7 +190,7 @@ kernel void render_demo(
     }
     const Vector16 colour = shade(advance(eye, ray, t), ray);
     const float16 weight = select((float16)0.0f, (float16)1.0f, hit);
-    const float hits = dot16(weight, 1.0f);
+    const float hits = sum16(weight);
     const float3 shown =
         (float3)(dot16(weight, colour.x), dot16(weight, colour.y), dot16(weight, colour.z)) / hits;
     image[y * width + x] = convert_uchar4_sat_rte(255.0f * (float4)(shown, hits / 16.0f));

@@ -30,30 +30,30 @@ typedef struct {
     float16 x, y, z;
 } Vector16;
 
-inline float16 dot_axis(const Vector16 a, const float3 n) {
+static inline float16 dot_axis(const Vector16 a, const float3 n) {
     return a.x * n.x + a.y * n.y + a.z * n.z;
 }
 
-inline float16 dot_lanes(const Vector16 a, const Vector16 b) {
+static inline float16 dot_lanes(const Vector16 a, const Vector16 b) {
     return a.x * b.x + a.y * b.y + a.z * b.z;
 }
 
-inline Vector16 advance(const Vector16 from, const Vector16 direction, const float16 t) {
+static inline Vector16 advance(const Vector16 from, const Vector16 direction, const float16 t) {
     return (Vector16){from.x + t * direction.x, from.y + t * direction.y, from.z + t * direction.z};
 }
 
-inline Vector16 normalize_lanes(const Vector16 a) {
+static inline Vector16 normalize_lanes(const Vector16 a) {
     const float16 scale = 1.0f / sqrt(dot_lanes(a, a));
     return (Vector16){a.x * scale, a.y * scale, a.z * scale};
 }
 
-inline float16 length_lanes(const float16 a, const float16 b) {
+static inline float16 length_lanes(const float16 a, const float16 b) {
     return sqrt(a * a + b * b);
 }
 
 // Distance of a rounded rectangle of half sides ha + r and hb + r from (a, b), measured from its
 // centre.
-inline float16
+static inline float16
 rectangle(const float16 a, const float16 b, const float ha, const float hb, const float r) {
     const float16 u = fabs(a) - ha, v = fabs(b) - hb;
     return length_lanes(max(u, 0.0f), max(v, 0.0f)) + min(max(u, v), 0.0f) - r;
@@ -61,13 +61,13 @@ rectangle(const float16 a, const float16 b, const float ha, const float hb, cons
 
 // Distance of a rod with round ends: `along` and `off` are the coordinates along its axis and from
 // it.
-inline float16
+static inline float16
 rod(const float16 along, const float16 off, const float from, const float to, const float radius) {
     return length_lanes(along - clamp(along, from, to), off) - radius;
 }
 
 // Distances of a place to all parts, each exact outside of its part.
-inline void parts(const Vector16 position, float16 *distances) {
+static inline void parts(const Vector16 position, float16 *distances) {
     const Vector16 p = {position.x, position.y, position.z - GLOBE_Z};
     const float16 square = dot_lanes(p, p), from_axis = length_lanes(p.x, p.y);
     // Every ring has a height over its plane and a radius in it.
@@ -99,7 +99,7 @@ inline void parts(const Vector16 position, float16 *distances) {
 }
 
 // Distance of a place to the object; negative inside.
-inline float16 scene_distance(const Vector16 p) {
+static inline float16 scene_distance(const Vector16 p) {
     float16 d[PARTS];
     parts(p, d);
     return min(min(min(d[BASE], d[BRASS]), min(d[BAND], d[SPOKES])), d[GLOBE]);

@@ -27,7 +27,8 @@
 
 // New moments and the step of one value, or of 16: T is float or float16. rest: of adam_rest.
 #define ADAM_STEP(T, name)                                                                         \
-    inline T name(const T g, const float4 rest, T *m, T *v, const float rate, const float eps) {   \
+    static inline T name(                                                                          \
+        const T g, const float4 rest, T *m, T *v, const float rate, const float eps) {             \
         const T missed = rest.z > 0.0f ? rest.z * rate * *m / (sqrt(*v) + eps) : (T)(0.0f);        \
         *m *= rest.x;                                                                              \
         *v *= rest.y;                                                                              \
@@ -95,11 +96,11 @@ kernel void adam_rest(
     last[i] = step;
 }
 
-inline size_t row_of(global const uint *rows, const size_t g) {
+static inline size_t row_of(global const uint *rows, const size_t g) {
     return LAZY ? rows[g] : g;
 }
 
-inline float4 rest_of(global const float4 *rest, const size_t g) {
+static inline float4 rest_of(global const float4 *rest, const size_t g) {
     return LAZY ? rest[g] : NO_REST;
 }
 
@@ -127,7 +128,7 @@ kernel void adam_opacity_update(
 }
 
 // Harmonics of the direction from the eye to a grid vertex.
-inline void
+static inline void
 adam_basis(global const float *grid, global const float *camera, const uint id, float *basis) {
     const Camera view = camera_load(camera);
     const float3 direction = grid_position(grid, id) - view.eye;

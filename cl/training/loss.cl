@@ -9,7 +9,7 @@
 // The kernels run in their order here: moments of the windows along y; along x, then SSIM and its
 // slopes; slopes spread along x; along y, with the gradient; sums. Scratch rows are BLOCKS float16
 // long, 2 more than 3W values need, so that no tap along x needs a test.
-#include "common.h"
+#include "reduce.h"
 #include "vector.h"
 
 #define TAPS 11
@@ -25,12 +25,8 @@ constant float WINDOW[TAPS] = {// exp(-x^2 / (2 * 1.5^2)), normalised
 // s is kept 1 lower: the moments of numbers around 0 lose the least
 #define SUM_SHIFT 1.0f
 
-inline float sum16(const float16 a) {
-    return dot16(a, 1.0f);
-}
-
 // All ones in the lanes below `count`, for select().
-inline int16 lanes_below(const int count) {
+static inline int16 lanes_below(const int count) {
     return (int16)(0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15) < count;
 }
 
@@ -68,7 +64,7 @@ kernel void loss_moments(
 
 // 16 values of a scratch row blurred from value i on; each tap lies `step` values beside the one
 // before.
-inline float16 blur_along_x(global const float16 *row, const int i, const int step) {
+static inline float16 blur_along_x(global const float16 *row, const int i, const int step) {
     global const float *values = (global const float *)row + i;
     float16 sum = 0.0f;
     for (int k = 0; k < TAPS; k++)

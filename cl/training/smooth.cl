@@ -3,7 +3,7 @@
 #include "common.h"
 
 // Index of `id` in ids[first, last), ascending; NONE where it is missing.
-inline uint find(global const uint *ids, const uint id, uint first, uint last) {
+static inline uint find(global const uint *ids, const uint id, uint first, uint last) {
     const uint end = last;
     while (first < last) {
         const uint middle = first + (last - first) / 2;
