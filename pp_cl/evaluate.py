@@ -1,7 +1,6 @@
 """Evaluation of a run: every view of a split, rendered, rounded to 8 bits, measured."""
 
 import time
-from dataclasses import replace
 from pathlib import PurePosixPath
 
 import numpy as np
@@ -92,14 +91,13 @@ def _render_all(dev, config, model, views, gamma_now):
     float32 in [0, 1].
     """
     model.net.freeze()
-    exact = Renderer(dev, model, replace(config.raster, tau=0.0)) if config.raster.tau > 0 else None
     renderer, target = Renderer(dev, model, config.raster), Target(dev, config.scene.downscale)
     # builds the programs
-    renderer.picture(reduced_camera(views[0], config.scene.downscale), gamma_now)
+    renderer.render(reduced_camera(views[0], config.scene.downscale), gamma_now)
     for view in views:
         camera = reduced_camera(view, config.scene.downscale)
         start = time.perf_counter()
-        picture = renderer.picture(camera, gamma_now)
+        picture = renderer.render(camera, gamma_now)
         seconds = time.perf_counter() - start
         target.load(view)
         truth = target.crop(0, 0, camera.width, camera.height).get()
@@ -108,28 +106,24 @@ def _render_all(dev, config, model, views, gamma_now):
             picture,
             truth,
             seconds,
-            _dropped(renderer, picture, exact, camera, gamma_now) if exact else {},
+            _tau_errors(renderer, camera, gamma_now) if config.raster.tau > 0 else {},
         )
 
 
-def _dropped(renderer, picture, exact, camera, gamma_now):
-    """{"tau_bound", "tau_feature_error", "tau_picture_error"} of the view rendered last.
+def _tau_errors(renderer, camera, gamma_now):
+    """{"tau_bound", "tau_feature_error", "tau_picture_error"} of a view.
 
-    The largest weight that a pixel dropped (or its bound), and the largest differences from
-    `exact`, which renders at tau 0: of a feature over the features' range, and of the picture.
+    The largest weight that a pixel dropped (or its bound), and the largest differences from tau 0:
+    of a feature over the range of the features, and of the image.
     """
-    bound, features = (
-        renderer.weights.dropped(renderer.pairs).get().max(initial=0),
-        renderer.features.get(),
-    )
-    exact_picture = exact.picture(camera, gamma_now)
-    exact_features = exact.features.get()
+    view = renderer.rasterise(camera, gamma_now)
+    bound, features = renderer.dropped_weights(view).get().max(initial=0), view.features.get()
+    exact = renderer.rasterise(camera, gamma_now, tau=0.0).features.get()
+    image, exact_image = (renderer.render(camera, gamma_now, tau=tau) for tau in (None, 0.0))
     return {
         "tau_bound": float(bound),
-        "tau_feature_error": float(
-            np.abs(features - exact_features).max() / max(np.ptp(exact_features), 1e-30)
-        ),
-        "tau_picture_error": float(np.abs(picture - exact_picture).max()),
+        "tau_feature_error": float(np.abs(features - exact).max() / max(np.ptp(exact), 1e-30)),
+        "tau_picture_error": float(np.abs(image - exact_image).max()),
     }
 
 

@@ -36,6 +36,17 @@ class Model:
         """Number of points."""
         return self.points["ids"].shape[0]
 
+    @property
+    def cloud(self):
+        from types import SimpleNamespace
+
+        return SimpleNamespace(
+            count=self.count,
+            ids=self.points["ids"],
+            opacity=self.points["opacity"],
+            sh=[self.points[b.name] for b in self.blocks],
+        )
+
     @classmethod
     def create(cls, dev, grid, ids, depth_range, widths, seed, degree=SH_DEGREES[-1]):
         """Fresh model: opacity 1, SH coefficients 0, network at its random start.

@@ -1,155 +1,202 @@
-"""From a model and a camera to a picture, and back to gradients: the one place that writes the
-order of the stages.
+"""From a model and a camera to an image, and back to gradients: the one place that writes the order
+of the stages.
 
-project -> pairs -> weights -> shade what is seen -> blend features -> U-Net
+project -> pairs -> blend weights -> shade the points that contribute -> blend features -> U-Net
 """
 
-import numpy as np
+from __future__ import annotations
 
+from collections.abc import Hashable
+from dataclasses import dataclass
+
+import numpy as np
+from pyopencl.array import Array
+
+from pp_cl.config import RasterConfig
+from pp_cl.device.buffers import Buffers, Table
+from pp_cl.model import Model
 from pp_cl.raster.blend import BACKGROUND, Blend
-from pp_cl.raster.blend_weights import Weights
+from pp_cl.raster.blend_weights import BlendWeights, PixelWeights
 from pp_cl.raster.pair_cache import PairCache
-from pp_cl.raster.pairs import Pairs
-from pp_cl.raster.project import Footprint, Projection
+from pp_cl.raster.pairs import PairBuilder, Pairs
+from pp_cl.raster.project import Footprint, ProjectedPoints, Projection
 from pp_cl.raster.shade import shade_forward
+from pp_cl.scene.camera import Camera
 
 NETWORK_MULTIPLE = 4  # the U-Net halves its input twice
-WEIGHING = ("project", "pairs", "weights")  # the stages that need no features
-# far - near of the scenes for which the paper's radius of 0.0015 was chosen
-PAPER_DEPTH_RANGE = 4.0
+PAPER_DEPTH_RANGE = (
+    4.0  # far - near of the scenes for which the paper's radius of 0.0015 was chosen
+)
+
+
+@dataclass(frozen=True)
+class ViewWeights:
+    """Which points contribute to a view, and how much; valid until the next view is weighed.
+
+    offset: (left, top) of the view in its padded image of H x W pixels. points: the N points in the
+    padded camera.
+    """
+
+    offset: tuple[int, int]
+    points: ProjectedPoints
+    pairs: Pairs
+    weights: PixelWeights
+
+    @property
+    def camera_buffer(self) -> Array:
+        """(20,) float32, the padded camera, cl/camera.h."""
+        return self.points.camera_buffer
+
+    @property
+    def shaded(self) -> Array:
+        """(S,) uint32, ascending: the points that contribute."""
+        return self.weights.shaded
+
+
+@dataclass(frozen=True)
+class RasterResult(ViewWeights):
+    """ViewWeights with the points' features (N, 16), of which the rows `shaded` are set, and the
+    features blended of them, (H, W, 16); float32.
+    """
+
+    point_features: Array
+    features: Array
+
+
+@dataclass(frozen=True)
+class RenderResult(RasterResult):
+    """A RasterResult with the image that the network made of it, (H, W, 3) float32, unclamped."""
+
+    image: Array
 
 
 class Renderer:
-    """Renders a model; holds what the backward pass needs of the last forward pass.
+    """Renders a model. Its buffers are reused from view to view.
 
-    settings: config.RasterConfig. cache: keeps the hits of views with a key. offset: (left, top) of
-    the asked-for picture in the padded one. camera: (20,) device buffer of the padded camera.
+    cache_bytes: device memory for the pairs of views that repeat (PairCache).
     """
 
-    def __init__(self, dev, model, settings):
+    def __init__(self, dev, model: Model, settings: RasterConfig, cache_bytes: int = 0):
         self.dev = dev
         self.model = model
         self.settings = settings
-        self.footprint = Footprint(settings.footprint)
-        self.projection = Projection(dev, self.footprint)
-        self.pairs = Pairs(dev, self.footprint)
-        self.cache = PairCache(dev)
-        self.weights = Weights(dev)
-        self.blend = Blend(dev, self.footprint, mean=settings.mean_gradient)
-        self.offset = (0, 0)
-        self.camera, self.radius_buffer = dev.empty((20,)), dev.empty((1,))
-        self._count = self._size = None
+        self.cache = PairCache(dev, cache_bytes)
+        footprint = Footprint(settings.footprint)
+        self._projection = Projection(dev, footprint)
+        self._pairs = PairBuilder(dev, footprint)
+        self._weights = BlendWeights(dev)
+        self._blend = Blend(dev, footprint, settings.mean_gradient)
+        self._buffers = Buffers(dev)
 
-    def forward(self, camera, gamma, dropout=0.0, seed=0, training=False, key=None):
-        """(H, W, 3) device array, unclamped, of the camera padded to a multiple of 4; see `offset`.
-
-        dropout: share of the points left out, at random by `seed`. training: keep what backward()
-        needs. key: of a view whose camera and points are the same in every call until
-        cache.clear(), so that its hits may be kept.
-        """
-        for stage in self.stages(camera, gamma, dropout, seed, key).values():
-            stage()
-        return self.model.net.forward(self.features, training, BACKGROUND)
-
-    def blend_weights(self, camera, gamma):
-        """The first stages of forward(): who covers which pixel, and how much."""
-        stages = self.stages(camera, gamma)
-        for name in WEIGHING:
-            stages[name]()
-
-    def stages(self, camera, gamma, dropout=0.0, seed=0, key=None):
-        """{name: function} of forward()'s stages from the points to self.features (H, W, 16), in
-        their order.
-        """
-        padded, *self.offset = camera.padded(NETWORK_MULTIPLE)
-        size = (padded.height, padded.width)
-        self._allocate(*size)
-        self.camera.set(padded.packed())
-        points, settings, pairs, weights = (
-            self.model.points,
-            self.settings,
-            self.pairs,
-            self.weights,
-        )
-        radius = self._radius(padded)
-        self.radius_buffer.set(np.array([radius], np.float32))
-        sh = [points[block.name] for block in self.model.blocks]
+    @staticmethod
+    def table(n: int, height: int, width: int) -> Table:
+        """The renderer's own buffers for n points and a padded image."""
         return {
-            "project": lambda: self.projection.grid(
-                self.camera, self.model.grid_buffer, points["ids"], radius, dropout, seed
-            ),
-            "pairs": lambda: self.cache.build(
-                key, pairs, self.camera, size, self.projection, self.radius_buffer
-            ),
-            "weights": lambda: weights.weigh(
-                pairs,
-                self.camera,
-                points["opacity"],
-                gamma,
-                settings.max_tracked,
-                settings.early_stop,
-                settings.tau,
-            ),
-            "shade": lambda: shade_forward(
-                self.dev,
-                self.camera,
-                self.projection.point_camera,
-                weights.kept,
-                sh,
-                self.point_features,
-            ),
-            "blend": lambda: self.blend.forward(pairs, self.point_features, self.features),
+            "camera_buffer": ((20,), np.float32),
+            "point_radius": ((1,), np.float32),
+            "point_features": ((n, 16), np.float32),
+            "features": ((height, width, 16), np.float32),
         }
 
-    def backward(self, grad_image):
-        """(grad_point_features (N,16), grad_opacity (N)) from the gradient of forward()'s picture.
+    def forward(
+        self, camera: Camera, gamma: float, *, training: bool = False, **options
+    ) -> RenderResult:
+        """Render a camera. training: keep what backward() needs. options: of rasterise()."""
+        raster = self.rasterise(camera, gamma, **options)
+        with self.dev.stage("network"):
+            image = self.model.net.forward(raster.features, training, BACKGROUND)
+        return RenderResult(**vars(raster), image=image)
 
-        The gradients of the network's parameters lie in model.net.gradients; those of the SH
-        coefficients are rank one in grad_point_features, and the optimiser never forms them.
+    def rasterise(self, camera: Camera, gamma: float, **options) -> RasterResult:
+        """The blended features of a camera. options: of weigh()."""
+        view, cloud, b = self.weigh(camera, gamma, **options), self.model.cloud, self._buffers
+        with self.dev.stage("shade"):
+            shade_forward(self.dev, view.points, view.shaded, cloud.sh, b.point_features)
+        with self.dev.stage("blend"):
+            self._blend.forward(view.pairs, view.weights, b.point_features, b.features)
+        return RasterResult(**vars(view), point_features=b.point_features, features=b.features)
+
+    def weigh(
+        self,
+        camera: Camera,
+        gamma: float,
+        *,
+        dropout: float = 0.0,
+        seed: int = 0,
+        key: Hashable = None,
+        tau: float | None = None,
+    ) -> ViewWeights:
+        """The blend weights of a camera, which is padded to multiples of 4 pixels.
+
+        dropout: share of the points left out, at random by `seed`. key: names a view whose camera
+        and points are the same in every call until cache.clear(), so that its pairs may be cached.
+        tau: instead of the settings'.
         """
-        return self.backward_features(self.model.net.backward(grad_image))
+        cloud, settings, b = self.model.cloud, self.settings, self._buffers
+        padded, *offset = camera.padded(NETWORK_MULTIPLE)
+        size = (padded.height, padded.width)
+        b.require(self.table(cloud.count, *size))
+        b.camera_buffer.set(padded.packed())
+        b.point_radius.set(np.array([self._radius(padded)], np.float32))
+        with self.dev.stage("project"):
+            points = self._projection.grid(
+                b.camera_buffer,
+                self.model.grid_buffer,
+                cloud.ids,
+                b.point_radius,
+                dropout=dropout,
+                seed=seed,
+            )
+        with self.dev.stage("pairs"):
+            pairs = self.cache.get(key, lambda: self._pairs.build(points, size))
+        with self.dev.stage("weights"):
+            weights = self._weights.compute(
+                pairs,
+                b.camera_buffer,
+                cloud.opacity,
+                gamma,
+                max_tracked=settings.max_tracked,
+                early_stop=settings.early_stop,
+                tau=settings.tau if tau is None else tau,
+            )
+        return ViewWeights(tuple(offset), points, pairs, weights)
 
-    def backward_features(self, grad_features):
-        """The same from the gradient of self.features (H, W, 16)."""
-        self.blend.backward(
-            self.pairs,
-            self.weights.pair_weight,
-            self.point_features,
-            self.features,
-            grad_features,
-            self.grad_point_features,
-            self.grad_opacity,
-        )
-        return self.grad_point_features, self.grad_opacity
+    def backward(self, result: RenderResult, grad_image: Array) -> tuple[Array, Array]:
+        """(grad_point_features (N, 16), grad_opacity (N,)) from dL/dimage of result.image.
 
-    def add_point_weights(self, total):
-        """Add each point's blend weight in the last picture to total (N)."""
-        self.weights.add_point_weights(self.pairs, total)
+        result: the last one of forward(training=True). The gradients of the network's parameters
+        are in model.net.gradients; those of the SH coefficients are rank one in
+        grad_point_features, and the optimiser never forms them.
+        """
+        with self.dev.stage("network backward"):
+            grad_features = self.model.net.backward(grad_image)
+        return self.backward_features(result, grad_features)
 
-    def picture(self, camera, gamma):
-        """(H, W, 3) float32 numpy picture of the camera, clamped to [0, 1]."""
-        image = self.forward(camera, gamma).get()
-        left, top = self.offset
-        return np.clip(image[top : top + camera.height, left : left + camera.width], 0, 1)
+    def backward_features(self, result: RasterResult, grad_features: Array) -> tuple[Array, Array]:
+        """The same from dL/dfeatures (H, W, 16) of result.features."""
+        with self.dev.stage("backward"):
+            gradient = self._blend.gradient(
+                result.pairs, result.weights, result.point_features, result.features, grad_features
+            )
+            return self._blend.backward(gradient)
+
+    def add_point_weights(self, view: ViewWeights, total: Array) -> None:
+        """Add each point's blend weights, summed over the view's pixels, to total (N,) float32."""
+        self._weights.add_to_points(view.pairs, view.weights, total)
+
+    def dropped_weights(self, view: ViewWeights) -> Array:
+        """(HW,) float32: the blend weight that tau dropped from each pixel, or a bound above it."""
+        return self._weights.dropped(view.pairs, view.weights)
+
+    def render(self, camera: Camera, gamma: float, **options) -> np.ndarray:
+        """(H, W, 3) float32 numpy image of the camera, clamped to [0, 1]. options: of weigh()."""
+        result = self.forward(camera, gamma, **options)
+        left, top = result.offset
+        image = result.image.get()[top : top + camera.height, left : left + camera.width]
+        return np.clip(image, 0, 1)
 
     def _radius(self, camera):
-        """The points' radius in world units for a camera."""
+        """The points' radius in world units."""
         if self.settings.footprint == "soft":
             return self.settings.radius * self.model.grid.edge
         return self.settings.radius * (camera.far - camera.near) / PAPER_DEPTH_RANGE
-
-    def _allocate(self, height, width):
-        """Buffers for the model's present number of points and this size."""
-        n = self.model.count
-        if n != self._count:
-            self._count = n
-            # released first
-            self.point_features = self.grad_point_features = self.grad_opacity = None
-            self.point_features = self.dev.empty((n, 16))
-            self.grad_point_features, self.grad_opacity = (
-                self.dev.empty((n, 16)),
-                self.dev.empty((n,)),
-            )
-        if (height, width) != self._size:
-            self._size = (height, width)
-            self.features = self.dev.empty((height, width, 16))

@@ -67,7 +67,7 @@ class Trainer:
         self.target.load(view)
         target = self.target.crop(*box, phase)
 
-        image = self.renderer.forward(
+        rendered = self.renderer.forward(
             camera,
             gamma(t, config.iterations, *self.gamma),
             dropout=config.dropout,
@@ -75,13 +75,17 @@ class Trainer:
             training=True,
             key=view_index if self.views_stay() else None,
         )
-        grad_image = self.loss.forward_backward(image, target, *self.renderer.offset)
-        grads = self.renderer.backward(grad_image)
-        kept = self.renderer.weights.kept
+        grad_image = self.loss.forward_backward(rendered.image, target, *rendered.offset)
+        grads = self.renderer.backward(rendered, grad_image)
         self.optimiser.update(
-            t + 1, rates, grads, self.renderer.camera, config.sh_eps / target.size, kept
+            t + 1,
+            rates,
+            grads,
+            rendered.camera_buffer,
+            config.sh_eps / target.size,
+            rendered.shaded,
         )
-        self.renderer.add_point_weights(self.model.points["weight"])
+        self.renderer.add_point_weights(rendered, self.model.points["weight"])
 
         self.step = t + 1
         self._regularise(rates)
@@ -180,8 +184,8 @@ class Trainer:
         if self.config.final_prune_weight > 0:
             total = self.dev.zeros((self.model.count,))
             for view in self.views:
-                self.renderer.blend_weights(reduced_camera(view, self.downscale), self.gamma[1])
-                self.renderer.add_point_weights(total)
+                weights = self.renderer.weigh(reduced_camera(view, self.downscale), self.gamma[1])
+                self.renderer.add_point_weights(weights, total)
             self._prune(total, self.config.final_prune_weight)
         self.model.points = {name: self.model.points[name] for name in ("ids", *self.model.keys)}
 
@@ -191,7 +195,7 @@ class Trainer:
 
     def picture(self, view):
         """(H,W,3) float32 in [0, 1]: the present model's picture of a view."""
-        return self.renderer.picture(
+        return self.renderer.render(
             reduced_camera(view, self.downscale),
             gamma(self.step, self.config.iterations, *self.gamma),
         )

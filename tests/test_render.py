@@ -14,7 +14,6 @@ from support.networks import plain_parameters
 from support.scenes import ring_cameras
 
 from pp_cl.config import RasterConfig
-from pp_cl.raster.sh import SH_BLOCKS
 from pp_cl.render import PAPER_DEPTH_RANGE, Renderer
 
 GAMMA = 0.03
@@ -25,12 +24,10 @@ def chained(model, settings, camera, opacity=None, sh=None, tracked=0):
     of the padded camera.
     """
     padded, _, _ = camera.padded(4)
-    positions = GRID.positions(model.points["ids"].get())
-    opacity = model.points["opacity"].get().astype(np.float64) if opacity is None else opacity
+    positions = GRID.positions(model.cloud.ids.get())
+    opacity = model.cloud.opacity.get().astype(np.float64) if opacity is None else opacity
     sh = (
-        np.concatenate([model.points[block.name].get() for block in SH_BLOCKS], 1).astype(
-            np.float64
-        )
+        np.concatenate([array.get() for array in model.cloud.sh], 1).astype(np.float64)
         if sh is None
         else sh
     )
@@ -91,12 +88,13 @@ def test_picture_and_gradients(dev, rng, name):
     settings = SETTINGS[name]
     model, camera = make_model(dev, rng), ring_cameras(1, 30)[0].crop(3, 4, 22, 17)
     renderer = Renderer(dev, model, settings)
-    picture = renderer.forward(camera, GAMMA, training=True).get()
+    result = renderer.forward(camera, GAMMA, training=True)
+    picture = result.image.get()
     expected, backward = chained(model, settings, camera, tracked=settings.max_tracked)
     assert picture.shape == (20, 24, 3) and relative_error(picture, expected) < 1e-5
 
     grad = rng.normal(size=picture.shape).astype(np.float32)
-    grad_features, grad_opacity = renderer.backward(dev.upload(grad))
+    grad_features, grad_opacity = renderer.backward(result, dev.upload(grad))
     want_features, want_opacity, _, want_net = backward(grad)
     assert np.abs(want_features).max() > 0 and np.abs(want_opacity).max() > 0
     assert relative_error(grad_features.get(), want_features) < 5e-5
@@ -111,10 +109,8 @@ def test_the_chain_is_the_derivative(dev, rng):
     grad = rng.normal(size=(12, 12, 3))
     _, backward = chained(model, settings, camera)
     _, grad_opacity, grad_sh, _ = backward(grad)
-    opacity = model.points["opacity"].get().astype(np.float64)
-    sh = np.concatenate([model.points[block.name].get() for block in SH_BLOCKS], 1).astype(
-        np.float64
-    )
+    opacity = model.cloud.opacity.get().astype(np.float64)
+    sh = np.concatenate([array.get() for array in model.cloud.sh], 1).astype(np.float64)
 
     def loss(o, s):
         return (chained(model, settings, camera, o, s)[0] * grad).sum()
@@ -138,12 +134,12 @@ def test_padding_does_not_move_the_picture(dev, rng):
     """
     model, camera = make_model(dev, rng), ring_cameras(1, 32)[0]
     renderer = Renderer(dev, model, RasterConfig())
-    renderer.forward(camera, GAMMA)
-    whole = renderer.features.get()
+    whole = renderer.rasterise(camera, GAMMA).features.get()
     odd = camera.crop(5, 7, 21, 19)
-    assert renderer.picture(odd, GAMMA).shape == (19, 21, 3)
-    left, top = renderer.offset
-    inner = renderer.features.get()[top : top + 19, left : left + 21]
+    assert renderer.render(odd, GAMMA).shape == (19, 21, 3)
+    result = renderer.rasterise(odd, GAMMA)
+    left, top = result.offset
+    inner = result.features.get()[top : top + 19, left : left + 21]
     np.testing.assert_allclose(inner, whole[7:26, 5:26], atol=2e-5)
 
 
@@ -151,22 +147,21 @@ def test_an_empty_view_is_the_background(dev, rng):
     model, camera = make_model(dev, rng), ring_cameras(1, 16)[0]
     away = replace(camera, pose=camera.pose * [-1, 1, -1, 1])  # turned round
     renderer = Renderer(dev, model, RasterConfig())
-    picture = renderer.forward(away, GAMMA, training=True).get()
-    np.testing.assert_array_equal(renderer.features.get(), np.ones((16, 16, 16), np.float32))
-    assert np.isfinite(picture).all()
-    grad_features, grad_opacity = renderer.backward(dev.upload(np.ones((16, 16, 3), np.float32)))
+    result = renderer.forward(away, GAMMA, training=True)
+    np.testing.assert_array_equal(result.features.get(), np.ones((16, 16, 16), np.float32))
+    assert np.isfinite(result.image.get()).all()
+    grad_features, grad_opacity = renderer.backward(
+        result, dev.upload(np.ones((16, 16, 3), np.float32))
+    )
     assert not grad_features.get().any() and not grad_opacity.get().any()
 
 
 def test_dropout_leaves_out_its_share_and_pictures_are_repeatable(dev, rng):
     model, camera = make_model(dev, rng, 300), ring_cameras(1, 32)[0]
     renderer = Renderer(dev, model, RasterConfig())
-    renderer.forward(camera, GAMMA)
-    everyone = renderer.pairs.seen.size
-    renderer.forward(camera, GAMMA, dropout=0.5, seed=1)
-    assert 0.35 * everyone < renderer.pairs.seen.size < 0.65 * everyone
-    first = renderer.picture(camera, GAMMA)
-    np.testing.assert_array_equal(first, renderer.picture(camera, GAMMA))
-    np.testing.assert_array_equal(
-        first, Renderer(dev, model, RasterConfig()).picture(camera, GAMMA)
-    )
+    everyone = renderer.weigh(camera, GAMMA).pairs.seen.size
+    some = renderer.weigh(camera, GAMMA, dropout=0.5, seed=1).pairs.seen.size
+    assert 0.35 * everyone < some < 0.65 * everyone
+    first = renderer.render(camera, GAMMA)
+    np.testing.assert_array_equal(first, renderer.render(camera, GAMMA))
+    np.testing.assert_array_equal(first, Renderer(dev, model, RasterConfig()).render(camera, GAMMA))

@@ -1,15 +1,19 @@
-// Eq. (1) of the PlenopticPoints supplemental: features blended by the weights of weights.cl, and
-// gradients by gathering.
+// Eq. (1) of the PlenopticPoints supplemental: features blended by the weights of blend_weights.cl,
+// and gradients by gathering.
 //
-// F = sum b_i f_i + b_0 * 1,  dL/df_i = sum b_i G,  dL/do_i = sum G.(f_i - F) b_i (1/o_i +
-// z_i/gamma)  with G = dL/dF
+// F = sum b_i f_i + b_0 * 1
+// dL/df_i = sum b_i G,  dL/do_i = sum G.(f_i - F) b_i (1/o_i + z_i/gamma)  with G = dL/dF
 //
 // vec_type_hint: the vectors are written out; Intel's compiler would merge work-items into wider
 // ones, up to 8 times slower.
 #include "common.h"
 #include "raster/footprint.h"
+#include "raster/pair_role.h"
 #include "reduce.h"
 
+#ifndef HAS_ROLES
+#define HAS_ROLES 1  // 0: every pair is tracked, and pair_role is not read
+#endif
 #ifndef MEAN
 #define MEAN 0  // 1: gradients are divided by the number of pixels that track the point (Pulsar)
 #endif
@@ -18,7 +22,7 @@
 kernel void blend_forward(
     const uint hw,                         // pixels
     global const uint *pixel_offset,       // (HW+1)
-    global const ulong *hit,               // (P) weight << 32 | point; no point: the list ends
+    global const ulong *pixel_entry,       // (P) weight << 32 | point; no point: the list ends
     global const float16 *point_features,  // (N, 16)
     global float16 *features)              // (H, W, 16)
 {
@@ -26,9 +30,9 @@ kernel void blend_forward(
     if (q >= hw) return;
     float16 sum = 0.0f;
     float weights = 0.0f;
-    for (uint i = pixel_offset[q]; i < pixel_offset[q + 1] && (uint)hit[i] != NONE; i++) {
-        const float b = as_float((uint)(hit[i] >> 32));
-        sum += b * point_features[(uint)hit[i]];
+    for (uint i = pixel_offset[q]; i < pixel_offset[q + 1] && (uint)pixel_entry[i] != NONE; i++) {
+        const float b = as_float((uint)(pixel_entry[i] >> 32));
+        sum += b * point_features[(uint)pixel_entry[i]];
         weights += b;
     }
     // the background's features are 1, its weight is what is left
@@ -55,6 +59,7 @@ kernel __attribute__((vec_type_hint(float16))) void blend_backward(
     global const uint *point_offset,       // (N+1)
     global const uint *pair_pixel,         // (P)
     global const float2 *pair_weight,      // (P, 2)
+    global const uchar *pair_role,         // (?) P with HAS_ROLES
     global const float16 *grad_features,   // (H, W, 16) G
     global const float *pixel_dot,         // (HW) G.F
     global float16 *grad_point_features,   // (N, 16)
@@ -66,8 +71,8 @@ kernel __attribute__((vec_type_hint(float16))) void blend_backward(
     float dL_do = 0.0f;
     uint tracked = 0;
     for (uint pair = point_offset[i]; pair < point_offset[i + 1]; pair++) {
+        if (HAS_ROLES && pair_role[pair] != TRACKED) continue;
         const float2 weight = pair_weight[pair];
-        if (signbit(weight.x)) continue;
         const uint q = pair_pixel[pair];
         const float16 G = grad_features[q];
         dL_df += weight.x * G;
@@ -82,27 +87,28 @@ kernel __attribute__((vec_type_hint(float16))) void blend_backward(
 // One work-item per point: reads what blend_backward reads, writes dL/dl and dL/dd = dL/dl / d of
 // its pairs (see the top).
 kernel void blend_backward_pairs(
-    const uint n,                          // points
-    global const float16 *point_features,  // (N, 16)
-    global const uint *point_offset,       // (N+1)
-    global const uint *pair_pixel,         // (P)
-    global const float2 *pair_weight,      // (P, 2)
-    global const float16 *grad_features,   // (H, W, 16) G
-    global const float *pixel_dot,         // (HW) G.F
-    global const uint2 *pair_source,       // (P, 2) point, bits of d
-    global float2 *grad_pair)              // (P, 2) dL/dl, dL/dd
+    const uint n,                              // points
+    global const float16 *point_features,      // (N, 16)
+    global const uint *point_offset,           // (N+1)
+    global const uint *pair_pixel,             // (P)
+    global const float2 *pair_weight,          // (P, 2)
+    global const uchar *pair_role,             // (?) P with HAS_ROLES
+    global const float16 *grad_features,       // (H, W, 16) G
+    global const float *pixel_dot,             // (HW) G.F
+    global const uint2 *pair_point_closeness,  // (P, 2) point, bits of d
+    global float2 *grad_pair)                  // (P, 2) dL/dl, dL/dd
 {
     const uint i = get_global_id(0);
     if (i >= n) return;
     uint tracked = 0;
     for (uint pair = point_offset[i]; pair < point_offset[i + 1]; pair++)
-        tracked += !signbit(pair_weight[pair].x);
+        tracked += !HAS_ROLES || pair_role[pair] == TRACKED;
     const float scale = MEAN && tracked ? 1.0f / tracked : 1.0f;
     for (uint pair = point_offset[i]; pair < point_offset[i + 1]; pair++) {
         const uint q = pair_pixel[pair];
-        const float b = pair_weight[pair].x, d = as_float(pair_source[pair].y);
+        const float b = pair_weight[pair].x, d = as_float(pair_point_closeness[pair].y);
         float dL_dl = 0.0f;
-        if (!signbit(b))
+        if (!HAS_ROLES || pair_role[pair] == TRACKED)
             dL_dl = scale * b * (dot16(grad_features[q], point_features[i]) - pixel_dot[q]);
         grad_pair[pair] = (float2)(dL_dl, d > 0.0f ? dL_dl / d : 0.0f);
     }
@@ -111,11 +117,11 @@ kernel void blend_backward_pairs(
 // One work-item per sphere: reads the gradients of its pairs, writes those of its position and
 // radius.
 kernel void blend_backward_spheres(
-    const uint n,  // spheres
-    const uint k,  // radii: 1 (all alike) or n
+    const uint n,      // spheres
+    const uint radii,  // 1 (all alike) or n
     const float gamma,
     global const float *camera,         // (20) camera.h
-    global const float *point_radius,   // (K)
+    global const float *point_radius,   // (radii)
     global const float4 *point_camera,  // (N, 4) x, y, z, t
     global const float *opacity,        // (N)
     global const uint *point_offset,    // (N+1)
@@ -126,14 +132,14 @@ kernel void blend_backward_spheres(
 {
     const uint i = get_global_id(0);
     if (i >= n) return;
-    const Camera view = camera_load(camera);
-    const Footprint f = footprint_load(&view, point_camera[i], point_radius[k == 1 ? 0 : i]);
-    const float dl_ddepth = -opacity[i] / (gamma * (view.far - view.near));
+    const Camera cam = camera_load(camera);
+    const Footprint f = footprint_load(&cam, point_camera[i], point_radius[radii == 1 ? 0 : i]);
+    const float dl_ddepth = -opacity[i] / (gamma * (cam.far - cam.near));
     float3 dL_dc = 0.0f;
     float dL_dR = 0.0f;
     for (uint pair = point_offset[i]; pair < point_offset[i + 1]; pair++) {
         const uint q = pair_pixel[pair];
-        const float3 ray = camera_ray(&view, q % view.width, q / view.width);
+        const float3 ray = camera_ray(&cam, q % cam.width, q / cam.width);
         const float3 delta = f.centre - f.t * ray;
         const float rho = length(delta);
         const float along = fmin(dot(f.centre, ray), f.t);
@@ -156,6 +162,6 @@ kernel void blend_backward_spheres(
             dL_dR += dL_dd * rho / (f.radius * f.radius);
         }
     }
-    vstore3(dL_dc.x * view.right + dL_dc.y * view.down + dL_dc.z * view.forward, i, grad_positions);
+    vstore3(dL_dc.x * cam.right + dL_dc.y * cam.down + dL_dc.z * cam.forward, i, grad_positions);
     grad_radius[i] = dL_dR;
 }

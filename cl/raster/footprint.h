@@ -33,13 +33,13 @@ typedef struct {
 } Footprint;
 
 // Width of a pixel at range t; the smaller focal length has the wider pixels.
-static inline float pixel_width(const Camera *k, const float t) {
-    return t / fmin(k->fx, k->fy);
+static inline float pixel_width(const Camera *cam, const float t) {
+    return t / fmin(cam->fx, cam->fy);
 }
 
-ALWAYS_INLINE Footprint footprint_load(const Camera *k, const float4 point, const float radius) {
+ALWAYS_INLINE Footprint footprint_load(const Camera *cam, const float4 point, const float radius) {
     Footprint f;
-    const float width = pixel_width(k, point.w);
+    const float width = pixel_width(cam, point.w);
     f.centre = point.xyz;
     f.t = point.w;
     f.radius = radius;
@@ -51,7 +51,7 @@ ALWAYS_INLINE Footprint footprint_load(const Camera *k, const float4 point, cons
 // Tests the 4 x 4 pixels from (x, y) on that lie in the box: bit 4 j + i of the result is pixel (x
 // + i, y + j).
 ALWAYS_INLINE uint footprint_block(
-    const Camera *k,
+    const Camera *cam,
     const Footprint *f,
     const int4 box,
     const int x,
@@ -62,7 +62,7 @@ ALWAYS_INLINE uint footprint_block(
 // there in another.
 #pragma OPENCL FP_CONTRACT OFF
     const float16 px = LANE_X + (float)x, py = LANE_Y + (float)y;
-    const float16 mx = (px + (0.5f - k->cx)) / k->fx, my = (py + (0.5f - k->cy)) / k->fy;
+    const float16 mx = (px + (0.5f - cam->cx)) / cam->fx, my = (py + (0.5f - cam->cy)) / cam->fy;
     // the unit ray is (mx, my, 1) * inverse
     const float16 inverse = 1.0f / sqrt(mx * mx + my * my + 1.0f);
     const float16 range = f->t * inverse;

@@ -12,9 +12,9 @@
 // One work-item per point: reads where it is, writes its number of hits.
 kernel __attribute__((vec_type_hint(float16))) void pairs_count(
     const uint n,                       // points
-    const uint k,                       // radii: 1 (all alike) or n
+    const uint radii,                   // 1 (all alike) or n
     global const float *camera,         // (20) camera.h
-    global const float *point_radius,   // (K)
+    global const float *point_radius,   // (radii)
     global const float4 *point_camera,  // (N, 4) x, y, z, t
     global const ushort4 *point_box,    // (N, 4) first x, first y, last x, last y
     global uint *point_count)           // (N)
@@ -24,12 +24,12 @@ kernel __attribute__((vec_type_hint(float16))) void pairs_count(
     const int4 box = convert_int4(point_box[i]);
     uint count = 0;
     if (box.x <= box.z) {
-        const Camera view = camera_load(camera);
-        const Footprint f = footprint_load(&view, point_camera[i], point_radius[k == 1 ? 0 : i]);
+        const Camera cam = camera_load(camera);
+        const Footprint f = footprint_load(&cam, point_camera[i], point_radius[radii == 1 ? 0 : i]);
         float16 closeness, depth;
         for (int y = box.y; y <= box.w; y += BLOCK_SIDE)
             for (int x = box.x; x <= box.z; x += BLOCK_SIDE)
-                count += popcount(footprint_block(&view, &f, box, x, y, &closeness, &depth));
+                count += popcount(footprint_block(&cam, &f, box, x, y, &closeness, &depth));
     }
     point_count[i] = count;
 }
@@ -37,37 +37,37 @@ kernel __attribute__((vec_type_hint(float16))) void pairs_count(
 // One work-item per point: finds its hits again, writes them as pairs and counts them at their
 // pixels.
 kernel __attribute__((vec_type_hint(float16))) void pairs_fill(
-    const uint n,                       // points
-    const uint k,                       // radii: 1 (all alike) or n
-    global const float *camera,         // (20) camera.h
-    global const float *point_radius,   // (K)
-    global const float4 *point_camera,  // (N, 4) x, y, z, t
-    global const ushort4 *point_box,    // (N, 4) first x, first y, last x, last y
-    global const uint *point_offset,    // (N+1) first pair of each point
-    global uint *pair_pixel,            // (P)
-    global uint2 *pair_source,          // (P, 2) point, bits of d in [0, 1]
-    global ulong *pair_place,           // (P) depth << 32 | place in the list of the pixel
-    global volatile uint *pixel_count)  // (HW) accumulates
+    const uint n,                        // points
+    const uint radii,                    // 1 (all alike) or n
+    global const float *camera,          // (20) camera.h
+    global const float *point_radius,    // (radii)
+    global const float4 *point_camera,   // (N, 4) x, y, z, t
+    global const ushort4 *point_box,     // (N, 4) first x, first y, last x, last y
+    global const uint *point_offset,     // (N+1) first pair of each point
+    global uint *pair_pixel,             // (P)
+    global uint2 *pair_point_closeness,  // (P, 2) point, bits of d in [0, 1]
+    global ulong *pair_place,            // (P) depth << 32 | place in the list of the pixel
+    global volatile uint *pixel_count)   // (HW) accumulates
 {
     const uint i = get_global_id(0);
     if (i >= n) return;
     uint pair = point_offset[i];
     if (pair == point_offset[i + 1]) return;
-    const Camera view = camera_load(camera);
-    const Footprint f = footprint_load(&view, point_camera[i], point_radius[k == 1 ? 0 : i]);
+    const Camera cam = camera_load(camera);
+    const Footprint f = footprint_load(&cam, point_camera[i], point_radius[radii == 1 ? 0 : i]);
     const int4 box = convert_int4(point_box[i]);
     for (int y = box.y; y <= box.w; y += BLOCK_SIDE)
         for (int x = box.x; x <= box.z; x += BLOCK_SIDE) {
             float16 closeness, depth;
             float lane_closeness[16], lane_depth[16];
-            uint hits = footprint_block(&view, &f, box, x, y, &closeness, &depth);
+            uint hits = footprint_block(&cam, &f, box, x, y, &closeness, &depth);
             vstore16(closeness, 0, lane_closeness);
             vstore16(depth, 0, lane_depth);
             for (; hits; hits &= hits - 1, pair++) {
                 const int lane = 31 - clz(hits & -hits);
-                const uint pixel = (y + lane / BLOCK_SIDE) * view.width + x + lane % BLOCK_SIDE;
+                const uint pixel = (y + lane / BLOCK_SIDE) * cam.width + x + lane % BLOCK_SIDE;
                 pair_pixel[pair] = pixel;
-                pair_source[pair] = (uint2)(i, as_uint(lane_closeness[lane]));
+                pair_point_closeness[pair] = (uint2)(i, as_uint(lane_closeness[lane]));
                 pair_place[pair] =
                     upsample(as_uint(lane_depth[lane]), atomic_inc(&pixel_count[pixel]));
             }

@@ -4,7 +4,9 @@
 #include "grid.h"
 #include "raster/footprint.h"
 
+#ifndef LANES
 #define LANES 16  // points of a work-item, one lane each: one by one, a CPU's vectors stay empty
+#endif
 
 // Least cosine between a point's direction and the optical axis (Pulsar): nothing behind or beside
 // the eye.
@@ -48,7 +50,7 @@ ALWAYS_INLINE void tangents(
 // the sphere's front, as in Pulsar), behind the eye, or not finite, for which every comparison is
 // false.
 ALWAYS_INLINE void project(
-    const Camera *k,
+    const Camera *cam,
     const float16 x,
     const float16 y,
     const float16 z,
@@ -57,23 +59,23 @@ ALWAYS_INLINE void project(
     const uint count,
     global float4 *point_camera,
     global ushort4 *point_box) {
-    const float16 vx = x - k->eye.x, vy = y - k->eye.y, vz = z - k->eye.z;
-    const float16 cx = k->right.x * vx + k->right.y * vy + k->right.z * vz;
-    const float16 cy = k->down.x * vx + k->down.y * vy + k->down.z * vz;
-    const float16 cz = k->forward.x * vx + k->forward.y * vy + k->forward.z * vz;
+    const float16 vx = x - cam->eye.x, vy = y - cam->eye.y, vz = z - cam->eye.z;
+    const float16 cx = cam->right.x * vx + cam->right.y * vy + cam->right.z * vz;
+    const float16 cy = cam->down.x * vx + cam->down.y * vy + cam->down.z * vz;
+    const float16 cz = cam->forward.x * vx + cam->forward.y * vy + cam->forward.z * vz;
     const float16 t = sqrt(cx * cx + cy * cy + cz * cz);
     const float16 front = t - radius;
     const int16 kept =
-        wanted & (front >= k->near) & (front <= k->far) & (t > 0.0f) & (cz >= LEAST_COSINE * t);
+        wanted & (front >= cam->near) & (front <= cam->far) & (t > 0.0f) & (cz >= LEAST_COSINE * t);
     const float16 reach =
-        FOOTPRINT == SPHERE ? radius : fmax(radius, LEAST_RADIUS * t / fmin(k->fx, k->fy));
+        FOOTPRINT == SPHERE ? radius : fmax(radius, LEAST_RADIUS * t / fmin(cam->fx, cam->fy));
     int16 x0, y0, x1, y1;
-    tangents(cx, cz, reach, k->fx, k->cx, k->width, &x0, &x1);
-    tangents(cy, cz, reach, k->fy, k->cy, k->height, &y0, &y1);
+    tangents(cx, cz, reach, cam->fx, cam->cx, cam->width, &x0, &x1);
+    tangents(cy, cz, reach, cam->fy, cam->cy, cam->height, &y0, &y1);
     x0 = max(x0, (int16)(0));
     y0 = max(y0, (int16)(0));
-    x1 = min(x1, (int16)(k->width - 1));
-    y1 = min(y1, (int16)(k->height - 1));
+    x1 = min(x1, (int16)(cam->width - 1));
+    y1 = min(y1, (int16)(cam->height - 1));
     const int16 visible = kept & (x1 >= x0) & (y1 >= y0);
 
     float place[4][LANES];
@@ -96,20 +98,20 @@ ALWAYS_INLINE void project(
 // One work-item per 16 points: reads their grid indices, writes their camera-space positions and
 // distances, and their boxes.
 kernel __attribute__((vec_type_hint(float16))) void project_grid(
-    const uint n,                 // points
-    const float radius,           // of every point
-    const uint dropout,           // a point is left out where its random uint is below this
-    const uint seed,              // of the random uints
-    global const float *camera,   // (20) camera.h
-    global const float *grid,     // (8) grid.h
-    global const uint *point_id,  // (N)
-    global float4 *point_camera,  // (N, 4) x, y, z, t; t = -1: left out
+    const uint n,                      // points
+    const uint dropout,                // a point is left out where its random uint is below this
+    const uint seed,                   // of the random uints
+    global const float *camera,        // (20) camera.h
+    global const float *grid,          // (8) grid.h
+    global const uint *point_id,       // (N)
+    global const float *point_radius,  // (1) of every point
+    global float4 *point_camera,       // (N, 4) x, y, z, t; t = -1: left out
     global ushort4 *point_box)  // (N, 4) first x, first y, last x, last y; none where last < first
 {
     const uint first = get_global_id(0) * LANES;
     if (first >= n) return;
     const uint count = min((uint)LANES, n - first), stream = scramble(seed);
-    const Camera k = camera_load(camera);
+    const Camera cam = camera_load(camera);
     float x[LANES], y[LANES], z[LANES];
     int wanted[LANES];
     for (uint j = 0; j < LANES; j++) {
@@ -121,33 +123,33 @@ kernel __attribute__((vec_type_hint(float16))) void project_grid(
         wanted[j] = -(scramble(id + stream) >= dropout);
     }
     project(
-        &k, vload16(0, x), vload16(0, y), vload16(0, z), (float16)(radius), vload16(0, wanted),
-        count, point_camera + first, point_box + first);
+        &cam, vload16(0, x), vload16(0, y), vload16(0, z), (float16)(point_radius[0]),
+        vload16(0, wanted), count, point_camera + first, point_box + first);
 }
 
 // One work-item per 16 spheres: reads their positions and radii, writes the same as project_grid.
 kernel __attribute__((vec_type_hint(float16))) void project_spheres(
     const uint n,                      // spheres
-    const uint k,                      // radii: 1 (all alike) or n
+    const uint radii,                  // 1 (all alike) or n
     global const float *camera,        // (20) camera.h
     global const float *positions,     // (N, 3) world
-    global const float *point_radius,  // (K)
+    global const float *point_radius,  // (radii)
     global float4 *point_camera,       // (N, 4) x, y, z, t; t = -1: left out
     global ushort4 *point_box)  // (N, 4) first x, first y, last x, last y; none where last < first
 {
     const uint first = get_global_id(0) * LANES;
     if (first >= n) return;
     const uint count = min((uint)LANES, n - first);
-    const Camera view = camera_load(camera);
+    const Camera cam = camera_load(camera);
     float x[LANES], y[LANES], z[LANES], radius[LANES];
     for (uint j = 0; j < LANES; j++) {
         const uint i = first + min(j, count - 1);
         x[j] = positions[3 * i];
         y[j] = positions[3 * i + 1];
         z[j] = positions[3 * i + 2];
-        radius[j] = point_radius[k == 1 ? 0 : i];
+        radius[j] = point_radius[radii == 1 ? 0 : i];
     }
     project(
-        &view, vload16(0, x), vload16(0, y), vload16(0, z), vload16(0, radius), (int16)(-1), count,
+        &cam, vload16(0, x), vload16(0, y), vload16(0, z), vload16(0, radius), (int16)(-1), count,
         point_camera + first, point_box + first);
 }

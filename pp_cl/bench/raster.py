@@ -14,12 +14,13 @@ cl/bench/peak.cl once a round.
 """
 
 import math
+from collections import defaultdict
+from collections.abc import Iterator
 
 import numpy as np
 
 from pp_cl.bench.network import check_files, interleave, save_figure
 from pp_cl.bench.peak import Copy
-from pp_cl.bench.pulsar import pulsar_row
 from pp_cl.bench.raster_scenes import SCENES
 from pp_cl.device.discover import open_device
 from pp_cl.errors import UserError
@@ -33,77 +34,75 @@ DEFAULTS = {
     "tau": "0,1e-4,1e-3,1e-2",
     "gamma": "0.01",
 }
-COMMON = ("project", "pairs")  # the stages before tau has a say
 
 
-def bench_raster(dev, scene, points, sizes, taus, gamma):
-    """Rows for every number of points, side and tau; prints them."""
-    copy, rows = Copy(dev), []
+def bench_raster(
+    dev, scene: str, points: list[int], sizes: list[int], taus: list[float], gamma: float
+) -> Iterator[dict]:
+    """Yield a row for every number of points, side and tau. scene: a key of SCENES."""
+    copy = Copy(dev)
     for n in points:
         for size in sizes:
             before = dev.peak_bytes = dev.bytes
-            rows += _rows(dev, SCENES[scene](dev, n, size, gamma), taus, copy, before)
-    return rows
+            yield from _rows(dev, SCENES[scene](dev, n, size, gamma), taus, copy, before)
 
 
 def _rows(dev, bench, taus, copy, before):
     """Rows of one scene. before: device memory in use without it."""
-    runs = {
-        (None, name): _finished(dev, run) for name, run in bench.stages().items() if name in COMMON
-    }
+    stages_ms, copy_ms = _time(dev, bench, taus, copy)
+    copied = copy.bytes / copy_ms * 1e-6
+    exact = bench.forward(0.0).features.get()
+    feature_range, _ = (
+        bench.feature_range,
+        bench.covered_pixels,
+    )  # they rasterise, the loop does too
     for tau in taus:
-        runs |= {
-            (tau, name): _finished(dev, run, bench, tau)
-            for name, run in bench.stages().items()
-            if name not in COMMON
-        }
-    times = {key: float(np.median(ms)) for key, ms in interleave(runs | {"copy": copy.run}).items()}
-    copied = copy.bytes / times["copy"] * 1e-6
-    exact, rows = bench.features(0.0), []
-    feature_range = bench.feature_range()
-    for tau in taus:
-        features = bench.features(tau)
-        stages = {name: times.get((tau, name), times.get((None, name))) for name in bench.stages()}
-        moved = bench.moved()
-        forward = sum(ms for name, ms in stages.items() if name in bench.forward)
-        backward = sum(ms for name, ms in stages.items() if name not in bench.forward)
+        result, stages = bench.forward(tau), stages_ms[tau]
+        features, moved = result.features.get(), bench.moved_bytes(result, tau)
+        forward = sum(ms for name, ms in stages.items() if name in bench.forward_stages)
+        backward = sum(stages.values()) - forward
         gbs = sum(moved.values()) / (forward + backward) * 1e-6
-        rows.append(
-            {
-                "scene": bench.name,
-                "points": bench.count,
-                "size": bench.size,
-                "gamma": bench.gamma,
-                "tau": tau,
-                "pairs": bench.pairs.total,
-                "shaded": int(bench.weights.kept.size),
-                "forward_ms": forward,
-                "backward_ms": backward,
-                "stages_ms": stages,
-                "stages_bytes": moved,
-                "gbs": gbs,
-                "copy_gbs": copied,
-                "copy_share": gbs / copied,
-                "peak_device_bytes": dev.peak_bytes - before,
-                "max_err": bench.error(features),
-                "tau_err": float((np.abs(features - exact) / feature_range).max()),
-                "tau_bound": float(bench.weights.dropped(bench.pairs).get().max()),
-            }
-        )
-        print(line(rows[-1]), flush=True)
-    return rows
+        yield {
+            "scene": bench.name,
+            "points": bench.count,
+            "size": bench.size,
+            "gamma": bench.gamma,
+            "tau": tau,
+            "pairs": result.pairs.total,
+            "shaded": int(result.shaded.size),
+            "forward_ms": forward,
+            "backward_ms": backward,
+            "stages_ms": stages,
+            "stages_bytes": moved,
+            "gbs": gbs,
+            "copy_gbs": copied,
+            "copy_share": gbs / copied,
+            "peak_device_bytes": dev.peak_bytes - before,
+            "max_err": bench.error(features),
+            "tau_err": float((np.abs(features - exact) / feature_range).max()),
+            "tau_bound": float(bench.dropped_weights(result).max()),
+        }
 
 
-def _finished(dev, run, bench=None, tau=None):
-    """A function that sets tau, runs a stage and waits for it."""
+def _time(dev, bench, taus, copy):
+    """({tau: {stage: median milliseconds}}, milliseconds of the copy), all in turn."""
+    seconds = {tau: defaultdict(list) for tau in taus}
 
-    def finished():
-        if bench:
-            bench.tau = tau
-        run()
-        dev.finish()
+    def runner(tau):
+        def run():
+            with dev.timed_stages() as stages:
+                bench.backward(bench.forward(tau))
+            for name, values in stages.items():
+                seconds[tau][name] += values
 
-    return finished
+        return run
+
+    times = interleave({tau: runner(tau) for tau in taus} | {"copy": copy.run})
+    medians = {
+        tau: {name: float(np.median(values[1:])) * 1e3 for name, values in stages.items()}
+        for tau, stages in seconds.items()  # the first pass, which builds programs, does not count
+    }
+    return medians, float(np.median(times["copy"]))
 
 
 COLUMNS = "{:7} {:>8} {:>5} {:>7} {:>9} {:>9} {:>9} {:>5} {:>8} {:>8} {:>8}  {}".format
@@ -199,25 +198,21 @@ def run_raster(scene, points, size, tau, gamma, json_file=None, plot_file=None, 
     figure = check_files(json_file, plot_file)
     dev = open_device(device)
     print(f"{dev.name} [{dev.info['platform']}]\n{HEAD}")
-    rows = bench_raster(dev, scene, points, sizes, taus, gamma[0])
+    rows = []
+    for row in bench_raster(dev, scene, points, sizes, taus, gamma[0]):
+        rows.append(row)
+        print(line(row), flush=True)
     fitted = growth(rows)
     for fit in fitted:
         print(
             f"side {fit['size']}, tau {fit['tau']:g}: time grows as points^{fit['exponent']:.2f},"
             f" at most ^{fit['steepest']:.2f} from one number to the next"
         )
-    sides = sizes if scene == "pulsar" else ()
-    reference = [row for n in points for side in sides if (row := pulsar_row(n, side, gamma[0]))]
-    for row in reference:
-        print(
-            f"Pulsar (PyTorch3D, CPU): {row['points']} points, side {row['size']}: "
-            f"forward {row['forward_ms']:.1f} ms, backward {row['backward_ms']:.1f} ms"
-        )
     if json_file:
         result = {
             "device": dev.name,
             "platform": dev.info["platform"],
-            "rows": rows + reference,
+            "rows": rows,
             "growth": fitted,
         }
         write_json(json_file, result)

@@ -17,6 +17,11 @@ def table_bytes(table: Table) -> int:
     return sum(math.prod(shape) * np.dtype(dtype).itemsize for shape, dtype in table.values())
 
 
+def grown(capacity: int, needed: int) -> int:
+    """The capacity, or a quarter more than `needed` where that is more than it holds."""
+    return capacity if needed <= capacity else needed + needed // 4
+
+
 class Buffers:
     """The device arrays of one stage, as attributes named like the rows of its table.
 

@@ -1,95 +1,128 @@
-"""The blend of Eq. (1): features, and the gradients, by gathering."""
+"""The blend of Eq. (1): features of pixels, and gradients gathered by point."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from pyopencl.array import Array
+
+from pp_cl.device.buffers import Buffers, Table
+from pp_cl.raster.blend_weights import PixelWeights
+from pp_cl.raster.pairs import Pairs
+from pp_cl.raster.project import Footprint, ProjectedPoints
 
 BACKGROUND = 1.0  # every feature of a pixel without hits (cl/raster/blend.cl)
 
 
-class Blend:
-    """Blends the hits of a Pairs object by their weights (Weights).
+@dataclass(frozen=True)
+class BlendGradient:
+    """What all gradients of one blend are made of.
 
-    mean: gradients are means over a point's pixels, as Pulsar's, not sums.
+    point_features: (N, 16), as in Blend.forward. grad_features: (H, W, 16), G = dL/dF. pixel_dot:
+    (HW,), G.F. All float32.
     """
 
-    def __init__(self, dev, footprint, mean=False):
-        self.dev = dev
-        self.program = dev.program("raster/blend", MEAN=int(mean), **footprint.defines)
-        self.pixel_dot = None
+    pairs: Pairs
+    weights: PixelWeights
+    point_features: Array
+    grad_features: Array
+    pixel_dot: Array
 
-    def forward(self, pairs, point_features, features):
-        """Write features (H,W,16) from point_features (N,16), of which only the rows of
-        Weights.kept are read.
+
+class Blend:
+    """Blends features by PixelWeights.
+
+    mean_gradient: a point's gradients are divided by its number of tracked pixels, as Pulsar does.
+    """
+
+    def __init__(self, dev, footprint: Footprint, mean_gradient: bool = False):
+        self.dev = dev
+        self.defines = {"MEAN": int(mean_gradient), **footprint.defines}
+        self._buffers = Buffers(dev)
+
+    @staticmethod
+    def table(n: int, pixels: int) -> Table:
+        """The buffers for n points and a number of pixels."""
+        return {
+            "pixel_dot": ((pixels,), np.float32),
+            "grad_point_features": ((n, 16), np.float32),
+            "grad_opacity": ((n,), np.float32),
+        }
+
+    def forward(
+        self, pairs: Pairs, weights: PixelWeights, point_features: Array, features: Array
+    ) -> None:
+        """Write features (H, W, 16) from point_features (N, 16), both float32.
+
+        Of point_features only the rows weights.shaded are read.
         """
-        self.program.launch(
+        self._program(weights).launch(
             "blend_forward",
             pairs.pixels,
             hw=pairs.pixels,
             pixel_offset=pairs.pixel_offset,
-            hit=pairs.hit,
+            pixel_entry=weights.pixel_entry,
             point_features=point_features,
             features=features,
         )
 
-    def backward(
+    def gradient(
         self,
-        pairs,
-        pair_weight,
-        point_features,
-        features,
-        grad_features,
-        grad_point_features,
-        grad_opacity,
-    ):
-        """Write grad_point_features (N,16) and grad_opacity (N), zeros for unseen points.
-
-        pair_weight: (P,2) of Weights. features: (H,W,16), the result of forward. grad_features:
-        (H,W,16).
-        """
-        self.program.launch(
-            "blend_backward",
-            pairs.points,
-            n=pairs.points,
-            grad_point_features=grad_point_features,
-            grad_opacity=grad_opacity,
-            **self._slopes(pairs, pair_weight, point_features, features, grad_features),
+        pairs: Pairs,
+        weights: PixelWeights,
+        point_features: Array,
+        features: Array,
+        grad_features: Array,
+    ) -> BlendGradient:
+        """Prepare the backward pass of forward(pairs, weights, point_features, features)."""
+        self._buffers.require(self.table(pairs.points, pairs.pixels))
+        self._program(weights).launch(
+            "blend_backward_pixels",
+            pairs.pixels,
+            hw=pairs.pixels,
+            features=features,
+            grad_features=grad_features,
+            pixel_dot=self._buffers.pixel_dot,
         )
+        return BlendGradient(pairs, weights, point_features, grad_features, self._buffers.pixel_dot)
+
+    def backward(self, gradient: BlendGradient) -> tuple[Array, Array]:
+        """(grad_point_features (N, 16), grad_opacity (N,)) float32, valid until the next call.
+
+        Points that are not shaded get zeros.
+        """
+        grads = self._buffers.grad_point_features, self._buffers.grad_opacity
+        self._launch_by_point(
+            "blend_backward", gradient, grad_point_features=grads[0], grad_opacity=grads[1]
+        )
+        return grads
 
     def backward_spheres(
-        self,
-        pairs,
-        pair_weight,
-        view,
-        gamma,
-        point_radius,
-        point_camera,
-        opacity,
-        point_features,
-        features,
-        grad_features,
-        grad_positions,
-        grad_radius,
-    ):
-        """Write grad_positions (N,3), world axes, and grad_radius (N) of explicit spheres.
+        self, gradient: BlendGradient, points: ProjectedPoints, opacity: Array, gamma: float
+    ) -> tuple[Array, Array]:
+        """(grad_positions (N, 3) in world axes, grad_radius (N,)) float32 of explicit spheres.
 
-        point_radius: (1) or (N). point_camera: (N,4) from project. The rest as for Weights.weigh
-        and backward.
+        points, opacity, gamma: those of the forward pass.
         """
-        n, grad_pair = pairs.points, self.dev.empty(pair_weight.shape)
-        self.program.launch(
+        pairs, n = gradient.pairs, gradient.pairs.points
+        grad_pair = self.dev.empty(gradient.weights.pair_weight.shape)
+        grad_positions, grad_radius = self.dev.empty((n, 3)), self.dev.empty((n,))
+        self._launch_by_point(
             "blend_backward_pairs",
-            n,
-            n=n,
-            pair_source=pairs.pair_source,
+            gradient,
+            pair_point_closeness=pairs.pair_point_closeness,
             grad_pair=grad_pair,
-            **self._slopes(pairs, pair_weight, point_features, features, grad_features),
         )
-        self.program.launch(
+        self._program(gradient.weights).launch(
             "blend_backward_spheres",
             n,
             n=n,
-            k=point_radius.size,
+            radii=points.point_radius.size,
             gamma=gamma,
-            camera=view,
-            point_radius=point_radius,
-            point_camera=point_camera,
+            camera=points.camera_buffer,
+            point_radius=points.point_radius,
+            point_camera=points.point_camera,
             opacity=opacity,
             point_offset=pairs.point_offset,
             pair_pixel=pairs.pair_pixel,
@@ -97,26 +130,24 @@ class Blend:
             grad_positions=grad_positions,
             grad_radius=grad_radius,
         )
+        return grad_positions, grad_radius
 
-    def _slopes(self, pairs, pair_weight, point_features, features, grad_features):
-        """The arguments from which the backward kernels take dL/db = G.(f - F) of each pair;
-        computes G.F.
-        """
-        if self.pixel_dot is None or self.pixel_dot.size != pairs.pixels:
-            self.pixel_dot = self.dev.empty((pairs.pixels,))
-        self.program.launch(
-            "blend_backward_pixels",
-            pairs.pixels,
-            hw=pairs.pixels,
-            features=features,
-            grad_features=grad_features,
-            pixel_dot=self.pixel_dot,
+    def _launch_by_point(self, kernel, gradient, **outputs):
+        """Launch a kernel that walks over the tracked pairs of each point."""
+        pairs, weights = gradient.pairs, gradient.weights
+        self._program(weights).launch(
+            kernel,
+            pairs.points,
+            n=pairs.points,
+            point_features=gradient.point_features,
+            point_offset=pairs.point_offset,
+            pair_pixel=pairs.pair_pixel,
+            pair_weight=weights.pair_weight,
+            pair_role=weights.pair_role,
+            grad_features=gradient.grad_features,
+            pixel_dot=gradient.pixel_dot,
+            **outputs,
         )
-        return {
-            "point_features": point_features,
-            "point_offset": pairs.point_offset,
-            "pair_pixel": pairs.pair_pixel,
-            "pair_weight": pair_weight,
-            "grad_features": grad_features,
-            "pixel_dot": self.pixel_dot,
-        }
+
+    def _program(self, weights):
+        return self.dev.program("raster/blend", HAS_ROLES=int(weights.has_roles), **self.defines)

@@ -1,18 +1,29 @@
-"""The hits of views that never change, kept in device memory from step to step: positions do not
-move, only opacities do.
+"""Pairs of views that repeat exactly, kept on the device within a memory budget.
+
+Between two steps that show the same whole view, points keep their places; only opacities, features
+and the network change. So the pairs can be kept, and projecting and sorting be skipped.
 """
 
-from pp_cl.raster.pairs import LASTING
+from __future__ import annotations
+
+from collections.abc import Callable, Hashable
+from dataclasses import fields, replace
+
+from pyopencl.array import Array
+
+from pp_cl.raster.pairs import Pairs
+
+ARRAYS = tuple(field.name for field in fields(Pairs) if field.name != "total")
 
 
 class PairCache:
-    """Builds Pairs, or takes them from what it keeps. Results are the same bits either way.
+    """Copies of Pairs by view. Results are the same bits with and without it.
 
-    What came first stays: views are drawn in turn, so that dropping the one used longest ago would
-    always drop the next. budget: bytes of device memory. bytes: in use, of len(cache) views.
+    The first views stay: views are drawn in turn, so evicting the least recently used one would
+    always evict the next. budget: bytes of device memory. bytes: in use, by len(cache) views.
     """
 
-    def __init__(self, dev, budget=0):
+    def __init__(self, dev, budget: int = 0):
         self.dev = dev
         self.budget = budget
         self.clear()
@@ -20,26 +31,27 @@ class PairCache:
     def __len__(self):
         return len(self._views)
 
-    def clear(self):
-        """Forget everything: the points are others now."""
-        self._views, self.bytes = {}, 0
+    def clear(self) -> None:
+        """Forget all views, because the points have changed."""
+        self._views: dict[Hashable, Pairs] = {}
+        self.bytes = 0
 
-    def build(self, key, pairs, view, size, projection, point_radius):
-        """pairs.build(view, size, projection, point_radius) of the view called `key`; None: of one
-        that may change.
+    def get(self, key: Hashable, build: Callable[[], Pairs]) -> Pairs:
+        """The pairs of the view called `key`, from the cache or from build().
 
-        Of one key, all but the opacities must be the same until clear().
+        key: None for a view that does not repeat. Until clear(), a key must stand for one camera,
+        size and set of points.
         """
         if key in self._views:
-            pairs.adopt(*self._views[key])
-            return
-        pairs.build(view, size, projection, point_radius)
-        arrays = {name: getattr(pairs, name) for name in LASTING}
-        needed = sum(array.nbytes for array in arrays.values())
-        if key is None or self.bytes + needed > self.budget:
-            return
-        self.bytes += needed
-        copies = {name: self.dev.empty(array.shape, array.dtype) for name, array in arrays.items()}
-        for name, array in arrays.items():
-            self.dev.copy(copies[name], array)
-        self._views[key] = (pairs.total, copies)
+            return self._views[key]
+        pairs = build()
+        needed = sum(getattr(pairs, name).nbytes for name in ARRAYS)
+        if key is not None and self.bytes + needed <= self.budget:
+            self.bytes += needed
+            self._views[key] = replace(pairs, **{n: self._copy(getattr(pairs, n)) for n in ARRAYS})
+        return pairs
+
+    def _copy(self, array: Array) -> Array:
+        copy = self.dev.empty(array.shape, array.dtype)
+        self.dev.copy(copy, array)
+        return copy

@@ -1,139 +1,142 @@
-"""All (point, pixel) hits of one view, by point and by pixel."""
+"""All hits of one view, a hit being a pair of a point and a pixel: listed by point and by pixel."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
 
 import numpy as np
+from pyopencl.array import Array
 
+from pp_cl.device.buffers import Buffers, Table, grown
 from pp_cl.device.scan import exclusive_scan, nonzero, read_total
 from pp_cl.errors import UserError
+from pp_cl.raster.project import Footprint, ProjectedPoints
 
-MOST_PAIRS = 2**32 - 1  # that can be numbered
-PAIR_ARRAYS = {
-    "pair_pixel": ((), np.uint32),
-    "pair_source": ((2,), np.uint32),
-    "pair_key": ((), np.uint64),
-    "hit": ((), np.uint64),
-}  # shape and dtype of a pair's row
-# What build() makes and no later stage changes.
-LASTING = ("seen", "point_offset", "pixel_offset", "pair_pixel", "pair_source", "pair_key")
-GROWTH = 1.25  # spare room of the pair buffers, so that they are not replaced at every view
+MOST_PAIRS = 2**32 - 1  # pairs are numbered by uint32
 
 
+@dataclass(frozen=True)
 class Pairs:
-    """The hits of the view built or adopted last; the buffers grow and are kept from view to view.
+    """The hits of a view of N points and HW pixels, valid until the next one is built.
 
-    total: number of pairs; P = max(1, total). seen: (S) uint32, the points with a pair, ascending.
-    point_offset: (N+1) uint32, point i owns the pairs point_offset[i] to point_offset[i+1].
-    pair_pixel: (P) uint32, y*W + x. pair_source: (P,2) uint32, the point, and the bits of the d of
-    Eq. (1). pixel_offset: (HW+1) uint32, pixel q owns the keys pixel_offset[q] to
-    pixel_offset[q+1]. pair_key: (P) uint64, depth bits << 32 | pair, sorted within each pixel: by
-    depth, then by point. hit: (P) uint64, scratch here; Weights lists each pixel's weights and
-    points in it.
+    total: number of pairs; P = max(1, total). seen: (S,) uint32, the points with a pair, ascending.
+    point_offset: (N+1,) uint32, point i owns pairs point_offset[i] to point_offset[i+1].
+    pixel_offset: (HW+1,) uint32, pixel q owns keys pixel_offset[q] to pixel_offset[q+1].
+    pair_pixel: (P,) uint32, y*W + x. pair_point_closeness: (P, 2) uint32, the point, and the bits
+    of the closeness d of Eq. (1). pair_key: (P,) uint64, depth bits << 32 | pair, sorted within
+    each pixel by depth, then by point.
     """
 
-    def __init__(self, dev, footprint):
+    total: int
+    seen: Array
+    point_offset: Array
+    pixel_offset: Array
+    pair_pixel: Array
+    pair_point_closeness: Array
+    pair_key: Array
+
+    @property
+    def points(self) -> int:
+        """N."""
+        return self.point_offset.size - 1
+
+    @property
+    def pixels(self) -> int:
+        """HW."""
+        return self.pixel_offset.size - 1
+
+
+class PairBuilder:
+    """Finds and sorts the hits of projected points; the buffers grow and are reused."""
+
+    def __init__(self, dev, footprint: Footprint):
         self.dev = dev
         self.program = dev.program("raster/pairs", **footprint.defines)
-        self.points = self.pixels = self.capacity = 0
-        self._of_points, self._of_pixels, self._of_pairs = {}, {}, {}
+        self._buffers = Buffers(dev)
+        self._capacity = 0
 
-    def build(self, view, size, projection, point_radius):
-        """Find and sort the hits of projected points. Waits for the device, to learn how many there
-        are.
-
-        Raises UserError for more than can be numbered or kept in the device's memory.
-
-        view: (20) packed camera. size: its (height, width). projection: Projection of N points.
-        point_radius: (1) or (N) float32, the radii they were projected with.
-        """
-        n, hw = projection.point_camera.shape[0], size[0] * size[1]
-        launch = self.program.launch
-        self._resize(n, hw)
-        points = {
-            "n": n,
-            "k": point_radius.size,
-            "camera": view,
-            "point_radius": point_radius,
-            "point_camera": projection.point_camera,
-            "point_box": projection.point_box,
+    @staticmethod
+    def table(n: int, pixels: int, pairs: int) -> Table:
+        """The buffers for n points, a number of pixels and room for a number of pairs."""
+        return {
+            "point_count": ((n,), np.uint32),
+            "point_offset": ((n + 1,), np.uint32),
+            "seen": ((n,), np.uint32),
+            "pixel_count": ((pixels,), np.uint32),
+            "pixel_offset": ((pixels + 1,), np.uint32),
+            "pair_pixel": ((pairs,), np.uint32),
+            "pair_point_closeness": ((pairs, 2), np.uint32),
+            "pair_key": ((pairs,), np.uint64),
+            "pair_scratch": ((pairs,), np.uint64),
         }
 
-        point_count, seen_index = self._of_points["count"], self._of_points["seen"]
-        launch("pairs_count", n, point_count=point_count, **points)
-        self.seen = seen_index[: nonzero(self.dev, point_count, self.point_offset, seen_index)]
-        exclusive_scan(self.dev, point_count, self.point_offset)
-        self._reserve(read_total(self.dev, self.point_offset))
+    def build(self, points: ProjectedPoints, size: tuple[int, int]) -> Pairs:
+        """Pairs of an image of size (height, width). Waits for the device to learn their number.
 
-        pixel_count = self._of_pixels["count"]
-        self.dev.fill(pixel_count, 0)
+        Raises UserError for more pairs than can be numbered or kept in the device's memory.
+        """
+        n, pixels, b, launch = len(points.point_box), size[0] * size[1], self._buffers, self._launch
+        b.require(self.table(n, pixels, max(1, self._capacity)))
+        launch("pairs_count", n, points, point_count=b.point_count)
+        seen = b.seen[: nonzero(self.dev, b.point_count, b.point_offset, b.seen)]
+        exclusive_scan(self.dev, b.point_count, b.point_offset)
+        total = self._reserve(n, pixels, read_total(self.dev, b.point_offset))
+
+        names = ("pair_pixel", "pair_point_closeness", "pair_key", "pair_scratch")
+        pair = {name: getattr(b, name)[: max(1, total)] for name in names}
+        scratch = pair.pop("pair_scratch")
+        self.dev.fill(b.pixel_count, 0)
         launch(
             "pairs_fill",
             n,
-            point_offset=self.point_offset,
-            pair_pixel=self.pair_pixel,
-            pair_source=self.pair_source,
-            pair_place=self.hit,
-            pixel_count=pixel_count,
-            **points,
+            points,
+            point_offset=b.point_offset,
+            pair_pixel=pair["pair_pixel"],
+            pair_point_closeness=pair["pair_point_closeness"],
+            pair_place=scratch,
+            pixel_count=b.pixel_count,
         )
-        exclusive_scan(self.dev, pixel_count, self.pixel_offset)
-        launch(
+        exclusive_scan(self.dev, b.pixel_count, b.pixel_offset)
+        self.program.launch(
             "pairs_scatter",
-            self.total,
-            pairs=self.total,
-            pair_pixel=self.pair_pixel,
-            pair_place=self.hit,
-            pixel_offset=self.pixel_offset,
-            pair_key=self.pair_key,
+            total,
+            pairs=total,
+            pair_pixel=pair["pair_pixel"],
+            pair_place=scratch,
+            pixel_offset=b.pixel_offset,
+            pair_key=pair["pair_key"],
         )
-        launch(
+        self.program.launch(
             "pairs_sort",
-            hw,
-            hw=hw,
-            pixel_offset=self.pixel_offset,
-            scratch=self.hit,
-            pair_key=self.pair_key,
+            pixels,
+            hw=pixels,
+            pixel_offset=b.pixel_offset,
+            scratch=scratch,
+            pair_key=pair["pair_key"],
+        )
+        return Pairs(total, seen, b.point_offset, b.pixel_offset, **pair)
+
+    def _launch(self, kernel, n, points, **arguments):
+        """Launch a kernel that walks over the pixels of each point's box."""
+        self.program.launch(
+            kernel,
+            n,
+            n=n,
+            radii=points.point_radius.size,
+            camera=points.camera_buffer,
+            point_radius=points.point_radius,
+            point_camera=points.point_camera,
+            point_box=points.point_box,
+            **arguments,
         )
 
-    def adopt(self, total, arrays):
-        """Take over what build() once made, as {name: array}: the names of LASTING, and these
-        sizes.
-        """
-        n, hw = arrays["point_offset"].size - 1, arrays["pixel_offset"].size - 1
-        self._resize(n, hw)
-        self._reserve(total)
-        for name in LASTING:
-            setattr(self, name, arrays[name])
-
-    def _resize(self, n, hw):
-        """Buffers for n points and hw pixels."""
-        if n != self.points:
-            self.points = n
-            sizes = {"count": n, "offset": n + 1, "seen": n}
-            self._of_points = {}  # released first
-            self._of_points = {
-                name: self.dev.empty((size,), np.uint32) for name, size in sizes.items()
-            }
-        if hw != self.pixels:
-            self.pixels = hw
-            sizes = {"count": hw, "offset": hw + 1}
-            self._of_pixels = {
-                name: self.dev.empty((size,), np.uint32) for name, size in sizes.items()
-            }
-        self.point_offset, self.pixel_offset = self._of_points["offset"], self._of_pixels["offset"]
-
-    def _reserve(self, total):
-        """Arrays for `total` pairs; old buffers are released before larger ones are allocated."""
+    def _reserve(self, n, pixels, total):
+        """Make room for `total` pairs; returns that number."""
         if total >= MOST_PAIRS:
             raise UserError(
-                f"the points of one view cover more than {MOST_PAIRS} pixels in all: lower"
-                " --points, raise --downscale, or lower raster.radius"
+                f"the points of one view cover more than {MOST_PAIRS} pixels in all: "
+                "lower --points, raise --downscale, or lower raster.radius"
             )
-        self.total, p = total, max(1, total)
-        if self.capacity < p:
-            self.capacity = max(1, int(total * GROWTH))
-            for name in PAIR_ARRAYS:
-                setattr(self, name, None)
-            self._of_pairs = {}
-            for name, (row, dtype) in PAIR_ARRAYS.items():
-                self._of_pairs[name] = self.dev.empty((self.capacity, *row), dtype)
-        for name in PAIR_ARRAYS:
-            setattr(self, name, self._of_pairs[name][:p])
+        self._capacity = grown(self._capacity, total)
+        self._buffers.require(self.table(n, pixels, max(1, self._capacity)))
+        return total

@@ -1,10 +1,15 @@
-"""Points to camera axes, and the kind of footprint they have on the image."""
+"""Points in camera axes, and the box of pixels that each may cover."""
+
+from __future__ import annotations
 
 from dataclasses import dataclass
 
 import numpy as np
+from pyopencl.array import Array
 
-LANES = 16  # of cl/raster/project.cl
+from pp_cl.device.buffers import Buffers, Table
+
+LANES = 16  # points of one work-item
 KINDS = ("disc", "soft", "sphere")
 
 
@@ -12,8 +17,8 @@ KINDS = ("disc", "soft", "sphere")
 class Footprint:
     """What a point covers (cl/raster/footprint.h).
 
-    kind: "disc" (the paper's hard disc: 0.75 pixels, or the radius if that is more), "soft"
-    (closeness falls linearly to the same rim) or "sphere" (Pulsar's general spheres). Raises
+    kind: "disc" (the paper's hard disc: radius at least 0.75 pixels), "soft" (closeness falls
+    linearly from the centre to the same rim) or "sphere" (Pulsar's general spheres). Raises
     ValueError for another kind.
     """
 
@@ -24,64 +29,89 @@ class Footprint:
             raise ValueError(f"no such footprint: {self}")
 
     @property
-    def defines(self):
+    def defines(self) -> dict[str, int]:
         """{macro: value} for the programs that include footprint.h."""
         return {"FOOTPRINT": KINDS.index(self.kind)}
 
 
-class Projection:
-    """Where the points of one view are; the buffers are kept from view to view.
+@dataclass(frozen=True)
+class ProjectedPoints:
+    """N points in one view, valid until the next projection.
 
-    point_camera: (N,4) float32, x, y, z in camera axes and the distance; (0, 0, 0, -1) for a point
-    left out by Pulsar's culling rule. point_box: (N,4) uint16, first x, first y, last x, last y of
-    the pixels that may be hit; none where last < first.
+    camera_buffer: (20,) float32, cl/camera.h. point_camera: (N, 4) float32, x, y, z in camera axes
+    and the distance from the eye; (0, 0, 0, -1) for a point that Pulsar's rule culls. point_box:
+    (N, 4) uint16, first x, first y, last x, last y of the pixels that may be hit; last < first
+    means none. point_radius: (1,) or (N,) float32, world units.
     """
 
-    def __init__(self, dev, footprint):
-        self.dev = dev
-        self.program = dev.program("raster/project", **footprint.defines)
-        self.point_camera = self.point_box = None
+    camera_buffer: Array
+    point_camera: Array
+    point_box: Array
+    point_radius: Array
 
-    def grid(self, view, grid, point_id, radius, dropout=0.0, seed=0):
+
+class Projection:
+    """Projects points; the buffers are reused from view to view."""
+
+    def __init__(self, dev, footprint: Footprint):
+        self.program = dev.program("raster/project", LANES=LANES, **footprint.defines)
+        self._buffers = Buffers(dev)
+
+    @staticmethod
+    def table(n: int) -> Table:
+        """The buffers for n points."""
+        return {"point_camera": ((n, 4), np.float32), "point_box": ((n, 4), np.uint16)}
+
+    def grid(
+        self,
+        camera_buffer: Array,
+        grid_buffer: Array,
+        point_id: Array,
+        point_radius: Array,
+        *,
+        dropout: float = 0.0,
+        seed: int = 0,
+    ) -> ProjectedPoints:
         """Project vertices of a grid.
 
-        view: (20) packed camera. grid: (8) packed Grid. point_id: (N) uint32. radius: one number
-        for all. dropout: probability in [0, 1) with which each point is left out, at random by
-        (seed, id). seed: uint32.
+        grid_buffer: (8,) float32, Grid.packed(). point_id: (N,) uint32. point_radius: (1,).
+        dropout: probability in [0, 1) with which a point is left out, at random by (seed, id).
+        seed: uint32.
         """
-        n = point_id.size
-        self._resize(n)
-        self.program.launch(
+        return self._launch(
             "project_grid",
-            -(-n // LANES),
-            n=n,
-            radius=radius,
+            point_id.size,
+            camera_buffer,
+            point_radius,
             dropout=round(dropout * 2**32),
             seed=seed,
-            camera=view,
-            grid=grid,
+            grid=grid_buffer,
             point_id=point_id,
-            point_camera=self.point_camera,
-            point_box=self.point_box,
         )
 
-    def spheres(self, view, positions, point_radius):
-        """Project spheres. positions: (N,3) float32, world. point_radius: (1) or (N) float32."""
-        n = positions.shape[0]
-        self._resize(n)
-        self.program.launch(
+    def spheres(
+        self, camera_buffer: Array, positions: Array, point_radius: Array
+    ) -> ProjectedPoints:
+        """Project spheres. positions: (N, 3) float32, world. point_radius: (1,) or (N,)."""
+        return self._launch(
             "project_spheres",
+            len(positions),
+            camera_buffer,
+            point_radius,
+            radii=point_radius.size,
+            positions=positions,
+        )
+
+    def _launch(self, kernel, n, camera_buffer, point_radius, **arguments):
+        self._buffers.require(self.table(n))
+        points = {name: getattr(self._buffers, name) for name in self.table(n)}
+        self.program.launch(
+            kernel,
             -(-n // LANES),
             n=n,
-            k=point_radius.size,
-            camera=view,
-            positions=positions,
+            camera=camera_buffer,
             point_radius=point_radius,
-            point_camera=self.point_camera,
-            point_box=self.point_box,
+            **points,
+            **arguments,
         )
-
-    def _resize(self, n):
-        if self.point_camera is None or self.point_camera.shape[0] != n:
-            self.point_camera = self.dev.empty((n, 4))
-            self.point_box = self.dev.empty((n, 4), np.uint16)
+        return ProjectedPoints(camera_buffer, point_radius=point_radius, **points)

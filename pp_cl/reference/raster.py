@@ -72,3 +72,23 @@ class PixelReference:
             / weight.sum()
             @ np.vstack([point_features, np.ones((1, point_features.shape[1]))])
         )
+
+
+def sh_basis(directions):
+    """(N, 9) real harmonics of degrees 0 to 2 of unit directions (N, 3), as cl/sh.h orders them."""
+    x, y, z = np.asarray(directions, np.float64).T
+    first, second = np.sqrt(3 / (4 * np.pi)), np.sqrt(15 / (4 * np.pi))
+    return np.stack(
+        [
+            np.full_like(x, 0.5 / np.sqrt(np.pi)),
+            -first * y,
+            first * z,
+            -first * x,
+            second * x * y,
+            -second * y * z,
+            np.sqrt(5 / (16 * np.pi)) * (3 * z * z - 1),
+            -second * x * z,
+            0.5 * second * (x * x - y * y),
+        ],
+        -1,
+    )

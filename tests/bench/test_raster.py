@@ -3,19 +3,14 @@ input is one line.
 """
 
 import json
-import sys
-import types
 from dataclasses import replace
 
 import numpy as np
 import pytest
 from oracle import raster as oracle_raster
-from support.comparisons import relative_error
 
 from pp_cl.bench import network as bench
 from pp_cl.bench import peak
-from pp_cl.bench import raster_scenes as bench_scene
-from pp_cl.bench.pulsar import pulsar_row
 from pp_cl.bench.raster import bench_raster, growth, read_numbers
 from pp_cl.bench.raster_scenes import SCENES
 from pp_cl.cli import main
@@ -42,17 +37,19 @@ def test_float64_values_are_the_oracles(dev, name):
     blend = oracle_raster.blend(camera, geometry, scene.opacity, 0.05)
     everyone = np.arange(scene.count)
     if name == "grid":
-        sh = np.concatenate(
-            [v.get() for k, v in scene.renderer.model.points.items() if k.startswith("sh")], 1
-        )
+        sh = np.concatenate([v.get() for v in scene.renderer.model.cloud.sh], 1)
         np.testing.assert_allclose(
-            scene.shaded(everyone), oracle_raster.shade(positions, camera.eye, sh), atol=1e-6
+            scene.exact_features(everyone),
+            oracle_raster.shade(positions, camera.eye, sh),
+            atol=1e-6,
         )
-    expected, compared = oracle_raster.features(blend, scene.shaded(everyone)), 0
+    expected, compared = oracle_raster.features(blend, scene.exact_features(everyone)), 0
     for pixel in range(256):
         hits = reference.hits(pixel % 16, pixel // 16)
         if hits is not None:
-            actual = reference.features(hits, scene.opacity[hits[0]], scene.shaded(hits[0]), 0.05)
+            actual = reference.features(
+                hits, scene.opacity[hits[0]], scene.exact_features(hits[0]), 0.05
+            )
             np.testing.assert_allclose(actual, expected[pixel], atol=1e-9)
             compared += len(hits[0]) > 0
     assert compared > 50
@@ -71,7 +68,7 @@ def test_pixels_that_rounding_decides_are_left_out(dev, offset, clear):
 
 @pytest.mark.parametrize("name", SCENES)
 def test_rows(dev, name):
-    rows = bench_raster(dev, name, [60, 500], [12, 20], [0.0, 1e-2], 0.05)
+    rows = list(bench_raster(dev, name, [60, 500], [12, 20], [0.0, 1e-2], 0.05))
     assert [(row["size"], row["tau"]) for row in rows] == [
         (12, 0),
         (12, 1e-2),
@@ -105,10 +102,10 @@ def test_rows(dev, name):
 
 def test_a_wrong_picture_is_found(dev):
     scene = SCENES["grid"](dev, 500, 16, 0.05)
-    features = scene.features(0.0)
+    features = scene.forward(0.0).features.get()
     assert scene.error(features) < 1e-4
     features[..., 3] += 0.1
-    assert scene.error(features) == pytest.approx(0.1 / scene.feature_range()[3], rel=1e-2)
+    assert scene.error(features) == pytest.approx(0.1 / scene.feature_range[3], rel=1e-2)
 
 
 def test_growth_is_fitted():
@@ -181,67 +178,3 @@ def test_numbers_are_read_ascending():
     assert read_numbers("--points", "1e3,10,10", int, 1, 10**6) == [10, 1000]
     with pytest.raises(UserError):
         read_numbers("--points", "", int, 1, 10**6)
-
-
-class Tensor(np.ndarray):
-    """What pulsar_row() needs of PyTorch's."""
-
-    def requires_grad_(self, _):
-        self.learned = True
-
-    def backward(self, grad):
-        assert grad.shape == self.shape
-
-
-def test_pulsars_row(monkeypatch):
-    """With stand-ins for PyTorch and PyTorch3D, whose renderer gets the scene of PulsarScene."""
-    monkeypatch.setitem(sys.modules, "torch", None)
-    assert pulsar_row(5, 4, 0.1) is None
-    seen = {}
-
-    class Renderer:
-        def __init__(self, width, height, n, n_channels):
-            seen["shape"] = (width, height, n, n_channels)
-
-        def __call__(self, positions, features, radius, camera, gamma, max_depth, min_depth):
-            assert (
-                positions.learned
-                and features.learned
-                and radius.learned
-                and features.shape == (5, bench_scene.CHANNELS)
-            )
-            seen["scene"] = (positions, radius, camera.tolist(), gamma, max_depth, min_depth)
-            return np.ones((4, 4, 16)).view(Tensor)
-
-    rng = np.random.default_rng(0)
-    names = (
-        "torch",
-        "pytorch3d",
-        "pytorch3d.renderer",
-        "pytorch3d.renderer.points",
-        "pytorch3d.renderer.points.pulsar",
-    )
-    for name in names:
-        monkeypatch.setitem(sys.modules, name, types.ModuleType(name))
-    vars(sys.modules["torch"]).update(
-        manual_seed=lambda _: None,
-        rand=lambda *shape: rng.random(shape).view(Tensor),
-        randn_like=np.ones_like,
-        tensor=lambda values: np.array(values).view(Tensor),
-        full=lambda shape, value: np.full(shape, value).view(Tensor),
-    )
-    sys.modules[names[-1]].Renderer = Renderer
-    row = pulsar_row(5, 4, 0.1)
-    assert (
-        row["forward_ms"] > 0 and row["backward_ms"] > 0 and (row["points"], row["size"]) == (5, 4)
-    )
-    assert seen["shape"] == (4, 4, 5, bench_scene.CHANNELS)
-    positions, radius, camera, *rest = seen["scene"]
-    assert (positions.min(axis=0) >= [-0.5, -0.5, 1]).all() and (
-        positions.max(axis=0) <= [0.5, 0.5, 2]
-    ).all()
-    assert (
-        relative_error(radius, [0.0015] * 5) < 1e-6
-        and camera == [0] * 6 + [0.5, 0.5]
-        and rest == [0.1, 2.5, 0.6]
-    )

@@ -5,7 +5,7 @@ import pytest
 from oracle import raster as oracle
 from support.comparisons import numeric_gradient, relative_error
 from support.guarded import AWKWARD_SIZES
-from support.raster_scene import GAMMAS, Blended, Scene
+from support.raster_scene import GAMMAS, Blended, PairedPoints
 
 from pp_cl.raster.project import KINDS
 
@@ -83,7 +83,7 @@ def test_sphere_gradients_against_finite_differences(dev, rng, gamma, mean):
     blended.radius[-1] = 0.01  # below a pixel
     blended.positions[-1] = 0
     opacity = blended.opacity
-    blended.scene = Scene(dev, blended.camera, blended.positions, blended.radius, "sphere")
+    blended.scene = PairedPoints(dev, blended.camera, blended.positions, blended.radius, "sphere")
     blended.scene.blend(opacity, gamma, blended.point_features, mean=mean)
     hit = blended.scene.hits()
     gradients = blended.scene.sphere_gradients(blended.grad)

@@ -10,19 +10,25 @@ from support.raster_scene import GAMMAS, Blended
 from pp_cl.raster.project import KINDS
 
 TAUS = (1e-4, 1e-2, 0.3)
+TRACKED, UNTRACKED, DROPPED = range(3)  # cl/raster/pair_role.h
+
+
+def dropped_weights(scene):
+    """(HW,) the weight that each pixel dropped, or a bound above it."""
+    return scene.weighing.dropped(scene.pairs, scene.weights).get()
 
 
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("gamma", GAMMAS)
 def test_weights(dev, rng, kind, gamma):
     blended = Blended(dev, rng, kind=kind, gamma=gamma)
-    assert np.abs(np.abs(blended.weight) - blended.blend["weight"]).max() < 2e-4
-    assert blended.scene.weights.kept is blended.scene.pairs.seen
+    assert np.abs(blended.weight - blended.blend["weight"]).max() < 2e-4
+    assert blended.scene.weights.shaded is blended.scene.pairs.seen
 
 
-@pytest.mark.parametrize("stop", [0.001, 0.05, 0.5])
-def test_early_stop(dev, rng, stop):
-    blended = Blended(dev, rng, n=500, gamma=0.02, radius=0.4, stop=stop)
+@pytest.mark.parametrize("early_stop", [0.001, 0.05, 0.5])
+def test_early_stop(dev, rng, early_stop):
+    blended = Blended(dev, rng, n=500, gamma=0.02, radius=0.4, early_stop=early_stop)
     dropped = blended.geometry["hit"] & ~blended.blend["hit"]
     assert dropped.sum() > 100 and (blended.blend["hit"].sum(axis=0) > 16).any()
     assert (
@@ -33,13 +39,14 @@ def test_early_stop(dev, rng, stop):
     assert relative_error(gradients["features"], expected[0]) < 1e-4
     assert relative_error(gradients["opacity"], expected[1]) < 2e-4
     whole = oracle.blend(blended.camera, blended.geometry, blended.opacity, 0.02)
-    assert whole["weight"][dropped].max() < stop
+    assert whole["weight"][dropped].max() < early_stop
 
 
 def test_point_weights_accumulate(dev, rng):
     blended = Blended(dev, rng, max_tracked=2)
     point_weight = dev.upload(np.arange(257, dtype=np.float32))
-    blended.scene.weights.add_point_weights(blended.scene.pairs, point_weight)
+    scene = blended.scene
+    scene.weighing.add_to_points(scene.pairs, scene.weights, point_weight)
     assert (
         relative_error(point_weight.get() - np.arange(257), blended.blend["weight"].sum(axis=1))
         < 1e-4
@@ -58,8 +65,7 @@ def test_tau(dev, n, gamma, tau):
         for t in (0.0, tau)
     )
     hit = exact.geometry["hit"]
-    slope = blended.scene.dense(blended.scene.weights.pair_weight.get()[:, 1])
-    dropped = hit & np.signbit(blended.weight) & np.signbit(slope)
+    dropped = hit & (blended.role == DROPPED)
     left = blended.weight[hit & ~dropped] / exact.weight[hit & ~dropped]
     # a tail that was never weighed is missing in their sum
     assert (left >= 1 - 1e-6).all() and (left <= 1 + tau).all()
@@ -67,18 +73,18 @@ def test_tau(dev, n, gamma, tau):
         assert dropped.any()
 
     true = np.where(dropped, exact.weight.astype(np.float64), 0).sum(axis=0)
-    said = blended.scene.weights.dropped(blended.scene.pairs).get()
+    said = dropped_weights(blended.scene)
     assert (said <= tau).all() and (true <= said * (1 + 1e-5)).all()
-    assert not exact.scene.weights.dropped(exact.scene.pairs).get().any()
+    assert not dropped_weights(exact.scene).any()
 
-    kept = blended.scene.weights.kept.get()
-    np.testing.assert_array_equal(kept, np.flatnonzero((hit & ~dropped).any(axis=1)))
+    shaded = blended.scene.weights.shaded.get()
+    np.testing.assert_array_equal(shaded, np.flatnonzero((hit & ~dropped).any(axis=1)))
     values = np.vstack([exact.point_features, np.ones(16)])  # the background's are 1
     bound = said.max() * (values.max(axis=0) - values.min(axis=0))
     assert (np.abs(blended.features - exact.features).max(axis=0) <= bound + 1e-5).all()
     gradients = blended.gradients()
     assert all(np.isfinite(g).all() for g in gradients.values())
-    assert not gradients["features"][~np.isin(np.arange(n), kept)].any()
+    assert not gradients["features"][~np.isin(np.arange(n), shaded)].any()
 
 
 def test_tau_drops_from_the_back(dev, rng):
@@ -87,11 +93,11 @@ def test_tau_drops_from_the_back(dev, rng):
     """
     blended = Blended(dev, rng, n=500, gamma=0.1, radius=0.4, tau=0.05)
     whole, order = blended.blend["weight"], oracle.order(blended.geometry)
-    said, fits = blended.scene.weights.dropped(blended.scene.pairs).get(), 0
+    said, fits = dropped_weights(blended.scene), 0
     for q in np.flatnonzero(blended.geometry["hit"].any(axis=0)):
         points = np.flatnonzero(blended.geometry["hit"][:, q])
         points = points[np.argsort(order[points, q])]
-        kept = ~np.signbit(blended.weight[points, q])
+        kept = blended.role[points, q] == TRACKED
         last = np.flatnonzero(kept).max(initial=-1)
         if last >= 0 and last + 1 < len(points):
             behind = whole[points[last + 1 :], q].sum()
@@ -104,27 +110,27 @@ def test_tau_drops_from_the_back(dev, rng):
 def test_tau_gradients_are_those_of_what_is_left(dev, rng):
     """dL/df = sum b G over the pairs that are left."""
     blended = Blended(dev, rng, n=500, gamma=0.02, radius=0.4, tau=0.02)
-    weight = np.where(np.signbit(blended.weight), 0, blended.weight).astype(np.float64)
+    weight = np.where(blended.role == TRACKED, blended.weight, 0).astype(np.float64)
     assert relative_error(blended.gradients()["features"], weight @ blended.grad) < 1e-4
     expected = blended.oracle_gradients()[0]
     assert 1e-4 < relative_error(weight @ blended.grad, expected) < 0.05
 
 
 def test_tau_with_gradients_of_spheres(dev, rng):
-    """Points that are not kept have no features: nothing reads them."""
+    """Points that are not shaded have no features: nothing reads them."""
     blended = Blended(dev, rng, n=500, kind="sphere", gamma=0.02, radius=0.4, tau=0.1)
-    missing = ~np.isin(np.arange(500), blended.scene.weights.kept.get())
+    missing = ~np.isin(np.arange(500), blended.scene.weights.shaded.get())
     assert np.isnan(blended.scene.point_features.get()[missing]).all() and missing.sum() > 50
     gradients = blended.scene.sphere_gradients(blended.grad)
     assert all(np.isfinite(g).all() and not g[missing].any() for g in gradients.values())
 
 
-def test_untracked_hits_without_weight_are_kept(dev, rng):
-    """A weight may underflow to 0 beyond max_tracked; its point is in the picture's lists, so it
-    must be shaded.
+def test_untracked_hits_without_weight_are_shaded(dev, rng):
+    """A weight may underflow to 0 beyond max_tracked; its point is in the pixels' lists, so it must
+    be shaded.
     """
-    blended = Blended(dev, rng, n=300, gamma=1e-3, radius=0.4, max_tracked=1, stop=1e-30)
-    untracked_zero = blended.geometry["hit"] & np.signbit(blended.weight) & (blended.weight == 0)
+    blended = Blended(dev, rng, n=300, gamma=1e-3, radius=0.4, max_tracked=1, early_stop=1e-30)
+    untracked_zero = (blended.role == UNTRACKED) & (blended.weight == 0)
     assert untracked_zero.any() and np.isfinite(blended.features).all()
 
 
@@ -133,5 +139,5 @@ def test_two_runs_give_the_same_bits(dev, tau):
     runs = []
     for _ in range(2):
         blended = Blended(dev, np.random.default_rng(3), n=3000, radius=0.2, tau=tau)
-        runs.append([blended.weight, blended.scene.weights.kept.get(), blended.features])
+        runs.append([blended.weight, blended.scene.weights.shaded.get(), blended.features])
     assert all(np.array_equal(a, b) for a, b in zip(*runs, strict=True))

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from oracle import raster as oracle
 from support.comparisons import relative_error
-from support.raster_scene import Scene, make_camera
+from support.raster_scene import PairedPoints, make_camera
 
 NEAR, FAR = 2.0, 6.0
 CAMERA = replace(
@@ -22,20 +22,20 @@ def depth_at(z):
 
 
 def blend_on_axis(dev, z, opacity, gamma, camera=CAMERA, **options):
-    """(Scene, weights): points at normalised depths z, straight ahead of a one-pixel camera, each
+    """(PairedPoints, weights): points at normalised depths z ahead of a one-pixel camera, each
     in its own channel.
     """
     positions = np.stack([np.zeros(len(z)), np.zeros(len(z)), depth_at(z)], -1)
-    scene = Scene(dev, camera, positions, 0.001)
+    scene = PairedPoints(dev, camera, positions, 0.001)
     scene.blend(np.asarray(opacity), gamma, np.resize(np.eye(16), (len(z), 16)), **options)
-    return scene, scene.dense(np.abs(scene.weights.pair_weight.get()[:, 0]))[:, 0]
+    return scene, scene.dense(scene.weights.pair_weight.get()[:, 0])[:, 0]
 
 
 def test_nearest_possible_point_at_the_final_gamma(dev):
     """exp(z/gamma) = e^100 at z = 1 is above the largest float."""
     radius = 2.0**-10
     positions = np.stack([np.zeros(3), np.zeros(3), depth_at([1.0, 0.99, 0.5]) + radius], -1)
-    scene = Scene(dev, CAMERA, positions, radius, "sphere")
+    scene = PairedPoints(dev, CAMERA, positions, radius, "sphere")
     features = scene.blend([1, 1, 1], 0.01, np.eye(3, 16))
     e = np.exp([0.0, -1.0, -50.0])
     assert np.allclose(features[0, 0, :3], e / e.sum(), rtol=1e-4, atol=1e-7)
@@ -57,7 +57,7 @@ def test_the_smallest_gamma(dev, opacity):
 
 def dense_geometry(scene):
     """oracle.geometry of a scene on the axis."""
-    return oracle.geometry(scene.camera, scene.projection.point_camera.get()[:, :3], 0.001, "soft")
+    return oracle.geometry(scene.camera, scene.projected.point_camera.get()[:, :3], 0.001, "soft")
 
 
 @pytest.mark.parametrize("gamma", [0.1, 0.01, 1e-5])
@@ -111,8 +111,8 @@ def test_softness(dev):
 def test_points_behind_and_on_the_plane_of_the_eye(dev, kind):
     camera = replace(CAMERA, near=1e-3)
     positions = np.array([[0, 0, -3.0], [0, 0, 0], [3.0, 0, 0], [0, 3.0, 1e-9], [0, 0, 3.0]])
-    scene = Scene(dev, camera, positions, 0.01, kind)
-    assert scene.projection.point_camera.get()[:, 3].tolist() == [-1, -1, -1, -1, 3]
+    scene = PairedPoints(dev, camera, positions, 0.01, kind)
+    assert scene.projected.point_camera.get()[:, 3].tolist() == [-1, -1, -1, -1, 3]
     assert scene.pairs.seen.get().tolist() == [4]
 
 
@@ -121,7 +121,7 @@ def test_points_behind_and_on_the_plane_of_the_eye(dev, kind):
 def test_positions_that_are_not_finite(dev, bad, axis):
     positions = np.array([[0, 0, 3.0], [0, 0, 3.0], [0.001, 0, 4.0]])
     positions[1, axis] = bad
-    scene = Scene(dev, CAMERA, positions, 0.1, "sphere")
+    scene = PairedPoints(dev, CAMERA, positions, 0.1, "sphere")
     assert scene.pairs.seen.get().tolist() == [0, 2]
     features = scene.blend(np.ones(3), 0.01, np.ones((3, 16)) * 2)
     gradients = scene.gradients(np.ones((1, 1, 16))) | scene.sphere_gradients(np.ones((1, 1, 16)))
@@ -131,7 +131,7 @@ def test_positions_that_are_not_finite(dev, bad, axis):
 
 def test_a_ray_through_the_centre_of_a_sphere_has_gradients(dev):
     """rho = 0: d has no slope there, and nothing may be divided by it."""
-    scene = Scene(dev, CAMERA, np.array([[0, 0, 3.0]]), 0.5, "sphere")
+    scene = PairedPoints(dev, CAMERA, np.array([[0, 0, 3.0]]), 0.5, "sphere")
     scene.blend([0.5], 0.1, np.full((1, 16), 2.0))
     gradients = scene.sphere_gradients(np.ones((1, 1, 16)))
     assert gradients["positions"][0, 2] < 0 and (gradients["positions"][0, :2] == 0).all()
@@ -142,8 +142,8 @@ def test_a_hit_on_the_very_rim(dev):
     """d = 0 with an exponent above that of the largest float: no weight, no gradient, no NaN."""
     camera = replace(CAMERA, near=1.8, far=10.0)
     # rho = |(3, 0, 4) - 5 (0, 0, 1)|
-    scene = Scene(dev, camera, np.array([[3.0, 0, 4.0]]), np.sqrt(10.0), "sphere")
-    assert scene.pairs.total == 1 and scene.pairs.pair_source.get()[0, 1] == 0
+    scene = PairedPoints(dev, camera, np.array([[3.0, 0, 4.0]]), np.sqrt(10.0), "sphere")
+    assert scene.pairs.total == 1 and scene.pairs.pair_point_closeness.get()[0, 1] == 0
     assert (scene.blend([1.0], 0.005, np.full((1, 16), 2.0)) == 1).all()
     gradients = scene.gradients(np.ones((1, 1, 16))) | scene.sphere_gradients(np.ones((1, 1, 16)))
     assert all((g == 0).all() for g in gradients.values())
@@ -151,16 +151,16 @@ def test_a_hit_on_the_very_rim(dev):
 
 def test_the_early_stop_spares_points_beyond_far(dev):
     """At z < 0 a lower opacity has more weight than the opacity 1."""
-    scene = Scene(dev, CAMERA, np.array([[0, 0, FAR + 0.3]]), 0.4)
-    weight = 1 - scene.blend([0.133], 0.01, np.zeros((1, 16)), stop=0.01)[0, 0, 0]
+    scene = PairedPoints(dev, CAMERA, np.array([[0, 0, FAR + 0.3]]), 0.4)
+    weight = 1 - scene.blend([0.133], 0.01, np.zeros((1, 16)), early_stop=0.01)[0, 0, 0]
     expected = 0.133 * np.exp(-0.133 * 0.075 / 0.01)
     assert relative_error(weight, expected / (1 + expected)) < 1e-3
 
 
 def test_a_point_at_the_eye(dev):
     """It has no direction, and is left out even where near = 0 would let it in."""
-    scene = Scene(dev, replace(CAMERA, near=0.0), np.zeros((1, 3)), 0.0)
-    assert scene.projection.point_camera.get().tolist() == [[0, 0, 0, -1]]
+    scene = PairedPoints(dev, replace(CAMERA, near=0.0), np.zeros((1, 3)), 0.0)
+    assert scene.projected.point_camera.get().tolist() == [[0, 0, 0, -1]]
 
 
 @pytest.mark.parametrize("gamma", [0.1, 0.01])
@@ -174,7 +174,7 @@ def test_thousands_of_hits_in_one_pixel(dev, rng, gamma):
 
 
 def test_an_empty_view(dev):
-    scene = Scene(
+    scene = PairedPoints(
         dev, replace(CAMERA, width=31, height=33), np.array([[100.0, 0, 3.0], [0, 0, 300.0]]), 0.01
     )
     assert scene.pairs.total == 0 and scene.pairs.seen.size == 0
@@ -191,5 +191,5 @@ def test_one_point_and_one_pixel(dev):
 
 def test_a_point_as_large_as_the_view(dev):
     camera = replace(CAMERA, width=257, height=33, fx=200.0, fy=200.0, cx=128.0, cy=16.0)
-    scene = Scene(dev, camera, np.array([[0, 0, 5.0]]), 2.9, "sphere")
+    scene = PairedPoints(dev, camera, np.array([[0, 0, 5.0]]), 2.9, "sphere")
     assert scene.hits().all()

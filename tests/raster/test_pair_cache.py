@@ -1,17 +1,18 @@
-"""Hits that are kept: the same bits as those found anew, within the budget, forgotten when the
-points change.
+"""The cache of pairs: the same bits as pairs built anew, within the budget, cleared when the points
+change.
 """
 
 import numpy as np
 import pytest
 from support.models import make_model
-from support.raster_scene import Scene, make_camera, make_points
+from support.raster_scene import PairedPoints, make_camera, make_points
 from support.scenes import ring_cameras
 
 from pp_cl.config import RasterConfig
 from pp_cl.errors import UserError
-from pp_cl.raster.pair_cache import PairCache
-from pp_cl.raster.pairs import LASTING
+from pp_cl.raster.pair_cache import ARRAYS, PairCache
+from pp_cl.raster.pairs import PairBuilder
+from pp_cl.raster.project import Footprint
 from pp_cl.render import Renderer
 from pp_cl.training.memory import spare_memory
 
@@ -19,21 +20,18 @@ GAMMA = 0.03
 
 
 def state(pairs):
-    """Host copies of everything that build() leaves; without pairs, their arrays hold one row that
-    means nothing.
-    """
-    arrays = {name: getattr(pairs, name).get() for name in LASTING}
+    """Host copies of Pairs; without pairs, their arrays hold one row that means nothing."""
+    arrays = {name: getattr(pairs, name).get() for name in ARRAYS}
     rows = [
         array[: pairs.total] if name.startswith("pair_") else array
         for name, array in arrays.items()
     ]
-    return [pairs.total, pairs.points, pairs.pixels, *rows]
+    return [pairs.total, *rows]
 
 
-def build(cache, key, scene, pairs):
-    """What is in `pairs` after building a scene's view through the cache."""
-    cache.build(key, pairs, scene.view, scene.shape, scene.projection, scene.radius)
-    return state(pairs)
+def build(cache, key, scene, builder):
+    """The state of a scene's pairs, built through the cache."""
+    return state(cache.get(key, lambda: builder.build(scene.projected, scene.shape)))
 
 
 def same(first, second):
@@ -46,28 +44,28 @@ def test_kept_hits_are_the_same_bits(dev, rng, budget):
     """Views of different sizes in changing order, one of them empty."""
     sizes = [(24, 20), (31, 33), (1, 1), (24, 20), (16, 8)]
     scenes = [
-        Scene(dev, make_camera(*size), make_points(rng, 257) + 1e6 * (i == 4), 0.2)
+        PairedPoints(dev, make_camera(*size), make_points(rng, 257) + 1e6 * (i == 4), 0.2)
         for i, size in enumerate(sizes)
     ]
     expected = [state(scene.pairs) for scene in scenes]
     assert expected[4][0] == 0 < expected[0][0]
-    cache, pairs = PairCache(dev, budget), Scene(dev, make_camera(), make_points(rng, 3), 0.1).pairs
+    cache, builder = PairCache(dev, budget), PairBuilder(dev, Footprint("soft"))
     for turn in range(3):
         for i in np.random.default_rng(turn).permutation(5):
-            assert same(build(cache, int(i), scenes[i], pairs), expected[i])
+            assert same(build(cache, int(i), scenes[i], builder), expected[i])
         assert len(cache) == 5 if budget == 10**9 else len(cache) < 5
         assert cache.bytes <= budget
     assert (len(cache) > 0) == (budget > 0)
 
 
 def test_a_kept_view_is_not_built_again(dev, rng):
-    scene, other = (Scene(dev, make_camera(), make_points(rng, 60), 0.2) for _ in range(2))
-    cache, pairs = PairCache(dev, 10**9), scene.pairs
-    first = build(cache, "a", scene, pairs)
-    assert not same(build(cache, None, other, pairs), first) and len(cache) == 1
-    assert same(build(cache, "a", other, pairs), first)
+    scene, other = (PairedPoints(dev, make_camera(), make_points(rng, 60), 0.2) for _ in range(2))
+    cache, builder = PairCache(dev, 10**9), PairBuilder(dev, Footprint("soft"))
+    first = build(cache, "a", scene, builder)
+    assert not same(build(cache, None, other, builder), first) and len(cache) == 1
+    assert same(build(cache, "a", other, builder), first)
     cache.clear()
-    assert cache.bytes == 0 and not same(build(cache, "a", other, pairs), first)
+    assert cache.bytes == 0 and not same(build(cache, "a", other, builder), first)
 
 
 @pytest.mark.parametrize("footprint", ["soft", "disc"])
@@ -78,8 +76,8 @@ def test_pictures_and_gradients_are_the_same_bits(dev, rng, footprint, tau):
     settings = RasterConfig(
         footprint=footprint, radius=0.75 if footprint == "soft" else 0.0015, tau=tau
     )
-    kept, anew = Renderer(dev, model, settings), Renderer(dev, model, settings)
-    kept.cache.budget = 10**9
+    kept = Renderer(dev, model, settings, cache_bytes=10**9)
+    anew = Renderer(dev, model, settings)
     grad = dev.upload(rng.normal(size=(24, 24, 16)), np.float32)
     for step in range(8):
         if step == 5:
@@ -90,12 +88,11 @@ def test_pictures_and_gradients_are_the_same_bits(dev, rng, footprint, tau):
         model.points["opacity"].set(rng.uniform(0, 1, model.count).astype(np.float32))
         results = []
         for renderer, key in ((kept, step % 3), (anew, None)):
-            for run in renderer.stages(cameras[step % 3], GAMMA, key=key).values():
-                run()
-            gradients = [g.get() for g in renderer.backward_features(grad)]
+            result = renderer.rasterise(cameras[step % 3], GAMMA, key=key)
+            gradients = [g.get() for g in renderer.backward_features(result, grad)]
             weights = dev.zeros((model.count,))
-            renderer.add_point_weights(weights)
-            results.append([renderer.features.get(), weights.get(), *gradients])
+            renderer.add_point_weights(result, weights)
+            results.append([result.features.get(), weights.get(), *gradients])
         assert same(*results)
     assert len(kept.cache) == 3 and len(anew.cache) == 0
 

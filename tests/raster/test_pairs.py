@@ -7,9 +7,10 @@ import pytest
 from oracle import raster as oracle
 from support.comparisons import relative_error
 from support.guarded import AWKWARD_SIZES, large
-from support.raster_scene import Scene, make_camera, make_points
+from support.raster_scene import PairedPoints, make_camera, make_points
 
-from pp_cl.raster.project import KINDS
+from pp_cl.raster.pairs import PairBuilder
+from pp_cl.raster.project import KINDS, Footprint
 
 BAND = 1e-4  # pixels beside the edge of a footprint where rounding may decide
 
@@ -23,7 +24,7 @@ def check(scene, expected):
     assert hits.sum() == total and (~clear).mean() < 0.01
 
     points, pixels = scene.pair_points(), pairs.pair_pixel.get()[:total].astype(np.int64)
-    source = pairs.pair_source.get()[:total]
+    source = pairs.pair_point_closeness.get()[:total]
     assert np.array_equal(source[:, 0], points)
     assert (
         relative_error(source[:, 1].view(np.float32), expected["closeness"][points, pixels]) < 1e-4
@@ -47,7 +48,7 @@ def check(scene, expected):
 def test_equal_radii(dev, rng, kind, radius):
     camera, positions = make_camera(), make_points(rng, 300)
     check(
-        Scene(dev, camera, positions, radius, kind),
+        PairedPoints(dev, camera, positions, radius, kind),
         oracle.geometry(camera, positions, radius, kind),
     )
 
@@ -58,15 +59,15 @@ def test_radii_of_all_sizes(dev, rng, kind, n):
     camera, positions = replace(make_camera(33, 31), fy=26.0), make_points(rng, n)
     radius = np.float32(10.0 ** rng.uniform(-3, 0, n))
     check(
-        Scene(dev, camera, positions, radius, kind),
+        PairedPoints(dev, camera, positions, radius, kind),
         oracle.geometry(camera, positions, radius, kind),
     )
 
 
 def test_a_crop_sees_the_same_hits(dev, rng):
     camera, positions = make_camera(40, 36), make_points(rng, 300)
-    whole = Scene(dev, camera, positions, 0.1).hits().reshape(-1, 36, 40)
-    crop = Scene(dev, camera.crop(11, 7, 13, 17), positions, 0.1).hits().reshape(-1, 17, 13)
+    whole = PairedPoints(dev, camera, positions, 0.1).hits().reshape(-1, 36, 40)
+    crop = PairedPoints(dev, camera.crop(11, 7, 13, 17), positions, 0.1).hits().reshape(-1, 17, 13)
     assert np.array_equal(crop, whole[:, 7:24, 11:24])
     assert crop.any()
 
@@ -75,7 +76,7 @@ def test_every_visible_point_hits_a_pixel(dev, rng):
     camera = replace(make_camera(40, 36), fy=30.0)
     slopes = rng.uniform(-0.3, 0.3, (2000, 2))
     positions = camera.eye + 4 * np.column_stack([slopes, np.ones(2000)]) @ camera.pose[:, :3].T
-    assert len(Scene(dev, camera, positions, 1e-3, "disc").pairs.seen) == 2000
+    assert len(PairedPoints(dev, camera, positions, 1e-3, "disc").pairs.seen) == 2000
 
 
 @pytest.mark.parametrize("n", [63, 64, 65, 128, 129, 1000, large(100_000)])
@@ -83,32 +84,27 @@ def test_lists_of_any_length_are_sorted(dev, rng, n):
     camera = replace(make_camera(1, 1), pose=np.eye(3, 4), cx=0.5, cy=0.5)
     positions = np.zeros((n, 3))
     positions[:, 2] = np.round(rng.uniform(2.2, 5.9, n), 3)  # many equal depths
-    pairs = Scene(dev, camera, positions, 0.1).pairs
+    pairs = PairedPoints(dev, camera, positions, 0.1).pairs
     assert pairs.total == n
     expected = np.argsort(positions[:, 2].astype(np.float32), kind="stable")
     assert np.array_equal(pairs.pair_key.get()[:n] & 0xFFFFFFFF, expected)
 
 
 def test_buffers_serve_views_of_any_size(dev, rng):
-    camera = make_camera(33, 31)
     few, many = make_points(rng, 31), make_points(rng, 257)
-    scene = Scene(dev, camera, few, 0.3)
-    capacity = scene.pairs.capacity
+    builder = PairBuilder(dev, Footprint("soft"))
     for positions, size in ((many, (33, 31)), (few, (5, 9)), (many[:1], (1, 1)), (many, (33, 31))):
         view = replace(make_camera(*size), cx=size[0] / 2, cy=size[1] / 2)
-        other = Scene(dev, view, positions, 0.3)
-        other.pairs = scene.pairs
-        other.pairs.build(other.view, other.shape, other.projection, other.radius)
+        other = PairedPoints(dev, view, positions, 0.3)
+        other.pairs = builder.build(other.projected, other.shape)
         check(other, oracle.geometry(view, positions, 0.3, "soft"))
-        assert scene.pairs.capacity >= capacity
-        capacity = scene.pairs.capacity
 
 
 def test_two_builds_give_the_same_bits(dev, rng):
     camera, positions = make_camera(40, 36), make_points(rng, 5000)
-    first, second = (Scene(dev, camera, positions, 0.15).pairs for _ in range(2))
+    first, second = (PairedPoints(dev, camera, positions, 0.15).pairs for _ in range(2))
     total = first.total
-    for name in ("pair_pixel", "pair_source", "pair_key"):
+    for name in ("pair_pixel", "pair_point_closeness", "pair_key"):
         assert np.array_equal(
             getattr(first, name).get()[:total], getattr(second, name).get()[:total]
         ), name

@@ -9,9 +9,10 @@ import numpy as np
 import pytest
 from oracle import raster as oracle
 from support.comparisons import relative_error
-from support.raster_scene import Blended, Scene, make_camera
+from support.raster_scene import Blended, PairedPoints, make_camera
 
 from pp_cl.errors import UserError
+from pp_cl.raster.pairs import PairBuilder
 from pp_cl.raster.project import KINDS
 
 TAUS = (0.0, 0.01)
@@ -23,7 +24,7 @@ def check(dev, rng, camera, positions, radius, kind, tau=0.0, gamma=0.05):
     """
     n = len(positions)
     opacity, point_features = np.float32(rng.uniform(0, 1, n)), rng.normal(size=(n, 16))
-    scene = Scene(dev, camera, positions, radius, kind)
+    scene = PairedPoints(dev, camera, positions, radius, kind)
     geometry = oracle.geometry(camera, positions, radius, kind)
     hits, clear = scene.hits(), geometry["margin"] > 1e-3
     assert np.array_equal(hits[clear], geometry["hit"][clear]) and (~clear).mean() < 0.02
@@ -72,7 +73,7 @@ def test_across_the_near_sphere_and_the_plane_of_the_eye(dev, rng, kind):
     scene = check(
         dev, rng, camera, camera.eye + directions * (front + radius)[:, None], radius, kind
     )
-    placed = scene.projection.point_camera.get()
+    placed = scene.projected.point_camera.get()
     left_out = placed[:, 3] < 0
     assert (left_out[front < 0.5 - 1e-4]).all() and (~left_out).sum() > 40
     assert (placed[~left_out, 2] < radius[~left_out]).any()  # reaches the plane of the eye
@@ -102,7 +103,7 @@ def test_an_image_of_one_pixel(dev, rng, n):
     if n:
         check(dev, rng, camera, rng.normal(size=(n, 3)), 0.3, "soft")
     else:
-        scene = Scene(dev, camera, np.full((1, 3), 1e6), 0.3)
+        scene = PairedPoints(dev, camera, np.full((1, 3), 1e6), 0.3)
         assert scene.pairs.total == 0 and (scene.blend([1.0], 0.1, np.zeros((1, 16))) == 1).all()
 
 
@@ -126,9 +127,9 @@ def test_an_image_of_millions_of_pixels(dev):
         camera.eye
         + depth * (rays / np.linalg.norm(rays, axis=1, keepdims=True)) @ camera.pose[:, :3].T
     )
-    scene = Scene(dev, camera, positions, 0.004, "disc")
+    scene = PairedPoints(dev, camera, positions, 0.004, "disc")
     offsets = scene.pairs.pixel_offset.get().astype(np.int64)
-    points = scene.pairs.pair_source.get()[:, 0][
+    points = scene.pairs.pair_point_closeness.get()[:, 0][
         scene.pairs.pair_key.get()[: scene.pairs.total] & 0xFFFFFFFF
     ]
     found = 0
@@ -153,10 +154,11 @@ def test_long_lists_do_not_take_quadratic_time(dev):
     def best(n):
         positions = np.zeros((n, 3))
         positions[:, 2] = np.random.default_rng(1).permutation(np.linspace(2.2, 5.9, n))
-        scene, seconds = Scene(dev, camera, positions, 0.1), []
+        scene, seconds = PairedPoints(dev, camera, positions, 0.1), []
+        builder = PairBuilder(dev, scene.footprint)
         for _ in range(4):
             start = time.perf_counter()
-            scene.pairs.build(scene.view, scene.shape, scene.projection, scene.radius)
+            builder.build(scene.projected, scene.shape)
             scene.blend(np.ones(n), 0.05, np.zeros((n, 16)), tau=1e-3)
             seconds.append(time.perf_counter() - start)
         return min(seconds)
@@ -170,7 +172,7 @@ def test_more_pairs_than_can_be_numbered(dev):
     camera = replace(make_camera(1024, 1024), fx=9e4, fy=9e4, cx=512.0, cy=512.0)
     straight = camera.eye + 4 * camera.pose[:, 2:3].T
     with pytest.raises(UserError, match="--points"):
-        Scene(dev, camera, np.repeat(straight, 4097, axis=0), 1.9)
+        PairedPoints(dev, camera, np.repeat(straight, 4097, axis=0), 1.9)
 
 
 @pytest.mark.large

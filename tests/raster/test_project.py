@@ -17,23 +17,24 @@ GRID = Grid((-1.1, -0.9, -0.7), 0.05, (45, 37, 29))
 
 def project_grid(dev, camera, ids, radius=0.0, **options):
     """(N, 4) positions in camera axes and distances of grid vertices."""
-    projection = Projection(dev, Footprint("disc"))
-    projection.grid(
+    points = Projection(dev, Footprint("disc")).grid(
         dev.upload(camera.packed()),
         dev.upload(GRID.packed()),
         dev.upload(ids, np.uint32),
-        radius,
+        dev.upload([radius], np.float32),
         **options,
     )
-    return projection.point_camera.get()
+    return points.point_camera.get()
 
 
 def project_spheres(dev, camera, positions, radius, kind="soft"):
     """((N, 4) camera positions, (N, 4) boxes)."""
-    projection = Projection(dev, Footprint(kind))
-    radius = dev.upload(np.atleast_1d(radius), np.float32)
-    projection.spheres(dev.upload(camera.packed()), dev.upload(positions, np.float32), radius)
-    return projection.point_camera.get(), projection.point_box.get()
+    points = Projection(dev, Footprint(kind)).spheres(
+        dev.upload(camera.packed()),
+        dev.upload(positions, np.float32),
+        dev.upload(np.atleast_1d(radius), np.float32),
+    )
+    return points.point_camera.get(), points.point_box.get()
 
 
 @pytest.mark.parametrize("n", AWKWARD_SIZES)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from oracle.raster import camera_space, pulsar_box
 from support.comparisons import relative_error
-from support.raster_scene import Scene
+from support.raster_scene import PairedPoints
 
 from pp_cl.scene.camera import Camera
 
@@ -62,7 +62,7 @@ class Case:
             self.arrays = {key: file[key] for key in file.files}
         self.camera = read_camera(self)
         self.positions, self.radius = self["in_positions"] * MIRROR, self["in_radius"]
-        self.scene = Scene(dev, self.camera, self.positions, self.radius, "sphere")
+        self.scene = PairedPoints(dev, self.camera, self.positions, self.radius, "sphere")
         # The weights sum to one, so features shifted from Pulsar's background to ours shift the
         # picture alike.
         self.shift = 1 - self["in_bg"].astype(np.float64)
@@ -130,7 +130,7 @@ def test_picture_and_hits(dev, data, name):
 
 
 def test_early_stop_drops_no_more_than_in_pulsar(dev, data, name):
-    case = Case(dev, data, name, stop=0.01)
+    case = Case(dev, data, name, early_stop=0.01)
     assert np.abs(case.image - case["exact_pad001_image"]).max() < 1e-2
 
 

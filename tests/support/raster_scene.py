@@ -6,8 +6,8 @@ import numpy as np
 from oracle import raster as oracle
 
 from pp_cl.raster.blend import Blend
-from pp_cl.raster.blend_weights import Weights
-from pp_cl.raster.pairs import Pairs
+from pp_cl.raster.blend_weights import BlendWeights
+from pp_cl.raster.pairs import PairBuilder
 from pp_cl.raster.project import Footprint, Projection
 from pp_cl.scene.camera import Camera
 
@@ -42,7 +42,7 @@ def make_points(rng, n):
     return rng.normal(size=(n, 3)) * [0.9, 0.9, 0.8]
 
 
-class Scene:
+class PairedPoints:
     """Points projected and paired with the pixels of a camera; arrays are float64 or float32 numpy.
 
     positions: (N, 3). radius: one number or (N,), world units.
@@ -52,12 +52,13 @@ class Scene:
         self.dev, self.camera, self.n = dev, camera, len(positions)
         self.shape = (camera.height, camera.width)
         self.footprint = Footprint(kind)
-        self.view = dev.upload(camera.packed())
-        self.radius = dev.upload(np.atleast_1d(radius), np.float32)
-        self.projection = Projection(dev, self.footprint)
-        self.projection.spheres(self.view, dev.upload(positions, np.float32), self.radius)
-        self.pairs = Pairs(dev, self.footprint)
-        self.pairs.build(self.view, self.shape, self.projection, self.radius)
+        self.camera_buffer = dev.upload(camera.packed())
+        self.projected = Projection(dev, self.footprint).spheres(
+            self.camera_buffer,
+            dev.upload(positions, np.float32),
+            dev.upload(np.atleast_1d(radius), np.float32),
+        )
+        self.pairs = PairBuilder(dev, self.footprint).build(self.projected, self.shape)
 
     def pair_points(self):
         """(P,) the point of each pair, from the offsets alone."""
@@ -76,55 +77,45 @@ class Scene:
         """(N, HW) bool."""
         return self.dense(np.ones(max(1, self.pairs.total), bool), False)
 
-    def blend(self, opacity, gamma, point_features, mean=False, max_tracked=0, stop=0.0, tau=0.0):
-        """(H, W, 16) blended features; those of the points that are not kept are set to NaN
-        first.
+    def blend(self, opacity, gamma, point_features, mean=False, **drops):
+        """(H, W, 16) blended features; those of the points that are not shaded are set to NaN
+        first. drops: of BlendWeights.compute().
         """
         self.gamma, self.opacity = gamma, self.dev.upload(opacity, np.float32)
-        self.weights, self.blending = Weights(self.dev), Blend(self.dev, self.footprint, mean)
-        self.weights.weigh(self.pairs, self.view, self.opacity, gamma, max_tracked, stop, tau)
-        kept = np.isin(np.arange(self.n), self.weights.kept.get())
+        self.blending, self.weighing = Blend(self.dev, self.footprint, mean), BlendWeights(self.dev)
+        self.weights = self.weighing.compute(
+            self.pairs, self.camera_buffer, self.opacity, gamma, **drops
+        )
+        shaded = np.isin(np.arange(self.n), self.weights.shaded.get())
         self.point_features = self.dev.upload(
-            np.where(kept[:, None], point_features, np.nan), np.float32
+            np.where(shaded[:, None], point_features, np.nan), np.float32
         )
         self.features = self.dev.empty((*self.shape, 16))
-        self.blending.forward(self.pairs, self.point_features, self.features)
+        self.blending.forward(self.pairs, self.weights, self.point_features, self.features)
         return self.features.get()
+
+    def roles(self):
+        """(P,) numpy: cl/raster/pair_role.h of each pair."""
+        roles = self.weights.pair_role.get()
+        return roles if self.weights.has_roles else np.zeros(len(self.pairs.pair_pixel), np.uint8)
 
     def gradients(self, grad_features):
         """{"features": (N, 16), "opacity": (N,)} of sum(features * grad_features) after blend()."""
-        grad_point_features, grad_opacity = self.dev.empty((self.n, 16)), self.dev.empty((self.n,))
-        self.grad = self.dev.upload(np.reshape(grad_features, (*self.shape, 16)), np.float32)
-        self.blending.backward(
-            self.pairs,
-            self.weights.pair_weight,
-            self.point_features,
-            self.features,
-            self.grad,
-            grad_point_features,
-            grad_opacity,
-        )
-        return {"features": grad_point_features.get(), "opacity": grad_opacity.get()}
+        features, opacity = self.blending.backward(self._gradient(grad_features))
+        return {"features": features.get(), "opacity": opacity.get()}
 
     def sphere_gradients(self, grad_features):
         """{"positions": (N, 3), "radius": (N,)} of the same."""
-        grad_positions, grad_radius = self.dev.empty((self.n, 3)), self.dev.empty((self.n,))
-        self.grad = self.dev.upload(np.reshape(grad_features, (*self.shape, 16)), np.float32)
-        self.blending.backward_spheres(
-            self.pairs,
-            self.weights.pair_weight,
-            self.view,
-            self.gamma,
-            self.radius,
-            self.projection.point_camera,
-            self.opacity,
-            self.point_features,
-            self.features,
-            self.grad,
-            grad_positions,
-            grad_radius,
+        positions, radius = self.blending.backward_spheres(
+            self._gradient(grad_features), self.projected, self.opacity, self.gamma
         )
-        return {"positions": grad_positions.get(), "radius": grad_radius.get()}
+        return {"positions": positions.get(), "radius": radius.get()}
+
+    def _gradient(self, grad_features):
+        grad = self.dev.upload(np.reshape(grad_features, (*self.shape, 16)), np.float32)
+        return self.blending.gradient(
+            self.pairs, self.weights, self.point_features, self.features, grad
+        )
 
 
 GAMMAS = (0.1, 0.01)
@@ -146,7 +137,7 @@ class Blended:
         self.opacity[1::7] = 1
         self.point_features = rng.normal(size=(n, 16))
         self.grad = rng.normal(size=(size[0] * size[1], 16))
-        self.scene = Scene(dev, self.camera, self.positions, self.radius, kind)
+        self.scene = PairedPoints(dev, self.camera, self.positions, self.radius, kind)
         self.features = self.scene.blend(self.opacity, gamma, self.point_features, **blend).reshape(
             -1, 16
         )
@@ -154,9 +145,10 @@ class Blended:
             "hit": self.scene.hits()
         }
         self.blend = oracle.blend(
-            self.camera, self.geometry, self.opacity, gamma, blend.get("stop", 0.0)
+            self.camera, self.geometry, self.opacity, gamma, blend.get("early_stop", 0.0)
         )
         self.weight = self.scene.dense(self.scene.weights.pair_weight.get()[:, 0])
+        self.role = self.scene.dense(self.scene.roles())
 
     def gradients(self):
         """The kernels' gradients of sum(features * grad)."""
