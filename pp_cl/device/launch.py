@@ -4,6 +4,7 @@ The signature is parsed from the source, so that it works the same on drivers th
 info; the tests compare it with the driver's own (-cl-kernel-arg-info).
 """
 
+import math
 import operator
 import re
 from dataclasses import dataclass
@@ -11,6 +12,9 @@ from dataclasses import dataclass
 import numpy as np
 import pyopencl as cl
 import pyopencl.array as cl_array
+
+from pp_cl.device.formula import evaluate, names_in, parse_formula
+from pp_cl.errors import UserError
 
 SCALARS = {
     "char": np.int8,
@@ -42,8 +46,8 @@ _SHAPE = re.compile(r"^\(([^()]*(?:\([^()]*\)[^()]*)*)\)")
 
 @dataclass(frozen=True)
 class Parameter:
-    """One kernel parameter. shape: dimension words of its comment, None for a scalar or for
-    `(...)`.
+    """One kernel parameter. shape: the dimensions of its comment as text, such as "N+1"; None for
+    a scalar or for `(...)`.
     """
 
     name: str
@@ -93,6 +97,10 @@ def _parse_parameter(code, comment, where):
             raise ValueError(f"{where}: buffer {name!r} has no shape in its comment")
         shape = tuple(w.strip() for w in words.group(1).split(",") if w.strip())
         shape = None if shape == ("...",) else shape
+        try:
+            [parse_formula(word) for word in shape or () if word != "?"]
+        except ValueError as error:
+            raise ValueError(f"{where}: {name}: {error}") from None
     return Parameter(
         name, space or "", SCALARS[base], int(width or 1), "const" in qualifiers, shape
     )
@@ -101,13 +109,17 @@ def _parse_parameter(code, comment, where):
 class Kernel:
     """A compiled kernel that is called with named arguments."""
 
-    def __init__(self, kernel, parameters, defines, label):
+    def __init__(self, kernel, device, parameters, defines, label):
         self.kernel = kernel
+        limit = cl.kernel_work_group_info.WORK_GROUP_SIZE
+        self.largest_group = kernel.get_work_group_info(limit, device)  # work-items
         self.parameters = parameters
         self.names = [p.name for p in parameters]
-        self.defines = defines
         self.label = label
-        self._letters = {word.lower() for p in parameters for word in p.shape or ()}
+        words = {word for p in parameters for word in p.shape or () if word != "?"}
+        names = set().union(*(names_in(parse_formula(word)) for word in words))
+        self._macros = {name: int(defines[name]) for name in names & defines.keys()}
+        self._letters = {name.lower() for name in names}
         self._checked = set()  # shapes and sizes already found right
 
     def arguments(self, values):
@@ -137,9 +149,7 @@ class Kernel:
                     sizes[p.name.lower()] = int(value)
         key = (*shapes, *sizes.values())
         if key not in self._checked:
-            for p in self.parameters:
-                if p.space in ("global", "constant"):
-                    self._check_buffer(p, values[p.name], sizes)
+            self._check_buffers(values, sizes)
             if len(self._checked) > 4096:
                 self._checked.clear()
             self._checked.add(key)
@@ -159,22 +169,35 @@ class Kernel:
                 f"{self.label}: {p.name} = {value!r} is no {np.dtype(p.dtype)}: {error}"
             ) from error
 
-    def _check_buffer(self, p, array, sizes):
-        """Compare one array with its parameter; sizes: {letter: size} so far, new letters are
-        added.
+    def _check_buffers(self, values, sizes):
+        """Compare the arrays with their parameters. sizes: {letter: size} of the scalars; the sizes
+        of the other letters are added.
         """
-        has = f"{self.label}: {p.name} has shape {array.shape}"
-        if not array.flags.c_contiguous:
-            raise ValueError(f"{has} and strides {array.strides}: not contiguous")
-        if p.shape is None:
-            return
-        if len(array.shape) != len(p.shape):
-            raise ValueError(f"{has}, expected rank {len(p.shape)} {p.shape}")
-        for word, size in zip(p.shape, array.shape, strict=True):
-            word = str(self.defines.get(word, word))
-            expected = int(word) if word.isdigit() else sizes.setdefault(word.lower(), size)
-            if word != "?" and size != expected:
-                raise ValueError(f"{has}, expected {p.shape} with {word} = {expected}")
+        dimensions = []  # (formula, number, what to say if they differ)
+        for p in self.parameters:
+            if p.space not in ("global", "constant"):
+                continue
+            array = values[p.name]
+            has = f"{self.label}: {p.name} has shape {array.shape}"
+            if not array.flags.c_contiguous:
+                raise ValueError(f"{has} and strides {array.strides}: not contiguous")
+            if p.shape is None:
+                continue
+            if len(array.shape) != len(p.shape):
+                raise ValueError(f"{has}, expected rank {len(p.shape)} {p.shape}")
+            has += f", expected {p.shape}"
+            dimensions += [(w, n, has) for w, n in zip(p.shape, array.shape, strict=True)]
+        # letters first: the formulas are computed from them
+        for word, size, has in sorted(dimensions, key=lambda d: not d[0].isidentifier()):
+            if word == "?":
+                continue
+            expected = evaluate(
+                parse_formula(word), lambda n: self._macros.get(n, sizes.get(n.lower()))
+            )
+            if expected is None:  # a letter's first buffer
+                expected = sizes.setdefault(word.lower(), size)
+            if size != expected:
+                raise ValueError(f"{has} with {word} = {expected}")
 
 
 def _kind(value):
@@ -200,7 +223,7 @@ class Program:
             ) from error
         self.built = built
         self.kernels = {
-            k: Kernel(getattr(built, k), p, defines, f"{name}.cl:{k}")
+            k: Kernel(getattr(built, k), device.device, p, defines, f"{name}.cl:{k}")
             for k, p in signatures.items()
         }
 
@@ -210,7 +233,8 @@ class Program:
         size: int or tuple of work-items, rounded up to the work-group size (kernels guard their
         tail); nothing is launched when it is 0. local: work-group size; None = DEFAULT_LOCAL.
         arguments: by parameter name. Raises TypeError (names, dtypes) and ValueError (shapes)
-        before anything is enqueued, UserError when the driver gives up.
+        before anything is enqueued, UserError when the work-group is too large for the device or
+        the driver gives up.
         """
         kernel = self.kernels[kernel_name]
         values = kernel.arguments(arguments)
@@ -222,6 +246,12 @@ class Program:
         )
         if 0 in size:
             return
+        if math.prod(local) > kernel.largest_group:
+            raise UserError(
+                f"{kernel.label}: a work-group of {math.prod(local)} work-items, but"
+                f" {self.device.name} runs at most {kernel.largest_group} of this kernel: choose"
+                " another device (`pp-cl devices`)"
+            )
         size = tuple(-(-s // group) * group for s, group in zip(size, local, strict=True))
         event = self.device.attempt(
             f"run {kernel.label}", kernel.kernel, self.device.queue, size, local, *values

@@ -6,6 +6,7 @@ import pytest
 
 from pp_cl.device import device as device_module
 from pp_cl.device.launch import DEFAULT_LOCAL, parse_signatures
+from pp_cl.errors import UserError
 
 KERNEL_FOLDER = device_module.kernel_folder()  # before any test replaces it
 STEMS = sorted(
@@ -47,6 +48,18 @@ kernel void behind(
     global float *y)               // (N)
 {
     if (get_global_id(0) == 0) y[n] = 1.0f;
+}
+
+// One work-item: nothing; its buffers' lengths are formulas.
+kernel void formulas(
+    const uint n,
+    const int height,
+    global const float *offsets,   // (N+1)
+    global const float *halves,    // ((height-1)/2, WIDTH * 2)
+    global const float *both,      // (a + B - 1)
+    global const float *first,     // (A)
+    global const float *second)    // (B)
+{
 }
 """
 
@@ -93,7 +106,7 @@ def test_parsed_signature():
 
 def test_all_kernels_of_a_file_are_found():
     signatures = parse_signatures(SOURCE, "toy.cl")
-    assert list(signatures) == ["rows", "copied", "behind"]
+    assert list(signatures) == ["rows", "copied", "behind", "formulas"]
     assert [p.space for p in signatures["copied"]] == ["global", "local", "global"]
     assert signatures["copied"][2].shape is None
 
@@ -134,6 +147,11 @@ def test_nested_brackets_in_a_shape():
         ("    const unsigned int n)", "cannot read parameter"),
         ("    const float4 colour)", "neither a global"),
         ("    float *x)  // (N)", "neither a global"),
+        ("    global float *x)  // (N**2)", r"f.cl: f: x: 'N\*\*2' is no formula"),
+        ("    global float *x)  // (len(N))", r"'len\(N\)' is no formula"),
+        ("    global float *x)  // (4, N + 1.5)", r"'N \+ 1.5' is no formula"),
+        ("    global float *x)  // (4, N and C)", "'N and C' is no formula"),
+        ("    global float *x)  // (rows of N)", "'rows of N' is no formula"),
     ],
 )
 def test_heads_that_are_refused(parameters, message):
@@ -269,11 +287,52 @@ def test_refused_before_the_enqueue(program, dev, rows, case):
     assert enqueued == []
 
 
+FORMULAS = {"offsets": (34,), "halves": (3, 8), "both": (11,), "first": (5,), "second": (7,)}
+
+
+@pytest.mark.parametrize(
+    "change, message",
+    [
+        ({"offsets": (33,)}, r"offsets has shape \(33,\), expected .* with N\+1 = 34"),
+        ({"halves": (4, 8)}, r"halves .* with \(height-1\)/2 = 3"),
+        ({"halves": (3, 4)}, r"halves .* with WIDTH \* 2 = 8"),
+        ({"both": (12,)}, r"both .* with a \+ B - 1 = 11"),
+        ({"first": (6,)}, r"both .* with a \+ B - 1 = 12"),
+    ],
+)
+def test_a_length_that_is_a_formula_is_checked(dev, tmp_path, monkeypatch, change, message):
+    (tmp_path / "toy.cl").write_text(SOURCE)
+    monkeypatch.setattr(device_module, "kernel_folder", lambda: tmp_path)
+    program = dev.program("toy", WIDTH=4)
+    good = {name: dev.zeros(shape) for name, shape in FORMULAS.items()}
+    program.launch("formulas", 1, n=33, height=8, **good)
+    bad = {name: dev.zeros(shape) for name, shape in change.items()}
+    with pytest.raises(ValueError, match=f"^toy.cl:formulas: {message}"):
+        program.launch("formulas", 1, n=33, height=8, **{**good, **bad})
+
+
+def test_a_formula_without_sizes_stands_for_itself(program, dev):
+    good = {name: dev.zeros(shape) for name, shape in FORMULAS.items()}
+    program.launch("formulas", 1, n=33, height=8, **{**good, "halves": dev.zeros((3, 5))})
+
+
+def test_a_work_group_larger_than_the_device_runs_is_one_line(program, dev, rows):
+    limit = program.kernels["rows"].largest_group
+    assert limit == cl.Kernel(program.built, "rows").get_work_group_info(
+        cl.kernel_work_group_info.WORK_GROUP_SIZE, dev.device
+    )
+    program.launch("rows", 33, local=min(64, limit), **rows)
+    with pytest.raises(
+        UserError, match=rf"^toy.cl:rows: a work-group of {2 * limit} work-items, but .* {limit} "
+    ):
+        program.launch("rows", 33, local=2 * limit, **rows)
+
+
 def test_a_define_in_a_shape_is_checked(dev, tmp_path, monkeypatch, rows):
     (tmp_path / "toy.cl").write_text(SOURCE)
     monkeypatch.setattr(device_module, "kernel_folder", lambda: tmp_path)
     dev.program("toy", WIDTH=4).launch("rows", 33, **rows)
-    with pytest.raises(ValueError, match="with 5 = 5"):
+    with pytest.raises(ValueError, match="with WIDTH = 5"):
         dev.program("toy", WIDTH=5).launch("rows", 33, **rows)
 
 

@@ -1,4 +1,4 @@
-"""The rules of the OpenCL sources. Each function takes a source and returns what breaks the rule."""
+"""Rules of the OpenCL sources. Each function takes a source and returns what breaks its rule."""
 
 import re
 
