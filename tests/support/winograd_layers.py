@@ -1,6 +1,7 @@
 """Winograd convolutions run on plain arrays."""
 
 import numpy as np
+from support.guarded import large
 
 from pp_cl.layers.conv import pack_bias, pack_weights, unpack_weights
 from pp_cl.layers.winograd import (
@@ -11,7 +12,6 @@ from pp_cl.layers.winograd import (
 )
 from pp_cl.layers.winograd_backward_weights import gradient_scratch_floats, winograd_weight_gradient
 from pp_cl.layers.winograd_transform import transform_flipped_weights, transform_weights
-from support.guarded import large
 
 
 def stored_weights(array, m, ci, co, half):
