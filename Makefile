@@ -2,6 +2,7 @@
 PYTHON ?= python3
 BIN := .venv/bin
 READY := .venv/.ready
+KERNELS := $(shell find cl -name "*.cl" -o -name "*.h")
 
 # The tests of all kernels, the longest in Oclgrind first.
 OCLGRIND := tests/layers/test_tiles.py \
@@ -63,8 +64,18 @@ bench: $(READY) ## time and error of the network and of its layers; ARGS="--size
 	$(BIN)/pp-cl bench unet $(ARGS)
 	$(BIN)/pp-cl bench conv $(ARGS)
 
-lint: $(READY) ## check the style of the Python files
+lint: $(READY) ## check the Python files (ruff) and the format of the kernels (clang-format)
 	@$(BIN)/ruff check
+	@$(BIN)/ruff format --check
+	@$(BIN)/clang-format --dry-run --Werror $(KERNELS)
+
+format: $(READY) ## format the Python files and the kernels
+	@$(BIN)/ruff check --fix
+	@$(BIN)/ruff format
+	@$(BIN)/clang-format -i $(KERNELS)
+
+wheel: $(READY) ## build the wheel into dist/
+	@$(BIN)/python -m pip wheel --quiet --no-deps --wheel-dir dist .
 
 oclgrind: $(READY) ## run the tests of all kernels in Oclgrind (Debian's package): stray accesses, data races, uninitialised reads
 	@printf '%s\n' $(OCLGRIND) | $(ON_OCLGRIND) xargs -P $$(nproc) -I{} \

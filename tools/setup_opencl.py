@@ -48,11 +48,15 @@ def install_debian():
     env = {**os.environ, "DEBIAN_FRONTEND": "noninteractive"}
     for command in ("update", "install --yes --no-install-recommends pocl-opencl-icd"):
         subprocess.run(
-            ["apt-get", "-qq", *command.split()], env=env, stdout=subprocess.DEVNULL, check=True
+            [shutil.which("apt-get"), "-qq", *command.split()],
+            env=env,
+            stdout=subprocess.DEVNULL,
+            check=True,
         )
 
 
 def pip(*arguments):
+    """Run the pip of this virtual environment."""
     subprocess.run(
         [sys.executable, "-m", "pip", "--disable-pip-version-check", "--quiet", *arguments],
         check=True,

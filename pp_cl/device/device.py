@@ -133,7 +133,11 @@ class Device:
             options += [f"-D{k}={v}" for k, v in key[1]]
             start = time.perf_counter()
             self._programs[key] = Program(
-                self, name, (folder / f"{name}.cl").read_text("utf-8"), options, defines
+                self,
+                name,
+                (folder / f"{name}.cl").read_text("utf-8"),
+                options=options,
+                defines=defines,
             )
             if self.debug:
                 print(

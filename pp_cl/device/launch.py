@@ -109,7 +109,7 @@ def _parse_parameter(code, comment, where):
 class Kernel:
     """A compiled kernel that is called with named arguments."""
 
-    def __init__(self, kernel, device, parameters, defines, label):
+    def __init__(self, kernel, device, parameters, *, defines, label):
         self.kernel = kernel
         limit = cl.kernel_work_group_info.WORK_GROUP_SIZE
         self.largest_group = kernel.get_work_group_info(limit, device)  # work-items
@@ -211,7 +211,7 @@ def _kind(value):
 class Program:
     """One built cl/*.cl file."""
 
-    def __init__(self, device, name, source, options, defines):
+    def __init__(self, device, name, source, *, options, defines):
         self.device = device
         self.name = name
         signatures = parse_signatures(source, f"cl/{name}.cl")
@@ -223,7 +223,7 @@ class Program:
             ) from error
         self.built = built
         self.kernels = {
-            k: Kernel(getattr(built, k), device.device, p, defines, f"{name}.cl:{k}")
+            k: Kernel(getattr(built, k), device.device, p, defines=defines, label=f"{name}.cl:{k}")
             for k, p in signatures.items()
         }
 
