@@ -1,10 +1,9 @@
-// The regular grid of the points, read from one buffer of 8 floats; pp_cl/scene/grid.py writes it.
+// The regular grid of the points, read from one buffer of 8 floats: origin x, y, z; edge; nx, ny, nz;
+// 0. pp_cl/scene/grid.py writes it.
 #ifndef PP_GRID_H
 #define PP_GRID_H
 
-#define GRID_FLOATS 8  // origin x, y, z; edge; nx, ny, nz; 0
-
-// World position of grid vertex `id` = i + nx*(j + ny*k).
+// World position of the grid's vertex (i, j, k), whose id is i + nx*(j + ny*k).
 static inline float3 grid_position(global const float *grid, const uint id) {
     const uint nx = (uint)grid[4], ny = (uint)grid[5];
     const uint row = id / nx;

@@ -12,11 +12,11 @@ from pp_cl.files.contact_sheet import write_comparison
 from pp_cl.files.image import write_png
 from pp_cl.layers.tuning import adopt_stored
 from pp_cl.metrics.psnr_ssim import Metrics, mean
+from pp_cl.metrics.published import published_row
 from pp_cl.model import Model
 from pp_cl.render import Renderer
-from pp_cl.run import CHECKPOINT, load_run, open_scene, with_depth_range
+from pp_cl.run import CHECKPOINT, load_run, open_scene
 from pp_cl.scene.target import Target
-from pp_cl.scene.views import reduced_camera
 from pp_cl.training.schedule import gamma
 
 PICTURE_VIEWS = 4  # rows of the comparison picture
@@ -41,7 +41,7 @@ def evaluate_run(folder, metrics, split, save_images, device_choice, tolerance=N
     model = Model.load(
         dev, header, arrays, config.network.widths, config.points.sh_degree, folder / CHECKPOINT
     )
-    views = with_depth_range(scene.splits[split], model.depth_range)
+    views = scene.splits[split]
 
     target_folder = folder / "eval"
     (target_folder / "images" if save_images else target_folder).mkdir(parents=True, exist_ok=True)
@@ -74,7 +74,7 @@ def evaluate_run(folder, metrics, split, save_images, device_choice, tolerance=N
         "seconds_per_frame": float(np.median(seconds)),
         # of the network's multiplications; the rest saw background alone
         "network_share": float(np.mean(shares)),
-        "published": scene.published,
+        "published": published_row(scene.name, [view.stored_camera for view in views]),
     }
     write_json(target_folder / "metrics.json", result)
     write_comparison(target_folder / "comparison.png", *zip(*pictures, strict=True))
@@ -91,22 +91,21 @@ def _render_all(dev, config, model, views, gamma_now):
     float32 in [0, 1].
     """
     model.net.freeze()
-    renderer, target = Renderer(dev, model, config.raster), Target(dev, config.scene.downscale)
+    renderer, target = Renderer(dev, model, config.raster), Target(dev)
     # builds the programs
-    renderer.render(reduced_camera(views[0], config.scene.downscale), gamma_now)
+    renderer.render(views[0].camera, gamma_now)
     for view in views:
-        camera = reduced_camera(view, config.scene.downscale)
         start = time.perf_counter()
-        picture = renderer.render(camera, gamma_now)
+        picture = renderer.render(view.camera, gamma_now)
         seconds = time.perf_counter() - start
         target.load(view)
-        truth = target.crop(0, 0, camera.width, camera.height).get()
+        truth = target.whole()
         yield (
             view,
             picture,
             truth,
             seconds,
-            _tau_errors(renderer, camera, gamma_now) if config.raster.tau > 0 else {},
+            _tau_errors(renderer, view.camera, gamma_now) if config.raster.tau > 0 else {},
         )
 
 

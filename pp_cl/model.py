@@ -14,7 +14,7 @@ class Model:
     """Points and network on a device.
 
     degree: of the SH, 0 to 2. blocks: points.ShBlock of each array of coefficients. grid: Grid.
-    depth_range: (near, far), world units, of cameras that bring none. points: {"ids" (N) uint32
+    depth_range: (near, far), world units, for every camera. points: {"ids" (N) uint32
     ascending, "opacity" (N), "sh0" (N,1,16), "sh1" (N,3,16), "sh4" (N,3,16), "sh7" (N,2,16)} device
     arrays, see points.SH_BLOCKS, as far as the degree goes; training adds rows of its own. keys: of
     the learned ones, all but "ids".

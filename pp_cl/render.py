@@ -136,8 +136,8 @@ class Renderer:
         padded, *offset = camera.padded(NETWORK_MULTIPLE)
         size = (padded.height, padded.width)
         b.require(self.table(cloud.count, *size))
-        b.camera_buffer.set(padded.packed())
-        b.point_radius.set(np.array([self._radius(padded)], np.float32))
+        b.camera_buffer.set(padded.packed(self.model.depth_range))
+        b.point_radius.set(np.array([self._radius()], np.float32))
         with self.dev.stage("project"):
             points = self._projection.grid(
                 b.camera_buffer,
@@ -195,8 +195,9 @@ class Renderer:
         image = result.image.get()[top : top + camera.height, left : left + camera.width]
         return np.clip(image, 0, 1)
 
-    def _radius(self, camera):
+    def _radius(self):
         """The points' radius in world units."""
         if self.settings.footprint == "soft":
             return self.settings.radius * self.model.grid.edge
-        return self.settings.radius * (camera.far - camera.near) / PAPER_DEPTH_RANGE
+        near, far = self.model.depth_range
+        return self.settings.radius * (far - near) / PAPER_DEPTH_RANGE

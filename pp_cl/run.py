@@ -6,7 +6,6 @@ import hashlib
 import json
 import sys
 import time
-from dataclasses import replace
 
 import numpy as np
 from tqdm import tqdm
@@ -18,9 +17,8 @@ from pp_cl.files.checkpoint import load_checkpoint, save_checkpoint
 from pp_cl.files.contact_sheet import write_comparison
 from pp_cl.layers.tuning import adopt_of_run, adopt_stored
 from pp_cl.model import Model
-from pp_cl.scene.hull import build_grid, depth_range, spacing_pixels
+from pp_cl.scene.hull import CELL_CAP, build_grid, depth_range, spacing_pixels
 from pp_cl.scene.load import load_scene
-from pp_cl.scene.views import reduced_camera
 from pp_cl.train import Trainer
 from pp_cl.training.memory import memory_plan, print_plan, spare_memory
 
@@ -44,22 +42,24 @@ def load_run(path):
 
 
 def open_scene(dev, config, splits):
-    """Scene of config.scene.path with the given splits; `demo` is rendered on the device."""
+    """Scene of config.scene.path with the given splits, reduced config.scene.downscale times;
+    `demo` is rendered on the device.
+    """
     if config.scene.path != "demo":
-        return load_scene(config.scene.path, splits)
+        return load_scene(config.scene.path, splits).reduced(config.scene.downscale)
     from pp_cl.scene.demo import SPLITS, demo_scene
 
     unknown = set(splits) - set(SPLITS)
     if unknown:
         raise UserError(f"--split {', '.join(unknown)}: demo has {', '.join(SPLITS)}")
-    return demo_scene(dev)
+    return demo_scene(dev, splits).reduced(config.scene.downscale)
 
 
 def fingerprint(views):
-    """Hex digest of the views' names, cameras and sizes, by which a checkpoint knows its scene."""
+    """Hex digest of the views' names and stored cameras, by which a checkpoint knows its scene."""
     digest = hashlib.sha256()
     for view in views:
-        camera = view.camera
+        camera = view.stored_camera
         digest.update(f"{view.name} {camera.width}x{camera.height} ".encode())
         digest.update(
             np.round(
@@ -67,12 +67,6 @@ def fingerprint(views):
             ).tobytes()
         )
     return digest.hexdigest()
-
-
-def with_depth_range(views, near_far):
-    """The views with one (near, far) in all their cameras."""
-    near, far = near_far
-    return [replace(v, camera=replace(v.camera, near=near, far=far)) for v in views]
 
 
 def train_run(folder, config, device_choice):
@@ -130,16 +124,20 @@ def _check_folder(folder):
 def _start(dev, config, scene):
     """(Trainer, info) of a run from its beginning."""
     views = scene.splits["train"]
-    reduced_camera(views[0], config.scene.downscale)  # refuses a reduction that leaves too little
     start = time.perf_counter()
     hull = build_grid(dev, views, config.points.count)
     near_far = depth_range(views, hull)
     dims = "x".join(str(d) for d in hull.grid.dims)
     print(
         f"hull: {len(hull.ids)} points on a {dims} grid, edge {hull.grid.edge:.6g}"
-        f" ({spacing_pixels(hull, views, config.scene.downscale):.2f} pixels), depth"
+        f" ({spacing_pixels(hull, views):.2f} pixels), depth"
         f" {near_far[0]:.3f} to {near_far[1]:.3f} ({time.perf_counter() - start:.1f} s)"
     )
+    if hull.capped:
+        print(
+            f"hull: only {len(hull.ids)} of the {config.points.count} points asked for, since a"
+            f" finer grid would have more than {CELL_CAP} cells"
+        )
     model = Model.create(
         dev,
         hull.grid,
@@ -149,7 +147,7 @@ def _start(dev, config, scene):
         config.train.seed,
         config.points.sh_degree,
     )
-    return Trainer(dev, config, model, with_depth_range(views, near_far)), {
+    return Trainer(dev, config, model, views), {
         "scene": fingerprint(views),
         "initial_points": len(hull.ids),
     }
@@ -163,7 +161,7 @@ def _resume(dev, config, scene, header, arrays, file):
             f"{file}: belongs to another scene than {config.scene.path}; use another --out"
         )
     model = Model.load(dev, header, arrays, config.network.widths, config.points.sh_degree, file)
-    trainer = Trainer(dev, config, model, with_depth_range(views, model.depth_range))
+    trainer = Trainer(dev, config, model, views)
     try:
         trainer.restore(header["step"], arrays)
     except (KeyError, ValueError) as error:

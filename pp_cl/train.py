@@ -7,7 +7,6 @@ import numpy as np
 from pp_cl.errors import UserError
 from pp_cl.render import Renderer
 from pp_cl.scene.target import Target
-from pp_cl.scene.views import object_box, reduced_camera
 from pp_cl.training.adam import moment_scale
 from pp_cl.training.loss import Loss
 from pp_cl.training.optimiser import Optimiser, Rates
@@ -28,15 +27,14 @@ class Trainer:
         self.config = config.train
         self.network = config.network
         self.gamma = config.raster.gamma
-        self.downscale = config.scene.downscale
         self.model = model
         self.views = views
         self.step = 0
         self.renderer = Renderer(dev, model, config.raster)
-        self.target = Target(dev, self.downscale)
+        self.target = Target(dev)
         self.loss = Loss(dev, self.config.ssim_weight)
         self.optimiser = Optimiser(dev, model, self.config.lazy_adam, self._moment_scale())
-        self.boxes = object_box(views, self.downscale, BOX_MARGIN)
+        self.boxes = [view.object_bounds(BOX_MARGIN) for view in views]
         model.points["weight"] = dev.zeros((model.count,))
         self._smoother = None
 
@@ -46,7 +44,7 @@ class Trainer:
         """
         if not self.config.moments_16bit:
             return None
-        camera = reduced_camera(self.views[0], self.downscale)
+        camera = self.views[0].camera
         return moment_scale(
             self.config.sh_eps / (3 * math.prod(self.config.crop_size(camera.width, camera.height)))
         )
@@ -63,9 +61,9 @@ class Trainer:
         view_index, box, phase = self.draw(rng)
 
         view = self.views[view_index]
-        camera = self.target.camera(view, *box, phase)
+        camera = view.crop_camera(box, phase)
         self.target.load(view)
-        target = self.target.crop(*box, phase)
+        target = self.target.crop(box, phase)
 
         rendered = self.renderer.forward(
             camera,
@@ -99,7 +97,7 @@ class Trainer:
         return (
             config.crop == 0
             and config.dropout == 0
-            and not (config.pixel_jitter and self.downscale > 1)
+            and not (config.pixel_jitter and self.views[0].downscale > 1)
         )
 
     def draw(self, rng):
@@ -109,8 +107,9 @@ class Trainer:
         config, n = self.config, len(self.views)
         epoch, place = divmod(self.step, n)
         index = int(np.random.default_rng((config.seed, epoch, n)).permutation(n)[place])
-        camera = reduced_camera(self.views[index], self.downscale)
-        phases = self.downscale if config.pixel_jitter else 1
+        view = self.views[index]
+        camera = view.camera
+        phases = view.downscale if config.pixel_jitter else 1
         phase = tuple(int(p) for p in rng.integers(phases, size=2))
         if config.crop == 0:
             return index, (0, 0, camera.width, camera.height), phase
@@ -184,7 +183,7 @@ class Trainer:
         if self.config.final_prune_weight > 0:
             total = self.dev.zeros((self.model.count,))
             for view in self.views:
-                weights = self.renderer.weigh(reduced_camera(view, self.downscale), self.gamma[1])
+                weights = self.renderer.weigh(view.camera, self.gamma[1])
                 self.renderer.add_point_weights(weights, total)
             self._prune(total, self.config.final_prune_weight)
         self.model.points = {name: self.model.points[name] for name in ("ids", *self.model.keys)}
@@ -196,15 +195,14 @@ class Trainer:
     def picture(self, view):
         """(H,W,3) float32 in [0, 1]: the present model's picture of a view."""
         return self.renderer.render(
-            reduced_camera(view, self.downscale),
+            view.camera,
             gamma(self.step, self.config.iterations, *self.gamma),
         )
 
     def truth(self, view):
         """(H,W,3) float32 in [0, 1]: what the picture should be."""
-        camera = reduced_camera(view, self.downscale)
         self.target.load(view)
-        return self.target.crop(0, 0, camera.width, camera.height).get()
+        return self.target.whole()
 
     def arrays(self):
         """{name: numpy array} of the whole state."""

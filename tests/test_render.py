@@ -32,14 +32,12 @@ def chained(model, settings, camera, opacity=None, sh=None, tracked=0):
         else sh
     )
     spacing_or_world = (
-        GRID.edge
-        if settings.footprint == "soft"
-        else (camera.far - camera.near) / PAPER_DEPTH_RANGE
+        GRID.edge if settings.footprint == "soft" else np.ptp(model.depth_range) / PAPER_DEPTH_RANGE
     )
     geometry = oracle_raster.geometry(
         padded, positions, settings.radius * spacing_or_world, settings.footprint
     )
-    blend = oracle_raster.blend(padded, geometry, opacity, GAMMA, settings.early_stop)
+    blend = oracle_raster.blend(geometry, opacity, GAMMA, settings.early_stop)
     shaded = oracle_raster.shade(positions, padded.eye, sh)
     features = oracle_raster.features(blend, shaded)
     parameters = plain_parameters(model.net, model.net.parameters)

@@ -4,6 +4,7 @@ not.
 
 import json
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -288,8 +289,18 @@ def _noting(caches, finish):
 )
 def test_views_stay_only_where_nothing_is_drawn(changes, stay):
     settings = {"crop": 0, "dropout": 0.0, "pixel_jitter": False} | changes
-    trainer = SimpleNamespace(config=SimpleNamespace(**settings), downscale=2)
+    trainer = SimpleNamespace(
+        config=SimpleNamespace(**settings), views=[SimpleNamespace(downscale=2)]
+    )
     assert Trainer.views_stay(trainer) == stay
+
+
+def test_a_capped_grid_is_told(scene, tmp_path, capsys, monkeypatch):
+    """The ball fills about half of its box, so 1500 cells hold some 750 points."""
+    monkeypatch.setattr("pp_cl.scene.hull.CELL_CAP", 1500)
+    assert main(arguments(scene, tmp_path / "run", train__iterations=1)) == 0
+    told = re.search(r"^hull: only (\d+) of the 1500 points .*$", capsys.readouterr().out, re.M)
+    assert 500 < int(told[1]) < 1500
 
 
 def test_a_memory_that_is_too_small_is_one_line(scene, tmp_path, capsys):

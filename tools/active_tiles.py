@@ -22,9 +22,8 @@ from pp_cl.files.atomic import write_json
 from pp_cl.model import Model
 from pp_cl.raster.blend import BACKGROUND
 from pp_cl.render import Renderer
-from pp_cl.run import CHECKPOINT, load_run, open_scene, with_depth_range
+from pp_cl.run import CHECKPOINT, load_run, open_scene
 from pp_cl.scene.target import Target
-from pp_cl.scene.views import reduced_camera
 from pp_cl.training.loss import Loss
 
 
@@ -37,22 +36,20 @@ class Comparison:
         header, arrays = load_run(folder / CHECKPOINT)
         widths, degree = self.config.network.widths, self.config.points.sh_degree
         model = Model.load(dev, header, arrays, widths, degree, folder / CHECKPOINT)
-        self.views = with_depth_range(
-            open_scene(dev, self.config, (split,)).splits[split], model.depth_range
-        )
-        self.downscale = downscale or self.config.scene.downscale
+        scene = open_scene(dev, self.config, (split,))
+        self.views = (scene.reduced(downscale) if downscale else scene).splits[split]
         self.net = bench.make_network(dev, widths, "auto") if widths else model.net
         self.renderer = Renderer(dev, model, self.config.raster)
-        self.target = Target(dev, self.downscale)
+        self.target = Target(dev)
         self.loss = Loss(dev, self.config.train.ssim_weight)
 
     def row(self, view, runs):
         """{"view", "size", "share", times in ms, ratios, largest differences} of one view."""
-        camera = reduced_camera(view, self.downscale)
+        camera = view.camera
         self.renderer.forward(camera, self.config.raster.gamma[1])
         x = self.renderer.features
         self.target.load(view)
-        target = self.target.crop(0, 0, camera.width, camera.height)
+        target = self.target.crop((0, 0, camera.width, camera.height))
         grad = self.loss.forward_backward(
             self.net.forward(x, False, BACKGROUND), target, *self.renderer.offset
         )

@@ -13,8 +13,8 @@ from pp_cl.errors import UserError
 from pp_cl.scene.demo import SIZE, demo_mesh, demo_scene, write_scene
 
 
-def main():
-    """Render, write, and say what was written; returns the exit status."""
+def main() -> int:
+    """Write the images and the mesh; returns the exit status."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("folder", type=Path, help="where to; must not exist, or be empty")
     parser.add_argument(

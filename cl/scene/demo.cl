@@ -1,4 +1,4 @@
-// Pictures of the demo's object (demo_object.h): brass, lacquer and inlaid wood, sphere-traced
+// Images of the demo's object (demo_object.h): brass, lacquer and inlaid wood, sphere-traced
 // (Hart 1996) with 4x4 rays a pixel, one in each lane of a float16; and its distance field for the
 // mesh.
 #include "camera.h"
@@ -52,7 +52,7 @@ static inline Vector16 mix_colours(const float3 a, const float3 b, const float16
         a.x + (b.x - a.x) * share, a.y + (b.y - a.y) * share, a.z + (b.z - a.z) * share};
 }
 
-// `colour`, and where asked for instead of it a mixture of a and b.
+// `colour`, replaced in the lanes `where` by a mixture of a and b.
 static inline Vector16 paint(
     const Vector16 colour,
     const int16 where,
@@ -161,15 +161,15 @@ kernel void render_demo(
 {
     const uint x = get_global_id(0), y = get_global_id(1);
     if (x >= width || y >= height) return;
-    const Camera k = camera_load(camera);
+    const Camera cam = camera_load(camera);
     const float16 across = (float16)(1, 3, 5, 7, 1, 3, 5, 7, 1, 3, 5, 7, 1, 3, 5, 7) / 8.0f;
     const float16 along = (float16)(1, 1, 1, 1, 3, 3, 3, 3, 5, 5, 5, 5, 7, 7, 7, 7) / 8.0f;
-    const float16 right = (x + across - k.cx) / k.fx, down = (y + along - k.cy) / k.fy;
+    const float16 right = (x + across - cam.cx) / cam.fx, down = (y + along - cam.cy) / cam.fy;
     const Vector16 ray = normalize_lanes((Vector16){
-        k.right.x * right + k.down.x * down + k.forward.x,
-        k.right.y * right + k.down.y * down + k.forward.y,
-        k.right.z * right + k.down.z * down + k.forward.z});
-    const Vector16 eye = {k.eye.x, k.eye.y, k.eye.z};
+        cam.right.x * right + cam.down.x * down + cam.forward.x,
+        cam.right.y * right + cam.down.y * down + cam.forward.y,
+        cam.right.z * right + cam.down.z * down + cam.forward.z});
+    const Vector16 eye = {cam.eye.x, cam.eye.y, cam.eye.z};
 
     const Vector16 from_bound = {eye.x, eye.y, eye.z - BOUND_Z};
     const float16 middle = -dot_lanes(from_bound, ray);

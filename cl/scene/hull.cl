@@ -4,8 +4,8 @@
 #include "common.h"
 
 // One work-item per word of a mask's row: reads the alpha of its 32 pixels and of their neighbours,
-// writes the set of pixels with an alpha above `threshold` in their 3x3 neighbourhood. The 1 pixel
-// keeps what touches the silhouette.
+// writes the set of pixels with an alpha above `threshold` in their 3x3 neighbourhood. That margin of
+// 1 pixel keeps vertices that touch the silhouette.
 kernel void pack_mask(
     const uint width,  // pixels
     const uint height,
@@ -29,8 +29,8 @@ kernel void pack_mask(
 }
 
 // One work-item per word of 32 vertices along x: projects them into the views, one view after the
-// other until none is left, writes the set of those that some image sees and no mask rejects.
-// Outside an image and behind a camera is no evidence.
+// other until all are rejected, writes the set of those that some image sees and no mask rejects. A
+// vertex outside of an image or behind its camera is not rejected by it.
 kernel void carve(
     const uint nx,
     const uint ny,

@@ -1,15 +1,15 @@
-// What a rendering is compared with: a stored photograph, reduced by area and composited over
-// white.
+// The target of a rendering: a stored photograph, reduced by area and composited over white.
 #include "common.h"
 
-// One work-item per target pixel: reads its block of k x k stored pixels, writes the mean colour of
-// those that exist, white if none does. Straight alpha: colour over white = rgb * a + (1 - a).
+// One work-item per target pixel: reads its block of downscale x downscale stored pixels, writes the
+// mean colour of those that exist, white if none does. Straight alpha: colour over white =
+// rgb * a + (1 - a).
 kernel void target_forward(
     const int width,  // of the target, pixels
     const int height,
-    const int k,     // stored pixels a target pixel spans, each way
-    const int left,  // stored column and row where the block of target pixel (0, 0) starts,
-    const int top,   //   possibly outside of the image
+    const int downscale,  // stored pixels that a target pixel spans, each way
+    const int left,       // stored column and row where the block of target pixel (0, 0) starts,
+    const int top,        //   possibly outside of the image
     const int image_width,
     const int image_height,
     global const uchar4 *image,  // (image_height, image_width, 4) straight RGBA
@@ -17,9 +17,9 @@ kernel void target_forward(
 {
     const int x = get_global_id(0), y = get_global_id(1);
     if (x >= width || y >= height) return;
-    const int x0 = max(left + k * x, 0), x1 = min(left + k * (x + 1), image_width);
-    const int y0 = max(top + k * y, 0), y1 = min(top + k * (y + 1), image_height);
-    // of colours in units of 1 / 255^2; exact up to k = 16, where it reaches 2^24
+    const int x0 = max(left + downscale * x, 0), x1 = min(left + downscale * (x + 1), image_width);
+    const int y0 = max(top + downscale * y, 0), y1 = min(top + downscale * (y + 1), image_height);
+    // of colours in units of 1 / 255^2; exact up to downscale = 16, where it reaches 2^24
     float4 sum = 0.0f;
     for (int v = y0; v < y1; v++) {
         uint4 row = 0;

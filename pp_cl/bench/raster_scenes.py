@@ -123,6 +123,7 @@ class GridScene(BenchScene):
     """
 
     name, forward_stages = "grid", ("project", "pairs", "weights", "shade", "blend")
+    depth_range = (2.0, 6.0)
 
     def __init__(self, dev, n, size, gamma):
         rng = np.random.default_rng(0)
@@ -137,9 +138,9 @@ class GridScene(BenchScene):
         axes[:, 2] *= np.linalg.det(axes)
         focal = size / (2 * np.tan(np.radians(20)))
         pose = np.concatenate([axes, -4 * axes[:, 2:]], 1)
-        self.camera = Camera(pose, focal, focal, size / 2, size / 2, size, size, 2.0, 6.0)
+        self.camera = Camera(pose, focal, focal, size / 2, size / 2, size, size)
 
-        model = Model.create(dev, grid, ids, (2.0, 6.0), (CHANNELS,) * 3, seed=0)
+        model = Model.create(dev, grid, ids, self.depth_range, (CHANNELS,) * 3, seed=0)
         self.opacity = rng.uniform(0.7, 1, self.count).astype(np.float32)
         self.sh_0 = rng.standard_normal((self.count, 1, CHANNELS), np.float32)
         model.cloud.opacity.set(self.opacity)
@@ -149,7 +150,13 @@ class GridScene(BenchScene):
         settings = RasterConfig(footprint="disc", radius=0.0015)
         self.renderer = Renderer(dev, model, settings)
         self.grad = dev.upload(rng.standard_normal((size, size, CHANNELS), np.float32))
-        self.reference = PixelReference(self.camera, grid.positions(ids), settings.radius, "disc")
+        self.reference = PixelReference(
+            self.camera,
+            grid.positions(ids),
+            settings.radius,
+            "disc",
+            depth_range=self.depth_range,
+        )
 
     def forward(self, tau):
         """As BenchScene."""
@@ -186,23 +193,23 @@ class PulsarScene(BenchScene):
     """
 
     name, forward_stages = "pulsar", ("project", "pairs", "weights", "blend")
-    radius, near, far = 0.0015, 0.6, 2.5
+    radius, depth_range = 0.0015, (0.6, 2.5)
 
     def __init__(self, dev, n, size, gamma):
         rng = np.random.default_rng(0)
         self.dev, self.size, self.gamma, self.count = dev, size, gamma, n
-        self.camera = Camera(
-            np.eye(3, 4), size, size, size / 2, size / 2, size, size, self.near, self.far
-        )
+        self.camera = Camera(np.eye(3, 4), size, size, size / 2, size / 2, size, size)
         self.opacity = np.ones(n, np.float32)
         positions = rng.random((n, 3), np.float32) + np.float32([-0.5, -0.5, 1])
         self.point_features = rng.random((n, CHANNELS), np.float32)
-        self.reference = PixelReference(self.camera, positions, self.radius, "sphere")
+        self.reference = PixelReference(
+            self.camera, positions, self.radius, "sphere", depth_range=self.depth_range
+        )
 
         footprint = Footprint("sphere")
         self.projection, self.pairs = Projection(dev, footprint), PairBuilder(dev, footprint)
         self.weights, self.blend = BlendWeights(dev), Blend(dev, footprint)
-        self.camera_buffer = dev.upload(self.camera.packed())
+        self.camera_buffer = dev.upload(self.camera.packed(self.depth_range))
         self.point_radius = dev.upload([self.radius], np.float32)
         self.positions, self.point_opacity = dev.upload(positions), dev.upload(self.opacity)
         self.device_features = dev.upload(self.point_features)

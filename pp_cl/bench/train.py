@@ -11,9 +11,8 @@ import numpy as np
 
 from pp_cl.config import Config
 from pp_cl.model import Model
-from pp_cl.run import open_scene, with_depth_range
+from pp_cl.run import open_scene
 from pp_cl.scene.hull import build_grid, depth_range
-from pp_cl.scene.views import reduced_camera
 from pp_cl.train import Trainer
 from pp_cl.training.optimiser import Rates
 
@@ -32,7 +31,7 @@ def make_trainer(dev, config: Config) -> Trainer:
     )
     opacity = np.random.default_rng(0).uniform(0.3, 1, model.cloud.count).astype(np.float32)
     model.cloud.opacity.set(opacity)
-    return Trainer(dev, config, model, with_depth_range(views, near_far))
+    return Trainer(dev, config, model, views)
 
 
 def bench_train(dev, config: Config, views: int, rounds: int) -> dict:
@@ -51,8 +50,7 @@ def bench_train(dev, config: Config, views: int, rounds: int) -> dict:
                 seconds.clear()  # the first round builds the programs and fills the cache
             for i in range(views):
                 view = trainer.views[len(trainer.views) * i // views]
-                camera = reduced_camera(view, config.scene.downscale)
-                result = renderer.rasterise(camera, config.raster.gamma[1], key=i)
+                result = renderer.rasterise(view.camera, config.raster.gamma[1], key=i)
                 if i not in grads:
                     values = np.random.default_rng(i).normal(size=result.features.shape) * 1e-6
                     grads[i] = dev.upload(values, np.float32)

@@ -14,10 +14,11 @@ class PixelReference:
     for.
 
     positions: (N, 3), world. radius: one number, world units. kind: disc or sphere, no larger than
-    a few pixels.
+    a few pixels. depth_range: (near, far).
     """
 
-    def __init__(self, camera, positions, radius, kind):
+    def __init__(self, camera, positions, radius, kind, *, depth_range):
+        self.depth_range = depth_range
         self.camera, self.radius, self.kind = camera, radius, kind
         self.points = (np.asarray(positions, np.float64) - camera.eye) @ camera.pose[:, :3]
         x, y, z = self.points.T
@@ -64,7 +65,8 @@ class PixelReference:
         the background is 1.
         """
         _, closeness, depth = hits
-        z = 1 - (depth - self.camera.near) / (self.camera.far - self.camera.near)
+        near, far = self.depth_range
+        z = 1 - (depth - near) / (far - near)
         exponent = np.append(opacity * z / gamma, EPS / gamma)
         weight = np.append(opacity * closeness, 1.0) * np.exp(exponent - exponent.max())
         return (

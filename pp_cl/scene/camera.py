@@ -1,18 +1,18 @@
 """The pinhole camera of cl/camera.h."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-
-CAMERA_FLOATS = 20
+from numpy.typing import ArrayLike
 
 
 @dataclass(frozen=True)
 class Camera:
-    """A pinhole camera, OpenCV axes (x right, y down, z forward), pixel centres at +0.5.
+    """A pinhole camera with OpenCV axes: x right, y down, z forward.
 
-    pose: (3, 4) float64 camera-to-world, orthonormal rotation. near, far: Euclidean distance from
-    the eye, world units.
+    pose: (3, 4) float64 camera-to-world, orthonormal rotation. fx, fy, cx, cy: pixels; the centre
+    of pixel (x, y) is (x + 0.5, y + 0.5). The depth range is the model's, not the camera's.
     """
 
     pose: np.ndarray
@@ -22,52 +22,83 @@ class Camera:
     cy: float
     width: int
     height: int
-    near: float = 2.0
-    far: float = 6.0
+
+    @classmethod
+    def look_at(
+        cls,
+        eye: ArrayLike,
+        target: ArrayLike,
+        up: ArrayLike = (0.0, 0.0, 1.0),
+        *,
+        fx: float,
+        width: int,
+        height: int,
+        fy: float | None = None,
+    ) -> "Camera":
+        """A camera at `eye` whose image shows `target` in its centre, the principal point.
+
+        up: as in the function look_at. fy: fx if not given.
+        """
+        pose = look_at(eye, target, up)
+        return cls(pose, fx, fx if fy is None else fy, width / 2, height / 2, width, height)
 
     @property
-    def eye(self):
+    def eye(self) -> np.ndarray:
         """(3,) position in world coordinates."""
         return self.pose[:, 3]
 
-    def packed(self):
-        """(20,) float32, the layout of cl/camera.h."""
+    def packed(self, depth_range: Sequence[float]) -> np.ndarray:
+        """(20,) float32, the layout of cl/camera.h.
+
+        depth_range: (near, far), Euclidean distances from the eye, world units.
+        """
         return np.concatenate(
             [
                 self.pose[:, :3].T.ravel(),
                 self.eye,
-                [self.fx, self.fy, self.cx, self.cy, self.near, self.far, self.width, self.height],
+                [self.fx, self.fy, self.cx, self.cy, *depth_range, self.width, self.height],
             ]
         ).astype(np.float32)
 
-    def crop(self, x0, y0, width, height):
-        """The camera that sees columns [x0, x0+width) and rows [y0, y0+height); may reach outside
-        this one.
+    def crop(self, x0: int, y0: int, width: int, height: int) -> "Camera":
+        """The camera of columns [x0, x0+width) and rows [y0, y0+height) of this one's image, which
+        they may exceed.
         """
         return replace(self, cx=self.cx - x0, cy=self.cy - y0, width=width, height=height)
 
-    def shifted(self, dx, dy):
-        """The camera whose pixels lie (dx, dy) pixels further right and down: a sub-pixel phase."""
+    def shifted(self, dx: float, dy: float) -> "Camera":
+        """The camera whose pixels lie (dx, dy) pixels further right and down."""
         return replace(self, cx=self.cx - dx, cy=self.cy - dy)
 
-    def downscaled(self, k):
-        """The camera of the image reduced k times by averaging k x k blocks; rows and columns left
-        over are cut off.
+    def downscaled(self, factor: int) -> "Camera":
+        """The camera of the image whose pixels are means of factor x factor pixels; columns and
+        rows that fill no block are cut off.
         """
         return replace(
             self,
-            fx=self.fx / k,
-            fy=self.fy / k,
-            cx=self.cx / k,
-            cy=self.cy / k,
-            width=self.width // k,
-            height=self.height // k,
+            fx=self.fx / factor,
+            fy=self.fy / factor,
+            cx=self.cx / factor,
+            cy=self.cy / factor,
+            width=self.width // factor,
+            height=self.height // factor,
         )
 
-    def padded(self, multiple):
-        """(camera, left, top): enlarged so that both sides divide by `multiple`; crop the picture
-        at (left, top).
+    def padded(self, multiple: int) -> tuple["Camera", int, int]:
+        """(camera, left, top): enlarged so that `multiple` divides both sides; this camera's image
+        starts at column `left` and row `top` of the larger one.
         """
         extra_w, extra_h = -self.width % multiple, -self.height % multiple
         left, top = extra_w // 2, extra_h // 2
         return self.crop(-left, -top, self.width + extra_w, self.height + extra_h), left, top
+
+
+def look_at(eye: ArrayLike, target: ArrayLike, up: ArrayLike = (0.0, 0.0, 1.0)) -> np.ndarray:
+    """(3, 4) float64 camera-to-world pose of a camera at `eye` that looks at `target`.
+
+    up: world direction, not parallel to the line of sight, that points up in the image.
+    """
+    forward = np.subtract(target, eye) / np.linalg.norm(np.subtract(target, eye))
+    right = np.cross(forward, up)
+    right /= np.linalg.norm(right)
+    return np.column_stack([right, np.cross(forward, right), forward, eye])

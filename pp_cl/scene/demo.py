@@ -1,10 +1,11 @@
-"""The scene `demo`: pictures and a mesh of an object that cl/scene/demo.cl makes up, so that
-nothing must be downloaded.
+"""The scene `demo`: images and a mesh of an object that cl/scene/demo.cl defines, so that nothing
+must be downloaded.
 """
 
 import math
 import os
 import shutil
+from collections.abc import Iterable
 from pathlib import Path
 
 import numpy as np
@@ -21,14 +22,15 @@ from pp_cl.scene.views import View
 SPLITS = ("train", "test")
 SIZE = 400  # pixels
 ANGLE = 0.6911112  # of view across the image, radians: NeRF-synthetic's
-DISTANCE = 3.4  # of the cameras from the origin; the object fills the picture
+DISTANCE = 3.4  # of the cameras from the origin; the object fills the image
 TRAIN_VIEWS, TEST_VIEWS = 64, 16
+NO_DEPTH_RANGE = (0.0, math.inf)  # the rays are traced through the whole object
 OBJECT_BOX = ((-0.8, -0.8, -1.0), (0.8, 0.8, 0.92))  # holds the object
 
 
-def demo_scene(dev, splits=SPLITS, size=SIZE):
+def demo_scene(dev, splits: Iterable[str] = SPLITS, size: int = SIZE) -> Scene:
     """Scene `demo` of 64 training and 16 test views of size x size pixels, rendered on the device;
-    no depth range.
+    it states no depth range.
 
     The training views spread evenly from a little below the horizon to the pole, the test views
     circle the object.
@@ -41,11 +43,11 @@ def demo_scene(dev, splits=SPLITS, size=SIZE):
         ]
         for split in splits
     }
-    return Scene("demo", None, views, False)
+    return Scene("demo", None, views)
 
 
-def render(dev, camera):
-    """(H, W, 4) uint8 straight RGBA picture of the object; alpha is the share of 4x4 rays that hit
+def render(dev, camera: Camera) -> np.ndarray:
+    """(H, W, 4) uint8 straight RGBA image of the object; alpha is the share of 4x4 rays that hit
     it.
     """
     image = dev.empty((camera.height, camera.width, 4), np.uint8)
@@ -54,13 +56,13 @@ def render(dev, camera):
         (camera.width, camera.height),
         width=camera.width,
         height=camera.height,
-        camera=dev.upload(camera.packed()),
+        camera=dev.upload(camera.packed(NO_DEPTH_RANGE)),
         image=image,
     )
     return image.get()
 
 
-def demo_mesh(dev, resolution=256):
+def demo_mesh(dev, resolution: int = 256) -> tuple[np.ndarray, np.ndarray]:
     """((V, 3) float32 vertices, (F, 3) int32 faces, counter-clockwise from outside) of the object,
     by marching cubes.
 
@@ -76,7 +78,7 @@ def demo_mesh(dev, resolution=256):
     return (low + edge * vertices[:, ::-1]).astype(np.float32), faces
 
 
-def distances(dev, grid):
+def distances(dev, grid: Grid) -> np.ndarray:
     """(nz, ny, nx) float32 signed distances of a Grid's vertices to the object, negative inside."""
     n = math.prod(grid.dims)
     out = dev.empty((n,))
@@ -86,13 +88,13 @@ def distances(dev, grid):
     return out.get().reshape(grid.dims[::-1])
 
 
-def write_scene(scene, folder):
-    """Write a Scene as a NeRF-synthetic folder (transforms_<split>.json and PNG images) that
-    load_scene reads.
+def write_scene(scene: Scene, folder: str | Path) -> None:
+    """Write the stored images of a Scene as a NeRF-synthetic folder (transforms_<split>.json and
+    PNG images) that load_scene reads.
 
-    Nerfstudio's fl_x, fl_y, cx, cy, w, h (and near, far where the scene has them) stand in every
-    frame. The folder appears when it is complete. Raises UserError if it exists and is not empty,
-    or cannot be written.
+    Every frame has nerfstudio's fl_x, fl_y, cx, cy, w, h, and near and far if the scene states
+    them. The folder appears when it is complete. Raises UserError if it exists and is not empty, or
+    cannot be written.
     """
     folder = Path(folder).resolve()
     if folder.is_file() or folder.is_dir() and any(folder.iterdir()):
@@ -116,7 +118,7 @@ def write_scene(scene, folder):
 
 def _transforms(views):
     """Content of a transforms_<split>.json."""
-    camera = views[0].camera
+    camera = views[0].stored_camera
     return {
         "camera_angle_x": 2 * math.atan(0.5 * camera.width / camera.fx),
         "frames": [_frame(view) for view in views],
@@ -124,7 +126,7 @@ def _transforms(views):
 
 
 def _frame(view):
-    camera = view.camera
+    camera = view.stored_camera
     pose = np.vstack([camera.pose * [1, -1, -1, 1], [0, 0, 0, 1]])  # OpenGL: y up, z backward
     frame = {
         "file_path": "./" + Path(view.name).with_suffix("").as_posix(),
@@ -136,7 +138,9 @@ def _frame(view):
         "w": camera.width,
         "h": camera.height,
     }
-    return frame | ({"near": camera.near, "far": camera.far} if view.has_depth_range else {})
+    if view.depth_range:
+        frame["near"], frame["far"] = view.depth_range
+    return frame
 
 
 def _spread_cameras(size):
@@ -154,10 +158,13 @@ def _circling_cameras(size):
 
 
 def _camera(azimuth, elevation, size):
-    """Camera at two angles in radians that looks at the origin, z up."""
+    """Camera at two angles in radians that looks at the origin, z up.
+
+    camera.look_at would give other last bits, and with them other images and checkpoints.
+    """
     level = math.cos(elevation)
     forward = -np.array([math.cos(azimuth) * level, math.sin(azimuth) * level, math.sin(elevation)])
     right = np.array([-math.sin(azimuth), math.cos(azimuth), 0.0])
     pose = np.column_stack([right, np.cross(forward, right), forward, -DISTANCE * forward])
     focal = 0.5 * size / math.tan(0.5 * ANGLE)
-    return Camera(pose, focal, focal, size / 2, size / 2, size, size, math.nan, math.nan)
+    return Camera(pose, focal, focal, size / 2, size / 2, size, size)

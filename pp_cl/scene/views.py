@@ -1,6 +1,7 @@
-"""A photograph with its camera and mask, at full resolution and reduced."""
+"""A photograph with its camera and mask, at its stored resolution and reduced."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 
@@ -13,72 +14,74 @@ from pp_cl.scene.camera import Camera
 # from the object, and masks that once were JPEG carry noise of that size around their edge (NeRD's
 # captures). Above 8 both end within 1.5 pixels of alpha 0.5.
 MASK_THRESHOLD = 8
-
-
-# pixels of a reduced image: SSIM's window of 11 and the U-Net's two poolings need room
+# pixels of a reduced image, each way: SSIM's window of 11 and the U-Net's two poolings need room
 MIN_SIDE = 16
 
 
 @dataclass(frozen=True, eq=False)
 class View:
-    """One photograph.
+    """A photograph, which is used reduced: its pixels are the means of blocks of
+    downscale x downscale stored pixels.
 
-    name: path of the image relative to the scene's folder. camera: of the full stored resolution;
-    near and far are NaN while unknown. image: (H, W, 4) uint8, straight RGBA (alpha 255 everywhere
-    if the file has none); not to be changed.
+    name: path of the image relative to the scene's folder. stored_camera: the camera of the stored
+    image. image: (H, W, 4) uint8, the stored image as straight RGBA (alpha 255 everywhere if the
+    file has none); not to be changed. depth_range: (near, far) of this camera, Euclidean distances
+    in world units, if the dataset states one.
     """
 
     name: str
-    camera: Camera
+    stored_camera: Camera
     image: np.ndarray
+    depth_range: tuple[float, float] | None = None
+    downscale: int = 1
 
-    @property
-    def has_depth_range(self):
-        """True if near and far are known."""
-        return bool(np.isfinite(self.camera.near) and np.isfinite(self.camera.far))
+    @cached_property
+    def camera(self) -> Camera:
+        """The camera of the reduced image."""
+        return self.stored_camera.downscaled(self.downscale)
+
+    def reduced(self, downscale: int) -> "View":
+        """The same photograph reduced `downscale` times from its stored resolution.
+
+        Raises UserError unless that is a whole number that leaves at least MIN_SIDE pixels each
+        way.
+        """
+        width, height = self.stored_camera.width, self.stored_camera.height
+        most = min(width, height) // MIN_SIDE
+        if most == 0:
+            raise UserError(
+                f"{self.name}: {width}x{height} pixels; at least {MIN_SIDE}x{MIN_SIDE} are needed"
+            )
+        if not isinstance(downscale, int) or not 1 <= downscale <= most:
+            raise UserError(
+                f"--downscale {downscale}: not a whole number from 1 to {most}, the range for the "
+                f"{width}x{height} pixels of {self.name}"
+            )
+        return replace(self, downscale=downscale)
+
+    def crop_camera(
+        self, box: tuple[int, int, int, int], jitter: tuple[int, int] = (0, 0)
+    ) -> Camera:
+        """The camera of Target.crop(box, jitter) of this view."""
+        dx, dy = (stored / self.downscale for stored in jitter)
+        return self.camera.shifted(dx, dy).crop(*box)
+
+    def object_bounds(self, margin: int) -> tuple[int, int, int, int]:
+        """(x0, y0, x1, y1): the pixels of the reduced image, half-open, that show the object, and
+        `margin` more on every side, cut off at the image's border.
+
+        The whole image if its mask is empty.
+        """
+        camera, k = self.camera, self.downscale
+        mask = self.image[: camera.height * k, : camera.width * k, 3] > MASK_THRESHOLD
+        x0, x1 = _extent(mask.any(axis=0), k, margin)
+        y0, y1 = _extent(mask.any(axis=1), k, margin)
+        return x0, y0, x1, y1
 
 
-def reduced_camera(view, downscale):
-    """Camera of a view reduced `downscale` times.
-
-    Raises UserError unless that is a whole number that leaves at least MIN_SIDE pixels each way.
-    """
-    camera = view.camera
-    most = min(camera.width, camera.height) // MIN_SIDE
-    if most == 0:
-        raise UserError(
-            f"{view.name}: {camera.width}x{camera.height} pixels; at least {MIN_SIDE}x{MIN_SIDE}"
-            " are needed"
-        )
-    if not isinstance(downscale, int) or not 1 <= downscale <= most:
-        raise UserError(
-            f"--downscale {downscale}: not a whole number from 1 to {most}, the range for the "
-            f"{camera.width}x{camera.height} pixels of {view.name}"
-        )
-    return camera.downscaled(downscale)
-
-
-def object_box(views, downscale, margin):
-    """[(x0, y0, x1, y1)] for each view: the pixels of the reduced image, half-open, that show the
-    object.
-
-    margin: reduced pixels added on every side, as far as the image goes. A view without object gets
-    its whole image.
-    """
-    return [_object_box(view, downscale, margin) for view in views]
-
-
-def _object_box(view, downscale, margin):
-    camera = reduced_camera(view, downscale)
-    mask = view.image[: camera.height * downscale, : camera.width * downscale, 3] > MASK_THRESHOLD
-    x0, x1 = _extent(mask.any(axis=0), downscale, margin)
-    y0, y1 = _extent(mask.any(axis=1), downscale, margin)
-    return x0, y0, x1, y1
-
-
-def _extent(occupied, downscale, margin):
-    """(first, last + 1) reduced pixel of the occupied stored columns or rows; the whole length if
-    there are none.
+def _extent(occupied: np.ndarray, downscale: int, margin: int) -> tuple[int, int]:
+    """(first, last + 1) reduced pixel of the occupied stored columns or rows (N,) bool, grown by
+    the margin; the whole length if none is occupied.
     """
     size, found = len(occupied) // downscale, np.flatnonzero(occupied) // downscale
     if found.size == 0:

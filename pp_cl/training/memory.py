@@ -5,7 +5,6 @@ import math
 from pp_cl.errors import UserError
 from pp_cl.raster.sh import sh_blocks
 from pp_cl.render import NETWORK_MULTIPLE
-from pp_cl.scene.views import reduced_camera
 from pp_cl.training.prune import SCRATCH_BYTES
 from pp_cl.training.smooth import CHUNK
 
@@ -37,7 +36,7 @@ def memory_plan(dev, config, model, views):
     views.
     """
     n, train = model.count, config.train
-    camera = reduced_camera(views[0], config.scene.downscale)
+    camera = views[0].camera
     width, height = (
         side + -side % NETWORK_MULTIPLE for side in train.crop_size(camera.width, camera.height)
     )

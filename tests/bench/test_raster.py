@@ -33,8 +33,10 @@ def test_float64_values_are_the_oracles(dev, name):
     scene = SCENES[name](dev, 400, 16, 0.05)
     camera, reference = scene.camera, scene.reference
     positions = reference.points @ camera.pose[:, :3].T + camera.eye
-    geometry = oracle_raster.geometry(camera, positions, reference.radius, reference.kind)
-    blend = oracle_raster.blend(camera, geometry, scene.opacity, 0.05)
+    geometry = oracle_raster.geometry(
+        camera, positions, reference.radius, reference.kind, scene.depth_range
+    )
+    blend = oracle_raster.blend(geometry, scene.opacity, 0.05)
     everyone = np.arange(scene.count)
     if name == "grid":
         sh = np.concatenate([v.get() for v in scene.renderer.model.cloud.sh], 1)
@@ -63,7 +65,8 @@ def test_pixels_that_rounding_decides_are_left_out(dev, offset, clear):
     camera = replace(SCENES["pulsar"](dev, 8, 16, 0.1).camera, fx=1600.0, fy=1600.0, cx=8.5, cy=8.5)
     angle = 2 * np.arcsin(offset / 3200)  # the chord to the ray straight ahead is offset / 1600
     position = 1.5 * np.array([[np.sin(angle), 0, np.cos(angle)]])
-    assert (PixelReference(camera, position, 1e-6, "disc").hits(8, 8) is not None) == clear
+    reference = PixelReference(camera, position, 1e-6, "disc", depth_range=(0.6, 2.5))
+    assert (reference.hits(8, 8) is not None) == clear
 
 
 @pytest.mark.parametrize("name", SCENES)

@@ -25,10 +25,8 @@ from pp_cl.network.sparse_tiles import (
 from pp_cl.network.unet import UNet, unet_steps
 from pp_cl.raster.blend import BACKGROUND
 from pp_cl.render import Renderer
-from pp_cl.run import with_depth_range
 from pp_cl.scene.hull import build_grid, depth_range
 from pp_cl.scene.load import load_scene
-from pp_cl.scene.views import reduced_camera
 
 STEPS = unet_steps((16, 16, 16), 3)
 SIZE = (148, 180)  # room for a class inside; levels 1 and 2 end in tiles that are cut off
@@ -221,8 +219,8 @@ def test_lego(dev, data, rng, always):
     model = Model.create(dev, hull.grid, hull.ids, near_far, (16, 32, 48), 1)
     model.points["sh0"].set(rng.normal(size=model.points["sh0"].shape).astype(np.float32))
     renderer = Renderer(dev, model, preset("tiny").raster)
-    for view in with_depth_range(views[:2], near_far):
-        renderer.forward(reduced_camera(view, 2), 0.01)
+    for view in views[:2]:
+        renderer.forward(view.reduced(2).camera, 0.01)
         x = renderer.features
         share = np.mean(
             [

@@ -21,7 +21,7 @@ def kept(views, positions, threshold):
     alive = np.ones(len(positions), bool)
     border = np.full(len(positions), np.inf)
     for view in views:
-        camera, mask = view.camera, dilated_mask(view.image[..., 3], threshold)
+        camera, mask = view.stored_camera, dilated_mask(view.image[..., 3], threshold)
         x, y, z = camera.pose[:, :3].T @ (positions - camera.eye).T
         for n in np.flatnonzero(z > 0):
             u = camera.fx * x[n] / z[n] + camera.cx

@@ -5,6 +5,7 @@
 import numpy as np
 
 EPS = 1e-6
+DEPTH_RANGE = (2.0, 6.0)  # (near, far) where a test gives no other
 LEAST_RADIUS = 0.75
 
 
@@ -18,19 +19,14 @@ def pixel_width(camera, t):
     return t / min(camera.fx, camera.fy)
 
 
-def kept(camera, positions, radius):
+def kept(camera, positions, radius, depth_range=DEPTH_RANGE):
     """(N,) bool: finite, in front of the eye, and t - radius in [near, far]."""
+    near, far = depth_range
     with np.errstate(all="ignore"):
         c = camera_space(camera, positions)
         t = np.linalg.norm(c, axis=1)
         front = t - radius
-        return (
-            np.isfinite(t)
-            & (t > 0)
-            & (front >= camera.near)
-            & (front <= camera.far)
-            & (c[:, 2] >= 1e-6 * t)
-        )
+        return np.isfinite(t) & (t > 0) & (front >= near) & (front <= far) & (c[:, 2] >= 1e-6 * t)
 
 
 def rays(camera):
@@ -42,16 +38,16 @@ def rays(camera):
     return r / np.linalg.norm(r, axis=1, keepdims=True)
 
 
-def geometry(camera, positions, radius, kind):
-    """Dict of (N, HW) arrays: hit, closeness, depth, and margin = distance of the hit test from its
-    edge, in pixels.
+def geometry(camera, positions, radius, kind, depth_range=DEPTH_RANGE):
+    """Dict of (N, HW) arrays: hit, closeness, depth, z = normalised depth, and margin = distance of
+    the hit test from its edge, in pixels.
 
     radius: (N,) world units. Points that are left out hit nothing. Pulsar's box, part of the
     sphere's rule, is included.
     """
     radius = np.broadcast_to(np.asarray(radius, np.float64), (len(positions),))
     c, r = camera_space(camera, positions), rays(camera)
-    ok = kept(camera, positions, radius)
+    ok = kept(camera, positions, radius, depth_range)
     c = np.where(ok[:, None], c, [0.0, 0.0, 1.0])
     t = np.linalg.norm(c, axis=1)[:, None]
     radius, width = radius[:, None], pixel_width(camera, t)
@@ -72,7 +68,14 @@ def geometry(camera, positions, radius, kind):
         depth = along - np.sqrt(np.maximum(radius**2 - across**2, 0))
         margin = np.minimum(np.abs(rho - radius), np.abs(rho - least)) / width
         hit &= pulsar_box(camera, c, radius[:, 0])
-    return {"hit": hit & ok[:, None], "closeness": closeness, "depth": depth, "margin": margin}
+    near, far = depth_range
+    return {
+        "hit": hit & ok[:, None],
+        "closeness": closeness,
+        "depth": depth,
+        "z": 1 - (depth - near) / (far - near),
+        "margin": margin,
+    }
 
 
 def pulsar_box(camera, c, radius):
@@ -107,13 +110,12 @@ def order(geometry_):
     return ranks
 
 
-def blend(camera, geometry_, opacity, gamma, stop=0.0):
+def blend(geometry_, opacity, gamma, stop=0.0):
     """Dict: weight (N, HW) b; share (N, HW) b/o, its limit at o = 0; z (N, HW); background (HW,)
     b_0; hit (N, HW) used.
     """
-    hit, d = geometry_["hit"], geometry_["closeness"]
+    hit, d, z = geometry_["hit"], geometry_["closeness"], geometry_["z"]
     o = np.asarray(opacity, np.float64)[:, None]
-    z = 1 - (geometry_["depth"] - camera.near) / (camera.far - camera.near)
     if stop > 0:
         hit = hit & ~stopped(hit, d, o, z, order(geometry_), gamma, stop)
     with np.errstate(divide="ignore", invalid="ignore"):  # outside the hits

@@ -3,19 +3,18 @@
 import numpy as np
 
 
-def target_forward(image, k, left, top, width, height):
-    """(height, width, 3): means over white of the k x k blocks, from (left, top) on, of an (H, W,
-    4) uint8 image.
+def target_forward(image, downscale, left, top, width, height):
+    """(height, width, 3): means over white of the downscale x downscale blocks, from (left, top)
+    on, of an (H, W, 4) uint8 image.
     """
     colour, alpha = image[..., :3] / 255.0, image[..., 3:] / 255.0
     over_white = colour * alpha + (1 - alpha)
     target = np.ones((height, width, 3))
     for y in range(height):
         for x in range(width):
-            rows = [v for v in range(top + k * y, top + k * (y + 1)) if 0 <= v < image.shape[0]]
-            columns = [
-                u for u in range(left + k * x, left + k * (x + 1)) if 0 <= u < image.shape[1]
-            ]
+            row, column = top + downscale * y, left + downscale * x
+            rows = [v for v in range(row, row + downscale) if 0 <= v < image.shape[0]]
+            columns = [u for u in range(column, column + downscale) if 0 <= u < image.shape[1]]
             if rows and columns:
                 target[y, x] = over_white[
                     rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1

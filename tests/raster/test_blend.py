@@ -54,7 +54,7 @@ def test_gradients_against_finite_differences(dev, rng, gamma):
     gradients = blended.gradients()
 
     def loss(opacity, point_features):
-        blend = oracle.blend(blended.camera, blended.geometry, opacity, gamma)
+        blend = oracle.blend(blended.geometry, opacity, gamma)
         return (oracle.features(blend, point_features) * blended.grad).sum()
 
     opacity = blended.opacity.astype(np.float64)
@@ -90,7 +90,7 @@ def test_sphere_gradients_against_finite_differences(dev, rng, gamma, mean):
 
     def loss(positions, radius):
         geometry = oracle.geometry(blended.camera, positions, radius, "sphere") | {"hit": hit}
-        blend = oracle.blend(blended.camera, geometry, opacity, gamma)
+        blend = oracle.blend(geometry, opacity, gamma)
         return (oracle.features(blend, blended.point_features) * blended.grad).sum()
 
     scale = np.maximum(hit.sum(axis=1), 1) if mean else np.ones(n)

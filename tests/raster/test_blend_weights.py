@@ -38,7 +38,7 @@ def test_early_stop(dev, rng, early_stop):
     gradients, expected = blended.gradients(), blended.oracle_gradients()
     assert relative_error(gradients["features"], expected[0]) < 1e-4
     assert relative_error(gradients["opacity"], expected[1]) < 2e-4
-    whole = oracle.blend(blended.camera, blended.geometry, blended.opacity, 0.02)
+    whole = oracle.blend(blended.geometry, blended.opacity, 0.02)
     assert whole["weight"][dropped].max() < early_stop
 
 

@@ -11,9 +11,7 @@ from support.comparisons import relative_error
 from support.raster_scene import PairedPoints, make_camera
 
 NEAR, FAR = 2.0, 6.0
-CAMERA = replace(
-    make_camera(1, 1), pose=np.eye(3, 4), fx=100.0, fy=100.0, cx=0.5, cy=0.5, near=NEAR, far=FAR
-)
+CAMERA = replace(make_camera(1, 1), pose=np.eye(3, 4), fx=100.0, fy=100.0, cx=0.5, cy=0.5)
 
 
 def depth_at(z):
@@ -49,9 +47,7 @@ def test_the_smallest_gamma(dev, opacity):
     scene, weight = blend_on_axis(dev, [0.9, 0.8, 0.1], [opacity] * 3, 1e-5)
     gradients = scene.gradients(np.ones((1, 1, 16)))
     assert np.isfinite(weight).all() and all(np.isfinite(g).all() for g in gradients.values())
-    expected = oracle.blend(CAMERA, dense_geometry(scene), [np.float32(opacity)] * 3, 1e-5)[
-        "weight"
-    ][:, 0]
+    expected = oracle.blend(dense_geometry(scene), [np.float32(opacity)] * 3, 1e-5)["weight"][:, 0]
     assert np.allclose(weight, expected, rtol=1e-2, atol=1e-30)
 
 
@@ -109,9 +105,8 @@ def test_softness(dev):
 
 @pytest.mark.parametrize("kind", ["disc", "soft", "sphere"])
 def test_points_behind_and_on_the_plane_of_the_eye(dev, kind):
-    camera = replace(CAMERA, near=1e-3)
     positions = np.array([[0, 0, -3.0], [0, 0, 0], [3.0, 0, 0], [0, 3.0, 1e-9], [0, 0, 3.0]])
-    scene = PairedPoints(dev, camera, positions, 0.01, kind)
+    scene = PairedPoints(dev, CAMERA, positions, 0.01, kind, (1e-3, FAR))
     assert scene.projected.point_camera.get()[:, 3].tolist() == [-1, -1, -1, -1, 3]
     assert scene.pairs.seen.get().tolist() == [4]
 
@@ -140,9 +135,10 @@ def test_a_ray_through_the_centre_of_a_sphere_has_gradients(dev):
 
 def test_a_hit_on_the_very_rim(dev):
     """d = 0 with an exponent above that of the largest float: no weight, no gradient, no NaN."""
-    camera = replace(CAMERA, near=1.8, far=10.0)
     # rho = |(3, 0, 4) - 5 (0, 0, 1)|
-    scene = PairedPoints(dev, camera, np.array([[3.0, 0, 4.0]]), np.sqrt(10.0), "sphere")
+    scene = PairedPoints(
+        dev, CAMERA, np.array([[3.0, 0, 4.0]]), np.sqrt(10.0), "sphere", (1.8, 10.0)
+    )
     assert scene.pairs.total == 1 and scene.pairs.pair_point_closeness.get()[0, 1] == 0
     assert (scene.blend([1.0], 0.005, np.full((1, 16), 2.0)) == 1).all()
     gradients = scene.gradients(np.ones((1, 1, 16))) | scene.sphere_gradients(np.ones((1, 1, 16)))
@@ -159,7 +155,7 @@ def test_the_early_stop_spares_points_beyond_far(dev):
 
 def test_a_point_at_the_eye(dev):
     """It has no direction, and is left out even where near = 0 would let it in."""
-    scene = PairedPoints(dev, replace(CAMERA, near=0.0), np.zeros((1, 3)), 0.0)
+    scene = PairedPoints(dev, CAMERA, np.zeros((1, 3)), 0.0, depth_range=(0.0, FAR))
     assert scene.projected.point_camera.get().tolist() == [[0, 0, 0, -1]]
 
 
@@ -167,7 +163,7 @@ def test_a_point_at_the_eye(dev):
 def test_thousands_of_hits_in_one_pixel(dev, rng, gamma):
     z, opacity = rng.uniform(0.1, 0.99, 20_000), np.float32(rng.uniform(0, 1, 20_000))
     scene, weight = blend_on_axis(dev, z, opacity, gamma)
-    blend = oracle.blend(CAMERA, dense_geometry(scene), opacity, gamma)
+    blend = oracle.blend(dense_geometry(scene), opacity, gamma)
     assert relative_error(weight, blend["weight"][:, 0]) < 1e-4
     expected = oracle.features(blend, np.resize(np.eye(16), (20_000, 16)))
     assert relative_error(scene.features.get().reshape(1, 16), expected) < 1e-4

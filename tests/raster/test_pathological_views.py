@@ -18,19 +18,21 @@ from pp_cl.raster.project import KINDS
 TAUS = (0.0, 0.01)
 
 
-def check(dev, rng, camera, positions, radius, kind, tau=0.0, gamma=0.05):
+def check(
+    dev, rng, camera, positions, radius, kind, tau=0.0, gamma=0.05, depth_range=oracle.DEPTH_RANGE
+):
     """A scene's hits, features and gradients against the oracle; returns the scene. Left out are
     pixels where rounding decides over a hit, or makes up most of a closeness.
     """
     n = len(positions)
     opacity, point_features = np.float32(rng.uniform(0, 1, n)), rng.normal(size=(n, 16))
-    scene = PairedPoints(dev, camera, positions, radius, kind)
-    geometry = oracle.geometry(camera, positions, radius, kind)
+    scene = PairedPoints(dev, camera, positions, radius, kind, depth_range)
+    geometry = oracle.geometry(camera, positions, radius, kind, depth_range)
     hits, clear = scene.hits(), geometry["margin"] > 1e-3
     assert np.array_equal(hits[clear], geometry["hit"][clear]) and (~clear).mean() < 0.02
     inner = (geometry["margin"] > 1e-2).all(axis=0)
     assert inner.mean() > 0.5
-    blend = oracle.blend(camera, geometry | {"hit": hits}, opacity, gamma)
+    blend = oracle.blend(geometry | {"hit": hits}, opacity, gamma)
     features = scene.blend(opacity, gamma, point_features, tau=tau).reshape(-1, 16)
     values = np.vstack([point_features, np.ones((1, 16))])
     slack = tau * np.ptp(values, axis=0).max()
@@ -54,9 +56,9 @@ def test_from_inside_the_object(dev, rng, kind, tau, radius):
     """Points on all sides, also behind and beside the eye, and very near; an angle of view of 130
     degrees.
     """
-    camera = replace(make_camera(28, 20), fx=6.5, fy=6.5, near=0.05, far=4.0)
+    camera = replace(make_camera(28, 20), fx=6.5, fy=6.5)
     positions = camera.eye + rng.uniform(-1, 1, (400, 3))
-    scene = check(dev, rng, camera, positions, radius, kind, tau)
+    scene = check(dev, rng, camera, positions, radius, kind, tau, depth_range=(0.05, 4.0))
     assert 20 < scene.pairs.seen.size < 300
 
 
@@ -65,14 +67,13 @@ def test_across_the_near_sphere_and_the_plane_of_the_eye(dev, rng, kind):
     """Spheres whose front is just before and just behind `near`, and some that reach beside and
     behind the eye.
     """
-    camera = replace(make_camera(24, 24), fx=5.0, fy=5.0, near=0.5, far=3.0)
+    camera = replace(make_camera(24, 24), fx=5.0, fy=5.0)
     directions = rng.normal(size=(300, 3))
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
     radius = np.float32(rng.uniform(0.01, 0.8, 300))
     front = 0.5 + rng.uniform(-0.1, 0.1, 300)
-    scene = check(
-        dev, rng, camera, camera.eye + directions * (front + radius)[:, None], radius, kind
-    )
+    positions = camera.eye + directions * (front + radius)[:, None]
+    scene = check(dev, rng, camera, positions, radius, kind, depth_range=(0.5, 3.0))
     placed = scene.projected.point_camera.get()
     left_out = placed[:, 3] < 0
     assert (left_out[front < 0.5 - 1e-4]).all() and (~left_out).sum() > 40

@@ -18,7 +18,7 @@ GRID = Grid((-1.1, -0.9, -0.7), 0.05, (45, 37, 29))
 def project_grid(dev, camera, ids, radius=0.0, **options):
     """(N, 4) positions in camera axes and distances of grid vertices."""
     points = Projection(dev, Footprint("disc")).grid(
-        dev.upload(camera.packed()),
+        dev.upload(camera.packed(oracle.DEPTH_RANGE)),
         dev.upload(GRID.packed()),
         dev.upload(ids, np.uint32),
         dev.upload([radius], np.float32),
@@ -27,10 +27,10 @@ def project_grid(dev, camera, ids, radius=0.0, **options):
     return points.point_camera.get()
 
 
-def project_spheres(dev, camera, positions, radius, kind="soft"):
+def project_spheres(dev, camera, positions, radius, kind="soft", depth_range=oracle.DEPTH_RANGE):
     """((N, 4) camera positions, (N, 4) boxes)."""
     points = Projection(dev, Footprint(kind)).spheres(
-        dev.upload(camera.packed()),
+        dev.upload(camera.packed(depth_range)),
         dev.upload(positions, np.float32),
         dev.upload(np.atleast_1d(radius), np.float32),
     )
@@ -51,10 +51,10 @@ def test_grid_vertices_are_where_the_grid_says(dev, rng, n):
 
 @pytest.mark.parametrize("n", AWKWARD_SIZES)
 def test_spheres_are_culled_at_their_front(dev, rng, n):
-    camera = replace(make_camera(), near=3.5, far=4.8)
+    camera, depth_range = make_camera(), (3.5, 4.8)
     positions, radius = make_points(rng, n), rng.uniform(0.01, 0.3, n)
-    points, _ = project_spheres(dev, camera, positions, radius)
-    kept = oracle.kept(camera, positions, radius)
+    points, _ = project_spheres(dev, camera, positions, radius, depth_range=depth_range)
+    kept = oracle.kept(camera, positions, radius, depth_range)
     assert np.array_equal(points[:, 3] >= 0, kept)
     assert n < 257 or 20 < kept.sum() < n - 20
     assert (
@@ -65,15 +65,20 @@ def test_spheres_are_culled_at_their_front(dev, rng, n):
 
 
 def test_near_and_far_are_inclusive_and_the_radius_counts(dev):
-    camera = replace(make_camera(focal=32.0), pose=np.eye(3, 4), fy=32.0, near=2.0, far=4.0)
+    camera = replace(make_camera(focal=32.0), pose=np.eye(3, 4), fy=32.0)
+
+    def kept(positions, radius):
+        points, _ = project_spheres(dev, camera, positions, radius, depth_range=(2.0, 4.0))
+        return (points[:, 3] > 0).tolist()
+
     positions = np.array([[0, 0, 2.0], [0, 0, 1.9999], [0, 0, 4.0], [0, 0, 4.0001]])
-    assert (project_spheres(dev, camera, positions, 0.0)[0][:, 3] > 0).tolist() == [
+    assert kept(positions, 0.0) == [
         True,
         False,
         True,
         False,
     ]
-    assert (project_spheres(dev, camera, positions + [0, 0, 0.5], 0.5)[0][:, 3] > 0).tolist() == [
+    assert kept(positions + [0, 0, 0.5], 0.5) == [
         True,
         False,
         True,
@@ -138,8 +143,10 @@ def test_boxes_hold_the_hits_and_little_more(dev, rng, kind):
 
 
 def test_boxes_reach_all_over_the_image_beside_the_eye(dev):
-    camera = replace(make_camera(), pose=np.eye(3, 4), near=0.1)
-    points, boxes = project_spheres(dev, camera, np.array([[1.0, 0.0, 0.5]]), 0.6, "sphere")
+    camera = replace(make_camera(), pose=np.eye(3, 4))
+    points, boxes = project_spheres(
+        dev, camera, np.array([[1.0, 0.0, 0.5]]), 0.6, "sphere", (0.1, 6.0)
+    )
     assert points[0, 3] > 0
     assert boxes[0].tolist() == [0, 0, camera.width - 1, camera.height - 1]
 

@@ -30,8 +30,8 @@ MIRROR = np.array([1.0, -1.0, 1.0])  # Pulsar's left-handed world to our right-h
 
 
 def read_camera(fixture):
-    """Our Camera: Pulsar's integer pixel centres become ours at +0.5, its y axis turns over with
-    the world.
+    """Our (Camera, depth range): Pulsar's integer pixel centres become ours at +0.5, its y axis
+    turns over with the world.
     """
     width, height = int(fixture["in_width"]), int(fixture["in_height"])
     step_x, step_y = (
@@ -49,8 +49,8 @@ def read_camera(fixture):
     pose = MIRROR[:, None] * np.concatenate([axes, fixture["in_cam_pos"][:, None]], 1)
     assert np.allclose(np.linalg.det(pose[:, :3]), 1, atol=1e-5)
     focal = float(fixture["in_focal_length"]) / pixel
-    near, far = float(fixture["in_min_depth"]), float(fixture["in_max_depth"])
-    return Camera(pose, focal, focal, width / 2, height / 2, width, height, near, far)
+    depth_range = float(fixture["in_min_depth"]), float(fixture["in_max_depth"])
+    return Camera(pose, focal, focal, width / 2, height / 2, width, height), depth_range
 
 
 class Case:
@@ -60,9 +60,11 @@ class Case:
         self.name = name
         with np.load(folder / "pulsar_fixtures" / f"{name}.npz") as file:
             self.arrays = {key: file[key] for key in file.files}
-        self.camera = read_camera(self)
+        self.camera, depth_range = read_camera(self)
         self.positions, self.radius = self["in_positions"] * MIRROR, self["in_radius"]
-        self.scene = PairedPoints(dev, self.camera, self.positions, self.radius, "sphere")
+        self.scene = PairedPoints(
+            dev, self.camera, self.positions, self.radius, "sphere", depth_range
+        )
         # The weights sum to one, so features shifted from Pulsar's background to ours shift the
         # picture alike.
         self.shift = 1 - self["in_bg"].astype(np.float64)

@@ -1,17 +1,15 @@
-"""The camera and its device layout, crops, phases, downscaling and padding."""
+"""The camera and its device layout, poses, crops, shifts, downscaling and padding."""
 
 import numpy as np
 import pytest
 
-from pp_cl.scene.camera import CAMERA_FLOATS, Camera
+from pp_cl.scene.camera import Camera, look_at
 
 
 def make_camera(rng, width=40, height=30):
     rotation, _ = np.linalg.qr(rng.normal(size=(3, 3)))
     rotation *= np.sign(np.linalg.det(rotation))
-    return Camera(
-        np.c_[rotation, rng.normal(size=3)], 50.0, 55.0, 19.0, 16.5, width, height, 1.0, 5.0
-    )
+    return Camera(np.c_[rotation, rng.normal(size=3)], 50.0, 55.0, 19.0, 16.5, width, height)
 
 
 def project(camera, points):
@@ -28,12 +26,30 @@ def points_in_front(camera, rng, n=20):
 
 def test_packed_layout(rng):
     camera = make_camera(rng)
-    packed = camera.packed()
-    assert packed.shape == (CAMERA_FLOATS,) and packed.dtype == np.float32
+    packed = camera.packed((1, 5))
+    assert packed.shape == (20,) and packed.dtype == np.float32
     point = points_in_front(camera, rng, 1)[0]
     in_camera = packed[:9].reshape(3, 3) @ (point - packed[9:12])
     np.testing.assert_allclose(in_camera, (point - camera.eye) @ camera.pose[:, :3], rtol=1e-5)
     np.testing.assert_allclose(packed[12:], [50, 55, 19, 16.5, 1, 5, 40, 30])
+
+
+def test_look_at_centres_the_target_and_points_up(rng):
+    for eye, target, up in rng.normal(size=(20, 3, 3)):
+        camera = Camera.look_at(eye, target, up, fx=50.0, fy=55.0, width=40, height=30)
+        assert np.array_equal(camera.pose, look_at(eye, target, up))
+        rotation = camera.pose[:, :3]
+        np.testing.assert_allclose(rotation.T @ rotation, np.eye(3), atol=1e-12)
+        assert np.linalg.det(rotation) > 0 and (target - eye) @ rotation[:, 2] > 0
+        np.testing.assert_allclose(project(camera, target[None]), [[20, 15]], atol=1e-9)
+        above = project(camera, (target + 1e-3 * up)[None])[0]
+        assert above[1] < 15 and above[0] == pytest.approx(20, abs=1e-6)
+
+
+def test_look_at_has_square_pixels_and_z_up_unless_told():
+    camera = Camera.look_at([3.0, 0, 0], [0, 0, 0], fx=50.0, width=40, height=30)
+    assert (camera.fx, camera.fy, camera.cx, camera.cy) == (50, 50, 20, 15)
+    np.testing.assert_array_equal(camera.pose[:, 1], [0, 0, -1])
 
 
 def test_crop_shift_and_downscale_move_pixels_as_they_say(rng):

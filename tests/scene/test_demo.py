@@ -1,4 +1,4 @@
-"""The demo's object and pictures: distances and silhouettes against the float64 oracle, mesh,
+"""The demo's object and images: distances and silhouettes against the float64 oracle, mesh,
 gloss, the written folder.
 """
 
@@ -19,15 +19,6 @@ from pp_cl.scene.hull import build_grid
 from pp_cl.scene.load import load_scene
 
 KEY = np.array([0.40, -0.52, 0.7547])  # direction of the key light
-
-
-def look_at(eye, target, size, focal):
-    """Camera at `eye` that looks at `target`; size: (width, height); focal: pixels."""
-    forward = (target - eye) / np.linalg.norm(target - eye)
-    right = np.cross(forward, [0, 0, 1])
-    right /= np.linalg.norm(right)
-    pose = np.column_stack([right, np.cross(forward, right), forward, eye])
-    return Camera(pose, focal, focal, size[0] / 2, size[1] / 2, *size)
 
 
 @pytest.mark.parametrize("n", AWKWARD_SIZES)
@@ -54,7 +45,7 @@ def test_silhouettes_equal_the_oracle(dev, width, height):
     """Alpha lies between the shares of the rays that touch and of those that come within the
     tracer's tolerance.
     """
-    camera = look_at(np.array([1.5, -2.8, 1.2]), np.zeros(3), (width, height), 40)
+    camera = Camera.look_at((1.5, -2.8, 1.2), (0, 0, 0), fx=40, width=width, height=height)
     image = render(dev, camera)
     near, touching = coverage(camera)
     alpha = image[..., 3] / 255 * 16
@@ -65,7 +56,7 @@ def test_silhouettes_equal_the_oracle(dev, width, height):
 
 @pytest.mark.large
 def test_a_crop_shows_the_same_pixels(dev):
-    camera = look_at(np.array([-2.0, 2.0, 1.5]), np.zeros(3), (64, 64), 80)
+    camera = Camera.look_at((-2.0, 2.0, 1.5), (0, 0, 0), fx=80, width=64, height=64)
     whole, part = render(dev, camera), render(dev, camera.crop(13, 21, 33, 29))
     # rays that graze an edge may choose otherwise
     differing = (np.abs(whole[21:50, 13:46].astype(int) - part) > 1).any(-1)
@@ -81,9 +72,8 @@ def test_the_globe_is_glossy(dev):
     side = np.cross(KEY, [0, 0, 1.0])
     colours = []
     for eye in (KEY, KEY + side, KEY - side):
-        image = render(
-            dev, look_at(CENTRE + 0.2 * KEY + 0.4 * eye / np.linalg.norm(eye), facing, (3, 3), 2000)
-        )
+        eye = CENTRE + 0.2 * KEY + 0.4 * eye / np.linalg.norm(eye)
+        image = render(dev, Camera.look_at(eye, facing, fx=2000, width=3, height=3))
         assert (image[..., 3] == 255).all()
         colours.append(image[1, 1, :3] / 255)
     mirrored, *others = colours
@@ -109,14 +99,14 @@ def test_the_mesh_is_the_object(dev):
 def test_the_scene_shows_the_whole_mesh(dev):
     """64 + 16 views; the mesh projects onto the masks, which carve a hull that holds it."""
     scene = demo_scene(dev, size=64)
-    assert (scene.name, scene.folder, scene.depth_range_stored) == ("demo", None, False)
+    assert (scene.name, scene.folder) == ("demo", None)
     assert {split: len(views) for split, views in scene.splits.items()} == {"train": 64, "test": 16}
     vertices, _ = demo_mesh(dev, 64)
     eyes = []
     for view in scene.splits["train"] + scene.splits["test"]:
         camera, alpha = view.camera, np.pad(view.image[..., 3], 1)
         np.testing.assert_allclose(camera.pose[:, :3].T @ camera.pose[:, :3], np.eye(3), atol=1e-12)
-        assert np.linalg.det(camera.pose[:, :3]) > 0 and not view.has_depth_range
+        assert np.linalg.det(camera.pose[:, :3]) > 0 and view.depth_range is None
         assert not alpha[[1, -2]].any() and not alpha[:, [1, -2]].any(), (
             f"{view.name} cuts the object off"
         )
@@ -144,20 +134,27 @@ def test_a_split_can_be_made_alone(dev):
 
 
 @pytest.mark.large
+def test_a_reduced_scene_is_written_at_its_stored_resolution(dev, tmp_path):
+    scene = demo_scene(dev, ("test",), size=32)
+    write_scene(scene.reduced(2), tmp_path / "demo")
+    camera = load_scene(tmp_path / "demo", ("test",)).splits["test"][0].camera
+    assert replace(camera, pose=None) == replace(scene.splits["test"][0].camera, pose=None)
+
+
+@pytest.mark.large
 def test_a_written_scene_is_read_back(dev, tmp_path):
     scene = demo_scene(dev, size=24)
     folder = tmp_path / "new" / "demo"
     write_scene(scene, folder)
     again = load_scene(folder, ("train", "test"))
-    assert not again.depth_range_stored and again.name == "demo"
+    assert again.name == "demo"
     for split, views in scene.splits.items():
         assert [v.name for v in again.splits[split]] == [v.name for v in views]
         for view, read in zip(views, again.splits[split], strict=True):
             np.testing.assert_array_equal(read.image, view.image)
             np.testing.assert_allclose(read.camera.pose, view.camera.pose, atol=1e-12)
-            assert replace(read.camera, pose=None, near=0, far=0) == replace(
-                view.camera, pose=None, near=0, far=0
-            )
+            assert replace(read.camera, pose=None) == replace(view.camera, pose=None)
+            assert read.depth_range is None
     angle = json.loads((folder / "transforms_test.json").read_text())["camera_angle_x"]
     assert angle == pytest.approx(0.6911112)
 
@@ -166,14 +163,11 @@ def test_a_written_scene_is_read_back(dev, tmp_path):
 def test_a_depth_range_is_written(dev, tmp_path):
     scene = demo_scene(dev, ("train",), size=16)
     scene.splits["train"] = [
-        replace(v, camera=replace(v.camera, near=1.5, far=5.25)) for v in scene.splits["train"][:2]
+        replace(view, depth_range=(1.5, 5.25)) for view in scene.splits["train"][:2]
     ]
     write_scene(scene, tmp_path / "demo")
     again = load_scene(tmp_path / "demo")
-    assert (
-        again.depth_range_stored
-        and [(v.camera.near, v.camera.far) for v in again.splits["train"]] == [(1.5, 5.25)] * 2
-    )
+    assert [view.depth_range for view in again.splits["train"]] == [(1.5, 5.25)] * 2
 
 
 @pytest.mark.large

@@ -2,28 +2,21 @@
 
 import json
 import math
-import shutil
 
 import numpy as np
 import pytest
 
 from pp_cl.errors import UserError
 from pp_cl.files.image import read_rgba, write_png
-from pp_cl.scene.camera import Camera
+from pp_cl.scene.camera import look_at
 from pp_cl.scene.load import load_scene
-from pp_cl.scene.views import MASK_THRESHOLD, View, object_box, reduced_camera
 
 SIZE = (24, 18)  # width, height of the images written here
 
 
-def look_at(eye):
+def opengl_pose(eye):
     """4x4 camera-to-world in OpenGL axes of a camera that looks from `eye` to the origin, z up."""
-    backward = np.array(eye) / np.linalg.norm(eye)
-    right = np.cross([0, 0, 1], backward)
-    right /= np.linalg.norm(right)
-    matrix = np.eye(4)
-    matrix[:3] = np.stack([right, np.cross(backward, right), backward, eye], 1)
-    return matrix
+    return np.vstack([look_at(eye, (0, 0, 0)) * [1, -1, -1, 1], [0, 0, 0, 1]])
 
 
 def write_scene(folder, split="train", count=3, edit=None):
@@ -37,7 +30,7 @@ def write_scene(folder, split="train", count=3, edit=None):
             folder / f"{split}_{i}.png", rng.integers(0, 256, (SIZE[1], SIZE[0], 4), np.uint8)
         )
         angle = 2 * np.pi * i / count
-        matrix = look_at([3 * np.cos(angle), 3 * np.sin(angle), 1.2])
+        matrix = opengl_pose([3 * np.cos(angle), 3 * np.sin(angle), 1.2])
         frames.append({"file_path": f"./{split}_{i}", "transform_matrix": matrix.tolist()})
     data = {"camera_angle_x": 0.7, "frames": frames}
     if edit:
@@ -69,7 +62,7 @@ def test_views_and_names(tmp_path, capfd):
     write_scene(tmp_path)
     write_scene(tmp_path, "test", count=2)
     scene = load_scene(tmp_path, ("train", "test"))
-    assert scene.name == tmp_path.name and scene.folder == tmp_path and scene.published == {}
+    assert scene.name == tmp_path.name and scene.folder == tmp_path
     assert [v.name for v in scene.splits["train"]] == ["train_0.png", "train_1.png", "train_2.png"]
     assert [v.name for v in scene.splits["test"]] == ["test_0.png", "test_1.png"]
     for view in scene.splits["train"] + scene.splits["test"]:
@@ -104,11 +97,7 @@ def test_defaults_of_nerf_synthetic(tmp_path):
     camera = scene.splits["train"][0].camera
     assert camera.fx == camera.fy == 0.5 * SIZE[0] / math.tan(0.35)
     assert (camera.cx, camera.cy) == (SIZE[0] / 2, SIZE[1] / 2)
-    assert (
-        not scene.depth_range_stored
-        and not scene.splits["train"][0].has_depth_range
-        and math.isnan(camera.near)
-    )
+    assert [view.depth_range for view in scene.splits["train"]] == [None] * 3
 
 
 def test_nerfstudio_names(tmp_path):
@@ -124,7 +113,7 @@ def test_nerfstudio_names(tmp_path):
     write_scene(tmp_path, edit=edit)
     scene = load_scene(tmp_path)
     got = [
-        [getattr(v.camera, k) for k in ("fx", "fy", "cx", "cy", "near", "far")]
+        [v.camera.fx, v.camera.fy, v.camera.cx, v.camera.cy, *v.depth_range]
         for v in scene.splits["train"]
     ]
     assert got == [
@@ -132,7 +121,6 @@ def test_nerfstudio_names(tmp_path):
         [33, 32.5, 11.25, 0, 1.5, 5],
         [31, 32.5, 11.25, 8.5, 2, 5],
     ]
-    assert scene.depth_range_stored and scene.splits["train"][0].has_depth_range
 
 
 def test_angle_of_height_and_single_focal_length(tmp_path):
@@ -173,7 +161,7 @@ def test_scene_behind_a_link(tmp_path):
 
 def test_rows_and_rounding_of_the_pose(tmp_path, rng):
     """3x4 is read as 4x4 is; a rotation that is off by rounding comes out orthonormal."""
-    exact = look_at([1, 2, 0.5])
+    exact = opengl_pose([1, 2, 0.5])
     rough = exact.copy()
     rough[:3, :3] += rng.uniform(-1e-4, 1e-4, (3, 3))
     for matrix in (exact[:3], rough):
@@ -194,7 +182,7 @@ def test_image_without_alpha_is_all_object(tmp_path):
 
 # --------------------------------------------------------------------------------------------------
 
-MATRIX = look_at([3, 0, 1])
+MATRIX = opengl_pose([3, 0, 1])
 NAN_MATRIX = MATRIX * np.where(np.eye(4) == 1, np.nan, 1)
 
 BAD_FRAMES = {
@@ -355,85 +343,16 @@ def test_depth_range_of_some_views_only(tmp_path):
     refused(tmp_path, "near and far", "train_0.png", "train_2.png")
 
 
-# ----------------------------------------------------------------------------------------- reductio
-
-
-@pytest.fixture
-def view():
-    """A view of 70x50 pixels, all transparent."""
-    return View(
-        "a.png", Camera(np.eye(3, 4), 60, 60, 35, 25, 70, 50), np.zeros((50, 70, 4), np.uint8)
-    )
-
-
-def test_reduced_camera(view):
-    camera = reduced_camera(view, 3)
-    assert (camera.width, camera.height, camera.fx, camera.cx) == (23, 16, 20, 35 / 3)
-
-
-@pytest.mark.parametrize("downscale", (0, -1, 4, 1.5, "2", None))
-def test_reduced_too_far(view, downscale):
-    with pytest.raises(UserError, match=r"--downscale .*from 1 to 3.*70x50 pixels of a\.png"):
-        reduced_camera(view, downscale)
-
-
-def test_image_too_small_for_any_reduction():
-    with pytest.raises(UserError, match=r"a\.png: 70x15 pixels"):
-        reduced_camera(
-            View(
-                "a.png",
-                Camera(np.eye(3, 4), 60, 60, 35, 25, 70, 15),
-                np.zeros((15, 70, 4), np.uint8),
-            ),
-            1,
-        )
-
-
-@pytest.mark.parametrize("downscale", (1, 2, 3))
-@pytest.mark.parametrize("margin", (0, 2, 100))
-def test_object_box_is_the_tightest(view, rng, downscale, margin):
-    """Against a search over the reduced pixels one by one; the image's leftover columns and rows do
-    not count.
-    """
-    for _ in range(5):
-        view.image[..., 3] = rng.integers(0, MASK_THRESHOLD + 1, view.image.shape[:2])
-        view.image[rng.integers(5, 50, 4), rng.integers(9, 70, 4), 3] = MASK_THRESHOLD + 1
-        width, height = 70 // downscale, 50 // downscale
-        hit = [
-            (x, y)
-            for x in range(width)
-            for y in range(height)
-            if view.image[
-                y * downscale : (y + 1) * downscale, x * downscale : (x + 1) * downscale, 3
-            ].max()
-            > MASK_THRESHOLD
-        ]
-        x, y = zip(*hit, strict=True)
-        expected = (
-            max(min(x) - margin, 0),
-            max(min(y) - margin, 0),
-            min(max(x) + 1 + margin, width),
-            min(max(y) + 1 + margin, height),
-        )
-        assert object_box([view], downscale, margin) == [expected]
-
-
-def test_object_box_without_object(view):
-    assert object_box([view, view], 3, 5) == [(0, 0, 23, 16)] * 2
-
-
 # --------------------------------------------------------------------------------------------------
 
 
 def test_lego(data):
-    """The view's mask lies where the model's extent says; the published row belongs to this
-    scene.
-    """
+    """The view's mask lies where the model's extent says."""
     scene = load_scene(data / "nerf_synthetic/lego", ("test",))
     views = scene.splits["test"]
-    assert len(views) == 25 and views[1].name == "test/r_8.png" and not scene.depth_range_stored
-    assert scene.published == {"PlenopticPoints": {"psnr": 33.00, "ssim": 0.975, "lpips": 0.026}}
+    assert len(views) == 25 and views[1].name == "test/r_8.png"
     for view in views:
+        assert view.depth_range is None
         assert view.camera.fx == pytest.approx(1111.111, abs=1e-3) and view.image.shape == (
             800,
             800,
@@ -446,12 +365,12 @@ def test_lego(data):
 def test_ethiopian_head(data):
     """An object away from the origin: its centre is seen in every photograph."""
     scene = load_scene(data / "ethiopian_head", ("train", "test"))
-    assert scene.depth_range_stored and scene.published == {}
     assert [len(v) for v in scene.splits.values()] == [57, 9]
     for view in scene.splits["train"] + scene.splits["test"]:
         assert alpha_at(view, [-0.521, 1.297, 1.718]) > 250
-        assert 3.3 < view.camera.near < 3.7 and 3.9 < view.camera.far < 5.1
-        x0, y0, x1, y1 = object_box([view], 2, 0)[0]
+        near, far = view.depth_range
+        assert 3.3 < near < 3.7 and 3.9 < far < 5.1
+        x0, y0, x1, y1 = view.reduced(2).object_bounds(0)
         assert 40 < x1 - x0 < 200 and 40 < y1 - y0 <= 200
 
 
@@ -460,13 +379,3 @@ def alpha_at(view, point):
     camera = view.camera
     x, y, z = camera.pose[:, :3].T @ (point - camera.eye)
     return view.image[int(camera.fy * y / z + camera.cy), int(camera.fx * x / z + camera.cx), 3]
-
-
-def test_published_rows_need_the_benchmark_itself(tmp_path):
-    """A scene that is only named like it gets none."""
-    folder = tmp_path / "lego"
-    folder.mkdir()
-    write_scene(folder)
-    assert load_scene(folder).published == {}
-    shutil.move(folder, tmp_path / "other")
-    assert load_scene(tmp_path / "other").name == "other"

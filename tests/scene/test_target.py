@@ -1,5 +1,5 @@
-"""Targets of crops at reduced resolution against the float64 oracle, and against the geometry of
-their cameras.
+"""Targets of crops of reduced images against the float64 oracle, and against the geometry of their
+cameras.
 """
 
 import numpy as np
@@ -7,7 +7,6 @@ import pytest
 from oracle import target as oracle
 from support.guarded import AWKWARD_SIZES
 
-from pp_cl.errors import UserError
 from pp_cl.scene.camera import Camera
 from pp_cl.scene.load import load_scene
 from pp_cl.scene.target import Target
@@ -32,103 +31,105 @@ def random_view(rng, width, height):
     return make_view(image)
 
 
-def check(dev, view, k, x0, y0, width, height, phase):
+def check(dev, view, downscale, box, jitter):
     """Compare one crop with the oracle."""
-    target = Target(dev, k)
-    target.load(view)
-    result = target.crop(x0, y0, width, height, phase).get()
-    expected = oracle.target_forward(
-        view.image, k, k * x0 + phase[0], k * y0 + phase[1], width, height
-    )
+    target = Target(dev)
+    target.load(view.reduced(downscale))
+    result = target.crop(box, jitter).get()
+    left, top = (downscale * first + moved for first, moved in zip(box, jitter, strict=False))
+    expected = oracle.target_forward(view.image, downscale, left, top, *box[2:])
     assert result.shape == expected.shape
     assert np.abs(result - expected).max() < TOLERANCE
 
 
 @pytest.mark.parametrize("size", AWKWARD_SIZES)
 def test_sizes(dev, rng, size):
-    check(dev, random_view(rng, 97, 83), 3, 1, 2, size, 5, (2, 1))
-    check(dev, random_view(rng, 97, 83), 3, 1, 2, 5, size, (0, 2))
+    check(dev, random_view(rng, 97, 83), 3, (1, 2, size, 5), (2, 1))
+    check(dev, random_view(rng, 97, 83), 3, (1, 2, 5, size), (0, 2))
 
 
 @pytest.mark.parametrize("k", (1, 2, 4, 5, 20))
-def test_reductions_and_phases(dev, rng, k):
-    """Every phase of a crop whose blocks end inside, at and beyond the image's right and lower
+def test_reductions_and_jitter(dev, rng, k):
+    """Several offsets of a crop whose blocks end inside, at and beyond the image's right and lower
     edges.
     """
     view = random_view(rng, 16 * k + 3, 17 * k + 1)
-    for phase in {(0, 0), (k - 1, 0), (0, k - 1), (k // 2, k - 1)}:
-        check(dev, view, k, 0, 0, 16, 17, phase)
-        check(dev, view, k, 11, 13, 8, 7, phase)
+    for jitter in {(0, 0), (k - 1, 0), (0, k - 1), (k // 2, k - 1)}:
+        check(dev, view, k, (0, 0, 16, 17), jitter)
+        check(dev, view, k, (11, 13, 8, 7), jitter)
 
 
 def test_crop_reaching_outside_counts_pixels_inside(dev, rng):
     view = random_view(rng, 40, 36)
-    check(dev, view, 2, -3, -5, 27, 30, (1, 1))
-    check(dev, view, 1, -20, 10, 90, 9, (0, 0))
+    check(dev, view, 2, (-3, -5, 27, 30), (1, 1))
+    check(dev, view, 1, (-20, 10, 90, 9), (0, 0))
 
 
 @pytest.mark.parametrize(("x0", "y0"), ((-9, 0), (30, 0), (0, -9), (0, 30), (1000, 1000)))
 def test_wholly_outside_is_white(dev, x0, y0):
     view = make_view(np.zeros((32, 32, 4), np.uint8) + np.array([9, 8, 7, 255], np.uint8))
-    target = Target(dev, 2)
-    target.load(view)
-    assert (target.crop(x0, y0, 8, 8).get() == 1).all()
-    assert (np.abs(target.crop(4, 4, 8, 8).get() - np.array([9, 8, 7]) / 255) < TOLERANCE).all()
+    target = Target(dev)
+    target.load(view.reduced(2))
+    assert (target.crop((x0, y0, 8, 8)).get() == 1).all()
+    assert (np.abs(target.crop((4, 4, 8, 8)).get() - np.array([9, 8, 7]) / 255) < TOLERANCE).all()
 
 
 def test_transparent_is_exactly_white_whatever_its_colour(dev, rng):
     image = rng.integers(0, 256, (64, 64, 4), np.uint8)
     image[..., 3] = 0
-    target = Target(dev, 4)
-    target.load(make_view(image))
-    assert (target.crop(0, 0, 16, 16).get() == 1).all()
+    target = Target(dev)
+    target.load(make_view(image).reduced(4))
+    assert (target.whole() == 1).all() and (target.crop((0, 0, 16, 16)).get() == 1).all()
 
 
-@pytest.mark.parametrize("phase", ((0, 0), (1, 0), (0, 3), (3, 2)))
-def test_camera_sees_what_the_target_shows(dev, phase):
+@pytest.mark.parametrize("jitter", ((0, 0), (1, 0), (0, 3), (3, 2)))
+def test_camera_sees_what_the_target_shows(dev, jitter):
     """Colours that are linear in the stored pixel's position come back where the target's camera
     says they are.
     """
     x, y = np.meshgrid(np.arange(80), np.arange(64))
-    view = make_view(np.stack([3 * x, 4 * y, x + y, np.full_like(x, 255)], -1).astype(np.uint8))
-    target = Target(dev, 4)
+    image = np.stack([3 * x, 4 * y, x + y, np.full_like(x, 255)], -1).astype(np.uint8)
+    view, box = make_view(image).reduced(4), (2, 1, 12, 9)
+    target, stored = Target(dev), view.stored_camera
     target.load(view)
-    x0, y0, width, height = 2, 1, 12, 9
-    camera = target.camera(view, x0, y0, width, height, phase)
-    result = target.crop(x0, y0, width, height, phase).get()
+    camera = view.crop_camera(box, jitter)
+    result = target.crop(box, jitter).get()
     assert (camera.height, camera.width, 3) == result.shape
-    for row, column in np.ndindex(height, width):
-        u = (column + 0.5 - camera.cx) / camera.fx * view.camera.fx + view.camera.cx - 0.5
-        v = (row + 0.5 - camera.cy) / camera.fy * view.camera.fy + view.camera.cy - 0.5
+    for row, column in np.ndindex(result.shape[:2]):
+        u = (column + 0.5 - camera.cx) / camera.fx * stored.fx + stored.cx - 0.5
+        v = (row + 0.5 - camera.cy) / camera.fy * stored.fy + stored.cy - 0.5
         assert np.abs(result[row, column] * 255 - [3 * u, 4 * v, u + v]).max() < 1e-4
-    assert (camera.pose == view.camera.pose).all()
+    assert (camera.pose == stored.pose).all()
 
 
 def test_loading_another_view_replaces_the_first(dev, rng):
-    first, second, larger = (random_view(rng, *size) for size in ((40, 40), (40, 40), (50, 60)))
-    target = Target(dev, 2)
+    sizes = ((40, 40), (40, 40), (50, 60))
+    first, second, larger = (random_view(rng, *size).reduced(2) for size in sizes)
+    target = Target(dev)
     for view in (first, second, second, first, larger, first):
         target.load(view)
         expected = oracle.target_forward(view.image, 2, 0, 0, 20, 20)
-        assert np.abs(target.crop(0, 0, 20, 20).get() - expected).max() < TOLERANCE
+        assert np.abs(target.crop((0, 0, 20, 20)).get() - expected).max() < TOLERANCE
 
 
 def test_two_crops_stand_side_by_side(dev, rng):
-    target = Target(dev, 2)
-    target.load(random_view(rng, 40, 40))
-    first, second = target.crop(0, 0, 8, 8), target.crop(5, 5, 8, 8)
+    target = Target(dev)
+    target.load(random_view(rng, 40, 40).reduced(2))
+    first, second = target.crop((0, 0, 8, 8)), target.crop((5, 5, 8, 8))
     assert not np.array_equal(first.get(), second.get())
     assert np.array_equal(first.get()[5:, 5:], second.get()[:3, :3])
 
 
-def test_reduction_too_far(dev, rng):
-    with pytest.raises(UserError, match="--downscale 3"):
-        Target(dev, 3).load(random_view(rng, 40, 40))
-    with pytest.raises(UserError, match="--downscale 3"):
-        Target(dev, 3).camera(random_view(rng, 40, 40), 0, 0, 8, 8)
+def test_another_reduction_of_the_view_that_is_loaded(dev, rng):
+    view, target = random_view(rng, 48, 48), Target(dev)
+    for downscale in (1, 3, 2):
+        target.load(view.reduced(downscale))
+        side = 48 // downscale
+        expected = oracle.target_forward(view.image, downscale, 0, 0, side, side)
+        assert np.abs(target.whole() - expected).max() < TOLERANCE
 
 
 def test_real_view(dev, data):
     view = load_scene(data / "ethiopian_head", ("test",)).splits["test"][0]
-    check(dev, view, 2, 0, 0, 200, 200, (0, 0))
-    check(dev, view, 4, 20, 30, 64, 64, (3, 1))
+    check(dev, view, 2, (0, 0, 200, 200), (0, 0))
+    check(dev, view, 4, (20, 30, 64, 64), (3, 1))

@@ -9,15 +9,7 @@ from pp_cl.raster.blend import Blend
 from pp_cl.raster.blend_weights import BlendWeights
 from pp_cl.raster.pairs import PairBuilder
 from pp_cl.raster.project import Footprint, Projection
-from pp_cl.scene.camera import Camera
-
-
-def look_at(eye, target):
-    """(3, 4) float64 pose of a camera at `eye` that looks at `target`, world z up."""
-    forward = np.subtract(target, eye) / np.linalg.norm(np.subtract(target, eye))
-    right = np.cross(forward, [0.0, 0.0, 1.0])
-    right /= np.linalg.norm(right)
-    return np.stack([right, np.cross(forward, right), forward, eye], 1)
+from pp_cl.scene.camera import Camera, look_at
 
 
 def make_camera(width=24, height=20, focal=30.0):
@@ -36,23 +28,21 @@ def make_camera(width=24, height=20, focal=30.0):
 
 
 def make_points(rng, n):
-    """(N, 3) points around the origin; some lie outside the view, or nearer or farther than
-    allowed.
-    """
+    """(N, 3) points around the origin; some lie outside the view or the depth range."""
     return rng.normal(size=(n, 3)) * [0.9, 0.9, 0.8]
 
 
 class PairedPoints:
     """Points projected and paired with the pixels of a camera; arrays are float64 or float32 numpy.
 
-    positions: (N, 3). radius: one number or (N,), world units.
+    positions: (N, 3). radius: one number or (N,), world units. depth_range: (near, far).
     """
 
-    def __init__(self, dev, camera, positions, radius, kind="soft"):
+    def __init__(self, dev, camera, positions, radius, kind="soft", depth_range=oracle.DEPTH_RANGE):
         self.dev, self.camera, self.n = dev, camera, len(positions)
         self.shape = (camera.height, camera.width)
         self.footprint = Footprint(kind)
-        self.camera_buffer = dev.upload(camera.packed())
+        self.camera_buffer = dev.upload(camera.packed(depth_range))
         self.projected = Projection(dev, self.footprint).spheres(
             self.camera_buffer,
             dev.upload(positions, np.float32),
@@ -144,9 +134,7 @@ class Blended:
         self.geometry = oracle.geometry(self.camera, self.positions, self.radius, kind) | {
             "hit": self.scene.hits()
         }
-        self.blend = oracle.blend(
-            self.camera, self.geometry, self.opacity, gamma, blend.get("early_stop", 0.0)
-        )
+        self.blend = oracle.blend(self.geometry, self.opacity, gamma, blend.get("early_stop", 0.0))
         self.weight = self.scene.dense(self.scene.weights.pair_weight.get()[:, 0])
         self.role = self.scene.dense(self.scene.roles())
 

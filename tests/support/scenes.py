@@ -8,14 +8,6 @@ from PIL import Image
 from pp_cl.scene.camera import Camera
 
 
-def look_at(eye, target=(0, 0, 0)):
-    """(3, 4) camera-to-world of OpenCV axes, looking from eye to target with world z up."""
-    forward = np.subtract(target, eye) / np.linalg.norm(np.subtract(target, eye))
-    right = np.cross(forward, [0, 0, 1])
-    right /= np.linalg.norm(right)
-    return np.stack([right, np.cross(forward, right), forward, eye], 1)
-
-
 def ring_cameras(n, size, distance=4.0, field_of_view=0.7):
     """n cameras on two rings around the origin that look at it."""
     focal = 0.5 * size / np.tan(0.5 * field_of_view)
@@ -25,13 +17,11 @@ def ring_cameras(n, size, distance=4.0, field_of_view=0.7):
             np.linspace(0, 2 * np.pi, n, endpoint=False), np.tile([0.2, 0.7], n)[:n], strict=True
         )
     ]
-    return [
-        Camera(look_at(eye), focal, focal, size / 2, size / 2, size, size, 2.0, 6.0) for eye in eyes
-    ]
+    return [Camera.look_at(eye, (0, 0, 0), fx=focal, width=size, height=size) for eye in eyes]
 
 
 def ball_image(camera, radius=0.8):
-    """(H, W, 4) uint8 picture of a ball at the origin whose colour varies with the surface
+    """(H, W, 4) uint8 image of a ball at the origin whose colour varies with the surface
     position.
     """
     y, x = np.mgrid[: camera.height, : camera.width] + 0.5

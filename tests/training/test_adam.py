@@ -116,7 +116,11 @@ class Cloud:
         )
         self.opacity = [dev.upload(self.start["opacity"]), *moments(dev, self.start["opacity"])]
         self.sh, self.sh_moments = dev.upload(self.start["sh"]), self.adam.sh_moments(block, n)
-        self.scene = [dev.upload(GRID.packed()), dev.upload(CAMERA.packed()), dev.upload(self.ids)]
+        self.scene = [
+            dev.upload(GRID.packed()),
+            dev.upload(CAMERA.packed((2.0, 6.0))),
+            dev.upload(self.ids),
+        ]
 
     def step(self, grad_features, grad_opacity, rows, step=None):
         """Update the rows; the kernels must not read the gradients of the others, which are NaN."""
@@ -306,7 +310,7 @@ def test_sh_of_a_point_in_the_eye_stays_finite(dev):
     adam.update_sh(
         SH_BLOCKS[2],
         dev.upload(grid.packed()),
-        dev.upload(camera.packed()),
+        dev.upload(camera.packed((2.0, 6.0))),
         dev.upload(ids),
         dev.zeros((2, 16)),
         sh,

@@ -7,7 +7,7 @@ from support.scenes import write_ball_scene
 from pp_cl.config import Config, assign, preset
 from pp_cl.errors import UserError
 from pp_cl.model import Model
-from pp_cl.run import open_scene, with_depth_range
+from pp_cl.run import open_scene
 from pp_cl.scene.grid import Grid
 from pp_cl.train import Trainer
 from pp_cl.training.memory import memory_plan, point_bytes, print_plan
@@ -39,7 +39,7 @@ def trained(dev, folder, changes):
     before, dev.peak_bytes = dev.bytes, dev.bytes
     grid = Grid((-0.87, -0.87, -0.87), 0.06, (30, 30, 30))
     model = Model.create(dev, grid, np.arange(27_000), (2.0, 6.0), config.network.widths, 0)
-    views = with_depth_range(open_scene(dev, config, ("train",)).splits["train"], (2.0, 6.0))
+    views = open_scene(dev, config, ("train",)).splits["train"]
     trainer = Trainer(dev, config, model, views)
     plan = memory_plan(dev, config, model, views)
     for _ in range(30):

@@ -1,5 +1,5 @@
-"""Scenes in the format of NeRF-synthetic, transforms_<split>.json, with nerfstudio's names for what
-it does not know.
+"""Reader of scenes in the format of NeRF-synthetic, transforms_<split>.json, extended by
+nerfstudio's keys: intrinsics per frame, principal point, near and far.
 """
 
 import json
@@ -17,54 +17,25 @@ FILES = "transforms_train.json"
 
 # Lens distortion is not modelled, so its coefficients must be absent or 0.
 DISTORTION = ("k1", "k2", "k3", "k4", "p1", "p2")
-# without distortion, that is
+# values of camera_model that are pinhole cameras when those coefficients are 0
 PINHOLES = ("PERSPECTIVE", "PINHOLE", "SIMPLE_PINHOLE", "OPENCV", "SIMPLE_RADIAL", "RADIAL")
 
-MOST = 1e30  # numbers beyond are refused: they have no float32
-# largest eigenvalue of R^T R - 1 that passes as rounding; NeRF-synthetic has 1e-6
+MOST = 1e30  # larger numbers are refused: float32 could not hold their products
+# largest eigenvalue of R^T R - 1 that is taken for rounding; NeRF-synthetic has 1e-6
 ROTATION_TOLERANCE = 1e-3
 CV_FROM_GL = np.diag([1.0, -1.0, -1.0])  # OpenGL: y up, z backward; OpenCV: y down, z forward
 
-# PlenopticPoints supplemental, Tables 5 to 7: PSNR, SSIM, LPIPS (VGG) over the 200 test views of
-# 800x800.
-PLENOPTIC_POINTS = {
-    "chair": (35.35, 0.986, 0.016),
-    "drums": (25.59, 0.947, 0.050),
-    "ficus": (32.68, 0.982, 0.016),
-    "hotdog": (37.18, 0.985, 0.022),
-    "lego": (33.00, 0.975, 0.026),
-    "materials": (29.27, 0.960, 0.041),
-    "mic": (35.07, 0.991, 0.007),
-    "ship": (28.40, 0.891, 0.125),
-}
-SYNTHETIC_SIZE, SYNTHETIC_FOCAL = 800, 1111.11  # pixels, of all eight
 
-
-def recognises(folder):
+def recognises(folder: Path) -> bool:
     """True if the folder holds a transforms_<split>.json."""
     return any(folder.glob("transforms_*.json"))
 
 
-def published(name, cameras):
-    """{"PlenopticPoints": {"psnr", "ssim", "lpips"}} for a NeRF-synthetic scene, told by name and
-    cameras; else {}.
-    """
-    synthetic = all(
-        c.width == c.height == SYNTHETIC_SIZE and abs(c.fx - SYNTHETIC_FOCAL) < 0.01
-        for c in cameras
-    )
-    if name not in PLENOPTIC_POINTS or not synthetic:
-        return {}
-    return {
-        "PlenopticPoints": dict(zip(("psnr", "ssim", "lpips"), PLENOPTIC_POINTS[name], strict=True))
-    }
+def read_split(folder: Path, split: str) -> list[tuple[str, Camera, tuple[float, float] | None]]:
+    """[(image path relative to the folder, Camera, (near, far))] of transforms_<split>.json.
 
-
-def read_split(folder, split):
-    """[(image path relative to the folder, Camera)] of transforms_<split>.json.
-
-    near and far are NaN where they are not given. Raises UserError naming the file and the key of
-    what is wrong.
+    The last is None for a frame without near and far. Raises UserError naming the file and the key
+    that is missing or wrong.
     """
     file = folder / f"transforms_{split}.json"
     if not file.is_file():
@@ -98,7 +69,7 @@ def _read_json(file):
 
 @dataclass
 class _Frame:
-    """The keys of one frame; what it does not say itself, the file says for all."""
+    """The keys of one frame; a key that the frame lacks is looked up in the whole file."""
 
     file: Path
     shared: dict
@@ -114,7 +85,7 @@ class _Frame:
         return self.shared.get(key) if self.own.get(key) is None else self.own[key]
 
     def error(self, key, text):
-        """The UserError about a key, which names it where it stands."""
+        """The UserError about a key, which names the file and the frame that the key stands in."""
         here = f"frames[{self.index}]."
         is_shared = key in self.shared and self.own.get(key) is None
         return UserError(f"{self.file}: {'' if is_shared else here}{key}: {text}")
@@ -134,14 +105,14 @@ class _Frame:
 
 
 def _read_frame(folder, frame):
-    """(image path relative to the folder, Camera) of one frame."""
+    """(image path relative to the folder, Camera, (near, far) or None) of one frame."""
     name = _image_name(folder, frame)
     width, height = _size(folder, name, frame)
     _refuse_distortion(frame)
     fx, fy = _focal_lengths(frame, width, height)
     cx, cy = frame.number("cx"), frame.number("cy")
     centre = (width / 2 if cx is None else cx, height / 2 if cy is None else cy)
-    return name, Camera(_pose(frame), fx, fy, *centre, width, height, *_depth_range(frame))
+    return name, Camera(_pose(frame), fx, fy, *centre, width, height), _depth_range(frame)
 
 
 def _image_name(folder, frame):
@@ -223,10 +194,10 @@ def _focal_length(frame, length_key, angle_key, size):
 
 
 def _depth_range(frame):
-    """(near, far), or NaN twice if neither is given."""
+    """(near, far), or None if neither is given."""
     near, far = frame.number("near", above=0), frame.number("far", above=0)
     if near is None and far is None:
-        return math.nan, math.nan
+        return None
     if near is None or far is None:
         raise frame.error(
             "near" if near is None else "far", "is missing; give both near and far, or neither"

@@ -1,0 +1,126 @@
+"""The box around the object that the masks allow, and why masks can leave no hull."""
+
+from collections.abc import Sequence
+
+import numpy as np
+from scipy.optimize import linprog
+
+from pp_cl.errors import UserError
+from pp_cl.scene.grid import Grid, smallest_edge
+from pp_cl.scene.views import MASK_THRESHOLD, View
+
+# how far, in image sizes, an object that the image border cuts off may reach beyond the border
+CROPPED_MARGIN = 0.5
+SOLVED, INFEASIBLE = 0, 2  # status of scipy.optimize.linprog
+PROBED_CELLS = 32**3  # positions at which an error's explanation looks up the masks
+NAMES_SHOWN = 3  # views named in an error
+
+
+def bounding_box(views: Sequence[View]) -> np.ndarray:
+    """(2, 3) box around the intersection of one pyramid per view, the one through the rectangle
+    around its mask, by linear programs.
+
+    A side where the mask reaches the image border does not bound the object, unless nothing else
+    does; then the object is taken to end CROPPED_MARGIN image sizes outside. Raises UserError when
+    the pyramids do not meet or do not end.
+    """
+    for margin in (None, CROPPED_MARGIN):
+        planes = np.concatenate([_silhouette_planes(view, margin) for view in views])
+        # lower bounds of x, y, z, -x, -y, -z
+        bounds = [
+            linprog(axis, -planes[:, :3], -planes[:, 3], bounds=(None, None))
+            for axis in (*np.eye(3), *-np.eye(3))
+        ]
+        if any(b.status == INFEASIBLE for b in bounds):
+            eyes = np.stack([view.camera.eye for view in views])
+            reach = np.ptp(eyes, axis=0).max() or 1.0
+            raise UserError(explain_empty_hull(views, eyes.mean(0) + reach * np.array([[-1], [1]])))
+        if all(b.status == SOLVED for b in bounds):
+            return np.array([[1], [-1]]) * np.array([b.fun for b in bounds]).reshape(2, 3)
+    raise UserError(
+        f"{views[0].name} and the {len(views) - 1} other training views do not bound the object: "
+        "it must be seen from several sides"
+    )
+
+
+def _silhouette_planes(view, cropped_margin):
+    """(P, 4) normals n and offsets o: n.x >= o holds for all x that the rectangle around the
+    dilated mask lets pass.
+
+    Sides where it reaches the image border: left out, or cropped_margin image sizes further out.
+    """
+    camera, mask = view.stored_camera, view.image[..., 3] > MASK_THRESHOLD
+    normals = []
+    for axis, size, focal, centre in (
+        (0, camera.width, camera.fx, camera.cx),
+        (1, camera.height, camera.fy, camera.cy),
+    ):
+        used = np.flatnonzero(mask.any(axis))
+        if not used.size:
+            continue
+        for sign, edge, border in ((1, used[0] - 1, 0), (-1, used[-1] + 2, size)):
+            if sign * (edge - border) <= 0:
+                if cropped_margin is None:
+                    continue
+                edge = border - sign * cropped_margin * size
+            normal = np.array([0, 0, -(edge - centre) / focal])
+            normal[axis] = 1
+            normals.append(sign * camera.pose[:, :3] @ normal / np.linalg.norm(normal))
+    normals = np.array(normals).reshape(-1, 3)
+    return np.column_stack([normals, normals @ camera.eye])
+
+
+def explain_empty_hull(views: Sequence[View], box: np.ndarray) -> str:
+    """One line on why the masks leave no point: which views contradict most others.
+
+    It counts the masks that hold each of about 32^3 positions in a (2, 3) box.
+    """
+    empty = [view.name for view in views if view.image[..., 3].max() <= MASK_THRESHOLD]
+    if empty:
+        return (
+            f"{_names(empty)}: the mask is empty (no alpha above {MASK_THRESHOLD}): mend or remove"
+            " the image"
+        )
+    grid = Grid.centred_in(box, smallest_edge(box, PROBED_CELLS))
+    vertices = np.stack(np.meshgrid(*(np.arange(n) for n in grid.dims), [1]), -1).reshape(-1, 4)
+    on_mask, beside = np.stack(
+        [_mask_votes(view, grid.projection(view.stored_camera) @ vertices.T) for view in views],
+        axis=1,
+    )
+    agreeing = on_mask.sum(0).max()
+    objections = beside[:, on_mask.sum(0) == agreeing].mean(1)
+    names = [views[i].name for i in np.argsort(-objections, kind="stable") if objections[i] > 0]
+    if agreeing >= 0.75 * len(views) and names:
+        return (
+            f"{_names(names)}: the mask rejects every place that the other views agree on: check"
+            " its alpha and its camera"
+        )
+    names = _names([view.name for view in views])
+    return (
+        f"{names}: the masks leave no point, at most {agreeing} of {len(views)} meet in one place:"
+        " check the masks and the camera poses (camera-to-world; in transforms files x right, y"
+        " up, z backward)"
+    )
+
+
+def _mask_votes(view, projected):
+    """(2, N) bool: which positions fall onto the mask, and which into the image beside it.
+
+    projected: (3, N), as Grid.projection gives them.
+    """
+    u, v, depth = projected
+    height, width = view.image.shape[:2]
+    ahead = depth > 0
+    x, y = (np.floor(np.divide(a, depth, where=ahead, out=np.full_like(a, -1))) for a in (u, v))
+    inside = ahead & (x >= 0) & (x < width) & (y >= 0) & (y < height)
+    on = (
+        view.image[np.where(inside, y, 0).astype(int), np.where(inside, x, 0).astype(int), 3]
+        > MASK_THRESHOLD
+    )
+    return np.stack([inside & on, inside & ~on])
+
+
+def _names(names):
+    return ", ".join(names[:NAMES_SHOWN]) + (
+        f" and {len(names) - NAMES_SHOWN} more" if len(names) > NAMES_SHOWN else ""
+    )
