@@ -87,18 +87,20 @@ def _pixels_per_point(config, model, camera):
     return math.pi * radius**2
 
 
-def print_plan(rows, dev):
-    """Print the table against the device's limits. Raises UserError naming the knobs when it does
-    not fit.
-    """
-    total = sum(size for _, _, size in rows)
-    print(
+def plan_table(rows, dev):
+    """Text of the table against the device's limits."""
+    lines = [
         f"memory plan ({dev.name}: {dev.info['memory_bytes'] / MIB:.0f} MiB, "
         f"at most {dev.info['max_allocation_bytes'] / MIB:.0f} at once)"
-    )
-    for what, shape, size in rows:
-        print(f"  {what:36s} {shape:28s} {size / MIB:9.1f} MiB")
-    print(f"  {'total':36s} {'':28s} {total / MIB:9.1f} MiB")
+    ]
+    for what, shape, size in (*rows, ("total", "", sum(size for _, _, size in rows))):
+        lines.append(f"  {what:36s} {shape:28s} {size / MIB:9.1f} MiB")
+    return "\n".join(lines)
+
+
+def check_plan(rows, dev):
+    """Raise UserError naming the knobs when the plan does not fit the device's memory."""
+    total = sum(size for _, _, size in rows)
     if total > dev.info["memory_bytes"]:
         raise UserError(
             f"the training needs {total / MIB:.0f} MiB, {dev.name} has"
