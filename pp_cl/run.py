@@ -24,7 +24,7 @@ from pp_cl.scene.hull import build_grid, depth_range, spacing_pixels
 from pp_cl.scene.load import Scene, load_scene
 from pp_cl.scene.views import View, reduced_camera
 from pp_cl.train import Trainer
-from pp_cl.training.memory import check_plan, memory_plan, spare_memory
+from pp_cl.training.memory import Plan, memory_plan, spare_memory
 from pp_cl.training.schedule import gamma
 
 Stored = tuple[dict[str, Any], dict[str, np.ndarray]]  # header and arrays of a checkpoint
@@ -213,7 +213,7 @@ class HullFacts(NamedTuple):
 class Training:
     """A training that is ready to begin or to go on.
 
-    info: what its checkpoints' headers hold beside the model's. plan: rows of memory_plan. hull:
+    info: what its checkpoints' headers hold beside the model's. plan: of memory_plan. hull:
     None if it goes on from a checkpoint.
     """
 
@@ -221,7 +221,7 @@ class Training:
     config: Config
     trainer: Trainer
     info: dict[str, Any]
-    plan: list[tuple[str, str, int]]
+    plan: Plan
     hull: HullFacts | None
 
     def run(self, on_step: Callable[[int, dict | None], None] | None = None) -> float:
@@ -232,8 +232,8 @@ class Training:
         Raises UserError, before anything is written, where the memory is too small.
         """
         trainer, settings = self.trainer, self.config.train
-        check_plan(self.plan, trainer.dev)
-        trainer.renderer.cache.budget = spare_memory(self.plan, settings.memory_gib)
+        spare = spare_memory(self.plan, trainer.dev, settings.memory_gib)
+        trainer.renderer.cache.budget = spare
         self.folder.create(self.config.to_json())
         with self.folder.open_log(trainer.step) as log:
             seconds = log.seconds

@@ -42,7 +42,7 @@ def run(options: argparse.Namespace) -> None:
     from pp_cl.device.discover import open_device
     from pp_cl.files.run_folder import RunFolder
     from pp_cl.run import open_training, run_config, stored_state
-    from pp_cl.training.memory import plan_table
+    from pp_cl.training.memory import plan_lines
 
     folder = RunFolder(options.out)
     config = run_config(folder, options.scene, options.preset, _given_settings(options))
@@ -59,7 +59,7 @@ def run(options: argparse.Namespace) -> None:
     print(f"device: {dev.name} [{dev.info['platform']}]")
     training = open_training(dev, folder, config, stored)
     print(_first_line(training))
-    print(plan_table(training.plan, dev))
+    print("\n".join(plan_lines(training.plan, dev)))
     seconds = _run_with_bar(training)
     print(
         f"trained {config.train.iterations} steps in {seconds:.1f} s;"

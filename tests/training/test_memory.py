@@ -10,7 +10,7 @@ from pp_cl.model import Model
 from pp_cl.run import open_scene, with_depth_range
 from pp_cl.scene.grid import Grid
 from pp_cl.train import Trainer
-from pp_cl.training.memory import check_plan, memory_plan, plan_table, point_bytes
+from pp_cl.training.memory import memory_plan, plan_lines, point_bytes, spare_memory
 
 PAPER_POINTS = 4_040_533  # lego, supplemental Table 4
 WAYS = [
@@ -85,8 +85,8 @@ def test_the_papers_scale_fits_nine_gibibytes(lazy):
 
 def test_a_plan_over_the_memory_names_the_knobs(dev):
     rows = [("points", "(3) x 4", dev.info["memory_bytes"])]
-    check_plan(rows, dev)
-    table = plan_table(rows, dev).splitlines()
+    assert spare_memory(rows, dev, 0) == 0
+    table = plan_lines(rows, dev)
     assert len(table) == 3 and "points" in table[1] and "total" in table[2]
     with pytest.raises(UserError, match="lower --points, .* train.moments_16bit"):
-        check_plan([("points", "(3) x 4", dev.info["memory_bytes"] + 1)], dev)
+        spare_memory([("points", "(3) x 4", dev.info["memory_bytes"] + 1)], dev, 0)
