@@ -224,6 +224,16 @@ PRESETS = {
     },
 }
 
+# Settings with a short name on the command line and in run.train_scene().
+SHORT = {
+    "iterations": "train.iterations",
+    "points": "points.count",
+    "downscale": "scene.downscale",
+    "seed": "train.seed",
+    "memory": "train.memory_gib",
+    "tolerance": "network.tolerance",
+}
+
 # Old key: new key. Old keys are accepted in this version and noted in Config.notes.
 RENAMED = {
     "points.footprint": "raster.footprint",
@@ -351,7 +361,7 @@ def load_config(path: Path | str) -> Config:
         stored = json.loads(path.read_text())
     except OSError as error:
         raise UserError(f"{path}: {error.strerror}; is this the folder of a run?") from None
-    except ValueError as error:
+    except (ValueError, RecursionError) as error:
         raise UserError(f"{path}: not JSON ({error}); restore it or start a new run") from None
     if not isinstance(stored, dict) or stored.get("preset") not in tuple(PRESETS):
         raise UserError(

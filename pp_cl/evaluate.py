@@ -1,158 +1,145 @@
 """Evaluation of a run: every view of a split, rendered, rounded to 8 bits, measured."""
 
+import os
+import shutil
 import time
-from pathlib import PurePosixPath
+from collections.abc import Iterator
+from pathlib import Path, PurePosixPath
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from pp_cl.config import assign, load_config, validate
 from pp_cl.device.discover import open_device
 from pp_cl.files.atomic import remove_leftovers, write_json
 from pp_cl.files.contact_sheet import write_comparison
 from pp_cl.files.image import write_png
-from pp_cl.layers.tuning import adopt_stored
 from pp_cl.metrics.psnr_ssim import Metrics, mean
 from pp_cl.metrics.published import published_row
-from pp_cl.model import Model
-from pp_cl.render import Renderer
-from pp_cl.run import CHECKPOINT, load_run, open_scene
+from pp_cl.run import Run, load_run
 from pp_cl.scene.target import Target
-from pp_cl.training.schedule import gamma
+from pp_cl.scene.views import View
 
-PICTURE_VIEWS = 4  # rows of the comparison picture
+SHOWN_VIEWS = 4  # rows of the comparison image
 
 
-def evaluate_run(folder, metrics, split, save_images, device_choice, tolerance=None):
-    """Measure a run; writes RUN/eval/metrics.json and comparison.png, prints a table, returns the
-    metrics.
-
-    metrics: names out of psnr, ssim, lpips; tolerance: text for network.tolerance, None = the
-    run's. Raises UserError for a missing or broken run or split.
+class Rendered(NamedTuple):
+    """A view as the run renders it. image, truth: (H, W, 3) float32 in [0, 1]. tau: what dropping
+    hits changed, empty at raster.tau 0. computed: fraction of the network's multiplications that
+    were computed; the others would have seen background alone.
     """
-    config = load_config(folder / "config.json")
-    if tolerance is not None:
-        assign(config, "network.tolerance", tolerance, "--tolerance")
-        validate(config, "--tolerance")
-    header, arrays = load_run(folder / CHECKPOINT)
-    dev = open_device(device_choice)
-    adopt_stored(dev, config.network.tolerance)
-    scene = open_scene(dev, config, (split,))
-    measure = Metrics(dev, metrics)
-    model = Model.load(
-        dev, header, arrays, config.network.widths, config.points.sh_degree, folder / CHECKPOINT
-    )
-    views = scene.splits[split]
 
-    target_folder = folder / "eval"
-    (target_folder / "images" if save_images else target_folder).mkdir(parents=True, exist_ok=True)
-    remove_leftovers(target_folder)
-    gamma_now = gamma(header["step"], config.train.iterations, *config.raster.gamma)
-    shown = {len(views) * i // PICTURE_VIEWS for i in range(PICTURE_VIEWS)}
-    rows, pictures, seconds, shares = [], [], [], []
-    for i, (view, picture, truth, duration, dropped) in enumerate(
-        _render_all(dev, config, model, views, gamma_now)
-    ):
-        rows.append({"name": view.name} | measure(picture, truth) | dropped)
-        seconds.append(duration)
-        shares.append(model.net.share)
-        if i in shown:
-            pictures.append((picture, truth))
+    name: str
+    image: np.ndarray
+    truth: np.ndarray
+    seconds: float
+    tau: dict[str, float]
+    computed: float
+
+
+def evaluate_run(
+    folder: Path | str,
+    split: str = "test",
+    metrics: tuple[str, ...] = ("psnr", "ssim"),
+    *,
+    save_images: bool = False,
+    device: str | None = None,
+    tolerance: float | None = None,
+    scene: str | None = None,
+) -> dict[str, Any]:
+    """Measure a run; writes metrics.json and comparison.png into RUN/eval, or RUN/eval/SPLIT for
+    other splits than test, and returns the former.
+
+    metrics: names out of psnr, ssim, lpips. save_images: write every view to images/ there, in
+    place of what an earlier evaluation left. device: as `pp-cl eval --device`; tolerance, scene: as
+    load_run takes them. Raises UserError for a missing or broken run or split.
+    """
+    run = load_run(open_device(device), folder, tolerance=tolerance, scene=scene)
+    scene = run.scene(split)
+    views = scene.splits[split]
+    measure = Metrics(run.dev, metrics)
+    target = run.folder.evaluation(split)
+    target.mkdir(parents=True, exist_ok=True)
+    remove_leftovers(target)
+    if save_images:
+        shutil.rmtree(target / "images", ignore_errors=True)
+    files = image_files([view.name for view in views])
+    rows, costs, shown = [], [], []
+    for i, rendered in enumerate(render_views(run, views)):
+        image, truth = rendered.image, rendered.truth
+        rows.append({"name": rendered.name} | measure(image, truth) | rendered.tau)
+        costs.append((rendered.seconds, rendered.computed))
+        if i in {len(views) * row // SHOWN_VIEWS for row in range(SHOWN_VIEWS)}:
+            shown.append((image, truth))
         if save_images:
-            write_png(target_folder / "images" / f"{PurePosixPath(view.name).stem}.png", picture)
-    result = {
-        "split": split,
-        "device": dev.name,
-        "step": header["step"],
-        "finished": header["finished"],
-        "mean": mean([{name: row[name] for name in ("name", *metrics)} for row in rows]),
-        "per_image": rows,
-        "points": {
-            "initial": header["initial_points"],
-            "final": model.count,
-            "grid": header["grid"]["dims"],
-        },
-        "seconds_per_frame": float(np.median(seconds)),
-        # of the network's multiplications; the rest saw background alone
-        "network_share": float(np.mean(shares)),
-        "published": published_row(scene.name, [view.stored_camera for view in views]),
-    }
-    write_json(target_folder / "metrics.json", result)
-    write_comparison(target_folder / "comparison.png", *zip(*pictures, strict=True))
-    _print_table(result, folder)
-    print(
-        f"wrote {target_folder / 'metrics.json'} and {target_folder / 'comparison.png'} (prediction"
-        " | truth | 4 x error)"
-    )
+            path = target / "images" / files[i]
+            path.parent.mkdir(parents=True, exist_ok=True)
+            write_png(path, image)
+    means = mean([{name: row[name] for name in metrics} for row in rows])
+    published = published_row(scene.name, [view.stored_camera for view in views])
+    result = {"split": split, "device": run.dev.name, "mean": means, "per_image": rows}
+    result |= _about(run, costs) | {"published": published}
+    write_json(target / "metrics.json", result)
+    write_comparison(target / "comparison.png", *zip(*shown, strict=True))
     return result
 
 
-def _render_all(dev, config, model, views, gamma_now):
-    """Yield (view, prediction (H,W,3), truth (H,W,3), seconds of the rendering, what tau did) as
-    float32 in [0, 1].
+def _about(run, costs):
+    """What metrics.json says of the run. costs: [(seconds, fraction computed)] of each view."""
+    seconds, computed = zip(*costs, strict=True)
+    return {
+        "step": run.header["step"],
+        "finished": run.header["finished"],
+        "points": {
+            "initial": run.header["initial_points"],
+            "final": run.model.count,
+            "grid": run.header["grid"]["dims"],
+        },
+        "seconds_per_frame": float(np.median(seconds)),
+        "computed_fraction": float(np.mean(computed)),
+    }
+
+
+def image_files(names: list[str]) -> list[PurePosixPath]:
+    """Relative paths of PNG files for views of these names: the folders in which they differ stay,
+    those that all of them share go.
     """
-    model.net.freeze()
-    renderer, target = Renderer(dev, model, config.raster), Target(dev)
-    # builds the programs
-    renderer.render(views[0].camera, gamma_now)
+    paths = [PurePosixPath(name) for name in names]
+    shared = os.path.commonpath([path.parent for path in paths])
+    paths = [path.relative_to(shared) for path in paths]
+    files = [path.with_suffix(".png") for path in paths]
+    if len(set(files)) < len(files):  # a.jpg beside a.png
+        files = [path.with_name(f"{path.name}.png") for path in paths]
+    return files
+
+
+def render_views(run: Run, views: list[View]) -> Iterator[Rendered]:
+    """Each view as the run renders it, in turn."""
+    target = Target(run.dev)
+    run.render(views[0].camera)  # builds the programs
     for view in views:
         start = time.perf_counter()
-        picture = renderer.render(view.camera, gamma_now)
+        image = run.render(view.camera)
         seconds = time.perf_counter() - start
+        computed = run.model.net.share
         target.load(view)
         truth = target.whole()
-        yield (
-            view,
-            picture,
-            truth,
-            seconds,
-            _tau_errors(renderer, view.camera, gamma_now) if config.raster.tau > 0 else {},
-        )
+        tau = _effect_of_tau(run, view.camera) if run.config.raster.tau > 0 else {}
+        yield Rendered(view.name, image, truth, seconds, tau, computed)
 
 
-def _tau_errors(renderer, camera, gamma_now):
+def _effect_of_tau(run, camera):
     """{"tau_bound", "tau_feature_error", "tau_picture_error"} of a view.
 
     The largest weight that a pixel dropped (or its bound), and the largest differences from tau 0:
     of a feature over the range of the features, and of the image.
     """
-    view = renderer.rasterise(camera, gamma_now)
+    renderer, gamma = run.renderer, run.gamma
+    view = renderer.rasterise(camera, gamma)
     bound, features = renderer.dropped_weights(view).get().max(initial=0), view.features.get()
-    exact = renderer.rasterise(camera, gamma_now, tau=0.0).features.get()
-    image, exact_image = (renderer.render(camera, gamma_now, tau=tau) for tau in (None, 0.0))
+    exact = renderer.rasterise(camera, gamma, tau=0.0).features.get()
+    image, exact_image = (renderer.render(camera, gamma, tau=tau) for tau in (None, 0.0))
     return {
         "tau_bound": float(bound),
         "tau_feature_error": float(np.abs(features - exact).max() / max(np.ptp(exact), 1e-30)),
         "tau_picture_error": float(np.abs(image - exact_image).max()),
     }
-
-
-def _print_table(result, folder):
-    names = list(result["mean"])
-    print(f"{'':28s}" + "".join(f"{n:>9s}" for n in names))
-    rows = {f"{folder} ({len(result['per_image'])} views)": result["mean"]} | {
-        f"{k} (published)": v for k, v in result["published"].items()
-    }
-    for label, values in rows.items():
-        print(
-            f"{label:28s}"
-            + "".join(f"{values[n]:9.4f}" if n in values else f"{'':9s}" for n in names)
-        )
-    points = result["points"]
-    errors = {
-        name: max(row.get(name, 0.0) for row in result["per_image"])
-        for name in ("tau_bound", "tau_feature_error", "tau_picture_error")
-    }
-    if any(errors.values()):
-        print(
-            "raster.tau: dropped at most {:.1e} of a pixel; features off by {:.1e} of their range,"
-            " the picture by {:.1e}".format(*errors.values())
-        )
-    share = (
-        f"{result['network_share']:.0%} of the network's work, "
-        if result["network_share"] < 1
-        else ""
-    )
-    print(
-        f"{points['final']} of {points['initial']} points, {share}"
-        f"{result['seconds_per_frame'] * 1e3:.0f} ms per frame on {result['device']}"
-    )

@@ -1,47 +1,94 @@
-"""The folder of a run: starting, resuming, logging, previews and checkpoints around the training
-loop.
-"""
+"""Runs: a training that starts or goes on in a folder, and the model that it leaves there."""
 
 import hashlib
-import json
-import sys
 import time
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any, NamedTuple
 
 import numpy as np
-from tqdm import tqdm
 
+from pp_cl.config import SHORT, Config, assign, load_config, preset, sections, validate
+from pp_cl.device.device import Device
 from pp_cl.device.discover import open_device
 from pp_cl.errors import UserError
-from pp_cl.files.atomic import remove_leftovers, write_text
-from pp_cl.files.checkpoint import load_checkpoint, save_checkpoint
 from pp_cl.files.contact_sheet import write_comparison
+from pp_cl.files.run_folder import RunFolder
 from pp_cl.layers.tuning import adopt_of_run, adopt_stored
 from pp_cl.model import Model
-from pp_cl.scene.hull import CELL_CAP, build_grid, depth_range, spacing_pixels
-from pp_cl.scene.load import load_scene
+from pp_cl.render import Renderer
+from pp_cl.scene.camera import Camera
+from pp_cl.scene.hull import build_grid, depth_range, spacing_pixels
+from pp_cl.scene.load import Scene, load_scene
+from pp_cl.scene.views import View
 from pp_cl.train import Trainer
-from pp_cl.training.memory import memory_plan, print_plan, spare_memory
+from pp_cl.training.memory import Plan, memory_plan, spare_memory
+from pp_cl.training.schedule import gamma
 
-CHECKPOINT = "checkpoint.npz"
-# of a run's checkpoint
-HEADER = ("scene", "step", "finished", "initial_points", "grid", "depth_range")
+Stored = tuple[dict[str, Any], dict[str, np.ndarray]]  # header and arrays of a checkpoint
 
 
-def load_run(path):
-    """(header, arrays) of a run's checkpoint. Raises UserError as load_checkpoint does, and for an
-    incomplete header.
+# ---- settings and scene
+
+
+def run_config(
+    folder: RunFolder,
+    scene: str,
+    preset_name: str | None = None,
+    given: Iterable[tuple[str, Any, str]] = (),
+) -> Config:
+    """Config of a training in `folder`: its stored one if it has one, else the preset's, with the
+    given settings.
+
+    scene: a folder, or the word demo. given: (key, value or its text, origin), which a stored run
+    must agree with. Raises UserError naming the first setting that differs or makes no sense.
     """
-    header, arrays = load_checkpoint(path)
-    missing = [key for key in HEADER if key not in header]
-    if missing:
-        raise UserError(
-            f"{path}: its header lacks {', '.join(missing)}; delete it to train anew, or restore a"
-            " copy"
-        )
-    return header, arrays
+    if folder.config.exists():
+        config, stored = load_config(folder.config), load_config(folder.config)
+        if preset_name not in (None, stored.preset):
+            raise UserError(
+                f"{folder.config}: preset is {stored.preset} there, {preset_name} asked for; use"
+                " another --out"
+            )
+    else:
+        config, stored = preset(preset_name or "tiny"), None
+        config.scene.downscale = 2 if scene == "demo" else 1
+    configure(config, scene, given)
+    if stored:
+        _check_same(config, stored, folder)
+    return config
 
 
-def open_scene(dev, config, splits):
+def configure(config: Config, scene: str, given: Iterable[tuple[str, Any, str]] = ()) -> Config:
+    """The config with another scene and the given settings. Raises UserError as run_config does."""
+    config.scene.path = scene if scene == "demo" else str(Path(scene).resolve())
+    for key, value, origin in given:
+        assign(config, key, value, origin)
+    validate(config, "settings")
+    return config
+
+
+def _check_same(asked, stored, folder):
+    """Raise UserError naming the first setting that differs, the place of the scene aside: a
+    checkpoint knows its scene by more than that.
+    """
+    for (section, ours), (_, theirs) in zip(sections(asked), sections(stored), strict=True):
+        for name, value in vars(ours).items():
+            there = getattr(theirs, name)
+            if value != there and (section, name) != ("scene", "path"):
+                _refuse_setting(folder, f"{section}.{name}", there, value)
+
+
+def _refuse_setting(folder, key, there, asked):
+    raise UserError(
+        f"{folder.config}: {key} is {there} there, {asked} asked for; use another --out, or the"
+        " settings of the run"
+    )
+
+
+def open_scene(dev: Device, config: Config, splits: tuple[str, ...]) -> Scene:
     """Scene of config.scene.path with the given splits, reduced config.scene.downscale times;
     `demo` is rendered on the device.
     """
@@ -55,7 +102,7 @@ def open_scene(dev, config, splits):
     return demo_scene(dev, splits).reduced(config.scene.downscale)
 
 
-def fingerprint(views):
+def fingerprint(views: list[View]) -> str:
     """Hex digest of the views' names and stored cameras, by which a checkpoint knows its scene."""
     digest = hashlib.sha256()
     for view in views:
@@ -69,75 +116,211 @@ def fingerprint(views):
     return digest.hexdigest()
 
 
-def train_run(folder, config, device_choice):
-    """Train into `folder`, from its last checkpoint where there is one.
+# ---- what a training leaves
 
-    config: config.Config. Raises UserError for a scene, folder or checkpoint that does not fit; a
-    start that fails writes nothing.
+
+@dataclass
+class Run:
+    """The model of a run's last checkpoint. header: of the checkpoint, see files/run_folder.py."""
+
+    dev: Device
+    folder: RunFolder
+    config: Config
+    header: dict[str, Any]
+    model: Model
+
+    @cached_property
+    def renderer(self) -> Renderer:
+        """Renders the model, whose parameters must not change any more."""
+        self.model.net.freeze()
+        return Renderer(self.dev, self.model, self.config.raster)
+
+    @property
+    def gamma(self) -> float:
+        """Depth sharpness of the blend at the run's last step."""
+        return gamma(self.header["step"], self.config.train.iterations, *self.config.raster.gamma)
+
+    def scene(self, split: str) -> Scene:
+        """The run's scene with one split. Raises UserError where it is missing or broken."""
+        path = self.config.scene.path
+        if path != "demo" and not Path(path).is_dir():
+            raise UserError(f"{path}: the run's scene is not there; say where with --scene")
+        return open_scene(self.dev, self.config, (split,))
+
+    def cameras(self, split: str = "test") -> list[Camera]:
+        """The cameras of a split's views at the resolution of the run."""
+        return [view.camera for view in self.scene(split).splits[split]]
+
+    def render(self, camera: Camera) -> np.ndarray:
+        """(H, W, 3) float32 image in [0, 1] as the camera sees the model."""
+        return self.renderer.render(camera, self.gamma)
+
+
+def load_run(
+    dev: Device,
+    folder: Path | str,
+    *,
+    tolerance: float | None = None,
+    scene: str | None = None,
+) -> Run:
+    """The run in a folder, finished or not.
+
+    tolerance: in place of its network.tolerance; scene: the folder of its scene, if that has moved.
+    Raises UserError naming the file that is missing or broken.
     """
-    checkpoint = folder / CHECKPOINT
-    _check_folder(folder)
-    stored = load_run(checkpoint) if checkpoint.exists() else None
-    if stored and stored[0]["finished"]:
-        print(
-            f"{folder} is finished ({stored[0]['step']} steps); `pp-cl eval {folder} --metrics`"
-            " measures it"
-        )
-        return
-    dev = open_device(device_choice)
-    print(f"device: {dev.name} [{dev.info['platform']}]")
+    folder = RunFolder(folder)
+    config = load_config(folder.config)
+    given = [] if tolerance is None else [("network.tolerance", tolerance, "tolerance")]
+    configure(config, scene or config.scene.path, given)
+    header, arrays = folder.load()
+    adopt_stored(dev, config.network.tolerance)
+    model = Model.load(
+        dev,
+        header,
+        arrays,
+        config.network.widths,
+        config.points.sh_degree,
+        folder.checkpoint,
+    )
+    return Run(dev, folder, config, header, model)
+
+
+# ---- training
+
+
+class HullFacts(NamedTuple):
+    """The initial grid. capped: it has fewer points than asked for, at the most cells that a grid may
+    have. edge: world units, spacing: the same in pixels; seconds it took.
+    """
+
+    points: int
+    capped: bool
+    dims: tuple[int, int, int]
+    edge: float
+    spacing: float
+    depth_range: tuple[float, float]
+    seconds: float
+
+
+@dataclass
+class Training:
+    """A training that is ready to begin or to go on.
+
+    info: what its checkpoints' headers hold beside the model's. plan: of memory_plan. hull:
+    None if it goes on from a checkpoint.
+    """
+
+    folder: RunFolder
+    config: Config
+    trainer: Trainer
+    info: dict[str, Any]
+    plan: Plan
+    hull: HullFacts | None
+
+    def run(self, on_step: Callable[[int, dict | None], None] | None = None) -> float:
+        """Train to the end with log, previews and checkpoints; returns the seconds of training,
+        those before an interruption included.
+
+        on_step(step, row) is called after each step, with its row of the log where it has one.
+        Raises UserError, before anything is written, where the memory is too small.
+        """
+        trainer, settings = self.trainer, self.config.train
+        spare = spare_memory(self.plan, trainer.dev, settings.memory_gib)
+        trainer.renderer.cache.budget = spare
+        self.folder.create(self.config.to_json())
+        with self.folder.open_log(trainer.step) as log:
+            seconds = log.seconds
+            while trainer.step < settings.iterations:
+                start = time.perf_counter()
+                terms = trainer.train_step()
+                seconds += time.perf_counter() - start
+                row = self._after_step(log, terms, seconds)
+                if on_step:
+                    on_step(trainer.step, row)
+            start = time.perf_counter()
+            trainer.finish()
+            seconds += time.perf_counter() - start
+            self._save(finished=True)
+            log.write(self._row(seconds) | {"points": trainer.model.count, "finished": True})
+        return seconds
+
+    def _after_step(self, log, terms, seconds):
+        """Row of the log, checkpoint and preview, where they are due; returns the row or None."""
+        trainer, settings = self.trainer, self.config.train
+        step, last, row = trainer.step, trainer.step == settings.iterations, None
+        if step % settings.log_every == 0 or last:
+            state = {"points": trainer.model.count, "rates": trainer.rates()}
+            row = self._row(seconds) | terms | state
+            log.write(row)
+        if step % settings.checkpoint_every == 0 and not last:
+            self._save(finished=False)
+        if last or (settings.previews and step % -(-settings.iterations // settings.previews) == 0):
+            self._preview()
+        return row
+
+    def _row(self, seconds):
+        return {"step": self.trainer.step, "seconds": round(seconds, 3)}
+
+    def _save(self, finished):
+        trainer = self.trainer
+        header = trainer.model.header() | self.info | {"step": trainer.step, "finished": finished}
+        self.folder.save(header, trainer.model.arrays() if finished else trainer.arrays())
+
+    def _preview(self):
+        """Prediction, truth and error of the first training view."""
+        trainer, view = self.trainer, self.trainer.views[0]
+        path = self.folder.previews / f"step_{trainer.step:06d}.png"
+        write_comparison(path, [trainer.picture(view)], [trainer.truth(view)])
+
+
+def stored_state(folder: RunFolder, config: Config) -> Stored | None:
+    """(header, arrays) of the folder's checkpoint, None where there is none. Raises UserError for a
+    folder or checkpoint that does not fit.
+    """
+    folder.check_usable()
+    stored = folder.load() if folder.checkpoint.exists() else None
+    if folder.config.exists() and (stored is None or stored[0]["finished"]):
+        path = load_config(folder.config).scene.path
+        if path != config.scene.path:
+            _refuse_setting(folder, "scene.path", path, config.scene.path)
+    return stored
+
+
+def open_training(
+    dev: Device, folder: RunFolder, config: Config, stored: Stored | None
+) -> Training:
+    """A training in `folder`, from its checkpoint `stored` where it has one. Nothing is written.
+
+    Raises UserError for a scene or checkpoint that does not fit.
+    """
     tolerance = config.network.tolerance
-    tuning = (
-        adopt_of_run(dev, tolerance, stored[0].get("tuning"), checkpoint)
-        if stored
-        else adopt_stored(dev, tolerance)
-    )
-    scene = open_scene(dev, config, ("train",))
-    trainer, info = (
-        _resume(dev, config, scene, *stored, checkpoint) if stored else _start(dev, config, scene)
-    )
-    info["tuning"] = tuning
+    if stored:
+        tuning = adopt_of_run(dev, tolerance, stored[0].get("tuning"), folder.checkpoint)
+    else:
+        tuning = adopt_stored(dev, tolerance)
+    views = open_scene(dev, config, ("train",)).splits["train"]
+    if stored:
+        trainer, info, hull = _resume(dev, config, views, stored, folder.checkpoint)
+    else:
+        trainer, info, hull = _start(dev, config, views)
     plan = memory_plan(dev, config, trainer.model, trainer.views)
-    print_plan(plan, dev)
-    trainer.renderer.cache.budget = spare_memory(plan, config.train.memory_gib)
-
-    folder.mkdir(parents=True, exist_ok=True)
-    remove_leftovers(folder)
-    write_text(folder / "config.json", config.to_json() + "\n")
-    _optimise(trainer, config, folder, info)
+    return Training(folder, config, trainer, info | {"tuning": tuning}, plan, hull)
 
 
-def _check_folder(folder):
-    if folder.exists() and not folder.is_dir():
-        raise UserError(f"{folder}: is not a folder; choose another --out")
-    if (
-        folder.is_dir()
-        and not (folder / "config.json").exists()
-        and any(p for p in folder.iterdir() if not p.name.startswith("."))
-    ):
-        raise UserError(
-            f"{folder}: holds other files and no config.json; choose an empty or new folder for"
-            " --out"
-        )
-
-
-def _start(dev, config, scene):
-    """(Trainer, info) of a run from its beginning."""
-    views = scene.splits["train"]
+def _start(dev, config, views):
+    """(Trainer, info, HullFacts) of a training from its beginning."""
     start = time.perf_counter()
     hull = build_grid(dev, views, config.points.count)
     near_far = depth_range(views, hull)
-    dims = "x".join(str(d) for d in hull.grid.dims)
-    print(
-        f"hull: {len(hull.ids)} points on a {dims} grid, edge {hull.grid.edge:.6g}"
-        f" ({spacing_pixels(hull, views):.2f} pixels), depth"
-        f" {near_far[0]:.3f} to {near_far[1]:.3f} ({time.perf_counter() - start:.1f} s)"
+    facts = HullFacts(
+        len(hull.ids),
+        hull.capped,
+        hull.grid.dims,
+        hull.grid.edge,
+        spacing_pixels(hull, views),
+        near_far,
+        time.perf_counter() - start,
     )
-    if hull.capped:
-        print(
-            f"hull: only {len(hull.ids)} of the {config.points.count} points asked for, since a"
-            f" finer grid would have more than {CELL_CAP} cells"
-        )
     model = Model.create(
         dev,
         hull.grid,
@@ -147,15 +330,13 @@ def _start(dev, config, scene):
         config.train.seed,
         config.points.sh_degree,
     )
-    return Trainer(dev, config, model, views), {
-        "scene": fingerprint(views),
-        "initial_points": len(hull.ids),
-    }
+    trainer = Trainer(dev, config, model, views)
+    return trainer, {"scene": fingerprint(views), "initial_points": facts.points}, facts
 
 
-def _resume(dev, config, scene, header, arrays, file):
-    """(Trainer, info) of a run that goes on."""
-    views = scene.splits["train"]
+def _resume(dev, config, views, stored, file):
+    """(Trainer, info, None) of a training that goes on."""
+    header, arrays = stored
     if header["scene"] != fingerprint(views):
         raise UserError(
             f"{file}: belongs to another scene than {config.scene.path}; use another --out"
@@ -169,109 +350,33 @@ def _resume(dev, config, scene, header, arrays, file):
             f"{file}: its training state is incomplete ({error}); delete it to train anew, or"
             " restore a copy"
         ) from None
-    print(f"resuming at step {header['step']} with {model.count} points")
-    return trainer, {key: header[key] for key in ("scene", "initial_points")}
+    return trainer, {key: header[key] for key in ("scene", "initial_points")}, None
 
 
-def _optimise(trainer, config, folder, info):
-    """The loop over steps, with its log, previews and checkpoints."""
-    settings = config.train
-    log, seconds = _open_log(folder / "log.jsonl", trainer.step)
-    preview_every = (
-        -(-settings.iterations // settings.previews)
-        if settings.previews
-        else settings.iterations + 1
-    )
-    bar = tqdm(
-        total=settings.iterations,
-        initial=trainer.step,
-        unit="step",
-        mininterval=1 if sys.stderr.isatty() else 30,
-        file=sys.stderr,
-    )
-    with log, bar:
-        while trainer.step < settings.iterations:
-            start = time.perf_counter()
-            terms = trainer.train_step()
-            t = trainer.step
-            last = t == settings.iterations
-            seconds += time.perf_counter() - start
-            bar.update()
-            if t % settings.log_every == 0 or last:
-                _log(
-                    log,
-                    {
-                        "step": t,
-                        "seconds": round(seconds, 3),
-                        **terms,
-                        "points": trainer.model.count,
-                        "rates": trainer.rates(),
-                    },
-                )
-                bar.set_postfix(
-                    psnr=f"{terms['psnr']:.2f}", points=trainer.model.count, refresh=False
-                )
-            if t % settings.checkpoint_every == 0 and not last:
-                _save(trainer, folder, info, finished=False)
-            if t % preview_every == 0 or last:
-                _preview(trainer, folder, f"step_{t:06d}.png")
-        start = time.perf_counter()
-        trainer.finish()
-        seconds += time.perf_counter() - start
-        _save(trainer, folder, info, finished=True)
-        _log(
-            log,
-            {
-                "step": trainer.step,
-                "seconds": round(seconds, 3),
-                "points": trainer.model.count,
-                "finished": True,
-            },
-        )
-    print(
-        f"trained {trainer.step} steps in {seconds:.1f} s; {trainer.model.count} of"
-        f" {info['initial_points']} points remain; wrote {folder / CHECKPOINT}"
-    )
+def train_scene(
+    scene: str,
+    out: Path | str,
+    preset: str | None = None,
+    device: str | None = None,
+    *,
+    settings: dict[str, Any] | None = None,
+    on_step: Callable[[int, dict | None], None] | None = None,
+    **options: Any,
+) -> Run:
+    """Train a scene into the folder `out`, or go on with the run there; a finished one is left
+    alone.
 
-
-def _open_log(path, step):
-    """(file open for appending, training seconds so far): rows after `step` are cut off, they will
-    be made again.
+    scene: a folder, or the word demo. device: as `pp-cl train --device`. settings: {"section.key":
+    value}; options: the same by the short names of config.SHORT, such as iterations. on_step: see
+    Training.run. Raises UserError as `pp-cl train` reports it.
     """
-    rows = []
-    if path.exists():
-        for line in path.read_text().splitlines():
-            try:
-                row = json.loads(line)
-            except ValueError:
-                break  # the line that a kill cut short
-            if row["step"] > step or row.get("finished"):
-                break
-            rows.append(row)
-    write_text(path, "".join(json.dumps(row) + "\n" for row in rows))
-    return open(path, "a"), rows[-1]["seconds"] if rows else 0.0
-
-
-def _log(file, row):
-    try:
-        file.write(json.dumps(row, allow_nan=False) + "\n")
-        file.flush()
-    except OSError as error:
-        raise UserError(
-            f"{file.name}: cannot be written ({error.strerror}); free some space, the same command"
-            " goes on"
-        ) from error
-
-
-def _save(trainer, folder, info, finished):
-    header = trainer.model.header() | info | {"step": trainer.step, "finished": finished}
-    save_checkpoint(
-        folder / CHECKPOINT, header, trainer.model.arrays() if finished else trainer.arrays()
-    )
-
-
-def _preview(trainer, folder, name):
-    """Prediction, truth and error of the first training view."""
-    (folder / "previews").mkdir(exist_ok=True)
-    view = trainer.views[0]
-    write_comparison(folder / "previews" / name, [trainer.picture(view)], [trainer.truth(view)])
+    unknown = set(options) - set(SHORT)
+    if unknown:
+        raise TypeError(f"train_scene() has no {min(unknown)}; it has {', '.join(SHORT)}, settings")
+    settings = {SHORT[name]: value for name, value in options.items()} | (settings or {})
+    folder = RunFolder(out)
+    config = run_config(folder, str(scene), preset, [(*s, "settings") for s in settings.items()])
+    stored, dev = stored_state(folder, config), open_device(device)
+    if not (stored and stored[0]["finished"]):
+        open_training(dev, folder, config, stored).run(on_step)
+    return load_run(dev, out)

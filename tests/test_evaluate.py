@@ -11,6 +11,7 @@ from support.scenes import write_ball_scene
 from pp_cl.cli import main
 from pp_cl.config import Config
 from pp_cl.errors import UserError
+from pp_cl.evaluate import image_files
 from pp_cl.files.image import read_rgba
 from pp_cl.metrics.psnr_ssim import psnr
 from pp_cl.run import open_scene
@@ -104,8 +105,74 @@ def test_twice_gives_the_same_numbers_and_other_splits_work(run):
         assert main(["eval", str(run)]) == 0
         results.append(json.loads((run / "eval" / "metrics.json").read_text())["per_image"])
     assert results[0] == results[1]
-    assert main(["eval", str(run), "--split", "train"]) == 0
-    assert len(json.loads((run / "eval" / "metrics.json").read_text())["per_image"]) == 8
+    assert main(["eval", str(run), "--split", "train", "--save-images"]) == 0
+    assert len(json.loads((run / "eval" / "train" / "metrics.json").read_text())["per_image"]) == 8
+    assert len(list((run / "eval" / "train" / "images").iterdir())) == 8
+    assert json.loads((run / "eval" / "metrics.json").read_text())["per_image"] == results[0]
+
+
+def test_images_of_an_earlier_evaluation_are_removed(run):
+    stale = run / "eval" / "images" / "cam0" / "r_7.png"
+    stale.parent.mkdir(parents=True, exist_ok=True)
+    stale.write_bytes(b"")
+    assert main(["eval", str(run), "--save-images"]) == 0
+    assert [p.name for p in sorted((run / "eval" / "images").rglob("*"))] == ["r_0.png", "r_1.png"]
+
+
+@pytest.mark.parametrize(
+    "names, files",
+    [
+        (["test/r_0.png", "test/r_1.png"], ["r_0.png", "r_1.png"]),
+        (["cam0/0001.png", "cam1/0001.jpg"], ["cam0/0001.png", "cam1/0001.png"]),
+        (["images/a/1.png", "images/b/1.png"], ["a/1.png", "b/1.png"]),
+        (["test/1.png", "2.png"], ["test/1.png", "2.png"]),
+        (["test/1.png", "test/1.jpg"], ["1.png.png", "1.jpg.png"]),
+        (["r_0.png"], ["r_0.png"]),
+    ],
+)
+def test_every_image_has_a_file_of_its_own(names, files):
+    assert [str(path) for path in image_files(names)] == files
+
+
+def test_views_of_one_name_in_two_folders_are_both_saved(run, tmp_path):
+    """The scene lies elsewhere by now, and its test views in two folders."""
+    copy = tmp_path / "run"
+    shutil.copytree(run, copy)
+    assert main(["eval", str(copy), "--save-images"]) == 0
+    before = json.loads((copy / "eval" / "metrics.json").read_text())
+    moved = move_scene(copy, tmp_path / "moved")
+    content = json.loads((moved / "transforms_test.json").read_text())
+    for i, frame in enumerate(content["frames"]):
+        (moved / f"cam{i}").mkdir()
+        (moved / "test" / f"r_{i}.png").rename(moved / f"cam{i}" / "0001.png")
+        frame["file_path"] = f"./cam{i}/0001"
+    (moved / "transforms_test.json").write_text(json.dumps(content))
+    images = {i: (copy / "eval" / "images" / f"r_{i}.png").read_bytes() for i in range(2)}
+    assert main(["eval", str(copy), "--save-images", "--scene", str(moved)]) == 0
+    for i, image in images.items():
+        assert (copy / "eval" / "images" / f"cam{i}" / "0001.png").read_bytes() == image
+    assert json.loads((copy / "eval" / "metrics.json").read_text())["mean"] == before["mean"]
+
+
+def move_scene(run, to):
+    """Copy the run's scene to a new place and forget the old one."""
+    config = json.loads((run / "config.json").read_text())
+    shutil.copytree(config["scene"]["path"], to)
+    config["scene"]["path"] = str(to.parent / "gone")
+    (run / "config.json").write_text(json.dumps(config))
+    return to
+
+
+def test_a_scene_that_has_moved_is_one_line_and_may_be_named(run, tmp_path, capsys):
+    copy = tmp_path / "run"
+    shutil.copytree(run, copy)
+    moved = move_scene(copy, tmp_path / "moved")
+    assert main(["eval", str(copy)]) == 2
+    error = capsys.readouterr().err
+    assert str(tmp_path / "gone") in error and "--scene" in error and error.count("\n") == 1
+    assert main(["eval", str(copy), "--scene", str(moved)]) == 0
+    assert main(["eval", str(copy), "--scene", str(tmp_path / "other")]) == 2
+    assert str(tmp_path / "other") in capsys.readouterr().err
 
 
 def test_a_missing_split_is_one_line(run, capsys):

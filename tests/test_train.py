@@ -5,12 +5,13 @@ not.
 import json
 import os
 import re
+import resource
+import shutil
 import signal
 import subprocess
 import sys
 import time
 from pathlib import Path
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -18,7 +19,6 @@ from support.runs import arguments, train_and_interrupt
 from support.scenes import write_ball_scene
 
 from pp_cl.cli import main
-from pp_cl.errors import UserError
 from pp_cl.files.checkpoint import load_checkpoint, save_checkpoint
 from pp_cl.train import Trainer, _draw_start
 from pp_cl.training.optimiser import Optimiser
@@ -202,6 +202,34 @@ def test_a_checkpoint_of_another_scene_is_refused(scene, tmp_path, capsys):
     assert (out / "checkpoint.npz").read_bytes() == before
 
 
+def test_a_scene_that_has_moved_is_known_by_its_views(scene, finished, tmp_path, monkeypatch):
+    train_and_interrupt(scene, tmp_path / "run", 25, monkeypatch)
+    shutil.copytree(scene, tmp_path / "moved")
+    assert main(arguments(str(tmp_path / "moved"), tmp_path / "run")) == 0
+    assert (tmp_path / "run" / "checkpoint.npz").read_bytes() == (
+        finished / "checkpoint.npz"
+    ).read_bytes()
+    config = json.loads((tmp_path / "run" / "config.json").read_text())
+    assert config["scene"]["path"] == str(tmp_path / "moved")
+
+
+@pytest.mark.parametrize("steps", [25, 5, 60])
+def test_another_scene_is_refused_at_any_state_of_the_run(
+    scene, tmp_path, capsys, monkeypatch, steps
+):
+    """With a checkpoint, before the first, and when the run is finished."""
+    out, other = tmp_path / "run", write_ball_scene(tmp_path / "other", views=7)
+    if steps == 60:
+        assert main(arguments(scene, out)) == 0
+    else:
+        train_and_interrupt(scene, out, steps, monkeypatch)
+    before = {p.name: p.read_bytes() for p in out.iterdir() if p.is_file()}
+    assert main(arguments(other, out)) == 2
+    error = capsys.readouterr().err.splitlines()[-1]
+    assert ("belongs to another scene" if steps == 25 else "scene.path is ") in error
+    assert {p.name: p.read_bytes() for p in out.iterdir() if p.is_file()} == before
+
+
 @pytest.mark.parametrize(
     "lost", ["moment.m.enc0.a.weight", "state.v.sh1", "state.last", "state.weight"]
 )
@@ -223,13 +251,33 @@ def test_a_checkpoint_without_its_training_state_is_refused(
     assert "header lacks scene" in capsys.readouterr().err
 
 
-def test_a_full_disk_while_logging_is_one_line(scene, tmp_path, capsys, monkeypatch):
-    def full(_file, _row):
-        raise UserError("log.jsonl: cannot be written (No space left on device); free some space")
+def test_a_full_disk_while_logging_is_one_line_and_the_run_goes_on(
+    scene, finished, tmp_path, capsys, monkeypatch
+):
+    """No file may grow from the log's present size on, once all kernels are built."""
+    train_step, limits = Trainer.train_step, resource.getrlimit(resource.RLIMIT_FSIZE)
 
-    monkeypatch.setattr("pp_cl.run._log", full)
-    assert main(arguments(scene, tmp_path / "run")) == 2
-    assert "No space left" in capsys.readouterr().err
+    def step_with_a_full_disk(self):
+        terms = train_step(self)
+        if self.step == 14:
+            size = (tmp_path / "run" / "log.jsonl").stat().st_size
+            resource.setrlimit(resource.RLIMIT_FSIZE, (size + 10, limits[1]))
+        return terms
+
+    monkeypatch.setattr(Trainer, "train_step", step_with_a_full_disk)
+    try:
+        status = main(arguments(scene, tmp_path / "run"))
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+        monkeypatch.undo()
+    error = capsys.readouterr().err.splitlines()[-1]
+    assert status == 2 and "log.jsonl: cannot be written (File too large)" in error
+    assert load_checkpoint(tmp_path / "run" / "checkpoint.npz")[0]["step"] == 10
+    assert main(arguments(scene, tmp_path / "run")) == 0
+    resumed, whole = (out / "checkpoint.npz" for out in (tmp_path / "run", finished))
+    assert resumed.read_bytes() == whole.read_bytes()
+    steps, expected = ([row["step"] for row in rows(out)] for out in (tmp_path / "run", finished))
+    assert steps == expected
 
 
 def test_a_loss_that_is_not_finite_stops_the_run_and_keeps_the_checkpoint(
@@ -250,14 +298,14 @@ def test_a_loss_that_is_not_finite_stops_the_run_and_keeps_the_checkpoint(
 
 
 def test_a_training_that_keeps_its_hits_ends_with_the_same_bytes(scene, tmp_path, monkeypatch):
-    """Of whole images without phases; also where there is room for some views only, and over
+    """Of whole images without pixel jitter; also where there is room for some views only, and over
     prunings.
     """
     whole = {"train__crop": 0, "train__pixel_jitter": "false", "train__dropout": 0}
     whole |= {"train__iterations": 40, "train__prune_every": 15}
     results, caches = [], []
     for budget in (0, 300_000, 10**9):
-        monkeypatch.setattr("pp_cl.run.spare_memory", lambda plan, limit, budget=budget: budget)
+        monkeypatch.setattr("pp_cl.run.spare_memory", lambda *_, budget=budget: budget)
         monkeypatch.setattr("pp_cl.train.Trainer.finish", _noting(caches, Trainer.finish))
         out = tmp_path / str(budget)
         assert main(arguments(scene, out, **whole)) == 0
@@ -279,20 +327,25 @@ def _noting(caches, finish):
 
 
 @pytest.mark.parametrize(
-    "changes, stay",
+    "changes, words, cached",
     [
-        ({}, True),
-        ({"crop": 64}, False),
-        ({"dropout": 0.1}, False),
-        ({"pixel_jitter": True}, False),
+        ({}, (), True),
+        ({"train__crop": 24}, (), False),
+        ({"train__dropout": 0.1}, (), False),
+        ({"train__pixel_jitter": "true"}, (), False),
+        ({"train__pixel_jitter": "true"}, ("--downscale", "1"), True),
     ],
 )
-def test_views_stay_only_where_nothing_is_drawn(changes, stay):
-    settings = {"crop": 0, "dropout": 0.0, "pixel_jitter": False} | changes
-    trainer = SimpleNamespace(
-        config=SimpleNamespace(**settings), views=[SimpleNamespace(downscale=2)]
-    )
-    assert Trainer.views_stay(trainer) == stay
+def test_hits_are_cached_only_of_views_that_repeat(
+    scene, tmp_path, monkeypatch, changes, words, cached
+):
+    whole = {"train__crop": 0, "train__pixel_jitter": "false", "train__dropout": 0} | changes
+    caches = []
+    monkeypatch.setattr("pp_cl.run.spare_memory", lambda *_: 10**9)
+    monkeypatch.setattr("pp_cl.train.Trainer.finish", _noting(caches, Trainer.finish))
+    settings = arguments(scene, tmp_path / "run", train__iterations=6, **whole)
+    assert main([*settings, *words]) == 0
+    assert (caches[0][0] > 0) == cached
 
 
 def test_a_capped_grid_is_told(scene, tmp_path, capsys, monkeypatch):

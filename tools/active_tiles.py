@@ -15,14 +15,13 @@ from pathlib import Path
 import numpy as np
 
 from pp_cl.bench import network as bench
-from pp_cl.config import load_config
+from pp_cl.commands.options import read_shape
 from pp_cl.device.discover import open_device
 from pp_cl.errors import UserError
 from pp_cl.files.atomic import write_json
-from pp_cl.model import Model
 from pp_cl.raster.blend import BACKGROUND
 from pp_cl.render import Renderer
-from pp_cl.run import CHECKPOINT, load_run, open_scene
+from pp_cl.run import load_run
 from pp_cl.scene.target import Target
 from pp_cl.training.loss import Loss
 
@@ -32,26 +31,24 @@ class Comparison:
 
     def __init__(self, dev, folder, split, downscale, widths):
         self.dev = dev
-        self.config = load_config(folder / "config.json")
-        header, arrays = load_run(folder / CHECKPOINT)
-        widths, degree = self.config.network.widths, self.config.points.sh_degree
-        model = Model.load(dev, header, arrays, widths, degree, folder / CHECKPOINT)
-        scene = open_scene(dev, self.config, (split,))
+        run = load_run(dev, folder)
+        scene = run.scene(split)
+        self.config = run.config
         self.views = (scene.reduced(downscale) if downscale else scene).splits[split]
-        self.net = bench.make_network(dev, widths, "auto") if widths else model.net
-        self.renderer = Renderer(dev, model, self.config.raster)
+        self.net = bench.make_network(dev, widths, "auto") if widths else run.model.net
+        self.renderer = Renderer(dev, run.model, self.config.raster)
         self.target = Target(dev)
         self.loss = Loss(dev, self.config.train.ssim_weight)
 
     def row(self, view, runs):
         """{"view", "size", "share", times in ms, ratios, largest differences} of one view."""
         camera = view.camera
-        self.renderer.forward(camera, self.config.raster.gamma[1])
-        x = self.renderer.features
+        rendered = self.renderer.rasterise(camera, self.config.raster.gamma[1])
+        x = rendered.features
         self.target.load(view)
         target = self.target.crop((0, 0, camera.width, camera.height))
         grad = self.loss.forward_backward(
-            self.net.forward(x, False, BACKGROUND), target, *self.renderer.offset
+            self.net.forward(x, False, BACKGROUND), target, *rendered.offset
         )
 
         results = [self._results(x, grad, background) for background in (None, BACKGROUND)]
@@ -126,7 +123,7 @@ def main(argv=None):
     try:
         if min(options.views, options.runs, options.downscale or 1) < 1:
             raise UserError("--views, --runs, --downscale: must be at least 1")
-        widths = bench.read_shape("4", options.widths)[1] if options.widths else None
+        widths = read_shape("4", options.widths)[1] if options.widths else None
         dev = open_device(options.device)
         comparison = Comparison(dev, Path(options.run), options.split, options.downscale, widths)
         number = min(options.views, len(comparison.views))

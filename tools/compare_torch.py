@@ -12,6 +12,7 @@ import sys
 import numpy as np
 
 from pp_cl.bench import network as bench
+from pp_cl.commands.options import read_shape
 from pp_cl.device.discover import open_device
 from pp_cl.errors import UserError
 from pp_cl.files.atomic import write_json
@@ -164,7 +165,7 @@ def main(argv=None):
     parser.add_argument("--json", metavar="FILE", help="also write the result there")
     options = parser.parse_args(argv)
     try:
-        size, widths = bench.read_shape(options.size, options.widths)
+        size, widths = read_shape(options.size, options.widths)
         if min(options.threads, options.runs) < 1:
             raise UserError("--threads, --runs: must be at least 1")
         torch = _import_torch()

@@ -282,25 +282,13 @@ def line(row):
 BENCHES = {"conv": bench_conv, "unet": bench_unet}
 
 
-def read_shape(size, widths):
-    """(int, three ints) of the texts of --size and --widths; UserError for what the network cannot
-    have.
+def run_bench(what, size, widths, tolerance=1e-5, *, json_file=None, plot_file=None, device=None):
+    """Measure, print the table, write the files asked for. what: a key of BENCHES; size: side of
+    the image in pixels, a multiple of 4; widths: channels of the three levels; tolerance: relative
+    L2 error allowed for a convolution of the variant auto.
+
+    Raises UserError, before anything is measured, for files that cannot be written.
     """
-    if not size.isdecimal() or int(size) % 4 or int(size) == 0:
-        raise UserError(f"--size {size}: the network takes multiples of 4")
-    numbers = [int(n) for n in widths.split(",") if n.isdecimal()]
-    if len(numbers) != 3 or widths.count(",") != 2 or min(numbers) < 1:
-        raise UserError(f"--widths {widths}: write three numbers of channels, as 128,256,512")
-    return int(size), tuple(numbers)
-
-
-def run_bench(what, size, widths, json_file=None, plot_file=None, device=None, tolerance=1e-5):
-    """Measure, print the table, write the files asked for. what: a key of BENCHES; size, widths: as
-    read_shape(); tolerance: of the variant auto.
-
-    Raises UserError, before anything is measured, also for files that cannot be written.
-    """
-    size, widths = read_shape(size, widths)
     figure = check_files(json_file, plot_file)
     dev = open_device(device)
     print(f"{dev.name} [{dev.info['platform']}]")

@@ -13,27 +13,14 @@ Times are wall clock until the stage's work is done, in turn: all stages of all 
 cl/bench/peak.cl once a round.
 """
 
-import math
 from collections import defaultdict
 from collections.abc import Iterator
 
 import numpy as np
 
-from pp_cl.bench.network import check_files, interleave, save_figure
+from pp_cl.bench.network import interleave
 from pp_cl.bench.peak import Copy
 from pp_cl.bench.raster_scenes import SCENES
-from pp_cl.device.discover import open_device
-from pp_cl.errors import UserError
-from pp_cl.files.atomic import write_json
-
-# Texts of the options; gamma: the last of a training, the sharpest.
-DEFAULTS = {
-    "scene": "grid",
-    "points": "10000,63000,250000,1000000,4000000",
-    "size": "200,400,800",
-    "tau": "0,1e-4,1e-3,1e-2",
-    "gamma": "0.01",
-}
 
 
 def bench_raster(
@@ -122,7 +109,7 @@ HEAD = COLUMNS(
 )
 
 
-def line(row):
+def line(row: dict) -> str:
     """One line of the printed table; times in milliseconds."""
     stages = ", ".join(f"{name} {ms:.2f}" for name, ms in row["stages_ms"].items())
     return COLUMNS(
@@ -141,7 +128,7 @@ def line(row):
     )
 
 
-def growth(rows):
+def growth(rows: list[dict]) -> list[dict]:
     """[{"size", "tau", "exponent", "steepest"}]: time ~ points^exponent, fitted over all, and
     between two neighbours.
     """
@@ -165,64 +152,8 @@ def growth(rows):
     return found
 
 
-def read_numbers(option, text, kind, least, most):
-    """Numbers of a comma-separated option, ascending, each once. Raises UserError naming the
-    option.
-    """
-    try:
-        numbers = sorted({kind(float(word)) for word in text.split(",")})
-    except (ValueError, OverflowError):
-        numbers = []
-    if not numbers or not all(math.isfinite(x) and least <= x <= most for x in numbers):
-        raise UserError(
-            f"{option} {text}: write numbers from {least:g} to {most:g}, separated by commas"
-        )
-    return numbers
-
-
-def run_raster(scene, points, size, tau, gamma, json_file=None, plot_file=None, device=None):
-    """Measure, print the table, write the files asked for. points, size, tau, gamma: the options'
-    texts, see DEFAULTS.
-
-    Raises UserError, before anything is measured, for options that make no sense and files that
-    cannot be written.
-    """
-    points = read_numbers("--points", points, int, 8, 2**27)
-    sizes = read_numbers("--size", size, int, 4, 4096)
-    if any(side % 4 for side in sizes):
-        raise UserError(f"--size {size}: write multiples of 4")
-    taus = read_numbers("--tau", tau, float, 0, 0.5)
-    gamma = read_numbers("--gamma", gamma, float, 1e-5, 1)
-    if len(gamma) > 1:
-        raise UserError("--gamma: write one number")
-    figure = check_files(json_file, plot_file)
-    dev = open_device(device)
-    print(f"{dev.name} [{dev.info['platform']}]\n{HEAD}")
-    rows = []
-    for row in bench_raster(dev, scene, points, sizes, taus, gamma[0]):
-        rows.append(row)
-        print(line(row), flush=True)
-    fitted = growth(rows)
-    for fit in fitted:
-        print(
-            f"side {fit['size']}, tau {fit['tau']:g}: time grows as points^{fit['exponent']:.2f},"
-            f" at most ^{fit['steepest']:.2f} from one number to the next"
-        )
-    if json_file:
-        result = {
-            "device": dev.name,
-            "platform": dev.info["platform"],
-            "rows": rows,
-            "growth": fitted,
-        }
-        write_json(json_file, result)
-    if figure:
-        _plot(figure, f"raster, {scene}, gamma {gamma[0]:g}, {dev.name}", rows)
-        save_figure(figure, plot_file)
-
-
-def _plot(figure, title, rows):
-    """Time against the number of points, and the errors against tau."""
+def plot(figure, title: str, rows: list[dict]) -> None:
+    """Draw time against the number of points, and the errors against tau. figure: matplotlib's."""
     figure.suptitle(title, fontsize="medium")
     time, error = figure.subplots(1, 2)
     time.set(

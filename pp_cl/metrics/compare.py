@@ -1,7 +1,11 @@
-"""`pp-cl compare`: metrics of an image, or of a folder of images, against the truth."""
+"""Metrics of an image, or of a folder of images, against the truth."""
 
 from pathlib import Path
+from typing import Any
 
+import numpy as np
+
+from pp_cl.device.device import Device
 from pp_cl.errors import UserError
 from pp_cl.files.image import read_rgba
 from pp_cl.metrics.psnr_ssim import Metrics, mean
@@ -9,16 +13,21 @@ from pp_cl.metrics.psnr_ssim import Metrics, mean
 SUFFIXES = (".png", ".jpg", ".jpeg")
 
 
-def compare(dev_factory, prediction, truth, metrics):
+def compare(
+    prediction: Path | str,
+    truth: Path | str,
+    metrics: tuple[str, ...] = ("psnr", "ssim"),
+    dev: Device | None = None,
+) -> dict[str, Any]:
     """Metrics of two images, or of two folders that hold images of the same names.
 
-    dev_factory: called without arguments for a Device, only if `metrics` names lpips. Transparent
-    images are composited over white. Returns {"mean": {metric: number}, "per_image": [{"name",
-    metric: number, ...}]}. Raises UserError naming a file that is missing, unreadable, without
-    partner or of another size than its partner.
+    metrics: names out of psnr, ssim, lpips; dev: only lpips needs one. Transparent images are
+    composited over white. Returns {"mean": {metric: number}, "per_image": [{"name", metric: number,
+    ...}]}. Raises UserError naming a file that is missing, unreadable, without partner or of
+    another size than its partner.
     """
     pairs = _pairs(Path(prediction), Path(truth))
-    measure = Metrics(dev_factory() if "lpips" in metrics else None, metrics)
+    measure = Metrics(dev, metrics)
     rows = [{"name": a.name, **_measure(measure, a, b)} for a, b in pairs]
     return {"mean": mean(rows), "per_image": rows}
 
@@ -58,7 +67,7 @@ def _measure(measure, prediction, truth):
         raise UserError(f"{prediction}: {error}") from None
 
 
-def read_over_white(path):
+def read_over_white(path: Path | str) -> np.ndarray:
     """Float64 (H, W, 3) image in [0, 1] of a file, composited over white. Raises UserError naming
     the file.
     """

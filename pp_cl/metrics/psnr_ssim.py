@@ -3,6 +3,7 @@
 import numpy as np
 from skimage.metrics import structural_similarity
 
+from pp_cl.device.device import Device
 from pp_cl.errors import UserError
 from pp_cl.files.image import to_8bit
 from pp_cl.metrics.lpips import Lpips
@@ -11,7 +12,7 @@ PSNR_CAP = 100.0  # dB of identical images: JSON has no infinity
 SSIM_WINDOW = 11  # pixels
 
 
-def psnr(a, b):
+def psnr(a: np.ndarray, b: np.ndarray) -> float:
     """-10 log10 of the mean squared error over all values of two uint8 images, in dB, at most
     PSNR_CAP.
     """
@@ -19,7 +20,7 @@ def psnr(a, b):
     return float(min(PSNR_CAP, -10 * np.log10(max(mse, 1e-30))))
 
 
-def ssim(a, b):
+def ssim(a: np.ndarray, b: np.ndarray) -> float:
     """Structural similarity (Wang et al. 2004) of two uint8 (H, W, 3) images.
 
     Gaussian window 11x11 of sigma 1.5, population variances; mean over the channels and the pixels
@@ -45,16 +46,13 @@ def ssim(a, b):
 
 
 class Metrics:
-    """The named metrics of image pairs. dev: a Device; only lpips needs one."""
+    """The named metrics of image pairs. names: out of psnr, ssim, lpips; only lpips needs dev."""
 
-    def __init__(self, dev, names=("psnr", "ssim", "lpips")):
-        self.functions = {"psnr": psnr, "ssim": ssim}
-        if "lpips" in names:
-            distance = Lpips(dev).distance
-            self.functions["lpips"] = lambda a, b: distance(a / 255.0, b / 255.0)
+    def __init__(self, dev: Device | None, names: tuple[str, ...]) -> None:
         self.names = names
+        self._lpips = Lpips(dev) if "lpips" in names else None
 
-    def __call__(self, prediction, truth):
+    def __call__(self, prediction: np.ndarray, truth: np.ndarray) -> dict[str, float]:
         """{name: number} of two float (H, W, 3) images in [0, 1], both rounded to 8 bits first.
 
         Raises ValueError if the shapes differ, UserError if they are too small for a metric.
@@ -62,10 +60,14 @@ class Metrics:
         if prediction.shape != truth.shape:
             raise ValueError(f"prediction {prediction.shape}, truth {truth.shape}")
         a, b = to_8bit(prediction), to_8bit(truth)
-        return {name: self.functions[name](a, b) for name in self.names}
+        functions = {"psnr": psnr, "ssim": ssim, "lpips": self._distance}
+        return {name: functions[name](a, b) for name in self.names}
+
+    def _distance(self, a, b):
+        return self._lpips.distance(a / 255.0, b / 255.0)
 
 
-def mean(rows):
+def mean(rows: list[dict]) -> dict[str, float]:
     """{name: mean over the rows} of dicts of numbers with the same keys; the key "name" is left
     out.
     """

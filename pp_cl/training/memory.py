@@ -2,6 +2,7 @@
 
 import math
 
+from pp_cl.device.device import Device
 from pp_cl.errors import UserError
 from pp_cl.raster.sh import sh_blocks
 from pp_cl.render import NETWORK_MULTIPLE
@@ -9,6 +10,8 @@ from pp_cl.training.prune import SCRATCH_BYTES
 from pp_cl.training.smooth import CHUNK
 
 MIB, GIB = 2**20, 2**30
+
+Plan = list[tuple[str, str, int]]  # what the buffers are for, their shapes as text, bytes
 # two keys of 8, pixel, closeness, point and two weights of 4 bytes, a quarter of spare room
 PAIR_BYTES = 45
 
@@ -86,31 +89,27 @@ def _pixels_per_point(config, model, camera):
     return math.pi * radius**2
 
 
-def print_plan(rows, dev):
-    """Print the table against the device's limits. Raises UserError naming the knobs when it does
-    not fit.
+def plan_lines(plan: Plan, dev: Device) -> list[str]:
+    """The plan as text, against the device's limits."""
+    rows = [*plan, ("total", "", sum(size for _, _, size in plan))]
+    return [
+        f"memory plan ({dev.name}: {dev.info['memory_bytes'] / MIB:.0f} MiB, at most"
+        f" {dev.info['max_allocation_bytes'] / MIB:.0f} at once)",
+        *(f"  {what:36s} {shape:28s} {size / MIB:9.1f} MiB" for what, shape, size in rows),
+    ]
+
+
+def spare_memory(plan: Plan, dev: Device, limit: float) -> int:
+    """Bytes that a plan leaves of `limit` GiB; 0 without a limit. Raises UserError naming the
+    settings where it takes more than the limit, or than the device has.
     """
-    total = sum(size for _, _, size in rows)
-    print(
-        f"memory plan ({dev.name}: {dev.info['memory_bytes'] / MIB:.0f} MiB, "
-        f"at most {dev.info['max_allocation_bytes'] / MIB:.0f} at once)"
-    )
-    for what, shape, size in rows:
-        print(f"  {what:36s} {shape:28s} {size / MIB:9.1f} MiB")
-    print(f"  {'total':36s} {'':28s} {total / MIB:9.1f} MiB")
-    if total > dev.info["memory_bytes"]:
+    needed, available = sum(size for _, _, size in plan), dev.info["memory_bytes"]
+    if needed > available:
         raise UserError(
-            f"the training needs {total / MIB:.0f} MiB, {dev.name} has"
-            f" {dev.info['memory_bytes'] / MIB:.0f}: lower --points, raise --downscale, or set"
-            " train.moments_16bit, train.crop or smaller network.widths"
+            f"the training needs {needed / MIB:.0f} MiB, {dev.name} has {available / MIB:.0f}:"
+            " lower --points, raise --downscale, or set train.moments_16bit, train.crop or smaller"
+            " network.widths"
         )
-
-
-def spare_memory(plan, limit):
-    """Bytes that a plan, rows (what, shape, bytes), leaves of `limit` GiB; 0 without a limit.
-    Raises UserError below 0.
-    """
-    needed = sum(size for _, _, size in plan)
     if limit and limit * GIB < needed:
         raise UserError(
             f"--memory {limit:g}: the training needs {needed / GIB:.2f} GiB; raise it, lower"

@@ -153,7 +153,7 @@ def test_bad_input_is_one_line(words, named, capsys):
 def test_a_plot_needs_matplotlib_and_a_known_suffix(tmp_path, monkeypatch):
     with pytest.raises(UserError, match="png"):
         pytest.importorskip("matplotlib", reason="the plot needs the extra `plot`")
-        run_bench("conv", "8", "16,16,16", plot_file=tmp_path / "b.xyz")
+        run_bench("conv", 8, (16, 16, 16), plot_file=tmp_path / "b.xyz")
     monkeypatch.setitem(sys.modules, "matplotlib.figure", None)
     with pytest.raises(UserError, match="pp-cl\\[plot\\]"):
-        run_bench("conv", "8", "16,16,16", plot_file=tmp_path / "b.png")
+        run_bench("conv", 8, (16, 16, 16), plot_file=tmp_path / "b.png")

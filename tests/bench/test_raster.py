@@ -11,10 +11,9 @@ from oracle import raster as oracle_raster
 
 from pp_cl.bench import network as bench
 from pp_cl.bench import peak
-from pp_cl.bench.raster import bench_raster, growth, read_numbers
+from pp_cl.bench.raster import bench_raster, growth
 from pp_cl.bench.raster_scenes import SCENES
 from pp_cl.cli import main
-from pp_cl.errors import UserError
 from pp_cl.reference.raster import PixelReference
 
 SMALL = ("--points", "60,500", "--size", "12,20", "--tau", "0,1e-2")
@@ -175,9 +174,3 @@ def test_bad_input_is_one_line(words, named, capsys):
 def test_the_other_benches_take_none_of_its_options(option, capsys):
     assert main(["bench", "conv", option, "1"]) == 2
     assert option in capsys.readouterr().err
-
-
-def test_numbers_are_read_ascending():
-    assert read_numbers("--points", "1e3,10,10", int, 1, 10**6) == [10, 1000]
-    with pytest.raises(UserError):
-        read_numbers("--points", "", int, 1, 10**6)

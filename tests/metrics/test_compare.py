@@ -5,14 +5,8 @@ import pytest
 
 from pp_cl.errors import UserError
 from pp_cl.files.image import write_png
-from pp_cl.metrics import compare as compare_module
 from pp_cl.metrics.compare import compare, read_over_white
 from pp_cl.metrics.psnr_ssim import Metrics, mean
-
-
-def no_device():
-    """A device that nobody may ask for."""
-    pytest.fail("a device was opened")
 
 
 @pytest.fixture
@@ -28,35 +22,18 @@ def folders(rng, tmp_path):
 
 def test_two_images(folders):
     pred, truth = folders[0] / "a.png", folders[1] / "b.png"
-    result = compare(no_device, pred, truth, ("psnr", "ssim"))
+    result = compare(pred, truth, ("psnr", "ssim"))
     expected = Metrics(None, ("psnr", "ssim"))(read_over_white(pred), read_over_white(truth))
     assert result == {"mean": expected, "per_image": [{"name": "a.png", **expected}]}
 
 
 def test_two_folders_by_name(folders):
     pred, truth = folders
-    result = compare(no_device, str(pred), str(truth), ("psnr",))
+    result = compare(str(pred), str(truth), ("psnr",))
     assert [row["name"] for row in result["per_image"]] == ["a.png", "b.png"]
     for row in result["per_image"]:
-        assert (
-            row
-            == compare(no_device, pred / row["name"], truth / row["name"], ("psnr",))["per_image"][
-                0
-            ]
-        )
+        assert row == compare(pred / row["name"], truth / row["name"], ("psnr",))["per_image"][0]
     assert result["mean"] == mean(result["per_image"])
-
-
-def test_a_device_is_opened_for_lpips_alone(folders, monkeypatch):
-    asked = []
-
-    def metrics(dev, names):
-        asked.append((dev, names))
-        return lambda a, b: {"lpips": 0.5}
-
-    monkeypatch.setattr(compare_module, "Metrics", metrics)
-    assert compare(lambda: "device", *folders, ("lpips",))["mean"] == {"lpips": 0.5}
-    assert asked == [("device", ("lpips",))]
 
 
 def test_transparent_images_lie_over_white(tmp_path):
@@ -71,7 +48,7 @@ def test_bad_input_names_the_file(folders, tmp_path):
 
     def refuse(a, b, match, metrics=("psnr", "ssim")):
         with pytest.raises(UserError, match=match):
-            compare(no_device, a, b, metrics)
+            compare(a, b, metrics)
 
     refuse(pred, truth / "a.png", "truth/a.png: not a folder")
     refuse(pred / "a.png", truth, "pred/a.png: not a folder")

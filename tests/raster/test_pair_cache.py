@@ -97,8 +97,8 @@ def test_pictures_and_gradients_are_the_same_bits(dev, rng, footprint, tau):
     assert len(kept.cache) == 3 and len(anew.cache) == 0
 
 
-def test_what_a_plan_leaves():
+def test_what_a_plan_leaves(dev):
     plan = [("a", "", 2**30), ("b", "", 2**29)]
-    assert spare_memory(plan, 0) == 0 and spare_memory(plan, 2) == 2**29
+    assert spare_memory(plan, dev, 0) == 0 and spare_memory(plan, dev, 2) == 2**29
     with pytest.raises(UserError, match="--memory 1: .* 1.50 GiB"):
-        spare_memory(plan, 1)
+        spare_memory(plan, dev, 1)

@@ -10,7 +10,7 @@ from pp_cl.model import Model
 from pp_cl.run import open_scene
 from pp_cl.scene.grid import Grid
 from pp_cl.train import Trainer
-from pp_cl.training.memory import memory_plan, point_bytes, print_plan
+from pp_cl.training.memory import memory_plan, plan_lines, point_bytes, spare_memory
 
 PAPER_POINTS = 4_040_533  # lego, supplemental Table 4
 WAYS = [
@@ -83,8 +83,10 @@ def test_the_papers_scale_fits_nine_gibibytes(lazy):
     assert single - PAPER_POINTS * sum(point_bytes(train, 2).values()) == PAPER_POINTS * 576
 
 
-def test_a_plan_over_the_memory_names_the_knobs(dev, capsys):
-    print_plan([("points", "(3) x 4", dev.info["memory_bytes"])], dev)
-    assert "total" in capsys.readouterr().out
+def test_a_plan_over_the_memory_names_the_knobs(dev):
+    rows = [("points", "(3) x 4", dev.info["memory_bytes"])]
+    assert spare_memory(rows, dev, 0) == 0
+    table = plan_lines(rows, dev)
+    assert len(table) == 3 and "points" in table[1] and "total" in table[2]
     with pytest.raises(UserError, match="lower --points, .* train.moments_16bit"):
-        print_plan([("points", "(3) x 4", dev.info["memory_bytes"] + 1)], dev)
+        spare_memory([("points", "(3) x 4", dev.info["memory_bytes"] + 1)], dev, 0)

@@ -1,0 +1,171 @@
+"""The command pp-cl bench."""
+
+import argparse
+
+from pp_cl.commands import options as shared
+from pp_cl.config import preset
+from pp_cl.errors import UserError
+
+HELP = "time against error of the convolutions, the network, the rasteriser, a training step"
+# the options that only some benches have
+OPTIONS = {
+    "conv": ("size", "widths", "plot"),
+    "unet": ("size", "widths", "plot", "tolerance"),
+    "raster": ("size", "scene", "points", "tau", "gamma", "plot"),
+    "train": ("scene", "points", "set"),
+}
+VIEWS, ROUNDS = 3, 5  # of bench train: views of the scene, evenly spread, and rounds over them
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the command's options."""
+    add = parser.add_argument
+    add(
+        "what",
+        choices=OPTIONS,
+        help="conv: every layer of the network; unet: all of it; raster: points; train: a step"
+        " without the network",
+    )
+    add(
+        "--size",
+        metavar="S",
+        help="side of the image in pixels, a multiple of 4 (256; raster: 200,400,800)",
+    )
+    add(
+        "--widths",
+        metavar="A,B,C",
+        help="conv, unet: channels of the levels (128,256,512: the paper's)",
+    )
+    add(
+        "--scene",
+        metavar="SCENE",
+        help="raster: grid, discs on a grid (default), or pulsar, Pulsar's spheres; train: a"
+        " folder, or the word demo (default)",
+    )
+    add(
+        "--points",
+        metavar="N,...",
+        help="raster: numbers of points (10 thousand to 4 million); train: one (4 million)",
+    )
+    add("--tau", metavar="T,...", help="raster: weight that a pixel may drop (0,1e-4,1e-3,1e-2)")
+    add("--gamma", metavar="G", help="raster: depth sharpness of the blend (0.01)")
+    shared.add_set(parser, "train: a setting in place of the paper preset's")
+    add("--json", metavar="FILE", help="also write the rows there")
+    add("--plot", metavar="FILE", help="also draw time against error there (.png, .svg, .pdf)")
+    shared.add_tolerance(parser)
+    shared.add_device(parser)
+
+
+def run(options: argparse.Namespace) -> None:
+    """Measure, print the table, write the files asked for. Raises UserError, before anything is
+    measured, for options that make no sense and files that cannot be written.
+    """
+    _refuse_foreign(options)
+    {"raster": _run_raster, "train": _run_train}.get(options.what, _run_network)(options)
+
+
+def _refuse_foreign(options):
+    """Raise UserError for an option of another bench."""
+    if options.what == "conv" and options.tolerance is not None:
+        raise UserError(
+            "--tolerance: bench conv shows every variant; give it to bench unet, whose auto picks"
+            " among them"
+        )
+    for name in {name for names in OPTIONS.values() for name in names} - {*OPTIONS[options.what]}:
+        if getattr(options, name):
+            raise UserError(f"--{name}: bench {options.what} has no such option; leave it out")
+
+
+def _run_raster(options):
+    from pp_cl.bench.network import check_files, save_figure
+    from pp_cl.bench.raster import HEAD, bench_raster, growth, line, plot
+    from pp_cl.bench.raster_scenes import SCENES
+
+    scene = options.scene or "grid"
+    if scene not in SCENES:
+        raise UserError(f"--scene {scene}: choose from {', '.join(SCENES)}")
+    points = options.points or "10000,63000,250000,1000000,4000000"
+    points = shared.read_numbers("--points", points, int, least=8, most=2**27)
+    sizes = shared.read_numbers("--size", options.size or "200,400,800", int, least=4, most=4096)
+    if any(side % 4 for side in sizes):
+        raise UserError(f"--size {options.size}: write multiples of 4")
+    taus = options.tau or "0,1e-4,1e-3,1e-2"
+    taus = shared.read_numbers("--tau", taus, float, least=0, most=0.5)
+    # the last gamma of a training, the sharpest
+    gamma = shared.read_number("--gamma", options.gamma or "0.01", float, least=1e-5, most=1)
+    figure = check_files(options.json, options.plot)
+    dev = _open_device(options)
+    print(HEAD)
+    rows = []
+    for row in bench_raster(dev, scene, points, sizes, taus, gamma):
+        rows.append(row)
+        print(line(row), flush=True)
+    fits = growth(rows)
+    for fit in fits:
+        print(
+            f"side {fit['size']}, tau {fit['tau']:g}: time grows as points^{fit['exponent']:.2f},"
+            f" at most ^{fit['steepest']:.2f} from one number to the next"
+        )
+    _write_json(options.json, dev, rows, growth=fits)
+    if figure:
+        plot(figure, f"raster, {scene}, gamma {gamma:g}, {dev.name}", rows)
+        save_figure(figure, options.plot)
+
+
+def _run_train(options):
+    from pp_cl.bench.network import check_files
+    from pp_cl.bench.train import bench_train
+    from pp_cl.run import configure
+
+    config = configure(preset("paper"), options.scene or "demo", shared.read_set(options.set))
+    if options.points:
+        points = shared.read_number("--points", options.points, int, least=8, most=2**27)
+        config.points.count = points
+    check_files(options.json, None)
+    dev = _open_device(options)
+    row = bench_train(dev, config, VIEWS, ROUNDS)
+    print(
+        f"{row['points']} points, {row['pairs']} hits in a view, {row['shaded']:.0%} shaded,"
+        f" {row['peak_device_bytes'] / 2**30:.2f} GiB at the peak"
+    )
+    for name, ms in row["stages_ms"].items():
+        print(f"  {name:10s} {ms:9.2f} ms")
+    print(f"forward {row['forward_ms']:.2f} ms, backward and update {row['backward_ms']:.2f} ms")
+    _write_json(options.json, dev, [row])
+
+
+def _run_network(options):
+    from pp_cl.bench.network import run_bench
+
+    size, widths = shared.read_shape(options.size or "256", options.widths or "128,256,512")
+    tolerance = shared.read_tolerance(options.tolerance)
+    if tolerance is None:
+        tolerance = preset("tiny").network.tolerance
+    run_bench(
+        options.what,
+        size,
+        widths,
+        tolerance,
+        json_file=options.json,
+        plot_file=options.plot,
+        device=options.device,
+    )
+
+
+def _open_device(options):
+    """The device asked for, named on the first line."""
+    from pp_cl.device.discover import open_device
+
+    dev = open_device(options.device)
+    print(f"{dev.name} [{dev.info['platform']}]")
+    return dev
+
+
+def _write_json(file, dev, rows, **more):
+    """Write the rows, if a file was asked for."""
+    from pp_cl.files.atomic import write_json
+
+    if file:
+        write_json(
+            file, {"device": dev.name, "platform": dev.info["platform"], "rows": rows} | more
+        )

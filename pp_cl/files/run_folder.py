@@ -1,0 +1,128 @@
+"""The folder of a run: the names in it, its checkpoint, its log."""
+
+import json
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from pp_cl.errors import UserError
+from pp_cl.files.atomic import remove_leftovers, write_text
+from pp_cl.files.checkpoint import load_checkpoint, save_checkpoint
+
+# what the header of a run's checkpoint holds at least
+HEADER = ("scene", "step", "finished", "initial_points", "grid", "depth_range")
+
+
+class RunFolder:
+    """path: the folder; config, checkpoint, log, previews: paths in it, which need not exist."""
+
+    def __init__(self, path: Path | str) -> None:
+        self.path = Path(path)
+        self.config = self.path / "config.json"
+        self.checkpoint = self.path / "checkpoint.npz"
+        self.log = self.path / "log.jsonl"
+        self.previews = self.path / "previews"
+
+    def __str__(self) -> str:
+        return str(self.path)
+
+    def evaluation(self, split: str) -> Path:
+        """Folder of the evaluation of a split: eval for test, eval/SPLIT for others."""
+        return self.path / "eval" if split == "test" else self.path / "eval" / split
+
+    def check_usable(self) -> None:
+        """Raise UserError if the folder is a file, or holds files that belong to no run."""
+        if self.path.exists() and not self.path.is_dir():
+            raise UserError(f"{self}: is not a folder; choose another --out")
+        if self.config.exists() or not self.path.exists():
+            return
+        if any(not p.name.startswith(".") for p in self.path.iterdir()):
+            raise UserError(
+                f"{self}: holds other files and no config.json; choose an empty or new folder for"
+                " --out"
+            )
+
+    def create(self, config_json: str) -> None:
+        """Make the folders, remove what a killed process left unfinished, write config.json."""
+        self.previews.mkdir(parents=True, exist_ok=True)
+        for folder in (self.path, self.previews):
+            remove_leftovers(folder)
+        write_text(self.config, config_json + "\n")
+
+    def load(self) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
+        """(header, arrays) of the checkpoint. Raises UserError as load_checkpoint does, and for an
+        incomplete header.
+        """
+        header, arrays = load_checkpoint(self.checkpoint)
+        missing = [key for key in HEADER if key not in header]
+        if missing:
+            raise UserError(
+                f"{self.checkpoint}: its header lacks {', '.join(missing)}; delete it to train"
+                " anew, or restore a copy"
+            )
+        return header, arrays
+
+    def save(self, header: dict[str, Any], arrays: dict[str, np.ndarray]) -> None:
+        """Replace the checkpoint."""
+        save_checkpoint(self.checkpoint, header, arrays)
+
+    def open_log(self, step: int) -> "Log":
+        """The log, cut off after `step`: later rows will be made again."""
+        return Log(self.log, step)
+
+
+class Log:
+    """A file of one JSON object per logged step. seconds: of training, up to its last row."""
+
+    def __init__(self, path: Path, step: int) -> None:
+        rows = _rows_until(path, step)
+        write_text(path, "".join(json.dumps(row) + "\n" for row in rows))
+        self.seconds = rows[-1]["seconds"] if rows else 0.0
+        # unbuffered: a failed write leaves nothing that closing would try to write again
+        self._file = open(path, "ab", buffering=0)  # noqa: SIM115
+
+    def __enter__(self) -> "Log":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._file.close()
+
+    def write(self, row: dict[str, Any]) -> None:
+        """Append a row. Raises UserError naming the file when it cannot be written, ValueError for
+        NaN.
+        """
+        data = (json.dumps(row, allow_nan=False) + "\n").encode()
+        try:
+            while data:
+                data = data[self._file.write(data) :]
+        except OSError as error:
+            raise UserError(
+                f"{self._file.name}: cannot be written ({error.strerror}); free some space, the"
+                " same command goes on"
+            ) from error
+
+
+def _rows_until(path, step):
+    """The rows of a log up to `step`, or up to the first that is broken or says finished."""
+    rows = []
+    for line in path.read_text("utf-8", "replace").splitlines() if path.exists() else ():
+        row = _read_row(line)
+        if row is None or row["step"] > step or row.get("finished"):
+            break
+        rows.append(row)
+    return rows
+
+
+def _read_row(line):
+    """The object of a line; None where a kill or a fault left no row with step and seconds."""
+    try:
+        row = json.loads(line)
+        json.dumps(row, allow_nan=False)
+    except (ValueError, RecursionError):
+        return None
+    if not isinstance(row, dict) or type(row.get("step")) is not int:
+        return None
+    seconds = row.get("seconds")
+    return row if type(seconds) in (int, float) and math.isfinite(seconds) else None

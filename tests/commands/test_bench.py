@@ -1,0 +1,37 @@
+"""`pp-cl bench train`, and options that belong to another bench."""
+
+import json
+
+import pytest
+from support.scenes import write_ball_scene
+
+from pp_cl.cli import main
+
+
+def test_train_prints_and_writes_its_row(tmp_path, capsys):
+    scene, file = write_ball_scene(tmp_path / "ball", size=40), tmp_path / "b.json"
+    words = ["--scene", scene, "--points", "1500", "--set", "train.lazy_adam=true"]
+    assert main(["bench", "train", *words, "--json", str(file)]) == 0
+    printed, result = capsys.readouterr().out, json.loads(file.read_text())
+    (row,) = result["rows"]
+    assert result["device"] and f"{row['points']} points" in printed
+    assert all(name in printed for name in row["stages_ms"])
+
+
+@pytest.mark.parametrize(
+    "words, named",
+    [
+        (["train", "--points", "10,20"], "--points 10,20: write one number"),
+        (["train", "--set", "train.sped=1"], "train.sped"),
+        (["train", "--scene", "/nowhere"], "/nowhere"),
+        (["train", "--tau", "0"], "--tau"),
+        (["train", "--plot", "b.png"], "--plot"),
+        (["raster", "--set", "train.seed=1"], "--set"),
+        (["unet", "--scene", "demo"], "--scene"),
+        (["raster", "--gamma", "0.1,0.2"], "--gamma"),
+    ],
+)
+def test_options_of_another_bench_are_one_line(words, named, capsys):
+    assert main(["bench", *words]) == 2
+    error = capsys.readouterr().err
+    assert named in error and error.count("\n") == 1

@@ -1,0 +1,81 @@
+"""pp-cl from Python: the same runs, without text."""
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from support.runs import SETTINGS, arguments
+from support.scenes import write_ball_scene
+
+import pp_cl
+from pp_cl.cli import main
+from pp_cl.files.image import read_rgba, to_8bit
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory):
+    """Folder of a small scene."""
+    return write_ball_scene(tmp_path_factory.mktemp("scene") / "ball")
+
+
+@pytest.fixture(scope="module")
+def trained(scene, tmp_path_factory):
+    """(Run, folder) trained from Python with the settings of support.runs."""
+    out = tmp_path_factory.mktemp("runs") / "python"
+    return pp_cl.train_scene(scene, out, downscale=2, settings=SETTINGS), out
+
+
+def test_python_and_the_command_line_train_the_same_bytes(scene, trained, tmp_path):
+    assert main(arguments(scene, tmp_path / "command")) == 0
+    for name in ("checkpoint.npz", "config.json"):
+        assert (trained[1] / name).read_bytes() == (tmp_path / "command" / name).read_bytes()
+
+
+def test_a_run_renders_what_the_evaluation_saves(trained, capsys):
+    from pp_cl import evaluate_run, load_run, open_device
+
+    dev = open_device()
+    run = load_run(dev, trained[1])
+    images = [run.render(camera) for camera in run.cameras("test")]
+    assert all(image.shape == (24, 24, 3) and image.dtype == np.float32 for image in images)
+    result = evaluate_run(trained[1], save_images=True)
+    assert result == json.loads((trained[1] / "eval" / "metrics.json").read_text())
+    for i, image in enumerate(images):
+        saved = read_rgba(trained[1] / "eval" / "images" / f"r_{i}.png")[..., :3]
+        np.testing.assert_array_equal(saved, to_8bit(image))
+        np.testing.assert_array_equal(trained[0].render(trained[0].cameras()[i]), image)
+
+
+def test_a_finished_run_is_left_alone_and_steps_are_told(scene, trained, tmp_path):
+    steps = []
+
+    def on_step(step, row):
+        steps.append((step, row and row["psnr"]))
+
+    out = tmp_path / "run"
+    run = pp_cl.train_scene(scene, out, iterations=6, points=500, downscale=2, on_step=on_step)
+    assert run.header["finished"] and [step for step, _ in steps] == [1, 2, 3, 4, 5, 6]
+    assert [psnr is not None for _, psnr in steps] == [False] * 5 + [True]
+    pp_cl.train_scene(scene, out, iterations=6, on_step=on_step)
+    assert len(steps) == 6
+
+
+def test_wrong_words_are_refused(scene, tmp_path):
+    with pytest.raises(TypeError, match="no iteration; it has iterations, points"):
+        pp_cl.train_scene(scene, tmp_path / "run", iteration=5)
+    with pytest.raises(pp_cl.UserError, match="settings: unknown key 'train.x'"):
+        pp_cl.train_scene(scene, tmp_path / "run", settings={"train.x": 1})
+    with pytest.raises(AttributeError):
+        _ = pp_cl.trains
+    assert not (tmp_path / "run").exists()
+
+
+def test_the_package_and_its_help_need_no_opencl():
+    code = "import sys, pp_cl, pp_cl.cli\ntry: pp_cl.cli.main(['train', '--help'])\n"
+    code += "except SystemExit: pass\nassert 'pyopencl' not in sys.modules\n"
+    code += "assert 'numpy' not in sys.modules\nassert set(pp_cl.__all__) <= set(dir(pp_cl))"
+    root = Path(__file__).parents[1]
+    subprocess.run([sys.executable, "-c", code], check=True, cwd=root, stdout=subprocess.DEVNULL)
