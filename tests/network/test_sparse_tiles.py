@@ -220,8 +220,7 @@ def test_lego(dev, data, rng, always):
     model.points["sh0"].set(rng.normal(size=model.points["sh0"].shape).astype(np.float32))
     renderer = Renderer(dev, model, preset("tiny").raster)
     for view in views[:2]:
-        renderer.forward(view.reduced(2).camera, 0.01)
-        x = renderer.features
+        x = renderer.rasterise(view.reduced(2).camera, 0.01).features
         share = np.mean(
             [
                 of.computed.mean()
