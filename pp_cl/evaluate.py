@@ -13,11 +13,12 @@ from pp_cl.files.image import write_png
 from pp_cl.layers.tuning import adopt_stored
 from pp_cl.metrics.psnr_ssim import Metrics, mean
 from pp_cl.model import Model
+from pp_cl.network.unet import UNet
 from pp_cl.render import Renderer
 from pp_cl.run import CHECKPOINT, load_run, open_scene, with_depth_range
 from pp_cl.scene.target import Target
 from pp_cl.scene.views import reduced_camera
-from pp_cl.training.schedule import gamma
+from pp_cl.training.schedule import gamma_at
 
 PICTURE_VIEWS = 4  # rows of the comparison picture
 
@@ -38,19 +39,19 @@ def evaluate_run(folder, metrics, split, save_images, device_choice, tolerance=N
     adopt_stored(dev, config.network.tolerance)
     scene = open_scene(dev, config, (split,))
     measure = Metrics(dev, metrics)
-    model = Model.load(
-        dev, header, arrays, config.network.widths, config.points.sh_degree, folder / CHECKPOINT
-    )
+    net = UNet(dev, widths=config.network.widths)
+    degree, file = config.points.sh_degree, folder / CHECKPOINT
+    model = Model.load(dev, header, arrays, net, degree=degree, file=file)
     views = with_depth_range(scene.splits[split], model.depth_range)
 
     target_folder = folder / "eval"
     (target_folder / "images" if save_images else target_folder).mkdir(parents=True, exist_ok=True)
     remove_leftovers(target_folder)
-    gamma_now = gamma(header["step"], config.train.iterations, *config.raster.gamma)
+    gamma = gamma_at(header["step"], config.train.iterations, *config.raster.gamma)
     shown = {len(views) * i // PICTURE_VIEWS for i in range(PICTURE_VIEWS)}
     rows, pictures, seconds, shares = [], [], [], []
     for i, (view, picture, truth, duration, dropped) in enumerate(
-        _render_all(dev, config, model, views, gamma_now)
+        _render_all(dev, config, model, views, gamma)
     ):
         rows.append({"name": view.name} | measure(picture, truth) | dropped)
         seconds.append(duration)
@@ -86,18 +87,18 @@ def evaluate_run(folder, metrics, split, save_images, device_choice, tolerance=N
     return result
 
 
-def _render_all(dev, config, model, views, gamma_now):
+def _render_all(dev, config, model, views, gamma):
     """Yield (view, prediction (H,W,3), truth (H,W,3), seconds of the rendering, what tau did) as
     float32 in [0, 1].
     """
     model.net.freeze()
     renderer, target = Renderer(dev, model, config.raster), Target(dev, config.scene.downscale)
     # builds the programs
-    renderer.render(reduced_camera(views[0], config.scene.downscale), gamma_now)
+    renderer.render(reduced_camera(views[0], config.scene.downscale), gamma)
     for view in views:
         camera = reduced_camera(view, config.scene.downscale)
         start = time.perf_counter()
-        picture = renderer.render(camera, gamma_now)
+        picture = renderer.render(camera, gamma)
         seconds = time.perf_counter() - start
         target.load(view)
         truth = target.crop(0, 0, camera.width, camera.height).get()
@@ -106,20 +107,20 @@ def _render_all(dev, config, model, views, gamma_now):
             picture,
             truth,
             seconds,
-            _tau_errors(renderer, camera, gamma_now) if config.raster.tau > 0 else {},
+            _tau_errors(renderer, camera, gamma) if config.raster.tau > 0 else {},
         )
 
 
-def _tau_errors(renderer, camera, gamma_now):
+def _tau_errors(renderer, camera, gamma):
     """{"tau_bound", "tau_feature_error", "tau_picture_error"} of a view.
 
     The largest weight that a pixel dropped (or its bound), and the largest differences from tau 0:
     of a feature over the range of the features, and of the image.
     """
-    view = renderer.rasterise(camera, gamma_now)
+    view = renderer.rasterise(camera, gamma)
     bound, features = renderer.dropped_weights(view).get().max(initial=0), view.features.get()
-    exact = renderer.rasterise(camera, gamma_now, tau=0.0).features.get()
-    image, exact_image = (renderer.render(camera, gamma_now, tau=tau) for tau in (None, 0.0))
+    exact = renderer.rasterise(camera, gamma, tau=0.0).features.get()
+    image, exact_image = (renderer.render(camera, gamma, tau=tau) for tau in (None, 0.0))
     return {
         "tau_bound": float(bound),
         "tau_feature_error": float(np.abs(features - exact).max() / max(np.ptp(exact), 1e-30)),

@@ -18,11 +18,12 @@ from pp_cl.files.checkpoint import load_checkpoint, save_checkpoint
 from pp_cl.files.contact_sheet import write_comparison
 from pp_cl.layers.tuning import adopt_of_run, adopt_stored
 from pp_cl.model import Model
+from pp_cl.network.unet import UNet
 from pp_cl.scene.hull import build_grid, depth_range, spacing_pixels
 from pp_cl.scene.load import load_scene
 from pp_cl.scene.views import reduced_camera
 from pp_cl.train import Trainer
-from pp_cl.training.memory import memory_plan, print_plan, spare_memory
+from pp_cl.training.memory import memory_plan, plan_lines, spare_memory
 
 CHECKPOINT = "checkpoint.npz"
 # of a run's checkpoint
@@ -103,9 +104,9 @@ def train_run(folder, config, device_choice):
         _resume(dev, config, scene, *stored, checkpoint) if stored else _start(dev, config, scene)
     )
     info["tuning"] = tuning
-    plan = memory_plan(dev, config, trainer.model, trainer.views)
-    print_plan(plan, dev)
-    trainer.renderer.cache.budget = spare_memory(plan, config.train.memory_gib)
+    plan = memory_plan(config, trainer.model, trainer.views)
+    print("\n".join(plan_lines(plan, dev)))
+    trainer.renderer.cache.budget = spare_memory(plan, dev, config.train.memory_gib)
 
     folder.mkdir(parents=True, exist_ok=True)
     remove_leftovers(folder)
@@ -140,15 +141,8 @@ def _start(dev, config, scene):
         f" ({spacing_pixels(hull, views, config.scene.downscale):.2f} pixels), depth"
         f" {near_far[0]:.3f} to {near_far[1]:.3f} ({time.perf_counter() - start:.1f} s)"
     )
-    model = Model.create(
-        dev,
-        hull.grid,
-        hull.ids,
-        near_far,
-        config.network.widths,
-        config.train.seed,
-        config.points.sh_degree,
-    )
+    net = UNet(dev, widths=config.network.widths, seed=config.train.seed)
+    model = Model.create(dev, hull.grid, hull.ids, near_far, net, degree=config.points.sh_degree)
     return Trainer(dev, config, model, with_depth_range(views, near_far)), {
         "scene": fingerprint(views),
         "initial_points": len(hull.ids),
@@ -162,7 +156,8 @@ def _resume(dev, config, scene, header, arrays, file):
         raise UserError(
             f"{file}: belongs to another scene than {config.scene.path}; use another --out"
         )
-    model = Model.load(dev, header, arrays, config.network.widths, config.points.sh_degree, file)
+    net = UNet(dev, widths=config.network.widths, seed=config.train.seed)
+    model = Model.load(dev, header, arrays, net, degree=config.points.sh_degree, file=file)
     trainer = Trainer(dev, config, model, with_depth_range(views, model.depth_range))
     try:
         trainer.restore(header["step"], arrays)
@@ -276,4 +271,4 @@ def _preview(trainer, folder, name):
     """Prediction, truth and error of the first training view."""
     (folder / "previews").mkdir(exist_ok=True)
     view = trainer.views[0]
-    write_comparison(folder / "previews" / name, [trainer.picture(view)], [trainer.truth(view)])
+    write_comparison(folder / "previews" / name, [trainer.render(view)], [trainer.target(view)])

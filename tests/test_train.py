@@ -9,7 +9,6 @@ import subprocess
 import sys
 import time
 from pathlib import Path
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -17,9 +16,10 @@ from support.runs import arguments, train_and_interrupt
 from support.scenes import write_ball_scene
 
 from pp_cl.cli import main
+from pp_cl.config import TrainConfig
 from pp_cl.errors import UserError
 from pp_cl.files.checkpoint import load_checkpoint, save_checkpoint
-from pp_cl.train import Trainer, _draw_start
+from pp_cl.train import Trainer, _draw_start, views_repeat
 from pp_cl.training.optimiser import Optimiser
 
 
@@ -236,11 +236,11 @@ def test_a_loss_that_is_not_finite_stops_the_run_and_keeps_the_checkpoint(
 ):
     update, steps = Optimiser.update, []
 
-    def poisoned(self, *args):
-        update(self, *args)
+    def poisoned(self, *args, **named):
+        update(self, *args, **named)
         steps.append(0)
         if len(steps) == 15:
-            self.dev.fill(self.model.points["sh0"], np.nan)
+            self.dev.fill(self.model.cloud.sh[0], np.nan)
 
     monkeypatch.setattr(Optimiser, "update", poisoned)
     assert main(arguments(scene, tmp_path / "run")) == 2
@@ -249,14 +249,14 @@ def test_a_loss_that_is_not_finite_stops_the_run_and_keeps_the_checkpoint(
 
 
 def test_a_training_that_keeps_its_hits_ends_with_the_same_bytes(scene, tmp_path, monkeypatch):
-    """Of whole images without phases; also where there is room for some views only, and over
+    """Of whole images without jitter; also where there is room for some views only, and over
     prunings.
     """
     whole = {"train__crop": 0, "train__pixel_jitter": "false", "train__dropout": 0}
     whole |= {"train__iterations": 40, "train__prune_every": 15}
     results, caches = [], []
     for budget in (0, 300_000, 10**9):
-        monkeypatch.setattr("pp_cl.run.spare_memory", lambda plan, limit, budget=budget: budget)
+        monkeypatch.setattr("pp_cl.run.spare_memory", lambda *_, budget=budget: budget)
         monkeypatch.setattr("pp_cl.train.Trainer.finish", _noting(caches, Trainer.finish))
         out = tmp_path / str(budget)
         assert main(arguments(scene, out, **whole)) == 0
@@ -278,7 +278,7 @@ def _noting(caches, finish):
 
 
 @pytest.mark.parametrize(
-    "changes, stay",
+    "changes, repeat",
     [
         ({}, True),
         ({"crop": 64}, False),
@@ -286,10 +286,9 @@ def _noting(caches, finish):
         ({"pixel_jitter": True}, False),
     ],
 )
-def test_views_stay_only_where_nothing_is_drawn(changes, stay):
+def test_views_repeat_only_where_nothing_is_drawn(changes, repeat):
     settings = {"crop": 0, "dropout": 0.0, "pixel_jitter": False} | changes
-    trainer = SimpleNamespace(config=SimpleNamespace(**settings), downscale=2)
-    assert Trainer.views_stay(trainer) == stay
+    assert views_repeat(TrainConfig(**settings), downscale=2) == repeat
 
 
 def test_a_memory_that_is_too_small_is_one_line(scene, tmp_path, capsys):
@@ -335,7 +334,9 @@ def test_the_other_footprints_train_too(scene, tmp_path, footprint, radius):
     ],
 )
 def test_crops_stay_inside_and_show_the_object(low, high, size, limit):
-    starts = {_draw_start(np.random.default_rng(i), low, high, size, limit) for i in range(300)}
+    starts = {
+        _draw_start(np.random.default_rng(i), low, high, size, limit=limit) for i in range(300)
+    }
     assert min(starts) >= 0 and max(starts) + size <= limit
     for start in starts:
         shown = min(high, start + size) - max(low, start)

@@ -20,6 +20,7 @@ from pp_cl.device.discover import open_device
 from pp_cl.errors import UserError
 from pp_cl.files.atomic import write_json
 from pp_cl.model import Model
+from pp_cl.network.unet import UNet
 from pp_cl.raster.blend import BACKGROUND
 from pp_cl.render import Renderer
 from pp_cl.run import CHECKPOINT, load_run, open_scene, with_depth_range
@@ -35,8 +36,9 @@ class Comparison:
         self.dev = dev
         self.config = load_config(folder / "config.json")
         header, arrays = load_run(folder / CHECKPOINT)
-        widths, degree = self.config.network.widths, self.config.points.sh_degree
-        model = Model.load(dev, header, arrays, widths, degree, folder / CHECKPOINT)
+        net = UNet(dev, widths=self.config.network.widths)
+        file, degree = folder / CHECKPOINT, self.config.points.sh_degree
+        model = Model.load(dev, header, arrays, net, degree=degree, file=file)
         self.views = with_depth_range(
             open_scene(dev, self.config, (split,)).splits[split], model.depth_range
         )
@@ -49,12 +51,12 @@ class Comparison:
     def row(self, view, runs):
         """{"view", "size", "share", times in ms, ratios, largest differences} of one view."""
         camera = reduced_camera(view, self.downscale)
-        self.renderer.forward(camera, self.config.raster.gamma[1])
-        x = self.renderer.features
+        result = self.renderer.rasterise(camera, self.config.raster.gamma[1])
+        x = result.features
         self.target.load(view)
         target = self.target.crop(0, 0, camera.width, camera.height)
         grad = self.loss.forward_backward(
-            self.net.forward(x, False, BACKGROUND), target, *self.renderer.offset
+            self.net.forward(x, False, BACKGROUND), target, *result.offset
         )
 
         results = [self._results(x, grad, background) for background in (None, BACKGROUND)]
