@@ -18,6 +18,7 @@ from pp_cl.files.contact_sheet import write_comparison
 from pp_cl.files.run_folder import RunFolder
 from pp_cl.layers.tuning import adopt_of_run, adopt_stored
 from pp_cl.model import Model
+from pp_cl.network.unet import UNet
 from pp_cl.render import Renderer
 from pp_cl.scene.camera import Camera
 from pp_cl.scene.hull import build_grid, depth_range, spacing_pixels
@@ -25,7 +26,7 @@ from pp_cl.scene.load import Scene, load_scene
 from pp_cl.scene.views import View
 from pp_cl.train import Trainer
 from pp_cl.training.memory import Plan, memory_plan, spare_memory
-from pp_cl.training.schedule import gamma
+from pp_cl.training.schedule import gamma_at
 
 Stored = tuple[dict[str, Any], dict[str, np.ndarray]]  # header and arrays of a checkpoint
 
@@ -138,7 +139,9 @@ class Run:
     @property
     def gamma(self) -> float:
         """Depth sharpness of the blend at the run's last step."""
-        return gamma(self.header["step"], self.config.train.iterations, *self.config.raster.gamma)
+        return gamma_at(
+            self.header["step"], self.config.train.iterations, *self.config.raster.gamma
+        )
 
     def scene(self, split: str) -> Scene:
         """The run's scene with one split. Raises UserError where it is missing or broken."""
@@ -174,14 +177,9 @@ def load_run(
     configure(config, scene or config.scene.path, given)
     header, arrays = folder.load()
     adopt_stored(dev, config.network.tolerance)
-    model = Model.load(
-        dev,
-        header,
-        arrays,
-        config.network.widths,
-        config.points.sh_degree,
-        folder.checkpoint,
-    )
+    net = UNet(dev, widths=config.network.widths)
+    degree, file = config.points.sh_degree, folder.checkpoint
+    model = Model.load(dev, header, arrays, net, degree=degree, file=file)
     return Run(dev, folder, config, header, model)
 
 
@@ -189,8 +187,8 @@ def load_run(
 
 
 class HullFacts(NamedTuple):
-    """The initial grid. capped: it has fewer points than asked for, at the most cells that a grid may
-    have. edge: world units, spacing: the same in pixels; seconds it took.
+    """The initial grid. capped: the largest grid allowed has fewer points than asked for. edge: world
+    units; spacing: the same in pixels; seconds it took.
     """
 
     points: int
@@ -270,7 +268,7 @@ class Training:
         """Prediction, truth and error of the first training view."""
         trainer, view = self.trainer, self.trainer.views[0]
         path = self.folder.previews / f"step_{trainer.step:06d}.png"
-        write_comparison(path, [trainer.picture(view)], [trainer.truth(view)])
+        write_comparison(path, [trainer.render(view)], [trainer.target(view)])
 
 
 def stored_state(folder: RunFolder, config: Config) -> Stored | None:
@@ -303,7 +301,7 @@ def open_training(
         trainer, info, hull = _resume(dev, config, views, stored, folder.checkpoint)
     else:
         trainer, info, hull = _start(dev, config, views)
-    plan = memory_plan(dev, config, trainer.model, trainer.views)
+    plan = memory_plan(config, trainer.model, trainer.views)
     return Training(folder, config, trainer, info | {"tuning": tuning}, plan, hull)
 
 
@@ -321,15 +319,9 @@ def _start(dev, config, views):
         near_far,
         time.perf_counter() - start,
     )
-    model = Model.create(
-        dev,
-        hull.grid,
-        hull.ids,
-        near_far,
-        config.network.widths,
-        config.train.seed,
-        config.points.sh_degree,
-    )
+    net = UNet(dev, widths=config.network.widths, seed=config.train.seed)
+    degree = config.points.sh_degree
+    model = Model.create(dev, hull.grid, hull.ids, near_far, net, degree=degree)
     trainer = Trainer(dev, config, model, views)
     return trainer, {"scene": fingerprint(views), "initial_points": facts.points}, facts
 
@@ -341,7 +333,8 @@ def _resume(dev, config, views, stored, file):
         raise UserError(
             f"{file}: belongs to another scene than {config.scene.path}; use another --out"
         )
-    model = Model.load(dev, header, arrays, config.network.widths, config.points.sh_degree, file)
+    net = UNet(dev, widths=config.network.widths, seed=config.train.seed)
+    model = Model.load(dev, header, arrays, net, degree=config.points.sh_degree, file=file)
     trainer = Trainer(dev, config, model, views)
     try:
         trainer.restore(header["step"], arrays)

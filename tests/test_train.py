@@ -285,11 +285,11 @@ def test_a_loss_that_is_not_finite_stops_the_run_and_keeps_the_checkpoint(
 ):
     update, steps = Optimiser.update, []
 
-    def poisoned(self, *args):
-        update(self, *args)
+    def poisoned(self, *args, **named):
+        update(self, *args, **named)
         steps.append(0)
         if len(steps) == 15:
-            self.dev.fill(self.model.points["sh0"], np.nan)
+            self.dev.fill(self.model.cloud.sh[0], np.nan)
 
     monkeypatch.setattr(Optimiser, "update", poisoned)
     assert main(arguments(scene, tmp_path / "run")) == 2
@@ -399,7 +399,9 @@ def test_the_other_footprints_train_too(scene, tmp_path, footprint, radius):
     ],
 )
 def test_crops_stay_inside_and_show_the_object(low, high, size, limit):
-    starts = {_draw_start(np.random.default_rng(i), low, high, size, limit) for i in range(300)}
+    starts = {
+        _draw_start(np.random.default_rng(i), low, high, size, limit=limit) for i in range(300)
+    }
     assert min(starts) >= 0 and max(starts) + size <= limit
     for start in starts:
         shown = min(high, start + size) - max(low, start)

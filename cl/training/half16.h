@@ -1,5 +1,5 @@
-// Sixteen values kept in 16 bits each, rounded up or down at random so that the mean stays: a decay
-// of less than half a unit in the last place would otherwise never happen.
+// Sixteen values stored in 16 bits each, rounded up or down at random so that the expected value is
+// exact: rounding to nearest would undo every decay of less than half a unit in the last place.
 #ifndef PP_HALF16_H
 #define PP_HALF16_H
 
@@ -15,8 +15,8 @@ static inline uint16 random16(const uint number) {
     return scramble(number) * (uint16)(1, 3, 5, 7, 9, 11, 13, 15, 17, 19, 21, 23, 25, 27, 29, 31);
 }
 
-// Write 16 values to p; the lowest 13 bits of `random` decide. Too large ones become the largest,
-// NaN stays.
+// Write 16 values to p; the lowest 13 bits of `random` decide. Values beyond the
+// largest half become it, NaN remains NaN.
 static inline void store_half16(const float16 value, const uint16 random, global half *p) {
     const uint16 dither = random & CUT_BITS;
     const float16 size =

@@ -8,12 +8,16 @@
 //
 // The kernels run in their order here: moments of the windows along y; along x, then SSIM and its
 // slopes; slopes spread along x; along y, with the gradient; sums. Scratch rows are BLOCKS float16
-// long, 2 more than 3W values need, so that no tap along x needs a test.
+// long, MARGIN more than 3W values need, so that no tap along x needs a test.
 #include "reduce.h"
 #include "vector.h"
 
-#define TAPS 11
+#ifndef TAPS
+#define TAPS 11  // pixels, the side of a window
+#endif
+#ifndef MARGIN
 #define MARGIN 2  // float16 blocks, >= 3 * (TAPS - 1) values
+#endif
 #define C1 1e-4f  // (0.01 * 1)^2: the constants of Wang et al. for a range of 1
 #define C2 9e-4f  // (0.03 * 1)^2
 

@@ -68,7 +68,7 @@ kernel void smooth_gather(
 }
 
 // One work-item per point of a chunk: writes its coefficients back.
-kernel void smooth_scatter(
+kernel void smooth_write_back(
     const uint n,                    // points
     const uint first,                // point of the chunk
     const uint count,                // points in the chunk

@@ -12,6 +12,7 @@ from pyopencl.array import Array
 
 from pp_cl.config import RasterConfig
 from pp_cl.model import Model
+from pp_cl.network.unet import UNet
 from pp_cl.raster.blend import Blend
 from pp_cl.raster.blend_weights import BlendWeights
 from pp_cl.raster.pairs import PairBuilder
@@ -140,7 +141,8 @@ class GridScene(BenchScene):
         pose = np.concatenate([axes, -4 * axes[:, 2:]], 1)
         self.camera = Camera(pose, focal, focal, size / 2, size / 2, size, size)
 
-        model = Model.create(dev, grid, ids, self.depth_range, (CHANNELS,) * 3, seed=0)
+        net = UNet(dev, widths=(CHANNELS,) * 3)
+        model = Model.create(dev, grid, ids, self.depth_range, net)
         self.opacity = rng.uniform(0.7, 1, self.count).astype(np.float32)
         self.sh_0 = rng.standard_normal((self.count, 1, CHANNELS), np.float32)
         model.cloud.opacity.set(self.opacity)

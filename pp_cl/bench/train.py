@@ -11,6 +11,7 @@ import numpy as np
 
 from pp_cl.config import Config
 from pp_cl.model import Model
+from pp_cl.network.unet import UNet
 from pp_cl.run import open_scene
 from pp_cl.scene.hull import build_grid, depth_range
 from pp_cl.train import Trainer
@@ -26,9 +27,8 @@ def make_trainer(dev, config: Config) -> Trainer:
     views = open_scene(dev, config, ("train",)).splits["train"]
     hull = build_grid(dev, views, config.points.count)
     near_far = depth_range(views, hull)
-    model = Model.create(
-        dev, hull.grid, hull.ids, near_far, (16, 16, 16), config.train.seed, config.points.sh_degree
-    )
+    net = UNet(dev, widths=(16, 16, 16))
+    model = Model.create(dev, hull.grid, hull.ids, near_far, net, degree=config.points.sh_degree)
     opacity = np.random.default_rng(0).uniform(0.3, 1, model.cloud.count).astype(np.float32)
     model.cloud.opacity.set(opacity)
     return Trainer(dev, config, model, views)
@@ -58,7 +58,12 @@ def bench_train(dev, config: Config, views: int, rounds: int) -> dict:
                 step += 1
                 with dev.stage("update"):
                     trainer.optimiser.update(
-                        step, rates, gradients, result.camera_buffer, 1e-10, result.shaded
+                        step,
+                        rates,
+                        gradients,
+                        camera_buffer=result.camera_buffer,
+                        shaded=result.shaded,
+                        sh_eps=1e-10,
                     )
     stages = {name: float(np.median(values)) * 1e3 for name, values in seconds.items()}
     return {

@@ -6,33 +6,34 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class ShBlock:
-    """SH coefficients that one array (N, count, 16) holds: `count` of one degree, from the basis'
-    `first` on.
+    """The SH coefficients of one array (N, count, 16): `count` of one degree, those of the basis
+    functions `first`, `first` + 1, ...
+
+    name: sh_ and the degree, then a or b where a degree fills two arrays.
     """
 
+    name: str
     first: int
     count: int
 
     @property
-    def name(self):
-        """Its key in Model.points."""
-        return f"sh{self.first}"
-
-    @property
-    def degree(self):
+    def degree(self) -> int:
         """0, 1 or 2."""
         return math.isqrt(self.first)
 
 
-# Degree 2 lies in two arrays: no array takes more than 192 bytes a point, so that 4.04 million
+# Degree 2 fills two arrays: no array takes more than 192 bytes a point, so that 4.04 million
 # points fit devices that allocate at most 1 GiB at once. The layout is the same everywhere, and so
 # are the bits.
-SH_BLOCKS = (ShBlock(0, 1), ShBlock(1, 3), ShBlock(4, 3), ShBlock(7, 2))
-
-
+SH_BLOCKS = (
+    ShBlock("sh_0", 0, 1),
+    ShBlock("sh_1", 1, 3),
+    ShBlock("sh_2a", 4, 3),
+    ShBlock("sh_2b", 7, 2),
+)
 SH_DEGREES = (0, 1, 2)
 
 
-def sh_blocks(degree):
+def sh_blocks(degree: int) -> tuple[ShBlock, ...]:
     """Those of SH_BLOCKS up to a degree."""
     return tuple(block for block in SH_BLOCKS if block.degree <= degree)

@@ -9,8 +9,6 @@ from pyopencl.array import Array
 from pp_cl.raster.project import ProjectedPoints
 from pp_cl.raster.sh import SH_BLOCKS
 
-NAMES = ("sh_0", "sh_1", "sh_2a", "sh_2b")  # of SH_BLOCKS
-
 
 def shade_forward(
     dev, points: ProjectedPoints, shaded: Array, sh: Sequence[Array], point_features: Array
@@ -22,11 +20,12 @@ def shade_forward(
     ValueError where they end within a degree or have another shape.
     """
     n = len(points.point_camera)
-    for name, block, array in zip(NAMES, SH_BLOCKS, sh, strict=False):
+    for block, array in zip(SH_BLOCKS, sh, strict=False):
         if array.shape != (n, block.count, 16):
-            raise ValueError(f"{name} has shape {array.shape}, not {(n, block.count, 16)}")
+            raise ValueError(f"{block.name} has shape {array.shape}, not {(n, block.count, 16)}")
     absent = [sh[0]] * (len(SH_BLOCKS) - len(sh))  # not read below their degree
-    arrays = dict(zip(NAMES, [*sh, *absent], strict=True))
+    names = [block.name for block in SH_BLOCKS]
+    arrays = dict(zip(names, [*sh, *absent], strict=True))
     dev.program("raster/shade", DEGREE=_degree(len(sh))).launch(
         "shade_forward",
         shaded.size,

@@ -1,21 +1,35 @@
-"""Adam of the network and of the points, and exponential averages of the weights.
+"""Adam of the network and of the points, and exponential moving averages (EMA) of parameters.
 
-Dense Adam is torch's: every row moves in every step by its momentum, seen or not. Lazy Adam leaves
-a row alone until it receives a gradient again, and then makes up for the steps between.
-docs/maths.md states the difference.
+Dense Adam is torch's: every row moves in every step by its momentum, whether it received a gradient
+or not. Lazy Adam skips points without a gradient; when one receives a gradient again, the skipped
+steps are first applied in closed form. docs/maths.md states the difference.
 """
 
 import math
+from dataclasses import dataclass
 
 import numpy as np
+from pyopencl.array import Array
 
+from pp_cl.device.buffers import Buffers, Table
+from pp_cl.device.device import Device
+from pp_cl.device.launch import Program
 from pp_cl.device.scan import nonzero
+from pp_cl.raster.sh import ShBlock
 
-BETA1, BETA2 = 0.9, 0.999  # Kingma & Ba 2015; cl/training/adam.cl knows them too
+BETA1, BETA2 = 0.9, 0.999  # Kingma & Ba 2015
 GOLDEN = 0x9E3779B1  # 2^32 over the golden ratio: seeds of successive steps lie far apart
+# What fewer skipped steps do stands in a table; beta1 to this power is 0 in float32.
+TABLE_STEPS = 1024
 
 
-def moment_scale(eps):
+def adam_program(dev: Device, **defines) -> Program:
+    """cl/training/adam.cl with the betas of this module."""
+    decays = {"DECAY1": f"{1 - BETA1:.9g}f", "DECAY2": f"{1 - BETA2:.9g}f"}
+    return dev.program("training/adam", **decays, **defines)
+
+
+def moment_scale(eps: float) -> float:
     """The power of two by which moments in 16 bits are multiplied: it takes eps to about 2^-6.
 
     A half holds 2^-14 to 2^16 with all its bits, so these are eps/256 to 4 million eps; below, the
@@ -24,7 +38,7 @@ def moment_scale(eps):
     return 2.0 ** (-6 - round(math.log2(eps)))
 
 
-def _step_arguments(step, rate, eps):
+def _rate_and_eps(step, rate, eps):
     """The kernels' scalars: rate (m/c1) / (sqrt(v/c2) + eps) is (rate sqrt(c2)/c1) m / (sqrt(v) +
     eps sqrt(c2)).
     """
@@ -38,173 +52,260 @@ def _same_shape(**arrays):
         raise ValueError(f"arrays of one shape wanted: {shapes}")
 
 
-def adam_update(dev, parameter, grad, m, v, step, rate, eps):
-    """One Adam step of `parameter`, in place.
+def adam_update(
+    dev: Device,
+    parameter: Array,
+    grad: Array,
+    moments: dict[str, Array],
+    *,
+    step: int,
+    rate: float,
+    eps: float,
+) -> None:
+    """One dense Adam step of `parameter`, in place.
 
-    parameter, grad, m, v: float32 arrays of one shape, any; m and v start as zeros. step: from 1
-    on. Raises ValueError when the shapes differ.
+    parameter, grad, moments "m" and "v": float32 arrays of one shape, any; the moments start as
+    zeros. step: from 1 on. Raises ValueError when the shapes differ.
     """
-    _same_shape(parameter=parameter, grad=grad, m=m, v=v)
-    dev.program("training/adam").launch(
+    _same_shape(parameter=parameter, grad=grad, **moments)
+    adam_program(dev).launch(
         "adam_update",
         -(-parameter.size // 16),
         n=parameter.size,
         grad=grad,
         parameter=parameter,
-        m=m,
-        v=v,
-        **_step_arguments(step, rate, eps),
+        **moments,
+        **_rate_and_eps(step, rate, eps),
     )
 
 
-class Touched:
-    """Lists the points that received a gradient; its scratch is kept from step to step."""
+class PointsWithGradient:
+    """Lists the points that received a gradient."""
 
-    def __init__(self, dev):
+    def __init__(self, dev: Device):
         self.dev = dev
-        self.flags = None
+        self._buffers = Buffers(dev)
 
-    def rows(self, seen, grad_point_features, grad_opacity):
-        """(S) uint32, ascending: the seen points with a gradient that is not 0. Waits for the
-        device.
+    @staticmethod
+    def table(n: int) -> Table:
+        """The scratch for n points, `rows` with the result among it."""
+        sizes = {"has_gradient": n, "offsets": n + 1, "rows": n}
+        return {name: ((size,), np.uint32) for name, size in sizes.items()}
 
-        seen: (?) uint32 indices. grad_point_features: (N, 16). grad_opacity: (N). Only the rows
-        seen are read.
+    def rows(self, shaded: Array, grad_point_features: Array, grad_opacity: Array) -> Array:
+        """(S) uint32, ascending: the shaded points with a gradient that is not 0, valid until the
+        next call. Waits for the device.
+
+        shaded: (?) uint32 indices. grad_point_features: (N, 16). grad_opacity: (N). Only the
+        shaded rows are read.
         """
-        n = len(grad_opacity)
-        if self.flags is None or len(self.flags) != n:
-            self.flags = self.offsets = self.indices = None  # released first
-            self.flags, self.indices = (
-                self.dev.empty((n,), np.uint32),
-                self.dev.empty((n,), np.uint32),
-            )
-            self.offsets = self.dev.empty((n + 1,), np.uint32)
-        self.dev.fill(self.flags, 0)
-        self.dev.program("training/adam").launch(
-            "adam_touched",
-            len(seen),
-            s=len(seen),
-            seen=seen,
-            touched=self.flags,
+        buffers = self._buffers
+        buffers.require(self.table(len(grad_opacity)))
+        self.dev.fill(buffers.has_gradient, 0)
+        adam_program(self.dev).launch(
+            "adam_flag_gradients",
+            len(shaded),
+            s=len(shaded),
+            shaded=shaded,
             grad_point_features=grad_point_features,
             grad_opacity=grad_opacity,
+            has_gradient=buffers.has_gradient,
         )
-        return self.indices[: nonzero(self.dev, self.flags, self.offsets, self.indices)]
+        found = nonzero(self.dev, buffers.has_gradient, buffers.offsets, buffers.rows)
+        return buffers.rows[:found]
 
 
-def rest_table():
-    """(1024, 4) float32: what k = 0, 1, ... steps without a gradient do, as cl/training/adam.cl's
-    adam_rest reads it.
-
-    beta1^1024 is 0 in float32.
+def skipped_steps_table() -> np.ndarray:
+    """(TABLE_STEPS, 4) float32: what k = 0, 1, ... steps without a gradient do, as adam_catch_up in
+    cl/training/adam.cl reads it.
     """
-    k, rho = np.arange(1024.0), BETA1 / math.sqrt(BETA2)
+    k, rho = np.arange(float(TABLE_STEPS)), BETA1 / math.sqrt(BETA2)
     return np.stack([BETA1**k, BETA2**k, rho * (1 - rho**k) / (1 - rho), 0 * k], 1).astype(
         np.float32
     )
 
 
-class PointAdam:
-    """Adam of per-point arrays: begin() a step, then update each array.
+@dataclass(frozen=True)
+class UpdatedPoints:
+    """The points that one step updates: all N, or those listed by lazy Adam.
 
-    lazy: a step updates the rows that it lists; else all. scale: of SH moments in 16 bits
-    (moment_scale); None: in 32.
+    step: from 1 on. count: S, how many they are. rows: (S) uint32, their indices, and skipped:
+    (?, 4) float32, what each one's skipped steps did, where lazy; else not read.
     """
 
-    def __init__(self, dev, lazy=False, scale=None):
+    step: int
+    count: int
+    rows: Array
+    skipped: Array
+    lazy: bool
+
+
+@dataclass(frozen=True)
+class ShGradient:
+    """The gradient of the SH coefficients in one view, as the factors of a rank-one product: the
+    harmonics of the direction from the eye to a point, and the gradient of the point's features.
+
+    grid: (8) of Grid.packed(). camera_buffer: (20). ids: (N) uint32 grid ids.
+    grad_point_features: (N, 16).
+    """
+
+    grid: Array
+    camera_buffer: Array
+    ids: Array
+    grad_point_features: Array
+
+
+class PointAdam:
+    """Adam of per-point arrays: choose the points of a step, then update each array.
+
+    scale: of SH moments in 16 bits (moment_scale); None: in 32.
+    """
+
+    def __init__(self, dev: Device, scale: float | None = None):
         self.dev = dev
-        self.defines = {"LAZY": int(lazy)}
         self.scale = scale
-        self.kinds = ("m", "v") if scale is None else ("mv",)
-        self.rows, self.rest = dev.zeros((1,), np.uint32), dev.zeros((1, 4))  # nobody reads these
-        self.table = dev.upload(rest_table())
+        self._unread = {"rows": dev.zeros((1,), np.uint32), "skipped": dev.zeros((1, 4))}
+        self._skipped_steps = dev.upload(skipped_steps_table())
+        self._buffers = Buffers(dev)
 
-    def begin(self, step, n):
-        """Begin a step, from 1 on, that updates all n points."""
-        self.step, self.count = step, n
+    @staticmethod
+    def table(n: int) -> Table:
+        """The scratch of lazy Adam for n points."""
+        return {"skipped": ((n, 4), np.float32)}
 
-    def begin_lazy(self, step, rows, last):
-        """Begin a step that updates listed rows.
+    def all_points(self, step: int, n: int) -> UpdatedPoints:
+        """All n points, for a step from 1 on."""
+        return UpdatedPoints(step, n, **self._unread, lazy=False)
 
-        rows: (S) uint32 point indices, each once. last: (N) uint32, each point's last step, 0 at
-        first; the present one is noted.
+    def listed_points(self, step: int, rows: Array, last_step: Array) -> UpdatedPoints:
+        """The listed points, for a step from 1 on.
+
+        rows: (S) uint32 point indices, each once. last_step: (N) uint32, the step that updated
+        each point last, 0: none; becomes `step` for the listed ones.
         """
-        self.step, self.count, self.rows = step, len(rows), rows
-        if len(self.rest) != len(last):
-            self.rest = None  # released first
-            self.rest = self.dev.empty((len(last), 4))
+        self._buffers.require(self.table(len(last_step)))
+        updated = UpdatedPoints(step, len(rows), rows, self._buffers.skipped, lazy=True)
         self._launch(
-            "adam_rest",
+            updated,
+            "adam_catch_up",
             step=step,
-            t=len(self.table),
+            t=TABLE_STEPS,
             log_beta2=math.log2(BETA2),
-            table=self.table,
-            last=last,
+            skipped_steps=self._skipped_steps,
+            last_step=last_step,
         )
+        return updated
 
-    def update_opacity(self, grad_opacity, opacity, m, v, rate, eps):
-        """Update opacities, which stay in [0, 1]. All arrays: (N); m and v start as zeros."""
+    def update_opacity(
+        self,
+        updated: UpdatedPoints,
+        grad_opacity: Array,
+        opacity: Array,
+        moments: dict[str, Array],
+        *,
+        rate: float,
+        eps: float,
+    ) -> None:
+        """Update opacities, clamped to [0, 1]. All arrays: (N); moments "m" and "v" start as
+        zeros.
+        """
         self._launch(
+            updated,
             "adam_opacity_update",
             grad_opacity=grad_opacity,
             opacity=opacity,
-            m=m,
-            v=v,
-            **_step_arguments(self.step, rate, eps),
+            **moments,
+            **_rate_and_eps(updated.step, rate, eps),
         )
 
-    def sh_moments(self, block, n):
-        """{kind: zeros} for n points: "m" and "v" (N, count, 16) or, in 16 bits, both as "mv" (N,
-        count, 2, 16).
+    def update_sh(
+        self,
+        updated: UpdatedPoints,
+        block: ShBlock,
+        gradient: ShGradient,
+        sh: Array,
+        *,
+        moments: dict[str, Array],
+        rate: float,
+        eps: float,
+    ) -> None:
+        """Update the SH coefficients of one block. sh: (N, block.count, 16). moments: start as
+        zeros, "m" and "v" shaped like sh, or in 16 bits both as "mv" (N, block.count, 2, 16).
         """
-        if self.scale is None:
-            return {kind: self.dev.zeros((n, block.count, 16)) for kind in self.kinds}
-        return {kind: self.dev.zeros((n, block.count, 2, 16), np.float16) for kind in self.kinds}
-
-    def update_sh(self, block, grid, camera, ids, grad_point_features, sh, moments, rate, eps):
-        """Update the SH coefficients of one block.
-
-        block: points.ShBlock. grid: (8,) of Grid.packed(). camera: (20,) of the view the gradient
-        belongs to. ids: (N,) uint32 grid ids. grad_point_features: (N, 16) gradient of the points'
-        features in that view. sh: (N, block.count, 16). moments: as sh_moments() made them.
-        """
-        kernel, defines = "adam_sh_update", {"FIRST": block.first, "K": block.count}
+        kernel, defines = "adam_sh_update", {"SH_FIRST": block.first, "SH_COUNT": block.count}
+        arguments = moments
         if self.scale is not None:
-            kernel, defines["SCALE"] = "adam_sh_update_half", f"{self.scale!r}f"
-            moments = {"moments": moments["mv"], "seed": self.step * GOLDEN % 2**32}
+            kernel, defines["SCALE"] = "adam_sh_update_16bit", f"{self.scale!r}f"
+            arguments = moments | {"seed": updated.step * GOLDEN % 2**32}
         self._launch(
+            updated,
             kernel,
             defines,
-            grid=grid,
-            camera=camera,
-            ids=ids,
             sh=sh,
-            grad_point_features=grad_point_features,
-            **moments,
-            **_step_arguments(self.step, rate, eps),
+            grid=gradient.grid,
+            camera=gradient.camera_buffer,
+            ids=gradient.ids,
+            grad_point_features=gradient.grad_point_features,
+            **arguments,
+            **_rate_and_eps(updated.step, rate, eps),
         )
 
-    def _launch(self, kernel, defines=None, **arguments):
-        self.dev.program("training/adam", **self.defines, **defines or {}).launch(
-            kernel, self.count, s=self.count, rows=self.rows, rest=self.rest, **arguments
+    def _launch(self, updated, kernel, defines=None, **arguments):
+        adam_program(self.dev, LAZY=int(updated.lazy), **defines or {}).launch(
+            kernel,
+            updated.count,
+            s=updated.count,
+            rows=updated.rows,
+            skipped=updated.skipped,
+            **arguments,
         )
 
 
-def ema_update(dev, average, parameter, weight):
-    """Move an average, in place: average += weight * (parameter - average). A weight of 1 copies,
-    whatever it held.
+def ema_update(dev: Device, ema: Array, parameter: Array, weight: float) -> None:
+    """Move an EMA, in place: ema += weight * (parameter - ema). A weight of 1 copies, whatever it
+    held.
 
-    average, parameter: float32 arrays of one shape, any. Raises ValueError when the shapes differ.
+    ema, parameter: float32 arrays of one shape, any. Raises ValueError when the shapes differ.
     """
-    _same_shape(average=average, parameter=parameter)
+    _same_shape(ema=ema, parameter=parameter)
     if weight == 1:
-        dev.copy(average, parameter)
+        dev.copy(ema, parameter)
         return
-    dev.program("training/adam").launch(
+    adam_program(dev).launch(
         "ema_update",
         -(-parameter.size // 16),
         n=parameter.size,
         weight=weight,
         parameter=parameter,
-        average=average,
+        ema=ema,
     )
+
+
+class Ema:
+    """Exponential moving averages of named parameters.
+
+    arrays: {name: float32 array like the parameter}, empty before the first update.
+    """
+
+    def __init__(self, dev: Device):
+        self.dev = dev
+        self.arrays: dict[str, Array] = {}
+
+    def update(self, parameters: dict[str, Array], weight: float) -> None:
+        """Move the averages towards the parameters by `weight`; a weight of 1 starts them there."""
+        for name, parameter in parameters.items():
+            if name not in self.arrays:
+                self.arrays[name] = self.dev.empty(parameter.shape)
+            ema_update(self.dev, self.arrays[name], parameter, weight)
+
+    def apply(self, parameters: dict[str, Array]) -> None:
+        """Copy the averages, if there are any, into the parameters and release them."""
+        for name in list(self.arrays):
+            self.dev.copy(parameters[name], self.arrays.pop(name))
+
+    def restore(self, parameters: dict[str, Array], stored: dict[str, np.ndarray]) -> None:
+        """Take over stored averages, by the parameters' names. Raises ValueError for another
+        size.
+        """
+        for name, array in stored.items():
+            self.arrays[name] = self.dev.upload(array.reshape(parameters[name].shape))

@@ -1,8 +1,13 @@
 """The training loss: L1 + weight * (1 - SSIM), and its gradient."""
 
-from types import SimpleNamespace
+import numpy as np
+from pyopencl.array import Array
 
-WINDOW = 11  # pixels, the side of an SSIM window
+from pp_cl.device.buffers import Buffers, Table
+from pp_cl.device.device import Device
+
+TAPS = 11  # pixels, the side of an SSIM window
+MARGIN = 2  # float16 by which a scratch row is longer than its values, >= 3 * (TAPS - 1) / 16
 
 
 class Loss:
@@ -14,97 +19,96 @@ class Loss:
     device after a call: L, L1, 1 - SSIM, mean squared error.
     """
 
-    def __init__(self, dev, ssim_weight):
+    def __init__(self, dev: Device, ssim_weight: float):
         self.dev = dev
         self.ssim_weight = ssim_weight
         self.terms = dev.zeros((4,))
-        self._sizes = None
+        self._buffers = Buffers(dev)
 
-    def forward_backward(self, prediction, target, left=0, top=0):
+    @staticmethod
+    def table(
+        prediction_shape: tuple[int, ...], target_shape: tuple[int, ...], ssim_weight: float
+    ) -> Table:
+        """The scratch for a prediction (PH, PW, 3) and a target (H, W, 3), and the gradient."""
+        height, width, _ = target_shape
+        has_ssim = ssim_weight != 0 and min(height, width) >= TAPS
+        window_rows = height - TAPS + 1 if has_ssim else 0
+        blocks = -(-3 * width // 16) + MARGIN  # float16 in a scratch row
+        shapes = {
+            "moments": (window_rows, 4, blocks, 16),
+            "slopes": (window_rows, 3, blocks, 16),
+            "spread": (window_rows, 3, blocks, 16),
+            "partial_terms": (window_rows + height, blocks, 4),
+            "row_terms": (window_rows + height, 4),
+            "grad_prediction": tuple(prediction_shape),
+        }
+        return {name: (shape, np.float32) for name, shape in shapes.items()}
+
+    def forward_backward(
+        self, prediction: Array, target: Array, left: int = 0, top: int = 0
+    ) -> Array:
         """dL/dprediction, (PH, PW, 3) float32, valid until the next call; sets `terms`.
 
         prediction: (PH, PW, 3) float32, unclamped. target: (H, W, 3) float32, lies on the
         prediction's columns left..left+W and rows top..top+H; the gradient is 0 elsewhere. Raises
         ValueError where it reaches outside.
         """
-        (height, width, _), (prediction_height, prediction_width, _) = (
-            target.shape,
-            prediction.shape,
-        )
-        if (
-            min(left, top) < 0
-            or left + width > prediction_width
-            or top + height > prediction_height
-        ):
-            raise ValueError(
-                f"target {target.shape} at ({left}, {top}) reaches outside the prediction"
-                f" {prediction.shape}"
-            )
-        self._prepare(prediction.shape, target.shape)
+        corner = _corner(prediction.shape, target.shape, left, top)
+        height, width, _ = target.shape
         b = self._buffers
-        images = {
-            "prediction": prediction,
-            "target": target,
-            "pw": prediction_width,
-            "w": width,
-            "corner": 3 * (top * prediction_width + left),
-        }
-        rows = {"v": b.window_rows, "blocks": b.blocks}
-        size = (b.blocks, b.window_rows)
-        launch = self.dev.program("training/loss").launch
-        launch("loss_moments", size, moments=b.moments, **images, **rows)
-        launch(
+        b.require(self.table(prediction.shape, target.shape, self.ssim_weight))
+        window_rows, _, blocks, _ = b.moments.shape
+        rows, size = {"v": window_rows, "blocks": blocks}, (blocks, window_rows)
+        images = {"prediction": prediction, "target": target}
+        images |= {"pw": prediction.shape[1], "w": width, "corner": corner}
+        slopes, spread, partial_terms = b.slopes, b.spread, b.partial_terms
+
+        self._launch("loss_moments", size, moments=b.moments, **images, **rows)
+        self._launch(
             "loss_similarity",
             size,
             w=width,
             weight=self.ssim_weight,
             moments=b.moments,
-            slopes=b.slopes,
-            partial_terms=b.partial_terms,
+            slopes=slopes,
+            partial_terms=partial_terms,
             **rows,
         )
-        launch("loss_spread", size, slopes=b.slopes, spread=b.spread, **rows)
+        self._launch("loss_spread", size, slopes=slopes, spread=spread, **rows)
         if prediction.shape != target.shape:
             self.dev.fill(b.grad_prediction, 0)
-        launch(
+        self._launch(
             "loss_gradient",
-            (b.blocks, height),
+            (blocks, height),
             h=height,
-            spread=b.spread,
+            spread=spread,
             grad_prediction=b.grad_prediction,
-            partial_terms=b.partial_terms,
+            partial_terms=partial_terms,
             **images,
             **rows,
         )
-        n = b.window_rows + height
-        launch("loss_sum", n, rows=n, m=b.blocks, terms=b.partial_terms, sums=b.row_terms)
-        launch(
-            "loss_sum",
-            1,
-            rows=1,
-            m=n,
-            terms=b.row_terms.reshape(1, n, 4),
-            sums=self.terms.reshape(1, 4),
-        )
+        self._sum(partial_terms, b.row_terms)
+        self._sum(b.row_terms.reshape(1, -1, 4), self.terms.reshape(1, 4))
         return b.grad_prediction
 
-    def _prepare(self, prediction_shape, target_shape):
-        """Allocate for these sizes, unless the last call had the same."""
-        if self._sizes == (prediction_shape, target_shape):
-            return
-        height, width, _ = target_shape
-        has_ssim = self.ssim_weight != 0 and min(height, width) >= WINDOW
-        window_rows = height - WINDOW + 1 if has_ssim else 0
-        blocks = -(-3 * width // 16) + 2  # float16 in a scratch row, with the kernels' margin
-        empty = self.dev.empty
-        self._buffers = SimpleNamespace(
-            window_rows=window_rows,
-            blocks=blocks,
-            moments=empty((window_rows, 4, blocks, 16)),
-            slopes=empty((window_rows, 3, blocks, 16)),
-            spread=empty((window_rows, 3, blocks, 16)),
-            partial_terms=empty((window_rows + height, blocks, 4)),
-            row_terms=empty((window_rows + height, 4)),
-            grad_prediction=empty(prediction_shape),
+    def _sum(self, terms, sums):
+        """Write sums (ROWS, 4) of terms (ROWS, M, 4)."""
+        rows, m, _ = terms.shape
+        self._launch("loss_sum", rows, rows=rows, m=m, terms=terms, sums=sums)
+
+    def _launch(self, kernel, size, **arguments):
+        program = self.dev.program("training/loss", TAPS=TAPS, MARGIN=MARGIN)
+        program.launch(kernel, size, **arguments)
+
+
+def _corner(prediction_shape, target_shape, left, top):
+    """First value of the prediction under a target at (left, top). Raises ValueError where the
+    target reaches outside.
+    """
+    (ph, pw, _), (height, width, _) = prediction_shape, target_shape
+    if min(left, top) < 0 or left + width > pw or top + height > ph:
+        raise ValueError(
+            f"target {target_shape} at ({left}, {top}) reaches outside the prediction"
+            f" {prediction_shape}"
         )
-        self._sizes = (prediction_shape, target_shape)
+    return 3 * (top * pw + left)

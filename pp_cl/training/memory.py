@@ -1,101 +1,112 @@
-"""The memory a training will take, as a table made before it is taken."""
+"""The memory a training will take, summed over the tables of its stages before they allocate."""
 
 import math
 
+import numpy as np
+
+from pp_cl.config import Config, RasterConfig
+from pp_cl.device.buffers import Table, grown, table_bytes
 from pp_cl.device.device import Device
 from pp_cl.errors import UserError
-from pp_cl.raster.sh import sh_blocks
-from pp_cl.render import NETWORK_MULTIPLE
-from pp_cl.training.prune import SCRATCH_BYTES
-from pp_cl.training.smooth import CHUNK
+from pp_cl.model import Model, PointCloud
+from pp_cl.raster.blend import Blend
+from pp_cl.raster.blend_weights import BlendWeights
+from pp_cl.raster.pairs import PairBuilder
+from pp_cl.raster.project import Projection
+from pp_cl.render import NETWORK_MULTIPLE, Renderer
+from pp_cl.scene.camera import Camera
+from pp_cl.scene.views import View
+from pp_cl.training.loss import Loss
+from pp_cl.training.optimiser import Optimiser
+from pp_cl.training.point_state import PointState
+from pp_cl.training.prune import prune_table
+from pp_cl.training.smooth import Smoother, chunk_points
 
 MIB, GIB = 2**20, 2**30
 
-Plan = list[tuple[str, str, int]]  # what the buffers are for, their shapes as text, bytes
-# two keys of 8, pixel, closeness, point and two weights of 4 bytes, a quarter of spare room
-PAIR_BYTES = 45
+Plan = list[tuple[str, Table]]  # what the buffers of each table are for
 
 
-def point_bytes(train, degree):
-    """{what: bytes on the device} of one point of a training. train: config.TrainConfig. degree: of
-    the SH.
-    """
-    coefficients = 16 * sum(block.count for block in sh_blocks(degree))
-    learned = 4 * (1 + coefficients)
-    return {
-        "ids, opacities, SH coefficients": 4 + learned,
-        "Adam's moments": 2 * (4 + (2 if train.moments_16bit else 4) * coefficients),
-        "averages": learned if train.ema else 0,
-        # 4 of adam_rest; last steps, flags, offsets, rows
-        "weights, Adam's lists": 4 * (1 + (8 if train.lazy_adam else 0)),
-        # position, box, features, gradients, offsets and lists
-        "points of one view": 4 * (4 + 2 + 16 + 16 + 1 + 3),
-        "neighbours": 4 * 6 if train.sh_smoothing > 0 else 0,
-    }
-
-
-def memory_plan(dev, config, model, views):
-    """[(what, shape text, bytes)] of the device buffers of a training with this model on these
-    views.
-    """
-    n, train = model.count, config.train
+def memory_plan(config: Config, model: Model, views: list[View]) -> Plan:
+    """The device buffers of a training with this model on these views."""
+    n, train, blocks = model.count, config.train, model.cloud.blocks
     camera = views[0].camera
-    width, height = (
-        side + -side % NETWORK_MULTIPLE for side in train.crop_size(camera.width, camera.height)
-    )
-    rows = [
-        (what, f"({n}) x {size} bytes", n * size)
-        for what, size in point_bytes(train, model.degree).items()
-        if size
+    width, height = train.crop_size(camera.width, camera.height)
+    padded, _, _ = camera.crop(0, 0, width, height).padded(NETWORK_MULTIPLE)
+    size = (padded.height, padded.width)
+    image, target = (*size, 3), (height, width, 3)
+    row_bytes = max(64 * block.count for block in blocks)  # of the largest array of a point
+    return [
+        ("points", PointCloud.table(n, blocks)),
+        ("training state of the points", PointState.table(n, blocks, train)),
+        ("averages of the points", PointState.ema_table(n, blocks) if train.ema else {}),
+        ("optimiser", Optimiser.table(n, model.net.parameters, train)),
+        ("smoothing (estimate)", _smoothing_table(config, model)),
+        ("pruning (at most)", prune_table(n, row_bytes)),
+        *_raster_tables(
+            config.raster, n, size, n * _pixels_per_point(config.raster, model, camera)
+        ),
+        (f"network at {size[1]}x{size[0]}", _network_table(model, size)),
+        ("loss", Loss.table(image, target, train.ssim_weight)),
+        (
+            "photograph and target",
+            {"image": (views[0].image.shape, np.uint8), "target": (target, np.float32)},
+        ),
     ]
-    row_bytes = max(64 * block.count for block in model.blocks)  # of the largest array of a point
-    if train.sh_smoothing > 0:
-        chunk = min(n, max(CHUNK, n // model.grid.dims[2]))  # the points of a layer, about
-        rows.append(
-            ("smoothing (estimate)", f"2 x ({chunk}) x {row_bytes} bytes", 2 * chunk * row_bytes)
-        )
-    rows.append(("pruning", "at most", min(SCRATCH_BYTES, n * row_bytes)))
-    if config.raster.early_stop > 0 or config.raster.tau > 0:
-        rows.append(("points kept in one view", f"({n}) x 12 bytes", 12 * n))
-    pairs = round(n * _pixels_per_point(config, model, camera))
-    rows.append(
-        ("point-pixel pairs (estimate)", f"({pairs}) x {PAIR_BYTES} bytes", PAIR_BYTES * pairs)
-    )
-    network = model.net.memory_plan(height, width, True)
-    rows.append(
-        (
-            f"network at {width}x{height}",
-            f"{len(network)} buffers",
-            sum(size for _, _, size in network),
-        )
-    )
-    image = views[0].image
-    rows.append(
-        (
-            "image, target, loss",
-            f"({height}, {width}, 3) x 12",
-            image.nbytes + 4 * height * width * 3 * 12,
-        )
-    )
-    return rows
 
 
-def _pixels_per_point(config, model, camera):
+def _smoothing_table(config, model):
+    """The Smoother's. Its chunk depends on the neighbours, which are not known yet: they are about
+    a layer of the grid apart.
+    """
+    if config.train.sh_smoothing == 0:
+        return {}
+    n = model.count
+    return Smoother.table(n, chunk_points(n, n // model.grid.dims[2]))
+
+
+def _network_table(model, size):
+    plan = model.net.memory_plan(*size, True)
+    return {f"{i} {name}": (shape, np.float32) for i, (name, shape, _) in enumerate(plan)}
+
+
+def _raster_tables(settings, n, size, pairs):
+    """The tables of the stages from projection to blending. pairs: an estimated number, because the
+    true one is known only when a view has been projected.
+    """
+    pixels, room = size[0] * size[1], grown(0, round(pairs))
+    has_roles = settings.early_stop > 0 or settings.tau > 0 or settings.max_tracked > 0
+    return [
+        ("projection", Projection.table(n)),
+        ("pairs (estimate)", PairBuilder.table(n, pixels, room)),
+        ("blend weights (estimate)", BlendWeights.table(n, room, has_roles)),
+        ("blend", Blend.table(n, pixels)),
+        ("features", Renderer.table(n, *size)),
+    ]
+
+
+def _pixels_per_point(settings: RasterConfig, model: Model, camera: Camera) -> float:
     """Mean area of a footprint in pixels, seen from the middle of the depth range."""
     middle = sum(model.depth_range) / 2
     radius = 0.75  # the hard disc
-    if config.raster.footprint == "soft":
-        radius = max(radius, config.raster.radius * model.grid.edge * camera.fx / middle)
+    if settings.footprint == "soft":
+        radius = max(radius, settings.radius * model.grid.edge * camera.fx / middle)
     return math.pi * radius**2
+
+
+def plan_bytes(plan: Plan) -> int:
+    """Bytes of all buffers of a plan."""
+    return sum(table_bytes(table) for _, table in plan)
 
 
 def plan_lines(plan: Plan, dev: Device) -> list[str]:
     """The plan as text, against the device's limits."""
-    rows = [*plan, ("total", "", sum(size for _, _, size in plan))]
+    rows = [(what, len(table), table_bytes(table)) for what, table in plan if table]
+    rows.append(("total", sum(number for _, number, _ in rows), plan_bytes(plan)))
     return [
         f"memory plan ({dev.name}: {dev.info['memory_bytes'] / MIB:.0f} MiB, at most"
         f" {dev.info['max_allocation_bytes'] / MIB:.0f} at once)",
-        *(f"  {what:36s} {shape:28s} {size / MIB:9.1f} MiB" for what, shape, size in rows),
+        *(f"  {what:30s} {number:4d} buffers {size / MIB:9.1f} MiB" for what, number, size in rows),
     ]
 
 
@@ -103,7 +114,7 @@ def spare_memory(plan: Plan, dev: Device, limit: float) -> int:
     """Bytes that a plan leaves of `limit` GiB; 0 without a limit. Raises UserError naming the
     settings where it takes more than the limit, or than the device has.
     """
-    needed, available = sum(size for _, _, size in plan), dev.info["memory_bytes"]
+    needed, available = plan_bytes(plan), dev.info["memory_bytes"]
     if needed > available:
         raise UserError(
             f"the training needs {needed / MIB:.0f} MiB, {dev.name} has {available / MIB:.0f}:"

@@ -1,14 +1,18 @@
-"""Adam for everything learned, and the averaged (EMA) copy of it.
+"""The update of everything learned: Adam, and the averaged (EMA) copy."""
 
-The moments and averages of the points lie beside them in model.points, so that pruning moves all
-rows alike.
-"""
+from __future__ import annotations
 
 from dataclasses import dataclass
 
 import numpy as np
+from pyopencl.array import Array
 
-from pp_cl.training.adam import PointAdam, Touched, adam_update, ema_update
+from pp_cl.config import NetworkConfig, TrainConfig
+from pp_cl.device.buffers import Table
+from pp_cl.device.device import Device
+from pp_cl.model import Model
+from pp_cl.training.adam import Ema, PointAdam, PointsWithGradient, ShGradient, adam_update
+from pp_cl.training.point_state import PointState
 from pp_cl.training.schedule import learning_rate
 
 OPACITY_EPS = 1e-15  # opacity gradients span many decades; clamping bounds the step instead
@@ -19,18 +23,18 @@ NETWORK_EPS = 1e-8  # PyTorch's default
 class Rates:
     """Adam's rates at one step. sh: of the degrees 0, 1, 2."""
 
-    sh: tuple
+    sh: tuple[float, ...]
     opacity: float
     network: float
 
     @classmethod
-    def at(cls, step, network, train):
-        """The rates of a step from 0 on. network, train: config.NetworkConfig,
-        config.TrainConfig.
-        """
+    def at(cls, step: int, network: NetworkConfig, train: TrainConfig) -> Rates:
+        """The rates of a step from 0 on."""
         steps = train.iterations
         sh = tuple(
-            learning_rate(step, steps, first, first * train.sh_rate_decay, round(delay * steps))
+            learning_rate(
+                step, steps, first, first * train.sh_rate_decay, delay_steps=round(delay * steps)
+            )
             if first
             else 0.0
             for first, delay in zip(train.sh_rate, train.sh_delay, strict=True)
@@ -43,116 +47,110 @@ class Rates:
 
 
 class Optimiser:
-    """Moments of the points and the network, and their updates.
+    """Updates points and network; owns the network's moments and averages, the points' are in
+    `state`.
 
-    lazy: a step updates only the points that received a gradient; else all of them. scale: see
-    PointAdam.
+    moment_scale: of SH moments in 16 bits; None: in 32.
     """
 
-    def __init__(self, dev, model, lazy=False, scale=None):
+    def __init__(self, dev: Device, model: Model, state: PointState, moment_scale: float | None):
         self.dev = dev
         self.model = model
-        self.lazy = lazy
+        self.state = state
+        self.point_adam = PointAdam(dev, moment_scale)
+        self.with_gradient = PointsWithGradient(dev)
         self.moments = {
-            f"{kind}.{name}": dev.zeros(array.shape)
+            name: {kind: dev.zeros(array.shape) for kind in "mv"}
             for name, array in model.net.parameters.items()
-            for kind in "mv"
         }
-        self.point_adam, self.touched = PointAdam(dev, lazy, scale), Touched(dev)
-        for block in model.blocks:
-            for kind, array in self.point_adam.sh_moments(block, model.count).items():
-                model.points[f"{kind}.{block.name}"] = array
-        for kind in "mv":
-            model.points[f"{kind}.opacity"] = dev.zeros((model.count,))
-        if lazy:
-            model.points["last"] = dev.zeros((model.count,), np.uint32)
-        self.averages = {}  # of the network; those of the points are model.points["a.*"]
+        self.ema = Ema(dev)
 
-    def update(self, step, rates, grads, camera, feature_eps, kept):
+    @staticmethod
+    def table(n: int, parameters: dict[str, Array], settings: TrainConfig) -> Table:
+        """The arrays for n points and these parameters of a network, averages included."""
+        kinds = ("m", "v", "ema") if settings.ema else ("m", "v")
+        table = {
+            f"{kind}.{name}": (array.shape, np.float32)
+            for name, array in parameters.items()
+            for kind in kinds
+        }
+        if settings.lazy_adam:
+            table |= PointAdam.table(n) | PointsWithGradient.table(n)
+        return table
+
+    def update(
+        self,
+        step: int,
+        rates: Rates,
+        grads: tuple[Array, Array],
+        *,
+        camera_buffer: Array,
+        shaded: Array,
+        sh_eps: float,
+    ) -> None:
         """One Adam step.
 
-        step: from 1. grads: (grad_point_features (N,16), grad_opacity (N)); the network's own
-        gradients lie in it. camera: (20) device buffer of the view. feature_eps: Adam's eps of the
-        SH coefficients. kept: (S) uint32, the points of the picture; a lazy update reads the
-        gradients of no others.
+        step: from 1. grads: (grad_point_features (N,16), grad_opacity (N)); the network's own lie
+        in model.net.gradients. camera_buffer: (20), of the image the gradients belong to. shaded:
+        (S) uint32, the points that make up that image; lazy Adam reads the gradients of no others.
+        sh_eps: Adam's eps of the SH coefficients.
         """
-        grad_features, grad_opacity = grads
-        points, adam = self.model.points, self.point_adam
-        if self.lazy:
-            adam.begin_lazy(step, self.touched.rows(kept, *grads), points["last"])
+        cloud, state, adam = self.model.cloud, self.state, self.point_adam
+        grad_point_features, grad_opacity = grads
+        if state.last_step is None:
+            updated = adam.all_points(step, cloud.count)
         else:
-            adam.begin(step, self.model.count)
-        for block in self.model.blocks:
-            if rates.sh[block.degree] == 0:
-                continue  # its moments are not even read
-            adam.update_sh(
-                block,
-                self.model.grid_buffer,
-                camera,
-                points["ids"],
-                grad_features,
-                points[block.name],
-                {kind: points[f"{kind}.{block.name}"] for kind in adam.kinds},
-                rates.sh[block.degree],
-                feature_eps,
-            )
-        opacity = [points[name] for name in ("opacity", "m.opacity", "v.opacity")]
-        adam.update_opacity(grad_opacity, *opacity, rates.opacity, OPACITY_EPS)
-        for name, parameter in self.model.net.parameters.items():
-            adam_update(
-                self.dev,
-                parameter,
-                self.model.net.gradients[name],
-                self.moments[f"m.{name}"],
-                self.moments[f"v.{name}"],
-                step,
-                rates.network,
-                NETWORK_EPS,
-            )
+            rows = self.with_gradient.rows(shaded, *grads)
+            updated = adam.listed_points(step, rows, state.last_step)
 
-    def average(self, weight):
-        """Move the averages towards the present values by `weight`; a weight of 1 starts them
-        there.
+        grid = self.model.grid_buffer
+        gradient = ShGradient(grid, camera_buffer, cloud.ids, grad_point_features)
+        for block, sh in zip(cloud.blocks, cloud.sh, strict=True):
+            moments, rate = state.moments(block.name), rates.sh[block.degree]
+            if rate > 0:  # else the moments are not even read
+                adam.update_sh(updated, block, gradient, sh, moments=moments, rate=rate, eps=sh_eps)
+        moments = state.moments("opacity")
+        adam.update_opacity(
+            updated, grad_opacity, cloud.opacity, moments, rate=rates.opacity, eps=OPACITY_EPS
+        )
+        self._update_network(step, rates.network)
+
+    def _update_network(self, step, rate):
+        net = self.model.net
+        for name, parameter in net.parameters.items():
+            grad, moments = net.gradients[name], self.moments[name]
+            adam_update(self.dev, parameter, grad, moments, step=step, rate=rate, eps=NETWORK_EPS)
+
+    def update_ema(self, weight: float) -> None:
+        """Move the averages of points and network towards the present values by `weight`; a weight
+        of 1 starts them there.
         """
-        for parameter, store, key in self._averaged():
-            if key not in store:
-                store[key] = self.dev.empty(parameter.shape)
-            ema_update(self.dev, store[key], parameter, weight)
+        self.state.ema.update(self.model.cloud.learned(), weight)
+        self.ema.update(self.model.net.parameters, weight)
 
-    def adopt_averages(self):
+    def apply_ema(self) -> None:
         """Make the averages, where there are any, the model's values."""
-        for parameter, store, key in self._averaged():
-            if key in store:
-                self.dev.copy(parameter, store.pop(key))
+        self.state.ema.apply(self.model.cloud.learned())
+        self.ema.apply(self.model.net.parameters)
 
-    def _averaged(self):
-        points = self.model.points
-        for name in self.model.keys:
-            yield points[name], points, f"a.{name}"
-        for name, parameter in self.model.net.parameters.items():
-            yield parameter, self.averages, name
-
-    def arrays(self):
-        """{name: numpy array} of the state beside the model's own arrays."""
-        own = {f"moment.{name}": a.get() for name, a in self.moments.items()}
-        own |= {f"average.{name}": a.get() for name, a in self.averages.items()}
-        learned = {"ids", *self.model.keys}
-        return own | {
-            f"state.{name}": a.get() for name, a in self.model.points.items() if name not in learned
+    def arrays(self) -> dict[str, np.ndarray]:
+        """{name in a checkpoint: array} of all but the model's own arrays."""
+        moments = {
+            f"moment.{kind}.{name}": array.get()
+            for name, arrays in self.moments.items()
+            for kind, array in arrays.items()
         }
+        averages = {f"average.{name}": array.get() for name, array in self.ema.arrays.items()}
+        return self.state.arrays() | moments | averages
 
-    def restore(self, arrays):
-        """Take the state of a checkpoint, as written by arrays(). Raises KeyError and ValueError
-        for what does not fit.
+    def restore(self, arrays: dict[str, np.ndarray]) -> None:
+        """Take over the state of a checkpoint, as written by arrays(). Raises KeyError and
+        ValueError for what does not fit.
         """
-        for name in self.moments:
-            self.moments[name].set(arrays[f"moment.{name}"])
-        points = self.model.points
-        for name in [n for n in points if n not in ("ids", *self.model.keys)]:
-            if arrays[f"state.{name}"].shape != points[name].shape:
-                raise ValueError(f"state.{name} has shape {arrays[f'state.{name}'].shape}")
-            points[name].set(arrays[f"state.{name}"])
-        for parameter, store, key in list(self._averaged()):
-            name = f"state.{key}" if store is points else f"average.{key}"
-            if name in arrays:
-                store[key] = self.dev.upload(arrays[name].reshape(parameter.shape))
+        self.state.restore(self.model.cloud, arrays)
+        for name, moments in self.moments.items():
+            for kind, array in moments.items():
+                array.set(arrays[f"moment.{kind}.{name}"])
+        parameters = self.model.net.parameters
+        keys = {name: f"average.{name}" for name in parameters}
+        self.ema.restore(parameters, {n: arrays[key] for n, key in keys.items() if key in arrays})

@@ -1,7 +1,10 @@
-"""Smoothing of the SH coefficients over the grid, outside Adam: its moments know nothing of it."""
+"""Smoothing of the SH coefficients over the grid, outside Adam: it leaves the moments alone."""
 
 import numpy as np
+from pyopencl.array import Array
 
+from pp_cl.device.buffers import Buffers, Table
+from pp_cl.device.device import Device
 from pp_cl.raster.sh import SH_BLOCKS
 
 NONE = 0xFFFFFFFF
@@ -10,42 +13,46 @@ CHUNK = 16384
 MOST_COEFFICIENTS = max(block.count for block in SH_BLOCKS)  # of one point in one array
 
 
-def neighbour_table(dev, grid, ids):
-    """(N, 6) uint32: index of each point's neighbours -x, +x, -y, +y, -z, +z; 0xffffffff where the
-    grid has no point.
-
-    grid: (8,) of Grid.packed(). ids: (N,) uint32 grid ids, ascending.
+def chunk_points(n: int, furthest: int) -> int:
+    """How many of n points are smoothed at a time where neighbours lie up to `furthest` rows apart:
+    a chunk is written back once the next one is computed, so no neighbour may lie further away.
     """
-    neighbours = dev.empty((len(ids), 6), np.uint32)
-    dev.program("training/smooth").launch(
-        "neighbour_table", len(ids), n=len(ids), grid=grid, ids=ids, neighbours=neighbours
-    )
-    return neighbours
+    return min(max(furthest, CHUNK), n)
 
 
 class Smoother:
     """Smooths per-point coefficients over the grid; made anew when the points change.
 
-    grid: (8,) of Grid.packed(). ids: (N,) uint32 grid ids, ascending.
+    grid: (8,) of Grid.packed(). ids: (N,) uint32 grid ids, ascending. neighbours: (N, 6) uint32,
+    index of each point's neighbours -x, +x, -y, +y, -z, +z; 0xffffffff where the grid has no point.
     """
 
-    def __init__(self, dev, grid, ids):
+    def __init__(self, dev: Device, grid: Array, ids: Array):
         self.dev = dev
-        self.neighbours = neighbour_table(dev, grid, ids)
-        # A chunk is written back once the next one is computed, so no neighbour may lie further
-        # than one chunk away.
+        n = len(ids)
+        self._buffers = Buffers(dev)
+        self._buffers.require({"neighbours": self.table(n, 0)["neighbours"]})
+        self.neighbours = self._buffers.neighbours
+        dev.program("training/smooth").launch(
+            "neighbour_table", n, n=n, grid=grid, ids=ids, neighbours=self.neighbours
+        )
         after = self.neighbours.get()[:, 1::2]
-        reach = np.where(
-            after == NONE, 0, after - np.arange(len(ids), dtype=np.uint32)[:, None]
-        ).max(initial=0)
-        self.chunk = min(max(int(reach), CHUNK), len(ids))
-        self._slots = [dev.empty((self.chunk * MOST_COEFFICIENTS, 16)) for _ in range(2)]
+        places = np.arange(n, dtype=np.uint32)[:, None]
+        furthest = np.where(after == NONE, 0, after - places).max(initial=0)
+        self.chunk = chunk_points(n, int(furthest))
+        self._buffers.require(self.table(n, self.chunk))
 
-    def smooth(self, sh, amount):
+    @staticmethod
+    def table(n: int, chunk: int) -> Table:
+        """The arrays for n points that are smoothed `chunk` at a time."""
+        smoothed = ((chunk * MOST_COEFFICIENTS, 16), np.float32)
+        return {"neighbours": ((n, 6), np.uint32), "even": smoothed, "odd": smoothed}
+
+    def smooth(self, sh: Array, amount: float) -> None:
         """Move every coefficient f, in place: f += amount * (mean of the existing neighbours' f -
         f).
 
-        All reads see the old values; a point without neighbours stays as it is. amount: 0 to 1; 4 *
+        All reads see the old values; a point without neighbours keeps its own. amount: 0 to 1; 4 *
         lambda * learning rate for every fourth step. sh: (N, K, 16) float32, K up to 3; ValueError
         beyond.
         """
@@ -53,12 +60,13 @@ class Smoother:
         n, coefficients, _ = sh.shape
         if coefficients > MOST_COEFFICIENTS:
             raise ValueError(f"at most {MOST_COEFFICIENTS} coefficients a point: {sh.shape}")
+        slots = (self._buffers.even, self._buffers.odd)
         waiting = None
         for start in range(0, n, self.chunk):
             part = {
                 "first": start,
                 "count": min(self.chunk, n - start),
-                "smoothed": self._slots[start // self.chunk % 2],
+                "smoothed": slots[start // self.chunk % 2],
                 "n": n,
                 "k": coefficients,
                 "sh": sh,
@@ -67,7 +75,7 @@ class Smoother:
                 "smooth_gather", part["count"], neighbours=self.neighbours, amount=amount, **part
             )
             if waiting:
-                launch("smooth_scatter", waiting["count"], **waiting)
+                launch("smooth_write_back", waiting["count"], **waiting)
             waiting = part
         if waiting:
-            launch("smooth_scatter", waiting["count"], **waiting)
+            launch("smooth_write_back", waiting["count"], **waiting)

@@ -216,8 +216,9 @@ def test_lego(dev, data, rng, always):
     views = load_scene(data / "nerf_synthetic/lego", ("train",)).splits["train"][:8]
     hull = build_grid(dev, views, 20_000)
     near_far = depth_range(views, hull)
-    model = Model.create(dev, hull.grid, hull.ids, near_far, (16, 32, 48), 1)
-    model.points["sh0"].set(rng.normal(size=model.points["sh0"].shape).astype(np.float32))
+    net = UNet(dev, widths=(16, 32, 48), seed=1)
+    model = Model.create(dev, hull.grid, hull.ids, near_far, net)
+    model.cloud.sh[0].set(rng.normal(size=model.cloud.sh[0].shape).astype(np.float32))
     renderer = Renderer(dev, model, preset("tiny").raster)
     for view in views[:2]:
         x = renderer.rasterise(view.reduced(2).camera, 0.01).features

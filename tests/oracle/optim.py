@@ -11,28 +11,27 @@ class Adam:
     def __init__(self, parameter, beta1=0.9, beta2=0.999):
         self.parameter = np.array(parameter, np.float64)
         self.m, self.v, self.t = np.zeros_like(self.parameter), np.zeros_like(self.parameter), 0
-        self.last = np.zeros(len(self.parameter), int)
+        self.last_step = np.zeros(len(self.parameter), int)
         self.betas = beta1, beta2
 
     def step(self, grad, rate, eps, low=-np.inf, high=np.inf, rows=slice(None)):
-        """rows: those that this step updates. They first make up for the steps since their last
-        one, as if the gradient had been 0 in these: the moments exactly, the moves with the
-        present rate and eps.
+        """rows: those that this step updates. The steps since their last one are applied first,
+        with gradients of 0: the moments exactly, the moves with the present rate and eps.
         """
         beta1, beta2 = self.betas
         self.t += 1
-        missed = (self.t - 1 - self.last[rows]).reshape(-1, *[1] * (self.parameter.ndim - 1))
-        self.last[rows] = self.t
+        skipped = (self.t - 1 - self.last_step[rows]).reshape(-1, *[1] * (self.parameter.ndim - 1))
+        self.last_step[rows] = self.t
         c1, c2 = 1 - beta1**self.t, 1 - beta2**self.t
         m, v, moved = self.m[rows], self.v[rows], self.parameter[rows].copy()
-        for j in range(1, missed.max(initial=0) + 1):
+        for j in range(1, skipped.max(initial=0) + 1):
             with_decay = rate / c1 * m * beta1**j / (np.sqrt(v / c2) + eps) / np.sqrt(beta2) ** j
-            moved -= np.where(j <= missed, with_decay, 0)
+            moved -= np.where(j <= skipped, with_decay, 0)
             if beta1**j < 1e-30:
                 break
         grad = np.asarray(grad, np.float64)[rows]
-        m = beta1 * beta1**missed * m + (1 - beta1) * grad
-        v = beta2 * beta2**missed * v + (1 - beta2) * grad * grad
+        m = beta1 * beta1**skipped * m + (1 - beta1) * grad
+        v = beta2 * beta2**skipped * v + (1 - beta2) * grad * grad
         moved -= rate / c1 * m / (np.sqrt(v / c2) + eps)
         self.m[rows], self.v[rows], self.parameter[rows] = m, v, np.clip(moved, low, high)
 
@@ -57,7 +56,7 @@ def sh_basis(direction):
 
 
 def sh_gradient(positions, eye, grad_point_features, block):
-    """(N, block.count, 16) gradient of the SH coefficients of one points.ShBlock."""
+    """(N, block.count, 16) gradient of the SH coefficients of one sh.ShBlock."""
     towards = positions - eye
     basis = sh_basis(towards / np.linalg.norm(towards, axis=-1, keepdims=True))[
         block.first : block.first + block.count

@@ -9,12 +9,10 @@ from support.raster_scene import PairedPoints, make_camera, make_points
 from support.scenes import ring_cameras
 
 from pp_cl.config import RasterConfig
-from pp_cl.errors import UserError
 from pp_cl.raster.pair_cache import ARRAYS, PairCache
 from pp_cl.raster.pairs import PairBuilder
 from pp_cl.raster.project import Footprint
 from pp_cl.render import Renderer
-from pp_cl.training.memory import spare_memory
 
 GAMMA = 0.03
 
@@ -82,10 +80,8 @@ def test_pictures_and_gradients_are_the_same_bits(dev, rng, footprint, tau):
     for step in range(8):
         if step == 5:
             kept.cache.clear()
-            model.points |= {
-                name: dev.upload(array.get()[::2]) for name, array in model.points.items()
-            }
-        model.points["opacity"].set(rng.uniform(0, 1, model.count).astype(np.float32))
+            model.cloud.compact(dev, dev.upload(np.arange(0, model.count, 2), np.uint32))
+        model.cloud.opacity.set(rng.uniform(0, 1, model.count).astype(np.float32))
         results = []
         for renderer, key in ((kept, step % 3), (anew, None)):
             result = renderer.rasterise(cameras[step % 3], GAMMA, key=key)
@@ -95,10 +91,3 @@ def test_pictures_and_gradients_are_the_same_bits(dev, rng, footprint, tau):
             results.append([result.features.get(), weights.get(), *gradients])
         assert same(*results)
     assert len(kept.cache) == 3 and len(anew.cache) == 0
-
-
-def test_what_a_plan_leaves(dev):
-    plan = [("a", "", 2**30), ("b", "", 2**29)]
-    assert spare_memory(plan, dev, 0) == 0 and spare_memory(plan, dev, 2) == 2**29
-    with pytest.raises(UserError, match="--memory 1: .* 1.50 GiB"):
-        spare_memory(plan, dev, 1)

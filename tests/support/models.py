@@ -3,7 +3,7 @@
 import numpy as np
 
 from pp_cl.model import Model
-from pp_cl.raster.sh import SH_BLOCKS
+from pp_cl.network.unet import UNet
 from pp_cl.scene.grid import Grid
 
 GRID = Grid((-0.5, -0.45, -0.4), 0.13, (8, 7, 6))
@@ -15,10 +15,10 @@ WIDTHS = (16, 16, 16)
 def make_model(dev, rng, n=90):
     """A model with random parameters and some opacities of 0 and 1."""
     ids = np.sort(rng.choice(np.prod(GRID.dims), n, replace=False)).astype(np.uint32)
-    model = Model.create(dev, GRID, ids, (2.0, 6.0), WIDTHS, seed=3)
+    model = Model.create(dev, GRID, ids, (2.0, 6.0), UNet(dev, widths=WIDTHS, seed=3))
     opacity = rng.uniform(0.2, 1, n).astype(np.float32)
     opacity[::9], opacity[4::9] = 0, 1
-    model.points["opacity"].set(opacity)
-    for block in SH_BLOCKS:
-        model.points[block.name].set(rng.normal(size=(n, block.count, 16)).astype(np.float32))
+    model.cloud.opacity.set(opacity)
+    for array in model.cloud.sh:
+        array.set(rng.normal(size=array.shape).astype(np.float32))
     return model

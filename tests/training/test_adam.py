@@ -7,11 +7,21 @@ from oracle import optim as oracle_optim
 from support.comparisons import relative_error
 from support.guarded import AWKWARD_SIZES
 
+from pp_cl.config import TrainConfig
 from pp_cl.device.device import kernel_folder
 from pp_cl.raster.sh import SH_BLOCKS
 from pp_cl.scene.camera import Camera
 from pp_cl.scene.grid import Grid
-from pp_cl.training.adam import PointAdam, Touched, adam_update, ema_update, moment_scale
+from pp_cl.training.adam import (
+    Ema,
+    PointAdam,
+    PointsWithGradient,
+    ShGradient,
+    adam_update,
+    ema_update,
+    moment_scale,
+)
+from pp_cl.training.point_state import PointState
 
 GRID = Grid((-0.7, -0.5, -0.6), 0.05, (23, 19, 31))
 SH_EPS = 4e-7  # of the tiny preset
@@ -20,18 +30,27 @@ CAMERA = Camera(np.column_stack([np.eye(3), EYE]), 100, 100, 50, 50, 100, 100)
 
 
 def moments(dev, parameter):
-    return dev.zeros(parameter.shape), dev.zeros(parameter.shape)
+    return {kind: dev.zeros(parameter.shape) for kind in "mv"}
+
+
+def sh_moments(dev, block, n, scale=None):
+    table = PointState.table(n, [block], TrainConfig(moments_16bit=scale is not None))
+    return {
+        name.partition(".")[0]: dev.zeros(*row)
+        for name, row in table.items()
+        if name.endswith(block.name)
+    }
 
 
 def train(dev, start, grads, rate, eps):
     """(parameter, m, v) after a step with each gradient, and the oracle."""
     parameter = dev.upload(start)
-    m, v = moments(dev, start)
+    state = moments(dev, start)
     oracle = oracle_optim.Adam(start)
     for step, grad in enumerate(grads, 1):
-        adam_update(dev, parameter, dev.upload(grad), m, v, step, rate, eps)
+        adam_update(dev, parameter, dev.upload(grad), state, step=step, rate=rate, eps=eps)
         oracle.step(grad, rate, eps)
-    return parameter.get(), m.get(), v.get(), oracle
+    return parameter.get(), state["m"].get(), state["v"].get(), oracle
 
 
 @pytest.mark.parametrize("n", [*AWKWARD_SIZES, 16])
@@ -93,7 +112,7 @@ def test_zero_gradient_moves_nothing_but_momentum_does(dev, rng):
 def test_refuses_different_shapes(dev):
     a, b = dev.zeros((4, 3)), dev.zeros((3, 4))
     with pytest.raises(ValueError, match="one shape"):
-        adam_update(dev, a, b, dev.zeros((4, 3)), dev.zeros((4, 3)), 1, 0.1, 1e-8)
+        adam_update(dev, a, b, moments(dev, a), step=1, rate=0.1, eps=1e-8)
     with pytest.raises(ValueError, match="one shape"):
         ema_update(dev, a, b, 0.5)
 
@@ -109,18 +128,28 @@ class Cloud:
             "sh": rng.standard_normal((n, block.count, 16)).astype(np.float32),
         }
         self.oracles = {name: oracle_optim.Adam(start) for name, start in self.start.items()}
-        self.adam, self.last, self.steps = (
-            PointAdam(dev, lazy, scale),
-            dev.zeros((n,), np.uint32),
-            0,
-        )
-        self.opacity = [dev.upload(self.start["opacity"]), *moments(dev, self.start["opacity"])]
-        self.sh, self.sh_moments = dev.upload(self.start["sh"]), self.adam.sh_moments(block, n)
+        self.adam, self.steps = PointAdam(dev, scale), 0
+        self.last_step = dev.zeros((n,), np.uint32)
+        self.opacity, self.sh = dev.upload(self.start["opacity"]), dev.upload(self.start["sh"])
+        self.opacity_moments = moments(dev, self.start["opacity"])
+        self.sh_moments = sh_moments(dev, block, n, scale)
         self.scene = [
             dev.upload(GRID.packed()),
             dev.upload(CAMERA.packed((2.0, 6.0))),
             dev.upload(self.ids),
         ]
+
+    def updated(self, rows):
+        """The points of this step."""
+        if not self.lazy:
+            return self.adam.all_points(self.steps, self.n)
+        rows = self.dev.upload(rows, np.uint32)
+        return self.adam.listed_points(self.steps, rows, self.last_step)
+
+    def update_opacity(self, updated, grad_opacity):
+        self.adam.update_opacity(
+            updated, grad_opacity, self.opacity, self.opacity_moments, rate=0.03, eps=1e-15
+        )
 
     def step(self, grad_features, grad_opacity, rows, step=None):
         """Update the rows; the kernels must not read the gradients of the others, which are NaN."""
@@ -134,14 +163,17 @@ class Cloud:
             )
             for g in (grad_features, grad_opacity)
         )
-        if self.lazy:
-            self.adam.begin_lazy(self.steps, self.dev.upload(rows, np.uint32), self.last)
-        else:
-            self.adam.begin(self.steps, self.n)
+        updated, product = self.updated(rows), ShGradient(*self.scene, features)
         self.adam.update_sh(
-            self.block, *self.scene, features, self.sh, self.sh_moments, 0.1, SH_EPS
+            updated,
+            self.block,
+            product,
+            self.sh,
+            moments=self.sh_moments,
+            rate=0.1,
+            eps=SH_EPS,
         )
-        self.adam.update_opacity(opacities, *self.opacity, 0.03, 1e-15)
+        self.update_opacity(updated, opacities)
         gradient = oracle_optim.sh_gradient(
             GRID.positions(self.ids), EYE, grad_features, self.block
         )
@@ -155,7 +187,8 @@ class Cloud:
         else:
             m, root = np.moveaxis(self.sh_moments["mv"].get().astype(np.float64), 2, 0) / self.scale
             sh = [self.sh.get(), m, root**2]
-        return {"sh": sh, "opacity": [array.get() for array in self.opacity]}
+        opacity = [self.opacity, *self.opacity_moments.values()]
+        return {"sh": sh, "opacity": [array.get() for array in opacity]}
 
     def check(self):
         """Compare parameters and moments with the oracle's."""
@@ -185,7 +218,7 @@ def test_dense_and_lazy_are_one_where_every_point_has_a_gradient(dev, n, block):
         cloud.check()
         np.testing.assert_array_equal(cloud.sh.get()[::3], cloud.start["sh"][::3])
         states.append(cloud.state())
-    assert (cloud.last.get() == 5).all()
+    assert (cloud.last_step.get() == 5).all()
     for name in states[0]:
         for dense, lazy in zip(states[0][name], states[1][name], strict=True):
             np.testing.assert_array_equal(dense, lazy)
@@ -198,10 +231,10 @@ def test_lazy_matches_oracle(dev, rng, n, block):
     for _ in range(12):
         cloud.step(*gradients(rng, n), np.flatnonzero(rng.random(n) < 0.4))
     cloud.check()
-    np.testing.assert_array_equal(cloud.last.get(), cloud.oracles["sh"].last)
+    np.testing.assert_array_equal(cloud.last_step.get(), cloud.oracles["sh"].last_step)
 
 
-def test_rows_that_are_not_listed_rest(dev, rng):
+def test_rows_that_are_not_listed_keep_their_values(dev, rng):
     cloud = Cloud(dev, rng, 257)
     cloud.step(*gradients(rng, 257), np.arange(257))
     before = cloud.state()
@@ -212,7 +245,7 @@ def test_rows_that_are_not_listed_rest(dev, rng):
             np.testing.assert_array_equal(array[1::2], old[1::2])
             assert (array[rows] != old[rows]).any()
     cloud.step(*gradients(rng, 257), [])
-    assert (cloud.last.get()[1::2] == 1).all() and (cloud.last.get()[::2] == 2).all()
+    assert (cloud.last_step.get()[1::2] == 1).all() and (cloud.last_step.get()[::2] == 2).all()
 
 
 def test_lazy_moments_are_dense_ones(dev, rng):
@@ -231,27 +264,27 @@ def test_lazy_moments_are_dense_ones(dev, rng):
 
 
 @pytest.mark.parametrize("n", AWKWARD_SIZES)
-def test_touched_are_those_with_a_gradient(dev, rng, n):
-    seen = np.flatnonzero(rng.random(n) < 0.8)
+def test_points_with_a_gradient(dev, rng, n):
+    shaded = np.flatnonzero(rng.random(n) < 0.8)
     features, opacity = np.full((n, 16), np.nan, np.float32), np.full(n, np.nan, np.float32)
-    features[seen], opacity[seen] = 0, 0
-    expected = [i for place, i in enumerate(seen) if place % 3]
-    for place, i in enumerate(seen):
+    features[shaded], opacity[shaded] = 0, 0
+    expected = [i for place, i in enumerate(shaded) if place % 3]
+    for place, i in enumerate(shaded):
         features[i, place % 16] = (0, 1e-37, np.nan)[place % 3] if place % 2 else 0
         opacity[i] = 0 if place % 2 else (-0.0, -1e-30, np.inf)[place % 3]
-    touched = Touched(dev)
+    points = PointsWithGradient(dev)
     for _ in range(2):
-        rows = touched.rows(dev.upload(seen, np.uint32), dev.upload(features), dev.upload(opacity))
+        rows = points.rows(dev.upload(shaded, np.uint32), dev.upload(features), dev.upload(opacity))
         np.testing.assert_array_equal(rows.get(), np.array(expected, np.uint32))
 
 
-def test_a_row_that_rested_is_where_dense_adam_has_moved_it(dev, rng):
+def test_a_row_that_caught_up_is_where_dense_adam_has_moved_it(dev, rng):
     """Late in training, where the bias corrections stand still, at a constant rate and a small eps:
     nothing is lost.
     """
     cloud, dense = Cloud(dev, rng, 257), oracle_optim.Adam(np.zeros((257, 1, 16)))
     dense.t, start = 20_000, cloud.sh.get().astype(np.float64)
-    cloud.last.set(np.full(257, 20_000, np.uint32))
+    cloud.last_step.set(np.full(257, 20_000, np.uint32))
     for step in range(20_001, 20_041):
         features = 100 * gradients(rng, 257)[0]
         rows = np.arange(257) if step == 20_040 else np.flatnonzero(rng.random(257) < 0.1)
@@ -266,7 +299,7 @@ def test_a_row_that_rested_is_where_dense_adam_has_moved_it(dev, rng):
 
 
 @pytest.mark.parametrize("step", [100, 3000, 50_000, 10**8])
-def test_long_rests(dev, rng, step):
+def test_many_skipped_steps(dev, rng, step):
     cloud = Cloud(dev, rng, 33)
     for at in (1, step, step + 1):
         cloud.step(*gradients(rng, 33), np.arange(33), at)
@@ -281,7 +314,7 @@ def test_opacity_stays_in_its_bounds(dev, rng):
             rng.standard_normal(257) + np.linspace(-2, 2, 257),
             np.arange(step % 2, 257, 2),
         )
-    opacity = cloud.opacity[0].get()
+    opacity = cloud.opacity.get()
     assert opacity.min() == 0
     assert opacity.max() == 1
     np.testing.assert_allclose(opacity, cloud.oracles["opacity"].parameter, atol=2e-6)
@@ -289,11 +322,9 @@ def test_opacity_stays_in_its_bounds(dev, rng):
 
 def test_a_nan_is_not_hidden(dev, rng):
     cloud = Cloud(dev, rng, 31)
-    cloud.adam.begin_lazy(1, dev.upload(np.arange(31), np.uint32), cloud.last)
-    cloud.adam.update_opacity(
-        dev.upload(np.full(31, np.nan), np.float32), *cloud.opacity, 0.1, 1e-15
-    )
-    assert np.isnan(cloud.opacity[0].get()).all()
+    cloud.steps = 1
+    cloud.update_opacity(cloud.updated(np.arange(31)), dev.upload(np.full(31, np.nan), np.float32))
+    assert np.isnan(cloud.opacity.get()).all()
 
 
 def test_sh_of_a_point_in_the_eye_stays_finite(dev):
@@ -304,22 +335,18 @@ def test_sh_of_a_point_in_the_eye_stays_finite(dev):
     )
     ids = np.array([2 + 5, 3], np.uint32)
     start = np.ones((2, 3, 16), np.float32)
-    adam = PointAdam(dev)
-    sh, sh_moments = dev.upload(start), adam.sh_moments(SH_BLOCKS[2], 2)
-    adam.begin(1, 2)
-    adam.update_sh(
-        SH_BLOCKS[2],
+    adam, sh, state = PointAdam(dev), dev.upload(start), sh_moments(dev, SH_BLOCKS[2], 2)
+    product = ShGradient(
         dev.upload(grid.packed()),
         dev.upload(camera.packed((2.0, 6.0))),
         dev.upload(ids),
         dev.zeros((2, 16)),
-        sh,
-        sh_moments,
-        0.5,
-        1e-15,
+    )
+    adam.update_sh(
+        adam.all_points(1, 2), SH_BLOCKS[2], product, sh, moments=state, rate=0.5, eps=1e-15
     )
     np.testing.assert_array_equal(sh.get(), start)
-    assert not sh_moments["m"].get().any()
+    assert not state["m"].get().any()
 
 
 @pytest.mark.parametrize("n", AWKWARD_SIZES)
@@ -335,7 +362,7 @@ def test_half_moments_follow_the_oracle(dev, rng, n, block):
     assert np.abs(parameter - oracle.parameter).max() < 0.01 * moved + 1e-7
     assert relative_error(m, oracle.m) < 0.005
     assert relative_error(np.sqrt(v), np.sqrt(oracle.v)) < 0.005
-    np.testing.assert_array_equal(cloud.last.get(), oracle.last)
+    np.testing.assert_array_equal(cloud.last_step.get(), oracle.last_step)
 
 
 @pytest.mark.large
@@ -416,3 +443,20 @@ def test_average_starts_as_a_copy(dev, rng):
     average = dev.empty((31, 3))  # NaN
     ema_update(dev, average, dev.upload(parameter), 1.0)
     np.testing.assert_array_equal(average.get(), parameter)
+
+
+def test_averages_are_applied_and_released(dev, rng):
+    parameters = {name: dev.upload(rng.random(33), np.float32) for name in "ab"}
+    start = {name: array.get() for name, array in parameters.items()}
+    ema, before = Ema(dev), dev.bytes
+    ema.update(parameters, 1.0)
+    for array in parameters.values():
+        dev.fill(array, 0)
+    ema.update(parameters, 0.25)
+    ema.apply(parameters)
+    assert not ema.arrays and dev.bytes == before
+    for name, array in parameters.items():
+        np.testing.assert_allclose(array.get(), 0.75 * start[name], rtol=1e-6)
+    dev.fill(parameters["a"], 0)
+    ema.apply(parameters)
+    assert not parameters["a"].get().any()

@@ -4,7 +4,7 @@ import math
 
 import pytest
 
-from pp_cl.training.schedule import average_weight, gamma, learning_rate
+from pp_cl.training.schedule import ema_weight, gamma_at, learning_rate
 
 SH_RATES = [
     (
@@ -24,8 +24,10 @@ SH_RATES = [
 
 @pytest.mark.parametrize(("arguments", "values"), SH_RATES)
 def test_published_rates(arguments, values):
+    first, last, delay_steps = arguments
     for step, value in values.items():
-        assert learning_rate(step, 50000, *arguments) == pytest.approx(value, abs=6e-6)
+        rate = learning_rate(step, 50000, first, last, delay_steps=delay_steps)
+        assert rate == pytest.approx(value, abs=6e-6)
 
 
 def test_delay_factor_zero_starts_at_exactly_zero():
@@ -38,13 +40,13 @@ def test_rate_stays_after_the_end():
 
 
 def test_gamma():
-    assert gamma(0, 50000) == pytest.approx(0.1)
-    assert gamma(25000, 50000) == pytest.approx(0.031623, abs=5e-7)
-    assert gamma(50000, 50000) == pytest.approx(0.01)
+    assert gamma_at(0, 50000) == pytest.approx(0.1)
+    assert gamma_at(25000, 50000) == pytest.approx(0.031623, abs=5e-7)
+    assert gamma_at(50000, 50000) == pytest.approx(0.01)
 
 
-def test_average_weight():
-    weights = [average_weight(step, 3500) for step in range(3500)]
+def test_ema_weight():
+    weights = [ema_weight(step, 3500) for step in range(3500)]
     due = [step for step, weight in enumerate(weights) if weight]
     assert due == list(range(2450, 3500, 10))
     assert weights[2450] == 1
@@ -53,6 +55,6 @@ def test_average_weight():
 
 @pytest.mark.parametrize("steps", [1, 2, 7, 100])
 def test_short_trainings_average_too(steps):
-    weights = [average_weight(step, steps) for step in range(steps)]
+    weights = [ema_weight(step, steps) for step in range(steps)]
     assert [w for w in weights if w][0] == 1
     assert all(0 <= w <= 1 for w in weights)

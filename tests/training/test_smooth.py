@@ -7,13 +7,13 @@ from support.comparisons import relative_error
 from support.guarded import AWKWARD_SIZES
 
 from pp_cl.scene.grid import Grid
-from pp_cl.training.smooth import Smoother, neighbour_table
+from pp_cl.training.smooth import Smoother
 
 NONE = 0xFFFFFFFF
 
 
 def cloud(dev, ids, dims):
-    """(device, grid, ids) on the device: the arguments of neighbour_table and Smoother."""
+    """(device, grid, ids) on the device: the arguments of Smoother."""
     return (
         dev,
         dev.upload(Grid((0, 0, 0), 1, dims).packed()),
@@ -34,14 +34,14 @@ def expected_table(ids, dims):
 def test_table_matches_dictionary(dev, rng, n, dims):
     ids = some_ids(rng, n, dims)
     np.testing.assert_array_equal(
-        neighbour_table(*cloud(dev, ids, dims)).get(), expected_table(ids, dims)
+        Smoother(*cloud(dev, ids, dims)).neighbours.get(), expected_table(ids, dims)
     )
 
 
 def test_full_grid_does_not_wrap(dev):
     dims = (4, 3, 5)
     ids = np.arange(60)
-    found = neighbour_table(*cloud(dev, ids, dims)).get()
+    found = Smoother(*cloud(dev, ids, dims)).neighbours.get()
     np.testing.assert_array_equal(found, expected_table(ids, dims))
     assert (found == NONE).sum() == 2 * (3 * 5 + 4 * 5 + 4 * 3)  # one a face cell
 
@@ -52,7 +52,7 @@ def test_table_of_a_huge_grid(dev):
     last = 517 * 512 * 507 - 1
     ids = [0, 1, 516, 517, 517 * 512 - 1, 517 * 512, last - 517 * 512, last - 517, last - 1, last]
     np.testing.assert_array_equal(
-        neighbour_table(*cloud(dev, ids, dims)).get(), expected_table(ids, dims)
+        Smoother(*cloud(dev, ids, dims)).neighbours.get(), expected_table(ids, dims)
     )
 
 
@@ -86,7 +86,7 @@ def test_chunks_read_old_values_only(dev, rng, monkeypatch, dims):
     assert relative_error(smoothed(dev, values, ids, dims, 1.0), expected) < 5e-7
 
 
-def test_lonely_points_stay(dev, rng):
+def test_points_without_neighbours_keep_their_values(dev, rng):
     dims = (9, 9, 9)
     ids = [0, 2, 8, 9 * 2, 9 * 9 * 2, 9**3 - 1]
     values = rng.standard_normal((6, 3, 16)).astype(np.float32)

@@ -1,0 +1,103 @@
+"""What training keeps for each point beside what is learned."""
+
+from __future__ import annotations
+
+import numpy as np
+from pyopencl.array import Array
+
+from pp_cl.config import TrainConfig
+from pp_cl.device.buffers import Table
+from pp_cl.device.device import Device
+from pp_cl.model import PointCloud
+from pp_cl.raster.sh import ShBlock
+from pp_cl.training.adam import Ema
+from pp_cl.training.prune import compact_rows
+
+# Names in a checkpoint where they differ: SH blocks are called after their first basis function.
+STORED_NAMES = {
+    "sh_0": "sh0",
+    "sh_1": "sh1",
+    "sh_2a": "sh4",
+    "sh_2b": "sh7",
+    "last_step": "last",
+    "weight_sum": "weight",
+}
+
+
+class PointState:
+    """Adam's moments, blend weights and averages of a point cloud; rows as in the cloud.
+
+    ema: averages by the names of PointCloud.learned().
+    """
+
+    def __init__(self, dev: Device, cloud: PointCloud, settings: TrainConfig):
+        table = self.table(cloud.count, cloud.blocks, settings)
+        self._arrays = {name: dev.zeros(*row) for name, row in table.items()}
+        self.ema = Ema(dev)
+
+    @staticmethod
+    def table(n: int, blocks: tuple[ShBlock, ...], settings: TrainConfig) -> Table:
+        """The arrays of n points without the averages; all start as zeros."""
+        table = {"weight_sum": ((n,), np.float32)}
+        if settings.lazy_adam:
+            table["last_step"] = ((n,), np.uint32)
+        table |= {f"{kind}.opacity": ((n,), np.float32) for kind in "mv"}
+        for block in blocks:
+            if settings.moments_16bit:
+                table[f"mv.{block.name}"] = ((n, block.count, 2, 16), np.float16)
+            else:
+                row = ((n, block.count, 16), np.float32)
+                table |= {f"{kind}.{block.name}": row for kind in "mv"}
+        return table
+
+    @staticmethod
+    def ema_table(n: int, blocks: tuple[ShBlock, ...]) -> Table:
+        """The averages of n points."""
+        table = PointCloud.table(n, blocks)
+        del table["ids"]
+        return table
+
+    @property
+    def weight_sum(self) -> Array:
+        """(N) float32: blend weights summed over the steps since the last pruning."""
+        return self._arrays["weight_sum"]
+
+    @property
+    def last_step(self) -> Array | None:
+        """(N) uint32: the step that updated each point last, 0: none; None where Adam is dense."""
+        return self._arrays.get("last_step")
+
+    def moments(self, name: str) -> dict[str, Array]:
+        """Adam's moments of a learned array: "m" and "v", or in 16 bits both as "mv"."""
+        keys = ((kind, f"{kind}.{name}") for kind in ("m", "v", "mv"))
+        return {kind: self._arrays[key] for kind, key in keys if key in self._arrays}
+
+    def compact(self, dev: Device, keep: Array) -> None:
+        """Drop all rows but `keep`, (M) uint32, ascending; one array after the other."""
+        for arrays in (self._arrays, self.ema.arrays):
+            for name in arrays:
+                arrays[name] = compact_rows(dev, arrays[name], keep)
+
+    def arrays(self) -> dict[str, np.ndarray]:
+        """{name in a checkpoint: array}."""
+        averages = {f"a.{name}": array for name, array in self.ema.arrays.items()}
+        return {_stored(name): array.get() for name, array in (self._arrays | averages).items()}
+
+    def restore(self, cloud: PointCloud, arrays: dict[str, np.ndarray]) -> None:
+        """Take over the state of a checkpoint. Raises KeyError and ValueError for an array that is
+        missing or has another shape.
+        """
+        for name, array in self._arrays.items():
+            stored = arrays[_stored(name)]
+            if stored.shape != array.shape:
+                raise ValueError(f"{_stored(name)} has shape {stored.shape}")
+            array.set(stored)
+        learned = cloud.learned()
+        keys = {name: _stored(f"a.{name}") for name in learned}
+        self.ema.restore(learned, {n: arrays[key] for n, key in keys.items() if key in arrays})
+
+
+def _stored(name):
+    """The name in a checkpoint, as in "m.sh_2a" -> "state.m.sh4"."""
+    kind, dot, array = name.rpartition(".")
+    return f"state.{kind}{dot}{STORED_NAMES.get(array, array)}"
