@@ -374,8 +374,6 @@ def _bench(options):
             device=options.device,
         )
         return
-    from pp_cl.bench.network import run_bench
-
     if foreign:
         raise UserError(f"--{foreign[0]}: only for pp-cl bench raster; leave it out")
     if options.what == "conv" and options.tolerance is not None:
@@ -383,25 +381,91 @@ def _bench(options):
             "--tolerance: bench conv shows every variant; give it to bench unet, whose auto picks"
             " among them"
         )
-    run_bench(
-        options.what,
-        options.size or "256",
-        options.widths or "128,256,512",
-        options.json,
-        options.plot,
-        options.device,
-        _read_tolerance(options),
-    )
+    _bench_network(options)
+
+
+def _bench_network(options):
+    from pp_cl.bench.conv import bench_conv
+    from pp_cl.bench.options import read_shape
+    from pp_cl.bench.plots import check_files, plot_time_and_error, save_figure
+    from pp_cl.bench.table import HEAD, line
+    from pp_cl.bench.unet import bench_unet
+    from pp_cl.device.discover import open_device
+    from pp_cl.files.atomic import write_json
+    from pp_cl.layers.policy import load_policy
+
+    size, widths = read_shape(options.size or "256", options.widths or "128,256,512")
+    figure = check_files(options.json, options.plot)
+    dev = open_device(options.device)
+    print(f"{dev.name} [{dev.info['platform']}]")
+    policy = load_policy(dev, _read_tolerance(options))
+    print(f"{policy.origin}\n{HEAD}")
+    rows = []
+    bench = {"conv": bench_conv, "unet": bench_unet}[options.what]
+    for row in bench(dev, size, widths, policy):
+        rows.append(row)
+        print(line(row), flush=True)
+    for direction, memory in {r["direction"]: r.get("memory_bytes") for r in rows}.items():
+        if memory:
+            print(f"the network's memory, {direction}: {memory / 2**20:.0f} MiB")
+    if options.json:
+        result = {"device": dev.name, "platform": dev.info["platform"], "rows": rows}
+        write_json(options.json, result)
+    if figure:
+        plot_time_and_error(figure, f"{options.what}, {size} x {size}, {dev.name}", rows)
+        save_figure(figure, options.plot)
 
 
 def _tune(options):
-    from pp_cl.bench.network import read_shape
-    from pp_cl.bench.tune import EVALUATED, run_tune
+    import time
+
+    from pp_cl.bench import tune
+    from pp_cl.bench.options import read_shape
+    from pp_cl.bench.table import TUNE_HEAD, blocking_line, tune_line
+    from pp_cl.device.discover import open_device
+    from pp_cl.layers.blocking import CHOICES
+    from pp_cl.layers.policy import make_policy
+    from pp_cl.layers.variants import shipped_order
 
     config, tolerance = preset(options.preset or "tiny"), _read_tolerance(options)
-    evaluated = EVALUATED[config.preset]
+    evaluated = tune.EVALUATED[config.preset]
     size, widths = read_shape(
         options.size or str(evaluated), options.widths or ",".join(map(str, config.network.widths))
     )
     training = size if options.size else config.train.crop or evaluated
-    run_tune(widths, training, size, tolerance, options.device)
+    dev = open_device(options.device)
+    tune.check_cache()
+    print(
+        f"{dev.name} [{dev.info['platform']}], widths {','.join(map(str, widths))}, "
+        f"training at {training}x{training}, evaluation at {size}x{size}"
+    )
+
+    def show_blocking(chosen, times):
+        shipped = {name: values[0] for name, values in CHOICES[kind].items()}
+        for name, ms in times.items():
+            print(blocking_line(name, ms, chosen.get(name, shipped[name])))
+        print(TUNE_HEAD, flush=True)
+
+    def show_row(case, row):
+        policy = make_policy(dev, tolerance, {"tile_shapes": {}, "rows": [row]})
+        try:
+            chosen = policy.choose(case.shape)
+        except UserError:
+            chosen = None
+        shipped = shipped_order(kind, case.shape)[0]
+        print(tune_line(case.name, row, chosen, shipped), flush=True)
+
+    kind = make_policy(dev).device_class
+    start = time.perf_counter()
+    cases = tune.network_cases(widths, training, size)
+    tuning, shipped_ms = tune.run_tune(
+        dev, cases, tolerance, on_blocking=show_blocking, on_row=show_row
+    )
+    print(f"stored in {tune.store(dev, tuning)} ({time.perf_counter() - start:.0f} s)")
+    policy = make_policy(dev, tolerance, tuning)
+    times = tune.total_times(cases, tuning["rows"], shipped_ms, policy)
+    for what, (shipped, tuned) in times.items():
+        print(
+            f"convolutions of {what}: {shipped:.2f} ms as shipped, {tuned:.2f} ms as tuned, "
+            f"{shipped / tuned:.2f} times as fast"
+        )

@@ -10,7 +10,7 @@ from pp_cl.device.discover import open_device
 from pp_cl.files.atomic import remove_leftovers, write_json
 from pp_cl.files.contact_sheet import write_comparison
 from pp_cl.files.image import write_png
-from pp_cl.layers.tuning import adopt_stored
+from pp_cl.layers.policy import load_policy
 from pp_cl.metrics.psnr_ssim import Metrics, mean
 from pp_cl.model import Model
 from pp_cl.render import Renderer
@@ -35,11 +35,18 @@ def evaluate_run(folder, metrics, split, save_images, device_choice, tolerance=N
         validate(config, "--tolerance")
     header, arrays = load_run(folder / CHECKPOINT)
     dev = open_device(device_choice)
-    adopt_stored(dev, config.network.tolerance)
+    policy = load_policy(dev, config.network.tolerance)
+    print(policy.origin)
     scene = open_scene(dev, config, (split,))
-    measure = Metrics(dev, metrics)
+    measure = Metrics(dev, metrics, policy.blocking)
     model = Model.load(
-        dev, header, arrays, config.network.widths, config.points.sh_degree, folder / CHECKPOINT
+        dev,
+        header,
+        arrays,
+        config.network.widths,
+        config.points.sh_degree,
+        folder / CHECKPOINT,
+        policy=policy,
     )
     views = with_depth_range(scene.splits[split], model.depth_range)
 
@@ -48,13 +55,13 @@ def evaluate_run(folder, metrics, split, save_images, device_choice, tolerance=N
     remove_leftovers(target_folder)
     gamma_now = gamma(header["step"], config.train.iterations, *config.raster.gamma)
     shown = {len(views) * i // PICTURE_VIEWS for i in range(PICTURE_VIEWS)}
-    rows, pictures, seconds, shares = [], [], [], []
-    for i, (view, picture, truth, duration, dropped) in enumerate(
+    rows, pictures, seconds, fractions = [], [], [], []
+    for i, (view, picture, truth, duration, fraction, dropped) in enumerate(
         _render_all(dev, config, model, views, gamma_now)
     ):
         rows.append({"name": view.name} | measure(picture, truth) | dropped)
         seconds.append(duration)
-        shares.append(model.net.share)
+        fractions.append(fraction)
         if i in shown:
             pictures.append((picture, truth))
         if save_images:
@@ -73,7 +80,7 @@ def evaluate_run(folder, metrics, split, save_images, device_choice, tolerance=N
         },
         "seconds_per_frame": float(np.median(seconds)),
         # of the network's multiplications; the rest saw background alone
-        "network_share": float(np.mean(shares)),
+        "network_share": float(np.mean(fractions)),
         "published": scene.published,
     }
     write_json(target_folder / "metrics.json", result)
@@ -87,8 +94,8 @@ def evaluate_run(folder, metrics, split, save_images, device_choice, tolerance=N
 
 
 def _render_all(dev, config, model, views, gamma_now):
-    """Yield (view, prediction (H,W,3), truth (H,W,3), seconds of the rendering, what tau did) as
-    float32 in [0, 1].
+    """Yield (view, prediction (H,W,3), truth (H,W,3), seconds of the rendering, computed fraction
+    of the network, what tau did); images as float32 in [0, 1].
     """
     model.net.freeze()
     renderer, target = Renderer(dev, model, config.raster), Target(dev, config.scene.downscale)
@@ -97,7 +104,8 @@ def _render_all(dev, config, model, views, gamma_now):
     for view in views:
         camera = reduced_camera(view, config.scene.downscale)
         start = time.perf_counter()
-        picture = renderer.render(camera, gamma_now)
+        result = renderer.forward(camera, gamma_now)
+        picture = result.clamped(camera)
         seconds = time.perf_counter() - start
         target.load(view)
         truth = target.crop(0, 0, camera.width, camera.height).get()
@@ -106,6 +114,7 @@ def _render_all(dev, config, model, views, gamma_now):
             picture,
             truth,
             seconds,
+            result.computed_fraction,
             _tau_errors(renderer, camera, gamma_now) if config.raster.tau > 0 else {},
         )
 

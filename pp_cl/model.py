@@ -48,16 +48,18 @@ class Model:
         )
 
     @classmethod
-    def create(cls, dev, grid, ids, depth_range, widths, seed, degree=SH_DEGREES[-1]):
+    def create(cls, dev, grid, ids, depth_range, widths, seed, degree=SH_DEGREES[-1], policy=None):
         """Fresh model: opacity 1, SH coefficients 0, network at its random start.
 
-        ids: (N) uint32 ascending grid vertices.
+        ids: (N) uint32 ascending grid vertices. policy: of the network's convolutions, None = as
+        shipped.
         """
         n = len(ids)
         points = {"ids": dev.upload(ids, np.uint32), "opacity": dev.upload(np.ones(n, np.float32))}
         for block in sh_blocks(degree):
             points[block.name] = dev.zeros((n, block.count, 16))
-        return cls(dev, grid, depth_range, points, UNet(dev, widths=widths, seed=seed), degree)
+        net = UNet(dev, widths, seed=seed, policy=policy)
+        return cls(dev, grid, depth_range, points, net, degree)
 
     def header(self):
         """JSON-able description that load() needs beside the arrays."""
@@ -83,7 +85,7 @@ class Model:
         return stored | {f"net.{name}": array.get() for name, array in self.net.parameters.items()}
 
     @classmethod
-    def load(cls, dev, header, arrays, widths, degree, file):
+    def load(cls, dev, header, arrays, widths, degree, file, *, policy=None):
         """Model of a checkpoint's header and arrays. Raises UserError naming the file and the array
         that does not fit.
         """
@@ -96,7 +98,7 @@ class Model:
             depth_range = tuple(header["depth_range"])
         except (KeyError, TypeError):
             raise UserError(f"{file}: its header is incomplete; train anew") from None
-        net = UNet(dev, widths=widths, seed=0)
+        net = UNet(dev, widths, policy=policy)
         n = len(arrays.get("points.ids", ()))
         shapes = {"ids": (n,), "opacity": (n,)} | {
             f"sh{d}": (n, 2 * d + 1, 16) for d in SH_DEGREES[: degree + 1]

@@ -16,7 +16,7 @@ from pp_cl.errors import UserError
 from pp_cl.files.atomic import remove_leftovers, write_text
 from pp_cl.files.checkpoint import load_checkpoint, save_checkpoint
 from pp_cl.files.contact_sheet import write_comparison
-from pp_cl.layers.tuning import adopt_of_run, adopt_stored
+from pp_cl.layers.policy import load_policy, policy_of_run
 from pp_cl.model import Model
 from pp_cl.scene.hull import build_grid, depth_range, spacing_pixels
 from pp_cl.scene.load import load_scene
@@ -93,16 +93,19 @@ def train_run(folder, config, device_choice):
     dev = open_device(device_choice)
     print(f"device: {dev.name} [{dev.info['platform']}]")
     tolerance = config.network.tolerance
-    tuning = (
-        adopt_of_run(dev, tolerance, stored[0].get("tuning"), checkpoint)
+    policy = (
+        policy_of_run(dev, tolerance, stored[0].get("tuning"), checkpoint)
         if stored
-        else adopt_stored(dev, tolerance)
+        else load_policy(dev, tolerance)
     )
+    print(policy.origin)
     scene = open_scene(dev, config, ("train",))
     trainer, info = (
-        _resume(dev, config, scene, *stored, checkpoint) if stored else _start(dev, config, scene)
+        _resume(dev, config, scene, *stored, checkpoint, policy)
+        if stored
+        else _start(dev, config, scene, policy)
     )
-    info["tuning"] = tuning
+    info["tuning"] = policy.tuning
     plan = memory_plan(dev, config, trainer.model, trainer.views)
     print_plan(plan, dev)
     trainer.renderer.cache.budget = spare_memory(plan, config.train.memory_gib)
@@ -127,7 +130,7 @@ def _check_folder(folder):
         )
 
 
-def _start(dev, config, scene):
+def _start(dev, config, scene, policy):
     """(Trainer, info) of a run from its beginning."""
     views = scene.splits["train"]
     reduced_camera(views[0], config.scene.downscale)  # refuses a reduction that leaves too little
@@ -148,6 +151,7 @@ def _start(dev, config, scene):
         config.network.widths,
         config.train.seed,
         config.points.sh_degree,
+        policy,
     )
     return Trainer(dev, config, model, with_depth_range(views, near_far)), {
         "scene": fingerprint(views),
@@ -155,14 +159,15 @@ def _start(dev, config, scene):
     }
 
 
-def _resume(dev, config, scene, header, arrays, file):
+def _resume(dev, config, scene, header, arrays, file, policy):
     """(Trainer, info) of a run that goes on."""
     views = scene.splits["train"]
     if header["scene"] != fingerprint(views):
         raise UserError(
             f"{file}: belongs to another scene than {config.scene.path}; use another --out"
         )
-    model = Model.load(dev, header, arrays, config.network.widths, config.points.sh_degree, file)
+    widths, degree = config.network.widths, config.points.sh_degree
+    model = Model.load(dev, header, arrays, widths, degree, file, policy=policy)
     trainer = Trainer(dev, config, model, with_depth_range(views, model.depth_range))
     try:
         trainer.restore(header["step"], arrays)

@@ -19,9 +19,10 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from pp_cl.bench.network import check_files, interleave, save_figure
-from pp_cl.bench.peak import Copy
+from pp_cl.bench.peak import CopyBandwidth
+from pp_cl.bench.plots import check_files, save_figure
 from pp_cl.bench.raster_scenes import SCENES
+from pp_cl.bench.timing import interleave
 from pp_cl.device.discover import open_device
 from pp_cl.errors import UserError
 from pp_cl.files.atomic import write_json
@@ -40,7 +41,7 @@ def bench_raster(
     dev, scene: str, points: list[int], sizes: list[int], taus: list[float], gamma: float
 ) -> Iterator[dict]:
     """Yield a row for every number of points, side and tau. scene: a key of SCENES."""
-    copy = Copy(dev)
+    copy = CopyBandwidth(dev)
     for n in points:
         for size in sizes:
             before = dev.peak_bytes = dev.bytes

@@ -45,12 +45,14 @@ def ssim(a, b):
 
 
 class Metrics:
-    """The named metrics of image pairs. dev: a Device; only lpips needs one."""
+    """The named metrics of image pairs. dev: a Device; only lpips needs one. blocking: of the
+    convolutions of lpips, None = as shipped.
+    """
 
-    def __init__(self, dev, names=("psnr", "ssim", "lpips")):
+    def __init__(self, dev, names=("psnr", "ssim", "lpips"), blocking=None):
         self.functions = {"psnr": psnr, "ssim": ssim}
         if "lpips" in names:
-            distance = Lpips(dev).distance
+            distance = Lpips(dev, blocking=blocking).distance
             self.functions["lpips"] = lambda a, b: distance(a / 255.0, b / 255.0)
         self.names = names
 
