@@ -6,7 +6,6 @@ KERNELS := $(shell find cl -name "*.cl" -o -name "*.h")
 
 # The tests of all kernels, the longest in Oclgrind first.
 OCLGRIND := tests/layers/test_tiles.py \
-	tests/layers/test_conv_local.py \
 	tests/raster/test_blend_weights.py \
 	tests/layers/test_winograd.py \
 	tests/raster/test_blend.py \

@@ -46,17 +46,25 @@ def evaluate_run(
     tolerance: float | None = None,
     scene: str | None = None,
 ) -> dict[str, Any]:
+    """evaluate() of the run in a folder. device: as `pp-cl eval --device`; tolerance, scene: as
+    load_run takes them.
+    """
+    run = load_run(open_device(device), folder, tolerance=tolerance, scene=scene)
+    return evaluate(run, split, metrics, save_images=save_images)
+
+
+def evaluate(
+    run: Run, split: str, metrics: tuple[str, ...], *, save_images: bool = False
+) -> dict[str, Any]:
     """Measure a run; writes metrics.json and comparison.png into RUN/eval, or RUN/eval/SPLIT for
     other splits than test, and returns the former.
 
     metrics: names out of psnr, ssim, lpips. save_images: write every view to images/ there, in
-    place of what an earlier evaluation left. device: as `pp-cl eval --device`; tolerance, scene: as
-    load_run takes them. Raises UserError for a missing or broken run or split.
+    place of what an earlier evaluation left. Raises UserError for a missing or broken split.
     """
-    run = load_run(open_device(device), folder, tolerance=tolerance, scene=scene)
     scene = run.scene(split)
     views = scene.splits[split]
-    measure = Metrics(run.dev, metrics)
+    measure = Metrics(run.dev, metrics, run.policy.blocking)
     target = run.folder.evaluation(split)
     target.mkdir(parents=True, exist_ok=True)
     remove_leftovers(target)
@@ -118,13 +126,13 @@ def render_views(run: Run, views: list[View]) -> Iterator[Rendered]:
     run.render(views[0].camera)  # builds the programs
     for view in views:
         start = time.perf_counter()
-        image = run.render(view.camera)
+        result = run.renderer.forward(view.camera, run.gamma)
+        image = result.clamped(view.camera)
         seconds = time.perf_counter() - start
-        computed = run.model.net.share
         target.load(view)
         truth = target.whole()
         tau = _effect_of_tau(run, view.camera) if run.config.raster.tau > 0 else {}
-        yield Rendered(view.name, image, truth, seconds, tau, computed)
+        yield Rendered(view.name, image, truth, seconds, tau, result.computed_fraction)
 
 
 def _effect_of_tau(run, camera):

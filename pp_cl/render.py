@@ -65,9 +65,19 @@ class RasterResult(ViewWeights):
 
 @dataclass(frozen=True)
 class RenderResult(RasterResult):
-    """A RasterResult with the image that the network made of it, (H, W, 3) float32, unclamped."""
+    """A RasterResult with the image that the network made of it, (H, W, 3) float32, unclamped.
+
+    computed_fraction: of the network's multiplications; the rest saw only background.
+    """
 
     image: Array
+    computed_fraction: float
+
+    def clamped(self, camera: Camera) -> np.ndarray:
+        """(H, W, 3) float32 image of the camera without the padding, clamped to [0, 1]."""
+        left, top = self.offset
+        image = self.image.get()[top : top + camera.height, left : left + camera.width]
+        return np.clip(image, 0, 1)
 
 
 class Renderer:
@@ -104,8 +114,10 @@ class Renderer:
         """Render a camera. training: keep what backward() needs. options: of rasterise()."""
         raster = self.rasterise(camera, gamma, **options)
         with self.dev.stage("network"):
-            image = self.model.net.forward(raster.features, training, BACKGROUND)
-        return RenderResult(**vars(raster), image=image)
+            plan = self.model.net.plan_tiles(raster.features, BACKGROUND)
+            image = self.model.net.forward(raster.features, training, plan)
+        fraction = plan.computed_fraction if plan else 1.0
+        return RenderResult(**vars(raster), image=image, computed_fraction=fraction)
 
     def rasterise(self, camera: Camera, gamma: float, **options) -> RasterResult:
         """The blended features of a camera. options: of weigh()."""
@@ -190,10 +202,7 @@ class Renderer:
 
     def render(self, camera: Camera, gamma: float, **options) -> np.ndarray:
         """(H, W, 3) float32 numpy image of the camera, clamped to [0, 1]. options: of weigh()."""
-        result = self.forward(camera, gamma, **options)
-        left, top = result.offset
-        image = result.image.get()[top : top + camera.height, left : left + camera.width]
-        return np.clip(image, 0, 1)
+        return self.forward(camera, gamma, **options).clamped(camera)
 
     def _radius(self):
         """The points' radius in world units."""

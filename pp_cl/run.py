@@ -16,7 +16,7 @@ from pp_cl.device.discover import open_device
 from pp_cl.errors import UserError
 from pp_cl.files.contact_sheet import write_comparison
 from pp_cl.files.run_folder import RunFolder
-from pp_cl.layers.tuning import adopt_of_run, adopt_stored
+from pp_cl.layers.policy import ConvolutionPolicy, load_policy, policy_of_run
 from pp_cl.model import Model
 from pp_cl.network.unet import UNet
 from pp_cl.render import Renderer
@@ -122,13 +122,16 @@ def fingerprint(views: list[View]) -> str:
 
 @dataclass
 class Run:
-    """The model of a run's last checkpoint. header: of the checkpoint, see files/run_folder.py."""
+    """The model of a run's last checkpoint. header: of the checkpoint, see files/run_folder.py.
+    policy: of the convolutions.
+    """
 
     dev: Device
     folder: RunFolder
     config: Config
     header: dict[str, Any]
     model: Model
+    policy: ConvolutionPolicy
 
     @cached_property
     def renderer(self) -> Renderer:
@@ -176,19 +179,19 @@ def load_run(
     given = [] if tolerance is None else [("network.tolerance", tolerance, "tolerance")]
     configure(config, scene or config.scene.path, given)
     header, arrays = folder.load()
-    adopt_stored(dev, config.network.tolerance)
-    net = UNet(dev, widths=config.network.widths)
+    policy = load_policy(dev, config.network.tolerance)
+    net = UNet(dev, config.network.widths, policy=policy)
     degree, file = config.points.sh_degree, folder.checkpoint
     model = Model.load(dev, header, arrays, net, degree=degree, file=file)
-    return Run(dev, folder, config, header, model)
+    return Run(dev, folder, config, header, model, policy)
 
 
 # ---- training
 
 
 class HullFacts(NamedTuple):
-    """The initial grid. capped: the largest grid allowed has fewer points than asked for. edge: world
-    units; spacing: the same in pixels; seconds it took.
+    """The initial grid. capped: the largest grid allowed has fewer points than asked for. edge:
+    world units; spacing: the same in pixels; seconds it took.
     """
 
     points: int
@@ -205,7 +208,7 @@ class Training:
     """A training that is ready to begin or to go on.
 
     info: what its checkpoints' headers hold beside the model's. plan: of memory_plan. hull:
-    None if it goes on from a checkpoint.
+    None if it goes on from a checkpoint. origin: of the choice of convolutions, a line of text.
     """
 
     folder: RunFolder
@@ -214,6 +217,7 @@ class Training:
     info: dict[str, Any]
     plan: Plan
     hull: HullFacts | None
+    origin: str
 
     def run(self, on_step: Callable[[int, dict | None], None] | None = None) -> float:
         """Train to the end with log, previews and checkpoints; returns the seconds of training,
@@ -293,20 +297,23 @@ def open_training(
     """
     tolerance = config.network.tolerance
     if stored:
-        tuning = adopt_of_run(dev, tolerance, stored[0].get("tuning"), folder.checkpoint)
+        policy = policy_of_run(dev, tolerance, stored[0].get("tuning"), folder.checkpoint)
     else:
-        tuning = adopt_stored(dev, tolerance)
+        policy = load_policy(dev, tolerance)
+    net = UNet(dev, config.network.widths, seed=config.train.seed, policy=policy)
     views = open_scene(dev, config, ("train",)).splits["train"]
     if stored:
-        trainer, info, hull = _resume(dev, config, views, stored, folder.checkpoint)
+        trainer, info, hull = _resume(config, views, net, stored, folder.checkpoint)
     else:
-        trainer, info, hull = _start(dev, config, views)
+        trainer, info, hull = _start(config, views, net)
     plan = memory_plan(config, trainer.model, trainer.views)
-    return Training(folder, config, trainer, info | {"tuning": tuning}, plan, hull)
+    info["tuning"] = policy.tuning
+    return Training(folder, config, trainer, info, plan, hull, policy.origin)
 
 
-def _start(dev, config, views):
+def _start(config, views, net):
     """(Trainer, info, HullFacts) of a training from its beginning."""
+    dev = net.dev
     start = time.perf_counter()
     hull = build_grid(dev, views, config.points.count)
     near_far = depth_range(views, hull)
@@ -319,23 +326,22 @@ def _start(dev, config, views):
         near_far,
         time.perf_counter() - start,
     )
-    net = UNet(dev, widths=config.network.widths, seed=config.train.seed)
     degree = config.points.sh_degree
     model = Model.create(dev, hull.grid, hull.ids, near_far, net, degree=degree)
     trainer = Trainer(dev, config, model, views)
     return trainer, {"scene": fingerprint(views), "initial_points": facts.points}, facts
 
 
-def _resume(dev, config, views, stored, file):
+def _resume(config, views, net, stored, file):
     """(Trainer, info, None) of a training that goes on."""
     header, arrays = stored
     if header["scene"] != fingerprint(views):
         raise UserError(
             f"{file}: belongs to another scene than {config.scene.path}; use another --out"
         )
-    net = UNet(dev, widths=config.network.widths, seed=config.train.seed)
-    model = Model.load(dev, header, arrays, net, degree=config.points.sh_degree, file=file)
-    trainer = Trainer(dev, config, model, views)
+    degree = config.points.sh_degree
+    model = Model.load(net.dev, header, arrays, net, degree=degree, file=file)
+    trainer = Trainer(net.dev, config, model, views)
     try:
         trainer.restore(header["step"], arrays)
     except (KeyError, ValueError) as error:

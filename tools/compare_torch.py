@@ -11,11 +11,15 @@ import sys
 
 import numpy as np
 
-from pp_cl.bench import network as bench
+from pp_cl.bench import unet as bench
+from pp_cl.bench.timing import errors, interleave
 from pp_cl.commands.options import read_shape
 from pp_cl.device.discover import open_device
 from pp_cl.errors import UserError
 from pp_cl.files.atomic import write_json
+from pp_cl.layers.policy import AUTO, make_policy
+from pp_cl.layers.variants import VARIANTS
+from pp_cl.network.layer import Conv, Pool
 
 # Seconds before each timed call. OpenMP's threads go on spinning for some milliseconds after
 # PyTorch is done, on cores that our device's threads need.
@@ -28,7 +32,7 @@ class TorchNetwork:
     """
 
     def __init__(self, torch, net, dtype):
-        self.torch, self.dtype, self.steps = torch, dtype, net.steps
+        self.torch, self.dtype, self.layers = torch, dtype, net.layers
         plain = bench.plain_parameters(net, net.parameters)
         self.parameters = {name: self._tensor(values) for name, values in plain.items()}
 
@@ -45,25 +49,23 @@ class TorchNetwork:
     def image(self, x):
         """(1, 3, H, W) of the features x (1, C, H, W)."""
         functional, outputs = self.torch.nn.functional, {"x": x}
-        for step in self.steps:
-            source = outputs[step.inputs[0]]
-            if len(step.inputs) > 1:
-                source = self.torch.cat([outputs[name] for name in step.inputs], 1)
-            if step.kind == "pool":
+        for layer in self.layers:
+            source = outputs[layer.inputs[0]]
+            if len(layer.inputs) > 1:
+                source = self.torch.cat([outputs[name] for name in layer.inputs], 1)
+            if isinstance(layer, Conv):
+                weight = self.parameters[layer.name + ".weight"]
+                bias = self.parameters[layer.name + ".bias"]
+                out = functional.conv2d(source, weight, bias, padding=layer.kernel_size // 2)
+                if layer.relu:
+                    out = functional.relu(out, inplace=True)
+            elif isinstance(layer, Pool):
                 out = functional.avg_pool2d(source, 2)
-            elif step.kind == "up":
+            else:
                 out = functional.interpolate(
                     source, scale_factor=2, mode="bilinear", align_corners=False
                 )
-            else:
-                weight, bias = (
-                    self.parameters[step.name + ".weight"],
-                    self.parameters[step.name + ".bias"],
-                )
-                out = functional.conv2d(source, weight, bias, padding=weight.shape[2] // 2)
-                if step.kind == "conv3":
-                    out = functional.relu(out, inplace=True)
-            outputs[step.name] = out
+            outputs[layer.name] = out
         return 0.5 + 0.5 * outputs["out"]
 
     def forward(self, x):
@@ -80,12 +82,12 @@ class TorchNetwork:
         return dict(zip(names, gradients, strict=True))
 
 
-def compare(torch, dev, widths, size, variant, rounds):
+def compare(torch, dev, widths, size, *, variant, rounds):
     """The measurement as a dictionary for JSON: see main()."""
     rng = np.random.default_rng(0)
     values = np.maximum(rng.normal(size=(size, size, bench.CHANNELS_IN)), 0).astype(np.float32)
     grads = rng.normal(size=(size, size, bench.CHANNELS_OUT)).astype(np.float32)
-    net = bench.make_network(dev, widths, variant)
+    net = bench.make_network(dev, widths, make_policy(dev, variant=variant))
     x, grad_image = dev.upload(values), dev.upload(grads)
     twin = TorchNetwork(torch, net, torch.float32)
     torch_x = twin.input(values)
@@ -93,10 +95,10 @@ def compare(torch, dev, widths, size, variant, rounds):
 
     exact = TorchNetwork(torch, net, torch.float64)
     expected = exact.forward(exact.input(values)).numpy()[0].transpose(1, 2, 0)
-    rel_l2 = bench.errors(net.forward(x, training=False).get(), expected)[0]
-    torch_rel_l2 = bench.errors(twin.forward(torch_x).numpy()[0].transpose(1, 2, 0), expected)[0]
+    rel_l2 = errors(net.forward(x, training=False).get(), expected)[0]
+    torch_rel_l2 = errors(twin.forward(torch_x).numpy()[0].transpose(1, 2, 0), expected)[0]
 
-    times = bench.interleave(
+    times = interleave(
         {
             ("forward", "ours"): bench.forward_runner(dev, net, x, grad_image),
             ("forward", "torch"): lambda: twin.forward(torch_x),
@@ -155,7 +157,7 @@ def main(argv=None):
     )
     parser.add_argument(
         "--variant",
-        choices=bench.NETWORK_VARIANTS,
+        choices=(AUTO, *VARIANTS),
         default="auto",
         help="of our convolutions (auto)",
     )
@@ -171,7 +173,12 @@ def main(argv=None):
         torch = _import_torch()
         torch.set_num_threads(options.threads)
         result = compare(
-            torch, open_device(options.device), widths, size, options.variant, options.runs
+            torch,
+            open_device(options.device),
+            widths,
+            size,
+            variant=options.variant,
+            rounds=options.runs,
         )
         if options.json:
             write_json(options.json, result)

@@ -1,7 +1,7 @@
-// The layers between convolutions, on (H, W, C) feature maps: pooling, bilinear upsampling, a
-// straight line. But for the last, a work-item is (16 channels, x, y): one vector of a pixel,
-// shorter where C ends. It writes where the pixel's tile is computed (tiles.h); max pooling
-// everywhere.
+// The layers between convolutions, on (H, W, C) feature maps: pooling, bilinear upsampling, an
+// affine map (scale * x + offset). In all but the affine map a work-item is (16 channels, x, y):
+// one vector of a pixel, shorter at the last channels. It writes where the pixel's tile is computed
+// (tiles.h); max pooling writes everywhere.
 #include "common.h"
 #include "layers/tiles.h"
 #include "vector.h"

@@ -86,20 +86,20 @@ ALWAYS_INLINE void transform_back(
             for (int i = 0; i < POSITIONS; i++)
                 t[i] = m[i * pitch + block * TILES + tile];
 #pragma unroll
-            for (int i = 0; i < S; i++)
-                transform_output(t + i, S);
+            for (int i = 0; i < WINO_S; i++)
+                transform_output(t + i, WINO_S);
 #pragma unroll
-            for (int i = 0; i < M; i++)
-                transform_output(t + i * S, 1);
+            for (int i = 0; i < WINO_M; i++)
+                transform_output(t + i * WINO_S, 1);
             const float16 offset = bias ? bias[block] : (float16)0.0f;
 #pragma unroll
-            for (int i = 0; i < M; i++)
+            for (int i = 0; i < WINO_M; i++)
 #pragma unroll
-                for (int j = 0; j < M; j++)
+                for (int j = 0; j < WINO_M; j++)
                     if (corner.y + i < height && corner.x + j < width) {
                         const size_t at =
                             ((size_t)(corner.y + i) * width + corner.x + j) * co + block * 16;
-                        float16 value = t[i * S + j] + offset;
+                        float16 value = t[i * WINO_S + j] + offset;
                         if (relu)  // max(., 0) would hide a NaN
                             value = select(value, (float16)0.0f, value < 0.0f);
                         if (mask)

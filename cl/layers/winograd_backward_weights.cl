@@ -42,19 +42,20 @@ ALWAYS_INLINE void transform_gradients(
             const float times = tile_count[tile_list[3 + (first + tile) / (PER_SIDE * PER_SIDE)]];
             float16 t[POSITIONS], sum = 0.0f;
             load_tile(
-                t, M, patch, grad_out + block * 16, channels, corner.x, corner.y, height, width);
+                t, WINO_M, patch, grad_out + block * 16, channels, corner.x, corner.y, height,
+                width);
 #pragma unroll
-            for (int i = 0; i < M; i++)
+            for (int i = 0; i < WINO_M; i++)
 #pragma unroll
-                for (int j = 0; j < M; j++)
-                    sum += t[i * S + j] *= times;
+                for (int j = 0; j < WINO_M; j++)
+                    sum += t[i * WINO_S + j] *= times;
             round += sum;
 #pragma unroll
-            for (int i = 0; i < M; i++)
-                transform_gradient(t + i, S);
+            for (int i = 0; i < WINO_M; i++)
+                transform_gradient(t + i, WINO_S);
 #pragma unroll
-            for (int i = 0; i < S; i++)
-                transform_gradient(t + i * S, 1);
+            for (int i = 0; i < WINO_S; i++)
+                transform_gradient(t + i * WINO_S, 1);
 #pragma unroll
             for (int i = 0; i < POSITIONS; i++)
                 z[i * PITCH(CO_PART) + block * TILES + tile] = t[i];
@@ -123,15 +124,16 @@ ALWAYS_INLINE void store_gradients(
         for (int i = 0; i < POSITIONS; i++)
             t[i] = sums[i * (CO_PART / 16) * ci_part + row];
 #pragma unroll
-        for (int i = 0; i < S; i++)
-            transform_kernel_gradient(t + i, S);
+        for (int i = 0; i < WINO_S; i++)
+            transform_kernel_gradient(t + i, WINO_S);
 #pragma unroll
         for (int i = 0; i < 3; i++)
-            transform_kernel_gradient(t + i * S, 1);
+            transform_kernel_gradient(t + i * WINO_S, 1);
 #pragma unroll
         for (int i = 0; i < 9; i++)
-            grad_weight[i * ci + row] =
-                first_sum ? t[i / 3 * S + i % 3] : grad_weight[i * ci + row] + t[i / 3 * S + i % 3];
+            grad_weight[i * ci + row] = first_sum
+                                            ? t[i / 3 * WINO_S + i % 3]
+                                            : grad_weight[i * ci + row] + t[i / 3 * WINO_S + i % 3];
     }
 }
 

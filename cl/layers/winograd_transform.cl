@@ -19,7 +19,7 @@ ALWAYS_INLINE float16 unit_of(const int16 largest) {
 }
 
 // One work-item per 16 output channels: reads all their weights and writes their units.
-kernel void winograd_units(
+kernel void winograd_transform_units(
     const int ci,
     const int blocks,
     global const float16 *weight,  // (blocks, 3, 3, ci, 16)
@@ -35,7 +35,7 @@ kernel void winograd_units(
 
 // One work-item per input channel c: the same for the flipped weights, whose output channels are
 // the input channels from `first` on.
-kernel void winograd_flipped_units(
+kernel void winograd_transform_flipped_units(
     const int co,
     const int blocks,              // of input channels taken
     const int first,               // input channel
@@ -65,14 +65,14 @@ ALWAYS_INLINE void store_kernel(
     const float16 inverse = as_float16((2 * 127 << EXPONENT) - as_int16(transformed[block]));
 #pragma unroll
     for (int i = 0; i < 9; i++)
-        t[i / 3 * S + i % 3] *= inverse;
+        t[i / 3 * WINO_S + i % 3] *= inverse;
 #endif
 #pragma unroll
     for (int i = 0; i < 3; i++)
-        transform_kernel(t + i, S);
+        transform_kernel(t + i, WINO_S);
 #pragma unroll
-    for (int i = 0; i < S; i++)
-        transform_kernel(t + i * S, 1);
+    for (int i = 0; i < WINO_S; i++)
+        transform_kernel(t + i * WINO_S, 1);
 #pragma unroll
     for (int i = 0; i < POSITIONS; i++)
         STORE_WEIGHT(t[i], transformed, WEIGHT_AT(i, block, blocks, channels) + channel);
@@ -80,7 +80,7 @@ ALWAYS_INLINE void store_kernel(
 
 // One work-item per (input channel, 16 output channels): reads 3 x 3 weights (and, with HALF, their
 // units), writes their values at all positions.
-kernel void winograd_weights(
+kernel void winograd_transform_weights(
     const int ci,
     const int blocks,
     global const float16 *weight,  // (blocks, 3, 3, ci, 16)
@@ -91,14 +91,14 @@ kernel void winograd_weights(
     float16 t[POSITIONS];
 #pragma unroll
     for (int i = 0; i < 9; i++)
-        t[i / 3 * S + i % 3] = weight[(block * 9 + i) * ci + c];
+        t[i / 3 * WINO_S + i % 3] = weight[(block * 9 + i) * ci + c];
     store_kernel(t, transformed, c, ci, block, blocks);
 }
 
 // One work-item per (output channel, 16 input channels from `first` on): the same for the mirrored
 // kernels with the roles of input and output channels exchanged, which the input gradient is made
 // with.
-kernel void winograd_flipped_weights(
+kernel void winograd_transform_flipped_weights(
     const int co,
     const int blocks,             // of input channels taken
     const int first,              // input channel
@@ -113,9 +113,9 @@ kernel void winograd_flipped_weights(
     for (int i = 0; i < 9; i++) {
         global const float *tap =
             weight + ((o / 16 * 9 + 8 - i) * ci + first + block * 16) * 16 + o % 16;
-        t[i / 3 * S + i % 3] = (float16)(tap[0], tap[16], tap[32], tap[48], tap[64], tap[80],
-                                         tap[96], tap[112], tap[128], tap[144], tap[160], tap[176],
-                                         tap[192], tap[208], tap[224], tap[240]);
+        t[i / 3 * WINO_S + i % 3] = (float16)(tap[0], tap[16], tap[32], tap[48], tap[64], tap[80],
+                                              tap[96], tap[112], tap[128], tap[144], tap[160],
+                                              tap[176], tap[192], tap[208], tap[224], tap[240]);
     }
     store_kernel(t, transformed, o, co, block, blocks);
 }

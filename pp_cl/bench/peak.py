@@ -4,24 +4,29 @@ larger than any cache.
 
 import time
 
-LANES = 16
-# of one run: long against the 30 us of a launch, short enough to be run between any two others
+from pp_cl.device.device import Device
+from pp_cl.layers.blocking import device_class
+from pp_cl.layers.tiles import LANES
+
+# Of one run: long against the 30 us of a launch, short enough to run between any two others.
 SECONDS = 0.02
 
-# caches of processors and GPUs hold up to an eighth of it; above, the copy would be too fast
+# Eight times what the caches of processors and GPUs hold: a copy inside a cache would be too fast.
 COPY_BYTES = 2**28
 
 
-class Peak:
-    """The loop, long enough to be timed on the device at hand. flops: floating-point operations of
-    one run().
+class PeakFlops:
+    """A loop of multiply-adds in registers, long enough to be timed. flops: floating-point
+    operations of one run().
     """
 
-    def __init__(self, dev):
+    def __init__(self, dev: Device):
         self.dev = dev
         # A CPU core needs 2 units x 4 cycles of chains and has 32 vector registers. On a GPU the 16
         # lanes of one chain are 16 chains already, and many work-items share a unit.
-        self.chains, per_unit, self.local = (16, 64, 1) if dev.is_cpu else (2, 2048, 64)
+        self.chains, per_unit, self.local = {"CPU": (16, 64, 1), "GPU": (2, 2048, 64)}[
+            device_class(dev)
+        ]
         self.out = dev.empty((per_unit * dev.info["compute_units"], LANES))
         self.rounds = 64
         self.run()  # builds the kernel
@@ -29,11 +34,11 @@ class Peak:
             self.rounds *= 2
 
     @property
-    def flops(self):
+    def flops(self) -> int:
         """A multiply-add counts as two."""
         return 2 * self.out.size * self.chains * self.rounds
 
-    def run(self, first=0.0, factor=0.5, term=1.0):
+    def run(self, first: float = 0.0, factor: float = 0.5, term: float = 1.0) -> None:
         """Run the loop and wait for it. The chains tend to term / (1 - factor): they neither
         overflow nor vanish.
         """
@@ -56,16 +61,16 @@ class Peak:
         return time.perf_counter() - start
 
 
-class Copy:
+class CopyBandwidth:
     """A copy of COPY_BYTES. bytes: moved by one run(), read and written."""
 
-    def __init__(self, dev):
+    def __init__(self, dev: Device):
         self.dev = dev
         self.source = dev.zeros((COPY_BYTES // (4 * LANES), LANES))
         self.target = dev.zeros(self.source.shape)
         self.bytes = self.source.nbytes + self.target.nbytes
 
-    def run(self):
+    def run(self) -> None:
         """Copy and wait for it."""
         self.dev.program("bench/peak").launch(
             "peak_copy",

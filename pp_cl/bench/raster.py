@@ -18,16 +18,16 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from pp_cl.bench.network import interleave
-from pp_cl.bench.peak import Copy
+from pp_cl.bench.peak import CopyBandwidth
 from pp_cl.bench.raster_scenes import SCENES
+from pp_cl.bench.timing import interleave
 
 
 def bench_raster(
     dev, scene: str, points: list[int], sizes: list[int], taus: list[float], gamma: float
 ) -> Iterator[dict]:
     """Yield a row for every number of points, side and tau. scene: a key of SCENES."""
-    copy = Copy(dev)
+    copy = CopyBandwidth(dev)
     for n in points:
         for size in sizes:
             before = dev.peak_bytes = dev.bytes

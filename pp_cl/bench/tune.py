@@ -1,205 +1,173 @@
-"""`pp-cl tune`: times what can be chosen for a network's convolutions on the device at hand, and
-stores it (tuning.py).
+"""`pp-cl tune`: times what can be chosen for a network's convolutions on the device at hand.
 
-First the tile shapes, one choice for all layers: they depend on a core's registers and caches, and
-the best one was the same for every layer wherever we measured. Then, with these, every variant for
-every distinct convolution and direction: a training step at the crop's size, a forward pass at the
-evaluation's. Times are medians of interleaved runs, errors are against float64 (bench_layer.py).
+First the blocking, one for all layers: it depends on a core's registers and caches, and the best
+one was the same for every layer wherever we measured. Then, with it, every variant for every
+distinct convolution and direction: a training step at the crop's size, a forward pass at the
+evaluation's. Times are medians of interleaved runs, errors are against float64 (conv.py).
 """
 
-import time
-from contextlib import contextmanager, suppress
-from dataclasses import dataclass
+from collections.abc import Callable
+from contextlib import suppress
+from dataclasses import dataclass, replace
+from pathlib import Path
 
 import numpy as np
 
-from pp_cl.bench.layer import DIRECTIONS, Layer
-from pp_cl.bench.network import errors, interleave, network_shape
-from pp_cl.device.discover import TEMPORARY_CACHE, open_device
+from pp_cl.bench.conv import RandomConv
+from pp_cl.bench.timing import errors, interleave
+from pp_cl.device.device import Device
+from pp_cl.device.discover import TEMPORARY_CACHE
 from pp_cl.errors import UserError
 from pp_cl.files.atomic import write_json
 from pp_cl.files.cache import make_cache_folder
+from pp_cl.layers.blocking import CHOICES
+from pp_cl.layers.direction import Direction
+from pp_cl.layers.policy import ConvolutionPolicy, make_policy
 from pp_cl.layers.tuning import (
     FORMAT,
     MARGIN,
-    Tuning,
     device_key,
     fastest,
     read_tuning,
-    shape_choices,
     tuning_file,
 )
-from pp_cl.layers.variants import shipped_order
+from pp_cl.layers.variants import ConvShape, shipped_order
+from pp_cl.network.architectures import convolutions, unet_layers
 
 # Sides of a preset's pictures, in pixels, where they are evaluated; trainings take crops of them.
 EVALUATED = {"tiny": 200, "small": 400, "paper": 800}
-# What takes HOPELESS times the best one's time in the best of its first PROBES runs is not run
-# again.
+# A variant is given up when even its best of PROBES runs is HOPELESS times slower than the fastest.
 HOPELESS, PROBES = 3, 2
-# of the images that tile shapes are tried on, whatever the network's: they belong to the device
-SHAPES_SIDE = 96
-# What the tile shapes of a kernel file are tried with: (variant, directions).
+# Pixels: side of the images on which blockings are tried, whatever the network's images: they
+# belong to the device.
+BLOCKING_SIDE = 96
+# {field of Blocking: (variant, directions) that it is tried with}
 TRIED = {
-    "winograd": ("winograd4", ("forward", "input")),
-    "winograd_weights": ("winograd4", ("weights",)),
-    "direct": ("direct", ("forward", "input")),
+    "winograd": ("winograd4", (Direction.FORWARD, Direction.BACKWARD_INPUT)),
+    "winograd_weights": ("winograd4", (Direction.BACKWARD_WEIGHTS,)),
+    "direct": ("direct", (Direction.FORWARD, Direction.BACKWARD_INPUT)),
 }
 
 
 @dataclass(frozen=True)
 class Case:
-    """A convolution in one direction, as often as the network has it. side: of its square image, in
-    pixels.
+    """A convolution in one direction, as often as the network has it.
+
+    name: of a layer. sources: channels; of an input gradient those of its one source. side: of its
+    square image, in pixels. training: part of a training step, else only of an evaluation's
+    picture.
     """
 
     name: str
-    direction: str
+    direction: Direction
     k: int
-    sources: tuple  # channels; of an input gradient the one source that it is of
+    sources: tuple[int, ...]
     co: int
     side: int
     count: int
-    training: bool  # part of a training step, else of an evaluation's picture alone
+    training: bool
 
     @property
-    def shape(self):
-        """(k, sources, co, side): what a Layer is made of."""
+    def layer(self) -> tuple:
+        """(k, sources, co, side): what a RandomConv is made of."""
         return self.k, self.sources, self.co, self.side
 
+    @property
+    def shape(self) -> ConvShape:
+        """What its variant is chosen by."""
+        return ConvShape(self.direction, self.k, self.sources, self.co, self.side**2)
 
-def network_cases(widths, train_side, evaluated_side):
-    """[Case] of all distinct convolutions of a training step and of an evaluation's picture."""
-    steps, channels = network_shape(widths)
+
+def network_cases(widths: tuple[int, int, int], train_side: int, evaluated_side: int) -> list[Case]:
+    """All distinct convolutions of a training step and of an evaluation's picture."""
     found = {}
-
-    def add(side, training, step, direction, sources):
-        key = (direction, int(step.kind[-1]), sources, step.channels, side >> step.level)
-        name, count, before = found.get(key, (step.name, 0, training))
-        found[key] = (name, count + (training == before), before)
-
-    for side, training, directions in (
-        (train_side, True, DIRECTIONS),
-        (evaluated_side, False, DIRECTIONS[:1]),
-    ):
-        for step in (s for s in steps if s.kind.startswith("conv")):
-            sources = tuple(channels[name] for name in step.inputs)
-            for direction in directions:
-                for part in [(c,) for c in sources] if direction == "input" else [sources]:
-                    add(side, training, step, direction, part)
-    return [
-        Case(name, direction, k, sources, co, side, count, training)
-        for (direction, k, sources, co, side), (name, count, training) in found.items()
-    ]
+    for side, training in ((train_side, True), (evaluated_side, False)):
+        for layer in convolutions(unet_layers(widths)):
+            for direction, source in layer.computations(training):
+                sources = layer.sources if source is None else (layer.sources[source],)
+                key = (direction, layer.kernel_size, sources, layer.channels, side >> layer.level)
+                name, count, before = found.get(key, (layer.name, 0, training))
+                found[key] = (name, count + (training == before), before)
+    return [Case(name, *key, count, training) for key, (name, count, training) in found.items()]
 
 
-def time_runs(runs):
-    """{name: median milliseconds} of functions run in turn, hopeless ones only a few times."""
+def time_runs(runs: dict[object, Callable]) -> dict[object, float]:
+    """{name: median milliseconds} of functions run in turn; hopeless ones run PROBES times only."""
     times = interleave(runs, rounds=PROBES)
     limit = HOPELESS * min(min(t) for t in times.values())
     times |= interleave({name: run for name, run in runs.items() if min(times[name]) <= limit})
     return {name: float(np.median(t)) for name, t in times.items()}
 
 
-@contextmanager
-def shaped(dev, shapes):
-    """The device with other tile shapes for a while; {} = as shipped."""
-    before, dev.tile_shapes = dev.tile_shapes, shapes
-    try:
-        yield
-    finally:
-        dev.tile_shapes = before
+def tune_blocking(
+    dev: Device, cases: list[Case], policy: ConvolutionPolicy
+) -> tuple[dict, dict[str, dict]]:
+    """({field of Blocking: value} where the shipped value is not the best, {field: {value: total
+    milliseconds over the training's 3x3 layers}}).
 
-
-def with_shapes(layer, shapes, run):
-    """`run` of the layer as a function that runs with the device's tile shapes replaced by
-    `shapes`.
+    As in measure(), what seems faster than the shipped value must be so again.
     """
-    with shaped(layer.dev, shapes):
-        work = layer.make_work()
-
-    def changed():
-        before, layer.work = layer.work, work
-        with shaped(layer.dev, shapes):
-            run()
-        layer.work = before
-
-    return changed
-
-
-def tune_shapes(dev, cases):
-    """{kernel file: tile shape} of the least total time over the training's 3x3 layers, where it is
-    not the shipped one.
-
-    As in measure(), what seems faster than the shipped shape must be so again.
-    """
-    totals = time_shapes(dev, cases, shape_choices(dev))
-    shipped = {name: shape_choices(dev)[name][0] for name in totals}
+    choices = CHOICES[policy.device_class]
+    totals = time_blocking(dev, cases, choices, policy)
+    shipped = {name: choices[name][0] for name in totals}
     best = {name: fastest(ms, shipped[name]) for name, ms in totals.items()}
-    pairs = {name: (shipped[name], shape) for name, shape in best.items() if shape != shipped[name]}
-    for name, ms in time_shapes(dev, cases, pairs).items():
+    pairs = {name: (shipped[name], value) for name, value in best.items() if value != shipped[name]}
+    for name, ms in time_blocking(dev, cases, pairs, policy).items():
         totals[name] |= ms
         best[name] = fastest(ms, shipped[name])
-    for name, ms in totals.items():
-        shown = [
-            f"{_text(shape)} {total:.2f}{' (taken)' if shape == best[name] else ''}"
-            for shape, total in ms.items()
-        ]
-        print(f"tile shapes of {name}, ms: {', '.join(shown)}", flush=True)
-    return {name: shape for name, shape in best.items() if shape != shipped[name]}
+    return {name: value for name, value in best.items() if value != shipped[name]}, totals
 
 
-def time_shapes(dev, cases, shapes):
-    """{kernel file: {tile shape: total milliseconds}} of the training's 3x3 layers, for some shapes
-    of some files.
-    """
+def time_blocking(
+    dev: Device, cases: list[Case], values: dict[str, tuple], policy: ConvolutionPolicy
+) -> dict[str, dict]:
+    """{field of Blocking: {value: total milliseconds over the training's 3x3 layers}}."""
     totals = {}
     for case in (c for c in cases if c.training and c.k == 3):
-        used = [name for name in shapes if case.direction in TRIED[name][1]]
-        layer = Layer(dev, case.k, SHAPES_SIDE, case.sources, case.co) if used else None
+        used = [name for name in values if case.direction in TRIED[name][1]]
+        conv = RandomConv(dev, case.k, BLOCKING_SIDE, case.sources, co=case.co) if used else None
         for name in used:
             variant = TRIED[name][0]
-            if variant in layer.variants:
-                run = layer.runner(variant, case.direction)
-                times = time_runs(
-                    {shape: with_shapes(layer, {name: shape}, run) for shape in shapes[name]}
-                )
-                total = totals.setdefault(name, dict.fromkeys(shapes[name], 0.0))
-                for shape, ms in times.items():
-                    total[shape] += case.count * ms
+            if variant in conv.variants:
+                runs = {
+                    value: conv.runner(
+                        variant, case.direction, _with_blocking(policy, {name: value})
+                    )
+                    for value in values[name]
+                }
+                total = totals.setdefault(name, dict.fromkeys(values[name], 0.0))
+                for value, ms in time_runs(runs).items():
+                    total[value] += case.count * ms
     return totals
 
 
-def _text(shape):
-    """8, 2, (1, 1, 1) -> 8/2/1x1x1"""
-    parts = shape if isinstance(shape, tuple) else (shape,)
-    return "/".join("x".join(map(str, p)) if isinstance(p, tuple) else str(p) for p in parts)
+def _with_blocking(policy, values):
+    return replace(policy, blocking=replace(policy.blocking, **values))
 
 
-def measure(dev, case, layer):
+def measure(
+    case: Case, conv: RandomConv, shipped: ConvolutionPolicy, tuned: ConvolutionPolicy
+) -> tuple[dict, float]:
     """(row of a tuning, milliseconds as shipped) of a case: times and errors of all variants that
-    can take it.
+    can run it, with the blocking of `tuned`.
 
     Those that seem faster than the shipped one must be so in a second measurement, whose times
     count: the best of several noisy numbers is too good.
     """
-    shipped = shipped_variant(dev, case)
-    runs = {
-        variant: layer.runner(variant, case.direction)
-        for variant in layer.variants
-        if variant in _order(dev, case)
-    }
-    found = {variant: errors(*layer.result(variant, case.direction))[0] for variant in runs}
+    order = shipped_order(shipped.device_class, case.shape)
+    names = [variant for variant in conv.variants if variant in order]
+    runs = {name: conv.runner(name, case.direction, tuned) for name in names}
+    found = {name: errors(*conv.result(name, case.direction, tuned))[0] for name in names}
     ms = time_runs(runs)
-    again = {
-        name: runs[name] for name in runs if name == shipped or ms[name] * MARGIN < ms[shipped]
-    }
-    if dev.tile_shapes:
-        again[None] = with_shapes(layer, {}, runs[shipped])
+    first = order[0]
+    again = {name: runs[name] for name in runs if name == first or ms[name] * MARGIN < ms[first]}
+    if tuned.blocking != shipped.blocking:
+        again[None] = conv.runner(first, case.direction, shipped)
     if len(again) > 1:
         ms |= time_runs(again)
-    shipped_ms = ms.pop(None, ms[shipped])
+    shipped_ms = ms.pop(None, ms[first])
     return {
-        "direction": case.direction,
+        "direction": case.direction.value,
         "k": case.k,
         "ci": sum(case.sources),
         "co": case.co,
@@ -209,86 +177,90 @@ def measure(dev, case, layer):
     }, shipped_ms
 
 
-def tune_layers(dev, cases, tolerance):
-    """(rows of all cases, their milliseconds as shipped); prints each, with what is taken within
-    the tolerance.
+def tune_layers(
+    dev: Device,
+    cases: list[Case],
+    shipped: ConvolutionPolicy,
+    tuned: ConvolutionPolicy,
+    *,
+    on_row: Callable[[Case, dict], None],
+) -> tuple[list[dict], list[float]]:
+    """(rows of all cases, their milliseconds as shipped). on_row: called with each case and its
+    row.
     """
-    rows, shipped_ms, layer, shape = [], [], None, None
+    rows, shipped_ms, conv, layer = [], [], None, None
     for case in cases:
-        if case.shape != shape:
-            layer, shape = None, case.shape  # one at a time
-            layer = Layer(dev, case.k, case.side, case.sources, case.co)
-        row, ms = measure(dev, case, layer)
+        if case.layer != layer:
+            conv, layer = None, case.layer  # frees the old one first
+            conv = RandomConv(dev, case.k, case.side, case.sources, co=case.co)
+        row, ms = measure(case, conv, shipped, tuned)
         rows.append(row)
         shipped_ms.append(ms)
-        try:
-            taken = picked(dev, case, Tuning(tolerance, [row]))
-        except UserError:
-            taken = None
-        print(line(case, row, taken, shipped_variant(dev, case)), flush=True)
+        on_row(case, row)
     return rows, shipped_ms
 
 
-def _order(dev, case):
-    return shipped_order(dev, case.direction, case.k, (*case.sources, case.co), case.side**2)
+def run_tune(
+    dev: Device,
+    cases: list[Case],
+    tolerance: float,
+    *,
+    on_blocking: Callable[[dict, dict], None],
+    on_row: Callable[[Case, dict], None],
+) -> tuple[dict, list[float]]:
+    """(tuning of this device as layers/tuning.py stores it, milliseconds of the cases as shipped).
 
-
-def shipped_variant(dev, case):
-    """The variant that is shipped for a case."""
-    return _order(dev, case)[0]
-
-
-def picked(dev, case, tuning):
-    """The variant that a tuning picks for a case."""
-    return tuning.pick(
-        case.direction, case.k, sum(case.sources), case.co, case.side**2, _order(dev, case)
-    )
-
-
-def summary(dev, cases, rows, shipped_ms, tuning):
-    """Lines that say what the tuning gains. Raises UserError where no variant keeps its
-    tolerance.
+    on_blocking: called with the result of tune_blocking(); on_row: with each case and its row.
     """
-    lines = []
+    shipped = make_policy(dev, tolerance)
+    blocking, times = tune_blocking(dev, cases, shipped)
+    on_blocking(blocking, times)
+    tuned = _with_blocking(shipped, blocking)
+    rows, shipped_ms = tune_layers(dev, cases, shipped, tuned, on_row=on_row)
+    tuning = {"format": FORMAT, "device": device_key(dev), "tile_shapes": blocking, "rows": rows}
+    return tuning, shipped_ms
+
+
+def check_cache() -> None:
+    """Raise UserError if the user's cache cannot be written, or is a temporary folder."""
+    if make_cache_folder().parent.name.startswith(TEMPORARY_CACHE):
+        raise UserError(
+            "the user's cache cannot be written, so nothing would be kept; set PP_CACHE to a folder"
+            " that stays"
+        )
+
+
+def store(dev: Device, tuning: dict) -> Path:
+    """Write a tuning to the user's cache, merged with the one there; returns its path."""
+    with suppress(OSError, ValueError):  # there is none, or one that this replaces
+        tuning = merge(tuning, read_tuning(dev))
+    write_json(tuning_file(dev), tuning)
+    return tuning_file(dev)
+
+
+def total_times(
+    cases: list[Case], rows: list[dict], shipped_ms: list[float], policy: ConvolutionPolicy
+) -> dict[str, tuple[float, float]]:
+    """{"a training step", "a picture of the evaluation": (milliseconds as shipped, as tuned)} of
+    the convolutions. Raises UserError where no variant keeps the policy's tolerance.
+    """
+    found = {}
     for training, what in ((True, "a training step"), (False, "a picture of the evaluation")):
         some = [
             (c, row, ms)
             for c, row, ms in zip(cases, rows, shipped_ms, strict=True)
             if c.training == training
         ]
-        shipped = sum(c.count * ms for c, _, ms in some)
-        tuned = sum(c.count * row["ms"][picked(dev, c, tuning)] for c, row, _ in some)
         if some:
-            lines.append(
-                f"convolutions of {what}: {shipped:.2f} ms as shipped, {tuned:.2f} ms as tuned, "
-                f"{shipped / tuned:.2f} times as fast"
-            )
-    return lines
+            shipped = sum(c.count * ms for c, _, ms in some)
+            tuned = sum(c.count * row["ms"][policy.choose(c.shape)] for c, row, _ in some)
+            found[what] = shipped, tuned
+    return found
 
 
-COLUMNS = "{:7} {:20} {:9} {:68} {:>8}  {}".format
-HEAD = COLUMNS("layer", "shape", "direction", "milliseconds", "rel. L2", "taken")
-
-
-def line(case, row, taken, shipped):
-    """One line of the printed table; taken: None where no variant is exact enough."""
-    ms = ", ".join(f"{name} {ms:.3f}" for name, ms in row["ms"].items())
-    shape = f"{case.side}x{case.side}x{row['ci']}x{case.co}x{case.k}"
-    if taken is None:
-        return COLUMNS(case.name, shape, case.direction, ms, "", "none")
-    return COLUMNS(
-        case.name,
-        shape,
-        case.direction,
-        ms,
-        f"{row['rel_l2'][taken]:.1e}",
-        taken if taken == shipped else f"{taken} instead of {shipped}",
-    )
-
-
-def merge(tuning, earlier):
+def merge(tuning: dict, earlier: dict) -> dict:
     """The tuning, with the rows of an earlier one for other layers, if both were measured with the
-    same tile shapes.
+    same blocking.
     """
     if earlier["tile_shapes"] != tuning["tile_shapes"]:
         return tuning
@@ -300,36 +272,3 @@ def merge(tuning, earlier):
 
 def _key(row):
     return tuple(row[name] for name in ("direction", "k", "ci", "co", "pixels"))
-
-
-def run_tune(widths, train_side, evaluated_side, tolerance, device=None):
-    """Measure a network's convolutions, print the tables, store the tuning.
-
-    Raises UserError, before anything is measured, where it cannot be stored; and where no variant
-    keeps the tolerance.
-    """
-    dev = open_device(device)
-    if make_cache_folder().parent.name.startswith(TEMPORARY_CACHE):
-        raise UserError(
-            "the user's cache cannot be written, so nothing would be kept; set PP_CACHE to a folder"
-            " that stays"
-        )
-    print(
-        f"{dev.name} [{dev.info['platform']}], widths {','.join(map(str, widths))}, "
-        f"training at {train_side}x{train_side}, evaluation at {evaluated_side}x{evaluated_side}"
-    )
-    start, cases = time.perf_counter(), network_cases(widths, train_side, evaluated_side)
-    dev.tile_shapes = tune_shapes(dev, cases)
-    print(HEAD)
-    rows, shipped_ms = tune_layers(dev, cases, tolerance)
-    tuning = {
-        "format": FORMAT,
-        "device": device_key(dev),
-        "tile_shapes": dev.tile_shapes,
-        "rows": rows,
-    }
-    with suppress(OSError, ValueError):  # there is none, or one that this replaces
-        tuning = merge(tuning, read_tuning(dev))
-    write_json(tuning_file(dev), tuning)
-    print(f"stored in {tuning_file(dev)} ({time.perf_counter() - start:.0f} s)")
-    print("\n".join(summary(dev, cases, rows, shipped_ms, Tuning(tolerance, rows))))

@@ -77,7 +77,7 @@ def _refuse_foreign(options):
 
 
 def _run_raster(options):
-    from pp_cl.bench.network import check_files, save_figure
+    from pp_cl.bench.plots import check_files, save_figure
     from pp_cl.bench.raster import HEAD, bench_raster, growth, line, plot
     from pp_cl.bench.raster_scenes import SCENES
 
@@ -113,7 +113,7 @@ def _run_raster(options):
 
 
 def _run_train(options):
-    from pp_cl.bench.network import check_files
+    from pp_cl.bench.plots import check_files
     from pp_cl.bench.train import bench_train
     from pp_cl.run import configure
 
@@ -135,21 +135,29 @@ def _run_train(options):
 
 
 def _run_network(options):
-    from pp_cl.bench.network import run_bench
+    from pp_cl.bench.conv import bench_conv
+    from pp_cl.bench.plots import check_files, plot_time_and_error, save_figure
+    from pp_cl.bench.table import HEAD, line
+    from pp_cl.bench.unet import bench_unet
+    from pp_cl.layers.policy import load_policy
 
     size, widths = shared.read_shape(options.size or "256", options.widths or "128,256,512")
     tolerance = shared.read_tolerance(options.tolerance)
-    if tolerance is None:
-        tolerance = preset("tiny").network.tolerance
-    run_bench(
-        options.what,
-        size,
-        widths,
-        tolerance,
-        json_file=options.json,
-        plot_file=options.plot,
-        device=options.device,
-    )
+    figure = check_files(options.json, options.plot)
+    dev = _open_device(options)
+    policy = load_policy(dev, preset("tiny").network.tolerance if tolerance is None else tolerance)
+    print(f"{policy.origin}\n{HEAD}")
+    rows = []
+    for row in {"conv": bench_conv, "unet": bench_unet}[options.what](dev, size, widths, policy):
+        rows.append(row)
+        print(line(row), flush=True)
+    for direction, memory in {r["direction"]: r.get("memory_bytes") for r in rows}.items():
+        if memory:
+            print(f"the network's memory, {direction}: {memory / 2**20:.0f} MiB")
+    _write_json(options.json, dev, rows)
+    if figure:
+        plot_time_and_error(figure, f"{options.what}, {size} x {size}, {dev.name}", rows)
+        save_figure(figure, options.plot)
 
 
 def _open_device(options):

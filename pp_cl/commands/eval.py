@@ -24,19 +24,19 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> None:
     """Evaluate, print the table."""
-    from pp_cl.evaluate import evaluate_run
-    from pp_cl.files.run_folder import RunFolder
+    from pp_cl.device.discover import open_device
+    from pp_cl.evaluate import evaluate
+    from pp_cl.run import load_run
 
-    folder = RunFolder(options.run_folder)
-    result = evaluate_run(
-        folder.path,
-        options.split,
+    metrics, tolerance = (
         shared.read_metrics(options.metrics),
-        save_images=options.save_images,
-        device=options.device,
-        tolerance=shared.read_tolerance(options.tolerance),
-        scene=options.scene,
+        shared.read_tolerance(options.tolerance),
     )
+    dev = open_device(options.device)
+    run = load_run(dev, options.run_folder, tolerance=tolerance, scene=options.scene)
+    print(run.policy.origin)
+    result = evaluate(run, options.split, metrics, save_images=options.save_images)
+    folder = run.folder
     print(_table(result, folder))
     print(_summary(result))
     written = folder.evaluation(options.split)

@@ -58,6 +58,7 @@ def run(options: argparse.Namespace) -> None:
     dev = open_device(options.device)
     print(f"device: {dev.name} [{dev.info['platform']}]")
     training = open_training(dev, folder, config, stored)
+    print(training.origin)
     print(_first_line(training))
     print("\n".join(plan_lines(training.plan, dev)))
     seconds = _run_with_bar(training)

@@ -1,9 +1,11 @@
 """The command pp-cl tune."""
 
 import argparse
+import time
 
 from pp_cl.commands import options as shared
 from pp_cl.config import PRESETS, preset
+from pp_cl.errors import UserError
 
 HELP = "time the variants of the convolutions on this device, keep the fastest"
 
@@ -24,16 +26,55 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(options: argparse.Namespace) -> None:
-    """Measure, store the tuning."""
-    from pp_cl.bench.tune import EVALUATED, run_tune
+    """Measure, print what is taken, store the tuning."""
+    from pp_cl.bench import tune
+    from pp_cl.bench.table import TUNE_HEAD, blocking_line, tune_line
+    from pp_cl.device.discover import open_device
+    from pp_cl.layers.blocking import CHOICES
+    from pp_cl.layers.policy import make_policy
+    from pp_cl.layers.variants import shipped_order
 
     config = preset(options.preset or "tiny")
     tolerance = shared.read_tolerance(options.tolerance)
     if tolerance is None:
         tolerance = config.network.tolerance
-    evaluated = EVALUATED[config.preset]
+    evaluated = tune.EVALUATED[config.preset]
     size, widths = shared.read_shape(
         options.size or str(evaluated), options.widths or ",".join(map(str, config.network.widths))
     )
     training = size if options.size else config.train.crop or evaluated
-    run_tune(widths, training, size, tolerance, options.device)
+    dev = open_device(options.device)
+    tune.check_cache()
+    print(
+        f"{dev.name} [{dev.info['platform']}], widths {','.join(map(str, widths))}, "
+        f"training at {training}x{training}, evaluation at {size}x{size}"
+    )
+    kind = make_policy(dev).device_class
+
+    def show_blocking(chosen, times):
+        shipped = {name: values[0] for name, values in CHOICES[kind].items()}
+        for name, ms in times.items():
+            print(blocking_line(name, ms, chosen.get(name, shipped[name])))
+        print(TUNE_HEAD, flush=True)
+
+    def show_row(case, row):
+        policy = make_policy(dev, tolerance, {"tile_shapes": {}, "rows": [row]})
+        try:
+            chosen = policy.choose(case.shape)
+        except UserError:
+            chosen = None
+        print(tune_line(case.name, row, chosen, shipped_order(kind, case.shape)[0]), flush=True)
+
+    start = time.perf_counter()
+    cases = tune.network_cases(widths, training, size)
+    tuning, shipped_ms = tune.run_tune(
+        dev, cases, tolerance, on_blocking=show_blocking, on_row=show_row
+    )
+    print(f"stored in {tune.store(dev, tuning)} ({time.perf_counter() - start:.0f} s)")
+    policy = make_policy(dev, tolerance, tuning)
+    times = tune.total_times(cases, tuning["rows"], shipped_ms, policy)
+    for what, (shipped, tuned) in times.items():
+        print(
+            f"convolutions of {what}: {shipped:.2f} ms as shipped, {tuned:.2f} ms as tuned, "
+            f"{shipped / tuned:.2f} times as fast"
+        )

@@ -94,8 +94,6 @@ def _debug_level():
 class Device:
     """One OpenCL device with its queue, programs and buffers. debug: PP_DEBUG
     (docs/environment.md).
-
-    tuning, tile_shapes: what tuning.adopt() set for the convolutions; None and {} = as shipped.
     """
 
     def __init__(self, device):
@@ -104,7 +102,6 @@ class Device:
         self.info = describe(device)
         self.is_cpu = bool(device.type & cl.device_type.CPU)
         self.debug = _debug_level()
-        self.tuning, self.tile_shapes = None, {}
         self.context = cl.Context([device])
         properties = cl.command_queue_properties.PROFILING_ENABLE if self.debug else 0
         self.queue = cl.CommandQueue(self.context, properties=properties)

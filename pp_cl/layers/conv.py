@@ -1,88 +1,74 @@
-"""Convolutions K x K (K = 1 or 3), stride 1, zero padding K // 2, and the layout of their
+"""Direct convolutions K x K (K = 1 or 3), stride 1, zero padding K // 2, and the layout of their
 weights.
 """
 
 import numpy as np
+from pyopencl.array import Array
 
-from pp_cl.layers.conv_local import local_program
-from pp_cl.layers.tiles import LANES, checked_tiles
+from pp_cl.device.device import Device
+from pp_cl.layers.blocking import Blocking
+from pp_cl.layers.tiles import LANES, Tiles, checked_tiles
 
 
-def pack_weights(weight, dtype=np.float32):
-    """(CO, CI, K, K) numpy array -> (ceil(CO / 16), K, K, CI, 16), output channels beyond CO
-    zero.
-    """
+def pack_weights(weight: np.ndarray, dtype: type = np.float32) -> np.ndarray:
+    """(CO, CI, K, K) -> (ceil(CO / 16), K, K, CI, 16), output channels beyond CO zero."""
     co, ci, k, _ = weight.shape
     packed = np.zeros((-(-co // LANES) * LANES, ci, k, k), dtype)
     packed[:co] = weight
     return np.ascontiguousarray(packed.reshape(-1, LANES, ci, k, k).transpose(0, 3, 4, 2, 1))
 
 
-def unpack_weights(packed, co):
+def unpack_weights(packed: np.ndarray, co: int) -> np.ndarray:
     """The inverse of pack_weights: (CO, CI, K, K)."""
     blocks, k, _, ci, _ = packed.shape
     return packed.transpose(0, 4, 3, 1, 2).reshape(blocks * LANES, ci, k, k)[:co]
 
 
-def pack_bias(bias, dtype=np.float32):
-    """(CO,) numpy array -> (ceil(CO / 16) * 16,), padded with zeros."""
+def pack_bias(bias: np.ndarray, dtype: type = np.float32) -> np.ndarray:
+    """(CO,) -> (ceil(CO / 16) * 16,), padded with zeros."""
     return np.pad(np.asarray(bias, dtype), (0, -len(bias) % LANES))
 
 
-def shipped_tiling(dev, channels_out):
-    """(TILE, BLOCKS, work-group) of cl/layers/conv.cl for wide images, as shipped.
+def conv_forward(
+    dev: Device,
+    sources: tuple[Array, ...],
+    weight: Array,
+    bias: Array,
+    *,
+    out: Array,
+    relu: bool,
+    blocking: Blocking,
+    tiles: Tiles | None = None,
+) -> None:
+    """out = convolution of the sources' concatenation + bias, then max(., 0) if relu.
 
-    A CPU core has 32 vector registers. Where the blocks of 16 channels pair up, two share each
-    input value and take 8 pixels: 16 accumulators and 6 weights; else one takes 12. A GPU's
-    work-item has about 255 scalar registers: 4 pixels.
-    """
-    if not dev.is_cpu:
-        return 4, 1, (16, 4, 1)
-    return (12, 1, (1, 1, 1)) if -(-channels_out // LANES) % 2 else (8, 2, (1, 1, 1))
-
-
-def tiling(dev, width, channels_out):
-    """(TILE, BLOCKS, work-group) for an image `width` wide: as tuned for the device, else as
-    shipped.
-    """
-    tile, blocks, local = dev.tile_shapes.get("direct") or shipped_tiling(dev, channels_out)
-    if -(-channels_out // LANES) % blocks:
-        tile, blocks, local = shipped_tiling(dev, channels_out)
-    return next(t for t in (tile, 8, 4, 1) if t <= width), blocks, tuple(local)
-
-
-def conv_forward(dev, x, weight, bias, out, relu, x2=None, tiles=None, local_memory=False):
-    """out = convolution of [x, x2] + bias, then max(., 0) if relu.
-
-    x: (H, W, C1), x2: None or (H, W, C2); weight: (ceil(CO/16), K, K, C1 + C2, 16); bias:
-    (ceil(CO/16) * 16,); out: (H, W, CO), all float32; tiles: tiles.Tiles of out that are written,
-    None = all; local_memory: by cl/layers/conv_local.cl, which takes 3x3 kernels and channels in
-    multiples of 16. Raises ValueError when shapes do not fit together.
+    sources: one or two of (H, W, C1), (H, W, C2); weight: (ceil(CO/16), K, K, C1 + C2, 16); bias:
+    (ceil(CO/16) * 16,); out: (H, W, CO), all float32; tiles: those of out to compute, None = all.
+    Raises ValueError when shapes do not fit together.
     """
     height, width, co = out.shape
-    c1, c2 = x.shape[2], 0 if x2 is None else x2.shape[2]
+    channels = [source.shape[2] for source in sources]
     blocks = -(-co // LANES)
-    if weight.shape[0] != blocks or weight.shape[3] != c1 + c2 or bias.shape != (blocks * LANES,):
+    if (weight.shape[0], weight.shape[3]) != (blocks, sum(channels)) or bias.shape != (
+        blocks * LANES,
+    ):
         raise ValueError(
-            f"convolution of {c1} + {c2} to {co} channels: weight is {weight.shape}, bias"
-            f" {bias.shape}"
+            f"convolution of {' + '.join(map(str, channels))} to {co} channels: weight is"
+            f" {weight.shape}, bias {bias.shape}"
         )
-    if local_memory:
-        program, size, local = local_program(dev, height, width, c1, c2, co)
-    else:
-        program, size, local = _program(dev, weight.shape[1], height, width, co)
+    program, size, work_group = _program(dev, blocking, weight.shape[1], out.shape)
     program.launch(
         "conv_forward",
         size,
-        local=local,
+        local=work_group,
         height=height,
         width=width,
-        c1=c1,
-        c2=c2,
+        c1=channels[0],
+        c2=sum(channels[1:]),
         co=co,
         relu=relu,
-        x=x,
-        x2=x if x2 is None else x2,
+        x=sources[0],
+        x2=sources[-1],
         weight=weight,
         bias=bias,
         out=out,
@@ -90,32 +76,37 @@ def conv_forward(dev, x, weight, bias, out, relu, x2=None, tiles=None, local_mem
     )
 
 
-def conv_backward_input(dev, x, flipped, grad_out, grad_x, masked, tiles=None, local_memory=False):
-    """grad_x = gradient of the convolution's input; where masked, of the input of the ReLU that
-    made x (zero where x <= 0).
+def conv_backward_input(
+    dev: Device,
+    flipped: Array,
+    grad_out: Array,
+    grad_x: Array,
+    *,
+    mask: Array | None,
+    blocking: Blocking,
+    tiles: Tiles | None = None,
+) -> None:
+    """grad_x = gradient of a convolution's input, 0 where mask <= 0.
 
-    x, grad_x: (H, W, C), grad_out: (H, W, CO); flipped: (ceil(C/16), K, K, CO, 16) from
-    conv_weights.flip_weights. x is read only where masked. tiles: tiles.Tiles of grad_x that are
-    written, None = all; local_memory: as in conv_forward. Raises ValueError when shapes do not fit
-    together.
+    flipped: (ceil(C/16), K, K, CO, 16) from conv_backward_weights.flip_weights; grad_out: (H, W,
+    CO); grad_x: (H, W, C); mask: (H, W, C), the input where it is a ReLU's output, so that grad_x
+    is the gradient of the ReLU's input, or None; tiles: those of grad_x to compute, None = all.
+    Raises ValueError when shapes do not fit together.
     """
     height, width, c = grad_x.shape
     if flipped.shape[0] != -(-c // LANES):
         raise ValueError(f"input gradient of {c} channels: flipped weights are {flipped.shape}")
-    if local_memory:
-        program, size, local = local_program(dev, height, width, grad_out.shape[2], c)
-    else:
-        program, size, local = _program(dev, flipped.shape[1], height, width, c)
+    program, size, work_group = _program(dev, blocking, flipped.shape[1], grad_x.shape)
     program.launch(
         "conv_backward_input",
         size,
-        local=local,
+        local=work_group,
         height=height,
         width=width,
         c=c,
         co=grad_out.shape[2],
-        masked=masked,
-        x=x,
+        masked=mask is not None,
+        x=grad_x if mask is None else mask,
         flipped=flipped,
         grad_out=grad_out,
         grad_x=grad_x,
@@ -123,7 +114,9 @@ def conv_backward_input(dev, x, flipped, grad_out, grad_x, masked, tiles=None, l
     )
 
 
-def _program(dev, k, height, width, channels_out):
-    tile, blocks, local = tiling(dev, width, channels_out)
-    size = (-(-width // tile), height, -(-channels_out // (LANES * blocks)))
-    return dev.program("layers/conv", K=k, TILE=tile, BLOCKS=blocks), size, local
+def _program(dev, blocking, k, shape):
+    """(program, global size, work-group) for a result of shape (H, W, C)."""
+    height, width, channels = shape
+    pixels, groups, work_group = blocking.of_direct(width, channels)
+    size = (-(-width // pixels), height, -(-channels // (LANES * groups)))
+    return dev.program("layers/conv", KERNEL_SIZE=k, PIXELS=pixels, BLOCKS=groups), size, work_group

@@ -1,19 +1,23 @@
-"""Weight and bias gradients of convolutions, and the flipped weights their input gradients are made
-with.
+"""Weight and bias gradients of the direct convolutions, and the flipped weights from which their
+input gradients are computed.
 """
 
-from pp_cl.layers.conv import LANES
-from pp_cl.layers.tiles import checked_tiles
+from pyopencl.array import Array
 
-# Rows of the image that one work-item adds up: few enough to stay in a core's cache, and enough
-# parts for all cores.
+from pp_cl.device.device import Device
+from pp_cl.layers.blocking import Blocking
+from pp_cl.layers.tiles import LANES, Tiles, checked_tiles
+
+# Rows of the image that one work-item sums: few enough to stay in a core's cache, and enough parts
+# for all cores.
 ROWS_PER_PART = 8
-# The parts of all sums together take at most so many floats (64 MiB), or one part if that is
-# larger.
+# The partial sums take at most this many floats (64 MiB), or one part if that is larger.
 PARTIAL_FLOATS = 1 << 24
 
 
-def flip_weights(dev, weight, first, flipped):
+def flip_weights(
+    dev: Device, weight: Array, first: int, flipped: Array, *, blocking: Blocking
+) -> None:
     """flipped = weight with the kernel mirrored and the roles of input and output channels
     exchanged.
 
@@ -22,7 +26,7 @@ def flip_weights(dev, weight, first, flipped):
     """
     k, ci = weight.shape[1], weight.shape[3]
     blocks, co = flipped.shape[0], flipped.shape[3]
-    dev.program("layers/conv_backward_weights", K=k, CI_TILE=_ci_tile(dev, k, ci)).launch(
+    _program(dev, blocking, k, ci)[0].launch(
         "conv_flip_weights",
         (co, k * k, blocks),
         c=min(ci - first, blocks * LANES),
@@ -34,47 +38,52 @@ def flip_weights(dev, weight, first, flipped):
     )
 
 
-def partial_floats(height, weight_shape):
-    """Floats of scratch memory that weight_gradient needs for an image `height` high."""
+def partial_floats(height: int, weight_shape: tuple) -> int:
+    """Floats of scratch memory that conv_backward_weights needs for an image `height` high."""
     blocks, k, _, ci, _ = weight_shape
     return _parts(height, weight_shape)[0] * blocks * (k * k * ci + 1) * LANES
 
 
-def weight_gradient(dev, x, grad_out, grad_weight, grad_bias, partial, x2=None, tiles=None):
-    """Overwrite grad_weight and grad_bias with the gradients of conv_forward(x, ..., x2), given
+def conv_backward_weights(
+    dev: Device,
+    sources: tuple[Array, ...],
+    grad_out: Array,
+    grad_weight: Array,
+    *,
+    grad_bias: Array,
+    partial: Array,
+    blocking: Blocking,
+    tiles: Tiles | None = None,
+) -> None:
+    """Overwrite grad_weight and grad_bias with the gradients of conv_forward(sources, ...), given
     dL/dout before the ReLU.
 
-    x: (H, W, C1), x2: None or (H, W, C2), grad_out: (H, W, CO); grad_weight: (ceil(CO/16), K, K, C1
-    + C2, 16); grad_bias: (ceil(CO/16) * 16,); partial: scratch of at least partial_floats(H,
-    grad_weight.shape). tiles: tiles.Tiles of grad_out that are read, each as often as it counts,
-    None = all, once. The sums run in an order that depends on the shapes alone. Raises ValueError
+    sources: one or two of (H, W, C1), (H, W, C2); grad_out: (H, W, CO); grad_weight:
+    (ceil(CO/16), K, K, C1 + C2, 16); grad_bias: (ceil(CO/16) * 16,); partial: scratch of at least
+    partial_floats(H, grad_weight.shape); tiles: those of grad_out to sum, each as often as it
+    counts, None = all, once. The order of the sums depends on the shapes alone. Raises ValueError
     when shapes do not fit together.
     """
     height, width, co = grad_out.shape
     blocks, k, _, ci, _ = grad_weight.shape
-    sources = [x] if x2 is None else [x, x2]
-    if (
-        sum(s.shape[2] for s in sources) != ci
-        or blocks != -(-co // LANES)
-        or grad_bias.shape != (blocks * LANES,)
-    ):
+    channels = [source.shape[2] for source in sources]
+    if (sum(channels), -(-co // LANES), grad_bias.shape) != (ci, blocks, (blocks * LANES,)):
         raise ValueError(
-            f"weight gradient of {[s.shape for s in sources]} to {co} channels: "
+            f"weight gradient of {channels} to {co} channels: "
             f"weight is {grad_weight.shape}, bias {grad_bias.shape}"
         )
     needed = partial_floats(height, grad_weight.shape)
     if partial.size < needed:
         raise ValueError(f"weight gradient: scratch has {partial.size} floats, needs {needed}")
+    tiles = checked_tiles(dev, tiles, height, width)
     parts, rows = _parts(height, grad_weight.shape)
     first = 0
-    for source in sources:
-        c = source.shape[2]
-        tile = _ci_tile(dev, k, c)
-        program = dev.program("layers/conv_backward_weights", K=k, CI_TILE=tile)
+    for source, c in zip(sources, channels, strict=True):
+        program, group = _program(dev, blocking, k, c)
         program.launch(
             "conv_backward_weights",
-            (c // tile * k, blocks, parts),
-            local=(1, 1, 1) if dev.is_cpu else None,
+            (c // group * k, blocks, parts),
+            local=blocking.work_group,
             height=height,
             width=width,
             c=c,
@@ -84,7 +93,7 @@ def weight_gradient(dev, x, grad_out, grad_weight, grad_bias, partial, x2=None, 
             rows=rows,
             x=source,
             grad_out=grad_out,
-            tile_count=checked_tiles(dev, tiles, height, width).count,
+            tile_count=tiles.count,
             partial=partial,
         )
         first += c
@@ -108,12 +117,11 @@ def _parts(height, weight_shape):
     return -(-height // rows), rows
 
 
-def _ci_tile(dev, k, channels):
-    """Input channels of one work-item: a divisor of the channels whose k * tile accumulators fit
-    the registers.
-
-    A CPU core has 32 vector registers; a GPU's work-item has about 255 scalar ones, and a vector
-    takes 16 of them.
+def _program(dev, blocking, k, channels):
+    """(program, input channels of one work-item): a divisor of the channels whose sums, k for each
+    channel, fit the registers.
     """
-    accumulators = 24 if dev.is_cpu else 6
-    return next(t for t in (16, 8, 4, 2, 1) if t * k <= accumulators and channels % t == 0)
+    group = next(
+        n for n in (16, 8, 4, 2, 1) if n * k <= blocking.accumulators and channels % n == 0
+    )
+    return dev.program("layers/conv_backward_weights", KERNEL_SIZE=k, CI_GROUP=group), group

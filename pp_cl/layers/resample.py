@@ -1,15 +1,18 @@
-"""Pooling, bilinear upsampling and a straight line on (H, W, C) float32 feature maps.
+"""Pooling, bilinear upsampling and an affine map (scale * x + offset) on (H, W, C) float32 feature
+maps.
 
-tiles: tiles.Tiles of the result that are written, None = all.
+tiles: those of the result to compute, None = all.
 """
 
-from pp_cl.layers.conv import LANES
-from pp_cl.layers.tiles import checked_tiles
+from pyopencl.array import Array
+
+from pp_cl.device.device import Device
+from pp_cl.layers.tiles import LANES, Tiles, checked_tiles
 
 LOCAL = (1, 16, 4)  # 16 channels, x, y
 
 
-def avgpool2_forward(dev, x, out, tiles=None):
+def avgpool2_forward(dev: Device, x: Array, out: Array, *, tiles: Tiles | None = None) -> None:
     """out (H, W, C) = mean of 2x2 pixels of x (2H, 2W, C). Raises ValueError for other shapes."""
     h, w, c = _check_double(out, x)
     _launch(
@@ -25,11 +28,14 @@ def avgpool2_forward(dev, x, out, tiles=None):
     )
 
 
-def avgpool2_backward(dev, x, grad_out, grad_x, tiles=None):
+def avgpool2_backward(
+    dev: Device, x: Array, grad_out: Array, grad_x: Array, *, tiles: Tiles | None = None
+) -> None:
     """Adds the gradient of avgpool2_forward to grad_x (2H, 2W, C), then sets grad_x to 0 where x <=
     0.
 
-    x: the ReLU's output that was pooled; grad_x: gradient from its other use; grad_out: (H, W, C).
+    x: the ReLU's output that was pooled; grad_x: gradient of that output's other use; grad_out: (H,
+    W, C).
     """
     h, w, c = _check_double(grad_out, grad_x)
     _launch(
@@ -46,7 +52,7 @@ def avgpool2_backward(dev, x, grad_out, grad_x, tiles=None):
     )
 
 
-def maxpool2_forward(dev, x, out):
+def maxpool2_forward(dev: Device, x: Array, out: Array) -> None:
     """out (H // 2, W // 2, C) = largest of 2x2 pixels of x (H, W, C). Raises ValueError for other
     shapes.
     """
@@ -56,7 +62,7 @@ def maxpool2_forward(dev, x, out):
     _launch(dev, "maxpool2_forward", (c, w, h), h=h, w=w, c=c, x_width=x.shape[1], x=x, out=out)
 
 
-def upsample2_forward(dev, x, out, tiles=None):
+def upsample2_forward(dev: Device, x: Array, out: Array, *, tiles: Tiles | None = None) -> None:
     """out (2H, 2W, C) = x (H, W, C), bilinear, align_corners False, border repeated."""
     h, w, c = _check_double(x, out)
     _launch(
@@ -72,7 +78,9 @@ def upsample2_forward(dev, x, out, tiles=None):
     )
 
 
-def upsample2_backward(dev, grad_out, grad_x, tiles=None):
+def upsample2_backward(
+    dev: Device, grad_out: Array, grad_x: Array, *, tiles: Tiles | None = None
+) -> None:
     """grad_x (H, W, C) = gradient of upsample2_forward, given grad_out (2H, 2W, C)."""
     h, w, c = _check_double(grad_x, grad_out)
     _launch(
@@ -88,7 +96,7 @@ def upsample2_backward(dev, grad_out, grad_x, tiles=None):
     )
 
 
-def affine(dev, scale, offset, x, out):
+def affine(dev: Device, scale: float, offset: float, x: Array, out: Array) -> None:
     """out = scale * x + offset; both of any one shape, out may be x."""
     if x.shape != out.shape:
         raise ValueError(f"affine of {x.shape} to {out.shape}")

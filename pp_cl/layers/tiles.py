@@ -1,19 +1,19 @@
-"""Tiles of 4 x 4 pixels of a feature map: which of them a kernel computes, which hold something,
-and copies among them.
+"""Tiles of 4 x 4 pixels of a feature map: which of them a kernel computes, which differ from the
+background or from each other, and copies among them.
 
 A feature map of (height, width) pixels has ceil(height / 4) x ceil(width / 4) tiles, numbered row
 by row; the last ones may be cut off by the border.
 """
 
-import weakref
 from dataclasses import dataclass
 
 import numpy as np
 from pyopencl.array import Array
 
+from pp_cl.device.device import Device
+
 LANES = 16  # channels in one float16
-# a tile of outputs of F(4x4, 3x3), and what one pixel is after the network has halved its input
-# twice
+# pixels: the outputs of F(4x4, 3x3), and one pixel after the network has halved its input twice
 SIDE = 4
 
 
@@ -21,30 +21,27 @@ SIDE = 4
 class Tiles:
     """The tiles of a feature map that a kernel computes.
 
-    size: (height, width) of the feature map. number: of computed tiles. list: (3 + number,) int32:
-    height, width, number, the tiles ascending. count: (rows, columns) float32: how many tiles each
-    one stands for where sums are taken over the whole feature map, itself among them; 0 for those
-    that are not computed.
+    size: (height, width) of the feature map. number: how many tiles are computed. list: (3 +
+    number,) int32: height, width, number, the computed tiles ascending. count: (rows, columns)
+    float32: in sums over the whole feature map a computed tile counts that often, for itself and
+    its copies; 0 for tiles that are not computed.
     """
 
-    size: tuple
+    size: tuple[int, int]
     number: int
     list: Array
     count: Array
 
 
-_all_tiles = weakref.WeakKeyDictionary()  # {device: {(height, width): Tiles}}
-
-
-def grid_shape(height, width):
+def grid_shape(height: int, width: int) -> tuple[int, int]:
     """(rows, columns) of the tiles of a feature map."""
     return -(-height // SIDE), -(-width // SIDE)
 
 
-def some_tiles(dev, size, count):
-    """Tiles of a feature map of `size` = (height, width) from their count (rows, columns), numpy.
+def some_tiles(dev: Device, size: tuple[int, int], count: np.ndarray) -> Tiles:
+    """Tiles of a feature map of `size` = (height, width) from their count (rows, columns).
 
-    Raises ValueError when there are none.
+    Raises ValueError when no count is above 0.
     """
     chosen = np.flatnonzero(count)
     if not len(chosen):
@@ -57,16 +54,21 @@ def some_tiles(dev, size, count):
     )
 
 
-def all_tiles(dev, height, width):
-    """Every tile of a feature map, made once for each size."""
-    made = _all_tiles.setdefault(dev, {})
-    if (height, width) not in made:
-        made[height, width] = some_tiles(dev, (height, width), np.ones(grid_shape(height, width)))
-    return made[height, width]
+def all_tiles(dev: Device, height: int, width: int) -> Tiles:
+    """Every tile of a feature map."""
+    return some_tiles(dev, (height, width), np.ones(grid_shape(height, width)))
 
 
-def checked_tiles(dev, tiles, height, width):
-    """`tiles`, or all if None. Raises ValueError for those of a feature map of another size."""
+def all_tiles_buffers(height: int, width: int) -> dict[str, tuple[tuple, type]]:
+    """{name: (shape, dtype)} of the device buffers of all_tiles()."""
+    rows, columns = grid_shape(height, width)
+    return {"list": ((3 + rows * columns,), np.int32), "count": ((rows, columns), np.float32)}
+
+
+def checked_tiles(dev: Device, tiles: Tiles | None, height: int, width: int) -> Tiles:
+    """`tiles`; all of them, made for this call, if None. Raises ValueError for those of a feature
+    map of another size.
+    """
     if tiles is None:
         return all_tiles(dev, height, width)
     if tiles.size != (height, width):
@@ -74,28 +76,28 @@ def checked_tiles(dev, tiles, height, width):
     return tiles
 
 
-def tiles_find(dev, x, background):
-    """(rows, columns) numpy bool: the tiles of x (H, W, C) float32 in which some value is not
+def tiles_find(dev: Device, x: Array, background: float) -> np.ndarray:
+    """(rows, columns) bool: the tiles of x (H, W, C) float32 in which some value is not
     `background`.
     """
     return _flags(dev, "tiles_find", x, background=background)
 
 
-def tiles_compare(dev, x, source):
-    """(rows, columns) numpy bool: the tiles of x (H, W, C) float32 whose bits are not those of the
-    tile that `source` names.
+def tiles_compare(dev: Device, x: Array, source: np.ndarray) -> np.ndarray:
+    """(rows, columns) bool: the tiles of x (H, W, C) float32 that differ in some bit from the tile
+    whose number `source` gives.
 
-    source: (rows, columns) numpy integers; a tile and its source have the same shape.
+    source: (rows, columns) integers; a tile and its source have the same shape.
     """
     return _flags(dev, "tiles_compare", x, source=dev.upload(source, np.int32))
 
 
-def tiles_copy(dev, x, source, chosen):
-    """Make the chosen tiles of x (H, W, C) float32 copies of the tiles that `source` names, which
-    are not chosen themselves.
+def tiles_copy(dev: Device, x: Array, source: np.ndarray, chosen: np.ndarray) -> None:
+    """Overwrite the chosen tiles of x (H, W, C) float32 with the tiles whose numbers `source`
+    gives, which are not chosen themselves.
 
-    source: (rows, columns) numpy integers; chosen: (rows, columns) numpy bool. A tile and its
-    source have the same shape.
+    source: (rows, columns) integers; chosen: (rows, columns) bool. A tile and its source have the
+    same shape.
     """
     to = np.flatnonzero(chosen)
     if not len(to):

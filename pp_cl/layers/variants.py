@@ -1,200 +1,204 @@
-"""The variants of a convolution behind one interface: forward pass, gradient of the input,
-gradients of weights and bias.
-
-A variant is a name in VARIANTS. Winograd's take 3x3 kernels and channels in multiples of 16;
-`applicable` gives the direct one for the others. Each call gets a Work, memory to work in, which
-several convolutions may share one after the other.
+"""The registry of convolution variants: one row each, with its measured error and the device that
+prefers it, and the interface that all of them have.
 """
 
-import math
 from dataclasses import dataclass
+from typing import Protocol
 
 from pyopencl.array import Array
 
-from pp_cl.layers.conv import LANES, conv_backward_input, conv_forward
-from pp_cl.layers.conv_backward_weights import flip_weights, partial_floats, weight_gradient
-from pp_cl.layers.winograd import (
-    fits,
-    scratch_floats,
-    transformed_floats,
-    winograd_backward_input,
-    winograd_forward,
-)
-from pp_cl.layers.winograd_backward_weights import gradient_scratch_floats, winograd_weight_gradient
-from pp_cl.layers.winograd_transform import transform_flipped_weights, transform_weights
+from pp_cl.device.device import Device
+from pp_cl.layers.blocking import Blocking
+from pp_cl.layers.direction import Direction
+from pp_cl.layers.tiles import Tiles
+from pp_cl.layers.variant_direct import DirectConvolution
+from pp_cl.layers.variant_winograd import WinogradConvolution
+from pp_cl.layers.winograd import WinogradForm, fits
+from pp_cl.layers.work import Work
 
-# By name: the side m of Winograd's tiles of outputs, None for the direct convolutions, of which
-# "local" goes through local memory; whether weights are stored as half.
+FORWARD, INPUT, WEIGHTS = Direction
+
+
+@dataclass(frozen=True)
+class Variant:
+    """One way to compute a convolution.
+
+    winograd_m: side of Winograd's tiles of outputs, None for the direct convolution. half:
+    transformed weights are stored in 16 bits. errors: {K: {direction: bound on the relative L2
+    errors that `pp-cl bench conv` measured for K x K layers, of a ReLU's outputs or normal
+    gradients, with up to 512 channels and 800 x 800 pixels}}; docs/convolutions.md has hard inputs.
+    A direction without an error has no kernel of its own. devices: classes of devices that it is
+    offered to. shipped_from: {direction: on CPUs, shipped for images of at least that many pixels}.
+    preferred: the device that prefers it, and the measurement that says so.
+    """
+
+    winograd_m: int | None
+    half: bool
+    errors: dict[int, dict[Direction, float]]
+    devices: tuple[str, ...]
+    shipped_from: dict[Direction, int]
+    preferred: str
+
+    def can_run(self, k: int, *channels: int) -> bool:
+        """Whether it takes a K x K kernel and these numbers of channels, of each source and of the
+        output.
+        """
+        return k in self.errors and (self.winograd_m is None or fits(*channels))
+
+    def convolution(self, dev: Device, blocking: Blocking) -> "Convolution":
+        """Its implementation on a device."""
+        if self.winograd_m is None:
+            return DirectConvolution(dev, blocking)
+        form = WinogradForm(
+            self.winograd_m, self.half, *blocking.winograd, blocking.winograd_weights
+        )
+        return WinogradConvolution(dev, form)
+
+
+# Below the least numbers of pixels too few tiles share the cost of transforming the weights.
+# Channels matter less: from 16 on, all of them gain. No Winograd variant is offered to GPUs: a
+# work-item holds a group of one lane, and GPU compilers spill 15 KB of its registers.
 VARIANTS = {
-    "direct": (None, False),
-    "winograd2": (2, False),
-    "winograd4": (4, False),
-    "winograd4_half": (4, True),
-    "local": (None, False),
+    "direct": Variant(
+        None,
+        False,
+        {
+            3: {FORWARD: 9e-7, INPUT: 1.3e-6, WEIGHTS: 3.5e-7},
+            1: {FORWARD: 3.5e-7, INPUT: 4.5e-7, WEIGHTS: 4e-7},
+        },
+        ("CPU", "GPU"),
+        {FORWARD: 0, INPUT: 0, WEIGHTS: 0},
+        "CPU: images of less than 256 pixels and channels beside the multiples of 16, 2 cores with"
+        " AVX-512. GPU: the only one, not timed.",
+    ),
+    "winograd2": Variant(
+        2,
+        False,
+        {3: {FORWARD: 7e-7, INPUT: 8e-7, WEIGHTS: 4e-7}},
+        ("CPU",),
+        {FORWARD: 256, INPUT: 256},
+        "CPU: images of 256 to 900 pixels, and the most exact of all, 2 cores with AVX-512.",
+    ),
+    "winograd4": Variant(
+        4,
+        False,
+        {3: {FORWARD: 2.2e-6, INPUT: 2.6e-6, WEIGHTS: 8.5e-7}},
+        ("CPU",),
+        {FORWARD: 900, INPUT: 900, WEIGHTS: 64},
+        "CPU: 2.7 times as fast as direct in the paper's network at 256x256, 2 cores with AVX-512.",
+    ),
+    "winograd4_half": Variant(
+        4,
+        True,
+        {3: {FORWARD: 1.5e-3, INPUT: 1.5e-3}},
+        ("CPU",),
+        {},
+        "CPU, where --tolerance allows it: forward 7 to 16 % faster than winograd4 at 512 channels,"
+        " 2 cores with AVX-512.",
+    ),
 }
-# By what is computed: the variants that are fastest from so many pixels on, measured on 2 cores
-# with AVX-512. Below, too few tiles share the cost of transforming the weights. Channels matter
-# less: from 16 on, all of them gain. Half's is for those who ask for it: faster from 512 channels
-# on, at several hundred times the error.
-FASTEST = {
-    "forward": ((900, "winograd4"), (256, "winograd2"), (0, "direct")),
-    "input": ((900, "winograd4"), (256, "winograd2"), (0, "direct")),
-    "weights": ((64, "winograd4"), (0, "direct")),
-}
-# By what is computed: a bound on the relative L2 errors of 3x3 layers that bench_layer.py measured,
-# of a ReLU's outputs or normal gradients, with up to 512 channels and 800 x 800 pixels; then of 1x1
-# layers. docs/convolutions.md has hard inputs. For the weights, "local" and half have no kernels of
-# their own.
-ERRORS = {
-    "forward": {
-        "direct": 9e-7,
-        "winograd2": 7e-7,
-        "winograd4": 2.2e-6,
-        "winograd4_half": 1.5e-3,
-        "local": 9e-7,
-    },
-    "input": {
-        "direct": 1.3e-6,
-        "winograd2": 8e-7,
-        "winograd4": 2.6e-6,
-        "winograd4_half": 1.5e-3,
-        "local": 1.3e-6,
-    },
-    "weights": {"direct": 3.5e-7, "winograd2": 4e-7, "winograd4": 8.5e-7},
-}
-ERRORS_1X1 = {"forward": 3.5e-7, "input": 4.5e-7, "weights": 4e-7}
 
 
-@dataclass
-class Work:
-    """Device memory for convolutions to work in."""
+class Convolution(Protocol):
+    """A variant on a device: what DirectConvolution and WinogradConvolution do."""
 
-    scratch: Array  # float32, any number of floats that suffices
-    weights: Array  # weights as a kernel wants them
+    def work_floats(
+        self, direction: Direction, height: int, weight_shape: tuple, c: int
+    ) -> tuple[int, int]:
+        """(floats of Work.scratch, floats of Work.weights) for an image `height` high.
 
-    def grow(self, dev, scratch, weights):
-        """Make room for as many floats, if there is less."""
-        for name, floats in (("scratch", scratch), ("weights", weights)):
-            if getattr(self, name).size < floats:
-                setattr(self, name, None)  # the old one goes before the new one comes
-                setattr(self, name, dev.empty(floats))
+        weight_shape: (ceil(CO/16), K, K, CI, 16); c: input channels, of a gradient of the input
+        those of the one source.
+        """
+
+    def lay_out(self, weight: Array) -> Array | None:
+        """The weights as forward() transforms them in each call, in an array of their own; None if
+        it reads them as they are.
+        """
+
+    def forward(
+        self,
+        sources: tuple[Array, ...],
+        weight: Array,
+        bias: Array,
+        out: Array,
+        *,
+        relu: bool,
+        work: Work,
+        tiles: Tiles | None = None,
+        laid_out: Array | None = None,
+    ) -> None:
+        """As conv.conv_forward. laid_out: lay_out(weight), if it was called before."""
+
+    def backward_input(
+        self,
+        weight: Array,
+        first: int,
+        grad_out: Array,
+        grad_x: Array,
+        *,
+        mask: Array | None,
+        work: Work,
+        tiles: Tiles | None = None,
+    ) -> None:
+        """As conv.conv_backward_input, from the weights of forward(); first: the input channel of
+        weight that is grad_x's first.
+        """
+
+    def backward_weights(
+        self,
+        sources: tuple[Array, ...],
+        grad_out: Array,
+        grad_weight: Array,
+        grad_bias: Array,
+        *,
+        work: Work,
+        tiles: Tiles | None = None,
+    ) -> None:
+        """As conv_backward_weights.conv_backward_weights."""
 
 
-def work_floats(dev, variant, direction, height, weight_shape, c=None):
-    """(floats of Work.scratch, floats of Work.weights) that a convolution of an image `height` high
-    needs.
+@dataclass(frozen=True)
+class ConvShape:
+    """One direction of a convolution, as far as the choice of a variant goes.
 
-    weight_shape: (ceil(CO/16), K, K, CI, 16); c: the input channels of a gradient of the input.
+    k: side of the kernel. sources: channels of each input. co: output channels. pixels: of the
+    image. source: index of the input whose gradient is computed, None in the other directions.
     """
-    m, half = VARIANTS[variant]
-    blocks, k, _, ci, _ = weight_shape
-    if direction == "weights":
-        return partial_floats(height, weight_shape) if m is None else gradient_scratch_floats(
-            dev, m
-        ), 0
-    ci, co = c or ci, blocks * LANES
-    if m:
-        return scratch_floats(dev, m, ci, co), transformed_floats(m, ci, co, half)
-    return 0, math.prod(_flipped_shape(weight_shape, c, co)) if direction == "input" else 0
+
+    direction: Direction
+    k: int
+    sources: tuple[int, ...]
+    co: int
+    pixels: int
+    source: int | None = None
+
+    @property
+    def ci(self) -> int:
+        """Input channels; of a gradient of the input, those of its one source."""
+        return sum(self.sources) if self.source is None else self.sources[self.source]
 
 
-def applicable(variant, k, *channels):
-    """`variant`, or "direct" where it cannot take a K x K kernel or these numbers of channels."""
-    return variant if k == 3 and fits(*channels) else "direct"
+def offered(device_class: str) -> list[str]:
+    """The names of the variants that are worth trying on a class of devices."""
+    return [name for name, variant in VARIANTS.items() if device_class in variant.devices]
 
 
-def offered(dev):
-    """The variants worth trying on a class of devices: what a CPU calls local memory is no faster
-    than the rest.
+def shipped_order(device_class: str, shape: ConvShape) -> list[str]:
+    """The variants that can run a convolution and have a kernel of their own for its direction, the
+    shipped choice first.
     """
-    return [name for name in VARIANTS if not (dev.is_cpu and name == "local")]
-
-
-def shipped_order(dev, direction, k, channels, pixels):
-    """The variants that can take a convolution and have a kernel of their own for it, the shipped
-    choice first.
-
-    direction: a key of FASTEST; channels: of each source and of the output; pixels: of the image.
-    """
-    names = offered(dev)  # "direct" first: what a GPU takes, where nobody has measured yet
-    if dev.is_cpu:
-        first = [name for least, name in FASTEST[direction] if pixels >= least]
-        names = list(dict.fromkeys([*first, *names]))
-    return [
+    names = [
         name
-        for name in names
-        if name in ERRORS[direction] and applicable(name, k, *channels) == name
+        for name in offered(device_class)
+        if VARIANTS[name].can_run(shape.k, *shape.sources, shape.co)
+        and shape.direction in VARIANTS[name].errors[shape.k]
     ]
+    if device_class != "CPU":
+        return names
 
+    def least_pixels(name):
+        least = VARIANTS[name].shipped_from.get(shape.direction)
+        return -1 if least is None or least > shape.pixels else least
 
-def pick_variant(dev, direction, ci, co, height, width, k=3, sources=()):
-    """The variant for a K x K convolution of ci to co channels: as tuned for the device, else the
-    shipped choice.
-
-    direction: a key of FASTEST; sources: the channels of each source, where the convolution reads
-    two. Raises UserError where no variant is as exact as the tolerance that the device was given.
-    """
-    order = shipped_order(dev, direction, k, (*(sources or (ci,)), co), height * width)
-    return dev.tuning.pick(direction, k, ci, co, height * width, order) if dev.tuning else order[0]
-
-
-def lay_out(dev, variant, weight):
-    """Weights as forward() lays them out each time, in an array of their own; None where it takes
-    them as they are.
-    """
-    (m, half), (blocks, _, _, ci, _) = VARIANTS[variant], weight.shape
-    if m is None:
-        return None
-    laid_out = dev.empty(transformed_floats(m, ci, blocks * LANES, half))
-    transform_weights(dev, m, weight, laid_out, half)
-    return laid_out
-
-
-def forward(dev, variant, x, weight, bias, out, relu, work, x2=None, tiles=None, laid_out=None):
-    """conv.conv_forward by a variant. laid_out: lay_out(variant, weight), if it is there
-    already.
-    """
-    m, half = VARIANTS[variant]
-    if m is None:
-        conv_forward(dev, x, weight, bias, out, relu, x2, tiles, variant == "local")
-        return
-    if laid_out is None:
-        laid_out = work.weights
-        transform_weights(dev, m, weight, laid_out, half)
-    winograd_forward(dev, m, x, laid_out, bias, out, relu, work.scratch, x2, half, tiles)
-
-
-def backward_input(dev, variant, x, weight, first, grad_out, grad_x, masked, work, tiles=None):
-    """conv.conv_backward_input by a variant; weight as in forward, `first`: the channel of it where
-    x begins.
-    """
-    m, half = VARIANTS[variant]
-    c, co = grad_x.shape[2], grad_out.shape[2]
-    if m is None:
-        shape = _flipped_shape(weight.shape, c, co)
-        flipped = work.weights[: math.prod(shape)].reshape(shape)
-        flip_weights(dev, weight, first, flipped)
-        conv_backward_input(dev, x, flipped, grad_out, grad_x, masked, tiles, variant == "local")
-    else:
-        transform_flipped_weights(dev, m, weight, first, c, work.weights, half)
-        winograd_backward_input(
-            dev, m, x, work.weights, grad_out, grad_x, masked, work.scratch, half, tiles
-        )
-
-
-def backward_weights(dev, variant, x, grad_out, grad_weight, grad_bias, work, x2=None, tiles=None):
-    """conv_weights.weight_gradient by a variant; half changes nothing, as it reads no weights, and
-    "local" is direct.
-    """
-    m, _ = VARIANTS[variant]
-    if m is None:
-        weight_gradient(dev, x, grad_out, grad_weight, grad_bias, work.scratch, x2, tiles)
-    else:
-        winograd_weight_gradient(
-            dev, m, x, grad_out, grad_weight, grad_bias, work.scratch, x2, tiles
-        )
-
-
-def _flipped_shape(weight_shape, c, co):
-    """Shape of the flipped weights of c input channels."""
-    return -(-c // LANES), *weight_shape[1:3], co, LANES
+    return sorted(names, key=least_pixels, reverse=True)

@@ -1,95 +1,115 @@
-"""3x3 convolutions by Winograd's minimal filtering F(m x m, 3 x 3): variants of conv.py's with
-fewer multiplications.
+"""3x3 convolutions by Winograd's minimal filtering F(m x m, 3 x 3), with fewer multiplications than
+the direct ones.
 
-m = 2 takes 2.25 times fewer than the direct variant, m = 4 takes 4 times fewer at two or three
-times the error. Channels come in multiples of 16. winograd_filter.py makes ready the weights that
-any number of convolutions then use; `half` says that they are stored in 16 bits.
+m = 2 takes 2.25 times fewer, m = 4 takes 4 times fewer at two or three times the error. Channels
+come in multiples of 16. The weights are transformed first (winograd_transform.py).
 """
 
-from pp_cl.layers.conv import LANES
-from pp_cl.layers.tiles import SIDE, checked_tiles
+from dataclasses import dataclass
 
-# As shipped; Device.tile_shapes["winograd"] has others where the device was tuned. Tiles
-# transformed and multiplied at a time. More of them use the weights better, fewer leave more room
-# in the caches.
-TILES = 64
-# Tiles whose sums are held in registers together, a divisor of TILES: with 2 x 16 channels, 16 of
-# AVX-512's 32 vectors.
-GROUP = 8
+from pyopencl.array import Array
+
+from pp_cl.device.device import Device
+from pp_cl.layers.tiles import LANES, SIDE, Tiles, checked_tiles
+from pp_cl.layers.work import Work
 
 
-def fits(*channels):
-    """Whether Winograd's variants can take these numbers of channels."""
-    return all(c and c % LANES == 0 for c in channels)
+@dataclass(frozen=True)
+class WinogradForm:
+    """One of the ways to run these kernels.
 
-
-def positions(m):
-    """Values of a transformed tile."""
-    return (m + 2) ** 2
-
-
-def transformed_floats(m, ci, co, half=False):
-    """Floats of the transformed weights, as cl/layers/winograd.h lays them out, of ci to co
-    channels or the other way round.
+    m: side of a tile of outputs, 2 or 4. half: transformed weights are stored in 16 bits. tiles,
+    group: tiles transformed at a time and multiplied together, weights_tiles: tiles transformed at
+    a time for the gradient of the weights; see blocking.Blocking.
     """
-    floats = positions(m) * (ci * co + LANES)
-    return max(ci, co) + floats // 2 if half else floats
 
+    m: int
+    half: bool
+    tiles: int
+    group: int
+    weights_tiles: int
 
-def scratch_floats(dev, m, ci, co):
-    """Floats of scratch memory of a convolution of ci to co channels or, the other way round, its
-    input gradient.
-    """
-    return dev.info["compute_units"] * positions(m) * ((ci + co) * _tile_shape(dev)[0] + 3 * LANES)
+    @property
+    def positions(self) -> int:
+        """Values of a transformed tile."""
+        return (self.m + 2) ** 2
+
+    def transformed_floats(self, ci: int, co: int) -> int:
+        """Floats of the transformed weights of ci to co channels, as cl/layers/winograd.h lays them
+        out.
+        """
+        floats = self.positions * (ci * co + LANES)
+        return max(ci, co) + floats // 2 if self.half else floats
+
+    def scratch_floats(self, dev: Device, ci: int, co: int) -> int:
+        """Floats of scratch memory of a convolution of ci to co channels, or of its input
+        gradient.
+        """
+        vectors = (ci + co) * self.tiles + 3 * LANES
+        return dev.info["compute_units"] * self.positions * vectors
 
 
 def winograd_forward(
-    dev, m, x, transformed, bias, out, relu, scratch, x2=None, half=False, tiles=None
-):
-    """out = convolution of [x, x2] + bias, then max(., 0) if relu: conv.conv_forward by
-    winograd_filter.transform_weights.
+    dev: Device,
+    form: WinogradForm,
+    sources: tuple[Array, ...],
+    bias: Array,
+    *,
+    out: Array,
+    relu: bool,
+    work: Work,
+    tiles: Tiles | None = None,
+) -> None:
+    """out = convolution of the sources' concatenation + bias, then max(., 0) if relu.
 
-    x: (H, W, C1), x2: None or (H, W, C2), bias: (CO,), out: (H, W, CO); scratch: at least
-    scratch_floats; tiles: tiles.Tiles of out that are written, None = all. The result does not
-    depend on the number of compute units. Raises ValueError when shapes do not fit together.
+    sources: one or two of (H, W, C1), (H, W, C2); bias: (CO,); out: (H, W, CO); work.weights: from
+    winograd_transform.transform_weights; work.scratch: at least form.scratch_floats; tiles: those
+    of out to compute, None = all. The result does not depend on the number of compute units.
+    Raises ValueError when shapes do not fit together.
     """
     height, width, co = out.shape
-    c1, c2 = x.shape[2], 0 if x2 is None else x2.shape[2]
-    if not fits(c1, co) or c2 % LANES or bias.shape != (co,):
+    channels = [source.shape[2] for source in sources]
+    if not fits(*channels, co) or bias.shape != (co,):
         raise ValueError(
-            f"Winograd convolution of {c1} + {c2} to {co} channels, bias {bias.shape}: "
-            f"channels come in multiples of {LANES}"
+            f"Winograd convolution of {' + '.join(map(str, channels))} to {co} channels, bias"
+            f" {bias.shape}: channels come in multiples of {LANES}"
         )
-    check_size("transformed weights", transformed, transformed_floats(m, c1 + c2, co, half))
-    check_size("scratch", scratch, scratch_floats(dev, m, c1 + c2, co))
+    _check_work(dev, form, work, (sum(channels), co))
     tiles = checked_tiles(dev, tiles, height, width)
-    _program(dev, m, co // LANES, half).launch(
+    _program(dev, form, co).launch(
         "winograd_forward",
-        work_items(dev, m, tiles),
+        work_items(dev, form, tiles),
         local=1,
-        c1=c1,
-        c2=c2,
+        c1=channels[0],
+        c2=sum(channels[1:]),
         co=co,
         relu=relu,
-        x=x,
-        x2=x if x2 is None else x2,
-        transformed=transformed,
+        x=sources[0],
+        x2=sources[-1],
+        transformed=work.weights,
         bias=bias,
         tile_list=tiles.list,
         out=out,
-        scratch=scratch,
+        scratch=work.scratch,
     )
 
 
 def winograd_backward_input(
-    dev, m, x, transformed, grad_out, grad_x, masked, scratch, half=False, tiles=None
-):
-    """grad_x = gradient of the convolution's input: conv.conv_backward_input by
-    winograd_filter.transform_flipped_weights.
+    dev: Device,
+    form: WinogradForm,
+    grad_out: Array,
+    grad_x: Array,
+    *,
+    mask: Array | None,
+    work: Work,
+    tiles: Tiles | None = None,
+) -> None:
+    """grad_x = gradient of a convolution's input, 0 where mask <= 0.
 
-    x, grad_x: (H, W, C), grad_out: (H, W, CO); scratch: at least scratch_floats. x is read only
-    where masked. tiles: tiles.Tiles of grad_x that are written, None = all. Raises ValueError when
-    shapes do not fit together.
+    grad_out: (H, W, CO); grad_x: (H, W, C); mask: (H, W, C) or None, as in
+    conv.conv_backward_input; work.weights: from winograd_transform.transform_flipped_weights;
+    work.scratch: at least form.scratch_floats; tiles: those of grad_x to compute, None = all.
+    Raises ValueError when shapes do not fit together.
     """
     height, width, c = grad_x.shape
     co = grad_out.shape[2]
@@ -98,47 +118,56 @@ def winograd_backward_input(
             f"Winograd input gradient of {c} from {co} channels: channels come in multiples of"
             f" {LANES}"
         )
-    check_size("transformed weights", transformed, transformed_floats(m, c, co, half))
-    check_size("scratch", scratch, scratch_floats(dev, m, c, co))
+    _check_work(dev, form, work, (c, co))
     tiles = checked_tiles(dev, tiles, height, width)
-    _program(dev, m, c // LANES, half).launch(
+    _program(dev, form, c).launch(
         "winograd_backward_input",
-        work_items(dev, m, tiles),
+        work_items(dev, form, tiles),
         local=1,
         c=c,
         co=co,
-        masked=masked,
-        x=x,
-        flipped=transformed,
+        masked=mask is not None,
+        x=grad_x if mask is None else mask,
+        flipped=work.weights,
         grad_out=grad_out,
         tile_list=tiles.list,
         grad_x=grad_x,
-        scratch=scratch,
+        scratch=work.scratch,
     )
 
 
-def work_items(dev, m, tiles):
-    """One a compute unit, but none without tiles."""
-    return min(dev.info["compute_units"], tiles.number * (SIDE // m) ** 2)
+def fits(*channels: int) -> bool:
+    """Whether these numbers of channels are multiples of 16."""
+    return all(c and c % LANES == 0 for c in channels)
 
 
-def pair_blocks(blocks):
+def work_items(dev: Device, form: WinogradForm, tiles: Tiles) -> int:
+    """One work-item per compute unit, at most one per tile of outputs."""
+    return min(dev.info["compute_units"], tiles.number * (SIDE // form.m) ** 2)
+
+
+def pair_blocks(channels: int) -> int:
     """Groups of 16 output channels that are multiplied together."""
-    return 1 if blocks % 2 else 2
+    return 1 if channels // LANES % 2 else 2
 
 
-def check_size(what, array, floats):
+def check_size(what: str, array: Array, floats: int) -> None:
     """Raise ValueError if an array is too small."""
     if array.size < floats:
         raise ValueError(f"Winograd: {what} of {array.size} floats, needs {floats}")
 
 
-def _program(dev, m, blocks, half):
-    tiles, group = _tile_shape(dev)
+def _check_work(dev, form, work, channels):
+    check_size("transformed weights", work.weights, form.transformed_floats(*channels))
+    check_size("scratch", work.scratch, form.scratch_floats(dev, *channels))
+
+
+def _program(dev, form, channels_out):
     return dev.program(
-        "layers/winograd", M=m, TILES=tiles, GROUP=group, BLOCKS=pair_blocks(blocks), HALF=int(half)
+        "layers/winograd",
+        WINO_M=form.m,
+        TILES=form.tiles,
+        GROUP=form.group,
+        BLOCKS=pair_blocks(channels_out),
+        HALF=int(form.half),
     )
-
-
-def _tile_shape(dev):
-    return dev.tile_shapes.get("winograd") or (TILES, GROUP)

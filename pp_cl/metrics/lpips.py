@@ -7,6 +7,7 @@ from itertools import islice
 import numpy as np
 
 from pp_cl.errors import UserError
+from pp_cl.layers.blocking import shipped_blocking
 from pp_cl.layers.conv import conv_forward, pack_weights
 from pp_cl.layers.resample import maxpool2_forward
 from pp_cl.metrics.lpips_weights import load_weights
@@ -18,12 +19,13 @@ LEAST_SIZE = 16  # pixels: four poolings leave one
 
 class Lpips:
     """Distance of image pairs. weights: as load_weights() returns them, which is the default (and
-    may raise UserError).
+    may raise UserError). blocking: of the convolutions, None = as shipped.
     """
 
-    def __init__(self, dev, weights=None):
+    def __init__(self, dev, weights=None, blocking=None):
         weights = load_weights() if weights is None else weights
         self.dev = dev
+        self.blocking = blocking or shipped_blocking(dev)
         self.program = dev.program("metrics/lpips")
         self.layers = [
             (dev.upload(pack_weights(weights[f"kernel{i}"])), dev.upload(weights[f"bias{i}"]))
@@ -79,7 +81,7 @@ class Lpips:
 
     def _convolve(self, x, weight, bias):
         out = self.dev.empty((*x.shape[:2], *bias.shape))
-        conv_forward(self.dev, x, weight, bias, out, relu=True)
+        conv_forward(self.dev, (x,), weight, bias, out=out, relu=True, blocking=self.blocking)
         return out
 
     def _compare(self, a, b, head):

@@ -1,62 +1,73 @@
-"""Buffers that hold one array after another: which of a network's arrays can share one."""
+"""Which arrays of a network can share a buffer, one after the other: assignment by liveness."""
 
+import math
 from dataclasses import dataclass
 
-import numpy as np
+from pp_cl.network.layer import Layer
 
 
-def lifetimes(steps, training):
-    """[(name, first, last)] of the arrays of a network, in steps of its forward and backward pass,
-    by first use.
+def gradient_of(name: str) -> str:
+    """The name of the array that holds the gradient of a layer's output, or of a parameter."""
+    return f"grad {name}"
 
-    steps: unet.Step. The input and the passes' gradients are named as in unet.UNet; the input
-    itself is the caller's.
+
+def lifetimes(layers: list[Layer], training: bool) -> list[tuple[str, int, int]]:
+    """[(name, first, last)] of a network's arrays, in layers of its forward and backward pass, by
+    first use.
+
+    The network's input "x" is not among them: it belongs to the caller.
     """
-    schedule = [(*step.inputs, step.name) for step in steps]
+    schedule = [(*layer.inputs, layer.name) for layer in layers]
     if training:
-        for step in reversed(steps):
-            activations = () if step.kind == "up" else step.inputs
-            schedule.append(
-                (*activations, "grad " + step.name, *("grad " + name for name in step.inputs))
-            )
+        for layer in reversed(layers):
+            read = layer.inputs if layer.reads_input_backward else ()
+            written = [gradient_of(name) for name in layer.inputs]
+            schedule.append((*read, gradient_of(layer.name), *written))
     found = {}
     for time, names in enumerate(schedule):
         for name in names:
             found[name] = (found.get(name, (time,))[0], time)
     del found["x"]
-    last = steps[-1].name
+    last = layers[-1].name
     found[last] = (found[last][0], len(schedule))  # the caller may read it after backward
     return [(name, *lifetime) for name, lifetime in found.items()]
 
 
 @dataclass
-class Slot:
-    """One buffer that holds several arrays, one after the other."""
+class SharedBuffer:
+    """A buffer that holds several arrays, one after the other."""
 
     floats: int
-    names: list
+    names: list[str]
     free_from: int
 
+    @property
+    def label(self) -> str:
+        """Its name in the memory plan."""
+        return " = ".join(self.names)
 
-def assign_slots(lifetimes, shapes):
-    """[Slot] such that no two arrays of one slot live at the same time.
 
-    lifetimes: [(name, first, last)] by first use. An array takes the free slot that fits it best;
+def plan_buffers(
+    lifetimes: list[tuple[str, int, int]], shapes: dict[str, tuple]
+) -> list[SharedBuffer]:
+    """Buffers in which no two arrays live at the same time.
+
+    lifetimes: [(name, first, last)] by first use. An array takes the free buffer that fits it best;
     if none is large enough, the largest free one grows.
     """
-    slots = []
+    buffers = []
     for name, first, last in lifetimes:
-        floats = int(np.prod(shapes[name]))
-        free = [s for s in slots if s.free_from <= first]
-        large = [s for s in free if s.floats >= floats]
-        if free:
-            slot = (
-                min(large, key=lambda s: s.floats) if large else max(free, key=lambda s: s.floats)
-            )
+        floats = math.prod(shapes[name])
+        free = [b for b in buffers if b.free_from <= first]
+        large = [b for b in free if b.floats >= floats]
+        if large:
+            buffer = min(large, key=lambda b: b.floats)
+        elif free:
+            buffer = max(free, key=lambda b: b.floats)
         else:
-            slot = Slot(0, [], 0)
-            slots.append(slot)
-        slot.floats = max(slot.floats, floats)
-        slot.names.append(name)
-        slot.free_from = last + 1
-    return slots
+            buffer = SharedBuffer(0, [], 0)
+            buffers.append(buffer)
+        buffer.floats = max(buffer.floats, floats)
+        buffer.names.append(name)
+        buffer.free_from = last + 1
+    return buffers

@@ -1,249 +1,235 @@
-"""Which tiles of the network's feature maps need computing, where much of the image is background.
+"""Which tiles of the network's feature maps are computed where much of the image is background.
 
-Where the network sees nothing but background, its output depends on nothing but the distance from
-the borders of the image, which it sees as zeros. So the tiles that see only background fall into
-classes of equal ones: one class inside, one for each place where a border is felt. One tile of each
-class is computed, its representative; the others are copies of it, made where something reads them.
-In the sums over the image, the gradients of weights, a representative counts as often as its class
-has tiles. The results are the same but for rounding: Winograd's transforms mix the last bits of a
-tile.
+Where the network sees nothing but background, its output depends only on the distance from the
+borders of the image, which it sees as zeros. So the tiles that see only background fall into
+classes of equal ones: one class inside, one for each place near a border. One tile of each class is
+computed, its representative; the others are copies of it, made where a layer needs them. In the
+sums over the image, the gradients of weights, a representative counts as often as its class has
+tiles. The results are the same but for rounding: Winograd's transforms mix the last bits of a tile.
 
 The backward pass has classes of its own: of the tiles where the network saw only background, those
-whose gradient of the image has the bits of their representative's. How far something reaches,
-forward or backward, is counted in pixels of the image at every level.
+whose gradient of the image has the same bits as their representative's.
 """
 
 from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
+from pyopencl.array import Array
 
-from pp_cl.layers.tiles import SIDE, grid_shape, some_tiles, tiles_compare, tiles_copy
+from pp_cl.device.device import Device
+from pp_cl.layers.tiles import SIDE, Tiles, all_tiles, some_tiles, tiles_compare, tiles_copy
+from pp_cl.network.architectures import convolutions
+from pp_cl.network.layer import Layer
+from pp_cl.network.tile_sets import grow, halve
 
-# Tiles of the image's gradient so near its border are classes of their own: losses see the border
-# from afar, too.
+# Pixels: tiles of the image's gradient that are nearer to its border are classes of their own,
+# because the loss sees the border from afar, too.
 LOSS_BORDER = 48
 
 
 @dataclass(frozen=True)
-class Layout:
+class TileMap:
     """The tiles of one feature map, whose height and width are those of the image divided by
     2**level.
 
-    source: (rows, columns) int, the computed tile that has the same values: itself, or its class's
-    representative.
+    source: (rows, columns) int, the number of the computed tile that has the same values: the
+    tile's own, or its class's representative.
     """
 
     level: int
     source: np.ndarray
 
     @cached_property
-    def computed(self):
+    def computed(self) -> np.ndarray:
         """(rows, columns) bool."""
         return self.source == np.arange(self.source.size).reshape(self.source.shape)
 
-    def count(self):
-        """(rows, columns) of tiles that each tile stands for, itself among them; 0 for copies."""
-        return np.bincount(self.source.ravel(), minlength=self.source.size).reshape(
-            self.source.shape
-        )
+    def count(self) -> np.ndarray:
+        """(rows, columns) int: how many tiles each one stands for, itself among them; 0 for
+        copies.
+        """
+        count = np.bincount(self.source.ravel(), minlength=self.source.size)
+        return count.reshape(self.source.shape)
 
 
-def layout(size, level, active, border):
-    """Layout of a feature map in an image of `size` = (height, width), in which the `active` tiles
-    are in no class.
+def map_tiles(size: tuple[int, int], level: int, active: np.ndarray, border: int) -> TileMap:
+    """TileMap of a feature map in an image of `size` = (height, width): `active` tiles are always
+    computed, all others are grouped into classes of equal tiles.
 
-    active: (rows, columns) bool. border: the border of the image is felt so many tiles of level 0
-    away.
+    active: (rows, columns) bool. border: tiles of level 0 from the border of the image within which
+    a tile may depend on its distance from it.
     """
     rows, columns = (_classes(length, level, border * SIDE) for length in size)
     classes = (rows[:, None] * (columns.max() + 1) + columns).ravel()
     idle, source = np.flatnonzero(~active), np.arange(active.size)
     representative = np.zeros(classes.max() + 1, int)
-    # the last one written stays: the first of its class
+    # assigned backwards, so that the first tile of a class remains
     representative[classes[idle[::-1]]] = idle[::-1]
     source[idle] = representative[classes[idle]]
-    return Layout(level, source.reshape(active.shape))
+    return TileMap(level, source.reshape(active.shape))
 
 
 def _classes(length, level, border):
-    """Classes of the tiles along one axis of the image: those that a border is felt in have their
-    own.
-    """
+    """Classes of the tiles along one axis of the image: each tile near a border is its own."""
     side = SIDE << level
     start = np.arange(0, length, side)
-    felt = (start < border) | (start + side > length - border)
-    return np.where(felt, np.arange(len(start)), len(start))
+    near = (start < border) | (start + side > length - border)
+    return np.where(near, np.arange(len(start)), len(start))
 
 
-def forward_reach(steps):
-    """{name: pixels}: how far from its place in x a change is felt in the output of a step."""
-    reach = {"x": 0}
-    for step in steps:
-        own = {"conv3": 2, "conv1": 0, "pool": 1, "up": 2}[step.kind] << step.level >> 1
-        reach[step.name] = max(reach[name] for name in step.inputs) + own
-    return reach
+def receptive_radius(layers: list[Layer]) -> dict[str, int]:
+    """{name: pixels}: how far from its place a change of x changes the output of a layer."""
+    radius = {"x": 0}
+    for layer in layers:
+        radius[layer.name] = max(radius[name] for name in layer.inputs) + layer.forward_radius()
+    return radius
 
 
-def backward_reach(steps):
-    """{name: pixels}: how far from its place in the image's gradient a change is felt in the
-    gradient of a step's output.
+def gradient_radius(layers: list[Layer]) -> dict[str, int]:
+    """{name: pixels}: how far from its place a change of the image's gradient changes the gradient
+    of a layer's output.
     """
-    reach = dict.fromkeys([*(step.name for step in steps), "x"], 0)
-    for step in reversed(steps):
-        own = {"conv3": 1, "conv1": 0, "pool": 0, "up": 2}[step.kind] << step.level
-        for name in step.inputs:
-            reach[name] = max(reach[name], reach[step.name] + own)
-    return reach
+    radius = dict.fromkeys([*(layer.name for layer in layers), "x"], 0)
+    for layer in reversed(layers):
+        for name in layer.inputs:
+            radius[name] = max(radius[name], radius[layer.name] + layer.backward_radius())
+    return radius
 
 
-def grow(tiles, n=1):
-    """(rows, columns) bool: the tiles within n tiles, diagonals included, of those that are set."""
-    for _ in range(2):  # along the columns, then along the rows
-        length = len(tiles)
-        total = np.zeros((length + 1, tiles.shape[1]), np.int32)
-        np.cumsum(tiles, 0, out=total[1:])
-        place = np.arange(length)
-        tiles = (total[np.minimum(place + n + 1, length)] > total[np.maximum(place - n, 0)]).T
-    return tiles
+def levels_of(layers: list[Layer]) -> dict[str, int]:
+    """{name: level} of the network's input "x" and of all layers' outputs."""
+    return {"x": 0} | {layer.name: layer.level for layer in layers}
 
 
-def halve(tiles, levels=1):
-    """The tiles 2**levels as wide that hold any of those that are set."""
-    for _ in range(levels):
-        rows, columns = tiles.shape
-        padded = np.pad(tiles, ((0, rows % 2), (0, columns % 2)))
-        tiles = padded.reshape(-1, 2, padded.shape[1] // 2, 2).any((1, 3))
-    return tiles
+class AllTiles:
+    """A pass that computes all tiles."""
+
+    computed_fraction = 1.0
+
+    def __init__(self, dev: Device, size: tuple[int, int], layers: list[Layer]):
+        self._levels = levels_of(layers)
+        self._tiles = {
+            level: all_tiles(dev, size[0] >> level, size[1] >> level)
+            for level in sorted(set(self._levels.values()))
+        }
+
+    def tiles(self, name: str) -> Tiles:
+        """The tiles of a feature map to compute."""
+        return self._tiles[self._levels[name]]
+
+    def fill_copies(self, name: str, array: Array) -> None:
+        """Nothing: there are no copies."""
+
+    def backward(self, arrays: dict[str, Array], grad_out: Array) -> "AllTiles":
+        """The backward pass after this forward pass."""
+        return self
 
 
-def double(tiles, shape):
-    """The tiles half as wide that lie in those that are set; there are (rows, columns) = shape of
-    them.
-    """
-    return tiles.repeat(2, 0).repeat(2, 1)[: shape[0], : shape[1]]
+class TilePlan:
+    """A pass that computes some tiles of each feature map.
 
-
-class Everything:
-    """A pass in which all tiles are computed. levels: {name: level} of the feature maps."""
-
-    def __init__(self, dev, size, levels):
-        self.levels = levels
-        self._tiles = {}
-        for level in sorted(set(levels.values())):
-            height, width = size[0] >> level, size[1] >> level
-            self._tiles[level] = some_tiles(
-                dev, (height, width), np.ones(grid_shape(height, width))
-            )
-
-    def tiles(self, name):
-        """tiles.Tiles of the feature map that a step computes."""
-        return self._tiles[self.levels[name]]
-
-    def complete(self, name, array):
-        """Called once all computed tiles of a feature map are there."""
-
-
-class Active:
-    """A pass in which only some tiles of each feature map are computed.
-
-    found: (rows, columns) bool, the tiles of the image where it starts. levels, reach: {name:
-    level, pixels} of the feature maps: how far from `found`, and with `border` tiles more from the
-    image's border, they are to be computed. Of each feature map: layouts, {name: Layout}, and read,
-    {name: (rows, columns) bool}, the tiles that something reads.
+    size: (height, width) of the image. active: (rows, columns) bool, the tiles of the image where
+    the pass starts. radius: {name: pixels} of the feature maps that the pass computes: tiles within
+    that distance of `active` are computed; within `border` tiles more than that from the image's
+    border they are classes of their own. maps: {name: TileMap}. needed: {name: (rows, columns)
+    bool}, the tiles that a later layer reads.
     """
 
-    def __init__(self, dev, size, found, levels, reach, border=0):
-        self.dev = dev
-        self.size = size
-        made = {}
-        self.layouts = {}
-        for name, level in levels.items():
-            n = -(-reach[name] // SIDE)
+    def __init__(
+        self,
+        dev: Device,
+        layers: list[Layer],
+        size: tuple[int, int],
+        active: np.ndarray,
+        *,
+        radius: dict[str, int],
+        border: int = 0,
+    ):
+        self.dev, self.layers, self.size = dev, layers, size
+        made, levels = {}, levels_of(layers)
+        self.maps = {}
+        for name, pixels in radius.items():
+            level, n = levels[name], -(-pixels // SIDE)
             if (level, n) not in made:
-                made[level, n] = layout(size, level, halve(grow(found, n), level), border + n)
-            self.layouts[name] = made[level, n]
-        self.read = {name: np.zeros_like(of.computed) for name, of in self.layouts.items()}
+                near = halve(grow(active, n), level)
+                made[level, n] = map_tiles(size, level, near, border + n)
+            self.maps[name] = made[level, n]
+        self.needed = {name: np.zeros_like(m.computed) for name, m in self.maps.items()}
         self._tiles = {}
 
-    def tiles(self, name):
-        """tiles.Tiles of the feature map that a step computes."""
-        of = self.layouts[name]
-        if id(of) not in self._tiles:
-            size = self.size[0] >> of.level, self.size[1] >> of.level
-            self._tiles[id(of)] = some_tiles(self.dev, size, of.count())
-        return self._tiles[id(of)]
+    def tiles(self, name: str) -> Tiles:
+        """The tiles of a feature map to compute."""
+        tile_map = self.maps[name]
+        if id(tile_map) not in self._tiles:
+            size = self.size[0] >> tile_map.level, self.size[1] >> tile_map.level
+            self._tiles[id(tile_map)] = some_tiles(self.dev, size, tile_map.count())
+        return self._tiles[id(tile_map)]
 
-    def complete(self, name, array, read=None):
-        """Copy to the tiles that something reads and nobody computes. Called once the computed ones
-        are there.
+    def fill_copies(self, name: str, array: Array, needed: np.ndarray | None = None) -> None:
+        """Copy representatives to the needed tiles that were not computed.
 
-        read: others than self.read[name].
+        needed: others than self.needed[name].
         """
-        of = self.layouts[name]
-        tiles_copy(
-            self.dev, array, of.source, (self.read[name] if read is None else read) & ~of.computed
-        )
+        tile_map = self.maps[name]
+        needed = self.needed[name] if needed is None else needed
+        tiles_copy(self.dev, array, tile_map.source, needed & ~tile_map.computed)
 
 
-class ActiveForward(Active):
+class ForwardPlan(TilePlan):
     """The forward pass over an image of `size`, where x differs from the background in the tiles
-    `found`.
+    `active`.
+
+    affected: (rows, columns) bool, the tiles of the image that see more than background.
+    computed_fraction: of the network's multiplications.
     """
 
-    def __init__(self, dev, steps, size, found):
-        reach, last = forward_reach(steps), steps[-1].name
-        super().__init__(dev, size, found, {step.name: step.level for step in steps}, reach)
-        for step in steps:
-            for name in step.inputs:
+    def __init__(self, dev: Device, layers: list[Layer], size: tuple[int, int], active: np.ndarray):
+        radius, last = receptive_radius(layers), layers[-1].name
+        del radius["x"]
+        super().__init__(dev, layers, size, active, radius=radius)
+        for layer in layers:
+            computed = self.maps[layer.name].computed
+            for name in layer.inputs:
                 if name != "x":
-                    self.read[name] |= _reads_forward(
-                        step, self.layouts[step.name].computed, self.read[name].shape
-                    )
-        self.read[last][:] = True
-        self.felt = grow(found, -(-reach[last] // SIDE))
+                    needed = self.needed[name]
+                    needed |= layer.needed_forward(computed, needed.shape)
+        self.needed[last][:] = True
+        self.affected = grow(active, -(-radius[last] // SIDE))
+        count = {c.name: c.multiplications(*size) for c in convolutions(layers)}
+        computed = sum(n * self.maps[name].computed.mean() for name, n in count.items())
+        self.computed_fraction = computed / sum(count.values())
+
+    def backward(self, arrays: dict[str, Array], grad_out: Array) -> "BackwardPlan":
+        """The backward pass; the activations in `arrays` are completed where it needs them."""
+        plan = BackwardPlan(self, grad_out)
+        for name, needed in plan.activations.items():
+            self.fill_copies(name, arrays[name], needed)
+        return plan
 
 
-class ActiveBackward(Active):
-    """The backward pass after `forward`, given the gradient (H, W, C) of the last step's output."""
+class BackwardPlan(TilePlan):
+    """The backward pass after a forward pass, given the gradient (H, W, C) of the last layer's
+    output.
 
-    def __init__(self, dev, steps, forward, grad_out):
-        border = -(-max(LOSS_BORDER, forward_reach(steps)[steps[-1].name]) // SIDE)
-        classes = layout(forward.size, 0, forward.felt, border)
-        found = forward.felt | tiles_compare(dev, grad_out, classes.source)
-        levels = {step.name: step.level for step in steps} | {"x": 0}
-        super().__init__(dev, forward.size, found, levels, backward_reach(steps), border)
-        # {name: (rows, columns) bool} of their tiles that are read, as inputs and as masks of a
-        # ReLU
+    activations: {name: (rows, columns) bool}, the tiles of forward outputs that it reads, as inputs
+    of layers and as masks of ReLUs.
+    """
+
+    def __init__(self, forward: ForwardPlan, grad_out: Array):
+        dev, layers, size = forward.dev, forward.layers, forward.size
+        radius = receptive_radius(layers)[layers[-1].name]
+        border = -(-max(LOSS_BORDER, radius) // SIDE)
+        classes = map_tiles(size, 0, forward.affected, border)
+        active = forward.affected | tiles_compare(dev, grad_out, classes.source)
+        super().__init__(dev, layers, size, active, radius=gradient_radius(layers), border=border)
         self.activations = {}
-        for step in steps:
-            out = self.layouts[step.name].computed
-            for name in step.inputs:
-                at_input = self.layouts[name].computed
-                self.read[step.name] |= _reads_backward(step, at_input, out.shape)
-                if step.kind != "up" and name != "x":
-                    reads = _reads_forward(step, out, at_input.shape) | at_input
+        for layer in layers:
+            out = self.maps[layer.name].computed
+            for name in layer.inputs:
+                at_input = self.maps[name].computed
+                self.needed[layer.name] |= layer.needed_backward(at_input, out.shape)
+                if layer.reads_input_backward and name != "x":
+                    reads = layer.needed_forward(out, at_input.shape) | at_input
                     self.activations[name] = self.activations.get(name, False) | reads
-        self.read["x"][:] = True
-
-
-def _reads_forward(step, computed, shape):
-    """Tiles of a step's input, (rows, columns) = shape of them, that the computed tiles of its
-    output are made of.
-    """
-    if step.kind == "conv3":
-        return grow(computed)
-    if step.kind == "pool":
-        return double(computed, shape)
-    return halve(grow(computed)) if step.kind == "up" else computed
-
-
-def _reads_backward(step, computed, shape):
-    """Tiles of the gradient of a step's output that the computed tiles of its input's gradient are
-    made of.
-    """
-    if step.kind == "conv3":
-        return grow(computed)
-    if step.kind == "pool":
-        return halve(computed)
-    return grow(double(computed, shape)) if step.kind == "up" else computed
+        self.needed["x"][:] = True

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 
 
-def convolution(x, weight, bias=0.0):
+def convolution(x: np.ndarray, weight: np.ndarray, bias: np.ndarray | float = 0.0) -> np.ndarray:
     """(H, W, CO) float64 convolution of x (H, W, CI) by weight (CO, CI, K, K), stride 1, zero
     padding K // 2.
     """
@@ -16,20 +16,22 @@ def convolution(x, weight, bias=0.0):
     return out.reshape(*x.shape[:2], -1) + bias
 
 
-def convolution_at(x, weight, bias, pixels):
-    """The same at some pixels, rows (P,) and columns (P,): (P, CO)."""
+def convolution_at(
+    x: np.ndarray, weight: np.ndarray, bias: np.ndarray | float, pixels: tuple
+) -> np.ndarray:
+    """(P, CO): the same at some pixels = (rows (P,), columns (P,))."""
     k = weight.shape[2]
     windows = sliding_window_view(np.pad(x, _padding(k)), (k, k), (0, 1))[pixels]  # (P, CI, K, K)
     matrix = weight.reshape(len(weight), -1).astype(np.float64).T
     return windows.reshape(len(windows), -1).astype(np.float64) @ matrix + bias
 
 
-def flipped(weight):
-    """Weights (CI, CO, K, K) whose convolution of dL/dout is dL/dx."""
+def flipped(weight: np.ndarray) -> np.ndarray:
+    """(CI, CO, K, K) weights by which the convolution of dL/dout is dL/dx."""
     return weight.transpose(1, 0, 2, 3)[:, :, ::-1, ::-1]
 
 
-def weight_gradient(x, grad_out, k):
+def convolution_backward_weights(x: np.ndarray, grad_out: np.ndarray, k: int) -> np.ndarray:
     """(CO, CI, K, K) float64 gradient of the weights; x: (H, W, CI), grad_out: (H, W, CO), or some
     channels of either.
     """
@@ -53,66 +55,68 @@ def _taps(x, k):
             yield ky, kx, padded[ky : ky + height, kx : kx + width].reshape(-1, channels)
 
 
-def network(steps, parameters, x):
-    """{step: its float64 output} of the network of unet_steps; "image" is the image, "x" the input
-    (H, W, C).
+def pool(x: np.ndarray) -> np.ndarray:
+    """(H / 2, W / 2, C): means of 2 x 2 pixels of x (H, W, C)."""
+    return x.reshape(x.shape[0] // 2, 2, x.shape[1] // 2, 2, -1).mean((1, 3))
 
-    parameters: {"enc0.a.weight": (CO, CI, K, K), "enc0.a.bias": (CO,), ...}.
+
+def pool_backward(grad_out: np.ndarray) -> np.ndarray:
+    """(2 H, 2 W, C) gradient of the input of pool(), given that of its output (H, W, C)."""
+    return 0.25 * grad_out.repeat(2, 0).repeat(2, 1)
+
+
+def upsample(x: np.ndarray) -> np.ndarray:
+    """(2 H, 2 W, C): x (H, W, C) enlarged, bilinear, the border repeated."""
+    return _along_both(_bilinear(x.shape[0]), _bilinear(x.shape[1]), x)
+
+
+def upsample_backward(grad_out: np.ndarray) -> np.ndarray:
+    """(H, W, C) gradient of the input of upsample(), given that of its output (2 H, 2 W, C)."""
+    height, width = grad_out.shape[:2]
+    return _along_both(_bilinear(height // 2).T, _bilinear(width // 2).T, grad_out)
+
+
+def network(layers: list, parameters: dict, x: np.ndarray) -> dict[str, np.ndarray]:
+    """{layer: its float64 output} of a network; "image" is the image, "x" the input (H, W, C).
+
+    layers: pp_cl.network.layer.Layer in the order of the forward pass. parameters:
+    {"enc0.a.weight": (CO, CI, K, K), "enc0.a.bias": (CO,), ...}.
     """
     outputs = {"x": np.asarray(x, np.float64)}
-    for step in steps:
-        source = _joined(step, outputs)
-        if step.kind == "pool":
-            out = source.reshape(source.shape[0] // 2, 2, source.shape[1] // 2, 2, -1).mean((1, 3))
-        elif step.kind == "up":
-            out = _along_both(_bilinear(source.shape[0]), _bilinear(source.shape[1]), source)
-        else:
-            out = convolution(
-                source, parameters[step.name + ".weight"], parameters[step.name + ".bias"]
-            )
-        outputs[step.name] = np.maximum(out, 0) if step.kind == "conv3" else out
-    outputs["image"] = 0.5 + 0.5 * outputs["out"]
+    for layer in layers:
+        outputs[layer.name] = layer.reference_forward(_joined(layer, outputs), parameters)
+    outputs["image"] = 0.5 + 0.5 * outputs[layers[-1].name]
     return outputs
 
 
-def network_gradients(steps, parameters, outputs, active, grad_image):
+def network_gradients(
+    layers: list, parameters: dict, outputs: dict, active: dict, *, grad_image: np.ndarray
+) -> dict[str, np.ndarray]:
     """{"x" or parameter: its gradient}, given the outputs of network() and dL/dimage (H, W, 3).
 
-    active: {step: where its ReLU lets the gradient pass}. Near 0 two ways of rounding disagree
+    active: {layer: where its ReLU lets the gradient pass}. Near 0 two ways of rounding disagree
     about that, and one such place weighs more than the rounding of all others: pass those of the
     network that is to be judged.
     """
     gradients, grads = {}, defaultdict(float)  # of parameters; of outputs, summed over their uses
-    grads["out"] = 0.5 * np.asarray(grad_image, np.float64)
-    for step in reversed(steps):
-        grad = grads.pop(step.name)
-        if step.kind == "conv3":
-            grad = grad * active[step.name]
-        if step.kind == "pool":
-            grad_source = 0.25 * grad.repeat(2, 0).repeat(2, 1)
-        elif step.kind == "up":
-            grad_source = _along_both(
-                _bilinear(len(grad) // 2).T, _bilinear(grad.shape[1] // 2).T, grad
-            )
-        else:
-            weight, source = parameters[step.name + ".weight"], _joined(step, outputs)
-            gradients[step.name + ".weight"] = weight_gradient(source, grad, weight.shape[2])
-            gradients[step.name + ".bias"] = grad.sum((0, 1))
-            grad_source = convolution(grad, flipped(weight))
+    grads[layers[-1].name] = 0.5 * np.asarray(grad_image, np.float64)
+    for layer in reversed(layers):
+        grad = grads.pop(layer.name)
+        if layer.relu:
+            grad = grad * active[layer.name]
+        source = _joined(layer, outputs)
+        grad_source, of_parameters = layer.reference_backward(source, grad, parameters)
+        gradients |= of_parameters
         first = 0
-        for name in step.inputs:
+        for name in layer.inputs:
             channels = outputs[name].shape[2]
             grads[name] = grads[name] + grad_source[..., first : first + channels]
             first += channels
     return gradients | {"x": grads["x"]}
 
 
-def _joined(step, outputs):
-    return (
-        outputs[step.inputs[0]]
-        if len(step.inputs) == 1
-        else np.concatenate([outputs[n] for n in step.inputs], 2)
-    )
+def _joined(layer, outputs):
+    return np.concatenate([outputs[name] for name in layer.inputs], 2)
 
 
 def _bilinear(n):

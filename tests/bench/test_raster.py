@@ -9,8 +9,7 @@ import numpy as np
 import pytest
 from oracle import raster as oracle_raster
 
-from pp_cl.bench import network as bench
-from pp_cl.bench import peak
+from pp_cl.bench import peak, timing
 from pp_cl.bench.raster import bench_raster, growth
 from pp_cl.bench.raster_scenes import SCENES
 from pp_cl.cli import main
@@ -23,8 +22,8 @@ SMALL = ("--points", "60,500", "--size", "12,20", "--tau", "0,1e-2")
 def quick(monkeypatch):
     """Short runs, and few of them."""
     monkeypatch.setattr(peak, "COPY_BYTES", 2**16)
-    monkeypatch.setattr(bench, "SECONDS", 0.0)
-    monkeypatch.setattr(bench, "LEAST_ROUNDS", 2)
+    monkeypatch.setattr(timing, "SECONDS", 0.0)
+    monkeypatch.setattr(timing, "LEAST_ROUNDS", 2)
 
 
 @pytest.mark.parametrize("name", SCENES)

@@ -3,71 +3,102 @@ command as a user meets it.
 """
 
 import json
-from collections import defaultdict
+from collections import Counter
 from dataclasses import replace
 
-import numpy as np
 import pytest
+from support.tunings import tuning_of
 
-from pp_cl.bench import network as bench
-from pp_cl.bench import tune
-from pp_cl.bench.layer import DIRECTIONS, Layer
+from pp_cl.bench import timing, tune
+from pp_cl.bench.conv import RandomConv
 from pp_cl.bench.tune import (
     Case,
     measure,
     merge,
     network_cases,
-    run_tune,
-    summary,
     time_runs,
-    tune_layers,
-    tune_shapes,
+    total_times,
+    tune_blocking,
 )
 from pp_cl.cli import main
 from pp_cl.device.discover import TEMPORARY_CACHE, open_device
 from pp_cl.errors import UserError
-from pp_cl.layers.tuning import Tuning, device_key, load_tuning, shape_choices, tuning_file
+from pp_cl.layers.blocking import CHOICES, device_class
+from pp_cl.layers.direction import Direction
+from pp_cl.layers.policy import make_policy
+from pp_cl.layers.tuning import device_key, load_tuning, tuning_file
 from pp_cl.layers.variants import offered
 
+FORWARD, INPUT, WEIGHTS = Direction
 SMALL = ("--size", "8", "--widths", "16,16,16")
-CASE = Case("enc0.b", "forward", 3, (16,), 32, 32, 2, True)  # as shipped: winograd4
+CASE = Case("enc0.b", FORWARD, 3, (16,), 32, 32, 2, True)  # as shipped: winograd4
+TUNED = {"winograd": (32, 8)}  # another blocking than the shipped one
+MS = {"direct": 3.0, "winograd2": 2.0, "winograd4": 1.0, "winograd4_half": 9.0}
 
 
 @pytest.fixture(autouse=True)
 def cache(tmp_path, monkeypatch):
     """A cache of its own for every test, and short runs."""
     monkeypatch.setenv("PP_CACHE", str(tmp_path / "cache"))
-    monkeypatch.setattr(bench, "SECONDS", 0.0)
-    monkeypatch.setattr(bench, "LEAST_ROUNDS", 1)
+    monkeypatch.setattr(timing, "SECONDS", 0.0)
+    monkeypatch.setattr(timing, "LEAST_ROUNDS", 1)
     return tmp_path / "cache"
 
 
-@pytest.fixture
-def dev(dev):
-    """The device, as shipped again after the test."""
-    yield dev
-    dev.tuning, dev.tile_shapes = None, {}
-
-
 class Clock:
-    """Stands in for bench.interleave: times of one call after the other from `script`, the last one
-    for all that follow.
-
-    Variants that the script does not know are slow.
+    """Stands in for the module time: only what tests say takes time. measurement: number of the
+    present call of time_runs(), from 1 on.
     """
 
-    def __init__(self, monkeypatch, *script):
-        self.script, self.calls = list(script), []
-        monkeypatch.setattr(tune, "interleave", self)
+    def __init__(self):
+        self.now, self.measurement = 0.0, 0
 
-    def __call__(self, runs, rounds=None):
-        self.calls.append((list(runs), rounds))
-        times = defaultdict(
-            lambda: 9.0, self.script.pop(0) if len(self.script) > 1 else self.script[0]
-        )
-        for run in runs.values():
-            run()
-        return {name: [times[name]] * (rounds or 5) for name in runs}
+    def perf_counter(self):
+        return self.now
+
+    def sleep(self, seconds):
+        pass
+
+
+@pytest.fixture
+def clock(monkeypatch):
+    """The invented clock."""
+    made = Clock()
+    monkeypatch.setattr(timing, "time", made)
+
+    def counted(runs):
+        made.measurement += 1
+        return time_runs(runs)
+
+    monkeypatch.setattr(tune, "time_runs", counted)
+    return made
+
+
+@pytest.fixture
+def takes(monkeypatch, clock):
+    """A function that makes convolutions take ms(variant, blocking, measurement) milliseconds."""
+    runner = RandomConv.runner
+
+    def script(ms):
+        def timed_runner(self, variant, direction, policy):
+            run = runner(self, variant, direction, policy)
+
+            def timed():
+                run()
+                clock.now += ms(variant, policy.blocking, clock.measurement) * 1e-3
+
+            return timed
+
+        monkeypatch.setattr(RandomConv, "runner", timed_runner)
+
+    return script
+
+
+def measured(dev, case=CASE, blocking=()):
+    """(row, milliseconds as shipped) of a case, with another blocking than the shipped one."""
+    conv = RandomConv(dev, case.k, case.side, case.sources, co=case.co)
+    tuned = make_policy(dev, None, tuning_of(dev, blocking=blocking))
+    return measure(case, conv, make_policy(dev), tuned)
 
 
 # ---- the cases
@@ -78,17 +109,17 @@ def test_cases_of_a_network():
     training = [c for c in cases if c.training]
     by_place = {(c.name, c.direction): c for c in training}
     # and dec0.b
-    assert by_place["enc0.b", "forward"] == Case("enc0.b", "forward", 3, (32,), 32, 128, 2, True)
+    assert by_place["enc0.b", FORWARD] == Case("enc0.b", FORWARD, 3, (32,), 32, 128, 2, True)
     # dec0.a's two inputs, and those of enc0.b and dec0.b, are one kind of gradient
-    assert by_place["enc0.b", "input"] == Case("enc0.b", "input", 3, (32,), 32, 128, 4, True)
-    assert by_place["dec0.a", "forward"] == Case("dec0.a", "forward", 3, (32, 32), 32, 128, 1, True)
-    assert by_place["up1", "weights"] == Case("up1", "weights", 1, (128,), 64, 32, 1, True)
-    assert ("dec0.a", "input") not in by_place
-    counts = {d: sum(c.count for c in training if c.direction == d) for d in DIRECTIONS}
+    assert by_place["enc0.b", INPUT] == Case("enc0.b", INPUT, 3, (32,), 32, 128, 4, True)
+    assert by_place["dec0.a", FORWARD] == Case("dec0.a", FORWARD, 3, (32, 32), 32, 128, 1, True)
+    assert by_place["up1", WEIGHTS] == Case("up1", WEIGHTS, 1, (128,), 64, 32, 1, True)
+    assert ("dec0.a", INPUT) not in by_place
+    counts = {d: sum(c.count for c in training if c.direction == d) for d in Direction}
     # 13 convolutions, two of two sources
-    assert counts == {"forward": 13, "weights": 13, "input": 15}
+    assert counts == {FORWARD: 13, WEIGHTS: 13, INPUT: 15}
     evaluation = [c for c in cases if not c.training]
-    assert {c.direction for c in evaluation} == {"forward"} and {c.side for c in evaluation} == {
+    assert {c.direction for c in evaluation} == {FORWARD} and {c.side for c in evaluation} == {
         200,
         100,
         50,
@@ -101,28 +132,35 @@ def test_cases_of_a_network():
 # ---- what is concluded from times
 
 
-def test_hopeless_runs_are_not_repeated(monkeypatch):
-    clock = Clock(monkeypatch, {"a": 1.0, "b": 3.1, "c": 2.9}, {"a": 5.0, "c": 4.0})
-    assert time_runs(dict.fromkeys("abc", lambda: None)) == {"a": 5.0, "b": 3.1, "c": 4.0}
-    assert clock.calls == [(["a", "b", "c"], tune.PROBES), (["a", "c"], None)]
+def run_for(clock, name, runs, *seconds):
+    """A function that takes the next of `seconds`, the last one from then on, and is counted."""
+
+    def run():
+        clock.now += seconds[min(runs[name], len(seconds) - 1)]
+        runs[name] += 1
+
+    return run
 
 
-def test_one_slow_probe_condemns_nobody(monkeypatch):
+def test_hopeless_runs_are_given_up(clock):
+    runs = Counter()
+    made = {n: run_for(clock, n, runs, s) for n, s in (("a", 1), ("b", 3.1), ("c", 2.9))}
+    assert time_runs(made) == pytest.approx({"a": 1e3, "b": 3.1e3, "c": 2.9e3})
+    assert runs["b"] < runs["a"] == runs["c"]
+
+
+def test_one_slow_probe_condemns_nobody(clock):
     """The best of the probes counts: a machine that was busy for one run is not the variant's
     fault.
     """
-    script = [{"a": [1.0, 1.0], "b": [9.0, 0.9]}, {"a": [1.0], "b": [0.9]}]
-    monkeypatch.setattr(
-        tune,
-        "interleave",
-        lambda runs, rounds=None: {name: script[rounds is None][name] for name in runs},
-    )
-    assert time_runs({"a": None, "b": None}) == {"a": 1.0, "b": 0.9}
+    runs = Counter()
+    made = {"a": run_for(clock, "a", runs, 1), "b": run_for(clock, "b", runs, 0.9, 9, 0.9)}
+    assert time_runs(made) == pytest.approx({"a": 1e3, "b": 0.9e3})
 
 
-def test_a_row_says_what_was_measured(dev, monkeypatch):
-    clock = Clock(monkeypatch, {"direct": 3.0, "winograd2": 2.0, "winograd4": 1.0})
-    row, shipped_ms = measure(dev, CASE, Layer(dev, 3, 32, (16,), 32))
+def test_a_row_says_what_was_measured(dev, takes):
+    takes(lambda variant, blocking, measurement: MS[variant])
+    row, shipped_ms = measured(dev)
     assert {k: row[k] for k in ("direction", "k", "ci", "co", "pixels")} == {
         "direction": "forward",
         "k": 3,
@@ -130,97 +168,102 @@ def test_a_row_says_what_was_measured(dev, monkeypatch):
         "co": 32,
         "pixels": 1024,
     }
-    assert (
-        row["ms"].items() >= {"direct": 3.0, "winograd2": 2.0, "winograd4": 1.0}.items()
-        and shipped_ms == 1.0
-    )
-    assert row["ms"].keys() == row["rel_l2"].keys() == set(offered(dev))
+    assert row["ms"] == pytest.approx(MS) and shipped_ms == pytest.approx(1.0)
+    assert row["ms"].keys() == row["rel_l2"].keys() == set(offered(device_class(dev)))
     assert 0 < row["rel_l2"]["winograd2"] < row["rel_l2"]["winograd4"] < 1e-5
-    assert len(clock.calls) == 2  # the shipped one is the fastest: nothing to confirm
-    weights, _ = measure(dev, replace(CASE, direction="weights"), Layer(dev, 3, 32, (16,), 32))
-    # the others have no kernels of their own
+    weights, _ = measured(dev, replace(CASE, direction=WEIGHTS))
+    # half has no kernel of its own
     assert weights["ms"].keys() == {"direct", "winograd2", "winograd4"}
 
 
-def test_all_that_seem_faster_are_measured_again(dev, monkeypatch):
+def test_the_times_of_all_that_seem_faster_are_those_of_the_second_measurement(dev, takes):
     """The fastest may be beyond a tolerance, and the next one is then taken."""
-    first = {"direct": 0.9, "winograd2": 0.5, "winograd4": 1.0}
-    clock = Clock(monkeypatch, first)
-    measure(dev, CASE, Layer(dev, 3, 32, (16,), 32))
-    assert clock.calls[-1][0] == ["direct", "winograd2", "winograd4"]
+    first = MS | {"direct": 0.9, "winograd2": 0.5}
+    second = MS | {"direct": 0.8, "winograd2": 0.6, "winograd4": 1.1}
+    takes(lambda variant, blocking, measurement: (first, second)[measurement > 1][variant])
+    row, shipped_ms = measured(dev)
+    assert row["ms"] == pytest.approx(second) and shipped_ms == pytest.approx(1.1)
 
 
-@pytest.mark.parametrize("second, taken", [(0.5, "winograd2"), (1.1, "winograd4")])
-def test_a_faster_variant_must_be_so_twice(dev, monkeypatch, second, taken):
-    first = {"direct": 3.0, "winograd2": 0.5, "winograd4": 1.0}
-    clock = Clock(monkeypatch, first, first, first | {"winograd2": second})
-    layer = Layer(dev, 3, 32, (16,), 32)
-    row, shipped_ms = measure(dev, CASE, layer)
-    assert clock.calls[-1][0] == ["winograd2", "winograd4"]
-    assert row["ms"].items() >= (first | {"winograd2": second}).items() and shipped_ms == 1.0
-    assert tune.picked(dev, CASE, Tuning(1e-5, [row])) == taken
+@pytest.mark.parametrize("second, chosen", [(0.5, "winograd2"), (1.1, "winograd4")])
+def test_a_faster_variant_must_be_so_twice(dev, takes, second, chosen):
+    def ms(variant, blocking, measurement):
+        if variant != "winograd2":
+            return MS[variant]
+        return second if measurement > 1 else 0.5
+
+    takes(ms)
+    row, shipped_ms = measured(dev)
+    assert row["ms"]["winograd2"] == pytest.approx(second) and shipped_ms == pytest.approx(1.0)
+    assert make_policy(dev, 1e-5, tuning_of(dev, [row])).choose(CASE.shape) == chosen
 
 
-def test_with_tuned_tiles_the_shipped_ones_are_timed_too(dev, monkeypatch):
-    dev.tile_shapes = {"winograd": (32, 8)}
-    seen = []
-    monkeypatch.setattr(
-        Layer,
-        "runner",
-        lambda self, variant, _: lambda: seen.append((variant, dict(self.dev.tile_shapes))),
-    )
-    monkeypatch.setattr(Layer, "result", lambda self, variant, direction: (np.ones(1), np.ones(1)))
-    Clock(monkeypatch, {"direct": 3.0, "winograd2": 2.0, "winograd4": 1.0, None: 1.5})
-    row, shipped_ms = measure(dev, CASE, Layer(dev, 3, 32, (16,), 32))
-    assert shipped_ms == 1.5 and None not in row["ms"]
-    assert ("winograd4", {}) in seen and ("winograd4", {"winograd": (32, 8)}) in seen
-    assert dev.tile_shapes == {"winograd": (32, 8)}
-    (line,) = summary(dev, [CASE], [row], [shipped_ms], Tuning(1e-5, [row]))
+def test_with_another_blocking_the_shipped_one_is_timed_too(dev, takes):
+    def ms(variant, blocking, measurement):
+        shipped = variant == "winograd4" and blocking == make_policy(dev).blocking
+        return 1.5 if shipped else MS[variant]
+
+    takes(ms)
+    row, shipped_ms = measured(dev, blocking=TUNED)
+    assert shipped_ms == pytest.approx(1.5) and row["ms"] == pytest.approx(MS)
+    policy = make_policy(dev, 1e-5, tuning_of(dev, [row], TUNED))
     # the network has the layer twice
-    assert "3.00 ms as shipped, 2.00 ms as tuned, 1.50 times as fast" in line
+    assert total_times([CASE], [row], [shipped_ms], policy) == {
+        "a training step": pytest.approx((3.0, 2.0))
+    }
 
 
 @pytest.mark.parametrize("second, chosen", [(1.0, {"winograd": (128, 8)}), (2.0, {})])
-def test_tile_shapes_are_chosen_for_all_layers_together(dev, monkeypatch, capsys, second, chosen):
-    shapes = shape_choices(dev)
-    first = {shape: 2.0 for of in shapes.values() for shape in of} | {(128, 8): 1.0}
+def test_blocking_is_chosen_for_all_layers_together(dev, takes, second, chosen):
+    """(128, 8) seems the fastest; only if it is so again it is taken."""
     cases = [
         CASE,
-        Case("enc0.b", "weights", 3, (16,), 32, 32, 2, True),
-        Case("up0", "forward", 1, (16,), 16, 8, 1, True),
+        Case("enc0.b", WEIGHTS, 3, (16,), 32, 32, 2, True),
+        Case("up0", FORWARD, 1, (16,), 16, 8, 1, True),
     ]
-    clock = Clock(monkeypatch, *[first] * 6, first | {(128, 8): second})
-    assert tune_shapes(dev, cases) == chosen
-    # two for each of three files, and the pair
-    assert clock.calls[-1][0] == [(64, 8), (128, 8)] and len(clock.calls) == 8
-    printed = capsys.readouterr().out.splitlines()
-    assert len(printed) == 3 and f"128/8 {2 * second:.2f}" in "".join(printed)
-    assert ("128/8 2.00 (taken)" in "".join(printed)) == bool(chosen)
-    assert dev.tile_shapes == {}
+    fast = []
+
+    def ms(variant, blocking, measurement):
+        if variant != "winograd4" or blocking.winograd != (128, 8):
+            return 2.0
+        fast.append(measurement)
+        return 1.0 if measurement == fast[0] else second
+
+    takes(ms)
+    found, times = tune_blocking(dev, cases, make_policy(dev))
+    assert found == chosen and times.keys() == CHOICES["CPU"].keys()
+    # the network has the layer twice
+    assert times["winograd"][128, 8] == pytest.approx(2 * second)
+    assert times["winograd"][64, 8] == pytest.approx(4.0)
 
 
-def test_the_table_names_what_is_taken_within_the_tolerance(dev, monkeypatch, capsys):
-    Clock(monkeypatch, {"direct": 3.0, "winograd2": 2.0, "winograd4": 1.0})
-    for tolerance, end in (
-        (1e-5, "winograd4"),
-        (2.4e-7, "winograd2 instead of winograd4"),
-        (1e-9, "none"),
+def test_the_table_names_what_is_chosen_within_the_tolerance(dev, takes, monkeypatch, capsys):
+    takes(lambda variant, blocking, measurement: MS[variant])
+    monkeypatch.setattr(tune, "network_cases", lambda *args: [CASE])
+    for tolerance, end, status in (
+        ("1e-5", "winograd4", 0),
+        ("2.4e-7", "winograd2 instead of winograd4", 0),
+        ("1e-9", "none", 2),
     ):
-        tune_layers(dev, [CASE], tolerance)
-        assert capsys.readouterr().out.rstrip().endswith(end)
+        assert main(["tune", *SMALL, "--tolerance", tolerance]) == status
+        lines = capsys.readouterr().out.splitlines()
+        (line,) = [x for x in lines if x.startswith("enc0.b")]
+        assert line.endswith(end)
 
 
 def test_an_earlier_tuning_of_other_layers_is_kept():
-    def of(tiles, *rows):
+    def of(blocking, *rows):
         rows = [
             {"direction": "forward", "k": 3, "ci": ci, "co": 16, "pixels": 4, "ms": ms}
             for ci, ms in rows
         ]
-        return {"tile_shapes": tiles, "rows": rows}
+        return {"tile_shapes": blocking, "rows": rows}
 
     new = of({}, (16, 1), (32, 2))
     assert merge(new, of({}, (32, 3), (64, 4))) == of({}, (16, 1), (32, 2), (64, 4))
-    assert merge(new, of({"winograd": (32, 8)}, (64, 4))) == new  # its times are of other tiles
+    assert (
+        merge(new, of({"winograd": (32, 8)}, (64, 4))) == new
+    )  # its times are of another blocking
 
 
 # ---- the command
@@ -266,9 +309,9 @@ def test_tune_stores_what_the_others_then_use(cache, capsys):
 )
 def test_network_and_sizes_asked_for(monkeypatch, words, network):
     called = []
-    monkeypatch.setattr(tune, "run_tune", lambda *args: called.append(args))
-    assert main(["tune", *words, "--tolerance", "1e-6", "--device", "0:0"]) == 0
-    assert called == [(*network, 1e-6, "0:0")]
+    monkeypatch.setattr(tune, "network_cases", lambda *args: called.append(args) or [])
+    assert main(["tune", *words, "--tolerance", "1e-6"]) == 0
+    assert called == [network]
 
 
 @pytest.mark.parametrize(
@@ -302,7 +345,7 @@ def test_a_tolerance_that_nothing_keeps_is_refused_and_the_measurement_kept(caps
 
 
 def test_where_nothing_can_be_stored_nothing_is_measured(tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr(tune, "tune_shapes", lambda *args: pytest.fail("measured"))
+    monkeypatch.setattr(tune, "run_tune", lambda *args, **kwargs: pytest.fail("measured"))
     (tmp_path / "file").write_text("")
     monkeypatch.setenv("PP_CACHE", str(tmp_path / "file" / "cache"))
     assert main(["tune", *SMALL]) == 2
@@ -313,7 +356,7 @@ def test_where_nothing_can_be_stored_nothing_is_measured(tmp_path, monkeypatch, 
     temporary.mkdir()
     monkeypatch.setenv("XDG_CACHE_HOME", str(temporary))  # as device.py sets it for this process
     with pytest.raises(UserError, match="nothing would be kept; set PP_CACHE"):
-        run_tune((16, 16, 16), 8, 8, 1e-5)
+        tune.check_cache()
 
 
 def test_bench_conv_takes_no_tolerance_it_would_ignore(capsys):

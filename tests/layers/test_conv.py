@@ -1,5 +1,7 @@
 """cl/layers/conv.cl against float64."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from oracle.conv import conv, conv_gradients
@@ -12,6 +14,7 @@ from support.conv_layers import (
     layer,
 )
 
+from pp_cl.layers.blocking import SHIPPED
 from pp_cl.layers.conv import (
     conv_backward_input,
     conv_forward,
@@ -22,26 +25,27 @@ from pp_cl.layers.conv import (
 from pp_cl.layers.conv_backward_weights import flip_weights
 
 
-def run_forward(dev, x, weight, bias, relu, x2=None):
+def run_forward(dev, x, weight, bias, relu, x2=None, blocking=SHIPPED["CPU"]):
     out = dev.empty((*x.shape[:2], len(bias)))
     conv_forward(
         dev,
-        dev.upload(x),
+        tuple(dev.upload(source) for source in (x, x2) if source is not None),
         dev.upload(pack_weights(weight)),
         dev.upload(pack_bias(bias)),
-        out,
-        relu,
-        None if x2 is None else dev.upload(x2),
+        out=out,
+        relu=relu,
+        blocking=blocking,
     )
     return out.get()
 
 
-def run_backward_input(dev, x, weight, grad_out, masked, first=0):
+def run_backward_input(dev, x, weight, grad_out, masked, first=0, blocking=SHIPPED["CPU"]):
     co, _, k, _ = weight.shape
     flipped = dev.empty((-(-x.shape[2] // 16), k, k, co, 16))
-    flip_weights(dev, dev.upload(pack_weights(weight)), first, flipped)
+    flip_weights(dev, dev.upload(pack_weights(weight)), first, flipped, blocking=blocking)
     grad_x = dev.empty(x.shape)
-    conv_backward_input(dev, dev.upload(x), flipped, dev.upload(grad_out), grad_x, masked)
+    mask = dev.upload(x) if masked else None
+    conv_backward_input(dev, flipped, dev.upload(grad_out), grad_x, mask=mask, blocking=blocking)
     return grad_x.get()
 
 
@@ -113,19 +117,23 @@ def test_hard_inputs(dev, rng):
     check_hard_inputs(dev, rng, run_forward, run_backward_input)
 
 
-def test_work_groups_of_a_gpu(dev, rng, monkeypatch):
-    """The tiles and work-groups that other devices get: their tails reach beyond the image and the
+def test_work_groups_of_a_gpu(dev, rng):
+    """The pixels and work-groups that other devices get: their tails reach beyond the image and the
     channels.
     """
-    monkeypatch.setattr(dev, "is_cpu", False)
+    gpu = SHIPPED["GPU"]
     for height, width, ci, co in ((5, 37, 16, 48), (3, 2, 3, 20)):
         x, grad_out = (rng.normal(size=(height, width, c)).astype(np.float32) for c in (ci, co))
         weight, bias = layer(rng, ci, co, 3)
         assert (
-            relative_error(run_forward(dev, x, weight, bias, False), conv(x, weight, bias)) < 3e-6
+            relative_error(
+                run_forward(dev, x, weight, bias, False, blocking=gpu), conv(x, weight, bias)
+            )
+            < 3e-6
         )
         expected = conv_gradients(x, weight, grad_out)[0]
-        assert relative_error(run_backward_input(dev, x, weight, grad_out, False), expected) < 3e-6
+        actual = run_backward_input(dev, x, weight, grad_out, False, blocking=gpu)
+        assert relative_error(actual, expected) < 3e-6
 
 
 @pytest.mark.large
@@ -136,14 +144,15 @@ def test_same_bits_twice(dev, rng):
 def test_wrong_shapes_are_refused(dev):
     x, out = dev.zeros((4, 4, 16)), dev.zeros((4, 4, 32))
     weight, bias = dev.zeros((2, 3, 3, 16, 16)), dev.zeros(32)
+    given = {"out": out, "relu": False, "blocking": SHIPPED["CPU"]}
     with pytest.raises(ValueError, match="16 \\+ 16 to 32 channels"):
-        conv_forward(dev, x, weight, bias, out, False, x2=x)
+        conv_forward(dev, (x, x), weight, bias, **given)
     with pytest.raises(ValueError, match="bias"):
-        conv_forward(dev, x, weight, dev.zeros(16), out, False)
+        conv_forward(dev, (x,), weight, dev.zeros(16), **given)
     with pytest.raises(ValueError, match="width"):
-        conv_forward(dev, x, weight, bias, dev.zeros((4, 5, 32)), False)
+        conv_forward(dev, (x,), weight, bias, **given | {"out": dev.zeros((4, 5, 32))})
     with pytest.raises(ValueError, match="flipped"):
-        conv_backward_input(dev, x, weight, out, x, False)
+        conv_backward_input(dev, weight, out, x, mask=None, blocking=SHIPPED["CPU"])
 
 
 def test_relu_hides_no_nan(dev, rng):
@@ -151,6 +160,24 @@ def test_relu_hides_no_nan(dev, rng):
     x[2, 3, 4] = np.nan
     out = dev.empty((5, 7, 16))
     weight, bias = pack_weights(rng.normal(size=(16, 16, 3, 3))), pack_bias(np.zeros(16))
-    conv_forward(dev, dev.upload(x), dev.upload(weight), dev.upload(bias), out, relu=True)
+    conv_forward(
+        dev,
+        (dev.upload(x),),
+        dev.upload(weight),
+        dev.upload(bias),
+        out=out,
+        relu=True,
+        blocking=SHIPPED["CPU"],
+    )
     bad = np.isnan(out.get()).all(axis=2)
     assert bad[1:4, 2:5].all() and bad.sum() == 9
+
+
+def test_a_blocking_fits_the_channels_and_the_width():
+    paired = replace(SHIPPED["CPU"], direct=(6, 2, (1, 1, 1)))
+    assert paired.of_direct(100, 64) == paired.of_direct(6, 64) == (6, 2, (1, 1, 1))
+    assert paired.of_direct(5, 64) == (4, 2, (1, 1, 1))
+    assert paired.of_direct(3, 64) == (1, 2, (1, 1, 1))
+    assert paired.of_direct(100, 48) == (12, 1, (1, 1, 1))  # three groups do not pair up
+    single = replace(SHIPPED["CPU"], direct=(4, 1, (1, 1, 1)))
+    assert single.of_direct(100, 48) == single.of_direct(100, 64) == (4, 1, (1, 1, 1))

@@ -1,5 +1,7 @@
 """cl/layers/tiles.cl against numpy, and the kernels that compute some tiles only."""
 
+import re
+
 import numpy as np
 import pytest
 from oracle.conv import conv_gradients
@@ -8,11 +10,16 @@ from support.comparisons import relative_error
 from support.conv_layers import layer
 from support.guarded import large
 
+from pp_cl.device.device import kernel_folder
 from pp_cl.layers import resample as layers
+from pp_cl.layers.blocking import SHIPPED
 from pp_cl.layers.conv import pack_bias, pack_weights, unpack_weights
+from pp_cl.layers.direction import Direction
 from pp_cl.layers.tiles import (
+    LANES,
     SIDE,
     all_tiles,
+    all_tiles_buffers,
     checked_tiles,
     grid_shape,
     some_tiles,
@@ -20,14 +27,8 @@ from pp_cl.layers.tiles import (
     tiles_copy,
     tiles_find,
 )
-from pp_cl.layers.variants import (
-    VARIANTS,
-    Work,
-    backward_input,
-    backward_weights,
-    forward,
-    work_floats,
-)
+from pp_cl.layers.variants import VARIANTS
+from pp_cl.layers.work import Work
 
 # (height, width, channels): less than a tile, cut-off tiles, several work-groups
 SHAPES = [(1, 1, 1), (3, 5, 16), (31, 33, 3), (4, 257, 20), (257, 8, 16)]
@@ -107,8 +108,11 @@ def test_lists_and_wrong_sizes(dev):
     np.testing.assert_array_equal(tiles.list.get(), [9, 6, 3, 1, 2, 5])
     np.testing.assert_array_equal(tiles.count.get(), [[0, 2], [1, 0], [0, 5]])
     assert checked_tiles(dev, tiles, 9, 6) is tiles
-    assert checked_tiles(dev, None, 9, 6) is all_tiles(dev, 9, 6)
-    assert all_tiles(dev, 9, 6).number == 6
+    whole = all_tiles(dev, 9, 6)
+    assert whole.number == 6
+    for name, (shape, dtype) in all_tiles_buffers(9, 6).items():
+        assert getattr(whole, name).shape == shape and getattr(whole, name).dtype == dtype
+    np.testing.assert_array_equal(checked_tiles(dev, None, 9, 6).list.get(), whole.list.get())
     with pytest.raises(ValueError, match="\\(9, 6\\).*\\(9, 7\\)"):
         checked_tiles(dev, tiles, 9, 7)
     with pytest.raises(ValueError, match="no tile"):
@@ -128,62 +132,51 @@ def test_convolutions_compute_the_chosen_tiles(dev, rng, k, variant, height, wid
     counts = random_counts(rng, height, width)
     chosen = pixels_of(counts > 0, height, width)
     tiles = some_tiles(dev, (height, width), counts)
-    sources = [dev.upload(np.ascontiguousarray(s)) for s in np.split(x, [c1], 2)]
+    sources = tuple(dev.upload(np.ascontiguousarray(s)) for s in np.split(x, [c1], 2))
     device_weight, device_grad = dev.upload(pack_weights(weight)), dev.upload(grad_out)
 
-    def work(direction, c=None):
-        return Work(
-            *[
-                dev.empty(max(1, n))
-                for n in work_floats(dev, variant, direction, height, device_weight.shape, c)
-            ]
-        )
+    convolution = VARIANTS[variant].convolution(dev, SHIPPED["CPU"])
+
+    def work(direction, c):
+        floats = convolution.work_floats(direction, height, device_weight.shape, c)
+        return Work.empty(dev, *floats)
 
     bias = dev.upload(pack_bias(bias))
     whole, out = dev.empty((height, width, co)), dev.empty((height, width, co))
     for result, which in ((whole, None), (out, tiles)):
-        forward(
-            dev,
-            variant,
-            sources[0],
+        convolution.forward(
+            sources,
             device_weight,
             bias,
             result,
-            True,
-            work("forward"),
-            sources[1],
-            which,
+            relu=True,
+            work=work(Direction.FORWARD, c1 + c2),
+            tiles=which,
         )
     np.testing.assert_array_equal(out.get(), np.where(chosen[..., None], whole.get(), np.nan))
 
     whole, grad_x = dev.empty((height, width, c2)), dev.empty((height, width, c2))
     for result, which in ((whole, None), (grad_x, tiles)):
-        backward_input(
-            dev,
-            variant,
-            sources[1],
+        convolution.backward_input(
             device_weight,
             c1,
             device_grad,
             result,
-            True,
-            work("input", c2),
-            which,
+            mask=sources[1],
+            work=work(Direction.BACKWARD_INPUT, c2),
+            tiles=which,
         )
     np.testing.assert_array_equal(grad_x.get(), np.where(chosen[..., None], whole.get(), np.nan))
 
     grad_weight, grad_bias = dev.empty(device_weight.shape), dev.empty(co)
     poisoned = dev.upload(np.where(chosen[..., None], grad_out, np.nan), np.float32)
-    backward_weights(
-        dev,
-        variant,
-        sources[0],
+    convolution.backward_weights(
+        sources,
         poisoned,
         grad_weight,
         grad_bias,
-        work("weights"),
-        sources[1],
-        tiles,
+        work=work(Direction.BACKWARD_WEIGHTS, c1 + c2),
+        tiles=tiles,
     )
     counted = grad_out * pixels_of(counts, height, width)[..., None]
     expected = conv_gradients(x, weight, counted.astype(np.float64))
@@ -201,7 +194,8 @@ def test_layers_compute_the_chosen_tiles(dev, rng, height, width, channels):
     def check(call, shape, expected, *inputs, start=None):
         counts = random_counts(rng, *shape[:2])
         result = dev.empty(shape) if start is None else dev.upload(start)
-        call(dev, *[dev.upload(i) for i in inputs], result, some_tiles(dev, shape[:2], counts))
+        tiles = some_tiles(dev, shape[:2], counts)
+        call(dev, *[dev.upload(i) for i in inputs], result, tiles=tiles)
         chosen, untouched = (
             pixels_of(counts > 0, *shape[:2]),
             np.full(shape, np.nan) if start is None else start,
@@ -220,3 +214,11 @@ def test_layers_compute_the_chosen_tiles(dev, rng, height, width, channels):
         low,
         start=other,
     )
+
+
+@pytest.mark.parametrize(
+    "file, name, value", [("layers/tiles.h", "SIDE", SIDE), ("common.h", "CHANNELS", LANES)]
+)
+def test_host_and_kernels_agree(file, name, value):
+    text = (kernel_folder() / file).read_text("utf-8")
+    assert int(re.search(rf"^#define {name} (\d+)", text, re.M)[1]) == value

@@ -5,9 +5,12 @@ import pytest
 from oracle.conv import conv_gradients
 from support.comparisons import relative_error
 from support.guarded import large
-from support.winograd_layers import BOUNDS, SHAPES, run_weight_gradient
+from support.winograd_layers import BOUNDS, SHAPES, form, run_backward_weights
 
-from pp_cl.layers.winograd_backward_weights import gradient_scratch_floats, winograd_weight_gradient
+from pp_cl.layers.winograd_backward_weights import (
+    backward_weights_floats,
+    winograd_backward_weights,
+)
 
 # With parts of 128 x 128 channels: several, and tails of both kinds
 PARTS = [*map(large, [(5, 6, 80, 144), (9, 7, 144, 48), (12, 20, 272, 256)])]
@@ -15,12 +18,12 @@ PARTS = [*map(large, [(5, 6, 80, 144), (9, 7, 144, 48), (12, 20, 272, 256)])]
 
 @pytest.mark.parametrize("m", BOUNDS)
 @pytest.mark.parametrize("shape", SHAPES + PARTS)
-def test_weight_gradient(dev, rng, shape, m):
+def test_backward_weights(dev, rng, shape, m):
     height, width, ci, co = shape
     x = rng.normal(size=(height, width, ci)).astype(np.float32)
     grad_out = rng.normal(size=(height, width, co)).astype(np.float32)
     _, expected_weight, expected_bias = conv_gradients(x, np.zeros((co, ci, 3, 3)), grad_out)
-    weight, bias = run_weight_gradient(dev, m, grad_out, x)
+    weight, bias = run_backward_weights(dev, form(m), grad_out, x)
     assert relative_error(weight, expected_weight) < BOUNDS[m]
     assert relative_error(bias, expected_bias) < BOUNDS[m]
 
@@ -34,7 +37,7 @@ def test_two_sources(dev, rng, c1, c2, m):
     _, expected_weight, expected_bias = conv_gradients(
         joined, np.zeros((32, c1 + c2, 3, 3)), grad_out
     )
-    weight, bias = run_weight_gradient(dev, m, grad_out, x, x2)
+    weight, bias = run_backward_weights(dev, form(m), grad_out, x, x2)
     assert relative_error(weight, expected_weight) < BOUNDS[m]
     assert relative_error(bias, expected_bias) < BOUNDS[m]
 
@@ -46,8 +49,10 @@ def test_hard_inputs(dev, rng, m):
     _, expected, _ = conv_gradients(x, np.zeros((16, 16, 3, 3)), grad_out)
     # the sums cancel: the error is small against the terms, not against the result
     scale = np.abs(grad_out).sum((0, 1)).max() * 1e3
-    assert np.abs(run_weight_gradient(dev, m, grad_out, x)[0] - expected).max() < 1e-6 * scale
-    weight, bias = run_weight_gradient(dev, m, np.zeros_like(grad_out), x)
+    assert (
+        np.abs(run_backward_weights(dev, form(m), grad_out, x)[0] - expected).max() < 1e-6 * scale
+    )
+    weight, bias = run_backward_weights(dev, form(m), np.zeros_like(grad_out), x)
     assert not weight.any() and not bias.any()
 
 
@@ -56,9 +61,11 @@ def test_hard_inputs(dev, rng, m):
 def test_same_bits_for_any_number_of_compute_units(dev, rng, monkeypatch, units):
     x = rng.normal(size=(37, 40, 144)).astype(np.float32)
     grad_out = rng.normal(size=(37, 40, 144)).astype(np.float32)
-    expected = run_weight_gradient(dev, 4, grad_out, x)
+    expected = run_backward_weights(dev, form(4), grad_out, x)
     monkeypatch.setitem(dev.info, "compute_units", units)
-    for actual, value in zip(run_weight_gradient(dev, 4, grad_out, x), expected, strict=True):
+    for actual, value in zip(
+        run_backward_weights(dev, form(4), grad_out, x), expected, strict=True
+    ):
         np.testing.assert_array_equal(actual, value)
 
 
@@ -67,16 +74,15 @@ def test_wrong_shapes_are_refused(dev):
     x, grad_out, scratch = (
         dev.zeros((4, 4, 16)),
         dev.zeros((4, 4, 32)),
-        dev.zeros(gradient_scratch_floats(dev, 4)),
+        dev.zeros(backward_weights_floats(dev, form(4))),
     )
     grad_weight, grad_bias = dev.zeros((2, 3, 3, 16, 16)), dev.zeros(32)
-    with pytest.raises(ValueError, match="\\[16, 16\\] to 32 channels"):
-        winograd_weight_gradient(dev, 4, x, grad_out, grad_weight, grad_bias, scratch, x2=x)
-    with pytest.raises(ValueError, match="bias \\(16,\\)"):
-        winograd_weight_gradient(dev, 4, x, grad_out, grad_weight, dev.zeros(16), scratch)
-    with pytest.raises(ValueError, match="\\[3\\] to 32"):
-        winograd_weight_gradient(
-            dev, 4, dev.zeros((4, 4, 3)), grad_out, dev.zeros((2, 3, 3, 3, 16)), grad_bias, scratch
-        )
-    with pytest.raises(ValueError, match="scratch has 10 floats"):
-        winograd_weight_gradient(dev, 4, x, grad_out, grad_weight, grad_bias, dev.zeros(10))
+    given = {"grad_weight": grad_weight, "grad_bias": grad_bias, "scratch": scratch}
+    for sources, change, match in (
+        ((x, x), {}, "\\[16, 16\\] to 32 channels"),
+        ((x,), {"grad_bias": dev.zeros(16)}, "bias \\(16,\\)"),
+        ((dev.zeros((4, 4, 3)),), {"grad_weight": dev.zeros((2, 3, 3, 3, 16))}, "\\[3\\] to 32"),
+        ((x,), {"scratch": dev.zeros(10)}, "scratch of 10 floats"),
+    ):
+        with pytest.raises(ValueError, match=match):
+            winograd_backward_weights(dev, form(4), sources, grad_out, **given | change)

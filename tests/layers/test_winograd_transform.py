@@ -7,14 +7,13 @@ import pytest
 from oracle.conv import conv
 from oracle.winograd import ROUNDING, SMALLEST, convolve, matrices
 from oracle.winograd import transform_weights as exact_weights
-from support.winograd_layers import transformed_by_device
+from support.winograd_layers import form, transformed_by_device
 
 from pp_cl.layers.variants import VARIANTS
-from pp_cl.layers.winograd import transformed_floats
 from pp_cl.layers.winograd_transform import transform_flipped_weights, transform_weights
 from pp_cl.reference.network import flipped
 
-FORMS = [form for form in VARIANTS.values() if form[0]]
+FORMS = [(v.winograd_m, v.half) for v in VARIANTS.values() if v.winograd_m]
 SHAPES = [(16, 16), (48, 16), (16, 80), (64, 32), (272, 144)]  # channels in, out
 # float32's rounding times the operations, in a row, that make one transformed weight
 FLOAT = 2.0**-24 * 12
@@ -117,11 +116,13 @@ def test_half_hides_nothing_that_is_not_finite(dev, rng, flip, bad):
 
 
 def test_wrong_shapes_are_refused(dev):
-    weight, transformed = dev.zeros((2, 3, 3, 16, 16)), dev.zeros(transformed_floats(4, 16, 32))
+    weight = dev.zeros((2, 3, 3, 16, 16))
+    transformed = dev.zeros(form(4).transformed_floats(16, 32))
     with pytest.raises(ValueError, match="transformed weights of 10 floats"):
-        transform_weights(dev, 4, weight, dev.zeros(10))
+        transform_weights(dev, form(4), weight, dev.zeros(10))
+    half = form(4, half=True)
     with pytest.raises(ValueError, match="transformed weights"):
-        transform_weights(dev, 4, weight, dev.zeros(transformed_floats(4, 16, 32, True) - 1), True)
+        transform_weights(dev, half, weight, dev.zeros(half.transformed_floats(16, 32) - 1))
     for first, c in ((0, 3), (8, 16), (16, 16)):
         with pytest.raises(ValueError, match=f"{c} channels from {first}"):
-            transform_flipped_weights(dev, 4, weight, first, c, transformed)
+            transform_flipped_weights(dev, form(4), weight, first, c=c, transformed=transformed)

@@ -10,25 +10,25 @@ from support.networks import plain_parameters
 
 import pp_cl.network.unet
 from pp_cl.config import preset
+from pp_cl.layers.policy import make_policy
 from pp_cl.layers.tiles import SIDE, grid_shape, tiles_find
 from pp_cl.model import Model
+from pp_cl.network.architectures import convolutions, unet_layers
 from pp_cl.network.sparse_tiles import (
     LOSS_BORDER,
-    ActiveForward,
-    backward_reach,
-    double,
-    forward_reach,
-    grow,
-    halve,
-    layout,
+    ForwardPlan,
+    gradient_radius,
+    map_tiles,
+    receptive_radius,
 )
-from pp_cl.network.unet import UNet, unet_steps
+from pp_cl.network.tile_sets import double, grow, halve
+from pp_cl.network.unet import UNet
 from pp_cl.raster.blend import BACKGROUND
 from pp_cl.render import Renderer
 from pp_cl.scene.hull import build_grid, depth_range
 from pp_cl.scene.load import load_scene
 
-STEPS = unet_steps((16, 16, 16), 3)
+LAYERS = unet_layers((16, 16, 16))
 SIZE = (148, 180)  # room for a class inside; levels 1 and 2 end in tiles that are cut off
 OBJECTS = {  # (rows, columns) that are not background
     "inside": (slice(60, 81), slice(70, 93)),
@@ -44,7 +44,7 @@ OBJECTS = {  # (rows, columns) that are not background
 def always(monkeypatch):
     """Choose tiles in small images, too, and however many remain."""
     monkeypatch.setattr(pp_cl.network.unet, "LEAST_PIXELS", 0)
-    monkeypatch.setattr(pp_cl.network.unet, "MOST_SHARE", 1)
+    monkeypatch.setattr(pp_cl.network.unet, "MOST_COMPUTED", 1)
 
 
 def scene(rng, place, size=SIZE):
@@ -63,7 +63,9 @@ def scene(rng, place, size=SIZE):
 
 def run(dev, net, x, grad_y, background):
     """[image, gradient of x, gradients of the parameters] as the device computes them."""
-    y = net.forward(dev.upload(x), True, background).get()
+    x = dev.upload(x)
+    plan = None if background is None else net.plan_tiles(x, background)
+    y = net.forward(x, True, plan).get()
     return [y, net.backward(dev.upload(grad_y)).get(), *[g.get() for g in net.gradients.values()]]
 
 
@@ -71,11 +73,13 @@ def run(dev, net, x, grad_y, background):
 @pytest.mark.parametrize("variant", ["direct", "auto"])
 def test_equals_the_dense_network(dev, rng, always, name, variant):
     x, grad_y = scene(rng, OBJECTS[name])
-    net = UNet(dev, (16, 32, 48), seed=1, variant=variant)
+    net = UNet(dev, (16, 32, 48), seed=1, policy=make_policy(dev, variant=variant))
     expected = run(dev, net, x, grad_y, None)
     actual = run(dev, net, x, grad_y, BACKGROUND)
-    assert (net.share < 0.4) == (name != "everywhere")
-    np.testing.assert_array_equal(net.forward(dev.upload(x), False, BACKGROUND).get(), actual[0])
+    device_x = dev.upload(x)
+    plan = net.plan_tiles(device_x, BACKGROUND)
+    assert (plan.computed_fraction < 0.4) == (name != "everywhere")
+    np.testing.assert_array_equal(net.forward(device_x, False, plan).get(), actual[0])
     if variant == "direct":  # Winograd mixes the last bits of a tile
         np.testing.assert_array_equal(actual[0], expected[0])
     for a, b in zip(actual[:2], expected[:2], strict=True):
@@ -112,32 +116,28 @@ def test_nan_comes_through(dev, rng, always):
 def test_few_tiles_in_large_images_only(dev, rng):
     net = UNet(dev, (16, 16, 16))
     for height, end, chosen in ((256, 60, True), (256, 240, False), (252, 60, False)):
-        net.forward(
-            dev.upload(scene(rng, (slice(40, end), slice(40, end)), (height, 256))[0]),
-            False,
-            BACKGROUND,
-        )
-        assert (net.share < 1) == chosen
+        x = scene(rng, (slice(40, end), slice(40, end)), (height, 256))[0]
+        plan = net.plan_tiles(dev.upload(x), BACKGROUND)
+        assert (plan is not None) == chosen
         if chosen:
-            assert net.share <= pp_cl.network.unet.MOST_SHARE
+            assert plan.computed_fraction <= pp_cl.network.unet.MOST_COMPUTED
 
 
-def test_reach_is_what_a_change_reaches(rng):
+def test_radius_is_what_a_change_reaches(rng):
     """In float64, for a change at every place of a period of the pooling and the border far
     away.
     """
     parameters = {}
-    steps, size, centre = unet_steps((1, 1, 1), 1), 96, 48
-    for step in (s for s in steps if s.kind.startswith("conv")):
-        shape = 1, len(step.inputs), int(step.kind[-1]), int(step.kind[-1])
+    layers, size, centre = unet_layers((1, 1, 1), 1, 1), 96, 48
+    for layer in convolutions(layers):
         parameters |= {
-            f"{step.name}.weight": rng.uniform(0.5, 1, shape),
-            f"{step.name}.bias": np.ones(1),
+            f"{layer.name}.weight": rng.uniform(0.5, 1, layer.weight_shape()),
+            f"{layer.name}.bias": np.ones(1),
         }
     before = unet(np.ones((size, size, 1)), parameters)[1]
-    felt = dict.fromkeys(before, 0)
+    reached = dict.fromkeys(before, 0)
     grad = np.zeros((size, size, 1))
-    felt_back = 0
+    reached_back = 0
     for place in range(centre, centre + 4):
         x = np.ones((size, size, 1))
         x[place, place] = 2
@@ -146,20 +146,20 @@ def test_reach_is_what_a_change_reaches(rng):
             if name not in ("wide1", "wide0", "up1", "up0"):  # the oracle enlarges first
                 scale = size // len(value)
                 rows = np.flatnonzero(np.abs(value - before[name])[..., 0].max(1) > 1e-9)
-                felt[name] = max(
-                    felt[name], place - rows[0] * scale, rows[-1] * scale + scale - 1 - place
+                reached[name] = max(
+                    reached[name], place - rows[0] * scale, rows[-1] * scale + scale - 1 - place
                 )
         grad[:], grad[place, place] = 0, 1
         rows = np.flatnonzero(
             np.abs(unet_gradients(np.ones((size, size, 1)), parameters, grad)[0])[..., 0].max(1)
             > 1e-12
         )
-        felt_back = max(felt_back, place - rows[0], rows[-1] - place)
-    reach = forward_reach(steps)
-    for name in felt:
-        if felt[name]:
-            assert felt[name] <= reach[name] <= felt[name] + 3, (name, felt[name], reach[name])
-    assert felt_back <= backward_reach(steps)["x"] <= felt_back + 3
+        reached_back = max(reached_back, place - rows[0], rows[-1] - place)
+    radius = receptive_radius(layers)
+    for name in reached:
+        if reached[name]:
+            assert reached[name] <= radius[name] <= reached[name] + 3, name
+    assert reached_back <= gradient_radius(layers)["x"] <= reached_back + 3
 
 
 @pytest.mark.parametrize("n", [1, 2, 7, 60])
@@ -181,11 +181,11 @@ def test_grow_halve_and_double(rng, n):
 
 @pytest.mark.parametrize("level", [0, 1, 2])
 @pytest.mark.parametrize("border", [0, 3, 100])
-def test_layout(rng, level, border):
+def test_map_tiles(rng, level, border):
     height, width = 148, 260
     shape = grid_shape(height >> level, width >> level)
     active = rng.random(shape) < 0.3
-    found = layout((height, width), level, active, border)
+    found = map_tiles((height, width), level, active, border)
     tiles = np.arange(active.size).reshape(shape)
     assert found.computed.ravel()[found.source.ravel()].all()
     assert (found.source == tiles)[active].all()
@@ -209,7 +209,7 @@ def test_the_loss_sees_the_border_no_further(dev):
     """The margin that is compared tile by tile holds what the forward pass and a window of the
     SSIM's gradient reach.
     """
-    assert forward_reach(STEPS)["out"] + 2 * 5 <= LOSS_BORDER
+    assert receptive_radius(LAYERS)["out"] + 2 * 5 <= LOSS_BORDER
 
 
 def test_lego(dev, data, rng, always):
@@ -222,18 +222,14 @@ def test_lego(dev, data, rng, always):
     renderer = Renderer(dev, model, preset("tiny").raster)
     for view in views[:2]:
         x = renderer.rasterise(view.reduced(2).camera, 0.01).features
-        share = np.mean(
-            [
-                of.computed.mean()
-                for of in ActiveForward(
-                    dev, model.net.steps, x.shape[:2], tiles_find(dev, x, BACKGROUND)
-                ).layouts.values()
-            ]
-        )
+        active = tiles_find(dev, x, BACKGROUND)
+        maps = ForwardPlan(dev, model.net.layers, x.shape[:2], active).maps
+        computed = np.mean([tile_map.computed.mean() for tile_map in maps.values()])
         grad_y = dev.upload(np.full((*x.shape[:2], 3), 0.1, np.float32))
         results = []
         for background in (None, BACKGROUND):
-            y = model.net.forward(x, True, background).get()
+            plan = None if background is None else model.net.plan_tiles(x, background)
+            y = model.net.forward(x, True, plan).get()
             results.append(
                 (
                     y,
@@ -241,7 +237,7 @@ def test_lego(dev, data, rng, always):
                     *[g.get() for g in model.net.gradients.values()],
                 )
             )
-        assert 0.1 < share < 0.6
+        assert 0.1 < computed < 0.6
         assert np.abs(results[0][0] - results[1][0]).max() <= 1e-6 * np.abs(results[0][0]).max()
         assert np.linalg.norm(results[0][1] - results[1][1]) <= 1e-6 * np.linalg.norm(results[0][1])
         for a, b in zip(results[0][2:], results[1][2:], strict=True):

@@ -7,6 +7,7 @@ from oracle.winograd import rounding_share
 from support.comparisons import numeric_gradient, relative_error
 from support.networks import plain_parameters
 
+from pp_cl.layers.policy import make_policy
 from pp_cl.network.unet import UNet
 
 
@@ -20,7 +21,7 @@ from pp_cl.network.unet import UNet
     ],
 )
 def test_forward_and_backward(dev, rng, widths, variant):
-    net = UNet(dev, widths, seed=1, variant=variant)
+    net = UNet(dev, widths, seed=1, policy=make_policy(dev, variant=variant))
     x, grad_y = (
         rng.normal(size=(12, 16, 16)).astype(np.float32),
         rng.normal(size=(12, 16, 3)).astype(np.float32),
@@ -41,7 +42,7 @@ def test_weights_stored_as_half(dev, rng):
     """The image; of the gradients test_bench.py, as the places where a ReLU passes them depend on
     the rounding.
     """
-    net = UNet(dev, (16, 32, 48), seed=1, variant="winograd4_half")
+    net = UNet(dev, (16, 32, 48), seed=1, policy=make_policy(dev, variant="winograd4_half"))
     x = rng.normal(size=(12, 16, 16)).astype(np.float32)
     expected = unet(x, plain_parameters(net, net.parameters))[0]
     assert (
@@ -85,7 +86,7 @@ def test_inference_equals_training(dev, rng):
 
 @pytest.mark.parametrize("variant", ["direct", "winograd2", "auto"])
 def test_frozen_weights_are_laid_out_once(dev, rng, variant):
-    net = UNet(dev, seed=3, variant=variant)
+    net = UNet(dev, seed=3, policy=make_policy(dev, variant=variant))
     small, large = (
         dev.upload(rng.normal(size=(*s, 16)).astype(np.float32)) for s in ((16, 12), (32, 36))
     )
@@ -149,7 +150,7 @@ def test_hard_inputs(dev, rng):
 
 def test_wrong_use_is_refused(dev):
     with pytest.raises(ValueError, match="fft.*auto, direct, winograd2, winograd4"):
-        UNet(dev, variant="fft")
+        UNet(dev, policy=make_policy(dev, variant="fft"))
     net = UNet(dev, (16, 16, 16))
     with pytest.raises(ValueError, match="\\(10, 8, 16\\)"):
         net.forward(dev.zeros((10, 8, 16)))
@@ -165,7 +166,7 @@ def test_wrong_use_is_refused(dev):
 def test_memory_plan_is_what_is_allocated(dev, training, variant):
     x, grad_y = dev.zeros((16, 20, 16)), dev.zeros((16, 20, 3))
     before = dev.bytes
-    net = UNet(dev, (16, 32, 48), variant=variant)
+    net = UNet(dev, (16, 32, 48), policy=make_policy(dev, variant=variant))
     net.forward(x, training)
     if training:
         net.backward(grad_y)
@@ -182,9 +183,9 @@ def test_memory_of_the_papers_network(dev):
 
 def test_the_variant_may_change_between_images(dev, rng):
     x, grad_y = dev.upload(rng.normal(size=(12, 16, 16)).astype(np.float32)), dev.zeros((12, 16, 3))
-    net = UNet(dev, (16, 32, 48), seed=1, variant="direct")
+    net = UNet(dev, (16, 32, 48), seed=1, policy=make_policy(dev, variant="direct"))
     for variant in ("winograd4", "direct", "winograd2"):
-        alone = UNet(dev, (16, 32, 48), seed=1, variant=variant)
-        net.variant = variant
+        alone = UNet(dev, (16, 32, 48), seed=1, policy=make_policy(dev, variant=variant))
+        net.use(alone.policy)
         np.testing.assert_array_equal(net.forward(x).get(), alone.forward(x).get())
         np.testing.assert_array_equal(net.backward(grad_y).get(), alone.backward(grad_y).get())

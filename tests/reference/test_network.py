@@ -8,14 +8,14 @@ from oracle.conv import conv, conv_gradients
 from oracle.unet import unet, unet_gradients
 from support.comparisons import relative_error
 
-from pp_cl.network.unet import unet_steps
+from pp_cl.network.architectures import convolutions, unet_layers
 from pp_cl.reference.network import (
     convolution,
     convolution_at,
+    convolution_backward_weights,
     flipped,
     network,
     network_gradients,
-    weight_gradient,
 )
 
 
@@ -27,27 +27,25 @@ def test_convolution_and_its_gradients(rng, height, width, ci, co, k):
     expected, (grad_x, grad_weight, _) = conv(x, weight, bias), conv_gradients(x, weight, grad_out)
     assert relative_error(convolution(x, weight, bias), expected) < 1e-13
     assert relative_error(convolution(grad_out, flipped(weight)), grad_x) < 1e-13
-    assert relative_error(weight_gradient(x, grad_out, k), grad_weight) < 1e-13
+    assert relative_error(convolution_backward_weights(x, grad_out, k), grad_weight) < 1e-13
     pixels = rng.integers(0, height, 12), rng.integers(0, width, 12)
     assert relative_error(convolution_at(x, weight, bias, pixels), expected[pixels]) < 1e-13
 
 
 def test_network_and_its_gradients(rng):
-    widths, steps = (4, 5, 6), unet_steps((4, 5, 6), 3)
-    channels = {"x": 7} | {s.name: s.channels for s in steps}
+    widths, layers = (4, 5, 6), unet_layers((4, 5, 6), 7, 3)
     parameters = {}
-    for step in (s for s in steps if s.kind.startswith("conv")):
-        shape = (step.channels, sum(channels[n] for n in step.inputs), *[int(step.kind[-1])] * 2)
+    for layer in convolutions(layers):
         parameters |= {
-            step.name + ".weight": rng.normal(size=shape),
-            step.name + ".bias": rng.normal(size=step.channels),
+            layer.name + ".weight": rng.normal(size=layer.weight_shape()),
+            layer.name + ".bias": rng.normal(size=layer.channels),
         }
     x, grad_image = rng.normal(size=(8, 12, 7)), rng.normal(size=(8, 12, 3))
-    outputs = network(steps, parameters, x)
+    outputs = network(layers, parameters, x)
     assert outputs["enc2.a"].shape == (2, 3, widths[2])
     assert relative_error(outputs["image"], unet(x, parameters)[0]) < 1e-13
     active = {name: values > 0 for name, values in outputs.items()}
-    gradients = network_gradients(steps, parameters, outputs, active, grad_image)
+    gradients = network_gradients(layers, parameters, outputs, active, grad_image=grad_image)
     expected_x, expected = unet_gradients(x, parameters, grad_image)
     assert relative_error(gradients.pop("x"), expected_x) < 1e-13
     assert gradients.keys() == expected.keys()

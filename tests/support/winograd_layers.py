@@ -3,15 +3,20 @@
 import numpy as np
 from support.guarded import large
 
+from pp_cl.layers.blocking import SHIPPED, Blocking
 from pp_cl.layers.conv import pack_bias, pack_weights, unpack_weights
-from pp_cl.layers.winograd import (
-    positions,
-    scratch_floats,
-    transformed_floats,
-    winograd_forward,
+from pp_cl.layers.winograd import WinogradForm, winograd_forward
+from pp_cl.layers.winograd_backward_weights import (
+    backward_weights_floats,
+    winograd_backward_weights,
 )
-from pp_cl.layers.winograd_backward_weights import gradient_scratch_floats, winograd_weight_gradient
 from pp_cl.layers.winograd_transform import transform_flipped_weights, transform_weights
+from pp_cl.layers.work import Work
+
+
+def form(m, half=False, blocking: Blocking = SHIPPED["CPU"]):
+    """The WinogradForm of F(m x m, 3 x 3)."""
+    return WinogradForm(m, half, *blocking.winograd, blocking.winograd_weights)
 
 
 def stored_weights(array, m, ci, co, half):
@@ -20,7 +25,7 @@ def stored_weights(array, m, ci, co, half):
     """
     array = array.get()
     units, weights = (array[:co], array[co:].view(np.float16)) if half else (np.ones(co), array)
-    weights = weights[: positions(m) * (ci * co + 16)].reshape(m + 2, m + 2, -1)[..., :-16]
+    weights = weights[: (m + 2) ** 2 * (ci * co + 16)].reshape(m + 2, m + 2, -1)[..., :-16]
     weights = weights.reshape(m + 2, m + 2, co // 16, ci, 16)
     return units.astype(np.float64), weights.swapaxes(3, 4).reshape(
         m + 2, m + 2, co, ci
@@ -33,13 +38,12 @@ def transformed_by_device(dev, m, half, weight, flip=False, first=0, c=None):
     """
     co, ci = weight.shape[:2]
     ci, co = (co, c) if flip else (ci, co)
-    transformed = dev.empty(transformed_floats(m, ci, co, half))
+    transformed = dev.empty(form(m, half).transformed_floats(ci, co))
+    packed = dev.upload(pack_weights(weight))
     if flip:
-        transform_flipped_weights(
-            dev, m, dev.upload(pack_weights(weight)), first, c, transformed, half
-        )
+        transform_flipped_weights(dev, form(m, half), packed, first, c=c, transformed=transformed)
     else:
-        transform_weights(dev, m, dev.upload(pack_weights(weight)), transformed, half)
+        transform_weights(dev, form(m, half), packed, transformed)
     return stored_weights(transformed, m, ci, co, half)
 
 
@@ -62,36 +66,33 @@ SHAPES = [
 BOUNDS = {2: 3e-6, 4: 8e-6}
 
 
-def run_forward(dev, m, x, weight, bias, relu, x2=None, half=False):
+def work_of(dev, form, ci, co):
+    """As much work memory as a convolution of ci to co channels needs."""
+    return Work.empty(dev, form.scratch_floats(dev, ci, co), form.transformed_floats(ci, co))
+
+
+def run_forward(dev, form, x, weight, bias, *, relu, x2=None):
+    """(H, W, CO) by the device; form: WinogradForm."""
     co, ci = weight.shape[:2]
-    out, transformed = dev.empty((*x.shape[:2], co)), dev.empty(transformed_floats(m, ci, co, half))
-    transform_weights(dev, m, dev.upload(pack_weights(weight)), transformed, half)
-    winograd_forward(
-        dev,
-        m,
-        dev.upload(x),
-        transformed,
-        dev.upload(pack_bias(bias)),
-        out,
-        relu,
-        dev.empty(scratch_floats(dev, m, ci, co)),
-        None if x2 is None else dev.upload(x2),
-        half,
-    )
+    out, work = dev.empty((*x.shape[:2], co)), work_of(dev, form, ci, co)
+    transform_weights(dev, form, dev.upload(pack_weights(weight)), work.weights)
+    sources = tuple(dev.upload(source) for source in (x, x2) if source is not None)
+    bias = dev.upload(pack_bias(bias))
+    winograd_forward(dev, form, sources, bias, out=out, relu=relu, work=work)
     return out.get()
 
 
-def run_weight_gradient(dev, m, grad_out, *sources):
+def run_backward_weights(dev, form, grad_out, *sources):
+    """((CO, CI, 3, 3), (CO,)) gradients by the device; form: WinogradForm."""
     co, ci = grad_out.shape[2], sum(s.shape[2] for s in sources)
     grad_weight, grad_bias = dev.empty((co // 16, 3, 3, ci, 16)), dev.empty(co)
-    winograd_weight_gradient(
+    winograd_backward_weights(
         dev,
-        m,
-        dev.upload(sources[0]),
+        form,
+        tuple(dev.upload(s) for s in sources),
         dev.upload(grad_out),
-        grad_weight,
-        grad_bias,
-        dev.empty(gradient_scratch_floats(dev, m)),
-        *[dev.upload(s) for s in sources[1:]],
+        grad_weight=grad_weight,
+        grad_bias=grad_bias,
+        scratch=dev.empty(backward_weights_floats(dev, form)),
     )
     return unpack_weights(grad_weight.get(), co), grad_bias.get()

@@ -11,7 +11,9 @@ import numpy as np
 import pytest
 from support.comparisons import relative_error
 
-from pp_cl.bench.network import NETWORK_VARIANTS, make_network, plain_parameters
+from pp_cl.bench.unet import make_network, plain_parameters
+from pp_cl.layers.policy import AUTO, make_policy
+from pp_cl.layers.variants import VARIANTS
 
 SPEC = importlib.util.spec_from_file_location(
     "compare_torch", Path(__file__).parents[2] / "tools" / "compare_torch.py"
@@ -28,9 +30,9 @@ def torch():
     )
 
 
-@pytest.mark.parametrize("variant", [v for v in NETWORK_VARIANTS if not v.endswith("half")])
+@pytest.mark.parametrize("variant", [AUTO, *(name for name, v in VARIANTS.items() if not v.half)])
 def test_the_twin_is_the_same_network(torch, dev, rng, variant):
-    net = make_network(dev, (16, 32, 48), variant)
+    net = make_network(dev, (16, 32, 48), make_policy(dev, variant=variant))
     x, grad_image = (
         rng.normal(size=(16, 16, 16)).astype(np.float32),
         rng.normal(size=(16, 16, 3)).astype(np.float32),

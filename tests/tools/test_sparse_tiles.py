@@ -1,4 +1,4 @@
-"""tools/active_tiles.py: the rows it prints are measurements of the run, and bad input is told."""
+"""tools/sparse_tiles.py: the rows it prints are measurements of the run, and bad input is told."""
 
 import importlib.util
 import json
@@ -10,7 +10,7 @@ from support.scenes import write_ball_scene
 from pp_cl.cli import main
 
 SPEC = importlib.util.spec_from_file_location(
-    "active_tiles", Path(__file__).parents[2] / "tools" / "active_tiles.py"
+    "sparse_tiles", Path(__file__).parents[2] / "tools" / "sparse_tiles.py"
 )
 TOOL = importlib.util.module_from_spec(SPEC)
 SPEC.loader.exec_module(TOOL)
@@ -19,7 +19,7 @@ SPEC.loader.exec_module(TOOL)
 @pytest.fixture(scope="module")
 def run(tmp_path_factory):
     """A run of a few steps on a ball in large pictures."""
-    folder = tmp_path_factory.mktemp("active_tiles")
+    folder = tmp_path_factory.mktemp("sparse_tiles")
     scene = write_ball_scene(folder / "ball", size=300)
     assert (
         main(
@@ -49,9 +49,9 @@ def test_rows(run, tmp_path, capsys):
     rows = json.loads(file.read_text())["rows"]
     assert len(rows) == 2
     for row in rows:
-        assert row["size"] == [300, 300] and 0 < row["share"] < 0.8
+        assert row["size"] == [300, 300] and 0 < row["computed_fraction"] < 0.8
         assert row["forward_ratio"] == pytest.approx(
-            row["forward_dense_ms"] / row["forward_active_ms"]
+            row["forward_dense_ms"] / row["forward_sparse_ms"]
         )
         assert max(row["image_difference"], row["grad_features_difference"]) < 1e-6
         assert row["grad_parameters_difference"] < 5e-6

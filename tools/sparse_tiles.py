@@ -1,9 +1,9 @@
 """What the network saves where a run's views are background: share of the work, time, and
 difference from the dense one.
 
-    python tools/active_tiles.py RUN --downscale 1 --widths 128,256,512 --views 4 --json FILE
+    python tools/sparse_tiles.py RUN --downscale 1 --widths 128,256,512 --views 4 --json FILE
 
-Each view's features go through the same network with all tiles and with the active ones
+Each view's features go through the same network computing all tiles and only the planned ones
 (pp_cl/network/sparse_tiles.py), in turn. The gradient of the image is the training loss's against
 the photograph. Without --widths it is the run's own network.
 """
@@ -14,11 +14,13 @@ from pathlib import Path
 
 import numpy as np
 
-from pp_cl.bench import network as bench
+from pp_cl.bench.timing import interleave
+from pp_cl.bench.unet import make_network
 from pp_cl.commands.options import read_shape
 from pp_cl.device.discover import open_device
 from pp_cl.errors import UserError
 from pp_cl.files.atomic import write_json
+from pp_cl.layers.policy import make_policy
 from pp_cl.raster.blend import BACKGROUND
 from pp_cl.render import Renderer
 from pp_cl.run import load_run
@@ -29,40 +31,38 @@ from pp_cl.training.loss import Loss
 class Comparison:
     """A run's model, and the network that its views go through."""
 
-    def __init__(self, dev, folder, split, downscale, widths):
+    def __init__(self, dev, folder, split, *, downscale, widths):
         self.dev = dev
         run = load_run(dev, folder)
         scene = run.scene(split)
         self.config = run.config
         self.views = (scene.reduced(downscale) if downscale else scene).splits[split]
-        self.net = bench.make_network(dev, widths, "auto") if widths else run.model.net
+        self.net = make_network(dev, widths, make_policy(dev)) if widths else run.model.net
         self.renderer = Renderer(dev, run.model, self.config.raster)
         self.target = Target(dev)
         self.loss = Loss(dev, self.config.train.ssim_weight)
 
     def row(self, view, runs):
-        """{"view", "size", "share", times in ms, ratios, largest differences} of one view."""
+        """A row of one view: size, computed fraction, times in ms, ratios, largest differences."""
         camera = view.camera
-        rendered = self.renderer.rasterise(camera, self.config.raster.gamma[1])
-        x = rendered.features
+        view_raster = self.renderer.rasterise(camera, self.config.raster.gamma[1])
+        x = view_raster.features
         self.target.load(view)
         target = self.target.crop((0, 0, camera.width, camera.height))
-        grad = self.loss.forward_backward(
-            self.net.forward(x, False, BACKGROUND), target, *rendered.offset
-        )
+        grad = self.loss.forward_backward(self.net.forward(x, False), target, *view_raster.offset)
 
-        results = [self._results(x, grad, background) for background in (None, BACKGROUND)]
-        share = self.net.share
+        plan = self.net.plan_tiles(x, BACKGROUND)
+        results = [self._results(x, grad, tiles) for tiles in (None, plan)]
         differences = [
             float(np.abs(a - b).max() / np.abs(a).max()) for a, b in zip(*results, strict=True)
         ]
-        times = bench.interleave(
+        times = interleave(
             {
                 (direction, name): self._runner(
                     x, grad if direction == "train" else None, background
                 )
                 for direction in ("forward", "train")
-                for name, background in (("dense", None), ("active", BACKGROUND))
+                for name, background in (("dense", None), ("sparse", BACKGROUND))
             },
             runs,
         )
@@ -70,16 +70,16 @@ class Comparison:
         return {
             "view": view.name,
             "size": list(x.shape[:2]),
-            "share": float(share),
+            "computed_fraction": float(plan.computed_fraction) if plan else 1.0,
             **{f"{direction}_{name}_ms": value for (direction, name), value in ms.items()},
-            **{f"{d}_ratio": ms[d, "dense"] / ms[d, "active"] for d in ("forward", "train")},
+            **{f"{d}_ratio": ms[d, "dense"] / ms[d, "sparse"] for d in ("forward", "train")},
             "image_difference": differences[0],
             "grad_features_difference": differences[1],
             "grad_parameters_difference": max(differences[2:]),
         }
 
-    def _results(self, x, grad, background):
-        image = self.net.forward(x, True, background).get()
+    def _results(self, x, grad, plan):
+        image = self.net.forward(x, True, plan).get()
         return [
             image,
             self.net.backward(grad).get(),
@@ -88,7 +88,8 @@ class Comparison:
 
     def _runner(self, x, grad, background):
         def run():
-            self.net.forward(x, grad is not None, background)
+            plan = None if background is None else self.net.plan_tiles(x, background)
+            self.net.forward(x, grad is not None, plan)
             if grad is not None:
                 self.net.backward(grad)
             self.dev.finish()
@@ -125,7 +126,9 @@ def main(argv=None):
             raise UserError("--views, --runs, --downscale: must be at least 1")
         widths = read_shape("4", options.widths)[1] if options.widths else None
         dev = open_device(options.device)
-        comparison = Comparison(dev, Path(options.run), options.split, options.downscale, widths)
+        comparison = Comparison(
+            dev, Path(options.run), options.split, downscale=options.downscale, widths=widths
+        )
         number = min(options.views, len(comparison.views))
         rows = []
         for i in range(number):
@@ -144,14 +147,14 @@ def main(argv=None):
                 options.json, {"device": dev.name, "platform": dev.info["platform"], "rows": rows}
             )
     except UserError as error:
-        print(f"active_tiles: {error}", file=sys.stderr)
+        print(f"sparse_tiles: {error}", file=sys.stderr)
         return 2
     mean = {
         k: float(np.mean([row[k] for row in rows]))
-        for k in ("share", "forward_ratio", "train_ratio")
+        for k in ("computed_fraction", "forward_ratio", "train_ratio")
     }
     print(
-        f"{number} views: {mean['share']:.0%} of the multiplications remain; forward"
+        f"{number} views: {mean['computed_fraction']:.0%} of the multiplications remain; forward"
         f" {mean['forward_ratio']:.2f} times as fast as dense, with backward"
         f" {mean['train_ratio']:.2f}"
     )

@@ -1,0 +1,63 @@
+"""Figures of the benches; matplotlib is an extra."""
+
+from pathlib import Path
+
+from pp_cl.errors import UserError
+from pp_cl.files.atomic import atomic_file
+
+
+def check_files(json_file: str | None, plot_file: str | None):
+    """A matplotlib figure for the plot, None without one. Raises UserError if a file cannot be
+    written.
+    """
+    for option, file in (("--json", json_file), ("--plot", plot_file)):
+        if file and not Path(file).resolve().parent.is_dir():
+            raise UserError(f"{option} {file}: no such folder; make it first")
+    return _figure(plot_file) if plot_file else None
+
+
+def _figure(path):
+    try:
+        from matplotlib.figure import Figure
+    except ImportError:
+        raise UserError(
+            f"--plot {path}: needs matplotlib; install it with `pip install 'pp-cl[plot]'`"
+        ) from None
+    figure, suffix = Figure(figsize=(8, 6), layout="constrained"), Path(path).suffix[1:].lower()
+    if suffix not in figure.canvas.get_supported_filetypes():
+        raise UserError(f"--plot {path}: name a .png, .svg or .pdf file")
+    return figure
+
+
+def plot_time_and_error(figure, title: str, rows: list[dict]) -> None:
+    """Time against error, both logarithmic: a colour for each variant, a marker for each
+    direction.
+    """
+    axes = figure.add_subplot(
+        xscale="log", yscale="log", xlabel="milliseconds", ylabel="relative L2 error", title=title
+    )
+    directions, variants = (
+        list(dict.fromkeys(row[key] for row in rows)) for key in ("direction", "variant")
+    )
+    for d, direction in enumerate(directions):
+        for v, variant in enumerate(variants):
+            some = [
+                row for row in rows if row["direction"] == direction and row["variant"] == variant
+            ]
+            # an error of 0 has no logarithm: draw it far below float32's
+            axes.plot(
+                [row["ms"] for row in some],
+                [max(row["rel_l2"], 1e-9) for row in some],
+                "os^"[d],
+                color=f"C{v}",
+                label=f"{variant}, {direction}",
+            )
+
+
+def save_figure(figure, path: str) -> None:
+    """Write a figure whose axes are drawn, with a grid and a legend."""
+    for axes in figure.axes:
+        axes.grid(True, which="both", alpha=0.3)
+        axes.legend(fontsize="small")
+    with atomic_file(path) as file:
+        figure.savefig(file, format=Path(path).suffix[1:].lower())

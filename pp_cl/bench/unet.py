@@ -1,0 +1,144 @@
+"""`pp-cl bench unet`: time against error of the variants of the convolutions, as a network.
+
+Errors are against float64 (reference/network.py), over the whole image, at most CHECK_SIZE wide and
+high: of a larger image its upper left part, taken as an image of its own.
+"""
+
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+
+import numpy as np
+from pyopencl.array import Array
+
+from pp_cl.bench.peak import PeakFlops
+from pp_cl.bench.timing import errors, variant_rows
+from pp_cl.device.device import Device
+from pp_cl.layers.conv import unpack_weights
+from pp_cl.layers.policy import AUTO, ConvolutionPolicy
+from pp_cl.layers.resample import affine
+from pp_cl.layers.variants import offered
+from pp_cl.network.architectures import multiplications
+from pp_cl.network.unet import UNet
+from pp_cl.reference import network as reference
+
+CHANNELS_IN, CHANNELS_OUT = 16, 3
+CHECK_SIZE = 128  # float64 takes seconds for each variant of the paper's network at this size
+
+
+def bench_unet(
+    dev: Device, size: int, widths: tuple[int, int, int], policy: ConvolutionPolicy
+) -> Iterator[dict]:
+    """Rows of the whole network at size x size, by every variant and by `policy`: forward, and
+    train = forward and backward to the input and the weights.
+
+    The errors of train are those of the gradient (input's, or a weight's or bias's) where they are
+    largest. "memory_bytes" is the network's memory by `policy`.
+    """
+    peak, rng = PeakFlops(dev), np.random.default_rng(0)
+    x = np.maximum(rng.normal(size=(size, size, CHANNELS_IN)), 0).astype(np.float32)
+    grad_image = rng.normal(size=(size, size, CHANNELS_OUT)).astype(np.float32)
+    # one network for all policies, so that large images fit
+    net = make_network(dev, widths, policy)
+    names = (AUTO, *offered(policy.device_class))
+    policies = {name: replace(policy, variant=name) for name in names}
+    parameters = plain_parameters(net, net.parameters)
+    outputs = reference.network(net.layers, parameters, x[:CHECK_SIZE, :CHECK_SIZE])
+    part = grad_image[:CHECK_SIZE, :CHECK_SIZE]
+    found = {
+        name: network_errors(dev, net, p, outputs=outputs, grad_image=part)
+        for name, p in policies.items()
+    }
+    device_x, device_grad = dev.upload(x), dev.upload(grad_image)
+    flops = 2 * multiplications(net.layers, size, size)
+    for direction, factor, runner in (("forward", 1, forward_runner), ("train", 3, train_runner)):
+        net.use(policies[AUTO])
+        memory = sum(row[2] for row in net.memory_plan(size, size, direction == "train"))
+        about = {
+            "layer": "network",
+            "shape": [size, size, CHANNELS_IN, *widths, CHANNELS_OUT],
+            "direction": direction,
+            "memory_bytes": memory,
+        }
+        run = runner(dev, net, device_x, device_grad)
+        yield from variant_rows(
+            about,
+            {name: _by_policy(net, p, run) for name, p in policies.items()},
+            {name: found[name][direction] for name in names},
+            flops=factor * flops,
+            peak=peak,
+        )
+
+
+def _by_policy(net, policy, run):
+    """`run` of the network, as a function that runs it by a policy."""
+
+    def changed():
+        net.use(policy)
+        run()
+
+    return changed
+
+
+def make_network(dev: Device, widths: tuple[int, int, int], policy: ConvolutionPolicy) -> UNet:
+    """A network by a policy; the parameters do not depend on it.
+
+    The weights are uniform in +-sqrt(6 / (CI K K)) (He et al. 2015), so that values keep their size
+    through the layers as they do in a trained network. With UNet's own initial weights they fade,
+    and the error of an image that is 0.5 and little else says nothing.
+    """
+    net = UNet(dev, widths, CHANNELS_IN, CHANNELS_OUT, policy=policy)
+    for name, parameter in net.parameters.items():
+        if name.endswith(".weight"):
+            affine(dev, np.sqrt(6), 0.0, parameter, parameter)
+    return net
+
+
+def forward_runner(dev: Device, net: UNet, x: Array, grad_image: Array) -> Callable:
+    """A function that makes an image, as evaluation does, and waits for it."""
+
+    def run():
+        net.forward(x, training=False)
+        dev.finish()
+
+    return run
+
+
+def train_runner(dev: Device, net: UNet, x: Array, grad_image: Array) -> Callable:
+    """A function that makes an image and then all gradients, and waits for them."""
+
+    def run():
+        net.forward(x)
+        net.backward(grad_image)
+        dev.finish()
+
+    return run
+
+
+def plain_parameters(net: UNet, arrays: dict[str, Array]) -> dict[str, np.ndarray]:
+    """{name: (CO, CI, K, K) or (CO,) numpy array} of a network's parameters or gradients."""
+    channels, plain = {layer.name: layer.channels for layer in net.layers}, {}
+    for name, array in arrays.items():
+        values, co = array.get(), channels[name.rsplit(".", 1)[0]]
+        plain[name] = unpack_weights(values, co) if values.ndim == 5 else values[:co]
+    return plain
+
+
+def network_errors(
+    dev: Device, net: UNet, policy: ConvolutionPolicy, *, outputs: dict, grad_image: np.ndarray
+) -> dict[str, tuple[float, float]]:
+    """{"forward": errors, "train": errors} of the network by a policy. outputs: of
+    reference.network, in float64; grad_image: (H, W, 3).
+    """
+    parameters = plain_parameters(net, net.parameters)
+    net.use(policy)
+    image = net.forward(dev.upload(outputs["x"], np.float32)).get()
+    active = {layer.name: net.output(layer.name).get() > 0 for layer in net.layers if layer.relu}
+    actual = {"x": net.backward(dev.upload(grad_image)).get()}
+    actual |= plain_parameters(net, net.gradients)
+    expected = reference.network_gradients(
+        net.layers, parameters, outputs, active, grad_image=grad_image
+    )
+    return {
+        "forward": errors(image, outputs["image"]),
+        "train": max(errors(actual[name], expected[name]) for name in expected),
+    }

@@ -1,0 +1,13 @@
+"""Short measurements."""
+
+import pytest
+
+from pp_cl.bench import peak, timing
+
+
+@pytest.fixture
+def quick(monkeypatch):
+    """Short runs, and few of them."""
+    monkeypatch.setattr(peak, "SECONDS", 0.0)
+    monkeypatch.setattr(timing, "SECONDS", 0.0)
+    monkeypatch.setattr(timing, "LEAST_ROUNDS", 2)

@@ -1,0 +1,58 @@
+"""pp_cl/bench/conv.py: every variant is right, and its numbers are what they say."""
+
+import numpy as np
+import pytest
+from support.benches import HALF, KEYS
+
+from pp_cl.bench.conv import RandomConv, bench_conv
+from pp_cl.bench.timing import errors
+from pp_cl.layers.blocking import device_class
+from pp_cl.layers.direction import Direction
+from pp_cl.layers.policy import make_policy
+from pp_cl.layers.variants import offered
+
+pytestmark = pytest.mark.usefixtures("quick")
+
+
+@pytest.mark.parametrize(
+    "k, sources, co, choice", [(3, (16, 48), 32, True), (3, (3,), 16, False), (1, (32,), 3, False)]
+)
+@pytest.mark.parametrize("direction", Direction)
+def test_a_layer_is_compared_with_the_truth(dev, direction, k, sources, co, choice):
+    conv, policy = RandomConv(dev, k, 13, sources, co=co), make_policy(dev)
+    assert conv.variants == (offered(device_class(dev)) if choice else ["direct"])
+    for variant in conv.variants:
+        actual, expected = conv.result(variant, direction, policy)
+        assert actual.shape == expected.shape and expected.dtype == np.float64
+        assert np.abs(expected).max() > 0.1
+        assert errors(actual, expected)[0] < (
+            1e-5 if direction is Direction.BACKWARD_WEIGHTS else HALF.get(variant, 1e-5)
+        )
+
+
+def test_rows_of_the_layers(dev):
+    rows = list(bench_conv(dev, 8, (16, 16, 32), make_policy(dev)))
+    assert all(row.keys() >= KEYS for row in rows)
+    assert {row["direction"] for row in rows} == {"forward", "input", "weights"}
+    # enc0.b and dec0.b are one layer, as are enc1.b and dec1.b
+    layers = [
+        row["layer"] for row in rows if row["direction"] == "forward" and row["variant"] == "direct"
+    ]
+    assert layers == [
+        "enc0.a",
+        "enc1.a",
+        "enc2.a",
+        "enc2.b",
+        "up1",
+        "dec1.a",
+        "up0",
+        "dec0.a",
+        "out",
+    ]
+    shapes = {row["layer"]: row["shape"] for row in rows}
+    assert shapes["dec1.a"] == [4, 4, 32, 16, 3] and shapes["out"] == [8, 8, 16, 3, 1]
+    for row in rows:
+        assert row["rel_l2"] < HALF.get(row["variant"], 1e-5)
+        assert row["peak_share"] == pytest.approx(row["gflops"] / row["peak_gflops"])
+        height, width, ci, co, k = row["shape"]
+        assert row["gflops"] == pytest.approx(2e-6 * k * k * ci * co * height * width / row["ms"])
