@@ -43,12 +43,12 @@ class Comparison:
     def row(self, view, runs):
         """{"view", "size", "share", times in ms, ratios, largest differences} of one view."""
         camera = reduced_camera(view, self.downscale)
-        self.renderer.forward(camera, self.config.raster.gamma[1])
-        x = self.renderer.features
+        result = self.renderer.rasterise(camera, self.config.raster.gamma[1])
+        x = result.features
         self.target.load(view)
         target = self.target.crop(0, 0, camera.width, camera.height)
         grad = self.loss.forward_backward(
-            self.net.forward(x, False, BACKGROUND), target, *self.renderer.offset
+            self.net.forward(x, False, BACKGROUND), target, *result.offset
         )
 
         results = [self._results(x, grad, background) for background in (None, BACKGROUND)]

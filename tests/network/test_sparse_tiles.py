@@ -222,8 +222,7 @@ def test_lego(dev, data, rng, always):
     model.points["sh0"].set(rng.normal(size=model.points["sh0"].shape).astype(np.float32))
     renderer = Renderer(dev, model, preset("tiny").raster)
     for view in with_depth_range(views[:2], near_far):
-        renderer.forward(reduced_camera(view, 2), 0.01)
-        x = renderer.features
+        x = renderer.rasterise(reduced_camera(view, 2), 0.01).features
         share = np.mean(
             [
                 of.computed.mean()
