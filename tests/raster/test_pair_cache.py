@@ -16,6 +16,8 @@ from pp_cl.raster.project import Footprint
 from pp_cl.render import Renderer
 from pp_cl.training.memory import spare_memory
 
+pytestmark = pytest.mark.kernels
+
 GAMMA = 0.03
 
 
