@@ -6,6 +6,7 @@ from itertools import islice
 
 import numpy as np
 
+from pp_cl.device.device import Device
 from pp_cl.errors import UserError
 from pp_cl.layers.conv import conv_forward, pack_weights
 from pp_cl.layers.resample import maxpool2_forward
@@ -21,7 +22,7 @@ class Lpips:
     may raise UserError).
     """
 
-    def __init__(self, dev, weights=None):
+    def __init__(self, dev: Device, weights: dict[str, np.ndarray] | None = None):
         weights = load_weights() if weights is None else weights
         self.dev = dev
         self.program = dev.program("metrics/lpips")
@@ -31,7 +32,7 @@ class Lpips:
         ]
         self.heads = [dev.upload(weights[f"head{i}"]) for i in range(len(BLOCKS))]
 
-    def distance(self, a, b):
+    def distance(self, a: np.ndarray, b: np.ndarray) -> float:
         """LPIPS of two (H, W, 3) images in [0, 1].
 
         Raises UserError for images of less than LEAST_SIZE pixels a side, ValueError for different

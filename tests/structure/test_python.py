@@ -50,6 +50,14 @@ PLANTED = [
         "self.cache.budget",
     ),
     (rules.foreign_writes, "pp_cl/x.py", "def f(dev):\n    dev.bytes += 1", "dev.bytes"),
+    (rules.untyped_functions, "pp_cl/x.py", "def f(a: int): pass", "f has no types"),
+    (rules.untyped_functions, "pp_cl/x.py", "def f(a, *, b: int) -> int: pass", "f has no types"),
+    (
+        rules.untyped_functions,
+        "pp_cl/x.py",
+        "class A:\n    def __init__(self, a): pass",
+        "__init__ has no types",
+    ),
     (rules.lambdas_in_dicts, "pp_cl/x.py", "a = {1: lambda: 2}", "line 1: lambda in a dict"),
 ]
 
@@ -57,8 +65,10 @@ GOOD = """
 from pp_cl.errors import UserError
 
 class A:
-    def f(self, a, b, c, d, *, e, f, g, h):
-        self.a, self.b = a, b
+    def __init__(self, a: int):
+        self.a, self.b = a, a
+
+    def f(self, a: int, b: int, c: int, d: int, *, e: int, f: int, g: int, h: int) -> None:
         raise UserError("print()")
 """
 

@@ -99,6 +99,19 @@ def foreign_writes(tree, path):
     return sorted(name for name in found if name not in SHARED.get(path, ()))
 
 
+def untyped_functions(tree, path):
+    """Public functions and methods have types on all parameters and on the result."""
+    owners = [n for n in ast.walk(tree) if isinstance(n, ast.ClassDef) and n.name[0] != "_"]
+    functions = [n for owner in [tree, *owners] for n in owner.body if isinstance(n, FUNCTIONS)]
+    found = []
+    for node in (n for n in functions if n.name[0] != "_" or n.name == "__init__"):
+        parameters = node.args.posonlyargs + node.args.args + node.args.kwonlyargs
+        typed = all(a.annotation or a.arg in ("self", "cls") for a in parameters)
+        if not typed or not (node.returns or node.name == "__init__"):
+            found.append(f"{node.name} has no types")
+    return found
+
+
 def lambdas_in_dicts(tree, path):
     """A dict holds no lambdas: they hide parameters."""
     dicts = (node for node in ast.walk(tree) if isinstance(node, ast.Dict))
