@@ -113,7 +113,15 @@ def _parse_parameter(code, comment, where):
 class Kernel:
     """A compiled kernel that is called with named arguments."""
 
-    def __init__(self, kernel, device, parameters, *, defines, label):
+    def __init__(
+        self,
+        kernel: cl.Kernel,
+        device: cl.Device,
+        parameters: list[Parameter],
+        *,
+        defines: dict[str, Any],
+        label: str,
+    ):
         self.kernel = kernel
         limit = cl.kernel_work_group_info.WORK_GROUP_SIZE
         self.largest_group = kernel.get_work_group_info(limit, device)  # work-items
@@ -223,9 +231,17 @@ def quiet_compiler() -> Iterator[None]:
 
 
 class Program:
-    """One built cl/*.cl file."""
+    """One built cl/*.cl file. device: the pp_cl.device.device.Device that builds and runs it."""
 
-    def __init__(self, device, name, source, *, options, defines):
+    def __init__(
+        self,
+        device: Any,
+        name: str,
+        source: str,
+        *,
+        options: list[str],
+        defines: dict[str, Any],
+    ):
         self.device = device
         self.name = name
         signatures = parse_signatures(source, f"cl/{name}.cl")
