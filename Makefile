@@ -2,41 +2,18 @@
 PYTHON ?= python3
 BIN := .venv/bin
 READY := .venv/.ready
-KERNELS := $(shell find cl -name "*.cl" -o -name "*.h")
+KERNELS = $(shell find cl -name "*.cl" -o -name "*.h")
 
-# The tests of all kernels, the longest in Oclgrind first.
-OCLGRIND := tests/layers/test_tiles.py \
-	tests/raster/test_blend_weights.py \
-	tests/layers/test_winograd.py \
-	tests/raster/test_blend.py \
-	tests/training/test_adam.py \
-	tests/raster/test_pair_cache.py \
-	tests/metrics/test_lpips.py \
-	tests/raster/test_hard_cases.py \
-	tests/raster/test_pathological_views.py \
-	tests/layers/test_winograd_backward_weights.py \
-	tests/raster/test_pairs.py \
-	tests/training/test_loss.py \
-	tests/layers/test_conv.py \
-	tests/device/test_scan.py \
-	tests/layers/test_conv_backward_weights.py \
-	tests/training/test_smooth.py \
-	tests/layers/test_winograd_transform.py \
-	tests/layers/test_resample.py \
-	tests/scene/test_demo.py \
-	tests/raster/test_project.py \
-	tests/training/test_prune.py \
-	tests/scene/test_target.py \
-	tests/scene/test_hull.py \
-	tests/raster/test_shade.py \
-	tests/bench/test_peak.py
+# The tests that the rule of three names for the kernel files, and those with the marker `kernels`.
+OCLGRIND = $(shell find cl -name "*.cl" | sed "s|^cl/\(.*\)/\(.*\).cl|tests/\1/test_\2.py|"; \
+	grep -rl "pytest.mark.kernels" --include="test_*.py" tests)
 # Its check for uninitialised reads knows no optimised code and no forced inlining; it takes its options from here, where
 # pyopencl's cache does not see them.
 ON_OCLGRIND := OCL_ICD_VENDORS=/usr/lib/oclgrind/liboclgrind-rt-icd.so OCLGRIND_DATA_RACES=1 OCLGRIND_UNINITIALIZED=1 \
 	OCLGRIND_NUM_THREADS=1 OCLGRIND_BUILD_OPTIONS="-cl-opt-disable -DALWAYS_INLINE=static" PYOPENCL_NO_CACHE=1 \
 	PP_DEVICE=Oclgrind PP_DATA=/nonexistent
 
-.PHONY: help setup demo test test-intel bench lint oclgrind clean
+.PHONY: help setup demo test test-intel bench lint format wheel oclgrind clean
 
 help: ## print this list
 	@sed -n 's/^\([a-z-]*\):.*## \(.*\)/\1	\2/p' Makefile | expand -t 12
@@ -74,7 +51,9 @@ format: $(READY) ## format the Python files and the kernels
 	@$(BIN)/clang-format -i $(KERNELS)
 
 wheel: $(READY) ## build the wheel into dist/
+	@rm -rf build dist
 	@$(BIN)/python -m pip wheel --quiet --no-deps --wheel-dir dist .
+	@ls dist
 
 oclgrind: $(READY) ## run the tests of all kernels in Oclgrind (Debian's package): stray accesses, data races, uninitialised reads
 	@printf '%s\n' $(OCLGRIND) | $(ON_OCLGRIND) xargs -P $$(nproc) -I{} \

@@ -5,8 +5,8 @@
 #define NONE 0xffffffffu  // "no such index"
 
 // Every helper is static: a plain `inline` one has no definition to link with where a compiler
-// declines to inline it. PoCL calls functions it finds large, passing structs and vectors in memory,
-// unless forced to inline them; a simulator that cannot do so defines ALWAYS_INLINE as static.
+// declines to inline it. PoCL calls functions that it finds large, with structs and vectors passed
+// in memory, unless forced to inline them; a simulator that cannot defines ALWAYS_INLINE as static.
 #ifndef ALWAYS_INLINE
 #define ALWAYS_INLINE __attribute__((always_inline)) static inline
 #endif

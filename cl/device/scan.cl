@@ -5,8 +5,9 @@
 #ifndef FLAGS
 #define FLAGS 0  // 1: every non-zero value counts as one
 #endif
-// values per work-item: a million values take two levels; pp_cl/device/scan.py knows it too
-#define BLOCK 512
+#ifndef BLOCK
+#define BLOCK 512  // values per work-item: a million values take two levels
+#endif
 
 static inline uint scan_value(const uint value) {
     return FLAGS ? (value != 0) : value;

@@ -9,6 +9,8 @@ import math
 import numpy as np
 from pyopencl.array import Array
 
+from pp_cl.device.device import Device
+
 Table = dict[str, tuple[tuple[int, ...], type]]
 
 
@@ -28,7 +30,7 @@ class Buffers:
     An array whose shape and dtype stay the same keeps its memory and its content.
     """
 
-    def __init__(self, dev):
+    def __init__(self, dev: Device):
         self._dev = dev
         self._arrays: dict[str, Array] = {}
 

@@ -6,36 +6,31 @@ import atexit
 import os
 import sys
 import time
-import warnings
 import weakref
 from collections import defaultdict
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pyopencl as cl
-import pyopencl.array as cl_array
+from numpy.typing import ArrayLike
+from pyopencl.array import Array
 
-from pp_cl.device.launch import Program
+from pp_cl.device.launch import Kernel, Program
 from pp_cl.errors import UserError
 
 SMALLER = "lower --points or raise --downscale"
 
-# pyopencl 2026.1 reads this variable unasked when its cache folder cannot be written, and dies of a
-# KeyError.
-os.environ.setdefault("PYOPENCL_CACHE_FAILURE_FATAL", "")
-# Intel's runtime reports every build, a good one too; PYOPENCL_COMPILER_OUTPUT=1 shows what a
-# compiler really says.
-warnings.filterwarnings("ignore", "Non-empty compiler output", cl.CompilerWarning)
 
-
-def kernel_folder():
+def kernel_folder() -> Path:
     """The folder of the .cl files: inside the installed package, or beside it in a checkout."""
     inside = Path(__file__).parents[1] / "cl"
     return inside if inside.is_dir() else Path(__file__).parents[2] / "cl"
 
 
-def describe(device):
+def describe(device: cl.Device) -> dict[str, str | int]:
     """A cl.Device's "name", "platform", "version", "driver", "type", "compute_units",
     "memory_bytes", "max_allocation_bytes" in a dictionary.
     """
@@ -96,7 +91,7 @@ class Device:
     (docs/environment.md).
     """
 
-    def __init__(self, device):
+    def __init__(self, device: cl.Device):
         self.device = device
         self.name = device.name.strip()
         self.info = describe(device)
@@ -112,7 +107,7 @@ class Device:
         if self.debug:
             atexit.register(self.print_profile)
 
-    def program(self, name, **defines):
+    def program(self, name: str, **defines: int | float | str) -> Program:
         """The Program of cl/<name>.cl built with -D for each define; built once.
 
         Raises RuntimeError with the file, the options and the compiler's words when it does not
@@ -144,7 +139,7 @@ class Device:
                 )
         return self._programs[key]
 
-    def empty(self, shape, dtype=np.float32):
+    def empty(self, shape: int | tuple[int, ...], dtype: type = np.float32) -> Array:
         """Uninitialised array on the device; zeros under PP_DEBUG=3, so that its scan sees only
         what kernels wrote.
         """
@@ -153,13 +148,13 @@ class Device:
             self.fill(array, 0)
         return array
 
-    def zeros(self, shape, dtype=np.float32):
+    def zeros(self, shape: int | tuple[int, ...], dtype: type = np.float32) -> Array:
         """Array of zeros on the device."""
         array = self._allocate(shape, dtype)
         self.fill(array, 0)
         return array
 
-    def upload(self, values, dtype=None):
+    def upload(self, values: ArrayLike, dtype: type | None = None) -> Array:
         """Copy of a numpy array on the device."""
         values = np.ascontiguousarray(values, dtype)
         array = self._allocate(values.shape, values.dtype)
@@ -167,7 +162,7 @@ class Device:
             self.attempt("upload a buffer", array.set, values)
         return array
 
-    def fill(self, array, value):
+    def fill(self, array: Array, value: float) -> None:
         """Set all elements of an array of this device to one value."""
         if array.size:
             self.attempt(
@@ -180,7 +175,7 @@ class Device:
                 array.nbytes,
             )
 
-    def copy(self, target, source):
+    def copy(self, target: Array, source: Array) -> None:
         """Copy one array of this device into another of the same size."""
         if target.nbytes != source.nbytes:
             raise ValueError(
@@ -188,7 +183,7 @@ class Device:
             )
         self.copy_rows(target, 0, source, len(source))
 
-    def copy_rows(self, target, start, source, count):
+    def copy_rows(self, target: Array, start: int, source: Array, count: int) -> None:
         """Copy the first `count` rows of one array of this device over those of another from row
         `start` on.
         """
@@ -208,19 +203,19 @@ class Device:
                 dst_offset=start * row_bytes,
             )
 
-    def front(self, array, count):
+    def front(self, array: Array, count: int) -> Array:
         """The first `count` rows of an array of this device. Its buffer stays as large as it was,
         and is counted so.
         """
         rows = array[:count]
-        rows.whole = getattr(array, "whole", array)  # alive as long as this part of it
+        weakref.finalize(rows, lambda whole: None, array)  # the array lives as long as its front
         return rows
 
-    def finish(self):
+    def finish(self) -> None:
         """Wait until everything enqueued is done."""
         self.queue.finish()
 
-    def attempt(self, what, function, *args, **kwargs):
+    def attempt(self, what: str, function: Callable[..., Any], *args, **kwargs) -> Any:
         """function(*args, **kwargs); UserError when the driver gives up (many allocate only at the
         first use).
         """
@@ -233,7 +228,7 @@ class Device:
             ) from error
 
     @contextmanager
-    def stage(self, name: str):
+    def stage(self, name: str) -> Iterator[None]:
         """Times the part of a pass called `name` under PP_DEBUG >= 1 and timed_stages().
 
         When timed, the queue is drained before and after, so that stages do not overlap.
@@ -248,7 +243,7 @@ class Device:
         self._stage_seconds[name].append(time.perf_counter() - start)
 
     @contextmanager
-    def timed_stages(self):
+    def timed_stages(self) -> Iterator[dict[str, list[float]]]:
         """Yields {stage name: [seconds of each pass]}, filled by the stages inside the block."""
         before, self._stage_seconds = self._stage_seconds, defaultdict(list)
         try:
@@ -268,7 +263,7 @@ class Device:
                 f" in use: {SMALLER}"
             )
         array = self.attempt(
-            f"allocate {nbytes / 2**20:.0f} MiB", cl_array.empty, self.queue, shape, dtype
+            f"allocate {nbytes / 2**20:.0f} MiB", cl.array.empty, self.queue, shape, dtype
         )
         self.bytes += nbytes
         self.peak_bytes = max(self.peak_bytes, self.bytes)
@@ -278,7 +273,7 @@ class Device:
     def _released(self, nbytes):
         self.bytes -= nbytes
 
-    def observe(self, kernel, event, arguments):
+    def observe(self, kernel: Kernel, event: cl.Event, arguments: dict[str, Any]) -> None:
         """PP_DEBUG 1, 2: wait, note the kernel's time. PP_DEBUG 3: stop at the first NaN or Inf in
         an output as well.
         """
@@ -294,11 +289,11 @@ class Device:
                         f"{kernel.label}: {p.name} has {bad.size} NaN or Inf, first at {bad[0]}"
                     )
 
-    def profile(self):
+    def profile(self) -> dict[str, list[float]]:
         """{kernel label "file.cl:kernel": [seconds of each launch]} gathered at PP_DEBUG >= 1."""
         return dict(self._seconds)
 
-    def print_profile(self):
+    def print_profile(self) -> None:
         """A table on stderr, longest first: passes, median and total time of stages and, at
         PP_DEBUG 1, of kernel files, else of kernels.
         """

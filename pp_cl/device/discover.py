@@ -3,14 +3,15 @@
 import atexit
 import os
 import shutil
-import sys
 import tempfile
+import warnings
 
 import numpy as np
 import pyopencl as cl
 import pyopencl.array as cl_array
 
 from pp_cl.device.device import Device
+from pp_cl.device.launch import quiet_compiler
 from pp_cl.errors import UserError
 
 MEND = (
@@ -28,7 +29,7 @@ TEMPORARY_CACHE = "pp-cl-cache-"
 PROBE = "kernel void probe(global float *x) { x[get_global_id(0)] *= 2.0f; }"
 
 
-def list_devices():
+def list_devices() -> list[tuple[str, cl.Device, str | None]]:
     """[(index "platform:device", cl.Device, problem or None)] of all OpenCL devices; each is probed
     with a test build.
     """
@@ -52,7 +53,9 @@ def _probe(device):
         context = cl.Context([device])
         queue = cl.CommandQueue(context)
         x = cl_array.to_device(queue, np.arange(4, dtype=np.float32))
-        cl.Program(context, PROBE).build().probe(queue, (4,), None, x.data)
+        with quiet_compiler():
+            program = cl.Program(context, PROBE).build()
+        program.probe(queue, (4,), None, x.data)
         return None if np.array_equal(x.get(), [0, 2, 4, 6]) else "computes a wrong result"
     except cl.Error as error:
         return "does not run: " + " ".join(str(error).split())[:160]
@@ -62,6 +65,8 @@ def _give_cache():
     """Drivers and pyopencl fail where the user's cache cannot be written (containers, service
     accounts): a temporary one.
     """
+    # pyopencl 2026.1 reads this variable, unset or not, where its cache cannot be written: KeyError
+    os.environ.setdefault("PYOPENCL_CACHE_FAILURE_FATAL", "")
     folder = os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache")
     try:
         os.makedirs(folder, exist_ok=True)
@@ -70,13 +75,13 @@ def _give_cache():
     except OSError as error:
         temporary = os.environ["XDG_CACHE_HOME"] = tempfile.mkdtemp(prefix=TEMPORARY_CACHE)
         atexit.register(shutil.rmtree, temporary, ignore_errors=True)
-        print(
+        warnings.warn(
             f"{folder}: {error.strerror}; kernels are built anew: set XDG_CACHE_HOME to keep them",
-            file=sys.stderr,
+            stacklevel=3,
         )
 
 
-def open_device(choice=None):
+def open_device(choice: str | None = None) -> Device:
     """Device chosen by `choice`, else PP_DEVICE, else the first GPU that works, else the first
     other device that works.
 

@@ -7,7 +7,11 @@ info; the tests compare it with the driver's own (-cl-kernel-arg-info).
 import math
 import operator
 import re
+import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import pyopencl as cl
@@ -58,7 +62,7 @@ class Parameter:
     shape: tuple | None
 
 
-def parse_signatures(source, file):
+def parse_signatures(source: str, file: str) -> dict[str, list[Parameter]]:
     """{kernel name: [Parameter, ...]} of an OpenCL C source that follows docs/conventions.md.
 
     Raises ValueError naming the file, kernel and line of a parameter that does not.
@@ -109,7 +113,15 @@ def _parse_parameter(code, comment, where):
 class Kernel:
     """A compiled kernel that is called with named arguments."""
 
-    def __init__(self, kernel, device, parameters, *, defines, label):
+    def __init__(
+        self,
+        kernel: cl.Kernel,
+        device: cl.Device,
+        parameters: list[Parameter],
+        *,
+        defines: dict[str, Any],
+        label: str,
+    ):
         self.kernel = kernel
         limit = cl.kernel_work_group_info.WORK_GROUP_SIZE
         self.largest_group = kernel.get_work_group_info(limit, device)  # work-items
@@ -122,7 +134,7 @@ class Kernel:
         self._letters = {name.lower() for name in names}
         self._checked = set()  # shapes and sizes already found right
 
-    def arguments(self, values):
+    def arguments(self, values: dict[str, Any]) -> list[Any]:
         """OpenCL arguments in order, from {name: pyopencl Array, number or cl.LocalMemory}. Raises
         TypeError, ValueError.
         """
@@ -208,15 +220,34 @@ def _kind(value):
     )
 
 
-class Program:
-    """One built cl/*.cl file."""
+@contextmanager
+def quiet_compiler() -> Iterator[None]:
+    """Ignores that a compiler said something: Intel's does at every build, a good one too.
+    PYOPENCL_COMPILER_OUTPUT=1 shows what it said.
+    """
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", "Non-empty compiler output", cl.CompilerWarning)
+        yield
 
-    def __init__(self, device, name, source, *, options, defines):
+
+class Program:
+    """One built cl/*.cl file. device: the pp_cl.device.device.Device that builds and runs it."""
+
+    def __init__(
+        self,
+        device: Any,
+        name: str,
+        source: str,
+        *,
+        options: list[str],
+        defines: dict[str, Any],
+    ):
         self.device = device
         self.name = name
         signatures = parse_signatures(source, f"cl/{name}.cl")
         try:
-            built = cl.Program(device.context, source).build(options=options)
+            with quiet_compiler():
+                built = cl.Program(device.context, source).build(options=options)
         except cl.RuntimeError as error:
             raise RuntimeError(
                 f"cl/{name}.cl does not build on {device.name} with {' '.join(options)}:\n{error}"
@@ -227,7 +258,13 @@ class Program:
             for k, p in signatures.items()
         }
 
-    def launch(self, kernel_name, size, local=None, **arguments):
+    def launch(
+        self,
+        kernel_name: str,
+        size: int | tuple[int, ...],
+        local: int | tuple[int, ...] | None = None,
+        **arguments,
+    ) -> None:
         """Enqueue one kernel.
 
         size: int or tuple of work-items, rounded up to the work-group size (kernels guard their

@@ -2,11 +2,14 @@
 
 import numpy as np
 import pyopencl as cl
+from pyopencl.array import Array
 
-BLOCK = 512  # of cl/device/scan.cl
+from pp_cl.device.device import Device
+
+BLOCK = 512  # values per work-item
 
 
-def exclusive_scan(dev, values, offsets, flags=False):
+def exclusive_scan(dev: Device, values: Array, offsets: Array, flags: bool = False) -> None:
     """Write offsets[i] = sum of values[:i], so that offsets[N] is the total; at most 2^32 - 1,
     where sums stay.
 
@@ -14,7 +17,7 @@ def exclusive_scan(dev, values, offsets, flags=False):
     """
     n = values.size
     blocks = -(-n // BLOCK)
-    program = dev.program("device/scan", FLAGS=int(flags))
+    program = dev.program("device/scan", FLAGS=int(flags), BLOCK=BLOCK)
     if blocks == 1:
         block_offset = dev.zeros((2,), np.uint32)
     else:
@@ -33,14 +36,14 @@ def exclusive_scan(dev, values, offsets, flags=False):
     )
 
 
-def read_total(dev, offsets):
+def read_total(dev: Device, offsets: Array) -> int:
     """The last entry of `offsets` as an int; waits for the device."""
     total = np.empty(1, np.uint32)
     cl.enqueue_copy(dev.queue, total, offsets.data, src_offset=offsets.nbytes - total.nbytes)
     return int(total[0])
 
 
-def nonzero(dev, values, offsets, indices):
+def nonzero(dev: Device, values: Array, offsets: Array, indices: Array) -> int:
     """Number of non-zero values; writes their indices, ascending, to the front of `indices`. Waits
     for the device.
 
@@ -49,7 +52,7 @@ def nonzero(dev, values, offsets, indices):
     """
     n = values.size
     exclusive_scan(dev, values, offsets, flags=True)
-    dev.program("device/scan", FLAGS=1).launch(
+    dev.program("device/scan", FLAGS=1, BLOCK=BLOCK).launch(
         "scan_nonzero", n, n=n, values=values, offsets=offsets, indices=indices
     )
     return read_total(dev, offsets)

@@ -6,8 +6,9 @@ from itertools import islice
 
 import numpy as np
 
+from pp_cl.device.device import Device
 from pp_cl.errors import UserError
-from pp_cl.layers.blocking import shipped_blocking
+from pp_cl.layers.blocking import Blocking, shipped_blocking
 from pp_cl.layers.conv import conv_forward, pack_weights
 from pp_cl.layers.resample import maxpool2_forward
 from pp_cl.metrics.lpips_weights import load_weights
@@ -22,7 +23,12 @@ class Lpips:
     may raise UserError). blocking: of the convolutions, None = as shipped.
     """
 
-    def __init__(self, dev, weights=None, blocking=None):
+    def __init__(
+        self,
+        dev: Device,
+        weights: dict[str, np.ndarray] | None = None,
+        blocking: Blocking | None = None,
+    ):
         weights = load_weights() if weights is None else weights
         self.dev = dev
         self.blocking = blocking or shipped_blocking(dev)
@@ -33,7 +39,7 @@ class Lpips:
         ]
         self.heads = [dev.upload(weights[f"head{i}"]) for i in range(len(BLOCKS))]
 
-    def distance(self, a, b):
+    def distance(self, a: np.ndarray, b: np.ndarray) -> float:
         """LPIPS of two (H, W, 3) images in [0, 1].
 
         Raises UserError for images of less than LEAST_SIZE pixels a side, ValueError for different

@@ -10,6 +10,8 @@ from oracle import raster as oracle
 from support.comparisons import relative_error
 from support.raster_scene import PairedPoints, make_camera
 
+pytestmark = pytest.mark.kernels
+
 NEAR, FAR = 2.0, 6.0
 CAMERA = replace(make_camera(1, 1), pose=np.eye(3, 4), fx=100.0, fy=100.0, cx=0.5, cy=0.5)
 

@@ -14,6 +14,8 @@ from pp_cl.raster.pairs import PairBuilder
 from pp_cl.raster.project import Footprint
 from pp_cl.render import Renderer
 
+pytestmark = pytest.mark.kernels
+
 GAMMA = 0.03
 
 

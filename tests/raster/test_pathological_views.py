@@ -15,6 +15,8 @@ from pp_cl.errors import UserError
 from pp_cl.raster.pairs import PairBuilder
 from pp_cl.raster.project import KINDS
 
+pytestmark = pytest.mark.kernels
+
 TAUS = (0.0, 0.01)
 
 
