@@ -18,8 +18,8 @@ import sys
 from pathlib import Path
 
 ROOT = Path(__file__).parents[1]
-BLOCK = re.compile(r"(<!-- table: (\S+) -->\n).*?(<!-- end table -->)", re.DOTALL)
-MARKER = re.compile(r"<!-- (?:end )?table")
+BLOCK = re.compile(r"^(<!-- table: (\S+) -->\n).*?^(<!-- end table -->)$", re.DOTALL | re.MULTILINE)
+MARKER = re.compile(r"^<!-- (?:end )?table", re.MULTILINE)
 
 
 class TableError(Exception):
