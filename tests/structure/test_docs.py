@@ -5,6 +5,8 @@ from pathlib import Path
 
 import pytest
 
+from pp_cl.config import Config, sections
+
 ROOT = Path(__file__).parents[2]
 DOCUMENTS = [
     *(ROOT / name for name in ("README.md", "CONTRIBUTING.md", "CHANGELOG.md")),
@@ -47,3 +49,13 @@ def test_the_index_names_every_document():
     text = (ROOT / "docs" / "index.md").read_text("utf-8")
     linked = {path.resolve() for path in named_files(text, ROOT / "docs")}
     assert {path for path in DOCUMENTS if path.name != "index.md"} <= linked
+
+
+@pytest.mark.parametrize(
+    "path", [p for p in DOCUMENTS if p.stem != "CHANGELOG"], ids=lambda p: p.stem
+)
+def test_named_settings_exist(path):
+    known = {name: vars(values) for name, values in sections(Config())}
+    words = re.findall(rf"\b({'|'.join(known)})\.(\w+)\b(?!\.)", path.read_text("utf-8"))
+    files = {"py", "cl", "md", "json", "h"}
+    assert not [w for w in words if w[1] not in known[w[0]] and w[1] not in files]
