@@ -3,6 +3,7 @@ weights.
 """
 
 import numpy as np
+
 from oracle.conv import conv, conv_gradients
 from oracle.layers import avgpool2, avgpool2_gradient, upsample2, upsample2_gradient
 

@@ -14,7 +14,8 @@ DOCUMENTS = [
 ]
 PATH = re.compile(r"`((?:pp_cl|cl|tests|tools|docs)/[\w./]+)`")
 PLACEHOLDER = re.compile(r"\bW/|\b(?:test_)?x\.")  # as in cl/W/x.cl
-REMOVED = {"tools/paper_scale.py", "tools/active_tiles.py"}  # history: the changelog and old measurements name it
+# History: the changelog and a measurement name them.
+REMOVED = {"tools/paper_scale.py", "tools/active_tiles.py"}
 
 
 def named_files(text: str, folder: Path) -> list[Path]:

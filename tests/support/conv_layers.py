@@ -2,6 +2,7 @@
 
 import numpy as np
 from oracle.conv import conv, conv_gradients
+
 from support.comparisons import relative_error
 from support.guarded import large
 
