@@ -13,7 +13,7 @@ ON_OCLGRIND := OCL_ICD_VENDORS=/usr/lib/oclgrind/liboclgrind-rt-icd.so OCLGRIND_
 	OCLGRIND_NUM_THREADS=1 OCLGRIND_BUILD_OPTIONS="-cl-opt-disable -DALWAYS_INLINE=static" PYOPENCL_NO_CACHE=1 \
 	PP_DEVICE=Oclgrind PP_DATA=/nonexistent
 
-.PHONY: help setup demo test test-intel bench lint format wheel oclgrind clean
+.PHONY: help setup demo test test-intel bench lint format docs wheel oclgrind clean
 
 help: ## print this list
 	@sed -n 's/^\([a-z-]*\):.*## \(.*\)/\1	\2/p' Makefile | expand -t 12
@@ -49,6 +49,9 @@ format: $(READY) ## format the Python files and the kernels
 	@$(BIN)/ruff check --fix
 	@$(BIN)/ruff format
 	@$(BIN)/clang-format -i $(KERNELS)
+
+docs: $(READY) ## write the tables in README.md and docs/ from docs/results/*.json
+	@$(BIN)/python tools/docs_tables.py
 
 wheel: $(READY) ## build the wheel into dist/
 	@rm -rf build dist

@@ -1,0 +1,78 @@
+"""tools/docs_tables.py: the documents hold the tables that it writes."""
+
+import importlib.util
+import json
+import re
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[2]
+SPEC = importlib.util.spec_from_file_location("docs_tables", ROOT / "tools" / "docs_tables.py")
+TOOL = importlib.util.module_from_spec(SPEC)
+SPEC.loader.exec_module(TOOL)
+
+RESULTS = {
+    "measured": "times",
+    "machine": "a machine",
+    "version": "1",
+    "columns": [{"head": "n", "cell": "{n:,} {unit}"}, {"head": "error", "cell": "{error:.1e}"}],
+    "rows": [{"n": 1000, "error": 2e-6}, {"n": 2, "unit": "points", "error": 0.0}, {"unit": "x"}],
+    "notes": ["A note."],
+}
+TABLE = """Times. Measured with version 1 on a machine.
+
+| n | error |
+| --- | --- |
+| 1,000 | 2.0e-6 |
+| 2 points | 0 |
+| x |  |
+
+A note."""
+
+
+def test_a_table():
+    assert TOOL.table(RESULTS) == TABLE
+
+
+@pytest.mark.parametrize("path", TOOL.documents(ROOT), ids=lambda path: path.stem)
+def test_documents_are_up_to_date(path):
+    text = path.read_text("utf-8")
+    assert TOOL.with_tables(text, TOOL.read_results(ROOT / "docs" / "results")) == text
+
+
+def test_all_results_are_shown_once():
+    text = "".join(path.read_text("utf-8") for path in TOOL.documents(ROOT))
+    shown = re.findall(r"(?m)^<!-- table: (\S+) -->$", text)
+    assert sorted(shown) == sorted(TOOL.read_results(ROOT / "docs" / "results"))
+
+
+def test_it_writes_what_changed_and_nothing_else(tmp_path, capsys):
+    (tmp_path / "docs" / "results").mkdir(parents=True)
+    (tmp_path / "docs" / "results" / "times.json").write_text(json.dumps(RESULTS))
+    readme = tmp_path / "README.md"
+    readme.write_text("before\n\n<!-- table: times -->\nold\n<!-- end table -->\nafter\n")
+    (tmp_path / "docs" / "other.md").write_text("| a | b |\n")
+    assert TOOL.main(tmp_path) == 0
+    assert capsys.readouterr().out == "wrote README.md\n"
+    assert readme.read_text() == (
+        f"before\n\n<!-- table: times -->\n\n{TABLE}\n\n<!-- end table -->\nafter\n"
+    )
+    assert TOOL.main(tmp_path) == 0
+    assert capsys.readouterr().out == ""
+
+
+@pytest.mark.parametrize(
+    ("text", "word"),
+    [
+        ("<!-- table: nobody -->\n<!-- end table -->\n", "nobody.json"),
+        ("<!-- table: times -->\n| a |\n", "lacks"),
+        ("| a |\n<!-- end table -->\n", "lacks"),
+    ],
+)
+def test_bad_markers(text, word, tmp_path, capsys):
+    (tmp_path / "docs").mkdir()
+    (tmp_path / "README.md").write_text(text)
+    assert TOOL.main(tmp_path) == 2
+    assert word in capsys.readouterr().err
+    assert (tmp_path / "README.md").read_text() == text
