@@ -120,15 +120,15 @@ class Renderer:
         return RenderResult(**vars(raster), image=image, computed_fraction=fraction)
 
     def rasterise(self, camera: Camera, gamma: float, **options) -> RasterResult:
-        """The blended features of a camera. options: of weigh()."""
-        view, cloud, b = self.weigh(camera, gamma, **options), self.model.cloud, self._buffers
+        """The blended features of a camera. options: of blend_weights()."""
+        view, cloud, b = self.blend_weights(camera, gamma, **options), self.model.cloud, self._buffers
         with self.dev.stage("shade"):
             shade_forward(self.dev, view.points, view.shaded, cloud.sh, b.point_features)
         with self.dev.stage("blend"):
             self._blend.forward(view.pairs, view.weights, b.point_features, b.features)
         return RasterResult(**vars(view), point_features=b.point_features, features=b.features)
 
-    def weigh(
+    def blend_weights(
         self,
         camera: Camera,
         gamma: float,
@@ -201,7 +201,7 @@ class Renderer:
         return self._weights.dropped(view.pairs, view.weights)
 
     def render(self, camera: Camera, gamma: float, **options) -> np.ndarray:
-        """(H, W, 3) float32 numpy image of the camera, clamped to [0, 1]. options: of weigh()."""
+        """(H, W, 3) float32 numpy image of the camera, clamped to [0, 1]. options: of blend_weights()."""
         return self.forward(camera, gamma, **options).clamped(camera)
 
     def _radius(self):

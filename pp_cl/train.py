@@ -176,7 +176,7 @@ class Trainer:
         if self.config.final_prune_weight > 0:
             total = self.dev.zeros((self.model.count,))
             for view in self.views:
-                weights = self.renderer.weigh(view.camera, self.gamma[1])
+                weights = self.renderer.blend_weights(view.camera, self.gamma[1])
                 self.renderer.add_point_weights(weights, total)
             self.prune(total, self.config.final_prune_weight)
 

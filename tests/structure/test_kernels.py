@@ -62,6 +62,7 @@ def test_a_planted_violation_is_found(check, source, expected):
         rules.helpers_without_static,
         rules.long_parameter_lists,
         rules.silent_kernels,
+        rules.long_lines,
     ],
     ids=lambda check: check.__name__,
 )

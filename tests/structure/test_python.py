@@ -81,7 +81,15 @@ def test_a_planted_violation_is_found(check, path, source, expected):
 
 @pytest.mark.parametrize(
     "check",
-    [rules.imports_from_above],
+    [
+        rules.imports_from_above,
+        rules.long_parameter_lists,
+        rules.long_functions,
+        rules.prints,
+        rules.foreign_writes,
+        rules.lambdas_in_dicts,
+        rules.untyped_functions,
+    ],
     ids=lambda check: check.__name__,
 )
 def test_the_rule_holds_everywhere(check):

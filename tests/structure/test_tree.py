@@ -4,7 +4,7 @@ import configparser
 from pathlib import Path
 
 import pytest
-from support.rules import identifiers, retired_words
+from support.rules import MOST_FILE_LINES, identifiers, retired_words
 
 ROOT = Path(__file__).parents[2]
 KERNEL_FILES = sorted((ROOT / "cl").rglob("*.cl"))
@@ -28,6 +28,11 @@ def test_setup_cfg_lists_every_package():
     folders = {path.parent for path in (ROOT / "pp_cl").rglob("*.py")}
     packages = {path.relative_to(ROOT).as_posix().replace("/", ".") for path in folders}
     assert set(setup["options"]["packages"].split()) == packages | {"pp_cl.cl"}
+
+
+def test_files_are_short():
+    lengths = {p.relative_to(ROOT): len(p.read_text("utf-8").splitlines()) for p in SOURCES}
+    assert not {str(p): n for p, n in lengths.items() if n >= MOST_FILE_LINES}
 
 
 PLANTED = """

@@ -23,7 +23,7 @@ FLOORS = [
 FLOOR = {wing: floor for floor, wings in enumerate(FLOORS) for wing in wings}
 
 MOST_PARAMETERS, MOST_POSITIONAL = 8, 4
-MOST_FUNCTION_LINES = 50
+MOST_FUNCTION_LINES, MOST_FILE_LINES = 50, 400
 FUNCTIONS = (ast.FunctionDef, ast.AsyncFunctionDef)
 
 # Who may write to an attribute of another object, and why.
