@@ -219,11 +219,11 @@ def test_lego(dev, data, rng, always):
     hull = build_grid(dev, views, 20_000)
     near_far = depth_range(views, hull)
     model = Model.create(dev, hull.grid, hull.ids, near_far, (16, 32, 48), 1)
-    model.points["sh0"].set(rng.normal(size=model.points["sh0"].shape).astype(np.float32))
+    sh0 = model.cloud.sh[0]
+    sh0.set(rng.normal(size=sh0.shape).astype(np.float32))
     renderer = Renderer(dev, model, preset("tiny").raster)
     for view in with_depth_range(views[:2], near_far):
-        renderer.forward(reduced_camera(view, 2), 0.01)
-        x = renderer.features
+        x = renderer.rasterise(reduced_camera(view, 2), 0.01).features
         active = tiles_find(dev, x, BACKGROUND)
         maps = ForwardPlan(dev, model.net.layers, x.shape[:2], active).maps
         computed = np.mean([tile_map.computed.mean() for tile_map in maps.values()])
