@@ -10,6 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 from pyopencl.array import Array
 
+from pp_cl.device.buffers import Table
 from pp_cl.device.device import Device
 
 LANES = 16  # channels in one float16
@@ -59,7 +60,7 @@ def all_tiles(dev: Device, height: int, width: int) -> Tiles:
     return some_tiles(dev, (height, width), np.ones(grid_shape(height, width)))
 
 
-def all_tiles_buffers(height: int, width: int) -> dict[str, tuple[tuple, type]]:
+def all_tiles_buffers(height: int, width: int) -> Table:
     """{name: (shape, dtype)} of the device buffers of all_tiles()."""
     rows, columns = grid_shape(height, width)
     return {"list": ((3 + rows * columns,), np.int32), "count": ((rows, columns), np.float32)}

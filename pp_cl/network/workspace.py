@@ -5,6 +5,7 @@ import math
 import numpy as np
 from pyopencl.array import Array
 
+from pp_cl.device.buffers import Table
 from pp_cl.device.device import Device
 from pp_cl.layers.direction import Direction
 from pp_cl.layers.policy import ConvolutionPolicy
@@ -19,10 +20,8 @@ from pp_cl.network.sparse_tiles import AllTiles, levels_of
 # The convolutions' Work in a table of buffers.
 SCRATCH, WEIGHTS = "convolutions: scratch", "convolutions: transformed weights"
 
-BufferTable = dict[str, tuple[tuple, type]]  # {name: (shape, dtype)}
 
-
-def parameter_table(layers: list[Layer]) -> BufferTable:
+def parameter_table(layers: list[Layer]) -> Table:
     """{name: (shape, dtype)} of the parameters: "enc0.a.weight" (ceil(CO/16), K, K, CI, 16),
     "enc0.a.bias" (ceil(CO/16) * 16,), ...
     """
@@ -73,7 +72,7 @@ class WorkspacePlan:
                 needs = convolution.work_floats(direction, rows, weight_shape, shape.ci)
                 self.work_floats = [max(*n) for n in zip(self.work_floats, needs, strict=True)]
 
-    def buffers(self) -> BufferTable:
+    def buffers(self) -> Table:
         """{name: (shape, dtype)} of all device buffers of a Workspace."""
         table = {buffer.label: ((buffer.floats,), np.float32) for buffer in self.shared}
         for name, floats in zip((SCRATCH, WEIGHTS), self.work_floats, strict=True):
