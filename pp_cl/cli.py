@@ -6,6 +6,7 @@ Bad input is one line on stderr and exit status 2.
 import argparse
 import importlib
 import sys
+import warnings
 from collections.abc import Sequence
 
 from pp_cl import __version__
@@ -23,6 +24,7 @@ class _Parser(argparse.ArgumentParser):
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run a command; returns the exit status."""
+    warnings.showwarning = _show_warning
     try:
         options = _parser().parse_args(argv)
         options.run(options)
@@ -38,6 +40,11 @@ def main(argv: Sequence[str] | None = None) -> int:
         return _fail(
             "interrupted; the same command takes a training up from its last checkpoint", 130
         )
+
+
+def _show_warning(message, *_args, **_kwargs):
+    """One line on stderr, without the place in our source."""
+    print(f"pp-cl: {message}", file=sys.stderr)
 
 
 def _fail(message, status=2):
@@ -57,6 +64,7 @@ def _parser():
             name,
             help=module.HELP,
             description=module.HELP,
+            epilog=getattr(module, "EPILOG", None),
             allow_abbrev=False,
             formatter_class=argparse.RawDescriptionHelpFormatter,
         )

@@ -16,6 +16,7 @@ def setting(
     help: str,
     least: float | None = None,
     most: float | None = None,
+    *,
     choices: tuple[str, ...] = (),
 ) -> Any:
     """A dataclass field with its line of --help and the values allowed: [least, most], for a tuple
@@ -343,7 +344,7 @@ def validate(config: Config, origin: str) -> None:
         )
 
 
-def _check(value, where, help, least, most, choices):
+def _check(value, where, *, least, most, choices, **_):
     if choices and value not in choices:
         raise UserError(f"{where} = {value!r}; choose from {', '.join(choices)}")
     several = isinstance(value, tuple)
@@ -375,7 +376,9 @@ def load_config(path: Path | str) -> Config:
         for name, value in values.items():
             assign(config, f"{section}.{name}", value, str(path))
     if len(config.notes) > 1:
-        config.notes = [f"{config.notes[0]}, {len(config.notes) - 1} other keys were renamed too"]
+        config.notes[:] = [
+            f"{config.notes[0]}, {len(config.notes) - 1} other keys were renamed too"
+        ]
     validate(config, str(path))
     return config
 

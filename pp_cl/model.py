@@ -88,7 +88,7 @@ class PointCloud:
     ) -> PointCloud:
         """The points of a checkpoint's arrays. Raises UserError as Model.load does."""
         n = len(arrays.get("points.ids", ()))
-        ids = _fitting(arrays, "points.ids", (n,), file, np.uint32)
+        ids = _fitting(arrays, "points.ids", (n,), file, dtype=np.uint32)
         opacity = _fitting(arrays, "points.opacity", (n,), file)
         by_degree = [
             _fitting(arrays, f"points.sh{d}", (n, 2 * d + 1, 16), file)
@@ -114,6 +114,7 @@ class Model:
         grid: Grid,
         depth_range: tuple[float, float],
         cloud: PointCloud,
+        *,
         net: UNet,
     ):
         self.dev = dev
@@ -135,15 +136,15 @@ class Model:
         grid: Grid,
         ids: np.ndarray,
         depth_range: tuple[float, float],
-        net: UNet,
         *,
+        net: UNet,
         degree: int = SH_DEGREES[-1],
     ) -> Model:
         """Fresh model: points of opacity 1 with SH coefficients of 0, and a network.
 
         ids: (N) ascending grid vertices. degree: of the SH, 0 to 2.
         """
-        return cls(dev, grid, depth_range, PointCloud.create(dev, ids, degree), net)
+        return cls(dev, grid, depth_range, PointCloud.create(dev, ids, degree), net=net)
 
     def header(self) -> dict:
         """JSON-able description that load() needs beside the arrays."""
@@ -188,10 +189,10 @@ class Model:
         cloud = PointCloud.load(dev, arrays, degree, file)
         for name, parameter in net.parameters.items():
             parameter.set(_fitting(arrays, f"net.{name}", parameter.shape, file))
-        return cls(dev, grid, depth_range, cloud, net)
+        return cls(dev, grid, depth_range, cloud, net=net)
 
 
-def _fitting(arrays, name, shape, file, dtype=np.float32):
+def _fitting(arrays, name, shape, file, *, dtype=np.float32):
     """The array called `name`, contiguous. Raises UserError where it is missing or differs."""
     array = arrays.get(name)
     if array is None or array.shape != tuple(shape) or array.dtype != dtype:

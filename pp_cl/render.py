@@ -14,6 +14,7 @@ from pyopencl.array import Array
 
 from pp_cl.config import RasterConfig
 from pp_cl.device.buffers import Buffers, Table
+from pp_cl.device.device import Device
 from pp_cl.model import Model
 from pp_cl.raster.blend import BACKGROUND, Blend
 from pp_cl.raster.blend_weights import BlendWeights, PixelWeights
@@ -86,7 +87,7 @@ class Renderer:
     cache_bytes: device memory for the pairs of views that repeat (PairCache).
     """
 
-    def __init__(self, dev, model: Model, settings: RasterConfig, cache_bytes: int = 0):
+    def __init__(self, dev: Device, model: Model, settings: RasterConfig, cache_bytes: int = 0):
         self.dev = dev
         self.model = model
         self.settings = settings
@@ -121,9 +122,15 @@ class Renderer:
 
     def rasterise(self, camera: Camera, gamma: float, **options) -> RasterResult:
         """The blended features of a camera. options: of blend_weights()."""
-        view, cloud, b = self.blend_weights(camera, gamma, **options), self.model.cloud, self._buffers
+        view, cloud, b = (
+            self.blend_weights(camera, gamma, **options),
+            self.model.cloud,
+            self._buffers,
+        )
         with self.dev.stage("shade"):
-            shade_forward(self.dev, view.points, view.shaded, cloud.sh, b.point_features)
+            shade_forward(
+                self.dev, view.points, view.shaded, cloud.sh, point_features=b.point_features
+            )
         with self.dev.stage("blend"):
             self._blend.forward(view.pairs, view.weights, b.point_features, b.features)
         return RasterResult(**vars(view), point_features=b.point_features, features=b.features)
@@ -188,7 +195,11 @@ class Renderer:
         """The same from dL/dfeatures (H, W, 16) of result.features."""
         with self.dev.stage("backward"):
             gradient = self._blend.gradient(
-                result.pairs, result.weights, result.point_features, result.features, grad_features
+                result.pairs,
+                result.weights,
+                result.point_features,
+                features=result.features,
+                grad_features=grad_features,
             )
             return self._blend.backward(gradient)
 
@@ -201,7 +212,9 @@ class Renderer:
         return self._weights.dropped(view.pairs, view.weights)
 
     def render(self, camera: Camera, gamma: float, **options) -> np.ndarray:
-        """(H, W, 3) float32 numpy image of the camera, clamped to [0, 1]. options: of blend_weights()."""
+        """(H, W, 3) float32 numpy image of the camera, clamped to [0, 1]. options: of
+        blend_weights().
+        """
         return self.forward(camera, gamma, **options).clamped(camera)
 
     def _radius(self):

@@ -55,7 +55,7 @@ def run_config(
             )
     else:
         config, stored = preset(preset_name or "tiny"), None
-        config.scene.downscale = 2 if scene == "demo" else 1
+        assign(config, "scene.downscale", 2 if scene == "demo" else 1, "settings")
     configure(config, scene, given)
     if stored:
         _check_same(config, stored, folder)
@@ -64,7 +64,8 @@ def run_config(
 
 def configure(config: Config, scene: str, given: Iterable[tuple[str, Any, str]] = ()) -> Config:
     """The config with another scene and the given settings. Raises UserError as run_config does."""
-    config.scene.path = scene if scene == "demo" else str(Path(scene).resolve())
+    path = scene if scene == "demo" else str(Path(scene).resolve())
+    assign(config, "scene.path", path, "settings")
     for key, value, origin in given:
         assign(config, key, value, origin)
     validate(config, "settings")
@@ -228,7 +229,7 @@ class Training:
         """
         trainer, settings = self.trainer, self.config.train
         spare = spare_memory(self.plan, trainer.dev, settings.memory_gib)
-        trainer.renderer.cache.budget = spare
+        trainer.renderer.cache.set_budget(spare)
         self.folder.create(self.config.to_json())
         with self.folder.open_log(trainer.step) as log:
             seconds = log.seconds
@@ -303,7 +304,7 @@ def open_training(
     net = UNet(dev, config.network.widths, seed=config.train.seed, policy=policy)
     views = open_scene(dev, config, ("train",)).splits["train"]
     if stored:
-        trainer, info, hull = _resume(config, views, net, stored, folder.checkpoint)
+        trainer, info, hull = _resume(config, views, net, stored, file=folder.checkpoint)
     else:
         trainer, info, hull = _start(config, views, net)
     plan = memory_plan(config, trainer.model, trainer.views)
@@ -327,12 +328,12 @@ def _start(config, views, net):
         time.perf_counter() - start,
     )
     degree = config.points.sh_degree
-    model = Model.create(dev, hull.grid, hull.ids, near_far, net, degree=degree)
+    model = Model.create(dev, hull.grid, hull.ids, near_far, net=net, degree=degree)
     trainer = Trainer(dev, config, model, views)
     return trainer, {"scene": fingerprint(views), "initial_points": facts.points}, facts
 
 
-def _resume(config, views, net, stored, file):
+def _resume(config, views, net, stored, *, file):
     """(Trainer, info, None) of a training that goes on."""
     header, arrays = stored
     if header["scene"] != fingerprint(views):

@@ -55,8 +55,8 @@ ALWAYS_INLINE Hits load_hits(
 }
 
 // One pixel's entries [begin, stop) hold the weights of its hits, and hits that weigh `dropped` are
-// gone already. Drops, from the back on, every hit with which `dropped` stays within tau, and closes
-// the gaps. Returns the end of the entries that remain.
+// gone already. Drops, from the back on, every hit with which `dropped` stays within tau, and
+// closes the gaps. Returns the end of the entries that remain.
 static inline uint drop_hits(
     const uint begin,
     const uint stop,
@@ -88,8 +88,9 @@ static inline uint drop_hits(
 // the MAX_TRACKED nearest hits get gradients. A hit is dropped, with weight 0,
 // - by early_stop, with all behind it, once even an opaque, centred hit (o = d = 1) would have less
 //   than this share of the weight; differs from Pulsar: it looks only when its buffer is flushed;
-// - by tau, from the back on, while the sum of all dropped weights stays within tau; a tail so light
-//   that it is not weighed is not in D, and the background gets the weights of the other dropped hits.
+// - by tau, from the back on, while the sum of all dropped weights stays within tau; a tail so
+//   light that it is not weighed is not in D, and the background gets the weights of the other
+//   dropped hits.
 // By pixel: the hits that are not dropped, by depth. If any were dropped, one more entry follows,
 // with no point and the dropped weight.
 kernel __attribute__((vec_type_hint(float16))) void blend_weights_forward(
@@ -166,8 +167,8 @@ kernel __attribute__((vec_type_hint(float16))) void blend_weights_forward(
     }
 }
 
-// One work-item per pixel: writes the weight that it dropped, or a bound of it where not all dropped
-// hits were weighed.
+// One work-item per pixel: writes the weight that it dropped, or a bound of it where not all
+// dropped hits were weighed.
 kernel void dropped_weights(
     const uint hw,                    // pixels
     global const uint *pixel_offset,  // (HW+1)

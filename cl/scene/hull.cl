@@ -4,8 +4,8 @@
 #include "common.h"
 
 // One work-item per word of a mask's row: reads the alpha of its 32 pixels and of their neighbours,
-// writes the set of pixels with an alpha above `threshold` in their 3x3 neighbourhood. That margin of
-// 1 pixel keeps vertices that touch the silhouette.
+// writes the set of pixels with an alpha above `threshold` in their 3x3 neighbourhood. That margin
+// of 1 pixel keeps vertices that touch the silhouette.
 kernel void pack_mask(
     const uint width,  // pixels
     const uint height,

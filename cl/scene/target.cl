@@ -1,9 +1,9 @@
 // The target of a rendering: a stored photograph, reduced by area and composited over white.
 #include "common.h"
 
-// One work-item per target pixel: reads its block of downscale x downscale stored pixels, writes the
-// mean colour of those that exist, white if none does. Straight alpha: colour over white =
-// rgb * a + (1 - a).
+// One work-item per target pixel: reads its block of downscale x downscale stored pixels, writes
+// the mean colour of those that exist, white if none does. Straight alpha: colour over white = rgb
+// * a + (1 - a).
 kernel void target_forward(
     const int width,  // of the target, pixels
     const int height,

@@ -1,12 +1,13 @@
 """Figures of the benches; matplotlib is an extra."""
 
 from pathlib import Path
+from typing import Any
 
 from pp_cl.errors import UserError
 from pp_cl.files.atomic import atomic_file
 
 
-def check_files(json_file: str | None, plot_file: str | None):
+def check_files(json_file: str | None, plot_file: str | None) -> Any | None:
     """A matplotlib figure for the plot, None without one. Raises UserError if a file cannot be
     written.
     """
@@ -29,7 +30,7 @@ def _figure(path):
     return figure
 
 
-def plot_time_and_error(figure, title: str, rows: list[dict]) -> None:
+def plot_time_and_error(figure: Any, title: str, rows: list[dict]) -> None:
     """Time against error, both logarithmic: a colour for each variant, a marker for each
     direction.
     """
@@ -54,7 +55,7 @@ def plot_time_and_error(figure, title: str, rows: list[dict]) -> None:
             )
 
 
-def save_figure(figure, path: str) -> None:
+def save_figure(figure: Any, path: str) -> None:
     """Write a figure whose axes are drawn, with a grid and a legend."""
     for axes in figure.axes:
         axes.grid(True, which="both", alpha=0.3)

@@ -15,34 +15,42 @@ cl/bench/peak.cl once a round.
 
 from collections import defaultdict
 from collections.abc import Iterator
+from typing import Any
 
 import numpy as np
 
 from pp_cl.bench.peak import CopyBandwidth
 from pp_cl.bench.raster_scenes import SCENES
 from pp_cl.bench.timing import interleave
+from pp_cl.device.device import Device
 
 
 def bench_raster(
-    dev, scene: str, points: list[int], sizes: list[int], taus: list[float], gamma: float
+    dev: Device,
+    scene: str,
+    points: list[int],
+    sizes: list[int],
+    *,
+    taus: list[float],
+    gamma: float,
 ) -> Iterator[dict]:
     """Yield a row for every number of points, side and tau. scene: a key of SCENES."""
     copy = CopyBandwidth(dev)
     for n in points:
         for size in sizes:
-            before = dev.peak_bytes = dev.bytes
-            yield from _rows(dev, SCENES[scene](dev, n, size, gamma), taus, copy, before)
+            before = dev.reset_peak()
+            yield from _rows(
+                dev, SCENES[scene](dev, n, size, gamma), taus, copy=copy, before=before
+            )
 
 
-def _rows(dev, bench, taus, copy, before):
+def _rows(dev, bench, taus, *, copy, before):
     """Rows of one scene. before: device memory in use without it."""
     stages_ms, copy_ms = _time(dev, bench, taus, copy)
     copied = copy.bytes / copy_ms * 1e-6
     exact = bench.forward(0.0).features.get()
-    feature_range, _ = (
-        bench.feature_range,
-        bench.covered_pixels,
-    )  # they rasterise, the loop does too
+    # both rasterise the scene when they are first read: not inside the loop, which does so too
+    feature_range, _ = bench.feature_range, bench.covered_pixels
     for tau in taus:
         result, stages = bench.forward(tau), stages_ms[tau]
         features, moved = result.features.get(), bench.moved_bytes(result, tau)
@@ -152,7 +160,7 @@ def growth(rows: list[dict]) -> list[dict]:
     return found
 
 
-def plot(figure, title: str, rows: list[dict]) -> None:
+def plot(figure: Any, title: str, rows: list[dict]) -> None:
     """Draw time against the number of points, and the errors against tau. figure: matplotlib's."""
     figure.suptitle(title, fontsize="medium")
     time, error = figure.subplots(1, 2)

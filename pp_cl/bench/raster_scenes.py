@@ -11,6 +11,7 @@ import numpy as np
 from pyopencl.array import Array
 
 from pp_cl.config import RasterConfig
+from pp_cl.device.device import Device
 from pp_cl.model import Model
 from pp_cl.network.unet import UNet
 from pp_cl.raster.blend import Blend
@@ -126,7 +127,7 @@ class GridScene(BenchScene):
     name, forward_stages = "grid", ("project", "pairs", "weights", "shade", "blend")
     depth_range = (2.0, 6.0)
 
-    def __init__(self, dev, n, size, gamma):
+    def __init__(self, dev: Device, n: int, size: int, gamma: float):
         rng = np.random.default_rng(0)
         edge = (4 / 3 * np.pi / n) ** (1 / 3)
         side = int(2 / edge) + 2
@@ -142,7 +143,7 @@ class GridScene(BenchScene):
         self.camera = Camera(pose, focal, focal, size / 2, size / 2, size, size)
 
         net = UNet(dev, widths=(CHANNELS,) * 3)
-        model = Model.create(dev, grid, ids, self.depth_range, net)
+        model = Model.create(dev, grid, ids, self.depth_range, net=net)
         self.opacity = rng.uniform(0.7, 1, self.count).astype(np.float32)
         self.sh_0 = rng.standard_normal((self.count, 1, CHANNELS), np.float32)
         model.cloud.opacity.set(self.opacity)
@@ -160,26 +161,26 @@ class GridScene(BenchScene):
             depth_range=self.depth_range,
         )
 
-    def forward(self, tau):
+    def forward(self, tau: float) -> RasterResult:
         """As BenchScene."""
         return self.renderer.rasterise(self.camera, self.gamma, tau=tau)
 
-    def backward(self, result):
+    def backward(self, result: RasterResult) -> None:
         """Stage `backward`: gradients of features and opacities."""
         self.renderer.backward_features(result, self.grad)
 
-    def dropped_weights(self, result):
+    def dropped_weights(self, result: RasterResult) -> np.ndarray:
         """As BenchScene."""
         return self.renderer.dropped_weights(result).get()
 
-    def exact_features(self, points):
+    def exact_features(self, points: np.ndarray) -> np.ndarray:
         """As BenchScene."""
         directions = self.reference.points[points] / self.reference.range[points, None]
         basis = sh_basis(directions @ self.camera.pose[:, :3].T)
         higher = HIGHER_SH * basis[:, 1:].sum(1, keepdims=True)
         return basis[:, :1] * self.sh_0[points, 0].astype(np.float64) + higher
 
-    def moved_bytes(self, result, tau):
+    def moved_bytes(self, result: RasterResult, tau: float) -> dict[str, int]:
         """As BenchScene, with the stages of a grid and of harmonics."""
         shading = 4 + 16 + 9 * ROW + ROW
         own = {"project": self.count * (4 + 16 + 8), "shade": result.shaded.size * shading}
@@ -197,7 +198,7 @@ class PulsarScene(BenchScene):
     name, forward_stages = "pulsar", ("project", "pairs", "weights", "blend")
     radius, depth_range = 0.0015, (0.6, 2.5)
 
-    def __init__(self, dev, n, size, gamma):
+    def __init__(self, dev: Device, n: int, size: int, gamma: float):
         rng = np.random.default_rng(0)
         self.dev, self.size, self.gamma, self.count = dev, size, gamma, n
         self.camera = Camera(np.eye(3, 4), size, size, size / 2, size / 2, size, size)
@@ -218,7 +219,7 @@ class PulsarScene(BenchScene):
         self.features = dev.empty((size, size, CHANNELS))
         self.grad = dev.upload(rng.standard_normal((size, size, CHANNELS), np.float32))
 
-    def forward(self, tau):
+    def forward(self, tau: float) -> RasterResult:
         """As BenchScene."""
         with self.dev.stage("project"):
             points = self.projection.spheres(self.camera_buffer, self.positions, self.point_radius)
@@ -232,25 +233,29 @@ class PulsarScene(BenchScene):
             self.blend.forward(pairs, weights, self.device_features, self.features)
         return RasterResult((0, 0), points, pairs, weights, self.device_features, self.features)
 
-    def backward(self, result):
+    def backward(self, result: RasterResult) -> None:
         """Stages `backward` and `spheres`."""
         with self.dev.stage("backward"):
             gradient = self.blend.gradient(
-                result.pairs, result.weights, result.point_features, result.features, self.grad
+                result.pairs,
+                result.weights,
+                result.point_features,
+                features=result.features,
+                grad_features=self.grad,
             )
             self.blend.backward(gradient)
         with self.dev.stage("spheres"):
             self.blend.backward_spheres(gradient, result.points, self.point_opacity, self.gamma)
 
-    def dropped_weights(self, result):
+    def dropped_weights(self, result: RasterResult) -> np.ndarray:
         """As BenchScene."""
         return self.weights.dropped(result.pairs, result.weights).get()
 
-    def exact_features(self, points):
+    def exact_features(self, points: np.ndarray) -> np.ndarray:
         """As BenchScene."""
         return self.point_features[points].astype(np.float64)
 
-    def moved_bytes(self, result, tau):
+    def moved_bytes(self, result: RasterResult, tau: float) -> dict[str, int]:
         """As BenchScene, with the stages of spheres."""
         n, p, hw = self.count, result.pairs.total, self.size**2
         spheres = p * (4 + 8 + 8 + 8) + p * (4 + 8) + (ROW + 16 + 16) * n + 2 * (ROW + 4) * hw

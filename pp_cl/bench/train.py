@@ -10,6 +10,7 @@ from __future__ import annotations
 import numpy as np
 
 from pp_cl.config import Config
+from pp_cl.device.device import Device
 from pp_cl.model import Model
 from pp_cl.network.unet import UNet
 from pp_cl.run import open_scene
@@ -22,19 +23,21 @@ CACHE_BYTES = 2 << 30
 FORWARD = ("project", "pairs", "weights", "shade", "blend")
 
 
-def make_trainer(dev, config: Config) -> Trainer:
+def make_trainer(dev: Device, config: Config) -> Trainer:
     """Trainer on the scene's hull, with opacities in [0.3, 1] and a network of 16 channels."""
     views = open_scene(dev, config, ("train",)).splits["train"]
     hull = build_grid(dev, views, config.points.count)
     near_far = depth_range(views, hull)
     net = UNet(dev, widths=(16, 16, 16))
-    model = Model.create(dev, hull.grid, hull.ids, near_far, net, degree=config.points.sh_degree)
+    model = Model.create(
+        dev, hull.grid, hull.ids, near_far, net=net, degree=config.points.sh_degree
+    )
     opacity = np.random.default_rng(0).uniform(0.3, 1, model.cloud.count).astype(np.float32)
     model.cloud.opacity.set(opacity)
     return Trainer(dev, config, model, views)
 
 
-def bench_train(dev, config: Config, views: int, rounds: int) -> dict:
+def bench_train(dev: Device, config: Config, views: int, rounds: int) -> dict:
     """{"points", "pairs", "shaded", "stages_ms", "forward_ms", "backward_ms", "peak_device_bytes"}.
 
     views: evenly spread over the scene's. Times are medians over the views of all rounds;
@@ -42,7 +45,7 @@ def bench_train(dev, config: Config, views: int, rounds: int) -> dict:
     """
     trainer = make_trainer(dev, config)
     renderer, rates = trainer.renderer, Rates.at(STEP, config.network, config.train)
-    renderer.cache.budget = CACHE_BYTES
+    renderer.cache.set_budget(CACHE_BYTES)
     grads, step = {}, 0
     with dev.timed_stages() as seconds:
         for round_ in range(rounds + 1):

@@ -89,7 +89,7 @@ def make_network(dev: Device, widths: tuple[int, int, int], policy: ConvolutionP
     net = UNet(dev, widths, CHANNELS_IN, CHANNELS_OUT, policy=policy)
     for name, parameter in net.parameters.items():
         if name.endswith(".weight"):
-            affine(dev, np.sqrt(6), 0.0, parameter, parameter)
+            affine(dev, np.sqrt(6), 0.0, parameter, out=parameter)
     return net
 
 

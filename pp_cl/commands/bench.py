@@ -3,7 +3,7 @@
 import argparse
 
 from pp_cl.commands import options as shared
-from pp_cl.config import preset
+from pp_cl.config import assign, preset
 from pp_cl.errors import UserError
 
 HELP = "time against error of the convolutions, the network, the rasteriser, a training step"
@@ -97,7 +97,7 @@ def _run_raster(options):
     dev = _open_device(options)
     print(HEAD)
     rows = []
-    for row in bench_raster(dev, scene, points, sizes, taus, gamma):
+    for row in bench_raster(dev, scene, points, sizes, taus=taus, gamma=gamma):
         rows.append(row)
         print(line(row), flush=True)
     fits = growth(rows)
@@ -120,7 +120,7 @@ def _run_train(options):
     config = configure(preset("paper"), options.scene or "demo", shared.read_set(options.set))
     if options.points:
         points = shared.read_number("--points", options.points, int, least=8, most=2**27)
-        config.points.count = points
+        assign(config, "points.count", points, "--points")
     check_files(options.json, None)
     dev = _open_device(options)
     row = bench_train(dev, config, VIEWS, ROUNDS)

@@ -7,11 +7,11 @@ from pp_cl.commands import options as shared
 from pp_cl.config import PRESETS, SHORT, help_lines
 
 HELP = "learn a scene; the same command resumes an unfinished run"
+EPILOG = "settings (--set), with the tiny preset's values:\n" + "\n".join(help_lines())
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the command's options."""
-    parser.epilog = "settings (--set), with the tiny preset's values:\n" + "\n".join(help_lines())
     add = parser.add_argument
     add("scene", metavar="SCENE", help="folder with transforms_train.json, or the word demo")
     add("--out", required=True, metavar="RUN", help="folder of the run")

@@ -71,8 +71,13 @@ def run(options: argparse.Namespace) -> None:
         dev, cases, tolerance, on_blocking=show_blocking, on_row=show_row
     )
     print(f"stored in {tune.store(dev, tuning)} ({time.perf_counter() - start:.0f} s)")
-    policy = make_policy(dev, tolerance, tuning)
-    times = tune.total_times(cases, tuning["rows"], shipped_ms, policy)
+    _print_gain(
+        tune.total_times(cases, tuning["rows"], shipped_ms, make_policy(dev, tolerance, tuning))
+    )
+
+
+def _print_gain(times):
+    """What the tuning saves. times: {what: (milliseconds as shipped, as tuned)}."""
     for what, (shipped, tuned) in times.items():
         print(
             f"convolutions of {what}: {shipped:.2f} ms as shipped, {tuned:.2f} ms as tuned, "

@@ -251,6 +251,11 @@ class Device:
         finally:
             self._stage_seconds = before
 
+    def reset_peak(self) -> int:
+        """Measure peak_bytes anew from here on. Returns the bytes in use."""
+        self.peak_bytes = self.bytes
+        return self.bytes
+
     def _allocate(self, shape, dtype):
         dtype = np.dtype(dtype)
         nbytes = int(np.prod(shape, dtype=np.int64)) * dtype.itemsize

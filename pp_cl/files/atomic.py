@@ -3,14 +3,16 @@
 import errno
 import json
 import os
+from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any, BinaryIO
 
 from pp_cl.errors import UserError
 
 
 @contextmanager
-def atomic_file(path):
+def atomic_file(path: Path | str) -> Iterator[BinaryIO]:
     """A binary file object whose content appears under `path` only when the block ends well.
 
     Raises UserError naming the file when the disk is full or may not be written; nothing
@@ -47,18 +49,18 @@ def _sync_folder(folder):
         os.close(descriptor)
 
 
-def write_text(path, text):
+def write_text(path: Path | str, text: str) -> None:
     """Write a text file atomically."""
     with atomic_file(path) as file:
         file.write(text.encode())
 
 
-def write_json(path, value):
+def write_json(path: Path | str, value: Any) -> None:
     """Write JSON atomically; NaN and Inf are refused with ValueError."""
     write_text(path, json.dumps(value, indent=1, allow_nan=False) + "\n")
 
 
-def remove_leftovers(folder):
+def remove_leftovers(folder: Path | str) -> None:
     """Delete temporary files that a killed process left in the folder."""
     for leftover in Path(folder).glob(".*.tmp"):
         leftover.unlink(missing_ok=True)

@@ -10,12 +10,12 @@ from platformdirs import user_cache_dir
 from pp_cl.errors import UserError
 
 
-def cache_folder():
+def cache_folder() -> Path:
     """PP_CACHE, else the user's cache folder of the system."""
     return Path(os.environ.get("PP_CACHE") or user_cache_dir("pp-cl"))
 
 
-def make_cache_folder():
+def make_cache_folder() -> Path:
     """The same, made where it is missing. Raises UserError if that fails."""
     folder = cache_folder()
     try:

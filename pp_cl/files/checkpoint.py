@@ -3,6 +3,7 @@
 import json
 import zipfile
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -12,7 +13,9 @@ from pp_cl.files.atomic import atomic_file
 FORMAT = 1  # raised when the arrays change meaning
 
 
-def save_checkpoint(path, header, arrays):
+def save_checkpoint(
+    path: Path | str, header: dict[str, Any], arrays: dict[str, np.ndarray]
+) -> None:
     """Write {name: numpy array} and a JSON header. The same content gives the same bytes: no times
     are stored.
     """
@@ -23,7 +26,7 @@ def save_checkpoint(path, header, arrays):
         np.savez(file, header=meta, **arrays)
 
 
-def load_checkpoint(path):
+def load_checkpoint(path: Path | str) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
     """(header, {name: numpy array}) of a checkpoint.
 
     Raises UserError naming the file when it is missing, truncated, corrupt, of another format, or

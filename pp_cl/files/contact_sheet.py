@@ -1,5 +1,8 @@
 """Pictures that show how well views are predicted."""
 
+from collections.abc import Sequence
+from pathlib import Path
+
 import numpy as np
 from PIL import Image, ImageDraw
 
@@ -12,7 +15,7 @@ CAPTIONS = ("prediction", "truth", f"error x{ERROR_GAIN}")
 LINE, INK = 200, (60, 60, 60)
 
 
-def comparison(predictions, truths):
+def comparison(predictions: Sequence[np.ndarray], truths: Sequence[np.ndarray]) -> np.ndarray:
     """uint8 picture of equally large float (H, W, 3) images in [0, 1]: a row of prediction, truth
     and error for each view.
 
@@ -37,6 +40,8 @@ def _error(prediction, truth):
     return np.repeat(1 - ERROR_GAIN * error, 3, axis=2)
 
 
-def write_comparison(path, predictions, truths):
+def write_comparison(
+    path: Path, predictions: Sequence[np.ndarray], truths: Sequence[np.ndarray]
+) -> None:
     """Write comparison(...) as a PNG file."""
     write_png(path, comparison(predictions, truths))

@@ -17,7 +17,7 @@ EIGHT_BIT_MODES = ("RGBA", "RGB", "LA", "L", "PA", "P", "1")
 PNG_SIGNATURE, PNG_DEPTH_BYTE = b"\x89PNG\r\n\x1a\n", 24
 
 
-def read_rgba(path):
+def read_rgba(path: Path | str) -> np.ndarray:
     """(H, W, 4) uint8 straight RGBA of an image file; gray and palette colours are expanded, no
     alpha means 255.
 
@@ -33,7 +33,7 @@ def read_rgba(path):
         return np.array(image if image.mode == "RGBA" else image.convert("RGBA"))
 
 
-def image_size(path):
+def image_size(path: Path | str) -> tuple[int, int]:
     """(width, height) from the header of an image file. Raises UserError as read_rgba does."""
     with _opened(path) as image:
         return image.size
@@ -64,7 +64,7 @@ def _is_deep_png(path):
     return head.startswith(PNG_SIGNATURE) and head[PNG_DEPTH_BYTE] == 16
 
 
-def to_8bit(image):
+def to_8bit(image: np.ndarray) -> np.ndarray:
     """uint8 image of a float image: clamped to [0, 1], rounded to the nearest of 256 levels. Raises
     ValueError for NaN.
     """
@@ -74,7 +74,7 @@ def to_8bit(image):
     return (np.clip(image, 0, 1) * 255 + 0.5).astype(np.uint8)
 
 
-def write_png(path, image):
+def write_png(path: Path | str, image: np.ndarray) -> None:
     """Write a uint8 or float [0, 1] image of shape (H, W), (H, W, 3) or (H, W, 4), atomically.
 
     Raises UserError naming the file when the disk is full or may not be written, ValueError for

@@ -66,19 +66,13 @@ def conv_backward_weights(
     """
     height, width, co = grad_out.shape
     blocks, k, _, ci, _ = grad_weight.shape
-    channels = [source.shape[2] for source in sources]
-    if (sum(channels), -(-co // LANES), grad_bias.shape) != (ci, blocks, (blocks * LANES,)):
-        raise ValueError(
-            f"weight gradient of {channels} to {co} channels: "
-            f"weight is {grad_weight.shape}, bias {grad_bias.shape}"
-        )
-    needed = partial_floats(height, grad_weight.shape)
-    if partial.size < needed:
-        raise ValueError(f"weight gradient: scratch has {partial.size} floats, needs {needed}")
+    _check_shapes(sources, grad_out, grad_weight, grad_bias)
+    _check_scratch(partial, partial_floats(height, grad_weight.shape))
     tiles = checked_tiles(dev, tiles, height, width)
     parts, rows = _parts(height, grad_weight.shape)
     first = 0
-    for source, c in zip(sources, channels, strict=True):
+    for source in sources:
+        c = source.shape[2]
         program, group = _program(dev, blocking, k, c)
         program.launch(
             "conv_backward_weights",
@@ -97,6 +91,12 @@ def conv_backward_weights(
             partial=partial,
         )
         first += c
+    _sum_parts(program, partial, grad_weight, grad_bias, parts=parts)
+
+
+def _sum_parts(program, partial, grad_weight, grad_bias, *, parts):
+    """Write the sums over the parts of an image."""
+    blocks, k, _, ci, _ = grad_weight.shape
     program.launch(
         "conv_sum_parts",
         (k * k * ci + 1, blocks),
@@ -107,6 +107,23 @@ def conv_backward_weights(
         grad_weight=grad_weight,
         grad_bias=grad_bias,
     )
+
+
+def _check_shapes(sources, grad_out, grad_weight, grad_bias):
+    """Raise ValueError when shapes do not fit together."""
+    co, (blocks, _, _, ci, _) = grad_out.shape[2], grad_weight.shape
+    channels = [source.shape[2] for source in sources]
+    if (sum(channels), -(-co // LANES), grad_bias.shape) != (ci, blocks, (blocks * LANES,)):
+        raise ValueError(
+            f"weight gradient of {channels} to {co} channels: "
+            f"weight is {grad_weight.shape}, bias {grad_bias.shape}"
+        )
+
+
+def _check_scratch(partial, needed):
+    """Raise ValueError when there is less scratch than needed."""
+    if partial.size < needed:
+        raise ValueError(f"weight gradient: scratch has {partial.size} floats, needs {needed}")
 
 
 def _parts(height, weight_shape):

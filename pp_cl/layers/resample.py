@@ -96,7 +96,7 @@ def upsample2_backward(
     )
 
 
-def affine(dev: Device, scale: float, offset: float, x: Array, out: Array) -> None:
+def affine(dev: Device, scale: float, offset: float, x: Array, *, out: Array) -> None:
     """out = scale * x + offset; both of any one shape, out may be x."""
     if x.shape != out.shape:
         raise ValueError(f"affine of {x.shape} to {out.shape}")

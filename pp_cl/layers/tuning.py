@@ -10,7 +10,7 @@ stores its tuning in its checkpoint: tuning the device again changes no run unde
 import json
 import math
 import re
-import sys
+import warnings
 from pathlib import Path
 
 from pp_cl import __version__
@@ -76,10 +76,10 @@ def load_tuning(dev: Device) -> dict | None:
         reason = (
             error.strerror if isinstance(error, OSError) else " ".join(str(error).split())[:160]
         )
-        print(
+        warnings.warn(
             f"{tuning_file(dev)}: ignored ({reason}); run `pp-cl tune` to measure anew, or"
             " delete it",
-            file=sys.stderr,
+            stacklevel=2,
         )
         return None
 

@@ -35,18 +35,8 @@ def winograd_backward_weights(
     scratch: at least backward_weights_floats. The order of the sums depends on the shapes alone.
     Raises ValueError when shapes do not fit together.
     """
+    _check_shapes(sources, grad_out, grad_weight, grad_bias)
     height, width, co = grad_out.shape
-    blocks, _, _, ci, _ = grad_weight.shape
-    channels = [source.shape[2] for source in sources]
-    if not fits(*channels, co) or (sum(channels), co, grad_bias.shape) != (
-        ci,
-        blocks * LANES,
-        (co,),
-    ):
-        raise ValueError(
-            f"Winograd weight gradient of {channels} to {co} channels: weight is"
-            f" {grad_weight.shape}, bias {grad_bias.shape}"
-        )
     check_size("scratch", scratch, backward_weights_floats(dev, form))
     program = dev.program(
         "layers/winograd_backward_weights",
@@ -55,9 +45,9 @@ def winograd_backward_weights(
         CO_PART=CO_PART,
         BLOCKS=pair_blocks(co),
     )
-    tiles = checked_tiles(dev, tiles, height, width)
-    first = 0
-    for source, c in zip(sources, channels, strict=True):
+    tiles, first = checked_tiles(dev, tiles, height, width), 0
+    for source in sources:
+        c = source.shape[2]
         ci_part = _ci_part(dev, c, co)
         items = min(dev.info["compute_units"], -(-c // ci_part) * -(-co // CO_PART))
         program.launch(
@@ -67,7 +57,7 @@ def winograd_backward_weights(
             c=c,
             co=co,
             first=first,
-            ci=ci,
+            ci=grad_weight.shape[3],
             ci_part=ci_part,
             x=source,
             grad_out=grad_out,
@@ -78,6 +68,18 @@ def winograd_backward_weights(
             scratch=scratch,
         )
         first += c
+
+
+def _check_shapes(sources, grad_out, grad_weight, grad_bias):
+    """Raise ValueError when shapes do not fit together."""
+    co, (blocks, _, _, ci, _) = grad_out.shape[2], grad_weight.shape
+    channels = [source.shape[2] for source in sources]
+    found = (sum(channels), co, grad_bias.shape)
+    if not fits(*channels, co) or found != (ci, blocks * LANES, (co,)):
+        raise ValueError(
+            f"Winograd weight gradient of {channels} to {co} channels: weight is"
+            f" {grad_weight.shape}, bias {grad_bias.shape}"
+        )
 
 
 def _ci_part(dev, c, co):

@@ -41,6 +41,12 @@ class SharedBuffer:
     names: list[str]
     free_from: int
 
+    def add(self, name: str, floats: int, last: int) -> None:
+        """Give the buffer an array that lives until step `last`."""
+        self.floats = max(self.floats, floats)
+        self.names.append(name)
+        self.free_from = last + 1
+
     @property
     def label(self) -> str:
         """Its name in the memory plan."""
@@ -67,7 +73,5 @@ def plan_buffers(
         else:
             buffer = SharedBuffer(0, [], 0)
             buffers.append(buffer)
-        buffer.floats = max(buffer.floats, floats)
-        buffer.names.append(name)
-        buffer.free_from = last + 1
+        buffer.add(name, floats, last)
     return buffers

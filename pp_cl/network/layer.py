@@ -4,6 +4,7 @@ A layer is named like its output. Feature maps are (H, W, C) float32; those at l
 image's height and width divided by 2**L. Distances are pixels of the image at every level.
 """
 
+from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -36,6 +37,7 @@ class Resources(Protocol):
     gradients: dict[str, Array]
     work: Work
 
+    @abstractmethod
     def convolution(
         self, layer: "Conv", direction: Direction, source: int | None = None
     ) -> Convolution:
@@ -46,7 +48,7 @@ class Resources(Protocol):
 
 
 @dataclass(frozen=True)
-class Layer:
+class Layer(ABC):
     """A layer whose output is `name`.
 
     inputs: names of one layer, or of the two that a convolution reads as one; "x" is the network's
@@ -61,12 +63,13 @@ class Layer:
     reads_input_backward = True  # whether the backward pass reads the inputs
     relu = False  # whether the output is a ReLU's
 
+    @abstractmethod
     def forward(
         self, resources: Resources, sources: tuple[Array, ...], out: Array, tiles: Tiles
     ) -> None:
         """Compute the tiles of out from the inputs."""
-        raise NotImplementedError
 
+    @abstractmethod
     def backward_input(
         self,
         resources: Resources,
@@ -81,48 +84,48 @@ class Layer:
 
         mask: that input, if it is a ReLU's output, to get the gradient of the ReLU's input.
         """
-        raise NotImplementedError
 
     def backward_weights(
         self, resources: Resources, sources: tuple[Array, ...], grad_out: Array, tiles: Tiles
     ) -> None:
         """Overwrite the gradients of the layer's parameters, if it has any."""
+        return
 
     def multiplications(self, height: int, width: int) -> int:
         """Multiplications of weights by values in a forward pass over an image of this size."""
         return 0
 
+    @abstractmethod
     def forward_radius(self) -> int:
         """How far from its place a change of the input changes the output, in pixels."""
-        raise NotImplementedError
 
+    @abstractmethod
     def backward_radius(self) -> int:
         """The same from the gradient of the output to the gradient of the input."""
-        raise NotImplementedError
 
+    @abstractmethod
     def needed_forward(self, computed: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
         """(rows, columns) = shape bool: tiles of an input that the computed tiles of the output
         read.
         """
-        raise NotImplementedError
 
+    @abstractmethod
     def needed_backward(self, computed: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
         """(rows, columns) = shape bool: tiles of the gradient of the output that the computed tiles
         of an input's gradient read.
         """
-        raise NotImplementedError
 
+    @abstractmethod
     def reference_forward(self, source: np.ndarray, parameters: dict) -> np.ndarray:
         """Float64 output from the inputs' concatenation (H, W, CI); parameters: {name: numpy}."""
-        raise NotImplementedError
 
+    @abstractmethod
     def reference_backward(
         self, source: np.ndarray, grad_out: np.ndarray, parameters: dict
     ) -> tuple[np.ndarray, dict]:
         """(float64 gradient of the inputs' concatenation, {parameter: its gradient}), given that of
         the output before its ReLU.
         """
-        raise NotImplementedError
 
 
 @dataclass(frozen=True)
@@ -152,7 +155,9 @@ class Conv(Layer):
             found += [(Direction.BACKWARD_INPUT, i) for i in range(len(self.sources))]
         return found
 
-    def forward(self, resources, sources, out, tiles):
+    def forward(
+        self, resources: Resources, sources: tuple[Array, ...], out: Array, tiles: Tiles
+    ) -> None:
         """As Layer.forward."""
         resources.convolution(self, Direction.FORWARD).forward(
             sources,
@@ -165,7 +170,16 @@ class Conv(Layer):
             laid_out=resources.laid_out(self),
         )
 
-    def backward_input(self, resources, source, grad_out, grad_x, *, mask, tiles):
+    def backward_input(
+        self,
+        resources: Resources,
+        source: int,
+        grad_out: Array,
+        grad_x: Array,
+        *,
+        mask: Array | None,
+        tiles: Tiles,
+    ) -> None:
         """As Layer.backward_input."""
         resources.convolution(self, Direction.BACKWARD_INPUT, source).backward_input(
             resources.parameters[self.name + ".weight"],
@@ -177,7 +191,9 @@ class Conv(Layer):
             tiles=tiles,
         )
 
-    def backward_weights(self, resources, sources, grad_out, tiles):
+    def backward_weights(
+        self, resources: Resources, sources: tuple[Array, ...], grad_out: Array, tiles: Tiles
+    ) -> None:
         """As Layer.backward_weights."""
         resources.convolution(self, Direction.BACKWARD_WEIGHTS).backward_weights(
             sources,
@@ -188,30 +204,32 @@ class Conv(Layer):
             tiles=tiles,
         )
 
-    def multiplications(self, height, width):
+    def multiplications(self, height: int, width: int) -> int:
         """As Layer.multiplications, counted as a direct convolution."""
         weights = self.kernel_size**2 * sum(self.sources) * self.channels
         return weights * (height >> self.level) * (width >> self.level)
 
-    def forward_radius(self):
+    def forward_radius(self) -> int:
         """As Layer.forward_radius."""
         return self.kernel_size // 2 << self.level
 
     backward_radius = forward_radius
 
-    def needed_forward(self, computed, shape):
+    def needed_forward(self, computed: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
         """As Layer.needed_forward."""
         return grow(computed) if self.kernel_size > 1 else computed
 
     needed_backward = needed_forward
 
-    def reference_forward(self, source, parameters):
+    def reference_forward(self, source: np.ndarray, parameters: dict) -> np.ndarray:
         """As Layer.reference_forward."""
         weight, bias = parameters[self.name + ".weight"], parameters[self.name + ".bias"]
         out = reference.convolution(source, weight, bias)
         return np.maximum(out, 0) if self.relu else out
 
-    def reference_backward(self, source, grad_out, parameters):
+    def reference_backward(
+        self, source: np.ndarray, grad_out: np.ndarray, parameters: dict
+    ) -> tuple[np.ndarray, dict]:
         """As Layer.reference_backward."""
         weight = parameters[self.name + ".weight"]
         gradients = {
@@ -229,35 +247,48 @@ class Pool(Layer):
     too.
     """
 
-    def forward(self, resources, sources, out, tiles):
+    def forward(
+        self, resources: Resources, sources: tuple[Array, ...], out: Array, tiles: Tiles
+    ) -> None:
         """As Layer.forward."""
         avgpool2_forward(resources.dev, sources[0], out, tiles=tiles)
 
-    def backward_input(self, resources, source, grad_out, grad_x, *, mask, tiles):
+    def backward_input(
+        self,
+        resources: Resources,
+        source: int,
+        grad_out: Array,
+        grad_x: Array,
+        *,
+        mask: Array | None,
+        tiles: Tiles,
+    ) -> None:
         """As Layer.backward_input, but added to grad_x, where the skip's gradient is."""
         avgpool2_backward(resources.dev, mask, grad_out, grad_x, tiles=tiles)
 
-    def forward_radius(self):
+    def forward_radius(self) -> int:
         """As Layer.forward_radius."""
         return 1 << self.level >> 1
 
-    def backward_radius(self):
+    def backward_radius(self) -> int:
         """As Layer.backward_radius."""
         return 0
 
-    def needed_forward(self, computed, shape):
+    def needed_forward(self, computed: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
         """As Layer.needed_forward."""
         return double(computed, shape)
 
-    def needed_backward(self, computed, shape):
+    def needed_backward(self, computed: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
         """As Layer.needed_backward."""
         return halve(computed)
 
-    def reference_forward(self, source, parameters):
+    def reference_forward(self, source: np.ndarray, parameters: dict) -> np.ndarray:
         """As Layer.reference_forward."""
         return reference.pool(source)
 
-    def reference_backward(self, source, grad_out, parameters):
+    def reference_backward(
+        self, source: np.ndarray, grad_out: np.ndarray, parameters: dict
+    ) -> tuple[np.ndarray, dict]:
         """As Layer.reference_backward."""
         return reference.pool_backward(grad_out), {}
 
@@ -268,34 +299,47 @@ class Upsample(Layer):
 
     reads_input_backward = False
 
-    def forward(self, resources, sources, out, tiles):
+    def forward(
+        self, resources: Resources, sources: tuple[Array, ...], out: Array, tiles: Tiles
+    ) -> None:
         """As Layer.forward."""
         upsample2_forward(resources.dev, sources[0], out, tiles=tiles)
 
-    def backward_input(self, resources, source, grad_out, grad_x, *, mask, tiles):
+    def backward_input(
+        self,
+        resources: Resources,
+        source: int,
+        grad_out: Array,
+        grad_x: Array,
+        *,
+        mask: Array | None,
+        tiles: Tiles,
+    ) -> None:
         """As Layer.backward_input. Its input is never a ReLU's output."""
         upsample2_backward(resources.dev, grad_out, grad_x, tiles=tiles)
 
-    def forward_radius(self):
+    def forward_radius(self) -> int:
         """As Layer.forward_radius."""
         return 2 << self.level >> 1
 
-    def backward_radius(self):
+    def backward_radius(self) -> int:
         """As Layer.backward_radius."""
         return 2 << self.level
 
-    def needed_forward(self, computed, shape):
+    def needed_forward(self, computed: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
         """As Layer.needed_forward."""
         return halve(grow(computed))
 
-    def needed_backward(self, computed, shape):
+    def needed_backward(self, computed: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
         """As Layer.needed_backward."""
         return grow(double(computed, shape))
 
-    def reference_forward(self, source, parameters):
+    def reference_forward(self, source: np.ndarray, parameters: dict) -> np.ndarray:
         """As Layer.reference_forward."""
         return reference.upsample(source)
 
-    def reference_backward(self, source, grad_out, parameters):
+    def reference_backward(
+        self, source: np.ndarray, grad_out: np.ndarray, parameters: dict
+    ) -> tuple[np.ndarray, dict]:
         """As Layer.reference_backward."""
         return reference.upsample_backward(grad_out), {}

@@ -107,7 +107,7 @@ class UNet:
             sources, out = tuple(arrays[name] for name in layer.inputs), arrays[layer.name]
             layer.forward(workspace, sources, out, tiles.tiles(layer.name))
             tiles.fill_copies(layer.name, out)
-        affine(self.dev, 0.5, 0.5, out, out)
+        affine(self.dev, 0.5, 0.5, out, out=out)
         if training:
             self._trained = workspace, arrays, tiles
         return out
@@ -124,7 +124,7 @@ class UNet:
             raise RuntimeError("UNet.backward needs a forward(training=True) before it")
         (workspace, arrays, tiles), self._trained = self._trained, None
         grad_last = arrays[gradient_of(self.layers[-1].name)]
-        affine(self.dev, 0.5, 0.0, grad_y, grad_last)
+        affine(self.dev, 0.5, 0.0, grad_y, out=grad_last)
         tiles = tiles.backward(arrays, grad_last)
         for layer in reversed(self.layers):
             sources = tuple(arrays[name] for name in layer.inputs)

@@ -8,6 +8,7 @@ import numpy as np
 from pyopencl.array import Array
 
 from pp_cl.device.buffers import Buffers, Table
+from pp_cl.device.device import Device
 from pp_cl.raster.blend_weights import PixelWeights
 from pp_cl.raster.pairs import Pairs
 from pp_cl.raster.project import Footprint, ProjectedPoints
@@ -36,7 +37,7 @@ class Blend:
     mean_gradient: a point's gradients are divided by its number of tracked pixels, as Pulsar does.
     """
 
-    def __init__(self, dev, footprint: Footprint, mean_gradient: bool = False):
+    def __init__(self, dev: Device, footprint: Footprint, mean_gradient: bool = False):
         self.dev = dev
         self.defines = {"MEAN": int(mean_gradient), **footprint.defines}
         self._buffers = Buffers(dev)
@@ -72,6 +73,7 @@ class Blend:
         pairs: Pairs,
         weights: PixelWeights,
         point_features: Array,
+        *,
         features: Array,
         grad_features: Array,
     ) -> BlendGradient:

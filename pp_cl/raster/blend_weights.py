@@ -10,6 +10,7 @@ import numpy as np
 from pyopencl.array import Array
 
 from pp_cl.device.buffers import Buffers, Table, grown
+from pp_cl.device.device import Device
 from pp_cl.device.scan import nonzero
 from pp_cl.raster.pairs import Pairs
 
@@ -36,7 +37,7 @@ class PixelWeights:
 class BlendWeights:
     """Computes blend weights; the buffers grow and are reused."""
 
-    def __init__(self, dev):
+    def __init__(self, dev: Device):
         self.dev = dev
         self._buffers = Buffers(dev)
         self._capacity = 0

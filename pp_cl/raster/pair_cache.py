@@ -11,6 +11,7 @@ from dataclasses import fields, replace
 
 from pyopencl.array import Array
 
+from pp_cl.device.device import Device
 from pp_cl.raster.pairs import Pairs
 
 ARRAYS = tuple(field.name for field in fields(Pairs) if field.name != "total")
@@ -23,13 +24,17 @@ class PairCache:
     always evict the next. budget: bytes of device memory. bytes: in use, by len(cache) views.
     """
 
-    def __init__(self, dev, budget: int = 0):
+    def __init__(self, dev: Device, budget: int = 0):
         self.dev = dev
         self.budget = budget
         self.clear()
 
     def __len__(self):
         return len(self._views)
+
+    def set_budget(self, budget: int) -> None:
+        """Allow the cache so many bytes; what it holds already stays."""
+        self.budget = budget
 
     def clear(self) -> None:
         """Forget all views, because the points have changed."""

@@ -8,6 +8,7 @@ import numpy as np
 from pyopencl.array import Array
 
 from pp_cl.device.buffers import Buffers, Table, grown
+from pp_cl.device.device import Device
 from pp_cl.device.scan import exclusive_scan, nonzero, read_total
 from pp_cl.errors import UserError
 from pp_cl.raster.project import Footprint, ProjectedPoints
@@ -49,7 +50,7 @@ class Pairs:
 class PairBuilder:
     """Finds and sorts the hits of projected points; the buffers grow and are reused."""
 
-    def __init__(self, dev, footprint: Footprint):
+    def __init__(self, dev: Device, footprint: Footprint):
         self.dev = dev
         self.program = dev.program("raster/pairs", **footprint.defines)
         self._buffers = Buffers(dev)

@@ -8,6 +8,7 @@ import numpy as np
 from pyopencl.array import Array
 
 from pp_cl.device.buffers import Buffers, Table
+from pp_cl.device.device import Device
 
 LANES = 16  # points of one work-item
 KINDS = ("disc", "soft", "sphere")
@@ -53,7 +54,7 @@ class ProjectedPoints:
 class Projection:
     """Projects points; the buffers are reused from view to view."""
 
-    def __init__(self, dev, footprint: Footprint):
+    def __init__(self, dev: Device, footprint: Footprint):
         self.program = dev.program("raster/project", LANES=LANES, **footprint.defines)
         self._buffers = Buffers(dev)
 

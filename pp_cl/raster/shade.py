@@ -6,12 +6,18 @@ from collections.abc import Sequence
 
 from pyopencl.array import Array
 
+from pp_cl.device.device import Device
 from pp_cl.raster.project import ProjectedPoints
 from pp_cl.raster.sh import SH_BLOCKS
 
 
 def shade_forward(
-    dev, points: ProjectedPoints, shaded: Array, sh: Sequence[Array], point_features: Array
+    dev: Device,
+    points: ProjectedPoints,
+    shaded: Array,
+    sh: Sequence[Array],
+    *,
+    point_features: Array,
 ) -> None:
     """Write the rows `shaded` of point_features (N, 16) float32.
 

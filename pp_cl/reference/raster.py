@@ -2,7 +2,11 @@
 errors against.
 """
 
+from typing import Any
+
 import numpy as np
+
+Hits = tuple[np.ndarray, np.ndarray, np.ndarray]  # points, closeness, depth
 
 EPS = 1e-6  # depth of the background, as a z
 LEAST_RADIUS = 0.75  # pixels
@@ -13,11 +17,19 @@ class PixelReference:
     """Points, all in front of a camera and between near and far, of which some pixels are asked
     for.
 
-    positions: (N, 3), world. radius: one number, world units. kind: disc or sphere, no larger than
-    a few pixels. depth_range: (near, far).
+    camera: scene.camera.Camera. positions: (N, 3), world. radius: one number, world units. kind:
+    disc or sphere, no larger than a few pixels. depth_range: (near, far).
     """
 
-    def __init__(self, camera, positions, radius, kind, *, depth_range):
+    def __init__(
+        self,
+        camera: Any,
+        positions: np.ndarray,
+        radius: float,
+        kind: str,
+        *,
+        depth_range: tuple[float, float],
+    ):
         self.depth_range = depth_range
         self.camera, self.radius, self.kind = camera, radius, kind
         self.points = (np.asarray(positions, np.float64) - camera.eye) @ camera.pose[:, :3]
@@ -27,7 +39,7 @@ class PixelReference:
         # half as wide again: far from the axis, pixels see more than a circle
         self.window = 1 + 1.5 * max(LEAST_RADIUS, radius * max(camera.fx, camera.fy) / z.min())
 
-    def hits(self, column, row):
+    def hits(self, column: int, row: int) -> Hits | None:
         """(points (S,), closeness (S,), depth (S,)) of a pixel, or None where float32's rounding
         may decide over a hit.
         """
@@ -60,7 +72,9 @@ class PixelReference:
             depth = along - np.sqrt(np.maximum(radius**2 - across**2, 0))
         return points[hit], closeness[hit], depth[hit]
 
-    def features(self, hits, opacity, point_features, gamma):
+    def features(
+        self, hits: Hits, opacity: np.ndarray, point_features: np.ndarray, gamma: float
+    ) -> np.ndarray:
         """(C,) blended features of hits(); opacity: (S,), point_features: (S, C) of these points;
         the background is 1.
         """
@@ -76,7 +90,7 @@ class PixelReference:
         )
 
 
-def sh_basis(directions):
+def sh_basis(directions: np.ndarray) -> np.ndarray:
     """(N, 9) real harmonics of degrees 0 to 2 of unit directions (N, 3), as cl/sh.h orders them."""
     x, y, z = np.asarray(directions, np.float64).T
     first, second = np.sqrt(3 / (4 * np.pi)), np.sqrt(15 / (4 * np.pi))

@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 from skimage.measure import marching_cubes
 
+from pp_cl.device.device import Device
 from pp_cl.errors import UserError
 from pp_cl.files.atomic import write_json
 from pp_cl.files.image import write_png
@@ -28,7 +29,7 @@ NO_DEPTH_RANGE = (0.0, math.inf)  # the rays are traced through the whole object
 OBJECT_BOX = ((-0.8, -0.8, -1.0), (0.8, 0.8, 0.92))  # holds the object
 
 
-def demo_scene(dev, splits: Iterable[str] = SPLITS, size: int = SIZE) -> Scene:
+def demo_scene(dev: Device, splits: Iterable[str] = SPLITS, size: int = SIZE) -> Scene:
     """Scene `demo` of 64 training and 16 test views of size x size pixels, rendered on the device;
     it states no depth range.
 
@@ -46,7 +47,7 @@ def demo_scene(dev, splits: Iterable[str] = SPLITS, size: int = SIZE) -> Scene:
     return Scene("demo", None, views)
 
 
-def render(dev, camera: Camera) -> np.ndarray:
+def render(dev: Device, camera: Camera) -> np.ndarray:
     """(H, W, 4) uint8 straight RGBA image of the object; alpha is the share of 4x4 rays that hit
     it.
     """
@@ -62,7 +63,7 @@ def render(dev, camera: Camera) -> np.ndarray:
     return image.get()
 
 
-def demo_mesh(dev, resolution: int = 256) -> tuple[np.ndarray, np.ndarray]:
+def demo_mesh(dev: Device, resolution: int = 256) -> tuple[np.ndarray, np.ndarray]:
     """((V, 3) float32 vertices, (F, 3) int32 faces, counter-clockwise from outside) of the object,
     by marching cubes.
 
@@ -78,7 +79,7 @@ def demo_mesh(dev, resolution: int = 256) -> tuple[np.ndarray, np.ndarray]:
     return (low + edge * vertices[:, ::-1]).astype(np.float32), faces
 
 
-def distances(dev, grid: Grid) -> np.ndarray:
+def distances(dev: Device, grid: Grid) -> np.ndarray:
     """(nz, ny, nx) float32 signed distances of a Grid's vertices to the object, negative inside."""
     n = math.prod(grid.dims)
     out = dev.empty((n,))
@@ -97,7 +98,7 @@ def write_scene(scene: Scene, folder: str | Path) -> None:
     cannot be written.
     """
     folder = Path(folder).resolve()
-    if folder.is_file() or folder.is_dir() and any(folder.iterdir()):
+    if folder.is_file() or (folder.is_dir() and any(folder.iterdir())):
         raise UserError(f"{folder}: exists already; choose a new or empty folder")
     unfinished = folder.with_name(f".{folder.name}.{os.getpid()}.tmp")
     try:

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from pyopencl.array import Array
 
+from pp_cl.device.device import Device
 from pp_cl.errors import UserError
 from pp_cl.scene.bounds import bounding_box, explain_empty_hull
 from pp_cl.scene.grid import Grid, smallest_edge
@@ -70,7 +71,7 @@ class Carving:
 class Carver:
     """Masks and cameras of the stored images, on the device, to carve any grid with."""
 
-    def __init__(self, dev, views: Sequence[View]):
+    def __init__(self, dev: Device, views: Sequence[View]):
         self.dev = dev
         self.program = dev.program("scene/hull")
         self.cameras = [view.stored_camera for view in views]
@@ -145,7 +146,7 @@ class Carver:
         return Grid(tuple(float(x) for x in origin), carving.grid.edge, (nx, ny, nz)), ids.get()
 
 
-def build_grid(dev, views: Sequence[View], points: int) -> Hull:
+def build_grid(dev: Device, views: Sequence[View], points: int) -> Hull:
     """Hull with about `points` vertices: the rule that fits Table 4 of the PlenopticPoints
     supplemental.
 

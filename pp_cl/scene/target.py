@@ -5,6 +5,7 @@ over white.
 import numpy as np
 from pyopencl.array import Array
 
+from pp_cl.device.device import Device
 from pp_cl.scene.views import View
 
 
@@ -15,7 +16,7 @@ class Target:
     the image only those inside count, and wholly outside the target is white.
     """
 
-    def __init__(self, dev):
+    def __init__(self, dev: Device):
         self.dev = dev
         self.program = dev.program("scene/target")
         self._view = self._image = None  # the view loaded, and its image on the device

@@ -69,7 +69,7 @@ def test_pixels_that_rounding_decides_are_left_out(dev, offset, clear):
 
 @pytest.mark.parametrize("name", SCENES)
 def test_rows(dev, name):
-    rows = list(bench_raster(dev, name, [60, 500], [12, 20], [0.0, 1e-2], 0.05))
+    rows = list(bench_raster(dev, name, [60, 500], [12, 20], taus=[0.0, 1e-2], gamma=0.05))
     assert [(row["size"], row["tau"]) for row in rows] == [
         (12, 0),
         (12, 1e-2),

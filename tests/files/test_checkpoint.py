@@ -109,7 +109,7 @@ def test_leftovers_of_a_killed_process_are_removed(tmp_path):
 
 
 def test_json_never_holds_nan(tmp_path):
-    with pytest.raises(ValueError):
+    with pytest.raises(ValueError, match="JSON compliant"):
         write_json(tmp_path / "a.json", {"x": float("nan")})
     assert not (tmp_path / "a.json").exists()
 

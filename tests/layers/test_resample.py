@@ -79,7 +79,7 @@ def test_upsample_keeps_constants(dev):
 def test_affine(dev, rng):
     x = rng.normal(size=(31, 33, 3)).astype(np.float32)
     out = dev.upload(x)
-    layers.affine(dev, 0.5, 0.25, out, out)
+    layers.affine(dev, 0.5, 0.25, out, out=out)
     assert relative_error(out.get(), 0.5 * x.astype(np.float64) + 0.25) < 1e-7
 
 
@@ -93,4 +93,4 @@ def test_wrong_shapes_are_refused(dev):
     with pytest.raises(ValueError, match="max pooling"):
         layers.maxpool2_forward(dev, large, dev.zeros((2, 4, 16)))
     with pytest.raises(ValueError, match="affine"):
-        layers.affine(dev, 1, 0, small, large)
+        layers.affine(dev, 1, 0, small, out=large)

@@ -70,16 +70,15 @@ def test_without_one_the_device_class_is_named(dev, monkeypatch):
         ("pp_cl", "0.0.0"),
     ],
 )
-def test_a_foreign_devices_tuning_is_not_used(dev, capsys, name, value):
+def test_a_foreign_devices_tuning_is_not_used(dev, name, value):
     tuning = tuning_of(dev, [row()])
     tuning["device"][name] = value
     write_json(tuning_file(dev), tuning)  # copied here, or measured before an update
-    assert load_tuning(dev) is None
-    line = capsys.readouterr().err
-    assert (
-        line.count("\n") == 1 and f"measured with {name} {value}" in line and "pp-cl tune" in line
-    )
-    assert load_policy(dev, DEFAULT).choose(SHAPE) == "winograd4"
+    with pytest.warns(UserWarning, match=f"measured with {name} {value}.*pp-cl tune") as warned:
+        assert load_tuning(dev) is None
+    assert "\n" not in str(warned[0].message)
+    with pytest.warns(UserWarning, match="ignored"):
+        assert load_policy(dev, DEFAULT).choose(SHAPE) == "winograd4"
 
 
 def test_devices_have_files_of_their_own(dev, monkeypatch):
@@ -99,22 +98,18 @@ BROKEN = {
 
 
 @pytest.mark.parametrize("content", BROKEN.values(), ids=BROKEN)
-def test_a_broken_file_is_ignored_in_one_line(dev, capsys, content):
+def test_a_broken_file_is_ignored_in_one_line(dev, content):
     tuning_file(dev).write_bytes(content)
-    assert load_tuning(dev) is None
-    line = capsys.readouterr().err
-    assert (
-        line.count("\n") == 1
-        and str(tuning_file(dev)) in line
-        and "ignored" in line
-        and "pp-cl tune" in line
-    )
+    with pytest.warns(UserWarning, match="ignored.*pp-cl tune") as warned:
+        assert load_tuning(dev) is None
+    (line,) = (str(warning.message) for warning in warned)
+    assert str(tuning_file(dev)) in line and "\n" not in line
 
 
-def test_a_file_that_cannot_be_read_is_ignored_in_one_line(dev, capsys):
+def test_a_file_that_cannot_be_read_is_ignored_in_one_line(dev):
     tuning_file(dev).mkdir()
-    assert load_tuning(dev) is None
-    assert "ignored" in capsys.readouterr().err
+    with pytest.warns(UserWarning, match="ignored"):
+        assert load_tuning(dev) is None
 
 
 @pytest.mark.parametrize(
@@ -139,11 +134,11 @@ def test_a_file_that_cannot_be_read_is_ignored_in_one_line(dev, capsys):
         {"rows": [row(rel_l2={"direct": 1e-7})]},
     ],
 )
-def test_a_tuning_that_cannot_be_is_ignored_in_one_line(dev, capsys, change):
+def test_a_tuning_that_cannot_be_is_ignored_in_one_line(dev, change):
     tuning_file(dev).write_text(json.dumps(tuning_of(dev, [row()]) | change))
-    assert load_tuning(dev) is None
-    line = capsys.readouterr().err
-    assert line.count("\n") == 1 and "ignored" in line
+    with pytest.warns(UserWarning, match="ignored") as warned:
+        assert load_tuning(dev) is None
+    assert "\n" not in str(warned[0].message)
 
 
 # ---- runs

@@ -1,5 +1,7 @@
 """pp_cl/network/buffers.py: arrays that share a buffer never live at the same time."""
 
+from itertools import pairwise
+
 import numpy as np
 
 from pp_cl.network.architectures import unet_layers
@@ -15,7 +17,7 @@ def test_arrays_of_one_buffer_never_overlap(rng):
     assert len(buffers) < 20
     for buffer in buffers:
         held = [lifetimes[name] for name in buffer.names]
-        assert all(a[2] < b[1] for a, b in zip(held, held[1:], strict=False))
+        assert all(a[2] < b[1] for a, b in pairwise(held))
         assert buffer.floats == max(np.prod(shapes[name]) for name in buffer.names)
 
 

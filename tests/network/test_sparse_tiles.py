@@ -217,7 +217,7 @@ def test_lego(dev, data, rng, always):
     hull = build_grid(dev, views, 20_000)
     near_far = depth_range(views, hull)
     net = UNet(dev, widths=(16, 32, 48), seed=1)
-    model = Model.create(dev, hull.grid, hull.ids, near_far, net)
+    model = Model.create(dev, hull.grid, hull.ids, near_far, net=net)
     model.cloud.sh[0].set(rng.normal(size=model.cloud.sh[0].shape).astype(np.float32))
     renderer = Renderer(dev, model, preset("tiny").raster)
     for view in views[:2]:

@@ -38,7 +38,7 @@ def test_forward(dev, rng, n, degree):
         shaded.scene.projected,
         dev.upload(seen, np.uint32),
         [dev.upload(c) for c in shaded.sh],
-        features,
+        point_features=features,
     )
     assert relative_error(features.get()[seen], shaded.features()[seen]) < 1e-5
     assert (np.delete(features.get(), seen, axis=0) == 7).all()
@@ -58,7 +58,7 @@ def test_wrong_shapes_are_refused(dev, rng):
             shaded.scene.projected,
             shaded.scene.pairs.seen,
             [dev.upload(shaded.sh[0]), dev.empty((31, 5, 16))],
-            dev.empty((31, 16)),
+            point_features=dev.empty((31, 16)),
         )
 
 
@@ -70,5 +70,5 @@ def test_half_a_degree_is_refused(dev, rng):
             shaded.scene.projected,
             shaded.scene.pairs.seen,
             [dev.upload(c) for c in shaded.sh[:3]],
-            dev.empty((31, 16)),
+            point_features=dev.empty((31, 16)),
         )

@@ -104,7 +104,11 @@ class PairedPoints:
     def _gradient(self, grad_features):
         grad = self.dev.upload(np.reshape(grad_features, (*self.shape, 16)), np.float32)
         return self.blending.gradient(
-            self.pairs, self.weights, self.point_features, self.features, grad
+            self.pairs,
+            self.weights,
+            self.point_features,
+            features=self.features,
+            grad_features=grad,
         )
 
 

@@ -27,7 +27,7 @@ MOST_FUNCTION_LINES, MOST_FILE_LINES = 50, 400
 FUNCTIONS = (ast.FunctionDef, ast.AsyncFunctionDef)
 
 # Who may write to an attribute of another object, and why.
-SHARED = {}
+SHARED = {"pp_cl/cli.py": {"warnings.showwarning": "the hook that Python has for this"}}
 # Who below commands/ may print, and why.
 PRINTERS = {"pp_cl/device/device.py": "PP_DEBUG's tables"}
 

@@ -46,7 +46,7 @@ def trained(dev, folder, changes, base="tiny"):
     grid = Grid((-0.87, -0.87, -0.87), 0.06, (30, 30, 30))
     net = UNet(dev, widths=config.network.widths)
     degree = config.points.sh_degree
-    model = Model.create(dev, grid, np.arange(POINTS), (2.0, 6.0), net, degree=degree)
+    model = Model.create(dev, grid, np.arange(POINTS), (2.0, 6.0), net=net, degree=degree)
     views = open_scene(dev, config, ("train",)).splits["train"]
     trainer = Trainer(dev, config, model, views)
     plan = memory_plan(config, model, views)

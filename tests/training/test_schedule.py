@@ -56,5 +56,5 @@ def test_ema_weight():
 @pytest.mark.parametrize("steps", [1, 2, 7, 100])
 def test_short_trainings_average_too(steps):
     weights = [ema_weight(step, steps) for step in range(steps)]
-    assert [w for w in weights if w][0] == 1
+    assert next(w for w in weights if w) == 1
     assert all(0 <= w <= 1 for w in weights)
