@@ -15,7 +15,7 @@ WIDTHS = (16, 16, 16)
 def make_model(dev, rng, n=90):
     """A model with random parameters and some opacities of 0 and 1."""
     ids = np.sort(rng.choice(np.prod(GRID.dims), n, replace=False)).astype(np.uint32)
-    model = Model.create(dev, GRID, ids, (2.0, 6.0), UNet(dev, widths=WIDTHS, seed=3))
+    model = Model.create(dev, GRID, ids, (2.0, 6.0), net=UNet(dev, widths=WIDTHS, seed=3))
     opacity = rng.uniform(0.2, 1, n).astype(np.float32)
     opacity[::9], opacity[4::9] = 0, 1
     model.cloud.opacity.set(opacity)
