@@ -93,3 +93,16 @@ def test_pictures_and_gradients_are_the_same_bits(dev, rng, footprint, tau):
             results.append([result.features.get(), weights.get(), *gradients])
         assert same(*results)
     assert len(kept.cache) == 3 and len(anew.cache) == 0
+
+
+def test_a_cached_view_reserves_no_room_for_pairs(dev, rng):
+    """The pairs of a cached view stay where they are: the builder's buffers need not hold them."""
+    scene, footprint = (
+        PairedPoints(dev, make_camera(), make_points(rng, 257), 0.3),
+        Footprint("soft"),
+    )
+    cache = PairCache(dev, 10**9)
+    build(cache, "a", scene, PairBuilder(dev, footprint))
+    builder, before = PairBuilder(dev, footprint), dev.bytes
+    build(cache, "a", scene, builder)
+    assert dev.bytes == before

@@ -1,0 +1,262 @@
+"""The reader of NeRF-synthetic's format: its conventions, and every kind of bad input."""
+
+import json
+import math
+
+import numpy as np
+import pytest
+from support.transforms_scenes import SIZE, opengl_pose, refused, train_views, write_scene
+
+from pp_cl.files.image import read_rgba, write_png
+from pp_cl.scene.load import load_scene
+
+# -------------------------------------------------------------------------------------------------
+
+
+def test_views_and_names(tmp_path, capfd):
+    write_scene(tmp_path)
+    write_scene(tmp_path, "test", count=2)
+    scene = load_scene(tmp_path, ("train", "test"))
+    assert scene.name == tmp_path.name and scene.folder == tmp_path
+    assert [v.name for v in scene.splits["train"]] == ["train_0.png", "train_1.png", "train_2.png"]
+    assert [v.name for v in scene.splits["test"]] == ["test_0.png", "test_1.png"]
+    for view in scene.splits["train"] + scene.splits["test"]:
+        assert np.array_equal(view.image, read_rgba(tmp_path / view.name))
+        assert (view.camera.width, view.camera.height) == SIZE
+    assert list(load_scene(str(tmp_path)).splits) == ["train"]
+    assert capfd.readouterr().err == "", "a progress bar without a terminal"
+
+
+def test_projection_follows_opengl(tmp_path, rng):
+    """A world point lands where the format's own rules (y up, looking along -z) put it."""
+    data = write_scene(tmp_path)
+    focal = 0.5 * SIZE[0] / math.tan(0.35)
+    for frame, view in zip(data["frames"], load_scene(tmp_path).splits["train"], strict=True):
+        point = rng.normal(size=3) * 0.3
+        x, y, z, _ = np.linalg.inv(frame["transform_matrix"]) @ [*point, 1]
+        expected = [SIZE[0] / 2 + focal * x / -z, SIZE[1] / 2 - focal * y / -z]
+        camera = view.camera
+        x, y, z = camera.pose[:, :3].T @ (point - camera.eye)
+        assert z > 0
+        assert np.allclose(
+            [camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy],
+            expected,
+            rtol=0,
+            atol=1e-9,
+        )
+
+
+def test_defaults_of_nerf_synthetic(tmp_path):
+    write_scene(tmp_path)
+    scene = load_scene(tmp_path)
+    camera = scene.splits["train"][0].camera
+    assert camera.fx == camera.fy == 0.5 * SIZE[0] / math.tan(0.35)
+    assert (camera.cx, camera.cy) == (SIZE[0] / 2, SIZE[1] / 2)
+    assert [view.depth_range for view in scene.splits["train"]] == [None] * 3
+
+
+def test_nerfstudio_names(tmp_path):
+    """A frame's own key goes before the file's."""
+
+    def edit(data):
+        data.update(
+            fl_x=31.0, fl_y=32.5, cx=11.25, cy=8.5, w=SIZE[0], h=float(SIZE[1]), near=2.0, far=5
+        )
+        data.update(k1=0, p2=0.0, camera_model="OPENCV")
+        data["frames"][1].update(fl_x=33.0, cy=0, near=1.5, far=None)
+
+    write_scene(tmp_path, edit=edit)
+    scene = load_scene(tmp_path)
+    got = [
+        [v.camera.fx, v.camera.fy, v.camera.cx, v.camera.cy, *v.depth_range]
+        for v in scene.splits["train"]
+    ]
+    assert got == [
+        [31, 32.5, 11.25, 8.5, 2, 5],
+        [33, 32.5, 11.25, 0, 1.5, 5],
+        [31, 32.5, 11.25, 8.5, 2, 5],
+    ]
+
+
+def test_angle_of_height_and_single_focal_length(tmp_path):
+    camera = train_views(tmp_path, camera_angle_y=0.5)[0].camera
+    assert camera.fy == 0.5 * SIZE[1] / math.tan(0.25) != camera.fx
+    camera = train_views(tmp_path, fl_x=40)[0].camera
+    assert camera.fx == camera.fy == 40
+
+
+@pytest.mark.parametrize(
+    "given", ("train_1", "./train_1.png", "sub/../train_1", "{folder}/train_1", "linked")
+)
+def test_ways_to_name_an_image(tmp_path, given):
+    (tmp_path / "sub").mkdir()
+    (tmp_path / "linked.png").symlink_to("train_1.png")
+    view = train_views(tmp_path, file_path=given.format(folder=tmp_path))[0]
+    assert view.name == "train_1.png" and np.array_equal(
+        view.image, read_rgba(tmp_path / "train_1.png")
+    )
+
+
+def test_json_in_utf8_with_byte_order_mark(tmp_path):
+    data = write_scene(tmp_path, count=1)
+    (tmp_path / "train_0.png").rename(tmp_path / "köpfe.png")
+    data["frames"][0]["file_path"] = "köpfe"
+    (tmp_path / "transforms_train.json").write_text(
+        json.dumps(data, ensure_ascii=False), encoding="utf-8-sig"
+    )
+    assert load_scene(tmp_path).splits["train"][0].name == "köpfe.png"
+
+
+def test_scene_behind_a_link(tmp_path):
+    write_scene(tmp_path)
+    link = tmp_path.parent / f"{tmp_path.name}_link"
+    link.symlink_to(tmp_path)
+    assert len(load_scene(link).splits["train"]) == 3
+
+
+def test_rows_and_rounding_of_the_pose(tmp_path, rng):
+    """3x4 is read as 4x4 is; a rotation that is off by rounding comes out orthonormal."""
+    exact = opengl_pose([1, 2, 0.5])
+    rough = exact.copy()
+    rough[:3, :3] += rng.uniform(-1e-4, 1e-4, (3, 3))
+    for matrix in (exact[:3], rough):
+        pose = train_views(tmp_path, transform_matrix=matrix.tolist())[0].camera.pose
+        rotation = pose[:, :3]
+        assert (
+            np.abs(rotation.T @ rotation - np.eye(3)).max() < 1e-14 and np.linalg.det(rotation) > 0
+        )
+        assert np.abs(rotation - exact[:3, :3] * [1, -1, -1]).max() < 2e-4
+        assert np.array_equal(pose[:, 3], exact[:3, 3])
+
+
+def test_image_without_alpha_is_all_object(tmp_path):
+    write_scene(tmp_path, count=1)
+    write_png(tmp_path / "train_0.png", np.zeros((SIZE[1], SIZE[0], 3), np.uint8))
+    assert (load_scene(tmp_path).splits["train"][0].image[..., 3] == 255).all()
+
+
+# --------------------------------------------------------------------------------------------------
+
+MATRIX = opengl_pose([3, 0, 1])
+NAN_MATRIX = MATRIX * np.where(np.eye(4) == 1, np.nan, 1)
+
+BAD_FRAMES = {
+    "no path": ({"file_path": None}, "file_path", "must be the path"),
+    "path is a number": ({"file_path": 3}, "file_path", "must be the path"),
+    "no such image": ({"file_path": "./train_9"}, "file_path", "train_9"),
+    "folder as image": ({"file_path": "."}, "file_path", "no image"),
+    "zero byte": ({"file_path": "a\0b"}, "file_path", "not a usable path"),
+    "endless name": ({"file_path": "a" * 5000}, "file_path", "not a usable path"),
+    "parent folder": ({"file_path": "../secret.png"}, "file_path", "leaves the scene's folder"),
+    "parent folder without ending": (
+        {"file_path": "./x/../../secret"},
+        "file_path",
+        "leaves the scene's folder",
+    ),
+    "absolute": ({"file_path": "/etc/hostname"}, "file_path", "leaves the scene's folder"),
+    "link out": ({"file_path": "link_out"}, "file_path", "leaves the scene's folder"),
+    "loop of links": ({"file_path": "loop"}, "file_path", "not a usable path"),
+    "no matrix": ({"transform_matrix": None}, "transform_matrix", "4x4 or 3x4"),
+    "NaN": ({"transform_matrix": NAN_MATRIX.tolist()}, "transform_matrix", "NaN"),
+    "infinite": ({"transform_matrix": (MATRIX[:3] + math.inf).tolist()}, "transform_matrix", "Inf"),
+    "3x3": ({"transform_matrix": MATRIX[:3, :3].tolist()}, "transform_matrix", "(3, 3)"),
+    "ragged": ({"transform_matrix": [[1, 2], [3]]}, "transform_matrix", "4x4 or 3x4"),
+    "words": ({"transform_matrix": "unknown"}, "transform_matrix", "4x4 or 3x4"),
+    "huge": ({"transform_matrix": [[10**400] * 4] * 4}, "transform_matrix", "4x4 or 3x4"),
+    "scaled": (
+        {"transform_matrix": (MATRIX * [1.01, 1.01, 1.01, 1]).tolist()},
+        "transform_matrix",
+        "no rotation",
+    ),
+    "mirrored": (
+        {"transform_matrix": (MATRIX * [-1, 1, 1, 1]).tolist()},
+        "transform_matrix",
+        "no rotation",
+    ),
+    "zero": (
+        {"transform_matrix": (MATRIX * [0, 0, 0, 1]).tolist()},
+        "transform_matrix",
+        "no rotation",
+    ),
+    "transposed": ({"transform_matrix": MATRIX.T.tolist()}, "transform_matrix", "last row"),
+    "negative focal length": ({"fl_x": -5}, "fl_x", "above 0"),
+    "focal length in words": ({"fl_x": "50mm"}, "fl_x", '"50mm"'),
+    "true": ({"fl_x": True}, "fl_x", "true"),
+    "NaN number": ({"cx": math.nan}, "cx", "NaN"),
+    "infinite number": ({"cy": -math.inf}, "cy", "-Infinity"),
+    "huge number": ({"fl_y": 10**400}, "fl_y", "finite"),
+    "angle over pi": ({"camera_angle_x": 40}, "camera_angle_x", "below 3.14"),
+    "width": ({"w": 48}, "w", "24x18", "train_1.png"),
+    "height": ({"h": 19}, "h", "24x18", "train_1.png"),
+    "distortion": ({"k1": 0.01}, "k1", "undistort"),
+    "fisheye": ({"camera_model": "OPENCV_FISHEYE"}, "camera_model", "undistort"),
+    "near only": ({"near": 1.0}, "far", "missing"),
+    "far only": ({"far": 1.0}, "near", "missing"),
+    "near 0": ({"near": 0, "far": 2}, "near", "above 0"),
+    "far before near": ({"near": 3, "far": 2}, "far", "above near"),
+}
+
+
+@pytest.mark.parametrize("case", BAD_FRAMES)
+def test_bad_frame(tmp_path, case):
+    """The message names the file, the frame and the key."""
+    folder = tmp_path / "scene"
+    folder.mkdir()
+    write_png(tmp_path / "secret.png", np.zeros((SIZE[1], SIZE[0], 4), np.uint8))
+    (folder / "link_out.png").symlink_to(tmp_path / "secret.png")
+    (folder / "loop").symlink_to("loop")
+    change, key, *words = BAD_FRAMES[case]
+    write_scene(folder, edit=lambda data: data["frames"][1].update(change))
+    refused(folder, folder / "transforms_train.json", f"frames[1].{key}:", *words)
+
+
+def test_bad_key_of_the_whole_file(tmp_path):
+    write_scene(tmp_path, edit=lambda data: data.update(camera_angle_x="wide"))
+    refused(tmp_path, f"{tmp_path / 'transforms_train.json'}: camera_angle_x:", '"wide"')
+
+
+def test_no_focal_length(tmp_path):
+    write_scene(tmp_path, edit=lambda data: data.pop("camera_angle_x"))
+    refused(tmp_path, "transforms_train.json: frames[0].fl_x:", "camera_angle_x")
+
+
+@pytest.mark.parametrize("frames", ([], {}, None, "all"))
+def test_no_frames(tmp_path, frames):
+    write_scene(tmp_path, edit=lambda data: data.update(frames=frames))
+    refused(tmp_path, "transforms_train.json: frames:")
+
+
+def test_frame_that_is_no_object(tmp_path):
+    write_scene(tmp_path, edit=lambda data: data["frames"].append([1, 2]))
+    refused(tmp_path, "transforms_train.json: frames[3]:")
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    (
+        ('{\n "frames": [,]\n}', ("line 2", "column 13")),
+        ("", ("line 1", "column 1")),
+        ("[1, 2]", ("object",)),
+        ("[" * 100_000, ("JSON",)),
+        ('{"w": ' + "9" * 5000 + "}", ("JSON",)),
+        ("\udcff\udcfe", ("JSON",)),
+    ),
+)
+def test_broken_json(tmp_path, text, words):
+    (tmp_path / "transforms_train.json").write_text(text, errors="surrogateescape")
+    refused(tmp_path, tmp_path / "transforms_train.json", *words)
+
+
+def test_json_cut_anywhere(tmp_path):
+    write_scene(tmp_path, count=1)
+    file = tmp_path / "transforms_train.json"
+    content = file.read_text()
+    for length in range(0, len(content), 7):
+        file.write_text(content[:length])
+        refused(tmp_path, file, "line 1")
+
+
+def test_missing_image(tmp_path):
+    write_scene(tmp_path)
+    (tmp_path / "train_2.png").unlink()
+    refused(tmp_path, "transforms_train.json: frames[2].file_path:", "train_2")

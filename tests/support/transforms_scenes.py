@@ -1,0 +1,54 @@
+"""Scenes in the format of NeRF-synthetic, with random images, right and wrong ones."""
+
+import json
+
+import numpy as np
+import pytest
+
+from pp_cl.errors import UserError
+from pp_cl.files.image import write_png
+from pp_cl.scene.camera import look_at
+from pp_cl.scene.load import load_scene
+
+SIZE = (24, 18)  # width, height of the images written here
+
+
+def opengl_pose(eye):
+    """4x4 camera-to-world in OpenGL axes of a camera that looks from `eye` to the origin, z up."""
+    return np.vstack([look_at(eye, (0, 0, 0)) * [1, -1, -1, 1], [0, 0, 0, 1]])
+
+
+def write_scene(folder, split="train", count=3, edit=None):
+    """A NeRF-synthetic split of `count` random views; edit(data) changes the JSON before it is
+    written. Returns its data.
+    """
+    rng = np.random.default_rng(3)
+    frames = []
+    for i in range(count):
+        write_png(
+            folder / f"{split}_{i}.png", rng.integers(0, 256, (SIZE[1], SIZE[0], 4), np.uint8)
+        )
+        angle = 2 * np.pi * i / count
+        matrix = opengl_pose([3 * np.cos(angle), 3 * np.sin(angle), 1.2])
+        frames.append({"file_path": f"./{split}_{i}", "transform_matrix": matrix.tolist()})
+    data = {"camera_angle_x": 0.7, "frames": frames}
+    if edit:
+        edit(data)
+    (folder / f"transforms_{split}.json").write_text(json.dumps(data))
+    return data
+
+
+def train_views(folder, **keys):
+    """Views of a new scene of which `keys` are added to every frame."""
+    write_scene(folder, edit=lambda data: [frame.update(keys) for frame in data["frames"]])
+    return load_scene(folder).splits["train"]
+
+
+def refused(folder, *words, splits=("train",)):
+    """Loading fails with one line that has all the words."""
+    with pytest.raises(UserError) as caught:
+        load_scene(folder, splits)
+    message = str(caught.value)
+    assert "\n" not in message
+    for word in words:
+        assert str(word) in message, message
