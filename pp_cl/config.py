@@ -171,10 +171,6 @@ class TrainConfig:
     log_every: int = setting(50, "steps between two rows of log.jsonl", 1, 10**8)
     previews: int = setting(4, "preview images written in the course of the run", 0, 1000)
 
-    def crop_size(self, width: int, height: int) -> tuple[int, int]:
-        """(width, height) in pixels that a step trains on, of an image of width x height."""
-        return (min(self.crop, width), min(self.crop, height)) if self.crop else (width, height)
-
 
 @dataclass
 class Config:

@@ -99,7 +99,7 @@ def _about(run, costs):
         "finished": run.header["finished"],
         "points": {
             "initial": run.header["initial_points"],
-            "final": run.model.count,
+            "final": run.model.cloud.count,
             "grid": run.header["grid"]["dims"],
         },
         "seconds_per_frame": float(np.median(seconds)),

@@ -244,7 +244,7 @@ class Training:
             trainer.finish()
             seconds += time.perf_counter() - start
             self._save(finished=True)
-            log.write(self._row(seconds) | {"points": trainer.model.count, "finished": True})
+            log.write(self._row(seconds) | {"points": trainer.model.cloud.count, "finished": True})
         return seconds
 
     def _after_step(self, log, terms, seconds):
@@ -252,7 +252,7 @@ class Training:
         trainer, settings = self.trainer, self.config.train
         step, last, row = trainer.step, trainer.step == settings.iterations, None
         if step % settings.log_every == 0 or last:
-            state = {"points": trainer.model.count, "rates": trainer.rates()}
+            state = {"points": trainer.model.cloud.count, "rates": trainer.rates()}
             row = self._row(seconds) | terms | state
             log.write(row)
         if step % settings.checkpoint_every == 0 and not last:

@@ -53,8 +53,7 @@ class Trainer:
         config = self.config
         if not config.moments_16bit:
             return None
-        camera = self.views[0].camera
-        values = 3 * math.prod(config.crop_size(camera.width, camera.height))
+        values = 3 * math.prod(self.views[0].crop_size(config.crop))
         return moment_scale(config.sh_eps / values)
 
     # ----------------------------------------------------------------------------------------------
@@ -113,7 +112,7 @@ class Trainer:
         if config.crop == 0:
             return index, (0, 0, camera.width, camera.height), jitter
         x0, y0, x1, y1 = self._boxes[index]
-        width, height = config.crop_size(camera.width, camera.height)
+        width, height = view.crop_size(config.crop)
         left = _draw_start(rng, x0, x1, width, limit=camera.width)
         top = _draw_start(rng, y0, y1, height, limit=camera.height)
         return index, (left, top, width, height), jitter
@@ -174,7 +173,7 @@ class Trainer:
         """
         self.optimiser.apply_ema()
         if self.config.final_prune_weight > 0:
-            total = self.dev.zeros((self.model.count,))
+            total = self.dev.zeros((self.model.cloud.count,))
             for view in self.views:
                 weights = self.renderer.blend_weights(view.camera, self.gamma[1])
                 self.renderer.add_point_weights(weights, total)

@@ -1,6 +1,7 @@
 """The command pp-cl bench."""
 
 import argparse
+import sys
 
 from pp_cl.commands import options as shared
 from pp_cl.config import assign, preset
@@ -121,6 +122,8 @@ def _run_train(options):
     if options.points:
         points = shared.read_number("--points", options.points, int, least=8, most=2**27)
         assign(config, "points.count", points, "--points")
+    for note in config.notes:
+        print(f"pp-cl: {note}", file=sys.stderr)
     check_files(options.json, None)
     dev = _open_device(options)
     row = bench_train(dev, config, VIEWS, ROUNDS)

@@ -64,7 +64,7 @@ def run(options: argparse.Namespace) -> None:
     seconds = _run_with_bar(training)
     print(
         f"trained {config.train.iterations} steps in {seconds:.1f} s;"
-        f" {training.trainer.model.count} of {training.info['initial_points']} points remain;"
+        f" {training.trainer.model.cloud.count} of {training.info['initial_points']} points remain;"
         f" wrote {folder.checkpoint}"
     )
 
@@ -83,7 +83,7 @@ def _first_line(training):
     hull = training.hull
     if hull is None:
         trainer = training.trainer
-        return f"resuming at step {trainer.step} with {trainer.model.count} points"
+        return f"resuming at step {trainer.step} with {trainer.model.cloud.count} points"
     near, far = hull.depth_range
     asked = training.config.points.count
     capped = (

@@ -54,3 +54,24 @@ def load_checkpoint(path: Path | str) -> tuple[dict[str, Any], dict[str, np.ndar
                 f"{path}: {name} holds NaN or Inf; delete it to train anew, or restore a copy"
             )
     return header, arrays
+
+
+def fitting_array(
+    arrays: dict[str, np.ndarray],
+    name: str,
+    shape: tuple[int, ...],
+    file: Path,
+    *,
+    dtype: type = np.float32,
+) -> np.ndarray:
+    """The array called `name`, contiguous. Raises UserError naming the file and the array where it
+    is missing or has another shape or dtype.
+    """
+    array = arrays.get(name)
+    if array is None or array.shape != tuple(shape) or array.dtype != dtype:
+        found = "missing" if array is None else f"{array.dtype} {array.shape}"
+        raise UserError(
+            f"{file}: {name} is {found}, expected {np.dtype(dtype)} {tuple(shape)}; "
+            "its config.json may belong to another run"
+        )
+    return np.ascontiguousarray(array)

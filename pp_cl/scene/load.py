@@ -1,4 +1,4 @@
-"""Scenes: photographs of one object, with cameras and masks, from any format that FORMATS knows."""
+"""Scenes: photographs of one object, with cameras and masks, from any format that READERS knows."""
 
 import os
 from collections.abc import Iterable, Sequence

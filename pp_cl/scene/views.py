@@ -66,6 +66,11 @@ class View:
         dx, dy = (stored / self.downscale for stored in jitter)
         return self.camera.shifted(dx, dy).crop(*box)
 
+    def crop_size(self, side: int) -> tuple[int, int]:
+        """(width, height) of a crop of at most `side` x `side` pixels; 0: the whole image."""
+        size = self.camera.width, self.camera.height
+        return (min(side, size[0]), min(side, size[1])) if side else size
+
     def object_bounds(self, margin: int) -> tuple[int, int, int, int]:
         """(x0, y0, x1, y1): the pixels of the reduced image, half-open, that show the object, and
         `margin` more on every side, cut off at the image's border.

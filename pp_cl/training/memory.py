@@ -6,12 +6,14 @@ import numpy as np
 
 from pp_cl.config import Config, RasterConfig
 from pp_cl.device.buffers import Table, grown, table_bytes
+from pp_cl.device.compact import compact_table
 from pp_cl.device.device import Device
 from pp_cl.errors import UserError
-from pp_cl.model import Model, PointCloud
+from pp_cl.model import Model
 from pp_cl.raster.blend import Blend
 from pp_cl.raster.blend_weights import BlendWeights
 from pp_cl.raster.pairs import PairBuilder
+from pp_cl.raster.point_cloud import PointCloud
 from pp_cl.raster.project import Projection
 from pp_cl.render import NETWORK_MULTIPLE, Renderer
 from pp_cl.scene.camera import Camera
@@ -19,7 +21,6 @@ from pp_cl.scene.views import View
 from pp_cl.training.loss import Loss
 from pp_cl.training.optimiser import Optimiser
 from pp_cl.training.point_state import PointState
-from pp_cl.training.prune import prune_table
 from pp_cl.training.smooth import Smoother, chunk_points
 
 MIB, GIB = 2**20, 2**30
@@ -29,9 +30,9 @@ Plan = list[tuple[str, Table]]  # what the buffers of each table are for
 
 def memory_plan(config: Config, model: Model, views: list[View]) -> Plan:
     """The device buffers of a training with this model on these views."""
-    n, train, blocks = model.count, config.train, model.cloud.blocks
+    n, train, blocks = model.cloud.count, config.train, model.cloud.blocks
     camera = views[0].camera
-    width, height = train.crop_size(camera.width, camera.height)
+    width, height = views[0].crop_size(train.crop)
     padded, _, _ = camera.crop(0, 0, width, height).padded(NETWORK_MULTIPLE)
     size = (padded.height, padded.width)
     image, target = (*size, 3), (height, width, 3)
@@ -42,7 +43,7 @@ def memory_plan(config: Config, model: Model, views: list[View]) -> Plan:
         ("averages of the points", PointState.ema_table(n, blocks) if train.ema else {}),
         ("optimiser", Optimiser.table(n, model.net.parameters, train)),
         ("smoothing (estimate)", _smoothing_table(config, model)),
-        ("pruning (at most)", prune_table(n, row_bytes)),
+        ("pruning (at most)", compact_table(n, row_bytes)),
         *_raster_tables(
             config.raster, n, size, n * _pixels_per_point(config.raster, model, camera)
         ),
@@ -61,7 +62,7 @@ def _smoothing_table(config, model):
     """
     if config.train.sh_smoothing == 0:
         return {}
-    n = model.count
+    n = model.cloud.count
     return Smoother.table(n, chunk_points(n, n // model.grid.dims[2]))
 
 

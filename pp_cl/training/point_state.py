@@ -7,11 +7,11 @@ from pyopencl.array import Array
 
 from pp_cl.config import TrainConfig
 from pp_cl.device.buffers import Table
+from pp_cl.device.compact import compact_rows
 from pp_cl.device.device import Device
-from pp_cl.model import PointCloud
+from pp_cl.raster.point_cloud import PointCloud
 from pp_cl.raster.sh import ShBlock
 from pp_cl.training.adam import Ema
-from pp_cl.training.prune import compact_rows
 
 # Names in a checkpoint where they differ: SH blocks are called after their first basis function.
 STORED_NAMES = {

@@ -82,13 +82,13 @@ def test_pictures_and_gradients_are_the_same_bits(dev, rng, footprint, tau):
     for step in range(8):
         if step == 5:
             kept.cache.clear()
-            model.cloud.compact(dev, dev.upload(np.arange(0, model.count, 2), np.uint32))
-        model.cloud.opacity.set(rng.uniform(0, 1, model.count).astype(np.float32))
+            model.cloud.compact(dev, dev.upload(np.arange(0, model.cloud.count, 2), np.uint32))
+        model.cloud.opacity.set(rng.uniform(0, 1, model.cloud.count).astype(np.float32))
         results = []
         for renderer, key in ((kept, step % 3), (anew, None)):
             result = renderer.rasterise(cameras[step % 3], GAMMA, key=key)
             gradients = [g.get() for g in renderer.backward_features(result, grad)]
-            weights = dev.zeros((model.count,))
+            weights = dev.zeros((model.cloud.count,))
             renderer.add_point_weights(result, weights)
             results.append([result.features.get(), weights.get(), *gradients])
         assert same(*results)

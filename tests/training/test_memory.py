@@ -6,15 +6,16 @@ from support.scenes import write_ball_scene
 
 from pp_cl.config import assign, preset
 from pp_cl.device.buffers import table_bytes
+from pp_cl.device.compact import compact_table
 from pp_cl.errors import UserError
-from pp_cl.model import Model, PointCloud
+from pp_cl.model import Model
 from pp_cl.network.unet import UNet
+from pp_cl.raster.point_cloud import PointCloud
 from pp_cl.run import open_scene
 from pp_cl.scene.grid import Grid
 from pp_cl.train import Trainer
 from pp_cl.training.memory import memory_plan, plan_bytes, plan_lines, spare_memory
 from pp_cl.training.point_state import PointState
-from pp_cl.training.prune import prune_table
 
 POINTS = 27_000
 PAPER_POINTS = 4_040_533  # lego, supplemental Table 4
@@ -58,9 +59,9 @@ def trained(dev, folder, changes, base="tiny"):
 @pytest.mark.parametrize("changes", WAYS)
 def test_the_plan_is_what_a_training_takes(dev, tmp_path, changes):
     trainer, plan, peak = trained(dev, tmp_path / "ball", changes)
-    assert trainer.model.count == POINTS
+    assert trainer.model.cloud.count == POINTS
     blocks = trainer.model.cloud.blocks
-    pruning = table_bytes(prune_table(POINTS, max(64 * block.count for block in blocks)))
+    pruning = table_bytes(compact_table(POINTS, max(64 * block.count for block in blocks)))
     assert pruning == POINTS * (192 + 4)
     planned = plan_bytes(plan) - pruning
     assert 0.97 * peak < planned < 1.03 * peak
@@ -74,11 +75,11 @@ def test_the_plan_is_what_a_training_takes(dev, tmp_path, changes):
 
 
 def test_pruning_stays_within_the_plan(dev, tmp_path, monkeypatch):
-    monkeypatch.setattr("pp_cl.training.prune.SCRATCH_BYTES", 10**6)
+    monkeypatch.setattr("pp_cl.device.compact.SCRATCH_BYTES", 10**6)
     trainer, plan, _ = trained(dev, tmp_path / "ball", {})
     before, dev.peak_bytes = dev.bytes, dev.bytes
     trainer.prune(dev.upload(np.arange(POINTS), np.float32), 1.0)
-    assert trainer.model.count == POINTS - 1
+    assert trainer.model.cloud.count == POINTS - 1
     assert dev.peak_bytes <= before + 10**6 + 2 * 4 * POINTS  # the weights and the list of the kept
     assert dev.peak_bytes <= plan_bytes(plan)
 

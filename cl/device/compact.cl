@@ -1,4 +1,4 @@
-// Compaction of per-point arrays.
+// Compaction of arrays: rows move to the front.
 
 // One work-item per kept row: copies it from its old place.
 kernel void gather_rows(

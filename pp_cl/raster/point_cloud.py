@@ -1,0 +1,97 @@
+"""What is learned of the points, one row each."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from pyopencl.array import Array
+
+from pp_cl.device.buffers import Table
+from pp_cl.device.compact import compact_rows
+from pp_cl.device.device import Device
+from pp_cl.files.checkpoint import fitting_array
+from pp_cl.raster.sh import SH_BLOCKS, SH_DEGREES, ShBlock, sh_blocks
+
+
+@dataclass
+class PointCloud:
+    """The points, one row each; device arrays.
+
+    ids: (N) uint32, vertices of the grid, ascending. opacity: (N) float32 in [0, 1]. sh: the SH
+    coefficients, (N, count, 16) float32 of each block.
+    """
+
+    ids: Array
+    opacity: Array
+    sh: list[Array]
+
+    @property
+    def count(self) -> int:
+        """Number of points."""
+        return len(self.ids)
+
+    @property
+    def blocks(self) -> tuple[ShBlock, ...]:
+        """The block that each array of `sh` holds."""
+        return SH_BLOCKS[: len(self.sh)]
+
+    @staticmethod
+    def table(n: int, blocks: tuple[ShBlock, ...]) -> Table:
+        """The arrays of n points."""
+        table = {"ids": ((n,), np.uint32), "opacity": ((n,), np.float32)}
+        return table | {block.name: ((n, block.count, 16), np.float32) for block in blocks}
+
+    @classmethod
+    def create(cls, dev: Device, ids: np.ndarray, degree: int) -> PointCloud:
+        """Points of opacity 1 with SH coefficients of 0. ids: (N), ascending."""
+        blocks, n = sh_blocks(degree), len(ids)
+        table = cls.table(n, blocks)
+        opacity = dev.upload(np.ones(n, np.float32))
+        sh = [dev.zeros(*table[block.name]) for block in blocks]
+        return cls(dev.upload(ids, np.uint32), opacity, sh)
+
+    def learned(self) -> dict[str, Array]:
+        """{name: array} of all that training changes: "opacity", and the SH by block."""
+        names = (block.name for block in self.blocks)
+        return {"opacity": self.opacity} | dict(zip(names, self.sh, strict=True))
+
+    def compact(self, dev: Device, keep: Array) -> None:
+        """Drop all rows but `keep`, (M) uint32, ascending; one array after the other."""
+        self.ids = compact_rows(dev, self.ids, keep)
+        self.opacity = compact_rows(dev, self.opacity, keep)
+        for i in range(len(self.sh)):
+            self.sh[i] = compact_rows(dev, self.sh[i], keep)
+
+    def arrays(self) -> dict[str, np.ndarray]:
+        """The arrays as a checkpoint names them; the SH by degree, (N, 1, 16), (N, 3, 16),
+        (N, 5, 16).
+        """
+        stored = {"points.ids": self.ids.get(), "points.opacity": self.opacity.get()}
+        for degree in sorted({block.degree for block in self.blocks}):
+            parts = [
+                array.get()
+                for block, array in zip(self.blocks, self.sh, strict=True)
+                if block.degree == degree
+            ]
+            stored[f"points.sh{degree}"] = np.concatenate(parts, 1)
+        return stored
+
+    @classmethod
+    def load(
+        cls, dev: Device, arrays: dict[str, np.ndarray], degree: int, file: Path
+    ) -> PointCloud:
+        """The points of a checkpoint's arrays. Raises UserError as Model.load does."""
+        n = len(arrays.get("points.ids", ()))
+        ids = fitting_array(arrays, "points.ids", (n,), file, dtype=np.uint32)
+        opacity = fitting_array(arrays, "points.opacity", (n,), file)
+        by_degree = [
+            fitting_array(arrays, f"points.sh{d}", (n, 2 * d + 1, 16), file)
+            for d in SH_DEGREES[: degree + 1]
+        ]
+        sh = []
+        for block in sh_blocks(degree):
+            start = block.first - block.degree**2  # within its degree
+            sh.append(dev.upload(by_degree[block.degree][:, start : start + block.count]))
+        return cls(dev.upload(ids), dev.upload(opacity), sh)
