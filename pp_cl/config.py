@@ -205,12 +205,13 @@ PRESETS = {
         "raster.max_tracked": 64,
         "raster.early_stop": 0.001,
         "network.widths": (128, 256, 512),
-        # Inferred from the same authors' next method, INPC: the supplemental gives no number.
+        # Inferred from INPC, a later method of the same first author: the supplemental gives no
+        # number.
         "network.rate": (3e-4, 5e-5),
         "train.iterations": 50_000,
         "train.crop": 0,
         # Ours: the supplemental mentions no jitter, dropout, smoothing or averaging, and no rule
-        # of pruning.
+        # of pruning. Ours in all presets: the loss and its weight, Adam's eps, the opacity's rate.
         "train.pixel_jitter": False,
         "train.dropout": 0.0,
         "train.sh_smoothing": 0.0,
