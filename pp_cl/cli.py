@@ -54,7 +54,9 @@ def _fail(message, status=2):
 
 def _parser():
     parser = _Parser(
-        prog="pp-cl", description="Reconstruct an object from photographs with OpenCL.", allow_abbrev=False
+        prog="pp-cl",
+        description="Reconstruct an object from photographs with OpenCL.",
+        allow_abbrev=False,
     )
     parser.add_argument("--version", action="version", version=f"pp-cl {__version__}")
     commands = parser.add_subparsers(dest="command", required=True, parser_class=_Parser)
