@@ -269,7 +269,7 @@ def test_an_earlier_tuning_of_other_layers_is_kept():
 # ---- the command
 
 
-def test_tune_stores_what_the_others_then_use(cache, capsys):
+def test_tune_stores_what_the_others_then_use(cache, capsys, monkeypatch):
     assert main(["tune", *SMALL]) == 0
     dev = open_device()
     tuning = load_tuning(dev)
@@ -292,6 +292,7 @@ def test_tune_stores_what_the_others_then_use(cache, capsys):
     assert main(["bench", "conv", *SMALL]) == 0
     captured = capsys.readouterr()
     assert "measured with name Abacus" in captured.err and "as shipped" in captured.out
+    monkeypatch.setattr(tune, "network_cases", lambda *args: [CASE])
     assert main(["tune", *SMALL, "--preset", "paper"]) == 0  # and is replaced
     assert capsys.readouterr().err == ""
     assert load_tuning(dev)["device"] == device_key(dev)
@@ -335,7 +336,8 @@ def test_bad_input_is_one_line(words, named, capsys, cache):
     assert not cache.exists() or not list(cache.iterdir())
 
 
-def test_a_tolerance_that_nothing_keeps_is_refused_and_the_measurement_kept(capsys):
+def test_a_tolerance_that_nothing_keeps_is_refused_and_the_measurement_kept(capsys, monkeypatch):
+    monkeypatch.setattr(tune, "network_cases", lambda *args: [CASE])
     assert main(["tune", *SMALL, "--tolerance", "1e-12"]) == 2
     line = capsys.readouterr().err
     assert line.count("\n") == 1 and "tolerance 1e-12" in line
