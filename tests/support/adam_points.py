@@ -1,0 +1,128 @@
+"""Points updated by the kernels of Adam and by its float64 twin alike."""
+
+import numpy as np
+from oracle import optim as oracle_optim
+from support.comparisons import relative_error
+
+from pp_cl.config import TrainConfig
+from pp_cl.raster.sh import SH_BLOCKS
+from pp_cl.scene.camera import Camera
+from pp_cl.scene.grid import Grid
+from pp_cl.training.adam import (
+    PointAdam,
+    ShGradient,
+)
+from pp_cl.training.point_state import PointState
+
+GRID = Grid((-0.7, -0.5, -0.6), 0.05, (23, 19, 31))
+
+
+SH_EPS = 4e-7  # of the tiny preset
+
+
+EYE = np.array([1.5, -2.5, 1.2])
+
+
+CAMERA = Camera(np.column_stack([np.eye(3), EYE]), 100, 100, 50, 50, 100, 100)
+
+
+def moments(dev, parameter):
+    return {kind: dev.zeros(parameter.shape) for kind in "mv"}
+
+
+def sh_moments(dev, block, n, scale=None):
+    table = PointState.table(n, [block], TrainConfig(moments_16bit=scale is not None))
+    return {
+        name.partition(".")[0]: dev.zeros(*row)
+        for name, row in table.items()
+        if name.endswith(block.name)
+    }
+
+
+class Cloud:
+    """Points whose opacities and SH coefficients of one block are trained, and their oracles."""
+
+    def __init__(self, dev, rng, n, block=SH_BLOCKS[0], lazy=True, scale=None):
+        self.dev, self.n, self.block, self.lazy, self.scale = dev, n, block, lazy, scale
+        self.ids = np.sort(rng.choice(np.prod(GRID.dims), n, replace=False)).astype(np.uint32)
+        self.start = {
+            "opacity": rng.random(n).astype(np.float32),
+            "sh": rng.standard_normal((n, block.count, 16)).astype(np.float32),
+        }
+        self.oracles = {name: oracle_optim.Adam(start) for name, start in self.start.items()}
+        self.adam, self.steps = PointAdam(dev, scale), 0
+        self.last_step = dev.zeros((n,), np.uint32)
+        self.opacity, self.sh = dev.upload(self.start["opacity"]), dev.upload(self.start["sh"])
+        self.opacity_moments = moments(dev, self.start["opacity"])
+        self.sh_moments = sh_moments(dev, block, n, scale)
+        self.scene = [
+            dev.upload(GRID.packed()),
+            dev.upload(CAMERA.packed((2.0, 6.0))),
+            dev.upload(self.ids),
+        ]
+
+    def updated(self, rows):
+        """The points of this step."""
+        if not self.lazy:
+            return self.adam.all_points(self.steps, self.n)
+        rows = self.dev.upload(rows, np.uint32)
+        return self.adam.listed_points(self.steps, rows, self.last_step)
+
+    def update_opacity(self, updated, grad_opacity):
+        self.adam.update_opacity(
+            updated, grad_opacity, self.opacity, self.opacity_moments, rate=0.03, eps=1e-15
+        )
+
+    def step(self, grad_features, grad_opacity, rows, step=None):
+        """Update the rows; the kernels must not read the gradients of the others, which are NaN."""
+        self.steps = step or self.steps + 1
+        for oracle in self.oracles.values():
+            oracle.t = self.steps - 1
+        listed = np.isin(np.arange(self.n), rows)
+        features, opacities = (
+            self.dev.upload(
+                np.where(listed.reshape(-1, *[1] * (g.ndim - 1)), g, np.nan), np.float32
+            )
+            for g in (grad_features, grad_opacity)
+        )
+        updated, product = self.updated(rows), ShGradient(*self.scene, features)
+        self.adam.update_sh(
+            updated,
+            self.block,
+            product,
+            self.sh,
+            moments=self.sh_moments,
+            rate=0.1,
+            eps=SH_EPS,
+        )
+        self.update_opacity(updated, opacities)
+        gradient = oracle_optim.sh_gradient(
+            GRID.positions(self.ids), EYE, grad_features, self.block
+        )
+        self.oracles["sh"].step(gradient, 0.1, SH_EPS, rows=rows)
+        self.oracles["opacity"].step(grad_opacity, 0.03, 1e-15, low=0, high=1, rows=rows)
+
+    def state(self):
+        """{name: (parameter, m, v)} on the host."""
+        if self.scale is None:
+            sh = [self.sh.get(), *(array.get() for array in self.sh_moments.values())]
+        else:
+            m, root = np.moveaxis(self.sh_moments["mv"].get().astype(np.float64), 2, 0) / self.scale
+            sh = [self.sh.get(), m, root**2]
+        opacity = [self.opacity, *self.opacity_moments.values()]
+        return {"sh": sh, "opacity": [array.get() for array in opacity]}
+
+    def check(self):
+        """Compare parameters and moments with the oracle's."""
+        for name, (parameter, m, v) in self.state().items():
+            oracle = self.oracles[name]
+            assert relative_error(parameter, oracle.parameter) < 1e-6
+            assert relative_error(m, oracle.m) < 1e-6
+            assert relative_error(v, oracle.v) < 3e-6
+
+
+def gradients(rng, n):
+    """(of the features, of the opacity); every third point's are 0."""
+    features, opacity = 1e-4 * rng.standard_normal((n, 16)), 1e-5 * rng.standard_normal(n)
+    features[::3], opacity[::3] = 0, 0
+    return features.astype(np.float32), opacity.astype(np.float32)
