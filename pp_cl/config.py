@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from pp_cl.errors import UserError
+from pp_cl.presets import ABSENT, PRESETS, RENAMED
 
 
 def setting(
@@ -39,6 +40,7 @@ class PointsConfig:
     """The point cloud."""
 
     count: int = setting(250_000, "number of grid points aimed at in the visual hull", 1, 2**27)
+    opacity: float = setting(0.1, "opacity of all points before training", 0, 1)
     sh_degree: int = setting(
         2, "degree of the spherical harmonics (SH): 0 (the same from all sides), 1 or 2", 0, 2
     )
@@ -59,8 +61,13 @@ class RasterConfig:
         1e-6,
         100,
     )
+    blend: str = setting(
+        "alpha",
+        "alpha: compositing from front to back; softmax: the paper's Eq. (1)",
+        choices=("softmax", "alpha"),
+    )
     gamma: tuple = setting(
-        (0.1, 0.01), "depth sharpness of the blend at the first and the last step", 1e-5, 1
+        (0.1, 0.01), "depth sharpness of the softmax at the first and the last step", 1e-5, 1
     )
     max_tracked: int = setting(
         0,
@@ -69,9 +76,9 @@ class RasterConfig:
         2**31 - 1,
     )
     early_stop: float = setting(
-        0.0,
+        0.001,
         "early termination: stop blending a pixel once no further hit can contribute more than"
-        " this share (0: never; paper: 0.001)",
+        " this share (0: never)",
         0,
         0.5,
     )
@@ -130,13 +137,13 @@ class TrainConfig:
         1e3,
     )
     opacity_rate: tuple = setting(
-        (3e-2, 3e-3), "Adam's learning rate at the first and the last step", 1e-12, 100
+        (1e-1, 1e-2), "Adam's learning rate at the first and the last step", 1e-12, 100
     )
     lazy_adam: bool = setting(
         False, "update only points that received a gradient; false: momentum moves the others too"
     )
     moments_16bit: bool = setting(False, "store Adam's moments of the SH coefficients in 16 bits")
-    dropout: float = setting(0.15, "share of the points left out at random in each step", 0, 0.95)
+    dropout: float = setting(0.0, "share of the points left out at random in each step", 0, 0.95)
     sh_smoothing: float = setting(
         0.03,
         "per step, pull the SH towards the mean of the grid neighbours by this times the SH"
@@ -189,68 +196,6 @@ class Config:
         stored = dataclasses.asdict(self)
         del stored["notes"]
         return json.dumps(stored, indent=1)
-
-
-# What differs from the defaults above, which are the tiny preset: minutes on a CPU.
-PRESETS = {
-    "tiny": {},
-    # for 400 x 400; 8000 steps take a quarter of an hour on a CPU, all 20,000 were not timed
-    "small": {"points.count": 1_000_000, "train.iterations": 20_000, "train.crop": 192},
-    "paper": {
-        # Stated by the supplemental, as are the defaults of raster.gamma, train.sh_rate and its
-        # decay, and the delays of 0, 500 and 1000 steps.
-        "points.count": 4_000_000,
-        "raster.footprint": "disc",
-        "raster.radius": 0.0015,
-        "raster.max_tracked": 64,
-        "raster.early_stop": 0.001,
-        "network.widths": (128, 256, 512),
-        # Inferred from INPC, a later method of the same first author: the supplemental gives no
-        # number.
-        "network.rate": (3e-4, 5e-5),
-        "train.iterations": 50_000,
-        "train.crop": 0,
-        # Ours: the supplemental mentions no jitter, dropout, smoothing or averaging, and no rule
-        # of pruning. Ours in all presets: the loss and its weight, Adam's eps, the opacity's rate.
-        "train.pixel_jitter": False,
-        "train.dropout": 0.0,
-        "train.sh_smoothing": 0.0,
-        "train.ema": False,
-        "train.prune_weight": 1e-4,
-        "train.prune_every": 500,
-        "train.checkpoint_every": 5000,
-    },
-}
-
-# Settings with a short name on the command line and in run.train_scene().
-SHORT = {
-    "iterations": "train.iterations",
-    "points": "points.count",
-    "downscale": "scene.downscale",
-    "seed": "train.seed",
-    "memory": "train.memory_gib",
-    "tolerance": "network.tolerance",
-}
-
-# Old key: new key. Old keys are accepted in this version and noted in Config.notes.
-RENAMED = {
-    "points.footprint": "raster.footprint",
-    "points.radius": "raster.radius",
-    "points.gamma": "raster.gamma",
-    "points.max_tracked": "raster.max_tracked",
-    "points.stop": "raster.early_stop",
-    "points.tau": "raster.tau",
-    "points.mean_gradient": "raster.mean_gradient",
-    "train.phases": "train.pixel_jitter",
-    "train.feature_eps": "train.sh_eps",
-    "train.lazy": "train.lazy_adam",
-    "train.half_moments": "train.moments_16bit",
-    "train.smooth": "train.sh_smoothing",
-    "train.smooth_every": "train.sh_smoothing_every",
-    "train.final_weight": "train.final_prune_weight",
-    "train.average": "train.ema",
-    "train.memory": "train.memory_gib",
-}
 
 
 def preset(name: str) -> Config:
@@ -367,6 +312,8 @@ def load_config(path: Path | str) -> Config:
             " new run"
         )
     config = preset(stored.pop("preset"))
+    for key, value in ABSENT.items():
+        assign(config, key, value, str(path))
     for section, values in stored.items():
         if not isinstance(values, dict):
             raise UserError(f"{path}: {section} is not an object")

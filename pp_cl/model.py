@@ -50,12 +50,13 @@ class Model:
         *,
         net: UNet,
         degree: int = SH_DEGREES[-1],
+        opacity: float = 1.0,
     ) -> Model:
-        """Fresh model: points of opacity 1 with SH coefficients of 0, and a network.
+        """Fresh model: points of one opacity with SH coefficients of 0, and a network.
 
         ids: (N) ascending grid vertices. degree: of the SH, 0 to 2.
         """
-        return cls(dev, grid, depth_range, PointCloud.create(dev, ids, degree), net=net)
+        return cls(dev, grid, depth_range, PointCloud.create(dev, ids, degree, opacity), net=net)
 
     def header(self) -> dict:
         """JSON-able description that load() needs beside the arrays."""

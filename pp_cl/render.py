@@ -16,8 +16,8 @@ from pp_cl.config import RasterConfig
 from pp_cl.device.buffers import Buffers, Table
 from pp_cl.device.device import Device
 from pp_cl.model import Model
-from pp_cl.raster.blend import BACKGROUND, Blend
-from pp_cl.raster.blend_weights import BlendWeights, PixelWeights
+from pp_cl.raster.blend import BACKGROUND, BLENDS, Blend
+from pp_cl.raster.blend_weights import PixelWeights
 from pp_cl.raster.pair_cache import PairCache
 from pp_cl.raster.pairs import PairBuilder, Pairs
 from pp_cl.raster.project import Footprint, ProjectedPoints, Projection
@@ -95,8 +95,8 @@ class Renderer:
         footprint = Footprint(settings.footprint)
         self._projection = Projection(dev, footprint)
         self._pairs = PairBuilder(dev, footprint)
-        self._weights = BlendWeights(dev)
-        self._blend = Blend(dev, footprint, settings.mean_gradient)
+        self._weights = BLENDS[settings.blend](dev)
+        self._blend = Blend(dev, footprint, self._weights, settings.mean_gradient)
         self._buffers = Buffers(dev)
 
     @staticmethod

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from pp_cl.config import SHORT, Config, assign, load_config, preset, sections, validate
+from pp_cl.config import Config, assign, load_config, preset, sections, validate
 from pp_cl.device.device import Device
 from pp_cl.device.discover import open_device
 from pp_cl.errors import UserError
@@ -19,6 +19,7 @@ from pp_cl.files.run_folder import RunFolder
 from pp_cl.layers.policy import ConvolutionPolicy, load_policy, policy_of_run
 from pp_cl.model import Model
 from pp_cl.network.unet import UNet
+from pp_cl.presets import SHORT
 from pp_cl.render import Renderer
 from pp_cl.scene.camera import Camera
 from pp_cl.scene.hull import build_grid, depth_range, spacing_pixels
@@ -327,8 +328,16 @@ def _start(config, views, net):
         near_far,
         time.perf_counter() - start,
     )
-    degree = config.points.sh_degree
-    model = Model.create(dev, hull.grid, hull.ids, near_far, net=net, degree=degree)
+    points = config.points
+    model = Model.create(
+        dev,
+        hull.grid,
+        hull.ids,
+        near_far,
+        net=net,
+        degree=points.sh_degree,
+        opacity=points.opacity,
+    )
     trainer = Trainer(dev, config, model, views)
     return trainer, {"scene": fingerprint(views), "initial_points": facts.points}, facts
 
@@ -367,7 +376,7 @@ def train_scene(
     alone.
 
     scene: a folder, or the word demo. device: as `pp-cl train --device`. settings: {"section.key":
-    value}; options: the same by the short names of config.SHORT, such as iterations. on_step: see
+    value}; options: the same by the short names of presets.SHORT, such as iterations. on_step: see
     Training.run. Raises UserError as `pp-cl train` reports it.
     """
     unknown = set(options) - set(SHORT)

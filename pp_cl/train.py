@@ -69,8 +69,9 @@ class Trainer:
 
         view = self.views[view_index]
         camera = view.crop_camera(box, jitter)
-        self._target.load(view)
-        target = self._target.crop(box, jitter)
+        with self.dev.stage("target"):
+            self._target.load(view)
+            target = self._target.crop(box, jitter)
 
         rendered = self.renderer.forward(
             camera,
@@ -80,17 +81,20 @@ class Trainer:
             training=True,
             key=view_index if views_repeat(config, view.downscale) else None,
         )
-        grad_image = self.loss.forward_backward(rendered.image, target, *rendered.offset)
+        with self.dev.stage("loss"):
+            grad_image = self.loss.forward_backward(rendered.image, target, *rendered.offset)
         grads = self.renderer.backward(rendered, grad_image)
-        self.optimiser.update(
-            t + 1,
-            rates,
-            grads,
-            camera_buffer=rendered.camera_buffer,
-            shaded=rendered.shaded,
-            sh_eps=config.sh_eps / target.size,
-        )
-        self.renderer.add_point_weights(rendered, self.state.weight_sum)
+        with self.dev.stage("update"):
+            self.optimiser.update(
+                t + 1,
+                rates,
+                grads,
+                camera_buffer=rendered.camera_buffer,
+                shaded=rendered.shaded,
+                sh_eps=config.sh_eps / target.size,
+            )
+        with self.dev.stage("sums"):
+            self.renderer.add_point_weights(rendered, self.state.weight_sum)
 
         self.step = t + 1
         self._regularise(rates)
@@ -137,12 +141,15 @@ class Trainer:
         """Grid smoothing, averaging and pruning, where they are due after this step."""
         config, t = self.config, self.step
         if config.sh_smoothing > 0 and t % config.sh_smoothing_every == 0:
-            self._smooth(rates)
+            with self.dev.stage("smoothing"):
+                self._smooth(rates)
         weight = ema_weight(t, config.iterations) if config.ema else 0
         if weight > 0:
-            self.optimiser.update_ema(weight)
+            with self.dev.stage("averages"):
+                self.optimiser.update_ema(weight)
         if t % config.prune_every == 0 and t < config.iterations:
-            self.prune(self.state.weight_sum, config.prune_weight * config.prune_every)
+            with self.dev.stage("pruning"):
+                self.prune(self.state.weight_sum, config.prune_weight * config.prune_every)
             self.dev.fill(self.state.weight_sum, 0)
 
     def _smooth(self, rates):

@@ -4,8 +4,9 @@ import json
 
 import pytest
 
-from pp_cl.config import PRESETS, RENAMED, Config, assign, help_lines, load_config, preset, validate
+from pp_cl.config import Config, assign, help_lines, load_config, preset, validate
 from pp_cl.errors import UserError
+from pp_cl.presets import PRESETS, RENAMED
 
 
 @pytest.mark.parametrize("name", PRESETS)
@@ -18,9 +19,10 @@ def test_presets_are_valid_and_survive_json(name, tmp_path):
 
 @pytest.mark.parametrize("name", PRESETS)
 def test_a_key_that_a_stored_run_lacks_has_its_presets_value(name, tmp_path):
+    """Unless the key came later: the run had the former behaviour."""
     (tmp_path / "config.json").write_text(json.dumps({"preset": name, "train": {"seed": 3}}))
     expected = preset(name)
-    expected.train.seed = 3
+    expected.train.seed, expected.raster.blend, expected.points.opacity = 3, "softmax", 1.0
     assert load_config(tmp_path / "config.json") == expected
 
 
@@ -42,7 +44,7 @@ def test_a_run_with_old_keys_loads_with_one_note(tmp_path):
         section, name = new.split(".")
         former, former_name = old.split(".")
         stored[former][former_name] = stored[section].pop(name)
-    assert not stored.pop("raster")
+    assert stored.pop("raster") == {"blend": "softmax"}  # the one key that had no former name
     (tmp_path / "config.json").write_text(json.dumps(stored))
     config = load_config(tmp_path / "config.json")
     assert config == preset("paper")

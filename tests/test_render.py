@@ -14,6 +14,7 @@ from support.networks import plain_parameters
 from support.scenes import ring_cameras
 
 from pp_cl.config import RasterConfig
+from pp_cl.raster.blend import BLENDS
 from pp_cl.render import PAPER_DEPTH_RANGE, Renderer
 
 GAMMA = 0.03
@@ -37,7 +38,11 @@ def chained(model, settings, camera, opacity=None, sh=None, tracked=0):
     geometry = oracle_raster.geometry(
         padded, positions, settings.radius * spacing_or_world, settings.footprint
     )
-    blend = oracle_raster.blend(geometry, opacity, GAMMA, settings.early_stop)
+    alpha = settings.blend == "alpha"
+    if alpha:
+        blend = oracle_raster.alpha(geometry, opacity, settings.early_stop)
+    else:
+        blend = oracle_raster.blend(geometry, opacity, GAMMA, settings.early_stop)
     shaded = oracle_raster.shade(positions, padded.eye, sh)
     features = oracle_raster.features(blend, shaded)
     parameters = plain_parameters(model.net, model.net.parameters)
@@ -48,16 +53,22 @@ def chained(model, settings, camera, opacity=None, sh=None, tracked=0):
         grad_features, grad_net = unet_gradients(
             features.reshape(*shape, 16), parameters, grad_picture
         )
-        grad_shaded, grad_opacity, _ = oracle_raster.blend_gradients(
-            geometry,
-            blend,
-            opacity,
-            shaded,
-            grad_features.reshape(-1, 16),
-            GAMMA,
-            tracked,
-            settings.mean_gradient,
-        )
+        grad_features = grad_features.reshape(-1, 16)
+        if alpha:
+            grad_shaded, grad_opacity, _ = oracle_raster.alpha_gradients(
+                geometry, blend, shaded, grad_features, tracked, settings.mean_gradient
+            )
+        else:
+            grad_shaded, grad_opacity, _ = oracle_raster.blend_gradients(
+                geometry,
+                blend,
+                opacity,
+                shaded,
+                grad_features,
+                GAMMA,
+                tracked,
+                settings.mean_gradient,
+            )
         directions = positions - padded.eye
         basis = oracle_raster.sh_basis(
             directions / np.linalg.norm(directions, axis=1, keepdims=True)
@@ -68,22 +79,25 @@ def chained(model, settings, camera, opacity=None, sh=None, tracked=0):
 
 
 SETTINGS = {
-    "soft": RasterConfig(),
-    "soft, wide": RasterConfig(radius=1.4),
-    "disc": RasterConfig(footprint="disc", radius=0.0015),
-    "disc, the paper's gradients": RasterConfig(
-        footprint="disc", radius=0.0015, max_tracked=3, early_stop=0.001
-    ),
-    "sphere": RasterConfig(footprint="sphere", radius=0.11),
-    "sphere, Pulsar's gradients": RasterConfig(
-        footprint="sphere", radius=0.11, max_tracked=5, mean_gradient=True
-    ),
+    "soft": {},
+    "soft, wide": {"radius": 1.4},
+    "disc": {"footprint": "disc", "radius": 0.0015},
+    "disc, the paper's gradients": {"footprint": "disc", "radius": 0.0015, "max_tracked": 3},
+    "sphere": {"footprint": "sphere", "radius": 0.11},
+    "sphere, Pulsar's gradients": {
+        "footprint": "sphere",
+        "radius": 0.11,
+        "max_tracked": 5,
+        "mean_gradient": True,
+    },
 }
 
 
+@pytest.mark.parametrize("blend", BLENDS)
+@pytest.mark.parametrize("early_stop", [0.0, 0.001])
 @pytest.mark.parametrize("name", SETTINGS)
-def test_picture_and_gradients(dev, rng, name):
-    settings = SETTINGS[name]
+def test_picture_and_gradients(dev, rng, name, early_stop, blend):
+    settings = RasterConfig(blend=blend, early_stop=early_stop, **SETTINGS[name])
     model, camera = make_model(dev, rng), ring_cameras(1, 30)[0].crop(3, 4, 22, 17)
     renderer = Renderer(dev, model, settings)
     result = renderer.forward(camera, GAMMA, training=True)

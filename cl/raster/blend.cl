@@ -1,8 +1,10 @@
-// Eq. (1) of the PlenopticPoints supplemental: features blended by the weights of blend_weights.cl,
-// and gradients by gathering.
+// Features blended by the weights of softmax.cl or alpha.cl, and gradients by gathering.
 //
-// F = sum b_i f_i + b_0 * 1
-// dL/df_i = sum b_i G,  dL/do_i = sum G.(f_i - F) b_i (1/o_i + z_i/gamma)  with G = dL/dF
+// F = sum b_i f_i + b_0 * 1, with G = dL/dF
+// dL/df_i = sum b_i G,  dL/do_i = sum s_i (G.f_i - rest)
+//
+// s_i is the second value of pair_weight; rest is what takes the place of a hit that fades: in the
+// softmax all of the pixel's hits, G.F, in alpha compositing those behind it.
 //
 // vec_type_hint: the vectors are written out; Intel's compiler would merge work-items into wider
 // ones, up to 8 times slower.
@@ -13,6 +15,9 @@
 
 #ifndef HAS_ROLES
 #define HAS_ROLES 1  // 0: every pair is tracked, and pair_role is not read
+#endif
+#ifndef REST_BY_PAIR
+#define REST_BY_PAIR 0  // 0: rest is one value a pixel
 #endif
 #ifndef MEAN
 #define MEAN 0  // 1: gradients are divided by the number of pixels that track the point (Pulsar)
@@ -39,18 +44,6 @@ kernel void blend_forward(
     features[q] = sum + (1.0f - weights);
 }
 
-// One work-item per pixel: writes G.F, the part of G.(f - F) that all its points share.
-kernel void blend_backward_pixels(
-    const uint hw,                        // pixels
-    global const float16 *features,       // (H, W, 16) F
-    global const float16 *grad_features,  // (H, W, 16) G
-    global float *pixel_dot)              // (HW)
-{
-    const uint q = get_global_id(0);
-    if (q >= hw) return;
-    pixel_dot[q] = dot16(grad_features[q], features[q]);
-}
-
 // One work-item per point: reads its pairs and their pixels' gradients, writes the gradients of its
 // features and opacity.
 kernel __attribute__((vec_type_hint(float16))) void blend_backward(
@@ -61,7 +54,7 @@ kernel __attribute__((vec_type_hint(float16))) void blend_backward(
     global const float2 *pair_weight,      // (P, 2)
     global const uchar *pair_role,         // (?) P with HAS_ROLES
     global const float16 *grad_features,   // (H, W, 16) G
-    global const float *pixel_dot,         // (HW) G.F
+    global const float *rest,              // (HW), or (P) with REST_BY_PAIR
     global float16 *grad_point_features,   // (N, 16)
     global float *grad_opacity)            // (N)
 {
@@ -76,7 +69,7 @@ kernel __attribute__((vec_type_hint(float16))) void blend_backward(
         const uint q = pair_pixel[pair];
         const float16 G = grad_features[q];
         dL_df += weight.x * G;
-        dL_do += weight.y * (dot16(G, point_features[i]) - pixel_dot[q]);
+        dL_do += weight.y * (dot16(G, point_features[i]) - rest[REST_BY_PAIR ? pair : q]);
         tracked++;
     }
     const float scale = MEAN && tracked ? 1.0f / tracked : 1.0f;
@@ -94,7 +87,7 @@ kernel void blend_backward_pairs(
     global const float2 *pair_weight,          // (P, 2)
     global const uchar *pair_role,             // (?) P with HAS_ROLES
     global const float16 *grad_features,       // (H, W, 16) G
-    global const float *pixel_dot,             // (HW) G.F
+    global const float *rest,                  // (HW) G.F
     global const uint2 *pair_point_closeness,  // (P, 2) point, bits of d
     global float2 *grad_pair)                  // (P, 2) dL/dl, dL/dd
 {
@@ -107,9 +100,10 @@ kernel void blend_backward_pairs(
     for (uint pair = point_offset[i]; pair < point_offset[i + 1]; pair++) {
         const uint q = pair_pixel[pair];
         const float b = pair_weight[pair].x, d = as_float(pair_point_closeness[pair].y);
+        const float others = rest[REST_BY_PAIR ? pair : q];
         float dL_dl = 0.0f;
         if (!HAS_ROLES || pair_role[pair] == TRACKED)
-            dL_dl = scale * b * (dot16(grad_features[q], point_features[i]) - pixel_dot[q]);
+            dL_dl = scale * b * (dot16(grad_features[q], point_features[i]) - others);
         grad_pair[pair] = (float2)(dL_dl, d > 0.0f ? dL_dl / d : 0.0f);
     }
 }

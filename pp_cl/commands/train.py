@@ -4,7 +4,8 @@ import argparse
 import sys
 
 from pp_cl.commands import options as shared
-from pp_cl.config import PRESETS, SHORT, help_lines
+from pp_cl.config import help_lines
+from pp_cl.presets import PRESETS, SHORT
 
 HELP = "learn a scene; the same command resumes an unfinished run"
 EPILOG = "settings (--set), with the tiny preset's values:\n" + "\n".join(help_lines())

@@ -4,8 +4,9 @@ import argparse
 import time
 
 from pp_cl.commands import options as shared
-from pp_cl.config import PRESETS, preset
+from pp_cl.config import preset
 from pp_cl.errors import UserError
+from pp_cl.presets import PRESETS
 
 HELP = "time the variants of the convolutions on this device, keep the fastest"
 

@@ -1,7 +1,8 @@
-"""The blend of Eq. (1): features of pixels, and gradients gathered by point."""
+"""The blend of features by their weights, and its gradients gathered by point."""
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -9,10 +10,13 @@ from pyopencl.array import Array
 
 from pp_cl.device.buffers import Buffers, Table
 from pp_cl.device.device import Device
-from pp_cl.raster.blend_weights import PixelWeights
+from pp_cl.raster.alpha import Alpha
+from pp_cl.raster.blend_weights import BlendWeights, PixelWeights
 from pp_cl.raster.pairs import Pairs
 from pp_cl.raster.project import Footprint, ProjectedPoints
+from pp_cl.raster.softmax import Softmax
 
+BLENDS: dict[str, type[BlendWeights]] = {"softmax": Softmax, "alpha": Alpha}  # raster.blend
 BACKGROUND = 1.0  # every feature of a pixel without hits (cl/raster/blend.cl)
 
 
@@ -20,33 +24,44 @@ BACKGROUND = 1.0  # every feature of a pixel without hits (cl/raster/blend.cl)
 class BlendGradient:
     """What all gradients of one blend are made of.
 
-    point_features: (N, 16), as in Blend.forward. grad_features: (H, W, 16), G = dL/dF. pixel_dot:
-    (HW,), G.F. All float32.
+    point_features: (N, 16), as in Blend.forward. grad_features: (H, W, 16), G = dL/dF. rest: of
+    BlendWeights.rest. All float32.
     """
 
     pairs: Pairs
     weights: PixelWeights
     point_features: Array
     grad_features: Array
-    pixel_dot: Array
+    rest: Array
 
 
 class Blend:
     """Blends features by PixelWeights.
 
-    mean_gradient: a point's gradients are divided by its number of tracked pixels, as Pulsar does.
+    weighing: what computes them. mean_gradient: a point's gradients are divided by its number of
+    tracked pixels, as Pulsar does.
     """
 
-    def __init__(self, dev: Device, footprint: Footprint, mean_gradient: bool = False):
+    def __init__(
+        self,
+        dev: Device,
+        footprint: Footprint,
+        weighing: BlendWeights,
+        mean_gradient: bool = False,
+    ):
         self.dev = dev
-        self.defines = {"MEAN": int(mean_gradient), **footprint.defines}
+        self.weighing = weighing
+        self.defines = {
+            "MEAN": int(mean_gradient),
+            "REST_BY_PAIR": int(weighing.rest_by_pair),
+            **footprint.defines,
+        }
         self._buffers = Buffers(dev)
 
     @staticmethod
-    def table(n: int, pixels: int) -> Table:
-        """The buffers for n points and a number of pixels."""
+    def table(n: int) -> Table:
+        """The buffers for n points."""
         return {
-            "pixel_dot": ((pixels,), np.float32),
             "grad_point_features": ((n, 16), np.float32),
             "grad_opacity": ((n,), np.float32),
         }
@@ -78,16 +93,11 @@ class Blend:
         grad_features: Array,
     ) -> BlendGradient:
         """Prepare the backward pass of forward(pairs, weights, point_features, features)."""
-        self._buffers.require(self.table(pairs.points, pairs.pixels))
-        self._program(weights).launch(
-            "blend_backward_pixels",
-            pairs.pixels,
-            hw=pairs.pixels,
-            features=features,
-            grad_features=grad_features,
-            pixel_dot=self._buffers.pixel_dot,
+        self._buffers.require(self.table(pairs.points))
+        rest = self.weighing.rest(
+            pairs, weights, point_features, features=features, grad_features=grad_features
         )
-        return BlendGradient(pairs, weights, point_features, grad_features, self._buffers.pixel_dot)
+        return BlendGradient(pairs, weights, point_features, grad_features, rest)
 
     def backward(self, gradient: BlendGradient) -> tuple[Array, Array]:
         """(grad_point_features (N, 16), grad_opacity (N,)) float32, valid until the next call.
@@ -121,7 +131,7 @@ class Blend:
             n,
             n=n,
             radii=points.point_radius.size,
-            gamma=gamma,
+            gamma=gamma if self.weighing.depends_on_depth else math.inf,
             camera=points.camera_buffer,
             point_radius=points.point_radius,
             point_camera=points.point_camera,
@@ -147,7 +157,7 @@ class Blend:
             pair_weight=weights.pair_weight,
             pair_role=weights.pair_role,
             grad_features=gradient.grad_features,
-            pixel_dot=gradient.pixel_dot,
+            rest=gradient.rest,
             **outputs,
         )
 

@@ -1,9 +1,10 @@
-"""The blend weights of Eq. (1), and which hits are dropped because they change a pixel by less than
-a bound.
+"""What the two blends have in common: the weights of a view's pairs, and what they mean for the
+points.
 """
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from dataclasses import dataclass
 
 import numpy as np
@@ -14,17 +15,20 @@ from pp_cl.device.device import Device
 from pp_cl.device.scan import nonzero
 from pp_cl.raster.pairs import Pairs
 
+DROPPED = 2  # cl/raster/pair_role.h
+
 
 @dataclass(frozen=True)
 class PixelWeights:
     """The blend weights of a Pairs object, valid until the next ones are computed.
 
     has_roles: some pairs may be untracked or dropped; else all are tracked and pair_role is unread.
-    pair_weight: (P, 2) float32, the weight b of Eq. (1), and b (1/o + z/gamma), which times
-    G.(f - F) is dL/do. pair_role: (P,) uint8, cl/raster/pair_role.h. pixel_entry: (P,) uint64,
-    weight bits << 32 | point, each pixel's hits by depth; dropped hits end a pixel's list with an
-    entry of no point that holds their weight. shaded: (S,) uint32, ascending, the points with a hit
-    that is not dropped: no other point's features are read, no other point gets a gradient.
+    pair_weight: (P, 2) float32, the weight b, and s, which times G.f - rest is dL/do
+    (cl/raster/blend.cl); undefined where the pair is dropped. pair_role: (P,) uint8,
+    cl/raster/pair_role.h. pixel_entry: (P,) uint64, weight bits << 32 | point, each pixel's hits by
+    depth; dropped hits end a pixel's list with an entry of no point that holds their weight or a
+    bound of it. shaded: (S,) uint32, ascending, the points with a hit that is not dropped: no other
+    point's features are read, no other point gets a gradient.
     """
 
     has_roles: bool
@@ -34,8 +38,15 @@ class PixelWeights:
     shaded: Array
 
 
-class BlendWeights:
-    """Computes blend weights; the buffers grow and are reused."""
+class BlendWeights(ABC):
+    """Computes blend weights and what their gradients need; the buffers grow and are reused.
+
+    rest_by_pair: rest() has one value a pair, else one a pixel. depends_on_depth: the weights
+    change with the depth of a hit, not only with the order of the hits.
+    """
+
+    rest_by_pair: bool
+    depends_on_depth: bool
 
     def __init__(self, dev: Device):
         self.dev = dev
@@ -57,6 +68,12 @@ class BlendWeights:
         }
         return always | listing if has_roles else always
 
+    @classmethod
+    @abstractmethod
+    def own_table(cls, pixels: int, pairs: int) -> Table:
+        """The buffers of one blend beside those of table()."""
+
+    @abstractmethod
     def compute(
         self,
         pairs: Pairs,
@@ -70,45 +87,45 @@ class BlendWeights:
     ) -> PixelWeights:
         """The weights of all pairs.
 
-        opacity: (N,) float32 in [0, 1]. max_tracked: only this many nearest hits of a pixel get
-        gradients (64 in the paper); 0: all. early_stop: Pulsar's percent_allowed_difference, in
-        [0, 1), 0.001 in the paper: a pixel drops all hits behind the depth where no hit can have
-        this share any more; 0: none. tau: in [0, 1): a pixel drops hits, from the back on, whose
-        weights sum to at most tau; no feature of the pixel changes by more than tau times the range
-        of that feature over the pixel's points and the background. 0: none.
+        opacity: (N,) float32 in [0, 1]. gamma: depth sharpness of the softmax. max_tracked: only
+        this many nearest hits of a pixel get gradients (64 in the paper); 0: all. early_stop: in
+        [0, 1): a pixel drops all hits behind the depth where no hit can have this share any more;
+        0: none. tau: in [0, 1): a pixel drops hits whose weights sum to at most tau; no feature of
+        the pixel changes by more than tau times the range of that feature over the pixel's points
+        and the background. 0: none.
         """
-        drops = early_stop > 0 or tau > 0
-        has_roles = drops or max_tracked > 0
+
+    @abstractmethod
+    def rest(
+        self,
+        pairs: Pairs,
+        weights: PixelWeights,
+        point_features: Array,
+        *,
+        features: Array,
+        grad_features: Array,
+    ) -> Array:
+        """(HW,) or, with rest_by_pair, (P,) float32: what G.f of a hit is compared with.
+
+        weights: the last ones computed. point_features: (N, 16); features, grad_features: F and
+        G, (H, W, 16), of Blend.forward with these weights.
+        """
+
+    def _reserve(self, pairs, has_roles):
+        """The buffers (pair_weight, pair_role, pixel_entry) for these pairs."""
         p, b = max(1, pairs.total), self._buffers
         self._capacity = grown(self._capacity, p)
-        b.require(self.table(pairs.points, self._capacity, has_roles))
-        pair_weight, pixel_entry = b.pair_weight[:p], b.pixel_entry[:p]
+        table = self.table(pairs.points, self._capacity, has_roles)
+        b.require(table | self.own_table(pairs.pixels, self._capacity))
         pair_role = b.pair_role[:p] if has_roles else b.pair_role
-        self._program(DROPS=int(drops), MAX_TRACKED=max_tracked).launch(
-            "blend_weights_forward",
-            pairs.pixels,
-            hw=pairs.pixels,
-            gamma=gamma,
-            early_stop=early_stop,
-            tau=tau,
-            camera=camera_buffer,
-            pixel_offset=pairs.pixel_offset,
-            pair_key=pairs.pair_key,
-            pair_point_closeness=pairs.pair_point_closeness,
-            opacity=opacity,
-            pair_weight=pair_weight,
-            pair_role=pair_role,
-            pixel_entry=pixel_entry,
-        )
-        shaded = self._list_shaded(pairs, pair_role) if drops else pairs.seen
-        return PixelWeights(has_roles, pair_weight, pair_role, pixel_entry, shaded)
+        return b.pair_weight[:p], pair_role, b.pixel_entry[:p]
 
     def dropped(self, pairs: Pairs, weights: PixelWeights) -> Array:
-        """(HW,) float32: the weight that tau dropped from each pixel, or a bound just above it; at
-        most tau.
+        """(HW,) float32: the weight that was dropped from each pixel, or a bound just above it; at
+        most tau, where no early_stop was given.
         """
         pixel_dropped = self.dev.empty((pairs.pixels,))
-        self._program().launch(
+        self._shared(weights).launch(
             "dropped_weights",
             pairs.pixels,
             hw=pairs.pixels,
@@ -120,19 +137,20 @@ class BlendWeights:
 
     def add_to_points(self, pairs: Pairs, weights: PixelWeights, point_weight: Array) -> None:
         """Add each point's blend weights, summed over the pixels, to point_weight (N,) float32."""
-        self._program().launch(
+        self._shared(weights).launch(
             "add_point_weights",
             pairs.points,
             n=pairs.points,
             point_offset=pairs.point_offset,
             pair_weight=weights.pair_weight,
+            pair_role=weights.pair_role,
             point_weight=point_weight,
         )
 
     def _list_shaded(self, pairs, pair_role):
         """The points with a hit that is not dropped. Waits for the device."""
         n, b = pairs.points, self._buffers
-        self._program().launch(
+        self.dev.program("raster/blend_weights").launch(
             "find_shaded_points",
             n,
             n=n,
@@ -142,5 +160,5 @@ class BlendWeights:
         )
         return b.shaded[: nonzero(self.dev, b.point_is_shaded, b.point_place, b.shaded)]
 
-    def _program(self, **defines):
-        return self.dev.program("raster/blend_weights", **defines)
+    def _shared(self, weights):
+        return self.dev.program("raster/blend_weights", HAS_ROLES=int(weights.has_roles))

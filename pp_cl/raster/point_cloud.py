@@ -44,13 +44,13 @@ class PointCloud:
         return table | {block.name: ((n, block.count, 16), np.float32) for block in blocks}
 
     @classmethod
-    def create(cls, dev: Device, ids: np.ndarray, degree: int) -> PointCloud:
-        """Points of opacity 1 with SH coefficients of 0. ids: (N), ascending."""
+    def create(cls, dev: Device, ids: np.ndarray, degree: int, opacity: float = 1.0) -> PointCloud:
+        """Points of one opacity with SH coefficients of 0. ids: (N), ascending."""
         blocks, n = sh_blocks(degree), len(ids)
         table = cls.table(n, blocks)
-        opacity = dev.upload(np.ones(n, np.float32))
+        opacities = dev.upload(np.full(n, opacity, np.float32))
         sh = [dev.zeros(*table[block.name]) for block in blocks]
-        return cls(dev.upload(ids, np.uint32), opacity, sh)
+        return cls(dev.upload(ids, np.uint32), opacities, sh)
 
     def learned(self) -> dict[str, Array]:
         """{name: array} of all that training changes: "opacity", and the SH by block."""

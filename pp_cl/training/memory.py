@@ -10,8 +10,7 @@ from pp_cl.device.compact import compact_table
 from pp_cl.device.device import Device
 from pp_cl.errors import UserError
 from pp_cl.model import Model
-from pp_cl.raster.blend import Blend
-from pp_cl.raster.blend_weights import BlendWeights
+from pp_cl.raster.blend import BLENDS, Blend
 from pp_cl.raster.pairs import PairBuilder
 from pp_cl.raster.point_cloud import PointCloud
 from pp_cl.raster.project import Projection
@@ -76,12 +75,16 @@ def _raster_tables(settings, n, size, pairs):
     true one is known only when a view has been projected.
     """
     pixels, room = size[0] * size[1], grown(0, round(pairs))
+    blend = BLENDS[settings.blend]
     has_roles = settings.early_stop > 0 or settings.tau > 0 or settings.max_tracked > 0
     return [
         ("projection", Projection.table(n)),
         ("pairs (estimate)", PairBuilder.table(n, pixels, room)),
-        ("blend weights (estimate)", BlendWeights.table(n, room, has_roles)),
-        ("blend", Blend.table(n, pixels)),
+        (
+            "blend weights (estimate)",
+            blend.table(n, room, has_roles) | blend.own_table(pixels, room),
+        ),
+        ("blend", Blend.table(n)),
         ("features", Renderer.table(n, *size)),
     ]
 

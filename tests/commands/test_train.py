@@ -6,7 +6,7 @@ from support.runs import arguments, train_and_interrupt
 from support.scenes import write_ball_scene
 
 from pp_cl.cli import main
-from pp_cl.config import RENAMED
+from pp_cl.presets import RENAMED
 
 
 def test_an_old_key_is_taken_and_named_on_one_line(tmp_path, capsys):

@@ -174,6 +174,50 @@ def blend_gradients(
     return scale[:, None] * (weight @ G), scale * dL_do, scale[:, None] * weight * s
 
 
+def alpha(geometry_, opacity, least=0.0):
+    """Dict of front-to-back compositing: alpha (N, HW); weight (N, HW) b; through (N, HW) T in
+    front of a hit; background (HW,) what is left; hit (N, HW) used: those where T >= least.
+    """
+    hit, ranks = geometry_["hit"], order(geometry_)
+    alpha_ = np.asarray(opacity, np.float64)[:, None] * geometry_["closeness"]
+    weight, through, used = np.zeros(hit.shape), np.zeros(hit.shape), np.zeros_like(hit)
+    background = np.ones(hit.shape[1])
+    for q in np.flatnonzero(hit.any(axis=0)):
+        points = np.flatnonzero(hit[:, q])
+        for i in points[np.argsort(ranks[points, q])]:
+            if background[q] < least:
+                break
+            used[i, q], through[i, q] = True, background[q]
+            weight[i, q] = background[q] * alpha_[i, q]
+            background[q] *= 1 - alpha_[i, q]
+    return {
+        "alpha": alpha_,
+        "weight": weight,
+        "through": through,
+        "background": background,
+        "hit": used,
+    }
+
+
+def alpha_gradients(geometry_, blend_, point_features, grad_features, max_tracked=0, mean=False):
+    """(dL/df (N, C), dL/do (N,), dL/dalpha (N, HW)) as blend_gradients."""
+    G, f = np.asarray(grad_features, np.float64), np.asarray(point_features, np.float64)
+    own, ranks = f @ G.T, order(geometry_)
+    slope = np.zeros_like(own)
+    for q in np.flatnonzero(blend_["hit"].any(axis=0)):
+        points = np.flatnonzero(blend_["hit"][:, q])
+        rest = G[q].sum()  # G times what is composited behind a hit
+        for i in points[np.argsort(-ranks[points, q])]:
+            slope[i, q] = blend_["through"][i, q] * (own[i, q] - rest)
+            rest += blend_["alpha"][i, q] * (own[i, q] - rest)
+    tracked = blend_["hit"] & (ranks < max_tracked) if max_tracked else blend_["hit"]
+    scale = 1 / np.maximum(tracked.sum(axis=1), 1) if mean else np.ones(len(f))
+    slope = np.where(tracked, slope, 0)
+    dL_do = (slope * geometry_["closeness"]).sum(axis=1)
+    weight = np.where(tracked, blend_["weight"], 0)
+    return scale[:, None] * (weight @ G), scale * dL_do, scale[:, None] * slope
+
+
 SH = (
     0.28209479177387814,
     0.4886025119029199,

@@ -8,27 +8,10 @@ import numpy as np
 import pytest
 from oracle import raster as oracle
 from support.comparisons import relative_error
-from support.raster_scene import PairedPoints, make_camera
+from support.raster_scene import AXIS as CAMERA
+from support.raster_scene import FAR, PairedPoints, blend_on_axis, depth_at
 
 pytestmark = pytest.mark.kernels
-
-NEAR, FAR = 2.0, 6.0
-CAMERA = replace(make_camera(1, 1), pose=np.eye(3, 4), fx=100.0, fy=100.0, cx=0.5, cy=0.5)
-
-
-def depth_at(z):
-    """Distance from the eye of normalised depth z."""
-    return FAR - np.asarray(z) * (FAR - NEAR)
-
-
-def blend_on_axis(dev, z, opacity, gamma, camera=CAMERA, **options):
-    """(PairedPoints, weights): points at normalised depths z ahead of a one-pixel camera, each
-    in its own channel.
-    """
-    positions = np.stack([np.zeros(len(z)), np.zeros(len(z)), depth_at(z)], -1)
-    scene = PairedPoints(dev, camera, positions, 0.001)
-    scene.blend(np.asarray(opacity), gamma, np.resize(np.eye(16), (len(z), 16)), **options)
-    return scene, scene.dense(scene.weights.pair_weight.get()[:, 0])[:, 0]
 
 
 def test_nearest_possible_point_at_the_final_gamma(dev):

@@ -2,11 +2,13 @@
 intermediate at hand.
 """
 
+from dataclasses import replace
+
 import numpy as np
 from oracle import raster as oracle
 
-from pp_cl.raster.blend import Blend
-from pp_cl.raster.blend_weights import BlendWeights
+from pp_cl.raster.blend import BLENDS, Blend
+from pp_cl.raster.blend_weights import DROPPED
 from pp_cl.raster.pairs import PairBuilder
 from pp_cl.raster.project import Footprint, Projection
 from pp_cl.scene.camera import Camera, look_at
@@ -67,12 +69,13 @@ class PairedPoints:
         """(N, HW) bool."""
         return self.dense(np.ones(max(1, self.pairs.total), bool), False)
 
-    def blend(self, opacity, gamma, point_features, mean=False, **drops):
+    def blend(self, opacity, gamma, point_features, *, mean=False, rule="softmax", **drops):
         """(H, W, 16) blended features; those of the points that are not shaded are set to NaN
-        first. drops: of BlendWeights.compute().
+        first. rule: of BLENDS. drops: of BlendWeights.compute().
         """
         self.gamma, self.opacity = gamma, self.dev.upload(opacity, np.float32)
-        self.blending, self.weighing = Blend(self.dev, self.footprint, mean), BlendWeights(self.dev)
+        self.weighing = BLENDS[rule](self.dev)
+        self.blending = Blend(self.dev, self.footprint, self.weighing, mean)
         self.weights = self.weighing.compute(
             self.pairs, self.camera_buffer, self.opacity, gamma, **drops
         )
@@ -83,6 +86,11 @@ class PairedPoints:
         self.features = self.dev.empty((*self.shape, 16))
         self.blending.forward(self.pairs, self.weights, self.point_features, self.features)
         return self.features.get()
+
+    def weight(self):
+        """(N, HW) the blend weights, 0 where a hit was dropped."""
+        weights = self.weights.pair_weight.get()[:, 0]
+        return self.dense(np.where(self.roles() == DROPPED, 0, weights))
 
     def roles(self):
         """(P,) numpy: cl/raster/pair_role.h of each pair."""
@@ -112,6 +120,26 @@ class PairedPoints:
         )
 
 
+NEAR, FAR = oracle.DEPTH_RANGE
+# a camera of one pixel that looks along z from the origin
+AXIS = replace(make_camera(1, 1), pose=np.eye(3, 4), fx=100.0, fy=100.0, cx=0.5, cy=0.5)
+
+
+def depth_at(z):
+    """Distance from the eye of normalised depth z."""
+    return FAR - np.asarray(z) * (FAR - NEAR)
+
+
+def blend_on_axis(dev, z, opacity, gamma, camera=AXIS, **options):
+    """(PairedPoints, weights): points at normalised depths z ahead of a one-pixel camera, each
+    in its own channel.
+    """
+    positions = np.stack([np.zeros(len(z)), np.zeros(len(z)), depth_at(z)], -1)
+    scene = PairedPoints(dev, camera, positions, 0.001)
+    scene.blend(np.asarray(opacity), gamma, np.resize(np.eye(16), (len(z), 16)), **options)
+    return scene, scene.weight()[:, 0]
+
+
 GAMMAS = (0.1, 0.01)
 
 
@@ -119,9 +147,18 @@ class Blended:
     """A random scene blended by the kernels and by the oracle, both with the kernels' hits."""
 
     def __init__(
-        self, dev, rng, n=257, kind="soft", gamma=0.1, radius=None, size=(24, 20), **blend
+        self,
+        dev,
+        rng,
+        n=257,
+        kind="soft",
+        gamma=0.1,
+        radius=None,
+        size=(24, 20),
+        rule="softmax",
+        **blend,
     ):
-        self.camera, self.gamma, self.kind = make_camera(*size), gamma, kind
+        self.camera, self.gamma, self.kind, self.rule = make_camera(*size), gamma, kind, rule
         self.positions = make_points(rng, n)
         self.radius = np.float32(
             rng.uniform(0.05, 0.5, n) if radius is None else np.full(n, radius)
@@ -132,14 +169,18 @@ class Blended:
         self.point_features = rng.normal(size=(n, 16))
         self.grad = rng.normal(size=(size[0] * size[1], 16))
         self.scene = PairedPoints(dev, self.camera, self.positions, self.radius, kind)
-        self.features = self.scene.blend(self.opacity, gamma, self.point_features, **blend).reshape(
-            -1, 16
-        )
+        self.features = self.scene.blend(
+            self.opacity, gamma, self.point_features, rule=rule, **blend
+        ).reshape(-1, 16)
         self.geometry = oracle.geometry(self.camera, self.positions, self.radius, kind) | {
             "hit": self.scene.hits()
         }
-        self.blend = oracle.blend(self.geometry, self.opacity, gamma, blend.get("early_stop", 0.0))
-        self.weight = self.scene.dense(self.scene.weights.pair_weight.get()[:, 0])
+        stop = blend.get("early_stop", 0.0)
+        if rule == "alpha":
+            self.blend = oracle.alpha(self.geometry, self.opacity, max(stop, blend.get("tau", 0.0)))
+        else:
+            self.blend = oracle.blend(self.geometry, self.opacity, gamma, stop)
+        self.weight = self.scene.weight()
         self.role = self.scene.dense(self.scene.roles())
 
     def gradients(self):
@@ -147,7 +188,11 @@ class Blended:
         return self.scene.gradients(self.grad)
 
     def oracle_gradients(self, max_tracked=0, mean=False):
-        """The same by the oracle: (features, opacity, by pair and logit)."""
+        """The same by the oracle: (features, opacity, by pair and logit, or by pair and alpha)."""
+        if self.rule == "alpha":
+            return oracle.alpha_gradients(
+                self.geometry, self.blend, self.point_features, self.grad, max_tracked, mean
+            )
         return oracle.blend_gradients(
             self.geometry,
             self.blend,

@@ -9,7 +9,7 @@ import tokenize
 
 # What a wing (or a module at the door) may import: its own floor and those below it.
 FLOORS = [
-    ("errors", "reference"),
+    ("errors", "reference", "presets"),
     ("config", "files", "device"),
     ("scene", "raster", "layers"),
     ("network", "metrics"),

@@ -1,0 +1,180 @@
+// The blend weights of Eq. (1) of the PlenopticPoints supplemental: each pixel's softmax over its
+// hits; which of them are dropped; and what that means for the points.
+//
+// a_i = o_i z_i/gamma,  b_i = o_i d_i exp(a_i - M)/D,  b_0 = exp(EPS/gamma - M)/D
+//
+// M is the largest of EPS/gamma and the a_i where d_i > 0, D the sum of all numerators. No exponent
+// is positive, and D does not vanish: a_i > 1 means o_i > gamma, and a d_i > 0 is at least 6e-8;
+// without any, b_0's numerator is at least 1/e.
+//
+// vec_type_hint: the vectors are written out; Intel's compiler would merge work-items into wider
+// ones, up to 8 times slower.
+#include "common.h"
+#include "camera.h"
+#include "raster/pair_role.h"
+#include "reduce.h"
+
+#ifndef DROPS
+#define DROPS 1  // early_stop or tau may be above 0
+#endif
+#ifndef MAX_TRACKED
+#define MAX_TRACKED 0  // nearest hits of a pixel that get gradients; 0: all
+#endif
+#define HAS_ROLES                                                                                  \
+    (DROPS || MAX_TRACKED)  // else every pair is TRACKED, and pair_role is not touched
+
+#define EPS 1e-6f    // depth of the background, as a z (Pulsar's background_normalized_depth)
+#define BATCH 16     // hits of a pixel handled at once, one lane each
+#define TAIL 0.125f  // a tail of hits whose bound is below this share of tau is not even weighed
+
+// What Eq. (1) needs of a batch of hits. Lanes without a hit have opacity and closeness 0, hence no
+// weight.
+typedef struct {
+    float16 opacity, closeness, z;
+} Hits;
+
+ALWAYS_INLINE Hits load_hits(
+    const Camera *cam,
+    global const ulong *key,
+    const uint count,
+    global const uint2 *pair_point_closeness,
+    global const float *opacity) {
+    float o[BATCH] = {0.0f}, d[BATCH] = {0.0f}, depth[BATCH] = {0.0f};
+    for (uint j = 0; j < count; j++) {
+        const ulong entry = key[j];
+        const uint2 hit = pair_point_closeness[(uint)entry];
+        o[j] = opacity[hit.x];
+        d[j] = as_float(hit.y);
+        depth[j] = as_float((uint)(entry >> 32));
+    }
+    Hits h;
+    h.opacity = vload16(0, o);
+    h.closeness = vload16(0, d);
+    h.z = 1.0f - (vload16(0, depth) - cam->near) / (cam->far - cam->near);
+    return h;
+}
+
+// One pixel's entries [begin, stop) hold the weights of its hits, and hits that weigh `dropped` are
+// gone already. Drops, from the back on, every hit with which `dropped` stays within tau, and
+// closes the gaps. Returns the end of the entries that remain.
+static inline uint drop_hits(
+    const uint begin,
+    const uint stop,
+    const float tau,
+    float *dropped,
+    global const ulong *pair_key,
+    global float2 *pair_weight,
+    global uchar *pair_role,
+    global ulong *pixel_entry) {
+    for (uint i = stop; i-- > begin;) {
+        const float sum = *dropped + as_float((uint)(pixel_entry[i] >> 32));
+        if (sum <= tau) {
+            *dropped = sum;
+            pair_weight[(uint)pair_key[i]] = 0.0f;
+            pair_role[(uint)pair_key[i]] = DROPPED;
+            pixel_entry[i] = NONE;
+        }
+    }
+    uint end = begin;
+    for (uint i = begin; i < stop; i++)
+        if ((uint)pixel_entry[i] != NONE) pixel_entry[end++] = pixel_entry[i];
+    return end;
+}
+
+// One work-item per pixel: reads its hits, nearest first, writes their weights by pair and, with
+// their points, by pixel.
+//
+// By pair: b, and b (1/o + z/gamma), finite at o = 0, whose product with G.(f - F) is dL/do. Only
+// the MAX_TRACKED nearest hits get gradients. A hit is dropped, with weight 0,
+// - by early_stop, with all behind it, once even an opaque, centred hit (o = d = 1) would have less
+//   than this share of the weight; differs from Pulsar: it looks only when its buffer is flushed;
+// - by tau, from the back on, while the sum of all dropped weights stays within tau; a tail so
+//   light that it is not weighed is not in D, and the background gets the weights of the other
+//   dropped hits.
+// By pixel: the hits that are not dropped, by depth. If any were dropped, one more entry follows,
+// with no point and the dropped weight.
+kernel __attribute__((vec_type_hint(float16))) void softmax_weights(
+    const uint hw,  // pixels
+    const float gamma,
+    const float early_stop,                    // 0: none
+    const float tau,                           // 0: none
+    global const float *camera,                // (20) camera.h
+    global const uint *pixel_offset,           // (HW+1)
+    global const ulong *pair_key,              // (P) depth << 32 | pair, sorted within a pixel
+    global const uint2 *pair_point_closeness,  // (P, 2) point, bits of d
+    global const float *opacity,               // (N)
+    global float2 *pair_weight,                // (P, 2)
+    global uchar *pair_role,                   // (?) P with HAS_ROLES
+    global ulong *pixel_entry)                 // (P) weight << 32 | point, in the order of the keys
+{
+    const uint q = get_global_id(0);
+    if (q >= hw) return;
+    const Camera cam = camera_load(camera);
+    const uint begin = pixel_offset[q], end = pixel_offset[q + 1];
+    uint stop = end;
+    float M = EPS / gamma, D = 1.0f;  // the background alone
+    float dropped = 0.0f;
+    Hits h;
+    for (uint first = begin; first < stop; first += BATCH) {
+        const uint count = min((uint)BATCH, end - first);
+        h = load_hits(&cam, pair_key + first, count, pair_point_closeness, opacity);
+        const float16 a = h.opacity * h.z / gamma;
+        const float m = fmax(M, max16(select((float16)(M), a, h.closeness > 0.0f)));
+        D *= exp(M - m);
+        M = m;
+        float term[BATCH], best[BATCH];
+        vstore16(h.opacity * h.closeness * exp(fmin(a - M, 0.0f)), 0, term);
+        if (DROPS) vstore16(exp(fmax(h.z, 0.0f) / gamma - M), 0, best);
+        for (uint j = 0; j < count && first + j < stop; j++) {
+            // no less than the weights of this hit and all that follow
+            const float bound = DROPS ? (end - first - j) * best[j] : 0.0f;
+            if (DROPS && bound < TAIL * tau * D) {
+                dropped = bound / D;
+                stop = first + j;
+            } else if (DROPS && best[j] < early_stop / (1.0f - early_stop) * D)
+                stop = first + j;
+            else
+                D += term[j];
+        }
+    }
+    for (uint first = begin; first < stop; first += BATCH) {
+        const uint count = min((uint)BATCH, end - first);
+        if (end - begin > BATCH)
+            h = load_hits(&cam, pair_key + first, count, pair_point_closeness, opacity);
+        const float16 a = h.opacity * h.z / gamma;
+        // b/o; a > M only where d = 0
+        const float16 share = h.closeness * exp(fmin(a - M, 0.0f)) / D;
+        float b[BATCH], slope[BATCH];
+        vstore16(h.opacity * share, 0, b);
+        vstore16(share * (1.0f + a), 0, slope);
+        for (uint j = 0; j < min(count, stop - first); j++) {
+            const uint i = first + j, pair = (uint)pair_key[i];
+            const bool tracked = !MAX_TRACKED || i - begin < MAX_TRACKED;
+            pair_weight[pair] = (float2)(b[j], tracked ? slope[j] : 0.0f);
+            if (HAS_ROLES) pair_role[pair] = tracked ? TRACKED : UNTRACKED;
+            pixel_entry[i] = upsample(as_uint(b[j]), pair_point_closeness[pair].x);
+        }
+    }
+    if (DROPS) {
+        for (uint i = stop; i < end; i++) {
+            pair_weight[(uint)pair_key[i]] = 0.0f;
+            pair_role[(uint)pair_key[i]] = DROPPED;
+        }
+        if (tau > 0.0f)
+            stop = drop_hits(
+                begin, stop, tau, &dropped, pair_key, pair_weight, pair_role, pixel_entry);
+        if (stop < end) pixel_entry[stop] = upsample(as_uint(dropped), NONE);
+    }
+}
+
+// One work-item per pixel: writes G.F, which a hit's G.f is compared with.
+kernel void softmax_rest(
+    const uint hw,                        // pixels
+    global const float16 *features,       // (H, W, 16) F
+    global const float16 *grad_features,  // (H, W, 16) G
+    global float *rest)                   // (HW)
+{
+    const uint q = get_global_id(0);
+    if (q >= hw) return;
+    rest[q] = dot16(grad_features[q], features[q]);
+}

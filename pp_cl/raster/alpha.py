@@ -1,0 +1,88 @@
+"""Alpha compositing from front to back, and the hits that are dropped because hardly any light gets
+to them.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from pyopencl.array import Array
+
+from pp_cl.device.buffers import Table
+from pp_cl.raster.blend_weights import DROPPED, BlendWeights, PixelWeights
+from pp_cl.raster.pairs import Pairs
+
+
+class Alpha(BlendWeights):
+    """The weights T o d of cl/raster/alpha.cl.
+
+    A hit may weigh T in all, and so may all behind it together: early_stop and tau are one bound,
+    of which the higher counts.
+    """
+
+    rest_by_pair = True
+    depends_on_depth = False
+
+    @classmethod
+    def own_table(cls, pixels: int, pairs: int) -> Table:
+        """As BlendWeights."""
+        return {"transmittance": ((pixels,), np.float32), "rest": ((pairs,), np.float32)}
+
+    def compute(
+        self,
+        pairs: Pairs,
+        camera_buffer: Array,
+        opacity: Array,
+        gamma: float,
+        *,
+        max_tracked: int = 0,
+        early_stop: float = 0.0,
+        tau: float = 0.0,
+    ) -> PixelWeights:
+        """As BlendWeights; camera and gamma do not matter."""
+        least = max(early_stop, tau)
+        has_roles = least > 0 or max_tracked > 0
+        pair_weight, pair_role, pixel_entry = self._reserve(pairs, has_roles)
+        if least > 0:
+            self.dev.fill(pair_role, DROPPED)
+        program = self.dev.program("raster/alpha", DROPS=int(least > 0), MAX_TRACKED=max_tracked)
+        program.launch(
+            "alpha_weights",
+            pairs.pixels,
+            hw=pairs.pixels,
+            least=least,
+            pixel_offset=pairs.pixel_offset,
+            pair_key=pairs.pair_key,
+            pair_point_closeness=pairs.pair_point_closeness,
+            opacity=opacity,
+            pair_weight=pair_weight,
+            pair_role=pair_role,
+            pixel_entry=pixel_entry,
+            transmittance=self._buffers.transmittance,
+        )
+        shaded = self._list_shaded(pairs, pair_role) if least > 0 else pairs.seen
+        return PixelWeights(has_roles, pair_weight, pair_role, pixel_entry, shaded)
+
+    def rest(
+        self,
+        pairs: Pairs,
+        weights: PixelWeights,
+        point_features: Array,
+        *,
+        features: Array,
+        grad_features: Array,
+    ) -> Array:
+        """As BlendWeights: B of each pair, G times what is composited behind it."""
+        rest = self._buffers.rest[: max(1, pairs.total)]
+        self.dev.program("raster/alpha").launch(
+            "alpha_rest",
+            pairs.pixels,
+            hw=pairs.pixels,
+            pixel_offset=pairs.pixel_offset,
+            pair_key=pairs.pair_key,
+            pixel_entry=weights.pixel_entry,
+            transmittance=self._buffers.transmittance,
+            point_features=point_features,
+            grad_features=grad_features,
+            rest=rest,
+        )
+        return rest

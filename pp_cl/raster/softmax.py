@@ -1,0 +1,82 @@
+"""The blend of Eq. (1), a softmax over the hits of a pixel, and which hits are dropped because they
+change a pixel by less than a bound.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from pyopencl.array import Array
+
+from pp_cl.device.buffers import Table
+from pp_cl.raster.blend_weights import BlendWeights, PixelWeights
+from pp_cl.raster.pairs import Pairs
+
+
+class Softmax(BlendWeights):
+    """The weights of Eq. (1). early_stop is Pulsar's percent_allowed_difference (0.001 in the
+    paper); tau drops hits from the back on.
+    """
+
+    rest_by_pair = False
+    depends_on_depth = True
+
+    @classmethod
+    def own_table(cls, pixels: int, pairs: int) -> Table:
+        """As BlendWeights."""
+        return {"rest": ((pixels,), np.float32)}
+
+    def compute(
+        self,
+        pairs: Pairs,
+        camera_buffer: Array,
+        opacity: Array,
+        gamma: float,
+        *,
+        max_tracked: int = 0,
+        early_stop: float = 0.0,
+        tau: float = 0.0,
+    ) -> PixelWeights:
+        """As BlendWeights."""
+        drops = early_stop > 0 or tau > 0
+        has_roles = drops or max_tracked > 0
+        pair_weight, pair_role, pixel_entry = self._reserve(pairs, has_roles)
+        program = self.dev.program("raster/softmax", DROPS=int(drops), MAX_TRACKED=max_tracked)
+        program.launch(
+            "softmax_weights",
+            pairs.pixels,
+            hw=pairs.pixels,
+            gamma=gamma,
+            early_stop=early_stop,
+            tau=tau,
+            camera=camera_buffer,
+            pixel_offset=pairs.pixel_offset,
+            pair_key=pairs.pair_key,
+            pair_point_closeness=pairs.pair_point_closeness,
+            opacity=opacity,
+            pair_weight=pair_weight,
+            pair_role=pair_role,
+            pixel_entry=pixel_entry,
+        )
+        shaded = self._list_shaded(pairs, pair_role) if drops else pairs.seen
+        return PixelWeights(has_roles, pair_weight, pair_role, pixel_entry, shaded)
+
+    def rest(
+        self,
+        pairs: Pairs,
+        weights: PixelWeights,
+        point_features: Array,
+        *,
+        features: Array,
+        grad_features: Array,
+    ) -> Array:
+        """As BlendWeights: G.F of each pixel."""
+        rest = self._buffers.rest
+        self.dev.program("raster/softmax").launch(
+            "softmax_rest",
+            pairs.pixels,
+            hw=pairs.pixels,
+            features=features,
+            grad_features=grad_features,
+            rest=rest,
+        )
+        return rest
