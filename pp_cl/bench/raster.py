@@ -1,5 +1,5 @@
 """`pp-cl bench raster`: time, bytes and error of the rasteriser's stages, by number of points,
-image side and tau.
+image side, blend and tau.
 
 Scenes: `grid`, a ball full of points on a grid, as discs with spherical harmonics, seen like the
 objects of the papers' scenes; `pulsar`, spheres of radius 0.0015 in a cube of side 1 at a depth of
@@ -9,8 +9,8 @@ Errors are in shares of the features' range over the points seen and the backgro
 float64 at some pixels, tau_err against tau = 0 at all pixels, and the bound of the latter, which is
 the largest weight that a pixel dropped.
 
-Times are wall clock until the stage's work is done, in turn: all stages of all taus and the copy of
-cl/bench/peak.cl once a round.
+Times are wall clock until the stage's work is done, in turn: all stages of all cases and the copy
+of cl/bench/peak.cl once a round.
 """
 
 from collections import defaultdict
@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 
 from pp_cl.bench.peak import CopyBandwidth
-from pp_cl.bench.raster_scenes import SCENES
+from pp_cl.bench.raster_scenes import SCENES, Case
 from pp_cl.bench.timing import interleave
 from pp_cl.device.device import Device
 
@@ -31,29 +31,32 @@ def bench_raster(
     points: list[int],
     sizes: list[int],
     *,
-    taus: list[float],
+    cases: list[Case],
     gamma: float,
 ) -> Iterator[dict]:
-    """Yield a row for every number of points, side and tau. scene: a key of SCENES."""
+    """Yield a row for every number of points, side and case. scene: a key of SCENES."""
     copy = CopyBandwidth(dev)
     for n in points:
         for size in sizes:
             before = dev.reset_peak()
             yield from _rows(
-                dev, SCENES[scene](dev, n, size, gamma), taus, copy=copy, before=before
+                dev, SCENES[scene](dev, n, size, gamma), cases, copy=copy, before=before
             )
 
 
-def _rows(dev, bench, taus, *, copy, before):
-    """Rows of one scene. before: device memory in use without it."""
-    stages_ms, copy_ms = _time(dev, bench, taus, copy)
+def _rows(dev, bench, cases, *, copy, before):
+    """Rows of one scene."""
+    stages_ms, copy_ms = _time(dev, bench, cases, copy)
     copied = copy.bytes / copy_ms * 1e-6
-    exact = bench.forward(0.0).features.get()
+    exact = {
+        blend: bench.forward(Case(blend, 0.0)).features.get()
+        for blend in dict.fromkeys(case.blend for case in cases)
+    }
     # both rasterise the scene when they are first read: not inside the loop, which does so too
     feature_range, _ = bench.feature_range, bench.covered_pixels
-    for tau in taus:
-        result, stages = bench.forward(tau), stages_ms[tau]
-        features, moved = result.features.get(), bench.moved_bytes(result, tau)
+    for case in cases:
+        result, stages = bench.forward(case), stages_ms[case]
+        features, moved = result.features.get(), bench.moved_bytes(case, result)
         forward = sum(ms for name, ms in stages.items() if name in bench.forward_stages)
         backward = sum(stages.values()) - forward
         gbs = sum(moved.values()) / (forward + backward) * 1e-6
@@ -62,7 +65,8 @@ def _rows(dev, bench, taus, *, copy, before):
             "points": bench.count,
             "size": bench.size,
             "gamma": bench.gamma,
-            "tau": tau,
+            "blend": case.blend,
+            "tau": case.tau,
             "pairs": result.pairs.total,
             "shaded": int(result.shaded.size),
             "forward_ms": forward,
@@ -73,38 +77,39 @@ def _rows(dev, bench, taus, *, copy, before):
             "copy_gbs": copied,
             "copy_share": gbs / copied,
             "peak_device_bytes": dev.peak_bytes - before,
-            "max_err": bench.error(features),
-            "tau_err": float((np.abs(features - exact) / feature_range).max()),
-            "tau_bound": float(bench.dropped_weights(result).max()),
+            "max_err": bench.error(case, features),
+            "tau_err": float((np.abs(features - exact[case.blend]) / feature_range).max()),
+            "tau_bound": float(bench.dropped_weights(case, result).max()),
         }
 
 
-def _time(dev, bench, taus, copy):
-    """({tau: {stage: median milliseconds}}, milliseconds of the copy), all in turn."""
-    seconds = {tau: defaultdict(list) for tau in taus}
+def _time(dev, bench, cases, copy):
+    """({case: {stage: median milliseconds}}, milliseconds of the copy), all in turn."""
+    seconds = {case: defaultdict(list) for case in cases}
 
-    def runner(tau):
+    def runner(case):
         def run():
             with dev.timed_stages() as stages:
-                bench.backward(bench.forward(tau))
+                bench.backward(case, bench.forward(case))
             for name, values in stages.items():
-                seconds[tau][name] += values
+                seconds[case][name] += values
 
         return run
 
-    times = interleave({tau: runner(tau) for tau in taus} | {"copy": copy.run})
+    times = interleave({case: runner(case) for case in cases} | {"copy": copy.run})
     medians = {
-        tau: {name: float(np.median(values[1:])) * 1e3 for name, values in stages.items()}
-        for tau, stages in seconds.items()  # the first pass, which builds programs, does not count
+        case: {name: float(np.median(values[1:])) * 1e3 for name, values in stages.items()}
+        for case, stages in seconds.items()  # the first pass, which builds programs, does not count
     }
     return medians, float(np.median(times["copy"]))
 
 
-COLUMNS = "{:7} {:>8} {:>5} {:>7} {:>9} {:>9} {:>9} {:>5} {:>8} {:>8} {:>8}  {}".format
+COLUMNS = "{:7} {:>8} {:>5} {:7} {:>7} {:>9} {:>9} {:>9} {:>5} {:>8} {:>8} {:>8}  {}".format
 HEAD = COLUMNS(
     "scene",
     "points",
     "side",
+    "blend",
     "tau",
     "shaded",
     "forward",
@@ -124,6 +129,7 @@ def line(row: dict) -> str:
         row["scene"],
         row["points"],
         row["size"],
+        row["blend"],
         f"{row['tau']:g}",
         row["shaded"],
         f"{row['forward_ms']:.2f}",
@@ -137,27 +143,30 @@ def line(row: dict) -> str:
 
 
 def growth(rows: list[dict]) -> list[dict]:
-    """[{"size", "tau", "exponent", "steepest"}]: time ~ points^exponent, fitted over all, and
-    between two neighbours.
+    """[{"size", "blend", "tau", "exponent", "steepest"}]: time ~ points^exponent, fitted over all,
+    and between two neighbours.
     """
     found = []
-    for size, tau in dict.fromkeys((row["size"], row["tau"]) for row in rows):
+    for curve in dict.fromkeys(map(_curve, rows)):
         some = sorted(
             (row["points"], row["forward_ms"] + row["backward_ms"])
             for row in rows
-            if (row["size"], row["tau"]) == (size, tau)
+            if _curve(row) == curve
         )
         if len(some) > 1:
             n, ms = np.log(np.array(some).T)
             found.append(
                 {
-                    "size": size,
-                    "tau": tau,
+                    **dict(zip(("size", "blend", "tau"), curve, strict=True)),
                     "exponent": float(np.polyfit(n, ms, 1)[0]),
                     "steepest": float((np.diff(ms) / np.diff(n)).max()),
                 }
             )
     return found
+
+
+def _curve(row):
+    return row["size"], row["blend"], row["tau"]
 
 
 def plot(figure: Any, title: str, rows: list[dict]) -> None:
@@ -170,16 +179,16 @@ def plot(figure: Any, title: str, rows: list[dict]) -> None:
     error.set(
         xscale="log", yscale="log", xlabel="tau", ylabel="largest change of a feature / its range"
     )
-    for s, size in enumerate(dict.fromkeys(row["size"] for row in rows)):
-        for t, tau in enumerate(dict.fromkeys(row["tau"] for row in rows)):
-            some = [row for row in rows if (row["size"], row["tau"]) == (size, tau)]
-            time.plot(
-                [row["points"] for row in some],
-                [row["forward_ms"] + row["backward_ms"] for row in some],
-                marker="os^Dv"[t % 5],
-                color=f"C{s}",
-                label=f"side {size}, tau {tau:g}",
-            )
+    for c, curve in enumerate(dict.fromkeys(map(_curve, rows))):
+        some = [row for row in rows if _curve(row) == curve]
+        size, blend, tau = curve
+        time.plot(
+            [row["points"] for row in some],
+            [row["forward_ms"] + row["backward_ms"] for row in some],
+            marker="os^Dv"[c % 5],
+            color=f"C{c}",
+            label=f"side {size}, {blend}, tau {tau:g}",
+        )
     dropping = [row for row in rows if row["tau"] > 0]
     for key, style, label in (("tau_err", "o", "measured"), ("tau_bound", "_", "bound")):
         error.plot(

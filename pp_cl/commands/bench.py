@@ -12,7 +12,7 @@ HELP = "time against error of the convolutions, the network, the rasteriser, a t
 OPTIONS = {
     "conv": ("size", "widths", "plot"),
     "unet": ("size", "widths", "plot", "tolerance"),
-    "raster": ("size", "scene", "points", "tau", "gamma", "plot"),
+    "raster": ("size", "scene", "points", "blend", "tau", "gamma", "plot"),
     "train": ("scene", "points", "set"),
 }
 VIEWS, ROUNDS = 3, 5  # of bench train: views of the scene, evenly spread, and rounds over them
@@ -48,6 +48,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="N,...",
         help="raster: numbers of points (10 thousand to 4 million); train: one (4 million)",
     )
+    add("--blend", metavar="B,...", help="raster: of alpha,softmax (both)")
     add("--tau", metavar="T,...", help="raster: weight that a pixel may drop (0,1e-4,1e-3,1e-2)")
     add("--gamma", metavar="G", help="raster: depth sharpness of the blend (0.01)")
     shared.add_set(parser, "train: a setting in place of the paper preset's")
@@ -80,7 +81,8 @@ def _refuse_foreign(options):
 def _run_raster(options):
     from pp_cl.bench.plots import check_files, save_figure
     from pp_cl.bench.raster import HEAD, bench_raster, growth, line, plot
-    from pp_cl.bench.raster_scenes import SCENES
+    from pp_cl.bench.raster_scenes import SCENES, Case
+    from pp_cl.raster.blend import BLENDS
 
     scene = options.scene or "grid"
     if scene not in SCENES:
@@ -92,19 +94,24 @@ def _run_raster(options):
         raise UserError(f"--size {options.size}: write multiples of 4")
     taus = options.tau or "0,1e-4,1e-3,1e-2"
     taus = shared.read_numbers("--tau", taus, float, least=0, most=0.5)
+    blends = (options.blend or "alpha,softmax").split(",")
+    if not set(blends) <= set(BLENDS):
+        raise UserError(f"--blend {options.blend}: choose from {', '.join(BLENDS)}")
+    cases = [Case(blend, tau) for blend in dict.fromkeys(blends) for tau in taus]
     # the last gamma of a training, the sharpest
     gamma = shared.read_number("--gamma", options.gamma or "0.01", float, least=1e-5, most=1)
     figure = check_files(options.json, options.plot)
     dev = _open_device(options)
     print(HEAD)
     rows = []
-    for row in bench_raster(dev, scene, points, sizes, taus=taus, gamma=gamma):
+    for row in bench_raster(dev, scene, points, sizes, cases=cases, gamma=gamma):
         rows.append(row)
         print(line(row), flush=True)
     fits = growth(rows)
     for fit in fits:
         print(
-            f"side {fit['size']}, tau {fit['tau']:g}: time grows as points^{fit['exponent']:.2f},"
+            f"side {fit['size']}, {fit['blend']}, tau {fit['tau']:g}: time grows as"
+            f" points^{fit['exponent']:.2f},"
             f" at most ^{fit['steepest']:.2f} from one number to the next"
         )
     _write_json(options.json, dev, rows, growth=fits)

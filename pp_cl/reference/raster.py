@@ -89,6 +89,16 @@ class PixelReference:
             @ np.vstack([point_features, np.ones((1, point_features.shape[1]))])
         )
 
+    def composited(self, hits: Hits, opacity: np.ndarray, point_features: np.ndarray) -> np.ndarray:
+        """(C,) features of hits() composited from front to back, otherwise as features()."""
+        points, closeness, depth = hits
+        result, through = np.zeros(point_features.shape[1]), 1.0
+        for i in np.lexsort((points, depth)):
+            alpha = float(opacity[i]) * closeness[i]
+            result += through * alpha * point_features[i]
+            through *= 1 - alpha
+        return result + through
+
 
 def sh_basis(directions: np.ndarray) -> np.ndarray:
     """(N, 9) real harmonics of degrees 0 to 2 of unit directions (N, 3), as cl/sh.h orders them."""
