@@ -153,10 +153,20 @@ class TrainConfig:
     )
     sh_smoothing_every: int = setting(4, "steps between two smoothings", 1, 10**8)
     prune_weight: float = setting(
-        1e-3, "prune points whose mean blend weight per step is below this (0: off)", 0, 1e6
+        2e-3, "prune points whose mean blend weight per look is below this (0: off)", 0, 1e6
     )
     prune_opacity: float = setting(0.01, "prune points with an opacity below this", 0, 1)
     prune_every: int = setting(250, "steps between two prunings", 1, 10**8)
+    prune_looks: int = setting(
+        20, "number of steps that must have seen a point, hidden or not, to prune it", 1, 10**8
+    )
+    refine_at: tuple = setting(
+        (1.0, 1.0),
+        "shares of the iterations after which images double in size and points become eight each"
+        " (1: never); training begins on images reduced as often",
+        0,
+        1,
+    )
     final_prune_weight: float = setting(
         1.0,
         "after the last step, prune points whose blend weights over all training views sum to"

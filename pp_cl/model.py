@@ -7,6 +7,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
+from pyopencl.array import Array
 
 from pp_cl.device.device import Device
 from pp_cl.errors import UserError
@@ -57,6 +58,19 @@ class Model:
         ids: (N) ascending grid vertices. degree: of the SH, 0 to 2.
         """
         return cls(dev, grid, depth_range, PointCloud.create(dev, ids, degree, opacity), net=net)
+
+    def refine(self) -> Array:
+        """Replace every point by the eight around it on the grid of half the spacing, which take
+        over what it has learned. Returns the point that each one comes from, (8 N,) uint32.
+
+        Raises ValueError as Grid.children does.
+        """
+        ids, parents = self.grid.children(self.cloud.ids.get())
+        rows = self.dev.upload(parents)
+        self.cloud.replace_by(self.dev, ids, rows)
+        self.grid = self.grid.refined()
+        self.grid_buffer = self.dev.upload(self.grid.packed())
+        return rows
 
     def header(self) -> dict:
         """JSON-able description that load() needs beside the arrays."""

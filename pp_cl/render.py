@@ -203,9 +203,11 @@ class Renderer:
             )
             return self._blend.backward(gradient)
 
-    def add_point_weights(self, view: ViewWeights, total: Array) -> None:
-        """Add each point's blend weights, summed over the view's pixels, to total (N,) float32."""
-        self._weights.add_to_points(view.pairs, view.weights, total)
+    def add_point_weights(self, view: ViewWeights, total: Array, looks: Array) -> None:
+        """Add each point's blend weights, summed over the view's pixels, to total, and 1 to looks
+        where the point is in the view, hidden or not; both (N,) float32.
+        """
+        self._weights.add_to_points(view.pairs, view.weights, total, looks)
 
     def dropped_weights(self, view: ViewWeights) -> Array:
         """(HW,) float32: the blend weight that tau dropped from each pixel, or a bound above it."""

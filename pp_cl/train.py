@@ -3,7 +3,6 @@
 import math
 
 import numpy as np
-from pyopencl.array import Array
 
 from pp_cl.config import Config, TrainConfig
 from pp_cl.device.device import Device
@@ -16,11 +15,13 @@ from pp_cl.training.adam import moment_scale
 from pp_cl.training.loss import Loss
 from pp_cl.training.optimiser import Optimiser, Rates
 from pp_cl.training.point_state import PointState
-from pp_cl.training.prune import keep_indices
-from pp_cl.training.schedule import ema_weight, gamma_at
+from pp_cl.training.prune import judge, keep_indices
+from pp_cl.training.refine import refine
+from pp_cl.training.schedule import ema_weight, gamma_at, refine_steps
 from pp_cl.training.smooth import Smoother
 
 BOX_MARGIN = 8  # pixels around the object from which crops are drawn
+CROP_LOSS = 0.25  # of the crop's side for every halving of the images
 
 
 class Trainer:
@@ -35,6 +36,7 @@ class Trainer:
         self.config = config.train
         self.network = config.network
         self.gamma = config.raster.gamma
+        self._composited = config.raster.blend == "alpha"
         self.model = model
         self.views = views
         self.step = 0
@@ -43,8 +45,16 @@ class Trainer:
         self.state = PointState(dev, model.cloud, self.config)
         self.optimiser = Optimiser(dev, model, self.state, self._moment_scale())
         self._target = Target(dev)
-        self._boxes = [view.object_bounds(BOX_MARGIN) for view in views]
-        self._smoother = None  # made when it is due, anew after pruning
+        self._smoother = None  # made when it is due, anew when the points change
+        self._refine_steps = refine_steps(self.config.iterations, self.config.refine_at)
+        self._set_level()
+
+    def _set_level(self):
+        """The images of this step: halved once for every refinement of the grid to come."""
+        to_come = sum(self.step < step for step in self._refine_steps)
+        self._reduced = _halved(self.views, to_come)
+        self._crop = 4 * round(self.config.crop * (1 - CROP_LOSS * to_come) / 4)
+        self._boxes = [view.object_bounds(BOX_MARGIN) for view in self._reduced]
 
     def _moment_scale(self):
         """Of moments in 16 bits, from the eps of the first view: powers of two, so that others may
@@ -67,7 +77,7 @@ class Trainer:
         rates = Rates.at(t, self.network, config)
         view_index, box, jitter = self.draw(rng)
 
-        view = self.views[view_index]
+        view = self._reduced[view_index]
         camera = view.crop_camera(box, jitter)
         with self.dev.stage("target"):
             self._target.load(view)
@@ -94,7 +104,8 @@ class Trainer:
                 sh_eps=config.sh_eps / target.size,
             )
         with self.dev.stage("sums"):
-            self.renderer.add_point_weights(rendered, self.state.weight_sum)
+            state = self.state
+            self.renderer.add_point_weights(rendered, state.weight_sum, state.look_count)
 
         self.step = t + 1
         self._regularise(rates)
@@ -109,14 +120,14 @@ class Trainer:
         config, n = self.config, len(self.views)
         epoch, place = divmod(self.step, n)
         index = int(np.random.default_rng((config.seed, epoch, n)).permutation(n)[place])
-        view = self.views[index]
+        view = self._reduced[index]
         camera = view.camera
         offsets = view.downscale if config.pixel_jitter else 1
         jitter = tuple(int(p) for p in rng.integers(offsets, size=2))
-        if config.crop == 0:
+        if self._crop == 0:
             return index, (0, 0, camera.width, camera.height), jitter
         x0, y0, x1, y1 = self._boxes[index]
-        width, height = view.crop_size(config.crop)
+        width, height = view.crop_size(self._crop)
         left = _draw_start(rng, x0, x1, width, limit=camera.width)
         top = _draw_start(rng, y0, y1, height, limit=camera.height)
         return index, (left, top, width, height), jitter
@@ -138,7 +149,7 @@ class Trainer:
     # ----------------------------------------------------------------------------------------------
 
     def _regularise(self, rates):
-        """Grid smoothing, averaging and pruning, where they are due after this step."""
+        """Smoothing, averaging, pruning and refining, where they are due after this step."""
         config, t = self.config, self.step
         if config.sh_smoothing > 0 and t % config.sh_smoothing_every == 0:
             with self.dev.stage("smoothing"):
@@ -149,8 +160,9 @@ class Trainer:
                 self.optimiser.update_ema(weight)
         if t % config.prune_every == 0 and t < config.iterations:
             with self.dev.stage("pruning"):
-                self.prune(self.state.weight_sum, config.prune_weight * config.prune_every)
-            self.dev.fill(self.state.weight_sum, 0)
+                self.prune()
+        if t in self._refine_steps:
+            self._refine()
 
     def _smooth(self, rates):
         """Pull every SH coefficient towards the mean of its grid neighbours, outside Adam."""
@@ -162,17 +174,28 @@ class Trainer:
             if rates.sh[block.degree] > 0:
                 self._smoother.smooth(sh, pull * rates.sh[block.degree])
 
-    def prune(self, weights: Array, least: float) -> None:
-        """Drop the points whose weight is below `least` or whose opacity is too low, with their
-        training state. weights: (N) float32.
-        """
-        cloud, least_opacity = self.model.cloud, self.config.prune_opacity
-        keep = keep_indices(self.dev, weights, least, cloud.opacity, least_opacity=least_opacity)
-        if len(keep) < cloud.count:
-            self.renderer.cache.clear()
-            cloud.compact(self.dev, keep)
-            self.state.compact(self.dev, keep)
-            self._smoother = None
+    def prune(self) -> None:
+        """Drop the points that were looked at often enough and weigh too little."""
+        self._keep(judge(self.dev, self.state, self.model.cloud.opacity, self.config))
+
+    def _keep(self, rows):
+        """Drop all points but `rows`, with their training state."""
+        if len(rows) < self.model.cloud.count:
+            self._forget_points()
+            self.model.cloud.compact(self.dev, rows)
+            self.state.compact(self.dev, rows)
+
+    def _refine(self):
+        """Go on to images of twice the size and points of half the spacing."""
+        self._forget_points()
+        with self.dev.stage("refining"):
+            refine(self.dev, self.model, self.state, composited=self._composited)
+        self._set_level()
+
+    def _forget_points(self):
+        """Drop what was made for the present points."""
+        self.renderer.cache.clear()
+        self._smoother = None
 
     def finish(self) -> None:
         """Adopt the averages, and drop the points that hardly weigh anything in any training
@@ -180,11 +203,15 @@ class Trainer:
         """
         self.optimiser.apply_ema()
         if self.config.final_prune_weight > 0:
-            total = self.dev.zeros((self.model.cloud.count,))
+            cloud = self.model.cloud
+            total, looks = (self.dev.zeros((cloud.count,)) for _ in range(2))
             for view in self.views:
                 weights = self.renderer.blend_weights(view.camera, self.gamma[1])
-                self.renderer.add_point_weights(weights, total)
-            self.prune(total, self.config.final_prune_weight)
+                self.renderer.add_point_weights(weights, total, looks)
+            least = self.config.final_prune_weight, self.config.prune_opacity
+            self._keep(
+                keep_indices(self.dev, total, least[0], cloud.opacity, least_opacity=least[1])
+            )
 
     def rates(self) -> dict:
         """The learning rates of the last step, for the log."""
@@ -209,6 +236,7 @@ class Trainer:
         already. Raises KeyError and ValueError for an array that does not fit.
         """
         self.step = step
+        self._set_level()
         self.optimiser.restore(arrays)
 
 
@@ -220,10 +248,28 @@ def views_repeat(config: TrainConfig, downscale: int) -> bool:
     return config.crop == 0 and config.dropout == 0 and not jitters
 
 
+def _halved(views, times):
+    """The views at 1 / 2^times of their size. Raises UserError where that is too small."""
+    try:
+        return [view.reduced(view.downscale * 2**times) for view in views]
+    except UserError as error:
+        raise UserError(
+            f"train.refine_at halves the images {times} times; use fewer of them ({error})"
+        ) from None
+
+
 def _draw_start(rng, low, high, size, *, limit):
     """First pixel of a crop of `size` that shows a part of [low, high) as large as possible, inside
     [0, limit).
+
+    Crops are drawn from all that touch [low, high), and moved inside it: so its ends are in about
+    as many of them as its middle. Those moved are spread over BOX_MARGIN pixels: the network pools
+    by 4, and would learn one phase of its grid where crops always began at the same pixel.
     """
     first, last = sorted((low, high - size))
-    first, last = max(first, 0), min(last, limit - size)
-    return int(rng.integers(min(first, last), max(first, last) + 1))
+    first, last = max(first, 0), max(min(last, limit - size), 0)
+    if high - low <= size:
+        return int(rng.integers(first, last + 1))
+    start = int(rng.integers(low - size, high + 1))
+    inside = int(rng.integers(BOX_MARGIN))
+    return int(np.clip(start, min(first + inside, last), max(last - inside, first)))

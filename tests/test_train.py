@@ -409,3 +409,40 @@ def test_crops_stay_inside_and_show_the_object(low, high, size, limit):
     assert len(starts) == max(
         1, min(max(low, high - size), limit - size) - max(min(low, high - size), 0) + 1
     )
+
+
+@pytest.mark.parametrize("low, high, size, limit", [(10, 400, 64, 800), (0, 617, 256, 800)])
+def test_crops_show_the_ends_of_the_object_as_often_as_its_middle(low, high, size, limit):
+    """No pixel is in less than the share of crops that it would be in if they came from all over,
+    and none in more than twice that.
+    """
+    seen, draws = np.zeros(limit), 3000
+    for i in range(draws):
+        start = _draw_start(np.random.default_rng(i), low, high, size, limit=limit)
+        seen[start : start + size] += 1 / draws
+    fair = size / (high - low + size)
+    assert 0.93 * fair < seen[low:high].min() and seen[low:high].max() < 2.07 * fair
+
+
+@pytest.mark.parametrize("share, stops", [(0.3, (12, 33)), (0.8, (45, 55))])
+def test_a_refined_run_resumes_to_the_same_bytes(scene, tmp_path, monkeypatch, share, stops):
+    """Stopped before and after the refinement, which may come after the averages' beginning."""
+    changes = {"train__refine_at": f"{share},1", "points__count": 300, "train__prune_looks": 4}
+    changes["downscale"] = 1
+    assert main(arguments(scene, tmp_path / "whole", **changes)) == 0
+    whole = (tmp_path / "whole" / "checkpoint.npz").read_bytes()
+    points = {row["step"]: row["points"] for row in rows(tmp_path / "whole")[:-1]}
+    after = round(60 * share) // 5 * 5 + 5
+    assert points[after] > 4 * points[after - 5]
+    for steps in stops:
+        out = tmp_path / str(steps)
+        train_and_interrupt(scene, out, steps, monkeypatch, **changes)
+        assert main(arguments(scene, out, **changes)) == 0
+        assert (out / "checkpoint.npz").read_bytes() == whole
+
+
+def test_images_too_small_to_halve_are_one_line(scene, tmp_path, capsys):
+    words = arguments(scene, tmp_path / "small", train__refine_at="0.3,0.6")
+    assert main(words) == 2
+    error = capsys.readouterr().err
+    assert "train.refine_at halves the images 2 times" in error and error.count("\n") == 1

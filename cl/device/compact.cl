@@ -1,11 +1,11 @@
-// Compaction of arrays: rows move to the front.
+// Compaction of arrays, and arrays of rows of others.
 
-// One work-item per kept row: copies it from its old place.
+// One work-item per row of the result: copies it from its old place.
 kernel void gather_rows(
-    const uint first,            // of the kept rows that are copied: its place in the list
+    const uint first,            // of the listed rows that are copied: its place in the list
     const uint m,                // rows to copy
     const uint r,                // words in a row
-    global const uint *indices,  // (?) old places of all kept rows
+    global const uint *indices,  // (?) old places of all listed rows
     global const uint *source,   // (?, R)
     global uint *target)         // (?, R) at least M rows
 {

@@ -39,13 +39,15 @@ kernel void find_shaded_points(
     point_is_shaded[i] = count;
 }
 
-// One work-item per point: reads the weights of its pairs, adds their sum. Accumulates.
+// One work-item per point: reads the weights of its pairs, adds their sum, and one look if there is
+// a pair. Accumulates.
 kernel void add_point_weights(
     const uint n,                      // points
     global const uint *point_offset,   // (N+1)
     global const float2 *pair_weight,  // (P, 2)
     global const uchar *pair_role,     // (?) P with HAS_ROLES
-    global float *point_weight)        // (N) accumulates
+    global float *point_weight,        // (N) accumulates
+    global float *point_looks)         // (N) accumulates
 {
     const uint i = get_global_id(0);
     if (i >= n) return;
@@ -53,4 +55,5 @@ kernel void add_point_weights(
     for (uint pair = point_offset[i]; pair < point_offset[i + 1]; pair++)
         if (!HAS_ROLES || pair_role[pair] != DROPPED) sum += pair_weight[pair].x;
     point_weight[i] += sum;
+    if (point_offset[i] < point_offset[i + 1]) point_looks[i] += 1.0f;
 }

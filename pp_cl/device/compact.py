@@ -1,4 +1,4 @@
-"""Some rows of an array moved to its front, without a second array of its size."""
+"""Rows of an array: some moved to its front without a second array of its size, or gathered."""
 
 import numpy as np
 from pyopencl.array import Array
@@ -44,6 +44,24 @@ def compact_rows(dev: Device, array: Array, keep: Array) -> Array:
         if piece < m:
             dev.copy_rows(array, start, scratch, count)
     return scratch if piece == m else dev.front(array, m)
+
+
+def gather_rows(dev: Device, array: Array, rows: Array) -> Array:
+    """A new array of the rows `rows` of `array`, (N, ...) of whole 4-byte words. rows: (M,) uint32,
+    in any order, with repetitions.
+    """
+    gathered = dev.empty((len(rows), *array.shape[1:]), array.dtype)
+    dev.program("device/compact").launch(
+        "gather_rows",
+        len(rows),
+        first=0,
+        m=len(rows),
+        r=array.nbytes // len(array) // 4,
+        indices=rows,
+        source=_words(array),
+        target=_words(gathered),
+    )
+    return gathered
 
 
 def _words(array):

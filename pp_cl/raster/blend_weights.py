@@ -135,8 +135,12 @@ class BlendWeights(ABC):
         )
         return pixel_dropped
 
-    def add_to_points(self, pairs: Pairs, weights: PixelWeights, point_weight: Array) -> None:
-        """Add each point's blend weights, summed over the pixels, to point_weight (N,) float32."""
+    def add_to_points(
+        self, pairs: Pairs, weights: PixelWeights, point_weight: Array, point_looks: Array
+    ) -> None:
+        """Add each point's blend weights, summed over the pixels, to point_weight, and 1 to
+        point_looks where it has a hit, dropped or not; both (N,) float32.
+        """
         self._shared(weights).launch(
             "add_point_weights",
             pairs.points,
@@ -145,6 +149,7 @@ class BlendWeights(ABC):
             pair_weight=weights.pair_weight,
             pair_role=weights.pair_role,
             point_weight=point_weight,
+            point_looks=point_looks,
         )
 
     def _list_shaded(self, pairs, pair_role):

@@ -9,7 +9,7 @@ import numpy as np
 from pyopencl.array import Array
 
 from pp_cl.device.buffers import Table
-from pp_cl.device.compact import compact_rows
+from pp_cl.device.compact import compact_rows, gather_rows
 from pp_cl.device.device import Device
 from pp_cl.files.checkpoint import fitting_array
 from pp_cl.raster.sh import SH_BLOCKS, SH_DEGREES, ShBlock, sh_blocks
@@ -63,6 +63,15 @@ class PointCloud:
         self.opacity = compact_rows(dev, self.opacity, keep)
         for i in range(len(self.sh)):
             self.sh[i] = compact_rows(dev, self.sh[i], keep)
+
+    def replace_by(self, dev: Device, ids: np.ndarray, rows: Array) -> None:
+        """Become the points `ids`, (M) ascending, each with what point rows[i] of the present ones
+        has learned; one array after the other. rows: (M,) uint32.
+        """
+        self.ids = dev.upload(ids, np.uint32)
+        self.opacity = gather_rows(dev, self.opacity, rows)
+        for i in range(len(self.sh)):
+            self.sh[i] = gather_rows(dev, self.sh[i], rows)
 
     def arrays(self) -> dict[str, np.ndarray]:
         """The arrays as a checkpoint names them; the SH by degree, (N, 1, 16), (N, 3, 16),

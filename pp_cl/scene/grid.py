@@ -1,5 +1,6 @@
 """The regular grid whose vertices are the points."""
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -26,6 +27,32 @@ class Grid:
         steps = np.maximum(box[1] - box[0], 0) // edge
         origin = box.mean(0) - edge * steps / 2
         return cls(tuple(float(x) for x in origin), edge, tuple(int(n) + 1 for n in steps))
+
+    def refined(self) -> "Grid":
+        """The grid of half the spacing that has eight vertices around each of this one's: vertex
+        (i, j, k) is in the middle of (2 i, 2 j, 2 k) to (2 i + 1, 2 j + 1, 2 k + 1).
+        """
+        origin = tuple(x - self.edge / 4 for x in self.origin)
+        return Grid(origin, self.edge / 2, tuple(2 * n for n in self.dims))
+
+    def children(self, ids: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """(vertices of refined(), ascending, the place in `ids` of each one's parent), (8 N) uint32
+        both. Raises ValueError where refined() has more vertices than 32 bits can number.
+        """
+        if 8 * math.prod(self.dims) > 2**32:
+            raise ValueError(f"a grid of {self.dims} vertices cannot be refined")
+        nx, ny, _ = self.dims
+        ids = np.asarray(ids, np.int64)
+        i, j, k = ids % nx, ids // nx % ny, ids // (nx * ny)
+        found = [
+            2 * i + a + 2 * nx * (2 * j + b + 2 * ny * (2 * k + c))
+            for c in (0, 1)
+            for b in (0, 1)
+            for a in (0, 1)
+        ]
+        found = np.concatenate(found)
+        order = np.argsort(found)
+        return found[order].astype(np.uint32), (order % len(ids)).astype(np.uint32)
 
     @property
     def centre(self) -> np.ndarray:

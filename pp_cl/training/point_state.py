@@ -7,7 +7,7 @@ from pyopencl.array import Array
 
 from pp_cl.config import TrainConfig
 from pp_cl.device.buffers import Table
-from pp_cl.device.compact import compact_rows
+from pp_cl.device.compact import compact_rows, gather_rows
 from pp_cl.device.device import Device
 from pp_cl.raster.point_cloud import PointCloud
 from pp_cl.raster.sh import ShBlock
@@ -21,6 +21,7 @@ STORED_NAMES = {
     "sh_2b": "sh7",
     "last_step": "last",
     "weight_sum": "weight",
+    "look_count": "looks",
 }
 
 
@@ -38,7 +39,7 @@ class PointState:
     @staticmethod
     def table(n: int, blocks: tuple[ShBlock, ...], settings: TrainConfig) -> Table:
         """The arrays of n points without the averages; all start as zeros."""
-        table = {"weight_sum": ((n,), np.float32)}
+        table = {"weight_sum": ((n,), np.float32), "look_count": ((n,), np.float32)}
         if settings.lazy_adam:
             table["last_step"] = ((n,), np.uint32)
         table |= {f"{kind}.opacity": ((n,), np.float32) for kind in "mv"}
@@ -59,8 +60,13 @@ class PointState:
 
     @property
     def weight_sum(self) -> Array:
-        """(N) float32: blend weights summed over the steps since the last pruning."""
+        """(N) float32: blend weights summed over the looks since the point was last judged."""
         return self._arrays["weight_sum"]
+
+    @property
+    def look_count(self) -> Array:
+        """(N) float32: steps since then that had the point in their image, hidden or not."""
+        return self._arrays["look_count"]
 
     @property
     def last_step(self) -> Array | None:
@@ -77,6 +83,16 @@ class PointState:
         for arrays in (self._arrays, self.ema.arrays):
             for name in arrays:
                 arrays[name] = compact_rows(dev, arrays[name], keep)
+
+    def replace_by(self, dev: Device, rows: Array) -> None:
+        """Become the state of points that each take over that of point rows[i], but for weights
+        and looks, which start anew. rows: (M,) uint32.
+        """
+        for arrays in (self._arrays, self.ema.arrays):
+            for name in arrays:
+                arrays[name] = gather_rows(dev, arrays[name], rows)
+        for sums in (self.weight_sum, self.look_count):
+            dev.fill(sums, 0)
 
     def arrays(self) -> dict[str, np.ndarray]:
         """{name in a checkpoint: array}."""

@@ -3,7 +3,9 @@
 import numpy as np
 from pyopencl.array import Array
 
+from pp_cl.config import TrainConfig
 from pp_cl.device.device import Device
+from pp_cl.training.point_state import PointState
 
 
 def keep_indices(
@@ -19,8 +21,27 @@ def keep_indices(
     weights, opacities: (N,) float32. NaN counts as too little. Where no point would remain, the
     one of the highest weight does (the first of several).
     """
-    weight, opacity = weights.get(), opacities.get()
-    keep = np.flatnonzero((weight >= least_weight) & (opacity >= least_opacity))
-    if keep.size == 0:
-        keep = [np.argmax(np.nan_to_num(weight, nan=-np.inf))]
-    return dev.upload(keep, np.uint32)
+    weight = weights.get()
+    return _listed(dev, (weight >= least_weight) & (opacities.get() >= least_opacity), weight)
+
+
+def judge(dev: Device, state: PointState, opacities: Array, settings: TrainConfig) -> Array:
+    """The same by the weights of training: a point that was looked at train.prune_looks times must
+    have weighed train.prune_weight a look, and have train.prune_opacity; its count starts anew.
+
+    Others stay: what was not looked at may have been hidden by what is still fog.
+    """
+    weight, looks = state.weight_sum.get(), state.look_count.get()
+    judged = looks >= settings.prune_looks
+    passes = (weight >= settings.prune_weight * looks) & (opacities.get() >= settings.prune_opacity)
+    for sums, values in ((state.weight_sum, weight), (state.look_count, looks)):
+        sums.set(np.where(judged, np.float32(0), values))
+    return _listed(dev, ~judged | passes, weight)
+
+
+def _listed(dev, keep, weight):
+    """Indices of the points to keep, at least one."""
+    indices = np.flatnonzero(keep)
+    if indices.size == 0:
+        indices = [np.argmax(np.nan_to_num(weight, nan=-np.inf))]
+    return dev.upload(indices, np.uint32)

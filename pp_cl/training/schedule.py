@@ -29,6 +29,13 @@ def learning_rate(
     )
 
 
+def refine_steps(steps: int, shares: tuple[float, ...]) -> list[int]:
+    """The numbers of steps done, ascending, after which the grid is refined. shares: of the steps;
+    1: never.
+    """
+    return sorted(max(1, round(share * steps)) for share in shares if share < 1)
+
+
 def gamma_at(step: int, steps: int, first: float = 0.1, last: float = 0.01) -> float:
     """The blend's softness, exponential from `first` to `last` (PlenopticPoints supplemental)."""
     return learning_rate(step, steps, first, last)

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from support.guarded import AWKWARD_SIZES
 
-from pp_cl.device.compact import compact_rows
+from pp_cl.device.compact import compact_rows, gather_rows
 
 
 @pytest.mark.parametrize("n", AWKWARD_SIZES)
@@ -40,3 +40,13 @@ def test_compact_keeps_every_bit(dev, monkeypatch, dtype, scratch_bytes):
     indices = dev.upload(np.array([1, 2, 4, 5], np.uint32))
     rows = compact_rows(dev, dev.upload(bits.view(dtype)), indices)
     np.testing.assert_array_equal(rows.get().view(np.uint32), bits[[1, 2, 4, 5]])
+
+
+@pytest.mark.parametrize("n", AWKWARD_SIZES)
+@pytest.mark.parametrize("shape, dtype", [((), np.uint32), ((3, 16), np.float32), ((2, 16), "f2")])
+def test_gather(dev, rng, n, shape, dtype):
+    source = rng.integers(0, 2**15, (n, *shape)).astype(dtype)
+    rows = rng.integers(0, n, 3 * n).astype(np.uint32)
+    gathered = gather_rows(dev, dev.upload(source), dev.upload(rows))
+    assert gathered.dtype == source.dtype
+    np.testing.assert_array_equal(gathered.get(), source[rows])

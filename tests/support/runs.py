@@ -17,11 +17,11 @@ SETTINGS = {
 }
 
 
-def arguments(scene, out, **changes):
+def arguments(scene, out, downscale=2, **changes):
     """Command line of a small training."""
     settings = SETTINGS | {k.replace("__", "."): v for k, v in changes.items()}
     sets = [word for key, value in settings.items() for word in ("--set", f"{key}={value}")]
-    return ["train", scene, "--out", str(out), "--downscale", "2", *sets]
+    return ["train", scene, "--out", str(out), "--downscale", str(downscale), *sets]
 
 
 def train_and_interrupt(scene, out, steps, monkeypatch, **changes):

@@ -78,7 +78,9 @@ def test_pruning_stays_within_the_plan(dev, tmp_path, monkeypatch):
     monkeypatch.setattr("pp_cl.device.compact.SCRATCH_BYTES", 10**6)
     trainer, plan, _ = trained(dev, tmp_path / "ball", {})
     before, dev.peak_bytes = dev.bytes, dev.bytes
-    trainer.prune(dev.upload(np.arange(POINTS), np.float32), 1.0)
+    trainer.state.weight_sum.set(np.arange(POINTS, dtype=np.float32))
+    trainer.state.look_count.set(np.full(POINTS, 20, np.float32))
+    trainer.prune()
     assert trainer.model.cloud.count == POINTS - 1
     assert dev.peak_bytes <= before + 10**6 + 2 * 4 * POINTS  # the weights and the list of the kept
     assert dev.peak_bytes <= plan_bytes(plan)

@@ -7,7 +7,7 @@ from pp_cl.config import TrainConfig
 from pp_cl.device.buffers import table_bytes
 from pp_cl.raster.point_cloud import PointCloud
 from pp_cl.training.point_state import PointState
-from pp_cl.training.prune import keep_indices
+from pp_cl.training.prune import judge, keep_indices
 
 
 def kept(dev, weights, least_weight, opacities, least_opacity):
@@ -49,7 +49,7 @@ def test_compacting_never_takes_more_than_its_scratch(dev, rng, monkeypatch, sha
         {k: (1e3 * rng.random(a.shape)).astype(a.dtype) for k, a in state.arrays().items()},
     )
     host = cloud.arrays() | state.arrays()
-    assert len(host) == 5 + 1 + 2 + 5 + (1 + 4 if settings else 8)
+    assert len(host) == 5 + 2 + 2 + 5 + (1 + 4 if settings else 8)
     keep = np.arange(0, 1000, share, dtype=np.uint32)
     indices = dev.upload(keep)
     before, dev.peak_bytes = dev.bytes, dev.bytes
@@ -70,3 +70,29 @@ def test_compacting_never_takes_more_than_its_scratch(dev, rng, monkeypatch, sha
     assert before - dev.bytes == sum(
         table_bytes({name: old[name]}) - table_bytes({name: new[name]}) for name in small
     )
+
+
+def test_only_what_was_looked_at_is_judged(dev):
+    """By its weight a look, and counted anew; the rest keeps its sums."""
+    settings = TrainConfig(prune_weight=0.1, prune_looks=10, prune_opacity=0.01, sh_rate=(1, 0, 0))
+    cloud = PointCloud.create(dev, np.arange(6), 0)
+    state = PointState(dev, cloud, settings)
+    state.weight_sum.set(np.float32([0, 0, 0.9, 1, 100, np.nan]))
+    state.look_count.set(np.float32([9, 10, 10, 10, 1000, 10]))
+    opacity = dev.upload(np.float32([0, 1, 1, 1, 1, 1]))
+    assert judge(dev, state, opacity, settings).get().tolist() == [0, 3, 4]
+    assert state.look_count.get().tolist() == [9, 0, 0, 0, 0, 0]
+    assert not state.weight_sum.get().any()
+    opacity.set(np.float32([0, 1, 1, 0, 1, 1]))
+    state.look_count.set(np.float32([20, 9, 9, 20, 0, 0]))
+    state.weight_sum.set(np.float32([5, 0, 0, 5, 0, 0]))
+    assert judge(dev, state, opacity, settings).get().tolist() == [1, 2, 4, 5]
+
+
+def test_one_judged_point_always_survives(dev):
+    settings = TrainConfig(prune_looks=1, prune_weight=1.0)
+    cloud = PointCloud.create(dev, np.arange(3), 2)
+    state = PointState(dev, cloud, settings)
+    state.weight_sum.set(np.float32([1, 3, 2]))
+    state.look_count.set(np.float32([10, 10, 10]))
+    assert judge(dev, state, cloud.opacity, settings).get().tolist() == [1]
