@@ -15,6 +15,7 @@ from pp_cl.scene.views import View
 from pp_cl.training.adam import moment_scale
 from pp_cl.training.loss import Loss
 from pp_cl.training.optimiser import Optimiser, Rates
+from pp_cl.training.perceptual import PerceptualLoss
 from pp_cl.training.point_state import PointState
 from pp_cl.training.prune import keep_indices
 from pp_cl.training.schedule import ema_weight, gamma_at
@@ -40,6 +41,7 @@ class Trainer:
         self.step = 0
         self.renderer = Renderer(dev, model, config.raster)
         self.loss = Loss(dev, self.config.ssim_weight)
+        self.perceptual = PerceptualLoss(dev, self.config.perceptual_weight, model.net.policy)
         self.state = PointState(dev, model.cloud, self.config)
         self.optimiser = Optimiser(dev, model, self.state, self._moment_scale())
         self._target = Target(dev)
@@ -59,8 +61,8 @@ class Trainer:
     # ----------------------------------------------------------------------------------------------
 
     def train_step(self) -> dict[str, float]:
-        """One step; returns {"loss", "l1", "ssim", "psnr"} of its crop. Raises UserError if the
-        loss is not finite.
+        """One step; returns {"loss", "l1", "ssim", "psnr"} of its crop, and "lpips" where that is a
+        term of the loss. Raises UserError if the loss is not finite.
         """
         t, config = self.step, self.config
         rng = np.random.default_rng((config.seed, t))
@@ -81,6 +83,13 @@ class Trainer:
             key=view_index if views_repeat(config, view.downscale) else None,
         )
         grad_image = self.loss.forward_backward(rendered.image, target, *rendered.offset)
+        self.perceptual.add(
+            rendered.image,
+            target,
+            rendered.offset,
+            grad_prediction=grad_image,
+            terms=self.loss.terms,
+        )
         grads = self.renderer.backward(rendered, grad_image)
         self.optimiser.update(
             t + 1,
@@ -129,6 +138,7 @@ class Trainer:
             "l1": l1,
             "ssim": 1 - dissimilarity,
             "psnr": -10 * math.log10(max(mse, 1e-10)),
+            **self.perceptual.terms(),
         }
 
     # ----------------------------------------------------------------------------------------------
