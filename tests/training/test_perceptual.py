@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from oracle.lpips import WIDTHS, lpips, lpips_gradient, random_weights
 from support.comparisons import relative_error
-from support.guarded import AWKWARD_SIZES
+from support.guarded import AWKWARD_SIZES, large
 from support.runs import arguments
 from support.scenes import write_ball_scene
 
@@ -17,7 +17,7 @@ from pp_cl.layers.policy import make_policy
 from pp_cl.metrics.lpips import Lpips
 from pp_cl.training.perceptual import PerceptualLoss
 
-SIZES = [(16, 16), (17, 33), (39, 31), (16, 257)]
+SIZES = [(16, 16), (17, 33), large((39, 31)), large((16, 257))]
 WEIGHT = 0.3
 
 
@@ -98,6 +98,7 @@ def test_equal_images_have_no_loss_and_no_gradient(dev, rng, weights):
         assert not terms.any() and not grad.any()
 
 
+@pytest.mark.large
 def test_sizes_may_change_between_calls_and_bits_stay(dev, rng, weights):
     loss, seen = PerceptualLoss(dev, WEIGHT, make_policy(dev), weights), {}
     pairs = [images(rng, *size) for size in [(20, 40), (33, 17)]]
@@ -139,6 +140,7 @@ def test_sums_equal_float64(dev, rng, n):
         np.testing.assert_allclose(terms.get(), [3.5 + 0.5 * expected.sum(), 1, 1, 1], rtol=1e-6)
 
 
+@pytest.mark.large
 def test_tables_are_what_it_takes(dev, rng, weights):
     before, policy, size = dev.bytes, make_policy(dev), (64, 40)
     loss = PerceptualLoss(dev, WEIGHT, policy, weights)
@@ -173,12 +175,14 @@ def rows(out):
     return [json.loads(line) for line in (out / "log.jsonl").read_text().splitlines()]
 
 
+@pytest.mark.large
 def test_a_training_without_it_reads_no_weights(scene, tmp_path, monkeypatch):
     monkeypatch.setattr("pp_cl.metrics.lpips.load_weights", _no_weights)
     assert main(arguments(scene, tmp_path / "off")) == 0
     assert all("lpips" not in row for row in rows(tmp_path / "off"))
 
 
+@pytest.mark.large
 def test_a_training_with_it_lowers_it(scene, tmp_path, monkeypatch, weights):
     """The loss holds it and falls, and it ends lower than where it is only measured."""
     monkeypatch.setattr("pp_cl.metrics.lpips.load_weights", lambda: weights)
@@ -195,6 +199,7 @@ def test_a_training_with_it_lowers_it(scene, tmp_path, monkeypatch, weights):
     assert ends[0.1] < 0.8 * ends[1e-9]
 
 
+@pytest.mark.large
 def test_crops_that_are_too_small_are_refused(scene, tmp_path, capsys, monkeypatch, weights):
     monkeypatch.setattr("pp_cl.metrics.lpips.load_weights", lambda: weights)
     crop = {"train__crop": 12, "train__perceptual_weight": 0.1}
@@ -204,6 +209,7 @@ def test_crops_that_are_too_small_are_refused(scene, tmp_path, capsys, monkeypat
     assert not (tmp_path / "run").exists()
 
 
+@pytest.mark.large
 def test_missing_weights_are_one_line(scene, tmp_path, capsys, monkeypatch):
     monkeypatch.setattr("pp_cl.metrics.lpips.load_weights", _no_weights)
     words = arguments(scene, tmp_path / "run", train__perceptual_weight=0.1)
