@@ -119,6 +119,7 @@ class TrainConfig:
         True, "shift the pixel grid of the downscaled image by a random sub-pixel offset each step"
     )
     ssim_weight: float = setting(0.2, "loss = L1 + ssim_weight * (1 - SSIM)", 0, 10)
+    perceptual_weight: float = setting(0.0, "adds this times LPIPS to the loss (0: off)", 0, 10)
     sh_rate: tuple = setting(
         (0.5, 0.25, 0.125),
         "Adam's first learning rate of SH degrees 0, 1, 2; at rate 0 a degree stays 0",

@@ -64,7 +64,7 @@ def evaluate(
     """
     scene = run.scene(split)
     views = scene.splits[split]
-    measure = Metrics(run.dev, metrics, run.policy.blocking)
+    measure = Metrics(run.dev, metrics, run.policy)
     target = run.folder.evaluation(split)
     target.mkdir(parents=True, exist_ok=True)
     remove_leftovers(target)

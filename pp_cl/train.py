@@ -14,6 +14,7 @@ from pp_cl.scene.views import View
 from pp_cl.training.adam import moment_scale
 from pp_cl.training.loss import Loss
 from pp_cl.training.optimiser import Optimiser, Rates
+from pp_cl.training.perceptual import PerceptualLoss
 from pp_cl.training.point_state import PointState
 from pp_cl.training.prune import judge, keep_indices
 from pp_cl.training.refine import refine
@@ -42,6 +43,7 @@ class Trainer:
         self.step = 0
         self.renderer = Renderer(dev, model, config.raster)
         self.loss = Loss(dev, self.config.ssim_weight)
+        self.perceptual = PerceptualLoss(dev, self.config.perceptual_weight, model.net.policy)
         self.state = PointState(dev, model.cloud, self.config)
         self.optimiser = Optimiser(dev, model, self.state, self._moment_scale())
         self._target = Target(dev)
@@ -69,8 +71,8 @@ class Trainer:
     # ----------------------------------------------------------------------------------------------
 
     def train_step(self) -> dict[str, float]:
-        """One step; returns {"loss", "l1", "ssim", "psnr"} of its crop. Raises UserError if the
-        loss is not finite.
+        """One step; returns {"loss", "l1", "ssim", "psnr"} of its crop, and "lpips" where that is a
+        term of the loss. Raises UserError if the loss is not finite.
         """
         t, config = self.step, self.config
         rng = np.random.default_rng((config.seed, t))
@@ -92,7 +94,7 @@ class Trainer:
             key=view_index if views_repeat(config, view.downscale) else None,
         )
         with self.dev.stage("loss"):
-            grad_image = self.loss.forward_backward(rendered.image, target, *rendered.offset)
+            grad_image = self._losses(rendered, target)
         grads = self.renderer.backward(rendered, grad_image)
         with self.dev.stage("update"):
             self.optimiser.update(
@@ -110,6 +112,18 @@ class Trainer:
         self.step = t + 1
         self._regularise(rates)
         return self._terms()
+
+    def _losses(self, rendered, target):
+        """dL/dimage of what is rendered; the terms are in self.loss.terms."""
+        grad_image = self.loss.forward_backward(rendered.image, target, *rendered.offset)
+        self.perceptual.add(
+            rendered.image,
+            target,
+            rendered.offset,
+            grad_prediction=grad_image,
+            terms=self.loss.terms,
+        )
+        return grad_image
 
     def draw(
         self, rng: np.random.Generator
@@ -144,6 +158,7 @@ class Trainer:
             "l1": l1,
             "ssim": 1 - dissimilarity,
             "psnr": -10 * math.log10(max(mse, 1e-10)),
+            **self.perceptual.terms(),
         }
 
     # ----------------------------------------------------------------------------------------------

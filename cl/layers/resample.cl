@@ -71,6 +71,42 @@ kernel void maxpool2_forward(
     store16(largest, out + ((size_t)row * w + column) * c + first, lanes);
 }
 
+// One work-item per (16 channels, x, y) of out: ADDS grad_out to grad_x at the largest of the 2x2
+// pixels that it covers, of equal ones at the first, as PyTorch does. x is the output of a ReLU,
+// and grad_x holds the gradient of its input from another use of x: nothing is added where x is 0.
+kernel void maxpool2_backward(
+    const int h,  // of out
+    const int w,
+    const int c,
+    const int x_width,
+    global const float *x,         // (?, x_width, c)
+    global const float *grad_out,  // (h, w, c)
+    global float *grad_x)          // (?, x_width, c) accumulates
+{
+    const int first = get_global_id(0) * CHANNELS, column = get_global_id(1),
+              row = get_global_id(2), lanes = c - first;
+    if (first >= c || column >= w || row >= h) return;
+    const size_t upper = ((size_t)row * 2 * x_width + column * 2) * c + first,
+                 lower = upper + x_width * c;
+    const size_t at[4] = {upper, upper + c, lower, lower + c};
+    float16 value[4];
+    float16 largest = 0.0f;
+#pragma unroll
+    for (int i = 0; i < 4; i++) {
+        value[i] = load16(x + at[i], lanes);
+        largest = fmax(largest, value[i]);
+    }
+    const float16 dL_dout = load16(grad_out + ((size_t)row * w + column) * c + first, lanes);
+    int16 open = largest > 0.0f;  // lanes whose largest value has not been met yet
+#pragma unroll
+    for (int i = 0; i < 4; i++) {
+        const int16 taken = open & (value[i] == largest);
+        const float16 others = load16(grad_x + at[i], lanes);
+        store16(select(others, others + dL_dout, taken), grad_x + at[i], lanes);
+        open &= ~taken;
+    }
+}
+
 // One work-item per (16 channels, x, y) of out, which is twice as high and wide as x: reads the
 // pixel of x that out's centre lies in and the nearest ones beside it, writes them weighted 3/4 and
 // 1/4 along each axis (bilinear, align_corners False, the border repeated).

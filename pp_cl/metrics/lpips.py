@@ -1,43 +1,152 @@
 """LPIPS v0.1 with VGG16 (Zhang et al. 2018): a perceptual distance, run on the convolutions of the
-renderer.
+renderer. The metric is here; the loss (training/perceptual.py) computes it with the same network.
 """
 
-from itertools import islice
+import math
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
 
 import numpy as np
+from pyopencl.array import Array
 
+from pp_cl.device.buffers import Table
 from pp_cl.device.device import Device
 from pp_cl.errors import UserError
-from pp_cl.layers.blocking import Blocking, shipped_blocking
-from pp_cl.layers.conv import conv_forward, pack_weights
-from pp_cl.layers.resample import maxpool2_forward
+from pp_cl.layers.conv import pack_weights
+from pp_cl.layers.direction import Direction
+from pp_cl.layers.policy import ConvolutionPolicy, make_policy
+from pp_cl.layers.resample import maxpool2_backward, maxpool2_forward
+from pp_cl.layers.tiles import LANES, Tiles, all_tiles, all_tiles_buffers
+from pp_cl.layers.variants import Convolution, ConvShape
+from pp_cl.layers.work import Work
 from pp_cl.metrics.lpips_weights import load_weights
 
 # convolutions between the poolings of VGG16; the last one of each block is compared
 BLOCKS = (2, 2, 3, 3, 3)
+WIDTHS = (64, 128, 256, 512, 512)  # channels of the blocks
 LEAST_SIZE = 16  # pixels: four poolings leave one
+
+Size = tuple[int, int]  # (height, width)
+Place = Callable[[str, tuple[int, ...]], Array]
+
+
+@dataclass(frozen=True)
+class VggConv:
+    """A 3x3 convolution with ReLU of VGG16. name, source: of its output and of its input: "input",
+    "conv0", "features0" (the last convolution of block 0), "pool1", ...
+    """
+
+    name: str
+    source: str
+    block: int
+    ci: int
+    co: int
+
+    def weight_shape(self) -> tuple[int, ...]:
+        """As conv.pack_weights makes it."""
+        return -(-self.co // LANES), 3, 3, self.ci, LANES
+
+    def choose(self, dev: Device, policy: ConvolutionPolicy, size: Size) -> "Choice":
+        """Its variants for an image of `size`."""
+        pixels = math.prod(size_of(size, self.block))
+        shapes = (
+            ConvShape(direction, 3, (self.ci,), self.co, pixels, source)
+            for direction, source in ((Direction.FORWARD, None), (Direction.BACKWARD_INPUT, 0))
+        )
+        return Choice(*(policy.convolution(dev, shape) for shape in shapes))
+
+
+@dataclass(frozen=True)
+class Choice:
+    """The variants that compute a convolution."""
+
+    forward: Convolution
+    backward: Convolution
+
+    def work_floats(self, layer: VggConv, size: Size) -> list[tuple[int, int]]:
+        """As variants.Convolution.work_floats, [forward, backward]."""
+        height, _ = size_of(size, layer.block)
+        return [
+            variant.work_floats(direction, height, layer.weight_shape(), layer.ci)
+            for variant, direction in (
+                (self.forward, Direction.FORWARD),
+                (self.backward, Direction.BACKWARD_INPUT),
+            )
+        ]
+
+
+def size_of(size: Size, block: int) -> Size:
+    """(height, width) of a block's features for an image of `size`."""
+    return size[0] >> block, size[1] >> block
+
+
+def vgg_layers(widths: tuple[int, ...] = WIDTHS) -> list[VggConv]:
+    """The convolutions in the order of the forward pass. widths: channels of the blocks."""
+    layers, ci, source = [], 3, "input"
+    for block, (convolutions, co) in enumerate(zip(BLOCKS, widths, strict=True)):
+        for i in range(convolutions):
+            last = i == convolutions - 1
+            name = f"features{block}" if last else f"conv{len(layers)}"
+            layers.append(VggConv(name, source, block, ci, co))
+            ci, source = co, name
+        source = f"pool{block + 1}"
+    return layers
 
 
 class Lpips:
-    """Distance of image pairs. weights: as load_weights() returns them, which is the default (and
-    may raise UserError). blocking: of the convolutions, None = as shipped.
+    """The network, prepared for images of one size at a time, and the distance of image pairs.
+
+    weights: as load_weights() returns them, which is the default (and may raise UserError). policy:
+    of the convolutions, None = direct ones as shipped. training: backward() will be called.
     """
 
     def __init__(
         self,
         dev: Device,
         weights: dict[str, np.ndarray] | None = None,
-        blocking: Blocking | None = None,
+        policy: ConvolutionPolicy | None = None,
+        *,
+        training: bool = False,
     ):
         weights = load_weights() if weights is None else weights
         self.dev = dev
-        self.blocking = blocking or shipped_blocking(dev)
+        self.policy = policy or make_policy(dev, variant="direct")
+        self.training = training
         self.program = dev.program("metrics/lpips")
-        self.layers = [
-            (dev.upload(pack_weights(weights[f"kernel{i}"])), dev.upload(weights[f"bias{i}"]))
-            for i in range(sum(BLOCKS))
-        ]
         self.heads = [dev.upload(weights[f"head{i}"]) for i in range(len(BLOCKS))]
+        self.widths = tuple(head.size for head in self.heads)
+        self._weights, self._biases = {}, {}
+        for i, layer in enumerate(vgg_layers(self.widths)):
+            self._weights[layer.name] = dev.upload(pack_weights(weights[f"kernel{i}"]))
+            self._biases[layer.name] = dev.upload(weights[f"bias{i}"])
+        self._size = None
+        self._choices: dict[str, Choice] = {}
+        self._laid_out: dict[str, Array | None] = {}
+        self._tiles: list[Tiles] = []  # of each block
+        self._work = Work.empty(dev, 1, 1)
+
+    @staticmethod
+    def table(
+        dev: Device, policy: ConvolutionPolicy, size: Size, widths: tuple[int, ...] = WIDTHS
+    ) -> Table:
+        """The device buffers of a network that is trained with, for images of `size`: weights, work
+        and tiles, without feature maps.
+        """
+        floats, work = {}, [(1, 1)]
+        for layer in vgg_layers(widths):
+            choice = layer.choose(dev, policy, size)
+            needs = choice.work_floats(layer, size)
+            work += needs
+            floats[f"weights of {layer.name}"] = math.prod(layer.weight_shape())
+            floats[f"bias of {layer.name}"] = layer.co
+            floats[f"transformed weights of {layer.name}"] = needs[0][1]
+        floats["work: scratch"], floats["work: weights"] = map(max, zip(*work, strict=True))
+        table = {name: ((number,), np.float32) for name, number in floats.items()}
+        for block, width in enumerate(widths):
+            table[f"head {block}"] = (width,), np.float32
+            tiles = all_tiles_buffers(*size_of(size, block))
+            table |= {f"tiles of block {block}, {name}": row for name, row in tiles.items()}
+        return table
 
     def distance(self, a: np.ndarray, b: np.ndarray) -> float:
         """LPIPS of two (H, W, 3) images in [0, 1].
@@ -55,46 +164,153 @@ class Lpips:
             )
         # Both images go through a block before either goes on, so that the features of one block
         # only are held.
-        features = [self._input(a), self._input(b)]
-        layers = iter(self.layers)
+        features = [
+            self.features(self.dev.upload(image, np.float32), (height, width), self._new)
+            for image in (a, b)
+        ]
         total = 0.0
-        for block, (convolutions, head) in enumerate(zip(BLOCKS, self.heads, strict=True)):
-            if block:
-                features = [self._pool(x) for x in features]
-            for weight, bias in islice(layers, convolutions):
-                for i in range(2):
-                    features[i] = self._convolve(features[i], weight, bias)
-            total += self._compare(*features, head)
+        for block, pair in enumerate(zip(*features, strict=True)):
+            distance = self.dev.empty(size_of((height, width), block))
+            self.compare(block, *pair, distance)
+            total += float(distance.get().mean(dtype=np.float64))
         return total
 
-    def _input(self, image):
-        x = self.dev.empty(image.shape)
-        n = image.shape[0] * image.shape[1]
-        self.program.launch(
-            "lpips_input",
-            n,
-            n=n,
-            image=self.dev.upload(image.reshape(n, 3), np.float32),
-            x=x.reshape(n, 3),
+    def _new(self, name, shape):
+        return self.dev.empty(shape)
+
+    def features(self, image: Array, size: Size, place: Place, corner: int = 0) -> Iterator[Array]:
+        """Computes and yields each block's features (H, W, C), block by block.
+
+        image: (IH, IW, 3) float32, of which the rectangle of `size` from its value `corner` on is
+        looked at; at least LEAST_SIZE pixels a side. place(name, shape) returns the array in which
+        to compute a map, see VggConv; its input must not be in the same one.
+        """
+        self._prepare(size)
+        height, width = size
+        x = place("input", (height, width, 3))
+        self._launch_input("lpips_input", size, corner, image=image, x=x)
+        layers = iter(vgg_layers(self.widths))
+        for block, convolutions in enumerate(BLOCKS):
+            if block:
+                pooled = place(f"pool{block}", (*size_of(size, block), x.shape[2]))
+                maxpool2_forward(self.dev, x, pooled)
+                x = pooled
+            for _ in range(convolutions):
+                layer = next(layers)
+                out = place(layer.name, (*x.shape[:2], layer.co))
+                self._convolve(layer, x, out)
+                x = out
+            yield x
+
+    def compare(self, block: int, a: Array, b: Array, distance: Array) -> None:
+        """distance (H, W) of the features a and b (H, W, C) of a block; LPIPS is the sum of its
+        means.
+        """
+        self._launch_pixels("lpips_distance", block, a=a, b=b, distance=distance.reshape(-1))
+
+    def backward(
+        self,
+        maps: dict[str, Array],
+        targets: list[Array],
+        weight: float,
+        *,
+        place: Place,
+        grad_image: Array,
+        corner: int = 0,
+    ) -> None:
+        """Adds the gradient of weight * LPIPS by the image to grad_image.
+
+        maps: {name: (H, W, C)} of the convolutions' outputs for that image, from the last call of
+        features(). targets: the features that it is compared with, of each block. place, corner: as
+        features() takes them; a gradient of the name "gradient" is computed from the one before.
+        """
+        grad, layers = None, vgg_layers(self.widths)[::-1]
+        for block in reversed(range(len(BLOCKS))):
+            x = maps[f"features{block}"]
+            pooled_grad, grad = grad, place("gradient", x.shape)
+            share = weight / math.prod(x.shape[:2])
+            self._launch_pixels(
+                "lpips_distance_backward",
+                block,
+                weight=share,
+                a=x,
+                b=targets[block],
+                grad_a=grad.reshape(-1, x.shape[2]),
+            )
+            if pooled_grad is not None:
+                maxpool2_backward(self.dev, x, pooled_grad, grad)
+            for layer in (layer for layer in layers if layer.block == block):
+                grad_x = place("gradient", (*x.shape[:2], layer.ci))
+                # Poolings and the input are no ReLU's outputs.
+                self._convolve_backward(layer, grad, grad_x, maps.get(layer.source))
+                grad = grad_x
+        self._launch_input(
+            "lpips_input_backward", grad.shape[:2], corner, grad_x=grad, grad_image=grad_image
         )
-        return x
 
-    def _pool(self, x):
-        height, width, channels = x.shape
-        out = self.dev.empty((height // 2, width // 2, channels))
-        maxpool2_forward(self.dev, x, out)
-        return out
+    # ----------------------------------------------------------------------------------------------
 
-    def _convolve(self, x, weight, bias):
-        out = self.dev.empty((*x.shape[:2], *bias.shape))
-        conv_forward(self.dev, (x,), weight, bias, out=out, relu=True, blocking=self.blocking)
-        return out
+    def _prepare(self, size):
+        """Variants, transformed weights, tiles and work for images of this size."""
+        if size == self._size:
+            return
+        self._size, self._laid_out, self._tiles, self._work = None, {}, [], None
+        work = [(1, 1)]
+        for layer in vgg_layers(self.widths):
+            choice = self._choices[layer.name] = layer.choose(self.dev, self.policy, size)
+            self._laid_out[layer.name] = choice.forward.lay_out(self._weights[layer.name])
+            needs = choice.work_floats(layer, size)
+            work += needs if self.training else needs[:1]
+        self._tiles = [all_tiles(self.dev, *size_of(size, i)) for i in range(len(BLOCKS))]
+        self._work = Work.empty(self.dev, *map(max, zip(*work, strict=True)))
+        self._size = size
 
-    def _compare(self, a, b, head):
+    def _convolve(self, layer, x, out):
+        self._choices[layer.name].forward.forward(
+            (x,),
+            self._weights[layer.name],
+            self._biases[layer.name],
+            out,
+            relu=True,
+            work=self._work,
+            tiles=self._tiles[layer.block],
+            laid_out=self._laid_out[layer.name],
+        )
+
+    def _convolve_backward(self, layer, grad_out, grad_x, mask):
+        self._choices[layer.name].backward.backward_input(
+            self._weights[layer.name],
+            0,
+            grad_out,
+            grad_x,
+            mask=mask,
+            work=self._work,
+            tiles=self._tiles[layer.block],
+        )
+
+    def _launch_input(self, kernel, size, corner, **arrays):
+        height, width = size
+        image = arrays["image"] if "image" in arrays else arrays["grad_image"]
+        self.program.launch(
+            kernel,
+            (width, height),
+            h=height,
+            w=width,
+            image_width=image.shape[1],
+            corner=corner,
+            **arrays,
+        )
+
+    def _launch_pixels(self, kernel, block, a, b, **arguments):
         channels = a.shape[2]
         n = a.size // channels
-        a, b, distance = a.reshape(n, channels), b.reshape(n, channels), self.dev.empty((n,))
         self.program.launch(
-            "lpips_distance", n, n=n, c=channels, a=a, b=b, head=head, distance=distance
+            kernel,
+            n,
+            n=n,
+            c=channels,
+            a=a.reshape(n, channels),
+            b=b.reshape(n, channels),
+            head=self.heads[block],
+            **arguments,
         )
-        return float(distance.get().mean(dtype=np.float64))

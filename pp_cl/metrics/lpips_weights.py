@@ -98,7 +98,7 @@ def _read_member(url):
 def _failure(reason):
     return UserError(
         f"LPIPS weights: {reason}; try again with a network connection, or leave LPIPS out with"
-        " --metrics psnr,ssim"
+        " train.perceptual_weight=0 or --metrics psnr,ssim"
     )
 
 

@@ -1,12 +1,14 @@
 """PSNR, SSIM and LPIPS of 8-bit images, with the settings behind the tables of this field."""
 
+from dataclasses import replace
+
 import numpy as np
 from skimage.metrics import structural_similarity
 
 from pp_cl.device.device import Device
 from pp_cl.errors import UserError
 from pp_cl.files.image import to_8bit
-from pp_cl.layers.blocking import Blocking
+from pp_cl.layers.policy import ConvolutionPolicy
 from pp_cl.metrics.lpips import Lpips
 
 PSNR_CAP = 100.0  # dB of identical images: JSON has no infinity
@@ -48,14 +50,19 @@ def ssim(a: np.ndarray, b: np.ndarray) -> float:
 
 class Metrics:
     """The named metrics of image pairs. names: out of psnr, ssim, lpips; only lpips needs dev.
-    blocking: of the convolutions of lpips, None = as shipped.
+    policy: whose blocking the convolutions of lpips take, None = as shipped; they are direct ones
+    at any tolerance, so that a metric does not depend on it.
     """
 
     def __init__(
-        self, dev: Device | None, names: tuple[str, ...], blocking: Blocking | None = None
+        self,
+        dev: Device | None,
+        names: tuple[str, ...],
+        policy: ConvolutionPolicy | None = None,
     ) -> None:
         self.names = names
-        self._lpips = Lpips(dev, blocking=blocking) if "lpips" in names else None
+        direct = policy and replace(policy, variant="direct")
+        self._lpips = Lpips(dev, policy=direct) if "lpips" in names else None
 
     def __call__(self, prediction: np.ndarray, truth: np.ndarray) -> dict[str, float]:
         """{name: number} of two float (H, W, 3) images in [0, 1], both rounded to 8 bits first.

@@ -53,7 +53,7 @@ class Loss:
         prediction's columns left..left+W and rows top..top+H; the gradient is 0 elsewhere. Raises
         ValueError where it reaches outside.
         """
-        corner = _corner(prediction.shape, target.shape, left, top)
+        corner = corner_of(prediction.shape, target.shape, left, top)
         height, width, _ = target.shape
         b = self._buffers
         b.require(self.table(prediction.shape, target.shape, self.ssim_weight))
@@ -101,7 +101,9 @@ class Loss:
         program.launch(kernel, size, **arguments)
 
 
-def _corner(prediction_shape, target_shape, left, top):
+def corner_of(
+    prediction_shape: tuple[int, ...], target_shape: tuple[int, ...], left: int, top: int
+) -> int:
     """First value of the prediction under a target at (left, top). Raises ValueError where the
     target reaches outside.
     """

@@ -9,6 +9,7 @@ from pp_cl.device.buffers import Table, grown, table_bytes
 from pp_cl.device.compact import compact_table
 from pp_cl.device.device import Device
 from pp_cl.errors import UserError
+from pp_cl.metrics.lpips import Lpips
 from pp_cl.model import Model
 from pp_cl.raster.blend import BLENDS, Blend
 from pp_cl.raster.pairs import PairBuilder
@@ -19,6 +20,7 @@ from pp_cl.scene.camera import Camera
 from pp_cl.scene.views import View
 from pp_cl.training.loss import Loss
 from pp_cl.training.optimiser import Optimiser
+from pp_cl.training.perceptual import PerceptualLoss
 from pp_cl.training.point_state import PointState
 from pp_cl.training.smooth import Smoother, chunk_points
 
@@ -48,6 +50,7 @@ def memory_plan(config: Config, model: Model, views: list[View]) -> Plan:
         ),
         (f"network at {size[1]}x{size[0]}", _network_table(model, size)),
         ("loss", Loss.table(image, target, train.ssim_weight)),
+        *(_perceptual_tables(model.net, target) if train.perceptual_weight else ()),
         (
             "photograph and target",
             {"image": (views[0].image.shape, np.uint8), "target": (target, np.float32)},
@@ -68,6 +71,13 @@ def _smoothing_table(config, model):
 def _network_table(model, size):
     plan = model.net.memory_plan(*size, True)
     return {f"{i} {name}": (shape, np.float32) for i, (name, shape, _) in enumerate(plan)}
+
+
+def _perceptual_tables(net, target):
+    return [
+        ("perceptual loss", PerceptualLoss.table(target)),
+        ("network of LPIPS", Lpips.table(net.dev, net.policy, target[:2])),
+    ]
 
 
 def _raster_tables(settings, n, size, pairs):

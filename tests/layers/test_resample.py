@@ -42,6 +42,18 @@ def test_maxpool_drops_odd_borders(dev, rng, shape):
     np.testing.assert_array_equal(out.get(), oracle.maxpool2(x))
 
 
+@pytest.mark.parametrize("shape", [(2, 2, 16), (3, 5, 3), (31, 33, 17), (257, 2, 32), (1, 9, 16)])
+def test_maxpool_backward_adds_at_the_first_of_the_largest(dev, rng, shape):
+    # few levels: many equal ones, and cells of zeros, which receive nothing
+    x = np.maximum(rng.integers(-3, 3, shape), 0).astype(np.float32)
+    others = rng.normal(size=shape).astype(np.float32)
+    grad_out = rng.normal(size=(shape[0] // 2, shape[1] // 2, shape[2])).astype(np.float32)
+    grad_x = dev.upload(others)
+    layers.maxpool2_backward(dev, dev.upload(x), dev.upload(grad_out), grad_x)
+    expected = others + oracle.maxpool2_gradient(x, grad_out) * (x > 0)
+    assert relative_error(grad_x.get(), expected) < 5e-7
+
+
 @pytest.mark.parametrize("shape", SHAPES)
 def test_upsample(dev, rng, shape):
     h, w, c = shape
@@ -61,6 +73,12 @@ def test_gradients_by_finite_differences(dev, rng):
     grad_x = dev.zeros(x.shape)
     layers.avgpool2_backward(dev, dev.upload(x, np.float32), dev.upload(grad_pooled), grad_x)
     numeric = numeric_gradient(lambda v: (oracle.avgpool2(v) * grad_pooled).sum(), x, 1e-4)
+    assert relative_error(grad_x.get().ravel(), numeric) < 1e-6
+
+    x = rng.permutation(48).reshape(4, 6, 2) + 1.0  # no two are equal
+    numeric = numeric_gradient(lambda v: (oracle.maxpool2(v) * grad_pooled).sum(), x, 1e-4)
+    grad_x = dev.zeros(x.shape)
+    layers.maxpool2_backward(dev, dev.upload(x, np.float32), dev.upload(grad_pooled), grad_x)
     assert relative_error(grad_x.get().ravel(), numeric) < 1e-6
 
     grad_out = rng.normal(size=(8, 12, 2)).astype(np.float32)
@@ -92,5 +110,7 @@ def test_wrong_shapes_are_refused(dev):
         layers.upsample2_forward(dev, small, large)
     with pytest.raises(ValueError, match="max pooling"):
         layers.maxpool2_forward(dev, large, dev.zeros((2, 4, 16)))
+    with pytest.raises(ValueError, match="max pooling"):
+        layers.maxpool2_backward(dev, large, dev.zeros((2, 4, 16)), large)
     with pytest.raises(ValueError, match="affine"):
         layers.affine(dev, 1, 0, small, out=large)

@@ -2,9 +2,16 @@
 
 import numpy as np
 import pytest
-from oracle.lpips import lpips, pixel_distance, random_weights, scaled_input
+from oracle.lpips import (
+    lpips,
+    lpips_gradient,
+    pixel_distance,
+    pixel_distance_gradient,
+    random_weights,
+    scaled_input,
+)
 from PIL import Image
-from support.comparisons import relative_error
+from support.comparisons import numeric_gradient, relative_error
 from support.guarded import AWKWARD_SIZES
 
 from pp_cl.errors import UserError
@@ -12,40 +19,91 @@ from pp_cl.metrics import lpips_weights
 from pp_cl.metrics.lpips import Lpips
 
 
-@pytest.mark.parametrize("n", AWKWARD_SIZES)
-def test_input_equals_oracle(dev, rng, n):
-    image = rng.uniform(0, 1, (n, 3)).astype(np.float32)
-    x = dev.empty((n, 3))
-    dev.program("metrics/lpips").launch("lpips_input", n, n=n, image=dev.upload(image), x=x)
-    assert relative_error(x.get(), scaled_input(image.astype(np.float64))) < 1e-6
+@pytest.mark.parametrize(("h", "w"), [(1, n) for n in AWKWARD_SIZES] + [(31, 1), (33, 31)])
+def test_input_equals_oracle(dev, rng, h, w):
+    """Of the rectangle at (2, 1) of a larger image; the gradient is added to what is there."""
+    image = rng.uniform(0, 1, (h + 3, w + 5, 3)).astype(np.float32)
+    sizes = {"h": h, "w": w, "image_width": w + 5, "corner": 3 * (w + 5 + 2)}
+    inside = np.s_[1 : 1 + h, 2 : 2 + w]
+    x, program = dev.empty((h, w, 3)), dev.program("metrics/lpips")
+    program.launch("lpips_input", (w, h), image=dev.upload(image), x=x, **sizes)
+    assert relative_error(x.get(), scaled_input(image[inside].astype(np.float64))) < 1e-6
+
+    grad_x, others = rng.normal(size=(h, w, 3)).astype(np.float32), np.ones_like(image)
+    grad_image = dev.upload(others)
+    program.launch(
+        "lpips_input_backward", (w, h), grad_x=dev.upload(grad_x), grad_image=grad_image, **sizes
+    )
+    expected = others.astype(np.float64)
+    expected[inside] += numeric_scale() * grad_x
+    assert relative_error(grad_image.get(), expected) < 1e-6
 
 
-@pytest.mark.parametrize("n", AWKWARD_SIZES)
-@pytest.mark.parametrize("channels", [16, 64, 512])
-def test_distance_equals_oracle(dev, rng, n, channels):
+def numeric_scale():
+    """Derivative of scaled_input, which is linear."""
+    return scaled_input(np.ones(3)) - scaled_input(np.zeros(3))
+
+
+def hard_features(rng, n, channels):
+    """(a, b (n, channels), head (channels,)) float32: features of very different lengths."""
     a, b = (
         np.maximum(rng.normal(0, 1, (n, channels)), 0) * 10 ** rng.uniform(-3, 3, (n, 1))
         for _ in range(2)
     )
     a[0] = 0  # a pixel without features has no direction
-    a, b, head = (
-        a.astype(np.float32),
-        b.astype(np.float32),
-        rng.uniform(0, 1, channels).astype(np.float32),
-    )
-    distance = dev.empty((n,))
+    head = rng.uniform(0, 1, channels)
+    return tuple(array.astype(np.float32) for array in (a, b, head))
+
+
+def launch_distance(dev, kernel, a, b, head, **more):
     dev.program("metrics/lpips").launch(
-        "lpips_distance",
-        n,
-        n=n,
-        c=channels,
+        kernel,
+        len(a),
+        n=len(a),
+        c=len(head),
         a=dev.upload(a),
         b=dev.upload(b),
         head=dev.upload(head),
-        distance=distance,
+        **more,
     )
+
+
+@pytest.mark.parametrize("n", AWKWARD_SIZES)
+@pytest.mark.parametrize("channels", [16, 64, 512])
+def test_distance_equals_oracle(dev, rng, n, channels):
+    a, b, head = hard_features(rng, n, channels)
+    distance = dev.empty((n,))
+    launch_distance(dev, "lpips_distance", a, b, head, distance=distance)
     expected = pixel_distance(a.astype(np.float64), b.astype(np.float64), head.astype(np.float64))
     assert relative_error(distance.get(), expected) < 2e-6
+
+
+@pytest.mark.parametrize("n", AWKWARD_SIZES)
+@pytest.mark.parametrize("channels", [16, 64, 512])
+def test_gradient_of_the_distance_equals_oracle(dev, rng, n, channels):
+    """Times the length of the features, by which the gradients of pixels differ a millionfold."""
+    a, b, head = hard_features(rng, n, channels)
+    a[-1] = b[-1]  # equal pixels
+    grad_a = dev.empty((n, channels))
+    launch_distance(dev, "lpips_distance_backward", a, b, head, weight=0.3, grad_a=grad_a)
+    exact = [array.astype(np.float64) for array in (a, b, head)]
+    expected = 0.3 * pixel_distance_gradient(*exact) * (a > 0)
+    length = np.linalg.norm(exact[0], axis=1, keepdims=True)
+    grad = grad_a.get()
+    assert relative_error(grad * length, expected * length) < 3e-6
+    assert not grad[0].any() and not grad[-1].any()
+
+
+def test_gradients_of_the_oracle_are_the_derivatives(rng):
+    a, b, head = rng.uniform(0.1, 1, (5, 16)), rng.uniform(0, 1, (5, 16)), rng.uniform(0, 1, 16)
+    numeric = numeric_gradient(lambda x: pixel_distance(x, b, head).sum(), a, 1e-6)
+    assert relative_error(pixel_distance_gradient(a, b, head).ravel(), numeric) < 1e-8
+
+    weights, size = random_weights(rng), (17, 35)
+    a, b = rng.uniform(0, 1, (2, *size, 3))
+    places = rng.choice(a.size, 40, replace=False)
+    numeric = numeric_gradient(lambda x: lpips(x, b, weights), a, 1e-6, places)
+    assert relative_error(lpips_gradient(a, b, weights).flat[places], numeric) < 1e-5
 
 
 @pytest.mark.parametrize("size", [(16, 16), (17, 33), (39, 31)])

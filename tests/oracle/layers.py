@@ -20,6 +20,18 @@ def maxpool2(x):
     return np.asarray(x, np.float64)[: 2 * h, : 2 * w].reshape(h, 2, w, 2, c).max((1, 3))
 
 
+def maxpool2_gradient(x, grad_out):
+    """(H, W, C), (H // 2, W // 2, C) -> (H, W, C): at the largest of a cell, the first of equal
+    ones.
+    """
+    grad_x = np.zeros(x.shape)
+    for row, column, c in np.ndindex(grad_out.shape):
+        cell = x[2 * row : 2 * row + 2, 2 * column : 2 * column + 2, c]
+        y, z = np.unravel_index(cell.argmax(), (2, 2))
+        grad_x[2 * row + y, 2 * column + z, c] = grad_out[row, column, c]
+    return grad_x
+
+
 def upsample_matrix(n):
     """(2n, n): row i holds the weights of output i, from the definition by coordinates (i + 0.5) /
     2 - 0.5.

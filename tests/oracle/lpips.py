@@ -1,6 +1,8 @@
 """Float64 numpy twin of LPIPS v0.1 with VGG16."""
 
 import numpy as np
+from oracle.conv import conv_gradients
+from oracle.layers import maxpool2_gradient
 
 BLOCKS = (2, 2, 3, 3, 3)
 WIDTHS = (16, 16, 32, 32, 48)  # channels of the blocks of a network small enough for numpy
@@ -51,6 +53,44 @@ def lpips(a, b, weights):
             layer += 1
         total += pixel_distance(x, y, weights[f"head{block}"]).mean()
     return total
+
+
+def pixel_distance_gradient(a, b, head):
+    """Gradient of pixel_distance(a, b, head).sum() by a; 0 at pixels without features."""
+    length = np.sqrt((a**2).sum(axis=-1, keepdims=True))
+    unit_a = a / (length + 1e-10)
+    unit_b = b / (np.sqrt((b**2).sum(axis=-1, keepdims=True)) + 1e-10)
+    by_unit = 2 * head * (unit_a - unit_b)
+    turned = (by_unit * a).sum(axis=-1, keepdims=True) / np.where(length > 0, length, np.inf)
+    return by_unit / (length + 1e-10) - turned * a / (length + 1e-10) ** 2
+
+
+def lpips_gradient(a, b, weights):
+    """Gradient of lpips(a, b, weights) by a, (H, W, 3)."""
+    weights = {name: array.astype(np.float64) for name, array in weights.items()}
+    inputs, features = [], []  # of each convolution; of each block, of both images
+    for image in (a, b):
+        x, seen, found, layer = scaled_input(image), [], [], 0
+        for block, convolutions in enumerate(BLOCKS):
+            x = max_pool(x) if block else x
+            for _ in range(convolutions):
+                seen.append(x)
+                x = convolve_relu(x, weights[f"kernel{layer}"], weights[f"bias{layer}"])
+                layer += 1
+            found.append(x)
+        inputs, features = inputs or seen, [*features, found]
+
+    grad = None
+    for block in reversed(range(len(BLOCKS))):
+        x, y = (found[block] for found in features)
+        here = pixel_distance_gradient(x, y, weights[f"head{block}"]) / (x.shape[0] * x.shape[1])
+        grad = here if grad is None else here + maxpool2_gradient(x, grad)
+        for _ in range(BLOCKS[block]):
+            layer -= 1
+            grad_out, kernel = grad * (x > 0), weights[f"kernel{layer}"]
+            x = inputs[layer]
+            grad = conv_gradients(x, kernel, grad_out)[0]
+    return grad * 2 / np.array([0.458, 0.448, 0.450])
 
 
 def random_weights(rng):

@@ -8,6 +8,7 @@ from pp_cl.config import assign, preset
 from pp_cl.device.buffers import table_bytes
 from pp_cl.device.compact import compact_table
 from pp_cl.errors import UserError
+from pp_cl.metrics.lpips import WIDTHS, vgg_layers
 from pp_cl.model import Model
 from pp_cl.network.unet import UNet
 from pp_cl.raster.point_cloud import PointCloud
@@ -24,6 +25,7 @@ WAYS = [
     {"train.lazy_adam": "true", "raster.early_stop": "0.001"},
     {"train.moments_16bit": "true", "train.ema": "false", "train.sh_smoothing": "0"},
     {"points.sh_degree": "1"},
+    {"train.perceptual_weight": "0.1"},
 ]
 
 
@@ -56,8 +58,17 @@ def trained(dev, folder, changes, base="tiny"):
     return trainer, plan, dev.peak_bytes - before
 
 
+def zero_weights():
+    """Of LPIPS, in their shapes."""
+    layers = vgg_layers()
+    weights = {f"kernel{i}": np.zeros((x.co, x.ci, 3, 3)) for i, x in enumerate(layers)}
+    weights |= {f"bias{i}": np.zeros(x.co, np.float32) for i, x in enumerate(layers)}
+    return weights | {f"head{i}": np.zeros(width, np.float32) for i, width in enumerate(WIDTHS)}
+
+
 @pytest.mark.parametrize("changes", WAYS)
-def test_the_plan_is_what_a_training_takes(dev, tmp_path, changes):
+def test_the_plan_is_what_a_training_takes(dev, tmp_path, monkeypatch, changes):
+    monkeypatch.setattr("pp_cl.metrics.lpips.load_weights", zero_weights)
     trainer, plan, peak = trained(dev, tmp_path / "ball", changes)
     assert trainer.model.cloud.count == POINTS
     blocks = trainer.model.cloud.blocks
