@@ -5,6 +5,16 @@ PRESETS = {
     "tiny": {},
     # for 400 x 400; 8000 steps take a quarter of an hour on a CPU, all 20,000 were not timed
     "small": {"points.count": 1_000_000, "train.iterations": 20_000, "train.crop": 192},
+    # for 800 x 800: begins at a quarter of the size, where fog clears at little cost
+    "full": {
+        "points.count": 170_000,
+        "train.iterations": 7000,
+        "train.refine_at": (0.32, 0.6),
+        "train.crop": 256,
+        "train.lazy_adam": True,
+        "train.moments_16bit": True,
+        "train.sh_smoothing_every": 8,
+    },
     "paper": {
         # Stated by the supplemental, as are the defaults of raster.gamma, train.sh_rate and its
         # decay, and the delays of 0, 500 and 1000 steps.

@@ -308,7 +308,7 @@ def open_training(
         trainer, info, hull = _resume(config, views, net, stored, file=folder.checkpoint)
     else:
         trainer, info, hull = _start(config, views, net)
-    plan = memory_plan(config, trainer.model, trainer.views)
+    plan = memory_plan(config, trainer.model, trainer.views, trainer.refinements_to_come)
     info["tuning"] = policy.tuning
     return Training(folder, config, trainer, info, plan, hull, policy.origin)
 

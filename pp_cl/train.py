@@ -22,6 +22,7 @@ from pp_cl.training.schedule import ema_weight, gamma_at, refine_steps
 from pp_cl.training.smooth import Smoother
 
 BOX_MARGIN = 8  # pixels around the object from which crops are drawn
+END_SHARE = 0.25  # of the crops that lie at one end of the object's box
 CROP_LOSS = 0.25  # of the crop's side for every halving of the images
 
 
@@ -51,9 +52,14 @@ class Trainer:
         self._refine_steps = refine_steps(self.config.iterations, self.config.refine_at)
         self._set_level()
 
+    @property
+    def refinements_to_come(self) -> int:
+        """How often the grid will still be refined."""
+        return sum(self.step < step for step in self._refine_steps)
+
     def _set_level(self):
         """The images of this step: halved once for every refinement of the grid to come."""
-        to_come = sum(self.step < step for step in self._refine_steps)
+        to_come = self.refinements_to_come
         self._reduced = _halved(self.views, to_come)
         self._crop = 4 * round(self.config.crop * (1 - CROP_LOSS * to_come) / 4)
         self._boxes = [view.object_bounds(BOX_MARGIN) for view in self._reduced]
@@ -277,14 +283,16 @@ def _draw_start(rng, low, high, size, *, limit):
     """First pixel of a crop of `size` that shows a part of [low, high) as large as possible, inside
     [0, limit).
 
-    Crops are drawn from all that touch [low, high), and moved inside it: so its ends are in about
-    as many of them as its middle. Those moved are spread over BOX_MARGIN pixels: the network pools
-    by 4, and would learn one phase of its grid where crops always began at the same pixel.
+    A share END_SHARE of the crops lies at either end, since uniform draws hardly ever show the
+    ends of what is much wider than a crop. They are spread over BOX_MARGIN pixels: the network
+    pools by 4, and would learn one phase of its grid where crops always began at the same pixel.
     """
     first, last = sorted((low, high - size))
     first, last = max(first, 0), max(min(last, limit - size), 0)
-    if high - low <= size:
-        return int(rng.integers(first, last + 1))
-    start = int(rng.integers(low - size, high + 1))
-    inside = int(rng.integers(BOX_MARGIN))
-    return int(np.clip(start, min(first + inside, last), max(last - inside, first)))
+    start = int(rng.integers(first, last + 1))
+    end, inside = rng.random(), int(rng.integers(BOX_MARGIN))
+    if high - low > size and end < END_SHARE:
+        start = min(first + inside, last)
+    elif high - low > size and end > 1 - END_SHARE:
+        start = max(last - inside, first)
+    return start

@@ -25,13 +25,21 @@ from pp_cl.training.point_state import PointState
 from pp_cl.training.smooth import Smoother, chunk_points
 
 MIB, GIB = 2**20, 2**30
+REFINED = (
+    4.5  # times as many points after a refinement: half of them are pruned in the course of it
+)
 
 Plan = list[tuple[str, Table]]  # what the buffers of each table are for
 
 
-def memory_plan(config: Config, model: Model, views: list[View]) -> Plan:
-    """The device buffers of a training with this model on these views."""
-    n, train, blocks = model.cloud.count, config.train, model.cloud.blocks
+def memory_plan(config: Config, model: Model, views: list[View], refinements: int = 0) -> Plan:
+    """The device buffers of a training with this model on these views, at its most points.
+
+    refinements: of the grid that are still to come; the points after them are an estimate.
+    """
+    train, blocks = config.train, model.cloud.blocks
+    n = round(model.cloud.count * REFINED**refinements)
+    edge = model.grid.edge / 2**refinements
     camera = views[0].camera
     width, height = views[0].crop_size(train.crop)
     padded, _, _ = camera.crop(0, 0, width, height).padded(NETWORK_MULTIPLE)
@@ -43,10 +51,10 @@ def memory_plan(config: Config, model: Model, views: list[View]) -> Plan:
         ("training state of the points", PointState.table(n, blocks, train)),
         ("averages of the points", PointState.ema_table(n, blocks) if train.ema else {}),
         ("optimiser", Optimiser.table(n, model.net.parameters, train)),
-        ("smoothing (estimate)", _smoothing_table(config, model)),
+        ("smoothing (estimate)", _smoothing_table(config, model, n)),
         ("pruning (at most)", compact_table(n, row_bytes)),
         *_raster_tables(
-            config.raster, n, size, n * _pixels_per_point(config.raster, model, camera)
+            config.raster, n, size, n * _pixels_per_point(config.raster, model, camera, edge)
         ),
         (f"network at {size[1]}x{size[0]}", _network_table(model, size)),
         ("loss", Loss.table(image, target, train.ssim_weight)),
@@ -58,14 +66,14 @@ def memory_plan(config: Config, model: Model, views: list[View]) -> Plan:
     ]
 
 
-def _smoothing_table(config, model):
+def _smoothing_table(config, model, n):
     """The Smoother's. Its chunk depends on the neighbours, which are not known yet: they are about
     a layer of the grid apart.
     """
     if config.train.sh_smoothing == 0:
         return {}
-    n = model.cloud.count
-    return Smoother.table(n, chunk_points(n, n // model.grid.dims[2]))
+    layers = model.grid.dims[2] * (n / model.cloud.count) ** (1 / 3)
+    return Smoother.table(n, chunk_points(n, round(n / layers)))
 
 
 def _network_table(model, size):
@@ -99,12 +107,12 @@ def _raster_tables(settings, n, size, pairs):
     ]
 
 
-def _pixels_per_point(settings: RasterConfig, model: Model, camera: Camera) -> float:
+def _pixels_per_point(settings: RasterConfig, model: Model, camera: Camera, edge: float) -> float:
     """Mean area of a footprint in pixels, seen from the middle of the depth range."""
     middle = sum(model.depth_range) / 2
     radius = 0.75  # the hard disc
     if settings.footprint == "soft":
-        radius = max(radius, settings.radius * model.grid.edge * camera.fx / middle)
+        radius = max(radius, settings.radius * edge * camera.fx / middle)
     return math.pi * radius**2
 
 
