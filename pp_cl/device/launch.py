@@ -145,8 +145,16 @@ class Kernel:
         words = {word for p in parameters for word in p.shape or () if word != "?"}
         names = set().union(*(names_in(parse_formula(word)) for word in words))
         self._macros = {name: int(defines[name]) for name in names & defines.keys()}
-        self._letters = {name.lower() for name in names}
-        self._dtypes = [np.dtype(p.dtype) for p in parameters]
+        letters = {name.lower() for name in names}
+        # (parameter, dtype of a buffer, letter that a scalar gives a size to) in order
+        self._slots = [
+            (
+                p,
+                np.dtype(p.dtype) if p.space in ("global", "constant") else None,
+                p.name.lower() if not p.space and p.name.lower() in letters else None,
+            )
+            for p in parameters
+        ]
         self._checked = set()  # shapes and sizes already found right
         self._ranges = {}  # {(size, work-group) as given: as enqueued}
 
@@ -159,9 +167,9 @@ class Kernel:
             unknown = [n for n in values if n not in self.names]
             raise TypeError(f"{self.label}: missing {missing}, unknown {unknown}")
         arguments, shapes, sizes = [], [], {}
-        for p, dtype in zip(self.parameters, self._dtypes, strict=True):
+        for p, dtype, letter in self._slots:
             value = values[p.name]
-            if p.space in ("global", "constant"):
+            if dtype:
                 if not isinstance(value, cl_array.Array) or value.dtype != dtype:
                     raise TypeError(
                         f"{self.label}: {p.name} is {_kind(value)}, expected a device array of "
@@ -172,9 +180,10 @@ class Kernel:
             elif p.space == "local":
                 arguments.append(value)
             else:
-                arguments.append(self._scalar(p, value))
-                if p.name.lower() in self._letters:
-                    sizes[p.name.lower()] = int(value)
+                number = self._scalar(p, value)
+                arguments.append(number)
+                if letter:
+                    sizes[letter] = int(number)
         key = (*shapes, *sizes.values())
         if key not in self._checked:
             self._check_buffers(values, sizes)

@@ -12,7 +12,8 @@ class Work:
     """Device memory for convolutions to work in; several may share one, one after the other."""
 
     scratch: Array  # float32, at least as many floats as the largest convolution needs
-    weights: Array  # float32, weights flipped or transformed for a kernel
+    # float32, weights flipped or transformed for a kernel, or the parts of their gradients
+    weights: Array
 
     @classmethod
     def empty(cls, dev: Device, scratch: int, weights: int) -> "Work":

@@ -93,6 +93,6 @@ def run_backward_weights(dev, form, grad_out, *sources):
         dev.upload(grad_out),
         grad_weight=grad_weight,
         grad_bias=grad_bias,
-        scratch=dev.empty(backward_weights_floats(dev, form)),
+        work=Work.empty(dev, *backward_weights_floats(dev, form, grad_weight.shape)),
     )
     return unpack_weights(grad_weight.get(), co), grad_bias.get()
