@@ -137,9 +137,9 @@ ALWAYS_INLINE void store_gradients(
     }
 }
 
-// One work-item per compute unit (work-groups of 1): takes its share of all parts in turn, each of
-// them ci_part x CO_PART channels and one of tile_parts stretches of tile_list: walks those tiles
-// in [x, x2] (without making it) and grad_out, and writes its part of the sums: dL/dweight in rows
+// One work-item per compute unit (work-groups of 1): takes one part after the other, each of them
+// ci_part x CO_PART channels and one of tile_parts stretches of tile_list: walks those tiles in
+// [x, x2] (without making it) and grad_out, and writes its part of the sums: dL/dweight in rows
 // (ky, kx, channel) of partial, dL/dbias in the last row.
 kernel void winograd_backward_weights(
     const int c1,
@@ -153,16 +153,17 @@ kernel void winograd_backward_weights(
     global const int *tile_list,     // (?) of grad_out
     global const float *tile_count,  // (?, ?) of grad_out
     global float16 *partial,         // (...) at least (tile_parts, co / 16, 9 * (c1 + c2) + 1, 16)
-    global float16 *scratch)         // (...) work-items times SLICE(ci_part) vectors
+    global float16 *scratch)         // (...) COUNTERS + work-items * SLICE(ci_part)
 {
-    const int tiles = tile_list[2] * PER_SIDE * PER_SIDE, items = get_global_size(0), ci = c1 + c2;
+    const int tiles = tile_list[2] * PER_SIDE * PER_SIDE, ci = c1 + c2;
     const int co_parts = (co + CO_PART - 1) / CO_PART,
               weight_parts = (ci + ci_part - 1) / ci_part * co_parts;
-    global float16 *v = scratch + (size_t)get_global_id(0) * SLICE(ci_part);
+    global float16 *v = scratch + COUNTERS + (size_t)get_global_id(0) * SLICE(ci_part);
     global float16 *z = v + POSITIONS * PITCH(ci_part), *sums = z + POSITIONS * PITCH(CO_PART);
     global float16 *bias = sums + POSITIONS * ci_part * (CO_PART / 16);
     global float *patch = (global float *)(bias + CO_PART / 16);
-    for (int part = get_global_id(0); part < weight_parts * tile_parts; part += items) {
+    const int parts = weight_parts * tile_parts;
+    for (int part = take(scratch, 1); part < parts; part = take(scratch, 1)) {
         const int tile_part = part / weight_parts, weight_part = part % weight_parts;
         const int c0 = weight_part / co_parts * ci_part, rows = min(ci_part, ci - c0);
         const int rows_of_x = clamp(c1 - c0, 0, rows);
@@ -196,4 +197,5 @@ kernel void winograd_backward_weights(
             }
         }
     }
+    leave(scratch);
 }

@@ -11,7 +11,7 @@ from pyopencl.array import Array
 
 from pp_cl.device.device import Device
 from pp_cl.layers.tiles import LANES, SIDE, Tiles, checked_tiles
-from pp_cl.layers.work import Work
+from pp_cl.layers.work import COUNTERS, Work
 
 # Transformed weights of at most so many channels in times channels out are narrow: they stay in a
 # core's L2 cache, so that a quarter of the tiles at a time, of which more stays in L1, costs little
@@ -55,7 +55,7 @@ class WinogradForm:
         gradient.
         """
         vectors = (ci + co) * self.tiles_of(ci, co) + 3 * LANES
-        return dev.info["compute_units"] * self.positions * vectors
+        return COUNTERS + dev.info["compute_units"] * self.positions * vectors
 
 
 def winograd_forward(

@@ -6,7 +6,7 @@ from pp_cl.device.device import Device
 from pp_cl.layers.conv_backward_weights import sum_parts
 from pp_cl.layers.tiles import LANES, SIDE, Tiles, checked_tiles
 from pp_cl.layers.winograd import WinogradForm, check_size, fits, pair_blocks
-from pp_cl.layers.work import Work
+from pp_cl.layers.work import COUNTERS, Work
 
 # At most this many input and output channels of the weights at a time: smaller parts transform the
 # same tiles more often, larger ones outgrow a core's cache.
@@ -30,7 +30,8 @@ def backward_weights_floats(
     values = (ci_part + co_part) // LANES * form.weights_tiles
     vectors = form.positions * (values + 3 + ci_part * co_part // LANES) + co_part // LANES
     parts = MOST_PARTS if _is_narrow(ci, blocks * LANES) else 1
-    return dev.info["compute_units"] * vectors * LANES, parts * blocks * (9 * ci + 1) * LANES
+    scratch = COUNTERS + dev.info["compute_units"] * vectors * LANES
+    return scratch, parts * blocks * (9 * ci + 1) * LANES
 
 
 def winograd_backward_weights(
@@ -56,21 +57,13 @@ def winograd_backward_weights(
     needed = backward_weights_floats(dev, form, grad_weight.shape)
     check_size("scratch", work.scratch, needed[0])
     check_size("parts of the gradient", work.weights, needed[1])
-    program = dev.program(
-        "layers/winograd_backward_weights",
-        WINO_M=form.m,
-        TILES=form.weights_tiles,
-        CO_PART=min(CO_PART, co),
-        BLOCKS=pair_blocks(co),
-    )
     tiles = checked_tiles(dev, tiles, height, width)
     tile_parts = _tile_parts(tiles.number * (SIDE // form.m) ** 2, sum(channels), co)
-    ci = sum(channels)
-    ci_part = ci if tile_parts > 1 else _ci_part(dev, ci, co)
-    weight_parts = -(-ci // ci_part) * -(-co // CO_PART)
-    program.launch(
+    ci_part = sum(channels) if tile_parts > 1 else _ci_part(dev, sum(channels), co)
+    parts = tile_parts * -(-sum(channels) // ci_part) * -(-co // CO_PART)
+    _program(dev, form, co).launch(
         "winograd_backward_weights",
-        min(dev.info["compute_units"], weight_parts * tile_parts),
+        min(dev.info["compute_units"], parts),
         local=1,
         c1=channels[0],
         c2=sum(channels[1:]),
@@ -118,3 +111,13 @@ def _ci_part(dev, ci, co):
     """
     wanted = -(-dev.info["compute_units"] // -(-co // CO_PART))
     return min(CI_PART, max(1, ci // (LANES * wanted)) * LANES)
+
+
+def _program(dev, form, co):
+    return dev.program(
+        "layers/winograd_backward_weights",
+        WINO_M=form.m,
+        TILES=form.weights_tiles,
+        CO_PART=min(CO_PART, co),
+        BLOCKS=pair_blocks(co),
+    )

@@ -17,7 +17,7 @@ from support.winograd_layers import (
 
 from pp_cl.layers.blocking import CHOICES
 from pp_cl.layers.conv import pack_weights
-from pp_cl.layers.winograd import winograd_backward_input, winograd_forward
+from pp_cl.layers.winograd import WinogradForm, winograd_backward_input, winograd_forward
 from pp_cl.layers.winograd_transform import transform_flipped_weights
 from pp_cl.layers.work import Work
 
@@ -236,5 +236,8 @@ def test_wrong_shapes_are_refused(dev):
         backward(dev.zeros((4, 4, 20)))
 
 
-def test_groups_divide_rounds():
-    assert all(tiles % group == 0 for tiles, group in CHOICES["CPU"]["winograd"])
+@pytest.mark.parametrize("channels", [16, 512])
+@pytest.mark.parametrize("choice", CHOICES["CPU"]["winograd"])
+def test_groups_divide_rounds(choice, channels):
+    chosen = WinogradForm(4, False, *choice, 32)
+    assert chosen.tiles_of(channels, channels) % chosen.group == 0
