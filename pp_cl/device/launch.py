@@ -180,7 +180,8 @@ class Kernel:
             elif p.space == "local":
                 arguments.append(value)
             else:
-                number = self._scalar(p, value)
+                quick = type(value) is int and p.limits and p.limits[0] <= value <= p.limits[1]
+                number = value if quick else self._scalar(p, value)
                 arguments.append(number)
                 if letter:
                     sizes[letter] = int(number)

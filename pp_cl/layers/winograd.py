@@ -13,9 +13,8 @@ from pp_cl.device.device import Device
 from pp_cl.layers.tiles import LANES, SIDE, Tiles, checked_tiles
 from pp_cl.layers.work import COUNTERS, Work
 
-# Transformed weights of at most so many channels in times channels out are narrow: they stay in a
-# core's L2 cache, so that a quarter of the tiles at a time, of which more stays in L1, costs little
-# reading of weights. 32 to 128 channels are 1.14 times as fast so, on 2 cores with AVX-512.
+# Weights of at most so many channels in times channels out are narrow: transformed they take 2.25
+# MiB, about what a core's L2 cache holds, and reading them for fewer tiles at a time costs little.
 NARROW = 128 * 128
 
 
@@ -23,15 +22,15 @@ NARROW = 128 * 128
 class WinogradForm:
     """One of the ways to run these kernels.
 
-    m: side of a tile of outputs, 2 or 4. half: transformed weights are stored in 16 bits. tiles,
-    group: tiles transformed at a time (tiles_of) and multiplied together, weights_tiles: tiles
-    transformed at a time for the gradient of the weights; see blocking.Blocking.
+    m: side of a tile of outputs, 2 or 4. half: transformed weights are stored in 16 bits. wide,
+    narrow: (tiles transformed at a time, tiles multiplied together) by channels, weights_tiles:
+    tiles transformed at a time for the gradient of the weights; see blocking.Blocking.
     """
 
     m: int
     half: bool
-    tiles: int
-    group: int
+    wide: tuple[int, int]
+    narrow: tuple[int, int]
     weights_tiles: int
 
     @property
@@ -39,9 +38,9 @@ class WinogradForm:
         """Values of a transformed tile."""
         return (self.m + 2) ** 2
 
-    def tiles_of(self, ci: int, co: int) -> int:
-        """Tiles transformed at a time by a convolution of ci to co channels."""
-        return self.tiles if ci * co > NARROW else max(self.group, self.tiles // 4)
+    def tiles_and_group(self, ci: int, co: int) -> tuple[int, int]:
+        """`wide` or `narrow`, for a convolution of ci to co channels."""
+        return self.narrow if ci * co <= NARROW else self.wide
 
     def transformed_floats(self, ci: int, co: int) -> int:
         """Floats of the transformed weights of ci to co channels, as cl/layers/winograd.h lays them
@@ -54,7 +53,7 @@ class WinogradForm:
         """Floats of scratch memory of a convolution of ci to co channels, or of its input
         gradient.
         """
-        vectors = (ci + co) * self.tiles_of(ci, co) + 3 * LANES
+        vectors = (ci + co) * self.tiles_and_group(ci, co)[0] + 3 * LANES
         return COUNTERS + dev.info["compute_units"] * self.positions * vectors
 
 
@@ -172,11 +171,12 @@ def _check_work(dev, form, work, channels):
 
 
 def _program(dev, form, channels_in, channels_out):
+    tiles, group = form.tiles_and_group(channels_in, channels_out)
     return dev.program(
         "layers/winograd",
         WINO_M=form.m,
-        TILES=form.tiles_of(channels_in, channels_out),
-        GROUP=form.group,
+        TILES=tiles,
+        GROUP=group,
         BLOCKS=pair_blocks(channels_out),
         HALF=int(form.half),
     )

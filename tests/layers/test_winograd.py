@@ -15,9 +15,9 @@ from support.winograd_layers import (
     work_of,
 )
 
-from pp_cl.layers.blocking import CHOICES
+from pp_cl.layers.blocking import CHOICES, SHIPPED
 from pp_cl.layers.conv import pack_weights
-from pp_cl.layers.winograd import WinogradForm, winograd_backward_input, winograd_forward
+from pp_cl.layers.winograd import winograd_backward_input, winograd_forward
 from pp_cl.layers.winograd_transform import transform_flipped_weights
 from pp_cl.layers.work import Work
 
@@ -236,8 +236,11 @@ def test_wrong_shapes_are_refused(dev):
         backward(dev.zeros((4, 4, 20)))
 
 
-@pytest.mark.parametrize("channels", [16, 512])
-@pytest.mark.parametrize("choice", CHOICES["CPU"]["winograd"])
-def test_groups_divide_rounds(choice, channels):
-    chosen = WinogradForm(4, False, *choice, 32)
-    assert chosen.tiles_of(channels, channels) % chosen.group == 0
+def test_groups_divide_rounds():
+    for field in ("winograd", "winograd_narrow"):
+        assert all(tiles % group == 0 for tiles, group in CHOICES["CPU"][field])
+
+
+def test_the_blocking_depends_on_the_channels():
+    assert form(4).tiles_and_group(128, 128) == SHIPPED["CPU"].winograd_narrow
+    assert form(4).tiles_and_group(128, 144) == SHIPPED["CPU"].winograd

@@ -16,7 +16,9 @@ from pp_cl.layers.work import Work
 
 def form(m, half=False, blocking: Blocking = SHIPPED["CPU"]):
     """The WinogradForm of F(m x m, 3 x 3)."""
-    return WinogradForm(m, half, *blocking.winograd, blocking.winograd_weights)
+    return WinogradForm(
+        m, half, blocking.winograd, blocking.winograd_narrow, blocking.winograd_weights
+    )
 
 
 def stored_weights(array, m, ci, co, half):
