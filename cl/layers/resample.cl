@@ -1,6 +1,6 @@
 // The layers between convolutions, on (H, W, C) feature maps: pooling, bilinear upsampling, an
 // affine map (scale * x + offset). In all but the affine map a work-item is (16 channels, x, y):
-// one vector of a pixel, shorter at the last channels. It writes where the pixel's tile is computed
+// one vector of a pixel, shorter at the last channels. It writes where its tile is computed
 // (tiles.h); max pooling writes everywhere.
 #include "common.h"
 #include "layers/tiles.h"
@@ -107,9 +107,10 @@ kernel void maxpool2_backward(
     }
 }
 
-// One work-item per (16 channels, x, y) of out, which is twice as high and wide as x: reads the
-// pixel of x that out's centre lies in and the nearest ones beside it, writes them weighted 3/4 and
-// 1/4 along each axis (bilinear, align_corners False, the border repeated).
+// One work-item per (16 channels, x, y) of x: writes the 2x2 pixels of out, which is twice as high
+// and wide, that lie in its pixel, and all of them in one tile. Each is the pixel of x that its
+// centre lies in and the nearest ones beside it, weighted 3/4 and 1/4 along each axis (bilinear,
+// align_corners False, the border repeated).
 kernel void upsample2_forward(
     const int h,  // of x
     const int w,
@@ -120,17 +121,24 @@ kernel void upsample2_forward(
 {
     const int first = get_global_id(0) * CHANNELS, column = get_global_id(1),
               row = get_global_id(2), lanes = c - first;
-    if (first >= c || column >= 2 * w || row >= 2 * h ||
-        !tile_is_computed(tile_count, column, row, 2 * w))
+    if (first >= c || column >= w || row >= h ||
+        !tile_is_computed(tile_count, 2 * column, 2 * row, 2 * w))
         return;
-    const int near = column / 2 * c,
-              beside = clamp(column / 2 - 1 + 2 * (column & 1), 0, w - 1) * c;
-    const int other = clamp(row / 2 - 1 + 2 * (row & 1), 0, h - 1);
-    global const float *a = x + (size_t)(row / 2) * w * c + first,
-                       *b = x + (size_t)other * w * c + first;
-    const float16 upper = 0.75f * load16(a + near, lanes) + 0.25f * load16(a + beside, lanes);
-    const float16 lower = 0.75f * load16(b + near, lanes) + 0.25f * load16(b + beside, lanes);
-    store16(0.75f * upper + 0.25f * lower, out + ((size_t)row * 2 * w + column) * c + first, lanes);
+    const int left = max(column - 1, 0) * c, right = min(column + 1, w - 1) * c;
+    float16 line[3][2];  // rows row - 1, row, row + 1 of x at the two columns of out
+#pragma unroll
+    for (int i = 0; i < 3; i++) {
+        global const float *pixels = x + (size_t)clamp(row - 1 + i, 0, h - 1) * w * c + first;
+        const float16 near = 0.75f * load16(pixels + column * c, lanes);
+        line[i][0] = near + 0.25f * load16(pixels + left, lanes);
+        line[i][1] = near + 0.25f * load16(pixels + right, lanes);
+    }
+    global float *corner = out + ((size_t)row * 4 * w + column * 2) * c + first;
+#pragma unroll
+    for (int i = 0; i < 4; i++)
+        store16(
+            0.75f * line[1][i % 2] + 0.25f * line[i / 2 * 2][i % 2],
+            corner + (i / 2 * 2 * w + i % 2) * c, lanes);
 }
 
 // One work-item per (16 channels, x, y) of x: gathers the 4x4 pixels of grad_out that read it,

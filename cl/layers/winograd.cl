@@ -1,10 +1,10 @@
 // 3x3 convolution by Winograd's minimal filtering (winograd.h): the forward pass and the gradient
 // of its input.
 //
-// The image is cut into tiles of M x M outputs. A work-item takes an equal share of those to
-// compute, TILES at a time, through three stages: the input tiles are transformed, multiplied
-// position by position as matrices (tiles x CI) (CI x CO), and transformed back. What lies between
-// the stages stays in its own slice of `scratch`, small enough for the caches.
+// The image is cut into tiles of M x M outputs. A work-item takes those to compute, TILES or less
+// at a time, through three stages: the input tiles are transformed, multiplied position by position
+// as matrices (tiles x CI) (CI x CO), and transformed back. What lies between the stages stays in
+// its own slice of `scratch`, small enough for the caches.
 //
 // One work-item per compute unit (work-groups of 1): an image's tiles are many, and each slice is
 // used over and over.
@@ -110,8 +110,8 @@ ALWAYS_INLINE void transform_back(
     }
 }
 
-// The whole convolution of [x, x2] (c2 = 0: of x) for this work-item's tiles; bias, relu, mask: as
-// in transform_back.
+// The whole convolution of [x, x2] (c2 = 0: of x) for the tiles that this work-item takes; bias,
+// relu, mask: as in transform_back.
 ALWAYS_INLINE void convolve(
     global const float *x,
     global const float *x2,
@@ -127,16 +127,16 @@ ALWAYS_INLINE void convolve(
     global float16 *scratch)  // all work-items'
 {
     const int ci = c1 + c2;
-    global float16 *v = scratch + get_global_id(0) * SLICE(ci, co), *m = v + POSITIONS * PITCH(ci);
+    global float16 *v = scratch + COUNTERS + get_global_id(0) * SLICE(ci, co);
+    global float16 *m = v + POSITIONS * PITCH(ci);
     global float *patch = (global float *)(m + POSITIONS * PITCH(co));
 
-    const long tiles = tile_list[2] * PER_SIDE * PER_SIDE;
-    const int begin = tiles * get_global_id(0) / get_global_size(0);
-    const int end = tiles * (get_global_id(0) + 1) / get_global_size(0);
-    const int rounds = max(1, (end - begin + TILES - 1) / TILES);  // of about the same size
-    const int step = ((end - begin + rounds - 1) / rounds + GROUP - 1) / GROUP * GROUP;
-    for (int first = begin; first < end; first += step) {
-        const int count = min(step, end - first), padded = (count + GROUP - 1) / GROUP * GROUP;
+    const int tiles = tile_list[2] * PER_SIDE * PER_SIDE;
+    const int share = (tiles + get_global_size(0) - 1) / get_global_size(0);
+    const int rounds = (share + TILES - 1) / TILES;  // of about the same size
+    const int step = ((share + rounds - 1) / rounds + GROUP - 1) / GROUP * GROUP;
+    for (int first = take(scratch, step); first < tiles; first = take(scratch, step)) {
+        const int count = min(step, tiles - first), padded = (count + GROUP - 1) / GROUP * GROUP;
         for (int source = 0; source < (c2 ? 2 : 1); source++)
             transform_tiles(
                 v + (source ? c1 / 16 * TILES : 0), PITCH(ci), patch, source ? x2 : x,
@@ -144,10 +144,11 @@ ALWAYS_INLINE void convolve(
         multiply(m, v, transformed, ci, co / 16, padded);
         transform_back(out, m, bias, relu, mask, co, tile_list, first, count);
     }
+    leave(scratch);
 }
 
-// One work-item per compute unit: reads its tiles' neighbourhood in x, then in x2 (the
-// concatenation [x, x2] without making it), and writes its tiles of out.
+// One work-item per compute unit: takes tiles, reads their neighbourhood in x, then in x2 (the
+// concatenation [x, x2] without making it), and writes those tiles of out.
 kernel void winograd_forward(
     const int c1,
     const int c2,  // channels of x2; 0 = x2 is not read
@@ -159,14 +160,14 @@ kernel void winograd_forward(
     global const float16 *bias,         // (?)
     global const int *tile_list,        // (?)
     global float *out,                  // (height, width, co)
-    global float16 *scratch)            // (...) work-items times SLICE(c1 + c2, co) vectors
+    global float16 *scratch)            // (...) COUNTERS + work-items * SLICE(c1 + c2, co)
 {
     convolve(x, x2, c1, c2, transformed, bias, relu, 0, out, co, tile_list, scratch);
 }
 
-// One work-item per compute unit: reads its tiles' neighbourhood in grad_out, and writes its tiles
-// of grad_x, which is the convolution of grad_out with the flipped weights. masked: x is the output
-// of a ReLU and grad_x the gradient of its input.
+// One work-item per compute unit: takes tiles, reads their neighbourhood in grad_out, and writes
+// those tiles of grad_x, which is the convolution of grad_out with the flipped weights. masked: x
+// is the output of a ReLU and grad_x the gradient of its input.
 kernel void winograd_backward_input(
     const int c,
     const int co,
@@ -176,7 +177,7 @@ kernel void winograd_backward_input(
     global const float *grad_out,   // (height, width, co)
     global const int *tile_list,    // (?) of grad_x
     global float *grad_x,           // (height, width, c)
-    global float16 *scratch)        // (...) work-items times SLICE(co, c) vectors
+    global float16 *scratch)        // (...) COUNTERS + work-items * SLICE(co, c)
 {
     convolve(grad_out, 0, co, 0, flipped, 0, 0, masked ? x : 0, grad_x, c, tile_list, scratch);
 }

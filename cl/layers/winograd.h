@@ -141,6 +141,25 @@ ALWAYS_INLINE void transform_kernel_gradient(float16 *t, const int step) {
 // position to the next. The odd one keeps the positions apart in the sets of a cache.
 #define PITCH(channels) ((channels) / 16 * TILES + 1)
 
+// A scratch begins with a vector for two counters, both 0 between kernels: how much of the work is
+// taken, and how many work-items found nothing more to take. Which work-item takes what changes no
+// result: a compute unit that is late or slow takes less.
+#define COUNTERS 1
+
+// The first of the next n pieces of work.
+static inline int take(global float16 *scratch, const int n) {
+    return atomic_add((volatile global int *)scratch, n);
+}
+
+// Called once by each work-item, after it took more than there is.
+static inline void leave(global float16 *scratch) {
+    volatile global int *counters = (volatile global int *)scratch;
+    if (atomic_inc(counters + 1) == (int)get_global_size(0) - 1) {
+        atomic_xchg(counters, 0);
+        atomic_xchg(counters + 1, 0);
+    }
+}
+
 // The corner of the i-th tile of outputs among those of tile_list: height, width, number, and the
 // tiles of tiles.h.
 static inline int2 tile_corner(global const int *tile_list, const int i) {

@@ -9,7 +9,7 @@
 #define BLOCKS 2  // groups of 16 output channels multiplied together; divides their number
 #endif
 #ifndef CO_PART
-#define CO_PART 128  // output channels of one part of the weights, a multiple of 16 * BLOCKS
+#define CO_PART 128  // output channels taken at a time, a multiple of 16 * BLOCKS
 #endif
 // Vectors of one work-item's scratch: values, gradients, the sums of weights' and biases'
 // gradients, a patch for load_tile.
@@ -137,54 +137,65 @@ ALWAYS_INLINE void store_gradients(
     }
 }
 
-// One work-item per compute unit (work-groups of 1): takes parts of ci_part x CO_PART channels in
-// turn, walks the tiles of tile_list in x and grad_out for each, and writes that part of the
-// gradients. No part is added to by two work-items.
+// One work-item per compute unit (work-groups of 1): takes one part after the other, each of them
+// ci_part x CO_PART channels and one of tile_parts stretches of tile_list: walks those tiles in
+// [x, x2] (without making it) and grad_out, and writes its part of the sums: dL/dweight in rows
+// (ky, kx, channel) of partial, dL/dbias in the last row.
 kernel void winograd_backward_weights(
-    const int c,
+    const int c1,
+    const int c2,  // channels of x2; 0 = x2 is not read
     const int co,
-    const int first,        // channel of the weights where x begins; 0 writes the bias gradient too
-    const int ci,           // channels of the weights
-    const int ci_part,      // a multiple of 16
-    global const float *x,  // (height, width, c)
+    const int ci_part,               // a multiple of 16
+    const int tile_parts,            // at most the number of tiles
+    global const float *x,           // (height, width, c1)
+    global const float *x2,          // (height, width, ?)
     global const float *grad_out,    // (height, width, co)
     global const int *tile_list,     // (?) of grad_out
     global const float *tile_count,  // (?, ?) of grad_out
-    global float16 *grad_weight,     // (?, 3, 3, ci, 16)
-    global float16 *grad_bias,       // (?)
-    global float16 *scratch)         // (...) work-items times SLICE(ci_part) vectors
+    global float16 *partial,         // (...) at least (tile_parts, co / 16, 9 * (c1 + c2) + 1, 16)
+    global float16 *scratch)         // (...) COUNTERS + work-items * SLICE(ci_part)
 {
-    const int tiles = tile_list[2] * PER_SIDE * PER_SIDE, items = get_global_size(0);
+    const int tiles = tile_list[2] * PER_SIDE * PER_SIDE, ci = c1 + c2;
     const int co_parts = (co + CO_PART - 1) / CO_PART,
-              parts = (c + ci_part - 1) / ci_part * co_parts;
-    global float16 *v = scratch + (size_t)get_global_id(0) * SLICE(ci_part);
+              weight_parts = (ci + ci_part - 1) / ci_part * co_parts;
+    global float16 *v = scratch + COUNTERS + (size_t)get_global_id(0) * SLICE(ci_part);
     global float16 *z = v + POSITIONS * PITCH(ci_part), *sums = z + POSITIONS * PITCH(CO_PART);
     global float16 *bias = sums + POSITIONS * ci_part * (CO_PART / 16);
     global float *patch = (global float *)(bias + CO_PART / 16);
-    for (int part = get_global_id(0); part < parts; part += items) {
-        const int c0 = part / co_parts * ci_part, rows = min(ci_part, c - c0);
-        const int block0 = part % co_parts * (CO_PART / 16),
+    const int parts = weight_parts * tile_parts;
+    for (int part = take(scratch, 1); part < parts; part = take(scratch, 1)) {
+        const int tile_part = part / weight_parts, weight_part = part % weight_parts;
+        const int c0 = weight_part / co_parts * ci_part, rows = min(ci_part, ci - c0);
+        const int rows_of_x = clamp(c1 - c0, 0, rows);
+        const int block0 = weight_part % co_parts * (CO_PART / 16),
                   blocks = min(CO_PART / 16, co / 16 - block0);
-        for (int begin = 0; begin < tiles; begin += SUMMED) {
+        const int first = (long)tiles * tile_part / tile_parts,
+                  end = (long)tiles * (tile_part + 1) / tile_parts;
+        global float16 *out = partial + ((size_t)tile_part * (co / 16) + block0) * (9 * ci + 1);
+        for (int begin = first; begin < end; begin += SUMMED) {
             for (int block = 0; block < blocks; block++)
                 bias[block] = 0.0f;
-            for (int tile = begin; tile < min(begin + SUMMED, tiles); tile += TILES) {
-                const int count = min(TILES, tiles - tile);
-                transform_tiles(
-                    v, PITCH(ci_part), patch, x + c0, c, rows / 16, tile_list, tile, count, count);
+            for (int tile = begin; tile < min(begin + SUMMED, end); tile += TILES) {
+                const int count = min(TILES, end - tile);
+                for (int source = 0; source < (c2 ? 2 : 1); source++)
+                    transform_tiles(
+                        v + (source ? rows_of_x / 16 * TILES : 0), PITCH(ci_part), patch,
+                        source ? x2 + max(c0 - c1, 0) : x + c0, source ? c2 : c1,
+                        (source ? rows - rows_of_x : rows_of_x) / 16, tile_list, tile, count,
+                        count);
                 transform_gradients(
                     z, bias, patch, grad_out + block0 * 16, co, blocks, tile_list, tile_count, tile,
                     count);
                 multiply_gradients(sums, v, z, ci_part, rows, blocks, count, tile == begin);
             }
             for (int block = 0; block < blocks; block++) {
-                const int out = block0 + block;
+                global float16 *weight = out + block * (9 * ci + 1);
                 store_gradients(
-                    grad_weight + out * 9 * ci + first + c0, sums + block * ci_part, ci, ci_part,
-                    rows, begin == 0);
-                if (first + c0 == 0)
-                    grad_bias[out] = begin == 0 ? bias[block] : grad_bias[out] + bias[block];
+                    weight + c0, sums + block * ci_part, ci, ci_part, rows, begin == first);
+                if (c0 == 0)
+                    weight[9 * ci] = begin == first ? bias[block] : weight[9 * ci] + bias[block];
             }
         }
     }
+    leave(scratch);
 }

@@ -69,7 +69,7 @@ class RandomConv:
             convolution.work_floats(direction, self.out.shape[0], self.weight.shape, c)
             for c in (channels if direction is Direction.BACKWARD_INPUT else [sum(channels)])
         ]
-        work = Work(*(self.dev.empty(max(1, *n)) for n in zip(*needs, strict=True)))
+        work = Work.empty(self.dev, *(max(n) for n in zip(*needs, strict=True)))
         compute = {
             Direction.FORWARD: self._run_forward,
             Direction.BACKWARD_INPUT: self._run_backward_input,

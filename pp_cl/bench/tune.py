@@ -44,6 +44,7 @@ BLOCKING_SIDE = 96
 # {field of Blocking: (variant, directions) that it is tried with}
 TRIED = {
     "winograd": ("winograd4", (Direction.FORWARD, Direction.BACKWARD_INPUT)),
+    "winograd_narrow": ("winograd4", (Direction.FORWARD, Direction.BACKWARD_INPUT)),
     "winograd_weights": ("winograd4", (Direction.BACKWARD_WEIGHTS,)),
     "direct": ("direct", (Direction.FORWARD, Direction.BACKWARD_INPUT)),
 }

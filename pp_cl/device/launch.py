@@ -11,6 +11,7 @@ import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -38,6 +39,9 @@ SCALARS = {
 # them, because PoCL compiles a kernel again for every new work-group size; hence the tail guards.
 DEFAULT_LOCAL = {1: (64,), 2: (16, 4), 3: (16, 4, 1)}
 
+# Shapes and sizes of launches that a kernel remembers, so that it checks and rounds them once.
+REMEMBERED = 4096
+
 _KERNEL = re.compile(
     r"^(?:__)?kernel\s+(?:__attribute__\s*\(\(.*?\)\)\s*)?void\s+(\w+)\s*\(", re.MULTILINE
 )
@@ -60,6 +64,13 @@ class Parameter:
     width: int  # of the OpenCL vector
     const: bool  # what it points at
     shape: tuple | None
+
+    @cached_property
+    def limits(self) -> tuple[int, int] | None:
+        """The least and the largest integer of its type, None for a float."""
+        if not issubclass(self.dtype, np.integer):
+            return None
+        return int(np.iinfo(self.dtype).min), int(np.iinfo(self.dtype).max)
 
 
 def parse_signatures(source: str, file: str) -> dict[str, list[Parameter]]:
@@ -122,59 +133,104 @@ class Kernel:
         defines: dict[str, Any],
         label: str,
     ):
+        # with their types pyopencl packs scalars itself; without, ten of them take it 40 us
+        kernel.set_scalar_arg_dtypes([None if p.space else p.dtype for p in parameters])
         self.kernel = kernel
         limit = cl.kernel_work_group_info.WORK_GROUP_SIZE
         self.largest_group = kernel.get_work_group_info(limit, device)  # work-items
         self.parameters = parameters
-        self.names = [p.name for p in parameters]
+        self.names = {p.name for p in parameters}
         self.label = label
+        self._device_name = device.name.strip()
         words = {word for p in parameters for word in p.shape or () if word != "?"}
         names = set().union(*(names_in(parse_formula(word)) for word in words))
         self._macros = {name: int(defines[name]) for name in names & defines.keys()}
-        self._letters = {name.lower() for name in names}
+        letters = {name.lower() for name in names}
+        # (parameter, dtype of a buffer, letter that a scalar gives a size to) in order
+        self._slots = [
+            (
+                p,
+                np.dtype(p.dtype) if p.space in ("global", "constant") else None,
+                p.name.lower() if not p.space and p.name.lower() in letters else None,
+            )
+            for p in parameters
+        ]
         self._checked = set()  # shapes and sizes already found right
+        self._ranges = {}  # {(size, work-group) as given: as enqueued}
 
     def arguments(self, values: dict[str, Any]) -> list[Any]:
         """OpenCL arguments in order, from {name: pyopencl Array, number or cl.LocalMemory}. Raises
         TypeError, ValueError.
         """
-        if values.keys() != set(self.names):
-            missing = [n for n in self.names if n not in values]
+        if values.keys() != self.names:
+            missing = [p.name for p in self.parameters if p.name not in values]
             unknown = [n for n in values if n not in self.names]
             raise TypeError(f"{self.label}: missing {missing}, unknown {unknown}")
         arguments, shapes, sizes = [], [], {}
-        for p in self.parameters:
+        for p, dtype, letter in self._slots:
             value = values[p.name]
-            if p.space in ("global", "constant"):
-                if not isinstance(value, cl_array.Array) or value.dtype != p.dtype:
+            if dtype:
+                if not isinstance(value, cl_array.Array) or value.dtype != dtype:
                     raise TypeError(
                         f"{self.label}: {p.name} is {_kind(value)}, expected a device array of "
-                        f"{np.dtype(p.dtype)}"
+                        f"{dtype}"
                     )
                 arguments.append(value.data)
                 shapes.append((value.shape, value.strides))
             elif p.space == "local":
                 arguments.append(value)
             else:
-                arguments.append(self._scalar(p, value))
-                if p.name.lower() in self._letters:
-                    sizes[p.name.lower()] = int(value)
+                quick = type(value) is int and p.limits and p.limits[0] <= value <= p.limits[1]
+                number = value if quick else self._scalar(p, value)
+                arguments.append(number)
+                if letter:
+                    sizes[letter] = int(number)
         key = (*shapes, *sizes.values())
         if key not in self._checked:
             self._check_buffers(values, sizes)
-            if len(self._checked) > 4096:
+            if len(self._checked) > REMEMBERED:
                 self._checked.clear()
             self._checked.add(key)
         return arguments
 
+    def ranges(
+        self, size: int | tuple[int, ...], local: int | tuple[int, ...] | None
+    ) -> tuple[tuple[int, ...], tuple[int, ...]] | None:
+        """(work-items, work-group) to enqueue, of those given to launch(); None for no work-item.
+
+        Raises UserError when the work-group is too large for the device.
+        """
+        key = size, local
+        if key not in self._ranges:
+            if len(self._ranges) > REMEMBERED:
+                self._ranges.clear()
+            self._ranges[key] = self._rounded(size, local)
+        return self._ranges[key]
+
+    def _rounded(self, size, local):
+        size = (int(size),) if np.isscalar(size) else tuple(int(s) for s in size)
+        local = (
+            DEFAULT_LOCAL[len(size)]
+            if local is None
+            else ((local,) if np.isscalar(local) else tuple(local))
+        )
+        if 0 in size:
+            return None
+        if math.prod(local) > self.largest_group:
+            raise UserError(
+                f"{self.label}: a work-group of {math.prod(local)} work-items, but"
+                f" {self._device_name} runs at most {self.largest_group} of this kernel: choose"
+                " another device (`pp-cl devices`)"
+            )
+        return tuple(-(-s // group) * group for s, group in zip(size, local, strict=True)), local
+
     def _scalar(self, p, value):
         try:
-            if not issubclass(p.dtype, np.integer):
-                return p.dtype(float(value))
-            # index() refuses the 2.5 that numpy would cut to 2
-            number = p.dtype(operator.index(value))
-            if number != value:
-                raise OverflowError("out of range")  # numpy before 2 wraps around
+            if p.limits is None:
+                return float(value)
+            number = int(operator.index(value))  # index() refuses the 2.5 that int() cuts to 2
+            if not p.limits[0] <= number <= p.limits[1]:
+                raise OverflowError("out of range")
             return number
         except (TypeError, OverflowError) as error:
             raise TypeError(
@@ -275,23 +331,11 @@ class Program:
         """
         kernel = self.kernels[kernel_name]
         values = kernel.arguments(arguments)
-        size = (int(size),) if np.isscalar(size) else tuple(int(s) for s in size)
-        local = (
-            DEFAULT_LOCAL[len(size)]
-            if local is None
-            else ((local,) if np.isscalar(local) else tuple(local))
-        )
-        if 0 in size:
+        ranges = kernel.ranges(size, local)
+        if ranges is None:
             return
-        if math.prod(local) > kernel.largest_group:
-            raise UserError(
-                f"{kernel.label}: a work-group of {math.prod(local)} work-items, but"
-                f" {self.device.name} runs at most {kernel.largest_group} of this kernel: choose"
-                " another device (`pp-cl devices`)"
-            )
-        size = tuple(-(-s // group) * group for s, group in zip(size, local, strict=True))
         event = self.device.attempt(
-            f"run {kernel.label}", kernel.kernel, self.device.queue, size, local, *values
+            f"run {kernel.label}", kernel.kernel, self.device.queue, *ranges, *values
         )
         if self.device.debug:
             self.device.observe(kernel, event, arguments)

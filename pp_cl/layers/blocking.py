@@ -15,7 +15,8 @@ class Blocking:
     where the groups come in multiples of that number; direct_odd: the same for other channels.
     accumulators: float16 sums that a work-item of conv_backward_weights.cl keeps in registers;
     work_group: its work-group, None = the launcher's default. winograd: (tiles transformed at a
-    time, tiles multiplied together) of winograd.cl. winograd_weights: tiles transformed at a time
+    time, tiles multiplied together) of winograd.cl; winograd_narrow: the same for few channels
+    (winograd.NARROW). winograd_weights: tiles transformed at a time
     by winograd_backward_weights.cl.
     """
 
@@ -24,8 +25,10 @@ class Blocking:
     accumulators: int
     work_group: tuple[int, int, int] | None
     # More tiles at a time use the transformed weights better, fewer leave more room in the caches.
-    # The second number divides the first: with 2 x 16 channels, 16 of AVX-512's 32 vectors.
+    # The second number divides the first: with 2 x 16 channels, 8 take 16 of AVX-512's 32 vectors,
+    # 12 take 24.
     winograd: tuple[int, int] = (64, 8)
+    winograd_narrow: tuple[int, int] = (12, 12)
     winograd_weights: int = 32
 
     def of_direct(self, width: int, channels_out: int) -> tuple[int, int, tuple[int, int, int]]:
@@ -47,6 +50,7 @@ SHIPPED = {
 CHOICES = {
     "CPU": {
         "winograd": ((64, 8), (32, 8), (128, 8), (64, 4), (64, 2)),
+        "winograd_narrow": ((12, 12), (16, 8), (32, 8), (16, 4), (16, 2)),
         "winograd_weights": (32, 16, 64),
         "direct": ((8, 2, (1, 1, 1)), (4, 2, (1, 1, 1)), (12, 1, (1, 1, 1)), (6, 1, (1, 1, 1))),
     },

@@ -91,13 +91,17 @@ def conv_backward_weights(
             partial=partial,
         )
         first += c
-    _sum_parts(program, partial, grad_weight, grad_bias, parts=parts)
+    sum_parts(dev, partial, grad_weight, grad_bias, parts=parts)
 
 
-def _sum_parts(program, partial, grad_weight, grad_bias, *, parts):
-    """Write the sums over the parts of an image."""
+def sum_parts(
+    dev: Device, partial: Array, grad_weight: Array, grad_bias: Array, *, parts: int
+) -> None:
+    """grad_weight (blocks, K, K, CI, 16) and grad_bias (blocks * 16,) = sums, in order, of the
+    parts of an image, partial (parts, blocks, K * K * CI + 1, 16) or longer.
+    """
     blocks, k, _, ci, _ = grad_weight.shape
-    program.launch(
+    dev.program("layers/conv_backward_weights", KERNEL_SIZE=k).launch(
         "conv_sum_parts",
         (k * k * ci + 1, blocks),
         per_block=k * k * ci,

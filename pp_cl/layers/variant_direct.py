@@ -26,7 +26,7 @@ class DirectConvolution:
     ) -> tuple[int, int]:
         """As variants.Convolution.work_floats."""
         if direction is Direction.BACKWARD_WEIGHTS:
-            return partial_floats(height, weight_shape), 0
+            return 0, partial_floats(height, weight_shape)
         flipped = math.prod(_flipped_shape(weight_shape, c, weight_shape[0] * LANES))
         return 0, flipped if direction is Direction.BACKWARD_INPUT else 0
 
@@ -93,7 +93,7 @@ class DirectConvolution:
             grad_out,
             grad_weight,
             grad_bias=grad_bias,
-            partial=work.scratch,
+            partial=work.weights,
             tiles=tiles,
             blocking=self.blocking,
         )

@@ -28,7 +28,7 @@ class WinogradConvolution:
     ) -> tuple[int, int]:
         """As variants.Convolution.work_floats."""
         if direction is Direction.BACKWARD_WEIGHTS:
-            return backward_weights_floats(self.dev, self.form), 0
+            return backward_weights_floats(self.dev, self.form, weight_shape)
         co = weight_shape[0] * LANES
         return self.form.scratch_floats(self.dev, c, co), self.form.transformed_floats(c, co)
 
@@ -97,6 +97,6 @@ class WinogradConvolution:
             grad_out,
             grad_weight=grad_weight,
             grad_bias=grad_bias,
-            scratch=work.scratch,
+            work=work,
             tiles=tiles,
         )

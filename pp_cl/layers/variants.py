@@ -50,7 +50,11 @@ class Variant:
         if self.winograd_m is None:
             return DirectConvolution(dev, blocking)
         form = WinogradForm(
-            self.winograd_m, self.half, *blocking.winograd, blocking.winograd_weights
+            self.winograd_m,
+            self.half,
+            blocking.winograd,
+            blocking.winograd_narrow,
+            blocking.winograd_weights,
         )
         return WinogradConvolution(dev, form)
 

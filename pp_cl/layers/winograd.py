@@ -11,28 +11,36 @@ from pyopencl.array import Array
 
 from pp_cl.device.device import Device
 from pp_cl.layers.tiles import LANES, SIDE, Tiles, checked_tiles
-from pp_cl.layers.work import Work
+from pp_cl.layers.work import COUNTERS, Work
+
+# Weights of at most so many channels in times channels out are narrow: transformed they take 2.25
+# MiB, about what a core's L2 cache holds, and reading them for fewer tiles at a time costs little.
+NARROW = 128 * 128
 
 
 @dataclass(frozen=True)
 class WinogradForm:
     """One of the ways to run these kernels.
 
-    m: side of a tile of outputs, 2 or 4. half: transformed weights are stored in 16 bits. tiles,
-    group: tiles transformed at a time and multiplied together, weights_tiles: tiles transformed at
-    a time for the gradient of the weights; see blocking.Blocking.
+    m: side of a tile of outputs, 2 or 4. half: transformed weights are stored in 16 bits. wide,
+    narrow: (tiles transformed at a time, tiles multiplied together) by channels, weights_tiles:
+    tiles transformed at a time for the gradient of the weights; see blocking.Blocking.
     """
 
     m: int
     half: bool
-    tiles: int
-    group: int
+    wide: tuple[int, int]
+    narrow: tuple[int, int]
     weights_tiles: int
 
     @property
     def positions(self) -> int:
         """Values of a transformed tile."""
         return (self.m + 2) ** 2
+
+    def tiles_and_group(self, ci: int, co: int) -> tuple[int, int]:
+        """`wide` or `narrow`, for a convolution of ci to co channels."""
+        return self.narrow if ci * co <= NARROW else self.wide
 
     def transformed_floats(self, ci: int, co: int) -> int:
         """Floats of the transformed weights of ci to co channels, as cl/layers/winograd.h lays them
@@ -45,8 +53,8 @@ class WinogradForm:
         """Floats of scratch memory of a convolution of ci to co channels, or of its input
         gradient.
         """
-        vectors = (ci + co) * self.tiles + 3 * LANES
-        return dev.info["compute_units"] * self.positions * vectors
+        vectors = (ci + co) * self.tiles_and_group(ci, co)[0] + 3 * LANES
+        return COUNTERS + dev.info["compute_units"] * self.positions * vectors
 
 
 def winograd_forward(
@@ -76,7 +84,7 @@ def winograd_forward(
         )
     _check_work(dev, form, work, (sum(channels), co))
     tiles = checked_tiles(dev, tiles, height, width)
-    _program(dev, form, co).launch(
+    _program(dev, form, sum(channels), co).launch(
         "winograd_forward",
         work_items(dev, form, tiles),
         local=1,
@@ -120,7 +128,7 @@ def winograd_backward_input(
         )
     _check_work(dev, form, work, (c, co))
     tiles = checked_tiles(dev, tiles, height, width)
-    _program(dev, form, c).launch(
+    _program(dev, form, co, c).launch(
         "winograd_backward_input",
         work_items(dev, form, tiles),
         local=1,
@@ -162,12 +170,13 @@ def _check_work(dev, form, work, channels):
     check_size("scratch", work.scratch, form.scratch_floats(dev, *channels))
 
 
-def _program(dev, form, channels_out):
+def _program(dev, form, channels_in, channels_out):
+    tiles, group = form.tiles_and_group(channels_in, channels_out)
     return dev.program(
         "layers/winograd",
         WINO_M=form.m,
-        TILES=form.tiles,
-        GROUP=form.group,
+        TILES=tiles,
+        GROUP=group,
         BLOCKS=pair_blocks(channels_out),
         HALF=int(form.half),
     )

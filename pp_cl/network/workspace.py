@@ -11,7 +11,7 @@ from pp_cl.layers.direction import Direction
 from pp_cl.layers.policy import ConvolutionPolicy
 from pp_cl.layers.tiles import LANES, all_tiles_buffers
 from pp_cl.layers.variants import Convolution
-from pp_cl.layers.work import Work
+from pp_cl.layers.work import COUNTERS, Work
 from pp_cl.network.architectures import convolutions
 from pp_cl.network.buffers import SharedBuffer, gradient_of, lifetimes, plan_buffers
 from pp_cl.network.layer import Conv, Layer
@@ -60,7 +60,7 @@ class WorkspacePlan:
         self.shapes = outputs | {gradient_of(name): shape for name, shape in outputs.items()}
         self.shared: list[SharedBuffer] = plan_buffers(lifetimes(layers, training), self.shapes)
         self.convolutions: dict[tuple, Convolution] = {}
-        self.work_floats = [1, 1]
+        self.work_floats = [COUNTERS, 1]
         parameters = parameter_table(layers)
         for layer in convolutions(layers):
             rows, columns = shapes[layer.name]
@@ -111,7 +111,7 @@ class Workspace:
             for name in shared.names:
                 shape = plan.shapes[name]
                 self.arrays[name] = buffer[: math.prod(shape)].reshape(shape)
-        self.work = Work(dev.empty(*table[SCRATCH]), dev.empty(*table[WEIGHTS]))
+        self.work = Work.empty(dev, *plan.work_floats)
         self.all_tiles = AllTiles(dev, plan.size, plan.layers)
 
     def follow(self, plan: WorkspacePlan) -> None:

@@ -175,13 +175,13 @@ def all_values(field):
     return list(dict.fromkeys(v for choices in CHOICES.values() for v in choices.get(field, ())))
 
 
-@pytest.mark.parametrize("field", ["winograd", "winograd_weights", "direct"])
+@pytest.mark.parametrize("field", ["winograd", "winograd_narrow", "winograd_weights", "direct"])
 def test_every_blocking_computes_the_same(dev, field):
     variants = ["direct"] if field == "direct" else ["winograd2", "winograd4"]
-    convolutions = [
-        RandomConv(dev, 3, side, sources, co=co)
-        for sources, co, side in (((32, 16), 32, 13), ((16,), 48, 7), ((16,), 16, 3))
-    ]
+    layers = [((32, 16), 32, 13), ((16,), 48, 7), ((16,), 16, 3)]
+    if field == "winograd":
+        layers = [((80, 64), 128, 13), ((144,), 128, 3)]
+    convolutions = [RandomConv(dev, 3, side, sources, co=co) for sources, co, side in layers]
     for value in all_values(field):
         policy = make_policy(dev, DEFAULT, tuning_of(dev, blocking={field: value}))
         for conv in convolutions:
@@ -191,20 +191,23 @@ def test_every_blocking_computes_the_same(dev, field):
                     assert error < 2e-6, (value, variant, direction)
 
 
-@pytest.mark.parametrize("field", ["winograd", "winograd_weights"])
+@pytest.mark.parametrize("field", ["winograd", "winograd_narrow", "winograd_weights"])
 def test_every_blocking_stays_in_the_memory_it_asks_for(dev, rng, field):
     """Images of more tiles than are taken at a time, and as much scratch memory as these blockings
     need, no more.
     """
-    # wide: two full parts of the weights
+    # wide: no narrow weights, and two full parts of them
     x, wide = (rng.normal(size=(50, 31, c)).astype(np.float32) for c in (16, 256))
-    weight, bias = layer_weights(rng, 16, 16, 3)
+    narrow = layer_weights(rng, 16, 16, 3)
     for value in all_values(field):
         blocking = make_policy(dev, DEFAULT, tuning_of(dev, blocking={field: value})).blocking
         for m in (2, 4):
             of = form(m, blocking=blocking)
             if field == "winograd":
-                assert np.isfinite(run_forward(dev, of, x, weight, bias, relu=False)).all()
+                parameters = layer_weights(rng, 256, 80, 3)
+                assert np.isfinite(run_forward(dev, of, wide, *parameters, relu=False)).all()
+            elif field == "winograd_narrow":
+                assert np.isfinite(run_forward(dev, of, x, *narrow, relu=False)).all()
             else:
                 assert np.isfinite(run_backward_weights(dev, of, wide[..., :128], wide)[0]).all()
             dev.check()

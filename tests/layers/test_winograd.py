@@ -15,7 +15,7 @@ from support.winograd_layers import (
     work_of,
 )
 
-from pp_cl.layers.blocking import CHOICES
+from pp_cl.layers.blocking import CHOICES, SHIPPED
 from pp_cl.layers.conv import pack_weights
 from pp_cl.layers.winograd import winograd_backward_input, winograd_forward
 from pp_cl.layers.winograd_transform import transform_flipped_weights
@@ -237,4 +237,10 @@ def test_wrong_shapes_are_refused(dev):
 
 
 def test_groups_divide_rounds():
-    assert all(tiles % group == 0 for tiles, group in CHOICES["CPU"]["winograd"])
+    for field in ("winograd", "winograd_narrow"):
+        assert all(tiles % group == 0 for tiles, group in CHOICES["CPU"][field])
+
+
+def test_the_blocking_depends_on_the_channels():
+    assert form(4).tiles_and_group(128, 128) == SHIPPED["CPU"].winograd_narrow
+    assert form(4).tiles_and_group(128, 144) == SHIPPED["CPU"].winograd

@@ -11,13 +11,16 @@ from pp_cl.layers.winograd_backward_weights import (
     backward_weights_floats,
     winograd_backward_weights,
 )
+from pp_cl.layers.work import Work
 
 # With parts of 128 x 128 channels: several, and tails of both kinds
 PARTS = [*map(large, [(5, 6, 80, 144), (9, 7, 144, 48), (12, 20, 272, 256)])]
+# Narrow weights: 2 and 8 parts of the tiles of F(4x4), 8 and 16 of F(2x2)
+TILE_PARTS = [*map(large, [(33, 97, 16, 32), (130, 81, 32, 16)])]
 
 
 @pytest.mark.parametrize("m", BOUNDS)
-@pytest.mark.parametrize("shape", SHAPES + PARTS)
+@pytest.mark.parametrize("shape", SHAPES + PARTS + TILE_PARTS)
 def test_backward_weights(dev, rng, shape, m):
     height, width, ci, co = shape
     x = rng.normal(size=(height, width, ci)).astype(np.float32)
@@ -58,9 +61,10 @@ def test_hard_inputs(dev, rng, m):
 
 @pytest.mark.large
 @pytest.mark.parametrize("units", [1, 3, 100])
-def test_same_bits_for_any_number_of_compute_units(dev, rng, monkeypatch, units):
-    x = rng.normal(size=(37, 40, 144)).astype(np.float32)
-    grad_out = rng.normal(size=(37, 40, 144)).astype(np.float32)
+@pytest.mark.parametrize("height, channels", [(37, 144), (131, 48)])
+def test_same_bits_for_any_number_of_compute_units(dev, rng, monkeypatch, height, channels, units):
+    x = rng.normal(size=(height, 40, channels)).astype(np.float32)
+    grad_out = rng.normal(size=(height, 40, channels)).astype(np.float32)
     expected = run_backward_weights(dev, form(4), grad_out, x)
     monkeypatch.setitem(dev.info, "compute_units", units)
     for actual, value in zip(
@@ -71,18 +75,17 @@ def test_same_bits_for_any_number_of_compute_units(dev, rng, monkeypatch, units)
 
 @pytest.mark.large
 def test_wrong_shapes_are_refused(dev):
-    x, grad_out, scratch = (
-        dev.zeros((4, 4, 16)),
-        dev.zeros((4, 4, 32)),
-        dev.zeros(backward_weights_floats(dev, form(4))),
-    )
+    x, grad_out = dev.zeros((4, 4, 16)), dev.zeros((4, 4, 32))
     grad_weight, grad_bias = dev.zeros((2, 3, 3, 16, 16)), dev.zeros(32)
-    given = {"grad_weight": grad_weight, "grad_bias": grad_bias, "scratch": scratch}
+    scratch, parts = backward_weights_floats(dev, form(4), grad_weight.shape)
+    work = Work.empty(dev, scratch, parts)
+    given = {"grad_weight": grad_weight, "grad_bias": grad_bias, "work": work}
     for sources, change, match in (
         ((x, x), {}, "\\[16, 16\\] to 32 channels"),
         ((x,), {"grad_bias": dev.zeros(16)}, "bias \\(16,\\)"),
         ((dev.zeros((4, 4, 3)),), {"grad_weight": dev.zeros((2, 3, 3, 3, 16))}, "\\[3\\] to 32"),
-        ((x,), {"scratch": dev.zeros(10)}, "scratch of 10 floats"),
+        ((x,), {"work": Work.empty(dev, 0, parts)}, "scratch of 16 floats"),
+        ((x,), {"work": Work.empty(dev, scratch, 10)}, "parts of the gradient of 10 floats"),
     ):
         with pytest.raises(ValueError, match=match):
             winograd_backward_weights(dev, form(4), sources, grad_out, **given | change)

@@ -16,7 +16,9 @@ from pp_cl.layers.work import Work
 
 def form(m, half=False, blocking: Blocking = SHIPPED["CPU"]):
     """The WinogradForm of F(m x m, 3 x 3)."""
-    return WinogradForm(m, half, *blocking.winograd, blocking.winograd_weights)
+    return WinogradForm(
+        m, half, blocking.winograd, blocking.winograd_narrow, blocking.winograd_weights
+    )
 
 
 def stored_weights(array, m, ci, co, half):
@@ -93,6 +95,6 @@ def run_backward_weights(dev, form, grad_out, *sources):
         dev.upload(grad_out),
         grad_weight=grad_weight,
         grad_bias=grad_bias,
-        scratch=dev.empty(backward_weights_floats(dev, form)),
+        work=Work.empty(dev, *backward_weights_floats(dev, form, grad_weight.shape)),
     )
     return unpack_weights(grad_weight.get(), co), grad_bias.get()
