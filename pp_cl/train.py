@@ -22,7 +22,7 @@ from pp_cl.training.schedule import ema_weight, gamma_at, refine_steps
 from pp_cl.training.smooth import Smoother
 
 BOX_MARGIN = 8  # pixels around the object from which crops are drawn
-END_SHARE = 0.25  # of the crops that lie at one end of the object's box
+END_SHARE = 0.25  # of the crops that show one end of the object, at least
 CROP_LOSS = 0.25  # of the crop's side for every halving of the images
 
 
@@ -283,16 +283,17 @@ def _draw_start(rng, low, high, size, *, limit):
     """First pixel of a crop of `size` that shows a part of [low, high) as large as possible, inside
     [0, limit).
 
-    A share END_SHARE of the crops lies at either end, since uniform draws hardly ever show the
-    ends of what is much wider than a crop. They are spread over BOX_MARGIN pixels: the network
-    pools by 4, and would learn one phase of its grid where crops always began at the same pixel.
+    The object's two ends are each in a share END_SHARE of the crops if not in more: uniform draws
+    hardly ever show the ends of what is much wider than a crop.
     """
     first, last = sorted((low, high - size))
     first, last = max(first, 0), max(min(last, limit - size), 0)
     start = int(rng.integers(first, last + 1))
-    end, inside = rng.random(), int(rng.integers(BOX_MARGIN))
-    if high - low > size and end < END_SHARE:
+    end, inside = rng.random(), int(rng.integers(BOX_MARGIN + 1))
+    uniform = min((BOX_MARGIN + 1) / (last - first + 1), END_SHARE)
+    drawn = (END_SHARE - uniform) / (1 - 2 * uniform)
+    if high - low > size and end < drawn:
         start = min(first + inside, last)
-    elif high - low > size and end > 1 - END_SHARE:
+    elif high - low > size and end > 1 - drawn:
         start = max(last - inside, first)
     return start

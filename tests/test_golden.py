@@ -27,6 +27,7 @@ SETTINGS = {
     "train.sh_smoothing": 0.25,
     "train.sh_smoothing_every": 1,
     "train.prune_every": 20,
+    "train.prune_looks": 5,
     "train.final_prune_weight": 0.2,
     "train.log_every": 10,
     "train.previews": 0,

@@ -30,6 +30,8 @@ typedef struct {
     float radius;   // world units
     float least;    // LEAST_RADIUS pixels at range t, world units
     int tiny;       // the radius is below one pixel
+    // reciprocals: dividing 16 lanes takes as long as all else that is done with them
+    float per_fx, per_fy, per_reach;
 } Footprint;
 
 // Width of a pixel at range t; the smaller focal length has the wider pixels.
@@ -45,6 +47,9 @@ ALWAYS_INLINE Footprint footprint_load(const Camera *cam, const float4 point, co
     f.radius = radius;
     f.least = LEAST_RADIUS * width;
     f.tiny = f.radius < width;
+    f.per_fx = 1.0f / cam->fx;
+    f.per_fy = 1.0f / cam->fy;
+    f.per_reach = 1.0f / fmax(f.radius, f.least);
     return f;
 }
 
@@ -62,7 +67,8 @@ ALWAYS_INLINE uint footprint_block(
 // there in another.
 #pragma OPENCL FP_CONTRACT OFF
     const float16 px = LANE_X + (float)x, py = LANE_Y + (float)y;
-    const float16 mx = (px + (0.5f - cam->cx)) / cam->fx, my = (py + (0.5f - cam->cy)) / cam->fy;
+    const float16 mx = (px + (0.5f - cam->cx)) * f->per_fx;
+    const float16 my = (py + (0.5f - cam->cy)) * f->per_fy;
     // the unit ray is (mx, my, 1) * inverse
     const float16 inverse = 1.0f / sqrt(mx * mx + my * my + 1.0f);
     const float16 range = f->t * inverse;
@@ -76,7 +82,7 @@ ALWAYS_INLINE uint footprint_block(
     // on no d is constant.
     const float reach = fmax(f->radius, f->least);
     hit = hit && rho2 < reach * reach;
-    *closeness = FOOTPRINT == DISC ? (float16)(1.0f) : 1.0f - sqrt(rho2) / reach;
+    *closeness = FOOTPRINT == DISC ? (float16)(1.0f) : 1.0f - sqrt(rho2) * f->per_reach;
     *depth = f->t;
 #else
     const float16 rho = sqrt(rho2);

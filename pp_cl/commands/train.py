@@ -20,8 +20,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--preset",
         choices=PRESETS,
         help=(
-            "tiny (default): 200x200, minutes on a CPU; small: 400x400, longer; paper: the paper's"
-            " numbers"
+            "tiny (default): 200x200, minutes on a CPU; small: 400x400 and full: 800x800, longer;"
+            " paper: the paper's numbers"
         ),
     )
     add("--iterations", metavar="N", help="steps of training")

@@ -18,8 +18,9 @@ def test_an_old_key_is_taken_and_named_on_one_line(tmp_path, capsys):
 
 
 def test_a_run_with_old_keys_resumes_and_gets_the_new_ones(tmp_path, capsys, monkeypatch):
+    """Before raster.blend there was, all was softmax."""
     scene, out = write_ball_scene(tmp_path / "ball"), tmp_path / "run"
-    train_and_interrupt(scene, out, 15, monkeypatch)
+    train_and_interrupt(scene, out, 15, monkeypatch, raster__blend="softmax")
     new = json.loads((out / "config.json").read_text())
     old = json.loads((out / "config.json").read_text())
     for former, key in RENAMED.items():
@@ -29,7 +30,7 @@ def test_a_run_with_old_keys_resumes_and_gets_the_new_ones(tmp_path, capsys, mon
     del old["raster"]
     (out / "config.json").write_text(json.dumps(old))
     capsys.readouterr()
-    assert main(arguments(scene, out)) == 0
+    assert main(arguments(scene, out, raster__blend="softmax")) == 0
     captured = capsys.readouterr()
     notes = [line for line in captured.err.splitlines() if "is called" in line]
     assert len(notes) == 1 and "other keys" in notes[0] and "resuming at step 10" in captured.out
