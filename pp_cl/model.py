@@ -10,6 +10,7 @@ import numpy as np
 from pyopencl.array import Array
 
 from pp_cl.device.device import Device
+from pp_cl.device.rows import DeviceRows
 from pp_cl.errors import UserError
 from pp_cl.files.checkpoint import fitting_array
 from pp_cl.network.unet import UNet
@@ -83,10 +84,11 @@ class Model:
             "depth_range": [float(x) for x in self.depth_range],
         }
 
-    def arrays(self) -> dict[str, np.ndarray]:
+    def arrays(self) -> dict[str, DeviceRows]:
         """{name: array} of everything learned, as a checkpoint stores it."""
-        network = {f"net.{name}": array.get() for name, array in self.net.parameters.items()}
-        return self.cloud.arrays() | network
+        parameters = self.net.parameters.items()
+        network = {f"net.{name}": DeviceRows(self.dev, array) for name, array in parameters}
+        return self.cloud.arrays(self.dev) | network
 
     @classmethod
     def load(
@@ -99,7 +101,8 @@ class Model:
         degree: int,
         file: Path,
     ) -> Model:
-        """Model of a checkpoint's header and arrays; net takes the parameters stored there.
+        """Model of a checkpoint's header and arrays, which are taken out of `arrays`; net takes the
+        parameters stored there.
 
         Raises UserError naming the file and the array that does not fit.
         """
@@ -114,5 +117,5 @@ class Model:
             raise UserError(f"{file}: its header is incomplete; train anew") from None
         cloud = PointCloud.load(dev, arrays, degree, file)
         for name, parameter in net.parameters.items():
-            parameter.set(fitting_array(arrays, f"net.{name}", parameter.shape, file))
+            dev.write(parameter, fitting_array(arrays, f"net.{name}", parameter.shape, file))
         return cls(dev, grid, depth_range, cloud, net=net)

@@ -6,6 +6,7 @@ import numpy as np
 
 from pp_cl.config import Config, TrainConfig
 from pp_cl.device.device import Device
+from pp_cl.device.rows import DeviceRows
 from pp_cl.errors import UserError
 from pp_cl.model import Model
 from pp_cl.render import Renderer
@@ -248,13 +249,14 @@ class Trainer:
         self._target.load(view)
         return self._target.whole()
 
-    def arrays(self) -> dict[str, np.ndarray]:
+    def arrays(self) -> dict[str, DeviceRows]:
         """{name in a checkpoint: array} of the model and of the training's state."""
         return self.model.arrays() | self.optimiser.arrays()
 
     def restore(self, step: int, arrays: dict[str, np.ndarray]) -> None:
-        """Go on after `step` steps with the arrays of a checkpoint; the model has been loaded
-        already. Raises KeyError and ValueError for an array that does not fit.
+        """Go on after `step` steps with the arrays of a checkpoint, which are taken out of
+        `arrays`; the model has been loaded already. Raises KeyError and ValueError for an array
+        that does not fit.
         """
         self.step = step
         self._set_level()

@@ -158,9 +158,39 @@ class Device:
         """Copy of a numpy array on the device."""
         values = np.ascontiguousarray(values, dtype)
         array = self._allocate(values.shape, values.dtype)
-        if values.size:
-            self.attempt("upload a buffer", array.set, values)
+        self.write(array, values)
         return array
+
+    def write(self, array: Array, values: np.ndarray) -> None:
+        """Overwrite an array of this device by a numpy array of its shape and dtype.
+
+        Array.set, as Array.get, would keep the numpy array alive as long as the device's.
+        """
+        if values.shape != array.shape or values.dtype != array.dtype:
+            raise ValueError(f"write: {values.shape} {values.dtype} to {array.shape} {array.dtype}")
+        if array.size:
+            self.attempt(
+                "upload a buffer",
+                cl.enqueue_copy,
+                self.queue,
+                array.base_data,
+                np.ascontiguousarray(values),
+                dst_offset=array.offset,
+            )
+
+    def download(self, array: Array) -> np.ndarray:
+        """Copy of an array of this device."""
+        values = np.empty(array.shape, array.dtype)
+        if array.size:
+            self.attempt(
+                "download a buffer",
+                cl.enqueue_copy,
+                self.queue,
+                values,
+                array.base_data,
+                src_offset=array.offset,
+            )
+        return values
 
     def fill(self, array: Array, value: float) -> None:
         """Set all elements of an array of this device to one value."""

@@ -2,8 +2,9 @@
 
 import json
 import zipfile
+from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 
@@ -13,17 +14,35 @@ from pp_cl.files.atomic import atomic_file
 FORMAT = 1  # raised when the arrays change meaning
 
 
+class Rows(Protocol):
+    """An array that comes in pieces, as device/rows.py has them."""
+
+    shape: tuple[int, ...]
+    dtype: np.dtype
+
+    def pieces(self) -> Iterator[np.ndarray]:
+        """Its rows, some at a time."""
+
+
 def save_checkpoint(
-    path: Path | str, header: dict[str, Any], arrays: dict[str, np.ndarray]
+    path: Path | str, header: dict[str, Any], arrays: Mapping[str, np.ndarray | Rows]
 ) -> None:
-    """Write {name: numpy array} and a JSON header. The same content gives the same bytes: no times
-    are stored.
+    """Write {name: array} and a JSON header as np.savez does, without a copy of a whole array. The
+    same content gives the same bytes: no times are stored.
     """
-    meta = np.frombuffer(
-        json.dumps({"format": FORMAT, **header}, sort_keys=True).encode(), np.uint8
-    )
-    with atomic_file(path) as file:
-        np.savez(file, header=meta, **arrays)
+    text = json.dumps({"format": FORMAT, **header}, sort_keys=True).encode()
+    with atomic_file(path) as file, zipfile.ZipFile(file, "w") as archive:
+        for name, array in {"header": np.frombuffer(text, np.uint8), **arrays}.items():
+            with archive.open(f"{name}.npy", "w", force_zip64=True) as member:
+                _write_array(member, array)
+
+
+def _write_array(member, array):
+    kind = np.lib.format.dtype_to_descr(array.dtype)
+    facts = {"descr": kind, "fortran_order": False, "shape": tuple(array.shape)}
+    np.lib.format.write_array_header_1_0(member, facts)
+    for piece in [array] if isinstance(array, np.ndarray) else array.pieces():
+        member.write(np.ascontiguousarray(piece).reshape(-1).view(np.uint8))
 
 
 def load_checkpoint(path: Path | str) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
@@ -64,10 +83,11 @@ def fitting_array(
     *,
     dtype: type = np.float32,
 ) -> np.ndarray:
-    """The array called `name`, contiguous. Raises UserError naming the file and the array where it
-    is missing or has another shape or dtype.
+    """The array called `name`, contiguous, taken out of `arrays`, so that its memory can be freed.
+    Raises UserError naming the file and the array where it is missing or has another shape or
+    dtype.
     """
-    array = arrays.get(name)
+    array = arrays.pop(name, None)
     if array is None or array.shape != tuple(shape) or array.dtype != dtype:
         found = "missing" if array is None else f"{array.dtype} {array.shape}"
         raise UserError(

@@ -2,6 +2,7 @@
 
 import json
 import math
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -9,7 +10,7 @@ import numpy as np
 
 from pp_cl.errors import UserError
 from pp_cl.files.atomic import remove_leftovers, write_text
-from pp_cl.files.checkpoint import load_checkpoint, save_checkpoint
+from pp_cl.files.checkpoint import Rows, load_checkpoint, save_checkpoint
 
 # what the header of a run's checkpoint holds at least
 HEADER = ("scene", "step", "finished", "initial_points", "grid", "depth_range")
@@ -64,7 +65,7 @@ class RunFolder:
             )
         return header, arrays
 
-    def save(self, header: dict[str, Any], arrays: dict[str, np.ndarray]) -> None:
+    def save(self, header: dict[str, Any], arrays: Mapping[str, np.ndarray | Rows]) -> None:
         """Replace the checkpoint."""
         save_checkpoint(self.checkpoint, header, arrays)
 

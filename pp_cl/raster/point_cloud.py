@@ -11,6 +11,7 @@ from pyopencl.array import Array
 from pp_cl.device.buffers import Table
 from pp_cl.device.compact import compact_rows, gather_rows
 from pp_cl.device.device import Device
+from pp_cl.device.rows import DeviceRows
 from pp_cl.files.checkpoint import fitting_array
 from pp_cl.raster.sh import SH_BLOCKS, SH_DEGREES, ShBlock, sh_blocks
 
@@ -73,19 +74,16 @@ class PointCloud:
         for i in range(len(self.sh)):
             self.sh[i] = gather_rows(dev, self.sh[i], rows)
 
-    def arrays(self) -> dict[str, np.ndarray]:
+    def arrays(self, dev: Device) -> dict[str, DeviceRows]:
         """The arrays as a checkpoint names them; the SH by degree, (N, 1, 16), (N, 3, 16),
         (N, 5, 16).
         """
-        stored = {"points.ids": self.ids.get(), "points.opacity": self.opacity.get()}
+        stored = {"ids": DeviceRows(dev, self.ids), "opacity": DeviceRows(dev, self.opacity)}
+        blocks = list(zip(self.blocks, self.sh, strict=True))
         for degree in sorted({block.degree for block in self.blocks}):
-            parts = [
-                array.get()
-                for block, array in zip(self.blocks, self.sh, strict=True)
-                if block.degree == degree
-            ]
-            stored[f"points.sh{degree}"] = np.concatenate(parts, 1)
-        return stored
+            parts = [array for block, array in blocks if block.degree == degree]
+            stored[f"sh{degree}"] = DeviceRows(dev, *parts)
+        return {f"points.{name}": rows for name, rows in stored.items()}
 
     @classmethod
     def load(

@@ -10,6 +10,7 @@ from pyopencl.array import Array
 from pp_cl.config import NetworkConfig, TrainConfig
 from pp_cl.device.buffers import Table
 from pp_cl.device.device import Device
+from pp_cl.device.rows import DeviceRows
 from pp_cl.model import Model
 from pp_cl.training.adam import Ema, PointAdam, PointsWithGradient, ShGradient, adam_update
 from pp_cl.training.point_state import PointState
@@ -133,24 +134,27 @@ class Optimiser:
         self.state.ema.apply(self.model.cloud.learned())
         self.ema.apply(self.model.net.parameters)
 
-    def arrays(self) -> dict[str, np.ndarray]:
+    def arrays(self) -> dict[str, DeviceRows]:
         """{name in a checkpoint: array} of all but the model's own arrays."""
-        moments = {
-            f"moment.{kind}.{name}": array.get()
+        network = {
+            f"moment.{kind}.{name}": array
             for name, arrays in self.moments.items()
             for kind, array in arrays.items()
         }
-        averages = {f"average.{name}": array.get() for name, array in self.ema.arrays.items()}
-        return self.state.arrays() | moments | averages
+        network |= {f"average.{name}": array for name, array in self.ema.arrays.items()}
+        rows = {name: DeviceRows(self.dev, array) for name, array in network.items()}
+        return self.state.arrays() | rows
 
     def restore(self, arrays: dict[str, np.ndarray]) -> None:
-        """Take over the state of a checkpoint, as written by arrays(). Raises KeyError and
+        """Take the state, as written by arrays(), out of a checkpoint's arrays. Raises KeyError and
         ValueError for what does not fit.
         """
         self.state.restore(self.model.cloud, arrays)
         for name, moments in self.moments.items():
             for kind, array in moments.items():
-                array.set(arrays[f"moment.{kind}.{name}"])
+                self.dev.write(array, arrays.pop(f"moment.{kind}.{name}"))
         parameters = self.model.net.parameters
         keys = {name: f"average.{name}" for name in parameters}
-        self.ema.restore(parameters, {n: arrays[key] for n, key in keys.items() if key in arrays})
+        self.ema.restore(
+            parameters, {n: arrays.pop(key) for n, key in keys.items() if key in arrays}
+        )

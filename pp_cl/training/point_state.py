@@ -9,6 +9,7 @@ from pp_cl.config import TrainConfig
 from pp_cl.device.buffers import Table
 from pp_cl.device.compact import compact_rows, gather_rows
 from pp_cl.device.device import Device
+from pp_cl.device.rows import DeviceRows
 from pp_cl.raster.point_cloud import PointCloud
 from pp_cl.raster.sh import ShBlock
 from pp_cl.training.adam import Ema
@@ -33,6 +34,7 @@ class PointState:
 
     def __init__(self, dev: Device, cloud: PointCloud, settings: TrainConfig):
         table = self.table(cloud.count, cloud.blocks, settings)
+        self.dev = dev
         self._arrays = {name: dev.zeros(*row) for name, row in table.items()}
         self.ema = Ema(dev)
 
@@ -94,23 +96,21 @@ class PointState:
         for sums in (self.weight_sum, self.look_count):
             dev.fill(sums, 0)
 
-    def arrays(self) -> dict[str, np.ndarray]:
+    def arrays(self) -> dict[str, DeviceRows]:
         """{name in a checkpoint: array}."""
         averages = {f"a.{name}": array for name, array in self.ema.arrays.items()}
-        return {_stored(name): array.get() for name, array in (self._arrays | averages).items()}
+        arrays = (self._arrays | averages).items()
+        return {_stored(name): DeviceRows(self.dev, array) for name, array in arrays}
 
     def restore(self, cloud: PointCloud, arrays: dict[str, np.ndarray]) -> None:
-        """Take over the state of a checkpoint. Raises KeyError and ValueError for an array that is
-        missing or has another shape.
+        """Take the state out of a checkpoint's arrays. Raises KeyError and ValueError for an array
+        that is missing or does not fit.
         """
         for name, array in self._arrays.items():
-            stored = arrays[_stored(name)]
-            if stored.shape != array.shape:
-                raise ValueError(f"{_stored(name)} has shape {stored.shape}")
-            array.set(stored)
+            self.dev.write(array, arrays.pop(_stored(name)))
         learned = cloud.learned()
         keys = {name: _stored(f"a.{name}") for name in learned}
-        self.ema.restore(learned, {n: arrays[key] for n, key in keys.items() if key in arrays})
+        self.ema.restore(learned, {n: arrays.pop(key) for n, key in keys.items() if key in arrays})
 
 
 def _stored(name):

@@ -6,6 +6,7 @@ import zipfile
 import numpy as np
 import pytest
 
+from pp_cl.device.rows import DeviceRows
 from pp_cl.errors import UserError
 from pp_cl.files import atomic
 from pp_cl.files.atomic import atomic_file, remove_leftovers, write_json
@@ -26,6 +27,13 @@ def test_round_trip_and_equal_bytes(tmp_path):
     assert header["step"] == 3 and set(arrays) == set(ARRAYS)
     for name, array in ARRAYS.items():
         np.testing.assert_array_equal(arrays[name], array)
+
+
+def test_arrays_in_pieces_give_the_bytes_of_whole_ones(dev, tmp_path):
+    rows = {name: DeviceRows(dev, dev.upload(array)) for name, array in ARRAYS.items()}
+    save_checkpoint(tmp_path / "a.npz", {"step": 3}, ARRAYS)
+    save_checkpoint(tmp_path / "b.npz", {"step": 3}, rows)
+    assert (tmp_path / "a.npz").read_bytes() == (tmp_path / "b.npz").read_bytes()
 
 
 def test_bytes_do_not_depend_on_the_clock(tmp_path, monkeypatch):

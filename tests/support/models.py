@@ -22,3 +22,8 @@ def make_model(dev, rng, n=90):
     for array in model.cloud.sh:
         array.set(rng.normal(size=array.shape).astype(np.float32))
     return model
+
+
+def fetched(arrays):
+    """{name: numpy array} of {name: DeviceRows}."""
+    return {name: rows.get() for name, rows in arrays.items()}

@@ -76,7 +76,9 @@ def test_the_plan_is_what_a_training_takes(dev, tmp_path, monkeypatch, changes):
     assert pruning == POINTS * (192 + 4)
     planned = plan_bytes(plan) - pruning
     assert 0.97 * peak < planned < 1.03 * peak
-    held = sum(a.nbytes for a in (trainer.model.cloud.arrays() | trainer.state.arrays()).values())
+    held = sum(
+        a.nbytes for a in (trainer.model.cloud.arrays(dev) | trainer.state.arrays()).values()
+    )
     tables = [
         PointCloud.table(POINTS, blocks),
         PointState.table(POINTS, blocks, trainer.config),

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from support.models import fetched
 
 from pp_cl.config import TrainConfig
 from pp_cl.device.buffers import table_bytes
@@ -48,14 +49,14 @@ def test_compacting_never_takes_more_than_its_scratch(dev, rng, monkeypatch, sha
         cloud,
         {k: (1e3 * rng.random(a.shape)).astype(a.dtype) for k, a in state.arrays().items()},
     )
-    host = cloud.arrays() | state.arrays()
+    host = fetched(cloud.arrays(dev) | state.arrays())
     assert len(host) == 5 + 2 + 2 + 5 + (1 + 4 if settings else 8)
     keep = np.arange(0, 1000, share, dtype=np.uint32)
     indices = dev.upload(keep)
     before, dev.peak_bytes = dev.bytes, dev.bytes
     cloud.compact(dev, indices)
     state.compact(dev, indices)
-    found = cloud.arrays() | state.arrays()
+    found = fetched(cloud.arrays(dev) | state.arrays())
     for name, values in host.items():
         np.testing.assert_array_equal(found[name], values[keep])
     assert cloud.count == len(keep)

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 from support.guarded import AWKWARD_SIZES
-from support.models import make_model
+from support.models import fetched, make_model
 
 from pp_cl.config import TrainConfig
 from pp_cl.scene.grid import Grid
@@ -50,11 +50,11 @@ def test_all_arrays_follow(dev, rng, composited, settings):
         model.cloud, {k: (99 * rng.random(a.shape)).astype(a.dtype) for k, a in stored.items()}
     )
     state.ema.arrays["opacity"].set(rng.random(model.cloud.count).astype(np.float32))
-    grid, before = model.grid, model.cloud.arrays() | state.arrays()
+    grid, before = model.grid, fetched(model.cloud.arrays(dev) | state.arrays())
     ids, parents = grid.children(before["points.ids"])
     refine(dev, model, state, composited=composited)
 
-    after = model.cloud.arrays() | state.arrays()
+    after = fetched(model.cloud.arrays(dev) | state.arrays())
     assert model.grid == grid.refined() and after.keys() == before.keys()
     np.testing.assert_array_equal(model.grid_buffer.get(), grid.refined().packed())
     np.testing.assert_array_equal(after.pop("points.ids"), ids)
