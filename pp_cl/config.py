@@ -176,7 +176,7 @@ class TrainConfig:
         1e9,
     )
     ema: bool = setting(
-        True, "average the parameters (EMA) over the last 30 % of the steps and keep the averages"
+        True, "average the parameters (EMA) over the last 15 % of the steps and keep the averages"
     )
     checkpoint_every: int = setting(1000, "steps between two checkpoints", 1, 10**8)
     memory_gib: float = setting(

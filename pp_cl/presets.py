@@ -8,12 +8,12 @@ PRESETS = {
     # for 800 x 800: begins at a quarter of the size, where fog clears at little cost
     "full": {
         "points.count": 170_000,
-        "train.iterations": 7000,
-        "train.refine_at": (0.32, 0.6),
+        "train.iterations": 12_000,
+        "train.refine_at": (0.33, 0.67),
         "train.crop": 256,
         "train.lazy_adam": True,
         "train.moments_16bit": True,
-        "train.sh_smoothing_every": 8,
+        "train.sh_smoothing_every": 16,
     },
     "paper": {
         # Stated by the supplemental, as are the defaults of raster.gamma, train.sh_rate and its

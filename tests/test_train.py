@@ -427,7 +427,7 @@ def test_a_quarter_of_the_crops_shows_an_end_of_the_object(low, high, size, limi
     assert inner.min() > min(0.5 * fair, END_SHARE - 0.03)
 
 
-@pytest.mark.parametrize("share, stops", [(0.3, (12, 33)), (0.8, (45, 55))])
+@pytest.mark.parametrize("share, stops", [(0.3, (12, 33)), (0.9, (52, 57))])
 def test_a_refined_run_resumes_to_the_same_bytes(scene, tmp_path, monkeypatch, share, stops):
     """Stopped before and after the refinement, which may come after the averages' beginning."""
     changes = {"train__refine_at": f"{share},1", "points__count": 300, "train__prune_looks": 4}

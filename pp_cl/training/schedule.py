@@ -4,7 +4,7 @@ steps - 1.
 
 import math
 
-EMA_UPDATES = 200  # times the averages would be updated in all steps; the last 30 % do
+EMA_UPDATES = 200  # times the averages would be updated in all steps; the last 15 % do
 
 
 def learning_rate(
@@ -45,10 +45,10 @@ def ema_weight(step: int, steps: int) -> float:
     """Weight of the present parameters in their exponential moving average; 0 where no update is
     due.
 
-    The average starts as a copy (weight 1) at 7/10 of the steps, then takes 1 - exp(-k/(steps/20))
+    The average starts as a copy (weight 1) at 17/20 of the steps, then takes 1 - exp(-k/(steps/20))
     every k = steps/200 steps: a time constant of a twentieth of the training, in ten updates.
     """
-    every, since = max(1, steps // EMA_UPDATES), step - 7 * steps // 10
+    every, since = max(1, steps // EMA_UPDATES), step - 17 * steps // 20
     if since < 0 or since % every:
         return 0.0
     return 1.0 if since == 0 else 1 - math.exp(-every / (0.05 * steps))

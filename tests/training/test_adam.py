@@ -321,6 +321,23 @@ def test_rounding_to_half(dev):
     assert (np.abs(rounded.mean(axis=0) - exact) < 0.02 * step).all()
 
 
+def test_every_half_is_read_and_written_exactly(dev):
+    """A half is a value of its own: no dither moves it. Infinities become the largest half."""
+    source = """#include "training/half16.h"
+        kernel void copy(global const half *from, global float16 *value, global half *to) {
+            const uint i = get_global_id(0);
+            value[i] = load_half16(from + 16 * i);
+            store_half16(value[i], random16(i) >> 19, to + 16 * i);
+        }"""
+    kernel = cl.Program(dev.context, source).build(["-I", str(kernel_folder())]).copy
+    halves = np.arange(2**16, dtype=np.uint16)
+    value, to = dev.empty((2**16,)), dev.empty((2**16,), np.uint16)
+    kernel(dev.queue, (2**12,), None, dev.upload(halves).data, value.data, to.data)
+    exact = halves.view(np.float16)
+    np.testing.assert_array_equal(value.get(), exact.astype(np.float32))
+    np.testing.assert_array_equal(to.get().view(np.float16), np.clip(exact, -65504, 65504))
+
+
 @pytest.mark.parametrize("n", AWKWARD_SIZES)
 def test_average(dev, rng, n):
     average, parameter = rng.standard_normal((2, n)).astype(np.float32)

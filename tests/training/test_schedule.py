@@ -48,9 +48,9 @@ def test_gamma():
 def test_ema_weight():
     weights = [ema_weight(step, 3500) for step in range(3500)]
     due = [step for step, weight in enumerate(weights) if weight]
-    assert due == list(range(2450, 3500, 17))
-    assert weights[2450] == 1
-    assert weights[2467] == weights[due[-1]] == pytest.approx(1 - math.exp(-17 / 175))
+    assert due == list(range(2975, 3500, 17))
+    assert weights[2975] == 1
+    assert weights[2992] == weights[due[-1]] == pytest.approx(1 - math.exp(-17 / 175))
 
 
 @pytest.mark.parametrize("steps", [1, 2, 7, 100])
