@@ -140,6 +140,13 @@ class TrainConfig:
     opacity_rate: tuple = setting(
         (1e-1, 1e-2), "Adam's learning rate at the first and the last step", 1e-12, 100
     )
+    opacity_rate_steps: int = setting(
+        1000,
+        "number of steps that opacity_rate is meant for: longer trainings multiply it by the square"
+        " root of this over their iterations (0: no matter how many)",
+        0,
+        10**8,
+    )
     lazy_adam: bool = setting(
         False, "update only points that received a gradient; false: momentum moves the others too"
     )

@@ -32,6 +32,8 @@ PRESETS = {
         "train.crop": 0,
         # Ours: the supplemental mentions no jitter, dropout, smoothing or averaging, and no rule
         # of pruning. Ours in all presets: the loss and its weight, Adam's eps, the opacity's rate.
+        "train.opacity_rate": (3e-2, 3e-3),
+        "train.opacity_rate_steps": 0,
         "train.pixel_jitter": False,
         "train.dropout": 0.0,
         "train.sh_smoothing": 0.0,
@@ -74,4 +76,4 @@ RENAMED = {
 
 
 # What a setting is taken for that a config.json of an earlier version does not have.
-ABSENT = {"points.opacity": 1.0, "raster.blend": "softmax"}
+ABSENT = {"points.opacity": 1.0, "raster.blend": "softmax", "train.opacity_rate_steps": 0}

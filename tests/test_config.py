@@ -22,7 +22,8 @@ def test_a_key_that_a_stored_run_lacks_has_its_presets_value(name, tmp_path):
     """Unless the key came later: the run had the former behaviour."""
     (tmp_path / "config.json").write_text(json.dumps({"preset": name, "train": {"seed": 3}}))
     expected = preset(name)
-    expected.train.seed, expected.raster.blend, expected.points.opacity = 3, "softmax", 1.0
+    expected.train.seed, expected.train.opacity_rate_steps = 3, 0
+    expected.raster.blend, expected.points.opacity = "softmax", 1.0
     assert load_config(tmp_path / "config.json") == expected
 
 

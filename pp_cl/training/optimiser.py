@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -40,9 +41,11 @@ class Rates:
             else 0.0
             for first, delay in zip(train.sh_rate, train.sh_delay, strict=True)
         )
+        # opacities travel about as far in a long training as in a short one
+        scale = math.sqrt(min(1.0, train.opacity_rate_steps / steps or 1.0))
         return cls(
             sh,
-            learning_rate(step, steps, *train.opacity_rate),
+            scale * learning_rate(step, steps, *train.opacity_rate),
             learning_rate(step, steps, *network.rate),
         )
 
