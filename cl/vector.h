@@ -6,9 +6,14 @@
 // The 16 values at p, of which `count` exist; the others read as 0.
 static inline float16 load16(global const float *p, const int count) {
     if (count >= 16) return vload16(0, p);
-    if (count <= 4)  // an image's channels: without the detour through memory
-        return (float16)(p[0], count > 1 ? p[1] : 0.0f, count > 2 ? p[2] : 0.0f,
-                         count > 3 ? p[3] : 0.0f, (float4)(0.0f), (float8)(0.0f));
+    if (count <= 4) {  // an image's channels: without the detour through memory
+        float16 few = 0.0f;
+        few.s0 = p[0];
+        few.s1 = count > 1 ? p[1] : 0.0f;
+        few.s2 = count > 2 ? p[2] : 0.0f;
+        few.s3 = count > 3 ? p[3] : 0.0f;
+        return few;
+    }
     float x[16];
     for (int i = 0; i < 16; i++)
         x[i] = i < count ? p[i] : 0.0f;
