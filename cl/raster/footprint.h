@@ -30,7 +30,7 @@ typedef struct {
     float radius;   // world units
     float least;    // LEAST_RADIUS pixels at range t, world units
     int tiny;       // the radius is below one pixel
-    // reciprocals: dividing 16 lanes takes as long as all else that is done with them
+    // reciprocals, since dividing 16 lanes by one number is slower than multiplying them
     float per_fx, per_fy, per_reach;
 } Footprint;
 

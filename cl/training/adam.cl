@@ -183,8 +183,8 @@ kernel void adam_sh_update(
 
 // SCALE * m and SCALE * sqrt(v) of one coefficient: the square root halves the range of exponents.
 ALWAYS_INLINE void moments_load(global const half *mv, float16 *m, float16 *v) {
-    const float16 root = load_half16(mv + 16);
-    *m = load_half16(mv);
+    const float16 root = vload_half16(1, mv);
+    *m = vload_half16(0, mv);
     *v = root * root;
 }
 

@@ -31,16 +31,7 @@ def compact_rows(dev: Device, array: Array, keep: Array) -> Array:
     scratch = dev.empty((piece, *array.shape[1:]), array.dtype)
     for start in range(0, m, piece):
         count = min(piece, m - start)
-        dev.program("device/compact").launch(
-            "gather_rows",
-            count,
-            first=start,
-            m=count,
-            r=row_bytes // 4,
-            indices=keep,
-            source=_words(array),
-            target=_words(scratch),
-        )
+        _gather(dev, array, keep, scratch, first=start, count=count)
         if piece < m:
             dev.copy_rows(array, start, scratch, count)
     return scratch if piece == m else dev.front(array, m)
@@ -51,17 +42,22 @@ def gather_rows(dev: Device, array: Array, rows: Array) -> Array:
     in any order, with repetitions.
     """
     gathered = dev.empty((len(rows), *array.shape[1:]), array.dtype)
+    _gather(dev, array, rows, gathered, first=0, count=len(rows))
+    return gathered
+
+
+def _gather(dev, array, rows, target, *, first, count):
+    """Copy the rows rows[first] to rows[first + count] of `array` to the front of `target`."""
     dev.program("device/compact").launch(
         "gather_rows",
-        len(rows),
-        first=0,
-        m=len(rows),
+        count,
+        first=first,
+        m=count,
         r=array.nbytes // len(array) // 4,
         indices=rows,
         source=_words(array),
-        target=_words(gathered),
+        target=_words(target),
     )
-    return gathered
 
 
 def _words(array):

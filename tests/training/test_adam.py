@@ -326,7 +326,7 @@ def test_every_half_is_read_and_written_exactly(dev):
     source = """#include "training/half16.h"
         kernel void copy(global const half *from, global float16 *value, global half *to) {
             const uint i = get_global_id(0);
-            value[i] = load_half16(from + 16 * i);
+            value[i] = vload_half16(i, from);
             store_half16(value[i], random16(i) >> 19, to + 16 * i);
         }"""
     kernel = cl.Program(dev.context, source).build(["-I", str(kernel_folder())]).copy
