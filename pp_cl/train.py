@@ -13,6 +13,7 @@ from pp_cl.render import Renderer
 from pp_cl.scene.target import Target
 from pp_cl.scene.views import View
 from pp_cl.training.adam import moment_scale
+from pp_cl.training.crops import BOX_MARGIN, draw_start
 from pp_cl.training.loss import Loss
 from pp_cl.training.optimiser import Optimiser, Rates
 from pp_cl.training.perceptual import PerceptualLoss
@@ -22,8 +23,6 @@ from pp_cl.training.refine import refine
 from pp_cl.training.schedule import ema_weight, gamma_at, refine_steps
 from pp_cl.training.smooth import Smoother
 
-BOX_MARGIN = 8  # pixels around the object from which crops are drawn
-END_SHARE = 0.25  # of the crops that show one end of the object, at least
 CROP_LOSS = 0.25  # of the crop's side for every halving of the images
 
 
@@ -149,8 +148,8 @@ class Trainer:
             return index, (0, 0, camera.width, camera.height), jitter
         x0, y0, x1, y1 = self._boxes[index]
         width, height = view.crop_size(self._crop)
-        left = _draw_start(rng, x0, x1, width, limit=camera.width)
-        top = _draw_start(rng, y0, y1, height, limit=camera.height)
+        left = draw_start(rng, x0, x1, width, limit=camera.width)
+        top = draw_start(rng, y0, y1, height, limit=camera.height)
         return index, (left, top, width, height), jitter
 
     def _terms(self):
@@ -279,23 +278,3 @@ def _halved(views, times):
         raise UserError(
             f"train.refine_at halves the images {times} times; use fewer of them ({error})"
         ) from None
-
-
-def _draw_start(rng, low, high, size, *, limit):
-    """First pixel of a crop of `size` that shows a part of [low, high) as large as possible, inside
-    [0, limit).
-
-    The object's two ends are each in a share END_SHARE of the crops if not in more: uniform draws
-    hardly ever show the ends of what is much wider than a crop.
-    """
-    first, last = sorted((low, high - size))
-    first, last = max(first, 0), max(min(last, limit - size), 0)
-    start = int(rng.integers(first, last + 1))
-    end, inside = rng.random(), int(rng.integers(BOX_MARGIN + 1))
-    uniform = min((BOX_MARGIN + 1) / (last - first + 1), END_SHARE)
-    drawn = (END_SHARE - uniform) / (1 - 2 * uniform)
-    if high - low > size and end < drawn:
-        start = min(first + inside, last)
-    elif high - low > size and end > 1 - drawn:
-        start = max(last - inside, first)
-    return start

@@ -20,7 +20,7 @@ from support.scenes import write_ball_scene
 
 from pp_cl.cli import main
 from pp_cl.files.checkpoint import load_checkpoint, save_checkpoint
-from pp_cl.train import BOX_MARGIN, END_SHARE, Trainer, _draw_start
+from pp_cl.train import Trainer
 from pp_cl.training.optimiser import Optimiser
 
 
@@ -385,67 +385,3 @@ def test_the_other_footprints_train_too(scene, tmp_path, footprint, radius):
     )
     losses = [r["loss"] for r in rows(out)[:-1]]
     assert losses[-1] < losses[0]
-
-
-@pytest.mark.parametrize(
-    "low, high, size, limit",
-    [
-        (10, 50, 16, 64),
-        (20, 30, 16, 64),
-        (0, 5, 16, 64),
-        (60, 64, 16, 64),
-        (0, 64, 64, 64),
-        (3, 60, 64, 64),
-    ],
-)
-def test_crops_stay_inside_and_show_the_object(low, high, size, limit):
-    starts = {
-        _draw_start(np.random.default_rng(i), low, high, size, limit=limit) for i in range(300)
-    }
-    assert min(starts) >= 0 and max(starts) + size <= limit
-    for start in starts:
-        shown = min(high, start + size) - max(low, start)
-        assert shown == min(size, high - low)
-    assert len(starts) == max(
-        1, min(max(low, high - size), limit - size) - max(min(low, high - size), 0) + 1
-    )
-
-
-@pytest.mark.parametrize(
-    "low, high, size, limit", [(10, 400, 64, 800), (0, 617, 256, 800), (17, 183, 128, 200)]
-)
-def test_a_quarter_of_the_crops_shows_an_end_of_the_object(low, high, size, limit):
-    """Drawn uniformly they would hardly ever; what lies between is seen as often, within a half."""
-    seen, draws = np.zeros(limit), 3000
-    for i in range(draws):
-        start = _draw_start(np.random.default_rng(i), low, high, size, limit=limit)
-        seen[start : start + size] += 1 / draws
-    ends = seen[[low + BOX_MARGIN, high - BOX_MARGIN - 1]]
-    assert ends == pytest.approx(END_SHARE, abs=0.03)
-    inner = seen[low + BOX_MARGIN : high - BOX_MARGIN]
-    fair = size / (high - low)
-    assert inner.min() > min(0.5 * fair, END_SHARE - 0.03)
-
-
-@pytest.mark.parametrize("share, stops", [(0.3, (12, 33)), (0.9, (52, 57))])
-def test_a_refined_run_resumes_to_the_same_bytes(scene, tmp_path, monkeypatch, share, stops):
-    """Stopped before and after the refinement, which may come after the averages' beginning."""
-    changes = {"train__refine_at": f"{share},1", "points__count": 300, "train__prune_looks": 4}
-    changes["downscale"] = 1
-    assert main(arguments(scene, tmp_path / "whole", **changes)) == 0
-    whole = (tmp_path / "whole" / "checkpoint.npz").read_bytes()
-    points = {row["step"]: row["points"] for row in rows(tmp_path / "whole")[:-1]}
-    after = round(60 * share) // 5 * 5 + 5
-    assert points[after] > 4 * points[after - 5]
-    for steps in stops:
-        out = tmp_path / str(steps)
-        train_and_interrupt(scene, out, steps, monkeypatch, **changes)
-        assert main(arguments(scene, out, **changes)) == 0
-        assert (out / "checkpoint.npz").read_bytes() == whole
-
-
-def test_images_too_small_to_halve_are_one_line(scene, tmp_path, capsys):
-    words = arguments(scene, tmp_path / "small", train__refine_at="0.3,0.6")
-    assert main(words) == 2
-    error = capsys.readouterr().err
-    assert "train.refine_at halves the images 2 times" in error and error.count("\n") == 1
