@@ -8,9 +8,11 @@ __version__ = "0.1.0"
 _MODULES = {
     "open_device": "pp_cl.device.discover",
     "train_scene": "pp_cl.run",
-    "load_run": "pp_cl.run",
+    "load": "pp_cl.trained",
+    "load_run": "pp_cl.trained",
     "evaluate_run": "pp_cl.evaluate",
     "Camera": "pp_cl.scene.camera",
+    "Picture": "pp_cl.files.picture",
     "UserError": "pp_cl.errors",
 }
 

@@ -3,7 +3,7 @@
 import dataclasses
 import json
 import math
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -161,12 +161,15 @@ class TrainConfig:
     )
     sh_smoothing_every: int = setting(4, "steps between two smoothings", 1, 10**8)
     prune_weight: float = setting(
-        2e-3, "prune points whose mean blend weight per look is below this (0: off)", 0, 1e6
+        0.05,
+        "prune points that in no look have this blend weight, summed over the pixels (0: off)",
+        0,
+        1e6,
     )
     prune_opacity: float = setting(0.01, "prune points with an opacity below this", 0, 1)
     prune_every: int = setting(250, "steps between two prunings", 1, 10**8)
     prune_looks: int = setting(
-        20, "number of steps that must have seen a point, hidden or not, to prune it", 1, 10**8
+        100, "number of steps that must have seen a point, hidden or not, to prune it", 1, 10**8
     )
     refine_at: tuple = setting(
         (1.0, 1.0),
@@ -176,9 +179,9 @@ class TrainConfig:
         1,
     )
     final_prune_weight: float = setting(
-        1.0,
-        "after the last step, prune points whose blend weights over all training views sum to"
-        " less than this (0: off)",
+        0.05,
+        "after the last step, prune points that have this blend weight in no training view (0:"
+        " off)",
         0,
         1e9,
     )
@@ -311,6 +314,19 @@ def _check(value, where, *, least, most, choices, **_):
     if least is not None and not all(least <= v <= most for v in (value if several else (value,))):
         which = "each" if several else "it"
         raise UserError(f"{where} = {_text(value)}; {which} must lie in [{least}, {most}]")
+
+
+def configure(config: Config, scene: str, given: Iterable[tuple[str, Any, str]] = ()) -> Config:
+    """The config with another scene and the given settings: (key, value or its text, origin).
+
+    Raises UserError naming the first that makes no sense.
+    """
+    path = scene if scene == "demo" else str(Path(scene).resolve())
+    assign(config, "scene.path", path, "settings")
+    for key, value, origin in given:
+        assign(config, key, value, origin)
+    validate(config, "settings")
+    return config
 
 
 def load_config(path: Path | str) -> Config:

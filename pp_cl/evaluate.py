@@ -15,9 +15,9 @@ from pp_cl.files.contact_sheet import write_comparison
 from pp_cl.files.image import write_png
 from pp_cl.metrics.psnr_ssim import Metrics, mean
 from pp_cl.metrics.published import published_row
-from pp_cl.run import Run, load_run
 from pp_cl.scene.target import Target
 from pp_cl.scene.views import View
+from pp_cl.trained import Run, load_run
 
 SHOWN_VIEWS = 4  # rows of the comparison image
 

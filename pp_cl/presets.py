@@ -38,7 +38,6 @@ PRESETS = {
         "train.dropout": 0.0,
         "train.sh_smoothing": 0.0,
         "train.ema": False,
-        "train.prune_weight": 1e-4,
         "train.prune_every": 500,
         "train.checkpoint_every": 5000,
     },

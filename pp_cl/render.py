@@ -6,7 +6,7 @@ project -> pairs -> blend weights -> shade the points that contribute -> blend f
 
 from __future__ import annotations
 
-from collections.abc import Hashable
+from collections.abc import Callable, Hashable
 from dataclasses import dataclass
 
 import numpy as np
@@ -15,9 +15,11 @@ from pyopencl.array import Array
 from pp_cl.config import RasterConfig
 from pp_cl.device.buffers import Buffers, Table
 from pp_cl.device.device import Device
+from pp_cl.files.picture import Picture
 from pp_cl.model import Model
 from pp_cl.raster.blend import BACKGROUND, BLENDS, Blend
 from pp_cl.raster.blend_weights import PixelWeights
+from pp_cl.raster.depth import depth_forward
 from pp_cl.raster.pair_cache import PairCache
 from pp_cl.raster.pairs import PairBuilder, Pairs
 from pp_cl.raster.project import Footprint, ProjectedPoints, Projection
@@ -120,8 +122,17 @@ class Renderer:
         fraction = plan.computed_fraction if plan else 1.0
         return RenderResult(**vars(raster), image=image, computed_fraction=fraction)
 
-    def rasterise(self, camera: Camera, gamma: float, **options) -> RasterResult:
-        """The blended features of a camera. options: of blend_weights()."""
+    def rasterise(
+        self,
+        camera: Camera,
+        gamma: float,
+        *,
+        add_pending: Callable[..., None] | None = None,
+        **options,
+    ) -> RasterResult:
+        """The blended features of a camera. add_pending: Optimiser.add_pending for the step, which
+        may change the points' features. options: of blend_weights().
+        """
         view, cloud, b = (
             self.blend_weights(camera, gamma, **options),
             self.model.cloud,
@@ -131,6 +142,12 @@ class Renderer:
             shade_forward(
                 self.dev, view.points, view.shaded, cloud.sh, point_features=b.point_features
             )
+            if add_pending:
+                add_pending(
+                    camera_buffer=view.camera_buffer,
+                    shaded=view.shaded,
+                    point_features=b.point_features,
+                )
         with self.dev.stage("blend"):
             self._blend.forward(view.pairs, view.weights, b.point_features, b.features)
         return RasterResult(**vars(view), point_features=b.point_features, features=b.features)
@@ -144,18 +161,20 @@ class Renderer:
         seed: int = 0,
         key: Hashable = None,
         tau: float | None = None,
+        depth_range: tuple[float, float] | None = None,
     ) -> ViewWeights:
         """The blend weights of a camera, which is padded to multiples of 4 pixels.
 
         dropout: share of the points left out, at random by `seed`. key: names a view whose camera
         and points are the same in every call until cache.clear(), so that its pairs may be cached.
-        tau: instead of the settings'.
+        tau: instead of the settings'. depth_range: instead of the model's, which a camera may see
+        beyond that is none of the scene's; a softmax of depth needs the model's.
         """
         cloud, settings, b = self.model.cloud, self.settings, self._buffers
         padded, *offset = camera.padded(NETWORK_MULTIPLE)
         size = (padded.height, padded.width)
         b.require(self.table(cloud.count, *size))
-        b.camera_buffer.set(padded.packed(self.model.depth_range))
+        b.camera_buffer.set(padded.packed(depth_range or self.model.depth_range))
         b.point_radius.set(np.array([self._radius()], np.float32))
         with self.dev.stage("project"):
             points = self._projection.grid(
@@ -203,11 +222,11 @@ class Renderer:
             )
             return self._blend.backward(gradient)
 
-    def add_point_weights(self, view: ViewWeights, total: Array, looks: Array) -> None:
-        """Add each point's blend weights, summed over the view's pixels, to total, and 1 to looks
-        where the point is in the view, hidden or not; both (N,) float32.
+    def raise_peaks(self, view: ViewWeights, peaks: Array, looks: Array) -> None:
+        """Raise peaks to each point's blend weights, summed over the view's pixels, where they are
+        higher, and add 1 to looks where the point is in the view, hidden or not; both (N,) float32.
         """
-        self._weights.add_to_points(view.pairs, view.weights, total, looks)
+        self._weights.raise_peaks(view.pairs, view.weights, peaks, looks)
 
     def dropped_weights(self, view: ViewWeights) -> Array:
         """(HW,) float32: the blend weight that tau dropped from each pixel, or a bound above it."""
@@ -218,6 +237,24 @@ class Renderer:
         blend_weights().
         """
         return self.forward(camera, gamma, **options).clamped(camera)
+
+    def picture(
+        self, camera: Camera, gamma: float, *, features: bool = False, **options
+    ) -> Picture:
+        """Colour, alpha and depth of the camera; with its features where asked for. options: of
+        blend_weights().
+        """
+        result = self.forward(camera, gamma, **options)
+        size = result.features.shape[:2]
+        with self.dev.stage("depth"):
+            arrays = depth_forward(self.dev, result.points, result.pairs, result.weights, size=size)
+        left, top = result.offset
+        window = slice(top, top + camera.height), slice(left, left + camera.width)
+        return Picture(
+            result.clamped(camera),
+            *(array.get()[window] for array in arrays),
+            features=result.features.get()[window] if features else None,
+        )
 
     def _radius(self):
         """The points' radius in world units."""

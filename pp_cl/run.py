@@ -1,38 +1,30 @@
-"""Runs: a training that starts or goes on in a folder, and the model that it leaves there."""
+"""A training that starts or goes on in the folder of a run."""
 
-import hashlib
 import time
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
-from functools import cached_property
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from pp_cl.config import Config, assign, load_config, preset, sections, validate
+from pp_cl.config import Config, assign, configure, load_config, preset, sections
 from pp_cl.device.device import Device
 from pp_cl.device.discover import open_device
 from pp_cl.errors import UserError
 from pp_cl.files.contact_sheet import write_comparison
 from pp_cl.files.run_folder import RunFolder
-from pp_cl.layers.policy import ConvolutionPolicy, load_policy, policy_of_run
+from pp_cl.layers.policy import load_policy, policy_of_run
 from pp_cl.model import Model
 from pp_cl.network.unet import UNet
 from pp_cl.presets import SHORT
-from pp_cl.render import Renderer
-from pp_cl.scene.camera import Camera
 from pp_cl.scene.hull import build_grid, depth_range, spacing_pixels
-from pp_cl.scene.load import Scene, load_scene
-from pp_cl.scene.views import View
+from pp_cl.scene.open import fingerprint, open_scene
 from pp_cl.train import Trainer
+from pp_cl.trained import Run, load_run
 from pp_cl.training.memory import Plan, memory_plan, spare_memory
-from pp_cl.training.schedule import gamma_at
 
 Stored = tuple[dict[str, Any], dict[str, np.ndarray]]  # header and arrays of a checkpoint
-
-
-# ---- settings and scene
 
 
 def run_config(
@@ -63,16 +55,6 @@ def run_config(
     return config
 
 
-def configure(config: Config, scene: str, given: Iterable[tuple[str, Any, str]] = ()) -> Config:
-    """The config with another scene and the given settings. Raises UserError as run_config does."""
-    path = scene if scene == "demo" else str(Path(scene).resolve())
-    assign(config, "scene.path", path, "settings")
-    for key, value, origin in given:
-        assign(config, key, value, origin)
-    validate(config, "settings")
-    return config
-
-
 def _check_same(asked, stored, folder):
     """Raise UserError naming the first setting that differs, the place of the scene aside: a
     checkpoint knows its scene by more than that.
@@ -89,106 +71,6 @@ def _refuse_setting(folder, key, there, asked):
         f"{folder.config}: {key} is {there} there, {asked} asked for; use another --out, or the"
         " settings of the run"
     )
-
-
-def open_scene(dev: Device, config: Config, splits: tuple[str, ...]) -> Scene:
-    """Scene of config.scene.path with the given splits, reduced config.scene.downscale times;
-    `demo` is rendered on the device.
-    """
-    if config.scene.path != "demo":
-        return load_scene(config.scene.path, splits).reduced(config.scene.downscale)
-    from pp_cl.scene.demo import SPLITS, demo_scene
-
-    unknown = set(splits) - set(SPLITS)
-    if unknown:
-        raise UserError(f"--split {', '.join(unknown)}: demo has {', '.join(SPLITS)}")
-    return demo_scene(dev, splits).reduced(config.scene.downscale)
-
-
-def fingerprint(views: list[View]) -> str:
-    """Hex digest of the views' names and stored cameras, by which a checkpoint knows its scene."""
-    digest = hashlib.sha256()
-    for view in views:
-        camera = view.stored_camera
-        digest.update(f"{view.name} {camera.width}x{camera.height} ".encode())
-        digest.update(
-            np.round(
-                np.append(camera.pose.ravel(), [camera.fx, camera.fy, camera.cx, camera.cy]), 6
-            ).tobytes()
-        )
-    return digest.hexdigest()
-
-
-# ---- what a training leaves
-
-
-@dataclass
-class Run:
-    """The model of a run's last checkpoint. header: of the checkpoint, see files/run_folder.py.
-    policy: of the convolutions.
-    """
-
-    dev: Device
-    folder: RunFolder
-    config: Config
-    header: dict[str, Any]
-    model: Model
-    policy: ConvolutionPolicy
-
-    @cached_property
-    def renderer(self) -> Renderer:
-        """Renders the model, whose parameters must not change any more."""
-        self.model.net.freeze()
-        return Renderer(self.dev, self.model, self.config.raster)
-
-    @property
-    def gamma(self) -> float:
-        """Depth sharpness of the blend at the run's last step."""
-        return gamma_at(
-            self.header["step"], self.config.train.iterations, *self.config.raster.gamma
-        )
-
-    def scene(self, split: str) -> Scene:
-        """The run's scene with one split. Raises UserError where it is missing or broken."""
-        path = self.config.scene.path
-        if path != "demo" and not Path(path).is_dir():
-            raise UserError(f"{path}: the run's scene is not there; say where with --scene")
-        return open_scene(self.dev, self.config, (split,))
-
-    def cameras(self, split: str = "test") -> list[Camera]:
-        """The cameras of a split's views at the resolution of the run."""
-        return [view.camera for view in self.scene(split).splits[split]]
-
-    def render(self, camera: Camera) -> np.ndarray:
-        """(H, W, 3) float32 image in [0, 1] as the camera sees the model."""
-        return self.renderer.render(camera, self.gamma)
-
-
-def load_run(
-    dev: Device,
-    folder: Path | str,
-    *,
-    tolerance: float | None = None,
-    scene: str | None = None,
-) -> Run:
-    """The run in a folder, finished or not.
-
-    tolerance: in place of its network.tolerance; scene: the folder of its scene, if that has moved.
-    Raises UserError naming the file that is missing or broken.
-    """
-    folder = RunFolder(folder)
-    config = load_config(folder.config)
-    given = [] if tolerance is None else [("network.tolerance", tolerance, "tolerance")]
-    configure(config, scene or config.scene.path, given)
-    header, arrays = folder.load()
-    policy = load_policy(dev, config.network.tolerance)
-    net = UNet(dev, config.network.widths, policy=policy)
-    degree, file = config.points.sh_degree, folder.checkpoint
-    model = Model.load(dev, header, arrays, net, degree=degree, file=file)
-    return Run(dev, folder, config, header, model, policy)
-
-
-# ---- training
 
 
 class HullFacts(NamedTuple):

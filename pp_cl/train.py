@@ -1,6 +1,7 @@
 """The training loop: what one step does, in the order of the paper."""
 
 import math
+from functools import partial
 
 import numpy as np
 
@@ -91,6 +92,7 @@ class Trainer:
             self._target.load(view)
             target = self._target.crop(box, jitter)
 
+        sh_eps = config.sh_eps / target.size
         rendered = self.renderer.forward(
             camera,
             gamma_at(t, config.iterations, *self.gamma),
@@ -98,6 +100,7 @@ class Trainer:
             seed=int(rng.integers(2**32)),
             training=True,
             key=view_index if views_repeat(config, view.downscale) else None,
+            add_pending=partial(self.optimiser.add_pending, t + 1, rates, sh_eps=sh_eps),
         )
         with self.dev.stage("loss"):
             grad_image = self._losses(rendered, target)
@@ -109,11 +112,10 @@ class Trainer:
                 grads,
                 camera_buffer=rendered.camera_buffer,
                 shaded=rendered.shaded,
-                sh_eps=config.sh_eps / target.size,
+                sh_eps=sh_eps,
             )
-        with self.dev.stage("sums"):
-            state = self.state
-            self.renderer.add_point_weights(rendered, state.weight_sum, state.look_count)
+        with self.dev.stage("peaks"):
+            self.renderer.raise_peaks(rendered, self.state.peak_weight, self.state.look_count)
 
         self.step = t + 1
         self._regularise(rates)
@@ -225,13 +227,13 @@ class Trainer:
         self.optimiser.apply_ema()
         if self.config.final_prune_weight > 0:
             cloud = self.model.cloud
-            total, looks = (self.dev.zeros((cloud.count,)) for _ in range(2))
+            peaks, looks = (self.dev.zeros((cloud.count,)) for _ in range(2))
             for view in self.views:
                 weights = self.renderer.blend_weights(view.camera, self.gamma[1])
-                self.renderer.add_point_weights(weights, total, looks)
+                self.renderer.raise_peaks(weights, peaks, looks)
             least = self.config.final_prune_weight, self.config.prune_opacity
             self._keep(
-                keep_indices(self.dev, total, least[0], cloud.opacity, least_opacity=least[1])
+                keep_indices(self.dev, peaks, least[0], cloud.opacity, least_opacity=least[1])
             )
 
     def rates(self) -> dict:

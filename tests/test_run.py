@@ -39,14 +39,14 @@ def test_a_run_renders_what_the_evaluation_saves(trained, capsys):
 
     dev = open_device()
     run = load_run(dev, trained[1])
-    images = [run.render(camera) for camera in run.cameras("test")]
+    images = [run.render(camera).colour for camera in run.cameras("test")]
     assert all(image.shape == (24, 24, 3) and image.dtype == np.float32 for image in images)
     result = evaluate_run(trained[1], save_images=True)
     assert result == json.loads((trained[1] / "eval" / "metrics.json").read_text())
     for i, image in enumerate(images):
         saved = read_rgba(trained[1] / "eval" / "images" / f"r_{i}.png")[..., :3]
         np.testing.assert_array_equal(saved, to_8bit(image))
-        np.testing.assert_array_equal(trained[0].render(trained[0].cameras()[i]), image)
+        np.testing.assert_array_equal(trained[0].render(trained[0].cameras()[i]).colour, image)
 
 
 def test_a_finished_run_is_left_alone_and_steps_are_told(scene, trained, tmp_path):

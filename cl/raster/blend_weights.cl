@@ -39,14 +39,14 @@ kernel void find_shaded_points(
     point_is_shaded[i] = count;
 }
 
-// One work-item per point: reads the weights of its pairs, adds their sum, and one look if there is
-// a pair. Accumulates.
-kernel void add_point_weights(
+// One work-item per point: reads the weights of its pairs, keeps their sum if it is the highest so
+// far, and adds one look if there is a pair.
+kernel void raise_point_peaks(
     const uint n,                      // points
     global const uint *point_offset,   // (N+1)
     global const float2 *pair_weight,  // (P, 2)
     global const uchar *pair_role,     // (?) P with HAS_ROLES
-    global float *point_weight,        // (N) accumulates
+    global float *point_peak,          // (N) read and written
     global float *point_looks)         // (N) accumulates
 {
     const uint i = get_global_id(0);
@@ -54,6 +54,6 @@ kernel void add_point_weights(
     float sum = 0.0f;
     for (uint pair = point_offset[i]; pair < point_offset[i + 1]; pair++)
         if (!HAS_ROLES || pair_role[pair] != DROPPED) sum += pair_weight[pair].x;
-    point_weight[i] += sum;
+    point_peak[i] = fmax(point_peak[i], sum);
     if (point_offset[i] < point_offset[i + 1]) point_looks[i] += 1.0f;
 }

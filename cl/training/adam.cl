@@ -15,7 +15,7 @@
 #endif
 
 #ifndef LAZY
-#define LAZY 0  // 1: update the points in `rows`; 0: update all, `rows` and `skipped` are not read
+#define LAZY 0  // 1: SH of the points in `rows`; 0: of all, `rows` and `skipped` are not read
 #endif
 #ifndef SCALE
 #define SCALE 1.0f  // of moments in 16 bits
@@ -29,8 +29,7 @@
 #define DECAY2 0.001f
 #endif
 
-// New moments and the step of one value, or of 16: T is float or float16. skipped: of
-// adam_catch_up.
+// New moments and the step of one value, or of 16: T is float or float16. skipped: of adam_skipped.
 #define ADAM_STEP(T, name)                                                                         \
     static inline T name(                                                                          \
         const T g, const float4 skipped, T *m, T *v, const float rate, const float eps) {          \
@@ -72,21 +71,21 @@ kernel void adam_flag_gradients(
     const uint s,                               // shaded points
     global const uint *shaded,                  // (S) their indices
     global const float16 *grad_point_features,  // (N, 16) only the shaded are read
-    global const float *grad_opacity,           // (N)
     global uint *has_gradient)                  // (N) only the shaded are written
 {
     const uint g = get_global_id(0);
     if (g >= s) return;
     const uint i = shaded[g];
-    has_gradient[i] = any(grad_point_features[i] != 0.0f) || grad_opacity[i] != 0.0f;
+    has_gradient[i] = any(grad_point_features[i] != 0.0f);
 }
 
-// One work-item per listed point: reads its last step, writes the present one, and what the k steps
-// between, with gradients of 0, did: the decay of its moments, and how many times rate m/(sqrt(v) +
-// eps) they would have moved it, sum over j = 1..k of rho^j with rho = beta1/sqrt(beta2).
-kernel void adam_catch_up(
+// One work-item per listed point: reads its last step, and writes what the k steps between, with
+// gradients of 0, did: the decay of its moments, and how many times rate m/(sqrt(v) + eps) they
+// would have moved it, sum over j = 1..k of rho^j with rho = beta1/sqrt(beta2).
+kernel void adam_skipped(
     const uint s,                        // listed points
     const uint step,                     // from 1
+    const uint updating,                 // 1: `step` becomes their last step; 0: it stays
     const uint t,                        // rows of the table
     const float log_beta2,               // log2(beta2)
     global const float4 *skipped_steps,  // (T, 4) by k: beta1^k, beta2^k, moves, 0
@@ -100,7 +99,7 @@ kernel void adam_catch_up(
     float4 row = skipped_steps[min(k, t - 1)];
     if (k >= t) row.y = exp2(k * log_beta2);
     skipped[g] = row;
-    last_step[i] = step;
+    if (updating) last_step[i] = step;
 }
 
 static inline size_t updated_point(global const uint *rows, const size_t g) {
@@ -111,24 +110,21 @@ static inline float4 skipped_of(global const float4 *skipped, const size_t g) {
     return LAZY ? skipped[g] : NOTHING_SKIPPED;
 }
 
-// One work-item per updated point: moves its opacity, which stays in [0, 1], and the moments.
+// One work-item per point: moves its opacity, which stays in [0, 1], and the moments.
 kernel void adam_opacity_update(
-    const uint s,      // updated points
+    const uint n,      // points
     const float rate,  // as in adam_update
     const float eps,
-    global const uint *rows,           // (?) their S indices
-    global const float4 *skipped,      // (?, 4) of adam_catch_up
-    global const float *grad_opacity,  // (N) only those of updated points are read
+    global const float *grad_opacity,  // (N)
     global float *opacity,             // (N)
     global float *m,                   // (N)
     global float *v)                   // (N)
 {
-    const uint g = get_global_id(0);
-    if (g >= s) return;
-    const size_t i = updated_point(rows, g);
+    const uint i = get_global_id(0);
+    if (i >= n) return;
     float m1 = m[i], v1 = v[i];
     const float moved =
-        opacity[i] - adam_step(grad_opacity[i], skipped_of(skipped, g), &m1, &v1, rate, eps);
+        opacity[i] - adam_step(grad_opacity[i], NOTHING_SKIPPED, &m1, &v1, rate, eps);
     m[i] = m1;
     v[i] = v1;
     opacity[i] = moved < 0.0f ? 0.0f : moved > 1.0f ? 1.0f : moved;  // clamp() would hide a NaN
@@ -169,7 +165,7 @@ kernel void adam_sh_update(
     const float rate,  // as in adam_update
     const float eps,
     global const uint *rows,                    // (?) their S indices
-    global const float4 *skipped,               // (?, 4) of adam_catch_up
+    global const float4 *skipped,               // (?, 4) of adam_skipped
     global const float *grid,                   // (8)
     global const float *camera,                 // (20) camera.h
     global const uint *ids,                     // (N) grid ids
@@ -201,7 +197,7 @@ kernel void adam_sh_update_16bit(
     const float rate,  // as in adam_update
     const float eps,
     global const uint *rows,                    // (?) their S indices
-    global const float4 *skipped,               // (?, 4) of adam_catch_up
+    global const float4 *skipped,               // (?, 4) of adam_skipped
     global const float *grid,                   // (8)
     global const float *camera,                 // (20) camera.h
     global const uint *ids,                     // (N) grid ids
@@ -212,6 +208,58 @@ kernel void adam_sh_update_16bit(
     SH_UPDATE(
         moments_load(mv + 32 * at, &m16, &v16),
         moments_store(m16, v16, random16(seed + 9 * (uint)i + SH_FIRST + k), mv + 32 * at));
+}
+
+// Body of the two kernels below: adds what the skipped steps of point i have yet to move its
+// features by, as the next update will. LOAD: as above.
+#define SH_PENDING(LOAD)                                                                           \
+    const size_t g = get_global_id(0);                                                             \
+    if (g >= s) return;                                                                            \
+    const float moves = skipped[g].z;                                                              \
+    if (moves == 0.0f) return;                                                                     \
+    const size_t i = rows[g];                                                                      \
+    float basis[9];                                                                                \
+    adam_basis(grid, camera, ids[i], basis);                                                       \
+    float16 f = point_features[i];                                                                 \
+    for (size_t k = 0; k < SH_COUNT; k++) {                                                        \
+        const size_t at = i * SH_COUNT + k;                                                        \
+        float16 m16, v16;                                                                          \
+        LOAD;                                                                                      \
+        f -= basis[SH_FIRST + k] * (moves * rate * m16 / (sqrt(v16) + SCALE * eps));               \
+    }                                                                                              \
+    point_features[i] = f;
+
+// One work-item per listed point: its features with pending moves, moments in 32 bits.
+kernel void adam_sh_pending(
+    const uint s,      // listed points
+    const float rate,  // as in adam_update
+    const float eps,
+    global const uint *rows,         // (S) their indices
+    global const float4 *skipped,    // (?, 4) of adam_skipped
+    global const float *grid,        // (8)
+    global const float *camera,      // (20) camera.h
+    global const uint *ids,          // (N) grid ids
+    global const float16 *m,         // (N, SH_COUNT, 16)
+    global const float16 *v,         // (N, SH_COUNT, 16)
+    global float16 *point_features)  // (N, 16) only the listed rows are read and written
+{
+    SH_PENDING((m16 = m[at], v16 = v[at]));
+}
+
+// The same with moments in 16 bits.
+kernel void adam_sh_pending_16bit(
+    const uint s,      // listed points
+    const float rate,  // as in adam_update
+    const float eps,
+    global const uint *rows,         // (S) their indices
+    global const float4 *skipped,    // (?, 4) of adam_skipped
+    global const float *grid,        // (8)
+    global const float *camera,      // (20) camera.h
+    global const uint *ids,          // (N) grid ids
+    global const half *mv,           // (N, SH_COUNT, 2, 16)
+    global float16 *point_features)  // (N, 16) only the listed rows are read and written
+{
+    SH_PENDING(moments_load(mv + 32 * at, &m16, &v16));
 }
 
 // One work-item per 16 values: moves an EMA towards a parameter.

@@ -13,8 +13,8 @@ from pp_cl.config import Config
 from pp_cl.device.device import Device
 from pp_cl.model import Model
 from pp_cl.network.unet import UNet
-from pp_cl.run import open_scene
 from pp_cl.scene.hull import build_grid, depth_range
+from pp_cl.scene.open import open_scene
 from pp_cl.train import Trainer
 from pp_cl.training.optimiser import Rates
 

@@ -123,7 +123,7 @@ def _run_raster(options):
 def _run_train(options):
     from pp_cl.bench.plots import check_files
     from pp_cl.bench.train import bench_train
-    from pp_cl.run import configure
+    from pp_cl.config import configure
 
     config = configure(preset("paper"), options.scene or "demo", shared.read_set(options.set))
     if options.points:

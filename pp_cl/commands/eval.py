@@ -26,7 +26,7 @@ def run(options: argparse.Namespace) -> None:
     """Evaluate, print the table."""
     from pp_cl.device.discover import open_device
     from pp_cl.evaluate import evaluate
-    from pp_cl.run import load_run
+    from pp_cl.trained import load_run
 
     metrics, tolerance = (
         shared.read_metrics(options.metrics),

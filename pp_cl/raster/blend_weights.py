@@ -135,20 +135,20 @@ class BlendWeights(ABC):
         )
         return pixel_dropped
 
-    def add_to_points(
-        self, pairs: Pairs, weights: PixelWeights, point_weight: Array, point_looks: Array
+    def raise_peaks(
+        self, pairs: Pairs, weights: PixelWeights, point_peak: Array, point_looks: Array
     ) -> None:
-        """Add each point's blend weights, summed over the pixels, to point_weight, and 1 to
-        point_looks where it has a hit, dropped or not; both (N,) float32.
+        """Raise point_peak to each point's blend weights, summed over the pixels, where they are
+        higher, and add 1 to point_looks where it has a hit, dropped or not; both (N,) float32.
         """
         self._shared(weights).launch(
-            "add_point_weights",
+            "raise_point_peaks",
             pairs.points,
             n=pairs.points,
             point_offset=pairs.point_offset,
             pair_weight=weights.pair_weight,
             pair_role=weights.pair_role,
-            point_weight=point_weight,
+            point_peak=point_peak,
             point_looks=point_looks,
         )
 

@@ -1,8 +1,10 @@
 """Adam of the network and of the points, and exponential moving averages (EMA) of parameters.
 
 Dense Adam is torch's: every row moves in every step by its momentum, whether it received a gradient
-or not. Lazy Adam skips points without a gradient; when one receives a gradient again, the skipped
-steps are first applied in closed form. docs/maths.md states the difference.
+or not. Lazy Adam skips the SH coefficients of points without a gradient; what the skipped steps
+would have moved is added in closed form to the features of a point that is seen again
+(PointAdam.add_pending), and to its coefficients when it receives a gradient again. docs/maths.md
+states the difference.
 """
 
 import math
@@ -92,15 +94,14 @@ class PointsWithGradient:
         sizes = {"has_gradient": n, "offsets": n + 1, "rows": n}
         return {name: ((size,), np.uint32) for name, size in sizes.items()}
 
-    def rows(self, shaded: Array, grad_point_features: Array, grad_opacity: Array) -> Array:
+    def rows(self, shaded: Array, grad_point_features: Array) -> Array:
         """(S) uint32, ascending: the shaded points with a gradient that is not 0, valid until the
         next call. Waits for the device.
 
-        shaded: (?) uint32 indices. grad_point_features: (N, 16). grad_opacity: (N). Only the
-        shaded rows are read.
+        shaded: (?) uint32 indices. grad_point_features: (N, 16), only the shaded rows are read.
         """
         buffers = self._buffers
-        buffers.require(self.table(len(grad_opacity)))
+        buffers.require(self.table(len(grad_point_features)))
         self.dev.fill(buffers.has_gradient, 0)
         adam_program(self.dev).launch(
             "adam_flag_gradients",
@@ -108,7 +109,6 @@ class PointsWithGradient:
             s=len(shaded),
             shaded=shaded,
             grad_point_features=grad_point_features,
-            grad_opacity=grad_opacity,
             has_gradient=buffers.has_gradient,
         )
         found = nonzero(self.dev, buffers.has_gradient, buffers.offsets, buffers.rows)
@@ -116,7 +116,7 @@ class PointsWithGradient:
 
 
 def skipped_steps_table() -> np.ndarray:
-    """(TABLE_STEPS, 4) float32: what k = 0, 1, ... steps without a gradient do, as adam_catch_up in
+    """(TABLE_STEPS, 4) float32: what k = 0, 1, ... steps without a gradient do, as adam_skipped in
     cl/training/adam.cl reads it.
     """
     k, rho = np.arange(float(TABLE_STEPS)), BETA1 / math.sqrt(BETA2)
@@ -127,7 +127,7 @@ def skipped_steps_table() -> np.ndarray:
 
 @dataclass(frozen=True)
 class UpdatedPoints:
-    """The points that one step updates: all N, or those listed by lazy Adam.
+    """The points whose SH one step updates: all N, or those listed by lazy Adam.
 
     step: from 1 on. count: S, how many they are. rows: (S) uint32, their indices, and skipped:
     (?, 4) float32, what each one's skipped steps did, where lazy; else not read.
@@ -141,17 +141,28 @@ class UpdatedPoints:
 
 
 @dataclass(frozen=True)
-class ShGradient:
-    """The gradient of the SH coefficients in one view, as the factors of a rank-one product: the
-    harmonics of the direction from the eye to a point, and the gradient of the point's features.
+class Directions:
+    """Where the SH of points are evaluated: in the directions from the eye to them.
 
     grid: (8) of Grid.packed(). camera_buffer: (20). ids: (N) uint32 grid ids.
-    grad_point_features: (N, 16).
     """
 
     grid: Array
     camera_buffer: Array
     ids: Array
+
+    def arguments(self) -> dict[str, Array]:
+        """By the kernels' names."""
+        return {"grid": self.grid, "camera": self.camera_buffer, "ids": self.ids}
+
+
+@dataclass(frozen=True)
+class ShGradient:
+    """The gradient of the SH coefficients in one view, as the factors of a rank-one product: the
+    harmonics of the directions, and the gradient of the points' features, (N, 16).
+    """
+
+    directions: Directions
     grad_point_features: Array
 
 
@@ -177,18 +188,21 @@ class PointAdam:
         """All n points, for a step from 1 on."""
         return UpdatedPoints(step, n, **self._unread, lazy=False)
 
-    def listed_points(self, step: int, rows: Array, last_step: Array) -> UpdatedPoints:
-        """The listed points, for a step from 1 on.
+    def listed_points(
+        self, step: int, rows: Array, last_step: Array, *, updating: bool = True
+    ) -> UpdatedPoints:
+        """The listed points, for a step from 1 on; valid until the next call.
 
         rows: (S) uint32 point indices, each once. last_step: (N) uint32, the step that updated
-        each point last, 0: none; becomes `step` for the listed ones.
+        each point last, 0: none; where `updating`, it becomes `step` for the listed ones.
         """
         self._buffers.require(self.table(len(last_step)))
         updated = UpdatedPoints(step, len(rows), rows, self._buffers.skipped, lazy=True)
         self._launch(
             updated,
-            "adam_catch_up",
+            "adam_skipped",
             step=step,
+            updating=int(updating),
             t=TABLE_STEPS,
             log_beta2=math.log2(BETA2),
             skipped_steps=self._skipped_steps,
@@ -198,7 +212,7 @@ class PointAdam:
 
     def update_opacity(
         self,
-        updated: UpdatedPoints,
+        step: int,
         grad_opacity: Array,
         opacity: Array,
         moments: dict[str, Array],
@@ -206,16 +220,41 @@ class PointAdam:
         rate: float,
         eps: float,
     ) -> None:
-        """Update opacities, clamped to [0, 1]. All arrays: (N); moments "m" and "v" start as
-        zeros.
+        """Update all opacities, clamped to [0, 1]. All arrays: (N); moments "m" and "v" start as
+        zeros. step: from 1 on.
         """
-        self._launch(
-            updated,
+        adam_program(self.dev).launch(
             "adam_opacity_update",
+            len(opacity),
+            n=len(opacity),
             grad_opacity=grad_opacity,
             opacity=opacity,
             **moments,
-            **_rate_and_eps(updated.step, rate, eps),
+            **_rate_and_eps(step, rate, eps),
+        )
+
+    def add_pending(
+        self,
+        listed: UpdatedPoints,
+        block: ShBlock,
+        directions: Directions,
+        point_features: Array,
+        *,
+        moments: dict[str, Array],
+        rate: float,
+        eps: float,
+    ) -> None:
+        """Add to the listed rows of point_features (N, 16) what an update in this step of the SH
+        coefficients of one block will first catch up with. The rest: as for update_sh().
+        """
+        self._launch(
+            listed,
+            "adam_sh_pending" if self.scale is None else "adam_sh_pending_16bit",
+            self._defines(block),
+            point_features=point_features,
+            **moments,
+            **directions.arguments(),
+            **_rate_and_eps(listed.step, rate, eps),
         )
 
     def update_sh(
@@ -232,23 +271,25 @@ class PointAdam:
         """Update the SH coefficients of one block. sh: (N, block.count, 16). moments: start as
         zeros, "m" and "v" shaped like sh, or in 16 bits both as "mv" (N, block.count, 2, 16).
         """
-        kernel, defines = "adam_sh_update", {"SH_FIRST": block.first, "SH_COUNT": block.count}
-        arguments = moments
+        kernel, arguments = "adam_sh_update", moments
         if self.scale is not None:
-            kernel, defines["SCALE"] = "adam_sh_update_16bit", f"{self.scale!r}f"
+            kernel = "adam_sh_update_16bit"
             arguments = moments | {"seed": updated.step * GOLDEN % 2**32}
         self._launch(
             updated,
             kernel,
-            defines,
+            self._defines(block),
             sh=sh,
-            grid=gradient.grid,
-            camera=gradient.camera_buffer,
-            ids=gradient.ids,
             grad_point_features=gradient.grad_point_features,
+            **gradient.directions.arguments(),
             **arguments,
             **_rate_and_eps(updated.step, rate, eps),
         )
+
+    def _defines(self, block):
+        """Options of the kernels of SH."""
+        defines = {"SH_FIRST": block.first, "SH_COUNT": block.count}
+        return defines if self.scale is None else {**defines, "SCALE": f"{self.scale!r}f"}
 
     def _launch(self, updated, kernel, defines=None, **arguments):
         adam_program(self.dev, LAZY=int(updated.lazy), **defines or {}).launch(

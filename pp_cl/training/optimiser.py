@@ -13,7 +13,14 @@ from pp_cl.device.buffers import Table
 from pp_cl.device.device import Device
 from pp_cl.device.rows import DeviceRows
 from pp_cl.model import Model
-from pp_cl.training.adam import Ema, PointAdam, PointsWithGradient, ShGradient, adam_update
+from pp_cl.training.adam import (
+    Directions,
+    Ema,
+    PointAdam,
+    PointsWithGradient,
+    ShGradient,
+    adam_update,
+)
 from pp_cl.training.point_state import PointState
 from pp_cl.training.schedule import learning_rate
 
@@ -104,20 +111,50 @@ class Optimiser:
         if state.last_step is None:
             updated = adam.all_points(step, cloud.count)
         else:
-            rows = self.with_gradient.rows(shaded, *grads)
+            rows = self.with_gradient.rows(shaded, grad_point_features)
             updated = adam.listed_points(step, rows, state.last_step)
 
-        grid = self.model.grid_buffer
-        gradient = ShGradient(grid, camera_buffer, cloud.ids, grad_point_features)
-        for block, sh in zip(cloud.blocks, cloud.sh, strict=True):
-            moments, rate = state.moments(block.name), rates.sh[block.degree]
-            if rate > 0:  # else the moments are not even read
-                adam.update_sh(updated, block, gradient, sh, moments=moments, rate=rate, eps=sh_eps)
+        gradient = ShGradient(self._directions(camera_buffer), grad_point_features)
+        for block, sh, learned in self._learned_blocks(rates):
+            adam.update_sh(updated, block, gradient, sh, **learned, eps=sh_eps)
         moments = state.moments("opacity")
         adam.update_opacity(
-            updated, grad_opacity, cloud.opacity, moments, rate=rates.opacity, eps=OPACITY_EPS
+            step, grad_opacity, cloud.opacity, moments, rate=rates.opacity, eps=OPACITY_EPS
         )
         self._update_network(step, rates.network)
+
+    def add_pending(
+        self,
+        step: int,
+        rates: Rates,
+        *,
+        camera_buffer: Array,
+        shaded: Array,
+        point_features: Array,
+        sh_eps: float,
+    ) -> None:
+        """Add to the features (N, 16) of the shaded points what lazy Adam has yet to move them by
+        (the arguments: of update()); nothing where Adam is dense.
+        """
+        if self.state.last_step is None:
+            return
+        adam, directions = self.point_adam, self._directions(camera_buffer)
+        listed = adam.listed_points(step, shaded, self.state.last_step, updating=False)
+        for block, _, learned in self._learned_blocks(rates):
+            adam.add_pending(listed, block, directions, point_features, **learned, eps=sh_eps)
+
+    def _directions(self, camera_buffer):
+        return Directions(self.model.grid_buffer, camera_buffer, self.model.cloud.ids)
+
+    def _learned_blocks(self, rates):
+        """(block, coefficients, {"moments", "rate"}) of the SH that this step learns; the moments
+        of the others are not even read.
+        """
+        cloud = self.model.cloud
+        for block, sh in zip(cloud.blocks, cloud.sh, strict=True):
+            rate = rates.sh[block.degree]
+            if rate > 0:
+                yield block, sh, {"moments": self.state.moments(block.name), "rate": rate}
 
     def _update_network(self, step, rate):
         net = self.model.net

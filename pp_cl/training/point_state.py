@@ -21,7 +21,7 @@ STORED_NAMES = {
     "sh_2a": "sh4",
     "sh_2b": "sh7",
     "last_step": "last",
-    "weight_sum": "weight",
+    "peak_weight": "peak",
     "look_count": "looks",
 }
 
@@ -41,7 +41,7 @@ class PointState:
     @staticmethod
     def table(n: int, blocks: tuple[ShBlock, ...], settings: TrainConfig) -> Table:
         """The arrays of n points without the averages; all start as zeros."""
-        table = {"weight_sum": ((n,), np.float32), "look_count": ((n,), np.float32)}
+        table = {"peak_weight": ((n,), np.float32), "look_count": ((n,), np.float32)}
         if settings.lazy_adam:
             table["last_step"] = ((n,), np.uint32)
         table |= {f"{kind}.opacity": ((n,), np.float32) for kind in "mv"}
@@ -61,9 +61,11 @@ class PointState:
         return table
 
     @property
-    def weight_sum(self) -> Array:
-        """(N) float32: blend weights summed over the looks since the point was last judged."""
-        return self._arrays["weight_sum"]
+    def peak_weight(self) -> Array:
+        """(N) float32: the highest blend weight of a look since the point was last judged, summed
+        over the pixels.
+        """
+        return self._arrays["peak_weight"]
 
     @property
     def look_count(self) -> Array:
@@ -87,14 +89,14 @@ class PointState:
                 arrays[name] = compact_rows(dev, arrays[name], keep)
 
     def replace_by(self, dev: Device, rows: Array) -> None:
-        """Become the state of points that each take over that of point rows[i], but for weights
+        """Become the state of points that each take over that of point rows[i], but for peaks
         and looks, which start anew. rows: (M,) uint32.
         """
         for arrays in (self._arrays, self.ema.arrays):
             for name in arrays:
                 arrays[name] = gather_rows(dev, arrays[name], rows)
-        for sums in (self.weight_sum, self.look_count):
-            dev.fill(sums, 0)
+        for array in (self.peak_weight, self.look_count):
+            dev.fill(array, 0)
 
     def arrays(self) -> dict[str, DeviceRows]:
         """{name in a checkpoint: array}."""

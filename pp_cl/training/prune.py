@@ -26,17 +26,17 @@ def keep_indices(
 
 
 def judge(dev: Device, state: PointState, opacities: Array, settings: TrainConfig) -> Array:
-    """The same by the weights of training: a point that was looked at train.prune_looks times must
-    have weighed train.prune_weight a look, and have train.prune_opacity; its count starts anew.
+    """The same by the looks of training: a point that was looked at train.prune_looks times must
+    have weighed train.prune_weight in one of them, and have train.prune_opacity; both start anew.
 
-    Others stay: what was not looked at may have been hidden by what is still fog.
+    Others stay. A mean over the looks would drop what few views see, such as the inside of a gap.
     """
-    weight, looks = state.weight_sum.get(), state.look_count.get()
+    peak, looks = state.peak_weight.get(), state.look_count.get()
     judged = looks >= settings.prune_looks
-    passes = (weight >= settings.prune_weight * looks) & (opacities.get() >= settings.prune_opacity)
-    for sums, values in ((state.weight_sum, weight), (state.look_count, looks)):
-        sums.set(np.where(judged, np.float32(0), values))
-    return _listed(dev, ~judged | passes, weight)
+    passes = (peak >= settings.prune_weight) & (opacities.get() >= settings.prune_opacity)
+    for array, values in ((state.peak_weight, peak), (state.look_count, looks)):
+        array.set(np.where(judged, np.float32(0), values))
+    return _listed(dev, ~judged | passes, peak)
 
 
 def _listed(dev, keep, weight):

@@ -20,20 +20,31 @@ class Adam:
         """
         beta1, beta2 = self.betas
         self.t += 1
-        skipped = (self.t - 1 - self.last_step[rows]).reshape(-1, *[1] * (self.parameter.ndim - 1))
+        moved = self.parameter[rows] + self.pending(self.t, rate, eps, rows)
+        skipped = self._skipped(self.t, rows)
         self.last_step[rows] = self.t
         c1, c2 = 1 - beta1**self.t, 1 - beta2**self.t
-        m, v, moved = self.m[rows], self.v[rows], self.parameter[rows].copy()
-        for j in range(1, skipped.max(initial=0) + 1):
-            with_decay = rate / c1 * m * beta1**j / (np.sqrt(v / c2) + eps) / np.sqrt(beta2) ** j
-            moved -= np.where(j <= skipped, with_decay, 0)
-            if beta1**j < 1e-30:
-                break
         grad = np.asarray(grad, np.float64)[rows]
-        m = beta1 * beta1**skipped * m + (1 - beta1) * grad
-        v = beta2 * beta2**skipped * v + (1 - beta2) * grad * grad
+        m = beta1 * beta1**skipped * self.m[rows] + (1 - beta1) * grad
+        v = beta2 * beta2**skipped * self.v[rows] + (1 - beta2) * grad * grad
         moved -= rate / c1 * m / (np.sqrt(v / c2) + eps)
         self.m[rows], self.v[rows], self.parameter[rows] = m, v, np.clip(moved, low, high)
+
+    def pending(self, t, rate, eps, rows=slice(None)):
+        """What the steps that the rows skipped before step t have yet to move them by."""
+        beta1, beta2 = self.betas
+        skipped, m, v = self._skipped(t, rows), self.m[rows], self.v[rows]
+        c1, c2, moves = 1 - beta1**t, 1 - beta2**t, np.zeros_like(m)
+        for j in range(1, skipped.max(initial=0) + 1):
+            with_decay = rate / c1 * m * beta1**j / (np.sqrt(v / c2) + eps) / np.sqrt(beta2) ** j
+            moves -= np.where(j <= skipped, with_decay, 0)
+            if beta1**j < 1e-30:
+                break
+        return moves
+
+    def _skipped(self, t, rows):
+        shape = (-1, *[1] * (self.parameter.ndim - 1))
+        return (t - 1 - self.last_step[rows]).reshape(shape)
 
 
 def sh_basis(direction):
@@ -55,13 +66,17 @@ def sh_basis(direction):
     )
 
 
+def block_basis(positions, eye, block):
+    """(N, block.count): the harmonics of one sh.ShBlock in the directions from the eye."""
+    towards = positions - eye
+    basis = sh_basis(towards / np.linalg.norm(towards, axis=-1, keepdims=True))
+    return basis[block.first : block.first + block.count].T
+
+
 def sh_gradient(positions, eye, grad_point_features, block):
     """(N, block.count, 16) gradient of the SH coefficients of one sh.ShBlock."""
-    towards = positions - eye
-    basis = sh_basis(towards / np.linalg.norm(towards, axis=-1, keepdims=True))[
-        block.first : block.first + block.count
-    ]
-    return basis.T[:, :, None] * np.asarray(grad_point_features, np.float64)[:, None, :]
+    gradient = np.asarray(grad_point_features, np.float64)
+    return block_basis(positions, eye, block)[:, :, None] * gradient[:, None, :]
 
 
 def neighbours(ids, dims):

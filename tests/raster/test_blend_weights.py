@@ -13,18 +13,20 @@ pytestmark = pytest.mark.parametrize("rule", BLENDS)
 
 @pytest.mark.parametrize("early_stop", [0.0, 0.05])
 @pytest.mark.parametrize("max_tracked", [0, 2])
-def test_point_weights_accumulate(dev, rng, rule, early_stop, max_tracked):
+def test_points_keep_their_highest_weight(dev, rng, rule, early_stop, max_tracked):
     """Untracked hits count, dropped ones do not; a look counts either way."""
     options = {"early_stop": early_stop, "max_tracked": max_tracked}
     blended = Blended(dev, rng, n=500, gamma=0.02, radius=0.4, rule=rule, **options)
     assert (blended.role == DROPPED).any() == (early_stop > 0)
-    point_weight, looks = (dev.upload(np.arange(500, dtype=np.float32)) for _ in range(2))
-    scene = blended.scene
-    scene.weighing.add_to_points(scene.pairs, scene.weights, point_weight, looks)
+    before, looks = (dev.upload(x * np.arange(500), np.float32) for x in (2e-3, 1))
+    peak, scene = before.copy(), blended.scene
+    scene.weighing.raise_peaks(scene.pairs, scene.weights, peak, looks)
     seen = blended.geometry["hit"].any(axis=1)
     np.testing.assert_array_equal(looks.get() - np.arange(500), seen)
-    expected = blended.blend["weight"].sum(axis=1)
-    assert relative_error(point_weight.get() - np.arange(500), expected) < 1e-4
+    weight = blended.blend["weight"].sum(axis=1)
+    raised = weight > before.get()
+    assert raised.any() and not raised.all()
+    assert relative_error(peak.get(), np.maximum(before.get(), weight)) < 1e-6
 
 
 @pytest.mark.parametrize("tau", [0.0, 1e-2])

@@ -88,9 +88,9 @@ def test_pictures_and_gradients_are_the_same_bits(dev, rng, footprint, tau):
         for renderer, key in ((kept, step % 3), (anew, None)):
             result = renderer.rasterise(cameras[step % 3], GAMMA, key=key)
             gradients = [g.get() for g in renderer.backward_features(result, grad)]
-            weights, looks = (dev.zeros((model.cloud.count,)) for _ in range(2))
-            renderer.add_point_weights(result, weights, looks)
-            results.append([result.features.get(), weights.get(), looks.get(), *gradients])
+            peaks, looks = (dev.zeros((model.cloud.count,)) for _ in range(2))
+            renderer.raise_peaks(result, peaks, looks)
+            results.append([result.features.get(), peaks.get(), looks.get(), *gradients])
         assert same(*results)
     assert len(kept.cache) == 3 and len(anew.cache) == 0
 

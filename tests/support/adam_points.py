@@ -8,10 +8,7 @@ from pp_cl.config import TrainConfig
 from pp_cl.raster.sh import SH_BLOCKS
 from pp_cl.scene.camera import Camera
 from pp_cl.scene.grid import Grid
-from pp_cl.training.adam import (
-    PointAdam,
-    ShGradient,
-)
+from pp_cl.training.adam import Directions, PointAdam, ShGradient
 from pp_cl.training.point_state import PointState
 
 GRID = Grid((-0.7, -0.5, -0.6), 0.05, (23, 19, 31))
@@ -55,11 +52,11 @@ class Cloud:
         self.opacity, self.sh = dev.upload(self.start["opacity"]), dev.upload(self.start["sh"])
         self.opacity_moments = moments(dev, self.start["opacity"])
         self.sh_moments = sh_moments(dev, block, n, scale)
-        self.scene = [
+        self.directions = Directions(
             dev.upload(GRID.packed()),
             dev.upload(CAMERA.packed((2.0, 6.0))),
             dev.upload(self.ids),
-        ]
+        )
 
     def updated(self, rows):
         """The points of this step."""
@@ -68,24 +65,22 @@ class Cloud:
         rows = self.dev.upload(rows, np.uint32)
         return self.adam.listed_points(self.steps, rows, self.last_step)
 
-    def update_opacity(self, updated, grad_opacity):
+    def update_opacity(self, grad_opacity):
         self.adam.update_opacity(
-            updated, grad_opacity, self.opacity, self.opacity_moments, rate=0.03, eps=1e-15
+            self.steps, grad_opacity, self.opacity, self.opacity_moments, rate=0.03, eps=1e-15
         )
 
     def step(self, grad_features, grad_opacity, rows, step=None):
-        """Update the rows; the kernels must not read the gradients of the others, which are NaN."""
+        """Update the SH of the rows, whose kernels must not read the gradients of the others, which
+        are NaN, and all opacities.
+        """
         self.steps = step or self.steps + 1
         for oracle in self.oracles.values():
             oracle.t = self.steps - 1
-        listed = np.isin(np.arange(self.n), rows)
-        features, opacities = (
-            self.dev.upload(
-                np.where(listed.reshape(-1, *[1] * (g.ndim - 1)), g, np.nan), np.float32
-            )
-            for g in (grad_features, grad_opacity)
-        )
-        updated, product = self.updated(rows), ShGradient(*self.scene, features)
+        self.oracles["opacity"].last_step[:] = self.steps - 1  # dense
+        listed = np.isin(np.arange(self.n), rows)[:, None]
+        features = self.dev.upload(np.where(listed, grad_features, np.nan), np.float32)
+        updated, product = self.updated(rows), ShGradient(self.directions, features)
         self.adam.update_sh(
             updated,
             self.block,
@@ -95,12 +90,31 @@ class Cloud:
             rate=0.1,
             eps=SH_EPS,
         )
-        self.update_opacity(updated, opacities)
-        gradient = oracle_optim.sh_gradient(
-            GRID.positions(self.ids), EYE, grad_features, self.block
+        self.update_opacity(self.dev.upload(grad_opacity, np.float32))
+        self.oracles["sh"].step(self.sh_gradient(grad_features), 0.1, SH_EPS, rows=rows)
+        self.oracles["opacity"].step(grad_opacity, 0.03, 1e-15, low=0, high=1)
+
+    def sh_gradient(self, grad_features):
+        """(N, block.count, 16) float64."""
+        return oracle_optim.sh_gradient(GRID.positions(self.ids), EYE, grad_features, self.block)
+
+    def pending(self, rows, step):
+        """(N, 16) that lazy Adam adds to features of 0 of the rows in `step`; NaN elsewhere."""
+        features = np.full((self.n, 16), np.nan, np.float32)
+        features[rows] = 0
+        features = self.dev.upload(features)
+        rows = self.dev.upload(rows, np.uint32)
+        listed = self.adam.listed_points(step, rows, self.last_step, updating=False)
+        self.adam.add_pending(
+            listed,
+            self.block,
+            self.directions,
+            features,
+            moments=self.sh_moments,
+            rate=0.1,
+            eps=SH_EPS,
         )
-        self.oracles["sh"].step(gradient, 0.1, SH_EPS, rows=rows)
-        self.oracles["opacity"].step(grad_opacity, 0.03, 1e-15, low=0, high=1, rows=rows)
+        return features.get()
 
     def state(self):
         """{name: (parameter, m, v)} on the host."""

@@ -13,6 +13,7 @@ from pp_cl.raster.sh import SH_BLOCKS
 from pp_cl.scene.camera import Camera
 from pp_cl.scene.grid import Grid
 from pp_cl.training.adam import (
+    Directions,
     Ema,
     PointAdam,
     PointsWithGradient,
@@ -132,10 +133,9 @@ def test_rows_that_are_not_listed_keep_their_values(dev, rng):
     before = cloud.state()
     rows = np.arange(0, 257, 2)
     cloud.step(*gradients(rng, 257), rows)
-    for name, arrays in cloud.state().items():
-        for array, old in zip(arrays, before[name], strict=True):
-            np.testing.assert_array_equal(array[1::2], old[1::2])
-            assert (array[rows] != old[rows]).any()
+    for array, old in zip(cloud.state()["sh"], before["sh"], strict=True):
+        np.testing.assert_array_equal(array[1::2], old[1::2])
+        assert (array[rows] != old[rows]).any()
     cloud.step(*gradients(rng, 257), [])
     assert (cloud.last_step.get()[1::2] == 1).all() and (cloud.last_step.get()[::2] == 2).all()
 
@@ -144,29 +144,49 @@ def test_lazy_moments_are_dense_ones(dev, rng):
     """At every step that lists a row, its moments are those of dense Adam with gradients of 0 in
     between.
     """
-    cloud, dense = Cloud(dev, rng, 33), oracle_optim.Adam(np.zeros(33))
+    cloud, dense = Cloud(dev, rng, 33), oracle_optim.Adam(np.zeros((33, 1, 16)))
     for _ in range(40):
-        grad = gradients(rng, 33)[1]
+        grad = gradients(rng, 33)[0]
         rows = np.flatnonzero(rng.random(33) < 0.2)
-        cloud.step(np.zeros((33, 16)), grad, rows)
-        dense.step(np.where(np.isin(np.arange(33), rows), grad, 0), 0.03, 1e-15)
-        _, m, v = (array[rows] for array in cloud.state()["opacity"])
+        cloud.step(grad, np.zeros(33), rows)
+        grad[~np.isin(np.arange(33), rows)] = 0
+        dense.step(cloud.sh_gradient(grad), 0.1, SH_EPS)
+        _, m, v = (array[rows] for array in cloud.state()["sh"])
         np.testing.assert_allclose(m, dense.m[rows], rtol=3e-6, atol=1e-10)
-        np.testing.assert_allclose(v, dense.v[rows], rtol=3e-6)
+        np.testing.assert_allclose(v, dense.v[rows], rtol=3e-6, atol=1e-18)
+
+
+@pytest.mark.parametrize("n", AWKWARD_SIZES)
+@pytest.mark.parametrize("block", SH_BLOCKS, ids=lambda b: b.name)
+@pytest.mark.parametrize("scale", [None, moment_scale(SH_EPS)], ids=["32 bits", "16 bits"])
+def test_pending_moves_are_those_that_the_next_update_catches_up_with(dev, rng, n, block, scale):
+    cloud = Cloud(dev, rng, n, block, scale=scale)
+    for _ in range(6):
+        cloud.step(*gradients(rng, n), np.flatnonzero(rng.random(n) < 0.6))
+    rows, last = np.flatnonzero(rng.random(n) < 0.7), cloud.last_step.get()
+    pending = cloud.pending(rows, 10)
+    np.testing.assert_array_equal(cloud.last_step.get(), last)
+    assert np.isnan(np.delete(pending, rows, axis=0)).all()
+    moves = cloud.oracles["sh"].pending(10, 0.1, SH_EPS)
+    basis = oracle_optim.block_basis(GRID.positions(cloud.ids), EYE, block)
+    expected = np.einsum("nk,nkc->nc", basis, moves)
+    bound = 1e-6 if scale is None else 0.01
+    assert np.abs(pending[rows] - expected[rows]).max(initial=0) <= bound * np.abs(expected).max()
+    if n > 1:
+        assert np.abs(pending[rows]).max() > 0.01
 
 
 @pytest.mark.parametrize("n", AWKWARD_SIZES)
 def test_points_with_a_gradient(dev, rng, n):
     shaded = np.flatnonzero(rng.random(n) < 0.8)
-    features, opacity = np.full((n, 16), np.nan, np.float32), np.full(n, np.nan, np.float32)
-    features[shaded], opacity[shaded] = 0, 0
+    features = np.full((n, 16), np.nan, np.float32)
+    features[shaded] = 0
     expected = [i for place, i in enumerate(shaded) if place % 3]
     for place, i in enumerate(shaded):
-        features[i, place % 16] = (0, 1e-37, np.nan)[place % 3] if place % 2 else 0
-        opacity[i] = 0 if place % 2 else (-0.0, -1e-30, np.inf)[place % 3]
+        features[i, place % 16] = (-0.0, -1e-37, np.nan)[place % 3]
     points = PointsWithGradient(dev)
     for _ in range(2):
-        rows = points.rows(dev.upload(shaded, np.uint32), dev.upload(features), dev.upload(opacity))
+        rows = points.rows(dev.upload(shaded, np.uint32), dev.upload(features))
         np.testing.assert_array_equal(rows.get(), np.array(expected, np.uint32))
 
 
@@ -215,7 +235,7 @@ def test_opacity_stays_in_its_bounds(dev, rng):
 def test_a_nan_is_not_hidden(dev, rng):
     cloud = Cloud(dev, rng, 31)
     cloud.steps = 1
-    cloud.update_opacity(cloud.updated(np.arange(31)), dev.upload(np.full(31, np.nan), np.float32))
+    cloud.update_opacity(dev.upload(np.full(31, np.nan), np.float32))
     assert np.isnan(cloud.opacity.get()).all()
 
 
@@ -228,12 +248,10 @@ def test_sh_of_a_point_in_the_eye_stays_finite(dev):
     ids = np.array([2 + 5, 3], np.uint32)
     start = np.ones((2, 3, 16), np.float32)
     adam, sh, state = PointAdam(dev), dev.upload(start), sh_moments(dev, SH_BLOCKS[2], 2)
-    product = ShGradient(
-        dev.upload(grid.packed()),
-        dev.upload(camera.packed((2.0, 6.0))),
-        dev.upload(ids),
-        dev.zeros((2, 16)),
+    directions = Directions(
+        dev.upload(grid.packed()), dev.upload(camera.packed((2.0, 6.0))), dev.upload(ids)
     )
+    product = ShGradient(directions, dev.zeros((2, 16)))
     adam.update_sh(
         adam.all_points(1, 2), SH_BLOCKS[2], product, sh, moments=state, rate=0.5, eps=1e-15
     )

@@ -12,8 +12,8 @@ from pp_cl.metrics.lpips import WIDTHS, vgg_layers
 from pp_cl.model import Model
 from pp_cl.network.unet import UNet
 from pp_cl.raster.point_cloud import PointCloud
-from pp_cl.run import open_scene
 from pp_cl.scene.grid import Grid
+from pp_cl.scene.open import open_scene
 from pp_cl.train import Trainer
 from pp_cl.training.memory import memory_plan, plan_bytes, plan_lines, spare_memory
 from pp_cl.training.point_state import PointState
@@ -91,8 +91,8 @@ def test_pruning_stays_within_the_plan(dev, tmp_path, monkeypatch):
     monkeypatch.setattr("pp_cl.device.compact.SCRATCH_BYTES", 10**6)
     trainer, plan, _ = trained(dev, tmp_path / "ball", {})
     before, dev.peak_bytes = dev.bytes, dev.bytes
-    trainer.state.weight_sum.set(np.arange(POINTS, dtype=np.float32))
-    trainer.state.look_count.set(np.full(POINTS, 20, np.float32))
+    trainer.state.peak_weight.set(np.arange(POINTS, dtype=np.float32))
+    trainer.state.look_count.set(np.full(POINTS, 100, np.float32))
     trainer.prune()
     assert trainer.model.cloud.count == POINTS - 1
     assert dev.peak_bytes <= before + 10**6 + 2 * 4 * POINTS  # the weights and the list of the kept

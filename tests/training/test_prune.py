@@ -44,7 +44,7 @@ def test_compacting_never_takes_more_than_its_scratch(dev, rng, monkeypatch, sha
     del array  # else it is not released
     state = PointState(dev, cloud, TrainConfig(**settings))
     state.ema.update(cloud.learned(), 1.0)
-    state.weight_sum.set(rng.random(1000).astype(np.float32))
+    state.peak_weight.set(rng.random(1000).astype(np.float32))
     state.restore(
         cloud,
         {k: (1e3 * rng.random(a.shape)).astype(a.dtype) for k, a in state.arrays().items()},
@@ -74,19 +74,19 @@ def test_compacting_never_takes_more_than_its_scratch(dev, rng, monkeypatch, sha
 
 
 def test_only_what_was_looked_at_is_judged(dev):
-    """By its weight a look, and counted anew; the rest keeps its sums."""
+    """By the highest weight of a look, and counted anew; the rest keeps its counts."""
     settings = TrainConfig(prune_weight=0.1, prune_looks=10, prune_opacity=0.01, sh_rate=(1, 0, 0))
     cloud = PointCloud.create(dev, np.arange(6), 0)
     state = PointState(dev, cloud, settings)
-    state.weight_sum.set(np.float32([0, 0, 0.9, 1, 100, np.nan]))
+    state.peak_weight.set(np.float32([0, 0, 0.09, 0.1, 100, np.nan]))
     state.look_count.set(np.float32([9, 10, 10, 10, 1000, 10]))
     opacity = dev.upload(np.float32([0, 1, 1, 1, 1, 1]))
     assert judge(dev, state, opacity, settings).get().tolist() == [0, 3, 4]
     assert state.look_count.get().tolist() == [9, 0, 0, 0, 0, 0]
-    assert not state.weight_sum.get().any()
+    assert not state.peak_weight.get().any()
     opacity.set(np.float32([0, 1, 1, 0, 1, 1]))
     state.look_count.set(np.float32([20, 9, 9, 20, 0, 0]))
-    state.weight_sum.set(np.float32([5, 0, 0, 5, 0, 0]))
+    state.peak_weight.set(np.float32([5, 0, 0, 5, 0, 0]))
     assert judge(dev, state, opacity, settings).get().tolist() == [1, 2, 4, 5]
 
 
@@ -94,6 +94,6 @@ def test_one_judged_point_always_survives(dev):
     settings = TrainConfig(prune_looks=1, prune_weight=1.0)
     cloud = PointCloud.create(dev, np.arange(3), 2)
     state = PointState(dev, cloud, settings)
-    state.weight_sum.set(np.float32([1, 3, 2]))
+    state.peak_weight.set(np.float32([0.1, 0.3, 0.2]))
     state.look_count.set(np.float32([10, 10, 10]))
     assert judge(dev, state, cloud.opacity, settings).get().tolist() == [1]

@@ -1,0 +1,80 @@
+"""A rendered view on the host: colour, alpha and depth, and how they become an image file."""
+
+from __future__ import annotations
+
+import io
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from PIL import Image
+
+from pp_cl.files.image import to_8bit, write_png
+
+WHITE = (1.0, 1.0, 1.0)
+
+
+@dataclass(frozen=True)
+class Picture:
+    """A view as a model shows it, over white. Float32 arrays of H rows and W columns.
+
+    colour: (H, W, 3), sRGB in [0, 1], over white. alpha: (H, W) in [0, 1], the share that the
+    object covers. depth: (H, W), along the camera's axis in world units, mean by blend weight;
+    median_depth: the same where half of the weight is reached; both infinite where alpha is 0.
+    features: (H, W, 16), what the network made the colours of, or None.
+    """
+
+    colour: np.ndarray
+    alpha: np.ndarray
+    depth: np.ndarray
+    median_depth: np.ndarray
+    features: np.ndarray | None = None
+
+    def over(self, background: tuple[float, float, float]) -> np.ndarray:
+        """(H, W, 3) float32 in [0, 1]: the object over a colour, sRGB in [0, 1]."""
+        behind = (1 - self.alpha)[..., None]
+        return np.clip(self.colour + behind * (np.float32(background) - 1), 0, 1)
+
+    def rgba(self) -> np.ndarray:
+        """(H, W, 4) float32 in [0, 1]: straight (not premultiplied) colour, and alpha."""
+        alpha = self.alpha[..., None]
+        # what shows at alpha a over white is a colour + (1 - a)
+        straight = (self.colour - (1 - alpha)) / np.maximum(alpha, 1 / 255)
+        return np.concatenate([np.clip(straight, 0, 1), alpha], axis=2)
+
+    def premultiplied_linear(self) -> np.ndarray:
+        """(H, W, 4) float32: linear light multiplied by alpha, and alpha, as OpenEXR keeps them."""
+        rgba = self.rgba()
+        linear = srgb_to_linear(rgba[..., :3]) * rgba[..., 3:]
+        return np.concatenate([linear, rgba[..., 3:]], axis=2)
+
+    def image(self, background: tuple[float, float, float] | None) -> np.ndarray:
+        """over(background), or rgba() where that is None."""
+        return self.rgba() if background is None else self.over(background)
+
+    def save(self, path: Path | str, background: tuple[float, float, float] | None = WHITE) -> None:
+        """Write an 8-bit PNG; background None: transparent. Raises UserError as write_png does."""
+        write_png(path, self.image(background))
+
+    def _repr_png_(self) -> bytes:
+        """The picture over white, by which a notebook shows it."""
+        encoded = io.BytesIO()
+        Image.fromarray(to_8bit(self.colour)).save(encoded, "PNG")
+        return encoded.getvalue()
+
+
+def srgb_to_linear(values: np.ndarray) -> np.ndarray:
+    """IEC 61966-2-1's transfer function: [0, 1] to linear light."""
+    return np.where(values <= 0.04045, values / 12.92, ((values + 0.055) / 1.055) ** 2.4).astype(
+        np.float32
+    )
+
+
+def mean_picture(pictures: list[Picture]) -> Picture:
+    """The mean of several samples of one view; depths and features are those of the first."""
+    first = pictures[0]
+    colour, alpha = (
+        np.mean([getattr(p, name) for p in pictures], axis=0, dtype=np.float32)
+        for name in ("colour", "alpha")
+    )
+    return Picture(colour, alpha, first.depth, first.median_depth, first.features)

@@ -1,0 +1,131 @@
+"""What a training leaves: a model that can be rendered from anywhere."""
+
+import math
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from pp_cl.config import Config, configure, load_config
+from pp_cl.device.device import Device
+from pp_cl.device.discover import open_device
+from pp_cl.errors import UserError
+from pp_cl.files.picture import Picture, mean_picture
+from pp_cl.files.run_folder import RunFolder
+from pp_cl.layers.policy import ConvolutionPolicy, load_policy
+from pp_cl.model import Model
+from pp_cl.network.unet import UNet
+from pp_cl.render import Renderer
+from pp_cl.scene.camera import Camera
+from pp_cl.scene.load import Scene
+from pp_cl.scene.open import open_scene
+from pp_cl.training.schedule import gamma_at
+
+NEAREST = 0.05  # of a point to the eye, in radii of the object
+
+
+@dataclass
+class Run:
+    """The model of a run's last checkpoint. header: of the checkpoint, see files/run_folder.py.
+    policy: of the convolutions.
+    """
+
+    dev: Device
+    folder: RunFolder
+    config: Config
+    header: dict[str, Any]
+    model: Model
+    policy: ConvolutionPolicy
+
+    @cached_property
+    def renderer(self) -> Renderer:
+        """Renders the model, whose parameters must not change any more."""
+        self.model.net.freeze()
+        return Renderer(self.dev, self.model, self.config.raster)
+
+    @property
+    def gamma(self) -> float:
+        """Depth sharpness of the blend at the run's last step."""
+        return gamma_at(
+            self.header["step"], self.config.train.iterations, *self.config.raster.gamma
+        )
+
+    def scene(self, split: str) -> Scene:
+        """The run's scene with one split. Raises UserError where it is missing or broken."""
+        path = self.config.scene.path
+        if path != "demo" and not Path(path).is_dir():
+            raise UserError(f"{path}: the run's scene is not there; say where with --scene")
+        return open_scene(self.dev, self.config, (split,))
+
+    def cameras(self, split: str = "test") -> list[Camera]:
+        """The cameras of a split's views at the resolution of the run."""
+        return [view.camera for view in self.scene(split).splits[split]]
+
+    @cached_property
+    def ball(self) -> tuple[np.ndarray, float]:
+        """(centre (3,), radius), world units, of the smallest ball around the middle of the box of
+        the points that holds them all.
+        """
+        points = self.model.grid.positions(self.model.cloud.ids.get())
+        centre = (points.min(axis=0) + points.max(axis=0)) / 2
+        radius = np.linalg.norm(points - centre, axis=1).max() + self.model.grid.edge
+        return centre, float(radius)
+
+    def render(self, camera: Camera, *, samples: int = 1, features: bool = False) -> Picture:
+        """The model as the camera sees it.
+
+        samples: a square number of images, shifted by fractions of a pixel, whose mean it is.
+        features: with the network's input. Raises ValueError for another number of samples.
+        """
+        side = math.isqrt(samples)
+        if samples < 1 or side * side != samples:
+            raise ValueError(f"{samples} samples are no square number")
+        shifts = (np.arange(side) + 0.5) / side - 0.5
+        options = {"features": features, "depth_range": self._depth_range(camera)}
+        pictures = [
+            self.renderer.picture(camera.shifted(dx, dy), self.gamma, **options)
+            for dy in shifts
+            for dx in shifts
+        ]
+        return mean_picture(pictures)
+
+    def _depth_range(self, camera):
+        """(near, far) of a camera anywhere; None, the model's, where the blend depends on it."""
+        if self.config.raster.blend == "softmax":
+            return None
+        centre, radius = self.ball
+        distance = float(np.linalg.norm(camera.eye - centre))
+        return max(distance - radius, NEAREST * radius), distance + radius
+
+
+def load_run(
+    dev: Device,
+    folder: Path | str,
+    *,
+    tolerance: float | None = None,
+    scene: str | None = None,
+) -> Run:
+    """The run in a folder, finished or not.
+
+    tolerance: in place of its network.tolerance; scene: the folder of its scene, if that has moved.
+    Raises UserError naming the file that is missing or broken.
+    """
+    folder = RunFolder(folder)
+    config = load_config(folder.config)
+    given = [] if tolerance is None else [("network.tolerance", tolerance, "tolerance")]
+    configure(config, scene or config.scene.path, given)
+    header, arrays = folder.load()
+    policy = load_policy(dev, config.network.tolerance)
+    net = UNet(dev, config.network.widths, policy=policy)
+    degree, file = config.points.sh_degree, folder.checkpoint
+    model = Model.load(dev, header, arrays, net, degree=degree, file=file)
+    return Run(dev, folder, config, header, model, policy)
+
+
+def load(folder: Path | str, device: str | None = None) -> Run:
+    """The run in a folder, on a device: as `pp-cl devices` lists them, else the default one. Raises
+    UserError naming the file that is missing or broken.
+    """
+    return load_run(open_device(device), folder)
