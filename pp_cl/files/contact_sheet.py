@@ -35,6 +35,27 @@ def comparison(predictions: Sequence[np.ndarray], truths: Sequence[np.ndarray]) 
     return np.array(picture)
 
 
+def tiles(images: Sequence[np.ndarray], columns: int) -> np.ndarray:
+    """uint8 picture of equally large uint8 images, (H, W, 3) or (H, W, 4), row by row; what is
+    transparent shows white.
+    """
+    opaque = [_over_white(image) for image in images]
+    blank = np.full_like(opaque[0], 255)
+    rows = -(-len(opaque) // columns)
+    opaque += [blank] * (rows * columns - len(opaque))
+    table = np.pad(opaque, ((0, 0), (0, GAP), (0, GAP), (0, 0)), constant_values=LINE)
+    _, height, width, _ = table.shape
+    table = table.reshape(rows, columns, height, width, 3).transpose(0, 2, 1, 3, 4)
+    return table.reshape(rows * height, columns * width, 3)[:-GAP, :-GAP]
+
+
+def _over_white(image):
+    if image.shape[2] == 3:
+        return image
+    alpha = image[..., 3:] / 255
+    return to_8bit(image[..., :3] / 255 * alpha + 1 - alpha)
+
+
 def _error(prediction, truth):
     error = np.abs(np.asarray(prediction, np.float64) - truth).mean(axis=2, keepdims=True)
     return np.repeat(1 - ERROR_GAIN * error, 3, axis=2)

@@ -15,7 +15,7 @@ FLOORS = [
     ("network", "metrics"),
     ("training", "model", "render"),
     ("train", "trained"),
-    ("run", "evaluate", "export", "view"),
+    ("run", "evaluate", "film", "export", "view"),
     ("bench",),
     ("commands",),
     ("cli", "__init__", "__main__"),
