@@ -30,7 +30,7 @@ def write_exr(path: Path, channels: dict[str, np.ndarray]) -> None:
     temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
     header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
     try:
-        OpenEXR.File(header, channels).write(str(temporary))
+        OpenEXR.File(header, dict(channels)).write(str(temporary))
         os.replace(temporary, path)
     except (OSError, RuntimeError) as error:
         reason = " ".join(str(error).split())[:120]
