@@ -10,7 +10,7 @@ import warnings
 from collections.abc import Sequence
 
 from pp_cl import __version__
-from pp_cl.errors import UserError
+from pp_cl.errors import Stopped, UserError
 
 COMMANDS = ("devices", "train", "eval", "compare", "bench", "tune")  # modules of pp_cl.commands
 
@@ -31,6 +31,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         return 0
     except UserError as error:
         return _fail(str(error))
+    except Stopped as stopped:
+        return _fail(str(stopped), stopped.status)
     except OSError as error:
         what = f"{error.filename or 'file'}: {error.strerror or error}"
         return _fail(f"{what}; check the path, permissions and free space")

@@ -197,7 +197,16 @@ class TrainConfig:
         2**20,
     )
     log_every: int = setting(50, "steps between two rows of log.jsonl", 1, 10**8)
-    previews: int = setting(4, "preview images written in the course of the run", 0, 1000)
+    previews: int = setting(
+        4, "preview images written in the course of the run; the first comes early besides", 0, 1000
+    )
+    eval_every: int = setting(
+        0,
+        "steps between two measurements of a few views of the split val, else test: test_psnr in"
+        " log.jsonl (0: none)",
+        0,
+        10**8,
+    )
 
 
 @dataclass
