@@ -259,7 +259,7 @@ def _start(config, views, net):
         hull.capped,
         hull.grid.dims,
         hull.grid.edge,
-        spacing_pixels(hull, views),
+        spacing_pixels(hull.grid, [view.camera for view in views]),
         near_far,
         time.perf_counter() - start,
     )

@@ -1,4 +1,4 @@
-"""Pictures that show how well views are predicted."""
+"""Pictures of many images: how well views are predicted, and what photographs there are."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -23,15 +23,40 @@ def comparison(predictions: Sequence[np.ndarray], truths: Sequence[np.ndarray]) 
     around the object.
     """
     rows = [np.stack([p, t, _error(p, t)]) for p, t in zip(predictions, truths, strict=True)]
+    table = np.pad(_table(to_8bit(rows)), ((HEADER, 0), (0, 0), (0, 0)), constant_values=255)
+    width = predictions[0].shape[1] + GAP
+    return _captioned(table, [(column * width, 0) for column in range(3)], CAPTIONS)
+
+
+def contact_sheet(
+    images: Sequence[np.ndarray], captions: Sequence[str], columns: int = 4
+) -> np.ndarray:
+    """uint8 picture of equally large uint8 (H, W, 3) images, row by row, a caption above each."""
+    height, width = images[0].shape[0] + HEADER + GAP, images[0].shape[1] + GAP
+    columns = min(columns, len(images))
+    tiles = np.pad(np.stack(images), ((0, 0), (HEADER, 0), (0, 0), (0, 0)), constant_values=255)
     tiles = np.pad(
-        to_8bit(rows), ((0, 0), (0, 0), (0, GAP), (0, GAP), (0, 0)), constant_values=LINE
+        tiles, ((0, -len(images) % columns), (0, 0), (0, 0), (0, 0)), constant_values=255
     )
-    n, columns, height, width, _ = tiles.shape
-    table = tiles.transpose(0, 2, 1, 3, 4).reshape(n * height, columns * width, 3)[:-GAP, :-GAP]
-    picture = Image.fromarray(np.pad(table, ((HEADER, 0), (0, 0), (0, 0)), constant_values=255))
+    table = _table(tiles.reshape(-1, columns, *tiles.shape[1:]))
+    places = [(i % columns * width, i // columns * height) for i in range(len(images))]
+    return _captioned(table, places, captions)
+
+
+def _table(tiles):
+    """Picture of (rows, columns, H, W, 3) uint8 tiles with lines between them."""
+    tiles = np.pad(tiles, ((0, 0), (0, 0), (0, GAP), (0, GAP), (0, 0)), constant_values=LINE)
+    rows, columns, height, width, _ = tiles.shape
+    table = tiles.transpose(0, 2, 1, 3, 4).reshape(rows * height, columns * width, 3)
+    return table[:-GAP, :-GAP]
+
+
+def _captioned(table, places, captions):
+    """The picture with captions whose strips begin at the places, (x, y)."""
+    picture = Image.fromarray(table)
     draw = ImageDraw.Draw(picture)
-    for column, caption in enumerate(CAPTIONS):
-        draw.text((column * width + 3, 1), caption, fill=INK)
+    for (x, y), caption in zip(places, captions, strict=True):
+        draw.text((x + 3, y + 1), caption, fill=INK)
     return np.array(picture)
 
 
