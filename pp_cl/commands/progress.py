@@ -1,5 +1,6 @@
 """How a training shows that it goes on: one line on a terminal, elsewhere now and then a line."""
 
+import os
 import sys
 import time
 from typing import Any, TextIO
@@ -11,6 +12,10 @@ from pp_cl.run import Training
 REDRAWN = 1  # seconds, at least, between two states of the bar
 LINES_APART = 30  # seconds, at least, between the lines in a file
 GIB = 2**30
+# tqdm's, with little beside what follows; it is cut off at the right border
+FORMAT = "{percentage:3.0f}%|{bar}| {n_fmt}/{total_fmt}, {rate_fmt}, {remaining} left{postfix}"
+# of a terminal that does not tell its size, where tqdm would show nothing
+WIDTH, ROWS = 100, 20
 
 
 def follow(training: Training, stream: TextIO | None = None) -> "Bar | Lines":
@@ -25,14 +30,16 @@ class Bar:
     """One line with rate, time left, PSNR, points and device memory, for a terminal."""
 
     def __init__(self, training: Training, stream: TextIO) -> None:
-        self._dev, self._test = training.trainer.dev, {}
+        self._dev, self._test = training.trainer.dev, ""
         self._bar = tqdm(
             total=training.config.train.iterations,
             initial=training.trainer.step,
             unit="step",
             delay=1e-6,  # shows from the first step on, not above an error before it
             mininterval=REDRAWN,
-            dynamic_ncols=True,
+            bar_format=FORMAT,
+            ncols=_columns(stream),
+            nrows=ROWS,
             file=stream,
         )
 
@@ -48,14 +55,20 @@ class Bar:
         if row is None:
             return
         if "test_psnr" in row:
-            self._test = {"test": f"{row['test_psnr']:.2f}"}
-        self._bar.set_postfix(
-            psnr=f"{row['psnr']:.2f}",
-            **self._test,
-            points=row["points"],
-            memory=f"{self._dev.bytes / GIB:.2f}GiB",
+            self._test = f" (test {row['test_psnr']:.1f})"
+        self._bar.set_postfix_str(
+            f"PSNR {row['psnr']:.1f}{self._test}, {row['points']} points,"
+            f" {self._dev.bytes / GIB:.2f} GiB",
             refresh=False,
         )
+
+
+def _columns(stream):
+    """Columns of the terminal."""
+    try:
+        return os.get_terminal_size(stream.fileno()).columns or WIDTH
+    except (OSError, ValueError):
+        return WIDTH
 
 
 class Lines:
