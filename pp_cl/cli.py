@@ -17,6 +17,7 @@ COMMANDS = (
     "train",
     "eval",
     "info",
+    "render",
     "compare",
     "bench",
     "tune",

@@ -119,6 +119,13 @@ class TrainConfig:
         True, "shift the pixel grid of the downscaled image by a random sub-pixel offset each step"
     )
     ssim_weight: float = setting(0.2, "loss = L1 + ssim_weight * (1 - SSIM)", 0, 10)
+    mask_weight: float = setting(
+        1.0,
+        "adds this times the mean square by which the rendered alpha exceeds the photograph's to"
+        " the loss, with raster.blend=alpha and photographs that have masks (0: off)",
+        0,
+        1e3,
+    )
     perceptual_weight: float = setting(0.0, "adds this times LPIPS to the loss (0: off)", 0, 10)
     sh_rate: tuple = setting(
         (0.5, 0.25, 0.125),

@@ -16,7 +16,7 @@ from pp_cl.files.checkpoint import checkpoint_array
 from pp_cl.files.contact_sheet import contact_sheet
 from pp_cl.files.image import to_8bit
 from pp_cl.files.run_folder import RunFolder
-from pp_cl.scene.cameras import estimated_up, looked_at
+from pp_cl.scene.camera_path import looked_at, up_of
 from pp_cl.scene.grid import Grid
 from pp_cl.scene.hull import Hull, build_grid, spacing_pixels
 from pp_cl.scene.load import Frame, evenly
@@ -225,7 +225,7 @@ def _rig(views):
     return {
         "looked_at": centre.tolist(),
         "distances": _range([np.linalg.norm(camera.eye - centre) for camera in cameras]),
-        "up": estimated_up(cameras).tolist(),
+        "up": up_of(cameras).tolist(),
     }
 
 

@@ -38,6 +38,7 @@ PRESETS = {
         "train.dropout": 0.0,
         "train.sh_smoothing": 0.0,
         "train.ema": False,
+        "train.mask_weight": 0.0,
         "train.prune_every": 500,
         "train.checkpoint_every": 5000,
     },
@@ -80,4 +81,9 @@ RENAMED = {
 
 
 # What a setting is taken for that a config.json of an earlier version does not have.
-ABSENT = {"points.opacity": 1.0, "raster.blend": "softmax", "train.opacity_rate_steps": 0}
+ABSENT = {
+    "points.opacity": 1.0,
+    "raster.blend": "softmax",
+    "train.opacity_rate_steps": 0,
+    "train.mask_weight": 0.0,
+}

@@ -199,8 +199,11 @@ class Renderer:
             )
         return ViewWeights(tuple(offset), points, pairs, weights)
 
-    def backward(self, result: RenderResult, grad_image: Array) -> tuple[Array, Array]:
-        """(grad_point_features (N, 16), grad_opacity (N,)) from dL/dimage of result.image.
+    def backward(
+        self, result: RenderResult, grad_image: Array, grad_alpha: Array | None = None
+    ) -> tuple[Array, Array]:
+        """(grad_point_features (N, 16), grad_opacity (N,)) from dL/dimage of result.image, and
+        dL/dalpha (H * W,) of its pixels' alpha where the blend has a transmittance.
 
         result: the last one of forward(training=True). The gradients of the network's parameters
         are in model.net.gradients; those of the SH coefficients are rank one in
@@ -208,9 +211,11 @@ class Renderer:
         """
         with self.dev.stage("network backward"):
             grad_features = self.model.net.backward(grad_image)
-        return self.backward_features(result, grad_features)
+        return self.backward_features(result, grad_features, grad_alpha)
 
-    def backward_features(self, result: RasterResult, grad_features: Array) -> tuple[Array, Array]:
+    def backward_features(
+        self, result: RasterResult, grad_features: Array, grad_alpha: Array | None = None
+    ) -> tuple[Array, Array]:
         """The same from dL/dfeatures (H, W, 16) of result.features."""
         with self.dev.stage("backward"):
             gradient = self._blend.gradient(
@@ -219,6 +224,7 @@ class Renderer:
                 result.point_features,
                 features=result.features,
                 grad_features=grad_features,
+                grad_alpha=grad_alpha,
             )
             return self._blend.backward(gradient)
 

@@ -16,6 +16,7 @@ from pp_cl.scene.views import View
 from pp_cl.training.adam import moment_scale
 from pp_cl.training.crops import BOX_MARGIN, draw_start
 from pp_cl.training.loss import Loss
+from pp_cl.training.mask import MaskLoss
 from pp_cl.training.optimiser import Optimiser, Rates
 from pp_cl.training.perceptual import PerceptualLoss
 from pp_cl.training.point_state import PointState
@@ -45,6 +46,7 @@ class Trainer:
         self.step = 0
         self.renderer = Renderer(dev, model, config.raster)
         self.loss = Loss(dev, self.config.ssim_weight)
+        self.mask_loss = MaskLoss(dev, self.config.mask_weight)
         self.perceptual = PerceptualLoss(dev, self.config.perceptual_weight, model.net.policy)
         self.state = PointState(dev, model.cloud, self.config)
         self.optimiser = Optimiser(dev, model, self.state, self._moment_scale())
@@ -78,8 +80,8 @@ class Trainer:
     # ----------------------------------------------------------------------------------------------
 
     def train_step(self) -> dict[str, float]:
-        """One step; returns {"loss", "l1", "ssim", "psnr"} of its crop, and "lpips" where that is a
-        term of the loss. Raises UserError if the loss is not finite.
+        """One step; returns {"loss", "l1", "ssim", "psnr"} of its crop, and "mask" and "lpips"
+        where they are terms of the loss. Raises UserError if the loss is not finite.
         """
         t, config = self.step, self.config
         rng = np.random.default_rng((config.seed, t))
@@ -91,6 +93,7 @@ class Trainer:
         with self.dev.stage("target"):
             self._target.load(view)
             target = self._target.crop(box, jitter)
+            target_alpha = self._target.alpha(box, jitter) if view.has_mask else None
 
         sh_eps = config.sh_eps / target.size
         rendered = self.renderer.forward(
@@ -103,8 +106,8 @@ class Trainer:
             add_pending=partial(self.optimiser.add_pending, t + 1, rates, sh_eps=sh_eps),
         )
         with self.dev.stage("loss"):
-            grad_image = self._losses(rendered, target)
-        grads = self.renderer.backward(rendered, grad_image)
+            gradients = self._losses(rendered, target, target_alpha)
+        grads = self.renderer.backward(rendered, *gradients)
         with self.dev.stage("update"):
             self.optimiser.update(
                 t + 1,
@@ -121,8 +124,8 @@ class Trainer:
         self._regularise(rates)
         return self._terms()
 
-    def _losses(self, rendered, target):
-        """dL/dimage of what is rendered; the terms are in self.loss.terms."""
+    def _losses(self, rendered, target, target_alpha):
+        """(dL/dimage, dL/dalpha or None) of what is rendered; their sum is in self.loss.terms."""
         grad_image = self.loss.forward_backward(rendered.image, target, *rendered.offset)
         self.perceptual.add(
             rendered.image,
@@ -131,7 +134,14 @@ class Trainer:
             grad_prediction=grad_image,
             terms=self.loss.terms,
         )
-        return grad_image
+        grad_alpha = self.mask_loss.add(
+            rendered.weights.transmittance,
+            target_alpha,
+            size=rendered.features.shape[:2],
+            offset=rendered.offset,
+            terms=self.loss.terms,
+        )
+        return grad_image, grad_alpha
 
     def draw(
         self, rng: np.random.Generator
@@ -166,6 +176,7 @@ class Trainer:
             "l1": l1,
             "ssim": 1 - dissimilarity,
             "psnr": -10 * math.log10(max(mse, 1e-10)),
+            **self.mask_loss.terms(),
             **self.perceptual.terms(),
         }
 

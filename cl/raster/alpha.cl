@@ -4,7 +4,9 @@
 //
 // The background gets the transmittance T that is left. With B_i, the product of G = dL/dF and the
 // features composited of all that lies behind hit i, dL/do_i = T_i d_i (G.f_i - B_i): nothing is
-// divided by 1 - alpha. An opaque hit lets LEAST_THROUGH pass, so that B is known behind it too.
+// divided by 1 - alpha. An opaque hit lets LEAST_THROUGH pass, so that B is known behind it too. A
+// gradient g of the pixel's alpha, 1 - T, is that of a feature which all points have and the
+// background has not: G.f becomes G.f + g.
 #include "common.h"
 #include "raster/pair_role.h"
 #include "reduce.h"
@@ -14,6 +16,9 @@
 #endif
 #ifndef MAX_TRACKED
 #define MAX_TRACKED 0  // nearest hits of a pixel that get gradients; 0: all
+#endif
+#ifndef HAS_GRAD_ALPHA
+#define HAS_GRAD_ALPHA 0  // 0: grad_alpha is 0 and not read
 #endif
 #define HAS_ROLES                                                                                  \
     (DROPS || MAX_TRACKED)  // else every pair is TRACKED, and pair_role is not touched
@@ -57,8 +62,8 @@ kernel void alpha_weights(
     transmittance[q] = T;
 }
 
-// One work-item per pixel: reads its hits, farthest first, and their points' features, writes B of
-// each pair that is not dropped.
+// One work-item per pixel: reads its hits, farthest first, and their points' features, writes B - g
+// of each pair that is not dropped.
 kernel __attribute__((vec_type_hint(float16))) void alpha_rest(
     const uint hw,                         // pixels
     global const uint *pixel_offset,       // (HW+1)
@@ -67,11 +72,13 @@ kernel __attribute__((vec_type_hint(float16))) void alpha_rest(
     global const float *transmittance,     // (HW)
     global const float16 *point_features,  // (N, 16)
     global const float16 *grad_features,   // (H, W, 16) G
+    global const float *grad_alpha,        // (?) HW with HAS_GRAD_ALPHA: g
     global float *rest)                    // (P)
 {
     const uint q = get_global_id(0);
     if (q >= hw) return;
     const float16 G = grad_features[q];
+    const float g = HAS_GRAD_ALPHA ? grad_alpha[q] : 0.0f;
     const uint begin = pixel_offset[q];
     uint end = begin;
     while (end < pixel_offset[q + 1] && (uint)pixel_entry[end] != NONE)
@@ -80,10 +87,10 @@ kernel __attribute__((vec_type_hint(float16))) void alpha_rest(
     float B = dot16(G, (float16)(1.0f));  // the background's features are 1
     for (uint i = end; i-- > begin;) {
         const float b = as_float((uint)(pixel_entry[i] >> 32));
-        rest[(uint)pair_key[i]] = B;
+        rest[(uint)pair_key[i]] = B - g;
         if (b > 0.0f) {
             T += b;  // in front of this hit
-            B += b / T * (dot16(G, point_features[(uint)pixel_entry[i]]) - B);
+            B += b / T * (dot16(G, point_features[(uint)pixel_entry[i]]) + g - B);
         }
     }
 }

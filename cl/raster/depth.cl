@@ -4,7 +4,7 @@
 
 // One work-item per pixel: reads its hits, nearest first, and where their points are, writes the
 // share of the pixel that is not background, and the depth of that along the camera's axis: the
-// mean by weight, and the depth of the hit with which half of the weight is reached.
+// mean by weight, and where half of the weight is reached, which grows evenly from hit to hit.
 kernel void depth_forward(
     const uint hw,                      // pixels
     global const uint *pixel_offset,    // (HW+1)
@@ -24,10 +24,14 @@ kernel void depth_forward(
         alpha += b;
         depth += b * point_camera[(uint)pixel_entry[end]].z;
     }
-    float half_way = 0.0f, median = INFINITY;
-    for (uint i = begin; i < end && half_way < 0.5f * alpha; i++) {
-        half_way += as_float((uint)(pixel_entry[i] >> 32));
-        median = point_camera[(uint)pixel_entry[i]].z;
+    float reached = 0.0f, before = 0.0f, median = INFINITY;
+    for (uint i = begin; i < end && reached < 0.5f * alpha; i++) {
+        const float b = as_float((uint)(pixel_entry[i] >> 32));
+        const float z = point_camera[(uint)pixel_entry[i]].z;
+        const float share = b > 0.0f ? fmin((0.5f * alpha - reached) / b, 1.0f) : 1.0f;
+        median = i == begin ? z : before + share * (z - before);
+        reached += b;
+        before = z;
     }
     pixel_alpha[q] = fmin(alpha, 1.0f);
     pixel_depth[q] = alpha > 0.0f ? depth / alpha : INFINITY;

@@ -22,33 +22,22 @@ def comparison(predictions: Sequence[np.ndarray], truths: Sequence[np.ndarray]) 
     The error is the absolute difference, mean of the channels, ERROR_GAIN times; white is none, as
     around the object.
     """
-    rows = [np.stack([p, t, _error(p, t)]) for p, t in zip(predictions, truths, strict=True)]
-    table = np.pad(_table(to_8bit(rows)), ((HEADER, 0), (0, 0), (0, 0)), constant_values=255)
-    width = predictions[0].shape[1] + GAP
+    pairs = zip(predictions, truths, strict=True)
+    images = [to_8bit(image) for p, t in pairs for image in (p, t, _error(p, t))]
+    table = np.pad(tiles(images, 3), ((HEADER, 0), (0, 0), (0, 0)), constant_values=255)
+    width = images[0].shape[1] + GAP
     return _captioned(table, [(column * width, 0) for column in range(3)], CAPTIONS)
 
 
 def contact_sheet(
     images: Sequence[np.ndarray], captions: Sequence[str], columns: int = 4
 ) -> np.ndarray:
-    """uint8 picture of equally large uint8 (H, W, 3) images, row by row, a caption above each."""
-    height, width = images[0].shape[0] + HEADER + GAP, images[0].shape[1] + GAP
+    """tiles(images, columns) with a caption above each image, and no more columns than images."""
     columns = min(columns, len(images))
-    tiles = np.pad(np.stack(images), ((0, 0), (HEADER, 0), (0, 0), (0, 0)), constant_values=255)
-    tiles = np.pad(
-        tiles, ((0, -len(images) % columns), (0, 0), (0, 0), (0, 0)), constant_values=255
-    )
-    table = _table(tiles.reshape(-1, columns, *tiles.shape[1:]))
+    headed = [np.pad(i, ((HEADER, 0), (0, 0), (0, 0)), constant_values=255) for i in images]
+    height, width = (side + GAP for side in headed[0].shape[:2])
     places = [(i % columns * width, i // columns * height) for i in range(len(images))]
-    return _captioned(table, places, captions)
-
-
-def _table(tiles):
-    """Picture of (rows, columns, H, W, 3) uint8 tiles with lines between them."""
-    tiles = np.pad(tiles, ((0, 0), (0, 0), (0, GAP), (0, GAP), (0, 0)), constant_values=LINE)
-    rows, columns, height, width, _ = tiles.shape
-    table = tiles.transpose(0, 2, 1, 3, 4).reshape(rows * height, columns * width, 3)
-    return table[:-GAP, :-GAP]
+    return _captioned(tiles(headed, columns), places, captions)
 
 
 def _captioned(table, places, captions):
@@ -58,6 +47,27 @@ def _captioned(table, places, captions):
     for (x, y), caption in zip(places, captions, strict=True):
         draw.text((x + 3, y + 1), caption, fill=INK)
     return np.array(picture)
+
+
+def tiles(images: Sequence[np.ndarray], columns: int) -> np.ndarray:
+    """uint8 picture of equally large uint8 images, (H, W, 3) or (H, W, 4), row by row; what is
+    transparent shows white.
+    """
+    opaque = [_over_white(image) for image in images]
+    blank = np.full_like(opaque[0], 255)
+    rows = -(-len(opaque) // columns)
+    opaque += [blank] * (rows * columns - len(opaque))
+    table = np.pad(opaque, ((0, 0), (0, GAP), (0, GAP), (0, 0)), constant_values=LINE)
+    _, height, width, _ = table.shape
+    table = table.reshape(rows, columns, height, width, 3).transpose(0, 2, 1, 3, 4)
+    return table.reshape(rows * height, columns * width, 3)[:-GAP, :-GAP]
+
+
+def _over_white(image):
+    if image.shape[2] == 3:
+        return image
+    alpha = image[..., 3:] / 255
+    return to_8bit(image[..., :3] / 255 * alpha + 1 - alpha)
 
 
 def _error(prediction, truth):

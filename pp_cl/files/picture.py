@@ -31,9 +31,14 @@ class Picture:
     features: np.ndarray | None = None
 
     def over(self, background: tuple[float, float, float]) -> np.ndarray:
-        """(H, W, 3) float32 in [0, 1]: the object over a colour, sRGB in [0, 1]."""
-        behind = (1 - self.alpha)[..., None]
-        return np.clip(self.colour + behind * (np.float32(background) - 1), 0, 1)
+        """(H, W, 3) float32 in [0, 1]: the object over a colour, sRGB in [0, 1]; where nothing is,
+        exactly that colour. Over white it is `colour`, as the network made it.
+        """
+        if tuple(background) == WHITE:
+            return self.colour
+        rgba = self.rgba()
+        alpha = rgba[..., 3:]
+        return rgba[..., :3] * alpha + (1 - alpha) * np.float32(background)
 
     def rgba(self) -> np.ndarray:
         """(H, W, 4) float32 in [0, 1]: straight (not premultiplied) colour, and alpha."""
@@ -68,6 +73,12 @@ def srgb_to_linear(values: np.ndarray) -> np.ndarray:
     return np.where(values <= 0.04045, values / 12.92, ((values + 0.055) / 1.055) ** 2.4).astype(
         np.float32
     )
+
+
+def linear_to_srgb(values: np.ndarray) -> np.ndarray:
+    """The inverse of srgb_to_linear: linear light in [0, 1] to sRGB."""
+    low = values <= 0.0031308
+    return np.where(low, 12.92 * values, 1.055 * values ** (1 / 2.4) - 0.055).astype(np.float32)
 
 
 def mean_picture(pictures: list[Picture]) -> Picture:

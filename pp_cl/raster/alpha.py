@@ -60,7 +60,8 @@ class Alpha(BlendWeights):
             transmittance=self._buffers.transmittance,
         )
         shaded = self._list_shaded(pairs, pair_role) if least > 0 else pairs.seen
-        return PixelWeights(has_roles, pair_weight, pair_role, pixel_entry, shaded)
+        transmittance = self._buffers.transmittance[: pairs.pixels]
+        return PixelWeights(has_roles, pair_weight, pair_role, pixel_entry, shaded, transmittance)
 
     def rest(
         self,
@@ -70,19 +71,21 @@ class Alpha(BlendWeights):
         *,
         features: Array,
         grad_features: Array,
+        grad_alpha: Array | None = None,
     ) -> Array:
-        """As BlendWeights: B of each pair, G times what is composited behind it."""
+        """As BlendWeights: B of each pair, G times what is composited behind it, minus g."""
         rest = self._buffers.rest[: max(1, pairs.total)]
-        self.dev.program("raster/alpha").launch(
+        self.dev.program("raster/alpha", HAS_GRAD_ALPHA=int(grad_alpha is not None)).launch(
             "alpha_rest",
             pairs.pixels,
             hw=pairs.pixels,
             pixel_offset=pairs.pixel_offset,
             pair_key=pairs.pair_key,
             pixel_entry=weights.pixel_entry,
-            transmittance=self._buffers.transmittance,
+            transmittance=weights.transmittance,
             point_features=point_features,
             grad_features=grad_features,
+            grad_alpha=weights.transmittance if grad_alpha is None else grad_alpha,
             rest=rest,
         )
         return rest

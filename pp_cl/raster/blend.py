@@ -91,11 +91,20 @@ class Blend:
         *,
         features: Array,
         grad_features: Array,
+        grad_alpha: Array | None = None,
     ) -> BlendGradient:
-        """Prepare the backward pass of forward(pairs, weights, point_features, features)."""
+        """Prepare the backward pass of forward(pairs, weights, point_features, features).
+
+        grad_alpha: as BlendWeights.rest takes it.
+        """
         self._buffers.require(self.table(pairs.points))
         rest = self.weighing.rest(
-            pairs, weights, point_features, features=features, grad_features=grad_features
+            pairs,
+            weights,
+            point_features,
+            features=features,
+            grad_features=grad_features,
+            grad_alpha=grad_alpha,
         )
         return BlendGradient(pairs, weights, point_features, grad_features, rest)
 

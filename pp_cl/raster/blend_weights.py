@@ -28,7 +28,8 @@ class PixelWeights:
     cl/raster/pair_role.h. pixel_entry: (P,) uint64, weight bits << 32 | point, each pixel's hits by
     depth; dropped hits end a pixel's list with an entry of no point that holds their weight or a
     bound of it. shaded: (S,) uint32, ascending, the points with a hit that is not dropped: no other
-    point's features are read, no other point gets a gradient.
+    point's features are read, no other point gets a gradient. transmittance: (HW,) float32, what
+    is left for the background, None of a softmax.
     """
 
     has_roles: bool
@@ -36,6 +37,7 @@ class PixelWeights:
     pair_role: Array
     pixel_entry: Array
     shaded: Array
+    transmittance: Array | None = None
 
 
 class BlendWeights(ABC):
@@ -104,11 +106,13 @@ class BlendWeights(ABC):
         *,
         features: Array,
         grad_features: Array,
+        grad_alpha: Array | None = None,
     ) -> Array:
         """(HW,) or, with rest_by_pair, (P,) float32: what G.f of a hit is compared with.
 
         weights: the last ones computed. point_features: (N, 16); features, grad_features: F and
-        G, (H, W, 16), of Blend.forward with these weights.
+        G, (H, W, 16), of Blend.forward with these weights. grad_alpha: g = dL/d(1 - T), (HW,), of
+        weights with a transmittance; None: 0.
         """
 
     def _reserve(self, pairs, has_roles):

@@ -16,8 +16,8 @@ class AlphaDepth(NamedTuple):
     """What the points alone tell of a view, before the network; float32 arrays (H, W).
 
     alpha: share of the pixel that is not background, in [0, 1]. depth: along the camera's axis,
-    world units, mean by blend weight; median: the depth at which half of the weight is reached;
-    both infinite where alpha is 0.
+    world units, mean by blend weight; median: where half of the weight is reached, interpolated
+    between hits; both infinite where alpha is 0.
     """
 
     alpha: Array

@@ -68,8 +68,11 @@ class Softmax(BlendWeights):
         *,
         features: Array,
         grad_features: Array,
+        grad_alpha: Array | None = None,
     ) -> Array:
         """As BlendWeights: G.F of each pixel."""
+        if grad_alpha is not None:
+            raise ValueError("a softmax has no gradient of alpha")
         rest = self._buffers.rest
         self.dev.program("raster/softmax").launch(
             "softmax_rest",

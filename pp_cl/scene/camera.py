@@ -1,5 +1,6 @@
 """The pinhole camera of cl/camera.h."""
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -83,6 +84,19 @@ class Camera:
             width=self.width // factor,
             height=self.height // factor,
         )
+
+    def resized(self, width: int, height: int) -> "Camera":
+        """The camera whose image has this many pixels and shows as much across its width."""
+        scale = width / self.width
+        cx = scale * self.cx
+        cy = scale * (self.cy - self.height / 2) + height / 2
+        fx, fy = scale * self.fx, scale * self.fy
+        return replace(self, fx=fx, fy=fy, cx=cx, cy=cy, width=width, height=height)
+
+    def with_angle(self, radians: float) -> "Camera":
+        """The camera with this angle of view across the width of its image."""
+        scale = self.width / 2 / math.tan(radians / 2) / self.fx
+        return replace(self, fx=scale * self.fx, fy=scale * self.fy)
 
     def padded(self, multiple: int) -> tuple["Camera", int, int]:
         """(camera, left, top): enlarged so that `multiple` divides both sides; this camera's image

@@ -35,11 +35,21 @@ class Target:
         box: (x0, y0, width, height), reduced pixels; may reach outside of the image. jitter: stored
         pixels by which all blocks lie further right and down. View.crop_camera gives the camera.
         """
+        target = self.dev.empty((box[3], box[2], 3))
+        self._launch("target_forward", box, jitter, target=target)
+        return target
+
+    def alpha(self, box: tuple[int, int, int, int], jitter: tuple[int, int] = (0, 0)) -> Array:
+        """(height, width) float32: the mean alpha of the same pixels, 0 outside of the image."""
+        alpha = self.dev.empty((box[3], box[2]))
+        self._launch("target_alpha", box, jitter, alpha=alpha)
+        return alpha
+
+    def _launch(self, kernel, box, jitter, **output):
         x0, y0, width, height = box
         downscale = self._view.downscale
-        target = self.dev.empty((height, width, 3))
         self.program.launch(
-            "target_forward",
+            kernel,
             (width, height),
             width=width,
             height=height,
@@ -49,9 +59,8 @@ class Target:
             image_width=self._image.shape[1],
             image_height=self._image.shape[0],
             image=self._image,
-            target=target,
+            **output,
         )
-        return target
 
     def whole(self) -> np.ndarray:
         """(height, width, 3) float32, on the host: the loaded view's whole reduced image."""

@@ -41,6 +41,11 @@ class View:
         """The camera of the reduced image."""
         return self.stored_camera.downscaled(self.downscale)
 
+    @cached_property
+    def has_mask(self) -> bool:
+        """Whether some pixel is not wholly opaque."""
+        return bool((self.image[..., 3] < 255).any())
+
     def reduced(self, downscale: int) -> "View":
         """The same photograph reduced `downscale` times from its stored resolution.
 

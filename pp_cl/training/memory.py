@@ -19,6 +19,7 @@ from pp_cl.render import NETWORK_MULTIPLE, Renderer
 from pp_cl.scene.camera import Camera
 from pp_cl.scene.views import View
 from pp_cl.training.loss import Loss
+from pp_cl.training.mask import MaskLoss
 from pp_cl.training.optimiser import Optimiser
 from pp_cl.training.perceptual import PerceptualLoss
 from pp_cl.training.point_state import PointState
@@ -58,10 +59,15 @@ def memory_plan(config: Config, model: Model, views: list[View], refinements: in
         ),
         (f"network at {size[1]}x{size[0]}", _network_table(model, size)),
         ("loss", Loss.table(image, target, train.ssim_weight)),
+        ("mask loss", MaskLoss.table(*size) if train.mask_weight else {}),
         *(_perceptual_tables(model.net, target) if train.perceptual_weight else ()),
         (
             "photograph and target",
-            {"image": (views[0].image.shape, np.uint8), "target": (target, np.float32)},
+            {
+                "image": (views[0].image.shape, np.uint8),
+                "target": (target, np.float32),
+                "alpha": (target[:2], np.float32),
+            },
         ),
     ]
 

@@ -1,6 +1,8 @@
 """What a training shows while it runs, on a terminal and elsewhere."""
 
 import io
+import os
+import pty
 from types import SimpleNamespace
 
 import pytest
@@ -54,6 +56,19 @@ def test_a_terminal_has_one_line(training, monkeypatch):
     last = text.rstrip("\n").rpartition("\r")[2]
     assert last.startswith("100%|") and " 400/400, " in last and "step/s, 00:00 left" in last
     assert last.rstrip().endswith(", PSNR 27.3 (test 25.5), 1200 points, 1.50 GiB")
+
+
+def test_a_terminal_that_tells_no_size_shows_the_line(training, monkeypatch):
+    """As those of containers and of `script` do, whose size is 0 x 0."""
+    master, slave = pty.openpty()
+    monkeypatch.setattr("pp_cl.commands.progress.REDRAWN", 0)
+    with open(slave, "w") as stream:
+        with progress.follow(training, stream) as follower:
+            follower(101, ROW)
+            follower(102, ROW)
+        text = os.read(master, 10_000).decode()
+    os.close(master)
+    assert "102/400" in text and "PSNR 27.3" in text
 
 
 @pytest.mark.parametrize("seconds, text", [(0, "0:00"), (61, "1:01"), (36_610, "10:10:10")])

@@ -52,6 +52,30 @@ def test_gradients(dev, rng, kind, mean, max_tracked, early_stop):
 
 
 @pytest.mark.parametrize("n", AWKWARD_SIZES)
+@pytest.mark.parametrize("early_stop", [0.0, 0.05])
+def test_a_gradient_of_alpha_is_one_of_a_feature_that_only_the_background_has(
+    dev, rng, n, early_stop
+):
+    """A feature that is 0 in all points is T, since the background's is 1."""
+    blended = alpha_scene(dev, rng, n=n, early_stop=early_stop)
+    grad_alpha = rng.normal(size=blended.grad.shape[0])
+    blended.point_features[:, 15] = 0
+    drops = {"early_stop": early_stop, "rule": "alpha"}
+    blended.scene.blend(blended.opacity, 0.1, blended.point_features, **drops)
+    blended.grad[:, 15] = -grad_alpha
+    expected = blended.oracle_gradients()
+    blended.grad[:, 15] = 0
+    gradients = blended.scene.gradients(blended.grad, grad_alpha)
+    assert relative_error(gradients["opacity"], expected[1]) < 2e-5
+    assert relative_error(gradients["features"][:, :15], expected[0][:, :15]) < 2e-5
+    without = blended.scene.gradients(blended.grad)
+    assert relative_error(without["opacity"], expected[1]) > 0.01 or n == 1
+    transmittance = blended.scene.weights.transmittance.get()
+    exact = 1 - blended.blend["weight"].sum(axis=0)
+    assert np.abs(transmittance - exact).max() < 1e-5
+
+
+@pytest.mark.parametrize("n", AWKWARD_SIZES)
 @pytest.mark.parametrize("size", [(1, 1), (31, 33)])
 def test_sizes(dev, rng, n, size):
     blended = alpha_scene(dev, rng, n=n, size=size, early_stop=1e-3)

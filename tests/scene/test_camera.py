@@ -70,3 +70,16 @@ def test_padding_keeps_every_pixel(rng, width, height):
     assert 0 <= padded.width - width < 4 and 0 <= padded.height - height < 4
     points = points_in_front(camera, rng)
     np.testing.assert_allclose(project(padded, points), project(camera, points) + [left, top])
+
+
+def test_resized_shows_as_much_across():
+    camera = Camera(np.eye(3, 4), 50, 60, 33, 20, 64, 48)
+    wide = camera.resized(128, 48)
+    assert (wide.fx, wide.fy, wide.cx, wide.cy) == (100, 120, 66, 16)
+    same = camera.resized(64, 48)
+    assert (same.fx, same.fy, same.cx, same.cy) == (50, 60, 33, 20)
+
+
+def test_an_angle_of_view():
+    camera = Camera(np.eye(3, 4), 50, 60, 32, 24, 64, 48).with_angle(np.pi / 2)
+    assert (camera.fx, camera.fy) == pytest.approx((32, 38.4))

@@ -40,6 +40,11 @@ def check(dev, view, downscale, box, jitter):
     expected = oracle.target_forward(view.image, downscale, left, top, *box[2:])
     assert result.shape == expected.shape
     assert np.abs(result - expected).max() < TOLERANCE
+    # over white, the object's share is what a black object would hide
+    black = np.concatenate([np.zeros_like(view.image[..., :3]), view.image[..., 3:]], axis=2)
+    hidden = 1 - oracle.target_forward(black, downscale, left, top, *box[2:])[..., 0]
+    alpha = target.alpha(box, jitter).get()
+    assert alpha.shape == hidden.shape and np.abs(alpha - hidden).max() < TOLERANCE
 
 
 @pytest.mark.parametrize("size", AWKWARD_SIZES)

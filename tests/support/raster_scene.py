@@ -97,9 +97,11 @@ class PairedPoints:
         roles = self.weights.pair_role.get()
         return roles if self.weights.has_roles else np.zeros(len(self.pairs.pair_pixel), np.uint8)
 
-    def gradients(self, grad_features):
-        """{"features": (N, 16), "opacity": (N,)} of sum(features * grad_features) after blend()."""
-        features, opacity = self.blending.backward(self._gradient(grad_features))
+    def gradients(self, grad_features, grad_alpha=None):
+        """{"features": (N, 16), "opacity": (N,)} of sum(features * grad_features) and, where given,
+        sum(alpha * grad_alpha) after blend().
+        """
+        features, opacity = self.blending.backward(self._gradient(grad_features, grad_alpha))
         return {"features": features.get(), "opacity": opacity.get()}
 
     def sphere_gradients(self, grad_features):
@@ -109,7 +111,9 @@ class PairedPoints:
         )
         return {"positions": positions.get(), "radius": radius.get()}
 
-    def _gradient(self, grad_features):
+    def _gradient(self, grad_features, grad_alpha=None):
+        if grad_alpha is not None:
+            grad_alpha = self.dev.upload(grad_alpha, np.float32)
         grad = self.dev.upload(np.reshape(grad_features, (*self.shape, 16)), np.float32)
         return self.blending.gradient(
             self.pairs,
@@ -117,6 +121,7 @@ class PairedPoints:
             self.point_features,
             features=self.features,
             grad_features=grad,
+            grad_alpha=grad_alpha,
         )
 
 

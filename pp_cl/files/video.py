@@ -1,0 +1,82 @@
+"""Films from frames, by imageio: MP4 and WebM with the ffmpeg of its wheel, GIF with Pillow."""
+
+import os
+from collections.abc import Iterable
+from pathlib import Path
+
+import numpy as np
+
+from pp_cl.errors import UserError
+
+FORMATS = ("mp4", "webm", "gif")
+MISSING = "films need the packages imageio and imageio-ffmpeg: pip install pp-cl[video]"
+
+
+def check_video(suffix: str) -> None:
+    """Raise UserError with the command that mends it where a film of this format cannot be made."""
+    try:
+        import imageio.v3  # noqa: F401
+
+        if suffix != "gif":
+            import imageio_ffmpeg
+
+            imageio_ffmpeg.get_ffmpeg_exe()
+    except (ImportError, RuntimeError):
+        raise UserError(f"{MISSING}; or write frames with --format png") from None
+
+
+def write_video(path: Path, frames: Iterable[np.ndarray], fps: float) -> None:
+    """Write a film of uint8 frames of one size, (H, W, 3), or (H, W, 4) with straight alpha, which
+    WebM keeps; atomically. An odd side is extended by a copy of its last row or column, as video
+    needs even ones.
+
+    path: its suffix, one of FORMATS, chooses the format. Raises UserError naming the file when it
+    cannot be written.
+    """
+    import imageio.v2 as imageio
+
+    temporary = path.with_name(f".{path.stem}.{os.getpid()}.tmp{path.suffix}")
+    frames = iter(frames)
+    first = next(frames)
+    try:
+        with imageio.get_writer(str(temporary), **_options(path.suffix[1:], first, fps)) as writer:
+            for frame in (first, *frames):
+                writer.append_data(_even(frame))
+        os.replace(temporary, path)
+    except OSError as error:
+        reason = " ".join(str(error).split())[:120]
+        raise UserError(
+            f"{path}: cannot be written ({reason}); check the folder, its permissions and free"
+            " space"
+        ) from error
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+def _options(suffix, frame, fps):
+    """Of imageio's writer."""
+    if suffix == "gif":
+        return {"mode": "I", "duration": 1000 / fps, "loop": 0}
+    alpha = frame.shape[2] == 4
+    options = {
+        "fps": fps,
+        "macro_block_size": 1,
+        "ffmpeg_log_level": "error",
+        "input_params": ["-threads", "2"],
+    }
+    if suffix == "mp4":
+        return options | {"codec": "libx264", "quality": 8, "pixelformat": "yuv420p"}
+    pixels = "yuva420p" if alpha else "yuv420p"
+    quality = ["-crf", "24", "-b:v", "0", "-auto-alt-ref", "0"]
+    return options | {
+        "codec": "libvpx-vp9",
+        "quality": None,
+        "pixelformat": pixels,
+        "output_params": quality,
+    }
+
+
+def _even(frame):
+    """The frame with even sides."""
+    height, width = frame.shape[:2]
+    return np.pad(frame, ((0, height % 2), (0, width % 2), (0, 0)), "edge")

@@ -1,0 +1,100 @@
+"""Paths of a camera around an object, made from the cameras that photographed it."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from pp_cl.scene.camera import Camera, look_at
+
+MARGIN = 0.95  # of the image that the object may fill
+HIGHEST = math.radians(60)  # elevation of an orbit or spiral; near the poles a picture would spin
+TURNS = 2  # of a spiral
+SAMPLED_POINTS = 20_000
+
+
+def up_of(cameras: Sequence[Camera]) -> np.ndarray:
+    """(3,) unit vector that is up in the photographs: as far as possible across all horizontal
+    edges of the images (people hold a camera level), on the side of their mean upper edge.
+    """
+    right, up = (np.stack([camera.pose[:, axis] for camera in cameras]) for axis in (0, 1))
+    mean = -up.mean(axis=0)
+    # the mean decides where the right axes leave more than one direction open
+    spread = right.T @ right / len(cameras) - 0.1 * np.outer(mean, mean)
+    direction = np.linalg.eigh(spread)[1][:, 0]
+    return direction if direction @ mean >= 0 else -direction
+
+
+def looked_at(cameras: Sequence[Camera]) -> np.ndarray:
+    """(3,) the world position nearest to the optical axes of all cameras, by least squares."""
+    forward = np.stack([camera.pose[:, 2] for camera in cameras])
+    eyes = np.stack([camera.eye for camera in cameras])
+    across = np.eye(3) - forward[:, :, None] * forward[:, None, :]  # (N, 3, 3) projectors
+    return np.linalg.lstsq(across.sum(0), np.einsum("nij,nj->i", across, eyes), rcond=1e-9)[0]
+
+
+class Surroundings:
+    """Where cameras were around an object.
+
+    cameras: those of the photographs. points: (N, 3), world positions of the object's points.
+    """
+
+    def __init__(self, cameras: Sequence[Camera], points: np.ndarray):
+        self.up = up_of(cameras)
+        self.centre = (points.min(axis=0) + points.max(axis=0)) / 2
+        step = max(1, len(points) // SAMPLED_POINTS)
+        self._points = points[::step] - self.centre
+        first, *offsets = (camera.eye - self.centre for camera in cameras)
+        offsets = np.array([first, *offsets])
+        self.distance = float(np.median(np.linalg.norm(offsets, axis=1)))
+        heights = offsets @ self.up / np.linalg.norm(offsets, axis=1)
+        self.elevations = np.clip(np.arcsin(np.clip(heights, -1, 1)), -HIGHEST, HIGHEST)
+        self._ahead = _unit(first - first @ self.up * self.up, self.up)
+        self._aside = np.cross(self.up, self._ahead)
+
+    def orbit(self, camera: Camera, frames: int) -> list[Camera]:
+        """A circle at the photographs' median elevation that begins where the first of them was
+        taken; the last frame is one step before the first. camera: size and angle of view.
+        """
+        angles = 2 * math.pi * np.arange(frames) / frames
+        return self._around(camera, angles, np.full(frames, np.median(self.elevations)))
+
+    def spiral(self, camera: Camera, frames: int) -> list[Camera]:
+        """Two turns from the lowest tenth of the photographs' elevations to the highest."""
+        low, high = np.quantile(self.elevations, [0.1, 0.9])
+        angles = TURNS * 2 * math.pi * np.arange(frames) / frames
+        return self._around(camera, angles, np.linspace(low, high, frames))
+
+    def _around(self, camera, angles, elevations):
+        """Cameras at these angles that look at the centre, from one distance: that of the
+        photographs, or farther where the object would be cut off.
+        """
+        offsets = [
+            math.cos(e) * (math.cos(a) * self._ahead + math.sin(a) * self._aside)
+            + math.sin(e) * self.up
+            for a, e in zip(angles, elevations, strict=True)
+        ]
+        poses = [look_at(offset, (0, 0, 0), self.up) for offset in offsets]
+        distance = max(self.distance, *(self._least_distance(camera, pose) for pose in poses))
+        centred = replace(camera, cx=camera.width / 2, cy=camera.height / 2)
+        return [
+            replace(centred, pose=np.column_stack([pose[:, :3], self.centre + distance * offset]))
+            for pose, offset in zip(poses, offsets, strict=True)
+        ]
+
+    def _least_distance(self, camera, pose):
+        """From which all points are in the image of a camera of this direction."""
+        x, y, z = (self._points @ pose[:, :3]).T
+        across = np.abs(x) * 2 * camera.fx / (MARGIN * camera.width) - z
+        down = np.abs(y) * 2 * camera.fy / (MARGIN * camera.height) - z
+        return float(max(across.max(), down.max()))
+
+
+def _unit(vector, up):
+    """The vector at length 1; where it is 0, some unit vector across `up`."""
+    length = np.linalg.norm(vector)
+    if length > 1e-9:
+        return vector / length
+    across = np.cross(up, np.eye(3)[np.argmin(np.abs(up))])
+    return across / np.linalg.norm(across)

@@ -1,0 +1,94 @@
+"""Cameras from a file of another program, without images: nerfstudio's camera_path.json, a
+transforms.json, and the cameras.json of 3D Gaussian Splatting and brush.
+"""
+
+import math
+from pathlib import Path
+
+import numpy as np
+
+from pp_cl.errors import UserError
+from pp_cl.scene.camera import Camera
+from pp_cl.scene.readers.frame import GL_FROM_CV, Frame, pinhole, read_json, rigid_pose
+
+FORMATS = (
+    "a camera_path.json (with camera_path), a transforms.json (with frames), or a cameras.json (a"
+    " list)"
+)
+POSE_SHAPES = {"rotation": (3, 3), "position": (3,)}
+MOST_PIXELS = 2**15  # a side; the pixel boxes of points are 16-bit
+
+
+def read_cameras(file: Path, size: tuple[int, int] | None = None) -> list[Camera]:
+    """The cameras of a file, in its order and world.
+
+    size: (width, height) for frames that do not state theirs. Raises UserError naming the file and
+    the key that is missing or wrong.
+    """
+    if not file.is_file():
+        raise UserError(f"{file}: no such file; give orbit, spiral, a split, or {FORMATS}")
+    data = read_json(file)
+    if isinstance(data, list):
+        read, frames, listed, shared = _splatting_camera, data, "", {}
+    elif isinstance(data, dict) and "camera_path" in data:
+        read, listed, shared = _path_camera, "camera_path", data
+        frames = data["camera_path"]
+    elif isinstance(data, dict) and "frames" in data:
+        read, frames, listed, shared = _transforms_camera, data["frames"], "frames", data
+    else:
+        raise UserError(f"{file}: holds no cameras; give {FORMATS}")
+    if not isinstance(frames, list) or not frames:
+        raise UserError(f"{file}: {listed or 'the list'}: must hold one camera or more")
+    return [
+        read(Frame(file, shared, frame, index, listed), size) for index, frame in enumerate(frames)
+    ]
+
+
+def _transforms_camera(frame, size):
+    return pinhole(frame, *_size(frame, ("w", "h"), size))
+
+
+def _path_camera(frame, size):
+    """Of nerfstudio's viewer: fov is the angle across the height, in degrees."""
+    width, height = _size(frame, ("render_width", "render_height"), size)
+    fov = frame.number("fov", above=0, below=180)
+    if fov is None:
+        raise frame.error("fov", "is missing; add the angle across the height in degrees")
+    numbers = frame.get("camera_to_world")
+    if isinstance(numbers, list) and len(numbers) == 16:
+        numbers = [numbers[row : row + 4] for row in range(0, 16, 4)]
+    pose = rigid_pose(frame, "camera_to_world", numbers) @ GL_FROM_CV
+    focal = 0.5 * height / math.tan(math.radians(fov) / 2)
+    return Camera(pose, focal, focal, width / 2, height / 2, width, height)
+
+
+def _splatting_camera(frame, size):
+    """Camera-to-world rotation with OpenCV's axes, and position."""
+    width, height = _size(frame, ("width", "height"), size)
+    rotation, position = (_array(frame, key, s) for key, s in POSE_SHAPES.items())
+    pose = rigid_pose(frame, "rotation", np.column_stack([rotation, position]))
+    focal = [frame.number(key, above=0) for key in ("fx", "fy")]
+    if focal[0] is None:
+        raise frame.error("fx", "is missing; add the focal length in pixels")
+    fy = focal[0] if focal[1] is None else focal[1]
+    return Camera(pose, focal[0], fy, width / 2, height / 2, width, height)
+
+
+def _array(frame, key, shape):
+    try:
+        array = np.array(frame.get(key), np.float64)
+    except (TypeError, ValueError, OverflowError):
+        array = np.empty(0)
+    if array.shape != shape:
+        raise frame.error(key, f"must be {'x'.join(map(str, shape))} numbers")
+    return array
+
+
+def _size(frame, keys, given):
+    """(width, height) in whole pixels as the frame states them, else as given."""
+    stated = [frame.number(key, above=0, below=MOST_PIXELS) for key in keys]
+    if None in stated:
+        if given is None:
+            raise frame.error(keys[stated.index(None)], "is missing; add it, or give --size WxH")
+        return given
+    return tuple(max(1, round(side)) for side in stated)

@@ -1,0 +1,81 @@
+"""The mask term of the loss: the rendered alpha should not exceed the photograph's."""
+
+import numpy as np
+from pyopencl.array import Array
+
+from pp_cl.device.buffers import Buffers, Table
+from pp_cl.device.device import Device
+
+
+class MaskLoss:
+    """Adds weight * mean max(alpha - mask, 0)^2 to a loss, for blends with a transmittance (alpha
+    compositing). At weight 0 it allocates nothing and adds nothing.
+
+    Without it points spread half a spacing beyond the outline, and the network hides them.
+    """
+
+    def __init__(self, dev: Device, weight: float):
+        self.dev = dev
+        self.weight = weight
+        self._buffers = Buffers(dev)
+        self._measured = False
+
+    @staticmethod
+    def table(height: int, width: int) -> Table:
+        """The scratch for a padded image of this size."""
+        shapes = {"grad_alpha": (height * width,), "row_term": (height,), "mean": (1,)}
+        return {name: (shape, np.float32) for name, shape in shapes.items()}
+
+    def add(
+        self,
+        transmittance: Array | None,
+        target_alpha: Array | None,
+        *,
+        size: tuple[int, int],
+        offset: tuple[int, int],
+        terms: Array,
+    ) -> Array | None:
+        """Adds the term to terms[0]; returns dL/dalpha (PH * PW,) float32, valid until the next
+        call, or None where there is no term.
+
+        transmittance: (PH * PW,) of the padded image, None for a blend that has none. target_alpha:
+        (H, W) in [0, 1], None for a photograph without mask. size: (PH, PW). offset: (left, top) of
+        the target in it.
+        """
+        self._measured = self.weight > 0 and transmittance is not None and target_alpha is not None
+        if not self._measured:
+            return None
+        (height, width), (h, w), (left, top) = size, target_alpha.shape, offset
+        buffers = self._buffers
+        buffers.require(self.table(height, width))
+        program = self.dev.program("training/mask")
+        program.launch(
+            "mask_gradient",
+            height,
+            ph=height,
+            pw=width,
+            h=h,
+            w=w,
+            left=left,
+            top=top,
+            weight=self.weight,
+            transmittance=transmittance,
+            target_alpha=target_alpha,
+            grad_alpha=buffers.grad_alpha,
+            row_term=buffers.row_term,
+        )
+        program.launch(
+            "mask_sum",
+            1,
+            ph=height,
+            pixels=h * w,
+            weight=self.weight,
+            row_term=buffers.row_term,
+            mean=buffers.mean,
+            terms=terms,
+        )
+        return buffers.grad_alpha
+
+    def terms(self) -> dict[str, float]:
+        """{"mask": the mean square of the last call of add()}, {} where there was none."""
+        return {"mask": float(self._buffers.mean.get()[0])} if self._measured else {}

@@ -1,0 +1,71 @@
+"""A rendered view over any background, transparent, in linear light."""
+
+import io
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from pp_cl.files.image import read_rgba
+from pp_cl.files.picture import Picture, linear_to_srgb, mean_picture, srgb_to_linear
+
+
+def picture(rng, height=7, width=5):
+    """(Picture, straight colours): a known object over white."""
+    straight = rng.random((height, width, 3)).astype(np.float32)
+    alpha = rng.random((height, width)).astype(np.float32)
+    alpha[0], alpha[1] = 0, 1
+    colour = straight * alpha[..., None] + 1 - alpha[..., None]
+    depth = np.where(alpha > 0, 3 + alpha, np.inf).astype(np.float32)
+    return Picture(colour, alpha, depth, depth), straight
+
+
+def test_it_is_what_the_object_shows_over_a_colour(rng):
+    shown, straight = picture(rng)
+    over = shown.over((0.2, 0.4, 0.6))
+    alpha = shown.alpha[..., None]
+    expected = straight * alpha + (1 - alpha) * np.float32([0.2, 0.4, 0.6])
+    np.testing.assert_allclose(over, expected, atol=1e-6)
+    np.testing.assert_allclose(shown.over((1, 1, 1)), shown.colour, atol=1e-6)
+
+
+def test_straight_colours_come_back(rng):
+    shown, straight = picture(rng)
+    rgba = shown.rgba()
+    np.testing.assert_array_equal(rgba[..., 3], shown.alpha)
+    seen = shown.alpha > 0.05
+    np.testing.assert_allclose(rgba[seen][:, :3], straight[seen], atol=1e-5)
+    assert np.isfinite(rgba).all()
+
+
+def test_premultiplied_linear_light(rng):
+    shown, straight = picture(rng)
+    linear, alpha = shown.premultiplied_linear(), shown.alpha[..., None]
+    expected = srgb_to_linear(straight) * alpha
+    seen = shown.alpha > 0.05
+    np.testing.assert_allclose(linear[seen][:, :3], expected[seen], atol=1e-5)
+
+
+def test_transfer_functions_are_inverse():
+    values = np.linspace(0, 1, 1001, dtype=np.float32)
+    np.testing.assert_allclose(linear_to_srgb(srgb_to_linear(values)), values, atol=1e-5)
+    # IEC 61966-2-1: 18 % gray is at 46 % of the signal
+    assert srgb_to_linear(np.float32(0.4613)) == pytest.approx(0.18, abs=1e-4)
+
+
+def test_it_is_saved_and_shown_in_a_notebook(rng, tmp_path):
+    shown, _ = picture(rng)
+    shown.save(tmp_path / "white.png")
+    shown.save(tmp_path / "clear.png", background=None)
+    white, clear = (read_rgba(tmp_path / f"{name}.png") for name in ("white", "clear"))
+    assert (white[..., 3] == 255).all() and (clear[0, :, 3] == 0).all()
+    there = np.array(Image.open(io.BytesIO(shown._repr_png_())))
+    np.testing.assert_array_equal(there, white[..., :3])
+
+
+def test_the_mean_of_samples(rng):
+    (one, _), (two, _) = picture(rng), picture(rng)
+    mean = mean_picture([one, two])
+    np.testing.assert_allclose(mean.colour, (one.colour + two.colour) / 2, rtol=1e-6)
+    np.testing.assert_allclose(mean.alpha, (one.alpha + two.alpha) / 2, rtol=1e-6)
+    np.testing.assert_array_equal(mean.depth, one.depth)

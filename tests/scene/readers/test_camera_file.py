@@ -1,0 +1,122 @@
+"""Cameras of other programs' files, against poses worked out by hand."""
+
+import json
+
+import numpy as np
+import pytest
+from support.scenes import ring_cameras
+
+from pp_cl.errors import UserError
+from pp_cl.scene.readers.camera_file import read_cameras
+
+CAMERAS = ring_cameras(3, 64)
+TO_GL = np.diag([1, -1, -1, 1])
+
+
+def written(folder, content):
+    path = folder / "cameras.json"
+    path.write_text(content if isinstance(content, str) else json.dumps(content))
+    return path
+
+
+def world(camera):
+    """4x4 camera-to-world, OpenGL's axes, as a list."""
+    return (np.vstack([camera.pose, [0, 0, 0, 1]]) @ TO_GL).tolist()
+
+
+def splatting(camera):
+    """An entry of cameras.json: OpenCV's axes."""
+    return {
+        "id": 0,
+        "img_name": "a",
+        "width": camera.width,
+        "height": camera.height,
+        "position": camera.eye.tolist(),
+        "rotation": camera.pose[:, :3].tolist(),
+        "fx": camera.fx,
+        "fy": camera.fy,
+    }
+
+
+def path_entry(camera):
+    """An entry of nerfstudio's camera_path: the angle across the height."""
+    fov = np.degrees(2 * np.arctan(0.5 * camera.height / camera.fy))
+    return {"camera_to_world": np.ravel(world(camera)).tolist(), "fov": fov, "aspect": 1}
+
+
+CONTENTS = {
+    "cameras.json": [splatting(camera) for camera in CAMERAS],
+    "transforms.json": {
+        "fl_x": CAMERAS[0].fx,
+        "w": 64,
+        "h": 64,
+        "frames": [{"file_path": "no/such.png", "transform_matrix": world(c)} for c in CAMERAS],
+    },
+    "camera_path.json": {
+        "camera_type": "perspective",
+        "render_width": 64,
+        "render_height": 64,
+        "camera_path": [path_entry(camera) for camera in CAMERAS],
+    },
+}
+
+
+@pytest.mark.parametrize("name", CONTENTS)
+def test_cameras_are_read(tmp_path, name):
+    read = read_cameras(written(tmp_path, CONTENTS[name]))
+    assert len(read) == 3
+    for got, camera in zip(read, CAMERAS, strict=True):
+        np.testing.assert_allclose(got.pose, camera.pose, atol=1e-9)
+        intrinsics = (got.fx, got.fy, got.cx, got.cy, got.width, got.height)
+        assert intrinsics == pytest.approx((camera.fx, camera.fy, 32, 32, 64, 64))
+
+
+def test_a_size_is_taken_from_the_command_where_the_file_has_none(tmp_path):
+    content = {"camera_angle_x": 0.7, "frames": [{"transform_matrix": world(CAMERAS[0])}]}
+    (camera,) = read_cameras(written(tmp_path, content), (80, 40))
+    assert (camera.width, camera.height) == (80, 40)
+    assert camera.fx == pytest.approx(40 / np.tan(0.35))
+    with pytest.raises(UserError, match="frames.0.*w: is missing; add it, or give --size"):
+        read_cameras(written(tmp_path, content))
+
+
+def changed(name, key, value):
+    """CONTENTS[name] with one key of its second camera changed."""
+    content = json.loads(json.dumps(CONTENTS[name]))
+    listed = content if isinstance(content, list) else content.get("frames", ())
+    listed = listed or content["camera_path"]
+    listed[1][key] = value
+    return content
+
+
+@pytest.mark.parametrize(
+    "content, named",
+    [
+        ("{", "line 1"),
+        ("[]", "must hold one camera"),
+        ("3", "holds no cameras"),
+        ({"frames": 3}, "frames: must hold"),
+        ({"camera_path": [7]}, r"camera_path\[0\]: must be a JSON object"),
+        (changed("cameras.json", "position", [1, 2]), r"\[1\].position"),
+        (changed("cameras.json", "position", [1, 2, float("nan")]), r"\[1\].rotation"),
+        (changed("cameras.json", "rotation", [[2, 0, 0], [0, 1, 0], [0, 0, 1]]), "no rotation"),
+        (changed("cameras.json", "fx", None), "fx: is missing"),
+        (changed("cameras.json", "width", -3), "width"),
+        (changed("cameras.json", "height", 1e9), "height"),
+        (changed("camera_path.json", "fov", 200), "fov"),
+        (changed("camera_path.json", "fov", None), "fov: is missing"),
+        (changed("camera_path.json", "camera_to_world", [1] * 15), "camera_to_world"),
+        (changed("transforms.json", "transform_matrix", "x"), "transform_matrix"),
+        (changed("transforms.json", "k1", 0.1), "distortion"),
+    ],
+)
+def test_what_is_wrong_is_one_line(tmp_path, content, named):
+    path = written(tmp_path, content)
+    with pytest.raises(UserError, match=named) as caught:
+        read_cameras(path)
+    assert str(path) in str(caught.value) and "\n" not in str(caught.value)
+
+
+def test_no_such_file(tmp_path):
+    with pytest.raises(UserError, match="no such file; give orbit"):
+        read_cameras(tmp_path / "a.json")

@@ -1,0 +1,98 @@
+"""Paths around an object: smooth, upright, and with the whole object in view."""
+
+import numpy as np
+import pytest
+from support.ball_views import CENTRE, ball_camera
+from support.scenes import ring_cameras
+
+from pp_cl.scene.camera import Camera
+from pp_cl.scene.camera_path import MARGIN, Surroundings, looked_at, up_of
+
+
+def turned(cameras, rotation, shift):
+    """The cameras in a world that was turned and moved."""
+    return [
+        Camera(
+            np.column_stack([rotation @ c.pose[:, :3], rotation @ c.eye + shift]),
+            c.fx,
+            c.fy,
+            c.cx,
+            c.cy,
+            c.width,
+            c.height,
+        )
+        for c in cameras
+    ]
+
+
+@pytest.fixture
+def tilted(rng):
+    """(cameras, points, up) of an object in a world whose up is no axis."""
+    rotation = np.linalg.qr(rng.normal(size=(3, 3)))[0]
+    rotation *= np.sign(np.linalg.det(rotation))
+    shift = np.array([5.0, -3.0, 2.0])
+    points = rng.uniform(-1, 1, (500, 3)) * [0.9, 0.4, 0.7]
+    cameras = turned(ring_cameras(12, 64), rotation, shift)
+    return cameras, points @ rotation.T + shift, rotation[:, 2]
+
+
+def test_up_is_found_whatever_the_axes(tilted):
+    cameras, _, up = tilted
+    np.testing.assert_allclose(up_of(cameras), up, atol=1e-6)
+
+
+def test_up_of_one_side_and_of_one_camera(tilted):
+    cameras, _, up = tilted
+    assert up_of(cameras[:3]) @ up > 0.99
+    one = up_of(cameras[:1])
+    np.testing.assert_allclose(one, -cameras[0].pose[:, 1], atol=1e-6)
+
+
+def test_up_is_not_fooled_by_cameras_that_all_look_down():
+    """Their mean upper edge leans outwards only where they stand on one side."""
+    cameras = ring_cameras(4, 64)[:2]
+    assert up_of(cameras)[2] > 0.95
+
+
+@pytest.mark.parametrize("path", ["orbit", "spiral"])
+def test_the_object_is_whole_and_nothing_jumps(tilted, path):
+    cameras, points, up = tilted
+    around = Surroundings(cameras, points)
+    frames = getattr(around, path)(cameras[0].resized(120, 60), 48)
+    assert len(frames) == 48
+    for camera in frames:
+        assert (camera.width, camera.height) == (120, 60)
+        assert np.linalg.det(camera.pose[:, :3]) == pytest.approx(1)
+        assert abs(camera.pose[:, 0] @ up) < 1e-6 and camera.pose[:, 1] @ up < 0  # level, upright
+        x, y, z = ((points - camera.eye) @ camera.pose[:, :3]).T
+        assert (z > 0).all()
+        assert (np.abs(camera.fx * x / z) <= MARGIN * 60 + 1e-6).all()
+        assert (np.abs(camera.fy * y / z) <= MARGIN * 30 + 1e-6).all()
+    eyes = np.array([camera.eye for camera in frames])
+    steps = np.linalg.norm(np.diff(eyes, axis=0), axis=1)
+    assert steps.max() < 1.1 * np.median(steps)
+    if path == "orbit":
+        assert np.linalg.norm(eyes[0] - eyes[-1]) == pytest.approx(steps[0], rel=1e-6)
+
+
+def test_an_orbit_begins_at_the_first_photograph(tilted):
+    cameras, points, up = tilted
+    around = Surroundings(cameras, points)
+    first = around.orbit(cameras[0], 10)[0].eye - around.centre
+    there = cameras[0].eye - around.centre
+    flat = [v - v @ up * up for v in (first, there)]
+    cosine = flat[0] @ flat[1] / np.linalg.norm(flat[0]) / np.linalg.norm(flat[1])
+    assert cosine == pytest.approx(1, abs=1e-6)
+
+
+def test_a_camera_above_the_object_is_no_division_by_zero():
+    camera = Camera.look_at((0, 0, 4), (0, 0, 0), (0, 1, 0), fx=50, width=64, height=64)
+    points = np.array([[-1.0, -1, -1], [1, 1, 1]])
+    for frame in Surroundings([camera], points).orbit(camera, 5):
+        assert np.isfinite(frame.pose).all()
+
+
+def test_the_optical_axes_meet_where_the_cameras_look(rng):
+    cameras = [ball_camera(CENTRE + 4 * d, CENTRE) for d in rng.normal(size=(7, 3))]
+    np.testing.assert_allclose(looked_at(cameras), CENTRE, atol=1e-9)
+    assert np.isfinite(looked_at(cameras[:1])).all()
