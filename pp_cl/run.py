@@ -122,7 +122,7 @@ class Training:
     def run(
         self,
         on_step: OnStep | None = None,
-        is_stopped: Callable[[], object] = lambda: False,
+        is_stopped: Callable[[], bool] = lambda: False,
     ) -> float:
         """Train to the end with log, previews and checkpoints; returns the seconds of training,
         those before an interruption included.

@@ -24,6 +24,7 @@ def test_a_key_that_a_stored_run_lacks_has_its_presets_value(name, tmp_path):
     expected = preset(name)
     expected.train.seed, expected.train.opacity_rate_steps = 3, 0
     expected.raster.blend, expected.points.opacity = "softmax", 1.0
+    expected.train.mask_weight = 0.0
     assert load_config(tmp_path / "config.json") == expected
 
 

@@ -85,7 +85,8 @@ def run(options: argparse.Namespace) -> None:
 def _given_settings(options):
     """[(key, text, origin)] of every setting on the command line."""
     texts = {name: getattr(options, name) for name in SHORT}
-    given = [(SHORT[name], text, f"--{name}") for name, text in texts.items() if text is not None]
+    texts = {name: text for name, text in texts.items() if text is not None}
+    given = [(SHORT[name], text, f"--{name.replace('_', '-')}") for name, text in texts.items()]
     return given + shared.read_set(options.set)
 
 
@@ -140,7 +141,7 @@ def _run(training, options):
             for follower in followers:
                 follower(step, row)
 
-        seconds = training.run(on_step, lambda: caught)
+        seconds = training.run(on_step, lambda: bool(caught))
     if trainer.step < training.config.train.iterations:
         raise Stopped(
             f"stopped at step {trainer.step}; wrote {folder.checkpoint}; the same command goes on",

@@ -1,0 +1,34 @@
+"""The exact depth of the demo against the mesh of the same object, and the measures."""
+
+import numpy as np
+import trimesh
+
+from pp_cl.scene.demo import demo_mesh, demo_scene
+from tools.depth_error import DemoSurface, near_share, overlap, pixel_rays
+
+
+def test_the_depth_is_where_rays_meet_the_mesh(dev, rng):
+    camera = demo_scene(dev, ["test"], size=48).splits["test"][3].camera
+    depth = DemoSurface(dev).depth(camera)
+    vertices, faces = demo_mesh(dev, 256)
+    rays = pixel_rays(camera)
+    chosen = [tuple(p) for p in rng.integers(0, 48, (60, 2))]
+    mesh = trimesh.Trimesh(vertices, faces, process=False)
+    directions = np.array([rays[p] for p in chosen])
+    places, index, _ = mesh.ray.intersects_location(
+        np.tile(camera.eye, (len(chosen), 1)), directions, multiple_hits=False
+    )
+    exact = np.full(len(chosen), np.inf)
+    exact[index] = (places - camera.eye) @ camera.pose[:, 2]
+    found = np.array([depth[p] for p in chosen])
+    agree = np.isfinite(exact) == np.isfinite(found)
+    assert agree.mean() > 0.95 and np.isfinite(exact).sum() > 5
+    both = np.isfinite(exact) & np.isfinite(found)
+    assert np.median(np.abs(exact[both] - found[both])) < 0.004  # the mesh's edge is 0.0075
+
+
+def test_measures():
+    exact = np.array([[1.0, 2.0], [3.0, np.inf]])
+    seen = np.isfinite(exact)
+    assert near_share(exact + [[0.1, 0.3], [-0.1, 0]], exact, seen, 0.2) == 2 / 3
+    assert overlap(np.array([[1, 1, 0]], bool), np.array([[0, 1, 1]], bool)) == 1 / 3
