@@ -32,7 +32,9 @@ class SceneConfig:
     """The photographs."""
 
     path: str = setting("", "folder of the scene, or the word demo")
-    downscale: int = setting(1, "reduce the images this many times to train and evaluate", 1, 64)
+    downscale: int = setting(
+        1, "reduce the images this many times; if not given, to about the preset's size", 1, 64
+    )
 
 
 @dataclass
