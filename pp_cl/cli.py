@@ -10,12 +10,13 @@ import warnings
 from collections.abc import Sequence
 
 from pp_cl import __version__
-from pp_cl.errors import UserError
+from pp_cl.errors import Stopped, UserError
 
 COMMANDS = (
     "devices",
     "train",
     "eval",
+    "info",
     "render",
     "compare",
     "bench",
@@ -39,6 +40,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         return 0
     except UserError as error:
         return _fail(str(error))
+    except Stopped as stopped:
+        return _fail(str(stopped), stopped.status)
     except OSError as error:
         what = f"{error.filename or 'file'}: {error.strerror or error}"
         return _fail(f"{what}; check the path, permissions and free space")

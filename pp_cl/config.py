@@ -32,7 +32,9 @@ class SceneConfig:
     """The photographs."""
 
     path: str = setting("", "folder of the scene, or the word demo")
-    downscale: int = setting(1, "reduce the images this many times to train and evaluate", 1, 64)
+    downscale: int = setting(
+        1, "reduce the images this many times; if not given, to about the preset's size", 1, 64
+    )
 
 
 @dataclass
@@ -204,7 +206,16 @@ class TrainConfig:
         2**20,
     )
     log_every: int = setting(50, "steps between two rows of log.jsonl", 1, 10**8)
-    previews: int = setting(4, "preview images written in the course of the run", 0, 1000)
+    previews: int = setting(
+        4, "preview images written in the course of the run; the first comes early besides", 0, 1000
+    )
+    eval_every: int = setting(
+        0,
+        "steps between two measurements of a few views of the split val, else test: test_psnr in"
+        " log.jsonl (0: none)",
+        0,
+        10**8,
+    )
 
 
 @dataclass

@@ -1,7 +1,17 @@
-"""The one exception a user may see."""
+"""The exceptions a user may see."""
 
 
 class UserError(Exception):
     """Bad input or environment. The message is one line that names the file (and key) and the
     mend.
     """
+
+
+class Stopped(Exception):
+    """A signal ended a command in good order. The message is one line that says how to go on;
+    status: the exit status, 128 and the signal's number.
+    """
+
+    def __init__(self, message: str, status: int) -> None:
+        super().__init__(message)
+        self.status = status

@@ -46,11 +46,16 @@ PRESETS = {
     },
 }
 
+# Pixels of the longer side of the images that a preset is made for: it reduces larger ones. None:
+# as they are.
+IMAGE_SIZES = {"tiny": 200, "small": 400, "full": None, "paper": None}
+
 # Settings with a short name on the command line and in run.train_scene().
 SHORT = {
     "iterations": "train.iterations",
     "points": "points.count",
     "downscale": "scene.downscale",
+    "eval_every": "train.eval_every",
     "seed": "train.seed",
     "memory": "train.memory_gib",
     "tolerance": "network.tolerance",

@@ -1,8 +1,9 @@
 """A training that starts or goes on in the folder of a run."""
 
+import math
 import time
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -13,17 +14,24 @@ from pp_cl.device.device import Device
 from pp_cl.device.discover import open_device
 from pp_cl.errors import UserError
 from pp_cl.files.contact_sheet import write_comparison
+from pp_cl.files.image import to_8bit
 from pp_cl.files.run_folder import RunFolder
 from pp_cl.layers.policy import load_policy, policy_of_run
+from pp_cl.metrics.psnr_ssim import psnr
 from pp_cl.model import Model
 from pp_cl.network.unet import UNet
 from pp_cl.presets import SHORT
 from pp_cl.scene.hull import build_grid, depth_range, spacing_pixels
-from pp_cl.scene.open import fingerprint, open_scene
+from pp_cl.scene.open import fingerprint, measured_split, open_scene, preset_downscale
+from pp_cl.scene.views import View
 from pp_cl.train import Trainer
 from pp_cl.trained import Run, load_run
 from pp_cl.training.memory import Plan, memory_plan, spare_memory
 
+FIRST_PREVIEW = 10.0  # seconds; with a slow step and its writing it shows within 20
+MEASURED_VIEWS = 4
+
+OnStep = Callable[[int, dict[str, Any] | None], None]
 Stored = tuple[dict[str, Any], dict[str, np.ndarray]]  # header and arrays of a checkpoint
 
 
@@ -34,10 +42,12 @@ def run_config(
     given: Iterable[tuple[str, Any, str]] = (),
 ) -> Config:
     """Config of a training in `folder`: its stored one if it has one, else the preset's, with the
-    given settings.
+    given settings. Where these do not say scene.downscale, a new one reduces the images to about
+    the preset's size.
 
     scene: a folder, or the word demo. given: (key, value or its text, origin), which a stored run
-    must agree with. Raises UserError naming the first setting that differs or makes no sense.
+    must agree with. Raises UserError naming the first setting that differs or makes no sense, or
+    what is wrong with the scene's files.
     """
     if folder.config.exists():
         config, stored = load_config(folder.config), load_config(folder.config)
@@ -48,8 +58,11 @@ def run_config(
             )
     else:
         config, stored = preset(preset_name or "tiny"), None
-        assign(config, "scene.downscale", 2 if scene == "demo" else 1, "settings")
+    given = list(given)
     configure(config, scene, given)
+    if not stored and "scene.downscale" not in [key for key, _, _ in given]:
+        downscale = preset_downscale(config.scene.path, config.preset)
+        assign(config, "scene.downscale", downscale, "preset")
     if stored:
         _check_same(config, stored, folder)
     return config
@@ -93,6 +106,7 @@ class Training:
 
     info: what its checkpoints' headers hold beside the model's. plan: of memory_plan. hull:
     None if it goes on from a checkpoint. origin: of the choice of convolutions, a line of text.
+    measured: the views that train.eval_every measures.
     """
 
     folder: RunFolder
@@ -102,13 +116,21 @@ class Training:
     plan: Plan
     hull: HullFacts | None
     origin: str
+    measured: list[View]
+    _preview_by: float = field(default=math.inf, init=False)  # time.monotonic()'s seconds
 
-    def run(self, on_step: Callable[[int, dict | None], None] | None = None) -> float:
+    def run(
+        self,
+        on_step: OnStep | None = None,
+        is_stopped: Callable[[], bool] = lambda: False,
+    ) -> float:
         """Train to the end with log, previews and checkpoints; returns the seconds of training,
         those before an interruption included.
 
         on_step(step, row) is called after each step, with its row of the log where it has one.
-        Raises UserError, before anything is written, where the memory is too small.
+        is_stopped() is asked after each step: where it is true, a checkpoint is written and the
+        training ends there, to be gone on with. Raises UserError, before anything is written, where
+        the memory is too small.
         """
         trainer, settings = self.trainer, self.config.train
         spare = spare_memory(self.plan, trainer.dev, settings.memory_gib)
@@ -116,13 +138,19 @@ class Training:
         self.folder.create(self.config.to_json())
         with self.folder.open_log(trainer.step) as log:
             seconds = log.seconds
+            first = trainer.step + 1
             while trainer.step < settings.iterations:
                 start = time.perf_counter()
                 terms = trainer.train_step()
                 seconds += time.perf_counter() - start
+                if trainer.step == first:  # the kernels are built
+                    self._expect_preview()
                 row = self._after_step(log, terms, seconds)
                 if on_step:
                     on_step(trainer.step, row)
+                if is_stopped() and trainer.step < settings.iterations:
+                    self._save(finished=False)
+                    return seconds
             start = time.perf_counter()
             trainer.finish()
             seconds += time.perf_counter() - start
@@ -134,18 +162,35 @@ class Training:
         """Row of the log, checkpoint and preview, where they are due; returns the row or None."""
         trainer, settings = self.trainer, self.config.train
         step, last, row = trainer.step, trainer.step == settings.iterations, None
-        if step % settings.log_every == 0 or last:
+        is_measured = settings.eval_every and step % settings.eval_every == 0
+        measured = self._measure() if is_measured else {}
+        if step % settings.log_every == 0 or last or is_measured:
             state = {"points": trainer.model.cloud.count, "rates": trainer.rates()}
-            row = self._row(seconds) | terms | state
+            row = self._row(seconds) | terms | state | measured
             log.write(row)
         if step % settings.checkpoint_every == 0 and not last:
             self._save(finished=False)
-        if last or (settings.previews and step % -(-settings.iterations // settings.previews) == 0):
+        due = settings.previews and step % -(-settings.iterations // settings.previews) == 0
+        if last or due or time.monotonic() >= self._preview_by:
             self._preview()
         return row
 
     def _row(self, seconds):
-        return {"step": self.trainer.step, "seconds": round(seconds, 3)}
+        device = self.trainer.dev.name
+        return {"step": self.trainer.step, "seconds": round(seconds, 3), "device": device}
+
+    def _measure(self):
+        """{"test_psnr": mean over the measured views, of 8-bit images} of the present model."""
+        trainer = self.trainer
+        pairs = [(trainer.render(view), trainer.target(view)) for view in self.measured]
+        return {"test_psnr": float(np.mean([psnr(to_8bit(a), to_8bit(b)) for a, b in pairs]))}
+
+    def _expect_preview(self):
+        """Be due an early preview, by the clock, where the run has none yet. It is an extra, which
+        no later step depends on.
+        """
+        wanted = self.config.train.previews and not any(self.folder.previews.glob("*.png"))
+        self._preview_by = time.monotonic() + FIRST_PREVIEW if wanted else math.inf
 
     def _save(self, finished):
         trainer = self.trainer
@@ -155,6 +200,7 @@ class Training:
     def _preview(self):
         """Prediction, truth and error of the first training view."""
         trainer, view = self.trainer, self.trainer.views[0]
+        self._preview_by = math.inf
         path = self.folder.previews / f"step_{trainer.step:06d}.png"
         write_comparison(path, [trainer.render(view)], [trainer.target(view)])
 
@@ -186,13 +232,20 @@ def open_training(
         policy = load_policy(dev, tolerance)
     net = UNet(dev, config.network.widths, seed=config.train.seed, policy=policy)
     views = open_scene(dev, config, ("train",)).splits["train"]
+    measured = _measured_views(dev, config) if config.train.eval_every else []
     if stored:
         trainer, info, hull = _resume(config, views, net, stored, file=folder.checkpoint)
     else:
         trainer, info, hull = _start(config, views, net)
     plan = memory_plan(config, trainer.model, trainer.views, trainer.refinements_to_come)
     info["tuning"] = policy.tuning
-    return Training(folder, config, trainer, info, plan, hull, policy.origin)
+    return Training(folder, config, trainer, info, plan, hull, policy.origin, measured)
+
+
+def _measured_views(dev, config):
+    """A few views of the split val, else test."""
+    split = measured_split(config.scene.path)
+    return open_scene(dev, config, (split,), most=MEASURED_VIEWS).splits[split]
 
 
 def _start(config, views, net):
@@ -206,7 +259,7 @@ def _start(config, views, net):
         hull.capped,
         hull.grid.dims,
         hull.grid.edge,
-        spacing_pixels(hull, views),
+        spacing_pixels(hull.grid, [view.camera for view in views]),
         near_far,
         time.perf_counter() - start,
     )
@@ -251,7 +304,7 @@ def train_scene(
     device: str | None = None,
     *,
     settings: dict[str, Any] | None = None,
-    on_step: Callable[[int, dict | None], None] | None = None,
+    on_step: OnStep | None = None,
     **options: Any,
 ) -> Run:
     """Train a scene into the folder `out`, or go on with the run there; a finished one is left

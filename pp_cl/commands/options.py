@@ -2,7 +2,10 @@
 
 import argparse
 import math
+import sys
+import webbrowser
 from collections.abc import Callable
+from pathlib import Path
 
 from pp_cl.config import assign, preset, validate
 from pp_cl.errors import UserError
@@ -52,6 +55,19 @@ def read_metrics(text: str) -> tuple[str, ...]:
     if not names or set(names) - set(METRICS):
         raise UserError(f"--metrics {text}: choose from {', '.join(METRICS)}")
     return names
+
+
+def add_open(parser: argparse.ArgumentParser) -> None:
+    """Add --open, for show."""
+    parser.add_argument(
+        "--open", action="store_true", help="show the written picture with the system's viewer"
+    )
+
+
+def show(path: Path | str) -> None:
+    """Open a picture with the system's viewer, or say that there is none."""
+    if not webbrowser.open(Path(path).resolve().as_uri()):
+        print(f"--open: this system names no viewer; open {path} yourself", file=sys.stderr)
 
 
 def read_shape(size: str, widths: str) -> tuple[int, tuple[int, ...]]:

@@ -2,6 +2,7 @@
 
 import argparse
 import sys
+from contextlib import ExitStack
 
 from pp_cl.commands import options as shared
 from pp_cl.config import help_lines
@@ -20,18 +21,26 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--preset",
         choices=PRESETS,
         help=(
-            "tiny (default): 200x200, minutes on a CPU; small: 400x400 and full: 800x800, longer;"
-            " paper: the paper's numbers"
+            "tiny (default): images of about 200 pixels, minutes on a CPU; small: of 400, and full:"
+            " of 800, longer; paper: the paper's numbers"
         ),
     )
     add("--iterations", metavar="N", help="steps of training")
     add("--points", metavar="N", help="wanted points on the grid")
-    add("--downscale", metavar="K", help="reduce the images K times (demo: 2, others: 1)")
+    add(
+        "--downscale", metavar="K", help="reduce the images K times (default: to the preset's size)"
+    )
     add("--seed", metavar="S", help="of everything random (0)")
     add(
         "--memory",
         metavar="GIB",
         help="device memory to use; what is not needed caches the hits of repeating views",
+    )
+    add("--eval-every", metavar="N", help="measure a few test views every N steps (never)")
+    add(
+        "--tensorboard",
+        action="store_true",
+        help="also write the curves to RUN/tensorboard (needs pp-cl[tensorboard])",
     )
     shared.add_tolerance(parser)
     shared.add_set(parser, "any other setting, see below")
@@ -46,7 +55,8 @@ def run(options: argparse.Namespace) -> None:
     from pp_cl.training.memory import plan_lines
 
     folder = RunFolder(options.out)
-    config = run_config(folder, options.scene, options.preset, _given_settings(options))
+    given, is_new = _given_settings(options), not folder.config.exists()
+    config = run_config(folder, options.scene, options.preset, given)
     for note in config.notes:
         print(f"pp-cl: {note}", file=sys.stderr)
     stored = stored_state(folder, config)
@@ -60,9 +70,11 @@ def run(options: argparse.Namespace) -> None:
     print(f"device: {dev.name} [{dev.info['platform']}]")
     training = open_training(dev, folder, config, stored)
     print(training.origin)
+    chosen = is_new and "scene.downscale" not in [key for key, _, _ in given]
+    print(_images_line(training, chosen))
     print(_first_line(training))
-    print("\n".join(plan_lines(training.plan, dev)))
-    seconds = _run_with_bar(training)
+    print("\n".join(plan_lines(training.plan, dev)), flush=True)
+    seconds = _run(training, options)
     print(
         f"trained {config.train.iterations} steps in {seconds:.1f} s;"
         f" {training.trainer.model.cloud.count} of {training.info['initial_points']} points remain;"
@@ -73,7 +85,8 @@ def run(options: argparse.Namespace) -> None:
 def _given_settings(options):
     """[(key, text, origin)] of every setting on the command line."""
     texts = {name: getattr(options, name) for name in SHORT}
-    given = [(SHORT[name], text, f"--{name}") for name, text in texts.items() if text is not None]
+    texts = {name: text for name, text in texts.items() if text is not None}
+    given = [(SHORT[name], text, f"--{name.replace('_', '-')}") for name, text in texts.items()]
     return given + shared.read_set(options.set)
 
 
@@ -99,23 +112,39 @@ def _first_line(training):
     )
 
 
-def _run_with_bar(training):
-    """Seconds of the training, run under a progress bar."""
-    from tqdm import tqdm
+def _images_line(training, chosen):
+    """The size of the images. chosen: whether the preset chose it."""
+    view = training.trainer.views[0]
+    stored, used = (f"{c.width}x{c.height}" for c in (view.stored_camera, view.camera))
+    if view.downscale == 1:
+        return f"images: {stored}"
+    why = f" for the preset {training.config.preset} (--downscale 1 keeps them)" if chosen else ""
+    return f"images: {stored}, reduced {view.downscale} times to {used}{why}"
 
-    bar = tqdm(
-        total=training.config.train.iterations,
-        initial=training.trainer.step,
-        unit="step",
-        delay=1e-6,  # shows from the first step on, not above an error before it
-        mininterval=1 if sys.stderr.isatty() else 30,
-        file=sys.stderr,
-    )
 
-    def on_step(_step, row):
-        bar.update()
-        if row:
-            bar.set_postfix(psnr=f"{row['psnr']:.2f}", points=row["points"], refresh=False)
+def _run(training, options):
+    """Seconds of the training, run to its end. Raises Stopped after Ctrl-C or SIGTERM."""
+    from pp_cl.commands.progress import follow
+    from pp_cl.commands.signals import first_signal
+    from pp_cl.errors import Stopped
+    from pp_cl.files.scalars import Scalars
 
-    with bar:
-        return training.run(on_step)
+    trainer, folder = training.trainer, training.folder
+    with ExitStack() as stack:
+        followers = [stack.enter_context(follow(training))]
+        if options.tensorboard:
+            scalars = Scalars(folder.path / "tensorboard", trainer.step)
+            followers.append(stack.enter_context(scalars))
+        caught = stack.enter_context(first_signal())
+
+        def on_step(step, row):
+            for follower in followers:
+                follower(step, row)
+
+        seconds = training.run(on_step, lambda: bool(caught))
+    if trainer.step < training.config.train.iterations:
+        raise Stopped(
+            f"stopped at step {trainer.step}; wrote {folder.checkpoint}; the same command goes on",
+            128 + caught[0],
+        )
+    return seconds

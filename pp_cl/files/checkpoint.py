@@ -3,6 +3,7 @@
 import json
 import zipfile
 from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -51,28 +52,63 @@ def load_checkpoint(path: Path | str) -> tuple[dict[str, Any], dict[str, np.ndar
     Raises UserError naming the file when it is missing, truncated, corrupt, of another format, or
     holds NaN or Inf.
     """
-    path = Path(path)
-    if not path.is_file():
-        raise UserError(f"{path}: no such checkpoint; train first")
-    try:
-        with np.load(path, allow_pickle=False) as stored:
-            arrays = {name: stored[name] for name in stored.files}
-        header = json.loads(arrays.pop("header").tobytes())
-    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile, RuntimeError) as error:
-        raise UserError(
-            f"{path}: corrupt checkpoint ({' '.join(str(error).split())[:100]}); delete it to train"
-            " anew, or restore a copy"
-        ) from None
-    if header.get("format") != FORMAT:
-        raise UserError(
-            f"{path}: format {header.get('format')}, this version reads {FORMAT}; train anew"
-        )
+    with _opened(path) as stored:
+        arrays = {name: stored[name] for name in stored.files if name != "header"}
+        header = _header(stored, path)
     for name, array in arrays.items():
         if array.dtype.kind == "f" and not np.isfinite(array).all():
             raise UserError(
                 f"{path}: {name} holds NaN or Inf; delete it to train anew, or restore a copy"
             )
     return header, arrays
+
+
+def checkpoint_shapes(path: Path | str) -> tuple[dict[str, Any], dict[str, tuple[int, ...]]]:
+    """(header, {name: shape}) of a checkpoint, whose arrays are not read. Raises UserError as
+    load_checkpoint does, NaN and Inf aside.
+    """
+    with _opened(path) as stored:
+        header, shapes = _header(stored, path), {}
+        for name in stored.files:
+            with stored.zip.open(f"{name}.npy") as member:
+                np.lib.format.read_magic(member)
+                shapes[name] = np.lib.format.read_array_header_1_0(member)[0]
+    del shapes["header"]
+    return header, shapes
+
+
+def checkpoint_array(path: Path | str, name: str) -> np.ndarray:
+    """One array of a checkpoint. Raises UserError naming the file where it is missing or
+    corrupt.
+    """
+    with _opened(path) as stored:
+        return stored[name]
+
+
+@contextmanager
+def _opened(path):
+    """The archive of a checkpoint; what is wrong with it becomes a UserError."""
+    path = Path(path)
+    if not path.is_file():
+        raise UserError(f"{path}: no such checkpoint; train first")
+    try:
+        with np.load(path, allow_pickle=False) as stored:
+            yield stored
+    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile, RuntimeError) as error:
+        raise UserError(
+            f"{path}: corrupt checkpoint ({' '.join(str(error).split())[:100]}); delete it to train"
+            " anew, or restore a copy"
+        ) from None
+
+
+def _header(stored, path):
+    """The header, of a format that is read."""
+    header = json.loads(stored["header"].tobytes())
+    if header.get("format") != FORMAT:
+        raise UserError(
+            f"{path}: format {header.get('format')}, this version reads {FORMAT}; train anew"
+        )
+    return header
 
 
 def fitting_array(

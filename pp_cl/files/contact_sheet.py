@@ -1,4 +1,4 @@
-"""Pictures that show how well views are predicted."""
+"""Pictures of many images: how well views are predicted, and what photographs there are."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -22,16 +22,30 @@ def comparison(predictions: Sequence[np.ndarray], truths: Sequence[np.ndarray]) 
     The error is the absolute difference, mean of the channels, ERROR_GAIN times; white is none, as
     around the object.
     """
-    rows = [np.stack([p, t, _error(p, t)]) for p, t in zip(predictions, truths, strict=True)]
-    tiles = np.pad(
-        to_8bit(rows), ((0, 0), (0, 0), (0, GAP), (0, GAP), (0, 0)), constant_values=LINE
-    )
-    n, columns, height, width, _ = tiles.shape
-    table = tiles.transpose(0, 2, 1, 3, 4).reshape(n * height, columns * width, 3)[:-GAP, :-GAP]
-    picture = Image.fromarray(np.pad(table, ((HEADER, 0), (0, 0), (0, 0)), constant_values=255))
+    pairs = zip(predictions, truths, strict=True)
+    images = [to_8bit(image) for p, t in pairs for image in (p, t, _error(p, t))]
+    table = np.pad(tiles(images, 3), ((HEADER, 0), (0, 0), (0, 0)), constant_values=255)
+    width = images[0].shape[1] + GAP
+    return _captioned(table, [(column * width, 0) for column in range(3)], CAPTIONS)
+
+
+def contact_sheet(
+    images: Sequence[np.ndarray], captions: Sequence[str], columns: int = 4
+) -> np.ndarray:
+    """tiles(images, columns) with a caption above each image, and no more columns than images."""
+    columns = min(columns, len(images))
+    headed = [np.pad(i, ((HEADER, 0), (0, 0), (0, 0)), constant_values=255) for i in images]
+    height, width = (side + GAP for side in headed[0].shape[:2])
+    places = [(i % columns * width, i // columns * height) for i in range(len(images))]
+    return _captioned(tiles(headed, columns), places, captions)
+
+
+def _captioned(table, places, captions):
+    """The picture with captions whose strips begin at the places, (x, y)."""
+    picture = Image.fromarray(table)
     draw = ImageDraw.Draw(picture)
-    for column, caption in enumerate(CAPTIONS):
-        draw.text((column * width + 3, 1), caption, fill=INK)
+    for (x, y), caption in zip(places, captions, strict=True):
+        draw.text((x + 3, y + 1), caption, fill=INK)
     return np.array(picture)
 
 

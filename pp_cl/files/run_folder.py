@@ -3,6 +3,7 @@
 import json
 import math
 from collections.abc import Mapping
+from itertools import takewhile
 from pathlib import Path
 from typing import Any
 
@@ -10,7 +11,7 @@ import numpy as np
 
 from pp_cl.errors import UserError
 from pp_cl.files.atomic import remove_leftovers, write_text
-from pp_cl.files.checkpoint import Rows, load_checkpoint, save_checkpoint
+from pp_cl.files.checkpoint import Rows, checkpoint_shapes, load_checkpoint, save_checkpoint
 
 # what the header of a run's checkpoint holds at least
 HEADER = ("scene", "step", "finished", "initial_points", "grid", "depth_range")
@@ -57,13 +58,28 @@ class RunFolder:
         incomplete header.
         """
         header, arrays = load_checkpoint(self.checkpoint)
+        self._check_header(header)
+        return header, arrays
+
+    def shapes(self) -> tuple[dict[str, Any], dict[str, tuple[int, ...]]]:
+        """(header, {name: shape}) of the checkpoint, whose arrays are not read. Raises UserError as
+        load() does.
+        """
+        header, shapes = checkpoint_shapes(self.checkpoint)
+        self._check_header(header)
+        return header, shapes
+
+    def _check_header(self, header):
         missing = [key for key in HEADER if key not in header]
         if missing:
             raise UserError(
                 f"{self.checkpoint}: its header lacks {', '.join(missing)}; delete it to train"
                 " anew, or restore a copy"
             )
-        return header, arrays
+
+    def rows(self) -> list[dict[str, Any]]:
+        """The rows of the log, up to the first that is broken."""
+        return _rows(self.log)
 
     def save(self, header: dict[str, Any], arrays: Mapping[str, np.ndarray | Rows]) -> None:
         """Replace the checkpoint."""
@@ -105,15 +121,15 @@ class Log:
             ) from error
 
 
+def _rows(path):
+    """The rows of a log up to the first that is broken."""
+    lines = path.read_text("utf-8", "replace").splitlines() if path.exists() else ()
+    return list(takewhile(lambda row: row is not None, map(_read_row, lines)))
+
+
 def _rows_until(path, step):
     """The rows of a log up to `step`, or up to the first that is broken or says finished."""
-    rows = []
-    for line in path.read_text("utf-8", "replace").splitlines() if path.exists() else ():
-        row = _read_row(line)
-        if row is None or row["step"] > step or row.get("finished"):
-            break
-        rows.append(row)
-    return rows
+    return list(takewhile(lambda row: row["step"] <= step and not row.get("finished"), _rows(path)))
 
 
 def _read_row(line):

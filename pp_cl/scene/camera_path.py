@@ -26,6 +26,14 @@ def up_of(cameras: Sequence[Camera]) -> np.ndarray:
     return direction if direction @ mean >= 0 else -direction
 
 
+def looked_at(cameras: Sequence[Camera]) -> np.ndarray:
+    """(3,) the world position nearest to the optical axes of all cameras, by least squares."""
+    forward = np.stack([camera.pose[:, 2] for camera in cameras])
+    eyes = np.stack([camera.eye for camera in cameras])
+    across = np.eye(3) - forward[:, :, None] * forward[:, None, :]  # (N, 3, 3) projectors
+    return np.linalg.lstsq(across.sum(0), np.einsum("nij,nj->i", across, eyes), rcond=1e-9)[0]
+
+
 class Surroundings:
     """Where cameras were around an object.
 

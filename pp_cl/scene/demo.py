@@ -9,7 +9,6 @@ from collections.abc import Iterable
 from pathlib import Path
 
 import numpy as np
-from skimage.measure import marching_cubes
 
 from pp_cl.device.device import Device
 from pp_cl.errors import UserError
@@ -17,7 +16,7 @@ from pp_cl.files.atomic import write_json
 from pp_cl.files.image import write_png
 from pp_cl.scene.camera import Camera
 from pp_cl.scene.grid import Grid
-from pp_cl.scene.load import Scene
+from pp_cl.scene.load import Frame, Scene, evenly
 from pp_cl.scene.views import View
 
 SPLITS = ("train", "test")
@@ -29,22 +28,33 @@ NO_DEPTH_RANGE = (0.0, math.inf)  # the rays are traced through the whole object
 OBJECT_BOX = ((-0.8, -0.8, -1.0), (0.8, 0.8, 0.92))  # holds the object
 
 
-def demo_scene(dev: Device, splits: Iterable[str] = SPLITS, size: int = SIZE) -> Scene:
+def demo_scene(
+    dev: Device, splits: Iterable[str] = SPLITS, size: int = SIZE, *, most: int | None = None
+) -> Scene:
     """Scene `demo` of 64 training and 16 test views of size x size pixels, rendered on the device;
-    it states no depth range.
+    it states no depth range. most: views of each split, spread evenly; None: all.
 
     The training views spread evenly from a little below the horizon to the pole, the test views
     circle the object.
     """
-    cameras = {"train": _spread_cameras(size), "test": _circling_cameras(size)}
     views = {
         split: [
-            View(f"{split}/r_{i}.png", camera, render(dev, camera))
-            for i, camera in enumerate(cameras[split])
+            View(name, camera, render(dev, camera))
+            for name, camera, _ in evenly(demo_frames(split, size), most)
         ]
         for split in splits
     }
     return Scene("demo", None, views)
+
+
+def demo_frames(split: str, size: int = SIZE) -> list[Frame]:
+    """[(name, Camera, None)] of a split's views, without their images. Raises UserError for a
+    split that there is not.
+    """
+    if split not in SPLITS:
+        raise UserError(f"--split {split}: demo has {', '.join(SPLITS)}")
+    cameras = _spread_cameras(size) if split == "train" else _circling_cameras(size)
+    return [(f"{split}/r_{i}.png", camera, None) for i, camera in enumerate(cameras)]
 
 
 def render(dev: Device, camera: Camera) -> np.ndarray:
@@ -70,6 +80,8 @@ def demo_mesh(dev: Device, resolution: int = 256) -> tuple[np.ndarray, np.ndarra
     resolution: grid vertices along the box's longest side; the thinnest parts are 0.022 wide, the
     box is 1.92 long.
     """
+    from skimage.measure import marching_cubes  # takes long to import
+
     low, high = np.array(OBJECT_BOX)
     edge = (high - low).max() / (resolution - 1)
     dims = tuple(int(n) for n in np.ceil((high - low) / edge - 1e-6) + 1)

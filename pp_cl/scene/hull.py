@@ -9,6 +9,7 @@ from pyopencl.array import Array
 from pp_cl.device.device import Device
 from pp_cl.errors import UserError
 from pp_cl.scene.bounds import bounding_box, explain_empty_hull
+from pp_cl.scene.camera import Camera
 from pp_cl.scene.grid import Grid, smallest_edge
 from pp_cl.scene.views import MASK_THRESHOLD, View
 
@@ -209,13 +210,12 @@ def depth_range(views: Sequence[View], hull: Hull) -> tuple[float, float]:
     )
 
 
-def spacing_pixels(hull: Hull, views: Sequence[View]) -> float:
-    """Grid edge in pixels of the views' reduced images, at the hull's centre, mean over the
-    views.
+def spacing_pixels(grid: Grid, cameras: Sequence[Camera]) -> float:
+    """Grid edge in pixels of the cameras' images, at the middle of the grid, mean over the
+    cameras.
     """
-    cameras = [view.camera for view in views]
-    distances = [np.linalg.norm(camera.eye - hull.grid.centre) for camera in cameras]
-    pixels = [c.fx * hull.grid.edge / d for c, d in zip(cameras, distances, strict=True)]
+    distances = [np.linalg.norm(camera.eye - grid.centre) for camera in cameras]
+    pixels = [c.fx * grid.edge / d for c, d in zip(cameras, distances, strict=True)]
     return float(np.mean(pixels))
 
 

@@ -5,19 +5,25 @@ from collections.abc import Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
+from types import ModuleType
+from typing import TypeVar
 
 import numpy as np
 from tqdm import tqdm
 
 from pp_cl.errors import UserError
 from pp_cl.files.image import read_rgba
+from pp_cl.scene.camera import Camera
 from pp_cl.scene.readers import transforms
 from pp_cl.scene.views import View
 
 # One module per format. FILES names the files it reads, recognises(folder) tells whether a folder
-# holds such files, and read_split(folder, split) gives [(image path relative to the folder, Camera,
-# (near, far) or None)] without reading pixels.
+# holds such files, splits(folder) names its splits, and read_split(folder, split) gives [(image
+# path relative to the folder, Camera, (near, far) or None)] without reading pixels.
 READERS = (transforms,)
+
+Frame = tuple[str, Camera, tuple[float, float] | None]
+Item = TypeVar("Item")
 
 
 @dataclass(frozen=True)
@@ -43,12 +49,14 @@ class Scene:
         return replace(self, splits=splits)
 
 
-def load_scene(path: str | Path, splits: Iterable[str] = ("train",)) -> Scene:
-    """Scene of the given splits from a folder, not reduced; a progress bar shows on a terminal.
+def evenly(items: Sequence[Item], most: int | None) -> list[Item]:
+    """At most `most` of the items, spread evenly, the first among them; None: all."""
+    n = len(items)
+    return list(items) if most is None or n <= most else [items[n * i // most] for i in range(most)]
 
-    Raises UserError naming the file, and the key where there is one, for whatever is missing,
-    broken or contradictory.
-    """
+
+def find_reader(path: str | Path) -> ModuleType:
+    """The module of READERS for a folder. Raises UserError where it holds no scene."""
     folder = Path(path)
     if not folder.is_dir():
         raise UserError(
@@ -57,7 +65,19 @@ def load_scene(path: str | Path, splits: Iterable[str] = ("train",)) -> Scene:
     reader = next((reader for reader in READERS if reader.recognises(folder)), None)
     if reader is None:
         raise UserError(f"{folder}: no scene in it; it needs {_known_files()}")
-    frames = {split: reader.read_split(folder, split) for split in splits}
+    return reader
+
+
+def load_scene(
+    path: str | Path, splits: Iterable[str] = ("train",), most: int | None = None
+) -> Scene:
+    """Scene of the given splits from a folder, not reduced; a progress bar shows on a terminal.
+
+    most: views to read of each split, spread evenly; None: all. Raises UserError naming the file,
+    and the key where there is one, for whatever is missing, broken or contradictory.
+    """
+    reader, folder = find_reader(path), Path(path)
+    frames = {split: evenly(reader.read_split(folder, split), most) for split in splits}
     everything = [frame for listed in frames.values() for frame in listed]
     _check_alike(folder, everything)
     images = iter(_read_images([folder / name for name, _, _ in everything]))

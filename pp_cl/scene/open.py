@@ -1,28 +1,71 @@
 """The scene that a run's settings name."""
 
 import hashlib
+from pathlib import Path
 
 import numpy as np
 
 from pp_cl.config import Config
 from pp_cl.device.device import Device
 from pp_cl.errors import UserError
-from pp_cl.scene.load import Scene, load_scene
-from pp_cl.scene.views import View
+from pp_cl.presets import IMAGE_SIZES
+from pp_cl.scene import demo
+from pp_cl.scene.load import Frame, Scene, find_reader, load_scene
+from pp_cl.scene.views import View, fitting_downscale
+
+DEMO = "demo"  # the word that names the scene which the program makes itself
 
 
-def open_scene(dev: Device, config: Config, splits: tuple[str, ...]) -> Scene:
+def open_scene(
+    dev: Device, config: Config, splits: tuple[str, ...], most: int | None = None
+) -> Scene:
     """Scene of config.scene.path with the given splits, reduced config.scene.downscale times;
-    `demo` is rendered on the device.
+    `demo` is rendered on the device. most: views of each split, spread evenly; None: all.
     """
-    if config.scene.path != "demo":
-        return load_scene(config.scene.path, splits).reduced(config.scene.downscale)
-    from pp_cl.scene.demo import SPLITS, demo_scene
+    path, downscale = config.scene.path, config.scene.downscale
+    if path == DEMO:
+        return demo.demo_scene(dev, splits, most=most).reduced(downscale)
+    return load_scene(path, splits, most).reduced(downscale)
 
-    unknown = set(splits) - set(SPLITS)
-    if unknown:
-        raise UserError(f"--split {', '.join(unknown)}: demo has {', '.join(SPLITS)}")
-    return demo_scene(dev, splits).reduced(config.scene.downscale)
+
+def scene_format(path: str) -> str:
+    """The name of the reader of a scene; of `demo` the word itself. Raises UserError where there is
+    no scene.
+    """
+    return DEMO if path == DEMO else find_reader(path).__name__.rpartition(".")[2]
+
+
+def scene_splits(path: str) -> list[str]:
+    """The names of a scene's splits. Raises UserError where there is no scene."""
+    return list(demo.SPLITS) if path == DEMO else find_reader(path).splits(Path(path))
+
+
+def scene_frames(path: str, split: str = "train") -> list[Frame]:
+    """[(name, Camera, (near, far) or None)] of the views of a split, without their pixels. Raises
+    UserError as load_scene does.
+    """
+    if path == DEMO:
+        return demo.demo_frames(split)
+    return find_reader(path).read_split(Path(path), split)
+
+
+def preset_downscale(path: str, preset: str) -> int:
+    """How many times a preset reduces the images of a scene, by the size of the first. Raises
+    UserError as load_scene does.
+    """
+    _, camera, _ = scene_frames(path)[0]
+    return fitting_downscale((camera.width, camera.height), IMAGE_SIZES[preset])
+
+
+def measured_split(path: str) -> str:
+    """The split that tells how a training goes: val, else test. Raises UserError where the scene
+    has neither.
+    """
+    present = scene_splits(path)
+    for split in ("val", "test"):
+        if split in present:
+            return split
+    raise UserError(f"--eval-every: {path} has no split val or test; leave it out")
 
 
 def fingerprint(views: list[View]) -> str:

@@ -16,6 +16,7 @@ from pp_cl.scene.camera import Camera
 MASK_THRESHOLD = 8
 # pixels of a reduced image, each way: SSIM's window of 11 and the U-Net's two poolings need room
 MIN_SIDE = 16
+LEAST_SHARE = 0.75  # of the size that a preset is made for: further down, details would be lost
 
 
 @dataclass(frozen=True, eq=False)
@@ -87,6 +88,17 @@ class View:
         x0, x1 = _extent(mask.any(axis=0), k, margin)
         y0, y1 = _extent(mask.any(axis=1), k, margin)
         return x0, y0, x1, y1
+
+
+def fitting_downscale(size: tuple[int, int], side: int | None) -> int:
+    """The whole number that reduces images of `size`, (width, height) pixels, so that their longer
+    side comes nearest to `side`, not below three quarters of it; 1 where side is None.
+    """
+    if side is None:
+        return 1
+    longer, most = max(size), min(size) // MIN_SIDE
+    fitting = [k for k in range(1, most + 1) if longer / k >= LEAST_SHARE * side]
+    return min(fitting, key=lambda k: abs(longer / k - side), default=1)
 
 
 def _extent(occupied: np.ndarray, downscale: int, margin: int) -> tuple[int, int]:

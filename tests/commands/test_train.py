@@ -2,11 +2,14 @@
 
 import json
 
+import pytest
 from support.runs import arguments, train_and_interrupt
 from support.scenes import write_ball_scene
 
 from pp_cl.cli import main
+from pp_cl.files.run_folder import RunFolder
 from pp_cl.presets import RENAMED
+from pp_cl.run import run_config
 
 
 def test_an_old_key_is_taken_and_named_on_one_line(tmp_path, capsys):
@@ -35,3 +38,42 @@ def test_a_run_with_old_keys_resumes_and_gets_the_new_ones(tmp_path, capsys, mon
     notes = [line for line in captured.err.splitlines() if "is called" in line]
     assert len(notes) == 1 and "other keys" in notes[0] and "resuming at step 10" in captured.out
     assert json.loads((out / "config.json").read_text()) == new
+
+
+def trained_lines(capsys, *words):
+    """Lines on stdout of a training of two steps that must go well."""
+    few = ["--iterations", "2", "--points", "300", "--set", "network.widths=16,16,16"]
+    assert main(["train", *map(str, words), *few]) == 0
+    return capsys.readouterr().out.splitlines()
+
+
+def test_a_preset_reduces_large_images_and_says_so(tmp_path, capsys):
+    scene, out = write_ball_scene(tmp_path / "ball", views=4, size=400), tmp_path / "run"
+    line = "images: 400x400, reduced 2 times to 200x200"
+    chosen = f"{line} for the preset tiny (--downscale 1 keeps them)"
+    assert chosen in trained_lines(capsys, scene, "--out", out)
+    assert json.loads((out / "config.json").read_text())["scene"]["downscale"] == 2
+    assert line in trained_lines(capsys, scene, "--out", tmp_path / "a", "--downscale", "2")
+    given = ("--set", "scene.downscale=1")
+    assert "images: 400x400" in trained_lines(capsys, scene, "--out", tmp_path / "b", *given)
+
+
+def test_a_run_keeps_the_size_of_its_images(tmp_path, capsys, monkeypatch):
+    """Also one of before, whose images were not reduced unless it was told to."""
+    scene, out = write_ball_scene(tmp_path / "ball", size=300), tmp_path / "run"
+    words = arguments(scene, out, downscale=1, train__iterations=6)
+    with monkeypatch.context() as patch:
+        patch.setattr("pp_cl.run.Training._after_step", _interrupting)
+        assert main(words) == 130
+    capsys.readouterr()
+    assert main(["train", scene, "--out", str(out)]) == 0
+    assert "images: 300x300" in capsys.readouterr().out.splitlines()
+
+
+def _interrupting(*_):
+    raise KeyboardInterrupt
+
+
+@pytest.mark.parametrize("preset, expected", [("tiny", 2), ("small", 1), ("full", 1), ("paper", 1)])
+def test_the_demo_is_reduced_by_the_same_rule(tmp_path, preset, expected):
+    assert run_config(RunFolder(tmp_path / "run"), "demo", preset).scene.downscale == expected

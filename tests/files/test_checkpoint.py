@@ -10,7 +10,12 @@ from pp_cl.device.rows import DeviceRows
 from pp_cl.errors import UserError
 from pp_cl.files import atomic
 from pp_cl.files.atomic import atomic_file, remove_leftovers, write_json
-from pp_cl.files.checkpoint import load_checkpoint, save_checkpoint
+from pp_cl.files.checkpoint import (
+    checkpoint_array,
+    checkpoint_shapes,
+    load_checkpoint,
+    save_checkpoint,
+)
 
 ARRAYS = {
     "points.ids": np.arange(5, dtype=np.uint32),
@@ -27,6 +32,24 @@ def test_round_trip_and_equal_bytes(tmp_path):
     assert header["step"] == 3 and set(arrays) == set(ARRAYS)
     for name, array in ARRAYS.items():
         np.testing.assert_array_equal(arrays[name], array)
+
+
+def test_shapes_and_single_arrays_are_read_without_the_others(tmp_path):
+    path = tmp_path / "a.npz"
+    save_checkpoint(path, {"step": 3}, ARRAYS)
+    header, shapes = checkpoint_shapes(path)
+    assert header["step"] == 3 and shapes == {name: array.shape for name, array in ARRAYS.items()}
+    ids = checkpoint_array(path, "points.ids")
+    np.testing.assert_array_equal(ids, ARRAYS["points.ids"])
+    with pytest.raises(UserError, match="a.npz: corrupt checkpoint"):
+        checkpoint_array(path, "points.sh0")
+    data = bytearray(path.read_bytes())
+    data[data.index(b"\x93NUMPY", data.index(b"opacity.npy"))] ^= 0xFF
+    path.write_bytes(data)
+    with pytest.raises(UserError, match="a.npz: corrupt checkpoint"):
+        checkpoint_shapes(path)
+    with pytest.raises(UserError, match="no such checkpoint"):
+        checkpoint_shapes(tmp_path / "none.npz")
 
 
 def test_arrays_in_pieces_give_the_bytes_of_whole_ones(dev, tmp_path):

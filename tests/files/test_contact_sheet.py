@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from pp_cl.files.contact_sheet import GAP, HEADER, comparison, write_comparison
+from pp_cl.files.contact_sheet import GAP, HEADER, comparison, contact_sheet, write_comparison
 from pp_cl.files.image import read_rgba
 
 
@@ -39,3 +39,16 @@ def test_picture_is_written(tmp_path):
     image = np.full((16, 16, 3), 0.5)
     write_comparison(tmp_path / "preview.png", [image], [image])
     assert (read_rgba(tmp_path / "preview.png")[..., :3] == comparison([image], [image])).all()
+
+
+def test_photographs_stand_row_by_row_under_their_names(rng):
+    images = [rng.integers(0, 256, (30, 40, 3), np.uint8) for _ in range(5)]
+    picture = contact_sheet(images, list("abcde"), columns=3)
+    height, width = HEADER + 30 + GAP, 40 + GAP
+    assert picture.shape == (2 * height - GAP, 3 * width - GAP, 3)
+    for i, image in enumerate(images):
+        y, x = i // 3 * height, i % 3 * width
+        assert (picture[y + HEADER : y + HEADER + 30, x : x + 40] == image).all()
+        assert (picture[y : y + HEADER, x : x + 40] < 128).any(), "no caption"
+    assert (picture[height : height + HEADER + 30, 2 * width :] == 255).all()
+    assert contact_sheet(images[:1], ["a"]).shape == (HEADER + 30, 40, 3)

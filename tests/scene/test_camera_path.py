@@ -2,10 +2,11 @@
 
 import numpy as np
 import pytest
+from support.ball_views import CENTRE, ball_camera
 from support.scenes import ring_cameras
 
 from pp_cl.scene.camera import Camera
-from pp_cl.scene.camera_path import MARGIN, Surroundings, up_of
+from pp_cl.scene.camera_path import MARGIN, Surroundings, looked_at, up_of
 
 
 def turned(cameras, rotation, shift):
@@ -89,3 +90,9 @@ def test_a_camera_above_the_object_is_no_division_by_zero():
     points = np.array([[-1.0, -1, -1], [1, 1, 1]])
     for frame in Surroundings([camera], points).orbit(camera, 5):
         assert np.isfinite(frame.pose).all()
+
+
+def test_the_optical_axes_meet_where_the_cameras_look(rng):
+    cameras = [ball_camera(CENTRE + 4 * d, CENTRE) for d in rng.normal(size=(7, 3))]
+    np.testing.assert_allclose(looked_at(cameras), CENTRE, atol=1e-9)
+    assert np.isfinite(looked_at(cameras[:1])).all()

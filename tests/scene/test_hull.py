@@ -243,8 +243,10 @@ def test_spacing_is_what_two_projected_neighbours_are_apart(dev):
     towards = camera.pose[:, :3].T @ (centre - camera.eye)
     along = towards + [found.grid.edge, 0, 0]
     expected = camera.fx * (along[0] / along[2] - towards[0] / towards[2])
-    assert spacing_pixels(found, views[:1]) == pytest.approx(expected, rel=1e-3)
-    assert spacing_pixels(found, [views[0].reduced(4)]) == pytest.approx(expected / 4, rel=1e-3)
+    assert spacing_pixels(found.grid, [views[0].camera]) == pytest.approx(expected, rel=1e-3)
+    assert spacing_pixels(found.grid, [views[0].reduced(4).camera]) == pytest.approx(
+        expected / 4, rel=1e-3
+    )
 
 
 @pytest.mark.parametrize("points", (0, -3, 2**27 + 1))

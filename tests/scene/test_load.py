@@ -5,7 +5,7 @@ import pytest
 from support.transforms_scenes import SIZE, refused, write_scene
 
 from pp_cl.files.image import write_png
-from pp_cl.scene.load import load_scene
+from pp_cl.scene.load import evenly, load_scene
 
 
 def test_missing_folder_format_and_split(tmp_path):
@@ -22,6 +22,20 @@ def test_truncated_image(tmp_path):
     file = tmp_path / "train_1.png"
     file.write_bytes(file.read_bytes()[:-200])
     refused(tmp_path, file, "truncated", "copy")
+
+
+def test_some_views_of_a_split_are_read_and_no_others(tmp_path):
+    write_scene(tmp_path)
+    names = [view.name for view in load_scene(tmp_path).splits["train"]]
+    (tmp_path / names[1]).write_bytes((tmp_path / names[1]).read_bytes()[:-200])
+    few = load_scene(tmp_path, most=1).splits["train"]
+    assert [view.name for view in few] == names[:1]
+
+
+def test_evenly_takes_the_first_and_the_same_steps():
+    assert evenly(range(8), 4) == [0, 2, 4, 6]
+    assert evenly(range(5), 4) == [0, 1, 2, 3] and evenly(range(3), 4) == [0, 1, 2]
+    assert evenly(range(3), None) == [0, 1, 2]
 
 
 def test_views_of_different_sizes(tmp_path):

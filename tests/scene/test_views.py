@@ -5,7 +5,7 @@ import pytest
 
 from pp_cl.errors import UserError
 from pp_cl.scene.camera import Camera
-from pp_cl.scene.views import MASK_THRESHOLD, View
+from pp_cl.scene.views import MASK_THRESHOLD, View, fitting_downscale
 
 
 @pytest.fixture
@@ -68,3 +68,22 @@ def test_object_bounds_are_the_tightest(view, rng, downscale, margin):
 
 def test_object_bounds_without_object(view):
     assert view.reduced(3).object_bounds(5) == (0, 0, 23, 16)
+
+
+@pytest.mark.parametrize(
+    "size, side, expected",
+    [
+        ((800, 800), 200, 4),
+        ((400, 400), 200, 2),
+        ((200, 200), 200, 1),
+        ((48, 48), 200, 1),  # smaller ones are not enlarged
+        ((300, 200), 200, 2),  # 150 is three quarters of 200
+        ((298, 200), 200, 1),
+        ((4032, 3024), 200, 20),
+        ((1000, 40), 200, 2),  # no side below 16 pixels
+        ((10, 10), 200, 1),
+        ((4032, 3024), None, 1),
+    ],
+)
+def test_a_preset_takes_the_whole_number_nearest_to_its_size(size, side, expected):
+    assert fitting_downscale(size, side) == expected

@@ -15,7 +15,7 @@ FLOORS = [
     ("network", "metrics"),
     ("training", "model", "render"),
     ("train", "trained"),
-    ("run", "evaluate", "film", "export", "view"),
+    ("run", "evaluate", "film", "export", "view", "info"),
     ("bench",),
     ("commands",),
     ("cli", "__init__", "__main__"),

@@ -32,6 +32,8 @@ def run(tmp_path_factory):
                 "1500",
                 "--iterations",
                 "2",
+                "--downscale",
+                "1",
                 "--set",
                 "train.crop=28",
                 "--set",

@@ -17,6 +17,11 @@ def recognises(folder: Path) -> bool:
     return any(folder.glob("transforms_*.json"))
 
 
+def splits(folder: Path) -> list[str]:
+    """The names of the splits that the folder holds."""
+    return sorted(f.stem.removeprefix("transforms_") for f in folder.glob("transforms_*.json"))
+
+
 def read_split(folder: Path, split: str) -> list[tuple[str, Camera, tuple[float, float] | None]]:
     """[(image path relative to the folder, Camera, (near, far))] of transforms_<split>.json.
 
@@ -25,9 +30,7 @@ def read_split(folder: Path, split: str) -> list[tuple[str, Camera, tuple[float,
     """
     file = folder / f"transforms_{split}.json"
     if not file.is_file():
-        present = ", ".join(
-            sorted(f.stem.removeprefix("transforms_") for f in folder.glob("transforms_*.json"))
-        )
+        present = ", ".join(splits(folder))
         raise UserError(f"{file}: no such file; the splits of this scene are {present}")
     data = read_json(file)
     if not isinstance(data, dict):

@@ -1,0 +1,148 @@
+"""The command pp-cl info."""
+
+import argparse
+import json
+
+from pp_cl.commands import options as shared
+from pp_cl.errors import UserError
+from pp_cl.presets import PRESETS
+
+HELP = "say what a run or a scene is; --picture draws its points over photographs"
+MIB = 2**20
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the command's options."""
+    add = parser.add_argument
+    add("subject", metavar="RUN|SCENE", help="folder of a run or of a scene, or the word demo")
+    add("--json", action="store_true", help="print JSON")
+    add("--picture", metavar="FILE", help="write photographs with the outline of the points (PNG)")
+    shared.add_open(parser)
+    add("--preset", choices=PRESETS, default="tiny", help="of a scene: whose hull (tiny)")
+    add("--scene", metavar="SCENE", help="where the run's scene is now, if it has moved")
+    shared.add_device(parser)
+
+
+def run(options: argparse.Namespace) -> None:
+    """Print the facts, write the picture. Raises UserError for --open without a picture."""
+    from pp_cl.files.image import write_png
+    from pp_cl.files.run_folder import RunFolder
+
+    if options.open and not options.picture:
+        raise UserError("--open: there is no picture; name its file with --picture FILE")
+    folder = RunFolder(options.subject)
+    tell = _run_told if folder.config.exists() else _scene_told
+    facts, lines, image = tell(folder, options)
+    if image is not None:
+        write_png(options.picture, image)
+        facts["picture"] = options.picture
+        lines.append(f"wrote {options.picture}")
+    print(json.dumps(facts, indent=1) if options.json else "\n".join(lines))
+    if options.open:
+        shared.show(options.picture)
+
+
+def _run_told(folder, options):
+    """(facts, lines, picture or None) of a run."""
+    from pp_cl.device.discover import open_device
+    from pp_cl.info import run_facts, run_picture
+
+    facts, image = run_facts(folder, options.scene), None
+    if options.picture:
+        image = run_picture(open_device(options.device), folder, options.scene)
+    return facts, _run_lines(facts), image
+
+
+def _scene_told(_folder, options):
+    """The same of a scene."""
+    from pp_cl.device.discover import open_device
+    from pp_cl.info import describe_scene, picture
+
+    dev = open_device(options.device)
+    facts, views, hull = describe_scene(dev, options.subject, options.preset)
+    image = picture(dev, views, hull) if options.picture else None
+    return facts, _scene_lines(facts), image
+
+
+def _line(name, text):
+    return f"{name:12s}{text}"
+
+
+def _grid_text(grid):
+    pixels = grid["edge_pixels"]
+    in_pixels = "" if pixels is None else f" ({pixels:.2f} pixels)"
+    return f"{'x'.join(map(str, grid['dims']))}, edge {grid['edge']:.6g}{in_pixels}"
+
+
+def _run_lines(facts):
+    state = "finished" if facts["finished"] else "not finished"
+    reduced = f", images reduced {facts['downscale']} times" * (facts["downscale"] > 1)
+    lines = [
+        _line("run", f"{facts['run']}, preset {facts['preset']}"),
+        _line("scene", f"{facts['scene']}{reduced}"),
+        _line("training", f"step {facts['step']} of {facts['iterations']}, {state}"),
+    ]
+    if facts["seconds"] is not None:
+        where = f" on {facts['device']}" if facts["device"] else ""
+        lines.append(_line("", f"{facts['seconds']:.1f} s{where}"))
+    if facts["psnr"] is not None:
+        lines.append(_line("", f"PSNR {facts['psnr']:.2f} in the last logged step"))
+    network = facts["network"]
+    widths = ", ".join(map(str, network["widths"]))
+    lines.append(_line("network", f"{widths} channels"))
+    if facts["points"]:
+        lines[-1] += f", {network['parameters']} parameters"
+        initial, left = facts["points"]["initial"], facts["points"]["left"]
+        lines += [
+            _line("points", f"{left} left of {initial} at the start"),
+            _line("grid", _grid_text(facts["grid"])),
+            _line("checkpoint", f"{facts['checkpoint_bytes'] / MIB:.1f} MiB"),
+        ]
+    else:
+        lines.append(_line("checkpoint", "none yet"))
+    measured = facts["metrics"] or {}
+    values = ", ".join(f"{name} {value:.4f}" for name, value in measured.items())
+    return [*lines, _line("test views", values or "not evaluated yet")]
+
+
+def _scene_lines(facts):
+    splits = ", ".join(f"{name} {count}" for name, count in facts["splits"].items())
+    sizes = ", ".join(f"{count} of {size}" for size, count in facts["images"].items())
+    angle_x, angle_y = (_range(facts["field_of_view"][axis], ".1f") for axis in "xy")
+    masks = facts["masks"]
+    share = "" if masks["object"] is None else f", {masks['object']:.1%} of the image is object"
+    stated = facts["depth_range"]
+    return [
+        _line("scene", f"{facts['scene']}, format {facts['format']}"),
+        _line("splits", splits),
+        _line("images", f"{sizes}; preset {facts['preset']}: reduced {facts['downscale']} times"),
+        _line("focal", f"{_range(facts['focal_pixels'], '.1f')} pixels"),
+        _line("view", f"{angle_x} x {angle_y} degrees"),
+        _line("masks", f"{masks['with_alpha']:.0%} of the training views have one{share}"),
+        _line("depth range", _range(stated, ".3f") if stated else "none stated"),
+        _line("cameras", f"{_range(facts['distances'], '.3f')} from {_vector(facts['looked_at'])}"),
+        _line("up", f"{_vector(facts['up'])} (estimated)"),
+        *_hull_lines(facts),
+    ]
+
+
+def _hull_lines(facts):
+    hull = facts["hull"]
+    if hull is None:
+        return [_line("hull", f"none: {facts['problem']}")]
+    low, high = map(_vector, hull["box"])
+    return [
+        _line("hull", f"{hull['points']} points{' (capped)' * hull['capped']}, {_grid_text(hull)}"),
+        _line("box", f"{low} to {high}"),
+    ]
+
+
+def _range(values, form):
+    """One number, or two with `to` between them."""
+    low, high = (format(value, form) for value in values)
+    return low if low == high else f"{low} to {high}"
+
+
+def _vector(values):
+    """(x, y, z), without the sign of -0.000."""
+    return "(" + ", ".join(f"{round(value, 3) + 0.0:.3f}" for value in values) + ")"

@@ -1,0 +1,110 @@
+"""How a training shows that it goes on: one line on a terminal, elsewhere now and then a line."""
+
+import os
+import sys
+import time
+from typing import Any, TextIO
+
+from tqdm import tqdm
+
+from pp_cl.run import Training
+
+REDRAWN = 1  # seconds, at least, between two states of the bar
+LINES_APART = 30  # seconds, at least, between the lines in a file
+GIB = 2**30
+# tqdm's, with little beside what follows; it is cut off at the right border
+FORMAT = "{percentage:3.0f}%|{bar}| {n_fmt}/{total_fmt}, {rate_fmt}, {remaining} left{postfix}"
+# of a terminal that does not tell its size, where tqdm would show nothing
+WIDTH, ROWS = 100, 20
+
+
+def follow(training: Training, stream: TextIO | None = None) -> "Bar | Lines":
+    """What to enter while a training runs and to call after each of its steps, with the step and
+    its row of the log. stream: sys.stderr if not given.
+    """
+    stream = stream or sys.stderr
+    return Bar(training, stream) if stream.isatty() else Lines(training, stream)
+
+
+class Bar:
+    """One line with rate, time left, PSNR, points and device memory, for a terminal."""
+
+    def __init__(self, training: Training, stream: TextIO) -> None:
+        self._dev, self._test = training.trainer.dev, ""
+        self._bar = tqdm(
+            total=training.config.train.iterations,
+            initial=training.trainer.step,
+            unit="step",
+            delay=1e-6,  # shows from the first step on, not above an error before it
+            mininterval=REDRAWN,
+            bar_format=FORMAT,
+            ncols=_columns(stream),
+            nrows=ROWS,
+            file=stream,
+        )
+
+    def __enter__(self) -> "Bar":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._bar.close()
+
+    def __call__(self, step: int, row: dict[str, Any] | None) -> None:
+        """Move on to a step."""
+        self._bar.update()
+        if row is None:
+            return
+        if "test_psnr" in row:
+            self._test = f" (test {row['test_psnr']:.1f})"
+        self._bar.set_postfix_str(
+            f"PSNR {row['psnr']:.1f}{self._test}, {row['points']} points,"
+            f" {self._dev.bytes / GIB:.2f} GiB",
+            refresh=False,
+        )
+
+
+def _columns(stream):
+    """Columns of the terminal."""
+    try:
+        return os.get_terminal_size(stream.fileno()).columns or WIDTH
+    except (OSError, ValueError):
+        return WIDTH
+
+
+class Lines:
+    """Plain lines, of rows of the log that are LINES_APART seconds apart: for files and pipes."""
+
+    def __init__(self, training: Training, stream: TextIO) -> None:
+        self._dev, self._stream = training.trainer.dev, stream
+        self._first, self._steps = training.trainer.step, training.config.train.iterations
+        self._start, self._next = time.monotonic(), 0.0
+
+    def __enter__(self) -> "Lines":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        pass
+
+    def __call__(self, step: int, row: dict[str, Any] | None) -> None:
+        """Print a line, where the step has a row and the last line is long enough ago."""
+        now = time.monotonic()
+        if row is None or now < self._next:
+            return
+        self._next = now + LINES_APART
+        rate = (step - self._first) / max(now - self._start, 1e-6)
+        left = round((self._steps - step) / rate)
+        test = f", test PSNR {row['test_psnr']:.2f}" if "test_psnr" in row else ""
+        print(
+            f"step {step} of {self._steps}, {rate:.3g} steps/s, {clock(left)} left,"
+            f" PSNR {row['psnr']:.2f}{test}, {row['points']} points,"
+            f" {self._dev.bytes / GIB:.2f} GiB",
+            file=self._stream,
+            flush=True,
+        )
+
+
+def clock(seconds: int) -> str:
+    """h:mm:ss, or m:ss below an hour."""
+    minutes, rest = divmod(seconds, 60)
+    hours, minutes = divmod(minutes, 60)
+    return f"{hours}:{minutes:02d}:{rest:02d}" if hours else f"{minutes}:{rest:02d}"

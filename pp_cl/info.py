@@ -1,0 +1,264 @@
+"""What a run or a scene is, in numbers that JSON can hold, and in a picture."""
+
+import json
+import math
+from collections import Counter
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from pp_cl.config import Config, configure, load_config, preset
+from pp_cl.device.device import Device
+from pp_cl.errors import UserError
+from pp_cl.files.checkpoint import checkpoint_array
+from pp_cl.files.contact_sheet import contact_sheet
+from pp_cl.files.image import to_8bit
+from pp_cl.files.run_folder import RunFolder
+from pp_cl.scene.camera_path import looked_at, up_of
+from pp_cl.scene.grid import Grid
+from pp_cl.scene.hull import Hull, build_grid, spacing_pixels
+from pp_cl.scene.load import Frame, evenly
+from pp_cl.scene.open import open_scene, preset_downscale, scene_format, scene_frames, scene_splits
+from pp_cl.scene.outline import outline
+from pp_cl.scene.target import Target
+from pp_cl.scene.views import MASK_THRESHOLD, View, fitting_downscale
+
+SHOWN_VIEWS, SHOWN_SIZE = 12, 320  # photographs of the picture, and their longer side in pixels
+OUTLINE = (255, 0, 160)  # a colour that few objects have
+
+Facts = dict[str, Any]
+
+
+class Points(NamedTuple):
+    """Vertices of a grid. ids: (N,) uint32."""
+
+    grid: Grid
+    ids: np.ndarray
+
+
+# --------------------------------------------------------------------------------------------------
+
+
+def run_facts(folder: RunFolder, scene: str | None = None) -> Facts:
+    """What a run is, from its files alone; what they do not tell is None.
+
+    scene: where its scene is now, if it has moved. Raises UserError naming the file that is missing
+    or broken.
+    """
+    config = _config(folder, scene)
+    facts = {
+        "run": str(folder),
+        "preset": config.preset,
+        "scene": config.scene.path,
+        "downscale": config.scene.downscale,
+        "iterations": config.train.iterations,
+        "network": {"widths": list(config.network.widths), "parameters": None},
+        "step": 0,
+        "finished": False,
+        "points": None,
+        "grid": None,
+        "checkpoint_bytes": None,
+        **_logged(folder),
+        "metrics": _metrics(folder),
+    }
+    if folder.checkpoint.exists():
+        header, shapes = folder.shapes()
+        sizes = (math.prod(s) for name, s in shapes.items() if name.startswith("net."))
+        facts["network"]["parameters"] = sum(sizes)
+        facts |= {"step": header["step"], "finished": header["finished"]}
+        facts["points"] = {"initial": header["initial_points"], "left": shapes["points.ids"][0]}
+        facts["grid"] = header["grid"] | {"edge_pixels": _edge_pixels(config, _grid(header))}
+        facts["checkpoint_bytes"] = folder.checkpoint.stat().st_size
+    return facts
+
+
+def run_picture(dev: Device, folder: RunFolder, scene: str | None = None) -> np.ndarray:
+    """picture() of the points that a run has left. Raises UserError as run_facts does, and for a
+    scene that is missing or broken.
+    """
+    config, (header, _) = _config(folder, scene), folder.shapes()
+    points = Points(_grid(header), checkpoint_array(folder.checkpoint, "points.ids"))
+    return picture(dev, open_scene(dev, config, ("train",), SHOWN_VIEWS).splits["train"], points)
+
+
+def _config(folder, scene):
+    config = load_config(folder.config)
+    return configure(config, scene or config.scene.path)
+
+
+def _grid(header):
+    grid = header["grid"]
+    return Grid(tuple(grid["origin"]), grid["edge"], tuple(grid["dims"]))
+
+
+def _edge_pixels(config, grid):
+    """The grid's edge in pixels of the run's images; None where the scene cannot be read."""
+    try:
+        frames = scene_frames(config.scene.path)
+    except UserError:
+        return None
+    cameras = [camera.downscaled(config.scene.downscale) for _, camera, _ in frames]
+    return spacing_pixels(grid, cameras)
+
+
+def _logged(folder):
+    """{"device", "seconds"} of the last row of the log, and the last "psnr"."""
+    rows = folder.rows()
+    last = rows[-1] if rows else {}
+    values = [row["psnr"] for row in rows if "psnr" in row]
+    return {
+        "device": last.get("device"),
+        "seconds": last.get("seconds"),
+        "psnr": values[-1] if values else None,
+    }
+
+
+def _metrics(folder):
+    """The means of the evaluation of the test split, None where there is none."""
+    file = folder.evaluation("test") / "metrics.json"
+    if not file.exists():
+        return None
+    try:
+        return dict(json.loads(file.read_text())["mean"])
+    except (ValueError, KeyError, TypeError):
+        raise UserError(f"{file}: holds no metrics; run `pp-cl eval {folder}` again") from None
+
+
+# --------------------------------------------------------------------------------------------------
+
+
+class Described(NamedTuple):
+    """A scene. hull: None where the masks give none."""
+
+    facts: Facts
+    views: list[View]
+    hull: Hull | None
+
+
+def describe_scene(dev: Device, scene: str, preset_name: str) -> Described:
+    """What a scene is, from its training views and the cameras of the others.
+
+    preset_name: whose number of points the hull gets, and whose size the images. Raises UserError
+    for a scene that is missing or broken; what prevents a hull is a fact.
+    """
+    config = configure(preset(preset_name), scene)
+    path = config.scene.path
+    names = sorted(scene_splits(path), key=lambda split: (split == "test", split))
+    frames = {split: scene_frames(path, split) for split in names}
+    views = open_scene(dev, config, ("train",)).splits["train"]
+    downscale = preset_downscale(path, preset_name)
+    hull, problem = _hull(dev, views, config)
+    facts = {
+        "scene": path,
+        "format": scene_format(path),
+        "splits": {split: len(listed) for split, listed in frames.items()},
+        "images": _sizes([frame for listed in frames.values() for frame in listed]),
+        **_lenses(views),
+        "masks": _masks(views),
+        "depth_range": _stated_range(views),
+        **_rig(views),
+        "preset": preset_name,
+        "downscale": downscale,
+        "hull": _hull_facts(hull, [view.camera.downscaled(downscale) for view in views]),
+        "problem": problem,
+    }
+    return Described(facts, views, hull)
+
+
+def _hull(dev, views, config: Config):
+    """(Hull, None), or (None, why there is none)."""
+    try:
+        return build_grid(dev, views, config.points.count), None
+    except UserError as error:
+        return None, str(error)
+
+
+def _sizes(frames: Sequence[Frame]):
+    return dict(Counter(f"{camera.width}x{camera.height}" for _, camera, _ in frames))
+
+
+def _range(values):
+    return [float(min(values)), float(max(values))]
+
+
+def _lenses(views):
+    """Least and most of the training views: focal length, angles of view."""
+    cameras = [view.stored_camera for view in views]
+    angles = [
+        [math.degrees(2 * math.atan(size / (2 * focal))) for size, focal in pairs]
+        for pairs in (
+            [(c.width, c.fx) for c in cameras],
+            [(c.height, c.fy) for c in cameras],
+        )
+    ]
+    return {
+        "focal_pixels": _range([focal for c in cameras for focal in (c.fx, c.fy)]),
+        "field_of_view": {"x": _range(angles[0]), "y": _range(angles[1])},
+    }
+
+
+def _masks(views):
+    """{"with_alpha": share of the views whose image has a transparent pixel, "object": mean share
+    of such an image that shows the object, None where there is none}.
+    """
+    masks = [view.image[..., 3] for view in views if view.image[..., 3].min() < 255]
+    shares = [float((mask > MASK_THRESHOLD).mean()) for mask in masks]
+    return {
+        "with_alpha": len(masks) / len(views),
+        "object": float(np.mean(shares)) if shares else None,
+    }
+
+
+def _stated_range(views):
+    ranges = [view.depth_range for view in views if view.depth_range]
+    if not ranges:
+        return None
+    return [min(near for near, _ in ranges), max(far for _, far in ranges)]
+
+
+def _rig(views):
+    """What the cameras look at, their distances from it, and the direction up."""
+    cameras = [view.stored_camera for view in views]
+    centre = looked_at(cameras)
+    return {
+        "looked_at": centre.tolist(),
+        "distances": _range([np.linalg.norm(camera.eye - centre) for camera in cameras]),
+        "up": up_of(cameras).tolist(),
+    }
+
+
+def _hull_facts(hull, cameras):
+    if hull is None:
+        return None
+    grid = hull.grid
+    low = np.asarray(grid.origin)
+    return {
+        "points": len(hull.ids),
+        "capped": hull.capped,
+        "dims": list(grid.dims),
+        "edge": grid.edge,
+        "edge_pixels": spacing_pixels(grid, cameras),
+        "box": [low.tolist(), (low + grid.edge * (np.asarray(grid.dims) - 1)).tolist()],
+    }
+
+
+# --------------------------------------------------------------------------------------------------
+
+
+def picture(dev: Device, views: Sequence[View], points: Points | Hull | None) -> np.ndarray:
+    """uint8 (H, W, 3) contact sheet of up to 12 photographs over white, spread evenly over the
+    views, with the outline of the points drawn over them.
+    """
+    target, images = Target(dev), []
+    shown = evenly(views, SHOWN_VIEWS)
+    for view in shown:
+        size = view.stored_camera.width, view.stored_camera.height
+        small = view.reduced(fitting_downscale(size, SHOWN_SIZE))
+        target.load(small)
+        image = to_8bit(target.whole())
+        if points:
+            image[outline(points.grid, points.ids, small.camera)] = OUTLINE
+        images.append(image)
+    return contact_sheet(images, [Path(view.name).name for view in shown])

@@ -1,0 +1,143 @@
+"""Ctrl-C and SIGTERM: the step is finished and a checkpoint written."""
+
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+from pathlib import Path
+
+import pytest
+from support.runs import arguments
+from support.scenes import write_ball_scene
+
+from pp_cl.cli import main
+from pp_cl.commands.signals import first_signal
+from pp_cl.files.checkpoint import load_checkpoint
+from pp_cl.train import Trainer
+
+ROOT = Path(__file__).parents[2]
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory):
+    """Folder of a small scene."""
+    return write_ball_scene(tmp_path_factory.mktemp("scene") / "ball")
+
+
+@pytest.fixture(scope="module")
+def whole(scene, tmp_path_factory):
+    """The checkpoint of a training that was not stopped."""
+    out = tmp_path_factory.mktemp("runs") / "whole"
+    assert main(arguments(scene, out)) == 0
+    return (out / "checkpoint.npz").read_bytes()
+
+
+def signalling(monkeypatch, at, number):
+    """Trainer.train_step that sends this process a signal in the middle of a step."""
+    train_step = Trainer.train_step
+
+    def stepping(self):
+        if self.step + 1 == at:
+            signal.raise_signal(number)
+        return train_step(self)
+
+    monkeypatch.setattr(Trainer, "train_step", stepping)
+
+
+@pytest.mark.parametrize(
+    "steps, number, status", [(3, signal.SIGINT, 130), (47, signal.SIGTERM, 143)]
+)
+def test_a_signal_ends_the_step_and_the_run_goes_on_to_the_same_bytes(
+    scene, whole, tmp_path, capsys, monkeypatch, steps, number, status
+):
+    out, before = tmp_path / "run", signal.getsignal(number)
+    with monkeypatch.context() as patch:
+        signalling(patch, steps, number)
+        assert main(arguments(scene, out)) == status
+    told = [line for line in capsys.readouterr().err.splitlines() if line.startswith("pp-cl: ")]
+    assert len(told) == 1 and "the same command goes on" in told[0] and f"step {steps};" in told[0]
+    header, _ = load_checkpoint(out / "checkpoint.npz")
+    assert header["step"] == steps and not header["finished"]
+    assert signal.getsignal(number) is before
+    assert main(arguments(scene, out)) == 0
+    assert (out / "checkpoint.npz").read_bytes() == whole
+
+
+def test_a_signal_in_the_last_step_changes_nothing(scene, whole, tmp_path, monkeypatch):
+    signalling(monkeypatch, 60, signal.SIGINT)
+    assert main(arguments(scene, tmp_path / "run")) == 0
+    assert (tmp_path / "run" / "checkpoint.npz").read_bytes() == whole
+
+
+def test_a_second_signal_stops_at_once(scene, tmp_path, capsys, monkeypatch):
+    """Both come in step 25: the last checkpoint is that of step 20."""
+    train_step = Trainer.train_step
+
+    def stepping(self):
+        if self.step + 1 == 25:
+            signal.raise_signal(signal.SIGTERM)
+            signal.raise_signal(signal.SIGINT)
+        return train_step(self)
+
+    monkeypatch.setattr(Trainer, "train_step", stepping)
+    assert main(arguments(scene, tmp_path / "run")) == 130
+    assert "from its last checkpoint" in capsys.readouterr().err
+    assert load_checkpoint(tmp_path / "run" / "checkpoint.npz")[0]["step"] == 20
+
+
+def test_a_process_that_is_terminated_says_how_to_go_on(scene, tmp_path):
+    """As a scheduler does it; the log is no terminal."""
+    out = tmp_path / "run"
+    command = [sys.executable, "-m", "pp_cl", *arguments(scene, out, train__iterations=100_000)]
+    with open(tmp_path / "text", "wb") as text:
+        process = subprocess.Popen(command, cwd=ROOT, stdout=text, stderr=text)
+    while process.poll() is None and not (out / "checkpoint.npz").exists():
+        time.sleep(0.01)
+    process.send_signal(signal.SIGTERM)
+    assert process.wait() == 143
+    text = (tmp_path / "text").read_bytes()
+    assert b"\r" not in text and b"Traceback" not in text
+    assert text.splitlines()[-1].endswith(b"the same command goes on")
+
+
+def test_ignored_signals_stay_ignored(monkeypatch):
+    """nohup and & in a script rely on it."""
+    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
+    try:
+        with first_signal() as caught:
+            os.kill(os.getpid(), signal.SIGINT)
+            assert signal.getsignal(signal.SIGINT) is signal.SIG_IGN and not caught
+    finally:
+        signal.signal(signal.SIGINT, before)
+
+
+def test_another_thread_catches_nothing():
+    found = []
+
+    def enter():
+        with first_signal() as caught:
+            found.append((caught, signal.getsignal(signal.SIGTERM)))
+
+    thread = threading.Thread(target=enter)
+    thread.start()
+    thread.join()
+    assert found == [([], signal.getsignal(signal.SIGTERM))]
+
+
+def test_a_checkpoint_between_all_that_is_due_resumes_to_the_same_bytes(
+    scene, tmp_path, monkeypatch
+):
+    """After a refinement, with lazy Adam and moments in 16 bits, between two smoothings, within the
+    averages, not at a pruning.
+    """
+    changes = {"train__lazy_adam": "true", "train__moments_16bit": "true", "downscale": 1}
+    changes |= {"train__refine_at": "0.5,1", "points__count": 300, "train__prune_looks": 4}
+    assert main(arguments(scene, tmp_path / "whole", **changes)) == 0
+    with monkeypatch.context() as patch:
+        signalling(patch, 53, signal.SIGINT)
+        assert main(arguments(scene, tmp_path / "run", **changes)) == 130
+    assert main(arguments(scene, tmp_path / "run", **changes)) == 0
+    one, other = ((tmp_path / name / "checkpoint.npz").read_bytes() for name in ("whole", "run"))
+    assert one == other

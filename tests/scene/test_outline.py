@@ -1,0 +1,58 @@
+"""The outline of points, against the ball that they fill."""
+
+import numpy as np
+import pytest
+from support.ball_views import CENTRE, RADIUS, ball_camera, ball_view
+
+from pp_cl.scene.camera import Camera
+from pp_cl.scene.grid import Grid
+from pp_cl.scene.outline import outline, silhouette
+
+
+def ball_points(per_radius, shell=False):
+    """(Grid, ids) of the vertices in the ball; shell: of the outer two layers only."""
+    edge = RADIUS / per_radius
+    n = 2 * per_radius + 3
+    grid = Grid(tuple(CENTRE - edge * (n - 1) / 2), edge, (n, n, n))
+    distance = np.linalg.norm(grid.positions(np.arange(n**3)) - CENTRE, axis=1)
+    inside = (distance <= RADIUS) & (distance > (RADIUS - 2 * edge if shell else 0))
+    return grid, np.flatnonzero(inside).astype(np.uint32)
+
+
+@pytest.mark.parametrize("per_radius, shell", [(40, False), (12, False), (12, True), (6, False)])
+def test_the_silhouette_is_that_of_the_ball_without_gaps(per_radius, shell):
+    grid, ids = ball_points(per_radius, shell)
+    camera = ball_camera(CENTRE + np.array([3.0, 2.0, 1.0]), CENTRE, size=(96, 80))
+    found = silhouette(grid, ids, camera)
+    truth = ball_view("ball", camera).image[..., 3] > 0
+    assert found.shape == (80, 96)
+    wrong = found != truth
+    assert wrong.sum() < 0.12 * truth.sum()
+    y, x = np.nonzero(wrong)  # only along the border, within the spacing of the points
+    radius = np.sqrt(truth.sum() / np.pi)
+    off = np.abs(np.hypot(x + 0.5 - camera.cx, y + 0.5 - camera.cy) - radius)
+    assert off.max() < radius / per_radius + 2.5
+
+
+def test_the_outline_is_a_thin_ring():
+    grid, ids = ball_points(20)
+    camera = ball_camera(CENTRE + np.array([4.0, 0.0, 1.0]), CENTRE, size=(96, 96))
+    ring, inside = outline(grid, ids, camera), silhouette(grid, ids, camera)
+    length = 2 * np.pi * np.sqrt(inside.sum() / np.pi)
+    assert 1.5 * length < ring.sum() < 3.5 * length
+    assert not ring[48, 48] and not ring[0].any()
+
+
+def test_points_behind_the_camera_and_outside_the_image_are_not_drawn():
+    grid, ids = ball_points(6)
+    away = Camera.look_at(CENTRE + [3.0, 0, 0], CENTRE + [9.0, 0, 0], fx=90, width=64, height=64)
+    assert not silhouette(grid, ids, away).any()
+    beside = ball_camera(CENTRE + [3.0, 0, 0], CENTRE + [0, 9.0, 0])
+    assert not outline(grid, ids, beside).any()
+
+
+def test_a_cut_off_object_has_no_outline_along_the_border():
+    """The camera is so near that the ball fills the image."""
+    grid, ids = ball_points(20)
+    camera = ball_camera(CENTRE + [1.2, 0, 0], CENTRE)
+    assert silhouette(grid, ids, camera).all() and not outline(grid, ids, camera).any()

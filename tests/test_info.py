@@ -1,0 +1,224 @@
+"""`pp-cl info`: what a run or a scene is, and the picture of its points."""
+
+import json
+import math
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+from support.runs import arguments, train_and_interrupt
+from support.scenes import write_ball_scene
+
+from pp_cl.cli import main
+from pp_cl.files.checkpoint import load_checkpoint
+from pp_cl.files.contact_sheet import GAP, HEADER
+from pp_cl.files.image import read_rgba
+from pp_cl.info import OUTLINE
+
+BALL = 0.8  # its radius, support.scenes
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory):
+    """Folder of a small scene."""
+    return write_ball_scene(tmp_path_factory.mktemp("scene") / "ball")
+
+
+@pytest.fixture(scope="module")
+def finished(scene, tmp_path_factory):
+    """Folder of a finished and evaluated run."""
+    out = tmp_path_factory.mktemp("runs") / "run"
+    assert main(arguments(scene, out)) == 0
+    assert main(["eval", str(out), "--metrics", "psnr"]) == 0
+    return out
+
+
+@pytest.fixture
+def facts(capsys):
+    """Reads the facts that `pp-cl info ... --json` prints."""
+
+    def read(*words):
+        capsys.readouterr()
+        assert main(["info", *map(str, words), "--json"]) == 0
+        return json.loads(capsys.readouterr().out)
+
+    return read
+
+
+def failure(capsys, *words):
+    """The one line on stderr of a command that must end with exit status 2."""
+    capsys.readouterr()
+    assert main(["info", *map(str, words)]) == 2
+    captured = capsys.readouterr()
+    assert captured.err.count("\n") == 1 and not captured.out
+    return captured.err
+
+
+def test_a_run_says_what_its_files_say(scene, finished, facts):
+    found = facts(finished)
+    header, arrays = load_checkpoint(finished / "checkpoint.npz")
+    log = [json.loads(line) for line in (finished / "log.jsonl").read_text().splitlines()]
+    assert found["preset"] == "tiny" and found["scene"] == scene and found["downscale"] == 2
+    assert (found["step"], found["iterations"], found["finished"]) == (60, 60, True)
+    assert found["points"] == {
+        "initial": header["initial_points"],
+        "left": len(arrays["points.ids"]),
+    }
+    assert found["grid"]["dims"] == header["grid"]["dims"]
+    # 24 pixels across, angle of view 0.7, from a distance of 4
+    pixels = 12 / math.tan(0.35) * header["grid"]["edge"] / 4
+    assert found["grid"]["edge_pixels"] == pytest.approx(pixels, rel=0.02)
+    assert found["checkpoint_bytes"] == (finished / "checkpoint.npz").stat().st_size
+    assert found["device"] == log[-1]["device"] and found["seconds"] == log[-1]["seconds"]
+    assert found["psnr"] == log[-2]["psnr"]
+    assert found["metrics"] == json.loads((finished / "eval/metrics.json").read_text())["mean"]
+    parameters = sum(a.size for name, a in arrays.items() if name.startswith("net."))
+    assert found["network"] == {"widths": [16, 16, 16], "parameters": parameters}
+
+
+def test_a_run_in_lines(finished, capsys):
+    assert main(["info", str(finished)]) == 0
+    text = capsys.readouterr().out
+    for part in ("preset tiny", "step 60 of 60, finished", "left of", "16, 16, 16 channels"):
+        assert part in text
+    assert "pixels)" in text and "MiB" in text and "psnr" in text
+
+
+def test_an_unfinished_run_and_one_without_a_checkpoint(scene, tmp_path, facts, monkeypatch):
+    train_and_interrupt(scene, tmp_path / "run", 25, monkeypatch)
+    found = facts(tmp_path / "run")
+    assert (found["step"], found["finished"], found["metrics"]) == (20, False, None)
+    train_and_interrupt(scene, tmp_path / "young", 7, monkeypatch)
+    found = facts(tmp_path / "young")
+    assert found["step"] == 0 and found["points"] is None and found["seconds"] > 0
+    assert main(["info", str(tmp_path / "young")]) == 0
+
+
+def test_a_run_whose_scene_was_renamed(scene, finished, tmp_path, facts, capsys):
+    """info tells what it knows; its picture, and eval, ask for --scene."""
+    run, old, new = tmp_path / "run", tmp_path / "ball", tmp_path / "sphere"
+    shutil.copytree(scene, old)
+    assert main(arguments(str(old), run, train__iterations=6)) == 0
+    before = facts(run)
+    assert main(["eval", str(run), "--metrics", "psnr"]) == 0
+    metrics = json.loads((run / "eval" / "metrics.json").read_text())
+    old.rename(new)
+    assert facts(run)["grid"]["edge_pixels"] is None
+    assert main(["eval", str(run)]) == 2
+    assert f"{old}: the run's scene is not there; say where with --scene" in capsys.readouterr().err
+    picture = ("--picture", tmp_path / "points.png")
+    assert str(old) in failure(capsys, run, *picture)
+    assert facts(run, "--scene", new)["grid"] == before["grid"]
+    assert facts(run, "--scene", new, *picture)["picture"] == str(tmp_path / "points.png")
+    assert main(["eval", str(run), "--metrics", "psnr", "--scene", str(new)]) == 0
+    again = json.loads((run / "eval" / "metrics.json").read_text())
+    assert again["per_image"] == metrics["per_image"]
+
+
+def test_a_scene_says_what_is_in_it(scene, facts):
+    found = facts(scene)
+    assert found["format"] == "transforms" and list(found["splits"].items()) == [
+        ("train", 8),
+        ("test", 2),
+    ]
+    assert found["images"] == {"48x48": 10} and found["downscale"] == 1
+    focal = 24 / math.tan(0.35)
+    assert found["focal_pixels"] == pytest.approx([focal, focal])
+    assert found["field_of_view"]["x"] == pytest.approx([math.degrees(0.7)] * 2)
+    share = np.pi * (BALL / math.sqrt(16 - BALL**2) * focal) ** 2 / 48**2
+    assert found["masks"] == {"with_alpha": 1.0, "object": pytest.approx(share, rel=0.02)}
+    assert found["depth_range"] is None and found["problem"] is None
+    assert found["distances"] == pytest.approx([4, 4], abs=1e-6)
+    assert found["looked_at"] == pytest.approx([0, 0, 0], abs=1e-6)
+    assert found["up"] == pytest.approx([0, 0, 1], abs=1e-3)
+    hull = found["hull"]
+    assert 250_000 <= hull["points"] <= 255_000 and not hull["capped"]
+    low, high = np.array(hull["box"])
+    assert (low < -0.9 * BALL).all() and (high > 0.9 * BALL).all()
+    assert (np.abs(hull["box"]) < 1.5 * BALL).all()
+
+
+def test_a_scene_in_lines_and_the_preset_of_its_hull(scene, capsys):
+    assert main(["info", scene, "--preset", "full"]) == 0
+    text = capsys.readouterr().out
+    points = int(text.split("hull")[1].split()[0])
+    assert 170_000 <= points <= 174_000
+    for part in ("train 8, test 2", "10 of 48x48", "100% of the training views", "(estimated)"):
+        assert part in text
+    assert "-0.000" not in text
+
+
+def test_a_scene_without_masks_has_no_hull_and_a_picture(tmp_path, facts, capsys):
+    scene = Path(write_ball_scene(tmp_path / "ball", views=5))
+    for path in (scene / "train").iterdir():
+        Image.open(path).convert("RGB").save(path)
+    found = facts(scene, "--picture", tmp_path / "sheet.png")
+    assert found["masks"] == {"with_alpha": 0.0, "object": None} and found["hull"] is None
+    assert "has no transparent pixel" in found["problem"]
+    image = read_rgba(tmp_path / "sheet.png")[..., :3]
+    assert image.shape[1] == 4 * (48 + GAP) - GAP and not (image == OUTLINE).all(-1).any()
+    assert main(["info", str(scene)]) == 0
+    assert "hull        none: " in capsys.readouterr().out
+
+
+def outlined(path, tile):
+    """(48, 48) bool: where a tile of a picture has the outline's colour."""
+    row, column = divmod(tile, 4)
+    y, x = HEADER + row * (48 + HEADER + GAP), column * (48 + GAP)
+    return (read_rgba(path)[y : y + 48, x : x + 48, :3] == OUTLINE).all(-1)
+
+
+@pytest.mark.parametrize("is_run", [False, True])
+def test_the_picture_draws_the_points_around_the_object(scene, is_run, tmp_path, capsys):
+    path, subject = tmp_path / "points.png", scene
+    if is_run:
+        subject = tmp_path / "run"
+        assert (
+            main(arguments(scene, subject, train__iterations=2, train__final_prune_weight=0)) == 0
+        )
+    assert main(["info", str(subject), "--picture", str(path)]) == 0
+    assert f"wrote {path}" in capsys.readouterr().out
+    radius = BALL / math.sqrt(16 - BALL**2) * 24 / math.tan(0.35)  # of the ball, in pixels
+    for tile in range(8):
+        y, x = np.nonzero(outlined(path, tile)) - np.array([[23.5], [23.5]])
+        off = np.hypot(x, y) - radius
+        assert off.max() < 3.5
+        directions = np.arctan2(y, x)[np.abs(off) < 3.5] / (2 * np.pi) * 24
+        assert set(np.floor(directions)) == set(range(-12, 12))
+
+
+def test_the_demo_is_a_scene_too(facts, monkeypatch):
+    monkeypatch.setattr("pp_cl.scene.demo.TRAIN_VIEWS", 6)
+    found = facts("demo")
+    assert found["format"] == "demo" and found["splits"] == {"train": 6, "test": 16}
+    assert found["downscale"] == 2 and found["distances"] == pytest.approx([3.4, 3.4])
+
+
+def test_what_is_neither_is_one_line(tmp_path, capsys):
+    assert "no such folder" in failure(capsys, tmp_path / "none")
+    assert "no scene in it" in failure(capsys, tmp_path)
+    (tmp_path / "config.json").write_text('{"preset": "tiny"}')
+    (tmp_path / "checkpoint.npz").write_bytes(b"PK\x03\x04 not really")
+    assert "corrupt checkpoint" in failure(capsys, tmp_path)
+
+
+def test_a_broken_evaluation_is_one_line(finished, tmp_path, capsys):
+    run = tmp_path / "run"
+    shutil.copytree(finished, run)
+    (run / "eval" / "metrics.json").write_text("[]")
+    assert "metrics.json: holds no metrics" in failure(capsys, run)
+
+
+def test_pictures_are_opened_when_asked_for(finished, tmp_path, capsys, monkeypatch):
+    opened, path = [], tmp_path / "points.png"
+    monkeypatch.setattr("webbrowser.open", lambda uri: opened.append(uri) or True)
+    assert "--picture" in failure(capsys, finished, "--open") and not opened
+    assert main(["info", str(finished), "--picture", str(path), "--open"]) == 0
+    assert main(["eval", str(finished), "--metrics", "psnr", "--open"]) == 0
+    assert opened == [path.as_uri(), (finished / "eval" / "comparison.png").as_uri()]
+    monkeypatch.setattr("webbrowser.open", lambda uri: False)
+    capsys.readouterr()
+    assert main(["info", str(finished), "--picture", str(path), "--open"]) == 0
+    assert f"open {path} yourself" in capsys.readouterr().err
