@@ -2,6 +2,7 @@
 
 import argparse
 import sys
+from contextlib import nullcontext
 
 from pp_cl.commands import options as shared
 from pp_cl.config import help_lines
@@ -33,6 +34,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="GIB",
         help="device memory to use; what is not needed caches the hits of repeating views",
     )
+    add("--view", action="store_true", help="look on in the browser, as with `pp-cl view RUN`")
     shared.add_tolerance(parser)
     shared.add_set(parser, "any other setting, see below")
     shared.add_device(parser)
@@ -44,6 +46,7 @@ def run(options: argparse.Namespace) -> None:
     from pp_cl.files.run_folder import RunFolder
     from pp_cl.run import open_training, run_config, stored_state
     from pp_cl.training.memory import plan_lines
+    from pp_cl.view.serve import serve_in_background
 
     folder = RunFolder(options.out)
     config = run_config(folder, options.scene, options.preset, _given_settings(options))
@@ -62,7 +65,8 @@ def run(options: argparse.Namespace) -> None:
     print(training.origin)
     print(_first_line(training))
     print("\n".join(plan_lines(training.plan, dev)))
-    seconds = _run_with_bar(training)
+    with serve_in_background(folder.path, options.device) if options.view else nullcontext():
+        seconds = _run_with_bar(training)
     print(
         f"trained {config.train.iterations} steps in {seconds:.1f} s;"
         f" {training.trainer.model.cloud.count} of {training.info['initial_points']} points remain;"

@@ -3,6 +3,7 @@
 import argparse
 import os
 import sys
+import threading
 import webbrowser
 
 from pp_cl.commands import options as shared
@@ -61,4 +62,5 @@ def _open(address):
     """Show the page in a browser, unless only one for terminals would answer."""
     windows = sys.platform in ("win32", "darwin")
     if windows or any(os.environ.get(n) for n in ("BROWSER", "DISPLAY", "WAYLAND_DISPLAY")):
-        webbrowser.open(address)
+        # some browsers answer only when they are closed, and must not keep the server waiting
+        threading.Thread(target=webbrowser.open, args=(address,), daemon=True).start()

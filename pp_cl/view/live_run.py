@@ -122,7 +122,7 @@ class LiveRun:
         if request.show in OWN_CAMERA:
             if not self._views:
                 raise UserError(self.notice)
-            index = nearest_view([view.camera for view in self._views], camera)
+            index = nearest_view([v.camera for v in self._views], camera, self._run.ball[0])
             camera = self._views[index].camera
         factor = draft_factor(camera) if request.draft else 1
         camera = camera.downscaled(factor)
@@ -221,13 +221,14 @@ def mean_up(cameras: list[Camera]) -> np.ndarray:
     return up / length if length > 1e-3 else -cameras[0].pose[:, 1]
 
 
-def nearest_view(cameras: list[Camera], camera: Camera) -> int:
-    """Which of the cameras is nearest to another: by the distance of the eyes, and by the turn of
-    the axis times the mean distance of the eyes, so that both count alike in any unit.
+def nearest_view(cameras: list[Camera], camera: Camera, centre: np.ndarray) -> int:
+    """Which of the cameras is nearest to another: by the distance of the eyes, plus the angle
+    between the axes times the eye's distance from the object's centre (3,).
     """
-    apart = np.array([np.linalg.norm(other.eye - camera.eye) for other in cameras])
+    radius = np.linalg.norm(camera.eye - centre)
+    apart = [np.linalg.norm(other.eye - camera.eye) for other in cameras]
     turned = [np.arccos(np.clip(c.pose[:, 2] @ camera.pose[:, 2], -1, 1)) for c in cameras]
-    return int(np.argmin(apart + np.mean(apart) * np.array(turned)))
+    return int(np.argmin(np.array(apart) + radius * np.array(turned)))
 
 
 def draft_factor(camera: Camera) -> int:

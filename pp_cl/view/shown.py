@@ -10,7 +10,7 @@ from pp_cl.files.image import to_8bit
 from pp_cl.files.picture import srgb_to_linear
 from pp_cl.scene.camera import Camera
 
-DARK = 0.09  # sRGB, the page's background
+DARK = np.array([23, 24, 27]) / 255  # sRGB, the background of page.css
 LEAST_ALPHA = 0.5  # of a pixel that has a depth to look at: those below mix edge and background
 JPEG_QUALITY = 90
 # eleven colours of viridis, from low to high (matplotlib, CC0)
