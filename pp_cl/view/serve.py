@@ -101,7 +101,7 @@ async def _serve(live, access, listening, *, announce, with_parent):
     from pp_cl.view.server import ViewServer
 
     server = ViewServer(live, access)
-    runner = web.AppRunner(server.app(), access_log=None, shutdown_timeout=1.0)
+    runner = server.runner()
     await runner.setup()
     try:
         await web.SockSite(runner, listening).start()

@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import json
+import logging
 import time
 from collections import deque
 from importlib.resources import files
 from typing import Any
 
 from aiohttp import WSMsgType, web
+from aiohttp.http_exceptions import HttpProcessingError
 
 from pp_cl.errors import UserError
 from pp_cl.view.access import Access
@@ -29,6 +32,7 @@ FILES = {
 SOCKET = "socket"  # its path
 MOST_TABS = 16
 LOG_SECONDS = 1.0  # between two looks at the log
+GRACE_SECONDS = 1.0  # for requests in work when the server ends
 PULSE_SECONDS = 20.0  # a tab that answers no ping for so long is gone
 RATE_SECONDS = 2.0  # of frames that the rate is counted over
 
@@ -112,8 +116,15 @@ class ViewServer:
             for name, (file, kind) in FILES.items()
         }
 
-    def app(self) -> web.Application:
-        """The application; rendering begins and ends with it."""
+    def runner(self) -> web.AppRunner:
+        """Runs the server; rendering begins with its setup() and ends with its cleanup()."""
+        logger = logging.getLogger(__name__)
+        logger.addFilter(_is_a_bug)
+        return web.AppRunner(
+            self._app(), access_log=None, logger=logger, shutdown_timeout=GRACE_SECONDS
+        )
+
+    def _app(self):
         app = web.Application(middlewares=[self._guard], client_max_size=MOST_BYTES)
         app.on_response_prepare.append(self._set_headers)
         app.cleanup_ctx.append(self._work)
@@ -161,6 +172,7 @@ class ViewServer:
             self.tabs.discard(tab)
             self.thread.forget(tab)
             sender.cancel()
+            await _ended(sender)
         return socket
 
     def _request(self, tab, text):
@@ -204,3 +216,14 @@ class ViewServer:
     async def _close_tabs(self, _app):
         for tab in list(self.tabs):
             await tab.socket.close(code=1001, message=b"pp-cl view has ended")
+
+
+def _is_a_bug(record):
+    """Whether a record of the log is worth its traceback: broken HTTP of a stranger is not."""
+    return not (record.exc_info and isinstance(record.exc_info[1], HttpProcessingError))
+
+
+async def _ended(sender):
+    """Wait for a task that was cancelled; that its tab is gone is no error of it."""
+    with contextlib.suppress(asyncio.CancelledError, ConnectionError):
+        await sender

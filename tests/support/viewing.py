@@ -97,7 +97,7 @@ async def served(dev, folder):
     with contextlib.closing(socket.create_server(("127.0.0.1", 0))) as listening:
         access = Access("127.0.0.1", listening.getsockname()[1])
         server = ViewServer(LiveRun(dev, folder), access)
-        runner = web.AppRunner(server.app(), access_log=None, shutdown_timeout=1.0)
+        runner = server.runner()
         await runner.setup()
         try:
             await web.SockSite(runner, listening).start()

@@ -210,3 +210,24 @@ def test_a_training_is_followed(dev, copied):
                 await tab.receive("facts")
 
     asyncio.run(scenario())
+
+
+def test_broken_http_is_refused_and_leaves_no_traceback(dev, trained, capsys, caplog):
+    async def scenario():
+        async with served(dev, trained) as here:
+            for junk in (
+                b"GET / HTTP/9.9\r\n\r\n",
+                b"\x16\x03\x01\r\n\r\n",
+                b"GET /" + b"a" * 9999,
+            ):
+                reader, writer = await asyncio.open_connection("127.0.0.1", here.access.port)
+                writer.write(junk)
+                assert (await asyncio.wait_for(reader.read(), SECONDS)).startswith(b"HTTP/1.0 400")
+                writer.close()
+            async with here.tab() as socket:  # is gone without a word
+                await here.ready(socket)
+                socket._response.connection.transport.abort()
+            await until(lambda: not here.server.tabs)
+
+    asyncio.run(scenario())
+    assert caplog.text == "" and capsys.readouterr().err == ""
