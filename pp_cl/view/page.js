@@ -28,7 +28,7 @@ function connect() {
   socket.onmessage = (event) => (typeof event.data === "string" ? take(JSON.parse(event.data)) : takeFrame(event.data));
   socket.onclose = () => {
     $("status").textContent = "not connected";
-    say("The connection is lost: pp-cl view has ended, or its address has changed.", true);
+    say(`The viewer has ended; pp-cl view ${facts ? facts.name : "RUN"} shows the run again, at a new address.`, true);
     setTimeout(connect, RECONNECT);
   };
 }
@@ -192,7 +192,7 @@ function layOut() {
 
 // [[column, row] of the eye on the overlay, lines of the frustum] for each view ahead of the camera
 function frustums(at, perPixel) {
-  const size = 0.16 * around.radius;
+  const size = 0.12 * around.radius;
   return around.views.map((view) => {
     const c = fromFacts(view.camera), depth = (size * 2 * c.fx) / Math.max(c.w, c.h) / 2;
     const corners = [[0, 0], [c.w, 0], [c.w, c.h], [0, c.h]].map(([u, v]) => unproject(c, u, v, depth));

@@ -92,10 +92,6 @@ def test_a_frustum_is_clicked_the_camera_copied_and_the_device_shown(dev, traine
             text = await page.until("document.getElementById('numbers').innerText")
             assert dev.name in text and "frames per second" in text
 
-    async def copied_camera(page):
-        await click(page, "#copy")
-        return json.loads(await page.until("document.getElementById('camera').value"))
-
     async def place_of_a_frustum(page, names):
         """Where a frustum is pointed at, and the name of its view, as the caption says it."""
         for x in range(20, 680, 22):
@@ -134,6 +130,37 @@ def test_dragging_brings_frames_and_a_second_tab_is_another(dev, trained):
             assert not here.server.tabs and here.server.thread.drawn == drawn
 
     asyncio.run(scenario())
+
+
+def test_fingers_turn_and_pinch_on_a_small_screen(dev, trained):
+    async def scenario():
+        async with served(dev, trained) as here, chromium() as browser, browser.page() as page:
+            size = {"width": 390, "height": 800, "deviceScaleFactor": 2, "mobile": True}
+            await page.call("Emulation.setDeviceMetricsOverride", **size)
+            await page.call("Emulation.setTouchEmulationEnabled", enabled=True, maxTouchPoints=2)
+            await page.open(here.access.address)
+            first = await still(page)
+            assert await page.evaluate("document.documentElement.scrollWidth") == 390
+            path = [(200 + 8 * i, 200) for i in range(9)]
+            turned = await still(page, page.touch(path))
+            assert turned != first
+            apart = [(180 - 8 * i, 200) for i in range(9)], [(220 + 8 * i, 200) for i in range(9)]
+            assert await still(page, page.touch(*apart)) not in (first, turned)
+            after = await copied_camera(page)
+            view = here.server._surroundings
+            away = [np.subtract(eye_of(c), view["centre"]) for c in (after, view["camera"])]
+            assert np.linalg.norm(away[0]) < 0.7 * np.linalg.norm(away[1])
+
+    def eye_of(facts):
+        return np.array(facts["transform_matrix"])[:3, 3]
+
+    asyncio.run(scenario())
+
+
+async def copied_camera(page):
+    """The camera as the page gives it."""
+    await click(page, "#copy")
+    return json.loads(await page.until("document.getElementById('camera').value"))
 
 
 def test_a_wrong_token_and_a_foreign_page_are_refused(dev, trained):
