@@ -16,7 +16,7 @@ from pp_cl.scene.readers.transforms import CV_FROM_GL
 MOST_BYTES = 8192  # of a message: a camera in full precision takes a tenth of it
 KINDS = ("frame", "snapshot")
 SHOWN = ("colour", "alpha", "depth", "normals", "hits", "error", "photograph")
-LEAST_SIDE, MOST_SIDE, MOST_PIXELS = 16, 4096, 2**22  # of a picture; 16 as in scene/views.py
+LEAST_SIDE, MOST_SIDE, MOST_PIXELS = 16, 4096, 2**23  # of a picture, as page.js
 ROTATION_TOLERANCE = 1e-4  # largest element of R^T R - 1; a browser counts in float64
 MOST_NUMBER = 2**53 - 1  # what a browser counts to exactly
 # {name: (least, most)}; exposure in stops, kept as a share of the points

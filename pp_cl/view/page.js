@@ -7,6 +7,7 @@ const RADIANS_PER_PIXEL = 0.008, ZOOM_PER_PIXEL = 0.0012, NEAR_CLICK = 22, CLICK
 const RECONNECT = 2000, NOTE = 4000; // ms
 const SLIDERS = ["tau", "early_stop", "kept", "exposure"];
 const CUBIC = ["tau", "early_stop"]; // most of their effect is near 0: value = 0.5 position^3
+const MOST_SIDE = 4096, MOST_PIXELS = 2 ** 23; // of a picture, as messages.py
 const OWN_CAMERA = ["error", "photograph"];
 
 let socket = null;
@@ -75,8 +76,7 @@ function ask(draft) {
 function send(kind, draft) {
   if (!socket || socket.readyState !== WebSocket.OPEN || !camera) return;
   const values = Object.fromEntries(SLIDERS.map((id) => [id, value(id)]));
-  const facts = toFacts(scaled(camera, Number($("size").value)));
-  socket.send(JSON.stringify({ number: ++number, kind, show: show(), draft, camera: facts, ...values }));
+  socket.send(JSON.stringify({ number: ++number, kind, show: show(), draft, camera: sized(), ...values }));
 }
 
 async function takeFrame(buffer) {
@@ -123,6 +123,12 @@ function showFrameFacts(frame) {
   const data = document.body.dataset; // for tests and for the curious
   data.frames = Number(data.frames || 0) + 1;
   Object.assign(data, { number: frame.number, show: frame.show, draft: frame.draft, rate, step: frame.step });
+}
+
+// The camera at the size that is chosen, as far as the server allows it.
+function sized() {
+  const { w, h } = camera, most = Math.min(MOST_SIDE / Math.max(w, h), 0.999 * Math.sqrt(MOST_PIXELS / (w * h)));
+  return toFacts(scaled(camera, Math.min(Number($("size").value), most)));
 }
 
 const short = (x) => Number(x.toPrecision(3)).toString();
@@ -344,7 +350,7 @@ function reset() {
 async function copyCamera() {
   if (!camera) return;
   const box = $("camera"), own = photograph || show() === "error";
-  const at = own && shownView !== null ? around.views[shownView].camera : toFacts(scaled(camera, Number($("size").value)));
+  const at = own && shownView !== null ? around.views[shownView].camera : sized();
   box.value = JSON.stringify(at, null, 1);
   box.hidden = false;
   try {
