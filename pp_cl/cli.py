@@ -18,6 +18,7 @@ COMMANDS = (
     "eval",
     "info",
     "render",
+    "view",
     "compare",
     "bench",
     "tune",

@@ -161,14 +161,15 @@ class Renderer:
         seed: int = 0,
         key: Hashable = None,
         tau: float | None = None,
+        early_stop: float | None = None,
         depth_range: tuple[float, float] | None = None,
     ) -> ViewWeights:
         """The blend weights of a camera, which is padded to multiples of 4 pixels.
 
         dropout: share of the points left out, at random by `seed`. key: names a view whose camera
         and points are the same in every call until cache.clear(), so that its pairs may be cached.
-        tau: instead of the settings'. depth_range: instead of the model's, which a camera may see
-        beyond that is none of the scene's; a softmax of depth needs the model's.
+        tau, early_stop: instead of the settings'. depth_range: instead of the model's, which a
+        camera may see beyond that is none of the scene's; a softmax of depth needs the model's.
         """
         cloud, settings, b = self.model.cloud, self.settings, self._buffers
         padded, *offset = camera.padded(NETWORK_MULTIPLE)
@@ -194,7 +195,7 @@ class Renderer:
                 cloud.opacity,
                 gamma,
                 max_tracked=settings.max_tracked,
-                early_stop=settings.early_stop,
+                early_stop=settings.early_stop if early_stop is None else early_stop,
                 tau=settings.tau if tau is None else tau,
             )
         return ViewWeights(tuple(offset), points, pairs, weights)

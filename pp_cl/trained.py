@@ -83,7 +83,7 @@ class Run:
         if samples < 1 or side * side != samples:
             raise ValueError(f"{samples} samples are no square number")
         shifts = (np.arange(side) + 0.5) / side - 0.5
-        options = {"features": features, "depth_range": self._depth_range(camera)}
+        options = {"features": features, "depth_range": self.depth_range(camera)}
         pictures = [
             self.renderer.picture(camera.shifted(dx, dy), self.gamma, **options)
             for dy in shifts
@@ -91,7 +91,7 @@ class Run:
         ]
         return mean_picture(pictures)
 
-    def _depth_range(self, camera):
+    def depth_range(self, camera: Camera) -> tuple[float, float] | None:
         """(near, far) of a camera anywhere; None, the model's, where the blend depends on it."""
         if self.config.raster.blend == "softmax":
             return None

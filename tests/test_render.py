@@ -177,3 +177,17 @@ def test_dropout_leaves_out_its_share_and_pictures_are_repeatable(dev, rng):
     first = renderer.render(camera, GAMMA)
     np.testing.assert_array_equal(first, renderer.render(camera, GAMMA))
     np.testing.assert_array_equal(first, Renderer(dev, model, RasterConfig()).render(camera, GAMMA))
+
+
+@pytest.mark.parametrize("blend", BLENDS)
+def test_tau_and_early_stop_of_a_call_are_those_of_other_settings(dev, rng, blend):
+    model, camera = make_model(dev, rng, 300), ring_cameras(1, 32)[0]
+    settings = RasterConfig(blend=blend, early_stop=0.0)
+    renderer = Renderer(dev, model, settings)
+    exact = renderer.render(camera, GAMMA)
+    for option in ({"tau": 0.3}, {"early_stop": 0.2}):
+        other = Renderer(dev, model, replace(settings, **option)).render(camera, GAMMA)
+        np.testing.assert_array_equal(renderer.render(camera, GAMMA, **option), other)
+        assert (other != exact).any()
+    lasting = Renderer(dev, model, replace(settings, early_stop=0.2))
+    np.testing.assert_array_equal(lasting.render(camera, GAMMA, early_stop=0.0), exact)

@@ -2,7 +2,7 @@
 
 import argparse
 import sys
-from contextlib import ExitStack
+from contextlib import ExitStack, nullcontext
 
 from pp_cl.commands import options as shared
 from pp_cl.config import help_lines
@@ -42,6 +42,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         action="store_true",
         help="also write the curves to RUN/tensorboard (needs pp-cl[tensorboard])",
     )
+    add("--view", action="store_true", help="look on in the browser, as with `pp-cl view RUN`")
     shared.add_tolerance(parser)
     shared.add_set(parser, "any other setting, see below")
     shared.add_device(parser)
@@ -53,6 +54,7 @@ def run(options: argparse.Namespace) -> None:
     from pp_cl.files.run_folder import RunFolder
     from pp_cl.run import open_training, run_config, stored_state
     from pp_cl.training.memory import plan_lines
+    from pp_cl.view.serve import serve_in_background
 
     folder = RunFolder(options.out)
     given, is_new = _given_settings(options), not folder.config.exists()
@@ -74,7 +76,8 @@ def run(options: argparse.Namespace) -> None:
     print(_images_line(training, chosen))
     print(_first_line(training))
     print("\n".join(plan_lines(training.plan, dev)), flush=True)
-    seconds = _run(training, options)
+    with serve_in_background(folder.path, options.device) if options.view else nullcontext():
+        seconds = _run(training, options)
     print(
         f"trained {config.train.iterations} steps in {seconds:.1f} s;"
         f" {training.trainer.model.cloud.count} of {training.info['initial_points']} points remain;"

@@ -65,6 +65,12 @@ class PointCloud:
         for i in range(len(self.sh)):
             self.sh[i] = compact_rows(dev, self.sh[i], keep)
 
+    def rows(self, dev: Device, keep: Array) -> PointCloud:
+        """A copy of the rows `keep`, (M) uint32, ascending."""
+        sh = [gather_rows(dev, array, keep) for array in self.sh]
+        ids, opacity = (gather_rows(dev, array, keep) for array in (self.ids, self.opacity))
+        return PointCloud(ids, opacity, sh)
+
     def replace_by(self, dev: Device, ids: np.ndarray, rows: Array) -> None:
         """Become the points `ids`, (M) ascending, each with what point rows[i] of the present ones
         has learned; one array after the other. rows: (M,) uint32.

@@ -1,0 +1,66 @@
+"""The command pp-cl view."""
+
+import argparse
+import os
+import sys
+import threading
+import webbrowser
+
+from pp_cl.commands import options as shared
+
+HELP = "look at a run in the browser, also while it is trained"
+LOOPBACK = "127.0.0.1"
+PORT = "8733"
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the command's options."""
+    add = parser.add_argument
+    add("run_folder", metavar="RUN", help="folder of the run, finished or not")
+    add("--port", default=PORT, metavar="P", help=f"port to listen on (default {PORT}; 0: any)")
+    add(
+        "--host",
+        default=LOOPBACK,
+        metavar="H",
+        help=f"address to listen on (default {LOOPBACK}: this machine only)",
+    )
+    add("--open", action="store_true", help="open the page in the default browser")
+    add("--wait", action="store_true", help="wait for RUN to begin; end with the calling process")
+    add("--scene", metavar="SCENE", help="where the run's scene is now, if it has moved")
+    shared.add_device(parser)
+
+
+def run(options: argparse.Namespace) -> None:
+    """Serve until Ctrl-C."""
+    from pp_cl.view.serve import serve
+
+    port = int(shared.read_number("--port", options.port, int, least=0, most=65535))
+    if options.host != LOOPBACK:
+        print(
+            f"pp-cl: --host {options.host}: whoever can reach this address and learns the token can"
+            " look on; nothing is encrypted",
+            file=sys.stderr,
+        )
+
+    def announce(address):
+        print(f"{options.run_folder}: {address}  (Ctrl-C ends)", flush=True)
+        if options.open:
+            _open(address)
+
+    serve(
+        options.run_folder,
+        host=options.host,
+        port=port,
+        announce=announce,
+        device=options.device,
+        scene=options.scene,
+        wait=options.wait,
+    )
+
+
+def _open(address):
+    """Show the page in a browser, unless only one for terminals would answer."""
+    windows = sys.platform in ("win32", "darwin")
+    if windows or any(os.environ.get(n) for n in ("BROWSER", "DISPLAY", "WAYLAND_DISPLAY")):
+        # some browsers answer only when they are closed, and must not keep the server waiting
+        threading.Thread(target=webbrowser.open, args=(address,), daemon=True).start()

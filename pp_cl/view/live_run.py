@@ -1,0 +1,258 @@
+"""The run that is looked at: its last checkpoint, taken up anew when it is replaced, and what it
+shows to a camera.
+"""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from pp_cl.config import load_config
+from pp_cl.device.device import Device
+from pp_cl.errors import UserError
+from pp_cl.files.image import to_8bit
+from pp_cl.files.run_folder import RunFolder
+from pp_cl.model import Model
+from pp_cl.render import NETWORK_MULTIPLE, Renderer
+from pp_cl.scene.camera import Camera
+from pp_cl.scene.target import Target
+from pp_cl.trained import Run, load_run
+from pp_cl.view import shown
+from pp_cl.view.messages import LEAST_SIDE, Frame, ViewRequest, camera_facts
+
+DRAFT = 4  # times fewer pixels each way while the camera moves
+OWN_CAMERA = ("error", "photograph")  # are shown from the nearest training view's own camera
+# where no training view says how to look: from above one corner, 40 degrees wide
+START_SIZE, START_FOCAL, START_SIDE = 400, 550.0, (1.0, -1.0, 0.6)
+START_DISTANCE = 3.5  # radii of the object
+
+
+class LiveRun:
+    """A run folder that may still be trained into; used from one thread.
+
+    waiting: why there is nothing to draw yet, one line, or None. notice: one line about photographs
+    that are missing, or None. loads: how often a checkpoint was taken up.
+    """
+
+    def __init__(self, dev: Device, folder: Path | str, scene: str | None = None) -> None:
+        self.dev = dev
+        self.folder = RunFolder(folder)
+        self.waiting: str | None = f"{folder}: no checkpoint yet; waiting for the first one"
+        self.notice: str | None = None
+        self.loads = 0
+        self._scene_path = scene
+        self._run: Run | None = None
+        self._views: list | None = None
+        self._stamp = None
+        self._fewer = None  # (share, Renderer) of the points last kept
+        self._target = Target(dev)
+
+    def refresh(self) -> bool:
+        """Take up the checkpoint if it is another one than last time; whether anything changed. A
+        broken one leaves the last model in place, or a line in `waiting`.
+        """
+        try:
+            found = self.folder.checkpoint.stat()
+        except OSError:
+            return False
+        stamp = found.st_mtime_ns, found.st_size, found.st_ino
+        if stamp == self._stamp:
+            return False
+        self._stamp = stamp
+        try:
+            run = load_run(self.dev, self.folder.path, scene=self._scene_path)
+        except UserError as error:
+            self.waiting, self.notice = (
+                (str(error), None) if self._run is None else (None, str(error))
+            )
+            return True
+        if self._views is None:
+            self._views, self.notice = _training_views(run)
+        self._run, self._fewer, self.waiting = run, None, None
+        self.loads += 1
+        return True
+
+    def facts(self) -> dict[str, Any]:
+        """What the page shows about the run, JSON-able."""
+        facts = {
+            "name": self.folder.path.resolve().name,
+            "waiting": self.waiting,
+            "notice": self.notice,
+            "loads": self.loads,
+            "device": self.dev.name,
+            "platform": self.dev.info["platform"],
+        }
+        if self._run is None:
+            return facts
+        header, config = self._run.header, self._run.config
+        return facts | {
+            "step": header["step"],
+            "iterations": config.train.iterations,
+            "finished": header["finished"],
+            "points": self._run.model.cloud.count,
+            "tau": config.raster.tau,
+            "early_stop": config.raster.early_stop,
+        }
+
+    def surroundings(self) -> dict[str, Any] | None:
+        """What the page turns around and draws beside the picture, JSON-able: the object's centre
+        and radius, what is up, the first camera, the training views. None while there is no model.
+        """
+        if self._run is None:
+            return None
+        centre, radius = self._run.ball
+        cameras = [view.camera for view in self._views]
+        first = cameras[0] if cameras else _start_camera(centre, radius)
+        return {
+            "centre": centre.tolist(),
+            "radius": radius,
+            "up": mean_up(cameras or [first]).tolist(),
+            "camera": camera_facts(first),
+            "views": [{"name": v.name, "camera": camera_facts(v.camera)} for v in self._views],
+        }
+
+    def draw(self, request: ViewRequest) -> Frame:
+        """The picture that is asked for. Raises UserError where there is none to be had."""
+        if self._run is None:
+            raise UserError(self.waiting)
+        start, index, camera = time.perf_counter(), None, request.camera
+        if request.show in OWN_CAMERA:
+            if not self._views:
+                raise UserError(self.notice)
+            index = nearest_view([v.camera for v in self._views], camera, self._run.ball[0])
+            camera = self._views[index].camera
+        factor = draft_factor(camera) if request.draft else 1
+        camera = camera.downscaled(factor)
+        photograph = None if index is None else self._photograph(self._views[index], factor)
+        image, scale = self._image(request, camera, photograph)
+        if request.exposure:
+            image = shown.exposed(image, request.exposure)
+        lossless = request.kind == "snapshot"
+        data = shown.encoded(image, lossless)
+        facts = {
+            "type": request.kind,
+            "number": request.number,
+            "show": request.show,
+            "draft": request.draft,
+            "mime": "image/png" if lossless else "image/jpeg",
+            "camera": camera_facts(camera),
+            "view": index,
+            "scale": scale,
+            "step": self._run.header["step"],
+            "milliseconds": round(1e3 * (time.perf_counter() - start), 1),
+        }
+        return Frame(request.kind, facts, data)
+
+    def _image(self, request, camera, photograph):
+        """((H, W, 3) uint8, (lowest, highest) of its colour scale or None)."""
+        run, show = self._run, request.show
+        if show == "photograph":
+            return to_8bit(photograph), None
+        renderer = self._renderer(request.kept)
+        options = {
+            "tau": request.tau,
+            "early_stop": request.early_stop,
+            "depth_range": run.depth_range(camera),
+        }
+        if show == "hits":
+            hits = hits_per_pixel(renderer, camera, run.gamma, **options)
+            most = int(hits.max())
+            return shown.colour_scale(hits, 0, most, hits > 0), (0, most)
+        picture = renderer.picture(camera, run.gamma, **options)
+        if show == "alpha":
+            return shown.grey(picture.alpha), None
+        known = picture.alpha >= shown.LEAST_ALPHA
+        if show == "depth":
+            centre, radius = run.ball
+            middle = float((centre - camera.eye) @ camera.pose[:, 2])
+            scale = max(middle - radius, 0.0), max(middle + radius, 0.0)
+            return shown.colour_scale(picture.depth, *scale, known), scale
+        if show == "normals":
+            depth = np.where(known, picture.depth, np.inf)
+            return shown.normal_colours(shown.normals_from_depth(depth, camera)), None
+        if show == "error":
+            return shown.error_image(picture.colour, photograph), None
+        return to_8bit(picture.colour), None
+
+    def _renderer(self, kept):
+        """Renders the share `kept` of the points."""
+        run = self._run
+        if kept == 1:
+            return run.renderer
+        if self._fewer is None or self._fewer[0] != kept:
+            network = run.renderer.model.net  # of the run's renderer, which has frozen it
+            model = most_opaque(run.model, network, kept)
+            self._fewer = kept, Renderer(self.dev, model, run.config.raster)
+        return self._fewer[1]
+
+    def _photograph(self, view, factor):
+        """(H, W, 3) float32 of a view, reduced `factor` times more than the run's."""
+        self._target.load(view.reduced(view.downscale * factor))
+        return self._target.whole()
+
+
+def _training_views(run):
+    """(training views, notice): without views, why."""
+    try:
+        return run.scene("train").splits["train"], None
+    except UserError as error:
+        return [], f"no training views: {error}"
+
+
+def _start_camera(centre, radius):
+    eye = centre + START_DISTANCE * radius * np.array(START_SIDE) / np.linalg.norm(START_SIDE)
+    return Camera.look_at(eye, centre, fx=START_FOCAL, width=START_SIZE, height=START_SIZE)
+
+
+def check_run(folder: Path | str) -> None:
+    """Raise UserError unless the folder has the settings of a run; a checkpoint may come later."""
+    load_config(RunFolder(folder).config)
+
+
+def mean_up(cameras: list[Camera]) -> np.ndarray:
+    """(3,) unit vector in world axes: the mean of what is up in the cameras' images; that of the
+    first where they cancel.
+    """
+    up = -np.mean([camera.pose[:, 1] for camera in cameras], axis=0)
+    length = np.linalg.norm(up)
+    return up / length if length > 1e-3 else -cameras[0].pose[:, 1]
+
+
+def nearest_view(cameras: list[Camera], camera: Camera, centre: np.ndarray) -> int:
+    """Which of the cameras is nearest to another: by the distance of the eyes, plus the angle
+    between the axes times the eye's distance from the object's centre (3,).
+    """
+    radius = np.linalg.norm(camera.eye - centre)
+    apart = [np.linalg.norm(other.eye - camera.eye) for other in cameras]
+    turned = [np.arccos(np.clip(c.pose[:, 2] @ camera.pose[:, 2], -1, 1)) for c in cameras]
+    return int(np.argmin(np.array(apart) + radius * np.array(turned)))
+
+
+def draft_factor(camera: Camera) -> int:
+    """How many times a draft is smaller each way: DRAFT, or less where sides would get too short
+    for the network.
+    """
+    return max(1, min(DRAFT, min(camera.width, camera.height) // LEAST_SIDE))
+
+
+def most_opaque(model: Model, network: Any, share: float) -> Model:
+    """A copy of a model with that share of its points, in (0, 1], those of the highest opacity, and
+    at least one. network: the UNet of the copy.
+    """
+    opacity = model.cloud.opacity.get()
+    count = max(1, round(share * len(opacity)))
+    keep = np.sort(np.argsort(-opacity, kind="stable")[:count]).astype(np.uint32)
+    cloud = model.cloud.rows(model.dev, model.dev.upload(keep))
+    return Model(model.dev, model.grid, model.depth_range, cloud, net=network)
+
+
+def hits_per_pixel(renderer: Renderer, camera: Camera, gamma: float, **options: Any) -> np.ndarray:
+    """(H, W) int64: the hits of each pixel. options: of Renderer.blend_weights()."""
+    view = renderer.blend_weights(camera, gamma, **options)
+    padded, left, top = camera.padded(NETWORK_MULTIPLE)
+    hits = np.diff(view.pairs.pixel_offset.get().astype(np.int64))
+    hits = hits.reshape(padded.height, padded.width)
+    return hits[top : top + camera.height, left : left + camera.width]

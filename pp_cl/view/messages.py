@@ -1,0 +1,159 @@
+"""What a tab of the browser asks for, read without trust, and how an answer is packed."""
+
+from __future__ import annotations
+
+import json
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from pp_cl.errors import UserError
+from pp_cl.scene.camera import Camera
+from pp_cl.scene.readers.transforms import CV_FROM_GL
+
+MOST_BYTES = 8192  # of a message: a camera in full precision takes a tenth of it
+KINDS = ("frame", "snapshot")
+SHOWN = ("colour", "alpha", "depth", "normals", "hits", "error", "photograph")
+LEAST_SIDE, MOST_SIDE, MOST_PIXELS = 16, 4096, 2**23  # of a picture, as page.js
+ROTATION_TOLERANCE = 1e-4  # largest element of R^T R - 1; a browser counts in float64
+MOST_NUMBER = 2**53 - 1  # what a browser counts to exactly
+# {name: (least, most)}; exposure in stops, kept as a share of the points
+RANGES = {"tau": (0, 0.5), "early_stop": (0, 0.5), "kept": (0.001, 1), "exposure": (-6, 6)}
+INTRINSICS = {"fl_x": (1, 1e6), "fl_y": (1, 1e6), "cx": (-1e5, 1e5), "cy": (-1e5, 1e5)}
+MOST_DISTANCE = 1e6  # of an eye from the origin, world units: float32 has 0.1 left there
+
+
+@dataclass(frozen=True)
+class ViewRequest:
+    """A picture that a tab asks for.
+
+    number: grows from request to request. kind: of KINDS; a snapshot is lossless. show: of SHOWN.
+    draft: at a quarter of the resolution. kept: share of the points, the most opaque ones, in
+    (0, 1]. exposure: in stops.
+    """
+
+    number: int
+    kind: str
+    show: str
+    camera: Camera
+    draft: bool
+    tau: float
+    early_stop: float
+    kept: float
+    exposure: float
+
+
+@dataclass(frozen=True)
+class Frame:
+    """An answer: facts about a picture, JSON-able, and the picture as a PNG or JPEG file."""
+
+    kind: str
+    facts: dict[str, Any]
+    data: bytes
+
+    def packed(self, **more: Any) -> bytes:
+        """One message: the length of the facts, 4 bytes, little-endian; facts and `more` as JSON;
+        the file.
+        """
+        facts = json.dumps(self.facts | more, allow_nan=False).encode()
+        return len(facts).to_bytes(4, "little") + facts + self.data
+
+
+def read_request(text: str) -> ViewRequest:
+    """The request in a message. Raises UserError in one line for whatever is no such request."""
+    try:
+        message = json.loads(text, parse_constant=_refuse_constant)
+    except (ValueError, RecursionError):
+        raise UserError("the message is no JSON of finite numbers; reload the page") from None
+    if not isinstance(message, dict):
+        raise UserError("the message is no JSON object; reload the page")
+    if type(message.get("draft")) is not bool:
+        raise UserError("draft: must be true or false")
+    return ViewRequest(
+        number=_whole(message, "number", (0, MOST_NUMBER)),
+        kind=_word(message, "kind", KINDS),
+        show=_word(message, "show", SHOWN),
+        camera=_camera(message.get("camera")),
+        draft=message["draft"],
+        **{name: _number(message, name, limits) for name, limits in RANGES.items()},
+    )
+
+
+def camera_facts(camera: Camera) -> dict[str, Any]:
+    """A camera in the form of nerfstudio's transforms files, OpenGL axes."""
+    pose = np.vstack([camera.pose, [0, 0, 0, 1]])
+    pose[:3, :3] = pose[:3, :3] @ CV_FROM_GL
+    return {
+        "transform_matrix": pose.tolist(),
+        "fl_x": camera.fx,
+        "fl_y": camera.fy,
+        "cx": camera.cx,
+        "cy": camera.cy,
+        "w": camera.width,
+        "h": camera.height,
+    }
+
+
+def _camera(facts):
+    """The Camera of such facts. Raises UserError naming what is wrong."""
+    if not isinstance(facts, dict):
+        raise UserError("camera: is missing")
+    width, height = (_whole(facts, key, (LEAST_SIDE, MOST_SIDE), "camera.") for key in "wh")
+    if width * height > MOST_PIXELS:
+        raise UserError(f"camera: {width}x{height} pixels are more than {MOST_PIXELS}")
+    lens = [_number(facts, key, limits, "camera.") for key, limits in INTRINSICS.items()]
+    return Camera(_pose(facts.get("transform_matrix")), *lens, width, height)
+
+
+def _pose(rows):
+    """(3, 4) float64 with OpenCV axes of a 4 x 4 matrix with OpenGL axes."""
+    name = "camera.transform_matrix"
+    shaped = isinstance(rows, list) and len(rows) == 4
+    if not shaped or not all(isinstance(row, list) and len(row) == 4 for row in rows):
+        raise UserError(f"{name}: must be 4 rows of 4 numbers")
+    if not all(_is_number(value) for row in rows for value in row):
+        raise UserError(f"{name}: holds what is no finite number")
+    matrix = np.array(rows, np.float64)
+    if np.abs(matrix[:3, 3]).max() > MOST_DISTANCE:
+        raise UserError(f"{name}: the eye is more than {MOST_DISTANCE:g} from the origin")
+    turn = matrix[:3, :3]
+    off = np.abs(turn.T @ turn - np.eye(3)).max() if np.abs(turn).max() <= 2 else math.inf
+    if off > ROTATION_TOLERANCE or np.linalg.det(turn) < 0:
+        raise UserError(f"{name}: its axes are not orthonormal and right-handed")
+    if not np.array_equal(matrix[3], [0, 0, 0, 1]):
+        raise UserError(f"{name}: its last row must be 0, 0, 0, 1")
+    return np.column_stack([turn @ CV_FROM_GL, matrix[:3, 3]])
+
+
+def _refuse_constant(word):
+    raise ValueError(word)
+
+
+def _is_number(value):
+    """Whether it is a finite number that float64 holds; true and false are none."""
+    if type(value) is int:
+        return abs(value) <= MOST_NUMBER
+    return type(value) is float and math.isfinite(value)
+
+
+def _number(message, key, limits, prefix=""):
+    value, (least, most) = message.get(key), limits
+    if not _is_number(value) or not least <= value <= most:
+        raise UserError(f"{prefix}{key}: must be a number from {least:g} to {most:g}")
+    return float(value)
+
+
+def _whole(message, key, limits, prefix=""):
+    value, (least, most) = message.get(key), limits
+    if type(value) is not int or not least <= value <= most:
+        raise UserError(f"{prefix}{key}: must be a whole number from {least} to {most}")
+    return value
+
+
+def _word(message, key, words):
+    value = message.get(key)
+    if not isinstance(value, str) or value not in words:
+        raise UserError(f"{key}: must be one of {', '.join(words)}")
+    return value

@@ -1,0 +1,123 @@
+"""Starting and ending the server."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import errno
+import importlib.util
+import os
+import socket
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+from pp_cl.device.discover import open_device
+from pp_cl.errors import UserError
+from pp_cl.view.access import Access
+from pp_cl.view.live_run import LiveRun, check_run
+
+WAIT_SECONDS = 0.5  # between two looks for what is waited for
+GRACE_SECONDS = 10.0  # for a server in the background to end
+
+
+def check_installed() -> None:
+    """Raise UserError where the web framework is missing."""
+    if importlib.util.find_spec("aiohttp") is None:
+        raise UserError("pp-cl view needs aiohttp; install it with `pip install 'pp-cl[view]'`")
+
+
+def serve(
+    folder: Path | str,
+    *,
+    host: str,
+    port: int,
+    announce: Callable[[str], None],
+    device: str | None = None,
+    scene: str | None = None,
+    wait: bool = False,
+) -> None:
+    """Show the run in a folder in the browser until Ctrl-C, which ends it without an exception.
+
+    port: 0 takes a free one. announce: called with the address once it listens. device: as `pp-cl
+    devices` lists them. scene: where the run's scene is now. wait: for the folder to become a run,
+    and end with the process that has started this one. Raises UserError for a folder that is no
+    run, and for a host or port that cannot be had.
+    """
+    check_installed()
+    if not wait:
+        check_run(folder)
+    with (
+        contextlib.closing(_listen(host, port)) as listening,
+        contextlib.suppress(KeyboardInterrupt),
+    ):
+        access = Access(host, listening.getsockname()[1])
+        live = LiveRun(open_device(device), folder, scene)
+        asyncio.run(_serve(live, access, listening, announce=announce, with_parent=wait))
+
+
+@contextlib.contextmanager
+def serve_in_background(folder: Path | str, device: str | None = None) -> Iterator[None]:
+    """Show a run that is about to be trained, in a process of its own, until the block ends.
+
+    The process has its own device and reads the checkpoint file: the training's bits stay what they
+    are. It prints the address and opens it. Raises UserError where the web framework is missing.
+    """
+    check_installed()
+    words = [sys.executable, "-m", "pp_cl", "view", str(folder), "--wait", "--open", "--port", "0"]
+    words += [] if device is None else ["--device", device]
+    process = subprocess.Popen(words, stdin=subprocess.DEVNULL)
+    try:
+        yield
+    finally:
+        process.terminate()
+        try:
+            process.wait(GRACE_SECONDS)
+        except subprocess.TimeoutExpired:
+            process.kill()
+            process.wait()
+
+
+def _listen(host, port):
+    """A socket that listens. Raises UserError in one line."""
+    family = socket.AF_INET6 if ":" in host else socket.AF_INET
+    try:
+        return socket.create_server((host, port), family=family)
+    except OSError as error:
+        if error.errno == errno.EADDRINUSE:
+            line = f"--port {port}: another program uses it; choose another, or 0 for a free one"
+        elif error.errno in (errno.EACCES, errno.EPERM):
+            line = f"--port {port}: not allowed to this user; choose one above 1023"
+        else:
+            line = f"--host {host}: no address of this machine ({error.strerror})"
+        raise UserError(line) from None
+
+
+async def _serve(live, access, listening, *, announce, with_parent):
+    """Serve until cancelled, or until the render thread has failed."""
+    from aiohttp import web
+
+    from pp_cl.view.server import ViewServer
+
+    server = ViewServer(live, access)
+    runner = server.runner()
+    await runner.setup()
+    try:
+        await web.SockSite(runner, listening).start()
+        announce(access.address)
+        ends = [server.failed]
+        if with_parent:
+            ends.append(asyncio.create_task(_parent_ended()))
+        await asyncio.wait(ends, return_when=asyncio.FIRST_COMPLETED)
+        if server.failed.done():
+            server.failed.result()  # raises
+    finally:
+        await runner.cleanup()
+
+
+async def _parent_ended():
+    """Wait until the process that has started this one is gone."""
+    parent = os.getppid()
+    while os.getppid() == parent:
+        await asyncio.sleep(WAIT_SECONDS)

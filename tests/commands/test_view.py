@@ -1,0 +1,160 @@
+"""`pp-cl view` as a process, and beside a training."""
+
+import json
+import os
+import signal
+import socket
+import subprocess
+import sys
+import time
+import urllib.error
+import urllib.request
+
+import pytest
+from support.runs import arguments
+from support.scenes import write_ball_scene
+
+from pp_cl.cli import main
+
+SECONDS = 60
+
+
+@pytest.fixture
+def begun(tmp_path):
+    """A run that has its settings and no checkpoint."""
+    scene = write_ball_scene(tmp_path / "ball")
+    assert main(arguments(scene, tmp_path / "run", train__iterations=1)) == 0
+    (tmp_path / "run" / "checkpoint.npz").unlink()
+    return tmp_path / "run"
+
+
+def started(*words):
+    """A process `pp-cl view`, whose SIGINT is Ctrl-C's."""
+    return subprocess.Popen(
+        [sys.executable, "-m", "pp_cl", "view", *map(str, words)],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.default_int_handler),
+    )
+
+
+def status(address):
+    try:
+        with urllib.request.urlopen(address, timeout=SECONDS) as response:  # noqa: S310
+            return response.status
+    except urllib.error.HTTPError as error:
+        return error.code
+
+
+def test_the_address_works_and_ctrl_c_ends_cleanly(begun):
+    process = started(begun, "--port", "0")
+    try:
+        address = process.stdout.readline().split()[1]
+        assert address.startswith("http://127.0.0.1:")
+        assert status(address) == 200
+        assert status(address.rsplit("/", 2)[0] + "/") == 403
+        process.send_signal(signal.SIGINT)
+        out, err = process.communicate(timeout=SECONDS)
+    finally:
+        process.kill()
+    assert process.returncode == 0 and err == "" and out == ""
+
+
+@pytest.mark.parametrize("name", ["", "nothing"])
+def test_what_is_no_run_is_one_line_and_status_2(tmp_path, capsys, name):
+    assert main(["view", str(tmp_path / name), "--port", "0"]) == 2
+    lines = capsys.readouterr().err.splitlines()
+    assert len(lines) == 1 and "config.json" in lines[0]
+
+
+def test_a_busy_port_is_one_line_and_status_2(begun, capsys):
+    with socket.create_server(("127.0.0.1", 0)) as other:
+        port = other.getsockname()[1]
+        assert main(["view", str(begun), "--port", str(port)]) == 2
+    lines = capsys.readouterr().err.splitlines()
+    assert len(lines) == 1 and f"--port {port}: another program uses it" in lines[0]
+
+
+@pytest.mark.parametrize(
+    "options", [["--port", "x"], ["--port", "70000"], ["--port", "-1"], ["--port", "1,2"]]
+)
+def test_a_port_that_is_none_is_refused(begun, capsys, options):
+    assert main(["view", str(begun), *options]) == 2
+    assert "--port" in capsys.readouterr().err
+
+
+def test_another_host_warns_and_one_that_is_not_ours_is_refused(begun, capsys):
+    assert main(["view", str(begun), "--host", "192.0.2.1", "--port", "0"]) == 2
+    warning, error = capsys.readouterr().err.splitlines()
+    assert "nothing is encrypted" in warning and "--host 192.0.2.1" in error
+
+
+def test_a_missing_framework_names_the_extra(begun, capsys, monkeypatch):
+    monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
+    assert main(["view", str(begun)]) == 2
+    assert "pip install 'pp-cl[view]'" in capsys.readouterr().err
+
+
+def test_a_training_shows_itself_and_ends_what_it_started(tmp_path, capfd, monkeypatch):
+    """The browser is a script that notes the address it gets, and what answers there."""
+    browser, noted = tmp_path / "browser.py", tmp_path / "noted"
+    browser.write_text(
+        "import sys, urllib.request\n"
+        "page = urllib.request.urlopen(sys.argv[1]).status\n"
+        f"open({str(noted)!r}, 'w').write(f'{{sys.argv[1]}} {{page}}')\n"
+    )
+    monkeypatch.setenv("BROWSER", f"{sys.executable} {browser} %s")
+    scene = write_ball_scene(tmp_path / "ball")
+    wait_for_the_browser(monkeypatch, noted)
+    assert main([*arguments(scene, tmp_path / "run", train__iterations=3), "--view"]) == 0
+    address, page = noted.read_text().split()
+    assert page == "200" and address in capfd.readouterr().out
+    with pytest.raises(urllib.error.URLError):
+        status(address)
+    assert json.loads((tmp_path / "run" / "log.jsonl").read_text().splitlines()[-1])["finished"]
+
+
+def wait_for_the_browser(monkeypatch, noted):
+    """Let the training's first step take until the page was opened."""
+    from pp_cl.train import Trainer
+
+    train_step = Trainer.train_step
+
+    def waiting(self):
+        deadline = time.monotonic() + SECONDS
+        while not (noted.exists() and noted.read_text()) and time.monotonic() < deadline:
+            time.sleep(0.1)
+        return train_step(self)
+
+    monkeypatch.setattr(Trainer, "train_step", waiting)
+
+
+def test_a_waiting_server_ends_with_its_parent(tmp_path):
+    """A parent that is killed cannot end its child itself."""
+    child = [sys.executable, "-m", "pp_cl", "view", str(tmp_path / "run"), "--wait", "--port", "0"]
+    script = (
+        "import subprocess, sys, os\n"
+        f"child = subprocess.Popen({child!r}, stdout=subprocess.PIPE, text=True)\n"
+        "print(child.pid, child.stdout.readline().split()[1], flush=True)\n"
+        "os.kill(os.getpid(), 9)\n"
+    )
+    parent = subprocess.run(
+        [sys.executable, "-c", script], stdout=subprocess.PIPE, text=True, timeout=SECONDS
+    )
+    pid, address = parent.stdout.split()
+    deadline = time.monotonic() + SECONDS
+    try:
+        while is_served(address):
+            assert time.monotonic() < deadline
+            time.sleep(0.1)
+    except AssertionError:
+        os.kill(int(pid), signal.SIGKILL)
+        raise
+
+
+def is_served(address):
+    try:
+        return status(address) == 200
+    except (urllib.error.URLError, ConnectionError):
+        return False
