@@ -11,7 +11,7 @@ import numpy as np
 
 from pp_cl.errors import UserError
 from pp_cl.scene.camera import Camera
-from pp_cl.scene.readers.transforms import CV_FROM_GL
+from pp_cl.scene.readers.frame import GL_FROM_CV
 
 MOST_BYTES = 8192  # of a message: a camera in full precision takes a tenth of it
 KINDS = ("frame", "snapshot")
@@ -84,7 +84,7 @@ def read_request(text: str) -> ViewRequest:
 def camera_facts(camera: Camera) -> dict[str, Any]:
     """A camera in the form of nerfstudio's transforms files, OpenGL axes."""
     pose = np.vstack([camera.pose, [0, 0, 0, 1]])
-    pose[:3, :3] = pose[:3, :3] @ CV_FROM_GL
+    pose = pose @ GL_FROM_CV
     return {
         "transform_matrix": pose.tolist(),
         "fl_x": camera.fx,
@@ -124,7 +124,7 @@ def _pose(rows):
         raise UserError(f"{name}: its axes are not orthonormal and right-handed")
     if not np.array_equal(matrix[3], [0, 0, 0, 1]):
         raise UserError(f"{name}: its last row must be 0, 0, 0, 1")
-    return np.column_stack([turn @ CV_FROM_GL, matrix[:3, 3]])
+    return np.column_stack([turn, matrix[:3, 3]]) @ GL_FROM_CV
 
 
 def _refuse_constant(word):
