@@ -12,7 +12,15 @@ from collections.abc import Sequence
 from pp_cl import __version__
 from pp_cl.errors import UserError
 
-COMMANDS = ("devices", "train", "eval", "compare", "bench", "tune")  # modules of pp_cl.commands
+COMMANDS = (
+    "devices",
+    "train",
+    "eval",
+    "export",
+    "compare",
+    "bench",
+    "tune",
+)  # modules of pp_cl.commands
 
 
 class _Parser(argparse.ArgumentParser):
