@@ -10,11 +10,12 @@ from pp_cl.export.glb import write_point_glb
 from pp_cl.export.mesh import coloured_mesh, write_mesh
 from pp_cl.export.out import check_file, check_parent
 from pp_cl.export.packages import library
-from pp_cl.export.page import check_drawable, write_page
+from pp_cl.export.page import page_text
 from pp_cl.export.ply import write_ply
 from pp_cl.export.points import coloured_points
-from pp_cl.export.renderings import write_renderings
-from pp_cl.scene.demo import check_new_folder
+from pp_cl.export.renderings import renderings
+from pp_cl.files.atomic import write_text
+from pp_cl.scene.demo import check_new_folder, write_scene
 from pp_cl.trained import Run
 
 
@@ -36,9 +37,6 @@ def export(run: Run, name: str, path: Path, min_weight: float = 0.0) -> str:
 
     Raises UserError for what cannot be written, before which nothing is.
     """
-    if name == "html":
-        check_drawable(run)
-    path.parent.mkdir(parents=True, exist_ok=True)  # RUN/export
     return FORMATS[name].write(run, path, min_weight)
 
 
@@ -59,13 +57,13 @@ def check_target(name: str, folder: Path, out: Path | None) -> Path:
 
 def _ply(run, path, min_weight):
     points = coloured_points(run, min_weight)
-    write_ply(path, points, run.model.cloud)
+    write_ply(_in_folder(path), points, run.model.cloud)
     return _count(points, run)
 
 
 def _glb(run, path, min_weight):
     points = coloured_points(run, min_weight)
-    write_point_glb(path, points)
+    write_point_glb(_in_folder(path), points)
     return _count(points, run)
 
 
@@ -75,18 +73,26 @@ def _count(points, run):
 
 def _mesh(run, path, min_weight):
     mesh = coloured_mesh(run)
-    write_mesh(path, mesh)
+    write_mesh(_in_folder(path), mesh)
     return f"{len(mesh.vertices)} vertices, {len(mesh.faces)} faces"
 
 
 def _html(run, path, min_weight):
-    write_page(path, run)
-    return f"{run.model.cloud.count} points, {path.stat().st_size / 1e6:.1f} MB"
+    text = page_text(run)
+    write_text(_in_folder(path), text)
+    return f"{run.model.cloud.count} points, {len(text) / 1e6:.1f} MB"
 
 
 def _scene(run, path, min_weight):
-    counts = write_renderings(path, run)
-    return ", ".join(f"{count} {split} views" for split, count in counts.items())
+    scene = renderings(run)
+    write_scene(scene, _in_folder(path))
+    return ", ".join(f"{len(views)} {split} views" for split, views in scene.splits.items())
+
+
+def _in_folder(path):
+    """The path, its folder made: RUN/export is made when there is something to write."""
+    path.parent.mkdir(exist_ok=True)
+    return path
 
 
 FORMATS = {

@@ -55,9 +55,12 @@ function sortPoints(eye) {
   for (let i = 0; i < n; i++) order[starts[keys[i]]++] = i;
 }
 
-// How many times larger the camera shows the object than the training views do, at least 1. The
-// footprints grow with it: no network fills the gaps between points that pixels finer than the
-// training's would show.
+// No network fills the gaps between points that pixels finer than the training's show. So a
+// footprint keeps the size in world units that it has in the finest training view, and grows up to
+// this factor. At the training's own pixels all is as it was fitted.
+const GROWN = 1.6;
+
+// How many times larger the camera shows the object than the training views do, at least 1.
 function magnification(camera, eye) {
   const distance = Math.hypot(...add(eye, header.centre, -1));
   return Math.max(1, header.pixel * Math.min(camera.fx, camera.fy) / Math.max(distance, 1e-9));
@@ -79,6 +82,7 @@ layout(location = 8) in vec4 b6;
 uniform vec3 origin, eye;
 uniform float edge, radius, nearest, low[9], span[9];
 uniform float least;                    // half the width of the smallest footprint, in pixels
+uniform float grown;                    // footprints that fill the gaps between points
 uniform mat3 axes;                      // columns: right, down, forward
 uniform vec4 focal;                     // fx, fy, cx, cy
 uniform vec2 size;
@@ -90,7 +94,7 @@ void main() {
   vec3 position = origin + edge * vertex, towards = position - eye;
   centre = towards * axes;
   t = length(towards);
-  reach = max(radius, least * t / min(focal.x, focal.y));
+  reach = grown * max(radius, least * t / min(focal.x, focal.y));
   gl_Position = vec4(2.0, 2.0, 2.0, 1.0);  // outside
   gl_PointSize = 1.0;
   float scale = centre.z * centre.z - reach * reach;
@@ -209,7 +213,9 @@ function makeDrawer(gl) {
       place("axes"), false, [p[0], p[4], p[8], p[1], p[5], p[9], p[2], p[6], p[10]]);
     gl.uniform4f(place("focal"), camera.fx, camera.fy, camera.cx, camera.cy);
     gl.uniform2f(place("size"), camera.width, camera.height);
-    gl.uniform1f(place("least"), 0.75 * magnification(camera, eye));
+    const larger = magnification(camera, eye);
+    gl.uniform1f(place("least"), 0.75 * larger);
+    gl.uniform1f(place("grown"), Math.min(larger, GROWN));
     gl.enable(gl.BLEND);
     gl.blendFunc(gl.ONE, gl.ONE_MINUS_SRC_ALPHA);
     gl.drawElements(gl.POINTS, header.count, gl.UNSIGNED_INT, 0);
@@ -349,5 +355,5 @@ addEventListener("keydown", (event) => {
 });
 addEventListener("hashchange", () => { look = lookOf(location.hash); soon(); });
 addEventListener("resize", soon);
-window.ppcl = { setCamera, sortPoints, order, canvas };
+window.ppcl = { setCamera, show, sortPoints, order, positions, canvas };
 show();

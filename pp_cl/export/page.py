@@ -12,8 +12,6 @@ import numpy as np
 
 from pp_cl.errors import UserError
 from pp_cl.export.harmonics import COUNT, fit_harmonics
-from pp_cl.files.atomic import write_text
-from pp_cl.scene.camera import Camera
 from pp_cl.trained import NEAREST, Run
 
 # Bytes of a point: vertex (3, uint16), opacity (uint16), coefficients (27 and 1 unused, uint8).
@@ -32,15 +30,6 @@ class PackedPoints:
     low: np.ndarray
     span: np.ndarray
 
-    def coefficients(self) -> np.ndarray:
-        """(N, 9, 3) float32: what the page draws."""
-        bytes_ = self.rows["colour"][:, : 3 * COUNT].reshape(-1, COUNT, 3)
-        return self.low[:, None] + self.span[:, None] * (bytes_ / np.float32(255))
-
-    def opacity(self) -> np.ndarray:
-        """(N,) float32."""
-        return self.rows["opacity"] / np.float32(65535)
-
 
 def pack(run: Run, coefficients: np.ndarray) -> PackedPoints:
     """The run's points with coefficients (N, 9, 3) of their colours."""
@@ -57,10 +46,8 @@ def pack(run: Run, coefficients: np.ndarray) -> PackedPoints:
     return PackedPoints(rows, low, span)
 
 
-def write_page(path: Path | str, run: Run) -> None:
-    """Write the page. Raises UserError as write_text does, and for a run that is not composited of
-    soft footprints.
-    """
+def page_text(run: Run) -> str:
+    """The page. Raises UserError as check_drawable does."""
     check_drawable(run)
     points = pack(run, fit_harmonics(run))
     folder = Path(__file__).parent
@@ -73,7 +60,7 @@ def write_page(path: Path | str, run: Run) -> None:
     }
     for name, text in parts.items():
         page = page.replace(f"<!-- {name} -->", text)
-    write_text(path, page)
+    return page
 
 
 def check_drawable(run: Run) -> None:
@@ -87,13 +74,6 @@ def check_drawable(run: Run) -> None:
             f" {raster.footprint} cannot be drawn by the page, only alpha with soft; choose another"
             " --format"
         )
-
-
-def page_camera(camera: Camera) -> str:
-    """The argument of the page's ppcl.setCamera, as JSON."""
-    names = ("fx", "fy", "cx", "cy", "width", "height")
-    values = {name: float(getattr(camera, name)) for name in names}
-    return json.dumps({"pose": camera.pose.ravel().tolist()} | values)
 
 
 def _header(run, points):

@@ -2,30 +2,26 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 from tqdm import tqdm
 
 from pp_cl.errors import UserError
 from pp_cl.evaluate import image_files
 from pp_cl.files.image import to_8bit
-from pp_cl.scene.demo import SPLITS, write_scene
+from pp_cl.scene.demo import SPLITS
 from pp_cl.scene.load import Scene
 from pp_cl.scene.views import View
 from pp_cl.trained import Run
 
 
-def write_renderings(folder: Path | str, run: Run) -> dict[str, int]:
-    """Write a NeRF-synthetic folder of the run's renderings, straight RGBA, of the train and test
-    views at the run's resolution. Returns the number of views by split; a test split that the
-    scene does not have is left out.
+def renderings(run: Run) -> Scene:
+    """The train and test views at the run's resolution, each image the run's rendering of it as
+    straight RGBA; a test split that the run's scene does not have is left out.
 
-    Raises UserError as write_scene does, and for a training split that cannot be read.
+    Raises UserError for a training split that cannot be read.
     """
     splits = {split: _rendered(run, split) for split in SPLITS}
     splits = {split: views for split, views in splits.items() if views}
-    write_scene(Scene(run.folder.path.name, None, splits), folder)
-    return {split: len(views) for split, views in splits.items()}
+    return Scene(run.folder.path.name, None, splits)
 
 
 def _rendered(run, split):
