@@ -5,7 +5,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass
 
 import numpy as np
 
@@ -22,16 +21,6 @@ MARGIN = 2  # vertices around the points, so that the surface is closed
 SLAB = 1 << 20  # vertices that are projected at once: 50 MB of temporary arrays
 
 
-@dataclass(frozen=True)
-class Field:
-    """Signed distances in units of TRUNCATION edges, (nz, ny, nx) float32 in [-1, 1], negative
-    inside, at the vertices of a grid.
-    """
-
-    grid: Grid
-    distances: np.ndarray
-
-
 def box_around(grid: Grid, ids: np.ndarray) -> Grid:
     """The part of a grid around its vertices ids (N,), MARGIN wider on every side."""
     nx, ny, _ = grid.dims
@@ -43,12 +32,12 @@ def box_around(grid: Grid, ids: np.ndarray) -> Grid:
     return Grid(tuple(float(x) for x in origin), grid.edge, dims)
 
 
-def fuse(grid: Grid, views: Iterable[tuple[Camera, Picture]]) -> Field:
-    """The mean over the views of each vertex's signed distance to the surface that the pictures
-    show, along the cameras' axes.
+def fuse(grid: Grid, views: Iterable[tuple[Camera, Picture]], hidden: float = HIDDEN) -> np.ndarray:
+    """(nz, ny, nx) float32 in [-1, 1]: the mean over the views of each vertex's distance to the
+    surface that the pictures show, along the cameras' axes, in TRUNCATION edges, negative inside.
 
-    A view says nothing of vertices outside its image, and only HIDDEN of those more than TRUNCATION
-    edges behind its surface. What no view says anything of is inside.
+    A view says nothing of vertices outside its image, and counts as `hidden` views for those more
+    than TRUNCATION edges behind its surface. What no view says anything of is inside.
     """
     total, count = (np.zeros(grid.dims[::-1], np.float32) for _ in range(2))
     nx, ny, nz = grid.dims
@@ -57,18 +46,22 @@ def fuse(grid: Grid, views: Iterable[tuple[Camera, Picture]]) -> Field:
         depth = np.where(picture.alpha >= COVERED, picture.median_depth, np.inf)
         for first in range(0, nz, layers):
             slab = slice(first, min(first + layers, nz))
-            distance, weight = _distances(grid, camera, depth, slab)
+            distance, shown = _distances(grid, camera, depth, slab)
+            weight = np.where(distance > -1, 1, hidden) * shown
             total[slab] += distance * weight
             count[slab] += weight
-    return Field(grid, np.where(count > 0, total / np.maximum(count, HIDDEN), -1))
+    return np.where(count > 0, total / np.maximum(count, 1e-6), -1).astype(np.float32)
 
 
 def _distances(grid, camera, depth, slab):
-    """(the distances of a slab's vertices, -1 where they are hidden, what the view's word weighs),
-    both (layers, ny, nx) float32.
+    """(the distances of a slab's vertices, float32, -1 where they are hidden; whether they are in
+    the image), both (layers, ny, nx).
     """
     nx, ny, _ = grid.dims
-    i, j, k = np.arange(nx), np.arange(ny)[:, None], np.arange(slab.start, slab.stop)[:, None, None]
+    i, j, k = (
+        np.arange(*ends, dtype=np.float32) for ends in ((nx,), (ny,), (slab.start, slab.stop))
+    )
+    j, k = j[:, None], k[:, None, None]
     across, down, z = (
         row[0] * i + row[1] * j + row[2] * k + row[3]
         for row in grid.projection(camera).astype(np.float32)
@@ -76,9 +69,6 @@ def _distances(grid, camera, depth, slab):
     ahead = np.maximum(z, np.float32(1e-6))
     column, row = across / ahead, down / ahead
     shown = (z > 0) & (column >= 0) & (column < camera.width) & (row >= 0) & (row < camera.height)
-    surface = depth[
-        np.where(shown, row, 0).astype(np.int32), np.where(shown, column, 0).astype(np.int32)
-    ]
-    distance = np.clip((surface - z) / np.float32(TRUNCATION * grid.edge), -np.inf, 1)
-    weight = np.where(distance >= -1, np.float32(1), np.float32(HIDDEN)) * shown
-    return np.maximum(distance, -1), weight
+    pixel = tuple(np.where(shown, at, 0).astype(np.int32) for at in (row, column))
+    distance = (depth[pixel] - z) / np.float32(TRUNCATION * grid.edge)
+    return np.clip(distance, -1, 1), shown

@@ -32,17 +32,18 @@ def basis(towards: np.ndarray) -> np.ndarray:
     return np.stack(rows, 1).astype(np.float32)
 
 
-def fit_harmonics(run: Run) -> np.ndarray:
-    """(N, 9, 3) float32: coefficients of basis() of the sRGB colour of each of the run's points.
+def fit_harmonics(run: Run, steps: int = STEPS, count: int = COUNT) -> np.ndarray:
+    """(N, count, 3) float32: coefficients of the first functions of basis(), of the sRGB colour of
+    each of the run's points.
 
     Colours are blended as the features are, over white, and clamped at last: one point's may lie
     outside [0, 1].
     """
-    system = _System(run, run.cameras("train"))
+    system = _System(run, run.cameras("train"), count)
     residual, inverse = system.start()
     solution = np.zeros_like(residual)
     direction, last = np.zeros_like(residual), 1.0
-    for step in range(STEPS + 1):
+    for step in range(steps + 1):
         scaled = inverse @ residual
         product = float(np.vdot(residual, scaled))
         if product == 0:
@@ -64,24 +65,25 @@ class _System:
 
     run: Run
     cameras: list[Camera]
+    count: int
 
     def start(self):
-        """(b (N, 9, 3), the inverses of A's blocks (N, 9, 9)), float32."""
-        n = self.run.model.cloud.count
-        b, blocks = np.zeros((n, COUNT, 3), np.float32), np.zeros((n, COUNT, COUNT), np.float32)
+        """(b (N, count, 3), the inverses of A's blocks (N, count, count)), float32."""
+        n, count = self.run.model.cloud.count, self.count
+        b, blocks = np.zeros((n, count, 3), np.float32), np.zeros((n, count, count), np.float32)
         for seen, matrix, at in self._passes("colours"):
             picture = seen.picture()
             colour = (picture.colour - (1 - picture.alpha)[..., None]).reshape(-1, 3)
             weight = matrix.sum(0)
             b += at[:, :, None] * (matrix.T @ colour)[:, None]
             blocks += (weight[:, None] * at)[:, :, None] * at[:, None]
-        self.ridge = RIDGE * blocks[:, :1, 0] * (np.arange(COUNT) > 0) + LEAST
-        diagonal = np.arange(COUNT)
+        self.ridge = RIDGE * blocks[:, :1, 0] * (np.arange(count) > 0) + LEAST
+        diagonal = np.arange(count)
         blocks[:, diagonal, diagonal] += self.ridge
         return b, np.linalg.inv(blocks)
 
     def apply(self, coefficients):
-        """A times coefficients (N, 9, 3)."""
+        """A times coefficients (N, count, 3)."""
         result = self.ridge[..., None] * coefficients
         for _, matrix, at in self._passes("harmonics"):
             colour = np.einsum("nk,nkc->nc", at, coefficients)
@@ -89,8 +91,12 @@ class _System:
         return result
 
     def _passes(self, text):
-        """(observation, blend matrix, basis (N, 9)) of each view."""
+        """(observation, blend matrix, basis (N, count)) of each view."""
         grid, cloud = self.run.model.grid, self.run.model.cloud
         positions = grid.positions(cloud.ids.get())
         for seen in observe(self.run, self.cameras, text):
-            yield seen, seen.blend_matrix(), basis(directions(positions, seen.camera))
+            yield (
+                seen,
+                seen.blend_matrix(),
+                basis(directions(positions, seen.camera))[:, : self.count],
+            )

@@ -38,8 +38,8 @@ def surface(run: Run) -> tuple[np.ndarray, np.ndarray]:
     """
     grid = box_around(run.model.grid, run.model.cloud.ids.get())
     cameras = tqdm(run.cameras("train"), "depths", unit="view", leave=False, disable=None)
-    field = fuse(grid, ((camera, run.render(camera)) for camera in cameras))
-    outside = np.pad(field.distances, 1, constant_values=1)  # closes what no view shows
+    distances = fuse(grid, ((camera, run.render(camera)) for camera in cameras))
+    outside = np.pad(distances, 1, constant_values=1)  # closes what no view shows
     if outside.min() >= 0:
         raise UserError(f"{run.folder}: the training views show no surface; train it longer")
     vertices, faces, _, _ = marching_cubes(outside, 0, gradient_direction="ascent")

@@ -255,7 +255,7 @@ function lookOf(hash) {
   }
   const towards = add(look.target, look.eye, -1);
   const usable = Math.hypot(...cross(towards, look.up)) > 1e-9;
-  return usable ? look : { ...first };
+  return usable ? look : { ...look, ...first };
 }
 
 function hashOf(look) {
@@ -317,8 +317,8 @@ function approach(factor) {
 
 const fingers = new Map();
 canvas.addEventListener("pointerdown", (event) => {
-  canvas.setPointerCapture(event.pointerId);
   fingers.set(event.pointerId, [event.clientX, event.clientY]);
+  canvas.setPointerCapture(event.pointerId);
 });
 canvas.addEventListener("pointermove", (event) => {
   const before = fingers.get(event.pointerId);

@@ -38,7 +38,7 @@ def radii():
 
 
 def test_the_sign_is_that_of_the_ball(views):
-    field = fuse(GRID, views).distances
+    field = fuse(GRID, views)
     assert field.shape == GRID.dims[::-1] and np.abs(field).max() <= 1
     assert (field[radii() < RADIUS - GRID.edge] < 0).all()
     # above and below, where the ring of cameras sees, and the grid's corners beside them
@@ -46,9 +46,9 @@ def test_the_sign_is_that_of_the_ball(views):
 
 
 def test_slabs_change_nothing(views, monkeypatch):
-    whole = fuse(GRID, views[:3]).distances
+    whole = fuse(GRID, views[:3])
     monkeypatch.setattr(fusion, "SLAB", 3000)
-    assert np.array_equal(fuse(GRID, views[:3]).distances, whole)
+    assert np.array_equal(fuse(GRID, views[:3]), whole)
 
 
 def test_a_ray_that_slips_through_hollows_nothing(views):
@@ -58,7 +58,8 @@ def test_a_ray_that_slips_through_hollows_nothing(views):
     alpha = np.where(np.isfinite(depth), picture.alpha, 0)
     broken = [(camera, replace(picture, alpha=alpha, median_depth=depth)), *views[1:]]
     inside = radii() < RADIUS - 4 * GRID.edge
-    assert (fuse(GRID, broken).distances[inside] < 0).all()
+    assert (fuse(GRID, broken)[inside] < 0).all()
+    assert (fuse(GRID, broken, hidden=0.0)[inside] > 0).any()
 
 
 def test_the_box_holds_the_points_and_a_margin():

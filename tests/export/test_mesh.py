@@ -7,7 +7,6 @@ import trimesh
 
 from pp_cl.errors import UserError
 from pp_cl.export import mesh as module
-from pp_cl.export.fusion import Field
 from pp_cl.export.glb import gltf_colours
 from pp_cl.export.mesh import coloured_mesh, surface, write_mesh
 
@@ -57,6 +56,6 @@ def test_it_reads_back_by_meshio(mesh, tmp_path):
 
 
 def test_no_surface_is_one_line(run, monkeypatch):
-    monkeypatch.setattr(module, "fuse", lambda grid, _: Field(grid, np.ones(grid.dims[::-1])))
+    monkeypatch.setattr(module, "fuse", lambda grid, _: np.ones(grid.dims[::-1]))
     with pytest.raises(UserError, match="show no surface"):
         surface(run)

@@ -110,26 +110,70 @@ def test_a_browser_sorts_the_points_from_far_to_near(page, tmp_path):
     assert np.diff(distances).max() < 1.1 * np.ptp(distances) / 65535
 
 
-def test_the_address_says_the_camera(run, page, tmp_path):
-    size, fov = 30, 40.0
-    focal = size / 2 / np.tan(np.radians(fov) / 2)
-    camera = Camera.look_at(
-        (1, -3.5, 1.2), (0.1, 0, 0), (0, 0.1, 1), fx=focal, width=size, height=30
-    )
-    fragment = f"#eye=1,-3.5,1.2&target=0.1,0,0&up=0,0.1,1&fov={fov}&w={size}&h=30"
+def looking(eye, target, up, fov):
+    """The page's camera of 48 x 30 pixels that looks so, as the address says it."""
+    focal = 15 / np.tan(np.radians(fov) / 2)
+    return Camera.look_at(eye, target, up, fx=focal, width=48, height=30)
+
+
+def check_address(run, page, fragment, camera, tmp_path):
+    """The page at an address shows what a camera sees."""
     script = "ppcl.show(); return ppcl.canvas.toDataURL();"
-    image = image_of(ask(page, script, tmp_path, fragment))
+    image = image_of(ask(page, script, tmp_path, fragment + "&w=48&h=30"))
+    assert image.min() < 0.9
     assert psnr(image, predicted(run, page, camera)) > 45
 
 
-def test_a_broken_address_shows_the_first_look(page, tmp_path):
-    script = "ppcl.show(); return ppcl.canvas.toDataURL();"
-    images = [
-        image_of(ask(page, script, tmp_path, fragment + "&w=64&h=48"))
-        for fragment in ("#", "#eye=1,2&target=x&up=,,&fov=-3", "#eye=1,2,3&target=1,2,3")
-    ]
-    assert images[0].shape == (48, 64, 3) and images[0].min() < 0.9
-    assert np.array_equal(images[0], images[1]) and images[2].min() < 0.9
+def test_the_address_says_the_camera(run, page, tmp_path):
+    camera = looking((1, -3.5, 1.2), (0.1, 0, 0), (0, 0.1, 1), 40)
+    fragment = "#eye=1,-3.5,1.2&target=0.1,0,0&up=0,0.1,1&fov=40"
+    check_address(run, page, fragment, camera, tmp_path)
+
+
+@pytest.mark.parametrize("fragment", ["#eye=1,2&target=x&up=,,&fov=-3", "#eye=1,2,3&target=1,2,3"])
+def test_a_broken_address_shows_the_first_look(run, page, fragment, tmp_path):
+    header = kept(page)[0]
+    camera = looking(header["eye"], header["centre"], header["up"], header["fov"])
+    check_address(run, page, fragment, camera, tmp_path)
+
+
+CONTROLS = """
+    const seen = [], see = () => { ppcl.show(); seen.push(ppcl.canvas.toDataURL()); };
+    const send = (type, x, y, more) => ppcl.canvas.dispatchEvent(new PointerEvent(
+        type, { pointerId: 1, clientX: x, clientY: y, buttons: 1, bubbles: true, ...more }));
+    const drag = (more) => {
+        send("pointerdown", 100, 100, more);
+        send("pointermove", 160, 120, more);
+        send("pointerup", 160, 120, more);
+    };
+    see();
+    drag({}); see();
+    const address = location.hash;
+    drag({ shiftKey: true }); see();
+    ppcl.canvas.dispatchEvent(new WheelEvent("wheel", { deltaY: -80 })); see();
+    dispatchEvent(new KeyboardEvent("keydown", { key: "r" })); see();
+    return { seen, address };"""
+
+
+def test_mouse_and_keys_move_the_camera(page, tmp_path):
+    found = ask(page, CONTROLS, tmp_path)
+    assert len(set(found["seen"])) == 4 and found["seen"][0] == found["seen"][4]
+    header = kept(page)[0]
+    eye, target = (
+        np.array([float(x) for x in re.search(rf"{name}=([^&]+)", found["address"])[1].split(",")])
+        for name in ("eye", "target")
+    )
+    centre, first = (np.array(header[name]) for name in ("centre", "eye"))
+    assert target == pytest.approx(centre, abs=1e-5)
+    distances = [np.linalg.norm(at - centre) for at in (eye, first)]
+    assert distances[0] == pytest.approx(distances[1], rel=1e-5)
+    up = np.array(header["up"])
+    turned = [np.cross(up, at - centre) for at in (eye, first)]
+    cosine = turned[0] @ turned[1] / np.prod([np.linalg.norm(t) for t in turned])
+    assert np.arccos(cosine) == pytest.approx(60 / 200, abs=1e-4)  # radians, of 60 pixels
+    # the hand moved down, so the eye rises by 20 pixels' worth
+    rise = [np.arcsin((at - centre) @ up / distances[1]) for at in (eye, first)]
+    assert rise[0] - rise[1] == pytest.approx(20 / 200, abs=1e-4)
 
 
 def test_the_runs_name_is_text(run_folder, session_device, tmp_path):
