@@ -14,6 +14,7 @@ from pp_cl.errors import UserError
 from pp_cl.export.fusion import HIDDEN, box_around, fuse
 from pp_cl.export.harmonics import STEPS, basis, fit_harmonics
 from pp_cl.export.observe import directions, observe
+from pp_cl.files.image import to_8bit
 from pp_cl.metrics.psnr_ssim import psnr
 from pp_cl.scene.demo import demo_mesh, distances
 from pp_cl.scene.grid import Grid
@@ -78,9 +79,9 @@ def page_rows(run: Run) -> list[dict]:
     target, truths = Target(run.dev), []
     for view in views:
         target.load(view)
-        truths.append(target.whole())
+        truths.append(to_8bit(target.whole()))
     cameras = [view.camera for view in views]
-    images = [run.render(camera).colour for camera in cameras]
+    images = [to_8bit(run.render(camera).colour) for camera in cameras]
     network = np.mean([psnr(*pair) for pair in zip(images, truths, strict=True)])
     rows = [{"what": "the network", "truth": round(float(network), 2)}]
     tried = [(9, steps) for steps in (0, 1, STEPS, 7)] + [(1, STEPS), (4, STEPS)]
@@ -96,14 +97,14 @@ def page_rows(run: Run) -> list[dict]:
 
 
 def _drawn(run, coefficients, cameras):
-    """The images (H, W, 3) that a page would draw of coefficients (N, count, 3)."""
+    """The images (H, W, 3) uint8 that a page would draw of coefficients (N, count, 3)."""
     positions = run.model.grid.positions(run.model.cloud.ids.get())
     drawn = []
     for seen in observe(run, cameras, "drawing"):
         at = basis(directions(positions, seen.camera))[:, : coefficients.shape[1]]
         matrix = seen.blend_matrix()
         image = matrix @ np.einsum("nk,nkc->nc", at, coefficients) + (1 - matrix.sum(1))[:, None]
-        drawn.append(image.reshape(seen.camera.height, seen.camera.width, 3).clip(0, 1))
+        drawn.append(to_8bit(image.reshape(seen.camera.height, seen.camera.width, 3)))
     return drawn
 
 

@@ -96,8 +96,8 @@ def _in_folder(path):
 
 
 FORMATS = {
-    "ply": Format(_ply, "points.ply", (".ply",), ("plyfile",)),
-    "glb": Format(_glb, "points.glb", (".glb",), ("trimesh",)),
+    "ply": Format(_ply, "cloud.ply", (".ply",), ("plyfile",)),
+    "glb": Format(_glb, "cloud.glb", (".glb",), ("trimesh",)),
     "mesh": Format(_mesh, "mesh.ply", (".ply", ".glb"), ("trimesh",)),
     "html": Format(_html, "view.html", (".html",)),
     "scene": Format(_scene, "scene"),

@@ -14,6 +14,7 @@ from pp_cl.errors import UserError
 from pp_cl.export.harmonics import basis
 from pp_cl.export.observe import directions, observe
 from pp_cl.export.page import POINT, check_drawable, pack, page_text
+from pp_cl.files.image import to_8bit
 from pp_cl.metrics.psnr_ssim import psnr
 from pp_cl.scene.camera import Camera
 from pp_cl.trained import load_run
@@ -41,14 +42,14 @@ def kept(page):
 
 
 def predicted(run, page, camera):
-    """(H, W, 3): what the page is to draw, by the run's own blend weights."""
+    """(H, W, 3) uint8: what the page is to draw, by the run's own blend weights."""
     _, _, coefficients, _ = kept(page)
     positions = run.model.grid.positions(run.model.cloud.ids.get())
     at = basis(directions(positions, camera))
     (seen,) = observe(run, [camera], "")
     matrix = seen.blend_matrix()
     image = matrix @ np.einsum("nk,nkc->nc", at, coefficients) + (1 - matrix.sum(1))[:, None]
-    return image.reshape(camera.height, camera.width, 3).clip(0, 1)
+    return to_8bit(image.reshape(camera.height, camera.width, 3))
 
 
 def page_camera(camera):
@@ -87,7 +88,7 @@ def test_coefficients_are_kept_to_within_a_step(run, rng):
 
 def test_what_it_keeps_shows_what_the_run_shows(run, page):
     for camera in run.cameras("test"):
-        assert psnr(predicted(run, page, camera), run.render(camera).colour) > 25
+        assert psnr(predicted(run, page, camera), to_8bit(run.render(camera).colour)) > 25
 
 
 def test_a_browser_draws_what_the_run_shows(run, page, tmp_path):
@@ -96,8 +97,8 @@ def test_a_browser_draws_what_the_run_shows(run, page, tmp_path):
         (camera) => {{ ppcl.setCamera(camera); return ppcl.canvas.toDataURL(); }});"""
     for url, camera in zip(ask(page, script, tmp_path), cameras, strict=True):
         image = image_of(url)
-        assert psnr(image, run.render(camera).colour) > 25
-        assert psnr(image, predicted(run, page, camera)) > 45  # rounded to 8 bits: 59
+        assert psnr(image, to_8bit(run.render(camera).colour)) > 25
+        assert psnr(image, predicted(run, page, camera)) > 45
 
 
 def test_a_browser_sorts_the_points_from_far_to_near(page, tmp_path):
@@ -116,25 +117,38 @@ def looking(eye, target, up, fov):
     return Camera.look_at(eye, target, up, fx=focal, width=48, height=30)
 
 
-def check_address(run, page, fragment, camera, tmp_path):
-    """The page at an address shows what a camera sees."""
-    script = "ppcl.show(); return ppcl.canvas.toDataURL();"
-    image = image_of(ask(page, script, tmp_path, fragment + "&w=48&h=30"))
-    assert image.min() < 0.9
-    assert psnr(image, predicted(run, page, camera)) > 45
+def check_address(page, fragment, camera, tmp_path):
+    """The page at an address shows what a camera sees; returns that, (H, W, 3) uint8."""
+    script = f"""ppcl.show(); const shown = ppcl.canvas.toDataURL();
+        ppcl.setCamera({page_camera(camera)}); return [shown, ppcl.canvas.toDataURL()];"""
+    urls = ask(page, script, tmp_path, fragment + "&w=48&h=30")
+    shown, set_ = (image_of(url) for url in urls)
+    assert shown.shape == (30, 48, 3) and shown.min() < 230
+    assert psnr(shown, set_) > 50
+    return shown
 
 
 def test_the_address_says_the_camera(run, page, tmp_path):
     camera = looking((1, -3.5, 1.2), (0.1, 0, 0), (0, 0.1, 1), 40)
     fragment = "#eye=1,-3.5,1.2&target=0.1,0,0&up=0,0.1,1&fov=40"
-    check_address(run, page, fragment, camera, tmp_path)
+    shown = check_address(page, fragment, camera, tmp_path)
+    assert psnr(shown, predicted(run, page, camera)) > 45
 
 
 @pytest.mark.parametrize("fragment", ["#eye=1,2&target=x&up=,,&fov=-3", "#eye=1,2,3&target=1,2,3"])
-def test_a_broken_address_shows_the_first_look(run, page, fragment, tmp_path):
+def test_a_broken_address_shows_the_first_look(page, fragment, tmp_path):
     header = kept(page)[0]
     camera = looking(header["eye"], header["centre"], header["up"], header["fov"])
-    check_address(run, page, fragment, camera, tmp_path)
+    check_address(page, fragment, camera, tmp_path)
+
+
+def test_footprints_grow_where_the_object_is_larger_than_in_training(run, page, tmp_path):
+    """They close gaps: the page covers more than the rasteriser does."""
+    far = run.cameras("test")[0]
+    near = replace(far, fx=2 * far.fx, fy=2 * far.fy)
+    script = f"ppcl.setCamera({page_camera(near)}); return ppcl.canvas.toDataURL();"
+    drawn = image_of(ask(page, script, tmp_path)).astype(int)
+    assert np.mean(drawn < 250) > np.mean(predicted(run, page, near) < 250)
 
 
 CONTROLS = """

@@ -57,6 +57,6 @@ def ask(page, script, tmp_path, fragment=""):
 
 
 def image_of(url):
-    """(H, W, 3) float image in [0, 1] of a data URL of a PNG."""
+    """(H, W, 3) uint8 image of a data URL of a PNG."""
     data = base64.b64decode(url.partition("base64,")[2])
-    return np.asarray(Image.open(io.BytesIO(data)).convert("RGB")) / 255
+    return np.asarray(Image.open(io.BytesIO(data)).convert("RGB"))
