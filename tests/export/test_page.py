@@ -142,6 +142,14 @@ def test_a_broken_address_shows_the_first_look(page, fragment, tmp_path):
     check_address(page, fragment, camera, tmp_path)
 
 
+def test_footprints_are_never_smaller_than_a_pixel(run, page, tmp_path):
+    near = run.cameras("test")[0]
+    far = replace(near, fx=near.fx / 4, fy=near.fy / 4)
+    script = f"ppcl.setCamera({page_camera(far)}); return ppcl.canvas.toDataURL();"
+    drawn = image_of(ask(page, script, tmp_path)).astype(int)
+    assert np.abs(drawn - predicted(run, page, far)).max() <= 3
+
+
 def test_footprints_grow_where_the_object_is_larger_than_in_training(run, page, tmp_path):
     """They close gaps: the page covers more than the rasteriser does."""
     far = run.cameras("test")[0]
