@@ -19,6 +19,7 @@ COMMANDS = (
     "info",
     "render",
     "view",
+    "export",
     "compare",
     "bench",
     "tune",

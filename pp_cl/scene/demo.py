@@ -110,8 +110,7 @@ def write_scene(scene: Scene, folder: str | Path) -> None:
     cannot be written.
     """
     folder = Path(folder).resolve()
-    if folder.is_file() or (folder.is_dir() and any(folder.iterdir())):
-        raise UserError(f"{folder}: exists already; choose a new or empty folder")
+    check_new_folder(folder)
     unfinished = folder.with_name(f".{folder.name}.{os.getpid()}.tmp")
     try:
         for split, views in scene.splits.items():
@@ -127,6 +126,12 @@ def write_scene(scene: Scene, folder: str | Path) -> None:
         ) from error
     finally:
         shutil.rmtree(unfinished, ignore_errors=True)
+
+
+def check_new_folder(folder: Path) -> None:
+    """Raise UserError where write_scene would write over something."""
+    if folder.is_file() or (folder.is_dir() and any(folder.iterdir())):
+        raise UserError(f"{folder}: exists already; choose a new or empty folder")
 
 
 def _transforms(views):

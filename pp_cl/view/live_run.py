@@ -18,6 +18,7 @@ from pp_cl.files.run_folder import RunFolder
 from pp_cl.model import Model
 from pp_cl.render import NETWORK_MULTIPLE, Renderer
 from pp_cl.scene.camera import Camera
+from pp_cl.scene.camera_path import up_of
 from pp_cl.scene.target import Target
 from pp_cl.trained import Run, load_run
 from pp_cl.view import shown
@@ -109,7 +110,7 @@ class LiveRun:
         return {
             "centre": centre.tolist(),
             "radius": radius,
-            "up": mean_up(cameras or [first]).tolist(),
+            "up": up_of(cameras or [first]).tolist(),
             "camera": camera_facts(first),
             "views": [{"name": v.name, "camera": camera_facts(v.camera)} for v in self._views],
         }
@@ -210,15 +211,6 @@ def _start_camera(centre, radius):
 def check_run(folder: Path | str) -> None:
     """Raise UserError unless the folder has the settings of a run; a checkpoint may come later."""
     load_config(RunFolder(folder).config)
-
-
-def mean_up(cameras: list[Camera]) -> np.ndarray:
-    """(3,) unit vector in world axes: the mean of what is up in the cameras' images; that of the
-    first where they cancel.
-    """
-    up = -np.mean([camera.pose[:, 1] for camera in cameras], axis=0)
-    length = np.linalg.norm(up)
-    return up / length if length > 1e-3 else -cameras[0].pose[:, 1]
 
 
 def nearest_view(cameras: list[Camera], camera: Camera, centre: np.ndarray) -> int:

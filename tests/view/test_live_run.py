@@ -17,7 +17,6 @@ from pp_cl.view.live_run import (
     check_run,
     draft_factor,
     hits_per_pixel,
-    mean_up,
     most_opaque,
     nearest_view,
 )
@@ -159,13 +158,6 @@ def test_surroundings_hold_the_first_training_camera_and_what_is_up(dev, live, t
     np.testing.assert_allclose(np.linalg.norm(around["up"]), 1)
     np.testing.assert_allclose(around["up"], [0, 0, 1], atol=0.1)
     assert np.linalg.norm(around["centre"]) < 0.3 and 0.6 < around["radius"] < 2
-
-
-def test_up_is_the_mean_or_the_first_where_the_mean_is_nothing():
-    camera = ring_cameras(1, 48)[0]
-    head = replace(camera, pose=camera.pose * [-1, -1, 1, 1])
-    np.testing.assert_allclose(mean_up([camera, head]), -camera.pose[:, 1])
-    np.testing.assert_allclose(mean_up([head, head]), camera.pose[:, 1])
 
 
 def test_the_nearest_view_counts_place_and_direction():

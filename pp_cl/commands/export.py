@@ -1,0 +1,64 @@
+"""The command pp-cl export."""
+
+import argparse
+from pathlib import Path
+
+from pp_cl.commands import options as shared
+from pp_cl.errors import UserError
+
+HELP = "write a run in a format that other programs open"
+EPILOG = """formats:
+  ply    all points with colour, opacity and everything learned (pp-cl[export])
+  glb    the coloured points (pp-cl[export])
+  mesh   the surface with coloured vertices, .ply or .glb by --out (pp-cl[export])
+  html   one page that a browser draws without network or installation
+  scene  renderings of the train and test views as a NeRF-synthetic folder
+docs/export.md says more."""
+FORMATS = ("ply", "glb", "mesh", "html", "scene")
+OF_POINTS = ("ply", "glb")
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the command's options."""
+    parser.add_argument("run_folder", metavar="RUN", help="folder of the run")
+    parser.add_argument("--format", required=True, choices=FORMATS, help="see below")
+    parser.add_argument(
+        "--out", metavar="PATH", help="file, or folder of a scene (default: in RUN/export)"
+    )
+    parser.add_argument(
+        "--min-weight",
+        metavar="W",
+        help="of ply and glb: leave out points whose blend weights sum to no more than W in every"
+        " training view (0: those that none shows)",
+    )
+    parser.add_argument(
+        "--scene", metavar="SCENE", help="where the run's scene is now, if it has moved"
+    )
+    shared.add_device(parser)
+
+
+def run(options: argparse.Namespace) -> None:
+    """Write the run, say what was written."""
+    from pp_cl.device.discover import open_device
+    from pp_cl.export.formats import check_target, export
+    from pp_cl.trained import load_run
+
+    name, folder = options.format, Path(options.run_folder)
+    min_weight = _read_min_weight(options.min_weight, name)
+    path = check_target(name, folder, Path(options.out) if options.out else None)
+    run = load_run(open_device(options.device), folder, scene=options.scene)
+    if not run.header["finished"]:
+        print(
+            f"{folder}: unfinished, step {run.header['step']} of {run.config.train.iterations}; its"
+            " last checkpoint is exported"
+        )
+    print(f"wrote {path}: {export(run, name, path, min_weight)}")
+
+
+def _read_min_weight(text, name):
+    """The number of --min-weight, 0 where it was not given."""
+    if text is None:
+        return 0.0
+    if name not in OF_POINTS:
+        raise UserError(f"--min-weight {text}: only {' and '.join(OF_POINTS)} leave out points")
+    return shared.read_number("--min-weight", text, float, least=0, most=1e6)

@@ -1,0 +1,1 @@
+"""What a run becomes in other programs: point clouds, meshes, a web page, renderings."""

@@ -1,0 +1,77 @@
+"""The surface of a run as a mesh with coloured vertices."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from scipy.spatial import cKDTree
+from skimage.measure import marching_cubes
+from tqdm import tqdm
+
+from pp_cl.errors import UserError
+from pp_cl.export.fusion import box_around, fuse
+from pp_cl.export.glb import gltf_colours
+from pp_cl.export.packages import library
+from pp_cl.export.points import ColouredPoints, coloured_points
+from pp_cl.files.atomic import atomic_file
+from pp_cl.trained import Run
+
+NEIGHBOURS = 4  # points that colour a vertex
+
+
+@dataclass(frozen=True)
+class Mesh:
+    """vertices: (V, 3) float32, world units. faces: (F, 3) int32, counter-clockwise from outside.
+    colours: (V, 3) uint8 sRGB.
+    """
+
+    vertices: np.ndarray
+    faces: np.ndarray
+    colours: np.ndarray
+
+
+def surface(run: Run) -> tuple[np.ndarray, np.ndarray]:
+    """(vertices (V, 3) float32, faces (F, 3) int32) of the surface that the depths of the training
+    views agree on, by marching cubes. Raises UserError where they show none.
+    """
+    grid = box_around(run.model.grid, run.model.cloud.ids.get())
+    cameras = tqdm(run.cameras("train"), "depths", unit="view", leave=False, disable=None)
+    distances = fuse(grid, ((camera, run.render(camera)) for camera in cameras))
+    outside = np.pad(distances, 1, constant_values=1)  # closes what no view shows
+    if outside.min() >= 0:
+        raise UserError(f"{run.folder}: the training views show no surface; train it longer")
+    vertices, faces, _, _ = marching_cubes(outside, 0, gradient_direction="ascent")
+    positions = np.asarray(grid.origin) + grid.edge * (vertices[:, ::-1] - 1)
+    return positions.astype(np.float32), faces.astype(np.int32)
+
+
+def coloured_mesh(run: Run) -> Mesh:
+    """surface(), each vertex in the mean colour of the nearest points by their weight over the
+    squared distance.
+    """
+    vertices, faces = surface(run)
+    return Mesh(vertices, faces, _colours(vertices, coloured_points(run), run.model.grid.edge))
+
+
+def _colours(vertices, points: ColouredPoints, edge):
+    """(V, 3) uint8."""
+    count = min(NEIGHBOURS, len(points.rows))
+    distance, near = cKDTree(points.positions).query(vertices, list(range(1, count + 1)))
+    weight = points.weight[near] / (distance**2 + edge**2)
+    mean = (weight[..., None] * points.colours[near]).sum(1) / weight.sum(1, keepdims=True)
+    return np.rint(mean).astype(np.uint8)
+
+
+def write_mesh(path: Path | str, mesh: Mesh) -> None:
+    """Write a PLY or GLB file, by the suffix. Raises UserError as atomic_file does, and where
+    trimesh is missing.
+    """
+    kind = Path(path).suffix.lower().removeprefix(".")
+    colours = gltf_colours(mesh.colours) if kind == "glb" else mesh.colours
+    made = library("trimesh").Trimesh(
+        mesh.vertices, mesh.faces, vertex_colors=colours, process=False
+    )
+    with atomic_file(path) as file:
+        file.write(made.export(file_type=kind))

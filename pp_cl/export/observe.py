@@ -1,0 +1,68 @@
+"""The training views as the run renders them, and what each point contributes to them."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.sparse import csr_array
+from tqdm import tqdm
+
+from pp_cl.files.picture import Picture
+from pp_cl.render import NETWORK_MULTIPLE, ViewWeights
+from pp_cl.scene.camera import Camera
+from pp_cl.trained import Run
+
+NO_POINT = 0xFFFFFFFF  # of a pixel entry: the hits behind it were dropped
+
+
+@dataclass(frozen=True)
+class Observation:
+    """A run's N points in a view of H x W pixels; valid until the next view is weighed."""
+
+    run: Run
+    camera: Camera
+    view: ViewWeights
+
+    def picture(self) -> Picture:
+        """The view as the run renders it."""
+        return self.run.render(self.camera)
+
+    def point_weights(self) -> np.ndarray:
+        """(N,) float32: each point's blend weights, summed over the pixels."""
+        dev, n = self.run.dev, self.run.model.cloud.count
+        weights, looks = dev.zeros((n,)), dev.zeros((n,))
+        self.run.renderer.raise_peaks(self.view, weights, looks)
+        return weights.get()
+
+    def blend_matrix(self) -> csr_array:
+        """(HW, N) float32: the blend weight of each point in each pixel y*W + x."""
+        pairs, camera = self.view.pairs, self.camera
+        padded, left, top = camera.padded(NETWORK_MULTIPLE)
+        entry = self.view.weights.pixel_entry.get()[: pairs.total]
+        point = (entry & NO_POINT).astype(np.uint32)
+        weight = (entry >> np.uint64(32)).astype(np.uint32).view(np.float32)
+        offset = pairs.pixel_offset.get().astype(np.int64)
+        # what follows an entry of no point within its pixel was never written
+        ends = np.concatenate([[0], np.cumsum(point == NO_POINT)])
+        valid = ends[1:] == np.repeat(ends[offset[:-1]], np.diff(offset))
+        kept = np.concatenate([[0], np.cumsum(valid)])[offset]
+        shape = padded.height * padded.width, pairs.points
+        matrix = csr_array((weight[valid], point[valid].astype(np.int32), kept), shape=shape)
+        rows = np.arange(padded.height)[top : top + camera.height, None] * padded.width
+        return matrix[(rows + np.arange(left, left + camera.width)).ravel()]
+
+
+def observe(run: Run, cameras: list[Camera], text: str) -> Iterator[Observation]:
+    """What the points contribute to each camera's view, in turn; a progress bar with a text shows
+    on a terminal.
+    """
+    for camera in tqdm(cameras, desc=text, unit="view", leave=False, disable=None):
+        yield Observation(run, camera, run.renderer.blend_weights(camera, run.gamma))
+
+
+def directions(positions: np.ndarray, camera: Camera) -> np.ndarray:
+    """(N, 3) unit vectors from the camera's eye to positions (N, 3)."""
+    towards = positions - camera.eye
+    return towards / np.linalg.norm(towards, axis=1, keepdims=True)

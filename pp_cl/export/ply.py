@@ -1,0 +1,56 @@
+"""Points as a PLY file with everything that is learned of them."""
+
+from pathlib import Path
+
+import numpy as np
+
+from pp_cl.export.packages import library
+from pp_cl.export.points import ColouredPoints
+from pp_cl.files.atomic import atomic_file
+from pp_cl.raster.point_cloud import PointCloud
+
+COMMENTS = (
+    "pp-cl: points of a run, world axes and units of its scene",
+    "red, green, blue: sRGB, as the run shows the point in the training view where it weighs most",
+    "weight: blend weights of the point in that view, summed over its pixels",
+    "opacity: of the point's centre, 0 to 1",
+    "f_dc_C: degree 0 of the spherical harmonics of feature C, C from 0 to 15; features are the",
+    "input of the run's network and no colours",
+    "f_D_K_C: coefficient K of degree D of feature C; basis and signs of PlenOctrees",
+)
+COORDINATES, CHANNELS = ("x", "y", "z"), ("red", "green", "blue")
+
+
+def write_ply(path: Path | str, points: ColouredPoints, cloud: PointCloud) -> None:
+    """Write a binary little-endian PLY file of points and of what `cloud` learned of them. Raises
+    UserError as atomic_file does, and where plyfile is missing.
+    """
+    plyfile = library("plyfile")
+    columns = _columns(points) | _harmonics(points, cloud)
+    dtype = [(name, column.dtype.newbyteorder("<")) for name, column in columns.items()]
+    table = np.empty(len(points.rows), dtype)
+    for name, column in columns.items():
+        table[name] = column
+    element = plyfile.PlyElement.describe(table, "vertex")
+    data = plyfile.PlyData([element], byte_order="<", comments=list(COMMENTS))
+    with atomic_file(path) as file:
+        data.write(file)
+
+
+def _columns(points):
+    """{property: (M,) array} of what every program understands."""
+    columns = dict(zip(COORDINATES, points.positions.T, strict=True))
+    columns |= dict(zip(CHANNELS, points.colours.T, strict=True))
+    return columns | {"opacity": points.opacity, "weight": points.weight}
+
+
+def _harmonics(points, cloud):
+    """{property: (M,) array} of the SH coefficients."""
+    columns = {}
+    for block, array in zip(cloud.blocks, cloud.sh, strict=True):
+        values = array.get()[points.rows]
+        for k in range(block.count):
+            order = block.first + k - block.degree**2  # within its degree
+            name = "f_dc" if block.degree == 0 else f"f_{block.degree}_{order}"
+            columns |= {f"{name}_{c}": values[:, k, c] for c in range(16)}
+    return columns

@@ -1,0 +1,125 @@
+"""The command pp-cl export: what it writes where, and one line for whatever is wrong."""
+
+import json
+import os
+import shutil
+import sys
+
+import pytest
+from support.runs import train_and_interrupt
+from support.scenes import write_ball_scene
+
+from pp_cl.cli import main
+from pp_cl.commands import export as command
+from pp_cl.export.formats import FORMATS
+from pp_cl.export.out import check_parent
+
+
+@pytest.fixture(scope="module")
+def unfinished(tmp_path_factory):
+    """A run that was interrupted."""
+    folder = tmp_path_factory.mktemp("export")
+    scene = write_ball_scene(folder / "ball", views=6, size=40)
+    with pytest.MonkeyPatch.context() as patch:
+        train_and_interrupt(scene, folder / "run", 20, patch)
+    return folder / "run"
+
+
+@pytest.fixture
+def copied(unfinished, tmp_path):
+    shutil.copytree(unfinished, tmp_path / "run")
+    return tmp_path / "run"
+
+
+def failure(capsys, *words):
+    """The one line on stderr of a command that must end with exit status 2."""
+    capsys.readouterr()
+    assert main(["export", *map(str, words)]) == 2
+    error = capsys.readouterr().err.splitlines()
+    lines = [line for line in error if line.startswith("pp-cl: ")]
+    assert len(lines) == 1 and error[-1] == lines[0]
+    return lines[0]
+
+
+def test_the_command_knows_the_formats_that_there_are():
+    assert tuple(FORMATS) == command.FORMATS
+
+
+# so little training shows no surface; tests/export/test_formats.py writes a mesh
+@pytest.mark.parametrize("name", [name for name in command.FORMATS if name != "mesh"])
+def test_every_format_goes_to_its_place_and_the_run_is_named_unfinished(name, copied, capsys):
+    assert main(["export", str(copied), "--format", name]) == 0
+    written, said = copied / "export" / FORMATS[name].name, capsys.readouterr().out
+    assert written.exists() and f"wrote {written}: " in said
+    assert f"{copied}: unfinished, step 20 of 60" in said
+    assert [path.name for path in written.parent.iterdir()] == [written.name]
+
+
+def test_out_says_where(copied, tmp_path, capsys):
+    out = tmp_path / "a.ply"
+    assert main(["export", str(copied), "--format", "ply", "--out", str(out)]) == 0
+    whole = out.stat().st_size
+    words = ["--format", "ply", "--out", str(out), "--min-weight", "0.3"]
+    assert main(["export", str(copied), *words]) == 0
+    assert out.stat().st_size < whole and not (copied / "export").exists()
+
+
+def forbidden(tmp_path):
+    """A folder that may not be written: root may write everywhere but into /proc."""
+    folder = tmp_path / "forbidden"
+    folder.mkdir(mode=0o500)
+    return "/proc" if os.access(folder, os.W_OK) else folder
+
+
+WRONG = {
+    "no such run": (["{tmp}/none", "--format", "ply"], "none"),
+    "no format": (["{run}"], "--format"),
+    "unknown format": (["{run}", "--format", "obj"], "obj"),
+    "a folder for a file": (["{run}", "--format", "ply", "--out", "{tmp}"], "is a folder"),
+    "no folder": (["{run}", "--format", "glb", "--out", "{tmp}/no/a.glb"], "is no folder"),
+    "a file for a folder": (["{run}", "--format", "scene", "--out", "{run}/config.json"], "exists"),
+    "a full folder": (["{run}", "--format", "scene", "--out", "{run}"], "exists already"),
+    "other suffix": (["{run}", "--format", "mesh", "--out", "{tmp}/a.obj"], ".ply or .glb"),
+    "a weight that is none": (["{run}", "--format", "ply", "--min-weight", "x"], "--min-weight x"),
+    "a weight for a page": (["{run}", "--format", "html", "--min-weight", "1"], "only ply and glb"),
+    "a scene that is gone": (["{run}", "--format", "ply", "--scene", "{tmp}/gone"], "gone"),
+    "no device": (["{run}", "--format", "ply", "--device", "abacus"], "abacus"),
+}
+
+
+@pytest.mark.parametrize("name", WRONG)
+def test_wrong_input_is_one_line_and_writes_nothing(name, copied, tmp_path, capsys):
+    before = sorted(tmp_path.rglob("*"))
+    words, named = WRONG[name]
+    words = [word.format(run=copied, tmp=tmp_path) for word in words]
+    assert named in failure(capsys, *words)
+    assert sorted(tmp_path.rglob("*")) == before
+
+
+@pytest.mark.parametrize("name", ["ply", "glb", "html", "scene"])
+def test_a_folder_that_may_not_be_written_is_one_line(name, copied, tmp_path, capsys):
+    out = os.path.join(forbidden(tmp_path), "a" + (FORMATS[name].suffixes or ("",))[0])
+    assert out in failure(capsys, copied, "--format", name, "--out", out)
+    assert not os.path.exists(out)
+
+
+def test_such_a_folder_is_found_before_the_work(tmp_path, monkeypatch):
+    monkeypatch.setattr(os, "access", lambda path, mode: False)
+    with pytest.raises(command.UserError, match="may not be written"):
+        check_parent(tmp_path / "a.ply")
+
+
+@pytest.mark.parametrize("name, library", [("ply", "plyfile"), ("glb", "trimesh")])
+def test_a_missing_library_is_one_line(name, library, copied, capsys, monkeypatch):
+    monkeypatch.setitem(sys.modules, library, None)
+    error = failure(capsys, copied, "--format", name)
+    assert library in error and "pip install pp-cl[export]" in error
+    assert not (copied / "export").exists()
+
+
+def test_a_run_of_softmax_has_no_page(copied, capsys):
+    config = json.loads((copied / "config.json").read_text())
+    config["raster"]["blend"] = "softmax"
+    (copied / "config.json").write_text(json.dumps(config))
+    assert "raster.blend softmax" in failure(capsys, copied, "--format", "html")
+    assert not (copied / "export").exists()

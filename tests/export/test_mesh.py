@@ -1,0 +1,61 @@
+"""The mesh lies on the ball, and reads back as it was."""
+
+import meshio
+import numpy as np
+import pytest
+import trimesh
+
+from pp_cl.errors import UserError
+from pp_cl.export import mesh as module
+from pp_cl.export.glb import gltf_colours
+from pp_cl.export.mesh import coloured_mesh, surface, write_mesh
+
+RADIUS = 0.8  # of the ball
+
+
+@pytest.fixture(scope="module")
+def mesh(run):
+    return coloured_mesh(run)
+
+
+def test_it_is_the_ball(run, mesh):
+    distance = np.abs(np.linalg.norm(mesh.vertices, axis=1) - RADIUS)
+    assert np.median(distance) < 1.5 * run.model.grid.edge
+    made = trimesh.Trimesh(mesh.vertices, mesh.faces)
+    assert made.is_watertight
+    assert made.volume == pytest.approx(4 / 3 * np.pi * RADIUS**3, rel=0.25)  # faces look outwards
+
+
+def test_vertices_have_the_colours_of_the_ball_there(mesh):
+    expected = 255 * (0.5 + 0.4 * np.sin(4 * mesh.vertices + [0, 1, 2]))  # support/scenes.py
+    high = mesh.vertices[:, 2] > 0  # which the cameras see well
+    assert np.median(np.abs(mesh.colours - expected)[high]) < 30
+
+
+@pytest.mark.parametrize("suffix", ["ply", "glb"])
+def test_it_reads_back_by_trimesh(mesh, suffix, tmp_path):
+    path = tmp_path / f"a.{suffix}"
+    write_mesh(path, mesh)
+    read = trimesh.load(path, process=False)
+    if suffix == "glb":
+        (read,) = read.geometry.values()
+        assert np.array_equal(read.visual.vertex_colors, gltf_colours(mesh.colours))
+    else:
+        assert np.array_equal(read.visual.vertex_colors[:, :3], mesh.colours)
+    assert np.array_equal(np.float32(read.vertices), mesh.vertices)
+    assert np.array_equal(read.faces, mesh.faces)
+
+
+def test_it_reads_back_by_meshio(mesh, tmp_path):
+    write_mesh(tmp_path / "a.ply", mesh)
+    read = meshio.read(tmp_path / "a.ply")
+    assert np.array_equal(np.float32(read.points), mesh.vertices)
+    assert np.array_equal(read.cells_dict["triangle"], mesh.faces)
+    colours = np.stack([read.point_data[name] for name in ("red", "green", "blue")], 1)
+    assert np.array_equal(colours.view(np.uint8), mesh.colours)  # meshio knows no uchar
+
+
+def test_no_surface_is_one_line(run, monkeypatch):
+    monkeypatch.setattr(module, "fuse", lambda grid, _: np.ones(grid.dims[::-1]))
+    with pytest.raises(UserError, match="show no surface"):
+        surface(run)

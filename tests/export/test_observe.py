@@ -1,0 +1,54 @@
+"""What a view's blend weights say of its points, as a matrix."""
+
+import json
+import shutil
+
+import numpy as np
+import pytest
+
+from pp_cl.export.observe import directions, observe
+from pp_cl.trained import load_run
+
+
+def check(run):
+    for seen in observe(run, run.cameras("test"), "test"):
+        matrix, weights = seen.blend_matrix(), seen.point_weights()
+        assert matrix.shape == (30 * 30, run.model.cloud.count) and weights.max() > 0.1
+        assert matrix.sum(0) == pytest.approx(weights, abs=1e-5)
+        assert matrix.sum(1) == pytest.approx(seen.picture().alpha.ravel(), abs=1e-5)
+
+
+def test_rows_sum_to_alpha_and_columns_to_the_points_weights(run):
+    check(run)
+
+
+def test_dropped_hits_are_no_part_of_it(run_folder, session_device, tmp_path):
+    shutil.copytree(run_folder, tmp_path / "run")
+    config = json.loads((tmp_path / "run" / "config.json").read_text())
+    config["raster"]["early_stop"] = 0.3
+    (tmp_path / "run" / "config.json").write_text(json.dumps(config))
+    run = load_run(session_device, tmp_path / "run")
+    camera = run.cameras("test")[0]
+    whole = load_run(session_device, run_folder)
+    (seen,), (all_seen,) = (list(observe(r, [camera], "")) for r in (run, whole))
+    assert 0 < seen.blend_matrix().nnz < all_seen.blend_matrix().nnz
+    check(run)
+
+
+def test_it_blends_what_the_rasteriser_blends(run):
+    camera = run.cameras("test")[0]
+    (seen,) = observe(run, [camera], "test")
+    matrix = seen.blend_matrix()
+    raster = run.renderer.rasterise(camera, run.gamma)
+    points = np.zeros(raster.point_features.shape, np.float32)
+    shaded = raster.shaded.get()
+    points[shaded] = raster.point_features.get()[shaded]
+    blended = matrix @ points + (1 - matrix.sum(1))[:, None]  # the background's features are 1
+    features = run.render(camera, features=True).features.reshape(-1, 16)
+    assert blended == pytest.approx(features, abs=1e-4)
+
+
+def test_directions_are_unit_vectors_from_the_eye(run, rng):
+    camera, ahead = run.cameras("test")[0], rng.normal(size=(20, 3))
+    found = directions(camera.eye + ahead, camera)
+    assert found * np.linalg.norm(ahead, axis=1)[:, None] == pytest.approx(ahead)

@@ -1,0 +1,134 @@
+"""What the mesh and the page of a run on demo lose: python tools/export_quality.py RUN."""
+
+import argparse
+import json
+import sys
+from dataclasses import replace
+
+import numpy as np
+from scipy.ndimage import map_coordinates
+from scipy.spatial import cKDTree
+from skimage.measure import marching_cubes
+
+from pp_cl.errors import UserError
+from pp_cl.export.fusion import HIDDEN, box_around, fuse
+from pp_cl.export.harmonics import STEPS, basis, fit_harmonics
+from pp_cl.export.observe import directions, observe
+from pp_cl.files.image import to_8bit
+from pp_cl.metrics.psnr_ssim import psnr
+from pp_cl.scene.demo import demo_mesh, distances
+from pp_cl.scene.grid import Grid
+from pp_cl.scene.target import Target
+from pp_cl.trained import Run, load
+
+SAMPLES = 60_000  # of a surface
+EXACT = Grid((-1.3, -1.3, -1.3), 0.01, (261, 261, 261))  # where exact distances are asked for
+
+
+def mesh_rows(run: Run) -> list[dict]:
+    """Distances of meshes to the exact surface and back, in grid edges."""
+    cameras = run.cameras("train")
+    views = [(camera, run.render(camera)) for camera in cameras]
+    means = [(camera, replace(p, median_depth=p.depth)) for camera, p in views]
+    grid = box_around(run.model.grid, run.model.cloud.ids.get())
+    opacity = _opacities(run, grid)
+    exact = distances(run.dev, EXACT), cKDTree(demo_mesh(run.dev)[0])
+    fields = [(f"opacity, level {level}", level - opacity) for level in (0.3, 0.5, 0.7)]
+    fields += [
+        ("fused median depths, hidden vertices say nothing", fuse(grid, views, 0.0)),
+        (f"fused mean depths, hidden {HIDDEN}", fuse(grid, means)),
+        (f"fused median depths, hidden {HIDDEN}, as exported", fuse(grid, views)),
+    ]
+    return [{"field": name} | _measured(field, grid, *exact) for name, field in fields]
+
+
+def _opacities(run, grid):
+    """(nz, ny, nx) opacities on a grid, 0 where there is no point."""
+    dense = np.zeros(grid.dims[::-1], np.float32)
+    positions = run.model.grid.positions(run.model.cloud.ids.get())
+    i, j, k = np.rint((positions - np.asarray(grid.origin)) / grid.edge).astype(int).T
+    dense[k, j, i] = run.model.cloud.opacity.get()
+    return dense
+
+
+def _measured(field, grid, exact, surface):
+    """A row of the surface where a field is 0, positive outside. surface: tree of exact points."""
+    vertices, faces, _, _ = marching_cubes(field, 0, gradient_direction="ascent")
+    corners = (np.asarray(grid.origin) + grid.edge * vertices[:, ::-1])[faces]
+    sides = corners[:, 1:] - corners[:, :1]
+    area = np.linalg.norm(np.cross(sides[:, 0], sides[:, 1]), axis=1)
+    rng = np.random.default_rng(0)
+    chosen = rng.choice(len(faces), SAMPLES, p=area / area.sum())
+    points = (rng.dirichlet((1, 1, 1), SAMPLES)[..., None] * corners[chosen]).sum(1)
+    at = (points - np.asarray(EXACT.origin)) / EXACT.edge
+    away = np.abs(map_coordinates(exact, at[:, ::-1].T, order=1, mode="nearest")) / grid.edge
+    back = cKDTree(points).query(surface.data)[0] / grid.edge
+    return {
+        "mean": round(float(away.mean()), 2),
+        "median": round(float(np.median(away)), 2),
+        "back": round(float(back.mean()), 2),
+        "vertices": len(vertices),
+    }
+
+
+def page_rows(run: Run) -> list[dict]:
+    """PSNR of harmonics against the run's images and the photographs, in dB, means of the test
+    views.
+    """
+    views = run.scene("test").splits["test"]
+    target, truths = Target(run.dev), []
+    for view in views:
+        target.load(view)
+        truths.append(to_8bit(target.whole()))
+    cameras = [view.camera for view in views]
+    images = [to_8bit(run.render(camera).colour) for camera in cameras]
+    network = np.mean([psnr(*pair) for pair in zip(images, truths, strict=True)])
+    rows = [{"what": "the network", "truth": round(float(network), 2)}]
+    tried = [(9, steps) for steps in (0, 1, STEPS, 7)] + [(1, STEPS), (4, STEPS)]
+    for count, steps in tried:
+        drawn = _drawn(run, fit_harmonics(run, steps, count), cameras)
+        against = {
+            name: round(float(np.mean([psnr(*p) for p in zip(drawn, others, strict=True)])), 2)
+            for name, others in (("run", images), ("truth", truths))
+        }
+        exported = ", as exported" if (count, steps) == (9, STEPS) else ""
+        rows.append({"what": f"{count} functions, {steps} more steps{exported}"} | against)
+    return rows
+
+
+def _drawn(run, coefficients, cameras):
+    """The images (H, W, 3) uint8 that a page would draw of coefficients (N, count, 3)."""
+    positions = run.model.grid.positions(run.model.cloud.ids.get())
+    drawn = []
+    for seen in observe(run, cameras, "drawing"):
+        at = basis(directions(positions, seen.camera))[:, : coefficients.shape[1]]
+        matrix = seen.blend_matrix()
+        image = matrix @ np.einsum("nk,nkc->nc", at, coefficients) + (1 - matrix.sum(1))[:, None]
+        drawn.append(to_8bit(image.reshape(seen.camera.height, seen.camera.width, 3)))
+    return drawn
+
+
+def main() -> int:
+    """Print the rows; returns the exit status."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("run", help="folder of a run on demo")
+    parser.add_argument("--json", metavar="FILE", help="write them there too")
+    options = parser.parse_args()
+    try:
+        run = load(options.run)
+        if run.config.scene.path != "demo":
+            raise UserError(f"{options.run}: its scene is {run.config.scene.path}, not demo")
+    except UserError as error:
+        print(f"export_quality: {error}", file=sys.stderr)
+        return 2
+    result = {"mesh": mesh_rows(run), "page": page_rows(run)}
+    for row in result["mesh"] + result["page"]:
+        print(row)
+    if options.json:
+        with open(options.json, "w", encoding="utf-8") as file:
+            json.dump(result, file, indent=1)
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
