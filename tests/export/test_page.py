@@ -132,7 +132,7 @@ def test_the_address_says_the_camera(run, page, tmp_path):
     camera = looking((1, -3.5, 1.2), (0.1, 0, 0), (0, 0.1, 1), 40)
     fragment = "#eye=1,-3.5,1.2&target=0.1,0,0&up=0,0.1,1&fov=40"
     shown = check_address(page, fragment, camera, tmp_path)
-    assert psnr(shown, predicted(run, page, camera)) > 45
+    assert psnr(shown, predicted(run, page, camera)) > 40  # nearer than a test view: more edges
 
 
 @pytest.mark.parametrize("fragment", ["#eye=1,2&target=x&up=,,&fov=-3", "#eye=1,2,3&target=1,2,3"])
