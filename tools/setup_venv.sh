@@ -1,5 +1,5 @@
 #!/bin/sh
-# Makes .venv with the package in it (editable, with its extras test and lint): tools/setup_venv.sh PYTHON
+# Makes .venv with the package in it (editable, with what its commands and tests need): tools/setup_venv.sh PYTHON
 set -eu
 python=$1
 
@@ -31,4 +31,4 @@ if ! .venv/bin/python -m pip --version >/dev/null 2>&1; then
     fi
 fi
 echo "installing pp-cl and what it needs into .venv ..."
-PYTHONWARNINGS=ignore .venv/bin/python -m pip install --quiet --disable-pip-version-check --editable '.[test,lint]'
+PYTHONWARNINGS=ignore .venv/bin/python -m pip install --quiet --disable-pip-version-check --editable '.[test,lint,video,view,export]'

@@ -4,14 +4,12 @@ import base64
 import io
 import json
 import re
-import shutil
 import subprocess
 
 import numpy as np
-import pytest
 from PIL import Image
+from support.chromium import find_chromium
 
-NAMES = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable")
 # WebGL on the CPU, so that no graphics card is needed
 OPTIONS = (
     "--headless=new",
@@ -32,14 +30,6 @@ document.querySelectorAll("script").forEach((script) => script.remove());
 </script>"""
 
 
-def browser():
-    """The path of a Chromium; skips the test where there is none."""
-    found = next(filter(None, map(shutil.which, NAMES)), None)
-    if found is None:
-        pytest.skip(f"no {NAMES[0]} on PATH, so nothing draws the page; apt install {NAMES[0]}")
-    return found
-
-
 def ask(page, script, tmp_path, fragment=""):
     """What a script returns that runs in a page after it has loaded, as JSON says it.
 
@@ -47,7 +37,7 @@ def ask(page, script, tmp_path, fragment=""):
     """
     probe = tmp_path / "probe.html"
     probe.write_text(page.read_text("utf-8") + PROBE % script, "utf-8")
-    words = [browser(), *OPTIONS, f"--user-data-dir={tmp_path / 'profile'}"]
+    words = [find_chromium(), *OPTIONS, f"--user-data-dir={tmp_path / 'profile'}"]
     done = subprocess.run(
         [*words, f"{probe.as_uri()}{fragment}"], capture_output=True, text=True, timeout=120
     )

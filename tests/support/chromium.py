@@ -27,9 +27,12 @@ OPTIONS = (
 )
 
 
+NAMES = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable")
+
+
 def find_chromium():
     """The program; skips the test where there is none."""
-    found = next(filter(None, map(shutil.which, ("chromium", "chromium-browser"))), None)
+    found = next(filter(None, map(shutil.which, NAMES)), None)
     if not found:
         pytest.skip("no chromium on PATH; apt install chromium")
     return found
