@@ -38,6 +38,27 @@ def atomic_file(path: Path | str) -> Iterator[BinaryIO]:
         temporary.unlink(missing_ok=True)
 
 
+@contextmanager
+def atomic_path(path: Path) -> Iterator[Path]:
+    """A temporary path of the same suffix for a library to write to, whose file appears under
+    `path` only when the block ends well.
+
+    Raises UserError naming the file when the library cannot write it.
+    """
+    temporary = path.with_name(f".{path.stem}.{os.getpid()}.tmp{path.suffix}")
+    try:
+        yield temporary
+        os.replace(temporary, path)
+    except (OSError, RuntimeError) as error:  # libraries in C++ raise the latter
+        reason = " ".join(str(error).split())[:120]
+        raise UserError(
+            f"{path}: cannot be written ({reason}); check the folder, its permissions and free"
+            " space"
+        ) from error
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
 def _sync_folder(folder):
     """Make a rename in the folder survive a power cut, where the system knows how."""
     if not hasattr(os, "O_DIRECTORY"):
@@ -62,5 +83,5 @@ def write_json(path: Path | str, value: Any) -> None:
 
 def remove_leftovers(folder: Path | str) -> None:
     """Delete temporary files that a killed process left in the folder."""
-    for leftover in Path(folder).glob(".*.tmp"):
+    for leftover in Path(folder).glob(".*.tmp*"):
         leftover.unlink(missing_ok=True)

@@ -1,12 +1,12 @@
 """OpenEXR images (linear light, premultiplied by alpha, with depth), by the package OpenEXR."""
 
-import os
 from pathlib import Path
 
 import numpy as np
 import OpenEXR
 
 from pp_cl.errors import UserError
+from pp_cl.files.atomic import atomic_path
 from pp_cl.files.picture import Picture
 
 
@@ -27,19 +27,9 @@ def write_exr(path: Path, channels: dict[str, np.ndarray]) -> None:
     """Write channels, (H, W) float32 each, without loss, atomically. Raises UserError naming the
     file when it cannot be written.
     """
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
     header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
-    try:
+    with atomic_path(path) as temporary:
         OpenEXR.File(header, dict(channels)).write(str(temporary))
-        os.replace(temporary, path)
-    except (OSError, RuntimeError) as error:
-        reason = " ".join(str(error).split())[:120]
-        raise UserError(
-            f"{path}: cannot be written ({reason}); check the folder, its permissions and free"
-            " space"
-        ) from error
-    finally:
-        temporary.unlink(missing_ok=True)
 
 
 def read_exr(path: Path | str) -> dict[str, np.ndarray]:

@@ -1,12 +1,13 @@
 """Films from frames, by imageio: MP4 and WebM with the ffmpeg of its wheel, GIF with Pillow."""
 
-import os
 from collections.abc import Iterable
+from itertools import chain
 from pathlib import Path
 
 import numpy as np
 
 from pp_cl.errors import UserError
+from pp_cl.files.atomic import atomic_path
 
 FORMATS = ("mp4", "webm", "gif")
 MISSING = "films need the packages imageio and imageio-ffmpeg: pip install pp-cl[video]"
@@ -35,22 +36,15 @@ def write_video(path: Path, frames: Iterable[np.ndarray], fps: float) -> None:
     """
     import imageio.v2 as imageio
 
-    temporary = path.with_name(f".{path.stem}.{os.getpid()}.tmp{path.suffix}")
     frames = iter(frames)
     first = next(frames)
-    try:
-        with imageio.get_writer(str(temporary), **_options(path.suffix[1:], first, fps)) as writer:
-            for frame in (first, *frames):
-                writer.append_data(_even(frame))
-        os.replace(temporary, path)
-    except OSError as error:
-        reason = " ".join(str(error).split())[:120]
-        raise UserError(
-            f"{path}: cannot be written ({reason}); check the folder, its permissions and free"
-            " space"
-        ) from error
-    finally:
-        temporary.unlink(missing_ok=True)
+    options = _options(path.suffix[1:], first, fps)
+    with (
+        atomic_path(path) as temporary,
+        imageio.get_writer(str(temporary), **options) as writer,
+    ):
+        for frame in chain([first], frames):
+            writer.append_data(_even(frame))
 
 
 def _options(suffix, frame, fps):

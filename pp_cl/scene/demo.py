@@ -17,6 +17,7 @@ from pp_cl.files.image import write_png
 from pp_cl.scene.camera import Camera
 from pp_cl.scene.grid import Grid
 from pp_cl.scene.load import Frame, Scene, evenly
+from pp_cl.scene.readers.frame import frame_keys
 from pp_cl.scene.views import View
 
 SPLITS = ("train", "test")
@@ -144,18 +145,8 @@ def _transforms(views):
 
 
 def _frame(view):
-    camera = view.stored_camera
-    pose = np.vstack([camera.pose * [1, -1, -1, 1], [0, 0, 0, 1]])  # OpenGL: y up, z backward
-    frame = {
-        "file_path": "./" + Path(view.name).with_suffix("").as_posix(),
-        "transform_matrix": pose.tolist(),
-        "fl_x": camera.fx,
-        "fl_y": camera.fy,
-        "cx": camera.cx,
-        "cy": camera.cy,
-        "w": camera.width,
-        "h": camera.height,
-    }
+    path = "./" + Path(view.name).with_suffix("").as_posix()
+    frame = {"file_path": path, **frame_keys(view.stored_camera)}
     if view.depth_range:
         frame["near"], frame["far"] = view.depth_range
     return frame

@@ -19,10 +19,11 @@ from pp_cl.model import Model
 from pp_cl.render import NETWORK_MULTIPLE, Renderer
 from pp_cl.scene.camera import Camera
 from pp_cl.scene.camera_path import up_of
+from pp_cl.scene.readers.frame import frame_keys
 from pp_cl.scene.target import Target
 from pp_cl.trained import Run, load_run
 from pp_cl.view import shown
-from pp_cl.view.messages import LEAST_SIDE, Frame, ViewRequest, camera_facts
+from pp_cl.view.messages import LEAST_SIDE, Frame, ViewRequest
 
 DRAFT = 4  # times fewer pixels each way while the camera moves
 OWN_CAMERA = ("error", "photograph")  # are shown from the nearest training view's own camera
@@ -111,8 +112,8 @@ class LiveRun:
             "centre": centre.tolist(),
             "radius": radius,
             "up": up_of(cameras or [first]).tolist(),
-            "camera": camera_facts(first),
-            "views": [{"name": v.name, "camera": camera_facts(v.camera)} for v in self._views],
+            "camera": frame_keys(first),
+            "views": [{"name": v.name, "camera": frame_keys(v.camera)} for v in self._views],
         }
 
     def draw(self, request: ViewRequest) -> Frame:
@@ -139,7 +140,7 @@ class LiveRun:
             "show": request.show,
             "draft": request.draft,
             "mime": "image/png" if lossless else "image/jpeg",
-            "camera": camera_facts(camera),
+            "camera": frame_keys(camera),
             "view": index,
             "scale": scale,
             "step": self._run.header["step"],

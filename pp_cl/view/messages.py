@@ -81,21 +81,6 @@ def read_request(text: str) -> ViewRequest:
     )
 
 
-def camera_facts(camera: Camera) -> dict[str, Any]:
-    """A camera in the form of nerfstudio's transforms files, OpenGL axes."""
-    pose = np.vstack([camera.pose, [0, 0, 0, 1]])
-    pose = pose @ GL_FROM_CV
-    return {
-        "transform_matrix": pose.tolist(),
-        "fl_x": camera.fx,
-        "fl_y": camera.fy,
-        "cx": camera.cx,
-        "cy": camera.cy,
-        "w": camera.width,
-        "h": camera.height,
-    }
-
-
 def _camera(facts):
     """The Camera of such facts. Raises UserError naming what is wrong."""
     if not isinstance(facts, dict):

@@ -11,9 +11,9 @@ import numpy as np
 from aiohttp import WSMsgType, web
 from PIL import Image
 
+from pp_cl.scene.readers.frame import frame_keys
 from pp_cl.view.access import Access
 from pp_cl.view.live_run import LiveRun
-from pp_cl.view.messages import camera_facts
 from pp_cl.view.server import ViewServer
 
 SECONDS = 60  # that an answer may take on a machine that does other things, too
@@ -21,7 +21,7 @@ SECONDS = 60  # that an answer may take on a machine that does other things, too
 
 def asking(camera, **changes):
     """A request for a camera's picture, as the page writes it."""
-    facts = camera if isinstance(camera, dict) else camera_facts(camera)
+    facts = camera if isinstance(camera, dict) else frame_keys(camera)
     request = {"number": 1, "kind": "frame", "show": "colour", "draft": False, "camera": facts}
     return request | {"tau": 0, "early_stop": 0.001, "kept": 1, "exposure": 0} | changes
 

@@ -9,8 +9,9 @@ from support.scenes import ring_cameras
 from support.viewing import asking
 
 from pp_cl.errors import UserError
+from pp_cl.scene.readers.frame import frame_keys
 from pp_cl.scene.readers.transforms import read_split
-from pp_cl.view.messages import RANGES, Frame, camera_facts, read_request
+from pp_cl.view.messages import RANGES, Frame, read_request
 
 CAMERA = replace(ring_cameras(3, 48)[1], cx=20.5, fy=61.0, height=40)
 
@@ -27,7 +28,7 @@ def test_a_copied_camera_is_a_frame_of_a_transforms_file(tmp_path):
     from PIL import Image
 
     Image.new("RGBA", (48, 40)).save(tmp_path / "a.png")
-    frame = camera_facts(CAMERA) | {"file_path": "a.png"}
+    frame = frame_keys(CAMERA) | {"file_path": "a.png"}
     (tmp_path / "transforms_train.json").write_text(json.dumps({"frames": [frame]}))
     [(_, camera, _)] = read_split(tmp_path, "train")
     np.testing.assert_allclose(camera.pose, CAMERA.pose, atol=1e-12)
@@ -35,7 +36,7 @@ def test_a_copied_camera_is_a_frame_of_a_transforms_file(tmp_path):
 
 
 def with_matrix(row, column, value):
-    facts = camera_facts(CAMERA)
+    facts = frame_keys(CAMERA)
     facts["transform_matrix"][row][column] = value
     return facts
 
@@ -46,13 +47,13 @@ BAD_CAMERAS = [
     *(with_matrix(0, 3, value) for value in (float("nan"), float("inf"), None, "1", True, 1e7)),
     *(with_matrix(1, 1, value) for value in (float("nan"), 5, 1e300, 10**400)),
     with_matrix(3, 3, 2),
-    camera_facts(CAMERA) | {"transform_matrix": [[1, 0, 0]] * 4},
-    camera_facts(CAMERA) | {"transform_matrix": [1, 2, 3, 4]},
-    camera_facts(replace(CAMERA, pose=CAMERA.pose * [-1, 1, 1, 1])),  # a mirror
-    *(camera_facts(CAMERA) | {key: 0} for key in ("fl_x", "fl_y", "w", "h")),
-    *(camera_facts(CAMERA) | {"cx": value} for value in (float("nan"), 1e6, None)),
-    *(camera_facts(CAMERA) | {"w": value} for value in (15, 48.0, 5000, True)),
-    camera_facts(CAMERA) | {"w": 4096, "h": 4096},
+    frame_keys(CAMERA) | {"transform_matrix": [[1, 0, 0]] * 4},
+    frame_keys(CAMERA) | {"transform_matrix": [1, 2, 3, 4]},
+    frame_keys(replace(CAMERA, pose=CAMERA.pose * [-1, 1, 1, 1])),  # a mirror
+    *(frame_keys(CAMERA) | {key: 0} for key in ("fl_x", "fl_y", "w", "h")),
+    *(frame_keys(CAMERA) | {"cx": value} for value in (float("nan"), 1e6, None)),
+    *(frame_keys(CAMERA) | {"w": value} for value in (15, 48.0, 5000, True)),
+    frame_keys(CAMERA) | {"w": 4096, "h": 4096},
 ]
 
 

@@ -76,6 +76,20 @@ class Frame:
         return float(value)
 
 
+def frame_keys(camera: Camera) -> dict[str, Any]:
+    """A camera in the format of nerfstudio's transforms files, which pinhole() reads."""
+    pose = np.vstack([camera.pose, [0, 0, 0, 1]]) @ GL_FROM_CV
+    return {
+        "transform_matrix": pose.tolist(),
+        "fl_x": camera.fx,
+        "fl_y": camera.fy,
+        "cx": camera.cx,
+        "cy": camera.cy,
+        "w": camera.width,
+        "h": camera.height,
+    }
+
+
 def pinhole(frame: Frame, width: int, height: int) -> Camera:
     """The camera of a frame in the format of NeRF-synthetic and nerfstudio whose image has this
     many pixels. Raises UserError naming the key that is missing or wrong.
