@@ -1,9 +1,10 @@
-import { fromFacts, orbit, pan, project, scaled, toFacts, unproject, zoom } from "./camera.js";
+import { fromFacts, orbit, pan, scaled, toFacts, zoom } from "./camera.js";
 import { drawCurve } from "./curve.js";
+import { drawFrustums, frustumAt, frustums } from "./frustums.js";
 
+const RADIANS_PER_PIXEL = 0.008, ZOOM_PER_PIXEL = 0.0012, CLICK = 5;
 const $ = (id) => document.getElementById(id);
 const STILL = 180; // ms without movement until the full resolution is asked for
-const RADIANS_PER_PIXEL = 0.008, ZOOM_PER_PIXEL = 0.0012, NEAR_CLICK = 22, CLICK = 5;
 const RECONNECT = 2000, NOTE = 4000; // ms
 const SLIDERS = ["tau", "early_stop", "kept", "exposure"];
 const CUBIC = ["tau", "early_stop"]; // most of their effect is near 0: value = 0.5 position^3
@@ -196,50 +197,25 @@ function layOut() {
 
 // ---- the training views
 
-// [[column, row] of the eye on the overlay, lines of the frustum] for each view ahead of the camera
-function frustums(at, perPixel) {
-  const size = 0.12 * around.radius;
-  return around.views.map((view) => {
-    const c = fromFacts(view.camera), depth = (size * 2 * c.fx) / Math.max(c.w, c.h) / 2;
-    const corners = [[0, 0], [c.w, 0], [c.w, c.h], [0, c.h]].map(([u, v]) => unproject(c, u, v, depth));
-    const points = [c.eye, ...corners].map((p) => project(at, p));
-    if (points.some((p) => p[2] < 0.02 * around.radius)) return null;
-    return points.map(([u, v]) => [u * perPixel, v * perPixel]);
-  });
+// The frustums on an overlay of this width, none where they are switched off.
+function shownFrustums(width) {
+  if (!shownCamera || !around || $("frustums").ariaPressed !== "true" || OWN_CAMERA.includes(show())) return [];
+  return frustums(around, shownCamera, width / shownCamera.w);
 }
 
 function drawOverlay(hovered = null) {
   const overlay = $("overlay"), ratio = window.devicePixelRatio || 1;
   overlay.width = overlay.clientWidth * ratio;
   overlay.height = overlay.clientHeight * ratio;
-  if (!shownCamera || !around || $("frustums").ariaPressed !== "true" || OWN_CAMERA.includes(show())) return;
   const g = overlay.getContext("2d");
   g.scale(ratio, ratio);
-  frustums(shownCamera, overlay.clientWidth / shownCamera.w).forEach((points, i) => {
-    if (!points) return;
-    const [eye, ...corners] = points;
-    g.strokeStyle = i === hovered ? "#ff8a1f" : "#3d7fd8a0";
-    g.lineWidth = i === hovered ? 2 : 1;
-    g.beginPath();
-    corners.forEach((corner, k) => {
-      g.moveTo(...eye); g.lineTo(...corner); g.lineTo(...corners[(k + 1) % 4]);
-    });
-    g.stroke();
-  });
+  drawFrustums(g, shownFrustums(overlay.clientWidth), hovered);
 }
 
 // The view whose frustum is nearest to a pointer event, or null.
 function viewAt(event) {
-  if (!shownCamera || !around || $("frustums").ariaPressed !== "true" || OWN_CAMERA.includes(show())) return null;
   const box = $("overlay").getBoundingClientRect();
-  let best = null, least = NEAR_CLICK;
-  frustums(shownCamera, box.width / shownCamera.w).forEach((points, i) => {
-    if (!points) return;
-    const middle = [0, 1].map((k) => points.reduce((sum, p) => sum + p[k], 0) / points.length);
-    const away = Math.hypot(event.clientX - box.left - middle[0], event.clientY - box.top - middle[1]);
-    if (away < least) [best, least] = [i, away];
-  });
-  return best;
+  return frustumAt(shownFrustums(box.width), event.clientX - box.left, event.clientY - box.top);
 }
 
 function jump(facts) {

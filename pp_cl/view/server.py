@@ -27,6 +27,7 @@ FILES = {
     "page.js": ("page.js", "text/javascript"),
     "camera.js": ("camera.js", "text/javascript"),
     "curve.js": ("curve.js", "text/javascript"),
+    "frustums.js": ("frustums.js", "text/javascript"),
     "icon.svg": ("icon.svg", "image/svg+xml"),
 }
 SOCKET = "socket"  # its path

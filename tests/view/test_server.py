@@ -33,7 +33,15 @@ def test_files_come_with_their_headers_and_nothing_else_does(dev, trained):
     async def scenario():
         async with served(dev, trained) as here:
             get, address = here.session.get, here.access.address
-            for name in ("", "page.js", "page.css", "camera.js", "curve.js", "icon.svg"):
+            for name in (
+                "",
+                "page.js",
+                "page.css",
+                "camera.js",
+                "curve.js",
+                "frustums.js",
+                "icon.svg",
+            ):
                 async with get(address + name) as response:
                     assert response.status == 200 and await response.text()
                     check_headers(response)
