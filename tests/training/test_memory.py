@@ -1,5 +1,7 @@
 """The memory plan against what a training really allocates."""
 
+import gc
+
 import numpy as np
 import pytest
 from support.scenes import write_ball_scene
@@ -27,6 +29,12 @@ WAYS = [
     {"points.sh_degree": "1"},
     {"train.perceptual_weight": "0.1"},
 ]
+
+
+@pytest.fixture(autouse=True)
+def nothing_left_over():
+    """What earlier tests left in reference cycles is released before memory is counted."""
+    gc.collect()
 
 
 def trained(dev, folder, changes, base="tiny"):

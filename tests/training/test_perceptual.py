@@ -192,7 +192,7 @@ def test_a_training_with_it_lowers_it(scene, tmp_path, monkeypatch, weights):
         assert main(arguments(scene, out, train__perceptual_weight=weight)) == 0
         log = [row for row in rows(out) if "loss" in row]
         for row in log:
-            parts = row["l1"] + 0.2 * (1 - row["ssim"]) + weight * row["lpips"]
+            parts = row["l1"] + 0.2 * (1 - row["ssim"]) + row["mask"] + weight * row["lpips"]
             assert row["loss"] == pytest.approx(parts, rel=1e-5)
         assert np.mean([row["loss"] for row in log[-3:]]) < 0.8 * log[0]["loss"]
         ends[weight] = np.mean([row["lpips"] for row in log[-3:]])
