@@ -97,6 +97,7 @@ def test_the_plan_is_what_a_training_takes(dev, tmp_path, monkeypatch, changes):
 
 def test_pruning_stays_within_the_plan(dev, tmp_path, monkeypatch):
     monkeypatch.setattr("pp_cl.device.compact.SCRATCH_BYTES", 10**6)
+    others = dev.bytes  # what fixtures of other tests hold
     trainer, plan, _ = trained(dev, tmp_path / "ball", {})
     before, dev.peak_bytes = dev.bytes, dev.bytes
     trainer.state.peak_weight.set(np.arange(POINTS, dtype=np.float32))
@@ -104,7 +105,7 @@ def test_pruning_stays_within_the_plan(dev, tmp_path, monkeypatch):
     trainer.prune()
     assert trainer.model.cloud.count == POINTS - 1
     assert dev.peak_bytes <= before + 10**6 + 2 * 4 * POINTS  # the weights and the list of the kept
-    assert dev.peak_bytes <= plan_bytes(plan)
+    assert dev.peak_bytes - others <= plan_bytes(plan)
 
 
 @pytest.mark.parametrize("lazy", ["false", "true"])
