@@ -203,7 +203,7 @@ def _masks(views):
     """{"with_alpha": share of the views whose image has a transparent pixel, "object": mean share
     of such an image that shows the object, None where there is none}.
     """
-    masks = [view.image[..., 3] for view in views if view.image[..., 3].min() < 255]
+    masks = [view.image[..., 3] for view in views if view.has_mask]
     shares = [float((mask > MASK_THRESHOLD).mean()) for mask in masks]
     return {
         "with_alpha": len(masks) / len(views),

@@ -60,6 +60,10 @@ class Model:
         """
         return cls(dev, grid, depth_range, PointCloud.create(dev, ids, degree, opacity), net=net)
 
+    def positions(self) -> np.ndarray:
+        """(N, 3) float64 world positions of the points."""
+        return self.grid.positions(self.cloud.ids.get())
+
     def refine(self) -> Array:
         """Replace every point by the eight around it on the grid of half the spacing, which take
         over what it has learned. Returns the point that each one comes from, (8 N,) uint32.

@@ -20,7 +20,7 @@ from pp_cl.network.unet import UNet
 from pp_cl.render import Renderer
 from pp_cl.scene.camera import Camera
 from pp_cl.scene.load import Scene
-from pp_cl.scene.open import open_scene
+from pp_cl.scene.open import DEMO, open_scene, scene_frames
 from pp_cl.training.schedule import gamma_at
 
 NEAREST = 0.05  # of a point to the eye, in radii of the object
@@ -54,21 +54,29 @@ class Run:
 
     def scene(self, split: str) -> Scene:
         """The run's scene with one split. Raises UserError where it is missing or broken."""
-        path = self.config.scene.path
-        if path != "demo" and not Path(path).is_dir():
-            raise UserError(f"{path}: the run's scene is not there; say where with --scene")
+        self._check_scene()
         return open_scene(self.dev, self.config, (split,))
 
     def cameras(self, split: str = "test") -> list[Camera]:
-        """The cameras of a split's views at the resolution of the run."""
-        return [view.camera for view in self.scene(split).splits[split]]
+        """The cameras of a split's views at the resolution of the run; no photograph is read.
+        Raises UserError as scene() does.
+        """
+        self._check_scene()
+        settings = self.config.scene
+        frames = scene_frames(settings.path, split)
+        return [camera.downscaled(settings.downscale) for _, camera, _ in frames]
+
+    def _check_scene(self):
+        path = self.config.scene.path
+        if path != DEMO and not Path(path).is_dir():
+            raise UserError(f"{path}: the run's scene is not there; say where with --scene")
 
     @cached_property
     def ball(self) -> tuple[np.ndarray, float]:
         """(centre (3,), radius), world units, of the smallest ball around the middle of the box of
         the points that holds them all.
         """
-        points = self.model.grid.positions(self.model.cloud.ids.get())
+        points = self.model.positions()
         centre = (points.min(axis=0) + points.max(axis=0)) / 2
         radius = np.linalg.norm(points - centre, axis=1).max() + self.model.grid.edge
         return centre, float(radius)

@@ -45,7 +45,7 @@ def mesh_rows(run: Run) -> list[dict]:
 def _opacities(run, grid):
     """(nz, ny, nx) opacities on a grid, 0 where there is no point."""
     dense = np.zeros(grid.dims[::-1], np.float32)
-    positions = run.model.grid.positions(run.model.cloud.ids.get())
+    positions = run.model.positions()
     i, j, k = np.rint((positions - np.asarray(grid.origin)) / grid.edge).astype(int).T
     dense[k, j, i] = run.model.cloud.opacity.get()
     return dense
@@ -98,7 +98,7 @@ def page_rows(run: Run) -> list[dict]:
 
 def _drawn(run, coefficients, cameras):
     """The images (H, W, 3) uint8 that a page would draw of coefficients (N, count, 3)."""
-    positions = run.model.grid.positions(run.model.cloud.ids.get())
+    positions = run.model.positions()
     drawn = []
     for seen in observe(run, cameras, "drawing"):
         at = basis(directions(positions, seen.camera))[:, : coefficients.shape[1]]

@@ -49,15 +49,19 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> None:
     """Render the frames that are missing, then write film and contact sheet."""
+    from pp_cl.device.discover import open_device
     from pp_cl.files.video import check_video
+    from pp_cl.film import Frames
+    from pp_cl.trained import load_run
 
-    style, fps, size, fov = _style(options), *_numbers(options), _size(options), _fov(options)
+    style, size, fov = _style(options), _size(options), _fov(options)
+    fps, count = _speed(options)
     if options.format in FILMS:
         check_video(options.format)
-    run = _load(options)
-    cameras = _cameras(run, options, fps, size=size, fov=fov)
+    run = load_run(open_device(options.device), options.run_folder, scene=options.scene)
+    cameras = _cameras(run, options.path, count, size=size, fov=fov)
     out = Path(options.out) if options.out else run.folder.path / "render" / _name(options.path)
-    frames = _frames(run, cameras, out, style)
+    frames = Frames(run, cameras, out, style)
     seconds = _render_with_bar(frames)
     made = f"{len(seconds)} of {len(cameras)} frames"
     if seconds:
@@ -71,19 +75,6 @@ def run(options: argparse.Namespace) -> None:
         written.insert(0, str(film))
     print(f"rendered {made}")
     print(f"wrote {', '.join(written)}")
-
-
-def _load(options):
-    from pp_cl.device.discover import open_device
-    from pp_cl.trained import load_run
-
-    return load_run(open_device(options.device), options.run_folder, scene=options.scene)
-
-
-def _frames(run, cameras, out, style):
-    from pp_cl.film import Frames
-
-    return Frames(run, cameras, out, style)
 
 
 def _style(options):
@@ -114,16 +105,17 @@ def _background(text):
     return tuple(int(w) / 255 for w in words)
 
 
-def _numbers(options):
-    """(frames per second,) of the options, with the number of frames checked."""
+def _speed(options):
+    """(frames per second, frames of an orbit or spiral) of the options."""
     fps = shared.read_number("--fps", options.fps, float, least=0.1, most=240)
     seconds = shared.read_number("--seconds", options.seconds, float, least=1e-3, most=1e5)
-    if not 1 <= round(seconds * fps) <= MOST_FRAMES:
+    count = round(seconds * fps)
+    if not 1 <= count <= MOST_FRAMES:
         raise UserError(
             f"--seconds {options.seconds}: {seconds * fps:g} frames at {fps:g} a second; ask for 1"
             f" to {MOST_FRAMES}"
         )
-    return (fps,)
+    return fps, count
 
 
 def _size(options):
@@ -148,8 +140,8 @@ def _name(path):
     return Path(path).stem if Path(path).suffix else path
 
 
-def _cameras(run, options, fps, *, size, fov):
-    """The cameras of the path, with the size and angle of view asked for."""
+def _cameras(run, path, count, *, size, fov):
+    """The cameras of a path, `count` of an orbit or spiral, with size and angle of view."""
     from pp_cl.scene.camera_path import Surroundings
     from pp_cl.scene.readers.camera_file import read_cameras
 
@@ -157,15 +149,14 @@ def _cameras(run, options, fps, *, size, fov):
         camera = camera.resized(*size) if size else camera
         return camera.with_angle(fov) if fov else camera
 
-    if Path(options.path).suffix:
-        return [shaped(camera) for camera in read_cameras(Path(options.path), size)]
-    if options.path not in ("orbit", "spiral"):
-        return [shaped(camera) for camera in run.cameras(options.path)]
+    if Path(path).suffix:
+        return [shaped(camera) for camera in read_cameras(Path(path), size)]
+    if path not in ("orbit", "spiral"):
+        return [shaped(camera) for camera in run.cameras(path)]
     photographs = run.cameras("train")
-    points = run.model.grid.positions(run.model.cloud.ids.get())
-    around, first = Surroundings(photographs, points), shaped(photographs[0])
-    count = round(fps * float(options.seconds))
-    return around.orbit(first, count) if options.path == "orbit" else around.spiral(first, count)
+    around, first = Surroundings(photographs, run.model.positions()), shaped(photographs[0])
+    make = around.orbit if path == "orbit" else around.spiral
+    return make(first, count)
 
 
 def _render_with_bar(frames):

@@ -7,7 +7,7 @@ from PIL import Image
 
 from pp_cl.files.contact_sheet import ERROR_GAIN
 from pp_cl.files.image import to_8bit
-from pp_cl.files.picture import srgb_to_linear
+from pp_cl.files.picture import linear_to_srgb, srgb_to_linear
 from pp_cl.scene.camera import Camera
 
 DARK = np.array([23, 24, 27]) / 255  # sRGB, the background of page.css
@@ -75,8 +75,7 @@ def error_image(image: np.ndarray, truth: np.ndarray) -> np.ndarray:
 def exposed(image: np.ndarray, stops: float) -> np.ndarray:
     """The uint8 image with 2^stops times as much light; sRGB, clipped."""
     light = srgb_to_linear(np.arange(256) / 255) * 2.0**stops
-    encoded = np.where(light <= 0.0031308, 12.92 * light, 1.055 * light ** (1 / 2.4) - 0.055)
-    return to_8bit(encoded)[image]
+    return to_8bit(linear_to_srgb(light))[image]
 
 
 def encoded(image: np.ndarray, lossless: bool) -> bytes:
