@@ -4,6 +4,9 @@ BIN := .venv/bin
 READY := .venv/.ready
 KERNELS = $(shell find cl -name "*.cl" -o -name "*.h")
 
+# Tests wait for builds of kernels, which use one core.
+ON_ALL_CORES := --numprocesses auto --dist worksteal
+
 # The tests that the rule of three names for the kernel files, and those with the marker `kernels`.
 OCLGRIND = $(shell find cl -name "*.cl" | sed "s|^cl/\(.*\)/\(.*\).cl|tests/\1/test_\2.py|"; \
 	grep -rl "pytest.mark.kernels" --include="test_*.py" tests)
@@ -29,12 +32,12 @@ demo: $(READY) ## train the demo scene into runs/demo and evaluate it: minutes o
 	$(BIN)/pp-cl train demo --preset tiny --iterations 1500 --out runs/demo
 	$(BIN)/pp-cl eval runs/demo --metrics
 
-test: $(READY) ## run the tests on the device of PP_DEVICE, else the default one
-	@$(BIN)/python -m pytest $(ARGS)
+test: $(READY) ## run the tests on the device of PP_DEVICE, else the default one, a process a core
+	@$(BIN)/python -m pytest $(ON_ALL_CORES) $(ARGS)
 
 test-intel: $(READY) ## the same on Intel's CPU runtime, installed into .venv if need be (x86-64)
 	@$(BIN)/python tools/setup_opencl.py --intel
-	@PP_DEVICE="Intel(R) OpenCL" $(BIN)/python -m pytest $(ARGS)
+	@PP_DEVICE="Intel(R) OpenCL" $(BIN)/python -m pytest $(ON_ALL_CORES) $(ARGS)
 
 bench: $(READY) ## time and error of the network and of its layers; ARGS="--size 200 --widths 32,64,128" for others
 	$(BIN)/pp-cl bench unet $(ARGS)

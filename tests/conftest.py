@@ -85,8 +85,16 @@ def pytest_terminal_summary(terminalreporter):
     )
 
 
+@pytest.hookimpl(optionalhook=True)
+def pytest_testnodedown(node, error):
+    """Take over what a worker of pytest-xdist has counted."""
+    for name, count in getattr(node, "workeroutput", {}).get("counts", {}).items():
+        COUNTS[name] += count
+
+
 def pytest_sessionfinish(session, exitstatus):
     """A whole run that launched no kernel has tested nothing."""
-    in_workers = session.config.getoption("numprocesses", None)  # pytest-xdist counts elsewhere
-    if session.testscollected > 100 and COUNTS["launches"] == 0 and not in_workers:
+    if hasattr(session.config, "workeroutput"):  # a worker, whose counts go to the first process
+        session.config.workeroutput["counts"] = COUNTS
+    elif session.testscollected > 100 and COUNTS["launches"] == 0:
         session.exitstatus = 1
