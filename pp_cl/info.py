@@ -19,9 +19,10 @@ from pp_cl.files.run_folder import RunFolder
 from pp_cl.scene.camera_path import looked_at, up_of
 from pp_cl.scene.grid import Grid
 from pp_cl.scene.hull import Hull, build_grid, spacing_pixels
-from pp_cl.scene.load import Frame, evenly
+from pp_cl.scene.load import evenly
 from pp_cl.scene.open import open_scene, preset_downscale, scene_format, scene_frames, scene_splits
 from pp_cl.scene.outline import outline
+from pp_cl.scene.photograph import Photograph
 from pp_cl.scene.target import Target
 from pp_cl.scene.views import MASK_THRESHOLD, View, fitting_downscale
 
@@ -99,7 +100,7 @@ def _edge_pixels(config, grid):
         frames = scene_frames(config.scene.path)
     except UserError:
         return None
-    cameras = [camera.downscaled(config.scene.downscale) for _, camera, _ in frames]
+    cameras = [frame.camera.downscaled(config.scene.downscale) for frame in frames]
     return spacing_pixels(grid, cameras)
 
 
@@ -175,8 +176,8 @@ def _hull(dev, views, config: Config):
         return None, str(error)
 
 
-def _sizes(frames: Sequence[Frame]):
-    return dict(Counter(f"{camera.width}x{camera.height}" for _, camera, _ in frames))
+def _sizes(frames: Sequence[Photograph]):
+    return dict(Counter(f"{frame.camera.width}x{frame.camera.height}" for frame in frames))
 
 
 def _range(values):

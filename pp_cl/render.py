@@ -12,7 +12,6 @@ from dataclasses import dataclass
 import numpy as np
 from pyopencl.array import Array
 
-from pp_cl.config import RasterConfig
 from pp_cl.device.buffers import Buffers, Table
 from pp_cl.device.device import Device
 from pp_cl.files.picture import Picture
@@ -25,6 +24,7 @@ from pp_cl.raster.pairs import PairBuilder, Pairs
 from pp_cl.raster.project import Footprint, ProjectedPoints, Projection
 from pp_cl.raster.shade import shade_forward
 from pp_cl.scene.camera import Camera
+from pp_cl.settings import RasterConfig
 
 NETWORK_MULTIPLE = 4  # the U-Net halves its input twice
 PAPER_DEPTH_RANGE = (

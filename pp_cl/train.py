@@ -5,7 +5,7 @@ from functools import partial
 
 import numpy as np
 
-from pp_cl.config import Config, TrainConfig
+from pp_cl.config import Config
 from pp_cl.device.device import Device
 from pp_cl.device.rows import DeviceRows
 from pp_cl.errors import UserError
@@ -13,6 +13,7 @@ from pp_cl.model import Model
 from pp_cl.render import Renderer
 from pp_cl.scene.target import Target
 from pp_cl.scene.views import View
+from pp_cl.settings import TrainConfig
 from pp_cl.training.adam import moment_scale
 from pp_cl.training.crops import BOX_MARGIN, draw_start
 from pp_cl.training.loss import Loss

@@ -64,7 +64,7 @@ class Run:
         self._check_scene()
         settings = self.config.scene
         frames = scene_frames(settings.path, split)
-        return [camera.downscaled(settings.downscale) for _, camera, _ in frames]
+        return [frame.camera.downscaled(settings.downscale) for frame in frames]
 
     def _check_scene(self):
         path = self.config.scene.path

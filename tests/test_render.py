@@ -13,9 +13,9 @@ from support.models import GRID, make_model
 from support.networks import plain_parameters
 from support.scenes import ring_cameras
 
-from pp_cl.config import RasterConfig
 from pp_cl.raster.blend import BLENDS
 from pp_cl.render import PAPER_DEPTH_RANGE, Renderer
+from pp_cl.settings import RasterConfig
 
 GAMMA = 0.03
 

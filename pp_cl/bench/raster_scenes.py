@@ -11,7 +11,6 @@ from typing import NamedTuple
 import numpy as np
 from pyopencl.array import Array
 
-from pp_cl.config import RasterConfig
 from pp_cl.device.device import Device
 from pp_cl.model import Model
 from pp_cl.network.unet import UNet
@@ -23,6 +22,7 @@ from pp_cl.reference.raster import PixelReference, sh_basis
 from pp_cl.render import RasterResult, Renderer
 from pp_cl.scene.camera import Camera
 from pp_cl.scene.grid import Grid
+from pp_cl.settings import RasterConfig
 
 SAMPLES = 64  # pixels compared with float64
 CHANNELS = 16

@@ -33,6 +33,14 @@ def read_rgba(path: Path | str) -> np.ndarray:
         return np.array(image if image.mode == "RGBA" else image.convert("RGBA"))
 
 
+def read_gray(path: Path | str) -> np.ndarray:
+    """(H, W) uint8 of an image file that is gray, such as a mask; colours become their luminance.
+    Raises UserError as read_rgba does.
+    """
+    rgba = read_rgba(path)
+    return np.array(Image.fromarray(rgba[..., :3]).convert("L"))
+
+
 def image_size(path: Path | str) -> tuple[int, int]:
     """(width, height) from the header of an image file. Raises UserError as read_rgba does."""
     with _opened(path) as image:

@@ -16,7 +16,8 @@ from pp_cl.files.atomic import write_json
 from pp_cl.files.image import write_png
 from pp_cl.scene.camera import Camera
 from pp_cl.scene.grid import Grid
-from pp_cl.scene.load import Frame, Scene, evenly
+from pp_cl.scene.load import Scene, evenly
+from pp_cl.scene.photograph import Photograph
 from pp_cl.scene.readers.frame import frame_keys
 from pp_cl.scene.views import View
 
@@ -40,22 +41,22 @@ def demo_scene(
     """
     views = {
         split: [
-            View(name, camera, render(dev, camera))
-            for name, camera, _ in evenly(demo_frames(split, size), most)
+            View(frame.name, frame.camera, render(dev, frame.camera))
+            for frame in evenly(demo_frames(split, size), most)
         ]
         for split in splits
     }
     return Scene("demo", None, views)
 
 
-def demo_frames(split: str, size: int = SIZE) -> list[Frame]:
-    """[(name, Camera, None)] of a split's views, without their images. Raises UserError for a
+def demo_frames(split: str, size: int = SIZE) -> list[Photograph]:
+    """A split's views, without their images. Raises UserError for a
     split that there is not.
     """
     if split not in SPLITS:
         raise UserError(f"--split {split}: demo has {', '.join(SPLITS)}")
     cameras = _spread_cameras(size) if split == "train" else _circling_cameras(size)
-    return [(f"{split}/r_{i}.png", camera, None) for i, camera in enumerate(cameras)]
+    return [Photograph(f"{split}/r_{i}.png", camera) for i, camera in enumerate(cameras)]
 
 
 def render(dev: Device, camera: Camera) -> np.ndarray:

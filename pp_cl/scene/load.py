@@ -1,7 +1,7 @@
 """Scenes: photographs of one object, with cameras and masks, from any format that READERS knows."""
 
 import os
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -13,16 +13,16 @@ from tqdm import tqdm
 
 from pp_cl.errors import UserError
 from pp_cl.files.image import read_rgba
-from pp_cl.scene.camera import Camera
+from pp_cl.scene.distortion import undistort
+from pp_cl.scene.masks import AS_GIVEN, MaskRule
 from pp_cl.scene.readers import transforms
 from pp_cl.scene.views import View
 
 # One module per format. FILES names the files it reads, recognises(folder) tells whether a folder
-# holds such files, splits(folder) names its splits, and read_split(folder, split) gives [(image
-# path relative to the folder, Camera, (near, far) or None)] without reading pixels.
+# holds such files, splits(folder) names its splits, and read_split(folder, split) gives a list of
+# Photograph without reading pixels. The first that recognises a folder reads it.
 READERS = (transforms,)
 
-Frame = tuple[str, Camera, tuple[float, float] | None]
 Item = TypeVar("Item")
 
 
@@ -69,7 +69,10 @@ def find_reader(path: str | Path) -> ModuleType:
 
 
 def load_scene(
-    path: str | Path, splits: Iterable[str] = ("train",), most: int | None = None
+    path: str | Path,
+    splits: Iterable[str] = ("train",),
+    most: int | None = None,
+    masks: MaskRule = AS_GIVEN,
 ) -> Scene:
     """Scene of the given splits from a folder, not reduced; a progress bar shows on a terminal.
 
@@ -77,13 +80,13 @@ def load_scene(
     and the key where there is one, for whatever is missing, broken or contradictory.
     """
     reader, folder = find_reader(path), Path(path)
-    frames = {split: evenly(reader.read_split(folder, split), most) for split in splits}
-    everything = [frame for listed in frames.values() for frame in listed]
+    listed = {split: evenly(reader.read_split(folder, split), most) for split in splits}
+    everything = [photograph for photographs in listed.values() for photograph in photographs]
     _check_alike(folder, everything)
-    images = iter(_read_images([folder / name for name, _, _ in everything]))
+    images = iter(_on_all_cores(lambda one: _read_image(folder, one, masks), everything))
     views = {
-        split: [View(name, camera, next(images), near_far) for name, camera, near_far in listed]
-        for split, listed in frames.items()
+        split: [View(one.name, one.camera, next(images), one.depth_range) for one in photographs]
+        for split, photographs in listed.items()
     }
     return Scene(folder.resolve().name, folder, views)
 
@@ -92,32 +95,42 @@ def _known_files() -> str:
     return " or ".join(reader.FILES for reader in READERS)
 
 
-def _check_alike(folder, frames):
-    """Raise UserError if images differ in size, or if only some frames have a depth range."""
-    first_name, first, first_range = frames[0]
-    for name, camera, near_far in frames:
-        if (camera.width, camera.height) != (first.width, first.height):
+def _check_alike(folder, photographs):
+    """Raise UserError if images differ in size, or if only some have a depth range."""
+    first = photographs[0]
+    for one in photographs:
+        size, first_size = (f"{c.width}x{c.height}" for c in (one.camera, first.camera))
+        if size != first_size:
             raise UserError(
-                f"{folder / name}: {camera.width}x{camera.height} pixels, but {folder / first_name}"
-                f" has {first.width}x{first.height}; all views must have one size"
+                f"{folder / one.name}: {size} pixels, but {folder / first.name} has {first_size};"
+                " all views must have one size"
             )
-        if (near_far is None) != (first_range is None):
+        if (one.depth_range is None) != (first.depth_range is None):
             raise UserError(
-                f"{folder}: near and far are given for only one of {first_name} and {name}; "
+                f"{folder}: near and far are given for only one of {first.name} and {one.name}; "
                 "give them for all views or for none"
             )
 
 
-def _read_images(paths: Sequence[Path]) -> list[np.ndarray]:
-    """[read_rgba(path)] in order, on all cores. Raises the UserError of the first file that cannot
-    be read.
+def _read_image(folder, photograph, masks):
+    """(H, W, 4) uint8 straight RGBA: the image with its mask, freed of distortion. Raises
+    UserError.
     """
+    image = read_rgba(folder / photograph.name)
+    image = masks.apply(image, photograph.mask and folder / photograph.mask)
+    if photograph.distortion:
+        image = undistort(image, photograph.camera, photograph.distortion)
+    return image
+
+
+def _on_all_cores(read: Callable[[Item], np.ndarray], items: Sequence[Item]) -> list[np.ndarray]:
+    """[read(item)] in order. Raises the UserError of the first that fails."""
     with ThreadPoolExecutor(os.cpu_count()) as pool:
         return list(
             tqdm(
-                pool.map(read_rgba, paths),
+                pool.map(read, items),
                 "reading images",
-                len(paths),
+                len(items),
                 unit="image",
                 leave=False,
                 disable=None,

@@ -10,7 +10,9 @@ from pp_cl.device.device import Device
 from pp_cl.errors import UserError
 from pp_cl.presets import IMAGE_SIZES
 from pp_cl.scene import demo
-from pp_cl.scene.load import Frame, Scene, find_reader, load_scene
+from pp_cl.scene.load import Scene, find_reader, load_scene
+from pp_cl.scene.masks import MaskRule
+from pp_cl.scene.photograph import Photograph
 from pp_cl.scene.views import View, fitting_downscale
 
 DEMO = "demo"  # the word that names the scene which the program makes itself
@@ -25,7 +27,7 @@ def open_scene(
     path, downscale = config.scene.path, config.scene.downscale
     if path == DEMO:
         return demo.demo_scene(dev, splits, most=most).reduced(downscale)
-    return load_scene(path, splits, most).reduced(downscale)
+    return load_scene(path, splits, most, MaskRule(config.scene.mask_from)).reduced(downscale)
 
 
 def scene_format(path: str) -> str:
@@ -40,10 +42,8 @@ def scene_splits(path: str) -> list[str]:
     return list(demo.SPLITS) if path == DEMO else find_reader(path).splits(Path(path))
 
 
-def scene_frames(path: str, split: str = "train") -> list[Frame]:
-    """[(name, Camera, (near, far) or None)] of the views of a split, without their pixels. Raises
-    UserError as load_scene does.
-    """
+def scene_frames(path: str, split: str = "train") -> list[Photograph]:
+    """The photographs of a split, without their pixels. Raises UserError as load_scene does."""
     if path == DEMO:
         return demo.demo_frames(split)
     return find_reader(path).read_split(Path(path), split)
@@ -53,7 +53,7 @@ def preset_downscale(path: str, preset: str) -> int:
     """How many times a preset reduces the images of a scene, by the size of the first. Raises
     UserError as load_scene does.
     """
-    _, camera, _ = scene_frames(path)[0]
+    camera = scene_frames(path)[0].camera
     return fitting_downscale((camera.width, camera.height), IMAGE_SIZES[preset])
 
 

@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 
-from pp_cl.config import Config, RasterConfig
+from pp_cl.config import Config
 from pp_cl.device.buffers import Table, grown, table_bytes
 from pp_cl.device.compact import compact_table
 from pp_cl.device.device import Device
@@ -18,6 +18,7 @@ from pp_cl.raster.project import Projection
 from pp_cl.render import NETWORK_MULTIPLE, Renderer
 from pp_cl.scene.camera import Camera
 from pp_cl.scene.views import View
+from pp_cl.settings import RasterConfig
 from pp_cl.training.loss import Loss
 from pp_cl.training.mask import MaskLoss
 from pp_cl.training.optimiser import Optimiser

@@ -8,11 +8,11 @@ from dataclasses import dataclass
 import numpy as np
 from pyopencl.array import Array
 
-from pp_cl.config import NetworkConfig, TrainConfig
 from pp_cl.device.buffers import Table
 from pp_cl.device.device import Device
 from pp_cl.device.rows import DeviceRows
 from pp_cl.model import Model
+from pp_cl.settings import NetworkConfig, TrainConfig
 from pp_cl.training.adam import (
     Directions,
     Ema,

@@ -3,8 +3,8 @@
 import numpy as np
 from pyopencl.array import Array
 
-from pp_cl.config import TrainConfig
 from pp_cl.device.device import Device
+from pp_cl.settings import TrainConfig
 from pp_cl.training.point_state import PointState
 
 

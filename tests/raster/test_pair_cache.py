@@ -8,11 +8,11 @@ from support.models import make_model
 from support.raster_scene import PairedPoints, make_camera, make_points
 from support.scenes import ring_cameras
 
-from pp_cl.config import RasterConfig
 from pp_cl.raster.pair_cache import ARRAYS, PairCache
 from pp_cl.raster.pairs import PairBuilder
 from pp_cl.raster.project import Footprint
 from pp_cl.render import Renderer
+from pp_cl.settings import RasterConfig
 
 pytestmark = pytest.mark.kernels
 

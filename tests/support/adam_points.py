@@ -4,10 +4,10 @@ import numpy as np
 from oracle import optim as oracle_optim
 from support.comparisons import relative_error
 
-from pp_cl.config import TrainConfig
 from pp_cl.raster.sh import SH_BLOCKS
 from pp_cl.scene.camera import Camera
 from pp_cl.scene.grid import Grid
+from pp_cl.settings import TrainConfig
 from pp_cl.training.adam import Directions, PointAdam, ShGradient
 from pp_cl.training.point_state import PointState
 

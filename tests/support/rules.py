@@ -9,7 +9,7 @@ import tokenize
 
 # What a wing (or a module at the door) may import: its own floor and those below it.
 FLOORS = [
-    ("errors", "reference", "presets"),
+    ("errors", "reference", "presets", "settings"),
     ("config", "files", "device"),
     ("scene", "raster", "layers"),
     ("network", "metrics"),

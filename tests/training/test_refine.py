@@ -5,8 +5,8 @@ import pytest
 from support.guarded import AWKWARD_SIZES
 from support.models import fetched, make_model
 
-from pp_cl.config import TrainConfig
 from pp_cl.scene.grid import Grid
+from pp_cl.settings import TrainConfig
 from pp_cl.training.point_state import PointState
 from pp_cl.training.refine import refine, split_opacity
 

@@ -30,7 +30,8 @@ def test_a_copied_camera_is_a_frame_of_a_transforms_file(tmp_path):
     Image.new("RGBA", (48, 40)).save(tmp_path / "a.png")
     frame = frame_keys(CAMERA) | {"file_path": "a.png"}
     (tmp_path / "transforms_train.json").write_text(json.dumps({"frames": [frame]}))
-    [(_, camera, _)] = read_split(tmp_path, "train")
+    [photograph] = read_split(tmp_path, "train")
+    camera = photograph.camera
     np.testing.assert_allclose(camera.pose, CAMERA.pose, atol=1e-12)
     assert (camera.fx, camera.fy, camera.cx, camera.cy) == (CAMERA.fx, 61.0, 20.5, CAMERA.cy)
 

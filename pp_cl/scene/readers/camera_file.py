@@ -9,7 +9,7 @@ import numpy as np
 
 from pp_cl.errors import UserError
 from pp_cl.scene.camera import Camera
-from pp_cl.scene.readers.frame import GL_FROM_CV, Frame, pinhole, read_json, rigid_pose
+from pp_cl.scene.readers.frame import GL_FROM_CV, Frame, distortion, pinhole, read_json, rigid_pose
 
 FORMATS = (
     "a camera_path.json (with camera_path), a transforms.json (with frames), or a cameras.json (a"
@@ -45,6 +45,7 @@ def read_cameras(file: Path, size: tuple[int, int] | None = None) -> list[Camera
 
 
 def _transforms_camera(frame, size):
+    distortion(frame)  # the model is checked; what it bends is a photograph's, not a rendering's
     return pinhole(frame, *_size(frame, ("w", "h"), size))
 
 

@@ -10,9 +10,9 @@ import numpy as np
 
 from pp_cl.errors import UserError
 from pp_cl.scene.camera import Camera
+from pp_cl.scene.distortion import Distortion
 
-# Lens distortion is not modelled, so its coefficients must be absent or 0.
-DISTORTION = ("k1", "k2", "k3", "k4", "p1", "p2")
+COEFFICIENTS = ("k1", "k2", "p1", "p2", "k3")  # of Distortion
 # values of camera_model that are pinhole cameras when those coefficients are 0
 PINHOLES = ("PERSPECTIVE", "PINHOLE", "SIMPLE_PINHOLE", "OPENCV", "SIMPLE_RADIAL", "RADIAL")
 
@@ -94,7 +94,6 @@ def pinhole(frame: Frame, width: int, height: int) -> Camera:
     """The camera of a frame in the format of NeRF-synthetic and nerfstudio whose image has this
     many pixels. Raises UserError naming the key that is missing or wrong.
     """
-    _refuse_distortion(frame)
     fx, fy = _focal_lengths(frame, width, height)
     cx, cy = frame.number("cx"), frame.number("cy")
     centre = (width / 2 if cx is None else cx, height / 2 if cy is None else cy)
@@ -102,19 +101,21 @@ def pinhole(frame: Frame, width: int, height: int) -> Camera:
     return Camera(pose @ GL_FROM_CV, fx, fy, *centre, width, height)
 
 
-def _refuse_distortion(frame):
-    for key in DISTORTION:
-        if frame.number(key):
-            raise frame.error(
-                key,
-                "lens distortion is not modelled; undistort the images and leave the"
-                " coefficient out",
-            )
+def distortion(frame: Frame) -> Distortion:
+    """The lens distortion of a frame in nerfstudio's format. Raises UserError for a model other
+    than OpenCV's.
+    """
     model = frame.get("camera_model")
     if model is not None and model not in PINHOLES:
         raise frame.error(
             "camera_model", f"{model!r} is not modelled; undistort the images to PINHOLE"
         )
+    if frame.number("k4"):
+        raise frame.error(
+            "k4", "a fourth radial coefficient is not modelled; undistort the images to PINHOLE"
+        )
+    given = {key: frame.number(key) for key in COEFFICIENTS}
+    return Distortion(**{key: value for key, value in given.items() if value is not None})
 
 
 def _focal_lengths(frame, width, height):

@@ -1,79 +1,101 @@
-"""Reader of scenes in the format of NeRF-synthetic, transforms_<split>.json, extended by
-nerfstudio's keys: intrinsics per frame, principal point, near and far.
+"""Reader of scenes in the format of NeRF-synthetic, transforms_<split>.json, and of nerfstudio,
+transforms.json, with the keys of both: intrinsics and distortion per frame, masks, near and far.
 """
 
-from pathlib import Path
+from functools import partial
+from pathlib import Path, PurePosixPath
 
 from pp_cl.errors import UserError
 from pp_cl.files.image import image_size
-from pp_cl.scene.camera import Camera
-from pp_cl.scene.readers.frame import Frame, pinhole, read_json
+from pp_cl.scene.photograph import Photograph
+from pp_cl.scene.readers.common import SPLITS, find_image, hold_out
+from pp_cl.scene.readers.frame import Frame, distortion, pinhole, read_json
 
-FILES = "transforms_train.json"
+ENDINGS = ("", ".png")  # of a file_path
+FILES = "transforms_train.json or transforms.json"
+SINGLE = "transforms.json"
+NAMED = ("train", "val", "test")  # splits that transforms.json may list as <split>_filenames
 
 
 def recognises(folder: Path) -> bool:
-    """True if the folder holds a transforms_<split>.json."""
-    return any(folder.glob("transforms_*.json"))
+    """True if the folder holds a transforms_<split>.json or a transforms.json."""
+    return (folder / SINGLE).is_file() or bool(_split_files(folder))
 
 
 def splits(folder: Path) -> list[str]:
     """The names of the splits that the folder holds."""
-    return sorted(f.stem.removeprefix("transforms_") for f in folder.glob("transforms_*.json"))
+    files = _split_files(folder)
+    if files:
+        return sorted(f.stem.removeprefix("transforms_") for f in files)
+    listed = [split for split in NAMED if f"{split}_filenames" in _read(folder / SINGLE)]
+    return sorted(listed) or SPLITS
 
 
-def read_split(folder: Path, split: str) -> list[tuple[str, Camera, tuple[float, float] | None]]:
-    """[(image path relative to the folder, Camera, (near, far))] of transforms_<split>.json.
+def read_split(folder: Path, split: str) -> list[Photograph]:
+    """The photographs of transforms_<split>.json; or those of transforms.json that its
+    <split>_filenames names, and where it has no such lists every eighth for test, the others for
+    train.
 
-    The last is None for a frame without near and far. Raises UserError naming the file and the key
-    that is missing or wrong.
+    Raises UserError naming the file and the key that is missing or wrong.
     """
-    file = folder / f"transforms_{split}.json"
-    if not file.is_file():
+    file = folder / (f"transforms_{split}.json" if _split_files(folder) else SINGLE)
+    if not file.is_file() or split not in splits(folder):
         present = ", ".join(splits(folder))
-        raise UserError(f"{file}: no such file; the splits of this scene are {present}")
+        raise UserError(f"{file}: no split {split}; the splits of this scene are {present}")
+    data = _read(file)
+    frames = [
+        _read_frame(folder, Frame(file, data, frame, index))
+        for index, frame in enumerate(data["frames"])
+    ]
+    return _of_split(file, data, frames, split) if file.name == SINGLE else frames
+
+
+def _split_files(folder):
+    return list(folder.glob("transforms_*.json"))
+
+
+def _read(file):
+    """The object of a transforms file, whose frames are a list."""
     data = read_json(file)
     if not isinstance(data, dict):
         raise UserError(f"{file}: must hold a JSON object with the key frames")
     frames = data.get("frames")
     if not isinstance(frames, list) or not frames:
         raise UserError(f"{file}: frames: must be a list of one frame or more")
-    return [
-        _read_frame(folder, Frame(file, data, frame, index)) for index, frame in enumerate(frames)
-    ]
+    return data
+
+
+def _of_split(file, data, photographs, split):
+    """Those of a transforms.json's photographs that belong to a split, in the order of their
+    names.
+    """
+    ordered = sorted(photographs, key=lambda photograph: photograph.name)
+    names = data.get(f"{split}_filenames")
+    if names is None:
+        return hold_out(ordered, split)
+    if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
+        raise UserError(f"{file}: {split}_filenames: must be a list of images' paths")
+    wanted = {PurePosixPath(name).as_posix() for name in names}
+    missing = wanted - {photograph.name for photograph in ordered}
+    if missing or not wanted:
+        what = f"{min(missing)!r} is the path of no frame" if missing else "is empty"
+        raise UserError(f"{file}: {split}_filenames: {what}; list images of the frames")
+    return [photograph for photograph in ordered if photograph.name in wanted]
 
 
 def _read_frame(folder, frame):
-    """(image path relative to the folder, Camera, (near, far) or None) of one frame."""
-    name = _image_name(folder, frame)
-    width, height = _size(folder, name, frame)
-    return name, pinhole(frame, width, height), _depth_range(frame)
-
-
-def _image_name(folder, frame):
-    """Path of the frame's image relative to the folder, which it may not leave, not even by a
-    symbolic link.
-    """
+    """The Photograph of one frame."""
     given = frame.get("file_path")
     if not isinstance(given, str) or not given:
         raise frame.error("file_path", "must be the path of an image")
-    try:
-        root = folder.resolve()
-        paths = [(root / candidate).resolve() for candidate in (given, given + ".png")]
-        if not all(path.is_relative_to(root) for path in paths):
-            raise frame.error(
-                "file_path", f"{given!r} leaves the scene's folder; move the image into it"
-            )
-        found = [path for path in paths if path.is_file()]
-    # a loop of links, a name too long, a zero byte
-    except (OSError, RuntimeError, ValueError) as error:
-        raise frame.error("file_path", f"{given[:80]!r} is not a usable path ({error})") from error
-    if not found:
-        raise frame.error(
-            "file_path",
-            f"no image at {given!r}, nor with .png added; copy it there or remove the frame",
-        )
-    return found[0].relative_to(root).as_posix()
+    name = find_image(folder, given, partial(frame.error, "file_path"), ENDINGS)
+    mask = frame.get("mask_path")
+    if mask is not None:
+        if not isinstance(mask, str) or not mask:
+            raise frame.error("mask_path", "must be the path of an image")
+        mask = find_image(folder, mask, partial(frame.error, "mask_path"))
+    camera = pinhole(frame, *_size(folder, name, frame))
+    return Photograph(name, camera, _depth_range(frame), mask, distortion(frame))
 
 
 def _size(folder, name, frame):

@@ -107,7 +107,7 @@ def changed(name, key, value):
         (changed("camera_path.json", "fov", None), "fov: is missing"),
         (changed("camera_path.json", "camera_to_world", [1] * 15), "camera_to_world"),
         (changed("transforms.json", "transform_matrix", "x"), "transform_matrix"),
-        (changed("transforms.json", "k1", 0.1), "distortion"),
+        (changed("transforms.json", "k4", 0.1), "undistort"),
     ],
 )
 def test_what_is_wrong_is_one_line(tmp_path, content, named):

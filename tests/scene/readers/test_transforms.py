@@ -188,7 +188,7 @@ BAD_FRAMES = {
     "angle over pi": ({"camera_angle_x": 40}, "camera_angle_x", "below 3.14"),
     "width": ({"w": 48}, "w", "24x18", "train_1.png"),
     "height": ({"h": 19}, "h", "24x18", "train_1.png"),
-    "distortion": ({"k1": 0.01}, "k1", "undistort"),
+    "distortion": ({"k4": 0.01}, "k4", "undistort"),
     "fisheye": ({"camera_model": "OPENCV_FISHEYE"}, "camera_model", "undistort"),
     "near only": ({"near": 1.0}, "far", "missing"),
     "far only": ({"far": 1.0}, "near", "missing"),

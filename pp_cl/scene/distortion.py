@@ -1,0 +1,61 @@
+"""Lens distortion, and photographs freed of it."""
+
+from dataclasses import astuple, dataclass
+
+import numpy as np
+from skimage.transform import warp
+
+from pp_cl.scene.camera import Camera
+
+CUBIC = 3  # order of interpolation
+
+
+@dataclass(frozen=True)
+class Distortion:
+    """Coefficients of OpenCV's model, radial (k1, k2, k3) and tangential (p1, p2)."""
+
+    k1: float = 0.0
+    k2: float = 0.0
+    p1: float = 0.0
+    p2: float = 0.0
+    k3: float = 0.0
+
+    def __bool__(self) -> bool:
+        """Whether it changes anything."""
+        return any(astuple(self))
+
+    def apply(self, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Where the lens puts the points (x / z, y / z) of the camera's axes, float64 arrays."""
+        xx, yy, xy = x * x, y * y, x * y
+        r2 = xx + yy
+        radial = 1 + r2 * (self.k1 + r2 * (self.k2 + r2 * self.k3))
+        return (
+            x * radial + 2 * self.p1 * xy + self.p2 * (r2 + 2 * xx),
+            y * radial + self.p1 * (r2 + 2 * yy) + 2 * self.p2 * xy,
+        )
+
+    def source_pixels(self, camera: Camera) -> np.ndarray:
+        """(2, H, W) float64: for each pixel of the camera without distortion, row and column of
+        the photograph, in pixel indices (a centre is whole), where its content lies.
+        """
+        x = (np.arange(camera.width) + 0.5 - camera.cx) / camera.fx
+        y = (np.arange(camera.height) + 0.5 - camera.cy) / camera.fy
+        x, y = self.apply(*np.meshgrid(x, y))
+        return np.stack([camera.fy * y + camera.cy, camera.fx * x + camera.cx]) - 0.5
+
+
+def undistort(image: np.ndarray, camera: Camera, distortion: Distortion) -> np.ndarray:
+    """(H, W, 4) uint8 straight RGBA that the camera would have taken without distortion.
+
+    Interpolated on premultiplied colour; beyond the photograph's border its edge goes on.
+    """
+    alpha = image[..., 3:].astype(np.float64) / 255
+    planes = np.concatenate([image[..., :3] / 255 * alpha, alpha], axis=2)
+    source = distortion.source_pixels(camera)
+    planes = np.stack(
+        [warp(planes[..., i], source, order=CUBIC, mode="edge", clip=True) for i in range(4)],
+        axis=2,
+    )
+    alpha = np.clip(planes[..., 3:], 0, 1)
+    colour = np.clip(planes[..., :3] / np.maximum(alpha, 1e-3), 0, 1)
+    return (np.concatenate([colour, alpha], axis=2) * 255 + 0.5).astype(np.uint8)

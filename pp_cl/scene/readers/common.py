@@ -1,0 +1,43 @@
+"""What several readers do: find an image that a file names, and split the photographs of a format
+that knows no splits.
+"""
+
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import TypeVar
+
+from pp_cl.errors import UserError
+
+HELD_OUT = 8  # one photograph of so many, the first among them, as LLFF and 3DGS do
+SPLITS = ["test", "train"]
+Item = TypeVar("Item")
+
+
+def find_image(
+    folder: Path, given: str, fail: Callable[[str], UserError], endings: Sequence[str] = ("",)
+) -> str:
+    """Path relative to the scene's folder of the image that a file there calls `given`, with the
+    first of the endings that exists.
+
+    fail(text) makes the error that names the file and the key. Raises it for a path that leaves the
+    folder, by a symbolic link or otherwise, and for one where no image is.
+    """
+    try:
+        root = folder.resolve()
+        paths = [(root / (given + ending)).resolve() for ending in endings]
+        if not all(path.is_relative_to(root) for path in paths):
+            raise fail(f"{given!r} leaves the scene's folder; move the image into it")
+        found = [path for path in paths if path.is_file()]
+    # a loop of links, a name too long, a zero byte
+    except (OSError, RuntimeError, ValueError) as error:
+        raise fail(f"{given[:80]!r} is not a usable path ({error})") from error
+    if not found:
+        tried = "".join(f", nor with {ending} added" for ending in endings if ending)
+        raise fail(f"no image at {given!r}{tried}; copy it there or remove the frame")
+    return found[0].relative_to(root).as_posix()
+
+
+def hold_out(items: Sequence[Item], split: str) -> list[Item]:
+    """The items of split train or test, of a format without splits: test is every eighth."""
+    is_test = split == "test"
+    return [item for index, item in enumerate(items) if (index % HELD_OUT == 0) == is_test]

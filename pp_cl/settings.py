@@ -1,0 +1,216 @@
+"""The settings themselves: one dataclass a section, one line a setting."""
+
+from dataclasses import dataclass, field
+from typing import Any
+
+
+def setting(
+    default: Any,
+    help: str,
+    least: float | None = None,
+    most: float | None = None,
+    *,
+    choices: tuple[str, ...] = (),
+) -> Any:
+    """A dataclass field with its line of --help and the values allowed: [least, most], for a tuple
+    of each element, or one of `choices`.
+    """
+    metadata = {"help": help, "least": least, "most": most, "choices": choices}
+    return field(default=default, metadata=metadata)
+
+
+@dataclass
+class SceneConfig:
+    """The photographs."""
+
+    path: str = setting("", "folder of the scene, or the word demo")
+    downscale: int = setting(
+        1, "reduce the images this many times; if not given, to about the preset's size", 1, 64
+    )
+    mask_from: str = setting(
+        "given",
+        "given: masks that the scene's format names, else alpha; alpha: the images' own; none: all"
+        " opaque",
+        choices=("given", "alpha", "none"),
+    )
+
+
+@dataclass
+class PointsConfig:
+    """The point cloud."""
+
+    count: int = setting(250_000, "number of grid points aimed at in the visual hull", 1, 2**27)
+    opacity: float = setting(0.1, "opacity of all points before training", 0, 1)
+    sh_degree: int = setting(
+        2, "degree of the spherical harmonics (SH): 0 (the same from all sides), 1 or 2", 0, 2
+    )
+
+
+@dataclass
+class RasterConfig:
+    """From points to a feature image."""
+
+    footprint: str = setting(
+        "soft",
+        "soft: d = 1 - rho/R; disc: the paper's hard disc; sphere: Pulsar's rules for any radius",
+        choices=("soft", "disc", "sphere"),
+    )
+    radius: float = setting(
+        0.75,
+        "soft: in point spacings; disc, sphere: in world units at a depth range of 4",
+        1e-6,
+        100,
+    )
+    blend: str = setting(
+        "alpha",
+        "alpha: compositing from front to back; softmax: the paper's Eq. (1)",
+        choices=("softmax", "alpha"),
+    )
+    gamma: tuple = setting(
+        (0.1, 0.01), "depth sharpness of the softmax at the first and the last step", 1e-5, 1
+    )
+    max_tracked: int = setting(
+        0,
+        "number of a pixel's nearest hits that receive gradients (0: all; paper: 64)",
+        0,
+        2**31 - 1,
+    )
+    early_stop: float = setting(
+        0.001,
+        "early termination: stop blending a pixel once no further hit can contribute more than"
+        " this share (0: never)",
+        0,
+        0.5,
+    )
+    tau: float = setting(
+        0.0,
+        "drop hits of a pixel whose blend weights sum to at most this (0: none)",
+        0,
+        0.5,
+    )
+    mean_gradient: bool = setting(
+        False, "divide a point's gradients by the number of its pixels, as Pulsar does"
+    )
+
+
+@dataclass
+class NetworkConfig:
+    """The U-Net that turns features into colours."""
+
+    widths: tuple = setting((32, 64, 128), "channels of its three levels", 1, 4096)
+    rate: tuple = setting(
+        (1e-3, 1e-4), "Adam's learning rate at the first and the last step", 1e-12, 100
+    )
+    tolerance: float = setting(
+        1e-5, "relative L2 error allowed for a convolution; the fastest variant is taken", 0, 1
+    )
+
+
+@dataclass
+class TrainConfig:
+    """The optimisation."""
+
+    iterations: int = setting(8_000, "training steps; every schedule ends at the last", 1, 10**8)
+    seed: int = setting(0, "seed of all random choices", 0, 2**32 - 1)
+    crop: int = setting(
+        128, "side in pixels of the square crop that a step trains on (0: whole images)", 0, 2**14
+    )
+    pixel_jitter: bool = setting(
+        True, "shift the pixel grid of the downscaled image by a random sub-pixel offset each step"
+    )
+    ssim_weight: float = setting(0.2, "loss = L1 + ssim_weight * (1 - SSIM)", 0, 10)
+    mask_weight: float = setting(
+        1.0,
+        "adds this times the mean square by which the rendered alpha exceeds the photograph's to"
+        " the loss, with raster.blend=alpha and photographs that have masks (0: off)",
+        0,
+        1e3,
+    )
+    perceptual_weight: float = setting(0.0, "adds this times LPIPS to the loss (0: off)", 0, 10)
+    sh_rate: tuple = setting(
+        (0.5, 0.25, 0.125),
+        "Adam's first learning rate of SH degrees 0, 1, 2; at rate 0 a degree stays 0",
+        0,
+        100,
+    )
+    sh_rate_decay: float = setting(0.1, "last over first learning rate of the SH", 1e-6, 1)
+    sh_delay: tuple = setting(
+        (0.0, 0.01, 0.02), "warm-up of SH degrees 0, 1, 2, as a share of the iterations", 0, 1
+    )
+    sh_eps: float = setting(
+        0.0197,
+        "Adam's eps for the SH coefficients, multiplied by 3*H*W of the training image, so that"
+        " it does not depend on the crop size",
+        1e-30,
+        1e3,
+    )
+    opacity_rate: tuple = setting(
+        (1e-1, 1e-2), "Adam's learning rate at the first and the last step", 1e-12, 100
+    )
+    opacity_rate_steps: int = setting(
+        1000,
+        "number of steps that opacity_rate is meant for: longer trainings multiply it by the square"
+        " root of this over their iterations (0: no matter how many)",
+        0,
+        10**8,
+    )
+    lazy_adam: bool = setting(
+        False, "update only points that received a gradient; false: momentum moves the others too"
+    )
+    moments_16bit: bool = setting(False, "store Adam's moments of the SH coefficients in 16 bits")
+    dropout: float = setting(0.0, "share of the points left out at random in each step", 0, 0.95)
+    sh_smoothing: float = setting(
+        0.03,
+        "per step, pull the SH towards the mean of the grid neighbours by this times the SH"
+        " learning rate (0: off)",
+        0,
+        0.25,
+    )
+    sh_smoothing_every: int = setting(4, "steps between two smoothings", 1, 10**8)
+    prune_weight: float = setting(
+        0.05,
+        "prune points that in no look have this blend weight, summed over the pixels (0: off)",
+        0,
+        1e6,
+    )
+    prune_opacity: float = setting(0.01, "prune points with an opacity below this", 0, 1)
+    prune_every: int = setting(250, "steps between two prunings", 1, 10**8)
+    prune_looks: int = setting(
+        100, "number of steps that must have seen a point, hidden or not, to prune it", 1, 10**8
+    )
+    refine_at: tuple = setting(
+        (1.0, 1.0),
+        "shares of the iterations after which images double in size and points become eight each"
+        " (1: never); training begins on images reduced as often",
+        0,
+        1,
+    )
+    final_prune_weight: float = setting(
+        0.05,
+        "after the last step, prune points that have this blend weight in no training view (0:"
+        " off)",
+        0,
+        1e9,
+    )
+    ema: bool = setting(
+        True, "average the parameters (EMA) over the last 15 % of the steps and keep the averages"
+    )
+    checkpoint_every: int = setting(1000, "steps between two checkpoints", 1, 10**8)
+    memory_gib: float = setting(
+        0.0,
+        "device memory that training may use, in GiB; what it does not need caches the hits of"
+        " repeating views (0: no cache)",
+        0,
+        2**20,
+    )
+    log_every: int = setting(50, "steps between two rows of log.jsonl", 1, 10**8)
+    previews: int = setting(
+        4, "preview images written in the course of the run; the first comes early besides", 0, 1000
+    )
+    eval_every: int = setting(
+        0,
+        "steps between two measurements of a few views of the split val, else test: test_psnr in"
+        " log.jsonl (0: none)",
+        0,
+        10**8,
+    )
