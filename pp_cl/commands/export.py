@@ -8,9 +8,9 @@ from pp_cl.errors import UserError
 
 HELP = "write a run in a format that other programs open"
 EPILOG = """formats:
-  ply    all points with colour, opacity and everything learned (pp-cl[export])
-  glb    the coloured points (pp-cl[export])
-  mesh   the surface with coloured vertices, .ply or .glb by --out (pp-cl[export])
+  ply    all points with colour, opacity and everything learned
+  glb    the coloured points
+  mesh   the surface with coloured vertices, .ply or .glb by --out
   html   one page that a browser draws without network or installation
   scene  renderings of the train and test views as a NeRF-synthetic folder
 docs/export.md says more."""

@@ -9,7 +9,6 @@ from pathlib import Path
 from pp_cl.export.glb import write_point_glb
 from pp_cl.export.mesh import coloured_mesh, write_mesh
 from pp_cl.export.out import check_file, check_parent
-from pp_cl.export.packages import library
 from pp_cl.export.page import page_text
 from pp_cl.export.ply import write_ply
 from pp_cl.export.points import coloured_points
@@ -22,13 +21,12 @@ from pp_cl.trained import Run
 @dataclass(frozen=True)
 class Format:
     """write(run, path, min_weight) writes it and says what it is. name: below RUN/export, where no
-    path is given. suffixes: of the file; none of a folder. needs: libraries of the extra `export`.
+    path is given. suffixes: of the file; none of a folder.
     """
 
     write: Callable[[Run, Path, float], str]
     name: str
     suffixes: tuple[str, ...] = ()
-    needs: tuple[str, ...] = ()
 
 
 def export(run: Run, name: str, path: Path, min_weight: float = 0.0) -> str:
@@ -43,11 +41,9 @@ def export(run: Run, name: str, path: Path, min_weight: float = 0.0) -> str:
 def check_target(name: str, folder: Path, out: Path | None) -> Path:
     """Where the format FORMATS[name] of the run in `folder` is written. out: as --out says.
 
-    Raises UserError unless it can be written there, and where a library is missing.
+    Raises UserError unless it can be written there.
     """
     chosen = FORMATS[name]
-    for module in chosen.needs:
-        library(module)
     path = folder / "export" / chosen.name if out is None else out
     check_file(path, chosen.suffixes) if chosen.suffixes else check_new_folder(path)
     if out is not None:
@@ -96,9 +92,9 @@ def _in_folder(path):
 
 
 FORMATS = {
-    "ply": Format(_ply, "cloud.ply", (".ply",), ("plyfile",)),
-    "glb": Format(_glb, "cloud.glb", (".glb",), ("trimesh",)),
-    "mesh": Format(_mesh, "mesh.ply", (".ply", ".glb"), ("trimesh",)),
+    "ply": Format(_ply, "cloud.ply", (".ply",)),
+    "glb": Format(_glb, "cloud.glb", (".glb",)),
+    "mesh": Format(_mesh, "mesh.ply", (".ply", ".glb")),
     "html": Format(_html, "view.html", (".html",)),
     "scene": Format(_scene, "scene"),
 }

@@ -3,8 +3,8 @@
 from pathlib import Path
 
 import numpy as np
+import trimesh
 
-from pp_cl.export.packages import library
 from pp_cl.export.points import ColouredPoints
 from pp_cl.files.atomic import atomic_file
 from pp_cl.files.image import to_8bit
@@ -12,10 +12,8 @@ from pp_cl.files.picture import srgb_to_linear
 
 
 def write_point_glb(path: Path | str, points: ColouredPoints) -> None:
-    """Write a GLB file of coloured points. Raises UserError as atomic_file does, and where trimesh
-    is missing.
-    """
-    cloud = library("trimesh").PointCloud(points.positions, gltf_colours(points.colours))
+    """Write a GLB file of coloured points. Raises UserError as atomic_file does."""
+    cloud = trimesh.PointCloud(points.positions, gltf_colours(points.colours))
     with atomic_file(path) as file:
         file.write(cloud.export(file_type="glb"))
 

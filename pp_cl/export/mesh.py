@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+import trimesh
 from scipy.spatial import cKDTree
 from skimage.measure import marching_cubes
 from tqdm import tqdm
@@ -13,7 +14,6 @@ from tqdm import tqdm
 from pp_cl.errors import UserError
 from pp_cl.export.fusion import box_around, fuse
 from pp_cl.export.glb import gltf_colours
-from pp_cl.export.packages import library
 from pp_cl.export.points import ColouredPoints, coloured_points
 from pp_cl.files.atomic import atomic_file
 from pp_cl.trained import Run
@@ -65,13 +65,9 @@ def _colours(vertices, points: ColouredPoints, edge):
 
 
 def write_mesh(path: Path | str, mesh: Mesh) -> None:
-    """Write a PLY or GLB file, by the suffix. Raises UserError as atomic_file does, and where
-    trimesh is missing.
-    """
+    """Write a PLY or GLB file, by the suffix. Raises UserError as atomic_file does."""
     kind = Path(path).suffix.lower().removeprefix(".")
     colours = gltf_colours(mesh.colours) if kind == "glb" else mesh.colours
-    made = library("trimesh").Trimesh(
-        mesh.vertices, mesh.faces, vertex_colors=colours, process=False
-    )
+    made = trimesh.Trimesh(mesh.vertices, mesh.faces, vertex_colors=colours, process=False)
     with atomic_file(path) as file:
         file.write(made.export(file_type=kind))

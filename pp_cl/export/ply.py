@@ -3,8 +3,8 @@
 from pathlib import Path
 
 import numpy as np
+import plyfile
 
-from pp_cl.export.packages import library
 from pp_cl.export.points import ColouredPoints
 from pp_cl.files.atomic import atomic_file
 from pp_cl.raster.point_cloud import PointCloud
@@ -23,9 +23,8 @@ COORDINATES, CHANNELS = ("x", "y", "z"), ("red", "green", "blue")
 
 def write_ply(path: Path | str, points: ColouredPoints, cloud: PointCloud) -> None:
     """Write a binary little-endian PLY file of points and of what `cloud` learned of them. Raises
-    UserError as atomic_file does, and where plyfile is missing.
+    UserError as atomic_file does.
     """
-    plyfile = library("plyfile")
     columns = _columns(points) | _harmonics(points, cloud)
     dtype = [(name, column.dtype.newbyteorder("<")) for name, column in columns.items()]
     table = np.empty(len(points.rows), dtype)

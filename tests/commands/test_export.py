@@ -3,7 +3,6 @@
 import json
 import os
 import shutil
-import sys
 
 import pytest
 from support.runs import train_and_interrupt
@@ -107,14 +106,6 @@ def test_such_a_folder_is_found_before_the_work(tmp_path, monkeypatch):
     monkeypatch.setattr(os, "access", lambda path, mode: False)
     with pytest.raises(command.UserError, match="may not be written"):
         check_parent(tmp_path / "a.ply")
-
-
-@pytest.mark.parametrize("name, library", [("ply", "plyfile"), ("glb", "trimesh")])
-def test_a_missing_library_is_one_line(name, library, copied, capsys, monkeypatch):
-    monkeypatch.setitem(sys.modules, library, None)
-    error = failure(capsys, copied, "--format", name)
-    assert library in error and "pip install pp-cl[export]" in error
-    assert not (copied / "export").exists()
 
 
 def test_a_run_of_softmax_has_no_page(copied, capsys):
