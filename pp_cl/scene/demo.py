@@ -3,8 +3,6 @@ must be downloaded.
 """
 
 import math
-import os
-import shutil
 from collections.abc import Iterable
 from pathlib import Path
 
@@ -12,7 +10,7 @@ import numpy as np
 
 from pp_cl.device.device import Device
 from pp_cl.errors import UserError
-from pp_cl.files.atomic import write_json
+from pp_cl.files.atomic import atomic_folder, write_json
 from pp_cl.files.image import write_png
 from pp_cl.scene.camera import Camera
 from pp_cl.scene.grid import Grid
@@ -111,29 +109,13 @@ def write_scene(scene: Scene, folder: str | Path) -> None:
     them. The folder appears when it is complete. Raises UserError if it exists and is not empty, or
     cannot be written.
     """
-    folder = Path(folder).resolve()
-    check_new_folder(folder)
-    unfinished = folder.with_name(f".{folder.name}.{os.getpid()}.tmp")
-    try:
+    with atomic_folder(Path(folder)) as unfinished:
         for split, views in scene.splits.items():
             for view in views:
                 path = (unfinished / view.name).with_suffix(".png")
                 path.parent.mkdir(parents=True, exist_ok=True)
                 write_png(path, view.image)
             write_json(unfinished / f"transforms_{split}.json", _transforms(views))
-        os.replace(unfinished, folder)
-    except OSError as error:
-        raise UserError(
-            f"{folder}: cannot be written ({error.strerror}); check permissions and free space"
-        ) from error
-    finally:
-        shutil.rmtree(unfinished, ignore_errors=True)
-
-
-def check_new_folder(folder: Path) -> None:
-    """Raise UserError where write_scene would write over something."""
-    if folder.is_file() or (folder.is_dir() and any(folder.iterdir())):
-        raise UserError(f"{folder}: exists already; choose a new or empty folder")
 
 
 def _transforms(views):
