@@ -21,6 +21,7 @@ COMMANDS = (
     "view",
     "export",
     "compare",
+    "shape",
     "bench",
     "tune",
 )  # modules of pp_cl.commands

@@ -15,7 +15,7 @@ FLOORS = [
     ("network", "metrics"),
     ("training", "model", "render"),
     ("train", "trained"),
-    ("run", "evaluate", "film", "export", "view", "info"),
+    ("run", "evaluate", "film", "export", "view", "info", "shape"),
     ("bench",),
     ("commands",),
     ("cli", "__init__", "__main__"),

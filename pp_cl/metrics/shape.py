@@ -1,0 +1,168 @@
+"""How well points on a grid fill the surface of a mesh (PlenopticPoints supplemental, Table 4)."""
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import trimesh
+
+from pp_cl.device.device import Device
+from pp_cl.errors import UserError
+from pp_cl.scene.grid import Grid
+
+SAMPLES = 1024**3  # of the supplemental
+RUN = 256  # samples of a work-item
+LAUNCH = 2**24  # samples of a launch
+WHOLE_AREA = 1 << 60
+MOST_VERTICES = 2**33  # of the grid around mesh and points: a bitset of 1 GiB
+
+
+@dataclass(frozen=True)
+class Mesh:
+    """vertices: (V, 3) float64, world coordinates. faces: (F, 3) integers."""
+
+    vertices: np.ndarray
+    faces: np.ndarray
+
+
+def read_mesh(path: Path | str) -> Mesh:
+    """The triangles of a file that trimesh reads (PLY, OBJ, STL, OFF, GLB ...), those of several
+    objects together. Raises UserError naming the file.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise UserError(f"{path}: no such file; give a triangle mesh")
+    try:
+        mesh = trimesh.load(path, force="mesh", process=False)
+        made = Mesh(np.array(mesh.vertices, np.float64), np.array(mesh.faces, np.int64))
+    except MemoryError:
+        raise
+    except Exception as error:  # loaders meet broken files with whatever comes up
+        reason = " ".join(str(error).split())[:120] or type(error).__name__
+        raise UserError(f"{path}: cannot be read as a mesh ({reason})") from error
+    if made.faces.size == 0 or made.vertices.ndim != 2:
+        raise UserError(f"{path}: holds no triangles; export it as a triangle mesh")
+    if made.faces.min() < 0 or made.faces.max() >= len(made.vertices):
+        raise UserError(f"{path}: a face names a vertex that is not there; export it anew")
+    if not np.isfinite(made.vertices).all():
+        raise UserError(f"{path}: a vertex is NaN or infinite; export it anew")
+    return made
+
+
+@dataclass(frozen=True)
+class Surface:
+    """The vertices of a grid that are nearest to some point of a mesh.
+
+    grid: around the mesh and the grid asked for, of the same edge and in step with it. bits:
+    (ny nz, words) uint32, the set: bit b of word w in a row is vertex 32 w + b. count: of its
+    vertices.
+    """
+
+    grid: Grid
+    bits: np.ndarray
+    count: int
+
+    def holds(self, grid: Grid, ids: np.ndarray) -> np.ndarray:
+        """(N,) bool: which vertices of the grid asked for, by their ids (N,), are among them."""
+        nx, ny, _ = grid.dims
+        ids = np.asarray(ids, np.int64)
+        steps = np.rint(np.subtract(grid.origin, self.grid.origin) / grid.edge).astype(np.int64)
+        i, j, k = ids % nx + steps[0], ids // nx % ny + steps[1], ids // (nx * ny) + steps[2]
+        words = self.bits[k * self.grid.dims[1] + j, i // 32]
+        return (words >> (i % 32).astype(np.uint32) & 1).astype(bool)
+
+
+@dataclass(frozen=True)
+class Overlap:
+    """points: how many. iou: of them and the surface's vertices, intersection over union. recall:
+    share of the surface's that are among the points; precision: share of the points that are on it.
+    """
+
+    points: int
+    iou: float
+    recall: float
+    precision: float
+
+
+def overlap(surface: Surface, grid: Grid, ids: np.ndarray) -> Overlap:
+    """Of the points with these ids (N,), N > 0, on the grid that the surface was sampled for."""
+    shared, points = int(surface.holds(grid, ids).sum()), len(ids)
+    return Overlap(
+        points, shared / (surface.count + points - shared), shared / surface.count, shared / points
+    )
+
+
+def sample_surface(
+    dev: Device,
+    mesh: Mesh,
+    grid: Grid,
+    samples: int = SAMPLES,
+    *,
+    advance: Callable[[int], object] = lambda samples: None,
+) -> Surface:
+    """The Surface of a mesh for a grid, by samples spread evenly over the mesh's area.
+
+    advance(samples) is called with the number of new samples from time to time. Raises UserError
+    for a mesh without area or too large for the grid, ValueError for other than 1 to 2^30 samples.
+    """
+    if not 1 <= samples <= SAMPLES:
+        raise ValueError(f"{samples} samples; they must be 1 to {SAMPLES}")
+    around = _grid_around(mesh, grid)
+    area_end, corners = _triangles(mesh, around)
+    nx, ny, nz = around.dims
+    rows, words = ny * nz, -(-nx // 32)
+    bits = dev.zeros((rows, words), np.uint32)
+    program = dev.program("metrics/shape", RUN=RUN)
+    buffers = {"area_end": dev.upload(area_end), "corners": dev.upload(corners)}
+    for first in range(0, samples, LAUNCH):
+        count = min(LAUNCH, samples - first)
+        program.launch(
+            "sample_surface",
+            -(-count // RUN),
+            samples=samples,
+            first=first,
+            count=count,
+            triangles=len(area_end),
+            nx=nx,
+            ny=ny,
+            nz=nz,
+            words=words,
+            bits=bits,
+            **buffers,
+        )
+        dev.finish()
+        advance(count)
+    found = bits.get()
+    return Surface(around, found, int(np.unpackbits(found.view(np.uint8)).sum(dtype=np.int64)))
+
+
+def _grid_around(mesh, grid):
+    """The grid in step with another that has a vertex nearest to every point of the mesh, and all
+    of the other's. Raises UserError.
+    """
+    origin = np.asarray(grid.origin)
+    low = np.floor((mesh.vertices.min(0) - origin) / grid.edge)
+    high = np.ceil((mesh.vertices.max(0) - origin) / grid.edge)
+    low, high = np.minimum(low, 0), np.maximum(high, np.asarray(grid.dims) - 1)
+    dims = tuple(int(n) for n in high - low + 1)
+    if math.prod(dims) > MOST_VERTICES:
+        raise UserError(
+            f"the mesh reaches over {dims[0]}x{dims[1]}x{dims[2]} vertices of the grid, more than"
+            f" {MOST_VERTICES}: is it in the world of the scene?"
+        )
+    return Grid(tuple(float(x) for x in origin + low * grid.edge), grid.edge, dims)
+
+
+def _triangles(mesh, grid):
+    """(area_end (F,) uint64, corners (F, 3, 4) float32) of the triangles that have an area."""
+    corners = (mesh.vertices[mesh.faces] - np.asarray(grid.origin)) / grid.edge
+    sides = corners[:, 1:] - corners[:, :1]
+    areas = np.linalg.norm(np.cross(sides[:, 0], sides[:, 1]), axis=1)
+    kept = areas > 0
+    if not kept.any():
+        raise UserError("the mesh has no triangle with an area")
+    share = np.cumsum(areas[kept]) / areas[kept].sum()
+    area_end = np.minimum(share * WHOLE_AREA, WHOLE_AREA).astype(np.uint64)
+    return area_end, np.pad(corners[kept], ((0, 0), (0, 0), (0, 1))).astype(np.float32)

@@ -1,0 +1,95 @@
+"""How well a run's points fill the surface of a mesh, before and after training: a row of Table 4
+of the PlenopticPoints supplemental.
+"""
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import asdict
+from typing import Any
+
+import numpy as np
+from tqdm import tqdm
+
+from pp_cl.config import Config, configure, load_config
+from pp_cl.device.device import Device
+from pp_cl.errors import UserError
+from pp_cl.files.checkpoint import checkpoint_array
+from pp_cl.files.run_folder import RunFolder
+from pp_cl.metrics.shape import Mesh, overlap, sample_surface
+from pp_cl.scene.demo import demo_mesh
+from pp_cl.scene.grid import Grid, smallest_edge
+from pp_cl.scene.hull import CELL_CAP, build_grid
+from pp_cl.scene.open import DEMO, open_scene
+
+DEMO_RESOLUTION = 512  # vertices of the demo's mesh along its longest side
+
+
+def mesh_shape(dev: Device, mesh: Mesh, edge: float | None, samples: int) -> dict[str, Any]:
+    """{"grid": {"dims", "edge"}, "surface": vertices nearest to the mesh} for a grid of this edge
+    around the mesh; None: the finest that points may have. Raises UserError as sample_surface does.
+    """
+    box = np.stack([mesh.vertices.min(0), mesh.vertices.max(0)])
+    chosen = edge or smallest_edge(box, CELL_CAP)
+    with _progress(samples) as advance:
+        surface = sample_surface(dev, mesh, Grid.centred_in(box, chosen), samples, advance=advance)
+    return {"grid": _grid_facts(surface.grid), "samples": samples, "surface": surface.count}
+
+
+def run_shape(
+    dev: Device, folder: RunFolder, mesh: Mesh | None, samples: int, *, scene: str | None = None
+) -> dict[str, Any]:
+    """{"grid", "surface", "before": Overlap, "after": Overlap} of a run: the hull's points before
+    training, on the run's last grid, and those that are left.
+
+    mesh: in the world of the scene; None: the demo's own. scene: where the run's scene is now, if
+    it has moved. Raises UserError for a run without checkpoint, a scene or a mesh that is missing.
+    """
+    config = load_config(folder.config)
+    configure(config, scene or config.scene.path)
+    if mesh is None:
+        if config.scene.path != DEMO:
+            raise UserError(f"{folder}: which mesh? give it with --mesh FILE, in the scene's world")
+        mesh = Mesh(*demo_mesh(dev, DEMO_RESOLUTION))
+    header, _ = folder.shapes()
+    found = header["grid"]
+    grid = Grid(tuple(found["origin"]), found["edge"], tuple(found["dims"]))
+    before = _points_before(dev, config, grid)
+    after = checkpoint_array(folder.checkpoint, "points.ids")
+    with _progress(samples) as advance:
+        surface = sample_surface(dev, mesh, grid, samples, advance=advance)
+    return {
+        "grid": _grid_facts(grid),
+        "samples": samples,
+        "surface": surface.count,
+        "before": asdict(overlap(surface, grid, before)),
+        "after": asdict(overlap(surface, grid, after)),
+    }
+
+
+def _points_before(dev, config: Config, grid):
+    """Ids on a run's last grid of the points that it began with; of a refined run, of what they
+    would be refined to without pruning.
+    """
+    views = open_scene(dev, config, ("train",)).splits["train"]
+    hull = build_grid(dev, views, config.points.count)
+    first, ids = hull.grid, hull.ids
+    while first.edge > 1.5 * grid.edge:
+        ids, _ = first.children(ids)
+        first = first.refined()
+    if first.dims != grid.dims or not np.allclose(first.origin, grid.origin, atol=1e-3 * grid.edge):
+        raise UserError(
+            f"{config.scene.path}: its hull is not the one that the run began with; say where the"
+            " scene is with --scene"
+        )
+    return ids
+
+
+def _grid_facts(grid):
+    return {"dims": list(grid.dims), "edge": grid.edge}
+
+
+@contextmanager
+def _progress(samples: int) -> Iterator[Callable[[int], object]]:
+    """What advances a progress bar, which shows on a terminal."""
+    with tqdm(total=samples, desc="sampling", unit_scale=True, leave=False, disable=None) as bar:
+        yield bar.update

@@ -1,0 +1,189 @@
+"""The vertices nearest to a mesh: against exact counts, and sample by sample against float64."""
+
+import numpy as np
+import pytest
+import trimesh
+from support.guarded import AWKWARD_SIZES
+
+from pp_cl.errors import UserError
+from pp_cl.metrics.shape import (
+    RUN,
+    Mesh,
+    Surface,
+    overlap,
+    read_mesh,
+    sample_surface,
+)
+from pp_cl.scene.grid import Grid
+
+SQUARE = Mesh(
+    np.array([[0.0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]]), np.array([[0, 1, 2], [0, 2, 3]])
+)
+R3 = (0xD1B54A33, 0xABC98389, 0x8CB92BA7)  # of the roots of x^4 = x + 1, in units of 2^-32
+
+
+def members(surface):
+    """(nz, ny, nx) bool of a Surface."""
+    nx, ny, nz = surface.grid.dims
+    bits = np.unpackbits(surface.bits.view(np.uint8), axis=1, bitorder="little")
+    return bits[:, :nx].reshape(nz, ny, nx).astype(bool)
+
+
+def oracle(mesh, grid, samples):
+    """(samples, 3) float64 places of the samples in units of the edge from vertex 0."""
+    corners = (mesh.vertices[mesh.faces] - np.asarray(grid.origin)) / grid.edge
+    sides = corners[:, 1:] - corners[:, :1]
+    ends = np.cumsum(np.linalg.norm(np.cross(sides[:, 0], sides[:, 1]), axis=1))
+    s = np.arange(samples, dtype=np.uint64)
+    first, second, third = (((s * np.uint64(m)) & np.uint64(2**32 - 1)) / 2.0**32 for m in R3)
+    chosen = corners[np.searchsorted(ends, ends[-1] * (s + first) / samples, side="right")]
+    out, across = np.sqrt(second), third
+    weights = np.stack([1 - out, out * (1 - across), out * across], 1)
+    return (weights[:, :, None] * chosen).sum(1)
+
+
+@pytest.mark.parametrize("samples", [*AWKWARD_SIZES, RUN, RUN + 1, 3000])
+def test_every_sample_marks_its_nearest_vertex(dev, rng, samples):
+    mesh = Mesh(rng.normal(size=(30, 3)), rng.integers(0, 30, (17, 3)))
+    mesh = Mesh(mesh.vertices, mesh.faces[[len(set(f)) == 3 for f in mesh.faces]])
+    surface = sample_surface(dev, mesh, Grid((0.05, -0.1, 0.2), 0.11, (3, 40, 2)), samples)
+    places = oracle(mesh, surface.grid, samples)
+    expected = np.zeros_like(members(surface))
+    i, j, k = np.floor(places + 0.5).astype(int).T
+    expected[k, j, i] = True
+    differing = np.argwhere(expected != members(surface))[:, ::-1]
+    # float32 may take a sample on the border of two vertices, or of two triangles, for the other's
+    assert len(differing) <= 0.01 * samples
+    for vertex in differing:
+        assert (np.abs(places - vertex).max(1) < 0.501).any()
+    assert surface.count == members(surface).sum()
+
+
+def test_a_sphere_has_the_vertices_whose_cubes_it_cuts(dev):
+    """The cube around a vertex is cut where its nearest corner is inside and its farthest
+    outside.
+    """
+    edge, n = 0.1, 23
+    ball = trimesh.creation.icosphere(subdivisions=6)
+    grid = Grid((-1.097, -1.1, -1.103), edge, (n, n, n))
+    axes = [origin + edge * np.arange(n) for origin in grid.origin]
+    near = [np.maximum(np.abs(axis) - edge / 2, 0) ** 2 for axis in axes]
+    far = [(np.abs(axis) + edge / 2) ** 2 for axis in axes]
+    near, far = (d[2][:, None, None] + d[1][None, :, None] + d[0] for d in (near, far))
+    exact = ((near <= 1) & (far >= 1)).ravel()
+    surface = sample_surface(dev, Mesh(ball.vertices, ball.faces), grid, 2**22)
+    assert surface.grid == grid
+    assert abs(surface.count / exact.sum() - 1) < 5e-3
+    found = overlap(surface, grid, np.flatnonzero(exact))
+    assert found.recall > 0.998 and found.precision > 0.995
+
+
+@pytest.mark.parametrize("size", AWKWARD_SIZES)
+def test_a_flat_square_has_one_layer(dev, size):
+    """Vertices at multiples of the edge on it: all of them, and none beside it."""
+    edge = 1 / size
+    surface = sample_surface(dev, SQUARE, Grid((0.0, 0, -edge), edge, (1, 1, 3)), 400_000)
+    assert surface.grid.dims == (size + 1, size + 1, 3)
+    found = members(surface)
+    assert not found[0].any() and not found[2].any()
+    assert found[1].mean() > 0.95
+
+
+def test_a_box_has_every_vertex_of_its_sides(dev):
+    """Sides at 0.39, 0.29 and 0.19 are nearest to the layers at 0.35, 0.25 and 0.15."""
+    box = trimesh.creation.box((0.78, 0.58, 0.38))
+    grid = Grid((-0.45, -0.35, -0.25), 0.1, (10, 8, 6))
+    surface = sample_surface(dev, Mesh(box.vertices, box.faces), grid, 200_000)
+    expected = np.zeros((6, 8, 10), bool)
+    expected[1:5, 1:7, 1:9] = True
+    expected[2:4, 2:6, 2:8] = False
+    np.testing.assert_array_equal(members(surface), expected)
+    assert surface.count == 8 * 6 * 4 - 6 * 4 * 2
+
+
+def test_launches_add_up(dev, monkeypatch):
+    told = []
+    one = sample_surface(dev, SQUARE, Grid((0.0, 0, 0), 0.03, (2, 2, 2)), 5000)
+    monkeypatch.setattr("pp_cl.metrics.shape.LAUNCH", 3 * RUN)
+    many = sample_surface(dev, SQUARE, one.grid, 5000, advance=told.append)
+    np.testing.assert_array_equal(one.bits, many.bits)
+    assert sum(told) == 5000 and len(told) == 7
+
+
+def test_the_grid_grows_around_the_mesh_in_step(dev):
+    grid = Grid((0.3, 0.3, 0.3), 0.25, (2, 2, 2))
+    surface = sample_surface(dev, SQUARE, grid, 100)
+    np.testing.assert_allclose(surface.grid.origin, (-0.2, -0.2, -0.2), atol=1e-12)
+    assert surface.grid.dims == (6, 6, 4) and surface.grid.edge == grid.edge
+
+
+def test_overlap_by_hand():
+    """Vertices 1, 3, 4 of a 3x2x1 grid; points 0, 1, 4, 5."""
+    grid = Grid((0.0, 0, 0), 1.0, (3, 2, 1))
+    surface = Surface(grid, np.array([[0b010], [0b011]], np.uint32), 3)
+    found = overlap(surface, grid, np.array([0, 1, 4, 5], np.uint32))
+    assert (found.points, found.iou, found.recall, found.precision) == (4, 2 / 5, 2 / 3, 2 / 4)
+    larger = Surface(
+        Grid((-1.0, -1, 0), 1.0, (4, 3, 1)), np.array([[0], [0b100], [0b110]], np.uint32), 3
+    )
+    assert overlap(larger, grid, np.array([0, 1, 4, 5], np.uint32)).recall == 2 / 3
+
+
+# --------------------------------------------------------------------------------------------------
+
+
+def test_what_cannot_be_sampled(dev):
+    grid = Grid((0.0, 0, 0), 1.0, (2, 2, 2))
+    flat = Mesh(SQUARE.vertices, np.array([[0, 1, 1]]))
+    with pytest.raises(UserError, match="no triangle with an area"):
+        sample_surface(dev, flat, grid, 10)
+    with pytest.raises(UserError, match="in the world of the scene"):
+        sample_surface(dev, Mesh(SQUARE.vertices * 1e6, SQUARE.faces), grid, 10)
+    for samples in (0, 2**30 + 1):
+        with pytest.raises(ValueError, match="samples"):
+            sample_surface(dev, SQUARE, grid, samples)
+
+
+@pytest.mark.parametrize("suffix", ["ply", "obj", "stl", "off", "glb"])
+def test_meshes_are_read(tmp_path, suffix):
+    box = trimesh.creation.box((1, 2, 3))
+    path = tmp_path / f"box.{suffix}"
+    box.export(path)
+    mesh = read_mesh(path)
+    assert len(mesh.faces) == 12
+    np.testing.assert_allclose(np.ptp(mesh.vertices, axis=0), (1, 2, 3))
+
+
+def test_real_meshes_are_read(data):
+    mesh = read_mesh(data / "meshes" / "cow" / "cow.obj")
+    assert mesh.faces.shape[1] == 3 and np.isfinite(mesh.vertices).all()
+
+
+NAN_VERTEX = "OFF\n3 1 0\n0 0 nan\n1 0 0\n0 1 0\n3 0 1 2\n"
+BAD_FILES = {
+    "empty": ("mesh.ply", b"", "cannot be read|no triangles"),
+    "no mesh": ("mesh.obj", b"hello", "no triangles|cannot be read"),
+    "points only": ("mesh.off", b"OFF\n1 0 0\n0 0 0\n", "no triangles|cannot be read"),
+    "NaN": ("mesh.off", NAN_VERTEX.encode(), "NaN"),
+    "a face beyond": (
+        "mesh.off",
+        b"OFF\n3 1 0\n0 0 0\n1 0 0\n0 1 0\n3 0 1 7\n",
+        "not there|cannot be read",
+    ),
+    "unknown kind": ("mesh.xyz1", b"1 2 3", "cannot be read"),
+    "truncated": ("mesh.stl", b"\0" * 90, "cannot be read|no triangles"),
+}
+
+
+@pytest.mark.parametrize("case", BAD_FILES)
+def test_a_bad_mesh_is_one_line(tmp_path, case):
+    name, content, words = BAD_FILES[case]
+    (tmp_path / name).write_bytes(content)
+    with pytest.raises(UserError, match=words) as caught:
+        read_mesh(tmp_path / name)
+    assert str(tmp_path / name) in str(caught.value) and "\n" not in str(caught.value)
+
+
+def test_a_missing_mesh(tmp_path):
+    with pytest.raises(UserError, match="no such file"):
+        read_mesh(tmp_path / "mesh.ply")

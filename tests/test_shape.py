@@ -1,0 +1,131 @@
+"""A run's points against the surface of its object: a row of Table 4."""
+
+import json
+import shutil
+from dataclasses import asdict
+
+import numpy as np
+import pytest
+import trimesh
+from support.runs import arguments
+from support.scenes import write_ball_scene
+
+from pp_cl.cli import main
+from pp_cl.errors import UserError
+from pp_cl.files.run_folder import RunFolder
+from pp_cl.metrics.shape import Mesh, overlap, sample_surface
+from pp_cl.scene.hull import build_grid
+from pp_cl.scene.load import load_scene
+from pp_cl.shape import mesh_shape, run_shape
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory):
+    return write_ball_scene(tmp_path_factory.mktemp("shape") / "ball", views=6, size=40)
+
+
+@pytest.fixture(scope="module")
+def mesh():
+    ball = trimesh.creation.icosphere(subdivisions=4, radius=0.8)
+    return Mesh(ball.vertices, ball.faces)
+
+
+@pytest.fixture(scope="module")
+def trained(scene, tmp_path_factory):
+    return train(scene, tmp_path_factory.mktemp("shape") / "run", points__count=1000)
+
+
+def train(scene, out, **changes):
+    """A run of 20 steps."""
+    assert main(arguments(scene, out, 1, train__iterations=20, **changes)) == 0
+    return out
+
+
+def test_a_run_before_and_after(dev, scene, mesh, trained):
+    """Before training the points fill the hull, which holds the ball; training drops some."""
+    facts = run_shape(dev, RunFolder(trained), mesh, 40_000)
+    hull = build_grid(dev, load_scene(scene).splits["train"], 1000)
+    surface = sample_surface(dev, mesh, hull.grid, 40_000)
+    before, after = facts["before"], facts["after"]
+    assert facts["surface"] == surface.count
+    assert before == asdict(overlap(surface, hull.grid, hull.ids))
+    assert before["recall"] > 0.8  # not those just outside of the ball
+    assert 0 < after["points"] < before["points"]
+    with np.load(trained / "checkpoint.npz") as stored:
+        assert after == asdict(overlap(surface, hull.grid, stored["points.ids"]))
+
+
+def test_a_refined_run_is_compared_on_its_last_grid(dev, scene, mesh, tmp_path):
+    changes = {"train__refine_at": "0.3,1", "points__count": 300}
+    facts = run_shape(dev, RunFolder(train(scene, tmp_path / "run", **changes)), mesh, 40_000)
+    hull = build_grid(dev, load_scene(scene).splits["train"], 300)
+    assert facts["grid"] == {"dims": [2 * n for n in hull.grid.dims], "edge": hull.grid.edge / 2}
+    assert facts["before"]["points"] == 8 * len(hull.ids) > facts["after"]["points"]
+    assert facts["before"]["recall"] > 0.8
+
+
+def test_a_mesh_alone(dev, mesh):
+    coarse, fine = (mesh_shape(dev, mesh, edge, 100_000)["surface"] for edge in (0.2, 0.1))
+    assert 3 < fine / coarse < 5
+    assert mesh_shape(dev, mesh, 0.1, 100_000)["grid"]["edge"] == 0.1
+
+
+def test_a_run_without_a_mesh_is_asked_for_one(dev, trained):
+    with pytest.raises(UserError, match="--mesh"):
+        run_shape(dev, RunFolder(trained), None, 100)
+
+
+def test_another_scene_is_noticed(dev, mesh, trained, tmp_path):
+    other = write_ball_scene(tmp_path / "other", views=5, size=40)
+    with pytest.raises(UserError, match="not the one that the run began with"):
+        run_shape(dev, RunFolder(trained), mesh, 100, scene=str(other))
+
+
+# --------------------------------------------------------------------------------------------------
+
+
+def test_the_command_prints_and_writes_the_row(mesh, trained, tmp_path, capsys):
+    file = tmp_path / "ball.ply"
+    trimesh.Trimesh(mesh.vertices, mesh.faces).export(file)
+    words = ["shape", str(trained), "--mesh", str(file), "--samples", "20000"]
+    assert main([*words, "--json", str(tmp_path / "row.json")]) == 0
+    facts = json.loads((tmp_path / "row.json").read_text())
+    lines = capsys.readouterr().out.splitlines()
+    assert [line.split()[0] for line in lines[-3:]] == ["training", "before", "after"]
+    assert lines[-1].split()[1:3] == [str(facts["after"]["points"]), f"{facts['after']['iou']:.4f}"]
+    assert main(["shape", str(file), "--edge", "0.2", "--samples", "1000"]) == 0
+    assert "edge 0.2" in capsys.readouterr().out
+
+
+WRONG = {
+    "no such subject": (["nothing"], "no such file"),
+    "samples 0": (["RUN", "--samples", "0"], "--samples 0"),
+    "samples in words": (["RUN", "--samples", "many"], "--samples many"),
+    "too many samples": (["RUN", "--samples", str(2**31)], "--samples"),
+    "edge of a run": (["RUN", "--edge", "1"], "--edge"),
+    "mesh of a mesh": (["MESH", "--mesh", "MESH"], "--mesh"),
+    "edge 0": (["MESH", "--edge", "0"], "--edge 0"),
+    "edge NaN": (["MESH", "--edge", "nan"], "--edge nan"),
+    "a run without mesh": (["RUN"], "--mesh FILE"),
+    "a mesh that is missing": (["RUN", "--mesh", "none.ply"], "none.ply"),
+    "a folder that is no run": (["EMPTY"], "config.json"),
+}
+
+
+@pytest.mark.parametrize("case", WRONG)
+def test_wrong_input_is_one_line(case, mesh, trained, tmp_path, capsys, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    trimesh.Trimesh(mesh.vertices, mesh.faces).export("ball.ply")
+    (tmp_path / "empty").mkdir()
+    names = {"RUN": str(trained), "MESH": "ball.ply", "EMPTY": "empty"}
+    words, said = WRONG[case]
+    assert main(["shape", *(names.get(word, word) for word in words)]) == 2
+    [line] = [x for x in capsys.readouterr().err.splitlines() if x.startswith("pp-cl: ")]
+    assert said in line
+
+
+def test_a_run_without_a_checkpoint(dev, mesh, trained, tmp_path):
+    shutil.copytree(trained, tmp_path / "run")
+    (tmp_path / "run" / "checkpoint.npz").unlink()
+    with pytest.raises(UserError, match="checkpoint"):
+        run_shape(dev, RunFolder(tmp_path / "run"), mesh, 100)

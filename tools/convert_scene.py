@@ -1,0 +1,62 @@
+"""Write a scene in another format, the demo included.
+
+    python -m tools.convert_scene SCENE OUT --format colmap
+
+Formats are the modules in tools/scene_formats/. Images become PNG at the stored size, freed of lens
+distortion; masks go where the format keeps them. Formats that know no
+splits hold out every eighth photograph: for them the views of both splits are dealt anew
+(--hold-out), which any format can be asked for, so that all of them train and test on the same.
+"""
+
+import argparse
+import sys
+from importlib import import_module
+from pathlib import Path
+
+from pp_cl.config import configure, preset
+from pp_cl.device.discover import open_device
+from pp_cl.errors import UserError
+from pp_cl.files.atomic import atomic_folder
+from pp_cl.scene.open import open_scene, scene_splits
+from pp_cl.scene.readers.common import SPLITS, hold_out
+from pp_cl.scene.views import View
+
+FOLDER = Path(__file__).with_name("scene_formats")
+FORMATS = sorted(file.stem for file in FOLDER.glob("*.py") if file.stem != "common")
+
+
+def convert(splits: dict[str, list[View]], folder: Path, name: str) -> None:
+    """Write the views of each split in a format. Raises UserError for a folder that holds
+    something, and for what the format cannot hold.
+    """
+    with atomic_folder(folder) as unfinished:
+        import_module(f"tools.scene_formats.{name}").write(unfinished, splits)
+
+
+def dealt(splits: dict[str, list[View]]) -> dict[str, list[View]]:
+    """The same views in splits train and test as formats without splits have them."""
+    views = [view for split in sorted(splits) for view in splits[split]]
+    return {split: hold_out(views, split) for split in SPLITS}
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """The exit status: 2 for bad input."""
+    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
+    parser.add_argument("scene", help="folder of a scene, or the word demo")
+    parser.add_argument("out", type=Path, help="new folder")
+    parser.add_argument("--format", required=True, choices=FORMATS)
+    parser.add_argument("--hold-out", action="store_true", help="deal the splits anew")
+    options = parser.parse_args(arguments)
+    try:
+        config = configure(preset("tiny"), options.scene)
+        names = tuple(scene_splits(config.scene.path))
+        splits = open_scene(open_device(), config, names).splits
+        convert(dealt(splits) if options.hold_out else splits, options.out, options.format)
+    except UserError as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 2
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
