@@ -14,7 +14,7 @@ from pp_cl.files.atomic import remove_leftovers, write_json
 from pp_cl.files.contact_sheet import write_comparison
 from pp_cl.files.image import write_png
 from pp_cl.metrics.psnr_ssim import Metrics, mean
-from pp_cl.metrics.published import published_row
+from pp_cl.metrics.published import differences, published_rows
 from pp_cl.scene.target import Target
 from pp_cl.scene.views import View
 from pp_cl.trained import Run, load_run
@@ -83,12 +83,21 @@ def evaluate(
             path.parent.mkdir(parents=True, exist_ok=True)
             write_png(path, image)
     means = mean([{name: row[name] for name in metrics} for row in rows])
-    published = published_row(scene.name, [view.stored_camera for view in views])
     result = {"split": split, "device": run.dev.name, "mean": means, "per_image": rows}
-    result |= _about(run, costs) | {"published": published}
+    result |= _about(run, costs) | _published(scene, split, views)
     write_json(target / "metrics.json", result)
     write_comparison(target / "comparison.png", *zip(*shown, strict=True))
     return result
+
+
+def _published(scene, split, views):
+    """{"published": rows of the scene's test views, "published_differs": how this measurement
+    differs from them}.
+    """
+    cameras = [view.stored_camera for view in views]
+    rows = published_rows(scene.name, cameras) if split == "test" else {}
+    differs = differences(scene.name, cameras, views[0].downscale) if rows else ""
+    return {"published": rows, "published_differs": differs}
 
 
 def _about(run, costs):

@@ -7,26 +7,28 @@ from pp_cl.errors import UserError
 from pp_cl.files.atomic import atomic_file
 
 
-def check_files(json_file: str | None, plot_file: str | None) -> Any | None:
-    """A matplotlib figure for the plot, None without one. Raises UserError if a file cannot be
-    written.
+def check_files(
+    json_file: str | None, plot_file: str | None, plot_option: str = "--plot"
+) -> Any | None:
+    """A matplotlib figure for the plot, None without one. Raises UserError naming the option if a
+    file cannot be written.
     """
-    for option, file in (("--json", json_file), ("--plot", plot_file)):
+    for option, file in (("--json", json_file), (plot_option, plot_file)):
         if file and not Path(file).resolve().parent.is_dir():
             raise UserError(f"{option} {file}: no such folder; make it first")
-    return _figure(plot_file) if plot_file else None
+    return _figure(plot_file, plot_option) if plot_file else None
 
 
-def _figure(path):
+def _figure(path, option):
     try:
         from matplotlib.figure import Figure
     except ImportError:
         raise UserError(
-            f"--plot {path}: needs matplotlib; install it with `pip install 'pp-cl[plot]'`"
+            f"{option} {path}: needs matplotlib; install it with `pip install 'pp-cl[plot]'`"
         ) from None
     figure, suffix = Figure(figsize=(8, 6), layout="constrained"), Path(path).suffix[1:].lower()
     if suffix not in figure.canvas.get_supported_filetypes():
-        raise UserError(f"--plot {path}: name a .png, .svg or .pdf file")
+        raise UserError(f"{option} {path}: name a .png, .svg or .pdf file")
     return figure
 
 
@@ -55,10 +57,28 @@ def plot_time_and_error(figure: Any, title: str, rows: list[dict]) -> None:
             )
 
 
+def plot_ranks(figure: Any, names: list[str], rows: list[tuple[str, dict]], own: str) -> None:
+    """A chart of horizontal bars for each of the metrics `names`, the first row on top.
+
+    rows: [(label, {name: value})]; those without a value are left out. own: label of the row to
+    mark.
+    """
+    for place, name in enumerate(names):
+        axes = figure.add_subplot(1, len(names), place + 1, title=name.upper())
+        measured = [(label, values[name]) for label, values in reversed(rows) if name in values]
+        labels, values = zip(*measured, strict=True)
+        colours = ["C1" if label == own else "C0" for label in labels]
+        axes.barh(range(len(labels)), values, color=colours)
+        axes.set_yticks(range(len(labels)), labels, fontsize="x-small")
+        low, high = min(values), max(values)
+        axes.set_xlim(max(0.0, low - 0.2 * (high - low)), high + 0.05 * (high - low) or None)
+
+
 def save_figure(figure: Any, path: str) -> None:
     """Write a figure whose axes are drawn, with a grid and a legend."""
     for axes in figure.axes:
         axes.grid(True, which="both", alpha=0.3)
-        axes.legend(fontsize="small")
+        if axes.get_legend_handles_labels()[0]:
+            axes.legend(fontsize="small")
     with atomic_file(path) as file:
         figure.savefig(file, format=Path(path).suffix[1:].lower())

@@ -5,6 +5,7 @@ import argparse
 from pp_cl.commands import options as shared
 
 HELP = "render a run's views and measure them"
+OTHER_LPIPS = "lpips_alex"
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -18,6 +19,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--save-images", action="store_true", help="write every view to RUN/eval/images/"
     )
+    parser.add_argument(
+        "--chart", metavar="FILE", help="draw the run among the published results (PNG, SVG, PDF)"
+    )
     shared.add_open(parser)
     shared.add_tolerance(parser)
     shared.add_device(parser)
@@ -25,6 +29,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> None:
     """Evaluate, print the table."""
+    from pp_cl.bench.plots import check_files, plot_ranks, save_figure
     from pp_cl.device.discover import open_device
     from pp_cl.evaluate import evaluate
     from pp_cl.trained import load_run
@@ -33,11 +38,16 @@ def run(options: argparse.Namespace) -> None:
         shared.read_metrics(options.metrics),
         shared.read_tolerance(options.tolerance),
     )
+    figure = check_files(None, options.chart, "--chart")
     dev = open_device(options.device)
     run = load_run(dev, options.run_folder, tolerance=tolerance, scene=options.scene)
     print(run.policy.origin)
     result = evaluate(run, options.split, metrics, save_images=options.save_images)
     folder = run.folder
+    if figure:
+        figure.set_size_inches(4 * len(metrics), 6)
+        plot_ranks(figure, list(metrics), _ranked(result, folder), _label(result, folder))
+        save_figure(figure, options.chart)
     print(_table(result, folder))
     print(_summary(result))
     written = folder.evaluation(options.split)
@@ -50,16 +60,38 @@ def run(options: argparse.Namespace) -> None:
 
 
 def _table(result, folder):
-    """The run's means above the published ones."""
-    names = list(result["mean"])
-    rows = {f"{folder} ({len(result['per_image'])} views)": result["mean"]} | {
-        f"{k} (published)": v for k, v in result["published"].items()
-    }
-    lines = [f"{'':28s}" + "".join(f"{n:>9s}" for n in names)]
-    for label, values in rows.items():
-        cells = (f"{values[n]:9.4f}" if n in values else f"{'':9s}" for n in names)
-        lines.append(f"{label:28s}" + "".join(cells))
+    """The run's means among the published ones, the best PSNR first."""
+    names, published = list(result["mean"]), result["published"]
+    width = max(28, len(_label(result, folder)) + 2)
+    lines = [f"{'':{width}s}" + "".join(f"{n:>10s}" for n in names)]
+    for label, values in _ranked(result, folder):
+        cells = (_cell(values, name) for name in names)
+        lines.append(f"{label:{width}s}" + "".join(cells).rstrip())
+    if result["published_differs"]:
+        lines.append(result["published_differs"])
+    if "lpips" in names and any(OTHER_LPIPS in values for values in published.values()):
+        lines.append("* LPIPS by AlexNet, which cannot be compared with the others, by VGG16")
     return "\n".join(lines)
+
+
+def _label(result, folder):
+    return f"{folder} ({len(result['per_image'])} views)"
+
+
+def _ranked(result, folder):
+    """[(label, values)] of the run and of the published rows, the best PSNR first where it was
+    measured.
+    """
+    rows = [(_label(result, folder), result["mean"]), *result["published"].items()]
+    if "psnr" in result["mean"]:
+        rows.sort(key=lambda row: -row[1]["psnr"])
+    return rows
+
+
+def _cell(values, name):
+    if name == "lpips" and OTHER_LPIPS in values:
+        return f"{values[OTHER_LPIPS]:9.4f}*"
+    return f"{values[name]:9.4f} " if name in values else " " * 10
 
 
 def _summary(result):

@@ -1,35 +1,76 @@
-"""Published results for benchmark scenes, which an evaluation puts beside its own."""
+"""Published results for benchmark scenes, which an evaluation puts beside its own: Tables 1 to 7 of
+the PlenopticPoints supplemental, in published.json.
+"""
 
+import json
 from collections.abc import Sequence
+from functools import cache
+from pathlib import Path
+from typing import Any
 
 from pp_cl.scene.camera import Camera
 
-# PlenopticPoints supplemental, Tables 5 to 7: PSNR, SSIM, LPIPS (VGG) over the 200 test views of
-# 800x800.
-PLENOPTIC_POINTS = {
-    "chair": (35.35, 0.986, 0.016),
-    "drums": (25.59, 0.947, 0.050),
-    "ficus": (32.68, 0.982, 0.016),
-    "hotdog": (37.18, 0.985, 0.022),
-    "lego": (33.00, 0.975, 0.026),
-    "materials": (29.27, 0.960, 0.041),
-    "mic": (35.07, 0.991, 0.007),
-    "ship": (28.40, 0.891, 0.125),
-}
+FILE = Path(__file__).with_name("published.json")
 SYNTHETIC_SIZE, SYNTHETIC_FOCAL = 800, 1111.11  # pixels, of all eight scenes' stored images
+SYNTHETIC_VIEWS = 200  # of the test split
+# the four sequences of Tables 1 to 3
+CO3D_SEQUENCES = {
+    "590_88941_178115": "car",
+    "250_26779_55023": "hydrant",
+    "618_100125_200129": "plant",
+    "34_1479_4753": "teddybear",
+}
+METRICS = ("psnr", "ssim", "lpips")
 
 
-def published_row(scene_name: str, cameras: Sequence[Camera]) -> dict[str, dict[str, float]]:
-    """{"PlenopticPoints": {"psnr", "ssim", "lpips"}} for a scene of NeRF-synthetic, else {}.
-
-    The scene is recognised by its name together with the cameras of its stored images. The results
-    are means over the test split at 800x800 pixels, whatever the evaluation beside them measures.
+@cache
+def tables() -> dict[str, Any]:
+    """published.json. synthetic (Tables 5 to 7) and co3d (1 to 3): {"scenes": names, "methods":
+    {name: {"psnr": [...], "ssim": [...], "lpips": [...] of the scenes or null, "mean": {...}}}};
+    lpips_net: of LPIPS where it is not VGG16. shape (Table 4): rows by scene.
     """
+    return json.loads(FILE.read_text("utf-8"))
+
+
+def published_rows(scene_name: str, cameras: Sequence[Camera]) -> dict[str, dict[str, float]]:
+    """{method: {"psnr", "ssim", "lpips"}} of a published scene, by PSNR from the best on, else {}.
+
+    A method whose LPIPS was measured with another net has it as lpips_alex. A scene of
+    NeRF-synthetic is recognised by its name together with the cameras of its stored images, one of
+    CO3D by the name of its sequence.
+    """
+    if scene_name in CO3D_SEQUENCES:
+        return _rows(tables()["co3d"], CO3D_SEQUENCES[scene_name])
     synthetic = all(
         c.width == c.height == SYNTHETIC_SIZE and abs(c.fx - SYNTHETIC_FOCAL) < 0.01
         for c in cameras
     )
-    if scene_name not in PLENOPTIC_POINTS or not synthetic:
-        return {}
-    values = PLENOPTIC_POINTS[scene_name]
-    return {"PlenopticPoints": dict(zip(("psnr", "ssim", "lpips"), values, strict=True))}
+    known = tables()["synthetic"]
+    return _rows(known, scene_name) if synthetic and scene_name in known["scenes"] else {}
+
+
+def differences(scene_name: str, cameras: Sequence[Camera], downscale: int) -> str:
+    """How a measurement of a published scene differs from the published ones, in words; "" if it
+    does not. cameras: of the stored images of the views measured.
+    """
+    if scene_name in CO3D_SEQUENCES:
+        return "" if downscale == 1 else f"here: images reduced {downscale} times"
+    said = [
+        f"{views} views of {side}x{side} pixels"
+        for views, side in (
+            (f"{SYNTHETIC_VIEWS} test", SYNTHETIC_SIZE),
+            (len(cameras), SYNTHETIC_SIZE // downscale),
+        )
+    ]
+    same = downscale == 1 and len(cameras) == SYNTHETIC_VIEWS
+    return "" if same else f"published: {said[0]}; here: {said[1]}"
+
+
+def _rows(table, scene):
+    column, rows = table["scenes"].index(scene), {}
+    for name, method in table["methods"].items():
+        row = {metric: method[metric][column] for metric in METRICS if method[metric]}
+        if "lpips_net" in method:
+            row[f"lpips_{method['lpips_net']}"] = row.pop("lpips")
+        rows[name] = row
+    return dict(sorted(rows.items(), key=lambda item: -item[1]["psnr"]))
