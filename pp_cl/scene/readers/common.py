@@ -37,6 +37,14 @@ def find_image(
     return found[0].relative_to(root).as_posix()
 
 
+def check_split(place: Path, split: str, present: Sequence[str]) -> None:
+    """Raise UserError naming the place where a scene has no such split."""
+    if split not in present:
+        raise UserError(
+            f"{place}: no split {split}; the splits of this scene are {', '.join(present)}"
+        )
+
+
 def hold_out(items: Sequence[Item], split: str) -> list[Item]:
     """The items of split train or test, of a format without splits: test is every eighth."""
     is_test = split == "test"

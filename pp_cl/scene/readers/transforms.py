@@ -8,7 +8,7 @@ from pathlib import Path, PurePosixPath
 from pp_cl.errors import UserError
 from pp_cl.files.image import image_size
 from pp_cl.scene.photograph import Photograph
-from pp_cl.scene.readers.common import SPLITS, find_image, hold_out
+from pp_cl.scene.readers.common import SPLITS, check_split, find_image, hold_out
 from pp_cl.scene.readers.frame import Frame, distortion, pinhole, read_json
 
 ENDINGS = ("", ".png")  # of a file_path
@@ -39,9 +39,7 @@ def read_split(folder: Path, split: str) -> list[Photograph]:
     Raises UserError naming the file and the key that is missing or wrong.
     """
     file = folder / (f"transforms_{split}.json" if _split_files(folder) else SINGLE)
-    if not file.is_file() or split not in splits(folder):
-        present = ", ".join(splits(folder))
-        raise UserError(f"{file}: no split {split}; the splits of this scene are {present}")
+    check_split(file, split, splits(folder))
     data = _read(file)
     frames = [
         _read_frame(folder, Frame(file, data, frame, index))

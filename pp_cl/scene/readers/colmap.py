@@ -1,0 +1,108 @@
+"""Reader of COLMAP's sparse models: cameras and images, text or binary, beside a folder of images
+and, for objects, one of masks.
+"""
+
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from pp_cl.errors import UserError
+from pp_cl.files.image import image_size
+from pp_cl.scene.camera import Camera
+from pp_cl.scene.distortion import Distortion
+from pp_cl.scene.photograph import Photograph
+from pp_cl.scene.readers.colmap_model import Image, Lens, is_model, read_model
+from pp_cl.scene.readers.common import SPLITS, check_split, find_image, hold_out
+
+FILES = "a sparse model of COLMAP beside images"
+PLACES = ("sparse/0", "sparse", "colmap/sparse/0", ".")
+IMAGES, MASKS = "images", "masks"
+MOST_FOCAL = 1e9  # pixels
+
+
+def recognises(folder: Path) -> bool:
+    """True if the folder has a model in one of the usual places."""
+    return _model_folder(folder) is not None
+
+
+def splits(folder: Path) -> list[str]:
+    """Train and test: COLMAP knows no splits."""
+    return SPLITS
+
+
+def read_split(folder: Path, split: str) -> list[Photograph]:
+    """The photographs of a split: test is every eighth in the order of their names.
+
+    An image's mask is masks/NAME.png, as COLMAP has it, or masks/NAME with the ending .png; with a
+    folder of masks, every image needs one. Raises UserError naming the file, and the image.
+    """
+    check_split(folder, split, SPLITS)
+    model = _model_folder(folder)
+    lenses, images = read_model(model)
+    ordered = sorted(images, key=lambda image: image.name)
+    return [
+        _photograph(folder, model, image, lenses[image.camera])
+        for image in hold_out(ordered, split)
+    ]
+
+
+def _model_folder(folder):
+    for place in PLACES:
+        if any(is_model(folder / place, suffix) for suffix in (".bin", ".txt")):
+            return folder / place
+    return None
+
+
+def _photograph(folder, model, image: Image, lens: Lens):
+    fail = partial(_error, model, image.name)
+    name = find_image(folder, f"{IMAGES}/{image.name}", fail)
+    size = image_size(folder / name)
+    if size != (lens.width, lens.height):
+        raise fail(
+            f"has {size[0]}x{size[1]} pixels, but its camera {lens.width}x{lens.height}; restore"
+            " the images that COLMAP was given"
+        )
+    fx, fy, cx, cy, distortion = _intrinsics(folder, model, lens)
+    w, x, y, z = image.rotation
+    rotation = Rotation.from_quat([x, y, z, w]).as_matrix().T
+    pose = np.column_stack([rotation, -rotation @ image.translation])
+    camera = Camera(pose, fx, fy, cx, cy, *size)
+    return Photograph(name, camera, mask=_mask(folder, image.name, fail), distortion=distortion)
+
+
+def _error(model, name, text):
+    return UserError(f"{model}: {name}: {text}")
+
+
+def _intrinsics(folder, model, lens):
+    """(fx, fy, cx, cy, Distortion). Raises UserError for a model that is not one of OpenCV's."""
+    p = lens.parameters
+    if lens.model == "SIMPLE_PINHOLE":
+        found = p[0], p[0], p[1], p[2], Distortion()
+    elif lens.model == "PINHOLE":
+        found = *p, Distortion()
+    elif lens.model in ("SIMPLE_RADIAL", "RADIAL"):
+        found = p[0], p[0], p[1], p[2], Distortion(*p[3:])
+    elif lens.model == "OPENCV":
+        found = *p[:4], Distortion(*p[4:])
+    else:
+        raise UserError(
+            f"{model}: camera model {lens.model} is not read; convert with `colmap"
+            f" image_undistorter --image_path {folder / IMAGES} --input_path {model} --output_path"
+            " NEW` and give NEW"
+        )
+    if not all(0 < focal < MOST_FOCAL for focal in found[:2]):
+        raise UserError(f"{model}: a camera has the focal length {min(found[:2]):g}; mend it")
+    return found
+
+
+def _mask(folder, name, fail):
+    """Path of the image's mask relative to the folder, None where there is no folder of masks."""
+    if not (folder / MASKS).is_dir():
+        return None
+    for given in (f"{name}.png", Path(name).with_suffix(".png").as_posix()):
+        if (folder / MASKS / given).is_file():
+            return find_image(folder, f"{MASKS}/{given}", fail)
+    raise fail(f"has no mask {MASKS}/{name}.png; add it, or remove the folder {MASKS}")
