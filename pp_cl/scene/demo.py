@@ -110,12 +110,17 @@ def write_scene(scene: Scene, folder: str | Path) -> None:
     cannot be written.
     """
     with atomic_folder(Path(folder)) as unfinished:
-        for split, views in scene.splits.items():
-            for view in views:
-                path = (unfinished / view.name).with_suffix(".png")
-                path.parent.mkdir(parents=True, exist_ok=True)
-                write_png(path, view.image)
-            write_json(unfinished / f"transforms_{split}.json", _transforms(views))
+        write_splits(unfinished, scene.splits)
+
+
+def write_splits(folder: Path, splits: dict[str, list[View]]) -> None:
+    """Write views in write_scene's format into a folder that exists."""
+    for split, views in splits.items():
+        for view in views:
+            path = (folder / view.name).with_suffix(".png")
+            path.parent.mkdir(parents=True, exist_ok=True)
+            write_png(path, view.image)
+        write_json(folder / f"transforms_{split}.json", _transforms(views))
 
 
 def _transforms(views):

@@ -15,13 +15,13 @@ from pp_cl.errors import UserError
 from pp_cl.files.image import read_rgba
 from pp_cl.scene.distortion import undistort
 from pp_cl.scene.masks import AS_GIVEN, MaskRule
-from pp_cl.scene.readers import colmap, transforms
+from pp_cl.scene.readers import co3d, colmap, llff, neus, nsvf, transforms
 from pp_cl.scene.views import View
 
 # One module per format. FILES names the files it reads, recognises(folder) tells whether a folder
 # holds such files, splits(folder) names its splits, and read_split(folder, split) gives a list of
 # Photograph without reading pixels. The first that recognises a folder reads it.
-READERS = (transforms, colmap)
+READERS = (transforms, co3d, neus, nsvf, colmap, llff)
 
 Item = TypeVar("Item")
 

@@ -3,12 +3,14 @@ that knows no splits.
 """
 
 from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
 from typing import TypeVar
 
 from pp_cl.errors import UserError
 
 HELD_OUT = 8  # one photograph of so many, the first among them, as LLFF and 3DGS do
+ENDINGS = (".png", ".jpg", ".jpeg", ".webp", ".exr")
 SPLITS = ["test", "train"]
 Item = TypeVar("Item")
 
@@ -35,6 +37,32 @@ def find_image(
         tried = "".join(f", nor with {ending} added" for ending in endings if ending)
         raise fail(f"no image at {given!r}{tried}; copy it there or remove the frame")
     return found[0].relative_to(root).as_posix()
+
+
+def folder_images(folder: Path, name: str) -> list[str]:
+    """Paths relative to the scene's folder of the images in its folder `name`, sorted. Raises
+    UserError where there are none.
+    """
+    files = sorted((folder / name).glob("*"))
+    found = [file.name for file in files if file.suffix.lower() in ENDINGS and file.is_file()]
+    if not found:
+        raise UserError(f"{folder / name}: no images in it; copy them there")
+    fail = partial(_error, folder / name)
+    return [find_image(folder, f"{name}/{image}", fail) for image in found]
+
+
+def of_stem(folder: Path, name: str, stem: str) -> str:
+    """Path relative to the scene's folder of the image in its folder `name` with this stem. Raises
+    UserError where there is none.
+    """
+    endings = [ending for ending in ENDINGS if (folder / name / f"{stem}{ending}").is_file()]
+    if not endings:
+        raise UserError(f"{folder / name}: no mask {stem}.png; add it, or remove the folder")
+    return find_image(folder, f"{name}/{stem}{endings[0]}", partial(_error, folder / name))
+
+
+def _error(place, text):
+    return UserError(f"{place}: {text}")
 
 
 def check_split(place: Path, split: str, present: Sequence[str]) -> None:

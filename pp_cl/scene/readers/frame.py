@@ -2,7 +2,9 @@
 
 import json
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -140,23 +142,27 @@ def _focal_length(frame, length_key, angle_key, size):
 
 
 def rigid_pose(frame: Frame, key: str, value: Any) -> np.ndarray:
-    """(3, 4) float64 pose of a 4x4 or 3x4 matrix, its rotation made orthonormal. Raises UserError
-    naming the key where it holds no rotation and place.
+    """rigid() of the value of a frame's key."""
+    return rigid(value, partial(frame.error, key))
+
+
+def rigid(value: Any, fail: Callable[[str], UserError]) -> np.ndarray:
+    """(3, 4) float64 pose of a 4x4 or 3x4 matrix, its rotation made orthonormal. Raises fail(text)
+    where it holds no rotation and place.
     """
     try:
         matrix = np.array(value, np.float64)
     except (TypeError, ValueError, OverflowError):
-        raise frame.error(key, "must be 4x4 or 3x4 numbers") from None
+        raise fail("must be 4x4 or 3x4 numbers") from None
     if matrix.shape not in ((4, 4), (3, 4)):
-        raise frame.error(key, f"has shape {matrix.shape}; must be 4x4 or 3x4 numbers")
+        raise fail(f"has shape {matrix.shape}; must be 4x4 or 3x4 numbers")
     if not (np.abs(matrix) < MOST).all():
-        raise frame.error(key, "holds NaN, Inf or a huge number; must be a camera-to-world matrix")
+        raise fail("holds NaN, Inf or a huge number; must be a camera-to-world matrix")
     if not np.allclose(matrix[3:], [0, 0, 0, 1], rtol=0, atol=1e-6):
-        raise frame.error(key, f"its last row is {matrix[3].tolist()}; must be [0, 0, 0, 1]")
+        raise fail(f"its last row is {matrix[3].tolist()}; must be [0, 0, 0, 1]")
     u, scale, vt = np.linalg.svd(matrix[:3, :3])
     if np.abs(scale**2 - 1).max() > ROTATION_TOLERANCE or np.linalg.det(u @ vt) < 0:
-        raise frame.error(
-            key,
+        raise fail(
             f"its 3x3 part is no rotation (scales {scale.round(4).tolist()}, "
             f"determinant {np.linalg.det(matrix[:3, :3]):.4f}); remove scale, shear and mirroring",
         )

@@ -1,0 +1,99 @@
+"""Arrays in files of numpy and of text that other people made, checked before they are believed."""
+
+import zipfile
+from pathlib import Path
+
+import numpy as np
+
+from pp_cl.errors import UserError
+
+MOST_BYTES = 2**28  # of an array that holds cameras
+MOST = 1e30  # larger numbers are refused: float32 could not hold their products
+
+
+def read_npy(file: Path) -> np.ndarray:
+    """The array of a .npy file as float64. Raises UserError naming the file."""
+    try:
+        with file.open("rb") as opened:
+            return _checked(file, "", _read(opened))
+    except FileNotFoundError:
+        raise UserError(f"{file}: no such file; copy it there") from None
+    except (OSError, ValueError, EOFError, SyntaxError) as error:
+        raise _unreadable(file, error) from None
+
+
+def read_npz(file: Path, wanted: str) -> dict[str, np.ndarray]:
+    """{name: array as float64} of the members of a .npz file whose names begin with `wanted`.
+    Raises UserError naming the file and the member.
+    """
+    try:
+        with zipfile.ZipFile(file) as archive:
+            names = [n.removesuffix(".npy") for n in archive.namelist() if n.endswith(".npy")]
+            arrays = {}
+            for name in names:
+                if name.startswith(wanted):
+                    with archive.open(f"{name}.npy") as opened:
+                        arrays[name] = _checked(file, f"{name}: ", _read(opened))
+            return arrays
+    except FileNotFoundError:
+        raise UserError(f"{file}: no such file; copy it there") from None
+    # broken archives raise whatever their bytes lead to
+    except (OSError, ValueError, EOFError, SyntaxError, RuntimeError, zipfile.BadZipFile) as error:
+        raise _unreadable(file, error) from None
+
+
+def _read(opened):
+    """The array of an opened .npy file, of numbers and no larger than cameras are."""
+    version = np.lib.format.read_magic(opened)
+    header = (
+        np.lib.format.read_array_header_1_0
+        if version == (1, 0)
+        else np.lib.format.read_array_header_2_0
+    )
+    shape, fortran, dtype = header(opened)
+    if dtype.kind not in "fiu":
+        raise ValueError(f"holds {dtype}, no numbers")
+    if int(np.prod(shape, dtype=object)) * dtype.itemsize > MOST_BYTES:
+        raise ValueError(f"claims the shape {shape}")
+    count = int(np.prod(shape, dtype=np.int64))
+    data = opened.read(count * dtype.itemsize)
+    if len(data) < count * dtype.itemsize:
+        raise ValueError("ends too early")
+    array = np.frombuffer(data, dtype, count)
+    return array.reshape(shape, order="F" if fortran else "C").astype(np.float64)
+
+
+def _checked(file, name, array):
+    if not (np.abs(array) < MOST).all():
+        raise UserError(f"{file}: {name}holds NaN, Inf or a huge number; write it anew")
+    return array
+
+
+def _unreadable(file, error):
+    if isinstance(error, UserError):
+        return error
+    reason = " ".join(str(error).split())[:120] or type(error).__name__
+    return UserError(f"{file}: cannot be read ({reason}); copy it anew")
+
+
+def read_numbers(file: Path) -> list[list[float]]:
+    """The numbers of each line of a text file that has some. Raises UserError naming the file and
+    the line.
+    """
+    try:
+        lines = file.read_text("utf-8").split("\n")
+    except FileNotFoundError:
+        raise UserError(f"{file}: no such file; copy it there") from None
+    except (OSError, ValueError) as error:
+        raise UserError(f"{file}: cannot be read as text ({error}); copy it anew") from None
+    rows = []
+    for number, line in enumerate(lines, 1):
+        try:
+            values = [float(word) for word in line.split()]
+        except ValueError:
+            raise UserError(f"{file}: line {number}: {line[:60]!r} are no numbers") from None
+        if not all(abs(value) < MOST for value in values):
+            raise UserError(f"{file}: line {number}: holds NaN, Inf or a huge number")
+        if values:
+            rows.append(values)
+    return rows

@@ -1,0 +1,202 @@
+"""Reader of single sequences of CO3D, versions 1 and 2: CATEGORY/SEQUENCE/ with images and masks,
+whose annotations lie in CATEGORY/. Those of the category are the only files read outside of the
+scene's folder.
+"""
+
+import gzip
+import json
+import zlib
+from functools import lru_cache, partial
+from pathlib import Path, PurePosixPath
+
+import numpy as np
+
+from pp_cl.errors import UserError
+from pp_cl.files.image import image_size
+from pp_cl.scene.camera import Camera
+from pp_cl.scene.photograph import Photograph
+from pp_cl.scene.readers.common import SPLITS, check_split, find_image, hold_out
+from pp_cl.scene.readers.frame import Frame, read_json, rigid
+
+FILES = "a sequence of CO3D, whose frame_annotations.jgz lies one folder above"
+ANNOTATIONS = "frame_annotations.jgz"
+MOST_TEXT = 2**31  # bytes of annotations; the largest category has a fifth of it
+# PyTorch3D: x left, y up, z forwards; OpenCV: x right, y down, z forwards
+CV_FROM_P3D = np.diag([-1.0, -1.0, 1.0])
+# what focal lengths and principal points are multiplied with, of half the width and height
+NORMALISED, ISOTROPIC = "ndc_norm_image_bounds", "ndc_isotropic"
+
+
+def recognises(folder: Path) -> bool:
+    """True if the folder has images and the one above it annotations."""
+    folder = folder.absolute()
+    return (folder / "images").is_dir() and (folder.parent / ANNOTATIONS).is_file()
+
+
+def splits(folder: Path) -> list[str]:
+    """Train and test, and val where a set list has frames for it."""
+    listed = _set_list(folder.resolve())
+    return sorted(listed) if listed else SPLITS
+
+
+def read_split(folder: Path, split: str) -> list[Photograph]:
+    """The photographs of a split, in the order of their frame numbers.
+
+    Version 1: frames that set_lists.json calls known are for training, unseen ones for testing.
+    Version 2: as the first of set_lists/*.json has it that names the sequence, those of many views
+    before others. Without a list test is every eighth. Frames whose mask is empty are left out.
+    Raises UserError naming the file and the frame.
+    """
+    folder = folder.resolve()
+    check_split(folder, split, splits(folder))
+    file, listed = folder.parent / ANNOTATIONS, _set_list(folder)
+    frames = [
+        Frame(file, {}, own, index, "frames")
+        for index, own in _annotations(file, folder.name, file.stat().st_mtime_ns)
+        if not (isinstance(own.get("mask"), dict) and own["mask"].get("mass") == 0)
+    ]
+    if not frames:
+        raise UserError(f"{file}: has no frame of the sequence {folder.name}; give another folder")
+    numbered = sorted((_number(frame), frame.index, frame) for frame in frames)
+    chosen = [frame for _, _, frame in numbered]
+    if listed is None:
+        chosen = hold_out(chosen, split)
+    else:
+        chosen = [frame for frame in chosen if _path(frame, "image") in listed[split]]
+    return [_photograph(folder, frame) for frame in chosen]
+
+
+@lru_cache(maxsize=1)
+def _annotations(file, sequence, _changed):
+    """[(index, annotation)] of a sequence's frames, of a file last changed then. Raises
+    UserError.
+    """
+    try:
+        with gzip.open(file) as opened:
+            text = opened.read(MOST_TEXT + 1)
+        if len(text) > MOST_TEXT:
+            raise UserError(f"{file}: holds more than {MOST_TEXT} bytes; give another file")
+        data = json.loads(text)
+    except (OSError, EOFError, zlib.error, ValueError, RecursionError) as error:
+        reason = " ".join(str(error).split())[:120]
+        raise UserError(
+            f"{file}: cannot be read as gzipped JSON ({reason}); copy it anew"
+        ) from None
+    if not isinstance(data, list) or not all(isinstance(own, dict) for own in data):
+        raise UserError(f"{file}: must hold a list of annotations; copy it anew")
+    return [(i, own) for i, own in enumerate(data) if own.get("sequence_name") == sequence]
+
+
+def _number(frame):
+    number = frame.number("frame_number")
+    if number is None:
+        raise frame.error("frame_number", "is missing; copy the annotations anew")
+    return number
+
+
+def _path(frame, key):
+    """The path of an image or mask in the dataset."""
+    value = frame.get(key)
+    path = value.get("path") if isinstance(value, dict) else None
+    if not isinstance(path, str) or not path:
+        raise frame.error(key, "must have the path of an image")
+    return path
+
+
+def _photograph(folder, frame):
+    name, mask = (_found(folder, frame, key) for key in ("image", "mask"))
+    size = image_size(folder / name)
+    stated = frame.get("image").get("size")
+    if stated is not None and stated != [size[1], size[0]]:
+        raise frame.error(
+            "image", f"has the size {stated} (height, width), but {name} has {size[0]}x{size[1]}"
+        )
+    return Photograph(name, _camera(frame, size), mask=mask)
+
+
+def _found(folder, frame, key):
+    """Path of an image relative to the sequence's folder; None where the frame has no mask."""
+    if key == "mask" and frame.get(key) is None:
+        return None
+    path, fail = PurePosixPath(_path(frame, key)), partial(frame.error, key)
+    if path.parts[:2] != (folder.parent.name, folder.name):
+        raise fail(f"{str(path)!r} is not in {folder.parent.name}/{folder.name}; move it there")
+    return find_image(folder, PurePosixPath(*path.parts[2:]).as_posix(), fail)
+
+
+def _camera(frame, size):
+    """The Camera of a viewpoint: x_camera = x_world R + T, in PyTorch3D's axes."""
+    own = frame.get("viewpoint")
+    if not isinstance(own, dict):
+        raise frame.error("viewpoint", "is missing; remove the frame")
+    view = Frame(frame.file, {}, own, frame.index, "viewpoint of frame ")
+    rotation, place = _numbers(view, "R", (3, 3)), _numbers(view, "T", (3,))
+    focal, centre = _numbers(view, "focal_length", (2,)), _numbers(view, "principal_point", (2,))
+    half = np.array(size) / 2
+    kind = own.get("intrinsics_format") or NORMALISED
+    if kind not in (NORMALISED, ISOTROPIC):
+        raise view.error("intrinsics_format", f"is {str(kind)[:40]!r}; {ISOTROPIC} is known")
+    scale = half if kind == NORMALISED else half.min()
+    focal, centre = focal * scale, half - centre * scale
+    if not (focal > 0).all():
+        raise view.error("focal_length", f"is {focal.min():g} pixels; must be above 0")
+    to_world = rotation @ CV_FROM_P3D
+    pose = rigid(np.column_stack([to_world, -rotation @ place]), partial(view.error, "R"))
+    return Camera(pose, *(float(v) for v in (*focal, *centre)), *size)
+
+
+def _numbers(view, key, shape):
+    try:
+        array = np.array(view.get(key), np.float64)
+    except (TypeError, ValueError, OverflowError):
+        array = np.empty(0)
+    if array.shape != shape or not np.isfinite(array).all():
+        raise view.error(key, f"must be {'x'.join(map(str, shape))} finite numbers")
+    return array
+
+
+# --------------------------------------------------------------------------------------------------
+
+
+def _set_list(folder):
+    """{split: paths of images} of the sequence, each in one split only; None without a list."""
+    category, sequence = folder.parent, folder.name
+    old = category / "set_lists.json"
+    if old.is_file():
+        kinds = {"train": "known", "test": "unseen"}
+        found = _listed(old, sequence)
+        return _disjoint(
+            {
+                split: set().union(*(paths for name, paths in found.items() if kind in name))
+                for split, kind in kinds.items()
+            }
+        )
+    files = sorted((category / "set_lists").glob("*.json"), key=lambda f: ("many" not in f.name, f))
+    for file in files:
+        if (found := _disjoint(_listed(file, sequence))) is not None:
+            return found
+    return None
+
+
+def _listed(file, sequence):
+    """{name of the set: paths of the sequence's images in it}. Raises UserError."""
+    data = read_json(file)
+    try:
+        return {
+            name: {path for owner, _, path in rows if owner == sequence}
+            for name, rows in data.items()
+        }
+    except (AttributeError, TypeError, ValueError):
+        raise UserError(
+            f"{file}: must be lists of [sequence, frame number, path]; copy it anew"
+        ) from None
+
+
+def _disjoint(found):
+    """The splits with frames, without those of train in the others; None without training or test
+    frames.
+    """
+    train = found.get("train", set())
+    splits = {name: paths - train for name, paths in found.items() if name in ("val", "test")}
+    splits = {name: paths for name, paths in splits.items() if paths}
+    return {"train": train, **splits} if train and "test" in splits else None

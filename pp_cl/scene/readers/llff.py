@@ -1,0 +1,74 @@
+"""Reader of scenes as LLFF has them: poses_bounds.npy beside images/, and masks/ for objects."""
+
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+
+from pp_cl.errors import UserError
+from pp_cl.files.image import image_size
+from pp_cl.scene.camera import Camera
+from pp_cl.scene.photograph import Photograph
+from pp_cl.scene.readers.arrays import read_npy
+from pp_cl.scene.readers.common import SPLITS, check_split, folder_images, hold_out, of_stem
+from pp_cl.scene.readers.frame import rigid
+
+FILES = "poses_bounds.npy (LLFF)"
+IMAGES, MASKS, POSES = "images", "masks", "poses_bounds.npy"
+NUMBERS = 17  # 3x4 pose, (height, width, focal length) as its fifth column; near, far
+# LLFF: down, right, backwards; OpenCV: right, down, forwards
+LLFF_FROM_CV = np.array([[0, 1, 0], [1, 0, 0], [0, 0, -1]])
+
+
+def recognises(folder: Path) -> bool:
+    """True if the folder has the file of poses."""
+    return (folder / POSES).is_file()
+
+
+def splits(folder: Path) -> list[str]:
+    """Train and test: test is every eighth image, as LLFF has it."""
+    return SPLITS
+
+
+def read_split(folder: Path, split: str) -> list[Photograph]:
+    """The photographs of a split, in the order of their names.
+
+    Where the images are smaller or larger than the poses say, the focal length is scaled. Near and
+    far bound all that was photographed, not the object, and are left out. Raises UserError naming
+    the file and the image.
+    """
+    check_split(folder, split, SPLITS)
+    file, names = folder / POSES, folder_images(folder, IMAGES)
+    rows = read_npy(file)
+    if rows.shape != (len(names), NUMBERS):
+        raise UserError(
+            f"{file}: has shape {rows.shape}, but {IMAGES}/ has {len(names)} images; must be"
+            f" {len(names)}x{NUMBERS} numbers"
+        )
+    has_masks = (folder / MASKS).is_dir()
+    read = []
+    for index, name in hold_out(list(enumerate(names)), split):
+        fail = partial(_error, file, index)
+        camera = _camera(rows[index, :15].reshape(3, 5), image_size(folder / name), fail)
+        mask = of_stem(folder, MASKS, Path(name).stem) if has_masks else None
+        read.append(Photograph(name, camera, mask=mask))
+    return read
+
+
+def _error(file, index, text):
+    return UserError(f"{file}: row {index}: {text}")
+
+
+def _camera(matrix, size, fail):
+    """The Camera, its principal point in the middle. Raises fail(text)."""
+    height, width, focal = matrix[:, 4]
+    if not (height > 0 and width > 0 and focal > 0):
+        raise fail(f"height {height:g}, width {width:g}, focal length {focal:g} must be above 0")
+    if abs(size[0] * height - size[1] * width) > max(width, height):
+        raise fail(
+            f"is for {width:g}x{height:g} pixels, but its image has {size[0]}x{size[1]}, another"
+            " shape; copy the images anew"
+        )
+    pose = np.column_stack([matrix[:, :3] @ LLFF_FROM_CV, matrix[:, 3]])
+    focal *= size[0] / width
+    return Camera(rigid(pose, fail), focal, focal, size[0] / 2, size[1] / 2, *size)

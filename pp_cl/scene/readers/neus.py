@@ -1,0 +1,105 @@
+"""Reader of scenes as IDR and NeuS have them, DTU among them: cameras_sphere.npz or cameras.npz
+with world_mat_i = K [R | t], images in image/, masks in mask/.
+"""
+
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+from scipy.linalg import rq
+
+from pp_cl.errors import UserError
+from pp_cl.files.image import image_size
+from pp_cl.scene.camera import Camera
+from pp_cl.scene.photograph import Photograph
+from pp_cl.scene.readers.arrays import read_npz
+from pp_cl.scene.readers.common import (
+    SPLITS,
+    check_split,
+    folder_images,
+    hold_out,
+    of_stem,
+)
+
+FILES = "cameras_sphere.npz (NeuS, DTU)"
+CAMERAS = ("cameras_sphere.npz", "cameras.npz")
+IMAGES, MASKS = "image", "mask"
+MOST_SKEW = 1e-3  # pixels of shear over the image; more is no camera of ours
+
+
+def recognises(folder: Path) -> bool:
+    """True if the folder has one of the files of cameras."""
+    return _file(folder) is not None
+
+
+def splits(folder: Path) -> list[str]:
+    """Train and test: the format knows no splits."""
+    return SPLITS
+
+
+def read_split(folder: Path, split: str) -> list[Photograph]:
+    """The photographs of a split: test is every eighth in the order of the images' names.
+
+    The world is that of world_mat, in its own units. scale_mat, where it is there, moves the unit
+    sphere around the object, which gives the depth range. Raises UserError naming the file and the
+    member.
+    """
+    check_split(folder, split, SPLITS)
+    file = _file(folder)
+    cameras, scales = read_npz(file, "world_mat_"), read_npz(file, "scale_mat_")
+    names = folder_images(folder, IMAGES)
+    has_masks = (folder / MASKS).is_dir()
+    read = []
+    for index, name in hold_out(list(enumerate(names)), split):
+        key = f"world_mat_{index}"
+        if key not in cameras:
+            raise UserError(
+                f"{file}: {key} is missing, but {IMAGES}/ has {len(names)} images; copy both anew"
+            )
+        camera = _camera(cameras[key], image_size(folder / name), partial(_error, file, key))
+        key = f"scale_mat_{index}"
+        depth_range = None
+        if key in scales:
+            depth_range = _depth_range(scales[key], camera, partial(_error, file, key))
+        mask = of_stem(folder, MASKS, Path(name).stem) if has_masks else None
+        read.append(Photograph(name, camera, depth_range, mask))
+    return read
+
+
+def _file(folder):
+    return next((folder / name for name in CAMERAS if (folder / name).is_file()), None)
+
+
+def _error(file, key, text):
+    return UserError(f"{file}: {key}: {text}")
+
+
+def _camera(matrix, size, fail):
+    """The Camera of a projection K [R | t]. Raises fail(text)."""
+    if matrix.shape not in ((4, 4), (3, 4)):
+        raise fail(f"has shape {matrix.shape}; must be 4x4 numbers")
+    left = matrix[:3, :3]
+    if not abs(np.linalg.det(left)) > 1e-12 * max(np.abs(left).max(), 1e-30) ** 3:
+        raise fail("is singular; must be K [R | t]")
+    upper, rotation = rq(left * np.sign(np.linalg.det(left)))
+    signs = np.sign(np.diag(upper))
+    upper, rotation = upper * signs, signs[:, None] * rotation
+    upper /= upper[2, 2]
+    if abs(upper[0, 1]) * size[1] > MOST_SKEW * upper[1, 1]:
+        raise fail(f"has a skew of {upper[0, 1]:.3g} pixels; cameras with skew are not modelled")
+    eye = -np.linalg.solve(left, matrix[:3, 3])
+    pose = np.column_stack([rotation.T, eye])
+    return Camera(pose, upper[0, 0], upper[1, 1], upper[0, 2], upper[1, 2], *size)
+
+
+def _depth_range(matrix, camera, fail):
+    """(near, far) of the sphere that the matrix makes of the unit sphere. Raises fail(text)."""
+    if matrix.shape != (4, 4):
+        raise fail(f"has shape {matrix.shape}; must be 4x4 numbers")
+    radius = abs(np.linalg.det(matrix[:3, :3])) ** (1 / 3)
+    distance = np.linalg.norm(camera.eye - matrix[:3, 3])
+    if radius == 0 or not np.allclose(
+        matrix[:3, :3] @ matrix[:3, :3].T, radius**2 * np.eye(3), atol=1e-3 * radius**2
+    ):
+        raise fail("is no scaling; leave it out")
+    return float(max(distance - radius, 1e-3 * radius)), float(distance + radius)

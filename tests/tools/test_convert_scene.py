@@ -1,0 +1,70 @@
+"""One scene in every format: the same cameras, images and masks come back."""
+
+import numpy as np
+import pytest
+from support.same_scene import held_out, same, views
+from support.scenes import write_ball_scene
+
+from pp_cl.errors import UserError
+from pp_cl.scene.load import load_scene
+from pp_cl.scene.open import scene_format
+from tools.convert_scene import FORMATS, convert, dealt, main
+
+READER = {"nerf_synthetic": "transforms", "nerfstudio": "transforms"}
+PLACE = {"co3d": "object/sequence"}  # of the scene in what is written
+
+
+def test_there_is_a_writer_for_each_reader():
+    assert FORMATS == ["co3d", "colmap", "llff", "nerf_synthetic", "nerfstudio", "neus", "nsvf"]
+
+
+@pytest.mark.parametrize("name", FORMATS)
+def test_what_is_written_comes_back(tmp_path, name):
+    given = held_out(views(centred=name == "llff", alike=name in ("llff", "nsvf")))
+    convert(given, tmp_path / "scene", name)
+    folder = tmp_path / "scene" / PLACE.get(name, ".")
+    assert scene_format(str(folder)) == READER.get(name, name)
+    same(folder, given)
+
+
+@pytest.mark.parametrize("name", ["co3d", "nerf_synthetic", "nerfstudio", "nsvf"])
+def test_formats_with_splits_keep_them(tmp_path, name):
+    many = views(alike=True)
+    given = {"test": many[:4], "train": many[4:9], "val": many[9:]}
+    convert(given, tmp_path / "scene", name)
+    same(tmp_path / "scene" / PLACE.get(name, "."), given)
+
+
+@pytest.mark.parametrize("name", ["colmap", "llff", "neus"])
+def test_formats_without_splits_ask_for_others(tmp_path, name):
+    many = views(centred=True)
+    with pytest.raises(UserError, match="--hold-out"):
+        convert({"train": many[:6], "test": many[6:]}, tmp_path / "scene", name)
+    assert not (tmp_path / "scene").exists()
+
+
+@pytest.mark.parametrize("name", ["nsvf", "llff"])
+def test_what_a_format_cannot_hold_is_refused(tmp_path, name):
+    with pytest.raises(UserError):
+        convert(held_out(views()), tmp_path / "scene", name)
+    assert not list(tmp_path.iterdir())
+
+
+def test_the_views_are_dealt_anew():
+    many = views(count=17)
+    found = dealt({"train": many[:9], "test": many[9:]})
+    assert [view.name for view in found["test"]] == ["9.png", "0.png", "8.png"]
+    assert len(found["train"]) == 14
+
+
+def test_the_command(tmp_path, capsys):
+    scene = write_ball_scene(tmp_path / "ball", views=6, size=24)
+    words = [scene, str(tmp_path / "c"), "--format", "colmap"]
+    assert main(words) == 2 and "--hold-out" in capsys.readouterr().err
+    assert main([*words, "--hold-out"]) == 0
+    read = load_scene(tmp_path / "c", ("train", "test")).splits
+    stored = load_scene(scene, ("train", "test")).splits
+    count = sum(map(len, stored.values()))
+    assert len(read["test"]) == -(-count // 8) and len(read["train"]) == count - len(read["test"])
+    np.testing.assert_array_equal(read["test"][0].image, stored["test"][0].image)
+    assert main(words) == 2 and "exists already" in capsys.readouterr().err

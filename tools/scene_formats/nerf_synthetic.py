@@ -1,0 +1,13 @@
+"""A scene as NeRF-synthetic has it, transforms_<split>.json with RGBA images, and nerfstudio's keys
+for the intrinsics.
+"""
+
+from pathlib import Path
+
+from pp_cl.scene.demo import write_splits
+from pp_cl.scene.views import View
+
+
+def write(folder: Path, splits: dict[str, list[View]]) -> None:
+    """Write the views, under their names with the ending .png."""
+    write_splits(folder, splits)
