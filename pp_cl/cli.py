@@ -16,6 +16,7 @@ COMMANDS = (
     "devices",
     "train",
     "eval",
+    "sweep",
     "info",
     "render",
     "view",

@@ -71,7 +71,7 @@ def _convert(value, example, where):
         if not isinstance(items, (list, tuple)) or len(items) != len(example):
             raise UserError(
                 f"{where}: {value!r} is not {len(example)} values separated by commas, like"
-                f" {_text(example)}"
+                f" {text_of(example)}"
             )
         return tuple(_convert(v, e, where) for v, e in zip(items, example, strict=True))
     kind, convert = KINDS[type(example)]
@@ -126,7 +126,7 @@ def _check(value, where, *, least, most, choices, **_):
     several = isinstance(value, tuple)
     if least is not None and not all(least <= v <= most for v in (value if several else (value,))):
         which = "each" if several else "it"
-        raise UserError(f"{where} = {_text(value)}; {which} must lie in [{least}, {most}]")
+        raise UserError(f"{where} = {text_of(value)}; {which} must lie in [{least}, {most}]")
 
 
 def configure(config: Config, scene: str, given: Iterable[tuple[str, Any, str]] = ()) -> Config:
@@ -174,17 +174,17 @@ def load_config(path: Path | str) -> Config:
     return config
 
 
-def _text(value):
-    """A value as --set takes it."""
+def text_of(value: Any) -> str:
+    """The value of a setting as --set takes it."""
     if isinstance(value, tuple):
-        return ",".join(map(_text, value))
+        return ",".join(map(text_of, value))
     return str(value).lower() if isinstance(value, bool) else str(value)
 
 
 def help_lines() -> list[str]:
     """Lines `section.key = default  (help)` of all settings: the text of `--help`."""
     return [
-        f"  {section}.{item.name} = {_text(item.default)}  ({item.metadata['help']})"
+        f"  {section}.{item.name} = {text_of(item.default)}  ({item.metadata['help']})"
         for section, values in sections(Config())
         for item in dataclasses.fields(values)
     ]

@@ -8,8 +8,8 @@ class UserError(Exception):
 
 
 class Stopped(Exception):
-    """A signal ended a command in good order. The message is one line that says how to go on;
-    status: the exit status, 128 and the signal's number.
+    """A command ended in good order before all was done. The message is one line that says how to
+    go on; status: the exit status, 128 and the number of the signal that ended it, else 1.
     """
 
     def __init__(self, message: str, status: int) -> None:

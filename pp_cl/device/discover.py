@@ -48,6 +48,26 @@ def list_devices() -> list[tuple[str, cl.Device, str | None]]:
     return found
 
 
+def separate_devices() -> list[str]:
+    """Indices "platform:device" of the devices that can work side by side: PP_DEVICE alone if it is
+    set, else the GPUs that work, else one other device. What two platforms list under one name is
+    taken for one. Raises UserError where nothing works.
+    """
+    if os.environ.get("PP_DEVICE"):
+        return [os.environ["PP_DEVICE"]]
+    working = [(i, device) for i, device, problem in list_devices() if problem is None]
+    gpus = {}  # name: {platform: indices}
+    for index, device in working:
+        if device.type & cl.device_type.GPU:
+            platforms = gpus.setdefault(device.name.strip(), {})
+            platforms.setdefault(device.platform.name, []).append(index)
+    if gpus:
+        return [index for platforms in gpus.values() for index in next(iter(platforms.values()))]
+    if not working:
+        open_device()  # says what is wrong
+    return [working[0][0]]
+
+
 def _probe(device):
     try:
         context = cl.Context([device])

@@ -16,7 +16,7 @@ from support.guarded import GuardedDevice
 from pp_cl.device import device as device_module
 from pp_cl.device import discover
 from pp_cl.device.device import Device, describe, kernel_folder
-from pp_cl.device.discover import list_devices, open_device
+from pp_cl.device.discover import list_devices, open_device, separate_devices
 from pp_cl.errors import UserError
 
 TINY = """
@@ -132,6 +132,26 @@ def test_choice_by_index_and_name(listed, monkeypatch, choice, wanted, variable)
     if variable:
         monkeypatch.setenv("PP_DEVICE", choice)
     assert open_device(None if variable else choice) is entries[wanted][1]
+
+
+def test_devices_that_can_work_side_by_side(listed, monkeypatch):
+    """GPUs alone if there are any; what two platforms list under one name is one; a processor is
+    shared by all its platforms.
+    """
+    h200 = [fake("NVIDIA CUDA", "H200", gpu=True, index=f"0:{i}") for i in range(2)]
+    again = [fake("PoCL", "H200 ", gpu=True, index=f"1:{i}") for i in range(2)]
+    broken = fake("C", "other", gpu=True, problem="does not run: x", index="2:0")
+    arc = fake("Intel", "Arc", gpu=True, index="3:0")
+    cpus = [fake("PoCL", "cpu", index="4:0"), fake("Intel", "Xeon", index="5:0")]
+    listed(*cpus, *h200, *again, broken, arc)
+    assert separate_devices() == ["0:0", "0:1", "3:0"]
+    listed(broken, *cpus)
+    assert separate_devices() == ["4:0"]
+    listed(broken)
+    with pytest.raises(UserError, match="no working OpenCL device"):
+        separate_devices()
+    monkeypatch.setenv("PP_DEVICE", "xeon")
+    assert separate_devices() == ["xeon"]
 
 
 def test_an_argument_beats_the_variable(listed, monkeypatch):

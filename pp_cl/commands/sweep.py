@@ -1,0 +1,183 @@
+"""The command pp-cl sweep."""
+
+import argparse
+import sys
+from contextlib import ExitStack
+from pathlib import Path
+
+from pp_cl.commands import options as shared
+from pp_cl.errors import Stopped, UserError
+from pp_cl.presets import PRESETS, SHORT
+
+HELP = "train and measure scenes x settings x seeds, with one table; the same command goes on"
+EPILOG = """\
+Each run is a folder DIR/SCENE/[SETTING/]seed-S, as `pp-cl train` and `pp-cl eval` leave it, with
+what its processes said beside it in seed-S.log. A run that is trained and measured is not run
+again; one that was interrupted goes on from its checkpoint. The table is also in DIR/sweep.json and
+DIR/sweep.md. Exit status: 0 all went well, 1 some runs failed, 2 nothing was run.
+
+  pp-cl sweep lego chair --out sweeps/a --seeds 1,2,3 --vary points.count=100000,200000
+  pp-cl sweep demo --out sweeps/b --vary network.widths=16,16,16/32,32,32 --set train.crop=128
+
+With --scheduler the runs go to the workers of a Dask cluster, which must see SCENE and DIR under
+the same paths. Who can reach a scheduler can run anything on its workers, so bind both to loopback,
+or use Dask's certificates:
+
+  dask scheduler --host 127.0.0.1
+  PP_DEVICE=0:0 dask worker tcp://127.0.0.1:8786 --host 127.0.0.1 --nthreads 1
+  pp-cl sweep lego --out sweeps/a --scheduler tcp://127.0.0.1:8786
+"""
+PATIENCE = 600  # seconds that trainings have to write their checkpoints when the sweep is stopped
+MOST_WORKERS = 256
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the command's options."""
+    add = parser.add_argument
+    add("scenes", nargs="+", metavar="SCENE", help="folder of a scene, or the word demo")
+    add("--out", required=True, metavar="DIR", help="folder of the runs and the table")
+    add("--seeds", default="0", metavar="A,B", help="a run for each (0)")
+    add("--preset", choices=PRESETS, help="as of `pp-cl train` (tiny)")
+    add("--iterations", metavar="N", help="steps of each training")
+    shared.add_set(parser, "a setting of all runs, as of `pp-cl train`")
+    add(
+        "--vary",
+        action="append",
+        default=[],
+        metavar="SECTION.KEY=A,B",
+        help="a run for each value; / separates values that are lists; several --vary: every"
+        " combination",
+    )
+    add("--workers", metavar="N", help="runs at the same time (one for each device that works)")
+    add("--scheduler", metavar="ADDRESS", help="of a Dask cluster, instead of own workers")
+    shared.add_metrics(parser)
+    add("--dry-run", action="store_true", help="list the runs, start nothing")
+    add("--json", metavar="FILE", help="write what DIR/sweep.json holds there, too")
+
+
+def run(options: argparse.Namespace) -> None:
+    """Run what is missing, print the table. Raises Stopped where runs failed."""
+    from pp_cl.sweep.table import text_table, write_tables
+
+    jobs, out = _jobs(options), Path(options.out)
+    if options.dry_run:
+        _print_plan(jobs)
+        return
+    rows = {job.folder: row for job in jobs if (row := _finished(job)[0])}
+    missing = [job for job in jobs if job.folder not in rows]
+    print(f"{len(jobs)} runs, {len(rows)} of them finished already", flush=True)
+    out.mkdir(parents=True, exist_ok=True)
+    if missing:
+        rows |= _run(options, missing, len(rows))
+    ordered = [_relative(rows[job.folder], out) for job in jobs]
+    write_tables(out, ordered, options.json)
+    print(text_table(ordered))
+    print(f"wrote {out / 'sweep.json'} and {out / 'sweep.md'}")
+    failed = sum("error" in row for row in ordered)
+    if failed:
+        raise Stopped(f"{failed} of {len(jobs)} runs failed; the same command tries them again", 1)
+
+
+def _jobs(options):
+    """The runs that the options ask for. Raises UserError."""
+    from pp_cl.files.run_folder import RunFolder
+    from pp_cl.sweep.plan import plan, read_seeds, read_varied
+
+    if options.scheduler and options.workers:
+        raise UserError("--workers: the cluster of --scheduler has its own; leave one of both out")
+    _workers(options, 0)
+    if options.json and not Path(options.json).resolve().parent.is_dir():
+        raise UserError(f"--json {options.json}: no such folder; make it first")
+    if RunFolder(options.out).config.exists():
+        raise UserError(f"--out {options.out}: is the folder of a run; choose another")
+    given = shared.read_set(options.set)
+    if options.iterations:
+        given = [(SHORT["iterations"], options.iterations, "--iterations"), *given]
+    jobs, notes = plan(
+        options.scenes,
+        options.out,
+        read_seeds(options.seeds),
+        read_varied(options.vary),
+        given=given,
+        preset_name=options.preset,
+        metrics=shared.read_metrics(options.metrics),
+    )
+    for note in notes:
+        print(f"pp-cl: {note}", file=sys.stderr)
+    return jobs
+
+
+def _workers(options, devices):
+    """The number of --workers, else of the devices."""
+    if options.workers is None:
+        return devices
+    return shared.read_number("--workers", options.workers, int, least=1, most=MOST_WORKERS)
+
+
+def _finished(job):
+    """(row or None, why the folder cannot be used or None)."""
+    from pp_cl.sweep.result import finished_row
+
+    try:
+        return finished_row(job), None
+    except UserError as error:
+        return None, str(error)
+
+
+def _print_plan(jobs):
+    """What would be run, and what has been."""
+    from pp_cl.sweep.result import progress
+    from pp_cl.sweep.table import values_text
+
+    done = 0
+    for job in jobs:
+        row, problem = _finished(job)
+        done += row is not None
+        if row:
+            state = f"finished: {values_text(row)}"
+        elif problem:
+            state = f"will fail: {problem}"
+        else:
+            state = f"to go on: {progress(job)}" if job.lock.exists() else "to do"
+        print(f"{job}: {state}")
+    print(f"{len(jobs)} runs, {done} of them finished already; nothing was started")
+
+
+def _run(options, jobs, done):
+    """{folder: row} of the jobs. Raises Stopped after Ctrl-C or SIGTERM."""
+    from pp_cl.commands.live_table import LiveTable
+    from pp_cl.commands.signals import first_signal
+    from pp_cl.device.discover import separate_devices
+    from pp_cl.sweep.cluster import await_ends, client_of, local_client, run_jobs
+    from pp_cl.sweep.task import prepare
+
+    rows = {}
+    with ExitStack() as stack:
+        caught = stack.enter_context(first_signal())
+        prepare(jobs)
+        if options.scheduler:
+            client = stack.enter_context(client_of(options.scheduler))
+        else:
+            devices = separate_devices()
+            workers = min(_workers(options, len(devices)), len(jobs))
+            client = stack.enter_context(local_client(devices, workers))
+        table = LiveTable(sys.stderr, jobs, done)
+
+        def on_row(job, row):
+            rows[job.folder] = row
+            table.end(row)
+
+        run_jobs(client, jobs, on_row=on_row, on_tick=table.tick, is_stopped=lambda: bool(caught))
+        if len(rows) < len(jobs):
+            for job in await_ends(table.at_work(), PATIENCE):
+                print(f"pp-cl: {job.folder}: a process still works there", file=sys.stderr)
+            left = len(jobs) - len(rows)
+            raise Stopped(
+                f"stopped with {left} runs left; the same command goes on", 128 + caught[0]
+            )
+    return rows
+
+
+def _relative(row, out):
+    """The row with its folder as seen from `out`, which may be moved."""
+    return row | {"folder": Path(row["folder"]).relative_to(out.resolve()).as_posix()}

@@ -1,0 +1,1 @@
+"""Many trainings with one table: scenes x settings x seeds, shared out by Dask."""

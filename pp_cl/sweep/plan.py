@@ -1,0 +1,196 @@
+"""The runs of a sweep: scenes x settings x seeds, and the folder of each."""
+
+import dataclasses
+import itertools
+import json
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from pp_cl.config import Config, assign, configure, preset, sections, text_of
+from pp_cl.errors import UserError
+from pp_cl.presets import RENAMED
+from pp_cl.scene.open import DEMO
+
+Given = tuple[str, str, str]  # key, text of the value, origin, as run.run_config takes them
+
+# Settings that tell the runs of a sweep apart by other means: what to write instead.
+TAKEN = {"train.seed": "--seeds", "scene.path": "more scenes as arguments"}
+
+
+@dataclass(frozen=True)
+class Job:
+    """A run of a sweep. scene: absolute folder, or demo; name: the scene in the table. varied:
+    (key, text of the value) of what differs between the settings; given: all that is set. folder:
+    of the run, absolute; iterations: of its training.
+    """
+
+    scene: str
+    name: str
+    varied: tuple[tuple[str, str], ...]
+    seed: int
+    folder: str
+    preset: str | None
+    given: tuple[Given, ...]
+    metrics: tuple[str, ...]
+    iterations: int
+
+    def __str__(self) -> str:
+        return " ".join(filter(None, [self.name, self.setting, f"seed {self.seed}"]))
+
+    @property
+    def setting(self) -> str:
+        """What is varied, as the table shows it; empty where nothing is."""
+        return " ".join(f"{key}={text}" for key, text in self.varied)
+
+    @property
+    def log(self) -> Path:
+        """What the run's processes say, beside its folder."""
+        return Path(f"{self.folder}.log")
+
+    @property
+    def lock(self) -> Path:
+        """File that the process which works in the folder holds locked."""
+        return Path(self.folder) / ".lock"
+
+    def to_json(self) -> str:
+        """One line that from_json() reads."""
+        return json.dumps(dataclasses.asdict(self))
+
+    @classmethod
+    def from_json(cls, text: str) -> "Job":
+        """The job of a line of to_json()."""
+        values = json.loads(text)
+        for name in ("varied", "given"):
+            values[name] = tuple(map(tuple, values[name]))
+        return cls(**values | {"metrics": tuple(values["metrics"])})
+
+
+def read_varied(texts: Sequence[str]) -> list[tuple[str, list[str]]]:
+    """[(key, texts of the values)] of the texts of --vary: values are separated by commas, those of
+    a setting that is a list itself by slashes. Raises UserError naming what makes no sense.
+    """
+    varied: dict[str, list[str]] = {}
+    for text in texts:
+        key, equals, values = (part.strip() for part in text.partition("="))
+        if not equals or not values:
+            raise UserError(f"--vary {text}: write --vary section.key=value,value")
+        key = RENAMED.get(key, key)
+        if key in varied:
+            raise UserError(f"--vary {text}: {key} is varied already; write its values in one")
+        _check_free(key, f"--vary {text}")
+        parts = values.split("/" if isinstance(_value(Config(), key), tuple) else ",")
+        varied[key] = [_canonical(key, part.strip()) for part in parts]
+        twice = [value for value in varied[key] if varied[key].count(value) > 1]
+        if twice:
+            raise UserError(f"--vary {text}: {twice[0]} stands there twice")
+    return list(varied.items())
+
+
+def _canonical(key, text):
+    """The value's text as the program writes it: 1e3 and 1000 are one value."""
+    config = preset("tiny")
+    assign(config, key, text, "--vary")
+    return text_of(_value(config, key))
+
+
+def _value(config, key):
+    """The value of section.key; None where there is no such setting."""
+    section, _, name = key.partition(".")
+    return getattr(dict(sections(config)).get(section), name, None)
+
+
+def _check_free(key, origin):
+    if key in TAKEN:
+        raise UserError(f"{origin}: {key} cannot be set in a sweep; write {TAKEN[key]}")
+
+
+def read_seeds(text: str) -> list[int]:
+    """The seeds of --seeds, ascending, each once. Raises UserError for what is no seed."""
+    seeds = set()
+    for word in text.split(","):
+        config = preset("tiny")
+        configure(config, DEMO, [("train.seed", word.strip(), "--seeds")])
+        seeds.add(config.train.seed)
+    return sorted(seeds)
+
+
+def plan(
+    scenes: Sequence[str],
+    out: Path | str,
+    seeds: Sequence[int],
+    varied: Sequence[tuple[str, list[str]]],
+    *,
+    given: Sequence[Given] = (),
+    preset_name: str | None = None,
+    metrics: Sequence[str] = ("psnr", "ssim"),
+) -> tuple[list[Job], list[str]]:
+    """(jobs, notes on old names of settings): scene by scene, setting by setting, seed by seed.
+
+    given: what all runs share. Raises UserError for scenes that are missing or share a name, and
+    for settings that make no sense.
+    """
+    for key, _, origin in given:
+        _check_free(RENAMED.get(key, key), origin)
+        if RENAMED.get(key, key) in dict(varied):
+            raise UserError(f"{origin} {key}: is varied too; leave one of both out")
+    names, jobs, notes = _names(scenes), [], []
+    keys = [key for key, _ in varied]
+    for scene, name in names.items():
+        for values in itertools.product(*(values for _, values in varied)):
+            setting = tuple(zip(keys, values, strict=True))
+            own = [(key, text, "--vary") for key, text in setting]
+            config = configure(preset(preset_name or "tiny"), scene, [*given, *own])
+            notes = config.notes
+            for seed in seeds:
+                everything = (*given, *own, ("train.seed", str(seed), "--seeds"))
+                jobs.append(
+                    Job(
+                        config.scene.path,
+                        name,
+                        setting,
+                        seed,
+                        str(_folder(Path(out).resolve(), name, setting, seed)),
+                        preset_name,
+                        everything,
+                        tuple(metrics),
+                        config.train.iterations,
+                    )
+                )
+    _check_folders(jobs)
+    return jobs, notes
+
+
+def _names(scenes):
+    """{scene: name}, in order. Names must differ, also where the file system ignores case."""
+    names = {}
+    for scene in scenes:
+        if scene != DEMO and not Path(scene).is_dir():
+            raise UserError(f"{scene}: no such folder; SCENE is a folder, or the word demo")
+        name = DEMO if scene == DEMO else Path(scene).resolve().name
+        for other, taken in names.items():
+            if taken.casefold() == name.casefold():
+                raise UserError(
+                    f"{scene}: is called {name}, as {other} is, and runs are kept under the name;"
+                    " rename one, or sweep it into another --out"
+                )
+        names[scene] = name
+    return names
+
+
+def _folder(out, name, setting, seed):
+    slug = "_".join(f"{key}={re.sub('[^a-zA-Z0-9.+-]', '-', text)}" for key, text in setting)
+    return out.joinpath(name, *([slug] if slug else []), f"seed-{seed}")
+
+
+def _check_folders(jobs):
+    """Values that differ only in what a file name cannot hold would share a folder."""
+    taken = {}
+    for job in jobs:
+        other = taken.setdefault(job.folder.casefold(), job)
+        if other is not job:
+            raise UserError(
+                f"--vary: {job.setting} and {other.setting} would share the folder {job.folder};"
+                " sweep them into two --out"
+            )

@@ -1,0 +1,137 @@
+"""The table of a sweep: means over seeds, means over scenes, as text, Markdown and JSON."""
+
+import math
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+from pp_cl.files.atomic import write_json, write_text
+
+Row = dict[str, Any]  # of a run, see sweep/result.py, or of means
+
+# column: (key of a row, text of its value)
+DECIMALS: dict[str, tuple[str, Callable[[float], str]]] = {
+    "PSNR": ("psnr", "{:.2f}".format),
+    "SSIM": ("ssim", "{:.4f}".format),
+    "LPIPS": ("lpips", "{:.4f}".format),
+    "points": ("points", "{:.0f}".format),
+    "seconds": ("seconds", "{:.1f}".format),
+}
+MEASURED = tuple(key for key, _ in DECIMALS.values())
+
+
+def scene_means(rows: Sequence[Row]) -> list[Row]:
+    """{"scene", "settings", "runs", "failed"} and the means over the seeds that went well, for each
+    scene and setting, in the order of the rows.
+    """
+    groups: dict[tuple, list[Row]] = {}
+    for row in rows:
+        groups.setdefault((row["scene"], *row["settings"].items()), []).append(row)
+    means = []
+    for group in groups.values():
+        good = [row for row in group if "error" not in row]
+        head = {"scene": group[0]["scene"], "settings": group[0]["settings"]}
+        counts = {"runs": len(good), "failed": len(group) - len(good)}
+        means.append(head | counts | _mean(good))
+    return means
+
+
+def overall_means(means: Sequence[Row]) -> list[Row]:
+    """{"settings", "scenes", "missing"} and the means over the scenes, each of which counts the
+    same, for each setting of scene_means(). missing: scenes without a run that went well.
+    """
+    groups: dict[tuple, list[Row]] = {}
+    for row in means:
+        groups.setdefault(tuple(row["settings"].items()), []).append(row)
+    overall = []
+    for group in groups.values():
+        good = [row for row in group if row["runs"]]
+        counts = {"scenes": len(good), "missing": len(group) - len(good)}
+        overall.append({"settings": group[0]["settings"]} | counts | _mean(good))
+    return overall
+
+
+def _mean(rows):
+    """{key: mean} of what is measured; a key that a row lacks is left out."""
+    columns = {key: [row.get(key) for row in rows] for key in MEASURED}
+    return {
+        key: math.fsum(values) / len(values)
+        for key, values in columns.items()
+        if values and None not in values
+    }
+
+
+def cells(rows: Sequence[Row]) -> list[list[str]]:
+    """The table's lines, the head first: a line for each scene and setting, and for several scenes
+    a line for the mean of each setting.
+    """
+    means = scene_means(rows)
+    overall = overall_means(means)
+    shown = [name for name, (key, _) in DECIMALS.items() if any(key in row for row in means)]
+    varies = any(row["settings"] for row in means)
+    lines = [["scene", *(["setting"] if varies else []), "runs", *shown]]
+    entries = [(row["scene"], row["runs"], row["failed"], row) for row in means]
+    if len({row["scene"] for row in means}) > 1:
+        entries += [("mean", row["scenes"], row["missing"], row) for row in overall]
+    for name, good, bad, row in entries:
+        what = " scenes" if name == "mean" else ""
+        count = f"{good} of {good + bad}{what}" if bad else f"{good}{what}"
+        setting = [setting_text(row)] if varies else []
+        values = [text(row[key]) if key in row else "-" for key, text in map(DECIMALS.get, shown)]
+        lines.append([name, *setting, count, *values])
+    return lines
+
+
+def setting_text(row: Row) -> str:
+    """What is varied in a row, as --vary takes it."""
+    return " ".join(f"{key}={text}" for key, text in row["settings"].items())
+
+
+def text_table(rows: Sequence[Row]) -> str:
+    """The table in columns: words to the left, numbers to the right."""
+    lines = cells(rows)
+    words = lines[0].index("runs") + 1
+    widths = [max(map(len, column)) for column in zip(*lines, strict=True)]
+    return "\n".join(
+        "  ".join(
+            cell.ljust(width) if i < words else cell.rjust(width)
+            for i, (cell, width) in enumerate(zip(line, widths, strict=True))
+        ).rstrip()
+        for line in lines
+    )
+
+
+def markdown(rows: Sequence[Row]) -> str:
+    """The table as Markdown, and below it what failed."""
+    head, *lines = cells(rows)
+    words = head.index("runs") + 1
+    rule = ["---" if i < words else "---:" for i in range(len(head))]
+    table = "".join(f"| {' | '.join(map(_escaped, line))} |\n" for line in [head, rule, *lines])
+    failed = [f"- {_escaped(run_text(r))}: {_escaped(r['error'])}\n" for r in rows if "error" in r]
+    return table + ("\nFailed:\n\n" + "".join(failed) if failed else "")
+
+
+def run_text(row: Row) -> str:
+    """The run of a row: scene, setting and seed."""
+    return " ".join(filter(None, [row["scene"], setting_text(row), f"seed {row['seed']}"]))
+
+
+def values_text(row: Row) -> str:
+    """What was measured of a run, or why it failed, in one line."""
+    if "error" in row:
+        return f"failed: {row['error']}"
+    present = {name: pair for name, pair in DECIMALS.items() if row.get(pair[0]) is not None}
+    return ", ".join(f"{name} {text(row[key])}" for name, (key, text) in present.items())
+
+
+def _escaped(text):
+    return text.replace("|", "\\|")
+
+
+def write_tables(out: Path, rows: Sequence[Row], more: str | None = None) -> None:
+    """Write sweep.json and sweep.md of the rows to the folder; `more`: another JSON file."""
+    means = scene_means(rows)
+    content = {"runs": list(rows), "scenes": means, "mean": overall_means(means)}
+    for file in filter(None, [out / "sweep.json", more]):
+        write_json(file, content)
+    write_text(out / "sweep.md", markdown(rows))

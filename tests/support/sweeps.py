@@ -1,0 +1,45 @@
+"""Runs of a sweep: planned ones, and folders of runs that look trained and measured."""
+
+import json
+
+from support.runs import SETTINGS
+
+from pp_cl.files.run_folder import RunFolder
+from pp_cl.run import run_config
+from pp_cl.sweep.plan import plan
+
+ITERATIONS = 16
+SETS = SETTINGS | {"train.iterations": ITERATIONS, "train.checkpoint_every": 4}
+SETS |= {"train.previews": 0, "scene.downscale": 2}
+GIVEN = [(key, str(value), "--set") for key, value in SETS.items()]
+
+
+def jobs_of(scenes, out, seeds=(0,), varied=(), **options):
+    """The planned runs of a sweep with the small settings."""
+    return plan([str(s) for s in scenes], out, seeds, varied, **{"given": GIVEN} | options)[0]
+
+
+def words_of(scenes, out, *more, changes=None):
+    """Command line of the same sweep, with other settings where there are changes."""
+    settings = SETS | (changes or {})
+    sets = [word for key, value in settings.items() for word in ("--set", f"{key}={value}")]
+    return ["sweep", *map(str, scenes), "--out", str(out), *sets, *map(str, more)]
+
+
+def pretend(job, psnr, ssim=0.5, *, points=10, seconds=2.0, step=None, finished=True):
+    """Write the folder of a run as its training and its evaluation would leave it."""
+    folder = RunFolder(job.folder)
+    folder.create(run_config(folder, job.scene, job.preset, job.given).to_json())
+    header = {"scene": "", "initial_points": 20, "grid": {}, "depth_range": [1, 2]}
+    folder.save(header | {"step": job.iterations, "finished": finished}, {})
+    with folder.open_log(0) as log:
+        log.write({"step": job.iterations, "seconds": seconds, "finished": finished})
+    folder.evaluation("test").mkdir()
+    measured = {
+        "mean": {"psnr": psnr, "ssim": ssim},
+        "finished": finished,
+        "step": job.iterations if step is None else step,
+        "points": {"final": points},
+        "device": "a device",
+    }
+    (folder.evaluation("test") / "metrics.json").write_text(json.dumps(measured))

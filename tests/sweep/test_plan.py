@@ -1,0 +1,147 @@
+"""Which runs a sweep has, and where."""
+
+import pytest
+from support.sweeps import jobs_of
+
+from pp_cl.errors import UserError
+from pp_cl.sweep.plan import Job, plan, read_seeds, read_varied
+
+
+@pytest.fixture
+def scenes(tmp_path):
+    """Two folders, a and b."""
+    folders = [tmp_path / "scenes" / name for name in "ab"]
+    for folder in folders:
+        folder.mkdir(parents=True)
+    return folders
+
+
+def refused(call, *words):
+    """The call fails with one line that has all the words."""
+    with pytest.raises(UserError) as caught:
+        call()
+    message = str(caught.value)
+    assert "\n" not in message
+    for word in words:
+        assert word in message, message
+
+
+def test_every_combination_is_a_run_of_its_own(tmp_path, scenes):
+    varied = read_varied(["points.count=1e3,2000", "network.widths=16,16,16/32,32,32"])
+    assert varied == [
+        ("points.count", ["1000", "2000"]),
+        ("network.widths", ["16,16,16", "32,32,32"]),
+    ]
+    jobs = jobs_of(scenes, tmp_path / "out", [1, 5], varied, given=[])
+    assert len(jobs) == len({job.folder for job in jobs}) == 2 * 2 * 2 * 2
+    slugs = [
+        f"points.count={count}_network.widths={width}-{width}-{width}"
+        for count in (1000, 2000)
+        for width in (16, 32)
+    ]
+    expected = [(s, slug, seed) for s in "ab" for slug in slugs for seed in (1, 5)]
+    out = tmp_path / "out"
+    assert [job.folder for job in jobs] == [
+        str(out / scene / slug / f"seed-{seed}") for scene, slug, seed in expected
+    ]
+    job = jobs[2]
+    assert job.setting == "points.count=1000 network.widths=32,32,32" and job.seed == 1
+    assert str(job) == "a points.count=1000 network.widths=32,32,32 seed 1"
+    assert [given[:2] for given in job.given] == [
+        ("points.count", "1000"),
+        ("network.widths", "32,32,32"),
+        ("train.seed", "1"),
+    ]
+
+
+def test_nothing_varied_needs_no_folder_of_the_setting(tmp_path, scenes):
+    (job,) = jobs_of(scenes[:1], tmp_path / "out", [3])
+    assert job.folder == str(tmp_path / "out" / "a" / "seed-3")
+    assert job.setting == "" and str(job) == "a seed 3"
+    assert job.log == tmp_path / "out" / "a" / "seed-3.log"
+
+
+def test_a_job_survives_its_way_to_a_process(tmp_path, scenes):
+    varied = [("raster.tau", ["0.5"])]
+    (job,) = jobs_of(scenes[:1], tmp_path, [3], varied, metrics=("psnr",), preset_name="small")
+    line = job.to_json()
+    assert "\n" not in line and Job.from_json(line) == job
+
+
+def test_iterations_are_those_of_preset_and_settings(tmp_path, scenes):
+    assert jobs_of(scenes, tmp_path, given=[], preset_name="small")[0].iterations == 20_000
+    varied = [("train.iterations", ["7", "9"])]
+    jobs = jobs_of(scenes[:1], tmp_path, varied=varied, given=[])
+    assert [job.iterations for job in jobs] == [7, 9]
+
+
+def test_an_old_key_is_varied_under_its_new_name_and_noted(tmp_path, scenes):
+    assert read_varied(["train.average=true,false"]) == [("train.ema", ["true", "false"])]
+    _, notes = plan(["demo"], tmp_path, [0], [], given=[("train.average", "true", "--set")])
+    assert notes == ["--set: train.average is called train.ema now"]
+
+
+@pytest.mark.parametrize("text, seeds", [("0", [0]), ("3,1,3, 2", [1, 2, 3]), ("1e2", [100])])
+def test_seeds(text, seeds):
+    assert read_seeds(text) == seeds
+
+
+@pytest.mark.parametrize("text", ["", "1,", "1.5", "-1", "a", "nan", "inf"])
+def test_what_is_no_seed(text):
+    refused(lambda: read_seeds(text), "train.seed")
+
+
+@pytest.mark.parametrize(
+    "texts, words",
+    [
+        (["points.count"], ["section.key=value"]),
+        (["points.count="], ["section.key=value"]),
+        (["points.none=1"], ["unknown key", "points.none"]),
+        (["none.count=1"], ["unknown key", "none.count"]),
+        (["count=1"], ["unknown key", "count"]),
+        (["points.count=1,x"], ["points.count", "'x'", "whole number"]),
+        (["points.count=1,,2"], ["points.count", "''"]),
+        (["points.count=1000,1e3"], ["1000", "twice"]),
+        (["network.widths=16,16"], ["network.widths", "3 values"]),
+        (["network.widths=16,16,16/"], ["network.widths", "3 values"]),
+        (["points.count=1", "points.count=2"], ["varied already"]),
+        (["train.ema=true", "train.average=false"], ["train.ema", "varied already"]),
+        (["train.seed=1,2"], ["train.seed", "--seeds"]),
+        (["scene.path=a,b"], ["scene.path", "arguments"]),
+        (["train.sh_rate=nan"], ["train.sh_rate"]),
+    ],
+)
+def test_what_cannot_be_varied(texts, words):
+    refused(lambda: read_varied(texts), "--vary", *words)
+
+
+@pytest.mark.parametrize("key", ["train.seed", "scene.path"])
+def test_what_tells_runs_apart_cannot_be_set(tmp_path, key):
+    refused(lambda: jobs_of(["demo"], tmp_path, given=[(key, "1", "--set")]), "--set", key)
+
+
+def test_a_value_out_of_bounds_is_refused_before_anything_runs(tmp_path):
+    varied = read_varied(["points.count=5,0"])
+    refused(lambda: jobs_of(["demo"], tmp_path, varied=varied, given=[]), "points.count = 0")
+    given = [("points.count", "5", "--set")]
+    refused(lambda: jobs_of(["demo"], tmp_path, varied=varied, given=given), "is varied too")
+
+
+def test_scenes_that_cannot_be_told_apart(tmp_path, scenes):
+    for name in ("a", "A", "demo"):
+        (tmp_path / "other" / name).mkdir(parents=True)
+    refused(lambda: jobs_of([scenes[0], tmp_path / "other" / "a"], tmp_path), "other/a", "rename")
+    refused(lambda: jobs_of([scenes[0], tmp_path / "other" / "A"], tmp_path), "other/A", "rename")
+    refused(lambda: jobs_of([scenes[0], f"{scenes[0]}/../a"], tmp_path), "rename")
+    refused(lambda: jobs_of(["demo", tmp_path / "other" / "demo"], tmp_path), "rename")
+
+
+def test_a_scene_that_is_not_there(tmp_path):
+    refused(lambda: jobs_of([tmp_path / "none"], tmp_path), str(tmp_path / "none"), "no such")
+
+
+def test_values_that_one_folder_would_hold(tmp_path, monkeypatch):
+    """No setting of today takes such words."""
+    varied = [("scene.mask_from", ["a/b", "a:b"])]
+    monkeypatch.setattr("pp_cl.config._check", lambda *_, **__: None)
+    refused(lambda: jobs_of(["demo"], tmp_path, varied=varied), "a/b", "a:b", "share the folder")

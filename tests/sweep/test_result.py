@@ -1,0 +1,115 @@
+"""What a run's folder tells of it."""
+
+import json
+
+import pytest
+from support.sweeps import ITERATIONS, jobs_of, pretend
+
+from pp_cl.errors import UserError
+from pp_cl.files.run_folder import RunFolder
+from pp_cl.sweep.result import finished_row, progress
+
+
+@pytest.fixture
+def job(tmp_path):
+    """A planned run of the demo."""
+    return jobs_of(["demo"], tmp_path / "out", [4])[0]
+
+
+def metrics_file(job):
+    return RunFolder(job.folder).evaluation("test") / "metrics.json"
+
+
+def test_a_run_that_is_trained_and_measured(job):
+    pretend(job, 21.5, 0.75, points=7, seconds=12.5)
+    assert finished_row(job) == {
+        "scene": "demo",
+        "settings": {},
+        "seed": 4,
+        "folder": job.folder,
+        "psnr": 21.5,
+        "ssim": 0.75,
+        "points": 7,
+        "device": "a device",
+        "seconds": 12.5,
+    }
+
+
+def test_no_folder_no_row(job):
+    assert finished_row(job) is None
+
+
+def test_a_training_that_is_not_at_its_end(job):
+    pretend(job, 21.5, finished=False)
+    assert finished_row(job) is None
+
+
+def test_a_measurement_of_an_earlier_checkpoint(job):
+    pretend(job, 21.5, step=3)
+    assert finished_row(job) is None
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        lambda result: result["mean"].pop("ssim"),
+        lambda result: result["mean"].update(psnr=float("nan")),
+        lambda result: result["mean"].update(psnr=float("inf")),
+        lambda result: result["mean"].update(psnr=None),
+        lambda result: result.update(mean=[1, 2]),
+        lambda result: result.pop("points"),
+        lambda result: result.update(finished=False),
+    ],
+)
+def test_a_measurement_that_is_not_whole_is_made_again(job, change):
+    pretend(job, 21.5)
+    result = json.loads(metrics_file(job).read_text())
+    change(result)
+    metrics_file(job).write_text(json.dumps(result))
+    assert finished_row(job) is None
+
+
+@pytest.mark.parametrize("text", ["", "[]", "{", "[" * 100_000, "\0"])
+def test_a_broken_measurement_is_made_again(job, text):
+    pretend(job, 21.5)
+    metrics_file(job).write_text(text)
+    assert finished_row(job) is None
+
+
+def test_more_metrics_than_asked_for_are_left_out(job, tmp_path):
+    pretend(job, 21.5)
+    (fewer,) = jobs_of(["demo"], tmp_path / "out", [4], metrics=["psnr"])
+    assert "ssim" not in finished_row(fewer) and finished_row(fewer)["psnr"] == 21.5
+    (more,) = jobs_of(["demo"], tmp_path / "out", [4], metrics=["psnr", "lpips"])
+    assert finished_row(more) is None
+
+
+def test_a_lost_log_leaves_the_seconds_unknown(job):
+    pretend(job, 21.5)
+    RunFolder(job.folder).log.unlink()
+    assert finished_row(job)["seconds"] is None
+
+
+def test_other_settings_in_the_folder_are_refused(job, tmp_path):
+    pretend(job, 21.5)
+    (other,) = jobs_of(["demo"], tmp_path / "out", [4], given=[("points.count", "9", "--set")])
+    with pytest.raises(UserError, match="points.count is 1500 there, 9 asked for"):
+        finished_row(other)
+
+
+def test_a_broken_checkpoint_is_refused(job):
+    pretend(job, 21.5)
+    RunFolder(job.folder).checkpoint.write_bytes(b"PK")
+    with pytest.raises(UserError, match=r"checkpoint\.npz"):
+        finished_row(job)
+
+
+def test_progress_by_the_log(job):
+    assert progress(job) == "beginning"
+    folder = RunFolder(job.folder)
+    folder.previews.mkdir(parents=True)
+    with folder.open_log(0) as log:
+        log.write({"step": 5, "seconds": 1.0, "psnr": 20.26})
+        assert progress(job) == f"step 5 of {ITERATIONS}, PSNR 20.3"
+        log.write({"step": ITERATIONS, "seconds": 2.0, "finished": True})
+    assert progress(job) == "evaluating"

@@ -1,0 +1,163 @@
+"""The arithmetic of a sweep's table, and how it looks."""
+
+import json
+
+import pytest
+
+from pp_cl.sweep.table import (
+    cells,
+    markdown,
+    overall_means,
+    scene_means,
+    text_table,
+    values_text,
+    write_tables,
+)
+
+
+def row(scene, seed, psnr=None, ssim=0.5, points=100, seconds=1.0, *, setting=None, error=None):
+    """The row of a run; a failed one without psnr."""
+    head = {"scene": scene, "settings": setting or {}, "seed": seed, "folder": f"{scene}/{seed}"}
+    if psnr is None:
+        return head | {"error": error or "broken"}
+    measured = {"psnr": psnr, "ssim": ssim, "points": points, "device": "d", "seconds": seconds}
+    return head | measured
+
+
+ROWS = [
+    row("a", 1, 20.0, 0.50, points=100, seconds=1.0),
+    row("a", 2, 23.0, 0.75, points=103, seconds=2.0),
+    row("b", 1, 31.0, 0.25, points=11, seconds=10.0),
+    row("b", 2),
+]
+
+
+def test_means_over_seeds_then_over_scenes():
+    """By hand: a (20 + 23) / 2, b 31 alone; scenes count the same whatever their runs."""
+    a, b = scene_means(ROWS)
+    assert a == {
+        "scene": "a",
+        "settings": {},
+        "runs": 2,
+        "failed": 0,
+        "psnr": 21.5,
+        "ssim": 0.625,
+        "points": 101.5,
+        "seconds": 1.5,
+    }
+    assert (b["runs"], b["failed"], b["psnr"]) == (1, 1, 31.0)
+    (overall,) = overall_means([a, b])
+    assert overall == {
+        "settings": {},
+        "scenes": 2,
+        "missing": 0,
+        "psnr": 26.25,
+        "ssim": 0.4375,
+        "points": 56.25,
+        "seconds": 5.75,
+    }
+
+
+def test_the_order_in_which_runs_end_changes_no_mean():
+    values = [0.1, 0.2, 0.3, 1e16, -1e16]
+    forth, back = (
+        scene_means([row("a", i, value) for i, value in enumerate(order)])[0]["psnr"]
+        for order in (values, values[::-1])
+    )
+    assert forth == back == pytest.approx(0.12, rel=1e-15)
+
+
+def test_settings_are_kept_apart():
+    rows = [
+        row(scene, 0, psnr, setting={"points.count": count})
+        for scene, count, psnr in [("a", "5", 1.0), ("a", "6", 2.0), ("b", "5", 3.0)]
+    ]
+    means = scene_means(rows)
+    assert [(m["scene"], m["settings"]["points.count"]) for m in means] == [
+        ("a", "5"),
+        ("a", "6"),
+        ("b", "5"),
+    ]
+    assert [
+        (m["settings"]["points.count"], m["scenes"], m["psnr"]) for m in overall_means(means)
+    ] == [
+        ("5", 2, 2.0),
+        ("6", 1, 2.0),
+    ]
+
+
+def test_a_scene_without_a_good_run_has_no_numbers_and_is_counted_as_missing():
+    means = scene_means([row("a", 1, 20.0), row("b", 1)])
+    assert "psnr" not in means[1] and means[1]["failed"] == 1
+    (overall,) = overall_means(means)
+    assert (overall["scenes"], overall["missing"], overall["psnr"]) == (1, 1, 20.0)
+
+
+def test_unknown_seconds_make_no_mean():
+    (mean,) = scene_means([row("a", 1, 20.0), row("a", 2, 22.0, seconds=None)])
+    assert "seconds" not in mean and mean["psnr"] == 21.0
+
+
+def test_the_printed_table():
+    assert text_table(ROWS).splitlines() == [
+        "scene  runs       PSNR    SSIM  points  seconds",
+        "a      2         21.50  0.6250     102      1.5",
+        "b      1 of 2    31.00  0.2500      11     10.0",
+        "mean   2 scenes  26.25  0.4375      56      5.8",
+    ]
+
+
+def test_one_scene_needs_no_mean_of_scenes():
+    assert [line[0] for line in cells(ROWS[:2])] == ["scene", "a"]
+
+
+def test_the_table_of_failures_alone():
+    assert cells([row("a", 1), row("b", 1)]) == [
+        ["scene", "runs"],
+        ["a", "0 of 1"],
+        ["b", "0 of 1"],
+        ["mean", "0 of 2 scenes"],
+    ]
+
+
+def test_settings_and_lpips_have_columns_where_there_are_any():
+    rows = [ROWS[0] | {"lpips": 0.125, "settings": {"points.count": "5", "train.ema": "true"}}]
+    head, line = cells(rows)
+    assert head == ["scene", "setting", "runs", "PSNR", "SSIM", "LPIPS", "points", "seconds"]
+    assert line[1] == "points.count=5 train.ema=true" and line[5] == "0.1250"
+
+
+def test_markdown_names_what_failed():
+    rows = [*ROWS[:3], row("b|c", 2, error="x | y")]
+    text = markdown(rows).splitlines()
+    assert text[:3] == [
+        "| scene | runs | PSNR | SSIM | points | seconds |",
+        "| --- | --- | ---: | ---: | ---: | ---: |",
+        "| a | 2 | 21.50 | 0.6250 | 102 | 1.5 |",
+    ]
+    assert text[-3:] == ["Failed:", "", "- b\\|c seed 2: x \\| y"]
+    assert "Failed" not in markdown(ROWS[:3])
+
+
+def test_a_run_in_one_line():
+    line = "PSNR 20.00, SSIM 0.5000, points 100, seconds 1.0"
+    assert values_text(ROWS[0]) == line
+    assert values_text(ROWS[0] | {"seconds": None}) == "PSNR 20.00, SSIM 0.5000, points 100"
+    assert values_text(ROWS[3]) == "failed: broken"
+
+
+def test_the_files(tmp_path):
+    write_tables(tmp_path, ROWS, str(tmp_path / "more.json"))
+    stored = json.loads((tmp_path / "sweep.json").read_text())
+    assert stored["runs"] == ROWS
+    assert [mean["psnr"] for mean in stored["scenes"]] == [21.5, 31.0]
+    assert [mean["psnr"] for mean in stored["mean"]] == [26.25]
+    assert (tmp_path / "more.json").read_text() == (tmp_path / "sweep.json").read_text()
+    assert (tmp_path / "sweep.md").read_text() == markdown(ROWS)
+    assert {p.name for p in tmp_path.iterdir()} == {"sweep.json", "sweep.md", "more.json"}
+
+
+def test_nan_is_never_written(tmp_path):
+    with pytest.raises(ValueError, match="JSON"):
+        write_tables(tmp_path, [row("a", 1, float("nan"))])
+    assert not list(tmp_path.iterdir())
