@@ -1,0 +1,211 @@
+"""The reader of CO3D's sequences: PyTorch3D's conventions, set lists, and every kind of bad
+input.
+"""
+
+import gzip
+import json
+
+import numpy as np
+import pytest
+from support.same_scene import held_out, same, views
+from support.transforms_scenes import refused
+
+from pp_cl.files.image import write_png
+from pp_cl.scene.readers.co3d import read_split
+from tools.scene_formats import co3d
+
+ANNOTATIONS = "frame_annotations.jgz"
+
+
+@pytest.fixture
+def sequence(tmp_path):
+    """The folder of a sequence, version 2."""
+    co3d.write(tmp_path, held_out(views()))
+    return tmp_path / "object" / "sequence"
+
+
+def annotations(folder):
+    with gzip.open(folder.parent / ANNOTATIONS, "rt") as file:
+        return json.load(file)
+
+
+def annotate(folder, data):
+    with gzip.open(folder.parent / ANNOTATIONS, "wt") as file:
+        json.dump(data, file)
+
+
+def edit(folder, change):
+    """change(annotation) of the fourth frame."""
+    data = annotations(folder)
+    change(data[3])
+    annotate(folder, data)
+
+
+# --------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("version", [1, 2])
+def test_both_versions_come_back(tmp_path, version):
+    given = held_out(views())
+    co3d.write(tmp_path, given, version)
+    same(tmp_path / "object" / "sequence", given)
+
+
+@pytest.mark.parametrize("size", [(40, 24), (24, 40), (33, 33)])
+@pytest.mark.parametrize("kind", ["ndc_isotropic", "ndc_norm_image_bounds", None])
+def test_projection_follows_pytorch3d(tmp_path, rng, size, kind):
+    """x_camera = x_world R + T with x to the left and y up; NDC of f x / z + p; x_ndc of 1 is the
+    left border where the image is square, and for ndc_isotropic where x is the shorter side.
+    """
+    folder = tmp_path / "apple" / "1_2_3"
+    (folder / "images").mkdir(parents=True)
+    write_png(folder / "images" / "a.png", np.zeros((size[1], size[0], 3)))
+    rotation = np.linalg.qr(rng.normal(size=(3, 3)))[0]
+    rotation *= np.sign(np.linalg.det(rotation))
+    place, focal, centre = np.array([0.1, -0.2, 5.0]), np.array([2.1, 2.3]), np.array([0.05, -0.1])
+    viewpoint = {
+        "R": rotation.tolist(),
+        "T": place.tolist(),
+        "focal_length": focal.tolist(),
+        "principal_point": centre.tolist(),
+        "intrinsics_format": kind,
+    }
+    image = {"path": "apple/1_2_3/images/a.png", "size": [size[1], size[0]]}
+    frame = {"sequence_name": "1_2_3", "frame_number": 4, "image": image, "viewpoint": viewpoint}
+    annotate(folder, [frame])
+    [photograph] = read_split(folder, "test")
+    camera = photograph.camera
+    for point in rng.normal(size=(20, 3)):
+        x, y, z = point @ rotation + place
+        ndc = focal * [x, y] / z + centre
+        scale = np.array(size) / 2 if kind != "ndc_isotropic" else min(size) / 2
+        expected = np.array(size) / 2 - scale * ndc
+        u, v, w = camera.pose[:, :3].T @ (point - camera.eye)
+        found = camera.fx * u / w + camera.cx, camera.fy * v / w + camera.cy
+        np.testing.assert_allclose(found, expected, rtol=0, atol=1e-9)
+    assert photograph.mask is None and (camera.width, camera.height) == size
+
+
+def test_sizes_may_differ_from_frame_to_frame(tmp_path):
+    given = {"train": views(size=(30, 22))[:4] + views(size=(21, 35))[4:8], "test": views()[8:]}
+    co3d.write(tmp_path, given, 1)
+    read = read_split(tmp_path / "object" / "sequence", "train")
+    for photograph, view in zip(read, given["train"], strict=True):
+        for name in ("fx", "fy", "cx", "cy", "width", "height"):
+            expected = getattr(view.stored_camera, name)
+            assert getattr(photograph.camera, name) == pytest.approx(expected, abs=1e-9)
+
+
+def test_set_lists_of_version_1(tmp_path):
+    """Known frames are for training, unseen ones for testing, whatever the other word."""
+    many = views()
+    co3d.write(tmp_path, {"train": many[:6], "test": many[6:]}, 1)
+    folder = tmp_path / "object" / "sequence"
+    file = folder.parent / "set_lists.json"
+    rows = [row for listed in json.loads(file.read_text()).values() for row in listed]
+    lists = {"train_known": rows[:3], "test_known": rows[3:5], "test_unseen": rows[5:7]}
+    lists["train_unseen"] = [["another", 0, "object/another/images/a.png"], *rows[7:8]]
+    file.write_text(json.dumps(lists))
+    assert [len(read_split(folder, split)) for split in ("train", "test")] == [5, 3]
+
+
+def test_the_first_set_list_with_both_splits_counts(sequence):
+    """fewview_train has its training frames among the test frames as well: they are no test."""
+    lists = sequence.parent / "set_lists"
+    many = lists / "set_lists_manyview_dev_0.json"
+    rows = [row for listed in json.loads(many.read_text()).values() for row in listed]
+    few = {"train": rows[:4], "test": rows[:6], "val": rows[6:7]}
+    (lists / "set_lists_fewview_train.json").write_text(json.dumps(few))
+    (lists / "set_lists_fewview_aaa.json").write_text(json.dumps({"train": rows, "test": rows}))
+    assert len(read_split(sequence, "test")) == 2, "many views go first"
+    many.unlink()
+    counts = {split: len(read_split(sequence, split)) for split in ("train", "test", "val")}
+    assert counts == {"train": 4, "test": 2, "val": 1}
+
+
+def test_without_lists_every_eighth_is_held_out(sequence):
+    for file in (sequence.parent / "set_lists").iterdir():
+        file.unlink()
+    numbers = [int(p.name[-10:-4]) for p in read_split(sequence, "test")]
+    assert numbers == [0, 8] and len(read_split(sequence, "train")) == 9
+
+
+def test_frames_with_an_empty_mask_are_left_out(sequence):
+    edit(sequence, lambda frame: frame["mask"].update(mass=0))
+    assert sum(len(read_split(sequence, split)) for split in ("train", "test")) == 10
+
+
+# --------------------------------------------------------------------------------------------------
+
+
+def view_change(**keys):
+    return lambda frame: frame["viewpoint"].update(keys)
+
+
+BAD = {
+    "no viewpoint": (lambda f: f.pop("viewpoint"), "viewpoint", "missing"),
+    "R of another shape": (view_change(R=[[1, 0], [0, 1]]), "R", "3x3"),
+    "R in words": (view_change(R="turned"), "R", "3x3"),
+    "R no rotation": (view_change(R=[[2, 0, 0], [0, 1, 0], [0, 0, 1]]), "no rotation"),
+    "T with NaN": (view_change(T=[0, 0, float("nan")]), "T", "finite"),
+    "one focal length": (view_change(focal_length=[2]), "focal_length", "2 finite numbers"),
+    "focal length 0": (view_change(focal_length=[0, 1]), "focal_length", "above 0"),
+    "principal point": (view_change(principal_point=None), "principal_point"),
+    "unknown NDC": (view_change(intrinsics_format="pixels"), "intrinsics_format", "pixels"),
+    "no image": (lambda f: f.update(image=None), "image", "path"),
+    "image missing": (
+        lambda f: f["image"].update(path="object/sequence/images/x.png"),
+        "no image at",
+    ),
+    "image of another sequence": (
+        lambda f: f["image"].update(path="object/other/images/frame000000.png"),
+        "is not in object/sequence",
+    ),
+    "image outside": (
+        lambda f: f["image"].update(path="object/sequence/../../../x.png"),
+        "leaves the scene's folder",
+    ),
+    "size": (lambda f: f["image"].update(size=[30, 22]), "30x22"),
+    "mask in words": (lambda f: f.update(mask="white"), "mask", "path"),
+    "no frame number": (lambda f: f.pop("frame_number"), "frame_number", "missing"),
+}
+
+
+@pytest.mark.parametrize("case", BAD)
+def test_bad_frame(sequence, case):
+    change, *words = BAD[case]
+    for file in (sequence.parent / "set_lists").iterdir():
+        file.unlink()
+    write_png(sequence.parent.parent.parent / "x.png", np.zeros((22, 30, 3)))
+    edit(sequence, change)
+    refused(sequence, sequence.parent / ANNOTATIONS, *words)
+
+
+BAD_FILES = {
+    "no gzip": (ANNOTATIONS, b"[]", "gzipped"),
+    "cut gzip": (ANNOTATIONS, gzip.compress(b"[" + b"1," * 9999)[:40], "gzipped"),
+    "no JSON": (ANNOTATIONS, gzip.compress(b"{"), "gzipped JSON"),
+    "no list": (ANNOTATIONS, gzip.compress(b"{}"), "list of annotations"),
+    "list of numbers": (ANNOTATIONS, gzip.compress(b"[1, 2]"), "list of annotations"),
+    "another sequence": (ANNOTATIONS, gzip.compress(b"[]"), "no frame of the sequence sequence"),
+    "set list": ("set_lists.json", b'{"train_known": [1]}', "must be lists of"),
+    "set list of numbers": ("set_lists.json", b'{"train_known": 1}', "must be lists of"),
+    "set list in words": ("set_lists.json", b"[]", "must be lists of"),
+    "set list broken": ("set_lists.json", b"{", "line 1"),
+}
+
+
+@pytest.mark.parametrize("case", BAD_FILES)
+def test_bad_file(sequence, case):
+    name, content, word = BAD_FILES[case]
+    (sequence.parent / name).write_bytes(content)
+    refused(sequence, sequence.parent / name, word)
+
+
+def test_annotations_beyond_all_bounds(sequence, monkeypatch):
+    monkeypatch.setattr("pp_cl.scene.readers.co3d.MOST_TEXT", 1000)
+    refused(sequence, "more than 1000 bytes")
+
+
+def test_an_unknown_split(sequence):
+    refused(sequence, "no split val", "test, train", splits=("val",))

@@ -1,0 +1,152 @@
+"""The reader of NeuS's and DTU's format."""
+
+import numpy as np
+import pytest
+from support.same_scene import held_out, same, views
+from support.transforms_scenes import refused
+
+from pp_cl.files.image import write_png
+from pp_cl.scene.readers.neus import read_split
+from tools.scene_formats import neus
+
+FILE = "cameras_sphere.npz"
+
+
+@pytest.fixture
+def scene(tmp_path):
+    neus.write(tmp_path, held_out(views()))
+    return tmp_path
+
+
+def edit(folder, change):
+    """change({name: array}) of the file of cameras."""
+    with np.load(folder / FILE) as stored:
+        arrays = dict(stored)
+    change(arrays)
+    np.savez(folder / FILE, **arrays)
+
+
+# --------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("scale", [1.0, -1.0, 1e-4, 3e5])
+def test_a_projection_is_known_up_to_its_scale(tmp_path, scale):
+    given = held_out(views())
+    neus.write(tmp_path, given)
+    edit(tmp_path, lambda a: a.update({name: scale * matrix for name, matrix in a.items()}))
+    same(tmp_path, given)
+
+
+def test_the_other_name_of_the_file(tmp_path):
+    given = held_out(views())
+    neus.write(tmp_path, given)
+    (tmp_path / FILE).rename(tmp_path / "cameras.npz")
+    same(tmp_path, given)
+
+
+def test_the_sphere_gives_the_depth_range(scene):
+    """Centre (0.1, 0, 0.2), radius 0.5."""
+    matrix = np.diag([0.5, 0.5, 0.5, 1])
+    matrix[:3, 3] = 0.1, 0, 0.2
+    edit(scene, lambda a: a.update({f"scale_mat_{i}": matrix for i in range(11)}))
+    for photograph in read_split(scene, "train"):
+        distance = np.linalg.norm(photograph.camera.eye - [0.1, 0, 0.2])
+        assert photograph.depth_range == pytest.approx((distance - 0.5, distance + 0.5))
+    assert read_split(scene, "test")[0].mask == "mask/000000.png"
+
+
+def test_a_camera_within_the_sphere_sees_from_its_eye_on(scene):
+    matrix = np.diag([10.0, 10, 10, 1])
+    edit(scene, lambda a: a.update({f"scale_mat_{i}": matrix for i in range(11)}))
+    near, far = read_split(scene, "train")[0].depth_range
+    assert near == pytest.approx(1e-2) and far > 10
+
+
+def test_without_masks_the_images_own_alpha_counts(scene):
+    for file in (scene / "mask").iterdir():
+        file.unlink()
+    (scene / "mask").rmdir()
+    assert all(photograph.mask is None for photograph in read_split(scene, "train"))
+
+
+# --------------------------------------------------------------------------------------------------
+
+
+def world(change):
+    """change(matrix) of the third camera."""
+
+    def changed(arrays):
+        arrays["world_mat_2"] = change(arrays["world_mat_2"].copy())
+
+    return changed
+
+
+def entry(row, column, value):
+    def changed(matrix):
+        matrix[row, column] = value
+        return matrix
+
+    return world(changed)
+
+
+def skewed(matrix):
+    """K with 1 % of shear."""
+    matrix[:3] = np.array([[1, 0.01, 0], [0, 1, 0], [0, 0, 1]]) @ matrix[:3]
+    return matrix
+
+
+BAD = {
+    "missing": (lambda a: a.pop("world_mat_2"), "world_mat_2", "missing"),
+    "shape": (world(lambda m: m[:2]), "world_mat_2", "(2, 4)"),
+    "NaN": (entry(0, 0, np.nan), "world_mat_2", "NaN"),
+    "infinite": (entry(0, 3, np.inf), "world_mat_2", "Inf"),
+    "huge": (entry(0, 3, 1e31), "world_mat_2", "huge"),
+    "singular": (world(lambda m: m * [1, 1, 0, 1]), "world_mat_2", "singular"),
+    "zero": (world(np.zeros_like), "world_mat_2", "singular"),
+    "skew": (world(skewed), "world_mat_2", "skew"),
+    "objects": (world(lambda m: np.array([None])), FILE, "cannot be read"),
+    "text": (world(lambda m: np.array("K [R | t]")), "no numbers"),
+    "scale of another shape": (lambda a: a.update(scale_mat_2=np.eye(2)), "scale_mat_2", "(2, 2)"),
+    "scale 0": (lambda a: a.update(scale_mat_2=np.zeros((4, 4))), "scale_mat_2", "no scaling"),
+    "scale sheared": (
+        lambda a: a.update(scale_mat_2=np.diag([1.0, 2, 1, 1])),
+        "scale_mat_2",
+        "no scaling",
+    ),
+}
+
+
+@pytest.mark.parametrize("case", BAD)
+def test_bad_cameras(scene, case):
+    change, *words = BAD[case]
+    edit(scene, change)
+    refused(scene, scene / FILE, *words)
+
+
+@pytest.mark.parametrize("content", [b"", b"PK", b"\x93NUMPY", b"\0" * 200])
+def test_a_broken_file(scene, content):
+    (scene / FILE).write_bytes(content)
+    refused(scene, scene / FILE, "copy it anew")
+
+
+def test_a_file_that_was_cut(scene):
+    data = (scene / FILE).read_bytes()
+    (scene / FILE).write_bytes(data[: len(data) // 2])
+    refused(scene, scene / FILE, "copy it anew")
+
+
+def test_more_images_than_cameras(scene):
+    write_png(scene / "image" / "zz.png", np.zeros((22, 30, 3)))
+    refused(scene, "world_mat_11", "12 images")
+
+
+def test_missing_files(scene):
+    (scene / "mask" / "000003.png").unlink()
+    refused(scene, scene / "mask", "no mask 000003.png")
+    for file in (scene / "image").iterdir():
+        file.unlink()
+    refused(scene, scene / "image", "no images")
+
+
+def test_an_unknown_split(scene):
+    refused(scene, "no split val", "test, train", splits=("val",))

@@ -1,0 +1,119 @@
+"""The reader of NSVF's format."""
+
+import numpy as np
+import pytest
+from support.same_scene import same, views
+from support.transforms_scenes import refused
+
+from pp_cl.scene.readers.nsvf import read_split, splits
+from tools.scene_formats import nsvf
+
+
+@pytest.fixture
+def scene(tmp_path):
+    many = views(alike=True)
+    nsvf.write(tmp_path, {"train": many[:6], "val": many[6:8], "test": many[8:]})
+    return tmp_path
+
+
+def lens_of(folder):
+    camera = read_split(folder, "train")[0].camera
+    return camera.fx, camera.fy, camera.cx, camera.cy
+
+
+# --------------------------------------------------------------------------------------------------
+
+
+def test_splits_are_those_of_the_names(scene):
+    assert splits(scene) == ["test", "train", "val"]
+    (scene / "rgb" / "9_other.png").write_bytes(b"")
+    assert [len(read_split(scene, split)) for split in splits(scene)] == [3, 6, 2]
+
+
+@pytest.mark.parametrize(
+    "text, expected",
+    [
+        ("40 0 14 0\n0 41 12 0\n0 0 1 0\n0 0 0 1\n", (40, 41, 14, 12)),
+        ("40 0 14\n0 41 12\n0 0 1\n", (40, 41, 14, 12)),
+        ("40 14 12 0.\n0. 0. 0.\n0.\n1.\n22 30\n", (40, 40, 14, 12)),
+        ("40 14 12 0.\n0. 0. 0.\n0.\n1.\n44 60\n", (20, 20, 7, 6)),
+        ("40 14 12\n", (40, 40, 14, 12)),
+    ],
+    ids=["4x4", "3x3", "synthetic", "for another size", "one line"],
+)
+def test_intrinsics(scene, text, expected):
+    (scene / "intrinsics.txt").write_text(text)
+    assert lens_of(scene) == expected
+
+
+def test_near_and_far(scene):
+    (scene / "near_and_far.txt").write_text("1.5 6\n")
+    assert read_split(scene, "test")[0].depth_range == (1.5, 6.0)
+
+
+def test_poses_are_those_of_the_views(tmp_path):
+    many = views(alike=True)
+    nsvf.write(tmp_path, {"train": many})
+    same(tmp_path, {"train": many})
+
+
+# --------------------------------------------------------------------------------------------------
+
+POSE = "pose/0_train_000002.txt"
+BAD = {
+    "pose of words": (POSE, "a b c d\n", "line 1", "no numbers"),
+    "pose of three lines": (POSE, "1 0 0 0\n0 1 0 0\n0 0 1 0\n", "4x4 numbers"),
+    "ragged pose": (POSE, "1 0 0 0\n0 1 0\n0 0 1 0\n0 0 0 1\n", "4x4 numbers"),
+    "pose with NaN": (POSE, "nan 0 0 0\n0 1 0 0\n0 0 1 0\n0 0 0 1\n", "NaN"),
+    "scaled pose": (POSE, "2 0 0 0\n0 2 0 0\n0 0 2 0\n0 0 0 1\n", "no rotation"),
+    "mirrored pose": (POSE, "-1 0 0 0\n0 1 0 0\n0 0 1 0\n0 0 0 1\n", "no rotation"),
+    "last row": (POSE, "1 0 0 0\n0 1 0 0\n0 0 1 0\n0 0 1 1\n", "last row"),
+    "empty pose": (POSE, "", "4x4 numbers"),
+    "intrinsics of words": ("intrinsics.txt", "focal\n", "line 1", "no numbers"),
+    "no intrinsics": ("intrinsics.txt", "", "4x4 matrix"),
+    "focal length 0": ("intrinsics.txt", "0 14 12 0\n", "focal length is 0"),
+    "skew": ("intrinsics.txt", "40 2 14\n0 41 12\n0 0 1\n", "skew"),
+    "size": ("intrinsics.txt", "40 14 12 0.\n0 0\n", "height and the width"),
+    "near only": ("near_and_far.txt", "1\n", "0 < near < far"),
+    "far before near": ("near_and_far.txt", "3 2\n", "0 < near < far"),
+    "infinite far": ("near_and_far.txt", "1 inf\n", "Inf"),
+    "bytes": ("near_and_far.txt", b"\xff\xfe\0", "text"),
+}
+
+
+@pytest.mark.parametrize("case", BAD)
+def test_bad_files(scene, case):
+    name, content, *words = BAD[case]
+    (scene / name).write_bytes(content if isinstance(content, bytes) else content.encode())
+    refused(scene, scene / name, *words)
+
+
+def test_a_pose_is_missing(scene):
+    (scene / POSE).unlink()
+    refused(scene, scene / POSE, "no such file")
+
+
+def test_an_image_that_leaves_the_folder(scene):
+    target = scene / "rgb" / "0_train_000002.png"
+    outside = scene.parent / "outside.png"
+    target.rename(outside)
+    target.symlink_to(outside)
+    refused(scene, "leaves the scene's folder")
+
+
+def test_an_unknown_split(scene):
+    refused(scene, "no split eval", "test, train, val", splits=("eval",))
+
+
+def test_no_image_of_any_split(scene):
+    for file in (scene / "rgb").iterdir():
+        file.unlink()
+    refused(scene, scene / "rgb", "no images")
+
+
+def test_a_scene_without_rotation_noise(tmp_path):
+    """Rotations are made orthonormal: the pose is the one that was written, to the last digits."""
+    many = views(alike=True)[:1]
+    nsvf.write(tmp_path, {"train": many})
+    pose = read_split(tmp_path, "train")[0].camera.pose
+    np.testing.assert_allclose(pose, many[0].stored_camera.pose, rtol=0, atol=1e-12)
