@@ -1,6 +1,7 @@
 """The command pp-cl train."""
 
 import argparse
+import math
 import sys
 from contextlib import ExitStack, nullcontext
 
@@ -15,7 +16,7 @@ EPILOG = "settings (--set), with the tiny preset's values:\n" + "\n".join(help_l
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the command's options."""
     add = parser.add_argument
-    add("scene", metavar="SCENE", help="folder with transforms_train.json, or the word demo")
+    add("scene", metavar="SCENE", help="folder of a scene, or the word demo")
     add("--out", required=True, metavar="RUN", help="folder of the run")
     add(
         "--preset",
@@ -117,12 +118,21 @@ def _first_line(training):
 
 def _images_line(training, chosen):
     """The size of the images. chosen: whether the preset chose it."""
-    view = training.trainer.views[0]
-    stored, used = (f"{c.width}x{c.height}" for c in (view.stored_camera, view.camera))
+    views = training.trainer.views
+    view = views[0]
+    stored, used = (
+        _sizes(cameras) for cameras in ([v.stored_camera for v in views], [v.camera for v in views])
+    )
     if view.downscale == 1:
         return f"images: {stored}"
     why = f" for the preset {training.config.preset} (--downscale 1 keeps them)" if chosen else ""
     return f"images: {stored}, reduced {view.downscale} times to {used}{why}"
+
+
+def _sizes(cameras):
+    """WxH of the cameras' images, or that of the smallest and of the largest."""
+    found = sorted({(c.width, c.height) for c in cameras}, key=math.prod)
+    return " to ".join(f"{w}x{h}" for w, h in dict.fromkeys((found[0], found[-1])))
 
 
 def _run(training, options):

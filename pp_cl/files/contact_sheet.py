@@ -16,8 +16,8 @@ LINE, INK = 200, (60, 60, 60)
 
 
 def comparison(predictions: Sequence[np.ndarray], truths: Sequence[np.ndarray]) -> np.ndarray:
-    """uint8 picture of equally large float (H, W, 3) images in [0, 1]: a row of prediction, truth
-    and error for each view.
+    """uint8 picture of float (H, W, 3) images in [0, 1]: a row of prediction, truth and error for
+    each view, whose sizes may differ.
 
     The error is the absolute difference, mean of the channels, ERROR_GAIN times; white is none, as
     around the object.
@@ -25,7 +25,7 @@ def comparison(predictions: Sequence[np.ndarray], truths: Sequence[np.ndarray]) 
     pairs = zip(predictions, truths, strict=True)
     images = [to_8bit(image) for p, t in pairs for image in (p, t, _error(p, t))]
     table = np.pad(tiles(images, 3), ((HEADER, 0), (0, 0), (0, 0)), constant_values=255)
-    width = images[0].shape[1] + GAP
+    width = _cell(images)[1] + GAP
     return _captioned(table, [(column * width, 0) for column in range(3)], CAPTIONS)
 
 
@@ -35,7 +35,7 @@ def contact_sheet(
     """tiles(images, columns) with a caption above each image, and no more columns than images."""
     columns = min(columns, len(images))
     headed = [np.pad(i, ((HEADER, 0), (0, 0), (0, 0)), constant_values=255) for i in images]
-    height, width = (side + GAP for side in headed[0].shape[:2])
+    height, width = (side + GAP for side in _cell(headed))
     places = [(i % columns * width, i // columns * height) for i in range(len(images))]
     return _captioned(tiles(headed, columns), places, captions)
 
@@ -50,10 +50,19 @@ def _captioned(table, places, captions):
 
 
 def tiles(images: Sequence[np.ndarray], columns: int) -> np.ndarray:
-    """uint8 picture of equally large uint8 images, (H, W, 3) or (H, W, 4), row by row; what is
-    transparent shows white.
+    """uint8 picture of uint8 images, (H, W, 3) or (H, W, 4), row by row, each in a cell as large as
+    the largest; what is transparent, or beside a smaller image, shows white.
     """
+    height, width = _cell(images)
     opaque = [_over_white(image) for image in images]
+    opaque = [
+        np.pad(
+            image,
+            ((0, height - image.shape[0]), (0, width - image.shape[1]), (0, 0)),
+            constant_values=255,
+        )
+        for image in opaque
+    ]
     blank = np.full_like(opaque[0], 255)
     rows = -(-len(opaque) // columns)
     opaque += [blank] * (rows * columns - len(opaque))
@@ -61,6 +70,11 @@ def tiles(images: Sequence[np.ndarray], columns: int) -> np.ndarray:
     _, height, width, _ = table.shape
     table = table.reshape(rows, columns, height, width, 3).transpose(0, 2, 1, 3, 4)
     return table.reshape(rows * height, columns * width, 3)[:-GAP, :-GAP]
+
+
+def _cell(images):
+    """(height, width) of the largest."""
+    return tuple(max(image.shape[axis] for image in images) for axis in (0, 1))
 
 
 def _over_white(image):

@@ -28,7 +28,7 @@ Item = TypeVar("Item")
 
 @dataclass(frozen=True)
 class Scene:
-    """Views of one object, all of one size.
+    """Views of one object.
 
     folder: None for a scene that the program makes itself. splits: views by split name ("train",
     "val", "test"). Either all views have a depth range or none has.
@@ -96,15 +96,9 @@ def _known_files() -> str:
 
 
 def _check_alike(folder, photographs):
-    """Raise UserError if images differ in size, or if only some have a depth range."""
+    """Raise UserError if only some photographs have a depth range."""
     first = photographs[0]
     for one in photographs:
-        size, first_size = (f"{c.width}x{c.height}" for c in (one.camera, first.camera))
-        if size != first_size:
-            raise UserError(
-                f"{folder / one.name}: {size} pixels, but {folder / first.name} has {first_size};"
-                " all views must have one size"
-            )
         if (one.depth_range is None) != (first.depth_range is None):
             raise UserError(
                 f"{folder}: near and far are given for only one of {first.name} and {one.name}; "

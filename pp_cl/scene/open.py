@@ -13,7 +13,7 @@ from pp_cl.scene import demo
 from pp_cl.scene.load import Scene, find_reader, load_scene
 from pp_cl.scene.masks import MaskRule
 from pp_cl.scene.photograph import Photograph
-from pp_cl.scene.views import View, fitting_downscale
+from pp_cl.scene.views import MIN_SIDE, View, fitting_downscale
 
 DEMO = "demo"  # the word that names the scene which the program makes itself
 
@@ -50,11 +50,13 @@ def scene_frames(path: str, split: str = "train") -> list[Photograph]:
 
 
 def preset_downscale(path: str, preset: str) -> int:
-    """How many times a preset reduces the images of a scene, by the size of the first. Raises
-    UserError as load_scene does.
+    """How many times a preset reduces the images of a scene, by the size of the largest training
+    image that leaves the smallest enough pixels. Raises UserError as load_scene does.
     """
-    camera = scene_frames(path)[0].camera
-    return fitting_downscale((camera.width, camera.height), IMAGE_SIZES[preset])
+    sizes = [(frame.camera.width, frame.camera.height) for frame in scene_frames(path)]
+    largest, smallest = max(sizes, key=max), min(sizes, key=min)
+    fitting = fitting_downscale(largest, IMAGE_SIZES[preset])
+    return max(1, min(fitting, min(smallest) // MIN_SIDE))
 
 
 def measured_split(path: str) -> str:

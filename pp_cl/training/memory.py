@@ -35,15 +35,17 @@ Plan = list[tuple[str, Table]]  # what the buffers of each table are for
 
 
 def memory_plan(config: Config, model: Model, views: list[View], refinements: int = 0) -> Plan:
-    """The device buffers of a training with this model on these views, at its most points.
+    """The device buffers of a training with this model on these views, at its most points and for
+    the largest of its crops.
 
     refinements: of the grid that are still to come; the points after them are an estimate.
     """
     train, blocks = config.train, model.cloud.blocks
     n = round(model.cloud.count * REFINED**refinements)
     edge = model.grid.edge / 2**refinements
-    camera = views[0].camera
-    width, height = views[0].crop_size(train.crop)
+    view = max(views, key=lambda v: (math.prod(v.crop_size(train.crop)), v.camera.fx))
+    camera, photograph = view.camera, max((v.image for v in views), key=lambda image: image.size)
+    width, height = view.crop_size(train.crop)
     padded, _, _ = camera.crop(0, 0, width, height).padded(NETWORK_MULTIPLE)
     size = (padded.height, padded.width)
     image, target = (*size, 3), (height, width, 3)
@@ -65,7 +67,7 @@ def memory_plan(config: Config, model: Model, views: list[View], refinements: in
         (
             "photograph and target",
             {
-                "image": (views[0].image.shape, np.uint8),
+                "image": (photograph.shape, np.uint8),
                 "target": (target, np.float32),
                 "alpha": (target[:2], np.float32),
             },

@@ -2,9 +2,8 @@
 
 import numpy as np
 import pytest
-from support.transforms_scenes import SIZE, refused, write_scene
+from support.transforms_scenes import refused, write_scene
 
-from pp_cl.files.image import write_png
 from pp_cl.scene.load import evenly, load_scene
 
 
@@ -36,21 +35,6 @@ def test_evenly_takes_the_first_and_the_same_steps():
     assert evenly(range(8), 4) == [0, 2, 4, 6]
     assert evenly(range(5), 4) == [0, 1, 2, 3] and evenly(range(3), 4) == [0, 1, 2]
     assert evenly(range(3), None) == [0, 1, 2]
-
-
-def test_views_of_different_sizes(tmp_path):
-    write_scene(tmp_path)
-    write_scene(tmp_path, "test")
-    write_png(tmp_path / "test_2.png", np.zeros((SIZE[1] + 1, SIZE[0], 4), np.uint8))
-    load_scene(tmp_path)
-    refused(
-        tmp_path,
-        tmp_path / "train_0.png",
-        tmp_path / "test_2.png",
-        "24x19",
-        "24x18",
-        splits=("train", "test"),
-    )
 
 
 def test_depth_range_of_some_views_only(tmp_path):

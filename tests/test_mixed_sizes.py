@@ -1,0 +1,129 @@
+"""Scenes whose photographs differ in size: every command takes them."""
+
+import json
+
+import numpy as np
+import pytest
+from support.runs import arguments, train_and_interrupt
+from support.scenes import ball_image, ring_cameras
+
+from pp_cl.cli import main
+from pp_cl.config import assign, preset
+from pp_cl.files.contact_sheet import GAP, tiles
+from pp_cl.files.image import read_rgba
+from pp_cl.files.run_folder import RunFolder
+from pp_cl.model import Model
+from pp_cl.network.unet import UNet
+from pp_cl.scene.demo import write_scene
+from pp_cl.scene.hull import build_grid
+from pp_cl.scene.load import Scene, load_scene
+from pp_cl.scene.open import preset_downscale
+from pp_cl.scene.views import View
+from pp_cl.trained import load_run
+from pp_cl.training.memory import memory_plan
+
+SIZES = ((48, 48), (37, 29), (24, 40))
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory):
+    """Views of three sizes, the ball off the middle in some; a crop of 24 pixels fits all but
+    one axis.
+    """
+    folder = tmp_path_factory.mktemp("mixed") / "ball"
+    splits = {}
+    for split, count in (("train", 9), ("test", 3)):
+        views = []
+        for i, camera in enumerate(ring_cameras(count, 48)):
+            width, height = SIZES[i % 3]
+            crop = camera.resized(width, height)
+            views.append(View(f"{split}/r_{i}.png", crop, ball_image(crop)))
+        splits[split] = views
+    write_scene(Scene("ball", None, splits), folder)
+    return str(folder)
+
+
+@pytest.fixture(scope="module", params=[24, 0, 64], ids=["crops", "whole", "larger crops"])
+def trained(request, scene, tmp_path_factory):
+    out = tmp_path_factory.mktemp("mixed") / "run"
+    assert main(arguments(scene, out, 1, train__crop=request.param)) == 0
+    return out
+
+
+def test_sizes_are_kept(scene):
+    views = load_scene(scene).splits["train"]
+    assert [(v.camera.width, v.camera.height) for v in views] == [*SIZES] * 3
+    assert preset_downscale(scene, "tiny") == 1
+
+
+def test_a_training_learns_and_resumes_to_the_same_bytes(scene, trained, tmp_path, monkeypatch):
+    crop = json.loads((trained / "config.json").read_text())["train"]["crop"]
+    train_and_interrupt(scene, tmp_path / "run", 33, monkeypatch, downscale=1, train__crop=crop)
+    assert main(arguments(scene, tmp_path / "run", 1, train__crop=crop)) == 0
+    checkpoint = (tmp_path / "run" / "checkpoint.npz").read_bytes()
+    assert checkpoint == (trained / "checkpoint.npz").read_bytes()
+    psnr = [row["psnr"] for row in RunFolder(trained).rows() if "psnr" in row]
+    assert psnr[-1] > psnr[0] + 3
+
+
+def test_each_view_is_measured_at_its_size(scene, trained):
+    assert main(["eval", str(trained), "--save-images"]) == 0
+    result = json.loads((trained / "eval" / "metrics.json").read_text())
+    views = load_scene(scene, ("test",)).splits["test"]
+    for row, view, size in zip(result["per_image"], views, SIZES, strict=True):
+        saved = read_rgba(trained / "eval" / "images" / view.name.rpartition("/")[2]) / 255.0
+        assert saved.shape[:2] == size[::-1]
+        truth = view.image / 255.0
+        truth = truth[..., :3] * truth[..., 3:] + 1 - truth[..., 3:]
+        mse = ((saved[..., :3] - truth) ** 2).mean()
+        assert row["psnr"] == pytest.approx(-10 * np.log10(mse), abs=0.05)
+
+
+def test_it_is_rendered_shown_and_exported(trained, tmp_path):
+    out = tmp_path / "frames"
+    assert (
+        main(["render", str(trained), "--path", "test", "--format", "png", "--out", str(out)]) == 0
+    )
+    assert [read_rgba(f).shape[1::-1] for f in sorted(out.glob("0*.png"))] == list(SIZES)
+    for words in (
+        ["info", str(trained), "--picture", str(tmp_path / "a.png")],
+        ["export", str(trained), "--format", "scene", "--out", str(tmp_path / "s")],
+        ["export", str(trained), "--format", "ply", "--out", str(tmp_path / "s.ply")],
+    ):
+        assert main(words) == 0
+
+
+def test_python_renders_each_at_its_size(dev, trained):
+    run = load_run(dev, trained)
+    sizes = [run.render(camera).colour.shape for camera in run.cameras("test")]
+    assert [shape[1::-1] for shape in sizes] == list(SIZES)
+
+
+@pytest.mark.parametrize("crop, side", [(0, 48), (24, 24), (64, 48)])
+def test_the_memory_plan_is_for_the_largest(dev, scene, crop, side):
+    config = preset("tiny")
+    settings = {"points.count": "400", "network.widths": "16,16,16", "train.crop": str(crop)}
+    for key, value in settings.items():
+        assign(config, key, value, "test")
+    views = load_scene(scene).splits["train"]
+    hull = build_grid(dev, views, 400)
+    net = UNet(dev, config.network.widths)
+    model = Model.create(dev, hull.grid, hull.ids, (2, 6), net=net, degree=2)
+    orders = [views, views[::-1]]
+    plans = [memory_plan(config, model, order) for order in orders]
+    assert plans[0] == plans[1]
+    assert f"network at {side}x{side}" in dict(plans[0])
+
+
+def test_info_lists_the_sizes(scene, capsys, tmp_path):
+    assert main(["info", scene, "--picture", str(tmp_path / "a.png")]) == 0
+    said = capsys.readouterr().out
+    assert all(f"4 of {w}x{h}" in said for w, h in SIZES)
+
+
+def test_pictures_of_different_sizes_lie_in_equal_cells():
+    images = [np.full((h, w, 3), i, np.uint8) for i, (w, h) in enumerate(SIZES)]
+    picture = tiles(images, 2)
+    assert picture.shape == (2 * 48 + GAP, 2 * 48 + GAP, 3)
+    assert (picture[:29, 50:87] == 1).all() and (picture[29:48, 50:98] == 255).all()
+    assert (picture[50:90, :24] == 2).all()
