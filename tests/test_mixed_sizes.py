@@ -93,6 +93,12 @@ def test_it_is_rendered_shown_and_exported(trained, tmp_path):
         assert main(words) == 0
 
 
+def test_a_film_of_different_sizes_is_refused(trained, capsys):
+    assert main(["render", str(trained), "--path", "test", "--format", "mp4"]) == 2
+    assert "--path test: its images differ in size" in capsys.readouterr().err
+    assert not (trained / "render").exists()
+
+
 def test_python_renders_each_at_its_size(dev, trained):
     run = load_run(dev, trained)
     sizes = [run.render(camera).colour.shape for camera in run.cameras("test")]

@@ -60,6 +60,11 @@ def run(options: argparse.Namespace) -> None:
         check_video(options.format)
     run = load_run(open_device(options.device), options.run_folder, scene=options.scene)
     cameras = _cameras(run, options.path, count, size=size, fov=fov)
+    if options.format in FILMS and len({(c.width, c.height) for c in cameras}) > 1:
+        raise UserError(
+            f"--path {options.path}: its images differ in size, which no film does; give --size"
+            " WxH, or --format png"
+        )
     out = Path(options.out) if options.out else run.folder.path / "render" / _name(options.path)
     frames = Frames(run, cameras, out, style)
     seconds = _render_with_bar(frames)

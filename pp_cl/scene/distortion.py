@@ -8,6 +8,7 @@ from skimage.transform import warp
 from pp_cl.scene.camera import Camera
 
 CUBIC = 3  # order of interpolation
+PROBED = 65  # places along each axis
 
 
 @dataclass(frozen=True)
@@ -33,6 +34,18 @@ class Distortion:
             x * radial + 2 * self.p1 * xy + self.p2 * (r2 + 2 * xx),
             y * radial + self.p1 * (r2 + 2 * yy) + 2 * self.p2 * xy,
         )
+
+    def folds(self, camera: Camera) -> bool:
+        """Whether the model turns back inside the camera's image, so that two directions meet in
+        one pixel: there its polynomials say nothing of the lens.
+        """
+        x = (np.linspace(0, camera.width, PROBED) - camera.cx) / camera.fx
+        y = (np.linspace(0, camera.height, PROBED) - camera.cy) / camera.fy
+        x, y = self.apply(*np.meshgrid(x, y))
+        along_x, along_y = (
+            np.stack([np.diff(a, axis=1)[1:], np.diff(a, axis=0)[:, 1:]]) for a in (x, y)
+        )
+        return bool((along_x[0] * along_y[1] - along_x[1] * along_y[0] <= 0).any())
 
     def source_pixels(self, camera: Camera) -> np.ndarray:
         """(2, H, W) float64: for each pixel of the camera without distortion, row and column of

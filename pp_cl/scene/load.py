@@ -112,6 +112,11 @@ def _read_image(folder, photograph, masks):
     """
     image = read_rgba(folder / photograph.name)
     image = masks.apply(image, photograph.mask and folder / photograph.mask)
+    if photograph.distortion.folds(photograph.camera):
+        raise UserError(
+            f"{folder / photograph.name}: its distortion coefficients fold the image over; correct"
+            " them, or undistort the images with the program that found them"
+        )
     if photograph.distortion:
         image = undistort(image, photograph.camera, photograph.distortion)
     return image

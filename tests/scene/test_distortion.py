@@ -1,0 +1,110 @@
+"""Lens distortion: OpenCV's formula by hand, and images that were distorted come back."""
+
+import json
+
+import numpy as np
+import pytest
+from scipy.ndimage import map_coordinates
+from support.transforms_scenes import refused, write_scene
+
+from pp_cl.files.image import read_rgba
+from pp_cl.scene.camera import Camera
+from pp_cl.scene.distortion import Distortion, undistort
+from pp_cl.scene.load import load_scene
+
+CAMERA = Camera(np.eye(3, 4), 150.0, 140.0, 84.0, 57.5, 161, 120)
+LENSES = {
+    "barrel": Distortion(k1=-0.2, k2=0.03),
+    "pincushion": Distortion(k1=0.15),
+    "tangential": Distortion(p1=0.01, p2=-0.008),
+    "all": Distortion(-0.15, 0.04, 0.004, -0.003, 0.01),
+}
+
+
+def test_the_formula_by_hand():
+    """x = 0.3, y = -0.2: r^2 = 0.13."""
+    x, y = Distortion(0.1, 0.01, 0.002, -0.003, 0.5).apply(np.array(0.3), np.array(-0.2))
+    radial = 1 + 0.1 * 0.13 + 0.01 * 0.13**2 + 0.5 * 0.13**3
+    assert x == pytest.approx(0.3 * radial + 2 * 0.002 * -0.06 - 0.003 * (0.13 + 2 * 0.09))
+    assert y == pytest.approx(-0.2 * radial + 0.002 * (0.13 + 2 * 0.04) + 2 * -0.003 * -0.06)
+
+
+def test_without_coefficients_nothing_changes(rng):
+    image = rng.integers(0, 256, (120, 161, 4), np.uint8)
+    image[..., 3] = 255
+    assert not Distortion() and Distortion(k3=1e-9)
+    assert np.array_equal(undistort(image, CAMERA, Distortion()), image)
+
+
+def photographed(pinhole, lens):
+    """The image (H, W) that the lens makes of a pinhole camera's, by Newton's method: for each
+    pixel of the photograph, where the pinhole camera has it.
+    """
+    v, u = np.mgrid[: CAMERA.height, : CAMERA.width] + 0.5
+    target = np.stack([(u - CAMERA.cx) / CAMERA.fx, (v - CAMERA.cy) / CAMERA.fy])
+    at, h = target.copy(), 1e-6
+    for _ in range(20):
+        value = np.stack(lens.apply(*at))
+        slope = [
+            (np.stack(lens.apply(at[0] + dx, at[1] + dy)) - value) / h
+            for dx, dy in ((h, 0), (0, h))
+        ]
+        (a, c), (b, d) = slope
+        off, determinant = target - value, a * d - b * c
+        at += np.stack([d * off[0] - b * off[1], a * off[1] - c * off[0]]) / determinant
+    rows, columns = at[1] * CAMERA.fy + CAMERA.cy - 0.5, at[0] * CAMERA.fx + CAMERA.cx - 0.5
+    return map_coordinates(pinhole, [rows, columns], order=5, mode="nearest")
+
+
+@pytest.mark.parametrize("name", LENSES)
+def test_dots_come_back_within_a_tenth_of_a_pixel(name):
+    """Their centroids, before the lens and after it was taken away; some are transparent."""
+    rows, columns = np.mgrid[24:100:24, 24:140:24].reshape(2, -1) + 0.3
+    v, u = np.mgrid[: CAMERA.height, : CAMERA.width]
+    dots = sum(
+        np.exp(-((v - r) ** 2 + (u - c) ** 2) / 8) for r, c in zip(rows, columns, strict=True)
+    )
+    lens = LENSES[name]
+    taken = photographed(dots, lens)
+    assert np.abs(taken - dots).max() > 0.1, "a lens that moves nothing tests nothing"
+    value = np.rint(255 * np.clip(taken, 0, 1)).astype(np.uint8)
+    for image, channel in (
+        (np.dstack([value, value, value, np.full_like(value, 255)]), 0),
+        (np.dstack([np.full_like(value, 200)] * 3 + [value]), 3),
+    ):
+        found = undistort(image, CAMERA, lens)[..., channel] / 255.0
+        for r, c in zip(rows, columns, strict=True):
+            window = found * ((v - r) ** 2 + (u - c) ** 2 < 64)
+            assert abs((v * window).sum() / window.sum() - r) < 0.1
+            assert abs((u * window).sum() / window.sum() - c) < 0.1
+
+
+@pytest.mark.parametrize("name", LENSES)
+def test_one_colour_stays_one_colour(name):
+    """The colours at the border of what is transparent do not bleed."""
+    image = np.full((120, 161, 4), (200, 30, 90, 255), np.uint8)
+    assert np.array_equal(undistort(image, CAMERA, LENSES[name]), image)
+    image[:, :80] = (0, 255, 0, 0)
+    found = undistort(image, CAMERA, LENSES[name])
+    shown = found[found[..., 3] > 30][:, :3].astype(int)
+    assert np.abs(shown - [200, 30, 90]).max() <= 4
+
+
+def test_a_lens_that_folds_is_refused(tmp_path):
+    """1 + 3 k1 r^2 < 0 from r = 0.58 on."""
+    assert Distortion(k1=-1.0).folds(CAMERA) and not Distortion(k1=-0.5).folds(CAMERA)
+    data = write_scene(tmp_path)
+    data["k1"] = -9.0
+    (tmp_path / "transforms_train.json").write_text(json.dumps(data))
+    refused(tmp_path, tmp_path / "train_0.png", "fold the image over")
+
+
+def test_photographs_of_a_scene_are_undistorted(tmp_path):
+    data = write_scene(tmp_path)
+    data.update(k1=0.3, p1=0.01, camera_model="OPENCV")
+    (tmp_path / "transforms_train.json").write_text(json.dumps(data))
+    for view in load_scene(tmp_path).splits["train"]:
+        stored = read_rgba(tmp_path / view.name)
+        expected = undistort(stored, view.stored_camera, Distortion(k1=0.3, p1=0.01))
+        np.testing.assert_array_equal(view.image, expected)
+        assert (view.image != stored).any()
