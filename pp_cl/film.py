@@ -12,9 +12,9 @@ import numpy as np
 from pp_cl.errors import UserError
 from pp_cl.files.atomic import remove_leftovers, write_json
 from pp_cl.files.contact_sheet import tiles
-from pp_cl.files.exr import picture_channels, read_exr, write_exr
-from pp_cl.files.image import read_rgba, to_8bit, write_png
-from pp_cl.files.picture import WHITE, linear_to_srgb
+from pp_cl.files.exr import write_exr
+from pp_cl.files.image import read_rgba, write_png
+from pp_cl.files.picture import WHITE
 from pp_cl.files.video import write_video
 from pp_cl.scene.camera import Camera
 from pp_cl.trained import Run
@@ -90,7 +90,7 @@ class Frames:
         style = self.style
         picture = self.run.render(camera, samples=style.samples, features=style.features)
         if style.suffix == "exr":
-            write_exr(path, picture_channels(picture))
+            write_exr(path, picture.channels())
         else:
             write_png(path, picture.image(style.background))
 
@@ -100,8 +100,7 @@ class Frames:
         """
         transparent = self.style.suffix == "exr" or self.style.background is None
         for i in range(len(self.paths)) if chosen is None else chosen:
-            read = _read_exr_rgba if self.style.suffix == "exr" else read_rgba
-            image = read(self.paths[i])
+            image = read_rgba(self.paths[i])
             yield image if transparent else image[..., :3]
 
     def write_sheet(self, path: Path) -> None:
@@ -114,14 +113,6 @@ class Frames:
     def write_film(self, path: Path, fps: float) -> None:
         """Write all frames as a film; raises UserError as write_video does."""
         write_video(path, self.images(), fps)
-
-
-def _read_exr_rgba(path):
-    """(H, W, 4) uint8 straight sRGB of what write_exr wrote of a picture."""
-    channels = read_exr(path)
-    red, green, blue, alpha = (channels[name] for name in "RGBA")
-    linear = np.stack([red, green, blue], -1) / np.maximum(alpha, 1e-6)[..., None]
-    return to_8bit(np.dstack([linear_to_srgb(np.clip(linear, 0, 1)), alpha]))
 
 
 def _reduced(image):

@@ -7,8 +7,8 @@ import trimesh
 
 from pp_cl.export.points import ColouredPoints
 from pp_cl.files.atomic import atomic_file
+from pp_cl.files.colour import srgb_to_linear
 from pp_cl.files.image import to_8bit
-from pp_cl.files.picture import srgb_to_linear
 
 
 def write_point_glb(path: Path | str, points: ColouredPoints) -> None:

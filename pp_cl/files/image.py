@@ -1,4 +1,4 @@
-"""8-bit images on disk."""
+"""Images on disk, as 8 bits a channel."""
 
 import io
 from contextlib import contextmanager
@@ -9,6 +9,7 @@ from PIL import Image
 
 from pp_cl.errors import UserError
 from pp_cl.files.atomic import atomic_file
+from pp_cl.files.exr import exr_size, read_exr_rgba
 
 FORMATS = ("PNG", "JPEG", "WEBP")
 # Pillow's names of what converts to RGBA without loss
@@ -19,11 +20,13 @@ PNG_SIGNATURE, PNG_DEPTH_BYTE = b"\x89PNG\r\n\x1a\n", 24
 
 def read_rgba(path: Path | str) -> np.ndarray:
     """(H, W, 4) uint8 straight RGBA of an image file; gray and palette colours are expanded, no
-    alpha means 255.
+    alpha means 255; OpenEXR as read_exr_rgba has it.
 
     Raises UserError naming a file that is missing, truncated, no image, or has other than 8 bits a
     channel.
     """
+    if _is_exr(path):
+        return read_exr_rgba(path)
     with _opened(path) as image:
         if image.mode not in EIGHT_BIT_MODES or _is_deep_png(path):
             raise UserError(
@@ -43,8 +46,14 @@ def read_gray(path: Path | str) -> np.ndarray:
 
 def image_size(path: Path | str) -> tuple[int, int]:
     """(width, height) from the header of an image file. Raises UserError as read_rgba does."""
+    if _is_exr(path):
+        return exr_size(path)
     with _opened(path) as image:
         return image.size
+
+
+def _is_exr(path):
+    return Path(path).suffix.lower() == ".exr"
 
 
 @contextmanager

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
+from pp_cl.files.colour import srgb_to_linear
 from pp_cl.files.image import to_8bit, write_png
 
 WHITE = (1.0, 1.0, 1.0)
@@ -53,6 +54,18 @@ class Picture:
         linear = srgb_to_linear(rgba[..., :3]) * rgba[..., 3:]
         return np.concatenate([linear, rgba[..., 3:]], axis=2)
 
+    def channels(self) -> dict[str, np.ndarray]:
+        """{channel: (H, W) float32} for OpenEXR: R, G, B, A; Z, the median depth, and mean.Z, both
+        infinite where nothing is; feature.00 to feature.15 where the picture has them.
+        """
+        colour = self.premultiplied_linear()
+        channels = {name: colour[..., i] for i, name in enumerate("RGBA")}
+        channels |= {"Z": self.median_depth, "mean.Z": self.depth}
+        if self.features is not None:
+            count = self.features.shape[2]
+            channels |= {f"feature.{i:02d}": self.features[..., i] for i in range(count)}
+        return {name: np.ascontiguousarray(array, np.float32) for name, array in channels.items()}
+
     def image(self, background: tuple[float, float, float] | None) -> np.ndarray:
         """over(background), or rgba() where that is None."""
         return self.rgba() if background is None else self.over(background)
@@ -66,19 +79,6 @@ class Picture:
         encoded = io.BytesIO()
         Image.fromarray(to_8bit(self.colour)).save(encoded, "PNG")
         return encoded.getvalue()
-
-
-def srgb_to_linear(values: np.ndarray) -> np.ndarray:
-    """IEC 61966-2-1's transfer function: [0, 1] to linear light."""
-    return np.where(values <= 0.04045, values / 12.92, ((values + 0.055) / 1.055) ** 2.4).astype(
-        np.float32
-    )
-
-
-def linear_to_srgb(values: np.ndarray) -> np.ndarray:
-    """The inverse of srgb_to_linear: linear light in [0, 1] to sRGB."""
-    low = values <= 0.0031308
-    return np.where(low, 12.92 * values, 1.055 * values ** (1 / 2.4) - 0.055).astype(np.float32)
 
 
 def mean_picture(pictures: list[Picture]) -> Picture:

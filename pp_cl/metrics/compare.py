@@ -10,7 +10,7 @@ from pp_cl.errors import UserError
 from pp_cl.files.image import read_rgba
 from pp_cl.metrics.psnr_ssim import Metrics, mean
 
-SUFFIXES = (".png", ".jpg", ".jpeg")
+SUFFIXES = (".exr", ".png", ".jpg", ".jpeg")
 
 
 def compare(

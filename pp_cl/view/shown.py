@@ -5,9 +5,9 @@ import io
 import numpy as np
 from PIL import Image
 
+from pp_cl.files.colour import linear_to_srgb, srgb_to_linear
 from pp_cl.files.contact_sheet import ERROR_GAIN
 from pp_cl.files.image import to_8bit
-from pp_cl.files.picture import linear_to_srgb, srgb_to_linear
 from pp_cl.scene.camera import Camera
 
 DARK = np.array([23, 24, 27]) / 255  # sRGB, the background of page.css

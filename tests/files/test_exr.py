@@ -1,12 +1,20 @@
-"""OpenEXR files hold the values that went in."""
+"""OpenEXR files hold the values that went in, and are read as photographs."""
+
+import json
+import shutil
 
 import numpy as np
 import OpenEXR
 import pytest
+from support.runs import arguments
+from support.scenes import write_ball_scene
 
+from pp_cl.cli import main
 from pp_cl.errors import UserError
-from pp_cl.files.exr import picture_channels, read_exr, write_exr
+from pp_cl.files.exr import read_exr, write_exr
+from pp_cl.files.image import image_size, read_rgba
 from pp_cl.files.picture import Picture
+from pp_cl.scene.load import load_scene
 
 
 @pytest.fixture
@@ -21,7 +29,7 @@ def shown(rng):
 
 
 def test_all_channels_come_back(shown, tmp_path):
-    channels = picture_channels(shown)
+    channels = shown.channels()
     write_exr(tmp_path / "a.exr", channels)
     assert [p.name for p in tmp_path.iterdir()] == ["a.exr"]
     there = OpenEXR.File(str(tmp_path / "a.exr"), separate_channels=True).channels()
@@ -46,4 +54,167 @@ def test_a_broken_file_is_one_line(tmp_path):
 
 def test_a_place_that_cannot_be_written_is_one_line(shown, tmp_path):
     with pytest.raises(UserError, match="a.exr: cannot be written"):
-        write_exr(tmp_path / "missing" / "a.exr", picture_channels(shown))
+        write_exr(tmp_path / "missing" / "a.exr", shown.channels())
+
+
+# --------------------------------------------------------------------------------------------------
+
+WIDTH, HEIGHT = 13, 9
+
+
+def srgb(linear):
+    """By hand: IEC 61966-2-1, then 8 bits."""
+    linear = np.clip(np.asarray(linear, np.float64), 0, 1)
+    low, high = 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055
+    return np.rint(255 * np.where(linear <= 0.0031308, low, high))
+
+
+def stored(path, channels, data=None, display=None, tiled=False):
+    """Write channels, float16 or float32, with data and display windows ((x0, y0), (x1, y1))."""
+    kind = OpenEXR.tiledimage if tiled else OpenEXR.scanlineimage
+    header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": kind}
+    if tiled:
+        header["tiles"] = OpenEXR.TileDescription()
+        header["tiles"].xSize = header["tiles"].ySize = 8
+    for name, window in (("dataWindow", data), ("displayWindow", display)):
+        if window is not None:
+            header[name] = tuple(np.array(corner, np.int32) for corner in window)
+    OpenEXR.File(header, channels).write(str(path))
+
+
+def colours(rng, dtype, alpha):
+    """({channel: plane}, expected (H, W, 4) of 8 bits): HDR, some pixels above 1."""
+    light = rng.uniform(0, 1.4, (HEIGHT, WIDTH, 3)).astype(dtype)
+    share = rng.uniform(0.2, 1, (HEIGHT, WIDTH)).astype(dtype) if alpha else None
+    given = light * share[..., None] if alpha else light
+    channels = {name: np.ascontiguousarray(given[..., i]) for i, name in enumerate("RGB")}
+    if alpha:
+        channels["A"] = share
+    straight = given.astype(float) / (share[..., None].astype(float) if alpha else 1)
+    opaque = np.full((HEIGHT, WIDTH), 255.0)
+    return channels, np.dstack([srgb(straight), np.rint(255 * share) if alpha else opaque])
+
+
+@pytest.mark.parametrize("tiled", [False, True], ids=["scanline", "tiled"])
+@pytest.mark.parametrize("alpha", [False, True], ids=["opaque", "alpha"])
+@pytest.mark.parametrize("dtype", [np.float16, np.float32])
+def test_every_kind_is_read(tmp_path, rng, dtype, alpha, tiled):
+    channels, expected = colours(rng, dtype, alpha)
+    stored(tmp_path / "a.exr", channels, tiled=tiled)
+    assert image_size(tmp_path / "a.exr") == (WIDTH, HEIGHT)
+    found = read_rgba(tmp_path / "a.exr")
+    assert found.dtype == np.uint8 and np.abs(found - expected).max() <= 1
+
+
+@pytest.mark.parametrize("shift", [(0, 0), (4, 3), (-4, 2), (20, 20), (-100, 0)])
+def test_windows_that_differ(tmp_path, rng, shift):
+    """The data window lies elsewhere than the display window, which is the image."""
+    channels, expected = colours(rng, np.float32, True)
+    low = np.array(shift) + [5, 6]
+    data = (low, low + [WIDTH - 1, HEIGHT - 1])
+    stored(tmp_path / "a.exr", channels, data, ((5, 6), (5 + 19, 6 + 11)))
+    assert image_size(tmp_path / "a.exr") == (20, 12)
+    canvas = np.zeros((140, 300, 4))
+    canvas[40 + shift[1] :, 120 + shift[0] :][:HEIGHT, :WIDTH] = expected
+    found = read_rgba(tmp_path / "a.exr")
+    wanted = canvas[40:52, 120:140]
+    assert np.abs(found[..., 3] - wanted[..., 3]).max() <= 1
+    there = wanted[..., 3] > 0
+    assert np.abs(found[there] - wanted[there]).max(initial=0) <= 1
+    assert not found[~there][:, 3].any()
+
+
+def test_gray_and_one_layer(tmp_path, rng):
+    plane = rng.uniform(0, 1, (HEIGHT, WIDTH)).astype(np.float32)
+    stored(tmp_path / "gray.exr", {"Y": plane})
+    assert np.abs(read_rgba(tmp_path / "gray.exr")[..., 1] - srgb(plane)).max() <= 1
+    layer = {f"Combined.{name}": plane for name in "RGBA"} | {"Depth.Z": plane}
+    stored(tmp_path / "layer.exr", layer)
+    assert np.abs(read_rgba(tmp_path / "layer.exr")[..., 3] - 255 * plane).max() <= 1
+
+
+def test_what_a_picture_writes_is_what_it_shows(shown, tmp_path):
+    write_exr(tmp_path / "a.exr", shown.channels())
+    expected = 255 * shown.rgba()
+    there = shown.alpha > 0.1
+    assert np.abs(read_rgba(tmp_path / "a.exr")[there] - expected[there]).max() <= 1
+
+
+PLANE = np.ones((HEIGHT, WIDTH), np.float32)
+NAN = np.where(np.arange(WIDTH) == 3, np.nan, PLANE).astype(np.float32)
+BAD_IMAGES = {
+    "no colours": ({"Z": PLANE}, "no images among its channels"),
+    "two colours": ({"R": PLANE, "G": PLANE}, "no images"),
+    "two layers": ({f"{a}.{c}": PLANE for a in "ab" for c in "RGB"}, "several images"),
+    "NaN": (dict.fromkeys("RGB", NAN), "9 pixels are NaN or infinite"),
+    "infinite": (dict.fromkeys("RGBA", PLANE * np.inf), "117 pixels"),
+    "infinite halves": (dict.fromkeys("RGB", (PLANE * np.inf).astype(np.float16)), "117 pixels"),
+}
+
+
+@pytest.mark.parametrize("case", BAD_IMAGES)
+def test_images_that_are_refused(tmp_path, case):
+    channels, words = BAD_IMAGES[case]
+    stored(tmp_path / "a.exr", {name: plane.copy() for name, plane in channels.items()})
+    with pytest.raises(UserError, match=words) as caught:
+        read_rgba(tmp_path / "a.exr")
+    assert str(tmp_path / "a.exr") in str(caught.value) and "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("share", [0.0, 0.02, 0.1, 0.3, 0.9])
+@pytest.mark.parametrize("read", [read_rgba, image_size])
+def test_cut_files(tmp_path, rng, share, read):
+    channels, _ = colours(rng, np.float32, True)
+    stored(tmp_path / "a.exr", channels)
+    data = (tmp_path / "a.exr").read_bytes()
+    (tmp_path / "a.exr").write_bytes(data[: int(share * len(data))])
+    try:
+        read(tmp_path / "a.exr")
+    except UserError as error:
+        assert str(tmp_path / "a.exr") in str(error) and "\n" not in str(error)
+    else:
+        assert read is image_size and share > 0.02, "a cut image was read"
+
+
+def test_a_size_beyond_all_memory(tmp_path, monkeypatch):
+    monkeypatch.setattr("pp_cl.files.exr.MOST_PIXELS", 100)
+    stored(tmp_path / "a.exr", dict.fromkeys("RGB", PLANE.copy()))
+    for read in (read_rgba, image_size):
+        with pytest.raises(UserError, match="13x9 pixels is no size"):
+            read(tmp_path / "a.exr")
+
+
+def test_a_missing_file(tmp_path):
+    for read in (read_rgba, image_size):
+        with pytest.raises(UserError, match="no such image"):
+            read(tmp_path / "a.exr")
+
+
+# --------------------------------------------------------------------------------------------------
+
+
+def test_a_scene_of_exr_images_is_the_scene_of_their_png_twins(tmp_path):
+    """Linear, premultiplied EXR in place of each PNG: the same photographs within a level, and a
+    training that sees the same.
+    """
+    write_ball_scene(tmp_path / "png", views=6, size=40)
+    shutil.copytree(tmp_path / "png", tmp_path / "exr")
+    for file in (tmp_path / "exr").rglob("*.png"):
+        rgba = read_rgba(file) / 255.0
+        low, high = rgba[..., :3] / 12.92, ((rgba[..., :3] + 0.055) / 1.055) ** 2.4
+        light = np.where(rgba[..., :3] <= 0.04045, low, high) * rgba[..., 3:]
+        planes = np.dstack([light, rgba[..., 3]]).astype(np.float32)
+        channels = {name: np.ascontiguousarray(planes[..., i]) for i, name in enumerate("RGBA")}
+        write_exr(file.with_suffix(".exr"), channels)
+        file.unlink()
+    psnr = {}
+    for kind in ("png", "exr"):
+        scene, run = str(tmp_path / kind), str(tmp_path / f"{kind}_run")
+        assert main(arguments(scene, run, 1)) == 0 and main(["eval", run]) == 0
+        psnr[kind] = json.loads((tmp_path / f"{kind}_run/eval/metrics.json").read_text())["mean"]
+    views = [load_scene(tmp_path / kind).splits["train"] for kind in ("png", "exr")]
+    for a, b in zip(*views, strict=True):
+        opaque = a.image[..., 3] == 255
+        assert np.abs(a.image[opaque].astype(int) - b.image[opaque]).max() <= 1
+        assert (a.image[..., 3] == b.image[..., 3]).all()
+    assert psnr["png"]["psnr"] == pytest.approx(psnr["exr"]["psnr"], abs=0.3)

@@ -11,7 +11,7 @@ from pp_cl.scene.photograph import Photograph
 from pp_cl.scene.readers.common import SPLITS, check_split, find_image, hold_out
 from pp_cl.scene.readers.frame import Frame, distortion, pinhole, read_json
 
-ENDINGS = ("", ".png")  # of a file_path
+ENDINGS = ("", ".png", ".exr")  # of a file_path
 FILES = "transforms_train.json or transforms.json"
 SINGLE = "transforms.json"
 NAMED = ("train", "val", "test")  # splits that transforms.json may list as <split>_filenames
