@@ -138,6 +138,8 @@ def configure(config: Config, scene: str, given: Iterable[tuple[str, Any, str]] 
     assign(config, "scene.path", path, "settings")
     for key, value, origin in given:
         assign(config, key, value, origin)
+    if config.scene.masks:
+        assign(config, "scene.masks", str(Path(config.scene.masks).resolve()), "settings")
     validate(config, "settings")
     return config
 

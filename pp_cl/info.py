@@ -3,7 +3,7 @@
 import json
 import math
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -16,20 +16,30 @@ from pp_cl.files.checkpoint import checkpoint_array
 from pp_cl.files.contact_sheet import contact_sheet
 from pp_cl.files.image import to_8bit
 from pp_cl.files.run_folder import RunFolder
+from pp_cl.scene.agreement import Disagreement, disagreements
 from pp_cl.scene.camera_path import looked_at, up_of
 from pp_cl.scene.grid import Grid
 from pp_cl.scene.hull import Hull, build_grid, spacing_pixels
 from pp_cl.scene.load import evenly
-from pp_cl.scene.open import open_scene, preset_downscale, scene_format, scene_frames, scene_splits
-from pp_cl.scene.outline import outline
+from pp_cl.scene.open import (
+    open_scene,
+    preset_downscale,
+    scene_box,
+    scene_format,
+    scene_frames,
+    scene_splits,
+)
+from pp_cl.scene.outline import outline, silhouette
 from pp_cl.scene.photograph import Photograph
 from pp_cl.scene.target import Target
 from pp_cl.scene.views import MASK_THRESHOLD, View, fitting_downscale
 
 SHOWN_VIEWS, SHOWN_SIZE = 12, 320  # photographs of the picture, and their longer side in pixels
 OUTLINE = (255, 0, 160)  # a colour that few objects have
+REJECTED = np.array([127, 60, 0], np.uint8)  # added to what a mask should have held
 
 Facts = dict[str, Any]
+Given = tuple[str, Any, str]  # a setting: key, value or its text, origin
 
 
 class Points(NamedTuple):
@@ -131,33 +141,40 @@ def _metrics(folder):
 
 
 class Described(NamedTuple):
-    """A scene. hull: None where the masks give none."""
+    """A scene. hull: None where the masks give none. disagreeing: masks that the others
+    contradict.
+    """
 
     facts: Facts
     views: list[View]
     hull: Hull | None
+    disagreeing: list[Disagreement]
 
 
-def describe_scene(dev: Device, scene: str, preset_name: str) -> Described:
+def describe_scene(
+    dev: Device, scene: str, preset_name: str, given: Iterable[Given] = ()
+) -> Described:
     """What a scene is, from its training views and the cameras of the others.
 
-    preset_name: whose number of points the hull gets, and whose size the images. Raises UserError
-    for a scene that is missing or broken; what prevents a hull is a fact.
+    preset_name: whose number of points the hull gets, and whose size the images. given: settings,
+    as configure takes them. Raises UserError for a scene that is missing or broken; what prevents a
+    hull is a fact.
     """
-    config = configure(preset(preset_name), scene)
+    config = configure(preset(preset_name), scene, given)
     path = config.scene.path
     names = sorted(scene_splits(path), key=lambda split: (split == "test", split))
     frames = {split: scene_frames(path, split) for split in names}
     views = open_scene(dev, config, ("train",)).splits["train"]
     downscale = preset_downscale(path, preset_name)
     hull, problem = _hull(dev, views, config)
+    found = disagreements(views, hull.grid.box) if hull else []
     facts = {
         "scene": path,
         "format": scene_format(path),
         "splits": {split: len(listed) for split, listed in frames.items()},
         "images": _sizes([frame for listed in frames.values() for frame in listed]),
         **_lenses(views),
-        "masks": _masks(views),
+        "masks": _masks(views) | {"disagreeing": _disagreeing(found)},
         "depth_range": _stated_range(views),
         **_rig(views),
         "preset": preset_name,
@@ -165,13 +182,13 @@ def describe_scene(dev: Device, scene: str, preset_name: str) -> Described:
         "hull": _hull_facts(hull, [view.camera.downscaled(downscale) for view in views]),
         "problem": problem,
     }
-    return Described(facts, views, hull)
+    return Described(facts, views, hull, found)
 
 
 def _hull(dev, views, config: Config):
     """(Hull, None), or (None, why there is none)."""
     try:
-        return build_grid(dev, views, config.points.count), None
+        return build_grid(dev, views, config.points.count, scene_box(config)), None
     except UserError as error:
         return None, str(error)
 
@@ -212,6 +229,10 @@ def _masks(views):
     }
 
 
+def _disagreeing(found):
+    return [{"view": one.view.name, "share": one.share} for one in found]
+
+
 def _stated_range(views):
     ranges = [view.depth_range for view in views if view.depth_range]
     if not ranges:
@@ -234,31 +255,42 @@ def _hull_facts(hull, cameras):
     if hull is None:
         return None
     grid = hull.grid
-    low = np.asarray(grid.origin)
     return {
         "points": len(hull.ids),
         "capped": hull.capped,
         "dims": list(grid.dims),
         "edge": grid.edge,
         "edge_pixels": spacing_pixels(grid, cameras),
-        "box": [low.tolist(), (low + grid.edge * (np.asarray(grid.dims) - 1)).tolist()],
+        "box": grid.box.tolist(),
     }
 
 
 # --------------------------------------------------------------------------------------------------
 
 
-def picture(dev: Device, views: Sequence[View], points: Points | Hull | None) -> np.ndarray:
+def picture(
+    dev: Device,
+    views: Sequence[View],
+    points: Points | Hull | None,
+    disagreeing: Sequence[Disagreement] = (),
+) -> np.ndarray:
     """uint8 (H, W, 3) contact sheet of up to 12 photographs over white, spread evenly over the
     views, with the outline of the points drawn over them.
+
+    disagreeing: their views come first, tinted where they reject what the others agree on.
     """
     target, images = Target(dev), []
-    shown = evenly(views, SHOWN_VIEWS)
+    tinted = {one.view.name: one for one in disagreeing[:SHOWN_VIEWS]}
+    others = [view for view in views if view.name not in tinted]
+    shown = [one.view for one in tinted.values()] + evenly(others, SHOWN_VIEWS - len(tinted))
     for view in shown:
         size = view.stored_camera.width, view.stored_camera.height
         small = view.reduced(fitting_downscale(size, SHOWN_SIZE))
         target.load(small)
         image = to_8bit(target.whole())
+        if view.name in tinted:
+            rejected = silhouette(*tinted[view.name][2:], small.camera)
+            image[rejected] = image[rejected] // 2 + REJECTED
         if points:
             image[outline(points.grid, points.ids, small.camera)] = OUTLINE
         images.append(image)

@@ -55,6 +55,8 @@ SHORT = {
     "iterations": "train.iterations",
     "points": "points.count",
     "downscale": "scene.downscale",
+    "masks": "scene.masks",
+    "mask_from": "scene.mask_from",
     "eval_every": "train.eval_every",
     "seed": "train.seed",
     "memory": "train.memory_gib",

@@ -2,6 +2,7 @@
 
 import math
 import time
+import warnings
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -14,15 +15,18 @@ from pp_cl.device.device import Device
 from pp_cl.device.discover import open_device
 from pp_cl.errors import UserError
 from pp_cl.files.contact_sheet import write_comparison
-from pp_cl.files.image import to_8bit
+from pp_cl.files.image import to_8bit, write_png
 from pp_cl.files.run_folder import RunFolder
+from pp_cl.info import picture
 from pp_cl.layers.policy import load_policy, policy_of_run
 from pp_cl.metrics.psnr_ssim import psnr
 from pp_cl.model import Model
 from pp_cl.network.unet import UNet
 from pp_cl.presets import SHORT
+from pp_cl.scene.agreement import disagreements
+from pp_cl.scene.bounds import listing
 from pp_cl.scene.hull import build_grid, depth_range, spacing_pixels
-from pp_cl.scene.open import fingerprint, measured_split, open_scene, preset_downscale
+from pp_cl.scene.open import fingerprint, measured_split, open_scene, preset_downscale, scene_box
 from pp_cl.scene.views import View
 from pp_cl.train import Trainer
 from pp_cl.trained import Run, load_run
@@ -30,6 +34,7 @@ from pp_cl.training.memory import Plan, memory_plan, spare_memory
 
 FIRST_PREVIEW = 10.0  # seconds; with a slow step and its writing it shows within 20
 MEASURED_VIEWS = 4
+MASKS_PICTURE = "masks.png"
 
 OnStep = Callable[[int, dict[str, Any] | None], None]
 Stored = tuple[dict[str, Any], dict[str, np.ndarray]]  # header and arrays of a checkpoint
@@ -88,7 +93,8 @@ def _refuse_setting(folder, key, there, asked):
 
 class HullFacts(NamedTuple):
     """The initial grid. capped: the largest grid allowed has fewer points than asked for. edge:
-    world units; spacing: the same in pixels; seconds it took.
+    world units; spacing: the same in pixels; seconds it took. picture: of masks that disagree with
+    the others, None where all agree.
     """
 
     points: int
@@ -98,6 +104,7 @@ class HullFacts(NamedTuple):
     spacing: float
     depth_range: tuple[float, float]
     seconds: float
+    picture: np.ndarray | None
 
 
 @dataclass
@@ -136,6 +143,8 @@ class Training:
         spare = spare_memory(self.plan, trainer.dev, settings.memory_gib)
         trainer.renderer.cache.set_budget(spare)
         self.folder.create(self.config.to_json())
+        if self.hull and self.hull.picture is not None:
+            write_png(self.folder.path / MASKS_PICTURE, self.hull.picture)
         with self.folder.open_log(trainer.step) as log:
             seconds = log.seconds
             first = trainer.step + 1
@@ -252,7 +261,7 @@ def _start(config, views, net):
     """(Trainer, info, HullFacts) of a training from its beginning."""
     dev = net.dev
     start = time.perf_counter()
-    hull = build_grid(dev, views, config.points.count)
+    hull = build_grid(dev, views, config.points.count, scene_box(config))
     near_far = depth_range(views, hull)
     facts = HullFacts(
         len(hull.ids),
@@ -262,6 +271,7 @@ def _start(config, views, net):
         spacing_pixels(hull.grid, [view.camera for view in views]),
         near_far,
         time.perf_counter() - start,
+        _told_of_masks(dev, views, hull),
     )
     points = config.points
     model = Model.create(
@@ -275,6 +285,20 @@ def _start(config, views, net):
     )
     trainer = Trainer(dev, config, model, views)
     return trainer, {"scene": fingerprint(views), "initial_points": facts.points}, facts
+
+
+def _told_of_masks(dev, views, hull):
+    """Warn of masks that disagree with the others; their picture, None where all agree."""
+    found = disagreements(views, hull.grid.box)
+    if not found:
+        return None
+    worst = listing([f"{one.view.name} ({one.share:.0%} of it)" for one in found])
+    warnings.warn(
+        f"masks reject what the other views agree on: {worst}; see {MASKS_PICTURE} in the run's"
+        " folder",
+        stacklevel=2,
+    )
+    return picture(dev, views, hull, found)
 
 
 def _resume(config, views, net, stored, *, file):

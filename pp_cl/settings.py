@@ -29,9 +29,19 @@ class SceneConfig:
     )
     mask_from: str = setting(
         "given",
-        "given: masks that the scene's format names, else alpha; alpha: the images' own; none: all"
-        " opaque",
-        choices=("given", "alpha", "none"),
+        "given: masks that the scene's format names, else alpha; alpha: the images' own; color: by"
+        " the uniform colour of the background; box, none: all opaque, points fill a box",
+        choices=("given", "alpha", "color", "box", "none"),
+    )
+    masks: str = setting("", "folder of masks named like the photographs, white on the object")
+    mask_tolerance: float = setting(
+        10.0, "distance from the background's colour in CIELAB that is still background", 0.1, 100
+    )
+    box: tuple = setting(
+        (0.0, 0.0, 0.0, 0.0, 0.0, 0.0),
+        "x, y, z of two corners of a box that holds the points (zeros: none)",
+        -1e30,
+        1e30,
     )
 
 

@@ -19,7 +19,7 @@ from pp_cl.metrics.shape import Mesh, overlap, sample_surface
 from pp_cl.scene.demo import demo_mesh
 from pp_cl.scene.grid import Grid, smallest_edge
 from pp_cl.scene.hull import CELL_CAP, build_grid
-from pp_cl.scene.open import DEMO, open_scene
+from pp_cl.scene.open import DEMO, open_scene, scene_box
 
 DEMO_RESOLUTION = 512  # vertices of the demo's mesh along its longest side
 
@@ -71,7 +71,7 @@ def _points_before(dev, config: Config, grid):
     would be refined to without pruning.
     """
     views = open_scene(dev, config, ("train",)).splits["train"]
-    hull = build_grid(dev, views, config.points.count)
+    hull = build_grid(dev, views, config.points.count, scene_box(config))
     first, ids = hull.grid, hull.ids
     while first.edge > 1.5 * grid.edge:
         ids, _ = first.children(ids)

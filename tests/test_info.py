@@ -128,7 +128,8 @@ def test_a_scene_says_what_is_in_it(scene, facts):
     assert found["focal_pixels"] == pytest.approx([focal, focal])
     assert found["field_of_view"]["x"] == pytest.approx([math.degrees(0.7)] * 2)
     share = np.pi * (BALL / math.sqrt(16 - BALL**2) * focal) ** 2 / 48**2
-    assert found["masks"] == {"with_alpha": 1.0, "object": pytest.approx(share, rel=0.02)}
+    share = pytest.approx(share, rel=0.02)
+    assert found["masks"] == {"with_alpha": 1.0, "object": share, "disagreeing": []}
     assert found["depth_range"] is None and found["problem"] is None
     assert found["distances"] == pytest.approx([4, 4], abs=1e-6)
     assert found["looked_at"] == pytest.approx([0, 0, 0], abs=1e-6)
@@ -150,15 +151,25 @@ def test_a_scene_in_lines_and_the_preset_of_its_hull(scene, capsys):
     assert "-0.000" not in text
 
 
-def test_a_scene_without_masks_has_no_hull_and_a_picture(tmp_path, facts, capsys):
+def test_a_scene_without_masks_has_a_picture(tmp_path, facts, capsys):
     scene = Path(write_ball_scene(tmp_path / "ball", views=5))
     for path in (scene / "train").iterdir():
         Image.open(path).convert("RGB").save(path)
     found = facts(scene, "--picture", tmp_path / "sheet.png")
-    assert found["masks"] == {"with_alpha": 0.0, "object": None} and found["hull"] is None
-    assert "has no transparent pixel" in found["problem"]
+    assert found["masks"] == {"with_alpha": 0.0, "object": None, "disagreeing": []}
+    assert found["hull"]["points"] > 0, "they fill a box"
     image = read_rgba(tmp_path / "sheet.png")[..., :3]
-    assert image.shape[1] == 4 * (48 + GAP) - GAP and not (image == OUTLINE).all(-1).any()
+    assert image.shape[1] == 4 * (48 + GAP) - GAP
+
+
+def test_a_scene_whose_masks_give_no_hull_has_a_picture(tmp_path, facts, capsys):
+    scene = Path(write_ball_scene(tmp_path / "ball", views=5))
+    path = scene / "train" / "r_3.png"
+    Image.open(path).convert("RGB").save(path)
+    found = facts(scene, "--picture", tmp_path / "sheet.png")
+    assert found["hull"] is None and "has no transparent pixel" in found["problem"]
+    image = read_rgba(tmp_path / "sheet.png")[..., :3]
+    assert not (image == OUTLINE).all(-1).any()
     assert main(["info", str(scene)]) == 0
     assert "hull        none: " in capsys.readouterr().out
 

@@ -14,7 +14,7 @@ from pp_cl.device.device import Device
 from pp_cl.model import Model
 from pp_cl.network.unet import UNet
 from pp_cl.scene.hull import build_grid, depth_range
-from pp_cl.scene.open import open_scene
+from pp_cl.scene.open import open_scene, scene_box
 from pp_cl.train import Trainer
 from pp_cl.training.optimiser import Rates
 
@@ -26,7 +26,7 @@ FORWARD = ("project", "pairs", "weights", "shade", "blend")
 def make_trainer(dev: Device, config: Config) -> Trainer:
     """Trainer on the scene's hull, with opacities in [0.3, 1] and a network of 16 channels."""
     views = open_scene(dev, config, ("train",)).splits["train"]
-    hull = build_grid(dev, views, config.points.count)
+    hull = build_grid(dev, views, config.points.count, scene_box(config))
     near_far = depth_range(views, hull)
     net = UNet(dev, widths=(16, 16, 16))
     model = Model.create(

@@ -19,6 +19,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("--picture", metavar="FILE", help="write photographs with the outline of the points (PNG)")
     shared.add_open(parser)
     add("--preset", choices=PRESETS, default="tiny", help="of a scene: whose hull (tiny)")
+    shared.add_masks(parser)
+    shared.add_set(parser, "of a scene: another setting, such as scene.box")
     add("--scene", metavar="SCENE", help="where the run's scene is now, if it has moved")
     shared.add_device(parser)
 
@@ -59,8 +61,9 @@ def _scene_told(_folder, options):
     from pp_cl.info import describe_scene, picture
 
     dev = open_device(options.device)
-    facts, views, hull = describe_scene(dev, options.subject, options.preset)
-    image = picture(dev, views, hull) if options.picture else None
+    given = shared.read_short(options, ("masks", "mask_from")) + shared.read_set(options.set)
+    facts, *shown = describe_scene(dev, options.subject, options.preset, given)
+    image = picture(dev, *shown) if options.picture else None
     return facts, _scene_lines(facts), image
 
 
@@ -119,6 +122,10 @@ def _scene_lines(facts):
         _line("focal", f"{_range(facts['focal_pixels'], '.1f')} pixels"),
         _line("view", f"{angle_x} x {angle_y} degrees"),
         _line("masks", f"{masks['with_alpha']:.0%} of the training views have one{share}"),
+        *(
+            _line("", f"{one['view']}: its mask rejects {one['share']:.0%} of what others agree on")
+            for one in masks["disagreeing"]
+        ),
         _line("depth range", _range(stated, ".3f") if stated else "none stated"),
         _line("cameras", f"{_range(facts['distances'], '.3f')} from {_vector(facts['looked_at'])}"),
         _line("up", f"{_vector(facts['up'])} (estimated)"),

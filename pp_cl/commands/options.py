@@ -4,11 +4,12 @@ import argparse
 import math
 import sys
 import webbrowser
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 
 from pp_cl.config import assign, preset, validate
 from pp_cl.errors import UserError
+from pp_cl.presets import SHORT
 
 METRICS = ("psnr", "ssim", "lpips")
 
@@ -37,6 +38,28 @@ def add_metrics(parser: argparse.ArgumentParser) -> None:
         metavar="A,B",
         help="of psnr, ssim, lpips; bare = all three (default psnr,ssim)",
     )
+
+
+def add_masks(parser: argparse.ArgumentParser) -> None:
+    """Add --masks and --mask-from, for read_short."""
+    parser.add_argument(
+        "--masks", metavar="FOLDER", help="masks named like the photographs, white on the object"
+    )
+    parser.add_argument(
+        "--mask-from",
+        metavar="HOW",
+        help="given (default), alpha, color (a uniform background), box or none",
+    )
+
+
+def read_short(options: argparse.Namespace, names: Iterable[str]) -> list[tuple[str, str, str]]:
+    """[(key, text, origin)] of the settings with these short names that were given."""
+    texts = {name: getattr(options, name) for name in names}
+    return [
+        (SHORT[name], text, f"--{name.replace('_', '-')}")
+        for name, text in texts.items()
+        if text is not None
+    ]
 
 
 def read_tolerance(text: str | None) -> float | None:

@@ -31,6 +31,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add(
         "--downscale", metavar="K", help="reduce the images K times (default: to the preset's size)"
     )
+    shared.add_masks(parser)
     add("--seed", metavar="S", help="of everything random (0)")
     add(
         "--memory",
@@ -88,10 +89,7 @@ def run(options: argparse.Namespace) -> None:
 
 def _given_settings(options):
     """[(key, text, origin)] of every setting on the command line."""
-    texts = {name: getattr(options, name) for name in SHORT}
-    texts = {name: text for name, text in texts.items() if text is not None}
-    given = [(SHORT[name], text, f"--{name.replace('_', '-')}") for name, text in texts.items()]
-    return given + shared.read_set(options.set)
+    return shared.read_short(options, SHORT) + shared.read_set(options.set)
 
 
 def _first_line(training):

@@ -21,10 +21,11 @@ def bounding_box(views: Sequence[View]) -> np.ndarray:
     around its mask, by linear programs.
 
     A side where the mask reaches the image border does not bound the object, unless nothing else
-    does; then the object is taken to end CROPPED_MARGIN image sizes outside. Raises UserError when
-    the pyramids do not meet or do not end.
+    does; then the object is taken to end CROPPED_MARGIN image sizes outside. Where no view has a
+    mask, images end at their borders. Raises UserError when the pyramids do not meet or do not end.
     """
-    for margin in (None, CROPPED_MARGIN):
+    masked = any(view.has_mask for view in views)
+    for margin in (None, CROPPED_MARGIN) if masked else (0.0, CROPPED_MARGIN):
         planes = np.concatenate([_silhouette_planes(view, margin) for view in views])
         # lower bounds of x, y, z, -x, -y, -z
         bounds = [
@@ -78,24 +79,19 @@ def explain_empty_hull(views: Sequence[View], box: np.ndarray) -> str:
     empty = [view.name for view in views if view.image[..., 3].max() <= MASK_THRESHOLD]
     if empty:
         return (
-            f"{_names(empty)}: the mask is empty (no alpha above {MASK_THRESHOLD}): mend or remove"
+            f"{listing(empty)}: the mask is empty (no alpha above {MASK_THRESHOLD}): mend or remove"
             " the image"
         )
-    grid = Grid.centred_in(box, smallest_edge(box, PROBED_CELLS))
-    vertices = np.stack(np.meshgrid(*(np.arange(n) for n in grid.dims), [1]), -1).reshape(-1, 4)
-    on_mask, beside = np.stack(
-        [_mask_votes(view, grid.projection(view.stored_camera) @ vertices.T) for view in views],
-        axis=1,
-    )
+    _, on_mask, beside = mask_votes(views, box)
     agreeing = on_mask.sum(0).max()
     objections = beside[:, on_mask.sum(0) == agreeing].mean(1)
     names = [views[i].name for i in np.argsort(-objections, kind="stable") if objections[i] > 0]
     if agreeing >= 0.75 * len(views) and names:
         return (
-            f"{_names(names)}: the mask rejects every place that the other views agree on: check"
+            f"{listing(names)}: the mask rejects every place that the other views agree on: check"
             " its alpha and its camera"
         )
-    names = _names([view.name for view in views])
+    names = listing([view.name for view in views])
     return (
         f"{names}: the masks leave no point, at most {agreeing} of {len(views)} meet in one place:"
         " check the masks and the camera poses (camera-to-world; in transforms files x right, y"
@@ -103,7 +99,18 @@ def explain_empty_hull(views: Sequence[View], box: np.ndarray) -> str:
     )
 
 
-def _mask_votes(view, projected):
+def mask_votes(views: Sequence[View], box: np.ndarray) -> tuple[Grid, np.ndarray, np.ndarray]:
+    """(a grid of about 32^3 vertices in a (2, 3) box, (V, N) bool: which of its vertices fall onto
+    each view's mask, and which into its image beside the mask).
+    """
+    grid = Grid.centred_in(box, smallest_edge(box, PROBED_CELLS))
+    k, j, i = np.indices(grid.dims[::-1]).reshape(3, -1)
+    vertices = np.stack([i, j, k, np.ones_like(i)])
+    votes = [_votes_of(view, grid.projection(view.stored_camera) @ vertices) for view in views]
+    return grid, *np.stack(votes, axis=1)
+
+
+def _votes_of(view, projected):
     """(2, N) bool: which positions fall onto the mask, and which into the image beside it.
 
     projected: (3, N), as Grid.projection gives them.
@@ -120,7 +127,8 @@ def _mask_votes(view, projected):
     return np.stack([inside & on, inside & ~on])
 
 
-def _names(names):
+def listing(names: Sequence[str]) -> str:
+    """A few of the names, and how many more there are."""
     return ", ".join(names[:NAMES_SHOWN]) + (
         f" and {len(names) - NAMES_SHOWN} more" if len(names) > NAMES_SHOWN else ""
     )

@@ -59,6 +59,12 @@ class Grid:
         """(3,) float64 world position of the middle of the vertices."""
         return np.asarray(self.origin) + self.edge * (np.asarray(self.dims) - 1) / 2
 
+    @property
+    def box(self) -> np.ndarray:
+        """(2, 3) float64: the first and the last vertex."""
+        low = np.asarray(self.origin)
+        return np.stack([low, low + self.edge * (np.asarray(self.dims) - 1)])
+
     def packed(self) -> np.ndarray:
         """(8,) float32, the layout of cl/grid.h."""
         return np.array([*self.origin, self.edge, *self.dims, 0], np.float32)

@@ -147,27 +147,31 @@ class Carver:
         return Grid(tuple(float(x) for x in origin), carving.grid.edge, (nx, ny, nz)), ids.get()
 
 
-def build_grid(dev: Device, views: Sequence[View], points: int) -> Hull:
+def build_grid(
+    dev: Device, views: Sequence[View], points: int, box: np.ndarray | None = None
+) -> Hull:
     """Hull with about `points` vertices: the rule that fits Table 4 of the PlenopticPoints
     supplemental.
 
-    views: of any sizes; their stored images and cameras are used. A vertex is inside if some image
-    sees it and each one that does has an alpha above MASK_THRESHOLD in the 3x3 pixels around it.
+    views: of any sizes; their stored images and cameras are used. box: (2, 3), which holds all
+    vertices; None: what the masks allow, and where no view has one what all cameras see. A vertex
+    is inside if some image sees it and each one that does has an alpha above MASK_THRESHOLD in the
+    3x3 pixels around it.
     The search starts from the box that the masks allow and rescales the edge from the measured
     count, until the count is `points` to 1.02 points. At CELL_CAP vertices of the grid, or after
     8 rounds, the best carving is taken: the smallest with enough points, else the largest. Raises
-    UserError for an impossible `points`, a view without a mask, masks or poses that leave no
-    vertex.
+    UserError for an impossible `points`, a view without a mask where others have one, masks or
+    poses that leave no vertex.
     """
     if not 1 <= points <= CELL_CAP:
         raise UserError(f"--points {points}: must be between 1 and {CELL_CAP}")
-    for view in views:
-        if view.image[..., 3].min() == 255:
-            raise UserError(
-                f"{view.name}: has no transparent pixel, but the points start from masks: "
-                "give it an alpha channel that is 0 around the object"
-            )
-    box = bounding_box(views)
+    masked = [view.has_mask for view in views]
+    if any(masked) and not all(masked):
+        raise UserError(
+            f"{views[masked.index(False)].name}: has no transparent pixel, but other photographs"
+            " have: give it a mask that is 0 around the object"
+        )
+    box = bounding_box(views) if box is None else box
     carver = Carver(dev, _farthest_point_order(views, box.mean(0)))
     coarse_edge = smallest_edge(box, min(COARSE_CELLS, CELL_CAP))
     best = last = carver.carve(Grid.centred_in(box, coarse_edge))

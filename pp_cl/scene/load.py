@@ -111,7 +111,7 @@ def _read_image(folder, photograph, masks):
     UserError.
     """
     image = read_rgba(folder / photograph.name)
-    image = masks.apply(image, photograph.mask and folder / photograph.mask)
+    image = masks.apply(image, photograph.name, photograph.mask and folder / photograph.mask)
     if photograph.distortion.folds(photograph.camera):
         raise UserError(
             f"{folder / photograph.name}: its distortion coefficients fold the image over; correct"

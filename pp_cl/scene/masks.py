@@ -1,41 +1,126 @@
 """Where the masks of photographs come from."""
 
 from dataclasses import dataclass
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 
 import numpy as np
+from scipy.ndimage import distance_transform_edt
+from skimage.color import rgb2lab
+from skimage.measure import label
 
 from pp_cl.errors import UserError
 from pp_cl.files.image import read_gray
+from pp_cl.scene.readers.common import ENDINGS
+
+BORDER_SHARE = 0.5  # of the border's pixels that must have its median colour
+OPAQUE = np.uint8(255)
+EDGE = 2.5  # pixels: the lens and its demosaicing mix no further
 
 
 @dataclass(frozen=True)
 class MaskRule:
-    """How a scene's masks are made. source: given, alpha or none (settings scene.mask_from)."""
+    """How a scene's masks are made: the settings scene.mask_from, scene.masks and
+    scene.mask_tolerance.
+
+    source: given, alpha, color, box or none. folder: of masks named like the photographs, before
+    everything else; "" for none. tolerance: of color, in CIELAB's units.
+    """
 
     source: str = "given"
+    folder: str = ""
+    tolerance: float = 10.0
 
-    def apply(self, image: np.ndarray, mask: Path | None) -> np.ndarray:
+    def apply(self, image: np.ndarray, name: str, mask: Path | None) -> np.ndarray:
         """(H, W, 4) uint8: the image with its mask as alpha.
 
-        image: (H, W, 4) uint8. mask: the file that the format names for it, if it does. Raises
-        UserError naming a mask that cannot be read or has another size.
+        image: (H, W, 4) uint8. name: of the photograph, relative to its scene. mask: the file that
+        the format names for it, if it does. Raises UserError naming a mask that is missing, cannot
+        be read or has another size, or a photograph without a uniform border.
         """
-        if self.source == "none":
-            return _with_alpha(image, np.uint8(255))
-        if mask is None or self.source == "alpha":
-            return image
-        alpha = read_gray(mask)
-        if alpha.shape != image.shape[:2]:
-            sizes = "{1}x{0} pixels, but its image has {3}x{2}".format(*alpha.shape, *image.shape)
-            raise UserError(f"{mask}: {sizes}; make it the image's size")
-        return _with_alpha(image, alpha)
+        if self.folder:
+            return _with_file(image, _named(Path(self.folder), name))
+        if self.source in ("box", "none"):
+            return _with_alpha(image, OPAQUE)
+        if self.source == "color":
+            return cut_out(image, name, self.tolerance)
+        return image if mask is None or self.source == "alpha" else _with_file(image, mask)
 
 
 AS_GIVEN = MaskRule()
+
+
+def _named(folder, name):
+    """The mask of a photograph in a folder: its path or its name, with the ending .png added or
+    another one. Raises UserError.
+    """
+    path = PurePosixPath(name)
+    for stem in (path, PurePosixPath(path.name)):
+        for given in (f"{stem}.png", *(stem.with_suffix(ending) for ending in ENDINGS)):
+            if (folder / given).is_file():
+                return folder / given
+    raise UserError(f"{folder}: no mask for {name}; add {path.stem}.png, white where the object is")
+
+
+def _with_file(image, mask):
+    """The image with the brightness of a mask's pixels as alpha. Raises UserError."""
+    alpha = read_gray(mask)
+    if alpha.shape != image.shape[:2]:
+        sizes = "{1}x{0} pixels, but its image has {3}x{2}".format(*alpha.shape, *image.shape)
+        raise UserError(f"{mask}: {sizes}; make it the image's size")
+    return _with_alpha(image, alpha)
 
 
 def _with_alpha(image, alpha):
     image = image.copy()
     image[..., 3] = alpha
     return image
+
+
+def cut_out(image: np.ndarray, name: str, tolerance: float) -> np.ndarray:
+    """(H, W, 4) uint8: the image without the uniform background that its border shows.
+
+    The background's colour is the median of the border; it is what reaches the border and is no
+    further than `tolerance` from it, a distance in CIELAB. Places of that colour which the object
+    encloses are opaque, since nothing tells a hole from a spot. Pixels at the edge are a mixture of
+    the background and of the nearest colour within the object. Raises UserError naming the
+    photograph where its border is of several colours.
+    """
+    colour = image[..., :3] / 255.0
+    behind = np.median(_border(colour), axis=0)
+    distance = np.linalg.norm(rgb2lab(colour) - rgb2lab(behind), axis=2)
+    share = (_border(distance) < 2 * tolerance).mean()
+    if share < BORDER_SHARE:
+        raise UserError(
+            f"{name}: only {share:.0%} of its border have one colour, so --mask-from color finds no"
+            " background; give masks with --masks FOLDER, or a higher scene.mask_tolerance"
+        )
+    outside = _touching_border(distance < tolerance)
+    within = distance_transform_edt(~outside) > EDGE
+    alpha = np.where(outside, 0, np.clip(distance / tolerance - 1, 0, 1))
+    alpha[within] = 1
+    if within.any():
+        away, nearest = distance_transform_edt(~within, return_indices=True)
+        mixed = ~outside & ~within & (away < 2 * EDGE)
+        alpha[mixed] = _share_of(colour, colour[tuple(nearest)], behind)[mixed]
+    straight = (colour - (1 - alpha[..., None]) * behind) / np.maximum(alpha, 1 / 255)[..., None]
+    rgba = np.dstack([np.clip(straight, 0, 1), alpha])
+    return (255 * rgba + 0.5).astype(np.uint8)
+
+
+def _border(image):
+    """The pixels of the outermost rows and columns, (N, ...)."""
+    return np.concatenate([image[0], image[-1], image[1:-1, 0], image[1:-1, -1]])
+
+
+def _share_of(mixture, front, behind):
+    """The share in [0, 1] of the front in mixtures of two colours, (H, W)."""
+    step = front - behind
+    length = np.maximum((step**2).sum(-1), 1e-6)
+    return np.clip(((mixture - behind) * step).sum(-1) / length, 0, 1)
+
+
+def _touching_border(places):
+    """(H, W) bool: the connected regions of `places` that reach the image's border."""
+    regions = label(places, connectivity=1)
+    reaching = np.unique(np.concatenate([regions[0], regions[-1], regions[:, 0], regions[:, -1]]))
+    return places & np.isin(regions, reaching[reaching > 0])

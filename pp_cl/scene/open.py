@@ -1,6 +1,7 @@
 """The scene that a run's settings name."""
 
 import hashlib
+import warnings
 from pathlib import Path
 
 import numpy as np
@@ -27,7 +28,36 @@ def open_scene(
     path, downscale = config.scene.path, config.scene.downscale
     if path == DEMO:
         return demo.demo_scene(dev, splits, most=most).reduced(downscale)
-    return load_scene(path, splits, most, MaskRule(config.scene.mask_from)).reduced(downscale)
+    settings = config.scene
+    rule = MaskRule(settings.mask_from, settings.masks, settings.mask_tolerance)
+    scene = load_scene(path, splits, most, rule)
+    _warn_without_masks(scene, settings.mask_from)
+    return scene.reduced(downscale)
+
+
+def _warn_without_masks(scene, source):
+    """Say so where the points will fill a box, unless that was asked for."""
+    views = scene.splits.get("train", [])
+    if views and source != "box" and not any(view.has_mask for view in views):
+        warnings.warn(
+            f"{scene.folder}: no photograph has a mask: points fill the box that all cameras see;"
+            " --mask-from color cuts out a uniform background, --masks FOLDER takes masks,"
+            " --mask-from box says that it is meant",
+            stacklevel=2,
+        )
+
+
+def scene_box(config: Config) -> np.ndarray | None:
+    """(2, 3) lower and upper corner of the setting scene.box, None where there is none. Raises
+    UserError for a box without volume.
+    """
+    corners = np.array(config.scene.box, np.float64).reshape(2, 3)
+    if not corners.any():
+        return None
+    box = np.stack([corners.min(0), corners.max(0)])
+    if not (box[1] > box[0]).all():
+        raise UserError("scene.box: its corners must differ in x, y and z")
+    return box
 
 
 def scene_format(path: str) -> str:

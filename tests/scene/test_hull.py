@@ -258,7 +258,7 @@ def test_impossible_counts(dev, points):
 def test_a_view_without_mask_is_named(dev):
     views = ball_views()
     views[3].image[..., 3] = 255
-    with pytest.raises(UserError, match=r"^train/r_3\.png: .*alpha channel"):
+    with pytest.raises(UserError, match=r"^train/r_3\.png: .*give it a mask"):
         build_grid(dev, views, 100)
 
 

@@ -1,0 +1,101 @@
+"""Masks that contradict the others are found, and none else."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from support.ball_views import CENTRE, RADIUS, ball_views
+from support.runs import arguments
+from support.scenes import write_ball_scene
+
+from pp_cl.cli import main
+from pp_cl.files.image import read_rgba, write_png
+from pp_cl.info import REJECTED, describe_scene, picture
+from pp_cl.scene.agreement import disagreements
+from pp_cl.scene.hull import build_grid
+from pp_cl.scene.load import load_scene
+
+BOX = np.stack([CENTRE - RADIUS, CENTRE + RADIUS])
+
+
+def shifted(view, share):
+    """The view with its mask moved to the right."""
+    image = view.image.copy()
+    image[..., 3] = np.roll(image[..., 3], round(share * image.shape[1]), axis=1)
+    return replace(view, image=image)
+
+
+@pytest.mark.parametrize("count", [8, 24, 60])
+def test_masks_of_one_object_agree(count):
+    assert disagreements(ball_views(count), BOX) == []
+
+
+@pytest.mark.parametrize("count", [24, 60])
+@pytest.mark.parametrize("bad", [0, 5])
+def test_a_shifted_mask_is_named(dev, count, bad):
+    views = ball_views(count)
+    views[bad] = shifted(views[bad], 0.15)
+    hull = build_grid(dev, views, 2000)
+    [found] = disagreements(views, hull.grid.box)
+    assert found.view is views[bad] and found.share > 0.15
+
+
+def test_the_share_is_that_of_the_object():
+    """A mask that lacks its left half rejects half of the ball."""
+    views = ball_views(60)
+    image = views[7].image.copy()
+    image[:, :32, 3] = 0
+    views[7] = replace(views[7], image=image)
+    [found] = disagreements(views, BOX)
+    assert found.view is views[7] and found.share == pytest.approx(0.5, abs=0.08)
+    places = found.grid.positions(found.ids)
+    assert (np.linalg.norm(places - CENTRE, axis=1) < 1.2 * RADIUS).all()
+
+
+def test_two_wrong_masks_come_the_worst_first():
+    views = ball_views(60)
+    views[3], views[40] = shifted(views[3], -0.15), shifted(views[40], 0.25)
+    assert [d.view.name for d in disagreements(views, BOX)] == [views[40].name, views[3].name]
+
+
+def test_without_masks_nothing_disagrees():
+    views = ball_views(12)
+    views[0] = replace(views[0], image=np.full_like(views[0].image, 255))
+    assert disagreements(views, BOX) == []
+
+
+def test_real_scenes_have_none(dev, data):
+    for name in ("nerf_synthetic/lego", "ethiopian_head"):
+        views = load_scene(data / name).splits["train"]
+        assert disagreements(views, build_grid(dev, views, 20_000).grid.box) == []
+
+
+@pytest.fixture
+def scene(tmp_path):
+    """A ball's scene with one shifted mask."""
+    folder = write_ball_scene(tmp_path / "ball", views=24, size=48)
+    file = tmp_path / "ball/train/r_4.png"
+    image = read_rgba(file)
+    image[..., 3] = np.roll(image[..., 3], 8, axis=1)
+    write_png(file, image)
+    return folder
+
+
+def test_the_scenes_facts_name_it_and_the_picture_shows_it_first(dev, scene, tmp_path, capsys):
+    facts, *shown = describe_scene(dev, scene, "tiny")
+    [told] = facts["masks"]["disagreeing"]
+    assert told["view"] == "train/r_4.png" and told["share"] > 0.15
+    sheet, plain = picture(dev, *shown), picture(dev, *shown[:2])
+    first = sheet[14 : 14 + 48, :48].astype(int)
+    tinted = (first[..., 0] >= REJECTED[0]) & (first[..., 2] <= 127) & (first[..., 1] >= 60)
+    assert tinted.sum() > 50
+    assert sheet.shape == plain.shape and (sheet != plain).any()
+    assert main(["info", scene, "--picture", str(tmp_path / "a.png")]) == 0
+    assert "train/r_4.png: its mask rejects" in capsys.readouterr().out
+
+
+def test_a_training_warns_and_leaves_the_picture(scene, tmp_path, capsys):
+    assert main(arguments(scene, tmp_path / "run", 1, train__iterations=2)) == 0
+    error = capsys.readouterr().err
+    assert "masks reject what the other views agree on: train/r_4.png (" in error
+    assert read_rgba(tmp_path / "run" / "masks.png").shape[1] > 48

@@ -1,0 +1,270 @@
+"""Masks from files, from a uniform background, and none."""
+
+import json
+import warnings
+
+import numpy as np
+import pytest
+from PIL import Image
+from scipy.ndimage import gaussian_filter
+from support.runs import arguments
+from support.scenes import ball_image, ring_cameras, write_ball_scene
+from support.transforms_scenes import SIZE, write_scene
+
+from pp_cl.cli import main
+from pp_cl.config import configure, preset
+from pp_cl.errors import UserError
+from pp_cl.files.image import read_rgba, write_png
+from pp_cl.scene.hull import build_grid
+from pp_cl.scene.load import load_scene
+from pp_cl.scene.masks import MaskRule, cut_out
+from pp_cl.scene.open import open_scene, scene_box
+from pp_cl.scene.views import MASK_THRESHOLD
+
+TOLERANCE = 10.0
+
+
+def disc(size=60, radius=20.0, soft=0.0):
+    """(size, size) alpha of a disc in the middle."""
+    y, x = np.mgrid[:size, :size] + 0.5 - size / 2
+    alpha = (np.hypot(x, y) < radius).astype(float)
+    return gaussian_filter(alpha, soft) if soft else alpha
+
+
+def over(alpha, colour, background):
+    """uint8 RGBA, opaque: a colour in [0, 1] over another by alpha."""
+    image = alpha[..., None] * np.array(colour) + (1 - alpha[..., None]) * np.array(background)
+    return np.dstack([np.rint(255 * image), np.full(alpha.shape, 255)]).astype(np.uint8)
+
+
+# --------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("background", [(1, 1, 1), (0, 0, 0), (0.1, 0.8, 0.2), (0.4, 0.4, 0.45)])
+def test_a_uniform_background_is_cut_out(rng, background):
+    """With the noise of a camera, and shading of a few levels across the image."""
+    alpha = disc()
+    image = over(alpha, (0.7, 0.2, 0.25), background).astype(float)
+    image[..., :3] += rng.normal(0, 2, image[..., :3].shape) + np.linspace(-3, 3, 60)[:, None]
+    image = np.clip(np.rint(image), 0, 255).astype(np.uint8)
+    found = cut_out(image, "a.png", TOLERANCE)
+    assert ((found[..., 3] > 127) == (alpha > 0.5)).all()
+    assert (found[..., 3][alpha == 1] > 220).all(), "the noise of the colours is that of the edge"
+    inside = disc(radius=17) == 1
+    assert np.abs(found[inside].astype(int) - image[inside]).max() <= 1
+
+
+def test_soft_edges_lose_the_background(rng):
+    """The colour of a half transparent pixel is the object's, not a mixture with the screen."""
+    alpha, colour = disc(soft=1.2), np.array([0.8, 0.3, 0.2])
+    found = cut_out(over(alpha, colour, (0.0, 1.0, 0.0)), "a.png", TOLERANCE) / 255
+    edge = (found[..., 3] > 0.3) & (found[..., 3] < 1)
+    assert edge.sum() > 10
+    mixed = (alpha[..., None] * colour + (1 - alpha[..., None]) * [0, 1, 0])[edge]
+    error, before = (np.abs(c - colour).mean() for c in (found[edge][:, :3], mixed))
+    assert error < 0.7 * before
+
+
+def test_spots_of_the_backgrounds_colour_stay():
+    """What the object encloses is taken for the object; a bay that reaches the border is not."""
+    alpha = disc()
+    image = over(alpha, (0.6, 0.1, 0.1), (1, 1, 1))
+    image[26:34, 26:34, :3] = 255
+    image[28:32, :30, :3] = 255
+    assert (cut_out(image, "a.png", TOLERANCE)[26:34, 26:34, 3] == 0).all()
+    image = over(alpha, (0.6, 0.1, 0.1), (1, 1, 1))
+    image[26:34, 26:34, :3] = 255
+    assert (cut_out(image, "a.png", TOLERANCE)[26:34, 26:34, 3] == 255).all()
+
+
+def test_a_larger_tolerance_takes_more():
+    image = over(disc(), (0.92, 0.92, 0.9), (1, 1, 1))
+    assert cut_out(image, "a.png", 10)[30, 30, 3] < 64
+    assert cut_out(image, "a.png", 2)[30, 30, 3] == 255
+
+
+def test_a_border_of_many_colours_is_refused(rng):
+    image = rng.integers(0, 256, (40, 40, 4), np.uint8)
+    with pytest.raises(UserError, match=r"a\.png: only \d+% of its border.*--masks FOLDER"):
+        cut_out(image, "a.png", TOLERANCE)
+
+
+def test_an_object_at_the_border_does_not_decide():
+    """Less than half of the border is the object's: the background is the other colour."""
+    image = over(np.zeros((40, 40)), (0, 0, 0), (1, 1, 1))
+    image[:25, :30, :3] = (200, 30, 30)
+    found = cut_out(image, "a.png", TOLERANCE)[..., 3]
+    assert (found[:25, :30] == 255).all() and (found[25:] == 0).all()
+
+
+# --------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("named", ["{stem}.png", "{name}.png", "{stem}.jpg"])
+def test_a_folder_of_masks(tmp_path, rng, named):
+    """Outside of the scene's folder, which the format's own masks and alpha give way to."""
+    (tmp_path / "scene").mkdir()
+    write_scene(tmp_path / "scene")
+    masks = tmp_path / "masks"
+    masks.mkdir()
+    expected = {}
+    for i in range(3):
+        mask = np.kron(rng.integers(0, 2, (9, 12)), np.ones((2, 2))).astype(np.uint8) * 255
+        file = masks / named.format(stem=f"train_{i}", name=f"train_{i}.png")
+        Image.fromarray(mask).save(file, quality=100)
+        expected[f"train_{i}.png"] = mask
+    views = load_scene(tmp_path / "scene", masks=MaskRule(folder=str(masks))).splits["train"]
+    for view in views:
+        assert np.abs(view.image[..., 3].astype(int) - expected[view.name]).max() <= 8
+        stored = read_rgba(tmp_path / "scene" / view.name)
+        assert (view.image[..., :3] == stored[..., :3]).all()
+
+
+@pytest.mark.parametrize(
+    "source, opaque", [("given", False), ("alpha", False), ("none", True), ("box", True)]
+)
+def test_alpha_is_taken_or_left(tmp_path, source, opaque):
+    write_scene(tmp_path)
+    for view in load_scene(tmp_path, masks=MaskRule(source)).splits["train"]:
+        assert (view.image[..., 3] == 255).all() == opaque
+
+
+@pytest.fixture
+def masked(tmp_path):
+    """(folder of a scene, folder of its masks)."""
+    write_scene(tmp_path)
+    masks = tmp_path / "masks"
+    masks.mkdir()
+    for i in range(3):
+        write_png(masks / f"train_{i}.png", np.ones((SIZE[1], SIZE[0])))
+    return tmp_path, masks
+
+
+BAD = {
+    "missing": (lambda m: (m / "train_1.png").unlink(), "no mask for train_1.png"),
+    "another size": (lambda m: write_png(m / "train_1.png", np.ones((4, 5))), "5x4 pixels"),
+    "empty file": (lambda m: (m / "train_1.png").write_bytes(b""), "cannot be read"),
+    "cut": (lambda m: (m / "train_1.png").write_bytes(b"\x89PNG\r\n\x1a\n"), "cannot be read"),
+    "text": (lambda m: (m / "train_1.png").write_text("white"), "cannot be read"),
+    "a folder": (
+        lambda m: ((m / "train_1.png").unlink(), (m / "train_1.png").mkdir()),
+        "no mask for train_1.png",
+    ),
+    "16 bits": (
+        lambda m: Image.fromarray(np.ones(SIZE[::-1], np.uint16)).save(m / "train_1.png"),
+        "8 bits",
+    ),
+}
+
+
+@pytest.mark.parametrize("case", BAD)
+def test_bad_masks(masked, case):
+    scene, masks = masked
+    change, words = BAD[case]
+    change(masks)
+    with pytest.raises(UserError, match=words) as caught:
+        load_scene(scene, masks=MaskRule(folder=str(masks)))
+    assert str(masks) in str(caught.value) and "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ("--masks", "nowhere"),
+        ("--mask-from", "colour"),
+        ("--set", "scene.mask_tolerance=0"),
+        ("--set", "scene.mask_tolerance=nan"),
+        ("--set", "scene.box=1,2,3"),
+        ("--set", "scene.box=0,0,0,1,1,0"),
+        ("--set", "scene.box=a,0,0,1,1,1"),
+    ],
+)
+def test_bad_options_are_one_line(masked, tmp_path, capsys, words):
+    assert main(["train", str(masked[0]), "--out", str(tmp_path / "run"), *words]) == 2
+    error = capsys.readouterr().err
+    assert error.count("\n") == 1 and words[1].partition("=")[0] in error
+    assert not (tmp_path / "run").exists()
+
+
+# --------------------------------------------------------------------------------------------------
+
+
+def opaque_ball(folder, background=(255, 255, 255)):
+    """The ball's scene with opaque images over a colour."""
+    write_ball_scene(folder, views=10, size=40)
+    for file in folder.rglob("*.png"):
+        rgba = read_rgba(file)
+        rgba[rgba[..., 3] == 0] = (*background, 255)
+        write_png(file, rgba[..., :3])
+    return str(folder)
+
+
+def test_a_ball_on_white_has_the_hull_of_its_masks(dev, tmp_path):
+    opaque_ball(tmp_path / "white")
+    write_ball_scene(tmp_path / "masked", views=10, size=40)
+    cut = load_scene(tmp_path / "white", masks=MaskRule("color")).splits["train"]
+    given = load_scene(tmp_path / "masked").splits["train"]
+    for a, b in zip(cut, given, strict=True):
+        masks = [view.image[..., 3] > MASK_THRESHOLD for view in (a, b)]
+        assert (masks[0] != masks[1]).mean() < 0.01
+    hulls = [build_grid(dev, views, 2000) for views in (cut, given)]
+    assert hulls[0].grid.edge == pytest.approx(hulls[1].grid.edge, rel=0.02)
+
+
+def test_without_masks_points_fill_what_all_cameras_see(dev, tmp_path):
+    """Two rings of cameras: the middle is in every image, and the box ends where no camera
+    looks.
+    """
+    scene = opaque_ball(tmp_path / "white")
+    config = configure(preset("tiny"), scene)
+    with pytest.warns(UserWarning, match="no photograph has a mask.*--mask-from color"):
+        views = open_scene(dev, config, ("train",)).splits["train"]
+    hull = build_grid(dev, views, 3000)
+    box = hull.grid.box
+    assert (box[0] < -0.8).all() and (box[1] > 0.8).all() and np.abs(box).max() < 3
+    config = configure(preset("tiny"), scene, [("scene.mask_from", "box", "test")])
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        open_scene(dev, config, ("train",))
+
+
+def test_a_box_that_is_given_holds_the_points(dev, tmp_path):
+    given = [("scene.box", "1,-1,-0.5,-0.9,0.8,0.5", "test"), ("scene.mask_from", "box", "test")]
+    config = configure(preset("tiny"), opaque_ball(tmp_path / "white"), given)
+    box = scene_box(config)
+    np.testing.assert_array_equal(box, [[-0.9, -1, -0.5], [1, 0.8, 0.5]])
+    views = open_scene(dev, config, ("train",)).splits["train"]
+    found = build_grid(dev, views, 3000, box).grid.box
+    assert (found >= box[0] - 1e-9).all() and (found <= box[1] + 1e-9).all()
+    np.testing.assert_allclose(np.ptp(found, axis=0), np.ptp(box, axis=0), rtol=0.2)
+    assert scene_box(preset("tiny")) is None
+
+
+def test_a_mask_for_some_photographs_only(dev, tmp_path):
+    write_ball_scene(tmp_path / "ball", views=6, size=40)
+    write_png(tmp_path / "ball/train/r_2.png", read_rgba(tmp_path / "ball/train/r_2.png")[..., :3])
+    views = load_scene(tmp_path / "ball").splits["train"]
+    with pytest.raises(UserError, match=r"train/r_2\.png: has no transparent pixel, but other"):
+        build_grid(dev, views, 1000)
+
+
+def test_the_choice_is_kept_with_the_run(tmp_path, monkeypatch):
+    """A relative folder of masks becomes an absolute path; the evaluation cuts out alike."""
+    scene = opaque_ball(tmp_path / "white", (20, 220, 40))
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "masks").mkdir()
+    for split in ("train", "test"):
+        for i, camera in enumerate(ring_cameras(10 if split == "train" else 2, 40)):
+            (tmp_path / "masks" / split).mkdir(exist_ok=True)
+            write_png(tmp_path / "masks" / split / f"r_{i}.png", ball_image(camera)[..., 3])
+    means = {}
+    for name, words in (("a", ["--mask-from", "color"]), ("b", ["--masks", "masks"])):
+        assert main([*arguments(scene, name, 1), *words]) == 0
+        monkeypatch.chdir("/")
+        assert main(["eval", str(tmp_path / name)]) == 0
+        monkeypatch.chdir(tmp_path)
+        metrics = json.loads((tmp_path / name / "eval/metrics.json").read_text())
+        means[name] = metrics["mean"]["psnr"]
+    assert abs(means["a"] - means["b"]) < 1.5
+    stored = json.loads((tmp_path / "b" / "config.json").read_text())["scene"]
+    assert stored["masks"] == str(tmp_path / "masks")
