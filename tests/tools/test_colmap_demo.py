@@ -1,0 +1,61 @@
+"""The photographs for COLMAP belong to one world, and cameras are compared up to a similarity."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from pp_cl.files.image import read_rgba
+from tools.colmap_demo import ROOM, align, cameras, room, write_photographs
+
+
+def test_the_wall_is_the_same_from_everywhere():
+    """A place on the wall has one colour, whichever camera shows it, up to interpolation."""
+    one, two = cameras(200)[20], cameras(200)[23]
+    images, checked = (room(one), room(two)), 0
+    for row, column in np.random.default_rng(0).integers(10, 190, (300, 2)):
+        ray = one.pose[:, :3] @ [
+            (column + 0.5 - one.cx) / one.fx,
+            (row + 0.5 - one.cy) / one.fy,
+            1,
+        ]
+        ray /= np.linalg.norm(ray)
+        b = ray @ one.eye
+        place = one.eye + (-b + np.sqrt(b**2 + ROOM**2 - one.eye @ one.eye)) * ray
+        x, y, z = two.pose[:, :3].T @ (place - two.eye)
+        u, v = two.fx * x / z + two.cx - 0.5, two.fy * y / z + two.cy - 0.5
+        if z > 0 and 1 < u < 198 and 1 < v < 198:
+            c, r = int(u), int(v)
+            patch = images[1][r : r + 2, c : c + 2].reshape(4, 3)
+            low, high = patch.min(0) - 0.12, patch.max(0) + 0.12
+            checked += ((images[0][row, column] > low) & (images[0][row, column] < high)).all()
+            checked -= ((images[0][row, column] <= low) | (images[0][row, column] >= high)).any()
+    assert checked > 50
+
+
+def test_photographs_and_masks(dev, tmp_path):
+    write_photographs(dev, tmp_path / "a", 64)
+    names = sorted(file.name for file in (tmp_path / "a" / "images").iterdir())
+    assert len(names) == 64 and names[0] == "000.png"
+    image = read_rgba(tmp_path / "a" / "images" / "007.png")
+    mask = read_rgba(tmp_path / "a" / "masks" / "007.png.png")[..., 0]
+    assert (image[..., 3] == 255).all() and 0.02 < (mask > 127).mean() < 0.5
+
+
+def test_cameras_are_compared_up_to_a_similarity(rng):
+    true = cameras(100)[:12]
+    turn, scale, shift = Rotation.random(random_state=1).as_matrix(), 3.7, rng.normal(size=3)
+
+    def moved(camera, noise=0.0, degrees=0.0):
+        small = Rotation.from_rotvec([0, np.radians(degrees), 0]).as_matrix()
+        rotation = turn @ camera.pose[:, :3] @ small
+        eye = scale * turn @ (camera.eye + noise * rng.normal(size=3)) + shift
+        return replace(camera, pose=np.column_stack([rotation, eye]))
+
+    exact = align([moved(camera) for camera in true], true)
+    assert exact.position < 1e-9 and exact.degrees < 1e-5
+    turned = align([moved(true[0], degrees=2.0), *(moved(c) for c in true[1:])], true)
+    assert turned.degrees == pytest.approx(2.0, abs=0.01)
+    noisy = align([moved(camera, noise=0.01) for camera in true], true)
+    assert 0.005 < noisy.position < 0.03
