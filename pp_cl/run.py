@@ -137,14 +137,29 @@ class Training:
         on_step(step, row) is called after each step, with its row of the log where it has one.
         is_stopped() is asked after each step: where it is true, a checkpoint is written and the
         training ends there, to be gone on with. Raises UserError, before anything is written, where
-        the memory is too small.
+        the memory is too small or another process trains into the folder.
         """
         trainer, settings = self.trainer, self.config.train
         spare = spare_memory(self.plan, trainer.dev, settings.memory_gib)
         trainer.renderer.cache.set_budget(spare)
-        self.folder.create(self.config.to_json())
-        if self.hull and self.hull.picture is not None:
-            write_png(self.folder.path / MASKS_PICTURE, self.hull.picture)
+        with self.folder.owned():
+            self._check_unchanged()
+            self.folder.create(self.config.to_json())
+            if self.hull and self.hull.picture is not None:
+                write_png(self.folder.path / MASKS_PICTURE, self.hull.picture)
+            return self._run(on_step, is_stopped)
+
+    def _check_unchanged(self):
+        """Raise UserError where another process trained into the folder since it was looked at."""
+        header = self.folder.shapes()[0] if self.folder.checkpoint.exists() else {"step": 0}
+        if header["step"] != self.trainer.step:
+            raise UserError(
+                f"{self.folder}: another training has gone on to step {header['step']} meanwhile;"
+                " give the command again"
+            )
+
+    def _run(self, on_step, is_stopped):
+        trainer, settings = self.trainer, self.config.train
         with self.folder.open_log(trainer.step) as log:
             seconds = log.seconds
             first = trainer.step + 1

@@ -1,8 +1,11 @@
 """pp-cl from Python: the same runs, without text."""
 
 import json
+import os
+import socket
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +15,12 @@ from support.scenes import write_ball_scene
 
 import pp_cl
 from pp_cl.cli import main
+from pp_cl.config import assign
+from pp_cl.device.discover import open_device
+from pp_cl.errors import UserError
 from pp_cl.files.image import read_rgba, to_8bit
+from pp_cl.files.run_folder import RunFolder
+from pp_cl.run import open_training, run_config
 
 
 @pytest.fixture(scope="module")
@@ -79,3 +87,45 @@ def test_the_package_and_its_help_need_no_opencl():
     code += "assert 'numpy' not in sys.modules\nassert set(pp_cl.__all__) <= set(dir(pp_cl))"
     root = Path(__file__).parents[1]
     subprocess.run([sys.executable, "-c", code], check=True, cwd=root, stdout=subprocess.DEVNULL)
+
+
+# --------------------------------------------------------------------------------------------------
+
+
+def test_a_folder_has_one_training_at_a_time(scene, tmp_path, capsys):
+    out = tmp_path / "run"
+    with RunFolder(out).owned():
+        assert main(arguments(scene, out)) == 2
+        error = capsys.readouterr().err.splitlines()[-1]
+        assert f"{out}: process {os.getpid()} on {socket.gethostname()} trains into it" in error
+    assert not (out / "config.json").exists(), "nothing was written beside the owner's"
+    assert main(arguments(scene, out, train__iterations=2)) == 0
+    assert not (out / ".owner").exists()
+
+
+def test_a_killed_owner_owns_nothing_any_more(scene, tmp_path):
+    out = tmp_path / "run"
+    words = [sys.executable, "-m", "pp_cl", *arguments(scene, out, train__iterations=5000)]
+    with subprocess.Popen(words, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE) as process:
+        while process.poll() is None and not (out / "log.jsonl").exists():
+            time.sleep(0.05)
+        second = subprocess.run(words, capture_output=True, text=True, check=False)
+        assert second.returncode == 2 and f"process {process.pid} on " in second.stderr
+        assert process.poll() is None, "the second start ended the first"
+        process.kill()
+    with RunFolder(out).owned():
+        assert (out / ".owner").read_text().startswith(f"process {os.getpid()} ")
+
+
+def test_a_folder_that_went_on_since_it_was_looked_at(scene, tmp_path, monkeypatch):
+    """Two trainings look at an empty folder; the slower one finds what the other has left."""
+    out, folder = tmp_path / "run", RunFolder(tmp_path / "run")
+    config = run_config(folder, scene, None, [("scene.downscale", 2, "test")])
+    for key, value in (SETTINGS | {"train.iterations": 3}).items():
+        assign(config, key, value, "test")
+    late, early = (open_training(open_device(), folder, config, None) for _ in range(2))
+    early.run()
+    before = (out / "checkpoint.npz").read_bytes()
+    with pytest.raises(UserError, match="another training has gone on to step 3"):
+        late.run()
+    assert (out / "checkpoint.npz").read_bytes() == before

@@ -2,12 +2,16 @@
 
 import json
 import math
-from collections.abc import Mapping
+import os
+import socket
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from itertools import takewhile
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from filelock import FileLock, Timeout
 
 from pp_cl.errors import UserError
 from pp_cl.files.atomic import remove_leftovers, write_text
@@ -45,6 +49,32 @@ class RunFolder:
                 f"{self}: holds other files and no config.json; choose an empty or new folder for"
                 " --out"
             )
+
+    @contextmanager
+    def owned(self) -> Iterator[None]:
+        """While the block runs, no other process trains into the folder, which is made where it is
+        missing. The system ends the ownership of a process that was killed.
+
+        Raises UserError naming the process that owns the folder.
+        """
+        self.path.mkdir(parents=True, exist_ok=True)
+        owner, lock = self.path / ".owner", FileLock(self.path / ".lock", timeout=0)
+        try:
+            lock.acquire()
+        except Timeout:
+            try:
+                who = owner.read_text().strip()
+            except OSError:
+                who = "another process"
+            raise UserError(
+                f"{self}: {who} trains into it; wait for its end, or choose another --out"
+            ) from None
+        try:
+            owner.write_text(f"process {os.getpid()} on {socket.gethostname()}\n")
+            yield
+        finally:
+            owner.unlink(missing_ok=True)
+            lock.release()
 
     def create(self, config_json: str) -> None:
         """Make the folders, remove what a killed process left unfinished, write config.json."""

@@ -52,7 +52,7 @@ class Job:
     @property
     def lock(self) -> Path:
         """File that the process which works in the folder holds locked."""
-        return Path(self.folder) / ".lock"
+        return Path(self.folder) / ".sweep.lock"
 
     def to_json(self) -> str:
         """One line that from_json() reads."""
