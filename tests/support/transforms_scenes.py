@@ -44,6 +44,13 @@ def train_views(folder, **keys):
     return load_scene(folder).splits["train"]
 
 
+def escape(file):
+    """Move a file out of its scene's folder and leave a symbolic link to it."""
+    outside = file.parents[2] / f"outside-{file.name}"
+    file.rename(outside)
+    file.symlink_to(outside)
+
+
 def refused(folder, *words, splits=("train",)):
     """Loading fails with one line that has all the words."""
     with pytest.raises(UserError) as caught:

@@ -1,5 +1,7 @@
 """One scene in every format: the same cameras, images and masks come back."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from support.same_scene import held_out, same, views
@@ -43,10 +45,27 @@ def test_formats_without_splits_ask_for_others(tmp_path, name):
     assert not (tmp_path / "scene").exists()
 
 
-@pytest.mark.parametrize("name", ["nsvf", "llff"])
-def test_what_a_format_cannot_hold_is_refused(tmp_path, name):
-    with pytest.raises(UserError):
-        convert(held_out(views()), tmp_path / "scene", name)
+def longer_lens(given):
+    """One view with another focal length, its principal point in the middle."""
+    first = given["train"][0]
+    camera = replace(first.stored_camera, fx=50.0, fy=50.0)
+    return given | {"train": [replace(first, stored_camera=camera), *given["train"][1:]]}
+
+
+REFUSED = {
+    "nsvf, lenses": ("nsvf", held_out(views()), "one camera for all"),
+    "nsvf, val alone": ("nsvf", {"val": views(alike=True)}, "no val without test"),
+    "nsvf, split": ("nsvf", {"eval": views(alike=True)}, "knows the splits train, val, test"),
+    "llff, lenses": ("llff", longer_lens(held_out(views(centred=True))), "one camera for all"),
+    "llff, off the middle": ("llff", held_out(views(alike=True)), "in the middle"),
+}
+
+
+@pytest.mark.parametrize("case", REFUSED)
+def test_what_a_format_cannot_hold_is_refused(tmp_path, case):
+    name, given, words = REFUSED[case]
+    with pytest.raises(UserError, match=words):
+        convert(given, tmp_path / "scene", name)
     assert not list(tmp_path.iterdir())
 
 

@@ -12,12 +12,14 @@ from tools.scene_formats.common import number, one_lens
 
 
 def write(folder: Path, splits: dict[str, list[View]]) -> None:
-    """Write the views. Raises UserError for views with different intrinsics, and other splits than
-    train, val and test.
+    """Write the views. Raises UserError for views with different intrinsics, other splits than
+    train, val and test, and val without test: readers take 1_ for test where there is no 2_.
     """
     prefixes = {split: prefix for prefix, split in PREFIXES.items()}
     if set(splits) - set(prefixes):
         raise UserError(f"NSVF knows the splits {', '.join(prefixes)} only")
+    if "val" in splits and "test" not in splits:
+        raise UserError("NSVF has no val without test; convert both, or name it test")
     lens = one_lens([view for views in splits.values() for view in views], "NSVF")
     for name in ("rgb", "pose"):
         (folder / name).mkdir(parents=True)

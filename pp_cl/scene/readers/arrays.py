@@ -1,24 +1,45 @@
 """Arrays in files of numpy and of text that other people made, checked before they are believed."""
 
+import lzma
+import math
+import struct
 import zipfile
+import zlib
 from pathlib import Path
+from tokenize import TokenError
 
 import numpy as np
 
 from pp_cl.errors import UserError
 
-MOST_BYTES = 2**28  # of an array that holds cameras
+MOST_BYTES = 2**28  # of all arrays of a file, as float64
+MOST_TEXT = 2**20  # bytes of a file with the numbers of one camera
 MOST = 1e30  # larger numbers are refused: float32 could not hold their products
+# What numpy and zipfile raise for bytes that are no array, besides the errors that say so.
+BROKEN = (
+    OSError,
+    ValueError,
+    EOFError,
+    SyntaxError,
+    TokenError,
+    TypeError,
+    OverflowError,
+    RuntimeError,
+    struct.error,
+    zlib.error,
+    lzma.LZMAError,
+    zipfile.BadZipFile,
+)
 
 
 def read_npy(file: Path) -> np.ndarray:
     """The array of a .npy file as float64. Raises UserError naming the file."""
     try:
         with file.open("rb") as opened:
-            return _checked(file, "", _read(opened))
+            return _checked(file, "", _read(opened, MOST_BYTES))
     except FileNotFoundError:
         raise UserError(f"{file}: no such file; copy it there") from None
-    except (OSError, ValueError, EOFError, SyntaxError) as error:
+    except BROKEN as error:
         raise _unreadable(file, error) from None
 
 
@@ -29,21 +50,21 @@ def read_npz(file: Path, wanted: str) -> dict[str, np.ndarray]:
     try:
         with zipfile.ZipFile(file) as archive:
             names = [n.removesuffix(".npy") for n in archive.namelist() if n.endswith(".npy")]
-            arrays = {}
+            arrays, left = {}, MOST_BYTES
             for name in names:
                 if name.startswith(wanted):
                     with archive.open(f"{name}.npy") as opened:
-                        arrays[name] = _checked(file, f"{name}: ", _read(opened))
+                        arrays[name] = _checked(file, f"{name}: ", _read(opened, left))
+                    left -= arrays[name].nbytes
             return arrays
     except FileNotFoundError:
         raise UserError(f"{file}: no such file; copy it there") from None
-    # broken archives raise whatever their bytes lead to
-    except (OSError, ValueError, EOFError, SyntaxError, RuntimeError, zipfile.BadZipFile) as error:
+    except BROKEN as error:
         raise _unreadable(file, error) from None
 
 
-def _read(opened):
-    """The array of an opened .npy file, of numbers and no larger than cameras are."""
+def _read(opened, most):
+    """The array of an opened .npy file, of numbers and of at most so many bytes as float64."""
     version = np.lib.format.read_magic(opened)
     header = (
         np.lib.format.read_array_header_1_0
@@ -53,9 +74,9 @@ def _read(opened):
     shape, fortran, dtype = header(opened)
     if dtype.kind not in "fiu":
         raise ValueError(f"holds {dtype}, no numbers")
-    if int(np.prod(shape, dtype=object)) * dtype.itemsize > MOST_BYTES:
+    count = math.prod(shape)
+    if min(shape, default=0) < 0 or count * max(dtype.itemsize, 8) > most:
         raise ValueError(f"claims the shape {shape}")
-    count = int(np.prod(shape, dtype=np.int64))
     data = opened.read(count * dtype.itemsize)
     if len(data) < count * dtype.itemsize:
         raise ValueError("ends too early")
@@ -80,10 +101,12 @@ def read_numbers(file: Path) -> list[list[float]]:
     """The numbers of each line of a text file that has some. Raises UserError naming the file and
     the line.
     """
+    if not file.is_file():
+        raise UserError(f"{file}: no such file; copy it there")
     try:
+        if file.stat().st_size > MOST_TEXT:
+            raise UserError(f"{file}: is longer than cameras are; copy it anew")
         lines = file.read_text("utf-8").split("\n")
-    except FileNotFoundError:
-        raise UserError(f"{file}: no such file; copy it there") from None
     except (OSError, ValueError) as error:
         raise UserError(f"{file}: cannot be read as text ({error}); copy it anew") from None
     rows = []
@@ -91,9 +114,13 @@ def read_numbers(file: Path) -> list[list[float]]:
         try:
             values = [float(word) for word in line.split()]
         except ValueError:
-            raise UserError(f"{file}: line {number}: {line[:60]!r} are no numbers") from None
+            raise UserError(
+                f"{file}: line {number}: {line[:60]!r} are no numbers; write it anew"
+            ) from None
         if not all(abs(value) < MOST for value in values):
-            raise UserError(f"{file}: line {number}: holds NaN, Inf or a huge number")
+            raise UserError(
+                f"{file}: line {number}: holds NaN, Inf or a huge number; write it anew"
+            )
         if values:
             rows.append(values)
     return rows

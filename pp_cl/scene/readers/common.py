@@ -40,11 +40,15 @@ def find_image(
 
 
 def folder_images(folder: Path, name: str) -> list[str]:
-    """Paths relative to the scene's folder of the images in its folder `name`, sorted. Raises
-    UserError where there are none.
+    """Paths relative to the scene's folder of the images in its folder `name`, sorted,
+    hidden files left out. Raises UserError where there are none.
     """
     files = sorted((folder / name).glob("*"))
-    found = [file.name for file in files if file.suffix.lower() in ENDINGS and file.is_file()]
+    found = [
+        file.name
+        for file in files
+        if file.suffix.lower() in ENDINGS and file.is_file() and not file.name.startswith(".")
+    ]
     if not found:
         raise UserError(f"{folder / name}: no images in it; copy them there")
     fail = partial(_error, folder / name)

@@ -1,7 +1,8 @@
 """Reader of scenes as IDR and NeuS have them, DTU among them: cameras_sphere.npz or cameras.npz
-with world_mat_i = K [R | t], images in image/, masks in mask/.
+with world_mat_i = K [R | t], images in image/, masks in mask/, all in the order of their names.
 """
 
+import re
 from functools import partial
 from pathlib import Path
 
@@ -18,7 +19,6 @@ from pp_cl.scene.readers.common import (
     check_split,
     folder_images,
     hold_out,
-    of_stem,
 )
 
 FILES = "cameras_sphere.npz (NeuS, DTU)"
@@ -48,26 +48,51 @@ def read_split(folder: Path, split: str) -> list[Photograph]:
     file = _file(folder)
     cameras, scales = read_npz(file, "world_mat_"), read_npz(file, "scale_mat_")
     names = folder_images(folder, IMAGES)
-    has_masks = (folder / MASKS).is_dir()
+    count = sum(re.fullmatch(r"world_mat_\d+", key) is not None for key in cameras)
+    if count != len(names):
+        raise UserError(
+            f"{file}: has {count} world_mat_i, but {IMAGES}/ has {len(names)} images; copy both"
+            " anew"
+        )
+    masks = _masks(folder, names)
     read = []
     for index, name in hold_out(list(enumerate(names)), split):
         key = f"world_mat_{index}"
         if key not in cameras:
-            raise UserError(
-                f"{file}: {key} is missing, but {IMAGES}/ has {len(names)} images; copy both anew"
-            )
+            raise _error(file, key, "is missing; number the cameras from 0 on")
         camera = _camera(cameras[key], image_size(folder / name), partial(_error, file, key))
         key = f"scale_mat_{index}"
         depth_range = None
         if key in scales:
             depth_range = _depth_range(scales[key], camera, partial(_error, file, key))
-        mask = of_stem(folder, MASKS, Path(name).stem) if has_masks else None
-        read.append(Photograph(name, camera, depth_range, mask))
+        read.append(Photograph(name, camera, depth_range, masks[index]))
     return read
 
 
 def _file(folder):
     return next((folder / name for name in CAMERAS if (folder / name).is_file()), None)
+
+
+def _masks(folder, names):
+    """The mask of each image, None where there is no folder of masks. The order pairs them, since
+    DTU has image/000000.png and mask/000.png. Raises UserError for numbers that do not agree.
+    """
+    if not (folder / MASKS).is_dir():
+        return [None] * len(names)
+    masks = folder_images(folder, MASKS)
+    if len(masks) != len(names):
+        raise UserError(
+            f"{folder / MASKS}: has {len(masks)} masks, but {IMAGES}/ has {len(names)} images; add"
+            " the missing ones, or remove the folder"
+        )
+    for name, mask in zip(names, masks, strict=True):
+        stems = [Path(path).stem for path in (name, mask)]
+        if all(stem.isdecimal() for stem in stems) and int(stems[0]) != int(stems[1]):
+            raise UserError(
+                f"{folder / mask}: is the mask of {name} in the order of the names; give masks the"
+                " numbers of their images"
+            )
+    return masks
 
 
 def _error(file, key, text):
@@ -79,9 +104,13 @@ def _camera(matrix, size, fail):
     if matrix.shape not in ((4, 4), (3, 4)):
         raise fail(f"has shape {matrix.shape}; must be 4x4 numbers")
     left = matrix[:3, :3]
-    if not abs(np.linalg.det(left)) > 1e-12 * max(np.abs(left).max(), 1e-30) ** 3:
+    determinant = np.linalg.det(left)
+    if not abs(determinant) > 1e-12 * max(np.abs(left).max(), 1e-30) ** 3:
         raise fail("is singular; must be K [R | t]")
-    upper, rotation = rq(left * np.sign(np.linalg.det(left)))
+    # -K [R | t] projects as K [R | t] does, but nothing tells it from a world that is mirrored
+    if determinant < 0:
+        raise fail("is mirrored or negated; must be K [R | t] with a rotation R")
+    upper, rotation = rq(left)
     signs = np.sign(np.diag(upper))
     upper, rotation = upper * signs, signs[:, None] * rotation
     upper /= upper[2, 2]

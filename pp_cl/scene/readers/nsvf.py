@@ -1,5 +1,6 @@
 """Reader of scenes as NSVF has them: rgb/ with the split in front of the names, pose/, one
-intrinsics.txt, and near_and_far.txt where it is there.
+intrinsics.txt, and near_and_far.txt where it is there. bbox.txt, the box of NSVF's voxels, is not
+read.
 """
 
 from functools import partial
@@ -28,33 +29,55 @@ def recognises(folder: Path) -> bool:
 
 
 def splits(folder: Path) -> list[str]:
-    """The splits that names of images begin with: 0_ train, 1_ val, 2_ test."""
-    names = [Path(name).name for name in folder_images(folder, IMAGES)]
-    return sorted({PREFIXES[name[:2]] for name in names if name[:2] in PREFIXES})
+    """The splits that names of images begin with: 0_ train, 1_ val, 2_ test; without 2_, as in
+    NSVF's Tanks and Temples and BlendedMVS, 1_ is test.
+    """
+    return sorted(_names(folder))
 
 
 def read_split(folder: Path, split: str) -> list[Photograph]:
     """The photographs of a split, in the order of their names. Poses are camera-to-world with
-    OpenCV's axes. Raises UserError naming the file.
+    OpenCV's axes; near and far are Euclidean distances. Raises UserError naming the file.
     """
-    check_split(folder, split, splits(folder))
-    lens, depth_range = _lens(folder / INTRINSICS), _depth_range(folder / "near_and_far.txt")
+    names = _names(folder)
+    check_split(folder, split, sorted(names))
+    file = folder / INTRINSICS
+    lens, depth_range = _lens(file), _depth_range(folder / "near_and_far.txt")
     read = []
-    for name in folder_images(folder, IMAGES):
-        stem = Path(name).stem
-        if PREFIXES.get(stem[:2]) != split:
-            continue
-        file, size = folder / POSES / f"{stem}.txt", image_size(folder / name)
-        rows = read_numbers(file)
-        if [len(row) for row in rows] != [4] * 4:
-            raise UserError(f"{file}: must be 4x4 numbers, a camera-to-world matrix")
-        pose = rigid(rows, partial(_error, file))
-        read.append(Photograph(name, Camera(pose, *_scaled(lens, size), *size), depth_range))
+    for name in names[split]:
+        pose, size = _pose(folder / POSES / f"{Path(name).stem}.txt"), image_size(folder / name)
+        values = _scaled(lens, size, partial(_error, file))
+        read.append(Photograph(name, Camera(pose, *values, *size), depth_range))
     return read
+
+
+def _names(folder):
+    """{split: names of its images}. Raises UserError where no name has a prefix."""
+    names = {}
+    for name in folder_images(folder, IMAGES):
+        split = PREFIXES.get(Path(name).name[:2])
+        if split:
+            names.setdefault(split, []).append(name)
+    if not names:
+        raise UserError(
+            f"{folder / IMAGES}: no image belongs to a split; begin their names with 0_ (train),"
+            " 1_ (val) or 2_ (test)"
+        )
+    if "test" not in names and "val" in names:
+        names["test"] = names.pop("val")
+    return names
 
 
 def _error(file, text):
     return UserError(f"{file}: {text}")
+
+
+def _pose(file):
+    """(3, 4) of a file of 4x4 numbers."""
+    rows = read_numbers(file)
+    if [len(row) for row in rows] != [4] * 4:
+        raise UserError(f"{file}: must be 4x4 numbers, a camera-to-world matrix")
+    return rigid(rows, partial(_error, file))
 
 
 def _lens(file):
@@ -81,11 +104,18 @@ def _lens(file):
     return *lens, size
 
 
-def _scaled(lens, size):
-    """(fx, fy, cx, cy) for images of another size."""
+def _scaled(lens, size, fail):
+    """(fx, fy, cx, cy) for images of another size, which must have the stated shape but for
+    rounding. Raises fail(text).
+    """
     *values, stated = lens
     if stated is None or tuple(stated) == size:
         return values
+    if abs(size[0] * stated[1] - size[1] * stated[0]) > max(stated):
+        raise fail(
+            f"is for {stated[0]:g}x{stated[1]:g} pixels, but an image has {size[0]}x{size[1]},"
+            " another shape; copy the images anew"
+        )
     x, y = size[0] / stated[0], size[1] / stated[1]
     return values[0] * x, values[1] * y, values[2] * x, values[3] * y
 

@@ -37,7 +37,7 @@ def test_paths_that_cannot_be_used(tmp_path, given):
 
 def test_images_of_a_folder_are_sorted_and_nothing_else_is_one(tmp_path):
     (tmp_path / "images" / "sub.png").mkdir(parents=True)
-    for name in ("b.png", "a.PNG", "c.txt"):
+    for name in ("b.png", "a.PNG", "c.txt", "._b.png"):
         (tmp_path / "images" / name).write_bytes(b"")
     assert folder_images(tmp_path, "images") == ["images/a.PNG", "images/b.png"]
     assert of_stem(tmp_path, "images", "b") == "images/b.png"

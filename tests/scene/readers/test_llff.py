@@ -5,7 +5,7 @@ import io
 import numpy as np
 import pytest
 from support.same_scene import held_out, same, views
-from support.transforms_scenes import refused
+from support.transforms_scenes import escape, refused
 
 from pp_cl.files.image import write_png
 from pp_cl.scene.readers.llff import read_split
@@ -82,6 +82,11 @@ BAD = {
     "height below 0": (cell(4, -22), "row 2", "height -22"),
     "another shape": (cell(4, 30), "row 2", "another shape"),
     "no rotation": (cell(0, 9), "row 2", "no rotation"),
+    "mirrored": (
+        lambda rows: rows * np.where(np.isin(np.arange(17), (0, 5, 10)), -1, 1),
+        "row 1",
+        "no rotation",
+    ),
     "text": (lambda rows: rows.astype(str), "no numbers"),
     "complex": (lambda rows: rows.astype(complex), "no numbers"),
     "objects": (lambda rows: rows.astype(object), "no numbers"),
@@ -128,6 +133,12 @@ def test_missing_images(scene):
 def test_a_missing_mask(scene):
     (scene / "masks" / "000003.png").unlink()
     refused(scene, scene / "masks", "no mask 000003.png")
+
+
+@pytest.mark.parametrize("name", ["images", "masks"])
+def test_a_link_that_leaves_the_folder(scene, name):
+    escape(scene / name / "000002.png")
+    refused(scene, scene / name, "leaves the scene's folder")
 
 
 def test_an_unknown_split(scene):

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 from support.same_scene import held_out, same, views
-from support.transforms_scenes import refused
+from support.transforms_scenes import escape, refused
 
 from pp_cl.files.image import write_png
 from pp_cl.scene.readers.neus import read_split
@@ -29,11 +29,39 @@ def edit(folder, change):
 # --------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("scale", [1.0, -1.0, 1e-4, 3e5])
+@pytest.mark.parametrize("scale", [1.0, 1e-4, 3e5])
 def test_a_projection_is_known_up_to_its_scale(tmp_path, scale):
     given = held_out(views())
     neus.write(tmp_path, given)
     edit(tmp_path, lambda a: a.update({name: scale * matrix for name, matrix in a.items()}))
+    same(tmp_path, given)
+
+
+def test_a_projection_by_hand(tmp_path):
+    """K [R | t] of a camera at (1, 2, 3) that looks along +x, its image's right along -y, its down
+    along -z: world axes as rows of R, t = -R c.
+    """
+    rotation = np.array([[0, -1, 0], [0, 0, -1], [1, 0, 0.0]])
+    world = np.array([[50, 0, 16], [0, 40, 10], [0, 0, 1]]) @ np.column_stack(
+        [rotation, [2, 3, -1]]
+    )
+    (tmp_path / "image").mkdir()
+    write_png(tmp_path / "image" / "0.png", np.zeros((22, 30, 3)))
+    np.savez(tmp_path / FILE, world_mat_0=world, world_mat_inv_0=np.eye(4))
+    [photograph] = read_split(tmp_path, "test")
+    camera = photograph.camera
+    np.testing.assert_allclose(camera.pose[:, :3], rotation.T, atol=1e-12)
+    np.testing.assert_allclose(camera.eye, (1, 2, 3), atol=1e-12)
+    np.testing.assert_allclose((camera.fx, camera.fy, camera.cx, camera.cy), (50, 40, 16, 10))
+    assert photograph.depth_range is None
+
+
+def test_masks_may_be_numbered_with_fewer_digits(tmp_path):
+    """As those of DTU: image/000000.png has mask/000.png."""
+    given = held_out(views())
+    neus.write(tmp_path, given)
+    for index in range(11):
+        (tmp_path / "mask" / f"{index:06d}.png").rename(tmp_path / "mask" / f"{index:03d}.png")
     same(tmp_path, given)
 
 
@@ -96,7 +124,15 @@ def skewed(matrix):
 
 
 BAD = {
-    "missing": (lambda a: a.pop("world_mat_2"), "world_mat_2", "missing"),
+    "missing": (lambda a: a.pop("world_mat_2"), "10 world_mat_i", "11 images"),
+    "one more": (lambda a: a.update(world_mat_11=np.eye(4)), "12 world_mat_i", "11 images"),
+    "numbered from 1": (
+        lambda a: a.update(world_mat_11=a.pop("world_mat_2")),
+        "world_mat_2",
+        "from 0 on",
+    ),
+    "mirrored": (world(lambda m: m @ np.diag([-1, 1, 1, 1])), "world_mat_2", "mirrored"),
+    "negated": (world(np.negative), "world_mat_2", "negated"),
     "shape": (world(lambda m: m[:2]), "world_mat_2", "(2, 4)"),
     "NaN": (entry(0, 0, np.nan), "world_mat_2", "NaN"),
     "infinite": (entry(0, 3, np.inf), "world_mat_2", "Inf"),
@@ -137,15 +173,26 @@ def test_a_file_that_was_cut(scene):
 
 def test_more_images_than_cameras(scene):
     write_png(scene / "image" / "zz.png", np.zeros((22, 30, 3)))
-    refused(scene, "world_mat_11", "12 images")
+    refused(scene, scene / FILE, "11 world_mat_i", "12 images")
 
 
 def test_missing_files(scene):
     (scene / "mask" / "000003.png").unlink()
-    refused(scene, scene / "mask", "no mask 000003.png")
+    refused(scene, scene / "mask", "10 masks", "11 images")
     for file in (scene / "image").iterdir():
         file.unlink()
     refused(scene, scene / "image", "no images")
+
+
+def test_masks_of_other_numbers(scene):
+    (scene / "mask" / "000010.png").rename(scene / "mask" / "000011.png")
+    refused(scene, scene / "mask" / "000011.png", "image/000010.png")
+
+
+@pytest.mark.parametrize("name", ["image", "mask"])
+def test_a_link_that_leaves_the_folder(scene, name):
+    escape(scene / name / "000002.png")
+    refused(scene, scene / name, "leaves the scene's folder")
 
 
 def test_an_unknown_split(scene):

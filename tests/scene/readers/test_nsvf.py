@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 from support.same_scene import same, views
-from support.transforms_scenes import refused
+from support.transforms_scenes import escape, refused
 
 from pp_cl.scene.readers.nsvf import read_split, splits
 from tools.scene_formats import nsvf
@@ -28,6 +28,17 @@ def test_splits_are_those_of_the_names(scene):
     assert splits(scene) == ["test", "train", "val"]
     (scene / "rgb" / "9_other.png").write_bytes(b"")
     assert [len(read_split(scene, split)) for split in splits(scene)] == [3, 6, 2]
+
+
+def test_where_there_is_no_2_test_is_1(tmp_path):
+    """As in NSVF's Tanks and Temples and BlendedMVS."""
+    many = views(alike=True)
+    nsvf.write(tmp_path, {"train": many[:6], "test": many[6:]})
+    for folder in ("rgb", "pose"):
+        for file in (tmp_path / folder).glob("2_*"):
+            file.rename(file.with_name(f"1_{file.name[2:]}"))
+    assert splits(tmp_path) == ["test", "train"]
+    same(tmp_path, {"train": many[:6], "test": many[6:]})
 
 
 @pytest.mark.parametrize(
@@ -73,10 +84,12 @@ BAD = {
     "no intrinsics": ("intrinsics.txt", "", "4x4 matrix"),
     "focal length 0": ("intrinsics.txt", "0 14 12 0\n", "focal length is 0"),
     "skew": ("intrinsics.txt", "40 2 14\n0 41 12\n0 0 1\n", "skew"),
+    "another shape": ("intrinsics.txt", "40 14 12 0.\n30 22\n", "22x30", "30x22", "shape"),
     "size": ("intrinsics.txt", "40 14 12 0.\n0 0\n", "height and the width"),
     "near only": ("near_and_far.txt", "1\n", "0 < near < far"),
     "far before near": ("near_and_far.txt", "3 2\n", "0 < near < far"),
     "infinite far": ("near_and_far.txt", "1 inf\n", "Inf"),
+    "a long file": (POSE, "1 0 0 0\n" * 2**17 + "1", "longer than cameras"),
     "bytes": ("near_and_far.txt", b"\xff\xfe\0", "text"),
 }
 
@@ -94,10 +107,7 @@ def test_a_pose_is_missing(scene):
 
 
 def test_an_image_that_leaves_the_folder(scene):
-    target = scene / "rgb" / "0_train_000002.png"
-    outside = scene.parent / "outside.png"
-    target.rename(outside)
-    target.symlink_to(outside)
+    escape(scene / "rgb" / "0_train_000002.png")
     refused(scene, "leaves the scene's folder")
 
 
@@ -109,6 +119,8 @@ def test_no_image_of_any_split(scene):
     for file in (scene / "rgb").iterdir():
         file.unlink()
     refused(scene, scene / "rgb", "no images")
+    (scene / "rgb" / "000.png").write_bytes(b"")
+    refused(scene, scene / "rgb", "0_ (train)")
 
 
 def test_a_scene_without_rotation_noise(tmp_path):
