@@ -45,6 +45,7 @@ def serve(
     and end with the process that has started this one. Raises UserError for a folder that is no
     run, and for a host or port that cannot be had.
     """
+    parent = os.getppid() if wait else None  # first of all: it may be gone once it is answered
     check_installed()
     if not wait:
         check_run(folder)
@@ -54,7 +55,7 @@ def serve(
     ):
         access = Access(host, listening.getsockname()[1])
         live = LiveRun(open_device(device), folder, scene)
-        asyncio.run(_serve(live, access, listening, announce=announce, with_parent=wait))
+        asyncio.run(_serve(live, access, listening, announce=announce, parent=parent))
 
 
 @contextlib.contextmanager
@@ -94,8 +95,10 @@ def _listen(host, port):
         raise UserError(line) from None
 
 
-async def _serve(live, access, listening, *, announce, with_parent):
-    """Serve until cancelled, or until the render thread has failed."""
+async def _serve(live, access, listening, *, announce, parent):
+    """Serve until cancelled, until the render thread has failed, or until the parent, a process,
+    is gone; None: that does not matter.
+    """
     from aiohttp import web
 
     from pp_cl.view.server import ViewServer
@@ -107,8 +110,8 @@ async def _serve(live, access, listening, *, announce, with_parent):
         await web.SockSite(runner, listening).start()
         announce(access.address)
         ends = [server.failed]
-        if with_parent:
-            ends.append(asyncio.create_task(_parent_ended()))
+        if parent is not None:
+            ends.append(asyncio.create_task(_ended(parent)))
         await asyncio.wait(ends, return_when=asyncio.FIRST_COMPLETED)
         if server.failed.done():
             server.failed.result()  # raises
@@ -116,8 +119,7 @@ async def _serve(live, access, listening, *, announce, with_parent):
         await runner.cleanup()
 
 
-async def _parent_ended():
+async def _ended(parent):
     """Wait until the process that has started this one is gone."""
-    parent = os.getppid()
     while os.getppid() == parent:
         await asyncio.sleep(WAIT_SECONDS)
