@@ -65,7 +65,11 @@ def run_facts(folder: RunFolder, scene: str | None = None) -> Facts:
         "scene": config.scene.path,
         "downscale": config.scene.downscale,
         "iterations": config.train.iterations,
-        "network": {"widths": list(config.network.widths), "parameters": None},
+        "network": {
+            "widths": list(config.network.widths),
+            "blocks": config.network.blocks,
+            "parameters": None,
+        },
         "step": 0,
         "finished": False,
         "points": None,

@@ -122,4 +122,10 @@ class Model:
         cloud = PointCloud.load(dev, arrays, degree, file)
         for name, parameter in net.parameters.items():
             dev.write(parameter, fitting_array(arrays, f"net.{name}", parameter.shape, file))
+        left = sorted(name for name in arrays if name.startswith("net."))
+        if left:
+            raise UserError(
+                f"{file}: holds {left[0]}, which the network of its config.json does not have; put"
+                " network.blocks back to what the run was trained with"
+            )
         return cls(dev, grid, depth_range, cloud, net=net)

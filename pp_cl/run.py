@@ -254,7 +254,7 @@ def open_training(
         policy = policy_of_run(dev, tolerance, stored[0].get("tuning"), folder.checkpoint)
     else:
         policy = load_policy(dev, tolerance)
-    net = UNet(dev, config.network.widths, seed=config.train.seed, policy=policy)
+    net = UNet.of_settings(dev, config.network, policy, seed=config.train.seed)
     views = open_scene(dev, config, ("train",)).splits["train"]
     measured = _measured_views(dev, config) if config.train.eval_every else []
     if stored:

@@ -108,6 +108,12 @@ class NetworkConfig:
     """The U-Net that turns features into colours."""
 
     widths: tuple = setting((32, 64, 128), "channels of its three levels", 1, 4096)
+    blocks: str = setting(
+        "double",
+        "what a level computes. double: two 3x3 convolutions with ReLU; single: one; gated: ELU of"
+        " one times the sigmoid of another",
+        choices=("double", "single", "gated"),
+    )
     rate: tuple = setting(
         (1e-3, 1e-4), "Adam's learning rate at the first and the last step", 1e-12, 100
     )

@@ -126,7 +126,7 @@ def load_run(
     configure(config, scene or config.scene.path, given)
     header, arrays = folder.load()
     policy = load_policy(dev, config.network.tolerance)
-    net = UNet(dev, config.network.widths, policy=policy)
+    net = UNet.of_settings(dev, config.network, policy)
     degree, file = config.points.sh_degree, folder.checkpoint
     model = Model.load(dev, header, arrays, net, degree=degree, file=file)
     return Run(dev, folder, config, header, model, policy)

@@ -112,6 +112,7 @@ def test_assign_refuses(key, text, message):
         ("train.iterations", 0),
         ("train.crop", 130),
         ("raster.footprint", "gauss"),
+        ("network.blocks", "triple"),
         ("raster.gamma", (0.1, 0.0)),
         ("network.widths", (0, 1, 1)),
         ("raster.footprint", ["soft"]),

@@ -75,13 +75,18 @@ def test_a_run_says_what_its_files_say(scene, finished, facts):
     assert found["psnr"] == log[-2]["psnr"]
     assert found["metrics"] == json.loads((finished / "eval/metrics.json").read_text())["mean"]
     parameters = sum(a.size for name, a in arrays.items() if name.startswith("net."))
-    assert found["network"] == {"widths": [16, 16, 16], "parameters": parameters}
+    assert found["network"] == {
+        "widths": [16, 16, 16],
+        "blocks": "double",
+        "parameters": parameters,
+    }
 
 
 def test_a_run_in_lines(finished, capsys):
     assert main(["info", str(finished)]) == 0
     text = capsys.readouterr().out
-    for part in ("preset tiny", "step 60 of 60, finished", "left of", "16, 16, 16 channels"):
+    network = "16, 16, 16 channels, double blocks"
+    for part in ("preset tiny", "step 60 of 60, finished", "left of", network):
         assert part in text
     assert "pixels)" in text and "MiB" in text and "psnr" in text
 

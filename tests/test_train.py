@@ -101,6 +101,56 @@ def test_other_ways_of_adam_learn_and_resume_to_the_same_bytes(
     assert (finished / "checkpoint.npz").read_bytes() != whole
 
 
+@pytest.mark.parametrize("blocks", ["single", "gated"])
+def test_the_networks_other_blocks_learn_and_resume_to_the_same_bytes(
+    scene, tmp_path, monkeypatch, capsys, blocks
+):
+    whole, run, changes = tmp_path / "whole", tmp_path / "run", {"network__blocks": blocks}
+    assert main(arguments(scene, whole, **changes)) == 0
+    losses = [r["loss"] for r in rows(whole)[:-1]]
+    assert np.mean(losses[-3:]) < 0.6 * losses[0]
+    train_and_interrupt(scene, run, 47, monkeypatch, **changes)
+    assert main(["train", scene, "--out", str(run)]) == 0  # the settings are the run's
+    assert (run / "checkpoint.npz").read_bytes() == (whole / "checkpoint.npz").read_bytes()
+    assert main(["eval", str(run)]) == 0
+    psnr = json.loads((run / "eval" / "metrics.json").read_text())["mean"]["psnr"]
+    frames, points = tmp_path / "frames", tmp_path / "p.ply"
+    few = ["--seconds", "0.1", "--fps", "20", "--size", "24x24", "--format", "png"]
+    assert main(["render", str(run), "--out", str(frames), *few]) == 0
+    assert main(["export", str(run), "--format", "ply", "--out", str(points)]) == 0
+    assert 15 < psnr < 60 and points.stat().st_size > 1000
+    assert len(list(frames.glob("*.png"))) == 2
+    capsys.readouterr()
+    assert main(arguments(scene, run, network__blocks="double")) == 2
+    assert f"network.blocks is {blocks} there, double asked for" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("blocks", ["single", "gated"])
+def test_a_network_of_other_blocks_than_the_checkpoints_is_refused(
+    finished, tmp_path, capsys, blocks
+):
+    run = tmp_path / "run"
+    shutil.copytree(finished, run)
+    text = (run / "config.json").read_text()
+    assert '"blocks": "double"' in text
+    (run / "config.json").write_text(text.replace('"double"', f'"{blocks}"'))
+    assert main(["eval", str(run)]) == 2
+    told = capsys.readouterr().err
+    assert "checkpoint.npz: " in told and "config.json" in told and told.count("\n") == 1
+
+
+def test_a_run_from_before_there_were_blocks_has_double_ones(finished, tmp_path):
+    run = tmp_path / "run"
+    shutil.copytree(finished, run)
+    stored = json.loads((run / "config.json").read_text())
+    assert stored["network"].pop("blocks") == "double"
+    (run / "config.json").write_text(json.dumps(stored))
+    for folder in (finished, run):
+        assert main(["eval", str(folder)]) == 0
+    one, other = (json.loads((f / "eval/metrics.json").read_text()) for f in (finished, run))
+    assert one["mean"] == other["mean"]
+
+
 def test_a_degree_of_rate_0_is_left_alone(scene, tmp_path, monkeypatch):
     changes = {"train__sh_rate": "0.5,0.25,0"}
     train_and_interrupt(scene, tmp_path / "run", 25, monkeypatch, **changes)

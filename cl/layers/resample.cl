@@ -27,13 +27,14 @@ kernel void avgpool2_forward(
 }
 
 // One work-item per (16 channels, x, y) of x: ADDS its share of grad_out to grad_x, which holds the
-// gradient from x's other use, and then sets it to 0 where x <= 0: x is the output of a ReLU,
-// grad_x becomes the gradient of that ReLU's input.
+// gradient from x's other use. If masked, it then sets it to 0 where x <= 0: x is the output of a
+// ReLU, grad_x becomes the gradient of that ReLU's input.
 kernel void avgpool2_backward(
     const int h,  // of out
     const int w,
     const int c,
-    global const float *x,           // (?, ?, c)
+    const int masked,
+    global const float *x,           // (?, ?, c) read only if masked
     global const float *grad_out,    // (h, w, c)
     global const float *tile_count,  // (?, ?) of grad_x, 0 = not computed
     global float *grad_x)            // (?, ?, c)
@@ -46,8 +47,9 @@ kernel void avgpool2_backward(
     const size_t at = ((size_t)row * 2 * w + column) * c + first;
     const float16 dL_dout =
         load16(grad_out + ((size_t)(row / 2) * w + column / 2) * c + first, lanes);
-    const float16 dL_dx = load16(grad_x + at, lanes) + 0.25f * dL_dout;
-    store16(select((float16)0.0f, dL_dx, load16(x + at, lanes) > 0.0f), grad_x + at, lanes);
+    float16 dL_dx = load16(grad_x + at, lanes) + 0.25f * dL_dout;
+    if (masked) dL_dx = select((float16)0.0f, dL_dx, load16(x + at, lanes) > 0.0f);
+    store16(dL_dx, grad_x + at, lanes);
 }
 
 // One work-item per (16 channels, x, y) of out: reads the 2x2 pixels it covers, writes their

@@ -129,14 +129,19 @@ class RandomConv:
 
 
 def bench_conv(
-    dev: Device, size: int, widths: tuple[int, int, int], policy: ConvolutionPolicy
+    dev: Device,
+    size: int,
+    widths: tuple[int, int, int],
+    policy: ConvolutionPolicy,
+    *,
+    blocks: str = "double",
 ) -> Iterator[dict]:
     """Rows of every distinct convolution of the network at size x size, in all directions.
 
-    policy: its blocking is used; every variant is measured.
+    policy: its blocking is used; every variant is measured. blocks: as UNet takes them.
     """
     peak, seen = PeakFlops(dev), set()
-    for layer in convolutions(unet_layers(widths)):
+    for layer in convolutions(unet_layers(widths, blocks=blocks)):
         side = size >> layer.level
         key = (layer.kernel_size, side, layer.sources, layer.channels)
         if key in seen:

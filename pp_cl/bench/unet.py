@@ -26,19 +26,24 @@ CHECK_SIZE = 128  # float64 takes seconds for each variant of the paper's networ
 
 
 def bench_unet(
-    dev: Device, size: int, widths: tuple[int, int, int], policy: ConvolutionPolicy
+    dev: Device,
+    size: int,
+    widths: tuple[int, int, int],
+    policy: ConvolutionPolicy,
+    *,
+    blocks: str = "double",
 ) -> Iterator[dict]:
     """Rows of the whole network at size x size, by every variant and by `policy`: forward, and
     train = forward and backward to the input and the weights.
 
     The errors of train are those of the gradient (input's, or a weight's or bias's) where they are
-    largest. "memory_bytes" is the network's memory by `policy`.
+    largest. "memory_bytes" is the network's memory by `policy`. blocks: as UNet takes them.
     """
     peak, rng = PeakFlops(dev), np.random.default_rng(0)
     x = np.maximum(rng.normal(size=(size, size, CHANNELS_IN)), 0).astype(np.float32)
     grad_image = rng.normal(size=(size, size, CHANNELS_OUT)).astype(np.float32)
     # one network for all policies, so that large images fit
-    net = make_network(dev, widths, policy)
+    net = make_network(dev, widths, policy, blocks)
     names = (AUTO, *offered(policy.device_class))
     policies = {name: replace(policy, variant=name) for name in names}
     parameters = plain_parameters(net, net.parameters)
@@ -56,6 +61,7 @@ def bench_unet(
         about = {
             "layer": "network",
             "shape": [size, size, CHANNELS_IN, *widths, CHANNELS_OUT],
+            "blocks": blocks,
             "direction": direction,
             "memory_bytes": memory,
         }
@@ -79,14 +85,19 @@ def _by_policy(net, policy, run):
     return changed
 
 
-def make_network(dev: Device, widths: tuple[int, int, int], policy: ConvolutionPolicy) -> UNet:
-    """A network by a policy; the parameters do not depend on it.
+def make_network(
+    dev: Device,
+    widths: tuple[int, int, int],
+    policy: ConvolutionPolicy,
+    blocks: str = "double",
+) -> UNet:
+    """A network by a policy; the parameters do not depend on it. blocks: as UNet takes them.
 
     The weights are uniform in +-sqrt(6 / (CI K K)) (He et al. 2015), so that values keep their size
     through the layers as they do in a trained network. With UNet's own initial weights they fade,
     and the error of an image that is 0.5 and little else says nothing.
     """
-    net = UNet(dev, widths, CHANNELS_IN, CHANNELS_OUT, policy=policy)
+    net = UNet(dev, widths, CHANNELS_IN, CHANNELS_OUT, blocks=blocks, policy=policy)
     for name, parameter in net.parameters.items():
         if name.endswith(".weight"):
             affine(dev, np.sqrt(6), 0.0, parameter, out=parameter)

@@ -10,8 +10,8 @@ from pp_cl.errors import UserError
 HELP = "time against error of the convolutions, the network, the rasteriser, a training step"
 # the options that only some benches have
 OPTIONS = {
-    "conv": ("size", "widths", "plot"),
-    "unet": ("size", "widths", "plot", "tolerance"),
+    "conv": ("size", "widths", "blocks", "plot"),
+    "unet": ("size", "widths", "blocks", "plot", "tolerance"),
     "raster": ("size", "scene", "points", "blend", "tau", "gamma", "plot"),
     "train": ("scene", "points", "set"),
 }
@@ -36,6 +36,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--widths",
         metavar="A,B,C",
         help="conv, unet: channels of the levels (128,256,512: the paper's)",
+    )
+    add(
+        "--blocks",
+        metavar="B",
+        help="conv, unet: double, single or gated (double)",
     )
     add(
         "--scene",
@@ -152,13 +157,15 @@ def _run_network(options):
     from pp_cl.layers.policy import load_policy
 
     size, widths = shared.read_shape(options.size or "256", options.widths or "128,256,512")
+    blocks = shared.read_blocks(options.blocks or "double")
     tolerance = shared.read_tolerance(options.tolerance)
     figure = check_files(options.json, options.plot)
     dev = _open_device(options)
     policy = load_policy(dev, preset("tiny").network.tolerance if tolerance is None else tolerance)
     print(f"{policy.origin}\n{HEAD}")
     rows = []
-    for row in {"conv": bench_conv, "unet": bench_unet}[options.what](dev, size, widths, policy):
+    bench = {"conv": bench_conv, "unet": bench_unet}[options.what]
+    for row in bench(dev, size, widths, policy, blocks=blocks):
         rows.append(row)
         print(line(row), flush=True)
     for direction, memory in {r["direction"]: r.get("memory_bytes") for r in rows}.items():

@@ -92,7 +92,7 @@ def _run_lines(facts):
         lines.append(_line("", f"PSNR {facts['psnr']:.2f} in the last logged step"))
     network = facts["network"]
     widths = ", ".join(map(str, network["widths"]))
-    lines.append(_line("network", f"{widths} channels"))
+    lines.append(_line("network", f"{widths} channels, {network['blocks']} blocks"))
     if facts["points"]:
         lines[-1] += f", {network['parameters']} parameters"
         initial, left = facts["points"]["initial"], facts["points"]["left"]

@@ -72,6 +72,14 @@ def read_tolerance(text: str | None) -> float | None:
     return config.network.tolerance
 
 
+def read_blocks(text: str) -> str:
+    """The word of --blocks. Raises UserError naming it."""
+    config = preset("tiny")
+    assign(config, "network.blocks", text, "--blocks")
+    validate(config, "--blocks")
+    return config.network.blocks
+
+
 def read_metrics(text: str) -> tuple[str, ...]:
     """The names of --metrics. Raises UserError for unknown ones."""
     names = tuple(n.strip() for n in text.split(",") if n.strip())

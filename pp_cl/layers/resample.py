@@ -29,13 +29,18 @@ def avgpool2_forward(dev: Device, x: Array, out: Array, *, tiles: Tiles | None =
 
 
 def avgpool2_backward(
-    dev: Device, x: Array, grad_out: Array, grad_x: Array, *, tiles: Tiles | None = None
+    dev: Device,
+    mask: Array | None,
+    grad_out: Array,
+    grad_x: Array,
+    *,
+    tiles: Tiles | None = None,
 ) -> None:
-    """Adds the gradient of avgpool2_forward to grad_x (2H, 2W, C), then sets grad_x to 0 where x <=
-    0.
+    """Adds the gradient of avgpool2_forward to grad_x (2H, 2W, C), then sets grad_x to 0 where mask
+    <= 0.
 
-    x: the ReLU's output that was pooled; grad_x: gradient of that output's other use; grad_out: (H,
-    W, C).
+    mask: what was pooled, where it is a ReLU's output, else None; grad_x: gradient of its other
+    use; grad_out: (H, W, C).
     """
     h, w, c = _check_double(grad_out, grad_x)
     _launch(
@@ -45,7 +50,8 @@ def avgpool2_backward(
         h=h,
         w=w,
         c=c,
-        x=x,
+        masked=mask is not None,
+        x=grad_x if mask is None else mask,
         grad_out=grad_out,
         grad_x=grad_x,
         tile_count=checked_tiles(dev, tiles, 2 * h, 2 * w).count,

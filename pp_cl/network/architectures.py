@@ -1,39 +1,72 @@
 """The network that turns feature maps into images: a U-Net of three levels (PlenopticPoints
 supplemental, decoder).
 
-Each level is two 3x3 convolutions with ReLU; levels are joined by 2x2 average pooling on the way
-down, by bilinear upsampling with a 1x1 convolution and a concatenation [upsampled, skip] on the way
-up; the image is 0.5 + 0.5 * (1x1 convolution). The 1x1 convolution runs before the upsampling: both
-are linear and the upsampling weights of a pixel add up to 1, so they commute, bias included, and it
-costs a quarter.
+Each level is a block: two 3x3 convolutions with ReLU, or one of the others that the supplemental
+compares with them. Levels are joined by 2x2 average pooling on the way down, by bilinear upsampling
+with a 1x1 convolution and a concatenation [upsampled, skip] on the way up; the image is 0.5 + 0.5 *
+(1x1 convolution). The 1x1 convolution runs before the upsampling: both are linear and the
+upsampling weights of a pixel add up to 1, so they commute, bias included, and it costs a quarter.
 """
 
-from pp_cl.network.layer import Conv, Layer, Pool, Upsample
+from collections.abc import Callable
+
+from pp_cl.network.layer import Conv, Gate, Layer, Pool, Upsample
+
+
+def _double(name, inputs, level, channels, *, sources):
+    first = Conv(f"{name}.a", inputs, level, channels, sources=sources)
+    return [first, Conv(f"{name}.b", (first.name,), level, channels, (channels,))]
+
+
+def _single(name, inputs, level, channels, *, sources):
+    return [Conv(f"{name}.a", inputs, level, channels, sources)]
+
+
+def _gated(name, inputs, level, channels, *, sources):
+    """Features and gates are one convolution: both read the same inputs."""
+    both = Conv(f"{name}.a", inputs, level, 2 * channels, sources, relu=False)
+    return [both, Gate(f"{name}.gate", (both.name,), level, channels)]
+
+
+# Makes a block's layers: (name, inputs, level, channels, sources=channels of each input).
+Block = Callable[..., list[Layer]]
+BLOCKS: dict[str, Block] = {
+    "double": _double,
+    "single": _single,
+    "gated": _gated,
+}
 
 
 def unet_layers(
-    widths: tuple[int, int, int], channels_in: int = 16, channels_out: int = 3
+    widths: tuple[int, int, int],
+    channels_in: int = 16,
+    channels_out: int = 3,
+    blocks: str = "double",
 ) -> list[Layer]:
-    """The layers in the order of the forward pass. widths: channels of the three levels."""
+    """The layers in the order of the forward pass. widths: channels of the three levels; blocks:
+    what a level computes, a key of BLOCKS.
+    """
     w0, w1, w2 = widths
+    block = BLOCKS[blocks]
+    enc0 = block("enc0", ("x",), 0, w0, sources=(channels_in,))
+    enc1 = block("enc1", ("pool0",), 1, w1, sources=(w0,))
+    enc2 = block("enc2", ("pool1",), 2, w2, sources=(w1,))
+    skip0, skip1 = enc0[-1].name, enc1[-1].name
+    dec1 = block("dec1", ("wide1", skip1), 1, w1, sources=(w1, w1))
+    dec0 = block("dec0", ("wide0", skip0), 0, w0, sources=(w0, w0))
     return [
-        Conv("enc0.a", ("x",), 0, w0, (channels_in,)),
-        Conv("enc0.b", ("enc0.a",), 0, w0, (w0,)),
-        Pool("pool0", ("enc0.b",), 1, w0),
-        Conv("enc1.a", ("pool0",), 1, w1, (w0,)),
-        Conv("enc1.b", ("enc1.a",), 1, w1, (w1,)),
-        Pool("pool1", ("enc1.b",), 2, w1),
-        Conv("enc2.a", ("pool1",), 2, w2, (w1,)),
-        Conv("enc2.b", ("enc2.a",), 2, w2, (w2,)),
-        Conv("up1", ("enc2.b",), 2, w1, (w2,), kernel_size=1, relu=False),
+        *enc0,
+        Pool("pool0", (skip0,), 1, w0),
+        *enc1,
+        Pool("pool1", (skip1,), 2, w1),
+        *enc2,
+        Conv("up1", (enc2[-1].name,), 2, w1, (w2,), kernel_size=1, relu=False),
         Upsample("wide1", ("up1",), 1, w1),
-        Conv("dec1.a", ("wide1", "enc1.b"), 1, w1, (w1, w1)),
-        Conv("dec1.b", ("dec1.a",), 1, w1, (w1,)),
-        Conv("up0", ("dec1.b",), 1, w0, (w1,), kernel_size=1, relu=False),
+        *dec1,
+        Conv("up0", (dec1[-1].name,), 1, w0, (w1,), kernel_size=1, relu=False),
         Upsample("wide0", ("up0",), 0, w0),
-        Conv("dec0.a", ("wide0", "enc0.b"), 0, w0, (w0, w0)),
-        Conv("dec0.b", ("dec0.a",), 0, w0, (w0,)),
-        Conv("out", ("dec0.b",), 0, channels_out, (w0,), kernel_size=1, relu=False),
+        *dec0,
+        Conv("out", (dec0[-1].name,), 0, channels_out, (w0,), kernel_size=1, relu=False),
     ]
 
 

@@ -13,6 +13,7 @@ from pyopencl.array import Array
 
 from pp_cl.device.device import Device
 from pp_cl.layers.direction import Direction
+from pp_cl.layers.gate import gate_backward, gate_forward
 from pp_cl.layers.resample import (
     avgpool2_backward,
     avgpool2_forward,
@@ -77,12 +78,13 @@ class Layer(ABC):
         grad_out: Array,
         grad_x: Array,
         *,
-        mask: Array | None,
+        x: Array,
+        is_relu: bool,
         tiles: Tiles,
     ) -> None:
-        """Compute the tiles of grad_x, the gradient of the input of number `source`.
+        """Compute the tiles of grad_x, the gradient of x, the input of number `source`.
 
-        mask: that input, if it is a ReLU's output, to get the gradient of the ReLU's input.
+        is_relu: x is a ReLU's output, and grad_x is to be the gradient of the ReLU's input.
         """
 
     def backward_weights(
@@ -177,7 +179,8 @@ class Conv(Layer):
         grad_out: Array,
         grad_x: Array,
         *,
-        mask: Array | None,
+        x: Array,
+        is_relu: bool,
         tiles: Tiles,
     ) -> None:
         """As Layer.backward_input."""
@@ -186,7 +189,7 @@ class Conv(Layer):
             sum(self.sources[:source]),
             grad_out,
             grad_x,
-            mask=mask,
+            mask=x if is_relu else None,
             work=resources.work,
             tiles=tiles,
         )
@@ -242,10 +245,55 @@ class Conv(Layer):
 
 
 @dataclass(frozen=True)
+class Gate(Layer):
+    """ELU of one half of the input's channels times the sigmoid of the other half."""
+
+    def forward(
+        self, resources: Resources, sources: tuple[Array, ...], out: Array, tiles: Tiles
+    ) -> None:
+        """As Layer.forward."""
+        gate_forward(resources.dev, sources[0], out, tiles=tiles)
+
+    def backward_input(
+        self,
+        resources: Resources,
+        source: int,
+        grad_out: Array,
+        grad_x: Array,
+        *,
+        x: Array,
+        is_relu: bool,
+        tiles: Tiles,
+    ) -> None:
+        """As Layer.backward_input. Its input is never a ReLU's output."""
+        gate_backward(resources.dev, x, grad_out, grad_x, tiles=tiles)
+
+    def forward_radius(self) -> int:
+        """As Layer.forward_radius."""
+        return 0
+
+    backward_radius = forward_radius
+
+    def needed_forward(self, computed: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
+        """As Layer.needed_forward."""
+        return computed
+
+    needed_backward = needed_forward
+
+    def reference_forward(self, source: np.ndarray, parameters: dict) -> np.ndarray:
+        """As Layer.reference_forward."""
+        return reference.gate(source)
+
+    def reference_backward(
+        self, source: np.ndarray, grad_out: np.ndarray, parameters: dict
+    ) -> tuple[np.ndarray, dict]:
+        """As Layer.reference_backward."""
+        return reference.gate_backward(source, grad_out), {}
+
+
+@dataclass(frozen=True)
 class Pool(Layer):
-    """Mean of 2 x 2 pixels of a convolution with ReLU, whose output another layer (the skip) reads,
-    too.
-    """
+    """Mean of 2 x 2 pixels of a feature map that another layer (the skip) reads, too."""
 
     def forward(
         self, resources: Resources, sources: tuple[Array, ...], out: Array, tiles: Tiles
@@ -260,11 +308,12 @@ class Pool(Layer):
         grad_out: Array,
         grad_x: Array,
         *,
-        mask: Array | None,
+        x: Array,
+        is_relu: bool,
         tiles: Tiles,
     ) -> None:
         """As Layer.backward_input, but added to grad_x, where the skip's gradient is."""
-        avgpool2_backward(resources.dev, mask, grad_out, grad_x, tiles=tiles)
+        avgpool2_backward(resources.dev, x if is_relu else None, grad_out, grad_x, tiles=tiles)
 
     def forward_radius(self) -> int:
         """As Layer.forward_radius."""
@@ -312,7 +361,8 @@ class Upsample(Layer):
         grad_out: Array,
         grad_x: Array,
         *,
-        mask: Array | None,
+        x: Array,
+        is_relu: bool,
         tiles: Tiles,
     ) -> None:
         """As Layer.backward_input. Its input is never a ReLU's output."""

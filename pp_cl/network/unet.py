@@ -14,6 +14,7 @@ from pp_cl.network.architectures import convolutions, unet_layers
 from pp_cl.network.buffers import gradient_of
 from pp_cl.network.sparse_tiles import ForwardPlan
 from pp_cl.network.workspace import Workspace, WorkspacePlan, parameter_table
+from pp_cl.settings import NetworkConfig
 
 # Background tiles are skipped only in images of at least LEAST_PIXELS pixels, and only if at most
 # MOST_COMPUTED of the multiplications remain: finding them costs time too.
@@ -24,12 +25,12 @@ MULTIPLE = 4  # pixels: two poolings halve the height and the width
 class UNet:
     """The network, its parameters and gradients, and the buffers it works in.
 
-    widths: channels of the three levels. policy: which variants its convolutions take, None = as
-    shipped, whatever their error. layers: network.layer.Layer in the order of the forward pass.
-    parameters, gradients: {"enc0.a.weight": (ceil(CO/16), K, K, CI, 16), "enc0.a.bias":
-    (ceil(CO/16) * 16,), ...} float32 on the device. Weights and biases start uniform in
-    +-1/sqrt(CI K K) (PyTorch's default for Conv2d), output channels beyond CO at 0, with gradient
-    0.
+    widths: channels of the three levels. blocks: what a level computes, of architectures.BLOCKS.
+    policy: which variants its convolutions take, None = as shipped, whatever their error. layers:
+    network.layer.Layer in the order of the forward pass. parameters, gradients: {"enc0.a.weight":
+    (ceil(CO/16), K, K, CI, 16), "enc0.a.bias": (ceil(CO/16) * 16,), ...} float32 on the device.
+    Weights and biases start uniform in +-1/sqrt(CI K K) (PyTorch's default for Conv2d), output
+    channels beyond CO at 0, with gradient 0.
     """
 
     def __init__(
@@ -39,11 +40,12 @@ class UNet:
         channels_in: int = 16,
         channels_out: int = 3,
         *,
+        blocks: str = "double",
         seed: int = 0,
         policy: ConvolutionPolicy | None = None,
     ):
         self.dev = dev
-        self.layers = unet_layers(widths, channels_in, channels_out)
+        self.layers = unet_layers(widths, channels_in, channels_out, blocks)
         self.channels_in = channels_in
         self.policy = policy or make_policy(dev)
         self.parameters = {}
@@ -61,6 +63,13 @@ class UNet:
         self._workspaces = {}  # {training: Workspace}
         self._trained = None  # (workspace, arrays, tile plan) of the last forward(training=True)
         self._frozen = None  # {(layer, variant): weights} once frozen
+
+    @classmethod
+    def of_settings(
+        cls, dev: Device, settings: NetworkConfig, policy: ConvolutionPolicy, *, seed: int = 0
+    ) -> "UNet":
+        """The network of a run."""
+        return cls(dev, settings.widths, blocks=settings.blocks, seed=seed, policy=policy)
 
     def use(self, policy: ConvolutionPolicy) -> None:
         """Take the variants of another policy from the next image on."""
@@ -137,7 +146,8 @@ class UNet:
                     i,
                     grad_out,
                     arrays[gradient_of(name)],
-                    mask=sources[i] if name in self._relu_outputs else None,
+                    x=sources[i],
+                    is_relu=name in self._relu_outputs,
                     tiles=tiles.tiles(name),
                 )
         grad_x = arrays[gradient_of("x")]

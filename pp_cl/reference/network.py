@@ -55,6 +55,21 @@ def _taps(x, k):
             yield ky, kx, padded[ky : ky + height, kx : kx + width].reshape(-1, channels)
 
 
+def gate(x: np.ndarray) -> np.ndarray:
+    """(H, W, C): ELU of the first C channels of x (H, W, 2 C) times the sigmoid of the others."""
+    features, gates = np.split(x, 2, 2)
+    return _elu(features) * _sigmoid(gates)
+
+
+def gate_backward(x: np.ndarray, grad_out: np.ndarray) -> np.ndarray:
+    """(H, W, 2 C) gradient of the input of gate(), given that of its output (H, W, C)."""
+    features, gates = np.split(x, 2, 2)
+    slope = np.exp(np.minimum(features, 0))
+    grad_features = grad_out * slope * _sigmoid(gates)
+    grad_gates = grad_out * _elu(features) * _sigmoid(gates) * _sigmoid(-gates)
+    return np.concatenate([grad_features, grad_gates], 2)
+
+
 def pool(x: np.ndarray) -> np.ndarray:
     """(H / 2, W / 2, C): means of 2 x 2 pixels of x (H, W, C)."""
     return x.reshape(x.shape[0] // 2, 2, x.shape[1] // 2, 2, -1).mean((1, 3))
@@ -117,6 +132,15 @@ def network_gradients(
 
 def _joined(layer, outputs):
     return np.concatenate([outputs[name] for name in layer.inputs], 2)
+
+
+def _elu(x):
+    return np.where(x > 0, x, np.expm1(np.minimum(x, 0)))
+
+
+def _sigmoid(x):
+    decay = np.exp(-np.abs(x))
+    return np.where(x >= 0, 1, decay) / (1 + decay)
 
 
 def _bilinear(n):

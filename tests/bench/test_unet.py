@@ -20,19 +20,21 @@ SMALL = ("--size", "8", "--widths", "16,16,16")
 pytestmark = pytest.mark.usefixtures("quick")
 
 
-@pytest.mark.parametrize("check_size", [8, 256])
-def test_rows_of_the_network(dev, monkeypatch, check_size):
+@pytest.mark.parametrize(
+    "check_size, blocks", [(8, "double"), (256, "double"), (8, "single"), (8, "gated")]
+)
+def test_rows_of_the_network(dev, monkeypatch, check_size, blocks):
     monkeypatch.setattr(unet, "CHECK_SIZE", check_size)
-    rows = list(unet.bench_unet(dev, 16, (16, 16, 32), make_policy(dev)))
+    rows = list(unet.bench_unet(dev, 16, (16, 16, 32), make_policy(dev), blocks=blocks))
     names = ["auto", *offered(device_class(dev))]
     assert [row["direction"] for row in rows] == ["forward"] * len(names) + ["train"] * len(names)
     assert [row["variant"] for row in rows] == names * 2
     for row in rows:
         assert row.keys() >= KEYS
-        assert row["shape"] == [16, 16, 16, 16, 16, 32, 3]
+        assert row["shape"] == [16, 16, 16, 16, 16, 32, 3] and row["blocks"] == blocks
         # ten layers
         assert 0 < row["rel_l2"] < 10 * HALF.get(row["variant"], 2e-6) and row["max_err"] > 0
-    flops = 2 * multiplications(unet_layers((16, 16, 32)), 16, 16)
+    flops = 2 * multiplications(unet_layers((16, 16, 32), blocks=blocks), 16, 16)
     assert rows[0]["gflops"] == pytest.approx(flops / rows[0]["ms"] * 1e-6)
     assert rows[-1]["gflops"] == pytest.approx(3 * flops / rows[-1]["ms"] * 1e-6)
 
@@ -66,6 +68,7 @@ def test_files_and_table(tmp_path, capsys):
         (("--widths", "16,32"), "--widths 16,32"),
         (("--widths", "16,0,32"), "16,0,32"),
         (("--widths", "1,2,3,x"), "1,2,3,x"),
+        (("--blocks", "triple"), "double, single, gated"),
         (("--json", "/nowhere/b.json"), "--json /nowhere/b.json"),
         (("--plot", "/nowhere/b.png"), "--plot /nowhere/b.png"),
         (("--device", "abacus"), "abacus"),

@@ -68,6 +68,14 @@ def test_upsample(dev, rng, shape):
     assert relative_error(grad_x.get(), oracle.upsample2_gradient(grad_out)) < 1e-6
 
 
+def test_avgpool_backward_without_a_mask_only_adds(dev, rng):
+    other = rng.normal(size=(6, 10, 17)).astype(np.float32)
+    grad_out = rng.normal(size=(3, 5, 17)).astype(np.float32)
+    grad_x = dev.upload(other)
+    layers.avgpool2_backward(dev, None, dev.upload(grad_out), grad_x)
+    assert relative_error(grad_x.get(), other + oracle.avgpool2_gradient(grad_out)) < 5e-7
+
+
 def test_gradients_by_finite_differences(dev, rng):
     x, grad_pooled = rng.uniform(0.5, 1, (4, 6, 2)), rng.normal(size=(2, 3, 2)).astype(np.float32)
     grad_x = dev.zeros(x.shape)

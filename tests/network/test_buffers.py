@@ -34,4 +34,7 @@ def test_lifetimes_of_the_network():
         and training[gradient_of("x")][1] == 2 * len(layers) - 1
     )
     assert training["enc0.a"][1] > training["enc0.b"][1] - 2  # read again by the backward pass
+    gated = {n: s for n, *s in lifetimes(unet_layers((16, 32, 48), 3, blocks="gated"), True)}
+    # the gate's backward pass reads its input
+    assert gated["enc0.a"] == [0, 2 * len(layers) - 2]
     assert training["up0"] == [12, 13]  # enlarging needs nothing of its input

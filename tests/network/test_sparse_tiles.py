@@ -13,7 +13,7 @@ from pp_cl.config import preset
 from pp_cl.layers.policy import make_policy
 from pp_cl.layers.tiles import SIDE, grid_shape, tiles_find
 from pp_cl.model import Model
-from pp_cl.network.architectures import convolutions, unet_layers
+from pp_cl.network.architectures import BLOCKS, convolutions, unet_layers
 from pp_cl.network.sparse_tiles import (
     LOSS_BORDER,
     ForwardPlan,
@@ -70,10 +70,14 @@ def run(dev, net, x, grad_y, background):
 
 
 @pytest.mark.parametrize("name", OBJECTS)
-@pytest.mark.parametrize("variant", ["direct", "auto"])
-def test_equals_the_dense_network(dev, rng, always, name, variant):
+@pytest.mark.parametrize(
+    "variant, blocks",
+    [("direct", "double"), ("auto", "double"), ("direct", "single"), ("direct", "gated")],
+)
+def test_equals_the_dense_network(dev, rng, always, name, variant, blocks):
     x, grad_y = scene(rng, OBJECTS[name])
-    net = UNet(dev, (16, 32, 48), seed=1, policy=make_policy(dev, variant=variant))
+    policy = make_policy(dev, variant=variant)
+    net = UNet(dev, (16, 32, 48), blocks=blocks, seed=1, policy=policy)
     expected = run(dev, net, x, grad_y, None)
     actual = run(dev, net, x, grad_y, BACKGROUND)
     device_x = dev.upload(x)
@@ -89,13 +93,21 @@ def test_equals_the_dense_network(dev, rng, always, name, variant):
         assert relative_error(a, b) < 5e-6
 
 
-@pytest.mark.parametrize("name", ["inside", "across the border"])
-def test_equals_float64(dev, rng, always, name):
+@pytest.mark.parametrize(
+    "name, blocks",
+    [
+        ("inside", "double"),
+        ("across the border", "double"),
+        ("inside", "single"),
+        ("across the border", "gated"),
+    ],
+)
+def test_equals_float64(dev, rng, always, name, blocks):
     x, grad_y = scene(rng, OBJECTS[name])
-    net = UNet(dev, (16, 16, 32), seed=2)
+    net = UNet(dev, (16, 16, 32), blocks=blocks, seed=2)
     actual, parameters = run(dev, net, x, grad_y, BACKGROUND), plain_parameters(net, net.parameters)
-    expected_x, expected = unet_gradients(x, parameters, grad_y)
-    assert relative_error(actual[0], unet(x, parameters)[0]) < 3e-6
+    expected_x, expected = unet_gradients(x, parameters, grad_y, blocks)
+    assert relative_error(actual[0], unet(x, parameters, blocks)[0]) < 3e-6
     assert relative_error(actual[1], expected_x) < 1e-5
     gradients = plain_parameters(net, net.gradients)
     errors = {key: relative_error(gradients[key], expected[key]) for key in expected}
@@ -123,25 +135,26 @@ def test_few_tiles_in_large_images_only(dev, rng):
             assert plan.computed_fraction <= pp_cl.network.unet.MOST_COMPUTED
 
 
-def test_radius_is_what_a_change_reaches(rng):
+@pytest.mark.parametrize("blocks", BLOCKS)
+def test_radius_is_what_a_change_reaches(rng, blocks):
     """In float64, for a change at every place of a period of the pooling and the border far
     away.
     """
     parameters = {}
-    layers, size, centre = unet_layers((1, 1, 1), 1, 1), 96, 48
+    layers, size, centre = unet_layers((1, 1, 1), 1, 1, blocks), 96, 48
     for layer in convolutions(layers):
         parameters |= {
             f"{layer.name}.weight": rng.uniform(0.5, 1, layer.weight_shape()),
-            f"{layer.name}.bias": np.ones(1),
+            f"{layer.name}.bias": np.ones(layer.channels),
         }
-    before = unet(np.ones((size, size, 1)), parameters)[1]
+    before = unet(np.ones((size, size, 1)), parameters, blocks)[1]
     reached = dict.fromkeys(before, 0)
     grad = np.zeros((size, size, 1))
     reached_back = 0
     for place in range(centre, centre + 4):
         x = np.ones((size, size, 1))
         x[place, place] = 2
-        after = unet(x, parameters)[1]
+        after = unet(x, parameters, blocks)[1]
         for name, value in after.items():
             if name not in ("wide1", "wide0", "up1", "up0"):  # the oracle enlarges first
                 scale = size // len(value)
@@ -151,7 +164,9 @@ def test_radius_is_what_a_change_reaches(rng):
                 )
         grad[:], grad[place, place] = 0, 1
         rows = np.flatnonzero(
-            np.abs(unet_gradients(np.ones((size, size, 1)), parameters, grad)[0])[..., 0].max(1)
+            np.abs(unet_gradients(np.ones((size, size, 1)), parameters, grad, blocks)[0])[
+                ..., 0
+            ].max(1)
             > 1e-12
         )
         reached_back = max(reached_back, place - rows[0], rows[-1] - place)

@@ -1,5 +1,8 @@
 """pp_cl/network/unet.py against a float64 network."""
 
+import dataclasses
+import math
+
 import numpy as np
 import pytest
 from oracle.unet import unet, unet_gradients
@@ -8,20 +11,27 @@ from support.comparisons import numeric_gradient, relative_error
 from support.networks import plain_parameters
 
 from pp_cl.layers.policy import make_policy
+from pp_cl.network.architectures import BLOCKS, convolutions, multiplications, unet_layers
 from pp_cl.network.unet import UNet
+from pp_cl.settings import NetworkConfig
 
 
 @pytest.mark.parametrize(
-    "widths, variant",
+    "widths, variant, blocks",
     [
-        ((16, 32, 48), "direct"),
-        ((16, 32, 48), "winograd2"),
-        ((16, 32, 48), "winograd4"),
-        ((20, 16, 40), "auto"),
+        ((16, 32, 48), "direct", "double"),
+        ((16, 32, 48), "winograd2", "double"),
+        ((16, 32, 48), "winograd4", "double"),
+        ((20, 16, 40), "auto", "double"),
+        ((16, 32, 48), "direct", "single"),
+        ((20, 16, 40), "auto", "single"),
+        ((16, 32, 48), "direct", "gated"),
+        ((20, 16, 40), "auto", "gated"),
+        ((3, 17, 5), "auto", "gated"),
     ],
 )
-def test_forward_and_backward(dev, rng, widths, variant):
-    net = UNet(dev, widths, seed=1, policy=make_policy(dev, variant=variant))
+def test_forward_and_backward(dev, rng, widths, variant, blocks):
+    net = UNet(dev, widths, blocks=blocks, seed=1, policy=make_policy(dev, variant=variant))
     x, grad_y = (
         rng.normal(size=(12, 16, 16)).astype(np.float32),
         rng.normal(size=(12, 16, 3)).astype(np.float32),
@@ -29,8 +39,8 @@ def test_forward_and_backward(dev, rng, widths, variant):
     parameters = plain_parameters(net, net.parameters)
     y = net.forward(dev.upload(x)).get()
     grad_x = net.backward(dev.upload(grad_y)).get()
-    expected_x, expected = unet_gradients(x, parameters, grad_y)
-    assert relative_error(y, unet(x, parameters)[0]) < 3e-6
+    expected_x, expected = unet_gradients(x, parameters, grad_y, blocks)
+    assert relative_error(y, unet(x, parameters, blocks)[0]) < 3e-6
     assert relative_error(grad_x, expected_x) < 1e-5
     gradients = plain_parameters(net, net.gradients)
     assert gradients.keys() == expected.keys()
@@ -50,11 +60,12 @@ def test_weights_stored_as_half(dev, rng):
     )
 
 
-def test_gradients_by_finite_differences(dev, rng):
-    """Steps this small cross no kink of a ReLU: the network is piecewise linear, so the differences
-    are exact there.
+@pytest.mark.parametrize("blocks", BLOCKS)
+def test_gradients_by_finite_differences(dev, rng, blocks):
+    """Steps this small cross no kink of a ReLU: but for gates the network is piecewise linear, so
+    the differences are exact there.
     """
-    net = UNet(dev, (4, 5, 6), channels_in=3, seed=2)
+    net = UNet(dev, (4, 5, 6), channels_in=3, blocks=blocks, seed=2)
     x, grad_y = (
         rng.normal(size=(8, 4, 3)).astype(np.float32),
         rng.normal(size=(8, 4, 3)).astype(np.float32),
@@ -64,9 +75,9 @@ def test_gradients_by_finite_differences(dev, rng):
     grad_x = net.backward(dev.upload(grad_y)).get()
 
     def loss(values, changed):
-        return (unet(x, parameters | {changed: values})[0] * grad_y).sum()
+        return (unet(x, parameters | {changed: values}, blocks)[0] * grad_y).sum()
 
-    numeric = numeric_gradient(lambda v: (unet(v, parameters)[0] * grad_y).sum(), x, 1e-5)
+    numeric = numeric_gradient(lambda v: (unet(v, parameters, blocks)[0] * grad_y).sum(), x, 1e-5)
     assert relative_error(grad_x.ravel(), numeric) < 5e-6
     gradients = plain_parameters(net, net.gradients)
     for name, values in parameters.items():
@@ -76,8 +87,9 @@ def test_gradients_by_finite_differences(dev, rng):
         assert relative_error(flat[some], numeric) < 5e-6, name
 
 
-def test_inference_equals_training(dev, rng):
-    net = UNet(dev, seed=3)
+@pytest.mark.parametrize("blocks", BLOCKS)
+def test_inference_equals_training(dev, rng, blocks):
+    net = UNet(dev, blocks=blocks, seed=3)
     x = dev.upload(rng.normal(size=(20, 24, 16)).astype(np.float32))
     np.testing.assert_array_equal(
         net.forward(x, training=False).get(), net.forward(x, training=True).get()
@@ -138,14 +150,16 @@ def test_initial_values_are_pytorchs(dev):
             assert values.std() == pytest.approx(bound / np.sqrt(3), rel=0.1), name
 
 
-def test_hard_inputs(dev, rng):
-    net = UNet(dev, (16, 16, 16), seed=4)
+@pytest.mark.parametrize("blocks", BLOCKS)
+def test_hard_inputs(dev, rng, blocks):
+    net = UNet(dev, (16, 16, 16), blocks=blocks, seed=4)
     parameters = plain_parameters(net, net.parameters)
     for x in (
         np.zeros((8, 8, 16), np.float32),
         (1e3 + rng.normal(size=(8, 8, 16))).astype(np.float32),
     ):
-        assert relative_error(net.forward(dev.upload(x)).get(), unet(x, parameters)[0]) < 5e-6
+        expected = unet(x, parameters, blocks)[0]
+        assert relative_error(net.forward(dev.upload(x)).get(), expected) < 5e-6
 
 
 def test_wrong_use_is_refused(dev):
@@ -161,16 +175,49 @@ def test_wrong_use_is_refused(dev):
         net.backward(dev.zeros((8, 8, 3)))
 
 
-@pytest.mark.parametrize("variant", ["direct", "winograd4", "winograd4_half"])
+@pytest.mark.parametrize(
+    "variant, blocks",
+    [
+        ("direct", "double"),
+        ("winograd4", "double"),
+        ("winograd4_half", "double"),
+        ("auto", "single"),
+        ("auto", "gated"),
+    ],
+)
 @pytest.mark.parametrize("training", [False, True])
-def test_memory_plan_is_what_is_allocated(dev, training, variant):
+def test_memory_plan_is_what_is_allocated(dev, training, variant, blocks):
     x, grad_y = dev.zeros((16, 20, 16)), dev.zeros((16, 20, 3))
     before = dev.bytes
-    net = UNet(dev, (16, 32, 48), policy=make_policy(dev, variant=variant))
+    policy = make_policy(dev, variant=variant)
+    net = UNet(dev, (16, 32, 48), blocks=blocks, policy=policy)
     net.forward(x, training)
     if training:
         net.backward(grad_y)
     assert dev.bytes - before == sum(row[2] for row in net.memory_plan(16, 20, training))
+
+
+@pytest.mark.parametrize(
+    "blocks, parameters, operations",
+    [
+        ("double", 6_968_579, 0.966e12),
+        ("single", 3_133_443, 0.494e12),
+        ("gated", 6_102_275, 0.978e12),
+    ],
+)
+def test_size_of_the_papers_network(blocks, parameters, operations):
+    """The parameters worked out by hand, and the multiplications at 800x800, with the 1x1
+    convolutions before the upsampling.
+    """
+    layers = unet_layers((128, 256, 512), blocks=blocks)
+    shapes = [layer.weight_shape() for layer in convolutions(layers)]
+    assert sum(math.prod(shape) + shape[0] for shape in shapes) == parameters
+    assert multiplications(layers, 800, 800) == pytest.approx(operations, rel=1e-3)
+
+
+def test_the_setting_names_the_blocks():
+    (item,) = (f for f in dataclasses.fields(NetworkConfig) if f.name == "blocks")
+    assert item.default == "double" and item.metadata["choices"] == tuple(BLOCKS)
 
 
 def test_memory_of_the_papers_network(dev):

@@ -1,6 +1,7 @@
-"""Float64 twins of cl/layers/resample.cl."""
+"""Float64 twins of cl/layers/resample.cl and cl/layers/gate.cl."""
 
 import numpy as np
+from scipy.special import expit
 
 
 def avgpool2(x):
@@ -30,6 +31,21 @@ def maxpool2_gradient(x, grad_out):
         y, z = np.unravel_index(cell.argmax(), (2, 2))
         grad_x[2 * row + y, 2 * column + z, c] = grad_out[row, column, c]
     return grad_x
+
+
+def gate(x):
+    """(H, W, 2 C) -> (H, W, C): ELU of the first half of the channels, sigmoid of the second."""
+    features, gates = np.split(np.asarray(x, np.float64), 2, 2)
+    return np.where(features > 0, features, np.expm1(np.minimum(features, 0))) * expit(gates)
+
+
+def gate_gradient(x, grad_out):
+    """(H, W, 2 C), (H, W, C) -> (H, W, 2 C)."""
+    features, gates = np.split(np.asarray(x, np.float64), 2, 2)
+    slope = np.where(features > 0, 1, np.exp(np.minimum(features, 0)))
+    opened = expit(gates) * expit(-gates)  # the derivative of the sigmoid
+    value = np.where(features > 0, features, np.expm1(np.minimum(features, 0)))
+    return np.concatenate([grad_out * slope * expit(gates), grad_out * value * opened], 2)
 
 
 def upsample_matrix(n):

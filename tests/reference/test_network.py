@@ -8,7 +8,7 @@ from oracle.conv import conv, conv_gradients
 from oracle.unet import unet, unet_gradients
 from support.comparisons import relative_error
 
-from pp_cl.network.architectures import convolutions, unet_layers
+from pp_cl.network.architectures import BLOCKS, convolutions, unet_layers
 from pp_cl.reference.network import (
     convolution,
     convolution_at,
@@ -32,21 +32,22 @@ def test_convolution_and_its_gradients(rng, height, width, ci, co, k):
     assert relative_error(convolution_at(x, weight, bias, pixels), expected[pixels]) < 1e-13
 
 
-def test_network_and_its_gradients(rng):
-    widths, layers = (4, 5, 6), unet_layers((4, 5, 6), 7, 3)
+@pytest.mark.parametrize("blocks", BLOCKS)
+def test_network_and_its_gradients(rng, blocks):
+    widths, layers = (4, 5, 6), unet_layers((4, 5, 6), 7, 3, blocks)
     parameters = {}
     for layer in convolutions(layers):
         parameters |= {
-            layer.name + ".weight": rng.normal(size=layer.weight_shape()),
+            layer.name + ".weight": 0.2 * rng.normal(size=layer.weight_shape()),
             layer.name + ".bias": rng.normal(size=layer.channels),
         }
     x, grad_image = rng.normal(size=(8, 12, 7)), rng.normal(size=(8, 12, 3))
     outputs = network(layers, parameters, x)
-    assert outputs["enc2.a"].shape == (2, 3, widths[2])
-    assert relative_error(outputs["image"], unet(x, parameters)[0]) < 1e-13
+    assert outputs["pool1"].shape == (2, 3, widths[1])
+    assert relative_error(outputs["image"], unet(x, parameters, blocks)[0]) < 1e-13
     active = {name: values > 0 for name, values in outputs.items()}
     gradients = network_gradients(layers, parameters, outputs, active, grad_image=grad_image)
-    expected_x, expected = unet_gradients(x, parameters, grad_image)
+    expected_x, expected = unet_gradients(x, parameters, grad_image, blocks)
     assert relative_error(gradients.pop("x"), expected_x) < 1e-13
     assert gradients.keys() == expected.keys()
     for name, gradient in gradients.items():
