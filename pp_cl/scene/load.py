@@ -81,6 +81,9 @@ def load_scene(
     """
     reader, folder = find_reader(path), Path(path)
     listed = {split: evenly(reader.read_split(folder, split), most) for split in splits}
+    for split, photographs in listed.items():
+        if not photographs:
+            raise UserError(f"{folder}: split {split} has no photographs; add some")
     everything = [photograph for photographs in listed.values() for photograph in photographs]
     _check_alike(folder, everything)
     images = iter(_on_all_cores(lambda one: _read_image(folder, one, masks), everything))

@@ -2,9 +2,11 @@
 
 import numpy as np
 import pytest
+from support.same_scene import views
 from support.transforms_scenes import refused, write_scene
 
 from pp_cl.scene.load import evenly, load_scene
+from tools.scene_formats import nerfstudio
 
 
 def test_missing_folder_format_and_split(tmp_path):
@@ -14,6 +16,15 @@ def test_missing_folder_format_and_split(tmp_path):
     refused(tmp_path / "transforms_train.json", "no such folder")
     write_scene(tmp_path, "val")
     refused(tmp_path, tmp_path / "transforms_test.json", "train, val", splits=("test",))
+
+
+def test_a_split_without_photographs(tmp_path):
+    """The first of every eight is for testing, so that a single one leaves none for training."""
+    nerfstudio.write(tmp_path, {"train": views(1)})
+    file = tmp_path / "transforms.json"
+    file.write_text(file.read_text().replace("train_filenames", "names"))
+    assert len(load_scene(tmp_path, ("test",)).splits["test"]) == 1
+    refused(tmp_path, tmp_path, "split train has no photographs")
 
 
 def test_truncated_image(tmp_path):

@@ -2,6 +2,7 @@
 and, for objects, one of masks.
 """
 
+import os
 from functools import partial
 from pathlib import Path
 
@@ -19,7 +20,7 @@ from pp_cl.scene.readers.common import SPLITS, check_split, find_image, hold_out
 FILES = "a sparse model of COLMAP beside images"
 PLACES = ("sparse/0", "sparse", "colmap/sparse/0", ".")
 IMAGES, MASKS = "images", "masks"
-MOST_FOCAL = 1e9  # pixels
+LEAST_FOCAL, MOST_FOCAL = 1e-3, 1e9  # pixels
 
 
 def recognises(folder: Path) -> bool:
@@ -93,7 +94,7 @@ def _intrinsics(folder, model, lens):
             f" image_undistorter --image_path {folder / IMAGES} --input_path {model} --output_path"
             " NEW` and give NEW"
         )
-    if not all(0 < focal < MOST_FOCAL for focal in found[:2]):
+    if not all(LEAST_FOCAL < focal < MOST_FOCAL for focal in found[:2]):
         raise UserError(f"{model}: a camera has the focal length {min(found[:2]):g}; mend it")
     return found
 
@@ -103,6 +104,7 @@ def _mask(folder, name, fail):
     if not (folder / MASKS).is_dir():
         return None
     for given in (f"{name}.png", Path(name).with_suffix(".png").as_posix()):
-        if (folder / MASKS / given).is_file():
+        # a name that is too long with .png is no file, where Path.is_file raises
+        if os.path.isfile(folder / MASKS / given):
             return find_image(folder, f"{MASKS}/{given}", fail)
     raise fail(f"has no mask {MASKS}/{name}.png; add it, or remove the folder {MASKS}")

@@ -1,18 +1,23 @@
 """Cameras and images of a sparse model of COLMAP, text or binary.
 
-Formats: https://colmap.github.io/format.html. Of points only the number is looked at.
+Formats: https://colmap.github.io/format.html. Files are read piece by piece and points are passed
+over, since they are nearly all of a file.
 """
 
-import math
+import os
 import struct
+import unicodedata
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 
 import numpy as np
 
 from pp_cl.errors import UserError
+from pp_cl.scene.readers.frame import MOST
 
-# id in binary files, number of parameters, of every model that COLMAP has
+# id in binary files, number of parameters, of every model of COLMAP that has a focal length
 MODELS = {
     "SIMPLE_PINHOLE": (0, 3),
     "PINHOLE": (1, 4),
@@ -26,10 +31,17 @@ MODELS = {
     "RADIAL_FISHEYE": (9, 5),
     "THIN_PRISM_FISHEYE": (10, 12),
     "RAD_TAN_THIN_PRISM_FISHEYE": (11, 16),
+    "SIMPLE_DIVISION": (12, 4),
+    "DIVISION": (13, 5),
+    "SIMPLE_FISHEYE": (14, 3),
+    "FISHEYE": (15, 4),
+    "EUCM": (16, 6),
 }
 NAMES = {number: name for name, (number, _) in MODELS.items()}
 MOST_PIXELS = 2**20  # a side; beyond it a number is no size
 MOST_NAME = 4096  # bytes of an image's name
+MOST_LINE = 2**26  # characters of a line: a million 2D points
+UNKNOWN = "is no known camera model; undistort with `colmap image_undistorter`, or copy it anew"
 POINT2D_BYTES = 24  # x, y and the id of a 3D point
 
 
@@ -61,21 +73,32 @@ def read_model(folder: Path) -> tuple[dict[int, Lens], list[Image]]:
     read_cameras, read_images = (
         (_binary_cameras, _binary_images) if suffix == ".bin" else (_text_cameras, _text_images)
     )
+    lenses = _lenses(folder / f"cameras{suffix}", read_cameras)
     file = folder / f"images{suffix}"
-    lenses, images = read_cameras(folder / f"cameras{suffix}"), read_images(file)
+    images, names = list(read_images(file)), set()
     if not images:
         raise UserError(f"{file}: holds no images; run COLMAP's mapper again")
-    names = set()
     for image in images:
         if image.camera not in lenses:
             raise UserError(
                 f"{file}: {image.name}: its camera {image.camera} is not in cameras{suffix}; copy"
                 " both files from one model"
             )
-        if image.name in names:
+        name = PurePosixPath(image.name)  # ./a.png is a.png
+        if name in names:
             raise UserError(f"{file}: {image.name}: stands there twice; remove one")
-        names.add(image.name)
+        names.add(name)
     return lenses, images
+
+
+def _lenses(file, read):
+    """{id: Lens}. Raises UserError for two of one id."""
+    lenses = {}
+    for identity, lens in read(file):
+        if identity in lenses:
+            raise UserError(f"{file}: camera {identity} stands there twice; remove one")
+        lenses[identity] = lens
+    return lenses
 
 
 def is_model(folder: Path, suffix: str) -> bool:
@@ -87,134 +110,168 @@ def _lens(where, model, size, parameters):
     """The Lens. Raises UserError beginning with `where`."""
     if not all(1 <= side < MOST_PIXELS for side in size):
         raise UserError(f"{where}: {size[0]}x{size[1]} pixels is no size; copy the file anew")
-    if len(parameters) != MODELS[model][1] or not all(map(math.isfinite, parameters)):
+    if len(parameters) != MODELS[model][1] or not _are_numbers(parameters):
         raise UserError(
-            f"{where}: {model} has {MODELS[model][1]} finite parameters; copy the file anew"
+            f"{where}: {model} has {MODELS[model][1]} parameters, finite and not huge; copy the"
+            " file anew"
         )
     return Lens(model, *size, tuple(parameters))
 
 
 def _image(where, name, camera, numbers):
     """The Image; numbers: qw, qx, qy, qz, tx, ty, tz. Raises UserError beginning with `where`."""
+    # it goes into messages of one line
+    if not name or any(unicodedata.category(letter) == "Cc" for letter in name):
+        raise UserError(f"{where}: {name[:80]!r} is no name of an image; rename it")
     numbers = np.array(numbers, np.float64)
-    length = np.linalg.norm(numbers[:4])
-    if not np.isfinite(numbers).all() or abs(length - 1) > 1e-3:
+    length = np.linalg.norm(numbers[:4]) if _are_numbers(numbers) else 0
+    if abs(length - 1) > 1e-3:
         raise UserError(f"{where}: {name}: its pose is no unit quaternion and place; mend it")
     return Image(name, camera, numbers[:4] / length, numbers[4:])
+
+
+def _are_numbers(values):
+    """Whether all are finite and not huge."""
+    return all(abs(value) < MOST for value in values)
 
 
 # --------------------------------------------------------------------------------------------------
 
 
 def _lines(file):
-    """[(number, line)] of a text file that are no comments."""
+    """(number, line) of a text file, one after the other."""
     try:
-        text = file.read_text("utf-8")
+        with file.open(encoding="utf-8-sig") as opened:
+            for number, line in enumerate(iter(lambda: opened.readline(MOST_LINE), ""), 1):
+                if len(line) == MOST_LINE:
+                    raise UserError(f"{file}: line {number}: does not end; copy it anew")
+                yield number, line.strip()
     except (OSError, ValueError) as error:
         raise UserError(f"{file}: cannot be read as text ({error}); copy it anew") from None
-    lines = enumerate(text.split("\n"), 1)
-    return [(number, line) for number, line in lines if not line.startswith("#")]
 
 
 def _text_cameras(file):
-    lenses = {}
+    """Each (id, Lens)."""
     for number, line in _lines(file):
-        if not line.strip():
+        if not line or line.startswith("#"):
             continue
         where, words = f"{file}: line {number}", line.split()
         try:
             identity, model, size = int(words[0]), words[1], (int(words[2]), int(words[3]))
             parameters = [float(word) for word in words[4:]]
         except (IndexError, ValueError, OverflowError):
-            raise UserError(f"{where}: is not CAMERA_ID MODEL WIDTH HEIGHT PARAMS[]") from None
+            raise UserError(
+                f"{where}: is not CAMERA_ID MODEL WIDTH HEIGHT PARAMS[]; copy the file anew"
+            ) from None
         if model not in MODELS:
-            raise UserError(f"{where}: {model[:40]!r} is no camera model of COLMAP's")
-        lenses[identity] = _lens(where, model, size, parameters)
-    return lenses
+            raise UserError(f"{where}: {model[:40]!r} {UNKNOWN}")
+        yield identity, _lens(where, model, size, parameters)
 
 
 def _text_images(file):
-    """Each image has two lines, of which the second, its 2D points, may be empty."""
-    images, lines = [], _lines(file)
-    while lines and not lines[-1][1].strip():
-        lines.pop()
-    for number, line in lines[::2]:
+    """Each Image; it has two lines, of which the second, its 2D points, may be empty."""
+    lines = _lines(file)
+    for number, line in lines:
+        if not line or line.startswith("#"):
+            continue
         where, words = f"{file}: line {number}", line.split(maxsplit=9)
         try:
-            numbers, camera, name = [float(w) for w in words[1:8]], int(words[8]), words[9].strip()
+            numbers, camera, name = [float(w) for w in words[1:8]], int(words[8]), words[9]
         except (IndexError, ValueError, OverflowError):
             raise UserError(
-                f"{where}: is not IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME"
+                f"{where}: is not IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME; copy the file anew"
             ) from None
-        images.append(_image(where, name, camera, numbers))
-    return images
+        number, points = next(lines, (number, ""))
+        # else an image without its line of points would hide the next one
+        if not _is_points(points):
+            raise UserError(
+                f"{file}: line {number}: must be the 2D points of {name[:80]!r}, X Y POINT3D_ID"
+                " each; give every image a second line, empty if it has none"
+            )
+        yield _image(where, name, camera, numbers)
+
+
+def _is_points(line):
+    words = line.split()
+    return len(words) % 3 == 0 and (not words or words[-1].lstrip("-").isdecimal())
 
 
 # --------------------------------------------------------------------------------------------------
 
 
 class _Bytes:
-    """A binary file, read piece by piece; what is beyond its end is a UserError."""
+    """An opened binary file, read piece by piece; what is beyond its end is a UserError."""
 
-    def __init__(self, file):
-        self.file, self.at = file, 0
-        try:
-            self.data = file.read_bytes()
-        except OSError as error:
-            raise UserError(f"{file}: cannot be read ({error.strerror}); copy it anew") from None
+    def __init__(self, file, opened):
+        self.file, self.opened = file, opened
+        self.size = os.fstat(opened.fileno()).st_size
 
     def take(self, form):
         """The values of a struct format, little-endian."""
         size = struct.calcsize("<" + form)
-        self.skip(size)
-        return struct.unpack_from("<" + form, self.data, self.at - size)
+        data = self.opened.read(size)
+        if len(data) < size:
+            raise self.too_short()
+        return struct.unpack("<" + form, data)
 
     def skip(self, size):
-        if size > len(self.data) - self.at:
-            raise UserError(f"{self.file}: ends at byte {len(self.data)}, too early; copy it anew")
-        self.at += size
+        if size > self.size - self.opened.tell():
+            raise self.too_short()
+        self.opened.seek(size, os.SEEK_CUR)
+
+    def too_short(self):
+        return UserError(f"{self.file}: ends at byte {self.size}, too early; copy it anew")
 
     def name(self):
-        end = self.data.find(b"\0", self.at, self.at + MOST_NAME)
-        if end < 0:
-            raise UserError(f"{self.file}: byte {self.at}: a name does not end; copy it anew")
-        text, self.at = self.data[self.at : end], end + 1
+        at = self.opened.tell()
+        text, end, _ = self.opened.read(MOST_NAME).partition(b"\0")
+        if not end:
+            raise UserError(f"{self.file}: byte {at}: a name does not end; copy it anew")
+        self.opened.seek(at + len(text) + 1)
         try:
             return text.decode()
         except UnicodeDecodeError:
-            raise UserError(
-                f"{self.file}: byte {self.at}: a name is not UTF-8; rename it"
-            ) from None
+            raise UserError(f"{self.file}: byte {at}: a name is not UTF-8; rename it") from None
 
     def end(self):
-        if self.at != len(self.data):
+        at = self.opened.tell()
+        if at != self.size:
             raise UserError(
-                f"{self.file}: goes on after its last entry, at byte {self.at}; copy it anew"
+                f"{self.file}: goes on after its last entry, at byte {at}; copy it anew"
             )
 
 
+@contextmanager
+def _opened(file) -> Iterator[_Bytes]:
+    try:
+        with file.open("rb") as opened:
+            yield _Bytes(file, opened)
+    except OSError as error:
+        raise UserError(f"{file}: cannot be read ({error.strerror}); copy it anew") from None
+
+
 def _binary_cameras(file):
-    data, lenses = _Bytes(file), {}
-    (count,) = data.take("Q")
-    for _ in range(count):  # a count that is too large ends at the file's end
-        identity, number, width, height = data.take("IiQQ")
-        where = f"{file}: camera {identity}"
-        if number not in NAMES:
-            raise UserError(f"{where}: {number} is no camera model of COLMAP's; copy it anew")
-        parameters = data.take("d" * MODELS[NAMES[number]][1])
-        lenses[identity] = _lens(where, NAMES[number], (width, height), parameters)
-    data.end()
-    return lenses
+    """Each (id, Lens)."""
+    with _opened(file) as data:
+        (count,) = data.take("Q")
+        for _ in range(count):  # a count that is too large ends at the file's end
+            identity, number, width, height = data.take("IiQQ")
+            where = f"{file}: camera {identity}"
+            if number not in NAMES:
+                raise UserError(f"{where}: {number} {UNKNOWN}")
+            parameters = data.take("d" * MODELS[NAMES[number]][1])
+            yield identity, _lens(where, NAMES[number], (width, height), parameters)
+        data.end()
 
 
 def _binary_images(file):
-    data, images = _Bytes(file), []
-    (count,) = data.take("Q")
-    for _ in range(count):
-        identity, *numbers, camera = data.take("IdddddddI")
-        name = data.name()
-        (points,) = data.take("Q")
-        data.skip(points * POINT2D_BYTES)
-        images.append(_image(f"{file}: image {identity}", name, camera, numbers))
-    data.end()
-    return images
+    """Each Image."""
+    with _opened(file) as data:
+        (count,) = data.take("Q")
+        for _ in range(count):
+            identity, *numbers, camera = data.take("IdddddddI")
+            name = data.name()
+            (points,) = data.take("Q")
+            data.skip(points * POINT2D_BYTES)
+            yield _image(f"{file}: image {identity}", name, camera, numbers)
+        data.end()

@@ -1,6 +1,9 @@
 """The reader of COLMAP's models: text and binary, its conventions, and every kind of bad input."""
 
+import shutil
 import struct
+import tracemalloc
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -8,11 +11,17 @@ from support.same_scene import held_out, same, views
 from support.transforms_scenes import refused
 
 from pp_cl.files.image import write_png
+from pp_cl.scene.distortion import Distortion
 from pp_cl.scene.load import load_scene
 from pp_cl.scene.readers.colmap import read_split
+from pp_cl.scene.readers.colmap_model import read_model
+from tools.colmap_demo import align, cameras
 from tools.scene_formats import colmap
 
 SIZE = (30, 22)
+# What COLMAP 3.8 found of photographs by tools/colmap_demo.py: six of the 64 images with their
+# first 2D points, one with none, which COLMAP's model_converter then wrote in both forms.
+BY_COLMAP = Path(__file__).parent / "colmap_models"
 
 
 @pytest.fixture(params=[True, False], ids=["binary", "text"])
@@ -86,6 +95,56 @@ def test_models(text, line, focal, k):
         assert (camera.cx, camera.cy) == (15, 11)
 
 
+@pytest.mark.parametrize("form", ["binary", "text"])
+def test_a_model_that_colmap_wrote(tmp_path, form):
+    """The same photographs from both forms, their cameras where the demo's are."""
+    shutil.copytree(BY_COLMAP / form, tmp_path / "sparse" / "0")
+    (tmp_path / "images").mkdir()
+    numbers = (0, 9, 20, 31, 42, 53)
+    for i in numbers:
+        write_png(tmp_path / "images" / f"{i:03d}.png", np.zeros((400, 400)))
+    found = [one for split in ("test", "train") for one in read_split(tmp_path, split)]
+    assert [one.name for one in found] == [f"images/{i:03d}.png" for i in numbers]
+    for one in found:
+        camera, k1 = one.camera, -0.0025245658661648311
+        assert camera.fx == camera.fy == 323.03151019681525 and (camera.cx, camera.cy) == (200, 200)
+        assert one.distortion == Distortion(k1=k1)
+    true = cameras(400)
+    alignment = align([one.camera for one in found], [true[i] for i in numbers])
+    assert alignment.position < 0.02 and alignment.degrees < 0.2
+
+
+def test_binary_goes_before_text(binary):
+    for name in ("cameras", "images"):
+        (binary / "sparse" / "0" / f"{name}.txt").write_text("no model")
+    assert len(read_split(binary, "train")) == 9
+
+
+def test_text_as_other_programs_write_it(text):
+    """A byte order mark, CR LF, empty lines and comments before an image, 2D points."""
+    before = read_split(text, "train")
+    for name in ("cameras.txt", "images.txt"):
+        file = text / "sparse" / "0" / name
+        lines = file.read_text().replace(".png\n\n", ".png\n1.5 2 -1 3 4.5 17\n\n# next\n\n")
+        file.write_bytes(b"\xef\xbb\xbf" + lines.replace("\n", "\r\n").encode())
+    for got, expected in zip(read_split(text, "train"), before, strict=True):
+        assert got.name == expected.name and np.array_equal(got.camera.pose, expected.camera.pose)
+
+
+def test_2d_points_take_no_memory(tmp_path):
+    count = 2**24
+    lens = struct.pack("<QIiQQ3d", 1, 1, 0, *SIZE, 40, 15, 11)
+    image = struct.pack("<QI7dI", 1, 1, 1, 0, 0, 0, 0, 0, 3, 1) + b"a.png\0"
+    (tmp_path / "cameras.bin").write_bytes(lens)
+    with (tmp_path / "images.bin").open("wb") as file:
+        file.write(image + struct.pack("<Q", count))
+        file.truncate(file.tell() + 24 * count)  # a hole: no space on the disk
+    tracemalloc.start()
+    _, [image] = read_model(tmp_path)
+    assert image.name == "a.png" and tracemalloc.get_traced_memory()[1] < 2**20
+    tracemalloc.stop()
+
+
 def test_without_masks_the_images_own_alpha_counts(written):
     folder, _ = written
     for file in (folder / "masks").iterdir():
@@ -138,6 +197,24 @@ BAD_TEXT = {
     "quaternion": ("images.txt", replaced(1, "3"), "000001.png", "unit quaternion"),
     "infinite place": ("images.txt", replaced(5, "inf"), "unit quaternion and place"),
     "short line": ("images.txt", second(lambda w: w[:6]), "line 3", "IMAGE_ID"),
+    "huge place": ("images.txt", replaced(5, "1e300"), "unit quaternion and place"),
+    "huge principal point": ("cameras.txt", replaced(6, "1e300"), "not huge"),
+    "camera twice": ("cameras.txt", replaced(0, "1"), "camera 1 stands there twice"),
+    "no lines of 2D points": (
+        "images.txt",
+        lambda lines: lines[::2],
+        "line 2",
+        "000000.png",
+        "second line",
+    ),
+    "broken 2D points": ("images.txt", lambda lines: [lines[0], "1 2", *lines[2:]], "line 2"),
+    "escape sequence in a name": (
+        "images.txt",
+        replaced(9, "\x1b[2J.png"),
+        "line 3",
+        "'\\x1b[2J.png' is no name",
+    ),
+    "image twice by two paths": ("images.txt", replaced(9, "./000000.png"), "twice"),
     "unknown camera": ("images.txt", replaced(8, "77"), "77 is not in cameras.txt"),
     "image twice": ("images.txt", replaced(9, "000000.png"), "000000.png", "twice"),
     "missing image": ("images.txt", replaced(9, "none.png"), "none.png", "no image"),
@@ -161,6 +238,14 @@ def test_other_models_are_named_with_the_command_that_converts_them(text):
     refused(text, "OPENCV_FISHEYE", "colmap image_undistorter", f"--image_path {text / 'images'}")
 
 
+def test_models_of_later_versions_are_named(binary):
+    """SIMPLE_DIVISION, number 12, has as many parameters as PINHOLE."""
+    file = binary / "sparse" / "0" / "cameras.bin"
+    data = file.read_bytes()
+    file.write_bytes(data[:12] + struct.pack("<i", 12) + data[16:])
+    refused(binary, "SIMPLE_DIVISION", "colmap image_undistorter", splits=("test",))
+
+
 BAD_BYTES = {
     "cut in a camera": ("cameras.bin", lambda b: b[:60], "byte 60"),
     "cut in a name": ("images.bin", lambda b: b[:76], "does not end"),
@@ -176,6 +261,13 @@ BAD_BYTES = {
     "size": ("cameras.bin", lambda b: b[:16] + struct.pack("<Q", 2**40) + b[24:], "no size"),
     "NaN": ("images.bin", lambda b: b[:12] + struct.pack("<d", np.nan) + b[20:], "quaternion"),
     "empty": ("cameras.bin", lambda b: b"", "ends at byte 0"),
+    "camera twice": (
+        "cameras.bin",
+        lambda b: b[:64] + struct.pack("<I", 1) + b[68:],
+        "camera 1 stands there twice",
+    ),
+    "line break in a name": ("images.bin", lambda b: b[:72] + b"\n" + b[73:], "is no name"),
+    "no name": ("images.bin", lambda b: b[:72] + b[82:], "image 1: '' is no name"),
 }
 
 
@@ -191,6 +283,16 @@ def test_a_missing_mask(written):
     folder, _ = written
     (folder / "masks" / "000003.png.png").unlink()
     refused(folder, "000003.png", "no mask masks/000003.png.png")
+
+
+def test_a_name_that_is_too_long_for_a_mask(binary):
+    """255 bytes, the most that a file's name may have; with .png it would have more."""
+    name = "x" * 251 + ".png"
+    (binary / "images" / "000001.png").rename(binary / "images" / name)
+    (binary / "masks" / "000001.png.png").unlink()
+    file = binary / "sparse" / "0" / "images.bin"
+    file.write_bytes(file.read_bytes().replace(b"000001.png", name.encode()))
+    refused(binary, name, "has no mask")
 
 
 def test_a_mask_of_another_size(written):
