@@ -92,6 +92,7 @@ def test_one_colour_stays_one_colour(name):
 
 def test_a_lens_that_folds_is_refused(tmp_path):
     """1 + 3 k1 r^2 < 0 from r = 0.58 on."""
+    assert Distortion(k1=float("nan")).folds(CAMERA)
     assert Distortion(k1=-1.0).folds(CAMERA) and not Distortion(k1=-0.5).folds(CAMERA)
     data = write_scene(tmp_path)
     data["k1"] = -9.0

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
+from pp_cl.errors import UserError
 from pp_cl.scene.readers.co3d import ANNOTATIONS, CV_FROM_P3D, ISOTROPIC, NORMALISED
 from pp_cl.scene.views import View
 from tools.scene_formats.common import number, write_mask, write_rgb
@@ -16,7 +17,10 @@ CATEGORY, SEQUENCE = "object", "sequence"
 
 
 def write(folder: Path, splits: dict[str, list[View]], version: int = 2) -> None:
-    """Write the sequence and the annotations beside it."""
+    """Write the sequence and the annotations beside it. Raises UserError for splits that the
+    format's set lists cannot tell.
+    """
+    _check(splits, version)
     annotations, listed, category = [], {}, folder / CATEGORY
     for split, views in splits.items():
         for view in views:
@@ -35,6 +39,16 @@ def write(folder: Path, splits: dict[str, list[View]], version: int = 2) -> None
     lists.write_text(json.dumps(listed))
 
 
+def _check(splits, version):
+    known = {"train", "test"} | ({"val"} if version == 2 else set())
+    filled = {split for split, views in splits.items() if views}
+    if set(splits) - known or not {"train", "test"} <= filled:
+        raise UserError(
+            f"a sequence of CO3D {version} has the splits {', '.join(sorted(known))}, this scene"
+            f" {', '.join(sorted(filled))}; deal them anew with --hold-out"
+        )
+
+
 def _set(split, version):
     return {"train": "train_known", "test": "train_unseen"}[split] if version == 1 else split
 
@@ -51,10 +65,12 @@ def _annotation(index, view, paths, version):
         "principal_point": ((half - [camera.cx, camera.cy]) / scale).tolist(),
         "intrinsics_format": NORMALISED if version == 1 else ISOTROPIC,
     }
+    # without pixels left unsaid: a reader leaves out the frames whose masks are known to be empty
+    mass = float((view.image[..., 3] > 0).sum())
     return {
         "sequence_name": SEQUENCE,
         "frame_number": index,
         "image": {"path": paths[0], "size": [camera.height, camera.width]},
-        "mask": {"path": paths[1], "mass": float((view.image[..., 3] > 0).sum())},
+        "mask": {"path": paths[1], "mass": mass or None},
         "viewpoint": viewpoint,
     }

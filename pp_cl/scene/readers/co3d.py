@@ -5,6 +5,7 @@ scene's folder.
 
 import gzip
 import json
+import os
 import zlib
 from functools import lru_cache, partial
 from pathlib import Path, PurePosixPath
@@ -16,7 +17,7 @@ from pp_cl.files.image import image_size
 from pp_cl.scene.camera import Camera
 from pp_cl.scene.photograph import Photograph
 from pp_cl.scene.readers.common import SPLITS, check_split, find_image, hold_out
-from pp_cl.scene.readers.frame import Frame, read_json, rigid
+from pp_cl.scene.readers.frame import MOST, Frame, numbers, read_json, rigid
 
 FILES = "a sequence of CO3D, whose frame_annotations.jgz lies one folder above"
 ANNOTATIONS = "frame_annotations.jgz"
@@ -29,13 +30,13 @@ NORMALISED, ISOTROPIC = "ndc_norm_image_bounds", "ndc_isotropic"
 
 def recognises(folder: Path) -> bool:
     """True if the folder has images and the one above it annotations."""
-    folder = folder.absolute()
+    folder = _whole(folder)
     return (folder / "images").is_dir() and (folder.parent / ANNOTATIONS).is_file()
 
 
 def splits(folder: Path) -> list[str]:
     """Train and test, and val where a set list has frames for it."""
-    listed = _set_list(folder.resolve())
+    listed = _set_list(_whole(folder))
     return sorted(listed) if listed else SPLITS
 
 
@@ -47,23 +48,28 @@ def read_split(folder: Path, split: str) -> list[Photograph]:
     before others. Without a list test is every eighth. Frames whose mask is empty are left out.
     Raises UserError naming the file and the frame.
     """
-    folder = folder.resolve()
+    folder = _whole(folder)
     check_split(folder, split, splits(folder))
     file, listed = folder.parent / ANNOTATIONS, _set_list(folder)
     frames = [
         Frame(file, {}, own, index, "frames")
         for index, own in _annotations(file, folder.name, file.stat().st_mtime_ns)
-        if not (isinstance(own.get("mask"), dict) and own["mask"].get("mass") == 0)
     ]
     if not frames:
         raise UserError(f"{file}: has no frame of the sequence {folder.name}; give another folder")
-    numbered = sorted((_number(frame), frame.index, frame) for frame in frames)
+    shown = [frame for frame in frames if _mass(frame) != 0]
+    numbered = sorted((_number(frame), frame.index, frame) for frame in shown)
     chosen = [frame for _, _, frame in numbered]
     if listed is None:
         chosen = hold_out(chosen, split)
     else:
         chosen = [frame for frame in chosen if _path(frame, "image") in listed[split]]
     return [_photograph(folder, frame) for frame in chosen]
+
+
+def _whole(folder):
+    """The folder's path from the root. Links stay: the annotations lie beside the link."""
+    return Path(os.path.abspath(folder))
 
 
 @lru_cache(maxsize=1)
@@ -92,6 +98,15 @@ def _number(frame):
     if number is None:
         raise frame.error("frame_number", "is missing; copy the annotations anew")
     return number
+
+
+def _mass(frame):
+    """Pixels in the mask of a frame; None where that is not said."""
+    mask = frame.get("mask")
+    if not isinstance(mask, dict):
+        return None
+    own = Frame(frame.file, {}, mask, frame.index, "mask of frame ")
+    return own.number("mass", above=-1)
 
 
 def _path(frame, key):
@@ -138,7 +153,7 @@ def _camera(frame, size):
         raise view.error("intrinsics_format", f"is {str(kind)[:40]!r}; {ISOTROPIC} is known")
     scale = half if kind == NORMALISED else half.min()
     focal, centre = focal * scale, half - centre * scale
-    if not (focal > 0).all():
+    if not (focal > 1 / MOST).all():
         raise view.error("focal_length", f"is {focal.min():g} pixels; must be above 0")
     to_world = rotation @ CV_FROM_P3D
     pose = rigid(np.column_stack([to_world, -rotation @ place]), partial(view.error, "R"))
@@ -146,11 +161,8 @@ def _camera(frame, size):
 
 
 def _numbers(view, key, shape):
-    try:
-        array = np.array(view.get(key), np.float64)
-    except (TypeError, ValueError, OverflowError):
-        array = np.empty(0)
-    if array.shape != shape or not np.isfinite(array).all():
+    array = numbers(view.get(key))
+    if array is None or array.shape != shape or not (np.abs(array) < MOST).all():
         raise view.error(key, f"must be {'x'.join(map(str, shape))} finite numbers")
     return array
 

@@ -146,14 +146,26 @@ def rigid_pose(frame: Frame, key: str, value: Any) -> np.ndarray:
     return rigid(value, partial(frame.error, key))
 
 
+def numbers(value: Any) -> np.ndarray | None:
+    """float64 array of nested lists of numbers, or of an array; None for anything else, as words
+    and truth values.
+    """
+    try:
+        leaves = np.array(value, object).ravel()
+        if any(isinstance(leaf, (str, bytes, bool)) for leaf in leaves):
+            return None
+        return np.array(value, np.float64)
+    except (TypeError, ValueError, OverflowError):
+        return None
+
+
 def rigid(value: Any, fail: Callable[[str], UserError]) -> np.ndarray:
     """(3, 4) float64 pose of a 4x4 or 3x4 matrix, its rotation made orthonormal. Raises fail(text)
     where it holds no rotation and place.
     """
-    try:
-        matrix = np.array(value, np.float64)
-    except (TypeError, ValueError, OverflowError):
-        raise fail("must be 4x4 or 3x4 numbers") from None
+    matrix = numbers(value)
+    if matrix is None:
+        raise fail("must be 4x4 or 3x4 numbers")
     if matrix.shape not in ((4, 4), (3, 4)):
         raise fail(f"has shape {matrix.shape}; must be 4x4 or 3x4 numbers")
     if not (np.abs(matrix) < MOST).all():

@@ -10,6 +10,7 @@ import pytest
 from support.same_scene import held_out, same, views
 from support.transforms_scenes import refused
 
+from pp_cl.errors import UserError
 from pp_cl.files.image import write_png
 from pp_cl.scene.readers.co3d import read_split
 from tools.scene_formats import co3d
@@ -135,6 +136,36 @@ def test_frames_with_an_empty_mask_are_left_out(sequence):
     assert sum(len(read_split(sequence, split)) for split in ("train", "test")) == 10
 
 
+def test_a_linked_sequence(sequence):
+    """Sequences may lie on another disk: the annotations are beside the link."""
+    elsewhere = sequence.parent.parent / "elsewhere"
+    sequence.rename(elsewhere)
+    sequence.symlink_to(elsewhere)
+    assert [len(read_split(sequence, split)) for split in ("train", "test")] == [9, 2]
+
+
+def test_a_view_with_nothing_in_it_comes_back(tmp_path):
+    given = held_out(views())
+    given["train"][2].image[..., 3] = 0
+    co3d.write(tmp_path, given)
+    assert len(read_split(tmp_path / "object" / "sequence", "train")) == len(given["train"])
+
+
+@pytest.mark.parametrize(
+    ("names", "version"),
+    [
+        (("train",), 2),
+        (("train", "val"), 2),
+        (("train", "test", "eval"), 2),
+        (("train", "test", "val"), 1),
+    ],
+)
+def test_splits_that_the_lists_cannot_tell_are_not_written(tmp_path, names, version):
+    with pytest.raises(UserError, match="--hold-out"):
+        co3d.write(tmp_path, dict.fromkeys(names, views()[:1]), version)
+    assert not list(tmp_path.iterdir())
+
+
 # --------------------------------------------------------------------------------------------------
 
 
@@ -147,6 +178,12 @@ BAD = {
     "R of another shape": (view_change(R=[[1, 0], [0, 1]]), "R", "3x3"),
     "R in words": (view_change(R="turned"), "R", "3x3"),
     "R no rotation": (view_change(R=[[2, 0, 0], [0, 1, 0], [0, 0, 1]]), "no rotation"),
+    "R as strings": (view_change(R=[["1", 0, 0], [0, 1, 0], [0, 0, 1]]), "R", "3x3"),
+    "T of truth values": (view_change(T=[True, False, True]), "T", "3 finite numbers"),
+    "T huge": (view_change(T=[0, 0, 1e200]), "T", "3 finite numbers"),
+    "focal length denormal": (view_change(focal_length=[5e-324, 1]), "focal_length", "above 0"),
+    "mass in words": (lambda f: f["mask"].update(mass="some"), "mask", "mass"),
+    "mass below 0": (lambda f: f["mask"].update(mass=-3), "mask", "mass"),
     "T with NaN": (view_change(T=[0, 0, float("nan")]), "T", "finite"),
     "one focal length": (view_change(focal_length=[2]), "focal_length", "2 finite numbers"),
     "focal length 0": (view_change(focal_length=[0, 1]), "focal_length", "above 0"),
