@@ -23,6 +23,7 @@ COMMANDS = (
     "export",
     "compare",
     "shape",
+    "compress",
     "bench",
     "tune",
 )  # modules of pp_cl.commands

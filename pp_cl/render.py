@@ -15,6 +15,7 @@ from pyopencl.array import Array
 from pp_cl.device.buffers import Buffers, Table
 from pp_cl.device.device import Device
 from pp_cl.files.picture import Picture
+from pp_cl.layers.tiles import SIDE
 from pp_cl.model import Model
 from pp_cl.raster.blend import BACKGROUND, BLENDS, Blend
 from pp_cl.raster.blend_weights import PixelWeights
@@ -24,6 +25,7 @@ from pp_cl.raster.pairs import PairBuilder, Pairs
 from pp_cl.raster.project import Footprint, ProjectedPoints, Projection
 from pp_cl.raster.shade import shade_forward
 from pp_cl.scene.camera import Camera
+from pp_cl.scene.window import ObjectWindow
 from pp_cl.settings import RasterConfig
 
 NETWORK_MULTIPLE = 4  # the U-Net halves its input twice
@@ -70,17 +72,41 @@ class RasterResult(ViewWeights):
 class RenderResult(RasterResult):
     """A RasterResult with the image that the network made of it, (H, W, 3) float32, unclamped.
 
-    computed_fraction: of the network's multiplications; the rest saw only background.
+    computed_fraction: of the network's multiplications; the rest saw only background, or is not
+    shown. shown: (rows, columns) bool, the tiles of the image in which any point is where no others
+    were asked for (raster.window), None = all of them; `offset` is negative where its window begins
+    within the view.
     """
 
     image: Array
     computed_fraction: float
+    shown: np.ndarray | None = None
 
     def clamped(self, camera: Camera) -> np.ndarray:
         """(H, W, 3) float32 image of the camera without the padding, clamped to [0, 1]."""
+        image = self.image.get()
+        if self.shown is not None:
+            height, width = image.shape[:2]
+            pixels = self.shown.repeat(SIDE, 0).repeat(SIDE, 1)[:height, :width]
+            image[~pixels] = BACKGROUND
+        return np.clip(self.placed(image, camera, BACKGROUND), 0, 1)
+
+    def placed(self, array: np.ndarray, camera: Camera, outside: float) -> np.ndarray:
+        """(height, width, ...) of the camera: an array of the computed pixels without the padding;
+        `outside` where none was computed.
+        """
         left, top = self.offset
-        image = self.image.get()[top : top + camera.height, left : left + camera.width]
-        return np.clip(image, 0, 1)
+        rows, columns = (
+            slice(max(0, -start), min(size, length - start))
+            for start, size, length in zip(
+                (top, left), (camera.height, camera.width), array.shape[:2], strict=True
+            )
+        )
+        whole = np.full((camera.height, camera.width, *array.shape[2:]), outside, array.dtype)
+        whole[rows, columns] = array[
+            rows.start + top : rows.stop + top, columns.start + left : columns.stop + left
+        ]
+        return whole
 
 
 class Renderer:
@@ -100,6 +126,7 @@ class Renderer:
         self._weights = BLENDS[settings.blend](dev)
         self._blend = Blend(dev, footprint, self._weights, settings.mean_gradient)
         self._buffers = Buffers(dev)
+        self._windowed = None  # the points' ids and their ObjectWindow
 
     @staticmethod
     def table(n: int, height: int, width: int) -> Table:
@@ -114,13 +141,33 @@ class Renderer:
     def forward(
         self, camera: Camera, gamma: float, *, training: bool = False, **options
     ) -> RenderResult:
-        """Render a camera. training: keep what backward() needs. options: of rasterise()."""
-        raster = self.rasterise(camera, gamma, **options)
+        """Render a camera. training: keep what backward() needs, and all of the image; else
+        raster.window says what. options: of rasterise().
+        """
+        if not training and self.settings.window == "object":
+            return self._forward_object(camera, gamma, **options)
+        raster, net = self.rasterise(camera, gamma, **options), self.model.net
         with self.dev.stage("network"):
-            plan = self.model.net.plan_tiles(raster.features, BACKGROUND)
-            image = self.model.net.forward(raster.features, training, plan)
+            plan = net.plan_tiles(raster.features, BACKGROUND)
+            image = net.forward(raster.features, training, plan)
         fraction = plan.computed_fraction if plan else 1.0
         return RenderResult(**vars(raster), image=image, computed_fraction=fraction)
+
+    def _forward_object(self, camera, gamma, **options):
+        """forward() of what shows any point."""
+        padded, *offset = camera.padded(NETWORK_MULTIPLE)  # so that all tiles stay where they are
+        window, left, top = self._window().crop(padded)
+        raster, net = self.rasterise(window, gamma, **options), self.model.net
+        with self.dev.stage("network"):
+            plan = net.plan_shown(raster.features, BACKGROUND)
+            image = net.forward(raster.features, False, plan)
+        share = window.width * window.height / (padded.width * padded.height)
+        return RenderResult(
+            **vars(raster) | {"offset": (offset[0] - left, offset[1] - top)},
+            image=image,
+            computed_fraction=share * plan.computed_fraction,
+            shown=plan.shown,
+        )
 
     def rasterise(
         self,
@@ -255,13 +302,20 @@ class Renderer:
         size = result.features.shape[:2]
         with self.dev.stage("depth"):
             arrays = depth_forward(self.dev, result.points, result.pairs, result.weights, size=size)
-        left, top = result.offset
-        window = slice(top, top + camera.height), slice(left, left + camera.width)
+        alpha, *depths = (array.get() for array in arrays)
         return Picture(
             result.clamped(camera),
-            *(array.get()[window] for array in arrays),
-            features=result.features.get()[window] if features else None,
+            result.placed(alpha, camera, 0.0),
+            *(result.placed(depth, camera, np.inf) for depth in depths),
+            features=result.placed(result.features.get(), camera, BACKGROUND) if features else None,
         )
+
+    def _window(self):
+        """The window around the present points."""
+        ids = self.model.cloud.ids
+        if self._windowed is None or self._windowed[0] is not ids:
+            self._windowed = ids, ObjectWindow(self.model.grid, ids.get(), self._radius())
+        return self._windowed[1]
 
     def _radius(self):
         """The points' radius in world units."""

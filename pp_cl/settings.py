@@ -98,6 +98,12 @@ class RasterConfig:
         0,
         0.5,
     )
+    window: str = setting(
+        "image",
+        "what is rendered. image: all of it; object: the window around the points, the rest is"
+        " white (a training renders its crops)",
+        choices=("image", "object"),
+    )
     mean_gradient: bool = setting(
         False, "divide a point's gradients by the number of its pixels, as Pulsar does"
     )

@@ -46,7 +46,7 @@ def test_a_run_with_old_keys_loads_with_one_note(tmp_path):
         section, name = new.split(".")
         former, former_name = old.split(".")
         stored[former][former_name] = stored[section].pop(name)
-    assert stored.pop("raster") == {"blend": "softmax"}  # the one key that had no former name
+    assert stored.pop("raster") == {"blend": "softmax", "window": "image"}  # without former names
     (tmp_path / "config.json").write_text(json.dumps(stored))
     config = load_config(tmp_path / "config.json")
     assert config == preset("paper")

@@ -15,6 +15,7 @@ from support.scenes import ring_cameras
 
 from pp_cl.raster.blend import BLENDS
 from pp_cl.render import PAPER_DEPTH_RANGE, Renderer
+from pp_cl.scene.window import ObjectWindow
 from pp_cl.settings import RasterConfig
 
 GAMMA = 0.03
@@ -191,3 +192,38 @@ def test_tau_and_early_stop_of_a_call_are_those_of_other_settings(dev, rng, blen
         assert (other != exact).any()
     lasting = Renderer(dev, model, replace(settings, early_stop=0.2))
     np.testing.assert_array_equal(lasting.render(camera, GAMMA, early_stop=0.0), exact)
+
+
+def test_a_window_around_the_object(dev, rng):
+    """What the window's camera sees, at its place; white, alpha 0 and no depth around it."""
+    model = make_model(dev, rng)
+    camera = ring_cameras(1, 150)[0].crop(0, 14, 150, 122)
+    whole = Renderer(dev, model, RasterConfig())
+    settings = RasterConfig(window="object")
+    window = Renderer(dev, model, settings)
+    found = window.picture(camera, GAMMA, features=True)
+    crop, left, top = ObjectWindow(GRID, model.cloud.ids.get(), 0.75 * GRID.edge).crop(camera)
+    place = slice(top, top + crop.height), slice(left, left + crop.width)
+    expected = whole.picture(crop, GAMMA, features=True)
+    outside = np.ones((camera.height, camera.width), bool)
+    outside[place] = False
+    assert outside.mean() > 0.3
+    for name, value in (("colour", 1), ("alpha", 0), ("depth", np.inf), ("features", 1)):
+        array = getattr(found, name)
+        assert np.array_equal(array[place], getattr(expected, name))
+        assert (array[outside] == value).all()
+    assert np.allclose(found.alpha, whole.picture(camera, GAMMA).alpha, rtol=0, atol=1e-6)
+    result = window.forward(camera, GAMMA)
+    assert result.computed_fraction == pytest.approx(1 - outside.mean())
+    trained = window.forward(camera, GAMMA, training=True)  # on what it is given
+    assert trained.image.shape == (124, 152, 3)
+
+
+def test_the_window_follows_the_points(dev, rng):
+    model = make_model(dev, rng)
+    camera = ring_cameras(1, 150)[0].crop(0, 14, 150, 122)
+    window = Renderer(dev, model, RasterConfig(window="object"))
+    before = window.forward(camera, GAMMA).image.shape
+    model.cloud.compact(dev, dev.upload([40, 41], np.uint32))
+    after = window.forward(camera, GAMMA).image.shape
+    assert after[0] * after[1] < before[0] * before[1]

@@ -7,6 +7,25 @@
 #define DEGREE 2  // of the highest harmonics in use: 0, 1 or 2
 #endif
 
+// Blends `features` of the coefficients of point i, read by LOAD(index, array), in the direction
+// from the eye to c, of length 1 in the camera's axes.
+#define SHADE(LOAD, i, cam, c, features)                                                           \
+    float basis[9];                                                                                \
+    sh_basis(c.x *cam.right + c.y * cam.down + c.z * cam.forward, basis);                          \
+    float16 features = basis[0] * LOAD(i, sh_0);                                                   \
+    if (DEGREE >= 1)                                                                               \
+        for (uint b = 0; b < 3; b++)                                                               \
+            features += basis[1 + b] * LOAD(3 * i + b, sh_1);                                      \
+    if (DEGREE >= 2) {                                                                             \
+        for (uint b = 0; b < 3; b++)                                                               \
+            features += basis[4 + b] * LOAD(3 * i + b, sh_2a);                                     \
+        for (uint b = 0; b < 2; b++)                                                               \
+            features += basis[7 + b] * LOAD(2 * i + b, sh_2b);                                     \
+    }
+
+#define LOAD_FLOAT(index, array) (array)[index]
+#define LOAD_HALF(index, array) vload_half16(index, array)
+
 // One work-item per shaded point: reads its coefficients and where it is, writes its features.
 kernel void shade_forward(
     const uint s,                       // shaded points
@@ -24,17 +43,27 @@ kernel void shade_forward(
     const uint i = shaded[g];
     const Camera cam = camera_load(camera);
     const float3 c = point_camera[i].xyz / point_camera[i].w;
-    float basis[9];
-    sh_basis(c.x * cam.right + c.y * cam.down + c.z * cam.forward, basis);
-    float16 f = basis[0] * sh_0[i];
-    if (DEGREE >= 1)
-        for (uint b = 0; b < 3; b++)
-            f += basis[1 + b] * sh_1[3 * i + b];
-    if (DEGREE >= 2) {
-        for (uint b = 0; b < 3; b++)
-            f += basis[4 + b] * sh_2a[3 * i + b];
-        for (uint b = 0; b < 2; b++)
-            f += basis[7 + b] * sh_2b[2 * i + b];
-    }
-    point_features[i] = f;
+    SHADE(LOAD_FLOAT, i, cam, c, features)
+    point_features[i] = features;
+}
+
+// The same from coefficients of 16 bits.
+kernel void shade_forward_half(
+    const uint s,                       // shaded points
+    global const uint *shaded,          // (S) their indices
+    global const float *camera,         // (20) camera.h
+    global const float4 *point_camera,  // (N, 4) x, y, z, distance; 0, 0, 0, -1: culled
+    global const half *sh_0,            // (N, 1, 16)
+    global const half *sh_1,            // (?, ?, 16) (N, 3, 16), not read at degree 0
+    global const half *sh_2a,           // (?, ?, 16) (N, 3, 16), not read below degree 2
+    global const half *sh_2b,           // (?, ?, 16) (N, 2, 16), not read below degree 2
+    global float16 *point_features)     // (N, 16) only the shaded rows are written
+{
+    const uint g = get_global_id(0);
+    if (g >= s) return;
+    const uint i = shaded[g];
+    const Camera cam = camera_load(camera);
+    const float3 c = point_camera[i].xyz / point_camera[i].w;
+    SHADE(LOAD_HALF, i, cam, c, features)
+    point_features[i] = features;
 }

@@ -47,7 +47,7 @@ def _harmonics(points, cloud):
     """{property: (M,) array} of the SH coefficients."""
     columns = {}
     for block, array in zip(cloud.blocks, cloud.sh, strict=True):
-        values = array.get()[points.rows]
+        values = np.float32(array.get()[points.rows])
         for k in range(block.count):
             order = block.first + k - block.degree**2  # within its degree
             name = "f_dc" if block.degree == 0 else f"f_{block.degree}_{order}"

@@ -93,26 +93,32 @@ def tiles_compare(dev: Device, x: Array, source: np.ndarray) -> np.ndarray:
     return _flags(dev, "tiles_compare", x, source=dev.upload(source, np.int32))
 
 
-def tiles_copy(dev: Device, x: Array, source: np.ndarray, chosen: np.ndarray) -> None:
-    """Overwrite the chosen tiles of x (H, W, C) float32 with the tiles whose numbers `source`
-    gives, which are not chosen themselves.
+def copy_list(dev: Device, source: np.ndarray, chosen: np.ndarray) -> Array | None:
+    """(2, n) int32: for tiles_copy(), the tiles whose numbers `source` gives for the n chosen ones,
+    and these; None where none is chosen.
 
-    source: (rows, columns) integers; chosen: (rows, columns) bool. A tile and its source have the
-    same shape.
+    source: (rows, columns) integers; chosen: (rows, columns) bool.
     """
     to = np.flatnonzero(chosen)
-    if not len(to):
+    return dev.upload(np.stack([source.ravel()[to], to]), np.int32) if len(to) else None
+
+
+def tiles_copy(dev: Device, x: Array, from_to: Array | None) -> None:
+    """Copy tiles of x (H, W, C) float32 to others, as copy_list() has them; none is both. A tile
+    and its source have the same shape.
+    """
+    if from_to is None:
         return
-    h, w, c = x.shape
+    (h, w, c), n = x.shape, from_to.shape[1]
     dev.program("layers/tiles").launch(
         "tiles_copy",
-        (-(-c // LANES), SIDE * SIDE, len(to)),
+        (-(-c // LANES), SIDE * SIDE, n),
         local=(1, SIDE * SIDE, 4),
         h=h,
         w=w,
         c=c,
-        n=len(to),
-        from_to=dev.upload(np.stack([source.ravel()[to], to]), np.int32),
+        n=n,
+        from_to=from_to,
         x=x,
     )
 

@@ -11,6 +11,8 @@ The backward pass has classes of its own: of the tiles where the network saw onl
 whose gradient of the image has the same bits as their representative's.
 """
 
+from __future__ import annotations
+
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -18,7 +20,15 @@ import numpy as np
 from pyopencl.array import Array
 
 from pp_cl.device.device import Device
-from pp_cl.layers.tiles import SIDE, Tiles, all_tiles, some_tiles, tiles_compare, tiles_copy
+from pp_cl.layers.tiles import (
+    SIDE,
+    Tiles,
+    all_tiles,
+    copy_list,
+    some_tiles,
+    tiles_compare,
+    tiles_copy,
+)
 from pp_cl.network.architectures import convolutions
 from pp_cl.network.layer import Layer
 from pp_cl.network.tile_sets import grow, halve
@@ -97,6 +107,15 @@ def gradient_radius(layers: list[Layer]) -> dict[str, int]:
     return radius
 
 
+def needed_radius(layers: list[Layer]) -> dict[str, int]:
+    """{name: pixels}: how far from a pixel of the image it depends on a layer's output."""
+    radius = dict.fromkeys([*(layer.name for layer in layers), "x"], 0)
+    for layer in reversed(layers):
+        for name in layer.inputs:
+            radius[name] = max(radius[name], radius[layer.name] + layer.forward_radius())
+    return radius
+
+
 def levels_of(layers: list[Layer]) -> dict[str, int]:
     """{name: level} of the network's input "x" and of all layers' outputs."""
     return {"x": 0} | {layer.name: layer.level for layer in layers}
@@ -121,7 +140,7 @@ class AllTiles:
     def fill_copies(self, name: str, array: Array) -> None:
         """Nothing: there are no copies."""
 
-    def backward(self, arrays: dict[str, Array], grad_out: Array) -> "AllTiles":
+    def backward(self, arrays: dict[str, Array], grad_out: Array) -> AllTiles:
         """The backward pass after this forward pass."""
         return self
 
@@ -156,7 +175,18 @@ class TilePlan:
                 made[level, n] = map_tiles(size, level, near, border + n)
             self.maps[name] = made[level, n]
         self.needed = {name: np.zeros_like(m.computed) for name, m in self.maps.items()}
-        self._tiles = {}
+        self._tiles, self._copies = {}, {}
+
+    def upload(self) -> TilePlan:
+        """The plan, with all lists on the device: an upload between kernels would wait for them."""
+        for name in self.maps:
+            self.tiles(name)
+            self._copies[name] = self._copy_list(name, self.needed[name])
+        return self
+
+    def _copy_list(self, name, needed):
+        tile_map = self.maps[name]
+        return copy_list(self.dev, tile_map.source, needed & ~tile_map.computed)
 
     def tiles(self, name: str) -> Tiles:
         """The tiles of a feature map to compute."""
@@ -171,38 +201,57 @@ class TilePlan:
 
         needed: others than self.needed[name].
         """
-        tile_map = self.maps[name]
-        needed = self.needed[name] if needed is None else needed
-        tiles_copy(self.dev, array, tile_map.source, needed & ~tile_map.computed)
+        own = needed is None
+        tiles_copy(self.dev, array, self._copies[name] if own else self._copy_list(name, needed))
 
 
-class ForwardPlan(TilePlan):
-    """The forward pass over an image of `size`, where x differs from the background in the tiles
-    `active`.
+class ImagePlan(TilePlan):
+    """A pass that makes an image. computed_fraction: of the network's multiplications."""
 
-    affected: (rows, columns) bool, the tiles of the image that see more than background.
-    computed_fraction: of the network's multiplications.
-    """
-
-    def __init__(self, dev: Device, layers: list[Layer], size: tuple[int, int], active: np.ndarray):
-        radius, last = receptive_radius(layers), layers[-1].name
-        del radius["x"]
-        super().__init__(dev, layers, size, active, radius=radius)
+    def __init__(self, dev: Device, layers: list[Layer], *place, radius: dict[str, int], **border):
+        del radius["x"]  # given, not computed
+        super().__init__(dev, layers, *place, radius=radius, **border)
         for layer in layers:
             computed = self.maps[layer.name].computed
             for name in layer.inputs:
                 if name != "x":
                     needed = self.needed[name]
                     needed |= layer.needed_forward(computed, needed.shape)
-        self.needed[last][:] = True
-        self.affected = grow(active, -(-radius[last] // SIDE))
-        count = {c.name: c.multiplications(*size) for c in convolutions(layers)}
+        count = {c.name: c.multiplications(*self.size) for c in convolutions(layers)}
         computed = sum(n * self.maps[name].computed.mean() for name, n in count.items())
         self.computed_fraction = computed / sum(count.values())
 
-    def backward(self, arrays: dict[str, Array], grad_out: Array) -> "BackwardPlan":
+
+class ShownPlan(ImagePlan):
+    """The forward pass over an image of `size` of which only the tiles `shown`, (rows, columns)
+    bool, are wanted: they are as those of a whole image, the others hold any numbers.
+
+    Each layer computes what these depend on. What else the transforms of a tile read is a copy of
+    some tile: it has no part in the result, but must be a number.
+    """
+
+    def __init__(self, dev: Device, layers: list[Layer], size: tuple[int, int], shown: np.ndarray):
+        self.shown = shown
+        one_class = {"border": -max(size)}
+        super().__init__(dev, layers, size, shown, radius=needed_radius(layers), **one_class)
+
+
+class ForwardPlan(ImagePlan):
+    """The forward pass over an image of `size`, where x differs from the background in the tiles
+    `active`.
+
+    affected: (rows, columns) bool, the tiles of the image that see more than background.
+    """
+
+    def __init__(self, dev: Device, layers: list[Layer], size: tuple[int, int], active: np.ndarray):
+        radius, last = receptive_radius(layers), layers[-1].name
+        super().__init__(dev, layers, size, active, radius=radius)
+        self.needed[last][:] = True
+        self.affected = grow(active, -(-radius[last] // SIDE))
+
+    def backward(self, arrays: dict[str, Array], grad_out: Array) -> BackwardPlan:
         """The backward pass; the activations in `arrays` are completed where it needs them."""
-        plan = BackwardPlan(self, grad_out)
+        plan = BackwardPlan(self, grad_out).upload()
         for name, needed in plan.activations.items():
             self.fill_copies(name, arrays[name], needed)
         return plan

@@ -12,12 +12,14 @@ from pp_cl.layers.resample import affine
 from pp_cl.layers.tiles import tiles_find
 from pp_cl.network.architectures import convolutions, unet_layers
 from pp_cl.network.buffers import gradient_of
-from pp_cl.network.sparse_tiles import ForwardPlan
+from pp_cl.network.tile_sets import grow
+from pp_cl.network.sparse_tiles import ForwardPlan, ImagePlan, ShownPlan
 from pp_cl.network.workspace import Workspace, WorkspacePlan, parameter_table
 from pp_cl.settings import NetworkConfig
 
 # Background tiles are skipped only in images of at least LEAST_PIXELS pixels, and only if at most
 # MOST_COMPUTED of the multiplications remain: finding them costs time too.
+SHOWN_AROUND = 1  # tiles around the points that plan_shown() takes for the object as well
 LEAST_PIXELS, MOST_COMPUTED = 1 << 16, 0.8
 MULTIPLE = 4  # pixels: two poolings halve the height and the width
 
@@ -93,14 +95,22 @@ class UNet:
         if math.prod(size) < LEAST_PIXELS:
             return None
         plan = ForwardPlan(self.dev, self.layers, size, tiles_find(self.dev, x, background))
-        return plan if plan.computed_fraction <= MOST_COMPUTED else None
+        return plan.upload() if plan.computed_fraction <= MOST_COMPUTED else None
 
-    def forward(self, x: Array, training: bool = True, plan: ForwardPlan | None = None) -> Array:
+    def plan_shown(self, x: Array, background: float) -> ShownPlan:
+        """What to compute for the tiles in which features x (H, W, channels_in) are not all
+        `background`; the image is undefined elsewhere.
+        """
+        shown = grow(tiles_find(self.dev, x, background), SHOWN_AROUND)
+        return ShownPlan(self.dev, self.layers, x.shape[:2], shown).upload()
+
+    def forward(self, x: Array, training: bool = True, plan: ImagePlan | None = None) -> Array:
         """(H, W, 3) image of the features x (H, W, channels_in); H and W are multiples of 4.
 
         The result is in a buffer of the network: the next call overwrites it. training: keep what
-        backward needs. plan: plan_tiles(x, ...), None = compute all tiles. Raises ValueError for
-        other sizes, RuntimeError for training once frozen.
+        backward needs. plan: plan_tiles(x, ...), or plan_shown(x, ...) where nothing is trained,
+        None = compute all tiles. Raises ValueError for other sizes, RuntimeError for training once
+        frozen.
         """
         if training and self._frozen is not None:
             raise RuntimeError("UNet.freeze() was called: the network can no longer be trained")

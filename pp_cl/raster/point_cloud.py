@@ -21,7 +21,8 @@ class PointCloud:
     """The points, one row each; device arrays.
 
     ids: (N) uint32, vertices of the grid, ascending. opacity: (N) float32 in [0, 1]. sh: the SH
-    coefficients, (N, count, 16) float32 of each block.
+    coefficients, (N, count, 16) of each block: float32, or float16 where they are not trained any
+    more.
     """
 
     ids: Array
@@ -99,8 +100,15 @@ class PointCloud:
         n = len(arrays.get("points.ids", ()))
         ids = fitting_array(arrays, "points.ids", (n,), file, dtype=np.uint32)
         opacity = fitting_array(arrays, "points.opacity", (n,), file)
+        is_half = arrays.get("points.sh0", ids).dtype == np.float16
         by_degree = [
-            fitting_array(arrays, f"points.sh{d}", (n, 2 * d + 1, 16), file)
+            fitting_array(
+                arrays,
+                f"points.sh{d}",
+                (n, 2 * d + 1, 16),
+                file,
+                dtype=np.float16 if is_half else np.float32,
+            )
             for d in SH_DEGREES[: degree + 1]
         ]
         sh = []

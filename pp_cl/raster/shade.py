@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+import numpy as np
 from pyopencl.array import Array
 
 from pp_cl.device.device import Device
@@ -22,8 +23,8 @@ def shade_forward(
     """Write the rows `shaded` of point_features (N, 16) float32.
 
     The direction of a point is normalize(point - eye) in world axes. shaded: (S,) uint32. sh: the
-    coefficients, float32 arrays (N, count, 16) of SH_BLOCKS up to the end of one degree. Raises
-    ValueError where they end within a degree or have another shape.
+    coefficients, arrays (N, count, 16) of SH_BLOCKS up to the end of one degree, all of them
+    float32 or all float16. Raises ValueError where they end within a degree or have another shape.
     """
     n = len(points.point_camera)
     for block, array in zip(SH_BLOCKS, sh, strict=False):
@@ -33,7 +34,7 @@ def shade_forward(
     names = [block.name for block in SH_BLOCKS]
     arrays = dict(zip(names, [*sh, *absent], strict=True))
     dev.program("raster/shade", DEGREE=_degree(len(sh))).launch(
-        "shade_forward",
+        "shade_forward_half" if sh[0].dtype == np.float16 else "shade_forward",
         shaded.size,
         s=shaded.size,
         shaded=shaded,

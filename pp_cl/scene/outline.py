@@ -16,7 +16,7 @@ def silhouette(grid: Grid, ids: np.ndarray, camera: Camera) -> np.ndarray:
     closed.
     """
     gap = math.ceil(spacing_pixels(grid, [camera])) + 1
-    x, y, depth = _project(camera, grid.positions(ids))
+    x, y, depth = project(camera, grid.positions(ids))
     columns, rows = np.floor(x) + gap, np.floor(y) + gap
     marked = np.zeros((camera.height + 2 * gap, camera.width + 2 * gap), bool)
     inside = (depth > 0) & (columns >= 0) & (columns < marked.shape[1])
@@ -30,8 +30,12 @@ def outline(grid: Grid, ids: np.ndarray, camera: Camera) -> np.ndarray:
     return find_boundaries(silhouette(grid, ids, camera), mode="thick")
 
 
-def _project(camera, positions):
-    """x, y in pixels and depth, (N,) each, of (N, 3) world positions."""
+def project(camera: Camera, positions: np.ndarray) -> np.ndarray:
+    """(3, N) float64: x and y in pixels and the depth of (N, 3) world positions; those that are not
+    in front of the camera are in its centre.
+    """
     right, down, depth = camera.pose[:, :3].T @ (positions - camera.eye).T
     ahead = np.where(depth > 0, depth, np.inf)
-    return camera.fx * right / ahead + camera.cx, camera.fy * down / ahead + camera.cy, depth
+    return np.stack(
+        [camera.fx * right / ahead + camera.cx, camera.fy * down / ahead + camera.cy, depth]
+    )

@@ -21,6 +21,7 @@ from pp_cl.layers.tiles import (
     all_tiles,
     all_tiles_buffers,
     checked_tiles,
+    copy_list,
     grid_shape,
     some_tiles,
     tiles_compare,
@@ -99,7 +100,7 @@ def test_copy(dev, rng, shape):
             source[place] = places.index(other)
             copies[place][:] = tiles[other]
     device_x = dev.upload(x)
-    tiles_copy(dev, device_x, source, chosen)
+    tiles_copy(dev, device_x, copy_list(dev, source, chosen))
     np.testing.assert_array_equal(device_x.get(), expected)
 
 

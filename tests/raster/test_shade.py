@@ -44,6 +44,27 @@ def test_forward(dev, rng, n, degree):
     assert (np.delete(features.get(), seen, axis=0) == 7).all()
 
 
+@pytest.mark.parametrize("degree", [0, 1, 2])
+def test_coefficients_of_16_bits(dev, rng, degree):
+    """The same features as from their float32 values, to the last bits."""
+    shaded = Shaded(dev, rng, 257, degree)
+    shaded.sh[0][:3, 0, :4] = [0, -6e-8, 65504, 1e-5]  # denormal halves and the largest
+    stored = [np.float16(c) for c in shaded.sh]
+    seen = np.flatnonzero(oracle.kept(shaded.camera, shaded.positions, 0.1))
+    found = []
+    for sh in (stored, [np.float32(c) for c in stored]):
+        features = dev.upload(np.full((257, 16), 7.0), np.float32)
+        shade_forward(
+            dev,
+            shaded.scene.projected,
+            dev.upload(seen, np.uint32),
+            [dev.upload(c, c.dtype) for c in sh],
+            point_features=features,
+        )
+        found.append(features.get())
+    assert np.array_equal(*found) and np.isfinite(found[0]).all()
+
+
 def test_the_basis_is_orthonormal(rng):
     directions = rng.normal(size=(400_000, 3))
     basis = oracle.sh_basis(directions / np.linalg.norm(directions, axis=1, keepdims=True))

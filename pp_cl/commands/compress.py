@@ -1,0 +1,94 @@
+"""The command pp-cl compress."""
+
+import argparse
+from pathlib import Path
+
+from pp_cl.commands import options as shared
+
+HELP = "make a trained model smaller and faster within a stated loss"
+EPILOG = """Tried in turn, each kept where the views below lose no more: coefficients of 16 bits,
+rendering only the window around the object, stopping earlier along a pixel, faster convolutions,
+fewer harmonics, and at last fewer points, those that weigh least in any training view going first.
+The loss is measured on the split val, without one on every eighth training view; never on the test
+views."""
+COLUMNS = "{:20s} {:>8s} {:>8s} {:>10s} {:>10s} {:>7s}  {}".format
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the command's options."""
+    parser.add_argument("run_folder", metavar="RUN", help="folder of a finished run")
+    parser.add_argument(
+        "--max-loss",
+        metavar="DB",
+        default="0.1",
+        help="the most that PSNR may lose, in dB, as 0.1 or 0.1dB (0.1)",
+    )
+    parser.add_argument(
+        "--out", metavar="DIR", help="new folder of the compressed run (RUN-compressed)"
+    )
+    parser.add_argument(
+        "--scene", metavar="SCENE", help="where the run's scene is now, if it has moved"
+    )
+    shared.add_device(parser)
+
+
+def run(options: argparse.Namespace) -> None:
+    """Search, print what was tried, write the compressed run."""
+    from pp_cl.compress.output import REPORT, check_out, validation_views, write_compressed
+    from pp_cl.compress.reduction import Original, nbytes, point_weights
+    from pp_cl.compress.search import Search, frame_ms
+    from pp_cl.device.discover import open_device
+    from pp_cl.trained import load_run
+
+    most_loss = _decibels(options.max_loss)
+    whole = load_run(open_device(options.device), options.run_folder, scene=options.scene)
+    out = Path(options.out or f"{whole.folder.path.resolve()}-compressed")
+    check_out(whole, out)
+    which, views = validation_views(whole)
+    original = Original(whole, point_weights(whole, whole.cameras("train")))
+    search, trials = Search(original, views, most_loss), []
+    print(f"{which}: {search.psnr:.2f} dB, may lose {most_loss:g}")
+    print(COLUMNS("tried", "PSNR", "loss", "points", "MiB", "speed", ""))
+    for trial in search.run():
+        trials.append(trial)
+        print(_line(trial), flush=True)
+    found = original.reduced(search.reduction)
+    loss = search.psnr - next((t.psnr for t in reversed(trials) if t.taken), search.psnr)
+    ms = frame_ms([whole, found], views)
+    sizes = [nbytes(original.arrays), nbytes(original.reduced_arrays(search.reduction))]
+    report = {
+        "of": str(whole.folder),
+        "most_loss": most_loss,
+        "views": which,
+        "psnr": search.psnr,
+        "loss": loss,
+        "reduction": vars(search.reduction),
+        "bytes": sizes,
+        "points": [whole.model.cloud.count, found.model.cloud.count],
+        "frame_ms": ms,
+        "device": whole.dev.name,
+    }
+    write_compressed(original, search.reduction, out, report)
+    print(
+        f"{sizes[0] / 2**20:.1f} to {sizes[1] / 2**20:.1f} MiB ({sizes[0] / sizes[1]:.1f} times"
+        f" less), {1e3 / ms[0]:.1f} to {1e3 / ms[1]:.1f} frames per second"
+        f" ({ms[0] / ms[1]:.2f} times), {loss:.3f} dB lost on {which}"
+    )
+    print(f"wrote {out} and {out / REPORT}; pp-cl eval {out} measures its test views")
+
+
+def _decibels(text):
+    return shared.read_number("--max-loss", text.removesuffix("dB"), float, least=0, most=20)
+
+
+def _line(trial):
+    speed = "" if trial.speed is None else f"{trial.speed:.2f}"
+    return COLUMNS(
+        trial.what,
+        f"{trial.psnr:.3f}",
+        f"{trial.loss:.3f}",
+        str(trial.points),
+        f"{trial.nbytes / 2**20:.1f}",
+        speed,
+        "taken" if trial.taken else "",
+    )

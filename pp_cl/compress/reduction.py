@@ -1,0 +1,152 @@
+"""What can be taken from a trained model, and what is left of it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+
+from pp_cl.config import Config, assign
+from pp_cl.evaluate import render_views
+from pp_cl.export.observe import observe
+from pp_cl.layers.policy import load_policy
+from pp_cl.metrics.psnr_ssim import Metrics
+from pp_cl.model import Model
+from pp_cl.network.unet import UNet
+from pp_cl.scene.camera import Camera
+from pp_cl.scene.views import View
+from pp_cl.trained import Run
+
+LARGEST_HALF = 65504.0
+
+
+@dataclass(frozen=True)
+class Reduction:
+    """What is left of a model and how it is rendered.
+
+    keep: share of the points, those that weigh most. half: the SH coefficients have 16 bits.
+    degree: of the SH. early_stop, tau, window: of raster; tolerance: network.tolerance.
+    """
+
+    keep: float
+    half: bool
+    degree: int
+    early_stop: float
+    tau: float
+    window: str
+    tolerance: float
+
+    @classmethod
+    def of(cls, run: Run) -> Reduction:
+        """A run as it is."""
+        raster = run.config.raster
+        return cls(
+            keep=1.0,
+            half=run.model.cloud.sh[0].dtype == np.float16,
+            degree=run.config.points.sh_degree,
+            early_stop=raster.early_stop,
+            tau=raster.tau,
+            window=raster.window,
+            tolerance=run.config.network.tolerance,
+        )
+
+    def settings(self) -> dict[str, object]:
+        """{key: value} of the settings that say how the reduced model is rendered."""
+        return {
+            "points.sh_degree": self.degree,
+            "raster.early_stop": self.early_stop,
+            "raster.tau": self.tau,
+            "raster.window": self.window,
+            "network.tolerance": self.tolerance,
+        }
+
+
+@dataclass(frozen=True)
+class Original:
+    """A trained run that reduced ones are made of. weights: (N,) float32, how much each point
+    contributes; see point_weights().
+    """
+
+    run: Run
+    weights: np.ndarray
+
+    @cached_property
+    def arrays(self) -> dict[str, np.ndarray]:
+        """{name: array} of its checkpoint."""
+        return {name: rows.get() for name, rows in self.run.model.arrays().items()}
+
+    def reduced_arrays(self, reduction: Reduction) -> dict[str, np.ndarray]:
+        """{name: array} of the checkpoint of a reduced run."""
+        kept, arrays = heaviest(self.weights, reduction.keep), {}
+        for name, array in self.arrays.items():
+            degree = name.removeprefix("points.sh") if name.startswith("points.sh") else None
+            if degree and int(degree) > reduction.degree:
+                continue
+            array = array[kept] if name.startswith("points.") else array
+            arrays[name] = _half(array) if degree and reduction.half else array
+        return arrays
+
+    def reduced(self, reduction: Reduction) -> Run:
+        """The reduced run, on the same device."""
+        run, config = self.run, self.config(reduction)
+        policy = load_policy(run.dev, reduction.tolerance)
+        net = UNet.of_settings(run.dev, config.network, policy)
+        model = Model.load(
+            run.dev,
+            run.header,
+            self.reduced_arrays(reduction),
+            net,
+            degree=reduction.degree,
+            file=run.folder.checkpoint,
+        )
+        return replace(run, config=config, model=model, policy=policy)
+
+    def config(self, reduction: Reduction) -> Config:
+        """The settings of a reduced run."""
+        config = self.run.config
+        config = replace(
+            config,
+            points=replace(config.points),
+            raster=replace(config.raster),
+            network=replace(config.network),
+        )
+        for key, value in reduction.settings().items():
+            assign(config, key, value, "compress")
+        return config
+
+
+def point_weights(run: Run, cameras: list[Camera]) -> np.ndarray:
+    """(N,) float32: the most that each point weighs in one of the cameras' views, as the sum of its
+    blend weights over the pixels. What few views see counts as much as what many see.
+    """
+    most = np.zeros(run.model.cloud.count, np.float32)
+    for seen in observe(run, cameras, "weighing points"):
+        np.maximum(most, seen.point_weights(), out=most)
+    return most
+
+
+def heaviest(weights: np.ndarray, share: float) -> np.ndarray:
+    """(M,) ascending: the indices of this share of the points, at least one, that weigh most; of
+    equal ones the first.
+    """
+    count = max(1, round(share * len(weights)))
+    return np.sort(np.argsort(-weights, kind="stable")[:count])
+
+
+def nbytes(arrays: dict[str, np.ndarray]) -> int:
+    """Bytes of a checkpoint's arrays."""
+    return sum(array.nbytes for array in arrays.values())
+
+
+def measured_psnr(run: Run, views: Sequence[View]) -> float:
+    """Mean PSNR of the run's 8-bit images of the views, in dB."""
+    measure = Metrics(run.dev, ("psnr",))
+    rows = [measure(seen.image, seen.truth)["psnr"] for seen in render_views(run, list(views))]
+    return float(np.mean(rows))
+
+
+def _half(array):
+    """The nearest numbers of 16 bits; what is beyond the largest becomes that."""
+    return np.clip(array, -LARGEST_HALF, LARGEST_HALF).astype(np.float16)

@@ -1,0 +1,111 @@
+"""The smallest and fastest reduction of a model within a loss."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from pp_cl.bench.timing import interleave
+from pp_cl.compress.reduction import Original, Reduction, measured_psnr, nbytes
+from pp_cl.scene.views import View
+from pp_cl.trained import Run
+
+# What is tried in turn: the share of the loss that all so far may take, and the field's values,
+# from mild to harsh; the first that is too harsh ends it. What only makes rendering faster must do
+# so.
+TRIALS = (
+    (0.2, "half", (True,)),
+    (0.5, "window", ("object",)),
+    (0.6, "early_stop", (0.003, 0.01, 0.03)),
+    (0.6, "tolerance", (1e-2,)),
+    (0.6, "degree", (1, 0)),
+)
+SMALLER = ("half", "degree")  # these take memory as well
+LEAST_KEPT, STEPS_OF_KEPT = 0.05, 0.01
+FASTER = 0.98  # of the time, at most, counts as faster
+TIMED_VIEWS, ROUNDS = 4, 5
+
+
+@dataclass(frozen=True)
+class Trial:
+    """A reduction that was tried. psnr: of the validation views, dB; loss: against the original;
+    nbytes: of the arrays; speed: frames per second over the original's, None where not timed.
+    """
+
+    what: str
+    reduction: Reduction
+    psnr: float
+    loss: float
+    nbytes: int
+    points: int
+    speed: float | None
+    taken: bool
+
+
+class Search:
+    """Finds a reduction that loses at most `most_loss` dB over the validation views."""
+
+    def __init__(self, original: Original, views: list[View], most_loss: float):
+        self.original, self.views, self.most_loss = original, views, most_loss
+        self.reduction = Reduction.of(original.run)
+        self.psnr = measured_psnr(original.run, views)
+
+    def run(self) -> Iterator[Trial]:
+        """What is tried, in turn; afterwards `reduction` is the one found."""
+        for share, name, values in TRIALS:
+            for value in values:
+                if not self._is_harsher(name, value):
+                    continue
+                trial = self._try(f"{name} {value}", {name: value}, share)
+                yield trial
+                if not trial.taken:
+                    break
+        yield from self._prune()
+
+    def _is_harsher(self, name, value):
+        present = getattr(self.reduction, name)
+        return value < present if name == "degree" else value != present and not value < present
+
+    def _try(self, what, changes, share=1.0):
+        """Measure a change of the present reduction, and adopt it where it serves."""
+        before, changed = self.reduction, replace(self.reduction, **changes)
+        run = self.original.reduced(changed)
+        psnr = measured_psnr(run, self.views)
+        loss = self.psnr - psnr
+        fits, speed = loss <= share * self.most_loss, None
+        if fits and not {*changes} & {*SMALLER, "keep"}:
+            present, new = frame_ms([self.original.reduced(before), run], self.views)
+            fits, speed = new <= FASTER * present, present / new
+        if fits:
+            self.reduction = changed
+        size = nbytes(self.original.reduced_arrays(changed))
+        return Trial(what, changed, psnr, loss, size, run.model.cloud.count, speed, fits)
+
+    def _prune(self):
+        """Halve the interval of the shares of points that may do."""
+        fails, fits = round(LEAST_KEPT / STEPS_OF_KEPT) - 1, round(1 / STEPS_OF_KEPT)
+        while fits - fails > 1:
+            share = (fails + fits) // 2 * STEPS_OF_KEPT
+            trial = self._try(f"points {share:.0%}", {"keep": share})
+            yield trial
+            if trial.taken:
+                fits = (fails + fits) // 2
+            else:
+                fails = (fails + fits) // 2
+
+
+def frame_ms(runs: list[Run], views: list[View]) -> list[float]:
+    """Median milliseconds of a frame of each run, in turn over a few views."""
+    cameras = [views[i * len(views) // TIMED_VIEWS].camera for i in range(TIMED_VIEWS)]
+
+    def renderer(run):
+        def render():
+            for camera in cameras:
+                run.renderer.render(camera, run.gamma)
+
+        return render
+
+    times = interleave({i: renderer(run) for i, run in enumerate(runs)}, rounds=ROUNDS)
+    return [float(np.median(times[i])) / len(cameras) for i in range(len(runs))]

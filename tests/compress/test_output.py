@@ -1,0 +1,79 @@
+"""The folder of a compressed run, and the command."""
+
+import json
+import shutil
+
+import numpy as np
+import pytest
+
+from pp_cl.cli import main
+from pp_cl.compress import search as search_module
+from pp_cl.compress.output import check_out, validation_views
+from pp_cl.errors import UserError
+from pp_cl.trained import load_run
+
+
+def test_validation_views_are_never_those_of_the_test(dev, ball_run, tmp_path):
+    run = load_run(dev, ball_run)
+    which, views = validation_views(run)
+    assert which == "2 views of train"
+    train = run.scene("train").splits["train"]
+    assert [view.name for view in views] == [train[0].name, train[8].name]
+    scene = tmp_path / "scene"
+    shutil.copytree(run.config.scene.path, scene)
+    shutil.copy(scene / "transforms_test.json", scene / "transforms_val.json")
+    with_val = load_run(dev, ball_run, scene=str(scene))
+    which, views = validation_views(with_val)
+    assert which == f"{len(views)} views of val"
+
+
+def test_the_command_writes_a_run(ball_run, tmp_path, capsys):
+    out = tmp_path / "small"
+    assert main(["compress", str(ball_run), "--max-loss", "0.5dB", "--out", str(out)]) == 0
+    printed = capsys.readouterr().out
+    report = json.loads((out / "compress.json").read_text())
+    assert "frames per second" in printed and report["loss"] <= 0.5 == report["most_loss"]
+    assert report["bytes"][1] <= report["bytes"][0] / 1.9
+    assert (out / "checkpoint.npz").stat().st_size < 1.1 * report["bytes"][1] + 20_000
+    assert main(["eval", str(out), "--metrics", "psnr"]) == 0
+    assert main(["info", str(out)]) == 0
+    assert main(["export", str(out), "--format", "ply", "--out", str(tmp_path / "a.ply")]) == 0
+    capsys.readouterr()
+    assert main(["compress", str(ball_run), "--out", str(out)]) == 2
+    assert str(out) in capsys.readouterr().err
+
+
+def test_the_same_model_comes_back(ball_run, tmp_path, capsys, monkeypatch, dev):
+    """What is written renders as what was measured."""
+    monkeypatch.setattr(search_module, "TRIALS", ((1.0, "half", (True,)),))
+    out = tmp_path / "small"
+    assert main(["compress", str(ball_run), "--max-loss", "3", "--out", str(out)]) == 0
+    report = json.loads((out / "compress.json").read_text())
+    run = load_run(dev, out)
+    assert run.model.cloud.sh[0].dtype == np.float16
+    assert run.model.cloud.count == report["points"][1] < report["points"][0]
+    assert json.loads((out / "config.json").read_text())["scene"]["path"]
+
+
+def test_bad_input_ends_in_one_line(ball_run, tmp_path, capsys):
+    (tmp_path / "held").mkdir()
+    (tmp_path / "held" / "file").write_text("x")
+    for words, expected in (
+        ([str(tmp_path / "none")], "none"),
+        ([str(ball_run), "--max-loss", "-1"], "--max-loss"),
+        ([str(ball_run), "--max-loss", "nan"], "--max-loss"),
+        ([str(ball_run), "--max-loss", "much"], "--max-loss"),
+        ([str(ball_run), "--out", str(tmp_path / "held")], "held"),
+        ([str(ball_run), "--scene", str(tmp_path / "gone")], "gone"),
+        ([str(ball_run), "--device", "none such"], "none such"),
+    ):
+        assert main(["compress", *words]) == 2
+        error = capsys.readouterr().err
+        assert error.count("\n") == 1 and expected in error
+
+
+def test_an_unfinished_run_is_refused(dev, ball_run, tmp_path):
+    run = load_run(dev, ball_run)
+    run.header["finished"] = False
+    with pytest.raises(UserError, match="not finished"):
+        check_out(run, tmp_path / "new")
