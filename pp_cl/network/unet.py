@@ -12,8 +12,8 @@ from pp_cl.layers.resample import affine
 from pp_cl.layers.tiles import tiles_find
 from pp_cl.network.architectures import convolutions, unet_layers
 from pp_cl.network.buffers import gradient_of
-from pp_cl.network.tile_sets import grow
 from pp_cl.network.sparse_tiles import ForwardPlan, ImagePlan, ShownPlan
+from pp_cl.network.tile_sets import grow
 from pp_cl.network.workspace import Workspace, WorkspacePlan, parameter_table
 from pp_cl.settings import NetworkConfig
 

@@ -74,6 +74,48 @@ def run(dev, net, x, grad_y, background):
     "variant, blocks",
     [("direct", "double"), ("auto", "double"), ("direct", "single"), ("direct", "gated")],
 )
+def test_the_shown_tiles_are_the_dense_networks(dev, rng, name, variant, blocks):
+    """Its buffers are full of NaN at first and none comes to what is shown; two images of the same
+    features have the same bits, whatever was made between them.
+    """
+    x = rng.normal(size=(*SIZE, 16)).astype(np.float32)
+    features = np.full_like(x, BACKGROUND)
+    features[OBJECTS[name]] = x[OBJECTS[name]]
+    policy = make_policy(dev, variant=variant)
+    net = UNet(dev, (16, 32, 48), blocks=blocks, seed=1, policy=policy)
+    device_x = dev.upload(features)
+    plan = net.plan_shown(device_x, BACKGROUND)
+    first = net.forward(device_x, False, plan).get()
+    other = dev.upload(x)
+    dense_of_other = net.forward(other, False).get()
+    dense = net.forward(device_x, False).get()
+    shown = plan.shown.repeat(SIDE, 0).repeat(SIDE, 1)[: SIZE[0], : SIZE[1]]
+    found = (features != BACKGROUND).any(2)
+    assert not (found & ~shown).any() and np.isfinite(dense_of_other).all()
+    if not shown.any():
+        return
+    assert relative_error(first[shown], dense[shown]) < 2e-6
+    again = net.forward(device_x, False, net.plan_shown(device_x, BACKGROUND)).get()
+    assert np.array_equal(again[shown], first[shown])
+
+
+def test_what_is_not_shown_is_not_computed(dev, rng):
+    net = UNet(dev, (16, 32, 48), seed=1)
+    features = np.full((*SIZE, 16), BACKGROUND, np.float32)
+    features[60:81, 70:93] = 0
+    device_x = dev.upload(features)
+    plan = net.plan_shown(device_x, BACKGROUND)
+    forward = ForwardPlan(dev, net.layers, SIZE, tiles_find(dev, device_x, BACKGROUND))
+    assert plan.computed_fraction < 0.6 * forward.computed_fraction
+    last = net.layers[-1].name
+    assert plan.maps[last].computed.sum() == plan.shown.sum() + 1  # and one for all others
+
+
+@pytest.mark.parametrize("name", OBJECTS)
+@pytest.mark.parametrize(
+    "variant, blocks",
+    [("direct", "double"), ("auto", "double"), ("direct", "single"), ("direct", "gated")],
+)
 def test_equals_the_dense_network(dev, rng, always, name, variant, blocks):
     x, grad_y = scene(rng, OBJECTS[name])
     policy = make_policy(dev, variant=variant)
