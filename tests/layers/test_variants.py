@@ -5,9 +5,7 @@ for.
 import numpy as np
 import pytest
 from oracle.conv import conv, conv_gradients
-from oracle.winograd import rounding_bound
 from support.conv_layers import layer
-from support.hard_layers import hard_layers
 
 from pp_cl.config import Config
 from pp_cl.layers.blocking import SHIPPED
@@ -17,6 +15,8 @@ from pp_cl.layers.policy import make_policy
 from pp_cl.layers.variants import VARIANTS, ConvShape, offered
 from pp_cl.layers.work import Work
 from pp_cl.reference.network import flipped
+from pp_cl.reference.winograd import rounding_bound
+from pp_cl.selftest.hard_layers import hard_layers
 
 
 def check(variant, actual, expected, x=None, weight=None):

@@ -16,7 +16,7 @@ FLOORS = [
     ("training", "model", "render"),
     ("train", "trained"),
     ("run", "evaluate", "film", "export", "view", "info", "shape"),
-    ("bench", "sweep"),
+    ("bench", "selftest", "sweep"),
     ("commands",),
     ("cli", "__init__", "__main__"),
 ]
