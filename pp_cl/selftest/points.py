@@ -78,6 +78,14 @@ class PairedPoints:
         matrix[self.pair_points(), self.pairs.pair_pixel.get()[:total]] = pair_values[:total]
         return matrix
 
+    def measured(self) -> dict[str, np.ndarray]:
+        """{"closeness", "depth"}: (N, HW) as the device computed them, 0 beside the hits."""
+        total = self.pairs.total
+        closeness = self.pairs.pair_point_closeness.get()[:total, 1].view(np.float32)
+        keys, depth = self.pairs.pair_key.get()[:total], np.empty(total, np.float32)
+        depth[keys & 0xFFFFFFFF] = (keys >> 32).astype(np.uint32).view(np.float32)
+        return {"closeness": self.dense(closeness), "depth": self.dense(depth)}
+
     def hits(self) -> np.ndarray:
         """(N, HW) bool."""
         return self.dense(np.ones(max(1, self.pairs.total), bool), False)
@@ -175,7 +183,10 @@ GAMMAS = (0.1, 0.01)
 
 
 class Blended:
-    """A random scene blended by the kernels and in float64, both with the kernels' hits."""
+    """A random scene blended by the kernels and in float64, both with the kernels' hits, closeness
+    and depth: at the rim of a footprint a closeness is rounding, and a softmax may make it half a
+    pixel.
+    """
 
     def __init__(
         self,
@@ -204,9 +215,7 @@ class Blended:
         self.features = self.scene.blend(
             self.opacity, gamma, self.point_features, rule=rule, **blend
         ).reshape(-1, 16)
-        self.geometry = dense.geometry(self.camera, self.positions, self.radius, kind) | {
-            "hit": self.scene.hits()
-        }
+        self.geometry = self._geometry()
         stop = blend.get("early_stop", 0.0)
         if rule == "alpha":
             self.blend = dense.alpha(self.geometry, self.opacity, max(stop, blend.get("tau", 0.0)))
@@ -214,6 +223,15 @@ class Blended:
             self.blend = dense.blend(self.geometry, self.opacity, gamma, stop)
         self.weight = self.scene.weight()
         self.role = self.scene.dense(self.scene.roles())
+
+    def _geometry(self):
+        """dense.geometry with what was measured in its place."""
+        geometry = dense.geometry(self.camera, self.positions, self.radius, self.kind)
+        hit, measured = self.scene.hits(), self.scene.measured()
+        for name, values in measured.items():
+            geometry[name] = np.where(hit, values, geometry[name])
+        z = 1 - (geometry["depth"] - NEAR) / (FAR - NEAR)
+        return geometry | {"hit": hit, "z": z}
 
     def gradients(self) -> Gradients:
         """The kernels' gradients of sum(features * grad)."""
