@@ -25,6 +25,7 @@ COMMANDS = (
     "shape",
     "bench",
     "tune",
+    "selftest",
 )  # modules of pp_cl.commands
 
 

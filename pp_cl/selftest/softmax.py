@@ -11,6 +11,7 @@ from pp_cl.device.device import Device
 from pp_cl.raster.blend_weights import DROPPED
 from pp_cl.raster.project import KINDS
 from pp_cl.reference import dense
+from pp_cl.reference.differences import numeric_gradient
 from pp_cl.selftest.case import (
     SIZES,
     Case,
@@ -32,13 +33,13 @@ from pp_cl.selftest.points import (
     make_camera,
 )
 
-# z is off by 1e-6 (project); over the final gamma, 0.01, that changes a weight by 1e-4 of itself,
-# and the sum that it is divided by as much
-WEIGHT = 2e-4
-# dL/do = share (1 + o z / gamma) s: the factor's own error, 1e-4, comes to that
-OPACITY = 5e-4
-# at gamma = 0.1 and in sums over equal depths less comes of z
-MILD = 1e-4
+# exponents o z / gamma of up to 100 are off by 100 EPS, 1.2e-5; so is each weight
+WEIGHT = 2e-5
+OPACITY = 5e-5  # dL/do = share (1 + o z / gamma) s: two such factors
+# on the axis z is the float64 one of a place that float32 rounded: 1e-6, over a gamma of 0.01
+PLACED = 1e-4
+STEP = 1e-6
+DIFFERENCES = 2e-3  # depths and closeness are steep at the rim, where that step is no small one
 
 
 def _forward(kind: str, dev: Device, rng: np.random.Generator) -> Iterator[Check]:
@@ -62,24 +63,41 @@ def _backward(kind: str, dev: Device, rng: np.random.Generator) -> Iterator[Chec
         yield exact(gradients["opacity"][unseen], np.zeros(unseen.sum()))
 
 
+def _spheres(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
+    """Gradients of positions and radii, against finite differences."""
+    blended = Blended(dev, rng, 30, kind="sphere")
+    hit, gradients = blended.scene.hits(), blended.scene.sphere_gradients(blended.grad)
+
+    def loss(positions, radius):
+        geometry = dense.geometry(blended.camera, positions, radius, "sphere") | {"hit": hit}
+        blend = dense.blend(geometry, blended.opacity, blended.gamma)
+        return (dense.features(blend, blended.point_features) * blended.grad).sum()
+
+    radius = blended.radius.astype(np.float64)
+    numeric = numeric_gradient(partial(loss, radius=radius), blended.positions, STEP)
+    yield relative(gradients["positions"].ravel(), numeric, DIFFERENCES)
+    numeric = numeric_gradient(partial(loss, blended.positions), radius, STEP)
+    yield relative(gradients["radius"], numeric, DIFFERENCES)
+
+
 def _sizes(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
     for n in SIZES:
         for size in ((1, 1), (31, 33)):
             blended = Blended(dev, rng, n, size=size)
             expected = dense.features(blended.blend, blended.point_features)
-            yield relative(blended.features, expected, MILD)
+            yield relative(blended.features, expected, WEIGHT)
             gradients, expected = blended.gradients(), blended.reference_gradients()
-            yield relative(gradients["features"], expected[0], MILD)
-            yield relative(gradients["opacity"], expected[1], MILD)
+            yield relative(gradients["features"], expected[0], WEIGHT)
+            yield relative(gradients["opacity"], expected[1], WEIGHT)
 
 
 def _early_stop(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
     for stop in (0.001, 0.05, 0.5):
         blended = Blended(dev, rng, 500, gamma=0.02, radius=0.4, early_stop=stop)
         expected = dense.features(blended.blend, blended.point_features)
-        yield relative(blended.features, expected, MILD)
+        yield relative(blended.features, expected, WEIGHT)
         gradients, expected = blended.gradients(), blended.reference_gradients()
-        yield relative(gradients["features"], expected[0], MILD)
+        yield relative(gradients["features"], expected[0], WEIGHT)
         yield relative(gradients["opacity"], expected[1], WEIGHT)
 
 
@@ -96,7 +114,7 @@ def _tau(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
         yield no_more(weight, said * (1 + WEIGHT), 1e-10)
         yield exact(scene.weights.shaded.get(), np.flatnonzero((hit & ~dropped).any(axis=1)))
         kept = np.where(hit & ~dropped, blended.weight, 0).astype(np.float64)
-        yield relative(blended.gradients()["features"], kept @ blended.grad, MILD)
+        yield relative(blended.gradients()["features"], kept @ blended.grad, WEIGHT)
 
 
 def _smallest_gamma(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
@@ -121,7 +139,7 @@ def _nearest(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
         [1, 1, 1], 0.01, np.eye(3, 16)
     )
     e = np.exp([0.0, -1.0, -50.0])
-    yield each(features[0, 0, :3], e / e.sum(), MILD, floor=1e-3)
+    yield each(features[0, 0, :3], e / e.sum(), PLACED, floor=1e-3)
 
 
 def _equal_depths(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
@@ -155,9 +173,9 @@ def _many_hits(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
     for gamma in (0.1, 0.01):
         scene, weight = blend_on_axis(dev, z, opacity, gamma)
         blend = dense.blend(_geometry(scene), opacity, gamma)
-        yield relative(weight, blend["weight"][:, 0], MILD)
+        yield relative(weight, blend["weight"][:, 0], PLACED)
         expected = dense.features(blend, np.resize(np.eye(16), (20_000, 16)))
-        yield relative(scene.features.get().reshape(1, 16), expected, MILD)
+        yield relative(scene.features.get().reshape(1, 16), expected, PLACED)
 
 
 def _rims(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
@@ -205,6 +223,7 @@ def _empty(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
 CASES = (
     *(Case(f"softmax: forward, {kind}", partial(_forward, kind)) for kind in KINDS),
     *(Case(f"softmax: backward, {kind}", partial(_backward, kind)) for kind in KINDS),
+    Case("softmax: gradients of spheres", _spheres),
     Case("softmax: awkward sizes", _sizes),
     Case("softmax: early stop", _early_stop),
     Case("softmax: weights dropped by tau", _tau),

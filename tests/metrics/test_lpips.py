@@ -3,12 +3,13 @@
 import numpy as np
 import pytest
 from PIL import Image
-from support.comparisons import numeric_gradient, relative_error
+from support.comparisons import relative_error
 from support.guarded import AWKWARD_SIZES
 
 from pp_cl.errors import UserError
 from pp_cl.metrics import lpips_weights
 from pp_cl.metrics.lpips import Lpips
+from pp_cl.reference.differences import numeric_gradient
 from pp_cl.reference.lpips import (
     lpips,
     lpips_gradient,

@@ -4,12 +4,13 @@ twin, and what is dropped.
 
 import numpy as np
 import pytest
-from support.comparisons import numeric_gradient, relative_error
+from support.comparisons import relative_error
 from support.guarded import AWKWARD_SIZES, large
 
 from pp_cl.raster.blend_weights import DROPPED
 from pp_cl.raster.project import KINDS
 from pp_cl.reference import dense as oracle
+from pp_cl.reference.differences import numeric_gradient
 from pp_cl.selftest.points import Blended, PairedPoints, make_camera
 from pp_cl.selftest.points import blend_on_axis as on_axis
 

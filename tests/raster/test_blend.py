@@ -2,11 +2,12 @@
 
 import numpy as np
 import pytest
-from support.comparisons import numeric_gradient, relative_error
+from support.comparisons import relative_error
 from support.guarded import AWKWARD_SIZES
 
 from pp_cl.raster.project import KINDS
 from pp_cl.reference import dense as oracle
+from pp_cl.reference.differences import numeric_gradient
 from pp_cl.selftest.points import GAMMAS, Blended, PairedPoints
 
 
