@@ -55,6 +55,7 @@ class PairedPoints:
         depth_range: tuple[float, float] = dense.DEPTH_RANGE,
     ):
         self.dev, self.camera, self.n = dev, camera, len(positions)
+        self._exact, self.depth_range = (positions, radius, kind), depth_range
         self.shape = (camera.height, camera.width)
         self.footprint = Footprint(kind)
         self.camera_buffer = dev.upload(camera.packed(depth_range))
@@ -78,13 +79,19 @@ class PairedPoints:
         matrix[self.pair_points(), self.pairs.pair_pixel.get()[:total]] = pair_values[:total]
         return matrix
 
-    def measured(self) -> dict[str, np.ndarray]:
-        """{"closeness", "depth"}: (N, HW) as the device computed them, 0 beside the hits."""
-        total = self.pairs.total
+    def geometry(self) -> dict[str, np.ndarray]:
+        """dense.geometry with the device's hits, and at these its closeness and depth: at the rim
+        of a footprint a closeness is rounding, and a softmax may make it half a pixel.
+        """
+        total, hit = self.pairs.total, self.hits()
         closeness = self.pairs.pair_point_closeness.get()[:total, 1].view(np.float32)
         keys, depth = self.pairs.pair_key.get()[:total], np.empty(total, np.float32)
         depth[keys & 0xFFFFFFFF] = (keys >> 32).astype(np.uint32).view(np.float32)
-        return {"closeness": self.dense(closeness), "depth": self.dense(depth)}
+        geometry = dense.geometry(self.camera, *self._exact, depth_range=self.depth_range)
+        for name, measured in (("closeness", closeness), ("depth", depth)):
+            geometry[name] = np.where(hit, self.dense(measured), geometry[name])
+        near, far = self.depth_range
+        return geometry | {"hit": hit, "z": 1 - (geometry["depth"] - near) / (far - near)}
 
     def hits(self) -> np.ndarray:
         """(N, HW) bool."""
@@ -184,8 +191,7 @@ GAMMAS = (0.1, 0.01)
 
 class Blended:
     """A random scene blended by the kernels and in float64, both with the kernels' hits, closeness
-    and depth: at the rim of a footprint a closeness is rounding, and a softmax may make it half a
-    pixel.
+    and depth.
     """
 
     def __init__(
@@ -215,7 +221,7 @@ class Blended:
         self.features = self.scene.blend(
             self.opacity, gamma, self.point_features, rule=rule, **blend
         ).reshape(-1, 16)
-        self.geometry = self._geometry()
+        self.geometry = self.scene.geometry()
         stop = blend.get("early_stop", 0.0)
         if rule == "alpha":
             self.blend = dense.alpha(self.geometry, self.opacity, max(stop, blend.get("tau", 0.0)))
@@ -223,15 +229,6 @@ class Blended:
             self.blend = dense.blend(self.geometry, self.opacity, gamma, stop)
         self.weight = self.scene.weight()
         self.role = self.scene.dense(self.scene.roles())
-
-    def _geometry(self):
-        """dense.geometry with what was measured in its place."""
-        geometry = dense.geometry(self.camera, self.positions, self.radius, self.kind)
-        hit, measured = self.scene.hits(), self.scene.measured()
-        for name, values in measured.items():
-            geometry[name] = np.where(hit, values, geometry[name])
-        z = 1 - (geometry["depth"] - NEAR) / (FAR - NEAR)
-        return geometry | {"hit": hit, "z": z}
 
     def gradients(self) -> Gradients:
         """The kernels' gradients of sum(features * grad)."""

@@ -34,7 +34,7 @@ FLIPS = [
     ("layers/conv", "[p] += value", "[p] -= value", "conv: direct, hard inputs"),
     ("layers/conv_backward_weights", "[i] += value", "[i] -= value", "conv: direct, hard inputs"),
     ("layers/winograd", "[i] += value", "[i] -= value", "conv: winograd2, hard inputs"),
-    ("layers/winograd_backward_weights", "[i] += value", "[i] -= value", "conv: winograd2, hard inputs"),
+    ("layers/winograd_backward_weights", "[i] += v", "[i] -= v", "conv: winograd2, hard inputs"),
     ("layers/winograd_transform", "= weight[(block * 9", "= -weight[(block * 9", "conv: winograd2"),
     ("layers/resample", "+ 0.25f * line", "- 0.25f * line", "layers: upsampling"),
     ("layers/resample", "+ 0.25f * dL_dout", "- 0.25f * dL_dout", "layers: mean pooling"),
