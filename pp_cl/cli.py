@@ -26,6 +26,7 @@ COMMANDS = (
     "compress",
     "bench",
     "tune",
+    "selftest",
 )  # modules of pp_cl.commands
 
 

@@ -6,7 +6,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from oracle import raster as oracle_raster
 from oracle.unet import unet, unet_gradients
 from support.comparisons import relative_error
 from support.models import GRID, make_model
@@ -14,6 +13,7 @@ from support.networks import plain_parameters
 from support.scenes import ring_cameras
 
 from pp_cl.raster.blend import BLENDS
+from pp_cl.reference import dense as oracle_raster
 from pp_cl.render import PAPER_DEPTH_RANGE, Renderer
 from pp_cl.scene.window import ObjectWindow
 from pp_cl.settings import RasterConfig
@@ -57,7 +57,12 @@ def chained(model, settings, camera, opacity=None, sh=None, tracked=0):
         grad_features = grad_features.reshape(-1, 16)
         if alpha:
             grad_shaded, grad_opacity, _ = oracle_raster.alpha_gradients(
-                geometry, blend, shaded, grad_features, tracked, settings.mean_gradient
+                geometry,
+                blend,
+                shaded,
+                grad_features,
+                max_tracked=tracked,
+                mean=settings.mean_gradient,
             )
         else:
             grad_shaded, grad_opacity, _ = oracle_raster.blend_gradients(
@@ -65,10 +70,10 @@ def chained(model, settings, camera, opacity=None, sh=None, tracked=0):
                 blend,
                 opacity,
                 shaded,
-                grad_features,
-                GAMMA,
-                tracked,
-                settings.mean_gradient,
+                grad_features=grad_features,
+                gamma=GAMMA,
+                max_tracked=tracked,
+                mean=settings.mean_gradient,
             )
         directions = positions - padded.eye
         basis = oracle_raster.sh_basis(

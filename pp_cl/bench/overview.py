@@ -36,14 +36,12 @@ def bench_overview(
     bench.
     """
     start, result = time.perf_counter(), {}
-    benches = {
-        "conv": lambda: (conv_steps(dev, policy), 1),
-        "unet": lambda: (unet_steps(dev, policy), GROWTH),
-        "raster": lambda: (raster_steps(dev), GROWTH),
-    }
-    for name, make in benches.items():
+    for name, steps, factor in (
+        ("conv", layer_steps(dev, policy), 1),
+        ("unet", network_steps(dev, policy), GROWTH),
+        ("raster", raster_steps(dev), GROWTH),
+    ):
         tell(f"{name}: about {budget * SHARES[name]:.0f} s")
-        steps, factor = make()
         result[name] = within(steps, budget * SHARES[name], factor)
     tell(f"training of the demo: about {budget * SHARES['training']:.0f} s")
     result["growth"] = growth(result["raster"])
@@ -76,7 +74,7 @@ def within(steps: Iterator[list[dict]], seconds: float, factor: float) -> list[d
             return rows
 
 
-def conv_steps(dev: Device, policy: ConvolutionPolicy) -> Iterator[list[dict]]:
+def layer_steps(dev: Device, policy: ConvolutionPolicy) -> Iterator[list[dict]]:
     """The rows of each layer, one direction after the other."""
     rows = []
     for row in bench_conv(dev, CONV_SIZE, WIDTHS, policy):
@@ -88,7 +86,7 @@ def conv_steps(dev: Device, policy: ConvolutionPolicy) -> Iterator[list[dict]]:
     yield rows
 
 
-def unet_steps(dev: Device, policy: ConvolutionPolicy) -> Iterator[list[dict]]:
+def network_steps(dev: Device, policy: ConvolutionPolicy) -> Iterator[list[dict]]:
     """The rows of each size, ascending."""
     for size in UNET_SIZES:
         yield list(bench_unet(dev, size, WIDTHS, policy))

@@ -108,6 +108,13 @@ class Device:
         if self.debug:
             atexit.register(self.print_profile)
 
+    @property
+    def build_options(self) -> list[str]:
+        """Options of every build; each program adds its folder and macros."""
+        # PoCL writes the number of clang's warnings to the terminal: dozens without AVX-512, all
+        # about how a float16 is passed
+        return [*STANDARD, *([] if self.debug else ["-w"])]
+
     def program(self, name: str, **defines: int | float | str) -> Program:
         """The Program of cl/<name>.cl built with -D for each define; built once.
 
@@ -123,15 +130,12 @@ class Device:
                     " path; move it"
                 )
             macros = [f"-D{k}={v}" for k, v in key[1]]
-            # PoCL writes the number of clang's warnings to the terminal: dozens without AVX-512,
-            # all about how a float16 is passed
-            quiet = [] if self.debug else ["-w"]
             start = time.perf_counter()
             self._programs[key] = Program(
                 self,
                 name,
                 (folder / f"{name}.cl").read_text("utf-8"),
-                options=[*STANDARD, *quiet, "-I", str(folder), *macros],
+                options=[*self.build_options, "-I", str(folder), *macros],
                 defines=defines,
             )
             if self.debug:

@@ -1,1 +1,1 @@
-"""Float64 twins that benches measure errors against."""
+"""Float64 twins: what benches and the selftest measure errors against, and most tests."""

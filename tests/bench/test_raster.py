@@ -7,13 +7,13 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from oracle import raster as oracle_raster
 
 from pp_cl.bench import peak, timing
 from pp_cl.bench.raster import bench_raster, growth
 from pp_cl.bench.raster_scenes import EXACT, SCENES, Case
 from pp_cl.cli import main
 from pp_cl.raster.blend import BLENDS
+from pp_cl.reference import dense as oracle_raster
 from pp_cl.reference.raster import PixelReference
 
 SMALL = ("--points", "60,500", "--size", "12,20", "--tau", "0,1e-2")
@@ -34,7 +34,7 @@ def test_float64_values_are_the_oracles(dev, name, rule):
     camera, reference = scene.camera, scene.reference
     positions = reference.points @ camera.pose[:, :3].T + camera.eye
     geometry = oracle_raster.geometry(
-        camera, positions, reference.radius, reference.kind, scene.depth_range
+        camera, positions, reference.radius, reference.kind, depth_range=scene.depth_range
     )
     blend = (
         oracle_raster.alpha(geometry, scene.opacity)

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from oracle.conv import conv, conv_gradients
-from support.comparisons import numeric_gradient, relative_error
+from support.comparisons import relative_error
 from support.conv_layers import (
     SHAPES,
     check_backward_input,
@@ -23,6 +23,7 @@ from pp_cl.layers.conv import (
     unpack_weights,
 )
 from pp_cl.layers.conv_backward_weights import flip_weights
+from pp_cl.reference.differences import numeric_gradient
 
 
 def run_forward(dev, x, weight, bias, relu, x2=None, blocking=SHIPPED["CPU"]):

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 from oracle.conv import conv, conv_gradients
-from support.comparisons import numeric_gradient, relative_error
+from support.comparisons import relative_error
 from support.conv_layers import SHAPES, layer
 
 from pp_cl.layers import conv_backward_weights as module
@@ -14,6 +14,7 @@ from pp_cl.layers.conv_backward_weights import (
     flip_weights,
     partial_floats,
 )
+from pp_cl.reference.differences import numeric_gradient
 
 
 def run_backward_weights(dev, grad_out, k, *sources, blocking=SHIPPED["CPU"]):

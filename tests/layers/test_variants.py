@@ -4,103 +4,37 @@ for.
 
 import numpy as np
 import pytest
-from oracle.conv import conv, conv_gradients
-from oracle.winograd import rounding_bound
 from support.conv_layers import layer
-from support.hard_layers import hard_layers
 
 from pp_cl.config import Config
 from pp_cl.layers.blocking import SHIPPED
-from pp_cl.layers.conv import pack_bias, pack_weights, unpack_weights
 from pp_cl.layers.direction import Direction
 from pp_cl.layers.policy import make_policy
 from pp_cl.layers.variants import VARIANTS, ConvShape, offered
-from pp_cl.layers.work import Work
-from pp_cl.reference.network import flipped
+from pp_cl.selftest.convolutions import Layer, within
+from pp_cl.selftest.hard_layers import hard_layers
 
 
-def check(variant, actual, expected, x=None, weight=None):
-    """Within 1e-5 of the largest value (of a channel, if a convolution of x by weight), plus half's
-    rounding of weight.
-    """
-    bound = 1e-5 * np.abs(expected).max((0, 1) if x is not None else None)
-    if x is not None and VARIANTS[variant].half:
-        bound = bound + rounding_bound(4, x, weight)
-    assert (np.abs(actual - expected) <= bound).all()
-
-
-def check_all_directions(dev, variant, parts, weight, bias, grad_out, relu):
-    """Forward, with ReLU or without, of the concatenation of `parts`, and all gradients, masked as
-    relu says.
-    """
-    convolution = VARIANTS[variant].convolution(dev, SHIPPED["CPU"])
-    x, co = np.concatenate(parts, 2), len(weight)
-    sources, device_grad = tuple(dev.upload(p) for p in parts), dev.upload(grad_out)
-    device_weight = dev.upload(pack_weights(weight))
-    out, grad_weight, grad_bias = (
-        dev.empty(grad_out.shape),
-        dev.empty(device_weight.shape),
-        dev.empty(-(-co // 16) * 16),
-    )
-
-    def work(direction, c):
-        return Work.empty(dev, *convolution.work_floats(direction, len(x), device_weight.shape, c))
-
-    convolution.forward(
-        sources,
-        device_weight,
-        dev.upload(pack_bias(bias)),
-        out,
-        relu=relu,
-        work=work(Direction.FORWARD, x.shape[2]),
-    )
-    check(variant, out.get(), conv(x, weight, bias, relu), x, weight)
-    expected = conv_gradients(x, weight, grad_out)
-    convolution.backward_weights(
-        sources,
-        device_grad,
-        grad_weight,
-        grad_bias,
-        work=work(Direction.BACKWARD_WEIGHTS, x.shape[2]),
-    )
-    check(variant, unpack_weights(grad_weight.get(), co), expected[1])
-    check(variant, grad_bias.get()[:co], expected[2])
-    first = 0
-    for source, plain in zip(sources, parts, strict=True):
-        part = slice(first, first + plain.shape[2])
-        grad_x = dev.empty(plain.shape)
-        convolution.backward_input(
-            device_weight,
-            first,
-            device_grad,
-            grad_x,
-            mask=source if relu else None,
-            work=work(Direction.BACKWARD_INPUT, plain.shape[2]),
-        )
-        check(
-            variant,
-            grad_x.get(),
-            (expected[0] * (x > 0 if relu else 1))[..., part],
-            grad_out,
-            flipped(weight)[part],
-        )
-        first = part.stop
+def check_all_directions(dev, variant, layer):
+    """Forward and all gradients."""
+    for result in layer.results(dev, variant, SHIPPED["CPU"]):
+        assert np.isfinite(result.actual).all()
+        assert within(variant, result).share <= 1
 
 
 @pytest.mark.parametrize("k, variant", [(1, "direct"), *[(3, variant) for variant in VARIANTS]])
 def test_all_directions(dev, rng, k, variant):
     weight, bias = layer(rng, 16 + 32, 48, k)
     parts = [np.maximum(rng.normal(size=(11, 14, c)), 0).astype(np.float32) for c in (16, 32)]
-    check_all_directions(
-        dev, variant, parts, weight, bias, rng.normal(size=(11, 14, 48)).astype(np.float32), True
-    )
+    grad_out = rng.normal(size=(11, 14, 48)).astype(np.float32)
+    check_all_directions(dev, variant, Layer(parts, weight, bias, grad_out, relu=True))
 
 
 @pytest.mark.parametrize("variant", VARIANTS)
 @pytest.mark.parametrize("name", hard_layers(np.random.default_rng(7)))
 def test_hard_layers(dev, rng, name, variant):
-    x, weight, bias, grad_out = hard_layers(rng)[name]
-    check_all_directions(dev, variant, [x], weight, bias, grad_out, False)
+    x, *others = hard_layers(rng)[name]
+    check_all_directions(dev, variant, Layer([x], *others))
 
 
 def test_where_a_variant_can_run():

@@ -5,13 +5,13 @@ half is scaled by.
 import numpy as np
 import pytest
 from oracle.conv import conv
-from oracle.winograd import ROUNDING, SMALLEST, convolve, matrices
-from oracle.winograd import transform_weights as exact_weights
 from support.winograd_layers import form, transformed_by_device
 
 from pp_cl.layers.variants import VARIANTS
 from pp_cl.layers.winograd_transform import transform_flipped_weights, transform_weights
 from pp_cl.reference.network import flipped
+from pp_cl.reference.winograd import ROUNDING, SMALLEST, convolve, matrices
+from pp_cl.reference.winograd import transform_weights as exact_weights
 
 FORMS = [(v.winograd_m, v.half) for v in VARIANTS.values() if v.winograd_m]
 SHAPES = [(16, 16), (48, 16), (16, 80), (64, 32), (272, 144)]  # channels in, out

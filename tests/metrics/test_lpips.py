@@ -2,7 +2,15 @@
 
 import numpy as np
 import pytest
-from oracle.lpips import (
+from PIL import Image
+from support.comparisons import relative_error
+from support.guarded import AWKWARD_SIZES
+
+from pp_cl.errors import UserError
+from pp_cl.metrics import lpips_weights
+from pp_cl.metrics.lpips import Lpips
+from pp_cl.reference.differences import numeric_gradient
+from pp_cl.reference.lpips import (
     lpips,
     lpips_gradient,
     pixel_distance,
@@ -10,13 +18,6 @@ from oracle.lpips import (
     random_weights,
     scaled_input,
 )
-from PIL import Image
-from support.comparisons import numeric_gradient, relative_error
-from support.guarded import AWKWARD_SIZES
-
-from pp_cl.errors import UserError
-from pp_cl.metrics import lpips_weights
-from pp_cl.metrics.lpips import Lpips
 
 
 @pytest.mark.parametrize(("h", "w"), [(1, n) for n in AWKWARD_SIZES] + [(31, 1), (33, 31)])

@@ -8,10 +8,10 @@ import tarfile
 
 import numpy as np
 import pytest
-from oracle.lpips import BLOCKS, random_weights
 
 from pp_cl.errors import UserError
 from pp_cl.metrics import lpips_weights
+from pp_cl.reference.lpips import BLOCKS, random_weights
 
 
 def package_tree(weights):

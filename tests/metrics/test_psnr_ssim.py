@@ -2,11 +2,11 @@
 
 import numpy as np
 import pytest
-from oracle.lpips import random_weights
 
 from pp_cl.errors import UserError
 from pp_cl.metrics import lpips
 from pp_cl.metrics.psnr_ssim import PSNR_CAP, Metrics, mean, psnr, ssim
+from pp_cl.reference.lpips import random_weights
 
 
 def ssim_oracle(a, b):

@@ -6,13 +6,14 @@ import math
 import numpy as np
 import pytest
 from oracle.unet import unet, unet_gradients
-from oracle.winograd import rounding_share
-from support.comparisons import numeric_gradient, relative_error
+from support.comparisons import relative_error
 from support.networks import plain_parameters
 
 from pp_cl.layers.policy import make_policy
 from pp_cl.network.architectures import BLOCKS, convolutions, multiplications, unet_layers
 from pp_cl.network.unet import UNet
+from pp_cl.reference.differences import numeric_gradient
+from pp_cl.reference.winograd import rounding_share
 from pp_cl.settings import NetworkConfig
 
 

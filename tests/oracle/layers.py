@@ -15,24 +15,6 @@ def avgpool2_gradient(grad_out):
     return 0.25 * np.asarray(grad_out, np.float64).repeat(2, 0).repeat(2, 1)
 
 
-def maxpool2(x):
-    """(H, W, C) -> (H // 2, W // 2, C)."""
-    h, w, c = x.shape[0] // 2, x.shape[1] // 2, x.shape[2]
-    return np.asarray(x, np.float64)[: 2 * h, : 2 * w].reshape(h, 2, w, 2, c).max((1, 3))
-
-
-def maxpool2_gradient(x, grad_out):
-    """(H, W, C), (H // 2, W // 2, C) -> (H, W, C): at the largest of a cell, the first of equal
-    ones.
-    """
-    grad_x = np.zeros(x.shape)
-    for row, column, c in np.ndindex(grad_out.shape):
-        cell = x[2 * row : 2 * row + 2, 2 * column : 2 * column + 2, c]
-        y, z = np.unravel_index(cell.argmax(), (2, 2))
-        grad_x[2 * row + y, 2 * column + z, c] = grad_out[row, column, c]
-    return grad_x
-
-
 def gate(x):
     """(H, W, 2 C) -> (H, W, C): ELU of the first half of the channels, sigmoid of the second."""
     features, gates = np.split(np.asarray(x, np.float64), 2, 2)

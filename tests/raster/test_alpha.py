@@ -4,14 +4,15 @@ twin, and what is dropped.
 
 import numpy as np
 import pytest
-from oracle import raster as oracle
-from support.comparisons import numeric_gradient, relative_error
+from support.comparisons import relative_error
 from support.guarded import AWKWARD_SIZES, large
-from support.raster_scene import Blended, PairedPoints, make_camera
-from support.raster_scene import blend_on_axis as on_axis
 
 from pp_cl.raster.blend_weights import DROPPED
 from pp_cl.raster.project import KINDS
+from pp_cl.reference import dense as oracle
+from pp_cl.reference.differences import numeric_gradient
+from pp_cl.selftest.points import Blended, PairedPoints, make_camera
+from pp_cl.selftest.points import blend_on_axis as on_axis
 
 STOPS = (1e-3, 0.05, 0.5)
 
@@ -43,7 +44,7 @@ def test_weights_and_features(dev, rng, kind, n):
 def test_gradients(dev, rng, kind, mean, max_tracked, early_stop):
     options = {"mean": mean, "max_tracked": max_tracked, "early_stop": early_stop}
     blended = alpha_scene(dev, rng, kind=kind, **options)
-    gradients, expected = blended.gradients(), blended.oracle_gradients(max_tracked, mean)
+    gradients, expected = blended.gradients(), blended.reference_gradients(max_tracked, mean)
     assert relative_error(gradients["features"], expected[0]) < 2e-5
     assert relative_error(gradients["opacity"], expected[1]) < 2e-5
     unseen = ~blended.blend["hit"].any(axis=1)
@@ -63,7 +64,7 @@ def test_a_gradient_of_alpha_is_one_of_a_feature_that_only_the_background_has(
     drops = {"early_stop": early_stop, "rule": "alpha"}
     blended.scene.blend(blended.opacity, 0.1, blended.point_features, **drops)
     blended.grad[:, 15] = -grad_alpha
-    expected = blended.oracle_gradients()
+    expected = blended.reference_gradients()
     blended.grad[:, 15] = 0
     gradients = blended.scene.gradients(blended.grad, grad_alpha)
     assert relative_error(gradients["opacity"], expected[1]) < 2e-5
@@ -81,7 +82,7 @@ def test_sizes(dev, rng, n, size):
     blended = alpha_scene(dev, rng, n=n, size=size, early_stop=1e-3)
     expected = oracle.features(blended.blend, blended.point_features)
     assert relative_error(blended.features, expected) < 2e-5
-    gradients, expected = blended.gradients(), blended.oracle_gradients()
+    gradients, expected = blended.gradients(), blended.reference_gradients()
     assert relative_error(gradients["features"], expected[0]) < 2e-5
     assert relative_error(gradients["opacity"], expected[1]) < 2e-5
 

@@ -2,12 +2,13 @@
 
 import numpy as np
 import pytest
-from oracle import raster as oracle
-from support.comparisons import numeric_gradient, relative_error
+from support.comparisons import relative_error
 from support.guarded import AWKWARD_SIZES
-from support.raster_scene import GAMMAS, Blended, PairedPoints
 
 from pp_cl.raster.project import KINDS
+from pp_cl.reference import dense as oracle
+from pp_cl.reference.differences import numeric_gradient
+from pp_cl.selftest.points import GAMMAS, Blended, PairedPoints
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -29,7 +30,7 @@ def test_sizes(dev, rng, n, size):
         relative_error(blended.features, oracle.features(blended.blend, blended.point_features))
         < 1e-4
     )
-    gradients, expected = blended.gradients(), blended.oracle_gradients()
+    gradients, expected = blended.gradients(), blended.reference_gradients()
     assert relative_error(gradients["features"], expected[0]) < 1e-4
     assert relative_error(gradients["opacity"], expected[1]) < 1e-4
 
@@ -40,7 +41,7 @@ def test_sizes(dev, rng, n, size):
 @pytest.mark.parametrize("max_tracked", [0, 3])
 def test_gradients(dev, rng, kind, gamma, mean, max_tracked):
     blended = Blended(dev, rng, kind=kind, gamma=gamma, mean=mean, max_tracked=max_tracked)
-    gradients, expected = blended.gradients(), blended.oracle_gradients(max_tracked, mean)
+    gradients, expected = blended.gradients(), blended.reference_gradients(max_tracked, mean)
     assert relative_error(gradients["features"], expected[0]) < 2e-4
     assert relative_error(gradients["opacity"], expected[1]) < 5e-4
     unseen = ~blended.geometry["hit"].any(axis=1)
@@ -83,7 +84,9 @@ def test_sphere_gradients_against_finite_differences(dev, rng, gamma, mean):
     blended.radius[-1] = 0.01  # below a pixel
     blended.positions[-1] = 0
     opacity = blended.opacity
-    blended.scene = PairedPoints(dev, blended.camera, blended.positions, blended.radius, "sphere")
+    blended.scene = PairedPoints(
+        dev, blended.camera, blended.positions, blended.radius, kind="sphere"
+    )
     blended.scene.blend(opacity, gamma, blended.point_features, mean=mean)
     hit = blended.scene.hits()
     gradients = blended.scene.sphere_gradients(blended.grad)

@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 from support.comparisons import relative_error
-from support.raster_scene import Blended
 
 from pp_cl.raster.blend import BLENDS
 from pp_cl.raster.blend_weights import DROPPED
+from pp_cl.selftest.points import Blended
 
 pytestmark = pytest.mark.parametrize("rule", BLENDS)
 

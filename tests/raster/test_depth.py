@@ -3,11 +3,11 @@
 import numpy as np
 import pytest
 from support.comparisons import relative_error
-from support.raster_scene import Blended, blend_on_axis, depth_at
 
 from pp_cl.raster.blend import BLENDS
 from pp_cl.raster.blend_weights import DROPPED
 from pp_cl.raster.depth import depth_forward
+from pp_cl.selftest.points import Blended, blend_on_axis, depth_at
 
 
 def found(dev, scene):

@@ -6,10 +6,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from oracle import raster as oracle
 from support.comparisons import relative_error
-from support.raster_scene import AXIS as CAMERA
-from support.raster_scene import FAR, PairedPoints, blend_on_axis, depth_at
+
+from pp_cl.reference import dense as oracle
+from pp_cl.selftest.points import AXIS as CAMERA
+from pp_cl.selftest.points import FAR, PairedPoints, blend_on_axis, depth_at
 
 pytestmark = pytest.mark.kernels
 
@@ -18,7 +19,7 @@ def test_nearest_possible_point_at_the_final_gamma(dev):
     """exp(z/gamma) = e^100 at z = 1 is above the largest float."""
     radius = 2.0**-10
     positions = np.stack([np.zeros(3), np.zeros(3), depth_at([1.0, 0.99, 0.5]) + radius], -1)
-    scene = PairedPoints(dev, CAMERA, positions, radius, "sphere")
+    scene = PairedPoints(dev, CAMERA, positions, radius, kind="sphere")
     features = scene.blend([1, 1, 1], 0.01, np.eye(3, 16))
     e = np.exp([0.0, -1.0, -50.0])
     assert np.allclose(features[0, 0, :3], e / e.sum(), rtol=1e-4, atol=1e-7)
@@ -91,7 +92,7 @@ def test_softness(dev):
 @pytest.mark.parametrize("kind", ["disc", "soft", "sphere"])
 def test_points_behind_and_on_the_plane_of_the_eye(dev, kind):
     positions = np.array([[0, 0, -3.0], [0, 0, 0], [3.0, 0, 0], [0, 3.0, 1e-9], [0, 0, 3.0]])
-    scene = PairedPoints(dev, CAMERA, positions, 0.01, kind, (1e-3, FAR))
+    scene = PairedPoints(dev, CAMERA, positions, 0.01, kind=kind, depth_range=(1e-3, FAR))
     assert scene.projected.point_camera.get()[:, 3].tolist() == [-1, -1, -1, -1, 3]
     assert scene.pairs.seen.get().tolist() == [4]
 
@@ -101,7 +102,7 @@ def test_points_behind_and_on_the_plane_of_the_eye(dev, kind):
 def test_positions_that_are_not_finite(dev, bad, axis):
     positions = np.array([[0, 0, 3.0], [0, 0, 3.0], [0.001, 0, 4.0]])
     positions[1, axis] = bad
-    scene = PairedPoints(dev, CAMERA, positions, 0.1, "sphere")
+    scene = PairedPoints(dev, CAMERA, positions, 0.1, kind="sphere")
     assert scene.pairs.seen.get().tolist() == [0, 2]
     features = scene.blend(np.ones(3), 0.01, np.ones((3, 16)) * 2)
     gradients = scene.gradients(np.ones((1, 1, 16))) | scene.sphere_gradients(np.ones((1, 1, 16)))
@@ -111,7 +112,7 @@ def test_positions_that_are_not_finite(dev, bad, axis):
 
 def test_a_ray_through_the_centre_of_a_sphere_has_gradients(dev):
     """rho = 0: d has no slope there, and nothing may be divided by it."""
-    scene = PairedPoints(dev, CAMERA, np.array([[0, 0, 3.0]]), 0.5, "sphere")
+    scene = PairedPoints(dev, CAMERA, np.array([[0, 0, 3.0]]), 0.5, kind="sphere")
     scene.blend([0.5], 0.1, np.full((1, 16), 2.0))
     gradients = scene.sphere_gradients(np.ones((1, 1, 16)))
     assert gradients["positions"][0, 2] < 0 and (gradients["positions"][0, :2] == 0).all()
@@ -122,7 +123,12 @@ def test_a_hit_on_the_very_rim(dev):
     """d = 0 with an exponent above that of the largest float: no weight, no gradient, no NaN."""
     # rho = |(3, 0, 4) - 5 (0, 0, 1)|
     scene = PairedPoints(
-        dev, CAMERA, np.array([[3.0, 0, 4.0]]), np.sqrt(10.0), "sphere", (1.8, 10.0)
+        dev,
+        CAMERA,
+        np.array([[3.0, 0, 4.0]]),
+        np.sqrt(10.0),
+        kind="sphere",
+        depth_range=(1.8, 10.0),
     )
     assert scene.pairs.total == 1 and scene.pairs.pair_point_closeness.get()[0, 1] == 0
     assert (scene.blend([1.0], 0.005, np.full((1, 16), 2.0)) == 1).all()
@@ -172,5 +178,5 @@ def test_one_point_and_one_pixel(dev):
 
 def test_a_point_as_large_as_the_view(dev):
     camera = replace(CAMERA, width=257, height=33, fx=200.0, fy=200.0, cx=128.0, cy=16.0)
-    scene = PairedPoints(dev, camera, np.array([[0, 0, 5.0]]), 2.9, "sphere")
+    scene = PairedPoints(dev, camera, np.array([[0, 0, 5.0]]), 2.9, kind="sphere")
     assert scene.hits().all()

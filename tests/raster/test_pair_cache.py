@@ -5,13 +5,13 @@ change.
 import numpy as np
 import pytest
 from support.models import make_model
-from support.raster_scene import PairedPoints, make_camera, make_points
 from support.scenes import ring_cameras
 
 from pp_cl.raster.pair_cache import ARRAYS, PairCache
 from pp_cl.raster.pairs import PairBuilder
 from pp_cl.raster.project import Footprint
 from pp_cl.render import Renderer
+from pp_cl.selftest.points import PairedPoints, make_camera, make_points
 from pp_cl.settings import RasterConfig
 
 pytestmark = pytest.mark.kernels

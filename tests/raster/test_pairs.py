@@ -4,13 +4,13 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from oracle import raster as oracle
 from support.comparisons import relative_error
 from support.guarded import AWKWARD_SIZES, large
-from support.raster_scene import PairedPoints, make_camera, make_points
 
 from pp_cl.raster.pairs import PairBuilder
 from pp_cl.raster.project import KINDS, Footprint
+from pp_cl.reference import dense as oracle
+from pp_cl.selftest.points import PairedPoints, make_camera, make_points
 
 BAND = 1e-4  # pixels beside the edge of a footprint where rounding may decide
 
@@ -48,7 +48,7 @@ def check(scene, expected):
 def test_equal_radii(dev, rng, kind, radius):
     camera, positions = make_camera(), make_points(rng, 300)
     check(
-        PairedPoints(dev, camera, positions, radius, kind),
+        PairedPoints(dev, camera, positions, radius, kind=kind),
         oracle.geometry(camera, positions, radius, kind),
     )
 
@@ -59,7 +59,7 @@ def test_radii_of_all_sizes(dev, rng, kind, n):
     camera, positions = replace(make_camera(33, 31), fy=26.0), make_points(rng, n)
     radius = np.float32(10.0 ** rng.uniform(-3, 0, n))
     check(
-        PairedPoints(dev, camera, positions, radius, kind),
+        PairedPoints(dev, camera, positions, radius, kind=kind),
         oracle.geometry(camera, positions, radius, kind),
     )
 
@@ -76,7 +76,7 @@ def test_every_visible_point_hits_a_pixel(dev, rng):
     camera = replace(make_camera(40, 36), fy=30.0)
     slopes = rng.uniform(-0.3, 0.3, (2000, 2))
     positions = camera.eye + 4 * np.column_stack([slopes, np.ones(2000)]) @ camera.pose[:, :3].T
-    assert len(PairedPoints(dev, camera, positions, 1e-3, "disc").pairs.seen) == 2000
+    assert len(PairedPoints(dev, camera, positions, 1e-3, kind="disc").pairs.seen) == 2000
 
 
 @pytest.mark.parametrize("n", [63, 64, 65, 128, 129, 1000, large(100_000)])

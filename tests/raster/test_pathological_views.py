@@ -7,13 +7,13 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from oracle import raster as oracle
 from support.comparisons import relative_error
-from support.raster_scene import Blended, PairedPoints, make_camera
 
 from pp_cl.errors import UserError
 from pp_cl.raster.pairs import PairBuilder
 from pp_cl.raster.project import KINDS
+from pp_cl.reference import dense as oracle
+from pp_cl.selftest.points import Blended, PairedPoints, make_camera
 
 pytestmark = pytest.mark.kernels
 
@@ -28,8 +28,8 @@ def check(
     """
     n = len(positions)
     opacity, point_features = np.float32(rng.uniform(0, 1, n)), rng.normal(size=(n, 16))
-    scene = PairedPoints(dev, camera, positions, radius, kind, depth_range)
-    geometry = oracle.geometry(camera, positions, radius, kind, depth_range)
+    scene = PairedPoints(dev, camera, positions, radius, kind=kind, depth_range=depth_range)
+    geometry = oracle.geometry(camera, positions, radius, kind, depth_range=depth_range)
     hits, clear = scene.hits(), geometry["margin"] > 1e-3
     assert np.array_equal(hits[clear], geometry["hit"][clear]) and (~clear).mean() < 0.02
     inner = (geometry["margin"] > 1e-2).all(axis=0)
@@ -42,7 +42,7 @@ def check(
     grad = rng.normal(size=(len(inner), 16)) * inner[:, None]
     gradients = scene.gradients(grad)
     expected = oracle.blend_gradients(
-        geometry | {"hit": hits}, blend, opacity, point_features, grad, gamma
+        geometry | {"hit": hits}, blend, opacity, point_features, grad_features=grad, gamma=gamma
     )
     if tau == 0:
         assert relative_error(gradients["features"], expected[0]) < 1e-3
@@ -130,7 +130,7 @@ def test_an_image_of_millions_of_pixels(dev):
         camera.eye
         + depth * (rays / np.linalg.norm(rays, axis=1, keepdims=True)) @ camera.pose[:, :3].T
     )
-    scene = PairedPoints(dev, camera, positions, 0.004, "disc")
+    scene = PairedPoints(dev, camera, positions, 0.004, kind="disc")
     offsets = scene.pairs.pixel_offset.get().astype(np.int64)
     points = scene.pairs.pair_point_closeness.get()[:, 0][
         scene.pairs.pair_key.get()[: scene.pairs.total] & 0xFFFFFFFF

@@ -4,13 +4,13 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from oracle import raster as oracle
 from support.comparisons import relative_error
 from support.guarded import AWKWARD_SIZES
-from support.raster_scene import make_camera, make_points
 
 from pp_cl.raster.project import KINDS, Footprint, Projection
+from pp_cl.reference import dense as oracle
 from pp_cl.scene.grid import Grid
+from pp_cl.selftest.points import make_camera, make_points
 
 GRID = Grid((-1.1, -0.9, -0.7), 0.05, (45, 37, 29))
 

@@ -4,11 +4,11 @@ gradients of its fixtures.
 
 import numpy as np
 import pytest
-from oracle.raster import camera_space, pulsar_box
 from support.comparisons import relative_error
-from support.raster_scene import PairedPoints
 
+from pp_cl.reference.dense import camera_space, pulsar_box
 from pp_cl.scene.camera import Camera
+from pp_cl.selftest.points import PairedPoints
 
 CASES = (
     "a_tiny_32_n50_c3",
@@ -63,7 +63,7 @@ class Case:
         self.camera, depth_range = read_camera(self)
         self.positions, self.radius = self["in_positions"] * MIRROR, self["in_radius"]
         self.scene = PairedPoints(
-            dev, self.camera, self.positions, self.radius, "sphere", depth_range
+            dev, self.camera, self.positions, self.radius, kind="sphere", depth_range=depth_range
         )
         # The weights sum to one, so features shifted from Pulsar's background to ours shift the
         # picture alike.

@@ -2,13 +2,13 @@
 
 import numpy as np
 import pytest
-from oracle import raster as oracle
 from support.comparisons import relative_error
 from support.guarded import AWKWARD_SIZES
-from support.raster_scene import PairedPoints, make_camera, make_points
 
 from pp_cl.raster.sh import SH_BLOCKS
 from pp_cl.raster.shade import shade_forward
+from pp_cl.reference import dense as oracle
+from pp_cl.selftest.points import PairedPoints, make_camera, make_points
 
 
 class Shaded:

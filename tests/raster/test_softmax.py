@@ -2,12 +2,12 @@
 
 import numpy as np
 import pytest
-from oracle import raster as oracle
 from support.comparisons import relative_error
 from support.guarded import AWKWARD_SIZES, large
-from support.raster_scene import GAMMAS, Blended
 
 from pp_cl.raster.project import KINDS
+from pp_cl.reference import dense as oracle
+from pp_cl.selftest.points import GAMMAS, Blended
 
 TAUS = (1e-4, 1e-2, 0.3)
 TRACKED, UNTRACKED, DROPPED = range(3)  # cl/raster/pair_role.h
@@ -35,7 +35,7 @@ def test_early_stop(dev, rng, early_stop):
         relative_error(blended.features, oracle.features(blended.blend, blended.point_features))
         < 1e-4
     )
-    gradients, expected = blended.gradients(), blended.oracle_gradients()
+    gradients, expected = blended.gradients(), blended.reference_gradients()
     assert relative_error(gradients["features"], expected[0]) < 1e-4
     assert relative_error(gradients["opacity"], expected[1]) < 2e-4
     whole = oracle.blend(blended.geometry, blended.opacity, 0.02)
@@ -101,7 +101,7 @@ def test_tau_gradients_are_those_of_what_is_left(dev, rng):
     blended = Blended(dev, rng, n=500, gamma=0.02, radius=0.4, tau=0.02)
     weight = np.where(blended.role == TRACKED, blended.weight, 0).astype(np.float64)
     assert relative_error(blended.gradients()["features"], weight @ blended.grad) < 1e-4
-    expected = blended.oracle_gradients()[0]
+    expected = blended.reference_gradients()[0]
     assert 1e-4 < relative_error(weight @ blended.grad, expected) < 0.05
 
 

@@ -8,10 +8,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import trimesh
-from oracle.demo import CENTRE, coverage, distance
 from support.guarded import AWKWARD_SIZES
 
 from pp_cl.errors import UserError
+from pp_cl.reference.demo import CENTRE, coverage, distance
 from pp_cl.scene.camera import Camera
 from pp_cl.scene.demo import OBJECT_BOX, demo_mesh, demo_scene, distances, render, write_scene
 from pp_cl.scene.grid import Grid

@@ -6,11 +6,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from oracle.hull import dilated_mask, kept
 from support.ball_views import CENTRE, RADIUS, ball_camera, ball_views
 from support.guarded import AWKWARD_SIZES
 
 from pp_cl.errors import UserError
+from pp_cl.reference.hull import dilated_mask, kept
 from pp_cl.scene import hull
 from pp_cl.scene.bounds import bounding_box
 from pp_cl.scene.camera import Camera

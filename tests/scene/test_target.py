@@ -4,9 +4,9 @@ cameras.
 
 import numpy as np
 import pytest
-from oracle import target as oracle
 from support.guarded import AWKWARD_SIZES
 
+from pp_cl.reference import target as oracle
 from pp_cl.scene.camera import Camera
 from pp_cl.scene.load import load_scene
 from pp_cl.scene.target import Target
@@ -37,12 +37,14 @@ def check(dev, view, downscale, box, jitter):
     target.load(view.reduced(downscale))
     result = target.crop(box, jitter).get()
     left, top = (downscale * first + moved for first, moved in zip(box, jitter, strict=False))
-    expected = oracle.target_forward(view.image, downscale, left, top, *box[2:])
+    expected = oracle.target_forward(view.image, downscale, left, top, width=box[2], height=box[3])
     assert result.shape == expected.shape
     assert np.abs(result - expected).max() < TOLERANCE
     # over white, the object's share is what a black object would hide
     black = np.concatenate([np.zeros_like(view.image[..., :3]), view.image[..., 3:]], axis=2)
-    hidden = 1 - oracle.target_forward(black, downscale, left, top, *box[2:])[..., 0]
+    hidden = (
+        1 - oracle.target_forward(black, downscale, left, top, width=box[2], height=box[3])[..., 0]
+    )
     alpha = target.alpha(box, jitter).get()
     assert alpha.shape == hidden.shape and np.abs(alpha - hidden).max() < TOLERANCE
 
@@ -113,7 +115,7 @@ def test_loading_another_view_replaces_the_first(dev, rng):
     target = Target(dev)
     for view in (first, second, second, first, larger, first):
         target.load(view)
-        expected = oracle.target_forward(view.image, 2, 0, 0, 20, 20)
+        expected = oracle.target_forward(view.image, 2, 0, 0, width=20, height=20)
         assert np.abs(target.crop((0, 0, 20, 20)).get() - expected).max() < TOLERANCE
 
 
@@ -130,7 +132,7 @@ def test_another_reduction_of_the_view_that_is_loaded(dev, rng):
     for downscale in (1, 3, 2):
         target.load(view.reduced(downscale))
         side = 48 // downscale
-        expected = oracle.target_forward(view.image, downscale, 0, 0, side, side)
+        expected = oracle.target_forward(view.image, downscale, 0, 0, width=side, height=side)
         assert np.abs(target.whole() - expected).max() < TOLERANCE
 
 

@@ -1,6 +1,6 @@
 """What rows of a bench hold."""
 
-from oracle.winograd import rounding_share
+from pp_cl.reference.winograd import rounding_share
 
 # relative L2 error of a layer with weights stored as half
 HALF = {"winograd4_half": rounding_share(4)}

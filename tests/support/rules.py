@@ -16,7 +16,7 @@ FLOORS = [
     ("training", "model", "render"),
     ("train", "trained"),
     ("run", "evaluate", "film", "export", "view", "info", "shape"),
-    ("bench", "sweep", "compress"),
+    ("bench", "selftest", "sweep", "compress"),
     ("commands",),
     ("cli", "__init__", "__main__"),
 ]

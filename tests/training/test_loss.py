@@ -2,10 +2,11 @@
 
 import numpy as np
 import pytest
-from oracle import loss as oracle_loss
 from skimage.metrics import structural_similarity
-from support.comparisons import numeric_gradient, relative_error
+from support.comparisons import relative_error
 
+from pp_cl.reference import loss as oracle_loss
+from pp_cl.reference.differences import numeric_gradient
 from pp_cl.training.loss import Loss
 
 SIZES = [(11, 11), (12, 33), (31, 16), (33, 31), (40, 257)]

@@ -4,7 +4,6 @@ import json
 
 import numpy as np
 import pytest
-from oracle.lpips import WIDTHS, lpips, lpips_gradient, random_weights
 from support.comparisons import relative_error
 from support.guarded import AWKWARD_SIZES, large
 from support.runs import arguments
@@ -15,6 +14,7 @@ from pp_cl.device.buffers import table_bytes
 from pp_cl.errors import UserError
 from pp_cl.layers.policy import make_policy
 from pp_cl.metrics.lpips import Lpips
+from pp_cl.reference.lpips import WIDTHS, lpips, lpips_gradient, random_weights
 from pp_cl.training.perceptual import PerceptualLoss
 
 SIZES = [(16, 16), (17, 33), large((39, 31)), large((16, 257))]

@@ -2,10 +2,10 @@
 
 import numpy as np
 import pytest
-from oracle import optim as oracle_optim
 from support.comparisons import relative_error
 from support.guarded import AWKWARD_SIZES
 
+from pp_cl.reference import optim as oracle_optim
 from pp_cl.scene.grid import Grid
 from pp_cl.training.smooth import Smoother
 

@@ -3,7 +3,9 @@
 import numpy as np
 
 
-def target_forward(image, downscale, left, top, width, height):
+def target_forward(
+    image: np.ndarray, downscale: int, left: int, top: int, *, width: int, height: int
+) -> np.ndarray:
     """(height, width, 3): means over white of the downscale x downscale blocks, from (left, top)
     on, of an (H, W, 4) uint8 image.
     """

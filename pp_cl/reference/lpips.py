@@ -1,43 +1,50 @@
 """Float64 numpy twin of LPIPS v0.1 with VGG16."""
 
 import numpy as np
-from oracle.conv import conv_gradients
-from oracle.layers import maxpool2_gradient
+
+from pp_cl.reference.network import convolution, flipped
+
+Weights = dict[str, np.ndarray]
 
 BLOCKS = (2, 2, 3, 3, 3)
 WIDTHS = (16, 16, 32, 32, 48)  # channels of the blocks of a network small enough for numpy
 
 
-def scaled_input(image):
+def scaled_input(image: np.ndarray) -> np.ndarray:
     """Network input of an image in [0, 1], (..., 3)."""
     return (2 * image - 1 - np.array([-0.030, -0.088, -0.188])) / np.array([0.458, 0.448, 0.450])
 
 
-def convolve_relu(x, kernel, bias):
-    """3x3 convolution with zero padding, then ReLU. x (H, W, CI), kernel (CO, CI, 3, 3)."""
-    height, width = x.shape[:2]
-    padded = np.pad(x, ((1, 1), (1, 1), (0, 0)))
-    out = np.zeros((height, width, len(bias))) + bias
-    for i in range(3):
-        for j in range(3):
-            out += padded[i : i + height, j : j + width] @ kernel[:, :, i, j].T
-    return np.maximum(out, 0)
+def _convolve_relu(x, kernel, bias):
+    return np.maximum(convolution(x, kernel, bias), 0)
 
 
-def max_pool(x):
+def maxpool2(x: np.ndarray) -> np.ndarray:
     """Largest value of each 2x2 cell; an odd last row or column is dropped."""
     height, width, channels = x.shape[0] // 2, x.shape[1] // 2, x.shape[2]
     return x[: 2 * height, : 2 * width].reshape(height, 2, width, 2, channels).max(axis=(1, 3))
 
 
-def pixel_distance(a, b, head):
+def maxpool2_gradient(x: np.ndarray, grad_out: np.ndarray) -> np.ndarray:
+    """(H, W, C), (H // 2, W // 2, C) -> (H, W, C): at the largest of a cell, the first of equal
+    ones.
+    """
+    grad_x = np.zeros(x.shape)
+    for row, column, c in np.ndindex(grad_out.shape):
+        cell = x[2 * row : 2 * row + 2, 2 * column : 2 * column + 2, c]
+        y, z = np.unravel_index(cell.argmax(), (2, 2))
+        grad_x[2 * row + y, 2 * column + z, c] = grad_out[row, column, c]
+    return grad_x
+
+
+def pixel_distance(a: np.ndarray, b: np.ndarray, head: np.ndarray) -> np.ndarray:
     """Weighted squared distance of the unit feature vectors of each pixel; a, b (..., C)."""
     unit_a = a / (np.sqrt((a**2).sum(axis=-1, keepdims=True)) + 1e-10)
     unit_b = b / (np.sqrt((b**2).sum(axis=-1, keepdims=True)) + 1e-10)
     return ((unit_a - unit_b) ** 2) @ head
 
 
-def lpips(a, b, weights):
+def lpips(a: np.ndarray, b: np.ndarray, weights: Weights) -> float:
     """Distance of two (H, W, 3) images in [0, 1]; weights as pp_cl.lpips_weights.load_weights()
     names them.
     """
@@ -46,16 +53,16 @@ def lpips(a, b, weights):
     layer, total = 0, 0.0
     for block, convolutions in enumerate(BLOCKS):
         if block:
-            x, y = max_pool(x), max_pool(y)
+            x, y = maxpool2(x), maxpool2(y)
         for _ in range(convolutions):
             kernel, bias = weights[f"kernel{layer}"], weights[f"bias{layer}"]
-            x, y = convolve_relu(x, kernel, bias), convolve_relu(y, kernel, bias)
+            x, y = _convolve_relu(x, kernel, bias), _convolve_relu(y, kernel, bias)
             layer += 1
         total += pixel_distance(x, y, weights[f"head{block}"]).mean()
     return total
 
 
-def pixel_distance_gradient(a, b, head):
+def pixel_distance_gradient(a: np.ndarray, b: np.ndarray, head: np.ndarray) -> np.ndarray:
     """Gradient of pixel_distance(a, b, head).sum() by a; 0 at pixels without features."""
     length = np.sqrt((a**2).sum(axis=-1, keepdims=True))
     unit_a = a / (length + 1e-10)
@@ -65,17 +72,17 @@ def pixel_distance_gradient(a, b, head):
     return by_unit / (length + 1e-10) - turned * a / (length + 1e-10) ** 2
 
 
-def lpips_gradient(a, b, weights):
+def lpips_gradient(a: np.ndarray, b: np.ndarray, weights: Weights) -> np.ndarray:
     """Gradient of lpips(a, b, weights) by a, (H, W, 3)."""
     weights = {name: array.astype(np.float64) for name, array in weights.items()}
     inputs, features = [], []  # of each convolution; of each block, of both images
     for image in (a, b):
         x, seen, found, layer = scaled_input(image), [], [], 0
         for block, convolutions in enumerate(BLOCKS):
-            x = max_pool(x) if block else x
+            x = maxpool2(x) if block else x
             for _ in range(convolutions):
                 seen.append(x)
-                x = convolve_relu(x, weights[f"kernel{layer}"], weights[f"bias{layer}"])
+                x = _convolve_relu(x, weights[f"kernel{layer}"], weights[f"bias{layer}"])
                 layer += 1
             found.append(x)
         inputs, features = inputs or seen, [*features, found]
@@ -89,11 +96,11 @@ def lpips_gradient(a, b, weights):
             layer -= 1
             grad_out, kernel = grad * (x > 0), weights[f"kernel{layer}"]
             x = inputs[layer]
-            grad = conv_gradients(x, kernel, grad_out)[0]
+            grad = convolution(grad_out, flipped(kernel))
     return grad * 2 / np.array([0.458, 0.448, 0.450])
 
 
-def random_weights(rng):
+def random_weights(rng: np.random.Generator) -> Weights:
     """Weights of VGG16's shape with few channels; He's deviation keeps the features alive."""
     weights, channels, layer = {}, 3, 0
     for block, (convolutions, width) in enumerate(zip(BLOCKS, WIDTHS, strict=True)):

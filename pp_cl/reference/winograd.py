@@ -9,7 +9,7 @@ ROUNDING = 2.0**-11  # half's largest relative error: 11 bits
 SMALLEST = 2.0**-24  # half's smallest positive number
 
 
-def matrices(m):
+def matrices(m: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """(A (S, m), G (S, 3), B (S, S)) with y = A^T [(G g) o (B d)] for S = m + 2 samples d and a
     kernel g of 3.
     """
@@ -26,7 +26,7 @@ def matrices(m):
     return a, g, np.linalg.lstsq(products, wanted.astype(np.float64), rcond=None)[0]
 
 
-def transform_weights(m, weight, magnitude=False):
+def transform_weights(m: int, weight: np.ndarray, magnitude: bool = False) -> np.ndarray:
     """weight (CO, CI, 3, 3) -> (S, S, CO, CI). magnitude: the sums of the terms' absolute
     values.
     """
@@ -35,7 +35,7 @@ def transform_weights(m, weight, magnitude=False):
     return np.einsum("sk,tl,oikl->stoi", g, g, np.asarray(weight, np.float64), optimize=True)
 
 
-def convolve(m, x, transformed, magnitude=False):
+def convolve(m: int, x: np.ndarray, transformed: np.ndarray, magnitude: bool = False) -> np.ndarray:
     """x (H, W, CI), transformed (S, S, CO, CI) -> (H, W, CO).
 
     magnitude: the sums of the absolute values of what each transformed weight adds to an output.
@@ -57,14 +57,14 @@ def convolve(m, x, transformed, magnitude=False):
     return out.reshape(rows * m, columns * m, -1)[:height, :width]
 
 
-def rounding_bound(m, x, weight):
+def rounding_bound(m: int, x: np.ndarray, weight: np.ndarray) -> np.ndarray:
     """(H, W, CO): at most so much of a convolution's outputs may change when the transformed
     weights are rounded to half.
     """
     return ROUNDING * convolve(m, x, transform_weights(m, weight), magnitude=True)
 
 
-def rounding_share(m):
+def rounding_share(m: int) -> float:
     """ROUNDING times how much more than the outputs, in L2, all products with transformed weights
     are, on white noise.
     """

@@ -1,9 +1,12 @@
 """Float64 twin of cl/scene/hull.cl: the mask of a view, and which positions the masks keep."""
 
+from collections.abc import Sequence
+from typing import Any
+
 import numpy as np
 
 
-def dilated_mask(alpha, threshold):
+def dilated_mask(alpha: np.ndarray, threshold: int) -> np.ndarray:
     """(H, W) bool: some pixel of the 3x3 neighbourhood has an alpha above the threshold."""
     height, width = alpha.shape
     mask = np.zeros((height, width), bool)
@@ -13,7 +16,9 @@ def dilated_mask(alpha, threshold):
     return mask
 
 
-def kept(views, positions, threshold):
+def kept(
+    views: Sequence[Any], positions: np.ndarray, threshold: int
+) -> tuple[np.ndarray, np.ndarray]:
     """((N,) bool kept, (N,) pixels to the nearest pixel border of any view that has the position
     before it).
     """

@@ -2,6 +2,8 @@
 hits.
 """
 
+from typing import Any
+
 import numpy as np
 
 CENTRE = np.array([0, 0, 0.15])  # of the globe
@@ -11,27 +13,27 @@ WHEEL_V = np.cross(WHEEL, MERIDIAN)
 ECLIPTIC = np.cos(np.pi / 3) * MERIDIAN + np.sin(np.pi / 3) * WHEEL_V
 
 
-def segment(p, a, b):
+def _segment(p, a, b):
     """Distances of (N, 3) places to the segment from a to b."""
     share = np.clip((p - a) @ (b - a) / ((b - a) @ (b - a)), 0, 1)
     return np.linalg.norm(p - a - share[:, None] * (b - a), axis=1)
 
 
-def circle(p, normal, radius):
+def _circle(p, normal, radius):
     """Distances of (N, 3) places to a circle around the origin."""
     height = p @ normal
     in_plane = np.linalg.norm(p - height[:, None] * normal, axis=1)
     return np.hypot(in_plane - radius, height)
 
 
-def rounded_rectangle(a, b, half_a, half_b, radius):
+def _rounded_rectangle(a, b, half, radius):
     """Signed distances of (a, b) to a rectangle grown by a radius."""
-    u, v = np.abs(a) - half_a, np.abs(b) - half_b
+    u, v = np.abs(a) - half[0], np.abs(b) - half[1]
     outside = np.hypot(np.maximum(u, 0), np.maximum(v, 0))
     return np.where((u > 0) | (v > 0), outside, np.maximum(u, v)) - radius
 
 
-def distance(positions):
+def distance(positions: np.ndarray) -> np.ndarray:
     """(N,) signed distances of (N, 3) world positions to the object."""
     p = positions - CENTRE
     z = np.array([0, 0, 1.0])
@@ -40,21 +42,21 @@ def distance(positions):
     in_band = np.linalg.norm(p - height[:, None] * MERIDIAN, axis=1)
     solids = [
         np.linalg.norm(p, axis=1) - 0.30,
-        rounded_rectangle(from_axis, p[:, 2] + 1.03, 0.50, 0.05, 0.03),
-        rounded_rectangle(in_band - 0.70, height, 0.018, 0.05, 0.006),
+        _rounded_rectangle(from_axis, p[:, 2] + 1.03, (0.50, 0.05), 0.03),
+        _rounded_rectangle(in_band - 0.70, height, (0.018, 0.05), 0.006),
         np.linalg.norm(p + 0.88 * z, axis=1) - 0.07,
-        segment(p, -1.0 * z, -0.72 * z) - 0.03,
-        segment(p, -0.69 * WHEEL, 0.69 * WHEEL) - 0.014,
-        circle(p, WHEEL, 0.54) - 0.024,
-        circle(p, ECLIPTIC, 0.62) - 0.018,
+        _segment(p, -1.0 * z, -0.72 * z) - 0.03,
+        _segment(p, -0.69 * WHEEL, 0.69 * WHEEL) - 0.014,
+        _circle(p, WHEEL, 0.54) - 0.024,
+        _circle(p, ECLIPTIC, 0.62) - 0.018,
     ]
     for angle in np.arange(12) * np.pi / 6:
         spoke = np.cos(angle) * MERIDIAN + np.sin(angle) * WHEEL_V
-        solids.append(segment(p, 0.2 * spoke, 0.54 * spoke) - 0.011)
+        solids.append(_segment(p, 0.2 * spoke, 0.54 * spoke) - 0.011)
     return np.min(solids, axis=0)
 
 
-def coverage(camera):
+def coverage(camera: Any) -> tuple[np.ndarray, np.ndarray]:
     """((H, W) share of 4x4 rays a pixel that come within 4e-4 of the object, (H, W) the same for
     1e-5).
     """

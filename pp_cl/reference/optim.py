@@ -2,19 +2,32 @@
 grid smoothing.
 """
 
+from typing import Any
+
 import numpy as np
+
+from pp_cl.reference.raster import sh_basis
 
 
 class Adam:
     """torch.optim.Adam without weight decay, for one array; lazy where a step lists rows."""
 
-    def __init__(self, parameter, beta1=0.9, beta2=0.999):
+    def __init__(self, parameter: np.ndarray, beta1: float = 0.9, beta2: float = 0.999):
         self.parameter = np.array(parameter, np.float64)
         self.m, self.v, self.t = np.zeros_like(self.parameter), np.zeros_like(self.parameter), 0
         self.last_step = np.zeros(len(self.parameter), int)
         self.betas = beta1, beta2
 
-    def step(self, grad, rate, eps, low=-np.inf, high=np.inf, rows=slice(None)):
+    def step(
+        self,
+        grad: np.ndarray,
+        rate: float,
+        eps: float,
+        *,
+        low: float = -np.inf,
+        high: float = np.inf,
+        rows: Any = slice(None),
+    ) -> None:
         """rows: those that this step updates. The steps since their last one are applied first,
         with gradients of 0: the moments exactly, the moves with the present rate and eps.
         """
@@ -30,7 +43,11 @@ class Adam:
         moved -= rate / c1 * m / (np.sqrt(v / c2) + eps)
         self.m[rows], self.v[rows], self.parameter[rows] = m, v, np.clip(moved, low, high)
 
-    def pending(self, t, rate, eps, rows=slice(None)):
+    def go_to(self, t: int) -> None:
+        """Count t steps."""
+        self.t = t
+
+    def pending(self, t: int, rate: float, eps: float, rows: Any = slice(None)) -> np.ndarray:
         """What the steps that the rows skipped before step t have yet to move them by."""
         beta1, beta2 = self.betas
         skipped, m, v = self._skipped(t, rows), self.m[rows], self.v[rows]
@@ -47,48 +64,32 @@ class Adam:
         return (t - 1 - self.last_step[rows]).reshape(shape)
 
 
-def sh_basis(direction):
-    """(9, ...) PlenOctrees' real basis at unit directions (..., 3)."""
-    x, y, z = np.moveaxis(direction, -1, 0)
-    pi = np.pi
-    return np.stack(
-        [
-            0 * x + np.sqrt(1 / (4 * pi)),
-            -np.sqrt(3 / (4 * pi)) * y,
-            np.sqrt(3 / (4 * pi)) * z,
-            -np.sqrt(3 / (4 * pi)) * x,
-            np.sqrt(15 / (4 * pi)) * x * y,
-            -np.sqrt(15 / (4 * pi)) * y * z,
-            np.sqrt(5 / (16 * pi)) * (3 * z * z - 1),
-            -np.sqrt(15 / (4 * pi)) * x * z,
-            np.sqrt(15 / (16 * pi)) * (x * x - y * y),
-        ]
-    )
-
-
-def block_basis(positions, eye, block):
+def block_basis(positions: np.ndarray, eye: np.ndarray, block: Any) -> np.ndarray:
     """(N, block.count): the harmonics of one sh.ShBlock in the directions from the eye."""
     towards = positions - eye
     basis = sh_basis(towards / np.linalg.norm(towards, axis=-1, keepdims=True))
-    return basis[block.first : block.first + block.count].T
+    return basis[:, block.first : block.first + block.count]
 
 
-def sh_gradient(positions, eye, grad_point_features, block):
+def sh_gradient(
+    positions: np.ndarray, eye: np.ndarray, grad_point_features: np.ndarray, block: Any
+) -> np.ndarray:
     """(N, block.count, 16) gradient of the SH coefficients of one sh.ShBlock."""
     gradient = np.asarray(grad_point_features, np.float64)
     return block_basis(positions, eye, block)[:, :, None] * gradient[:, None, :]
 
 
-def neighbours(ids, dims):
+def neighbours(ids: np.ndarray, dims: tuple[int, int, int]) -> list[list[int | None]]:
     """Per point the indices of its neighbours -x, +x, -y, +y, -z, +z, None where there is none."""
-    nx, ny, nz = dims
+    nx, ny, _ = dims
     index = {(int(i) % nx, int(i) // nx % ny, int(i) // (nx * ny)): n for n, i in enumerate(ids)}
-    assert all(z < nz for _, _, z in index)
     offsets = [(-1, 0, 0), (1, 0, 0), (0, -1, 0), (0, 1, 0), (0, 0, -1), (0, 0, 1)]
     return [[index.get((x + a, y + b, z + c)) for a, b, c in offsets] for x, y, z in index]
 
 
-def smoothed(values, ids, dims, amount):
+def smoothed(
+    values: np.ndarray, ids: np.ndarray, dims: tuple[int, int, int], amount: float
+) -> np.ndarray:
     """Array (N, ...) moved by `amount` towards the mean of their neighbours."""
     old = np.asarray(values, np.float64)
     new = old.copy()

@@ -16,7 +16,7 @@ def _window():
 WINDOW = _window()
 
 
-def windowed(image):
+def windowed(image: np.ndarray) -> np.ndarray:
     """(H-10, W-10, 3) weighted mean of each 11x11 window of an (H, W, 3) image."""
     h, w, _ = image.shape
     return sum(
@@ -24,7 +24,7 @@ def windowed(image):
     )
 
 
-def unwindowed(slopes, shape):
+def unwindowed(slopes: np.ndarray, shape: tuple[int, int, int]) -> np.ndarray:
     """The adjoint of windowed."""
     h, w, _ = shape
     image = np.zeros(shape)
@@ -34,7 +34,7 @@ def unwindowed(slopes, shape):
     return image
 
 
-def ssim(x, y):
+def ssim(x: np.ndarray, y: np.ndarray) -> tuple[float, np.ndarray]:
     """(mean SSIM, its gradient with respect to x)."""
     mx, my = windowed(x), windowed(y)
     vx, vy, cov = windowed(x * x) - mx**2, windowed(y * y) - my**2, windowed(x * y) - mx * my
@@ -51,7 +51,9 @@ def ssim(x, y):
     return similarity.mean(), gradient / similarity.size
 
 
-def loss(prediction, target, weight):
+def loss(
+    prediction: np.ndarray, target: np.ndarray, weight: float
+) -> tuple[np.ndarray, np.ndarray]:
     """(terms (4,): L, L1, 1 - SSIM, mean squared error; gradient (H, W, 3)) of equally large
     images.
     """

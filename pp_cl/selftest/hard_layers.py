@@ -5,7 +5,7 @@ half's range.
 import numpy as np
 
 
-def hard_layers(rng):
+def hard_layers(rng: np.random.Generator) -> dict[str, tuple[np.ndarray, ...]]:
     """{name: (x (H, W, CI), weight (CO, CI, 3, 3), bias (CO,), grad_out (H, W, CO))}, float32."""
 
     def normal(*shape):

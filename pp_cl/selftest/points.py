@@ -1,20 +1,24 @@
-"""Runs the rasteriser's stages on explicit points, for the tests: what render.py does, with every
-intermediate at hand.
+"""Runs the rasteriser's stages on explicit points: what render.py does, with every intermediate at
+hand. The tests use it too.
 """
 
 from dataclasses import replace
 
 import numpy as np
-from oracle import raster as oracle
+from numpy.typing import ArrayLike
 
+from pp_cl.device.device import Device
 from pp_cl.raster.blend import BLENDS, Blend
 from pp_cl.raster.blend_weights import DROPPED
 from pp_cl.raster.pairs import PairBuilder
 from pp_cl.raster.project import Footprint, Projection
+from pp_cl.reference import dense
 from pp_cl.scene.camera import Camera, look_at
 
+Gradients = dict[str, np.ndarray]
 
-def make_camera(width=24, height=20, focal=30.0):
+
+def make_camera(width: int = 24, height: int = 20, focal: float = 30.0) -> Camera:
     """A camera four units away from the origin, off the axes, with different focal lengths and an
     odd principal point.
     """
@@ -29,7 +33,7 @@ def make_camera(width=24, height=20, focal=30.0):
     )
 
 
-def make_points(rng, n):
+def make_points(rng: np.random.Generator, n: int) -> np.ndarray:
     """(N, 3) points around the origin; some lie outside the view or the depth range."""
     return rng.normal(size=(n, 3)) * [0.9, 0.9, 0.8]
 
@@ -40,8 +44,18 @@ class PairedPoints:
     positions: (N, 3). radius: one number or (N,), world units. depth_range: (near, far).
     """
 
-    def __init__(self, dev, camera, positions, radius, kind="soft", depth_range=oracle.DEPTH_RANGE):
+    def __init__(
+        self,
+        dev: Device,
+        camera: Camera,
+        positions: np.ndarray,
+        radius: ArrayLike,
+        *,
+        kind: str = "soft",
+        depth_range: tuple[float, float] = dense.DEPTH_RANGE,
+    ):
         self.dev, self.camera, self.n = dev, camera, len(positions)
+        self._exact, self.depth_range = (positions, radius, kind), depth_range
         self.shape = (camera.height, camera.width)
         self.footprint = Footprint(kind)
         self.camera_buffer = dev.upload(camera.packed(depth_range))
@@ -52,11 +66,11 @@ class PairedPoints:
         )
         self.pairs = PairBuilder(dev, self.footprint).build(self.projected, self.shape)
 
-    def pair_points(self):
+    def pair_points(self) -> np.ndarray:
         """(P,) the point of each pair, from the offsets alone."""
         return np.repeat(np.arange(self.n), np.diff(self.pairs.point_offset.get().astype(np.int64)))
 
-    def dense(self, pair_values, missing=0.0):
+    def dense(self, pair_values: np.ndarray, missing: float = 0.0) -> np.ndarray:
         """(N, HW) of values by pair: (P, ...) on the host."""
         total = self.pairs.total
         matrix = np.full(
@@ -65,11 +79,34 @@ class PairedPoints:
         matrix[self.pair_points(), self.pairs.pair_pixel.get()[:total]] = pair_values[:total]
         return matrix
 
-    def hits(self):
+    def geometry(self) -> dict[str, np.ndarray]:
+        """dense.geometry with the device's hits, and at these its closeness and depth: at the rim
+        of a footprint a closeness is rounding, and a softmax may make it half a pixel.
+        """
+        total, hit = self.pairs.total, self.hits()
+        closeness = self.pairs.pair_point_closeness.get()[:total, 1].view(np.float32)
+        keys, depth = self.pairs.pair_key.get()[:total], np.empty(total, np.float32)
+        depth[keys & 0xFFFFFFFF] = (keys >> 32).astype(np.uint32).view(np.float32)
+        geometry = dense.geometry(self.camera, *self._exact, depth_range=self.depth_range)
+        for name, measured in (("closeness", closeness), ("depth", depth)):
+            geometry[name] = np.where(hit, self.dense(measured), geometry[name])
+        near, far = self.depth_range
+        return geometry | {"hit": hit, "z": 1 - (geometry["depth"] - near) / (far - near)}
+
+    def hits(self) -> np.ndarray:
         """(N, HW) bool."""
         return self.dense(np.ones(max(1, self.pairs.total), bool), False)
 
-    def blend(self, opacity, gamma, point_features, *, mean=False, rule="softmax", **drops):
+    def blend(
+        self,
+        opacity: ArrayLike,
+        gamma: float,
+        point_features: np.ndarray,
+        *,
+        mean: bool = False,
+        rule: str = "softmax",
+        **drops: float,
+    ) -> np.ndarray:
         """(H, W, 16) blended features; those of the points that are not shaded are set to NaN
         first. rule: of BLENDS. drops: of BlendWeights.compute().
         """
@@ -87,24 +124,26 @@ class PairedPoints:
         self.blending.forward(self.pairs, self.weights, self.point_features, self.features)
         return self.features.get()
 
-    def weight(self):
+    def weight(self) -> np.ndarray:
         """(N, HW) the blend weights, 0 where a hit was dropped."""
         weights = self.weights.pair_weight.get()[:, 0]
         return self.dense(np.where(self.roles() == DROPPED, 0, weights))
 
-    def roles(self):
+    def roles(self) -> np.ndarray:
         """(P,) numpy: cl/raster/pair_role.h of each pair."""
         roles = self.weights.pair_role.get()
         return roles if self.weights.has_roles else np.zeros(len(self.pairs.pair_pixel), np.uint8)
 
-    def gradients(self, grad_features, grad_alpha=None):
+    def gradients(
+        self, grad_features: np.ndarray, grad_alpha: np.ndarray | None = None
+    ) -> Gradients:
         """{"features": (N, 16), "opacity": (N,)} of sum(features * grad_features) and, where given,
         sum(alpha * grad_alpha) after blend().
         """
         features, opacity = self.blending.backward(self._gradient(grad_features, grad_alpha))
         return {"features": features.get(), "opacity": opacity.get()}
 
-    def sphere_gradients(self, grad_features):
+    def sphere_gradients(self, grad_features: np.ndarray) -> Gradients:
         """{"positions": (N, 3), "radius": (N,)} of the same."""
         positions, radius = self.blending.backward_spheres(
             self._gradient(grad_features), self.projected, self.opacity, self.gamma
@@ -125,22 +164,24 @@ class PairedPoints:
         )
 
 
-NEAR, FAR = oracle.DEPTH_RANGE
+NEAR, FAR = dense.DEPTH_RANGE
 # a camera of one pixel that looks along z from the origin
 AXIS = replace(make_camera(1, 1), pose=np.eye(3, 4), fx=100.0, fy=100.0, cx=0.5, cy=0.5)
 
 
-def depth_at(z):
+def depth_at(z: ArrayLike) -> np.ndarray:
     """Distance from the eye of normalised depth z."""
     return FAR - np.asarray(z) * (FAR - NEAR)
 
 
-def blend_on_axis(dev, z, opacity, gamma, camera=AXIS, **options):
+def blend_on_axis(
+    dev: Device, z: ArrayLike, opacity: ArrayLike, gamma: float, **options: float | str
+) -> tuple[PairedPoints, np.ndarray]:
     """(PairedPoints, weights): points at normalised depths z ahead of a one-pixel camera, each
     in its own channel.
     """
     positions = np.stack([np.zeros(len(z)), np.zeros(len(z)), depth_at(z)], -1)
-    scene = PairedPoints(dev, camera, positions, 0.001)
+    scene = PairedPoints(dev, AXIS, positions, 0.001)
     scene.blend(np.asarray(opacity), gamma, np.resize(np.eye(16), (len(z), 16)), **options)
     return scene, scene.weight()[:, 0]
 
@@ -149,19 +190,22 @@ GAMMAS = (0.1, 0.01)
 
 
 class Blended:
-    """A random scene blended by the kernels and by the oracle, both with the kernels' hits."""
+    """A random scene blended by the kernels and in float64, both with the kernels' hits, closeness
+    and depth.
+    """
 
     def __init__(
         self,
-        dev,
-        rng,
-        n=257,
-        kind="soft",
-        gamma=0.1,
-        radius=None,
-        size=(24, 20),
-        rule="softmax",
-        **blend,
+        dev: Device,
+        rng: np.random.Generator,
+        n: int = 257,
+        *,
+        kind: str = "soft",
+        gamma: float = 0.1,
+        radius: float | None = None,
+        size: tuple[int, int] = (24, 20),
+        rule: str = "softmax",
+        **blend: float,
     ):
         self.camera, self.gamma, self.kind, self.rule = make_camera(*size), gamma, kind, rule
         self.positions = make_points(rng, n)
@@ -173,38 +217,43 @@ class Blended:
         self.opacity[1::7] = 1
         self.point_features = rng.normal(size=(n, 16))
         self.grad = rng.normal(size=(size[0] * size[1], 16))
-        self.scene = PairedPoints(dev, self.camera, self.positions, self.radius, kind)
+        self.scene = PairedPoints(dev, self.camera, self.positions, self.radius, kind=kind)
         self.features = self.scene.blend(
             self.opacity, gamma, self.point_features, rule=rule, **blend
         ).reshape(-1, 16)
-        self.geometry = oracle.geometry(self.camera, self.positions, self.radius, kind) | {
-            "hit": self.scene.hits()
-        }
+        self.geometry = self.scene.geometry()
         stop = blend.get("early_stop", 0.0)
         if rule == "alpha":
-            self.blend = oracle.alpha(self.geometry, self.opacity, max(stop, blend.get("tau", 0.0)))
+            self.blend = dense.alpha(self.geometry, self.opacity, max(stop, blend.get("tau", 0.0)))
         else:
-            self.blend = oracle.blend(self.geometry, self.opacity, gamma, stop)
+            self.blend = dense.blend(self.geometry, self.opacity, gamma, stop)
         self.weight = self.scene.weight()
         self.role = self.scene.dense(self.scene.roles())
 
-    def gradients(self):
+    def gradients(self) -> Gradients:
         """The kernels' gradients of sum(features * grad)."""
         return self.scene.gradients(self.grad)
 
-    def oracle_gradients(self, max_tracked=0, mean=False):
-        """The same by the oracle: (features, opacity, by pair and logit, or by pair and alpha)."""
+    def reference_gradients(
+        self, max_tracked: int = 0, mean: bool = False
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """The same in float64: (features, opacity, by pair and logit, or by pair and alpha)."""
         if self.rule == "alpha":
-            return oracle.alpha_gradients(
-                self.geometry, self.blend, self.point_features, self.grad, max_tracked, mean
+            return dense.alpha_gradients(
+                self.geometry,
+                self.blend,
+                self.point_features,
+                self.grad,
+                max_tracked=max_tracked,
+                mean=mean,
             )
-        return oracle.blend_gradients(
+        return dense.blend_gradients(
             self.geometry,
             self.blend,
             self.opacity,
             self.point_features,
-            self.grad,
-            self.gamma,
-            max_tracked,
-            mean,
+            grad_features=self.grad,
+            gamma=self.gamma,
+            max_tracked=max_tracked,
+            mean=mean,
         )

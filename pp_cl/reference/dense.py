@@ -2,24 +2,35 @@
 (N, HW).
 """
 
+from typing import Any
+
 import numpy as np
+
+from pp_cl.reference.raster import sh_basis
+
+Arrays = dict[str, np.ndarray]
 
 EPS = 1e-6
 DEPTH_RANGE = (2.0, 6.0)  # (near, far) where a test gives no other
 LEAST_RADIUS = 0.75
 
 
-def camera_space(camera, positions):
+def camera_space(camera: Any, positions: np.ndarray) -> np.ndarray:
     """(N, 3) positions in camera axes."""
     return (np.asarray(positions, np.float64) - camera.eye) @ camera.pose[:, :3]
 
 
-def pixel_width(camera, t):
+def pixel_width(camera: Any, t: np.ndarray) -> np.ndarray:
     """World width of a pixel at range t."""
     return t / min(camera.fx, camera.fy)
 
 
-def kept(camera, positions, radius, depth_range=DEPTH_RANGE):
+def kept(
+    camera: Any,
+    positions: np.ndarray,
+    radius: np.ndarray | float,
+    depth_range: tuple[float, float] = DEPTH_RANGE,
+) -> np.ndarray:
     """(N,) bool: finite, in front of the eye, and t - radius in [near, far]."""
     near, far = depth_range
     with np.errstate(all="ignore"):
@@ -29,7 +40,7 @@ def kept(camera, positions, radius, depth_range=DEPTH_RANGE):
         return np.isfinite(t) & (t > 0) & (front >= near) & (front <= far) & (c[:, 2] >= 1e-6 * t)
 
 
-def rays(camera):
+def rays(camera: Any) -> np.ndarray:
     """(HW, 3) unit rays through the pixel centres, in camera axes."""
     y, x = np.mgrid[: camera.height, : camera.width]
     r = np.stack(
@@ -38,7 +49,14 @@ def rays(camera):
     return r / np.linalg.norm(r, axis=1, keepdims=True)
 
 
-def geometry(camera, positions, radius, kind, depth_range=DEPTH_RANGE):
+def geometry(
+    camera: Any,
+    positions: np.ndarray,
+    radius: np.ndarray | float,
+    kind: str,
+    *,
+    depth_range: tuple[float, float] = DEPTH_RANGE,
+) -> Arrays:
     """Dict of (N, HW) arrays: hit, closeness, depth, z = normalised depth, and margin = distance of
     the hit test from its edge, in pixels.
 
@@ -78,7 +96,7 @@ def geometry(camera, positions, radius, kind, depth_range=DEPTH_RANGE):
     }
 
 
-def pulsar_box(camera, c, radius):
+def pulsar_box(camera: Any, c: np.ndarray, radius: np.ndarray) -> np.ndarray:
     """(N, HW) bool: the pixel lies in the sphere's box [floor(min), ceil(max)] of Pulsar; unbounded
     at the eye's plane.
     """
@@ -98,7 +116,7 @@ def pulsar_box(camera, c, radius):
     return inside
 
 
-def order(geometry_):
+def order(geometry_: Arrays) -> np.ndarray:
     """(N, HW) int: each hit's place in its pixel by (depth, index), from 0; other entries are
     meaningless.
     """
@@ -110,14 +128,14 @@ def order(geometry_):
     return ranks
 
 
-def blend(geometry_, opacity, gamma, stop=0.0):
+def blend(geometry_: Arrays, opacity: np.ndarray, gamma: float, stop: float = 0.0) -> Arrays:
     """Dict: weight (N, HW) b; share (N, HW) b/o, its limit at o = 0; z (N, HW); background (HW,)
     b_0; hit (N, HW) used.
     """
     hit, d, z = geometry_["hit"], geometry_["closeness"], geometry_["z"]
     o = np.asarray(opacity, np.float64)[:, None]
     if stop > 0:
-        hit = hit & ~stopped(hit, d, o, z, order(geometry_), gamma, stop)
+        hit = hit & ~_stopped(geometry_, o, gamma, stop)
     with np.errstate(divide="ignore", invalid="ignore"):  # outside the hits
         log_weight = np.where(hit, np.log(o * d) + o * z / gamma, -np.inf)
         log_share = np.where(hit, np.log(d) + o * z / gamma, -np.inf)
@@ -132,9 +150,10 @@ def blend(geometry_, opacity, gamma, stop=0.0):
     }
 
 
-def stopped(hit, d, o, z, ranks, gamma, stop):
+def _stopped(geometry_, o, gamma, stop):
     """(N, HW) bool: hits behind the early stop of their pixel."""
-    result = np.zeros_like(hit)
+    hit, d, z = geometry_["hit"], geometry_["closeness"], geometry_["z"]
+    result, ranks = np.zeros_like(hit), order(geometry_)
     for q in np.flatnonzero(hit.any(axis=0)):
         points = np.flatnonzero(hit[:, q])
         points = points[np.argsort(ranks[points, q])]
@@ -150,7 +169,7 @@ def stopped(hit, d, o, z, ranks, gamma, stop):
     return result
 
 
-def features(blend_, point_features):
+def features(blend_: Arrays, point_features: np.ndarray) -> np.ndarray:
     """(HW, C) blended features over a background of 1."""
     return (
         blend_["weight"].T @ np.asarray(point_features, np.float64) + blend_["background"][:, None]
@@ -158,8 +177,16 @@ def features(blend_, point_features):
 
 
 def blend_gradients(
-    geometry_, blend_, opacity, point_features, grad_features, gamma, max_tracked=0, mean=False
-):
+    geometry_: Arrays,
+    blend_: Arrays,
+    opacity: np.ndarray,
+    point_features: np.ndarray,
+    *,
+    grad_features: np.ndarray,
+    gamma: float,
+    max_tracked: int = 0,
+    mean: bool = False,
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """(dL/df (N, C), dL/do (N,), dL/dl (N, HW)) of grad_features (HW, C) for the max_tracked
     nearest hits (0: all).
     """
@@ -174,7 +201,7 @@ def blend_gradients(
     return scale[:, None] * (weight @ G), scale * dL_do, scale[:, None] * weight * s
 
 
-def alpha(geometry_, opacity, least=0.0):
+def alpha(geometry_: Arrays, opacity: np.ndarray, least: float = 0.0) -> Arrays:
     """Dict of front-to-back compositing: alpha (N, HW); weight (N, HW) b; through (N, HW) T in
     front of a hit; background (HW,) what is left; hit (N, HW) used: those where T >= least.
     """
@@ -199,7 +226,15 @@ def alpha(geometry_, opacity, least=0.0):
     }
 
 
-def alpha_gradients(geometry_, blend_, point_features, grad_features, max_tracked=0, mean=False):
+def alpha_gradients(
+    geometry_: Arrays,
+    blend_: Arrays,
+    point_features: np.ndarray,
+    grad_features: np.ndarray,
+    *,
+    max_tracked: int = 0,
+    mean: bool = False,
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """(dL/df (N, C), dL/do (N,), dL/dalpha (N, HW)) as blend_gradients."""
     G, f = np.asarray(grad_features, np.float64), np.asarray(point_features, np.float64)
     own, ranks = f @ G.T, order(geometry_)
@@ -218,36 +253,7 @@ def alpha_gradients(geometry_, blend_, point_features, grad_features, max_tracke
     return scale[:, None] * (weight @ G), scale * dL_do, scale[:, None] * slope
 
 
-SH = (
-    0.28209479177387814,
-    0.4886025119029199,
-    1.0925484305920792,
-    0.9461746957575601,
-    0.31539156525252005,
-    0.5462742152960396,
-)
-
-
-def sh_basis(directions):
-    """(N, 9) real harmonics of degrees 0 to 2 of unit directions (N, 3)."""
-    x, y, z = np.asarray(directions, np.float64).T
-    return np.stack(
-        [
-            np.full_like(x, SH[0]),
-            -SH[1] * y,
-            SH[1] * z,
-            -SH[1] * x,
-            SH[2] * x * y,
-            -SH[2] * y * z,
-            SH[3] * z * z - SH[4],
-            -SH[2] * x * z,
-            SH[5] * (x * x - y * y),
-        ],
-        -1,
-    )
-
-
-def shade(positions, eye, coefficients):
+def shade(positions: np.ndarray, eye: np.ndarray, coefficients: np.ndarray) -> np.ndarray:
     """(N, C) features of coefficients (N, K, C), K = 1, 4 or 9."""
     v = np.asarray(positions, np.float64) - eye
     basis = sh_basis(v / np.linalg.norm(v, axis=1, keepdims=True))

@@ -1,0 +1,41 @@
+"""The command pp-cl selftest."""
+
+import argparse
+
+from pp_cl.commands import options as shared
+from pp_cl.errors import Stopped
+
+HELP = "compare the kernels with float64 on this device, hard cases included"
+EPILOG = """\
+Each line is a case: the error that came closest to its bound, the bound, and whether it holds. What
+is printed is meant to be pasted into a report of a fault. Exit status: 0 all cases pass, 1 some
+fail, 2 there is no such device."""
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the command's options."""
+    parser.add_argument("--json", metavar="FILE", help="also write the results there")
+    shared.add_device(parser)
+
+
+def run(options: argparse.Namespace) -> None:
+    """Run the cases, print the table. Raises Stopped, which names them, where cases fail."""
+    from pp_cl.device.discover import open_device
+    from pp_cl.files.atomic import write_json
+    from pp_cl.selftest.report import HEAD, as_json, line, setup
+    from pp_cl.selftest.run import CASES, run_cases
+
+    dev = open_device(options.device)
+    for what, name in setup(dev).items():
+        print(f"{what:14}{name}")
+    print(f"\n{HEAD}", flush=True)
+    rows = []
+    for row in run_cases(dev, CASES):
+        rows.append(row)
+        print(line(row), flush=True)
+    if options.json:
+        write_json(options.json, as_json(dev, rows))
+    seconds, failed = sum(row.seconds for row in rows), [row.case for row in rows if not row.passed]
+    print(f"\n{len(rows)} cases in {seconds:.0f} s, {len(rows) - len(failed)} pass", flush=True)
+    if failed:
+        raise Stopped(f"selftest: {len(failed)} failed: {'; '.join(failed)}", 1)

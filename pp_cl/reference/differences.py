@@ -1,0 +1,25 @@
+"""Gradients by finite differences."""
+
+from collections.abc import Callable, Iterable
+
+import numpy as np
+
+
+def numeric_gradient(
+    function: Callable[[np.ndarray], float],
+    values: np.ndarray,
+    step: float,
+    indices: Iterable[int] | None = None,
+) -> np.ndarray:
+    """Central differences of a scalar function of a float64 array, at flat `indices` (all by
+    default): (len(indices),).
+    """
+    values = np.array(values, np.float64)
+    indices = range(values.size) if indices is None else indices
+    gradient = []
+    for i in indices:
+        upper, lower = values.copy(), values.copy()
+        upper.flat[i] += step
+        lower.flat[i] -= step
+        gradient.append((function(upper) - function(lower)) / (2 * step))
+    return np.array(gradient)

@@ -1,0 +1,49 @@
+"""Cases of prefix sums and of rows that are moved: exact, as all of it is integers and copies."""
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from pp_cl.device.compact import compact_rows, gather_rows
+from pp_cl.device.device import Device
+from pp_cl.device.scan import BLOCK, exclusive_scan, nonzero
+from pp_cl.selftest.case import SIZES, Case, Check, exact
+
+
+def _scan(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
+    """One block, its edges, two levels and three; sums up to 32 bits."""
+    for n in (*SIZES, BLOCK, BLOCK + 1, BLOCK * BLOCK + 1):
+        values = rng.integers(0, 9, n, dtype=np.uint32)
+        offsets = dev.empty((n + 1,), np.uint32)
+        exclusive_scan(dev, dev.upload(values), offsets)
+        yield exact(offsets.get(), np.concatenate([[0], np.cumsum(values)]))
+    offsets = dev.empty((4,), np.uint32)
+    exclusive_scan(dev, dev.upload([2**31, 2**31 - 1, 0], np.uint32), offsets)
+    yield exact(offsets.get(), [0, 2**31, 2**32 - 1, 2**32 - 1])
+
+
+def _nonzero(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
+    for n in (*SIZES, BLOCK + 1):
+        values = rng.integers(1, 9, n, dtype=np.uint32) * (rng.random(n) < 0.3)
+        offsets, indices = dev.empty((n + 1,), np.uint32), dev.empty((n,), np.uint32)
+        count = nonzero(dev, dev.upload(values, np.uint32), offsets, indices)
+        yield exact(indices.get()[:count], np.flatnonzero(values))
+
+
+def _compact(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
+    """Every bit is kept, those of NaN among them."""
+    for n in SIZES:
+        source = rng.integers(0, 2**32, (n, 3, 16), dtype=np.uint32)
+        kept = np.flatnonzero(rng.random(n) < 0.6) if n > 1 else np.zeros(1, int)
+        rows = compact_rows(dev, dev.upload(source.view(np.float32)), dev.upload(kept, np.uint32))
+        yield exact(rows.get().view(np.uint32), source[kept])
+        some = rng.integers(0, n, 3 * n)
+        gathered = gather_rows(dev, dev.upload(source), dev.upload(some, np.uint32))
+        yield exact(gathered.get(), source[some])
+
+
+CASES = (
+    Case("device: scan", _scan),
+    Case("device: list of non-zero values", _nonzero),
+    Case("device: compact and gather rows", _compact),
+)

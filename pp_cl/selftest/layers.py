@@ -1,0 +1,191 @@
+"""Cases of the layers: convolutions of every variant, pooling, upsampling, gate, tiles."""
+
+from collections.abc import Iterator
+from functools import cache, partial
+
+import numpy as np
+
+from pp_cl.device.device import Device
+from pp_cl.layers.blocking import shipped_blocking
+from pp_cl.layers.gate import gate_backward, gate_forward
+from pp_cl.layers.resample import (
+    affine,
+    avgpool2_backward,
+    avgpool2_forward,
+    maxpool2_backward,
+    maxpool2_forward,
+    upsample2_backward,
+    upsample2_forward,
+)
+from pp_cl.layers.tiles import copy_list, tiles_compare, tiles_copy, tiles_find
+from pp_cl.layers.variants import VARIANTS
+from pp_cl.reference import lpips, network
+from pp_cl.selftest.case import EPS, Case, Check, each, exact, relative
+from pp_cl.selftest.convolutions import Layer, within
+from pp_cl.selftest.hard_layers import hard_layers
+
+# (height, width, channels of each part of the input, channels out, side of the kernel)
+SHAPES = (
+    (1, 1, (16,), 16, 3),
+    (1, 31, (16,), 32, 3),
+    (31, 33, (16, 32), 48, 3),
+    (257, 3, (32,), 16, 3),
+    (8, 8, (512,), 32, 3),
+)
+DIRECT_SHAPES = (*SHAPES, (5, 31, (3,), 20, 3), (31, 33, (16, 32), 48, 1), (1, 1, (3,), 3, 1))
+# of the largest value: sums of up to 4608 products, each rounded by half EPS, grow as their root,
+# 4e-6, of which the largest of the values seen has the more the longer the sum; those of F(4x4)
+# pass through transforms that enlarge it. In a gradient of weights a sum is as long as the image.
+BOUNDS = {"direct": 3e-6, "winograd2": 3e-6, "winograd4": 8e-6}
+WEIGHTS_BOUND = 5e-6
+
+PLANES = ((1, 1, 16), (1, 5, 3), (31, 33, 17), (3, 257, 32))  # (H, W, C)
+FOUR = 4 * EPS  # means and interpolations of four values
+GATED = 4 * EPS  # exp, expm1 and a division: some units in the last place each
+
+
+def _normal(rng, *shape):
+    return rng.normal(size=shape).astype(np.float32)
+
+
+@cache
+def _layers():
+    """[Layer] of SHAPES and DIRECT_SHAPES, computed once for all variants."""
+    rng = np.random.default_rng(3)
+    layers = []
+    for height, width, parts, co, k in DIRECT_SHAPES:
+        bound = 1 / np.sqrt(sum(parts) * k * k)  # PyTorch's initial size
+        weight = rng.uniform(-bound, bound, (co, sum(parts), k, k)).astype(np.float32)
+        bias = rng.uniform(-bound, bound, co).astype(np.float32)
+        inputs = [np.maximum(_normal(rng, height, width, c), 0) for c in parts]
+        layers.append(Layer(inputs, weight, bias, _normal(rng, height, width, co), relu=True))
+    return layers
+
+
+@cache
+def _hard_layers():
+    """{name: Layer}, computed once for all variants."""
+    layers = hard_layers(np.random.default_rng(7))
+    return {name: Layer([x], *others) for name, (x, *others) in layers.items()}
+
+
+def _convolution(variant: str, dev: Device, rng: np.random.Generator) -> Iterator[Check]:
+    """All directions; awkward sizes, two sources, a masked gradient."""
+    blocking = shipped_blocking(dev)
+    layers = _layers() if variant == "direct" else _layers()[: len(SHAPES)]
+    for layer in layers:
+        forward, weights, bias, *inputs = layer.results(dev, variant, blocking)
+        for result in (forward, *inputs):
+            if VARIANTS[variant].half:
+                yield within(variant, result)
+            else:
+                yield relative(result.actual, result.expected, BOUNDS[variant])
+        for result in (weights, bias):
+            bound = max(WEIGHTS_BOUND, BOUNDS.get(variant, 0))
+            yield relative(result.actual, result.expected, bound)
+
+
+def _hard_convolution(variant: str, dev: Device, rng: np.random.Generator) -> Iterator[Check]:
+    """Large means, weights over six decades, values of 6e4 and 1e-7, 512 channels, zeros."""
+    for layer in _hard_layers().values():
+        for result in layer.results(dev, variant, shipped_blocking(dev)):
+            yield within(variant, result)
+
+
+def _pool(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
+    """Means of 2x2 pixels; the gradient is added, and masked by a ReLU."""
+    for h, w, c in PLANES:
+        x, other = np.maximum(_normal(rng, 2 * h, 2 * w, c), 0), _normal(rng, 2 * h, 2 * w, c)
+        grad_out, out, grad_x = _normal(rng, h, w, c), dev.empty((h, w, c)), dev.upload(other)
+        avgpool2_forward(dev, dev.upload(x), out)
+        yield relative(out.get(), network.pool(x.astype(np.float64)), FOUR)
+        avgpool2_backward(dev, dev.upload(x), dev.upload(grad_out), grad_x)
+        expected = (other + network.pool_backward(grad_out.astype(np.float64))) * (x > 0)
+        yield relative(grad_x.get(), expected, FOUR)
+
+
+def _max_pool(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
+    """The gradient goes to the first of equal ones, and not to cells of zeros; odd borders drop."""
+    for shape in ((2, 2, 16), (3, 5, 3), (31, 33, 17), (257, 2, 32)):
+        x = np.maximum(rng.integers(-3, 3, shape), 0).astype(np.float32)
+        pooled, other = (shape[0] // 2, shape[1] // 2, shape[2]), _normal(rng, *shape)
+        grad_out, out, grad_x = _normal(rng, *pooled), dev.empty(pooled), dev.upload(other)
+        maxpool2_forward(dev, dev.upload(x), out)
+        yield exact(out.get(), lpips.maxpool2(x))
+        maxpool2_backward(dev, dev.upload(x), dev.upload(grad_out), grad_x)
+        expected = other + lpips.maxpool2_gradient(x, grad_out) * (x > 0)
+        yield relative(grad_x.get(), expected, FOUR)
+
+
+def _upsample(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
+    for h, w, c in PLANES:
+        x, grad_out = _normal(rng, h, w, c), _normal(rng, 2 * h, 2 * w, c)
+        out, grad_x = dev.empty(grad_out.shape), dev.empty(x.shape)
+        upsample2_forward(dev, dev.upload(x), out)
+        yield relative(out.get(), network.upsample(x.astype(np.float64)), FOUR)
+        upsample2_backward(dev, dev.upload(grad_out), grad_x)
+        # sums of up to 16 weighted values
+        expected = network.upsample_backward(grad_out.astype(np.float64))
+        yield relative(grad_x.get(), expected, 8 * EPS)
+    constant, out = np.full((3, 5, 16), 1e3, np.float32), dev.empty((6, 10, 16))
+    upsample2_forward(dev, dev.upload(constant), out)
+    yield exact(out.get(), np.full((6, 10, 16), 1e3))
+
+
+def _affine(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
+    x = _normal(rng, 31, 33, 3)
+    out = dev.upload(x)
+    affine(dev, 0.5, 0.25, out, out=out)
+    yield relative(out.get(), 0.5 * x.astype(np.float64) + 0.25, EPS)
+
+
+def _gate(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
+    """Sizes; features and gates from 1e-12 to 60, where expm1 would cancel and exp overflow."""
+    for h, w, c in PLANES:
+        x, grad_out = 3 * _normal(rng, h, w, 2 * c), _normal(rng, h, w, c)
+        out, grad_x = _gated(dev, x, grad_out)
+        exact_x, exact_grad = x.astype(np.float64), grad_out.astype(np.float64)
+        yield relative(out, network.gate(exact_x), GATED)
+        yield relative(grad_x, network.gate_backward(exact_x, exact_grad), GATED)
+    powers = 10.0 ** np.arange(-12, 2)
+    values = [*-powers, 0, *powers, -40, 40, -60, 60]
+    x = np.stack(np.meshgrid(values, values), -1).reshape(1, -1, 2).astype(np.float32)
+    ones = np.ones((1, x.shape[1], 1), np.float32)
+    out, grad_x = _gated(dev, x, ones)
+    x = x.astype(np.float64)
+    # OpenCL allows exp and expm1 three units each; what float32 holds as a subnormal may be 0
+    yield each(out, network.gate(x), 3e-6, floor=1e-32)
+    yield each(grad_x, network.gate_backward(x, ones.astype(np.float64)), 3e-6, floor=1e-32)
+
+
+def _gated(dev, x, grad_out):
+    out, grad_x, device_x = dev.empty(grad_out.shape), dev.empty(x.shape), dev.upload(x)
+    gate_forward(dev, device_x, out)
+    gate_backward(dev, device_x, dev.upload(grad_out), grad_x)
+    return out.get(), grad_x.get()
+
+
+def _tiles(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
+    """Which tiles of 4x4 pixels hold something, which differ, copies of them."""
+    x = np.ones((8, 256, 20), np.float32)
+    chosen = rng.random((2, 64)) < 0.3
+    for row, column in np.argwhere(chosen):
+        y, z = 4 * row + rng.integers(4), 4 * column + rng.integers(4)
+        x[y, z, rng.integers(20)] = rng.choice([0.0, np.nan, np.inf, 1 + EPS])
+    array, source = dev.upload(x), np.full((2, 64), np.flatnonzero(~chosen)[0])
+    yield exact(tiles_find(dev, array, 1.0), chosen)
+    yield exact(tiles_compare(dev, array, source), chosen)
+    tiles_copy(dev, array, copy_list(dev, source, chosen))
+    yield exact(array.get(), np.ones_like(x))
+
+
+CASES = (
+    *(Case(f"conv: {v}", partial(_convolution, v), v) for v in VARIANTS),
+    *(Case(f"conv: {v}, hard inputs", partial(_hard_convolution, v), v) for v in VARIANTS),
+    Case("layers: mean pooling", _pool),
+    Case("layers: max pooling", _max_pool),
+    Case("layers: upsampling", _upsample),
+    Case("layers: affine", _affine),
+    Case("layers: gate", _gate),
+    Case("layers: tiles", _tiles),
+)

@@ -1,0 +1,92 @@
+"""Cases of the metrics: LPIPS, and points against a mesh."""
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from pp_cl.device.device import Device
+from pp_cl.metrics.lpips import Lpips
+from pp_cl.metrics.shape import Mesh, sample_surface
+from pp_cl.reference import lpips
+from pp_cl.scene.grid import Grid
+from pp_cl.selftest.case import SIZES, Case, Check, each, exact, relative
+
+BOX = np.array([(x, y, z) for x in (-0.39, 0.39) for y in (-0.29, 0.29) for z in (-0.19, 0.19)])
+QUADS = ((0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3))
+
+
+def _input(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
+    """Of the rectangle at (2, 1) of a larger image; the gradient is added."""
+    scale = lpips.scaled_input(np.ones(3)) - lpips.scaled_input(np.zeros(3))
+    for w in SIZES:
+        image = rng.uniform(0, 1, (34, w + 5, 3)).astype(np.float32)
+        sizes = {"h": 31, "w": w, "image_width": w + 5, "corner": 3 * (w + 5 + 2)}
+        inside, program = np.s_[1:32, 2 : 2 + w], dev.program("metrics/lpips")
+        x, grad_x = dev.empty((31, w, 3)), rng.normal(size=(31, w, 3)).astype(np.float32)
+        program.launch("lpips_input", (w, 31), image=dev.upload(image), x=x, **sizes)
+        # four roundings of values of up to 2.4
+        yield relative(x.get(), lpips.scaled_input(image[inside].astype(np.float64)), 1e-6)
+        grad_image, expected = dev.upload(np.ones_like(image)), np.ones(image.shape)
+        expected[inside] += scale * grad_x
+        program.launch(
+            "lpips_input_backward",
+            (w, 31),
+            grad_x=dev.upload(grad_x),
+            grad_image=grad_image,
+            **sizes,
+        )
+        yield relative(grad_image.get(), expected, 1e-6)
+
+
+def _distance(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
+    """Features whose lengths differ a millionfold; none; equal ones."""
+    for n in SIZES:
+        for channels in (16, 512):
+            features = np.maximum(rng.normal(size=(2, n, channels)), 0)
+            a, b = (features * 10 ** rng.uniform(-3, 3, (2, n, 1))).astype(np.float32)
+            a[0], a[-1] = 0, 0 if n == 1 else b[-1]
+            head = rng.uniform(0, 1, channels).astype(np.float32)
+            exact_a, exact_b, exact_head = (v.astype(np.float64) for v in (a, b, head))
+            distance, grad_a = dev.empty((n,)), dev.empty((n, channels))
+            arrays = {"a": dev.upload(a), "b": dev.upload(b), "head": dev.upload(head)}
+            arrays |= {"n": n, "c": channels}
+            program = dev.program("metrics/lpips")
+            program.launch("lpips_distance", n, distance=distance, **arrays)
+            # sums over 512 channels in 16 lanes: 32 roundings in a row, and those of a root
+            expected = lpips.pixel_distance(exact_a, exact_b, exact_head)
+            yield relative(distance.get(), expected, 2e-6)
+            program.launch("lpips_distance_backward", n, weight=0.3, grad_a=grad_a, **arrays)
+            expected = 0.3 * lpips.pixel_distance_gradient(exact_a, exact_b, exact_head) * (a > 0)
+            # times the length, by which gradients differ a millionfold
+            length = np.linalg.norm(exact_a, axis=1, keepdims=True)
+            yield relative(grad_a.get() * length, expected * length, 3e-6)
+            yield exact(grad_a.get()[[0, -1]], np.zeros((2, channels)))
+
+
+def _lpips(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
+    """A network of VGG16's shape with few channels: thirteen convolutions, each within 3e-6."""
+    weights = lpips.random_weights(rng)
+    for size in ((16, 16), (17, 33)):
+        a = rng.uniform(0, 1, (*size, 3))
+        b = np.clip(a + rng.normal(0, 0.1, a.shape), 0, 1)
+        yield each(Lpips(dev, weights).distance(a, b), lpips.lpips(a, b, weights), 1e-5)
+
+
+def _box(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
+    """Sides at 0.39, 0.29 and 0.19 are nearest to the layers at 0.35, 0.25 and 0.15."""
+    faces = np.array([t for a, b, c, d in QUADS for t in ((a, b, c), (a, c, d))])
+    grid = Grid((-0.45, -0.35, -0.25), 0.1, (10, 8, 6))
+    surface = sample_surface(dev, Mesh(BOX, faces), grid, 200_000)
+    expected = np.zeros((6, 8, 10), bool)
+    expected[1:5, 1:7, 1:9] = True
+    expected[2:4, 2:6, 2:8] = False
+    yield exact(surface.holds(grid, np.arange(10 * 8 * 6)), expected.ravel())
+    yield exact(surface.count, expected.sum())
+
+
+CASES = (
+    Case("metrics: input of LPIPS", _input),
+    Case("metrics: distance of LPIPS", _distance),
+    Case("metrics: LPIPS", _lpips),
+    Case("metrics: vertices on a box", _box),
+)

@@ -1,0 +1,203 @@
+"""Cases of the rasteriser before and after the blend weights: project, pairs, shade, depth."""
+
+from collections.abc import Iterator
+from dataclasses import replace
+from functools import partial
+
+import numpy as np
+
+from pp_cl.device.device import Device
+from pp_cl.raster.blend import BLENDS
+from pp_cl.raster.blend_weights import DROPPED
+from pp_cl.raster.depth import depth_forward
+from pp_cl.raster.project import KINDS, Footprint, Projection
+from pp_cl.raster.sh import SH_BLOCKS
+from pp_cl.raster.shade import shade_forward
+from pp_cl.reference import dense
+from pp_cl.scene.grid import Grid
+from pp_cl.selftest.case import EPS, SIZES, Case, Check, each, exact, finite, relative
+from pp_cl.selftest.points import (
+    AXIS,
+    FAR,
+    Blended,
+    PairedPoints,
+    blend_on_axis,
+    depth_at,
+    make_camera,
+    make_points,
+)
+
+GRID = Grid((-1.1, -0.9, -0.7), 0.05, (45, 37, 29))
+PLACED = 1e-6  # a rotation of a difference: 8 roundings of half EPS, and the camera's own two
+BAND = 1e-4  # pixels beside the edge of a footprint where rounding may decide
+CLOSENESS = 1e-4  # that band's: of a radius of at least 0.75 pixels
+RIM = 1e-3  # the depth of a sphere is steep at its rim
+SUMMED = 1e-5  # a sum of up to 80 weights, half EPS each, over another one
+
+
+def _project(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
+    """Vertices of a grid; spheres of which the depth range culls some, by their front."""
+    camera, depth_range = make_camera(), (3.5, 4.8)
+    for n in SIZES:
+        ids = rng.choice(np.prod(GRID.dims), n, replace=False)
+        ids[0] = np.prod(GRID.dims) - 1
+        points = Projection(dev, Footprint("disc")).grid(
+            dev.upload(camera.packed(dense.DEPTH_RANGE)),
+            dev.upload(GRID.packed()),
+            dev.upload(ids, np.uint32),
+            dev.zeros((1,)),
+        )
+        place = dense.camera_space(camera, GRID.positions(ids))
+        yield relative(points.point_camera.get()[:, :3], place, PLACED)
+        yield relative(points.point_camera.get()[:, 3], np.linalg.norm(place, axis=1), PLACED)
+
+        positions, radius = make_points(rng, n), rng.uniform(0.01, 0.3, n)
+        spheres = PairedPoints(dev, camera, positions, radius, depth_range=depth_range)
+        placed = spheres.projected.point_camera.get()
+        kept = dense.kept(camera, positions, radius, depth_range)
+        yield exact(placed[:, 3] >= 0, kept)
+        yield relative(placed[kept, :3], dense.camera_space(camera, positions)[kept], PLACED)
+
+
+def _not_finite(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
+    """Positions that are NaN, infinite or too large are left out and reach nothing."""
+    for bad in (np.nan, np.inf, -np.inf, 3e38, -3e38):
+        positions = np.array([[0, 0, 3.0], [0, 0, 3.0], [0.001, 0, 4.0]])
+        positions[1, rng.integers(3)] = bad
+        scene = PairedPoints(dev, AXIS, positions, 0.1, kind="sphere")
+        yield exact(scene.pairs.seen.get(), [0, 2])
+        features = scene.blend(np.ones(3), 0.01, np.ones((3, 16)) * 2)
+        ones = np.ones((1, 1, 16))
+        gradients = scene.gradients(ones) | scene.sphere_gradients(ones)
+        yield finite(features, *gradients.values())
+        yield exact([g[1].any() for g in gradients.values()], [False] * 4)
+
+
+def _behind(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
+    """Points behind the eye, on its plane and at the eye are left out."""
+    positions = np.array([[0, 0, -3.0], [0, 0, 0], [3.0, 0, 0], [0, 3.0, 1e-9], [0, 0, 3.0]])
+    for kind in KINDS:
+        scene = PairedPoints(dev, AXIS, positions, 0.01, kind=kind, depth_range=(1e-3, FAR))
+        yield exact(scene.projected.point_camera.get()[:, 3], [-1, -1, -1, -1, 3])
+        yield exact(scene.pairs.seen.get(), [4])
+
+
+def _pairs(kind: str, dev: Device, rng: np.random.Generator) -> Iterator[Check]:
+    """Which pixels a point hits, how close to its centre, at which depth, in which order."""
+    camera = replace(make_camera(33, 31), fy=26.0)
+    for n in SIZES:
+        positions, radius = make_points(rng, n), np.float32(10.0 ** rng.uniform(-3, 0, n))
+        scene = PairedPoints(dev, camera, positions, radius, kind=kind)
+        yield from _check_pairs(scene, dense.geometry(camera, positions, radius, kind))
+
+
+def _check_pairs(scene, expected):
+    """tests/raster/test_pairs.py says more of each."""
+    pairs, total, hits = scene.pairs, scene.pairs.total, scene.hits()
+    clear = expected["margin"] > BAND
+    yield exact(hits[clear], expected["hit"][clear])
+    yield exact(hits.sum(), total)
+    points, pixels = scene.pair_points(), pairs.pair_pixel.get()[:total].astype(np.int64)
+    source = pairs.pair_point_closeness.get()[:total]
+    yield exact(source[:, 0], points)
+    closeness = source[:, 1].view(np.float32)
+    yield relative(closeness, expected["closeness"][points, pixels], CLOSENESS)
+    counts, keys = np.diff(pairs.pixel_offset.get().astype(np.int64)), pairs.pair_key.get()[:total]
+    yield exact(counts, hits.sum(axis=0))
+    pair = (keys & 0xFFFFFFFF).astype(np.int64)
+    depth = (keys >> 32).astype(np.uint32).view(np.float32)
+    yield exact(np.sort(pair), np.arange(total))
+    yield exact(pixels[pair], np.repeat(np.arange(len(counts)), counts))
+    yield relative(depth, expected["depth"][points[pair], pixels[pair]], RIM)
+    inner = pixels[pair][1:] == pixels[pair][:-1]
+    yield exact((keys[1:] > keys[:-1])[inner], np.ones(inner.sum(), bool))
+    yield exact(pairs.seen.get(), np.flatnonzero(hits.any(axis=1)))
+
+
+def _equal_depths(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
+    """Thousands of points at few depths in one pixel: a stable order."""
+    camera = replace(AXIS, fx=30.0, fy=33.0)
+    for n in (*SIZES, 10_000):
+        positions = np.zeros((n, 3))
+        positions[:, 2] = np.round(rng.uniform(2.2, 5.9, n), 2)
+        pairs = PairedPoints(dev, camera, positions, 0.1).pairs
+        order = np.argsort(positions[:, 2].astype(np.float32), kind="stable")
+        yield exact(pairs.pair_key.get()[: pairs.total] & 0xFFFFFFFF, order)
+
+
+def _shade(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
+    """Harmonics of all degrees; points that are not listed keep their features."""
+    camera = make_camera()
+    for n in SIZES:
+        positions = make_points(rng, n)
+        scene = PairedPoints(dev, camera, positions, 0.1)
+        seen = np.flatnonzero(dense.kept(camera, positions, 0.1))[::2]
+        for degree in range(3):
+            sh = [rng.normal(size=(n, b.count, 16)) for b in SH_BLOCKS if b.degree <= degree]
+            features = dev.upload(np.full((n, 16), 7.0), np.float32)
+            shade_forward(
+                dev,
+                scene.projected,
+                dev.upload(seen, np.uint32),
+                [dev.upload(block, np.float32) for block in sh],
+                point_features=features,
+            )
+            expected = dense.shade(positions, camera.eye, np.concatenate(sh, axis=1))
+            # nine products of a direction's squares: 5 roundings each, of values of up to 4
+            yield relative(features.get()[seen], expected[seen], 1e-5)
+            yield exact(np.delete(features.get(), seen, axis=0), np.full((n - len(seen), 16), 7))
+
+
+def _depth(rule: str, dev: Device, rng: np.random.Generator) -> Iterator[Check]:
+    """Alpha and mean depth by the blend weights; the median of three points by hand."""
+    for n in (31, 257):
+        blended = Blended(dev, rng, n, gamma=0.02, radius=0.4, rule=rule, tau=1e-2)
+        scene = blended.scene
+        alpha, depth, _ = _depths(dev, scene)
+        weight = np.where(blended.role == DROPPED, 0, scene.weight()).astype(np.float64)
+        z = (blended.positions - scene.camera.eye) @ scene.camera.pose[:, 2]
+        total = weight.sum(axis=0)
+        hit = total > 0
+        yield each(alpha, np.minimum(total, 1), SUMMED, floor=1e-2)
+        yield exact(np.isinf(depth), ~hit)
+        mean = (weight * z[:, None]).sum(axis=0)[hit] / total[hit]
+        yield relative(depth[hit], mean, SUMMED)
+    scene, _ = blend_on_axis(dev, [0.9, 0.5, 0.1], [0.25, 1.0, 1.0], 0.1, rule="alpha")
+    alpha, depth, median = _depths(dev, scene)
+    near, far = depth_at(0.9), depth_at(0.5)
+    for actual, expected in (
+        (alpha, 1),
+        (depth, 0.25 * near + 0.75 * far),
+        # a quarter at the first, the second quarter is a third of the second's weight
+        (median, near + (far - near) / 3),
+    ):
+        yield relative(actual, [expected], 8 * EPS)
+
+
+def _depths(dev, scene):
+    arrays = depth_forward(dev, scene.projected, scene.pairs, scene.weights, size=scene.shape)
+    return [array.get().ravel() for array in arrays]
+
+
+def _peaks(rule: str, dev: Device, rng: np.random.Generator) -> Iterator[Check]:
+    """The highest weight of each point, and how often it was looked at."""
+    options = {"early_stop": 0.05, "max_tracked": 2}
+    blended = Blended(dev, rng, 500, gamma=0.02, radius=0.4, rule=rule, **options)
+    before, looks = (dev.upload(x * np.arange(500), np.float32) for x in (2e-3, 1))
+    peak, scene = before.copy(), blended.scene
+    scene.weighing.raise_peaks(scene.pairs, scene.weights, peak, looks)
+    yield exact(looks.get() - np.arange(500), blended.geometry["hit"].any(axis=1))
+    weight = blended.blend["weight"].sum(axis=1)
+    yield relative(peak.get(), np.maximum(before.get(), weight), PLACED)
+
+
+CASES = (
+    Case("raster: project", _project),
+    Case("raster: positions that are not finite", _not_finite),
+    Case("raster: points behind and at the eye", _behind),
+    *(Case(f"raster: pairs, {kind}", partial(_pairs, kind)) for kind in KINDS),
+    Case("raster: thousands of equal depths", _equal_depths),
+    Case("raster: shade", _shade),
+    *(Case(f"raster: depth, {rule}", partial(_depth, rule)) for rule in BLENDS),
+    *(Case(f"raster: highest weights, {rule}", partial(_peaks, rule)) for rule in BLENDS),
+)

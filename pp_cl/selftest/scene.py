@@ -1,0 +1,103 @@
+"""Cases of a scene's preparation: hull, targets, the demo."""
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from pp_cl.device.device import Device
+from pp_cl.reference import demo
+from pp_cl.reference.hull import dilated_mask, kept
+from pp_cl.reference.target import target_forward
+from pp_cl.scene.camera import Camera
+from pp_cl.scene.demo import distances
+from pp_cl.scene.grid import Grid
+from pp_cl.scene.hull import Carver
+from pp_cl.scene.target import Target
+from pp_cl.scene.views import MASK_THRESHOLD, View
+from pp_cl.selftest.case import SIZES, Case, Check, absolute, exact
+
+BORDER = 1e-4  # pixels to a pixel border within which float32 may choose the other pixel
+TARGET = 5e-7  # a few roundings of a float32 in [0, 1]
+DEMO = 2e-6  # distances of up to 2, by some ten roundings
+
+
+def _views(rng, share):
+    """Views of three sizes, one of them close, with `share` of the pixels in the mask, at random,
+    with alphas at and beside the threshold.
+    """
+    views = []
+    for eye, (width, height) in (
+        ((3.0, 1, 0.5), (64, 48)),
+        ((-2.0, 2, 1), (31, 33)),
+        ((0.3, -0.4, 0.2), (40, 257)),
+    ):
+        camera = Camera.look_at(
+            eye, (0, 0, 0), (0.3, 0.2, 1), fx=1.5 * width, width=width, height=height
+        )
+        inside = rng.random((height, width, 1)) < share
+        image = np.where(inside, MASK_THRESHOLD + 1, MASK_THRESHOLD).repeat(4, 2).astype(np.uint8)
+        views.append(View("noise", camera, image))
+    return views
+
+
+def _masks(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
+    """Dilated by a pixel and packed to bits."""
+    for view in _views(rng, 0.05):
+        height, width = view.image.shape[:2]
+        words = Carver(dev, [view]).masks.get().reshape(height, -1)
+        bits = np.unpackbits(words.view(np.uint8), axis=-1, bitorder="little")[:, :width]
+        yield exact(bits, dilated_mask(view.image[..., 3], MASK_THRESHOLD))
+
+
+def _hull(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
+    """Which vertices some image sees and no mask rejects, and their numbers."""
+    views = _views(rng, 0.15)
+    carver = Carver(dev, views)
+    for nx in SIZES:
+        edge, ny, nz = 2 / nx, 7, 5
+        grid = Grid((-edge * nx / 2, -edge * ny / 2, -edge * nz / 2 + 0.1), edge, (nx, ny, nz))
+        positions = grid.positions(np.arange(nx * ny * nz))
+        expected, border = kept(views, positions, MASK_THRESHOLD)
+        carving = carver.carve(grid)
+        bits = np.unpackbits(carving.bits.get().view(np.uint8), axis=-1, bitorder="little")
+        found = bits[:, :nx].ravel().astype(bool)
+        yield exact(found[border > BORDER], expected[border > BORDER])
+        yield exact(bits[:, nx:], np.zeros_like(bits[:, nx:]))
+        yield exact(carving.count, found.sum())
+        if carving.count:
+            tight, ids = carver.points(carving)
+            yield absolute(tight.positions(ids), positions[found], 1e-12)  # float64, on the host
+
+
+def _target(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
+    """Means over white of blocks of pixels, some of which reach outside of the image."""
+    image = rng.integers(0, 256, (83, 97, 4), np.uint8)
+    image[..., 3] = rng.choice([0, 255, 7, 130], (83, 97), p=[0.33, 0.33, 0.17, 0.17])
+    view = View("noise", Camera(np.eye(3, 4), 90.0, 95.0, 45.6, 45.7, 97, 83), image)
+    target = Target(dev)
+    target.load(view.reduced(3))
+    black = np.concatenate([np.zeros_like(image[..., :3]), image[..., 3:]], axis=2)
+    for width, height in ((1, 5), (31, 5), (33, 5), (5, 31), (257, 5)):
+        crop = {"width": width, "height": height}
+        box = (1, 2, width, height)
+        expected = target_forward(image, 3, 3 + 2, 6 + 1, **crop)
+        yield absolute(target.crop(box, (2, 1)).get(), expected, TARGET)
+        # over white, the object's share is what a black object would hide
+        hidden = 1 - target_forward(black, 3, 3 + 2, 6 + 1, **crop)[..., 0]
+        yield absolute(target.alpha(box, (2, 1)).get(), hidden, TARGET)
+
+
+def _demo(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
+    for n in SIZES:
+        for start in ((-0.8, 0.02, 0.1), (-0.5, -0.45, -0.9)):
+            grid = Grid(start, 1.6 / n, (n, 1, 1))
+            expected = demo.distance(grid.positions(np.arange(n)))
+            yield absolute(distances(dev, grid).ravel(), expected, DEMO)
+
+
+CASES = (
+    Case("scene: masks", _masks),
+    Case("scene: hull", _hull),
+    Case("scene: target", _target),
+    Case("scene: demo", _demo),
+)

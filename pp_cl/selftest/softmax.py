@@ -1,0 +1,232 @@
+"""Cases of the blend by softmax, Eq. (1): weights, features, gradients, and where a naive formula
+overflows, divides by zero or hangs.
+"""
+
+from collections.abc import Iterator
+from functools import partial
+
+import numpy as np
+
+from pp_cl.device.device import Device
+from pp_cl.raster.blend_weights import DROPPED
+from pp_cl.raster.project import KINDS
+from pp_cl.reference import dense
+from pp_cl.reference.differences import numeric_gradient
+from pp_cl.selftest.case import (
+    SIZES,
+    Case,
+    Check,
+    absolute,
+    each,
+    exact,
+    finite,
+    no_more,
+    relative,
+)
+from pp_cl.selftest.points import (
+    AXIS,
+    FAR,
+    Blended,
+    PairedPoints,
+    blend_on_axis,
+    depth_at,
+    make_camera,
+)
+
+# exponents o z / gamma of up to 100 are off by 100 EPS, 1.2e-5; so is each weight
+WEIGHT = 2e-5
+OPACITY = 5e-5  # dL/do = share (1 + o z / gamma) s: two such factors
+MANY = 1e-4  # a sum of 20000 terms one by one: each rounds all those before it
+NEAREST = 1e-4  # e^100 of a depth near 1: its rounding, and that of the place, times 100
+STEP = 1e-6
+DIFFERENCES = 2e-3  # depths and closeness are steep at the rim, where that step is no small one
+
+
+def _forward(kind: str, dev: Device, rng: np.random.Generator) -> Iterator[Check]:
+    for gamma in (0.1, 0.01):
+        blended = Blended(dev, rng, kind=kind, gamma=gamma)
+        yield absolute(blended.weight, blended.blend["weight"], WEIGHT)
+        expected = dense.features(blended.blend, blended.point_features)
+        yield relative(blended.features, expected, WEIGHT)
+        empty = ~blended.geometry["hit"].any(axis=0)
+        yield exact(blended.features[empty], np.ones((empty.sum(), 16)))
+
+
+def _backward(kind: str, dev: Device, rng: np.random.Generator) -> Iterator[Check]:
+    for gamma, mean, tracked in ((0.1, False, 0), (0.01, False, 3), (0.01, True, 0)):
+        options = {"mean": mean, "max_tracked": tracked}
+        blended = Blended(dev, rng, kind=kind, gamma=gamma, **options)
+        gradients, expected = blended.gradients(), blended.reference_gradients(tracked, mean)
+        yield relative(gradients["features"], expected[0], WEIGHT)
+        yield relative(gradients["opacity"], expected[1], OPACITY)
+        unseen = ~blended.geometry["hit"].any(axis=1)
+        yield exact(gradients["opacity"][unseen], np.zeros(unseen.sum()))
+
+
+def _spheres(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
+    """Gradients of positions and radii, against finite differences."""
+    blended = Blended(dev, rng, 30, kind="sphere")
+    hit, gradients = blended.scene.hits(), blended.scene.sphere_gradients(blended.grad)
+
+    def loss(positions, radius):
+        geometry = dense.geometry(blended.camera, positions, radius, "sphere") | {"hit": hit}
+        blend = dense.blend(geometry, blended.opacity, blended.gamma)
+        return (dense.features(blend, blended.point_features) * blended.grad).sum()
+
+    radius = blended.radius.astype(np.float64)
+    numeric = numeric_gradient(partial(loss, radius=radius), blended.positions, STEP)
+    yield relative(gradients["positions"].ravel(), numeric, DIFFERENCES)
+    numeric = numeric_gradient(partial(loss, blended.positions), radius, STEP)
+    yield relative(gradients["radius"], numeric, DIFFERENCES)
+
+
+def _sizes(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
+    for n in SIZES:
+        for size in ((1, 1), (31, 33)):
+            blended = Blended(dev, rng, n, size=size)
+            expected = dense.features(blended.blend, blended.point_features)
+            yield relative(blended.features, expected, WEIGHT)
+            gradients, expected = blended.gradients(), blended.reference_gradients()
+            yield relative(gradients["features"], expected[0], WEIGHT)
+            yield relative(gradients["opacity"], expected[1], WEIGHT)
+
+
+def _early_stop(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
+    for stop in (0.001, 0.05, 0.5):
+        blended = Blended(dev, rng, 500, gamma=0.02, radius=0.4, early_stop=stop)
+        expected = dense.features(blended.blend, blended.point_features)
+        yield relative(blended.features, expected, WEIGHT)
+        gradients, expected = blended.gradients(), blended.reference_gradients()
+        yield relative(gradients["features"], expected[0], WEIGHT)
+        yield relative(gradients["opacity"], expected[1], WEIGHT)
+
+
+def _tau(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
+    """What is dropped weighs no more than is said, and that is at most tau."""
+    for tau in (1e-4, 1e-2, 0.3):
+        blended = Blended(dev, rng, gamma=0.02, radius=0.3, tau=tau)
+        scene, hit = blended.scene, blended.geometry["hit"]
+        dropped = hit & (blended.role == DROPPED)
+        weight = np.where(dropped, blended.blend["weight"], 0).sum(axis=0)
+        said = scene.weighing.dropped(scene.pairs, scene.weights).get()
+        yield no_more(said, np.full_like(said, tau), 0.0)
+        # the weights are off by WEIGHT of themselves
+        yield no_more(weight, said * (1 + WEIGHT), 1e-10)
+        yield exact(scene.weights.shaded.get(), np.flatnonzero((hit & ~dropped).any(axis=1)))
+        kept = np.where(hit & ~dropped, blended.weight, 0).astype(np.float64)
+        yield relative(blended.gradients()["features"], kept @ blended.grad, WEIGHT)
+
+
+def _smallest_gamma(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
+    """gamma = 1e-5 makes exponents of 1e5, which are off by 1e-2: so are the weights."""
+    for opacity in (1.0, 0.3, 1e-3, 1e-38):
+        scene, weight = blend_on_axis(dev, [0.9, 0.8, 0.1], [opacity] * 3, 1e-5)
+        yield finite(*scene.gradients(np.ones((1, 1, 16))).values())
+        expected = dense.blend(scene.geometry(), [np.float32(opacity)] * 3, 1e-5)["weight"]
+        yield each(weight, expected[:, 0], 1e-2, floor=1e-28)
+
+
+def _nearest(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
+    """exp(z / gamma) = e^100 at z = 1 is above the largest float."""
+    radius = 2.0**-10
+    places = np.stack([np.zeros(3), np.zeros(3), depth_at([1.0, 0.99, 0.5]) + radius], -1)
+    features = PairedPoints(dev, AXIS, places, radius, kind="sphere").blend(
+        [1, 1, 1], 0.01, np.eye(3, 16)
+    )
+    e = np.exp([0.0, -1.0, -50.0])
+    yield each(features[0, 0, :3], e / e.sum(), NEAREST, floor=1e-3)
+
+
+def _equal_depths(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
+    """Shared equally; tracked in the order of the indices."""
+    for gamma in (0.1, 0.01, 1e-5):
+        for count in (2, 3, 16, 17, 100):
+            _, weight = blend_on_axis(dev, [0.7] * count, [1.0] * count, gamma)
+            yield exact(weight, np.full_like(weight, weight[0]))
+            # at gamma = 0.1 the background keeps up to e^-7 / 2, less than 1e-3
+            yield absolute(weight.sum(), 1, 1e-2 if gamma == 0.1 else 1e-5)
+    scene, _ = blend_on_axis(dev, [0.7] * 5, [1.0] * 5, 0.1, max_tracked=2)
+    tracked = scene.gradients(np.ones((1, 1, 16)))["features"].any(axis=1)
+    yield exact(tracked, [True, True, False, False, False])
+
+
+def _zero_opacity(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
+    """The picture is the background; every opacity has a gradient by which it can come back."""
+    for gamma in (0.1, 0.01, 1e-5):
+        scene, weight = blend_on_axis(dev, [0.9, 0.5, 0.2], [0.0] * 3, gamma)
+        yield exact(weight, np.zeros(3))
+        yield exact(scene.features.get(), np.ones((1, 1, 16)))
+        gradients = scene.gradients(np.ones((1, 1, 16)))
+        # d G.(f - bg) exp(-M) / D with D = 1: a handful of roundings
+        expected = scene.geometry()["closeness"][:, 0] * (1 - 16) * np.exp(-1e-6 / gamma)
+        yield relative(gradients["opacity"], expected, 1e-5)
+        yield exact(gradients["features"], np.zeros((3, 16)))
+
+
+def _many_hits(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
+    z, opacity = rng.uniform(0.1, 0.99, 20_000), np.float32(rng.uniform(0, 1, 20_000))
+    for gamma in (0.1, 0.01):
+        scene, weight = blend_on_axis(dev, z, opacity, gamma)
+        blend = dense.blend(scene.geometry(), opacity, gamma)
+        yield relative(weight, blend["weight"][:, 0], MANY)
+        expected = dense.features(blend, np.resize(np.eye(16), (20_000, 16)))
+        yield relative(scene.features.get().reshape(1, 16), expected, MANY)
+
+
+def _rims(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
+    """A sphere hit on the very rim, where d = 0; one through whose centre the ray goes; one beyond
+    far, which the early stop spares.
+    """
+    ones = np.ones((1, 1, 16))
+    # rho = |(3, 0, 4) - 5 (0, 0, 1)|
+    rim = PairedPoints(
+        dev,
+        AXIS,
+        np.array([[3.0, 0, 4.0]]),
+        np.sqrt(10.0),
+        kind="sphere",
+        depth_range=(1.8, 10.0),
+    )
+    yield exact(rim.pairs.total, 1)
+    yield exact(rim.blend([1.0], 0.005, np.full((1, 16), 2.0)), ones)
+    for gradient in (rim.gradients(ones) | rim.sphere_gradients(ones)).values():
+        yield exact(gradient, np.zeros_like(gradient))
+
+    through = PairedPoints(dev, AXIS, np.array([[0, 0, 3.0]]), 0.5, kind="sphere")
+    through.blend([0.5], 0.1, np.full((1, 16), 2.0))
+    gradients = through.sphere_gradients(ones)
+    yield finite(*gradients.values())
+    yield exact(np.sign(gradients["positions"]), [[0, 0, -1]])
+    yield exact(np.sign(gradients["radius"]), [1])
+
+    beyond = PairedPoints(dev, AXIS, np.array([[0, 0, FAR + 0.3]]), 0.4)
+    weight = 1 - beyond.blend([0.133], 0.01, np.zeros((1, 16)), early_stop=0.01)[0, 0, 0]
+    expected = 0.133 * np.exp(-0.133 * 0.075 / 0.01)
+    yield relative(weight, expected / (1 + expected), 1e-3)  # 1 - b cancels two digits
+
+
+def _empty(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
+    camera = make_camera(31, 33)
+    for rule in ("softmax", "alpha"):
+        scene = PairedPoints(dev, camera, np.array([[100.0, 0, 3.0], [0, 0, 300.0]]), 0.01)
+        features = scene.blend([1, 1], 0.01, np.zeros((2, 16)), rule=rule)
+        yield exact(features, np.ones((33, 31, 16)))
+        for gradient in scene.gradients(np.ones((33, 31, 16))).values():
+            yield exact(gradient, np.zeros_like(gradient))
+
+
+CASES = (
+    *(Case(f"softmax: forward, {kind}", partial(_forward, kind)) for kind in KINDS),
+    *(Case(f"softmax: backward, {kind}", partial(_backward, kind)) for kind in KINDS),
+    Case("softmax: gradients of spheres", _spheres),
+    Case("softmax: awkward sizes", _sizes),
+    Case("softmax: early stop", _early_stop),
+    Case("softmax: weights dropped by tau", _tau),
+    Case("softmax: gamma of 1e-5", _smallest_gamma),
+    Case("softmax: nearest possible point", _nearest),
+    Case("softmax: equal depths", _equal_depths),
+    Case("softmax: opacities of 0", _zero_opacity),
+    Case("softmax: 20000 hits in a pixel", _many_hits),
+    Case("softmax: rims and centres of spheres", _rims),
+    Case("softmax: an empty view", _empty),
+)

@@ -1,0 +1,277 @@
+"""Cases of what a training step does: losses, Adam, smoothing, EMA, refining."""
+
+from collections.abc import Iterator
+from functools import partial
+
+import numpy as np
+
+from pp_cl.device.device import Device
+from pp_cl.layers.policy import make_policy
+from pp_cl.raster.sh import SH_BLOCKS
+from pp_cl.reference import loss as reference_loss
+from pp_cl.reference import optim
+from pp_cl.reference.lpips import lpips, lpips_gradient, random_weights
+from pp_cl.scene.grid import Grid
+from pp_cl.selftest.adam_points import EYE, GRID, SH_EPS, Cloud, gradients, moments
+from pp_cl.selftest.case import (
+    EPS,
+    SIZES,
+    Case,
+    Check,
+    absolute,
+    each,
+    exact,
+    finite,
+    relative,
+)
+from pp_cl.training.adam import PointsWithGradient, adam_update, ema_update, moment_scale
+from pp_cl.training.loss import Loss
+from pp_cl.training.mask import MaskLoss
+from pp_cl.training.perceptual import PerceptualLoss
+from pp_cl.training.refine import split_opacity
+from pp_cl.training.smooth import Smoother
+
+LOSS = 16 * EPS  # 22 taps of a window, in two passes, and the sums of rows and columns
+FLAT = 3e-6  # variances of nothing: rounding of Var[d] over C2 = 0.03^2
+DEEP = 1e-5  # thirteen convolutions one after another, each within 3e-6
+
+
+def _loss(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
+    """L1 and SSIM; at sizes below a window L1 alone."""
+    for size in ((11, 11), (12, 33), (33, 31), (40, 257), (1, 1), (1, 257), (10, 40)):
+        prediction, target = _images(rng, *size)
+        for weight in (0.2, 1.0):
+            yield from _loss_checks(dev, prediction, target, weight, LOSS)
+
+
+def _images(rng, height, width):
+    """A smooth target with texture, and a prediction that leaves [0, 1]."""
+    y, x = np.mgrid[:height, :width][..., None] / 9.0
+    noise = rng.standard_normal((2, height, width, 3))
+    target = 0.5 + 0.4 * np.sin(x + y + np.arange(3)) * np.cos(2 * y) + 0.05 * noise[0]
+    return (target + 0.1 * noise[1]).astype(np.float32), target.astype(np.float32)
+
+
+def _loss_checks(dev, prediction, target, weight, *bounds):
+    """bounds: of the terms, and of the gradient where it is another."""
+    loss = Loss(dev, weight)
+    grad = loss.forward_backward(dev.upload(prediction), dev.upload(target)).get()
+    terms, expected = reference_loss.loss(prediction, target, weight)
+    yield each(loss.terms.get(), terms, bounds[0], floor=1e-10 / bounds[0])
+    yield relative(grad, expected, bounds[-1])
+
+
+def _hard_loss(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
+    """Flat images, equal ones, and variances far below the squares they are the difference of."""
+    for levels in ((0.0, 1.0), (1.0, 0.0), (1.0, 0.999), (0.3, 0.3001), (-2.0, 0.0)):
+        prediction, target = (np.full((20, 30, 3), level, np.float32) for level in levels)
+        yield from _loss_checks(dev, prediction, target, 0.2, FLAT)
+    for level in (0.0, 1.0):
+        noise = 1e-3 * rng.standard_normal((2, 24, 35, 3))
+        target = (level + noise[0]).astype(np.float32)
+        prediction = (target + noise[1]).astype(np.float32)
+        # rounding of values of 1 in variances of 1e-6, as shares of C2
+        yield from _loss_checks(dev, prediction, target, 1.0, 1e-5, 3e-5)
+        yield from _equal_images(dev, target)
+
+
+def _equal_images(dev, image):
+    loss = Loss(dev, 0.2)
+    grad = loss.forward_backward(dev.upload(image), dev.upload(image)).get()
+    yield exact(loss.terms.get(), np.zeros(4))
+    yield exact(grad, np.zeros_like(image))
+
+
+def _mask_loss(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
+    """weight * mean max(alpha - mask, 0)^2 of a part of the image; nothing outside of it."""
+    weight, width, left, top = 0.7, 29, 3, 1
+    for side in SIZES:
+        size, inside = (side + 3, 36), np.s_[top : top + side, left : left + width]
+        transmittance, mask = rng.random(size), rng.random((side, width))
+        loss, terms = MaskLoss(dev, weight), dev.upload([1, 2, 3, 4], np.float32)
+        grad = loss.add(
+            dev.upload(transmittance.ravel(), np.float32),
+            dev.upload(mask, np.float32),
+            size=size,
+            offset=(left, top),
+            terms=terms,
+        )
+        excess = np.maximum(1 - transmittance[inside] - mask, 0)
+        yield relative(terms.get(), [1 + weight * np.mean(excess**2), 2, 3, 4], 8 * EPS)
+        expected = np.zeros(size)
+        expected[inside] = 2 * weight * excess / mask.size
+        yield relative(grad.get().reshape(size), expected, 8 * EPS)
+
+
+def _perceptual_loss(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
+    weights = random_weights(np.random.default_rng(5))
+    for size in ((16, 16), (17, 33)):
+        target = rng.uniform(0, 1, (*size, 3))
+        prediction = target + rng.normal(0, 0.2, target.shape)
+        loss = PerceptualLoss(dev, 0.3, make_policy(dev, variant="direct"), weights)
+        terms, grad = dev.zeros((4,)), dev.zeros(target.shape)
+        images = [dev.upload(image, np.float32) for image in (prediction, target)]
+        loss.add(*images, (0, 0), grad_prediction=grad, terms=terms)
+        given = [image.get().astype(np.float64) for image in images]
+        yield relative(terms.get(), [0.3 * lpips(*given, weights), 0, 0, 0], DEEP)
+        yield relative(grad.get(), 0.3 * lpips_gradient(*given, weights), DEEP)
+
+
+def _adam(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
+    """Parameters and moments after twenty steps; the first step is the rate."""
+    for n in SIZES:
+        grads = 1e-3 * rng.standard_normal((20, n))
+        for eps in (1e-8, 1e-15):
+            twin, parameter, state = _adam_steps(
+                dev, rng.standard_normal(n), grads, rate=0.01, eps=eps
+            )
+            # the parameter is rounded in each step, by half EPS of its size; rarely the same way
+            yield relative(parameter, twin.parameter, 3e-7)
+            yield each(state["m"].get(), twin.m, 8 * EPS, floor=1e-3)
+            yield each(state["v"].get(), twin.v, 8 * EPS)
+    _, parameter, _ = _adam_steps(dev, np.zeros(257), np.full((1, 257), -3e-4), rate=0.5, eps=1e-15)
+    # what 1 - beta2 in float32 would miss by 7e-6
+    yield each(parameter, np.full(257, 0.5), 4e-7)
+
+
+def _adam_steps(dev, start, grads, *, rate, eps):
+    """(float64 twin, parameter, moments) after a step with each gradient."""
+    parameter = dev.upload(start, np.float32)
+    twin, state = optim.Adam(parameter.get()), moments(dev, parameter)
+    for step, grad in enumerate(grads.astype(np.float32), 1):
+        adam_update(dev, parameter, dev.upload(grad), state, step=step, rate=rate, eps=eps)
+        twin.step(grad, rate, eps)
+    return twin, parameter.get(), state
+
+
+def _adam_extremes(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
+    """Gradients of 1e-20 to 1e10, of which float32 cannot square all; and of 0."""
+    for scale in (1e-20, 1e-12, 1e-3, 1e10):
+        for eps in (1e-8, 1e-15):
+            grads = scale * rng.standard_normal((10, 31))
+            twin, parameter, _ = _adam_steps(dev, np.zeros(31), grads, rate=0.1, eps=eps)
+            # m / (sqrt(v) + eps): a few roundings, each step
+            yield relative(parameter, twin.parameter, 1e-5)
+    start = rng.standard_normal(33).astype(np.float32)
+    _, parameter, state = _adam_steps(dev, start, np.zeros((3, 33)), rate=0.5, eps=1e-15)
+    yield exact(parameter, start)
+    yield exact(state["v"].get(), np.zeros(33))
+
+
+def _point_adam(block: int, dev: Device, rng: np.random.Generator) -> Iterator[Check]:
+    """The gradient of harmonics, by the direction from the eye, and Adam of it and of the opacity;
+    points without a gradient catch up later.
+    """
+    for n in SIZES:
+        cloud = Cloud(dev, rng, n, SH_BLOCKS[block])
+        for _ in range(8):
+            cloud.step(*gradients(rng, n), np.flatnonzero(rng.random(n) < 0.4))
+        for compared in cloud.compared():
+            yield relative(*compared)
+        yield exact(cloud.last_step.get(), cloud.twins["sh"].last_step)
+        rows = np.flatnonzero(rng.random(n) < 0.7)
+        moves = cloud.twins["sh"].pending(10, 0.1, SH_EPS)
+        basis = optim.block_basis(GRID.positions(cloud.ids), EYE, cloud.block)
+        expected = np.einsum("nk,nkc->nc", basis, moves)
+        pending = cloud.pending(rows, 10)
+        scale = np.abs(expected).max()
+        yield absolute(pending[rows], expected[rows], 1e-6 * scale)
+    for step in (100, 50_000, 10**8):
+        cloud = Cloud(dev, rng, 33, SH_BLOCKS[block])
+        for at in (1, step, step + 1):
+            cloud.step(*gradients(rng, 33), np.arange(33), at)
+        for compared in cloud.compared():
+            yield relative(*compared)
+
+
+def _half_moments(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
+    """A half is off by up to 2^-11, and each of twelve steps rounds again."""
+    for n in SIZES:
+        cloud = Cloud(dev, rng, n, scale=moment_scale(SH_EPS))
+        for _ in range(12):
+            cloud.step(*gradients(rng, n), np.flatnonzero(rng.random(n) < 0.4))
+        parameter, m, v = cloud.state()["sh"]
+        twin = cloud.twins["sh"]
+        moved = np.abs(twin.parameter - cloud.start["sh"]).max()
+        yield absolute(parameter, twin.parameter, 0.01 * moved + 1e-7)
+        yield relative(m, twin.m, 0.005)
+        yield relative(np.sqrt(v), np.sqrt(twin.v), 0.005)
+
+
+def _bounded_opacity(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
+    """Huge gradients keep it in [0, 1], at the values of float64."""
+    cloud = Cloud(dev, rng, 257)
+    for _ in range(20):
+        drift = 1e4 * (rng.standard_normal(257) + np.linspace(-2, 2, 257))
+        cloud.step(np.zeros((257, 16)), drift, np.arange(257))
+    opacity = cloud.opacity.get()
+    yield finite(opacity)
+    yield exact([opacity.min(), opacity.max()], [0, 1])
+    yield absolute(opacity, cloud.twins["opacity"].parameter, 2e-6)  # twenty moves of 0.03
+
+
+def _points_with_gradient(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
+    """Rows that hold anything but 0, NaN among them."""
+    for n in SIZES:
+        shaded = np.flatnonzero(rng.random(n) < 0.8)
+        features = np.full((n, 16), np.nan, np.float32)
+        features[shaded] = 0
+        for place, i in enumerate(shaded):
+            features[i, place % 16] = (-0.0, -1e-37, np.nan)[place % 3]
+        rows = PointsWithGradient(dev).rows(dev.upload(shaded, np.uint32), dev.upload(features))
+        yield exact(rows.get(), shaded[np.arange(len(shaded)) % 3 > 0])
+
+
+def _ema(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
+    for n in SIZES:
+        old, new = rng.standard_normal((2, n)).astype(np.float32)
+        ema = dev.upload(old)
+        ema_update(dev, ema, dev.upload(new), 0.01)
+        expected = old + 0.01 * (new.astype(np.float64) - old)
+        yield relative(ema.get(), expected, 2 * EPS)
+
+
+def _smooth(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
+    """Neighbours on the grid, and the step towards their mean."""
+    dims = (7, 8, 9)
+    for n in SIZES:
+        ids = np.sort(rng.choice(np.prod(dims), n, replace=False)).astype(np.uint32)
+        smoother = Smoother(dev, dev.upload(Grid((0, 0, 0), 1, dims).packed()), dev.upload(ids))
+        table = [
+            [2**32 - 1 if j is None else j for j in row] for row in optim.neighbours(ids, dims)
+        ]
+        yield exact(smoother.neighbours.get(), table)
+        values = rng.standard_normal((n, 3, 16)).astype(np.float32)
+        for amount in (0.06, 1.0):
+            sh = dev.upload(values)
+            smoother.smooth(sh, amount)
+            expected = optim.smoothed(values, ids, dims, amount)
+            yield relative(sh.get(), expected, 4 * EPS)  # a mean of up to six
+
+
+def _refine(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
+    """1 - sqrt(1 - o), which cancels for small opacities."""
+    for n in SIZES:
+        opacity = np.float32(rng.uniform(0, 1, n))
+        opacity[::5], opacity[1::5], opacity[2::5] = 0, 1, 1e-7
+        array = dev.upload(opacity)
+        split_opacity(dev, array)
+        wide = opacity.astype(np.float64)
+        yield each(array.get(), wide / (1 + np.sqrt(1 - wide)), 3e-7)
+
+
+CASES = (
+    Case("loss: L1 and SSIM", _loss),
+    Case("loss: flat and equal images", _hard_loss),
+    Case("loss: mask", _mask_loss),
+    Case("loss: perceptual", _perceptual_loss),
+    Case("adam: arrays", _adam),
+    Case("adam: gradients of 0, 1e-20 and 1e10", _adam_extremes),
+    *(Case(f"adam: points, {b.name}", partial(_point_adam, i)) for i, b in enumerate(SH_BLOCKS)),
+    Case("adam: moments of 16 bits", _half_moments),
+    Case("adam: opacities at their bounds", _bounded_opacity),
+    Case("adam: points with a gradient", _points_with_gradient),
+    Case("training: moving average", _ema),
+    Case("training: smoothing", _smooth),
+    Case("training: split opacities", _refine),
+)

@@ -1,0 +1,69 @@
+"""pp-cl selftest: the table, the exit status, the JSON file; what it refuses."""
+
+import json
+import shutil
+
+import pytest
+
+from pp_cl.cli import main
+from pp_cl.device import device as device_module
+from pp_cl.selftest import run
+from pp_cl.selftest.case import Case
+
+NAMES = ("device: scan", "training: split opacities", "training: moving average")
+
+
+@pytest.fixture
+def few(monkeypatch):
+    """Three cases, the second of refine.cl."""
+    monkeypatch.setattr(run, "CASES", [c for name in NAMES for c in run.CASES if c.name == name])
+
+
+def test_all_pass(few, dev, tmp_path, capsys):
+    assert main(["selftest", "--json", str(tmp_path / "a.json")]) == 0
+    out, err = capsys.readouterr()
+    assert not err
+    lines = out.splitlines()
+    facts = dict(line.split(maxsplit=1) for line in lines[: lines.index("")] if "build" not in line)
+    assert dev.name in facts["device"] and facts["driver"] == dev.info["driver"]
+    assert "build options -cl-std=CL1.2" in out
+    assert [line.endswith("yes") for line in lines if line.startswith(NAMES)] == [True] * 3
+    assert lines[-1].startswith("3 cases in") and lines[-1].endswith("3 pass")
+    stored = json.loads((tmp_path / "a.json").read_text())
+    assert stored["passed"] and [row["case"] for row in stored["cases"]] == list(NAMES)
+
+
+def test_a_perturbed_kernel_is_status_1_and_named(few, tmp_path, monkeypatch, capsys):
+    shutil.copytree(device_module.kernel_folder(), tmp_path / "cl")
+    path = tmp_path / "cl" / "training" / "refine.cl"
+    path.write_text(path.read_text().replace("1.0f + sqrt", "1.0f - sqrt"))
+    monkeypatch.setattr(device_module, "kernel_folder", lambda: tmp_path / "cl")
+    assert main(["selftest", "--json", str(tmp_path / "a.json")]) == 1
+    out, err = capsys.readouterr()
+    assert err == "pp-cl: selftest: 1 failed: training: split opacities\n"
+    assert out.splitlines()[-1].endswith("2 pass")
+    stored = json.loads((tmp_path / "a.json").read_text())
+    assert [row["passed"] for row in stored["cases"]] == [True, False, True]
+
+
+def test_a_case_that_raises_is_a_line(few, monkeypatch, capsys):
+    def raises(dev, rng):
+        raise RuntimeError("no\nway")
+
+    monkeypatch.setattr(run, "CASES", [Case("a: b", raises), *run.CASES])
+    assert main(["selftest"]) == 1
+    out, err = capsys.readouterr()
+    assert "    RuntimeError: no way" in out.splitlines() and out.count(" yes") == 3
+    assert err == "pp-cl: selftest: 1 failed: a: b\n"
+
+
+def test_an_unknown_device_is_one_line(capsys):
+    assert main(["selftest", "--device", "no such device"]) == 2
+    out, err = capsys.readouterr()
+    assert not out and err.count("\n") == 1 and "no such OpenCL device" in err
+
+
+def test_a_file_that_cannot_be_written_is_one_line(few, tmp_path, capsys):
+    assert main(["selftest", "--json", str(tmp_path / "none" / "a.json")]) == 2
+    err = capsys.readouterr().err
+    assert err.count("\n") == 1 and "none/a.json" in err

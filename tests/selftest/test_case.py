@@ -1,0 +1,59 @@
+"""How results are measured: by hand, and that nothing which is not finite passes."""
+
+from functools import partial
+
+import numpy as np
+import pytest
+
+from pp_cl.selftest import case
+from pp_cl.selftest.case import Check
+
+ACTUAL, EXPECTED = [1.0, -2.5, 0.0], [1.0, -2.0, 0.0]
+MOST = np.array([0.1, 2.0, 0.0])
+MEASURES = {
+    "relative": (partial(case.relative, bound=0.3), 0.25),
+    "absolute": (partial(case.absolute, bound=0.6), 0.5),
+    "each": (partial(case.each, bound=0.3, floor=0.5), 0.2),
+    "allowed": (partial(case.allowed, most=MOST), 0.25),
+    "exact": (case.exact, 1),
+}
+
+
+@pytest.mark.parametrize("name", MEASURES)
+def test_errors_by_hand(name):
+    measure, error = MEASURES[name]
+    assert measure(ACTUAL, EXPECTED).error == error
+    assert measure(EXPECTED, EXPECTED).error == 0
+    with pytest.raises(ValueError, match="shape"):
+        measure(ACTUAL[:2], EXPECTED)
+
+
+@pytest.mark.parametrize("name", MEASURES)
+@pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
+@pytest.mark.parametrize("place", range(3))
+def test_what_is_not_finite_exceeds_every_bound(name, bad, place):
+    check = MEASURES[name][0](np.where(np.arange(3) == place, bad, EXPECTED), EXPECTED)
+    assert check.error > check.bound
+
+
+@pytest.mark.parametrize("measure", [case.relative, case.absolute, case.each])
+def test_no_values_have_no_error(measure):
+    assert measure(np.zeros((0, 3)), np.zeros((0, 3)), 0.0) == (0, 0)
+
+
+def test_what_must_be_zero_may_not_differ():
+    zeros = np.zeros(3)
+    assert case.allowed([0, 1e-30, 0], zeros, zeros).error == np.inf
+    assert case.relative([0, 1e-30, 0], zeros, 1e-6).error == 1
+    assert case.each([0, 1e-30, 0], zeros, 1e-6).error == 1e-30
+
+
+def test_excess():
+    assert case.no_more([0.5, 1.5, -9.0], [1.0, 1.0, 1.0], 0.1) == (0.5, 0.1)
+    assert case.no_more([np.nan], [1.0], 0.1).error == np.inf
+    assert case.finite(np.array([1, np.nan]), np.array([np.inf])) == (2, 0)
+
+
+def test_shares_of_bounds():
+    shares = [Check(*check).share for check in ((0, 0), (1, 0), (1, 4), (np.inf, 1))]
+    assert shares == [0, np.inf, 0.25, np.inf]

@@ -1,0 +1,82 @@
+"""A sign or a comparison flipped in any kernel file is seen, and the case that it concerns is
+named.
+"""
+
+import shutil
+
+import pytest
+
+from pp_cl.device import device as device_module
+from pp_cl.selftest.run import CASES, run_cases
+
+KERNELS = device_module.kernel_folder()
+# (kernel file, text that stands there once, what it becomes, the case that must fail)
+FLIPS = [
+    ("device/compact", "to[c] = from[c]", "to[c] = -from[c]", "device: compact and gather rows"),
+    ("device/scan", "offsets[i] = sum", "offsets[i] = -sum", "device: scan"),
+    ("scene/demo", "y[lane] = p.y", "y[lane] = -p.y", "scene: demo"),
+    ("scene/hull", "alive & seen", "alive | seen", "scene: hull"),
+    ("scene/target", "255 * (255 - c.w)", "255 * (255 + c.w)", "scene: target"),
+    ("raster/project", "vx + cam->forward.y", "vx - cam->forward.y", "raster: project"),
+    ("raster/pairs", "keys[a] < keys[b]", "keys[a] > keys[b]", "raster: thousands of equal depths"),
+    ("raster/shade", "features += basis[4 + b]", "features -= basis[4 + b]", "raster: shade"),
+    ("raster/depth", "depth += b *", "depth -= b *", "raster: depth, softmax"),
+    ("raster/depth", "before + share", "before - share", "raster: depth, alpha"),
+    ("raster/blend_weights", "sum += pair", "sum -= pair", "raster: highest weights, alpha"),
+    ("raster/softmax", "a - M, 0.0f)) / D", "a + M, 0.0f)) / D", "softmax: forward, disc"),
+    ("raster/softmax", "share * (1.0f + a)", "share * (1.0f - a)", "softmax: backward, soft"),
+    ("raster/alpha", "fmax(1.0f - alpha", "fmax(1.0f + alpha", "alpha: forward, soft"),
+    ("raster/alpha", "+ g - B)", "+ g + B)", "alpha: backward, soft"),
+    ("raster/alpha", "= B - g", "= B + g", "alpha: gradient of alpha"),
+    ("raster/blend", "sum + (1.0f - weights)", "sum + (1.0f + weights)", "softmax: forward, soft"),
+    ("raster/blend", "- rest[REST_BY_PAIR", "+ rest[REST_BY_PAIR", "alpha: backward, disc"),
+    ("raster/blend", "dL_dR -= dL_ddepth", "dL_dR += dL_ddepth", "softmax: gradients of spheres"),
+    ("layers/conv", "[p] += value", "[p] -= value", "conv: direct, hard inputs"),
+    ("layers/conv_backward_weights", "[i] += value", "[i] -= value", "conv: direct, hard inputs"),
+    ("layers/winograd", "[i] += value", "[i] -= value", "conv: winograd2, hard inputs"),
+    ("layers/winograd_backward_weights", "[i] += v", "[i] -= v", "conv: winograd2, hard inputs"),
+    ("layers/winograd_transform", "= weight[(block * 9", "= -weight[(block * 9", "conv: winograd2"),
+    ("layers/resample", "+ 0.25f * line", "- 0.25f * line", "layers: upsampling"),
+    ("layers/resample", "+ 0.25f * dL_dout", "- 0.25f * dL_dout", "layers: mean pooling"),
+    ("layers/gate", "(open * closed)", "(open + closed)", "layers: gate"),
+    ("layers/tiles", "line[i] != background", "line[i] == background", "layers: tiles"),
+    ("training/loss", "sign(d) + slope_0", "sign(d) - slope_0", "loss: L1 and SSIM"),
+    ("training/mask", "1.0f - transmittance", "1.0f + transmittance", "loss: mask"),
+    ("training/perceptual", "terms[0] += weight", "terms[0] -= weight", "loss: perceptual"),
+    ("training/adam", "DECAY1 * (g - *m)", "DECAY1 * (g + *m)", "adam: arrays"),
+    ("training/adam", "up + rate", "up - rate", "adam: gradients of 0, 1e-20 and 1e10"),
+    ("training/adam", "f -= basis", "f += basis", "adam: points, sh_0"),
+    ("training/smooth", "* k + c] - f", "* k + c] + f", "training: smoothing"),
+    ("training/refine", "1.0f + sqrt", "1.0f - sqrt", "training: split opacities"),
+    ("metrics/lpips", "d = a[k] * scale_a - b", "d = a[k] * scale_a + b", "metrics: LPIPS"),
+    ("metrics/shape", "at.x + 0.5f", "at.x - 0.5f", "metrics: vertices on a box"),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize("file, text, flipped, name", FLIPS, ids=lambda v: v.replace("/", "."))
+def test_a_flip_fails_its_case(dev, tmp_path, monkeypatch, file, text, flipped, name):
+    case = next(case for case in CASES if case.name == name)
+    assert [row.passed for row in run_cases(dev, [case])] == [True]
+    folder = flipped_folder(tmp_path, file, text, flipped)
+    monkeypatch.setattr(device_module, "kernel_folder", lambda: folder)
+    others = {key: program for key, program in dev._programs.items() if key[0] != file}
+    monkeypatch.setattr(dev, "_programs", others)
+    assert [row.case for row in run_cases(dev, [case]) if not row.passed] == [name]
+
+
+def flipped_folder(tmp_path, file, text, flipped):
+    """A copy of cl/ with the text, which must stand in the file once, flipped: by a character."""
+    assert abs(len(flipped) - len(text)) <= 1
+    folder = tmp_path / "cl"
+    shutil.copytree(KERNELS, folder)
+    path = folder / f"{file}.cl"
+    source = path.read_text("utf-8")
+    assert source.count(text) == 1, f"{file}.cl has {text!r} {source.count(text)} times"
+    path.write_text(source.replace(text, flipped))
+    return folder
+
+
+def test_every_kernel_file_is_flipped():
+    """But the one whose numbers mean nothing."""
+    files = {path.relative_to(KERNELS).with_suffix("").as_posix() for path in KERNELS.rglob("*.cl")}
+    assert files - {"bench/peak"} == {flip[0] for flip in FLIPS}

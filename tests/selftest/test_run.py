@@ -1,0 +1,73 @@
+"""Running cases: the worst check counts, an exception or a NaN fails its case and no other."""
+
+import numpy as np
+import pyopencl as cl
+import pytest
+
+from pp_cl.selftest.case import Case, Check, relative
+from pp_cl.selftest.run import run_case, run_cases
+
+
+def case(*checks, name="a: case", variant=None):
+    """A Case that yields these checks."""
+    return Case(name, lambda dev, rng: iter(checks), variant)
+
+
+def test_the_worst_check_is_the_one_closest_to_its_bound():
+    row = run_case(None, case(Check(1.0, 100.0), Check(0.5, 1.0), Check(0.0, 0.0)))
+    assert (row.error, row.bound, row.passed, row.reason) == (0.5, 1.0, True, "")
+    row = run_case(None, case(Check(1.0, 100.0), Check(1.0, 0.0), Check(5.0, 1.0)))
+    assert (row.error, row.bound, row.passed) == (1.0, 0.0, False)
+
+
+@pytest.mark.parametrize("bad", [np.nan, np.inf])
+def test_what_is_not_finite_fails(bad):
+    row = run_case(None, case(relative([0.5, bad], [0.5, 1.0], 1e9), Check(0.0, 1.0)))
+    assert not row.passed and row.error == np.inf and "NaN" in row.reason
+
+
+@pytest.mark.parametrize(
+    "error", [cl.RuntimeError("clBuild\nfailed: " + "x" * 900), AssertionError(), MemoryError("no")]
+)
+def test_an_exception_fails_its_case_alone(dev, error):
+    def raises(dev, rng):
+        yield Check(0.0, 1.0)
+        raise error
+
+    good = case(Check(0.0, 1.0), name="b: good")
+    bad, rest = run_cases(dev, [Case("a: bad", raises), good])
+    assert not bad.passed and bad.error is None and bad.bound is None
+    assert bad.reason.startswith(type(error).__name__)
+    assert "\n" not in bad.reason and len(bad.reason) <= 300
+    assert rest.passed and rest.case == "b: good"
+
+
+def test_ctrl_c_ends_all_cases(dev):
+    def interrupted(dev, rng):
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        next(run_cases(dev, [Case("a: b", interrupted)]))
+
+
+def test_a_case_without_checks_has_checked_nothing():
+    assert not run_case(None, case()).passed
+
+
+def test_variants_that_are_not_offered_are_left_out(dev, monkeypatch):
+    cases = [case(Check(0, 1), name=str(v), variant=v) for v in (None, "direct", "winograd4")]
+    monkeypatch.setattr(dev, "is_cpu", True)
+    assert [row.case for row in run_cases(dev, cases)] == ["None", "direct", "winograd4"]
+    monkeypatch.setattr(dev, "is_cpu", False)
+    assert [row.case for row in run_cases(dev, cases)] == ["None", "direct"]
+
+
+def test_every_case_draws_the_same_numbers_in_any_order(dev):
+    drawn = []
+
+    def draws(dev, rng):
+        drawn.append(rng.random())
+        yield Check(0.0, 1.0)
+
+    list(run_cases(dev, [Case("a: b", draws), Case("a: c", draws)]))
+    assert drawn[0] == drawn[1]
