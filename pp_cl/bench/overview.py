@@ -22,7 +22,7 @@ RASTER_SIZES, RASTER_POINTS = (200, 400, 800), (10_000, 63_000, 250_000, 1_000_0
 CASES = (Case("alpha", 0.0), Case("alpha", 1e-3), Case("softmax", 0.0))
 GAMMA = 0.01  # the last of a training
 SHARES = {"conv": 0.25, "unet": 0.2, "raster": 0.2, "training": 0.35}  # of the budget
-TRAINED = 0.5  # of its share is the training itself; the rest is the demo, its hull, the kernels
+TRAINED = 0.4  # of its share is the training itself; the rest is the demo, its hull, the kernels
 GROWTH = 3  # the next larger case takes so many times as long, or more
 
 

@@ -19,14 +19,21 @@ def check_files(
     return _figure(plot_file, plot_option) if plot_file else None
 
 
-def _figure(path, option):
+def new_figure(size: tuple[float, float], what: str = "the page") -> Any:
+    """An empty matplotlib figure of so many inches. Raises UserError without matplotlib, naming
+    what needs it.
+    """
     try:
         from matplotlib.figure import Figure
     except ImportError:
         raise UserError(
-            f"{option} {path}: needs matplotlib; install it with `pip install 'pp-cl[plot]'`"
+            f"{what}: needs matplotlib; install it with `pip install 'pp-cl[plot]'`"
         ) from None
-    figure, suffix = Figure(figsize=(8, 6), layout="constrained"), Path(path).suffix[1:].lower()
+    return Figure(figsize=size, layout="constrained")
+
+
+def _figure(path, option):
+    figure, suffix = new_figure((8, 6), f"{option} {path}"), Path(path).suffix[1:].lower()
     if suffix not in figure.canvas.get_supported_filetypes():
         raise UserError(f"{option} {path}: name a .png, .svg or .pdf file")
     return figure

@@ -46,8 +46,8 @@ def bench_raster(
 
 def _rows(dev, bench, cases, *, copy, before):
     """Rows of one scene."""
-    stages_ms, copy_ms = _time(dev, bench, cases, copy)
-    copied = copy.bytes / copy_ms * 1e-6
+    stages_ms, whole_ms = _time(dev, bench, cases, copy)
+    copied = copy.bytes / np.median(whole_ms["copy"]) * 1e-6
     exact = {
         blend: bench.forward(Case(blend, 0.0)).features.get()
         for blend in dict.fromkeys(case.blend for case in cases)
@@ -71,11 +71,13 @@ def _rows(dev, bench, cases, *, copy, before):
             "shaded": int(result.shaded.size),
             "forward_ms": forward,
             "backward_ms": backward,
+            "ms": float(np.median(whole_ms[case])),
+            "ms_range": [min(whole_ms[case]), max(whole_ms[case])],
             "stages_ms": stages,
             "stages_bytes": moved,
             "gbs": gbs,
-            "copy_gbs": copied,
-            "copy_share": gbs / copied,
+            "copy_gbs": float(copied),
+            "copy_share": float(gbs / copied),
             "peak_device_bytes": dev.peak_bytes - before,
             "max_err": bench.error(case, features),
             "tau_err": float((np.abs(features - exact[case.blend]) / feature_range).max()),
@@ -84,7 +86,9 @@ def _rows(dev, bench, cases, *, copy, before):
 
 
 def _time(dev, bench, cases, copy):
-    """({case: {stage: median milliseconds}}, milliseconds of the copy), all in turn."""
+    """({case: {stage: median milliseconds}}, {case or "copy": all its milliseconds}), all in
+    turn.
+    """
     seconds = {case: defaultdict(list) for case in cases}
 
     def runner(case):
@@ -101,7 +105,7 @@ def _time(dev, bench, cases, copy):
         case: {name: float(np.median(values[1:])) * 1e3 for name, values in stages.items()}
         for case, stages in seconds.items()  # the first pass, which builds programs, does not count
     }
-    return medians, float(np.median(times["copy"]))
+    return medians, times
 
 
 COLUMNS = "{:7} {:>8} {:>5} {:7} {:>7} {:>9} {:>9} {:>9} {:>5} {:>8} {:>8} {:>8}  {}".format

@@ -77,6 +77,7 @@ def variant_rows(
             | {
                 "ms": float(ms),
                 "ms_quartiles": [float(low), float(high)],
+                "ms_range": [min(times[variant]), max(times[variant])],
                 "runs": len(times[variant]),
                 "gflops": float(gflops),
                 "peak_gflops": float(peak_gflops),

@@ -2,14 +2,17 @@
 
 import argparse
 import sys
+from functools import partial
+from pathlib import Path
 
 from pp_cl.commands import options as shared
 from pp_cl.config import assign, preset
 from pp_cl.errors import UserError
 
-HELP = "time against error of the convolutions, the network, the rasteriser, a training step"
+HELP = "time against error of the convolutions, the network, the rasteriser, a training"
 # the options that only some benches have
 OPTIONS = {
+    "all": ("budget", "out"),
     "conv": ("size", "widths", "blocks", "plot"),
     "unet": ("size", "widths", "blocks", "plot", "tolerance"),
     "raster": ("size", "scene", "points", "blend", "tau", "gamma", "plot"),
@@ -23,9 +26,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
     add(
         "what",
+        nargs="?",
+        default="all",
         choices=OPTIONS,
-        help="conv: every layer of the network; unet: all of it; raster: points; train: a step"
-        " without the network",
+        help="all (default): a page about the device, from sizes that fit a budget of time; conv:"
+        " every layer of the network; unet: all of it; raster: points; train: a step without the"
+        " network",
     )
     add(
         "--size",
@@ -56,6 +62,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("--blend", metavar="B,...", help="raster: of alpha,softmax (both)")
     add("--tau", metavar="T,...", help="raster: weight that a pixel may drop (0,1e-4,1e-3,1e-2)")
     add("--gamma", metavar="G", help="raster: depth sharpness of the blend (0.01)")
+    add("--budget", metavar="T", help="all: seconds that it may take, as 120 or 120s (120)")
+    add("--out", metavar="DIR", help="all: folder of bench.json and bench.html (bench)")
     shared.add_set(parser, "train: a setting in place of the paper preset's")
     add("--json", metavar="FILE", help="also write the rows there")
     add("--plot", metavar="FILE", help="also draw time against error there (.png, .svg, .pdf)")
@@ -68,7 +76,8 @@ def run(options: argparse.Namespace) -> None:
     measured, for options that make no sense and files that cannot be written.
     """
     _refuse_foreign(options)
-    {"raster": _run_raster, "train": _run_train}.get(options.what, _run_network)(options)
+    own = {"all": _run_all, "raster": _run_raster, "train": _run_train}
+    own.get(options.what, _run_network)(options)
 
 
 def _refuse_foreign(options):
@@ -81,6 +90,28 @@ def _refuse_foreign(options):
     for name in {name for names in OPTIONS.values() for name in names} - {*OPTIONS[options.what]}:
         if getattr(options, name):
             raise UserError(f"--{name}: bench {options.what} has no such option; leave it out")
+
+
+def _run_all(options):
+    from pp_cl.bench.overview import bench_overview
+    from pp_cl.bench.page import page_text
+    from pp_cl.bench.plots import new_figure
+    from pp_cl.files.atomic import write_json, write_text
+    from pp_cl.layers.policy import load_policy
+
+    if options.json or options.plot or options.tolerance is not None:
+        raise UserError("--json, --plot, --tolerance: of a single bench; name one, or use --out")
+    text = (options.budget or "120").removesuffix("s")
+    budget = shared.read_number("--budget", text, float, least=1, most=86400)
+    folder = Path(options.out or "bench")
+    new_figure((1, 1))  # before anything is measured
+    folder.mkdir(parents=True, exist_ok=True)
+    dev = _open_device(options)
+    policy = load_policy(dev, preset("tiny").network.tolerance)
+    result = bench_overview(dev, policy, budget, partial(print, flush=True))
+    write_json(folder / "bench.json", result)
+    write_text(folder / "bench.html", page_text(result))
+    print(f"{result['seconds']:.0f} s; wrote {folder / 'bench.json'} and {folder / 'bench.html'}")
 
 
 def _run_raster(options):

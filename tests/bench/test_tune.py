@@ -302,10 +302,10 @@ def test_tune_stores_what_the_others_then_use(cache, capsys, monkeypatch):
     "words, network",
     [
         ([], ((32, 64, 128), 128, 200)),
-        (["--preset", "small"], ((32, 64, 128), 192, 400)),
+        (["--preset", "small"], ((32, 64, 128), 160, 400)),
         (["--preset", "paper"], ((128, 256, 512), 800, 800)),
         (["--size", "64"], ((32, 64, 128), 64, 64)),
-        (["--widths", "16,16,32", "--preset", "small"], ((16, 16, 32), 192, 400)),
+        (["--widths", "16,16,32", "--preset", "small"], ((16, 16, 32), 160, 400)),
     ],
 )
 def test_network_and_sizes_asked_for(monkeypatch, words, network):

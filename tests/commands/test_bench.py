@@ -3,8 +3,10 @@
 import json
 
 import pytest
+from support.bench_results import result
 from support.scenes import write_ball_scene
 
+from pp_cl.bench import overview
 from pp_cl.cli import main
 
 
@@ -35,3 +37,37 @@ def test_options_of_another_bench_are_one_line(words, named, capsys):
     assert main(["bench", *words]) == 2
     error = capsys.readouterr().err
     assert named in error and error.count("\n") == 1
+
+
+def test_all_writes_a_page_and_its_numbers(tmp_path, capsys, monkeypatch):
+    pytest.importorskip("matplotlib")
+    monkeypatch.setattr(overview, "bench_overview", lambda dev, policy, budget, tell: result())
+    assert main(["bench", "--budget", "3s", "--out", str(tmp_path / "page")]) == 0
+    assert json.loads((tmp_path / "page" / "bench.json").read_text()) == result()
+    assert "<h2>Time against error</h2>" in (tmp_path / "page" / "bench.html").read_text()
+    assert str(tmp_path / "page" / "bench.html") in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    "words, named",
+    [
+        (["--budget", "0"], "--budget 0"),
+        (["--budget", "long"], "--budget long"),
+        (["--json", "b.json"], "--json"),
+        (["all", "--size", "64"], "--size"),
+        (["unet", "--budget", "9"], "--budget"),
+        (["--tolerance", "1e-5"], "--tolerance"),
+    ],
+)
+def test_all_refuses_in_one_line(words, named, capsys):
+    assert main(["bench", *words]) == 2
+    error = capsys.readouterr().err
+    assert named in error and error.count("\n") == 1
+
+
+def test_a_folder_that_cannot_be_made_is_one_line(tmp_path, capsys):
+    pytest.importorskip("matplotlib")
+    (tmp_path / "file").write_text("x")
+    assert main(["bench", "--out", str(tmp_path / "file")]) == 2
+    error = capsys.readouterr().err
+    assert str(tmp_path / "file") in error and error.count("\n") == 1
