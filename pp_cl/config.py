@@ -3,14 +3,22 @@
 import dataclasses
 import json
 import math
+import os
+import warnings
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
+from functools import cache
 from pathlib import Path
 from typing import Any
 
-from pp_cl.errors import UserError
+from pp_cl.errors import UserError, quoted, shown
 from pp_cl.presets import ABSENT, PRESETS, RENAMED
 from pp_cl.settings import NetworkConfig, PointsConfig, RasterConfig, SceneConfig, TrainConfig
+
+FORMAT = 1  # of config.json: raised when keys are added or change meaning
+MOST_BYTES = 2**20  # of a config.json
+MOST_TEXT = 4096  # characters of a setting
+MEND_SETTINGS = "restore it or start a new run"
 
 
 @dataclass
@@ -26,8 +34,8 @@ class Config:
     notes: list[str] = field(default_factory=list, compare=False)
 
     def to_json(self) -> str:
-        """The settings as JSON text: {"preset": name, section: {name: value}}."""
-        stored = dataclasses.asdict(self)
+        """The settings as JSON text: {"format": FORMAT, "preset": name, section: {name: value}}."""
+        stored = {"format": FORMAT, **dataclasses.asdict(self)}
         del stored["notes"]
         return json.dumps(stored, indent=1)
 
@@ -70,7 +78,7 @@ def _convert(value, example, where):
         items = value.split(",") if isinstance(value, str) else value
         if not isinstance(items, (list, tuple)) or len(items) != len(example):
             raise UserError(
-                f"{where}: {value!r} is not {len(example)} values separated by commas, like"
+                f"{where}: {quoted(value)} is not {len(example)} values separated by commas, like"
                 f" {text_of(example)}"
             )
         return tuple(_convert(v, e, where) for v, e in zip(items, example, strict=True))
@@ -78,11 +86,11 @@ def _convert(value, example, where):
     try:
         return convert(value)
     except (KeyError, TypeError, ValueError, OverflowError):
-        raise UserError(f"{where}: {value!r} is not {kind}") from None
+        raise UserError(f"{where}: {quoted(value)} is not {kind}") from None
 
 
 def _whole(value):
-    number = float(value)
+    number = _finite(value)
     if number != int(number):
         raise ValueError
     return int(number)
@@ -90,7 +98,7 @@ def _whole(value):
 
 def _finite(value):
     number = float(value)
-    if not math.isfinite(number):
+    if isinstance(value, bool) or not math.isfinite(number):
         raise ValueError
     return number
 
@@ -122,7 +130,7 @@ def validate(config: Config, origin: str) -> None:
 
 def _check(value, where, *, least, most, choices, **_):
     if choices and value not in choices:
-        raise UserError(f"{where} = {value!r}; choose from {', '.join(choices)}")
+        raise UserError(f"{where} = {quoted(value)}; choose from {', '.join(choices)}")
     several = isinstance(value, tuple)
     if least is not None and not all(least <= v <= most for v in (value if several else (value,))):
         which = "each" if several else "it"
@@ -145,35 +153,112 @@ def configure(config: Config, scene: str, given: Iterable[tuple[str, Any, str]] 
 
 
 def load_config(path: Path | str) -> Config:
-    """Config of a config.json; old keys leave one note in all. Raises UserError naming the file
-    and the key.
+    """Config of a config.json. One of an earlier version, without a format number, may have old
+    keys, and lack those in presets.ABSENT: it leaves one line as a warning. Raises UserError naming
+    the file and the key.
     """
     path = Path(path)
+    stored = _read_settings(path)
+    numbered, name = "format" in stored, stored.get("preset")
+    if numbered and (type(stored["format"]) is not int or stored["format"] != FORMAT):
+        found = quoted(stored["format"], 40)
+        raise UserError(f"{path}: format is {found}, this version reads {FORMAT}; start a new run")
+    if type(name) is not str or name not in PRESETS:
+        raise UserError(
+            f"{path}: key preset is missing or none of {', '.join(PRESETS)}; {MEND_SETTINGS}"
+        )
+    config = preset(name)
+    known = {f"{s}.{item.name}" for s, v in sections(config) for item in dataclasses.fields(v)}
+    found = _stored_keys(path, stored, known if numbered else known | RENAMED.keys())
+    lacking = known - {RENAMED.get(key, key) for key in found}
+    for key in sorted(lacking):
+        if numbered or key not in ABSENT:
+            raise UserError(f"{path}: key {key} is missing; {MEND_SETTINGS}")
+        assign(config, key, ABSENT[key], str(path))
+    for key, value in found.items():
+        _check_type(config, RENAMED.get(key, key), value, f"{path}: {key}")
+        assign(config, key, value, str(path))
+    config.notes.clear()  # one line says it all
+    if not numbered:
+        _tell_of_earlier_version(
+            path, tuple(sorted(lacking)), tuple(sorted(found.keys() & RENAMED.keys()))
+        )
+    validate(config, str(path))
+    if not config.scene.path:
+        raise UserError(f"{path}: scene.path is empty; {MEND_SETTINGS}")
+    return config
+
+
+def _read_settings(path):
+    """The object in a config.json."""
     try:
-        stored = json.loads(path.read_text())
+        if path.stat().st_size > MOST_BYTES:
+            raise UserError(f"{path}: is larger than settings are; {MEND_SETTINGS}")
+        stored = json.loads(path.read_text("utf-8"))
     except OSError as error:
         raise UserError(f"{path}: {error.strerror}; is this the folder of a run?") from None
     except (ValueError, RecursionError) as error:
-        raise UserError(f"{path}: not JSON ({error}); restore it or start a new run") from None
-    if not isinstance(stored, dict) or stored.get("preset") not in tuple(PRESETS):
-        raise UserError(
-            f"{path}: key preset is missing or none of {', '.join(PRESETS)}; restore it or start a"
-            " new run"
-        )
-    config = preset(stored.pop("preset"))
-    for key, value in ABSENT.items():
-        assign(config, key, value, str(path))
+        raise UserError(f"{path}: not JSON ({shown(str(error))}); {MEND_SETTINGS}") from None
+    if not isinstance(stored, dict):
+        raise UserError(f"{path}: not settings but {quoted(stored, 40)}; {MEND_SETTINGS}")
+    return stored
+
+
+def _stored_keys(path, stored, known):
+    """{"section.key": value} of the object in a config.json, all of them known."""
+    found = {}
     for section, values in stored.items():
+        if section in ("format", "preset"):
+            continue
+        where = f"{path}: {shown(section, 40)}"
+        if section not in {key.partition(".")[0] for key in known}:
+            raise UserError(f"{where} is no section of settings; {MEND_SETTINGS}")
         if not isinstance(values, dict):
-            raise UserError(f"{path}: {section} is not an object")
-        for name, value in values.items():
-            assign(config, f"{section}.{name}", value, str(path))
-    if len(config.notes) > 1:
-        config.notes[:] = [
-            f"{config.notes[0]}, {len(config.notes) - 1} other keys were renamed too"
-        ]
-    validate(config, str(path))
-    return config
+            raise UserError(f"{where} is not an object; {MEND_SETTINGS}")
+        found |= {f"{section}.{name}": value for name, value in values.items()}
+    unknown = sorted(found.keys() - known)
+    if unknown:
+        raise UserError(f"{path}: unknown key {shown(unknown[0], 60)}; {MEND_SETTINGS}")
+    return found
+
+
+def _check_type(config, key, value, where):
+    """Raise UserError unless a stored value is of its setting's type; texts and truth values are no
+    numbers.
+    """
+    section, _, name = key.partition(".")
+    example = getattr(getattr(config, section), name)
+    pairs = [(value, example)]
+    if isinstance(example, tuple) and isinstance(value, list):
+        pairs = list(zip(value, example, strict=False))  # assign() counts them
+    for one, wanted in pairs:
+        allowed = (int, float) if type(wanted) in (int, float) else (type(wanted),)
+        if type(one) not in allowed:
+            kind = KINDS[type(wanted)][0] if type(wanted) in KINDS else f"{len(example)} values"
+            raise UserError(f"{where} is {quoted(one, 40)}, not {kind}; {MEND_SETTINGS}")
+        if type(one) is str and not _is_path(one):
+            raise UserError(f"{where} is {quoted(one, 40)}, no text; {MEND_SETTINGS}")
+
+
+def _is_path(text):
+    """Whether a system can take the text as the name of a file."""
+    try:
+        return len(text) <= MOST_TEXT and b"\0" not in os.fsencode(text)
+    except UnicodeEncodeError:
+        return False
+
+
+@cache
+def _tell_of_earlier_version(path, lacking, renamed):
+    """Say once what was made of the settings of an earlier version."""
+    told = [f"{path}: written by an earlier version, without a format number"]
+    if renamed:
+        others = f", and {len(renamed) - 1} other keys have new names" * (len(renamed) > 1)
+        told.append(f"{renamed[0]} is called {RENAMED[renamed[0]]} now{others}")
+    if lacking:
+        taken = ", ".join(f"{key} = {text_of(ABSENT[key]) or 'none'}" for key in lacking)
+        told.append(f"what it lacks is taken as {taken}")
+    warnings.warn("; ".join(told), stacklevel=3)
 
 
 def text_of(value: Any) -> str:

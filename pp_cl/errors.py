@@ -15,3 +15,20 @@ class Stopped(Exception):
     def __init__(self, message: str, status: int) -> None:
         super().__init__(message)
         self.status = status
+
+
+def shown(text: str, most: int = 100) -> str:
+    """What others wrote, for a message: on one line, without control characters, of at most `most`
+    characters.
+    """
+    text = " ".join(text[: 4 * most].split())
+    text = "".join(letter if letter.isprintable() else "?" for letter in text)
+    return text if len(text) <= most else f"{text[: most - 3]}..."
+
+
+def quoted(value: object, most: int = 100) -> str:
+    """shown() of a value as Python writes it: texts in quotation marks."""
+    try:
+        return shown(repr(value), most)
+    except (RecursionError, ValueError):  # nested deeply, or a number of thousands of digits
+        return f"a {type(value).__name__}"

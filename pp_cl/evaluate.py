@@ -136,7 +136,7 @@ def render_views(run: Run, views: list[View]) -> Iterator[Rendered]:
     for view in views:
         start = time.perf_counter()
         result = run.renderer.forward(view.camera, run.gamma)
-        image = result.clamped(view.camera)
+        image = run.checked(result.clamped(view.camera))
         seconds = time.perf_counter() - start
         target.load(view)
         truth = target.whole()

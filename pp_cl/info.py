@@ -12,7 +12,6 @@ import numpy as np
 from pp_cl.config import Config, configure, load_config, preset
 from pp_cl.device.device import Device
 from pp_cl.errors import UserError
-from pp_cl.files.checkpoint import checkpoint_array
 from pp_cl.files.contact_sheet import contact_sheet
 from pp_cl.files.image import to_8bit
 from pp_cl.files.run_folder import RunFolder
@@ -33,6 +32,7 @@ from pp_cl.scene.outline import outline, silhouette
 from pp_cl.scene.photograph import Photograph
 from pp_cl.scene.target import Target
 from pp_cl.scene.views import MASK_THRESHOLD, View, fitting_downscale
+from pp_cl.training.stored import opened_run
 
 SHOWN_VIEWS, SHOWN_SIZE = 12, 320  # photographs of the picture, and their longer side in pixels
 OUTLINE = (255, 0, 160)  # a colour that few objects have
@@ -79,12 +79,14 @@ def run_facts(folder: RunFolder, scene: str | None = None) -> Facts:
         "metrics": _metrics(folder),
     }
     if folder.checkpoint.exists():
-        header, shapes = folder.shapes()
-        sizes = (math.prod(s) for name, s in shapes.items() if name.startswith("net."))
+        with opened_run(folder, config) as stored:
+            header, forms = stored.header, stored.forms
+        sizes = (math.prod(f.shape) for name, f in forms.items() if name.startswith("net."))
         facts["network"]["parameters"] = sum(sizes)
         facts |= {"step": header["step"], "finished": header["finished"]}
-        facts["points"] = {"initial": header["initial_points"], "left": shapes["points.ids"][0]}
-        facts["grid"] = header["grid"] | {"edge_pixels": _edge_pixels(config, _grid(header))}
+        left, grid = forms["points.ids"].shape[0], header["grid"]
+        facts["points"] = {"initial": header["initial_points"], "left": left}
+        facts["grid"] = grid | {"edge_pixels": _edge_pixels(config, Grid.of_header(grid))}
         facts["checkpoint_bytes"] = folder.checkpoint.stat().st_size
     return facts
 
@@ -93,19 +95,15 @@ def run_picture(dev: Device, folder: RunFolder, scene: str | None = None) -> np.
     """picture() of the points that a run has left. Raises UserError as run_facts does, and for a
     scene that is missing or broken.
     """
-    config, (header, _) = _config(folder, scene), folder.shapes()
-    points = Points(_grid(header), checkpoint_array(folder.checkpoint, "points.ids"))
+    config = _config(folder, scene)
+    with opened_run(folder, config) as stored:
+        points = Points(Grid.of_header(stored.header["grid"]), stored.array("points.ids"))
     return picture(dev, open_scene(dev, config, ("train",), SHOWN_VIEWS).splits["train"], points)
 
 
 def _config(folder, scene):
     config = load_config(folder.config)
     return configure(config, scene or config.scene.path)
-
-
-def _grid(header):
-    grid = header["grid"]
-    return Grid(tuple(grid["origin"]), grid["edge"], tuple(grid["dims"]))
 
 
 def _edge_pixels(config, grid):
@@ -136,8 +134,12 @@ def _metrics(folder):
     if not file.exists():
         return None
     try:
-        return dict(json.loads(file.read_text())["mean"])
-    except (ValueError, KeyError, TypeError):
+        mean = json.loads(file.read_text("utf-8"))["mean"]
+        values = {name: float(value) for name, value in mean.items()}
+        if not all(map(math.isfinite, values.values())):
+            raise ValueError
+        return values
+    except (ValueError, KeyError, TypeError, AttributeError, OverflowError, RecursionError):
         raise UserError(f"{file}: holds no metrics; run `pp-cl eval {folder}` again") from None
 
 

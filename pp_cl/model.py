@@ -4,15 +4,11 @@ colours.
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import numpy as np
 from pyopencl.array import Array
 
 from pp_cl.device.device import Device
 from pp_cl.device.rows import DeviceRows
-from pp_cl.errors import UserError
-from pp_cl.files.checkpoint import fitting_array
 from pp_cl.network.unet import UNet
 from pp_cl.raster.point_cloud import PointCloud
 from pp_cl.raster.sh import SH_DEGREES
@@ -80,11 +76,7 @@ class Model:
     def header(self) -> dict:
         """JSON-able description that load() needs beside the arrays."""
         return {
-            "grid": {
-                "origin": [float(x) for x in self.grid.origin],
-                "edge": float(self.grid.edge),
-                "dims": [int(d) for d in self.grid.dims],
-            },
+            "grid": self.grid.header(),
             "depth_range": [float(x) for x in self.depth_range],
         }
 
@@ -103,29 +95,12 @@ class Model:
         net: UNet,
         *,
         degree: int,
-        file: Path,
     ) -> Model:
-        """Model of a checkpoint's header and arrays, which are taken out of `arrays`; net takes the
-        parameters stored there.
-
-        Raises UserError naming the file and the array that does not fit.
+        """Model of a checkpoint's header and arrays, as training/stored.py has checked them; the
+        arrays are taken out of `arrays`, net takes the parameters stored there.
         """
-        try:
-            grid = Grid(
-                tuple(header["grid"]["origin"]),
-                header["grid"]["edge"],
-                tuple(header["grid"]["dims"]),
-            )
-            depth_range = tuple(header["depth_range"])
-        except (KeyError, TypeError):
-            raise UserError(f"{file}: its header is incomplete; train anew") from None
-        cloud = PointCloud.load(dev, arrays, degree, file)
+        grid = Grid.of_header(header["grid"])
+        cloud = PointCloud.load(dev, arrays, degree)
         for name, parameter in net.parameters.items():
-            dev.write(parameter, fitting_array(arrays, f"net.{name}", parameter.shape, file))
-        left = sorted(name for name in arrays if name.startswith("net."))
-        if left:
-            raise UserError(
-                f"{file}: holds {left[0]}, which the network of its config.json does not have; put"
-                " network.blocks back to what the run was trained with"
-            )
-        return cls(dev, grid, depth_range, cloud, net=net)
+            dev.write(parameter, arrays.pop(f"net.{name}"))
+        return cls(dev, grid, tuple(header["depth_range"]), cloud, net=net)

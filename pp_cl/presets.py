@@ -92,10 +92,27 @@ RENAMED = {
 }
 
 
-# What a setting is taken for that a config.json of an earlier version does not have.
+# What a setting is taken for that a config.json without a format number may lack, since it came
+# later: what the program did before.
 ABSENT = {
+    "scene.mask_from": "given",
+    "scene.masks": "",
+    "scene.mask_tolerance": 10.0,
+    "scene.box": (0.0, 0.0, 0.0, 0.0, 0.0, 0.0),
     "points.opacity": 1.0,
+    "points.sh_degree": 2,
     "raster.blend": "softmax",
+    "raster.tau": 0.0,
+    "raster.window": "image",
+    "network.blocks": "double",
+    "network.tolerance": 1e-5,
     "train.opacity_rate_steps": 0,
     "train.mask_weight": 0.0,
+    "train.perceptual_weight": 0.0,
+    "train.lazy_adam": False,
+    "train.moments_16bit": False,
+    "train.prune_looks": 100,
+    "train.refine_at": (1.0, 1.0),
+    "train.memory_gib": 0.0,
+    "train.eval_every": 0,
 }

@@ -31,6 +31,7 @@ from pp_cl.scene.views import View
 from pp_cl.train import Trainer
 from pp_cl.trained import Run, load_run
 from pp_cl.training.memory import Plan, memory_plan, spare_memory
+from pp_cl.training.stored import load_run_state, opened_run
 
 FIRST_PREVIEW = 10.0  # seconds; with a slow step and its writing it shows within 20
 MEASURED_VIEWS = 4
@@ -151,10 +152,13 @@ class Training:
 
     def _check_unchanged(self):
         """Raise UserError where another process trained into the folder since it was looked at."""
-        header = self.folder.shapes()[0] if self.folder.checkpoint.exists() else {"step": 0}
-        if header["step"] != self.trainer.step:
+        step = 0
+        if self.folder.checkpoint.exists():
+            with opened_run(self.folder, self.config) as stored:
+                step = stored.header["step"]
+        if step != self.trainer.step:
             raise UserError(
-                f"{self.folder}: another training has gone on to step {header['step']} meanwhile;"
+                f"{self.folder}: another training has gone on to step {step} meanwhile;"
                 " give the command again"
             )
 
@@ -234,7 +238,7 @@ def stored_state(folder: RunFolder, config: Config) -> Stored | None:
     folder or checkpoint that does not fit.
     """
     folder.check_usable()
-    stored = folder.load() if folder.checkpoint.exists() else None
+    stored = load_run_state(folder, config) if folder.checkpoint.exists() else None
     if folder.config.exists() and (stored is None or stored[0]["finished"]):
         path = load_config(folder.config).scene.path
         if path != config.scene.path:
@@ -323,16 +327,9 @@ def _resume(config, views, net, stored, *, file):
         raise UserError(
             f"{file}: belongs to another scene than {config.scene.path}; use another --out"
         )
-    degree = config.points.sh_degree
-    model = Model.load(net.dev, header, arrays, net, degree=degree, file=file)
+    model = Model.load(net.dev, header, arrays, net, degree=config.points.sh_degree)
     trainer = Trainer(net.dev, config, model, views)
-    try:
-        trainer.restore(header["step"], arrays)
-    except (KeyError, ValueError) as error:
-        raise UserError(
-            f"{file}: its training state is incomplete ({error}); delete it to train anew, or"
-            " restore a copy"
-        ) from None
+    trainer.restore(header["step"], arrays)
     return trainer, {key: header[key] for key in ("scene", "initial_points")}, None
 
 

@@ -13,13 +13,13 @@ from tqdm import tqdm
 from pp_cl.config import Config, configure, load_config
 from pp_cl.device.device import Device
 from pp_cl.errors import UserError
-from pp_cl.files.checkpoint import checkpoint_array
 from pp_cl.files.run_folder import RunFolder
 from pp_cl.metrics.shape import Mesh, overlap, sample_surface
 from pp_cl.scene.demo import demo_mesh
 from pp_cl.scene.grid import Grid, smallest_edge
 from pp_cl.scene.hull import CELL_CAP, build_grid
 from pp_cl.scene.open import DEMO, open_scene, scene_box
+from pp_cl.training.stored import opened_run
 
 DEMO_RESOLUTION = 512  # vertices of the demo's mesh along its longest side
 
@@ -50,11 +50,9 @@ def run_shape(
         if config.scene.path != DEMO:
             raise UserError(f"{folder}: which mesh? give it with --mesh FILE, in the scene's world")
         mesh = Mesh(*demo_mesh(dev, DEMO_RESOLUTION))
-    header, _ = folder.shapes()
-    found = header["grid"]
-    grid = Grid(tuple(found["origin"]), found["edge"], tuple(found["dims"]))
+    with opened_run(folder, config) as stored:
+        grid, after = Grid.of_header(stored.header["grid"]), stored.array("points.ids")
     before = _points_before(dev, config, grid)
-    after = checkpoint_array(folder.checkpoint, "points.ids")
     with _progress(samples) as advance:
         surface = sample_surface(dev, mesh, grid, samples, advance=advance)
     return {

@@ -268,8 +268,7 @@ class Trainer:
 
     def restore(self, step: int, arrays: dict[str, np.ndarray]) -> None:
         """Go on after `step` steps with the arrays of a checkpoint, which are taken out of
-        `arrays`; the model has been loaded already. Raises KeyError and ValueError for an array
-        that does not fit.
+        `arrays`; the model has been loaded already.
         """
         self.step = step
         self._set_level()

@@ -22,6 +22,7 @@ from pp_cl.scene.camera import Camera
 from pp_cl.scene.load import Scene
 from pp_cl.scene.open import DEMO, open_scene, scene_frames
 from pp_cl.training.schedule import gamma_at
+from pp_cl.training.stored import load_run_state
 
 NEAREST = 0.05  # of a point to the eye, in radii of the object
 
@@ -85,7 +86,8 @@ class Run:
         """The model as the camera sees it.
 
         samples: a square number of images, shifted by fractions of a pixel, whose mean it is.
-        features: with the network's input. Raises ValueError for another number of samples.
+        features: with the network's input. Raises ValueError for another number of samples,
+        UserError as checked() does.
         """
         side = math.isqrt(samples)
         if samples < 1 or side * side != samples:
@@ -97,7 +99,20 @@ class Run:
             for dy in shifts
             for dx in shifts
         ]
-        return mean_picture(pictures)
+        picture = mean_picture(pictures)
+        self.checked(picture.colour)
+        return picture
+
+    def checked(self, image: np.ndarray) -> np.ndarray:
+        """An image of the run. Raises UserError naming the checkpoint where it holds NaN: finite
+        parameters may be too large to compute with.
+        """
+        if np.isnan(image).any():
+            raise UserError(
+                f"{self.folder.checkpoint}: its parameters are too large, the image holds NaN;"
+                " restore a copy, or train anew with a lower network.rate or train.sh_rate"
+            )
+        return image
 
     def depth_range(self, camera: Camera) -> tuple[float, float] | None:
         """(near, far) of a camera anywhere; None, the model's, where the blend depends on it."""
@@ -124,11 +139,10 @@ def load_run(
     config = load_config(folder.config)
     given = [] if tolerance is None else [("network.tolerance", tolerance, "tolerance")]
     configure(config, scene or config.scene.path, given)
-    header, arrays = folder.load()
+    header, arrays = load_run_state(folder, config)
     policy = load_policy(dev, config.network.tolerance)
     net = UNet.of_settings(dev, config.network, policy)
-    degree, file = config.points.sh_degree, folder.checkpoint
-    model = Model.load(dev, header, arrays, net, degree=degree, file=file)
+    model = Model.load(dev, header, arrays, net, degree=config.points.sh_degree)
     return Run(dev, folder, config, header, model, policy)
 
 

@@ -13,6 +13,7 @@ from PIL import Image
 from support.scenes import write_ball_scene
 
 from pp_cl.cli import main
+from pp_cl.config import preset
 
 
 def failure(capsys, *words):
@@ -177,7 +178,9 @@ def test_eval_of_nothing_and_of_broken_runs(tmp_path, capsys):
     run.mkdir()
     (run / "config.json").write_text("{}")
     assert "preset" in failure(capsys, "eval", run)
-    (run / "config.json").write_text('{"preset": "tiny"}')
+    config = preset("tiny")
+    config.scene.path = "demo"
+    (run / "config.json").write_text(config.to_json())
     assert "checkpoint.npz" in failure(capsys, "eval", run)
     (run / "checkpoint.npz").write_bytes(b"PK\x03\x04 not really")
     assert "corrupt" in failure(capsys, "eval", run)

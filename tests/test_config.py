@@ -1,31 +1,57 @@
 """Settings: presets, text conversion, JSON round trip, and one-line errors that name the key."""
 
 import json
+import os
+import re
+import warnings
 
+import numpy as np
 import pytest
 
 from pp_cl.config import Config, assign, help_lines, load_config, preset, validate
 from pp_cl.errors import UserError
-from pp_cl.presets import PRESETS, RENAMED
+from pp_cl.presets import ABSENT, PRESETS, RENAMED
 
 
 @pytest.mark.parametrize("name", PRESETS)
 def test_presets_are_valid_and_survive_json(name, tmp_path):
     config = preset(name)
+    config.scene.path = "demo"
     validate(config, "preset")
     (tmp_path / "config.json").write_text(config.to_json())
     assert load_config(tmp_path / "config.json") == config
 
 
 @pytest.mark.parametrize("name", PRESETS)
-def test_a_key_that_a_stored_run_lacks_has_its_presets_value(name, tmp_path):
-    """Unless the key came later: the run had the former behaviour."""
-    (tmp_path / "config.json").write_text(json.dumps({"preset": name, "train": {"seed": 3}}))
-    expected = preset(name)
-    expected.train.seed, expected.train.opacity_rate_steps = 3, 0
-    expected.raster.blend, expected.points.opacity = "softmax", 1.0
-    expected.train.mask_weight = 0.0
-    assert load_config(tmp_path / "config.json") == expected
+def test_what_an_earlier_version_did_not_know_is_taken_as_it_did(name, tmp_path):
+    """And told in one line; of a run without a format number alone."""
+    config = preset(name)
+    config.scene.path, config.train.seed = "demo", 3
+    stored = json.loads(config.to_json())
+    for key in ABSENT:
+        section, setting = key.split(".")
+        stored[section].pop(setting)
+    path = tmp_path / "config.json"
+    path.write_text(json.dumps(stored))
+    with pytest.raises(UserError, match="config.json: key network.blocks is missing"):
+        load_config(path)
+    del stored["format"]
+    path.write_text(json.dumps(stored))
+    with pytest.warns(UserWarning, match="config.json: written by an earlier version") as warned:
+        found = load_config(path)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert load_config(path) == found  # told once
+    (line,) = (str(warning.message) for warning in warned)
+    assert "raster.blend = softmax" in line and "scene.masks = none" in line and "\n" not in line
+    for key, value in ABSENT.items():
+        assign(config, key, value, "test")
+    assert found == config
+    assert (found.raster.blend, found.points.opacity, found.train.refine_at) == (
+        "softmax",
+        1.0,
+        (1.0, 1.0),
+    )
 
 
 @pytest.mark.parametrize("old", RENAMED)
@@ -40,19 +66,24 @@ def test_an_old_key_sets_the_new_one_and_is_noted(old):
     assert config.notes == [f"--set: {old} is called {new} now"] and not expected.notes
 
 
-def test_a_run_with_old_keys_loads_with_one_note(tmp_path):
-    stored = json.loads(preset("paper").to_json())
+def test_a_run_with_old_keys_loads_with_one_line(tmp_path):
+    expected = preset("paper")
+    expected.scene.path = "demo"
+    stored = json.loads(expected.to_json())
+    del stored["format"]
     for old, new in RENAMED.items():
         section, name = new.split(".")
         former, former_name = old.split(".")
         stored[former][former_name] = stored[section].pop(name)
     assert stored.pop("raster") == {"blend": "softmax", "window": "image"}  # without former names
     (tmp_path / "config.json").write_text(json.dumps(stored))
-    config = load_config(tmp_path / "config.json")
-    assert config == preset("paper")
-    (note,) = config.notes
-    assert "config.json: points.footprint is called raster.footprint now" in note
+    with pytest.warns(UserWarning, match="earlier version") as warned:
+        config = load_config(tmp_path / "config.json")
+    assert config == expected and not config.notes
+    (note,) = (str(warning.message) for warning in warned)
+    assert "config.json: " in note and "points.footprint is called raster.footprint now" in note
     assert f"{len(RENAMED) - 1} other keys" in note
+    assert note.endswith("lacks is taken as raster.blend = softmax, raster.window = image")
 
 
 def test_paper_preset_keeps_the_supplementals_numbers():
@@ -130,23 +161,152 @@ def test_validate_refuses(key, value):
         validate(config, "settings")
 
 
-@pytest.mark.parametrize(
-    "text, message",
-    [
-        ("{", "not JSON"),
-        ("[]", "preset"),
-        ('{"preset": ["tiny"]}', "preset"),
-        ('{"preset": "huge"}', "preset"),
-        ('{"preset": "tiny", "train": 3}', "train"),
-        ('{"preset": "tiny", "train": {"x": 3}}', "train.x"),
-    ],
-)
-def test_broken_config_file_names_file_and_key(tmp_path, text, message):
-    path = tmp_path / "config.json"
-    path.write_text(text)
-    with pytest.raises(UserError, match=message) as caught:
+TEXTS = {
+    "half": (b"{", "not JSON"),
+    "nothing": (b"", "not JSON"),
+    "no UTF-8": (b'{"preset": "\xff"}', "not JSON"),
+    "deep": (b"[" * 100_000, "not JSON"),
+    "5000 digits": (b'{"preset": ' + b"9" * 5000 + b"}", "not JSON"),
+    "a list": (b"[]", "not settings"),
+    "null": (b"null", "not settings"),
+    "large": (b" " * 2**20 + b"{}", "larger than settings"),
+    "nothing in it": (b"{}", "preset"),
+    "a list for the preset": (b'{"preset": ["tiny"]}', "preset"),
+    "an unknown preset": (b'{"preset": "huge"}', "preset"),
+    "no more than a preset": (b'{"preset": "tiny"}', "key network.rate is missing"),
+    "a number for a section": (b'{"preset": "tiny", "train": 3}', "train is not an object"),
+    "an unknown key": (b'{"preset": "tiny", "train": {"x": 3}}', "unknown key train.x"),
+    "an unknown section": (b'{"preset": "tiny", "trains": {}}', "trains is no section"),
+    "out of line": (b'{"preset": "tiny", "a\\nb\\u001b[31m": {}}', r"a b\?\[31m is no section"),
+}
+
+
+def refusal(path):
+    """The one line by which the settings are refused."""
+    with pytest.raises(UserError) as caught:
         load_config(path)
-    assert str(path) in str(caught.value)
+    line = str(caught.value)
+    assert line.startswith(f"{path}: ") and line.isprintable() and len(line) < 400
+    return line
+
+
+@pytest.mark.parametrize("text, told", TEXTS.values(), ids=TEXTS)
+def test_broken_config_file_names_file_and_key(tmp_path, text, told):
+    (tmp_path / "config.json").write_bytes(text)
+    assert re.search(told, refusal(tmp_path / "config.json"))
+
+
+def stored_settings():
+    """What a run of the demo stores."""
+    config = preset("tiny")
+    config.scene.path = "demo"
+    return json.loads(config.to_json())
+
+
+VALUES = [
+    ("format", 2, "format is 2, this version reads 1"),
+    ("format", True, "format is True"),
+    ("format", "1", "format is '1'"),
+    ("format", None, "format is None"),
+    ("train.iterations", True, "train.iterations is True, not a whole number"),
+    ("train.iterations", "60", "train.iterations is '60', not a whole number"),
+    ("train.iterations", 60.5, "train.iterations: 60.5 is not a whole number"),
+    ("train.iterations", 10**400, "is not a whole number"),
+    ("train.iterations", None, "train.iterations is None"),
+    ("train.iterations", 0, "train.iterations = 0"),
+    ("train.crop", 130, "train.crop = 130"),
+    ("train.ema", 1, "train.ema is 1, not true or false"),
+    ("train.ema", "true", "train.ema is 'true', not true or false"),
+    ("train.dropout", float("nan"), "train.dropout: nan is not a finite number"),
+    ("train.dropout", float("inf"), "train.dropout: inf is not a finite number"),
+    ("raster.radius", False, "raster.radius is False, not a finite number"),
+    ("raster.radius", [1.0], "raster.radius is [1.0]"),
+    ("raster.gamma", "0.1,0.01", "raster.gamma is '0.1,0.01', not 2 values"),
+    ("raster.gamma", [0.1], "is not 2 values"),
+    ("raster.gamma", [0.1, True], "raster.gamma is True, not a finite number"),
+    ("network.widths", {"0": 16}, "network.widths is {'0': 16}, not 3 values"),
+    ("raster.blend", "fog", "raster.blend = 'fog'; choose from softmax, alpha"),
+    ("raster.blend", 3, "raster.blend is 3, not a word"),
+    ("scene.path", "", "scene.path is empty"),
+    ("scene.path", "a\0b", r"scene.path is 'a\x00b', no text"),
+    ("scene.path", "\ud800", r"scene.path is '\ud800', no text"),
+    ("scene.path", "x" * 10**5, "no text"),
+    ("scene.masks", ["a"], "scene.masks is ['a'], not a word"),
+    ("points.count", [[[]]], "points.count is [[[]]]"),
+    ("points.colour", 3, "unknown key points.colour"),
+]
+
+
+@pytest.mark.parametrize("key, value, told", VALUES)
+def test_a_stored_value_of_another_kind_is_refused(tmp_path, key, value, told):
+    stored, path = stored_settings(), tmp_path / "config.json"
+    section, _, name = key.partition(".")
+    if name:
+        stored[section][name] = value
+    else:
+        stored[section] = value
+    path.write_text(json.dumps(stored))
+    assert told in refusal(path)
+
+
+@pytest.mark.parametrize("section", ["scene", "points", "raster", "network", "train"])
+def test_a_section_and_each_of_its_keys_must_be_there(tmp_path, section):
+    path = tmp_path / "config.json"
+    for name in stored_settings()[section]:
+        stored = stored_settings()
+        del stored[section][name]
+        path.write_text(json.dumps(stored))
+        assert f"key {section}.{name} is missing" in refusal(path)
+        if f"{section}.{name}" not in ABSENT:  # no earlier version lacked it
+            del stored["format"]
+            path.write_text(json.dumps(stored))
+            assert f"key {section}.{name} is missing" in refusal(path)
+    stored = stored_settings()
+    del stored[section]
+    path.write_text(json.dumps(stored))
+    assert f"key {section}." in refusal(path)
+
+
+def test_an_old_key_beside_a_format_number_is_refused(tmp_path):
+    stored, path = stored_settings(), tmp_path / "config.json"
+    stored["train"]["average"] = stored["train"].pop("ema")
+    path.write_text(json.dumps(stored))
+    assert "unknown key train.average" in refusal(path)
+
+
+def test_names_of_files_that_are_no_text_survive(tmp_path):
+    """A system may give bytes that are no UTF-8."""
+    stored, path = stored_settings(), tmp_path / "config.json"
+    stored["scene"]["path"] = os.fsdecode(b"/data/\xe4\xff")
+    path.write_text(json.dumps(stored))
+    assert os.fsencode(load_config(path).scene.path) == b"/data/\xe4\xff"
+
+
+def test_random_changes_are_refused_in_one_line_or_allowed_settings(tmp_path):
+    whole, path, refused = json.dumps(stored_settings(), indent=1).encode(), tmp_path / "c.json", 0
+    for seed in range(300):
+        rng, data = np.random.default_rng(seed), bytearray(whole)
+        for _ in range(rng.integers(1, 4)):
+            place, other = (int(n) for n in rng.integers(len(data), size=2))
+            kind, length = rng.integers(4), int(rng.integers(1, 30))
+            if kind == 0:
+                data[place] = rng.integers(256)
+            elif kind == 1:
+                del data[place : place + length]
+            elif kind == 2:
+                data[place:place] = data[other : other + length]
+            else:
+                data[place : place + 1] = rng.choice([b"NaN", b"1e999", b"true", b"[", b'"', b"-"])
+        path.write_bytes(data)
+        try:
+            config = load_config(path)
+        except UserError as error:
+            assert str(error).startswith(f"{path}: ") and str(error).isprintable(), seed
+            refused += 1
+            continue
+        validate(config, "settings")
+        assert json.loads(config.to_json()).keys() == stored_settings().keys()
+    assert refused > 200
 
 
 def test_help_covers_every_setting():

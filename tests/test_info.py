@@ -12,6 +12,7 @@ from support.runs import arguments, train_and_interrupt
 from support.scenes import write_ball_scene
 
 from pp_cl.cli import main
+from pp_cl.config import preset
 from pp_cl.files.checkpoint import load_checkpoint
 from pp_cl.files.contact_sheet import GAP, HEADER
 from pp_cl.files.image import read_rgba
@@ -215,15 +216,29 @@ def test_the_demo_is_a_scene_too(facts, monkeypatch):
 def test_what_is_neither_is_one_line(tmp_path, capsys):
     assert "no such folder" in failure(capsys, tmp_path / "none")
     assert "no scene in it" in failure(capsys, tmp_path)
-    (tmp_path / "config.json").write_text('{"preset": "tiny"}')
+    config = preset("tiny")
+    config.scene.path = "demo"
+    (tmp_path / "config.json").write_text(config.to_json())
     (tmp_path / "checkpoint.npz").write_bytes(b"PK\x03\x04 not really")
     assert "corrupt checkpoint" in failure(capsys, tmp_path)
 
 
-def test_a_broken_evaluation_is_one_line(finished, tmp_path, capsys):
+@pytest.mark.parametrize(
+    "text",
+    [
+        "[]",
+        "{",
+        "[" * 100_000,
+        '{"mean": 3}',
+        '{"mean": {"psnr": "high"}}',
+        '{"mean": {"psnr": NaN}}',
+        '{"mean": {"psnr": ' + "9" * 400 + "}}",
+    ],
+)
+def test_a_broken_evaluation_is_one_line(finished, tmp_path, capsys, text):
     run = tmp_path / "run"
     shutil.copytree(finished, run)
-    (run / "eval" / "metrics.json").write_text("[]")
+    (run / "eval" / "metrics.json").write_text(text)
     assert "metrics.json: holds no metrics" in failure(capsys, run)
 
 

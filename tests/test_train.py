@@ -139,14 +139,18 @@ def test_a_network_of_other_blocks_than_the_checkpoints_is_refused(
     assert "checkpoint.npz: " in told and "config.json" in told and told.count("\n") == 1
 
 
-def test_a_run_from_before_there_were_blocks_has_double_ones(finished, tmp_path):
+def test_a_run_from_before_there_were_blocks_has_double_ones(finished, tmp_path, capsys):
     run = tmp_path / "run"
     shutil.copytree(finished, run)
     stored = json.loads((run / "config.json").read_text())
-    assert stored["network"].pop("blocks") == "double"
+    assert stored["network"].pop("blocks") == "double" and stored.pop("format") == 1
     (run / "config.json").write_text(json.dumps(stored))
     for folder in (finished, run):
         assert main(["eval", str(folder)]) == 0
+    told = [line for line in capsys.readouterr().err.splitlines() if line.startswith("pp-cl: ")]
+    assert len(told) == 1 and "without a format number" in told[0]
+    assert told[0].startswith(f"pp-cl: {run / 'config.json'}: ")
+    assert told[0].endswith("what it lacks is taken as network.blocks = double")
     one, other = (json.loads((f / "eval/metrics.json").read_text()) for f in (finished, run))
     assert one["mean"] == other["mean"]
 
@@ -238,12 +242,12 @@ def test_settings_are_taken_from_the_run_and_may_not_change(scene, finished, cap
     assert "train.iterations is 60 there, 61 asked for" in capsys.readouterr().err
 
 
-def test_a_checkpoint_of_another_scene_is_refused(scene, tmp_path, capsys):
+def test_a_checkpoint_of_another_scene_is_refused(scene, tmp_path, capsys, monkeypatch):
     out = tmp_path / "run"
-    assert main(arguments(scene, out)) == 0
+    train_and_interrupt(scene, out, 15, monkeypatch)
     header, arrays = load_checkpoint(out / "checkpoint.npz")
     header.pop("format")
-    save_checkpoint(out / "checkpoint.npz", header | {"finished": False, "scene": "0" * 64}, arrays)
+    save_checkpoint(out / "checkpoint.npz", header | {"scene": "0" * 64}, arrays)
     before = (out / "checkpoint.npz").read_bytes()
     assert main(arguments(scene, out)) == 2
     assert "belongs to another scene" in capsys.readouterr().err

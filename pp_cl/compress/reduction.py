@@ -99,7 +99,6 @@ class Original:
             self.reduced_arrays(reduction),
             net,
             degree=reduction.degree,
-            file=run.folder.checkpoint,
         )
         return replace(run, config=config, model=model, policy=policy)
 

@@ -1,6 +1,7 @@
-"""Files of a run: written to a temporary name, synced, renamed; read without trust."""
+"""Checkpoints: written to a temporary name, synced, renamed; read without trust."""
 
 import json
+import math
 import zipfile
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
@@ -9,10 +10,13 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from pp_cl.errors import UserError
+from pp_cl.errors import UserError, quoted, shown
 from pp_cl.files.atomic import atomic_file
+from pp_cl.files.npz import NpzFile
 
 FORMAT = 1  # raised when the arrays change meaning
+MOST_HEADER = 2**24  # bytes; the measurements of a tuned device take some 100,000
+MEND = "delete it to train anew, or restore a copy"
 
 
 class Rows(Protocol):
@@ -46,88 +50,82 @@ def _write_array(member, array):
         member.write(np.ascontiguousarray(piece).reshape(-1).view(np.uint8))
 
 
-def load_checkpoint(path: Path | str) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
-    """(header, {name: numpy array}) of a checkpoint.
-
-    Raises UserError naming the file when it is missing, truncated, corrupt, of another format, or
-    holds NaN or Inf.
+class Checkpoint:
+    """An opened checkpoint. header: its JSON object; forms: {name: Form} of the other arrays, none
+    of which has been read.
     """
-    with _opened(path) as stored:
-        arrays = {name: stored[name] for name in stored.files if name != "header"}
-        header = _header(stored, path)
-    for name, array in arrays.items():
+
+    def __init__(self, path: Path, file: NpzFile) -> None:
+        self.path = path
+        self.forms = {name: form for name, form in file.forms.items() if name != "header"}
+        self._file = file
+        self.header = self._read_header()
+
+    def array(self, name: str) -> np.ndarray:
+        """One of its arrays. Raises UserError naming file and array where it cannot be read, or
+        holds NaN or Inf.
+        """
+        with _refused(self.path):
+            array = self._file.read(name)
         if array.dtype.kind == "f" and not np.isfinite(array).all():
-            raise UserError(
-                f"{path}: {name} holds NaN or Inf; delete it to train anew, or restore a copy"
-            )
-    return header, arrays
+            raise UserError(f"{self.path}: {name} holds NaN or Inf; {MEND}")
+        return array
 
-
-def checkpoint_shapes(path: Path | str) -> tuple[dict[str, Any], dict[str, tuple[int, ...]]]:
-    """(header, {name: shape}) of a checkpoint, whose arrays are not read. Raises UserError as
-    load_checkpoint does, NaN and Inf aside.
-    """
-    with _opened(path) as stored:
-        header, shapes = _header(stored, path), {}
-        for name in stored.files:
-            with stored.zip.open(f"{name}.npy") as member:
-                np.lib.format.read_magic(member)
-                shapes[name] = np.lib.format.read_array_header_1_0(member)[0]
-    del shapes["header"]
-    return header, shapes
-
-
-def checkpoint_array(path: Path | str, name: str) -> np.ndarray:
-    """One array of a checkpoint. Raises UserError naming the file where it is missing or
-    corrupt.
-    """
-    with _opened(path) as stored:
-        return stored[name]
+    def _read_header(self):
+        """The header, of a format that is read."""
+        with _refused(self.path):
+            form = self._file.forms.get("header")
+            if form is None or form.dtype != np.uint8 or math.prod(form.shape) > MOST_HEADER:
+                raise ValueError("it has no header")
+            text = self._file.read("header").tobytes()
+            header = json.loads(text, parse_constant=_refuse_constant)
+            if not isinstance(header, dict):
+                raise ValueError("its header is no JSON object")
+        if header.get("format") != FORMAT:
+            found = quoted(header.get("format"), 40)
+            raise UserError(f"{self.path}: format {found}, this version reads {FORMAT}; train anew")
+        return header
 
 
 @contextmanager
-def _opened(path):
-    """The archive of a checkpoint; what is wrong with it becomes a UserError."""
+def opened_checkpoint(path: Path | str) -> Iterator[Checkpoint]:
+    """The checkpoint, until the block ends. training/stored.py compares it with the settings of its
+    run.
+
+    Raises UserError naming the file when it is missing, truncated, corrupt or of another format.
+    """
     path = Path(path)
     if not path.is_file():
         raise UserError(f"{path}: no such checkpoint; train first")
+    with _refused(path):
+        file = NpzFile(path)
     try:
-        with np.load(path, allow_pickle=False) as stored:
-            yield stored
-    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile, RuntimeError) as error:
-        raise UserError(
-            f"{path}: corrupt checkpoint ({' '.join(str(error).split())[:100]}); delete it to train"
-            " anew, or restore a copy"
-        ) from None
+        yield Checkpoint(path, file)
+    finally:
+        file.close()
 
 
-def _header(stored, path):
-    """The header, of a format that is read."""
-    header = json.loads(stored["header"].tobytes())
-    if header.get("format") != FORMAT:
-        raise UserError(
-            f"{path}: format {header.get('format')}, this version reads {FORMAT}; train anew"
-        )
-    return header
-
-
-def fitting_array(
-    arrays: dict[str, np.ndarray],
-    name: str,
-    shape: tuple[int, ...],
-    file: Path,
-    *,
-    dtype: type = np.float32,
-) -> np.ndarray:
-    """The array called `name`, contiguous, taken out of `arrays`, so that its memory can be freed.
-    Raises UserError naming the file and the array where it is missing or has another shape or
-    dtype.
+def load_checkpoint(path: Path | str) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
+    """(header, {name: numpy array}) of a checkpoint of any run. Raises UserError as
+    opened_checkpoint and Checkpoint.array do.
     """
-    array = arrays.pop(name, None)
-    if array is None or array.shape != tuple(shape) or array.dtype != dtype:
-        found = "missing" if array is None else f"{array.dtype} {array.shape}"
+    with opened_checkpoint(path) as stored:
+        return stored.header, {name: stored.array(name) for name in stored.forms}
+
+
+@contextmanager
+def _refused(path):
+    """What is wrong with the file becomes a UserError."""
+    try:
+        yield
+    except OSError as error:
         raise UserError(
-            f"{file}: {name} is {found}, expected {np.dtype(dtype)} {tuple(shape)}; "
-            "its config.json may belong to another run"
-        )
-    return np.ascontiguousarray(array)
+            f"{path}: cannot be read ({error.strerror or error}); check its permissions and the"
+            " disk"
+        ) from None
+    except (ValueError, RecursionError) as error:
+        raise UserError(f"{path}: corrupt checkpoint ({shown(str(error))}); {MEND}") from None
+
+
+def _refuse_constant(name):
+    raise ValueError(f"its header holds {name}")

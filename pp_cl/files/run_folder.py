@@ -4,9 +4,9 @@ import json
 import math
 import os
 import socket
+import warnings
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from itertools import takewhile
 from pathlib import Path
 from typing import Any
 
@@ -15,10 +15,10 @@ from filelock import FileLock, Timeout
 
 from pp_cl.errors import UserError
 from pp_cl.files.atomic import remove_leftovers, write_text
-from pp_cl.files.checkpoint import Rows, checkpoint_shapes, load_checkpoint, save_checkpoint
+from pp_cl.files.checkpoint import Rows, save_checkpoint
 
-# what the header of a run's checkpoint holds at least
-HEADER = ("scene", "step", "finished", "initial_points", "grid", "depth_range")
+MOST_LINE = 2**16  # bytes of a row; a longer line is none of ours
+MOST_NUMBER = 1e300  # in a row
 
 
 class RunFolder:
@@ -83,30 +83,6 @@ class RunFolder:
             remove_leftovers(folder)
         write_text(self.config, config_json + "\n")
 
-    def load(self) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
-        """(header, arrays) of the checkpoint. Raises UserError as load_checkpoint does, and for an
-        incomplete header.
-        """
-        header, arrays = load_checkpoint(self.checkpoint)
-        self._check_header(header)
-        return header, arrays
-
-    def shapes(self) -> tuple[dict[str, Any], dict[str, tuple[int, ...]]]:
-        """(header, {name: shape}) of the checkpoint, whose arrays are not read. Raises UserError as
-        load() does.
-        """
-        header, shapes = checkpoint_shapes(self.checkpoint)
-        self._check_header(header)
-        return header, shapes
-
-    def _check_header(self, header):
-        missing = [key for key in HEADER if key not in header]
-        if missing:
-            raise UserError(
-                f"{self.checkpoint}: its header lacks {', '.join(missing)}; delete it to train"
-                " anew, or restore a copy"
-            )
-
     def rows(self) -> list[dict[str, Any]]:
         """The rows of the log, up to the first that is broken."""
         return _rows(self.log)
@@ -124,7 +100,7 @@ class Log:
     """A file of one JSON object per logged step. seconds: of training, up to its last row."""
 
     def __init__(self, path: Path, step: int) -> None:
-        rows = _rows_until(path, step)
+        rows = _rows(path, step)
         write_text(path, "".join(json.dumps(row) + "\n" for row in rows))
         self.seconds = rows[-1]["seconds"] if rows else 0.0
         # unbuffered: a failed write leaves nothing that closing would try to write again
@@ -151,25 +127,59 @@ class Log:
             ) from error
 
 
-def _rows(path):
-    """The rows of a log up to the first that is broken."""
-    lines = path.read_text("utf-8", "replace").splitlines() if path.exists() else ()
-    return list(takewhile(lambda row: row is not None, map(_read_row, lines)))
-
-
-def _rows_until(path, step):
-    """The rows of a log up to `step`, or up to the first that is broken or says finished."""
-    return list(takewhile(lambda row: row["step"] <= step and not row.get("finished"), _rows(path)))
-
-
-def _read_row(line):
-    """The object of a line; None where a kill or a fault left no row with step and seconds."""
+def read_row(line: bytes | str) -> dict[str, Any] | None:
+    """The row of a log in a line of it: numbers are finite, "step" and "seconds" are there, from 0
+    on, "psnr" and "loss" are numbers where they are there. None where a kill or a fault left
+    something else.
+    """
     try:
-        row = json.loads(line)
-        json.dumps(row, allow_nan=False)
+        row = json.loads(line, parse_constant=_refuse_constant) if len(line) <= MOST_LINE else None
+        if not isinstance(row, dict) or not _is_kept(row):
+            return None
     except (ValueError, RecursionError):
         return None
-    if not isinstance(row, dict) or type(row.get("step")) is not int:
-        return None
-    seconds = row.get("seconds")
-    return row if type(seconds) in (int, float) and math.isfinite(seconds) else None
+    whole, device = type(row.get("step")) is int, row.get("device", "")
+    numbers = [row.get(name, 0) for name in ("step", "seconds", "loss", "psnr")]
+    is_row = whole and "seconds" in row and isinstance(device, str)
+    is_row = is_row and all(type(number) in (int, float) for number in numbers)
+    return row if is_row and min(numbers[:2]) >= 0 else None
+
+
+def _is_kept(value):
+    """Whether a value of JSON may be written again: no number in it is huge, infinite included."""
+    if isinstance(value, (list, dict)):
+        return all(map(_is_kept, value.values() if isinstance(value, dict) else value))
+    return not isinstance(value, (int, float)) or abs(value) < MOST_NUMBER
+
+
+def _refuse_constant(name):
+    raise ValueError(f"{name} is no number")
+
+
+def _rows(path, step=math.inf):
+    """The rows of a log up to `step`, or to one that says finished where a step is given. The first
+    that is broken, and all after it, are left out with a warning; of a log that may be growing its
+    last line without one.
+    """
+    rows, last = [], {"step": 0, "seconds": 0}
+    for number, line in enumerate(_lines(path), 1):
+        row = read_row(line)
+        if row is None or any(row[name] < last[name] for name in last):
+            if line.endswith(b"\n") or len(line) > MOST_LINE or step < math.inf:
+                warnings.warn(
+                    f"{path}: line {number} is no row of a log; it is left out, as is all after it",
+                    stacklevel=2,
+                )
+            break
+        if row["step"] > step or (step < math.inf and row.get("finished")):
+            break
+        rows.append(row)
+        last = {name: row[name] for name in last}
+    return rows
+
+
+def _lines(path):
+    """The lines of a log, in pieces where they are too long."""
+    if path.exists():
+        with path.open("rb") as file:
+            yield from iter(lambda: file.readline(MOST_LINE + 1), b"")

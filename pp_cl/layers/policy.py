@@ -10,7 +10,7 @@ from pp_cl.device.device import Device
 from pp_cl.errors import UserError
 from pp_cl.layers.blocking import SHIPPED, Blocking, device_class
 from pp_cl.layers.tuning import (
-    check_form,
+    check_blocking,
     fastest,
     load_tuning,
     nearest_row,
@@ -133,25 +133,22 @@ def load_policy(dev: Device, tolerance: float) -> ConvolutionPolicy:
 def policy_of_run(
     dev: Device, tolerance: float, tuning: dict | None, file: Path
 ) -> ConvolutionPolicy:
-    """The policy by the tuning, or None, with which a run began, from its checkpoint `file`.
+    """The policy by the well formed tuning, or None, with which a run began, from its checkpoint
+    `file`.
 
     What was tuned since then changes nothing, so that a run's bits do not depend on when it was
     interrupted. Only on another device the run's tuning is of no use, and that device's own is
-    loaded. Raises UserError for a broken one.
+    loaded. Raises UserError for tile shapes that this version does not know.
     """
     if tuning is not None:
+        if any(tuning["device"][name] != dev.info[name] for name in ("platform", "name")):
+            return load_policy(dev, tolerance)
         try:
-            elsewhere = any(
-                tuning["device"][name] != dev.info[name] for name in ("platform", "name")
-            )
-            if not elsewhere:
-                check_form(tuning, dev)
-        except (KeyError, TypeError, ValueError) as error:
+            check_blocking(tuning, dev)
+        except ValueError as error:
             raise UserError(
                 f"{file}: its tuning is broken ({error}); delete it to train anew, or restore a"
                 " copy"
             ) from None
-        if elsewhere:
-            return load_policy(dev, tolerance)
     origin = f"convolutions: {'tuned' if tuning else 'as shipped'}, as when the run began"
     return make_policy(dev, tolerance, tuning, origin=origin)

@@ -15,6 +15,7 @@ from pathlib import Path
 
 from pp_cl import __version__
 from pp_cl.device.device import Device
+from pp_cl.errors import quoted, shown
 from pp_cl.files.cache import cache_folder
 from pp_cl.layers.blocking import CHOICES, device_class
 from pp_cl.layers.direction import Direction
@@ -22,6 +23,9 @@ from pp_cl.layers.variants import ConvShape
 
 FORMAT = 1
 MARGIN = 1.03  # another than the shipped choice must be faster by more than runs differ
+DEVICE_KEY = ("platform", "name", "driver", "compute_units", "pp_cl")
+MOST_BYTES = 2**24  # of a file; one device has some 100,000
+LEAST, MOST = 1e-30, 2**40  # of sizes, milliseconds and errors that a measurement can give
 LARGEST_RATIO = 4  # of pixels: a measurement says nothing about sizes farther away
 
 
@@ -51,9 +55,7 @@ def device_key(dev: Device) -> dict:
     """The device, driver, number of compute units and version of pp-cl for which a tuning is
     valid.
     """
-    return {name: dev.info[name] for name in ("platform", "name", "driver", "compute_units")} | {
-        "pp_cl": __version__
-    }
+    return {name: dev.info[name] for name in DEVICE_KEY[:-1]} | {DEVICE_KEY[-1]: __version__}
 
 
 def tuning_file(dev: Device) -> Path:
@@ -73,9 +75,7 @@ def load_tuning(dev: Device) -> dict | None:
     except FileNotFoundError:
         return None
     except (OSError, ValueError) as error:
-        reason = (
-            error.strerror if isinstance(error, OSError) else " ".join(str(error).split())[:160]
-        )
+        reason = error.strerror if isinstance(error, OSError) else shown(str(error), 160)
         warnings.warn(
             f"{tuning_file(dev)}: ignored ({reason}); run `pp-cl tune` to measure anew, or"
             " delete it",
@@ -88,37 +88,52 @@ def read_tuning(dev: Device) -> dict:
     """The device's stored tuning. Raises OSError, and ValueError for a broken file or one that is
     not valid for this device.
     """
-    tuning = json.loads(tuning_file(dev).read_text("utf-8"))
+    file = tuning_file(dev)
+    if file.stat().st_size > MOST_BYTES:
+        raise ValueError("larger than measurements are")
+    try:
+        tuning = json.loads(file.read_text("utf-8"))
+    except RecursionError:
+        raise ValueError("lists within lists") from None
     check_tuning(tuning, dev)
     return tuning | {"tile_shapes": stored_blocking(tuning)}
 
 
 def check_tuning(tuning: dict, dev: Device) -> None:
     """Raise ValueError with the reason unless `tuning` was measured on this device as it is."""
-    check_form(tuning, dev)
+    check_form(tuning)
+    check_blocking(tuning, dev)
     for name, value in device_key(dev).items():
         if tuning["device"][name] != value:
-            raise ValueError(f"measured with {name} {tuning['device'][name]}, here it is {value}")
+            found = tuning["device"][name]
+            found = shown(found) if isinstance(found, str) else quoted(found)
+            raise ValueError(f"measured with {name} {found}, here it is {value}")
 
 
-def check_form(tuning: dict, dev: Device) -> None:
-    """Raise ValueError with the reason unless `tuning` is well formed for this class of device."""
+def check_blocking(tuning: dict, dev: Device) -> None:
+    """Raise ValueError unless the tile shapes of a well formed `tuning` are among those of this
+    class of device.
+    """
+    choices = CHOICES[device_class(dev)]
+    for name, value in stored_blocking(tuning).items():
+        if repr(value) not in map(repr, choices.get(name, ())):  # True and 1.0 are equal to 1
+            raise ValueError(f"unknown tile shape {shown(name)} {quoted(value)}")
+
+
+def check_form(tuning: dict) -> None:
+    """Raise ValueError with the reason unless `tuning` is well formed for some device."""
     try:
         if tuning["format"] != FORMAT:
-            raise ValueError(f"format {tuning['format']}, this version reads {FORMAT}")
-        if tuning["device"].keys() != device_key(dev).keys():
+            raise ValueError(f"format {quoted(tuning['format'])}, this version reads {FORMAT}")
+        if sorted(tuning["device"].keys()) != sorted(DEVICE_KEY):
             raise ValueError("it names no device")
-        _check_blocking(tuning["tile_shapes"], CHOICES[device_class(dev)])
+        stored_blocking(tuning)
+        if not isinstance(tuning["rows"], list):
+            raise ValueError("it has no rows")
         for row in tuning["rows"]:
             _check_row(row)
-    except (KeyError, TypeError, AttributeError) as error:
-        raise ValueError(f"no tuning: {type(error).__name__} {error}") from None
-
-
-def _check_blocking(given, choices):
-    for name, value in given.items():
-        if _tupled(value) not in choices.get(name, ()):
-            raise ValueError(f"unknown tile shape {name} {value}")
+    except (KeyError, TypeError, AttributeError, RecursionError) as error:
+        raise ValueError(f"no tuning: {type(error).__name__} {shown(str(error))}") from None
 
 
 def _check_row(row):
@@ -126,12 +141,12 @@ def _check_row(row):
     numbers = [*row["ms"].values(), *row["rel_l2"].values()]
     if (
         row["direction"] not in {direction.value for direction in Direction}
-        or not all(type(n) is int and n > 0 for n in sizes)
-        or not all(type(x) in (int, float) and 0 <= x < math.inf for x in numbers)
+        or not all(type(n) is int and 0 < n < MOST for n in sizes)
+        or not all(type(x) in (int, float) and (x == 0 or LEAST < x < MOST) for x in numbers)
         or not row["ms"]
         or row["ms"].keys() != row["rel_l2"].keys()
     ):
-        raise ValueError(f"invalid row {row}")
+        raise ValueError(f"invalid row {quoted(row)}")
 
 
 def stored_blocking(tuning: dict) -> dict:

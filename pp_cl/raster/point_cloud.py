@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 from pyopencl.array import Array
@@ -12,7 +11,6 @@ from pp_cl.device.buffers import Table
 from pp_cl.device.compact import compact_rows, gather_rows
 from pp_cl.device.device import Device
 from pp_cl.device.rows import DeviceRows
-from pp_cl.files.checkpoint import fitting_array
 from pp_cl.raster.sh import SH_BLOCKS, SH_DEGREES, ShBlock, sh_blocks
 
 
@@ -93,24 +91,10 @@ class PointCloud:
         return {f"points.{name}": rows for name, rows in stored.items()}
 
     @classmethod
-    def load(
-        cls, dev: Device, arrays: dict[str, np.ndarray], degree: int, file: Path
-    ) -> PointCloud:
-        """The points of a checkpoint's arrays. Raises UserError as Model.load does."""
-        n = len(arrays.get("points.ids", ()))
-        ids = fitting_array(arrays, "points.ids", (n,), file, dtype=np.uint32)
-        opacity = fitting_array(arrays, "points.opacity", (n,), file)
-        is_half = arrays.get("points.sh0", ids).dtype == np.float16
-        by_degree = [
-            fitting_array(
-                arrays,
-                f"points.sh{d}",
-                (n, 2 * d + 1, 16),
-                file,
-                dtype=np.float16 if is_half else np.float32,
-            )
-            for d in SH_DEGREES[: degree + 1]
-        ]
+    def load(cls, dev: Device, arrays: dict[str, np.ndarray], degree: int) -> PointCloud:
+        """The points of a checkpoint's arrays, which are taken out of `arrays`."""
+        ids, opacity = (arrays.pop(f"points.{name}") for name in ("ids", "opacity"))
+        by_degree = [arrays.pop(f"points.sh{d}") for d in SH_DEGREES[: degree + 1]]
         sh = []
         for block in sh_blocks(degree):
             start = block.first - block.degree**2  # within its degree

@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -27,6 +28,19 @@ class Grid:
         steps = np.maximum(box[1] - box[0], 0) // edge
         origin = box.mean(0) - edge * steps / 2
         return cls(tuple(float(x) for x in origin), edge, tuple(int(n) + 1 for n in steps))
+
+    @classmethod
+    def of_header(cls, stored: dict[str, Any]) -> "Grid":
+        """The grid of what header() gave."""
+        return cls(tuple(stored["origin"]), stored["edge"], tuple(stored["dims"]))
+
+    def header(self) -> dict[str, Any]:
+        """JSON-able: {"origin", "edge", "dims"}."""
+        return {
+            "origin": [float(x) for x in self.origin],
+            "edge": float(self.edge),
+            "dims": [int(n) for n in self.dims],
+        }
 
     def refined(self) -> "Grid":
         """The grid of half the spacing that has eight vertices around each of this one's: vertex

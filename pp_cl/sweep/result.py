@@ -8,6 +8,7 @@ from pp_cl.config import load_config
 from pp_cl.files.run_folder import RunFolder
 from pp_cl.run import run_config
 from pp_cl.sweep.plan import Job
+from pp_cl.training.stored import opened_run
 
 
 def about(job: Job) -> dict[str, Any]:
@@ -39,7 +40,8 @@ def finished_row(job: Job) -> dict[str, Any] | None:
         return None
     if load_config(folder.config).scene.path != config.scene.path:
         return None  # for the training to refuse or, if it is the same scene, to go on with
-    header, _ = folder.shapes()
+    with opened_run(folder, config) as stored:
+        header = stored.header
     measured = _measured(folder, header, job.metrics) if header["finished"] else None
     if measured is None:
         return None

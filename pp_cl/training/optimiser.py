@@ -186,9 +186,7 @@ class Optimiser:
         return self.state.arrays() | rows
 
     def restore(self, arrays: dict[str, np.ndarray]) -> None:
-        """Take the state, as written by arrays(), out of a checkpoint's arrays. Raises KeyError and
-        ValueError for what does not fit.
-        """
+        """Take the state, as written by arrays(), out of the arrays of a checkpoint."""
         self.state.restore(self.model.cloud, arrays)
         for name, moments in self.moments.items():
             for kind, array in moments.items():

@@ -102,20 +102,18 @@ class PointState:
         """{name in a checkpoint: array}."""
         averages = {f"a.{name}": array for name, array in self.ema.arrays.items()}
         arrays = (self._arrays | averages).items()
-        return {_stored(name): DeviceRows(self.dev, array) for name, array in arrays}
+        return {stored_name(name): DeviceRows(self.dev, array) for name, array in arrays}
 
     def restore(self, cloud: PointCloud, arrays: dict[str, np.ndarray]) -> None:
-        """Take the state out of a checkpoint's arrays. Raises KeyError and ValueError for an array
-        that is missing or does not fit.
-        """
+        """Take the state out of the arrays of a checkpoint, as stored.py has checked it."""
         for name, array in self._arrays.items():
-            self.dev.write(array, arrays.pop(_stored(name)))
+            self.dev.write(array, arrays.pop(stored_name(name)))
         learned = cloud.learned()
-        keys = {name: _stored(f"a.{name}") for name in learned}
+        keys = {name: stored_name(f"a.{name}") for name in learned}
         self.ema.restore(learned, {n: arrays.pop(key) for n, key in keys.items() if key in arrays})
 
 
-def _stored(name):
-    """The name in a checkpoint, as in "m.sh_2a" -> "state.m.sh4"."""
+def stored_name(name: str) -> str:
+    """The name of an array in a checkpoint, as in "m.sh_2a" -> "state.m.sh4"."""
     kind, dot, array = name.rpartition(".")
     return f"state.{kind}{dot}{STORED_NAMES.get(array, array)}"

@@ -41,6 +41,11 @@ def gamma_at(step: int, steps: int, first: float = 0.1, last: float = 0.01) -> f
     return learning_rate(step, steps, first, last)
 
 
+def ema_start(steps: int) -> int:
+    """The step after which the averages begin."""
+    return 17 * steps // 20
+
+
 def ema_weight(step: int, steps: int) -> float:
     """Weight of the present parameters in their exponential moving average; 0 where no update is
     due.
@@ -48,7 +53,7 @@ def ema_weight(step: int, steps: int) -> float:
     The average starts as a copy (weight 1) at 17/20 of the steps, then takes 1 - exp(-k/(steps/20))
     every k = steps/200 steps: a time constant of a twentieth of the training, in ten updates.
     """
-    every, since = max(1, steps // EMA_UPDATES), step - 17 * steps // 20
+    every, since = max(1, steps // EMA_UPDATES), step - ema_start(steps)
     if since < 0 or since % every:
         return 0.0
     return 1.0 if since == 0 else 1 - math.exp(-every / (0.05 * steps))

@@ -1,11 +1,11 @@
 """The rows of a log while it is written."""
 
-import json
-import math
 import os
 from pathlib import Path
 
-MOST_LINE = 2**16  # bytes; a longer line is none of ours
+from pp_cl.files.run_folder import read_row
+
+NAMES = ("step", "loss", "psnr")
 
 
 class LogFollower:
@@ -34,7 +34,7 @@ class LogFollower:
             return False
         whole = text[: text.rfind(b"\n") + 1]
         self._read += len(whole)
-        found = (_read_row(line) for line in whole.splitlines())
+        found = (_shown(line) for line in whole.splitlines())
         self.rows += [row for row in found if row]
         return before != (len(self.rows), self.starts)
 
@@ -45,12 +45,7 @@ class LogFollower:
         self._inode = found.st_ino
 
 
-def _read_row(line):
-    """[step, loss, psnr] of a line that has them as finite numbers, else None."""
-    try:
-        row = json.loads(line) if len(line) <= MOST_LINE else None
-        values = [row[name] for name in ("step", "loss", "psnr")]
-    except (ValueError, RecursionError, TypeError, KeyError):
-        return None
-    kept = all(type(value) in (int, float) and math.isfinite(value) for value in values)
-    return values if kept else None
+def _shown(line):
+    """[step, loss, psnr] of a line that is a row with all three, else None."""
+    row = read_row(line)
+    return [row[name] for name in NAMES] if row and all(name in row for name in NAMES) else None

@@ -164,6 +164,7 @@ class LiveRun:
             most = int(hits.max())
             return shown.colour_scale(hits, 0, most, hits > 0), (0, most)
         picture = renderer.picture(camera, run.gamma, **options)
+        run.checked(picture.colour)
         if show == "alpha":
             return shown.grey(picture.alpha), None
         known = picture.alpha >= shown.LEAST_ALPHA

@@ -30,7 +30,7 @@ def test_a_run_with_old_keys_resumes_and_gets_the_new_ones(tmp_path, capsys, mon
         section, name = key.split(".")
         former_section, former_name = former.split(".")
         old[former_section][former_name] = old[section].pop(name)
-    del old["raster"]
+    del old["raster"], old["format"]  # there was none
     (out / "config.json").write_text(json.dumps(old))
     capsys.readouterr()
     assert main(arguments(scene, out, raster__blend="softmax")) == 0

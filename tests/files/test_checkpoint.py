@@ -11,9 +11,8 @@ from pp_cl.errors import UserError
 from pp_cl.files import atomic
 from pp_cl.files.atomic import atomic_file, remove_leftovers, write_json
 from pp_cl.files.checkpoint import (
-    checkpoint_array,
-    checkpoint_shapes,
     load_checkpoint,
+    opened_checkpoint,
     save_checkpoint,
 )
 
@@ -34,22 +33,23 @@ def test_round_trip_and_equal_bytes(tmp_path):
         np.testing.assert_array_equal(arrays[name], array)
 
 
-def test_shapes_and_single_arrays_are_read_without_the_others(tmp_path):
+def test_forms_and_single_arrays_are_read_without_the_others(tmp_path):
     path = tmp_path / "a.npz"
-    save_checkpoint(path, {"step": 3}, ARRAYS)
-    header, shapes = checkpoint_shapes(path)
-    assert header["step"] == 3 and shapes == {name: array.shape for name, array in ARRAYS.items()}
-    ids = checkpoint_array(path, "points.ids")
-    np.testing.assert_array_equal(ids, ARRAYS["points.ids"])
-    with pytest.raises(UserError, match="a.npz: corrupt checkpoint"):
-        checkpoint_array(path, "points.sh0")
+    arrays = ARRAYS | {"points.opacity": np.linspace(0, 1, 5000, dtype=np.float32)}
+    save_checkpoint(path, {"step": 3}, arrays)
     data = bytearray(path.read_bytes())
-    data[data.index(b"\x93NUMPY", data.index(b"opacity.npy"))] ^= 0xFF
+    data[data.index(arrays["points.opacity"].tobytes())] ^= 1  # read, it is corrupt
     path.write_bytes(data)
-    with pytest.raises(UserError, match="a.npz: corrupt checkpoint"):
-        checkpoint_shapes(path)
-    with pytest.raises(UserError, match="no such checkpoint"):
-        checkpoint_shapes(tmp_path / "none.npz")
+    with opened_checkpoint(path) as stored:
+        assert stored.header["step"] == 3
+        assert {n: (f.shape, f.dtype) for n, f in stored.forms.items()} == {
+            name: (array.shape, array.dtype) for name, array in arrays.items()
+        }
+        np.testing.assert_array_equal(stored.array("points.ids"), ARRAYS["points.ids"])
+        with pytest.raises(UserError, match=r"a\.npz: corrupt checkpoint \(Bad CRC"):
+            stored.array("points.opacity")
+    with pytest.raises(UserError, match="no such checkpoint"), opened_checkpoint(tmp_path / "none"):
+        pass
 
 
 def test_arrays_in_pieces_give_the_bytes_of_whole_ones(dev, tmp_path):

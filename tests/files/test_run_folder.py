@@ -7,6 +7,7 @@ import pytest
 
 from pp_cl.errors import UserError
 from pp_cl.files.run_folder import RunFolder
+from pp_cl.view.follow import LogFollower
 
 ROWS = [{"step": step, "seconds": step / 10, "loss": 1.0} for step in (5, 10, 15)]
 
@@ -53,12 +54,52 @@ def test_a_finished_row_is_made_again(folder):
         b'{"step": 10, "seconds": 1.0, "psnr": NaN}',
         b'{"step": 10, "seconds": 1e999}',
         b"[" * 100_000,
+        b'{"step": 10, "seconds": 1.0, "rates": ' + b"[" * 900 + b"]" * 900 + b"}",
+        b"",
+        b"null",
+        b'{"step": true, "seconds": 1.0}',
+        b'{"step": 10.0, "seconds": 1.0}',
+        b'{"step": -10, "seconds": 1.0}',
+        b'{"step": 4, "seconds": 1.0}',
+        b'{"step": 10, "seconds": 0.1}',
+        b'{"step": 10, "seconds": -1}',
+        b'{"step": 10, "seconds": true}',
+        b'{"step": 10, "seconds": ' + b"9" * 400 + b"}",
+        b'{"step": 10, "seconds": 1.0, "psnr": "20"}',
+        b'{"step": 10, "seconds": 1.0, "psnr": ' + b"9" * 400 + b"}",
+        b'{"step": 10, "seconds": 1.0, "rates": {"sh": [1, -Infinity]}}',
+        b'{"step": 10, "seconds": 1.0, "device": [1]}',
+        b'{"step": 10, "seconds": 1.0, "x": "' + b"y" * 2**17 + b'"}',
     ],
 )
 def test_a_damaged_log_is_cut_off_there(folder, line):
+    """And told in one line."""
     write(folder, json.dumps(ROWS[0]).encode(), line, json.dumps(ROWS[2]).encode())
-    with folder.open_log(20) as log:
+    with pytest.warns(UserWarning, match="line 2 is no row of a log"):
+        assert folder.rows() == ROWS[:1]
+    with pytest.warns(UserWarning, match="line 2 is no row of a log") as warned:
+        log = folder.open_log(20)
+    with log:
         assert log.seconds == 0.5 and rows(folder) == ROWS[:1]
+    (told,) = (str(warning.message) for warning in warned)
+    assert told.startswith(f"{folder.log}: ") and told.isprintable()
+    log = LogFollower(folder.log)
+    log.poll()
+    assert log.rows == [] and folder.rows() == ROWS[:1]
+
+
+def test_what_will_be_made_again_may_be_damaged(folder, recwarn):
+    """As a kill leaves it: nothing is lost, nothing to be told."""
+    write(folder, *(json.dumps(row).encode() for row in ROWS), b'{"step": 20, "sec')
+    with folder.open_log(10):
+        assert rows(folder) == ROWS[:2]
+    assert not recwarn.list
+
+
+def test_a_row_that_is_being_written_is_not_there_yet(folder, recwarn):
+    with folder.log.open("ab") as file:
+        file.write(b'{"step": 20, "sec')
+    assert folder.rows() == ROWS and not recwarn.list
 
 
 def test_a_full_disk_is_one_line_that_names_the_log(folder):
@@ -70,7 +111,7 @@ def test_a_full_disk_is_one_line_that_names_the_log(folder):
                 log.write(ROWS[2])
         finally:
             resource.setrlimit(resource.RLIMIT_FSIZE, limits)
-    with folder.open_log(10):
+    with pytest.warns(UserWarning, match="line 3 is no row"), folder.open_log(15):
         assert rows(folder) == ROWS[:2]
 
 

@@ -94,6 +94,10 @@ BROKEN = {
     "no object": b"[]",
     "null": b"null",
     "other": b'{"a": 1}',
+    "deep": b"[" * 100_000,
+    "5000 digits": b'{"format": ' + b"9" * 5000 + b"}",
+    "large": b" " * 2**24 + b"{}",
+    "out of line": b'{"format": "a\\nb\\u001b[31m"}',
 }
 
 
@@ -103,13 +107,21 @@ def test_a_broken_file_is_ignored_in_one_line(dev, content):
     with pytest.warns(UserWarning, match="ignored.*pp-cl tune") as warned:
         assert load_tuning(dev) is None
     (line,) = (str(warning.message) for warning in warned)
-    assert str(tuning_file(dev)) in line and "\n" not in line
+    assert str(tuning_file(dev)) in line and line.isprintable() and len(line) < 600
 
 
 def test_a_file_that_cannot_be_read_is_ignored_in_one_line(dev):
     tuning_file(dev).mkdir()
     with pytest.warns(UserWarning, match="ignored"):
         assert load_tuning(dev) is None
+
+
+def deep(levels):
+    """A list in a list in a list."""
+    found = []
+    for _ in range(levels):
+        found = [found]
+    return found
 
 
 @pytest.mark.parametrize(
@@ -132,6 +144,20 @@ def test_a_file_that_cannot_be_read_is_ignored_in_one_line(dev):
         {"rows": [row(ms=MS | {"direct": -1})]},
         {"rows": [row(ms=MS | {"direct": "1"})]},
         {"rows": [row(rel_l2={"direct": 1e-7})]},
+        {"rows": [row(pixels=10**400)]},
+        {"rows": [row(pixels=True)]},
+        {"rows": [row(ms=MS | {"direct": 10**400})]},
+        {"rows": [row(ms=MS | {"direct": 1e300})]},
+        {"rows": [row(ms=MS | {"direct": float("inf")})]},
+        {"rows": [row(rel_l2=REL_L2 | {"direct": 5e-324})]},
+        {"rows": [row(rel_l2=REL_L2 | {"direct": 1e300})]},
+        {"rows": [row(direction=["forward"])]},
+        {"rows": {}},
+        {"rows": "fast"},
+        {"tile_shapes": {"winograd": [True, 7]}},
+        {"tile_shapes": {"winograd": [64.0, 8]}},
+        {"tile_shapes": {"winograd": deep(900)}},
+        {"tile_shapes": None},
     ],
 )
 def test_a_tuning_that_cannot_be_is_ignored_in_one_line(dev, change):

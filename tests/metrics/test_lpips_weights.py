@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from pp_cl.errors import UserError
+from pp_cl.files.cache import make_cache_folder
 from pp_cl.metrics import lpips_weights
 from pp_cl.reference.lpips import BLOCKS, random_weights
 
@@ -90,7 +91,7 @@ def test_weights_are_downloaded_once(small, monkeypatch):
     assert_same(lpips_weights.load_weights(), small[0])
 
 
-@pytest.mark.parametrize("damage", ["truncate", "flip", "empty", "text", "other"])
+@pytest.mark.parametrize("damage", ["truncate", "flip", "empty", "text", "other", "bomb"])
 def test_a_damaged_cache_is_downloaded_again(small, monkeypatch, damage):
     weights, pickled = small
     monkeypatch.setattr(lpips_weights, "download", lambda: pickled)
@@ -103,11 +104,26 @@ def test_a_damaged_cache_is_downloaded_again(small, monkeypatch, damage):
             damage, content
         )
     )
+    if damage == "bomb":
+        np.savez_compressed(path, **weights, zeros=np.zeros(2**20))
     if damage == "other":
         np.savez(path, **{name: array + 1 for name, array in weights.items()})
-    assert_same(lpips_weights.load_weights(), weights)
+    with pytest.warns(UserWarning, match=r"lpips_vgg16\.npz: ignored .*; fetched anew") as warned:
+        assert_same(lpips_weights.load_weights(), weights)
+    assert len(warned) == 1 and str(warned[0].message).isprintable()
     forbid_download(monkeypatch)
     assert_same(lpips_weights.load_weights(), weights)
+
+
+def test_a_large_cache_is_not_even_opened(small, monkeypatch):
+    """A sparse file of 64 GiB."""
+    weights, pickled = small
+    monkeypatch.setattr(lpips_weights, "download", lambda: pickled)
+    path = make_cache_folder() / "lpips_vgg16.npz"
+    with path.open("wb") as file:
+        file.truncate(2**36)
+    with pytest.warns(UserWarning, match="larger than the weights"):
+        assert_same(lpips_weights.load_weights(), weights)
 
 
 def test_no_network_is_one_plain_line(small, monkeypatch, tmp_path):

@@ -2,6 +2,7 @@
 
 import json
 
+from support.checkpoints import contents
 from support.runs import SETTINGS
 
 from pp_cl.files.run_folder import RunFolder
@@ -29,9 +30,9 @@ def words_of(scenes, out, *more, changes=None):
 def pretend(job, psnr, ssim=0.5, *, points=10, seconds=2.0, step=None, finished=True):
     """Write the folder of a run as its training and its evaluation would leave it."""
     folder = RunFolder(job.folder)
-    folder.create(run_config(folder, job.scene, job.preset, job.given).to_json())
-    header = {"scene": "", "initial_points": 20, "grid": {}, "depth_range": [1, 2]}
-    folder.save(header | {"step": job.iterations, "finished": finished}, {})
+    config = run_config(folder, job.scene, job.preset, job.given)
+    folder.create(config.to_json())
+    folder.save(*contents(config, job.iterations if finished else job.iterations - 1, points))
     with folder.open_log(0) as log:
         log.write({"step": job.iterations, "seconds": seconds, "finished": finished})
     folder.evaluation("test").mkdir()

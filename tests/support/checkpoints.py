@@ -1,0 +1,70 @@
+"""Checkpoints that no training made: whole ones by a run's settings, and broken ones of them."""
+
+import json
+import zipfile
+
+import numpy as np
+
+from pp_cl.config import preset
+from pp_cl.files.checkpoint import save_checkpoint
+from pp_cl.training.stored import stored_forms
+
+POINTS, STEP, STEPS = 40, 50, 60
+HEADER = {
+    "scene": "5ce0e",
+    "step": STEP,
+    "finished": False,
+    "initial_points": 50,
+    "grid": {"origin": [-1.0, -1.0, -1.0], "edge": 0.25, "dims": [9, 8, 7]},
+    "depth_range": [2.0, 6.0],
+    "tuning": None,
+}
+
+
+def settings(**changes):
+    """The settings of such a run. changes: of the section train."""
+    config = preset("tiny")
+    config.scene.path = "demo"
+    config.network.widths = (16, 16, 16)
+    for name, value in ({"iterations": STEPS} | changes).items():
+        setattr(config.train, name, value)
+    return config
+
+
+def contents(config, step=STEP, n=POINTS):
+    """(header, {name: array}) that a run could have after `step` steps."""
+    rng, arrays = np.random.default_rng(5), {}
+    for name, form in stored_forms(config, n, step).items():
+        arrays[name] = rng.random(form.shape).astype(form.dtype)
+    arrays["points.ids"] = np.sort(rng.choice(9 * 8 * 7, n, replace=False)).astype(np.uint32)
+    if "state.last" in arrays:
+        arrays["state.last"] = rng.integers(0, step + 1, n).astype(np.uint32)
+    finished = step == config.train.iterations
+    return HEADER | {"step": step, "finished": finished}, arrays
+
+
+def write_run(folder, config, header, arrays):
+    """A run's folder with settings and this checkpoint."""
+    folder.path.mkdir(parents=True, exist_ok=True)
+    folder.config.write_text(config.to_json())
+    save_checkpoint(folder.checkpoint, header, arrays)
+
+
+def write_header(path, text):
+    """Replace the header of a checkpoint by bytes that need not be JSON."""
+    with zipfile.ZipFile(path) as old:
+        members = {entry.filename: old.read(entry) for entry in old.infolist()}
+    with zipfile.ZipFile(path, "w") as new:
+        for name, data in members.items():
+            if name == "header.npy":
+                with new.open(name, "w") as file:
+                    np.save(file, np.frombuffer(text, np.uint8))
+            else:
+                new.writestr(name, data)
+
+
+def header_text(**changes):
+    """The header as bytes; a change may be a text of JSON that json.dumps would not write."""
+    header = {"format": 1, **HEADER}
+    fields = [f'"{k}": {changes.get(k) or json.dumps(v)}' for k, v in header.items()]
+    return ("{" + ", ".join(fields) + "}").encode()

@@ -1,0 +1,573 @@
+"""Checkpoints of runs: what a training writes is what is expected; anything else is refused in one
+line that names the file, whoever reads it, before memory is taken for it.
+"""
+
+import io
+import json
+import shutil
+import tracemalloc
+import warnings
+import zipfile
+
+import numpy as np
+import pytest
+from support.checkpoints import (
+    HEADER,
+    STEP,
+    STEPS,
+    contents,
+    header_text,
+    settings,
+    write_header,
+    write_run,
+)
+from support.runs import arguments, train_and_interrupt
+from support.scenes import write_ball_scene
+from support.viewing import asking
+
+from pp_cl.cli import main
+from pp_cl.config import load_config
+from pp_cl.errors import UserError
+from pp_cl.files.checkpoint import load_checkpoint, save_checkpoint
+from pp_cl.files.run_folder import RunFolder
+from pp_cl.trained import load_run
+from pp_cl.training.stored import load_run_state, opened_run, stored_forms
+from pp_cl.view.live_run import LiveRun
+from pp_cl.view.messages import read_request
+
+
+@pytest.fixture
+def folder(tmp_path):
+    """A run's folder that does not exist yet."""
+    return RunFolder(tmp_path / "run")
+
+
+@pytest.fixture
+def config():
+    return settings(lazy_adam=True)
+
+
+def refusal(folder, config):
+    """The one line by which the checkpoint is refused."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        with pytest.raises(UserError) as caught:
+            load_run_state(folder, config)
+    line = str(caught.value)
+    assert line.startswith(f"{folder.checkpoint}: ") and line.isprintable() and len(line) < 400
+    return line
+
+
+# ---- whole ones
+
+
+@pytest.mark.parametrize("step", [1, STEP, 51, 59, STEPS])
+def test_what_fits_is_read_as_it_was_written(folder, config, step):
+    header, arrays = contents(config, step)
+    write_run(folder, config, header, arrays)
+    found_header, found = load_run_state(folder, load_config(folder.config))
+    assert found_header == {"format": 1, **header} and found.keys() == arrays.keys()
+    for name, array in arrays.items():
+        assert found[name].dtype == array.dtype
+        np.testing.assert_array_equal(found[name], array)
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory):
+    """Folder of a small scene."""
+    return write_ball_scene(tmp_path_factory.mktemp("scene") / "ball")
+
+
+@pytest.mark.parametrize(
+    "every, changes",
+    [
+        (10, {}),
+        (53, {}),  # the averages have begun
+        (53, {"train__ema": "false"}),
+        (53, {"train__lazy_adam": "true", "train__moments_16bit": "true"}),
+        (53, {"points__sh_degree": 0, "network__blocks": "gated"}),
+        (10, {"points__sh_degree": 1, "network__widths": "16,24,40"}),
+        (53, {"train__refine_at": "0.5,1", "downscale": 1}),
+    ],
+)
+def test_a_training_writes_what_is_expected(scene, tmp_path, monkeypatch, every, changes):
+    folder = RunFolder(tmp_path / "run")
+    changes = {"points__count": 300, "train__checkpoint_every": every, **changes}
+    train_and_interrupt(scene, folder.path, 58, monkeypatch, **changes)
+    header, arrays = load_checkpoint(folder.checkpoint)
+    assert header["step"] == (50 if every == 10 else 53)
+    expected = stored_forms(load_config(folder.config), len(arrays["points.ids"]), header["step"])
+    assert {name: (a.shape, a.dtype) for name, a in arrays.items()} == expected
+    load_run_state(folder, load_config(folder.config))
+
+
+# ---- broken headers
+
+HEADERS = {
+    "depth range of one": ({"depth_range": [2.0]}, "depth_range"),
+    "depth range of three": ({"depth_range": [2.0, 4.0, 6.0]}, "depth_range"),
+    "far before near": ({"depth_range": [6.0, 2.0]}, "depth_range"),
+    "near behind the eye": ({"depth_range": [-1.0, 2.0]}, "depth_range"),
+    "depths as texts": ({"depth_range": ["2", "6"]}, "depth_range"),
+    "depth of NaN": ({"depth_range": [2.0, float("nan")]}, "corrupt checkpoint"),
+    "no depth": ({"depth_range": [0.0, 1e-300]}, "depth_range"),
+    "near and far as one": ({"depth_range": [2.0, 2.0 + 1e-9]}, "depth_range"),
+    "depth beyond float32": ({"depth_range": [2.0, 1e39]}, "depth_range"),
+    "dims as a text": ({"grid": HEADER["grid"] | {"dims": "987"}}, "grid"),
+    "two dims": ({"grid": HEADER["grid"] | {"dims": [9, 8]}}, "grid"),
+    "negative dims": ({"grid": HEADER["grid"] | {"dims": [9, -8, -7]}}, "grid"),
+    "no vertices": ({"grid": HEADER["grid"] | {"dims": [9, 8, 0]}}, "grid"),
+    "dims that are no whole numbers": ({"grid": HEADER["grid"] | {"dims": [9.0, 8, 7]}}, "grid"),
+    "more vertices than ids": ({"grid": HEADER["grid"] | {"dims": [2**20, 2**20, 2]}}, "grid"),
+    "negative edge": ({"grid": HEADER["grid"] | {"edge": -0.25}}, "grid"),
+    "edge of NaN": ({"grid": HEADER["grid"] | {"edge": float("nan")}}, "corrupt checkpoint"),
+    "edge of true": ({"grid": HEADER["grid"] | {"edge": True}}, "grid"),
+    "grid without origin": ({"grid": {"edge": 0.25, "dims": [9, 8, 7]}}, "grid"),
+    "grid of more": ({"grid": HEADER["grid"] | {"angle": 3}}, "grid"),
+    "no grid": ({"grid": [1, 2]}, "grid"),
+    "step as a text": ({"step": "50"}, "step"),
+    "step as a list": ({"step": [50]}, "step"),
+    "negative step": ({"step": -5}, "step"),
+    "step past the end": ({"step": 10**9}, "step"),
+    "step of 400 digits": ({"step": 10**400}, "step"),
+    "no whole step": ({"step": -1e29}, "step"),
+    "step of true": ({"step": True}, "step"),
+    "finished of 1": ({"finished": 1}, "finished"),
+    "finished before its end": ({"finished": True}, "finished at step 50, of 60"),
+    "not finished at its end": ({"step": STEPS}, "not finished at step 60"),
+    "no points at the start": ({"initial_points": 0}, "initial_points"),
+    "fewer points at the start than now": ({"initial_points": 39}, "points.ids"),
+    "half a point": ({"initial_points": 50.5}, "initial_points"),
+    "scene of a number": ({"scene": 7}, "scene"),
+    "scene without end": ({"scene": "x" * 10**6}, "scene"),
+    "an unknown key": ({"col\nour\x1b[31m": 1}, "header holds col our?[31m"),
+    "tuning of a list": ({"tuning": []}, "tuning"),
+    "tuning of nothing": ({"tuning": {}}, "tuning"),
+    "another format": ({"format": 2}, "format 2"),
+    "format without end": ({"format": "y" * 10**6}, "format 'yyy"),
+}
+
+
+@pytest.mark.parametrize("change, told", HEADERS.values(), ids=HEADERS)
+def test_a_header_that_cannot_be_is_refused(folder, config, change, told):
+    header, arrays = contents(config)
+    write_run(folder, config, header | change, arrays)
+    assert told in refusal(folder, config)
+
+
+@pytest.mark.parametrize("key", [key for key in HEADER if key != "tuning"])
+def test_a_header_that_lacks_a_key_is_refused(folder, config, key):
+    header, arrays = contents(config)
+    del header[key]
+    write_run(folder, config, header, arrays)
+    assert f"its header lacks {key}" in refusal(folder, config)
+
+
+TEXTS = {
+    "a list": b"[]",
+    "a text": b'"header"',
+    "nothing": b"",
+    "no UTF-8": b"\xff\xfe{}",
+    "half": header_text()[:80],
+    "deep": b"[" * 10**5,
+    "an infinite step": header_text(step="1e999"),
+    "Infinity": header_text(step="Infinity"),
+    "5000 digits": header_text(step="9" * 5000),
+    "a deep tuning": header_text(tuning='{"rows": ' + "[" * 900 + "]" * 900 + "}"),
+}
+
+
+@pytest.mark.parametrize("text", TEXTS.values(), ids=TEXTS)
+def test_a_header_of_other_text_is_refused(folder, config, text):
+    write_run(folder, config, *contents(config))
+    write_header(folder.checkpoint, header_text())
+    load_run_state(folder, config)
+    write_header(folder.checkpoint, text)
+    refusal(folder, config)
+
+
+# ---- broken arrays
+
+
+def ids(values):
+    return np.array(values, np.uint32)
+
+
+ONE = np.zeros(3, np.float32)
+ARRAYS = {
+    "ids reversed": ("points.ids", lambda a: a[::-1].copy(), "ascending order"),
+    "ids equal": ("points.ids", lambda a: np.full_like(a, 7), "ascending order"),
+    "an id twice": ("points.ids", lambda a: np.sort(np.append(a[1:], a[5])), "ascending order"),
+    "ids outside": ("points.ids", lambda a: np.append(a[:-1], ids(9 * 8 * 7)), "vertices"),
+    "ids with a sign": ("points.ids", lambda a: a.astype(np.int32), "int32 (40,)"),
+    "ids in two columns": ("points.ids", lambda a: a.reshape(20, 2), "expected 1 to 50 points"),
+    "one id without a row": ("points.ids", lambda a: np.array(a[0]), "points.ids is "),
+    "no points": ("points.ids", lambda a: a[:0], "expected 1 to 50 points"),
+    "no ids": ("points.ids", None, "points.ids is missing"),
+    "an id less than opacities": ("points.ids", lambda a: a[:-1], "expected float32 (39,"),
+    "negative opacity": ("points.opacity", lambda a: a - 1, "opacities from 0 to 1"),
+    "huge opacity": ("points.opacity", lambda a: a + np.float32(1e30), "opacities from 0 to 1"),
+    "opacity of NaN": ("points.opacity", lambda a: a * np.float32("nan"), "NaN or Inf"),
+    "infinite colour": ("points.sh0", lambda a: a + np.float32("inf"), "points.sh0 holds NaN"),
+    "colours of doubles": ("points.sh1", lambda a: a.astype(float), "float64 (40, 3, 16)"),
+    "no degree 2": ("points.sh2", None, "points.sh2 is missing, expected float32 (40, 5, 16)"),
+    "a degree more": ("points.sh3", ONE, "holds points.sh3, which does not belong"),
+    "a layer less": ("net.up1.bias", None, "net.up1.bias is missing"),
+    "a layer more": ("net.enc3.a.bias", ONE, "holds net.enc3.a.bias"),
+    "a wider layer": ("net.out.bias", lambda a: np.append(a, a), "net.out.bias is float32 (32,)"),
+    "weights of other order": ("net.out.weight", lambda a: a[0], "expected float32 (1, 1, 1, 16"),
+    "moments less": ("moment.m.enc0.a.weight", None, "moment.m.enc0.a.weight is missing"),
+    "moments of halves": ("moment.v.out.bias", lambda a: a.astype(np.float16), "float16"),
+    "moments of fewer": ("state.m.sh4", lambda a: a[1:], "state.m.sh4 is float32 (39, 3, 16)"),
+    "negative squares": ("state.v.sh1", lambda a: -a, "state.v.sh1 holds other than"),
+    "negative squares inside": ("moment.v.dec0.a.bias", lambda a: -a, "moment.v.dec0.a.bias"),
+    "a step to come": ("state.last", lambda a: a + np.uint32(STEP + 1), "steps that are done"),
+    "no last steps": ("state.last", None, "state.last is missing"),
+    "negative weights": ("state.peak", lambda a: -a, "state.peak holds other than"),
+    "an average too early": ("average.out.bias", ONE, "holds average.out.bias"),
+    "what nobody asked for": ("photographs", ONE, "holds photographs, which does not belong"),
+    "texts": ("net.out.bias", lambda a: np.array(["x"] * 16), "corrupt checkpoint"),
+}
+
+
+@pytest.mark.parametrize("name, change, told", ARRAYS.values(), ids=ARRAYS)
+def test_an_array_that_cannot_be_is_refused(folder, config, name, change, told):
+    header, arrays = contents(config)
+    if change is None:
+        del arrays[name]
+    else:
+        arrays[name] = change(arrays[name]) if callable(change) else change
+    write_run(folder, config, header, arrays)
+    assert told in refusal(folder, config)
+
+
+@pytest.mark.parametrize(
+    "step, name, told",
+    [
+        (55, "average.out.bias", "average.out.bias is missing"),
+        (55, "state.a.opacity", "state.a.opacity is missing"),
+    ],
+)
+def test_averages_are_there_once_they_have_begun(folder, config, step, name, told):
+    header, arrays = contents(config, step)
+    write_run(folder, config, header, arrays)
+    load_run_state(folder, config)
+    del arrays[name]
+    write_run(folder, config, header, arrays)
+    assert told in refusal(folder, config)
+
+
+def test_a_finished_run_holds_no_state_and_an_unfinished_one_does(folder, config):
+    whole, model = contents(config)[1], contents(config, STEPS)[1]
+    write_run(folder, config, contents(config, STEPS)[0], whole)
+    assert "which does not belong" in refusal(folder, config)
+    write_run(folder, config, contents(config)[0], model)
+    assert "is missing" in refusal(folder, config)
+
+
+def test_coefficients_of_16_bits_are_those_of_a_finished_run_in_all_degrees(folder, config):
+    header, arrays = contents(config, STEPS)
+    for degree in range(3):
+        arrays[f"points.sh{degree}"] = arrays[f"points.sh{degree}"].astype(np.float16)
+        write_run(folder, config, header, arrays)
+        if degree < 2:
+            assert f"points.sh{degree + 1} is float32" in refusal(folder, config)
+    assert load_run_state(folder, config)[1]["points.sh2"].dtype == np.float16
+    header, arrays = contents(config)
+    arrays |= {name: a.astype(np.float16) for name, a in arrays.items() if "points.sh" in name}
+    write_run(folder, config, header, arrays)
+    assert "points.sh0 is float16" in refusal(folder, config)
+
+
+def test_moments_of_16_bits_are_no_others(folder, config):
+    half = settings(lazy_adam=True, moments_16bit=True)
+    header, arrays = contents(half)
+    write_run(folder, half, header, arrays)
+    assert "state.m.sh0 is missing" in refusal(folder, config)
+    load_run_state(folder, half)
+    arrays["state.mv.sh1"][3, 1, 1, 5] = -1
+    write_run(folder, half, header, arrays)
+    assert "second moments from 0 on" in refusal(folder, half)
+
+
+# ---- broken files
+
+
+def rewritten(path, change):
+    """Write the members of a checkpoint anew: change({name: bytes}) -> the same."""
+    with zipfile.ZipFile(path) as old:
+        members = {entry.filename: old.read(entry) for entry in old.infolist()}
+    with zipfile.ZipFile(path, "w") as new:
+        for name, data in change(members).items():
+            new.writestr(name, data)
+
+
+def npy(array, **options):
+    file = io.BytesIO()
+    np.save(file, array, **options)
+    return file.getvalue()
+
+
+def compressed(path):
+    with zipfile.ZipFile(path) as old:
+        members = {entry.filename: old.read(entry) for entry in old.infolist()}
+    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as new:
+        for name, data in members.items():
+            new.writestr(name, data)
+
+
+def bomb(path):
+    with zipfile.ZipFile(path, "a", zipfile.ZIP_DEFLATED) as archive:
+        archive.writestr("bomb.npy", npy(np.zeros(2**24)))
+
+
+def claimed(path):
+    """4 GiB in the directory, of which there is nothing."""
+    data = path.read_bytes()
+    place = data.rindex(b"PK\x01\x02")
+    size = (2**32 - 2).to_bytes(4, "little") * 2
+    path.write_bytes(data[: place + 20] + size + data[place + 28 :])
+
+
+def twice(path):
+    with warnings.catch_warnings(), zipfile.ZipFile(path, "a") as archive:
+        warnings.simplefilter("ignore")
+        archive.writestr("points.ids.npy", npy(ids(range(40))))
+
+
+def encrypted(path):
+    data = bytearray(path.read_bytes())
+    data[data.rindex(b"PK\x01\x02") + 8] |= 1
+    path.write_bytes(data)
+
+
+def with_member(name, data):
+    return lambda path: rewritten(path, lambda members: members | {name: data})
+
+
+def with_header(old, new):
+    """Change the text of the opacities' own header, of the same length."""
+    assert len(old) == len(new)
+    name = "points.opacity.npy"
+    return lambda path: rewritten(path, lambda m: m | {name: m[name].replace(old, new)})
+
+
+FILES = {
+    "empty": lambda path: path.write_bytes(b""),
+    "text": lambda path: path.write_text("hello"),
+    "half": lambda path: path.write_bytes(path.read_bytes()[: path.stat().st_size // 2]),
+    "an array alone": lambda path: path.write_bytes(npy(np.zeros(5))),
+    "an empty zip": lambda path: rewritten(path, lambda members: {}),
+    "a readme": with_member("README.txt", b"hello"),
+    "a readme that ends like an array": with_member("README.npy", b"hello"),
+    "a folder": with_member("points/", b""),
+    "a path outside": with_member("../../x.npy", npy(ONE)),
+    "a name that leaves the line": with_member("a\n\x1b[2J.npy", npy(ONE)),
+    "a pickle": with_member("x.npy", npy(np.array([{}], object), allow_pickle=True)),
+    "columns first": with_member("points.sh1.npy", npy(np.asfortranarray(np.ones((40, 3, 16))))),
+    "big-endian": with_member("points.opacity.npy", npy(np.zeros(40, ">f4"))),
+    "no header": lambda path: rewritten(
+        path, lambda m: {name: data for name, data in m.items() if name != "header.npy"}
+    ),
+    "a header of numbers": with_member("header.npy", npy(np.zeros(5))),
+    "fewer values than said": with_header(b"(40,)", b"(41,)"),
+    "more values than said": with_header(b"(40,)", b"(39,)"),
+    "less than none": with_header(b"(40,)", b"(-4,)"),
+    "code": with_header(b"'<f4'", b"f(4) "),
+    "python 2": with_header(b"(40,)", b"(4L,)"),
+    "brackets": with_header(b"(40,)", b"((((("),
+    "compressed": compressed,
+    "a bomb": bomb,
+    "4 GiB claimed": claimed,
+    "an array twice": twice,
+    "encrypted": encrypted,
+}
+
+
+@pytest.mark.parametrize("damage", FILES.values(), ids=FILES)
+def test_a_file_that_cannot_be_is_refused_before_memory_is_taken(folder, config, damage):
+    write_run(folder, config, *contents(config))
+    damage(folder.checkpoint)
+    refusal(folder, config)  # what is imported on the way is not counted below
+    tracemalloc.start()
+    try:
+        refusal(folder, config)
+        assert tracemalloc.get_traced_memory()[1] < 2**21
+    finally:
+        tracemalloc.stop()
+
+
+def test_a_file_that_may_not_be_read_is_not_called_corrupt(folder, config, monkeypatch):
+    write_run(folder, config, *contents(config))
+
+    def refused(*_args, **_named):
+        raise PermissionError(13, "Permission denied")
+
+    monkeypatch.setattr(zipfile, "ZipFile", refused)
+    line = refusal(folder, config)
+    assert "cannot be read (Permission denied)" in line and "delete" not in line
+
+
+def mutated(data, rng):
+    """A copy with a few random changes, half of them in the directory or an array's header."""
+    data = bytearray(data)
+    for _ in range(rng.integers(1, 4)):
+        marks = (b"PK\x01\x02", b"PK\x03\x04", b"\x93NUMPY", b"PK\x05\x06")
+        start = data.find(marks[rng.integers(4)], rng.integers(len(data)))
+        place = int(rng.integers(len(data)))
+        if start >= 0 and rng.random() < 0.7:
+            place = min(start + int(rng.integers(120)), len(data) - 1)
+        length = int(rng.integers(1, 40))
+        kind = rng.integers(6)
+        if kind == 0:
+            data[place] ^= 1 << rng.integers(8)
+        elif kind == 1:
+            data[place] = rng.integers(256)
+        elif kind == 2:
+            data[place : place + 4] = rng.choice([b"\xff\xff\xff\xff", b"\0\0\0\0", b"\0\0\0\x80"])
+        elif kind == 3:
+            del data[place : place + length]
+        elif kind == 4:
+            data[place:place] = data[place : place + length]
+        else:
+            other = int(rng.integers(len(data)))
+            data[place : place + length] = data[other : other + length]
+    return bytes(data)
+
+
+def test_of_random_changes_all_are_refused_or_change_nothing(folder, config):
+    header, arrays = contents(config)
+    write_run(folder, config, header, arrays)
+    whole, refused = folder.checkpoint.read_bytes(), 0
+    for seed in range(300):
+        folder.checkpoint.write_bytes(mutated(whole, np.random.default_rng(seed)))
+        try:
+            with warnings.catch_warnings():
+                warnings.simplefilter("error")
+                found_header, found = load_run_state(folder, config)
+        except UserError as error:
+            assert str(error).isprintable() and str(folder.checkpoint) in str(error), seed
+            refused += 1
+            continue
+        assert found_header == {"format": 1, **header} and found.keys() == arrays.keys(), seed
+        assert all(np.array_equal(found[name], arrays[name]) for name in arrays), seed
+    assert refused > 200
+
+
+# ---- whoever reads it
+
+
+@pytest.fixture(scope="module")
+def trained(scene, tmp_path_factory):
+    """(folder of a finished run, of one interrupted at step 20)."""
+    out = tmp_path_factory.mktemp("runs")
+    with pytest.MonkeyPatch.context() as patch:
+        train_and_interrupt(scene, out / "young", 25, patch)
+    assert main(arguments(scene, out / "run")) == 0
+    return out / "run", out / "young"
+
+
+BROKEN = {
+    "ids": lambda header, arrays: arrays.update({"points.ids": arrays["points.ids"][::-1].copy()}),
+    "member": lambda header, arrays: arrays.update(extra=ONE),
+    "step": lambda header, arrays: header.update(step=-5),
+    "opacity": lambda header, arrays: arrays["points.opacity"].fill(-1),
+}
+TOLD = {
+    "ids": "points.ids holds other than vertices of its grid in ascending order",
+    "member": "holds extra, which does not belong there",
+    "step": "step in its header is -5, expected one of the 60 steps",
+    "opacity": "points.opacity holds other than opacities from 0 to 1",
+}
+
+
+@pytest.mark.parametrize("kind", BROKEN)
+def test_every_reader_says_the_same(scene, trained, dev, tmp_path, capsys, kind):
+    finished, young = (tmp_path / name for name in ("run", "young"))
+    for old, new in zip(trained, (finished, young), strict=True):
+        shutil.copytree(old, new)
+        header, arrays = load_checkpoint(new / "checkpoint.npz")
+        header.pop("format")
+        BROKEN[kind](header, arrays)
+        save_checkpoint(new / "checkpoint.npz", header, arrays)
+    run, out = str(finished), str(tmp_path / "out")
+    commands = [
+        ["eval", run],
+        ["info", run, "--picture", str(tmp_path / "a.png")],
+        ["render", run, "--out", out, "--format", "png"],
+        ["export", run, "--format", "ply", "--out", f"{out}.ply"],
+        arguments(scene, finished),
+        arguments(scene, young),
+    ]
+    if kind == "opacity":
+        del commands[1]  # info reads the ids alone
+    for words in commands:
+        folder = young if str(young) in words else finished
+        capsys.readouterr()
+        assert main(words) == 2, words
+        error = capsys.readouterr().err.splitlines()
+        expected = f"pp-cl: {folder / 'checkpoint.npz'}: {TOLD[kind]}"
+        assert error[-1].startswith(expected), words
+        assert len([line for line in error if line.startswith("pp-cl: ")]) == 1
+    live = LiveRun(dev, finished)
+    assert live.refresh() and TOLD[kind] in live.waiting
+
+
+def overflow(path):
+    """Make the weights of a checkpoint so large that its network computes NaN."""
+    header, arrays = load_checkpoint(path)
+    header.pop("format")
+    for name, array in arrays.items():
+        if name.startswith("net.") and name.endswith("weight"):
+            array[...] = np.where(np.arange(array.size).reshape(array.shape) % 2, 1e30, -1e30)
+    save_checkpoint(path, header, arrays)
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ["eval"],
+        ["eval", "--set-tau"],
+        ["render", "--out", "frames", "--format", "png", "--seconds", "0.1", "--size", "24x24"],
+        ["export", "--format", "ply", "--out", "a.ply"],
+        ["export", "--format", "scene", "--out", "views"],
+        ["export", "--format", "mesh", "--out", "mesh.ply"],
+        ["export", "--format", "html", "--out", "page.html"],
+    ],
+)
+def test_finite_weights_that_overflow_are_one_line(trained, tmp_path, monkeypatch, capsys, words):
+    monkeypatch.chdir(tmp_path)
+    shutil.copytree(trained[0], "run")
+    overflow(tmp_path / "run" / "checkpoint.npz")
+    if words[1:] == ["--set-tau"]:
+        text = (tmp_path / "run/config.json").read_text()
+        (tmp_path / "run/config.json").write_text(text.replace('"tau": 0.0', '"tau": 0.01'))
+        words = words[:1]
+    capsys.readouterr()
+    assert main([words[0], "run", *words[1:]]) == 2
+    error = capsys.readouterr().err
+    assert "run/checkpoint.npz: its parameters are too large, the image holds NaN" in error
+    assert len([line for line in error.splitlines() if line.startswith("pp-cl: ")]) == 1
+
+
+def test_a_model_that_overflows_is_told_by_the_viewer(trained, dev, tmp_path):
+    """In place of the picture, and the render thread lives on."""
+    shutil.copytree(trained[0], tmp_path / "run")
+    overflow(tmp_path / "run" / "checkpoint.npz")
+    live = LiveRun(dev, tmp_path / "run")
+    assert live.refresh()
+    camera = load_run(dev, trained[0]).cameras("train")[0]
+    with pytest.raises(UserError, match="the image holds NaN"):
+        live.draw(read_request(json.dumps(asking(camera))))
+
+
+def test_only_what_is_asked_for_is_read(folder, config):
+    """info reads no array: what is wrong with their values does not keep it from telling."""
+    header, arrays = contents(config)
+    arrays["points.opacity"][0] = 2
+    write_run(folder, config, header, arrays)
+    with opened_run(folder, config) as stored:
+        assert stored.forms["points.opacity"].shape == (40,)
+        np.testing.assert_array_equal(stored.array("points.ids"), arrays["points.ids"])
+        with pytest.raises(UserError, match="opacities from 0 to 1"):
+            stored.array("points.opacity")
