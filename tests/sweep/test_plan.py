@@ -69,7 +69,7 @@ def test_a_job_survives_its_way_to_a_process(tmp_path, scenes):
 
 
 def test_iterations_are_those_of_preset_and_settings(tmp_path, scenes):
-    assert jobs_of(scenes, tmp_path, given=[], preset_name="small")[0].iterations == 20_000
+    assert jobs_of(scenes, tmp_path, given=[], preset_name="small")[0].iterations == 6_000
     varied = [("train.iterations", ["7", "9"])]
     jobs = jobs_of(scenes[:1], tmp_path, varied=varied, given=[])
     assert [job.iterations for job in jobs] == [7, 9]
