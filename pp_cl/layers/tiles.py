@@ -44,15 +44,15 @@ def some_tiles(dev: Device, size: tuple[int, int], count: np.ndarray) -> Tiles:
 
     Raises ValueError when no count is above 0.
     """
+    return Tiles(size, np.count_nonzero(count), *map(dev.upload, tile_arrays(size, count)))
+
+
+def tile_arrays(size: tuple[int, int], count: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Tiles.list and Tiles.count as numpy arrays. Raises ValueError as some_tiles()."""
     chosen = np.flatnonzero(count)
     if not len(chosen):
         raise ValueError(f"no tile of {size} chosen")
-    return Tiles(
-        size,
-        len(chosen),
-        dev.upload(np.concatenate([(*size, len(chosen)), chosen]), np.int32),
-        dev.upload(count, np.float32),
-    )
+    return np.array([*size, len(chosen), *chosen], np.int32), count.astype(np.float32)
 
 
 def all_tiles(dev: Device, height: int, width: int) -> Tiles:
@@ -93,23 +93,23 @@ def tiles_compare(dev: Device, x: Array, source: np.ndarray) -> np.ndarray:
     return _flags(dev, "tiles_compare", x, source=dev.upload(source, np.int32))
 
 
-def copy_list(dev: Device, source: np.ndarray, chosen: np.ndarray) -> Array | None:
+def copy_list(source: np.ndarray, chosen: np.ndarray) -> np.ndarray:
     """(2, n) int32: for tiles_copy(), the tiles whose numbers `source` gives for the n chosen ones,
-    and these; None where none is chosen.
+    and these.
 
     source: (rows, columns) integers; chosen: (rows, columns) bool.
     """
     to = np.flatnonzero(chosen)
-    return dev.upload(np.stack([source.ravel()[to], to]), np.int32) if len(to) else None
+    return np.stack([source.ravel()[to], to]).astype(np.int32)
 
 
-def tiles_copy(dev: Device, x: Array, from_to: Array | None) -> None:
-    """Copy tiles of x (H, W, C) float32 to others, as copy_list() has them; none is both. A tile
-    and its source have the same shape.
+def tiles_copy(dev: Device, x: Array, from_to: Array) -> None:
+    """Copy tiles of x (H, W, C) float32 to others, (2, n) int32 as copy_list() has them; none is
+    both. A tile and its source have the same shape.
     """
-    if from_to is None:
-        return
     (h, w, c), n = x.shape, from_to.shape[1]
+    if not n:
+        return
     dev.program("layers/tiles").launch(
         "tiles_copy",
         (-(-c // LANES), SIDE * SIDE, n),

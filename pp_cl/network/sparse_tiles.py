@@ -25,7 +25,7 @@ from pp_cl.layers.tiles import (
     Tiles,
     all_tiles,
     copy_list,
-    some_tiles,
+    tile_arrays,
     tiles_compare,
     tiles_copy,
 )
@@ -179,30 +179,38 @@ class TilePlan:
 
     def upload(self) -> TilePlan:
         """The plan, with all lists on the device: an upload between kernels would wait for them."""
-        for name in self.maps:
-            self.tiles(name)
-            self._copies[name] = self._copy_list(name, self.needed[name])
+        maps = {id(tile_map): tile_map for tile_map in self.maps.values()}
+        lists = [part for m in maps.values() for part in tile_arrays(self._size(m), m.count())]
+        copies = {name: self._copy_list(name, needed) for name, needed in self.needed.items()}
+        arrays = iter(self.dev.upload_all([*lists, *copies.values()]))
+        for key, m in maps.items():
+            self._tiles[key] = Tiles(
+                self._size(m), int(m.computed.sum()), next(arrays), next(arrays)
+            )
+        self._copies = dict(zip(copies, arrays, strict=True))
         return self
+
+    def _size(self, tile_map):
+        return self.size[0] >> tile_map.level, self.size[1] >> tile_map.level
 
     def _copy_list(self, name, needed):
         tile_map = self.maps[name]
-        return copy_list(self.dev, tile_map.source, needed & ~tile_map.computed)
+        return copy_list(tile_map.source, needed & ~tile_map.computed)
 
     def tiles(self, name: str) -> Tiles:
-        """The tiles of a feature map to compute."""
-        tile_map = self.maps[name]
-        if id(tile_map) not in self._tiles:
-            size = self.size[0] >> tile_map.level, self.size[1] >> tile_map.level
-            self._tiles[id(tile_map)] = some_tiles(self.dev, size, tile_map.count())
-        return self._tiles[id(tile_map)]
+        """The tiles of a feature map to compute; of a plan that is on the device."""
+        return self._tiles[id(self.maps[name])]
 
     def fill_copies(self, name: str, array: Array, needed: np.ndarray | None = None) -> None:
         """Copy representatives to the needed tiles that were not computed.
 
         needed: others than self.needed[name].
         """
-        own = needed is None
-        tiles_copy(self.dev, array, self._copies[name] if own else self._copy_list(name, needed))
+        if needed is None:
+            from_to = self._copies[name]
+        else:
+            from_to = self.dev.upload(self._copy_list(name, needed))
+        tiles_copy(self.dev, array, from_to)
 
 
 class ImagePlan(TilePlan):

@@ -100,7 +100,7 @@ def test_copy(dev, rng, shape):
             source[place] = places.index(other)
             copies[place][:] = tiles[other]
     device_x = dev.upload(x)
-    tiles_copy(dev, device_x, copy_list(dev, source, chosen))
+    tiles_copy(dev, device_x, dev.upload(copy_list(source, chosen)))
     np.testing.assert_array_equal(device_x.get(), expected)
 
 
