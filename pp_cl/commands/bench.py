@@ -17,6 +17,7 @@ OPTIONS = {
     "unet": ("size", "widths", "blocks", "plot", "tolerance"),
     "raster": ("size", "scene", "points", "blend", "tau", "gamma", "plot"),
     "train": ("scene", "points", "set"),
+    "model": ("runs", "plot"),
 }
 VIEWS, ROUNDS = 3, 5  # of bench train: views of the scene, evenly spread, and rounds over them
 
@@ -31,7 +32,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         choices=OPTIONS,
         help="all (default): a page about the device, from sizes that fit a budget of time; conv:"
         " every layer of the network; unet: all of it; raster: points; train: a step without the"
-        " network",
+        " network; model: frames per second against PSNR of a trained run",
     )
     add(
         "--size",
@@ -59,6 +60,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="N,...",
         help="raster: numbers of points (10 thousand to 4 million); train: one (4 million)",
     )
+    add("--runs", metavar="RUN,...", help="model: folders of runs; the first is reduced as well")
     add("--blend", metavar="B,...", help="raster: of alpha,softmax (both)")
     add("--tau", metavar="T,...", help="raster: weight that a pixel may drop (0,1e-4,1e-3,1e-2)")
     add("--gamma", metavar="G", help="raster: depth sharpness of the blend (0.01)")
@@ -76,7 +78,7 @@ def run(options: argparse.Namespace) -> None:
     measured, for options that make no sense and files that cannot be written.
     """
     _refuse_foreign(options)
-    own = {"all": _run_all, "raster": _run_raster, "train": _run_train}
+    own = {"all": _run_all, "raster": _run_raster, "train": _run_train, "model": _run_model}
     own.get(options.what, _run_network)(options)
 
 
@@ -178,6 +180,27 @@ def _run_train(options):
         print(f"  {name:10s} {ms:9.2f} ms")
     print(f"forward {row['forward_ms']:.2f} ms, backward and update {row['backward_ms']:.2f} ms")
     _write_json(options.json, dev, [row])
+
+
+def _run_model(options):
+    from pp_cl.bench.model import HEAD, bench_models, line, plot
+    from pp_cl.bench.plots import check_files, save_figure
+    from pp_cl.trained import load_run
+
+    if not options.runs:
+        raise UserError("--runs: missing; name the folder of a trained run")
+    figure = check_files(options.json, options.plot)
+    dev = _open_device(options)
+    runs = [load_run(dev, folder) for folder in options.runs.split(",")]
+    print(HEAD)
+    rows = []
+    for row in bench_models(runs):
+        rows.append(row)
+        print(line(row), flush=True)
+    _write_json(options.json, dev, rows)
+    if figure:
+        plot(figure, f"{runs[0].folder}, {dev.name}", rows)
+        save_figure(figure, options.plot)
 
 
 def _run_network(options):

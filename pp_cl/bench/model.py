@@ -1,0 +1,109 @@
+"""`pp-cl bench model`: frames per second against PSNR of trained runs, each way of making them
+smaller or faster by itself.
+
+PSNR is over a few test views, speed against the first run as it was trained, frame by frame in
+turn.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+from typing import Any
+
+from pp_cl.compress.reduction import (
+    Original,
+    Reduction,
+    measured_psnr,
+    nbytes,
+    point_weights,
+)
+from pp_cl.compress.search import frame_ms
+from pp_cl.layers.policy import make_policy
+from pp_cl.layers.variants import offered
+from pp_cl.trained import Run
+
+VIEWS = 8
+# Fields of Reduction and what they are set to, one at a time.
+TRIED = {
+    "keep": (0.9, 0.75, 0.5, 0.25),
+    "half": (True,),
+    "degree": (1, 0),
+    "tau": (1e-4, 1e-3, 1e-2),
+    "early_stop": (0.003, 0.01, 0.03),
+    "window": ("object",),
+}
+COLUMNS = "{:28} {:>9} {:>9} {:>8} {:>8} {:>7} {:>7}".format
+HEAD = COLUMNS("what", "points", "MiB", "PSNR", "loss", "ms", "speed")
+
+
+def bench_models(runs: list[Run]) -> Iterator[dict[str, Any]]:
+    """Rows of the first run, of the others, and of the first one's reductions: {"what", "points",
+    "bytes", "psnr", "loss", "ms", "speed"}.
+    """
+    first = runs[0]
+    scene = first.scene("test").splits["test"]
+    count = min(VIEWS, len(scene))
+    views = [scene[i * len(scene) // count] for i in range(count)]
+    whole = measured_psnr(first, views)
+
+    def row(what, run, size):
+        psnr = whole if run is first else measured_psnr(run, views)
+        before, ms = frame_ms([first, run], views)
+        return {
+            "what": what,
+            "points": run.model.cloud.count,
+            "bytes": size,
+            "psnr": psnr,
+            "loss": whole - psnr,
+            "ms": ms,
+            "speed": before / ms,
+        }
+
+    for run in runs:
+        arrays = {name: rows.get() for name, rows in run.model.arrays().items()}
+        yield row(str(run.folder), run, nbytes(arrays))
+    original = Original(first, point_weights(first, first.cameras("train")))
+    for what, reduction in _reductions(first):
+        size = nbytes(original.reduced_arrays(reduction))
+        yield row(what, original.reduced(reduction), size)
+    for name in offered(first.policy.device_class):
+        run = original.reduced(Reduction.of(first))
+        run.model.net.use(make_policy(first.dev, variant=name))
+        yield row(f"convolutions by {name}", run, nbytes(original.arrays))
+
+
+def _reductions(run):
+    """(what it is, Reduction) of each value that the run does not have yet."""
+    present = Reduction.of(run)
+    for name, values in TRIED.items():
+        for value in values:
+            if (name == "degree" and value >= present.degree) or value == getattr(present, name):
+                continue
+            yield f"{name} {value}", replace(present, **{name: value})
+
+
+def line(row: dict[str, Any]) -> str:
+    """One line of the printed table."""
+    return COLUMNS(
+        row["what"],
+        row["points"],
+        f"{row['bytes'] / 2**20:.1f}",
+        f"{row['psnr']:.2f}",
+        f"{row['loss']:.3f}",
+        f"{row['ms']:.1f}",
+        f"{row['speed']:.2f}",
+    )
+
+
+def plot(figure: Any, title: str, rows: list[dict[str, Any]]) -> None:
+    """Draw speed against loss, a colour for each way. figure: matplotlib's."""
+    axes = figure.add_subplot(
+        xlabel="frames per second, of the first run's", ylabel="PSNR lost, dB", title=title
+    )
+    axes.set_yscale("symlog", linthresh=0.01)
+    kinds = {row["what"]: row["what"].split()[0] for row in rows}
+    for i, kind in enumerate(dict.fromkeys(kinds.values())):
+        some = [row for row in rows if kinds[row["what"]] == kind]
+        speed, loss = [row["speed"] for row in some], [row["loss"] for row in some]
+        axes.plot(speed, loss, "os^Dv"[i % 5], color=f"C{i}", label=kind)

@@ -1,0 +1,73 @@
+"""Frames per second against PSNR: every way of making a run smaller, by itself."""
+
+import json
+
+import pytest
+from support.runs import arguments
+from support.scenes import write_ball_scene
+
+from pp_cl.bench import model as module
+from pp_cl.bench.model import TRIED, bench_models, line
+from pp_cl.cli import main
+from pp_cl.compress.reduction import measured_psnr
+from pp_cl.trained import load_run
+
+
+@pytest.fixture(scope="module")
+def trained(tmp_path_factory):
+    """Two runs of 20 steps, the second with one convolution a level."""
+    folder = tmp_path_factory.mktemp("model")
+    scene = write_ball_scene(folder / "ball", views=9, size=40)
+    for name, blocks in (("a", "double"), ("b", "single")):
+        changes = {"train__iterations": 20, "network__blocks": blocks, "train__previews": 0}
+        assert main(arguments(scene, folder / name, 1, **changes)) == 0
+    return folder
+
+
+def test_rows_of_two_runs(dev, trained, monkeypatch):
+    monkeypatch.setattr(module, "TRIED", TRIED | {"keep": (0.5,), "tau": (0.3,)})
+    runs = [load_run(dev, trained / name) for name in "ab"]
+    rows = list(bench_models(runs))
+    by_name = {row["what"]: row for row in rows}
+    first, second = rows[:2]
+    assert (first["loss"], first["what"]) == (0, str(runs[0].folder))
+    views = runs[0].scene("test").splits["test"]
+    picked = [views[i * len(views) // min(8, len(views))] for i in range(min(8, len(views)))]
+    assert first["psnr"] == pytest.approx(measured_psnr(runs[0], picked))
+    assert second["bytes"] < first["bytes"]
+    saved = first["bytes"] - by_name["half True"]["bytes"]
+    assert saved == first["points"] * 9 * 16 * 2
+    assert abs(by_name["half True"]["loss"]) < 0.05
+    assert by_name["keep 0.5"]["points"] == round(first["points"] / 2)
+    assert by_name["degree 0"]["bytes"] < by_name["degree 1"]["bytes"] < first["bytes"]
+    assert by_name["tau 0.3"]["loss"] != 0
+    assert abs(by_name["convolutions by direct"]["loss"]) < 0.01
+    for row in rows:
+        assert row["ms"] > 0 and row["speed"] > 0
+        assert row["loss"] == pytest.approx(first["psnr"] - row["psnr"])
+        assert f"{row['psnr']:.2f}" in line(row)
+
+
+def test_the_command(trained, tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr(module, "TRIED", {"half": (True,)})
+    pytest.importorskip("matplotlib")
+    words = ["--json", str(tmp_path / "m.json"), "--plot", str(tmp_path / "m.png")]
+    assert main(["bench", "model", "--runs", str(trained / "a"), *words]) == 0
+    rows = json.loads((tmp_path / "m.json").read_text())["rows"]
+    printed = capsys.readouterr().out
+    assert all(row["what"] in printed for row in rows) and rows[1]["what"] == "half True"
+    assert (tmp_path / "m.png").stat().st_size > 5000
+
+
+@pytest.mark.parametrize(
+    ("words", "named"),
+    [
+        ([], "--runs"),
+        (["--runs", "/nowhere"], "/nowhere"),
+        (["--runs", "x", "--size", "8"], "--size"),
+    ],
+)
+def test_bad_input_is_one_line(words, named, capsys):
+    assert main(["bench", "model", *words]) == 2
+    error = capsys.readouterr().err
+    assert named in error and error.count("\n") == 1
