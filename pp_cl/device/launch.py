@@ -209,11 +209,10 @@ class Kernel:
 
     def _rounded(self, size, local):
         size = (int(size),) if np.isscalar(size) else tuple(int(s) for s in size)
-        local = (
-            DEFAULT_LOCAL[len(size)]
-            if local is None
-            else ((local,) if np.isscalar(local) else tuple(local))
-        )
+        if local is None:
+            local = self._default_group(len(size))
+        else:
+            local = (local,) if np.isscalar(local) else tuple(local)
         if 0 in size:
             return None
         if math.prod(local) > self.largest_group:
@@ -223,6 +222,15 @@ class Kernel:
                 " another device (`pp-cl devices`)"
             )
         return tuple(-(-s // group) * group for s, group in zip(size, local, strict=True)), local
+
+    def _default_group(self, dimensions):
+        """The default work-group, halved until the device runs it: rusticl's software renderer runs
+        32 work-items of some kernels.
+        """
+        local = list(DEFAULT_LOCAL[dimensions])
+        while math.prod(local) > max(1, self.largest_group):
+            local[local.index(max(local))] //= 2
+        return tuple(local)
 
     def _scalar(self, p, value):
         try:

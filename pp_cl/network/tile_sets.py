@@ -5,12 +5,13 @@ import numpy as np
 
 def grow(tiles: np.ndarray, n: int = 1) -> np.ndarray:
     """(rows, columns) bool: the tiles within n tiles, diagonals included, of those that are set."""
-    for _ in range(2):  # along the columns, then along the rows
-        length = len(tiles)
-        total = np.zeros((length + 1, tiles.shape[1]), np.int32)
-        np.cumsum(tiles, 0, out=total[1:])
-        place = np.arange(length)
-        tiles = (total[np.minimum(place + n + 1, length)] > total[np.maximum(place - n, 0)]).T
+    for _ in range(n):
+        rows = tiles.copy()
+        rows[1:] |= tiles[:-1]
+        rows[:-1] |= tiles[1:]
+        tiles = rows.copy()
+        tiles[:, 1:] |= rows[:, :-1]
+        tiles[:, :-1] |= rows[:, 1:]
     return tiles
 
 

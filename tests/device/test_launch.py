@@ -419,3 +419,23 @@ def test_file_builds_alone_and_its_signatures_agree_with_the_driver(dev, stem):
         assert [driver_says(kernel, i) for i in range(kernel.num_args)] == [
             launcher_says(p) for p in parameters
         ], name
+
+
+@pytest.mark.parametrize(
+    ("limit", "groups"),
+    [
+        (64, [(64,), (16, 4), (16, 4, 1)]),
+        (32, [(32,), (8, 4), (8, 4, 1)]),
+        (7, [(4,), (2, 2), (2, 2, 1)]),
+        (1, [(1,), (1, 1), (1, 1, 1)]),
+    ],
+)
+def test_a_default_work_group_fits_the_device(program, monkeypatch, limit, groups):
+    kernel = program.kernels["rows"]
+    monkeypatch.setattr(kernel, "largest_group", limit)
+    monkeypatch.setattr(kernel, "_ranges", {})
+    for group in groups:
+        size = tuple(5 for _ in group)
+        rounded, local = kernel.ranges(size, None)
+        assert local == group
+        assert rounded == tuple(-(-5 // side) * side for side in group)
