@@ -16,12 +16,11 @@ import sys
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict
 from pathlib import Path
-from tempfile import TemporaryDirectory
 
 from pp_cl import __version__
 from pp_cl.device.device import kernel_folder
 from tools.gpu.builds import Build, read_builds
-from tools.gpu.compilers import BuildError, Usage, compile_build, version
+from tools.gpu.compilers import BuildError, Usage, cached_build, version
 from tools.gpu.known import (
     MOST_LOCAL,
     complaints,
@@ -45,19 +44,20 @@ Row = tuple[Build, str, str]  # build, kernel, target
 
 
 def compile_all(
-    targets: list[str], builds: dict[Build, set[str]], sources: Path
+    compilers: dict[str, str], builds: dict[Build, set[str]], sources: Path
 ) -> tuple[dict[Row, Usage], list[str]]:
-    """(what each launched kernel takes, a line for each build that failed)."""
+    """(what each launched kernel takes, a line for each build that failed). compilers: {target:
+    versions of its compilers}.
+    """
 
     def one(job):
         target, build = job
-        with TemporaryDirectory() as folder:
-            try:
-                return compile_build(target, build, sources, Path(folder))
-            except BuildError as error:
-                return error
+        try:
+            return cached_build(target, build, sources, compilers[target])
+        except BuildError as error:
+            return error
 
-    jobs = [(target, build) for target in targets for build in sorted(builds)]
+    jobs = [(target, build) for target in compilers for build in sorted(builds)]
     usages, failed = {}, []
     with ThreadPoolExecutor(os.cpu_count()) as pool:
         for (target, build), found in zip(jobs, pool.map(one, jobs), strict=True):
@@ -141,7 +141,7 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--write", action="store_true", help="the table; shorten the known list")
     given = parser.parse_args(arguments)
     compilers, missing = usable(given.targets.split(","))
-    usages, failed = compile_all(list(compilers), read_builds(), kernel_folder())
+    usages, failed = compile_all(compilers, read_builds(), kernel_folder())
     judged = {row: usage for row, usage in usages.items() if row[2] in TARGETS}
     found = all_complaints(judged)
     targets = {target for _, _, target in judged}

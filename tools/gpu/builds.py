@@ -78,19 +78,19 @@ def record(device: cl.Device) -> Builds:
     return dev.builds
 
 
-def read_builds(file: Path = FILE) -> Builds:
-    """The builds that write_builds() wrote."""
-    rows = json.loads(file.read_text("utf-8"))
+def read_builds(file: Path | None = None) -> Builds:
+    """The builds that write_builds() wrote. file: None = FILE."""
+    rows = json.loads((file or FILE).read_text("utf-8"))
     return {Build(row["file"], tuple(row["macros"])): set(row["kernels"]) for row in rows}
 
 
-def write_builds(builds: Builds, file: Path = FILE) -> None:
-    """One build a line."""
+def write_builds(builds: Builds, file: Path | None = None) -> None:
+    """One build a line. file: None = FILE."""
     rows = [
         json.dumps({"file": b.file, "macros": b.macros, "kernels": sorted(kernels)})
         for b, kernels in sorted(builds.items())
     ]
-    file.write_text("[\n" + ",\n".join(rows) + "\n]\n", "utf-8")
+    (file or FILE).write_text("[\n" + ",\n".join(rows) + "\n]\n", "utf-8")
 
 
 def differences(recorded: Builds, stored: Builds) -> list[str]:

@@ -5,20 +5,36 @@ driver's own compiler without a device. The drivers of NVIDIA and AMD hold other
 same compilers.
 """
 
+import hashlib
+import json
 import re
 import struct
 import subprocess
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
 from pp_cl.device.device import STANDARD
+from pp_cl.files.atomic import write_json
 from tools.gpu.builds import Build
-from tools.gpu.packages import LLVM, PTXAS, environment, find, library
+from tools.gpu.packages import (
+    AMD_LIBRARY,
+    CLANG,
+    FOLDER,
+    LINKER,
+    NVIDIA_LIBRARY,
+    OCLOC,
+    PTXAS,
+    environment,
+    find,
+)
 
 # What OpenCL asks of a division and of a square root, as NVIDIA's driver takes it.
 ULP = ("-mllvm", "-nvptx-prec-divf32=1", "-mllvm", "-nvptx-prec-sqrtf32=0")
+
+
+CACHE = FOLDER / "cache"
 
 
 class BuildError(Exception):
@@ -41,6 +57,21 @@ class Usage:
     simd: int | None = None
 
 
+def cached_build(target: str, build: Build, sources: Path, compilers: str) -> dict[str, Usage]:
+    """As compile_build(); from a file where it was compiled before. compilers: version(target)."""
+    texts = [sources / f"{build.file}.cl", *sorted(sources.rglob("*.h")), Path(__file__)]
+    about = repr((target, build, compilers, [path.read_text("utf-8") for path in texts]))
+    cache = CACHE / f"{hashlib.sha256(about.encode()).hexdigest()}.json"
+    if cache.is_file():
+        rows = json.loads(cache.read_text("utf-8"))
+        return {kernel: Usage(**row) for kernel, row in rows.items()}
+    with TemporaryDirectory() as folder:
+        found = compile_build(target, build, sources, Path(folder))
+    cache.parent.mkdir(parents=True, exist_ok=True)
+    write_json(cache, {kernel: asdict(usage) for kernel, usage in found.items()})
+    return found
+
+
 def compile_build(target: str, build: Build, sources: Path, folder: Path) -> dict[str, Usage]:
     """{kernel: Usage} of a build. target: sm_90, gfx1100, or one of ocloc's devices. folder: for
     what is compiled. Raises BuildError, CompilerMissing.
@@ -58,9 +89,10 @@ def version(target: str) -> str:
     backend = _backend(target)
     if backend is _intel:
         with TemporaryDirectory() as folder:
-            _run([find("ocloc"), "query", "OCL_DRIVER_VERSION"], folder)
+            _run([find(OCLOC), "query", "OCL_DRIVER_VERSION"], folder)
             return f"ocloc {Path(folder, 'OCL_DRIVER_VERSION').read_text().strip()}"
-    clang = f"clang {_version_said(f'clang-{LLVM}')}"
+    clang = f"clang {_version_said(CLANG)}"
+    find(NVIDIA_LIBRARY if backend is _nvidia else AMD_LIBRARY)
     return f"{clang}, ptxas {_version_said(PTXAS)}" if backend is _nvidia else clang
 
 
@@ -83,30 +115,30 @@ def _run(command, folder=None):
 
 def _clang(target, bitcode, options, source):
     """clang's command as far as NVIDIA's and AMD's agree."""
-    linked = ("-Xclang", "-mlink-builtin-bitcode", "-Xclang", str(library(bitcode)))
+    linked = ("-Xclang", "-mlink-builtin-bitcode", "-Xclang", find(bitcode))
     quiet = ("-w", "-Wno-linker-warnings")
-    return [find(f"clang-{LLVM}"), "-x", "cl", "-O3", target, *linked, *quiet, *options, source]
+    return [find(CLANG), "-x", "cl", "-O3", target, *linked, *quiet, *options, source]
 
 
 def _nvidia(arch, options, source, folder):
     ptx, cubin = str(folder / "x.ptx"), str(folder / "x.cubin")
-    clang = _clang("--target=nvptx64-nvidia-nvcl", "nvptx64--nvidiacl.bc", options, str(source))
+    clang = _clang("--target=nvptx64-nvidia-nvcl", NVIDIA_LIBRARY, options, str(source))
     _run([*clang, "-Xclang", "-target-cpu", "-Xclang", arch, *ULP, "-S", "-o", ptx])
     return parse_ptxas(_run([find(PTXAS), "-v", f"-arch={arch}", ptx, "-o", cubin]))
 
 
 def _amd(arch, options, source, folder):
     # linked: only then undefined functions fail
-    clang = _clang("--target=amdgcn-amd-amdhsa", "amdgcn--amdhsa.bc", options, str(source))
+    clang = _clang("--target=amdgcn-amd-amdhsa", AMD_LIBRARY, options, str(source))
     remarks = ("-nogpulib", "-Rpass-analysis=kernel-resource-usage")
-    linker = f"-fuse-ld={find(f'ld.lld-{LLVM}')}"
+    linker = f"-fuse-ld={find(LINKER)}"
     return parse_remarks(
         _run([*clang, f"-mcpu={arch}", *remarks, linker, "-o", str(folder / "x.co")])
     )
 
 
 def _intel(device, options, source, folder):
-    command = [find("ocloc"), "compile", "-file", str(source), "-device", device]
+    command = [find(OCLOC), "compile", "-file", str(source), "-device", device]
     command += ["-internal_options", "-cl-intel-allow-zebin", "-options", " ".join(options)]
     said = _run([*command, "-out_dir", str(folder), "-output", "x", "-output_no_suffix"])
     info = elf_section((folder / "x").read_bytes(), ".ze_info").decode(errors="replace")

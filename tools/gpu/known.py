@@ -30,15 +30,15 @@ def complaints(usage: Usage) -> dict[str, int]:
     return {what: number for what, number in found.items() if number}
 
 
-def read_known(file: Path = FILE) -> Complaints:
+def read_known() -> Complaints:
     """The list."""
-    return json.loads(file.read_text("utf-8"))
+    return json.loads(FILE.read_text("utf-8"))
 
 
-def write_known(known: Complaints, file: Path = FILE) -> None:
+def write_known(known: Complaints) -> None:
     """One kernel a line."""
     rows = [f"{json.dumps(kernel)}: {json.dumps(known[kernel])}" for kernel in sorted(known)]
-    file.write_text("{\n" + ",\n".join(rows) + "\n}\n", "utf-8")
+    FILE.write_text("{\n" + ",\n".join(rows) + "\n}\n", "utf-8")
 
 
 def news(found: Complaints, known: Complaints) -> list[str]:

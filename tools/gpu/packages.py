@@ -14,13 +14,17 @@ from pathlib import Path
 
 FOLDER = Path(__file__).parents[2] / "build" / "gpu"
 LLVM = 19
-# {program: the packages that it needs}
+CLANG, LINKER, PTXAS, OCLOC = f"clang-{LLVM}", f"ld.lld-{LLVM}", "ptxas", "ocloc"
+NVIDIA_LIBRARY, AMD_LIBRARY = "nvptx64--nvidiacl.bc", "amdgcn--amdhsa.bc"
+# {program or file: Debian's package of it}
 PACKAGES = {
-    f"clang-{LLVM}": (f"clang-{LLVM}", f"libclc-{LLVM}"),
-    f"ld.lld-{LLVM}": (f"lld-{LLVM}",),
-    "ocloc": ("intel-opencl-icd",),
+    CLANG: f"clang-{LLVM}",
+    NVIDIA_LIBRARY: f"libclc-{LLVM}",
+    AMD_LIBRARY: f"libclc-{LLVM}",
+    LINKER: f"lld-{LLVM}",
+    OCLOC: "intel-opencl-icd",
 }
-PTXAS = "ptxas"
+CUDA = Path("/usr/local/cuda/bin")
 
 
 class CompilerMissing(Exception):
@@ -39,40 +43,33 @@ def environment() -> dict[str, str]:
     }
 
 
-def find(program: str) -> str:
-    """The path of a program. Raises CompilerMissing."""
-    places = [environment()["PATH"]]
-    if program == PTXAS:
+def find(name: str) -> str:
+    """The path of a program, or of a file of libclc. Raises CompilerMissing."""
+    places, mode = [environment()["PATH"]], os.X_OK
+    if name == PTXAS:
         packages = Path(sysconfig.get_path("purelib"), "nvidia")
-        places += ["/usr/local/cuda/bin", *(str(p.parent) for p in packages.glob("*/bin/ptxas"))]
-    found = shutil.which(program, path=os.pathsep.join(places))
+        places += [str(CUDA), *(str(path.parent) for path in packages.glob("*/bin/ptxas"))]
+    elif name.endswith(".bc"):
+        places, mode = [str(FOLDER / "usr" / "lib" / "clc"), "/usr/lib/clc"], os.R_OK
+    found = shutil.which(name, mode, os.pathsep.join(places))
     if not found:
         source = (
             "install CUDA's compiler, or nvidia-cuda-nvcc into .venv by pip"
-            if program == PTXAS
-            else f"needs Debian's packages {', '.join(PACKAGES[program])}"
+            if name == PTXAS
+            else f"it is in Debian's package {PACKAGES[name]}"
         )
-        raise CompilerMissing(f"{program} is missing: {source}")
+        raise CompilerMissing(f"{name} is missing: {source}")
     return found
 
 
-def library(name: str) -> Path:
-    """A file of libclc. Raises CompilerMissing."""
-    places = (FOLDER / "usr" / "lib" / "clc" / name, Path("/usr/lib/clc") / name)
-    for path in places:
-        if path.is_file():
-            return path
-    raise CompilerMissing(f"{name} is missing: needs Debian's package libclc-{LLVM}")
-
-
 def unpack_missing() -> str:
-    """Unpack Debian's packages of the programs that are absent; what went wrong, else ""."""
-    wanted = []
-    for program, packages in PACKAGES.items():
+    """Unpack Debian's packages of what is absent. Returns what went wrong, else ""."""
+    wanted = {}  # in order, each once
+    for name, package in PACKAGES.items():
         try:
-            find(program)
+            find(name)
         except CompilerMissing:
-            wanted += packages
+            wanted[package] = name
     if not wanted:
         return ""
     if not shutil.which("apt-get") or not shutil.which("dpkg"):
