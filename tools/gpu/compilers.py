@@ -1,4 +1,4 @@
-"""What a GPU's compiler says of the kernels of a build: registers, spills, private and local memory.
+"""What a GPU's compiler says of the kernels of a build: their registers, spills and memory.
 
 NVIDIA: clang and libclc to PTX, then ptxas. AMD: clang and libclc, linked. Intel: ocloc, the
 driver's own compiler without a device. The drivers of NVIDIA and AMD hold other versions of the
@@ -208,8 +208,8 @@ def _number(text, key):
 
 
 def elf_section(data: bytes, wanted: str) -> bytes:
-    """A section of a 64-bit ELF file. Raises BuildError where there is none. (objcopy refuses
-    Intel's.)
+    """A section of a 64-bit ELF file. Raises BuildError where there is none. objcopy refuses
+    Intel's files.
     """
     if data[:4] == b"\x7fELF":
         (table,) = struct.unpack_from("<Q", data, 0x28)

@@ -27,8 +27,8 @@ from pp_cl.network.unet import LEAST_PIXELS, UNet
 from pp_cl.presets import PRESETS
 from pp_cl.raster.blend import BLENDS
 from pp_cl.raster.project import KINDS
-from pp_cl.raster.shade import shade_forward
 from pp_cl.raster.sh import SH_DEGREES
+from pp_cl.raster.shade import shade_forward
 from pp_cl.render import Renderer
 from pp_cl.scene import demo
 from pp_cl.scene.grid import Grid
@@ -101,9 +101,7 @@ def _model(dev, config, views):
     hull = build_grid(dev, views, config.points.count)
     net = UNet.of_settings(dev, config.network, seed=0, policy=make_policy(dev))
     near_far = depth_range(views, hull)
-    return Model.create(
-        dev, hull.grid, hull.ids, near_far, net=net, degree=config.points.sh_degree
-    )
+    return Model.create(dev, hull.grid, hull.ids, near_far, net=net, degree=config.points.sh_degree)
 
 
 def blends(dev: Device, views: list[View]) -> None:
@@ -138,9 +136,7 @@ def shadings(dev: Device, views: list[View]) -> None:
         renderer = Renderer(dev, _model(dev, config, views), config.raster)
         result = renderer.rasterise(views[0].camera, GAMMA)
         half = [dev.upload(sh.get(), np.float16) for sh in renderer.model.cloud.sh]
-        shade_forward(
-            dev, result.points, result.shaded, half, point_features=result.point_features
-        )
+        shade_forward(dev, result.points, result.shaded, half, point_features=result.point_features)
 
 
 def benchmarks(dev: Device) -> None:
