@@ -11,7 +11,7 @@ from tools.gpu.known import complaints, leftovers, news, read_known, shortened, 
 from tools.gpu_check import RESULTS, TARGETS
 
 # Lower them when the list has become shorter.
-MOST_KERNELS, MOST_COMPLAINTS = 185, 272
+MOST_KERNELS, MOST_COMPLAINTS = 166, 219
 
 ROWS = json.loads(RESULTS.read_text("utf-8"))["rows"]
 
@@ -38,12 +38,14 @@ def test_complaints(usage, expected):
 
 
 def test_news_and_leftovers():
-    stored = {"a": {"spill": 3, "private": 8}, "b": {"registers": 140}}
+    stored = {"a": {"spill": 3, "private": 8}, "b": {"registers": 160}}
     assert news(stored, stored) == leftovers(stored, stored) == []
     assert news({"a": {"spill": 4, "narrow": 8}}, stored) == [
         "a: spill 4, known with 3",
         "a: narrow 8",
     ]
+    assert news({"b": {"registers": 170}}, stored) == []  # as from one run to the next
+    assert news({"b": {"registers": 171}}, stored) == ["b: registers 171, known with 160"]
     assert news({"c": {"spill": 1}}, stored) == ["c: spill 1"]
     assert news({"a": {"spill": 2}}, stored) == []
     assert leftovers({"a": {"spill": 2}}, stored) == [
@@ -73,7 +75,8 @@ def test_the_list_is_what_the_table_shows():
         for target in TARGETS
         if (found := complaints(usage_of(row, target)))
     }
-    assert shown == read_known()
+    stored = read_known()
+    assert news(shown, stored) == leftovers(shown, stored) == []
 
 
 def test_the_table_has_all_builds():

@@ -34,6 +34,8 @@ def bare(tmp_path, monkeypatch):
     monkeypatch.setenv("PATH", str(programs))
     monkeypatch.setenv("LOG", str(tmp_path / "log"))
     monkeypatch.setattr(packages, "FOLDER", tmp_path / "gpu")
+    monkeypatch.setattr(packages, "SYSTEM_LIBCLC", tmp_path / "none")
+    monkeypatch.setattr(packages, "CUDA", tmp_path / "none")
     return programs
 
 
@@ -74,7 +76,6 @@ def test_what_apt_get_said_is_passed_on(bare):
 
 
 def test_ptxas_of_a_python_package(bare, tmp_path, monkeypatch):
-    monkeypatch.setattr(packages, "CUDA", tmp_path / "none")
     monkeypatch.setattr(packages.sysconfig, "get_path", lambda name: str(tmp_path / "site"))
     with pytest.raises(CompilerMissing, match="^ptxas is missing: install CUDA's compiler"):
         find("ptxas")

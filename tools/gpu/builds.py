@@ -45,7 +45,8 @@ class GpuDevice(Device):
     def __init__(self, device: cl.Device):
         super().__init__(device)
         self.is_cpu = False
-        self.info["type"] = "GPU"
+        # of no vendor, whose options the device at hand would refuse
+        self.info |= {"type": "GPU", "platform": "any"}
         self.builds: Builds = {}
 
     def program(self, name: str, **defines: int | float | str) -> "Recorded":

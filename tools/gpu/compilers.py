@@ -15,7 +15,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
-from pp_cl.device.device import STANDARD
+from pp_cl.device.device import INTEL_PLATFORM, STANDARD, vendor_options
 from pp_cl.files.atomic import write_json
 from tools.gpu.builds import Build
 from tools.gpu.packages import (
@@ -60,7 +60,8 @@ class Usage:
 def cached_build(target: str, build: Build, sources: Path, compilers: str) -> dict[str, Usage]:
     """As compile_build(); from a file where it was compiled before. compilers: version(target)."""
     texts = [sources / f"{build.file}.cl", *sorted(sources.rglob("*.h")), Path(__file__)]
-    about = repr((target, build, compilers, [path.read_text("utf-8") for path in texts]))
+    contents = [path.read_text("utf-8") for path in texts]
+    about = repr((_options(target, build), target, build, compilers, contents))
     cache = CACHE / f"{hashlib.sha256(about.encode()).hexdigest()}.json"
     if cache.is_file():
         rows = json.loads(cache.read_text("utf-8"))
@@ -76,8 +77,15 @@ def compile_build(target: str, build: Build, sources: Path, folder: Path) -> dic
     """{kernel: Usage} of a build. target: sm_90, gfx1100, or one of ocloc's devices. folder: for
     what is compiled. Raises BuildError, CompilerMissing.
     """
-    options = [*STANDARD, "-I", str(sources), *(f"-D{macro}" for macro in build.macros)]
+    options = [*_options(target, build), "-I", str(sources)]
     return _backend(target)(target, options, sources / f"{build.file}.cl", folder)
+
+
+def _options(target, build):
+    """Those that the drivers pass, but for the folder of the headers."""
+    platform = INTEL_PLATFORM if _backend(target) is _intel else target
+    vendors = vendor_options({"type": "GPU", "platform": platform}, build.file)
+    return [*STANDARD, *vendors, *(f"-D{macro}" for macro in build.macros)]
 
 
 def _backend(target: str) -> Callable[..., dict[str, Usage]]:

@@ -13,6 +13,7 @@ import sysconfig
 from pathlib import Path
 
 FOLDER = Path(__file__).parents[2] / "build" / "gpu"
+SYSTEM_LIBCLC, CUDA = Path("/usr/lib/clc"), Path("/usr/local/cuda/bin")
 LLVM = 19
 CLANG, LINKER, PTXAS, OCLOC = f"clang-{LLVM}", f"ld.lld-{LLVM}", "ptxas", "ocloc"
 NVIDIA_LIBRARY, AMD_LIBRARY = "nvptx64--nvidiacl.bc", "amdgcn--amdhsa.bc"
@@ -24,7 +25,6 @@ PACKAGES = {
     LINKER: f"lld-{LLVM}",
     OCLOC: "intel-opencl-icd",
 }
-CUDA = Path("/usr/local/cuda/bin")
 
 
 class CompilerMissing(Exception):
@@ -50,7 +50,7 @@ def find(name: str) -> str:
         packages = Path(sysconfig.get_path("purelib"), "nvidia")
         places += [str(CUDA), *(str(path.parent) for path in packages.glob("*/bin/ptxas"))]
     elif name.endswith(".bc"):
-        places, mode = [str(FOLDER / "usr" / "lib" / "clc"), "/usr/lib/clc"], os.R_OK
+        places, mode = [str(FOLDER / "usr" / "lib" / "clc"), str(SYSTEM_LIBCLC)], os.R_OK
     found = shutil.which(name, mode, os.pathsep.join(places))
     if not found:
         source = (
