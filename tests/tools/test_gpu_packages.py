@@ -34,7 +34,6 @@ def bare(tmp_path, monkeypatch):
     monkeypatch.setenv("PATH", str(programs))
     monkeypatch.setenv("LOG", str(tmp_path / "log"))
     monkeypatch.setattr(packages, "FOLDER", tmp_path / "gpu")
-    monkeypatch.setattr(packages, "SYSTEM_LIBCLC", tmp_path / "none")
     monkeypatch.setattr(packages, "CUDA", tmp_path / "none")
     return programs
 
@@ -54,7 +53,7 @@ def test_it_fetches_what_is_absent_once(bare, tmp_path):
     assert (tmp_path / "log").read_text().splitlines() == [
         "apt-get install --simulate --no-install-recommends"
         " clang-19 libclc-19 lld-19 intel-opencl-icd",
-        "apt-get download libone two",
+        "apt-get download clang-19 libclc-19 lld-19 intel-opencl-icd libone two",
     ]
     assert find("ocloc") == str(tmp_path / "gpu" / "usr" / "bin" / "ocloc")
     assert not (tmp_path / "gpu" / "packages").exists()

@@ -13,7 +13,7 @@ import sysconfig
 from pathlib import Path
 
 FOLDER = Path(__file__).parents[2] / "build" / "gpu"
-SYSTEM_LIBCLC, CUDA = Path("/usr/lib/clc"), Path("/usr/local/cuda/bin")
+CUDA = Path("/usr/local/cuda/bin")
 LLVM = 19
 CLANG, LINKER, PTXAS, OCLOC = f"clang-{LLVM}", f"ld.lld-{LLVM}", "ptxas", "ocloc"
 NVIDIA_LIBRARY, AMD_LIBRARY = "nvptx64--nvidiacl.bc", "amdgcn--amdhsa.bc"
@@ -50,7 +50,8 @@ def find(name: str) -> str:
         packages = Path(sysconfig.get_path("purelib"), "nvidia")
         places += [str(CUDA), *(str(path.parent) for path in packages.glob("*/bin/ptxas"))]
     elif name.endswith(".bc"):
-        places, mode = [str(FOLDER / "usr" / "lib" / "clc"), str(SYSTEM_LIBCLC)], os.R_OK
+        # not /usr/lib/clc, where another version of LLVM may have put its own
+        places, mode = [str(FOLDER / "usr" / "lib" / "clc")], os.R_OK
     found = shutil.which(name, mode, os.pathsep.join(places))
     if not found:
         source = (
@@ -79,7 +80,8 @@ def unpack_missing() -> str:
     debs.mkdir(parents=True)
     try:
         plan = _run("apt-get", "install", "--simulate", "--no-install-recommends", *wanted)
-        _run("apt-get", "download", *re.findall(r"(?m)^Inst (\S+)", plan), folder=debs)
+        needed = dict.fromkeys([*wanted, *re.findall(r"(?m)^Inst (\S+)", plan)])
+        _run("apt-get", "download", *needed, folder=debs)
         for deb in sorted(debs.glob("*.deb")):
             _run("dpkg", "-x", str(deb), str(FOLDER))
     except subprocess.CalledProcessError as error:
