@@ -16,7 +16,7 @@ ON_OCLGRIND := OCL_ICD_VENDORS=/usr/lib/oclgrind/liboclgrind-rt-icd.so OCLGRIND_
 	OCLGRIND_NUM_THREADS=1 OCLGRIND_BUILD_OPTIONS="-cl-opt-disable -DALWAYS_INLINE=static" PYOPENCL_NO_CACHE=1 \
 	PP_DEVICE=Oclgrind PP_DATA=/nonexistent
 
-.PHONY: help setup demo test test-intel bench lint format docs wheel oclgrind clean
+.PHONY: help setup demo test test-intel bench lint format docs wheel oclgrind gpu-check test-coarse clean
 
 help: ## print this list
 	@sed -n 's/^\([a-z-]*\):.*## \(.*\)/\1	\2/p' Makefile | expand -t 12
@@ -38,6 +38,11 @@ test: $(READY) ## run the tests on the device of PP_DEVICE, else the default one
 test-intel: $(READY) ## the same on Intel's CPU runtime, installed into .venv if need be (x86-64)
 	@$(BIN)/python tools/setup_opencl.py --intel
 	@PP_DEVICE="Intel(R) OpenCL" $(BIN)/python -m pytest $(ON_ALL_CORES) $(ARGS)
+
+# With it PoCL divides with errors up to 2.5 ulp, as GPUs may; more than they do, it takes no number for NaN or infinite.
+test-coarse: $(READY) ## run the tests of all kernels on PoCL with the coarse division that GPUs may have
+	@PYOPENCL_BUILD_OPTIONS=-cl-fast-relaxed-math PP_DEVICE="Portable Computing Language" \
+		$(BIN)/python -m pytest $(ON_ALL_CORES) -m "not large and not exact" $(ARGS) $(sort $(OCLGRIND) tests/device/test_rounding.py)
 
 bench: $(READY) ## time and error of the network and of its layers; ARGS="--size 200 --widths 32,64,128" for others
 	$(BIN)/pp-cl bench unet $(ARGS)
@@ -64,6 +69,10 @@ wheel: $(READY) ## build the wheel into dist/
 oclgrind: $(READY) ## run the tests of all kernels in Oclgrind (Debian's package): stray accesses, data races, uninitialised reads
 	@printf '%s\n' $(OCLGRIND) | $(ON_OCLGRIND) xargs -P $$(nproc) -I{} \
 		$(BIN)/python -m pytest -q -p no:cacheprovider -m "not large" $(ARGS) {}
+
+gpu-check: $(READY) ## compile and link all kernels for NVIDIA's, AMD's and Intel's GPUs, with no GPU; fetches Debian's compilers
+	@$(BIN)/python -m tools.gpu.builds
+	@$(BIN)/python -m tools.gpu_check $(ARGS)
 
 clean: ## remove .venv and everything built; runs/ stays
 	rm -rf .venv build dist *.egg-info .pytest_cache .ruff_cache

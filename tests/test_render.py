@@ -199,6 +199,7 @@ def test_tau_and_early_stop_of_a_call_are_those_of_other_settings(dev, rng, blen
     np.testing.assert_array_equal(lasting.render(camera, GAMMA, early_stop=0.0), exact)
 
 
+@pytest.mark.exact
 def test_a_window_around_the_object(dev, rng):
     """What the window's camera sees, at its place; white, alpha 0 and no depth around it."""
     model = make_model(dev, rng)

@@ -23,6 +23,26 @@ from pp_cl.errors import UserError
 
 SMALLER = "lower --points or raise --downscale"
 STANDARD = ("-cl-std=CL1.2", "-cl-kernel-arg-info")  # options of every build
+# Of Intel's driver of GPUs; others of that vendor refuse options that they do not know.
+INTEL_PLATFORM = "Intel(R) OpenCL"
+# Files with a kernel that spills with the 128 registers that a thread has there by default, and not
+# with 256, of which half as many threads run (docs/gpu_check.md).
+SPILLING_ON_INTEL = frozenset(
+    (
+        "layers/conv_backward_weights",
+        "layers/resample",
+        "raster/project",
+        "raster/softmax",
+        "training/loss",
+    )
+)
+
+
+def vendor_options(info: dict[str, str | int], name: str) -> tuple[str, ...]:
+    """Options of cl/<name>.cl on devices of one vendor. info: of describe()."""
+    intel_gpu = info["type"] == "GPU" and info["platform"].startswith(INTEL_PLATFORM)
+    large = intel_gpu and name in SPILLING_ON_INTEL
+    return ("-cl-intel-256-GRF-per-thread",) if large else ()
 
 
 def kernel_folder() -> Path:
@@ -135,7 +155,13 @@ class Device:
                 self,
                 name,
                 (folder / f"{name}.cl").read_text("utf-8"),
-                options=[*self.build_options, "-I", str(folder), *macros],
+                options=[
+                    *self.build_options,
+                    *vendor_options(self.info, name),
+                    "-I",
+                    str(folder),
+                    *macros,
+                ],
                 defines=defines,
             )
             if self.debug:

@@ -336,6 +336,37 @@ def test_a_build_error_names_file_options_and_cause(plain, tiny):
     assert "undeclared_thing" in str(error.value)
 
 
+@pytest.mark.parametrize(
+    ("platform", "kind", "large"),
+    [
+        ("Intel(R) OpenCL Graphics", "GPU", True),
+        ("Intel(R) OpenCL HD Graphics", "GPU", True),
+        ("Intel(R) OpenCL", "CPU", False),
+        ("Apple", "GPU", False),  # which drives Intel's GPUs too, and refuses unknown options
+        ("NVIDIA CUDA", "GPU", False),
+    ],
+)
+def test_intels_gpus_take_more_registers_for_files_that_spill(platform, kind, large):
+    info = {"platform": platform, "type": kind}
+    expected = ("-cl-intel-256-GRF-per-thread",) if large else ()
+    assert device_module.vendor_options(info, "raster/project") == expected
+    assert device_module.vendor_options(info, "raster/shade") == ()
+
+
+def test_files_with_options_of_a_vendor_exist():
+    files = device_module.SPILLING_ON_INTEL
+    assert all((kernel_folder() / f"{name}.cl").is_file() for name in files)
+
+
+def test_a_build_takes_the_options_of_its_vendor(plain, tiny, monkeypatch):
+    monkeypatch.setattr(device_module, "vendor_options", lambda info, name: ("-DDOUBLED=1",))
+    (tiny / "doubled.cl").write_text(
+        "#ifndef DOUBLED\n#error none\n#endif\n"
+        "kernel void f(\n    global float *x)  // (N)\n{ x[0] = 1.0f; }\n"
+    )
+    assert plain.program("doubled").kernels.keys() == {"f"}
+
+
 def test_a_kernel_folder_with_a_space_is_refused(plain, tmp_path, monkeypatch):
     monkeypatch.setattr(device_module, "kernel_folder", lambda: tmp_path / "a b")
     with pytest.raises(UserError, match="a b: .*space"):
@@ -379,6 +410,7 @@ def test_debug_1_times_files_and_2_times_kernels(debugged, capsys, level, label)
 
 
 @pytest.mark.parametrize("guarded", [False, True])
+@pytest.mark.exact
 def test_debug_3_finds_a_nan(debugged, guarded):
     with pytest.raises(FloatingPointError, match="tiny.cl:divide: y has 2 NaN or Inf, first at 1"):
         debugged("3", [1, 0, 2, 0], guarded)

@@ -58,6 +58,7 @@ def random_counts(rng, height, width):
 
 
 @pytest.mark.parametrize("shape", SHAPES)
+@pytest.mark.exact
 def test_find(dev, rng, shape):
     x = np.where(
         rng.random(shape) < 0.02, rng.choice([0.0, np.nan, np.inf, 1 + 2**-23], shape), 1

@@ -116,6 +116,7 @@ def test_what_is_not_shown_is_not_computed(dev, rng):
     "variant, blocks",
     [("direct", "double"), ("auto", "double"), ("direct", "single"), ("direct", "gated")],
 )
+@pytest.mark.exact
 def test_equals_the_dense_network(dev, rng, always, name, variant, blocks):
     x, grad_y = scene(rng, OBJECTS[name])
     policy = make_policy(dev, variant=variant)

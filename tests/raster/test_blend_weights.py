@@ -13,6 +13,7 @@ pytestmark = pytest.mark.parametrize("rule", BLENDS)
 
 @pytest.mark.parametrize("early_stop", [0.0, 0.05])
 @pytest.mark.parametrize("max_tracked", [0, 2])
+@pytest.mark.exact
 def test_points_keep_their_highest_weight(dev, rng, rule, early_stop, max_tracked):
     """Untracked hits count, dropped ones do not; a look counts either way."""
     options = {"early_stop": early_stop, "max_tracked": max_tracked}

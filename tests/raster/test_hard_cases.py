@@ -119,6 +119,7 @@ def test_a_ray_through_the_centre_of_a_sphere_has_gradients(dev):
     assert gradients["radius"][0] > 0
 
 
+@pytest.mark.exact
 def test_a_hit_on_the_very_rim(dev):
     """d = 0 with an exponent above that of the largest float: no weight, no gradient, no NaN."""
     # rho = |(3, 0, 4) - 5 (0, 0, 1)|

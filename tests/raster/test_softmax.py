@@ -45,6 +45,7 @@ def test_early_stop(dev, rng, early_stop):
 @pytest.mark.parametrize("n", [*AWKWARD_SIZES, large(3000)])
 @pytest.mark.parametrize("gamma", GAMMAS)
 @pytest.mark.parametrize("tau", TAUS)
+@pytest.mark.exact
 def test_tau(dev, n, gamma, tau):
     """What is left hardly changes, what is dropped weighs no more than is said, and that is at most
     tau.

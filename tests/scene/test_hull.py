@@ -93,6 +93,7 @@ def test_a_vertex_no_image_sees_is_dropped(dev):
     assert carver.carve(Grid((5, 0, 0), 0.1, (1, 1, 1))).count == 0  # behind
 
 
+@pytest.mark.exact
 def test_the_left_and_upper_borders_belong_to_an_image(dev):
     """Numbers that float32 holds exactly: the 5x5 vertices project to pixels 0, 16, 32, 48, 64 of
     64.

@@ -238,6 +238,7 @@ def test_opacity_stays_in_its_bounds(dev, rng):
     np.testing.assert_allclose(opacity, cloud.twins["opacity"].parameter, atol=2e-6)
 
 
+@pytest.mark.exact
 def test_a_nan_is_not_hidden(dev, rng):
     cloud = Cloud(dev, rng, 31)
     cloud.steps = 1
