@@ -4,6 +4,7 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from pp_cl.errors import UserError
 from pp_cl.scene.camera import Camera
@@ -45,6 +46,10 @@ class View:
     def has_mask(self) -> bool:
         """Whether some pixel is not wholly opaque."""
         return bool((self.image[..., 3] < 255).any())
+
+    def moved(self, by: ArrayLike) -> "View":
+        """The same photograph, its camera moved by (3,) world units."""
+        return replace(self, stored_camera=self.stored_camera.moved(by))
 
     def reduced(self, downscale: int) -> "View":
         """The same photograph reduced `downscale` times from its stored resolution.
