@@ -9,7 +9,7 @@ from pyopencl.array import Array
 
 from pp_cl.device.device import Device
 from pp_cl.errors import UserError
-from pp_cl.scene.bounds import bounding_box, explain_empty_hull
+from pp_cl.scene.bounds import bounding_box, explain_empty_hull, reach_of
 from pp_cl.scene.camera import Camera
 from pp_cl.scene.grid import Grid, smallest_edge
 from pp_cl.scene.views import MASK_THRESHOLD, View
@@ -23,7 +23,9 @@ TOLERANCE = 1.02  # a count of 1 to this many times the points asked for ends th
 # half-diagonals of the hull from its centre to near and to far: about the published range of 4 for
 # lego
 DEPTH_MARGIN = 1.25
-CORNER_BITS = 16  # of the size of the eyes' box, to which the corner that carving counts from is cut
+CORNER_BITS = (
+    16  # of the size of the eyes' box, to which the corner that carving counts from is cut
+)
 
 
 @dataclass(frozen=True)
@@ -163,7 +165,7 @@ def build_grid(
     count, until the count is `points` to 1.02 points. At CELL_CAP vertices of the grid, or after
     8 rounds, the best carving is taken: the smallest with enough points, else the largest. Raises
     UserError for an impossible `points`, a view without a mask where others have one, masks or
-    poses that leave no vertex.
+    poses that leave no vertex, cameras that make no scene.
     """
     if not 1 <= points <= CELL_CAP:
         raise UserError(f"--points {points}: must be between 1 and {CELL_CAP}")
@@ -173,18 +175,18 @@ def build_grid(
             f"{views[masked.index(False)].name}: has no transparent pixel, but other photographs"
             " have: give it a mask that is 0 around the object"
         )
-    corner = _corner(views)
+    corner = _corner(views, reach_of(views))
     near = [view.moved(-corner) for view in views]
     hull = _search(dev, near, points, bounding_box(near) if box is None else box - corner)
     return replace(hull, grid=hull.grid.moved(corner))
 
 
-def _corner(views):
+def _corner(views, reach):
     """(3,) world position near the cameras, from which a scene far from the origin is carved as one
     at the origin is: views that are moved alike, by whole units of the corner, give the same hull.
     """
     eyes = np.stack([view.camera.eye for view in views])
-    unit = 2.0 ** (math.frexp(np.ptp(eyes, axis=0).max())[1] - CORNER_BITS)
+    unit = 2.0 ** (math.frexp(reach)[1] - CORNER_BITS)
     return unit * np.floor(eyes.min(0) / unit)
 
 

@@ -28,7 +28,8 @@ class View:
     name: path of the image relative to the scene's folder. stored_camera: the camera of the stored
     image. image: (H, W, 4) uint8, the stored image as straight RGBA (alpha 255 everywhere if the
     file has none); not to be changed. depth_range: (near, far) of this camera, Euclidean distances
-    in world units, if the dataset states one.
+    in world units, if the dataset states one. digest: of the image's pixels, see
+    scene/identity.py; None for one that the program makes itself.
     """
 
     name: str
@@ -36,6 +37,7 @@ class View:
     image: np.ndarray
     depth_range: tuple[float, float] | None = None
     downscale: int = 1
+    digest: str | None = None
 
     @cached_property
     def camera(self) -> Camera:
