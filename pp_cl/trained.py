@@ -85,8 +85,8 @@ class Run:
             return
         if told := difference(header, listed, views):
             raise UserError(
-                f"{self.folder.checkpoint}: belongs to another scene than {path} ({told}); say where"
-                " its own is with --scene"
+                f"{self.folder.checkpoint}: belongs to another scene than {path} ({told}); say"
+                " where its own is with --scene"
             )
 
     def cameras(self, split: str = "test") -> list[Camera]:

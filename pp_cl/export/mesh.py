@@ -25,8 +25,8 @@ NEIGHBOURS = 4  # points that colour a vertex
 
 @dataclass(frozen=True)
 class Mesh:
-    """vertices: (V, 3) as in_world() gives them. faces: (F, 3) int32, counter-clockwise from outside.
-    colours: (V, 3) uint8 sRGB.
+    """vertices: (V, 3) as in_world() gives them. faces: (F, 3) int32, counter-clockwise from
+    outside. colours: (V, 3) uint8 sRGB.
     """
 
     vertices: np.ndarray
@@ -35,8 +35,8 @@ class Mesh:
 
 
 def surface(run: Run) -> tuple[np.ndarray, np.ndarray]:
-    """(vertices (V, 3) of in_world(), faces (F, 3) int32) of the surface that the depths of the training
-    views agree on, by marching cubes. Raises UserError where they show none.
+    """(vertices (V, 3) of in_world(), faces (F, 3) int32) of the surface that the depths of the
+    training views agree on, by marching cubes. Raises UserError where they show none.
     """
     grid = box_around(run.model.grid, run.model.cloud.ids.get())
     cameras = tqdm(run.cameras("train"), "depths", unit="view", leave=False, disable=None)

@@ -20,9 +20,9 @@ FINEST = 1e-3  # of the grid's edge: how far rounding to float32 may move a poin
 class ColouredPoints:
     """M points in the order of their ids.
 
-    rows: (M,) int64, their rows in the run's point cloud. positions: (M, 3) as in_world() gives them.
-    colours: (M, 3) uint8 sRGB. weight: (M,) float32, the blend weights in the view that gave the
-    colour, summed over its pixels. opacity: (M,) float32.
+    rows: (M,) int64, their rows in the run's point cloud. positions: (M, 3) as in_world() gives
+    them. colours: (M, 3) uint8 sRGB. weight: (M,) float32, the blend weights in the view that gave
+    the colour, summed over its pixels. opacity: (M,) float32.
     """
 
     rows: np.ndarray

@@ -23,9 +23,7 @@ TOLERANCE = 1.02  # a count of 1 to this many times the points asked for ends th
 # half-diagonals of the hull from its centre to near and to far: about the published range of 4 for
 # lego
 DEPTH_MARGIN = 1.25
-CORNER_BITS = (
-    16  # of the size of the eyes' box, to which the corner that carving counts from is cut
-)
+CORNER_BITS = 16  # the corner that carving counts from: whole 2^-16 of the size of the eyes' box
 
 
 @dataclass(frozen=True)

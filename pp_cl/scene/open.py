@@ -13,7 +13,7 @@ from pp_cl.scene import demo
 from pp_cl.scene.load import Scene, find_reader, list_photographs, load_scene
 from pp_cl.scene.masks import MaskRule
 from pp_cl.scene.photograph import Photograph
-from pp_cl.scene.views import MIN_SIDE, View, fitting_downscale
+from pp_cl.scene.views import MIN_SIDE, fitting_downscale
 
 DEMO = "demo"  # the word that names the scene which the program makes itself
 
