@@ -35,7 +35,8 @@ const order = new Uint32Array(header.count);
 const keys = new Uint16Array(header.count);
 const starts = new Uint32Array(BUCKETS + 1);
 
-// Fills order with the points, farthest from the eye first: one counting sort of the distances.
+// Fills order with the points, farthest from the eye, which is relative to the grid's origin, first:
+// one counting sort of the distances.
 function sortPoints(eye) {
   const n = header.count, distances = new Float32Array(n);
   let least = Infinity, most = 0;
