@@ -1,5 +1,5 @@
 // A pinhole camera read from one buffer of 20 floats (docs/conventions.md); pp_cl/scene/camera.py
-// writes it.
+// writes it. World coordinates count from a centre near the points, as in grid.h.
 #ifndef PP_CAMERA_H
 #define PP_CAMERA_H
 

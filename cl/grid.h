@@ -1,5 +1,5 @@
 // The regular grid of the points, read from one buffer of 8 floats: origin x, y, z; edge; nx, ny,
-// nz; 0. pp_cl/scene/grid.py writes it.
+// nz; 0. pp_cl/scene/grid.py writes it. World coordinates count from a centre near the points.
 #ifndef PP_GRID_H
 #define PP_GRID_H
 

@@ -55,7 +55,7 @@ class Frames:
         digest = hashlib.sha256(repr((self.style, self.run.header["step"])).encode())
         digest.update(f"{checkpoint.st_size} {checkpoint.st_mtime_ns}".encode())
         for camera in self.cameras:
-            digest.update(camera.packed((0, 0)).tobytes())
+            digest.update(self.run.model.packed(camera).tobytes())
         return digest.hexdigest()
 
     def _check_folder(self):

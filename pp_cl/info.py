@@ -76,7 +76,7 @@ def run_facts(folder: RunFolder, scene: str | None = None) -> Facts:
         "grid": None,
         "checkpoint_bytes": None,
         **_logged(folder),
-        "metrics": _metrics(folder),
+        **_metrics(folder),
     }
     if folder.checkpoint.exists():
         with opened_run(folder, config) as stored:
@@ -129,16 +129,19 @@ def _logged(folder):
 
 
 def _metrics(folder):
-    """The means of the evaluation of the test split, None where there is none."""
+    """{"metrics": means of the evaluation of the test split, "metrics_step": the step it was made
+    at}, None where there is none, or it does not tell.
+    """
     file = folder.evaluation("test") / "metrics.json"
     if not file.exists():
-        return None
+        return {"metrics": None, "metrics_step": None}
     try:
-        mean = json.loads(file.read_text("utf-8"))["mean"]
-        values = {name: float(value) for name, value in mean.items()}
-        if not all(map(math.isfinite, values.values())):
+        result = json.loads(file.read_text("utf-8"))
+        values = {name: float(value) for name, value in result["mean"].items()}
+        step = result.get("step")
+        if not all(map(math.isfinite, values.values())) or type(step) not in (int, type(None)):
             raise ValueError
-        return values
+        return {"metrics": values, "metrics_step": step}
     except (ValueError, KeyError, TypeError, AttributeError, OverflowError, RecursionError):
         raise UserError(f"{file}: holds no metrics; run `pp-cl eval {folder}` again") from None
 

@@ -12,6 +12,7 @@ from pp_cl.device.rows import DeviceRows
 from pp_cl.network.unet import UNet
 from pp_cl.raster.point_cloud import PointCloud
 from pp_cl.raster.sh import SH_DEGREES
+from pp_cl.scene.camera import Camera
 from pp_cl.scene.grid import Grid
 
 
@@ -19,7 +20,8 @@ class Model:
     """Points and network on a device.
 
     grid: the vertices that points lie on; grid_buffer: the same, packed, (8) float32 on the
-    device. depth_range: (near, far), distances from the eye in world units, of all cameras.
+    device. depth_range: (near, far), distances from the eye in world units, of all cameras. What
+    the device gets is relative to the grid's centre, which refinement keeps.
     """
 
     def __init__(
@@ -33,7 +35,7 @@ class Model:
     ):
         self.dev = dev
         self.grid = grid
-        self.grid_buffer = dev.upload(grid.packed())
+        self.grid_buffer = dev.upload(grid.packed(grid.centre))
         self.depth_range = depth_range
         self.cloud = cloud
         self.net = net
@@ -60,6 +62,12 @@ class Model:
         """(N, 3) float64 world positions of the points."""
         return self.grid.positions(self.cloud.ids.get())
 
+    def packed(self, camera: Camera, depth_range: tuple[float, float] | None = None) -> np.ndarray:
+        """(20,) float32: a camera that sees the points of grid_buffer. depth_range: instead of the
+        model's.
+        """
+        return camera.packed(depth_range or self.depth_range, self.grid.centre)
+
     def refine(self) -> Array:
         """Replace every point by the eight around it on the grid of half the spacing, which take
         over what it has learned. Returns the point that each one comes from, (8 N,) uint32.
@@ -70,7 +78,7 @@ class Model:
         rows = self.dev.upload(parents)
         self.cloud.replace_by(self.dev, ids, rows)
         self.grid = self.grid.refined()
-        self.grid_buffer = self.dev.upload(self.grid.packed())
+        self.grid_buffer = self.dev.upload(self.grid.packed(self.grid.centre))
         return rows
 
     def header(self) -> dict:

@@ -222,7 +222,7 @@ class Renderer:
         padded, *offset = camera.padded(NETWORK_MULTIPLE)
         size = (padded.height, padded.width)
         b.require(self.table(cloud.count, *size))
-        b.camera_buffer.set(padded.packed(depth_range or self.model.depth_range))
+        b.camera_buffer.set(self.model.packed(padded, depth_range))
         b.point_radius.set(np.array([self._radius()], np.float32))
         with self.dev.stage("project"):
             points = self._projection.grid(

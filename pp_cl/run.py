@@ -26,7 +26,8 @@ from pp_cl.presets import SHORT
 from pp_cl.scene.agreement import disagreements
 from pp_cl.scene.bounds import listing
 from pp_cl.scene.hull import build_grid, depth_range, spacing_pixels
-from pp_cl.scene.open import fingerprint, measured_split, open_scene, preset_downscale, scene_box
+from pp_cl.scene.identity import difference, identity
+from pp_cl.scene.open import measured_split, open_scene, preset_downscale, scene_box
 from pp_cl.scene.views import View
 from pp_cl.train import Trainer
 from pp_cl.trained import Run, load_run
@@ -303,7 +304,7 @@ def _start(config, views, net):
         opacity=points.opacity,
     )
     trainer = Trainer(dev, config, model, views)
-    return trainer, {"scene": fingerprint(views), "initial_points": facts.points}, facts
+    return trainer, identity(views) | {"initial_points": facts.points}, facts
 
 
 def _told_of_masks(dev, views, hull):
@@ -323,14 +324,19 @@ def _told_of_masks(dev, views, hull):
 def _resume(config, views, net, stored, *, file):
     """(Trainer, info, None) of a training that goes on."""
     header, arrays = stored
-    if header["scene"] != fingerprint(views):
-        raise UserError(
-            f"{file}: belongs to another scene than {config.scene.path}; use another --out"
+    path = config.scene.path
+    if told := difference(header, views, views):
+        raise UserError(f"{file}: belongs to another scene than {path} ({told}); use another --out")
+    if "pixels" not in header:
+        warnings.warn(
+            f"{file}: was begun by a version that did not keep the photographs' digests; only names"
+            f" and cameras of {path} could be compared",
+            stacklevel=2,
         )
     model = Model.load(net.dev, header, arrays, net, degree=config.points.sh_degree)
     trainer = Trainer(net.dev, config, model, views)
     trainer.restore(header["step"], arrays)
-    return trainer, {key: header[key] for key in ("scene", "initial_points")}, None
+    return trainer, identity(views) | {"initial_points": header["initial_points"]}, None
 
 
 def train_scene(

@@ -74,7 +74,8 @@ def _points_before(dev, config: Config, grid):
     while first.edge > 1.5 * grid.edge:
         ids, _ = first.children(ids)
         first = first.refined()
-    if first.dims != grid.dims or not np.allclose(first.origin, grid.origin, atol=1e-3 * grid.edge):
+    steps = np.abs(np.subtract(first.origin, grid.origin)) / grid.edge
+    if first.dims != grid.dims or steps.max() > 1e-3:
         raise UserError(
             f"{config.scene.path}: its hull is not the one that the run began with; say where the"
             " scene is with --scene"

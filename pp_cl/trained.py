@@ -1,6 +1,7 @@
 """What a training leaves: a model that can be rendered from anywhere."""
 
 import math
+import warnings
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -19,11 +20,13 @@ from pp_cl.model import Model
 from pp_cl.network.unet import UNet
 from pp_cl.render import Renderer
 from pp_cl.scene.camera import Camera
+from pp_cl.scene.identity import difference
 from pp_cl.scene.load import Scene
 from pp_cl.scene.open import DEMO, open_scene, scene_frames
 from pp_cl.training.schedule import gamma_at
 from pp_cl.training.stored import load_run_state
 
+COMPARED_VIEWS = 2  # training photographs that tell whether a scene is the run's
 NEAREST = 0.05  # of a point to the eye, in radii of the object
 
 
@@ -54,9 +57,37 @@ class Run:
         )
 
     def scene(self, split: str) -> Scene:
-        """The run's scene with one split. Raises UserError where it is missing or broken."""
+        """The run's scene with one split. Raises UserError where it is missing, broken or another
+        one than the run has learned.
+        """
         self._check_scene()
-        return open_scene(self.dev, self.config, (split,))
+        scene = open_scene(self.dev, self.config, (split,))
+        self._compare(split, scene.splits[split])
+        return scene
+
+    def _some_photographs(self):
+        return open_scene(self.dev, self.config, ("train",), COMPARED_VIEWS).splits["train"]
+
+    def _compare(self, split, views):
+        """Raise UserError unless the scene's training views are those of the run; of other splits'
+        scenes only a few photographs are read for it.
+        """
+        path, header = self.config.scene.path, self.header
+        try:
+            listed = scene_frames(path)
+            if split != "train":
+                views = self._some_photographs() if header.get("pixels") else []
+        except UserError as error:
+            warnings.warn(
+                f"{path}: cannot be compared with the scene of {self.folder} ({error})",
+                stacklevel=3,
+            )
+            return
+        if told := difference(header, listed, views):
+            raise UserError(
+                f"{self.folder.checkpoint}: belongs to another scene than {path} ({told}); say"
+                " where its own is with --scene"
+            )
 
     def cameras(self, split: str = "test") -> list[Camera]:
         """The cameras of a split's views at the resolution of the run; no photograph is read.

@@ -6,6 +6,7 @@ import shutil
 import numpy as np
 import pytest
 from PIL import Image
+from support.runs import arguments, train_and_interrupt
 from support.scenes import write_ball_scene
 
 from pp_cl.cli import main
@@ -185,3 +186,54 @@ def test_the_demo_has_no_validation_views(dev, capsys):
     config.scene.path = "demo"
     with pytest.raises(UserError, match="--split val: demo has train, test"):
         open_scene(dev, config, ("val",))
+
+
+def changed_scene(run, tmp_path, split, name):
+    """(copy of the run's scene in which a pixel of a photograph differs)."""
+    scene = json.loads((run / "config.json").read_text())["scene"]["path"]
+    shutil.copytree(scene, tmp_path / "ball")
+    pixels = np.array(Image.open(tmp_path / "ball" / split / name))
+    pixels[5, 5, 1] ^= 1
+    Image.fromarray(pixels).save(tmp_path / "ball" / split / name)
+    return str(tmp_path / "ball")
+
+
+def test_another_scene_is_refused_and_nothing_written(run, tmp_path, capsys):
+    before = (run / "eval" / "metrics.json").read_bytes()
+    other = write_ball_scene(tmp_path / "other", size=60, views=7)
+    changed = changed_scene(run, tmp_path, "train", "r_0.png")
+    for scene, told in ((other, "other names or cameras"), (changed, "train/r_0.png: other pix")):
+        for split in ("test", "train"):
+            assert main(["eval", str(run), "--scene", scene, "--split", split]) == 2
+            [error] = capsys.readouterr().err.splitlines()
+            assert "checkpoint.npz: belongs to another scene" in error and told in error
+            assert scene in error and "--scene" in error
+    assert (run / "eval" / "metrics.json").read_bytes() == before
+
+
+def test_the_pixels_of_all_training_views_are_compared_where_they_are_read(run, tmp_path, capsys):
+    scene = changed_scene(run, tmp_path, "train", "r_7.png")  # none of the few that test reads
+    assert main(["eval", str(run), "--scene", scene, "--split", "train"]) == 2
+    assert "train/r_7.png: other pixels" in capsys.readouterr().err
+
+
+def test_a_scene_without_training_views_is_measured_with_one_line(run, tmp_path, capsys):
+    scene = changed_scene(run, tmp_path, "train", "r_1.png")
+    (tmp_path / "ball" / "transforms_train.json").unlink()
+    assert main(["eval", str(run), "--scene", scene]) == 0
+    [told] = capsys.readouterr().err.splitlines()
+    assert "cannot be compared with the scene of" in told and "no split train" in told
+
+
+def test_an_unfinished_run_is_marked(tmp_path, capsys, monkeypatch):
+    scene, out = write_ball_scene(tmp_path / "ball"), tmp_path / "run"
+    train_and_interrupt(scene, out, 15, monkeypatch)
+    capsys.readouterr()
+    assert main(["eval", str(out), "--metrics", "psnr"]) == 0
+    assert f"{out} (2 views, unfinished, step 10)" in capsys.readouterr().out
+    assert main(["info", str(out)]) == 0
+    assert "(unfinished, at step 10)" in capsys.readouterr().out
+    assert main(arguments(scene, out)) == 0 and main(["eval", str(out), "--metrics", "psnr"]) == 0
+    capsys.readouterr()
+    assert main(["info", str(out)]) == 0
+    assert "(unfinished" not in capsys.readouterr().out

@@ -15,6 +15,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from PIL import Image
 from support.runs import arguments, train_and_interrupt
 from support.scenes import write_ball_scene
 
@@ -263,6 +264,35 @@ def test_a_scene_that_has_moved_is_known_by_its_views(scene, finished, tmp_path,
     ).read_bytes()
     config = json.loads((tmp_path / "run" / "config.json").read_text())
     assert config["scene"]["path"] == str(tmp_path / "moved")
+
+
+def test_a_scene_whose_pixels_have_changed_is_refused(scene, tmp_path, capsys, monkeypatch):
+    folder, out = tmp_path / "ball", tmp_path / "run"
+    shutil.copytree(scene, folder)
+    train_and_interrupt(str(folder), out, 15, monkeypatch)
+    before = (out / "checkpoint.npz").read_bytes()
+    pixels = np.array(Image.open(folder / "train" / "r_3.png"))
+    pixels[0, 0, 0] ^= 1
+    Image.fromarray(pixels).save(folder / "train" / "r_3.png")
+    assert main(arguments(str(folder), out)) == 2
+    error = capsys.readouterr().err.splitlines()[-1]
+    assert "belongs to another scene" in error and "train/r_3.png: other pixels" in error
+    assert (out / "checkpoint.npz").read_bytes() == before
+
+
+def test_a_checkpoint_without_digests_goes_on_with_one_line(
+    scene, finished, tmp_path, capsys, monkeypatch
+):
+    out = tmp_path / "run"
+    train_and_interrupt(scene, out, 15, monkeypatch)
+    header, arrays = load_checkpoint(out / "checkpoint.npz")
+    del header["format"], header["pixels"]
+    save_checkpoint(out / "checkpoint.npz", header, arrays)
+    capsys.readouterr()
+    assert main(arguments(scene, out)) == 0
+    told = [line for line in capsys.readouterr().err.splitlines() if "digests" in line]
+    assert len(told) == 1 and str(out / "checkpoint.npz") in told[0]
+    assert (out / "checkpoint.npz").read_bytes() == (finished / "checkpoint.npz").read_bytes()
 
 
 @pytest.mark.parametrize("steps", [25, 5, 60])

@@ -75,7 +75,8 @@ def _table(result, folder):
 
 
 def _label(result, folder):
-    return f"{folder} ({len(result['per_image'])} views)"
+    state = "" if result["finished"] else f", unfinished, step {result['step']}"
+    return f"{folder} ({len(result['per_image'])} views{state})"
 
 
 def _ranked(result, folder):

@@ -105,7 +105,9 @@ def _run_lines(facts):
         lines.append(_line("checkpoint", "none yet"))
     measured = facts["metrics"] or {}
     values = ", ".join(f"{name} {value:.4f}" for name, value in measured.items())
-    return [*lines, _line("test views", values or "not evaluated yet")]
+    step = facts["metrics_step"]
+    early = f" (unfinished, at step {step})" * (step is not None and step < facts["iterations"])
+    return [*lines, _line("test views", f"{values or 'not evaluated yet'}{early}")]
 
 
 def _scene_lines(facts):

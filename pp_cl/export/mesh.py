@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+import plyfile
 import trimesh
 from scipy.spatial import cKDTree
 from skimage.measure import marching_cubes
@@ -13,8 +14,9 @@ from tqdm import tqdm
 
 from pp_cl.errors import UserError
 from pp_cl.export.fusion import box_around, fuse
-from pp_cl.export.glb import gltf_colours
-from pp_cl.export.points import ColouredPoints, coloured_points
+from pp_cl.export.glb import glb_data, gltf_colours
+from pp_cl.export.ply import CHANNELS, COORDINATES
+from pp_cl.export.points import ColouredPoints, coloured_points, in_world
 from pp_cl.files.atomic import atomic_file
 from pp_cl.trained import Run
 
@@ -23,8 +25,8 @@ NEIGHBOURS = 4  # points that colour a vertex
 
 @dataclass(frozen=True)
 class Mesh:
-    """vertices: (V, 3) float32, world units. faces: (F, 3) int32, counter-clockwise from outside.
-    colours: (V, 3) uint8 sRGB.
+    """vertices: (V, 3) as in_world() gives them. faces: (F, 3) int32, counter-clockwise from
+    outside. colours: (V, 3) uint8 sRGB.
     """
 
     vertices: np.ndarray
@@ -33,8 +35,8 @@ class Mesh:
 
 
 def surface(run: Run) -> tuple[np.ndarray, np.ndarray]:
-    """(vertices (V, 3) float32, faces (F, 3) int32) of the surface that the depths of the training
-    views agree on, by marching cubes. Raises UserError where they show none.
+    """(vertices (V, 3) of in_world(), faces (F, 3) int32) of the surface that the depths of the
+    training views agree on, by marching cubes. Raises UserError where they show none.
     """
     grid = box_around(run.model.grid, run.model.cloud.ids.get())
     cameras = tqdm(run.cameras("train"), "depths", unit="view", leave=False, disable=None)
@@ -44,7 +46,7 @@ def surface(run: Run) -> tuple[np.ndarray, np.ndarray]:
         raise UserError(f"{run.folder}: the training views show no surface; train it longer")
     vertices, faces, _, _ = marching_cubes(outside, 0, gradient_direction="ascent")
     positions = np.asarray(grid.origin) + grid.edge * (vertices[:, ::-1] - 1)
-    return positions.astype(np.float32), faces.astype(np.int32)
+    return in_world(positions, grid.edge), faces.astype(np.int32)
 
 
 def coloured_mesh(run: Run) -> Mesh:
@@ -66,8 +68,32 @@ def _colours(vertices, points: ColouredPoints, edge):
 
 def write_mesh(path: Path | str, mesh: Mesh) -> None:
     """Write a PLY or GLB file, by the suffix. Raises UserError as atomic_file does."""
-    kind = Path(path).suffix.lower().removeprefix(".")
-    colours = gltf_colours(mesh.colours) if kind == "glb" else mesh.colours
-    made = trimesh.Trimesh(mesh.vertices, mesh.faces, vertex_colors=colours, process=False)
+    is_glb = Path(path).suffix.lower() == ".glb"
+    colours = gltf_colours(mesh.colours) if is_glb else mesh.colours
+
+    def make(vertices):
+        return trimesh.Trimesh(vertices, mesh.faces, vertex_colors=colours, process=False)
+
     with atomic_file(path) as file:
-        file.write(made.export(file_type=kind))
+        if is_glb:
+            file.write(glb_data(mesh.vertices, make))
+        elif mesh.vertices.dtype == np.float32:
+            file.write(make(mesh.vertices).export(file_type="ply"))
+        else:
+            _ply_of_doubles(mesh).write(file)
+
+
+def _ply_of_doubles(mesh):
+    """The same as trimesh writes, with coordinates of float64."""
+    table = np.empty(
+        len(mesh.vertices),
+        [*((name, "<f8") for name in COORDINATES), *((name, "u1") for name in CHANNELS)],
+    )
+    columns = [*mesh.vertices.T, *mesh.colours.T]
+    for name, column in zip((*COORDINATES, *CHANNELS), columns, strict=True):
+        table[name] = column
+    faces = np.empty(len(mesh.faces), [("vertex_indices", "<i4", (3,))])
+    faces["vertex_indices"] = mesh.faces
+    parts = {"vertex": table, "face": faces}
+    elements = [plyfile.PlyElement.describe(part, name) for name, part in parts.items()]
+    return plyfile.PlyData(elements, byte_order="<")

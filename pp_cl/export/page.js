@@ -23,18 +23,20 @@ const turned = (a, axis, angle) => {
 const text = atob(document.getElementById("points").textContent);
 const bytes = new Uint8Array(header.count * header.stride);
 for (let i = 0; i < bytes.length; i++) bytes[i] = text.charCodeAt(i);
+// from the grid's origin, which may be too far from the world's for float32
 const positions = new Float32Array(3 * header.count);
 const words = new Uint16Array(bytes.buffer);
 for (let i = 0; i < header.count; i++)
   for (let k = 0; k < 3; k++)
-    positions[3 * i + k] = header.origin[k] + header.edge * words[i * header.stride / 2 + k];
+    positions[3 * i + k] = header.edge * words[i * header.stride / 2 + k];
 
 const BUCKETS = 1 << 16;
 const order = new Uint32Array(header.count);
 const keys = new Uint16Array(header.count);
 const starts = new Uint32Array(BUCKETS + 1);
 
-// Fills order with the points, farthest from the eye first: one counting sort of the distances.
+// Fills order with the points, farthest from the eye, which is relative to the grid's origin, first:
+// one counting sort of the distances.
 function sortPoints(eye) {
   const n = header.count, distances = new Float32Array(n);
   let least = Infinity, most = 0;
@@ -79,7 +81,7 @@ layout(location = 5) in vec4 b3;
 layout(location = 6) in vec4 b4;
 layout(location = 7) in vec4 b5;
 layout(location = 8) in vec4 b6;
-uniform vec3 origin, eye;
+uniform vec3 eye;                       // from the grid's origin
 uniform float edge, radius, nearest, low[9], span[9];
 uniform float least;                    // half the width of the smallest footprint, in pixels
 uniform float grown;                    // footprints that fill the gaps between points
@@ -91,7 +93,7 @@ flat out float t, reach;
 flat out vec4 colour;
 vec3 value(int k, vec3 stored) { return low[k] + span[k] * stored; }
 void main() {
-  vec3 position = origin + edge * vertex, towards = position - eye;
+  vec3 towards = edge * vertex - eye;
   centre = towards * axes;
   t = length(towards);
   reach = grown * max(radius, least * t / min(focal.x, focal.y));
@@ -175,7 +177,6 @@ function makeDrawer(gl) {
   for (let i = 0; i < 7; i++) attribute(2 + i, 4, gl.UNSIGNED_BYTE, true, 8 + 4 * i);
   gl.bindBuffer(gl.ELEMENT_ARRAY_BUFFER, gl.createBuffer());
   gl.useProgram(program);
-  gl.uniform3fv(place("origin"), header.origin);
   gl.uniform1fv(place("low"), header.low);
   gl.uniform1fv(place("span"), header.span);
   for (const name of ["edge", "radius", "nearest"]) gl.uniform1f(place(name), header[name]);
@@ -198,7 +199,7 @@ function makeDrawer(gl) {
 
   // camera: pose (12 numbers, camera to world, by rows), fx, fy, cx, cy, width, height in pixels
   return (camera) => {
-    const p = camera.pose, eye = [p[3], p[7], p[11]];
+    const p = camera.pose, world = [p[3], p[7], p[11]], eye = add(world, header.origin, -1);
     sortPoints(eye);
     resize(camera.width, camera.height);
     gl.bindFramebuffer(gl.FRAMEBUFFER, target);
@@ -213,7 +214,7 @@ function makeDrawer(gl) {
       place("axes"), false, [p[0], p[4], p[8], p[1], p[5], p[9], p[2], p[6], p[10]]);
     gl.uniform4f(place("focal"), camera.fx, camera.fy, camera.cx, camera.cy);
     gl.uniform2f(place("size"), camera.width, camera.height);
-    const larger = magnification(camera, eye);
+    const larger = magnification(camera, world);
     gl.uniform1f(place("least"), 0.75 * larger);
     gl.uniform1f(place("grown"), Math.min(larger, GROWN));
     gl.enable(gl.BLEND);
@@ -259,7 +260,7 @@ function lookOf(hash) {
 }
 
 function hashOf(look) {
-  const list = (a) => a.map((x) => +x.toPrecision(7)).join(",");
+  const list = (a) => a.map((x) => +x.toPrecision(12)).join(",");
   return `#eye=${list(look.eye)}&target=${list(look.target)}&up=${list(look.up)}&fov=${look.fov}`;
 }
 

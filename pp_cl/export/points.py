@@ -13,14 +13,16 @@ from pp_cl.files.picture import Picture
 from pp_cl.scene.camera import Camera
 from pp_cl.trained import Run
 
+FINEST = 1e-3  # of the grid's edge: how far rounding to float32 may move a point in a file
+
 
 @dataclass(frozen=True)
 class ColouredPoints:
     """M points in the order of their ids.
 
-    rows: (M,) int64, their rows in the run's point cloud. positions: (M, 3) float32, world units.
-    colours: (M, 3) uint8 sRGB. weight: (M,) float32, the blend weights in the view that gave the
-    colour, summed over its pixels. opacity: (M,) float32.
+    rows: (M,) int64, their rows in the run's point cloud. positions: (M, 3) as in_world() gives
+    them. colours: (M, 3) uint8 sRGB. weight: (M,) float32, the blend weights in the view that gave
+    the colour, summed over its pixels. opacity: (M,) float32.
     """
 
     rows: np.ndarray
@@ -53,11 +55,19 @@ def coloured_points(run: Run, min_weight: float = 0.0) -> ColouredPoints:
         )
     return ColouredPoints(
         rows,
-        positions[rows].astype(np.float32),
+        in_world(positions[rows], run.model.grid.edge),
         colours[rows],
         best[rows],
         cloud.opacity.get()[rows],
     )
+
+
+def in_world(positions: np.ndarray, edge: float) -> np.ndarray:
+    """(N, 3) float64 world positions as files keep them: float32, which every program reads, or
+    float64 where the world's origin is so far that float32 moves them. edge: of the grid.
+    """
+    resolution = np.spacing(np.float32(np.abs(positions).max(initial=0)))
+    return positions if resolution > FINEST * edge else positions.astype(np.float32)
 
 
 def _colours(picture: Picture, camera: Camera, positions):

@@ -1,5 +1,6 @@
 """The box around the object that the masks allow, and why masks can leave no hull."""
 
+import math
 from collections.abc import Sequence
 
 import numpy as np
@@ -11,9 +12,45 @@ from pp_cl.scene.views import MASK_THRESHOLD, View
 
 # how far, in image sizes, an object that the image border cuts off may reach beyond the border
 CROPPED_MARGIN = 0.5
+# of the box of the eyes, world units: what float32 computes with (docs/scene_scale.md)
+LEAST_REACH, MOST_REACH = 1e-12, 1e15
+LEAST_SHARE = 1e-9  # of a distance: less of it is rounding
 SOLVED, INFEASIBLE = 0, 2  # status of scipy.optimize.linprog
 PROBED_CELLS = 32**3  # positions at which an error's explanation looks up the masks
 NAMES_SHOWN = 3  # views named in an error
+
+
+def reach_of(views: Sequence[View]) -> float:
+    """Longest side of the box of the cameras' eyes, world units. Raises UserError naming views
+    where they make no scene: all are in one place, one is much too far away, or all are too close.
+    """
+    eyes = np.stack([view.camera.eye for view in views])
+    reach, all_views = float(np.ptp(eyes, axis=0).max()), _all_of(views)
+    if len(views) == 1:
+        return reach
+    if reach <= LEAST_SHARE * np.abs(eyes).max():
+        place = ", ".join(f"{x:.6g}" for x in eyes[0])
+        raise UserError(
+            f"{all_views}: their cameras are all in one place, ({place}); give each frame its own"
+            " pose"
+        )
+    if reach < LEAST_REACH:
+        raise UserError(
+            f"{all_views}: their cameras are within {reach:.3g} world units, and"
+            f" {LEAST_REACH:g} is the least that float32 computes with; scale their positions up"
+        )
+    if reach > MOST_REACH:
+        distances = np.abs(eyes - np.median(eyes, axis=0)).max(1)
+        raise UserError(
+            f"{views[int(distances.argmax())].name}: its camera is {distances.max():.3g} world"
+            f" units from the others' middle, and {MOST_REACH:g} is the most that float32 computes"
+            " with; correct its pose, or scale all positions down"
+        )
+    return reach
+
+
+def _all_of(views):
+    return f"{views[0].name} and the {len(views) - 1} other training views"
 
 
 def bounding_box(views: Sequence[View]) -> np.ndarray:
@@ -22,26 +59,27 @@ def bounding_box(views: Sequence[View]) -> np.ndarray:
 
     A side where the mask reaches the image border does not bound the object, unless nothing else
     does; then the object is taken to end CROPPED_MARGIN image sizes outside. Where no view has a
-    mask, images end at their borders. Raises UserError when the pyramids do not meet or do not end.
+    mask, images end at their borders. Raises UserError when the pyramids do not meet, do not end or
+    meet in a point, and as reach_of does.
     """
+    unit = 2.0 ** math.frexp(reach_of(views))[1]  # the solver's tolerances are absolute
     masked = any(view.has_mask for view in views)
     for margin in (None, CROPPED_MARGIN) if masked else (0.0, CROPPED_MARGIN):
         planes = np.concatenate([_silhouette_planes(view, margin) for view in views])
         # lower bounds of x, y, z, -x, -y, -z
         bounds = [
-            linprog(axis, -planes[:, :3], -planes[:, 3], bounds=(None, None))
+            linprog(axis, -planes[:, :3], -planes[:, 3] / unit, bounds=(None, None))
             for axis in (*np.eye(3), *-np.eye(3))
         ]
         if any(b.status == INFEASIBLE for b in bounds):
             eyes = np.stack([view.camera.eye for view in views])
-            reach = np.ptp(eyes, axis=0).max() or 1.0
-            raise UserError(explain_empty_hull(views, eyes.mean(0) + reach * np.array([[-1], [1]])))
+            raise UserError(explain_empty_hull(views, eyes.mean(0) + unit * np.array([[-1], [1]])))
         if all(b.status == SOLVED for b in bounds):
-            return np.array([[1], [-1]]) * np.array([b.fun for b in bounds]).reshape(2, 3)
-    raise UserError(
-        f"{views[0].name} and the {len(views) - 1} other training views do not bound the object: "
-        "it must be seen from several sides"
-    )
+            box = np.array([[unit], [-unit]]) * np.array([b.fun for b in bounds]).reshape(2, 3)
+            if not np.ptp(box, axis=0).max() > LEAST_SHARE * unit:
+                break
+            return box
+    raise UserError(f"{_all_of(views)} do not bound the object: it must be seen from several sides")
 
 
 def _silhouette_planes(view, cropped_margin):

@@ -48,15 +48,22 @@ class Camera:
         """(3,) position in world coordinates."""
         return self.pose[:, 3]
 
-    def packed(self, depth_range: Sequence[float]) -> np.ndarray:
+    def moved(self, by: ArrayLike) -> "Camera":
+        """The camera with its eye moved by (3,) world units."""
+        return replace(self, pose=np.column_stack([self.pose[:, :3], np.add(self.eye, by)]))
+
+    def packed(
+        self, depth_range: Sequence[float], centre: ArrayLike = (0.0, 0.0, 0.0)
+    ) -> np.ndarray:
         """(20,) float32, the layout of cl/camera.h.
 
-        depth_range: (near, far), Euclidean distances from the eye, world units.
+        depth_range: (near, far), Euclidean distances from the eye, world units. centre: world
+        position that is the device's origin, which has to be near for float32.
         """
         return np.concatenate(
             [
                 self.pose[:, :3].T.ravel(),
-                self.eye,
+                self.eye - np.asarray(centre),
                 [self.fx, self.fy, self.cx, self.cy, *depth_range, self.width, self.height],
             ]
         ).astype(np.float32)

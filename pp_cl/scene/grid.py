@@ -1,13 +1,15 @@
 """The regular grid whose vertices are the points."""
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from pp_cl.scene.camera import Camera
+
+FLOAT32_BITS = 24
 
 
 @dataclass(frozen=True)
@@ -79,9 +81,23 @@ class Grid:
         low = np.asarray(self.origin)
         return np.stack([low, low + self.edge * (np.asarray(self.dims) - 1)])
 
-    def packed(self) -> np.ndarray:
-        """(8,) float32, the layout of cl/grid.h."""
-        return np.array([*self.origin, self.edge, *self.dims, 0], np.float32)
+    def moved(self, by: ArrayLike) -> "Grid":
+        """The grid moved by (3,) world units."""
+        return replace(self, origin=tuple(float(x) for x in np.add(self.origin, by)))
+
+    def rounded(self) -> "Grid":
+        """The grid with an edge that float32 holds, and an origin of whole units of its last bit.
+        So float64 holds each vertex and the centre exactly, up to 2^28 edges from the world's
+        origin, and moves by whole units change nothing else.
+        """
+        unit = 2.0 ** (math.frexp(self.edge)[1] - FLOAT32_BITS)
+        origin = tuple(float(x) for x in unit * np.rint(np.divide(self.origin, unit)))
+        return replace(self, origin=origin, edge=float(unit * np.rint(self.edge / unit)))
+
+    def packed(self, centre: ArrayLike = (0.0, 0.0, 0.0)) -> np.ndarray:
+        """(8,) float32, the layout of cl/grid.h. centre: as Camera.packed has it."""
+        origin = np.subtract(self.origin, centre)
+        return np.array([*origin, self.edge, *self.dims, 0], np.float32)
 
     def positions(self, ids: ArrayLike) -> np.ndarray:
         """(N, 3) float64 world positions of the vertices with ids (N,), i + nx*(j + ny*k)."""
@@ -101,7 +117,8 @@ class Grid:
 
 def smallest_edge(box: np.ndarray, cells: int) -> float:
     """Edge, within 0.1 %, of the finest grid over a (2, 3) box with at most `cells` vertices."""
-    size = np.maximum(box[1] - box[0], 1e-6 * np.ptp(box))  # a box may be flat
+    size = box[1] - box[0]
+    size = np.maximum(size, 1e-6 * size.max())  # a box may be flat
     edge = (size.prod() / cells) ** (1 / 3)
     while (excess := np.prod(size // edge + 1) / cells) > 1:
         edge *= max(excess ** (1 / 3), 1.001)

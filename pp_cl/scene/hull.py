@@ -1,14 +1,15 @@
 """The initial points: vertices of a regular grid inside the visual hull of the training masks."""
 
+import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from pyopencl.array import Array
 
 from pp_cl.device.device import Device
 from pp_cl.errors import UserError
-from pp_cl.scene.bounds import bounding_box, explain_empty_hull
+from pp_cl.scene.bounds import bounding_box, explain_empty_hull, reach_of
 from pp_cl.scene.camera import Camera
 from pp_cl.scene.grid import Grid, smallest_edge
 from pp_cl.scene.views import MASK_THRESHOLD, View
@@ -22,6 +23,7 @@ TOLERANCE = 1.02  # a count of 1 to this many times the points asked for ends th
 # half-diagonals of the hull from its centre to near and to far: about the published range of 4 for
 # lego
 DEPTH_MARGIN = 1.25
+CORNER_BITS = 16  # the corner that carving counts from: whole 2^-16 of the size of the eyes' box
 
 
 @dataclass(frozen=True)
@@ -161,7 +163,7 @@ def build_grid(
     count, until the count is `points` to 1.02 points. At CELL_CAP vertices of the grid, or after
     8 rounds, the best carving is taken: the smallest with enough points, else the largest. Raises
     UserError for an impossible `points`, a view without a mask where others have one, masks or
-    poses that leave no vertex.
+    poses that leave no vertex, cameras that make no scene.
     """
     if not 1 <= points <= CELL_CAP:
         raise UserError(f"--points {points}: must be between 1 and {CELL_CAP}")
@@ -171,10 +173,29 @@ def build_grid(
             f"{views[masked.index(False)].name}: has no transparent pixel, but other photographs"
             " have: give it a mask that is 0 around the object"
         )
-    box = bounding_box(views) if box is None else box
+    corner = _corner(views, reach_of(views))
+    near = [view.moved(-corner) for view in views]
+    hull = _search(dev, near, points, bounding_box(near) if box is None else box - corner)
+    return replace(hull, grid=hull.grid.moved(corner))
+
+
+def _corner(views, reach):
+    """(3,) world position near the cameras, from which a scene far from the origin is carved as one
+    at the origin is: views that are moved alike, by whole units of the corner, give the same hull.
+    """
+    eyes = np.stack([view.camera.eye for view in views])
+    unit = 2.0 ** (math.frexp(reach)[1] - CORNER_BITS)
+    return unit * np.floor(eyes.min(0) / unit)
+
+
+def _search(dev, views, points, box):
+    """The Hull of build_grid() in a box."""
     carver = Carver(dev, _farthest_point_order(views, box.mean(0)))
-    coarse_edge = smallest_edge(box, min(COARSE_CELLS, CELL_CAP))
-    best = last = carver.carve(Grid.centred_in(box, coarse_edge))
+
+    def carve(edge):
+        return carver.carve(Grid.centred_in(box, edge).rounded())
+
+    best = last = carve(smallest_edge(box, min(COARSE_CELLS, CELL_CAP)))
     capped, rounds = False, 0
     if not last.count:
         raise UserError(explain_empty_hull(views, box))
@@ -185,7 +206,7 @@ def build_grid(
         capped = edge > wanted
         if capped and edge > 0.99 * last.grid.edge:
             break  # the box shrinks no more
-        last = carver.carve(Grid.centred_in(box, edge))
+        last = carve(edge)
         rounds += 1
         best = min(best, last, key=lambda c: (c.count < points, abs(c.count - points)))
     return Hull(*carver.points(best), capped and best.count < points)

@@ -8,13 +8,14 @@ from pathlib import Path
 from types import ModuleType
 from typing import TypeVar
 
-import numpy as np
 from tqdm import tqdm
 
 from pp_cl.errors import UserError
 from pp_cl.files.image import read_rgba
 from pp_cl.scene.distortion import undistort
+from pp_cl.scene.identity import pixel_digest
 from pp_cl.scene.masks import AS_GIVEN, MaskRule
+from pp_cl.scene.photograph import Photograph
 from pp_cl.scene.readers import co3d, colmap, llff, neus, nsvf, transforms
 from pp_cl.scene.views import View
 
@@ -23,7 +24,9 @@ from pp_cl.scene.views import View
 # Photograph without reading pixels. The first that recognises a folder reads it.
 READERS = (transforms, co3d, neus, nsvf, colmap, llff)
 
-Item = TypeVar("Item")
+LEAST_FOCAL, MOST_FOCAL = 1e-2, 1e7  # pixels; docs/scene_scale.md says what is measured
+
+Item, Made = TypeVar("Item"), TypeVar("Made")
 
 
 @dataclass(frozen=True)
@@ -80,18 +83,46 @@ def load_scene(
     and the key where there is one, for whatever is missing, broken or contradictory.
     """
     reader, folder = find_reader(path), Path(path)
-    listed = {split: evenly(reader.read_split(folder, split), most) for split in splits}
-    for split, photographs in listed.items():
-        if not photographs:
-            raise UserError(f"{folder}: split {split} has no photographs; add some")
+    listed = {s: evenly(list_photographs(reader, folder, s), most) for s in splits}
     everything = [photograph for photographs in listed.values() for photograph in photographs]
     _check_alike(folder, everything)
     images = iter(_on_all_cores(lambda one: _read_image(folder, one, masks), everything))
     views = {
-        split: [View(one.name, one.camera, next(images), one.depth_range) for one in photographs]
+        split: [_view(one, *next(images)) for one in photographs]
         for split, photographs in listed.items()
     }
     return Scene(folder.resolve().name, folder, views)
+
+
+def list_photographs(reader: ModuleType, folder: Path, split: str) -> list[Photograph]:
+    """The photographs of a split that a module of READERS lists. Raises UserError where there are
+    none, and for a camera that shows nothing in float32.
+    """
+    photographs = reader.read_split(folder, split)
+    if not photographs:
+        raise UserError(f"{folder}: split {split} has no photographs; add some")
+    for one in photographs:
+        _check_lens(folder / one.name, one.camera)
+    return photographs
+
+
+def _check_lens(image, camera):
+    """Raise UserError for a camera that shows nothing in float32."""
+    focal, middle = (camera.fx, camera.fy), (camera.cx, camera.cy)
+    if not LEAST_FOCAL <= min(focal) <= max(focal) <= MOST_FOCAL:
+        what, least = f"focal lengths of {focal[0]:.3g} and {focal[1]:.3g}", LEAST_FOCAL
+    elif not -MOST_FOCAL <= min(middle) <= max(middle) <= MOST_FOCAL:
+        what, least = f"its principal point at {middle[0]:.3g}, {middle[1]:.3g}", -MOST_FOCAL
+    else:
+        return
+    raise UserError(
+        f"{image}: its camera has {what} pixels, which must be {least:g} to {MOST_FOCAL:g}; correct"
+        " the scene's file of cameras"
+    )
+
+
+def _view(photograph, image, digest):
+    return View(photograph.name, photograph.camera, image, photograph.depth_range, digest=digest)
 
 
 def _known_files() -> str:
@@ -110,8 +141,8 @@ def _check_alike(folder, photographs):
 
 
 def _read_image(folder, photograph, masks):
-    """(H, W, 4) uint8 straight RGBA: the image with its mask, freed of distortion. Raises
-    UserError.
+    """((H, W, 4) uint8 straight RGBA: the image with its mask, freed of distortion, the digest of
+    its pixels). Raises UserError.
     """
     image = read_rgba(folder / photograph.name)
     image = masks.apply(image, photograph.name, photograph.mask and folder / photograph.mask)
@@ -122,10 +153,10 @@ def _read_image(folder, photograph, masks):
         )
     if photograph.distortion:
         image = undistort(image, photograph.camera, photograph.distortion)
-    return image
+    return image, pixel_digest(image)
 
 
-def _on_all_cores(read: Callable[[Item], np.ndarray], items: Sequence[Item]) -> list[np.ndarray]:
+def _on_all_cores(read: Callable[[Item], Made], items: Sequence[Item]) -> list[Made]:
     """[read(item)] in order. Raises the UserError of the first that fails."""
     with ThreadPoolExecutor(os.cpu_count()) as pool:
         return list(

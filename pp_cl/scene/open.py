@@ -1,6 +1,5 @@
 """The scene that a run's settings name."""
 
-import hashlib
 import warnings
 from pathlib import Path
 
@@ -11,10 +10,10 @@ from pp_cl.device.device import Device
 from pp_cl.errors import UserError
 from pp_cl.presets import IMAGE_SIZES
 from pp_cl.scene import demo
-from pp_cl.scene.load import Scene, find_reader, load_scene
+from pp_cl.scene.load import Scene, find_reader, list_photographs, load_scene
 from pp_cl.scene.masks import MaskRule
 from pp_cl.scene.photograph import Photograph
-from pp_cl.scene.views import MIN_SIDE, View, fitting_downscale
+from pp_cl.scene.views import MIN_SIDE, fitting_downscale
 
 DEMO = "demo"  # the word that names the scene which the program makes itself
 
@@ -31,7 +30,8 @@ def open_scene(
     settings = config.scene
     rule = MaskRule(settings.mask_from, settings.masks, settings.mask_tolerance)
     scene = load_scene(path, splits, most, rule)
-    _warn_without_masks(scene, settings.mask_from)
+    if most is None:
+        _warn_without_masks(scene, settings.mask_from)
     return scene.reduced(downscale)
 
 
@@ -76,7 +76,7 @@ def scene_frames(path: str, split: str = "train") -> list[Photograph]:
     """The photographs of a split, without their pixels. Raises UserError as load_scene does."""
     if path == DEMO:
         return demo.demo_frames(split)
-    return find_reader(path).read_split(Path(path), split)
+    return list_photographs(find_reader(path), Path(path), split)
 
 
 def preset_downscale(path: str, preset: str) -> int:
@@ -98,17 +98,3 @@ def measured_split(path: str) -> str:
         if split in present:
             return split
     raise UserError(f"--eval-every: {path} has no split val or test; leave it out")
-
-
-def fingerprint(views: list[View]) -> str:
-    """Hex digest of the views' names and stored cameras, by which a checkpoint knows its scene."""
-    digest = hashlib.sha256()
-    for view in views:
-        camera = view.stored_camera
-        digest.update(f"{view.name} {camera.width}x{camera.height} ".encode())
-        digest.update(
-            np.round(
-                np.append(camera.pose.ravel(), [camera.fx, camera.fy, camera.cx, camera.cy]), 6
-            ).tobytes()
-        )
-    return digest.hexdigest()

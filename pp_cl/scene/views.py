@@ -4,6 +4,7 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from pp_cl.errors import UserError
 from pp_cl.scene.camera import Camera
@@ -27,7 +28,8 @@ class View:
     name: path of the image relative to the scene's folder. stored_camera: the camera of the stored
     image. image: (H, W, 4) uint8, the stored image as straight RGBA (alpha 255 everywhere if the
     file has none); not to be changed. depth_range: (near, far) of this camera, Euclidean distances
-    in world units, if the dataset states one.
+    in world units, if the dataset states one. digest: of the image's pixels, see
+    scene/identity.py; None for one that the program makes itself.
     """
 
     name: str
@@ -35,6 +37,7 @@ class View:
     image: np.ndarray
     depth_range: tuple[float, float] | None = None
     downscale: int = 1
+    digest: str | None = None
 
     @cached_property
     def camera(self) -> Camera:
@@ -45,6 +48,10 @@ class View:
     def has_mask(self) -> bool:
         """Whether some pixel is not wholly opaque."""
         return bool((self.image[..., 3] < 255).any())
+
+    def moved(self, by: ArrayLike) -> "View":
+        """The same photograph, its camera moved by (3,) world units."""
+        return replace(self, stored_camera=self.stored_camera.moved(by))
 
     def reduced(self, downscale: int) -> "View":
         """The same photograph reduced `downscale` times from its stored resolution.

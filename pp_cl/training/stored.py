@@ -3,6 +3,7 @@ and nothing in it is believed before it was checked.
 """
 
 import math
+import re
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any
@@ -18,6 +19,7 @@ from pp_cl.layers.tuning import check_form
 from pp_cl.network.architectures import unet_layers
 from pp_cl.network.workspace import parameter_table
 from pp_cl.raster.sh import SH_DEGREES, sh_blocks
+from pp_cl.scene.identity import DIGITS
 from pp_cl.training.point_state import PointState, stored_name
 from pp_cl.training.schedule import ema_start, refine_steps
 
@@ -25,6 +27,7 @@ MOST_VERTICES = 2**32  # an id has 32 bits
 LEAST_LENGTH, MOST_LENGTH = 1e-30, 1e30  # world units; float32 would hold no products of others
 LEAST_SHARE = 1e-6  # of far, between it and near: float32 would hold them as one
 MOST_TEXT = 1000
+DIGEST = re.compile(f"[0-9a-f]{{{DIGITS}}}")
 GRID = ("origin", "edge", "dims")
 
 
@@ -63,9 +66,11 @@ class StoredRun:
         missing = [key for key in rules if key not in header]
         if missing:
             self._refuse(f"its header lacks {', '.join(missing)}")
-        unknown = sorted(header.keys() - rules.keys() - {"format", "tuning"})
+        unknown = sorted(header.keys() - rules.keys() - {"format", "tuning", "pixels"})
         if unknown:
             self._refuse(f"its header holds {shown(unknown[0], 40)}, which this version knows not")
+        if "pixels" in header:
+            rules["pixels"] = _are_digests, "the digests of photographs"
         for key, (is_right, expected) in rules.items():
             if not is_right(header[key]):
                 self._refuse(f"{key} in its header is {quoted(header[key])}, expected {expected}")
@@ -154,7 +159,7 @@ Rule = tuple[Callable[[Any], bool], str]  # whether a value is right, and what i
 
 
 def _header_rules(config: Config) -> dict[str, Rule]:
-    """{key of the header: Rule}, beside "format" and the optional "tuning"."""
+    """{key of the header: Rule}, beside "format" and the optional "tuning" and "pixels"."""
     steps = config.train.iterations
     return {
         "scene": (lambda x: type(x) is str and 0 < len(x) <= MOST_TEXT, "a text"),
@@ -164,6 +169,15 @@ def _header_rules(config: Config) -> dict[str, Rule]:
         "grid": (_is_grid, "three numbers, a length and three numbers of vertices"),
         "depth_range": (_is_depth_range, "near and far"),
     }
+
+
+def _are_digests(pixels):
+    """Whether it is what identity() gives."""
+    return pixels is None or (
+        isinstance(pixels, dict)
+        and len(pixels) > 0
+        and all(type(x) is str and DIGEST.fullmatch(x) for x in pixels.values())
+    )
 
 
 def _whole_in(least, most):

@@ -22,7 +22,7 @@ MOST_NUMBER = 2**53 - 1  # what a browser counts to exactly
 # {name: (least, most)}; exposure in stops, kept as a share of the points
 RANGES = {"tau": (0, 0.5), "early_stop": (0, 0.5), "kept": (0.001, 1), "exposure": (-6, 6)}
 INTRINSICS = {"fl_x": (1, 1e6), "fl_y": (1, 1e6), "cx": (-1e5, 1e5), "cy": (-1e5, 1e5)}
-MOST_DISTANCE = 1e6  # of an eye from the origin, world units: float32 has 0.1 left there
+MOST_DISTANCE = 1e15  # of an eye from the origin, world units: float32 holds its square
 
 
 @dataclass(frozen=True)

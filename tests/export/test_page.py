@@ -101,6 +101,23 @@ def test_a_browser_draws_what_the_run_shows(run, page, tmp_path):
         assert psnr(image, predicted(run, page, camera)) > 45
 
 
+def test_a_browser_draws_the_same_far_from_the_origin(run, page, tmp_path):
+    by, camera, other = (
+        2.0**20 * np.array([1, -1, 1]),
+        run.cameras("test")[0],
+        tmp_path / "far.html",
+    )
+    text = element(page, "header")
+    header = json.loads(text)
+    header |= {name: (header[name] + by).tolist() for name in ("origin", "centre", "eye")}
+    other.write_text(page.read_text("utf-8").replace(text, json.dumps(header)))
+    images = []
+    for file, seen in ((page, camera), (other, camera.moved(by))):
+        script = f"ppcl.setCamera({page_camera(seen)}); return ppcl.canvas.toDataURL();"
+        images.append(image_of(ask(file, script, tmp_path)).astype(int))
+    assert np.abs(images[0] - images[1]).max() <= 1 and images[0].min() < 200
+
+
 def test_a_browser_sorts_the_points_from_far_to_near(page, tmp_path):
     script = """const eye = [0.3, 4, 1]; ppcl.sortPoints(eye);
         return Array.from(ppcl.order, (i) => Math.hypot(

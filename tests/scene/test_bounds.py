@@ -46,6 +46,56 @@ def test_wrong_axes_are_told(dev, flat):
         build_grid(dev, views, 100)
 
 
-def test_views_from_one_place_do_not_bound(dev):
+def test_one_view_does_not_bound(dev):
     with pytest.raises(UserError, match="from several sides"):
         build_grid(dev, ball_views()[:1], 100)
+
+
+def placed(place, scale=1.0):
+    """The views with eyes scaled about the object's centre, which comes to lie at `place`."""
+    return [
+        view.moved(place + scale * (view.camera.eye - CENTRE) - view.camera.eye)
+        for view in ball_views()
+    ]
+
+
+def test_boxes_move_and_grow_with_the_cameras():
+    box = bounding_box(ball_views()) - CENTRE
+    for place, scale in ((CENTRE, 1e-8), (CENTRE, 1e12), (np.array([1e6, -2e6, 3.0]), 1.0)):
+        rounding = 1e-9 * scale + 1e-15 * np.abs(place).max()
+        found = bounding_box(placed(place, scale)) - place
+        np.testing.assert_allclose(found, scale * box, rtol=0, atol=10 * rounding)
+
+
+@pytest.mark.parametrize("place, scale", [((0, 0, 0), 0), ((1, -2, 3), 0), ((1e9, 0, 0), 0.01)])
+def test_cameras_in_one_place_are_told(dev, place, scale):
+    told = r"^train/r_0\.png and the 11 other training views: .* all in one place, \("
+    with pytest.raises(UserError, match=told):
+        build_grid(dev, placed(np.array(place), scale), 100)
+
+
+@pytest.mark.parametrize(
+    "scale, told", [(1e-14, "within .* scale their positions up"), (1e20, "the most that float32")]
+)
+def test_scenes_that_float32_cannot_hold_are_told(dev, scale, told):
+    with pytest.raises(UserError, match=told):
+        build_grid(dev, placed(np.zeros(3), scale), 100)
+
+
+def test_a_camera_that_is_much_too_far_is_named(dev):
+    views = ball_views()
+    views[4] = views[4].moved((0, -1e29, 0))
+    with pytest.raises(UserError, match=r"^train/r_4\.png: its camera is 1e\+29 world units"):
+        build_grid(dev, views, 100)
+    views[4] = ball_views()[4].moved((0, -1e9, 0))
+    with pytest.raises(UserError, match="bound the object|leave no point"):
+        build_grid(dev, views, 100)
+
+
+def test_pyramids_that_meet_in_a_point_have_no_box():
+    views = [
+        replace(view, stored_camera=replace(view.camera, fx=1e300, fy=1e300))
+        for view in placed(np.zeros(3))
+    ]
+    with pytest.raises(UserError, match="bound the object"):
+        bounding_box(views)

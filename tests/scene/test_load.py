@@ -5,7 +5,9 @@ import pytest
 from support.same_scene import views
 from support.transforms_scenes import refused, write_scene
 
+from pp_cl.errors import UserError
 from pp_cl.scene.load import evenly, load_scene
+from pp_cl.scene.open import scene_frames
 from tools.scene_formats import nerfstudio
 
 
@@ -51,6 +53,29 @@ def test_evenly_takes_the_first_and_the_same_steps():
 def test_depth_range_of_some_views_only(tmp_path):
     write_scene(tmp_path, edit=lambda data: data["frames"][2].update(near=1, far=2))
     refused(tmp_path, "near and far", "train_0.png", "train_2.png")
+
+
+@pytest.mark.parametrize(
+    "key, value, told",
+    [
+        ("fl_y", 5e-324, "focal lengths"),
+        ("fl_x", 1e15, "focal lengths"),
+        ("camera_angle_y", 3.14159, "focal lengths"),
+        ("cx", 1e29, "principal point"),
+        ("cy", -1e29, "principal point"),
+    ],
+)
+def test_lenses_that_float32_cannot_hold(tmp_path, key, value, told):
+    write_scene(tmp_path, edit=lambda data: data["frames"][1].update({key: value}))
+    refused(tmp_path, tmp_path / "train_1.png", told, "correct")
+    with pytest.raises(UserError, match=told):
+        scene_frames(str(tmp_path))
+
+
+@pytest.mark.parametrize("angle", [5e-324, 1e-300, 0.0])
+def test_angles_of_view_that_show_nothing(tmp_path, angle):
+    write_scene(tmp_path, edit=lambda data: data.update(camera_angle_x=angle))
+    refused(tmp_path, "transforms_train.json: camera_angle_x", "above 1e-07")
 
 
 # --------------------------------------------------------------------------------------------------

@@ -51,3 +51,18 @@ def write_ball_scene(folder, views=8, size=48, splits=("train", "test")):
             json.dumps({"camera_angle_x": 0.7, "frames": frames})
         )
     return str(folder)
+
+
+def move_scene(folder, by, unit=None):
+    """Move all cameras of a NeRF-synthetic folder by (3,). unit: first round their eyes to whole
+    units of this power of two, so that moves by whole units are exact.
+    """
+    for file in folder.glob("transforms_*.json"):
+        data = json.loads(file.read_text())
+        for frame in data["frames"]:
+            pose = np.array(frame["transform_matrix"])
+            if unit:
+                pose[:3, 3] = unit * np.rint(pose[:3, 3] / unit)
+            pose[:3, 3] += by
+            frame["transform_matrix"] = pose.tolist()
+        file.write_text(json.dumps(data))

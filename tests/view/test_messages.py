@@ -45,7 +45,7 @@ def with_matrix(row, column, value):
 BAD_CAMERAS = [
     None,
     [],
-    *(with_matrix(0, 3, value) for value in (float("nan"), float("inf"), None, "1", True, 1e7)),
+    *(with_matrix(0, 3, value) for value in (float("nan"), float("inf"), None, "1", True, 1e16)),
     *(with_matrix(1, 1, value) for value in (float("nan"), 5, 1e300, 10**400)),
     with_matrix(3, 3, 2),
     frame_keys(CAMERA) | {"transform_matrix": [[1, 0, 0]] * 4},

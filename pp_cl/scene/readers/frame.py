@@ -21,6 +21,7 @@ PINHOLES = ("PERSPECTIVE", "PINHOLE", "SIMPLE_PINHOLE", "OPENCV", "SIMPLE_RADIAL
 MOST = 1e30  # larger numbers are refused: float32 could not hold their products
 # largest eigenvalue of R^T R - 1 that is taken for rounding; NeRF-synthetic has 1e-6
 ROTATION_TOLERANCE = 1e-3
+LEAST_ANGLE = 1e-7  # of view, radians: below it the tangent has no use for float32
 GL_FROM_CV = np.diag([1.0, -1.0, -1.0, 1.0])  # OpenGL: y up, z backward; OpenCV: y down, z forward
 
 
@@ -134,7 +135,7 @@ def _focal_lengths(frame, width, height):
 def _focal_length(frame, length_key, angle_key, size):
     length, angle = (
         frame.number(length_key, above=0),
-        frame.number(angle_key, above=0, below=math.pi),
+        frame.number(angle_key, above=LEAST_ANGLE, below=math.pi),
     )
     if length is None and angle is not None:
         length = 0.5 * size / math.tan(0.5 * angle)

@@ -1,0 +1,54 @@
+"""The grid's arithmetic near the world's origin and far from it."""
+
+from fractions import Fraction
+
+import numpy as np
+import pytest
+
+from pp_cl.scene.grid import Grid, smallest_edge
+
+FAR = np.array([1e6, -1e6, 1e6])
+
+
+@pytest.fixture
+def grid(rng):
+    return Grid(tuple(float(x) for x in rng.normal(size=3)), 0.0123456789, (45, 37, 30))
+
+
+def test_a_rounded_grid_is_the_same_to_float32(grid):
+    rounded = grid.rounded()
+    assert rounded.edge == np.float32(grid.edge) and rounded.dims == grid.dims
+    unit = 2.0**-30  # of an edge of 24 bits between 2^-7 and 2^-6
+    np.testing.assert_allclose(rounded.origin, grid.origin, rtol=0, atol=unit / 2)
+    assert all((Fraction(x) / Fraction(unit)).denominator == 1 for x in rounded.origin)
+    assert rounded.rounded() == rounded
+
+
+@pytest.mark.parametrize("by", [FAR, -FAR], ids=["far", "other way"])
+def test_vertices_of_a_rounded_grid_move_exactly(grid, by):
+    near = grid.rounded()
+    far, ids = near.moved(by), np.arange(0, 45 * 37 * 30, 7)
+    assert (far.positions(ids) - by == near.positions(ids)).all()
+    assert (far.centre - by == near.centre).all()
+    assert (far.packed(far.centre) == near.packed(near.centre)).all()
+    assert (far.refined().centre == far.centre).all()
+    exact = [
+        Fraction(x) + Fraction(near.edge) * (n - 1) / 2 - Fraction(c)
+        for x, n, c in zip(near.origin, near.dims, near.centre, strict=True)
+    ]
+    assert exact == [0, 0, 0]
+
+
+def test_a_packed_grid_counts_from_the_centre(grid):
+    packed = grid.packed((0.5, -0.25, 1.0))
+    assert packed.dtype == np.float32
+    np.testing.assert_allclose(packed[:3], np.array(grid.origin) - [0.5, -0.25, 1.0], rtol=1e-6)
+    assert packed[3:].tolist() == [np.float32(grid.edge), 45, 37, 30, 0]
+
+
+@pytest.mark.parametrize("by", [0, FAR])
+def test_the_smallest_edge_depends_on_the_size_alone(by):
+    box = np.array([[-1.0, -2.0, 0.5], [1.0, 2.0, 0.5]])  # flat
+    edge = smallest_edge(box + by, 1000)
+    assert edge == pytest.approx(smallest_edge(box, 1000), rel=1e-9)
+    assert np.prod(np.maximum(np.ptp(box, axis=0), 0) // edge + 1) <= 1000

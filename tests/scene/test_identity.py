@@ -1,0 +1,93 @@
+"""What tells whether a scene is the one that a run has learned."""
+
+import hashlib
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from PIL import Image
+from support.scenes import move_scene, write_ball_scene
+
+from pp_cl.scene.identity import difference, fingerprint, identity, pixel_digest
+from pp_cl.scene.load import load_scene
+from pp_cl.scene.masks import MaskRule
+from pp_cl.scene.open import scene_frames
+
+
+@pytest.fixture
+def folder(tmp_path):
+    write_ball_scene(tmp_path / "ball")
+    return tmp_path / "ball"
+
+
+def views_of(folder, **options):
+    return load_scene(folder, **options).splits["train"]
+
+
+def repaint(file, channel):
+    """Change one channel of one pixel by one."""
+    pixels = np.array(Image.open(file))
+    pixels[20, 20, channel] ^= 1
+    Image.fromarray(pixels).save(file)
+
+
+def test_a_digest_is_that_of_the_pixels(folder):
+    view = views_of(folder)[3]
+    pixels = np.array(Image.open(folder / view.name).convert("RGBA"))
+    assert view.digest == hashlib.sha256(pixels.tobytes()).hexdigest()[:16]
+    assert pixel_digest(pixels[:, ::2]) == pixel_digest(pixels[:, ::2].copy())
+    assert view.reduced(2).digest == view.moved((1, 2, 3)).digest == view.digest
+
+
+def test_the_same_scene_elsewhere_and_in_other_files(folder):
+    views, header = views_of(folder), identity(views_of(folder))
+    assert header["pixels"] == {view.name: view.digest for view in views}
+    assert header["scene"] == fingerprint(views) == fingerprint(scene_frames(str(folder)))
+    Image.open(folder / "train/r_1.png").save(folder / "train/r_1.png", compress_level=0)
+    moved = folder.rename(folder.parent / "moved")
+    assert difference(header, scene_frames(str(moved)), views_of(moved)) == ""
+
+
+@pytest.mark.parametrize("channel", [0, 3], ids=["colour", "mask"])
+def test_other_pixels_are_named(folder, channel):
+    header = identity(views_of(folder))
+    repaint(folder / "train/r_1.png", channel)
+    views = views_of(folder)
+    assert difference(header, views, views).startswith("train/r_1.png: other pixels")
+    assert difference(header, views, views[:1]) == ""
+    repaint(folder / "train/r_5.png", channel)
+    views = views_of(folder)
+    assert difference(header, views, views).startswith("train/r_1.png and 1 more: other pixels")
+
+
+def test_masks_of_their_own_belong_to_the_pixels(folder, tmp_path):
+    (tmp_path / "masks").mkdir()
+    for i in range(8):
+        mask = np.full((48, 48), 255, np.uint8)
+        mask[:, : 4 + i] = 0
+        Image.fromarray(mask).save(tmp_path / "masks" / f"r_{i}.png")
+    rule = MaskRule(folder=str(tmp_path / "masks"))
+    header = identity(views_of(folder, masks=rule))
+    pixels = np.array(Image.open(tmp_path / "masks/r_2.png"))
+    Image.fromarray(255 - pixels).save(tmp_path / "masks/r_2.png")
+    views = views_of(folder, masks=rule)
+    assert difference(header, views, views).startswith("train/r_2.png: other pixels")
+
+
+def test_other_cameras_and_names_are_told(folder):
+    views = views_of(folder)
+    header = identity(views)
+    told = "its training views have other names or cameras"
+    assert difference(header, views[1:], []) == told
+    assert difference(header, [replace(views[0], name="train/x.png"), *views[1:]], []) == told
+    move_scene(folder, (0, 0, 1e-3))
+    assert difference(header, scene_frames(str(folder)), []) == told
+
+
+def test_views_that_the_program_makes_have_no_digests(folder):
+    views = views_of(folder)
+    made = [replace(view, digest=None) for view in views]
+    header = identity(made)
+    assert header == {"scene": fingerprint(views), "pixels": None}
+    assert difference(header, made, made) == ""
+    assert difference({"scene": header["scene"]}, views, views) == ""  # of an older version

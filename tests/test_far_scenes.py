@@ -1,0 +1,134 @@
+"""Scenes far from the world's origin train, render and are exported as those at the origin."""
+
+import json
+
+import numpy as np
+import plyfile
+import pytest
+import trimesh
+from support.ball_views import ball_camera
+from support.runs import arguments
+from support.scenes import move_scene, write_ball_scene
+
+from pp_cl.cli import main
+from pp_cl.export.glb import write_point_glb
+from pp_cl.export.mesh import Mesh, write_mesh
+from pp_cl.export.ply import write_ply
+from pp_cl.export.points import coloured_points, in_world
+from pp_cl.files.checkpoint import load_checkpoint
+from pp_cl.metrics.shape import read_mesh
+from pp_cl.model import Model
+from pp_cl.trained import load_run
+
+FAR = np.array([1e6, -1e6, 1e6])
+UNIT = 2.0**-24  # of the eyes: float64 holds them exactly 1e6 away, and the grid too
+NEAR = np.array([0.0, 512.0, -64.0])
+CHANGES = {"train__iterations": 24, "train__prune_every": 8, "train__final_prune_weight": 0.05}
+
+
+def trained(folder, by, *, unit=None, **changes):
+    """(header, arrays, mean PSNR of the test views, folder) of a small training of the ball,
+    moved.
+    """
+    scene = write_ball_scene(folder / "ball")
+    move_scene(folder / "ball", by, unit)
+    assert main(arguments(scene, folder / "run", 1, **CHANGES | changes)) == 0
+    assert main(["eval", str(folder / "run")]) == 0
+    metrics = json.loads((folder / "run" / "eval" / "metrics.json").read_text())
+    return (
+        *load_checkpoint(folder / "run" / "checkpoint.npz"),
+        metrics["mean"]["psnr"],
+        folder / "run",
+    )
+
+
+@pytest.fixture(scope="module")
+def at_origin(tmp_path_factory):
+    return trained(tmp_path_factory.mktemp("origin"), 0, unit=UNIT)
+
+
+@pytest.mark.parametrize("by", [NEAR, FAR, -8 * FAR], ids=["near", "far", "farther"])
+def test_exact_moves_give_the_same_bits(at_origin, by, tmp_path):
+    header, arrays, psnr, _ = trained(tmp_path, by, unit=UNIT)
+    expected, expected_arrays, expected_psnr, _ = at_origin
+    assert psnr == expected_psnr
+    assert arrays.keys() == expected_arrays.keys()
+    for name, array in arrays.items():
+        assert np.array_equal(array, expected_arrays[name]), name
+    grid, other = header["grid"], expected["grid"]
+    assert (grid["edge"], grid["dims"]) == (other["edge"], other["dims"])
+    assert (np.subtract(grid["origin"], other["origin"]) == by).all()  # the world's, exactly
+    assert header["depth_range"] == expected["depth_range"]
+
+
+def test_refined_grids_give_the_same_bits_too(tmp_path):
+    changes = {"train__refine_at": "0.5,1.0", "points__count": 400}
+    (_, first, *_), (_, second, *_) = (
+        trained(tmp_path / str(i), by, unit=UNIT, **changes) for i, by in enumerate((NEAR, FAR))
+    )
+    assert first.keys() == second.keys()
+    assert all(np.array_equal(first[name], second[name]) for name in first)
+
+
+def test_a_move_that_rounds_the_poses_changes_next_to_nothing(tmp_path):
+    psnr = [trained(tmp_path / str(i), by)[2] for i, by in enumerate((0, FAR / 3))]
+    assert psnr[0] == pytest.approx(psnr[1], abs=0.05)
+
+
+def test_the_devices_origin_does_not_change_a_picture(at_origin, dev, monkeypatch):
+    """Runs of versions whose device counted from the world's origin look as they did."""
+    folder, camera = at_origin[3], ball_camera((2.4, -2.5, 1.3), (0, 0, 0))
+    run = load_run(dev, folder)
+    picture = run.render(camera)
+    monkeypatch.setattr(
+        Model,
+        "packed",
+        lambda model, camera, depth_range=None: camera.packed(depth_range or model.depth_range),
+    )
+    run = load_run(dev, folder)
+    run.model.grid_buffer = dev.upload(run.model.grid.packed())
+    before = run.render(camera)
+    assert picture.colour.std() > 0.05
+    assert np.abs(picture.colour - before.colour).max() < 1e-4
+    assert np.abs(picture.alpha - before.alpha).max() < 1e-4
+
+
+@pytest.fixture(scope="module")
+def far_run(tmp_path_factory, session_device):
+    folder = tmp_path_factory.mktemp("far")
+    trained(folder, FAR, unit=UNIT)
+    return load_run(session_device, folder / "run")
+
+
+def test_exported_points_keep_their_places_in_the_world(far_run, tmp_path):
+    points = coloured_points(far_run)
+    positions = far_run.model.positions()[points.rows]
+    write_ply(tmp_path / "a.ply", points, far_run.model.cloud)
+    vertex = plyfile.PlyData.read(str(tmp_path / "a.ply"))["vertex"]
+    assert np.array_equal(np.stack([vertex[name] for name in "xyz"], 1), positions)
+    write_point_glb(tmp_path / "a.glb", points)
+    cloud = trimesh.load(tmp_path / "a.glb")
+    [name] = cloud.graph.nodes_geometry
+    place, _ = cloud.graph[name]
+    [read] = cloud.geometry.values()
+    np.testing.assert_allclose(read.vertices + place[:3, 3], positions, rtol=0, atol=1e-6)
+
+
+@pytest.mark.parametrize("suffix", ["ply", "glb"])
+def test_exported_meshes_keep_their_places_in_the_world(suffix, tmp_path):
+    corners = np.array([[0, 0, 0], [0.001, 0, 0], [0, 0.001, 0], [0, 0, 0.001]]) + FAR
+    faces = np.array([[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]], np.int32)
+    colours = np.arange(12, dtype=np.uint8).reshape(4, 3) * 20
+    path = tmp_path / f"a.{suffix}"
+    write_mesh(path, Mesh(in_world(corners, 0.001), faces, colours))
+    read = read_mesh(path)
+    np.testing.assert_allclose(read.vertices, corners, rtol=0, atol=1e-9)
+    assert np.array_equal(read.faces, faces)
+    if suffix == "ply":
+        vertex = plyfile.PlyData.read(str(path))["vertex"]
+        assert np.array_equal(np.stack([vertex[c] for c in ("red", "green", "blue")], 1), colours)
+
+
+def test_files_keep_float32_where_it_holds_the_places():
+    assert in_world(np.full((2, 3), 10.0), 0.01).dtype == np.float32
+    assert in_world(np.full((2, 3), 200.0), 0.01).dtype == np.float64
