@@ -25,7 +25,7 @@ TRIALS = (
 SMALLER = ("half", "degree")  # these take memory as well
 LEAST_KEPT, STEPS_OF_KEPT = 0.05, 0.01
 FASTER = 0.98  # of the time, at most, counts as faster
-TIMED_VIEWS, ROUNDS = 4, 5
+TIMED_VIEWS, ROUNDS = 4, 9
 
 
 @dataclass(frozen=True)
