@@ -314,7 +314,9 @@ class Renderer:
         """The window around the present points."""
         ids = self.model.cloud.ids
         if self._windowed is None or self._windowed[0] is not ids:
-            self._windowed = ids, ObjectWindow(self.model.grid, ids.get(), self._radius())
+            margin = self.model.net.shown_margin
+            window = ObjectWindow(self.model.grid, ids.get(), self._radius(), margin)
+            self._windowed = ids, window
         return self._windowed[1]
 
     def _radius(self):

@@ -47,13 +47,13 @@ def bench_models(runs: list[Run]) -> Iterator[dict[str, Any]]:
     views = [scene[i * len(scene) // count] for i in range(count)]
     whole = measured_psnr(first, views)
 
-    def row(what, run, size):
+    def row(what, run):
         psnr = whole if run is first else measured_psnr(run, views)
         before, ms = frame_ms([first, run], views)
         return {
             "what": what,
             "points": run.model.cloud.count,
-            "bytes": size,
+            "bytes": nbytes(run),
             "psnr": psnr,
             "loss": whole - psnr,
             "ms": ms,
@@ -61,16 +61,14 @@ def bench_models(runs: list[Run]) -> Iterator[dict[str, Any]]:
         }
 
     for run in runs:
-        arrays = {name: rows.get() for name, rows in run.model.arrays().items()}
-        yield row(str(run.folder), run, nbytes(arrays))
+        yield row(str(run.folder), run)
     original = Original(first, point_weights(first, first.cameras("train")))
     for what, reduction in _reductions(first):
-        size = nbytes(original.reduced_arrays(reduction))
-        yield row(what, original.reduced(reduction), size)
+        yield row(what, original.reduced(reduction))
     for name in offered(first.policy.device_class):
         run = original.reduced(Reduction.of(first))
         run.model.net.use(make_policy(first.dev, variant=name))
-        yield row(f"convolutions by {name}", run, nbytes(original.arrays))
+        yield row(f"convolutions by {name}", run)
 
 
 def _reductions(run):

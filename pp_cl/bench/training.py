@@ -28,9 +28,9 @@ TIMED_FRAMES = 5
 
 
 def bench_training(dev: Device, seconds: float) -> dict[str, Any]:
-    """{"scene", "preset", "steps", "curve": rows of {"step", "seconds", "psnr"}, "step_ms",
-    "frame_ms": {stage: {"ms", "least", "most"}}} of a training of about so many seconds, those of
-    the measurements aside.
+    """{"scene", "preset", "steps", "points", "curve": rows of {"step", "seconds", "psnr"},
+    "step_ms", "frame_ms": {stage: {"ms", "least", "most"}}} of a training of about so many seconds,
+    those of the measurements aside.
 
     The stages of a step are those of the last ones, each waited for: without waiting they overlap.
     """
@@ -64,6 +64,7 @@ class _Demo:
         self._views = open_scene(dev, config, ("train",)).splits["train"]
         self.measured = open_scene(dev, config, ("test",), most=MEASURED_VIEWS).splits["test"]
         self._hull = build_grid(dev, self._views, config.points.count)
+        self._depth_range = depth_range(self._views, self._hull)
 
     def _config(self, steps) -> Config:
         config = configure(preset("tiny"), "demo")
@@ -80,7 +81,7 @@ class _Demo:
             self._dev,
             hull.grid,
             hull.ids,
-            depth_range(self._views, hull),
+            self._depth_range,
             net=UNet.of_settings(self._dev, config.network, policy),
             opacity=config.points.opacity,
         )

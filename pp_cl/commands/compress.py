@@ -7,7 +7,7 @@ from pp_cl.commands import options as shared
 
 HELP = "make a trained model smaller and faster within a stated loss"
 EPILOG = """Tried in turn, each kept where the views below lose no more: coefficients of 16 bits,
-rendering only the window around the object, stopping earlier along a pixel, faster convolutions,
+rendering only the tiles that show the object, stopping earlier along a pixel, faster convolutions,
 fewer harmonics, and at last fewer points, those that weigh least in any training view going first.
 The loss is measured on the split val, without one on every eighth training view; never on the test
 views."""
@@ -46,25 +46,21 @@ def run(options: argparse.Namespace) -> None:
     check_out(whole, out)
     which, views = validation_views(whole)
     original = Original(whole, point_weights(whole, whole.cameras("train")))
-    search, trials = Search(original, views, most_loss), []
+    search = Search(original, views, most_loss)
     print(f"{which}: {search.psnr:.2f} dB, may lose {most_loss:g}")
     print(COLUMNS("tried", "PSNR", "loss", "points", "MiB", "speed", ""))
-    for trial in search.run():
-        trials.append(trial)
+    for trial in search.trials():
         print(_line(trial), flush=True)
-    found = original.reduced(search.reduction)
-    loss = search.psnr - next((t.psnr for t in reversed(trials) if t.taken), search.psnr)
-    ms = frame_ms([whole, found], views)
-    sizes = [nbytes(original.arrays), nbytes(original.reduced_arrays(search.reduction))]
+    ms, sizes = frame_ms([whole, search.run], views), [nbytes(whole), nbytes(search.run)]
     report = {
         "of": str(whole.folder),
         "most_loss": most_loss,
         "views": which,
         "psnr": search.psnr,
-        "loss": loss,
+        "loss": search.loss,
         "reduction": vars(search.reduction),
         "bytes": sizes,
-        "points": [whole.model.cloud.count, found.model.cloud.count],
+        "points": [whole.model.cloud.count, search.run.model.cloud.count],
         "frame_ms": ms,
         "device": whole.dev.name,
     }
@@ -72,7 +68,7 @@ def run(options: argparse.Namespace) -> None:
     print(
         f"{sizes[0] / 2**20:.1f} to {sizes[1] / 2**20:.1f} MiB ({sizes[0] / sizes[1]:.1f} times"
         f" less), {1e3 / ms[0]:.1f} to {1e3 / ms[1]:.1f} frames per second"
-        f" ({ms[0] / ms[1]:.2f} times), {loss:.3f} dB lost on {which}"
+        f" ({ms[0] / ms[1]:.2f} times), {search.loss:.3f} dB lost on {which}"
     )
     print(f"wrote {out} and {out / REPORT}; pp-cl eval {out} measures its test views")
 

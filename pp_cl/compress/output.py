@@ -46,6 +46,5 @@ def write_compressed(
     with atomic_folder(out) as unfinished:
         folder = RunFolder(unfinished)
         write_text(folder.config, original.config(reduction).to_json() + "\n")
-        header = {k: v for k, v in original.run.header.items() if k != "format"}
-        folder.save(header, original.reduced_arrays(reduction))
+        folder.save(original.run.header, original.reduced_arrays(reduction))
         write_json(unfinished / REPORT, report)

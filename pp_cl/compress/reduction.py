@@ -134,9 +134,9 @@ def heaviest(weights: np.ndarray, share: float) -> np.ndarray:
     return np.sort(np.argsort(-weights, kind="stable")[:count])
 
 
-def nbytes(arrays: dict[str, np.ndarray]) -> int:
-    """Bytes of a checkpoint's arrays."""
-    return sum(array.nbytes for array in arrays.values())
+def nbytes(run: Run) -> int:
+    """Bytes of the arrays of a run's checkpoint."""
+    return sum(rows.nbytes for rows in run.model.arrays().values())
 
 
 def measured_psnr(run: Run, views: Sequence[View]) -> float:

@@ -31,7 +31,8 @@ TIMED_VIEWS, ROUNDS = 4, 9
 @dataclass(frozen=True)
 class Trial:
     """A reduction that was tried. psnr: of the validation views, dB; loss: against the original;
-    nbytes: of the arrays; speed: frames per second over the original's, None where not timed.
+    nbytes: of the arrays; speed: frames per second over those of what was taken before, None where
+    not timed.
     """
 
     what: str
@@ -45,14 +46,17 @@ class Trial:
 
 
 class Search:
-    """Finds a reduction that loses at most `most_loss` dB over the validation views."""
+    """Finds a reduction that loses at most `most_loss` dB over the validation views.
+
+    psnr: of the original. reduction, run, loss: what was taken so far, and what it loses.
+    """
 
     def __init__(self, original: Original, views: list[View], most_loss: float):
         self.original, self.views, self.most_loss = original, views, most_loss
-        self.reduction = Reduction.of(original.run)
+        self.reduction, self.run, self.loss = Reduction.of(original.run), original.run, 0.0
         self.psnr = measured_psnr(original.run, views)
 
-    def run(self) -> Iterator[Trial]:
+    def trials(self) -> Iterator[Trial]:
         """What is tried, in turn; afterwards `reduction` is the one found."""
         for share, name, values in TRIALS:
             for value in values:
@@ -66,22 +70,21 @@ class Search:
 
     def _is_harsher(self, name, value):
         present = getattr(self.reduction, name)
-        return value < present if name == "degree" else value != present and not value < present
+        return value < present if name == "degree" else value > present
 
     def _try(self, what, changes, share=1.0):
         """Measure a change of the present reduction, and adopt it where it serves."""
-        before, changed = self.reduction, replace(self.reduction, **changes)
+        changed = replace(self.reduction, **changes)
         run = self.original.reduced(changed)
         psnr = measured_psnr(run, self.views)
         loss = self.psnr - psnr
         fits, speed = loss <= share * self.most_loss, None
         if fits and not {*changes} & {*SMALLER, "keep"}:
-            present, new = frame_ms([self.original.reduced(before), run], self.views)
+            present, new = frame_ms([self.run, run], self.views)
             fits, speed = new <= FASTER * present, present / new
         if fits:
-            self.reduction = changed
-        size = nbytes(self.original.reduced_arrays(changed))
-        return Trial(what, changed, psnr, loss, size, run.model.cloud.count, speed, fits)
+            self.reduction, self.run, self.loss = changed, run, loss
+        return Trial(what, changed, psnr, loss, nbytes(run), run.model.cloud.count, speed, fits)
 
     def _prune(self):
         """Halve the interval of the shares of points that may do."""

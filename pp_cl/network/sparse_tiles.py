@@ -216,9 +216,18 @@ class TilePlan:
 class ImagePlan(TilePlan):
     """A pass that makes an image. computed_fraction: of the network's multiplications."""
 
-    def __init__(self, dev: Device, layers: list[Layer], *place, radius: dict[str, int], **border):
-        del radius["x"]  # given, not computed
-        super().__init__(dev, layers, *place, radius=radius, **border)
+    def __init__(
+        self,
+        dev: Device,
+        layers: list[Layer],
+        size: tuple[int, int],
+        active: np.ndarray,
+        *,
+        radius: dict[str, int],
+        border: int = 0,
+    ):
+        radius = {name: pixels for name, pixels in radius.items() if name != "x"}  # x is given
+        super().__init__(dev, layers, size, active, radius=radius, border=border)
         for layer in layers:
             computed = self.maps[layer.name].computed
             for name in layer.inputs:
@@ -240,8 +249,9 @@ class ShownPlan(ImagePlan):
 
     def __init__(self, dev: Device, layers: list[Layer], size: tuple[int, int], shown: np.ndarray):
         self.shown = shown
-        one_class = {"border": -max(size)}
-        super().__init__(dev, layers, size, shown, radius=needed_radius(layers), **one_class)
+        # no tile is near a border, so that all others are of one class
+        border = -max(size)
+        super().__init__(dev, layers, size, shown, radius=needed_radius(layers), border=border)
 
 
 class ForwardPlan(ImagePlan):

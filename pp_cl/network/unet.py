@@ -9,10 +9,15 @@ from pp_cl.device.device import Device
 from pp_cl.layers.conv import pack_bias, pack_weights
 from pp_cl.layers.policy import ConvolutionPolicy, make_policy
 from pp_cl.layers.resample import affine
-from pp_cl.layers.tiles import tiles_find
+from pp_cl.layers.tiles import SIDE, tiles_find
 from pp_cl.network.architectures import convolutions, unet_layers
 from pp_cl.network.buffers import gradient_of
-from pp_cl.network.sparse_tiles import ForwardPlan, ImagePlan, ShownPlan
+from pp_cl.network.sparse_tiles import (
+    ForwardPlan,
+    ImagePlan,
+    ShownPlan,
+    receptive_radius,
+)
 from pp_cl.network.tile_sets import grow
 from pp_cl.network.workspace import Workspace, WorkspacePlan, parameter_table
 from pp_cl.settings import NetworkConfig
@@ -96,6 +101,12 @@ class UNet:
             return None
         plan = ForwardPlan(self.dev, self.layers, size, tiles_find(self.dev, x, background))
         return plan.upload() if plan.computed_fraction <= MOST_COMPUTED else None
+
+    @property
+    def shown_margin(self) -> int:
+        """How far from what is not background, in pixels, anything matters to plan_shown()."""
+        radius = receptive_radius(self.layers)[self.layers[-1].name]
+        return radius + (SHOWN_AROUND + 1) * SIDE
 
     def plan_shown(self, x: Array, background: float) -> ShownPlan:
         """What to compute for the tiles in which features x (H, W, channels_in) are not all

@@ -6,19 +6,19 @@ from pp_cl.scene.camera import Camera
 from pp_cl.scene.grid import Grid
 from pp_cl.scene.outline import project
 
-MARGIN = 28  # pixels around the points: further than the network sees
 MULTIPLE = 4  # sides of a window: the U-Net halves its input twice
 
 
 class ObjectWindow:
     """Finds the window of a camera's image around all points.
 
-    grid, ids: (N,), ascending, of the points. radius: theirs, in world units.
+    grid, ids: (N,), ascending, of the points. radius: theirs, in world units. margin: pixels around
+    them.
     """
 
-    def __init__(self, grid: Grid, ids: np.ndarray, radius: float):
+    def __init__(self, grid: Grid, ids: np.ndarray, radius: float, margin: int):
         self._corners = grid.positions(hull_candidates(grid, ids))
-        self._radius = radius
+        self._radius, self._margin = radius, margin
 
     def crop(self, camera: Camera) -> tuple[Camera, int, int]:
         """(the camera of the window, its first column, its first row); all of the image where a
@@ -28,21 +28,19 @@ class ObjectWindow:
         if not depth.min() > self._radius:
             return camera, 0, 0
         reach = self._radius / (depth - self._radius)
-        left, width = _interval(x, reach, focal=camera.fx, centre=camera.cx, size=camera.width)
-        top, height = _interval(y, reach, focal=camera.fy, centre=camera.cy, size=camera.height)
+        left, width = self._interval(x, reach, camera.fx, centre=camera.cx, size=camera.width)
+        top, height = self._interval(y, reach, camera.fy, centre=camera.cy, size=camera.height)
         return camera.crop(left, top, width, height), left, top
 
-
-def _interval(places, reach, *, focal, centre, size):
-    """(first, length) of the pixels along an axis that balls around `places` touch, and a margin.
-
-    reach: radius over depth.
-    """
-    slant = np.hypot(1, (places - centre) / focal)
-    pixels = reach * slant * focal + MARGIN
-    first = int(np.clip(np.floor((places - pixels).min()), 0, size - 1)) // MULTIPLE * MULTIPLE
-    end = int(np.clip(np.ceil((places + pixels).max()), first + 1, size))
-    return first, min(-(-(end - first) // MULTIPLE) * MULTIPLE, size - first)
+    def _interval(self, places, reach, focal, *, centre, size):
+        """(first, length) of the pixels along an axis that balls around `places` touch, and the
+        margin. reach: radius over depth.
+        """
+        slant = np.hypot(1, (places - centre) / focal)
+        pixels = reach * slant * focal + self._margin
+        first = int(np.clip(np.floor((places - pixels).min()), 0, size - 1)) // MULTIPLE * MULTIPLE
+        end = int(np.clip(np.ceil((places + pixels).max()), first + 1, size))
+        return first, min(-(-(end - first) // MULTIPLE) * MULTIPLE, size - first)
 
 
 def hull_candidates(grid: Grid, ids: np.ndarray) -> np.ndarray:

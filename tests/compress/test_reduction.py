@@ -58,8 +58,8 @@ def test_fewer_points_of_16_bits_and_a_lower_degree(original):
         assert found.dtype == np.float16
         assert np.abs(found - exact).max() <= np.abs(exact).max() * 2**-11
     network = sum(a.nbytes for name, a in arrays.items() if name.startswith("net."))
-    assert nbytes(arrays) == len(kept) * (4 + 4 + 4 * 16 * 2) + network
     run = original.reduced(reduction)
+    assert nbytes(run) == len(kept) * (4 + 4 + 4 * 16 * 2) + network
     assert run.model.cloud.count == len(kept) and run.config.points.sh_degree == 1
     camera = run.cameras("train")[0]
     assert np.isfinite(run.render(camera).colour).all()

@@ -16,7 +16,7 @@ def views(original):
 
 def test_what_is_found_loses_no_more(original, views):
     search = Search(original, views, 0.5)
-    trials = list(search.run())
+    trials = list(search.trials())
     found = original.reduced(search.reduction)
     assert search.psnr - measured_psnr(found, views) <= 0.5
     last = next(trial for trial in reversed(trials) if trial.taken)
@@ -31,7 +31,7 @@ def test_nothing_is_lost_where_nothing_may_be(original, views, monkeypatch):
     """What loses anything is refused, and all points stay but those that no view sees."""
     monkeypatch.setattr(module, "TRIALS", ((1.0, "degree", (1, 0)),))
     search = Search(original, views, 0.0)
-    trials = list(search.run())
+    trials = list(search.trials())
     assert not trials[0].taken and trials[1].what.startswith("points"), "the first ends it"
     assert search.psnr <= measured_psnr(original.reduced(search.reduction), views)
     assert search.reduction.degree == 2
@@ -39,7 +39,7 @@ def test_nothing_is_lost_where_nothing_may_be(original, views, monkeypatch):
 
 def test_a_loss_without_bound_leaves_the_least(original, views):
     search = Search(original, views, 20.0)
-    list(search.run())
+    list(search.trials())
     assert search.reduction.keep == pytest.approx(module.LEAST_KEPT)
     assert search.reduction.degree == 0
 
@@ -49,7 +49,7 @@ def test_what_is_not_faster_is_refused(original, views, monkeypatch):
     taken = []
     for new in (99.0, 97.0):
         monkeypatch.setattr(module, "frame_ms", lambda runs, views, new=new: [100.0, new])
-        trial = next(Search(original, views, 20.0).run())
+        trial = next(Search(original, views, 20.0).trials())
         taken.append(trial.taken)
         assert trial.speed == pytest.approx(100 / new)
     assert taken == [False, True]
@@ -68,7 +68,7 @@ def test_a_compressed_run_is_not_tried_again(original, views, monkeypatch):
     )
     search = Search(original, views, 20.0)
     search.reduction = small
-    assert not list(search.run())
+    assert not list(search.trials())
 
 
 def test_times_are_of_a_frame(original, views):

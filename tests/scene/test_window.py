@@ -6,10 +6,10 @@ from scipy.spatial import ConvexHull
 
 from pp_cl.scene.camera import Camera
 from pp_cl.scene.grid import Grid
-from pp_cl.scene.window import MARGIN, ObjectWindow, hull_candidates
+from pp_cl.scene.window import ObjectWindow, hull_candidates
 
 GRID = Grid((-1.0, -0.7, 0.2), 0.1, (13, 17, 7))
-RADIUS = 0.075
+RADIUS, MARGIN = 0.075, 28
 
 
 @pytest.fixture
@@ -36,7 +36,7 @@ def test_candidates_of_a_full_grid_are_its_corners():
 
 def test_no_ball_reaches_beyond_the_window(ids, rng):
     """Points of the balls' surfaces, by chance, are inside by the margin."""
-    window = ObjectWindow(GRID, ids, RADIUS)
+    window = ObjectWindow(GRID, ids, RADIUS, MARGIN)
     for _ in range(20):
         eye = rng.normal(size=3)
         whole = camera(np.array([-0.4, 0.1, 0.5]) + eye / np.linalg.norm(eye) * rng.uniform(2, 9))
@@ -61,11 +61,11 @@ def test_no_ball_reaches_beyond_the_window(ids, rng):
 
 def test_all_of_the_image_where_the_eye_is_among_the_points(ids):
     whole = camera((-0.4, 0.0, 0.5), target=(-0.4, 0.8, 0.5))
-    assert ObjectWindow(GRID, ids, RADIUS).crop(whole) == (whole, 0, 0)
+    assert ObjectWindow(GRID, ids, RADIUS, MARGIN).crop(whole) == (whole, 0, 0)
 
 
 @pytest.mark.parametrize("target", [(-0.4, 40.0, 0.5), (-0.4, -40.0, 0.5), (0, 0, 40)])
 def test_a_few_pixels_where_no_point_is_in_the_image(ids, target):
-    shown, left, top = ObjectWindow(GRID, ids, RADIUS).crop(camera((-9, 0.1, 0.5), target))
+    shown, left, top = ObjectWindow(GRID, ids, RADIUS, MARGIN).crop(camera((-9, 0.1, 0.5), target))
     assert 0 < shown.width <= 90 and 0 < shown.height <= 61 and min(left, top) >= 0
     assert shown.width * shown.height < 90 * 61 / 4
