@@ -1,12 +1,10 @@
-"""Choosing a device, its buffers, its errors and its debug levels."""
+"""A device: its buffers, its errors, its programs and its debug levels."""
 
 import atexit
-import json
 import os
 import subprocess
 import sys
 import time
-from types import SimpleNamespace
 
 import numpy as np
 import pyopencl as cl
@@ -14,9 +12,8 @@ import pytest
 from support.guarded import GuardedDevice
 
 from pp_cl.device import device as device_module
-from pp_cl.device import discover
-from pp_cl.device.device import Device, describe, kernel_folder
-from pp_cl.device.discover import list_devices, open_device, separate_devices
+from pp_cl.device.device import Device, kernel_folder
+from pp_cl.device.discover import list_devices, open_device
 from pp_cl.errors import UserError
 
 TINY = """
@@ -33,26 +30,6 @@ kernel void divide(
 """
 
 
-def fake(platform, name, gpu=False, problem=None, index="0:0"):
-    """An entry of list_devices() that is never opened."""
-    kind = cl.device_type.GPU if gpu else cl.device_type.CPU
-    return (
-        index,
-        SimpleNamespace(name=name, platform=SimpleNamespace(name=platform), type=kind),
-        problem,
-    )
-
-
-@pytest.fixture
-def listed(monkeypatch):
-    """Sets what list_devices() returns; open_device() then returns the cl.Device in place of a
-    Device.
-    """
-    monkeypatch.setattr(discover, "Device", lambda d: d)
-    monkeypatch.delenv("PP_DEVICE", raising=False)
-    return lambda *entries: monkeypatch.setattr(discover, "list_devices", lambda: list(entries))
-
-
 @pytest.fixture
 def tiny(tmp_path, monkeypatch):
     """A kernel folder of the test's own."""
@@ -65,140 +42,6 @@ def tiny(tmp_path, monkeypatch):
 def plain(session_device):
     """The tests' device without guards."""
     return Device(session_device.device)
-
-
-# ---- choosing
-
-
-def test_listed_devices_are_probed(session_device):
-    found = list_devices()
-    assert any(d == session_device.device and problem is None for _, d, problem in found)
-    assert len({i for i, _, _ in found}) == len(found)
-
-
-def test_description_is_json(session_device):
-    info = json.loads(json.dumps(describe(session_device.device)))
-    assert info["type"] in ("CPU", "GPU", "ACCELERATOR", "OTHER")
-    assert info["compute_units"] >= 1
-    assert 2**27 <= info["max_allocation_bytes"] <= 2**50
-    assert 2**27 <= info["memory_bytes"] <= 2**50
-
-
-@pytest.mark.parametrize("result", ["wrong", "error"])
-def test_probe_names_the_problem(session_device, monkeypatch, result):
-    change = {"wrong": ("2.0f", "3.0f"), "error": ("2.0f", "undeclared")}
-    monkeypatch.setattr(discover, "PROBE", discover.PROBE.replace(*change[result]))
-    problem = discover._probe(session_device.device)
-    assert {"wrong": "computes a wrong result", "error": "does not run: "}[result] in problem
-    assert "\n" not in problem
-
-
-def test_a_gpu_comes_first(listed):
-    cpu, gpu = (
-        fake("Portable Computing Language", "cpu"),
-        fake("NVIDIA CUDA", "H200", gpu=True, index="1:0"),
-    )
-    listed(cpu, gpu)
-    assert open_device() is gpu[1]
-
-
-def test_a_gpu_that_fails_its_test_build_is_passed_over(listed):
-    cpu = fake("Portable Computing Language", "cpu")
-    listed(fake("rusticl", "llvmpipe", gpu=True, problem="does not run: x", index="1:0"), cpu)
-    assert open_device() is cpu[1]
-
-
-@pytest.mark.parametrize(
-    "choice, wanted",
-    [
-        ("0:0", 0),
-        ("1:0", 1),
-        ("1:1", 2),
-        ("intel", 1),
-        ("Portable", 0),
-        ("h200", 2),
-        ("xeon", 0),
-        ("cuda", 2),
-    ],
-)
-@pytest.mark.parametrize("variable", [False, True])
-def test_choice_by_index_and_name(listed, monkeypatch, choice, wanted, variable):
-    entries = [
-        fake("Portable Computing Language", "cpu-haswell-Intel(R) Xeon(R)"),
-        fake("Intel(R) OpenCL", "Intel(R) Xeon(R)", index="1:0"),
-        fake("NVIDIA CUDA", "NVIDIA H200", gpu=True, index="1:1"),
-    ]
-    listed(*entries)
-    if variable:
-        monkeypatch.setenv("PP_DEVICE", choice)
-    assert open_device(None if variable else choice) is entries[wanted][1]
-
-
-def test_devices_that_can_work_side_by_side(listed, monkeypatch):
-    """GPUs alone if there are any; what two platforms list under one name is one; a processor is
-    shared by all its platforms.
-    """
-    h200 = [fake("NVIDIA CUDA", "H200", gpu=True, index=f"0:{i}") for i in range(2)]
-    again = [fake("PoCL", "H200 ", gpu=True, index=f"1:{i}") for i in range(2)]
-    broken = fake("C", "other", gpu=True, problem="does not run: x", index="2:0")
-    arc = fake("Intel", "Arc", gpu=True, index="3:0")
-    cpus = [fake("PoCL", "cpu", index="4:0"), fake("Intel", "Xeon", index="5:0")]
-    listed(*cpus, *h200, *again, broken, arc)
-    assert separate_devices() == ["0:0", "0:1", "3:0"]
-    listed(broken, *cpus)
-    assert separate_devices() == ["4:0"]
-    listed(broken)
-    with pytest.raises(UserError, match="no working OpenCL device"):
-        separate_devices()
-    monkeypatch.setenv("PP_DEVICE", "xeon")
-    assert separate_devices() == ["xeon"]
-
-
-def test_an_argument_beats_the_variable(listed, monkeypatch):
-    entries = [fake("A", "a"), fake("B", "b", index="1:0")]
-    listed(*entries)
-    monkeypatch.setenv("PP_DEVICE", "0:0")
-    assert open_device("1:0") is entries[1][1]
-
-
-def test_unknown_choice_lists_what_was_found(listed):
-    listed(fake("Portable Computing Language", "cpu"))
-    with pytest.raises(
-        UserError,
-        match=r"^device 'radeon': no such OpenCL device; found 0:0 cpu \(Portable .*\) works$",
-    ):
-        open_device("radeon")
-
-
-def test_a_chosen_device_that_does_not_work_is_not_replaced(listed):
-    listed(fake("A", "good"), fake("B", "bad", problem="does not run: no target", index="1:0"))
-    with pytest.raises(
-        UserError,
-        match=r"device 'bad': no working OpenCL device .*1:0 bad \(B\) does not run: no target",
-    ):
-        open_device("bad")
-
-
-@pytest.mark.parametrize("entries", [[], [fake("A", "a", problem="does not run: x")]])
-def test_no_device_says_how_to_get_one(listed, entries):
-    listed(*entries)
-    with pytest.raises(UserError, match="no working OpenCL device") as error:
-        open_device()
-    assert "apt install pocl-opencl-icd" in str(error.value)
-    assert "\n" not in str(error.value)
-
-
-def test_without_a_driver_nothing_is_listed(monkeypatch):
-    def none():
-        raise cl.LogicError("clGetPlatformIDs failed: PLATFORM_NOT_FOUND_KHR")
-
-    monkeypatch.setattr(cl, "get_platforms", none)
-    assert list_devices() == []
-
-
-def test_real_choice_by_index(session_device):
-    index = next(i for i, d, _ in list_devices() if d == session_device.device)
-    assert open_device(index).device == session_device.device
 
 
 # ---- buffers
@@ -310,6 +153,33 @@ def test_a_wrong_call_of_the_driver_keeps_its_traceback(plain):
 def test_fresh_guarded_buffers_are_nan(dev):
     assert np.isnan(dev.empty((33,)).get()).all()
     assert (dev.empty((33,), np.uint32).get() == 0xFFFFFFFF).all()
+
+
+def test_several_arrays_by_one_transfer(dev, rng):
+    """Of any sizes and types, empty ones too; each lives on when the others are gone."""
+    values = [
+        rng.normal(size=(31, 3)).astype(np.float32),
+        np.empty((2, 0), np.int32),
+        np.arange(257, dtype=np.uint32)[::2],
+        np.float32([1]),
+    ]
+    before = dev.bytes
+    parts = dev.upload_all(values)
+    for part, array in zip(parts, values, strict=True):
+        assert part.shape == array.shape and part.dtype == array.dtype
+        assert np.array_equal(part.get(), array)
+    assert dev.bytes > before
+    last = parts[-1]
+    del parts, part
+    assert last.get() == 1 and dev.bytes > before
+    del last
+    assert dev.bytes == before
+
+
+def test_a_kernel_reads_a_part(dev, rng):
+    first, second = dev.upload_all([np.arange(5, dtype=np.float32), np.float32([7, -2, 3])])
+    dev.copy(first[:3], second)
+    assert first.get().tolist() == [7, -2, 3, 3, 4] and second.get().tolist() == [7, -2, 3]
 
 
 # ---- programs and debug levels
@@ -449,25 +319,6 @@ d.program("tiny").launch("divide", 3, n=3, x=x, y=d.empty((3,)))
     assert ran.stdout == ""
 
 
-def test_a_cache_folder_that_cannot_be_written_is_replaced(session_device, tmp_path):
-    blocked = tmp_path / "file"
-    blocked.write_text("")
-    index = next(i for i, d, _ in list_devices() if d == session_device.device)
-    script = (
-        "import os; from pp_cl.device.discover import open_device; "
-        f"open_device({index!r}).program('training/adam'); print(os.environ['XDG_CACHE_HOME'])"
-    )
-    ran = subprocess.run(
-        [sys.executable, "-c", script],
-        capture_output=True,
-        text=True,
-        env={**os.environ, "XDG_CACHE_HOME": str(blocked / "cache")},
-    )
-    assert ran.returncode == 0, ran.stderr
-    assert "set XDG_CACHE_HOME to keep them" in ran.stderr
-    assert not os.path.exists(ran.stdout.strip())  # gone with the process
-
-
 # ---- stages
 
 
@@ -484,30 +335,3 @@ def test_stages_are_timed_only_when_asked_for(session_device):
     assert list(seconds) == ["blend"]
     assert len(seconds["blend"]) == 2
     assert min(seconds["blend"]) >= 0.01
-
-
-def test_several_arrays_by_one_transfer(dev, rng):
-    """Of any sizes and types, empty ones too; each lives on when the others are gone."""
-    values = [
-        rng.normal(size=(31, 3)).astype(np.float32),
-        np.empty((2, 0), np.int32),
-        np.arange(257, dtype=np.uint32)[::2],
-        np.float32([1]),
-    ]
-    before = dev.bytes
-    parts = dev.upload_all(values)
-    for part, array in zip(parts, values, strict=True):
-        assert part.shape == array.shape and part.dtype == array.dtype
-        assert np.array_equal(part.get(), array)
-    assert dev.bytes > before
-    last = parts[-1]
-    del parts, part
-    assert last.get() == 1 and dev.bytes > before
-    del last
-    assert dev.bytes == before
-
-
-def test_a_kernel_reads_a_part(dev, rng):
-    first, second = dev.upload_all([np.arange(5, dtype=np.float32), np.float32([7, -2, 3])])
-    dev.copy(first[:3], second)
-    assert first.get().tolist() == [7, -2, 3, 3, 4] and second.get().tolist() == [7, -2, 3]

@@ -1,13 +1,16 @@
 """Checkpoints that no training made: whole ones by a run's settings, and broken ones of them."""
 
 import json
+import warnings
 import zipfile
 
 import numpy as np
+import pytest
 
 from pp_cl.config import preset
+from pp_cl.errors import UserError
 from pp_cl.files.checkpoint import save_checkpoint
-from pp_cl.training.stored import stored_forms
+from pp_cl.training.stored import load_run_state, stored_forms
 
 POINTS, STEP, STEPS = 40, 50, 60
 HEADER = {
@@ -19,6 +22,13 @@ HEADER = {
     "depth_range": [2.0, 6.0],
     "tuning": None,
 }
+
+
+ONE = np.zeros(3, np.float32)
+
+
+def ids(values):
+    return np.array(values, np.uint32)
 
 
 def settings(**changes):
@@ -68,3 +78,14 @@ def header_text(**changes):
     header = {"format": 1, **HEADER}
     fields = [f'"{k}": {changes.get(k) or json.dumps(v)}' for k, v in header.items()]
     return ("{" + ", ".join(fields) + "}").encode()
+
+
+def refusal(folder, config):
+    """The one line by which the checkpoint is refused."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        with pytest.raises(UserError) as caught:
+            load_run_state(folder, config)
+    line = str(caught.value)
+    assert line.startswith(f"{folder.checkpoint}: ") and line.isprintable() and len(line) < 400
+    return line

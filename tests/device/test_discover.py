@@ -1,0 +1,185 @@
+"""Which devices there are, whether they work, and which one is chosen."""
+
+import json
+import os
+import subprocess
+import sys
+from types import SimpleNamespace
+
+import pyopencl as cl
+import pytest
+
+from pp_cl.device import discover
+from pp_cl.device.device import describe
+from pp_cl.device.discover import list_devices, open_device, separate_devices
+from pp_cl.errors import UserError
+
+
+def fake(platform, name, gpu=False, problem=None, index="0:0"):
+    """An entry of list_devices() that is never opened."""
+    kind = cl.device_type.GPU if gpu else cl.device_type.CPU
+    return (
+        index,
+        SimpleNamespace(name=name, platform=SimpleNamespace(name=platform), type=kind),
+        problem,
+    )
+
+
+@pytest.fixture
+def listed(monkeypatch):
+    """Sets what list_devices() returns; open_device() then returns the cl.Device in place of a
+    Device.
+    """
+    monkeypatch.setattr(discover, "Device", lambda d: d)
+    monkeypatch.delenv("PP_DEVICE", raising=False)
+    return lambda *entries: monkeypatch.setattr(discover, "list_devices", lambda: list(entries))
+
+
+def test_listed_devices_are_probed(session_device):
+    found = list_devices()
+    assert any(d == session_device.device and problem is None for _, d, problem in found)
+    assert len({i for i, _, _ in found}) == len(found)
+
+
+def test_description_is_json(session_device):
+    info = json.loads(json.dumps(describe(session_device.device)))
+    assert info["type"] in ("CPU", "GPU", "ACCELERATOR", "OTHER")
+    assert info["compute_units"] >= 1
+    assert 2**27 <= info["max_allocation_bytes"] <= 2**50
+    assert 2**27 <= info["memory_bytes"] <= 2**50
+
+
+@pytest.mark.parametrize("result", ["wrong", "error"])
+def test_probe_names_the_problem(session_device, monkeypatch, result):
+    change = {"wrong": ("2.0f", "3.0f"), "error": ("2.0f", "undeclared")}
+    monkeypatch.setattr(discover, "PROBE", discover.PROBE.replace(*change[result]))
+    problem = discover._probe(session_device.device)
+    assert {"wrong": "computes a wrong result", "error": "does not run: "}[result] in problem
+    assert "\n" not in problem
+
+
+def test_a_gpu_comes_first(listed):
+    cpu, gpu = (
+        fake("Portable Computing Language", "cpu"),
+        fake("NVIDIA CUDA", "H200", gpu=True, index="1:0"),
+    )
+    listed(cpu, gpu)
+    assert open_device() is gpu[1]
+
+
+def test_a_gpu_that_fails_its_test_build_is_passed_over(listed):
+    cpu = fake("Portable Computing Language", "cpu")
+    listed(fake("rusticl", "llvmpipe", gpu=True, problem="does not run: x", index="1:0"), cpu)
+    assert open_device() is cpu[1]
+
+
+@pytest.mark.parametrize(
+    "choice, wanted",
+    [
+        ("0:0", 0),
+        ("1:0", 1),
+        ("1:1", 2),
+        ("intel", 1),
+        ("Portable", 0),
+        ("h200", 2),
+        ("xeon", 0),
+        ("cuda", 2),
+    ],
+)
+@pytest.mark.parametrize("variable", [False, True])
+def test_choice_by_index_and_name(listed, monkeypatch, choice, wanted, variable):
+    entries = [
+        fake("Portable Computing Language", "cpu-haswell-Intel(R) Xeon(R)"),
+        fake("Intel(R) OpenCL", "Intel(R) Xeon(R)", index="1:0"),
+        fake("NVIDIA CUDA", "NVIDIA H200", gpu=True, index="1:1"),
+    ]
+    listed(*entries)
+    if variable:
+        monkeypatch.setenv("PP_DEVICE", choice)
+    assert open_device(None if variable else choice) is entries[wanted][1]
+
+
+def test_devices_that_can_work_side_by_side(listed, monkeypatch):
+    """GPUs alone if there are any; what two platforms list under one name is one; a processor is
+    shared by all its platforms.
+    """
+    h200 = [fake("NVIDIA CUDA", "H200", gpu=True, index=f"0:{i}") for i in range(2)]
+    again = [fake("PoCL", "H200 ", gpu=True, index=f"1:{i}") for i in range(2)]
+    broken = fake("C", "other", gpu=True, problem="does not run: x", index="2:0")
+    arc = fake("Intel", "Arc", gpu=True, index="3:0")
+    cpus = [fake("PoCL", "cpu", index="4:0"), fake("Intel", "Xeon", index="5:0")]
+    listed(*cpus, *h200, *again, broken, arc)
+    assert separate_devices() == ["0:0", "0:1", "3:0"]
+    listed(broken, *cpus)
+    assert separate_devices() == ["4:0"]
+    listed(broken)
+    with pytest.raises(UserError, match="no working OpenCL device"):
+        separate_devices()
+    monkeypatch.setenv("PP_DEVICE", "xeon")
+    assert separate_devices() == ["xeon"]
+
+
+def test_an_argument_beats_the_variable(listed, monkeypatch):
+    entries = [fake("A", "a"), fake("B", "b", index="1:0")]
+    listed(*entries)
+    monkeypatch.setenv("PP_DEVICE", "0:0")
+    assert open_device("1:0") is entries[1][1]
+
+
+def test_unknown_choice_lists_what_was_found(listed):
+    listed(fake("Portable Computing Language", "cpu"))
+    with pytest.raises(
+        UserError,
+        match=r"^device 'radeon': no such OpenCL device; found 0:0 cpu \(Portable .*\) works$",
+    ):
+        open_device("radeon")
+
+
+def test_a_chosen_device_that_does_not_work_is_not_replaced(listed):
+    listed(fake("A", "good"), fake("B", "bad", problem="does not run: no target", index="1:0"))
+    with pytest.raises(
+        UserError,
+        match=r"device 'bad': no working OpenCL device .*1:0 bad \(B\) does not run: no target",
+    ):
+        open_device("bad")
+
+
+@pytest.mark.parametrize("entries", [[], [fake("A", "a", problem="does not run: x")]])
+def test_no_device_says_how_to_get_one(listed, entries):
+    listed(*entries)
+    with pytest.raises(UserError, match="no working OpenCL device") as error:
+        open_device()
+    assert "apt install pocl-opencl-icd" in str(error.value)
+    assert "\n" not in str(error.value)
+
+
+def test_without_a_driver_nothing_is_listed(monkeypatch):
+    def none():
+        raise cl.LogicError("clGetPlatformIDs failed: PLATFORM_NOT_FOUND_KHR")
+
+    monkeypatch.setattr(cl, "get_platforms", none)
+    assert list_devices() == []
+
+
+def test_real_choice_by_index(session_device):
+    index = next(i for i, d, _ in list_devices() if d == session_device.device)
+    assert open_device(index).device == session_device.device
+
+
+def test_a_cache_folder_that_cannot_be_written_is_replaced(session_device, tmp_path):
+    blocked = tmp_path / "file"
+    blocked.write_text("")
+    index = next(i for i, d, _ in list_devices() if d == session_device.device)
+    script = (
+        "import os; from pp_cl.device.discover import open_device; "
+        f"open_device({index!r}).program('training/adam'); print(os.environ['XDG_CACHE_HOME'])"
+    )
+    ran = subprocess.run(
+        [sys.executable, "-c", script],
+        capture_output=True,
+        text=True,
+        env={**os.environ, "XDG_CACHE_HOME": str(blocked / "cache")},
+    )
+    assert ran.returncode == 0, ran.stderr
+    assert "set XDG_CACHE_HOME to keep them" in ran.stderr
+    assert not os.path.exists(ran.stdout.strip())  # gone with the process
