@@ -14,8 +14,9 @@ from pyopencl.array import Array
 
 from pp_cl.device.buffers import Buffers, Table
 from pp_cl.device.device import Device
+from pp_cl.device.transfer import send
 from pp_cl.files.picture import Picture
-from pp_cl.layers.tiles import SIDE
+from pp_cl.layers.tiles import SIDE, TileFlags, tiles_hit
 from pp_cl.model import Model
 from pp_cl.raster.blend import BACKGROUND, BLENDS, Blend
 from pp_cl.raster.blend_weights import PixelWeights
@@ -39,13 +40,14 @@ class ViewWeights:
     """Which points contribute to a view, and how much; valid until the next view is weighed.
 
     offset: (left, top) of the view in its padded image of H x W pixels. points: the N points in the
-    padded camera.
+    padded camera. tiles: those of the padded image that have hits, None where nobody asks.
     """
 
     offset: tuple[int, int]
     points: ProjectedPoints
     pairs: Pairs
     weights: PixelWeights
+    tiles: TileFlags | None
 
     @property
     def camera_buffer(self) -> Array:
@@ -139,16 +141,25 @@ class Renderer:
         }
 
     def forward(
-        self, camera: Camera, gamma: float, *, training: bool = False, **options
+        self,
+        camera: Camera,
+        gamma: float,
+        *,
+        training: bool = False,
+        differs: Callable[[], np.ndarray | None] = lambda: None,
+        **options,
     ) -> RenderResult:
         """Render a camera. training: keep what backward() needs, and all of the image; else
-        raster.window says what. options: of rasterise().
+        raster.window says what. differs: of UNet.plan_tiles(), asked once the device was waited
+        for. options: of rasterise().
         """
         if not training and self.settings.window == "object":
             return self._forward_object(camera, gamma, **options)
         raster, net = self.rasterise(camera, gamma, **options), self.model.net
         with self.dev.stage("network"):
-            plan = net.plan_tiles(raster.features, BACKGROUND)
+            size, plan = raster.features.shape[:2], None
+            if net.is_planned(size):
+                plan = net.plan_tiles(size, raster.tiles.get(), differs())
             image = net.forward(raster.features, training, plan)
         fraction = plan.computed_fraction if plan else 1.0
         return RenderResult(**vars(raster), image=image, computed_fraction=fraction)
@@ -159,7 +170,7 @@ class Renderer:
         window, left, top = self._window().crop(padded)
         raster, net = self.rasterise(window, gamma, **options), self.model.net
         with self.dev.stage("network"):
-            plan = net.plan_shown(raster.features, BACKGROUND)
+            plan = net.plan_shown(raster.features.shape[:2], raster.tiles.get())
             image = net.forward(raster.features, False, plan)
         share = window.width * window.height / (padded.width * padded.height)
         return RenderResult(
@@ -222,8 +233,8 @@ class Renderer:
         padded, *offset = camera.padded(NETWORK_MULTIPLE)
         size = (padded.height, padded.width)
         b.require(self.table(cloud.count, *size))
-        b.camera_buffer.set(self.model.packed(padded, depth_range))
-        b.point_radius.set(np.array([self._radius()], np.float32))
+        send(self.dev, b.camera_buffer, self.model.packed(padded, depth_range))
+        send(self.dev, b.point_radius, np.array([self._radius()], np.float32))
         with self.dev.stage("project"):
             points = self._projection.grid(
                 b.camera_buffer,
@@ -233,19 +244,28 @@ class Renderer:
                 dropout=dropout,
                 seed=seed,
             )
-        with self.dev.stage("pairs"):
-            pairs = self.cache.get(key, lambda: self._pairs.build(points, size))
-        with self.dev.stage("weights"):
-            weights = self._weights.compute(
-                pairs,
-                b.camera_buffer,
-                cloud.opacity,
-                gamma,
-                max_tracked=settings.max_tracked,
-                early_stop=settings.early_stop if early_stop is None else early_stop,
-                tau=settings.tau if tau is None else tau,
-            )
-        return ViewWeights(tuple(offset), points, pairs, weights)
+        drops = {
+            "max_tracked": settings.max_tracked,
+            "early_stop": settings.early_stop if early_stop is None else early_stop,
+            "tau": settings.tau if tau is None else tau,
+        }
+        pairs, weights, tiles = self._weigh(points, size, gamma, key=key, drops=drops)
+        return ViewWeights(tuple(offset), points, pairs, weights, tiles)
+
+    def _weigh(self, points, size, gamma, *, key, drops):
+        """(Pairs, PixelWeights, TileFlags): anew where there was no room for all pairs."""
+        while True:
+            with self.dev.stage("pairs"):
+                pairs = self.cache.get(key) or self._pairs.enqueue(points, size)
+            with self.dev.stage("weights"):
+                weights = self._weights.compute(
+                    pairs, points.camera_buffer, self.model.cloud.opacity, gamma, **drops
+                )
+            tiles = tiles_hit(self.dev, pairs.pixel_offset, size)
+            tiles.get()  # the host's one wait for the device
+            if self._pairs.has_room(pairs):
+                self.cache.keep(key, pairs)
+                return pairs, weights, tiles
 
     def backward(
         self, result: RenderResult, grad_image: Array, grad_alpha: Array | None = None

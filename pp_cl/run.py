@@ -195,7 +195,7 @@ class Training:
         measured = self._measure() if is_measured else {}
         if step % settings.log_every == 0 or last or is_measured:
             state = {"points": trainer.model.cloud.count, "rates": trainer.rates()}
-            row = self._row(seconds) | terms | state | measured
+            row = self._row(seconds) | terms.get() | state | measured
             log.write(row)
         if step % settings.checkpoint_every == 0 and not last:
             self._save(finished=False)

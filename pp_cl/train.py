@@ -8,15 +8,17 @@ import numpy as np
 from pp_cl.config import Config
 from pp_cl.device.device import Device
 from pp_cl.device.rows import DeviceRows
+from pp_cl.device.transfer import read_later
 from pp_cl.errors import UserError
+from pp_cl.layers.tiles import tiles_find
 from pp_cl.model import Model
-from pp_cl.render import Renderer
+from pp_cl.render import NETWORK_MULTIPLE, Renderer
 from pp_cl.scene.target import Target
 from pp_cl.scene.views import View
 from pp_cl.settings import TrainConfig
 from pp_cl.training.adam import moment_scale
 from pp_cl.training.crops import BOX_MARGIN, draw_start
-from pp_cl.training.loss import Loss
+from pp_cl.training.loss import WHITE, Loss, gradient_tiles
 from pp_cl.training.mask import MaskLoss
 from pp_cl.training.optimiser import Optimiser, Rates
 from pp_cl.training.perceptual import PerceptualLoss
@@ -25,6 +27,7 @@ from pp_cl.training.prune import judge, keep_indices
 from pp_cl.training.refine import refine
 from pp_cl.training.schedule import ema_weight, gamma_at, refine_steps
 from pp_cl.training.smooth import Smoother
+from pp_cl.training.terms import StepTerms
 
 CROP_LOSS = 0.25  # of the crop's side for every halving of the images
 
@@ -52,6 +55,7 @@ class Trainer:
         self.state = PointState(dev, model.cloud, self.config)
         self.optimiser = Optimiser(dev, model, self.state, self._moment_scale())
         self._target = Target(dev)
+        self._terms = None  # of the last step
         self._smoother = None  # made when it is due, anew when the points change
         self._refine_steps = refine_steps(self.config.iterations, self.config.refine_at)
         self._set_level()
@@ -80,9 +84,9 @@ class Trainer:
 
     # ----------------------------------------------------------------------------------------------
 
-    def train_step(self) -> dict[str, float]:
-        """One step; returns {"loss", "l1", "ssim", "psnr"} of its crop, and "mask" and "lpips"
-        where they are terms of the loss. Raises UserError if the loss is not finite.
+    def train_step(self) -> StepTerms:
+        """One step, which the device may still be at. Raises UserError if the loss of the step
+        before is not finite.
         """
         t, config = self.step, self.config
         rng = np.random.default_rng((config.seed, t))
@@ -95,6 +99,7 @@ class Trainer:
             self._target.load(view)
             target = self._target.crop(box, jitter)
             target_alpha = self._target.alpha(box, jitter) if view.has_mask else None
+            differs = self._gradient_tiles(target, camera)
 
         sh_eps = config.sh_eps / target.size
         rendered = self.renderer.forward(
@@ -103,6 +108,7 @@ class Trainer:
             dropout=config.dropout,
             seed=int(rng.integers(2**32)),
             training=True,
+            differs=differs,
             key=view_index if views_repeat(config, view.downscale) else None,
             add_pending=partial(self.optimiser.add_pending, t + 1, rates, sh_eps=sh_eps),
         )
@@ -122,8 +128,9 @@ class Trainer:
             self.renderer.raise_peaks(rendered, self.state.peak_weight, self.state.look_count)
 
         self.step = t + 1
+        self._read_terms()
         self._regularise(rates)
-        return self._terms()
+        return self._terms
 
     def _losses(self, rendered, target, target_alpha):
         """(dL/dimage, dL/dalpha or None) of what is rendered; their sum is in self.loss.terms."""
@@ -165,21 +172,25 @@ class Trainer:
         top = draw_start(rng, y0, y1, height, limit=camera.height)
         return index, (left, top, width, height), jitter
 
-    def _terms(self):
-        total, l1, dissimilarity, mse = (float(x) for x in self.loss.terms.get())
-        if not math.isfinite(total):
-            raise UserError(
-                f"the loss is not finite at step {self.step}; the last checkpoint is kept: "
-                "lower train.sh_rate or network.rate"
-            )
-        return {
-            "loss": total,
-            "l1": l1,
-            "ssim": 1 - dissimilarity,
-            "psnr": -10 * math.log10(max(mse, 1e-10)),
-            **self.mask_loss.terms(),
-            **self.perceptual.terms(),
-        }
+    def _read_terms(self):
+        """Of this step; those of the one before are checked, which the device has done."""
+        self.check()
+        others = self.mask_loss.terms() | self.perceptual.terms()
+        self._terms = StepTerms(self.step, read_later(self.dev, self.loss.terms), others)
+
+    def check(self) -> None:
+        """Raise UserError if the loss of the last step is not finite."""
+        if self._terms:
+            self._terms.get()
+
+    def _gradient_tiles(self, target, camera):
+        """UNet.plan_tiles()'s differs, to be asked for once the device was waited for."""
+        padded, *offset = camera.padded(NETWORK_MULTIPLE)
+        size = padded.height, padded.width
+        if self.perceptual.weight or not self.model.net.is_planned(size):
+            return lambda: None
+        found = tiles_find(self.dev, target, WHITE)
+        return lambda: gradient_tiles(found.get(), size, offset)
 
     # ----------------------------------------------------------------------------------------------
 
@@ -263,7 +274,10 @@ class Trainer:
         return self._target.whole()
 
     def arrays(self) -> dict[str, DeviceRows]:
-        """{name in a checkpoint: array} of the model and of the training's state."""
+        """{name in a checkpoint: array} of the model and of the training's state. Raises UserError
+        as check().
+        """
+        self.check()
         return self.model.arrays() | self.optimiser.arrays()
 
     def restore(self, step: int, arrays: dict[str, np.ndarray]) -> None:

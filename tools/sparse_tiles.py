@@ -21,11 +21,11 @@ from pp_cl.device.discover import open_device
 from pp_cl.errors import UserError
 from pp_cl.files.atomic import write_json
 from pp_cl.layers.policy import make_policy
-from pp_cl.raster.blend import BACKGROUND
+from pp_cl.layers.tiles import tiles_find
 from pp_cl.render import Renderer
 from pp_cl.scene.target import Target
 from pp_cl.trained import load_run
-from pp_cl.training.loss import Loss
+from pp_cl.training.loss import WHITE, Loss, gradient_tiles
 
 
 class Comparison:
@@ -49,20 +49,28 @@ class Comparison:
         x = view_raster.features
         self.target.load(view)
         target = self.target.crop((0, 0, camera.width, camera.height))
-        grad = self.loss.forward_backward(self.net.forward(x, False), target, *view_raster.offset)
 
-        plan = self.net.plan_tiles(x, BACKGROUND)
-        results = [self._results(x, grad, tiles) for tiles in (None, plan)]
+        def plan():
+            found = tiles_find(self.dev, target, WHITE).get()
+            differs = gradient_tiles(found, x.shape[:2], view_raster.offset)
+            return self.net.plan_tiles(x.shape[:2], view_raster.tiles.get(), differs)
+
+        chosen = plan()
+        # of the image that has equal tiles: those of a dense one differ by rounding, of which the
+        # SSIM's gradient makes a thousand times more
+        image = self.net.forward(x, False, chosen)
+        grad = self.loss.forward_backward(image, target, *view_raster.offset)
+        results = [self._results(x, grad, tiles) for tiles in (None, chosen)]
         differences = [
             float(np.abs(a - b).max() / np.abs(a).max()) for a, b in zip(*results, strict=True)
         ]
         times = interleave(
             {
                 (direction, name): self._runner(
-                    x, grad if direction == "train" else None, background
+                    x, grad if direction == "train" else None, make_plan
                 )
                 for direction in ("forward", "train")
-                for name, background in (("dense", None), ("sparse", BACKGROUND))
+                for name, make_plan in (("dense", None), ("sparse", plan))
             },
             runs,
         )
@@ -70,7 +78,7 @@ class Comparison:
         return {
             "view": view.name,
             "size": list(x.shape[:2]),
-            "computed_fraction": float(plan.computed_fraction) if plan else 1.0,
+            "computed_fraction": float(chosen.computed_fraction) if chosen else 1.0,
             **{f"{direction}_{name}_ms": value for (direction, name), value in ms.items()},
             **{f"{d}_ratio": ms[d, "dense"] / ms[d, "sparse"] for d in ("forward", "train")},
             "image_difference": differences[0],
@@ -86,10 +94,9 @@ class Comparison:
             *[g.get() for g in self.net.gradients.values()],
         ]
 
-    def _runner(self, x, grad, background):
+    def _runner(self, x, grad, make_plan):
         def run():
-            plan = None if background is None else self.net.plan_tiles(x, background)
-            self.net.forward(x, grad is not None, plan)
+            self.net.forward(x, grad is not None, make_plan() if make_plan else None)
             if grad is not None:
                 self.net.backward(grad)
             self.dev.finish()

@@ -1,5 +1,4 @@
-// Tiles of a feature map (tiles.h): those that hold something, those that equal another, and
-// copying one to another.
+// Tiles of a feature map (tiles.h): those that hold something, and copying one to another.
 #include "common.h"
 #include "layers/tiles.h"
 #include "vector.h"
@@ -12,7 +11,7 @@ kernel void tiles_find(
     const int c,
     const float background,
     global const float *x,  // (h, w, c)
-    global int *found)      // (?, ?) tiles
+    global int *flags)      // (?, ?) tiles
 {
     const int tile = get_global_id(0), columns = tile_columns(w), rows = tile_columns(h);
     if (tile >= columns * rows) return;
@@ -24,32 +23,24 @@ kernel void tiles_find(
         for (int i = 0; i < values; i++)
             other |= line[i] != background;
     }
-    found[tile] = other;
+    flags[tile] = other;
 }
 
-// One work-item per tile: compares its bits with those of the tile it stands beside in `source`, of
-// the same shape; writes 1 if they differ, else 0.
-kernel void tiles_compare(
+// One work-item per tile: reads where the hits of its pixels begin, writes 1 if any pixel has hits,
+// else 0.
+kernel void tiles_hit(
     const int h,
     const int w,
-    const int c,
-    global const int *source,  // (?, ?) tiles
-    global const float *x,     // (h, w, c)
-    global int *differs)       // (?, ?) tiles
+    global const uint *pixel_offset,  // (H*W+1)
+    global int *flags)                // (?, ?) tiles
 {
     const int tile = get_global_id(0), columns = tile_columns(w), rows = tile_columns(h);
     if (tile >= columns * rows) return;
-    const int x0 = tile % columns * SIDE, y0 = tile / columns * SIDE;
-    const long shift =
-        ((long)(source[tile] / columns * SIDE - y0) * w + source[tile] % columns * SIDE - x0) * c;
-    const int values = min(SIDE, w - x0) * c;
-    int other = 0;
-    for (int y = y0; y < min(y0 + SIDE, h); y++) {
-        global const float *line = x + ((size_t)y * w + x0) * c;
-        for (int i = 0; i < values; i++)
-            other |= as_int(line[i]) != as_int(line[shift + i]);
-    }
-    differs[tile] = other;
+    const int x0 = tile % columns * SIDE, y0 = tile / columns * SIDE, x1 = min(x0 + SIDE, w);
+    int hit = 0;
+    for (int y = y0; y < min(y0 + SIDE, h); y++)
+        hit |= pixel_offset[y * w + x0] != pixel_offset[y * w + x1];
+    flags[tile] = hit;
 }
 
 // One work-item per (16 channels, pixel of a tile, copy): writes the pixel of the tile `to` as it

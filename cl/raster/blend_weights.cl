@@ -24,9 +24,11 @@ kernel void dropped_weights(
     pixel_dropped[q] = i < end ? as_float((uint)(pixel_entry[i] >> 32)) : 0.0f;
 }
 
-// One work-item per point: reads the roles of its pairs, writes how many are not dropped.
+// One work-item per point: reads the roles of its pairs, writes how many are not dropped; not those
+// that have no room.
 kernel void find_shaded_points(
     const uint n,                     // points
+    const uint p,                     // pairs for which there is room
     global const uint *point_offset,  // (N+1)
     global const uchar *pair_role,    // (P)
     global uint *point_is_shaded)     // (N) 0: no
@@ -34,7 +36,8 @@ kernel void find_shaded_points(
     const uint i = get_global_id(0);
     if (i >= n) return;
     uint count = 0;
-    for (uint pair = point_offset[i]; pair < point_offset[i + 1]; pair++)
+    const uint end = min(point_offset[i + 1], p);
+    for (uint pair = point_offset[i]; pair < end; pair++)
         count += pair_role[pair] != DROPPED;
     point_is_shaded[i] = count;
 }

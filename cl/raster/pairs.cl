@@ -35,9 +35,10 @@ kernel __attribute__((vec_type_hint(float16))) void pairs_count(
 }
 
 // One work-item per point: finds its hits again, writes them as pairs and counts them at their
-// pixels.
+// pixels; does nothing where not all pairs have room.
 kernel __attribute__((vec_type_hint(float16))) void pairs_fill(
     const uint n,                        // points
+    const uint p,                        // pairs for which there is room
     const uint radii,                    // 1 (all alike) or n
     global const float *camera,          // (20) camera.h
     global const float *point_radius,    // (radii)
@@ -52,7 +53,7 @@ kernel __attribute__((vec_type_hint(float16))) void pairs_fill(
     const uint i = get_global_id(0);
     if (i >= n) return;
     uint pair = point_offset[i];
-    if (pair == point_offset[i + 1]) return;
+    if (pair == point_offset[i + 1] || point_offset[n] > p) return;
     const Camera cam = camera_load(camera);
     const Footprint f = footprint_load(&cam, point_camera[i], point_radius[radii == 1 ? 0 : i]);
     const int4 box = convert_int4(point_box[i]);
@@ -76,14 +77,15 @@ kernel __attribute__((vec_type_hint(float16))) void pairs_fill(
 
 // One work-item per pair: writes its key at its place. Bits of floats >= 0 sort like the floats.
 kernel void pairs_scatter(
-    const uint pairs,                 // at most P
+    const uint p,                     // pairs for which there is room
+    const uint hw,                    // pixels
     global const uint *pair_pixel,    // (P)
     global const ulong *pair_place,   // (P) depth << 32 | place in the list of the pixel
     global const uint *pixel_offset,  // (HW+1) first key of each pixel
     global ulong *pair_key)           // (P) depth << 32 | pair, by pixel
 {
     const uint pair = get_global_id(0);
-    if (pair >= pairs) return;
+    if (pair >= p || pair >= pixel_offset[hw]) return;
     const ulong place = pair_place[pair];
     pair_key[pixel_offset[pair_pixel[pair]] + (uint)place] = upsample((uint)(place >> 32), pair);
 }

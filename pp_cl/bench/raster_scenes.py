@@ -252,7 +252,9 @@ class PulsarScene(BenchScene):
             )
         with self.dev.stage("blend"):
             blend.forward(pairs, weights, self.device_features, self.features)
-        return RasterResult((0, 0), points, pairs, weights, self.device_features, self.features)
+        return RasterResult(
+            (0, 0), points, pairs, weights, None, self.device_features, self.features
+        )
 
     def backward(self, case: Case, result: RasterResult) -> None:
         """Stages `backward` and `spheres`."""

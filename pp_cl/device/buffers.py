@@ -5,6 +5,7 @@ memory plan counts.
 from __future__ import annotations
 
 import math
+from collections.abc import Hashable
 
 import numpy as np
 from pyopencl.array import Array
@@ -22,6 +23,17 @@ def table_bytes(table: Table) -> int:
 def grown(capacity: int, needed: int) -> int:
     """The capacity, or a quarter more than `needed` where that is more than it holds."""
     return capacity if needed <= capacity else needed + needed // 4
+
+
+def scratch(dev: Device, name: Hashable, n: int, dtype: type) -> Array:
+    """(n,) uninitialised, in memory that all calls with this name share: only for what kernels
+    enqueued before the next such call read.
+    """
+    held = dev.scratch.get(name)
+    if held is None or len(held) < n or held.dtype != dtype:
+        held = dev.scratch[name] = None  # frees the old one first
+        held = dev.scratch[name] = dev.empty((grown(0, n),), dtype)
+    return held[:n]
 
 
 class Buffers:

@@ -7,8 +7,8 @@ import os
 import sys
 import time
 import weakref
-from collections import defaultdict
-from collections.abc import Callable, Iterator, Sequence
+from collections import defaultdict, deque
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -122,6 +122,7 @@ class Device:
         properties = cl.command_queue_properties.PROFILING_ENABLE if self.debug else 0
         self.queue = cl.CommandQueue(self.context, properties=properties)
         self.bytes = self.peak_bytes = 0
+        self.sent, self.scratch = deque(), {}  # of transfer.send(), buffers.scratch()
         self._programs = {}
         self._seconds = defaultdict(list)
         self._stage_seconds = defaultdict(list) if self.debug else None
@@ -192,25 +193,6 @@ class Device:
         array = self._allocate(values.shape, values.dtype)
         self.write(array, values)
         return array
-
-    def upload_all(self, values: Sequence[np.ndarray]) -> list[Array]:
-        """Copies of several numpy arrays on the device by one transfer: parts of one buffer, which
-        lives as long as any of them.
-        """
-        align = self.device.mem_base_addr_align // 8
-        ends = np.cumsum([0, *(-(-max(v.nbytes, 1) // align) * align for v in values)])
-        packed = np.zeros(ends[-1], np.uint8)
-        for start, array in zip(ends, values, strict=False):
-            packed[start : start + array.nbytes] = (
-                np.ascontiguousarray(array).reshape(-1).view("u1")
-            )
-        whole, parts = self.upload(packed), []
-        for start, array in zip(ends, values, strict=False):
-            region = whole.base_data.get_sub_region(int(start), max(array.nbytes, 1))
-            part = cl.array.Array(self.queue, array.shape, array.dtype, data=region)
-            weakref.finalize(part, lambda whole: None, whole)
-            parts.append(part)
-        return parts
 
     def write(self, array: Array, values: np.ndarray) -> None:
         """Overwrite an array of this device by a numpy array of its shape and dtype.

@@ -1,10 +1,13 @@
 """Exclusive prefix sums on the device, and the list of the non-zero entries."""
 
+from functools import cached_property
+
 import numpy as np
-import pyopencl as cl
 from pyopencl.array import Array
 
+from pp_cl.device.buffers import scratch
 from pp_cl.device.device import Device
+from pp_cl.device.transfer import Reading, read_later
 
 BLOCK = 512  # values per work-item
 
@@ -15,16 +18,21 @@ def exclusive_scan(dev: Device, values: Array, offsets: Array, flags: bool = Fal
 
     values: (N) uint32, N >= 1. offsets: (N+1) uint32. flags: every non-zero value counts as one.
     """
+    _scan(dev, values, offsets, flags=flags, level=0)
+
+
+def _scan(dev, values, offsets, *, flags, level):
+    """exclusive_scan() of the values or, from level 1 on, of sums of blocks."""
     n = values.size
     blocks = -(-n // BLOCK)
     program = dev.program("device/scan", FLAGS=int(flags), BLOCK=BLOCK)
+    block_offset = scratch(dev, ("scan offset", level), blocks + 1, np.uint32)
     if blocks == 1:
-        block_offset = dev.zeros((2,), np.uint32)
+        dev.fill(block_offset, 0)
     else:
-        block_sum = dev.empty((blocks,), np.uint32)
-        block_offset = dev.empty((blocks + 1,), np.uint32)
+        block_sum = scratch(dev, ("scan sum", level), blocks, np.uint32)
         program.launch("scan_sums", blocks, n=n, b=blocks, values=values, block_sum=block_sum)
-        exclusive_scan(dev, block_sum, block_offset)
+        _scan(dev, block_sum, block_offset, flags=False, level=level + 1)
     program.launch(
         "scan_offsets",
         blocks,
@@ -36,16 +44,28 @@ def exclusive_scan(dev: Device, values: Array, offsets: Array, flags: bool = Fal
     )
 
 
-def read_total(dev: Device, offsets: Array) -> int:
-    """The last entry of `offsets` as an int; waits for the device."""
-    total = np.empty(1, np.uint32)
-    cl.enqueue_copy(dev.queue, total, offsets.data, src_offset=offsets.nbytes - total.nbytes)
-    return int(total[0])
+class DeviceList:
+    """Indices that the device lists, ascending, and that it knows the number of.
+
+    total: Reading of one number, how many they are.
+    """
+
+    def __init__(self, total: Reading, indices: Array):
+        self._total, self._indices = total, indices
+
+    @cached_property
+    def array(self) -> Array:
+        """(S,) uint32 on the device; waits until their number is known."""
+        return self._indices[: int(self._total.get()[0])]
 
 
-def nonzero(dev: Device, values: Array, offsets: Array, indices: Array) -> int:
-    """Number of non-zero values; writes their indices, ascending, to the front of `indices`. Waits
-    for the device.
+def read_total(dev: Device, offsets: Array) -> Reading:
+    """The last entry of `offsets`, on its way."""
+    return read_later(dev, offsets, len(offsets) - 1)
+
+
+def nonzero(dev: Device, values: Array, offsets: Array, indices: Array) -> DeviceList:
+    """Where values are not zero, listed in the front of `indices`.
 
     values: (N) uint32, N >= 1. offsets: (N+1) uint32 scratch, left holding each value's number.
     indices: (N) uint32.
@@ -55,4 +75,4 @@ def nonzero(dev: Device, values: Array, offsets: Array, indices: Array) -> int:
     dev.program("device/scan", FLAGS=1, BLOCK=BLOCK).launch(
         "scan_nonzero", n, n=n, values=values, offsets=offsets, indices=indices
     )
-    return read_total(dev, offsets)
+    return DeviceList(read_total(dev, offsets), indices)

@@ -1,5 +1,5 @@
-"""Tiles of 4 x 4 pixels of a feature map: which of them a kernel computes, which differ from the
-background or from each other, and copies among them.
+"""Tiles of 4 x 4 pixels of a feature map: which of them a kernel computes, which hold something,
+and copies among them.
 
 A feature map of (height, width) pixels has ceil(height / 4) x ceil(width / 4) tiles, numbered row
 by row; the last ones may be cut off by the border.
@@ -10,8 +10,9 @@ from dataclasses import dataclass
 import numpy as np
 from pyopencl.array import Array
 
-from pp_cl.device.buffers import Table
+from pp_cl.device.buffers import Table, scratch
 from pp_cl.device.device import Device
+from pp_cl.device.transfer import Reading, read_later
 
 LANES = 16  # channels in one float16
 # pixels: the outputs of F(4x4, 3x3), and one pixel after the network has halved its input twice
@@ -77,20 +78,29 @@ def checked_tiles(dev: Device, tiles: Tiles | None, height: int, width: int) -> 
     return tiles
 
 
-def tiles_find(dev: Device, x: Array, background: float) -> np.ndarray:
-    """(rows, columns) bool: the tiles of x (H, W, C) float32 in which some value is not
-    `background`.
+@dataclass(frozen=True)
+class TileFlags:
+    """What is true of which tiles, as the device finds out."""
+
+    shape: tuple[int, int]
+    reading: Reading
+
+    def get(self) -> np.ndarray:
+        """(rows, columns) bool; waits until it is known."""
+        return self.reading.get().reshape(self.shape) != 0
+
+
+def tiles_find(dev: Device, x: Array, background: float) -> TileFlags:
+    """The tiles of x (H, W, C) float32 in which some value is not `background`."""
+    h, w, c = x.shape
+    return _flags(dev, "tiles_find", (h, w), c=c, background=background, x=x)
+
+
+def tiles_hit(dev: Device, pixel_offset: Array, size: tuple[int, int]) -> TileFlags:
+    """The tiles of an image of size (height, width) in which some pixel has hits, by its
+    Pairs.pixel_offset (HW+1,) uint32.
     """
-    return _flags(dev, "tiles_find", x, background=background)
-
-
-def tiles_compare(dev: Device, x: Array, source: np.ndarray) -> np.ndarray:
-    """(rows, columns) bool: the tiles of x (H, W, C) float32 that differ in some bit from the tile
-    whose number `source` gives.
-
-    source: (rows, columns) integers; a tile and its source have the same shape.
-    """
-    return _flags(dev, "tiles_compare", x, source=dev.upload(source, np.int32))
+    return _flags(dev, "tiles_hit", size, pixel_offset=pixel_offset)
 
 
 def copy_list(source: np.ndarray, chosen: np.ndarray) -> np.ndarray:
@@ -123,12 +133,11 @@ def tiles_copy(dev: Device, x: Array, from_to: Array) -> None:
     )
 
 
-def _flags(dev, kernel, x, **arguments):
-    h, w, c = x.shape
-    rows, columns = grid_shape(h, w)
-    flags = dev.empty((rows, columns), np.int32)
-    output = {"tiles_find": "found", "tiles_compare": "differs"}[kernel]
+def _flags(dev, kernel, size, **arguments):
+    shape = grid_shape(*size)
+    tiles = shape[0] * shape[1]
+    flags = scratch(dev, "tile flags", tiles, np.int32)
     dev.program("layers/tiles").launch(
-        kernel, rows * columns, h=h, w=w, c=c, x=x, **{output: flags}, **arguments
+        kernel, tiles, h=size[0], w=size[1], flags=flags.reshape(shape), **arguments
     )
-    return flags.get() != 0
+    return TileFlags(shape, read_later(dev, flags))

@@ -8,7 +8,7 @@ sums over the image, the gradients of weights, a representative counts as often 
 tiles. The results are the same but for rounding: Winograd's transforms mix the last bits of a tile.
 
 The backward pass has classes of its own: of the tiles where the network saw only background, those
-whose gradient of the image has the same bits as their representative's.
+whose gradient of the image is their representative's.
 """
 
 from __future__ import annotations
@@ -20,15 +20,8 @@ import numpy as np
 from pyopencl.array import Array
 
 from pp_cl.device.device import Device
-from pp_cl.layers.tiles import (
-    SIDE,
-    Tiles,
-    all_tiles,
-    copy_list,
-    tile_arrays,
-    tiles_compare,
-    tiles_copy,
-)
+from pp_cl.device.transfer import send_all
+from pp_cl.layers.tiles import SIDE, Tiles, all_tiles, copy_list, tile_arrays, tiles_copy
 from pp_cl.network.architectures import convolutions
 from pp_cl.network.layer import Layer
 from pp_cl.network.tile_sets import grow, halve
@@ -140,7 +133,7 @@ class AllTiles:
     def fill_copies(self, name: str, array: Array) -> None:
         """Nothing: there are no copies."""
 
-    def backward(self, arrays: dict[str, Array], grad_out: Array) -> AllTiles:
+    def backward(self, arrays: dict[str, Array]) -> AllTiles:
         """The backward pass after this forward pass."""
         return self
 
@@ -178,11 +171,11 @@ class TilePlan:
         self._tiles, self._copies = {}, {}
 
     def upload(self) -> TilePlan:
-        """The plan, with all lists on the device: an upload between kernels would wait for them."""
+        """The plan, with all lists on the device, until the next one of its class is."""
         maps = {id(tile_map): tile_map for tile_map in self.maps.values()}
         lists = [part for m in maps.values() for part in tile_arrays(self._size(m), m.count())]
-        copies = {name: self._copy_list(name, needed) for name, needed in self.needed.items()}
-        arrays = iter(self.dev.upload_all([*lists, *copies.values()]))
+        copies = self._copy_lists()
+        arrays = iter(send_all(self.dev, type(self), [*lists, *copies.values()]))
         for key, m in maps.items():
             self._tiles[key] = Tiles(
                 self._size(m), int(m.computed.sum()), next(arrays), next(arrays)
@@ -193,24 +186,21 @@ class TilePlan:
     def _size(self, tile_map):
         return self.size[0] >> tile_map.level, self.size[1] >> tile_map.level
 
-    def _copy_list(self, name, needed):
-        tile_map = self.maps[name]
-        return copy_list(tile_map.source, needed & ~tile_map.computed)
+    def _copy_lists(self):
+        """{name of a feature map: copy_list() of its needed tiles that are not computed}."""
+        return {name: _copies(self.maps[name], needed) for name, needed in self.needed.items()}
 
     def tiles(self, name: str) -> Tiles:
         """The tiles of a feature map to compute; of a plan that is on the device."""
         return self._tiles[id(self.maps[name])]
 
-    def fill_copies(self, name: str, array: Array, needed: np.ndarray | None = None) -> None:
-        """Copy representatives to the needed tiles that were not computed.
+    def fill_copies(self, name: str, array: Array) -> None:
+        """Copy representatives to the needed tiles that were not computed."""
+        tiles_copy(self.dev, array, self._copies[name])
 
-        needed: others than self.needed[name].
-        """
-        if needed is None:
-            from_to = self._copies[name]
-        else:
-            from_to = self.dev.upload(self._copy_list(name, needed))
-        tiles_copy(self.dev, array, from_to)
+
+def _copies(tile_map, needed):
+    return copy_list(tile_map.source, needed & ~tile_map.computed)
 
 
 class ImagePlan(TilePlan):
@@ -258,38 +248,47 @@ class ForwardPlan(ImagePlan):
     """The forward pass over an image of `size`, where x differs from the background in the tiles
     `active`.
 
-    affected: (rows, columns) bool, the tiles of the image that see more than background.
+    differs: (rows, columns) bool, the tiles of the image whose gradient may be another than that of
+    others which see only background; None: all. affected: the tiles of the image that see more than
+    background.
     """
 
-    def __init__(self, dev: Device, layers: list[Layer], size: tuple[int, int], active: np.ndarray):
+    def __init__(
+        self,
+        dev: Device,
+        layers: list[Layer],
+        size: tuple[int, int],
+        active: np.ndarray,
+        *,
+        differs: np.ndarray | None = None,
+    ):
         radius, last = receptive_radius(layers), layers[-1].name
         super().__init__(dev, layers, size, active, radius=radius)
         self.needed[last][:] = True
         self.affected = grow(active, -(-radius[last] // SIDE))
+        self.differs = np.ones_like(active) if differs is None else differs
 
-    def backward(self, arrays: dict[str, Array], grad_out: Array) -> BackwardPlan:
+    def backward(self, arrays: dict[str, Array]) -> BackwardPlan:
         """The backward pass; the activations in `arrays` are completed where it needs them."""
-        plan = BackwardPlan(self, grad_out).upload()
-        for name, needed in plan.activations.items():
-            self.fill_copies(name, arrays[name], needed)
+        plan = BackwardPlan(self).upload()
+        plan.fill_activations(arrays)
         return plan
 
 
 class BackwardPlan(TilePlan):
-    """The backward pass after a forward pass, given the gradient (H, W, C) of the last layer's
-    output.
+    """The backward pass after a forward pass.
 
     activations: {name: (rows, columns) bool}, the tiles of forward outputs that it reads, as inputs
     of layers and as masks of ReLUs.
     """
 
-    def __init__(self, forward: ForwardPlan, grad_out: Array):
+    def __init__(self, forward: ForwardPlan):
         dev, layers, size = forward.dev, forward.layers, forward.size
         radius = receptive_radius(layers)[layers[-1].name]
         border = -(-max(LOSS_BORDER, radius) // SIDE)
-        classes = map_tiles(size, 0, forward.affected, border)
-        active = forward.affected | tiles_compare(dev, grad_out, classes.source)
+        active = forward.affected | forward.differs
         super().__init__(dev, layers, size, active, radius=gradient_radius(layers), border=border)
+        self._forward_maps = forward.maps
         self.activations = {}
         for layer in layers:
             out = self.maps[layer.name].computed
@@ -300,3 +299,15 @@ class BackwardPlan(TilePlan):
                     reads = layer.needed_forward(out, at_input.shape) | at_input
                     self.activations[name] = self.activations.get(name, False) | reads
         self.needed["x"][:] = True
+
+    def _copy_lists(self):
+        """Those of the gradients, and of the activations."""
+        maps, activations = self._forward_maps, self.activations.items()
+        return super()._copy_lists() | {
+            ("activation", name): _copies(maps[name], needed) for name, needed in activations
+        }
+
+    def fill_activations(self, arrays: dict[str, Array]) -> None:
+        """Complete the forward outputs {name: array} where the pass reads them."""
+        for name in self.activations:
+            self.fill_copies(("activation", name), arrays[name])

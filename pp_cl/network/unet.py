@@ -9,7 +9,7 @@ from pp_cl.device.device import Device
 from pp_cl.layers.conv import pack_bias, pack_weights
 from pp_cl.layers.policy import ConvolutionPolicy, make_policy
 from pp_cl.layers.resample import affine
-from pp_cl.layers.tiles import SIDE, tiles_find
+from pp_cl.layers.tiles import SIDE
 from pp_cl.network.architectures import convolutions, unet_layers
 from pp_cl.network.buffers import gradient_of
 from pp_cl.network.sparse_tiles import (
@@ -89,17 +89,25 @@ class UNet:
         self._frozen = {}
         self._workspaces.clear()
 
-    def plan_tiles(self, x: Array, background: float) -> ForwardPlan | None:
-        """Which tiles to compute for features x (H, W, channels_in) that are `background` where no
-        point is; None = all, as few would be saved.
+    @staticmethod
+    def is_planned(size: tuple[int, int]) -> bool:
+        """Whether plan_tiles() is worth a try for an image of size (height, width)."""
+        return math.prod(size) >= LEAST_PIXELS
 
-        Where the network sees only background, one tile is computed in place of many equal ones
-        (sparse_tiles.py). The result is the same.
+    def plan_tiles(
+        self, size: tuple[int, int], active: np.ndarray, differs: np.ndarray | None = None
+    ) -> ForwardPlan | None:
+        """Which tiles to compute for features of `size` = (height, width) that are the same in all
+        tiles but the `active` ones, (rows, columns) bool; None = all, as few would be saved.
+
+        Where the network sees only this background, one tile is computed in place of many equal
+        ones (sparse_tiles.py). The result is the same. differs: the tiles whose gradient of the
+        image may not be that of others which see only background; None: all. Valid until the next
+        plan.
         """
-        size = x.shape[:2]
-        if math.prod(size) < LEAST_PIXELS:
+        if not self.is_planned(size):
             return None
-        plan = ForwardPlan(self.dev, self.layers, size, tiles_find(self.dev, x, background))
+        plan = ForwardPlan(self.dev, self.layers, size, active, differs=differs)
         return plan.upload() if plan.computed_fraction <= MOST_COMPUTED else None
 
     @property
@@ -108,18 +116,19 @@ class UNet:
         radius = receptive_radius(self.layers)[self.layers[-1].name]
         return radius + (SHOWN_AROUND + 1) * SIDE
 
-    def plan_shown(self, x: Array, background: float) -> ShownPlan:
-        """What to compute for the tiles in which features x (H, W, channels_in) are not all
-        `background`; the image is undefined elsewhere.
+    def plan_shown(self, size: tuple[int, int], active: np.ndarray) -> ShownPlan:
+        """What to compute for the `active` tiles, (rows, columns) bool, of an image of `size` =
+        (height, width) and those around them; the image is undefined elsewhere. Valid until the
+        next plan.
         """
-        shown = grow(tiles_find(self.dev, x, background), SHOWN_AROUND)
-        return ShownPlan(self.dev, self.layers, x.shape[:2], shown).upload()
+        shown = grow(active, SHOWN_AROUND)
+        return ShownPlan(self.dev, self.layers, size, shown).upload()
 
     def forward(self, x: Array, training: bool = True, plan: ImagePlan | None = None) -> Array:
         """(H, W, 3) image of the features x (H, W, channels_in); H and W are multiples of 4.
 
         The result is in a buffer of the network: the next call overwrites it. training: keep what
-        backward needs. plan: plan_tiles(x, ...), or plan_shown(x, ...) where nothing is trained,
+        backward needs. plan: of plan_tiles(), or of plan_shown() where nothing is trained,
         None = compute all tiles. Raises ValueError for other sizes, RuntimeError for training once
         frozen.
         """
@@ -155,7 +164,7 @@ class UNet:
         (workspace, arrays, tiles), self._trained = self._trained, None
         grad_last = arrays[gradient_of(self.layers[-1].name)]
         affine(self.dev, 0.5, 0.0, grad_y, out=grad_last)
-        tiles = tiles.backward(arrays, grad_last)
+        tiles = tiles.backward(arrays)
         for layer in reversed(self.layers):
             sources = tuple(arrays[name] for name in layer.inputs)
             grad_out = arrays[gradient_of(layer.name)]

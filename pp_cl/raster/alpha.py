@@ -59,7 +59,7 @@ class Alpha(BlendWeights):
             pixel_entry=pixel_entry,
             transmittance=self._buffers.transmittance,
         )
-        shaded = self._list_shaded(pairs, pair_role) if least > 0 else pairs.seen
+        shaded = self._list_shaded(pairs, pair_role if least > 0 else None)
         transmittance = self._buffers.transmittance[: pairs.pixels]
         return PixelWeights(has_roles, pair_weight, pair_role, pixel_entry, shaded, transmittance)
 
@@ -74,7 +74,7 @@ class Alpha(BlendWeights):
         grad_alpha: Array | None = None,
     ) -> Array:
         """As BlendWeights: B of each pair, G times what is composited behind it, minus g."""
-        rest = self._buffers.rest[: max(1, pairs.total)]
+        rest = self._buffers.rest[: pairs.capacity]
         self.dev.program("raster/alpha", HAS_GRAD_ALPHA=int(grad_alpha is not None)).launch(
             "alpha_rest",
             pairs.pixels,

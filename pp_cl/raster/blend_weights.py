@@ -12,7 +12,7 @@ from pyopencl.array import Array
 
 from pp_cl.device.buffers import Buffers, Table, grown
 from pp_cl.device.device import Device
-from pp_cl.device.scan import nonzero
+from pp_cl.device.scan import DeviceList, nonzero
 from pp_cl.raster.pairs import Pairs
 
 DROPPED = 2  # cl/raster/pair_role.h
@@ -27,17 +27,23 @@ class PixelWeights:
     (cl/raster/blend.cl); undefined where the pair is dropped. pair_role: (P,) uint8,
     cl/raster/pair_role.h. pixel_entry: (P,) uint64, weight bits << 32 | point, each pixel's hits by
     depth; dropped hits end a pixel's list with an entry of no point that holds their weight or a
-    bound of it. shaded: (S,) uint32, ascending, the points with a hit that is not dropped: no other
-    point's features are read, no other point gets a gradient. transmittance: (HW,) float32, what
-    is left for the background, None of a softmax.
+    bound of it. shaded_list: `shaded` before its length is known. transmittance: (HW,) float32,
+    what is left for the background, None of a softmax.
     """
 
     has_roles: bool
     pair_weight: Array
     pair_role: Array
     pixel_entry: Array
-    shaded: Array
+    shaded_list: DeviceList
     transmittance: Array | None = None
+
+    @property
+    def shaded(self) -> Array:
+        """(S,) uint32, ascending, the points with a hit that is not dropped: no other point's
+        features are read, no other point gets a gradient. Waits until their number is known.
+        """
+        return self.shaded_list.array
 
 
 class BlendWeights(ABC):
@@ -63,12 +69,9 @@ class BlendWeights(ABC):
             "pair_role": ((pairs if has_roles else 1,), np.uint8),
             "pixel_entry": ((pairs,), np.uint64),
         }
-        listing = {
-            "point_is_shaded": ((n,), np.uint32),
-            "point_place": ((n + 1,), np.uint32),
-            "shaded": ((n,), np.uint32),
-        }
-        return always | listing if has_roles else always
+        listing = {"point_place": ((n + 1,), np.uint32), "shaded": ((n,), np.uint32)}
+        flags = {"point_is_shaded": ((n,), np.uint32)}
+        return always | listing | (flags if has_roles else {})
 
     @classmethod
     @abstractmethod
@@ -117,7 +120,7 @@ class BlendWeights(ABC):
 
     def _reserve(self, pairs, has_roles):
         """The buffers (pair_weight, pair_role, pixel_entry) for these pairs."""
-        p, b = max(1, pairs.total), self._buffers
+        p, b = pairs.capacity, self._buffers
         self._capacity = grown(self._capacity, p)
         table = self.table(pairs.points, self._capacity, has_roles)
         b.require(table | self.own_table(pairs.pixels, self._capacity))
@@ -157,17 +160,20 @@ class BlendWeights(ABC):
         )
 
     def _list_shaded(self, pairs, pair_role):
-        """The points with a hit that is not dropped. Waits for the device."""
-        n, b = pairs.points, self._buffers
-        self.dev.program("raster/blend_weights").launch(
-            "find_shaded_points",
-            n,
-            n=n,
-            point_offset=pairs.point_offset,
-            pair_role=pair_role,
-            point_is_shaded=b.point_is_shaded,
-        )
-        return b.shaded[: nonzero(self.dev, b.point_is_shaded, b.point_place, b.shaded)]
+        """The points with a hit that is not dropped; with any hit where pair_role is None."""
+        n, b, has_hit = pairs.points, self._buffers, pairs.point_count
+        if pair_role is not None:
+            has_hit = b.point_is_shaded
+            self.dev.program("raster/blend_weights").launch(
+                "find_shaded_points",
+                n,
+                n=n,
+                p=pairs.capacity,
+                point_offset=pairs.point_offset,
+                pair_role=pair_role,
+                point_is_shaded=has_hit,
+            )
+        return nonzero(self.dev, has_hit, b.point_place, b.shaded)
 
     def _shared(self, weights):
         return self.dev.program("raster/blend_weights", HAS_ROLES=int(weights.has_roles))

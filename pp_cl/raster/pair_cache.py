@@ -6,7 +6,7 @@ and the network change. So the pairs can be kept, and projecting and sorting be 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Hashable
+from collections.abc import Hashable
 from dataclasses import fields, replace
 
 from pyopencl.array import Array
@@ -14,7 +14,8 @@ from pyopencl.array import Array
 from pp_cl.device.device import Device
 from pp_cl.raster.pairs import Pairs
 
-ARRAYS = tuple(field.name for field in fields(Pairs) if field.name != "total")
+ARRAYS = tuple(field.name for field in fields(Pairs) if field.name != "count")
+BY_PAIR = ("pair_pixel", "pair_point_closeness", "pair_key")
 
 
 class PairCache:
@@ -41,20 +42,25 @@ class PairCache:
         self._views: dict[Hashable, Pairs] = {}
         self.bytes = 0
 
-    def get(self, key: Hashable, build: Callable[[], Pairs]) -> Pairs:
-        """The pairs of the view called `key`, from the cache or from build().
+    def get(self, key: Hashable) -> Pairs | None:
+        """The pairs of the view called `key`, None where they are not here.
 
-        key: None for a view that does not repeat. Until clear(), a key must stand for one camera,
-        size and set of points.
+        Until clear(), a key must stand for one camera, size and set of points.
         """
-        if key in self._views:
-            return self._views[key]
-        pairs = build()
-        needed = sum(getattr(pairs, name).nbytes for name in ARRAYS)
-        if key is not None and self.bytes + needed <= self.budget:
-            self.bytes += needed
-            self._views[key] = replace(pairs, **{n: self._copy(getattr(pairs, n)) for n in ARRAYS})
-        return pairs
+        return self._views.get(key)
+
+    def keep(self, key: Hashable, pairs: Pairs) -> None:
+        """Keep a copy of the pairs of the view called `key`, if the budget allows.
+
+        key: None for a view that does not repeat.
+        """
+        rows = {name: getattr(pairs, name) for name in ARRAYS}
+        rows |= {name: rows[name][: max(1, pairs.total)] for name in BY_PAIR}
+        needed = sum(array.nbytes for array in rows.values())
+        if key is None or key in self._views or self.bytes + needed > self.budget:
+            return
+        self.bytes += needed
+        self._views[key] = replace(pairs, **{name: self._copy(rows[name]) for name in ARRAYS})
 
     def _copy(self, array: Array) -> Array:
         copy = self.dev.empty(array.shape, array.dtype)

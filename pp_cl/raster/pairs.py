@@ -9,7 +9,8 @@ from pyopencl.array import Array
 
 from pp_cl.device.buffers import Buffers, Table, grown
 from pp_cl.device.device import Device
-from pp_cl.device.scan import exclusive_scan, nonzero, read_total
+from pp_cl.device.scan import exclusive_scan, read_total
+from pp_cl.device.transfer import Reading
 from pp_cl.errors import UserError
 from pp_cl.raster.project import Footprint, ProjectedPoints
 
@@ -20,7 +21,10 @@ MOST_PAIRS = 2**32 - 1  # pairs are numbered by uint32
 class Pairs:
     """The hits of a view of N points and HW pixels, valid until the next one is built.
 
-    total: number of pairs; P = max(1, total). seen: (S,) uint32, the points with a pair, ascending.
+    P is what there was room for: where there are more pairs, there are none of the pixels, and
+    those of the points must not be read.
+
+    count: of one number, how many pairs there are. point_count: (N,) uint32, pairs of each point.
     point_offset: (N+1,) uint32, point i owns pairs point_offset[i] to point_offset[i+1].
     pixel_offset: (HW+1,) uint32, pixel q owns keys pixel_offset[q] to pixel_offset[q+1].
     pair_pixel: (P,) uint32, y*W + x. pair_point_closeness: (P, 2) uint32, the point, and the bits
@@ -28,13 +32,23 @@ class Pairs:
     each pixel by depth, then by point.
     """
 
-    total: int
-    seen: Array
+    count: Reading
+    point_count: Array
     point_offset: Array
     pixel_offset: Array
     pair_pixel: Array
     pair_point_closeness: Array
     pair_key: Array
+
+    @property
+    def total(self) -> int:
+        """The number of pairs; waits until it is known."""
+        return int(self.count.get()[0])
+
+    @property
+    def capacity(self) -> int:
+        """P."""
+        return len(self.pair_pixel)
 
     @property
     def points(self) -> int:
@@ -62,7 +76,6 @@ class PairBuilder:
         return {
             "point_count": ((n,), np.uint32),
             "point_offset": ((n + 1,), np.uint32),
-            "seen": ((n,), np.uint32),
             "pixel_count": ((pixels,), np.uint32),
             "pixel_offset": ((pixels + 1,), np.uint32),
             "pair_pixel": ((pairs,), np.uint32),
@@ -72,50 +85,71 @@ class PairBuilder:
         }
 
     def build(self, points: ProjectedPoints, size: tuple[int, int]) -> Pairs:
-        """Pairs of an image of size (height, width). Waits for the device to learn their number.
+        """Pairs of an image of size (height, width), with room for all. Waits for the device.
 
         Raises UserError for more pairs than can be numbered or kept in the device's memory.
         """
-        n, pixels, b, launch = len(points.point_box), size[0] * size[1], self._buffers, self._launch
-        b.require(self.table(n, pixels, max(1, self._capacity)))
-        launch("pairs_count", n, points, point_count=b.point_count)
-        seen = b.seen[: nonzero(self.dev, b.point_count, b.point_offset, b.seen)]
-        exclusive_scan(self.dev, b.point_count, b.point_offset)
-        total = self._reserve(n, pixels, read_total(self.dev, b.point_offset))
+        pairs = self.enqueue(points, size)
+        while not self.has_room(pairs):
+            pairs = self.enqueue(points, size)
+        return pairs
 
-        names = ("pair_pixel", "pair_point_closeness", "pair_key", "pair_scratch")
-        pair = {name: getattr(b, name)[: max(1, total)] for name in names}
-        scratch = pair.pop("pair_scratch")
+    def has_room(self, pairs: Pairs) -> bool:
+        """Whether there was room for the pairs; if not, the next ones will have it. Waits until
+        their number is known. Raises UserError as build() does.
+        """
+        total = pairs.total
+        if total >= MOST_PAIRS:
+            raise UserError(
+                f"the points of one view cover more than {MOST_PAIRS} pixels in all: "
+                "lower --points, raise --downscale, or lower raster.radius"
+            )
+        if total > pairs.capacity:
+            self._capacity = grown(self._capacity, total)
+        return total <= pairs.capacity
+
+    def enqueue(self, points: ProjectedPoints, size: tuple[int, int]) -> Pairs:
+        """As build(), but without waiting, and perhaps without room."""
+        n, pixels, b, launch = len(points.point_box), size[0] * size[1], self._buffers, self._launch
+        capacity = max(1, self._capacity)
+        b.require(self.table(n, pixels, capacity))
+        launch("pairs_count", n, points, point_count=b.point_count)
+        exclusive_scan(self.dev, b.point_count, b.point_offset)
+        count = read_total(self.dev, b.point_offset)
         self.dev.fill(b.pixel_count, 0)
         launch(
             "pairs_fill",
             n,
             points,
+            p=capacity,
             point_offset=b.point_offset,
-            pair_pixel=pair["pair_pixel"],
-            pair_point_closeness=pair["pair_point_closeness"],
-            pair_place=scratch,
+            pair_pixel=b.pair_pixel,
+            pair_point_closeness=b.pair_point_closeness,
+            pair_place=b.pair_scratch,
             pixel_count=b.pixel_count,
         )
         exclusive_scan(self.dev, b.pixel_count, b.pixel_offset)
         self.program.launch(
             "pairs_scatter",
-            total,
-            pairs=total,
-            pair_pixel=pair["pair_pixel"],
-            pair_place=scratch,
+            capacity,
+            p=capacity,
+            hw=pixels,
+            pair_pixel=b.pair_pixel,
+            pair_place=b.pair_scratch,
             pixel_offset=b.pixel_offset,
-            pair_key=pair["pair_key"],
+            pair_key=b.pair_key,
         )
         self.program.launch(
             "pairs_sort",
             pixels,
             hw=pixels,
             pixel_offset=b.pixel_offset,
-            scratch=scratch,
-            pair_key=pair["pair_key"],
+            scratch=b.pair_scratch,
+            pair_key=b.pair_key,
         )
-        return Pairs(total, seen, b.point_offset, b.pixel_offset, **pair)
+        fields = ("point_count", "point_offset", "pixel_offset", "pair_pixel")
+        fields += ("pair_point_closeness", "pair_key")
+        return Pairs(count, **{name: getattr(b, name) for name in fields})
 
     def _launch(self, kernel, n, points, **arguments):
         """Launch a kernel that walks over the pixels of each point's box."""
@@ -130,14 +164,3 @@ class PairBuilder:
             point_box=points.point_box,
             **arguments,
         )
-
-    def _reserve(self, n, pixels, total):
-        """Make room for `total` pairs; returns that number."""
-        if total >= MOST_PAIRS:
-            raise UserError(
-                f"the points of one view cover more than {MOST_PAIRS} pixels in all: "
-                "lower --points, raise --downscale, or lower raster.radius"
-            )
-        self._capacity = grown(self._capacity, total)
-        self._buffers.require(self.table(n, pixels, max(1, self._capacity)))
-        return total

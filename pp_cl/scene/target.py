@@ -5,7 +5,9 @@ over white.
 import numpy as np
 from pyopencl.array import Array
 
+from pp_cl.device.buffers import Buffers
 from pp_cl.device.device import Device
+from pp_cl.device.transfer import send
 from pp_cl.scene.views import View
 
 
@@ -20,30 +22,34 @@ class Target:
         self.dev = dev
         self.program = dev.program("scene/target")
         self._view = self._image = None  # the view loaded, and its image on the device
+        self._buffers = Buffers(dev)
 
     def load(self, view: View) -> None:
         """Bring a view's image to the device, unless it is there."""
         if self._view is None or self._view.image is not view.image:
             if self._image is None or self._image.shape != view.image.shape:
                 self._image = self.dev.empty(view.image.shape, np.uint8)
-            self._image.set(np.ascontiguousarray(view.image))
+            send(self.dev, self._image, view.image)
         self._view = view
 
     def crop(self, box: tuple[int, int, int, int], jitter: tuple[int, int] = (0, 0)) -> Array:
-        """(height, width, 3) float32: a part of the loaded view's reduced image.
+        """(height, width, 3) float32: a part of the loaded view's reduced image, valid until the
+        next call.
 
         box: (x0, y0, width, height), reduced pixels; may reach outside of the image. jitter: stored
         pixels by which all blocks lie further right and down. View.crop_camera gives the camera.
         """
-        target = self.dev.empty((box[3], box[2], 3))
-        self._launch("target_forward", box, jitter, target=target)
-        return target
+        self._buffers.require({"target": ((box[3], box[2], 3), np.float32)})
+        self._launch("target_forward", box, jitter, target=self._buffers.target)
+        return self._buffers.target
 
     def alpha(self, box: tuple[int, int, int, int], jitter: tuple[int, int] = (0, 0)) -> Array:
-        """(height, width) float32: the mean alpha of the same pixels, 0 outside of the image."""
-        alpha = self.dev.empty((box[3], box[2]))
-        self._launch("target_alpha", box, jitter, alpha=alpha)
-        return alpha
+        """(height, width) float32: the mean alpha of the same pixels, 0 outside of the image; valid
+        until the next call.
+        """
+        self._buffers.require({"alpha": ((box[3], box[2]), np.float32)})
+        self._launch("target_alpha", box, jitter, alpha=self._buffers.alpha)
+        return self._buffers.alpha
 
     def _launch(self, kernel, box, jitter, **output):
         x0, y0, width, height = box

@@ -66,6 +66,11 @@ class PairedPoints:
         )
         self.pairs = PairBuilder(dev, self.footprint).build(self.projected, self.shape)
 
+    @property
+    def seen(self) -> np.ndarray:
+        """(?,) the points with a pair, ascending."""
+        return np.flatnonzero(self.pairs.point_count.get())
+
     def pair_points(self) -> np.ndarray:
         """(P,) the point of each pair, from the offsets alone."""
         return np.repeat(np.arange(self.n), np.diff(self.pairs.point_offset.get().astype(np.int64)))

@@ -65,7 +65,7 @@ def _not_finite(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
         positions = np.array([[0, 0, 3.0], [0, 0, 3.0], [0.001, 0, 4.0]])
         positions[1, rng.integers(3)] = bad
         scene = PairedPoints(dev, AXIS, positions, 0.1, kind="sphere")
-        yield exact(scene.pairs.seen.get(), [0, 2])
+        yield exact(scene.seen, [0, 2])
         features = scene.blend(np.ones(3), 0.01, np.ones((3, 16)) * 2)
         ones = np.ones((1, 1, 16))
         gradients = scene.gradients(ones) | scene.sphere_gradients(ones)
@@ -79,7 +79,7 @@ def _behind(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
     for kind in KINDS:
         scene = PairedPoints(dev, AXIS, positions, 0.01, kind=kind, depth_range=(1e-3, FAR))
         yield exact(scene.projected.point_camera.get()[:, 3], [-1, -1, -1, -1, 3])
-        yield exact(scene.pairs.seen.get(), [4])
+        yield exact(scene.seen, [4])
 
 
 def _pairs(kind: str, dev: Device, rng: np.random.Generator) -> Iterator[Check]:
@@ -111,7 +111,7 @@ def _check_pairs(scene, expected):
     yield relative(depth, expected["depth"][points[pair], pixels[pair]], RIM)
     inner = pixels[pair][1:] == pixels[pair][:-1]
     yield exact((keys[1:] > keys[:-1])[inner], np.ones(inner.sum(), bool))
-    yield exact(pairs.seen.get(), np.flatnonzero(hits.any(axis=1)))
+    yield exact(scene.seen, np.flatnonzero(hits.any(axis=1)))
 
 
 def _equal_depths(dev: Device, rng: np.random.Generator) -> Iterator[Check]:

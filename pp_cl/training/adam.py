@@ -111,8 +111,7 @@ class PointsWithGradient:
             grad_point_features=grad_point_features,
             has_gradient=buffers.has_gradient,
         )
-        found = nonzero(self.dev, buffers.has_gradient, buffers.offsets, buffers.rows)
-        return buffers.rows[:found]
+        return nonzero(self.dev, buffers.has_gradient, buffers.offsets, buffers.rows).array
 
 
 def skipped_steps_table() -> np.ndarray:

@@ -5,8 +5,12 @@ from pyopencl.array import Array
 
 from pp_cl.device.buffers import Buffers, Table
 from pp_cl.device.device import Device
+from pp_cl.layers.tiles import SIDE, grid_shape
+from pp_cl.network.tile_sets import grow
 
 TAPS = 11  # pixels, the side of an SSIM window
+REACH = 2 * (TAPS // 2)  # pixels over which the loss's gradient depends on the target
+WHITE = 1.0  # of a target where its photograph is transparent
 MARGIN = 2  # float16 by which a scratch row is longer than its values, >= 3 * (TAPS - 1) / 16
 
 
@@ -99,6 +103,18 @@ class Loss:
     def _launch(self, kernel, size, **arguments):
         program = self.dev.program("training/loss", TAPS=TAPS, MARGIN=MARGIN)
         program.launch(kernel, size, **arguments)
+
+
+def gradient_tiles(found: np.ndarray, size: tuple[int, int], offset: tuple[int, int]) -> np.ndarray:
+    """(rows, columns) bool: the tiles of a prediction of `size` = (height, width) whose gradient
+    depends on more than a prediction of one colour before white, borders aside.
+
+    found: (?, ?) bool, the target's tiles that are not all white. offset: (left, top) of the target
+    in the prediction, less than a tile.
+    """
+    tiles = np.zeros(grid_shape(*size), bool)
+    tiles[: found.shape[0], : found.shape[1]] = found
+    return grow(tiles, -(-(REACH + max(offset)) // SIDE))
 
 
 def corner_of(

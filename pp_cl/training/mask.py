@@ -5,6 +5,7 @@ from pyopencl.array import Array
 
 from pp_cl.device.buffers import Buffers, Table
 from pp_cl.device.device import Device
+from pp_cl.device.transfer import Reading, read_later
 
 
 class MaskLoss:
@@ -76,6 +77,6 @@ class MaskLoss:
         )
         return buffers.grad_alpha
 
-    def terms(self) -> dict[str, float]:
+    def terms(self) -> dict[str, Reading]:
         """{"mask": the mean square of the last call of add()}, {} where there was none."""
-        return {"mask": float(self._buffers.mean.get()[0])} if self._measured else {}
+        return {"mask": read_later(self.dev, self._buffers.mean)} if self._measured else {}

@@ -7,6 +7,7 @@ from pyopencl.array import Array
 
 from pp_cl.device.buffers import Buffers, Table
 from pp_cl.device.device import Device
+from pp_cl.device.transfer import Reading, read_later
 from pp_cl.errors import UserError
 from pp_cl.layers.policy import ConvolutionPolicy
 from pp_cl.metrics.lpips import BLOCKS, LEAST_SIZE, WIDTHS, Lpips, size_of, vgg_layers
@@ -125,9 +126,9 @@ class PerceptualLoss:
         )
         return maps, targets
 
-    def terms(self) -> dict[str, float]:
+    def terms(self) -> dict[str, Reading]:
         """{"lpips": LPIPS of the last call of add()}, {} at weight 0."""
-        return {"lpips": float(self._buffers.total.get()[0])} if self._network else {}
+        return {"lpips": read_later(self.dev, self._buffers.total)} if self._network else {}
 
     def _launch(self, kernel, size, **arguments):
         self.dev.program("training/perceptual").launch(kernel, size, **arguments)

@@ -155,33 +155,6 @@ def test_fresh_guarded_buffers_are_nan(dev):
     assert (dev.empty((33,), np.uint32).get() == 0xFFFFFFFF).all()
 
 
-def test_several_arrays_by_one_transfer(dev, rng):
-    """Of any sizes and types, empty ones too; each lives on when the others are gone."""
-    values = [
-        rng.normal(size=(31, 3)).astype(np.float32),
-        np.empty((2, 0), np.int32),
-        np.arange(257, dtype=np.uint32)[::2],
-        np.float32([1]),
-    ]
-    before = dev.bytes
-    parts = dev.upload_all(values)
-    for part, array in zip(parts, values, strict=True):
-        assert part.shape == array.shape and part.dtype == array.dtype
-        assert np.array_equal(part.get(), array)
-    assert dev.bytes > before
-    last = parts[-1]
-    del parts, part
-    assert last.get() == 1 and dev.bytes > before
-    del last
-    assert dev.bytes == before
-
-
-def test_a_kernel_reads_a_part(dev, rng):
-    first, second = dev.upload_all([np.arange(5, dtype=np.float32), np.float32([7, -2, 3])])
-    dev.copy(first[:3], second)
-    assert first.get().tolist() == [7, -2, 3, 3, 4] and second.get().tolist() == [7, -2, 3]
-
-
 # ---- programs and debug levels
 
 

@@ -24,9 +24,9 @@ from pp_cl.layers.tiles import (
     copy_list,
     grid_shape,
     some_tiles,
-    tiles_compare,
     tiles_copy,
     tiles_find,
+    tiles_hit,
 )
 from pp_cl.layers.variants import VARIANTS
 from pp_cl.layers.work import Work
@@ -63,26 +63,21 @@ def test_find(dev, rng, shape):
     x = np.where(
         rng.random(shape) < 0.02, rng.choice([0.0, np.nan, np.inf, 1 + 2**-23], shape), 1
     ).astype(np.float32)
-    found = tiles_find(dev, dev.upload(x), 1.0)
+    found = tiles_find(dev, dev.upload(x), 1.0).get()
     assert found.shape == grid_shape(*shape[:2])
     for place, tile in by_tile(x).items():
         assert found[place] == (tile != 1).any()
 
 
-@pytest.mark.parametrize("shape", SHAPES)
-def test_compare(dev, rng, shape):
-    x = np.where(rng.random(shape) < 0.02, rng.choice([-0.0, np.nan, 1e-45], shape), 0).astype(
-        np.float32
-    )
-    tiles = by_tile(x)
-    source = np.arange(len(tiles)).reshape(grid_shape(*shape[:2]))
-    whole = [place for place, tile in tiles.items() if tile.shape[:2] == (SIDE, SIDE)]
-    for place in whole:
-        source[place] = source[whole[rng.integers(len(whole))]]
-    differs = tiles_compare(dev, dev.upload(x), source)
-    flat = list(tiles.values())
-    for place, tile in tiles.items():
-        assert differs[place] == (tile.tobytes() != flat[source[place]].tobytes())
+@pytest.mark.parametrize("height, width", [shape[:2] for shape in SHAPES])
+@pytest.mark.parametrize("share", [0.0, 0.02, 1.0])
+def test_hit(dev, rng, height, width, share):
+    hits = rng.integers(1, 5, (height, width)) * (rng.random((height, width)) < share)
+    offsets = np.concatenate([[0], np.cumsum(hits)]).astype(np.uint32)
+    found = tiles_hit(dev, dev.upload(offsets), (height, width)).get()
+    assert found.shape == grid_shape(height, width)
+    for place, tile in by_tile(hits).items():
+        assert found[place] == tile.any()
 
 
 @pytest.mark.parametrize("shape", SHAPES)

@@ -29,6 +29,7 @@ from pp_cl.scene.hull import build_grid, depth_range
 from pp_cl.scene.load import load_scene
 
 LAYERS = unet_layers((16, 16, 16))
+GRADIENT = np.float32([0.3, -0.2, 0.1])
 SIZE = (148, 180)  # room for a class inside; levels 1 and 2 end in tiles that are cut off
 OBJECTS = {  # (rows, columns) that are not background
     "inside": (slice(60, 81), slice(70, 93)),
@@ -53,7 +54,7 @@ def scene(rng, place, size=SIZE):
     """
     x, grad_y = (
         np.full((*size, 16), BACKGROUND, np.float32),
-        np.full((*size, 3), (0.3, -0.2, 0.1), np.float32),
+        np.full((*size, 3), GRADIENT, np.float32),
     )
     x[place] = rng.normal(size=x[place].shape)
     grad_y[place] = rng.normal(size=grad_y[place].shape)
@@ -61,10 +62,23 @@ def scene(rng, place, size=SIZE):
     return x, grad_y
 
 
+def active_tiles(x):
+    """(rows, columns) bool: the tiles of (H, W, C) that are not all background."""
+    return tiles_where((x != BACKGROUND).any(2))
+
+
+def tiles_where(pixels):
+    """(rows, columns) bool: the tiles that hold any of the pixels (H, W) bool."""
+    return halve(pixels, 2)
+
+
 def run(dev, net, x, grad_y, background):
     """[image, gradient of x, gradients of the parameters] as the device computes them."""
+    plan = None
+    if background is not None:
+        differs = tiles_where((grad_y != GRADIENT).any(2))
+        plan = net.plan_tiles(x.shape[:2], active_tiles(x), differs)
     x = dev.upload(x)
-    plan = None if background is None else net.plan_tiles(x, background)
     y = net.forward(x, True, plan).get()
     return [y, net.backward(dev.upload(grad_y)).get(), *[g.get() for g in net.gradients.values()]]
 
@@ -84,7 +98,7 @@ def test_the_shown_tiles_are_the_dense_networks(dev, rng, name, variant, blocks)
     policy = make_policy(dev, variant=variant)
     net = UNet(dev, (16, 32, 48), blocks=blocks, seed=1, policy=policy)
     device_x = dev.upload(features)
-    plan = net.plan_shown(device_x, BACKGROUND)
+    plan = net.plan_shown(SIZE, active_tiles(features))
     first = net.forward(device_x, False, plan).get()
     other = dev.upload(x)
     dense_of_other = net.forward(other, False).get()
@@ -95,7 +109,8 @@ def test_the_shown_tiles_are_the_dense_networks(dev, rng, name, variant, blocks)
     if not shown.any():
         return
     assert relative_error(first[shown], dense[shown]) < 2e-6
-    again = net.forward(device_x, False, net.plan_shown(device_x, BACKGROUND)).get()
+    plan = net.plan_shown(SIZE, active_tiles(features))
+    again = net.forward(device_x, False, plan).get()
     assert np.array_equal(again[shown], first[shown])
 
 
@@ -103,9 +118,8 @@ def test_what_is_not_shown_is_not_computed(dev, rng):
     net = UNet(dev, (16, 32, 48), seed=1)
     features = np.full((*SIZE, 16), BACKGROUND, np.float32)
     features[60:81, 70:93] = 0
-    device_x = dev.upload(features)
-    plan = net.plan_shown(device_x, BACKGROUND)
-    forward = ForwardPlan(dev, net.layers, SIZE, tiles_find(dev, device_x, BACKGROUND))
+    plan = net.plan_shown(SIZE, active_tiles(features))
+    forward = ForwardPlan(dev, net.layers, SIZE, active_tiles(features))
     assert plan.computed_fraction < 0.6 * forward.computed_fraction
     last = net.layers[-1].name
     assert plan.maps[last].computed.sum() == plan.shown.sum() + 1  # and one for all others
@@ -124,7 +138,7 @@ def test_equals_the_dense_network(dev, rng, always, name, variant, blocks):
     expected = run(dev, net, x, grad_y, None)
     actual = run(dev, net, x, grad_y, BACKGROUND)
     device_x = dev.upload(x)
-    plan = net.plan_tiles(device_x, BACKGROUND)
+    plan = net.plan_tiles(SIZE, active_tiles(x))
     assert (plan.computed_fraction < 0.4) == (name != "everywhere")
     np.testing.assert_array_equal(net.forward(device_x, False, plan).get(), actual[0])
     if variant == "direct":  # Winograd mixes the last bits of a tile
@@ -172,7 +186,7 @@ def test_few_tiles_in_large_images_only(dev, rng):
     net = UNet(dev, (16, 16, 16))
     for height, end, chosen in ((256, 60, True), (256, 240, False), (252, 60, False)):
         x = scene(rng, (slice(40, end), slice(40, end)), (height, 256))[0]
-        plan = net.plan_tiles(dev.upload(x), BACKGROUND)
+        plan = net.plan_tiles(x.shape[:2], active_tiles(x))
         assert (plan is not None) == chosen
         if chosen:
             assert plan.computed_fraction <= pp_cl.network.unet.MOST_COMPUTED
@@ -280,13 +294,16 @@ def test_lego(dev, data, rng, always):
     renderer = Renderer(dev, model, preset("tiny").raster)
     for view in views[:2]:
         x = renderer.rasterise(view.reduced(2).camera, 0.01).features
-        active = tiles_find(dev, x, BACKGROUND)
+        active = tiles_find(dev, x, BACKGROUND).get()
         maps = ForwardPlan(dev, model.net.layers, x.shape[:2], active).maps
         computed = np.mean([tile_map.computed.mean() for tile_map in maps.values()])
         grad_y = dev.upload(np.full((*x.shape[:2], 3), 0.1, np.float32))
         results = []
         for background in (None, BACKGROUND):
-            plan = None if background is None else model.net.plan_tiles(x, background)
+            plan = None
+            if background is not None:
+                same = np.zeros_like(active)
+                plan = model.net.plan_tiles(x.shape[:2], active, same)
             y = model.net.forward(x, True, plan).get()
             results.append(
                 (

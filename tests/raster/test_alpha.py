@@ -34,7 +34,7 @@ def test_weights_and_features(dev, rng, kind, n):
     expected = oracle.features(blended.blend, blended.point_features)
     assert relative_error(blended.features, expected) < 1e-5
     assert (blended.features[~blended.geometry["hit"].any(axis=0)] == 1).all()
-    assert blended.scene.weights.shaded is blended.scene.pairs.seen
+    assert np.array_equal(blended.scene.weights.shaded.get(), blended.scene.seen)
 
 
 @pytest.mark.parametrize("kind", KINDS)

@@ -94,7 +94,7 @@ def test_points_behind_and_on_the_plane_of_the_eye(dev, kind):
     positions = np.array([[0, 0, -3.0], [0, 0, 0], [3.0, 0, 0], [0, 3.0, 1e-9], [0, 0, 3.0]])
     scene = PairedPoints(dev, CAMERA, positions, 0.01, kind=kind, depth_range=(1e-3, FAR))
     assert scene.projected.point_camera.get()[:, 3].tolist() == [-1, -1, -1, -1, 3]
-    assert scene.pairs.seen.get().tolist() == [4]
+    assert scene.seen.tolist() == [4]
 
 
 @pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf, 3e38, -3e38])
@@ -103,7 +103,7 @@ def test_positions_that_are_not_finite(dev, bad, axis):
     positions = np.array([[0, 0, 3.0], [0, 0, 3.0], [0.001, 0, 4.0]])
     positions[1, axis] = bad
     scene = PairedPoints(dev, CAMERA, positions, 0.1, kind="sphere")
-    assert scene.pairs.seen.get().tolist() == [0, 2]
+    assert scene.seen.tolist() == [0, 2]
     features = scene.blend(np.ones(3), 0.01, np.ones((3, 16)) * 2)
     gradients = scene.gradients(np.ones((1, 1, 16))) | scene.sphere_gradients(np.ones((1, 1, 16)))
     assert np.isfinite(features).all()
@@ -165,7 +165,7 @@ def test_an_empty_view(dev):
     scene = PairedPoints(
         dev, replace(CAMERA, width=31, height=33), np.array([[100.0, 0, 3.0], [0, 0, 300.0]]), 0.01
     )
-    assert scene.pairs.total == 0 and scene.pairs.seen.size == 0
+    assert scene.pairs.total == 0 and scene.seen.size == 0
     assert (scene.blend([1, 1], 0.01, np.zeros((2, 16))) == 1).all()
     gradients = scene.gradients(np.ones((33, 31, 16)))
     assert not gradients["features"].any() and not gradients["opacity"].any()

@@ -31,7 +31,9 @@ def state(pairs):
 
 def build(cache, key, scene, builder):
     """The state of a scene's pairs, built through the cache."""
-    return state(cache.get(key, lambda: builder.build(scene.projected, scene.shape)))
+    pairs = cache.get(key) or builder.build(scene.projected, scene.shape)
+    cache.keep(key, pairs)
+    return state(pairs)
 
 
 def same(first, second):

@@ -40,7 +40,7 @@ def check(scene, expected):
     assert relative_error(depth, expected["depth"][points[pair], pixels[pair]]) < 1e-3
     inner = pixels[pair][1:] == pixels[pair][:-1]
     assert (keys[1:] > keys[:-1])[inner].all()
-    assert np.array_equal(pairs.seen.get(), np.flatnonzero(hits.any(axis=1)))
+    assert np.array_equal(scene.seen, np.flatnonzero(hits.any(axis=1)))
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -76,7 +76,7 @@ def test_every_visible_point_hits_a_pixel(dev, rng):
     camera = replace(make_camera(40, 36), fy=30.0)
     slopes = rng.uniform(-0.3, 0.3, (2000, 2))
     positions = camera.eye + 4 * np.column_stack([slopes, np.ones(2000)]) @ camera.pose[:, :3].T
-    assert len(PairedPoints(dev, camera, positions, 1e-3, kind="disc").pairs.seen) == 2000
+    assert len(PairedPoints(dev, camera, positions, 1e-3, kind="disc").seen) == 2000
 
 
 @pytest.mark.parametrize("n", [63, 64, 65, 128, 129, 1000, large(100_000)])

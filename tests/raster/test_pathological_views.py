@@ -61,7 +61,7 @@ def test_from_inside_the_object(dev, rng, kind, tau, radius):
     camera = replace(make_camera(28, 20), fx=6.5, fy=6.5)
     positions = camera.eye + rng.uniform(-1, 1, (400, 3))
     scene = check(dev, rng, camera, positions, radius, kind, tau, depth_range=(0.05, 4.0))
-    assert 20 < scene.pairs.seen.size < 300
+    assert 20 < scene.seen.size < 300
 
 
 @pytest.mark.parametrize("kind", KINDS)

@@ -77,7 +77,7 @@ def test_wrong_shapes_are_refused(dev, rng):
         shade_forward(
             dev,
             shaded.scene.projected,
-            shaded.scene.pairs.seen,
+            dev.upload(shaded.scene.seen, np.uint32),
             [dev.upload(shaded.sh[0]), dev.empty((31, 5, 16))],
             point_features=dev.empty((31, 16)),
         )
@@ -89,7 +89,7 @@ def test_half_a_degree_is_refused(dev, rng):
         shade_forward(
             dev,
             shaded.scene.projected,
-            shaded.scene.pairs.seen,
+            dev.upload(shaded.scene.seen, np.uint32),
             [dev.upload(c) for c in shaded.sh[:3]],
             point_features=dev.empty((31, 16)),
         )

@@ -23,7 +23,7 @@ def dropped_weights(scene):
 def test_weights(dev, rng, kind, gamma):
     blended = Blended(dev, rng, kind=kind, gamma=gamma)
     assert np.abs(blended.weight - blended.blend["weight"]).max() < 2e-4
-    assert blended.scene.weights.shaded is blended.scene.pairs.seen
+    assert np.array_equal(blended.scene.weights.shaded.get(), blended.scene.seen)
 
 
 @pytest.mark.parametrize("early_stop", [0.001, 0.05, 0.5])

@@ -18,6 +18,7 @@ from pp_cl.device.device import Device
 from pp_cl.layers.blocking import CHOICES, device_class
 from pp_cl.layers.direction import Direction
 from pp_cl.layers.policy import make_policy
+from pp_cl.layers.tiles import tiles_find
 from pp_cl.layers.variants import offered
 from pp_cl.metrics.lpips import Lpips, vgg_layers
 from pp_cl.metrics.shape import Mesh, sample_surface
@@ -168,10 +169,11 @@ def networks(dev: Device) -> None:
         net = make_network(dev, (CHANNELS,) * 3, make_policy(dev, variant=variant), blocks)
         x, grad = dev.zeros((size, size, CHANNELS)), dev.zeros((size, size, 3))
         train_runner(dev, net, x, grad)()
-    features = np.zeros((SPARSE_SIZE, SPARSE_SIZE, CHANNELS), np.float32)
-    features[:8, :8] = 1.0
-    x, grad = dev.upload(features), dev.zeros((SPARSE_SIZE, SPARSE_SIZE, 3))
-    net.forward(x, plan=net.plan_tiles(x, 0.0))
+    size = SPARSE_SIZE, SPARSE_SIZE
+    x, grad = dev.zeros((*size, CHANNELS)), dev.zeros((*size, 3))
+    active = tiles_find(dev, x, 0.0).get()
+    active[:2, :2] = True
+    net.forward(x, plan=net.plan_tiles(size, active))
     net.backward(grad)
 
 

@@ -1,0 +1,124 @@
+"""A training step in its steady state: the device is waited for once, and nothing is allocated."""
+
+import collections
+
+import numpy as np
+import pyopencl as cl
+import pytest
+from support.scenes import write_ball_scene
+
+import pp_cl.network.unet
+from pp_cl.config import configure, preset
+from pp_cl.device.device import Device
+from pp_cl.device.transfer import Reading
+from pp_cl.errors import UserError
+from pp_cl.files.run_folder import RunFolder
+from pp_cl.run import open_training
+
+COMPLETE = cl.command_execution_status.COMPLETE
+EVERY_STEP = {  # so that a step of any number does what most do
+    "points.count": 300,
+    "train.iterations": 1000,
+    "train.prune_every": 900,
+    "train.sh_smoothing_every": 900,
+}
+SETTINGS = {
+    "tiny": {},
+    "paper": {"network.widths": (16, 16, 16)},
+    "paper, crops": {"network.widths": (16, 16, 16), "train.crop": 24},
+}
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory):
+    """Folder of a small scene."""
+    return write_ball_scene(tmp_path_factory.mktemp("scene") / "ball")
+
+
+def make_trainer(dev, scene, folder, name):
+    """A trainer of the preset, with its settings changed."""
+    settings = EVERY_STEP | SETTINGS[name]
+    config = configure(
+        preset(name.partition(",")[0]), str(scene), [(k, v, "test") for k, v in settings.items()]
+    )
+    return open_training(dev, RunFolder(folder), config, None).trainer
+
+
+class Recorder:
+    """Counts what waits for the device, and what is allocated there."""
+
+    def __init__(self, monkeypatch):
+        self.counts = collections.Counter()
+        self._follow(monkeypatch, cl, "enqueue_copy", self._copies)
+        self._follow(monkeypatch, Device, "_allocate", "allocations")
+        self._follow(monkeypatch, Device, "finish", "waits")
+        self._follow(monkeypatch, Reading, "get", self._gets)
+
+    def _follow(self, monkeypatch, owner, name, counted):
+        original = getattr(owner, name)
+
+        def follow(*args, **named):
+            self.counts[counted if isinstance(counted, str) else counted(*args, **named)] += 1
+            return original(*args, **named)
+
+        monkeypatch.setattr(owner, name, follow)
+
+    @staticmethod
+    def _copies(queue, target, source, is_blocking=True, **_):
+        on_device = isinstance(target, cl.Buffer) and isinstance(source, cl.Buffer)
+        return "waits" if is_blocking and not on_device else "copies"
+
+    @staticmethod
+    def _gets(reading):
+        event = reading._event
+        there = event is None or event.command_execution_status == COMPLETE
+        return "read" if there else "waits"
+
+
+@pytest.mark.parametrize("planned", [False, True])
+@pytest.mark.parametrize("name", SETTINGS)
+def test_a_step_waits_once_and_allocates_nothing(dev, scene, tmp_path, monkeypatch, name, planned):
+    """planned: with background tiles left out, as in large images."""
+    if planned:
+        monkeypatch.setattr(pp_cl.network.unet, "LEAST_PIXELS", 0)
+        monkeypatch.setattr(pp_cl.network.unet, "MOST_COMPUTED", 2)
+    trainer = make_trainer(dev, scene, tmp_path / "run", name)
+    for _ in range(12):
+        trainer.train_step()
+    dev.finish()
+    with monkeypatch.context() as patched:
+        recorder = Recorder(patched)
+        for step in range(1, 6):
+            trainer.train_step()
+            assert recorder.counts["waits"] <= step, recorder.counts
+    assert recorder.counts["allocations"] == 0, recorder.counts
+    assert recorder.counts["read"] > 0
+
+
+def test_planned_steps_learn_the_same(dev, scene, tmp_path, monkeypatch):
+    """Gradients of the first step, with background tiles left out and without."""
+    found = []
+    for planned in (False, True):
+        monkeypatch.setattr(pp_cl.network.unet, "LEAST_PIXELS", 0 if planned else 10**9)
+        monkeypatch.setattr(pp_cl.network.unet, "MOST_COMPUTED", 2)
+        trainer = make_trainer(dev, scene, tmp_path / str(planned), "tiny")
+        assert trainer.model.net.is_planned((48, 48)) == planned
+        terms = trainer.train_step().get()
+        gradients = {name: g.get() for name, g in trainer.model.net.gradients.items()}
+        found.append((terms, gradients))
+    (terms, gradients), (planned_terms, planned_gradients) = found
+    assert planned_terms == pytest.approx(terms, rel=1e-5)
+    for name, gradient in gradients.items():
+        scale = np.abs(gradient).max()
+        assert np.abs(planned_gradients[name] - gradient).max() <= 1e-4 * scale, name
+
+
+def test_a_loss_that_is_not_finite_is_told_a_step_later_and_never_saved(dev, scene, tmp_path):
+    trainer = make_trainer(dev, scene, tmp_path / "run", "tiny")
+    trainer.train_step()
+    dev.fill(trainer.model.cloud.sh[0], np.nan)
+    trainer.train_step()
+    with pytest.raises(UserError, match="not finite at step 2"):
+        trainer.arrays()
+    with pytest.raises(UserError, match="not finite at step 2"):
+        trainer.train_step()

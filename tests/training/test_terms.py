@@ -1,0 +1,32 @@
+"""The terms of a step's loss."""
+
+import numpy as np
+import pytest
+
+from pp_cl.device.transfer import read_later
+from pp_cl.errors import UserError
+from pp_cl.training.terms import StepTerms
+
+
+def step_terms(dev, values, **others):
+    """Of step 7."""
+    readings = {name: read_later(dev, dev.upload(np.float32([v]))) for name, v in others.items()}
+    return StepTerms(7, read_later(dev, dev.upload(np.float32(values))), readings)
+
+
+def test_by_name(dev):
+    found = step_terms(dev, [0.75, 0.5, 0.25, 0.01], mask=0.125).get()
+    assert found == {
+        "loss": 0.75,
+        "l1": 0.5,
+        "ssim": 0.75,
+        "psnr": pytest.approx(20, abs=1e-6),
+        "mask": 0.125,
+    }
+    assert step_terms(dev, [0, 0, 0, 0]).get()["psnr"] == pytest.approx(100)
+
+
+@pytest.mark.parametrize("wrong", [np.nan, np.inf])
+def test_a_loss_that_is_not_finite(dev, wrong):
+    with pytest.raises(UserError, match="not finite at step 7"):
+        step_terms(dev, [wrong, 0, 0, 0]).get()
