@@ -100,8 +100,8 @@ class RasterConfig:
     )
     window: str = setting(
         "image",
-        "what is rendered. image: all of it; object: the tiles that show points and those around"
-        " them, the rest is white (a training renders its crops)",
+        "what is rendered. image: all of it; object: the tiles of 4x4 pixels that show points,"
+        " the rest is white (a training renders its crops)",
         choices=("image", "object"),
     )
     mean_gradient: bool = setting(

@@ -49,14 +49,14 @@ kernel void tiles_copy(
     const int h,
     const int w,
     const int c,
-    const int n,                // copies
-    global const int *from_to,  // (2, n) tiles: from, to
-    global float *x)            // (h, w, c)
+    const int n,                 // copies
+    global const int2 *from_to,  // (?, 2) tiles: from, to
+    global float *x)             // (h, w, c)
 {
     const int first = get_global_id(0) * CHANNELS, pixel = get_global_id(1), i = get_global_id(2),
               columns = tile_columns(w);
     if (first >= c || pixel >= SIDE * SIDE || i >= n) return;
-    const int from = from_to[i], to = from_to[n + i];
+    const int from = from_to[i].x, to = from_to[i].y;
     const int column = to % columns * SIDE + pixel % SIDE, row = to / columns * SIDE + pixel / SIDE;
     if (column >= w || row >= h) return;
     const size_t read =

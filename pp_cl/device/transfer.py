@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Hashable, Sequence
 
 import numpy as np
 import pyopencl as cl
 from pyopencl.array import Array
 
-from pp_cl.device.buffers import scratch
 from pp_cl.device.device import Device
 
 
@@ -62,20 +62,44 @@ def send(dev: Device, array: Array, values: np.ndarray) -> None:
         dev.sent.popleft()
 
 
-def send_all(dev: Device, name: Hashable, values: Sequence[np.ndarray]) -> list[Array]:
-    """Copies of several numpy arrays on the device by one transfer that is not waited for: parts of
-    one buffer, valid until the next call with this name.
+class Parts:
+    """Several arrays of a device in one buffer, which one transfer overwrites.
+
+    forms: [(shape, dtype)] of the arrays.
     """
-    align = dev.device.mem_base_addr_align // 8
-    ends = np.cumsum([0, *(-(-max(v.nbytes, 1) // align) * align for v in values)])
-    packed = np.zeros(ends[-1], np.uint8)
-    whole, parts = scratch(dev, name, len(packed), np.uint8), []
-    for start, array in zip(ends, values, strict=False):
-        packed[start : start + array.nbytes] = np.ascontiguousarray(array).reshape(-1).view("u1")
-        region = whole.base_data.get_sub_region(int(start), max(array.nbytes, 1))
-        parts.append(Array(dev.queue, array.shape, array.dtype, data=region))
-    send(dev, whole, packed)
-    return parts
+
+    def __init__(self, dev: Device, forms: Sequence[tuple[tuple[int, ...], type]]):
+        self._dev, self.forms = dev, forms
+        align = dev.device.mem_base_addr_align // 8
+        sizes = [max(1, math.prod(shape) * np.dtype(dtype).itemsize) for shape, dtype in forms]
+        self._starts = np.cumsum([0, *(-(-size // align) * align for size in sizes)])
+        self._whole = dev.empty((int(self._starts[-1]),), np.uint8)
+        self.arrays = []
+        for (shape, dtype), start, size in zip(forms, self._starts, sizes, strict=False):
+            region = self._whole.base_data.get_sub_region(int(start), size)
+            self.arrays.append(Array(dev.queue, shape, dtype, data=region))
+
+    def send(self, values: Sequence[np.ndarray]) -> None:
+        """Overwrite the arrays, after what is enqueued, by these of their dtypes; what is behind
+        shorter ones is undefined.
+        """
+        packed = np.empty(self._whole.shape, np.uint8)
+        for start, value in zip(self._starts, values, strict=False):
+            packed[start : start + value.nbytes] = (
+                np.ascontiguousarray(value).reshape(-1).view("u1")
+            )
+        send(self._dev, self._whole, packed)
+
+
+def shared_parts(
+    dev: Device, name: Hashable, forms: Sequence[tuple[tuple[int, ...], type]]
+) -> Parts:
+    """Parts of these forms, the same ones as long as calls with this name ask for the same."""
+    held = dev.scratch.get(name)
+    if held is None or held.forms != forms:
+        dev.scratch[name] = None  # frees the old ones first
+        held = dev.scratch[name] = Parts(dev, forms)
+    return held
 
 
 def _is_complete(event):

@@ -23,8 +23,8 @@ SIDE = 4
 class Tiles:
     """The tiles of a feature map that a kernel computes.
 
-    size: (height, width) of the feature map. number: how many tiles are computed. list: (3 +
-    number,) int32: height, width, number, the computed tiles ascending. count: (rows, columns)
+    size: (height, width) of the feature map. number: how many tiles are computed. list: (?,)
+    int32: height, width, number, the computed tiles ascending. count: (rows, columns)
     float32: in sums over the whole feature map a computed tile counts that often, for itself and
     its copies; 0 for tiles that are not computed.
     """
@@ -104,22 +104,20 @@ def tiles_hit(dev: Device, pixel_offset: Array, size: tuple[int, int]) -> TileFl
 
 
 def copy_list(source: np.ndarray, chosen: np.ndarray) -> np.ndarray:
-    """(2, n) int32: for tiles_copy(), the tiles whose numbers `source` gives for the n chosen ones,
+    """(n, 2) int32: for tiles_copy(), the tiles whose numbers `source` gives for the n chosen ones,
     and these.
 
     source: (rows, columns) integers; chosen: (rows, columns) bool.
     """
     to = np.flatnonzero(chosen)
-    return np.stack([source.ravel()[to], to]).astype(np.int32)
+    return np.stack([source.ravel()[to], to], axis=1).astype(np.int32)
 
 
-def tiles_copy(dev: Device, x: Array, from_to: Array) -> None:
-    """Copy tiles of x (H, W, C) float32 to others, (2, n) int32 as copy_list() has them; none is
-    both. A tile and its source have the same shape.
+def tiles_copy(dev: Device, x: Array, from_to: Array, n: int) -> None:
+    """Copy tiles of x (H, W, C) float32 to others: the first n of from_to, (?, 2) int32 as
+    copy_list() has them; none is both. A tile and its source have the same shape.
     """
-    (h, w, c), n = x.shape, from_to.shape[1]
-    if not n:
-        return
+    h, w, c = x.shape
     dev.program("layers/tiles").launch(
         "tiles_copy",
         (-(-c // LANES), SIDE * SIDE, n),

@@ -20,11 +20,19 @@ import numpy as np
 from pyopencl.array import Array
 
 from pp_cl.device.device import Device
-from pp_cl.device.transfer import send_all
-from pp_cl.layers.tiles import SIDE, Tiles, all_tiles, copy_list, tile_arrays, tiles_copy
+from pp_cl.device.transfer import shared_parts
+from pp_cl.layers.tiles import (
+    SIDE,
+    Tiles,
+    all_tiles,
+    all_tiles_buffers,
+    copy_list,
+    tile_arrays,
+    tiles_copy,
+)
 from pp_cl.network.architectures import convolutions
 from pp_cl.network.layer import Layer
-from pp_cl.network.tile_sets import grow, halve
+from pp_cl.network.tile_sets import distance, grow, halve
 
 # Pixels: tiles of the image's gradient that are nearer to its border are classes of their own,
 # because the loss sees the border from afar, too.
@@ -159,12 +167,12 @@ class TilePlan:
         border: int = 0,
     ):
         self.dev, self.layers, self.size = dev, layers, size
-        made, levels = {}, levels_of(layers)
+        made, levels, away = {}, levels_of(layers), distance(active)
         self.maps = {}
         for name, pixels in radius.items():
             level, n = levels[name], -(-pixels // SIDE)
             if (level, n) not in made:
-                near = halve(grow(active, n), level)
+                near = halve(away <= n, level)
                 made[level, n] = map_tiles(size, level, near, border + n)
             self.maps[name] = made[level, n]
         self.needed = {name: np.zeros_like(m.computed) for name, m in self.maps.items()}
@@ -173,21 +181,26 @@ class TilePlan:
     def upload(self) -> TilePlan:
         """The plan, with all lists on the device, until the next one of its class is."""
         maps = {id(tile_map): tile_map for tile_map in self.maps.values()}
-        lists = [part for m in maps.values() for part in tile_arrays(self._size(m), m.count())]
         copies = self._copy_lists()
-        arrays = iter(send_all(self.dev, type(self), [*lists, *copies.values()]))
+        forms = [form for m in maps.values() for form in all_tiles_buffers(*self._size(m)).values()]
+        forms += [((tile_map.source.size, 2), np.int32) for tile_map, _ in copies.values()]
+        parts = shared_parts(self.dev, type(self), forms)
+        lists = [part for m in maps.values() for part in tile_arrays(self._size(m), m.count())]
+        parts.send([*lists, *(from_to for _, from_to in copies.values())])
+        arrays = iter(parts.arrays)
         for key, m in maps.items():
             self._tiles[key] = Tiles(
                 self._size(m), int(m.computed.sum()), next(arrays), next(arrays)
             )
-        self._copies = dict(zip(copies, arrays, strict=True))
+        for (name, (_, from_to)), array in zip(copies.items(), arrays, strict=True):
+            self._copies[name] = array, len(from_to)
         return self
 
     def _size(self, tile_map):
         return self.size[0] >> tile_map.level, self.size[1] >> tile_map.level
 
     def _copy_lists(self):
-        """{name of a feature map: copy_list() of its needed tiles that are not computed}."""
+        """{name of a feature map: (TileMap, copy_list() of its needed tiles not computed)}."""
         return {name: _copies(self.maps[name], needed) for name, needed in self.needed.items()}
 
     def tiles(self, name: str) -> Tiles:
@@ -196,11 +209,11 @@ class TilePlan:
 
     def fill_copies(self, name: str, array: Array) -> None:
         """Copy representatives to the needed tiles that were not computed."""
-        tiles_copy(self.dev, array, self._copies[name])
+        tiles_copy(self.dev, array, *self._copies[name])
 
 
 def _copies(tile_map, needed):
-    return copy_list(tile_map.source, needed & ~tile_map.computed)
+    return tile_map, copy_list(tile_map.source, needed & ~tile_map.computed)
 
 
 class ImagePlan(TilePlan):

@@ -18,13 +18,11 @@ from pp_cl.network.sparse_tiles import (
     ShownPlan,
     receptive_radius,
 )
-from pp_cl.network.tile_sets import grow
 from pp_cl.network.workspace import Workspace, WorkspacePlan, parameter_table
 from pp_cl.settings import NetworkConfig
 
 # Background tiles are skipped only in images of at least LEAST_PIXELS pixels, and only if at most
 # MOST_COMPUTED of the multiplications remain: finding them costs time too.
-SHOWN_AROUND = 1  # tiles around the points that plan_shown() takes for the object as well
 LEAST_PIXELS, MOST_COMPUTED = 1 << 16, 0.8
 MULTIPLE = 4  # pixels: two poolings halve the height and the width
 
@@ -114,15 +112,13 @@ class UNet:
     def shown_margin(self) -> int:
         """How far from what is not background, in pixels, anything matters to plan_shown()."""
         radius = receptive_radius(self.layers)[self.layers[-1].name]
-        return radius + (SHOWN_AROUND + 1) * SIDE
+        return radius + SIDE
 
     def plan_shown(self, size: tuple[int, int], active: np.ndarray) -> ShownPlan:
         """What to compute for the `active` tiles, (rows, columns) bool, of an image of `size` =
-        (height, width) and those around them; the image is undefined elsewhere. Valid until the
-        next plan.
+        (height, width); the image is undefined elsewhere. Valid until the next plan.
         """
-        shown = grow(active, SHOWN_AROUND)
-        return ShownPlan(self.dev, self.layers, size, shown).upload()
+        return ShownPlan(self.dev, self.layers, size, active).upload()
 
     def forward(self, x: Array, training: bool = True, plan: ImagePlan | None = None) -> Array:
         """(H, W, 3) image of the features x (H, W, channels_in); H and W are multiples of 4.
@@ -214,15 +210,13 @@ class UNet:
         return self._plans[key]
 
     def _workspace(self, size, training):
-        """The buffers for this size, allocated anew only when the size changes."""
-        plan = self._plan(size, training)
-        workspace = self._workspaces.get(training)
-        if workspace is None or workspace.size != size:
-            workspace = self._workspaces[training] = None  # frees the old buffers first
-            if training:
-                self._trained = None
-            workspace = self._workspaces[training] = Workspace(
-                self.dev, plan, self.parameters, self.gradients, frozen=self._frozen
+        """The buffers for this size."""
+        if training not in self._workspaces:
+            self._workspaces[training] = Workspace(
+                self.dev, self.parameters, self.gradients, frozen=self._frozen
             )
+        workspace, plan = self._workspaces[training], self._plan(size, training)
+        if training and plan is not workspace.plan:
+            self._trained = None
         workspace.follow(plan)
         return workspace

@@ -88,14 +88,13 @@ class Workspace:
 
     parameters, gradients: of the network. frozen: None, or {(layer, variant): weights} that fills
     with the weights as forward() of a variant transforms them, because they no longer change.
-    arrays: {name: array} of the outputs and of their gradients (buffers.gradient_of), without x;
-    some share a buffer, one after the other.
+    plan: the one that is followed. arrays: {name: array} of the outputs and of their gradients
+    (buffers.gradient_of), without x; some share a buffer, one after the other.
     """
 
     def __init__(
         self,
         dev: Device,
-        plan: WorkspacePlan,
         parameters: dict[str, Array],
         gradients: dict[str, Array],
         *,
@@ -103,22 +102,51 @@ class Workspace:
     ):
         self.dev, self.parameters, self.gradients = dev, parameters, gradients
         self._frozen = frozen
-        self.size, self.plan = plan.size, plan
-        self.arrays = {}
-        table = plan.buffers()
-        self._buffers = [dev.empty(*table[shared.label]) for shared in plan.shared]
-        for shared, buffer in zip(plan.shared, self._buffers, strict=True):
-            for name in shared.names:
-                shape = plan.shapes[name]
-                self.arrays[name] = buffer[: math.prod(shape)].reshape(shape)
-        self.work = Work.empty(dev, *plan.work_floats)
-        self.all_tiles = AllTiles(dev, plan.size, plan.layers)
+        self.plan: WorkspacePlan | None = None
+        self.arrays: dict[str, Array] = {}
+        self._buffers: list[Array | None] = []
+        self._arrays_of = {}  # {plan: arrays} in the present buffers
+        self._all_tiles = None
+        self.work = Work.empty(dev, COUNTERS, 1)
 
     def follow(self, plan: WorkspacePlan) -> None:
-        """Compute by another plan, of another policy, from now on."""
-        if plan is not self.plan:
-            self.plan = plan
-            self.work.grow(self.dev, *plan.work_floats)
+        """Compute by a plan from now on, in the same buffers where they are large enough: images of
+        a film differ in size. The arrays are undefined.
+        """
+        if plan is self.plan:
+            return
+        if self.plan is None or plan.size != self.plan.size:
+            self._all_tiles = None
+        self.plan = plan
+        self.work.grow(self.dev, *plan.work_floats)
+        self._reserve([shared.floats for shared in plan.shared])
+        if plan not in self._arrays_of:
+            self._arrays_of[plan] = {
+                name: buffer[: math.prod(plan.shapes[name])].reshape(plan.shapes[name])
+                for shared, buffer in zip(plan.shared, self._buffers, strict=False)
+                for name in shared.names
+            }
+        self.arrays = self._arrays_of[plan]
+
+    def _reserve(self, floats):
+        """Make room for so many floats in each buffer, where there is less."""
+        self._buffers += [None] * (len(floats) - len(self._buffers))
+        held = [0 if buffer is None else buffer.size for buffer in self._buffers]
+        small = [i for i, needed in enumerate(floats) if held[i] < needed]
+        if small:
+            self.arrays = {}
+            self._arrays_of.clear()
+        for i in small:  # the old ones are freed first
+            self._buffers[i] = None
+        for i in small:
+            self._buffers[i] = self.dev.empty((floats[i],))
+
+    @property
+    def all_tiles(self) -> AllTiles:
+        """Of an image of the plan's size."""
+        if self._all_tiles is None:
+            self._all_tiles = AllTiles(self.dev, self.plan.size, self.plan.layers)
+        return self._all_tiles
 
     def convolution(
         self, layer: Conv, direction: Direction, source: int | None = None

@@ -6,7 +6,9 @@ from pp_cl.scene.camera import Camera
 from pp_cl.scene.grid import Grid
 from pp_cl.scene.outline import project
 
-MULTIPLE = 4  # sides of a window: the U-Net halves its input twice
+# pixels: where a window begins, since the U-Net halves its input twice; and its sides, as long as
+# they are inside the image, so that the frames of a film differ little in size
+PLACE, MULTIPLE = 4, 32
 
 
 class ObjectWindow:
@@ -38,7 +40,7 @@ class ObjectWindow:
         """
         slant = np.hypot(1, (places - centre) / focal)
         pixels = reach * slant * focal + self._margin
-        first = int(np.clip(np.floor((places - pixels).min()), 0, size - 1)) // MULTIPLE * MULTIPLE
+        first = int(np.clip(np.floor((places - pixels).min()), 0, size - 1)) // PLACE * PLACE
         end = int(np.clip(np.ceil((places + pixels).max()), first + 1, size))
         return first, min(-(-(end - first) // MULTIPLE) * MULTIPLE, size - first)
 

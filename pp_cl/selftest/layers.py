@@ -176,7 +176,8 @@ def _tiles(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
     yield exact(tiles_find(dev, array, 1.0).get(), chosen)
     hits = np.concatenate([[0], np.cumsum((x != 1).any(2))])
     yield exact(tiles_hit(dev, dev.upload(hits, np.uint32), (8, 256)).get(), chosen)
-    tiles_copy(dev, array, dev.upload(copy_list(source, chosen)))
+    copies = copy_list(source, chosen)
+    tiles_copy(dev, array, dev.upload(copies), len(copies))
     yield exact(array.get(), np.ones_like(x))
 
 

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from pp_cl.device.transfer import read_later, send, send_all
+from pp_cl.device.transfer import read_later, send, shared_parts
 
 
 def test_a_reading_is_what_the_kernels_before_it_left(dev, rng):
@@ -34,26 +34,29 @@ def test_what_is_sent_may_be_dropped_at_once(dev, rng):
             send(dev, array, wrong)
 
 
-def test_several_arrays_by_one_transfer(dev, rng):
-    """Of any sizes and types, empty ones too; in the same memory the next time."""
-    values = [
-        rng.normal(size=(31, 3)).astype(np.float32),
-        np.empty((2, 0), np.int32),
-        np.arange(257, dtype=np.uint32)[::2],
-        np.float32([1]),
-    ]
-    for _ in range(2):
-        parts = send_all(dev, "some", values)
-        for part, array in zip(parts, values, strict=True):
-            assert part.shape == array.shape and part.dtype == array.dtype
-            assert np.array_equal(part.get(), array)
-        used = dev.bytes
-        values = values[::-1]
-    send_all(dev, "some", values)
-    assert dev.bytes == used
+def test_parts_of_one_buffer(dev, rng):
+    """Of any shapes and types, empty ones too; of a shorter one the front is sent."""
+    forms = [((31, 3), np.float32), ((2, 0), np.int32), ((257,), np.uint32), ((1,), np.float32)]
+    parts = shared_parts(dev, "some", forms)
+    values = [rng.integers(1, 9, shape).astype(dtype) for shape, dtype in forms]
+    parts.send(values)
+    for part, value in zip(parts.arrays, values, strict=True):
+        assert part.shape == value.shape and part.dtype == value.dtype
+        assert np.array_equal(part.get(), value)
+    used = dev.bytes
+    assert shared_parts(dev, "some", list(forms)) is parts
+    values = [values[0][:7] + 1, values[1], values[2][:9] + 1, values[3] + 1]
+    parts.send(values)
+    for part, value in zip(parts.arrays, values, strict=True):
+        assert np.array_equal(part.get()[: len(value)], value)
+    shared_parts(dev, "some", forms[:2])
+    del parts, part
+    assert dev.bytes < used
 
 
 def test_a_kernel_reads_a_part(dev):
-    first, second = send_all(dev, "two", [np.arange(5, dtype=np.float32), np.float32([7, -2, 3])])
+    parts = shared_parts(dev, "two", [((5,), np.float32), ((3,), np.float32)])
+    parts.send([np.arange(5, dtype=np.float32), np.float32([7, -2, 3])])
+    first, second = parts.arrays
     dev.copy(first[:3], second)
     assert first.get().tolist() == [7, -2, 3, 3, 4] and second.get().tolist() == [7, -2, 3]

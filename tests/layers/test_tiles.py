@@ -96,7 +96,10 @@ def test_copy(dev, rng, shape):
             source[place] = places.index(other)
             copies[place][:] = tiles[other]
     device_x = dev.upload(x)
-    tiles_copy(dev, device_x, dev.upload(copy_list(source, chosen)))
+    copies = copy_list(source, chosen)
+    more = np.full((len(copies) + 3, 2), 2**30, np.int32)
+    more[: len(copies)] = copies
+    tiles_copy(dev, device_x, dev.upload(more), len(copies))
     np.testing.assert_array_equal(device_x.get(), expected)
 
 
