@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from pp_cl.bench import page_plots
-from pp_cl.bench.plots import new_figure
+from pp_cl.bench.plots import INSTALL, new_figure
 
 ABOUT = ("device", "platform", "driver", "version", "convolutions", "budget", "seconds")
 FIGURE_SIZE = (9, 4)  # inches
@@ -18,8 +18,8 @@ OPEN_ROWS = 20  # longer tables are closed at first
 
 
 def page_text(result: dict[str, Any]) -> str:
-    """The page of what bench_overview() returns; every number on it is one of its numbers. Raises
-    UserError without matplotlib.
+    """The page of what bench_overview() returns; every number on it is one of its numbers. Without
+    matplotlib it has no pictures, and says so.
     """
     sections = [_section(result, section) for section in SECTIONS]
     about = [(name, _number_or_text(result[name])) for name in ABOUT]
@@ -104,15 +104,21 @@ SECTIONS = (
 
 def _section(result, section):
     title, text, draw, tables = section
-    figure = new_figure(FIGURE_SIZE)
-    draw(figure, result)
-    _add_legend(figure)
-    parts = [f"<h2>{title}</h2>", f"<p>{html.escape(text)}</p>", _image(figure, title)]
+    parts = [f"<h2>{title}</h2>", f"<p>{html.escape(text)}</p>", _picture(draw, result, title)]
     for name, key, columns in tables:
         table = _table(_rows_of(result, key), columns)
         state = " open" if table.count("<tr>") <= OPEN_ROWS else ""
         parts.append(f"<details{state}><summary>{name}</summary>\n{table}\n</details>")
     return "\n".join(parts)
+
+
+def _picture(draw, result, title):
+    figure = new_figure(FIGURE_SIZE)
+    if figure is None:
+        return f"<p>The picture needs matplotlib: {html.escape(INSTALL)}.</p>"
+    draw(figure, result)
+    _add_legend(figure)
+    return _image(figure, title)
 
 
 def _rows_of(result, key):

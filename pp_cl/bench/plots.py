@@ -6,6 +6,8 @@ from typing import Any
 from pp_cl.errors import UserError
 from pp_cl.files.atomic import atomic_file
 
+INSTALL = "install it with `pip install 'pp-cl[plot]'`"
+
 
 def check_files(
     json_file: str | None, plot_file: str | None, plot_option: str = "--plot"
@@ -19,21 +21,19 @@ def check_files(
     return _figure(plot_file, plot_option) if plot_file else None
 
 
-def new_figure(size: tuple[float, float], what: str = "the page") -> Any:
-    """An empty matplotlib figure of so many inches. Raises UserError without matplotlib, naming
-    what needs it.
-    """
+def new_figure(size: tuple[float, float]) -> Any | None:
+    """An empty matplotlib figure of so many inches, None without matplotlib."""
     try:
         from matplotlib.figure import Figure
     except ImportError:
-        raise UserError(
-            f"{what}: needs matplotlib; install it with `pip install 'pp-cl[plot]'`"
-        ) from None
+        return None
     return Figure(figsize=size, layout="constrained")
 
 
 def _figure(path, option):
-    figure, suffix = new_figure((8, 6), f"{option} {path}"), Path(path).suffix[1:].lower()
+    figure, suffix = new_figure((8, 6)), Path(path).suffix[1:].lower()
+    if figure is None:
+        raise UserError(f"{option} {path}: needs matplotlib; {INSTALL}")
     if suffix not in figure.canvas.get_supported_filetypes():
         raise UserError(f"{option} {path}: name a .png, .svg or .pdf file")
     return figure

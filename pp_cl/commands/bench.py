@@ -97,7 +97,6 @@ def _refuse_foreign(options):
 def _run_all(options):
     from pp_cl.bench.overview import bench_overview
     from pp_cl.bench.page import page_text
-    from pp_cl.bench.plots import new_figure
     from pp_cl.files.atomic import write_json, write_text
     from pp_cl.layers.policy import load_policy
 
@@ -106,7 +105,6 @@ def _run_all(options):
     text = (options.budget or "120").removesuffix("s")
     budget = shared.read_number("--budget", text, float, least=1, most=86400)
     folder = Path(options.out or "bench")
-    new_figure((1, 1))  # before anything is measured
     folder.mkdir(parents=True, exist_ok=True)
     dev = _open_device(options)
     policy = load_policy(dev, preset("tiny").network.tolerance)

@@ -40,7 +40,6 @@ def test_options_of_another_bench_are_one_line(words, named, capsys):
 
 
 def test_all_writes_a_page_and_its_numbers(tmp_path, capsys, monkeypatch):
-    pytest.importorskip("matplotlib")
     monkeypatch.setattr(overview, "bench_overview", lambda dev, policy, budget, tell: result())
     assert main(["bench", "--budget", "3s", "--out", str(tmp_path / "page")]) == 0
     assert json.loads((tmp_path / "page" / "bench.json").read_text()) == result()
@@ -66,7 +65,6 @@ def test_all_refuses_in_one_line(words, named, capsys):
 
 
 def test_a_folder_that_cannot_be_made_is_one_line(tmp_path, capsys):
-    pytest.importorskip("matplotlib")
     (tmp_path / "file").write_text("x")
     assert main(["bench", "--out", str(tmp_path / "file")]) == 2
     error = capsys.readouterr().err
