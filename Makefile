@@ -32,7 +32,7 @@ demo: $(READY) ## train the demo scene into runs/demo and evaluate it: minutes o
 	$(BIN)/pp-cl train demo --preset tiny --iterations 1500 --out runs/demo
 	$(BIN)/pp-cl eval runs/demo --metrics
 
-test: $(READY) ## run the tests on the device of PP_DEVICE, else the default one, a process a core
+test: $(READY) ## run the tests on the device of PP_DEVICE, else on all that work, a process a core
 	@$(BIN)/python -m pytest $(ON_ALL_CORES) $(ARGS)
 
 test-intel: $(READY) ## the same on Intel's CPU runtime, installed into .venv if need be (x86-64)

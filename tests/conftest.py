@@ -1,5 +1,5 @@
-"""Fixtures: one guarded device a session; the count of kernels launched and of tests that had real
-data.
+"""Fixtures: each device that works, guarded; the count of kernels launched and of tests that had
+real data.
 """
 
 import os
@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from support.guarded import DATA, GuardedDevice, TracedDevice
 
-from pp_cl.device.discover import open_device
+from pp_cl.device.discover import list_devices, open_device
 from pp_cl.device.launch import Program
 from pp_cl.files.cache import cache_folder, make_cache_folder
 from pp_cl.metrics.lpips_weights import WEIGHTS_FILE
@@ -43,16 +43,31 @@ def cache_of_its_own(tmp_path_factory):
         shutil.move(lent, make_cache_folder() / WEIGHTS_FILE)
 
 
-@pytest.fixture(scope="session")
-def session_device(tmp_path_factory):
-    """The device of PP_DEVICE, else the default one, with guarded buffers; with traced ones where
-    Oclgrind watches reads.
+def devices():
+    """PP_DEVICE, else the indices of all devices that work; None, the default one, if that is all
+    there is.
     """
+    if os.environ.get("PP_DEVICE"):
+        return [os.environ["PP_DEVICE"]]
+    found = [index for index, _, problem in list_devices() if problem is None]
+    return found if len(found) > 1 else [None]
+
+
+DEVICES = devices()
+
+
+@pytest.fixture(
+    scope="session",
+    params=DEVICES,
+    ids=[f"device {name}" if name else "device" for name in DEVICES],
+)
+def session_device(request, tmp_path_factory):
+    """A device with guarded buffers; with traced ones where Oclgrind watches reads."""
     if os.environ.get("OCLGRIND_UNINITIALIZED") != "1":
-        return GuardedDevice(open_device().device)
+        return GuardedDevice(open_device(request.param).device)
     log = tmp_path_factory.mktemp("oclgrind") / "log"
     os.environ["OCLGRIND_LOG"] = str(log)
-    return TracedDevice(open_device().device, log)
+    return TracedDevice(open_device(request.param).device, log)
 
 
 @pytest.fixture
