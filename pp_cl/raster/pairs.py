@@ -9,6 +9,7 @@ from pyopencl.array import Array
 
 from pp_cl.device.buffers import Buffers, Table, grown
 from pp_cl.device.device import Device
+from pp_cl.device.form import lanes
 from pp_cl.device.scan import exclusive_scan, nonzero, read_total
 from pp_cl.errors import UserError
 from pp_cl.raster.project import Footprint, ProjectedPoints
@@ -52,7 +53,7 @@ class PairBuilder:
 
     def __init__(self, dev: Device, footprint: Footprint):
         self.dev = dev
-        self.program = dev.program("raster/pairs", **footprint.defines)
+        self.program = dev.program("raster/pairs", LANES=lanes(dev), **footprint.defines)
         self._buffers = Buffers(dev)
         self._capacity = 0
 
@@ -107,15 +108,18 @@ class PairBuilder:
             pixel_offset=b.pixel_offset,
             pair_key=pair["pair_key"],
         )
-        self.program.launch(
-            "pairs_sort",
-            pixels,
-            hw=pixels,
-            pixel_offset=b.pixel_offset,
-            scratch=scratch,
-            pair_key=pair["pair_key"],
-        )
+        self._sort(pixels, total, pair["pair_pixel"], pair["pair_key"], scratch=scratch)
         return Pairs(total, seen, b.point_offset, b.pixel_offset, **pair)
+
+    def _sort(self, pixels, total, pair_pixel, pair_key, *, scratch):
+        """Sort the keys of each pixel in place."""
+        keys = {"pixel_offset": self._buffers.pixel_offset, "pair_key": pair_key}
+        if self.dev.is_cpu:
+            self.program.launch("pairs_sort", pixels, hw=pixels, scratch=scratch, **keys)
+            return
+        keys |= {"pairs": total, "pair_pixel": pair_pixel, "sorted": scratch}
+        self.program.launch("pairs_sort_runs", total, **keys)
+        self.program.launch("pairs_merge_runs", total, **keys)
 
     def _launch(self, kernel, n, points, **arguments):
         """Launch a kernel that walks over the pixels of each point's box."""
