@@ -16,7 +16,7 @@ ON_OCLGRIND := OCL_ICD_VENDORS=/usr/lib/oclgrind/liboclgrind-rt-icd.so OCLGRIND_
 	OCLGRIND_NUM_THREADS=1 OCLGRIND_BUILD_OPTIONS="-cl-opt-disable -DALWAYS_INLINE=static" PYOPENCL_NO_CACHE=1 \
 	PP_DEVICE=Oclgrind PP_DATA=/nonexistent
 
-.PHONY: help setup demo test test-intel bench lint format docs wheel oclgrind gpu-check test-coarse clean
+.PHONY: help setup demo test test-intel bench lint format docs wheel oclgrind gpu-check test-coarse test-gpu-form clean
 
 help: ## print this list
 	@sed -n 's/^\([a-z-]*\):.*## \(.*\)/\1	\2/p' Makefile | expand -t 12
@@ -43,6 +43,10 @@ test-intel: $(READY) ## the same on Intel's CPU runtime, installed into .venv if
 test-coarse: $(READY) ## run the tests of all kernels on PoCL with the coarse division that GPUs may have
 	@PYOPENCL_BUILD_OPTIONS=-cl-fast-relaxed-math PP_DEVICE="Portable Computing Language" \
 		$(BIN)/python -m pytest $(ON_ALL_CORES) -m "not large and not exact" $(ARGS) $(sort $(OCLGRIND) tests/device/test_rounding.py)
+
+# Drivers and kernels have one form for CPUs and one for GPUs (pp_cl/device/form.py).
+test-gpu-form: $(READY) ## run the tests on PoCL with all drivers and kernels in the form that they have on GPUs
+	@PP_FORM=gpu PP_DEVICE="Portable Computing Language" $(BIN)/python -m pytest $(ON_ALL_CORES) $(ARGS)
 
 bench: $(READY) ## time and error of the network and of its layers; ARGS="--size 200 --widths 32,64,128" for others
 	$(BIN)/pp-cl bench unet $(ARGS)

@@ -1,5 +1,5 @@
-// The 16 lanes of a vector reduced to one value: always lane i with lane i + 8, then i + 4, i + 2
-// and i + 1, so that the order of a sum is fixed.
+// The 16 or 4 lanes of a vector reduced to one value: always lane i with lane i + 8, then i + 4, i
+// + 2 and i + 1, so that the order of a sum is fixed.
 #ifndef PP_REDUCE_H
 #define PP_REDUCE_H
 
@@ -15,10 +15,18 @@
 #define SUM(a, b) ((a) + (b))
 #define UNION(a, b) ((a) | (b))
 
+#define REDUCE4(name, T, JOIN)                                                                     \
+    static inline T name(const T##4 v) {                                                           \
+        const T##2 v2 = JOIN(v.lo, v.hi);                                                          \
+        return JOIN(v2.x, v2.y);                                                                   \
+    }
+
 REDUCE16(sum16, float, SUM)
+REDUCE4(sum4, float, SUM)
 REDUCE16(max16, float, fmax)
 REDUCE16(max_int16, int, max)
 REDUCE16(or_int16, int, UNION)
+REDUCE4(or_int4, int, UNION)
 
 // Sum of the products of two 16-vectors.
 static inline float dot16(const float16 a, const float16 b) {

@@ -79,6 +79,13 @@ def dev(session_device):
 
 
 @pytest.fixture
+def cpu_form(dev, monkeypatch):
+    """For a test of what is chosen on CPUs: the device takes their form, PP_FORM or not."""
+    monkeypatch.delenv("PP_FORM", raising=False)
+    monkeypatch.setattr(dev, "is_cpu", True)
+
+
+@pytest.fixture
 def rng():
     """A seeded numpy generator."""
     return np.random.default_rng(7)

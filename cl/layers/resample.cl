@@ -1,12 +1,13 @@
 // The layers between convolutions, on (H, W, C) feature maps: pooling, bilinear upsampling, an
-// affine map (scale * x + offset). In all but the affine map a work-item is (16 channels, x, y):
+// affine map (scale * x + offset). In all but the affine map a work-item is (LANES channels, x, y):
 // one vector of a pixel, shorter at the last channels. It writes where its tile is computed
 // (tiles.h); max pooling writes everywhere.
 #include "common.h"
+#include "lanes.h"
 #include "layers/tiles.h"
-#include "vector.h"
 
-// One work-item per (16 channels, x, y) of out: reads the 2x2 pixels it covers, writes their mean.
+// One work-item per (LANES channels, x, y) of out: reads the 2x2 pixels it covers, writes their
+// mean.
 kernel void avgpool2_forward(
     const int h,  // of out
     const int w,
@@ -15,20 +16,20 @@ kernel void avgpool2_forward(
     global const float *tile_count,  // (?, ?) of out, 0 = not computed
     global float *out)               // (h, w, c)
 {
-    const int first = get_global_id(0) * CHANNELS, column = get_global_id(1),
-              row = get_global_id(2), lanes = c - first;
+    const int first = get_global_id(0) * LANES, column = get_global_id(1), row = get_global_id(2),
+              count = c - first;
     if (first >= c || column >= w || row >= h || !tile_is_computed(tile_count, column, row, w))
         return;
     global const float *upper = x + ((size_t)row * 4 * w + column * 2) * c + first,
                        *lower = upper + 2 * w * c;
-    const float16 sum = (load16(upper, lanes) + load16(upper + c, lanes)) +
-                        (load16(lower, lanes) + load16(lower + c, lanes));
-    store16(0.25f * sum, out + ((size_t)row * w + column) * c + first, lanes);
+    const floats sum = (load_lanes(upper, count) + load_lanes(upper + c, count)) +
+                       (load_lanes(lower, count) + load_lanes(lower + c, count));
+    store_lanes(0.25f * sum, out + ((size_t)row * w + column) * c + first, count);
 }
 
-// One work-item per (16 channels, x, y) of x: ADDS its share of grad_out to grad_x, which holds the
-// gradient from x's other use. If masked, it then sets it to 0 where x <= 0: x is the output of a
-// ReLU, grad_x becomes the gradient of that ReLU's input.
+// One work-item per (LANES channels, x, y) of x: ADDS its share of grad_out to grad_x, which holds
+// the gradient from x's other use. If masked, it then sets it to 0 where x <= 0: x is the output of
+// a ReLU, grad_x becomes the gradient of that ReLU's input.
 kernel void avgpool2_backward(
     const int h,  // of out
     const int w,
@@ -39,20 +40,20 @@ kernel void avgpool2_backward(
     global const float *tile_count,  // (?, ?) of grad_x, 0 = not computed
     global float *grad_x)            // (?, ?, c)
 {
-    const int first = get_global_id(0) * CHANNELS, column = get_global_id(1),
-              row = get_global_id(2), lanes = c - first;
+    const int first = get_global_id(0) * LANES, column = get_global_id(1), row = get_global_id(2),
+              count = c - first;
     if (first >= c || column >= 2 * w || row >= 2 * h ||
         !tile_is_computed(tile_count, column, row, 2 * w))
         return;
     const size_t at = ((size_t)row * 2 * w + column) * c + first;
-    const float16 dL_dout =
-        load16(grad_out + ((size_t)(row / 2) * w + column / 2) * c + first, lanes);
-    float16 dL_dx = load16(grad_x + at, lanes) + 0.25f * dL_dout;
-    if (masked) dL_dx = select((float16)0.0f, dL_dx, load16(x + at, lanes) > 0.0f);
-    store16(dL_dx, grad_x + at, lanes);
+    const floats dL_dout =
+        load_lanes(grad_out + ((size_t)(row / 2) * w + column / 2) * c + first, count);
+    floats dL_dx = load_lanes(grad_x + at, count) + 0.25f * dL_dout;
+    if (masked) dL_dx = select((floats)0.0f, dL_dx, load_lanes(x + at, count) > 0.0f);
+    store_lanes(dL_dx, grad_x + at, count);
 }
 
-// One work-item per (16 channels, x, y) of out: reads the 2x2 pixels it covers, writes their
+// One work-item per (LANES channels, x, y) of out: reads the 2x2 pixels it covers, writes their
 // largest; an odd last row or column of x is left out, as PyTorch does.
 kernel void maxpool2_forward(
     const int h,  // of out
@@ -62,20 +63,21 @@ kernel void maxpool2_forward(
     global const float *x,  // (?, x_width, c)
     global float *out)      // (h, w, c)
 {
-    const int first = get_global_id(0) * CHANNELS, column = get_global_id(1),
-              row = get_global_id(2), lanes = c - first;
+    const int first = get_global_id(0) * LANES, column = get_global_id(1), row = get_global_id(2),
+              count = c - first;
     if (first >= c || column >= w || row >= h) return;
     global const float *upper = x + ((size_t)row * 2 * x_width + column * 2) * c + first,
                        *lower = upper + x_width * c;
-    const float16 largest = fmax(
-        fmax(load16(upper, lanes), load16(upper + c, lanes)),
-        fmax(load16(lower, lanes), load16(lower + c, lanes)));
-    store16(largest, out + ((size_t)row * w + column) * c + first, lanes);
+    const floats largest = fmax(
+        fmax(load_lanes(upper, count), load_lanes(upper + c, count)),
+        fmax(load_lanes(lower, count), load_lanes(lower + c, count)));
+    store_lanes(largest, out + ((size_t)row * w + column) * c + first, count);
 }
 
-// One work-item per (16 channels, x, y) of out: ADDS grad_out to grad_x at the largest of the 2x2
-// pixels that it covers, of equal ones at the first, as PyTorch does. x is the output of a ReLU,
-// and grad_x holds the gradient of its input from another use of x: nothing is added where x is 0.
+// One work-item per (LANES channels, x, y) of out: ADDS grad_out to grad_x at the largest of the
+// 2x2 pixels that it covers, of equal ones at the first, as PyTorch does. x is the output of a
+// ReLU, and grad_x holds the gradient of its input from another use of x: nothing is added where x
+// is 0.
 kernel void maxpool2_backward(
     const int h,  // of out
     const int w,
@@ -85,34 +87,34 @@ kernel void maxpool2_backward(
     global const float *grad_out,  // (h, w, c)
     global float *grad_x)          // (?, x_width, c) accumulates
 {
-    const int first = get_global_id(0) * CHANNELS, column = get_global_id(1),
-              row = get_global_id(2), lanes = c - first;
+    const int first = get_global_id(0) * LANES, column = get_global_id(1), row = get_global_id(2),
+              count = c - first;
     if (first >= c || column >= w || row >= h) return;
     const size_t upper = ((size_t)row * 2 * x_width + column * 2) * c + first,
                  lower = upper + x_width * c;
     const size_t at[4] = {upper, upper + c, lower, lower + c};
-    float16 value[4];
-    float16 largest = 0.0f;
+    floats value[4];
+    floats largest = 0.0f;
 #pragma unroll
     for (int i = 0; i < 4; i++) {
-        value[i] = load16(x + at[i], lanes);
+        value[i] = load_lanes(x + at[i], count);
         largest = fmax(largest, value[i]);
     }
-    const float16 dL_dout = load16(grad_out + ((size_t)row * w + column) * c + first, lanes);
-    int16 open = largest > 0.0f;  // lanes whose largest value has not been met yet
+    const floats dL_dout = load_lanes(grad_out + ((size_t)row * w + column) * c + first, count);
+    ints open = largest > 0.0f;  // lanes whose largest value has not been met yet
 #pragma unroll
     for (int i = 0; i < 4; i++) {
-        const int16 taken = open & (value[i] == largest);
-        const float16 others = load16(grad_x + at[i], lanes);
-        store16(select(others, others + dL_dout, taken), grad_x + at[i], lanes);
+        const ints taken = open & (value[i] == largest);
+        const floats others = load_lanes(grad_x + at[i], count);
+        store_lanes(select(others, others + dL_dout, taken), grad_x + at[i], count);
         open &= ~taken;
     }
 }
 
-// One work-item per (16 channels, x, y) of x: writes the 2x2 pixels of out, which is twice as high
-// and wide, that lie in its pixel, and all of them in one tile. Each is the pixel of x that its
-// centre lies in and the nearest ones beside it, weighted 3/4 and 1/4 along each axis (bilinear,
-// align_corners False, the border repeated).
+// One work-item per (LANES channels, x, y) of x: writes the 2x2 pixels of out, which is twice as
+// high and wide, that lie in its pixel, and all of them in one tile. Each is the pixel of x that
+// its centre lies in and the nearest ones beside it, weighted 3/4 and 1/4 along each axis
+// (bilinear, align_corners False, the border repeated).
 kernel void upsample2_forward(
     const int h,  // of x
     const int w,
@@ -121,29 +123,29 @@ kernel void upsample2_forward(
     global const float *tile_count,  // (?, ?) of out, 0 = not computed
     global float *out)               // (?, ?, c)
 {
-    const int first = get_global_id(0) * CHANNELS, column = get_global_id(1),
-              row = get_global_id(2), lanes = c - first;
+    const int first = get_global_id(0) * LANES, column = get_global_id(1), row = get_global_id(2),
+              count = c - first;
     if (first >= c || column >= w || row >= h ||
         !tile_is_computed(tile_count, 2 * column, 2 * row, 2 * w))
         return;
     const int left = max(column - 1, 0) * c, right = min(column + 1, w - 1) * c;
-    float16 line[3][2];  // rows row - 1, row, row + 1 of x at the two columns of out
+    floats line[3][2];  // rows row - 1, row, row + 1 of x at the two columns of out
 #pragma unroll
     for (int i = 0; i < 3; i++) {
         global const float *pixels = x + (size_t)clamp(row - 1 + i, 0, h - 1) * w * c + first;
-        const float16 near = 0.75f * load16(pixels + column * c, lanes);
-        line[i][0] = near + 0.25f * load16(pixels + left, lanes);
-        line[i][1] = near + 0.25f * load16(pixels + right, lanes);
+        const floats near = 0.75f * load_lanes(pixels + column * c, count);
+        line[i][0] = near + 0.25f * load_lanes(pixels + left, count);
+        line[i][1] = near + 0.25f * load_lanes(pixels + right, count);
     }
     global float *corner = out + ((size_t)row * 4 * w + column * 2) * c + first;
 #pragma unroll
     for (int i = 0; i < 4; i++)
-        store16(
+        store_lanes(
             0.75f * line[1][i % 2] + 0.25f * line[i / 2 * 2][i % 2],
-            corner + (i / 2 * 2 * w + i % 2) * c, lanes);
+            corner + (i / 2 * 2 * w + i % 2) * c, count);
 }
 
-// One work-item per (16 channels, x, y) of x: gathers the 4x4 pixels of grad_out that read it,
+// One work-item per (LANES channels, x, y) of x: gathers the 4x4 pixels of grad_out that read it,
 // writes their weighted sum.
 kernel void upsample2_backward(
     const int h,  // of x
@@ -153,24 +155,24 @@ kernel void upsample2_backward(
     global const float *tile_count,  // (?, ?) of grad_x, 0 = not computed
     global float *grad_x)            // (h, w, c)
 {
-    const int first = get_global_id(0) * CHANNELS, column = get_global_id(1),
-              row = get_global_id(2), lanes = c - first;
+    const int first = get_global_id(0) * LANES, column = get_global_id(1), row = get_global_id(2),
+              count = c - first;
     if (first >= c || column >= w || row >= h || !tile_is_computed(tile_count, column, row, w))
         return;
     // The outermost row or column reads its own edge of x with weight 1: it counts once more in
     // place of the one outside.
     const int x0 = max(2 * column - 1, 0) * c, x1 = 2 * column * c, x2 = x1 + c,
               x3 = min(2 * column + 2, 2 * w - 1) * c;
-    float16 dL_dx = 0.0f;
+    floats dL_dx = 0.0f;
 #pragma unroll
     for (int dy = 0; dy < 4; dy++) {
         const int y = clamp(2 * row - 1 + dy, 0, 2 * h - 1);
         global const float *grad = grad_out + (size_t)y * 2 * w * c + first;
-        const float16 outer = load16(grad + x0, lanes) + load16(grad + x3, lanes);
-        const float16 inner = load16(grad + x1, lanes) + load16(grad + x2, lanes);
+        const floats outer = load_lanes(grad + x0, count) + load_lanes(grad + x3, count);
+        const floats inner = load_lanes(grad + x1, count) + load_lanes(grad + x2, count);
         dL_dx += (dy == 0 || dy == 3 ? 0.25f : 0.75f) * (0.25f * outer + 0.75f * inner);
     }
-    store16(dL_dx, grad_x + ((size_t)row * w + column) * c + first, lanes);
+    store_lanes(dL_dx, grad_x + ((size_t)row * w + column) * c + first, count);
 }
 
 // One work-item per element: reads x, writes scale * x + offset.

@@ -9,6 +9,7 @@
 // vec_type_hint: the vectors are written out; Intel's compiler would merge work-items into wider
 // ones, up to 8 times slower.
 #include "common.h"
+#include "lanes.h"
 #include "raster/footprint.h"
 #include "raster/pair_role.h"
 #include "reduce.h"
@@ -23,7 +24,8 @@
 #define MEAN 0  // 1: gradients are divided by the number of pixels that track the point (Pulsar)
 #endif
 
-// One work-item per pixel: reads its hits and their points' features, writes the blended features.
+// One work-item per part of a pixel: reads its hits and their points' features, writes the blended
+// features.
 kernel void blend_forward(
     const uint hw,                         // pixels
     global const uint *pixel_offset,       // (HW+1)
@@ -31,22 +33,22 @@ kernel void blend_forward(
     global const float16 *point_features,  // (N, 16)
     global float16 *features)              // (H, W, 16)
 {
-    const uint q = get_global_id(0);
+    const uint q = get_global_id(0) / ROW_PARTS;
     if (q >= hw) return;
-    float16 sum = 0.0f;
+    floats sum = 0.0f;
     float weights = 0.0f;
     for (uint i = pixel_offset[q]; i < pixel_offset[q + 1] && (uint)pixel_entry[i] != NONE; i++) {
         const float b = as_float((uint)(pixel_entry[i] >> 32));
-        sum += b * point_features[(uint)pixel_entry[i]];
+        sum += b * load_part(point_features, (uint)pixel_entry[i]);
         weights += b;
     }
     // the background's features are 1, its weight is what is left
-    features[q] = sum + (1.0f - weights);
+    store_part(sum + (1.0f - weights), features, q);
 }
 
-// One work-item per point: reads its pairs and their pixels' gradients, writes the gradients of its
-// features and opacity.
-kernel __attribute__((vec_type_hint(float16))) void blend_backward(
+// One work-item per part of a point: reads its pairs and their pixels' gradients, writes the
+// gradients of its features and, the first one, of its opacity.
+kernel __attribute__((vec_type_hint(floats))) void blend_backward(
     const uint n,                          // points
     global const float16 *point_features,  // (N, 16)
     global const uint *point_offset,       // (N+1)
@@ -58,9 +60,9 @@ kernel __attribute__((vec_type_hint(float16))) void blend_backward(
     global float16 *grad_point_features,   // (N, 16)
     global float *grad_opacity)            // (N)
 {
-    const uint i = get_global_id(0);
+    const uint i = get_global_id(0) / ROW_PARTS;
     if (i >= n) return;
-    float16 dL_df = 0.0f;
+    floats dL_df = 0.0f;
     float dL_do = 0.0f;
     uint tracked = 0;
     for (uint pair = point_offset[i]; pair < point_offset[i + 1]; pair++) {
@@ -68,13 +70,13 @@ kernel __attribute__((vec_type_hint(float16))) void blend_backward(
         const float2 weight = pair_weight[pair];
         const uint q = pair_pixel[pair];
         const float16 G = grad_features[q];
-        dL_df += weight.x * G;
+        dL_df += weight.x * load_part(grad_features, q);
         dL_do += weight.y * (dot16(G, point_features[i]) - rest[REST_BY_PAIR ? pair : q]);
         tracked++;
     }
     const float scale = MEAN && tracked ? 1.0f / tracked : 1.0f;
-    grad_point_features[i] = scale * dL_df;
-    grad_opacity[i] = scale * dL_do;
+    store_part(scale * dL_df, grad_point_features, i);
+    if (ROW_PART == 0) grad_opacity[i] = scale * dL_do;
 }
 
 // One work-item per point: reads what blend_backward reads, writes dL/dl and dL/dd = dL/dl / d of

@@ -10,7 +10,7 @@
 #define RUN 64  // keys ranked at once by comparing all with all, 8 a step; longer lists are merged
 
 // One work-item per point: reads where it is, writes its number of hits.
-kernel __attribute__((vec_type_hint(float16))) void pairs_count(
+kernel __attribute__((vec_type_hint(floats))) void pairs_count(
     const uint n,                       // points
     const uint radii,                   // 1 (all alike) or n
     global const float *camera,         // (20) camera.h
@@ -26,7 +26,7 @@ kernel __attribute__((vec_type_hint(float16))) void pairs_count(
     if (box.x <= box.z) {
         const Camera cam = camera_load(camera);
         const Footprint f = footprint_load(&cam, point_camera[i], point_radius[radii == 1 ? 0 : i]);
-        float16 closeness, depth;
+        floats closeness, depth;
         for (int y = box.y; y <= box.w; y += BLOCK_SIDE)
             for (int x = box.x; x <= box.z; x += BLOCK_SIDE)
                 count += popcount(footprint_block(&cam, &f, box, x, y, &closeness, &depth));
@@ -36,7 +36,7 @@ kernel __attribute__((vec_type_hint(float16))) void pairs_count(
 
 // One work-item per point: finds its hits again, writes them as pairs and counts them at their
 // pixels; does nothing where not all pairs have room.
-kernel __attribute__((vec_type_hint(float16))) void pairs_fill(
+kernel __attribute__((vec_type_hint(floats))) void pairs_fill(
     const uint n,                        // points
     const uint p,                        // pairs for which there is room
     const uint radii,                    // 1 (all alike) or n
@@ -59,11 +59,11 @@ kernel __attribute__((vec_type_hint(float16))) void pairs_fill(
     const int4 box = convert_int4(point_box[i]);
     for (int y = box.y; y <= box.w; y += BLOCK_SIDE)
         for (int x = box.x; x <= box.z; x += BLOCK_SIDE) {
-            float16 closeness, depth;
-            float lane_closeness[16], lane_depth[16];
+            floats closeness, depth;
+            float lane_closeness[LANES], lane_depth[LANES];
             uint hits = footprint_block(&cam, &f, box, x, y, &closeness, &depth);
-            vstore16(closeness, 0, lane_closeness);
-            vstore16(depth, 0, lane_depth);
+            LANES_INTO(lane_closeness, closeness);
+            LANES_INTO(lane_depth, depth);
             for (; hits; hits &= hits - 1, pair++) {
                 const int lane = 31 - clz(hits & -hits);
                 const uint pixel = (y + lane / BLOCK_SIDE) * cam.width + x + lane % BLOCK_SIDE;
@@ -121,7 +121,8 @@ merge(global const ulong *keys, const uint middle, const uint count, global ulon
     }
 }
 
-// One work-item per pixel: sorts its keys in place.
+// One work-item per pixel: sorts its keys in place. GPUs, on which its arrays would lie in the
+// device's memory, run the two kernels below instead.
 kernel __attribute__((vec_type_hint(ulong8))) void pairs_sort(
     const uint hw,                    // pixels
     global const uint *pixel_offset,  // (HW+1)
@@ -146,4 +147,55 @@ kernel __attribute__((vec_type_hint(ulong8))) void pairs_sort(
             merge(
                 from + first, min(width, count - first), min(2 * width, count - first), to + first);
     }
+}
+
+// One work-item per key: writes it at its place within its run, RUN keys of its pixel.
+kernel void pairs_sort_runs(
+    const uint p,                     // pairs for which there is room
+    const uint hw,                    // pixels
+    global const uint *pair_pixel,    // (P)
+    global const uint *pixel_offset,  // (HW+1)
+    global const ulong *pair_key,     // (P) by pixel
+    global ulong *sorted)             // (P) the same, each run sorted
+{
+    const uint i = get_global_id(0);
+    if (i >= p || i >= pixel_offset[hw]) return;
+    const ulong key = pair_key[i];
+    const uint pixel = pair_pixel[(uint)key], begin = pixel_offset[pixel];
+    const uint first = i - (i - begin) % RUN, end = min(first + RUN, pixel_offset[pixel + 1]);
+    uint place = first;
+    for (uint j = first; j < end; j++)
+        place += pair_key[j] < key;
+    sorted[place] = key;
+}
+
+// One work-item per key of a sorted run: writes it at its place in the list of its pixel, which is
+// behind the smaller keys of all runs.
+kernel void pairs_merge_runs(
+    const uint p,                     // pairs for which there is room
+    const uint hw,                    // pixels
+    global const uint *pair_pixel,    // (P)
+    global const uint *pixel_offset,  // (HW+1)
+    global const ulong *sorted,       // (P) of pairs_sort_runs
+    global ulong *pair_key)           // (P) by pixel
+{
+    const uint i = get_global_id(0);
+    if (i >= p || i >= pixel_offset[hw]) return;
+    const ulong key = sorted[i];
+    const uint pixel = pair_pixel[(uint)key], begin = pixel_offset[pixel];
+    const uint end = pixel_offset[pixel + 1], own = i - (i - begin) % RUN;
+    uint place = begin + i - own;
+    for (uint first = begin; first < end; first += RUN) {
+        if (first == own) continue;
+        uint low = first, high = min(first + RUN, end);  // the smaller ones end between them
+        while (low < high) {
+            const uint middle = (low + high) / 2;
+            if (sorted[middle] < key)
+                low = middle + 1;
+            else
+                high = middle;
+        }
+        place += low - first;
+    }
+    pair_key[place] = key;
 }

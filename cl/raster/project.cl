@@ -2,11 +2,8 @@
 #include "common.h"
 #include "camera.h"
 #include "grid.h"
+#include "lanes.h"
 #include "raster/footprint.h"
-
-#ifndef LANES
-#define LANES 16  // points of a work-item, one lane each: one by one, a CPU's vectors stay empty
-#endif
 
 // Least cosine between a point's direction and the optical axis (Pulsar): nothing behind or beside
 // the eye.
@@ -18,14 +15,14 @@
 // The tangents from the eye to a circle of radius r at (u, z), u = x or y, have slopes m with (m z
 // - u)^2 = r^2 (1 + m^2); a circle that reaches the eye's plane has no bounds.
 ALWAYS_INLINE void tangents(
-    const float16 u,
-    const float16 z,
-    const float16 reach,
+    const floats u,
+    const floats z,
+    const floats reach,
     const float focal,
     const float centre,
     const float size,
-    int16 *first,
-    int16 *last) {
+    ints *first,
+    ints *last) {
 #if FOOTPRINT == SPHERE
     // from floor(first) to ceil(last): Pulsar's box is part of its hit rule
     const float margin = 0.0f;
@@ -34,15 +31,15 @@ ALWAYS_INLINE void tangents(
     const float margin = 0.01f;  // pixels; far above the rounding of the slopes
     const int round_first = 1, round_last = 0;
 #endif
-    const float16 scale = z * z - reach * reach, root = reach * sqrt(u * u + scale);
-    const float16 low = (u * z - root) / scale * focal + (centre - 0.5f - margin);
-    const float16 high = (u * z + root) / scale * focal + (centre - 0.5f + margin);
-    const int16 bounded = z > reach;
-    const float16 from = clamp(select((float16)(-2.0f), low, bounded), -2.0f, size);
-    const float16 to = clamp(select((float16)(size), high, bounded), -2.0f, size);
+    const floats scale = z * z - reach * reach, root = reach * sqrt(u * u + scale);
+    const floats low = (u * z - root) / scale * focal + (centre - 0.5f - margin);
+    const floats high = (u * z + root) / scale * focal + (centre - 0.5f + margin);
+    const ints bounded = z > reach;
+    const floats from = clamp(select((floats)(-2.0f), low, bounded), -2.0f, size);
+    const floats to = clamp(select((floats)(size), high, bounded), -2.0f, size);
     // x + 2 >= 0, so truncation is floor
-    *first = convert_int16(from + 2.0f) - 2 + round_first;
-    *last = convert_int16(to + 2.0f) - 2 + round_last;
+    *first = LANED(convert_int)(from + 2.0f) - 2 + round_first;
+    *last = LANED(convert_int)(to + 2.0f) - 2 + round_last;
 }
 
 // Writes (x, y, z, t) in camera axes of `count` points in world axes, and the box of pixels that
@@ -51,53 +48,53 @@ ALWAYS_INLINE void tangents(
 // false.
 ALWAYS_INLINE void project(
     const Camera *cam,
-    const float16 x,
-    const float16 y,
-    const float16 z,
-    const float16 radius,
-    const int16 wanted,
+    const floats x,
+    const floats y,
+    const floats z,
+    const floats radius,
+    const ints wanted,
     const uint count,
     global float4 *point_camera,
     global ushort4 *point_box) {
-    const float16 vx = x - cam->eye.x, vy = y - cam->eye.y, vz = z - cam->eye.z;
-    const float16 cx = cam->right.x * vx + cam->right.y * vy + cam->right.z * vz;
-    const float16 cy = cam->down.x * vx + cam->down.y * vy + cam->down.z * vz;
-    const float16 cz = cam->forward.x * vx + cam->forward.y * vy + cam->forward.z * vz;
-    const float16 t = sqrt(cx * cx + cy * cy + cz * cz);
-    const float16 front = t - radius;
-    const int16 kept =
+    const floats vx = x - cam->eye.x, vy = y - cam->eye.y, vz = z - cam->eye.z;
+    const floats cx = cam->right.x * vx + cam->right.y * vy + cam->right.z * vz;
+    const floats cy = cam->down.x * vx + cam->down.y * vy + cam->down.z * vz;
+    const floats cz = cam->forward.x * vx + cam->forward.y * vy + cam->forward.z * vz;
+    const floats t = sqrt(cx * cx + cy * cy + cz * cz);
+    const floats front = t - radius;
+    const ints kept =
         wanted & (front >= cam->near) & (front <= cam->far) & (t > 0.0f) & (cz >= LEAST_COSINE * t);
-    const float16 reach =
+    const floats reach =
         FOOTPRINT == SPHERE ? radius : fmax(radius, LEAST_RADIUS * t / fmin(cam->fx, cam->fy));
-    int16 x0, y0, x1, y1;
+    ints x0, y0, x1, y1;
     tangents(cx, cz, reach, cam->fx, cam->cx, cam->width, &x0, &x1);
     tangents(cy, cz, reach, cam->fy, cam->cy, cam->height, &y0, &y1);
-    x0 = max(x0, (int16)(0));
-    y0 = max(y0, (int16)(0));
-    x1 = min(x1, (int16)(cam->width - 1));
-    y1 = min(y1, (int16)(cam->height - 1));
-    const int16 visible = kept & (x1 >= x0) & (y1 >= y0);
+    x0 = max(x0, (ints)(0));
+    y0 = max(y0, (ints)(0));
+    x1 = min(x1, (ints)(cam->width - 1));
+    y1 = min(y1, (ints)(cam->height - 1));
+    const ints visible = kept & (x1 >= x0) & (y1 >= y0);
 
     float place[4][LANES];
     int box[4][LANES];
-    vstore16(select((float16)(0.0f), cx, kept), 0, place[0]);
-    vstore16(select((float16)(0.0f), cy, kept), 0, place[1]);
-    vstore16(select((float16)(0.0f), cz, kept), 0, place[2]);
-    vstore16(select((float16)(-1.0f), t, kept), 0, place[3]);
+    LANES_INTO(place[0], select((floats)(0.0f), cx, kept));
+    LANES_INTO(place[1], select((floats)(0.0f), cy, kept));
+    LANES_INTO(place[2], select((floats)(0.0f), cz, kept));
+    LANES_INTO(place[3], select((floats)(-1.0f), t, kept));
     // no pixel: last before first
-    vstore16(select((int16)(1), x0, visible), 0, box[0]);
-    vstore16(select((int16)(1), y0, visible), 0, box[1]);
-    vstore16(select((int16)(0), x1, visible), 0, box[2]);
-    vstore16(select((int16)(0), y1, visible), 0, box[3]);
+    LANES_INTO(box[0], select((ints)(1), x0, visible));
+    LANES_INTO(box[1], select((ints)(1), y0, visible));
+    LANES_INTO(box[2], select((ints)(0), x1, visible));
+    LANES_INTO(box[3], select((ints)(0), y1, visible));
     for (uint j = 0; j < count; j++) {
         point_camera[j] = (float4)(place[0][j], place[1][j], place[2][j], place[3][j]);
         point_box[j] = (ushort4)(box[0][j], box[1][j], box[2][j], box[3][j]);
     }
 }
 
-// One work-item per 16 points: reads their grid indices, writes their camera-space positions and
+// One work-item per LANES points: reads their grid indices, writes their camera-space positions and
 // distances, and their boxes.
-kernel __attribute__((vec_type_hint(float16))) void project_grid(
+kernel __attribute__((vec_type_hint(floats))) void project_grid(
     const uint n,                      // points
     const uint dropout,                // a point is left out where its random uint is below this
     const uint seed,                   // of the random uints
@@ -123,12 +120,13 @@ kernel __attribute__((vec_type_hint(float16))) void project_grid(
         wanted[j] = -(scramble(id + stream) >= dropout);
     }
     project(
-        &cam, vload16(0, x), vload16(0, y), vload16(0, z), (float16)(point_radius[0]),
-        vload16(0, wanted), count, point_camera + first, point_box + first);
+        &cam, LANES_FROM(x), LANES_FROM(y), LANES_FROM(z), (floats)(point_radius[0]),
+        LANES_FROM(wanted), count, point_camera + first, point_box + first);
 }
 
-// One work-item per 16 spheres: reads their positions and radii, writes the same as project_grid.
-kernel __attribute__((vec_type_hint(float16))) void project_spheres(
+// One work-item per LANES spheres: reads their positions and radii, writes the same as
+// project_grid.
+kernel __attribute__((vec_type_hint(floats))) void project_spheres(
     const uint n,                      // spheres
     const uint radii,                  // 1 (all alike) or n
     global const float *camera,        // (20) camera.h
@@ -150,6 +148,6 @@ kernel __attribute__((vec_type_hint(float16))) void project_spheres(
         radius[j] = point_radius[radii == 1 ? 0 : i];
     }
     project(
-        &cam, vload16(0, x), vload16(0, y), vload16(0, z), vload16(0, radius), (int16)(-1), count,
+        &cam, LANES_FROM(x), LANES_FROM(y), LANES_FROM(z), LANES_FROM(radius), (ints)(-1), count,
         point_camera + first, point_box + first);
 }

@@ -1,6 +1,7 @@
 // View-dependent features: spherical harmonics of the direction from the eye.
 #include "common.h"
 #include "camera.h"
+#include "lanes.h"
 #include "sh.h"
 
 #ifndef DEGREE
@@ -12,7 +13,7 @@
 #define SHADE(LOAD, i, cam, c, features)                                                           \
     float basis[9];                                                                                \
     sh_basis(c.x *cam.right + c.y * cam.down + c.z * cam.forward, basis);                          \
-    float16 features = basis[0] * LOAD(i, sh_0);                                                   \
+    floats features = basis[0] * LOAD(i, sh_0);                                                    \
     if (DEGREE >= 1)                                                                               \
         for (uint b = 0; b < 3; b++)                                                               \
             features += basis[1 + b] * LOAD(3 * i + b, sh_1);                                      \
@@ -23,10 +24,11 @@
             features += basis[7 + b] * LOAD(2 * i + b, sh_2b);                                     \
     }
 
-#define LOAD_FLOAT(index, array) (array)[index]
-#define LOAD_HALF(index, array) vload_half16(index, array)
+#define LOAD_FLOAT(index, array) load_part(array, index)
+#define LOAD_HALF(index, array) load_half_part(array, index)
 
-// One work-item per shaded point: reads its coefficients and where it is, writes its features.
+// One work-item per part of a shaded point: reads its coefficients and where it is, writes its
+// features.
 kernel void shade_forward(
     const uint s,                       // shaded points
     global const uint *shaded,          // (S) their indices
@@ -38,13 +40,13 @@ kernel void shade_forward(
     global const float16 *sh_2b,        // (?, ?, 16) (N, 2, 16), not read below degree 2
     global float16 *point_features)     // (N, 16) only the shaded rows are written
 {
-    const uint g = get_global_id(0);
+    const uint g = get_global_id(0) / ROW_PARTS;
     if (g >= s) return;
     const uint i = shaded[g];
     const Camera cam = camera_load(camera);
     const float3 c = point_camera[i].xyz / point_camera[i].w;
     SHADE(LOAD_FLOAT, i, cam, c, features)
-    point_features[i] = features;
+    store_part(features, point_features, i);
 }
 
 // The same from coefficients of 16 bits.
@@ -59,11 +61,11 @@ kernel void shade_forward_half(
     global const half *sh_2b,           // (?, ?, 16) (N, 2, 16), not read below degree 2
     global float16 *point_features)     // (N, 16) only the shaded rows are written
 {
-    const uint g = get_global_id(0);
+    const uint g = get_global_id(0) / ROW_PARTS;
     if (g >= s) return;
     const uint i = shaded[g];
     const Camera cam = camera_load(camera);
     const float3 c = point_camera[i].xyz / point_camera[i].w;
     SHADE(LOAD_HALF, i, cam, c, features)
-    point_features[i] = features;
+    store_part(features, point_features, i);
 }

@@ -11,8 +11,8 @@
 // ones, up to 8 times slower.
 #include "common.h"
 #include "camera.h"
+#include "lanes.h"
 #include "raster/pair_role.h"
-#include "reduce.h"
 
 #ifndef DROPS
 #define DROPS 1  // early_stop or tau may be above 0
@@ -24,13 +24,12 @@
     (DROPS || MAX_TRACKED)  // else every pair is TRACKED, and pair_role is not touched
 
 #define EPS 1e-6f    // depth of the background, as a z (Pulsar's background_normalized_depth)
-#define BATCH 16     // hits of a pixel handled at once, one lane each
 #define TAIL 0.125f  // a tail of hits whose bound is below this share of tau is not even weighed
 
-// What Eq. (1) needs of a batch of hits. Lanes without a hit have opacity and closeness 0, hence no
-// weight.
+// What Eq. (1) needs of a batch of LANES hits. Lanes without a hit have opacity and closeness 0,
+// hence no weight.
 typedef struct {
-    float16 opacity, closeness, z;
+    floats opacity, closeness, z;
 } Hits;
 
 ALWAYS_INLINE Hits load_hits(
@@ -39,7 +38,7 @@ ALWAYS_INLINE Hits load_hits(
     const uint count,
     global const uint2 *pair_point_closeness,
     global const float *opacity) {
-    float o[BATCH] = {0.0f}, d[BATCH] = {0.0f}, depth[BATCH] = {0.0f};
+    float o[LANES] = {0.0f}, d[LANES] = {0.0f}, depth[LANES] = {0.0f};
     for (uint j = 0; j < count; j++) {
         const ulong entry = key[j];
         const uint2 hit = pair_point_closeness[(uint)entry];
@@ -48,9 +47,9 @@ ALWAYS_INLINE Hits load_hits(
         depth[j] = as_float((uint)(entry >> 32));
     }
     Hits h;
-    h.opacity = vload16(0, o);
-    h.closeness = vload16(0, d);
-    h.z = 1.0f - (vload16(0, depth) - cam->near) / (cam->far - cam->near);
+    h.opacity = LANES_FROM(o);
+    h.closeness = LANES_FROM(d);
+    h.z = 1.0f - (LANES_FROM(depth) - cam->near) / (cam->far - cam->near);
     return h;
 }
 
@@ -93,7 +92,7 @@ static inline uint drop_hits(
 //   dropped hits.
 // By pixel: the hits that are not dropped, by depth. If any were dropped, one more entry follows,
 // with no point and the dropped weight.
-kernel __attribute__((vec_type_hint(float16))) void softmax_weights(
+kernel __attribute__((vec_type_hint(floats))) void softmax_weights(
     const uint hw,  // pixels
     const float gamma,
     const float early_stop,                    // 0: none
@@ -115,16 +114,16 @@ kernel __attribute__((vec_type_hint(float16))) void softmax_weights(
     float M = EPS / gamma, D = 1.0f;  // the background alone
     float dropped = 0.0f;
     Hits h;
-    for (uint first = begin; first < stop; first += BATCH) {
-        const uint count = min((uint)BATCH, end - first);
+    for (uint first = begin; first < stop; first += LANES) {
+        const uint count = min((uint)LANES, end - first);
         h = load_hits(&cam, pair_key + first, count, pair_point_closeness, opacity);
-        const float16 a = h.opacity * h.z / gamma;
-        const float m = fmax(M, max16(select((float16)(M), a, h.closeness > 0.0f)));
+        const floats a = h.opacity * h.z / gamma;
+        const float m = fmax(M, MAX_LANES(select((floats)(M), a, h.closeness > 0.0f)));
         D *= exp(M - m);
         M = m;
-        float term[BATCH], best[BATCH];
-        vstore16(h.opacity * h.closeness * exp(fmin(a - M, 0.0f)), 0, term);
-        if (DROPS) vstore16(exp(fmax(h.z, 0.0f) / gamma - M), 0, best);
+        float term[LANES], best[LANES];
+        LANES_INTO(term, h.opacity * h.closeness * exp(fmin(a - M, 0.0f)));
+        if (DROPS) LANES_INTO(best, exp(fmax(h.z, 0.0f) / gamma - M));
         for (uint j = 0; j < count && first + j < stop; j++) {
             // no less than the weights of this hit and all that follow
             const float bound = DROPS ? (end - first - j) * best[j] : 0.0f;
@@ -137,16 +136,16 @@ kernel __attribute__((vec_type_hint(float16))) void softmax_weights(
                 D += term[j];
         }
     }
-    for (uint first = begin; first < stop; first += BATCH) {
-        const uint count = min((uint)BATCH, end - first);
-        if (end - begin > BATCH)
+    for (uint first = begin; first < stop; first += LANES) {
+        const uint count = min((uint)LANES, end - first);
+        if (end - begin > LANES)
             h = load_hits(&cam, pair_key + first, count, pair_point_closeness, opacity);
-        const float16 a = h.opacity * h.z / gamma;
+        const floats a = h.opacity * h.z / gamma;
         // b/o; a > M only where d = 0
-        const float16 share = h.closeness * exp(fmin(a - M, 0.0f)) / D;
-        float b[BATCH], slope[BATCH];
-        vstore16(h.opacity * share, 0, b);
-        vstore16(share * (1.0f + a), 0, slope);
+        const floats share = h.closeness * exp(fmin(a - M, 0.0f)) / D;
+        float b[LANES], slope[LANES];
+        LANES_INTO(b, h.opacity * share);
+        LANES_INTO(slope, share * (1.0f + a));
         for (uint j = 0; j < min(count, stop - first); j++) {
             const uint i = first + j, pair = (uint)pair_key[i];
             const bool tracked = !MAX_TRACKED || i - begin < MAX_TRACKED;

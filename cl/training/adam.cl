@@ -3,9 +3,9 @@
 #include "camera.h"
 #include "common.h"
 #include "grid.h"
-#include "training/half16.h"
+#include "lanes.h"
 #include "sh.h"
-#include "vector.h"
+#include "training/half16.h"
 
 #ifndef SH_FIRST
 #define SH_FIRST 0  // basis function of the first SH coefficient in one array
@@ -29,7 +29,8 @@
 #define DECAY2 0.001f
 #endif
 
-// New moments and the step of one value, or of 16: T is float or float16. skipped: of adam_skipped.
+// New moments and the step of one value, or of LANES: T is float or floats. skipped: of
+// adam_skipped.
 #define ADAM_STEP(T, name)                                                                         \
     static inline T name(                                                                          \
         const T g, const float4 skipped, T *m, T *v, const float rate, const float eps) {          \
@@ -43,9 +44,9 @@
     }
 #define NOTHING_SKIPPED (float4)(1.0f, 1.0f, 0.0f, 0.0f)
 ADAM_STEP(float, adam_step)
-ADAM_STEP(float16, adam_step16)
+ADAM_STEP(floats, adam_step_lanes)
 
-// One work-item per 16 values: moves a parameter and its two moments one step.
+// One work-item per LANES values: moves a parameter and its two moments one step.
 kernel void adam_update(
     const uint n,              // values
     const float rate,          // learning rate * sqrt(1 - beta2^t) / (1 - beta1^t)
@@ -55,15 +56,15 @@ kernel void adam_update(
     global float *m,           // (...) first moment
     global float *v)           // (...) second moment
 {
-    const size_t i = 16 * get_global_id(0);
+    const size_t i = LANES * get_global_id(0);
     if (i >= n) return;
-    const int count = min(n - (uint)i, 16u);
-    float16 m16 = load16(m + i, count), v16 = load16(v + i, count);
-    const float16 step =
-        adam_step16(load16(grad + i, count), NOTHING_SKIPPED, &m16, &v16, rate, eps);
-    store16(m16, m + i, count);
-    store16(v16, v + i, count);
-    store16(load16(parameter + i, count) - step, parameter + i, count);
+    const int count = min(n - (uint)i, (uint)LANES);
+    floats m_new = load_lanes(m + i, count), v_new = load_lanes(v + i, count);
+    const floats step =
+        adam_step_lanes(load_lanes(grad + i, count), NOTHING_SKIPPED, &m_new, &v_new, rate, eps);
+    store_lanes(m_new, m + i, count);
+    store_lanes(v_new, v + i, count);
+    store_lanes(load_lanes(parameter + i, count) - step, parameter + i, count);
 }
 
 // One work-item per shaded point: writes whether it received a gradient; a NaN is one.
@@ -141,25 +142,26 @@ adam_basis(global const float *grid, global const float *camera, const uint id, 
 
 // Body of the two kernels below: moves SH_COUNT coefficients of point i and their moments one step.
 // The gradient of coefficient k is basis[k] * grad_point_features and is never stored. LOAD and
-// STORE read and write row `at` of the moments, as m16 = SCALE * m and v16 = SCALE^2 * v.
+// STORE read and write row `at` of the moments, as m_new = SCALE * m and v_new = SCALE^2 * v.
 #define SH_UPDATE(LOAD, STORE)                                                                     \
-    const size_t g = get_global_id(0);                                                             \
+    const size_t g = get_global_id(0) / ROW_PARTS;                                                 \
     if (g >= s) return;                                                                            \
     const size_t i = updated_point(rows, g);                                                       \
     float basis[9];                                                                                \
     adam_basis(grid, camera, ids[i], basis);                                                       \
     const float4 caught_up = skipped_of(skipped, g);                                               \
-    const float16 dL_df = SCALE * grad_point_features[i];                                          \
-    for (size_t k = 0; k < SH_COUNT; k++) {                                                        \
+    const floats dL_df = SCALE * load_part(grad_point_features, i);                                \
+    UNROLLED for (size_t k = 0; k < SH_COUNT; k++) {                                               \
         const size_t at = i * SH_COUNT + k;                                                        \
-        float16 m16, v16;                                                                          \
+        floats m_new, v_new;                                                                       \
         LOAD;                                                                                      \
-        sh[at] -=                                                                                  \
-            adam_step16(basis[SH_FIRST + k] * dL_df, caught_up, &m16, &v16, rate, SCALE * eps);    \
+        const floats step = adam_step_lanes(                                                       \
+            basis[SH_FIRST + k] * dL_df, caught_up, &m_new, &v_new, rate, SCALE * eps);            \
+        store_part(load_part(sh, at) - step, sh, at);                                              \
         STORE;                                                                                     \
     }
 
-// One work-item per updated point: moves SH coefficients and their moments in 32 bits.
+// One work-item per part of an updated point: moves SH coefficients and their moments in 32 bits.
 kernel void adam_sh_update(
     const uint s,      // updated points
     const float rate,  // as in adam_update
@@ -174,23 +176,29 @@ kernel void adam_sh_update(
     global float16 *m,                          // (N, SH_COUNT, 16)
     global float16 *v)                          // (N, SH_COUNT, 16)
 {
-    SH_UPDATE((m16 = m[at], v16 = v[at]), (m[at] = m16, v[at] = v16));
+    SH_UPDATE(
+        (m_new = load_part(m, at), v_new = load_part(v, at)),
+        (store_part(m_new, m, at), store_part(v_new, v, at)));
 }
 
 // SCALE * m and SCALE * sqrt(v) of one coefficient: the square root halves the range of exponents.
-ALWAYS_INLINE void moments_load(global const half *mv, float16 *m, float16 *v) {
-    const float16 root = vload_half16(1, mv);
-    *m = vload_half16(0, mv);
+ALWAYS_INLINE void moments_load(global const half *mv, const size_t at, floats *m, floats *v) {
+    const floats root = load_half_part(mv, 2 * at + 1);
+    *m = load_half_part(mv, 2 * at);
     *v = root * root;
 }
 
-ALWAYS_INLINE void
-moments_store(const float16 m, const float16 v, const uint16 random, global half *mv) {
-    store_half16(m, random >> 19, mv);
-    store_half16(sqrt(v), random >> 6, mv + 16);
+ALWAYS_INLINE void moments_store(
+    const floats m,
+    const floats v,
+    const uints random,
+    global half *mv,
+    const size_t at) {
+    store_half_part(m, random >> 19, mv, 2 * at);
+    store_half_part(sqrt(v), random >> 6, mv, 2 * at + 1);
 }
 
-// One work-item per updated point: moves SH coefficients and their moments in 16 bits.
+// One work-item per part of an updated point: moves SH coefficients and their moments in 16 bits.
 kernel void adam_sh_update_16bit(
     const uint s,      // updated points
     const uint seed,   // of the rounding: another one in each step
@@ -206,30 +214,30 @@ kernel void adam_sh_update_16bit(
     global half *mv)                            // (N, SH_COUNT, 2, 16)
 {
     SH_UPDATE(
-        moments_load(mv + 32 * at, &m16, &v16),
-        moments_store(m16, v16, random16(seed + 9 * (uint)i + SH_FIRST + k), mv + 32 * at));
+        moments_load(mv, at, &m_new, &v_new),
+        moments_store(m_new, v_new, random_part(seed + 9 * (uint)i + SH_FIRST + k), mv, at));
 }
 
 // Body of the two kernels below: adds what the skipped steps of point i have yet to move its
 // features by, as the next update will. LOAD: as above.
 #define SH_PENDING(LOAD)                                                                           \
-    const size_t g = get_global_id(0);                                                             \
+    const size_t g = get_global_id(0) / ROW_PARTS;                                                 \
     if (g >= s) return;                                                                            \
     const float moves = skipped[g].z;                                                              \
     if (moves == 0.0f) return;                                                                     \
     const size_t i = rows[g];                                                                      \
     float basis[9];                                                                                \
     adam_basis(grid, camera, ids[i], basis);                                                       \
-    float16 f = point_features[i];                                                                 \
-    for (size_t k = 0; k < SH_COUNT; k++) {                                                        \
+    floats f = load_part(point_features, i);                                                       \
+    UNROLLED for (size_t k = 0; k < SH_COUNT; k++) {                                               \
         const size_t at = i * SH_COUNT + k;                                                        \
-        float16 m16, v16;                                                                          \
+        floats m_new, v_new;                                                                       \
         LOAD;                                                                                      \
-        f -= basis[SH_FIRST + k] * (moves * rate * m16 / (sqrt(v16) + SCALE * eps));               \
+        f -= basis[SH_FIRST + k] * (moves * rate * m_new / (sqrt(v_new) + SCALE * eps));           \
     }                                                                                              \
-    point_features[i] = f;
+    store_part(f, point_features, i);
 
-// One work-item per listed point: its features with pending moves, moments in 32 bits.
+// One work-item per part of a listed point: its features with pending moves, moments in 32 bits.
 kernel void adam_sh_pending(
     const uint s,      // listed points
     const float rate,  // as in adam_update
@@ -243,7 +251,7 @@ kernel void adam_sh_pending(
     global const float16 *v,         // (N, SH_COUNT, 16)
     global float16 *point_features)  // (N, 16) only the listed rows are read and written
 {
-    SH_PENDING((m16 = m[at], v16 = v[at]));
+    SH_PENDING((m_new = load_part(m, at), v_new = load_part(v, at)));
 }
 
 // The same with moments in 16 bits.
@@ -259,19 +267,19 @@ kernel void adam_sh_pending_16bit(
     global const half *mv,           // (N, SH_COUNT, 2, 16)
     global float16 *point_features)  // (N, 16) only the listed rows are read and written
 {
-    SH_PENDING(moments_load(mv + 32 * at, &m16, &v16));
+    SH_PENDING(moments_load(mv, at, &m_new, &v_new));
 }
 
-// One work-item per 16 values: moves an EMA towards a parameter.
+// One work-item per LANES values: moves an EMA towards a parameter.
 kernel void ema_update(
     const uint n,                   // values
     const float weight,             // of the parameter
     global const float *parameter,  // (...) n values
     global float *ema)              // (...) n values
 {
-    const size_t i = 16 * get_global_id(0);
+    const size_t i = LANES * get_global_id(0);
     if (i >= n) return;
-    const int count = min(n - (uint)i, 16u);
-    const float16 a = load16(ema + i, count);
-    store16(a + weight * (load16(parameter + i, count) - a), ema + i, count);
+    const int count = min(n - (uint)i, (uint)LANES);
+    const floats a = load_lanes(ema + i, count);
+    store_lanes(a + weight * (load_lanes(parameter + i, count) - a), ema + i, count);
 }

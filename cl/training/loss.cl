@@ -7,16 +7,15 @@
 // pixel, so a step of one pixel is a step of 3 values.
 //
 // The kernels run in their order here: moments of the windows along y; along x, then SSIM and its
-// slopes; slopes spread along x; along y, with the gradient; sums. Scratch rows are BLOCKS float16
-// long, MARGIN more than 3W values need, so that no tap along x needs a test.
-#include "reduce.h"
-#include "vector.h"
+// slopes; slopes spread along x; along y, with the gradient; sums. Scratch rows are BLOCKS vectors
+// of LANES values long, MARGIN more than 3W values need, so that no tap along x needs a test.
+#include "lanes.h"
 
 #ifndef TAPS
 #define TAPS 11  // pixels, the side of a window
 #endif
 #ifndef MARGIN
-#define MARGIN 2  // float16 blocks, >= 3 * (TAPS - 1) values
+#define MARGIN (32 / LANES)  // vectors, >= 3 * (TAPS - 1) values
 #endif
 #define C1 1e-4f  // (0.01 * 1)^2: the constants of Wang et al. for a range of 1
 #define C2 9e-4f  // (0.03 * 1)^2
@@ -30,93 +29,94 @@ constant float WINDOW[TAPS] = {// exp(-x^2 / (2 * 1.5^2)), normalised
 #define SUM_SHIFT 1.0f
 
 // All ones in the lanes below `count`, for select().
-static inline int16 lanes_below(const int count) {
-    return (int16)(0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15) < count;
+static inline ints lanes_below(const int count) {
+    return LANED(convert_int)(LANE) < count;
 }
 
-// One work-item per 16 values of a row of windows: writes the moments of d, s, d^2, s^2 over 11
+// One work-item per LANES values of a row of windows: writes the moments of d, s, d^2, s^2 over 11
 // image rows.
 kernel void loss_moments(
     const uint v,                    // rows of windows, H - 10
     const uint w,                    // width of the target
     const uint pw,                   // width of the prediction
     const uint corner,               // first value of the prediction under the target
-    const uint blocks,               // float16 in a scratch row
+    const uint blocks,               // vectors in a scratch row
     global const float *prediction,  // (PH, PW, 3)
     global const float *target,      // (H, W, 3)
-    global float16 *moments)         // (V, 4, BLOCKS, 16)
+    global float *moments)           // (V, 4, BLOCKS, LANES)
 {
     const int b = get_global_id(0), y = get_global_id(1);
     if (b >= blocks || y >= v) return;
-    const int count = 3 * (int)w - 16 * b;
-    float16 m_d = 0.0f, m_s = 0.0f, m_dd = 0.0f, m_ss = 0.0f;
+    const int count = 3 * (int)w - LANES * b;
+    floats m_d = 0.0f, m_s = 0.0f, m_dd = 0.0f, m_ss = 0.0f;
     for (int k = 0; k < TAPS && count > 0; k++) {
-        const float16 p = load16(prediction + corner + 3 * (size_t)pw * (y + k) + 16 * b, count);
-        const float16 t = load16(target + 3 * (size_t)w * (y + k) + 16 * b, count);
-        const float16 d = p - t, s = p + t - SUM_SHIFT;
+        const floats p =
+            load_lanes(prediction + corner + 3 * (size_t)pw * (y + k) + LANES * b, count);
+        const floats t = load_lanes(target + 3 * (size_t)w * (y + k) + LANES * b, count);
+        const floats d = p - t, s = p + t - SUM_SHIFT;
         m_d += WINDOW[k] * d;
         m_s += WINDOW[k] * s;
         m_dd += WINDOW[k] * d * d;
         m_ss += WINDOW[k] * s * s;
     }
-    global float16 *row = moments + 4 * (size_t)blocks * y + b;
+    global floats *row = (global floats *)moments + 4 * (size_t)blocks * y + b;
     row[0] = m_d;
     row[blocks] = m_s;
     row[2 * blocks] = m_dd;
     row[3 * blocks] = m_ss;
 }
 
-// 16 values of a scratch row blurred from value i on; each tap lies `step` values beside the one
+// LANES values of a scratch row blurred from value i on; each tap lies `step` values beside the one
 // before.
-static inline float16 blur_along_x(global const float16 *row, const int i, const int step) {
+static inline floats blur_along_x(global const floats *row, const int i, const int step) {
     global const float *values = (global const float *)row + i;
-    float16 sum = 0.0f;
+    floats sum = 0.0f;
     for (int k = 0; k < TAPS; k++)
-        sum += WINDOW[k] * vload16(0, values + step * k);
+        sum += WINDOW[k] * LANES_FROM(values + step * k);
     return sum;
 }
 
-// One work-item per 16 values of a row of windows, shifted right by MARGIN: finishes the moments
+// One work-item per LANES values of a row of windows, shifted right by MARGIN: finishes the moments
 // along x, writes what the windows give to the loss and its slopes: dL/dp of a pixel is the
 // window-weighted sum of [0] + [1] d + [2] s.
 kernel void loss_similarity(
-    const uint v,                   // rows of windows
-    const uint w,                   // width of the target
-    const uint blocks,              // float16 in a scratch row
-    const float weight,             // of 1 - SSIM
-    global const float16 *moments,  // (V, 4, BLOCKS, 16)
-    global float16 *slopes,         // (V, 3, BLOCKS, 16) 0 outside the windows
-    global float4 *partial_terms)   // (ROWS, BLOCKS, 4) rows 0 to V - 1
+    const uint v,                  // rows of windows
+    const uint w,                  // width of the target
+    const uint blocks,             // vectors in a scratch row
+    const float weight,            // of 1 - SSIM
+    global const float *moments,   // (V, 4, BLOCKS, LANES)
+    global float *slopes,          // (V, 3, BLOCKS, LANES) 0 outside the windows
+    global float4 *partial_terms)  // (ROWS, BLOCKS, 4) rows 0 to V - 1
 {
     const int b = get_global_id(0), y = get_global_id(1);
     if (b >= blocks || y >= v) return;
-    float16 slope_0 = 0.0f, slope_d = 0.0f, slope_s = 0.0f;
+    floats slope_0 = 0.0f, slope_d = 0.0f, slope_s = 0.0f;
     float dissimilarity = 0.0f;
     if (b >= MARGIN) {
-        const int i = 16 * (b - MARGIN);
+        const int i = LANES * (b - MARGIN);
         const int windows = 3 * ((int)w - (TAPS - 1));
-        global const float16 *row = moments + 4 * (size_t)blocks * y;
-        const float16 m_d = blur_along_x(row, i, 3);
-        const float16 m_s = blur_along_x(row + blocks, i, 3);
-        const float16 var_d = fmax(blur_along_x(row + 2 * blocks, i, 3) - m_d * m_d, 0.0f);
-        const float16 var_s = fmax(blur_along_x(row + 3 * blocks, i, 3) - m_s * m_s, 0.0f);
-        const float16 mean_s = m_s + SUM_SHIFT;
-        const float16 P = 0.5f * (m_d * m_d + mean_s * mean_s) + C1;
-        const float16 Q = 0.5f * (var_d + var_s) + C2;
-        const float16 a = m_d * m_d / P, b = var_d / Q;
+        global const floats *row = (global const floats *)moments + 4 * (size_t)blocks * y;
+        const floats m_d = blur_along_x(row, i, 3);
+        const floats m_s = blur_along_x(row + blocks, i, 3);
+        const floats var_d = fmax(blur_along_x(row + 2 * blocks, i, 3) - m_d * m_d, 0.0f);
+        const floats var_s = fmax(blur_along_x(row + 3 * blocks, i, 3) - m_s * m_s, 0.0f);
+        const floats mean_s = m_s + SUM_SHIFT;
+        const floats P = 0.5f * (m_d * m_d + mean_s * mean_s) + C1;
+        const floats Q = 0.5f * (var_d + var_s) + C2;
+        const floats a = m_d * m_d / P, b = var_d / Q;
 
         const float scale = 1.0f / ((float)windows * v);
-        const int16 inside = lanes_below(windows - i);
-        dissimilarity = scale * sum16(select((float16)0.0f, a + b - a * b, inside));
+        const ints inside = lanes_below(windows - i);
+        dissimilarity = scale * SUM_LANES(select((floats)0.0f, a + b - a * b, inside));
 
-        const float16 dL_dvar_d = weight * scale * (1.0f - a) / Q * (1.0f - 0.5f * b);
-        const float16 dL_dvar_s = weight * scale * (1.0f - a) / Q * (-0.5f * b);
-        const float16 dL_dm = weight * scale * (1.0f - b) / P * ((2.0f - a) * m_d - a * mean_s);
-        slope_0 = select((float16)0.0f, dL_dm - 2.0f * (m_d * dL_dvar_d + m_s * dL_dvar_s), inside);
-        slope_d = select((float16)0.0f, 2.0f * dL_dvar_d, inside);
-        slope_s = select((float16)0.0f, 2.0f * dL_dvar_s, inside);
+        const floats dL_dvar_d = weight * scale * (1.0f - a) / Q * (1.0f - 0.5f * b);
+        const floats dL_dvar_s = weight * scale * (1.0f - a) / Q * (-0.5f * b);
+        const floats dL_dm = weight * scale * (1.0f - b) / P * ((2.0f - a) * m_d - a * mean_s);
+        slope_0 = select((floats)0.0f, dL_dm - 2.0f * (m_d * dL_dvar_d + m_s * dL_dvar_s), inside);
+        slope_d = select((floats)0.0f, 2.0f * dL_dvar_d, inside);
+        slope_s = select((floats)0.0f, 2.0f * dL_dvar_s, inside);
     }
-    global float16 *row = slopes + 3 * (size_t)blocks * y + b;
+    global floats *row = (global floats *)slopes + 3 * (size_t)blocks * y + b;
     row[0] = slope_0;
     row[blocks] = slope_d;
     row[2 * blocks] = slope_s;
@@ -124,58 +124,61 @@ kernel void loss_similarity(
         (float4)(weight * dissimilarity, 0.0f, dissimilarity, 0.0f);
 }
 
-// One work-item per 16 values of a row of windows: sums the slopes of the 11 windows of the row
+// One work-item per LANES values of a row of windows: sums the slopes of the 11 windows of the row
 // that see each value.
 kernel void loss_spread(
-    const uint v,                  // rows of windows
-    const uint blocks,             // float16 in a scratch row
-    global const float16 *slopes,  // (V, 3, BLOCKS, 16)
-    global float16 *spread)        // (V, 3, BLOCKS, 16) without the last MARGIN blocks
+    const uint v,                // rows of windows
+    const uint blocks,           // vectors in a scratch row
+    global const float *slopes,  // (V, 3, BLOCKS, LANES)
+    global float *spread)        // (V, 3, BLOCKS, LANES) without the last MARGIN blocks
 {
     const int b = get_global_id(0), y = get_global_id(1);
     if (b + MARGIN >= blocks || y >= v) return;
     for (int f = 0; f < 3; f++) {
         const size_t row = ((size_t)y * 3 + f) * blocks;
-        spread[row + b] = blur_along_x(slopes + row, 16 * (b + MARGIN), -3);
+        ((global floats *)spread)[row + b] =
+            blur_along_x((global const floats *)slopes + row, LANES * (b + MARGIN), -3);
     }
 }
 
-// One work-item per 16 values of a target row: sums the slopes of the 11 rows of windows that see
-// it, writes dL/dp and what the values give to the loss. Leaves the gradient outside the target as
-// it is.
+// One work-item per LANES values of a target row: sums the slopes of the 11 rows of windows that
+// see it, writes dL/dp and what the values give to the loss. Leaves the gradient outside the target
+// as it is.
 kernel void loss_gradient(
     const uint v,                    // rows of windows, 0 where there is no SSIM
     const uint h,                    // height of the target
     const uint w,                    // width of the target
     const uint pw,                   // width of the prediction
     const uint corner,               // first value of the prediction under the target
-    const uint blocks,               // float16 in a scratch row
+    const uint blocks,               // vectors in a scratch row
     global const float *prediction,  // (PH, PW, 3)
     global const float *target,      // (H, W, 3)
-    global const float16 *spread,    // (V, 3, BLOCKS, 16)
+    global const float *spread,      // (V, 3, BLOCKS, LANES)
     global float *grad_prediction,   // (PH, PW, 3)
     global float4 *partial_terms)    // (ROWS, BLOCKS, 4) rows V to V + H - 1
 {
     const int b = get_global_id(0), y = get_global_id(1);
     if (b >= blocks || y >= h) return;
-    const int count = 3 * (int)w - 16 * b;
+    const int count = 3 * (int)w - LANES * b;
     float absolute = 0.0f, squared = 0.0f;
     if (count > 0) {
-        const size_t at = corner + 3 * (size_t)pw * y + 16 * b;
-        const float16 p = load16(prediction + at, count);
-        const float16 t = load16(target + 3 * (size_t)w * y + 16 * b, count);
-        const float16 d = p - t, s = p + t - SUM_SHIFT;
-        float16 slope_0 = 0.0f, slope_d = 0.0f, slope_s = 0.0f;
+        const size_t at = corner + 3 * (size_t)pw * y + LANES * b;
+        const floats p = load_lanes(prediction + at, count);
+        const floats t = load_lanes(target + 3 * (size_t)w * y + LANES * b, count);
+        const floats d = p - t, s = p + t - SUM_SHIFT;
+        floats slope_0 = 0.0f, slope_d = 0.0f, slope_s = 0.0f;
         for (int k = max(0, y - (int)v + 1); k < TAPS && k <= y; k++) {
-            global const float16 *row = spread + 3 * (size_t)blocks * (y - k) + b;
+            global const floats *row =
+                (global const floats *)spread + 3 * (size_t)blocks * (y - k) + b;
             slope_0 += WINDOW[k] * row[0];
             slope_d += WINDOW[k] * row[blocks];
             slope_s += WINDOW[k] * row[2 * blocks];
         }
         const float scale = 1.0f / (3.0f * h * w);
-        store16(scale * sign(d) + slope_0 + slope_d * d + slope_s * s, grad_prediction + at, count);
-        absolute = scale * sum16(fabs(d));
-        squared = scale * dot16(d, d);
+        store_lanes(
+            scale * sign(d) + slope_0 + slope_d * d + slope_s * s, grad_prediction + at, count);
+        absolute = scale * SUM_LANES(fabs(d));
+        squared = scale * SUM_LANES(d * d);
     }
     partial_terms[(size_t)blocks * (v + y) + b] = (float4)(absolute, absolute, 0.0f, squared);
 }

@@ -1,6 +1,7 @@
 // Smoothing of the SH coefficients over the grid, outside Adam: f += amount * (mean of the
 // neighbours - f).
 #include "common.h"
+#include "lanes.h"
 
 // Index of `id` in ids[first, last), ascending; NONE where it is missing.
 static inline uint find(global const uint *ids, const uint id, uint first, uint last) {
@@ -36,8 +37,8 @@ kernel void neighbour_table(
     row[5] = find(ids, id + plane, i + 1, n);
 }
 
-// One work-item per point of a chunk: reads all its coefficients and its neighbours', writes the
-// smoothed ones.
+// One work-item per part of a point of a chunk: reads all its coefficients and its neighbours',
+// writes the smoothed ones.
 kernel void smooth_gather(
     const uint n,                   // points
     const uint first,               // point of the chunk
@@ -48,7 +49,7 @@ kernel void smooth_gather(
     global const float16 *sh,       // (N, K, 16)
     global float16 *smoothed)       // (?, 16) K rows a point of the chunk
 {
-    const size_t slot = get_global_id(0), i = first + slot;
+    const size_t slot = get_global_id(0) / ROW_PARTS, i = first + slot;
     if (slot >= count) return;
     uint around[6];
     float weight = 0.0f;
@@ -59,15 +60,15 @@ kernel void smooth_gather(
     }
     weight = amount / fmax(weight, 1.0f);
     for (size_t c = 0; c < k; c++) {
-        const float16 f = sh[i * k + c];
-        float16 sum = 0.0f;
+        const floats f = load_part(sh, i * k + c);
+        floats sum = 0.0f;
         for (int side = 0; side < 6; side++)
-            sum += sh[(size_t)around[side] * k + c] - f;  // 0 for a missing neighbour
-        smoothed[slot * k + c] = f + weight * sum;
+            sum += load_part(sh, (size_t)around[side] * k + c) - f;  // 0 for a missing neighbour
+        store_part(f + weight * sum, smoothed, slot * k + c);
     }
 }
 
-// One work-item per point of a chunk: writes its coefficients back.
+// One work-item per part of a point of a chunk: writes its coefficients back.
 kernel void smooth_write_back(
     const uint n,                    // points
     const uint first,                // point of the chunk
@@ -76,8 +77,8 @@ kernel void smooth_write_back(
     global const float16 *smoothed,  // (?, 16) K rows a point of the chunk
     global float16 *sh)              // (N, K, 16)
 {
-    const size_t slot = get_global_id(0);
+    const size_t slot = get_global_id(0) / ROW_PARTS;
     if (slot >= count) return;
     for (size_t c = 0; c < k; c++)
-        sh[(first + slot) * k + c] = smoothed[slot * k + c];
+        store_part(load_part(smoothed, slot * k + c), sh, (first + slot) * k + c);
 }

@@ -18,6 +18,7 @@ import pyopencl as cl
 from numpy.typing import ArrayLike
 from pyopencl.array import Array
 
+from pp_cl.device.form import takes_cpu_form
 from pp_cl.device.launch import Kernel, Program
 from pp_cl.errors import UserError
 
@@ -27,15 +28,7 @@ STANDARD = ("-cl-std=CL1.2", "-cl-kernel-arg-info")  # options of every build
 INTEL_PLATFORM = "Intel(R) OpenCL"
 # Files with a kernel that spills with the 128 registers that a thread has there by default, and not
 # with 256, of which half as many threads run (docs/gpu_check.md).
-SPILLING_ON_INTEL = frozenset(
-    (
-        "layers/conv_backward_weights",
-        "layers/resample",
-        "raster/project",
-        "raster/softmax",
-        "training/loss",
-    )
-)
+SPILLING_ON_INTEL = frozenset(("layers/conv_backward_weights",))
 
 
 def vendor_options(info: dict[str, str | int], name: str) -> tuple[str, ...]:
@@ -109,14 +102,14 @@ def _debug_level():
 
 class Device:
     """One OpenCL device with its queue, programs and buffers. debug: PP_DEBUG
-    (docs/environment.md).
+    (docs/environment.md). is_cpu: drivers and kernels take their form for CPUs.
     """
 
     def __init__(self, device: cl.Device):
         self.device = device
         self.name = device.name.strip()
         self.info = describe(device)
-        self.is_cpu = bool(device.type & cl.device_type.CPU)
+        self.is_cpu = takes_cpu_form(device)
         self.debug = _debug_level()
         self.context = cl.Context([device])
         properties = cl.command_queue_properties.PROFILING_ENABLE if self.debug else 0

@@ -8,9 +8,8 @@ compute, None = all.
 from pyopencl.array import Array
 
 from pp_cl.device.device import Device
-from pp_cl.layers.tiles import LANES, Tiles, checked_tiles
-
-LOCAL = (1, 16, 4)  # 16 channels, x, y
+from pp_cl.device.form import channel_ranges, lanes
+from pp_cl.layers.tiles import Tiles, checked_tiles
 
 
 def gate_forward(dev: Device, x: Array, out: Array, *, tiles: Tiles | None = None) -> None:
@@ -32,10 +31,11 @@ def _launch(dev, kernel, shape, tiles, **arguments):
     h, w, c = shape
     if arguments["x"].shape != (h, w, 2 * c):
         raise ValueError(f"a gate from {arguments['x'].shape} to {shape}: expected {(h, w, 2 * c)}")
-    dev.program("layers/gate").launch(
+    size, work_group = channel_ranges(dev, h, w, c)
+    dev.program("layers/gate", LANES=lanes(dev)).launch(
         kernel,
-        (-(-c // LANES), w, h),
-        local=LOCAL,
+        size,
+        work_group,
         h=h,
         w=w,
         c=c,

@@ -7,9 +7,8 @@ tiles: those of the result to compute, None = all.
 from pyopencl.array import Array
 
 from pp_cl.device.device import Device
-from pp_cl.layers.tiles import LANES, Tiles, checked_tiles
-
-LOCAL = (1, 16, 4)  # 16 channels, x, y
+from pp_cl.device.form import channel_ranges, lanes
+from pp_cl.layers.tiles import Tiles, checked_tiles
 
 
 def avgpool2_forward(dev: Device, x: Array, out: Array, *, tiles: Tiles | None = None) -> None:
@@ -18,7 +17,7 @@ def avgpool2_forward(dev: Device, x: Array, out: Array, *, tiles: Tiles | None =
     _launch(
         dev,
         "avgpool2_forward",
-        (c, w, h),
+        (h, w, c),
         h=h,
         w=w,
         c=c,
@@ -46,7 +45,7 @@ def avgpool2_backward(
     _launch(
         dev,
         "avgpool2_backward",
-        (c, 2 * w, 2 * h),
+        (2 * h, 2 * w, c),
         h=h,
         w=w,
         c=c,
@@ -63,7 +62,7 @@ def maxpool2_forward(dev: Device, x: Array, out: Array) -> None:
     shapes.
     """
     h, w, c = _check_half(x, out)
-    _launch(dev, "maxpool2_forward", (c, w, h), h=h, w=w, c=c, x_width=x.shape[1], x=x, out=out)
+    _launch(dev, "maxpool2_forward", (h, w, c), h=h, w=w, c=c, x_width=x.shape[1], x=x, out=out)
 
 
 def maxpool2_backward(dev: Device, x: Array, grad_out: Array, grad_x: Array) -> None:
@@ -76,7 +75,7 @@ def maxpool2_backward(dev: Device, x: Array, grad_out: Array, grad_x: Array) -> 
     _launch(
         dev,
         "maxpool2_backward",
-        (c, w, h),
+        (h, w, c),
         h=h,
         w=w,
         c=c,
@@ -93,7 +92,7 @@ def upsample2_forward(dev: Device, x: Array, out: Array, *, tiles: Tiles | None 
     _launch(
         dev,
         "upsample2_forward",
-        (c, w, h),
+        (h, w, c),
         h=h,
         w=w,
         c=c,
@@ -111,7 +110,7 @@ def upsample2_backward(
     _launch(
         dev,
         "upsample2_backward",
-        (c, w, h),
+        (h, w, c),
         h=h,
         w=w,
         c=c,
@@ -125,16 +124,14 @@ def affine(dev: Device, scale: float, offset: float, x: Array, *, out: Array) ->
     """out = scale * x + offset; both of any one shape, out may be x."""
     if x.shape != out.shape:
         raise ValueError(f"affine of {x.shape} to {out.shape}")
-    dev.program("layers/resample").launch(
+    dev.program("layers/resample", LANES=lanes(dev)).launch(
         "affine", x.size, n=x.size, scale=scale, offset=offset, x=x, out=out
     )
 
 
-def _launch(dev, kernel, size, **arguments):
-    channels, width, height = size
-    dev.program("layers/resample").launch(
-        kernel, (-(-channels // LANES), width, height), local=LOCAL, **arguments
-    )
+def _launch(dev, kernel, shape, **arguments):
+    size, work_group = channel_ranges(dev, *shape)
+    dev.program("layers/resample", LANES=lanes(dev)).launch(kernel, size, work_group, **arguments)
 
 
 def _check_double(small, large):

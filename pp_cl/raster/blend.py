@@ -10,6 +10,7 @@ from pyopencl.array import Array
 
 from pp_cl.device.buffers import Buffers, Table
 from pp_cl.device.device import Device
+from pp_cl.device.form import lanes, row_parts
 from pp_cl.raster.alpha import Alpha
 from pp_cl.raster.blend_weights import BlendWeights, PixelWeights
 from pp_cl.raster.pairs import Pairs
@@ -51,7 +52,9 @@ class Blend:
     ):
         self.dev = dev
         self.weighing = weighing
+        self._row_parts = row_parts(dev, on_gpu=4)
         self.defines = {
+            "LANES": lanes(dev, on_gpu=4),  # each work-item reads whole rows for its dot products
             "MEAN": int(mean_gradient),
             "REST_BY_PAIR": int(weighing.rest_by_pair),
             **footprint.defines,
@@ -75,7 +78,7 @@ class Blend:
         """
         self._program(weights).launch(
             "blend_forward",
-            pairs.pixels,
+            pairs.pixels * self._row_parts,
             hw=pairs.pixels,
             pixel_offset=pairs.pixel_offset,
             pixel_entry=weights.pixel_entry,
@@ -115,7 +118,11 @@ class Blend:
         """
         grads = self._buffers.grad_point_features, self._buffers.grad_opacity
         self._launch_by_point(
-            "blend_backward", gradient, grad_point_features=grads[0], grad_opacity=grads[1]
+            "blend_backward",
+            gradient.pairs.points * self._row_parts,
+            gradient,
+            grad_point_features=grads[0],
+            grad_opacity=grads[1],
         )
         return grads
 
@@ -131,6 +138,7 @@ class Blend:
         grad_positions, grad_radius = self.dev.empty((n, 3)), self.dev.empty((n,))
         self._launch_by_point(
             "blend_backward_pairs",
+            n,
             gradient,
             pair_point_closeness=pairs.pair_point_closeness,
             grad_pair=grad_pair,
@@ -153,12 +161,12 @@ class Blend:
         )
         return grad_positions, grad_radius
 
-    def _launch_by_point(self, kernel, gradient, **outputs):
+    def _launch_by_point(self, kernel, size, gradient, **outputs):
         """Launch a kernel that walks over the tracked pairs of each point."""
         pairs, weights = gradient.pairs, gradient.weights
         self._program(weights).launch(
             kernel,
-            pairs.points,
+            size,
             n=pairs.points,
             point_features=gradient.point_features,
             point_offset=pairs.point_offset,

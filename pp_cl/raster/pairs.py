@@ -9,6 +9,7 @@ from pyopencl.array import Array
 
 from pp_cl.device.buffers import Buffers, Table, grown
 from pp_cl.device.device import Device
+from pp_cl.device.form import lanes
 from pp_cl.device.scan import exclusive_scan, read_total
 from pp_cl.device.transfer import Reading
 from pp_cl.errors import UserError
@@ -66,7 +67,7 @@ class PairBuilder:
 
     def __init__(self, dev: Device, footprint: Footprint):
         self.dev = dev
-        self.program = dev.program("raster/pairs", **footprint.defines)
+        self.program = dev.program("raster/pairs", LANES=lanes(dev), **footprint.defines)
         self._buffers = Buffers(dev)
         self._capacity = 0
 
@@ -139,17 +140,21 @@ class PairBuilder:
             pixel_offset=b.pixel_offset,
             pair_key=b.pair_key,
         )
-        self.program.launch(
-            "pairs_sort",
-            pixels,
-            hw=pixels,
-            pixel_offset=b.pixel_offset,
-            scratch=b.pair_scratch,
-            pair_key=b.pair_key,
-        )
+        self._sort(pixels, capacity)
         fields = ("point_count", "point_offset", "pixel_offset", "pair_pixel")
         fields += ("pair_point_closeness", "pair_key")
         return Pairs(count, **{name: getattr(b, name) for name in fields})
+
+    def _sort(self, pixels, capacity):
+        """Sort the keys of each pixel in place."""
+        b = self._buffers
+        keys = {"hw": pixels, "pixel_offset": b.pixel_offset, "pair_key": b.pair_key}
+        if self.dev.is_cpu:
+            self.program.launch("pairs_sort", pixels, scratch=b.pair_scratch, **keys)
+            return
+        keys |= {"p": capacity, "pair_pixel": b.pair_pixel, "sorted": b.pair_scratch}
+        self.program.launch("pairs_sort_runs", capacity, **keys)
+        self.program.launch("pairs_merge_runs", capacity, **keys)
 
     def _launch(self, kernel, n, points, **arguments):
         """Launch a kernel that walks over the pixels of each point's box."""

@@ -9,8 +9,8 @@ from pyopencl.array import Array
 
 from pp_cl.device.buffers import Buffers, Table
 from pp_cl.device.device import Device
+from pp_cl.device.form import lanes
 
-LANES = 16  # points of one work-item
 KINDS = ("disc", "soft", "sphere")
 
 
@@ -55,7 +55,8 @@ class Projection:
     """Projects points; the buffers are reused from view to view."""
 
     def __init__(self, dev: Device, footprint: Footprint):
-        self.program = dev.program("raster/project", LANES=LANES, **footprint.defines)
+        self._lanes = lanes(dev)
+        self.program = dev.program("raster/project", LANES=self._lanes, **footprint.defines)
         self._buffers = Buffers(dev)
 
     @staticmethod
@@ -108,7 +109,7 @@ class Projection:
         points = {name: getattr(self._buffers, name) for name in self.table(n)}
         self.program.launch(
             kernel,
-            -(-n // LANES),
+            -(-n // self._lanes),
             n=n,
             camera=camera_buffer,
             point_radius=point_radius,

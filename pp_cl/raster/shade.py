@@ -8,6 +8,7 @@ import numpy as np
 from pyopencl.array import Array
 
 from pp_cl.device.device import Device
+from pp_cl.device.form import lanes, row_parts
 from pp_cl.raster.project import ProjectedPoints
 from pp_cl.raster.sh import SH_BLOCKS
 
@@ -33,9 +34,9 @@ def shade_forward(
     absent = [sh[0]] * (len(SH_BLOCKS) - len(sh))  # not read below their degree
     names = [block.name for block in SH_BLOCKS]
     arrays = dict(zip(names, [*sh, *absent], strict=True))
-    dev.program("raster/shade", DEGREE=_degree(len(sh))).launch(
+    dev.program("raster/shade", LANES=lanes(dev), DEGREE=_degree(len(sh))).launch(
         "shade_forward_half" if sh[0].dtype == np.float16 else "shade_forward",
-        shaded.size,
+        shaded.size * row_parts(dev),
         s=shaded.size,
         shaded=shaded,
         camera=points.camera_buffer,

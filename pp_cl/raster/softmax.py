@@ -8,6 +8,7 @@ import numpy as np
 from pyopencl.array import Array
 
 from pp_cl.device.buffers import Table
+from pp_cl.device.form import lanes
 from pp_cl.raster.blend_weights import BlendWeights, PixelWeights
 from pp_cl.raster.pairs import Pairs
 
@@ -40,7 +41,9 @@ class Softmax(BlendWeights):
         drops = early_stop > 0 or tau > 0
         has_roles = drops or max_tracked > 0
         pair_weight, pair_role, pixel_entry = self._reserve(pairs, has_roles)
-        program = self.dev.program("raster/softmax", DROPS=int(drops), MAX_TRACKED=max_tracked)
+        program = self.dev.program(
+            "raster/softmax", LANES=lanes(self.dev), DROPS=int(drops), MAX_TRACKED=max_tracked
+        )
         program.launch(
             "softmax_weights",
             pairs.pixels,

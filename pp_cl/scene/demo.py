@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from pp_cl.device.device import Device
+from pp_cl.device.form import lanes
 from pp_cl.errors import UserError
 from pp_cl.files.atomic import atomic_folder, write_json
 from pp_cl.files.image import write_png
@@ -62,7 +63,7 @@ def render(dev: Device, camera: Camera) -> np.ndarray:
     it.
     """
     image = dev.empty((camera.height, camera.width, 4), np.uint8)
-    dev.program("scene/demo").launch(
+    dev.program("scene/demo", LANES=lanes(dev)).launch(
         "render_demo",
         (camera.width, camera.height),
         width=camera.width,
@@ -95,8 +96,12 @@ def distances(dev: Device, grid: Grid) -> np.ndarray:
     """(nz, ny, nx) float32 signed distances of a Grid's vertices to the object, negative inside."""
     n = math.prod(grid.dims)
     out = dev.empty((n,))
-    dev.program("scene/demo").launch(
-        "demo_distances", -(-n // 16), n=n, grid=dev.upload(grid.packed()), distances=out
+    dev.program("scene/demo", LANES=lanes(dev)).launch(
+        "demo_distances",
+        -(-n // lanes(dev)),
+        n=n,
+        grid=dev.upload(grid.packed()),
+        distances=out,
     )
     return out.get().reshape(grid.dims[::-1])
 

@@ -15,6 +15,7 @@ from pyopencl.array import Array
 
 from pp_cl.device.buffers import Buffers, Table
 from pp_cl.device.device import Device
+from pp_cl.device.form import lanes, row_parts
 from pp_cl.device.launch import Program
 from pp_cl.device.scan import nonzero
 from pp_cl.raster.sh import ShBlock
@@ -28,7 +29,7 @@ TABLE_STEPS = 1024
 def adam_program(dev: Device, **defines) -> Program:
     """cl/training/adam.cl with the betas of this module."""
     decays = {"DECAY1": f"{1 - BETA1:.9g}f", "DECAY2": f"{1 - BETA2:.9g}f"}
-    return dev.program("training/adam", **decays, **defines)
+    return dev.program("training/adam", LANES=lanes(dev), **decays, **defines)
 
 
 def moment_scale(eps: float) -> float:
@@ -72,7 +73,7 @@ def adam_update(
     _same_shape(parameter=parameter, grad=grad, **moments)
     adam_program(dev).launch(
         "adam_update",
-        -(-parameter.size // 16),
+        -(-parameter.size // lanes(dev)),
         n=parameter.size,
         grad=grad,
         parameter=parameter,
@@ -200,6 +201,7 @@ class PointAdam:
         self._launch(
             updated,
             "adam_skipped",
+            updated.count,
             step=step,
             updating=int(updating),
             t=TABLE_STEPS,
@@ -249,6 +251,7 @@ class PointAdam:
         self._launch(
             listed,
             "adam_sh_pending" if self.scale is None else "adam_sh_pending_16bit",
+            listed.count * row_parts(self.dev),
             self._defines(block),
             point_features=point_features,
             **moments,
@@ -277,6 +280,7 @@ class PointAdam:
         self._launch(
             updated,
             kernel,
+            updated.count * row_parts(self.dev),
             self._defines(block),
             sh=sh,
             grad_point_features=gradient.grad_point_features,
@@ -290,10 +294,10 @@ class PointAdam:
         defines = {"SH_FIRST": block.first, "SH_COUNT": block.count}
         return defines if self.scale is None else {**defines, "SCALE": f"{self.scale!r}f"}
 
-    def _launch(self, updated, kernel, defines=None, **arguments):
+    def _launch(self, updated, kernel, size, defines=None, **arguments):
         adam_program(self.dev, LAZY=int(updated.lazy), **defines or {}).launch(
             kernel,
-            updated.count,
+            size,
             s=updated.count,
             rows=updated.rows,
             skipped=updated.skipped,
@@ -313,7 +317,7 @@ def ema_update(dev: Device, ema: Array, parameter: Array, weight: float) -> None
         return
     adam_program(dev).launch(
         "ema_update",
-        -(-parameter.size // 16),
+        -(-parameter.size // lanes(dev)),
         n=parameter.size,
         weight=weight,
         parameter=parameter,

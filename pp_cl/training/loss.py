@@ -5,13 +5,14 @@ from pyopencl.array import Array
 
 from pp_cl.device.buffers import Buffers, Table
 from pp_cl.device.device import Device
+from pp_cl.device.form import lanes
 from pp_cl.layers.tiles import SIDE, grid_shape
 from pp_cl.network.tile_sets import grow
 
 TAPS = 11  # pixels, the side of an SSIM window
 REACH = 2 * (TAPS // 2)  # pixels over which the loss's gradient depends on the target
 WHITE = 1.0  # of a target where its photograph is transparent
-MARGIN = 2  # float16 by which a scratch row is longer than its values, >= 3 * (TAPS - 1) / 16
+MARGIN = 32  # values by which a scratch row is longer than needed, >= 3 * (TAPS - 1)
 
 
 class Loss:
@@ -31,17 +32,23 @@ class Loss:
 
     @staticmethod
     def table(
-        prediction_shape: tuple[int, ...], target_shape: tuple[int, ...], ssim_weight: float
+        prediction_shape: tuple[int, ...],
+        target_shape: tuple[int, ...],
+        ssim_weight: float,
+        values: int,
     ) -> Table:
-        """The scratch for a prediction (PH, PW, 3) and a target (H, W, 3), and the gradient."""
+        """The scratch for a prediction (PH, PW, 3) and a target (H, W, 3), and the gradient.
+
+        values: lanes_of_loss(), those that a work-item handles.
+        """
         height, width, _ = target_shape
         has_ssim = ssim_weight != 0 and min(height, width) >= TAPS
         window_rows = height - TAPS + 1 if has_ssim else 0
-        blocks = -(-3 * width // 16) + MARGIN  # float16 in a scratch row
+        blocks = (-(-3 * width // 16) * 16 + MARGIN) // values  # vectors in a scratch row
         shapes = {
-            "moments": (window_rows, 4, blocks, 16),
-            "slopes": (window_rows, 3, blocks, 16),
-            "spread": (window_rows, 3, blocks, 16),
+            "moments": (window_rows, 4, blocks, values),
+            "slopes": (window_rows, 3, blocks, values),
+            "spread": (window_rows, 3, blocks, values),
             "partial_terms": (window_rows + height, blocks, 4),
             "row_terms": (window_rows + height, 4),
             "grad_prediction": tuple(prediction_shape),
@@ -60,7 +67,8 @@ class Loss:
         corner = corner_of(prediction.shape, target.shape, left, top)
         height, width, _ = target.shape
         b = self._buffers
-        b.require(self.table(prediction.shape, target.shape, self.ssim_weight))
+        values = lanes_of_loss(self.dev)
+        b.require(self.table(prediction.shape, target.shape, self.ssim_weight, values))
         window_rows, _, blocks, _ = b.moments.shape
         rows, size = {"v": window_rows, "blocks": blocks}, (blocks, window_rows)
         images = {"prediction": prediction, "target": target}
@@ -101,7 +109,9 @@ class Loss:
         self._launch("loss_sum", rows, rows=rows, m=m, terms=terms, sums=sums)
 
     def _launch(self, kernel, size, **arguments):
-        program = self.dev.program("training/loss", TAPS=TAPS, MARGIN=MARGIN)
+        values = lanes_of_loss(self.dev)
+        defines = {"LANES": values, "TAPS": TAPS, "MARGIN": MARGIN // values}
+        program = self.dev.program("training/loss", **defines)
         program.launch(kernel, size, **arguments)
 
 
@@ -115,6 +125,11 @@ def gradient_tiles(found: np.ndarray, size: tuple[int, int], offset: tuple[int, 
     tiles = np.zeros(grid_shape(*size), bool)
     tiles[: found.shape[0], : found.shape[1]] = found
     return grow(tiles, -(-(REACH + max(offset)) // SIDE))
+
+
+def lanes_of_loss(dev: Device) -> int:
+    """LANES of its kernels: on GPUs 4, as each work-item writes four terms to be summed."""
+    return lanes(dev, on_gpu=4)
 
 
 def corner_of(

@@ -19,7 +19,7 @@ from pp_cl.render import NETWORK_MULTIPLE, Renderer
 from pp_cl.scene.camera import Camera
 from pp_cl.scene.views import View
 from pp_cl.settings import RasterConfig
-from pp_cl.training.loss import Loss
+from pp_cl.training.loss import Loss, lanes_of_loss
 from pp_cl.training.mask import MaskLoss
 from pp_cl.training.optimiser import Optimiser
 from pp_cl.training.perceptual import PerceptualLoss
@@ -61,7 +61,7 @@ def memory_plan(config: Config, model: Model, views: list[View], refinements: in
             config.raster, n, size, n * _pixels_per_point(config.raster, model, camera, edge)
         ),
         (f"network at {size[1]}x{size[0]}", _network_table(model, size)),
-        ("loss", Loss.table(image, target, train.ssim_weight)),
+        ("loss", Loss.table(image, target, train.ssim_weight, lanes_of_loss(model.net.dev))),
         ("mask loss", MaskLoss.table(*size) if train.mask_weight else {}),
         *(_perceptual_tables(model.net, target) if train.perceptual_weight else ()),
         (

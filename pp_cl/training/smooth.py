@@ -5,6 +5,7 @@ from pyopencl.array import Array
 
 from pp_cl.device.buffers import Buffers, Table
 from pp_cl.device.device import Device
+from pp_cl.device.form import lanes, row_parts
 from pp_cl.raster.sh import SH_BLOCKS
 
 NONE = 0xFFFFFFFF
@@ -33,7 +34,7 @@ class Smoother:
         self._buffers = Buffers(dev)
         self._buffers.require({"neighbours": self.table(n, 0)["neighbours"]})
         self.neighbours = self._buffers.neighbours
-        dev.program("training/smooth").launch(
+        _program(dev).launch(
             "neighbour_table", n, n=n, grid=grid, ids=ids, neighbours=self.neighbours
         )
         after = self.neighbours.get()[:, 1::2]
@@ -56,7 +57,7 @@ class Smoother:
         lambda * learning rate for every fourth step. sh: (N, K, 16) float32, K up to 3; ValueError
         beyond.
         """
-        launch = self.dev.program("training/smooth").launch
+        launch, parts = _program(self.dev).launch, row_parts(self.dev)
         n, coefficients, _ = sh.shape
         if coefficients > MOST_COEFFICIENTS:
             raise ValueError(f"at most {MOST_COEFFICIENTS} coefficients a point: {sh.shape}")
@@ -72,10 +73,18 @@ class Smoother:
                 "sh": sh,
             }
             launch(
-                "smooth_gather", part["count"], neighbours=self.neighbours, amount=amount, **part
+                "smooth_gather",
+                part["count"] * parts,
+                neighbours=self.neighbours,
+                amount=amount,
+                **part,
             )
             if waiting:
-                launch("smooth_write_back", waiting["count"], **waiting)
+                launch("smooth_write_back", waiting["count"] * parts, **waiting)
             waiting = part
         if waiting:
-            launch("smooth_write_back", waiting["count"], **waiting)
+            launch("smooth_write_back", waiting["count"] * parts, **waiting)
+
+
+def _program(dev):
+    return dev.program("training/smooth", LANES=lanes(dev))

@@ -19,6 +19,8 @@ from pp_cl.layers.policy import load_policy, policy_of_run
 from pp_cl.layers.tuning import load_tuning, tuning_file
 from pp_cl.layers.variants import ConvShape
 
+pytestmark = pytest.mark.usefixtures("cpu_form")
+
 DEFAULT = 1e-5
 SHAPE = ConvShape(Direction.FORWARD, 3, (64,), 32, 64 * 64)
 

@@ -49,6 +49,7 @@ def shipped(dev, direction, ci, co, height, width, *, k=3, sources=None):
     return make_policy(dev).choose(shape)
 
 
+@pytest.mark.usefixtures("cpu_form")
 @pytest.mark.parametrize("direction", Direction)
 def test_shipped_choice(dev, monkeypatch, direction):
     assert shipped(dev, direction, 3, 64, 64, 64) == "direct"

@@ -1,0 +1,84 @@
+// Vectors of LANES neighbouring values, which one work-item handles: 16 on CPUs, 4 or 1 on GPUs
+// (pp_cl/device/form.py). The formulas are the same for all.
+#ifndef PP_LANES_H
+#define PP_LANES_H
+
+#include "reduce.h"
+#include "vector.h"
+
+#ifndef LANES
+#define LANES 16
+#endif
+
+#if LANES == 16
+#define LANED(name) name##16
+#define LANE (uint16)(0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15)
+#elif LANES == 4
+#define LANED(name) name##4
+#define LANE (uint4)(0, 1, 2, 3)
+#else
+#define LANED(name) name
+#define LANE 0u
+#endif
+
+typedef LANED(float) floats;
+typedef LANED(int) ints;
+typedef LANED(uint) uints;
+
+#if LANES == 1
+// Loops over arrays of a work-item, which are in registers only where the indices are known.
+#define UNROLLED _Pragma("unroll")
+#define LANES_FROM(p) (*(p))
+#define LANES_INTO(p, value) (*(p) = (value))
+#define ANY_LANE(v) ((v) != 0)
+#define SUM_LANES(v) (v)
+#define MAX_LANES(v) (v)
+#else
+#define UNROLLED
+#define LANES_FROM(p) LANED(vload)(0, p)
+#define LANES_INTO(p, value) LANED(vstore)(value, 0, p)
+#define ANY_LANE(v) any(v)
+#define SUM_LANES(v) LANED(sum)(v)
+#define MAX_LANES(v) LANED(max)(v)
+#endif
+
+// A row of 16 channels has ROW_PARTS such vectors. Of a kernel with a work-item for each part of
+// each row, ROW_PART is the item's, get_global_id(0) / ROW_PARTS its row.
+#define ROW_PARTS (CHANNELS / LANES)
+#define ROW_PART ((uint)get_global_id(0) % ROW_PARTS)
+
+ALWAYS_INLINE floats load_part(global const float16 *rows, const size_t row) {
+    return ((global const floats *)rows)[row * ROW_PARTS + ROW_PART];
+}
+
+ALWAYS_INLINE void store_part(const floats value, global float16 *rows, const size_t row) {
+    ((global floats *)rows)[row * ROW_PARTS + ROW_PART] = value;
+}
+
+ALWAYS_INLINE floats load_half_part(global const half *rows, const size_t row) {
+    return LANED(vload_half)(row * ROW_PARTS + ROW_PART, rows);
+}
+
+// load_lanes(p, count): the values at p, of which `count` exist; the others read as 0.
+// store_lanes(value, p, count): writes the first `count` of the values to p.
+#if LANES == 16
+#define load_lanes load16
+#define store_lanes store16
+#elif LANES == 4
+static inline float4 load_lanes(global const float *p, const int count) {
+    if (count >= 4) return vload4(0, p);
+    return (float4)(p[0], count > 1 ? p[1] : 0.0f, count > 2 ? p[2] : 0.0f, 0.0f);
+}
+
+static inline void store_lanes(const float4 value, global float *p, const int count) {
+    p[0] = value.x;
+    if (count > 1) p[1] = value.y;
+    if (count > 2) p[2] = value.z;
+    if (count > 3) p[3] = value.w;
+}
+#else
+#define load_lanes(p, count) (*(p))
+#define store_lanes(value, p, count) (*(p) = (value))
+#endif
+
+#endif

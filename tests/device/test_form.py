@@ -1,0 +1,62 @@
+"""pp_cl/device/form.py: which form a device takes, and how much a work-item handles in each."""
+
+import pyopencl as cl
+import pytest
+
+from pp_cl.device.discover import open_device
+from pp_cl.device.form import channel_ranges, lanes, row_parts, takes_cpu_form
+from pp_cl.errors import UserError
+from pp_cl.selftest.run import CASES, run_cases
+
+# of the kernels with two forms; `make test-gpu-form` runs all tests
+IN_GPU_FORM = (
+    "raster: project",
+    "raster: thousands of equal depths",
+    "raster: shade",
+    "softmax: forward, soft",
+    "softmax: backward, soft",
+    "layers: mean pooling",
+    "layers: upsampling",
+    "layers: gate",
+    "loss: L1 and SSIM",
+    "adam: arrays",
+    "adam: points, sh_0",
+    "training: smoothing",
+    "scene: demo",
+)
+
+
+def test_a_cpu_takes_its_form_unless_told_otherwise(dev, monkeypatch):
+    of_device = bool(dev.device.type & cl.device_type.CPU)
+    for unset in (None, ""):
+        monkeypatch.delenv("PP_FORM", raising=False)
+        if unset is not None:
+            monkeypatch.setenv("PP_FORM", unset)
+        assert takes_cpu_form(dev.device) == of_device
+    monkeypatch.setenv("PP_FORM", "gpu")
+    assert not takes_cpu_form(dev.device)
+    assert not open_device().is_cpu
+
+
+def test_another_form_is_refused(dev, monkeypatch):
+    monkeypatch.setenv("PP_FORM", "tpu")
+    with pytest.raises(UserError, match="^PP_FORM=tpu: must be gpu, or unset$"):
+        takes_cpu_form(dev.device)
+
+
+def test_lanes(dev, monkeypatch):
+    monkeypatch.setattr(dev, "is_cpu", True)
+    assert (lanes(dev), row_parts(dev)) == (16, 1)
+    # 40 channels: two vectors and a half; pixels in one group
+    assert channel_ranges(dev, 30, 20, 40) == ((3, 20, 30), (1, 16, 4))
+    monkeypatch.setattr(dev, "is_cpu", False)
+    assert (lanes(dev), row_parts(dev)) == (1, 16)
+    # the first dimension, in which neighbours run in step, is that of the channels
+    assert channel_ranges(dev, 30, 20, 40) == ((40, 20, 30), (16, 4, 1))
+
+
+@pytest.mark.parametrize("name", IN_GPU_FORM)
+def test_the_form_for_gpus_computes_the_same(dev, monkeypatch, name):
+    monkeypatch.setattr(dev, "is_cpu", False)
+    case = next(case for case in CASES if case.name == name)
+    assert [row.passed for row in run_cases(dev, [case])] == [True]
