@@ -30,6 +30,8 @@ INTEL_PLATFORM = "Intel(R) OpenCL"
 SPILLING_ON_INTEL = frozenset(
     (
         "layers/conv_backward_weights",
+        "layers/conv_local",
+        "layers/conv_local_backward_weights",
         "layers/resample",
         "raster/project",
         "raster/softmax",
