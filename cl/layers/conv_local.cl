@@ -80,7 +80,12 @@ ALWAYS_INLINE void convolve(
         barrier(CLK_LOCAL_MEM_FENCE);
         stage(values, weights, corner, x, weight, c0, channels, ci, height, width);
         barrier(CLK_LOCAL_MEM_FENCE);
+// No more at a time: AMD's and Intel's compilers would hold the weights of all in registers.
+#if KERNEL_SIZE == 3
 #pragma unroll 1
+#else
+#pragma unroll 4
+#endif
         for (int c = 0; c < CHUNK; c++)
 #pragma unroll
             for (int ky = 0; ky < KERNEL_SIZE; ky++) {

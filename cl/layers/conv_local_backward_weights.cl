@@ -87,28 +87,34 @@ kernel void conv_local_backward_weights(
             stage(values, grads, x, grad_out, tile_list, tile_count, t, to, c0, c, o0, co);
             barrier(CLK_LOCAL_MEM_FENCE);
 #pragma unroll 1
-            for (int row = 0; row < STAGE * SIDE; row++) {
-                local const float4 *seen =
-                    values + (row / SIDE * SPAN + row % SIDE + ky) * SPAN * CI_QUADS + lane;
-                float4 g[SIDE];
+            for (int tile = 0; tile < STAGE; tile++)
+#if KERNEL_SIZE == 3
+#pragma unroll 1
+#else
 #pragma unroll
-                for (int p = 0; p < SIDE; p++)
-                    g[p] = grads[(row * SIDE + p) * QUADS + quad];
+#endif
+                for (int row = 0; row < SIDE; row++) {
+                    local const float4 *seen =
+                        values + (tile * SPAN + row + ky) * SPAN * CI_QUADS + lane;
+                    float4 g[SIDE];
 #pragma unroll
-                for (int column = 0; column < SPAN; column++) {
-                    const float4 v = seen[column * CI_QUADS];
+                    for (int p = 0; p < SIDE; p++)
+                        g[p] = grads[((tile * SIDE + row) * SIDE + p) * QUADS + quad];
 #pragma unroll
-                    for (int kx = 0; kx < KERNEL_SIZE; kx++) {
-                        const int p = column - kx;
-                        if (p >= 0 && p < SIDE) {
-                            acc[kx][0] += v.x * g[p];
-                            acc[kx][1] += v.y * g[p];
-                            acc[kx][2] += v.z * g[p];
-                            acc[kx][3] += v.w * g[p];
+                    for (int column = 0; column < SPAN; column++) {
+                        const float4 v = seen[column * CI_QUADS];
+#pragma unroll
+                        for (int kx = 0; kx < KERNEL_SIZE; kx++) {
+                            const int p = column - kx;
+                            if (p >= 0 && p < SIDE) {
+                                acc[kx][0] += v.x * g[p];
+                                acc[kx][1] += v.y * g[p];
+                                acc[kx][2] += v.z * g[p];
+                                acc[kx][3] += v.w * g[p];
+                            }
                         }
                     }
                 }
-            }
         }
 #pragma unroll
         for (int kx = 0; kx < KERNEL_SIZE; kx++)
