@@ -27,7 +27,8 @@ static inline int item_quad(void) {
     return get_local_id(0) / GROUP_TILES % QUADS;
 }
 static inline int item_line(void) {
-    return get_local_id(0) / (GROUP_TILES * QUADS) * ROWS;
+    // as a quotient times ROWS times LINE, Intel's CPU runtime computes it without its rounding
+    return get_local_id(0) < ITEMS / 2 ? 0 : ROWS;
 }
 
 // Copy CHUNK channels of x from c0 on to values [channel][tile][line][column], zeros around the

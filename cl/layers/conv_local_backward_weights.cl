@@ -7,7 +7,9 @@
 #include "common.h"
 #include "layers/local.h"
 
-#define CI_QUADS (KERNEL_SIZE == 3 ? 4 : 8)  // groups of 4 input channels of a work-group
+#ifndef CI_QUADS
+#define CI_QUADS 4  // groups of 4 input channels of a work-group
+#endif
 #define ITEMS (CI_QUADS * QUADS * KERNEL_SIZE)
 #define STAGE 2  // tiles in local memory
 
@@ -91,7 +93,7 @@ kernel void conv_local_backward_weights(
 #if KERNEL_SIZE == 3
 #pragma unroll 1
 #else
-#pragma unroll
+#pragma unroll 2
 #endif
                 for (int row = 0; row < SIDE; row++) {
                     local const float4 *seen =

@@ -13,7 +13,7 @@ from pp_cl.layers.conv_backward_weights import (
 from pp_cl.layers.conv_local import QUAD, is_aligned, quads, runs
 from pp_cl.layers.tiles import LANES, SIDE, Tiles, checked_tiles
 
-# {side of the kernel: groups of four input channels of a work-group}: CI_QUADS in the kernel file
+# {side of the kernel: groups of four input channels of a work-group}
 CI_QUADS = {3: 4, 1: 8}
 # Tiles that a work-item sums in registers, at most: one sum over an image of background would lose
 # digits. Fewer of narrow images, so that it sums as many pixels as the direct kernel, a row.
@@ -80,8 +80,8 @@ def _program(dev, k, c, co):
     most = quads(co, aligned)
     for in_group in (n for n in (16, 8, 4) if n <= most):
         items = CI_QUADS[k] * in_group * k
-        macros = {"KERNEL_SIZE": k, "ALIGNED": int(aligned), "QUADS": in_group}
-        program = dev.program("layers/conv_local_backward_weights", **macros)
+        macros = {"KERNEL_SIZE": k, "CI_QUADS": CI_QUADS[k], "QUADS": in_group}
+        program = dev.program("layers/conv_local_backward_weights", ALIGNED=int(aligned), **macros)
         if runs(program, "conv_local_backward_weights", items):
             break
     return program, in_group, items

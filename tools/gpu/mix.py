@@ -90,7 +90,9 @@ def _innermost(operations):
             to = labels.get((_TARGET.search(operands) or [None])[0], i + 1)
             loops += [(to, i)] if to <= i else []
     return [
-        (a, b) for a, b in loops if not any((a, b) != (c, d) and a <= c and d <= b for c, d in loops)
+        (a, b)
+        for a, b in loops
+        if not any((a, b) != (c, d) and a <= c and d <= b for c, d in loops)
     ]
 
 
