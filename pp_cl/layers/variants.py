@@ -121,7 +121,7 @@ VARIANTS = {
 
 
 class Convolution(Protocol):
-    """A variant on a device: what DirectConvolution, LocalConvolution and WinogradConvolution do."""
+    """A variant on a device: what the classes of the modules variant_*.py do."""
 
     def work_floats(
         self, direction: Direction, height: int, weight_shape: tuple, c: int

@@ -26,8 +26,8 @@ SHAPES = [
 ]
 
 
-# The same for kernels whose work-groups share local memory, of which a simulator takes half a minute
-# for a group; and groups of 32 and 64 output channels.
+# The same, and groups of 64 output channels, for kernels whose work-groups share local memory: a
+# simulator takes half a minute for each.
 LOCAL_SHAPES = [
     (1, 5, 16, 3),
     (5, 1, 20, 20),
