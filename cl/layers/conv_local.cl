@@ -64,7 +64,8 @@ ALWAYS_INLINE void stage(
     }
 }
 
-// acc += convolution of x at the work-item's lines. weight: of x's first channel; ci: channels of the weights.
+// acc += convolution of x at the work-item's lines. weight: of x's first channel; ci: channels of
+// the weights.
 ALWAYS_INLINE void convolve(
     float4 acc[ROWS * SIDE],
     local float *values,
@@ -120,8 +121,8 @@ ALWAYS_INLINE void find_corners(local int2 *corner, global const int *tile_list)
     barrier(CLK_LOCAL_MEM_FENCE);
 }
 
-// One work-item per (4 output channels, ROWS lines of a tile), a work-group per (4 * QUADS channels,
-// GROUP_TILES tiles of the list): reads what the lines see in x, then in x2 (the concatenation
+// One work-item per (4 output channels, ROWS lines of a tile), a work-group per (4 * QUADS
+// channels, GROUP_TILES tiles of the list): reads what the lines see in x, then in x2 (the concatenation
 // [x, x2] without making it), and writes them to out.
 kernel void conv_local_forward(
     const int c1,

@@ -48,8 +48,8 @@ def conv_local_backward_weights(
         "tile_count": tiles.count,
         "partial": partial,
     }
-    first = 0
-    for x in sources:
+    summed = max(1, min(SUMMED, width // (SIDE * SIDE)))
+    for i, x in enumerate(sources):
         c = x.shape[2]
         program, in_group, items = _program(dev, k, c, co)
         program.launch(
@@ -57,19 +57,15 @@ def conv_local_backward_weights(
             (-(-c // (QUAD * CI_QUADS[k])) * items, -(-co // (QUAD * in_group)), parts),
             local=(items, 1, 1),
             c=c,
-            first=first,
+            first=sum(before.shape[2] for before in sources[:i]),
             ci=ci,
-            summed=max(1, min(SUMMED, width // (SIDE * SIDE))),
+            summed=summed,
             x=x,
             **common,
         )
-        first += c
+    channels, per_block = blocks * LANES, k * k * ci
     program.launch(
-        "conv_local_backward_bias",
-        (blocks * LANES, parts),
-        per_block=k * k * ci,
-        parts=parts,
-        **common,
+        "conv_local_backward_bias", (channels, parts), per_block=per_block, parts=parts, **common
     )
     sum_parts(dev, partial, grad_weight, grad_bias, parts=parts)
 
