@@ -122,8 +122,8 @@ ALWAYS_INLINE void find_corners(local int2 *corner, global const int *tile_list)
 }
 
 // One work-item per (4 output channels, ROWS lines of a tile), a work-group per (4 * QUADS
-// channels, GROUP_TILES tiles of the list): reads what the lines see in x, then in x2 (the concatenation
-// [x, x2] without making it), and writes them to out.
+// channels, GROUP_TILES tiles of the list): reads what the lines see in x, then in x2 (the
+// concatenation [x, x2] without making it), and writes them to out.
 kernel void conv_local_forward(
     const int c1,
     const int c2,  // channels of x2; 0 = x2 is not read
