@@ -26,9 +26,11 @@ SMALLER = "lower --points or raise --downscale"
 STANDARD = ("-cl-std=CL1.2", "-cl-kernel-arg-info")  # options of every build
 # Of Intel's driver of GPUs; others of that vendor refuse options that they do not know.
 INTEL_PLATFORM = "Intel(R) OpenCL"
-# Files with a kernel that spills with the 128 registers that a thread has there by default, and not
-# with 256, of which half as many threads run (docs/gpu_check.md).
-SPILLING_ON_INTEL = frozenset(("layers/conv_backward_weights",))
+# Files with a kernel that spills, or becomes narrow, with the 128 registers that a thread has there
+# by default, and not with 256, of which half as many threads run (docs/gpu_check.md).
+SPILLING_ON_INTEL = frozenset(
+    ("layers/conv_backward_weights", "layers/conv_local", "layers/conv_local_backward_weights")
+)
 
 
 def vendor_options(info: dict[str, str | int], name: str) -> tuple[str, ...]:

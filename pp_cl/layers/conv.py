@@ -47,15 +47,8 @@ def conv_forward(
     Raises ValueError when shapes do not fit together.
     """
     height, width, co = out.shape
+    check_forward(sources, weight, bias, out)
     channels = [source.shape[2] for source in sources]
-    blocks = -(-co // LANES)
-    if (weight.shape[0], weight.shape[3]) != (blocks, sum(channels)) or bias.shape != (
-        blocks * LANES,
-    ):
-        raise ValueError(
-            f"convolution of {' + '.join(map(str, channels))} to {co} channels: weight is"
-            f" {weight.shape}, bias {bias.shape}"
-        )
     program, size, work_group = _program(dev, blocking, weight.shape[1], out.shape)
     program.launch(
         "conv_forward",
@@ -94,8 +87,7 @@ def conv_backward_input(
     Raises ValueError when shapes do not fit together.
     """
     height, width, c = grad_x.shape
-    if flipped.shape[0] != -(-c // LANES):
-        raise ValueError(f"input gradient of {c} channels: flipped weights are {flipped.shape}")
+    check_flipped(flipped, grad_x)
     program, size, work_group = _program(dev, blocking, flipped.shape[1], grad_x.shape)
     program.launch(
         "conv_backward_input",
@@ -112,6 +104,26 @@ def conv_backward_input(
         grad_x=grad_x,
         tile_count=checked_tiles(dev, tiles, height, width).count,
     )
+
+
+def check_forward(sources: tuple[Array, ...], weight: Array, bias: Array, out: Array) -> None:
+    """Raise ValueError unless weight and bias are those of conv_forward() for these arrays."""
+    co, channels = out.shape[2], [source.shape[2] for source in sources]
+    blocks = -(-co // LANES)
+    if (weight.shape[0], weight.shape[3]) != (blocks, sum(channels)) or bias.shape != (
+        blocks * LANES,
+    ):
+        raise ValueError(
+            f"convolution of {' + '.join(map(str, channels))} to {co} channels: weight is"
+            f" {weight.shape}, bias {bias.shape}"
+        )
+
+
+def check_flipped(flipped: Array, grad_x: Array) -> None:
+    """Raise ValueError unless these are conv_backward_input()'s weights for so many channels."""
+    c = grad_x.shape[2]
+    if flipped.shape[0] != -(-c // LANES):
+        raise ValueError(f"input gradient of {c} channels: flipped weights are {flipped.shape}")
 
 
 def _program(dev, blocking, k, shape):

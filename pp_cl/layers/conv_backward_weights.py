@@ -41,7 +41,12 @@ def flip_weights(
 def partial_floats(height: int, weight_shape: tuple) -> int:
     """Floats of scratch memory that conv_backward_weights needs for an image `height` high."""
     blocks, k, _, ci, _ = weight_shape
-    return _parts(height, weight_shape)[0] * blocks * (k * k * ci + 1) * LANES
+    return most_parts(height, weight_shape) * blocks * (k * k * ci + 1) * LANES
+
+
+def most_parts(height: int, weight_shape: tuple) -> int:
+    """Into how many parts the sum over an image `height` high is cut."""
+    return _parts(height, weight_shape)[0]
 
 
 def conv_backward_weights(
@@ -66,8 +71,8 @@ def conv_backward_weights(
     """
     height, width, co = grad_out.shape
     blocks, k, _, ci, _ = grad_weight.shape
-    _check_shapes(sources, grad_out, grad_weight, grad_bias)
-    _check_scratch(partial, partial_floats(height, grad_weight.shape))
+    check_shapes(sources, grad_out, grad_weight, grad_bias)
+    check_scratch(partial, partial_floats(height, grad_weight.shape))
     tiles = checked_tiles(dev, tiles, height, width)
     parts, rows = _parts(height, grad_weight.shape)
     first = 0
@@ -113,7 +118,9 @@ def sum_parts(
     )
 
 
-def _check_shapes(sources, grad_out, grad_weight, grad_bias):
+def check_shapes(
+    sources: tuple[Array, ...], grad_out: Array, grad_weight: Array, grad_bias: Array
+) -> None:
     """Raise ValueError when shapes do not fit together."""
     co, (blocks, _, _, ci, _) = grad_out.shape[2], grad_weight.shape
     channels = [source.shape[2] for source in sources]
@@ -124,7 +131,7 @@ def _check_shapes(sources, grad_out, grad_weight, grad_bias):
         )
 
 
-def _check_scratch(partial, needed):
+def check_scratch(partial: Array, needed: int) -> None:
     """Raise ValueError when there is less scratch than needed."""
     if partial.size < needed:
         raise ValueError(f"weight gradient: scratch has {partial.size} floats, needs {needed}")

@@ -124,7 +124,7 @@ def load_policy(dev: Device, tolerance: float) -> ConvolutionPolicy:
     else:
         default = {
             "CPU": "as shipped for CPUs with wide vectors",
-            "GPU": "direct ones, as no GPU has been measured",
+            "GPU": "direct ones through local memory; no GPU has been measured",
         }[device_class(dev)]
         origin = f"convolutions: {default}; `pp-cl tune` measures this device"
     return make_policy(dev, tolerance, tuning, origin=origin)

@@ -72,9 +72,10 @@ class DirectConvolution:
         shape = _flipped_shape(weight.shape, grad_x.shape[2], grad_out.shape[2])
         flipped = work.weights[: math.prod(shape)].reshape(shape)
         flip_weights(self.dev, weight, first, flipped, blocking=self.blocking)
-        conv_backward_input(
-            self.dev, flipped, grad_out, grad_x, mask=mask, tiles=tiles, blocking=self.blocking
-        )
+        self._backward_input(flipped, grad_out, grad_x, mask=mask, tiles=tiles)
+
+    def _backward_input(self, flipped, grad_out, grad_x, **given):
+        conv_backward_input(self.dev, flipped, grad_out, grad_x, blocking=self.blocking, **given)
 
     def backward_weights(
         self,

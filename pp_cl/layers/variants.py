@@ -12,6 +12,7 @@ from pp_cl.layers.blocking import Blocking
 from pp_cl.layers.direction import Direction
 from pp_cl.layers.tiles import Tiles
 from pp_cl.layers.variant_direct import DirectConvolution
+from pp_cl.layers.variant_local import LocalConvolution
 from pp_cl.layers.variant_winograd import WinogradConvolution
 from pp_cl.layers.winograd import WinogradForm, fits
 from pp_cl.layers.work import Work
@@ -28,8 +29,9 @@ class Variant:
     errors that `pp-cl bench conv` measured for K x K layers, of a ReLU's outputs or normal
     gradients, with up to 512 channels and 800 x 800 pixels}}; docs/convolutions.md has hard inputs.
     A direction without an error has no kernel of its own. devices: classes of devices that it is
-    offered to. shipped_from: {direction: on CPUs, shipped for images of at least that many pixels}.
-    preferred: the device that prefers it, and the measurement that says so.
+    offered to; the first in VARIANTS of those that a GPU is offered is shipped there. shipped_from:
+    {direction: on CPUs, shipped for images of at least that many pixels}. preferred: the device
+    that prefers it, and the measurement that says so. local: the direct one through local memory.
     """
 
     winograd_m: int | None
@@ -38,6 +40,7 @@ class Variant:
     devices: tuple[str, ...]
     shipped_from: dict[Direction, int]
     preferred: str
+    local: bool = False
 
     def can_run(self, k: int, *channels: int) -> bool:
         """Whether it takes a K x K kernel and these numbers of channels, of each source and of the
@@ -47,6 +50,8 @@ class Variant:
 
     def convolution(self, dev: Device, blocking: Blocking) -> "Convolution":
         """Its implementation on a device."""
+        if self.local:
+            return LocalConvolution(dev, blocking)
         if self.winograd_m is None:
             return DirectConvolution(dev, blocking)
         form = WinogradForm(
@@ -63,6 +68,18 @@ class Variant:
 # Channels matter less: from 16 on, all of them gain. No Winograd variant is offered to GPUs: a
 # work-item holds a group of one lane, and GPU compilers spill 15 KB of its registers.
 VARIANTS = {
+    "local": Variant(
+        None,
+        False,
+        {
+            3: {FORWARD: 9e-7, INPUT: 1.3e-6, WEIGHTS: 3.5e-7},
+            1: {FORWARD: 3.5e-7, INPUT: 4.5e-7, WEIGHTS: 4e-7},
+        },
+        ("GPU",),
+        {},
+        "GPU: by what compilers say of its registers and instructions, not timed.",
+        local=True,
+    ),
     "direct": Variant(
         None,
         False,
@@ -73,7 +90,7 @@ VARIANTS = {
         ("CPU", "GPU"),
         {FORWARD: 0, INPUT: 0, WEIGHTS: 0},
         "CPU: images of less than 256 pixels and channels beside the multiples of 16, 2 cores with"
-        " AVX-512. GPU: the only one, not timed.",
+        " AVX-512.",
     ),
     "winograd2": Variant(
         2,
@@ -104,7 +121,7 @@ VARIANTS = {
 
 
 class Convolution(Protocol):
-    """A variant on a device: what DirectConvolution and WinogradConvolution do."""
+    """A variant on a device: what the classes of the modules variant_*.py do."""
 
     def work_floats(
         self, direction: Direction, height: int, weight_shape: tuple, c: int

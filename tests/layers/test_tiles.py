@@ -14,6 +14,7 @@ from pp_cl.device.device import kernel_folder
 from pp_cl.layers import resample as layers
 from pp_cl.layers.blocking import SHIPPED
 from pp_cl.layers.conv import pack_bias, pack_weights, unpack_weights
+from pp_cl.layers.conv_local import TILE_PARTS
 from pp_cl.layers.direction import Direction
 from pp_cl.layers.tiles import (
     LANES,
@@ -119,7 +120,9 @@ def test_lists_and_wrong_sizes(dev):
         some_tiles(dev, (9, 6), np.zeros((3, 2)))
 
 
-@pytest.mark.parametrize("k, variant", [(1, "direct"), *[(3, variant) for variant in VARIANTS]])
+@pytest.mark.parametrize(
+    "k, variant", [(1, "direct"), (1, "local"), *[(3, variant) for variant in VARIANTS]]
+)
 @pytest.mark.parametrize("height, width", [(3, 2), (11, 14), large(31, 33), large(6, 70)])
 def test_convolutions_compute_the_chosen_tiles(dev, rng, k, variant, height, width):
     """The other tiles of the results keep their NaN; those of a gradient that do not count may hold
@@ -217,7 +220,12 @@ def test_layers_compute_the_chosen_tiles(dev, rng, height, width, channels):
 
 
 @pytest.mark.parametrize(
-    "file, name, value", [("layers/tiles.h", "SIDE", SIDE), ("common.h", "CHANNELS", LANES)]
+    "file, name, value",
+    [
+        ("layers/tiles.h", "SIDE", SIDE),
+        ("common.h", "CHANNELS", LANES),
+        ("layers/conv_local.cl", "ROWS", SIDE // TILE_PARTS),
+    ],
 )
 def test_host_and_kernels_agree(file, name, value):
     text = (kernel_folder() / file).read_text("utf-8")

@@ -55,11 +55,11 @@ def test_without_one_the_device_class_is_named(dev, monkeypatch):
     gpu = policy.origin
     assert (
         "CPU" in cpu
-        and "no GPU has been measured" in gpu
+        and "through local memory; no GPU has been measured" in gpu
         and "pp-cl tune" in cpu
         and "pp-cl tune" in gpu
     )
-    assert policy.choose(SHAPE) == "direct"
+    assert policy.choose(SHAPE) == "local"
 
 
 @pytest.mark.parametrize(

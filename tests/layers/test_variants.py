@@ -22,7 +22,9 @@ def check_all_directions(dev, variant, layer):
         assert within(variant, result).share <= 1
 
 
-@pytest.mark.parametrize("k, variant", [(1, "direct"), *[(3, variant) for variant in VARIANTS]])
+@pytest.mark.parametrize(
+    "k, variant", [(1, "direct"), (1, "local"), *[(3, variant) for variant in VARIANTS]]
+)
 def test_all_directions(dev, rng, k, variant):
     weight, bias = layer(rng, 16 + 32, 48, k)
     parts = [np.maximum(rng.normal(size=(11, 14, c)), 0).astype(np.float32) for c in (16, 32)]
@@ -41,7 +43,8 @@ def test_where_a_variant_can_run():
     assert VARIANTS["winograd4"].can_run(3, 16, 48)
     assert not VARIANTS["winograd4"].can_run(1, 16, 48)
     assert not VARIANTS["winograd2"].can_run(3, 16, 3)
-    assert VARIANTS["direct"].can_run(3, 16, 3) and VARIANTS["direct"].can_run(1, 16)
+    for name in ("direct", "local"):
+        assert VARIANTS[name].can_run(3, 16, 3) and VARIANTS[name].can_run(1, 16)
 
 
 def shipped(dev, direction, ci, co, height, width, *, k=3, sources=None):
@@ -62,18 +65,20 @@ def test_shipped_choice(dev, monkeypatch, direction):
     assert shipped(dev, direction, 128, 128, 64, 64, k=1) == "direct"
     assert shipped(dev, direction, 48, 16, 64, 64, sources=(24, 24)) == "direct"
     assert shipped(dev, direction, 48, 16, 64, 64, sources=(16, 32)) == "winograd4"
-    assert offered("CPU") == list(VARIANTS)
+    # made for GPUs
+    assert offered("CPU") == [name for name in VARIANTS if name != "local"]
     monkeypatch.setattr(dev, "is_cpu", False)
     # one work-item a compute unit suits no GPU
-    assert offered("GPU") == ["direct"]
-    assert shipped(dev, direction, 128, 128, 64, 64) == "direct"
+    assert offered("GPU") == ["local", "direct"]
+    for k, co in ((3, 128), (3, 3), (1, 64)):
+        assert shipped(dev, direction, 128, co, 64, 64, k=k) == "local"
 
 
 def test_a_variant_asked_for_runs_where_it_can(dev):
     policy = make_policy(dev, variant="winograd2")
     assert policy.choose(ConvShape(Direction.FORWARD, 3, (16,), 16, 64)) == "winograd2"
     assert policy.choose(ConvShape(Direction.FORWARD, 3, (16, 3), 16, 64)) == "direct"
-    with pytest.raises(ValueError, match="fft.*auto, direct, winograd2, winograd4"):
+    with pytest.raises(ValueError, match="fft.*auto, local, direct, winograd2, winograd4"):
         make_policy(dev, variant="fft")
 
 

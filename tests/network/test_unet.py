@@ -165,7 +165,7 @@ def test_hard_inputs(dev, rng, blocks):
 
 
 def test_wrong_use_is_refused(dev):
-    with pytest.raises(ValueError, match="fft.*auto, direct, winograd2, winograd4"):
+    with pytest.raises(ValueError, match="fft.*auto, local, direct, winograd2, winograd4"):
         UNet(dev, policy=make_policy(dev, variant="fft"))
     net = UNet(dev, (16, 16, 16))
     with pytest.raises(ValueError, match="\\(10, 8, 16\\)"):

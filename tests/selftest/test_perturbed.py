@@ -34,6 +34,8 @@ FLIPS = [
     ("raster/blend", "dL_dR -= dL_ddepth", "dL_dR += dL_ddepth", "softmax: gradients of spheres"),
     ("layers/conv", "[p] += value", "[p] -= value", "conv: direct, hard inputs"),
     ("layers/conv_backward_weights", "[i] += value", "[i] -= value", "conv: direct, hard inputs"),
+    ("layers/conv_local", "+ p] += v", "+ p] -= v", "conv: local, hard inputs"),
+    ("layers/conv_local_backward_weights", "[0] += v", "[0] -= v", "conv: local, hard inputs"),
     ("layers/winograd", "[i] += value", "[i] -= value", "conv: winograd2, hard inputs"),
     ("layers/winograd_backward_weights", "[i] += v", "[i] -= v", "conv: winograd2, hard inputs"),
     ("layers/winograd_transform", "= weight[(block * 9", "= -weight[(block * 9", "conv: winograd2"),

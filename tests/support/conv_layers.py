@@ -26,6 +26,28 @@ SHAPES = [
 ]
 
 
+# The same, and groups of 64 output channels, for kernels whose work-groups share local memory: a
+# simulator takes half a minute for each.
+LOCAL_SHAPES = [
+    (1, 5, 16, 3),
+    (5, 1, 20, 20),
+    *map(
+        large,
+        [
+            (1, 1, 3, 16),
+            (3, 12, 1, 1),
+            (31, 33, 16, 48),
+            (257, 3, 32, 16),
+            (6, 31, 3, 64),
+            (4, 257, 48, 32),
+            (8, 8, 512, 32),
+            (16, 24, 32, 512),
+            (5, 21, 36, 64),
+        ],
+    ),
+]
+
+
 def layer(rng, ci, co, k):
     """Random weights and bias of PyTorch's initial size: (CO, CI, K, K), (CO,)."""
     bound = 1 / np.sqrt(ci * k * k)

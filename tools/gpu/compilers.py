@@ -23,6 +23,7 @@ from tools.gpu.packages import (
     CLANG,
     FOLDER,
     LINKER,
+    NVDISASM,
     NVIDIA_LIBRARY,
     OCLOC,
     PTXAS,
@@ -79,6 +80,22 @@ def compile_build(target: str, build: Build, sources: Path, folder: Path) -> dic
     """
     options = [*_options(target, build), "-I", str(sources)]
     return _backend(target)(target, options, sources / f"{build.file}.cl", folder)
+
+
+def assembly(target: str, build: Build, sources: Path, folder: Path) -> str:
+    """The instructions of a build for sm_* (SASS) or gfx*, as text. As compile_build(); raises
+    ValueError for other targets.
+    """
+    options, file = [*_options(target, build), "-I", str(sources)], sources / f"{build.file}.cl"
+    if _backend(target) is _nvidia:
+        nvdisasm = find(NVDISASM)
+        _nvidia(target, options, file, folder)
+        return _run([nvdisasm, "-c", str(folder / "x.cubin")])
+    if _backend(target) is _amd:
+        clang = _clang("--target=amdgcn-amd-amdhsa", AMD_LIBRARY, options, str(file))
+        _run([*clang, f"-mcpu={target}", "-nogpulib", "-S", "-o", str(folder / "x.s")])
+        return (folder / "x.s").read_text("utf-8")
+    raise ValueError(f"{target}: no assembly of it")
 
 
 def _options(target, build):

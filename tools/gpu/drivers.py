@@ -148,7 +148,7 @@ def benchmarks(dev: Device) -> None:
 
 def convolutions(dev: Device) -> None:
     """All directions and sizes of kernels, with every blocking that `pp-cl tune` tries; with
-    channels of every parity.
+    channels of every parity and in groups of 16, 32 and 64.
     """
     policy = make_policy(dev)
     tried = [
@@ -156,7 +156,7 @@ def convolutions(dev: Device) -> None:
         for name, values in CHOICES[device_class(dev)].items()
         for value in values
     ]
-    for k, (side, channels) in product((1, 3), ((8, 16), (8, 6), (8, 5), (2, 5))):
+    for k, (side, channels) in product((1, 3), ((8, 16), (8, 32), (8, 64), (8, 6), (8, 5), (2, 5))):
         conv = RandomConv(dev, k, side, (channels,), co=channels)
         for blocking, direction in product([policy.blocking, *tried], Direction):
             for variant in conv.variants:

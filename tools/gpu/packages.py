@@ -1,8 +1,8 @@
 """The compilers of GPUs: where they are, and Debian's packages of those that are absent.
 
 Packages are unpacked into build/gpu, not installed: that needs no root, and the installed driver of
-Intel's GPUs would be one more OpenCL platform. NVIDIA's ptxas is not free and in none of them; it
-is looked for in the PATH, in CUDA's folder and among the Python packages.
+Intel's GPUs would be one more OpenCL platform. NVIDIA's ptxas and nvdisasm are not free and in none
+of them; they are looked for in the PATH, in CUDA's folder and among the Python packages.
 """
 
 import os
@@ -16,6 +16,7 @@ FOLDER = Path(__file__).parents[2] / "build" / "gpu"
 CUDA = Path("/usr/local/cuda/bin")
 LLVM = 19
 CLANG, LINKER, PTXAS, OCLOC = f"clang-{LLVM}", f"ld.lld-{LLVM}", "ptxas", "ocloc"
+NVDISASM = "nvdisasm"
 NVIDIA_LIBRARY, AMD_LIBRARY = "nvptx64--nvidiacl.bc", "amdgcn--amdhsa.bc"
 # {program or file: Debian's package of it}
 PACKAGES = {
@@ -25,6 +26,8 @@ PACKAGES = {
     LINKER: f"lld-{LLVM}",
     OCLOC: "intel-opencl-icd",
 }
+# {program of CUDA's: package of Python that has it}
+WHEELS = {PTXAS: "nvidia-cuda-nvcc", NVDISASM: "nvidia-cuda-nvdisasm"}
 
 
 class CompilerMissing(Exception):
@@ -46,17 +49,17 @@ def environment() -> dict[str, str]:
 def find(name: str) -> str:
     """The path of a program, or of a file of libclc. Raises CompilerMissing."""
     places, mode = [environment()["PATH"]], os.X_OK
-    if name == PTXAS:
+    if name in WHEELS:
         packages = Path(sysconfig.get_path("purelib"), "nvidia")
-        places += [str(CUDA), *(str(path.parent) for path in packages.glob("*/bin/ptxas"))]
+        places += [str(CUDA), *(str(path.parent) for path in packages.glob(f"*/bin/{name}"))]
     elif name.endswith(".bc"):
         # not /usr/lib/clc, where another version of LLVM may have put its own
         places, mode = [str(FOLDER / "usr" / "lib" / "clc")], os.R_OK
     found = shutil.which(name, mode, os.pathsep.join(places))
     if not found:
         source = (
-            "install CUDA's compiler, or nvidia-cuda-nvcc into .venv by pip"
-            if name == PTXAS
+            f"install CUDA's compiler, or {WHEELS[name]} into .venv by pip"
+            if name in WHEELS
             else f"it is in Debian's package {PACKAGES[name]}"
         )
         raise CompilerMissing(f"{name} is missing: {source}")
