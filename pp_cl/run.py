@@ -146,8 +146,8 @@ class Training:
         on_step(step, row) is called after each step, with its row of the log where it has one.
         is_stopped() is asked after each step: where it is true, a checkpoint is written and the
         training ends there, to be gone on with. Raises UserError, before anything is written, where
-        another process trains into the folder; later on before a refinement for which the memory
-        is too small, with a checkpoint.
+        another process trains into the folder; later on where a refinement or the averages take
+        more memory than there is, with a checkpoint.
         """
         self.trainer.renderer.cache.set_budget(self.room.spare)
         with self.folder.owned():
@@ -175,7 +175,7 @@ class Training:
             seconds = log.seconds
             first = trainer.step + 1
             while trainer.step < settings.iterations:
-                self._check_refinement()
+                self._check_growth()
                 start = time.perf_counter()
                 terms = trainer.train_step()
                 seconds += time.perf_counter() - start
@@ -194,10 +194,10 @@ class Training:
             log.write(self._row(seconds) | {"points": trainer.model.cloud.count, "finished": True})
         return seconds
 
-    def _check_refinement(self):
+    def _check_growth(self):
         """Keep what is learned where the next step would not fit the memory."""
         try:
-            self.room.check_refinement(self.trainer.model, self.trainer.step)
+            self.room.check_growth(self.trainer.model, self.trainer.step)
         except UserError:
             self._save(finished=False)
             raise

@@ -125,8 +125,8 @@ def _images_line(training, chosen):
         return f"images: {stored}"
     why = f" for the preset {training.config.preset} (--downscale 1 keeps them)" if chosen else ""
     kept = (
-        f"; kept in memory reduced {view.shrunk} times, so pixel jitter has"
-        f" {view.downscale}x{view.downscale} places"
+        f"; kept in memory reduced {view.shrunk} times, which leaves pixel jitter"
+        f" {view.downscale}x{view.downscale} offsets"
     )
     return (
         f"images: {stored}, reduced {view.file_downscale} times to {used}{why}"

@@ -6,7 +6,7 @@ import numpy as np
 
 # Of a scene's photographs in memory, as RGBA; more than this is reduced while it is read. A fixed
 # number, not what happens to be free: the same command gives the same bits on every machine.
-KEPT_BYTES = 2**30
+KEPT_BYTES = 2**29
 ROWS = 16  # of the smaller image at a time: what is summed stays in a cache
 
 

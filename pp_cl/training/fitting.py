@@ -91,18 +91,16 @@ class Room:
         sketch = self.sketch.on_grid(grid, points, depth_range, step)
         self._check(sketch, advised=sketch)
 
-    def check_refinement(self, model: Model, step: int) -> None:
-        """Before the step after `step`: the same where it refines the grid, as it is known only now
-        how many points are left.
+    def check_growth(self, model: Model, step: int) -> None:
+        """Before the step after `step`: the same where it refines the grid or begins the averages,
+        as it is known only now how many points are left.
         """
         points = model.cloud.count
-        if step + 1 in self.sketch.refinements:
+        if step + 1 in (*self.sketch.refinements, self.sketch.averages):
             try:
                 self.check_points(model.grid, points, model.depth_range, step)
             except UserError as error:
-                raise UserError(
-                    f"step {step}: to refine the grid of {points} points, {error}"
-                ) from None
+                raise UserError(f"step {step}: to go on with {points} points, {error}") from None
 
     @property
     def host_bytes(self) -> int:
@@ -191,11 +189,13 @@ def _most(values, holds):
     """The last of the ascending `values` for which holds() is true, as it is for all before; 0
     where it is for none.
     """
-    low, high = 0, len(values)
+    if not values or not holds(values[0]):
+        return 0
+    low, high = 1, len(values)
     while low < high:
         middle = (low + high) // 2
         low, high = (middle + 1, high) if holds(values[middle]) else (low, middle)
-    return values[low - 1] if low else 0
+    return values[low - 1]
 
 
 def _size(size):

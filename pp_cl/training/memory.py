@@ -80,13 +80,13 @@ class Plan(NamedTuple):
     @property
     def largest(self) -> tuple[str, int]:
         """(what it is for, bytes) of the largest buffer."""
-        sizes = {
-            f"{what}: {name}": table_bytes({name: row})
+        sizes = (
+            (f"{what}: {name}", table_bytes({name: row}))
             for moment in self.moments
             for what, table in moment.tables
             for name, row in table.items()
-        }
-        return max(sizes.items(), key=lambda item: item[1])
+        )
+        return max(sizes, key=lambda size: size[1])
 
     def host(self, is_cpu: bool) -> int:
         """Most bytes that the host holds beside the program itself. is_cpu: of the device, whose
@@ -163,6 +163,12 @@ class Sketch:
         train = self.config.train
         return [s for s in refine_steps(train.iterations, train.refine_at) if s > self.step]
 
+    @property
+    def averages(self) -> float:
+        """The step from which on averages are kept, infinite for never."""
+        train = self.config.train
+        return ema_start(train.iterations) if train.ema else math.inf
+
 
 def memory_plan(sketch: Sketch) -> Plan:
     """The memory of the training. Pairs and points after prunings to come are estimates."""
@@ -178,7 +184,7 @@ def _moments(sketch: Sketch) -> Iterator[Moment]:
     steps = refine_steps(train.iterations, train.refine_at)
     start = max((s for s in steps if s <= sketch.step), default=0)
     to_come = sketch.refinements
-    averages = ema_start(train.iterations) if train.ema else math.inf
+    averages = sketch.averages
     for level, end in enumerate([*to_come, train.iterations]):
         now, left = max(start, sketch.step), len(to_come) - level
         args = {"left": left, "spacing": sketch.spacing / 2**level, "start": now, "end": end}

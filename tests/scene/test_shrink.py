@@ -43,14 +43,15 @@ def test_white_stays_white_in_the_largest_blocks():
 @pytest.mark.parametrize(
     "count, downscale, factor",
     [
-        (22, 8, 1),  # 1.06e9 bytes: just below 2^30
-        (23, 8, 2),
-        (300, 8, 4),
+        (11, 8, 1),  # 5.28e8 bytes: just below 2^29
+        (12, 8, 2),
+        (150, 8, 4),
+        (300, 8, 8),  # 4: 9e8
         (300, 1, 1),
         (300, 2, 2),
-        (300, 6, 6),  # 3: 1.6e9
         (300, 7, 7),
-        (300, 16, 4),
+        (300, 16, 8),
+        (170, 12, 4),  # 3: 9e8
         (5000, 8, 8),  # too many even so: as small as the training wants them
     ],
 )
