@@ -224,7 +224,7 @@ def test_the_advice_of_the_command_is_taken(plain, tmp_path, monkeypatch, capsys
 def test_a_refinement_that_does_not_fit_keeps_what_is_learned(plain, tmp_path, monkeypatch, capsys):
     """More points are left than the plan took them to be."""
     scene = write_ball_scene(tmp_path / "ball", size=64)
-    settings = {"train__refine_at": "0.5,1", "train__iterations": 40}
+    settings = {"train__refine_at": "0.5,1", "train__iterations": 40, "train__ema": "false"}
     settings |= {"train__prune_every": 1000, "train__checkpoint_every": 1000}
     monkeypatch.setattr(
         "pp_cl.training.memory._prunings", lambda train, start, end: int(end > start)
