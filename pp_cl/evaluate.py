@@ -94,9 +94,9 @@ def _published(scene, split, views):
     """{"published": rows of the scene's test views, "published_differs": how this measurement
     differs from them}.
     """
-    cameras = [view.stored_camera for view in views]
+    cameras = [view.file_camera for view in views]
     rows = published_rows(scene.name, cameras) if split == "test" else {}
-    differs = differences(scene.name, cameras, views[0].downscale) if rows else ""
+    differs = differences(scene.name, cameras, views[0].file_downscale) if rows else ""
     return {"published": rows, "published_differs": differs}
 
 

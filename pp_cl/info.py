@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from pp_cl.config import Config, configure, load_config, preset
+from pp_cl.config import Config, assign, configure, load_config, preset
 from pp_cl.device.device import Device
 from pp_cl.errors import UserError
 from pp_cl.files.contact_sheet import contact_sheet
@@ -173,8 +173,9 @@ def describe_scene(
     path = config.scene.path
     names = sorted(scene_splits(path), key=lambda split: (split == "test", split))
     frames = {split: scene_frames(path, split) for split in names}
-    views = open_scene(dev, config, ("train",)).splits["train"]
     downscale = preset_downscale(path, preset_name)
+    assign(config, "scene.downscale", downscale, "preset")
+    views = open_scene(dev, config, ("train",)).splits["train"]
     hull, problem = _hull(dev, views, config)
     found = disagreements(views, hull.grid.box) if hull else []
     facts = {
@@ -188,7 +189,7 @@ def describe_scene(
         **_rig(views),
         "preset": preset_name,
         "downscale": downscale,
-        "hull": _hull_facts(hull, [view.camera.downscaled(downscale) for view in views]),
+        "hull": _hull_facts(hull, [view.camera for view in views]),
         "problem": problem,
     }
     return Described(facts, views, hull, found)
@@ -212,7 +213,7 @@ def _range(values):
 
 def _lenses(views):
     """Least and most of the training views: focal length, angles of view."""
-    cameras = [view.stored_camera for view in views]
+    cameras = [view.file_camera for view in views]
     angles = [
         [math.degrees(2 * math.atan(size / (2 * focal))) for size, focal in pairs]
         for pairs in (

@@ -25,13 +25,20 @@ from pp_cl.network.unet import UNet
 from pp_cl.presets import SHORT
 from pp_cl.scene.agreement import disagreements
 from pp_cl.scene.bounds import listing
+from pp_cl.scene.grid import Grid
 from pp_cl.scene.hull import build_grid, depth_range, spacing_pixels
 from pp_cl.scene.identity import difference, identity
-from pp_cl.scene.open import measured_split, open_scene, preset_downscale, scene_box
+from pp_cl.scene.open import (
+    measured_split,
+    open_scene,
+    preset_downscale,
+    scene_box,
+    scene_frames,
+)
 from pp_cl.scene.views import View
 from pp_cl.train import Trainer
 from pp_cl.trained import Run, load_run
-from pp_cl.training.memory import Plan, memory_plan, spare_memory
+from pp_cl.training.fitting import Room
 from pp_cl.training.stored import load_run_state, opened_run
 
 FIRST_PREVIEW = 10.0  # seconds; with a slow step and its writing it shows within 20
@@ -113,16 +120,16 @@ class HullFacts(NamedTuple):
 class Training:
     """A training that is ready to begin or to go on.
 
-    info: what its checkpoints' headers hold beside the model's. plan: of memory_plan. hull:
-    None if it goes on from a checkpoint. origin: of the choice of convolutions, a line of text.
-    measured: the views that train.eval_every measures.
+    info: what its checkpoints' headers hold beside the model's. room: the memory there is, and the
+    plan of what is taken. hull: None if it goes on from a checkpoint. origin: of the choice of
+    convolutions, a line of text. measured: the views that train.eval_every measures.
     """
 
     folder: RunFolder
     config: Config
     trainer: Trainer
     info: dict[str, Any]
-    plan: Plan
+    room: Room
     hull: HullFacts | None
     origin: str
     measured: list[View]
@@ -139,11 +146,10 @@ class Training:
         on_step(step, row) is called after each step, with its row of the log where it has one.
         is_stopped() is asked after each step: where it is true, a checkpoint is written and the
         training ends there, to be gone on with. Raises UserError, before anything is written, where
-        the memory is too small or another process trains into the folder.
+        another process trains into the folder; later on where a refinement or the averages take
+        more memory than there is, with a checkpoint.
         """
-        trainer, settings = self.trainer, self.config.train
-        spare = spare_memory(self.plan, trainer.dev, settings.memory_gib)
-        trainer.renderer.cache.set_budget(spare)
+        self.trainer.renderer.cache.set_budget(self.room.spare)
         with self.folder.owned():
             self._check_unchanged()
             self.folder.create(self.config.to_json())
@@ -169,6 +175,7 @@ class Training:
             seconds = log.seconds
             first = trainer.step + 1
             while trainer.step < settings.iterations:
+                self._check_growth()
                 start = time.perf_counter()
                 terms = trainer.train_step()
                 seconds += time.perf_counter() - start
@@ -186,6 +193,14 @@ class Training:
             self._save(finished=True)
             log.write(self._row(seconds) | {"points": trainer.model.cloud.count, "finished": True})
         return seconds
+
+    def _check_growth(self):
+        """Keep what is learned where the next step would not fit the memory."""
+        try:
+            self.room.check_growth(self.trainer.model, self.trainer.step)
+        except UserError:
+            self._save(finished=False)
+            raise
 
     def _after_step(self, log, terms, seconds):
         """Row of the log, checkpoint and preview, where they are due; returns the row or None."""
@@ -252,7 +267,7 @@ def open_training(
 ) -> Training:
     """A training in `folder`, from its checkpoint `stored` where it has one. Nothing is written.
 
-    Raises UserError for a scene or checkpoint that does not fit.
+    Raises UserError for a scene or checkpoint that does not fit, and for too little memory.
     """
     tolerance = config.network.tolerance
     if stored:
@@ -260,15 +275,24 @@ def open_training(
     else:
         policy = load_policy(dev, tolerance)
     net = UNet.of_settings(dev, config.network, policy, seed=config.train.seed)
+    room = Room(config, net, scene_frames(config.scene.path))
+    if stored:
+        _check_stored(room, *stored)
+    else:
+        room.check_unseen()
     views = open_scene(dev, config, ("train",)).splits["train"]
     measured = _measured_views(dev, config) if config.train.eval_every else []
     if stored:
         trainer, info, hull = _resume(config, views, net, stored, file=folder.checkpoint)
     else:
-        trainer, info, hull = _start(config, views, net)
-    plan = memory_plan(config, trainer.model, trainer.views, trainer.refinements_to_come)
+        trainer, info, hull = _start(config, views, net, room)
     info["tuning"] = policy.tuning
-    return Training(folder, config, trainer, info, plan, hull, policy.origin, measured)
+    return Training(folder, config, trainer, info, room, hull, policy.origin, measured)
+
+
+def _check_stored(room, header, arrays):
+    grid, step = Grid.of_header(header["grid"]), header["step"]
+    room.check_points(grid, len(arrays["points.ids"]), header["depth_range"], step)
 
 
 def _measured_views(dev, config):
@@ -277,12 +301,13 @@ def _measured_views(dev, config):
     return open_scene(dev, config, (split,), most=MEASURED_VIEWS).splits[split]
 
 
-def _start(config, views, net):
+def _start(config, views, net, room):
     """(Trainer, info, HullFacts) of a training from its beginning."""
     dev = net.dev
     start = time.perf_counter()
     hull = build_grid(dev, views, config.points.count, scene_box(config))
     near_far = depth_range(views, hull)
+    room.check_points(hull.grid, len(hull.ids), near_far)
     facts = HullFacts(
         len(hull.ids),
         hull.capped,

@@ -17,7 +17,7 @@ from pp_cl.scene.target import Target
 from pp_cl.scene.views import View
 from pp_cl.settings import TrainConfig
 from pp_cl.training.adam import moment_scale
-from pp_cl.training.crops import BOX_MARGIN, draw_start
+from pp_cl.training.crops import BOX_MARGIN, crop_side, draw_start
 from pp_cl.training.loss import WHITE, Loss, gradient_tiles
 from pp_cl.training.mask import MaskLoss
 from pp_cl.training.optimiser import Optimiser, Rates
@@ -28,8 +28,6 @@ from pp_cl.training.refine import refine
 from pp_cl.training.schedule import ema_weight, gamma_at, refine_steps
 from pp_cl.training.smooth import Smoother
 from pp_cl.training.terms import StepTerms
-
-CROP_LOSS = 0.25  # of the crop's side for every halving of the images
 
 
 class Trainer:
@@ -69,7 +67,7 @@ class Trainer:
         """The images of this step: halved once for every refinement of the grid to come."""
         to_come = self.refinements_to_come
         self._reduced = _halved(self.views, to_come)
-        self._crop = 4 * round(self.config.crop * (1 - CROP_LOSS * to_come) / 4)
+        self._crop = crop_side(self.config.crop, to_come)
         self._boxes = [view.object_bounds(BOX_MARGIN) for view in self._reduced]
 
     def _moment_scale(self):

@@ -12,15 +12,14 @@ from pp_cl.config import assign, preset
 from pp_cl.files.contact_sheet import GAP, tiles
 from pp_cl.files.image import read_rgba
 from pp_cl.files.run_folder import RunFolder
-from pp_cl.model import Model
 from pp_cl.network.unet import UNet
 from pp_cl.scene.demo import write_scene
 from pp_cl.scene.hull import build_grid
 from pp_cl.scene.load import Scene, load_scene
-from pp_cl.scene.open import preset_downscale
+from pp_cl.scene.open import preset_downscale, scene_frames
 from pp_cl.scene.views import View
 from pp_cl.trained import load_run
-from pp_cl.training.memory import memory_plan
+from pp_cl.training.memory import Sketch, memory_plan
 
 SIZES = ((48, 48), (37, 29), (24, 40))
 
@@ -114,11 +113,13 @@ def test_the_memory_plan_is_for_the_largest(dev, scene, crop, side):
     views = load_scene(scene).splits["train"]
     hull = build_grid(dev, views, 400)
     net = UNet(dev, config.network.widths)
-    model = Model.create(dev, hull.grid, hull.ids, (2, 6), net=net, degree=2)
-    orders = [views, views[::-1]]
-    plans = [memory_plan(config, model, order) for order in orders]
+    frames, plans = scene_frames(scene), []
+    for order in (frames, frames[::-1]):
+        sketch = Sketch.unseen(config, net, order).on_grid(hull.grid, len(hull.ids), (2, 6))
+        plans.append(memory_plan(sketch))
     assert plans[0] == plans[1]
-    assert f"network at {side}x{side}" in dict(plans[0])
+    told = dict(plans[0].peak.tables)
+    assert f"network at {side}x{side}" in told and "previews at 48x48" in told
 
 
 def test_info_lists_the_sizes(scene, capsys, tmp_path):

@@ -199,7 +199,7 @@ def test_bounded_memory_gives_the_same_bytes(scene, tmp_path, capsys, monkeypatc
     ).read_bytes()
     monkeypatch.setenv("PP_MAX_ALLOCATION", str(150 * points / 2**20))
     assert main(arguments(scene, tmp_path / "smaller", **changes)) == 2
-    assert "lower --points" in capsys.readouterr().err
+    assert "at once: --points " in capsys.readouterr().err
     assert not (tmp_path / "smaller").exists()
 
 
@@ -387,7 +387,7 @@ def test_a_training_that_keeps_its_hits_ends_with_the_same_bytes(scene, tmp_path
     whole |= {"train__iterations": 40, "train__prune_every": 15}
     results, caches = [], []
     for budget in (0, 300_000, 10**9):
-        monkeypatch.setattr("pp_cl.run.spare_memory", lambda *_, budget=budget: budget)
+        monkeypatch.setattr("pp_cl.run.Room.spare", budget)
         monkeypatch.setattr("pp_cl.train.Trainer.finish", _noting(caches, Trainer.finish))
         out = tmp_path / str(budget)
         assert main(arguments(scene, out, **whole)) == 0
@@ -423,7 +423,7 @@ def test_hits_are_cached_only_of_views_that_repeat(
 ):
     whole = {"train__crop": 0, "train__pixel_jitter": "false", "train__dropout": 0} | changes
     caches = []
-    monkeypatch.setattr("pp_cl.run.spare_memory", lambda *_: 10**9)
+    monkeypatch.setattr("pp_cl.run.Room.spare", 10**9)
     monkeypatch.setattr("pp_cl.train.Trainer.finish", _noting(caches, Trainer.finish))
     settings = arguments(scene, tmp_path / "run", train__iterations=6, **whole)
     assert main([*settings, *words]) == 0

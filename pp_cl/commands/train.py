@@ -77,7 +77,7 @@ def run(options: argparse.Namespace) -> None:
     chosen = is_new and "scene.downscale" not in [key for key, _, _ in given]
     print(_images_line(training, chosen))
     print(_first_line(training))
-    print("\n".join(plan_lines(training.plan, dev)), flush=True)
+    print("\n".join(plan_lines(training.room.plan, dev)), flush=True)
     with serve_in_background(folder.path, options.device) if options.view else nullcontext():
         seconds = _run(training, options)
     print(
@@ -119,12 +119,19 @@ def _images_line(training, chosen):
     views = training.trainer.views
     view = views[0]
     stored, used = (
-        _sizes(cameras) for cameras in ([v.stored_camera for v in views], [v.camera for v in views])
+        _sizes(cameras) for cameras in ([v.file_camera for v in views], [v.camera for v in views])
     )
-    if view.downscale == 1:
+    if view.file_downscale == 1:
         return f"images: {stored}"
     why = f" for the preset {training.config.preset} (--downscale 1 keeps them)" if chosen else ""
-    return f"images: {stored}, reduced {view.downscale} times to {used}{why}"
+    kept = (
+        f"; kept in memory reduced {view.shrunk} times, which leaves pixel jitter"
+        f" {view.downscale}x{view.downscale} offsets"
+    )
+    return (
+        f"images: {stored}, reduced {view.file_downscale} times to {used}{why}"
+        f"{kept if view.shrunk > 1 else ''}"
+    )
 
 
 def _sizes(cameras):

@@ -24,6 +24,8 @@ MEND = (
 TEMPORARY_CACHE = "pp-cl-cache-"
 
 
+LEAST_CONSTANT = 64  # bytes of constant memory, which the kernels' tables take
+
 # A device is accepted only after this ran on it: PyPI's PoCL 3.0 is listed on current CPUs and
 # fails every build.
 PROBE = "kernel void probe(global float *x) { x[get_global_id(0)] *= 2.0f; }"
@@ -69,6 +71,10 @@ def separate_devices() -> list[str]:
 
 
 def _probe(device):
+    if device.max_constant_buffer_size < LEAST_CONSTANT:
+        return (
+            f"holds {device.max_constant_buffer_size} bytes of constants, {LEAST_CONSTANT} needed"
+        )
     try:
         context = cl.Context([device])
         queue = cl.CommandQueue(context)

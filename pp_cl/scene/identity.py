@@ -29,10 +29,10 @@ def identity(views: Sequence[View]) -> dict[str, Any]:
 
 
 def fingerprint(views: Sequence[View | Photograph]) -> str:
-    """Hex digest of the views' names and stored cameras."""
+    """Hex digest of the views' names and the cameras of their files."""
     digest = hashlib.sha256()
     for view in views:
-        camera = view.camera if isinstance(view, Photograph) else view.stored_camera
+        camera = view.camera if isinstance(view, Photograph) else view.file_camera
         digest.update(f"{view.name} {camera.width}x{camera.height} ".encode())
         numbers = np.append(camera.pose.ravel(), [camera.fx, camera.fy, camera.cx, camera.cy])
         digest.update(np.round(numbers, 6).tobytes())

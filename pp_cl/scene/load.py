@@ -17,12 +17,18 @@ from pp_cl.scene.identity import pixel_digest
 from pp_cl.scene.masks import AS_GIVEN, MaskRule
 from pp_cl.scene.photograph import Photograph
 from pp_cl.scene.readers import co3d, colmap, llff, neus, nsvf, transforms
-from pp_cl.scene.views import View
+from pp_cl.scene.shrink import shrink, shrink_factor
+from pp_cl.scene.views import View, check_downscale
 
 # One module per format. FILES names the files it reads, recognises(folder) tells whether a folder
 # holds such files, splits(folder) names its splits, and read_split(folder, split) gives a list of
 # Photograph without reading pixels. The first that recognises a folder reads it.
 READERS = (transforms, co3d, neus, nsvf, colmap, llff)
+
+# Bytes per pixel of what reading takes at its peak, measured with 12 megapixels: decoding and a
+# mask, cubic interpolation without distortion, a mask by colour (both in float64)
+DECODED, UNDISTORTED, CUT_OUT = 18, 125, 160
+READING_BYTES = 3 * 2**28  # of the photographs that are read side by side
 
 LEAST_FOCAL, MOST_FOCAL = 1e-2, 1e7  # pixels; docs/scene_scale.md says what is measured
 
@@ -76,22 +82,55 @@ def load_scene(
     splits: Iterable[str] = ("train",),
     most: int | None = None,
     masks: MaskRule = AS_GIVEN,
+    *,
+    downscale: int | None = None,
 ) -> Scene:
-    """Scene of the given splits from a folder, not reduced; a progress bar shows on a terminal.
+    """Scene of the given splits from a folder; a progress bar shows on a terminal.
 
-    most: views to read of each split, spread evenly; None: all. Raises UserError naming the file,
-    and the key where there is one, for whatever is missing, broken or contradictory.
+    most: views to read of each split, spread evenly; None: all. downscale: how many times its
+    images are reduced, those of a large scene in part while they are read; None: as they are
+    stored. Raises UserError naming the file, and the key where there is one, for whatever is
+    missing, broken or contradictory.
     """
     reader, folder = find_reader(path), Path(path)
     listed = {s: evenly(list_photographs(reader, folder, s), most) for s in splits}
     everything = [photograph for photographs in listed.values() for photograph in photographs]
     _check_alike(folder, everything)
-    images = iter(_on_all_cores(lambda one: _read_image(folder, one, masks), everything))
+    for photograph in everything if downscale else ():
+        check_downscale(photograph.name, photograph.camera, downscale)
+    factor = shrink_factor(_sizes(everything), downscale or 1)
+    workers, _ = reading(everything, masks)
+    images = iter(
+        _side_by_side(lambda one: _read_image(folder, one, masks, factor), everything, workers)
+    )
     views = {
-        split: [_view(one, *next(images)) for one in photographs]
+        split: [_view(one, factor, *next(images)) for one in photographs]
         for split, photographs in listed.items()
     }
-    return Scene(folder.resolve().name, folder, views)
+    scene = Scene(folder.resolve().name, folder, views)
+    return scene.reduced(downscale // factor) if downscale else scene
+
+
+def reading(photographs: Sequence[Photograph], masks: MaskRule = AS_GIVEN) -> tuple[int, int]:
+    """(how many photographs are read side by side, bytes that this takes beside the images that
+    stay): as many as there are cores, but no more than READING_BYTES hold.
+    """
+    most = max(_bytes_of_reading(one, masks) for one in photographs)
+    workers = max(1, min(os.cpu_count() or 1, READING_BYTES // most, len(photographs)))
+    return workers, workers * most
+
+
+def _bytes_of_reading(photograph, masks):
+    per_pixel = DECODED
+    if photograph.distortion:
+        per_pixel = UNDISTORTED
+    if masks.source == "color" and not masks.folder:
+        per_pixel = CUT_OUT
+    return per_pixel * photograph.camera.width * photograph.camera.height
+
+
+def _sizes(photographs):
+    return [(one.camera.width, one.camera.height) for one in photographs]
 
 
 def list_photographs(reader: ModuleType, folder: Path, split: str) -> list[Photograph]:
@@ -121,8 +160,17 @@ def _check_lens(image, camera):
     )
 
 
-def _view(photograph, image, digest):
-    return View(photograph.name, photograph.camera, image, photograph.depth_range, digest=digest)
+def _view(photograph, factor, image, digest):
+    camera = photograph.camera
+    return View(
+        photograph.name,
+        camera.downscaled(factor) if factor > 1 else camera,
+        image,
+        photograph.depth_range,
+        digest=digest,
+        shrunk=factor,
+        unshrunk_camera=camera if factor > 1 else None,
+    )
 
 
 def _known_files() -> str:
@@ -140,9 +188,9 @@ def _check_alike(folder, photographs):
             )
 
 
-def _read_image(folder, photograph, masks):
-    """((H, W, 4) uint8 straight RGBA: the image with its mask, freed of distortion, the digest of
-    its pixels). Raises UserError.
+def _read_image(folder, photograph, masks, factor):
+    """((H, W, 4) uint8 straight RGBA: the image with its mask, freed of distortion and reduced
+    `factor` times; the digest of its pixels before that). Raises UserError.
     """
     image = read_rgba(folder / photograph.name)
     image = masks.apply(image, photograph.name, photograph.mask and folder / photograph.mask)
@@ -153,12 +201,12 @@ def _read_image(folder, photograph, masks):
         )
     if photograph.distortion:
         image = undistort(image, photograph.camera, photograph.distortion)
-    return image, pixel_digest(image)
+    return shrink(image, factor), pixel_digest(image)
 
 
-def _on_all_cores(read: Callable[[Item], Made], items: Sequence[Item]) -> list[Made]:
+def _side_by_side(read: Callable[[Item], Made], items: Sequence[Item], workers: int) -> list[Made]:
     """[read(item)] in order. Raises the UserError of the first that fails."""
-    with ThreadPoolExecutor(os.cpu_count()) as pool:
+    with ThreadPoolExecutor(workers) as pool:
         return list(
             tqdm(
                 pool.map(read, items),

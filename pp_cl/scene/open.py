@@ -27,12 +27,16 @@ def open_scene(
     path, downscale = config.scene.path, config.scene.downscale
     if path == DEMO:
         return demo.demo_scene(dev, splits, most=most).reduced(downscale)
-    settings = config.scene
-    rule = MaskRule(settings.mask_from, settings.masks, settings.mask_tolerance)
-    scene = load_scene(path, splits, most, rule)
+    scene = load_scene(path, splits, most, mask_rule(config), downscale=downscale)
     if most is None:
-        _warn_without_masks(scene, settings.mask_from)
-    return scene.reduced(downscale)
+        _warn_without_masks(scene, config.scene.mask_from)
+    return scene
+
+
+def mask_rule(config: Config) -> MaskRule:
+    """How the masks of the run's scene are made."""
+    scene = config.scene
+    return MaskRule(scene.mask_from, scene.masks, scene.mask_tolerance)
 
 
 def _warn_without_masks(scene, source):

@@ -28,8 +28,10 @@ class View:
     name: path of the image relative to the scene's folder. stored_camera: the camera of the stored
     image. image: (H, W, 4) uint8, the stored image as straight RGBA (alpha 255 everywhere if the
     file has none); not to be changed. depth_range: (near, far) of this camera, Euclidean distances
-    in world units, if the dataset states one. digest: of the image's pixels, see
-    scene/identity.py; None for one that the program makes itself.
+    in world units, if the dataset states one. digest: of the file's pixels, see scene/identity.py;
+    None for one that the program makes itself. shrunk: how many times the stored image was reduced
+    while it was read from its file (scene/shrink.py). unshrunk_camera: of the file's image, where
+    that is another one.
     """
 
     name: str
@@ -38,6 +40,18 @@ class View:
     depth_range: tuple[float, float] | None = None
     downscale: int = 1
     digest: str | None = None
+    shrunk: int = 1
+    unshrunk_camera: Camera | None = None
+
+    @property
+    def file_camera(self) -> Camera:
+        """The camera of the image in its file."""
+        return self.unshrunk_camera or self.stored_camera
+
+    @property
+    def file_downscale(self) -> int:
+        """How many times the image in its file is reduced in all."""
+        return self.shrunk * self.downscale
 
     @cached_property
     def camera(self) -> Camera:
@@ -51,7 +65,8 @@ class View:
 
     def moved(self, by: ArrayLike) -> "View":
         """The same photograph, its camera moved by (3,) world units."""
-        return replace(self, stored_camera=self.stored_camera.moved(by))
+        unshrunk = self.unshrunk_camera and self.unshrunk_camera.moved(by)
+        return replace(self, stored_camera=self.stored_camera.moved(by), unshrunk_camera=unshrunk)
 
     def reduced(self, downscale: int) -> "View":
         """The same photograph reduced `downscale` times from its stored resolution.
@@ -59,17 +74,8 @@ class View:
         Raises UserError unless that is a whole number that leaves at least MIN_SIDE pixels each
         way.
         """
-        width, height = self.stored_camera.width, self.stored_camera.height
-        most = min(width, height) // MIN_SIDE
-        if most == 0:
-            raise UserError(
-                f"{self.name}: {width}x{height} pixels; at least {MIN_SIDE}x{MIN_SIDE} are needed"
-            )
-        if not isinstance(downscale, int) or not 1 <= downscale <= most:
-            raise UserError(
-                f"--downscale {downscale}: not a whole number from 1 to {most}, the range for the "
-                f"{width}x{height} pixels of {self.name}"
-            )
+        asked = downscale * self.shrunk if isinstance(downscale, int) else downscale
+        check_downscale(self.name, self.file_camera, asked)
         return replace(self, downscale=downscale)
 
     def crop_camera(
@@ -95,6 +101,23 @@ class View:
         x0, x1 = _extent(mask.any(axis=0), k, margin)
         y0, y1 = _extent(mask.any(axis=1), k, margin)
         return x0, y0, x1, y1
+
+
+def check_downscale(name: str, camera: Camera, downscale: int) -> None:
+    """Raise UserError unless the photograph `name` of a camera can be reduced `downscale` times: a
+    whole number that leaves at least MIN_SIDE pixels each way.
+    """
+    width, height = camera.width, camera.height
+    most = min(width, height) // MIN_SIDE
+    if most == 0:
+        raise UserError(
+            f"{name}: {width}x{height} pixels; at least {MIN_SIDE}x{MIN_SIDE} are needed"
+        )
+    if not isinstance(downscale, int) or not 1 <= downscale <= most:
+        raise UserError(
+            f"--downscale {downscale}: not a whole number from 1 to {most}, the range for the "
+            f"{width}x{height} pixels of {name}"
+        )
 
 
 def fitting_downscale(size: tuple[int, int], side: int | None) -> int:

@@ -1,9 +1,15 @@
-"""Where the crop of a training step lies along one axis."""
+"""How large the crop of a training step is, and where it lies along one axis."""
 
 import numpy as np
 
 BOX_MARGIN = 8  # pixels around the object from which crops are drawn
+CROP_LOSS = 0.25  # of the crop's side for every halving of the images
 END_SHARE = 0.25  # of the crops that show one end of the object, at least
+
+
+def crop_side(side: int, halvings: int) -> int:
+    """The setting train.crop, for images halved this many times: whole quads of pixels."""
+    return 4 * round(side * (1 - CROP_LOSS * halvings) / 4)
 
 
 def draw_start(rng: np.random.Generator, low: int, high: int, size: int, *, limit: int) -> int:

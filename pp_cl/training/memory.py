@@ -1,6 +1,9 @@
 """The memory a training will take, summed over the tables of its stages before they allocate."""
 
 import math
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -8,66 +11,275 @@ from pp_cl.config import Config
 from pp_cl.device.buffers import Table, grown, table_bytes
 from pp_cl.device.compact import compact_table
 from pp_cl.device.device import Device
-from pp_cl.errors import UserError
+from pp_cl.device.rows import PIECE_BYTES
 from pp_cl.metrics.lpips import Lpips
-from pp_cl.model import Model
+from pp_cl.network.buffers import gradient_of
+from pp_cl.network.unet import UNet
 from pp_cl.raster.blend import BLENDS, Blend
 from pp_cl.raster.pairs import PairBuilder
 from pp_cl.raster.point_cloud import PointCloud
 from pp_cl.raster.project import Projection
+from pp_cl.raster.sh import sh_blocks
 from pp_cl.render import NETWORK_MULTIPLE, Renderer
 from pp_cl.scene.camera import Camera
-from pp_cl.scene.views import View
-from pp_cl.settings import RasterConfig
+from pp_cl.scene.grid import Grid
+from pp_cl.scene.load import reading
+from pp_cl.scene.open import DEMO, mask_rule
+from pp_cl.scene.photograph import Photograph
+from pp_cl.scene.shrink import kept_bytes, shrink_factor
+from pp_cl.settings import TrainConfig
+from pp_cl.training.crops import crop_side
 from pp_cl.training.loss import Loss, lanes_of_loss
 from pp_cl.training.mask import MaskLoss
 from pp_cl.training.optimiser import Optimiser
 from pp_cl.training.perceptual import PerceptualLoss
 from pp_cl.training.point_state import PointState
+from pp_cl.training.schedule import ema_start, refine_steps
 from pp_cl.training.smooth import Smoother, chunk_points
 
 MIB, GIB = 2**20, 2**30
-REFINED = (
-    4.5  # times as many points after a refinement: half of them are pruned in the course of it
-)
+# The share of the points that k prunings leave is about FIRST * k^-SLOWER on the initial grid, and
+# on a refined one; measured on lego with the presets tiny, small and full.
+FIRST_KEPT, FIRST_SLOWER = 0.77, 0.155
+LATER_KEPT, LATER_SLOWER = 0.90, 0.068
+# bytes on the host: of pruning per point (weights, looks, opacities, and which stay), of refining
+# per point before it (the vertices of its eight in 64 bits, and their order)
+PRUNING_BYTES, REFINING_BYTES = 24, 320
 
-Plan = list[tuple[str, Table]]  # what the buffers of each table are for
+Tables = list[tuple[str, Table]]  # what the buffers of each table are for
 
 
-def memory_plan(config: Config, model: Model, views: list[View], refinements: int = 0) -> Plan:
-    """The device buffers of a training with this model on these views, at its most points and for
-    the largest of its crops.
+class Moment(NamedTuple):
+    """What is allocated at once at some time of a training. host: bytes of numpy arrays."""
 
-    refinements: of the grid that are still to come; the points after them are an estimate.
+    name: str
+    points: int
+    tables: Tables
+    host: int
+
+    @property
+    def device(self) -> int:
+        """Bytes of all buffers."""
+        return tables_bytes(self.tables)
+
+
+class Plan(NamedTuple):
+    """The memory of a training. photographs: bytes of their images on the host; reading: beside
+    those, while they are read.
     """
-    train, blocks = config.train, model.cloud.blocks
-    n = round(model.cloud.count * REFINED**refinements)
-    edge = model.grid.edge / 2**refinements
-    view = max(views, key=lambda v: (math.prod(v.crop_size(train.crop)), v.camera.fx))
-    camera, photograph = view.camera, max((v.image for v in views), key=lambda image: image.size)
-    width, height = view.crop_size(train.crop)
-    padded, _, _ = camera.crop(0, 0, width, height).padded(NETWORK_MULTIPLE)
-    size = (padded.height, padded.width)
-    image, target = (*size, 3), (height, width, 3)
+
+    moments: list[Moment]
+    photographs: int
+    reading: int
+
+    @property
+    def peak(self) -> Moment:
+        """The moment with the most bytes on the device."""
+        return max(self.moments, key=lambda moment: moment.device)
+
+    @property
+    def largest(self) -> tuple[str, int]:
+        """(what it is for, bytes) of the largest buffer."""
+        sizes = (
+            (f"{what}: {name}", table_bytes({name: row}))
+            for moment in self.moments
+            for what, table in moment.tables
+            for name, row in table.items()
+        )
+        return max(sizes, key=lambda size: size[1])
+
+    def host(self, is_cpu: bool) -> int:
+        """Most bytes that the host holds beside the program itself. is_cpu: of the device, whose
+        buffers are the host's memory as well.
+        """
+        training = max(moment.host + is_cpu * moment.device for moment in self.moments)
+        return self.photographs + max(training, self.reading)
+
+
+@dataclass(frozen=True)
+class Sketch:
+    """What the memory of a training follows from.
+
+    photographs: of the training views. points: at `step`. spacing: of the points, pixels of the
+    largest photograph as it is stored. layers: of the grid, on which points may lie.
+    """
+
+    config: Config
+    net: UNet
+    photographs: Sequence[Photograph]
+    points: int
+    spacing: float
+    layers: float
+    step: int = 0
+
+    @classmethod
+    def unseen(cls, config: Config, net: UNet, photographs: Sequence[Photograph]) -> "Sketch":
+        """Before the photographs are read and the hull is known: for a ball that fills the largest
+        of them.
+        """
+        points = config.points.count
+        camera = _largest([one.camera for one in photographs])
+        pixels = math.pi / 6 * math.sqrt(4 / math.pi * camera.width * camera.height) ** 3
+        return cls(
+            config, net, photographs, points, (pixels / points) ** (1 / 3), points ** (1 / 3)
+        )
+
+    def on_grid(
+        self, grid: Grid, points: int, depth_range: tuple[float, float], step: int = 0
+    ) -> "Sketch":
+        """The same with points on a grid, seen from the middle of the depth range."""
+        camera = _largest([one.camera for one in self.photographs])
+        spacing = grid.edge * camera.fx / (sum(depth_range) / 2)
+        return replace(self, points=points, spacing=spacing, layers=grid.dims[2], step=step)
+
+    def with_points(self, points: int) -> "Sketch":
+        """The same object with another number of points."""
+        finer = (points / self.points) ** (1 / 3)
+        return replace(
+            self, points=points, spacing=self.spacing / finer, layers=self.layers * finer
+        )
+
+    def with_settings(self, **changes: int) -> "Sketch":
+        """The same with other settings "downscale" and "crop"."""
+        config = self.config
+        scene = replace(config.scene, downscale=changes.get("downscale", config.scene.downscale))
+        train = replace(config.train, crop=changes.get("crop", config.train.crop))
+        return replace(self, config=replace(config, scene=scene, train=train))
+
+    @property
+    def sizes(self) -> list[tuple[int, int]]:
+        """(width, height) of the photographs in their files."""
+        return [(one.camera.width, one.camera.height) for one in self.photographs]
+
+    @property
+    def shrunk(self) -> int:
+        """How many times the photographs are reduced while they are read."""
+        scene = self.config.scene
+        return 1 if scene.path == DEMO else shrink_factor(self.sizes, scene.downscale)
+
+    @property
+    def refinements(self) -> list[int]:
+        """The steps of the refinements to come."""
+        train = self.config.train
+        return [s for s in refine_steps(train.iterations, train.refine_at) if s > self.step]
+
+    @property
+    def averages(self) -> float:
+        """The step from which on averages are kept, infinite for never."""
+        train = self.config.train
+        return ema_start(train.iterations) if train.ema else math.inf
+
+
+def memory_plan(sketch: Sketch) -> Plan:
+    """The memory of the training. Pairs and points after prunings to come are estimates."""
+    made = sketch.config.scene.path == DEMO
+    _, beside = reading(sketch.photographs, mask_rule(sketch.config))
+    photographs = kept_bytes(sketch.sizes, sketch.shrunk)
+    return Plan(list(_moments(sketch)), photographs, 0 if made else beside)
+
+
+def _moments(sketch: Sketch) -> Iterator[Moment]:
+    """From the sketch's step on: each level of refinement, the refining, and the averages."""
+    train, n = sketch.config.train, sketch.points
+    steps = refine_steps(train.iterations, train.refine_at)
+    start = max((s for s in steps if s <= sketch.step), default=0)
+    to_come = sketch.refinements
+    averages = sketch.averages
+    for level, end in enumerate([*to_come, train.iterations]):
+        now, left = max(start, sketch.step), len(to_come) - level
+        args = {"left": left, "spacing": sketch.spacing / 2**level, "start": now, "end": end}
+        yield _moment(sketch, f"from step {now} on", n, ema=averages <= now, **args)
+        before = _kept(train, start, now)
+        if now < averages < end:
+            kept = round(n * _kept(train, start, averages) / before)
+            yield _moment(sketch, f"averages, from step {averages} on", kept, ema=True, **args)
+        n = round(n * _kept(train, start, end) / before)
+        if left:
+            yield _refining(sketch, n, ema=averages <= end, **args)
+            n, start = 8 * n, end
+
+
+def _prunings(train: TrainConfig, start: int, end: int) -> int:
+    """How often points may be pruned after the steps `start` to `end`, looked at since `start`."""
+    if train.prune_weight == 0 and train.prune_opacity == 0:
+        return 0
+    every, last = train.prune_every, min(end, train.iterations - 1)
+    return max(0, last // every - -(-(start + train.prune_looks) // every) + 1)
+
+
+def _kept(train, start, end):
+    """The share of the points of a level, which began at step `start`, that the prunings up to
+    `end` leave, an estimate.
+    """
+    times = _prunings(train, start, end)
+    kept, slower = (LATER_KEPT, LATER_SLOWER) if start else (FIRST_KEPT, FIRST_SLOWER)
+    return kept * times**-slower if times else 1.0
+
+
+def _moment(sketch, name, n, *, left, spacing, start, end, ema):
+    """A level at its most points. left: refinements to come. spacing: as Sketch has it."""
+    train, blocks = sketch.config.train, sh_blocks(sketch.config.points.sh_degree)
+    prunes = _prunings(train, start, end) > 0
     row_bytes = max(64 * block.count for block in blocks)  # of the largest array of a point
+    pruning = [("pruning (at most)", compact_table(n, row_bytes))] if prunes else []
+    tables = [*_kept_tables(sketch, n, ema), *pruning, *_stages(sketch, n, left, spacing)]
+    every, last = train.checkpoint_every, min(end, train.iterations - 1)
+    saves = start // every < last // every
+    pieces = min(PIECE_BYTES, 64 * 8 * n) if saves else 0
+    return Moment(name, n, tables, prunes * PRUNING_BYTES * n + 2 * pieces)
+
+
+def _refining(sketch, n, *, left, spacing, start, end, ema):
+    """Old and new arrays of the points live together, one array after the other, beside the
+    buffers of the stages for the old points.
+    """
+    blocks = sh_blocks(sketch.config.points.sh_degree)
+    last = {
+        "rows": ((8 * n,), np.uint32),
+        "old": ((n, max(b.count for b in blocks), 16), np.float32),
+    }
+    tables = [
+        *_kept_tables(sketch, 8 * n, ema),
+        ("refining", last),
+        *_stages(sketch, n, left, spacing),
+    ]
+    return Moment(f"refining after step {end}", 8 * n, tables, REFINING_BYTES * n)
+
+
+def _kept_tables(sketch, n, ema):
+    """What stays from step to step. ema: with the averages."""
+    train, blocks = replace(sketch.config.train, ema=ema), sh_blocks(sketch.config.points.sh_degree)
     return [
         ("points", PointCloud.table(n, blocks)),
         ("training state of the points", PointState.table(n, blocks, train)),
-        ("averages of the points", PointState.ema_table(n, blocks) if train.ema else {}),
-        ("optimiser", Optimiser.table(n, model.net.parameters, train)),
-        ("smoothing (estimate)", _smoothing_table(config, model, n)),
-        ("pruning (at most)", compact_table(n, row_bytes)),
-        *_raster_tables(
-            config.raster, n, size, n * _pixels_per_point(config.raster, model, camera, edge)
-        ),
-        (f"network at {size[1]}x{size[0]}", _network_table(model, size)),
-        ("loss", Loss.table(image, target, train.ssim_weight, lanes_of_loss(model.net.dev))),
-        ("mask loss", MaskLoss.table(*size) if train.mask_weight else {}),
-        *(_perceptual_tables(model.net, target) if train.perceptual_weight else ()),
+        ("averages of the points", PointState.ema_table(n, blocks) if ema else {}),
+        ("optimiser", Optimiser.table(n, sketch.net.parameters, train)),
+    ]
+
+
+def _stages(sketch: Sketch, n: int, left: int, spacing: float) -> Tables:
+    """What the stages of a step and of a rendered preview take."""
+    config, net = sketch.config, sketch.net
+    train, downscale = config.train, config.scene.downscale
+    camera = _largest([one.camera for one in sketch.photographs])
+    whole, halved = camera.downscaled(downscale), camera.downscaled(downscale * 2**left)
+    crop, full = _padded(_crop(halved, crop_side(train.crop, left))), _padded(_crop(whole, 0))
+    width, height = _crop(halved, crop_side(train.crop, left))
+    target = (height, width, 3)
+    photograph = (camera.height // sketch.shrunk, camera.width // sketch.shrunk, 4)
+    pairs = n * _pixels_per_point(config, spacing / downscale)
+    return [
+        ("smoothing (estimate)", _smoothing_table(sketch, n)),
+        *_raster_tables(config.raster, n, full, pairs),
+        (f"network at {crop[1]}x{crop[0]}", _network_table(net, crop, True)),
+        (f"previews at {full[1]}x{full[0]}", _preview_table(net, full)),
+        ("loss", Loss.table((*crop, 3), target, train.ssim_weight, lanes_of_loss(net.dev))),
+        ("mask loss", MaskLoss.table(*crop) if train.mask_weight else {}),
+        *(_perceptual_tables(net, target) if train.perceptual_weight else ()),
         (
             "photograph and target",
             {
-                "image": (photograph.shape, np.uint8),
+                "image": (photograph, np.uint8),
                 "target": (target, np.float32),
                 "alpha": (target[:2], np.float32),
             },
@@ -75,19 +287,43 @@ def memory_plan(config: Config, model: Model, views: list[View], refinements: in
     ]
 
 
-def _smoothing_table(config, model, n):
+def _largest(cameras: Sequence[Camera]) -> Camera:
+    return max(cameras, key=lambda camera: (camera.width * camera.height, camera.fx))
+
+
+def _crop(camera, side):
+    """(width, height) of a crop; side 0: the whole image."""
+    return tuple(min(side, size) if side else size for size in (camera.width, camera.height))
+
+
+def _padded(size):
+    """(height, width) in whole multiples of what the network needs."""
+    return tuple(side + -side % NETWORK_MULTIPLE for side in size[::-1])
+
+
+def _smoothing_table(sketch, n):
     """The Smoother's. Its chunk depends on the neighbours, which are not known yet: they are about
     a layer of the grid apart.
     """
-    if config.train.sh_smoothing == 0:
+    if sketch.config.train.sh_smoothing == 0:
         return {}
-    layers = model.grid.dims[2] * (n / model.cloud.count) ** (1 / 3)
+    layers = sketch.layers * (n / sketch.points) ** (1 / 3)
     return Smoother.table(n, chunk_points(n, round(n / layers)))
 
 
-def _network_table(model, size):
-    plan = model.net.memory_plan(*size, True)
+def _network_table(net, size, training):
+    plan = net.memory_plan(*size, training)
     return {f"{i} {name}": (shape, np.float32) for i, (name, shape, _) in enumerate(plan)}
+
+
+def _preview_table(net, size):
+    """The buffers of whole images that are rendered, beside the network's parameters."""
+    own = {name for p in net.parameters for name in (p, gradient_of(p))}
+    return {
+        f"{i} {name}": (shape, np.float32)
+        for i, (name, shape, _) in enumerate(net.memory_plan(*size, False))
+        if name not in own
+    }
 
 
 def _perceptual_tables(net, target):
@@ -116,45 +352,31 @@ def _raster_tables(settings, n, size, pairs):
     ]
 
 
-def _pixels_per_point(settings: RasterConfig, model: Model, camera: Camera, edge: float) -> float:
-    """Mean area of a footprint in pixels, seen from the middle of the depth range."""
-    middle = sum(model.depth_range) / 2
+def _pixels_per_point(config: Config, spacing: float) -> float:
+    """Mean area of a footprint in pixels. spacing: of the points, pixels."""
     radius = 0.75  # the hard disc
-    if settings.footprint == "soft":
-        radius = max(radius, settings.radius * edge * camera.fx / middle)
+    if config.raster.footprint == "soft":
+        radius = max(radius, config.raster.radius * spacing)
     return math.pi * radius**2
 
 
-def plan_bytes(plan: Plan) -> int:
-    """Bytes of all buffers of a plan."""
-    return sum(table_bytes(table) for _, table in plan)
+def tables_bytes(tables: Tables) -> int:
+    """Bytes of all buffers of the tables."""
+    return sum(table_bytes(table) for _, table in tables)
 
 
 def plan_lines(plan: Plan, dev: Device) -> list[str]:
-    """The plan as text, against the device's limits."""
-    rows = [(what, len(table), table_bytes(table)) for what, table in plan if table]
-    rows.append(("total", sum(number for _, number, _ in rows), plan_bytes(plan)))
+    """The plan as text: the device's buffers at their peak against its limits, and the host."""
+    peak, (what, largest) = plan.peak, plan.largest
+    rows = [(what, len(table), table_bytes(table)) for what, table in peak.tables if table]
+    rows.append(("total", sum(number for _, number, _ in rows), peak.device))
+    host = plan.host(dev.is_cpu)
     return [
         f"memory plan ({dev.name}: {dev.info['memory_bytes'] / MIB:.0f} MiB, at most"
-        f" {dev.info['max_allocation_bytes'] / MIB:.0f} at once)",
-        *(f"  {what:30s} {number:4d} buffers {size / MIB:9.1f} MiB" for what, number, size in rows),
+        f" {dev.info['max_allocation_bytes'] / MIB:.0f} at once); {peak.name}, {peak.points}"
+        " points:",
+        *(f"  {name:30s} {number:4d} buffers {size / MIB:9.1f} MiB" for name, number, size in rows),
+        f"  largest buffer: {largest / MIB:.1f} MiB ({what})",
+        f"  host: {host / MIB:.0f} MiB beside the program, {plan.photographs / MIB:.0f} of them"
+        " photographs" + (", the device's among them" if dev.is_cpu else ""),
     ]
-
-
-def spare_memory(plan: Plan, dev: Device, limit: float) -> int:
-    """Bytes that a plan leaves of `limit` GiB; 0 without a limit. Raises UserError naming the
-    settings where it takes more than the limit, or than the device has.
-    """
-    needed, available = plan_bytes(plan), dev.info["memory_bytes"]
-    if needed > available:
-        raise UserError(
-            f"the training needs {needed / MIB:.0f} MiB, {dev.name} has {available / MIB:.0f}:"
-            " lower --points, raise --downscale, or set train.moments_16bit, train.crop or smaller"
-            " network.widths"
-        )
-    if limit and limit * GIB < needed:
-        raise UserError(
-            f"--memory {limit:g}: the training needs {needed / GIB:.2f} GiB; raise it, lower"
-            " --points, raise --downscale, or set train.crop or smaller network.widths"
-        )
-    return max(0, int(limit * GIB) - needed)

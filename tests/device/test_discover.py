@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 import subprocess
 import sys
 from types import SimpleNamespace
@@ -10,9 +11,10 @@ import pyopencl as cl
 import pytest
 
 from pp_cl.device import discover
-from pp_cl.device.device import describe
-from pp_cl.device.discover import list_devices, open_device, separate_devices
+from pp_cl.device.device import describe, kernel_folder
+from pp_cl.device.discover import LEAST_CONSTANT, list_devices, open_device, separate_devices
 from pp_cl.errors import UserError
+from pp_cl.training.loss import TAPS
 
 
 def fake(platform, name, gpu=False, problem=None, index="0:0"):
@@ -183,3 +185,38 @@ def test_a_cache_folder_that_cannot_be_written_is_replaced(session_device, tmp_p
     assert ran.returncode == 0, ran.stderr
     assert "set XDG_CACHE_HOME to keep them" in ran.stderr
     assert not os.path.exists(ran.stdout.strip())  # gone with the process
+
+
+class Lacking:
+    """A device as it is, but for what it says of its constant memory."""
+
+    def __init__(self, device, constants):
+        self._device, self.max_constant_buffer_size = device, constants
+
+    def __getattr__(self, name):
+        return getattr(self._device, name)
+
+
+def test_a_device_without_room_for_constants_does_not_work(monkeypatch):
+    """64 KiB is what OpenCL asks for; 64 bytes are enough."""
+    ((_, device, _), *_) = list_devices()
+
+    def platforms(constants):
+        return [SimpleNamespace(get_devices=lambda: [Lacking(device, constants)])]
+
+    monkeypatch.setattr("pyopencl.get_platforms", lambda: platforms(63))
+    assert list_devices()[0][2] == "holds 63 bytes of constants, 64 needed"
+    with pytest.raises(UserError, match="no working OpenCL device .*63 bytes of constants, 64"):
+        open_device()
+
+
+def test_what_kernels_hold_in_constant_memory():
+    """One table, of the 11 float32 of SSIM's window; no kernel takes a constant argument."""
+    found = [
+        (path.stem, line)
+        for path in sorted(kernel_folder().rglob("*.[ch]*"))
+        for line in path.read_text("utf-8").splitlines()
+        if re.search(r"\bconstant\b", line.partition("//")[0])
+    ]
+    assert [name for name, _ in found] == ["loss"]
+    assert "constant float WINDOW[TAPS]" in found[0][1] and 4 * TAPS <= LEAST_CONSTANT

@@ -6,8 +6,12 @@ from support.same_scene import views
 from support.transforms_scenes import refused, write_scene
 
 from pp_cl.errors import UserError
-from pp_cl.scene.load import evenly, load_scene
+from pp_cl.scene.camera import Camera
+from pp_cl.scene.distortion import Distortion
+from pp_cl.scene.load import evenly, load_scene, reading
+from pp_cl.scene.masks import MaskRule
 from pp_cl.scene.open import scene_frames
+from pp_cl.scene.photograph import Photograph
 from tools.scene_formats import nerfstudio
 
 
@@ -48,6 +52,28 @@ def test_evenly_takes_the_first_and_the_same_steps():
     assert evenly(range(8), 4) == [0, 2, 4, 6]
     assert evenly(range(5), 4) == [0, 1, 2, 3] and evenly(range(3), 4) == [0, 1, 2]
     assert evenly(range(3), None) == [0, 1, 2]
+
+
+@pytest.mark.parametrize(
+    "distortion, source, workers, per_pixel",
+    [
+        (Distortion(), "given", 3, 18),
+        (Distortion(k1=0.1), "given", 1, 125),
+        (Distortion(), "color", 1, 160),
+        (Distortion(k1=0.1), "color", 1, 160),
+    ],
+)
+def test_as_many_photographs_are_read_at_once_as_memory_holds(
+    monkeypatch, distortion, source, workers, per_pixel
+):
+    """12 megapixels of float64 beside one another would take gigabytes on many cores."""
+    monkeypatch.setattr("pp_cl.scene.load.os.cpu_count", lambda: 64)
+    camera = Camera(np.eye(3, 4), 4000, 4000, 2000, 1500, 4000, 3000)
+    phone = Photograph("a.jpg", camera, distortion=distortion)
+    told = reading([phone] * 300, MaskRule(source))
+    assert told == (workers, workers * per_pixel * 12_000_000)
+    small = Photograph("b.jpg", camera.downscaled(10))
+    assert reading([small] * 300)[0] == 64 and reading([small] * 5)[0] == 5
 
 
 def test_depth_range_of_some_views_only(tmp_path):

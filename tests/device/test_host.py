@@ -1,0 +1,60 @@
+"""The memory of the machine, as Linux and a container tell it."""
+
+import numpy as np
+import pytest
+
+from pp_cl.device import host
+
+MIB = 2**20
+
+
+@pytest.fixture
+def machine(tmp_path, monkeypatch):
+    """A machine with 1000 MiB free, on which this process holds 40 pages."""
+    monkeypatch.setattr(host, "PROC", tmp_path)
+    monkeypatch.setattr(host, "GROUP", tmp_path / "group")
+    monkeypatch.setattr("os.sysconf", lambda name: 4096)
+    (tmp_path / "self").mkdir()
+    (tmp_path / "self/statm").write_text("900 40 30 1 0 20 0\n")
+    (tmp_path / "meminfo").write_text("MemTotal:  9000 kB\nMemAvailable:  1024000 kB\n")
+    (tmp_path / "group").mkdir()
+    return tmp_path
+
+
+def limit(machine, most, used, cached):
+    (machine / "group/memory.max").write_text(f"{most}\n")
+    (machine / "group/memory.current").write_text(f"{used}\n")
+    (machine / "group/memory.stat").write_text(f"anon 5\ninactive_file {cached}\n")
+
+
+def test_what_is_free_and_what_the_process_holds(machine):
+    assert host.resident_bytes() == 40 * 4096
+    assert host.available_bytes() == 1000 * MIB + 40 * 4096
+
+
+def test_a_container_has_less(machine):
+    limit(machine, 500 * MIB, 300 * MIB, 30 * MIB)
+    assert host.available_bytes() == 230 * MIB + 40 * 4096
+    limit(machine, 5000 * MIB, 300 * MIB, 0)
+    assert host.available_bytes() == 1000 * MIB + 40 * 4096
+    limit(machine, "max", 300 * MIB, 0)
+    assert host.available_bytes() == 1000 * MIB + 40 * 4096
+
+
+@pytest.mark.parametrize("text", [None, "", "MemTotal: 9 kB\n", "MemAvailable: many\n"])
+def test_a_system_that_does_not_tell(machine, text):
+    (machine / "meminfo").unlink()
+    if text is not None:
+        (machine / "meminfo").write_text(text)
+    assert host.available_bytes() is None
+    (machine / "self/statm").unlink()
+    assert host.resident_bytes() == 0
+
+
+@pytest.mark.skipif(not host.PROC.is_dir(), reason="no /proc")
+def test_this_machine():
+    before = host.resident_bytes()
+    block = np.ones(2**25)  # 256 MiB, which are touched
+    grown = host.resident_bytes() - before
+    assert 0.9 * block.nbytes < grown < 1.2 * block.nbytes
+    assert host.available_bytes() > host.resident_bytes()

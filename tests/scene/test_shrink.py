@@ -1,0 +1,147 @@
+"""Photographs that are reduced while they are read: numbers, choice, what a training sees."""
+
+import hashlib
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from support.scenes import write_ball_scene
+
+from pp_cl.config import preset
+from pp_cl.errors import UserError
+from pp_cl.files.image import read_rgba
+from pp_cl.scene.hull import build_grid
+from pp_cl.scene.identity import difference, fingerprint, identity
+from pp_cl.scene.load import load_scene
+from pp_cl.scene.open import open_scene, scene_frames
+from pp_cl.scene.shrink import KEPT_BYTES, kept_bytes, shrink, shrink_factor
+from pp_cl.scene.target import Target
+
+PHONE = (4000, 3000)
+
+
+@pytest.mark.parametrize("factor", (1, 2, 3, 7, 64))
+def test_blocks_become_their_mean(rng, factor):
+    """Against float64, where every block is looked at on its own."""
+    image = rng.integers(0, 256, (150, 131, 4), dtype=np.uint8)
+    image[:70, :, 3] = 255
+    image[100:, :70, 3] = 0
+    small = shrink(image, factor)
+    assert small.shape == (150 // factor, 131 // factor, 4) and small.dtype == np.uint8
+    for y, x in np.ndindex(small.shape[:2]):
+        block = image[y * factor : (y + 1) * factor, x * factor : (x + 1) * factor].astype(float)
+        alpha = block[..., 3]
+        colour = (block[..., :3] * alpha[..., None]).sum((0, 1)) / max(alpha.sum(), 1)
+        expected = image[y, x] if factor == 1 else [*colour, alpha.mean()]
+        assert np.abs(small[y, x] - expected).max() <= 0.5 + 1e-9
+
+
+def test_white_stays_white_in_the_largest_blocks():
+    assert (shrink(np.full((130, 64, 4), 255, np.uint8), 64) == 255).all()
+
+
+@pytest.mark.parametrize(
+    "count, downscale, factor",
+    [
+        (11, 8, 1),  # 5.28e8 bytes: just below 2^29
+        (12, 8, 2),
+        (150, 8, 4),
+        (300, 8, 8),  # 4: 9e8
+        (300, 1, 1),
+        (300, 2, 2),
+        (300, 7, 7),
+        (300, 16, 8),
+        (170, 12, 4),  # 3: 9e8
+        (5000, 8, 8),  # too many even so: as small as the training wants them
+    ],
+)
+def test_the_least_reduction_that_fits(count, downscale, factor):
+    sizes = [PHONE] * count
+    assert shrink_factor(sizes, downscale) == factor
+    smaller = [f for f in range(1, factor) if downscale % f == 0]
+    assert all(kept_bytes(sizes, f) > KEPT_BYTES for f in smaller)
+
+
+@pytest.fixture
+def scene(tmp_path):
+    return write_ball_scene(tmp_path / "ball", size=98)
+
+
+def large(monkeypatch, most=8 * 4 * 50 * 50):
+    """Scenes are large from `most` bytes on: eight images of 98 pixels are halved."""
+    monkeypatch.setattr("pp_cl.scene.shrink.KEPT_BYTES", most)
+
+
+def opened(dev, scene, downscale):
+    config = preset("tiny")
+    config.scene = replace(config.scene, path=scene, downscale=downscale)
+    return open_scene(dev, config, ("train",)).splits["train"]
+
+
+def same(one, other):
+    """Whether two cameras are the same, to the last bit."""
+    return (one.packed((1, 2)) == other.packed((1, 2))).all() and one.fx == other.fx
+
+
+def test_a_large_scene_is_kept_reduced_and_stays_itself(dev, scene, monkeypatch):
+    whole = opened(dev, scene, 4)
+    large(monkeypatch)
+    views = opened(dev, scene, 4)
+    for view, before in zip(views, whole, strict=True):
+        pixels = read_rgba(f"{scene}/{view.name}")
+        assert (view.shrunk, view.downscale, view.file_downscale) == (2, 2, 4)
+        np.testing.assert_array_equal(view.image, shrink(pixels, 2))
+        assert same(view.camera, before.camera)  # exact, since 2 is a power of two
+        assert same(view.file_camera, before.stored_camera)
+        assert before.file_camera is before.stored_camera
+        assert view.digest == hashlib.sha256(pixels.tobytes()).hexdigest()[:16]
+    assert identity(views) == identity(whole)
+    assert fingerprint(views) == fingerprint(scene_frames(scene))
+    header = identity(whole)
+    assert difference(header, scene_frames(scene), views) == ""
+    moved = views[0].moved((1, 2, 3))
+    assert same(moved.file_camera, whole[0].moved((1, 2, 3)).stored_camera)
+
+
+def test_targets_of_a_large_scene_are_within_its_rounding(dev, scene, monkeypatch):
+    whole = opened(dev, scene, 4)
+    large(monkeypatch)
+    target = Target(dev)
+    for view, before in zip(opened(dev, scene, 4), whole, strict=True):
+        images = []
+        for one in (view, before):
+            target.load(one)
+            images.append(target.whole())
+        error = np.abs(images[0] - images[1])
+        # alpha and colour are rounded by half a level each
+        assert error.max() <= 1 / 255 and error.mean() < 0.2 / 255
+
+
+def test_the_hull_of_a_large_scene_is_nearly_the_same(dev, scene, monkeypatch):
+    whole = opened(dev, scene, 2)
+    large(monkeypatch)
+    hulls = [build_grid(dev, views, 20_000) for views in (whole, opened(dev, scene, 2))]
+    edges = [hull.grid.edge for hull in hulls]
+    assert edges[1] == pytest.approx(edges[0], rel=0.05)
+
+
+def test_pixels_stay_as_stored_where_nothing_is_reduced(dev, scene, monkeypatch):
+    large(monkeypatch, most=1)
+    for view in (opened(dev, scene, 1)[0], load_scene(scene).splits["train"][0]):
+        np.testing.assert_array_equal(view.image, read_rgba(f"{scene}/{view.name}"))
+        assert view.shrunk == 1
+
+
+def test_too_far_is_refused_before_a_photograph_is_read(dev, scene, monkeypatch):
+    large(monkeypatch)
+    monkeypatch.setattr("pp_cl.scene.load.read_rgba", None)
+    with pytest.raises(UserError, match=r"--downscale 7: .* from 1 to 6, .*98x98"):
+        opened(dev, scene, 7)
+
+
+def test_a_kept_image_is_reduced_further_in_words_of_its_file(dev, scene, monkeypatch):
+    large(monkeypatch)
+    view = opened(dev, scene, 4)[0]
+    assert view.reduced(3).file_downscale == 6
+    with pytest.raises(UserError, match=r"--downscale 8: .* from 1 to 6, .*98x98"):
+        view.reduced(4)

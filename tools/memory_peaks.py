@@ -1,0 +1,145 @@
+"""Compare the memory plan of trainings with the peaks of device and host that they reach.
+
+    python tools/memory_peaks.py [--scene FOLDER] [--only NAME ...] --out docs/results/memory.json
+
+Each training is a process of its own, a few steps long: what is allocated does not change between
+prunings. Refinements come early, so that none is left out. The row `phone` trains on 300
+photographs of 12 megapixels, which are made in a temporary folder (most of them links) and removed.
+"""
+
+import argparse
+import json
+import os
+import resource
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+
+import numpy as np
+from PIL import Image
+
+from pp_cl import __version__
+from pp_cl.device.discover import open_device
+from pp_cl.files.atomic import write_json
+from pp_cl.files.run_folder import RunFolder
+from pp_cl.run import open_training, run_config
+from pp_cl.scene.camera import Camera
+from pp_cl.scene.readers.frame import frame_keys
+
+MIB = 2**20
+PHONE, PHONES, SHRUNK = (4000, 3000), 300, 4  # pixels, photographs, times the drawing is enlarged
+EARLY = {"train.iterations": 30, "train.eval_every": 0}
+# what is trained: preset, settings
+TRAININGS = {
+    "tiny": ("tiny", {}),
+    "small": ("small", {}),
+    "full": ("full", {"points.count": 30_000}),
+    "paper": ("paper", {"points.count": 1_500_000, "scene.downscale": 4, "train.iterations": 4}),
+    "phone": ("tiny", {"scene.downscale": 8}),
+}
+COLUMNS = [
+    {"head": "training", "cell": "{name}"},
+    {"head": "points at the peak", "cell": "{points:,}"},
+    {"head": "device: plan", "cell": "{device_plan:.0f} MiB"},
+    {"head": "measured", "cell": "{device:.0f} MiB"},
+    {"head": "host: plan", "cell": "{host_plan:.0f} MiB"},
+    {"head": "measured", "cell": "{host:.0f} MiB"},
+    {"head": "plan / measured: device, host", "cell": "{device_ratio:.2f}, {host_ratio:.2f}"},
+]
+
+
+def write_phone_scene(folder: Path, count: int = PHONES) -> str:
+    """A scene of `count` photographs of 12 megapixels of a ball with a mask; all cameras look at
+    its centre from one distance and see the same circle, so that a few files do.
+    """
+    width, height = PHONE
+    y, x = np.mgrid[: height // SHRUNK, : width // SHRUNK] + 0.5
+    inside = np.hypot(x - x.mean(), y - y.mean()) < 0.4 * height / SHRUNK
+    rng = np.random.default_rng(0)
+    frames = []
+    for i in range(count):
+        path = folder / f"r_{i}.png"
+        if i < 4:
+            colour = rng.integers(0, 256, (*inside.shape, 3), np.uint8)
+            small = Image.fromarray(np.dstack([colour, 255 * inside.astype(np.uint8)]))
+            small.resize(PHONE, Image.Resampling.NEAREST).save(path, compress_level=1)
+        else:
+            os.link(folder / f"r_{i % 4}.png", path)
+        turn, rise = 2.4 * i, -0.3 + 1.2 * i / count
+        eye = 4 * np.array([np.cos(turn) * np.cos(rise), np.sin(turn) * np.cos(rise), np.sin(rise)])
+        camera = Camera.look_at(eye, (0, 0, 0), fx=1.2 * width, width=width, height=height)
+        frames.append({"file_path": f"r_{i}.png", **frame_keys(camera)})
+    (folder / "transforms_train.json").write_text(json.dumps({"frames": frames}))
+    return str(folder)
+
+
+def peaks(name: str, scene: str) -> dict:
+    """The row of one training, in MiB; for a process that does nothing else."""
+    preset, settings = TRAININGS[name]
+    given = [(*item, "--only") for item in (EARLY | settings).items()]
+    with tempfile.TemporaryDirectory() as temporary:
+        folder = RunFolder(Path(temporary) / "run")
+        config = run_config(folder, scene, preset, given)
+        dev = open_device()
+        training = open_training(dev, folder, config, None)
+        training.run()
+    host = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
+    plan, room = training.room.plan, training.room
+    return {
+        "name": name,
+        "points": plan.peak.points,
+        "device_plan": plan.peak.device / MIB,
+        "device": dev.peak_bytes / MIB,
+        "host_plan": room.host_bytes / MIB,
+        "host": host / MIB,
+        "device_ratio": plan.peak.device / dev.peak_bytes,
+        "host_ratio": room.host_bytes / host,
+    }
+
+
+def measured(name: str, scene: str) -> dict:
+    """peaks() in a process of its own."""
+    command = [sys.executable, __file__, "--child", name, "--scene", scene]
+    done = subprocess.run(command, check=True, stdout=subprocess.PIPE, text=True)
+    return json.loads(done.stdout.splitlines()[-1])
+
+
+def row(name: str, scene: str) -> dict:
+    """The row of a training by its name."""
+    if name != "phone":
+        return measured(name, scene)
+    with tempfile.TemporaryDirectory() as folder:
+        return measured(name, write_phone_scene(Path(folder)))
+
+
+def main() -> None:
+    """Measure and write the results."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--scene", default="demo", help="folder of a scene (demo)")
+    parser.add_argument("--only", nargs="+", choices=TRAININGS, default=list(TRAININGS))
+    parser.add_argument("--out", help="file of the results")
+    parser.add_argument("--child", choices=TRAININGS, help=argparse.SUPPRESS)
+    options = parser.parse_args()
+    if options.child:
+        print(json.dumps(peaks(options.child, options.scene)))
+        return
+    rows = [row(name, options.scene) for name in options.only]
+    print(json.dumps(rows, indent=1))
+    if options.out:
+        write_json(Path(options.out), results(rows))
+
+
+def results(rows: list[dict]) -> dict:
+    """A file of results for tools/docs_tables.py."""
+    return {
+        "measured": "the most memory of device and process that trainings of the presets take",
+        "command": "python tools/memory_peaks.py",
+        "version": __version__,
+        "columns": COLUMNS,
+        "rows": rows,
+    }
+
+
+if __name__ == "__main__":
+    main()
