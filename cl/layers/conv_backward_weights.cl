@@ -99,7 +99,10 @@ kernel void conv_backward_weights(
                 const int ahead = column + PAD;
                 window[0] = ahead < width ? counted(grad + ahead * co, count[ahead / SIDE], lanes)
                                           : (float16)0.0f;
-                if (!PAD && count[column / SIDE] == 0.0f) continue;
+                // pixels that no counted gradient sees may hold anything
+                if (count[max(column - PAD, 0) / SIDE] == 0.0f &&
+                    count[min(column + PAD, width - 1) / SIDE] == 0.0f)
+                    continue;
 #pragma unroll
                 for (int i = 0; i < CI_GROUP; i++) {
                     const float value = pixel[column * c + i];

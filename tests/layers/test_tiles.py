@@ -31,6 +31,7 @@ from pp_cl.layers.tiles import (
 )
 from pp_cl.layers.variants import VARIANTS
 from pp_cl.layers.work import Work
+from pp_cl.network.tile_sets import grow
 
 # (height, width, channels): less than a tile, cut-off tiles, several work-groups
 SHAPES = [(1, 1, 1), (3, 5, 16), (31, 33, 3), (4, 257, 20), (257, 8, 16)]
@@ -126,7 +127,7 @@ def test_lists_and_wrong_sizes(dev):
 @pytest.mark.parametrize("height, width", [(3, 2), (11, 14), large(31, 33), large(6, 70)])
 def test_convolutions_compute_the_chosen_tiles(dev, rng, k, variant, height, width):
     """The other tiles of the results keep their NaN; those of a gradient that do not count may hold
-    NaN.
+    NaN, and so may inputs that no counted tile's gradient sees.
     """
     c1, c2, co = 16, 32, 48
     weight, bias = layer(rng, c1 + c2, co, k)
@@ -173,8 +174,11 @@ def test_convolutions_compute_the_chosen_tiles(dev, rng, k, variant, height, wid
 
     grad_weight, grad_bias = dev.empty(device_weight.shape), dev.empty(co)
     poisoned = dev.upload(np.where(chosen[..., None], grad_out, np.nan), np.float32)
+    seen = pixels_of(grow(counts > 0, k // 2), height, width)
+    poisoned_x = np.where(seen[..., None], x, np.nan).astype(np.float32)
+    poisoned_sources = np.split(poisoned_x, [c1], 2)
     convolution.backward_weights(
-        sources,
+        tuple(dev.upload(np.ascontiguousarray(s)) for s in poisoned_sources),
         poisoned,
         grad_weight,
         grad_bias,
