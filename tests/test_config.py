@@ -204,7 +204,7 @@ def stored_settings():
 
 
 VALUES = [
-    ("format", 2, "format is 2, this version reads 1"),
+    ("format", 3, "format is 3, this version reads 2"),
     ("format", True, "format is True"),
     ("format", "1", "format is '1'"),
     ("format", None, "format is None"),

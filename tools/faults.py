@@ -24,7 +24,8 @@ from pathlib import Path
 from pp_cl import __version__
 from pp_cl.device.discover import open_device
 from pp_cl.scene.demo import demo_scene, write_scene
-from tools.injection.scenarios import SCENARIOS, Bench, Place, Tally
+from tools.injection.bench import Bench, Tally
+from tools.injection.scenarios import SCENARIOS
 from tools.injection.trial import SIZE, VIEWS
 from tools.injection.worker import ROOT, build_shim
 

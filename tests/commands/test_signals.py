@@ -83,7 +83,7 @@ def test_a_second_signal_stops_at_once(scene, tmp_path, capsys, monkeypatch):
 
     monkeypatch.setattr(Trainer, "train_step", stepping)
     assert main(arguments(scene, tmp_path / "run")) == 130
-    assert "from its last checkpoint" in capsys.readouterr().err
+    assert "goes on from" in capsys.readouterr().err
     assert load_checkpoint(tmp_path / "run" / "checkpoint.npz")[0]["step"] == 20
 
 

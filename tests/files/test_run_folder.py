@@ -125,7 +125,7 @@ def test_leftovers_are_removed_from_the_folder_and_the_previews(tmp_path):
     folder = RunFolder(tmp_path / "run")
     folder.previews.mkdir(parents=True)
     for place in (folder.path, folder.previews):
-        (place / ".step.png.1.tmp").write_bytes(b"half")
+        (place / ".step.png.999999999.tmp").write_bytes(b"half")
     folder.create("{}")
     assert [p.name for p in folder.path.rglob("*") if p.is_file()] == ["config.json"]
 

@@ -1,22 +1,20 @@
 """The faults: each scenario takes a Bench and gives a Tally for each kind of case it has tried."""
 
 import errno
-import random
 import shutil
 import signal
 import subprocess
-import tempfile
 import threading
 import time
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
-from dataclasses import dataclass, field
-from functools import cached_property, partial
+from functools import partial
 from pathlib import Path
-from queue import SimpleQueue
-from typing import Any
 
+import numpy as np
+
+from tools.injection.bench import Bench, Case, Place, Tally
 from tools.injection.trial import (
     complaints,
     content,
@@ -27,189 +25,12 @@ from tools.injection.trial import (
     leftovers,
     train_words,
 )
-from tools.injection.worker import Job, Outcome, Worker
 
 ERRORS = (errno.ENOSPC, errno.EIO)  # in turn
 # A process that goes on after these has lost a lock or a descriptor that its end would free.
 IN_A_CHILD = ("flock", "close")
 FULL_AT = (0, 8, 40, 100, 180, 240, 300, 360, 420, 500)  # KiB that a new run may take
 ENDED = {signal.SIGTERM: (0, 143, -15), signal.SIGINT: (0, 130, -2)}  # statuses after a signal
-
-Words = Callable[[Path], list[str]]  # command line of a run's folder
-
-
-@dataclass
-class Tally:
-    """fault: in words. tried, stopped, went_on: cases, those that the fault ended, and those that
-    it did not. findings: a line for each thing that was wrong.
-    """
-
-    fault: str
-    tried: int = 0
-    stopped: int = 0
-    went_on: int = 0
-    findings: list[str] = field(default_factory=list)
-
-    def add(self, outcome: Outcome, case: str, wrong: Iterable[str]) -> None:
-        """Count a case."""
-        self.tried += 1
-        self.stopped += outcome.status != 0
-        self.went_on += outcome.status == 0
-        self.findings += [f"{self.fault}, {case}: {line}" for line in wrong]
-
-
-class Place:
-    """A folder for the runs of cases, one at a time, and the processes that run them."""
-
-    def __init__(self, library: Path, folder: Path) -> None:
-        folder.mkdir(parents=True, exist_ok=True)
-        self._library, self.folder, self.run_folder = library, folder, folder / "run"
-
-    @cached_property
-    def warm(self) -> Worker:
-        """Runs commands on a device that it keeps."""
-        return Worker(self._library, forks=False)
-
-    @cached_property
-    def forking(self) -> Worker:
-        """Runs commands in children."""
-        return Worker(self._library, forks=True)
-
-    def run(self, words: list[str], *, in_child: bool = False, **faults: Any) -> Outcome:
-        """The outcome of a command. faults: as Job has them; run_folder is watched."""
-        worker = self.forking if in_child else self.warm
-        return worker.run(Job(words, str(self.run_folder), **faults))
-
-    def moved(self, folder: Path) -> "Place":
-        """The same processes with another folder."""
-        other = Place(self._library, folder)
-        vars(other).update(warm=self.warm, forking=self.forking)
-        return other
-
-    def close(self) -> None:
-        """End the processes."""
-        for name in vars(self).keys() & {"warm", "forking"}:
-            getattr(self, name).close()
-
-
-@dataclass
-class Bench:
-    """What the scenarios have.
-
-    scene: a folder; library: the shim; folder: for all runs; side_by_side: places that work at a
-    time. kills, stops: how many; seed: of their moments. most_calls: that fail of a command, spread
-    evenly.
-    """
-
-    scene: Path
-    library: Path
-    folder: Path
-    side_by_side: int
-    kills: int = 200
-    stops: int = 10
-    seed: int = 0
-    most_calls: int = 10**9
-
-    @cached_property
-    def places(self) -> list[Place]:
-        """Those that work side by side."""
-        return [Place(self.library, self.folder / str(n)) for n in range(self.side_by_side)]
-
-    def close(self) -> None:
-        """End the processes of the places."""
-        for place in self.places:
-            place.close()
-
-    @cached_property
-    def train(self) -> Words:
-        """The training."""
-        return partial(train_words, self.scene)
-
-    def template(self, *commands: Words) -> Path:
-        """A folder beside the cases that undisturbed commands have left."""
-        place = self.places[0]
-        folder = Path(tempfile.mkdtemp(dir=self.folder))
-        for words in commands:
-            outcome = place.warm.run(Job(words(folder), str(folder)))
-            if outcome.status:
-                raise RuntimeError(f"an undisturbed command failed: {outcome.errors}")
-        return folder
-
-    @cached_property
-    def trained(self) -> Path:
-        """A finished run."""
-        return self.template(self.train)
-
-    @cached_property
-    def interrupted(self) -> Path:
-        """A run that was ended in front of its last checkpoint."""
-        place = self.places[0]
-        copied(None, place.run_folder)
-        calls = place.run(self.train(place.run_folder)).calls
-        last = max(n for n, call in enumerate(calls, 1) if call == "rename checkpoint.npz")
-        copied(None, place.run_folder)
-        place.run(self.train(place.run_folder), call=last, error=errno.ENOSPC)
-        return Path(shutil.copytree(place.run_folder, self.folder / "interrupted"))
-
-    def each(self, function: Callable[[Place, Any], Any], cases: Iterable[Any]) -> list[Any]:
-        """function(place, case) of every case, as many at a time as there are places."""
-        free = SimpleQueue()
-        for place in self.places:
-            free.put(place)
-
-        def one(case):
-            place = free.get()
-            try:
-                return function(place, case)
-            finally:
-                free.put(place)
-
-        with ThreadPoolExecutor(len(self.places)) as pool:
-            return list(pool.map(one, cases))
-
-
-@dataclass
-class Case:
-    """What a command does to a copy of the folder `begin`, undisturbed: expected, calls, seconds in
-    a child. Folders from which the next start has come to the expected bytes are remembered: the
-    same one need not be tried again.
-    """
-
-    bench: Bench
-    begin: Path | None
-    words: Words
-    _seen: set = field(default_factory=set)
-
-    def __post_init__(self):
-        place = self.bench.places[0]
-        copied(self.begin, place.run_folder)
-        outcome = place.run(self.words(place.run_folder), in_child=True)
-        self.expected, self.calls = content(place.run_folder), outcome.calls
-        self.seconds = outcome.seconds
-        if wrong := complaints(outcome, (0,)) + half_written(place.run_folder):
-            raise RuntimeError(f"undisturbed: {wrong}")
-
-    def disturb(self, place: Place, **faults: Any) -> Outcome:
-        """The outcome on a new copy."""
-        copied(self.begin, place.run_folder)
-        return place.run(self.words(place.run_folder), **faults)
-
-    def after(self, place: Place, *, may_leave: bool = False) -> list[str]:
-        """What is wrong in the folder, and after the next start. may_leave: temporary files."""
-        run = place.run_folder
-        left = leftovers(run)
-        wrong = half_written(run) + [f"left {name}" for name in left if not may_leave]
-        state = (frozenset(content(run).items()) if run.exists() else None, bool(left))
-        if state in self._seen:
-            return wrong
-        outcome = place.run(self.words(run))
-        then = complaints(outcome, (0,)) + differences(run, self.expected) + leftovers(run)
-        if not then:
-            self._seen.add(state)
-        return wrong + [f"the next start: {line}" for line in then]
-
-
-# --------------------------------------------------------------------------------------------------
 
 
 def failing_calls(bench: Bench) -> Iterator[Tally]:
@@ -245,18 +66,21 @@ def _each_call(bench, name, begin, words):
 def kills(bench: Bench) -> Iterator[Tally]:
     """SIGKILL, half at random moments, half in front of random calls, again and again."""
     few = max(1, bench.kills // 5)
-    yield _killed(bench, "training", None, bench.train, bench.kills)
-    yield _killed(bench, "evaluation", bench.trained, eval_words, few)
+    for name, begin, words, count in (
+        ("training", None, bench.train, bench.kills),
+        ("evaluation", bench.trained, eval_words, few),
+    ):
+        yield _killed(Case(bench, begin, words), f"SIGKILL, {name}", count)
 
 
-def _killed(bench, name, begin, words, count):
-    case, tally = Case(bench, begin, words), Tally(f"SIGKILL, {name}")
+def _killed(case, fault, count):
+    bench, tally = case.bench, Tally(fault)
     shares = [count // len(bench.places)] * len(bench.places)
     shares[0] += count - sum(shares)
 
     def chain(place, share):
         number, share = share
-        return _kill_chain(case, place, random.Random(f"{bench.seed} {name} {number}"), share)
+        return _kill_chain(case, place, np.random.default_rng((bench.seed, count, number)), share)
 
     for results in bench.each(chain, enumerate(shares)):
         for moment, outcome, wrong in results:
@@ -275,7 +99,7 @@ def _kill_chain(case, place, rng, count):
             seconds = rng.uniform(0, case.seconds)
             moment, faults = f"{seconds:.3f} s", {"signals": [(seconds, signal.SIGKILL)]}
         else:
-            number = rng.randint(1, len(case.calls))
+            number = int(rng.integers(1, len(case.calls) + 1))
             moment, faults = f"before call {number}", {"call": number}
         outcome = place.run(case.words(run), in_child=True, **faults)
         wrong = half_written(run) if run.exists() else []
@@ -307,7 +131,7 @@ def stops(bench: Bench) -> Iterator[Tally]:
 
 
 def _stopped(bench, case, fault, numbers):
-    tally, rng = Tally(fault), random.Random(f"{bench.seed} {fault}")
+    tally, rng = Tally(fault), np.random.default_rng((bench.seed, *map(int, numbers)))
 
     def stop(place, moments):
         signals = list(zip(moments, numbers, strict=True))
@@ -317,7 +141,7 @@ def _stopped(bench, case, fault, numbers):
         return moments, outcome, wrong + case.after(place, may_leave=killed)
 
     first = [rng.uniform(0, case.seconds) for _ in range(bench.stops)]
-    moments = [[t + rng.uniform(0, 0.2) * i for i in range(len(numbers))] for t in first]
+    moments = [[t + 0.1 * i for i in range(len(numbers))] for t in first]
     for times, outcome, wrong in bench.each(stop, moments):
         tally.add(outcome, " and ".join(f"{t:.3f} s" for t in times), wrong)
     return tally
@@ -332,15 +156,16 @@ def mounted(folder: Path) -> Iterator[Callable[[str], None]]:
     CalledProcessError where that is not allowed.
     """
     folder.mkdir(parents=True, exist_ok=True)
-    _mount("-t", "tmpfs", "-o", "size=64m", "tmpfs", folder)
+    _system("mount", "-t", "tmpfs", "-o", "size=64m", "tmpfs", folder)
     try:
-        yield lambda options: _mount("-o", f"remount,{options}", folder)
+        yield lambda options: _system("mount", "-o", f"remount,{options}", folder)
     finally:
-        subprocess.run(["umount", "-l", str(folder)], check=True)
+        _system("umount", "-l", folder)
 
 
-def _mount(*words):
-    subprocess.run(["mount", *map(str, words)], check=True, capture_output=True)
+def _system(*words):
+    words = [str(word) for word in words]
+    subprocess.run(words, check=True, capture_output=True)
 
 
 def full_disks(bench: Bench) -> Iterator[Tally]:
@@ -436,7 +261,7 @@ def two_writers(bench: Bench) -> Iterator[Tally]:
     finished run.
     """
     case, tally = Case(bench, None, bench.train), Tally("two trainings into one folder")
-    first, rng = bench.places[0], random.Random(bench.seed)
+    first, rng = bench.places[0], np.random.default_rng(bench.seed)
     second = Place(bench.library, first.folder)
     for _ in range(bench.stops):
         copied(None, first.run_folder)

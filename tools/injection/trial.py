@@ -1,4 +1,4 @@
-"""What a command must leave after a fault: its words, the content of a run's folder, the verdict."""
+"""What a command must leave after a fault: its words, what its run's folder holds, the verdict."""
 
 import json
 import re
@@ -25,7 +25,7 @@ SETTINGS = {
 }
 VIEWS, SIZE = 4, 16  # of the scene; its images are square
 TIMES = ("seconds", "seconds_per_frame")  # what no two runs have in common
-BESIDE = (".lock", ".owner")  # of no use without the process that wrote them
+BESIDE = (".lock", ".owner", ".evaluation")  # marks without content of their own
 LEFTOVER = re.compile(r"\..*\.tmp")
 PREVIEW = re.compile(r"previews/step_\d+\.png")
 
@@ -106,7 +106,7 @@ def _problem(path):
 
 
 def differences(run: Path, expected: dict[str, bytes]) -> list[str]:
-    """A line for each file that differs; an early preview, which the clock asks for, may be more."""
+    """A line for each file that differs; an early preview, for which the clock asks, may be new."""
     found = content(run)
     names = [n for n in found.keys() | expected.keys() if found.get(n) != expected.get(n)]
     names = [n for n in names if n in expected or not PREVIEW.fullmatch(n)]

@@ -13,7 +13,6 @@ import sys
 import tempfile
 import time
 import traceback
-from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 
@@ -132,7 +131,7 @@ def _import_all():
     import pp_cl.cli
     import pp_cl.commands.progress
     import pp_cl.evaluate
-    import pp_cl.view.serve  # noqa: F401
+    import pp_cl.view.serve
 
     pp_cl.cli._parser()
 
