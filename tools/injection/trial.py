@@ -16,6 +16,7 @@ SETTINGS = {
     "train.iterations": 60,
     "points.count": 500,
     "network.widths": "16,16,16",
+    "network.blocks": "single",
     "train.crop": 0,
     "train.prune_every": 20,
     "train.checkpoint_every": 20,
