@@ -65,6 +65,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         return _fail("the host has no memory left; lower --points or raise --downscale")
     except KeyboardInterrupt:
         return _fail("interrupted", 128 + signal.SIGINT)
+    finally:
+        _drop_stdout()
 
 
 def _mend_streams():
@@ -96,7 +98,6 @@ def _show_warning(message, *_args, **_kwargs):
 
 
 def _fail(message, status=2):
-    _drop_stdout()
     _show_warning(message)
     return status
 

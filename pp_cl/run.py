@@ -253,7 +253,7 @@ def stored_state(folder: RunFolder, config: Config) -> Stored | None:
     """
     folder.check_usable()
     stored = load_run_state(folder, config) if folder.checkpoint.exists() else None
-    if stored and stored[0]["finished"] and folder.config.exists():
+    if folder.config.exists() and (stored is None or stored[0]["finished"]):
         path = load_config(folder.config).scene.path
         if path != config.scene.path:
             _refuse_setting(folder, "scene.path", path, config.scene.path)

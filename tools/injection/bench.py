@@ -86,8 +86,7 @@ class Bench:
     """What the scenarios have.
 
     scene: a folder; library: the shim; folder: for all runs; side_by_side: places that work at a
-    time. kills, stops: how many; seed: of their moments. most_calls: that fail of a command, spread
-    evenly.
+    time. kills, stops: how many; seed: of their moments.
     """
 
     scene: Path
@@ -97,7 +96,6 @@ class Bench:
     kills: int = 200
     stops: int = 10
     seed: int = 0
-    most_calls: int = 10**9
 
     @cached_property
     def places(self) -> list[Place]:
@@ -159,20 +157,23 @@ class Bench:
 
 @dataclass
 class Case:
-    """What a command does to a copy of the folder `begin`, undisturbed: expected, calls, seconds in
-    a child. Folders from which the next start has come to the expected bytes are remembered: the
-    same one need not be tried again.
+    """What a command does to a copy of the folder `begin`, undisturbed: expected, calls, seconds.
+    Folders from which the next start has come to the expected bytes are remembered: the same one
+    need not be tried again.
+
+    begin: None for nothing. in_child: as it is run to be timed.
     """
 
     bench: Bench
     begin: Path | None
     words: Words
+    in_child: bool = False
     _seen: set = field(default_factory=set)
 
     def __post_init__(self):
         place = self.bench.places[0]
         copied(self.begin, place.run_folder)
-        outcome = place.run(self.words(place.run_folder), in_child=True)
+        outcome = place.run(self.words(place.run_folder), in_child=self.in_child)
         self.expected, self.calls = content(place.run_folder), outcome.calls
         self.seconds = outcome.seconds
         if wrong := complaints(outcome, (0,)) + half_written(place.run_folder):

@@ -6,7 +6,7 @@ import signal
 import subprocess
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from functools import partial
@@ -36,16 +36,20 @@ ENDED = {signal.SIGTERM: (0, 143, -15), signal.SIGINT: (0, 130, -2)}  # statuses
 def failing_calls(bench: Bench) -> Iterator[Tally]:
     """Each call that changes the run fails, in four commands."""
     evaluated = bench.template(bench.train, eval_words)
-    yield _each_call(bench, "training", None, bench.train)
-    yield _each_call(bench, "training that goes on", bench.interrupted, bench.train)
-    yield _each_call(bench, "evaluation", bench.trained, eval_words)
-    yield _each_call(bench, "evaluation again", evaluated, eval_words)
+    for name, begin, words in (
+        ("training", None, bench.train),
+        ("training that goes on", bench.interrupted, bench.train),
+        ("evaluation", bench.trained, eval_words),
+        ("evaluation again", evaluated, eval_words),
+    ):
+        case = Case(bench, begin, words)
+        numbers = range(1, len(case.calls) + 1)
+        yield fail_calls(case, f"each call fails once, {name}", numbers)
 
 
-def _each_call(bench, name, begin, words):
-    case, tally = Case(bench, begin, words), Tally(f"each call fails once, {name}")
-    numbers = range(1, len(case.calls) + 1)
-    step = -(-len(numbers) // bench.most_calls)
+def fail_calls(case: Case, fault: str, numbers: Iterable[int]) -> Tally:
+    """Each of these calls of a command fails in a run of its own."""
+    tally = Tally(fault)
 
     def fail(place, number):
         kind = case.calls[number - 1].split()[0]
@@ -58,7 +62,7 @@ def _each_call(bench, name, begin, words):
             wrong += differences(place.run_folder, case.expected)
         return number, outcome, wrong + case.after(place, may_leave=kind == "remove")
 
-    for number, outcome, wrong in bench.each(fail, numbers[::step]):
+    for number, outcome, wrong in case.bench.each(fail, numbers):
         tally.add(outcome, f"call {number} ({case.calls[number - 1]})", wrong)
     return tally
 
@@ -70,7 +74,7 @@ def kills(bench: Bench) -> Iterator[Tally]:
         ("training", None, bench.train, bench.kills),
         ("evaluation", bench.trained, eval_words, few),
     ):
-        yield _killed(Case(bench, begin, words), f"SIGKILL, {name}", count)
+        yield _killed(Case(bench, begin, words, in_child=True), f"SIGKILL, {name}", count)
 
 
 def _killed(case, fault, count):
@@ -111,7 +115,8 @@ def _kill_chain(case, place, rng, count):
             results.append((f"no kill at {moment}", outcome, wrong))
         copied(case.begin, run)
     wrong = case.after(place, may_leave=True)
-    results[-1][2].extend(wrong)
+    if results:
+        results[-1][2].extend(wrong)
     return results
 
 
@@ -121,7 +126,7 @@ def stops(bench: Bench) -> Iterator[Tally]:
         ("training", None, bench.train),
         ("evaluation", bench.trained, eval_words),
     ):
-        case = Case(bench, begin, words)
+        case = Case(bench, begin, words, in_child=True)
         for label, numbers in (
             ("SIGTERM", [signal.SIGTERM]),
             ("Ctrl-C", [signal.SIGINT]),
@@ -260,7 +265,7 @@ def two_writers(bench: Bench) -> Iterator[Tally]:
     """Two trainings begin in one folder at about the same time: one goes on, or the second finds a
     finished run.
     """
-    case, tally = Case(bench, None, bench.train), Tally("two trainings into one folder")
+    case, tally = Case(bench, None, bench.train, in_child=True), Tally("two trainings, one folder")
     first, rng = bench.places[0], np.random.default_rng(bench.seed)
     second = Place(bench.library, first.folder)
     for _ in range(bench.stops):
