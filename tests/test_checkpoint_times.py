@@ -53,11 +53,8 @@ def saved(monkeypatch):
     [
         (1000, 7.5, [8, 16, 24, 32, 40, 48, 56, 60]),
         (1000, 0, [60]),
-        (1000, 59, [59, 60]),
-        (1000, 60, [60]),
         # any checkpoint begins the minutes anew
         (10, 7.5, [8, 10, 18, 20, 28, 30, 38, 40, 48, 50, 58, 60]),
-        (5, 7.5, list(range(5, 61, 5))),
     ],
 )
 def test_minutes_and_steps_say_when_and_the_bytes_are_the_same(
