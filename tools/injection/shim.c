@@ -33,12 +33,14 @@ void faults_arm(const char *path, long call, int error, const char *trace_path) 
     count = 0;
     failing = call;
     error_number = error;
-    if (trace >= 0)
-        syscall(SYS_close, trace);
-    trace = syscall(SYS_openat, AT_FDCWD, trace_path, O_WRONLY | O_CREAT | O_TRUNC | O_CLOEXEC, 0644);
+    if (trace >= 0) syscall(SYS_close, trace);
+    trace =
+        syscall(SYS_openat, AT_FDCWD, trace_path, O_WRONLY | O_CREAT | O_TRUNC | O_CLOEXEC, 0644);
 }
 
-void faults_disarm(void) { *folder = 0; }
+void faults_disarm(void) {
+    *folder = 0;
+}
 
 /* The time of day counts down from now on. */
 void faults_turn_clock(void) {
@@ -49,20 +51,17 @@ void faults_turn_clock(void) {
 /* Whether this call fails. path: absolute, or relative to the folder open as `at`. */
 static int fails(const char *kind, int at, const char *path) {
     char whole[2 * PATH_MAX] = "", link[64];
-    if (!*folder)
-        return 0;
+    if (!*folder) return 0;
     if (path && path[0] == '/') {
         snprintf(whole, sizeof whole, "%s", path);
     } else {
         snprintf(link, sizeof link, at == AT_FDCWD ? "/proc/self/cwd" : "/proc/self/fd/%d", at);
         ssize_t length = readlink(link, whole, PATH_MAX - 1);
-        if (length < 0)
-            return 0;
+        if (length < 0) return 0;
         snprintf(whole + length, sizeof whole - length, path ? "/%s" : "%s", path ? path : "");
     }
     size_t length = strlen(folder);
-    if (strncmp(whole, folder, length) || (whole[length] && whole[length] != '/'))
-        return 0;
+    if (strncmp(whole, folder, length) || (whole[length] && whole[length] != '/')) return 0;
     count++;
     int saved = errno, chosen = count == failing;
     if (trace >= 0) {
@@ -71,8 +70,7 @@ static int fails(const char *kind, int at, const char *path) {
         int size = snprintf(line, sizeof line, "%s%s %s\n", chosen ? "! " : "", kind, rest);
         syscall(SYS_write, trace, line, (size_t)size);
     }
-    if (chosen && !error_number)
-        kill(getpid(), SIGKILL);
+    if (chosen && !error_number) kill(getpid(), SIGKILL);
     errno = chosen ? error_number : saved;
     return chosen;
 }
@@ -113,7 +111,9 @@ ssize_t write(int file, const void *data, size_t size) {
 }
 
 #define ON_FILE(name, kind)                                                                        \
-    int name(int file) { return fails(kind, file, NULL) ? -1 : REAL(name)(file); }
+    int name(int file) {                                                                           \
+        return fails(kind, file, NULL) ? -1 : REAL(name)(file);                                    \
+    }
 ON_FILE(fsync, "fsync")
 ON_FILE(fdatasync, "fsync")
 
@@ -122,8 +122,7 @@ int close(int file) {
     int flags = *folder ? fcntl(file, F_GETFL) : -1;
     int chosen = flags >= 0 && flags & (O_WRONLY | O_RDWR) && fails("close", file, NULL);
     int status = REAL(close)(file);
-    if (chosen)
-        errno = error_number;
+    if (chosen) errno = error_number;
     return chosen ? -1 : status;
 }
 
