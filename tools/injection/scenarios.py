@@ -265,7 +265,10 @@ def two_writers(bench: Bench) -> Iterator[Tally]:
     """Two trainings begin in one folder at about the same time: one goes on, or the second finds a
     finished run.
     """
-    case, tally = Case(bench, None, bench.train, in_child=True), Tally("two trainings, one folder")
+    case, tally = (
+        Case(bench, None, bench.train, in_child=True),
+        Tally("two trainings into one folder"),
+    )
     first, rng = bench.places[0], np.random.default_rng(bench.seed)
     second = Place(bench.library, first.folder)
     for _ in range(bench.stops):
