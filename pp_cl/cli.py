@@ -5,9 +5,12 @@ Bad input is one line on stderr and exit status 2.
 
 import argparse
 import importlib
+import os
+import signal
 import sys
 import warnings
 from collections.abc import Sequence
+from contextlib import suppress
 
 from pp_cl import __version__
 from pp_cl.errors import Stopped, UserError
@@ -30,6 +33,9 @@ COMMANDS = (
 )  # modules of pp_cl.commands
 
 
+BROKEN_PIPE = 128 + 13  # the status of what SIGPIPE ends, of a number that Windows lacks
+
+
 class _Parser(argparse.ArgumentParser):
     """argparse with one-line errors."""
 
@@ -40,32 +46,59 @@ class _Parser(argparse.ArgumentParser):
 def main(argv: Sequence[str] | None = None) -> int:
     """Run a command; returns the exit status."""
     warnings.showwarning = _show_warning
+    _mend_streams()
     try:
         options = _parser().parse_args(argv)
         options.run(options)
+        sys.stdout.flush()
         return 0
     except UserError as error:
         return _fail(str(error))
     except Stopped as stopped:
         return _fail(str(stopped), stopped.status)
+    except BrokenPipeError:
+        return _fail("nobody reads what is printed any more; stopped", BROKEN_PIPE)
     except OSError as error:
         what = f"{error.filename or 'file'}: {error.strerror or error}"
         return _fail(f"{what}; check the path, permissions and free space")
     except MemoryError:
         return _fail("the host has no memory left; lower --points or raise --downscale")
     except KeyboardInterrupt:
-        return _fail(
-            "interrupted; the same command takes a training up from its last checkpoint", 130
-        )
+        return _fail("interrupted", 128 + signal.SIGINT)
+    finally:
+        _drop_stdout()
+
+
+def _mend_streams():
+    """A closed stdout or stderr takes what is printed to nowhere; what an encoding lacks is printed
+    as its code.
+    """
+    if sys.stdout is None:
+        sys.stdout = open(os.devnull, "w", encoding="utf-8")  # noqa: SIM115
+    if sys.stderr is None:
+        sys.stderr = open(os.devnull, "w", encoding="utf-8")  # noqa: SIM115
+    if hasattr(sys.stdout, "reconfigure"):
+        sys.stdout.reconfigure(errors="backslashreplace")
+
+
+def _drop_stdout():
+    """What stdout does not take goes nowhere: the end of Python would fail on it again."""
+    try:
+        sys.stdout.flush()
+    except OSError:
+        nowhere = os.open(os.devnull, os.O_WRONLY)
+        os.dup2(nowhere, sys.stdout.fileno())
+        os.close(nowhere)
 
 
 def _show_warning(message, *_args, **_kwargs):
     """One line on stderr, without the place in our source."""
-    print(f"pp-cl: {message}", file=sys.stderr)
+    with suppress(OSError):  # of a full disk, which is no reason to stop
+        print(f"pp-cl: {message}", file=sys.stderr, flush=True)
 
 
 def _fail(message, status=2):
-    print(f"pp-cl: {message}", file=sys.stderr)
+    _show_warning(message)
     return status
 
 

@@ -12,10 +12,10 @@ from pathlib import Path
 from typing import Any
 
 from pp_cl.errors import UserError, quoted, shown
-from pp_cl.presets import ABSENT, PRESETS, RENAMED
+from pp_cl.presets import ABSENT, ADDED, PRESETS, RENAMED
 from pp_cl.settings import NetworkConfig, PointsConfig, RasterConfig, SceneConfig, TrainConfig
 
-FORMAT = 1  # of config.json: raised when keys are added or change meaning
+FORMAT = 2  # of config.json: raised when keys are added or change meaning
 MOST_BYTES = 2**20  # of a config.json
 MOST_TEXT = 4096  # characters of a setting
 MEND_SETTINGS = "restore it or start a new run"
@@ -145,6 +145,8 @@ def configure(config: Config, scene: str, given: Iterable[tuple[str, Any, str]] 
     path = scene if scene == "demo" else str(Path(scene).resolve())
     assign(config, "scene.path", path, "settings")
     for key, value, origin in given:
+        if key == "scene.path":
+            raise UserError(f"{origin}: scene.path is what SCENE says; give it there")
         assign(config, key, value, origin)
     if config.scene.masks:
         assign(config, "scene.masks", str(Path(config.scene.masks).resolve()), "settings")
@@ -153,40 +155,48 @@ def configure(config: Config, scene: str, given: Iterable[tuple[str, Any, str]] 
 
 
 def load_config(path: Path | str) -> Config:
-    """Config of a config.json. One of an earlier version, without a format number, may have old
-    keys, and lack those in presets.ABSENT: it leaves one line as a warning. Raises UserError naming
-    the file and the key.
+    """Config of a config.json. One of an earlier format may lack the keys of presets.ABSENT that
+    came later, and one without a format number have old keys: they leave one line as a warning.
+    Raises UserError naming the file and the key.
     """
     path = Path(path)
     stored = _read_settings(path)
-    numbered, name = "format" in stored, stored.get("preset")
-    if numbered and (type(stored["format"]) is not int or stored["format"] != FORMAT):
-        found = quoted(stored["format"], 40)
-        raise UserError(f"{path}: format is {found}, this version reads {FORMAT}; start a new run")
+    number, name = _format(path, stored), stored.get("preset")
     if type(name) is not str or name not in PRESETS:
         raise UserError(
             f"{path}: key preset is missing or none of {', '.join(PRESETS)}; {MEND_SETTINGS}"
         )
     config = preset(name)
     known = {f"{s}.{item.name}" for s, v in sections(config) for item in dataclasses.fields(v)}
-    found = _stored_keys(path, stored, known if numbered else known | RENAMED.keys())
+    found = _stored_keys(path, stored, known if number else known | RENAMED.keys())
     lacking = known - {RENAMED.get(key, key) for key in found}
     for key in sorted(lacking):
-        if numbered or key not in ABSENT:
+        if key not in ABSENT or number >= ADDED.get(key, 1):
             raise UserError(f"{path}: key {key} is missing; {MEND_SETTINGS}")
         assign(config, key, ABSENT[key], str(path))
     for key, value in found.items():
         _check_type(config, RENAMED.get(key, key), value, f"{path}: {key}")
         assign(config, key, value, str(path))
     config.notes.clear()  # one line says it all
-    if not numbered:
-        _tell_of_earlier_version(
-            path, tuple(sorted(lacking)), tuple(sorted(found.keys() & RENAMED.keys()))
-        )
+    if number < FORMAT:
+        renamed = found.keys() & RENAMED.keys()
+        _tell_of_earlier_version(path, number, tuple(sorted(lacking)), tuple(sorted(renamed)))
     validate(config, str(path))
     if not config.scene.path:
         raise UserError(f"{path}: scene.path is empty; {MEND_SETTINGS}")
     return config
+
+
+def _format(path, stored):
+    """The format number of a config.json, 0 where there is none."""
+    if "format" not in stored:
+        return 0
+    number = stored["format"]
+    if type(number) is not int or not 1 <= number <= FORMAT:
+        raise UserError(
+            f"{path}: format is {quoted(number, 40)}, this version reads {FORMAT}; start a new run"
+        )
+    return number
 
 
 def _read_settings(path):
@@ -249,9 +259,10 @@ def _is_path(text):
 
 
 @cache
-def _tell_of_earlier_version(path, lacking, renamed):
+def _tell_of_earlier_version(path, number, lacking, renamed):
     """Say once what was made of the settings of an earlier version."""
-    told = [f"{path}: written by an earlier version, without a format number"]
+    written = f"in format {number}" if number else "without a format number"
+    told = [f"{path}: written by an earlier version, {written}"]
     if renamed:
         others = f", and {len(renamed) - 1} other keys have new names" * (len(renamed) > 1)
         told.append(f"{renamed[0]} is called {RENAMED[renamed[0]]} now{others}")

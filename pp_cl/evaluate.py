@@ -10,7 +10,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from pp_cl.device.discover import open_device
-from pp_cl.files.atomic import remove_leftovers, write_json
+from pp_cl.errors import UserError
+from pp_cl.files.atomic import check_writable, remove_leftovers, write_json
 from pp_cl.files.contact_sheet import write_comparison
 from pp_cl.files.image import write_png
 from pp_cl.metrics.psnr_ssim import Metrics, mean
@@ -20,6 +21,7 @@ from pp_cl.scene.views import View
 from pp_cl.trained import Run, load_run
 
 SHOWN_VIEWS = 4  # rows of the comparison image
+MARK = ".evaluation"  # file in a folder that evaluations may replace
 
 
 class Rendered(NamedTuple):
@@ -45,31 +47,41 @@ def evaluate_run(
     device: str | None = None,
     tolerance: float | None = None,
     scene: str | None = None,
+    out: Path | str | None = None,
 ) -> dict[str, Any]:
     """evaluate() of the run in a folder. device: as `pp-cl eval --device`; tolerance, scene: as
     load_run takes them.
     """
     run = load_run(open_device(device), folder, tolerance=tolerance, scene=scene)
-    return evaluate(run, split, metrics, save_images=save_images)
+    return evaluate(run, split, metrics, save_images=save_images, out=out)
 
 
 def evaluate(
-    run: Run, split: str, metrics: tuple[str, ...], *, save_images: bool = False
+    run: Run,
+    split: str,
+    metrics: tuple[str, ...],
+    *,
+    save_images: bool = False,
+    out: Path | str | None = None,
 ) -> dict[str, Any]:
-    """Measure a run; writes metrics.json and comparison.png into RUN/eval, or RUN/eval/SPLIT for
-    other splits than test, and returns the former.
+    """Measure a run; writes metrics.json and comparison.png into the folder `out`, if not given
+    RUN/eval, or RUN/eval/SPLIT for other splits than test, and returns the former.
 
     metrics: names out of psnr, ssim, lpips. save_images: write every view to images/ there, in
-    place of what an earlier evaluation left. Raises UserError for a missing or broken split.
+    place of what an earlier evaluation left. Raises UserError for a missing or broken split, a
+    folder that may not be written, and an `out` that holds something else than an evaluation.
     """
+    target = run.folder.evaluation(split) if out is None else Path(out)
+    check_target(target, is_new=out is not None)
     scene = run.scene(split)
     views = scene.splits[split]
     measure = Metrics(run.dev, metrics, run.policy)
-    target = run.folder.evaluation(split)
     target.mkdir(parents=True, exist_ok=True)
+    if out is not None:
+        (target / MARK).touch()
     remove_leftovers(target)
-    if save_images:
-        shutil.rmtree(target / "images", ignore_errors=True)
+    if save_images and (target / "images").exists():
+        shutil.rmtree(target / "images")
     files = image_files([view.name for view in views])
     rows, costs, shown = [], [], []
     for i, rendered in enumerate(render_views(run, views)):
@@ -88,6 +100,17 @@ def evaluate(
     write_json(target / "metrics.json", result)
     write_comparison(target / "comparison.png", *zip(*shown, strict=True))
     return result
+
+
+def check_target(target: Path, *, is_new: bool) -> None:
+    """Raise UserError where an evaluation cannot be written into a folder. is_new: nor if it holds
+    files of others, of which images/ would be removed.
+    """
+    if target.exists() and not target.is_dir():
+        raise UserError(f"{target}: is not a folder; choose another --out")
+    check_writable(target)
+    if is_new and target.exists() and not (target / MARK).exists() and any(target.iterdir()):
+        raise UserError(f"{target}: holds other files; choose a new or empty folder for --out")
 
 
 def _published(scene, split, views):

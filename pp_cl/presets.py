@@ -92,8 +92,8 @@ RENAMED = {
 }
 
 
-# What a setting is taken for that a config.json without a format number may lack, since it came
-# later: what the program did before.
+# What a setting is taken for that a config.json of an earlier format may lack, since it came later:
+# what the program did before.
 ABSENT = {
     "scene.mask_from": "given",
     "scene.masks": "",
@@ -115,4 +115,8 @@ ABSENT = {
     "train.refine_at": (1.0, 1.0),
     "train.memory_gib": 0.0,
     "train.eval_every": 0,
+    "train.checkpoint_minutes": 0.0,
 }
+
+# The format of config.json that first had a key of ABSENT; the others came with format 1.
+ADDED = {"train.checkpoint_minutes": 2}

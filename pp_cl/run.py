@@ -14,9 +14,10 @@ from pp_cl.config import Config, assign, configure, load_config, preset, section
 from pp_cl.device.device import Device
 from pp_cl.device.discover import open_device
 from pp_cl.errors import UserError
+from pp_cl.files.atomic import check_writable
 from pp_cl.files.contact_sheet import write_comparison
 from pp_cl.files.image import to_8bit, write_png
-from pp_cl.files.run_folder import RunFolder
+from pp_cl.files.run_folder import MASKS_PICTURE, RunFolder
 from pp_cl.info import picture
 from pp_cl.layers.policy import load_policy, policy_of_run
 from pp_cl.metrics.psnr_ssim import psnr
@@ -43,7 +44,6 @@ from pp_cl.training.stored import load_run_state, opened_run
 
 FIRST_PREVIEW = 10.0  # seconds; with a slow step and its writing it shows within 20
 MEASURED_VIEWS = 4
-MASKS_PICTURE = "masks.png"
 
 OnStep = Callable[[int, dict[str, Any] | None], None]
 Stored = tuple[dict[str, Any], dict[str, np.ndarray]]  # header and arrays of a checkpoint
@@ -59,25 +59,26 @@ def run_config(
     given settings. Where these do not say scene.downscale, a new one reduces the images to about
     the preset's size.
 
-    scene: a folder, or the word demo. given: (key, value or its text, origin), which a stored run
-    must agree with. Raises UserError naming the first setting that differs or makes no sense, or
-    what is wrong with the scene's files.
+    scene: a folder, or the word demo. given: (key, value or its text, origin), which a run with a
+    checkpoint must agree with; without one there is nothing that other settings would spoil. Raises
+    UserError naming the first setting that differs or makes no sense, or what is wrong with the
+    scene's files.
     """
-    if folder.config.exists():
-        config, stored = load_config(folder.config), load_config(folder.config)
-        if preset_name not in (None, stored.preset):
+    stored = load_config(folder.config) if folder.config.exists() else None
+    if stored and preset_name not in (None, stored.preset):
+        if folder.checkpoint.exists():
             raise UserError(
                 f"{folder.config}: preset is {stored.preset} there, {preset_name} asked for; use"
                 " another --out"
             )
-    else:
-        config, stored = preset(preset_name or "tiny"), None
+        stored = None
+    config = load_config(folder.config) if stored else preset(preset_name or "tiny")
     given = list(given)
     configure(config, scene, given)
     if not stored and "scene.downscale" not in [key for key, _, _ in given]:
         downscale = preset_downscale(config.scene.path, config.preset)
         assign(config, "scene.downscale", downscale, "preset")
-    if stored:
+    if stored and folder.checkpoint.exists():
         _check_same(config, stored, folder)
     return config
 
@@ -134,6 +135,7 @@ class Training:
     origin: str
     measured: list[View]
     _preview_by: float = field(default=math.inf, init=False)  # time.monotonic()'s seconds
+    _save_by: float = field(default=math.inf, init=False)
 
     def run(
         self,
@@ -174,6 +176,7 @@ class Training:
         with self.folder.open_log(trainer.step) as log:
             seconds = log.seconds
             first = trainer.step + 1
+            self._expect_save()
             while trainer.step < settings.iterations:
                 self._check_growth()
                 start = time.perf_counter()
@@ -190,8 +193,9 @@ class Training:
             start = time.perf_counter()
             trainer.finish()
             seconds += time.perf_counter() - start
-            self._save(finished=True)
+            # in front of the checkpoint: a row that has none is made again, a finished run is not
             log.write(self._row(seconds) | {"points": trainer.model.cloud.count, "finished": True})
+            self._save(finished=True)
         return seconds
 
     def _check_growth(self):
@@ -203,7 +207,9 @@ class Training:
             raise
 
     def _after_step(self, log, terms, seconds):
-        """Row of the log, checkpoint and preview, where they are due; returns the row or None."""
+        """Row of the log, preview and checkpoint, where they are due; returns the row or None. The
+        checkpoint is the last: what it stands for is not made again.
+        """
         trainer, settings = self.trainer, self.config.train
         step, last, row = trainer.step, trainer.step == settings.iterations, None
         is_measured = settings.eval_every and step % settings.eval_every == 0
@@ -212,11 +218,12 @@ class Training:
             state = {"points": trainer.model.cloud.count, "rates": trainer.rates()}
             row = self._row(seconds) | terms.get() | state | measured
             log.write(row)
-        if step % settings.checkpoint_every == 0 and not last:
-            self._save(finished=False)
         due = settings.previews and step % -(-settings.iterations // settings.previews) == 0
         if last or due or time.monotonic() >= self._preview_by:
             self._preview()
+        due = step % settings.checkpoint_every == 0 or time.monotonic() >= self._save_by
+        if due and not last:
+            self._save(finished=False)
         return row
 
     def _row(self, seconds):
@@ -236,10 +243,16 @@ class Training:
         wanted = self.config.train.previews and not any(self.folder.previews.glob("*.png"))
         self._preview_by = time.monotonic() + FIRST_PREVIEW if wanted else math.inf
 
+    def _expect_save(self):
+        """Be due a checkpoint by the clock, which no step depends on."""
+        minutes = self.config.train.checkpoint_minutes
+        self._save_by = time.monotonic() + 60 * minutes if minutes else math.inf
+
     def _save(self, finished):
         trainer = self.trainer
         header = trainer.model.header() | self.info | {"step": trainer.step, "finished": finished}
         self.folder.save(header, trainer.model.arrays() if finished else trainer.arrays())
+        self._expect_save()
 
     def _preview(self):
         """Prediction, truth and error of the first training view."""
@@ -267,8 +280,10 @@ def open_training(
 ) -> Training:
     """A training in `folder`, from its checkpoint `stored` where it has one. Nothing is written.
 
-    Raises UserError for a scene or checkpoint that does not fit, and for too little memory.
+    Raises UserError for a scene or checkpoint that does not fit, for too little memory, and for a
+    folder that may not be written.
     """
+    check_writable(folder.path)
     tolerance = config.network.tolerance
     if stored:
         policy = policy_of_run(dev, tolerance, stored[0].get("tuning"), folder.checkpoint)

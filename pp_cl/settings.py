@@ -218,6 +218,9 @@ class TrainConfig:
         True, "average the parameters (EMA) over the last 15 % of the steps and keep the averages"
     )
     checkpoint_every: int = setting(1000, "steps between two checkpoints", 1, 10**8)
+    checkpoint_minutes: float = setting(
+        10.0, "minutes after which the next step ends with a checkpoint (0: never)", 0, 10**6
+    )
     memory_gib: float = setting(
         0.0,
         "device memory that training may use, in GiB; what it does not need caches the hits of"

@@ -54,6 +54,23 @@ def test_what_an_earlier_version_did_not_know_is_taken_as_it_did(name, tmp_path)
     )
 
 
+def test_a_run_of_format_1_lacks_what_came_with_format_2_alone(tmp_path):
+    stored, path = stored_settings(), tmp_path / "config.json"
+    stored["format"] = 1
+    del stored["train"]["checkpoint_minutes"]
+    path.write_text(json.dumps(stored))
+    with pytest.warns(UserWarning, match="earlier version, in format 1; .*minutes = 0.0") as warned:
+        assert load_config(path).train.checkpoint_minutes == 0
+    assert len(warned) == 1
+    del stored["train"]["eval_every"]
+    path.write_text(json.dumps(stored))
+    assert "key train.eval_every is missing" in refusal(path)
+    stored = stored_settings()
+    del stored["train"]["checkpoint_minutes"]
+    path.write_text(json.dumps(stored))
+    assert "key train.checkpoint_minutes is missing" in refusal(path)
+
+
 @pytest.mark.parametrize("old", RENAMED)
 def test_an_old_key_sets_the_new_one_and_is_noted(old):
     new = RENAMED[old]
@@ -204,7 +221,8 @@ def stored_settings():
 
 
 VALUES = [
-    ("format", 2, "format is 2, this version reads 1"),
+    ("format", 3, "format is 3, this version reads 2"),
+    ("format", 0, "format is 0"),
     ("format", True, "format is True"),
     ("format", "1", "format is '1'"),
     ("format", None, "format is None"),

@@ -2,6 +2,7 @@
 
 import json
 import shutil
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -237,3 +238,56 @@ def test_an_unfinished_run_is_marked(tmp_path, capsys, monkeypatch):
     capsys.readouterr()
     assert main(["info", str(out)]) == 0
     assert "(unfinished" not in capsys.readouterr().out
+
+
+def files_of(folder):
+    """{path: bytes} of all files below a folder, the time of metrics.json left out."""
+    files = {p.relative_to(folder).as_posix(): p.read_bytes() for p in folder.rglob("*.*")}
+    if "metrics.json" in files:
+        result = json.loads(files["metrics.json"])
+        files["metrics.json"] = {**result, "seconds_per_frame": None}
+    return files
+
+
+def test_an_evaluation_is_written_elsewhere_on_request(run, tmp_path, capsys):
+    """With the same content; the run's folder stays as it is."""
+    copy, out = tmp_path / "run", tmp_path / "there" / "eval"
+    shutil.copytree(run, copy, ignore=shutil.ignore_patterns("eval"))
+    before = files_of(copy)
+    assert main(["eval", str(copy), "--save-images", "--out", str(out)]) == 0
+    assert f"wrote {out / 'metrics.json'}" in capsys.readouterr().out and files_of(copy) == before
+    first = files_of(out)
+    assert main(["eval", str(copy), "--save-images"]) == 0
+    assert files_of(copy / "eval") == {k: v for k, v in first.items() if k != ".evaluation"}
+    (out / "images" / "old.png").write_bytes(b"")
+    assert main(["eval", str(copy), "--save-images", "--out", str(out)]) == 0
+    assert files_of(out) == first
+
+
+def test_an_evaluation_does_not_replace_what_is_not_one(run, tmp_path, capsys):
+    (tmp_path / "images").mkdir()
+    (tmp_path / "images" / "holiday.png").write_bytes(b"mine")
+    (tmp_path / "file").write_text("mine")
+    for out, named in ((tmp_path, "holds other files"), (tmp_path / "file", "is not a folder")):
+        assert main(["eval", str(run), "--save-images", "--out", str(out)]) == 2
+        assert f"{out}: {named}" in capsys.readouterr().err
+    assert (tmp_path / "images" / "holiday.png").read_bytes() == b"mine"
+    assert (tmp_path / "file").read_text() == "mine"
+
+
+def test_an_evaluation_that_cannot_be_written_is_told_before_it_is_made(
+    run, tmp_path, capsys, monkeypatch
+):
+    out = tmp_path / "there"
+    monkeypatch.setattr("os.access", lambda path, _mode: Path(path) != tmp_path)
+    monkeypatch.setattr("pp_cl.evaluate.render_views", None)
+    assert main(["eval", str(run), "--out", str(out)]) == 2
+    assert f"{out}: may not be written" in capsys.readouterr().err and not out.exists()
+
+
+def test_what_a_killed_evaluation_left_goes_with_the_next(run):
+    left = run / "eval" / "images" / f".r_0.png.{2**22 + 1}.tmp"
+    left.parent.mkdir(parents=True, exist_ok=True)
+    left.write_bytes(b"half")
+    assert main(["eval", str(run)]) == 0
+    assert not left.exists()

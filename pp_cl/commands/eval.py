@@ -1,6 +1,7 @@
 """The command pp-cl eval."""
 
 import argparse
+from pathlib import Path
 
 from pp_cl.commands import options as shared
 
@@ -17,6 +18,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--scene", metavar="SCENE", help="where the run's scene is now, if it has moved"
     )
     parser.add_argument(
+        "--out", metavar="FOLDER", help="write there, not into RUN/eval, which then stays as it is"
+    )
+    parser.add_argument(
         "--save-images", action="store_true", help="write every view to RUN/eval/images/"
     )
     parser.add_argument(
@@ -31,7 +35,7 @@ def run(options: argparse.Namespace) -> None:
     """Evaluate, print the table."""
     from pp_cl.bench.plots import check_files, plot_ranks, save_figure
     from pp_cl.device.discover import open_device
-    from pp_cl.evaluate import evaluate
+    from pp_cl.evaluate import check_target, evaluate
     from pp_cl.trained import load_run
 
     metrics, tolerance = (
@@ -39,10 +43,12 @@ def run(options: argparse.Namespace) -> None:
         shared.read_tolerance(options.tolerance),
     )
     figure = check_files(None, options.chart, "--chart")
+    if options.out:
+        check_target(Path(options.out), is_new=True)
     dev = open_device(options.device)
     run = load_run(dev, options.run_folder, tolerance=tolerance, scene=options.scene)
     print(run.policy.origin)
-    result = evaluate(run, options.split, metrics, save_images=options.save_images)
+    result = evaluate(run, options.split, metrics, save_images=options.save_images, out=options.out)
     folder = run.folder
     if figure:
         figure.set_size_inches(4 * len(metrics), 6)
@@ -50,7 +56,7 @@ def run(options: argparse.Namespace) -> None:
         save_figure(figure, options.chart)
     print(_table(result, folder))
     print(_summary(result))
-    written = folder.evaluation(options.split)
+    written = Path(options.out or folder.evaluation(options.split))
     print(
         f"wrote {written / 'metrics.json'} and {written / 'comparison.png'} (prediction"
         " | truth | 4 x error)"

@@ -3,6 +3,7 @@
 import os
 import sys
 import time
+from contextlib import suppress
 from typing import Any, TextIO
 
 from tqdm import tqdm
@@ -91,6 +92,10 @@ class Lines:
         if row is None or now < self._next:
             return
         self._next = now + LINES_APART
+        with suppress(OSError):  # of a full disk, which is no reason to stop
+            self._print(step, row, now)
+
+    def _print(self, step, row, now):
         rate = (step - self._first) / max(now - self._start, 1e-6)
         left = round((self._steps - step) / rate)
         test = f", test PSNR {row['test_psnr']:.2f}" if "test_psnr" in row else ""

@@ -2,6 +2,7 @@
 
 import argparse
 import math
+import signal
 import sys
 from contextlib import ExitStack, nullcontext
 
@@ -159,7 +160,14 @@ def _run(training, options):
             for follower in followers:
                 follower(step, row)
 
-        seconds = training.run(on_step, lambda: bool(caught))
+        try:
+            seconds = training.run(on_step, lambda: bool(caught))
+        except KeyboardInterrupt:
+            kept = "goes on from" if folder.checkpoint.exists() else "begins anew, there is no"
+            raise Stopped(
+                f"stopped at once; the same command {kept} {folder.checkpoint}",
+                128 + signal.SIGINT,
+            ) from None
     if trainer.step < training.config.train.iterations:
         raise Stopped(
             f"stopped at step {trainer.step}; wrote {folder.checkpoint}; the same command goes on",

@@ -3,13 +3,26 @@
 import errno
 import json
 import os
+import re
 import shutil
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any, BinaryIO
 
 from pp_cl.errors import UserError
+
+LEFTOVER = re.compile(r"\..+\.(\d+)\.tmp(\..*)?", re.DOTALL)  # with the number of its process
+# what file systems say that cannot sync a folder, and folders that may be written, not read
+UNKNOWN_TO_FOLDERS = (
+    errno.EINVAL,
+    errno.ENOTSUP,
+    errno.EOPNOTSUPP,
+    errno.ENOSYS,
+    errno.EBADF,
+    errno.EACCES,
+    errno.EPERM,
+)
 
 
 @contextmanager
@@ -29,13 +42,21 @@ def atomic_file(path: Path | str) -> Iterator[BinaryIO]:
         os.replace(temporary, path)
         _sync_folder(path.parent)
     except OSError as error:
-        mend = (
-            "free some space"
-            if error.errno in (errno.ENOSPC, errno.EDQUOT)
-            else "check the folder and its permissions"
-        )
-        raise UserError(f"{path}: cannot be written ({error.strerror}); {mend}") from error
+        raise UserError(f"{path}: cannot be written ({error.strerror}); {mend(error)}") from error
     finally:
+        _remove(temporary)
+
+
+def mend(error: OSError) -> str:
+    """What to do about a file that cannot be written."""
+    if error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG):
+        return "free some space"
+    return "check the folder, its permissions and the disk"
+
+
+def _remove(temporary):
+    """Remove what did not get its final name; what stays is removed by the next start."""
+    with suppress(OSError):
         temporary.unlink(missing_ok=True)
 
 
@@ -57,7 +78,7 @@ def atomic_path(path: Path) -> Iterator[Path]:
             " space"
         ) from error
     finally:
-        temporary.unlink(missing_ok=True)
+        _remove(temporary)
 
 
 @contextmanager
@@ -87,15 +108,31 @@ def check_new_folder(folder: Path) -> None:
         raise UserError(f"{folder}: exists already; choose a new or empty folder")
 
 
+def check_writable(folder: Path | str, mend: str = "choose another --out") -> None:
+    """Raise UserError where a folder, or the one in which it would be made, may not be written."""
+    there = Path(folder).absolute()
+    while not there.exists() and there != there.parent:
+        there = there.parent
+    if not os.access(there, os.W_OK | os.X_OK):
+        raise UserError(
+            f"{folder}: may not be written (check the permissions of {there}, and that its file"
+            f" system is not read-only); {mend}"
+        )
+
+
 def _sync_folder(folder):
-    """Make a rename in the folder survive a power cut, where the system knows how."""
+    """Make a rename in the folder survive a power cut, where system and file system know how."""
     if not hasattr(os, "O_DIRECTORY"):
         return
-    descriptor = os.open(folder, os.O_DIRECTORY)
     try:
-        os.fsync(descriptor)
-    finally:
-        os.close(descriptor)
+        descriptor = os.open(folder, os.O_DIRECTORY)
+        try:
+            os.fsync(descriptor)
+        finally:
+            os.close(descriptor)
+    except OSError as error:
+        if error.errno not in UNKNOWN_TO_FOLDERS:
+            raise
 
 
 def write_text(path: Path | str, text: str) -> None:
@@ -110,6 +147,27 @@ def write_json(path: Path | str, value: Any) -> None:
 
 
 def remove_leftovers(folder: Path | str) -> None:
-    """Delete temporary files that a killed process left in the folder."""
-    for leftover in Path(folder).glob(".*.tmp*"):
-        leftover.unlink(missing_ok=True)
+    """Delete temporary files and folders that killed processes left in the folder and below it, not
+    those of processes that live.
+    """
+    for leftover in list(Path(folder).rglob(".*.tmp*")):
+        named = LEFTOVER.fullmatch(leftover.name)
+        if not named or _lives(int(named[1])):
+            continue
+        if leftover.is_dir() and not leftover.is_symlink():
+            shutil.rmtree(leftover)
+        else:
+            leftover.unlink(missing_ok=True)
+
+
+def _lives(process):
+    """Whether another process has this number; where the system has no way to ask, none has."""
+    if os.name != "posix" or process == os.getpid():
+        return False
+    try:
+        os.kill(process, 0)  # sends nothing
+    except PermissionError:
+        return True
+    except (ProcessLookupError, OverflowError):
+        return False
+    return True

@@ -6,7 +6,7 @@ import os
 import socket
 import warnings
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -14,9 +14,10 @@ import numpy as np
 from filelock import FileLock, Timeout
 
 from pp_cl.errors import UserError
-from pp_cl.files.atomic import remove_leftovers, write_text
+from pp_cl.files.atomic import mend, remove_leftovers, write_text
 from pp_cl.files.checkpoint import Rows, save_checkpoint
 
+MASKS_PICTURE = "masks.png"
 MOST_LINE = 2**16  # bytes of a row; a longer line is none of ours
 MOST_NUMBER = 1e300  # in a row
 
@@ -69,19 +70,32 @@ class RunFolder:
             raise UserError(
                 f"{self}: {who} trains into it; wait for its end, or choose another --out"
             ) from None
+        except OSError as error:
+            raise UserError(
+                f"{lock.lock_file}: cannot be locked ({error.strerror}); check the file system"
+            ) from error
         try:
-            owner.write_text(f"process {os.getpid()} on {socket.gethostname()}\n")
+            with _told(owner):
+                owner.write_text(f"process {os.getpid()} on {socket.gethostname()}\n")
             yield
         finally:
-            owner.unlink(missing_ok=True)
-            lock.release()
+            # the end of the process ends its ownership in any case
+            with suppress(OSError):
+                owner.unlink(missing_ok=True)
+            with suppress(OSError):
+                lock.release()
 
     def create(self, config_json: str) -> None:
-        """Make the folders, remove what a killed process left unfinished, write config.json."""
-        self.previews.mkdir(parents=True, exist_ok=True)
-        for folder in (self.path, self.previews):
-            remove_leftovers(folder)
+        """Make the folders, remove what a killed process left unfinished, and pictures that belong
+        to no checkpoint; write config.json, which makes the folder one of a run, before the rest.
+        """
+        self.path.mkdir(parents=True, exist_ok=True)
+        remove_leftovers(self.path)
+        if not self.checkpoint.exists():
+            for picture in (self.path / MASKS_PICTURE, *self.previews.glob("step_*.png")):
+                picture.unlink(missing_ok=True)
         write_text(self.config, config_json + "\n")
+        self.previews.mkdir(exist_ok=True)
 
     def rows(self) -> list[dict[str, Any]]:
         """The rows of the log, up to the first that is broken."""
@@ -110,21 +124,28 @@ class Log:
         return self
 
     def __exit__(self, *_: object) -> None:
-        self._file.close()
+        with _told(self._file.name):
+            self._file.close()
 
     def write(self, row: dict[str, Any]) -> None:
         """Append a row. Raises UserError naming the file when it cannot be written, ValueError for
         NaN.
         """
         data = (json.dumps(row, allow_nan=False) + "\n").encode()
-        try:
+        with _told(self._file.name):
             while data:
                 data = data[self._file.write(data) :]
-        except OSError as error:
-            raise UserError(
-                f"{self._file.name}: cannot be written ({error.strerror}); free some space, the"
-                " same command goes on"
-            ) from error
+
+
+@contextmanager
+def _told(path):
+    """A write that fails becomes a UserError naming the file."""
+    try:
+        yield
+    except OSError as error:
+        raise UserError(
+            f"{path}: cannot be written ({error.strerror}); {mend(error)}; the same command goes on"
+        ) from error
 
 
 def read_row(line: bytes | str) -> dict[str, Any] | None:

@@ -40,7 +40,7 @@ def test_frames_that_are_there_are_not_rendered_again(trained, tmp_path, capsys)
     assert main(words) == 0
     whole = {p.name: p.read_bytes() for p in (tmp_path / "o").iterdir()}
     (tmp_path / "o" / "00002.png").unlink()
-    (tmp_path / "o" / ".00003.png.1.tmp").write_bytes(b"half")
+    (tmp_path / "o" / ".00003.png.999999999.tmp").write_bytes(b"half")
     capsys.readouterr()
     assert main(words) == 0
     assert "rendered 1 of 4 frames" in capsys.readouterr().out

@@ -83,8 +83,33 @@ def test_a_second_signal_stops_at_once(scene, tmp_path, capsys, monkeypatch):
 
     monkeypatch.setattr(Trainer, "train_step", stepping)
     assert main(arguments(scene, tmp_path / "run")) == 130
-    assert "from its last checkpoint" in capsys.readouterr().err
+    assert "goes on from" in capsys.readouterr().err
     assert load_checkpoint(tmp_path / "run" / "checkpoint.npz")[0]["step"] == 20
+
+
+def test_a_second_signal_before_the_first_checkpoint_promises_nothing(
+    scene, tmp_path, capsys, monkeypatch
+):
+    train_step = Trainer.train_step
+
+    def stepping(self):
+        signal.raise_signal(signal.SIGINT)
+        signal.raise_signal(signal.SIGINT)
+        return train_step(self)
+
+    monkeypatch.setattr(Trainer, "train_step", stepping)
+    assert main(arguments(scene, tmp_path / "run")) == 130
+    (line,) = capsys.readouterr().err.splitlines()
+    assert "begins anew" in line and not (tmp_path / "run" / "checkpoint.npz").exists()
+
+
+def test_other_commands_promise_nothing(capsys, monkeypatch):
+    def interrupted(*_):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("pp_cl.commands.compare.run", interrupted)
+    assert main(["compare", "a", "b"]) == 130
+    assert capsys.readouterr().err == "pp-cl: interrupted\n"
 
 
 def test_a_process_that_is_terminated_says_how_to_go_on(scene, tmp_path):

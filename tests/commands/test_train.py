@@ -1,12 +1,14 @@
 """`pp-cl train`: what it prints about how settings were read."""
 
 import json
+from pathlib import Path
 
 import pytest
 from support.runs import arguments, train_and_interrupt
 from support.scenes import write_ball_scene
 
 from pp_cl.cli import main
+from pp_cl.errors import UserError
 from pp_cl.files.run_folder import RunFolder
 from pp_cl.presets import RENAMED
 from pp_cl.run import run_config
@@ -77,3 +79,68 @@ def _interrupting(*_):
 @pytest.mark.parametrize("preset, expected", [("tiny", 2), ("small", 1), ("full", 1), ("paper", 1)])
 def test_the_demo_is_reduced_by_the_same_rule(tmp_path, preset, expected):
     assert run_config(RunFolder(tmp_path / "run"), "demo", preset).scene.downscale == expected
+
+
+def failing_step(self):
+    raise UserError("the loss is not finite at step 1; lower network.rate")
+
+
+def test_a_start_without_a_checkpoint_takes_other_settings(tmp_path, capsys, monkeypatch):
+    """As a training advises that fails in its first steps; nothing of it shows in the next."""
+    scene, out, plain = write_ball_scene(tmp_path / "ball"), tmp_path / "run", tmp_path / "plain"
+    with monkeypatch.context() as patch:
+        patch.setattr("pp_cl.train.Trainer.train_step", failing_step)
+        assert main(arguments(scene, out, network__rate="100,100")) == 2
+    (out / "previews" / "step_000001.png").write_bytes(b"of other settings")
+    words = {"network__rate": "0.002,0.001", "train__iterations": 12, "train__refine_at": "1,1"}
+    assert main([*arguments(scene, out, **words), "--preset", "small"]) == 0
+    assert main([*arguments(scene, plain, **words), "--preset", "small"]) == 0
+    for name in ("checkpoint.npz", "config.json"):
+        assert (out / name).read_bytes() == (plain / name).read_bytes()
+    assert not (out / "previews" / "step_000001.png").exists()
+    capsys.readouterr()
+    assert main([*arguments(scene, out, **words), "--preset", "tiny"]) == 2
+    assert "preset is small there" in capsys.readouterr().err
+
+
+def test_a_start_without_a_checkpoint_keeps_what_is_not_said_anew(tmp_path, monkeypatch):
+    scene, folder = write_ball_scene(tmp_path / "ball"), RunFolder(tmp_path / "run")
+    with monkeypatch.context() as patch:
+        patch.setattr("pp_cl.train.Trainer.train_step", failing_step)
+        main(arguments(scene, folder.path, network__rate="100,100"))
+    config = run_config(folder, scene, None, [("network.rate", "1e-3,1e-4", "--set")])
+    assert config.network.rate == (1e-3, 1e-4)
+    assert (config.scene.downscale, config.points.count, config.train.crop) == (2, 1500, 24)
+
+
+def test_the_scene_is_named_in_one_place(tmp_path, capsys):
+    words = arguments(tmp_path / "a", tmp_path / "run", scene__path=tmp_path / "b")
+    assert main([str(word) for word in words]) == 2
+    assert "--set: scene.path is what SCENE says" in capsys.readouterr().err
+
+
+def test_a_folder_that_may_not_be_written_is_told_before_the_hull(tmp_path, capsys, monkeypatch):
+    scene, out = write_ball_scene(tmp_path / "ball"), tmp_path / "there" / "run"
+    monkeypatch.setattr("os.access", lambda path, _mode: Path(path) != tmp_path)
+    assert main(arguments(scene, out)) == 2
+    captured = capsys.readouterr()
+    assert f"{out}: may not be written" in captured.err and "hull" not in captured.out
+    assert not out.parent.exists()
+
+
+def test_a_row_and_a_preview_stand_before_the_checkpoint_that_holds_their_step(
+    tmp_path, monkeypatch
+):
+    """Or they would be missing for ever where a kill comes between."""
+    scene, out, found, save = write_ball_scene(tmp_path / "ball"), tmp_path / "run", {}, []
+
+    def saving(self, header, arrays):
+        rows = [json.loads(line) for line in self.log.read_text().splitlines()]
+        pictures = sorted(int(path.stem[5:]) for path in self.previews.iterdir())
+        found[header["step"]] = rows[-1]["step"], rows[-1].get("finished"), pictures[-1:]
+        return save[0](self, header, arrays)
+
+    save.append(RunFolder.save)
+    monkeypatch.setattr(RunFolder, "save", saving)
+    assert main(arguments(scene, out, train__previews=3, train__checkpoint_every=20)) == 0
+    assert found == {20: (20, None, [20]), 40: (40, None, [40]), 60: (60, True, [60])}

@@ -133,7 +133,7 @@ def test_missing_folder_names_the_file(tmp_path):
 
 
 def test_leftovers_of_a_killed_process_are_removed(tmp_path):
-    (tmp_path / ".checkpoint.npz.123.tmp").write_bytes(b"half")
+    (tmp_path / ".checkpoint.npz.999999999.tmp").write_bytes(b"half")
     (tmp_path / "log.jsonl").write_text("")
     remove_leftovers(tmp_path)
     assert [p.name for p in tmp_path.iterdir()] == ["log.jsonl"]

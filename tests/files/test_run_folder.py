@@ -1,6 +1,8 @@
 """The folder of a run: its log survives whatever stands in it, and a full disk is told."""
 
+import errno
 import json
+import os
 import resource
 
 import pytest
@@ -125,7 +127,7 @@ def test_leftovers_are_removed_from_the_folder_and_the_previews(tmp_path):
     folder = RunFolder(tmp_path / "run")
     folder.previews.mkdir(parents=True)
     for place in (folder.path, folder.previews):
-        (place / ".step.png.1.tmp").write_bytes(b"half")
+        (place / ".step.png.999999999.tmp").write_bytes(b"half")
     folder.create("{}")
     assert [p.name for p in folder.path.rglob("*") if p.is_file()] == ["config.json"]
 
@@ -134,3 +136,73 @@ def test_the_test_split_is_evaluated_into_eval_itself(tmp_path):
     folder = RunFolder(tmp_path)
     assert folder.evaluation("test") == tmp_path / "eval"
     assert folder.evaluation("train") == tmp_path / "eval" / "train"
+
+
+def test_a_start_that_fails_early_leaves_a_folder_of_a_run_or_an_empty_one(tmp_path, monkeypatch):
+    """Where config.json cannot be written, nothing else is there that would look foreign."""
+    folder = RunFolder(tmp_path / "run")
+
+    def fail(*_):
+        raise UserError("the disk is full")
+
+    with monkeypatch.context() as patch:
+        patch.setattr("pp_cl.files.run_folder.write_text", fail)
+        with folder.owned(), pytest.raises(UserError, match="the disk is full"):
+            folder.create("{}")
+    folder.check_usable()
+    with folder.owned():
+        folder.create("{}")
+    assert folder.config.read_text() == "{}\n" and folder.previews.is_dir()
+
+
+def test_pictures_without_a_checkpoint_go_and_others_stay(tmp_path):
+    """They may show other settings; a file of the user is none of them."""
+    folder = RunFolder(tmp_path)
+    folder.previews.mkdir()
+    ours = [tmp_path / "masks.png", folder.previews / "step_000030.png"]
+    others = [tmp_path / "notes.png", folder.previews / "mine.png"]
+    for path in ours + others:
+        path.write_bytes(b"picture")
+    folder.checkpoint.write_bytes(b"whole")
+    folder.create("{}")
+    assert all(path.exists() for path in ours + others)
+    folder.checkpoint.unlink()
+    folder.create("{}")
+    assert not any(path.exists() for path in ours) and all(path.exists() for path in others)
+
+
+def test_a_file_system_without_locks_is_one_line(tmp_path, monkeypatch):
+    def acquire(self):
+        raise OSError(errno.ENOLCK, "No locks available")
+
+    monkeypatch.setattr("pp_cl.files.run_folder.FileLock.acquire", acquire)
+    with pytest.raises(UserError, match="run/.lock: cannot be locked .No locks available"):
+        RunFolder(tmp_path / "run").owned().__enter__()
+
+
+def test_the_name_of_the_owner_is_not_worth_a_finished_training(tmp_path, monkeypatch):
+    def unlink(self, missing_ok=False):
+        raise OSError(errno.EIO, "Input/output error")
+
+    folder = RunFolder(tmp_path)
+    with monkeypatch.context() as patch:
+        patch.setattr("pathlib.Path.unlink", unlink)
+        with folder.owned():
+            pass
+    with folder.owned():
+        assert (tmp_path / ".owner").read_text().startswith(f"process {os.getpid()} ")
+    assert not (tmp_path / ".owner").exists()
+
+
+def test_a_log_that_fails_when_it_is_closed_is_one_line(folder):
+    class Failing:
+        name = str(folder.log)
+
+        def close(self):
+            raise OSError(errno.EIO, "Input/output error")
+
+    log = folder.open_log(10)
+    log.__exit__()
+    vars(log)["_file"] = Failing()
+    with pytest.raises(UserError, match="log.jsonl: cannot be written .Input/output error"), log:
+        pass

@@ -27,7 +27,13 @@ MOST_FUNCTION_LINES, MOST_FILE_LINES = 50, 400
 FUNCTIONS = (ast.FunctionDef, ast.AsyncFunctionDef)
 
 # Who may write to an attribute of another object, and why.
-SHARED = {"pp_cl/cli.py": {"warnings.showwarning": "the hook that Python has for this"}}
+SHARED = {
+    "pp_cl/cli.py": {
+        "warnings.showwarning": "the hook that Python has for this",
+        "sys.stdout": "Python leaves None where it is closed",
+        "sys.stderr": "Python leaves None where it is closed",
+    }
+}
 # Who below commands/ may print, and why.
 PRINTERS = {"pp_cl/device/device.py": "PP_DEBUG's tables"}
 

@@ -1,0 +1,103 @@
+"""Files written to a temporary name: file systems that cannot do all, and what a kill leaves."""
+
+import errno
+import os
+import stat
+from pathlib import Path
+
+import pytest
+
+from pp_cl.errors import UserError
+from pp_cl.files.atomic import atomic_file, check_writable, remove_leftovers, write_text
+
+DEAD = 2**22 + 1  # the number of no process: Linux has none above 2^22
+
+
+def failing_folder_sync(monkeypatch, number):
+    """os.fsync that fails for folders."""
+    fsync = os.fsync
+
+    def syncing(descriptor):
+        if stat.S_ISDIR(os.fstat(descriptor).st_mode):
+            raise OSError(number, os.strerror(number))
+        fsync(descriptor)
+
+    monkeypatch.setattr(os, "fsync", syncing)
+
+
+@pytest.mark.parametrize("number", [errno.EINVAL, errno.ENOTSUP, errno.ENOSYS, errno.EBADF])
+def test_a_file_system_that_cannot_sync_folders_still_takes_files(tmp_path, monkeypatch, number):
+    failing_folder_sync(monkeypatch, number)
+    write_text(tmp_path / "a", "text")
+    assert (tmp_path / "a").read_text() == "text"
+
+
+@pytest.mark.parametrize("number", [errno.EIO, errno.ENOSPC])
+def test_a_disk_that_fails_to_sync_a_folder_is_told(tmp_path, monkeypatch, number):
+    failing_folder_sync(monkeypatch, number)
+    with pytest.raises(UserError, match=f"a: cannot be written .{os.strerror(number)}"):
+        write_text(tmp_path / "a", "text")
+
+
+def test_a_folder_that_may_be_written_and_not_read_takes_files(tmp_path, monkeypatch):
+    open_file = os.open
+
+    def opening(path, flags, *rest, **named):
+        if flags & os.O_DIRECTORY:
+            raise PermissionError(errno.EACCES, "Permission denied", str(path))
+        return open_file(path, flags, *rest, **named)
+
+    monkeypatch.setattr(os, "open", opening)
+    write_text(tmp_path / "a", "text")
+    assert (tmp_path / "a").read_text() == "text"
+
+
+def test_a_temporary_file_that_stays_hides_no_error(tmp_path, monkeypatch):
+    def unlink(self, missing_ok=False):
+        raise OSError(errno.EIO, "Input/output error")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Path, "unlink", unlink)
+        patch.setattr(os, "replace", lambda *_: unlink(None))
+        with pytest.raises(UserError, match="a: cannot be written"):
+            write_text(tmp_path / "a", "text")
+        with pytest.raises(ZeroDivisionError), atomic_file(tmp_path / "b"):
+            raise ZeroDivisionError
+    assert all(path.name.startswith(".") for path in tmp_path.iterdir())
+
+
+def test_leftovers_below_a_folder_go_and_other_files_stay(tmp_path):
+    gone = [f".a.png.{DEAD}.tmp", f"x/y/.b.{DEAD}.tmp", f"x/.film.{DEAD}.tmp.mp4"]
+    gone.append(f".own.{os.getpid()}.tmp")  # of another process that had our number
+    kept = [".tmp", ".a.tmp", ".a.b.tmp", f"a.{DEAD}.tmp", f".a.{DEAD}.tmpfile", "x/log.jsonl"]
+    kept.append(f".a.{os.getppid()}.tmp")  # it is still being written
+    for name in gone + kept:
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / name).write_text("half")
+    folder = tmp_path / "x" / f".page.{DEAD}.tmp"
+    folder.mkdir()
+    (folder / "index.html").write_text("half")
+    remove_leftovers(tmp_path)
+    left = {p.relative_to(tmp_path).as_posix() for p in tmp_path.rglob("*") if p.is_file()}
+    assert left == set(kept) and not folder.exists()
+
+
+def test_a_link_named_like_a_leftover_loses_nothing_behind_it(tmp_path):
+    (tmp_path / "far").mkdir()
+    (tmp_path / "far" / "photo.png").write_text("mine")
+    (tmp_path / "run").mkdir()
+    (tmp_path / "run" / f".a.{DEAD}.tmp").symlink_to(tmp_path / "far")
+    remove_leftovers(tmp_path / "run")
+    assert (tmp_path / "far" / "photo.png").exists() and not list((tmp_path / "run").iterdir())
+
+
+def test_a_place_that_may_not_be_written_is_named(tmp_path, monkeypatch):
+    check_writable(tmp_path / "a" / "b")
+    assert not list(tmp_path.iterdir())
+    monkeypatch.setattr(os, "access", lambda path, _mode: Path(path) != tmp_path)
+    with pytest.raises(UserError) as caught:
+        check_writable(tmp_path / "a" / "b")
+    message = str(caught.value)
+    assert message.startswith(f"{tmp_path}/a/b: ") and f"permissions of {tmp_path}," in message
+    (tmp_path / "a").mkdir()
+    check_writable(tmp_path / "a" / "b")

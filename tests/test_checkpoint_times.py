@@ -1,0 +1,75 @@
+"""Checkpoints by the clock: when they are written, and that nothing else changes."""
+
+import time
+from types import SimpleNamespace
+
+import pytest
+from support.runs import arguments, train_and_interrupt
+from support.scenes import write_ball_scene
+
+from pp_cl.cli import main
+from pp_cl.files.run_folder import RunFolder
+from pp_cl.train import Trainer
+
+RARELY = {"train__checkpoint_every": 1000}
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory):
+    """Folder of a small scene."""
+    return write_ball_scene(tmp_path_factory.mktemp("scene") / "ball")
+
+
+@pytest.fixture(scope="module")
+def whole(scene, tmp_path_factory):
+    """The checkpoint of a training with none before the end."""
+    out = tmp_path_factory.mktemp("runs") / "whole"
+    assert main(arguments(scene, out, **RARELY, train__checkpoint_minutes=0)) == 0
+    return (out / "checkpoint.npz").read_bytes()
+
+
+@pytest.fixture
+def saved(monkeypatch):
+    """The steps at which checkpoints are written while every step takes a minute."""
+    steps, now, save, train_step = [], [0.0], RunFolder.save, Trainer.train_step
+
+    def saving(self, header, arrays):
+        steps.append(header["step"])
+        save(self, header, arrays)
+
+    def stepping(self):
+        now[0] += 60
+        return train_step(self)
+
+    clock = SimpleNamespace(monotonic=lambda: now[0], perf_counter=time.perf_counter)
+    monkeypatch.setattr("pp_cl.run.time", clock)
+    monkeypatch.setattr(RunFolder, "save", saving)
+    monkeypatch.setattr(Trainer, "train_step", stepping)
+    return steps
+
+
+@pytest.mark.parametrize(
+    "every, minutes, expected",
+    [
+        (1000, 7.5, [8, 16, 24, 32, 40, 48, 56, 60]),
+        (1000, 0, [60]),
+        # any checkpoint begins the minutes anew
+        (10, 7.5, [8, 10, 18, 20, 28, 30, 38, 40, 48, 50, 58, 60]),
+    ],
+)
+def test_minutes_and_steps_say_when_and_the_bytes_are_the_same(
+    scene, whole, saved, tmp_path, every, minutes, expected
+):
+    changes = {"train__checkpoint_every": every, "train__checkpoint_minutes": minutes}
+    assert main(arguments(scene, tmp_path / "run", **changes)) == 0
+    assert saved == expected
+    assert (tmp_path / "run" / "checkpoint.npz").read_bytes() == whole
+
+
+def test_a_run_goes_on_from_a_checkpoint_of_the_clock(scene, whole, saved, tmp_path, monkeypatch):
+    out, changes = tmp_path / "run", RARELY | {"train__checkpoint_minutes": 7.5}
+    train_and_interrupt(scene, out, 12, monkeypatch, **changes)
+    assert saved == [8]
+    assert main(arguments(scene, out, **changes)) == 0
+    assert saved == [8, 16, 24, 32, 40, 48, 56, 60]
+    assert (out / "checkpoint.npz").read_bytes() == whole
