@@ -8,9 +8,11 @@ import importlib
 import sys
 import warnings
 from collections.abc import Sequence
+from contextlib import suppress
 
 from pp_cl import __version__
-from pp_cl.errors import Stopped, UserError
+from pp_cl.commands.streams import usable_streams
+from pp_cl.errors import Stopped, UserError, one_line
 
 COMMANDS = (
     "devices",
@@ -30,6 +32,9 @@ COMMANDS = (
 )  # modules of pp_cl.commands
 
 
+SIGPIPE = 13  # Windows has no name for it
+
+
 class _Parser(argparse.ArgumentParser):
     """argparse with one-line errors."""
 
@@ -40,14 +45,23 @@ class _Parser(argparse.ArgumentParser):
 def main(argv: Sequence[str] | None = None) -> int:
     """Run a command; returns the exit status."""
     warnings.showwarning = _show_warning
+    with usable_streams():
+        return _run(argv)
+
+
+def _run(argv):
+    """The exit status of a command."""
     try:
         options = _parser().parse_args(argv)
         options.run(options)
+        sys.stdout.flush()
         return 0
     except UserError as error:
         return _fail(str(error))
     except Stopped as stopped:
         return _fail(str(stopped), stopped.status)
+    except BrokenPipeError:  # as in `pp-cl train ... | head`
+        return _fail("nobody reads the output any more", 128 + SIGPIPE)
     except OSError as error:
         what = f"{error.filename or 'file'}: {error.strerror or error}"
         return _fail(f"{what}; check the path, permissions and free space")
@@ -61,11 +75,12 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 def _show_warning(message, *_args, **_kwargs):
     """One line on stderr, without the place in our source."""
-    print(f"pp-cl: {message}", file=sys.stderr)
+    print(f"pp-cl: {one_line(message)}", file=sys.stderr)
 
 
 def _fail(message, status=2):
-    print(f"pp-cl: {message}", file=sys.stderr)
+    with suppress(OSError):  # nowhere to say it
+        print(f"pp-cl: {one_line(message)}", file=sys.stderr)
     return status
 
 

@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from pp_cl.errors import UserError, quoted, shown
+from pp_cl.files.regular import read_regular
 from pp_cl.presets import ABSENT, PRESETS, RENAMED
 from pp_cl.settings import NetworkConfig, PointsConfig, RasterConfig, SceneConfig, TrainConfig
 
@@ -192,9 +193,7 @@ def load_config(path: Path | str) -> Config:
 def _read_settings(path):
     """The object in a config.json."""
     try:
-        if path.stat().st_size > MOST_BYTES:
-            raise UserError(f"{path}: is larger than settings are; {MEND_SETTINGS}")
-        stored = json.loads(path.read_text("utf-8"))
+        stored = json.loads(read_regular(path, MOST_BYTES))
     except OSError as error:
         raise UserError(f"{path}: {error.strerror}; is this the folder of a run?") from None
     except (ValueError, RecursionError) as error:

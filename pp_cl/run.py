@@ -13,7 +13,8 @@ import numpy as np
 from pp_cl.config import Config, assign, configure, load_config, preset, sections
 from pp_cl.device.device import Device
 from pp_cl.device.discover import open_device
-from pp_cl.errors import UserError
+from pp_cl.errors import Diverged, UserError
+from pp_cl.files.checkpoint import check_finite
 from pp_cl.files.contact_sheet import write_comparison
 from pp_cl.files.image import to_8bit, write_png
 from pp_cl.files.run_folder import RunFolder
@@ -127,6 +128,7 @@ class Training:
     origin: str
     measured: list[View]
     _preview_by: float = field(default=math.inf, init=False)  # time.monotonic()'s seconds
+    _saved: int = field(default=0, init=False)  # step of the checkpoint; 0: there is none
 
     def run(
         self,
@@ -139,7 +141,8 @@ class Training:
         on_step(step, row) is called after each step, with its row of the log where it has one.
         is_stopped() is asked after each step: where it is true, a checkpoint is written and the
         training ends there, to be gone on with. Raises UserError, before anything is written, where
-        the memory is too small or another process trains into the folder.
+        the memory is too small or another process trains into the folder, and where numbers are no
+        longer finite: then the last checkpoint stays.
         """
         trainer, settings = self.trainer, self.config.train
         spare = spare_memory(self.plan, trainer.dev, settings.memory_gib)
@@ -149,7 +152,15 @@ class Training:
             self.folder.create(self.config.to_json())
             if self.hull and self.hull.picture is not None:
                 write_png(self.folder.path / MASKS_PICTURE, self.hull.picture)
-            return self._run(on_step, is_stopped)
+            self._saved = trainer.step
+            try:
+                return self._run(on_step, is_stopped)
+            except Diverged as error:
+                kept = f"{self.folder.checkpoint} of step {self._saved} is kept"
+                raise UserError(
+                    f"{error}; {kept if self._saved else 'nothing was kept'}: train into another"
+                    " --out with a lower network.rate or train.sh_rate"
+                ) from None
 
     def _check_unchanged(self):
         """Raise UserError where another process trained into the folder since it was looked at."""
@@ -180,6 +191,7 @@ class Training:
                 if is_stopped() and trainer.step < settings.iterations:
                     self._save(finished=False)
                     return seconds
+            check_finite(trainer.arrays())  # before averages take their place
             start = time.perf_counter()
             trainer.finish()
             seconds += time.perf_counter() - start
@@ -197,11 +209,11 @@ class Training:
             state = {"points": trainer.model.cloud.count, "rates": trainer.rates()}
             row = self._row(seconds) | terms | state | measured
             log.write(row)
-        if step % settings.checkpoint_every == 0 and not last:
-            self._save(finished=False)
         due = settings.previews and step % -(-settings.iterations // settings.previews) == 0
         if last or due or time.monotonic() >= self._preview_by:
             self._preview()
+        if step % settings.checkpoint_every == 0 and not last:
+            self._save(finished=False)
         return row
 
     def _row(self, seconds):
@@ -211,7 +223,7 @@ class Training:
     def _measure(self):
         """{"test_psnr": mean over the measured views, of 8-bit images} of the present model."""
         trainer = self.trainer
-        pairs = [(trainer.render(view), trainer.target(view)) for view in self.measured]
+        pairs = [(self._rendered(view), trainer.target(view)) for view in self.measured]
         return {"test_psnr": float(np.mean([psnr(to_8bit(a), to_8bit(b)) for a, b in pairs]))}
 
     def _expect_preview(self):
@@ -225,13 +237,21 @@ class Training:
         trainer = self.trainer
         header = trainer.model.header() | self.info | {"step": trainer.step, "finished": finished}
         self.folder.save(header, trainer.model.arrays() if finished else trainer.arrays())
+        self._saved = trainer.step
 
     def _preview(self):
         """Prediction, truth and error of the first training view."""
         trainer, view = self.trainer, self.trainer.views[0]
         self._preview_by = math.inf
         path = self.folder.previews / f"step_{trainer.step:06d}.png"
-        write_comparison(path, [trainer.render(view)], [trainer.target(view)])
+        write_comparison(path, [self._rendered(view)], [trainer.target(view)])
+
+    def _rendered(self, view):
+        """The present model's image of a view. Raises Diverged where there is none."""
+        image = self.trainer.render(view)
+        if not np.isfinite(image).all():
+            raise Diverged(f"the image of {view.name} holds NaN after step {self.trainer.step}")
+        return image
 
 
 def stored_state(folder: RunFolder, config: Config) -> Stored | None:

@@ -8,7 +8,7 @@ import numpy as np
 from pp_cl.config import Config
 from pp_cl.device.device import Device
 from pp_cl.device.rows import DeviceRows
-from pp_cl.errors import UserError
+from pp_cl.errors import Diverged, UserError
 from pp_cl.model import Model
 from pp_cl.render import Renderer
 from pp_cl.scene.target import Target
@@ -82,7 +82,7 @@ class Trainer:
 
     def train_step(self) -> dict[str, float]:
         """One step; returns {"loss", "l1", "ssim", "psnr"} of its crop, and "mask" and "lpips"
-        where they are terms of the loss. Raises UserError if the loss is not finite.
+        where they are terms of the loss. Raises Diverged if one of them is not finite.
         """
         t, config = self.step, self.config
         rng = np.random.default_rng((config.seed, t))
@@ -167,12 +167,7 @@ class Trainer:
 
     def _terms(self):
         total, l1, dissimilarity, mse = (float(x) for x in self.loss.terms.get())
-        if not math.isfinite(total):
-            raise UserError(
-                f"the loss is not finite at step {self.step}; the last checkpoint is kept: "
-                "lower train.sh_rate or network.rate"
-            )
-        return {
+        terms = {
             "loss": total,
             "l1": l1,
             "ssim": 1 - dissimilarity,
@@ -180,6 +175,10 @@ class Trainer:
             **self.mask_loss.terms(),
             **self.perceptual.terms(),
         }
+        broken = [name for name, value in terms.items() if not math.isfinite(value)]
+        if broken:
+            raise Diverged(f"the loss is not finite at step {self.step} ({', '.join(broken)})")
+        return terms
 
     # ----------------------------------------------------------------------------------------------
 

@@ -169,7 +169,7 @@ TEXTS = {
     "5000 digits": (b'{"preset": ' + b"9" * 5000 + b"}", "not JSON"),
     "a list": (b"[]", "not settings"),
     "null": (b"null", "not settings"),
-    "large": (b" " * 2**20 + b"{}", "larger than settings"),
+    "large": (b" " * 2**20 + b"{}", "larger than 1048576 bytes"),
     "nothing in it": (b"{}", "preset"),
     "a list for the preset": (b'{"preset": ["tiny"]}', "preset"),
     "an unknown preset": (b'{"preset": "huge"}', "preset"),
