@@ -45,7 +45,7 @@ class NpzFile:
 
     def __init__(self, path: Path) -> None:
         found = path.stat()
-        if not stat.S_ISREG(found.st_mode):  # a pipe would never end
+        if stat.S_ISFIFO(found.st_mode):  # it would never end
             raise ValueError("is no regular file")
         with _one_kind_of_error():
             self._archive = zipfile.ZipFile(path)

@@ -11,11 +11,12 @@ nonsense that is believed are findings: then the exit status is 1.
 
 import argparse
 import json
+import math
 import os
-import queue
 import select
 import subprocess
 import sys
+import tempfile
 import threading
 import time
 from collections.abc import Iterable
@@ -33,8 +34,8 @@ SHARES |= {"command_line": 0.5, "environment": 0.3, "lpips": 0.3}
 class Worker:
     """A process of tools/fuzz/worker.py, started anew when it dies or hangs."""
 
-    def __init__(self, seed: int, kept: str) -> None:
-        self._words = [sys.executable, "-m", "tools.fuzz.worker", str(seed), kept]
+    def __init__(self, seed: int, folder: str, kept: str) -> None:
+        self._words = [sys.executable, "-m", "tools.fuzz.worker", str(seed), folder, kept]
         self._process = None
 
     def try_input(self, name: str) -> dict:
@@ -74,25 +75,29 @@ class Worker:
 
 
 def names_of(surfaces: Iterable[str], count: int) -> list[str]:
-    """Names SURFACE:INDEX of so many inputs, by SHARES, each surface at least once."""
+    """Names SURFACE:INDEX of so many inputs, by SHARES, each surface at least once, all mixed."""
     shares = {surface: SHARES.get(surface, 1) for surface in surfaces}
     total = sum(shares.values())
     counts = {surface: max(1, round(count * share / total)) for surface, share in shares.items()}
-    return [f"{surface}:{index}" for surface, n in counts.items() for index in range(n)]
+    inputs = [(i / n, surface, i) for surface, n in counts.items() for i in range(n)]
+    return [f"{surface}:{index}" for _, surface, index in sorted(inputs)]
 
 
-def try_all(names: list[str], seed: int, kept: str = "") -> tuple[dict[str, int], dict]:
-    """({surface: inputs tried}, {finding: [(name, label, traceback)]}) of inputs, on all cores."""
-    left, tried, findings, lock = queue.SimpleQueue(), {}, {}, threading.Lock()
-    for name in names:
-        left.put(name)
+def try_all(
+    names: list[str], seed: int, kept: str = "", seconds: float = math.inf
+) -> tuple[dict[str, int], dict]:
+    """({surface: inputs tried}, {finding: [(name, label, traceback)]}) of inputs, on all cores, as
+    far as they are tried in so many seconds.
+    """
+    left, tried, findings, lock = iter(names), {}, {}, threading.Lock()
+    last = time.monotonic() + seconds
 
-    def work():
-        worker = Worker(seed, kept)
-        while not left.empty():
-            try:
-                name = left.get_nowait()
-            except queue.Empty:
+    def work(folder):
+        worker = Worker(seed, folder, kept)
+        while time.monotonic() < last:
+            with lock:
+                name = next(left, None)
+            if name is None:
                 break
             answer = worker.try_input(name)
             surface = name.partition(":")[0]
@@ -103,11 +108,13 @@ def try_all(names: list[str], seed: int, kept: str = "") -> tuple[dict[str, int]
                     findings.setdefault(key, []).append((name, answer["label"], answer["detail"]))
         worker.end()
 
-    workers = [threading.Thread(target=work) for _ in range(min(os.cpu_count(), len(names)))]
-    for thread in workers:
-        thread.start()
-    for thread in workers:
-        thread.join()
+    with tempfile.TemporaryDirectory(prefix="pp-cl-fuzz-") as folder:
+        count = min(os.cpu_count(), len(names))
+        workers = [threading.Thread(target=work, args=(folder,)) for _ in range(count)]
+        for thread in workers:
+            thread.start()
+        for thread in workers:
+            thread.join()
     return tried, findings
 
 
@@ -130,6 +137,7 @@ def main(arguments: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     parser.add_argument("--count", type=int, default=20_000, help="inputs (20000)")
     parser.add_argument("--seed", type=int, default=0, help="of all inputs (0)")
+    parser.add_argument("--minutes", type=float, default=math.inf, help="end after so many")
     parser.add_argument("--surfaces", metavar="A,B", help=f"of {', '.join(SURFACES)}")
     parser.add_argument("--one", metavar="SURFACE:INDEX", help="one input again")
     parser.add_argument(
@@ -142,9 +150,8 @@ def main(arguments: list[str] | None = None) -> int:
     if unknown:
         parser.error(f"no surface {min(unknown)}; there are {', '.join(SURFACES)}")
     start = time.monotonic()
-    tried, findings = try_all(
-        names, options.seed, options.keep and str(Path(options.keep).resolve())
-    )
+    kept = options.keep and str(Path(options.keep).resolve())
+    tried, findings = try_all(names, options.seed, kept, 60 * options.minutes)
     print(report(tried, findings, time.monotonic() - start, details=bool(options.one)))
     return 1 if findings else 0
 

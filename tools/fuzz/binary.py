@@ -8,7 +8,7 @@ from random import Random
 
 import numpy as np
 
-BOMB = 2**27  # bytes that a deflated member of an archive unfolds to
+BOMB = 2**25  # bytes that a deflated member of an archive unfolds to
 FIELDS = ("<I", "<i", "<Q", "<d", "<f", ">I", "<H")
 ODD_WHOLE = (0, 1, 2, 255, 2**15, 2**16 - 1, 2**31 - 1, 2**31, 2**32 - 1, 2**40, 2**63, 2**64 - 1)
 ODD_REAL = (0.0, -0.0, 1.0, -1.0, 1e-45, 1e30, -1e30, 1e38, 1e300, float("nan"), float("inf"))

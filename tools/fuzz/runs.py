@@ -113,9 +113,12 @@ def config(case: Case) -> None:
     read = case.read(lambda: load_config(run.config))
     if read is not None:
         check_config(read)
-        facts = case.read(lambda: run_facts(run))
-        if facts:
-            json.dumps(facts, allow_nan=False)
+        _tell(case, run)
+
+
+def _tell(case, run):
+    """What `pp-cl info --json` says of the run, in which NaN would be a ValueError."""
+    json.dumps(case.read(lambda: run_facts(run)), allow_nan=False)
 
 
 def check_config(config: Config) -> None:
@@ -155,11 +158,16 @@ def log(case: Case) -> None:
     follower.poll()
     check(all(math.isfinite(x) for row in follower.rows for x in row), "NaN in a curve")
     case.read(lambda: progress(_job(world, run)))
-    facts = case.read(lambda: run_facts(run))
-    json.dumps(facts, allow_nan=False)
-    with Log(run.log, rng.choice([0, 2, 4])) as kept:
-        check(math.isfinite(kept.seconds) and kept.seconds >= 0, f"{kept.seconds} seconds")
-    check_json(run.log)
+    _tell(case, run)
+    kept = case.read(lambda: _cut_off(run.log, rng.choice([0, 2, 4])))
+    if kept is not None:
+        check(math.isfinite(kept) and kept >= 0, f"{kept} seconds")
+        check_json(run.log)
+
+
+def _cut_off(file, step):
+    with Log(file, step) as kept:
+        return kept.seconds
 
 
 def _job(world, run):
@@ -180,9 +188,7 @@ def metrics(case: Case) -> None:
             rng, file.read_bytes()
         )
     _write(case, file, data)
-    facts = case.read(lambda: run_facts(run))
-    if facts:
-        json.dumps(facts, allow_nan=False)
+    _tell(case, run)
     words = set_words()[1::2]
     pairs = [(key, text, "--set") for key, _, text in (word.partition("=") for word in words)]
     job = dataclasses.replace(_job(world, run), given=tuple(pairs))

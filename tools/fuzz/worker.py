@@ -52,17 +52,17 @@ def _hang(*_):
 
 
 def main() -> None:
-    """Try inputs until standard input ends. Arguments: the seed, and a folder for inputs with
-    findings or nothing.
+    """Try inputs until standard input ends. Arguments: the seed, a folder to work in, and one for
+    inputs with findings or nothing.
     """
-    seed, kept = int(sys.argv[1]), sys.argv[2]
+    seed, place, kept = int(sys.argv[1]), *sys.argv[2:]
     answers = os.fdopen(os.dup(1), "w", buffering=1)
     os.dup2(os.open(os.devnull, os.O_WRONLY), 1)  # what commands print is no answer
     os.dup2(1, 2)
     resource.setrlimit(resource.RLIMIT_AS, (MEMORY, MEMORY))
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
     signal.signal(signal.SIGALRM, _hang)
-    with tempfile.TemporaryDirectory(prefix="pp-cl-fuzz-") as folder:
+    with tempfile.TemporaryDirectory(dir=place) as folder:
         world = World(Path(folder))
         world.share_device()
         for line in sys.stdin:
