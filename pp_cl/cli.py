@@ -12,7 +12,7 @@ from contextlib import suppress
 
 from pp_cl import __version__
 from pp_cl.commands.streams import usable_streams
-from pp_cl.errors import Stopped, UserError, one_line
+from pp_cl.errors import BuildError, Stopped, UserError, one_line
 
 COMMANDS = (
     "devices",
@@ -65,6 +65,12 @@ def _run(argv):
     except OSError as error:
         what = f"{error.filename or 'file'}: {error.strerror or error}"
         return _fail(f"{what}; check the path, permissions and free space")
+    except BuildError as error:
+        print(error.log.rstrip(), file=sys.stderr)
+        return _fail(
+            f"{error}; update the driver, choose another device with --device, or report the lines"
+            " above"
+        )
     except MemoryError:
         return _fail("the host has no memory left; lower --points or raise --downscale")
     except KeyboardInterrupt:

@@ -141,8 +141,11 @@ def _check(value, where, *, least, most, choices, **_):
 def configure(config: Config, scene: str, given: Iterable[tuple[str, Any, str]] = ()) -> Config:
     """The config with another scene and the given settings: (key, value or its text, origin).
 
-    Raises UserError naming the first that makes no sense.
+    Raises UserError naming the first that makes no sense, and for scene.path among them.
     """
+    given = list(given)
+    for origin in (origin for key, _, origin in given if key == "scene.path"):
+        raise UserError(f"{origin}: scene.path is what SCENE or --scene says; leave it out")
     path = scene if scene == "demo" else str(Path(scene).resolve())
     assign(config, "scene.path", path, "settings")
     for key, value, origin in given:

@@ -26,6 +26,14 @@ class Diverged(UserError):
     """A training has come to numbers that are none. The message says where."""
 
 
+class BuildError(RuntimeError):
+    """A driver does not build a kernel file. The message is one line; log: the compiler's words."""
+
+    def __init__(self, message: str, log: str) -> None:
+        super().__init__(one_line(message))
+        self.log = log
+
+
 class Stopped(Exception):
     """A command ended in good order before all was done. The message is one line that says how to
     go on; status: the exit status, 128 and the number of the signal that ended it, else 1.
