@@ -168,7 +168,7 @@ def masks(case: Case) -> None:
     rng, view = case.rng, ball_views()["train"][0]
     folder = case.folder / "masks"
     folder.mkdir()
-    name = rng.choice(["a.png", "images/a.png", "a.jpg", odd_text(rng)])
+    name = rng.choice(["a.png", "images/a.png", "a.jpg", f"{odd_text(rng)}.png"])
     source = rng.choice(["given", "alpha", "color", "box", "none"])
     tolerance = rng.choice([1e-6, 1.0, 10.0, 100.0])
     file = folder / "a.png"
