@@ -4,6 +4,10 @@ BIN := .venv/bin
 READY := .venv/.ready
 KERNELS = $(shell find cl -name "*.cl" -o -name "*.h")
 
+# of `make fuzz`
+COUNT ?= 20000
+SEED ?= 0
+
 # Tests wait for builds of kernels, which use one core.
 ON_ALL_CORES := --numprocesses auto --dist worksteal
 
@@ -16,7 +20,7 @@ ON_OCLGRIND := OCL_ICD_VENDORS=/usr/lib/oclgrind/liboclgrind-rt-icd.so OCLGRIND_
 	OCLGRIND_NUM_THREADS=1 OCLGRIND_BUILD_OPTIONS="-cl-opt-disable -DALWAYS_INLINE=static" PYOPENCL_NO_CACHE=1 \
 	PP_DEVICE=Oclgrind PP_DATA=/nonexistent
 
-.PHONY: help setup demo test test-intel bench lint format docs wheel oclgrind gpu-check faults test-coarse test-gpu-form clean
+.PHONY: help setup demo test test-intel bench lint format docs wheel oclgrind gpu-check fuzz faults test-coarse test-gpu-form clean
 
 help: ## print this list
 	@sed -n 's/^\([a-z-]*\):.*## \(.*\)/\1	\2/p' Makefile | expand -t 12
@@ -77,6 +81,9 @@ oclgrind: $(READY) ## run the tests of all kernels in Oclgrind (Debian's package
 gpu-check: $(READY) ## compile and link all kernels for NVIDIA's, AMD's and Intel's GPUs, with no GPU; fetches Debian's compilers
 	@$(BIN)/python -m tools.gpu.builds
 	@$(BIN)/python -m tools.gpu_check $(ARGS)
+
+fuzz: $(READY) ## try damaged and odd input on all that pp-cl reads: COUNT (20000) inputs of SEED (0)
+	@$(BIN)/python -m tools.fuzz --count $(COUNT) --seed $(SEED) $(ARGS)
 
 faults: $(READY) ## fail every write of a training and an evaluation, kill and stop them, fill the disk: a quarter of an hour
 	@$(BIN)/python -m tools.faults $(ARGS)

@@ -5,7 +5,6 @@ Bad input is one line on stderr and exit status 2.
 
 import argparse
 import importlib
-import os
 import signal
 import sys
 import warnings
@@ -13,7 +12,8 @@ from collections.abc import Sequence
 from contextlib import suppress
 
 from pp_cl import __version__
-from pp_cl.errors import Stopped, UserError
+from pp_cl.commands.streams import usable_streams
+from pp_cl.errors import BuildError, Stopped, UserError, one_line
 
 COMMANDS = (
     "devices",
@@ -33,7 +33,7 @@ COMMANDS = (
 )  # modules of pp_cl.commands
 
 
-BROKEN_PIPE = 128 + 13  # the status of what SIGPIPE ends, of a number that Windows lacks
+SIGPIPE = 13  # Windows has no name for it
 
 
 class _Parser(argparse.ArgumentParser):
@@ -46,7 +46,12 @@ class _Parser(argparse.ArgumentParser):
 def main(argv: Sequence[str] | None = None) -> int:
     """Run a command; returns the exit status."""
     warnings.showwarning = _show_warning
-    _mend_streams()
+    with usable_streams():
+        return _run(argv)
+
+
+def _run(argv):
+    """The exit status of a command."""
     try:
         options = _parser().parse_args(argv)
         options.run(options)
@@ -56,45 +61,27 @@ def main(argv: Sequence[str] | None = None) -> int:
         return _fail(str(error))
     except Stopped as stopped:
         return _fail(str(stopped), stopped.status)
-    except BrokenPipeError:
-        return _fail("nobody reads what is printed any more; stopped", BROKEN_PIPE)
+    except BrokenPipeError:  # as in `pp-cl train ... | head`
+        return _fail("nobody reads the output any more", 128 + SIGPIPE)
     except OSError as error:
         what = f"{error.filename or 'file'}: {error.strerror or error}"
         return _fail(f"{what}; check the path, permissions and free space")
+    except BuildError as error:
+        print(error.log.rstrip(), file=sys.stderr)
+        return _fail(
+            f"{error}; update the driver, choose another device with --device, or report the lines"
+            " above"
+        )
     except MemoryError:
         return _fail("the host has no memory left; lower --points or raise --downscale")
     except KeyboardInterrupt:
         return _fail("interrupted", 128 + signal.SIGINT)
-    finally:
-        _drop_stdout()
-
-
-def _mend_streams():
-    """A closed stdout or stderr takes what is printed to nowhere; what an encoding lacks is printed
-    as its code.
-    """
-    if sys.stdout is None:
-        sys.stdout = open(os.devnull, "w", encoding="utf-8")  # noqa: SIM115
-    if sys.stderr is None:
-        sys.stderr = open(os.devnull, "w", encoding="utf-8")  # noqa: SIM115
-    if hasattr(sys.stdout, "reconfigure"):
-        sys.stdout.reconfigure(errors="backslashreplace")
-
-
-def _drop_stdout():
-    """What stdout does not take goes nowhere: the end of Python would fail on it again."""
-    try:
-        sys.stdout.flush()
-    except OSError:
-        nowhere = os.open(os.devnull, os.O_WRONLY)
-        os.dup2(nowhere, sys.stdout.fileno())
-        os.close(nowhere)
 
 
 def _show_warning(message, *_args, **_kwargs):
     """One line on stderr, without the place in our source."""
     with suppress(OSError):  # of a full disk, which is no reason to stop
-        print(f"pp-cl: {message}", file=sys.stderr, flush=True)
+        print(f"pp-cl: {one_line(message)}", file=sys.stderr, flush=True)
 
 
 def _fail(message, status=2):

@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from pp_cl.errors import UserError, quoted, shown
+from pp_cl.files.regular import read_regular
 from pp_cl.presets import ABSENT, ADDED, PRESETS, RENAMED
 from pp_cl.settings import NetworkConfig, PointsConfig, RasterConfig, SceneConfig, TrainConfig
 
@@ -140,8 +141,11 @@ def _check(value, where, *, least, most, choices, **_):
 def configure(config: Config, scene: str, given: Iterable[tuple[str, Any, str]] = ()) -> Config:
     """The config with another scene and the given settings: (key, value or its text, origin).
 
-    Raises UserError naming the first that makes no sense.
+    Raises UserError naming the first that makes no sense, and for scene.path among them.
     """
+    given = list(given)
+    for origin in (origin for key, _, origin in given if key == "scene.path"):
+        raise UserError(f"{origin}: scene.path is what SCENE or --scene says; leave it out")
     path = scene if scene == "demo" else str(Path(scene).resolve())
     assign(config, "scene.path", path, "settings")
     for key, value, origin in given:
@@ -202,9 +206,7 @@ def _format(path, stored):
 def _read_settings(path):
     """The object in a config.json."""
     try:
-        if path.stat().st_size > MOST_BYTES:
-            raise UserError(f"{path}: is larger than settings are; {MEND_SETTINGS}")
-        stored = json.loads(path.read_text("utf-8"))
+        stored = json.loads(read_regular(path, MOST_BYTES))
     except OSError as error:
         raise UserError(f"{path}: {error.strerror}; is this the folder of a run?") from None
     except (ValueError, RecursionError) as error:

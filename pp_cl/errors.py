@@ -1,10 +1,37 @@
 """The exceptions a user may see."""
 
+MOST_LINE = 1000  # characters of a message: two long paths and a reason
+
+
+def one_line(text: object, most: int = MOST_LINE) -> str:
+    """A message as a terminal can show it: what others wrote in it may break no line, hold no
+    control characters and be no longer than that; what is too long lacks its middle.
+    """
+    text = str(text)
+    if len(text) > most:
+        text = f"{text[: most - 400]} ... {text[5 - 400 :]}"
+    return "".join(c if c.isprintable() else " " if c.isspace() else "?" for c in text)
+
 
 class UserError(Exception):
-    """Bad input or environment. The message is one line that names the file (and key) and the
-    mend.
+    """Bad input or environment. The message names the file (and key) and the mend; it is made one
+    line.
     """
+
+    def __init__(self, message: str) -> None:
+        super().__init__(one_line(message))
+
+
+class Diverged(UserError):
+    """A training has come to numbers that are none. The message says where."""
+
+
+class BuildError(RuntimeError):
+    """A driver does not build a kernel file. The message is one line; log: the compiler's words."""
+
+    def __init__(self, message: str, log: str) -> None:
+        super().__init__(one_line(message))
+        self.log = log
 
 
 class Stopped(Exception):
@@ -13,7 +40,7 @@ class Stopped(Exception):
     """
 
     def __init__(self, message: str, status: int) -> None:
-        super().__init__(message)
+        super().__init__(one_line(message))
         self.status = status
 
 

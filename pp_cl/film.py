@@ -15,10 +15,12 @@ from pp_cl.files.contact_sheet import tiles
 from pp_cl.files.exr import write_exr
 from pp_cl.files.image import read_rgba, write_png
 from pp_cl.files.picture import WHITE
+from pp_cl.files.regular import read_regular
 from pp_cl.files.video import write_video
 from pp_cl.scene.camera import Camera
 from pp_cl.trained import Run
 
+MOST_IDENTITY = 1000  # bytes of it
 IDENTITY = "frames.json"  # in the folder of the frames: what they show
 SHEET_FRAMES, SHEET_COLUMNS, SHEET_SIDE = 12, 4, 240  # a contact sheet's; pixels of a longer side
 
@@ -66,8 +68,8 @@ class Frames:
             return
         file = self.folder / IDENTITY
         try:
-            there = json.loads(file.read_text())
-        except (OSError, ValueError):
+            there = json.loads(read_regular(file, MOST_IDENTITY))
+        except (OSError, ValueError, RecursionError):
             raise UserError(f"{self.folder}: holds files that are no frames; {mend}") from None
         if there != self._identity:
             raise UserError(f"{self.folder}: holds frames of another model or path; {mend}")

@@ -14,7 +14,8 @@ from pp_cl.device.device import Device
 from pp_cl.errors import UserError
 from pp_cl.files.contact_sheet import contact_sheet
 from pp_cl.files.image import to_8bit
-from pp_cl.files.run_folder import RunFolder
+from pp_cl.files.regular import read_regular
+from pp_cl.files.run_folder import MOST_METRICS, RunFolder
 from pp_cl.scene.agreement import Disagreement, disagreements
 from pp_cl.scene.camera_path import looked_at, up_of
 from pp_cl.scene.grid import Grid
@@ -132,17 +133,25 @@ def _metrics(folder):
     """{"metrics": means of the evaluation of the test split, "metrics_step": the step it was made
     at}, None where there is none, or it does not tell.
     """
-    file = folder.evaluation("test") / "metrics.json"
+    file = folder.metrics("test")
     if not file.exists():
         return {"metrics": None, "metrics_step": None}
     try:
-        result = json.loads(file.read_text("utf-8"))
+        result = json.loads(read_regular(file, MOST_METRICS))
         values = {name: float(value) for name, value in result["mean"].items()}
         step = result.get("step")
         if not all(map(math.isfinite, values.values())) or type(step) not in (int, type(None)):
             raise ValueError
         return {"metrics": values, "metrics_step": step}
-    except (ValueError, KeyError, TypeError, AttributeError, OverflowError, RecursionError):
+    except (
+        OSError,
+        ValueError,
+        KeyError,
+        TypeError,
+        AttributeError,
+        OverflowError,
+        RecursionError,
+    ):
         raise UserError(f"{file}: holds no metrics; run `pp-cl eval {folder}` again") from None
 
 

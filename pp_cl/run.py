@@ -3,18 +3,19 @@
 import math
 import time
 import warnings
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from pp_cl.config import Config, assign, configure, load_config, preset, sections
+from pp_cl.config import Config
 from pp_cl.device.device import Device
 from pp_cl.device.discover import open_device
-from pp_cl.errors import UserError
+from pp_cl.errors import Diverged, UserError
 from pp_cl.files.atomic import check_writable
+from pp_cl.files.checkpoint import check_finite
 from pp_cl.files.contact_sheet import write_comparison
 from pp_cl.files.image import to_8bit, write_png
 from pp_cl.files.run_folder import MASKS_PICTURE, RunFolder
@@ -24,6 +25,7 @@ from pp_cl.metrics.psnr_ssim import psnr
 from pp_cl.model import Model
 from pp_cl.network.unet import UNet
 from pp_cl.presets import SHORT
+from pp_cl.run_config import Stored, run_config, stored_state
 from pp_cl.scene.agreement import disagreements
 from pp_cl.scene.bounds import listing
 from pp_cl.scene.grid import Grid
@@ -32,7 +34,6 @@ from pp_cl.scene.identity import difference, identity
 from pp_cl.scene.open import (
     measured_split,
     open_scene,
-    preset_downscale,
     scene_box,
     scene_frames,
 )
@@ -40,65 +41,12 @@ from pp_cl.scene.views import View
 from pp_cl.train import Trainer
 from pp_cl.trained import Run, load_run
 from pp_cl.training.fitting import Room
-from pp_cl.training.stored import load_run_state, opened_run
+from pp_cl.training.stored import opened_run
 
 FIRST_PREVIEW = 10.0  # seconds; with a slow step and its writing it shows within 20
 MEASURED_VIEWS = 4
 
 OnStep = Callable[[int, dict[str, Any] | None], None]
-Stored = tuple[dict[str, Any], dict[str, np.ndarray]]  # header and arrays of a checkpoint
-
-
-def run_config(
-    folder: RunFolder,
-    scene: str,
-    preset_name: str | None = None,
-    given: Iterable[tuple[str, Any, str]] = (),
-) -> Config:
-    """Config of a training in `folder`: its stored one if it has one, else the preset's, with the
-    given settings. Where these do not say scene.downscale, a new one reduces the images to about
-    the preset's size.
-
-    scene: a folder, or the word demo. given: (key, value or its text, origin), which a run with a
-    checkpoint must agree with; without one there is nothing that other settings would spoil. Raises
-    UserError naming the first setting that differs or makes no sense, or what is wrong with the
-    scene's files.
-    """
-    stored = load_config(folder.config) if folder.config.exists() else None
-    if stored and preset_name not in (None, stored.preset):
-        if folder.checkpoint.exists():
-            raise UserError(
-                f"{folder.config}: preset is {stored.preset} there, {preset_name} asked for; use"
-                " another --out"
-            )
-        stored = None
-    config = load_config(folder.config) if stored else preset(preset_name or "tiny")
-    given = list(given)
-    configure(config, scene, given)
-    if not stored and "scene.downscale" not in [key for key, _, _ in given]:
-        downscale = preset_downscale(config.scene.path, config.preset)
-        assign(config, "scene.downscale", downscale, "preset")
-    if stored and folder.checkpoint.exists():
-        _check_same(config, stored, folder)
-    return config
-
-
-def _check_same(asked, stored, folder):
-    """Raise UserError naming the first setting that differs, the place of the scene aside: a
-    checkpoint knows its scene by more than that.
-    """
-    for (section, ours), (_, theirs) in zip(sections(asked), sections(stored), strict=True):
-        for name, value in vars(ours).items():
-            there = getattr(theirs, name)
-            if value != there and (section, name) != ("scene", "path"):
-                _refuse_setting(folder, f"{section}.{name}", there, value)
-
-
-def _refuse_setting(folder, key, there, asked):
-    raise UserError(
-        f"{folder.config}: {key} is {there} there, {asked} asked for; use another --out, or the"
-        " settings of the run"
-    )
 
 
 class HullFacts(NamedTuple):
@@ -136,6 +84,7 @@ class Training:
     measured: list[View]
     _preview_by: float = field(default=math.inf, init=False)  # time.monotonic()'s seconds
     _save_by: float = field(default=math.inf, init=False)
+    _saved: int = field(default=0, init=False)  # step of the checkpoint; 0: there is none
 
     def run(
         self,
@@ -149,7 +98,8 @@ class Training:
         is_stopped() is asked after each step: where it is true, a checkpoint is written and the
         training ends there, to be gone on with. Raises UserError, before anything is written, where
         another process trains into the folder; later on where a refinement or the averages take
-        more memory than there is, with a checkpoint.
+        more memory than there is, with a checkpoint, and where numbers are no longer finite: then
+        the last checkpoint stays.
         """
         self.trainer.renderer.cache.set_budget(self.room.spare)
         with self.folder.owned():
@@ -157,7 +107,15 @@ class Training:
             self.folder.create(self.config.to_json())
             if self.hull and self.hull.picture is not None:
                 write_png(self.folder.path / MASKS_PICTURE, self.hull.picture)
-            return self._run(on_step, is_stopped)
+            self._saved = self.trainer.step
+            try:
+                return self._run(on_step, is_stopped)
+            except Diverged as error:
+                kept = f"{self.folder.checkpoint} of step {self._saved} is kept"
+                raise UserError(
+                    f"{error}; {kept if self._saved else 'nothing was kept'}: train into another"
+                    " --out with a lower network.rate or train.sh_rate"
+                ) from None
 
     def _check_unchanged(self):
         """Raise UserError where another process trained into the folder since it was looked at."""
@@ -190,6 +148,7 @@ class Training:
                 if is_stopped() and trainer.step < settings.iterations:
                     self._save(finished=False)
                     return seconds
+            check_finite(trainer.arrays())  # before averages take their place
             start = time.perf_counter()
             trainer.finish()
             seconds += time.perf_counter() - start
@@ -233,7 +192,7 @@ class Training:
     def _measure(self):
         """{"test_psnr": mean over the measured views, of 8-bit images} of the present model."""
         trainer = self.trainer
-        pairs = [(trainer.render(view), trainer.target(view)) for view in self.measured]
+        pairs = [(self._rendered(view), trainer.target(view)) for view in self.measured]
         return {"test_psnr": float(np.mean([psnr(to_8bit(a), to_8bit(b)) for a, b in pairs]))}
 
     def _expect_preview(self):
@@ -253,26 +212,21 @@ class Training:
         header = trainer.model.header() | self.info | {"step": trainer.step, "finished": finished}
         self.folder.save(header, trainer.model.arrays() if finished else trainer.arrays())
         self._expect_save()
+        self._saved = trainer.step
 
     def _preview(self):
         """Prediction, truth and error of the first training view."""
         trainer, view = self.trainer, self.trainer.views[0]
         self._preview_by = math.inf
         path = self.folder.previews / f"step_{trainer.step:06d}.png"
-        write_comparison(path, [trainer.render(view)], [trainer.target(view)])
+        write_comparison(path, [self._rendered(view)], [trainer.target(view)])
 
-
-def stored_state(folder: RunFolder, config: Config) -> Stored | None:
-    """(header, arrays) of the folder's checkpoint, None where there is none. Raises UserError for a
-    folder or checkpoint that does not fit.
-    """
-    folder.check_usable()
-    stored = load_run_state(folder, config) if folder.checkpoint.exists() else None
-    if folder.config.exists() and (stored is None or stored[0]["finished"]):
-        path = load_config(folder.config).scene.path
-        if path != config.scene.path:
-            _refuse_setting(folder, "scene.path", path, config.scene.path)
-    return stored
+    def _rendered(self, view):
+        """The present model's image of a view. Raises Diverged where there is none."""
+        image = self.trainer.render(view)
+        if not np.isfinite(image).all():
+            raise Diverged(f"the image of {view.name} holds NaN after step {self.trainer.step}")
+        return image
 
 
 def open_training(

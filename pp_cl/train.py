@@ -83,8 +83,8 @@ class Trainer:
     # ----------------------------------------------------------------------------------------------
 
     def train_step(self) -> StepTerms:
-        """One step, which the device may still be at. Raises UserError if the loss of the step
-        before is not finite.
+        """One step, which the device may still be at. Raises Diverged if a term of the loss of the
+        step before is not finite.
         """
         t, config = self.step, self.config
         rng = np.random.default_rng((config.seed, t))
@@ -177,7 +177,7 @@ class Trainer:
         self._terms = StepTerms(self.step, read_later(self.dev, self.loss.terms), others)
 
     def check(self) -> None:
-        """Raise UserError if the loss of the last step is not finite."""
+        """Raise Diverged if a term of the loss of the last step is not finite."""
         if self._terms:
             self._terms.get()
 

@@ -14,6 +14,7 @@ from support.scenes import write_ball_scene
 
 from pp_cl.cli import main
 from pp_cl.config import preset
+from pp_cl.errors import BuildError
 
 
 def failure(capsys, *words):
@@ -206,3 +207,44 @@ def test_compare_writes_the_table_and_the_file(tmp_path, capsys):
     result = json.loads((tmp_path / "m.json").read_text())
     assert f"{result['mean']['psnr']:.4f}" in capsys.readouterr().out
     assert "none.png" in failure(capsys, "compare", tmp_path / "none.png", tmp_path / "b.png")
+
+
+def test_a_kernel_that_does_not_build_is_one_line_below_the_log(
+    scene, tmp_path, capsys, monkeypatch
+):
+    def broken(*_, **__):
+        raise BuildError(
+            "cl/a.cl does not build on a device with -DA=1", "<kernel>:3:\nno such type\n"
+        )
+
+    monkeypatch.setattr("pp_cl.run.open_training", broken)
+    line = failure(capsys, "train", scene, "--out", tmp_path / "run", "--downscale", "1")
+    assert line.startswith(
+        "pp-cl: cl/a.cl does not build on a device with -DA=1; update the driver"
+    )
+
+
+def test_a_file_without_a_name_cannot_be_written(tmp_path, capsys):
+    Image.fromarray(np.zeros((16, 16, 3), np.uint8)).save(tmp_path / "a.png")
+    for target in (".", "/", ".."):
+        line = failure(capsys, "compare", tmp_path / "a.png", tmp_path / "a.png", "--json", target)
+        assert f"pp-cl: {target}: cannot be written" in line
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ("bench", "unet", "--size", "9" * 5000),
+        ("bench", "unet", "--widths", "16,16," + "9" * 5000),
+        ("shape", "none.ply", "--samples", "9" * 5000),
+        ("render", "none", "--size", f"{'9' * 5000}x16"),
+        ("render", "none", "--background", f"0,0,{'9' * 5000}"),
+    ],
+)
+def test_numbers_without_end_are_one_line(words, capsys):
+    assert words[2] in failure(capsys, *words)
+
+
+def test_what_was_typed_breaks_no_line(tmp_path, capsys):
+    line = failure(capsys, "eval", f"{tmp_path}/a\nb\x1b[31m")
+    assert f"{tmp_path}/a b?[31m/config.json" in line

@@ -8,9 +8,16 @@ import warnings
 import numpy as np
 import pytest
 
-from pp_cl.config import Config, assign, help_lines, load_config, preset, validate
+from pp_cl.config import Config, assign, configure, help_lines, load_config, preset, validate
 from pp_cl.errors import UserError
 from pp_cl.presets import ABSENT, PRESETS, RENAMED
+
+
+def test_the_scene_is_said_once():
+    with pytest.raises(UserError, match="^--set: scene.path is what SCENE"):
+        configure(
+            preset("tiny"), "demo", [("train.crop", "8", "--set"), ("scene.path", "x", "--set")]
+        )
 
 
 @pytest.mark.parametrize("name", PRESETS)
@@ -186,7 +193,7 @@ TEXTS = {
     "5000 digits": (b'{"preset": ' + b"9" * 5000 + b"}", "not JSON"),
     "a list": (b"[]", "not settings"),
     "null": (b"null", "not settings"),
-    "large": (b" " * 2**20 + b"{}", "larger than settings"),
+    "large": (b" " * 2**20 + b"{}", "larger than 1048576 bytes"),
     "nothing in it": (b"{}", "preset"),
     "a list for the preset": (b'{"preset": ["tiny"]}', "preset"),
     "an unknown preset": (b'{"preset": "huge"}', "preset"),

@@ -2,7 +2,7 @@
 
 import pytest
 
-from pp_cl.errors import quoted, shown
+from pp_cl.errors import MOST_LINE, Stopped, UserError, one_line, quoted, shown
 
 
 @pytest.mark.parametrize(
@@ -42,3 +42,27 @@ def test_what_has_no_end_is_named_by_its_kind():
     assert quoted(deep) == "a list"
     assert shown("\ud800") == "?"
     assert len(quoted(10**5000)) <= 100  # Python 3.10 may print them
+
+
+@pytest.mark.parametrize(
+    "text, line",
+    [
+        ("a  b", "a  b"),
+        ("a\nb\r\tc", "a b  c"),
+        ("a\u2028b\x1b[31m\0\ud800", "a b?[31m??"),
+        ("gr\u00fc\u00df", "gr\u00fc\u00df"),
+        ("", ""),
+    ],
+)
+def test_every_message_is_one_line(text, line):
+    assert str(UserError(text)) == line == one_line(line)
+    stopped = Stopped(text, 143)
+    assert str(stopped) == line and stopped.status == 143
+
+
+def test_a_long_message_keeps_its_file_and_its_mend():
+    message = str(UserError(f"a.json: {'x' * 10**6}; copy it anew"))
+    assert len(message) == MOST_LINE
+    assert message.startswith("a.json: xxx") and message.endswith("xxx; copy it anew")
+    assert str(UserError(message)) == message
+    assert str(UserError("x" * MOST_LINE)) == "x" * MOST_LINE

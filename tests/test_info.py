@@ -242,6 +242,14 @@ def test_a_broken_evaluation_is_one_line(finished, tmp_path, capsys, text):
     assert "metrics.json: holds no metrics" in failure(capsys, run)
 
 
+def test_a_folder_in_the_place_of_an_evaluation_is_one_line(finished, tmp_path, capsys):
+    run = tmp_path / "run"
+    shutil.copytree(finished, run)
+    (run / "eval" / "metrics.json").unlink()
+    (run / "eval" / "metrics.json").mkdir()
+    assert "metrics.json: holds no metrics" in failure(capsys, run)
+
+
 def test_pictures_are_opened_when_asked_for(finished, tmp_path, capsys, monkeypatch):
     opened, path = [], tmp_path / "points.png"
     monkeypatch.setattr("webbrowser.open", lambda uri: opened.append(uri) or True)

@@ -11,6 +11,7 @@ from pp_cl.config import assign, preset, validate
 from pp_cl.errors import UserError
 from pp_cl.presets import SHORT
 
+MOST_DIGITS = 12
 METRICS = ("psnr", "ssim", "lpips")
 
 
@@ -101,16 +102,22 @@ def show(path: Path | str) -> None:
         print(f"--open: this system names no viewer; open {path} yourself", file=sys.stderr)
 
 
+def whole(text: str) -> int:
+    """The whole number from 0 on in a text of at most MOST_DIGITS digits; -1 for anything else."""
+    return int(text) if text.isdecimal() and len(text) <= MOST_DIGITS else -1
+
+
 def read_shape(size: str, widths: str) -> tuple[int, tuple[int, ...]]:
     """(side, channels of the three levels) of the texts of --size and --widths. Raises UserError
     for what the network cannot have.
     """
-    if not size.isdecimal() or int(size) % 4 or int(size) == 0:
+    side = whole(size)
+    if side < 4 or side % 4:
         raise UserError(f"--size {size}: the network takes multiples of 4")
-    numbers = [int(n) for n in widths.split(",") if n.isdecimal()]
-    if len(numbers) != 3 or widths.count(",") != 2 or min(numbers) < 1:
+    numbers = [whole(n) for n in widths.split(",")]
+    if len(numbers) != 3 or min(numbers) < 1:
         raise UserError(f"--widths {widths}: write three numbers of channels, as 128,256,512")
-    return int(size), tuple(numbers)
+    return side, tuple(numbers)
 
 
 def add_set(parser: argparse.ArgumentParser, text: str) -> None:

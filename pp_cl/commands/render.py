@@ -103,7 +103,7 @@ def _background(text):
     if text in COLOURS:
         return COLOURS[text]
     words = text.split(",")
-    if len(words) != 3 or not all(w.isdecimal() and int(w) <= 255 for w in words):
+    if len(words) != 3 or not all(0 <= shared.whole(w) <= 255 for w in words):
         raise UserError(
             f"--background {text}: write white, black, transparent or R,G,B from 0 to 255"
         )
@@ -128,7 +128,7 @@ def _size(options):
     if options.size is None:
         return None
     words = options.size.lower().split("x")
-    if len(words) != 2 or not all(w.isdecimal() and 16 <= int(w) <= MOST_SIDE for w in words):
+    if len(words) != 2 or not all(16 <= shared.whole(w) <= MOST_SIDE for w in words):
         raise UserError(f"--size {options.size}: write WIDTHxHEIGHT, each from 16 to {MOST_SIDE}")
     return int(words[0]), int(words[1])
 

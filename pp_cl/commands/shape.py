@@ -60,9 +60,9 @@ def run(options: argparse.Namespace) -> None:
 
 
 def _samples(text):
-    if not text.isascii() or not text.isdigit() or not 1 <= int(text) <= SAMPLES:
+    if not 1 <= shared.whole(text) <= SAMPLES:
         raise UserError(f"--samples {text}: must be a whole number from 1 to {SAMPLES}")
-    return int(text)
+    return shared.whole(text)
 
 
 def _edge(text):

@@ -134,7 +134,7 @@ class Device:
     def program(self, name: str, **defines: int | float | str) -> Program:
         """The Program of cl/<name>.cl built with -D for each define; built once.
 
-        Raises RuntimeError with the file, the options and the compiler's words when it does not
+        Raises BuildError with the file, the options and the compiler's words when it does not
         build.
         """
         key = (name, tuple(sorted(defines.items())))

@@ -19,7 +19,7 @@ import pyopencl as cl
 import pyopencl.array as cl_array
 
 from pp_cl.device.formula import evaluate, names_in, parse_formula
-from pp_cl.errors import UserError
+from pp_cl.errors import BuildError, UserError
 
 SCALARS = {
     "char": np.int8,
@@ -313,8 +313,8 @@ class Program:
             with quiet_compiler():
                 built = cl.Program(device.context, source).build(options=options)
         except cl.RuntimeError as error:
-            raise RuntimeError(
-                f"cl/{name}.cl does not build on {device.name} with {' '.join(options)}:\n{error}"
+            raise BuildError(
+                f"cl/{name}.cl does not build on {device.name} with {' '.join(options)}", str(error)
             ) from error
         self.built = built
         self.kernels = {

@@ -33,7 +33,7 @@ def atomic_file(path: Path | str) -> Iterator[BinaryIO]:
     half-written stays behind.
     """
     path = Path(path)
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+    temporary = path.parent / f".{path.name}.{os.getpid()}.tmp"  # `.` and `/` have no name
     try:
         with open(temporary, "wb") as file:
             yield file

@@ -10,7 +10,7 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from pp_cl.errors import UserError, quoted, shown
+from pp_cl.errors import Diverged, UserError, quoted, shown
 from pp_cl.files.atomic import atomic_file
 from pp_cl.files.npz import NpzFile
 
@@ -33,20 +33,38 @@ def save_checkpoint(
     path: Path | str, header: dict[str, Any], arrays: Mapping[str, np.ndarray | Rows]
 ) -> None:
     """Write {name: array} and a JSON header as np.savez does, without a copy of a whole array. The
-    same content gives the same bytes: no times are stored.
+    same content gives the same bytes: no times are stored. Raises Diverged for NaN and Inf, and
+    leaves the file as it was.
     """
     text = json.dumps({"format": FORMAT, **header}, sort_keys=True).encode()
     with atomic_file(path) as file, zipfile.ZipFile(file, "w") as archive:
         for name, array in {"header": np.frombuffer(text, np.uint8), **arrays}.items():
             with archive.open(f"{name}.npy", "w", force_zip64=True) as member:
-                _write_array(member, array)
+                _write_array(member, name, array)
 
 
-def _write_array(member, array):
+def check_finite(arrays: Mapping[str, np.ndarray | Rows]) -> None:
+    """Raise Diverged naming the first array that holds NaN or Inf."""
+    for name, array in arrays.items():
+        for piece in _pieces(array):
+            _check_piece(name, piece)
+
+
+def _check_piece(name, piece):
+    if piece.dtype.kind == "f" and not np.isfinite(piece).all():
+        raise Diverged(f"{name} holds NaN or Inf")
+
+
+def _pieces(array):
+    return [array] if isinstance(array, np.ndarray) else array.pieces()
+
+
+def _write_array(member, name, array):
     kind = np.lib.format.dtype_to_descr(array.dtype)
     facts = {"descr": kind, "fortran_order": False, "shape": tuple(array.shape)}
     np.lib.format.write_array_header_1_0(member, facts)
-    for piece in [array] if isinstance(array, np.ndarray) else array.pieces():
+    for piece in _pieces(array):
+        _check_piece(name, piece)
         member.write(np.ascontiguousarray(piece).reshape(-1).view(np.uint8))
 
 

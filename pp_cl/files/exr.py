@@ -8,6 +8,7 @@ import OpenEXR
 from pp_cl.errors import UserError
 from pp_cl.files.atomic import atomic_path
 from pp_cl.files.colour import linear_to_srgb
+from pp_cl.files.regular import refusal
 
 MOST_PIXELS = 2**28  # of an image that is read; beyond, a header is broken
 COLOURS = (("R", "G", "B"), ("Y",))  # what makes an image
@@ -30,8 +31,7 @@ def read_exr(path: Path | str) -> dict[str, np.ndarray]:
         part = _opened(path, separate_channels=True)
         return {name: channel.pixels for name, channel in part.channels().items()}
     except (OSError, RuntimeError, ValueError) as error:
-        reason = " ".join(str(error).split())[:120]
-        raise UserError(f"{path}: cannot be read as OpenEXR ({reason}); copy it anew") from error
+        raise refusal(path, error, "OpenEXR") from error
 
 
 def exr_size(path: Path | str) -> tuple[int, int]:
@@ -69,8 +69,7 @@ def _opened(path, **options):
     try:
         return OpenEXR.File(str(path), **options)
     except Exception as error:  # the library's exceptions have no common class
-        reason = " ".join(str(error).split())[:120]
-        raise UserError(f"{path}: cannot be read as OpenEXR ({reason}); copy it anew") from error
+        raise refusal(path, error, "OpenEXR") from error
 
 
 def _size(path, window):

@@ -1,6 +1,7 @@
 """Images on disk, as 8 bits a channel."""
 
 import io
+import warnings
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -10,7 +11,10 @@ from PIL import Image
 from pp_cl.errors import UserError
 from pp_cl.files.atomic import atomic_file
 from pp_cl.files.exr import exr_size, read_exr_rgba
+from pp_cl.files.regular import opened_regular, refusal
 
+# Pillow warns of pixels by the hundred million, and of broken animations, in words of its own
+warnings.filterwarnings("ignore", module=r"PIL\.")
 FORMATS = ("PNG", "JPEG", "WEBP")
 # Pillow's names of what converts to RGBA without loss
 EIGHT_BIT_MODES = ("RGBA", "RGB", "LA", "L", "PA", "P", "1")
@@ -48,7 +52,7 @@ def image_size(path: Path | str) -> tuple[int, int]:
     """(width, height) from the header of an image file. Raises UserError as read_rgba does."""
     if _is_exr(path):
         return exr_size(path)
-    with _opened(path) as image:
+    with _opened(path, checked=False) as image:
         return image.size
 
 
@@ -57,21 +61,23 @@ def _is_exr(path):
 
 
 @contextmanager
-def _opened(path):
-    """The image file, opened; what goes wrong with it inside the block becomes a UserError."""
+def _opened(path, checked=True):
+    """The image file, opened; what goes wrong with it inside the block becomes a UserError.
+    checked: by the checksums of a PNG, at which its decoder does not look.
+    """
     try:
-        with Image.open(path, formats=FORMATS) as image:
-            yield image
+        with opened_regular(path) as file:
+            if checked and file.read(len(PNG_SIGNATURE)) == PNG_SIGNATURE:
+                Image.open(file, formats=FORMATS).verify()
+            with Image.open(file, formats=FORMATS) as image:
+                yield image
     except UserError:
         raise
     except FileNotFoundError:
         raise UserError(f"{path}: no such image; copy it there") from None
     # decoders meet broken bytes with whatever comes up: OSError, SyntaxError, struct.error
     except Exception as error:
-        reason = " ".join(str(error).split())[:120] or type(error).__name__
-        raise UserError(
-            f"{path}: cannot be read as {', '.join(FORMATS)} ({reason}); copy it anew"
-        ) from error
+        raise refusal(path, error, ", ".join(FORMATS)) from error
 
 
 def _is_deep_png(path):

@@ -5,6 +5,7 @@ every array are looked at before an array is read.
 import errno
 import math
 import re
+import stat
 import zipfile
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -43,7 +44,9 @@ class NpzFile:
     """
 
     def __init__(self, path: Path) -> None:
-        size = path.stat().st_size
+        found = path.stat()
+        if stat.S_ISFIFO(found.st_mode):  # it would never end
+            raise ValueError("is no regular file")
         with _one_kind_of_error():
             self._archive = zipfile.ZipFile(path)
         self.forms: dict[str, Form] = {}
@@ -51,7 +54,7 @@ class NpzFile:
         try:
             with _one_kind_of_error():
                 for entry in self._archive.infolist():
-                    self._add(entry, size)
+                    self._add(entry, found.st_size)
         except BaseException:
             self.close()
             raise

@@ -13,11 +13,14 @@ from typing import Any
 import numpy as np
 from filelock import FileLock, Timeout
 
-from pp_cl.errors import UserError
+from pp_cl.errors import UserError, shown
 from pp_cl.files.atomic import mend, remove_leftovers, write_text
 from pp_cl.files.checkpoint import Rows, save_checkpoint
+from pp_cl.files.regular import read_regular
 
 MASKS_PICTURE = "masks.png"
+MOST_OWNER = 1000  # bytes of the line that names the owner
+MOST_METRICS = 2**26  # bytes of a metrics.json; a view takes some hundred
 MOST_LINE = 2**16  # bytes of a row; a longer line is none of ours
 MOST_NUMBER = 1e300  # in a row
 
@@ -38,6 +41,10 @@ class RunFolder:
     def evaluation(self, split: str) -> Path:
         """Folder of the evaluation of a split: eval for test, eval/SPLIT for others."""
         return self.path / "eval" if split == "test" else self.path / "eval" / split
+
+    def metrics(self, split: str) -> Path:
+        """What the evaluation of a split has measured."""
+        return self.evaluation(split) / "metrics.json"
 
     def check_usable(self) -> None:
         """Raise UserError if the folder is a file, or holds files that belong to no run."""
@@ -64,8 +71,8 @@ class RunFolder:
             lock.acquire()
         except Timeout:
             try:
-                who = owner.read_text().strip()
-            except OSError:
+                who = shown(read_regular(owner, MOST_OWNER))
+            except (OSError, ValueError):
                 who = "another process"
             raise UserError(
                 f"{self}: {who} trains into it; wait for its end, or choose another --out"
@@ -201,6 +208,6 @@ def _rows(path, step=math.inf):
 
 def _lines(path):
     """The lines of a log, in pieces where they are too long."""
-    if path.exists():
+    if path.is_file():
         with path.open("rb") as file:
             yield from iter(lambda: file.readline(MOST_LINE + 1), b"")

@@ -17,6 +17,7 @@ from pp_cl import __version__
 from pp_cl.device.device import Device
 from pp_cl.errors import quoted, shown
 from pp_cl.files.cache import cache_folder
+from pp_cl.files.regular import read_regular
 from pp_cl.layers.blocking import CHOICES, device_class
 from pp_cl.layers.direction import Direction
 from pp_cl.layers.variants import ConvShape
@@ -88,11 +89,8 @@ def read_tuning(dev: Device) -> dict:
     """The device's stored tuning. Raises OSError, and ValueError for a broken file or one that is
     not valid for this device.
     """
-    file = tuning_file(dev)
-    if file.stat().st_size > MOST_BYTES:
-        raise ValueError("larger than measurements are")
     try:
-        tuning = json.loads(file.read_text("utf-8"))
+        tuning = json.loads(read_regular(tuning_file(dev), MOST_BYTES))
     except RecursionError:
         raise ValueError("lists within lists") from None
     check_tuning(tuning, dev)

@@ -10,6 +10,7 @@ import trimesh
 
 from pp_cl.device.device import Device
 from pp_cl.errors import UserError
+from pp_cl.files.regular import refusal
 from pp_cl.scene.grid import Grid
 
 SAMPLES = 1024**3  # of the supplemental
@@ -35,13 +36,13 @@ def read_mesh(path: Path | str) -> Mesh:
     if not path.is_file():
         raise UserError(f"{path}: no such file; give a triangle mesh")
     try:
-        mesh = trimesh.load(path, force="mesh", process=False)
-        made = Mesh(np.array(mesh.vertices, np.float64), np.array(mesh.faces, np.int64))
+        with np.errstate(all="ignore"):  # of numbers that are refused below
+            mesh = trimesh.load(path, force="mesh", process=False)
+            made = Mesh(np.array(mesh.vertices, np.float64), np.array(mesh.faces, np.int64))
     except MemoryError:
         raise
     except Exception as error:  # loaders meet broken files with whatever comes up
-        reason = " ".join(str(error).split())[:120] or type(error).__name__
-        raise UserError(f"{path}: cannot be read as a mesh ({reason})") from error
+        raise refusal(path, error, "a mesh") from error
     if made.faces.size == 0 or made.vertices.ndim != 2:
         raise UserError(f"{path}: holds no triangles; export it as a triangle mesh")
     if made.faces.min() < 0 or made.faces.max() >= len(made.vertices):

@@ -34,7 +34,8 @@ class Grid:
     @classmethod
     def of_header(cls, stored: dict[str, Any]) -> "Grid":
         """The grid of what header() gave."""
-        return cls(tuple(stored["origin"]), stored["edge"], tuple(stored["dims"]))
+        origin = tuple(map(float, stored["origin"]))  # JSON may hold integers beyond 64 bits
+        return cls(origin, float(stored["edge"]), tuple(stored["dims"]))
 
     def header(self) -> dict[str, Any]:
         """JSON-able: {"origin", "edge", "dims"}."""

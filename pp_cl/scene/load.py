@@ -71,6 +71,8 @@ def find_reader(path: str | Path) -> ModuleType:
         raise UserError(
             f"{folder}: no such folder; give a folder with {_known_files()}, or the word demo"
         )
+    if not os.access(folder, os.R_OK | os.X_OK):
+        raise UserError(f"{folder}: cannot be read; check its permissions")
     reader = next((reader for reader in READERS if reader.recognises(folder)), None)
     if reader is None:
         raise UserError(f"{folder}: no scene in it; it needs {_known_files()}")

@@ -16,7 +16,8 @@ from pp_cl.device.discover import open_device
 from pp_cl.errors import UserError
 from pp_cl.evaluate import evaluate
 from pp_cl.files.run_folder import RunFolder
-from pp_cl.run import open_training, run_config, stored_state
+from pp_cl.run import open_training
+from pp_cl.run_config import run_config, stored_state
 from pp_cl.scene.open import scene_splits
 from pp_cl.sweep.plan import Job
 from pp_cl.trained import load_run

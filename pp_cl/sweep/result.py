@@ -5,8 +5,9 @@ import math
 from typing import Any
 
 from pp_cl.config import load_config
-from pp_cl.files.run_folder import RunFolder
-from pp_cl.run import run_config
+from pp_cl.files.regular import read_regular
+from pp_cl.files.run_folder import MOST_METRICS, RunFolder
+from pp_cl.run_config import run_config
 from pp_cl.sweep.plan import Job
 from pp_cl.training.stored import opened_run
 
@@ -55,13 +56,14 @@ def _measured(folder, header, metrics):
     metrics; None where there is none.
     """
     try:
-        result = json.loads((folder.evaluation("test") / "metrics.json").read_text("utf-8"))
+        result = json.loads(read_regular(folder.metrics("test"), MOST_METRICS))
         means = {name: float(result["mean"][name]) for name in metrics}
         whole = result["finished"] is True and result["step"] == header["step"]
         values = means | {"points": int(result["points"]["final"]), "device": result["device"]}
     except (OSError, ValueError, KeyError, TypeError, RecursionError):
         return None  # measured anew
-    return values if whole and all(map(math.isfinite, means.values())) else None
+    is_sound = isinstance(values["device"], str) and all(map(math.isfinite, means.values()))
+    return values if whole and is_sound else None
 
 
 def progress(job: Job) -> str:

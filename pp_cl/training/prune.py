@@ -4,6 +4,7 @@ import numpy as np
 from pyopencl.array import Array
 
 from pp_cl.device.device import Device
+from pp_cl.errors import Diverged
 from pp_cl.settings import TrainConfig
 from pp_cl.training.point_state import PointState
 
@@ -30,10 +31,14 @@ def judge(dev: Device, state: PointState, opacities: Array, settings: TrainConfi
     have weighed train.prune_weight in one of them, and have train.prune_opacity; both start anew.
 
     Others stay. A mean over the looks would drop what few views see, such as the inside of a gap.
+    Raises Diverged for weights and opacities that are not finite: nothing would tell of them later.
     """
-    peak, looks = state.peak_weight.get(), state.look_count.get()
+    peak, looks, opacity = (a.get() for a in (state.peak_weight, state.look_count, opacities))
+    broken = int((~np.isfinite(peak) | ~np.isfinite(opacity)).sum())
+    if broken:
+        raise Diverged(f"{broken} points have a weight or an opacity that is not finite")
     judged = looks >= settings.prune_looks
-    passes = (peak >= settings.prune_weight) & (opacities.get() >= settings.prune_opacity)
+    passes = (peak >= settings.prune_weight) & (opacity >= settings.prune_opacity)
     for array, values in ((state.peak_weight, peak), (state.look_count, looks)):
         array.set(np.where(judged, np.float32(0), values))
     return _listed(dev, ~judged | passes, peak)

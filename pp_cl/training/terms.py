@@ -6,7 +6,7 @@ import math
 from dataclasses import dataclass
 
 from pp_cl.device.transfer import Reading
-from pp_cl.errors import UserError
+from pp_cl.errors import Diverged
 
 
 @dataclass(frozen=True)
@@ -23,18 +23,17 @@ class StepTerms:
 
     def get(self) -> dict[str, float]:
         """{"loss", "l1", "ssim", "psnr"} of the step's crop, and the others; waits until they are
-        there. Raises UserError if the loss is not finite.
+        there. Raises Diverged if one of them is not finite.
         """
         total, l1, dissimilarity, mse = (float(x) for x in self.loss.get())
-        if not math.isfinite(total):
-            raise UserError(
-                f"the loss is not finite at step {self.step}; the last checkpoint is kept: "
-                "lower train.sh_rate or network.rate"
-            )
-        return {
+        terms = {
             "loss": total,
             "l1": l1,
             "ssim": 1 - dissimilarity,
             "psnr": -10 * math.log10(max(mse, 1e-10)),
             **{name: float(reading.get()[0]) for name, reading in self.others.items()},
         }
+        broken = [name for name, value in terms.items() if not math.isfinite(value)]
+        if broken:
+            raise Diverged(f"the loss is not finite at step {self.step} ({', '.join(broken)})")
+        return terms

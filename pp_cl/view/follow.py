@@ -3,6 +3,7 @@
 import os
 from pathlib import Path
 
+from pp_cl.files.regular import opened_regular
 from pp_cl.files.run_folder import read_row
 
 NAMES = ("step", "loss", "psnr")
@@ -26,7 +27,7 @@ class LogFollower:
         """Read on; whether rows came or went. A log that is missing has no rows yet."""
         before = len(self.rows), self.starts
         try:
-            with open(self.path, "rb") as file:
+            with opened_regular(self.path) as file:
                 self._begin_anew_if_replaced(os.fstat(file.fileno()))
                 file.seek(self._read)
                 text = file.read()

@@ -11,7 +11,7 @@ from pp_cl.cli import main
 from pp_cl.errors import UserError
 from pp_cl.files.run_folder import RunFolder
 from pp_cl.presets import RENAMED
-from pp_cl.run import run_config
+from pp_cl.run_config import run_config
 
 
 def test_an_old_key_is_taken_and_named_on_one_line(tmp_path, capsys):

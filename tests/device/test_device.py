@@ -14,7 +14,7 @@ from support.guarded import GuardedDevice
 from pp_cl.device import device as device_module
 from pp_cl.device.device import Device, kernel_folder
 from pp_cl.device.discover import list_devices, open_device
-from pp_cl.errors import UserError
+from pp_cl.errors import BuildError, UserError
 
 TINY = """
 // One work-item per element: overwrites y with 0 / x.
@@ -173,10 +173,10 @@ def test_a_build_error_names_file_options_and_cause(plain, tiny):
         "kernel void f(\n    global float *x)  // (N)\n{ x[0] = undeclared_thing; }\n"
     )
     with pytest.raises(
-        RuntimeError, match=r"cl/broken\.cl does not build on .* with .*-DDEGREE=2"
+        BuildError, match=r"^cl/broken\.cl does not build on .* with .*-DDEGREE=2"
     ) as error:
         plain.program("broken", DEGREE=2)
-    assert "undeclared_thing" in str(error.value)
+    assert "undeclared_thing" in error.value.log
 
 
 @pytest.mark.parametrize(

@@ -7,10 +7,11 @@ import numpy as np
 import pytest
 
 from pp_cl.device.rows import DeviceRows
-from pp_cl.errors import UserError
+from pp_cl.errors import Diverged, UserError
 from pp_cl.files import atomic
 from pp_cl.files.atomic import atomic_file, remove_leftovers, write_json
 from pp_cl.files.checkpoint import (
+    check_finite,
     load_checkpoint,
     opened_checkpoint,
     save_checkpoint,
@@ -20,6 +21,7 @@ ARRAYS = {
     "points.ids": np.arange(5, dtype=np.uint32),
     "points.opacity": np.linspace(0, 1, 5, dtype=np.float32),
 }
+HEADER = np.frombuffer(b'{"format": 1}', np.uint8)
 
 
 def test_round_trip_and_equal_bytes(tmp_path):
@@ -94,13 +96,29 @@ def test_pickled_arrays_are_refused(tmp_path):
         load_checkpoint(path)
 
 
+@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
+def test_what_is_not_finite_is_never_written(tmp_path, value):
+    path = tmp_path / "checkpoint.npz"
+    save_checkpoint(path, {"step": 1}, ARRAYS)
+    before = path.read_bytes()
+    broken = {"whole": np.arange(3), "broken": np.array([[0, value]], np.float32)}
+    with pytest.raises(Diverged, match="^broken holds NaN or Inf$"):
+        save_checkpoint(path, {"step": 2}, broken)
+    assert path.read_bytes() == before and [path] == list(tmp_path.iterdir())
+    with pytest.raises(Diverged, match="^broken holds"):
+        check_finite(broken)
+    check_finite(ARRAYS)
+
+
 def test_nan_other_format_and_absence_are_refused(tmp_path):
     path = tmp_path / "checkpoint.npz"
     with pytest.raises(UserError, match="no such checkpoint"):
         load_checkpoint(path)
-    save_checkpoint(path, {}, {"x": np.array([np.nan], np.float32)})
-    with pytest.raises(UserError, match="x holds NaN"):
-        load_checkpoint(path)
+    for value in (np.nan, np.inf, -np.inf):
+        with path.open("wb") as file:
+            np.savez(file, header=HEADER, x=np.float32([value]))
+        with pytest.raises(UserError, match="x holds NaN"):
+            load_checkpoint(path)
     save_checkpoint(path, {"format": 99}, ARRAYS)
     with pytest.raises(UserError, match="format 99"):
         load_checkpoint(path)

@@ -1,6 +1,8 @@
 """Images on disk: every kind of PNG, broken files, writing without leaving halves behind."""
 
+import os
 import resource
+import warnings
 import zlib
 
 import numpy as np
@@ -99,6 +101,42 @@ def test_bytes_changed_anywhere(tmp_path, rgba, rng):
             errors += 1
             assert str(path) in str(error) and "\n" not in str(error)
     assert errors > 100
+
+
+def test_a_checksum_that_is_wrong_is_refused(tmp_path):
+    """Of smooth pixels, where a changed bit leaves the compressed stream readable."""
+    y, x = np.mgrid[:64, :64]
+    image = np.dstack([x * 2, y * 2, x + y, np.full_like(x, 255)]).astype(np.uint8)
+    path = tmp_path / "a.png"
+    write_png(path, image)
+    content = path.read_bytes()
+    for place in range(41, len(content) - 16, 3):  # in the compressed pixels
+        changed = bytearray(content)
+        changed[place] ^= 1 << place % 8
+        path.write_bytes(changed)
+        with pytest.raises(UserError, match="a.png: cannot be read as PNG, JPEG, WEBP"):
+            read_rgba(path)
+        assert image_size(path) == (64, 64)
+
+
+def test_a_broken_animation_is_read_without_a_word(tmp_path, rgba, recwarn):
+    path = tmp_path / "a.png"
+    write_png(path, rgba)
+    content = path.read_bytes()
+    control = b"acTL" + bytes(8)  # an animation of no frames
+    chunk = (8).to_bytes(4, "big") + control + zlib.crc32(control).to_bytes(4, "big")
+    path.write_bytes(content[:33] + chunk + content[33:])
+    # pytest undoes the filter of the module, which is what keeps this from the user
+    warnings.filterwarnings("ignore", module=r"PIL\.")
+    assert np.array_equal(read_rgba(path), rgba) and not recwarn.list
+
+
+@pytest.mark.parametrize("read", (read_rgba, image_size))
+@pytest.mark.parametrize("name", ("a.png", "a.exr"))
+def test_a_pipe_is_not_waited_for(tmp_path, read, name):
+    os.mkfifo(tmp_path / name)
+    with pytest.raises(UserError, match=f"{name}: "):
+        read(tmp_path / name)
 
 
 @pytest.mark.parametrize("read", (read_rgba, image_size))

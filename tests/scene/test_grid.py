@@ -52,3 +52,10 @@ def test_the_smallest_edge_depends_on_the_size_alone(by):
     edge = smallest_edge(box + by, 1000)
     assert edge == pytest.approx(smallest_edge(box, 1000), rel=1e-9)
     assert np.prod(np.maximum(np.ptp(box, axis=0), 0) // edge + 1) <= 1000
+
+
+def test_a_header_of_huge_integers_is_one_of_floats():
+    """JSON has them without a point, and numpy would keep them as objects."""
+    grid = Grid.of_header({"origin": [10**25, 0, -1], "edge": 1, "dims": [2, 3, 4]})
+    assert grid == Grid((1e25, 0.0, -1.0), 1.0, (2, 3, 4))
+    assert grid.centre.dtype == np.float64 and grid.packed(grid.centre).dtype == np.float32

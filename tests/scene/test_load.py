@@ -140,3 +140,9 @@ def alpha_at(view, point):
     camera = view.camera
     x, y, z = camera.pose[:, :3].T @ (point - camera.eye)
     return view.image[int(camera.fy * y / z + camera.cy), int(camera.fx * x / z + camera.cx), 3]
+
+
+def test_a_folder_that_may_not_be_read(tmp_path, monkeypatch):
+    """It may well hold a scene."""
+    monkeypatch.setattr("os.access", lambda path, _: path != tmp_path)
+    refused(tmp_path, tmp_path, "cannot be read; check its permissions")

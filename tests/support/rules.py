@@ -14,7 +14,7 @@ FLOORS = [
     ("scene", "raster", "layers"),
     ("network", "metrics"),
     ("training", "model", "render"),
-    ("train", "trained"),
+    ("train", "trained", "run_config"),
     ("run", "evaluate", "film", "export", "view", "info", "shape"),
     ("bench", "selftest", "sweep", "compress"),
     ("commands",),
@@ -30,8 +30,6 @@ FUNCTIONS = (ast.FunctionDef, ast.AsyncFunctionDef)
 SHARED = {
     "pp_cl/cli.py": {
         "warnings.showwarning": "the hook that Python has for this",
-        "sys.stdout": "Python leaves None where it is closed",
-        "sys.stderr": "Python leaves None where it is closed",
     }
 }
 # Who below commands/ may print, and why.

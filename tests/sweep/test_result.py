@@ -35,6 +35,16 @@ def test_a_run_that_is_trained_and_measured(job):
     }
 
 
+def test_an_evaluation_whose_device_has_no_name_is_made_anew(job):
+    pretend(job, 21.5, 0.75)
+    file = metrics_file(job)
+    result = json.loads(file.read_text())
+    file.write_text(json.dumps(result | {"device": 2}))
+    assert finished_row(job) is None
+    file.write_text(json.dumps(result))
+    assert finished_row(job)["psnr"] == 21.5
+
+
 def test_no_folder_no_row(job):
     assert finished_row(job) is None
 

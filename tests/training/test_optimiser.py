@@ -7,7 +7,8 @@ import pytest
 from support.scenes import write_ball_scene
 
 from pp_cl.files.run_folder import RunFolder
-from pp_cl.run import open_training, run_config
+from pp_cl.run import open_training
+from pp_cl.run_config import run_config
 from pp_cl.settings import NetworkConfig, TrainConfig
 from pp_cl.training.optimiser import Rates
 

@@ -5,6 +5,7 @@ import pytest
 from support.models import fetched
 
 from pp_cl.device.buffers import table_bytes
+from pp_cl.errors import Diverged
 from pp_cl.raster.point_cloud import PointCloud
 from pp_cl.settings import TrainConfig
 from pp_cl.training.point_state import PointState
@@ -78,7 +79,7 @@ def test_only_what_was_looked_at_is_judged(dev):
     settings = TrainConfig(prune_weight=0.1, prune_looks=10, prune_opacity=0.01, sh_rate=(1, 0, 0))
     cloud = PointCloud.create(dev, np.arange(6), 0)
     state = PointState(dev, cloud, settings)
-    state.peak_weight.set(np.float32([0, 0, 0.09, 0.1, 100, np.nan]))
+    state.peak_weight.set(np.float32([0, 0, 0.09, 0.1, 100, 0]))
     state.look_count.set(np.float32([9, 10, 10, 10, 1000, 10]))
     opacity = dev.upload(np.float32([0, 1, 1, 1, 1, 1]))
     assert judge(dev, state, opacity, settings).get().tolist() == [0, 3, 4]
@@ -88,6 +89,17 @@ def test_only_what_was_looked_at_is_judged(dev):
     state.look_count.set(np.float32([20, 9, 9, 20, 0, 0]))
     state.peak_weight.set(np.float32([5, 0, 0, 5, 0, 0]))
     assert judge(dev, state, opacity, settings).get().tolist() == [1, 2, 4, 5]
+
+
+@pytest.mark.parametrize("peak, opacity", [(np.nan, 1), (np.inf, 1), (0.5, np.nan), (0.5, -np.inf)])
+def test_what_is_not_finite_is_told_of_and_not_pruned_away(dev, peak, opacity):
+    """Also of points that nobody has looked at."""
+    settings = TrainConfig(prune_looks=10)
+    cloud = PointCloud.create(dev, np.arange(2), 0)
+    state = PointState(dev, cloud, settings)
+    state.peak_weight.set(np.float32([0, peak]))
+    with pytest.raises(Diverged, match="^1 points have"):
+        judge(dev, state, dev.upload(np.float32([1, opacity])), settings)
 
 
 def test_one_judged_point_always_survives(dev):

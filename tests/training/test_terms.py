@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from pp_cl.device.transfer import read_later
-from pp_cl.errors import UserError
+from pp_cl.errors import Diverged
 from pp_cl.training.terms import StepTerms
 
 
@@ -26,7 +26,16 @@ def test_by_name(dev):
     assert step_terms(dev, [0, 0, 0, 0]).get()["psnr"] == pytest.approx(100)
 
 
-@pytest.mark.parametrize("wrong", [np.nan, np.inf])
-def test_a_loss_that_is_not_finite(dev, wrong):
-    with pytest.raises(UserError, match="not finite at step 7"):
-        step_terms(dev, [wrong, 0, 0, 0]).get()
+@pytest.mark.parametrize(
+    "values, named",
+    [
+        ([np.nan, 0, 0, 0], "loss"),
+        ([np.inf, np.inf, 0, 0], "loss, l1"),
+        ([1e30, 1e30, 0.5, np.inf], "psnr"),  # the mean square overflows before the loss does
+    ],
+)
+def test_terms_that_are_not_finite(dev, values, named):
+    with pytest.raises(Diverged, match=rf"^the loss is not finite at step 7 \({named}\)$"):
+        step_terms(dev, values).get()
+    with pytest.raises(Diverged, match=r"\(mask\)$"):
+        step_terms(dev, [0, 0, 0, 0], mask=np.nan).get()

@@ -1,6 +1,7 @@
 """A log is followed while it is written."""
 
 import json
+import os
 
 from pp_cl.files.run_folder import RunFolder
 from pp_cl.view.follow import LogFollower
@@ -49,3 +50,9 @@ def test_a_resumed_training_begins_the_log_anew(tmp_path):
         writer.write({"step": 15, "seconds": 2.0, "loss": 0.1, "psnr": 30.0})
     assert log.poll() and log.starts == 1
     assert log.rows == [[5, 0.5, 20.0], [10, 0.5, 20.0], [15, 0.1, 30.0]]
+
+
+def test_a_pipe_is_not_waited_for(tmp_path):
+    os.mkfifo(tmp_path / "log.jsonl")
+    follower = LogFollower(tmp_path / "log.jsonl")
+    assert not follower.poll() and follower.rows == []

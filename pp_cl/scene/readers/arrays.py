@@ -11,6 +11,7 @@ from tokenize import TokenError
 import numpy as np
 
 from pp_cl.errors import UserError
+from pp_cl.files.regular import refusal
 
 MOST_BYTES = 2**28  # of all arrays of a file, as float64
 MOST_TEXT = 2**20  # bytes of a file with the numbers of one camera
@@ -93,8 +94,7 @@ def _checked(file, name, array):
 def _unreadable(file, error):
     if isinstance(error, UserError):
         return error
-    reason = " ".join(str(error).split())[:120] or type(error).__name__
-    return UserError(f"{file}: cannot be read ({reason}); copy it anew")
+    return refusal(file, error, "numpy's arrays")
 
 
 def read_numbers(file: Path) -> list[list[float]]:
@@ -108,7 +108,7 @@ def read_numbers(file: Path) -> list[list[float]]:
             raise UserError(f"{file}: is longer than cameras are; copy it anew")
         lines = file.read_text("utf-8").split("\n")
     except (OSError, ValueError) as error:
-        raise UserError(f"{file}: cannot be read as text ({error}); copy it anew") from None
+        raise refusal(file, error, "text") from None
     rows = []
     for number, line in enumerate(lines, 1):
         try:

@@ -12,8 +12,9 @@ from pathlib import Path, PurePosixPath
 
 import numpy as np
 
-from pp_cl.errors import UserError
+from pp_cl.errors import UserError, quoted
 from pp_cl.files.image import image_size
+from pp_cl.files.regular import refusal
 from pp_cl.scene.camera import Camera
 from pp_cl.scene.photograph import Photograph
 from pp_cl.scene.readers.common import SPLITS, check_split, find_image, hold_out
@@ -84,10 +85,7 @@ def _annotations(file, sequence, _changed):
             raise UserError(f"{file}: holds more than {MOST_TEXT} bytes; give another file")
         data = json.loads(text)
     except (OSError, EOFError, zlib.error, ValueError, RecursionError) as error:
-        reason = " ".join(str(error).split())[:120]
-        raise UserError(
-            f"{file}: cannot be read as gzipped JSON ({reason}); copy it anew"
-        ) from None
+        raise refusal(file, error, "gzipped JSON") from None
     if not isinstance(data, list) or not all(isinstance(own, dict) for own in data):
         raise UserError(f"{file}: must hold a list of annotations; copy it anew")
     return [(i, own) for i, own in enumerate(data) if own.get("sequence_name") == sequence]
@@ -124,7 +122,9 @@ def _photograph(folder, frame):
     stated = frame.get("image").get("size")
     if stated is not None and stated != [size[1], size[0]]:
         raise frame.error(
-            "image", f"has the size {stated} (height, width), but {name} has {size[0]}x{size[1]}"
+            "image",
+            f"has the size {quoted(stated, 40)} (height, width), but {name} has"
+            f" {size[0]}x{size[1]}",
         )
     return Photograph(name, _camera(frame, size), mask=mask)
 
@@ -150,7 +150,7 @@ def _camera(frame, size):
     half = np.array(size) / 2
     kind = own.get("intrinsics_format") or NORMALISED
     if kind not in (NORMALISED, ISOTROPIC):
-        raise view.error("intrinsics_format", f"is {str(kind)[:40]!r}; {ISOTROPIC} is known")
+        raise view.error("intrinsics_format", f"is {quoted(kind, 40)}; {ISOTROPIC} is known")
     scale = half if kind == NORMALISED else half.min()
     focal, centre = focal * scale, half - centre * scale
     if not (focal > 1 / MOST).all():

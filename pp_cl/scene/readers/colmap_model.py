@@ -15,6 +15,7 @@ from pathlib import Path, PurePosixPath
 import numpy as np
 
 from pp_cl.errors import UserError
+from pp_cl.files.regular import refusal
 from pp_cl.scene.readers.frame import MOST
 
 # id in binary files, number of parameters, of every model of COLMAP that has a focal length
@@ -147,7 +148,7 @@ def _lines(file):
                     raise UserError(f"{file}: line {number}: does not end; copy it anew")
                 yield number, line.strip()
     except (OSError, ValueError) as error:
-        raise UserError(f"{file}: cannot be read as text ({error}); copy it anew") from None
+        raise refusal(file, error, "text") from None
 
 
 def _text_cameras(file):
@@ -247,7 +248,7 @@ def _opened(file) -> Iterator[_Bytes]:
         with file.open("rb") as opened:
             yield _Bytes(file, opened)
     except OSError as error:
-        raise UserError(f"{file}: cannot be read ({error.strerror}); copy it anew") from None
+        raise refusal(file, error, "COLMAP's") from None
 
 
 def _binary_cameras(file):

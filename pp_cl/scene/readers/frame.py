@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from pp_cl.errors import UserError
+from pp_cl.files.regular import read_regular, refusal
 from pp_cl.scene.camera import Camera
 from pp_cl.scene.distortion import Distortion
 
@@ -18,6 +19,7 @@ COEFFICIENTS = ("k1", "k2", "p1", "p2", "k3")  # of Distortion
 # values of camera_model that are pinhole cameras when those coefficients are 0
 PINHOLES = ("PERSPECTIVE", "PINHOLE", "SIMPLE_PINHOLE", "OPENCV", "SIMPLE_RADIAL", "RADIAL")
 
+MOST_BYTES = 2**30  # of a JSON file; a frame takes some hundred
 MOST = 1e30  # larger numbers are refused: float32 could not hold their products
 # largest eigenvalue of R^T R - 1 that is taken for rounding; NeRF-synthetic has 1e-6
 ROTATION_TOLERANCE = 1e-3
@@ -28,14 +30,14 @@ GL_FROM_CV = np.diag([1.0, -1.0, -1.0, 1.0])  # OpenGL: y up, z backward; OpenCV
 def read_json(file: Path) -> Any:
     """Content of a JSON file. Raises UserError naming the file and the place that is broken."""
     try:
-        data = json.loads(file.read_text(encoding="utf-8-sig"))
+        data = json.loads(read_regular(file, MOST_BYTES, "utf-8-sig"))
     except json.JSONDecodeError as error:
         raise UserError(
             f"{file}: line {error.lineno}, column {error.colno}: {error.msg}; correct the JSON"
             " there"
         ) from None
     except (OSError, ValueError, RecursionError) as error:
-        raise UserError(f"{file}: cannot be read as JSON ({error}); copy it anew") from error
+        raise refusal(file, error, "JSON") from error
     return data
 
 

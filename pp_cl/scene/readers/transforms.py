@@ -49,7 +49,7 @@ def read_split(folder: Path, split: str) -> list[Photograph]:
 
 
 def _split_files(folder):
-    return list(folder.glob("transforms_*.json"))
+    return [file for file in folder.glob("transforms_*.json") if file.is_file()]
 
 
 def _read(file):

@@ -4,6 +4,7 @@ input.
 
 import gzip
 import json
+import os
 
 import numpy as np
 import pytest
@@ -242,6 +243,24 @@ def test_bad_file(sequence, case):
 def test_annotations_beyond_all_bounds(sequence, monkeypatch):
     monkeypatch.setattr("pp_cl.scene.readers.co3d.MOST_TEXT", 1000)
     refused(sequence, "more than 1000 bytes")
+
+
+def test_a_set_list_that_is_a_pipe_is_not_waited_for(sequence):
+    file = next((sequence.parent / "set_lists").iterdir())
+    file.unlink()
+    os.mkfifo(file)
+    with pytest.raises(UserError, match=f"{file.name}: cannot be read .Not a regular file"):
+        read_split(sequence, "train")
+
+
+def test_a_size_that_is_nested_deeply_is_quoted(sequence):
+    deep = []
+    for _ in range(400):
+        deep = [deep]
+    edit(sequence, lambda own: own["image"].update(size=deep))
+    with pytest.raises(UserError, match=r"has the size \[\[") as caught:
+        read_split(sequence, "train")
+    assert len(str(caught.value)) < 400
 
 
 def test_an_unknown_split(sequence):

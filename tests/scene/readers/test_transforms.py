@@ -2,6 +2,7 @@
 
 import json
 import math
+import os
 
 import numpy as np
 import pytest
@@ -9,6 +10,7 @@ from support.transforms_scenes import SIZE, opengl_pose, refused, train_views, w
 
 from pp_cl.files.image import read_rgba, write_png
 from pp_cl.scene.load import load_scene
+from pp_cl.scene.readers import transforms
 
 # -------------------------------------------------------------------------------------------------
 
@@ -245,6 +247,16 @@ def test_frame_that_is_no_object(tmp_path):
 def test_broken_json(tmp_path, text, words):
     (tmp_path / "transforms_train.json").write_text(text, errors="surrogateescape")
     refused(tmp_path, tmp_path / "transforms_train.json", *words)
+
+
+def test_a_pipe_is_no_file_of_cameras(tmp_path):
+    """Nor is it waited for."""
+    write_scene(tmp_path)
+    os.mkfifo(tmp_path / "transforms_val.json")
+    assert "val" not in transforms.splits(tmp_path)
+    (tmp_path / "transforms_train.json").unlink()
+    os.mkfifo(tmp_path / "transforms_train.json")
+    refused(tmp_path, tmp_path, "no scene in it")
 
 
 def test_json_cut_anywhere(tmp_path):

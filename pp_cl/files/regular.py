@@ -1,0 +1,49 @@
+"""Files that other programs wrote, looked at before they are read."""
+
+import errno
+import os
+import stat
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import BinaryIO
+
+from pp_cl.errors import UserError, shown
+
+MOST_REASON = 120  # characters
+
+
+@contextmanager
+def opened_regular(path: Path | str) -> Iterator[BinaryIO]:
+    """The opened file. Raises OSError where there is none, or where a folder is in its place, or a
+    pipe or a device, which may never end.
+    """
+    descriptor = os.open(path, os.O_RDONLY | getattr(os, "O_NONBLOCK", 0))
+    if not stat.S_ISREG(os.fstat(descriptor).st_mode):
+        os.close(descriptor)
+        raise OSError(errno.EINVAL, "Not a regular file", str(path))
+    with open(descriptor, "rb") as file:
+        yield file
+
+
+def read_regular(path: Path | str, most: int, encoding: str = "utf-8") -> str:
+    """The text of a file of at most so many bytes. Raises OSError as opened_regular, ValueError for
+    a larger one and for what is no such text.
+    """
+    with opened_regular(path) as file:
+        content = file.read(most + 1)
+    if len(content) > most:
+        raise ValueError(f"larger than {most} bytes")
+    return content.decode(encoding)
+
+
+def refusal(path: Path | str, error: Exception, kind: str, mend: str = "copy it anew") -> UserError:
+    """The UserError about a file that could not be read as `kind`: by the system's word, which has
+    another mend than a content that is broken.
+    """
+    if isinstance(error, OSError) and error.errno is not None:
+        return UserError(
+            f"{path}: cannot be read ({error.strerror}); check its permissions and the disk"
+        )
+    reason = shown(str(error), MOST_REASON) or type(error).__name__
+    return UserError(f"{path}: cannot be read as {kind} ({reason}); {mend}")

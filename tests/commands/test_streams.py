@@ -1,0 +1,81 @@
+"""The program with streams as shells give them: it ends as it would have, without a traceback."""
+
+import io
+import os
+import subprocess
+import sys
+
+import pytest
+
+from pp_cl.cli import main
+from pp_cl.commands.streams import usable_streams
+
+NOTHING = ("eval", "no/such/run")
+NO_RUN = b"pp-cl: no/such/run/config.json: No such file or directory; is this the folder of a run?"
+
+
+def program(words, **options):
+    """The ended process of pp-cl."""
+    options = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE} | options
+    words = [sys.executable, "-m", "pp_cl", *words]
+    return subprocess.run(words, timeout=120, check=False, **options)
+
+
+@pytest.mark.parametrize("buffered", [True, False])
+def test_output_that_nobody_reads(buffered):
+    reading, writing = os.pipe()
+    os.close(reading)
+    environment = os.environ | ({} if buffered else {"PYTHONUNBUFFERED": "1"})
+    done = program(["devices"], stdout=writing, env=environment)
+    os.close(writing)
+    assert done.returncode == 141
+    assert done.stderr.splitlines() == [b"pp-cl: nobody reads the output any more"]
+
+
+def test_errors_that_nobody_reads():
+    reading, writing = os.pipe()
+    os.close(reading)
+    assert program(NOTHING, stderr=writing).returncode == 2
+    os.close(writing)
+
+
+@pytest.mark.skipif(not os.path.exists("/dev/full"), reason="Linux has it")
+def test_streams_that_are_full():
+    with open("/dev/full", "wb") as full:
+        assert program(NOTHING, stderr=full).returncode == 2
+        done = program(["devices"], stdout=full)
+    assert done.returncode == 2
+    assert done.stderr.startswith(b"pp-cl: file: No space left on device")
+    assert done.stderr.count(b"\n") == 1
+
+
+def test_streams_that_are_closed():
+    done = [
+        subprocess.run(
+            ["/bin/sh", "-c", f'exec "$0" -m pp_cl eval no/such/run {closed}', sys.executable],
+            stderr=subprocess.PIPE,
+            check=False,
+        )
+        for closed in (">&-", "2>&-")
+    ]
+    assert [one.returncode for one in done] == [2, 2]
+    assert done[0].stderr.splitlines() == [NO_RUN] and done[1].stderr == b""
+
+
+def test_letters_that_an_encoding_lacks(tmp_path):
+    path = tmp_path / "gr\u00fc\u00df"
+    done = program(["eval", str(path)], env=os.environ | {"PYTHONIOENCODING": "ascii"})
+    assert done.returncode == 2 and b"gr\\xfc\\xdf/config.json: No such file" in done.stderr
+
+
+def test_the_streams_of_a_caller_are_left_alone(monkeypatch):
+    """Texts that are no files, as a notebook has them."""
+    out, err = io.StringIO(), io.StringIO()
+    monkeypatch.setattr("sys.stdout", out)
+    monkeypatch.setattr("sys.stderr", err)
+    assert main(NOTHING) == 2
+    assert out.getvalue() == "" and err.getvalue().encode().strip() == NO_RUN
+    monkeypatch.setattr("sys.stderr", None)
+    with usable_streams():
+        print("nowhere", file=sys.stderr)
+    assert sys.stderr is None

@@ -1,0 +1,64 @@
+"""What is opened, and what is said of what cannot be read."""
+
+import errno
+import json
+import os
+from zipfile import BadZipFile
+
+import pytest
+
+from pp_cl.files.regular import MOST_REASON, opened_regular, read_regular, refusal
+
+
+def test_a_file_of_at_most_so_many_bytes(tmp_path):
+    file = tmp_path / "a.txt"
+    file.write_bytes(b"\xef\xbb\xbf" + "gr\u00fc\u00df".encode())
+    assert read_regular(file, 9) == "\ufeffgr\u00fc\u00df"
+    assert read_regular(str(file), 9, "utf-8-sig") == "gr\u00fc\u00df"
+    with pytest.raises(ValueError, match="larger than 8 bytes"):
+        read_regular(file, 8)
+    with opened_regular(file) as opened:
+        assert opened.read(3) == b"\xef\xbb\xbf" and opened.seek(0) == 0
+
+
+def test_a_text_of_another_encoding(tmp_path):
+    (tmp_path / "a.txt").write_bytes("gr\u00fc\u00df".encode("latin-1"))
+    with pytest.raises(ValueError, match="utf-8"):
+        read_regular(tmp_path / "a.txt", 100)
+
+
+def test_a_link_is_followed(tmp_path):
+    (tmp_path / "a.txt").write_text("a")
+    (tmp_path / "b.txt").symlink_to("a.txt")
+    assert read_regular(tmp_path / "b.txt", 1) == "a"
+
+
+def test_what_is_no_file_is_not_waited_for(tmp_path):
+    os.mkfifo(tmp_path / "pipe")
+    for path in (tmp_path / "pipe", tmp_path, "/dev/zero"):
+        with pytest.raises(OSError, match="Not a regular file") as caught:
+            read_regular(path, 100)
+        assert caught.value.errno == errno.EINVAL
+    with pytest.raises(FileNotFoundError):
+        read_regular(tmp_path / "none", 100)
+
+
+def test_the_mend_fits_the_reason():
+    """A disk that fails and a file that may not be read are not mended by another copy."""
+    denied = PermissionError(errno.EACCES, "Permission denied", "a.png")
+    assert str(refusal("a.png", denied, "PNG")) == (
+        "a.png: cannot be read (Permission denied); check its permissions and the disk"
+    )
+    assert str(refusal("a.png", OSError("image file is truncated"), "PNG")) == (
+        "a.png: cannot be read as PNG (image file is truncated); copy it anew"
+    )
+    broken = BadZipFile("two\nlines " + "x" * 500)
+    said = str(refusal("a.npz", broken, "arrays", "write it anew"))
+    assert said.startswith("a.npz: cannot be read as arrays (two lines xxx")
+    assert said.endswith("...); write it anew") and len(said) < MOST_REASON + 60
+    assert "(EOFError)" in str(refusal("a", EOFError(), "JSON"))
+
+
+def test_a_json_may_be_read_so(tmp_path):
+    (tmp_path / "a.json").write_text('{"a": [1, 2]}')
+    assert json.loads(read_regular(tmp_path / "a.json", 2**10)) == {"a": [1, 2]}

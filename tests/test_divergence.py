@@ -1,0 +1,96 @@
+"""A training whose numbers are no longer finite: one line, the last good checkpoint, and NaN
+nowhere.
+"""
+
+import json
+
+import numpy as np
+import pytest
+from support.runs import arguments
+from support.scenes import write_ball_scene
+
+from pp_cl.cli import main
+from pp_cl.files.checkpoint import load_checkpoint
+from pp_cl.training.optimiser import Optimiser
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory):
+    """Folder of a small scene."""
+    return write_ball_scene(tmp_path_factory.mktemp("scene") / "ball")
+
+
+def rows(out):
+    return [json.loads(line) for line in (out / "log.jsonl").read_text().splitlines()]
+
+
+KEPT = "checkpoint.npz of step 10 is kept: train into another --out with a lower network.rate"
+# {what happens: (the step after which, to what, other settings, what is said)}
+DIVERGENCES = {
+    "points": (15, "points", {}, "the loss is not finite at step 16 (loss, l1, ssim, psnr)"),
+    "preview": (20, "points", {"train__checkpoint_every": 10}, "holds NaN after step 20"),
+    "measured": (
+        15,
+        "points",
+        {"train__eval_every": 15, "train__previews": 0},
+        "test/r_0.png holds NaN after step 15",
+    ),
+    "checkpoint": (20, "moment", {"train__previews": 0}, "holds NaN or Inf"),
+    "pruning": (20, "opacity", {"train__previews": 0, "train__prune_looks": 10**6}, "an opacity"),
+}
+
+
+@pytest.mark.parametrize("case", DIVERGENCES)
+def test_a_training_that_diverges_keeps_its_last_good_checkpoint(
+    scene, tmp_path, capsys, monkeypatch, case
+):
+    after, what, settings, words = DIVERGENCES[case]
+    _poison(monkeypatch, after, what)
+    settings = {"train__previews": 3} | settings
+    assert main(arguments(scene, tmp_path / "run", **settings)) == 2
+    line = capsys.readouterr().err.splitlines()[-1]
+    assert words in line and KEPT in line and str(tmp_path / "run") in line
+    header, arrays = load_checkpoint(tmp_path / "run" / "checkpoint.npz")
+    assert header["step"] == 10 and all(np.isfinite(a).all() for a in arrays.values())
+    logged = rows(tmp_path / "run")
+    assert logged[-1]["step"] in (10, 15, 20) and "NaN" not in json.dumps(logged)
+    drawn = sorted(path.name for path in (tmp_path / "run" / "previews").glob("*.png"))
+    assert drawn == [] or drawn[-1] <= "step_000015.png"
+
+
+def _poison(monkeypatch, after, what):
+    """NaN in an array after so many steps."""
+    update, steps = Optimiser.update, []
+
+    def poisoned(self, *args, **named):
+        update(self, *args, **named)
+        steps.append(0)
+        if len(steps) == after:
+            cloud = self.model.cloud
+            arrays = {
+                "points": cloud.sh[0],
+                "opacity": cloud.opacity,
+                "moment": next(iter(self.moments.values()))["m"],
+            }
+            self.dev.fill(arrays[what], np.nan)
+
+    monkeypatch.setattr(Optimiser, "update", poisoned)
+
+
+def test_a_training_that_diverges_at_its_end_is_not_finished(scene, tmp_path, capsys, monkeypatch):
+    """Averages would hide it."""
+    _poison(monkeypatch, 60, "moment")
+    assert main(arguments(scene, tmp_path / "run", train__previews=0)) == 2
+    line = capsys.readouterr().err.splitlines()[-1]
+    assert "holds NaN or Inf; " in line and "checkpoint.npz of step 50 is kept" in line
+    assert load_checkpoint(tmp_path / "run" / "checkpoint.npz")[0]["step"] == 50
+    assert not any(row.get("finished") for row in rows(tmp_path / "run"))
+
+
+def test_a_training_that_diverges_before_its_first_checkpoint(scene, tmp_path, capsys, monkeypatch):
+    _poison(monkeypatch, 3, "points")
+    assert main(arguments(scene, tmp_path / "run")) == 2
+    assert "at step 4 (loss, l1, ssim, psnr); nothing was kept: train into" in (
+        capsys.readouterr().err
+    )
+    assert not (tmp_path / "run" / "checkpoint.npz").exists()

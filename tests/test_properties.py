@@ -1,0 +1,190 @@
+"""Properties of what reads and writes texts, for whatever texts and numbers there are."""
+
+import dataclasses
+import json
+import math
+
+import numpy as np
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as arrays
+
+from pp_cl.config import Config, assign, load_config, preset, sections, text_of
+from pp_cl.errors import MOST_LINE, UserError, one_line, quoted, shown
+from pp_cl.files.checkpoint import load_checkpoint, save_checkpoint
+from pp_cl.files.run_folder import MOST_NUMBER, read_row
+from pp_cl.scene.readers.arrays import MOST, read_numbers
+from pp_cl.scene.readers.frame import rigid
+from pp_cl.sweep.plan import read_seeds, read_varied
+from pp_cl.view.messages import read_request
+
+# the same examples each time, none kept; tmp_path is written over by each
+many = settings(
+    max_examples=60,
+    deadline=None,
+    derandomize=True,
+    database=None,
+    suppress_health_check=[HealthCheck.function_scoped_fixture, HealthCheck.too_slow],
+)
+json_values = st.recursive(
+    st.none() | st.booleans() | st.integers() | st.floats() | st.text(),
+    lambda inner: st.lists(inner, max_size=4) | st.dictionaries(st.text(), inner, max_size=4),
+    max_leaves=12,
+)
+finite = st.floats(allow_nan=False, allow_infinity=False)
+
+
+@many
+@given(st.text() | st.text(min_size=1).map(lambda text: text * 300))
+def test_a_message_is_one_line_and_stays_as_it_is(text):
+    line = one_line(text)
+    assert (line.isprintable() or not line) and len(line) <= MOST_LINE and one_line(line) == line
+    if text.isprintable() and len(text) <= MOST_LINE:
+        assert line == text
+
+
+@many
+@given(json_values, st.integers(10, 200))
+def test_foreign_values_are_short(value, most):
+    for line in (quoted(value, most), shown(str(value), most)):
+        assert len(line) <= most and (line.isprintable() or not line)
+
+
+SETTINGS = [
+    (f"{section}.{item.name}", item)
+    for section, owner in sections(Config())
+    for item in dataclasses.fields(owner)
+    if section != "scene"
+]
+
+
+@st.composite
+def given_settings(draw):
+    """(key, a value within its limits)."""
+    key, item = draw(st.sampled_from(SETTINGS))
+    limits, several = item.metadata, isinstance(item.default, tuple)
+    kind = type(item.default[0]) if several else type(item.default)
+    one = {
+        bool: st.booleans(),
+        str: st.sampled_from(limits["choices"] or [item.default]),
+        int: st.integers(*(math.floor(limits[k] or 0) for k in ("least", "most"))),
+        float: st.floats(*(float(limits[k] or 0) for k in ("least", "most"))),
+    }[kind]
+    value = draw(st.tuples(*[one] * len(item.default)) if several else one)
+    return key, value
+
+
+@many
+@given(given_settings())
+def test_a_setting_is_itself_again_from_its_text(pair):
+    key, value = pair
+    section, _, name = key.partition(".")
+    config = preset("tiny")
+    assign(config, key, text_of(value), "a test")
+    assert getattr(getattr(config, section), name) == value
+
+
+@many
+@given(given_settings())
+def test_settings_are_themselves_again_from_their_file(tmp_path, pair):
+    config = preset("tiny")
+    config.scene.path = "demo"
+    assign(config, *pair, "a test")
+    (tmp_path / "config.json").write_text(config.to_json())
+    try:
+        assert load_config(tmp_path / "config.json") == config
+    except UserError as error:  # the one rule beyond limits
+        assert config.train.crop % 4 and "train.crop" in str(error)
+
+
+@many
+@given(json_values)
+def test_whatever_is_in_a_config_is_settings_or_one_line(tmp_path, value):
+    stored = json.loads(preset("tiny").to_json()) | {"train": value}
+    (tmp_path / "config.json").write_text(json.dumps(stored))
+    try:
+        load_config(tmp_path / "config.json")
+    except UserError as error:
+        assert str(error).startswith(f"{tmp_path}/config.json: ")
+        return
+    raise AssertionError(f"{value!r} was taken for the settings of a training")
+
+
+@many
+@given(st.integers(0, 10**9), finite.filter(lambda x: 0 <= x < MOST_NUMBER), json_values)
+def test_a_row_of_the_log_is_finite_or_none(step, seconds, value):
+    row = {"step": step, "seconds": seconds}
+    assert read_row(json.dumps(row)) == row
+    read = read_row(json.dumps(row | {"more": value}))
+    assert read is None or json.loads(json.dumps(read, allow_nan=False)) == row | {"more": value}
+    assert read_row(json.dumps(value)) is None or isinstance(value, dict)
+
+
+@many
+@given(st.binary(max_size=300))
+def test_no_bytes_of_a_log_or_of_a_message_are_an_error(data):
+    row = read_row(data)
+    assert row is None or row["step"] >= 0
+    try:
+        read_request(data.decode("utf-8", "replace"))
+    except UserError as error:
+        assert str(error)
+
+
+@many
+@given(st.lists(st.lists(finite.filter(lambda x: abs(x) < MOST), min_size=1), max_size=6))
+def test_numbers_in_a_text_come_back_exactly(tmp_path, rows):
+    text = "\n\n".join(" ".join(map(repr, row)) for row in rows)
+    (tmp_path / "a.txt").write_text(text)
+    assert read_numbers(tmp_path / "a.txt") == rows
+
+
+@many
+@given(st.dictionaries(st.from_regex(r"[a-z][a-z0-9.]{0,20}", fullmatch=True),
+                       arrays.arrays(st.sampled_from([np.float32, np.uint32, np.uint8]),
+                                     arrays.array_shapes(max_dims=4, max_side=4),
+                                     elements={"allow_nan": False, "allow_infinity": False}),
+                       max_size=4))  # fmt: skip
+def test_a_checkpoint_comes_back(tmp_path, stored):
+    stored = {f"x.{name}": array for name, array in stored.items()}
+    save_checkpoint(tmp_path / "a.npz", {"step": 1}, stored)
+    header, found = load_checkpoint(tmp_path / "a.npz")
+    assert header == {"format": 1, "step": 1} and found.keys() == stored.keys()
+    for name, array in stored.items():
+        assert found[name].dtype == array.dtype and np.array_equal(found[name], array)
+
+
+@many
+@given(arrays.arrays(np.float64, (3, 4), elements=st.floats(-2, 2)))
+def test_what_is_taken_for_a_pose_is_rigid(matrix):
+    """Near to what was given, for random matrices and for rotations that are off by little."""
+    u, _, vt = np.linalg.svd(matrix[:, :3])
+    turn = u @ np.diag([1, 1, np.linalg.det(u @ vt)]) @ vt
+    near = np.column_stack([turn + 1e-5 * matrix[:, :3], matrix[:, 3]])
+    for given_matrix in (matrix, near):
+        try:
+            pose = rigid(given_matrix, UserError)
+        except UserError:
+            assert given_matrix is matrix
+            continue
+        assert np.allclose(pose[:, :3] @ pose[:, :3].T, np.eye(3), atol=1e-12)
+        assert np.linalg.det(pose[:, :3]) > 0
+        assert np.abs(pose - given_matrix).max() < 1e-3
+
+
+@many
+@given(st.lists(st.integers(0, 2**31 - 1), min_size=1), st.sampled_from([",", " , "]))
+def test_seeds_are_sorted_and_each_once(seeds, comma):
+    assert read_seeds(comma.join(map(str, seeds))) == sorted(set(seeds))
+
+
+@many
+@given(given_settings())
+def test_a_value_that_is_varied_has_one_text(pair):
+    key, value = pair
+    if key == "train.seed":
+        return
+    text = text_of(value)
+    ((found, texts),) = read_varied([f"{key}={text}"])
+    assert found == key and texts == [text]
+    assert read_varied([f"{key}={texts[0]}"]) == [(key, texts)]
