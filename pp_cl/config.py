@@ -19,6 +19,8 @@ from pp_cl.settings import NetworkConfig, PointsConfig, RasterConfig, SceneConfi
 FORMAT = 2  # of config.json: raised when keys are added or change meaning
 MOST_BYTES = 2**20  # of a config.json
 MOST_TEXT = 4096  # characters of a setting
+# by network.blocks, how many convolutions there are but the last
+CONVOLUTIONS = {"double": 12, "single": 7, "gated": 7}
 MEND_SETTINGS = "restore it or start a new run"
 
 
@@ -122,10 +124,23 @@ def validate(config: Config, origin: str) -> None:
     for section, values in sections(config):
         for item in dataclasses.fields(values):
             _check(getattr(values, item.name), f"{origin}: {section}.{item.name}", **item.metadata)
+    _check_channels(config.network, origin)
     if config.train.crop % 4:
         raise UserError(
             f"{origin}: train.crop = {config.train.crop}; it must be a multiple of 4"
             " (0: whole images)"
+        )
+
+
+def _check_channels(network, origin):
+    """Raise UserError for network.channels that no network of these blocks can have."""
+    numbers = network.channels.split(",") if network.channels else []
+    count = CONVOLUTIONS[network.blocks]
+    sound = all(n.isascii() and n.isdigit() and 1 <= len(n) <= 4 and int(n) for n in numbers)
+    if numbers and not (sound and len(numbers) == count):
+        raise UserError(
+            f"{origin}: network.channels = {quoted(network.channels)}; it must be {count} numbers"
+            f" from 1 to 9999 where network.blocks is {network.blocks}, or none"
         )
 
 

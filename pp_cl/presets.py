@@ -105,6 +105,7 @@ ABSENT = {
     "raster.tau": 0.0,
     "raster.window": "image",
     "network.blocks": "double",
+    "network.channels": "",
     "network.tolerance": 1e-5,
     "train.opacity_rate_steps": 0,
     "train.mask_weight": 0.0,
@@ -119,4 +120,4 @@ ABSENT = {
 }
 
 # The format of config.json that first had a key of ABSENT; the others came with format 1.
-ADDED = {"train.checkpoint_minutes": 2}
+ADDED = {"train.checkpoint_minutes": 2, "network.channels": 2}

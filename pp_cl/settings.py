@@ -120,12 +120,22 @@ class NetworkConfig:
         " one times the sigmoid of another",
         choices=("double", "single", "gated"),
     )
+    channels: str = setting(
+        "",
+        "channels of each convolution but the last, in order, where a compressed model has fewer"
+        " than its widths say (none)",
+    )
     rate: tuple = setting(
         (1e-3, 1e-4), "Adam's learning rate at the first and the last step", 1e-12, 100
     )
     tolerance: float = setting(
         1e-5, "relative L2 error allowed for a convolution; the fastest variant is taken", 0, 1
     )
+
+    @property
+    def channel_numbers(self) -> tuple[int, ...]:
+        """`channels` as numbers, () where there are none."""
+        return tuple(int(number) for number in self.channels.split(",")) if self.channels else ()
 
 
 @dataclass

@@ -16,7 +16,6 @@ from pp_cl.compress.reduction import (
     Reduction,
     measured_psnr,
     nbytes,
-    point_weights,
 )
 from pp_cl.compress.search import frame_ms
 from pp_cl.layers.policy import make_policy
@@ -28,6 +27,7 @@ VIEWS = 8
 TRIED = {
     "keep": (0.9, 0.75, 0.5, 0.25),
     "half": (True,),
+    "channels": (0.001, 0.01, 0.1),
     "degree": (1, 0),
     "tau": (1e-4, 1e-3, 1e-2),
     "early_stop": (0.003, 0.01, 0.03),
@@ -62,7 +62,7 @@ def bench_models(runs: list[Run]) -> Iterator[dict[str, Any]]:
 
     for run in runs:
         yield row(str(run.folder), run)
-    original = Original(first, point_weights(first, first.cameras("train")))
+    original = Original.of(first)
     for what, reduction in _reductions(first):
         yield row(what, original.reduced(reduction))
     for name in offered(first.policy.device_class):

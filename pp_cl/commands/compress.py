@@ -35,7 +35,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(options: argparse.Namespace) -> None:
     """Search, print what was tried, write the compressed run."""
     from pp_cl.compress.output import REPORT, check_out, validation_views, write_compressed
-    from pp_cl.compress.reduction import Original, nbytes, point_weights
+    from pp_cl.compress.reduction import Original, nbytes
     from pp_cl.compress.search import Search, frame_ms
     from pp_cl.device.discover import open_device
     from pp_cl.trained import load_run
@@ -45,7 +45,7 @@ def run(options: argparse.Namespace) -> None:
     out = Path(options.out or f"{whole.folder.path.resolve()}-compressed")
     check_out(whole, out)
     which, views = validation_views(whole)
-    original = Original(whole, point_weights(whole, whole.cameras("train")))
+    original = Original.of(whole)
     search = Search(original, views, most_loss)
     print(f"{which}: {search.psnr:.2f} dB, may lose {most_loss:g}")
     print(COLUMNS("tried", "PSNR", "loss", "points", "MiB", "speed", ""))

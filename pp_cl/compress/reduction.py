@@ -8,6 +8,12 @@ from functools import cached_property
 
 import numpy as np
 
+from pp_cl.compress.channels import (
+    channel_weights,
+    channels_text,
+    kept_channels,
+    reduced_parameters,
+)
 from pp_cl.config import Config, assign
 from pp_cl.evaluate import render_views
 from pp_cl.export.observe import observe
@@ -27,11 +33,13 @@ class Reduction:
     """What is left of a model and how it is rendered.
 
     keep: share of the points, those that weigh most. half: the SH coefficients have 16 bits.
-    degree: of the SH. early_stop, tau, window: of raster; tolerance: network.tolerance.
+    channels: of the network only those go on that weigh this share of their layer's heaviest; 0:
+    all. degree: of the SH. early_stop, tau, window: of raster; tolerance: network.tolerance.
     """
 
     keep: float
     half: bool
+    channels: float
     degree: int
     early_stop: float
     tau: float
@@ -45,6 +53,7 @@ class Reduction:
         return cls(
             keep=1.0,
             half=run.model.cloud.sh[0].dtype == np.float16,
+            channels=0.0,
             degree=run.config.points.sh_degree,
             early_stop=raster.early_stop,
             tau=raster.tau,
@@ -66,11 +75,18 @@ class Reduction:
 @dataclass(frozen=True)
 class Original:
     """A trained run that reduced ones are made of. weights: (N,) float32, how much each point
-    contributes; see point_weights().
+    contributes; see point_weights(). channel_weights: see channels.channel_weights().
     """
 
     run: Run
     weights: np.ndarray
+    channel_weights: dict[str, np.ndarray]
+
+    @classmethod
+    def of(cls, run: Run) -> Original:
+        """A run, seen from its training cameras."""
+        cameras = run.cameras("train")
+        return cls(run, point_weights(run, cameras), channel_weights(run, cameras))
 
     @cached_property
     def arrays(self) -> dict[str, np.ndarray]:
@@ -86,7 +102,14 @@ class Original:
                 continue
             array = array[kept] if name.startswith("points.") else array
             arrays[name] = _half(array) if degree and reduction.half else array
-        return arrays
+        layers = self.run.model.net.layers
+        parameters = {n.removeprefix("net."): a for n, a in arrays.items() if n.startswith("net.")}
+        reduced = reduced_parameters(layers, parameters, self._kept(reduction))
+        return arrays | {f"net.{name}": array for name, array in reduced.items()}
+
+    def _kept(self, reduction):
+        """{layer: the channels that it keeps}."""
+        return kept_channels(self.run.model.net.layers, self.channel_weights, reduction.channels)
 
     def reduced(self, reduction: Reduction) -> Run:
         """The reduced run, on the same device."""
@@ -113,6 +136,9 @@ class Original:
         )
         for key, value in reduction.settings().items():
             assign(config, key, value, "compress")
+        if reduction.channels > 0 and self.channel_weights:
+            text = channels_text(self.run.model.net.layers, self._kept(reduction))
+            assign(config, "network.channels", text, "compress")
         return config
 
 

@@ -8,7 +8,8 @@ with a 1x1 convolution and a concatenation [upsampled, skip] on the way up; the 
 upsampling weights of a pixel add up to 1, so they commute, bias included, and it costs a quarter.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from dataclasses import replace
 
 from pp_cl.network.layer import Conv, Gate, Layer, Pool, Upsample
 
@@ -42,10 +43,34 @@ def unet_layers(
     channels_in: int = 16,
     channels_out: int = 3,
     blocks: str = "double",
+    *,
+    channels: Sequence[int] = (),
 ) -> list[Layer]:
     """The layers in the order of the forward pass. widths: channels of the three levels; blocks:
-    what a level computes, a key of BLOCKS.
+    what a level computes, a key of BLOCKS. channels: others, of each convolution but the last.
+    Raises ValueError for another number of them.
     """
+    layers = _of_widths(widths, channels_in, channels_out, blocks)
+    return _of_channels(layers, channels_in, [*channels, channels_out]) if channels else layers
+
+
+def _of_channels(layers, channels_in, channels):
+    """The same layers with other numbers of channels, those of each convolution."""
+    if len(channels) != len(convolutions(layers)):
+        raise ValueError(f"{len(channels)} numbers of channels, not {len(convolutions(layers))}")
+    found, numbers, changed = {"x": channels_in}, iter(channels), []
+    for layer in layers:
+        sources = tuple(found[name] for name in layer.inputs)
+        if isinstance(layer, Conv):
+            layer = replace(layer, channels=next(numbers), sources=sources)
+        else:
+            layer = replace(layer, channels=sources[0] // (2 if isinstance(layer, Gate) else 1))
+        found[layer.name] = layer.channels
+        changed.append(layer)
+    return changed
+
+
+def _of_widths(widths, channels_in, channels_out, blocks):
     w0, w1, w2 = widths
     block = BLOCKS[blocks]
     enc0 = block("enc0", ("x",), 0, w0, sources=(channels_in,))

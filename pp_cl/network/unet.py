@@ -1,6 +1,7 @@
 """The U-Net on a device: its parameters, and its layers run in order, forward and backward."""
 
 import math
+from collections.abc import Sequence
 
 import numpy as np
 from pyopencl.array import Array
@@ -31,6 +32,7 @@ class UNet:
     """The network, its parameters and gradients, and the buffers it works in.
 
     widths: channels of the three levels. blocks: what a level computes, of architectures.BLOCKS.
+    channels: as unet_layers() takes them.
     policy: which variants its convolutions take, None = as shipped, whatever their error. layers:
     network.layer.Layer in the order of the forward pass. parameters, gradients: {"enc0.a.weight":
     (ceil(CO/16), K, K, CI, 16), "enc0.a.bias": (ceil(CO/16) * 16,), ...} float32 on the device.
@@ -46,11 +48,12 @@ class UNet:
         channels_out: int = 3,
         *,
         blocks: str = "double",
+        channels: Sequence[int] = (),
         seed: int = 0,
         policy: ConvolutionPolicy | None = None,
     ):
         self.dev = dev
-        self.layers = unet_layers(widths, channels_in, channels_out, blocks)
+        self.layers = unet_layers(widths, channels_in, channels_out, blocks, channels=channels)
         self.channels_in = channels_in
         self.policy = policy or make_policy(dev)
         self.parameters = {}
@@ -74,7 +77,14 @@ class UNet:
         cls, dev: Device, settings: NetworkConfig, policy: ConvolutionPolicy, *, seed: int = 0
     ) -> "UNet":
         """The network of a run."""
-        return cls(dev, settings.widths, blocks=settings.blocks, seed=seed, policy=policy)
+        return cls(
+            dev,
+            settings.widths,
+            blocks=settings.blocks,
+            channels=settings.channel_numbers,
+            seed=seed,
+            policy=policy,
+        )
 
     def use(self, policy: ConvolutionPolicy) -> None:
         """Take the variants of another policy from the next image on."""

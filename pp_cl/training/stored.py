@@ -129,7 +129,9 @@ def stored_forms(config: Config, n: int, step: int, half: bool = False) -> dict[
     half: with coefficients of 16 bits, as a compressed run has them.
     """
     degree, colours = config.points.sh_degree, np.float16 if half else np.float32
-    network = parameter_table(unet_layers(config.network.widths, blocks=config.network.blocks))
+    settings = config.network
+    layers = unet_layers(settings.widths, blocks=settings.blocks, channels=settings.channel_numbers)
+    network = parameter_table(layers)
     table = {"points.ids": ((n,), np.uint32), "points.opacity": ((n,), np.float32)}
     table |= {f"points.sh{d}": ((n, 2 * d + 1, 16), colours) for d in SH_DEGREES[: degree + 1]}
     table |= {f"net.{name}": row for name, row in network.items()}

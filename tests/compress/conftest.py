@@ -5,7 +5,7 @@ from support.runs import arguments
 from support.scenes import write_ball_scene
 
 from pp_cl.cli import main
-from pp_cl.compress.reduction import Original, point_weights
+from pp_cl.compress.reduction import Original
 from pp_cl.trained import load_run
 
 
@@ -21,5 +21,4 @@ def ball_run(tmp_path_factory):
 
 @pytest.fixture
 def original(dev, ball_run):
-    run = load_run(dev, ball_run)
-    return Original(run, point_weights(run, run.cameras("train")))
+    return Original.of(load_run(dev, ball_run))

@@ -65,6 +65,7 @@ def test_a_compressed_run_is_not_tried_again(original, views, monkeypatch):
         early_stop=0.03,
         tolerance=0.01,
         degree=0,
+        channels=0.1,
     )
     search = Search(original, views, 20.0)
     search.reduction = small

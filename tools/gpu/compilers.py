@@ -115,7 +115,8 @@ def version(target: str) -> str:
     if backend is _intel:
         with TemporaryDirectory() as folder:
             _run([find(OCLOC), "query", "OCL_DRIVER_VERSION"], folder)
-            return f"ocloc {Path(folder, 'OCL_DRIVER_VERSION').read_text().strip()}"
+            said = Path(folder, "OCL_DRIVER_VERSION").read_text()
+            return f"ocloc {said.strip().strip(chr(0))}"
     clang = f"clang {_version_said(CLANG)}"
     find(NVIDIA_LIBRARY if backend is _nvidia else AMD_LIBRARY)
     return f"{clang}, ptxas {_version_said(PTXAS)}" if backend is _nvidia else clang
