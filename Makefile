@@ -20,7 +20,7 @@ ON_OCLGRIND := OCL_ICD_VENDORS=/usr/lib/oclgrind/liboclgrind-rt-icd.so OCLGRIND_
 	OCLGRIND_NUM_THREADS=1 OCLGRIND_BUILD_OPTIONS="-cl-opt-disable -DALWAYS_INLINE=static" PYOPENCL_NO_CACHE=1 \
 	PP_DEVICE=Oclgrind PP_DATA=/nonexistent
 
-.PHONY: help setup demo test test-intel bench lint format docs wheel oclgrind gpu-check fuzz faults test-coarse test-gpu-form clean
+.PHONY: help setup demo test test-slow test-intel bench lint format docs wheel oclgrind gpu-check fuzz faults test-coarse test-gpu-form clean
 
 help: ## print this list
 	@sed -n 's/^\([a-z-]*\):.*## \(.*\)/\1	\2/p' Makefile | expand -t 12
@@ -38,6 +38,9 @@ demo: $(READY) ## train the demo scene into runs/demo and evaluate it: minutes o
 
 test: $(READY) ## run the tests on the device of PP_DEVICE, else on all that work, a process a core
 	@$(BIN)/python -m pytest $(ON_ALL_CORES) $(ARGS)
+
+test-slow: $(READY) ## run the tests that `make test` leaves out: what others show in part, at more length
+	@$(BIN)/python -m pytest $(ON_ALL_CORES) -m slow $(ARGS)
 
 test-intel: $(READY) ## the same on Intel's CPU runtime, installed into .venv if need be (x86-64)
 	@$(BIN)/python tools/setup_opencl.py --intel

@@ -164,8 +164,6 @@ def configure(config: Config, scene: str, given: Iterable[tuple[str, Any, str]] 
     path = scene if scene == "demo" else str(Path(scene).resolve())
     assign(config, "scene.path", path, "settings")
     for key, value, origin in given:
-        if key == "scene.path":
-            raise UserError(f"{origin}: scene.path is what SCENE says; give it there")
         assign(config, key, value, origin)
     if config.scene.masks:
         assign(config, "scene.masks", str(Path(config.scene.masks).resolve()), "settings")

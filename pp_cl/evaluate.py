@@ -97,7 +97,7 @@ def evaluate(
     means = mean([{name: row[name] for name in metrics} for row in rows])
     result = {"split": split, "device": run.dev.name, "mean": means, "per_image": rows}
     result |= _about(run, costs) | _published(scene, split, views)
-    write_json(run.folder.metrics(split), result)
+    write_json(target / "metrics.json", result)
     write_comparison(target / "comparison.png", *zip(*shown, strict=True))
     return result
 

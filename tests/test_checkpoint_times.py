@@ -48,6 +48,7 @@ def saved(monkeypatch):
     return steps
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "every, minutes, expected",
     [

@@ -40,7 +40,13 @@ DIVERGENCES = {
 }
 
 
-@pytest.mark.parametrize("case", DIVERGENCES)
+@pytest.mark.parametrize(
+    "case",
+    [
+        case if case == "points" else pytest.param(case, marks=pytest.mark.slow)
+        for case in DIVERGENCES
+    ],
+)
 def test_a_training_that_diverges_keeps_its_last_good_checkpoint(
     scene, tmp_path, capsys, monkeypatch, case
 ):

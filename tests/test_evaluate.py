@@ -200,6 +200,8 @@ def changed_scene(run, tmp_path, split, name):
 
 
 def test_another_scene_is_refused_and_nothing_written(run, tmp_path, capsys):
+    assert main(["eval", str(run)]) == 0
+    capsys.readouterr()
     before = (run / "eval" / "metrics.json").read_bytes()
     other = write_ball_scene(tmp_path / "other", size=60, views=7)
     changed = changed_scene(run, tmp_path, "train", "r_0.png")

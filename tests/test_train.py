@@ -20,6 +20,7 @@ from support.runs import arguments, train_and_interrupt
 from support.scenes import write_ball_scene
 
 from pp_cl.cli import main
+from pp_cl.config import FORMAT
 from pp_cl.files.checkpoint import load_checkpoint, save_checkpoint
 from pp_cl.train import Trainer
 
@@ -143,7 +144,7 @@ def test_a_run_from_before_there_were_blocks_has_double_ones(finished, tmp_path,
     run = tmp_path / "run"
     shutil.copytree(finished, run)
     stored = json.loads((run / "config.json").read_text())
-    assert stored["network"].pop("blocks") == "double" and stored.pop("format") == 1
+    assert stored["network"].pop("blocks") == "double" and stored.pop("format") == FORMAT
     (run / "config.json").write_text(json.dumps(stored))
     for folder in (finished, run):
         assert main(["eval", str(folder)]) == 0

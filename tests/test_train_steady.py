@@ -75,8 +75,17 @@ class Recorder:
         return "read" if there else "waits"
 
 
-@pytest.mark.parametrize("planned", [False, True])
-@pytest.mark.parametrize("name", SETTINGS)
+@pytest.mark.parametrize(
+    "name, planned",
+    [
+        ("tiny", False),
+        ("paper", True),
+        *(
+            pytest.param(*case, marks=pytest.mark.slow)
+            for case in (("tiny", True), ("paper", False), ("paper, crops", True))
+        ),
+    ],
+)
 def test_a_step_waits_once_and_allocates_nothing(dev, scene, tmp_path, monkeypatch, name, planned):
     """planned: with background tiles left out, as in large images."""
     if planned:

@@ -336,11 +336,15 @@ class Ema:
         self.arrays: dict[str, Array] = {}
 
     def update(self, parameters: dict[str, Array], weight: float) -> None:
-        """Move the averages towards the parameters by `weight`; a weight of 1 starts them there."""
+        """Move the averages towards the parameters by `weight`; the first call starts them there,
+        as does a weight of 1.
+        """
         for name, parameter in parameters.items():
-            if name not in self.arrays:
+            if name in self.arrays:
+                ema_update(self.dev, self.arrays[name], parameter, weight)
+            else:
                 self.arrays[name] = self.dev.empty(parameter.shape)
-            ema_update(self.dev, self.arrays[name], parameter, weight)
+                self.dev.copy(self.arrays[name], parameter)
 
     def apply(self, parameters: dict[str, Array]) -> None:
         """Copy the averages, if there are any, into the parameters and release them."""

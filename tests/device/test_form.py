@@ -55,7 +55,10 @@ def test_lanes(dev, monkeypatch):
     assert channel_ranges(dev, 30, 20, 40) == ((40, 20, 30), (16, 4, 1))
 
 
-@pytest.mark.parametrize("name", IN_GPU_FORM)
+@pytest.mark.parametrize(
+    "name",
+    [*IN_GPU_FORM[:3], *(pytest.param(name, marks=pytest.mark.slow) for name in IN_GPU_FORM[3:])],
+)
 def test_the_form_for_gpus_computes_the_same(dev, monkeypatch, name):
     monkeypatch.setattr(dev, "is_cpu", False)
     case = next(case for case in CASES if case.name == name)

@@ -48,6 +48,7 @@ def test_a_failing_call_is_one_line_and_the_next_start_ends_at_the_same_bytes(ca
     assert (tally.tried, tally.stopped, tally.went_on) == (8, 7, 1)
 
 
+@pytest.mark.slow
 def test_other_bytes_at_the_end_are_found(case):
     other = Case(case.bench, None, case.words)
     other.expected["log.jsonl"] += b"more"

@@ -221,6 +221,7 @@ def test_the_advice_of_the_command_is_taken(plain, tmp_path, monkeypatch, capsys
     assert plain.peak_bytes <= 24 * MIB
 
 
+@pytest.mark.slow
 def test_a_refinement_that_does_not_fit_keeps_what_is_learned(plain, tmp_path, monkeypatch, capsys):
     """More points are left than the plan took them to be."""
     scene = write_ball_scene(tmp_path / "ball", size=64)

@@ -83,7 +83,9 @@ def zero_weights():
     return weights | {f"head{i}": np.zeros(width, np.float32) for i, width in enumerate(WIDTHS)}
 
 
-@pytest.mark.parametrize("changes", WAYS)
+@pytest.mark.parametrize(
+    "changes", [*WAYS[:4], *(pytest.param(way, marks=pytest.mark.slow) for way in WAYS[4:])]
+)
 def test_the_plan_is_what_a_training_takes(dev, tmp_path, monkeypatch, changes):
     monkeypatch.setattr("pp_cl.metrics.lpips.load_weights", zero_weights)
     trainer, plan, peak = trained(dev, tmp_path / "ball", changes)
