@@ -21,7 +21,7 @@ from tools.fuzz.judge import Case, Finding, check_json
 from tools.fuzz.templates import World
 from tools.fuzz.worker import SURFACES, try_input
 
-COUNT = 75
+COUNT = 50
 
 
 def drawn(seed):

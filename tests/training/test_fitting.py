@@ -202,6 +202,7 @@ def run(dev, monkeypatch, *words):
     return main(list(words))
 
 
+@pytest.mark.slow
 def test_the_advice_of_the_command_is_taken(plain, tmp_path, monkeypatch, capsys):
     """The device refuses what is more than it has, so that the plan cannot be too small."""
     scene = write_ball_scene(tmp_path / "ball", size=64)
