@@ -1,5 +1,8 @@
 // The weight side of a K x K convolution (K = KERNEL_SIZE): its weight and bias gradients, and the
 // flipped weights from which its input gradient is computed.
+//
+// vec_type_hint: the vectors are written out; Intel's compiler would merge work-items into wider
+// ones.
 #include "common.h"
 #include "layers/tiles.h"
 #include "vector.h"
@@ -18,7 +21,7 @@
 
 // One work-item per (output channel, ky * K + kx, 16 input channels from `first` on): reads 16
 // weights, writes them as one vector at the mirrored place. Lanes beyond c are 0.
-kernel void conv_flip_weights(
+kernel __attribute__((vec_type_hint(float16))) void conv_flip_weights(
     const int c,  // channels taken
     const int co,
     const int first,             // first channel taken
@@ -47,7 +50,7 @@ static inline float16 counted(global const float *grad, const float count, const
 // walks its rows of x with the gradients of the K output pixels that see each pixel, and writes its
 // part of the sums: dL/dweight in rows (ky, kx, channel) of partial, dL/dbias in the last row.
 // Needs no border test: it visits only pixels that exist. A gradient counts as often as its tile.
-kernel void conv_backward_weights(
+kernel __attribute__((vec_type_hint(float16))) void conv_backward_weights(
     const int height,
     const int width,
     const int c,
@@ -124,7 +127,7 @@ kernel void conv_backward_weights(
 
 // One work-item per (row of partial, 16 output channels): adds the parts in order; writes one
 // vector of a gradient.
-kernel void conv_sum_parts(
+kernel __attribute__((vec_type_hint(float16))) void conv_sum_parts(
     const int per_block,  // K * K * ci, rows of one block of weights
     const int blocks,
     const int parts,

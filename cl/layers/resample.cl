@@ -2,13 +2,16 @@
 // affine map (scale * x + offset). In all but the affine map a work-item is (LANES channels, x, y):
 // one vector of a pixel, shorter at the last channels. It writes where its tile is computed
 // (tiles.h); max pooling writes everywhere.
+//
+// vec_type_hint: the vectors are written out; Intel's compiler would merge work-items into wider
+// ones.
 #include "common.h"
 #include "lanes.h"
 #include "layers/tiles.h"
 
 // One work-item per (LANES channels, x, y) of out: reads the 2x2 pixels it covers, writes their
 // mean.
-kernel void avgpool2_forward(
+kernel __attribute__((vec_type_hint(floats))) void avgpool2_forward(
     const int h,  // of out
     const int w,
     const int c,
@@ -30,7 +33,7 @@ kernel void avgpool2_forward(
 // One work-item per (LANES channels, x, y) of x: ADDS its share of grad_out to grad_x, which holds
 // the gradient from x's other use. If masked, it then sets it to 0 where x <= 0: x is the output of
 // a ReLU, grad_x becomes the gradient of that ReLU's input.
-kernel void avgpool2_backward(
+kernel __attribute__((vec_type_hint(floats))) void avgpool2_backward(
     const int h,  // of out
     const int w,
     const int c,
@@ -55,7 +58,7 @@ kernel void avgpool2_backward(
 
 // One work-item per (LANES channels, x, y) of out: reads the 2x2 pixels it covers, writes their
 // largest; an odd last row or column of x is left out, as PyTorch does.
-kernel void maxpool2_forward(
+kernel __attribute__((vec_type_hint(floats))) void maxpool2_forward(
     const int h,  // of out
     const int w,
     const int c,
@@ -78,7 +81,7 @@ kernel void maxpool2_forward(
 // 2x2 pixels that it covers, of equal ones at the first, as PyTorch does. x is the output of a
 // ReLU, and grad_x holds the gradient of its input from another use of x: nothing is added where x
 // is 0.
-kernel void maxpool2_backward(
+kernel __attribute__((vec_type_hint(floats))) void maxpool2_backward(
     const int h,  // of out
     const int w,
     const int c,
@@ -115,7 +118,7 @@ kernel void maxpool2_backward(
 // high and wide, that lie in its pixel, and all of them in one tile. Each is the pixel of x that
 // its centre lies in and the nearest ones beside it, weighted 3/4 and 1/4 along each axis
 // (bilinear, align_corners False, the border repeated).
-kernel void upsample2_forward(
+kernel __attribute__((vec_type_hint(floats))) void upsample2_forward(
     const int h,  // of x
     const int w,
     const int c,
@@ -147,7 +150,7 @@ kernel void upsample2_forward(
 
 // One work-item per (LANES channels, x, y) of x: gathers the 4x4 pixels of grad_out that read it,
 // writes their weighted sum.
-kernel void upsample2_backward(
+kernel __attribute__((vec_type_hint(floats))) void upsample2_backward(
     const int h,  // of x
     const int w,
     const int c,
@@ -176,7 +179,7 @@ kernel void upsample2_backward(
 }
 
 // One work-item per element: reads x, writes scale * x + offset.
-kernel void affine(
+kernel __attribute__((vec_type_hint(floats))) void affine(
     const uint n,
     const float scale,
     const float offset,

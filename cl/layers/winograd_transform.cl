@@ -6,6 +6,9 @@
 // weight comes to lie from 2^13 to 2^14, what a transform makes of it (at most 2.25 times as much)
 // below half's largest number 65504; what is larger than 2^-27 of the largest keeps all of half's
 // 11 bits.
+//
+// vec_type_hint: the vectors are written out; Intel's compiler would merge work-items into wider
+// ones.
 #include "layers/winograd.h"
 #include "reduce.h"
 
@@ -19,7 +22,7 @@ ALWAYS_INLINE float16 unit_of(const int16 largest) {
 }
 
 // One work-item per 16 output channels: reads all their weights and writes their units.
-kernel void winograd_transform_units(
+kernel __attribute__((vec_type_hint(float16))) void winograd_transform_units(
     const int ci,
     const int blocks,
     global const float16 *weight,  // (blocks, 3, 3, ci, 16)
@@ -35,7 +38,7 @@ kernel void winograd_transform_units(
 
 // One work-item per input channel c: the same for the flipped weights, whose output channels are
 // the input channels from `first` on.
-kernel void winograd_transform_flipped_units(
+kernel __attribute__((vec_type_hint(float16))) void winograd_transform_flipped_units(
     const int co,
     const int blocks,              // of input channels taken
     const int first,               // input channel
@@ -80,7 +83,7 @@ ALWAYS_INLINE void store_kernel(
 
 // One work-item per (input channel, 16 output channels): reads 3 x 3 weights (and, with HALF, their
 // units), writes their values at all positions.
-kernel void winograd_transform_weights(
+kernel __attribute__((vec_type_hint(float16))) void winograd_transform_weights(
     const int ci,
     const int blocks,
     global const float16 *weight,  // (blocks, 3, 3, ci, 16)
@@ -98,7 +101,7 @@ kernel void winograd_transform_weights(
 // One work-item per (output channel, 16 input channels from `first` on): the same for the mirrored
 // kernels with the roles of input and output channels exchanged, which the input gradient is made
 // with.
-kernel void winograd_transform_flipped_weights(
+kernel __attribute__((vec_type_hint(float16))) void winograd_transform_flipped_weights(
     const int co,
     const int blocks,             // of input channels taken
     const int first,              // input channel
