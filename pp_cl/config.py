@@ -106,6 +106,13 @@ def _finite(value):
     return number
 
 
+def _word(value):
+    word = str(value)
+    if not _is_path(word):
+        raise ValueError
+    return word
+
+
 def _truth(value):
     return {"true": True, "1": True, "false": False, "0": False}[str(value).lower()]
 
@@ -114,7 +121,7 @@ def _truth(value):
 KINDS = {
     int: ("a whole number", _whole),
     float: ("a finite number", _finite),
-    str: ("a word", str),
+    str: ("a word", _word),
     bool: ("true or false", _truth),
 }
 

@@ -154,6 +154,7 @@ def test_assign_converts_text(key, text, value):
         ("train.pixel_jitter", "perhaps", "true or false"),
         ("raster.radius", "nan", "finite number"),
         ("raster.gamma", "0.1,x", "finite number"),
+        ("scene.masks", "a\0b", "is not a word"),
     ],
 )
 def test_assign_refuses(key, text, message):

@@ -43,7 +43,7 @@ def read_mesh(path: Path | str) -> Mesh:
         raise
     except Exception as error:  # loaders meet broken files with whatever comes up
         raise refusal(path, error, "a mesh") from error
-    if made.faces.size == 0 or made.vertices.ndim != 2:
+    if made.faces.size == 0 or not made.vertices.shape[1:] == made.faces.shape[1:] == (3,):
         raise UserError(f"{path}: holds no triangles; export it as a triangle mesh")
     if made.faces.min() < 0 or made.faces.max() >= len(made.vertices):
         raise UserError(f"{path}: a face names a vertex that is not there; export it anew")

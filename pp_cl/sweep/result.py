@@ -60,7 +60,7 @@ def _measured(folder, header, metrics):
         means = {name: float(result["mean"][name]) for name in metrics}
         whole = result["finished"] is True and result["step"] == header["step"]
         values = means | {"points": int(result["points"]["final"]), "device": result["device"]}
-    except (OSError, ValueError, KeyError, TypeError, RecursionError):
+    except (OSError, ValueError, OverflowError, KeyError, TypeError, RecursionError):
         return None  # measured anew
     is_sound = isinstance(values["device"], str) and all(map(math.isfinite, means.values()))
     return values if whole and is_sound else None

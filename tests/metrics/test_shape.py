@@ -170,6 +170,11 @@ BAD_FILES = {
         b"OFF\n3 1 0\n0 0 0\n1 0 0\n0 1 0\n3 0 1 7\n",
         "not there|cannot be read",
     ),
+    "two coordinates": (
+        "mesh.obj",
+        b"v 0 0\nv 1 0\nv 0 1\nf 1 2 3\n",
+        "no triangles|cannot be read",
+    ),
     "unknown kind": ("mesh.xyz1", b"1 2 3", "cannot be read"),
     "truncated": ("mesh.stl", b"\0" * 90, "cannot be read|no triangles"),
 }

@@ -66,6 +66,8 @@ def test_a_measurement_of_an_earlier_checkpoint(job):
         lambda result: result["mean"].update(psnr=float("nan")),
         lambda result: result["mean"].update(psnr=float("inf")),
         lambda result: result["mean"].update(psnr=None),
+        lambda result: result["mean"].update(psnr=10**400),
+        lambda result: result["points"].update(final=float("inf")),
         lambda result: result.update(mean=[1, 2]),
         lambda result: result.pop("points"),
         lambda result: result.update(finished=False),
