@@ -122,7 +122,7 @@ class Renderer:
         self.model = model
         self.settings = settings
         self.cache = PairCache(dev, cache_bytes)
-        footprint = Footprint(settings.footprint)
+        self._footprint = footprint = Footprint(settings.footprint)
         self._projection = Projection(dev, footprint)
         self._pairs = PairBuilder(dev, footprint)
         self._weights = BLENDS[settings.blend](dev)
@@ -321,7 +321,8 @@ class Renderer:
         result = self.forward(camera, gamma, **options)
         size = result.features.shape[:2]
         with self.dev.stage("depth"):
-            arrays = depth_forward(self.dev, result.points, result.pairs, result.weights, size=size)
+            view = result.points, result.pairs, result.weights
+            arrays = depth_forward(self.dev, *view, footprint=self._footprint, size=size)
         alpha, *depths = (array.get() for array in arrays)
         return Picture(
             result.clamped(camera),

@@ -1,37 +1,65 @@
 // Alpha and depth of a view, from the blend weights of its pixels.
+//
+// A hit's depth is where the pixel's ray meets the point: the front of its sphere, or of the ball
+// of its radius where footprints are soft. Points stand for what surrounds them, so the surface
+// lies in front of their centres.
 #include "common.h"
+#include "raster/footprint.h"
 #include "raster/pair_role.h"
 
-// One work-item per pixel: reads its hits, nearest first, and where their points are, writes the
-// share of the pixel that is not background, and the depth of that along the camera's axis: the
-// mean by weight, and where half of the weight is reached, which grows evenly from hit to hit.
+#ifndef HAS_ROLES
+#define HAS_ROLES 1  // 0: no pair is dropped, and pair_role is not read
+#endif
+
+// Distance from the eye. range: the pair's depth. d: its closeness.
+static inline float surface_range(const float range, const float radius, const float d) {
+    return FOOTPRINT == SOFT ? range - radius * sqrt(d * (2.0f - d)) : range;
+}
+
+// One work-item per pixel: reads its hits, nearest first, and writes the share of the pixel that is
+// not background, and the depth of that along the camera's axis: the mean by weight, and where half
+// of the weight is reached, which grows evenly from hit to hit.
 kernel void depth_forward(
-    const uint hw,                      // pixels
-    global const uint *pixel_offset,    // (HW+1)
-    global const ulong *pixel_entry,    // (P) weight << 32 | point; no point: the list ends
-    global const float4 *point_camera,  // (N, 4) x, y, z, distance
-    global float *pixel_alpha,          // (H, W)
-    global float *pixel_depth,          // (H, W) infinite where nothing is hit, as the next
-    global float *pixel_median)         // (H, W)
+    const uint hw,                             // pixels
+    const uint radii,                          // 1 (all alike) or N
+    global const float *camera,                // (20) camera.h
+    global const float *point_radius,          // (radii)
+    global const uint *pixel_offset,           // (HW+1)
+    global const ulong *pair_key,              // (P) depth << 32 | pair, sorted within a pixel
+    global const uint2 *pair_point_closeness,  // (P, 2) point, bits of d
+    global const float2 *pair_weight,          // (P, 2) b and another
+    global const uchar *pair_role,             // (?) P with HAS_ROLES
+    global float *pixel_alpha,                 // (H, W)
+    global float *pixel_depth,                 // (H, W) infinite where nothing is hit, as the next
+    global float *pixel_median)                // (H, W)
 {
     const uint q = get_global_id(0);
     if (q >= hw) return;
-    const uint begin = pixel_offset[q];
-    uint end = begin;
-    float alpha = 0.0f, depth = 0.0f;
-    for (; end < pixel_offset[q + 1] && (uint)pixel_entry[end] != NONE; end++) {
-        const float b = as_float((uint)(pixel_entry[end] >> 32));
-        alpha += b;
-        depth += b * point_camera[(uint)pixel_entry[end]].z;
+    const Camera cam = camera_load(camera);
+    const float axis = camera_ray(&cam, q % cam.width, q / cam.width).z;
+    const uint begin = pixel_offset[q], end = pixel_offset[q + 1];
+    float alpha = 0.0f;
+    for (uint i = begin; i < end; i++) {
+        const uint pair = (uint)pair_key[i];
+        if (!HAS_ROLES || pair_role[pair] != DROPPED) alpha += pair_weight[pair].x;
     }
-    float reached = 0.0f, before = 0.0f, median = INFINITY;
-    for (uint i = begin; i < end && reached < 0.5f * alpha; i++) {
-        const float b = as_float((uint)(pixel_entry[i] >> 32));
-        const float z = point_camera[(uint)pixel_entry[i]].z;
-        const float share = b > 0.0f ? fmin((0.5f * alpha - reached) / b, 1.0f) : 1.0f;
-        median = i == begin ? z : before + share * (z - before);
+    bool is_first = true;
+    float depth = 0.0f, reached = 0.0f, before = 0.0f, median = 0.0f;
+    for (uint i = begin; i < end; i++) {
+        const uint pair = (uint)pair_key[i];
+        if (HAS_ROLES && pair_role[pair] == DROPPED) continue;
+        const uint2 hit = pair_point_closeness[pair];
+        const float b = pair_weight[pair].x, radius = point_radius[radii == 1 ? 0 : hit.x];
+        const float range = as_float((uint)(pair_key[i] >> 32));
+        const float z = axis * surface_range(range, radius, as_float(hit.y));
+        depth += b * z;
+        if (reached < 0.5f * alpha) {
+            const float share = b > 0.0f ? fmin((0.5f * alpha - reached) / b, 1.0f) : 1.0f;
+            median = is_first ? z : before + share * (z - before);
+        }
         reached += b;
         before = z;
+        is_first = false;
     }
     pixel_alpha[q] = fmin(alpha, 1.0f);
     pixel_depth[q] = alpha > 0.0f ? depth / alpha : INFINITY;

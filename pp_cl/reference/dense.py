@@ -49,6 +49,19 @@ def rays(camera: Any) -> np.ndarray:
     return r / np.linalg.norm(r, axis=1, keepdims=True)
 
 
+def surface_depth(
+    camera: Any, geometry: Arrays, radius: np.ndarray | float, kind: str
+) -> np.ndarray:
+    """(N, HW): where a pixel's ray meets the point, along the camera's axis; of a soft point the
+    front of its ball, by the closeness. geometry, radius (N,) and kind: as geometry() has them.
+    """
+    ranges, d = geometry["depth"], np.maximum(geometry["closeness"], 0)
+    if kind == "soft":
+        radius = np.broadcast_to(np.asarray(radius, np.float64), len(ranges))
+        ranges = ranges - radius[:, None] * np.sqrt(d * (2 - d))
+    return ranges * rays(camera)[:, 2]
+
+
 def geometry(
     camera: Any,
     positions: np.ndarray,

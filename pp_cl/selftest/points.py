@@ -171,6 +171,7 @@ class PairedPoints:
 
 NEAR, FAR = dense.DEPTH_RANGE
 # a camera of one pixel that looks along z from the origin
+AXIS_RADIUS = 0.001  # world units
 AXIS = replace(make_camera(1, 1), pose=np.eye(3, 4), fx=100.0, fy=100.0, cx=0.5, cy=0.5)
 
 
@@ -186,7 +187,7 @@ def blend_on_axis(
     in its own channel.
     """
     positions = np.stack([np.zeros(len(z)), np.zeros(len(z)), depth_at(z)], -1)
-    scene = PairedPoints(dev, AXIS, positions, 0.001)
+    scene = PairedPoints(dev, AXIS, positions, AXIS_RADIUS)
     scene.blend(np.asarray(opacity), gamma, np.resize(np.eye(16), (len(z), 16)), **options)
     return scene, scene.weight()[:, 0]
 

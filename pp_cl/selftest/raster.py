@@ -18,6 +18,7 @@ from pp_cl.scene.grid import Grid
 from pp_cl.selftest.case import EPS, SIZES, Case, Check, each, exact, finite, relative
 from pp_cl.selftest.points import (
     AXIS,
+    AXIS_RADIUS,
     FAR,
     Blended,
     PairedPoints,
@@ -150,21 +151,21 @@ def _shade(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
 
 def _depth(rule: str, dev: Device, rng: np.random.Generator) -> Iterator[Check]:
     """Alpha and mean depth by the blend weights; the median of three points by hand."""
-    for n in (31, 257):
-        blended = Blended(dev, rng, n, gamma=0.02, radius=0.4, rule=rule, tau=1e-2)
+    for n, kind in ((31, "soft"), (257, "soft"), (257, "sphere"), (33, "disc")):
+        blended = Blended(dev, rng, n, gamma=0.02, radius=0.4, rule=rule, tau=1e-2, kind=kind)
         scene = blended.scene
         alpha, depth, _ = _depths(dev, scene)
         weight = np.where(blended.role == DROPPED, 0, scene.weight()).astype(np.float64)
-        z = (blended.positions - scene.camera.eye) @ scene.camera.pose[:, 2]
+        z = dense.surface_depth(scene.camera, blended.geometry, blended.radius, kind)
         total = weight.sum(axis=0)
         hit = total > 0
         yield each(alpha, np.minimum(total, 1), SUMMED, floor=1e-2)
         yield exact(np.isinf(depth), ~hit)
-        mean = (weight * z[:, None]).sum(axis=0)[hit] / total[hit]
+        mean = (weight * z).sum(axis=0)[hit] / total[hit]
         yield relative(depth[hit], mean, SUMMED)
     scene, _ = blend_on_axis(dev, [0.9, 0.5, 0.1], [0.25, 1.0, 1.0], 0.1, rule="alpha")
     alpha, depth, median = _depths(dev, scene)
-    near, far = depth_at(0.9), depth_at(0.5)
+    near, far = depth_at(np.array([0.9, 0.5])) - AXIS_RADIUS
     for actual, expected in (
         (alpha, 1),
         (depth, 0.25 * near + 0.75 * far),
@@ -175,7 +176,8 @@ def _depth(rule: str, dev: Device, rng: np.random.Generator) -> Iterator[Check]:
 
 
 def _depths(dev, scene):
-    arrays = depth_forward(dev, scene.projected, scene.pairs, scene.weights, size=scene.shape)
+    view = scene.projected, scene.pairs, scene.weights
+    arrays = depth_forward(dev, *view, footprint=scene.footprint, size=scene.shape)
     return [array.get().ravel() for array in arrays]
 
 

@@ -65,6 +65,7 @@ def command_line(case: Case) -> None:
         option = rng.choice([*OPTIONS.get(name, ("--help",)), odd_text(rng)])
         words += [option] if rng.random() < 0.1 else [option, odd_text(rng)]
     words += ["--no-such"] if name in SOON else SHORTENED.get(name, ())
+    words = [word.replace("\0", "") for word in words]  # no process starts with such a word
     case.label = brief(" ".join(words[1:]))
     kept = os.getcwd()
     os.chdir(case.folder)  # words may name files

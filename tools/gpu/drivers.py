@@ -119,7 +119,7 @@ def blends(dev: Device, views: list[View]) -> None:
         for grad in (None, grad_alpha) if blend == "alpha" else (None,):
             result = renderer.rasterise(camera, GAMMA)
             renderer.backward_features(result, dev.zeros(result.features.shape), grad)
-    renderer.picture(camera, GAMMA)
+        renderer.picture(camera, GAMMA)
     scene = SCENES["pulsar"](dev, 60, 16, GAMMA)
     for blend, tau in product(BLENDS, (0.0, 0.01)):
         case = Case(blend, tau)
