@@ -164,6 +164,8 @@ BAD_FRAMES = {
     "3x3": ({"transform_matrix": MATRIX[:3, :3].tolist()}, "transform_matrix", "(3, 3)"),
     "ragged": ({"transform_matrix": [[1, 2], [3]]}, "transform_matrix", "4x4 or 3x4"),
     "words": ({"transform_matrix": "unknown"}, "transform_matrix", "4x4 or 3x4"),
+    "texts": ({"transform_matrix": MATRIX.astype(str).tolist()}, "transform_matrix", "4x4 or 3x4"),
+    "truths": ({"transform_matrix": np.eye(4, dtype=bool).tolist()}, "transform_matrix", "4x4"),
     "huge": ({"transform_matrix": [[10**400] * 4] * 4}, "transform_matrix", "4x4 or 3x4"),
     "scaled": (
         {"transform_matrix": (MATRIX * [1.01, 1.01, 1.01, 1]).tolist()},
