@@ -353,11 +353,11 @@ class Program:
 
         size: int or tuple of work-items, rounded up to the work-group size (kernels guard their
         tail); nothing is launched when it is 0. local: work-group size; None = DEFAULT_LOCAL.
-        multiply_adds: at most so many in all; where that may take too long for a watchdog, several
-        launches share the work-items, cut along the dimension `along`, for which the kernel must
-        use global ids alone. arguments: by parameter name. Raises TypeError (names, dtypes) and ValueError (shapes)
-        before anything is enqueued, UserError when the work-group is too large for the device or
-        the driver gives up.
+        multiply_adds: at most so many in all; where they may take too long for a watchdog, several
+        launches share the work-items, cut along the dimension `along`, in which the kernel must use
+        global ids alone. arguments: by parameter name. Raises TypeError (names, dtypes) and
+        ValueError (shapes) before anything is enqueued, UserError when the work-group is too large
+        for the device or the driver gives up.
         """
         kernel = self.kernels[kernel_name]
         values = kernel.arguments(arguments)
