@@ -65,6 +65,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("--tau", metavar="T,...", help="raster: weight that a pixel may drop (0,1e-4,1e-3,1e-2)")
     add("--gamma", metavar="G", help="raster: depth sharpness of the blend (0.01)")
     add("--budget", metavar="T", help="all: seconds that it may take, as 120 or 120s (120)")
+    shared.add_set(parser, "train: a setting in place of the paper preset's")
+    _add_outputs(add)
+    shared.add_tolerance(parser)
+    shared.add_device(parser)
+
+
+def _add_outputs(add):
+    """Options of what is written and printed."""
     add("--out", metavar="DIR", help="all: folder of bench.json and bench.html (bench)")
     add(
         "--report",
@@ -72,11 +80,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="all, train: also print a table in Markdown of what the stages of a step took, beside"
         " what they must take by the device's bandwidth and rate",
     )
-    shared.add_set(parser, "train: a setting in place of the paper preset's")
     add("--json", metavar="FILE", help="also write the rows there")
     add("--plot", metavar="FILE", help="also draw time against error there (.png, .svg, .pdf)")
-    shared.add_tolerance(parser)
-    shared.add_device(parser)
 
 
 def run(options: argparse.Namespace) -> None:

@@ -365,7 +365,8 @@ class Program:
         if ranges is None:
             return
         size, local = ranges
-        parts = math.ceil(multiply_adds / MOST_MULTIPLY_ADDS) if self.device.has_watchdog else 1
+        watched = multiply_adds > 0 and self.device.has_watchdog
+        parts = math.ceil(multiply_adds / MOST_MULTIPLY_ADDS) if watched else 1
         for offset, part in cut(size, local, parts, along) if parts > 1 else [(None, size)]:
             event = self.device.attempt(
                 f"run {kernel.label}",
@@ -376,5 +377,7 @@ class Program:
                 *values,
                 global_offset=offset,
             )
+            if watched:  # what drivers hand to the system together is timed together
+                self.device.queue.flush()
             if self.device.debug:
                 self.device.observe(kernel, event, arguments)

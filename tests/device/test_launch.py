@@ -237,9 +237,13 @@ def test_a_long_kernel_is_launched_in_parts_for_a_watchdog(
 ):
     monkeypatch.setattr(launch, "MOST_MULTIPLY_ADDS", 100)
     monkeypatch.setattr(dev, "has_watchdog", has_watchdog)
-    seen, kernel = [], program.kernels["rows"].kernel
+    seen, flushed, kernel, queue = [], [], program.kernels["rows"].kernel, dev.queue
 
-    def enqueue(queue, size, *args, global_offset):
+    class Watched:
+        def flush(self):
+            flushed.append(len(seen))
+
+    def enqueue(_, size, *args, global_offset):
         seen.append((global_offset, size))
         return kernel(queue, size, *args, global_offset=global_offset)
 
@@ -248,8 +252,13 @@ def test_a_long_kernel_is_launched_in_parts_for_a_watchdog(
     n = 200
     longer = np.resize(x, (n, 4))
     rows |= {"n": n, "x": dev.upload(longer), "y": dev.empty((n, 1))}
-    program.launch("rows", n, multiply_adds=multiply_adds, **rows)
+    with monkeypatch.context() as patch:
+        patch.setattr(dev, "queue", Watched())
+        program.launch("rows", n, multiply_adds=multiply_adds, **rows)
     assert seen == launched
+    # each part is handed to the system by itself
+    watched = has_watchdog and multiply_adds > 0
+    assert flushed == (list(range(1, len(launched) + 1)) if watched else [])
     np.testing.assert_allclose(
         rows["y"].get()[:, 0], 2 * longer.sum(1) + np.arange(n) % 3, rtol=1e-6
     )

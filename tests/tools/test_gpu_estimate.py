@@ -18,7 +18,8 @@ STAGES += ["network backward", "backward", "update", "peaks", "step"]
 def test_the_file_in_docs_is_up_to_date(tmp_path, capsys):
     assert TOOL.main(tmp_path / "x.json") == 0
     assert str(tmp_path / "x.json") in capsys.readouterr().out
-    assert (tmp_path / "x.json").read_text() == TOOL.RESULTS.read_text()
+    made, kept = (json.loads(path.read_text()) for path in (tmp_path / "x.json", TOOL.RESULTS))
+    assert made | {"version": kept["version"]} == kept
 
 
 def test_it_says_that_nobody_measured_it():
