@@ -113,7 +113,7 @@ def test_smaller_work_groups_compute_the_same_bits(dev, rng, monkeypatch, most):
     assert tried == [n for n in module.GROUPS if n >= most]
 
 
-@pytest.mark.parametrize("k", [1, 3])
+@pytest.mark.parametrize("k", [1, large(3)])
 def test_launches_in_parts_compute_the_same_bits(dev, rng, monkeypatch, k):
     x = rng.normal(size=(9, 30, 16)).astype(np.float32)
     weight, bias = layer(rng, 16, 64, k)
