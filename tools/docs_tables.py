@@ -5,7 +5,8 @@
 The table of docs/results/NAME.json stands between the lines `<!-- table: NAME -->` and
 `<!-- end table -->` of a Markdown file. A file of results holds
 
-    measured   what the numbers are; machine, command, version, commit: how they were obtained
+    measured   what the numbers are; machine, command, version, commit: how they were obtained.
+               estimated, in its place: what numbers are that nobody measured
     columns    [{"head": text, "cell": format}]: format is a str.format of the row's keys
     rows       [{key: value}]; a key that a row lacks is printed as nothing
     notes      sentences below the table, optional
@@ -44,14 +45,17 @@ def cell(template: str, row: dict) -> str:
 
 
 def table(results: dict) -> str:
-    """Markdown of a file of results: what was measured and how, the table, the notes."""
-    origin = f"Measured with version {results['version']}"
+    """Markdown of a file of results: what was measured (or estimated) and how, the table, the
+    notes.
+    """
+    kind = "estimated" if "estimated" in results else "measured"
+    origin = f"{kind.capitalize()} with version {results['version']}"
     origin += f" on {results['machine']}" if "machine" in results else ""
     origin += f": `{results['command']}`" if "command" in results else ""
-    measured = results["measured"]
+    what = results[kind]
     heads = [column["head"] for column in results["columns"]]
     rows = [[cell(column["cell"], row) for column in results["columns"]] for row in results["rows"]]
-    lines = [f"{measured[0].upper()}{measured[1:]}. {origin}.", ""]
+    lines = [f"{what[0].upper()}{what[1:]}. {origin}.", ""]
     lines += ["| " + " | ".join(line) + " |" for line in (heads, ["---"] * len(heads), *rows)]
     for note in results.get("notes", ()):
         lines += ["", note]

@@ -31,6 +31,12 @@ static inline int item_line(void) {
     return get_local_id(0) < ITEMS / 2 ? 0 : ROWS;
 }
 
+// The place in the list of the work-group's first tile. Not by the group's number: where launches
+// share the list, each counts its groups from 0.
+static inline int first_tile(void) {
+    return get_global_id(0) / ITEMS * GROUP_TILES;
+}
+
 // Copy CHUNK channels of x from c0 on to values [channel][tile][line][column], zeros around the
 // image, and their weights of all taps to weights [channel][tap][quad].
 ALWAYS_INLINE void stage(
@@ -115,7 +121,7 @@ ALWAYS_INLINE void convolve(
 
 // The corners of the work-group's tiles. The last groups take the last tile for those beyond.
 ALWAYS_INLINE void find_corners(local int2 *corner, global const int *tile_list) {
-    const int item = get_local_id(0), tile = get_group_id(0) * GROUP_TILES + item;
+    const int item = get_local_id(0), tile = first_tile() + item;
     if (item < GROUP_TILES)
         corner[item] = tile_corner(tile_list[3 + min(tile, tile_list[2] - 1)], tile_list[1]);
     barrier(CLK_LOCAL_MEM_FENCE);
@@ -152,7 +158,7 @@ kernel void conv_local_forward(
             acc, values, weights, corner, source ? x2 : x, source ? w + c1 * 4 : w,
             source ? c2 : c1, ci, height, width);
 
-    if (channel >= co || get_group_id(0) * GROUP_TILES + item_tile() >= tile_list[2]) return;
+    if (channel >= co || first_tile() + item_tile() >= tile_list[2]) return;
     const int2 at = corner[item_tile()] + (int2)(0, item_line());
 #pragma unroll
     for (int p = 0; p < ROWS * SIDE; p++) {
@@ -192,7 +198,7 @@ kernel void conv_local_backward_input(
         acc, values, weights, corner, grad_out, flipped + get_group_id(1) * QUADS * TAPS * co, co,
         co, height, width);
 
-    if (channel >= c || get_group_id(0) * GROUP_TILES + item_tile() >= tile_list[2]) return;
+    if (channel >= c || first_tile() + item_tile() >= tile_list[2]) return;
     const int2 at = corner[item_tile()] + (int2)(0, item_line());
 #pragma unroll
     for (int p = 0; p < ROWS * SIDE; p++) {

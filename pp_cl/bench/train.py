@@ -20,6 +20,7 @@ from pp_cl.training.optimiser import Rates
 
 STEP = 2000  # whose learning rates are taken; all SH degrees move
 CACHE_BYTES = 2 << 30
+WIDTHS = (16, 16, 16)  # of a network that is updated, but not run
 FORWARD = ("project", "pairs", "weights", "shade", "blend")
 
 
@@ -28,7 +29,7 @@ def make_trainer(dev: Device, config: Config) -> Trainer:
     views = open_scene(dev, config, ("train",)).splits["train"]
     hull = build_grid(dev, views, config.points.count, scene_box(config))
     near_far = depth_range(views, hull)
-    net = UNet(dev, widths=(16, 16, 16))
+    net = UNet(dev, widths=WIDTHS)
     model = Model.create(
         dev, hull.grid, hull.ids, near_far, net=net, degree=config.points.sh_degree
     )
@@ -38,7 +39,8 @@ def make_trainer(dev: Device, config: Config) -> Trainer:
 
 
 def bench_train(dev: Device, config: Config, views: int, rounds: int) -> dict:
-    """{"points", "pairs", "shaded", "stages_ms", "forward_ms", "backward_ms", "peak_device_bytes"}.
+    """{"points", "pairs", "shaded", "size", "stages_ms", "forward_ms", "backward_ms",
+    "peak_device_bytes"}; shaded: a share of the points, size: (height, width) of the padded view.
 
     views: evenly spread over the scene's. Times are medians over the views of all rounds;
     backward_ms includes the update.
@@ -73,6 +75,7 @@ def bench_train(dev: Device, config: Config, views: int, rounds: int) -> dict:
         "points": trainer.model.cloud.count,
         "pairs": result.pairs.total,
         "shaded": result.shaded.size / trainer.model.cloud.count,
+        "size": result.features.shape[:2],
         "stages_ms": stages,
         "forward_ms": sum(stages[name] for name in FORWARD),
         "backward_ms": stages["backward"] + stages["update"],

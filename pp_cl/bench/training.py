@@ -29,8 +29,8 @@ TIMED_FRAMES = 5
 
 def bench_training(dev: Device, seconds: float) -> dict[str, Any]:
     """{"scene", "preset", "steps", "points", "curve": rows of {"step", "seconds", "psnr"},
-    "step_ms", "frame_ms": {stage: {"ms", "least", "most"}}} of a training of about so many seconds,
-    those of the measurements aside.
+    "step_ms", "frame_ms": {stage: {"ms", "least", "most"}}, "counts": of estimate.Counts, means of
+    a few steps} of a training of about so many seconds, those of the measurements aside.
 
     The stages of a step are those of the last ones, each waited for: without waiting they overlap.
     """
@@ -51,6 +51,7 @@ def bench_training(dev: Device, seconds: float) -> dict[str, Any]:
         "points": trainer.model.cloud.count,
         "curve": curve,
         "step_ms": step_ms,
+        "counts": _counts(trainer),
         "frame_ms": _frame(trainer, demo.measured[0]),
     }
 
@@ -113,6 +114,25 @@ def _row(trainer, measured, seconds):
         psnr(to_8bit(trainer.render(view)), to_8bit(trainer.target(view))) for view in measured
     ]
     return {"step": trainer.step, "seconds": seconds, "psnr": float(np.mean(found))}
+
+
+def _counts(trainer):
+    """What steps like the last ones work on."""
+    pairs, shaded = [], []
+    for i in range(TIMED_STEPS):
+        index, box, jitter = trainer.draw(np.random.default_rng(i))
+        camera = trainer.views[index].crop_camera(box, jitter)
+        result = trainer.renderer.rasterise(camera, trainer.gamma[1])
+        pairs.append(result.pairs.total)
+        shaded.append(result.shaded.size)
+    height, width, _ = result.features.shape
+    return {
+        "points": trainer.model.cloud.count,
+        "pairs": round(np.mean(pairs)),
+        "shaded": round(np.mean(shaded)),
+        "height": height,
+        "width": width,
+    }
 
 
 def _frame(trainer, view):

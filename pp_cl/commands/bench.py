@@ -12,11 +12,11 @@ from pp_cl.errors import UserError
 HELP = "time against error of the convolutions, the network, the rasteriser, a training"
 # the options that only some benches have
 OPTIONS = {
-    "all": ("budget", "out"),
+    "all": ("budget", "out", "report"),
     "conv": ("size", "widths", "blocks", "plot"),
     "unet": ("size", "widths", "blocks", "plot", "tolerance"),
     "raster": ("size", "scene", "points", "blend", "tau", "gamma", "plot"),
-    "train": ("scene", "points", "set"),
+    "train": ("scene", "points", "set", "report"),
     "model": ("runs", "plot"),
 }
 VIEWS, ROUNDS = 3, 5  # of bench train: views of the scene, evenly spread, and rounds over them
@@ -65,12 +65,23 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("--tau", metavar="T,...", help="raster: weight that a pixel may drop (0,1e-4,1e-3,1e-2)")
     add("--gamma", metavar="G", help="raster: depth sharpness of the blend (0.01)")
     add("--budget", metavar="T", help="all: seconds that it may take, as 120 or 120s (120)")
-    add("--out", metavar="DIR", help="all: folder of bench.json and bench.html (bench)")
     shared.add_set(parser, "train: a setting in place of the paper preset's")
-    add("--json", metavar="FILE", help="also write the rows there")
-    add("--plot", metavar="FILE", help="also draw time against error there (.png, .svg, .pdf)")
+    _add_outputs(add)
     shared.add_tolerance(parser)
     shared.add_device(parser)
+
+
+def _add_outputs(add):
+    """Options of what is written and printed."""
+    add("--out", metavar="DIR", help="all: folder of bench.json and bench.html (bench)")
+    add(
+        "--report",
+        action="store_true",
+        help="all, train: also print a table in Markdown of what the stages of a step took, beside"
+        " what they must take by the device's bandwidth and rate",
+    )
+    add("--json", metavar="FILE", help="also write the rows there")
+    add("--plot", metavar="FILE", help="also draw time against error there (.png, .svg, .pdf)")
 
 
 def run(options: argparse.Namespace) -> None:
@@ -97,6 +108,7 @@ def _refuse_foreign(options):
 def _run_all(options):
     from pp_cl.bench.overview import bench_overview
     from pp_cl.bench.page import page_text
+    from pp_cl.config import configure
     from pp_cl.files.atomic import write_json, write_text
     from pp_cl.layers.policy import load_policy
 
@@ -111,6 +123,10 @@ def _run_all(options):
     result = bench_overview(dev, policy, budget, partial(print, flush=True))
     write_json(folder / "bench.json", result)
     write_text(folder / "bench.html", page_text(result))
+    if options.report:
+        training = result["training"]
+        stages = {name: row["ms"] for name, row in training["step_ms"].items()}
+        _print_report(dev, configure(preset("tiny"), "demo"), training["counts"], stages)
     print(f"{result['seconds']:.0f} s; wrote {folder / 'bench.json'} and {folder / 'bench.html'}")
 
 
@@ -158,7 +174,7 @@ def _run_raster(options):
 
 def _run_train(options):
     from pp_cl.bench.plots import check_files
-    from pp_cl.bench.train import bench_train
+    from pp_cl.bench.train import WIDTHS, bench_train
     from pp_cl.config import configure
 
     config = configure(preset("paper"), options.scene or "demo", shared.read_set(options.set))
@@ -177,7 +193,21 @@ def _run_train(options):
     for name, ms in row["stages_ms"].items():
         print(f"  {name:10s} {ms:9.2f} ms")
     print(f"forward {row['forward_ms']:.2f} ms, backward and update {row['backward_ms']:.2f} ms")
+    if options.report:
+        height, width = row["size"]
+        counts = {"points": row["points"], "pairs": row["pairs"], "height": height, "width": width}
+        counts["shaded"] = round(row["shaded"] * row["points"])
+        assign(config, "network.widths", WIDTHS, "bench")
+        stages = {name: ms for name, ms in row["stages_ms"].items() if name != "pairs"}  # kept ones
+        _print_report(dev, config, counts, stages)
     _write_json(options.json, dev, [row])
+
+
+def _print_report(dev, config, counts, stages_ms):
+    """A table to paste. counts: of estimate.Counts."""
+    from pp_cl.bench.estimate import Counts, report
+
+    print("", *report(dev, config, Counts(**counts), stages_ms), "", sep="\n")
 
 
 def _run_model(options):

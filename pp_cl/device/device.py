@@ -40,6 +40,14 @@ def vendor_options(info: dict[str, str | int], name: str) -> tuple[str, ...]:
     return ("-cl-intel-256-GRF-per-thread",) if large else ()
 
 
+def has_watchdog(device: cl.Device) -> bool:
+    """Whether the system may stop a kernel that takes long: only NVIDIA's driver says so."""
+    try:
+        return bool(device.kernel_exec_timeout_nv)
+    except (cl.Error, AttributeError):
+        return True
+
+
 def kernel_folder() -> Path:
     """The folder of the .cl files: inside the installed package, or beside it in a checkout."""
     inside = Path(__file__).parents[1] / "cl"
@@ -104,7 +112,8 @@ def _debug_level():
 
 class Device:
     """One OpenCL device with its queue, programs and buffers. debug: PP_DEBUG
-    (docs/environment.md). is_cpu: drivers and kernels take their form for CPUs.
+    (docs/environment.md). is_cpu: drivers and kernels take their form for CPUs. has_watchdog: long
+    kernels are launched in parts.
     """
 
     def __init__(self, device: cl.Device):
@@ -112,6 +121,7 @@ class Device:
         self.name = device.name.strip()
         self.info = describe(device)
         self.is_cpu = takes_cpu_form(device)
+        self.has_watchdog = not self.is_cpu and has_watchdog(device)
         self.debug = _debug_level()
         self.context = cl.Context([device])
         properties = cl.command_queue_properties.PROFILING_ENABLE if self.debug else 0

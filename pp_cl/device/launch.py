@@ -39,6 +39,10 @@ SCALARS = {
 # them, because PoCL compiles a kernel again for every new work-group size; hence the tail guards.
 DEFAULT_LOCAL = {1: (64,), 2: (16, 4), 3: (16, 4, 1)}
 
+# Systems reset a GPU that draws the screen when one kernel takes about 2 seconds. So many
+# multiply-adds take half a second where 100 GFLOP/s are reached; see docs/devices.md.
+MOST_MULTIPLY_ADDS = 25e9
+
 # Shapes and sizes of launches that a kernel remembers, so that it checks and rounds them once.
 REMEMBERED = 4096
 
@@ -284,6 +288,19 @@ def _kind(value):
     )
 
 
+def cut(
+    size: tuple[int, ...], local: tuple[int, ...], parts: int, along: int
+) -> Iterator[tuple[tuple[int, ...], tuple[int, ...]]]:
+    """(offset, work-items) of about so many launches that share `size` work-items, cut between the
+    work-groups along one dimension.
+    """
+    step = -(-size[along] // (local[along] * parts)) * local[along]
+    for first in range(0, size[along], step):
+        offset, part = [0] * len(size), list(size)
+        offset[along], part[along] = first, min(step, size[along] - first)
+        yield tuple(offset), tuple(part)
+
+
 @contextmanager
 def quiet_compiler() -> Iterator[None]:
     """Ignores that a compiler said something: Intel's does at every build, a good one too.
@@ -327,23 +344,40 @@ class Program:
         kernel_name: str,
         size: int | tuple[int, ...],
         local: int | tuple[int, ...] | None = None,
+        *,
+        multiply_adds: float = 0,
+        along: int = 0,
         **arguments,
     ) -> None:
         """Enqueue one kernel.
 
         size: int or tuple of work-items, rounded up to the work-group size (kernels guard their
         tail); nothing is launched when it is 0. local: work-group size; None = DEFAULT_LOCAL.
-        arguments: by parameter name. Raises TypeError (names, dtypes) and ValueError (shapes)
-        before anything is enqueued, UserError when the work-group is too large for the device or
-        the driver gives up.
+        multiply_adds: at most so many in all; where they may take too long for a watchdog, several
+        launches share the work-items, cut along the dimension `along`, in which the kernel must use
+        global ids alone. arguments: by parameter name. Raises TypeError (names, dtypes) and
+        ValueError (shapes) before anything is enqueued, UserError when the work-group is too large
+        for the device or the driver gives up.
         """
         kernel = self.kernels[kernel_name]
         values = kernel.arguments(arguments)
         ranges = kernel.ranges(size, local)
         if ranges is None:
             return
-        event = self.device.attempt(
-            f"run {kernel.label}", kernel.kernel, self.device.queue, *ranges, *values
-        )
-        if self.device.debug:
-            self.device.observe(kernel, event, arguments)
+        size, local = ranges
+        watched = multiply_adds > 0 and self.device.has_watchdog
+        parts = math.ceil(multiply_adds / MOST_MULTIPLY_ADDS) if watched else 1
+        for offset, part in cut(size, local, parts, along) if parts > 1 else [(None, size)]:
+            event = self.device.attempt(
+                f"run {kernel.label}",
+                kernel.kernel,
+                self.device.queue,
+                part,
+                local,
+                *values,
+                global_offset=offset,
+            )
+            if watched:  # what drivers hand to the system together is timed together
+                self.device.queue.flush()
+            if self.device.debug:
+                self.device.observe(kernel, event, arguments)

@@ -7,7 +7,7 @@ from pyopencl.array import Array
 
 from pp_cl.device.device import Device
 from pp_cl.layers.blocking import Blocking
-from pp_cl.layers.tiles import LANES, Tiles, checked_tiles
+from pp_cl.layers.tiles import LANES, SIDE, Tiles, checked_tiles
 
 
 def pack_weights(weight: np.ndarray, dtype: type = np.float32) -> np.ndarray:
@@ -49,11 +49,14 @@ def conv_forward(
     height, width, co = out.shape
     check_forward(sources, weight, bias, out)
     channels = [source.shape[2] for source in sources]
+    tiles = checked_tiles(dev, tiles, height, width)
     program, size, work_group = _program(dev, blocking, weight.shape[1], out.shape)
     program.launch(
         "conv_forward",
         size,
         local=work_group,
+        multiply_adds=tiles.number * SIDE**2 * weight.shape[1] ** 2 * sum(channels) * co,
+        along=1,
         height=height,
         width=width,
         c1=channels[0],
@@ -65,7 +68,7 @@ def conv_forward(
         weight=weight,
         bias=bias,
         out=out,
-        tile_count=checked_tiles(dev, tiles, height, width).count,
+        tile_count=tiles.count,
     )
 
 
@@ -88,11 +91,14 @@ def conv_backward_input(
     """
     height, width, c = grad_x.shape
     check_flipped(flipped, grad_x)
+    tiles = checked_tiles(dev, tiles, height, width)
     program, size, work_group = _program(dev, blocking, flipped.shape[1], grad_x.shape)
     program.launch(
         "conv_backward_input",
         size,
         local=work_group,
+        multiply_adds=tiles.number * SIDE**2 * flipped.shape[1] ** 2 * grad_out.shape[2] * c,
+        along=1,
         height=height,
         width=width,
         c=c,
@@ -102,7 +108,7 @@ def conv_backward_input(
         flipped=flipped,
         grad_out=grad_out,
         grad_x=grad_x,
-        tile_count=checked_tiles(dev, tiles, height, width).count,
+        tile_count=tiles.count,
     )
 
 

@@ -83,6 +83,8 @@ def conv_backward_weights(
             "conv_backward_weights",
             (c // group * k, blocks, parts),
             local=blocking.work_group,
+            multiply_adds=height * width * k**2 * c * co,
+            along=2,
             height=height,
             width=width,
             c=c,

@@ -9,7 +9,7 @@ from pyopencl.array import Array
 from pp_cl.device.device import Device
 from pp_cl.device.launch import Program
 from pp_cl.layers.conv import check_flipped, check_forward
-from pp_cl.layers.tiles import LANES, Tiles, checked_tiles
+from pp_cl.layers.tiles import LANES, SIDE, Tiles, checked_tiles
 
 QUAD = 4  # channels of a work-item
 # Pixels of a work-item: two lines of a tile, ROWS in cl/layers/conv_local.cl.
@@ -109,4 +109,5 @@ def _launch(dev, kernel, form, **arguments):
             break
     groups = -(-tiles.number * TILE_PARTS * in_group // items)
     size = (groups * items, -(-channels // (QUAD * in_group)))
-    program.launch(kernel, size, local=(items, 1), **arguments)
+    multiply_adds = tiles.number * SIDE**2 * k**2 * sum(inputs) * channels
+    program.launch(kernel, size, local=(items, 1), multiply_adds=multiply_adds, **arguments)

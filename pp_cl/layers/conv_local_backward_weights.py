@@ -56,6 +56,7 @@ def conv_local_backward_weights(
             "conv_local_backward_weights",
             (-(-c // (QUAD * CI_QUADS[k])) * items, -(-co // (QUAD * in_group)), parts),
             local=(items, 1, 1),
+            multiply_adds=tiles.number * SIDE**2 * k**2 * c * co,
             c=c,
             first=sum(before.shape[2] for before in sources[:i]),
             ci=ci,

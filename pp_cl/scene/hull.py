@@ -23,6 +23,7 @@ TOLERANCE = 1.02  # a count of 1 to this many times the points asked for ends th
 # half-diagonals of the hull from its centre to near and to far: about the published range of 4 for
 # lego
 DEPTH_MARGIN = 1.25
+VERTEX_WORK = 10  # multiply-adds that project a vertex into a view, and find its pixel
 CORNER_BITS = 16  # the corner that carving counts from: whole 2^-16 of the size of the eyes' box
 
 
@@ -111,6 +112,8 @@ class Carver:
         self.program.launch(
             "carve",
             (words, rows),
+            multiply_adds=VERTEX_WORK * 32 * words * rows * len(self.cameras),
+            along=1,
             nx=nx,
             ny=ny,
             rows=rows,

@@ -56,6 +56,9 @@ def test_a_training_of_the_demo(dev, monkeypatch):
     assert all(5 < row["psnr"] < 40 for row in found["curve"])
     assert set(found["frame_ms"]) == {"project", "pairs", "weights", "shade", "blend", "network"}
     assert set(found["frame_ms"]) | {"network backward", "update"} <= set(found["step_ms"])
+    counts = found["counts"]
+    assert (counts["height"], counts["width"]) == (128, 128)  # the crop of a step
+    assert 0 < counts["shaded"] <= counts["points"] == found["points"] and counts["pairs"] > 1000
     for row in (*found["step_ms"].values(), *found["frame_ms"].values()):
         assert 0 < row["least"] <= row["ms"] <= row["most"]
 

@@ -20,6 +20,7 @@ def test_a_small_scene(dev, tmp_path, lazy):
     assert 1500 <= row["points"] < 1600
     assert 0 < row["shaded"] <= 1
     assert row["pairs"] > row["points"]
+    assert row["size"] == (40, 40)
     assert list(row["stages_ms"]) == [*FORWARD, "backward", "update"]
     assert row["forward_ms"] == pytest.approx(sum(row["stages_ms"][name] for name in FORWARD))
     assert row["peak_device_bytes"] > 1500 * 4 * 145

@@ -6,7 +6,7 @@ import pytest
 from support.bench_results import result
 from support.scenes import write_ball_scene
 
-from pp_cl.bench import overview
+from pp_cl.bench import estimate, overview
 from pp_cl.cli import main
 
 
@@ -18,6 +18,24 @@ def test_train_prints_and_writes_its_row(tmp_path, capsys):
     (row,) = result["rows"]
     assert result["device"] and f"{row['points']} points" in printed
     assert all(name in printed for name in row["stages_ms"])
+    assert "estimated" not in printed
+
+
+def test_train_reports_beside_an_estimate(tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr(estimate, "measured_card", lambda dev: estimate.Card(1e9, 1e12))
+    scene = write_ball_scene(tmp_path / "ball", size=40)
+    assert main(["bench", "train", "--scene", scene, "--points", "1500", "--report"]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    first = lines.index("| stage | measured, ms | estimated from these rates, ms |")
+    rows = [line.split("|")[1:-1] for line in lines[first + 2 :] if line]
+    # the pairs are kept, not built
+    assert [row[0].strip() for row in rows] == [
+        *("project", "weights", "shade", "blend", "backward", "update")
+    ]
+    measured, estimated = ([float(row[i]) for row in rows] for i in (1, 2))
+    assert min(measured) > 0 and min(estimated) > 0
+    # of a network of 16 channels: the paper's takes more than 0.1 s at 1 GB/s
+    assert estimated[-1] < 50
 
 
 @pytest.mark.parametrize(
@@ -44,12 +62,26 @@ def test_all_writes_a_page_and_its_numbers(tmp_path, capsys, monkeypatch):
     assert main(["bench", "--budget", "3s", "--out", str(tmp_path / "page")]) == 0
     assert json.loads((tmp_path / "page" / "bench.json").read_text()) == result()
     assert "<h2>Time against error</h2>" in (tmp_path / "page" / "bench.html").read_text()
-    assert str(tmp_path / "page" / "bench.html") in capsys.readouterr().out
+    printed = capsys.readouterr().out
+    assert str(tmp_path / "page" / "bench.html") in printed and "estimated" not in printed
+
+
+def test_all_reports_beside_an_estimate(tmp_path, capsys, monkeypatch):
+    counts = {"points": 1000, "pairs": 5000, "shaded": 400, "height": 64, "width": 32}
+    found = result()
+    found["training"]["counts"] = counts
+    monkeypatch.setattr(overview, "bench_overview", lambda dev, policy, budget, tell: found)
+    monkeypatch.setattr(estimate, "measured_card", lambda dev: estimate.Card(1e9, 1e12))
+    assert main(["bench", "--report", "--out", str(tmp_path / "page")]) == 0
+    printed = capsys.readouterr().out
+    assert "tiny, 1000 points, 5000 hits and 400 shaded points in 32x64 pixels" in printed
+    assert "\n| project | 33.2 | 0.033 |\n" in printed  # 28 bytes a point, and a launch
 
 
 @pytest.mark.parametrize(
     "words, named",
     [
+        (["unet", "--report"], "--report"),
         (["--budget", "0"], "--budget 0"),
         (["--budget", "long"], "--budget long"),
         (["--json", "b.json"], "--json"),

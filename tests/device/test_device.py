@@ -196,6 +196,22 @@ def test_intels_gpus_take_more_registers_for_files_that_spill(platform, kind, la
     assert device_module.vendor_options(info, "raster/shade") == ()
 
 
+@pytest.mark.parametrize("said, expected", [(1, True), (0, False), (None, True)])
+def test_only_nvidias_driver_rules_out_a_watchdog(said, expected):
+    class Driver:
+        @property
+        def kernel_exec_timeout_nv(self):
+            if said is None:
+                raise cl.LogicError("clGetDeviceInfo failed: INVALID_VALUE")
+            return said
+
+    assert device_module.has_watchdog(Driver()) is expected
+
+
+def test_a_cpu_has_no_watchdog(plain):
+    assert plain.has_watchdog is not plain.is_cpu
+
+
 def test_files_with_options_of_a_vendor_exist():
     files = device_module.SPILLING_ON_INTEL
     assert all((kernel_folder() / f"{name}.cl").is_file() for name in files)

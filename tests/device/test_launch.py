@@ -5,7 +5,8 @@ import pyopencl as cl
 import pytest
 
 from pp_cl.device import device as device_module
-from pp_cl.device.launch import DEFAULT_LOCAL, parse_signatures
+from pp_cl.device import launch
+from pp_cl.device.launch import DEFAULT_LOCAL, cut, parse_signatures
 from pp_cl.errors import UserError
 
 KERNEL_FOLDER = device_module.kernel_folder()  # before any test replaces it
@@ -196,7 +197,7 @@ def test_local_memory_and_any_shape(program, dev, rng):
 )
 def test_sizes_are_rounded_up_to_the_work_group(program, rows, size, local, enqueued):
     seen = []
-    program.kernels["rows"].kernel = lambda queue, *args: seen.append(args[:2])
+    program.kernels["rows"].kernel = lambda queue, *args, **_: seen.append(args[:2])
     program.launch("rows", size, local=local, **rows)
     assert seen == [enqueued]
 
@@ -205,6 +206,62 @@ def test_sizes_are_rounded_up_to_the_work_group(program, rows, size, local, enqu
 def test_a_size_of_zero_launches_nothing(program, rows, size):
     program.launch("rows", size, **rows)
     assert np.isnan(rows["y"].get()).all()
+
+
+@pytest.mark.parametrize(
+    "size, local, parts, along, expected",
+    [
+        ((128,), (64,), 2, 0, [((0,), (64,)), ((64,), (64,))]),
+        ((64,), (64,), 5, 0, [((0,), (64,))]),
+        # 5 groups in 4 parts: two at a time, the last one alone
+        ((8, 20), (8, 4), 4, 1, [((0, 0), (8, 8)), ((0, 8), (8, 8)), ((0, 16), (8, 4))]),
+        ((4, 4, 3), (4, 4, 1), 9, 2, [((0, 0, i), (4, 4, 1)) for i in range(3)]),
+    ],
+)
+def test_a_range_is_cut_between_work_groups(size, local, parts, along, expected):
+    assert list(cut(size, local, parts, along)) == expected
+
+
+@pytest.mark.parametrize(
+    "has_watchdog, multiply_adds, launched",
+    [
+        (True, 0, [(None, (256,))]),
+        (True, 100, [(None, (256,))]),
+        (True, 101, [((0,), (128,)), ((128,), (128,))]),
+        (True, 1e9, [((64 * i,), (64,)) for i in range(4)]),
+        (False, 1e9, [(None, (256,))]),
+    ],
+)
+def test_a_long_kernel_is_launched_in_parts_for_a_watchdog(
+    program, rows, dev, monkeypatch, *, has_watchdog, multiply_adds, launched
+):
+    monkeypatch.setattr(launch, "MOST_MULTIPLY_ADDS", 100)
+    monkeypatch.setattr(dev, "has_watchdog", has_watchdog)
+    seen, flushed, kernel, queue = [], [], program.kernels["rows"].kernel, dev.queue
+
+    class Watched:
+        def flush(self):
+            flushed.append(len(seen))
+
+    def enqueue(_, size, *args, global_offset):
+        seen.append((global_offset, size))
+        return kernel(queue, size, *args, global_offset=global_offset)
+
+    program.kernels["rows"].kernel = enqueue
+    x = rows["x"].get()
+    n = 200
+    longer = np.resize(x, (n, 4))
+    rows |= {"n": n, "x": dev.upload(longer), "y": dev.empty((n, 1))}
+    with monkeypatch.context() as patch:
+        patch.setattr(dev, "queue", Watched())
+        program.launch("rows", n, multiply_adds=multiply_adds, **rows)
+    assert seen == launched
+    # each part is handed to the system by itself
+    watched = has_watchdog and multiply_adds > 0
+    assert flushed == (list(range(1, len(launched) + 1)) if watched else [])
+    np.testing.assert_allclose(
+        rows["y"].get()[:, 0], 2 * longer.sum(1) + np.arange(n) % 3, rtol=1e-6
+    )
 
 
 def test_default_work_groups_match_their_rank():
@@ -281,7 +338,7 @@ def test_refused_before_the_enqueue(program, dev, rows, case):
     program.launch("rows", 33, **rows)  # a good launch before must not hide a bad one
     dev.fill(rows["y"], -1)
     enqueued = []
-    program.kernels["rows"].kernel = lambda *args: enqueued.append(args)
+    program.kernels["rows"].kernel = lambda *args, **_: enqueued.append(args)
     with pytest.raises(error, match=f"^toy.cl:rows: {message}"):
         program.launch("rows", 33, **change(dev, rows))
     assert enqueued == []

@@ -13,6 +13,7 @@ from support.conv_layers import (
     check_same_bits,
     layer,
 )
+from support.launches import check_parts
 
 from pp_cl.layers.blocking import SHIPPED
 from pp_cl.layers.conv import (
@@ -182,3 +183,20 @@ def test_a_blocking_fits_the_channels_and_the_width():
     assert paired.of_direct(100, 48) == (12, 1, (1, 1, 1))  # three groups do not pair up
     single = replace(SHIPPED["CPU"], direct=(4, 1, (1, 1, 1)))
     assert single.of_direct(100, 48) == single.of_direct(100, 64) == (4, 1, (1, 1, 1))
+
+
+def test_launches_in_parts_compute_the_same_bits(dev, rng, monkeypatch):
+    x, grad_out = (rng.normal(size=(13, 30, c)).astype(np.float32) for c in (20, 32))
+    weight, bias = layer(rng, 20, 32, 3)
+    given = {"blocking": SHIPPED["GPU"]}
+    launched = check_parts(
+        dev, monkeypatch, "conv_forward", lambda: run_forward(dev, x, weight, bias, True, **given)
+    )
+    assert launched == 4  # groups of 4 rows
+    launched = check_parts(
+        dev,
+        monkeypatch,
+        "conv_backward_input",
+        lambda: run_backward_input(dev, x, weight, grad_out, True, **given),
+    )
+    assert launched == 4

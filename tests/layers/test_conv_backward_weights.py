@@ -5,6 +5,7 @@ import pytest
 from oracle.conv import conv, conv_gradients
 from support.comparisons import relative_error
 from support.conv_layers import SHAPES, layer
+from support.launches import check_parts
 
 from pp_cl.layers import conv_backward_weights as module
 from pp_cl.layers.blocking import SHIPPED
@@ -63,6 +64,16 @@ def test_two_sources_and_few_parts(dev, rng, monkeypatch, limit):
     weight, bias = run_backward_weights(dev, grad_out, 3, x, x2)
     assert relative_error(weight, expected_weight) < 5e-6
     assert relative_error(bias, expected_bias) < 5e-6
+
+
+def test_launches_in_parts_compute_the_same_bits(dev, rng, monkeypatch):
+    x, grad_out = (rng.normal(size=(33, 10, c)).astype(np.float32) for c in (16, 20))
+    parts = -(-33 // module.ROWS_PER_PART)
+
+    def run():
+        return run_backward_weights(dev, grad_out, 3, x)
+
+    assert check_parts(dev, monkeypatch, "conv_backward_weights", run) == parts
 
 
 def test_backward_weights_by_finite_differences(dev, rng):

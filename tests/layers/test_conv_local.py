@@ -12,6 +12,7 @@ from support.conv_layers import (
     layer,
 )
 from support.guarded import large
+from support.launches import check_parts
 
 from pp_cl.layers import conv_local as module
 from pp_cl.layers.blocking import SHIPPED
@@ -110,6 +111,19 @@ def test_smaller_work_groups_compute_the_same_bits(dev, rng, monkeypatch, most):
     monkeypatch.setattr(module, "runs", runs)
     np.testing.assert_array_equal(run_forward(dev, x, weight, bias, True), expected)
     assert tried == [n for n in module.GROUPS if n >= most]
+
+
+@pytest.mark.parametrize("k", [1, large(3)])
+def test_launches_in_parts_compute_the_same_bits(dev, rng, monkeypatch, k):
+    x = rng.normal(size=(9, 30, 16)).astype(np.float32)
+    weight, bias = layer(rng, 16, 64, k)
+    given = dev, monkeypatch, "conv_local_forward"
+    # 3 x 8 tiles, 8 of 64 channels in a group of 256 work-items
+    assert check_parts(*given, lambda: run_forward(dev, x, weight, bias, True)) == 3
+    x, grad_out = (rng.normal(size=(9, 30, c)).astype(np.float32) for c in (64, 16))
+    weight, _ = layer(rng, 64, 16, k)
+    given = dev, monkeypatch, "conv_local_backward_input"
+    assert check_parts(*given, lambda: run_backward_input(dev, x, weight, grad_out, True)) == 3
 
 
 def test_what_a_work_group_computes():

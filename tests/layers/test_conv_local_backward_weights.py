@@ -6,6 +6,7 @@ from oracle.conv import conv_gradients
 from support.comparisons import relative_error
 from support.conv_layers import LOCAL_SHAPES
 from support.guarded import large
+from support.launches import check_parts
 
 from pp_cl.layers import conv_backward_weights as direct
 from pp_cl.layers import conv_local_backward_weights as module
@@ -93,6 +94,18 @@ def test_smaller_work_groups_compute_the_same_bits(dev, rng, monkeypatch):
     for actual, same in zip(run_backward_weights(dev, grad_out, 3, x), expected, strict=True):
         np.testing.assert_array_equal(actual, same)
     assert asked == [96, 48]
+
+
+@pytest.mark.parametrize("k, launched", [(1, 2), large(3, 3)])
+def test_launches_in_parts_compute_the_same_bits(dev, rng, monkeypatch, k, launched):
+    x, grad_out = (rng.normal(size=(9, 21, c)).astype(np.float32) for c in (36, 20))
+    count = check_parts(
+        dev,
+        monkeypatch,
+        "conv_local_backward_weights",
+        lambda: run_backward_weights(dev, grad_out, k, x),
+    )
+    assert count == launched  # groups of 16 input channels, of 1x1 kernels 32
 
 
 @pytest.mark.large

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from oracle.unet import unet, unet_gradients
 from support.comparisons import relative_error
+from support.launches import check_parts
 from support.networks import plain_parameters
 
 from pp_cl.layers.policy import make_policy
@@ -139,6 +140,19 @@ def test_same_bits_twice_and_for_equal_seeds(dev, rng):
     for first, second in zip(runs[0], runs[1], strict=True):
         np.testing.assert_array_equal(first, second)
     assert not np.array_equal(runs[0][0], runs[2][0])
+
+
+def test_a_gpus_launches_in_parts_have_the_same_bits(dev, rng, monkeypatch):
+    """As for a watchdog that allows a single multiply-add."""
+    monkeypatch.setattr(dev, "is_cpu", False)
+    x, grad_y = (dev.upload(rng.normal(size=(32, 36, c)), np.float32) for c in (16, 3))
+    net = UNet(dev, (16, 32, 64), seed=5)
+
+    def run():
+        y = net.forward(x).get()
+        return y, net.backward(grad_y).get(), *(g.get() for g in net.gradients.values())
+
+    assert check_parts(dev, monkeypatch, "conv_local_forward", run) > len(convolutions(net.layers))
 
 
 def test_initial_values_are_pytorchs(dev):

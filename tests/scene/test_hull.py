@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from support.ball_views import CENTRE, RADIUS, ball_camera, ball_views
 from support.guarded import AWKWARD_SIZES
+from support.launches import check_parts
 
 from pp_cl.errors import UserError
 from pp_cl.reference.hull import dilated_mask, kept
@@ -81,6 +82,19 @@ def test_carving_equals_the_oracle(dev, rng, nx, ny, nz):
         np.testing.assert_allclose(
             tight.positions(ids), positions[bits[:, :nx].ravel() == 1], atol=1e-12
         )
+
+
+def test_a_carving_in_parts_is_the_same(dev, rng, monkeypatch):
+    views = [noise_view(rng, np.array(eye), (64, 48), 0.1) for eye in ((3.0, 1, 0.5), (-2.0, 2, 1))]
+    carver, grid = Carver(dev, views), Grid((-1, -1, -1), 2 / 40, (40, 13, 7))
+    bits = []
+
+    def carve():
+        bits.append(carver.carve(grid).bits.get())
+        return bits[-1]
+
+    assert check_parts(dev, monkeypatch, "carve", carve) == -(-13 * 7 // 4)
+    assert bits[0].any()
 
 
 def test_a_vertex_no_image_sees_is_dropped(dev):

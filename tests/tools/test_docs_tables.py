@@ -35,6 +35,11 @@ def test_a_table():
     assert TOOL.table(RESULTS) == TABLE
 
 
+def test_an_estimate_is_not_called_measured():
+    estimated = {("estimated" if k == "measured" else k): v for k, v in RESULTS.items()}
+    assert TOOL.table(estimated) == TABLE.replace("Measured with", "Estimated with")
+
+
 @pytest.mark.parametrize("path", TOOL.documents(ROOT), ids=lambda path: path.stem)
 def test_documents_are_up_to_date(path):
     text = path.read_text("utf-8")
