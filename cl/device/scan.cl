@@ -13,7 +13,7 @@ static inline uint scan_value(const uint value) {
     return FLAGS ? (value != 0) : value;
 }
 
-// GROUP work-items per block of BLOCK values: reads them, writes their sum.
+// GROUP work-items per block of BLOCK values: read them, write their sum.
 kernel void scan_sums(
     const uint n,               // values
     const uint b,               // blocks
@@ -31,8 +31,8 @@ kernel void scan_sums(
     if (MEMBER == 0) block_sum[block] = total;
 }
 
-// GROUP work-items per block of BLOCK values: reads them and where the block starts, writes where
-// each value starts; the last block also writes the total behind them.
+// GROUP work-items per block of BLOCK values: read them and where the block starts, write where each
+// value starts; those of the last block also write the total behind them.
 kernel void scan_offsets(
     const uint n,                     // values
     const uint b,                     // blocks

@@ -20,6 +20,7 @@ from pp_cl.selftest.run import CASES, run_cases
 # of the kernels with two forms; `make test-gpu-form` runs all tests
 IN_GPU_FORM = (
     "device: scan",
+    "device: compact and gather rows",
     "raster: project",
     "raster: thousands of equal depths",
     "raster: shade",
@@ -29,6 +30,8 @@ IN_GPU_FORM = (
     "layers: upsampling",
     "layers: gate",
     "loss: L1 and SSIM",
+    "loss: mask",
+    "loss: perceptual",
     "adam: arrays",
     "adam: points, sh_0",
     "training: smoothing",
@@ -76,7 +79,7 @@ def test_groups(largest, items):
 
 @pytest.mark.parametrize(
     "name",
-    [*IN_GPU_FORM[:4], *(pytest.param(name, marks=pytest.mark.slow) for name in IN_GPU_FORM[4:])],
+    [*IN_GPU_FORM[:5], *(pytest.param(name, marks=pytest.mark.slow) for name in IN_GPU_FORM[5:])],
 )
 def test_the_form_for_gpus_computes_the_same(dev, monkeypatch, name):
     monkeypatch.setattr(dev, "is_cpu", False)
