@@ -7,6 +7,7 @@ import pyopencl as cl
 
 from pp_cl.errors import UserError
 
+SMALL_GROUP = 64  # work-items: no fewer fill what a GPU runs in step
 LARGEST_GROUP = 256  # work-items: what GPUs run of any kernel
 
 
@@ -58,9 +59,12 @@ def group_items(dev: Any) -> int:
     return 1 << most.bit_length() - 1
 
 
-def group_ranges(dev: Any, groups: int) -> tuple[int, int | None]:
-    """(work-items, work-group) of a kernel in which group_items() sum or scan together, `groups`
-    times.
+def group_ranges(dev: Any, groups: int, members: int | None = None) -> tuple[int, int | None]:
+    """(work-items, work-group) of a kernel in which `members`, None = group_items(), work together,
+    `groups` times; on CPUs one work-item each. A work-group holds groups as a whole.
     """
-    items = group_items(dev)
-    return groups * items, None if dev.is_cpu else items
+    if dev.is_cpu:
+        return groups, None
+    if members is None:
+        return groups * group_items(dev), group_items(dev)
+    return groups * members, max(members, SMALL_GROUP)

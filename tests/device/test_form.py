@@ -29,9 +29,11 @@ IN_GPU_FORM = (
     "layers: mean pooling",
     "layers: upsampling",
     "layers: gate",
+    "layers: tiles",
     "loss: L1 and SSIM",
     "loss: mask",
     "loss: perceptual",
+    "metrics: distance of LPIPS",
     "adam: arrays",
     "adam: points, sh_0",
     "training: smoothing",
@@ -73,7 +75,9 @@ def test_groups(largest, items):
     """A power of two that the device runs; none on CPUs, which take their work-group."""
     of = SimpleNamespace(is_cpu=False, device=SimpleNamespace(max_work_group_size=largest))
     assert (group_items(of), group_ranges(of, 7)) == (items, (7 * items, items))
+    assert group_ranges(of, 7, 16) == (112, 64)
     of.is_cpu = True
+    assert group_ranges(of, 7, 16) == (7, None)
     assert (group_items(of), group_ranges(of, 7)) == (1, (7, None))
 
 

@@ -51,7 +51,7 @@ FLIPS = [
     ("training/adam", "f -= basis", "f += basis", "adam: points, sh_0"),
     ("training/smooth", "* k + c) - f", "* k + c) + f", "training: smoothing"),
     ("training/refine", "1.0f + sqrt", "1.0f - sqrt", "training: split opacities"),
-    ("metrics/lpips", "d = a[k] * scale_a - b", "d = a[k] * scale_a + b", "metrics: LPIPS"),
+    ("metrics/lpips", "* scale_a - load_part", "* scale_a + load_part", "metrics: LPIPS"),
     ("metrics/shape", "at.x + 0.5f", "at.x - 0.5f", "metrics: vertices on a box"),
 ]  # fmt: skip
 
