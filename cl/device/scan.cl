@@ -31,8 +31,8 @@ kernel void scan_sums(
     if (MEMBER == 0) block_sum[block] = total;
 }
 
-// GROUP work-items per block of BLOCK values: read them and where the block starts, write where each
-// value starts; those of the last block also write the total behind them.
+// GROUP work-items per block of BLOCK values: read them and where the block starts, write where
+// each value starts; those of the last block also write the total behind them.
 kernel void scan_offsets(
     const uint n,                     // values
     const uint b,                     // blocks
