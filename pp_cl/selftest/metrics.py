@@ -22,7 +22,7 @@ def _input(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
     for w in SIZES:
         image = rng.uniform(0, 1, (34, w + 5, 3)).astype(np.float32)
         sizes = {"h": 31, "w": w, "image_width": w + 5, "corner": 3 * (w + 5 + 2)}
-        inside, program = np.s_[1:32, 2 : 2 + w], dev.program("metrics/lpips")
+        inside, program = np.s_[1:32, 2 : 2 + w], lpips_program(dev)
         x, grad_x = dev.empty((31, w, 3)), rng.normal(size=(31, w, 3)).astype(np.float32)
         program.launch("lpips_input", (w, 31), image=dev.upload(image), x=x, **sizes)
         # four roundings of values of up to 2.4
