@@ -1,6 +1,7 @@
 // Compaction of arrays, and arrays of rows of others.
+#include "group.h"
 
-// One work-item per row of the result: copies it from its old place.
+// GROUP work-items per row of the result: copy it from its old place.
 kernel void gather_rows(
     const uint first,            // of the listed rows that are copied: its place in the list
     const uint m,                // rows to copy
@@ -9,10 +10,10 @@ kernel void gather_rows(
     global const uint *source,   // (?, R)
     global uint *target)         // (?, R) at least M rows
 {
-    const size_t i = get_global_id(0);
+    const size_t i = get_global_id(0) / GROUP;
     if (i >= m) return;
     global const uint *from = source + (size_t)indices[first + i] * r;
     global uint *to = target + i * r;
-    for (uint c = 0; c < r; c++)
+    for (uint c = MEMBER; c < r; c += GROUP)
         to[c] = from[c];
 }

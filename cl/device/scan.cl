@@ -1,36 +1,38 @@
 // Exclusive prefix sums of uint32, and the list of the non-zero entries. A sum above the largest
 // uint is the largest uint.
-#include "common.h"
+#include "group.h"
 
 #ifndef FLAGS
 #define FLAGS 0  // 1: every non-zero value counts as one
 #endif
 #ifndef BLOCK
-#define BLOCK 512  // values per work-item: a million values take two levels
+#define BLOCK 512  // values that GROUP work-items scan together: a million take two levels
 #endif
 
 static inline uint scan_value(const uint value) {
     return FLAGS ? (value != 0) : value;
 }
 
-// One work-item per block of BLOCK values: reads them, writes their sum.
+// GROUP work-items per block of BLOCK values: read them, write their sum.
 kernel void scan_sums(
     const uint n,               // values
     const uint b,               // blocks
     global const uint *values,  // (N)
     global uint *block_sum)     // (B)
 {
-    const uint block = get_global_id(0);
+    SHARED(uint, shared, 2 * GROUP);
+    const uint block = GROUP_ID;
     if (block >= b) return;
     const uint end = min(n, (block + 1) * BLOCK);
-    uint sum = 0;
-    for (uint i = block * BLOCK; i < end; i++)
+    uint sum = 0, total;
+    for (uint i = block * BLOCK + MEMBER; i < end; i += GROUP)
         sum = add_sat(sum, scan_value(values[i]));
-    block_sum[block] = sum;
+    group_scan(sum, shared, &total);
+    if (MEMBER == 0) block_sum[block] = total;
 }
 
-// One work-item per block of BLOCK values: reads them and where the block starts, writes where each
-// value starts; the last block also writes the total behind them.
+// GROUP work-items per block of BLOCK values: read them and where the block starts, write where
+// each value starts; those of the last block also write the total behind them.
 kernel void scan_offsets(
     const uint n,                     // values
     const uint b,                     // blocks
@@ -38,15 +40,19 @@ kernel void scan_offsets(
     global const uint *block_offset,  // (B+1)
     global uint *offsets)             // (N+1)
 {
-    const uint block = get_global_id(0);
+    SHARED(uint, shared, 2 * GROUP);
+    const uint block = GROUP_ID;
     if (block >= b) return;
     const uint end = min(n, (block + 1) * BLOCK);
     uint sum = block_offset[block];
-    for (uint i = block * BLOCK; i < end; i++) {
-        offsets[i] = sum;
-        sum = add_sat(sum, scan_value(values[i]));
+    for (uint first = block * BLOCK; first < end; first += GROUP) {
+        const uint i = first + MEMBER;
+        uint total;
+        const uint before = group_scan(i < end ? scan_value(values[i]) : 0, shared, &total);
+        if (i < end) offsets[i] = add_sat(sum, before);
+        sum = add_sat(sum, total);
     }
-    if (block == b - 1) offsets[n] = sum;
+    if (MEMBER == 0 && block == b - 1) offsets[n] = sum;
 }
 
 // One work-item per value: reads it and its number among the non-zero ones, writes its index there

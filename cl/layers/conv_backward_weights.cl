@@ -3,9 +3,8 @@
 //
 // vec_type_hint: the vectors are written out; Intel's compiler would merge work-items into wider
 // ones.
-#include "common.h"
+#include "lanes.h"
 #include "layers/tiles.h"
-#include "vector.h"
 
 #ifndef KERNEL_SIZE
 #define KERNEL_SIZE 3  // side of the kernel: 1 or 3
@@ -125,9 +124,9 @@ kernel __attribute__((vec_type_hint(float16))) void conv_backward_weights(
     }
 }
 
-// One work-item per (row of partial, 16 output channels): adds the parts in order; writes one
-// vector of a gradient.
-kernel __attribute__((vec_type_hint(float16))) void conv_sum_parts(
+// One work-item per part of (row of partial, 16 output channels): adds the parts in order; writes
+// LANES values of a gradient.
+kernel __attribute__((vec_type_hint(floats))) void conv_sum_parts(
     const int per_block,  // K * K * ci, rows of one block of weights
     const int blocks,
     const int parts,
@@ -135,13 +134,13 @@ kernel __attribute__((vec_type_hint(float16))) void conv_sum_parts(
     global float16 *grad_weight,    // (blocks, KERNEL_SIZE, KERNEL_SIZE, ?, 16)
     global float16 *grad_bias)      // (?)
 {
-    const int row = get_global_id(0), block = get_global_id(1);
+    const int row = get_global_id(0) / ROW_PARTS, block = get_global_id(1);
     if (row > per_block || block >= blocks) return;
-    float16 sum = 0.0f;
+    floats sum = 0.0f;
     for (int part = 0; part < parts; part++)
-        sum += partial[((size_t)part * blocks + block) * (per_block + 1) + row];
+        sum += load_part(partial, ((size_t)part * blocks + block) * (per_block + 1) + row);
     if (row < per_block)
-        grad_weight[block * per_block + row] = sum;
+        store_part(sum, grad_weight, block * per_block + row);
     else
-        grad_bias[block] = sum;
+        store_part(sum, grad_bias, block);
 }

@@ -1,7 +1,6 @@
 // Tiles of a feature map (tiles.h): those that hold something, and copying one to another.
-#include "common.h"
+#include "lanes.h"
 #include "layers/tiles.h"
-#include "vector.h"
 
 // One work-item per tile: reads its pixels, writes 1 if any channel of any is not `background`, a
 // NaN included, else 0.
@@ -43,8 +42,8 @@ kernel void tiles_hit(
     flags[tile] = hit;
 }
 
-// One work-item per (16 channels, pixel of a tile, copy): writes the pixel of the tile `to` as it
-// is in the tile `from`. Both have the same shape, and nothing is copied to `from`.
+// One work-item per (LANES channels, pixel of a tile, copy): writes the pixel of the tile `to` as
+// it is in the tile `from`. Both have the same shape, and nothing is copied to `from`.
 kernel void tiles_copy(
     const int h,
     const int w,
@@ -53,7 +52,7 @@ kernel void tiles_copy(
     global const int2 *from_to,  // (?, 2) tiles: from, to
     global float *x)             // (h, w, c)
 {
-    const int first = get_global_id(0) * CHANNELS, pixel = get_global_id(1), i = get_global_id(2),
+    const int first = get_global_id(0) * LANES, pixel = get_global_id(1), i = get_global_id(2),
               columns = tile_columns(w);
     if (first >= c || pixel >= SIDE * SIDE || i >= n) return;
     const int from = from_to[i].x, to = from_to[i].y;
@@ -61,7 +60,7 @@ kernel void tiles_copy(
     if (column >= w || row >= h) return;
     const size_t read =
         (size_t)(from / columns * SIDE + pixel / SIDE) * w + from % columns * SIDE + pixel % SIDE;
-    store16(
-        load16(x + read * c + first, c - first), x + ((size_t)row * w + column) * c + first,
+    store_lanes(
+        load_lanes(x + read * c + first, c - first), x + ((size_t)row * w + column) * c + first,
         c - first);
 }

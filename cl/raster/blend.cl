@@ -79,6 +79,15 @@ kernel __attribute__((vec_type_hint(floats))) void blend_backward(
     if (ROW_PART == 0) grad_opacity[i] = scale * dL_do;
 }
 
+// Sum of the products of two rows, LANES channels at a time.
+static inline float dot_rows(global const float16 *a, global const float16 *b) {
+    global const floats *p = (global const floats *)a, *q = (global const floats *)b;
+    floats products = p[0] * q[0];
+    for (uint part = 1; part < ROW_PARTS; part++)
+        products += p[part] * q[part];
+    return SUM_LANES(products);
+}
+
 // One work-item per point: reads what blend_backward reads, writes dL/dl and dL/dd = dL/dl / d of
 // its pairs (see the top).
 kernel void blend_backward_pairs(
@@ -105,7 +114,7 @@ kernel void blend_backward_pairs(
         const float others = rest[REST_BY_PAIR ? pair : q];
         float dL_dl = 0.0f;
         if (!HAS_ROLES || pair_role[pair] == TRACKED)
-            dL_dl = scale * b * (dot16(grad_features[q], point_features[i]) - others);
+            dL_dl = scale * b * (dot_rows(grad_features + q, point_features + i) - others);
         grad_pair[pair] = (float2)(dL_dl, d > 0.0f ? dL_dl / d : 0.0f);
     }
 }

@@ -9,6 +9,7 @@
 // The kernels run in their order here: moments of the windows along y; along x, then SSIM and its
 // slopes; slopes spread along x; along y, with the gradient; sums. Scratch rows are BLOCKS vectors
 // of LANES values long, MARGIN more than 3W values need, so that no tap along x needs a test.
+#include "group.h"
 #include "lanes.h"
 
 #ifndef TAPS
@@ -183,17 +184,19 @@ kernel void loss_gradient(
     partial_terms[(size_t)blocks * (v + y) + b] = (float4)(absolute, absolute, 0.0f, squared);
 }
 
-// One work-item per row: the sum of its terms.
+// GROUP work-items per row: the sum of its terms.
 kernel void loss_sum(
     const uint rows,
     const uint m,                // terms in a row
     global const float4 *terms,  // (ROWS, M, 4)
     global float4 *sums)         // (ROWS, 4)
 {
-    const size_t row = get_global_id(0);
+    SHARED(float4, shared, GROUP);
+    const size_t row = GROUP_ID;
     if (row >= rows) return;
     float4 sum = 0.0f;
-    for (size_t i = 0; i < m; i++)
+    for (size_t i = MEMBER; i < m; i += GROUP)
         sum += terms[row * m + i];
-    sums[row] = sum;
+    sum = group_sum4(sum, shared);
+    if (MEMBER == 0) sums[row] = sum;
 }

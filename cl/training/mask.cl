@@ -1,10 +1,10 @@
 // The mask term of the loss: weight * mean max(a - m, 0)^2 of the rendered alpha a = 1 - T and the
 // photograph's alpha m. Only what exceeds the mask counts: the points in front of the hull fill it
 // anyway, and would be held there.
-#include "common.h"
+#include "group.h"
 
-// One work-item per row of the padded image: writes dL/da, 0 outside of the target, and the sum of
-// the row's squares.
+// GROUP work-items per row of the padded image: write dL/da, 0 outside of the target, and the sum
+// of the row's squares.
 kernel void mask_gradient(
     const uint ph,  // padded image
     const uint pw,
@@ -18,12 +18,13 @@ kernel void mask_gradient(
     global float *grad_alpha,           // (PHW)
     global float *row_term)             // (PH)
 {
-    const uint y = get_global_id(0);
+    SHARED(float, shared, GROUP);
+    const uint y = GROUP_ID;
     if (y >= ph) return;
     const float scale = 2.0f * weight / ((float)h * w);
     const bool inside = y >= top && y < top + h;
     float sum = 0.0f;
-    for (uint x = 0; x < pw; x++) {
+    for (uint x = MEMBER; x < pw; x += GROUP) {
         const uint q = y * pw + x;
         float difference = 0.0f;
         if (inside && x >= left && x < left + w)
@@ -32,10 +33,11 @@ kernel void mask_gradient(
         grad_alpha[q] = scale * difference;
         sum += difference * difference;
     }
-    row_term[y] = sum;
+    sum = group_sum(sum, shared);
+    if (MEMBER == 0) row_term[y] = sum;
 }
 
-// One work-item: writes the mean of the squares, and ADDS it, weighted, to the loss.
+// GROUP work-items: write the mean of the squares, and ADD it, weighted, to the loss.
 kernel void mask_sum(
     const uint ph,      // rows of the padded image
     const uint pixels,  // of the target
@@ -44,10 +46,13 @@ kernel void mask_sum(
     global float *mean,            // (1)
     global float *terms)           // (4) the loss's; accumulates in the first
 {
-    if (get_global_id(0) > 0) return;
+    SHARED(float, shared, GROUP);
+    if (GROUP_ID > 0) return;
     float sum = 0.0f;
-    for (uint y = 0; y < ph; y++)
+    for (uint y = MEMBER; y < ph; y += GROUP)
         sum += row_term[y];
+    sum = group_sum(sum, shared);
+    if (MEMBER > 0) return;
     mean[0] = sum / pixels;
     terms[0] += weight * mean[0];
 }

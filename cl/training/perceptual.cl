@@ -1,9 +1,9 @@
 // The perceptual term of the loss: weight * LPIPS, where LPIPS is the sum over the blocks of VGG16
 // of the mean of their pixels' distances.
-#include "reduce.h"
-#include "vector.h"
+#include "group.h"
+#include "lanes.h"
 
-// One work-item per row of a block's pixels: writes what the row gives to LPIPS.
+// GROUP work-items per row of a block's pixels: write what the row gives to LPIPS.
 kernel void perceptual_rows(
     const uint h,
     const uint w,
@@ -11,15 +11,17 @@ kernel void perceptual_rows(
     global const float *distance,  // (h, w)
     global float *row_term)        // (?)
 {
-    const uint y = get_global_id(0);
+    SHARED(float, shared, GROUP);
+    const uint y = GROUP_ID;
     if (y >= h) return;
-    float16 sum = 0.0f;
-    for (uint x = 0; x < w; x += 16)
-        sum += load16(distance + (size_t)y * w + x, (int)(w - x));
-    row_term[first + y] = sum16(sum) / ((float)h * w);
+    floats sum = 0.0f;
+    for (uint x = LANES * MEMBER; x < w; x += LANES * GROUP)
+        sum += load_lanes(distance + (size_t)y * w + x, (int)(w - x));
+    const float of_row = group_sum(SUM_LANES(sum), shared);
+    if (MEMBER == 0) row_term[first + y] = of_row / ((float)h * w);
 }
 
-// One work-item: writes the sum of the rows, LPIPS, and ADDS it, weighted, to the loss.
+// GROUP work-items: write the sum of the rows, LPIPS, and ADD it, weighted, to the loss.
 kernel void perceptual_sum(
     const uint n,                  // rows of all blocks
     const float weight,            // of LPIPS
@@ -27,10 +29,13 @@ kernel void perceptual_sum(
     global float *distance,        // (1) LPIPS
     global float *terms)           // (4) the loss's; accumulates in the first
 {
-    if (get_global_id(0) > 0) return;
+    SHARED(float, shared, GROUP);
+    if (GROUP_ID > 0) return;
     float sum = 0.0f;
-    for (uint i = 0; i < n; i++)
+    for (uint i = MEMBER; i < n; i += GROUP)
         sum += row_term[i];
+    sum = group_sum(sum, shared);
+    if (MEMBER > 0) return;
     distance[0] = sum;
     terms[0] += weight * sum;
 }

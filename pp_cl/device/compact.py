@@ -5,9 +5,11 @@ from pyopencl.array import Array
 
 from pp_cl.device.buffers import Table
 from pp_cl.device.device import Device
+from pp_cl.device.form import row_parts
 
 # bytes of the scratch that rows are moved through: 1.4 % of a training with 4 million points
 SCRATCH_BYTES = 2**27
+CHANNELS = 16  # words of a row of features
 
 
 def compact_table(n: int, row_bytes: int) -> Table:
@@ -48,12 +50,14 @@ def gather_rows(dev: Device, array: Array, rows: Array) -> Array:
 
 def _gather(dev, array, rows, target, *, first, count):
     """Copy the rows rows[first] to rows[first + count] of `array` to the front of `target`."""
-    dev.program("device/compact").launch(
+    words = array.nbytes // len(array) // 4
+    items = row_parts(dev) if words >= CHANNELS else 1
+    dev.program("device/compact", GROUP=items).launch(
         "gather_rows",
-        count,
+        count * items,
         first=first,
         m=count,
-        r=array.nbytes // len(array) // 4,
+        r=words,
         indices=rows,
         source=_words(array),
         target=_words(target),

@@ -7,6 +7,9 @@ import pyopencl as cl
 
 from pp_cl.errors import UserError
 
+SMALL_GROUP = 64  # work-items: no fewer fill what a GPU runs in step
+LARGEST_GROUP = 256  # work-items: what GPUs run of any kernel
+
 
 def takes_cpu_form(device: cl.Device) -> bool:
     """Whether drivers and kernels take their form for CPUs: on CPUs, unless PP_FORM=gpu.
@@ -44,3 +47,24 @@ def channel_ranges(
 def row_parts(dev: Any, on_gpu: int = 1) -> int:
     """Work-items for the 16 channels of a row, LANES each. on_gpu: as for lanes()."""
     return 16 // lanes(dev, on_gpu)
+
+
+def group_items(dev: Any) -> int:
+    """GROUP of kernels (cl/group.h): work-items that sum or scan together; a power of two on GPUs,
+    1 on CPUs.
+    """
+    if dev.is_cpu:
+        return 1
+    most = min(LARGEST_GROUP, dev.device.max_work_group_size)
+    return 1 << most.bit_length() - 1
+
+
+def group_ranges(dev: Any, groups: int, members: int | None = None) -> tuple[int, int | None]:
+    """(work-items, work-group) of a kernel in which `members`, None = group_items(), work together,
+    `groups` times; on CPUs one work-item each. A work-group holds groups as a whole.
+    """
+    if dev.is_cpu:
+        return groups, None
+    if members is None:
+        return groups * group_items(dev), group_items(dev)
+    return groups * members, max(members, SMALL_GROUP)

@@ -7,9 +7,16 @@ from pyopencl.array import Array
 
 from pp_cl.device.buffers import scratch
 from pp_cl.device.device import Device
+from pp_cl.device.form import group_items, group_ranges
 from pp_cl.device.transfer import Reading, read_later
 
-BLOCK = 512  # values per work-item
+BLOCK = 512  # values that a work-item of a CPU scans
+BLOCK_ON_GPU = 2048  # values that a work-group scans: four million take two levels
+
+
+def block_values(dev: Device) -> int:
+    """BLOCK of its kernels: values that one work-item, or on GPUs one work-group, scans."""
+    return BLOCK if dev.is_cpu else BLOCK_ON_GPU
 
 
 def exclusive_scan(dev: Device, values: Array, offsets: Array, flags: bool = False) -> None:
@@ -24,24 +31,30 @@ def exclusive_scan(dev: Device, values: Array, offsets: Array, flags: bool = Fal
 def _scan(dev, values, offsets, *, flags, level):
     """exclusive_scan() of the values or, from level 1 on, of sums of blocks."""
     n = values.size
-    blocks = -(-n // BLOCK)
-    program = dev.program("device/scan", FLAGS=int(flags), BLOCK=BLOCK)
+    blocks = -(-n // block_values(dev))
+    program, (size, local) = _program(dev, flags), group_ranges(dev, blocks)
     block_offset = scratch(dev, ("scan offset", level), blocks + 1, np.uint32)
     if blocks == 1:
         dev.fill(block_offset, 0)
     else:
         block_sum = scratch(dev, ("scan sum", level), blocks, np.uint32)
-        program.launch("scan_sums", blocks, n=n, b=blocks, values=values, block_sum=block_sum)
+        program.launch("scan_sums", size, local, n=n, b=blocks, values=values, block_sum=block_sum)
         _scan(dev, block_sum, block_offset, flags=False, level=level + 1)
     program.launch(
         "scan_offsets",
-        blocks,
+        size,
+        local,
         n=n,
         b=blocks,
         values=values,
         block_offset=block_offset,
         offsets=offsets,
     )
+
+
+def _program(dev, flags):
+    macros = {"FLAGS": int(flags), "BLOCK": block_values(dev), "GROUP": group_items(dev)}
+    return dev.program("device/scan", **macros)
 
 
 class DeviceList:
@@ -72,7 +85,7 @@ def nonzero(dev: Device, values: Array, offsets: Array, indices: Array) -> Devic
     """
     n = values.size
     exclusive_scan(dev, values, offsets, flags=True)
-    dev.program("device/scan", FLAGS=1, BLOCK=BLOCK).launch(
+    _program(dev, flags=True).launch(
         "scan_nonzero", n, n=n, values=values, offsets=offsets, indices=indices
     )
     return DeviceList(read_total(dev, offsets), indices)

@@ -5,6 +5,7 @@ input gradients are computed.
 from pyopencl.array import Array
 
 from pp_cl.device.device import Device
+from pp_cl.device.form import lanes, row_parts
 from pp_cl.layers.blocking import Blocking
 from pp_cl.layers.tiles import LANES, Tiles, checked_tiles
 
@@ -108,9 +109,9 @@ def sum_parts(
     parts of an image, partial (parts, blocks, K * K * CI + 1, 16) or longer.
     """
     blocks, k, _, ci, _ = grad_weight.shape
-    dev.program("layers/conv_backward_weights", KERNEL_SIZE=k).launch(
+    dev.program("layers/conv_backward_weights", KERNEL_SIZE=k, LANES=lanes(dev)).launch(
         "conv_sum_parts",
-        (k * k * ci + 1, blocks),
+        (row_parts(dev) * (k * k * ci + 1), blocks),
         per_block=k * k * ci,
         blocks=blocks,
         parts=parts,

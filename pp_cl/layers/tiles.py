@@ -12,6 +12,7 @@ from pyopencl.array import Array
 
 from pp_cl.device.buffers import Table, scratch
 from pp_cl.device.device import Device
+from pp_cl.device.form import channel_ranges, lanes
 from pp_cl.device.transfer import Reading, read_later
 
 LANES = 16  # channels in one float16
@@ -118,10 +119,11 @@ def tiles_copy(dev: Device, x: Array, from_to: Array, n: int) -> None:
     copy_list() has them; none is both. A tile and its source have the same shape.
     """
     h, w, c = x.shape
-    dev.program("layers/tiles").launch(
+    size, local = channel_ranges(dev, n, SIDE * SIDE, c)
+    _program(dev).launch(
         "tiles_copy",
-        (-(-c // LANES), SIDE * SIDE, n),
-        local=(1, SIDE * SIDE, 4),
+        size,
+        local,
         h=h,
         w=w,
         c=c,
@@ -131,11 +133,15 @@ def tiles_copy(dev: Device, x: Array, from_to: Array, n: int) -> None:
     )
 
 
+def _program(dev):
+    return dev.program("layers/tiles", LANES=lanes(dev))
+
+
 def _flags(dev, kernel, size, **arguments):
     shape = grid_shape(*size)
     tiles = shape[0] * shape[1]
     flags = scratch(dev, "tile flags", tiles, np.int32)
-    dev.program("layers/tiles").launch(
+    _program(dev).launch(
         kernel, tiles, h=size[0], w=size[1], flags=flags.reshape(shape), **arguments
     )
     return TileFlags(shape, read_later(dev, flags))

@@ -11,6 +11,8 @@ from pyopencl.array import Array
 
 from pp_cl.device.buffers import Table
 from pp_cl.device.device import Device
+from pp_cl.device.form import group_ranges, lanes, row_parts
+from pp_cl.device.launch import Program
 from pp_cl.errors import UserError
 from pp_cl.layers.conv import pack_weights
 from pp_cl.layers.direction import Direction
@@ -93,6 +95,11 @@ def vgg_layers(widths: tuple[int, ...] = WIDTHS) -> list[VggConv]:
     return layers
 
 
+def lpips_program(dev: Device) -> Program:
+    """The Program of cl/metrics/lpips.cl in the device's form."""
+    return dev.program("metrics/lpips", LANES=lanes(dev), GROUP=row_parts(dev))
+
+
 class Lpips:
     """The network, prepared for images of one size at a time, and the distance of image pairs.
 
@@ -112,7 +119,7 @@ class Lpips:
         self.dev = dev
         self.policy = policy or make_policy(dev, variant="direct")
         self.training = training
-        self.program = dev.program("metrics/lpips")
+        self.program = lpips_program(dev)
         self.heads = [dev.upload(weights[f"head{i}"]) for i in range(len(BLOCKS))]
         self.widths = tuple(head.size for head in self.heads)
         self._weights, self._biases = {}, {}
@@ -306,7 +313,7 @@ class Lpips:
         n = a.size // channels
         self.program.launch(
             kernel,
-            n,
+            *group_ranges(self.dev, n, row_parts(self.dev)),
             n=n,
             c=channels,
             a=a.reshape(n, channels),

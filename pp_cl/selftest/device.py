@@ -6,13 +6,14 @@ import numpy as np
 
 from pp_cl.device.compact import compact_rows, gather_rows
 from pp_cl.device.device import Device
-from pp_cl.device.scan import BLOCK, exclusive_scan, nonzero
+from pp_cl.device.scan import block_values, exclusive_scan, nonzero
 from pp_cl.selftest.case import SIZES, Case, Check, exact
 
 
 def _scan(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
     """One block, its edges, two levels and three; sums up to 32 bits."""
-    for n in (*SIZES, BLOCK, BLOCK + 1, BLOCK * BLOCK + 1):
+    block = block_values(dev)
+    for n in (*SIZES, block, block + 1, block * block + 1):
         values = rng.integers(0, 9, n, dtype=np.uint32)
         offsets = dev.empty((n + 1,), np.uint32)
         exclusive_scan(dev, dev.upload(values), offsets)
@@ -23,7 +24,7 @@ def _scan(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
 
 
 def _nonzero(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
-    for n in (*SIZES, BLOCK + 1):
+    for n in (*SIZES, block_values(dev) + 1):
         values = rng.integers(1, 9, n, dtype=np.uint32) * (rng.random(n) < 0.3)
         offsets, indices = dev.empty((n + 1,), np.uint32), dev.empty((n,), np.uint32)
         listed = nonzero(dev, dev.upload(values, np.uint32), offsets, indices)

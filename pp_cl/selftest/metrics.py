@@ -5,7 +5,8 @@ from collections.abc import Iterator
 import numpy as np
 
 from pp_cl.device.device import Device
-from pp_cl.metrics.lpips import Lpips
+from pp_cl.device.form import group_ranges, row_parts
+from pp_cl.metrics.lpips import Lpips, lpips_program
 from pp_cl.metrics.shape import Mesh, sample_surface
 from pp_cl.reference import lpips
 from pp_cl.scene.grid import Grid
@@ -21,7 +22,7 @@ def _input(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
     for w in SIZES:
         image = rng.uniform(0, 1, (34, w + 5, 3)).astype(np.float32)
         sizes = {"h": 31, "w": w, "image_width": w + 5, "corner": 3 * (w + 5 + 2)}
-        inside, program = np.s_[1:32, 2 : 2 + w], dev.program("metrics/lpips")
+        inside, program = np.s_[1:32, 2 : 2 + w], lpips_program(dev)
         x, grad_x = dev.empty((31, w, 3)), rng.normal(size=(31, w, 3)).astype(np.float32)
         program.launch("lpips_input", (w, 31), image=dev.upload(image), x=x, **sizes)
         # four roundings of values of up to 2.4
@@ -50,12 +51,12 @@ def _distance(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
             distance, grad_a = dev.empty((n,)), dev.empty((n, channels))
             arrays = {"a": dev.upload(a), "b": dev.upload(b), "head": dev.upload(head)}
             arrays |= {"n": n, "c": channels}
-            program = dev.program("metrics/lpips")
-            program.launch("lpips_distance", n, distance=distance, **arrays)
+            program, ranges = lpips_program(dev), group_ranges(dev, n, row_parts(dev))
+            program.launch("lpips_distance", *ranges, distance=distance, **arrays)
             # sums over 512 channels in 16 lanes: 32 roundings in a row, and those of a root
             expected = lpips.pixel_distance(exact_a, exact_b, exact_head)
             yield relative(distance.get(), expected, 2e-6)
-            program.launch("lpips_distance_backward", n, weight=0.3, grad_a=grad_a, **arrays)
+            program.launch("lpips_distance_backward", *ranges, weight=0.3, grad_a=grad_a, **arrays)
             expected = 0.3 * lpips.pixel_distance_gradient(exact_a, exact_b, exact_head) * (a > 0)
             # times the length, by which gradients differ a millionfold
             length = np.linalg.norm(exact_a, axis=1, keepdims=True)

@@ -5,7 +5,7 @@ from pyopencl.array import Array
 
 from pp_cl.device.buffers import Buffers, Table
 from pp_cl.device.device import Device
-from pp_cl.device.form import lanes
+from pp_cl.device.form import group_items, group_ranges, lanes
 from pp_cl.layers.tiles import SIDE, grid_shape
 from pp_cl.network.tile_sets import grow
 
@@ -106,13 +106,14 @@ class Loss:
     def _sum(self, terms, sums):
         """Write sums (ROWS, 4) of terms (ROWS, M, 4)."""
         rows, m, _ = terms.shape
-        self._launch("loss_sum", rows, rows=rows, m=m, terms=terms, sums=sums)
+        ranges = group_ranges(self.dev, rows)
+        self._launch("loss_sum", *ranges, rows=rows, m=m, terms=terms, sums=sums)
 
-    def _launch(self, kernel, size, **arguments):
+    def _launch(self, kernel, size, local=None, **arguments):
         values = lanes_of_loss(self.dev)
         defines = {"LANES": values, "TAPS": TAPS, "MARGIN": MARGIN // values}
-        program = self.dev.program("training/loss", **defines)
-        program.launch(kernel, size, **arguments)
+        program = self.dev.program("training/loss", GROUP=group_items(self.dev), **defines)
+        program.launch(kernel, size, local, **arguments)
 
 
 def gradient_tiles(found: np.ndarray, size: tuple[int, int], offset: tuple[int, int]) -> np.ndarray:

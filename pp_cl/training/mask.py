@@ -5,6 +5,7 @@ from pyopencl.array import Array
 
 from pp_cl.device.buffers import Buffers, Table
 from pp_cl.device.device import Device
+from pp_cl.device.form import group_items, group_ranges
 from pp_cl.device.transfer import Reading, read_later
 
 
@@ -49,10 +50,10 @@ class MaskLoss:
         (height, width), (h, w), (left, top) = size, target_alpha.shape, offset
         buffers = self._buffers
         buffers.require(self.table(height, width))
-        program = self.dev.program("training/mask")
+        program = self.dev.program("training/mask", GROUP=group_items(self.dev))
         program.launch(
             "mask_gradient",
-            height,
+            *group_ranges(self.dev, height),
             ph=height,
             pw=width,
             h=h,
@@ -67,7 +68,7 @@ class MaskLoss:
         )
         program.launch(
             "mask_sum",
-            1,
+            *group_ranges(self.dev, 1),
             ph=height,
             pixels=h * w,
             weight=self.weight,

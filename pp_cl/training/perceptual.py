@@ -7,6 +7,7 @@ from pyopencl.array import Array
 
 from pp_cl.device.buffers import Buffers, Table
 from pp_cl.device.device import Device
+from pp_cl.device.form import group_items, group_ranges, lanes
 from pp_cl.device.transfer import Reading, read_later
 from pp_cl.errors import UserError
 from pp_cl.layers.policy import ConvolutionPolicy
@@ -130,8 +131,11 @@ class PerceptualLoss:
         """{"lpips": LPIPS of the last call of add()}, {} at weight 0."""
         return {"lpips": read_later(self.dev, self._buffers.total)} if self._network else {}
 
-    def _launch(self, kernel, size, **arguments):
-        self.dev.program("training/perceptual").launch(kernel, size, **arguments)
+    def _launch(self, kernel, groups, **arguments):
+        """`groups`: how often group_items() of a GPU, or one work-item of a CPU, sum."""
+        macros = {"LANES": lanes(self.dev), "GROUP": group_items(self.dev)}
+        program = self.dev.program("training/perceptual", **macros)
+        program.launch(kernel, *group_ranges(self.dev, groups), **arguments)
 
 
 class _Places:

@@ -1,15 +1,26 @@
 """pp_cl/device/form.py: which form a device takes, and how much a work-item handles in each."""
 
+from types import SimpleNamespace
+
 import pyopencl as cl
 import pytest
 
 from pp_cl.device.discover import open_device
-from pp_cl.device.form import channel_ranges, lanes, row_parts, takes_cpu_form
+from pp_cl.device.form import (
+    channel_ranges,
+    group_items,
+    group_ranges,
+    lanes,
+    row_parts,
+    takes_cpu_form,
+)
 from pp_cl.errors import UserError
 from pp_cl.selftest.run import CASES, run_cases
 
 # of the kernels with two forms; `make test-gpu-form` runs all tests
 IN_GPU_FORM = (
+    "device: scan",
+    "device: compact and gather rows",
     "raster: project",
     "raster: thousands of equal depths",
     "raster: shade",
@@ -18,7 +29,11 @@ IN_GPU_FORM = (
     "layers: mean pooling",
     "layers: upsampling",
     "layers: gate",
+    "layers: tiles",
     "loss: L1 and SSIM",
+    "loss: mask",
+    "loss: perceptual",
+    "metrics: distance of LPIPS",
     "adam: arrays",
     "adam: points, sh_0",
     "training: smoothing",
@@ -55,9 +70,20 @@ def test_lanes(dev, monkeypatch):
     assert channel_ranges(dev, 30, 20, 40) == ((40, 20, 30), (16, 4, 1))
 
 
+@pytest.mark.parametrize(("largest", "items"), [(1024, 256), (256, 256), (100, 64), (1, 1)])
+def test_groups(largest, items):
+    """A power of two that the device runs; none on CPUs, which take their work-group."""
+    of = SimpleNamespace(is_cpu=False, device=SimpleNamespace(max_work_group_size=largest))
+    assert (group_items(of), group_ranges(of, 7)) == (items, (7 * items, items))
+    assert group_ranges(of, 7, 16) == (112, 64)
+    of.is_cpu = True
+    assert group_ranges(of, 7, 16) == (7, None)
+    assert (group_items(of), group_ranges(of, 7)) == (1, (7, None))
+
+
 @pytest.mark.parametrize(
     "name",
-    [*IN_GPU_FORM[:3], *(pytest.param(name, marks=pytest.mark.slow) for name in IN_GPU_FORM[3:])],
+    [*IN_GPU_FORM[:5], *(pytest.param(name, marks=pytest.mark.slow) for name in IN_GPU_FORM[5:])],
 )
 def test_the_form_for_gpus_computes_the_same(dev, monkeypatch, name):
     monkeypatch.setattr(dev, "is_cpu", False)

@@ -6,9 +6,10 @@ from PIL import Image
 from support.comparisons import relative_error
 from support.guarded import AWKWARD_SIZES
 
+from pp_cl.device.form import group_ranges, row_parts
 from pp_cl.errors import UserError
 from pp_cl.metrics import lpips_weights
-from pp_cl.metrics.lpips import Lpips
+from pp_cl.metrics.lpips import Lpips, lpips_program
 from pp_cl.reference.differences import numeric_gradient
 from pp_cl.reference.lpips import (
     lpips,
@@ -57,9 +58,9 @@ def hard_features(rng, n, channels):
 
 
 def launch_distance(dev, kernel, a, b, head, **more):
-    dev.program("metrics/lpips").launch(
+    lpips_program(dev).launch(
         kernel,
-        len(a),
+        *group_ranges(dev, len(a), row_parts(dev)),
         n=len(a),
         c=len(head),
         a=dev.upload(a),
@@ -93,6 +94,17 @@ def test_gradient_of_the_distance_equals_oracle(dev, rng, n, channels):
     grad = grad_a.get()
     assert relative_error(grad * length, expected * length) < 3e-6
     assert not grad[0].any() and not grad[-1].any()
+
+
+def test_both_forms_have_the_same_bits(dev, rng, monkeypatch):
+    features, found = hard_features(rng, 33, 64), []
+    for is_cpu in (True, False):
+        monkeypatch.setattr(dev, "is_cpu", is_cpu)
+        distance, grad_a = dev.empty((33,)), dev.empty((33, 64))
+        launch_distance(dev, "lpips_distance", *features, distance=distance)
+        launch_distance(dev, "lpips_distance_backward", *features, weight=0.3, grad_a=grad_a)
+        found.append(distance.get().tobytes() + grad_a.get().tobytes())
+    assert found[0] == found[1]
 
 
 def test_gradients_of_the_oracle_are_the_derivatives(rng):

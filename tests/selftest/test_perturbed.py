@@ -13,7 +13,7 @@ KERNELS = device_module.kernel_folder()
 # (kernel file, text that stands there once, what it becomes, the case that must fail)
 FLIPS = [
     ("device/compact", "to[c] = from[c]", "to[c] = -from[c]", "device: compact and gather rows"),
-    ("device/scan", "offsets[i] = sum", "offsets[i] = -sum", "device: scan"),
+    ("device/scan", "sum = add_sat(sum, total)", "sum = add_sat(sum, -total)", "device: scan"),
     ("scene/demo", "y[lane] = p.y", "y[lane] = -p.y", "scene: demo"),
     ("scene/hull", "alive & seen", "alive | seen", "scene: hull"),
     ("scene/target", "255 * (255 - c.w)", "255 * (255 + c.w)", "scene: target"),
@@ -51,7 +51,7 @@ FLIPS = [
     ("training/adam", "f -= basis", "f += basis", "adam: points, sh_0"),
     ("training/smooth", "* k + c) - f", "* k + c) + f", "training: smoothing"),
     ("training/refine", "1.0f + sqrt", "1.0f - sqrt", "training: split opacities"),
-    ("metrics/lpips", "d = a[k] * scale_a - b", "d = a[k] * scale_a + b", "metrics: LPIPS"),
+    ("metrics/lpips", "* scale_a - load_part", "* scale_a + load_part", "metrics: LPIPS"),
     ("metrics/shape", "at.x + 0.5f", "at.x - 0.5f", "metrics: vertices on a box"),
 ]  # fmt: skip
 

@@ -56,7 +56,7 @@ def test_a_new_set_is_noticed(device, tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(builds, "FILE", file)
     monkeypatch.setattr(builds, "run_all", gather)
     assert main(["--write"]) == 0
-    assert read_builds(file) == {Build("device/compact", ()): {"gather_rows"}}
+    assert read_builds(file) == {Build("device/compact", ("GROUP=1",)): {"gather_rows"}}
     assert main([]) == 0
     monkeypatch.setattr(builds, "run_all", with_a_new_set)
     assert main([]) == 1

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from skimage.metrics import structural_similarity
 from support.comparisons import relative_error
+from support.guarded import AWKWARD_SIZES
 
 from pp_cl.reference import loss as oracle_loss
 from pp_cl.reference.differences import numeric_gradient
@@ -147,3 +148,33 @@ def test_same_bits_twice(dev, rng):
     first, second = run(dev, prediction, target, 0.2), run(dev, prediction, target, 0.2)
     assert first[0].tobytes() == second[0].tobytes()
     assert first[1].tobytes() == second[1].tobytes()
+
+
+def float32_sum(terms, group):
+    """(4,) of terms (M, 4) in float32: member by member of a group, then as a tree."""
+    sums = np.zeros((group, 4), np.float32)
+    for first in range(0, len(terms), group):
+        part = terms[first : first + group]
+        sums[: len(part)] += part
+    while len(sums) > 1:
+        sums = sums[: len(sums) // 2] + sums[len(sums) // 2 :]
+    return sums[0]
+
+
+@pytest.mark.parametrize("m", [*AWKWARD_SIZES, 1590])
+@pytest.mark.parametrize("group", [1, 2, 256])
+def test_terms_are_summed_in_a_fixed_order(dev, rng, m, group):
+    terms = rng.uniform(0, 1, (3, m, 4)).astype(np.float32)
+    sums = dev.empty((3, 4))
+    dev.program("training/loss", GROUP=group).launch(
+        "loss_sum", 3 * group, group, rows=3, m=m, terms=dev.upload(terms), sums=sums
+    )
+    assert np.array_equal(sums.get(), [float32_sum(row, group) for row in terms])
+
+
+def test_a_tree_is_more_exact(rng):
+    """Than one work-item that sums them all."""
+    terms = rng.uniform(0, 1, (1590, 4)).astype(np.float32)
+    exact = terms.sum(axis=0, dtype=np.float64)
+    serial, tree = (np.abs(float32_sum(terms, group) - exact).max() for group in (1, 256))
+    assert 5 * tree < serial

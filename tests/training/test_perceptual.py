@@ -108,17 +108,19 @@ def test_sizes_may_change_between_calls_and_bits_stay(dev, rng, weights):
         assert seen.setdefault(i, bits) == bits
 
 
+@pytest.mark.parametrize("macros", [{"LANES": 16}, {"LANES": 1, "GROUP": 64}], ids=str)
 @pytest.mark.parametrize("n", AWKWARD_SIZES)
-def test_sums_equal_float64(dev, rng, n):
-    """A block of n x 31 pixels behind the 5 rows of others, and one of 31 x n."""
-    program = dev.program("training/perceptual")
+def test_sums_equal_float64(dev, rng, n, macros):
+    """A block of n x 31 pixels behind the 5 rows of others, and one of 31 x n; in both forms."""
+    program, group = dev.program("training/perceptual", **macros), macros.get("GROUP", 1)
     for h, w in ((n, 31), (31, n)):
         distance = rng.uniform(0, 1, (h, w)).astype(np.float32)
         row_term, total = dev.upload(np.ones(5 + h), np.float32), dev.empty((1,))
         terms = dev.upload(np.ones(4), np.float32)
         program.launch(
             "perceptual_rows",
-            h,
+            h * group,
+            64,
             h=h,
             w=w,
             first=5,
@@ -127,7 +129,8 @@ def test_sums_equal_float64(dev, rng, n):
         )
         program.launch(
             "perceptual_sum",
-            1,
+            64,
+            64,
             n=5 + h,
             weight=0.5,
             row_term=row_term,
