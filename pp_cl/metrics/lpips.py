@@ -20,7 +20,7 @@ from pp_cl.layers.policy import ConvolutionPolicy, make_policy
 from pp_cl.layers.resample import maxpool2_backward, maxpool2_forward
 from pp_cl.layers.tiles import LANES, Tiles, all_tiles, all_tiles_buffers
 from pp_cl.layers.variants import Convolution, ConvShape
-from pp_cl.layers.work import Work
+from pp_cl.layers.work import COUNTERS, Work
 from pp_cl.metrics.lpips_weights import load_weights
 
 # convolutions between the poolings of VGG16; the last one of each block is compared
@@ -130,7 +130,7 @@ class Lpips:
         self._choices: dict[str, Choice] = {}
         self._laid_out: dict[str, Array | None] = {}
         self._tiles: list[Tiles] = []  # of each block
-        self._work = Work.empty(dev, 1, 1)
+        self._work = Work.empty(dev, COUNTERS, 1)
 
     @staticmethod
     def table(
@@ -139,7 +139,7 @@ class Lpips:
         """The device buffers of a network that is trained with, for images of `size`: weights, work
         and tiles, without feature maps.
         """
-        floats, work = {}, [(1, 1)]
+        floats, work = {}, [(COUNTERS, 1)]
         for layer in vgg_layers(widths):
             choice = layer.choose(dev, policy, size)
             needs = choice.work_floats(layer, size)
@@ -262,7 +262,7 @@ class Lpips:
         if size == self._size:
             return
         self._size, self._laid_out, self._tiles, self._work = None, {}, [], None
-        work = [(1, 1)]
+        work = [(COUNTERS, 1)]
         for layer in vgg_layers(self.widths):
             choice = self._choices[layer.name] = layer.choose(self.dev, self.policy, size)
             self._laid_out[layer.name] = choice.forward.lay_out(self._weights[layer.name])
