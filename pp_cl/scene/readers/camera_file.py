@@ -9,7 +9,16 @@ import numpy as np
 
 from pp_cl.errors import UserError
 from pp_cl.scene.camera import Camera
-from pp_cl.scene.readers.frame import GL_FROM_CV, Frame, distortion, pinhole, read_json, rigid_pose
+from pp_cl.scene.readers.frame import (
+    GL_FROM_CV,
+    LEAST_ANGLE,
+    Frame,
+    distortion,
+    numbers,
+    pinhole,
+    read_json,
+    rigid_pose,
+)
 
 FORMATS = (
     "a camera_path.json (with camera_path), a transforms.json (with frames), or a cameras.json (a"
@@ -52,13 +61,13 @@ def _transforms_camera(frame, size):
 def _path_camera(frame, size):
     """Of nerfstudio's viewer: fov is the angle across the height, in degrees."""
     width, height = _size(frame, ("render_width", "render_height"), size)
-    fov = frame.number("fov", above=0, below=180)
+    fov = frame.number("fov", above=math.degrees(LEAST_ANGLE), below=180)
     if fov is None:
         raise frame.error("fov", "is missing; add the angle across the height in degrees")
-    numbers = frame.get("camera_to_world")
-    if isinstance(numbers, list) and len(numbers) == 16:
-        numbers = [numbers[row : row + 4] for row in range(0, 16, 4)]
-    pose = rigid_pose(frame, "camera_to_world", numbers) @ GL_FROM_CV
+    matrix = frame.get("camera_to_world")
+    if isinstance(matrix, list) and len(matrix) == 16:
+        matrix = [matrix[row : row + 4] for row in range(0, 16, 4)]
+    pose = rigid_pose(frame, "camera_to_world", matrix) @ GL_FROM_CV
     focal = 0.5 * height / math.tan(math.radians(fov) / 2)
     return Camera(pose, focal, focal, width / 2, height / 2, width, height)
 
@@ -76,11 +85,8 @@ def _splatting_camera(frame, size):
 
 
 def _array(frame, key, shape):
-    try:
-        array = np.array(frame.get(key), np.float64)
-    except (TypeError, ValueError, OverflowError):
-        array = np.empty(0)
-    if array.shape != shape:
+    array = numbers(frame.get(key))
+    if array is None or array.shape != shape:
         raise frame.error(key, f"must be {'x'.join(map(str, shape))} numbers")
     return array
 
