@@ -37,7 +37,7 @@ ALWAYS_INLINE void transform_input(VALUE *t, const int step) {
 #if WINO_M == 4
     const VALUE d4 = t[4 * step], d5 = t[5 * step];
     const VALUE even_p = d4 - POINT_Q2 * d2, odd_p = d3 - POINT_Q2 * d1,
-                  even_q = d4 - POINT_P2 * d2, odd_q = d3 - POINT_P2 * d1;
+                even_q = d4 - POINT_P2 * d2, odd_q = d3 - POINT_P2 * d1;
     t[0] = POINT_P2 * POINT_Q2 * d0 + (d4 - (POINT_P2 + POINT_Q2) * d2);
     t[step] = even_p + POINT_P * odd_p;
     t[2 * step] = even_p - POINT_P * odd_p;
@@ -73,7 +73,7 @@ ALWAYS_INLINE void transform_gradient(VALUE *t, const int step) {
 #if WINO_M == 4
     const VALUE g2 = t[2 * step], g3 = t[3 * step];
     const VALUE even_p = g0 + POINT_P2 * g2, odd_p = g1 + POINT_P2 * g3,
-                  even_q = g0 + POINT_Q2 * g2, odd_q = g1 + POINT_Q2 * g3;
+                even_q = g0 + POINT_Q2 * g2, odd_q = g1 + POINT_Q2 * g3;
     t[step] = even_p + POINT_P * odd_p;
     t[2 * step] = even_p - POINT_P * odd_p;
     t[3 * step] = even_q + POINT_Q * odd_q;

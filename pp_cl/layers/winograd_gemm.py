@@ -1,5 +1,5 @@
-"""3x3 convolutions by Winograd's minimal filtering F(m x m, 3 x 3) for GPUs: many tiles at a time are
-multiplied as matrices, through local memory.
+"""3x3 convolutions by Winograd's minimal filtering F(m x m, 3 x 3) for GPUs: many tiles at a time
+are multiplied as matrices, through local memory.
 
 The gradient of an input is the convolution with flipped weights. Channels come in multiples of 16.
 """
@@ -32,7 +32,9 @@ def transformed_floats(m: int, ci: int, co: int) -> int:
 
 
 def tiles_at_a_time(dev: Device, m: int, ci: int, co: int) -> int:
-    """Tiles of m x m outputs between two transforms: as many as a cache holds, in whole work-groups."""
+    """Tiles of m x m outputs that are transformed, multiplied and transformed back at a time: as
+    many as a cache holds, in whole work-groups.
+    """
     cache = min(max(LEAST_BYTES, dev.info["cache_bytes"] // 2), MOST_BYTES)
     group = _group_tiles(co, GROUPS[0])
     return max(1, cache // (4 * positions(m) * (ci + co)) // group) * group
@@ -83,10 +85,13 @@ def winograd_gemm_forward(
     work: Work,
     tiles: Tiles | None = None,
 ) -> None:
-    """As winograd.winograd_forward, with weights by winograd_gemm_weights() and scratch_floats()."""
+    """As winograd.winograd_forward, with weights by winograd_gemm_weights() and scratch of
+    scratch_floats().
+    """
     if bias.shape != out.shape[2:]:
         raise ValueError(f"Winograd convolution to {out.shape[2]} channels: bias {bias.shape}")
-    _convolve(dev, m, sources, out, work=work, tiles=tiles, bias=bias, relu=relu)
+    given = {"biased": True, "relu": relu, "masked": False, "bias": bias, "mask": out, "out": out}
+    _convolve(dev, m, sources, work=work, tiles=tiles, outputs=given)
 
 
 def winograd_gemm_backward_input(
@@ -100,12 +105,16 @@ def winograd_gemm_backward_input(
     tiles: Tiles | None = None,
 ) -> None:
     """As winograd.winograd_backward_input, with flipped weights by winograd_gemm_weights() and
-    scratch_floats().
+    scratch of scratch_floats().
     """
-    _convolve(dev, m, (grad_out,), grad_x, work=work, tiles=tiles, mask=mask)
+    given = {"biased": False, "relu": False, "masked": mask is not None, "bias": work.weights}
+    given |= {"mask": grad_x if mask is None else mask, "out": grad_x}
+    _convolve(dev, m, (grad_out,), work=work, tiles=tiles, outputs=given)
 
 
-def _convolve(dev, m, sources, out, *, work, tiles, bias=None, relu=False, mask=None):
+def _convolve(dev, m, sources, *, work, tiles, outputs):
+    """outputs: arguments of the last kernel."""
+    out = outputs["out"]
     height, width, co = out.shape
     channels = [source.shape[2] for source in sources]
     ci = sum(channels)
@@ -145,13 +154,8 @@ def _convolve(dev, m, sources, out, *, work, tiles, bias=None, relu=False, mask=
             (co, count),
             ci=ci,
             co=co,
-            biased=bias is not None,
-            relu=relu,
-            masked=mask is not None,
-            bias=work.weights if bias is None else bias,
-            mask=out if mask is None else mask,
-            out=out,
             **part,
+            **outputs,
         )
 
 

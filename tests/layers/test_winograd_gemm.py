@@ -5,7 +5,6 @@ import pytest
 from oracle.conv import conv, conv_gradients
 from support.comparisons import relative_error
 from support.conv_layers import check_hard_inputs, layer
-from support.guarded import large
 
 from pp_cl.layers import winograd_gemm as module
 from pp_cl.layers.blocking import SHIPPED
@@ -26,17 +25,12 @@ from pp_cl.layers.work import COUNTERS, Work
 SHAPES = [
     (1, 5, 16, 32),
     (5, 1, 32, 48),
-    *map(
-        large,
-        [
-            (1, 1, 16, 16),
-            (31, 33, 16, 48),
-            (257, 3, 32, 16),
-            (6, 31, 48, 64),
-            (8, 8, 512, 32),
-            (16, 24, 32, 512),
-        ],
-    ),
+    (1, 1, 16, 16),
+    (31, 33, 16, 48),
+    (257, 3, 32, 16),
+    (6, 31, 48, 64),
+    (8, 8, 512, 32),
+    (16, 24, 32, 512),
 ]
 # {m: error over the largest value}: the transforms of F(4x4) cost more than the sums do
 BOUNDS = {2: 3e-6, 4: 8e-6}
@@ -68,6 +62,20 @@ def run_backward_input(dev, m, x, weight, grad_out, masked, first=0):
     return grad_x.get()
 
 
+def test_in_small_work_groups(dev, rng, monkeypatch, m):
+    """What a simulator runs in half a minute: two sources, both directions, a tail of tiles."""
+    monkeypatch.setattr(module, "GROUPS", (32,))
+    x, x2 = (np.maximum(rng.normal(size=(1, 5, 16)), 0).astype(np.float32) for _ in range(2))
+    both, grad_out = np.concatenate([x, x2], 2), rng.normal(size=(1, 5, 16)).astype(np.float32)
+    weight, bias = layer(rng, 32, 16, 3)
+    actual = run_forward(dev, m, x, weight, bias, True, x2)
+    assert relative_error(actual, conv(both, weight, bias, True)) < BOUNDS[m]
+    expected = conv_gradients(both, weight, grad_out)[0][..., 16:] * (x2 > 0)
+    actual = run_backward_input(dev, m, x2, weight, grad_out, True, first=16)
+    assert relative_error(actual, expected) < BOUNDS[m]
+
+
+@pytest.mark.large
 @pytest.mark.parametrize("shape", SHAPES)
 def test_forward(dev, rng, shape, m):
     height, width, ci, co = shape
@@ -85,7 +93,8 @@ def test_forward(dev, rng, shape, m):
         assert error < 1.2 * relative_error(direct.get(), expected) + 2**-23
 
 
-@pytest.mark.parametrize("c1, c2", [(16, 32), large(48, 16)])
+@pytest.mark.large
+@pytest.mark.parametrize("c1, c2", [(16, 32), (48, 16)])
 def test_two_sources_are_a_concatenation(dev, rng, c1, c2, m):
     x = rng.normal(size=(7, 29, c1 + c2)).astype(np.float32)
     weight, bias = layer(rng, c1 + c2, 16, 3)
@@ -95,6 +104,7 @@ def test_two_sources_are_a_concatenation(dev, rng, c1, c2, m):
     np.testing.assert_array_equal(actual, run_forward(dev, m, x, weight, bias, True))
 
 
+@pytest.mark.large
 @pytest.mark.parametrize("shape", SHAPES)
 def test_backward_input(dev, rng, shape, m):
     height, width, ci, co = shape
@@ -160,7 +170,8 @@ def test_the_chunk_is_half_of_the_last_cache(dev, monkeypatch, m):
             assert scratch_floats(dev, m, ci, co) == COUNTERS + number * floats
 
 
-@pytest.mark.parametrize("most", [32, large(64)])
+@pytest.mark.large
+@pytest.mark.parametrize("most", [32, 64])
 def test_smaller_work_groups_compute_the_same_bits(dev, rng, monkeypatch, most, m):
     x = rng.normal(size=(9, 30, 16)).astype(np.float32)
     weight, bias = layer(rng, 16, 16, 3)
@@ -176,6 +187,7 @@ def test_smaller_work_groups_compute_the_same_bits(dev, rng, monkeypatch, most, 
     assert tried == {n for n in module.GROUPS if n >= most}
 
 
+@pytest.mark.large
 def test_relu_hides_no_nan(dev, rng, m):
     x = rng.normal(size=(9, 11, 16)).astype(np.float32)
     x[4, 5, 6] = np.nan
