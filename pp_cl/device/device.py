@@ -29,7 +29,12 @@ INTEL_PLATFORM = "Intel(R) OpenCL"
 # Files with a kernel that spills, or becomes narrow, with the 128 registers that a thread has there
 # by default, and not with 256, of which half as many threads run (docs/gpu_check.md).
 SPILLING_ON_INTEL = frozenset(
-    ("layers/conv_backward_weights", "layers/conv_local", "layers/conv_local_backward_weights")
+    (
+        "layers/conv_backward_weights",
+        "layers/conv_local",
+        "layers/conv_local_backward_weights",
+        "layers/winograd_gemm",
+    )
 )
 
 
@@ -56,7 +61,7 @@ def kernel_folder() -> Path:
 
 def describe(device: cl.Device) -> dict[str, str | int]:
     """A cl.Device's "name", "platform", "version", "driver", "type", "compute_units",
-    "memory_bytes", "max_allocation_bytes" in a dictionary.
+    "memory_bytes", "max_allocation_bytes", "cache_bytes" (of the last cache) in a dictionary.
     """
     return {
         "name": device.name.strip(),
@@ -67,6 +72,7 @@ def describe(device: cl.Device) -> dict[str, str | int]:
         "compute_units": device.max_compute_units,
         "memory_bytes": _memory_bytes(device),
         "max_allocation_bytes": _max_allocation_bytes(device),
+        "cache_bytes": device.global_mem_cache_size,
     }
 
 

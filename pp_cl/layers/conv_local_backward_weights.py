@@ -16,8 +16,9 @@ from pp_cl.layers.tiles import LANES, SIDE, Tiles, checked_tiles
 # {side of the kernel: groups of four input channels of a work-group}
 CI_QUADS = {3: 4, 1: 8}
 # Tiles that a work-item sums in registers, at most: one sum over an image of background would lose
-# digits. Fewer of narrow images, so that it sums as many pixels as the direct kernel, a row.
-SUMMED = 8
+# digits. Fewer of narrow images, so that it sums half as many pixels as the direct kernel, which
+# sums a row: errors stay below that one's.
+SUMMED = 4
 
 
 def conv_local_backward_weights(
@@ -48,7 +49,7 @@ def conv_local_backward_weights(
         "tile_count": tiles.count,
         "partial": partial,
     }
-    summed = max(1, min(SUMMED, width // (SIDE * SIDE)))
+    summed = max(1, min(SUMMED, width // (2 * SIDE * SIDE)))
     for i, x in enumerate(sources):
         c = x.shape[2]
         program, in_group, items = _program(dev, k, c, co)

@@ -14,6 +14,7 @@ from pp_cl.layers.tiles import Tiles
 from pp_cl.layers.variant_direct import DirectConvolution
 from pp_cl.layers.variant_local import LocalConvolution
 from pp_cl.layers.variant_winograd import WinogradConvolution
+from pp_cl.layers.variant_winograd_gemm import WinogradGemmConvolution
 from pp_cl.layers.winograd import WinogradForm, fits
 from pp_cl.layers.work import Work
 
@@ -31,7 +32,7 @@ class Variant:
     A direction without an error has no kernel of its own. devices: classes of devices that it is
     offered to; the first in VARIANTS of those that a GPU is offered is shipped there. shipped_from:
     {direction: on CPUs, shipped for images of at least that many pixels}. preferred: the device
-    that prefers it, and the measurement that says so. local: the direct one through local memory.
+    that prefers it, and the measurement that says so. local: through local memory.
     """
 
     winograd_m: int | None
@@ -50,10 +51,10 @@ class Variant:
 
     def convolution(self, dev: Device, blocking: Blocking) -> "Convolution":
         """Its implementation on a device."""
-        if self.local:
-            return LocalConvolution(dev, blocking)
         if self.winograd_m is None:
-            return DirectConvolution(dev, blocking)
+            return (LocalConvolution if self.local else DirectConvolution)(dev, blocking)
+        if self.local:
+            return WinogradGemmConvolution(dev, blocking, self.winograd_m)
         form = WinogradForm(
             self.winograd_m,
             self.half,
@@ -65,8 +66,8 @@ class Variant:
 
 
 # Below the least numbers of pixels too few tiles share the cost of transforming the weights.
-# Channels matter less: from 16 on, all of them gain. No Winograd variant is offered to GPUs: a
-# work-item holds a group of one lane, and GPU compilers spill 15 KB of its registers.
+# Channels matter less: from 16 on, all of them gain. The Winograd variants of CPUs are not offered
+# to GPUs: a work-item holds a group of one lane, and GPU compilers spill 15 KB of its registers.
 VARIANTS = {
     "local": Variant(
         None,
@@ -116,6 +117,24 @@ VARIANTS = {
         {},
         "CPU, where --tolerance allows it: forward 7 to 16 % faster than winograd4 at 512 channels,"
         " 2 cores with AVX-512.",
+    ),
+    "winograd2_gemm": Variant(
+        2,
+        False,
+        {3: {FORWARD: 7e-7, INPUT: 8e-7}},
+        ("GPU",),
+        {},
+        "GPU, where `pp-cl tune` finds it faster than local: not timed.",
+        local=True,
+    ),
+    "winograd4_gemm": Variant(
+        4,
+        False,
+        {3: {FORWARD: 2.2e-6, INPUT: 2.6e-6}},
+        ("GPU",),
+        {},
+        "GPU, where `pp-cl tune` finds it faster than local: not timed.",
+        local=True,
     ),
 }
 

@@ -36,7 +36,15 @@ DIRECT_SHAPES = (*SHAPES, (5, 31, (3,), 20, 3), (31, 33, (16, 32), 48, 1), (1, 1
 # of the largest value: sums of up to 4608 products, each rounded by half EPS, grow as their root,
 # 4e-6, of which the largest of the values seen has the more the longer the sum; those of F(4x4)
 # pass through transforms that enlarge it. In a gradient of weights a sum is as long as the image.
-BOUNDS = {"local": 3e-6, "direct": 3e-6, "winograd2": 3e-6, "winograd4": 8e-6}
+EXACT, OF_F4 = 3e-6, 8e-6
+BOUNDS = {
+    "local": EXACT,
+    "direct": EXACT,
+    "winograd2": EXACT,
+    "winograd4": OF_F4,
+    "winograd2_gemm": EXACT,
+    "winograd4_gemm": OF_F4,
+}
 WEIGHTS_BOUND = 5e-6
 
 PLANES = ((1, 1, 16), (1, 5, 3), (31, 33, 17), (3, 257, 32))  # (H, W, C)

@@ -54,7 +54,8 @@ def test_backward_weights(dev, rng, shape, k):
     if weight.size > 100:  # the error of few numbers is luck
         given = {"run": direct.conv_backward_weights, "blocking": SHIPPED["CPU"]}
         by_direct = run_backward_weights(dev, grad_out, k, x, **given)[0]
-        most = 1.2 * norm_error(by_direct, expected_weight) + 2**-25
+        # a tile is longer than the rows of few pixels, which the direct kernel sums
+        most = norm_error(by_direct, expected_weight) + (2**-25 if height * width < 200 else 0)
         assert norm_error(weight, expected_weight) < most
 
 

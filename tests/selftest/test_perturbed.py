@@ -39,6 +39,7 @@ FLIPS = [
     ("layers/winograd", "[i] += value", "[i] -= value", "conv: winograd2, hard inputs"),
     ("layers/winograd_backward_weights", "[i] += v", "[i] -= v", "conv: winograd2, hard inputs"),
     ("layers/winograd_transform", "= weight[(block * 9", "= -weight[(block * 9", "conv: winograd2"),
+    ("layers/winograd_gemm", "[0] += of", "[0] -= of", "conv: winograd2_gemm, hard inputs"),
     ("layers/resample", "+ 0.25f * line", "- 0.25f * line", "layers: upsampling"),
     ("layers/resample", "+ 0.25f * dL_dout", "- 0.25f * dL_dout", "layers: mean pooling"),
     ("layers/gate", "(open * closed)", "(open + closed)", "layers: gate"),

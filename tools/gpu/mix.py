@@ -26,6 +26,7 @@ TARGETS = ("sm_90", "gfx1100")
 LOOPS = {
     "layers/conv_local": ("conv_local_backward_input", "conv_local_forward"),
     "layers/conv_local_backward_weights": ("conv_local_backward_weights",),
+    "layers/winograd_gemm": ("winograd_gemm_multiply",),
 }
 
 # NVIDIA's, then AMD's: `/*0010*/ @P0 FFMA R1, R2, R3, R1 ;` and `v_fma_f32 v1, v2, v3, v1`
