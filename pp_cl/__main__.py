@@ -2,6 +2,6 @@
 
 import sys
 
-from pp_cl.cli import main
+from pp_cl.cli import program
 
-sys.exit(main())
+sys.exit(program())

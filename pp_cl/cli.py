@@ -50,6 +50,18 @@ def main(argv: Sequence[str] | None = None) -> int:
         return _run(argv)
 
 
+def program(argv: Sequence[str] | None = None) -> int:
+    """main() of a process of its own: a further Ctrl-C ends what Python does after it, without a
+    traceback.
+    """
+    try:
+        return main(argv)
+    except KeyboardInterrupt:  # a second one, where main() told of the first
+        return 128 + signal.SIGINT
+    finally:
+        signal.signal(signal.SIGINT, signal.SIG_DFL)
+
+
 def _run(argv):
     """The exit status of a command."""
     try:

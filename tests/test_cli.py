@@ -3,9 +3,11 @@ is wrong.
 """
 
 import json
+import signal
 import subprocess
 import sys
 from pathlib import Path
+from textwrap import dedent
 
 import numpy as np
 import pytest
@@ -248,3 +250,33 @@ def test_numbers_without_end_are_one_line(words, capsys):
 def test_what_was_typed_breaks_no_line(tmp_path, capsys):
     line = failure(capsys, "eval", f"{tmp_path}/a\nb\x1b[31m")
     assert f"{tmp_path}/a b?[31m/config.json" in line
+
+
+@pytest.mark.parametrize(
+    "told, then, status",
+    [("130", "os.kill(os.getpid(), signal.SIGINT)", -signal.SIGINT), ("1 / 0", "", 1)],
+)
+def test_a_further_interrupt_shows_no_traceback(told, then, status):
+    """Of a process whose main() has told of the first."""
+    lines = f"""
+        import os, signal
+        from pp_cl import cli
+        cli.main = lambda argv: {told}
+        told = cli.program()
+        {then}
+    """
+    done = subprocess.run([sys.executable, "-c", dedent(lines)], capture_output=True, text=True)
+    assert done.returncode == status
+    assert ("Traceback" in done.stderr) == (status == 1)
+
+
+def test_an_interrupt_while_the_first_is_told_of():
+    lines = """
+        from pp_cl import cli
+        def main(argv):
+            raise KeyboardInterrupt
+        cli.main = main
+        raise SystemExit(cli.program())
+    """
+    done = subprocess.run([sys.executable, "-c", dedent(lines)], capture_output=True, text=True)
+    assert (done.returncode, done.stderr) == (130, "")

@@ -113,7 +113,7 @@ def _serve(folder, forks):
             if not child:
                 _into(texts)
                 _arm(job, folder / "calls")
-                sys.exit(_main(job.words))
+                sys.exit(_main(job.words, "program"))
             status = _wait(child, job.signals)
         else:
             _into(texts)
@@ -145,12 +145,12 @@ def _keep_device():
     discover.open_device = cache(discover.open_device)
 
 
-def _main(words):
-    """Exit status of a command."""
-    from pp_cl.cli import main
+def _main(words, name="main"):
+    """Exit status of a command, by a function of pp_cl.cli."""
+    import pp_cl.cli
 
     try:
-        status = main(words)
+        status = getattr(pp_cl.cli, name)(words)
     except SystemExit as stopped:
         status = stopped.code
     except BaseException:
