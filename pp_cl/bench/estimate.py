@@ -18,7 +18,7 @@ from pp_cl.bench.timing import interleave
 from pp_cl.config import Config
 from pp_cl.device.buffers import table_bytes
 from pp_cl.device.device import Device
-from pp_cl.device.scan import BLOCK
+from pp_cl.device.scan import BLOCK_ON_GPU
 from pp_cl.layers.conv_backward_weights import partial_floats
 from pp_cl.network.architectures import multiplications, unet_layers
 from pp_cl.network.layer import Conv, Layer
@@ -145,8 +145,8 @@ def _moments(config, n):
 
 
 def _scans(n):
-    """Launches of exclusive_scan() of n values."""
-    return 1 if n <= BLOCK else 2 + _scans(-(-n // BLOCK))
+    """Launches of exclusive_scan() of n values on a GPU."""
+    return 1 if n <= BLOCK_ON_GPU else 2 + _scans(-(-n // BLOCK_ON_GPU))
 
 
 def _maps(layers, counts):

@@ -14,6 +14,7 @@ from pp_cl.layers.variants import offered
 pytestmark = pytest.mark.usefixtures("quick")
 
 
+@pytest.mark.usefixtures("cpu_form")
 @pytest.mark.parametrize(
     "k, sources, co, choice", [(3, (16, 48), 32, True), (3, (3,), 16, False), (1, (32,), 3, False)]
 )

@@ -158,6 +158,7 @@ def test_one_slow_probe_condemns_nobody(clock):
     assert time_runs(made) == pytest.approx({"a": 1e3, "b": 0.9e3})
 
 
+@pytest.mark.usefixtures("cpu_form")
 def test_a_row_says_what_was_measured(dev, takes):
     takes(lambda variant, blocking, measurement: MS[variant])
     row, shipped_ms = measured(dev)
@@ -176,6 +177,7 @@ def test_a_row_says_what_was_measured(dev, takes):
     assert weights["ms"].keys() == {"direct", "winograd2", "winograd4"}
 
 
+@pytest.mark.usefixtures("cpu_form")
 def test_the_times_of_all_that_seem_faster_are_those_of_the_second_measurement(dev, takes):
     """The fastest may be beyond a tolerance, and the next one is then taken."""
     first = MS | {"direct": 0.9, "winograd2": 0.5}
@@ -185,6 +187,7 @@ def test_the_times_of_all_that_seem_faster_are_those_of_the_second_measurement(d
     assert row["ms"] == pytest.approx(second) and shipped_ms == pytest.approx(1.1)
 
 
+@pytest.mark.usefixtures("cpu_form")
 @pytest.mark.parametrize("second, chosen", [(0.5, "winograd2"), (1.1, "winograd4")])
 def test_a_faster_variant_must_be_so_twice(dev, takes, second, chosen):
     def ms(variant, blocking, measurement):
@@ -198,6 +201,7 @@ def test_a_faster_variant_must_be_so_twice(dev, takes, second, chosen):
     assert make_policy(dev, 1e-5, tuning_of(dev, [row])).choose(CASE.shape) == chosen
 
 
+@pytest.mark.usefixtures("cpu_form")
 def test_with_another_blocking_the_shipped_one_is_timed_too(dev, takes):
     def ms(variant, blocking, measurement):
         shipped = variant == "winograd4" and blocking == make_policy(dev).blocking
@@ -213,6 +217,7 @@ def test_with_another_blocking_the_shipped_one_is_timed_too(dev, takes):
     }
 
 
+@pytest.mark.usefixtures("cpu_form")
 @pytest.mark.parametrize("second, chosen", [(1.0, {"winograd": (128, 8)}), (2.0, {})])
 def test_blocking_is_chosen_for_all_layers_together(dev, takes, second, chosen):
     """(128, 8) seems the fastest; only if it is so again it is taken."""
@@ -237,6 +242,7 @@ def test_blocking_is_chosen_for_all_layers_together(dev, takes, second, chosen):
     assert times["winograd"][64, 8] == pytest.approx(4.0)
 
 
+@pytest.mark.usefixtures("cpu_form")
 def test_the_table_names_what_is_chosen_within_the_tolerance(dev, takes, monkeypatch, capsys):
     takes(lambda variant, blocking, measurement: MS[variant])
     monkeypatch.setattr(tune, "network_cases", lambda *args: [CASE])
@@ -269,6 +275,7 @@ def test_an_earlier_tuning_of_other_layers_is_kept():
 # ---- the command
 
 
+@pytest.mark.usefixtures("cpu_form")
 def test_tune_stores_what_the_others_then_use(cache, capsys, monkeypatch):
     assert main(["tune", *SMALL]) == 0
     dev = open_device()

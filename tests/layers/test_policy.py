@@ -38,6 +38,7 @@ def test_the_fastest_is_taken_and_the_shipped_one_in_doubt():
     assert fastest({}, "a") == "a"
 
 
+@pytest.mark.usefixtures("cpu_form")
 def test_a_measured_layer_takes_its_fastest_variant(dev):
     assert pick(dev, [row()]) == "winograd2"
     assert (
@@ -54,12 +55,14 @@ def test_a_measured_layer_takes_its_fastest_variant(dev):
     )
 
 
+@pytest.mark.usefixtures("cpu_form")
 def test_other_layers_are_taken_as_shipped(dev):
     assert pick(dev, []) == "winograd4"
     for change in ({"ci": 32}, {"co": 64}, {"k": 1}, {"direction": "input"}):
         assert pick(dev, [row(**change)]) == "winograd4"
 
 
+@pytest.mark.usefixtures("cpu_form")
 def test_the_nearest_size_counts_within_a_factor_of_four(dev):
     rows = [row(10_000, MS | {"direct": 0.1}), row(100_000)]
     assert (
@@ -74,6 +77,7 @@ def test_the_nearest_size_counts_within_a_factor_of_four(dev):
     )
 
 
+@pytest.mark.usefixtures("cpu_form")
 def test_a_variant_beyond_the_tolerance_is_not_taken(dev):
     assert pick(dev, [row(ms=MS | {"winograd4": 0.1})], 5e-7) == "winograd4"
     assert pick(dev, [row(ms=MS | {"winograd4": 0.1})], 4.9e-7) == "winograd2"
@@ -82,6 +86,7 @@ def test_a_variant_beyond_the_tolerance_is_not_taken(dev):
     assert pick(dev, [], VARIANTS["direct"].errors[3][FORWARD]) == "winograd2"
 
 
+@pytest.mark.usefixtures("cpu_form")
 def test_what_no_variant_keeps_is_refused_with_the_least(dev):
     with pytest.raises(
         UserError,
@@ -137,6 +142,7 @@ def test_shipped_errors_bound_what_is_measured(dev, direction, sources, co, side
 # ---- on a device
 
 
+@pytest.mark.usefixtures("cpu_form")
 def test_a_network_takes_what_was_tuned(dev, rng):
     """Rows that make one variant the fastest everywhere give the bits of a network of that
     variant.
