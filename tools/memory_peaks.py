@@ -37,6 +37,7 @@ TRAININGS = {
     "small": ("small", {}),
     "full": ("full", {"points.count": 30_000}),
     "paper": ("paper", {"points.count": 1_500_000, "scene.downscale": 4, "train.iterations": 4}),
+    "paper in full": ("paper", {"train.iterations": 3}),  # 12 GiB on lego
     "phone": ("tiny", {"scene.downscale": 8}),
 }
 COLUMNS = [
