@@ -44,6 +44,7 @@ def test_the_rasteriser_begins_with_what_takes_least(dev, monkeypatch):
     assert len(set(asked)) == len(overview.RASTER_SIZES) * len(overview.RASTER_POINTS)
 
 
+@pytest.mark.slow
 def test_a_training_of_the_demo(dev, monkeypatch):
     """As few steps as there may be: the curve ends with the training, the stages of a frame are
     among those of a step.

@@ -276,6 +276,7 @@ def test_an_earlier_tuning_of_other_layers_is_kept():
 
 
 @pytest.mark.usefixtures("cpu_form")
+@pytest.mark.slow
 def test_tune_stores_what_the_others_then_use(cache, capsys, monkeypatch):
     assert main(["tune", *SMALL]) == 0
     dev = open_device()

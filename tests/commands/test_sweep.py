@@ -147,6 +147,7 @@ def undisturbed(dev, job):
     return evaluate(load_run(dev, folder.path), "test", job.metrics)
 
 
+@pytest.mark.slow
 def test_a_sweep_survives_the_death_of_a_worker(scenes, tmp_path, capsys, monkeypatch):
     """The table is that of trainings that nobody disturbed, in this process."""
     out = tmp_path / "out"
@@ -193,6 +194,7 @@ def scheduler():
             process.stderr.close()
 
 
+@pytest.mark.slow
 def test_a_scheduler_started_by_hand(scenes, scheduler, tmp_path, capsys):
     """A run that fails leaves the others alone; Ctrl-C ends a training with its checkpoint."""
     out, broken = tmp_path / "out", Path(write_ball_scene(tmp_path / "broken"))

@@ -142,6 +142,7 @@ def test_same_bits_twice_and_for_equal_seeds(dev, rng):
     assert not np.array_equal(runs[0][0], runs[2][0])
 
 
+@pytest.mark.slow
 def test_a_gpus_launches_in_parts_have_the_same_bits(dev, rng, monkeypatch):
     """As for a watchdog that allows a single multiply-add."""
     monkeypatch.setattr(dev, "is_cpu", False)

@@ -36,6 +36,7 @@ def with_a_new_set(dev):
     dev.program("device/compact", WIDTH=4, A=1)
 
 
+@pytest.mark.slow
 def test_the_drivers_build_what_is_stored(device):
     assert differences(record(device), read_builds()) == []
 
