@@ -65,7 +65,7 @@ def at_length():
 
 
 @pytest.mark.parametrize(
-    "file, text, flipped, name", at_length(), ids=lambda v: v.replace("/", ".")
+    "file, text, flipped, name", list(at_length()), ids=lambda v: v.replace("/", ".")
 )
 def test_a_flip_fails_its_case(dev, tmp_path, monkeypatch, file, text, flipped, name):
     case = next(case for case in CASES if case.name == name)
