@@ -170,8 +170,8 @@ class PairedPoints:
 
 
 NEAR, FAR = dense.DEPTH_RANGE
+AXIS_RADIUS = 0.001  # of points on the axis, world units
 # a camera of one pixel that looks along z from the origin
-AXIS_RADIUS = 0.001  # world units
 AXIS = replace(make_camera(1, 1), pose=np.eye(3, 4), fx=100.0, fy=100.0, cx=0.5, cy=0.5)
 
 
