@@ -88,12 +88,7 @@ ALWAYS_INLINE void transform_back(
 #pragma unroll
             for (int i = 0; i < POSITIONS; i++)
                 t[i] = m[i * pitch + block * TILES + tile];
-#pragma unroll
-            for (int i = 0; i < WINO_S; i++)
-                transform_output(t + i, WINO_S);
-#pragma unroll
-            for (int i = 0; i < WINO_M; i++)
-                transform_output(t + i * WINO_S, 1);
+            transform_output_tile(t);
             const float16 offset = bias ? bias[block] : (float16)0.0f;
 #pragma unroll
             for (int i = 0; i < WINO_M; i++)

@@ -102,12 +102,7 @@ ALWAYS_INLINE void transform_tiles(
             float16 t[POSITIONS];
             load_tile(
                 t, WINO_S, patch, x + chunk * 16, channels, corner.x, corner.y, height, width);
-#pragma unroll
-            for (int i = 0; i < WINO_S; i++)
-                transform_input(t + i, WINO_S);
-#pragma unroll
-            for (int i = 0; i < WINO_S; i++)
-                transform_input(t + i * WINO_S, 1);
+            transform_input_tile(t);
 #pragma unroll
             for (int i = 0; i < POSITIONS; i++)
                 v[i * pitch + chunk * TILES + tile] = t[i];

@@ -46,12 +46,7 @@ kernel void winograd_gemm_weights(
 #pragma unroll
     for (int i = 0; i < 9; i++)
         t[i / 3 * WINO_S + i % 3] = w[(flipped ? 8 - i : i) * channels * 16];
-#pragma unroll
-    for (int i = 0; i < 3; i++)
-        transform_kernel(t + i, WINO_S);
-#pragma unroll
-    for (int i = 0; i < WINO_S; i++)
-        transform_kernel(t + i * WINO_S, 1);
+    transform_kernel_tile(t);
 #pragma unroll
     for (int i = 0; i < POSITIONS; i++)
         transformed[(i * ci + c) * co + o] = t[i];
@@ -81,12 +76,7 @@ kernel void winograd_gemm_inputs(
         const bool inside = px >= 0 && px < width && py >= 0 && py < height;
         t[i] = inside ? image[((size_t)py * width + px) * channels] : 0.0f;
     }
-#pragma unroll
-    for (int i = 0; i < WINO_S; i++)
-        transform_input(t + i, WINO_S);
-#pragma unroll
-    for (int i = 0; i < WINO_S; i++)
-        transform_input(t + i * WINO_S, 1);
+    transform_input_tile(t);
 #pragma unroll
     for (int i = 0; i < POSITIONS; i++)
         scratch[COUNTERS + (i * count + tile) * ci + c] = t[i];
@@ -182,12 +172,7 @@ kernel void winograd_gemm_outputs(
 #pragma unroll
     for (int i = 0; i < POSITIONS; i++)
         t[i] = m[i * count * co];
-#pragma unroll
-    for (int i = 0; i < WINO_S; i++)
-        transform_output(t + i, WINO_S);
-#pragma unroll
-    for (int i = 0; i < WINO_M; i++)
-        transform_output(t + i * WINO_S, 1);
+    transform_output_tile(t);
     const int height = tile_list[0], width = tile_list[1];
     const int2 corner = tile_corner(tile_list, first + tile);
     const float offset = biased ? bias[c] : 0.0f;

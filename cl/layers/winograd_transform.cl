@@ -70,12 +70,7 @@ ALWAYS_INLINE void store_kernel(
     for (int i = 0; i < 9; i++)
         t[i / 3 * WINO_S + i % 3] *= inverse;
 #endif
-#pragma unroll
-    for (int i = 0; i < 3; i++)
-        transform_kernel(t + i, WINO_S);
-#pragma unroll
-    for (int i = 0; i < WINO_S; i++)
-        transform_kernel(t + i * WINO_S, 1);
+    transform_kernel_tile(t);
 #pragma unroll
     for (int i = 0; i < POSITIONS; i++)
         STORE_WEIGHT(t[i], transformed, WEIGHT_AT(i, block, blocks, channels) + channel);

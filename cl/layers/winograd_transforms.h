@@ -119,6 +119,36 @@ ALWAYS_INLINE void transform_kernel_gradient(VALUE *t, const int step) {
 #endif
 }
 
+// Of a tile of inputs, S x S.
+ALWAYS_INLINE void transform_input_tile(VALUE *t) {
+#pragma unroll
+    for (int i = 0; i < WINO_S; i++)
+        transform_input(t + i, WINO_S);
+#pragma unroll
+    for (int i = 0; i < WINO_S; i++)
+        transform_input(t + i * WINO_S, 1);
+}
+
+// S x S values of a tile -> M x M outputs, in rows of S.
+ALWAYS_INLINE void transform_output_tile(VALUE *t) {
+#pragma unroll
+    for (int i = 0; i < WINO_S; i++)
+        transform_output(t + i, WINO_S);
+#pragma unroll
+    for (int i = 0; i < WINO_M; i++)
+        transform_output(t + i * WINO_S, 1);
+}
+
+// 3 x 3 weights, in rows of S -> S x S values.
+ALWAYS_INLINE void transform_kernel_tile(VALUE *t) {
+#pragma unroll
+    for (int i = 0; i < 3; i++)
+        transform_kernel(t + i, WINO_S);
+#pragma unroll
+    for (int i = 0; i < WINO_S; i++)
+        transform_kernel(t + i * WINO_S, 1);
+}
+
 // The corner of the i-th tile of outputs among those of tile_list: height, width, number, and the
 // tiles of tiles.h.
 static inline int2 tile_corner(global const int *tile_list, const int i) {

@@ -1,17 +1,12 @@
-"""Kernels launched by argument name, with shapes checked against the comments of their signatures.
-
-The signature is parsed from the source, so that it works the same on drivers that give no argument
-info; the tests compare it with the driver's own (-cl-kernel-arg-info).
+"""Kernels launched by argument name, with shapes checked against the comments of their
+signatures.
 """
 
 import math
 import operator
-import re
 import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
-from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -19,21 +14,8 @@ import pyopencl as cl
 import pyopencl.array as cl_array
 
 from pp_cl.device.formula import evaluate, names_in, parse_formula
+from pp_cl.device.signature import Parameter, parse_signatures
 from pp_cl.errors import BuildError, UserError
-
-SCALARS = {
-    "char": np.int8,
-    "uchar": np.uint8,
-    "short": np.int16,
-    "ushort": np.uint16,
-    "int": np.int32,
-    "uint": np.uint32,
-    "long": np.int64,
-    "ulong": np.uint64,
-    "half": np.float16,
-    "float": np.float32,
-    "double": np.float64,
-}
 
 # Work-group sizes when the caller names none. They are fixed, and the global size is rounded up to
 # them, because PoCL compiles a kernel again for every new work-group size; hence the tail guards.
@@ -45,84 +27,6 @@ MOST_MULTIPLY_ADDS = 25e9
 
 # Shapes and sizes of launches that a kernel remembers, so that it checks and rounds them once.
 REMEMBERED = 4096
-
-_KERNEL = re.compile(
-    r"^(?:__)?kernel\s+(?:__attribute__\s*\(\(.*?\)\)\s*)?void\s+(\w+)\s*\(", re.MULTILINE
-)
-_PARAMETER = re.compile(
-    r"^(?:(global|constant|local)\s+)?((?:(?:const|restrict|volatile)\s+)*)"
-    r"([a-z]+?)(\d*)\s*(\*?)\s*(?:restrict\s+)?(\w+)$"
-)
-_SHAPE = re.compile(r"^\(([^()]*(?:\([^()]*\)[^()]*)*)\)")
-
-
-@dataclass(frozen=True)
-class Parameter:
-    """One kernel parameter. shape: the dimensions of its comment as text, such as "N+1"; None for
-    a scalar or for `(...)`.
-    """
-
-    name: str
-    space: str  # "global", "constant", "local", or "" for a scalar
-    dtype: type
-    width: int  # of the OpenCL vector
-    const: bool  # what it points at
-    shape: tuple | None
-
-    @cached_property
-    def limits(self) -> tuple[int, int] | None:
-        """The least and the largest integer of its type, None for a float."""
-        if not issubclass(self.dtype, np.integer):
-            return None
-        return int(np.iinfo(self.dtype).min), int(np.iinfo(self.dtype).max)
-
-
-def parse_signatures(source: str, file: str) -> dict[str, list[Parameter]]:
-    """{kernel name: [Parameter, ...]} of an OpenCL C source that follows docs/conventions.md.
-
-    Raises ValueError naming the file, kernel and line of a parameter that does not.
-    """
-    signatures = {}
-    for match in _KERNEL.finditer(source):
-        parameters = []
-        for line in source[match.end() :].split("\n"):
-            code, _, comment = line.partition("//")
-            code = code.strip()
-            last = code.rstrip(" {").endswith(")")
-            code = code.rstrip(" {").rstrip(")").rstrip(",").strip()
-            if code:
-                parameters.append(
-                    _parse_parameter(code, comment.strip(), f"{file}: {match.group(1)}")
-                )
-            if last:
-                break
-        signatures[match.group(1)] = parameters
-    return signatures
-
-
-def _parse_parameter(code, comment, where):
-    found = _PARAMETER.match(code)
-    if not found or found.group(3) not in SCALARS:
-        raise ValueError(f"{where}: cannot read parameter {code!r}; one parameter per line")
-    space, qualifiers, base, width, star, name = found.groups()
-    if bool(space) != bool(star) or (width and not star):
-        raise ValueError(
-            f"{where}: {code!r} is neither a global, constant or local pointer nor a scalar"
-        )
-    shape = None
-    if star:
-        words = _SHAPE.match(comment)
-        if not words:
-            raise ValueError(f"{where}: buffer {name!r} has no shape in its comment")
-        shape = tuple(w.strip() for w in words.group(1).split(",") if w.strip())
-        shape = None if shape == ("...",) else shape
-        try:
-            [parse_formula(word) for word in shape or () if word != "?"]
-        except ValueError as error:
-            raise ValueError(f"{where}: {name}: {error}") from None
-    return Parameter(
-        name, space or "", SCALARS[base], int(width or 1), "const" in qualifiers, shape
-    )
 
 
 class Kernel:

@@ -1,68 +1,20 @@
-"""The signature parser and the launcher's refusals."""
+"""Launches, the launcher's refusals, and the build of every kernel file."""
 
 import numpy as np
 import pyopencl as cl
 import pytest
+from support.toy_kernels import SOURCE
 
 from pp_cl.device import device as device_module
 from pp_cl.device import launch
-from pp_cl.device.launch import DEFAULT_LOCAL, cut, parse_signatures
+from pp_cl.device.launch import DEFAULT_LOCAL, cut
+from pp_cl.device.signature import parse_signatures
 from pp_cl.errors import UserError
 
 KERNEL_FOLDER = device_module.kernel_folder()  # before any test replaces it
 STEMS = sorted(
     p.relative_to(KERNEL_FOLDER).with_suffix("").as_posix() for p in KERNEL_FOLDER.rglob("*.cl")
 )
-
-SOURCE = """
-# ifndef WIDTH
-# define WIDTH 4
-# endif
-
-// One work-item per row: writes scale * the sum of a row of x, plus k of its row.
-kernel void rows(
-    const uint n,                  // rows
-    const float scale,
-    global const float4 *x,        // (N, WIDTH)
-    constant uint *k,              // (3)
-    global float *y)               // (N, 1) result
-{
-    const uint i = get_global_id(0);
-    if (i >= n) return;
-    const float4 v = x[i];
-    y[i] = scale * (v.x + v.y + v.z + v.w) + k[i % 3];
-}
-
-// One work-item per element, with local memory: copies x to y.
-kernel void copied(
-    global const float *x,         // (M)
-    local float *scratch,          // (64)
-    global float *y)               // (...) any shape
-{
-    scratch[get_local_id(0)] = x[get_global_id(0)];
-    y[get_global_id(0)] = scratch[get_local_id(0)];
-}
-
-// One work-item: writes one float behind y.
-kernel void behind(
-    const uint n,                  // size of y
-    global float *y)               // (N)
-{
-    if (get_global_id(0) == 0) y[n] = 1.0f;
-}
-
-// One work-item: nothing; its buffers' lengths are formulas.
-kernel void formulas(
-    const uint n,
-    const int height,
-    global const float *offsets,   // (N+1)
-    global const float *halves,    // ((height-1)/2, WIDTH * 2)
-    global const float *both,      // (a + B - 1)
-    global const float *first,     // (A)
-    global const float *second)    // (B)
-{
-}
-"""
 
 
 @pytest.fixture
@@ -85,79 +37,6 @@ def rows(dev, rng):
         "k": dev.upload(np.arange(3), np.uint32),
         "y": dev.empty((33, 1)),
     }
-
-
-# ---- the parser
-
-
-def test_parsed_signature():
-    n, scale, x, k, y = parse_signatures(SOURCE, "toy.cl")["rows"]
-    assert (n.name, n.space, n.dtype, n.shape) == ("n", "", np.uint32, None)
-    assert (scale.name, scale.dtype) == ("scale", np.float32)
-    assert (x.space, x.dtype, x.width, x.const, x.shape) == (
-        "global",
-        np.float32,
-        4,
-        True,
-        ("N", "WIDTH"),
-    )
-    assert (k.space, k.dtype, k.width, k.shape) == ("constant", np.uint32, 1, ("3",))
-    assert (y.const, y.shape) == (False, ("N", "1"))
-
-
-def test_all_kernels_of_a_file_are_found():
-    signatures = parse_signatures(SOURCE, "toy.cl")
-    assert list(signatures) == ["rows", "copied", "behind", "formulas"]
-    assert [p.space for p in signatures["copied"]] == ["global", "local", "global"]
-    assert signatures["copied"][2].shape is None
-
-
-@pytest.mark.parametrize(
-    "head, names",
-    [
-        ("kernel void f() {", []),
-        ("__kernel void f(\n    const int a)\n{", ["a"]),
-        (
-            (
-                "kernel __attribute__((reqd_work_group_size(1, 1, 1))) void f(\n    const int a,\n "
-                "   const uchar b) {"
-            ),
-            ["a", "b"],
-        ),
-        ("kernel void f(\n    global float *restrict x  // (N, (H-1)/2, ?) nested\n) {", ["x"]),
-    ],
-)
-def test_heads_that_are_understood(head, names):
-    assert [p.name for p in parse_signatures(head + "\n}\n", "f.cl")["f"]] == names
-
-
-def test_nested_brackets_in_a_shape():
-    (x,) = parse_signatures(
-        "kernel void f(\n    global float *x)  // (N, (H-1)/2, ?) nested\n{}", "f.cl"
-    )["f"]
-    assert x.shape == ("N", "(H-1)/2", "?")
-
-
-@pytest.mark.parametrize(
-    "parameters, message",
-    [
-        ("    global float *x)  // no shape", "f.cl: f: buffer 'x' has no shape"),
-        ("    global float *x, const uint n)  // (N)", "one parameter per line"),
-        ("    image2d_t picture)  // (N)", "cannot read parameter"),
-        ("    const size_t n)", "cannot read parameter"),
-        ("    const unsigned int n)", "cannot read parameter"),
-        ("    const float4 colour)", "neither a global"),
-        ("    float *x)  // (N)", "neither a global"),
-        ("    global float *x)  // (N**2)", r"f.cl: f: x: 'N\*\*2' is no formula"),
-        ("    global float *x)  // (len(N))", r"'len\(N\)' is no formula"),
-        ("    global float *x)  // (4, N + 1.5)", r"'N \+ 1.5' is no formula"),
-        ("    global float *x)  // (4, N and C)", "'N and C' is no formula"),
-        ("    global float *x)  // (rows of N)", "'rows of N' is no formula"),
-    ],
-)
-def test_heads_that_are_refused(parameters, message):
-    with pytest.raises(ValueError, match=message):
-        parse_signatures(f"kernel void f(\n{parameters}\n{{}}", "f.cl")
 
 
 # ---- launching

@@ -2,7 +2,7 @@
 
 import re
 
-from pp_cl.device.launch import parse_signatures
+from pp_cl.device.signature import parse_signatures
 
 MOST_PARAMETERS, MOST_COLUMNS = 12, 100
 

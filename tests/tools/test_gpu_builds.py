@@ -5,7 +5,7 @@ import pytest
 from pp_cl.device.compact import gather_rows
 from pp_cl.device.device import kernel_folder
 from pp_cl.device.discover import open_device
-from pp_cl.device.launch import parse_signatures
+from pp_cl.device.signature import parse_signatures
 from tools.gpu import builds
 from tools.gpu.builds import Build, differences, main, read_builds, record, write_builds
 
