@@ -7,7 +7,9 @@
 #include "common.h"
 #include "raster/footprint.h"
 
+#ifndef RUN
 #define RUN 64  // keys ranked at once by comparing all with all, 8 a step; longer lists are merged
+#endif
 
 // One work-item per point: reads where it is, writes its number of hits.
 kernel __attribute__((vec_type_hint(floats))) void pairs_count(
@@ -169,25 +171,33 @@ kernel void pairs_sort_runs(
     sorted[place] = key;
 }
 
-// One work-item per key of a sorted run: writes it at its place in the list of its pixel, which is
-// behind the smaller keys of all runs.
+// One work-item per key of a list of more than `least` keys: writes it at its place in its group,
+// the sorted runs of `width` keys that follow one another in `group` keys of its list. That place
+// is behind the smaller keys of all of the group's runs.
 kernel void pairs_merge_runs(
-    const uint p,                     // pairs for which there is room
-    const uint hw,                    // pixels
+    const uint p,      // pairs for which there is room
+    const uint hw,     // pixels
+    const uint width,  // keys of a run
+    const uint group,  // keys of what becomes one run: a multiple of width, or no list has more
+    const uint least,  // keys of the longest lists that are left alone
     global const uint *pair_pixel,    // (P)
     global const uint *pixel_offset,  // (HW+1)
-    global const ulong *sorted,       // (P) of pairs_sort_runs
-    global ulong *pair_key)           // (P) by pixel
+    global const ulong *sorted,       // (P) by pixel, each run sorted
+    global ulong *pair_key)           // (P) the same, each group sorted
 {
     const uint i = get_global_id(0);
     if (i >= p || i >= pixel_offset[hw]) return;
     const ulong key = sorted[i];
-    const uint pixel = pair_pixel[(uint)key], begin = pixel_offset[pixel];
-    const uint end = pixel_offset[pixel + 1], own = i - (i - begin) % RUN;
+    const uint pixel = pair_pixel[(uint)key], list = pixel_offset[pixel];
+    const uint count = pixel_offset[pixel + 1] - list;
+    if (count <= least) return;
+    const uint skipped = (i - list) / group * group;
+    const uint begin = list + skipped, end = begin + min(group, count - skipped);
+    const uint own = i - (i - begin) % width;
     uint place = begin + i - own;
-    for (uint first = begin; first < end; first += RUN) {
+    for (uint first = begin; first < end; first += width) {
         if (first == own) continue;
-        uint low = first, high = min(first + RUN, end);  // the smaller ones end between them
+        uint low = first, high = min(first + width, end);  // the smaller ones end between them
         while (low < high) {
             const uint middle = (low + high) / 2;
             if (sorted[middle] < key)

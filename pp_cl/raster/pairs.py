@@ -16,6 +16,8 @@ from pp_cl.errors import UserError
 from pp_cl.raster.project import Footprint, ProjectedPoints
 
 MOST_PAIRS = 2**32 - 1  # pairs are numbered by uint32
+RUN = 64  # keys ranked at once by comparing all with all; longer lists are merged
+LONG_LIST = RUN * RUN  # keys of lists that GPUs merge in more than one pass
 
 
 @dataclass(frozen=True)
@@ -67,7 +69,7 @@ class PairBuilder:
 
     def __init__(self, dev: Device, footprint: Footprint):
         self.dev = dev
-        self.program = dev.program("raster/pairs", LANES=lanes(dev), **footprint.defines)
+        self.program = dev.program("raster/pairs", LANES=lanes(dev), RUN=RUN, **footprint.defines)
         self._buffers = Buffers(dev)
         self._capacity = 0
 
@@ -154,7 +156,15 @@ class PairBuilder:
             return
         keys |= {"p": capacity, "pair_pixel": b.pair_pixel, "sorted": b.pair_scratch}
         self.program.launch("pairs_sort_runs", capacity, **keys)
-        self.program.launch("pairs_merge_runs", capacity, **keys)
+        self._merge(capacity, keys, width=RUN, group=LONG_LIST, least=0)
+        if capacity > LONG_LIST:  # there and back, for the lists that are longer
+            group = LONG_LIST * RUN
+            there = {"sorted": b.pair_key, "pair_key": b.pair_scratch}
+            self._merge(capacity, keys | there, width=LONG_LIST, group=group, least=LONG_LIST)
+            self._merge(capacity, keys, width=group, group=MOST_PAIRS, least=LONG_LIST)
+
+    def _merge(self, capacity, keys, **runs):
+        self.program.launch("pairs_merge_runs", capacity, **keys, **runs)
 
     def _launch(self, kernel, n, points, **arguments):
         """Launch a kernel that walks over the pixels of each point's box."""

@@ -90,6 +90,24 @@ def test_lists_of_any_length_are_sorted(dev, rng, n):
     assert np.array_equal(pairs.pair_key.get()[:n] & 0xFFFFFFFF, expected)
 
 
+@pytest.mark.parametrize(
+    "lengths", [(0, 1, 4095, 4096, 4097, 65, 9000), large((70, 262_144, 262_145, 4096, 300_000))]
+)
+def test_lists_of_all_lengths_side_by_side_are_sorted(dev, rng, lengths):
+    """About the lengths at which GPUs merge in one pass more."""
+    camera = replace(make_camera(len(lengths), 1), fx=5.0, fy=5.0, cx=len(lengths) / 2, cy=0.5)
+    pixel = rng.permutation(np.repeat(np.arange(len(lengths)), lengths))
+    along = oracle.rays(camera)[pixel] @ camera.pose[:, :3].T
+    positions = camera.eye + rng.uniform(2.2, 5.8, (len(pixel), 1)) * along
+    pairs = PairedPoints(dev, camera, positions, 1e-4, kind="disc").pairs
+    offsets, keys = pairs.pixel_offset.get().astype(np.int64), pairs.pair_key.get()[: pairs.total]
+    assert tuple(np.diff(offsets)) == lengths
+    found = pairs.pair_pixel.get()[(keys & 0xFFFFFFFF).astype(np.int64)]
+    assert np.array_equal(found, np.repeat(np.arange(len(lengths)), lengths))
+    assert len(np.unique(keys & 0xFFFFFFFF)) == pairs.total
+    assert (keys[1:] > keys[:-1])[found[1:] == found[:-1]].all()
+
+
 def test_buffers_serve_views_of_any_size(dev, rng):
     few, many = make_points(rng, 31), make_points(rng, 257)
     builder = PairBuilder(dev, Footprint("soft"))
