@@ -11,7 +11,6 @@ PRESETS = {
         "train.crop": 160,
         "train.lazy_adam": True,
         "train.moments_16bit": True,
-        "train.sh_smoothing_every": 16,
     },
     # for 800 x 800: begins at a quarter of the size, where fog clears at little cost
     "full": {
@@ -21,7 +20,6 @@ PRESETS = {
         "train.crop": 256,
         "train.lazy_adam": True,
         "train.moments_16bit": True,
-        "train.sh_smoothing_every": 16,
         # 0.05 leaves 3.5 million points, for which the averages take more than 9 GiB in all
         "train.prune_weight": 0.1,
     },
@@ -35,6 +33,7 @@ PRESETS = {
         "raster.radius": 0.0015,
         "raster.max_tracked": 64,
         "network.widths": (128, 256, 512),
+        "network.blocks": "double",
         # Inferred from INPC, a later method of the same first author: the supplemental gives no
         # number.
         "network.rate": (3e-4, 5e-5),

@@ -115,7 +115,7 @@ class NetworkConfig:
 
     widths: tuple = setting((32, 64, 128), "channels of its three levels", 1, 4096)
     blocks: str = setting(
-        "double",
+        "single",
         "what a level computes. double: two 3x3 convolutions with ReLU; single: one; gated: ELU of"
         " one times the sigmoid of another",
         choices=("double", "single", "gated"),
@@ -198,7 +198,7 @@ class TrainConfig:
         0,
         0.25,
     )
-    sh_smoothing_every: int = setting(4, "steps between two smoothings", 1, 10**8)
+    sh_smoothing_every: int = setting(16, "steps between two smoothings", 1, 10**8)
     prune_weight: float = setting(
         0.05,
         "prune points that in no look have this blend weight, summed over the pixels (0: off)",

@@ -78,7 +78,7 @@ def test_a_run_says_what_its_files_say(scene, finished, facts):
     parameters = sum(a.size for name, a in arrays.items() if name.startswith("net."))
     assert found["network"] == {
         "widths": [16, 16, 16],
-        "blocks": "double",
+        "blocks": "single",
         "parameters": parameters,
     }
 
@@ -86,7 +86,7 @@ def test_a_run_says_what_its_files_say(scene, finished, facts):
 def test_a_run_in_lines(finished, capsys):
     assert main(["info", str(finished)]) == 0
     text = capsys.readouterr().out
-    network = "16, 16, 16 channels, double blocks"
+    network = "16, 16, 16 channels, single blocks"
     for part in ("preset tiny", "step 60 of 60, finished", "left of", network):
         assert part in text
     assert "pixels)" in text and "MiB" in text and "psnr" in text

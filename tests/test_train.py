@@ -101,7 +101,7 @@ def test_other_ways_of_adam_learn_and_resume_to_the_same_bytes(
     assert (finished / "checkpoint.npz").read_bytes() != whole
 
 
-@pytest.mark.parametrize("blocks", ["single", "gated"])
+@pytest.mark.parametrize("blocks", ["double", "gated"])
 def test_the_networks_other_blocks_learn_and_resume_to_the_same_bytes(
     scene, tmp_path, monkeypatch, capsys, blocks
 ):
@@ -118,40 +118,42 @@ def test_the_networks_other_blocks_learn_and_resume_to_the_same_bytes(
     few = ["--seconds", "0.1", "--fps", "20", "--size", "24x24", "--format", "png"]
     assert main(["render", str(run), "--out", str(frames), *few]) == 0
     assert main(["export", str(run), "--format", "ply", "--out", str(points)]) == 0
-    assert 15 < psnr < 60 and points.stat().st_size > 1000
+    assert 14 < psnr < 60 and points.stat().st_size > 1000
     assert len(list(frames.glob("*.png"))) == 2
     capsys.readouterr()
-    assert main(arguments(scene, run, network__blocks="double")) == 2
-    assert f"network.blocks is {blocks} there, double asked for" in capsys.readouterr().err
+    assert main(arguments(scene, run, network__blocks="single")) == 2
+    assert f"network.blocks is {blocks} there, single asked for" in capsys.readouterr().err
 
 
-@pytest.mark.parametrize("blocks", ["single", "gated"])
+@pytest.mark.parametrize("blocks", ["double", "gated"])
 def test_a_network_of_other_blocks_than_the_checkpoints_is_refused(
     finished, tmp_path, capsys, blocks
 ):
     run = tmp_path / "run"
     shutil.copytree(finished, run)
     text = (run / "config.json").read_text()
-    assert '"blocks": "double"' in text
-    (run / "config.json").write_text(text.replace('"double"', f'"{blocks}"'))
+    assert '"blocks": "single"' in text
+    (run / "config.json").write_text(text.replace('"single"', f'"{blocks}"'))
     assert main(["eval", str(run)]) == 2
     told = capsys.readouterr().err
     assert "checkpoint.npz: " in told and "config.json" in told and told.count("\n") == 1
 
 
-def test_a_run_from_before_there_were_blocks_has_double_ones(finished, tmp_path, capsys):
-    run = tmp_path / "run"
-    shutil.copytree(finished, run)
+def test_a_run_from_before_there_were_blocks_has_double_ones(scene, tmp_path, capsys):
+    whole, run = tmp_path / "whole", tmp_path / "run"
+    assert main(arguments(scene, whole, network__blocks="double")) == 0
+    shutil.copytree(whole, run)
     stored = json.loads((run / "config.json").read_text())
     assert stored["network"].pop("blocks") == "double" and stored.pop("format") == FORMAT
     (run / "config.json").write_text(json.dumps(stored))
-    for folder in (finished, run):
+    capsys.readouterr()
+    for folder in (whole, run):
         assert main(["eval", str(folder)]) == 0
     told = [line for line in capsys.readouterr().err.splitlines() if line.startswith("pp-cl: ")]
     assert len(told) == 1 and "without a format number" in told[0]
     assert told[0].startswith(f"pp-cl: {run / 'config.json'}: ")
     assert told[0].endswith("what it lacks is taken as network.blocks = double")
-    one, other = (json.loads((f / "eval/metrics.json").read_text()) for f in (finished, run))
+    one, other = (json.loads((f / "eval/metrics.json").read_text()) for f in (whole, run))
     assert one["mean"] == other["mean"]
 
 

@@ -234,7 +234,7 @@ def test_size_of_the_papers_network(blocks, parameters, operations):
 
 def test_the_setting_names_the_blocks():
     (item,) = (f for f in dataclasses.fields(NetworkConfig) if f.name == "blocks")
-    assert item.default == "double" and item.metadata["choices"] == tuple(BLOCKS)
+    assert item.default == "single" and item.metadata["choices"] == tuple(BLOCKS)
 
 
 def test_memory_of_the_papers_network(dev):
