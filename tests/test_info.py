@@ -87,7 +87,7 @@ def test_a_run_in_lines(finished, capsys):
     assert main(["info", str(finished)]) == 0
     text = capsys.readouterr().out
     network = "16, 16, 16 channels, single blocks"
-    for part in ("preset tiny", "step 60 of 60, finished", "left of", network):
+    for part in ("preset tiny", "step 60 of 60, finished", "at the start)", network):
         assert part in text
     assert "pixels)" in text and "MiB" in text and "psnr" in text
 

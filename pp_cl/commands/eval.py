@@ -115,7 +115,7 @@ def _summary(result):
         )
     share = f"{computed:.0%} of the network's work, " if computed < 1 else ""
     lines.append(
-        f"{points['final']} of {points['initial']} points, {share}"
+        f"{points['final']} points ({points['initial']} at the start), {share}"
         f"{result['seconds_per_frame'] * 1e3:.0f} ms per frame on {result['device']}"
     )
     return "\n".join(lines)

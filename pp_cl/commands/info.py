@@ -97,7 +97,7 @@ def _run_lines(facts):
         lines[-1] += f", {network['parameters']} parameters"
         initial, left = facts["points"]["initial"], facts["points"]["left"]
         lines += [
-            _line("points", f"{left} left of {initial} at the start"),
+            _line("points", f"{left} ({initial} at the start)"),
             _line("grid", _grid_text(facts["grid"])),
             _line("checkpoint", f"{facts['checkpoint_bytes'] / MIB:.1f} MiB"),
         ]

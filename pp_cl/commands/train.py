@@ -84,7 +84,8 @@ def run(options: argparse.Namespace) -> None:
         seconds = _run(training, options)
     print(
         f"trained {config.train.iterations} steps in {seconds:.1f} s;"
-        f" {training.trainer.model.cloud.count} of {training.info['initial_points']} points remain;"
+        f" {training.trainer.model.cloud.count} points"
+        f" ({training.info['initial_points']} at the start);"
         f" wrote {folder.checkpoint}"
     )
 
