@@ -8,7 +8,10 @@ import shutil
 import numpy as np
 import pytest
 from support.guarded import DATA, GuardedDevice, TracedDevice
+from support.runs import arguments
+from support.scenes import write_ball_scene
 
+from pp_cl.cli import main
 from pp_cl.device.discover import list_devices, open_device
 from pp_cl.device.launch import Program
 from pp_cl.files.cache import cache_folder, make_cache_folder
@@ -98,6 +101,20 @@ def data():
         pytest.skip(f"no real data at {DATA}; set PP_DATA")
     COUNTS["data"] += 1
     return DATA
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory):
+    """Folder of a small scene."""
+    return write_ball_scene(tmp_path_factory.mktemp("scene") / "ball")
+
+
+@pytest.fixture(scope="module")
+def finished(scene, tmp_path_factory):
+    """Folder of an uninterrupted run."""
+    out = tmp_path_factory.mktemp("runs") / "whole"
+    assert main(arguments(scene, out)) == 0
+    return out
 
 
 def pytest_terminal_summary(terminalreporter):

@@ -5,19 +5,12 @@ from types import SimpleNamespace
 
 import pytest
 from support.runs import arguments, train_and_interrupt
-from support.scenes import write_ball_scene
 
 from pp_cl.cli import main
 from pp_cl.files.run_folder import RunFolder
 from pp_cl.train import Trainer
 
 RARELY = {"train__checkpoint_every": 1000}
-
-
-@pytest.fixture(scope="module")
-def scene(tmp_path_factory):
-    """Folder of a small scene."""
-    return write_ball_scene(tmp_path_factory.mktemp("scene") / "ball")
 
 
 @pytest.fixture(scope="module")

@@ -7,17 +7,10 @@ import json
 import numpy as np
 import pytest
 from support.runs import arguments
-from support.scenes import write_ball_scene
 
 from pp_cl.cli import main
 from pp_cl.files.checkpoint import load_checkpoint
 from pp_cl.training.optimiser import Optimiser
-
-
-@pytest.fixture(scope="module")
-def scene(tmp_path_factory):
-    """Folder of a small scene."""
-    return write_ball_scene(tmp_path_factory.mktemp("scene") / "ball")
 
 
 def rows(out):

@@ -22,12 +22,6 @@ BALL = 0.8  # its radius, support.scenes
 
 
 @pytest.fixture(scope="module")
-def scene(tmp_path_factory):
-    """Folder of a small scene."""
-    return write_ball_scene(tmp_path_factory.mktemp("scene") / "ball")
-
-
-@pytest.fixture(scope="module")
 def finished(scene, tmp_path_factory):
     """Folder of a finished and evaluated run."""
     out = tmp_path_factory.mktemp("runs") / "run"

@@ -11,7 +11,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 from support.runs import SETTINGS, arguments
-from support.scenes import write_ball_scene
 
 import pp_cl
 from pp_cl.cli import main
@@ -22,12 +21,6 @@ from pp_cl.files.image import read_rgba, to_8bit
 from pp_cl.files.run_folder import RunFolder
 from pp_cl.run import open_training
 from pp_cl.run_config import run_config
-
-
-@pytest.fixture(scope="module")
-def scene(tmp_path_factory):
-    """Folder of a small scene."""
-    return write_ball_scene(tmp_path_factory.mktemp("scene") / "ball")
 
 
 @pytest.fixture(scope="module")

@@ -16,26 +16,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 from support.runs import arguments, train_and_interrupt
-from support.scenes import write_ball_scene
 
 from pp_cl.cli import main
 from pp_cl.config import FORMAT
 from pp_cl.files.checkpoint import load_checkpoint
 from pp_cl.train import Trainer
-
-
-@pytest.fixture(scope="module")
-def scene(tmp_path_factory):
-    """Folder of a small scene."""
-    return write_ball_scene(tmp_path_factory.mktemp("scene") / "ball")
-
-
-@pytest.fixture(scope="module")
-def finished(scene, tmp_path_factory):
-    """Folder of an uninterrupted run."""
-    out = tmp_path_factory.mktemp("runs") / "whole"
-    assert main(arguments(scene, out)) == 0
-    return out
 
 
 def rows(out):

@@ -15,20 +15,6 @@ from pp_cl.cli import main
 from pp_cl.files.checkpoint import load_checkpoint, save_checkpoint
 
 
-@pytest.fixture(scope="module")
-def scene(tmp_path_factory):
-    """Folder of a small scene."""
-    return write_ball_scene(tmp_path_factory.mktemp("scene") / "ball")
-
-
-@pytest.fixture(scope="module")
-def finished(scene, tmp_path_factory):
-    """Folder of an uninterrupted run."""
-    out = tmp_path_factory.mktemp("runs") / "whole"
-    assert main(arguments(scene, out)) == 0
-    return out
-
-
 def test_a_finished_run_is_left_alone(scene, finished, capsys):
     before = (finished / "checkpoint.npz").stat().st_mtime_ns
     assert main(arguments(scene, finished)) == 0

@@ -5,7 +5,6 @@ import collections
 import numpy as np
 import pyopencl as cl
 import pytest
-from support.scenes import write_ball_scene
 
 import pp_cl.network.unet
 from pp_cl.config import configure, preset
@@ -27,12 +26,6 @@ SETTINGS = {
     "paper": {"network.widths": (16, 16, 16)},
     "paper, crops": {"network.widths": (16, 16, 16), "train.crop": 24},
 }
-
-
-@pytest.fixture(scope="module")
-def scene(tmp_path_factory):
-    """Folder of a small scene."""
-    return write_ball_scene(tmp_path_factory.mktemp("scene") / "ball")
 
 
 def make_trainer(dev, scene, folder, name):

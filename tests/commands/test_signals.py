@@ -10,7 +10,6 @@ from pathlib import Path
 
 import pytest
 from support.runs import arguments
-from support.scenes import write_ball_scene
 
 from pp_cl.cli import main
 from pp_cl.commands.signals import first_signal
@@ -18,12 +17,6 @@ from pp_cl.files.checkpoint import load_checkpoint
 from pp_cl.train import Trainer
 
 ROOT = Path(__file__).parents[2]
-
-
-@pytest.fixture(scope="module")
-def scene(tmp_path_factory):
-    """Folder of a small scene."""
-    return write_ball_scene(tmp_path_factory.mktemp("scene") / "ball")
 
 
 @pytest.fixture(scope="module")

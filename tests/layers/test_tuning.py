@@ -7,7 +7,6 @@ import json
 import numpy as np
 import pytest
 from support.runs import arguments, train_and_interrupt
-from support.scenes import write_ball_scene
 from support.tunings import MS, REL_L2, row, tuning_of
 
 from pp_cl.cli import main
@@ -173,12 +172,6 @@ def test_a_tuning_that_cannot_be_is_ignored_in_one_line(dev, change):
 
 
 SHORT = {"train__iterations": 20, "train__previews": 0}
-
-
-@pytest.fixture(scope="module")
-def scene(tmp_path_factory):
-    """Folder of a small scene."""
-    return write_ball_scene(tmp_path_factory.mktemp("scene") / "ball")
 
 
 @pytest.fixture

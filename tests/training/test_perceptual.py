@@ -7,7 +7,6 @@ import pytest
 from support.comparisons import relative_error
 from support.guarded import AWKWARD_SIZES, large
 from support.runs import arguments
-from support.scenes import write_ball_scene
 
 from pp_cl.cli import main
 from pp_cl.device.buffers import table_bytes
@@ -166,12 +165,6 @@ def _no_weights():
 
 
 # ---- trainings
-
-
-@pytest.fixture(scope="module")
-def scene(tmp_path_factory):
-    """Folder of a small scene."""
-    return write_ball_scene(tmp_path_factory.mktemp("scene") / "ball")
 
 
 def rows(out):

@@ -21,7 +21,6 @@ from support.checkpoints import (
     write_run,
 )
 from support.runs import arguments, train_and_interrupt
-from support.scenes import write_ball_scene
 from support.viewing import asking
 
 from pp_cl.cli import main
@@ -58,12 +57,6 @@ def test_what_fits_is_read_as_it_was_written(folder, config, step):
     for name, array in arrays.items():
         assert found[name].dtype == array.dtype
         np.testing.assert_array_equal(found[name], array)
-
-
-@pytest.fixture(scope="module")
-def scene(tmp_path_factory):
-    """Folder of a small scene."""
-    return write_ball_scene(tmp_path_factory.mktemp("scene") / "ball")
 
 
 @pytest.mark.parametrize(
