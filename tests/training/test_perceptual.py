@@ -182,11 +182,10 @@ def test_a_training_without_it_reads_no_weights(scene, tmp_path, monkeypatch):
 def test_a_training_with_it_lowers_it(scene, tmp_path, monkeypatch, weights):
     """The loss holds it and falls, and it ends lower than where it is only measured."""
     monkeypatch.setattr("pp_cl.metrics.lpips.load_weights", lambda: weights)
-    ends = {}
+    ends, slowly = {}, {"network__blocks": "double", "train__mask_weight": 0}
     for weight in (1e-9, 0.1):
         out = tmp_path / str(weight)
-        words = arguments(scene, out, train__perceptual_weight=weight, train__mask_weight=0)
-        assert main(words) == 0
+        assert main(arguments(scene, out, **slowly, train__perceptual_weight=weight)) == 0
         log = [row for row in rows(out) if "loss" in row]
         for row in log:
             parts = row["l1"] + 0.2 * (1 - row["ssim"]) + weight * row["lpips"]
