@@ -62,9 +62,9 @@ kernel void alpha_weights(
     transmittance[q] = T;
 }
 
-// One work-item per pixel: reads its hits, farthest first, and their points' features, writes B - g
-// of each pair that is not dropped.
-kernel __attribute__((vec_type_hint(float16))) void alpha_rest(
+// One work-item per pixel: reads its hits, farthest first, and their points' features, writes G.f +
+// g - B of each pair that is not dropped.
+kernel __attribute__((vec_type_hint(float16))) void alpha_gain(
     const uint hw,                         // pixels
     global const uint *pixel_offset,       // (HW+1)
     global const ulong *pair_key,          // (P) depth << 32 | pair
@@ -73,7 +73,7 @@ kernel __attribute__((vec_type_hint(float16))) void alpha_rest(
     global const float16 *point_features,  // (N, 16)
     global const float16 *grad_features,   // (H, W, 16) G
     global const float *grad_alpha,        // (?) HW with HAS_GRAD_ALPHA: g
-    global float *rest)                    // (P)
+    global float *gain)                    // (P)
 {
     const uint q = get_global_id(0);
     if (q >= hw) return;
@@ -87,10 +87,11 @@ kernel __attribute__((vec_type_hint(float16))) void alpha_rest(
     float B = dot16(G, (float16)(1.0f));  // the background's features are 1
     for (uint i = end; i-- > begin;) {
         const float b = as_float((uint)(pixel_entry[i] >> 32));
-        rest[(uint)pair_key[i]] = B - g;
+        const float more = dot16(G, point_features[(uint)pixel_entry[i]]) + g - B;
+        gain[(uint)pair_key[i]] = more;
         if (b > 0.0f) {
             T += b;  // in front of this hit
-            B += b / T * (dot16(G, point_features[(uint)pixel_entry[i]]) + g - B);
+            B += b / T * more;
         }
     }
 }

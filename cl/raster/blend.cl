@@ -4,7 +4,8 @@
 // dL/df_i = sum b_i G,  dL/do_i = sum s_i (G.f_i - rest)
 //
 // s_i is the second value of pair_weight; rest is what takes the place of a hit that fades: in the
-// softmax all of the pixel's hits, G.F, in alpha compositing those behind it.
+// softmax all of the pixel's hits, G.F, in alpha compositing those behind it, where alpha.cl has
+// computed the difference already.
 //
 // vec_type_hint: the vectors are written out; Intel's compiler would merge work-items into wider
 // ones, up to 8 times slower.
@@ -17,12 +18,15 @@
 #ifndef HAS_ROLES
 #define HAS_ROLES 1  // 0: every pair is tracked, and pair_role is not read
 #endif
-#ifndef REST_BY_PAIR
-#define REST_BY_PAIR 0  // 0: rest is one value a pixel
+#ifndef GAIN_BY_PAIR
+#define GAIN_BY_PAIR 0  // 1: G.f_i - rest of each pair is given; 0: rest of each pixel
 #endif
 #ifndef MEAN
 #define MEAN 0  // 1: gradients are divided by the number of pixels that track the point (Pulsar)
 #endif
+
+// G.f_i - rest of a pair in pixel q; `product`, G.f_i, is computed only where it is needed
+#define GAIN(pair, q, product) (GAIN_BY_PAIR ? rest[pair] : (product) - rest[q])
 
 // One work-item per part of a pixel: reads its hits and their points' features, writes the blended
 // features.
@@ -56,7 +60,7 @@ kernel __attribute__((vec_type_hint(floats))) void blend_backward(
     global const float2 *pair_weight,      // (P, 2)
     global const uchar *pair_role,         // (?) P with HAS_ROLES
     global const float16 *grad_features,   // (H, W, 16) G
-    global const float *rest,              // (HW), or (P) with REST_BY_PAIR
+    global const float *rest,              // (HW), or (P) what GAIN_BY_PAIR says
     global float16 *grad_point_features,   // (N, 16)
     global float *grad_opacity)            // (N)
 {
@@ -69,9 +73,8 @@ kernel __attribute__((vec_type_hint(floats))) void blend_backward(
         if (HAS_ROLES && pair_role[pair] != TRACKED) continue;
         const float2 weight = pair_weight[pair];
         const uint q = pair_pixel[pair];
-        const float16 G = grad_features[q];
         dL_df += weight.x * load_part(grad_features, q);
-        dL_do += weight.y * (dot16(G, point_features[i]) - rest[REST_BY_PAIR ? pair : q]);
+        dL_do += weight.y * GAIN(pair, q, dot16(grad_features[q], point_features[i]));
         tracked++;
     }
     const float scale = MEAN && tracked ? 1.0f / tracked : 1.0f;
@@ -98,7 +101,7 @@ kernel void blend_backward_pairs(
     global const float2 *pair_weight,          // (P, 2)
     global const uchar *pair_role,             // (?) P with HAS_ROLES
     global const float16 *grad_features,       // (H, W, 16) G
-    global const float *rest,                  // (HW) G.F
+    global const float *rest,                  // (HW), or (P) what GAIN_BY_PAIR says
     global const uint2 *pair_point_closeness,  // (P, 2) point, bits of d
     global float2 *grad_pair)                  // (P, 2) dL/dl, dL/dd
 {
@@ -111,10 +114,9 @@ kernel void blend_backward_pairs(
     for (uint pair = point_offset[i]; pair < point_offset[i + 1]; pair++) {
         const uint q = pair_pixel[pair];
         const float b = pair_weight[pair].x, d = as_float(pair_point_closeness[pair].y);
-        const float others = rest[REST_BY_PAIR ? pair : q];
         float dL_dl = 0.0f;
         if (!HAS_ROLES || pair_role[pair] == TRACKED)
-            dL_dl = scale * b * (dot_rows(grad_features + q, point_features + i) - others);
+            dL_dl = scale * b * GAIN(pair, q, dot_rows(grad_features + q, point_features + i));
         grad_pair[pair] = (float2)(dL_dl, d > 0.0f ? dL_dl / d : 0.0f);
     }
 }

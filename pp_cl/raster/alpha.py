@@ -19,13 +19,13 @@ class Alpha(BlendWeights):
     of which the higher counts.
     """
 
-    rest_by_pair = True
+    gain_by_pair = True
     depends_on_depth = False
 
     @classmethod
     def own_table(cls, pixels: int, pairs: int) -> Table:
         """As BlendWeights."""
-        return {"transmittance": ((pixels,), np.float32), "rest": ((pairs,), np.float32)}
+        return {"transmittance": ((pixels,), np.float32), "gain": ((pairs,), np.float32)}
 
     def compute(
         self,
@@ -73,10 +73,10 @@ class Alpha(BlendWeights):
         grad_features: Array,
         grad_alpha: Array | None = None,
     ) -> Array:
-        """As BlendWeights: B of each pair, G times what is composited behind it, minus g."""
-        rest = self._buffers.rest[: pairs.capacity]
+        """As BlendWeights: G.f + g - B of each pair, B being G times what is composited behind."""
+        gain = self._buffers.gain[: pairs.capacity]
         self.dev.program("raster/alpha", HAS_GRAD_ALPHA=int(grad_alpha is not None)).launch(
-            "alpha_rest",
+            "alpha_gain",
             pairs.pixels,
             hw=pairs.pixels,
             pixel_offset=pairs.pixel_offset,
@@ -86,6 +86,6 @@ class Alpha(BlendWeights):
             point_features=point_features,
             grad_features=grad_features,
             grad_alpha=weights.transmittance if grad_alpha is None else grad_alpha,
-            rest=rest,
+            gain=gain,
         )
-        return rest
+        return gain

@@ -56,7 +56,7 @@ class Blend:
         self.defines = {
             "LANES": lanes(dev, on_gpu=4),  # each work-item reads whole rows for its dot products
             "MEAN": int(mean_gradient),
-            "REST_BY_PAIR": int(weighing.rest_by_pair),
+            "GAIN_BY_PAIR": int(weighing.gain_by_pair),
             **footprint.defines,
         }
         self._buffers = Buffers(dev)

@@ -49,11 +49,11 @@ class PixelWeights:
 class BlendWeights(ABC):
     """Computes blend weights and what their gradients need; the buffers grow and are reused.
 
-    rest_by_pair: rest() has one value a pair, else one a pixel. depends_on_depth: the weights
+    gain_by_pair: rest() gives one value a pair, else one a pixel. depends_on_depth: the weights
     change with the depth of a hit, not only with the order of the hits.
     """
 
-    rest_by_pair: bool
+    gain_by_pair: bool
     depends_on_depth: bool
 
     def __init__(self, dev: Device):
@@ -111,7 +111,8 @@ class BlendWeights(ABC):
         grad_features: Array,
         grad_alpha: Array | None = None,
     ) -> Array:
-        """(HW,) or, with rest_by_pair, (P,) float32: what G.f of a hit is compared with.
+        """(HW,) float32: what G.f of a hit is compared with; or, with gain_by_pair, (P,): by how much
+        G.f exceeds it.
 
         weights: the last ones computed. point_features: (N, 16); features, grad_features: F and
         G, (H, W, 16), of Blend.forward with these weights. grad_alpha: g = dL/d(1 - T), (HW,), of

@@ -18,7 +18,7 @@ class Softmax(BlendWeights):
     paper); tau drops hits from the back on.
     """
 
-    rest_by_pair = False
+    gain_by_pair = False
     depends_on_depth = True
 
     @classmethod

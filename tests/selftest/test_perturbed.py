@@ -30,7 +30,7 @@ FLIPS = [
     ("raster/alpha", "+ g - B)", "+ g + B)", "alpha: backward, soft"),
     ("raster/alpha", "= B - g", "= B + g", "alpha: gradient of alpha"),
     ("raster/blend", "sum + (1.0f - weights)", "sum + (1.0f + weights)", "softmax: forward, soft"),
-    ("raster/blend", "- rest[REST_BY_PAIR", "+ rest[REST_BY_PAIR", "alpha: backward, disc"),
+    ("raster/alpha", "+ g - B;", "+ g + B;", "alpha: backward, disc"),
     ("raster/blend", "dL_dR -= dL_ddepth", "dL_dR += dL_ddepth", "softmax: gradients of spheres"),
     ("layers/conv", "[p] += value", "[p] -= value", "conv: direct, hard inputs"),
     ("layers/conv_backward_weights", "[i] += value", "[i] -= value", "conv: direct, hard inputs"),
