@@ -13,10 +13,10 @@ from typing import Any
 
 from pp_cl.errors import UserError, quoted, shown
 from pp_cl.files.regular import read_regular
-from pp_cl.presets import ABSENT, ADDED, PRESETS, RENAMED
+from pp_cl.presets import ABSENT, ADDED, PRESETS, REMOVED, RENAMED
 from pp_cl.settings import NetworkConfig, PointsConfig, RasterConfig, SceneConfig, TrainConfig
 
-FORMAT = 2  # of config.json: raised when keys are added or change meaning
+FORMAT = 3  # of config.json: raised when keys are added, change meaning or are removed
 MOST_BYTES = 2**20  # of a config.json
 MOST_TEXT = 4096  # characters of a setting
 # by network.blocks, how many convolutions there are but the last
@@ -192,7 +192,8 @@ def load_config(path: Path | str) -> Config:
         )
     config = preset(name)
     known = {f"{s}.{item.name}" for s, v in sections(config) for item in dataclasses.fields(v)}
-    found = _stored_keys(path, stored, known if number else known | RENAMED.keys())
+    found = _stored_keys(path, stored, known | _earlier_keys(number))
+    found = {key: value for key, value in found.items() if key not in REMOVED}
     lacking = known - {RENAMED.get(key, key) for key in found}
     for key in sorted(lacking):
         if key not in ABSENT or number >= ADDED.get(key, 1):
@@ -209,6 +210,11 @@ def load_config(path: Path | str) -> Config:
     if not config.scene.path:
         raise UserError(f"{path}: scene.path is empty; {MEND_SETTINGS}")
     return config
+
+
+def _earlier_keys(number):
+    """The keys that a config.json of this format may hold beside today's."""
+    return {*(REMOVED if number < 3 else ()), *(() if number else RENAMED)}
 
 
 def _format(path, stored):

@@ -9,8 +9,6 @@ PRESETS = {
         "train.iterations": 6_000,
         "train.refine_at": (0.35, 1.0),
         "train.crop": 160,
-        "train.lazy_adam": True,
-        "train.moments_16bit": True,
     },
     # for 800 x 800: begins at a quarter of the size, where fog clears at little cost
     "full": {
@@ -18,8 +16,6 @@ PRESETS = {
         "train.iterations": 12_000,
         "train.refine_at": (0.33, 0.67),
         "train.crop": 256,
-        "train.lazy_adam": True,
-        "train.moments_16bit": True,
         # 0.05 leaves 3.5 million points, for which the averages take more than 9 GiB in all
         "train.prune_weight": 0.1,
     },
@@ -34,11 +30,14 @@ PRESETS = {
         "raster.max_tracked": 64,
         "network.widths": (128, 256, 512),
         "network.blocks": "double",
+        "network.residual": False,
         # Inferred from INPC, a later method of the same first author: the supplemental gives no
         # number.
         "network.rate": (3e-4, 5e-5),
         "train.iterations": 50_000,
         "train.crop": 0,
+        "train.ssim_weight": 0.2,
+        "train.smooth_l1": 0.0,
         # Ours: the supplemental mentions no jitter, dropout, smoothing or averaging, and no rule
         # of pruning. Ours in all presets: the loss and its weight, Adam's eps, the opacity's rate.
         "train.opacity_rate": (3e-2, 3e-3),
@@ -81,8 +80,6 @@ RENAMED = {
     "points.mean_gradient": "raster.mean_gradient",
     "train.phases": "train.pixel_jitter",
     "train.feature_eps": "train.sh_eps",
-    "train.lazy": "train.lazy_adam",
-    "train.half_moments": "train.moments_16bit",
     "train.smooth": "train.sh_smoothing",
     "train.smooth_every": "train.sh_smoothing_every",
     "train.final_weight": "train.final_prune_weight",
@@ -105,12 +102,12 @@ ABSENT = {
     "raster.window": "image",
     "network.blocks": "double",
     "network.channels": "",
+    "network.residual": False,
     "network.tolerance": 1e-5,
     "train.opacity_rate_steps": 0,
+    "train.smooth_l1": 0.0,
     "train.mask_weight": 0.0,
     "train.perceptual_weight": 0.0,
-    "train.lazy_adam": False,
-    "train.moments_16bit": False,
     "train.prune_looks": 100,
     "train.refine_at": (1.0, 1.0),
     "train.memory_gib": 0.0,
@@ -118,5 +115,14 @@ ABSENT = {
     "train.checkpoint_minutes": 0.0,
 }
 
+# Settings of formats before 3, for the moments of the SH coefficients that Adam kept then, by their
+# names and older ones: a finished run is what it is without them.
+REMOVED = ("train.lazy_adam", "train.lazy", "train.moments_16bit", "train.half_moments")
+
 # The format of config.json that first had a key of ABSENT; the others came with format 1.
-ADDED = {"train.checkpoint_minutes": 2, "network.channels": 2}
+ADDED = {
+    "train.checkpoint_minutes": 2,
+    "network.channels": 2,
+    "network.residual": 3,
+    "train.smooth_l1": 3,
+}

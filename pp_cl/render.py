@@ -180,17 +180,8 @@ class Renderer:
             shown=plan.shown,
         )
 
-    def rasterise(
-        self,
-        camera: Camera,
-        gamma: float,
-        *,
-        add_pending: Callable[..., None] | None = None,
-        **options,
-    ) -> RasterResult:
-        """The blended features of a camera. add_pending: Optimiser.add_pending for the step, which
-        may change the points' features. options: of blend_weights().
-        """
+    def rasterise(self, camera: Camera, gamma: float, **options) -> RasterResult:
+        """The blended features of a camera. options: of blend_weights()."""
         view, cloud, b = (
             self.blend_weights(camera, gamma, **options),
             self.model.cloud,
@@ -200,12 +191,6 @@ class Renderer:
             shade_forward(
                 self.dev, view.points, view.shaded, cloud.sh, point_features=b.point_features
             )
-            if add_pending:
-                add_pending(
-                    camera_buffer=view.camera_buffer,
-                    shaded=view.shaded,
-                    point_features=b.point_features,
-                )
         with self.dev.stage("blend"):
             self._blend.forward(view.pairs, view.weights, b.point_features, b.features)
         return RasterResult(**vars(view), point_features=b.point_features, features=b.features)

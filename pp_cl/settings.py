@@ -125,6 +125,7 @@ class NetworkConfig:
         "channels of each convolution but the last, in order, where a compressed model has fewer"
         " than its widths say (none)",
     )
+    residual: bool = setting(True, "add a quarter of the first three features to the colours")
     rate: tuple = setting(
         (1e-3, 1e-4), "Adam's learning rate at the first and the last step", 1e-12, 100
     )
@@ -150,7 +151,10 @@ class TrainConfig:
     pixel_jitter: bool = setting(
         True, "shift the pixel grid of the downscaled image by a random sub-pixel offset each step"
     )
-    ssim_weight: float = setting(0.2, "loss = L1 + ssim_weight * (1 - SSIM)", 0, 10)
+    ssim_weight: float = setting(0.1, "loss = smooth L1 + ssim_weight * (1 - SSIM)", 0, 10)
+    smooth_l1: float = setting(
+        0.05, "the slope of L1 falls to 0 in proportion to errors below this (0: L1)", 0, 1
+    )
     mask_weight: float = setting(
         1.0,
         "adds this times the mean square by which the rendered alpha exceeds the photograph's to"
@@ -161,7 +165,7 @@ class TrainConfig:
     perceptual_weight: float = setting(0.0, "adds this times LPIPS to the loss (0: off)", 0, 10)
     sh_rate: tuple = setting(
         (0.5, 0.25, 0.125),
-        "Adam's first learning rate of SH degrees 0, 1, 2; at rate 0 a degree stays 0",
+        "first learning rate of SH degrees 0, 1, 2; at rate 0 a degree stays 0",
         0,
         100,
     )
@@ -171,7 +175,7 @@ class TrainConfig:
     )
     sh_eps: float = setting(
         0.0197,
-        "Adam's eps for the SH coefficients, multiplied by 3*H*W of the training image, so that"
+        "eps of the SH coefficients' step, multiplied by 3*H*W of the training image, so that"
         " it does not depend on the crop size",
         1e-30,
         1e3,
@@ -186,10 +190,6 @@ class TrainConfig:
         0,
         10**8,
     )
-    lazy_adam: bool = setting(
-        False, "update only points that received a gradient; false: momentum moves the others too"
-    )
-    moments_16bit: bool = setting(False, "store Adam's moments of the SH coefficients in 16 bits")
     dropout: float = setting(0.0, "share of the points left out at random in each step", 0, 0.95)
     sh_smoothing: float = setting(
         0.03,

@@ -1,8 +1,5 @@
 """The training loop: what one step does, in the order of the paper."""
 
-import math
-from functools import partial
-
 import numpy as np
 
 from pp_cl.config import Config
@@ -16,7 +13,6 @@ from pp_cl.render import NETWORK_MULTIPLE, Renderer
 from pp_cl.scene.target import Target
 from pp_cl.scene.views import View
 from pp_cl.settings import TrainConfig
-from pp_cl.training.adam import moment_scale
 from pp_cl.training.crops import BOX_MARGIN, crop_side, draw_start
 from pp_cl.training.loss import WHITE, Loss, gradient_tiles
 from pp_cl.training.mask import MaskLoss
@@ -47,11 +43,11 @@ class Trainer:
         self.views = views
         self.step = 0
         self.renderer = Renderer(dev, model, config.raster)
-        self.loss = Loss(dev, self.config.ssim_weight)
+        self.loss = Loss(dev, self.config.ssim_weight, self.config.smooth_l1)
         self.mask_loss = MaskLoss(dev, self.config.mask_weight)
         self.perceptual = PerceptualLoss(dev, self.config.perceptual_weight, model.net.policy)
-        self.state = PointState(dev, model.cloud, self.config)
-        self.optimiser = Optimiser(dev, model, self.state, self._moment_scale())
+        self.state = PointState(dev, model.cloud)
+        self.optimiser = Optimiser(dev, model, self.state)
         self._target = Target(dev)
         self._terms = None  # of the last step
         self._smoother = None  # made when it is due, anew when the points change
@@ -69,16 +65,6 @@ class Trainer:
         self._reduced = _halved(self.views, to_come)
         self._crop = crop_side(self.config.crop, to_come)
         self._boxes = [view.object_bounds(BOX_MARGIN) for view in self._reduced]
-
-    def _moment_scale(self):
-        """Of moments in 16 bits, from the eps of the first view: powers of two, so that others may
-        differ from it.
-        """
-        config = self.config
-        if not config.moments_16bit:
-            return None
-        values = 3 * math.prod(self.views[0].crop_size(config.crop))
-        return moment_scale(config.sh_eps / values)
 
     # ----------------------------------------------------------------------------------------------
 
@@ -108,7 +94,6 @@ class Trainer:
             training=True,
             differs=differs,
             key=view_index if views_repeat(config, view.downscale) else None,
-            add_pending=partial(self.optimiser.add_pending, t + 1, rates, sh_eps=sh_eps),
         )
         with self.dev.stage("loss"):
             gradients = self._losses(rendered, target, target_alpha)
@@ -118,7 +103,7 @@ class Trainer:
                 t + 1,
                 rates,
                 grads,
-                camera_buffer=rendered.camera_buffer,
+                points=rendered.points,
                 shaded=rendered.shaded,
                 sh_eps=sh_eps,
             )

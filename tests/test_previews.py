@@ -45,8 +45,6 @@ def test_the_split_val_is_measured_where_there_is_one(tmp_path, capsys):
     [
         {},
         {
-            "train__lazy_adam": "true",
-            "train__moments_16bit": "true",
             "train__refine_at": "0.5,1",
             "downscale": 1,
             "points__count": 300,

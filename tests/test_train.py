@@ -65,27 +65,6 @@ def test_stopped_at_any_step_it_resumes_to_the_same_bytes(
     assert strip == [{k: v for k, v in r.items() if k != "seconds"} for r in rows(finished)]
 
 
-@pytest.mark.parametrize(
-    "changes",
-    [
-        {"train__lazy_adam": "true"},
-        {"train__moments_16bit": "true"},
-        {"train__lazy_adam": "true", "train__moments_16bit": "true"},
-    ],
-)
-def test_other_ways_of_adam_learn_and_resume_to_the_same_bytes(
-    scene, finished, tmp_path, monkeypatch, changes
-):
-    assert main(arguments(scene, tmp_path / "whole", **changes)) == 0
-    losses = [r["loss"] for r in rows(tmp_path / "whole")[:-1]]
-    assert np.mean(losses[-3:]) < 0.6 * losses[0]
-    train_and_interrupt(scene, tmp_path / "run", 47, monkeypatch, **changes)
-    assert main(arguments(scene, tmp_path / "run", **changes)) == 0
-    whole = (tmp_path / "whole" / "checkpoint.npz").read_bytes()
-    assert (tmp_path / "run" / "checkpoint.npz").read_bytes() == whole
-    assert (finished / "checkpoint.npz").read_bytes() != whole
-
-
 @pytest.mark.parametrize("blocks", ["double", "gated"])
 def test_the_networks_other_blocks_learn_and_resume_to_the_same_bytes(
     scene, tmp_path, monkeypatch, capsys, blocks
@@ -147,10 +126,8 @@ def test_a_degree_of_rate_0_is_left_alone(scene, tmp_path, monkeypatch):
     changes = {"train__sh_rate": "0.5,0.25,0"}
     train_and_interrupt(scene, tmp_path / "run", 25, monkeypatch, **changes)
     _, arrays = load_checkpoint(tmp_path / "run" / "checkpoint.npz")
-    for name in ("points.sh2", "state.m.sh4", "state.v.sh4", "state.m.sh7", "state.v.sh7"):
-        assert not arrays[name].any()
-    for name in ("points.sh0", "points.sh1", "state.m.sh1", "state.v.sh1"):
-        assert arrays[name].any()
+    assert not arrays["points.sh2"].any()
+    assert arrays["points.sh0"].any() and arrays["points.sh1"].any()
     assert main(arguments(scene, tmp_path / "run", **changes)) == 0
 
 

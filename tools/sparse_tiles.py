@@ -40,7 +40,7 @@ class Comparison:
         self.net = make_network(dev, widths, make_policy(dev)) if widths else run.model.net
         self.renderer = Renderer(dev, run.model, self.config.raster)
         self.target = Target(dev)
-        self.loss = Loss(dev, self.config.train.ssim_weight)
+        self.loss = Loss(dev, self.config.train.ssim_weight, self.config.train.smooth_l1)
 
     def row(self, view, runs):
         """A row of one view: size, computed fraction, times in ms, ratios, largest differences."""

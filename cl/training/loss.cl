@@ -1,4 +1,6 @@
-// L = mean |p - t| + weight * (1 - mean SSIM) of a prediction p and a target t, and dL/dp.
+// L = mean D(p - t) + weight * (1 - mean SSIM) of a prediction p and a target t, and dL/dp.
+//
+// D is smooth L1 (Girshick 2015): d^2 / (2 beta) where |d| < beta, else |d| - beta/2; L1 at beta 0.
 //
 // SSIM (Wang et al. 2004): 11x11 Gaussian windows of sigma 1.5 that lie inside the target,
 // population variances, per channel. With d = p - t and s = p + t it is (1 - a)(1 - b), a = E[d]^2
@@ -142,6 +144,11 @@ kernel void loss_spread(
     }
 }
 
+// clamp(x, -1, 1), but a NaN remains one.
+static inline floats clamp_slope(const floats x) {
+    return x > 1.0f ? (floats)(1.0f) : x < -1.0f ? (floats)(-1.0f) : x;
+}
+
 // One work-item per LANES values of a target row: sums the slopes of the 11 rows of windows that
 // see it, writes dL/dp and what the values give to the loss. Leaves the gradient outside the target
 // as it is.
@@ -152,6 +159,7 @@ kernel void loss_gradient(
     const uint pw,                   // width of the prediction
     const uint corner,               // first value of the prediction under the target
     const uint blocks,               // vectors in a scratch row
+    const float beta,                // of smooth L1
     global const float *prediction,  // (PH, PW, 3)
     global const float *target,      // (H, W, 3)
     global const float *spread,      // (V, 3, BLOCKS, LANES)
@@ -161,7 +169,7 @@ kernel void loss_gradient(
     const int b = get_global_id(0), y = get_global_id(1);
     if (b >= blocks || y >= h) return;
     const int count = 3 * (int)w - LANES * b;
-    float absolute = 0.0f, squared = 0.0f;
+    float smooth = 0.0f, absolute = 0.0f, squared = 0.0f;
     if (count > 0) {
         const size_t at = corner + 3 * (size_t)pw * y + LANES * b;
         const floats p = load_lanes(prediction + at, count);
@@ -176,12 +184,14 @@ kernel void loss_gradient(
             slope_s += WINDOW[k] * row[2 * blocks];
         }
         const float scale = 1.0f / (3.0f * h * w);
+        const floats slope = beta > 0.0f ? clamp_slope(d / beta) : sign(d);
         store_lanes(
-            scale * sign(d) + slope_0 + slope_d * d + slope_s * s, grad_prediction + at, count);
+            scale * slope + slope_0 + slope_d * d + slope_s * s, grad_prediction + at, count);
+        smooth = scale * SUM_LANES(slope * (d - 0.5f * beta * slope));
         absolute = scale * SUM_LANES(fabs(d));
         squared = scale * SUM_LANES(d * d);
     }
-    partial_terms[(size_t)blocks * (v + y) + b] = (float4)(absolute, absolute, 0.0f, squared);
+    partial_terms[(size_t)blocks * (v + y) + b] = (float4)(smooth, absolute, 0.0f, squared);
 }
 
 // GROUP work-items per row: the sum of its terms.

@@ -29,7 +29,6 @@ from pp_cl.raster.point_cloud import PointCloud
 from pp_cl.raster.project import Projection
 from pp_cl.raster.sh import sh_blocks
 from pp_cl.training.loss import TAPS, Loss
-from pp_cl.training.point_state import PointState
 
 LAUNCH_SECONDS = 5e-6
 ROW = 64  # bytes of 16 channels
@@ -106,10 +105,7 @@ def network_layers(config: Config) -> list[Layer]:
 def _raster(config, counts):
     """The stages from projection to blending."""
     n, p, s, raster = counts.points, counts.pairs, counts.shaded, config.raster
-    blocks, lazy = sh_blocks(config.points.sh_degree), config.train.lazy_adam
-    coefficients = sum(block.count for block in blocks)
-    # lazy Adam adds what it has yet to move the features by, block by block
-    pending = len(blocks) * (16 + 2 * ROW) + _moments(config, n) / n if lazy else 0
+    coefficients = sum(block.count for block in sh_blocks(config.points.sh_degree))
     projected = table_bytes(Projection.table(n))
     pairs = PairBuilder.table(n, counts.pixels, p)
     keys = table_bytes({name: pairs[name] for name in ("pair_key", "pair_scratch")})
@@ -127,21 +123,9 @@ def _raster(config, counts):
         ),
         # of each pair its key, its closeness and the opacity of its point
         "weights": Work(weights + 20 * p + 4 * counts.pixels, 20 * p, 2 + drops + _scans(n)),
-        "shade": Work(
-            s * (4 + 16 + ROW * (coefficients + 1) + pending),
-            s * 16 * coefficients * (1 + lazy),
-            1 + lazy * (1 + len(blocks)),
-        ),
+        "shade": Work(s * (4 + 16 + ROW * (coefficients + 1)), s * 16 * coefficients, 1),
         "blend": Work(p * (8 + ROW) + counts.pixels * (4 + ROW), 16 * p, 1),
     }
-
-
-def _moments(config, n):
-    """Bytes of Adam's moments of the SH coefficients of n points."""
-    blocks = sh_blocks(config.points.sh_degree)
-    names = {block.name for block in blocks}
-    table = PointState.table(n, blocks, config.train)
-    return table_bytes({k: row for k, row in table.items() if k.partition(".")[2] in names})
 
 
 def _scans(n):
@@ -207,21 +191,17 @@ def _gradients(config, counts):
 
 
 def _update(config, layers, counts):
-    """Parameters and moments are read and written, gradients read; lazy Adam does so with the SH of
-    the shaded points alone.
+    """Parameters and moments are read and written, gradients read; of the SH those of the shaded
+    points alone, whose gradients and last steps are read twice.
     """
-    n, train, blocks = counts.points, config.train, sh_blocks(config.points.sh_degree)
+    n, s, blocks = counts.points, counts.shaded, sh_blocks(config.points.sh_degree)
     cloud = PointCloud.table(n, blocks)
-    sh = table_bytes({b.name: cloud[b.name] for b in blocks}) + _moments(config, n)
-    share = counts.shaded / n if train.lazy_adam else 1.0
-    moved = share * (2 * sh + len(blocks) * n * (ROW + 4)) + 4 * n * (2 * 3 + 1)
+    sh = table_bytes({b.name: cloud[b.name] for b in blocks}) // n
+    moved = s * (2 * sh + 2 * ROW + 2 * (ROW + 4) + 3 * 4) + 4 * n * (2 * 3 + 1)
     parameters = table_bytes(parameter_table(layers))
     coefficients = sum(block.count for block in blocks)
-    adds = ADAM * (16 * coefficients * share * n + n + parameters / 4)
-    launches = len(blocks) + 1 + len(parameter_table(layers))
-    if train.lazy_adam:  # which points have a gradient, and what they skipped
-        launches += 3 + _scans(n)
-    return Work(moved + 7 * parameters, adds, launches)
+    adds = 16 * s * (coefficients + ADAM) + ADAM * (n + parameters / 4)
+    return Work(moved + 7 * parameters, adds, 3 + len(parameter_table(layers)))
 
 
 def measured_card(dev: Device) -> Card:

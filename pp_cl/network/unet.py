@@ -10,6 +10,7 @@ from pp_cl.device.device import Device
 from pp_cl.layers.conv import pack_bias, pack_weights
 from pp_cl.layers.policy import ConvolutionPolicy, make_policy
 from pp_cl.layers.resample import affine
+from pp_cl.layers.residual import residual_backward, residual_forward
 from pp_cl.layers.tiles import SIDE
 from pp_cl.network.architectures import convolutions, unet_layers
 from pp_cl.network.buffers import gradient_of
@@ -26,6 +27,7 @@ from pp_cl.settings import NetworkConfig
 # MOST_COMPUTED of the multiplications remain: finding them costs time too.
 LEAST_PIXELS, MOST_COMPUTED = 1 << 16, 0.8
 MULTIPLE = 4  # pixels: two poolings halve the height and the width
+RESIDUAL_SHARE = 0.25  # of a feature in its colour; features differ by about four times as much
 
 
 class UNet:
@@ -37,7 +39,8 @@ class UNet:
     network.layer.Layer in the order of the forward pass. parameters, gradients: {"enc0.a.weight":
     (ceil(CO/16), K, K, CI, 16), "enc0.a.bias": (ceil(CO/16) * 16,), ...} float32 on the device.
     Weights and biases start uniform in +-1/sqrt(CI K K) (PyTorch's default for Conv2d), output
-    channels beyond CO at 0, with gradient 0.
+    channels beyond CO at 0, with gradient 0. residual: to be set before the first image; the image
+    is the network's plus RESIDUAL_SHARE of the first three features.
     """
 
     def __init__(
@@ -53,6 +56,7 @@ class UNet:
         policy: ConvolutionPolicy | None = None,
     ):
         self.dev = dev
+        self.residual = False
         self.layers = unet_layers(widths, channels_in, channels_out, blocks, channels=channels)
         self.channels_in = channels_in
         self.policy = policy or make_policy(dev)
@@ -77,7 +81,7 @@ class UNet:
         cls, dev: Device, settings: NetworkConfig, policy: ConvolutionPolicy, *, seed: int = 0
     ) -> "UNet":
         """The network of a run."""
-        return cls(
+        net = cls(
             dev,
             settings.widths,
             blocks=settings.blocks,
@@ -85,6 +89,8 @@ class UNet:
             seed=seed,
             policy=policy,
         )
+        net.residual = settings.residual
+        return net
 
     def use(self, policy: ConvolutionPolicy) -> None:
         """Take the variants of another policy from the next image on."""
@@ -153,6 +159,8 @@ class UNet:
             layer.forward(workspace, sources, out, tiles.tiles(layer.name))
             tiles.fill_copies(layer.name, out)
         affine(self.dev, 0.5, 0.5, out, out=out)
+        if self.residual:
+            residual_forward(self.dev, x, out, RESIDUAL_SHARE)
         if training:
             self._trained = workspace, arrays, tiles
         return out
@@ -188,6 +196,8 @@ class UNet:
                 )
         grad_x = arrays[gradient_of("x")]
         tiles.fill_copies("x", grad_x)
+        if self.residual:
+            residual_backward(self.dev, grad_y, grad_x, RESIDUAL_SHARE)
         return grad_x
 
     def output(self, name: str) -> Array:

@@ -111,8 +111,8 @@ class BlendWeights(ABC):
         grad_features: Array,
         grad_alpha: Array | None = None,
     ) -> Array:
-        """(HW,) float32: what G.f of a hit is compared with; or, with gain_by_pair, (P,): by how much
-        G.f exceeds it.
+        """(HW,) float32: what G.f of a hit is compared with; with gain_by_pair (P,): by how much
+        it exceeds that.
 
         weights: the last ones computed. point_features: (N, 16); features, grad_features: F and
         G, (H, W, 16), of Blend.forward with these weights. grad_alpha: g = dL/d(1 - T), (HW,), of

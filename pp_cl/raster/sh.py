@@ -37,3 +37,11 @@ SH_DEGREES = (0, 1, 2)
 def sh_blocks(degree: int) -> tuple[ShBlock, ...]:
     """Those of SH_BLOCKS up to a degree."""
     return tuple(block for block in SH_BLOCKS if block.degree <= degree)
+
+
+def stored_degree(blocks: int) -> int:
+    """The degree of the first so many SH_BLOCKS. Raises ValueError where they end within one."""
+    last, *following = SH_BLOCKS[blocks - 1 : blocks + 1]
+    if following and following[0].degree == last.degree:
+        raise ValueError(f"{blocks} arrays of coefficients end within degree {last.degree}")
+    return last.degree

@@ -10,7 +10,7 @@ from pyopencl.array import Array
 from pp_cl.device.device import Device
 from pp_cl.device.form import lanes, row_parts
 from pp_cl.raster.project import ProjectedPoints
-from pp_cl.raster.sh import SH_BLOCKS
+from pp_cl.raster.sh import SH_BLOCKS, stored_degree
 
 
 def shade_forward(
@@ -34,7 +34,7 @@ def shade_forward(
     absent = [sh[0]] * (len(SH_BLOCKS) - len(sh))  # not read below their degree
     names = [block.name for block in SH_BLOCKS]
     arrays = dict(zip(names, [*sh, *absent], strict=True))
-    dev.program("raster/shade", LANES=lanes(dev), DEGREE=_degree(len(sh))).launch(
+    dev.program("raster/shade", LANES=lanes(dev), DEGREE=stored_degree(len(sh))).launch(
         "shade_forward_half" if sh[0].dtype == np.float16 else "shade_forward",
         shaded.size * row_parts(dev),
         s=shaded.size,
@@ -44,11 +44,3 @@ def shade_forward(
         point_features=point_features,
         **arrays,
     )
-
-
-def _degree(blocks):
-    """The degree of the first so many SH_BLOCKS. Raises ValueError where they end within one."""
-    last, *following = SH_BLOCKS[blocks - 1 : blocks + 1]
-    if following and following[0].degree == last.degree:
-        raise ValueError(f"{blocks} arrays of coefficients end within degree {last.degree}")
-    return last.degree

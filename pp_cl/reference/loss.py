@@ -52,18 +52,22 @@ def ssim(x: np.ndarray, y: np.ndarray) -> tuple[float, np.ndarray]:
 
 
 def loss(
-    prediction: np.ndarray, target: np.ndarray, weight: float
+    prediction: np.ndarray, target: np.ndarray, weight: float, beta: float = 0.0
 ) -> tuple[np.ndarray, np.ndarray]:
     """(terms (4,): L, L1, 1 - SSIM, mean squared error; gradient (H, W, 3)) of equally large
     images.
     """
     x, y = np.asarray(prediction, np.float64), np.asarray(target, np.float64)
-    l1, gradient = np.abs(x - y).mean(), np.sign(x - y) / x.size
+    error = np.abs(x - y)
+    smooth, gradient = error.mean(), np.sign(x - y) / x.size
+    if beta:
+        smooth = np.where(error < beta, error**2 / (2 * beta), error - beta / 2).mean()
+        gradient *= np.minimum(error / beta, 1)
     dissimilarity = 0.0
     if weight and min(x.shape[:2]) >= 11:
         similarity, d_x = ssim(x, y)
         dissimilarity = 1 - similarity
         gradient = gradient - weight * d_x
     return np.array(
-        [l1 + weight * dissimilarity, l1, dissimilarity, ((x - y) ** 2).mean()]
+        [smooth + weight * dissimilarity, error.mean(), dissimilarity, (error**2).mean()]
     ), gradient

@@ -1,8 +1,6 @@
-"""Float64 twins of what changes parameters: Adam as torch computes it, the SH gradient written out,
-grid smoothing.
+"""Float64 twins of what changes parameters: Adam as torch computes it, RMSprop of the SH
+coefficients, grid smoothing.
 """
-
-from typing import Any
 
 import numpy as np
 
@@ -10,12 +8,11 @@ from pp_cl.reference.raster import sh_basis
 
 
 class Adam:
-    """torch.optim.Adam without weight decay, for one array; lazy where a step lists rows."""
+    """torch.optim.Adam without weight decay, for one array."""
 
     def __init__(self, parameter: np.ndarray, beta1: float = 0.9, beta2: float = 0.999):
         self.parameter = np.array(parameter, np.float64)
         self.m, self.v, self.t = np.zeros_like(self.parameter), np.zeros_like(self.parameter), 0
-        self.last_step = np.zeros(len(self.parameter), int)
         self.betas = beta1, beta2
 
     def step(
@@ -26,57 +23,45 @@ class Adam:
         *,
         low: float = -np.inf,
         high: float = np.inf,
-        rows: Any = slice(None),
     ) -> None:
-        """rows: those that this step updates. The steps since their last one are applied first,
-        with gradients of 0: the moments exactly, the moves with the present rate and eps.
-        """
+        """One step; the parameter stays in [low, high]."""
         beta1, beta2 = self.betas
         self.t += 1
-        moved = self.parameter[rows] + self.pending(self.t, rate, eps, rows)
-        skipped = self._skipped(self.t, rows)
-        self.last_step[rows] = self.t
+        grad = np.asarray(grad, np.float64)
+        self.m += (1 - beta1) * (grad - self.m)
+        self.v += (1 - beta2) * (grad * grad - self.v)
         c1, c2 = 1 - beta1**self.t, 1 - beta2**self.t
-        grad = np.asarray(grad, np.float64)[rows]
-        m = beta1 * beta1**skipped * self.m[rows] + (1 - beta1) * grad
-        v = beta2 * beta2**skipped * self.v[rows] + (1 - beta2) * grad * grad
-        moved -= rate / c1 * m / (np.sqrt(v / c2) + eps)
-        self.m[rows], self.v[rows], self.parameter[rows] = m, v, np.clip(moved, low, high)
+        moved = self.parameter - rate / c1 * self.m / (np.sqrt(self.v / c2) + eps)
+        self.parameter = np.clip(moved, low, high)
 
-    def go_to(self, t: int) -> None:
-        """Count t steps."""
+
+class RmsProp:
+    """The step of cl/training/rmsprop.cl, written out for all points in every step.
+
+    sh: (N, count, 16) coefficients. basis: (N, count), their harmonics.
+    """
+
+    def __init__(self, sh: np.ndarray, basis: np.ndarray, beta2: float = 0.999):
+        self.sh, self.basis, self.beta2 = np.array(sh, np.float64), basis, beta2
+        self.v, self.t = np.zeros((len(sh), 16)), 0
+
+    def step(self, t: int, grad_features: np.ndarray, rates: np.ndarray, eps: float) -> None:
+        """Step t with gradients (N, 16) of the features; those between it and the last had
+        gradients of 0. rates: of the basis functions.
+        """
+        grad = np.asarray(grad_features, np.float64)
+        self.v = self.beta2 ** (t - self.t) * self.v
+        self.v += (1 - self.beta2) * grad**2 / (4 * np.pi)
         self.t = t
-
-    def pending(self, t: int, rate: float, eps: float, rows: Any = slice(None)) -> np.ndarray:
-        """What the steps that the rows skipped before step t have yet to move them by."""
-        beta1, beta2 = self.betas
-        skipped, m, v = self._skipped(t, rows), self.m[rows], self.v[rows]
-        c1, c2, moves = 1 - beta1**t, 1 - beta2**t, np.zeros_like(m)
-        for j in range(1, skipped.max(initial=0) + 1):
-            with_decay = rate / c1 * m * beta1**j / (np.sqrt(v / c2) + eps) / np.sqrt(beta2) ** j
-            moves -= np.where(j <= skipped, with_decay, 0)
-            if beta1**j < 1e-30:
-                break
-        return moves
-
-    def _skipped(self, t, rows):
-        shape = (-1, *[1] * (self.parameter.ndim - 1))
-        return (t - 1 - self.last_step[rows]).reshape(shape)
+        scaled = grad / (np.sqrt(self.v / (1 - self.beta2**t)) + eps)
+        moves = np.asarray(rates)[: self.basis.shape[1]] * self.basis
+        self.sh -= moves[:, :, None] * scaled[:, None, :]
 
 
-def block_basis(positions: np.ndarray, eye: np.ndarray, block: Any) -> np.ndarray:
-    """(N, block.count): the harmonics of one sh.ShBlock in the directions from the eye."""
+def basis(positions: np.ndarray, eye: np.ndarray) -> np.ndarray:
+    """(N, 9): the harmonics in the directions from the eye."""
     towards = positions - eye
-    basis = sh_basis(towards / np.linalg.norm(towards, axis=-1, keepdims=True))
-    return basis[:, block.first : block.first + block.count]
-
-
-def sh_gradient(
-    positions: np.ndarray, eye: np.ndarray, grad_point_features: np.ndarray, block: Any
-) -> np.ndarray:
-    """(N, block.count, 16) gradient of the SH coefficients of one sh.ShBlock."""
-    gradient = np.asarray(grad_point_features, np.float64)
-    return block_basis(positions, eye, block)[:, :, None] * gradient[:, None, :]
+    return sh_basis(towards / np.linalg.norm(towards, axis=-1, keepdims=True))
 
 
 def neighbours(ids: np.ndarray, dims: tuple[int, int, int]) -> list[list[int | None]]:

@@ -7,12 +7,11 @@ import numpy as np
 
 from pp_cl.device.device import Device
 from pp_cl.layers.policy import make_policy
-from pp_cl.raster.sh import SH_BLOCKS
+from pp_cl.raster.sh import SH_DEGREES
 from pp_cl.reference import loss as reference_loss
 from pp_cl.reference import optim
 from pp_cl.reference.lpips import lpips, lpips_gradient, random_weights
 from pp_cl.scene.grid import Grid
-from pp_cl.selftest.adam_points import EYE, GRID, SH_EPS, Cloud, gradients, moments
 from pp_cl.selftest.case import (
     EPS,
     SIZES,
@@ -24,7 +23,8 @@ from pp_cl.selftest.case import (
     finite,
     relative,
 )
-from pp_cl.training.adam import PointsWithGradient, adam_update, ema_update, moment_scale
+from pp_cl.selftest.updated_points import Cloud, gradients
+from pp_cl.training.adam import adam_opacity_update, adam_update, ema_update
 from pp_cl.training.loss import Loss
 from pp_cl.training.mask import MaskLoss
 from pp_cl.training.perceptual import PerceptualLoss
@@ -40,8 +40,8 @@ def _loss(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
     """L1 and SSIM; at sizes below a window L1 alone."""
     for size in ((11, 11), (12, 33), (33, 31), (40, 257), (1, 1), (1, 257), (10, 40)):
         prediction, target = _images(rng, *size)
-        for weight in (0.2, 1.0):
-            yield from _loss_checks(dev, prediction, target, weight, LOSS)
+        for weight, beta in ((0.2, 0.0), (1.0, 0.0), (0.1, 0.05)):
+            yield from _loss_checks(dev, prediction, target, (weight, beta), LOSS)
 
 
 def _images(rng, height, width):
@@ -52,11 +52,13 @@ def _images(rng, height, width):
     return (target + 0.1 * noise[1]).astype(np.float32), target.astype(np.float32)
 
 
-def _loss_checks(dev, prediction, target, weight, *bounds):
-    """bounds: of the terms, and of the gradient where it is another."""
-    loss = Loss(dev, weight)
+def _loss_checks(dev, prediction, target, weights, *bounds):
+    """weights: of 1 - SSIM, and beta. bounds: of the terms, and of the gradient where it is
+    another.
+    """
+    loss = Loss(dev, *weights)
     grad = loss.forward_backward(dev.upload(prediction), dev.upload(target)).get()
-    terms, expected = reference_loss.loss(prediction, target, weight)
+    terms, expected = reference_loss.loss(prediction, target, *weights)
     yield each(loss.terms.get(), terms, bounds[0], floor=1e-10 / bounds[0])
     yield relative(grad, expected, bounds[-1])
 
@@ -65,13 +67,13 @@ def _hard_loss(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
     """Flat images, equal ones, and variances far below the squares they are the difference of."""
     for levels in ((0.0, 1.0), (1.0, 0.0), (1.0, 0.999), (0.3, 0.3001), (-2.0, 0.0)):
         prediction, target = (np.full((20, 30, 3), level, np.float32) for level in levels)
-        yield from _loss_checks(dev, prediction, target, 0.2, FLAT)
+        yield from _loss_checks(dev, prediction, target, (0.2, 0.0), FLAT)
     for level in (0.0, 1.0):
         noise = 1e-3 * rng.standard_normal((2, 24, 35, 3))
         target = (level + noise[0]).astype(np.float32)
         prediction = (target + noise[1]).astype(np.float32)
         # rounding of values of 1 in variances of 1e-6, as shares of C2
-        yield from _loss_checks(dev, prediction, target, 1.0, 1e-5, 3e-5)
+        yield from _loss_checks(dev, prediction, target, (1.0, 0.0), 1e-5, 3e-5)
         yield from _equal_images(dev, target)
 
 
@@ -137,7 +139,7 @@ def _adam(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
 def _adam_steps(dev, start, grads, *, rate, eps):
     """(float64 twin, parameter, moments) after a step with each gradient."""
     parameter = dev.upload(start, np.float32)
-    twin, state = optim.Adam(parameter.get()), moments(dev, parameter)
+    twin, state = optim.Adam(parameter.get()), _moments(dev, parameter)
     for step, grad in enumerate(grads.astype(np.float32), 1):
         adam_update(dev, parameter, dev.upload(grad), state, step=step, rate=rate, eps=eps)
         twin.step(grad, rate, eps)
@@ -158,68 +160,61 @@ def _adam_extremes(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
     yield exact(state["v"].get(), np.zeros(33))
 
 
-def _point_adam(block: int, dev: Device, rng: np.random.Generator) -> Iterator[Check]:
-    """The gradient of harmonics, by the direction from the eye, and Adam of it and of the opacity;
-    points without a gradient catch up later.
+def _moments(dev, parameter):
+    return {kind: dev.zeros(parameter.shape) for kind in "mv"}
+
+
+def _rmsprop(degree: int, dev: Device, rng: np.random.Generator) -> Iterator[Check]:
+    """Of harmonics by the direction from the eye; points without a gradient keep their values, and
+    their second moments decay.
     """
     for n in SIZES:
-        cloud = Cloud(dev, rng, n, SH_BLOCKS[block])
+        cloud = Cloud(dev, rng, n, degree)
         for _ in range(8):
-            cloud.step(*gradients(rng, n), np.flatnonzero(rng.random(n) < 0.4))
-        for compared in cloud.compared():
-            yield relative(*compared)
-        yield exact(cloud.last_step.get(), cloud.twins["sh"].last_step)
-        rows = np.flatnonzero(rng.random(n) < 0.7)
-        moves = cloud.twins["sh"].pending(10, 0.1, SH_EPS)
-        basis = optim.block_basis(GRID.positions(cloud.ids), EYE, cloud.block)
-        expected = np.einsum("nk,nkc->nc", basis, moves)
-        pending = cloud.pending(rows, 10)
-        scale = np.abs(expected).max()
-        yield absolute(pending[rows], expected[rows], 1e-6 * scale)
+            cloud.step(gradients(rng, n), np.flatnonzero(rng.random(n) < 0.4))
+        yield from _rmsprop_checks(cloud)
     for step in (100, 50_000, 10**8):
-        cloud = Cloud(dev, rng, 33, SH_BLOCKS[block])
+        cloud = Cloud(dev, rng, 33, degree)
         for at in (1, step, step + 1):
-            cloud.step(*gradients(rng, 33), np.arange(33), at)
-        for compared in cloud.compared():
-            yield relative(*compared)
+            cloud.step(gradients(rng, 33), np.arange(33), at)
+        yield from _rmsprop_checks(cloud)
 
 
-def _half_moments(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
-    """A half is off by up to 2^-11, and each of twelve steps rounds again."""
-    for n in SIZES:
-        cloud = Cloud(dev, rng, n, scale=moment_scale(SH_EPS))
-        for _ in range(12):
-            cloud.step(*gradients(rng, n), np.flatnonzero(rng.random(n) < 0.4))
-        parameter, m, v = cloud.state()["sh"]
-        twin = cloud.twins["sh"]
-        moved = np.abs(twin.parameter - cloud.start["sh"]).max()
-        yield absolute(parameter, twin.parameter, 0.01 * moved + 1e-7)
-        yield relative(m, twin.m, 0.005)
-        yield relative(np.sqrt(v), np.sqrt(twin.v), 0.005)
+def _rmsprop_checks(cloud):
+    yield relative(cloud.coefficients(), cloud.twin.sh, 1e-6)
+    yield relative(cloud.second_moment(), cloud.twin.v, 3e-6)  # a sum of squares
+
+
+def _rmsprop_extremes(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
+    """Gradients of 1e-20 to 1e10, of which float32 cannot square all; of 0 and -0; NaN stays."""
+    for scale in (1e-20, 1e-12, 1e-3, 1e10):
+        cloud = Cloud(dev, rng, 31)
+        for _ in range(10):
+            cloud.step(scale / 1e-4 * gradients(rng, 31), np.arange(31))
+        yield relative(cloud.coefficients(), cloud.twin.sh, 1e-6)
+    cloud = Cloud(dev, rng, 33)
+    grad = np.zeros((33, 16))
+    grad[1], grad[2, 5] = -0.0, np.nan
+    cloud.step(grad, np.arange(33))
+    expected = cloud.start.copy()
+    expected[2, :, 5] = np.nan
+    yield exact(np.isnan(cloud.coefficients()), np.isnan(expected))
+    yield exact(np.nan_to_num(cloud.coefficients()), np.nan_to_num(expected))
 
 
 def _bounded_opacity(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
     """Huge gradients keep it in [0, 1], at the values of float64."""
-    cloud = Cloud(dev, rng, 257)
-    for _ in range(20):
+    opacity = dev.upload(rng.random(257), np.float32)
+    twin, state = optim.Adam(opacity.get()), _moments(dev, opacity)
+    for step in range(1, 21):
         drift = 1e4 * (rng.standard_normal(257) + np.linspace(-2, 2, 257))
-        cloud.step(np.zeros((257, 16)), drift, np.arange(257))
-    opacity = cloud.opacity.get()
-    yield finite(opacity)
-    yield exact([opacity.min(), opacity.max()], [0, 1])
-    yield absolute(opacity, cloud.twins["opacity"].parameter, 2e-6)  # twenty moves of 0.03
-
-
-def _points_with_gradient(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
-    """Rows that hold anything but 0, NaN among them."""
-    for n in SIZES:
-        shaded = np.flatnonzero(rng.random(n) < 0.8)
-        features = np.full((n, 16), np.nan, np.float32)
-        features[shaded] = 0
-        for place, i in enumerate(shaded):
-            features[i, place % 16] = (-0.0, -1e-37, np.nan)[place % 3]
-        rows = PointsWithGradient(dev).rows(dev.upload(shaded, np.uint32), dev.upload(features))
-        yield exact(rows.get(), shaded[np.arange(len(shaded)) % 3 > 0])
+        grad = dev.upload(drift, np.float32)
+        adam_opacity_update(dev, opacity, grad, state, step=step, rate=0.03, eps=1e-15)
+        twin.step(grad.get(), 0.03, 1e-15, low=0, high=1)
+    moved = opacity.get()
+    yield finite(moved)
+    yield exact([moved.min(), moved.max()], [0, 1])
+    yield absolute(moved, twin.parameter, 2e-6)  # twenty moves of 0.03
 
 
 def _ema(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
@@ -267,10 +262,9 @@ CASES = (
     Case("loss: perceptual", _perceptual_loss),
     Case("adam: arrays", _adam),
     Case("adam: gradients of 0, 1e-20 and 1e10", _adam_extremes),
-    *(Case(f"adam: points, {b.name}", partial(_point_adam, i)) for i, b in enumerate(SH_BLOCKS)),
-    Case("adam: moments of 16 bits", _half_moments),
     Case("adam: opacities at their bounds", _bounded_opacity),
-    Case("adam: points with a gradient", _points_with_gradient),
+    *(Case(f"rmsprop: degree {d}", partial(_rmsprop, d)) for d in SH_DEGREES),
+    Case("rmsprop: gradients of 0, 1e-20, 1e10 and NaN", _rmsprop_extremes),
     Case("training: moving average", _ema),
     Case("training: smoothing", _smooth),
     Case("training: split opacities", _refine),

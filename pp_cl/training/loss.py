@@ -1,4 +1,4 @@
-"""The training loss: L1 + weight * (1 - SSIM), and its gradient."""
+"""The training loss: smooth L1 + weight * (1 - SSIM), and its gradient."""
 
 import numpy as np
 from pyopencl.array import Array
@@ -16,16 +16,19 @@ MARGIN = 32  # values by which a scratch row is longer than needed, >= 3 * (TAPS
 
 
 class Loss:
-    """L = mean |p - t| + ssim_weight * (1 - SSIM(p, t)) over an image; holds its scratch buffers.
+    """L = mean D(p - t) + ssim_weight * (1 - SSIM(p, t)) over an image; holds its scratch buffers.
 
+    D is smooth L1 (Girshick 2015): d^2 / (2 beta) below beta, |d| - beta/2 from there on; L1 where
+    beta is 0.
     SSIM (Wang et al. 2004): 11x11 Gaussian windows of sigma 1.5 inside the image, k1 .01, k2 .03,
     range 1, population variances, mean over channels and windows. It is off (its term reads 0)
     where ssim_weight is 0 or a side of the target is below 11 pixels. terms: (4,) float32 on the
     device after a call: L, L1, 1 - SSIM, mean squared error.
     """
 
-    def __init__(self, dev: Device, ssim_weight: float):
+    def __init__(self, dev: Device, ssim_weight: float, beta: float = 0.0):
         self.dev = dev
+        self.beta = beta
         self.ssim_weight = ssim_weight
         self.terms = dev.zeros((4,))
         self._buffers = Buffers(dev)
@@ -93,6 +96,7 @@ class Loss:
             "loss_gradient",
             (blocks, height),
             h=height,
+            beta=self.beta,
             spread=spread,
             grad_prediction=b.grad_prediction,
             partial_terms=partial_terms,

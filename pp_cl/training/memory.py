@@ -248,12 +248,12 @@ def _refining(sketch, n, *, left, spacing, start, end, ema):
 
 def _kept_tables(sketch, n, ema):
     """What stays from step to step. ema: with the averages."""
-    train, blocks = replace(sketch.config.train, ema=ema), sh_blocks(sketch.config.points.sh_degree)
+    blocks = sh_blocks(sketch.config.points.sh_degree)
     return [
         ("points", PointCloud.table(n, blocks)),
-        ("training state of the points", PointState.table(n, blocks, train)),
+        ("training state of the points", PointState.table(n)),
         ("averages of the points", PointState.ema_table(n, blocks) if ema else {}),
-        ("optimiser", Optimiser.table(n, sketch.net.parameters, train)),
+        ("optimiser", Optimiser.table(sketch.net.parameters, ema)),
     ]
 
 

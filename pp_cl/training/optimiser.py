@@ -1,4 +1,6 @@
-"""The update of everything learned: Adam, and the averaged (EMA) copy."""
+"""The update of everything learned: RMSprop of the SH coefficients, Adam of the rest, and the
+averaged (EMA) copy.
+"""
 
 from __future__ import annotations
 
@@ -12,16 +14,11 @@ from pp_cl.device.buffers import Table
 from pp_cl.device.device import Device
 from pp_cl.device.rows import DeviceRows
 from pp_cl.model import Model
+from pp_cl.raster.project import ProjectedPoints
 from pp_cl.settings import NetworkConfig, TrainConfig
-from pp_cl.training.adam import (
-    Directions,
-    Ema,
-    PointAdam,
-    PointsWithGradient,
-    ShGradient,
-    adam_update,
-)
+from pp_cl.training.adam import Ema, adam_opacity_update, adam_update
 from pp_cl.training.point_state import PointState
+from pp_cl.training.rmsprop import ShGradient, rmsprop_update
 from pp_cl.training.schedule import learning_rate
 
 OPACITY_EPS = 1e-15  # opacity gradients span many decades; clamping bounds the step instead
@@ -30,7 +27,7 @@ NETWORK_EPS = 1e-8  # PyTorch's default
 
 @dataclass(frozen=True)
 class Rates:
-    """Adam's rates at one step. sh: of the degrees 0, 1, 2."""
+    """The learning rates of one step. sh: of the degrees 0, 1, 2."""
 
     sh: tuple[float, ...]
     opacity: float
@@ -60,16 +57,12 @@ class Rates:
 class Optimiser:
     """Updates points and network; owns the network's moments and averages, the points' are in
     `state`.
-
-    moment_scale: of SH moments in 16 bits; None: in 32.
     """
 
-    def __init__(self, dev: Device, model: Model, state: PointState, moment_scale: float | None):
+    def __init__(self, dev: Device, model: Model, state: PointState):
         self.dev = dev
         self.model = model
         self.state = state
-        self.point_adam = PointAdam(dev, moment_scale)
-        self.with_gradient = PointsWithGradient(dev)
         self.moments = {
             name: {kind: dev.zeros(array.shape) for kind in "mv"}
             for name, array in model.net.parameters.items()
@@ -77,17 +70,13 @@ class Optimiser:
         self.ema = Ema(dev)
 
     @staticmethod
-    def table(n: int, parameters: dict[str, Array], settings: TrainConfig) -> Table:
-        """The arrays for n points and these parameters of a network, averages included."""
-        kinds = ("m", "v", "ema") if settings.ema else ("m", "v")
-        table = {
+    def table(parameters: dict[str, Array], ema: bool) -> Table:
+        """The arrays for these parameters of a network. ema: averages among them."""
+        return {
             f"{kind}.{name}": (array.shape, np.float32)
             for name, array in parameters.items()
-            for kind in kinds
+            for kind in (("m", "v", "ema") if ema else ("m", "v"))
         }
-        if settings.lazy_adam:
-            table |= PointAdam.table(n) | PointsWithGradient.table(n)
-        return table
 
     def update(
         self,
@@ -95,66 +84,33 @@ class Optimiser:
         rates: Rates,
         grads: tuple[Array, Array],
         *,
-        camera_buffer: Array,
+        points: ProjectedPoints,
         shaded: Array,
         sh_eps: float,
     ) -> None:
-        """One Adam step.
+        """One step.
 
         step: from 1. grads: (grad_point_features (N,16), grad_opacity (N)); the network's own lie
-        in model.net.gradients. camera_buffer: (20), of the image the gradients belong to. shaded:
-        (S) uint32, the points that make up that image; lazy Adam reads the gradients of no others.
-        sh_eps: Adam's eps of the SH coefficients.
+        in model.net.gradients. points: in the image that the gradients belong to. shaded: (S)
+        uint32, those that make it up; no others have a gradient of their features. sh_eps: eps of
+        the SH coefficients' step.
         """
-        cloud, state, adam = self.model.cloud, self.state, self.point_adam
-        grad_point_features, grad_opacity = grads
-        if state.last_step is None:
-            updated = adam.all_points(step, cloud.count)
-        else:
-            rows = self.with_gradient.rows(shaded, grad_point_features)
-            updated = adam.listed_points(step, rows, state.last_step)
-
-        gradient = ShGradient(self._directions(camera_buffer), grad_point_features)
-        for block, sh, learned in self._learned_blocks(rates):
-            adam.update_sh(updated, block, gradient, sh, **learned, eps=sh_eps)
-        moments = state.moments("opacity")
-        adam.update_opacity(
-            step, grad_opacity, cloud.opacity, moments, rate=rates.opacity, eps=OPACITY_EPS
+        model, state = self.model, self.state
+        cloud, (grad_point_features, grad_opacity) = model.cloud, grads
+        gradient = ShGradient(points, shaded, grad_point_features)
+        rmsprop_update(
+            self.dev, step, gradient, cloud.sh, moment=state.sh_moment, rates=rates.sh, eps=sh_eps
+        )
+        adam_opacity_update(
+            self.dev,
+            cloud.opacity,
+            grad_opacity,
+            state.opacity_moments,
+            step=step,
+            rate=rates.opacity,
+            eps=OPACITY_EPS,
         )
         self._update_network(step, rates.network)
-
-    def add_pending(
-        self,
-        step: int,
-        rates: Rates,
-        *,
-        camera_buffer: Array,
-        shaded: Array,
-        point_features: Array,
-        sh_eps: float,
-    ) -> None:
-        """Add to the features (N, 16) of the shaded points what lazy Adam has yet to move them by
-        (the arguments: of update()); nothing where Adam is dense.
-        """
-        if self.state.last_step is None:
-            return
-        adam, directions = self.point_adam, self._directions(camera_buffer)
-        listed = adam.listed_points(step, shaded, self.state.last_step, updating=False)
-        for block, _, learned in self._learned_blocks(rates):
-            adam.add_pending(listed, block, directions, point_features, **learned, eps=sh_eps)
-
-    def _directions(self, camera_buffer):
-        return Directions(self.model.grid_buffer, camera_buffer, self.model.cloud.ids)
-
-    def _learned_blocks(self, rates):
-        """(block, coefficients, {"moments", "rate"}) of the SH that this step learns; the moments
-        of the others are not even read.
-        """
-        cloud = self.model.cloud
-        for block, sh in zip(cloud.blocks, cloud.sh, strict=True):
-            rate = rates.sh[block.degree]
-            if rate > 0:
-                yield block, sh, {"moments": self.state.moments(block.name), "rate": rate}
 
     def _update_network(self, step, rate):
         net = self.model.net

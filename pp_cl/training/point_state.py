@@ -11,8 +11,8 @@ from pp_cl.device.device import Device
 from pp_cl.device.rows import DeviceRows
 from pp_cl.raster.point_cloud import PointCloud
 from pp_cl.raster.sh import ShBlock
-from pp_cl.settings import TrainConfig
 from pp_cl.training.adam import Ema
+from pp_cl.training.rmsprop import SecondMoment
 
 # Names in a checkpoint where they differ: SH blocks are called after their first basis function.
 STORED_NAMES = {
@@ -27,31 +27,23 @@ STORED_NAMES = {
 
 
 class PointState:
-    """Adam's moments, blend weights and averages of a point cloud; rows as in the cloud.
+    """Moments, blend weights and averages of a point cloud; rows as in the cloud.
 
     ema: averages by the names of PointCloud.learned().
     """
 
-    def __init__(self, dev: Device, cloud: PointCloud, settings: TrainConfig):
-        table = self.table(cloud.count, cloud.blocks, settings)
+    def __init__(self, dev: Device, cloud: PointCloud):
+        table = self.table(cloud.count)
         self.dev = dev
         self._arrays = {name: dev.zeros(*row) for name, row in table.items()}
         self.ema = Ema(dev)
 
     @staticmethod
-    def table(n: int, blocks: tuple[ShBlock, ...], settings: TrainConfig) -> Table:
+    def table(n: int) -> Table:
         """The arrays of n points without the averages; all start as zeros."""
-        table = {"peak_weight": ((n,), np.float32), "look_count": ((n,), np.float32)}
-        if settings.lazy_adam:
-            table["last_step"] = ((n,), np.uint32)
+        table = dict.fromkeys(("peak_weight", "look_count"), ((n,), np.float32))
         table |= {f"{kind}.opacity": ((n,), np.float32) for kind in "mv"}
-        for block in blocks:
-            if settings.moments_16bit:
-                table[f"mv.{block.name}"] = ((n, block.count, 2, 16), np.float16)
-            else:
-                row = ((n, block.count, 16), np.float32)
-                table |= {f"{kind}.{block.name}": row for kind in "mv"}
-        return table
+        return table | {"v.sh": ((n, 16), np.float32), "last_step": ((n,), np.uint32)}
 
     @staticmethod
     def ema_table(n: int, blocks: tuple[ShBlock, ...]) -> Table:
@@ -73,14 +65,14 @@ class PointState:
         return self._arrays["look_count"]
 
     @property
-    def last_step(self) -> Array | None:
-        """(N) uint32: the step that updated each point last, 0: none; None where Adam is dense."""
-        return self._arrays.get("last_step")
+    def sh_moment(self) -> SecondMoment:
+        """Of the SH coefficients."""
+        return SecondMoment(self._arrays["v.sh"], self._arrays["last_step"])
 
-    def moments(self, name: str) -> dict[str, Array]:
-        """Adam's moments of a learned array: "m" and "v", or in 16 bits both as "mv"."""
-        keys = ((kind, f"{kind}.{name}") for kind in ("m", "v", "mv"))
-        return {kind: self._arrays[key] for kind, key in keys if key in self._arrays}
+    @property
+    def opacity_moments(self) -> dict[str, Array]:
+        """Adam's "m" and "v", (N,) each."""
+        return {kind: self._arrays[f"{kind}.opacity"] for kind in "mv"}
 
     def compact(self, dev: Device, keep: Array) -> None:
         """Drop all rows but `keep`, (M) uint32, ascending; one array after the other."""

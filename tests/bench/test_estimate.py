@@ -50,14 +50,11 @@ def launches(monkeypatch):
     return counted
 
 
-@pytest.mark.parametrize(
-    "name, lazy", [("paper", True), pytest.param("tiny", False, marks=pytest.mark.slow)]
-)
-def test_the_launches_of_a_step_on_a_gpu(dev, tmp_path, monkeypatch, launches, *, name, lazy):
+@pytest.mark.parametrize("name", ["paper", pytest.param("tiny", marks=pytest.mark.slow)])
+def test_the_launches_of_a_step_on_a_gpu(dev, tmp_path, monkeypatch, launches, name):
     monkeypatch.setattr(dev, "is_cpu", False)
-    settings = SMALL | {"train.lazy_adam": lazy}
     scene = write_ball_scene(tmp_path / "ball")
-    config = configure(preset(name), scene, [(k, v, "test") for k, v in settings.items()])
+    config = configure(preset(name), scene, [(k, v, "test") for k, v in SMALL.items()])
     trainer = open_training(dev, RunFolder(tmp_path / "run"), config, None).trainer
     trainer.train_step()
     launches.clear()
@@ -90,33 +87,18 @@ def test_the_network_does_what_its_shapes_say():
     assert kept == pytest.approx(3 * (4 * parameters + 24 * pixels))
 
 
-def test_a_point_of_dense_adam_moves_these_bytes():
+def test_a_point_moves_these_bytes():
     config = preset("paper")
     assign(config, "network.widths", (16, 16, 16), "test")
-    one, two = (step_work(config, replace(COUNTS, points=n))["update"] for n in (N, 2 * N))
-    # nine rows of coefficients and two moments, read and written; opacity too; a gradient's row and
-    # the point's id for each of four arrays
-    assert two.bytes - one.bytes == N * (9 * 64 * 3 * 2 + 4 * 3 * 2 + 4 + 4 * (64 + 4))
-
-
-@pytest.mark.parametrize(
-    "setting, value, factor",
-    [
-        ("train.lazy_adam", True, S / N),
-        ("train.moments_16bit", True, (9 * 64 * 2 * 2) / (9 * 64 * 6)),
-    ],
-)
-def test_settings_that_save_bytes(setting, value, factor):
-    def of_points(config):
-        return step_work(config, COUNTS)["update"].bytes
-
-    plain, changed = preset("paper"), preset("paper")
-    for config in (plain, changed):
-        assign(config, "network.widths", (16, 16, 16), "test")
-    assign(changed, setting, value, "test")
-    sh = N * 9 * 64 * 6
-    gradients = N * 4 * (64 + 4) if setting == "train.lazy_adam" else 0
-    assert of_points(plain) - of_points(changed) == pytest.approx((1 - factor) * (sh + gradients))
+    update = [
+        step_work(config, replace(COUNTS, points=n, shaded=s))["update"].bytes
+        for n, s in ((N, S), (2 * N, S), (N, 2 * S))
+    ]
+    # the opacity and its two moments, read and written, and its gradient
+    assert update[1] - update[0] == N * (2 * 3 * 4 + 4)
+    # of a shaded one: nine rows of coefficients and one of their moment, read and written; its
+    # gradient and its index, both twice; its last step, read and written; its vertex
+    assert update[2] - update[0] == S * (2 * 9 * 64 + 2 * 64 + 2 * (64 + 4) + 2 * 4 + 4)
 
 
 def test_the_rasteriser_moves_these_bytes():

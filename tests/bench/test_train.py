@@ -7,13 +7,11 @@ from pp_cl.bench.train import FORWARD, bench_train
 from pp_cl.config import assign, preset
 
 
-@pytest.mark.parametrize("lazy", [False, True])
-def test_a_small_scene(dev, tmp_path, lazy):
+def test_a_small_scene(dev, tmp_path):
     config = preset("paper")
     for key, value in (
         ("scene.path", write_ball_scene(tmp_path / "ball", size=40)),
         ("points.count", 1500),
-        ("train.lazy_adam", lazy),
     ):
         assign(config, key, value, "test")
     row = bench_train(dev, config, views=2, rounds=1)

@@ -12,7 +12,7 @@ from pp_cl.cli import main
 
 def test_train_prints_and_writes_its_row(tmp_path, capsys):
     scene, file = write_ball_scene(tmp_path / "ball", size=40), tmp_path / "b.json"
-    words = ["--scene", scene, "--points", "1500", "--set", "train.lazy_adam=true"]
+    words = ["--scene", scene, "--points", "1500", "--set", "raster.tau=0.001"]
     assert main(["bench", "train", *words, "--json", str(file)]) == 0
     printed, result = capsys.readouterr().out, json.loads(file.read_text())
     (row,) = result["rows"]

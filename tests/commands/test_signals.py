@@ -147,11 +147,9 @@ def test_another_thread_catches_nothing():
 def test_a_checkpoint_between_all_that_is_due_resumes_to_the_same_bytes(
     scene, tmp_path, monkeypatch
 ):
-    """After a refinement, with lazy Adam and moments in 16 bits, between two smoothings, within the
-    averages, not at a pruning.
-    """
-    changes = {"train__lazy_adam": "true", "train__moments_16bit": "true", "downscale": 1}
-    changes |= {"train__refine_at": "0.5,1", "points__count": 300, "train__prune_looks": 4}
+    """After a refinement, between two smoothings, within the averages, not at a pruning."""
+    changes = {"train__refine_at": "0.5,1", "points__count": 300, "train__prune_looks": 4}
+    changes |= {"downscale": 1}
     assert main(arguments(scene, tmp_path / "whole", **changes)) == 0
     with monkeypatch.context() as patch:
         signalling(patch, 53, signal.SIGINT)

@@ -25,28 +25,47 @@ def images(rng, height, width, noise=0.1):
     return prediction.astype(np.float32), target.astype(np.float32)
 
 
-def run(dev, prediction, target, weight, **offset):
-    loss = Loss(dev, weight)
+def run(dev, prediction, target, weight, beta=0.0, **offset):
+    loss = Loss(dev, weight, beta)
     grad = loss.forward_backward(dev.upload(prediction), dev.upload(target), **offset)
     return loss.terms.get(), grad.get()
 
 
 @pytest.mark.parametrize("size", SIZES)
-@pytest.mark.parametrize("weight", [0.2, 1.0])
-def test_matches_oracle(dev, rng, size, weight):
+@pytest.mark.parametrize("weight, beta", [(0.2, 0.0), (1.0, 0.0), (0.1, 0.05), (0.2, 1.0)])
+def test_matches_oracle(dev, rng, size, weight, beta):
     prediction, target = images(rng, *size)
-    terms, grad = run(dev, prediction, target, weight)
-    expected_terms, expected_grad = oracle_loss.loss(prediction, target, weight)
+    terms, grad = run(dev, prediction, target, weight, beta)
+    expected_terms, expected_grad = oracle_loss.loss(prediction, target, weight, beta)
     np.testing.assert_allclose(terms, expected_terms, rtol=2e-6)
     assert relative_error(grad, expected_grad) < 2e-6
 
 
-def test_oracle_gradient_is_the_derivative(rng):
+@pytest.mark.parametrize("beta", [0.0, 0.05])
+def test_oracle_gradient_is_the_derivative(rng, beta):
     prediction, target = images(rng, 14, 13)
     assert np.abs(prediction - target).min() > 1e-6  # else L1 has a kink inside the difference
-    _, grad = oracle_loss.loss(prediction, target, 0.7)
-    numeric = numeric_gradient(lambda p: oracle_loss.loss(p, target, 0.7)[0][0], prediction, 5e-7)
+    _, grad = oracle_loss.loss(prediction, target, 0.7, beta)
+    numeric = numeric_gradient(
+        lambda p: oracle_loss.loss(p, target, 0.7, beta)[0][0], prediction, 5e-7
+    )
     assert relative_error(grad.ravel(), numeric) < 1e-6
+
+
+@pytest.mark.parametrize("weight", [0.0, 0.1])
+def test_a_nan_is_not_hidden(dev, rng, weight):
+    prediction, target = images(rng, 14, 13)
+    prediction[5, 6, 1] = np.nan
+    terms, grad = run(dev, prediction, target, weight, 0.05)
+    assert np.isnan(terms[0]) and np.isnan(grad[5, 6, 1])
+
+
+def test_smooth_l1_is_torchs(rng):
+    """torch.nn.SmoothL1Loss(beta=0.05) of these errors."""
+    error = np.array([0.0, 0.01, -0.05, 0.3]).reshape(1, 4, 1).repeat(3, axis=2)
+    terms, grad = oracle_loss.loss(error, np.zeros_like(error), 0.0, 0.05)
+    assert terms[0] == pytest.approx((0.001 + 0.025 + 0.275) / 4)
+    np.testing.assert_allclose(12 * grad[0, :, 0], [0, 0.2, -1, 1])
 
 
 def test_ssim_is_scikit_images(dev, rng):

@@ -26,12 +26,12 @@ POINTS = 27_000
 PAPER_POINTS = 4_040_533  # lego, supplemental Table 4
 WAYS = [
     {},
-    {"train.lazy_adam": "true", "raster.early_stop": "0.001"},
-    {"train.moments_16bit": "true", "train.ema": "false", "train.sh_smoothing": "0"},
+    {"raster.early_stop": "0"},
+    {"train.ema": "false", "train.sh_smoothing": "0"},
     {"points.sh_degree": "1"},
     {"train.perceptual_weight": "0.1"},
     {"train.refine_at": "0.4,0.7"},  # to points that are eight, then 64 times as many
-    {"train.refine_at": "1.0,0.9", "train.lazy_adam": "true"},  # with the averages
+    {"train.refine_at": "1.0,0.9"},  # with the averages
 ]
 
 
@@ -98,7 +98,7 @@ def test_the_plan_is_what_a_training_takes(dev, tmp_path, monkeypatch, changes):
     )
     tables = [
         PointCloud.table(points, blocks),
-        PointState.table(points, blocks, trainer.config),
+        PointState.table(points),
         PointState.ema_table(points, blocks) if trainer.config.ema else {},
     ]
     assert held == sum(map(table_bytes, tables))
@@ -119,18 +119,10 @@ def test_pruning_stays_within_the_plan(dev, tmp_path, monkeypatch):
     assert dev.peak_bytes - others <= plan.peak.device + pruning
 
 
-@pytest.mark.parametrize("lazy", ["false", "true"])
-def test_the_papers_scale_fits_nine_gibibytes(dev, tmp_path, lazy):
-    """Of a training scaled down: its points and hits take their share of 9 GiB, and 16 bits save
-    half of the moments of 9 x 16 coefficients.
-    """
-    peaks = []
-    for half in ("false", "true"):
-        changes = {"train.crop": 24, "train.lazy_adam": lazy, "train.moments_16bit": half}
-        _, _, peak = trained(dev, tmp_path / half, changes, base="paper")
-        peaks.append(peak)
-    assert peaks[0] < 9 * 2**30 * POINTS / PAPER_POINTS
-    assert peaks[0] - peaks[1] == POINTS * 2 * 2 * 9 * 16
+def test_the_papers_scale_fits_six_gibibytes(dev, tmp_path):
+    """Of a training scaled down: its points and hits take their share."""
+    _, _, peak = trained(dev, tmp_path, {"train.crop": 24}, base="paper")
+    assert peak < 6 * 2**30 * POINTS / PAPER_POINTS
 
 
 def sketch(dev, base="tiny", points=171_262, step=0, **changes):

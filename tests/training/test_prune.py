@@ -34,8 +34,7 @@ def test_one_point_always_survives(dev, weights, survivor):
 
 
 @pytest.mark.parametrize("share", [2, 10])
-@pytest.mark.parametrize("settings", [{}, {"lazy_adam": True, "moments_16bit": True}])
-def test_compacting_never_takes_more_than_its_scratch(dev, rng, monkeypatch, share, settings):
+def test_compacting_never_takes_more_than_its_scratch(dev, rng, monkeypatch, share):
     """Every row of the cloud and of its training state, averages included."""
     scratch = 40_000
     monkeypatch.setattr("pp_cl.device.compact.SCRATCH_BYTES", scratch)
@@ -43,7 +42,7 @@ def test_compacting_never_takes_more_than_its_scratch(dev, rng, monkeypatch, sha
     for array in cloud.learned().values():
         array.set(rng.random(array.shape).astype(np.float32))
     del array  # else it is not released
-    state = PointState(dev, cloud, TrainConfig(**settings))
+    state = PointState(dev, cloud)
     state.ema.update(cloud.learned(), 1.0)
     state.peak_weight.set(rng.random(1000).astype(np.float32))
     state.restore(
@@ -51,7 +50,7 @@ def test_compacting_never_takes_more_than_its_scratch(dev, rng, monkeypatch, sha
         {k: (1e3 * rng.random(a.shape)).astype(a.dtype) for k, a in state.arrays().items()},
     )
     host = fetched(cloud.arrays(dev) | state.arrays())
-    assert len(host) == 5 + 2 + 2 + 5 + (1 + 4 if settings else 8)
+    assert len(host) == 5 + 2 + 2 + 5 + 2
     keep = np.arange(0, 1000, share, dtype=np.uint32)
     indices = dev.upload(keep)
     before, dev.peak_bytes = dev.bytes, dev.bytes
@@ -64,7 +63,7 @@ def test_compacting_never_takes_more_than_its_scratch(dev, rng, monkeypatch, sha
     assert dev.peak_bytes <= before + scratch
     old, new = (
         PointCloud.table(n, cloud.blocks)
-        | PointState.table(n, cloud.blocks, TrainConfig(**settings))
+        | PointState.table(n)
         | {f"ema.{name}": row for name, row in PointState.ema_table(n, cloud.blocks).items()}
         for n in (1000, cloud.count)
     )
@@ -78,7 +77,7 @@ def test_only_what_was_looked_at_is_judged(dev):
     """By the highest weight of a look, and counted anew; the rest keeps its counts."""
     settings = TrainConfig(prune_weight=0.1, prune_looks=10, prune_opacity=0.01, sh_rate=(1, 0, 0))
     cloud = PointCloud.create(dev, np.arange(6), 0)
-    state = PointState(dev, cloud, settings)
+    state = PointState(dev, cloud)
     state.peak_weight.set(np.float32([0, 0, 0.09, 0.1, 100, 0]))
     state.look_count.set(np.float32([9, 10, 10, 10, 1000, 10]))
     opacity = dev.upload(np.float32([0, 1, 1, 1, 1, 1]))
@@ -96,7 +95,7 @@ def test_what_is_not_finite_is_told_of_and_not_pruned_away(dev, peak, opacity):
     """Also of points that nobody has looked at."""
     settings = TrainConfig(prune_looks=10)
     cloud = PointCloud.create(dev, np.arange(2), 0)
-    state = PointState(dev, cloud, settings)
+    state = PointState(dev, cloud)
     state.peak_weight.set(np.float32([0, peak]))
     with pytest.raises(Diverged, match="^1 points have"):
         judge(dev, state, dev.upload(np.float32([1, opacity])), settings)
@@ -105,7 +104,7 @@ def test_what_is_not_finite_is_told_of_and_not_pruned_away(dev, peak, opacity):
 def test_one_judged_point_always_survives(dev):
     settings = TrainConfig(prune_looks=1, prune_weight=1.0)
     cloud = PointCloud.create(dev, np.arange(3), 2)
-    state = PointState(dev, cloud, settings)
+    state = PointState(dev, cloud)
     state.peak_weight.set(np.float32([0.1, 0.3, 0.2]))
     state.look_count.set(np.float32([10, 10, 10]))
     assert judge(dev, state, cloud.opacity, settings).get().tolist() == [1]

@@ -6,7 +6,6 @@ from support.guarded import AWKWARD_SIZES
 from support.models import fetched, make_model
 
 from pp_cl.scene.grid import Grid
-from pp_cl.settings import TrainConfig
 from pp_cl.training.point_state import PointState
 from pp_cl.training.refine import refine, split_opacity
 
@@ -40,10 +39,9 @@ def test_a_grid_beyond_32_bits_is_refused():
 
 
 @pytest.mark.parametrize("composited", [False, True])
-@pytest.mark.parametrize("settings", [{}, {"lazy_adam": True, "moments_16bit": True}])
-def test_all_arrays_follow(dev, rng, composited, settings):
+def test_all_arrays_follow(dev, rng, composited):
     model = make_model(dev, rng)
-    state = PointState(dev, model.cloud, TrainConfig(**settings))
+    state = PointState(dev, model.cloud)
     state.ema.update(model.cloud.learned(), 1.0)
     stored = state.arrays()
     state.restore(

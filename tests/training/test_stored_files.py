@@ -29,7 +29,7 @@ def folder(tmp_path):
 
 @pytest.fixture
 def config():
-    return settings(lazy_adam=True)
+    return settings()
 
 
 def rewritten(path, change):

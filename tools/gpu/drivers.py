@@ -58,11 +58,7 @@ TRAINING = {
     "train.ema": True,
 }
 # What the presets leave out, beside them.
-MORE_TRAININGS = (
-    {"train.lazy_adam": True},
-    {"train.moments_16bit": True},
-    {"train.refine_at": (0.4, 1.0), "raster.blend": "softmax"},
-)
+MORE_TRAININGS = ({"train.refine_at": (0.4, 1.0), "raster.blend": "softmax"},)
 # Hits that a blending passes over: none, those behind an early stop, those beyond the nearest.
 DROPPING = (
     {"early_stop": 0.0},

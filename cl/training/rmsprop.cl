@@ -1,0 +1,89 @@
+// The step of the SH coefficients: RMSprop (Tieleman & Hinton 2012), that is Adam without a first
+// moment (beta1 = 0), with Adam's bias correction folded into rate and eps on the host.
+//
+// The gradient of coefficient k is Y_k(direction) G, G being that of the point's features, and is
+// never stored. The squares of the harmonics of a degree add up to the same in all directions
+// (Unsoeld 1927), so all coefficients of a feature share one second moment v, an average of
+// G^2 / (4 pi), which is the mean of Y_k^2 G^2 over the directions. They move by
+// rate Y_k G / (sqrt(v) + eps).
+//
+// A point without a gradient stays where it is; the decay of its v waits until it has one.
+#include "camera.h"
+#include "common.h"
+#include "lanes.h"
+#include "sh.h"
+
+#ifndef DEGREE
+#define DEGREE 2  // of the highest harmonics to move: 0, 1 or 2
+#endif
+#ifndef DECAY2
+#define DECAY2 0.001f  // 1 - beta2; 1 - 0.999f would be off by 1e-5 of itself
+#endif
+#ifndef LOG_BETA2
+#define LOG_BETA2 -0.00144342f  // log2(beta2)
+#endif
+#define MEAN_SQUARE 0.07957747f  // 1 / (4 pi), of each harmonic over all directions
+
+// One work-item per shaded point: takes its gradient into v, and divides the gradient by the root
+// of v.
+kernel void rmsprop_scale(
+    const uint s,                         // shaded points
+    const uint step,                      // from 1
+    const float eps,                      // eps * sqrt(1 - beta2^step)
+    global const uint *shaded,            // (S) their indices
+    global uint *last_step,               // (N) of each point's last gradient, 0: none
+    global float16 *v,                    // (N, 16)
+    global float16 *grad_point_features)  // (N, 16) G, then G / (sqrt(v) + eps), of the shaded
+{
+    const uint g = get_global_id(0);
+    if (g >= s) return;
+    const uint i = shaded[g];
+    const float16 G = grad_point_features[i];
+    if (!any(G != 0.0f)) return;  // a NaN is a gradient
+    const float16 moment =
+        exp2((step - last_step[i]) * LOG_BETA2) * v[i] + DECAY2 * MEAN_SQUARE * (G * G);
+    last_step[i] = step;
+    v[i] = moment;
+    grad_point_features[i] = G / (sqrt(moment) + eps);
+}
+
+// Moves `count` coefficients of point i, from basis function `first` on.
+#define MOVE(sh, first, count, rate)                                                               \
+    {                                                                                              \
+        UNROLLED for (size_t k = 0; k < count; k++) {                                              \
+            const size_t at = i * count + k;                                                       \
+            store_part(load_part(sh, at) - rate * basis[first + k] * scaled, sh, at);              \
+        }                                                                                          \
+    }
+
+// One work-item per part of a shaded point: moves its coefficients.
+kernel void rmsprop_move(
+    const uint s,        // shaded points
+    const float rate_0,  // learning rate * sqrt(1 - beta2^step), by degree
+    const float rate_1,
+    const float rate_2,
+    global const uint *shaded,           // (S) their indices
+    global const float *camera,          // (20) camera.h
+    global const float4 *point_camera,   // (N, 4) x, y, z, distance
+    global const float16 *scaled_grads,  // (N, 16) of rmsprop_scale
+    global float16 *sh_0,                // (N, 1, 16)
+    global float16 *sh_1,                // (?, ?, 16) (N, 3, 16), untouched at degree 0
+    global float16 *sh_2a,               // (?, ?, 16) (N, 3, 16), untouched below degree 2
+    global float16 *sh_2b)               // (?, ?, 16) (N, 2, 16), untouched below degree 2
+{
+    const size_t g = get_global_id(0) / ROW_PARTS;
+    if (g >= s) return;
+    const size_t i = shaded[g];
+    const floats scaled = load_part(scaled_grads, i);
+    if (!ANY_LANE(scaled != 0.0f)) return;
+    const Camera cam = camera_load(camera);
+    const float3 c = point_camera[i].xyz / point_camera[i].w;
+    float basis[9];
+    sh_basis(c.x * cam.right + c.y * cam.down + c.z * cam.forward, basis);
+    MOVE(sh_0, 0, 1, rate_0)
+    if (DEGREE >= 1) MOVE(sh_1, 1, 3, rate_1)
+    if (DEGREE >= 2) {
+        MOVE(sh_2a, 4, 3, rate_2)
+        MOVE(sh_2b, 7, 2, rate_2)
+    }
+}
