@@ -13,11 +13,9 @@ PRESETS = {
     # for 800 x 800: begins at a quarter of the size, where fog clears at little cost
     "full": {
         "points.count": 170_000,
-        "train.iterations": 12_000,
+        "train.iterations": 11_000,
         "train.refine_at": (0.33, 0.67),
         "train.crop": 256,
-        # 0.05 leaves 3.5 million points, for which the averages take more than 9 GiB in all
-        "train.prune_weight": 0.1,
     },
     "paper": {
         # Stated by the supplemental, as are the defaults of raster.gamma, train.sh_rate and its

@@ -24,7 +24,7 @@ from pp_cl.network.architectures import multiplications, unet_layers
 from pp_cl.network.layer import Conv, Layer
 from pp_cl.network.workspace import parameter_table
 from pp_cl.raster.blend import BLENDS, Blend
-from pp_cl.raster.pairs import PairBuilder
+from pp_cl.raster.pairs import LONG_LIST, PairBuilder
 from pp_cl.raster.point_cloud import PointCloud
 from pp_cl.raster.project import Projection
 from pp_cl.raster.sh import sh_blocks
@@ -83,17 +83,24 @@ class Counts:
 def step_work(config: Config, counts: Counts) -> dict[str, Work]:
     """{stage: Work} of one training step on a GPU, in order; the pairs are built, not kept."""
     layers = network_layers(config)
+    # features and colours, or their gradients, of which one is written
+    residual = Work(counts.pixels * (ROW + IMAGE), 3 * counts.pixels, 1)
+    residual = residual if config.network.residual else Work()
     return {
         "target": Work(counts.pixels * (4 + 12 + 4), 0, 2),
         **_raster(config, counts),
-        "network": _forward(layers, counts),
+        "network": _added(_forward(layers, counts), residual),
         "loss": _loss(config, counts),
-        "network backward": _backward(layers, counts),
+        "network backward": _added(_backward(layers, counts), residual),
         "backward": _gradients(config, counts),
         "update": _update(config, layers, counts),
         # a weight and a role of each pair; two numbers a point, read and written
         "peaks": Work(9 * counts.pairs + 20 * counts.points, counts.pairs, 1),
     }
+
+
+def _added(*works):
+    return Work(*map(sum, zip(*works, strict=True)))
 
 
 def network_layers(config: Config) -> list[Layer]:
@@ -119,7 +126,7 @@ def _raster(config, counts):
         "pairs": Work(
             2 * (projected + table_bytes(pairs) + keys),
             32 * (n + p),
-            5 + _scans(n) + _scans(counts.pixels),
+            5 + 2 * (p > LONG_LIST) + _scans(n) + _scans(counts.pixels),
         ),
         # of each pair its key, its closeness and the opacity of its point
         "weights": Work(weights + 20 * p + 4 * counts.pixels, 20 * p, 2 + drops + _scans(n)),

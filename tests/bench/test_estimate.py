@@ -50,8 +50,11 @@ def launches(monkeypatch):
     return counted
 
 
-@pytest.mark.parametrize("name", ["paper", pytest.param("tiny", marks=pytest.mark.slow)])
-def test_the_launches_of_a_step_on_a_gpu(dev, tmp_path, monkeypatch, launches, name):
+@pytest.mark.parametrize(
+    "name, pairs", [("paper", 4000), pytest.param("tiny", 5000, marks=pytest.mark.slow)]
+)
+def test_the_launches_of_a_step_on_a_gpu(dev, tmp_path, monkeypatch, launches, *, name, pairs):
+    """pairs: whether there may be lists that are sorted in two passes more."""
     monkeypatch.setattr(dev, "is_cpu", False)
     scene = write_ball_scene(tmp_path / "ball")
     config = configure(preset(name), scene, [(k, v, "test") for k, v in SMALL.items()])
@@ -61,7 +64,7 @@ def test_the_launches_of_a_step_on_a_gpu(dev, tmp_path, monkeypatch, launches, n
     trainer.train_step()
     # the padded image of the step
     _, (_, _, width, height), _ = trainer.draw(np.random.default_rng(0))
-    counts = Counts(trainer.model.cloud.count, P, S, height, width)
+    counts = Counts(trainer.model.cloud.count, pairs, S, height, width)
     expected = {stage: work.launches for stage, work in step_work(config, counts).items()}
     del launches[None]  # the tiles that hold any points, of which no stage is
     assert dict(launches) == expected
