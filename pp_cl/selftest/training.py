@@ -24,7 +24,7 @@ from pp_cl.selftest.case import (
     relative,
 )
 from pp_cl.selftest.updated_points import Cloud, gradients
-from pp_cl.training.adam import adam_opacity_update, adam_update, ema_update
+from pp_cl.training.adam import adam_update, ema_update
 from pp_cl.training.loss import Loss
 from pp_cl.training.mask import MaskLoss
 from pp_cl.training.perceptual import PerceptualLoss
@@ -209,7 +209,7 @@ def _bounded_opacity(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
     for step in range(1, 21):
         drift = 1e4 * (rng.standard_normal(257) + np.linspace(-2, 2, 257))
         grad = dev.upload(drift, np.float32)
-        adam_opacity_update(dev, opacity, grad, state, step=step, rate=0.03, eps=1e-15)
+        adam_update(dev, opacity, grad, state, step=step, rate=0.03, eps=1e-15, bounded=True)
         twin.step(grad.get(), 0.03, 1e-15, low=0, high=1)
     moved = opacity.get()
     yield finite(moved)

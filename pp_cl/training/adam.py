@@ -11,13 +11,11 @@ from pyopencl.array import Array
 
 from pp_cl.device.device import Device
 from pp_cl.device.form import lanes
-from pp_cl.device.launch import Program
 
 BETA1, BETA2 = 0.9, 0.999  # Kingma & Ba 2015
 
 
-def adam_program(dev: Device, **defines) -> Program:
-    """cl/training/adam.cl with the betas of this module."""
+def _program(dev, **defines):
     decays = {"DECAY1": f"{1 - BETA1:.9g}f", "DECAY2": f"{1 - BETA2:.9g}f"}
     return dev.program("training/adam", LANES=lanes(dev), **decays, **defines)
 
@@ -45,41 +43,21 @@ def adam_update(
     step: int,
     rate: float,
     eps: float,
+    bounded: bool = False,
 ) -> None:
     """One dense Adam step of `parameter`, in place.
 
     parameter, grad, moments "m" and "v": float32 arrays of one shape, any; the moments start as
-    zeros. step: from 1 on. Raises ValueError when the shapes differ.
+    zeros. step: from 1 on. bounded: the parameter stays in [0, 1]. Raises ValueError when the
+    shapes differ.
     """
     _same_shape(parameter=parameter, grad=grad, **moments)
-    adam_program(dev).launch(
+    _program(dev, BOUNDED=int(bounded)).launch(
         "adam_update",
         -(-parameter.size // lanes(dev)),
         n=parameter.size,
         grad=grad,
         parameter=parameter,
-        **moments,
-        **_rate_and_eps(step, rate, eps),
-    )
-
-
-def adam_opacity_update(
-    dev: Device,
-    opacity: Array,
-    grad: Array,
-    moments: dict[str, Array],
-    *,
-    step: int,
-    rate: float,
-    eps: float,
-) -> None:
-    """The same of opacities (N,), which stay in [0, 1]."""
-    adam_program(dev).launch(
-        "adam_opacity_update",
-        len(opacity),
-        n=len(opacity),
-        grad_opacity=grad,
-        opacity=opacity,
         **moments,
         **_rate_and_eps(step, rate, eps),
     )
@@ -95,7 +73,7 @@ def ema_update(dev: Device, ema: Array, parameter: Array, weight: float) -> None
     if weight == 1:
         dev.copy(ema, parameter)
         return
-    adam_program(dev).launch(
+    _program(dev).launch(
         "ema_update",
         -(-parameter.size // lanes(dev)),
         n=parameter.size,

@@ -16,7 +16,7 @@ from pp_cl.device.rows import DeviceRows
 from pp_cl.model import Model
 from pp_cl.raster.project import ProjectedPoints
 from pp_cl.settings import NetworkConfig, TrainConfig
-from pp_cl.training.adam import Ema, adam_opacity_update, adam_update
+from pp_cl.training.adam import Ema, adam_update
 from pp_cl.training.point_state import PointState
 from pp_cl.training.rmsprop import ShGradient, rmsprop_update
 from pp_cl.training.schedule import learning_rate
@@ -101,7 +101,7 @@ class Optimiser:
         rmsprop_update(
             self.dev, step, gradient, cloud.sh, moment=state.sh_moment, rates=rates.sh, eps=sh_eps
         )
-        adam_opacity_update(
+        adam_update(
             self.dev,
             cloud.opacity,
             grad_opacity,
@@ -109,6 +109,7 @@ class Optimiser:
             step=step,
             rate=rates.opacity,
             eps=OPACITY_EPS,
+            bounded=True,
         )
         self._update_network(step, rates.network)
 

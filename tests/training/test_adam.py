@@ -6,7 +6,7 @@ from support.comparisons import relative_error
 from support.guarded import AWKWARD_SIZES
 
 from pp_cl.reference import optim as oracle_optim
-from pp_cl.training.adam import Ema, adam_opacity_update, adam_update, ema_update
+from pp_cl.training.adam import Ema, adam_update, ema_update
 
 
 def moments(dev, parameter):
@@ -95,7 +95,7 @@ def test_opacity_stays_in_its_bounds(dev, rng, n):
     state, oracle = moments(dev, opacity), oracle_optim.Adam(opacity.get())
     for step in range(1, 41):
         grad = dev.upload(rng.standard_normal(n) + np.linspace(-2, 2, n), np.float32)
-        adam_opacity_update(dev, opacity, grad, state, step=step, rate=0.03, eps=1e-15)
+        adam_update(dev, opacity, grad, state, step=step, rate=0.03, eps=1e-15, bounded=True)
         oracle.step(grad.get(), 0.03, 1e-15, low=0, high=1)
     if n > 1:
         assert opacity.get().min() == 0
@@ -106,7 +106,8 @@ def test_opacity_stays_in_its_bounds(dev, rng, n):
 @pytest.mark.exact
 def test_a_nan_is_not_hidden(dev):
     opacity, grad = dev.zeros((31,)), dev.upload(np.full(31, np.nan), np.float32)
-    adam_opacity_update(dev, opacity, grad, moments(dev, opacity), step=1, rate=0.03, eps=1e-15)
+    state = moments(dev, opacity)
+    adam_update(dev, opacity, grad, state, step=1, rate=0.03, eps=1e-15, bounded=True)
     assert np.isnan(opacity.get()).all()
 
 
