@@ -39,8 +39,7 @@ class UNet:
     network.layer.Layer in the order of the forward pass. parameters, gradients: {"enc0.a.weight":
     (ceil(CO/16), K, K, CI, 16), "enc0.a.bias": (ceil(CO/16) * 16,), ...} float32 on the device.
     Weights and biases start uniform in +-1/sqrt(CI K K) (PyTorch's default for Conv2d), output
-    channels beyond CO at 0, with gradient 0. residual: to be set before the first image; the image
-    is the network's plus RESIDUAL_SHARE of the first three features.
+    channels beyond CO at 0, with gradient 0.
     """
 
     def __init__(
@@ -56,7 +55,7 @@ class UNet:
         policy: ConvolutionPolicy | None = None,
     ):
         self.dev = dev
-        self.residual = False
+        self._residual = False
         self.layers = unet_layers(widths, channels_in, channels_out, blocks, channels=channels)
         self.channels_in = channels_in
         self.policy = policy or make_policy(dev)
@@ -89,8 +88,13 @@ class UNet:
             seed=seed,
             policy=policy,
         )
-        net.residual = settings.residual
+        if settings.residual:
+            net.connect_residual()
         return net
+
+    def connect_residual(self) -> None:
+        """From the next image on, add RESIDUAL_SHARE of the first three features to it."""
+        self._residual = True
 
     def use(self, policy: ConvolutionPolicy) -> None:
         """Take the variants of another policy from the next image on."""
@@ -159,7 +163,7 @@ class UNet:
             layer.forward(workspace, sources, out, tiles.tiles(layer.name))
             tiles.fill_copies(layer.name, out)
         affine(self.dev, 0.5, 0.5, out, out=out)
-        if self.residual:
+        if self._residual:
             residual_forward(self.dev, x, out, RESIDUAL_SHARE)
         if training:
             self._trained = workspace, arrays, tiles
@@ -196,7 +200,7 @@ class UNet:
                 )
         grad_x = arrays[gradient_of("x")]
         tiles.fill_copies("x", grad_x)
-        if self.residual:
+        if self._residual:
             residual_backward(self.dev, grad_y, grad_x, RESIDUAL_SHARE)
         return grad_x
 
