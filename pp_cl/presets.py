@@ -38,6 +38,7 @@ PRESETS = {
         "train.crop": 0,
         "train.ssim_weight": 0.2,
         "train.smooth_l1": 0.0,
+        "train.sh_eps": 0.0197,
         # Ours: the supplemental mentions no jitter, dropout, smoothing or averaging, and no rule
         # of pruning. Ours in all presets: the loss and its weight, Adam's eps, the opacity's rate.
         "train.opacity_rate": (3e-2, 3e-3),

@@ -174,7 +174,7 @@ class TrainConfig:
         (0.0, 0.01, 0.02), "warm-up of SH degrees 0, 1, 2, as a share of the iterations", 0, 1
     )
     sh_eps: float = setting(
-        0.0197,
+        0.01,
         "eps of the SH coefficients' step, multiplied by 3*H*W of the training image, so that"
         " it does not depend on the crop size",
         1e-30,
