@@ -17,6 +17,7 @@ from pp_cl.layers.resample import (
     upsample2_backward,
     upsample2_forward,
 )
+from pp_cl.layers.residual import residual_backward, residual_forward
 from pp_cl.layers.tiles import copy_list, tiles_copy, tiles_find, tiles_hit
 from pp_cl.layers.variants import VARIANTS
 from pp_cl.reference import lpips, network
@@ -147,6 +148,18 @@ def _affine(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
     yield relative(out.get(), 0.5 * x.astype(np.float64) + 0.25, EPS)
 
 
+def _residual(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
+    """Features added to colours, and the gradient of that."""
+    for width in (1, 31, 33, 257):
+        features, image = rng.standard_normal((3, width, 16)), rng.standard_normal((3, width, 3))
+        out, grad = dev.upload(image, np.float32), dev.upload(features, np.float32)
+        residual_forward(dev, dev.upload(features, np.float32), out, 0.25)
+        yield relative(out.get(), image + 0.25 * (features[..., :3] - 1), 2 * EPS)
+        residual_backward(dev, dev.upload(image, np.float32), grad, 0.25)
+        expected = np.concatenate([features[..., :3] + 0.25 * image, features[..., 3:]], axis=2)
+        yield relative(grad.get(), expected, 2 * EPS)
+
+
 def _gate(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
     """Sizes; features and gates from 1e-12 to 60, where expm1 would cancel and exp overflow."""
     for h, w, c in PLANES:
@@ -199,6 +212,7 @@ CASES = (
     Case("layers: max pooling", _max_pool),
     Case("layers: upsampling", _upsample),
     Case("layers: affine", _affine),
+    Case("layers: residual", _residual),
     Case("layers: gate", _gate),
     Case("layers: tiles", _tiles),
 )
