@@ -182,9 +182,9 @@ def test_seeds_are_sorted_and_each_once(seeds, comma):
 @given(given_settings())
 def test_a_value_that_is_varied_has_one_text(pair):
     key, value = pair
-    if key == "train.seed":
-        return
     text = text_of(value)
+    if key == "train.seed" or not text:  # nothing is no value to vary
+        return
     ((found, texts),) = read_varied([f"{key}={text}"])
     assert found == key and texts == [text]
     assert read_varied([f"{key}={texts[0]}"]) == [(key, texts)]

@@ -66,7 +66,7 @@ def bench_train(dev: Device, config: Config, views: int, rounds: int) -> dict:
                         step,
                         rates,
                         gradients,
-                        camera_buffer=result.camera_buffer,
+                        points=result.points,
                         shaded=result.shaded,
                         sh_eps=1e-10,
                     )

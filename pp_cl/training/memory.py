@@ -40,8 +40,8 @@ from pp_cl.training.smooth import Smoother, chunk_points
 MIB, GIB = 2**20, 2**30
 # The share of the points that k prunings leave is about FIRST * k^-SLOWER on the initial grid, and
 # on a refined one; measured on lego with the presets tiny, small and full.
-FIRST_KEPT, FIRST_SLOWER = 0.77, 0.155
-LATER_KEPT, LATER_SLOWER = 0.90, 0.068
+FIRST_KEPT, FIRST_SLOWER = 0.745, 0.155
+LATER_KEPT, LATER_SLOWER = 0.85, 0.068
 # bytes on the host: of pruning per point (weights, looks, opacities, and which stay), of refining
 # per point before it (the vertices of its eight in 64 bits, and their order)
 PRUNING_BYTES, REFINING_BYTES = 24, 320
