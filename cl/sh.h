@@ -3,6 +3,8 @@
 #ifndef PP_SH_H
 #define PP_SH_H
 
+#include "camera.h"
+
 #define SH_0 0.28209479f   // 1 / (2 sqrt(pi))
 #define SH_1 0.48860251f   // sqrt(3 / (4 pi))
 #define SH_2A 1.09254843f  // sqrt(15 / (4 pi))
@@ -21,6 +23,13 @@ static inline void sh_basis(const float3 d, float *basis) {
     basis[6] = SH_2B * d.z * d.z - SH_2C;
     basis[7] = -SH_2A * d.x * d.z;
     basis[8] = SH_2D * (d.x * d.x - d.y * d.y);
+}
+
+// The same of the direction from the eye to a point. point: x, y, z in the camera's axes, distance.
+static inline void sh_basis_of_point(global const float *camera, const float4 point, float *basis) {
+    const Camera cam = camera_load(camera);
+    const float3 c = point.xyz / point.w;
+    sh_basis(c.x * cam.right + c.y * cam.down + c.z * cam.forward, basis);
 }
 
 #endif

@@ -16,7 +16,7 @@ PRESETS = {
         "train.iterations": 11_000,
         "train.refine_at": (0.33, 0.67),
         "train.crop": 256,
-        # 0.05 leaves a third more points, and takes a third longer
+        # 0.05 leaves a third more points
         "train.prune_weight": 0.1,
     },
     "paper": {
@@ -36,11 +36,11 @@ PRESETS = {
         "network.rate": (3e-4, 5e-5),
         "train.iterations": 50_000,
         "train.crop": 0,
+        # Ours: the supplemental mentions no jitter, dropout, smoothing or averaging, and no rule
+        # of pruning. Ours in all presets: the loss and its weight, Adam's eps, the opacity's rate.
         "train.ssim_weight": 0.2,
         "train.smooth_l1": 0.0,
         "train.sh_eps": 0.0197,
-        # Ours: the supplemental mentions no jitter, dropout, smoothing or averaging, and no rule
-        # of pruning. Ours in all presets: the loss and its weight, Adam's eps, the opacity's rate.
         "train.opacity_rate": (3e-2, 3e-3),
         "train.opacity_rate_steps": 0,
         "train.pixel_jitter": False,

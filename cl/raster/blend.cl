@@ -26,7 +26,7 @@
 #endif
 
 // G.f_i - rest of a pair in pixel q; `product`, G.f_i, is computed only where it is needed
-#define GAIN(pair, q, product) (GAIN_BY_PAIR ? rest[pair] : (product) - rest[q])
+#define GAIN(pair, q, product) (GAIN_BY_PAIR ? rest_or_gain[pair] : (product) - rest_or_gain[q])
 
 // One work-item per part of a pixel: reads its hits and their points' features, writes the blended
 // features.
@@ -60,7 +60,7 @@ kernel __attribute__((vec_type_hint(floats))) void blend_backward(
     global const float2 *pair_weight,      // (P, 2)
     global const uchar *pair_role,         // (?) P with HAS_ROLES
     global const float16 *grad_features,   // (H, W, 16) G
-    global const float *rest,              // (HW), or (P) what GAIN_BY_PAIR says
+    global const float *rest_or_gain,      // (HW) rest, or with GAIN_BY_PAIR (P) G.f_i - rest
     global float16 *grad_point_features,   // (N, 16)
     global float *grad_opacity)            // (N)
 {
@@ -101,7 +101,7 @@ kernel void blend_backward_pairs(
     global const float2 *pair_weight,          // (P, 2)
     global const uchar *pair_role,             // (?) P with HAS_ROLES
     global const float16 *grad_features,       // (H, W, 16) G
-    global const float *rest,                  // (HW), or (P) what GAIN_BY_PAIR says
+    global const float *rest_or_gain,          // (HW) rest, or with GAIN_BY_PAIR (P) G.f_i - rest
     global const uint2 *pair_point_closeness,  // (P, 2) point, bits of d
     global float2 *grad_pair)                  // (P, 2) dL/dl, dL/dd
 {

@@ -1,6 +1,5 @@
 // View-dependent features: spherical harmonics of the direction from the eye.
 #include "common.h"
-#include "camera.h"
 #include "lanes.h"
 #include "sh.h"
 
@@ -9,10 +8,10 @@
 #endif
 
 // Blends `features` of the coefficients of point i, read by LOAD(index, array), in the direction
-// from the eye to c, of length 1 in the camera's axes.
-#define SHADE(LOAD, i, cam, c, features)                                                           \
+// from the eye to it.
+#define SHADE(LOAD, i, features)                                                                   \
     float basis[9];                                                                                \
-    sh_basis(c.x *cam.right + c.y * cam.down + c.z * cam.forward, basis);                          \
+    sh_basis_of_point(camera, point_camera[i], basis);                                             \
     floats features = basis[0] * LOAD(i, sh_0);                                                    \
     if (DEGREE >= 1)                                                                               \
         for (uint b = 0; b < 3; b++)                                                               \
@@ -43,9 +42,7 @@ kernel void shade_forward(
     const uint g = get_global_id(0) / ROW_PARTS;
     if (g >= s) return;
     const uint i = shaded[g];
-    const Camera cam = camera_load(camera);
-    const float3 c = point_camera[i].xyz / point_camera[i].w;
-    SHADE(LOAD_FLOAT, i, cam, c, features)
+    SHADE(LOAD_FLOAT, i, features)
     store_part(features, point_features, i);
 }
 
@@ -64,8 +61,6 @@ kernel void shade_forward_half(
     const uint g = get_global_id(0) / ROW_PARTS;
     if (g >= s) return;
     const uint i = shaded[g];
-    const Camera cam = camera_load(camera);
-    const float3 c = point_camera[i].xyz / point_camera[i].w;
-    SHADE(LOAD_HALF, i, cam, c, features)
+    SHADE(LOAD_HALF, i, features)
     store_part(features, point_features, i);
 }

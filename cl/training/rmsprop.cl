@@ -8,7 +8,6 @@
 // rate Y_k G / (sqrt(v) + eps).
 //
 // A point without a gradient stays where it is; the decay of its v waits until it has one.
-#include "camera.h"
 #include "common.h"
 #include "lanes.h"
 #include "sh.h"
@@ -76,10 +75,8 @@ kernel void rmsprop_move(
     const size_t i = shaded[g];
     const floats scaled = load_part(scaled_grads, i);
     if (!ANY_LANE(scaled != 0.0f)) return;
-    const Camera cam = camera_load(camera);
-    const float3 c = point_camera[i].xyz / point_camera[i].w;
     float basis[9];
-    sh_basis(c.x * cam.right + c.y * cam.down + c.z * cam.forward, basis);
+    sh_basis_of_point(camera, point_camera[i], basis);
     MOVE(sh_0, 0, 1, rate_0)
     if (DEGREE >= 1) MOVE(sh_1, 1, 3, rate_1)
     if (DEGREE >= 2) {

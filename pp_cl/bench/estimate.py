@@ -202,8 +202,8 @@ def _update(config, layers, counts):
     points alone, whose gradients and last steps are read twice.
     """
     n, s, blocks = counts.points, counts.shaded, sh_blocks(config.points.sh_degree)
-    cloud = PointCloud.table(n, blocks)
-    sh = table_bytes({b.name: cloud[b.name] for b in blocks}) // n
+    point = PointCloud.table(1, blocks)
+    sh = table_bytes({b.name: point[b.name] for b in blocks})
     moved = s * (2 * sh + 2 * ROW + 2 * (ROW + 4) + 3 * 4) + 4 * n * (2 * 3 + 1)
     parameters = table_bytes(parameter_table(layers))
     coefficients = sum(block.count for block in blocks)

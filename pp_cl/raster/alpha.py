@@ -63,7 +63,7 @@ class Alpha(BlendWeights):
         transmittance = self._buffers.transmittance[: pairs.pixels]
         return PixelWeights(has_roles, pair_weight, pair_role, pixel_entry, shaded, transmittance)
 
-    def rest(
+    def rest_or_gain(
         self,
         pairs: Pairs,
         weights: PixelWeights,

@@ -25,15 +25,15 @@ BACKGROUND = 1.0  # every feature of a pixel without hits (cl/raster/blend.cl)
 class BlendGradient:
     """What all gradients of one blend are made of.
 
-    point_features: (N, 16), as in Blend.forward. grad_features: (H, W, 16), G = dL/dF. rest: of
-    BlendWeights.rest. All float32.
+    point_features: (N, 16), as in Blend.forward. grad_features: (H, W, 16), G = dL/dF.
+    rest_or_gain: of BlendWeights. All float32.
     """
 
     pairs: Pairs
     weights: PixelWeights
     point_features: Array
     grad_features: Array
-    rest: Array
+    rest_or_gain: Array
 
 
 class Blend:
@@ -98,10 +98,10 @@ class Blend:
     ) -> BlendGradient:
         """Prepare the backward pass of forward(pairs, weights, point_features, features).
 
-        grad_alpha: as BlendWeights.rest takes it.
+        grad_alpha: as BlendWeights.rest_or_gain takes it.
         """
         self._buffers.require(self.table(pairs.points))
-        rest = self.weighing.rest(
+        rest_or_gain = self.weighing.rest_or_gain(
             pairs,
             weights,
             point_features,
@@ -109,7 +109,7 @@ class Blend:
             grad_features=grad_features,
             grad_alpha=grad_alpha,
         )
-        return BlendGradient(pairs, weights, point_features, grad_features, rest)
+        return BlendGradient(pairs, weights, point_features, grad_features, rest_or_gain)
 
     def backward(self, gradient: BlendGradient) -> tuple[Array, Array]:
         """(grad_point_features (N, 16), grad_opacity (N,)) float32, valid until the next call.
@@ -174,7 +174,7 @@ class Blend:
             pair_weight=weights.pair_weight,
             pair_role=weights.pair_role,
             grad_features=gradient.grad_features,
-            rest=gradient.rest,
+            rest_or_gain=gradient.rest_or_gain,
             **outputs,
         )
 

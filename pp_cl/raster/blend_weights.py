@@ -49,8 +49,9 @@ class PixelWeights:
 class BlendWeights(ABC):
     """Computes blend weights and what their gradients need; the buffers grow and are reused.
 
-    gain_by_pair: rest() gives one value a pair, else one a pixel. depends_on_depth: the weights
-    change with the depth of a hit, not only with the order of the hits.
+    gain_by_pair: rest_or_gain() gives the gain of each pair, else the rest of each pixel.
+    depends_on_depth: the weights change with the depth of a hit, not only with the order of the
+    hits.
     """
 
     gain_by_pair: bool
@@ -101,7 +102,7 @@ class BlendWeights(ABC):
         """
 
     @abstractmethod
-    def rest(
+    def rest_or_gain(
         self,
         pairs: Pairs,
         weights: PixelWeights,

@@ -1,7 +1,9 @@
 """How the spherical harmonics of the points are stored: which coefficients lie in which array."""
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 
 @dataclass(frozen=True)
@@ -45,3 +47,11 @@ def stored_degree(blocks: int) -> int:
     if following and following[0].degree == last.degree:
         raise ValueError(f"{blocks} arrays of coefficients end within degree {last.degree}")
     return last.degree
+
+
+def sh_arguments(sh: Sequence[Any]) -> dict[str, Any]:
+    """{name of a kernel's argument: array} of the first so many SH_BLOCKS; the first array stands
+    for those that are absent, which a kernel of their degree leaves alone.
+    """
+    absent = [sh[0]] * (len(SH_BLOCKS) - len(sh))
+    return {block.name: a for block, a in zip(SH_BLOCKS, [*sh, *absent], strict=True)}

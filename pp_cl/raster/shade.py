@@ -10,7 +10,7 @@ from pyopencl.array import Array
 from pp_cl.device.device import Device
 from pp_cl.device.form import lanes, row_parts
 from pp_cl.raster.project import ProjectedPoints
-from pp_cl.raster.sh import SH_BLOCKS, stored_degree
+from pp_cl.raster.sh import SH_BLOCKS, sh_arguments, stored_degree
 
 
 def shade_forward(
@@ -31,9 +31,6 @@ def shade_forward(
     for block, array in zip(SH_BLOCKS, sh, strict=False):
         if array.shape != (n, block.count, 16):
             raise ValueError(f"{block.name} has shape {array.shape}, not {(n, block.count, 16)}")
-    absent = [sh[0]] * (len(SH_BLOCKS) - len(sh))  # not read below their degree
-    names = [block.name for block in SH_BLOCKS]
-    arrays = dict(zip(names, [*sh, *absent], strict=True))
     dev.program("raster/shade", LANES=lanes(dev), DEGREE=stored_degree(len(sh))).launch(
         "shade_forward_half" if sh[0].dtype == np.float16 else "shade_forward",
         shaded.size * row_parts(dev),
@@ -42,5 +39,5 @@ def shade_forward(
         camera=points.camera_buffer,
         point_camera=points.point_camera,
         point_features=point_features,
-        **arrays,
+        **sh_arguments(sh),
     )

@@ -63,7 +63,7 @@ class Softmax(BlendWeights):
         shaded = self._list_shaded(pairs, pair_role if drops else None)
         return PixelWeights(has_roles, pair_weight, pair_role, pixel_entry, shaded)
 
-    def rest(
+    def rest_or_gain(
         self,
         pairs: Pairs,
         weights: PixelWeights,

@@ -14,7 +14,7 @@ from pyopencl.array import Array
 from pp_cl.device.device import Device
 from pp_cl.device.form import lanes, row_parts
 from pp_cl.raster.project import ProjectedPoints
-from pp_cl.raster.sh import SH_BLOCKS, stored_degree
+from pp_cl.raster.sh import sh_arguments, stored_degree
 from pp_cl.training.adam import BETA2
 
 
@@ -60,8 +60,6 @@ def rmsprop_update(
     degree = max((d for d in range(stored_degree(len(sh)) + 1) if rates[d] > 0), default=None)
     if degree is None:
         return
-    names = [block.name for block in SH_BLOCKS]
-    absent = [sh[0]] * (len(names) - len(sh))  # untouched below their degree
     shaded, grads, points = gradient.shaded, gradient.grad_point_features, gradient.points
     root = math.sqrt(1 - BETA2**step)
     decay = {"DECAY2": f"{1 - BETA2:.9g}f", "LOG_BETA2": f"{math.log2(BETA2):.9g}f"}
@@ -85,5 +83,5 @@ def rmsprop_update(
         point_camera=points.point_camera,
         scaled_grads=grads,
         **{f"rate_{d}": root * rate for d, rate in enumerate(rates)},
-        **dict(zip(names, [*sh, *absent], strict=True)),
+        **sh_arguments(sh),
     )
