@@ -16,7 +16,7 @@ from pp_cl.files.regular import read_regular
 from pp_cl.presets import ABSENT, ADDED, PRESETS, REMOVED, RENAMED
 from pp_cl.settings import NetworkConfig, PointsConfig, RasterConfig, SceneConfig, TrainConfig
 
-FORMAT = 3  # of config.json: raised when keys are added, change meaning or are removed
+FORMAT = 4  # of config.json: raised when keys are added, change meaning or are removed
 MOST_BYTES = 2**20  # of a config.json
 MOST_TEXT = 4096  # characters of a setting
 # by network.blocks, how many convolutions there are but the last

@@ -16,8 +16,6 @@ PRESETS = {
         "train.iterations": 11_000,
         "train.refine_at": (0.33, 0.67),
         "train.crop": 256,
-        # 0.05 leaves a third more points
-        "train.prune_weight": 0.1,
     },
     "paper": {
         # Stated by the supplemental, as are the defaults of raster.gamma, train.sh_rate and its
@@ -38,7 +36,6 @@ PRESETS = {
         "train.crop": 0,
         # Ours: the supplemental mentions no jitter, dropout, smoothing or averaging, and no rule
         # of pruning. Ours in all presets: the loss and its weight, Adam's eps, the opacity's rate.
-        "train.ssim_weight": 0.2,
         "train.smooth_l1": 0.0,
         "train.sh_eps": 0.0197,
         "train.opacity_rate": (3e-2, 3e-3),
@@ -48,6 +45,7 @@ PRESETS = {
         "train.sh_smoothing": 0.0,
         "train.ema": False,
         "train.mask_weight": 0.0,
+        "train.spread_weight": 0.0,
         "train.prune_every": 500,
         "train.checkpoint_every": 5000,
     },
@@ -108,6 +106,7 @@ ABSENT = {
     "train.opacity_rate_steps": 0,
     "train.smooth_l1": 0.0,
     "train.mask_weight": 0.0,
+    "train.spread_weight": 0.0,
     "train.perceptual_weight": 0.0,
     "train.prune_looks": 100,
     "train.refine_at": (1.0, 1.0),
@@ -126,4 +125,5 @@ ADDED = {
     "network.channels": 2,
     "network.residual": 3,
     "train.smooth_l1": 3,
+    "train.spread_weight": 4,
 }

@@ -253,10 +253,16 @@ class Renderer:
                 return pairs, weights, tiles
 
     def backward(
-        self, result: RenderResult, grad_image: Array, grad_alpha: Array | None = None
+        self,
+        result: RenderResult,
+        grad_image: Array,
+        grad_alpha: Array | None = None,
+        *,
+        spread_weight: float = 0.0,
     ) -> tuple[Array, Array]:
         """(grad_point_features (N, 16), grad_opacity (N,)) from dL/dimage of result.image, and
-        dL/dalpha (H * W,) of its pixels' alpha where the blend has a transmittance.
+        dL/dalpha (H * W,) of its pixels' alpha and a weight of their spread where the blend has
+        a transmittance (BlendWeights.rest_or_gain).
 
         result: the last one of forward(training=True). The gradients of the network's parameters
         are in model.net.gradients; those of the SH coefficients are rank one in
@@ -264,10 +270,17 @@ class Renderer:
         """
         with self.dev.stage("network backward"):
             grad_features = self.model.net.backward(grad_image)
-        return self.backward_features(result, grad_features, grad_alpha)
+        return self.backward_features(
+            result, grad_features, grad_alpha, spread_weight=spread_weight
+        )
 
     def backward_features(
-        self, result: RasterResult, grad_features: Array, grad_alpha: Array | None = None
+        self,
+        result: RasterResult,
+        grad_features: Array,
+        grad_alpha: Array | None = None,
+        *,
+        spread_weight: float = 0.0,
     ) -> tuple[Array, Array]:
         """The same from dL/dfeatures (H, W, 16) of result.features."""
         with self.dev.stage("backward"):
@@ -278,6 +291,7 @@ class Renderer:
                 features=result.features,
                 grad_features=grad_features,
                 grad_alpha=grad_alpha,
+                spread_weight=spread_weight,
             )
             return self._blend.backward(gradient)
 

@@ -151,14 +151,22 @@ class TrainConfig:
     pixel_jitter: bool = setting(
         True, "shift the pixel grid of the downscaled image by a random sub-pixel offset each step"
     )
-    ssim_weight: float = setting(0.1, "loss = smooth L1 + ssim_weight * (1 - SSIM)", 0, 10)
+    ssim_weight: float = setting(0.2, "loss = smooth L1 + ssim_weight * (1 - SSIM)", 0, 10)
     smooth_l1: float = setting(
         0.05, "the slope of L1 falls to 0 in proportion to errors below this (0: L1)", 0, 1
     )
     mask_weight: float = setting(
-        1.0,
+        0.5,
         "adds this times the mean square by which the rendered alpha exceeds the photograph's to"
         " the loss, with raster.blend=alpha and photographs that have masks (0: off)",
+        0,
+        1e3,
+    )
+    spread_weight: float = setting(
+        0.6,
+        "adds up to this times the mean spread of the pixels, by how much their hits with"
+        " weight lie apart as a share of the grid's diagonal, to the loss, rising from 0 at the"
+        " first step, with raster.blend=alpha (0: off)",
         0,
         1e3,
     )

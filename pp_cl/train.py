@@ -21,7 +21,7 @@ from pp_cl.training.perceptual import PerceptualLoss
 from pp_cl.training.point_state import PointState
 from pp_cl.training.prune import judge, keep_indices
 from pp_cl.training.refine import refine
-from pp_cl.training.schedule import ema_weight, gamma_at, refine_steps
+from pp_cl.training.schedule import ema_weight, gamma_at, refine_steps, spread_weight_at
 from pp_cl.training.smooth import Smoother
 from pp_cl.training.terms import StepTerms
 
@@ -97,7 +97,8 @@ class Trainer:
         )
         with self.dev.stage("loss"):
             gradients = self._losses(rendered, target, target_alpha)
-        grads = self.renderer.backward(rendered, *gradients)
+        spread_weight = self._spread_weight(target.shape[0] * target.shape[1])
+        grads = self.renderer.backward(rendered, *gradients, spread_weight=spread_weight)
         with self.dev.stage("update"):
             self.optimiser.update(
                 t + 1,
@@ -133,6 +134,14 @@ class Trainer:
             terms=self.loss.terms,
         )
         return grad_image, grad_alpha
+
+    def _spread_weight(self, pixels):
+        """That of the spread of each of so many pixels at this step, for depths in world units."""
+        if not self._composited:
+            return 0.0
+        config = self.config
+        mean = spread_weight_at(self.step, config.iterations, config.spread_weight)
+        return mean / (pixels * self.model.grid.diagonal)
 
     def draw(
         self, rng: np.random.Generator

@@ -230,7 +230,7 @@ def stored_settings():
 
 
 VALUES = [
-    ("format", 4, "format is 4, this version reads 3"),
+    ("format", 5, "format is 5, this version reads 4"),
     ("format", 0, "format is 0"),
     ("format", True, "format is True"),
     ("format", "1", "format is '1'"),

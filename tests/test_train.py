@@ -17,6 +17,7 @@ import numpy as np
 import pytest
 from support.runs import arguments, train_and_interrupt
 
+from pp_cl import load
 from pp_cl.cli import main
 from pp_cl.config import FORMAT
 from pp_cl.files.checkpoint import load_checkpoint
@@ -311,3 +312,16 @@ def test_the_other_footprints_train_too(scene, tmp_path, footprint, radius):
     )
     losses = [r["loss"] for r in rows(out)[:-1]]
     assert losses[-1] < losses[0]
+
+
+def test_the_spread_brings_the_hits_of_a_pixel_together(scene, tmp_path):
+    """Their mean depth and their median depth differ less."""
+    apart = []
+    for weight in (0, 30):
+        out = tmp_path / str(weight)
+        assert main(arguments(scene, out, train__spread_weight=weight)) == 0
+        run = load(out)
+        pictures = [run.render(view.camera) for view in run.scene("test").splits["test"]]
+        seen = [(p.depth[p.alpha > 0.5], p.median_depth[p.alpha > 0.5]) for p in pictures]
+        apart.append(np.mean([np.abs(mean - median).mean() for mean, median in seen]))
+    assert apart[1] < 0.7 * apart[0]

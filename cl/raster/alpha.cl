@@ -6,7 +6,8 @@
 // features composited of all that lies behind hit i, dL/do_i = T_i d_i (G.f_i - B_i): nothing is
 // divided by 1 - alpha. An opaque hit lets LEAST_THROUGH pass, so that B is known behind it too. A
 // gradient g of the pixel's alpha, 1 - T, is that of a feature which all points have and the
-// background has not: G.f becomes G.f + g.
+// background has not: G.f becomes G.f + g. The spread of the pixel, w sum_ij b_i b_j |z_i - z_j|
+// (Mip-NeRF 360, Eq. 15, its distortion), adds its derivative with respect to b_i in the same way.
 #include "common.h"
 #include "raster/pair_role.h"
 #include "reduce.h"
@@ -19,6 +20,9 @@
 #endif
 #ifndef HAS_GRAD_ALPHA
 #define HAS_GRAD_ALPHA 0  // 0: grad_alpha is 0 and not read
+#endif
+#ifndef HAS_SPREAD
+#define HAS_SPREAD 0  // 0: spread_weight is 0 and not read
 #endif
 #define HAS_ROLES                                                                                  \
     (DROPS || MAX_TRACKED)  // else every pair is TRACKED, and pair_role is not touched
@@ -62,10 +66,16 @@ kernel void alpha_weights(
     transmittance[q] = T;
 }
 
+// The depth of a key, the weight of an entry.
+static inline float upper_float(const ulong pair) {
+    return as_float((uint)(pair >> 32));
+}
+
 // One work-item per pixel: reads its hits, farthest first, and their points' features, writes G.f +
-// g - B of each pair that is not dropped.
+// g - B, with what the spread adds, of each pair that is not dropped.
 kernel __attribute__((vec_type_hint(float16))) void alpha_gain(
     const uint hw,                         // pixels
+    const float spread_weight,             // w, read with HAS_SPREAD
     global const uint *pixel_offset,       // (HW+1)
     global const ulong *pair_key,          // (P) depth << 32 | pair
     global const ulong *pixel_entry,       // (P) weight << 32 | point; no point: the list ends
@@ -80,14 +90,27 @@ kernel __attribute__((vec_type_hint(float16))) void alpha_gain(
     const float16 G = grad_features[q];
     const float g = HAS_GRAD_ALPHA ? grad_alpha[q] : 0.0f;
     const uint begin = pixel_offset[q];
+    // depths count from here, so that sums of them keep their digits
+    const float nearest = begin < pixel_offset[q + 1] ? upper_float(pair_key[begin]) : 0.0f;
+    float2 front = 0.0f, behind = 0.0f;  // sums of b and b z of the hits there
     uint end = begin;
-    while (end < pixel_offset[q + 1] && (uint)pixel_entry[end] != NONE)
-        end++;
+    for (; end < pixel_offset[q + 1] && (uint)pixel_entry[end] != NONE; end++)
+        if (HAS_SPREAD) {
+            const float z = upper_float(pair_key[end]) - nearest;
+            front += upper_float(pixel_entry[end]) * (float2)(1.0f, z);
+        }
     float T = transmittance[q];
     float B = dot16(G, (float16)(1.0f));  // the background's features are 1
     for (uint i = end; i-- > begin;) {
-        const float b = as_float((uint)(pixel_entry[i] >> 32));
-        const float more = dot16(G, point_features[(uint)pixel_entry[i]]) + g - B;
+        const float b = upper_float(pixel_entry[i]);
+        float own = dot16(G, point_features[(uint)pixel_entry[i]]);
+        if (HAS_SPREAD) {
+            const float z = upper_float(pair_key[i]) - nearest;
+            front -= b * (float2)(1.0f, z);
+            own += 2.0f * spread_weight * (z * (front.x - behind.x) - (front.y - behind.y));
+            behind += b * (float2)(1.0f, z);
+        }
+        const float more = own + g - B;
         gain[(uint)pair_key[i]] = more;
         if (b > 0.0f) {
             T += b;  // in front of this hit

@@ -72,13 +72,16 @@ class Alpha(BlendWeights):
         features: Array,
         grad_features: Array,
         grad_alpha: Array | None = None,
+        spread_weight: float = 0.0,
     ) -> Array:
         """As BlendWeights: G.f + g - B of each pair, B being G times what is composited behind."""
         gain = self._buffers.gain[: pairs.capacity]
-        self.dev.program("raster/alpha", HAS_GRAD_ALPHA=int(grad_alpha is not None)).launch(
+        has = {"HAS_GRAD_ALPHA": grad_alpha is not None, "HAS_SPREAD": spread_weight > 0}
+        self.dev.program("raster/alpha", **{name: int(x) for name, x in has.items()}).launch(
             "alpha_gain",
             pairs.pixels,
             hw=pairs.pixels,
+            spread_weight=spread_weight,
             pixel_offset=pairs.pixel_offset,
             pair_key=pairs.pair_key,
             pixel_entry=weights.pixel_entry,

@@ -95,10 +95,11 @@ class Blend:
         features: Array,
         grad_features: Array,
         grad_alpha: Array | None = None,
+        spread_weight: float = 0.0,
     ) -> BlendGradient:
         """Prepare the backward pass of forward(pairs, weights, point_features, features).
 
-        grad_alpha: as BlendWeights.rest_or_gain takes it.
+        grad_alpha, spread_weight: as BlendWeights.rest_or_gain takes them.
         """
         self._buffers.require(self.table(pairs.points))
         rest_or_gain = self.weighing.rest_or_gain(
@@ -108,6 +109,7 @@ class Blend:
             features=features,
             grad_features=grad_features,
             grad_alpha=grad_alpha,
+            spread_weight=spread_weight,
         )
         return BlendGradient(pairs, weights, point_features, grad_features, rest_or_gain)
 

@@ -111,13 +111,16 @@ class BlendWeights(ABC):
         features: Array,
         grad_features: Array,
         grad_alpha: Array | None = None,
+        spread_weight: float = 0.0,
     ) -> Array:
         """(HW,) float32: what G.f of a hit is compared with; with gain_by_pair (P,): by how much
         it exceeds that.
 
         weights: the last ones computed. point_features: (N, 16); features, grad_features: F and
         G, (H, W, 16), of Blend.forward with these weights. grad_alpha: g = dL/d(1 - T), (HW,), of
-        weights with a transmittance; None: 0.
+        weights with a transmittance; None: 0. spread_weight: adds this times sum_ij b_i b_j |z_i -
+        z_j| of every pixel to the loss, with b and z the weights and depths (world units) of its
+        hits, for weights with a transmittance; no gradient of the depths is formed.
         """
 
     def _reserve(self, pairs, has_roles):

@@ -72,10 +72,11 @@ class Softmax(BlendWeights):
         features: Array,
         grad_features: Array,
         grad_alpha: Array | None = None,
+        spread_weight: float = 0.0,
     ) -> Array:
         """As BlendWeights: G.F of each pixel."""
-        if grad_alpha is not None:
-            raise ValueError("a softmax has no gradient of alpha")
+        if grad_alpha is not None or spread_weight > 0:
+            raise ValueError("a softmax has no gradient of alpha and of spread")
         rest = self._buffers.rest
         self.dev.program("raster/softmax").launch(
             "softmax_rest",

@@ -239,6 +239,21 @@ def alpha(geometry_: Arrays, opacity: np.ndarray, least: float = 0.0) -> Arrays:
     }
 
 
+def distances(geometry_: Arrays, blend_: Arrays) -> np.ndarray:
+    """(N, HW) sum_j b_j |z_i - z_j| of the hits that are used; 0 elsewhere."""
+    depth, weight, hit = geometry_["depth"], blend_["weight"], blend_["hit"]
+    found = np.zeros(hit.shape)
+    for q in np.flatnonzero(hit.any(axis=0)):
+        z = depth[hit[:, q], q]
+        found[hit[:, q], q] = np.abs(z[:, None] - z) @ weight[hit[:, q], q]
+    return found
+
+
+def spread(geometry_: Arrays, blend_: Arrays) -> np.ndarray:
+    """(HW,) sum_ij b_i b_j |z_i - z_j| of the hits that are used (Mip-NeRF 360, Eq. 15)."""
+    return (blend_["weight"] * distances(geometry_, blend_)).sum(axis=0)
+
+
 def alpha_gradients(
     geometry_: Arrays,
     blend_: Arrays,
@@ -247,10 +262,15 @@ def alpha_gradients(
     *,
     max_tracked: int = 0,
     mean: bool = False,
+    spread_weight: float = 0.0,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """(dL/df (N, C), dL/do (N,), dL/dalpha (N, HW)) as blend_gradients."""
+    """(dL/df (N, C), dL/do (N,), dL/dalpha (N, HW)) as blend_gradients, of a loss to which the
+    pixels' spread is added with this weight.
+    """
     G, f = np.asarray(grad_features, np.float64), np.asarray(point_features, np.float64)
     own, ranks = f @ G.T, order(geometry_)
+    if spread_weight:
+        own += 2 * spread_weight * distances(geometry_, blend_)
     slope = np.zeros_like(own)
     for q in np.flatnonzero(blend_["hit"].any(axis=0)):
         points = np.flatnonzero(blend_["hit"][:, q])

@@ -82,6 +82,11 @@ class Grid:
         low = np.asarray(self.origin)
         return np.stack([low, low + self.edge * (np.asarray(self.dims) - 1)])
 
+    @property
+    def diagonal(self) -> float:
+        """From the first to the last vertex, world units; an edge where there is one vertex."""
+        return float(np.linalg.norm(np.ptp(self.box, axis=0))) or self.edge
+
     def moved(self, by: ArrayLike) -> "Grid":
         """The grid moved by (3,) world units."""
         return replace(self, origin=tuple(float(x) for x in np.add(self.origin, by)))

@@ -75,6 +75,17 @@ def _gradient_of_alpha(dev: Device, rng: np.random.Generator) -> Iterator[Check]
     yield relative(gradients["opacity"], expected, GRADIENT)
 
 
+def _spread(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
+    """Of hits of all weights, of those before an early stop, and of the tracked ones."""
+    for n, tracked, stop in ((257, 0, 0.0), (257, 0, 0.05), (257, 3, 0.0), (31, 0, 0.0)):
+        blended = Blended(dev, rng, n, rule="alpha", max_tracked=tracked, early_stop=stop)
+        blended.grad[:] = 0
+        expected = blended.reference_gradients(tracked, spread_weight=3.0)[1]
+        gradients = blended.gradients(spread_weight=3.0)
+        yield relative(gradients["opacity"], expected, GRADIENT)
+        yield exact(gradients["features"], np.zeros((n, 16)))
+
+
 def _drops(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
     """Nothing in front of the stop is dropped, all behind it is, by no more than is said."""
     for option in ("early_stop", "tau"):
@@ -153,6 +164,7 @@ CASES = (
     *(Case(f"alpha: backward, {kind}", partial(_backward, kind)) for kind in KINDS),
     Case("alpha: awkward sizes", _sizes),
     Case("alpha: gradient of alpha", _gradient_of_alpha),
+    Case("alpha: spread", _spread),
     Case("alpha: early stop and tau", _drops),
     Case("alpha: opacities of 1", _opaque),
     Case("alpha: opacities of 0", _zero_opacity),

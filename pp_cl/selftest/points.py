@@ -140,12 +140,16 @@ class PairedPoints:
         return roles if self.weights.has_roles else np.zeros(len(self.pairs.pair_pixel), np.uint8)
 
     def gradients(
-        self, grad_features: np.ndarray, grad_alpha: np.ndarray | None = None
+        self,
+        grad_features: np.ndarray,
+        grad_alpha: np.ndarray | None = None,
+        spread_weight: float = 0.0,
     ) -> Gradients:
         """{"features": (N, 16), "opacity": (N,)} of sum(features * grad_features) and, where given,
-        sum(alpha * grad_alpha) after blend().
+        sum(alpha * grad_alpha) and the pixels' spread times its weight, after blend().
         """
-        features, opacity = self.blending.backward(self._gradient(grad_features, grad_alpha))
+        gradient = self._gradient(grad_features, grad_alpha, spread_weight)
+        features, opacity = self.blending.backward(gradient)
         return {"features": features.get(), "opacity": opacity.get()}
 
     def sphere_gradients(self, grad_features: np.ndarray) -> Gradients:
@@ -155,7 +159,7 @@ class PairedPoints:
         )
         return {"positions": positions.get(), "radius": radius.get()}
 
-    def _gradient(self, grad_features, grad_alpha=None):
+    def _gradient(self, grad_features, grad_alpha=None, spread_weight=0.0):
         if grad_alpha is not None:
             grad_alpha = self.dev.upload(grad_alpha, np.float32)
         grad = self.dev.upload(np.reshape(grad_features, (*self.shape, 16)), np.float32)
@@ -166,6 +170,7 @@ class PairedPoints:
             features=self.features,
             grad_features=grad,
             grad_alpha=grad_alpha,
+            spread_weight=spread_weight,
         )
 
 
@@ -236,12 +241,12 @@ class Blended:
         self.weight = self.scene.weight()
         self.role = self.scene.dense(self.scene.roles())
 
-    def gradients(self) -> Gradients:
-        """The kernels' gradients of sum(features * grad)."""
-        return self.scene.gradients(self.grad)
+    def gradients(self, spread_weight: float = 0.0) -> Gradients:
+        """The kernels' gradients of sum(features * grad) and the spread times its weight."""
+        return self.scene.gradients(self.grad, spread_weight=spread_weight)
 
     def reference_gradients(
-        self, max_tracked: int = 0, mean: bool = False
+        self, max_tracked: int = 0, mean: bool = False, spread_weight: float = 0.0
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """The same in float64: (features, opacity, by pair and logit, or by pair and alpha)."""
         if self.rule == "alpha":
@@ -252,6 +257,7 @@ class Blended:
                 self.grad,
                 max_tracked=max_tracked,
                 mean=mean,
+                spread_weight=spread_weight,
             )
         return dense.blend_gradients(
             self.geometry,

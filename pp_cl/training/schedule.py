@@ -1,5 +1,5 @@
-"""Learning rates, gamma and EMA weights as pure functions of the step, which counts from 0 to
-steps - 1.
+"""Learning rates, gamma, and the weights of EMA and spread, as pure functions of the step,
+which counts from 0 to steps - 1.
 """
 
 import math
@@ -39,6 +39,13 @@ def refine_steps(steps: int, shares: tuple[float, ...]) -> list[int]:
 def gamma_at(step: int, steps: int, first: float = 0.1, last: float = 0.01) -> float:
     """The blend's softness, exponential from `first` to `last` (PlenopticPoints supplemental)."""
     return learning_rate(step, steps, first, last)
+
+
+def spread_weight_at(step: int, steps: int, last: float) -> float:
+    """The weight of the spread: rises linearly from 0 to `last`, as there is no surface yet to
+    be made sharp at first.
+    """
+    return last * step / steps
 
 
 def ema_start(steps: int) -> int:

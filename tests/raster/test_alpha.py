@@ -77,6 +77,43 @@ def test_a_gradient_of_alpha_is_one_of_a_feature_that_only_the_background_has(
 
 
 @pytest.mark.parametrize("n", AWKWARD_SIZES)
+@pytest.mark.parametrize("option", [{}, {"mean": True}, {"max_tracked": 3}, {"early_stop": 0.05}])
+def test_the_gradient_of_the_spread_is_added(dev, rng, n, option):
+    blended = alpha_scene(dev, rng, n=n, **option)
+    without, gradients = blended.gradients(), blended.gradients(spread_weight=2.0)
+    of_points = {name: x for name, x in option.items() if name != "early_stop"}
+    expected = blended.reference_gradients(**of_points, spread_weight=2.0)
+    assert np.array_equal(gradients["features"], without["features"])
+    assert relative_error(gradients["opacity"], expected[1]) < 2e-5
+    assert relative_error(without["opacity"], expected[1]) > 0.01 or n == 1
+
+
+def test_gradients_of_the_spread_against_finite_differences(dev, rng):
+    blended = alpha_scene(dev, rng, n=60)
+    blended.grad[:] = 0
+
+    def loss(opacity):
+        return oracle.spread(blended.geometry, oracle.alpha(blended.geometry, opacity)).sum()
+
+    numeric = numeric_gradient(loss, blended.opacity.astype(np.float64), 1e-5, np.arange(60))
+    assert np.abs(numeric).max() > 0.1
+    gradients = blended.gradients(spread_weight=1.0)
+    assert relative_error(gradients["opacity"], numeric) < 1e-5
+
+
+def test_hits_at_one_depth_and_single_hits_have_no_spread(dev):
+    for z in ([0.5], [0.5] * 7):
+        scene, _ = on_axis(dev, z, [0.5] * len(z), 0.1, rule="alpha")
+        gradients = scene.gradients(np.zeros((1, 1, 16)), spread_weight=1e6)
+        assert (gradients["opacity"] == 0).all()
+
+
+def test_a_softmax_has_no_spread(dev, rng):
+    with pytest.raises(ValueError, match="spread"):
+        Blended(dev, rng).gradients(spread_weight=1.0)
+
+
+@pytest.mark.parametrize("n", AWKWARD_SIZES)
 @pytest.mark.parametrize("size", [(1, 1), (31, 33)])
 def test_sizes(dev, rng, n, size):
     blended = alpha_scene(dev, rng, n=n, size=size, early_stop=1e-3)

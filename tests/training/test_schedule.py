@@ -2,9 +2,10 @@
 
 import math
 
+import numpy as np
 import pytest
 
-from pp_cl.training.schedule import ema_weight, gamma_at, learning_rate
+from pp_cl.training.schedule import ema_weight, gamma_at, learning_rate, spread_weight_at
 
 SH_RATES = [
     (
@@ -43,6 +44,12 @@ def test_gamma():
     assert gamma_at(0, 50000) == pytest.approx(0.1)
     assert gamma_at(25000, 50000) == pytest.approx(0.031623, abs=5e-7)
     assert gamma_at(50000, 50000) == pytest.approx(0.01)
+
+
+def test_the_spread_weight_rises_from_nothing():
+    weights = [spread_weight_at(step, 200, 3.0) for step in range(200)]
+    assert weights[0] == 0 and weights[100] == pytest.approx(1.5) and max(weights) < 3
+    np.testing.assert_allclose(np.diff(weights), 3 / 200)
 
 
 def test_ema_weight():
