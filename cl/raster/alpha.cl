@@ -67,8 +67,8 @@ kernel void alpha_weights(
 }
 
 // The depth of a key, the weight of an entry.
-static inline float upper_float(const ulong pair) {
-    return as_float((uint)(pair >> 32));
+static inline float upper_float(const ulong word) {
+    return as_float((uint)(word >> 32));
 }
 
 // One work-item per pixel: reads its hits, farthest first, and their points' features, writes G.f +
