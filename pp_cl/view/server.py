@@ -66,13 +66,17 @@ class SocketTab:
         self.put(kind, json.dumps({"type": kind, **facts}, allow_nan=False))
 
     def tell_log(self, log: LogFollower) -> None:
-        """Send the rows of the log that this tab has not got."""
-        starts, sent = self.rows_sent
-        first = sent if starts == log.starts else 0
+        """Send the rows of the log that this tab has not got, if there are any.
+
+        The log may grow meanwhile: it is read in another thread.
+        """
+        starts, (starts_sent, sent) = log.starts, self.rows_sent
+        first = sent if starts == starts_sent else 0
         rows = log.rows[first:]
-        message = {"type": "log", "first": first, "rows": rows}
-        self.put(("log", log.starts, first), json.dumps(message, allow_nan=False))
-        self.rows_sent = log.starts, len(log.rows)
+        if rows or starts != starts_sent:
+            message = {"type": "log", "first": first, "rows": rows}
+            self.put(("log", starts, first), json.dumps(message, allow_nan=False))
+        self.rows_sent = starts, first + len(rows)
 
     def put(self, key: Any, message: str | bytes) -> None:
         """Send a message, in place of an unsent one of the same key."""

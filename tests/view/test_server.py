@@ -11,6 +11,7 @@ from aiohttp import WSServerHandshakeError
 from support.viewing import SECONDS, asking, served
 
 from pp_cl.view.messages import SHOWN
+from pp_cl.view.server import SocketTab
 
 HEADERS = {
     "Referrer-Policy": "no-referrer",
@@ -206,16 +207,47 @@ def test_a_training_is_followed(dev, copied):
             while not tab.last.get("log", {}).get("rows"):
                 await tab.receive("log")
             assert [row[0] for row in tab.last["log"]["rows"]] == [5]
-            (copied / "log.jsonl").write_bytes(b"".join(lines[:3]))
+            with (copied / "log.jsonl").open("ab") as file:
+                file.write(lines[1][9:] + lines[2])
             added = await tab.receive("log")
             assert added["first"] == 1 and [row[0] for row in added["rows"]] == [10, 15]
-            (copied / "checkpoint.npz").write_bytes(whole)
+            (copied / "new.npz").write_bytes(whole)
+            (copied / "new.npz").replace(copied / "checkpoint.npz")
             camera = (await tab.receive("surroundings"))["camera"]
             assert tab.last["facts"]["loads"] == 1 and tab.last["facts"]["waiting"] is None
             await tab.ask(camera)
             os.utime(copied / "checkpoint.npz", ns=(1, 1))
             while tab.last["facts"]["loads"] < 2:
                 await tab.receive("facts")
+
+    asyncio.run(scenario())
+
+
+def test_a_tab_gets_each_row_once_and_no_message_without_rows():
+    class Log:
+        starts, rows = 0, []
+
+    async def scenario():
+        tab, log = SocketTab(None), Log()
+        tab.tell_log(log)
+        assert sent(tab) == []
+        log.rows = [[5], [10]]
+        tab.tell_log(log)
+        tab.tell_log(log)
+        log.rows = [[5], [10], [15]]
+        tab.tell_log(log)
+        assert sent(tab) == [(0, [[5], [10]]), (2, [[15]])]
+        log.starts, log.rows = 1, []
+        tab.tell_log(log)
+        tab.tell_log(log)
+        assert sent(tab)[2:] == [(0, [])]  # the page forgets what it had
+        log.rows = [[5]]
+        tab.tell_log(log)
+        assert sent(tab)[2:] == [(0, [[5]])]  # in its place, as it was not sent yet
+
+    def sent(tab):
+        messages = [json.loads(text) for text in tab._outbox.values()]
+        return [(message["first"], message["rows"]) for message in messages]
 
     asyncio.run(scenario())
 
