@@ -140,33 +140,35 @@ kernel void blend_backward_spheres(
     const uint i = get_global_id(0);
     if (i >= n) return;
     const Camera cam = camera_load(camera);
-    const Footprint f = footprint_load(&cam, point_camera[i], point_radius[radii == 1 ? 0 : i]);
+    const float3 centre = point_camera[i].xyz;
+    const float t = point_camera[i].w, radius = point_radius[radii == 1 ? 0 : i];
+    const float width = t / least_focal(&cam), least = LEAST_RADIUS * width;
     const float dl_ddepth = -opacity[i] / (gamma * (cam.far - cam.near));
     float3 dL_dc = 0.0f;
     float dL_dR = 0.0f;
     for (uint pair = point_offset[i]; pair < point_offset[i + 1]; pair++) {
         const uint q = pair_pixel[pair];
         const float3 ray = camera_ray(&cam, q % cam.width, q / cam.width);
-        const float3 delta = f.centre - f.t * ray;
+        const float3 delta = centre - t * ray;
         const float rho = length(delta);
-        const float along = fmin(dot(f.centre, ray), f.t);
-        const float3 across = f.centre - along * ray;
+        const float along = fmin(dot(centre, ray), t);
+        const float3 across = centre - along * ray;
         const float w = length(across);
-        const float half_chord = sqrt((f.radius + w) * fmax(f.radius - w, 0.0f));
+        const float half_chord = sqrt((radius + w) * fmax(radius - w, 0.0f));
 
         // depth = along - half_chord; half_chord is the constant 0 where the ray misses the sphere
         // itself
         const float per_chord = half_chord > 0.0f ? 1.0f / half_chord : 0.0f;
         const float dL_ddepth = grad_pair[pair].x * dl_ddepth;
         dL_dc += dL_ddepth * (ray + per_chord * across);
-        dL_dR -= dL_ddepth * f.radius * per_chord;
+        dL_dR -= dL_ddepth * radius * per_chord;
 
         // d = 1 - rho/R, but the constant 1 near the centre of tiny spheres; at the very centre it
         // has no slope
-        if (rho > 0.0f && !(f.tiny && rho < f.least)) {
+        if (rho > 0.0f && !(radius < width && rho < least)) {
             const float dL_dd = grad_pair[pair].y;
-            dL_dc += dL_dd * (f.centre / f.t * dot(ray, delta) - delta) / (rho * f.radius);
-            dL_dR += dL_dd * rho / (f.radius * f.radius);
+            dL_dc += dL_dd * (centre / t * dot(ray, delta) - delta) / (rho * radius);
+            dL_dR += dL_dd * rho / (radius * radius);
         }
     }
     vstore3(dL_dc.x * cam.right + dL_dc.y * cam.down + dL_dc.z * cam.forward, i, grad_positions);

@@ -11,7 +11,11 @@
 #define RUN 64  // keys ranked at once by comparing all with all, 8 a step; longer lists are merged
 #endif
 
-// One work-item per point: reads where it is, writes its number of hits.
+// Pixels of a box that are tested before their hits are written, at most 32. With few, the pairs of
+// 16 points grow by turns, each in memory of its own, which is slow where they are many.
+#define CELLS (LANES > 1 ? 32 : 1)
+
+// One work-item per LANES points: reads where they are, writes their numbers of hits.
 kernel __attribute__((vec_type_hint(floats))) void pairs_count(
     const uint n,                       // points
     const uint radii,                   // 1 (all alike) or n
@@ -21,23 +25,25 @@ kernel __attribute__((vec_type_hint(floats))) void pairs_count(
     global const ushort4 *point_box,    // (N, 4) first x, first y, last x, last y
     global uint *point_count)           // (N)
 {
-    const uint i = get_global_id(0);
-    if (i >= n) return;
-    const int4 box = convert_int4(point_box[i]);
-    uint count = 0;
-    if (box.x <= box.z) {
-        const Camera cam = camera_load(camera);
-        const Footprint f = footprint_load(&cam, point_camera[i], point_radius[radii == 1 ? 0 : i]);
-        floats closeness, depth;
-        for (int y = box.y; y <= box.w; y += BLOCK_SIDE)
-            for (int x = box.x; x <= box.z; x += BLOCK_SIDE)
-                count += popcount(footprint_block(&cam, &f, box, x, y, &closeness, &depth));
-    }
-    point_count[i] = count;
+    const uint first = get_global_id(0) * LANES;
+    if (first >= n) return;
+    const uint count = min((uint)LANES, n - first);
+    const Camera cam = camera_load(camera);
+    const Footprints f =
+        footprints_load(&cam, first, count, radii, point_radius, point_camera, point_box);
+    ints hits = 0;
+    floats closeness, depth;
+    for (int row = 0; row < f.rows; row++)
+        for (int column = 0; column < f.columns; column++)
+            hits += footprints_hit(&cam, &f, column, row, &closeness, &depth) & 1;
+    int lane_hits[LANES];
+    LANES_INTO(lane_hits, hits);
+    for (uint j = 0; j < count; j++)
+        point_count[first + j] = lane_hits[j];
 }
 
-// One work-item per point: finds its hits again, writes them as pairs and counts them at their
-// pixels; does nothing where not all pairs have room.
+// One work-item per LANES points: finds their hits again, writes them as pairs and counts them at
+// their pixels; does nothing where not all pairs have room.
 kernel __attribute__((vec_type_hint(floats))) void pairs_fill(
     const uint n,                        // points
     const uint p,                        // pairs for which there is room
@@ -52,29 +58,46 @@ kernel __attribute__((vec_type_hint(floats))) void pairs_fill(
     global ulong *pair_place,            // (P) depth << 32 | place in the list of the pixel
     global volatile uint *pixel_count)   // (HW) accumulates
 {
-    const uint i = get_global_id(0);
-    if (i >= n) return;
-    uint pair = point_offset[i];
-    if (pair == point_offset[i + 1] || point_offset[n] > p) return;
+    const uint first = get_global_id(0) * LANES;
+    if (first >= n || point_offset[n] > p) return;
+    const uint count = min((uint)LANES, n - first);
+    if (point_offset[first] == point_offset[first + count]) return;
     const Camera cam = camera_load(camera);
-    const Footprint f = footprint_load(&cam, point_camera[i], point_radius[radii == 1 ? 0 : i]);
-    const int4 box = convert_int4(point_box[i]);
-    for (int y = box.y; y <= box.w; y += BLOCK_SIDE)
-        for (int x = box.x; x <= box.z; x += BLOCK_SIDE) {
-            floats closeness, depth;
-            float lane_closeness[LANES], lane_depth[LANES];
-            uint hits = footprint_block(&cam, &f, box, x, y, &closeness, &depth);
-            LANES_INTO(lane_closeness, closeness);
-            LANES_INTO(lane_depth, depth);
-            for (; hits; hits &= hits - 1, pair++) {
-                const int lane = 31 - clz(hits & -hits);
-                const uint pixel = (y + lane / BLOCK_SIDE) * cam.width + x + lane % BLOCK_SIDE;
-                pair_pixel[pair] = pixel;
-                pair_point_closeness[pair] = (uint2)(i, as_uint(lane_closeness[lane]));
-                pair_place[pair] =
-                    upsample(as_uint(lane_depth[lane]), atomic_inc(&pixel_count[pixel]));
+    const Footprints f =
+        footprints_load(&cam, first, count, radii, point_radius, point_camera, point_box);
+    uint next[LANES], corner[LANES];  // of each point: its next pair, the first pixel of its box
+    for (uint j = 0; j < count; j++) {
+        next[j] = point_offset[first + j];
+        corner[j] = f.box[1][j] * cam.width + f.box[0][j];
+    }
+    int row = 0, column = 0;
+    while (row < f.rows) {
+        // first a few pixels of all points, then what each point hit: its pairs lie together
+        float closeness[CELLS][LANES], depth[CELLS][LANES];
+        uint offset[CELLS], hits[LANES];
+        uints found = 0;
+        for (uint k = 0; k < CELLS && row < f.rows; k++) {
+            floats d, z;
+            const ints hit = footprints_hit(&cam, &f, column, row, &d, &z);
+            found |= select((uints)(0), (uints)(1u << k), hit);
+            LANES_INTO(closeness[k], d);
+            LANES_INTO(depth[k], z);
+            offset[k] = row * cam.width + column;
+            if (++column == f.columns) {
+                column = 0;
+                row++;
             }
         }
+        LANES_INTO(hits, found);
+        for (uint j = 0; j < count; j++)
+            for (uint left = hits[j]; left; left &= left - 1) {
+                const uint k = 31 - clz(left & -left), pair = next[j]++;
+                const uint pixel = corner[j] + offset[k];
+                pair_pixel[pair] = pixel;
+                pair_point_closeness[pair] = (uint2)(first + j, as_uint(closeness[k][j]));
+                pair_place[pair] = upsample(as_uint(depth[k][j]), atomic_inc(&pixel_count[pixel]));
+            }
+    }
 }
 
 // One work-item per pair: writes its key at its place. Bits of floats >= 0 sort like the floats.

@@ -65,7 +65,7 @@ ALWAYS_INLINE void project(
     const ints kept =
         wanted & (front >= cam->near) & (front <= cam->far) & (t > 0.0f) & (cz >= LEAST_COSINE * t);
     const floats reach =
-        FOOTPRINT == SPHERE ? radius : fmax(radius, LEAST_RADIUS * t / fmin(cam->fx, cam->fy));
+        FOOTPRINT == SPHERE ? radius : fmax(radius, LEAST_RADIUS * t / least_focal(cam));
     ints x0, y0, x1, y1;
     tangents(cx, cz, reach, cam->fx, cam->cx, cam->width, &x0, &x1);
     tangents(cy, cz, reach, cam->fy, cam->cy, cam->height, &y0, &y1);

@@ -69,7 +69,8 @@ class PairBuilder:
 
     def __init__(self, dev: Device, footprint: Footprint):
         self.dev = dev
-        self.program = dev.program("raster/pairs", LANES=lanes(dev), RUN=RUN, **footprint.defines)
+        self._lanes = lanes(dev)
+        self.program = dev.program("raster/pairs", LANES=self._lanes, RUN=RUN, **footprint.defines)
         self._buffers = Buffers(dev)
         self._capacity = 0
 
@@ -170,7 +171,7 @@ class PairBuilder:
         """Launch a kernel that walks over the pixels of each point's box."""
         self.program.launch(
             kernel,
-            n,
+            -(-n // self._lanes),
             n=n,
             radii=points.point_radius.size,
             camera=points.camera_buffer,
