@@ -55,15 +55,25 @@ kernel void scan_offsets(
     if (MEMBER == 0 && block == b - 1) offsets[n] = sum;
 }
 
-// One work-item per value: reads it and its number among the non-zero ones, writes its index there
-// if it is non-zero.
+// GROUP work-items per block of BLOCK values: read them and how many before the block are not zero,
+// write the indices of those that are not.
 kernel void scan_nonzero(
-    const uint n,                // values
-    global const uint *values,   // (N)
-    global const uint *offsets,  // (N+1) from scan_offsets with FLAGS = 1
-    global uint *indices)        // (N); the first offsets[n] are written
+    const uint n,                     // values
+    const uint b,                     // blocks
+    global const uint *values,        // (N)
+    global const uint *block_offset,  // (B+1) from scan_sums with FLAGS = 1
+    global uint *indices)             // (N); the first block_offset[b] are written
 {
-    const uint i = get_global_id(0);
-    if (i >= n) return;
-    if (values[i]) indices[offsets[i]] = i;
+    SHARED(uint, shared, 2 * GROUP);
+    const uint block = GROUP_ID;
+    if (block >= b) return;
+    const uint end = min(n, (block + 1) * BLOCK);
+    uint listed = block_offset[block];
+    for (uint first = block * BLOCK; first < end; first += GROUP) {
+        const uint i = first + MEMBER, found = i < end && values[i] != 0;
+        uint total;
+        const uint before = group_scan(found, shared, &total);
+        if (found) indices[listed + before] = i;
+        listed += total;
+    }
 }

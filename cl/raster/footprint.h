@@ -30,55 +30,29 @@ typedef struct {
     floats x, y, z;     // centre, camera axes
     floats t;           // its distance from the eye
     floats radius;      // world units
+    int box[4][LANES];  // first x, first y, last x, last y; no pixel: last before first
+    // what follows from these
+    int columns, rows;  // of the widest and the highest box
     floats least;       // LEAST_RADIUS pixels at range t, world units
     ints tiny;          // the radius is below one pixel
-    int box[4][LANES];  // first x, first y, last x, last y; no pixel: last before first
-    int columns, rows;  // of the widest and the highest box
     // reciprocals, since dividing 16 lanes by one number is slower than multiplying them
     floats per_reach;
     float per_fx, per_fy;
 } Footprints;
 
-// Reads those of the points from `first` on, of which `count` exist; the others have empty boxes.
-ALWAYS_INLINE Footprints footprints_load(
-    const Camera *cam,
-    const uint first,
-    const uint count,
-    const uint radii,
-    global const float *point_radius,
-    global const float4 *point_camera,
-    global const ushort4 *point_box) {
-    Footprints f;
-    float place[4][LANES], radius[LANES];
-    f.columns = f.rows = 0;
-    for (uint j = 0; j < LANES; j++) {
-        const uint i = first + min(j, count - 1);
-        const float4 at = point_camera[i];
-        const int4 box = j < count ? convert_int4(point_box[i]) : (int4)(1, 1, 0, 0);
-        place[0][j] = at.x;
-        place[1][j] = at.y;
-        place[2][j] = at.z;
-        place[3][j] = at.w;
-        radius[j] = point_radius[radii == 1 ? 0 : i];
-        f.box[0][j] = box.x;
-        f.box[1][j] = box.y;
-        f.box[2][j] = box.z;
-        f.box[3][j] = box.w;
-        f.columns = max(f.columns, box.z - box.x + 1);
-        f.rows = max(f.rows, box.w - box.y + 1);
+// Writes what follows from the rest.
+ALWAYS_INLINE void footprints_prepare(const Camera *cam, Footprints *f) {
+    f->columns = f->rows = 0;
+    UNROLLED for (uint j = 0; j < LANES; j++) {
+        f->columns = max(f->columns, f->box[2][j] - f->box[0][j] + 1);
+        f->rows = max(f->rows, f->box[3][j] - f->box[1][j] + 1);
     }
-    f.x = LANES_FROM(place[0]);
-    f.y = LANES_FROM(place[1]);
-    f.z = LANES_FROM(place[2]);
-    f.t = LANES_FROM(place[3]);
-    f.radius = LANES_FROM(radius);
-    const floats width = f.t / least_focal(cam);
-    f.least = LEAST_RADIUS * width;
-    f.tiny = f.radius < width;
-    f.per_reach = 1.0f / fmax(f.radius, f.least);
-    f.per_fx = 1.0f / cam->fx;
-    f.per_fy = 1.0f / cam->fy;
-    return f;
+    const floats width = f->t / least_focal(cam);
+    f->least = LEAST_RADIUS * width;
+    f->tiny = f->radius < width;
+    f->per_reach = 1.0f / fmax(f->radius, f->least);
+    f->per_fx = 1.0f / cam->fx;
+    f->per_fy = 1.0f / cam->fy;
 }
 
 // Tests pixel (column, row) of each point's box: lanes that hit are not 0.
@@ -89,8 +63,8 @@ ALWAYS_INLINE ints footprints_hit(
     const int row,
     floats *closeness,
     floats *depth) {
-// Counting and filling must find the same hits, so no compiler may round here in one way and
-// there in another.
+// Counting (project.cl) and filling (pairs.cl) must find the same hits, so no compiler may round
+// here in one way and there in another.
 #pragma OPENCL FP_CONTRACT OFF
     const ints x = LANES_FROM(f->box[0]) + column, y = LANES_FROM(f->box[1]) + row;
     const floats px = LANED(convert_float)(x), py = LANED(convert_float)(y);

@@ -15,35 +15,43 @@
 // 16 points grow by turns, each in memory of its own, which is slow where they are many.
 #define CELLS (LANES > 1 ? 32 : 1)
 
-// One work-item per LANES points: reads where they are, writes their numbers of hits.
-kernel __attribute__((vec_type_hint(floats))) void pairs_count(
-    const uint n,                       // points
-    const uint radii,                   // 1 (all alike) or n
-    global const float *camera,         // (20) camera.h
-    global const float *point_radius,   // (radii)
-    global const float4 *point_camera,  // (N, 4) x, y, z, t
-    global const ushort4 *point_box,    // (N, 4) first x, first y, last x, last y
-    global uint *point_count)           // (N)
-{
-    const uint first = get_global_id(0) * LANES;
-    if (first >= n) return;
-    const uint count = min((uint)LANES, n - first);
-    const Camera cam = camera_load(camera);
-    const Footprints f =
-        footprints_load(&cam, first, count, radii, point_radius, point_camera, point_box);
-    ints hits = 0;
-    floats closeness, depth;
-    for (int row = 0; row < f.rows; row++)
-        for (int column = 0; column < f.columns; column++)
-            hits += footprints_hit(&cam, &f, column, row, &closeness, &depth) & 1;
-    int lane_hits[LANES];
-    LANES_INTO(lane_hits, hits);
-    for (uint j = 0; j < count; j++)
-        point_count[first + j] = lane_hits[j];
+// Reads the footprints of the points from `first` on, of which `count` exist; the others have empty
+// boxes.
+ALWAYS_INLINE Footprints footprints_load(
+    const Camera *cam,
+    const uint first,
+    const uint count,
+    const uint radii,
+    global const float *point_radius,
+    global const float4 *point_camera,
+    global const ushort4 *point_box) {
+    Footprints f;
+    float place[4][LANES], radius[LANES];
+    for (uint j = 0; j < LANES; j++) {
+        const uint i = first + min(j, count - 1);
+        const float4 at = point_camera[i];
+        const int4 box = j < count ? convert_int4(point_box[i]) : (int4)(1, 1, 0, 0);
+        place[0][j] = at.x;
+        place[1][j] = at.y;
+        place[2][j] = at.z;
+        place[3][j] = at.w;
+        radius[j] = point_radius[radii == 1 ? 0 : i];
+        f.box[0][j] = box.x;
+        f.box[1][j] = box.y;
+        f.box[2][j] = box.z;
+        f.box[3][j] = box.w;
+    }
+    f.x = LANES_FROM(place[0]);
+    f.y = LANES_FROM(place[1]);
+    f.z = LANES_FROM(place[2]);
+    f.t = LANES_FROM(place[3]);
+    f.radius = LANES_FROM(radius);
+    footprints_prepare(cam, &f);
+    return f;
 }
 
-// One work-item per LANES points: finds their hits again, writes them as pairs and counts them at
-// their pixels; does nothing where not all pairs have room.
+// One work-item per LANES points: finds their hits again (project.cl counted them), writes them as
+// pairs and counts them at their pixels; does nothing where not all pairs have room.
 kernel __attribute__((vec_type_hint(floats))) void pairs_fill(
     const uint n,                        // points
     const uint p,                        // pairs for which there is room

@@ -1,4 +1,4 @@
-// Points to camera axes, and which of them are left out.
+// Points to camera axes, which of them are left out, and how many pixels each one hits.
 #include "common.h"
 #include "camera.h"
 #include "grid.h"
@@ -42,20 +42,16 @@ ALWAYS_INLINE void tangents(
     *last = LANED(convert_int)(to + 2.0f) - 2 + round_last;
 }
 
-// Writes (x, y, z, t) in camera axes of `count` points in world axes, and the box of pixels that
-// each may hit. A point is left out, with (0, 0, 0, -1), if it is too near or too far (measured at
-// the sphere's front, as in Pulsar), behind the eye, or not finite, for which every comparison is
-// false.
-ALWAYS_INLINE void project(
+// Points in world axes to camera axes, each with the box of pixels that it may hit. A point is left
+// out, with (0, 0, 0, -1) and no pixel, if it is too near or too far (measured at the sphere's
+// front, as in Pulsar), behind the eye, or not finite, for which every comparison is false.
+ALWAYS_INLINE Footprints project(
     const Camera *cam,
     const floats x,
     const floats y,
     const floats z,
     const floats radius,
-    const ints wanted,
-    const uint count,
-    global float4 *point_camera,
-    global ushort4 *point_box) {
+    const ints wanted) {
     const floats vx = x - cam->eye.x, vy = y - cam->eye.y, vz = z - cam->eye.z;
     const floats cx = cam->right.x * vx + cam->right.y * vy + cam->right.z * vz;
     const floats cy = cam->down.x * vx + cam->down.y * vy + cam->down.z * vz;
@@ -75,25 +71,55 @@ ALWAYS_INLINE void project(
     y1 = min(y1, (ints)(cam->height - 1));
     const ints visible = kept & (x1 >= x0) & (y1 >= y0);
 
-    float place[4][LANES];
-    int box[4][LANES];
-    LANES_INTO(place[0], select((floats)(0.0f), cx, kept));
-    LANES_INTO(place[1], select((floats)(0.0f), cy, kept));
-    LANES_INTO(place[2], select((floats)(0.0f), cz, kept));
-    LANES_INTO(place[3], select((floats)(-1.0f), t, kept));
+    Footprints f;
+    f.x = select((floats)(0.0f), cx, kept);
+    f.y = select((floats)(0.0f), cy, kept);
+    f.z = select((floats)(0.0f), cz, kept);
+    f.t = select((floats)(-1.0f), t, kept);
+    f.radius = radius;
     // no pixel: last before first
-    LANES_INTO(box[0], select((ints)(1), x0, visible));
-    LANES_INTO(box[1], select((ints)(1), y0, visible));
-    LANES_INTO(box[2], select((ints)(0), x1, visible));
-    LANES_INTO(box[3], select((ints)(0), y1, visible));
+    LANES_INTO(f.box[0], select((ints)(1), x0, visible));
+    LANES_INTO(f.box[1], select((ints)(1), y0, visible));
+    LANES_INTO(f.box[2], select((ints)(0), x1, visible));
+    LANES_INTO(f.box[3], select((ints)(0), y1, visible));
+    footprints_prepare(cam, &f);
+    return f;
+}
+
+// The number of pixels that each point hits.
+ALWAYS_INLINE ints count_hits(const Camera *cam, const Footprints *f) {
+    ints hits = 0;
+    floats closeness, depth;
+    for (int row = 0; row < f->rows; row++)
+        for (int column = 0; column < f->columns; column++)
+            hits += footprints_hit(cam, f, column, row, &closeness, &depth) & 1;
+    return hits;
+}
+
+// Writes where `count` points are, their boxes and numbers of hits.
+ALWAYS_INLINE void store_points(
+    const Camera *cam,
+    const Footprints *f,
+    const uint count,
+    global float4 *point_camera,
+    global ushort4 *point_box,
+    global uint *point_count) {
+    float place[4][LANES];
+    int hits[LANES];
+    LANES_INTO(place[0], f->x);
+    LANES_INTO(place[1], f->y);
+    LANES_INTO(place[2], f->z);
+    LANES_INTO(place[3], f->t);
+    LANES_INTO(hits, count_hits(cam, f));
     for (uint j = 0; j < count; j++) {
         point_camera[j] = (float4)(place[0][j], place[1][j], place[2][j], place[3][j]);
-        point_box[j] = (ushort4)(box[0][j], box[1][j], box[2][j], box[3][j]);
+        point_box[j] = (ushort4)(f->box[0][j], f->box[1][j], f->box[2][j], f->box[3][j]);
+        point_count[j] = hits[j];
     }
 }
 
 // One work-item per LANES points: reads their grid indices, writes their camera-space positions and
-// distances, and their boxes.
+// distances, their boxes and numbers of hits.
 kernel __attribute__((vec_type_hint(floats))) void project_grid(
     const uint n,                      // points
     const uint dropout,                // a point is left out where its random uint is below this
@@ -103,7 +129,8 @@ kernel __attribute__((vec_type_hint(floats))) void project_grid(
     global const uint *point_id,       // (N)
     global const float *point_radius,  // (1) of every point
     global float4 *point_camera,       // (N, 4) x, y, z, t; t = -1: left out
-    global ushort4 *point_box)  // (N, 4) first x, first y, last x, last y; none where last < first
+    global ushort4 *point_box,  // (N, 4) first x, first y, last x, last y; none where last < first
+    global uint *point_count)   // (N)
 {
     const uint first = get_global_id(0) * LANES;
     if (first >= n) return;
@@ -119,9 +146,10 @@ kernel __attribute__((vec_type_hint(floats))) void project_grid(
         z[j] = position.z;
         wanted[j] = -(scramble(id + stream) >= dropout);
     }
-    project(
+    const Footprints f = project(
         &cam, LANES_FROM(x), LANES_FROM(y), LANES_FROM(z), (floats)(point_radius[0]),
-        LANES_FROM(wanted), count, point_camera + first, point_box + first);
+        LANES_FROM(wanted));
+    store_points(&cam, &f, count, point_camera + first, point_box + first, point_count + first);
 }
 
 // One work-item per LANES spheres: reads their positions and radii, writes the same as
@@ -133,7 +161,8 @@ kernel __attribute__((vec_type_hint(floats))) void project_spheres(
     global const float *positions,     // (N, 3) world
     global const float *point_radius,  // (radii)
     global float4 *point_camera,       // (N, 4) x, y, z, t; t = -1: left out
-    global ushort4 *point_box)  // (N, 4) first x, first y, last x, last y; none where last < first
+    global ushort4 *point_box,  // (N, 4) first x, first y, last x, last y; none where last < first
+    global uint *point_count)   // (N)
 {
     const uint first = get_global_id(0) * LANES;
     if (first >= n) return;
@@ -147,7 +176,7 @@ kernel __attribute__((vec_type_hint(floats))) void project_spheres(
         z[j] = positions[3 * i + 2];
         radius[j] = point_radius[radii == 1 ? 0 : i];
     }
-    project(
-        &cam, LANES_FROM(x), LANES_FROM(y), LANES_FROM(z), LANES_FROM(radius), (ints)(-1), count,
-        point_camera + first, point_box + first);
+    const Footprints f =
+        project(&cam, LANES_FROM(x), LANES_FROM(y), LANES_FROM(z), LANES_FROM(radius), (ints)(-1));
+    store_points(&cam, &f, count, point_camera + first, point_box + first, point_count + first);
 }

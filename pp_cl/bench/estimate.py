@@ -121,15 +121,16 @@ def _raster(config, counts):
     weights = table_bytes(blend.table(n, p, drops or raster.max_tracked > 0))
     weights += table_bytes(blend.own_table(counts.pixels, 0))
     return {
-        "project": Work(4 * n + projected, 16 * n, 1),
-        # found twice; every array is written once and read once, the keys sorted in two passes
+        # hits are counted, then found again
+        "project": Work(4 * n + projected, 16 * (2 * n + p), 1),
+        # every array is written once and read once, the keys sorted in two passes
         "pairs": Work(
-            2 * (projected + table_bytes(pairs) + keys),
-            32 * (n + p),
-            5 + 2 * (p > LONG_LIST) + _scans(n) + _scans(counts.pixels),
+            projected + 2 * (table_bytes(pairs) + keys),
+            16 * (n + p),
+            4 + 2 * (p > LONG_LIST) + _scans(n) + _scans(counts.pixels),
         ),
         # of each pair its key, its closeness and the opacity of its point
-        "weights": Work(weights + 20 * p + 4 * counts.pixels, 20 * p, 2 + drops + _scans(n)),
+        "weights": Work(weights + 20 * p + 4 * counts.pixels, 20 * p, 1 + drops + _lists(n)),
         "shade": Work(s * (4 + 16 + ROW * (coefficients + 1)), s * 16 * coefficients, 1),
         "blend": Work(p * (8 + ROW) + counts.pixels * (4 + ROW), 16 * p, 1),
     }
@@ -138,6 +139,11 @@ def _raster(config, counts):
 def _scans(n):
     """Launches of exclusive_scan() of n values on a GPU."""
     return 1 if n <= BLOCK_ON_GPU else 2 + _scans(-(-n // BLOCK_ON_GPU))
+
+
+def _lists(n):
+    """Launches of nonzero() of n values on a GPU."""
+    return 2 + _scans(-(-n // BLOCK_ON_GPU))
 
 
 def _maps(layers, counts):

@@ -120,14 +120,14 @@ class BenchScene(ABC):
         blended = p
         if result.weights.has_roles:
             blended -= int((result.weights.pair_role.get()[:p] == DROPPED).sum())
-        # of a point: place, box, number; of a pair: pixel, point and closeness, place or key
+        # of a point: place, box, first pair; of a pair: pixel, point and closeness, place or key
         search, pair = 16 + 8 + 4, 4 + 8 + 8
         roles = 2 * p + 6 * 4 * n if case.tau > 0 else 0
         alpha = case.blend == "alpha"
         rest = (8 + 8 + 4 + 4) * blended if alpha else 2 * ROW * hw
         return {
-            # find twice, scan, scatter, sort
-            "pairs": 2 * n * search + 5 * 4 * n + 2 * p * pair + 2 * 8 * p + 4 * 4 * hw,
+            # find, scan, scatter, sort
+            "pairs": n * search + 5 * 4 * n + 2 * p * pair + 2 * 8 * p + 4 * 4 * hw,
             "weights": (blended if alpha else p) * (8 + 8 + 8 + 8) + 4 * n + 4 * hw + roles,
             "blend": 8 * blended + ROW * shaded + (ROW + 4) * hw,
             "backward": p * (4 + 8) + ROW * shaded + (ROW + 8) * n + (ROW + 4) * hw + rest,
@@ -203,7 +203,7 @@ class GridScene(BenchScene):
     def moved_bytes(self, case: Case, result: RasterResult) -> dict[str, int]:
         """As BenchScene, with the stages of a grid and of harmonics."""
         shading = 4 + 16 + 9 * ROW + ROW
-        own = {"project": self.count * (4 + 16 + 8), "shade": result.shaded.size * shading}
+        own = {"project": self.count * (4 + 16 + 8 + 4), "shade": result.shaded.size * shading}
         return own | super().moved_bytes(case, result)
 
 
@@ -283,7 +283,7 @@ class PulsarScene(BenchScene):
         """As BenchScene, with the stages of spheres."""
         n, p, hw = self.count, result.pairs.total, self.size**2
         spheres = p * (4 + 8 + 8 + 8) + p * (4 + 8) + (ROW + 16 + 16) * n + 2 * (ROW + 4) * hw
-        own = {"project": n * (12 + 16 + 8), "spheres": spheres}
+        own = {"project": n * (12 + 16 + 8 + 4), "spheres": spheres}
         return own | super().moved_bytes(case, result)
 
 

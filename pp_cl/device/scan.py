@@ -19,27 +19,25 @@ def block_values(dev: Device) -> int:
     return BLOCK if dev.is_cpu else BLOCK_ON_GPU
 
 
-def exclusive_scan(dev: Device, values: Array, offsets: Array, flags: bool = False) -> None:
+def exclusive_scan(dev: Device, values: Array, offsets: Array) -> None:
     """Write offsets[i] = sum of values[:i], so that offsets[N] is the total; at most 2^32 - 1,
     where sums stay.
 
-    values: (N) uint32, N >= 1. offsets: (N+1) uint32. flags: every non-zero value counts as one.
+    values: (N) uint32, N >= 1. offsets: (N+1) uint32.
     """
-    _scan(dev, values, offsets, flags=flags, level=0)
+    _scan(dev, values, offsets, level=0)
 
 
-def _scan(dev, values, offsets, *, flags, level):
+def _scan(dev, values, offsets, level):
     """exclusive_scan() of the values or, from level 1 on, of sums of blocks."""
     n = values.size
     blocks = -(-n // block_values(dev))
-    program, (size, local) = _program(dev, flags), group_ranges(dev, blocks)
-    block_offset = scratch(dev, ("scan offset", level), blocks + 1, np.uint32)
-    if blocks == 1:
-        dev.fill(block_offset, 0)
+    if blocks > 1:
+        block_offset = _block_offsets(dev, values, blocks, flags=False, level=level)
     else:
-        block_sum = scratch(dev, ("scan sum", level), blocks, np.uint32)
-        program.launch("scan_sums", size, local, n=n, b=blocks, values=values, block_sum=block_sum)
-        _scan(dev, block_sum, block_offset, flags=False, level=level + 1)
+        block_offset = scratch(dev, ("scan offset", level), 2, np.uint32)
+        dev.fill(block_offset, 0)
+    program, (size, local) = _program(dev, flags=False), group_ranges(dev, blocks)
     program.launch(
         "scan_offsets",
         size,
@@ -50,6 +48,24 @@ def _scan(dev, values, offsets, *, flags, level):
         block_offset=block_offset,
         offsets=offsets,
     )
+
+
+def _block_offsets(dev, values, blocks, *, flags, level):
+    """(blocks + 1,) what sums to the values before each block, and to all of them. flags: every
+    non-zero value counts as one.
+    """
+    block_offset = scratch(dev, ("scan offset", level), blocks + 1, np.uint32)
+    block_sum = scratch(dev, ("scan sum", level), blocks, np.uint32)
+    _program(dev, flags).launch(
+        "scan_sums",
+        *group_ranges(dev, blocks),
+        n=values.size,
+        b=blocks,
+        values=values,
+        block_sum=block_sum,
+    )
+    _scan(dev, block_sum, block_offset, level + 1)
+    return block_offset
 
 
 def _program(dev, flags):
@@ -77,15 +93,21 @@ def read_total(dev: Device, offsets: Array) -> Reading:
     return read_later(dev, offsets, len(offsets) - 1)
 
 
-def nonzero(dev: Device, values: Array, offsets: Array, indices: Array) -> DeviceList:
+def nonzero(dev: Device, values: Array, indices: Array) -> DeviceList:
     """Where values are not zero, listed in the front of `indices`.
 
-    values: (N) uint32, N >= 1. offsets: (N+1) uint32 scratch, left holding each value's number.
-    indices: (N) uint32.
+    values: (N) uint32, N >= 1. indices: (N) uint32.
     """
     n = values.size
-    exclusive_scan(dev, values, offsets, flags=True)
+    blocks = -(-n // block_values(dev))
+    block_offset = _block_offsets(dev, values, blocks, flags=True, level=0)
     _program(dev, flags=True).launch(
-        "scan_nonzero", n, n=n, values=values, offsets=offsets, indices=indices
+        "scan_nonzero",
+        *group_ranges(dev, blocks),
+        n=n,
+        b=blocks,
+        values=values,
+        block_offset=block_offset,
+        indices=indices,
     )
-    return DeviceList(read_total(dev, offsets), indices)
+    return DeviceList(read_total(dev, block_offset), indices)

@@ -69,10 +69,10 @@ class BlendWeights(ABC):
             "pair_weight": ((pairs, 2), np.float32),
             "pair_role": ((pairs if has_roles else 1,), np.uint8),
             "pixel_entry": ((pairs,), np.uint64),
+            "shaded": ((n,), np.uint32),
         }
-        listing = {"point_place": ((n + 1,), np.uint32), "shaded": ((n,), np.uint32)}
         flags = {"point_is_shaded": ((n,), np.uint32)}
-        return always | listing | (flags if has_roles else {})
+        return always | (flags if has_roles else {})
 
     @classmethod
     @abstractmethod
@@ -178,7 +178,7 @@ class BlendWeights(ABC):
                 pair_role=pair_role,
                 point_is_shaded=has_hit,
             )
-        return nonzero(self.dev, has_hit, b.point_place, b.shaded)
+        return nonzero(self.dev, has_hit, b.shaded)
 
     def _shared(self, weights):
         return self.dev.program("raster/blend_weights", HAS_ROLES=int(weights.has_roles))

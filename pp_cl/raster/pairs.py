@@ -78,7 +78,6 @@ class PairBuilder:
     def table(n: int, pixels: int, pairs: int) -> Table:
         """The buffers for n points, a number of pixels and room for a number of pairs."""
         return {
-            "point_count": ((n,), np.uint32),
             "point_offset": ((n + 1,), np.uint32),
             "pixel_count": ((pixels,), np.uint32),
             "pixel_offset": ((pixels + 1,), np.uint32),
@@ -114,18 +113,22 @@ class PairBuilder:
 
     def enqueue(self, points: ProjectedPoints, size: tuple[int, int]) -> Pairs:
         """As build(), but without waiting, and perhaps without room."""
-        n, pixels, b, launch = len(points.point_box), size[0] * size[1], self._buffers, self._launch
+        n, pixels, b = len(points.point_box), size[0] * size[1], self._buffers
         capacity = max(1, self._capacity)
         b.require(self.table(n, pixels, capacity))
-        launch("pairs_count", n, points, point_count=b.point_count)
-        exclusive_scan(self.dev, b.point_count, b.point_offset)
+        exclusive_scan(self.dev, points.point_count, b.point_offset)
         count = read_total(self.dev, b.point_offset)
         self.dev.fill(b.pixel_count, 0)
-        launch(
+        self.program.launch(
             "pairs_fill",
-            n,
-            points,
+            -(-n // self._lanes),
+            n=n,
             p=capacity,
+            radii=points.point_radius.size,
+            camera=points.camera_buffer,
+            point_radius=points.point_radius,
+            point_camera=points.point_camera,
+            point_box=points.point_box,
             point_offset=b.point_offset,
             pair_pixel=b.pair_pixel,
             pair_point_closeness=b.pair_point_closeness,
@@ -144,9 +147,8 @@ class PairBuilder:
             pair_key=b.pair_key,
         )
         self._sort(pixels, capacity)
-        fields = ("point_count", "point_offset", "pixel_offset", "pair_pixel")
-        fields += ("pair_point_closeness", "pair_key")
-        return Pairs(count, **{name: getattr(b, name) for name in fields})
+        fields = ("point_offset", "pixel_offset", "pair_pixel", "pair_point_closeness", "pair_key")
+        return Pairs(count, points.point_count, **{name: getattr(b, name) for name in fields})
 
     def _sort(self, pixels, capacity):
         """Sort the keys of each pixel in place."""
@@ -166,17 +168,3 @@ class PairBuilder:
 
     def _merge(self, capacity, keys, **runs):
         self.program.launch("pairs_merge_runs", capacity, **keys, **runs)
-
-    def _launch(self, kernel, n, points, **arguments):
-        """Launch a kernel that walks over the pixels of each point's box."""
-        self.program.launch(
-            kernel,
-            -(-n // self._lanes),
-            n=n,
-            radii=points.point_radius.size,
-            camera=points.camera_buffer,
-            point_radius=points.point_radius,
-            point_camera=points.point_camera,
-            point_box=points.point_box,
-            **arguments,
-        )

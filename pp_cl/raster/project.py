@@ -42,12 +42,14 @@ class ProjectedPoints:
     camera_buffer: (20,) float32, cl/camera.h. point_camera: (N, 4) float32, x, y, z in camera axes
     and the distance from the eye; (0, 0, 0, -1) for a point that Pulsar's rule culls. point_box:
     (N, 4) uint16, first x, first y, last x, last y of the pixels that may be hit; last < first
-    means none. point_radius: (1,) or (N,) float32, world units.
+    means none. point_count: (N,) uint32, pixels that are hit. point_radius: (1,) or (N,) float32,
+    world units.
     """
 
     camera_buffer: Array
     point_camera: Array
     point_box: Array
+    point_count: Array
     point_radius: Array
 
 
@@ -62,7 +64,11 @@ class Projection:
     @staticmethod
     def table(n: int) -> Table:
         """The buffers for n points."""
-        return {"point_camera": ((n, 4), np.float32), "point_box": ((n, 4), np.uint16)}
+        return {
+            "point_camera": ((n, 4), np.float32),
+            "point_box": ((n, 4), np.uint16),
+            "point_count": ((n,), np.uint32),
+        }
 
     def grid(
         self,

@@ -70,8 +70,8 @@ def seen_points(dev: Device, positions: np.ndarray, camera: Camera) -> Projected
     towards = positions - camera.eye
     distance = np.linalg.norm(towards, axis=1)
     rows = np.column_stack([towards @ camera.pose[:, :3], distance]).astype(np.float32)
-    absent = dev.zeros((1,))
-    return ProjectedPoints(dev.upload(camera.packed((2.0, 6.0))), dev.upload(rows), absent, absent)
+    absent = (dev.zeros((1,)),) * 3
+    return ProjectedPoints(dev.upload(camera.packed((2.0, 6.0))), dev.upload(rows), *absent)
 
 
 def gradients(rng: np.random.Generator, n: int) -> np.ndarray:

@@ -106,7 +106,7 @@ def test_a_point_moves_these_bytes():
 
 def test_the_rasteriser_moves_these_bytes():
     work = step_work(preset("paper"), COUNTS)
-    assert work["project"].bytes == N * (4 + 16 + 8)
+    assert work["project"].bytes == N * (4 + 16 + 8 + 4)
     assert work["shade"].bytes == S * (4 + 16 + 10 * 64)
     assert work["blend"].bytes == P * (8 + 64) + 64 * 32 * (4 + 64)
     assert all(w.bytes > 0 and w.launches > 0 for w in work.values())
@@ -130,8 +130,8 @@ def test_a_report_is_a_table_to_paste(dev, monkeypatch):
     lines = report(dev, preset("tiny"), COUNTS, {"project": 0.25, "smooth": 3.0})
     assert dev.name in lines[0] and " 1 GB/s" in lines[0] and "1000 GFLOP/s" in lines[0]
     assert "tiny, 1000 points, 5000 hits and 400 shaded points in 32x64 pixels" in lines[1]
-    # 28 bytes a point at 1 GB/s, and a launch
-    assert lines[-2:] == ["| project | 0.25 | 0.033 |", "| smooth | 3 |  |"]
+    # 32 bytes a point at 1 GB/s, and a launch
+    assert lines[-2:] == ["| project | 0.25 | 0.037 |", "| smooth | 3 |  |"]
 
 
 def test_the_rates_are_measured(dev, monkeypatch):
