@@ -42,18 +42,6 @@ typedef LANED(uint) uints;
 #define MAX_LANES(v) LANED(max)(v)
 #endif
 
-// The bits of the lanes that are not 0, of a comparison.
-#if LANES == 16
-#define LANE_BITS(v)                                                                               \
-    (uint) or_int16(                                                                               \
-        (v) &                                                                                      \
-        (int16)(1, 2, 4, 8, 16, 32, 64, 128, 256, 512, 1024, 2048, 4096, 8192, 16384, 32768))
-#elif LANES == 4
-#define LANE_BITS(v) (uint) or_int4((v) & (int4)(1, 2, 4, 8))
-#else
-#define LANE_BITS(v) (uint)(v)
-#endif
-
 // A row of 16 channels has ROW_PARTS such vectors. Of a kernel with a work-item for each part of
 // each row, ROW_PART is the item's, get_global_id(0) / ROW_PARTS its row.
 #define ROW_PARTS (CHANNELS / LANES)

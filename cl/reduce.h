@@ -13,7 +13,6 @@
         return JOIN(v2.x, v2.y);                                                                   \
     }
 #define SUM(a, b) ((a) + (b))
-#define UNION(a, b) ((a) | (b))
 
 #define REDUCE4(name, T, JOIN)                                                                     \
     static inline T name(const T##4 v) {                                                           \
@@ -25,8 +24,6 @@ REDUCE16(sum16, float, SUM)
 REDUCE4(sum4, float, SUM)
 REDUCE16(max16, float, fmax)
 REDUCE16(max_int16, int, max)
-REDUCE16(or_int16, int, UNION)
-REDUCE4(or_int4, int, UNION)
 
 // Sum of the products of two 16-vectors.
 static inline float dot16(const float16 a, const float16 b) {

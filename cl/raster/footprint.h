@@ -25,7 +25,7 @@ static inline float least_focal(const Camera *cam) {
     return fmin(cam->fx, cam->fy);
 }
 
-// Those of LANES neighbouring points, one lane each.
+// The footprints of LANES neighbouring points, one lane each.
 typedef struct {
     floats x, y, z;     // centre, camera axes
     floats t;           // its distance from the eye
