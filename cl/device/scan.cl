@@ -2,16 +2,9 @@
 // uint is the largest uint.
 #include "group.h"
 
-#ifndef FLAGS
-#define FLAGS 0  // 1: every non-zero value counts as one
-#endif
 #ifndef BLOCK
 #define BLOCK 512  // values that GROUP work-items scan together: a million take two levels
 #endif
-
-static inline uint scan_value(const uint value) {
-    return FLAGS ? (value != 0) : value;
-}
 
 // GROUP work-items per block of BLOCK values: read them, write their sum.
 kernel void scan_sums(
@@ -24,10 +17,29 @@ kernel void scan_sums(
     const uint block = GROUP_ID;
     if (block >= b) return;
     const uint end = min(n, (block + 1) * BLOCK);
-    uint sum = 0, total;
+    ulong sum = 0;  // of at most BLOCK values; add_sat would keep CPUs from adding several at once
+    uint total;
     for (uint i = block * BLOCK + MEMBER; i < end; i += GROUP)
-        sum = add_sat(sum, scan_value(values[i]));
-    group_scan(sum, shared, &total);
+        sum += values[i];
+    group_scan((uint)min(sum, (ulong)UINT_MAX), shared, &total);
+    if (MEMBER == 0) block_sum[block] = total;
+}
+
+// GROUP work-items per block of BLOCK flags: read them, write how many are not zero.
+kernel void count_nonzero(
+    const uint n,               // flags
+    const uint b,               // blocks
+    global const uchar *flags,  // (N)
+    global uint *block_sum)     // (B)
+{
+    SHARED(uint, shared, 2 * GROUP);
+    const uint block = GROUP_ID;
+    if (block >= b) return;
+    const uint end = min(n, (block + 1) * BLOCK);
+    uint count = 0, total;
+    for (uint i = block * BLOCK + MEMBER; i < end; i += GROUP)
+        count += flags[i] != 0;
+    group_scan(count, shared, &total);
     if (MEMBER == 0) block_sum[block] = total;
 }
 
@@ -48,20 +60,20 @@ kernel void scan_offsets(
     for (uint first = block * BLOCK; first < end; first += GROUP) {
         const uint i = first + MEMBER;
         uint total;
-        const uint before = group_scan(i < end ? scan_value(values[i]) : 0, shared, &total);
+        const uint before = group_scan(i < end ? values[i] : 0, shared, &total);
         if (i < end) offsets[i] = add_sat(sum, before);
         sum = add_sat(sum, total);
     }
     if (MEMBER == 0 && block == b - 1) offsets[n] = sum;
 }
 
-// GROUP work-items per block of BLOCK values: read them and how many before the block are not zero,
+// GROUP work-items per block of BLOCK flags: read them and how many before the block are not zero,
 // write the indices of those that are not.
 kernel void scan_nonzero(
-    const uint n,                     // values
+    const uint n,                     // flags
     const uint b,                     // blocks
-    global const uint *values,        // (N)
-    global const uint *block_offset,  // (B+1) from scan_sums with FLAGS = 1
+    global const uchar *flags,        // (N)
+    global const uint *block_offset,  // (B+1) prefix sums of what count_nonzero wrote
     global uint *indices)             // (N); the first block_offset[b] are written
 {
     SHARED(uint, shared, 2 * GROUP);
@@ -70,7 +82,7 @@ kernel void scan_nonzero(
     const uint end = min(n, (block + 1) * BLOCK);
     uint listed = block_offset[block];
     for (uint first = block * BLOCK; first < end; first += GROUP) {
-        const uint i = first + MEMBER, found = i < end && values[i] != 0;
+        const uint i = first + MEMBER, found = i < end && flags[i] != 0;
         uint total;
         const uint before = group_scan(found, shared, &total);
         if (found) indices[listed + before] = i;

@@ -24,22 +24,19 @@ kernel void dropped_weights(
     pixel_dropped[q] = i < end ? as_float((uint)(pixel_entry[i] >> 32)) : 0.0f;
 }
 
-// One work-item per point: reads the roles of its pairs, writes how many are not dropped; not those
-// that have no room.
+// One work-item per pixel: marks the points of its hits that are not dropped. Pixels share points,
+// so some write the same 1 to the same place.
 kernel void find_shaded_points(
-    const uint n,                     // points
-    const uint p,                     // pairs for which there is room
-    global const uint *point_offset,  // (N+1)
-    global const uchar *pair_role,    // (P)
-    global uint *point_is_shaded)     // (N) 0: no
+    const uint hw,                    // pixels
+    global const uint *pixel_offset,  // (HW+1)
+    global const ulong *pixel_entry,  // (P) weight << 32 | point; no point: the list ends
+    global uchar *point_is_shaded)    // (N) 1: yes; not written: no
 {
-    const uint i = get_global_id(0);
-    if (i >= n) return;
-    uint count = 0;
-    const uint end = min(point_offset[i + 1], p);
-    for (uint pair = point_offset[i]; pair < end; pair++)
-        count += pair_role[pair] != DROPPED;
-    point_is_shaded[i] = count;
+    const uint q = get_global_id(0);
+    if (q >= hw) return;
+    const uint end = pixel_offset[q + 1];
+    for (uint i = pixel_offset[q]; i < end && (uint)pixel_entry[i] != NONE; i++)
+        point_is_shaded[(uint)pixel_entry[i]] = 1;
 }
 
 // One work-item per point: reads the weights of its pairs, keeps their sum if it is the highest so

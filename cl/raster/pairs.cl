@@ -109,13 +109,16 @@ kernel __attribute__((vec_type_hint(floats))) void pairs_fill(
 }
 
 // One work-item per pair: writes its key at its place. Bits of floats >= 0 sort like the floats.
+//
+// volatile: else compilers for AVX-512 write the keys of several pairs with one scatter
+// instruction, which takes five times as long where processors run it key by key.
 kernel void pairs_scatter(
     const uint p,                     // pairs for which there is room
     const uint hw,                    // pixels
     global const uint *pair_pixel,    // (P)
     global const ulong *pair_place,   // (P) depth << 32 | place in the list of the pixel
     global const uint *pixel_offset,  // (HW+1) first key of each pixel
-    global ulong *pair_key)           // (P) depth << 32 | pair, by pixel
+    global volatile ulong *pair_key)  // (P) depth << 32 | pair, by pixel
 {
     const uint pair = get_global_id(0);
     if (pair >= p || pair >= pixel_offset[hw]) return;

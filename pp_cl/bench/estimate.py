@@ -129,8 +129,8 @@ def _raster(config, counts):
             16 * (n + p),
             4 + 2 * (p > LONG_LIST) + _scans(n) + _scans(counts.pixels),
         ),
-        # of each pair its key, its closeness and the opacity of its point
-        "weights": Work(weights + 20 * p + 4 * counts.pixels, 20 * p, 1 + drops + _lists(n)),
+        # of each pair its key, its closeness, the opacity of its point, and its entry
+        "weights": Work(weights + 28 * p + 8 * counts.pixels, 20 * p, 2 + _lists(n)),
         "shade": Work(s * (4 + 16 + ROW * (coefficients + 1)), s * 16 * coefficients, 1),
         "blend": Work(p * (8 + ROW) + counts.pixels * (4 + ROW), 16 * p, 1),
     }

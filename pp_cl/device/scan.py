@@ -33,15 +33,13 @@ def _scan(dev, values, offsets, level):
     n = values.size
     blocks = -(-n // block_values(dev))
     if blocks > 1:
-        block_offset = _block_offsets(dev, values, blocks, flags=False, level=level)
+        block_offset = _block_offsets(dev, "scan_sums", n, blocks, level=level, values=values)
     else:
         block_offset = scratch(dev, ("scan offset", level), 2, np.uint32)
         dev.fill(block_offset, 0)
-    program, (size, local) = _program(dev, flags=False), group_ranges(dev, blocks)
-    program.launch(
+    _program(dev).launch(
         "scan_offsets",
-        size,
-        local,
+        *group_ranges(dev, blocks),
         n=n,
         b=blocks,
         values=values,
@@ -50,27 +48,18 @@ def _scan(dev, values, offsets, level):
     )
 
 
-def _block_offsets(dev, values, blocks, *, flags, level):
-    """(blocks + 1,) what sums to the values before each block, and to all of them. flags: every
-    non-zero value counts as one.
-    """
+def _block_offsets(dev, kernel, n, blocks, *, level, **entries):
+    """(blocks + 1,) prefix sums of what the kernel finds in each block of n entries."""
     block_offset = scratch(dev, ("scan offset", level), blocks + 1, np.uint32)
     block_sum = scratch(dev, ("scan sum", level), blocks, np.uint32)
-    _program(dev, flags).launch(
-        "scan_sums",
-        *group_ranges(dev, blocks),
-        n=values.size,
-        b=blocks,
-        values=values,
-        block_sum=block_sum,
-    )
+    ranges = group_ranges(dev, blocks)
+    _program(dev).launch(kernel, *ranges, n=n, b=blocks, block_sum=block_sum, **entries)
     _scan(dev, block_sum, block_offset, level + 1)
     return block_offset
 
 
-def _program(dev, flags):
-    macros = {"FLAGS": int(flags), "BLOCK": block_values(dev), "GROUP": group_items(dev)}
-    return dev.program("device/scan", **macros)
+def _program(dev):
+    return dev.program("device/scan", BLOCK=block_values(dev), GROUP=group_items(dev))
 
 
 class DeviceList:
@@ -93,20 +82,20 @@ def read_total(dev: Device, offsets: Array) -> Reading:
     return read_later(dev, offsets, len(offsets) - 1)
 
 
-def nonzero(dev: Device, values: Array, indices: Array) -> DeviceList:
-    """Where values are not zero, listed in the front of `indices`.
+def nonzero(dev: Device, flags: Array, indices: Array) -> DeviceList:
+    """Where flags are not zero, listed in the front of `indices`.
 
-    values: (N) uint32, N >= 1. indices: (N) uint32.
+    flags: (N) uint8, N >= 1. indices: (N) uint32.
     """
-    n = values.size
+    n = flags.size
     blocks = -(-n // block_values(dev))
-    block_offset = _block_offsets(dev, values, blocks, flags=True, level=0)
-    _program(dev, flags=True).launch(
+    block_offset = _block_offsets(dev, "count_nonzero", n, blocks, level=0, flags=flags)
+    _program(dev).launch(
         "scan_nonzero",
         *group_ranges(dev, blocks),
         n=n,
         b=blocks,
-        values=values,
+        flags=flags,
         block_offset=block_offset,
         indices=indices,
     )

@@ -59,7 +59,7 @@ class Alpha(BlendWeights):
             pixel_entry=pixel_entry,
             transmittance=self._buffers.transmittance,
         )
-        shaded = self._list_shaded(pairs, pair_role if least > 0 else None)
+        shaded = self._list_shaded(pairs, pixel_entry)
         transmittance = self._buffers.transmittance[: pairs.pixels]
         return PixelWeights(has_roles, pair_weight, pair_role, pixel_entry, shaded, transmittance)
 

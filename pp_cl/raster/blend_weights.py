@@ -65,14 +65,13 @@ class BlendWeights(ABC):
     @staticmethod
     def table(n: int, pairs: int, has_roles: bool) -> Table:
         """The buffers for n points and room for a number of pairs. has_roles: see PixelWeights."""
-        always = {
+        return {
             "pair_weight": ((pairs, 2), np.float32),
             "pair_role": ((pairs if has_roles else 1,), np.uint8),
             "pixel_entry": ((pairs,), np.uint64),
+            "point_is_shaded": ((n,), np.uint8),
             "shaded": ((n,), np.uint32),
         }
-        flags = {"point_is_shaded": ((n,), np.uint32)}
-        return always | (flags if has_roles else {})
 
     @classmethod
     @abstractmethod
@@ -164,21 +163,19 @@ class BlendWeights(ABC):
             point_looks=point_looks,
         )
 
-    def _list_shaded(self, pairs, pair_role):
-        """The points with a hit that is not dropped; with any hit where pair_role is None."""
-        n, b, has_hit = pairs.points, self._buffers, pairs.point_count
-        if pair_role is not None:
-            has_hit = b.point_is_shaded
-            self.dev.program("raster/blend_weights").launch(
-                "find_shaded_points",
-                n,
-                n=n,
-                p=pairs.capacity,
-                point_offset=pairs.point_offset,
-                pair_role=pair_role,
-                point_is_shaded=has_hit,
-            )
-        return nonzero(self.dev, has_hit, b.shaded)
+    def _list_shaded(self, pairs, pixel_entry):
+        """The points with a hit that is not dropped."""
+        b = self._buffers
+        self.dev.fill(b.point_is_shaded, 0)
+        self.dev.program("raster/blend_weights").launch(
+            "find_shaded_points",
+            pairs.pixels,
+            hw=pairs.pixels,
+            pixel_offset=pairs.pixel_offset,
+            pixel_entry=pixel_entry,
+            point_is_shaded=b.point_is_shaded,
+        )
+        return nonzero(self.dev, b.point_is_shaded, b.shaded)
 
     def _shared(self, weights):
         return self.dev.program("raster/blend_weights", HAS_ROLES=int(weights.has_roles))

@@ -60,7 +60,7 @@ class Softmax(BlendWeights):
             pair_role=pair_role,
             pixel_entry=pixel_entry,
         )
-        shaded = self._list_shaded(pairs, pair_role if drops else None)
+        shaded = self._list_shaded(pairs, pixel_entry)
         return PixelWeights(has_roles, pair_weight, pair_role, pixel_entry, shaded)
 
     def rest_or_gain(

@@ -25,10 +25,10 @@ def _scan(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
 
 def _nonzero(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
     for n in (*SIZES, block_values(dev) + 1):
-        values = rng.integers(1, 9, n, dtype=np.uint32) * (rng.random(n) < 0.3)
+        flags = rng.integers(1, 256, n) * (rng.random(n) < 0.3)
         indices = dev.empty((n,), np.uint32)
-        listed = nonzero(dev, dev.upload(values, np.uint32), indices)
-        yield exact(listed.array.get(), np.flatnonzero(values))
+        listed = nonzero(dev, dev.upload(flags, np.uint8), indices)
+        yield exact(listed.array.get(), np.flatnonzero(flags))
 
 
 def _compact(dev: Device, rng: np.random.Generator) -> Iterator[Check]:

@@ -24,10 +24,10 @@ def test_exclusive_scan(dev, rng, n):
 @pytest.mark.parametrize("n", SIZES)
 @pytest.mark.parametrize("share", [0.0, 0.3, 1.0])
 def test_nonzero(dev, rng, n, share):
-    values = rng.integers(1, 9, n, dtype=np.uint32) * (rng.random(n) < share).astype(np.uint32)
+    flags = rng.integers(1, 256, n).astype(np.uint8) * (rng.random(n) < share).astype(np.uint8)
     indices = dev.empty((n,), np.uint32)
-    listed = nonzero(dev, dev.upload(values), indices)
-    assert np.array_equal(listed.array.get(), np.flatnonzero(values))
+    listed = nonzero(dev, dev.upload(flags), indices)
+    assert np.array_equal(listed.array.get(), np.flatnonzero(flags))
 
 
 def test_values_are_summed_exactly_up_to_32_bits(dev):
