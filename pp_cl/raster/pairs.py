@@ -27,7 +27,7 @@ class Pairs:
     P is what there was room for: where there are more pairs, there are none of the pixels, and
     those of the points must not be read.
 
-    count: of one number, how many pairs there are. point_count: (N,) uint32, pairs of each point.
+    count: of one number, how many pairs there are.
     point_offset: (N+1,) uint32, point i owns pairs point_offset[i] to point_offset[i+1].
     pixel_offset: (HW+1,) uint32, pixel q owns keys pixel_offset[q] to pixel_offset[q+1].
     pair_pixel: (P,) uint32, y*W + x. pair_point_closeness: (P, 2) uint32, the point, and the bits
@@ -36,7 +36,6 @@ class Pairs:
     """
 
     count: Reading
-    point_count: Array
     point_offset: Array
     pixel_offset: Array
     pair_pixel: Array
@@ -148,7 +147,7 @@ class PairBuilder:
         )
         self._sort(pixels, capacity)
         fields = ("point_offset", "pixel_offset", "pair_pixel", "pair_point_closeness", "pair_key")
-        return Pairs(count, points.point_count, **{name: getattr(b, name) for name in fields})
+        return Pairs(count, **{name: getattr(b, name) for name in fields})
 
     def _sort(self, pixels, capacity):
         """Sort the keys of each pixel in place."""

@@ -69,7 +69,7 @@ class PairedPoints:
     @property
     def seen(self) -> np.ndarray:
         """(?,) the points with a pair, ascending."""
-        return np.flatnonzero(self.pairs.point_count.get())
+        return np.flatnonzero(np.diff(self.pairs.point_offset.get()))
 
     def pair_points(self) -> np.ndarray:
         """(P,) the point of each pair, from the offsets alone."""
