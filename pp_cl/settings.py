@@ -66,7 +66,7 @@ class RasterConfig:
         choices=("soft", "disc", "sphere"),
     )
     radius: float = setting(
-        0.75,
+        1.0,
         "soft: in point spacings; disc, sphere: in world units at a depth range of 4",
         1e-6,
         100,
@@ -157,8 +157,9 @@ class TrainConfig:
     )
     mask_weight: float = setting(
         0.5,
-        "adds this times the mean square by which the rendered alpha exceeds the photograph's to"
-        " the loss, with raster.blend=alpha and photographs that have masks (0: off)",
+        "adds this times the mean square by which the rendered alpha differs from the"
+        " photograph's to the loss, where it is too low by a weight that rises from 0 at the first"
+        " step, with raster.blend=alpha and photographs that have masks (0: off)",
         0,
         1e3,
     )

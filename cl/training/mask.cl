@@ -1,10 +1,10 @@
-// The mask term of the loss: weight * mean max(a - m, 0)^2 of the rendered alpha a = 1 - T and the
-// photograph's alpha m. Only what exceeds the mask counts: the points in front of the hull fill it
-// anyway, and would be held there.
+// The mask term of the loss: weight * mean of (a - m)^2 of the rendered alpha a = 1 - T and the
+// photograph's alpha m, where a < m times `shortfall`: at first the points in front of the hull
+// fill the mask, and would be held there.
 #include "group.h"
 
 // GROUP work-items per row of the padded image: write dL/da, 0 outside of the target, and the sum
-// of the row's squares.
+// of the row's weighted squares.
 kernel void mask_gradient(
     const uint ph,  // padded image
     const uint pw,
@@ -13,6 +13,7 @@ kernel void mask_gradient(
     const uint left,  // of the target in the padded image
     const uint top,
     const float weight,
+    const float shortfall,
     global const float *transmittance,  // (PHW) T
     global const float *target_alpha,   // (H, W) m
     global float *grad_alpha,           // (PHW)
@@ -28,10 +29,10 @@ kernel void mask_gradient(
         const uint q = y * pw + x;
         float difference = 0.0f;
         if (inside && x >= left && x < left + w)
-            difference =
-                fmax(1.0f - transmittance[q] - target_alpha[(y - top) * w + x - left], 0.0f);
-        grad_alpha[q] = scale * difference;
-        sum += difference * difference;
+            difference = 1.0f - transmittance[q] - target_alpha[(y - top) * w + x - left];
+        const float weighted = difference < 0.0f ? shortfall * difference : difference;
+        grad_alpha[q] = scale * weighted;
+        sum += weighted * difference;
     }
     sum = group_sum(sum, shared);
     if (MEMBER == 0) row_term[y] = sum;

@@ -85,8 +85,10 @@ def _equal_images(dev, image):
 
 
 def _mask_loss(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
-    """weight * mean max(alpha - mask, 0)^2 of a part of the image; nothing outside of it."""
-    weight, width, left, top = 0.7, 29, 3, 1
+    """weight * mean (alpha - mask)^2 of a part of the image, where alpha is too low times the
+    shortfall's weight; nothing outside of it.
+    """
+    weight, shortfall, width, left, top = 0.7, 0.3, 29, 3, 1
     for side in SIZES:
         size, inside = (side + 3, 36), np.s_[top : top + side, left : left + width]
         transmittance, mask = rng.random(size), rng.random((side, width))
@@ -96,12 +98,14 @@ def _mask_loss(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
             dev.upload(mask, np.float32),
             size=size,
             offset=(left, top),
+            shortfall=shortfall,
             terms=terms,
         )
-        excess = np.maximum(1 - transmittance[inside] - mask, 0)
-        yield relative(terms.get(), [1 + weight * np.mean(excess**2), 2, 3, 4], 8 * EPS)
+        difference = 1 - transmittance[inside] - mask
+        weighted = np.where(difference < 0, shortfall, 1) * difference
+        yield relative(terms.get(), [1 + weight * np.mean(weighted * difference), 2, 3, 4], 8 * EPS)
         expected = np.zeros(size)
-        expected[inside] = 2 * weight * excess / mask.size
+        expected[inside] = 2 * weight * weighted / mask.size
         yield relative(grad.get().reshape(size), expected, 8 * EPS)
 
 

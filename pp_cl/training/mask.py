@@ -1,4 +1,4 @@
-"""The mask term of the loss: the rendered alpha should not exceed the photograph's."""
+"""The mask term of the loss: the rendered alpha should be the photograph's."""
 
 import numpy as np
 from pyopencl.array import Array
@@ -10,10 +10,11 @@ from pp_cl.device.transfer import Reading, read_later
 
 
 class MaskLoss:
-    """Adds weight * mean max(alpha - mask, 0)^2 to a loss, for blends with a transmittance (alpha
+    """Adds weight * mean (alpha - mask)^2 to a loss, for blends with a transmittance (alpha
     compositing). At weight 0 it allocates nothing and adds nothing.
 
-    Without it points spread half a spacing beyond the outline, and the network hides them.
+    Without it points spread half a spacing beyond the outline, and the network hides them; what
+    looks like the white that it paints over stays transparent.
     """
 
     def __init__(self, dev: Device, weight: float):
@@ -35,6 +36,7 @@ class MaskLoss:
         *,
         size: tuple[int, int],
         offset: tuple[int, int],
+        shortfall: float,
         terms: Array,
     ) -> Array | None:
         """Adds the term to terms[0]; returns dL/dalpha (PH * PW,) float32, valid until the next
@@ -42,14 +44,13 @@ class MaskLoss:
 
         transmittance: (PH * PW,) of the padded image, None for a blend that has none. target_alpha:
         (H, W) in [0, 1], None for a photograph without mask. size: (PH, PW). offset: (left, top) of
-        the target in it.
+        the target in it. shortfall: 0 to 1, weight of pixels whose alpha is below the mask.
         """
         self._measured = self.weight > 0 and transmittance is not None and target_alpha is not None
         if not self._measured:
             return None
         (height, width), (h, w), (left, top) = size, target_alpha.shape, offset
-        buffers = self._buffers
-        buffers.require(self.table(height, width))
+        (buffers := self._buffers).require(self.table(height, width))
         program = self.dev.program("training/mask", GROUP=group_items(self.dev))
         program.launch(
             "mask_gradient",
@@ -61,6 +62,7 @@ class MaskLoss:
             left=left,
             top=top,
             weight=self.weight,
+            shortfall=shortfall,
             transmittance=transmittance,
             target_alpha=target_alpha,
             grad_alpha=buffers.grad_alpha,
