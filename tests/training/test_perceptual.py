@@ -184,6 +184,7 @@ def test_a_training_with_it_lowers_it(scene, tmp_path, monkeypatch, weights):
     monkeypatch.setattr("pp_cl.metrics.lpips.load_weights", lambda: weights)
     ends, slowly = {}, {"network__blocks": "double", "network__residual": "false"}
     slowly |= {"train__mask_weight": 0, "train__smooth_l1": 0, "train__spread_weight": 0}
+    slowly["raster__radius"] = 0.75
     for weight in (1e-9, 0.1):
         out = tmp_path / str(weight)
         assert main(arguments(scene, out, **slowly, train__perceptual_weight=weight)) == 0
