@@ -21,7 +21,7 @@ from pp_cl.training.perceptual import PerceptualLoss
 from pp_cl.training.point_state import PointState
 from pp_cl.training.prune import judge, keep_indices
 from pp_cl.training.refine import refine
-from pp_cl.training.schedule import ema_weight, gamma_at, refine_steps, rising
+from pp_cl.training.schedule import ema_weight, gamma_at, refine_steps, rising_weight
 from pp_cl.training.smooth import Smoother
 from pp_cl.training.terms import StepTerms
 
@@ -131,7 +131,7 @@ class Trainer:
             target_alpha,
             size=rendered.features.shape[:2],
             offset=rendered.offset,
-            shortfall=rising(self.step, self.config.iterations),
+            shortfall=rising_weight(self.step, self.config.iterations),
             terms=self.loss.terms,
         )
         return grad_image, grad_alpha
@@ -141,7 +141,7 @@ class Trainer:
         if not self._composited:
             return 0.0
         config = self.config
-        mean = rising(self.step, config.iterations, config.spread_weight)
+        mean = rising_weight(self.step, config.iterations, config.spread_weight)
         return mean / (pixels * self.model.grid.diagonal)
 
     def draw(

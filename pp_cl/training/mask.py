@@ -11,7 +11,8 @@ from pp_cl.device.transfer import Reading, read_later
 
 class MaskLoss:
     """Adds weight * mean (alpha - mask)^2 to a loss, for blends with a transmittance (alpha
-    compositing). At weight 0 it allocates nothing and adds nothing.
+    compositing); pixels whose alpha is below the mask count less where a call says so. At weight 0
+    it allocates nothing and adds nothing.
 
     Without it points spread half a spacing beyond the outline, and the network hides them; what
     looks like the white that it paints over stays transparent.
@@ -50,7 +51,7 @@ class MaskLoss:
         if not self._measured:
             return None
         (height, width), (h, w), (left, top) = size, target_alpha.shape, offset
-        (buffers := self._buffers).require(self.table(height, width))
+        self._buffers.require(self.table(height, width))
         program = self.dev.program("training/mask", GROUP=group_items(self.dev))
         program.launch(
             "mask_gradient",
@@ -65,8 +66,8 @@ class MaskLoss:
             shortfall=shortfall,
             transmittance=transmittance,
             target_alpha=target_alpha,
-            grad_alpha=buffers.grad_alpha,
-            row_term=buffers.row_term,
+            grad_alpha=self._buffers.grad_alpha,
+            row_term=self._buffers.row_term,
         )
         program.launch(
             "mask_sum",
@@ -74,11 +75,11 @@ class MaskLoss:
             ph=height,
             pixels=h * w,
             weight=self.weight,
-            row_term=buffers.row_term,
-            mean=buffers.mean,
+            row_term=self._buffers.row_term,
+            mean=self._buffers.mean,
             terms=terms,
         )
-        return buffers.grad_alpha
+        return self._buffers.grad_alpha
 
     def terms(self) -> dict[str, Reading]:
         """{"mask": the mean square of the last call of add()}, {} where there was none."""

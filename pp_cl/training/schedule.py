@@ -41,7 +41,7 @@ def gamma_at(step: int, steps: int, first: float = 0.1, last: float = 0.01) -> f
     return learning_rate(step, steps, first, last)
 
 
-def rising(step: int, steps: int, last: float = 1.0) -> float:
+def rising_weight(step: int, steps: int, last: float = 1.0) -> float:
     """A weight that rises linearly from 0 to `last`: the spread's and that of alphas below the
     mask, as there is no surface yet to be made sharp or opaque at first.
     """

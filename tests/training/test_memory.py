@@ -23,7 +23,6 @@ from pp_cl.training.memory import Moment, Plan, Sketch, memory_plan, plan_lines
 from pp_cl.training.point_state import PointState
 
 POINTS = 27_000
-ESTIMATE = 1.04  # so far the plan may be off, for the hits that views have
 PAPER_POINTS = 4_040_533  # lego, supplemental Table 4
 WAYS = [
     {},
@@ -93,7 +92,7 @@ def test_the_plan_is_what_a_training_takes(dev, tmp_path, monkeypatch, changes):
     points = trainer.model.cloud.count
     blocks = trainer.model.cloud.blocks
     assert plan.peak.points == points and 0.8 * POINTS < points <= POINTS
-    assert peak / ESTIMATE < plan.peak.device < ESTIMATE * peak
+    assert 0.96 * peak < plan.peak.device < 1.04 * peak
     held = sum(
         a.nbytes for a in (trainer.model.cloud.arrays(dev) | trainer.state.arrays()).values()
     )
@@ -108,7 +107,7 @@ def test_the_plan_is_what_a_training_takes(dev, tmp_path, monkeypatch, changes):
 def test_pruning_stays_within_the_plan(dev, tmp_path, monkeypatch):
     monkeypatch.setattr("pp_cl.device.compact.SCRATCH_BYTES", 10**6)
     others = dev.bytes  # what fixtures of other tests hold
-    trainer, plan, _ = trained(dev, tmp_path / "ball", {})
+    trainer, plan, _ = trained(dev, tmp_path / "ball", {"raster.radius": "0.75"})
     pruning = table_bytes(compact_table(POINTS, 192))
     assert pruning == POINTS * 4 + 10**6
     before, dev.peak_bytes = dev.bytes, dev.bytes
@@ -117,7 +116,7 @@ def test_pruning_stays_within_the_plan(dev, tmp_path, monkeypatch):
     trainer.prune()
     assert trainer.model.cloud.count == POINTS - 1
     assert dev.peak_bytes <= before + 10**6 + 2 * 4 * POINTS  # the weights and the list of the kept
-    assert dev.peak_bytes - others <= ESTIMATE * plan.peak.device + pruning
+    assert dev.peak_bytes - others <= plan.peak.device + pruning
 
 
 def test_the_papers_scale_fits_six_gibibytes(dev, tmp_path):

@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from pp_cl.training.schedule import ema_weight, gamma_at, learning_rate, rising
+from pp_cl.training.schedule import ema_weight, gamma_at, learning_rate, rising_weight
 
 SH_RATES = [
     (
@@ -47,7 +47,7 @@ def test_gamma():
 
 
 def test_the_spread_weight_rises_from_nothing():
-    weights = [rising(step, 200, 3.0) for step in range(200)]
+    weights = [rising_weight(step, 200, 3.0) for step in range(200)]
     assert weights[0] == 0 and weights[100] == pytest.approx(1.5) and max(weights) < 3
     np.testing.assert_allclose(np.diff(weights), 3 / 200)
 
