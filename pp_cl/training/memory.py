@@ -130,7 +130,8 @@ class Sketch:
         """The same with points on a grid, seen from the middle of the depth range."""
         camera = _largest([one.camera for one in self.photographs])
         middle = sum(depth_range) / 2
-        # footprints grow by 1 / (z^2 cos) nearer by and off the axis: the mean over a cube, to second order
+        # footprints grow by 1 / (z^2 cos) nearer by and off the axis: the mean over a cube, to
+        # second order
         growth = 1 + (grid.diagonal / middle) ** 2 / 9
         spacing = grid.edge * camera.fx / middle * math.sqrt(growth)
         return replace(self, points=points, spacing=spacing, layers=grid.dims[2], step=step)
