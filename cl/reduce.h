@@ -23,7 +23,6 @@
 REDUCE16(sum16, float, SUM)
 REDUCE4(sum4, float, SUM)
 REDUCE16(max16, float, fmax)
-REDUCE16(max_int16, int, max)
 
 // Sum of the products of two 16-vectors.
 static inline float dot16(const float16 a, const float16 b) {

@@ -20,7 +20,7 @@ from pp_cl.files.contact_sheet import write_comparison
 from pp_cl.files.image import to_8bit, write_png
 from pp_cl.files.run_folder import MASKS_PICTURE, RunFolder
 from pp_cl.info import picture
-from pp_cl.layers.policy import load_policy, policy_of_run
+from pp_cl.layers.choice import load_policy, policy_of_run
 from pp_cl.metrics.psnr_ssim import psnr
 from pp_cl.model import Model
 from pp_cl.network.unet import UNet

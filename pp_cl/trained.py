@@ -15,7 +15,7 @@ from pp_cl.device.discover import open_device
 from pp_cl.errors import UserError
 from pp_cl.files.picture import Picture, mean_picture
 from pp_cl.files.run_folder import RunFolder
-from pp_cl.layers.policy import ConvolutionPolicy, load_policy
+from pp_cl.layers.choice import ConvolutionPolicy, load_policy
 from pp_cl.model import Model
 from pp_cl.network.unet import UNet
 from pp_cl.render import Renderer

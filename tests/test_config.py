@@ -10,7 +10,7 @@ import pytest
 
 from pp_cl.config import Config, assign, configure, help_lines, load_config, preset, validate
 from pp_cl.errors import UserError
-from pp_cl.network.architectures import convolutions, unet_layers
+from pp_cl.network.layers import convolutions, unet_layers
 from pp_cl.presets import ABSENT, PRESETS, RENAMED
 
 

@@ -24,7 +24,7 @@ from pp_cl.errors import UserError
 from pp_cl.evaluate import evaluate_run
 from pp_cl.files.atomic import write_json
 from pp_cl.files.run_folder import RunFolder
-from pp_cl.network.architectures import BLOCKS, convolutions, unet_layers
+from pp_cl.network.layers import BLOCKS, convolutions, unet_layers
 from pp_cl.run import train_scene
 from pp_cl.sweep.plan import Job, plan, read_seeds, read_varied
 from pp_cl.sweep.result import finished_row

@@ -17,9 +17,7 @@ from pp_cl.commands.options import read_shape
 from pp_cl.device.discover import open_device
 from pp_cl.errors import UserError
 from pp_cl.files.atomic import write_json
-from pp_cl.layers.policy import AUTO, make_policy
-from pp_cl.layers.variants import VARIANTS
-from pp_cl.network.layer import Conv, Pool
+from pp_cl.layers.choice import AUTO, VARIANTS, make_policy
 
 # Seconds before each timed call. OpenMP's threads go on spinning for some milliseconds after
 # PyTorch is done, on cores that our device's threads need.
@@ -53,13 +51,13 @@ class TorchNetwork:
             source = outputs[layer.inputs[0]]
             if len(layer.inputs) > 1:
                 source = self.torch.cat([outputs[name] for name in layer.inputs], 1)
-            if isinstance(layer, Conv):
+            if layer.kind == "conv":
                 weight = self.parameters[layer.name + ".weight"]
                 bias = self.parameters[layer.name + ".bias"]
                 out = functional.conv2d(source, weight, bias, padding=layer.kernel_size // 2)
                 if layer.relu:
                     out = functional.relu(out, inplace=True)
-            elif isinstance(layer, Pool):
+            elif layer.kind == "pool":
                 out = functional.avg_pool2d(source, 2)
             else:
                 out = functional.interpolate(

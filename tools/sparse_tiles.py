@@ -20,7 +20,7 @@ from pp_cl.commands.options import read_shape
 from pp_cl.device.discover import open_device
 from pp_cl.errors import UserError
 from pp_cl.files.atomic import write_json
-from pp_cl.layers.policy import make_policy
+from pp_cl.layers.choice import make_policy
 from pp_cl.layers.tiles import tiles_find
 from pp_cl.render import Renderer
 from pp_cl.scene.target import Target

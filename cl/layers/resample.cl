@@ -1,7 +1,6 @@
-// The layers between convolutions, on (H, W, C) feature maps: pooling, bilinear upsampling, an
-// affine map (scale * x + offset). In all but the affine map a work-item is (LANES channels, x, y):
-// one vector of a pixel, shorter at the last channels. It writes where its tile is computed
-// (tiles.h); max pooling writes everywhere.
+// The layers between convolutions, on (H, W, C) feature maps: pooling, bilinear upsampling. A
+// work-item is (LANES channels, x, y): one vector of a pixel, shorter at the last channels. It
+// writes where its tile is computed (tiles.h); max pooling writes everywhere.
 //
 // vec_type_hint: the vectors are written out; Intel's compiler would merge work-items into wider
 // ones.
@@ -176,17 +175,4 @@ kernel __attribute__((vec_type_hint(floats))) void upsample2_backward(
         dL_dx += (dy == 0 || dy == 3 ? 0.25f : 0.75f) * (0.25f * outer + 0.75f * inner);
     }
     store_lanes(dL_dx, grad_x + ((size_t)row * w + column) * c + first, count);
-}
-
-// One work-item per element: reads x, writes scale * x + offset.
-kernel __attribute__((vec_type_hint(floats))) void affine(
-    const uint n,
-    const float scale,
-    const float offset,
-    global const float *x,  // (...)
-    global float *out)      // (...)
-{
-    const uint i = get_global_id(0);
-    if (i >= n) return;
-    out[i] = scale * x[i] + offset;
 }

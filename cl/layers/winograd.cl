@@ -51,7 +51,7 @@ ALWAYS_INLINE void multiply(
                         float16 wc[BLOCKS];
 #pragma unroll
                         for (int b = 0; b < BLOCKS; b++)
-                            wc[b] = LOAD_WEIGHT(transformed, weight + b * ci + c);
+                            wc[b] = transformed[weight + b * ci + c];
 #pragma unroll
                         for (int i = 0; i < GROUP; i++)
 #pragma unroll
@@ -64,7 +64,7 @@ ALWAYS_INLINE void multiply(
 #pragma unroll
                     for (int i = 0; i < GROUP; i++)
                         m[position * PITCH(blocks * 16) + (block + b) * TILES + tile + i] =
-                            HALF ? acc[b][i] * transformed[block + b] : acc[b][i];
+                            acc[b][i];
             }
 }
 
@@ -129,7 +129,7 @@ ALWAYS_INLINE void convolve(
     global float16 *m = v + POSITIONS * PITCH(ci);
     global float *patch = (global float *)(m + POSITIONS * PITCH(co));
 
-    const int tiles = tile_list[2] * PER_SIDE * PER_SIDE;
+    const int tiles = tile_list[2];
     const int share = (tiles + get_global_size(0) - 1) / get_global_size(0);
     const int rounds = (share + TILES - 1) / TILES;  // of about the same size
     const int step = ((share + rounds - 1) / rounds + GROUP - 1) / GROUP * GROUP;

@@ -1,34 +1,134 @@
-// Winograd's convolutions on CPUs: tiles of 16 channels a vector, transformed in a slice of scratch
-// memory for each compute unit.
+// Winograd's minimal filtering F(4 x 4, 3 x 3) on CPUs (Lavin and Gray 2016, arXiv 1509.09308): tiles of
+// 16 channels a vector, transformed in a slice of scratch memory for each compute unit.
+//
+// Along one line, M = 4 outputs y of a kernel w over S = 6 samples d are a product of polynomials,
+// evaluated at S points: y = A^T [(G w) o (B^T d)]. The functions below apply one matrix to S or
+// fewer values `step` apart, in place: along a tile's columns, then its rows.
+//
+// Points: 0, -P, P, -Q, Q, infinity, where P = 3/4 and Q = 3/2 halve the float32 error of the usual 1
+// and 2 and are exact in binary (cf. Barabasz et al. 2020, arXiv 1803.10986).
 #ifndef PP_WINOGRAD_H
 #define PP_WINOGRAD_H
-#include "layers/winograd_transforms.h"
+#include "common.h"
+#include "layers/tiles.h"
 
 #ifndef TILES
 #define TILES 64  // tiles transformed and multiplied at a time
 #endif
-#ifndef HALF
-// 1: transformed weights are stored as half (IEEE 754's 16 bits) and computed with as float
-#define HALF 0
-#endif
+#define WINO_M SIDE          // side of a tile of outputs
+#define WINO_S (WINO_M + 2)  // side of a tile of inputs
+#define POSITIONS (WINO_S * WINO_S)
+
+#define POINT_P 0.75f
+#define POINT_Q 1.5f
+#define POINT_P2 (POINT_P * POINT_P)
+#define POINT_Q2 (POINT_Q * POINT_Q)
+#define NORM_0 (1 / (POINT_P2 * POINT_Q2))  // 1 / product of the distances of a point to the others
+#define NORM_P (1 / (2 * POINT_P2 * (POINT_P2 - POINT_Q2)))
+#define NORM_Q (1 / (2 * POINT_Q2 * (POINT_Q2 - POINT_P2)))
+
+// B^T: S samples -> S values.
+ALWAYS_INLINE void transform_input(float16 *t, const int step) {
+    const float16 d0 = t[0], d1 = t[step], d2 = t[2 * step], d3 = t[3 * step];
+    const float16 d4 = t[4 * step], d5 = t[5 * step];
+    const float16 even_p = d4 - POINT_Q2 * d2, odd_p = d3 - POINT_Q2 * d1,
+                  even_q = d4 - POINT_P2 * d2, odd_q = d3 - POINT_P2 * d1;
+    t[0] = POINT_P2 * POINT_Q2 * d0 + (d4 - (POINT_P2 + POINT_Q2) * d2);
+    t[step] = even_p + POINT_P * odd_p;
+    t[2 * step] = even_p - POINT_P * odd_p;
+    t[3 * step] = even_q + POINT_Q * odd_q;
+    t[4 * step] = even_q - POINT_Q * odd_q;
+    t[5 * step] = POINT_P2 * POINT_Q2 * d1 + (d5 - (POINT_P2 + POINT_Q2) * d3);
+}
+
+// A^T: S values -> M outputs.
+ALWAYS_INLINE void transform_output(float16 *t, const int step) {
+    const float16 m0 = t[0], sum_p = t[step] + t[2 * step], diff_p = t[step] - t[2 * step];
+    const float16 sum_q = t[3 * step] + t[4 * step], diff_q = t[3 * step] - t[4 * step];
+    t[0] = m0 + (sum_p + sum_q);
+    t[step] = POINT_P * diff_p + POINT_Q * diff_q;
+    t[2 * step] = POINT_P2 * sum_p + POINT_Q2 * sum_q;
+    t[3 * step] = POINT_P * POINT_P2 * diff_p + (POINT_Q * POINT_Q2 * diff_q + t[5 * step]);
+}
+
+// A: gradients of M outputs -> those of S values.
+ALWAYS_INLINE void transform_gradient(float16 *t, const int step) {
+    const float16 g0 = t[0], g1 = t[step];
+    const float16 g2 = t[2 * step], g3 = t[3 * step];
+    const float16 even_p = g0 + POINT_P2 * g2, odd_p = g1 + POINT_P2 * g3,
+                  even_q = g0 + POINT_Q2 * g2, odd_q = g1 + POINT_Q2 * g3;
+    t[step] = even_p + POINT_P * odd_p;
+    t[2 * step] = even_p - POINT_P * odd_p;
+    t[3 * step] = even_q + POINT_Q * odd_q;
+    t[4 * step] = even_q - POINT_Q * odd_q;
+    t[5 * step] = g3;
+}
+
+// G: 3 weights -> S values.
+ALWAYS_INLINE void transform_kernel(float16 *t, const int step) {
+    const float16 w0 = t[0], w1 = t[step], w2 = t[2 * step];
+    const float16 even_p = NORM_P * (w0 + POINT_P2 * w2), even_q = NORM_Q * (w0 + POINT_Q2 * w2);
+    t[0] = NORM_0 * w0;
+    t[step] = even_p + NORM_P * POINT_P * w1;
+    t[2 * step] = even_p - NORM_P * POINT_P * w1;
+    t[3 * step] = even_q + NORM_Q * POINT_Q * w1;
+    t[4 * step] = even_q - NORM_Q * POINT_Q * w1;
+    t[5 * step] = w2;
+}
+
+// G^T: gradients of S values -> those of 3 weights.
+ALWAYS_INLINE void transform_kernel_gradient(float16 *t, const int step) {
+    const float16 sum_p = t[step] + t[2 * step], diff_p = t[step] - t[2 * step];
+    const float16 sum_q = t[3 * step] + t[4 * step], diff_q = t[3 * step] - t[4 * step];
+    t[0] = NORM_0 * t[0] + (NORM_P * sum_p + NORM_Q * sum_q);
+    t[step] = NORM_P * POINT_P * diff_p + NORM_Q * POINT_Q * diff_q;
+    t[2 * step] = NORM_P * POINT_P2 * sum_p + (NORM_Q * POINT_Q2 * sum_q + t[5 * step]);
+}
+
+// Of a tile of inputs, S x S.
+ALWAYS_INLINE void transform_input_tile(float16 *t) {
+#pragma unroll
+    for (int i = 0; i < WINO_S; i++)
+        transform_input(t + i, WINO_S);
+#pragma unroll
+    for (int i = 0; i < WINO_S; i++)
+        transform_input(t + i * WINO_S, 1);
+}
+
+// S x S values of a tile -> M x M outputs, in rows of S.
+ALWAYS_INLINE void transform_output_tile(float16 *t) {
+#pragma unroll
+    for (int i = 0; i < WINO_S; i++)
+        transform_output(t + i, WINO_S);
+#pragma unroll
+    for (int i = 0; i < WINO_M; i++)
+        transform_output(t + i * WINO_S, 1);
+}
+
+// 3 x 3 weights, in rows of S -> S x S values.
+ALWAYS_INLINE void transform_kernel_tile(float16 *t) {
+#pragma unroll
+    for (int i = 0; i < 3; i++)
+        transform_kernel(t + i, WINO_S);
+#pragma unroll
+    for (int i = 0; i < WINO_S; i++)
+        transform_kernel(t + i * WINO_S, 1);
+}
 
 // Transformed weights are laid out (position, 16 output channels a block, input channel, 16). One
-// vector more between two positions keeps these apart in the sets of a cache. With HALF they are
-// multiples of their output channel's unit, a power of two (winograd_transform.cl), and the units
-// of all blocks come first, float16 a block: as long as two vectors of weights.
+// vector more between two positions keeps these apart in the sets of a cache.
 #define WEIGHT_AT(position, block, blocks, channels)                                               \
-    (2 * HALF * (blocks) + (position) * ((blocks) * (channels) + 1) + (block) * (channels))
-#if HALF
-#define LOAD_WEIGHT(transformed, at) vloada_half16(at, (global const half *)(transformed))
-#define STORE_WEIGHT(value, transformed, at) vstorea_half16(value, at, (global half *)(transformed))
-#else
-#define LOAD_WEIGHT(transformed, at) (transformed)[at]
-#define STORE_WEIGHT(value, transformed, at) (transformed)[at] = value
-#endif
+    ((position) * ((blocks) * (channels) + 1) + (block) * (channels))
 
 // Values of many tiles at once are laid out (position, 16 channels, TILES tiles); vectors from one
 // position to the next. The odd one keeps the positions apart in the sets of a cache.
 #define PITCH(channels) ((channels) / 16 * TILES + 1)
+
+// The corner of the i-th tile of tile_list: height, width, number, and the tiles of tiles.h.
+static inline int2 tile_corner(global const int *tile_list, const int i) {
+    const int columns = tile_columns(tile_list[1]), tile = tile_list[3 + i];
+    return (int2)(tile % columns, tile / columns) * SIDE;
+}
 
 // A scratch begins with a vector for two counters, both 0 between kernels: how much of the work is
 // taken, and how many work-items found nothing more to take. Which work-item takes what changes no

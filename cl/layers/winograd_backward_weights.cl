@@ -42,7 +42,7 @@ ALWAYS_INLINE void transform_gradients(
         float16 round = 0.0f;
         for (int tile = 0; tile < count; tile++) {
             const int2 corner = tile_corner(tile_list, first + tile);
-            const float times = tile_count[tile_list[3 + (first + tile) / (PER_SIDE * PER_SIDE)]];
+            const float times = tile_count[tile_list[3 + first + tile]];
             float16 t[POSITIONS], sum = 0.0f;
             load_tile(
                 t, WINO_M, patch, grad_out + block * 16, channels, corner.x, corner.y, height,
@@ -158,7 +158,7 @@ kernel __attribute__((vec_type_hint(float16))) void winograd_backward_weights(
     global float16 *partial,         // (...) at least (tile_parts, co / 16, 9 * (c1 + c2) + 1, 16)
     global float16 *scratch)         // (...) COUNTERS + work-items * SLICE(ci_part)
 {
-    const int tiles = tile_list[2] * PER_SIDE * PER_SIDE, ci = c1 + c2;
+    const int tiles = tile_list[2], ci = c1 + c2;
     const int co_parts = (co + CO_PART - 1) / CO_PART,
               weight_parts = (ci + ci_part - 1) / ci_part * co_parts;
     global float16 *v = scratch + COUNTERS + (size_t)get_global_id(0) * SLICE(ci_part);

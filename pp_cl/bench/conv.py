@@ -11,14 +11,10 @@ import numpy as np
 from pp_cl.bench.peak import PeakFlops
 from pp_cl.bench.timing import errors, variant_rows
 from pp_cl.device.device import Device
-from pp_cl.layers.blocking import device_class
-from pp_cl.layers.conv import pack_bias, pack_weights, unpack_weights
-from pp_cl.layers.direction import Direction
-from pp_cl.layers.policy import ConvolutionPolicy
+from pp_cl.layers.choice import VARIANTS, ConvolutionPolicy, device_class, offered
+from pp_cl.layers.conv import Direction, Work, pack_bias, pack_weights, unpack_weights
 from pp_cl.layers.tiles import all_tiles
-from pp_cl.layers.variants import VARIANTS, offered
-from pp_cl.layers.work import Work
-from pp_cl.network.architectures import convolutions, unet_layers
+from pp_cl.network.layers import convolutions, unet_layers
 from pp_cl.reference import network as reference
 
 SAMPLES = 256  # pixels: some of every place in the tiles of any variant
@@ -63,10 +59,10 @@ class RandomConv:
         """A function that computes a direction by a variant, as the network does, and waits for
         it. policy: its blocking is used.
         """
-        convolution = VARIANTS[variant].convolution(self.dev, policy.blocking)
+        conv, blocking = VARIANTS[variant].module, policy.blocking
         channels = [x.shape[2] for x in self.x]
         needs = [
-            convolution.work_floats(direction, self.out.shape[0], self.weight.shape, c)
+            conv.work_floats(self.dev, blocking, direction, self.out.shape[0], self.weight.shape, c)
             for c in (channels if direction is Direction.BACKWARD_INPUT else [sum(channels)])
         ]
         work = Work.empty(self.dev, *(max(n) for n in zip(*needs, strict=True)))
@@ -77,23 +73,27 @@ class RandomConv:
         }[direction]
 
         def run():
-            compute(convolution, {"work": work, "tiles": self.tiles})
+            compute(conv, blocking, {"work": work, "tiles": self.tiles})
             self.dev.finish()
 
         return run
 
-    def _run_forward(self, convolution, given):
-        convolution.forward(self.x, self.weight, self.bias, self.out, relu=self.relu, **given)
+    def _run_forward(self, conv, blocking, given):
+        conv.forward(
+            self.dev, blocking, self.x, self.weight, self.bias, self.out, relu=self.relu, **given
+        )
 
-    def _run_backward_input(self, convolution, given):
+    def _run_backward_input(self, conv, blocking, given):
         first = 0
         for x, grad_x in zip(self.x, self.grad_x, strict=True):
-            convolution.backward_input(self.weight, first, self.grad_out, grad_x, mask=x, **given)
+            conv.backward_input(
+                self.dev, blocking, self.weight, first, self.grad_out, grad_x, mask=x, **given
+            )
             first += x.shape[2]
 
-    def _run_backward_weights(self, convolution, given):
-        convolution.backward_weights(
-            self.x, self.grad_out, self.grad_weight, self.grad_bias, **given
+    def _run_backward_weights(self, conv, blocking, given):
+        conv.backward_weights(
+            self.dev, blocking, self.x, self.grad_out, self.grad_weight, self.grad_bias, **given
         )
 
     def result(

@@ -19,10 +19,8 @@ from pp_cl.config import Config
 from pp_cl.device.buffers import table_bytes
 from pp_cl.device.device import Device
 from pp_cl.device.scan import BLOCK_ON_GPU
-from pp_cl.layers.conv_backward_weights import partial_floats
-from pp_cl.network.architectures import multiplications, unet_layers
-from pp_cl.network.layer import Conv, Layer
-from pp_cl.network.workspace import parameter_table
+from pp_cl.layers.conv_direct import partial_floats
+from pp_cl.network.layers import Layer, multiplications, parameter_table, unet_layers
 from pp_cl.raster.blend import BLENDS, Blend
 from pp_cl.raster.pairs import LONG_LIST, PairBuilder
 from pp_cl.raster.point_cloud import PointCloud
@@ -171,7 +169,7 @@ def _backward(layers, counts):
     """The gradients of inputs and weights take as many multiply-adds as the forward pass each."""
     moved, launches = IMAGE * counts.pixels, 1
     for layer, inputs, output in _maps(layers, counts):
-        if not isinstance(layer, Conv):
+        if layer.kind != "conv":
             moved += 2 * inputs + output
             launches += 1
             continue

@@ -18,8 +18,7 @@ from pp_cl.compress.reduction import (
     nbytes,
 )
 from pp_cl.compress.search import frame_ms
-from pp_cl.layers.policy import make_policy
-from pp_cl.layers.variants import offered
+from pp_cl.layers.choice import make_policy, offered
 from pp_cl.trained import Run
 
 VIEWS = 8

@@ -13,7 +13,7 @@ from pp_cl.bench.raster_scenes import Case
 from pp_cl.bench.training import bench_training
 from pp_cl.bench.unet import bench_unet
 from pp_cl.device.device import Device
-from pp_cl.layers.policy import ConvolutionPolicy
+from pp_cl.layers.choice import ConvolutionPolicy
 
 WIDTHS = (32, 64, 128)  # of the presets tiny, small and full
 CONV_SIZE = 128

@@ -5,7 +5,7 @@ larger than any cache.
 import time
 
 from pp_cl.device.device import Device
-from pp_cl.layers.blocking import device_class
+from pp_cl.layers.choice import device_class
 from pp_cl.layers.tiles import LANES
 
 # Of one run: long against the 30 us of a launch, short enough to run between any two others.

@@ -12,7 +12,7 @@ import numpy as np
 from pp_cl.config import Config, assign, configure, preset
 from pp_cl.device.device import Device
 from pp_cl.files.image import to_8bit
-from pp_cl.layers.policy import load_policy
+from pp_cl.layers.choice import load_policy
 from pp_cl.metrics.psnr_ssim import psnr
 from pp_cl.model import Model
 from pp_cl.network.unet import UNet

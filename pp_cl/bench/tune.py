@@ -20,19 +20,21 @@ from pp_cl.device.discover import TEMPORARY_CACHE
 from pp_cl.errors import UserError
 from pp_cl.files.atomic import write_json
 from pp_cl.files.cache import make_cache_folder
-from pp_cl.layers.blocking import CHOICES
-from pp_cl.layers.direction import Direction
-from pp_cl.layers.policy import ConvolutionPolicy, make_policy
-from pp_cl.layers.tuning import (
+from pp_cl.layers.choice import (
+    CHOICES,
     FORMAT,
     MARGIN,
+    ConvolutionPolicy,
+    ConvShape,
     device_key,
     fastest,
+    make_policy,
     read_tuning,
+    shipped_order,
     tuning_file,
 )
-from pp_cl.layers.variants import ConvShape, shipped_order
-from pp_cl.network.architectures import convolutions, unet_layers
+from pp_cl.layers.conv import Direction
+from pp_cl.network.layers import computations, convolutions, unet_layers
 
 # Sides of a preset's pictures, in pixels, where they are evaluated; trainings take crops of them.
 EVALUATED = {"tiny": 200, "small": 400, "paper": 800}
@@ -43,9 +45,9 @@ HOPELESS, PROBES = 3, 2
 BLOCKING_SIDE = 96
 # {field of Blocking: (variant, directions) that it is tried with}
 TRIED = {
-    "winograd": ("winograd4", (Direction.FORWARD, Direction.BACKWARD_INPUT)),
-    "winograd_narrow": ("winograd4", (Direction.FORWARD, Direction.BACKWARD_INPUT)),
-    "winograd_weights": ("winograd4", (Direction.BACKWARD_WEIGHTS,)),
+    "winograd": ("winograd", (Direction.FORWARD, Direction.BACKWARD_INPUT)),
+    "winograd_narrow": ("winograd", (Direction.FORWARD, Direction.BACKWARD_INPUT)),
+    "winograd_weights": ("winograd", (Direction.BACKWARD_WEIGHTS,)),
     "direct": ("direct", (Direction.FORWARD, Direction.BACKWARD_INPUT)),
 }
 
@@ -84,7 +86,7 @@ def network_cases(widths: tuple[int, int, int], train_side: int, evaluated_side:
     found = {}
     for side, training in ((train_side, True), (evaluated_side, False)):
         for layer in convolutions(unet_layers(widths)):
-            for direction, source in layer.computations(training):
+            for direction, source in computations(layer, training):
                 sources = layer.sources if source is None else (layer.sources[source],)
                 key = (direction, layer.kernel_size, sources, layer.channels, side >> layer.level)
                 name, count, before = found.get(key, (layer.name, 0, training))
@@ -209,7 +211,7 @@ def run_tune(
     on_blocking: Callable[[dict, dict], None],
     on_row: Callable[[Case, dict], None],
 ) -> tuple[dict, list[float]]:
-    """(tuning of this device as layers/tuning.py stores it, milliseconds of the cases as shipped).
+    """(tuning of this device as layers/choice.py stores it, milliseconds of the cases as shipped).
 
     on_blocking: called with the result of tune_blocking(); on_row: with each case and its row.
     """

@@ -13,11 +13,9 @@ from pyopencl.array import Array
 from pp_cl.bench.peak import PeakFlops
 from pp_cl.bench.timing import errors, variant_rows
 from pp_cl.device.device import Device
+from pp_cl.layers.choice import AUTO, ConvolutionPolicy, offered
 from pp_cl.layers.conv import unpack_weights
-from pp_cl.layers.policy import AUTO, ConvolutionPolicy
-from pp_cl.layers.resample import affine
-from pp_cl.layers.variants import offered
-from pp_cl.network.architectures import multiplications
+from pp_cl.network.layers import multiplications
 from pp_cl.network.unet import UNet
 from pp_cl.reference import network as reference
 
@@ -100,7 +98,7 @@ def make_network(
     net = UNet(dev, widths, CHANNELS_IN, CHANNELS_OUT, blocks=blocks, policy=policy)
     for name, parameter in net.parameters.items():
         if name.endswith(".weight"):
-            affine(dev, np.sqrt(6), 0.0, parameter, out=parameter)
+            dev.write(parameter, np.float32(np.sqrt(6)) * parameter.get())
     return net
 
 

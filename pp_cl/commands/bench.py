@@ -110,7 +110,7 @@ def _run_all(options):
     from pp_cl.bench.page import page_text
     from pp_cl.config import configure
     from pp_cl.files.atomic import write_json, write_text
-    from pp_cl.layers.policy import load_policy
+    from pp_cl.layers.choice import load_policy
 
     if options.json or options.plot or options.tolerance is not None:
         raise UserError("--json, --plot, --tolerance: of a single bench; name one, or use --out")
@@ -236,7 +236,7 @@ def _run_network(options):
     from pp_cl.bench.plots import check_files, plot_time_and_error, save_figure
     from pp_cl.bench.table import HEAD, line
     from pp_cl.bench.unet import bench_unet
-    from pp_cl.layers.policy import load_policy
+    from pp_cl.layers.choice import load_policy
 
     size, widths = shared.read_shape(options.size or "256", options.widths or "128,256,512")
     blocks = shared.read_blocks(options.blocks or "double")

@@ -31,9 +31,7 @@ def run(options: argparse.Namespace) -> None:
     from pp_cl.bench import tune
     from pp_cl.bench.table import TUNE_HEAD, blocking_line, tune_line
     from pp_cl.device.discover import open_device
-    from pp_cl.layers.blocking import CHOICES
-    from pp_cl.layers.policy import make_policy
-    from pp_cl.layers.variants import shipped_order
+    from pp_cl.layers.choice import CHOICES, make_policy, shipped_order
 
     config = preset(options.preset or "tiny")
     tolerance = shared.read_tolerance(options.tolerance)

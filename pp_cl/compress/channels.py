@@ -10,8 +10,7 @@ import numpy as np
 
 from pp_cl.layers.conv import pack_bias, pack_weights, unpack_weights
 from pp_cl.layers.tiles import LANES
-from pp_cl.network.architectures import convolutions
-from pp_cl.network.layer import Conv, Gate, Layer, Pool
+from pp_cl.network.layers import Layer, convolutions
 from pp_cl.network.unet import UNet
 from pp_cl.scene.camera import Camera
 from pp_cl.trained import Run
@@ -27,7 +26,7 @@ def channel_weights(run: Run, cameras: Sequence[Camera]) -> Parameters:
     where the network has gates: theirs are two channels of a convolution.
     """
     layers = run.model.net.layers
-    if any(isinstance(layer, Gate) for layer in layers):
+    if any(layer.kind == "gate" for layer in layers):
         return {}
     net = _copied(run)
     found = {x.name: np.zeros(x.channels) for x in convolutions(layers) if x.relu}
@@ -53,7 +52,7 @@ def _norms_of_readers(layers, parameters):
     """{layer: (C,)}: the norm of all weights that read a channel, through pooling too."""
     squares = {layer.name: np.zeros(layer.channels) for layer in layers}
     for layer in reversed(layers):
-        if isinstance(layer, Conv):
+        if layer.kind == "conv":
             weight = unpack_weights(parameters[f"{layer.name}.weight"], layer.channels)
             parts = np.split((weight.astype(np.float64) ** 2).sum((0, 2, 3)), _ends(layer))
         else:
@@ -81,7 +80,7 @@ def kept_channels(
             count = int((weight >= least * weight.max()).sum()) if least > 0 else len(weight)
             count = min(-(-max(1, count) // LANES) * LANES, len(weight))
             kept[layer.name] = np.sort(np.argsort(-weight, kind="stable")[:count])
-        elif isinstance(layer, Pool) and layer.inputs[0] in kept:
+        elif layer.kind == "pool" and layer.inputs[0] in kept:
             kept[layer.name] = kept[layer.inputs[0]]
         else:
             kept[layer.name] = np.arange(layer.channels)

@@ -17,7 +17,7 @@ from pp_cl.compress.channels import (
 from pp_cl.config import Config, assign
 from pp_cl.evaluate import render_views
 from pp_cl.export.observe import observe
-from pp_cl.layers.policy import load_policy
+from pp_cl.layers.choice import load_policy
 from pp_cl.metrics.psnr_ssim import Metrics
 from pp_cl.model import Model
 from pp_cl.network.unet import UNet

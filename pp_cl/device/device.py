@@ -33,7 +33,6 @@ SPILLING_ON_INTEL = frozenset(
         "layers/conv_backward_weights",
         "layers/conv_local",
         "layers/conv_local_backward_weights",
-        "layers/winograd_gemm",
     )
 )
 

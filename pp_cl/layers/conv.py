@@ -1,13 +1,88 @@
-"""Direct convolutions K x K (K = 1 or 3), stride 1, zero padding K // 2, and the layout of their
-weights.
+"""What the three ways to compute a convolution share: how weights are laid out, how work is cut,
+memory to work in, and checks.
+
+conv_direct.py, conv_winograd.py and conv_local.py have the same five functions: work_floats,
+lay_out, forward, backward_input and backward_weights. All are convolutions K x K (K = 1 or 3) of
+stride 1 with zero padding K // 2; choice.py says which of them computes one.
 """
+
+from dataclasses import dataclass
+from enum import Enum
 
 import numpy as np
 from pyopencl.array import Array
 
 from pp_cl.device.device import Device
-from pp_cl.layers.blocking import Blocking
-from pp_cl.layers.tiles import LANES, SIDE, Tiles, checked_tiles
+from pp_cl.device.form import lanes, row_parts
+from pp_cl.layers.tiles import LANES
+
+COUNTERS = LANES  # floats at the start of a scratch: counters of cl/layers/winograd.h
+
+
+class Direction(Enum):
+    """What of a convolution is computed. The values are the words in stored tunings and in bench
+    rows.
+    """
+
+    FORWARD = "forward"
+    BACKWARD_INPUT = "input"  # gradient of the input
+    BACKWARD_WEIGHTS = "weights"  # gradients of weights and bias
+
+
+@dataclass(frozen=True)
+class Blocking:
+    """Sizes that kernels are built and launched with. They change speed, and the rounding of
+    winograd_backward_weights.cl, which sums `winograd_weights` tiles at a time.
+
+    direct: (pixels of a row, groups of 16 output channels, work-group) of a work-item of conv.cl,
+    where the groups come in multiples of that number; direct_odd: the same for other channels.
+    accumulators: float16 sums that a work-item of conv_backward_weights.cl keeps in registers;
+    work_group: its work-group, None = the launcher's default. winograd: (tiles transformed at a
+    time, tiles multiplied together) of winograd.cl; winograd_narrow: the same for few channels
+    (conv_winograd.NARROW). winograd_weights: tiles transformed at a time by
+    winograd_backward_weights.cl.
+    """
+
+    direct: tuple[int, int, tuple[int, int, int]]
+    direct_odd: tuple[int, int, tuple[int, int, int]]
+    accumulators: int
+    work_group: tuple[int, int, int] | None
+    # More tiles at a time use the transformed weights better, fewer leave more room in the caches.
+    # The second number divides the first: with 2 x 16 channels, 8 take 16 of AVX-512's 32 vectors,
+    # 12 take 24.
+    winograd: tuple[int, int] = (64, 8)
+    winograd_narrow: tuple[int, int] = (12, 12)
+    winograd_weights: int = 32
+
+
+@dataclass
+class Work:
+    """Device memory for convolutions to work in; several may share one, one after the other.
+
+    scratch: float32, at least as many floats as the largest convolution needs. The first COUNTERS
+    are 0 between kernels; only Winograd's use it. weights: float32, weights flipped or transformed
+    for a kernel, or the parts of their gradients.
+    """
+
+    scratch: Array
+    weights: Array
+
+    @classmethod
+    def empty(cls, dev: Device, scratch: int = COUNTERS, weights: int = 1) -> "Work":
+        """Room for that many floats, at least COUNTERS and one."""
+        work = cls(dev.empty(0), dev.empty(0))
+        work.grow(dev, max(COUNTERS, scratch), max(1, weights))
+        return work
+
+    def grow(self, dev: Device, scratch: int, weights: int) -> None:
+        """Make room for that many floats, if there is less."""
+        if self.scratch.size < scratch:
+            self.scratch = None  # frees the old array before allocating
+            self.scratch = dev.empty(scratch)
+            dev.fill(self.scratch[:COUNTERS], 0)
+        if self.weights.size < weights:
+            self.weights = None
+            self.weights = dev.empty(weights)
 
 
 def pack_weights(weight: np.ndarray, dtype: type = np.float32) -> np.ndarray:
@@ -29,112 +104,41 @@ def pack_bias(bias: np.ndarray, dtype: type = np.float32) -> np.ndarray:
     return np.pad(np.asarray(bias, dtype), (0, -len(bias) % LANES))
 
 
-def conv_forward(
-    dev: Device,
-    sources: tuple[Array, ...],
-    weight: Array,
-    bias: Array,
-    *,
-    out: Array,
-    relu: bool,
-    blocking: Blocking,
-    tiles: Tiles | None = None,
-) -> None:
-    """out = convolution of the sources' concatenation + bias, then max(., 0) if relu.
-
-    sources: one or two of (H, W, C1), (H, W, C2); weight: (ceil(CO/16), K, K, C1 + C2, 16); bias:
-    (ceil(CO/16) * 16,); out: (H, W, CO), all float32; tiles: those of out to compute, None = all.
-    Raises ValueError when shapes do not fit together.
+def check_weights(sources: tuple[Array, ...], weight: Array, bias: Array, out: Array) -> None:
+    """Raise ValueError unless weight (ceil(CO/16), K, K, CI, 16) and bias (ceil(CO/16) * 16,), or
+    their gradients, are those of a convolution of the sources (H, W, C1), (H, W, C2) to out (H, W,
+    CO).
     """
-    height, width, co = out.shape
-    check_forward(sources, weight, bias, out)
-    channels = [source.shape[2] for source in sources]
-    tiles = checked_tiles(dev, tiles, height, width)
-    program, size, work_group = _program(dev, blocking, weight.shape[1], out.shape)
-    program.launch(
-        "conv_forward",
-        size,
-        local=work_group,
-        multiply_adds=tiles.number * SIDE**2 * weight.shape[1] ** 2 * sum(channels) * co,
-        along=1,
-        height=height,
-        width=width,
-        c1=channels[0],
-        c2=sum(channels[1:]),
-        co=co,
-        relu=relu,
-        x=sources[0],
-        x2=sources[-1],
-        weight=weight,
-        bias=bias,
-        out=out,
-        tile_count=tiles.count,
-    )
-
-
-def conv_backward_input(
-    dev: Device,
-    flipped: Array,
-    grad_out: Array,
-    grad_x: Array,
-    *,
-    mask: Array | None,
-    blocking: Blocking,
-    tiles: Tiles | None = None,
-) -> None:
-    """grad_x = gradient of a convolution's input, 0 where mask <= 0.
-
-    flipped: (ceil(C/16), K, K, CO, 16) from conv_backward_weights.flip_weights; grad_out: (H, W,
-    CO); grad_x: (H, W, C); mask: (H, W, C), the input where it is a ReLU's output, so that grad_x
-    is the gradient of the ReLU's input, or None; tiles: those of grad_x to compute, None = all.
-    Raises ValueError when shapes do not fit together.
-    """
-    height, width, c = grad_x.shape
-    check_flipped(flipped, grad_x)
-    tiles = checked_tiles(dev, tiles, height, width)
-    program, size, work_group = _program(dev, blocking, flipped.shape[1], grad_x.shape)
-    program.launch(
-        "conv_backward_input",
-        size,
-        local=work_group,
-        multiply_adds=tiles.number * SIDE**2 * flipped.shape[1] ** 2 * grad_out.shape[2] * c,
-        along=1,
-        height=height,
-        width=width,
-        c=c,
-        co=grad_out.shape[2],
-        masked=mask is not None,
-        x=grad_x if mask is None else mask,
-        flipped=flipped,
-        grad_out=grad_out,
-        grad_x=grad_x,
-        tile_count=tiles.count,
-    )
-
-
-def check_forward(sources: tuple[Array, ...], weight: Array, bias: Array, out: Array) -> None:
-    """Raise ValueError unless weight and bias are those of conv_forward() for these arrays."""
     co, channels = out.shape[2], [source.shape[2] for source in sources]
     blocks = -(-co // LANES)
-    if (weight.shape[0], weight.shape[3]) != (blocks, sum(channels)) or bias.shape != (
-        blocks * LANES,
-    ):
+    expected = blocks, sum(channels), (blocks * LANES,)
+    if (weight.shape[0], weight.shape[3], bias.shape) != expected:
         raise ValueError(
             f"convolution of {' + '.join(map(str, channels))} to {co} channels: weight is"
             f" {weight.shape}, bias {bias.shape}"
         )
 
 
-def check_flipped(flipped: Array, grad_x: Array) -> None:
-    """Raise ValueError unless these are conv_backward_input()'s weights for so many channels."""
-    c = grad_x.shape[2]
-    if flipped.shape[0] != -(-c // LANES):
-        raise ValueError(f"input gradient of {c} channels: flipped weights are {flipped.shape}")
+def check_size(what: str, array: Array, floats: int) -> None:
+    """Raise ValueError if an array is too small."""
+    if array.size < floats:
+        raise ValueError(f"convolution: {what} of {array.size} floats, needs {floats}")
 
 
-def _program(dev, blocking, k, shape):
-    """(program, global size, work-group) for a result of shape (H, W, C)."""
-    height, width, channels = shape
-    pixels, groups, work_group = blocking.of_direct(width, channels)
-    size = (-(-width // pixels), height, -(-channels // (LANES * groups)))
-    return dev.program("layers/conv", KERNEL_SIZE=k, PIXELS=pixels, BLOCKS=groups), size, work_group
+def sum_parts(
+    dev: Device, partial: Array, grad_weight: Array, grad_bias: Array, *, parts: int
+) -> None:
+    """grad_weight (blocks, K, K, CI, 16) and grad_bias (blocks * 16,) = sums, in order, of the
+    parts of an image, partial (parts, blocks, K * K * CI + 1, 16) or longer.
+    """
+    blocks, k, _, ci, _ = grad_weight.shape
+    dev.program("layers/conv_backward_weights", KERNEL_SIZE=k, LANES=lanes(dev)).launch(
+        "conv_sum_parts",
+        (row_parts(dev) * (k * k * ci + 1), blocks),
+        per_block=k * k * ci,
+        blocks=blocks,
+        parts=parts,
+        partial=partial,
+        grad_weight=grad_weight,
+        grad_bias=grad_bias,
+    )

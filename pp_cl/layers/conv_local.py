@@ -1,5 +1,5 @@
-"""Direct convolutions K x K (K = 1 or 3) for GPUs: a work-group shares inputs and weights in local
-memory, and computes tiles of a list.
+"""Direct convolutions for GPUs: a work-group shares inputs and weights in local memory, and
+computes tiles of a list. Any channels, 1x1 and 3x3; weights and work memory are conv_direct's.
 """
 
 import math
@@ -7,9 +7,17 @@ import math
 from pyopencl.array import Array
 
 from pp_cl.device.device import Device
-from pp_cl.device.launch import Program
-from pp_cl.layers.conv import check_flipped, check_forward
+from pp_cl.layers.conv import Blocking, Work, check_size, check_weights, sum_parts
+from pp_cl.layers.conv_direct import (
+    flip_weights,
+    lay_out,
+    most_parts,
+    partial_floats,
+    work_floats,
+)
 from pp_cl.layers.tiles import LANES, SIDE, Tiles, checked_tiles
+
+__all__ = ["backward_input", "backward_weights", "forward", "lay_out", "work_floats"]
 
 QUAD = 4  # channels of a work-item
 # Pixels of a work-item: two lines of a tile, ROWS in cl/layers/conv_local.cl.
@@ -17,27 +25,40 @@ TILE_PARTS = 2
 # Work-items of a group that are tried, until a device runs so many. More share the weights, and fit
 # 32 KiB of local memory up to the first number.
 GROUPS = (256, 128, 64, 32)
+# {side of the kernel: groups of four input channels of a work-group} in the gradient of the weights
+CI_QUADS = {3: 4, 1: 8}
+# Tiles that a work-item sums in registers there, at most: one sum over an image of background would
+# lose digits. Fewer of narrow images, so that it sums half as many pixels as the direct kernel,
+# which sums a row: errors stay below that one's.
+SUMMED = 4
 
 
-def conv_local_forward(
+def forward(
     dev: Device,
+    _blocking: Blocking,
     sources: tuple[Array, ...],
     weight: Array,
     bias: Array,
-    *,
     out: Array,
+    *,
     relu: bool,
+    work: Work,
     tiles: Tiles | None = None,
+    laid_out: Array | None = None,
 ) -> None:
-    """As conv.conv_forward."""
+    """As conv_direct.forward."""
     height, width, co = out.shape
-    check_forward(sources, weight, bias, out)
+    check_weights(sources, weight, bias, out)
     channels = [source.shape[2] for source in sources]
     tiles = checked_tiles(dev, tiles, height, width)
-    _launch(
-        dev,
+    program, size, work_group = _program(
+        dev, "conv_local_forward", weight.shape[1], tiles, co, channels
+    )
+    program.launch(
         "conv_local_forward",
-        (weight.shape[1], tiles, co, channels),
+        size,
+        local=work_group,
+        multiply_adds=tiles.number * SIDE**2 * weight.shape[1] ** 2 * sum(channels) * co,
         c1=channels[0],
         c2=sum(channels[1:]),
         co=co,
@@ -51,25 +72,33 @@ def conv_local_forward(
     )
 
 
-def conv_local_backward_input(
+def backward_input(
     dev: Device,
-    flipped: Array,
+    blocking: Blocking,
+    weight: Array,
+    first: int,
     grad_out: Array,
     grad_x: Array,
     *,
     mask: Array | None,
+    work: Work,
     tiles: Tiles | None = None,
 ) -> None:
-    """As conv.conv_backward_input."""
+    """As conv_direct.backward_input."""
     height, width, c = grad_x.shape
-    check_flipped(flipped, grad_x)
+    co = grad_out.shape[2]
+    flipped = flip_weights(dev, blocking, weight, first, c, co, work)
     tiles = checked_tiles(dev, tiles, height, width)
-    _launch(
-        dev,
+    program, size, work_group = _program(
+        dev, "conv_local_backward_input", flipped.shape[1], tiles, c, [co]
+    )
+    program.launch(
         "conv_local_backward_input",
-        (flipped.shape[1], tiles, c, grad_out.shape[2:]),
+        size,
+        local=work_group,
+        multiply_adds=tiles.number * SIDE**2 * flipped.shape[1] ** 2 * co * c,
         c=c,
-        co=grad_out.shape[2],
+        co=co,
         masked=mask is not None,
         x=grad_x if mask is None else mask,
         flipped=flipped,
@@ -79,12 +108,70 @@ def conv_local_backward_input(
     )
 
 
-def is_aligned(*channels: int) -> bool:
+def backward_weights(
+    dev: Device,
+    _blocking: Blocking,
+    sources: tuple[Array, ...],
+    grad_out: Array,
+    grad_weight: Array,
+    grad_bias: Array,
+    *,
+    work: Work,
+    tiles: Tiles | None = None,
+) -> None:
+    """As conv_direct.backward_weights. The order of the sums depends on the shapes and the number
+    of tiles alone.
+    """
+    height, width, co = grad_out.shape
+    blocks, k, _, ci, _ = grad_weight.shape
+    check_weights(sources, grad_weight, grad_bias, grad_out)
+    check_size("parts", work.weights, partial_floats(height, grad_weight.shape))
+    tiles = checked_tiles(dev, tiles, height, width)
+    run = max(SUMMED, -(-tiles.number // most_parts(height, grad_weight.shape)))
+    parts = -(-tiles.number // run)
+    first = 0
+    for source in sources:
+        c = source.shape[2]
+        program, in_group, items = _weights_program(dev, k, c, co)
+        program.launch(
+            "conv_local_backward_weights",
+            (-(-c // (QUAD * CI_QUADS[k])) * items, -(-co // (QUAD * in_group)), parts),
+            local=(items, 1, 1),
+            multiply_adds=tiles.number * SIDE**2 * k**2 * c * co,
+            c=c,
+            first=first,
+            ci=ci,
+            summed=max(1, min(SUMMED, width // (2 * SIDE * SIDE))),
+            x=source,
+            co=co,
+            run=run,
+            grad_out=grad_out,
+            tile_list=tiles.list,
+            tile_count=tiles.count,
+            partial=work.weights,
+        )
+        first += c
+    program.launch(
+        "conv_local_backward_bias",
+        (blocks * LANES, parts),
+        per_block=k * k * ci,
+        parts=parts,
+        co=co,
+        run=run,
+        grad_out=grad_out,
+        tile_list=tiles.list,
+        tile_count=tiles.count,
+        partial=work.weights,
+    )
+    sum_parts(dev, work.weights, grad_weight, grad_bias, parts=parts)
+
+
+def _is_aligned(*channels):
     """Whether four channels of a pixel are read and written at once."""
     return all(c % QUAD == 0 for c in channels)
 
 
-def quads(channels: int, aligned: bool) -> int:
+def _quads(channels, aligned):
     """Groups of four of the output channels that a work-group computes: 16, 8 or 4, so that nothing
     is computed in vain. Channels that are not aligned are few.
     """
@@ -92,22 +179,39 @@ def quads(channels: int, aligned: bool) -> int:
     return LANES // QUAD * (math.gcd(blocks, 4) if aligned else 1)
 
 
-def runs(program: Program, kernel: str, items: int) -> bool:
-    """Whether the device runs a kernel in work-groups of so many items."""
-    return program.kernels[kernel].largest_group >= items
-
-
-def _launch(dev, kernel, form, **arguments):
-    """form: (side of the kernel, tiles, channels of the output, of the inputs)."""
-    k, tiles, channels, inputs = form
-    aligned = is_aligned(channels, *inputs)
-    in_group = quads(channels, aligned)
-    macros = {"KERNEL_SIZE": k, "ALIGNED": int(aligned), "QUADS": in_group}
+def _program(dev, kernel, k, tiles, channels, inputs):
+    """(program, work-items, work-group) of a kernel for `channels` of `inputs` [channels], in the
+    largest groups that the device runs.
+    """
+    aligned = _is_aligned(channels, *inputs)
+    in_group = _quads(channels, aligned)
     for items in (n for n in GROUPS if n >= TILE_PARTS * in_group):
-        program = dev.program("layers/conv_local", ITEMS=items, **macros)
-        if runs(program, kernel, items):
+        program = dev.program(
+            "layers/conv_local",
+            ITEMS=items,
+            KERNEL_SIZE=k,
+            ALIGNED=int(aligned),
+            QUADS=in_group,
+        )
+        if program.kernels[kernel].largest_group >= items:
             break
     groups = -(-tiles.number * TILE_PARTS * in_group // items)
-    size = (groups * items, -(-channels // (QUAD * in_group)))
-    multiply_adds = tiles.number * SIDE**2 * k**2 * sum(inputs) * channels
-    program.launch(kernel, size, local=(items, 1), multiply_adds=multiply_adds, **arguments)
+    return program, (groups * items, -(-channels // (QUAD * in_group))), (items, 1)
+
+
+def _weights_program(dev, k, c, co):
+    """(program, groups of four output channels and work-items of a work-group)."""
+    aligned = _is_aligned(c, co)
+    most = _quads(co, aligned)
+    for in_group in (n for n in (16, 8, 4) if n <= most):
+        items = CI_QUADS[k] * in_group * k
+        program = dev.program(
+            "layers/conv_local_backward_weights",
+            KERNEL_SIZE=k,
+            CI_QUADS=CI_QUADS[k],
+            QUADS=in_group,
+            ALIGNED=int(aligned),
+        )
+        if program.kernels["conv_local_backward_weights"].largest_group >= items:
+            break
+    return program, in_group, items

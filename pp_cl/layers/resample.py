@@ -1,5 +1,4 @@
-"""Pooling, bilinear upsampling and an affine map (scale * x + offset) on (H, W, C) float32 feature
-maps.
+"""Pooling and bilinear upsampling of (H, W, C) float32 feature maps.
 
 tiles: those of the result to compute, None = all.
 """
@@ -117,15 +116,6 @@ def upsample2_backward(
         grad_out=grad_out,
         grad_x=grad_x,
         tile_count=checked_tiles(dev, tiles, h, w).count,
-    )
-
-
-def affine(dev: Device, scale: float, offset: float, x: Array, *, out: Array) -> None:
-    """out = scale * x + offset; both of any one shape, out may be x."""
-    if x.shape != out.shape:
-        raise ValueError(f"affine of {x.shape} to {out.shape}")
-    dev.program("layers/resample", LANES=lanes(dev)).launch(
-        "affine", x.size, n=x.size, scale=scale, offset=offset, x=x, out=out
     )
 
 

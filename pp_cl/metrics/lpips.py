@@ -5,6 +5,7 @@ renderer. The metric is here; the loss (training/perceptual.py) computes it with
 import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from types import ModuleType
 
 import numpy as np
 from pyopencl.array import Array
@@ -14,13 +15,10 @@ from pp_cl.device.device import Device
 from pp_cl.device.form import group_ranges, lanes, row_parts
 from pp_cl.device.launch import Program
 from pp_cl.errors import UserError
-from pp_cl.layers.conv import pack_weights
-from pp_cl.layers.direction import Direction
-from pp_cl.layers.policy import ConvolutionPolicy, make_policy
+from pp_cl.layers.choice import ConvolutionPolicy, ConvShape, make_policy
+from pp_cl.layers.conv import COUNTERS, Direction, Work, pack_weights
 from pp_cl.layers.resample import maxpool2_backward, maxpool2_forward
 from pp_cl.layers.tiles import LANES, Tiles, all_tiles, all_tiles_buffers
-from pp_cl.layers.variants import Convolution, ConvShape
-from pp_cl.layers.work import COUNTERS, Work
 from pp_cl.metrics.lpips_weights import load_weights
 
 # convolutions between the poolings of VGG16; the last one of each block is compared
@@ -48,28 +46,32 @@ class VggConv:
         """As conv.pack_weights makes it."""
         return -(-self.co // LANES), 3, 3, self.ci, LANES
 
-    def choose(self, dev: Device, policy: ConvolutionPolicy, size: Size) -> "Choice":
+    def choose(self, policy: ConvolutionPolicy, size: Size) -> "Choice":
         """Its variants for an image of `size`."""
         pixels = math.prod(size_of(size, self.block))
         shapes = (
             ConvShape(direction, 3, (self.ci,), self.co, pixels, source)
             for direction, source in ((Direction.FORWARD, None), (Direction.BACKWARD_INPUT, 0))
         )
-        return Choice(*(policy.convolution(dev, shape) for shape in shapes))
+        return Choice(*(policy.convolution(shape) for shape in shapes))
 
 
 @dataclass(frozen=True)
 class Choice:
     """The variants that compute a convolution."""
 
-    forward: Convolution
-    backward: Convolution
+    forward: ModuleType
+    backward: ModuleType
 
-    def work_floats(self, layer: VggConv, size: Size) -> list[tuple[int, int]]:
-        """As variants.Convolution.work_floats, [forward, backward]."""
+    def work_floats(
+        self, dev: Device, policy: ConvolutionPolicy, layer: VggConv, size: Size
+    ) -> list[tuple[int, int]]:
+        """As conv_direct.work_floats, [forward, backward]."""
         height, _ = size_of(size, layer.block)
         return [
-            variant.work_floats(direction, height, layer.weight_shape(), layer.ci)
+            variant.work_floats(
+                dev, policy.blocking, direction, height, layer.weight_shape(), layer.ci
+            )
             for variant, direction in (
                 (self.forward, Direction.FORWARD),
                 (self.backward, Direction.BACKWARD_INPUT),
@@ -130,7 +132,7 @@ class Lpips:
         self._choices: dict[str, Choice] = {}
         self._laid_out: dict[str, Array | None] = {}
         self._tiles: list[Tiles] = []  # of each block
-        self._work = Work.empty(dev, COUNTERS, 1)
+        self._work = Work.empty(dev)
 
     @staticmethod
     def table(
@@ -141,8 +143,8 @@ class Lpips:
         """
         floats, work = {}, [(COUNTERS, 1)]
         for layer in vgg_layers(widths):
-            choice = layer.choose(dev, policy, size)
-            needs = choice.work_floats(layer, size)
+            choice = layer.choose(policy, size)
+            needs = choice.work_floats(dev, policy, layer, size)
             work += needs
             floats[f"weights of {layer.name}"] = math.prod(layer.weight_shape())
             floats[f"bias of {layer.name}"] = layer.co
@@ -264,9 +266,11 @@ class Lpips:
         self._size, self._laid_out, self._tiles, self._work = None, {}, [], None
         work = [(COUNTERS, 1)]
         for layer in vgg_layers(self.widths):
-            choice = self._choices[layer.name] = layer.choose(self.dev, self.policy, size)
-            self._laid_out[layer.name] = choice.forward.lay_out(self._weights[layer.name])
-            needs = choice.work_floats(layer, size)
+            choice = self._choices[layer.name] = layer.choose(self.policy, size)
+            self._laid_out[layer.name] = choice.forward.lay_out(
+                self.dev, self.policy.blocking, self._weights[layer.name]
+            )
+            needs = choice.work_floats(self.dev, self.policy, layer, size)
             work += needs if self.training else needs[:1]
         self._tiles = [all_tiles(self.dev, *size_of(size, i)) for i in range(len(BLOCKS))]
         self._work = Work.empty(self.dev, *map(max, zip(*work, strict=True)))
@@ -274,6 +278,8 @@ class Lpips:
 
     def _convolve(self, layer, x, out):
         self._choices[layer.name].forward.forward(
+            self.dev,
+            self.policy.blocking,
             (x,),
             self._weights[layer.name],
             self._biases[layer.name],
@@ -286,6 +292,8 @@ class Lpips:
 
     def _convolve_backward(self, layer, grad_out, grad_x, mask):
         self._choices[layer.name].backward.backward_input(
+            self.dev,
+            self.policy.blocking,
             self._weights[layer.name],
             0,
             grad_out,

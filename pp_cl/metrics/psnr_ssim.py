@@ -8,7 +8,7 @@ from skimage.metrics import structural_similarity
 from pp_cl.device.device import Device
 from pp_cl.errors import UserError
 from pp_cl.files.image import to_8bit
-from pp_cl.layers.policy import ConvolutionPolicy
+from pp_cl.layers.choice import ConvolutionPolicy
 from pp_cl.metrics.lpips import Lpips
 
 PSNR_CAP = 100.0  # dB of identical images: JSON has no infinity

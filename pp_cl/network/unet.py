@@ -7,36 +7,35 @@ import numpy as np
 from pyopencl.array import Array
 
 from pp_cl.device.device import Device
-from pp_cl.layers.conv import pack_bias, pack_weights
-from pp_cl.layers.policy import ConvolutionPolicy, make_policy
-from pp_cl.layers.resample import affine
-from pp_cl.layers.residual import residual_backward, residual_forward
-from pp_cl.layers.tiles import SIDE
-from pp_cl.network.architectures import convolutions, unet_layers
-from pp_cl.network.buffers import gradient_of
-from pp_cl.network.sparse_tiles import (
-    ForwardPlan,
-    ImagePlan,
-    ShownPlan,
-    receptive_radius,
+from pp_cl.layers.choice import ConvolutionPolicy, make_policy
+from pp_cl.layers.conv import Direction, pack_bias, pack_weights
+from pp_cl.layers.gate import gate_backward, gate_forward
+from pp_cl.layers.output import output_backward, output_forward, residual_backward
+from pp_cl.layers.resample import (
+    avgpool2_backward,
+    avgpool2_forward,
+    upsample2_backward,
+    upsample2_forward,
 )
-from pp_cl.network.workspace import Workspace, WorkspacePlan, parameter_table
+from pp_cl.layers.tiles import SIDE
+from pp_cl.network.layers import convolutions, gradient_of, parameter_table, unet_layers
+from pp_cl.network.tile_plan import ForwardPlan, ImagePlan, ShownPlan, receptive_radius
+from pp_cl.network.workspace import Workspace, WorkspacePlan
 from pp_cl.settings import NetworkConfig
 
 # Background tiles are skipped only in images of at least LEAST_PIXELS pixels, and only if at most
 # MOST_COMPUTED of the multiplications remain: finding them costs time too.
 LEAST_PIXELS, MOST_COMPUTED = 1 << 16, 0.8
 MULTIPLE = 4  # pixels: two poolings halve the height and the width
-RESIDUAL_SHARE = 0.25  # of a feature in its colour; features differ by about four times as much
 
 
 class UNet:
     """The network, its parameters and gradients, and the buffers it works in.
 
-    widths: channels of the three levels. blocks: what a level computes, of architectures.BLOCKS.
+    widths: channels of the three levels. blocks: what a level computes, of layers.BLOCKS.
     channels: as unet_layers() takes them.
     policy: which variants its convolutions take, None = as shipped, whatever their error. layers:
-    network.layer.Layer in the order of the forward pass. parameters, gradients: {"enc0.a.weight":
+    in the order of the forward pass. parameters, gradients: {"enc0.a.weight":
     (ceil(CO/16), K, K, CI, 16), "enc0.a.bias": (ceil(CO/16) * 16,), ...} float32 on the device.
     Weights and biases start uniform in +-1/sqrt(CI K K) (PyTorch's default for Conv2d), output
     channels beyond CO at 0, with gradient 0.
@@ -73,7 +72,7 @@ class UNet:
         self._plans = {}  # {(policy, size, training): WorkspacePlan}
         self._workspaces = {}  # {training: Workspace}
         self._trained = None  # (workspace, arrays, tile plan) of the last forward(training=True)
-        self._frozen = None  # {(layer, variant): weights} once frozen
+        self._frozen = None  # {(layer, module): weights} once frozen
 
     @classmethod
     def of_settings(
@@ -93,7 +92,7 @@ class UNet:
         return net
 
     def connect_residual(self) -> None:
-        """From the next image on, add RESIDUAL_SHARE of the first three features to it."""
+        """From the next image on, add output.SHARE of the first three features to it."""
         self._residual = True
 
     def use(self, policy: ConvolutionPolicy) -> None:
@@ -160,11 +159,9 @@ class UNet:
         tiles = plan or workspace.all_tiles
         for layer in self.layers:
             sources, out = tuple(arrays[name] for name in layer.inputs), arrays[layer.name]
-            layer.forward(workspace, sources, out, tiles.tiles(layer.name))
+            self._forward(workspace, layer, sources, out, tiles.tiles(layer.name))
             tiles.fill_copies(layer.name, out)
-        affine(self.dev, 0.5, 0.5, out, out=out)
-        if self._residual:
-            residual_forward(self.dev, x, out, RESIDUAL_SHARE)
+        output_forward(self.dev, out, x if self._residual else None)
         if training:
             self._trained = workspace, arrays, tiles
         return out
@@ -181,28 +178,91 @@ class UNet:
             raise RuntimeError("UNet.backward needs a forward(training=True) before it")
         (workspace, arrays, tiles), self._trained = self._trained, None
         grad_last = arrays[gradient_of(self.layers[-1].name)]
-        affine(self.dev, 0.5, 0.0, grad_y, out=grad_last)
+        output_backward(self.dev, grad_y, grad_last)
         tiles = tiles.backward(arrays)
         for layer in reversed(self.layers):
             sources = tuple(arrays[name] for name in layer.inputs)
             grad_out = arrays[gradient_of(layer.name)]
             tiles.fill_copies(layer.name, grad_out)
-            layer.backward_weights(workspace, sources, grad_out, tiles.tiles(layer.name))
+            if layer.kind == "conv":
+                self._backward_weights(workspace, layer, sources, grad_out, tiles.tiles(layer.name))
             for i, name in enumerate(layer.inputs):
-                layer.backward_input(
-                    workspace,
-                    i,
-                    grad_out,
-                    arrays[gradient_of(name)],
-                    x=sources[i],
-                    is_relu=name in self._relu_outputs,
-                    tiles=tiles.tiles(name),
-                )
+                grad_x = arrays[gradient_of(name)]
+                mask = sources[i] if name in self._relu_outputs else None
+                if layer.kind == "conv":
+                    self._backward_input(
+                        workspace, layer, i, grad_out, grad_x, mask=mask, tiles=tiles.tiles(name)
+                    )
+                elif layer.kind == "gate":
+                    gate_backward(self.dev, sources[i], grad_out, grad_x, tiles=tiles.tiles(name))
+                elif layer.kind == "pool":  # adds to the gradient of the skip
+                    avgpool2_backward(self.dev, mask, grad_out, grad_x, tiles=tiles.tiles(name))
+                else:
+                    upsample2_backward(self.dev, grad_out, grad_x, tiles=tiles.tiles(name))
         grad_x = arrays[gradient_of("x")]
         tiles.fill_copies("x", grad_x)
         if self._residual:
-            residual_backward(self.dev, grad_y, grad_x, RESIDUAL_SHARE)
+            residual_backward(self.dev, grad_y, grad_x)
         return grad_x
+
+    def _forward(self, workspace, layer, sources, out, tiles):
+        """Compute the tiles of a layer's output from its inputs."""
+        if layer.kind == "gate":
+            gate_forward(self.dev, sources[0], out, tiles=tiles)
+        elif layer.kind == "pool":
+            avgpool2_forward(self.dev, sources[0], out, tiles=tiles)
+        elif layer.kind == "upsample":
+            upsample2_forward(self.dev, sources[0], out, tiles=tiles)
+        else:
+            conv = workspace.plan.convolutions[layer.name, Direction.FORWARD, None]
+            conv.forward(
+                self.dev,
+                workspace.plan.blocking,
+                sources,
+                self.parameters[layer.name + ".weight"],
+                self.parameters[layer.name + ".bias"],
+                out,
+                relu=layer.relu,
+                work=workspace.work,
+                tiles=tiles,
+                laid_out=self._laid_out(workspace, layer, conv),
+            )
+
+    def _backward_input(self, workspace, layer, source, grad_out, grad_x, *, mask, tiles):
+        """Compute the tiles of grad_x, the gradient of a convolution's input of number `source`."""
+        workspace.plan.convolutions[layer.name, Direction.BACKWARD_INPUT, source].backward_input(
+            self.dev,
+            workspace.plan.blocking,
+            self.parameters[layer.name + ".weight"],
+            sum(layer.sources[:source]),
+            grad_out,
+            grad_x,
+            mask=mask,
+            work=workspace.work,
+            tiles=tiles,
+        )
+
+    def _backward_weights(self, workspace, layer, sources, grad_out, tiles):
+        """Overwrite the gradients of a convolution's parameters."""
+        workspace.plan.convolutions[layer.name, Direction.BACKWARD_WEIGHTS, None].backward_weights(
+            self.dev,
+            workspace.plan.blocking,
+            sources,
+            grad_out,
+            self.gradients[layer.name + ".weight"],
+            self.gradients[layer.name + ".bias"],
+            work=workspace.work,
+            tiles=tiles,
+        )
+
+    def _laid_out(self, workspace, layer, conv):
+        """The weights as conv.forward() transforms them, once frozen; None = not in advance."""
+        if self._frozen is None:
+            return None
+        if (layer.name, conv) not in self._frozen:
+            weight = self.parameters[layer.name + ".weight"]
+            self._frozen[layer.name, conv] = conv.lay_out(self.dev, workspace.plan.blocking, weight)
+        return self._frozen[layer.name, conv]
 
     def output(self, name: str) -> Array:
         """(H, W, C) output of the layer `name` in the last forward(training=True), until its
@@ -236,9 +296,7 @@ class UNet:
     def _workspace(self, size, training):
         """The buffers for this size."""
         if training not in self._workspaces:
-            self._workspaces[training] = Workspace(
-                self.dev, self.parameters, self.gradients, frozen=self._frozen
-            )
+            self._workspaces[training] = Workspace(self.dev)
         workspace, plan = self._workspaces[training], self._plan(size, training)
         if training and plan is not workspace.plan:
             self._trained = None

@@ -94,12 +94,12 @@ def upsample_backward(grad_out: np.ndarray) -> np.ndarray:
 def network(layers: list, parameters: dict, x: np.ndarray) -> dict[str, np.ndarray]:
     """{layer: its float64 output} of a network; "image" is the image, "x" the input (H, W, C).
 
-    layers: pp_cl.network.layer.Layer in the order of the forward pass. parameters:
+    layers: pp_cl.network.layers.Layer in the order of the forward pass. parameters:
     {"enc0.a.weight": (CO, CI, K, K), "enc0.a.bias": (CO,), ...}.
     """
     outputs = {"x": np.asarray(x, np.float64)}
     for layer in layers:
-        outputs[layer.name] = layer.reference_forward(_joined(layer, outputs), parameters)
+        outputs[layer.name] = _forward(layer, _joined(layer, outputs), parameters)
     outputs["image"] = 0.5 + 0.5 * outputs[layers[-1].name]
     return outputs
 
@@ -120,7 +120,7 @@ def network_gradients(
         if layer.relu:
             grad = grad * active[layer.name]
         source = _joined(layer, outputs)
-        grad_source, of_parameters = layer.reference_backward(source, grad, parameters)
+        grad_source, of_parameters = _backward(layer, source, grad, parameters)
         gradients |= of_parameters
         first = 0
         for name in layer.inputs:
@@ -128,6 +128,31 @@ def network_gradients(
             grads[name] = grads[name] + grad_source[..., first : first + channels]
             first += channels
     return gradients | {"x": grads["x"]}
+
+
+def _forward(layer, source, parameters):
+    """Output from the inputs' concatenation (H, W, CI)."""
+    if layer.kind != "conv":
+        return {"gate": gate, "pool": pool, "upsample": upsample}[layer.kind](source)
+    weight, bias = parameters[layer.name + ".weight"], parameters[layer.name + ".bias"]
+    out = convolution(source, weight, bias)
+    return np.maximum(out, 0) if layer.relu else out
+
+
+def _backward(layer, source, grad_out, parameters):
+    """(gradient of the inputs' concatenation, {parameter: its gradient}), given that of the output
+    before its ReLU.
+    """
+    if layer.kind == "gate":
+        return gate_backward(source, grad_out), {}
+    if layer.kind != "conv":
+        backward = {"pool": pool_backward, "upsample": upsample_backward}[layer.kind]
+        return backward(grad_out), {}
+    gradients = {
+        layer.name + ".weight": convolution_backward_weights(source, grad_out, layer.kernel_size),
+        layer.name + ".bias": grad_out.sum((0, 1)),
+    }
+    return convolution(grad_out, flipped(parameters[layer.name + ".weight"])), gradients
 
 
 def _joined(layer, outputs):

@@ -6,13 +6,9 @@ from typing import NamedTuple
 import numpy as np
 
 from pp_cl.device.device import Device
-from pp_cl.layers.blocking import Blocking
-from pp_cl.layers.conv import pack_bias, pack_weights, unpack_weights
-from pp_cl.layers.direction import Direction
-from pp_cl.layers.variants import VARIANTS
-from pp_cl.layers.work import Work
+from pp_cl.layers.choice import VARIANTS
+from pp_cl.layers.conv import Blocking, Direction, Work, pack_bias, pack_weights, unpack_weights
 from pp_cl.reference.network import convolution, convolution_backward_weights, flipped
-from pp_cl.reference.winograd import rounding_bound
 from pp_cl.selftest.case import Check, allowed
 
 # of the largest value: the transforms of F(4x4) add up 36 numbers of a few times its size, and a
@@ -21,11 +17,11 @@ SHARE = 1e-5
 
 
 class Result(NamedTuple):
-    """operands: (input, weights) of what is a convolution of the one by the other."""
+    """of_channels: whether it is a feature map, (H, W, C)."""
 
     actual: np.ndarray
     expected: np.ndarray
-    operands: tuple[np.ndarray, np.ndarray] | None = None
+    of_channels: bool = False
 
 
 class Layer:
@@ -57,15 +53,14 @@ class Layer:
     def results(self, dev: Device, variant: str, blocking: Blocking) -> Iterator[Result]:
         """Of the forward pass, of the weights, of the bias and of each part of the input."""
         run = _Run(self, dev, variant, blocking)
-        yield Result(run.forward(), self.out, (self.x, self.weight))
+        yield Result(run.forward(), self.out, True)
         grad_weight, grad_bias = run.backward_weights()
         yield Result(grad_weight, self.grad_weight)
         yield Result(grad_bias, self.grad_bias)
         first = 0
         for i, part in enumerate(self.parts):
             channels = slice(first, first + part.shape[2])
-            operands = self.grad_out, flipped(self.weight)[channels]
-            yield Result(run.backward_input(i, first), self.grad_x[..., channels], operands)
+            yield Result(run.backward_input(i, first), self.grad_x[..., channels], True)
             first = channels.stop
 
 
@@ -74,14 +69,16 @@ class _Run:
 
     def __init__(self, layer, dev, variant, blocking):
         self.layer, self.dev = layer, dev
-        self.convolution = VARIANTS[variant].convolution(dev, blocking)
+        self.conv, self.blocking = VARIANTS[variant].module, blocking
         self.sources = tuple(dev.upload(part) for part in layer.parts)
         self.weight = dev.upload(pack_weights(layer.weight))
         self.grad_out = dev.upload(layer.grad_out)
 
     def forward(self):
         out = self.dev.empty(self.layer.out.shape)
-        self.convolution.forward(
+        self.conv.forward(
+            self.dev,
+            self.blocking,
             self.sources,
             self.weight,
             self.dev.upload(pack_bias(self.layer.bias)),
@@ -97,7 +94,9 @@ class _Run:
             self.dev.empty(self.weight.shape),
             self.dev.empty(-(-co // 16) * 16),
         )
-        self.convolution.backward_weights(
+        self.conv.backward_weights(
+            self.dev,
+            self.blocking,
             self.sources,
             self.grad_out,
             grad_weight,
@@ -109,7 +108,9 @@ class _Run:
     def backward_input(self, i, first):
         source = self.sources[i]
         grad_x = self.dev.empty(source.shape)
-        self.convolution.backward_input(
+        self.conv.backward_input(
+            self.dev,
+            self.blocking,
             self.weight,
             first,
             self.grad_out,
@@ -121,16 +122,14 @@ class _Run:
 
     def _work(self, direction, c):
         height = len(self.layer.x)
-        floats = self.convolution.work_floats(direction, height, self.weight.shape, c)
+        floats = self.conv.work_floats(
+            self.dev, self.blocking, direction, height, self.weight.shape, c
+        )
         return Work.empty(self.dev, *floats)
 
 
-def within(variant: str, result: Result) -> Check:
-    """Each value against SHARE of the largest: of its channel, if it is a convolution's; and what
-    rounding the transformed weights to half may change.
-    """
-    expected, operands = result.expected, result.operands
-    most = SHARE * np.abs(expected).max((0, 1) if operands else None)
-    if operands and VARIANTS[variant].half:
-        most = most + rounding_bound(4, *operands)
+def within(result: Result) -> Check:
+    """Each value against SHARE of the largest: of its channel, if it is a convolution's."""
+    expected = result.expected
+    most = SHARE * np.abs(expected).max((0, 1) if result.of_channels else None)
     return allowed(result.actual, expected, np.broadcast_to(most, expected.shape))

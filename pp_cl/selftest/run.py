@@ -7,8 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from pp_cl.device.device import Device
-from pp_cl.layers.blocking import device_class
-from pp_cl.layers.variants import offered
+from pp_cl.layers.choice import device_class, offered
 from pp_cl.selftest import alpha, device, layers, metrics, raster, scene, softmax, training
 from pp_cl.selftest.case import Case
 

@@ -6,7 +6,7 @@ from functools import partial
 import numpy as np
 
 from pp_cl.device.device import Device
-from pp_cl.layers.policy import make_policy
+from pp_cl.layers.choice import make_policy
 from pp_cl.raster.sh import SH_DEGREES
 from pp_cl.reference import loss as reference_loss
 from pp_cl.reference import optim

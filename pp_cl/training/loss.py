@@ -7,7 +7,7 @@ from pp_cl.device.buffers import Buffers, Table
 from pp_cl.device.device import Device
 from pp_cl.device.form import group_items, group_ranges, lanes
 from pp_cl.layers.tiles import SIDE, grid_shape
-from pp_cl.network.tile_sets import grow
+from pp_cl.network.tile_plan import grow
 
 TAPS = 11  # pixels, the side of an SSIM window
 REACH = 2 * (TAPS // 2)  # pixels over which the loss's gradient depends on the target

@@ -13,7 +13,7 @@ from pp_cl.device.compact import compact_table
 from pp_cl.device.device import Device
 from pp_cl.device.rows import PIECE_BYTES
 from pp_cl.metrics.lpips import Lpips
-from pp_cl.network.buffers import gradient_of
+from pp_cl.network.layers import gradient_of
 from pp_cl.network.unet import UNet
 from pp_cl.raster.blend import BLENDS, Blend
 from pp_cl.raster.pairs import PairBuilder

@@ -10,7 +10,7 @@ from pp_cl.device.device import Device
 from pp_cl.device.form import group_items, group_ranges, lanes
 from pp_cl.device.transfer import Reading, read_later
 from pp_cl.errors import UserError
-from pp_cl.layers.policy import ConvolutionPolicy
+from pp_cl.layers.choice import ConvolutionPolicy
 from pp_cl.metrics.lpips import BLOCKS, LEAST_SIZE, WIDTHS, Lpips, size_of, vgg_layers
 from pp_cl.training.loss import corner_of
 

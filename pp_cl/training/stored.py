@@ -15,9 +15,8 @@ from pp_cl.errors import UserError, quoted, shown
 from pp_cl.files.checkpoint import MEND, Checkpoint, opened_checkpoint
 from pp_cl.files.npz import Form
 from pp_cl.files.run_folder import RunFolder
-from pp_cl.layers.tuning import check_form
-from pp_cl.network.architectures import unet_layers
-from pp_cl.network.workspace import parameter_table
+from pp_cl.layers.choice import check_form
+from pp_cl.network.layers import parameter_table, unet_layers
 from pp_cl.raster.sh import SH_DEGREES, sh_blocks
 from pp_cl.scene.identity import DIGITS
 from pp_cl.training.point_state import PointState, stored_name

@@ -6,10 +6,8 @@ from support.benches import HALF, KEYS
 
 from pp_cl.bench.conv import RandomConv, bench_conv
 from pp_cl.bench.timing import errors
-from pp_cl.layers.blocking import device_class
-from pp_cl.layers.direction import Direction
-from pp_cl.layers.policy import make_policy
-from pp_cl.layers.variants import offered
+from pp_cl.layers.choice import device_class, make_policy, offered
+from pp_cl.layers.conv import Direction
 
 pytestmark = pytest.mark.usefixtures("quick")
 

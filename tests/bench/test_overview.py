@@ -7,7 +7,7 @@ import pytest
 from pp_cl.bench import overview, training
 from pp_cl.bench.overview import bench_overview, raster_steps, within
 from pp_cl.bench.training import bench_training
-from pp_cl.layers.policy import make_policy
+from pp_cl.layers.choice import make_policy
 
 
 def steps_of(seconds):

@@ -23,11 +23,16 @@ from pp_cl.bench.tune import (
 from pp_cl.cli import main
 from pp_cl.device.discover import TEMPORARY_CACHE, open_device
 from pp_cl.errors import UserError
-from pp_cl.layers.blocking import CHOICES, device_class
-from pp_cl.layers.direction import Direction
-from pp_cl.layers.policy import make_policy
-from pp_cl.layers.tuning import device_key, load_tuning, tuning_file
-from pp_cl.layers.variants import offered
+from pp_cl.layers.choice import (
+    CHOICES,
+    device_class,
+    device_key,
+    load_tuning,
+    make_policy,
+    offered,
+    tuning_file,
+)
+from pp_cl.layers.conv import Direction
 
 FORWARD, INPUT, WEIGHTS = Direction
 SMALL = ("--size", "8", "--widths", "16,16,16")

@@ -11,10 +11,8 @@ from support.benches import HALF, KEYS
 from pp_cl.bench import unet
 from pp_cl.cli import main
 from pp_cl.device.discover import open_device
-from pp_cl.layers.blocking import device_class
-from pp_cl.layers.policy import make_policy
-from pp_cl.layers.variants import offered
-from pp_cl.network.architectures import multiplications, unet_layers
+from pp_cl.layers.choice import device_class, make_policy, offered
+from pp_cl.network.layers import multiplications, unet_layers
 
 SMALL = ("--size", "8", "--widths", "16,16,16")
 pytestmark = pytest.mark.usefixtures("quick")

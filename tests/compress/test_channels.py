@@ -11,7 +11,7 @@ from support.networks import plain_parameters
 from pp_cl.compress.channels import channels_text, kept_channels, reduced_parameters
 from pp_cl.compress.reduction import Reduction
 from pp_cl.layers.conv import unpack_weights
-from pp_cl.network.architectures import convolutions
+from pp_cl.network.layers import convolutions
 from pp_cl.network.unet import UNet
 
 DEAD = {"enc0.b": 20, "enc1.a": 33, "enc2.b": 17, "dec1.a": 40, "dec0.b": 1}

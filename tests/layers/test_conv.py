@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from oracle.conv import conv, conv_gradients
+from pp_cl.layers.conv_backward_weights import flip_weights
 from support.comparisons import relative_error
 from support.conv_layers import (
     SHAPES,
@@ -15,7 +16,7 @@ from support.conv_layers import (
 )
 from support.launches import check_parts
 
-from pp_cl.layers.blocking import SHIPPED
+from pp_cl.layers.choice import SHIPPED
 from pp_cl.layers.conv import (
     conv_backward_input,
     conv_forward,
@@ -23,7 +24,6 @@ from pp_cl.layers.conv import (
     pack_weights,
     unpack_weights,
 )
-from pp_cl.layers.conv_backward_weights import flip_weights
 from pp_cl.reference.differences import numeric_gradient
 
 

@@ -3,18 +3,18 @@
 import numpy as np
 import pytest
 from oracle.conv import conv, conv_gradients
-from support.comparisons import relative_error
-from support.conv_layers import SHAPES, layer
-from support.launches import check_parts
-
-from pp_cl.layers import conv_backward_weights as module
-from pp_cl.layers.blocking import SHIPPED
-from pp_cl.layers.conv import pack_bias, pack_weights, unpack_weights
 from pp_cl.layers.conv_backward_weights import (
     conv_backward_weights,
     flip_weights,
     partial_floats,
 )
+from support.comparisons import relative_error
+from support.conv_layers import SHAPES, layer
+from support.launches import check_parts
+
+from pp_cl.layers import conv_backward_weights as module
+from pp_cl.layers.choice import SHIPPED
+from pp_cl.layers.conv import pack_bias, pack_weights, unpack_weights
 from pp_cl.reference.differences import numeric_gradient
 
 

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 from oracle.conv import conv, conv_gradients
+from pp_cl.layers.conv_backward_weights import flip_weights
 from support.comparisons import relative_error
 from support.conv_layers import (
     LOCAL_SHAPES,
@@ -15,9 +16,8 @@ from support.guarded import large
 from support.launches import check_parts
 
 from pp_cl.layers import conv_local as module
-from pp_cl.layers.blocking import SHIPPED
+from pp_cl.layers.choice import SHIPPED
 from pp_cl.layers.conv import conv_forward, pack_bias, pack_weights
-from pp_cl.layers.conv_backward_weights import flip_weights
 from pp_cl.layers.conv_local import conv_local_backward_input, conv_local_forward, quads
 
 

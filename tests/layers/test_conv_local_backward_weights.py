@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 from oracle.conv import conv_gradients
+from pp_cl.layers.conv_local_backward_weights import conv_local_backward_weights
 from support.comparisons import relative_error
 from support.conv_layers import LOCAL_SHAPES
 from support.guarded import large
@@ -10,9 +11,8 @@ from support.launches import check_parts
 
 from pp_cl.layers import conv_backward_weights as direct
 from pp_cl.layers import conv_local_backward_weights as module
-from pp_cl.layers.blocking import SHIPPED
+from pp_cl.layers.choice import SHIPPED
 from pp_cl.layers.conv import pack_bias, pack_weights, unpack_weights
-from pp_cl.layers.conv_local_backward_weights import conv_local_backward_weights
 
 
 def run_backward_weights(dev, grad_out, k, *sources, run=conv_local_backward_weights, **given):

@@ -12,11 +12,8 @@ from support.winograd_layers import form, run_backward_weights, run_forward
 from pp_cl.bench.conv import RandomConv
 from pp_cl.bench.timing import errors
 from pp_cl.errors import UserError
-from pp_cl.layers.blocking import CHOICES
-from pp_cl.layers.direction import Direction
-from pp_cl.layers.policy import make_policy
-from pp_cl.layers.tuning import fastest
-from pp_cl.layers.variants import VARIANTS, ConvShape, offered
+from pp_cl.layers.choice import CHOICES, VARIANTS, ConvShape, fastest, make_policy, offered
+from pp_cl.layers.conv import Direction
 from pp_cl.network.unet import UNet
 
 DEFAULT = 1e-5

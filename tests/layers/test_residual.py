@@ -2,10 +2,10 @@
 
 import numpy as np
 import pytest
+from pp_cl.layers.residual import residual_backward, residual_forward
 from support.comparisons import relative_error
 from support.guarded import AWKWARD_SIZES
 
-from pp_cl.layers.residual import residual_backward, residual_forward
 from pp_cl.network.unet import RESIDUAL_SHARE, UNet
 
 

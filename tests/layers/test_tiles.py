@@ -12,10 +12,9 @@ from support.guarded import large
 
 from pp_cl.device.device import kernel_folder
 from pp_cl.layers import resample as layers
-from pp_cl.layers.blocking import SHIPPED
-from pp_cl.layers.conv import pack_bias, pack_weights, unpack_weights
+from pp_cl.layers.choice import SHIPPED, VARIANTS
+from pp_cl.layers.conv import Direction, Work, pack_bias, pack_weights, unpack_weights
 from pp_cl.layers.conv_local import TILE_PARTS
-from pp_cl.layers.direction import Direction
 from pp_cl.layers.tiles import (
     LANES,
     SIDE,
@@ -29,9 +28,7 @@ from pp_cl.layers.tiles import (
     tiles_find,
     tiles_hit,
 )
-from pp_cl.layers.variants import VARIANTS
-from pp_cl.layers.work import Work
-from pp_cl.network.tile_sets import grow
+from pp_cl.network.tile_plan import grow
 
 # (height, width, channels): less than a tile, cut-off tiles, several work-groups
 SHAPES = [(1, 1, 1), (3, 5, 16), (31, 33, 3), (4, 257, 20), (257, 8, 16)]

@@ -13,10 +13,8 @@ from pp_cl.cli import main
 from pp_cl.device.discover import open_device
 from pp_cl.files.atomic import write_json
 from pp_cl.files.checkpoint import load_checkpoint, save_checkpoint
-from pp_cl.layers.direction import Direction
-from pp_cl.layers.policy import load_policy, policy_of_run
-from pp_cl.layers.tuning import load_tuning, tuning_file
-from pp_cl.layers.variants import ConvShape
+from pp_cl.layers.choice import ConvShape, load_policy, load_tuning, policy_of_run, tuning_file
+from pp_cl.layers.conv import Direction
 
 pytestmark = pytest.mark.usefixtures("cpu_form")
 

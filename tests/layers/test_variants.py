@@ -7,10 +7,8 @@ import pytest
 from support.conv_layers import layer
 
 from pp_cl.config import Config
-from pp_cl.layers.blocking import SHIPPED
-from pp_cl.layers.direction import Direction
-from pp_cl.layers.policy import make_policy
-from pp_cl.layers.variants import VARIANTS, ConvShape, offered
+from pp_cl.layers.choice import SHIPPED, VARIANTS, ConvShape, make_policy, offered
+from pp_cl.layers.conv import Direction
 from pp_cl.selftest.convolutions import Layer, within
 from pp_cl.selftest.hard_layers import hard_layers
 

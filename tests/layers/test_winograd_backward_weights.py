@@ -3,15 +3,15 @@
 import numpy as np
 import pytest
 from oracle.conv import conv_gradients
-from support.comparisons import relative_error
-from support.guarded import large
-from support.winograd_layers import BOUNDS, SHAPES, form, run_backward_weights
-
 from pp_cl.layers.winograd_backward_weights import (
     backward_weights_floats,
     winograd_backward_weights,
 )
-from pp_cl.layers.work import Work
+from support.comparisons import relative_error
+from support.guarded import large
+from support.winograd_layers import BOUNDS, SHAPES, form, run_backward_weights
+
+from pp_cl.layers.conv import Work
 
 # With parts of 128 x 128 channels: several, and tails of both kinds
 PARTS = [*map(large, [(5, 6, 80, 144), (9, 7, 144, 48), (12, 20, 272, 256)])]

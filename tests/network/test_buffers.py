@@ -4,8 +4,8 @@ from itertools import pairwise
 
 import numpy as np
 
-from pp_cl.network.architectures import unet_layers
-from pp_cl.network.buffers import gradient_of, lifetimes, plan_buffers
+from pp_cl.network.layers import gradient_of, unet_layers
+from pp_cl.network.workspace import lifetimes, plan_buffers
 
 
 def test_arrays_of_one_buffer_never_overlap(rng):

@@ -10,18 +10,20 @@ from support.networks import plain_parameters
 
 import pp_cl.network.unet
 from pp_cl.config import preset
-from pp_cl.layers.policy import make_policy
+from pp_cl.layers.choice import make_policy
 from pp_cl.layers.tiles import SIDE, grid_shape, tiles_find
 from pp_cl.model import Model
-from pp_cl.network.architectures import BLOCKS, convolutions, unet_layers
-from pp_cl.network.sparse_tiles import (
+from pp_cl.network.layers import BLOCKS, convolutions, unet_layers
+from pp_cl.network.tile_plan import (
     LOSS_BORDER,
     ForwardPlan,
+    double,
     gradient_radius,
+    grow,
+    halve,
     map_tiles,
     receptive_radius,
 )
-from pp_cl.network.tile_sets import double, grow, halve
 from pp_cl.network.unet import UNet
 from pp_cl.raster.blend import BACKGROUND
 from pp_cl.render import Renderer

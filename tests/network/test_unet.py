@@ -10,8 +10,8 @@ from support.comparisons import relative_error
 from support.launches import check_parts
 from support.networks import plain_parameters
 
-from pp_cl.layers.policy import make_policy
-from pp_cl.network.architectures import BLOCKS, convolutions, multiplications, unet_layers
+from pp_cl.layers.choice import make_policy
+from pp_cl.network.layers import BLOCKS, convolutions, multiplications, unet_layers
 from pp_cl.network.unet import UNet
 from pp_cl.reference.differences import numeric_gradient
 from pp_cl.reference.winograd import rounding_share

@@ -8,7 +8,7 @@ from oracle.conv import conv, conv_gradients
 from oracle.unet import unet, unet_gradients
 from support.comparisons import relative_error
 
-from pp_cl.network.architectures import BLOCKS, convolutions, unet_layers
+from pp_cl.network.layers import BLOCKS, convolutions, unet_layers
 from pp_cl.reference.network import (
     convolution,
     convolution_at,

@@ -1,6 +1,6 @@
 """Invented measurements of convolutions."""
 
-from pp_cl.layers.tuning import FORMAT, device_key
+from pp_cl.layers.choice import FORMAT, device_key
 
 MS = {"direct": 3.0, "winograd2": 1.0, "winograd4": 2.0}
 REL_L2 = {"direct": 2e-7, "winograd2": 1e-7, "winograd4": 5e-7}

@@ -1,17 +1,16 @@
 """Winograd convolutions run on plain arrays."""
 
 import numpy as np
-from support.guarded import large
-
-from pp_cl.layers.blocking import SHIPPED, Blocking
-from pp_cl.layers.conv import pack_bias, pack_weights, unpack_weights
 from pp_cl.layers.winograd import WinogradForm, winograd_forward
 from pp_cl.layers.winograd_backward_weights import (
     backward_weights_floats,
     winograd_backward_weights,
 )
 from pp_cl.layers.winograd_transform import transform_flipped_weights, transform_weights
-from pp_cl.layers.work import Work
+from support.guarded import large
+
+from pp_cl.layers.choice import SHIPPED
+from pp_cl.layers.conv import Blocking, Work, pack_bias, pack_weights, unpack_weights
 
 
 def form(m, half=False, blocking: Blocking = SHIPPED["CPU"]):

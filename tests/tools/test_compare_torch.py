@@ -12,8 +12,7 @@ import pytest
 from support.comparisons import relative_error
 
 from pp_cl.bench.unet import make_network, plain_parameters
-from pp_cl.layers.policy import AUTO, make_policy
-from pp_cl.layers.variants import VARIANTS
+from pp_cl.layers.choice import AUTO, VARIANTS, make_policy
 
 SPEC = importlib.util.spec_from_file_location(
     "compare_torch", Path(__file__).parents[2] / "tools" / "compare_torch.py"

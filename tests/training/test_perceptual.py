@@ -11,7 +11,7 @@ from support.runs import arguments
 from pp_cl.cli import main
 from pp_cl.device.buffers import table_bytes
 from pp_cl.errors import UserError
-from pp_cl.layers.policy import make_policy
+from pp_cl.layers.choice import make_policy
 from pp_cl.metrics.lpips import Lpips
 from pp_cl.reference.lpips import WIDTHS, lpips, lpips_gradient, random_weights
 from pp_cl.training.perceptual import PerceptualLoss

@@ -14,9 +14,8 @@ from pp_cl.files.checkpoint import load_checkpoint
 from pp_cl.files.run_folder import Log
 from pp_cl.info import run_facts
 from pp_cl.layers import tuning
-from pp_cl.layers.direction import Direction
-from pp_cl.layers.policy import load_policy
-from pp_cl.layers.variants import VARIANTS, ConvShape
+from pp_cl.layers.choice import VARIANTS, ConvShape, load_policy
+from pp_cl.layers.conv import Direction
 from pp_cl.metrics import lpips_weights
 from pp_cl.sweep.plan import Job
 from pp_cl.sweep.result import finished_row, progress

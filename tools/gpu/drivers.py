@@ -15,15 +15,13 @@ from pp_cl.bench.raster_scenes import SCENES, Case
 from pp_cl.bench.unet import make_network, train_runner
 from pp_cl.config import Config, assign, preset
 from pp_cl.device.device import Device
-from pp_cl.layers.blocking import CHOICES, device_class
-from pp_cl.layers.direction import Direction
-from pp_cl.layers.policy import make_policy
+from pp_cl.layers.choice import CHOICES, device_class, make_policy, offered
+from pp_cl.layers.conv import Direction
 from pp_cl.layers.tiles import tiles_find
-from pp_cl.layers.variants import offered
 from pp_cl.metrics.lpips import Lpips, vgg_layers
 from pp_cl.metrics.shape import Mesh, sample_surface
 from pp_cl.model import Model
-from pp_cl.network.architectures import BLOCKS
+from pp_cl.network.layers import BLOCKS
 from pp_cl.network.unet import LEAST_PIXELS, UNet
 from pp_cl.presets import PRESETS
 from pp_cl.raster.blend import BLENDS

@@ -18,6 +18,7 @@ from functools import cached_property
 
 import numpy as np
 from pyopencl.array import Array
+from scipy.ndimage import distance_transform_cdt
 
 from pp_cl.device.device import Device
 from pp_cl.device.transfer import shared_parts
@@ -30,13 +31,91 @@ from pp_cl.layers.tiles import (
     tile_arrays,
     tiles_copy,
 )
-from pp_cl.network.architectures import convolutions
-from pp_cl.network.layer import Layer
-from pp_cl.network.tile_sets import distance, grow, halve
+from pp_cl.network.layers import Layer, convolutions, levels_of
 
 # Pixels: tiles of the image's gradient that are nearer to its border are classes of their own,
 # because the loss sees the border from afar, too.
 LOSS_BORDER = 48
+
+
+# Sets of tiles are (rows, columns) bool.
+
+
+def distance(tiles: np.ndarray) -> np.ndarray:
+    """(rows, columns) int: how many tiles away, diagonals included, the nearest one that is set is;
+    more than any number of them where none is.
+    """
+    if not tiles.any():
+        return np.full(tiles.shape, np.iinfo(np.int32).max)
+    return distance_transform_cdt(~tiles, "chessboard")
+
+
+def grow(tiles: np.ndarray, n: int = 1) -> np.ndarray:
+    """(rows, columns) bool: the tiles within n tiles, diagonals included, of those that are set."""
+    if n > 2:  # fewer are faster step by step
+        return distance(tiles) <= n
+    for _ in range(n):
+        rows = tiles.copy()
+        rows[1:] |= tiles[:-1]
+        rows[:-1] |= tiles[1:]
+        tiles = rows.copy()
+        tiles[:, 1:] |= rows[:, :-1]
+        tiles[:, :-1] |= rows[:, 1:]
+    return tiles
+
+
+def halve(tiles: np.ndarray, levels: int = 1) -> np.ndarray:
+    """The tiles 2**levels as wide that hold any of those that are set."""
+    for _ in range(levels):
+        rows = np.logical_or.reduceat(tiles, np.arange(0, tiles.shape[0], 2), axis=0)
+        tiles = np.logical_or.reduceat(rows, np.arange(0, tiles.shape[1], 2), axis=1)
+    return tiles
+
+
+def double(tiles: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
+    """(rows, columns) = shape bool: the tiles half as wide inside those that are set."""
+    return tiles.repeat(2, 0).repeat(2, 1)[: shape[0], : shape[1]]
+
+
+def forward_radius(layer: Layer) -> int:
+    """How far from its place a change of the input changes the output, in pixels of the image."""
+    if layer.kind == "conv":
+        return layer.kernel_size // 2 << layer.level
+    return {"gate": 0, "pool": 1, "upsample": 2}[layer.kind] << layer.level >> 1
+
+
+def backward_radius(layer: Layer) -> int:
+    """The same from the gradient of the output to the gradient of the input."""
+    if layer.kind == "conv":
+        return forward_radius(layer)
+    return {"gate": 0, "pool": 0, "upsample": 2}[layer.kind] << layer.level
+
+
+def needed_forward(layer: Layer, computed: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
+    """(rows, columns) = shape bool: tiles of an input that the computed tiles of the output
+    read.
+    """
+    if layer.kind == "pool":
+        return double(computed, shape)
+    if layer.kind == "upsample":
+        return halve(grow(computed))
+    return grow(computed) if layer.kernel_size > 1 else computed
+
+
+def needed_backward(layer: Layer, computed: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
+    """(rows, columns) = shape bool: tiles of the gradient of the output that the computed tiles of
+    an input's gradient read.
+    """
+    if layer.kind == "pool":
+        return halve(computed)
+    if layer.kind == "upsample":
+        return grow(double(computed, shape))
+    return needed_forward(layer, computed, shape)
+
+
+def reads_input_backward(layer: Layer) -> bool:
+    """Whether the backward pass reads the inputs."""
+    return layer.kind != "upsample"
 
 
 @dataclass(frozen=True)
@@ -93,7 +172,7 @@ def receptive_radius(layers: list[Layer]) -> dict[str, int]:
     """{name: pixels}: how far from its place a change of x changes the output of a layer."""
     radius = {"x": 0}
     for layer in layers:
-        radius[layer.name] = max(radius[name] for name in layer.inputs) + layer.forward_radius()
+        radius[layer.name] = max(radius[name] for name in layer.inputs) + forward_radius(layer)
     return radius
 
 
@@ -104,7 +183,7 @@ def gradient_radius(layers: list[Layer]) -> dict[str, int]:
     radius = dict.fromkeys([*(layer.name for layer in layers), "x"], 0)
     for layer in reversed(layers):
         for name in layer.inputs:
-            radius[name] = max(radius[name], radius[layer.name] + layer.backward_radius())
+            radius[name] = max(radius[name], radius[layer.name] + backward_radius(layer))
     return radius
 
 
@@ -113,13 +192,8 @@ def needed_radius(layers: list[Layer]) -> dict[str, int]:
     radius = dict.fromkeys([*(layer.name for layer in layers), "x"], 0)
     for layer in reversed(layers):
         for name in layer.inputs:
-            radius[name] = max(radius[name], radius[layer.name] + layer.forward_radius())
+            radius[name] = max(radius[name], radius[layer.name] + forward_radius(layer))
     return radius
-
-
-def levels_of(layers: list[Layer]) -> dict[str, int]:
-    """{name: level} of the network's input "x" and of all layers' outputs."""
-    return {"x": 0} | {layer.name: layer.level for layer in layers}
 
 
 class AllTiles:
@@ -236,7 +310,7 @@ class ImagePlan(TilePlan):
             for name in layer.inputs:
                 if name != "x":
                     needed = self.needed[name]
-                    needed |= layer.needed_forward(computed, needed.shape)
+                    needed |= needed_forward(layer, computed, needed.shape)
         count = {c.name: c.multiplications(*self.size) for c in convolutions(layers)}
         computed = sum(n * self.maps[name].computed.mean() for name, n in count.items())
         self.computed_fraction = computed / sum(count.values())
@@ -307,9 +381,9 @@ class BackwardPlan(TilePlan):
             out = self.maps[layer.name].computed
             for name in layer.inputs:
                 at_input = self.maps[name].computed
-                self.needed[layer.name] |= layer.needed_backward(at_input, out.shape)
-                if layer.reads_input_backward and name != "x":
-                    reads = layer.needed_forward(out, at_input.shape) | at_input
+                self.needed[layer.name] |= needed_backward(layer, at_input, out.shape)
+                if reads_input_backward(layer) and name != "x":
+                    reads = needed_forward(layer, out, at_input.shape) | at_input
                     self.activations[name] = self.activations.get(name, False) | reads
         self.needed["x"][:] = True
 

@@ -1,0 +1,245 @@
+"""Direct convolutions: any channels, 1x1 and 3x3."""
+
+import math
+
+from pyopencl.array import Array
+
+from pp_cl.device.device import Device
+from pp_cl.layers.conv import Blocking, Direction, Work, check_size, check_weights, sum_parts
+from pp_cl.layers.tiles import LANES, SIDE, Tiles, checked_tiles
+
+# Rows of the image that one work-item sums for the gradient of the weights: few enough to stay in a
+# core's cache, and enough parts for all cores.
+ROWS_PER_PART = 8
+# The partial sums take at most this many floats (64 MiB), or one part if that is larger.
+PARTIAL_FLOATS = 1 << 24
+
+
+def work_floats(
+    _dev: Device,
+    _blocking: Blocking,
+    direction: Direction,
+    height: int,
+    weight_shape: tuple,
+    c: int,
+) -> tuple[int, int]:
+    """(floats of Work.scratch, floats of Work.weights) for an image `height` high.
+
+    weight_shape: (ceil(CO/16), K, K, CI, 16); c: input channels, of a gradient of the input those
+    of the one source.
+    """
+    if direction is Direction.BACKWARD_WEIGHTS:
+        return 0, partial_floats(height, weight_shape)
+    flipped = math.prod(_flipped_shape(weight_shape, c, weight_shape[0] * LANES))
+    return 0, flipped if direction is Direction.BACKWARD_INPUT else 0
+
+
+def lay_out(_dev: Device, _blocking: Blocking, _weight: Array) -> None:
+    """None: the kernels read the weights as they are."""
+
+
+def forward(
+    dev: Device,
+    blocking: Blocking,
+    sources: tuple[Array, ...],
+    weight: Array,
+    bias: Array,
+    out: Array,
+    *,
+    relu: bool,
+    work: Work,
+    tiles: Tiles | None = None,
+    laid_out: Array | None = None,
+) -> None:
+    """out = convolution of the sources' concatenation + bias, then max(., 0) if relu.
+
+    sources: one or two of (H, W, C1), (H, W, C2); weight: (ceil(CO/16), K, K, C1 + C2, 16); bias:
+    (ceil(CO/16) * 16,); out: (H, W, CO), all float32; work: at least work_floats(); tiles: those of
+    out to compute, None = all; laid_out: lay_out(weight), None = computed here if it is needed.
+    Raises ValueError when shapes do not fit together.
+    """
+    height, width, co = out.shape
+    check_weights(sources, weight, bias, out)
+    channels = [source.shape[2] for source in sources]
+    tiles = checked_tiles(dev, tiles, height, width)
+    program, size, work_group = _program(dev, blocking, weight.shape[1], out.shape)
+    program.launch(
+        "conv_forward",
+        size,
+        local=work_group,
+        multiply_adds=tiles.number * SIDE**2 * weight.shape[1] ** 2 * sum(channels) * co,
+        along=1,
+        height=height,
+        width=width,
+        c1=channels[0],
+        c2=sum(channels[1:]),
+        co=co,
+        relu=relu,
+        x=sources[0],
+        x2=sources[-1],
+        weight=weight,
+        bias=bias,
+        out=out,
+        tile_count=tiles.count,
+    )
+
+
+def backward_input(
+    dev: Device,
+    blocking: Blocking,
+    weight: Array,
+    first: int,
+    grad_out: Array,
+    grad_x: Array,
+    *,
+    mask: Array | None,
+    work: Work,
+    tiles: Tiles | None = None,
+) -> None:
+    """grad_x = gradient of a convolution's input, 0 where mask <= 0.
+
+    weight: of forward(); first: its input channel that is grad_x's first; grad_out: (H, W, CO),
+    dL/dout before the ReLU; grad_x: (H, W, C); mask: (H, W, C), the input where it is a ReLU's
+    output, so that grad_x is the gradient of the ReLU's input, or None; tiles: those of grad_x to
+    compute, None = all. Raises ValueError when shapes do not fit together.
+    """
+    height, width, c = grad_x.shape
+    flipped = flip_weights(dev, blocking, weight, first, c, grad_out.shape[2], work)
+    tiles = checked_tiles(dev, tiles, height, width)
+    program, size, work_group = _program(dev, blocking, flipped.shape[1], grad_x.shape)
+    program.launch(
+        "conv_backward_input",
+        size,
+        local=work_group,
+        multiply_adds=tiles.number * SIDE**2 * flipped.shape[1] ** 2 * grad_out.shape[2] * c,
+        along=1,
+        height=height,
+        width=width,
+        c=c,
+        co=grad_out.shape[2],
+        masked=mask is not None,
+        x=grad_x if mask is None else mask,
+        flipped=flipped,
+        grad_out=grad_out,
+        grad_x=grad_x,
+        tile_count=tiles.count,
+    )
+
+
+def backward_weights(
+    dev: Device,
+    blocking: Blocking,
+    sources: tuple[Array, ...],
+    grad_out: Array,
+    grad_weight: Array,
+    grad_bias: Array,
+    *,
+    work: Work,
+    tiles: Tiles | None = None,
+) -> None:
+    """Overwrite grad_weight and grad_bias, shaped as forward()'s, with the gradients of forward(
+    sources, ...), given dL/dout (H, W, CO) before the ReLU.
+
+    tiles: those of grad_out to sum, each as often as it counts, None = all, once. The order of the
+    sums depends on the shapes alone. Raises ValueError when shapes do not fit together.
+    """
+    height, width, co = grad_out.shape
+    blocks, k, _, ci, _ = grad_weight.shape
+    check_weights(sources, grad_weight, grad_bias, grad_out)
+    check_size("parts", work.weights, partial_floats(height, grad_weight.shape))
+    tiles = checked_tiles(dev, tiles, height, width)
+    parts, rows = _parts(height, grad_weight.shape)
+    first = 0
+    for source in sources:
+        c = source.shape[2]
+        program, group = _weights_program(dev, blocking, k, c)
+        program.launch(
+            "conv_backward_weights",
+            (c // group * k, blocks, parts),
+            local=blocking.work_group,
+            multiply_adds=height * width * k**2 * c * co,
+            along=2,
+            height=height,
+            width=width,
+            c=c,
+            co=co,
+            first=first,
+            ci=ci,
+            rows=rows,
+            x=source,
+            grad_out=grad_out,
+            tile_count=tiles.count,
+            partial=work.weights,
+        )
+        first += c
+    sum_parts(dev, work.weights, grad_weight, grad_bias, parts=parts)
+
+
+def flip_weights(
+    dev: Device, blocking: Blocking, weight: Array, first: int, c: int, co: int, work: Work
+) -> Array:
+    """(ceil(c/16), K, K, co, 16) in work.weights: the weights with the kernel mirrored and the
+    roles of input and output channels exchanged.
+
+    weight: (ceil(CO/16), K, K, CI, 16); c: input channels taken from `first` on, CI - first or
+    less, a multiple of 16 unless they reach CI.
+    """
+    k, ci = weight.shape[1], weight.shape[3]
+    shape = _flipped_shape(weight.shape, c, co)
+    check_size("flipped weights", work.weights, math.prod(shape))
+    flipped = work.weights[: math.prod(shape)].reshape(shape)
+    _weights_program(dev, blocking, k, ci)[0].launch(
+        "conv_flip_weights",
+        (co, k * k, shape[0]),
+        c=min(ci - first, shape[0] * LANES),
+        co=co,
+        first=first,
+        ci=ci,
+        weight=weight,
+        flipped=flipped,
+    )
+    return flipped
+
+
+def partial_floats(height: int, weight_shape: tuple) -> int:
+    """Floats of Work.weights that backward_weights() needs for an image `height` high."""
+    blocks, k, _, ci, _ = weight_shape
+    return most_parts(height, weight_shape) * blocks * (k * k * ci + 1) * LANES
+
+
+def most_parts(height: int, weight_shape: tuple) -> int:
+    """Into how many parts the sum over an image `height` high is cut."""
+    return _parts(height, weight_shape)[0]
+
+
+def _parts(height, weight_shape):
+    """(parts, rows of each) of the sum over an image."""
+    blocks, k, _, ci, _ = weight_shape
+    limit = max(1, PARTIAL_FLOATS // (blocks * (k * k * ci + 1) * LANES))
+    rows = max(ROWS_PER_PART, -(-height // limit))
+    return -(-height // rows), rows
+
+
+def _flipped_shape(weight_shape, c, co):
+    return -(-c // LANES), *weight_shape[1:3], co, LANES
+
+
+def _program(dev, blocking, k, shape):
+    """(program, global size, work-group) for a result of shape (H, W, C)."""
+    height, width, channels = shape
+    pixels, groups, work_group = blocking.direct
+    if -(-channels // LANES) % groups:
+        pixels, groups, work_group = blocking.direct_odd
+    pixels = next(p for p in (pixels, 8, 4, 1) if p <= width)
+    size = (-(-width // pixels), height, -(-channels // (LANES * groups)))
+    return dev.program("layers/conv", KERNEL_SIZE=k, PIXELS=pixels, BLOCKS=groups), size, work_group
+
+
+def _weights_program(dev, blocking, k, channels):
+    """(program, input channels of one work-item): a divisor of the channels whose sums, k for each
+    channel, fit the registers.
+    """
+    group = next(
+        n for n in (16, 8, 4, 2, 1) if n * k <= blocking.accumulators and channels % n == 0
+    )
+    return dev.program("layers/conv_backward_weights", KERNEL_SIZE=k, CI_GROUP=group), group

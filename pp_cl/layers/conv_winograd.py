@@ -1,0 +1,285 @@
+"""3x3 convolutions by Winograd's minimal filtering F(4 x 4, 3 x 3): 4 times fewer multiplications
+than the direct ones, at two or three times the error. Channels come in multiples of 16.
+"""
+
+from pyopencl.array import Array
+
+from pp_cl.device.device import Device
+from pp_cl.layers.conv import (
+    COUNTERS,
+    Blocking,
+    Direction,
+    Work,
+    check_size,
+    check_weights,
+    sum_parts,
+)
+from pp_cl.layers.tiles import LANES, SIDE, Tiles, checked_tiles
+
+POSITIONS = (SIDE + 2) ** 2  # values of a transformed tile
+# Weights of at most so many channels in times channels out are narrow: transformed they take 2.25
+# MiB, about what a core's L2 cache holds, and reading them for fewer tiles at a time costs little.
+NARROW = 128 * 128
+# At most this many input and output channels of the gradient of the weights at a time: smaller
+# parts transform the same tiles more often, larger ones outgrow a core's cache.
+CI_PART, CO_PART = 128, 128
+# In these gradients, weights of at most so many channels in times channels out are narrow: their
+# sums, 36 floats each, fit a core's cache. Cutting them would transform each tile more than once.
+# The tiles are cut in their place, into 2, 4, 8 or 16 parts of LEAST_TILES or more.
+NARROW_SUMS = 64 * 128
+LEAST_TILES, MOST_PARTS = 80, 16
+
+
+def fits(*channels: int) -> bool:
+    """Whether these numbers of channels are multiples of 16."""
+    return all(c and c % LANES == 0 for c in channels)
+
+
+def work_floats(
+    dev: Device,
+    blocking: Blocking,
+    direction: Direction,
+    height: int,
+    weight_shape: tuple,
+    c: int,
+) -> tuple[int, int]:
+    """As conv_direct.work_floats."""
+    if direction is Direction.BACKWARD_WEIGHTS:
+        return _weights_gradient_floats(dev, blocking, weight_shape)
+    co = weight_shape[0] * LANES
+    return _scratch_floats(dev, blocking, c, co), transformed_floats(c, co)
+
+
+def transformed_floats(ci: int, co: int) -> int:
+    """Floats of the transformed weights of ci to co channels, as cl/layers/winograd.h lays them
+    out.
+    """
+    return POSITIONS * (ci * co + LANES)
+
+
+def lay_out(dev: Device, _blocking: Blocking, weight: Array) -> Array:
+    """The weights (CO/16, 3, 3, CI, 16) transformed, in a new array."""
+    blocks, _, _, ci, _ = weight.shape
+    laid_out = dev.empty(transformed_floats(ci, blocks * LANES))
+    _transform(dev, weight, laid_out)
+    return laid_out
+
+
+def forward(
+    dev: Device,
+    blocking: Blocking,
+    sources: tuple[Array, ...],
+    weight: Array,
+    bias: Array,
+    out: Array,
+    *,
+    relu: bool,
+    work: Work,
+    tiles: Tiles | None = None,
+    laid_out: Array | None = None,
+) -> None:
+    """As conv_direct.forward. The result does not depend on the number of compute units."""
+    height, width, co = out.shape
+    channels = [source.shape[2] for source in sources]
+    _check_channels(*channels, co)
+    check_weights(sources, weight, bias, out)
+    if laid_out is None:
+        _transform(dev, weight, work.weights)
+        laid_out = work.weights
+    check_size("scratch", work.scratch, _scratch_floats(dev, blocking, sum(channels), co))
+    tiles = checked_tiles(dev, tiles, height, width)
+    _program(dev, blocking, sum(channels), co).launch(
+        "winograd_forward",
+        min(dev.info["compute_units"], tiles.number),
+        local=1,
+        c1=channels[0],
+        c2=sum(channels[1:]),
+        co=co,
+        relu=relu,
+        x=sources[0],
+        x2=sources[-1],
+        transformed=laid_out,
+        bias=bias,
+        tile_list=tiles.list,
+        out=out,
+        scratch=work.scratch,
+    )
+
+
+def backward_input(
+    dev: Device,
+    blocking: Blocking,
+    weight: Array,
+    first: int,
+    grad_out: Array,
+    grad_x: Array,
+    *,
+    mask: Array | None,
+    work: Work,
+    tiles: Tiles | None = None,
+) -> None:
+    """As conv_direct.backward_input."""
+    height, width, c = grad_x.shape
+    co = grad_out.shape[2]
+    _check_channels(c, co)
+    _transform_flipped(dev, weight, first, c, work.weights)
+    check_size("scratch", work.scratch, _scratch_floats(dev, blocking, co, c))
+    tiles = checked_tiles(dev, tiles, height, width)
+    _program(dev, blocking, co, c).launch(
+        "winograd_backward_input",
+        min(dev.info["compute_units"], tiles.number),
+        local=1,
+        c=c,
+        co=co,
+        masked=mask is not None,
+        x=grad_x if mask is None else mask,
+        flipped=work.weights,
+        grad_out=grad_out,
+        tile_list=tiles.list,
+        grad_x=grad_x,
+        scratch=work.scratch,
+    )
+
+
+def backward_weights(
+    dev: Device,
+    blocking: Blocking,
+    sources: tuple[Array, ...],
+    grad_out: Array,
+    grad_weight: Array,
+    grad_bias: Array,
+    *,
+    work: Work,
+    tiles: Tiles | None = None,
+) -> None:
+    """As conv_direct.backward_weights. The order of the sums depends on the shapes and the number
+    of tiles alone.
+    """
+    height, width, co = grad_out.shape
+    channels = [source.shape[2] for source in sources]
+    _check_channels(*channels, co)
+    check_weights(sources, grad_weight, grad_bias, grad_out)
+    needed = _weights_gradient_floats(dev, blocking, grad_weight.shape)
+    check_size("scratch", work.scratch, needed[0])
+    check_size("parts", work.weights, needed[1])
+    tiles = checked_tiles(dev, tiles, height, width)
+    tile_parts = _tile_parts(tiles.number, sum(channels), co)
+    ci_part = sum(channels) if tile_parts > 1 else _ci_part(dev, sum(channels), co)
+    parts = tile_parts * -(-sum(channels) // ci_part) * -(-co // CO_PART)
+    dev.program(
+        "layers/winograd_backward_weights",
+        TILES=blocking.winograd_weights,
+        CO_PART=min(CO_PART, co),
+        BLOCKS=_paired_blocks(co),
+    ).launch(
+        "winograd_backward_weights",
+        min(dev.info["compute_units"], parts),
+        local=1,
+        c1=channels[0],
+        c2=sum(channels[1:]),
+        co=co,
+        ci_part=ci_part,
+        tile_parts=tile_parts,
+        x=sources[0],
+        x2=sources[-1],
+        grad_out=grad_out,
+        tile_list=tiles.list,
+        tile_count=tiles.count,
+        partial=work.weights,
+        scratch=work.scratch,
+    )
+    sum_parts(dev, work.weights, grad_weight, grad_bias, parts=tile_parts)
+
+
+def _transform(dev, weight, transformed):
+    """Fill transformed from weight (CO/16, 3, 3, CI, 16) for the forward pass."""
+    blocks, _, _, ci, _ = weight.shape
+    check_size("transformed weights", transformed, transformed_floats(ci, blocks * LANES))
+    dev.program("layers/winograd_transform").launch(
+        "winograd_transform_weights",
+        (ci, blocks),
+        local=(LANES, 1),
+        ci=ci,
+        blocks=blocks,
+        weight=weight,
+        transformed=transformed,
+    )
+
+
+def _transform_flipped(dev, weight, first, c, transformed):
+    """Fill transformed for the gradient of the c input channels from `first` on."""
+    blocks, _, _, ci, _ = weight.shape
+    co = blocks * LANES
+    if first % LANES or first + c > ci:
+        raise ValueError(f"Winograd input gradient of {c} channels from {first} on, of {ci}")
+    check_size("transformed weights", transformed, transformed_floats(co, c))
+    dev.program("layers/winograd_transform").launch(
+        "winograd_transform_flipped_weights",
+        (co, c // LANES),
+        local=(LANES, 1),
+        co=co,
+        blocks=c // LANES,
+        first=first,
+        ci=ci,
+        weight=weight,
+        transformed=transformed,
+    )
+
+
+def _check_channels(*channels):
+    if not fits(*channels):
+        raise ValueError(
+            f"Winograd convolution of {channels} channels: they come in multiples of 16"
+        )
+
+
+def _tiles_and_group(blocking, ci, co):
+    """(tiles transformed at a time, tiles multiplied together)."""
+    return blocking.winograd_narrow if ci * co <= NARROW else blocking.winograd
+
+
+def _scratch_floats(dev, blocking, ci, co):
+    """Floats of Work.scratch of a convolution of ci to co channels, or of its input gradient."""
+    vectors = (ci + co) * _tiles_and_group(blocking, ci, co)[0] + 3 * LANES
+    return COUNTERS + dev.info["compute_units"] * POSITIONS * vectors
+
+
+def _program(dev, blocking, ci, co):
+    tiles, group = _tiles_and_group(blocking, ci, co)
+    return dev.program("layers/winograd", TILES=tiles, GROUP=group, BLOCKS=_paired_blocks(co))
+
+
+def _paired_blocks(channels):
+    """Groups of 16 output channels that are multiplied together."""
+    return 1 if channels // LANES % 2 else 2
+
+
+def _weights_gradient_floats(dev, blocking, weight_shape):
+    """Floats of (Work.scratch, Work.weights) for backward_weights()."""
+    blocks, _, _, ci, _ = weight_shape
+    ci_part, co_part = min(CI_PART, ci), min(CO_PART, blocks * LANES)
+    values = (ci_part + co_part) // LANES * blocking.winograd_weights
+    vectors = POSITIONS * (values + 3 + ci_part * co_part // LANES) + co_part // LANES
+    parts = MOST_PARTS if _is_narrow(ci, blocks * LANES) else 1
+    scratch = COUNTERS + dev.info["compute_units"] * vectors * LANES
+    return scratch, parts * blocks * (9 * ci + 1) * LANES
+
+
+def _is_narrow(ci, co):
+    return ci <= CI_PART and co <= CO_PART and ci * co <= NARROW_SUMS
+
+
+def _tile_parts(number, ci, co):
+    """Parts of `number` tiles: a power of two, which most numbers of compute units share evenly."""
+    parts = 1
+    while _is_narrow(ci, co) and parts < MOST_PARTS and number >= 2 * parts * LEAST_TILES:
+        parts *= 2
+    return parts
+
+
+def _ci_part(dev, ci, co):
+    """Input channels of one part, where the tiles are not cut: few enough that every compute unit
+    gets a part.
+    """
+    wanted = -(-dev.info["compute_units"] // -(-co // CO_PART))
+    return min(CI_PART, max(1, ci // (LANES * wanted)) * LANES)

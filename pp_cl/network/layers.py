@@ -1,0 +1,164 @@
+"""The network that turns feature maps into images, as a list of layers: a U-Net of three levels
+(PlenopticPoints supplemental, decoder).
+
+Each level is a block: two 3x3 convolutions with ReLU, or one of the others that the supplemental
+compares with them. Levels are joined by 2x2 average pooling on the way down, by bilinear upsampling
+with a 1x1 convolution and a concatenation [upsampled, skip] on the way up; the image is 0.5 + 0.5 *
+(1x1 convolution). The 1x1 convolution runs before the upsampling: both are linear and the
+upsampling weights of a pixel add up to 1, so they commute, bias included, and it costs a quarter.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import numpy as np
+
+from pp_cl.device.buffers import Table
+from pp_cl.layers.conv import Direction
+from pp_cl.layers.tiles import LANES
+
+
+@dataclass(frozen=True)
+class Layer:
+    """A layer, named like its output.
+
+    kind: a convolution; ELU of one half of the input's channels times the sigmoid of the other
+    half; means of 2 x 2 pixels; twice the height and width, bilinear. inputs: names of one layer,
+    or of the two that a convolution reads as one; "x" is the network's input. level: the output has
+    the image's height and width divided by 2**level. channels: of the output. sources, kernel_size,
+    relu: of a convolution: the channels of each input, the side of the kernel, and whether a ReLU
+    follows.
+    """
+
+    kind: Literal["conv", "gate", "pool", "upsample"]
+    name: str
+    inputs: tuple[str, ...]
+    level: int
+    channels: int
+    sources: tuple[int, ...] = ()
+    kernel_size: int = 0
+    relu: bool = False
+
+    def weight_shape(self) -> tuple[int, int, int, int]:
+        """(CO, CI, K, K) of a convolution's weights."""
+        return self.channels, sum(self.sources), self.kernel_size, self.kernel_size
+
+    def multiplications(self, height: int, width: int) -> int:
+        """Multiplications of weights by values in a forward pass over an image of this size,
+        counted as direct convolutions.
+        """
+        weights = self.kernel_size**2 * sum(self.sources) * self.channels
+        return weights * (height >> self.level) * (width >> self.level)
+
+
+BLOCKS = ("double", "single", "gated")
+
+
+def _conv(name, inputs, level, channels, sources, kernel_size=3, relu=True):
+    return Layer("conv", name, inputs, level, channels, sources, kernel_size, relu)
+
+
+def _block(blocks, name, inputs, level, channels, sources):
+    """The layers of one level."""
+    if blocks == "gated":  # features and gates are one convolution: both read the same inputs
+        both = _conv(f"{name}.a", inputs, level, 2 * channels, sources, relu=False)
+        return [both, Layer("gate", f"{name}.gate", (both.name,), level, channels)]
+    first = _conv(f"{name}.a", inputs, level, channels, sources)
+    if blocks == "single":
+        return [first]
+    return [first, _conv(f"{name}.b", (first.name,), level, channels, (channels,))]
+
+
+def unet_layers(
+    widths: tuple[int, int, int],
+    channels_in: int = 16,
+    channels_out: int = 3,
+    blocks: str = "double",
+    *,
+    channels: Sequence[int] = (),
+) -> list[Layer]:
+    """The layers in the order of the forward pass. widths: channels of the three levels; blocks:
+    what a level computes, one of BLOCKS. channels: others, of each convolution but the last.
+    Raises ValueError for another number of them.
+    """
+    w0, w1, w2 = widths
+    enc0 = _block(blocks, "enc0", ("x",), 0, w0, (channels_in,))
+    enc1 = _block(blocks, "enc1", ("pool0",), 1, w1, (w0,))
+    enc2 = _block(blocks, "enc2", ("pool1",), 2, w2, (w1,))
+    skip0, skip1 = enc0[-1].name, enc1[-1].name
+    dec1 = _block(blocks, "dec1", ("wide1", skip1), 1, w1, (w1, w1))
+    dec0 = _block(blocks, "dec0", ("wide0", skip0), 0, w0, (w0, w0))
+    layers = [
+        *enc0,
+        Layer("pool", "pool0", (skip0,), 1, w0),
+        *enc1,
+        Layer("pool", "pool1", (skip1,), 2, w1),
+        *enc2,
+        _conv("up1", (enc2[-1].name,), 2, w1, (w2,), kernel_size=1, relu=False),
+        Layer("upsample", "wide1", ("up1",), 1, w1),
+        *dec1,
+        _conv("up0", (dec1[-1].name,), 1, w0, (w1,), kernel_size=1, relu=False),
+        Layer("upsample", "wide0", ("up0",), 0, w0),
+        *dec0,
+        _conv("out", (dec0[-1].name,), 0, channels_out, (w0,), kernel_size=1, relu=False),
+    ]
+    return _of_channels(layers, channels_in, [*channels, channels_out]) if channels else layers
+
+
+def _of_channels(layers, channels_in, channels):
+    """The same layers with other numbers of channels, those of each convolution."""
+    if len(channels) != len(convolutions(layers)):
+        raise ValueError(f"{len(channels)} numbers of channels, not {len(convolutions(layers))}")
+    found, numbers, changed = {"x": channels_in}, iter(channels), []
+    for layer in layers:
+        sources = tuple(found[name] for name in layer.inputs)
+        if layer.kind == "conv":
+            layer = replace(layer, channels=next(numbers), sources=sources)
+        else:
+            layer = replace(layer, channels=sources[0] // (2 if layer.kind == "gate" else 1))
+        found[layer.name] = layer.channels
+        changed.append(layer)
+    return changed
+
+
+def convolutions(layers: list[Layer]) -> list[Layer]:
+    """The layers that have parameters."""
+    return [layer for layer in layers if layer.kind == "conv"]
+
+
+def computations(layer: Layer, training: bool) -> list[tuple[Direction, int | None]]:
+    """(direction, input or None) of all computations of a convolution in a pass."""
+    found = [(Direction.FORWARD, None)]
+    if training:
+        found.append((Direction.BACKWARD_WEIGHTS, None))
+        found += [(Direction.BACKWARD_INPUT, i) for i in range(len(layer.sources))]
+    return found
+
+
+def parameter_table(layers: list[Layer]) -> Table:
+    """{name: (shape, dtype)} of the parameters: "enc0.a.weight" (ceil(CO/16), K, K, CI, 16),
+    "enc0.a.bias" (ceil(CO/16) * 16,), ...
+    """
+    table = {}
+    for layer in convolutions(layers):
+        co, ci, k, _ = layer.weight_shape()
+        blocks = -(-co // LANES)
+        table[layer.name + ".weight"] = (blocks, k, k, ci, LANES), np.float32
+        table[layer.name + ".bias"] = (blocks * LANES,), np.float32
+    return table
+
+
+def gradient_of(name: str) -> str:
+    """The name of the array that holds the gradient of a layer's output, or of a parameter."""
+    return f"grad {name}"
+
+
+def levels_of(layers: list[Layer]) -> dict[str, int]:
+    """{name: level} of the network's input "x" and of all layers' outputs."""
+    return {"x": 0} | {layer.name: layer.level for layer in layers}
+
+
+def multiplications(layers: list[Layer], height: int, width: int) -> int:
+    """Multiplications of weights by values in a forward pass over an image of this size."""
+    return sum(layer.multiplications(height, width) for layer in layers)
