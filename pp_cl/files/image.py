@@ -16,6 +16,7 @@ from pp_cl.files.regular import opened_regular, refusal
 # Pillow warns of pixels by the hundred million, and of broken animations, in words of its own
 warnings.filterwarnings("ignore", module=r"PIL\.")
 FORMATS = ("PNG", "JPEG", "WEBP")
+ENDINGS = (".png", ".jpg", ".jpeg", ".webp", ".exr")  # of the files that read_rgba reads
 # Pillow's names of what converts to RGBA without loss
 EIGHT_BIT_MODES = ("RGBA", "RGB", "LA", "L", "PA", "P", "1")
 # bits per channel stand in the header chunk, the first of all

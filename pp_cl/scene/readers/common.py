@@ -8,9 +8,9 @@ from pathlib import Path
 from typing import TypeVar
 
 from pp_cl.errors import UserError
+from pp_cl.files.image import ENDINGS
 
 HELD_OUT = 8  # one photograph of so many, the first among them, as LLFF and 3DGS do
-ENDINGS = (".png", ".jpg", ".jpeg", ".webp", ".exr")
 SPLITS = ["test", "train"]
 Item = TypeVar("Item")
 
