@@ -24,6 +24,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--save-images", action="store_true", help="write every view to RUN/eval/images/"
     )
     parser.add_argument(
+        "--published",
+        action="store_true",
+        help="put published results beside also where those are of other sizes or views",
+    )
+    parser.add_argument(
         "--chart", metavar="FILE", help="draw the run among the published results (PNG, SVG, PDF)"
     )
     shared.add_open(parser)
@@ -34,6 +39,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(options: argparse.Namespace) -> None:
     """Evaluate, print the table."""
     from pp_cl.bench.plots import check_files, plot_ranks, save_figure
+    from pp_cl.commands.progress import counted
     from pp_cl.device.discover import open_device
     from pp_cl.evaluate import check_target, evaluate
     from pp_cl.trained import load_run
@@ -48,13 +54,24 @@ def run(options: argparse.Namespace) -> None:
     dev = open_device(options.device)
     run = load_run(dev, options.run_folder, tolerance=tolerance, scene=options.scene)
     print(run.policy.origin)
-    result = evaluate(run, options.split, metrics, save_images=options.save_images, out=options.out)
+    with counted("view") as on_view:
+        result = evaluate(
+            run,
+            options.split,
+            metrics,
+            save_images=options.save_images,
+            out=options.out,
+            published=options.published,
+            on_view=on_view,
+        )
     folder = run.folder
     if figure:
         figure.set_size_inches(4 * len(metrics), 6)
         plot_ranks(figure, list(metrics), _ranked(result, folder), _label(result, folder))
         save_figure(figure, options.chart)
     print(_table(result, folder))
+    if options.published and not result["published"]:
+        print("--published: no results are known of this scene")
     print(_summary(result))
     written = Path(options.out or folder.evaluation(options.split))
     print(
