@@ -122,7 +122,8 @@ def counted(noun: str, stream: TextIO | None = None) -> Iterator[Callable[[int, 
 
         def tell(done: int, total: int) -> None:
             nonlocal told
-            bar.total = total
+            if done == 1:
+                bar.reset(total)
             bar.update()
             now = time.monotonic()
             if not bar.disable or now - told < LINES_APART:
