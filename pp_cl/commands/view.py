@@ -39,6 +39,7 @@ def run(options: argparse.Namespace) -> None:
     """Serve until Ctrl-C."""
     from pp_cl.view.serve import serve
 
+    shared.refuse_empty(options)
     port = int(shared.read_number("--port", options.port, int, least=0, most=65535))
     if options.host != LOOPBACK:
         print(
