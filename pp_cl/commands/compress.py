@@ -34,16 +34,24 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> None:
     """Search, print what was tried, write the compressed run."""
-    from pp_cl.compress.output import REPORT, check_out, validation_views, write_compressed
+    from pp_cl.compress.output import (
+        REPORT,
+        check_finished,
+        validation_views,
+        write_compressed,
+    )
     from pp_cl.compress.reduction import Original, nbytes
     from pp_cl.compress.search import Search, frame_ms
     from pp_cl.device.discover import open_device
+    from pp_cl.files.atomic import check_new_folder
     from pp_cl.trained import load_run
 
+    shared.refuse_empty(options)
     most_loss = _decibels(options.max_loss)
+    out = Path(options.out or f"{Path(options.run_folder).resolve()}-compressed")
+    check_new_folder(out)
     whole = load_run(open_device(options.device), options.run_folder, scene=options.scene)
-    out = Path(options.out or f"{whole.folder.path.resolve()}-compressed")
-    check_out(whole, out)
+    check_finished(whole)
     which, views = validation_views(whole)
     original = Original.of(whole)
     search = Search(original, views, most_loss)

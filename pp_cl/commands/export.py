@@ -43,6 +43,7 @@ def run(options: argparse.Namespace) -> None:
     from pp_cl.export.formats import check_target, export
     from pp_cl.trained import load_run
 
+    shared.refuse_empty(options)
     name, folder = options.format, Path(options.run_folder)
     min_weight = _read_min_weight(options.min_weight, name)
     path = check_target(name, folder, Path(options.out) if options.out else None)

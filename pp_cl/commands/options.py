@@ -53,6 +53,16 @@ def add_masks(parser: argparse.ArgumentParser) -> None:
     )
 
 
+def refuse_empty(options: argparse.Namespace) -> None:
+    """Raise UserError for an option that was given without a word, as by a shell's variable that is
+    not set: it would read as not given, or as the present folder.
+    """
+    for name, value in vars(options).items():
+        if value == "":
+            option = "RUN" if name == "run_folder" else f"--{name.replace('_', '-')}"
+            raise UserError(f"{option}: is empty; give a name, or leave it out")
+
+
 def read_short(options: argparse.Namespace, names: Iterable[str]) -> list[tuple[str, str, str]]:
     """[(key, text, origin)] of the settings with these short names that were given."""
     texts = {name: getattr(options, name) for name in names}

@@ -8,7 +8,7 @@ import pytest
 
 from pp_cl.cli import main
 from pp_cl.compress import search as search_module
-from pp_cl.compress.output import check_out, validation_views
+from pp_cl.compress.output import check_finished, validation_views
 from pp_cl.errors import UserError
 from pp_cl.trained import load_run
 
@@ -64,6 +64,8 @@ def test_bad_input_ends_in_one_line(ball_run, tmp_path, capsys):
         ([str(ball_run), "--max-loss", "nan"], "--max-loss"),
         ([str(ball_run), "--max-loss", "much"], "--max-loss"),
         ([str(ball_run), "--out", str(tmp_path / "held")], "held"),
+        ([str(ball_run), "--out", ""], "--out"),
+        ([str(ball_run), "--out", str(tmp_path / ("x" * 300))], "name"),
         ([str(ball_run), "--scene", str(tmp_path / "gone")], "gone"),
         ([str(ball_run), "--device", "none such"], "none such"),
     ):
@@ -72,8 +74,8 @@ def test_bad_input_ends_in_one_line(ball_run, tmp_path, capsys):
         assert error.count("\n") == 1 and expected in error
 
 
-def test_an_unfinished_run_is_refused(dev, ball_run, tmp_path):
+def test_an_unfinished_run_is_refused(dev, ball_run):
     run = load_run(dev, ball_run)
     run.header["finished"] = False
     with pytest.raises(UserError, match="not finished"):
-        check_out(run, tmp_path / "new")
+        check_finished(run)
