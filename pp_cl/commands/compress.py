@@ -29,11 +29,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--scene", metavar="SCENE", help="where the run's scene is now, if it has moved"
     )
+    parser.add_argument("-v", "--verbose", action="store_true", help="print what is tried, too")
     shared.add_device(parser)
 
 
 def run(options: argparse.Namespace) -> None:
-    """Search, print what was tried, write the compressed run."""
+    """Search, write the compressed run, print what it saves and loses."""
     from pp_cl.compress.output import REPORT, check_out, validation_views, write_compressed
     from pp_cl.compress.reduction import Original, nbytes
     from pp_cl.compress.search import Search, frame_ms
@@ -47,10 +48,7 @@ def run(options: argparse.Namespace) -> None:
     which, views = validation_views(whole)
     original = Original.of(whole)
     search = Search(original, views, most_loss)
-    print(f"{which}: {search.psnr:.2f} dB, may lose {most_loss:g}")
-    print(COLUMNS("tried", "PSNR", "loss", "points", "MiB", "speed", ""))
-    for trial in search.trials():
-        print(_line(trial), flush=True)
+    trials = _trials(search, which, options.verbose)
     ms, sizes = frame_ms([whole, search.run], views), [nbytes(whole), nbytes(search.run)]
     report = {
         "of": str(whole.folder),
@@ -63,6 +61,7 @@ def run(options: argparse.Namespace) -> None:
         "points": [whole.model.cloud.count, search.run.model.cloud.count],
         "frame_ms": ms,
         "device": whole.dev.name,
+        "trials": [vars(trial) | {"reduction": vars(trial.reduction)} for trial in trials],
     }
     write_compressed(original, search.reduction, out, report)
     print(
@@ -71,6 +70,24 @@ def run(options: argparse.Namespace) -> None:
         f" ({ms[0] / ms[1]:.2f} times), {search.loss:.3f} dB lost on {which}"
     )
     print(f"wrote {out} and {out / REPORT}; pp-cl eval {out} measures its test views")
+
+
+def _trials(search, which, verbose):
+    """All that is tried, told while it is: as a table, or as a count on a terminal."""
+    from tqdm import tqdm
+
+    if verbose:
+        print(f"{which}: {search.psnr:.2f} dB, may lose {search.most_loss:g}")
+        print(COLUMNS("tried", "PSNR", "loss", "points", "MiB", "speed", ""), flush=True)
+    trials = []
+    disable = True if verbose else None  # None: where there is no terminal
+    with tqdm(desc="searching", unit="trial", leave=False, disable=disable) as bar:
+        for trial in search.trials():
+            trials.append(trial)
+            bar.update()
+            if verbose:
+                print(_line(trial), flush=True)
+    return trials
 
 
 def _decibels(text):

@@ -14,18 +14,23 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("run_folder", metavar="RUN", help="folder of the run")
     shared.add_metrics(parser)
     parser.add_argument("--split", default="test", help="train, val or test (default)")
+    shared.add_run_scene(parser)
     parser.add_argument(
-        "--scene", metavar="SCENE", help="where the run's scene is now, if it has moved"
-    )
-    parser.add_argument(
-        "--out", metavar="FOLDER", help="write there, not into RUN/eval, which then stays as it is"
+        "--out",
+        type=shared.output_folder,
+        metavar="FOLDER",
+        help="write there, not into RUN/eval, which then stays as it is",
     )
     parser.add_argument(
         "--save-images", action="store_true", help="write every view to RUN/eval/images/"
     )
     parser.add_argument(
-        "--chart", metavar="FILE", help="draw the run among the published results (PNG, SVG, PDF)"
+        "--chart",
+        type=shared.figure_file,
+        metavar="FILE",
+        help="draw the run among the published results (PNG, SVG, PDF)",
     )
+    shared.add_json(parser)
     shared.add_open(parser)
     shared.add_tolerance(parser)
     shared.add_device(parser)
@@ -33,16 +38,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> None:
     """Evaluate, print the table."""
-    from pp_cl.bench.plots import check_files, plot_ranks, save_figure
+    from pp_cl.bench.plots import figure_of, plot_ranks, save_figure
     from pp_cl.device.discover import open_device
     from pp_cl.evaluate import check_target, evaluate
     from pp_cl.trained import load_run
 
-    metrics, tolerance = (
-        shared.read_metrics(options.metrics),
-        shared.read_tolerance(options.tolerance),
-    )
-    figure = check_files(None, options.chart, "--chart")
+    metrics, tolerance = options.metrics, options.tolerance
+    figure = figure_of(options.chart, "--chart")
     if options.out:
         check_target(Path(options.out), is_new=True)
     dev = open_device(options.device)
@@ -54,6 +56,7 @@ def run(options: argparse.Namespace) -> None:
         figure.set_size_inches(4 * len(metrics), 6)
         plot_ranks(figure, list(metrics), _ranked(result, folder), _label(result, folder))
         save_figure(figure, options.chart)
+    shared.write_json_option(options.json, result)
     print(_table(result, folder))
     print(_summary(result))
     written = Path(options.out or folder.evaluation(options.split))

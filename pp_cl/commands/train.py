@@ -11,14 +11,14 @@ from pp_cl.config import help_lines
 from pp_cl.presets import PRESETS, SHORT
 
 HELP = "learn a scene; the same command resumes an unfinished run"
-EPILOG = "settings (--set), with the tiny preset's values:\n" + "\n".join(help_lines())
+EPILOG = "\n".join(("settings (--set), with tiny's values and those that differ:", *help_lines()))
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the command's options."""
     add = parser.add_argument
     add("scene", metavar="SCENE", help="folder of a scene, or the word demo")
-    add("--out", required=True, metavar="RUN", help="folder of the run")
+    add("--out", required=True, type=shared.output_folder, metavar="RUN", help="folder of the run")
     add(
         "--preset",
         choices=PRESETS,

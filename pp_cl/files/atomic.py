@@ -51,6 +51,8 @@ def mend(error: OSError) -> str:
     """What to do about a file that cannot be written."""
     if error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG):
         return "free some space"
+    if error.errno == errno.ENAMETOOLONG:
+        return "choose a shorter name"
     return "check the folder, its permissions and the disk"
 
 

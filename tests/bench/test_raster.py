@@ -170,7 +170,7 @@ def test_files_and_table(tmp_path, capsys):
         (("--gamma", "0.1,0.2"), "--gamma"),
         (("--widths", "16,16,16"), "--widths"),
         (("--scene", "moon"), "--scene"),
-        (("--json", "/nowhere/b.json"), "--json /nowhere/b.json"),
+        (("--json", "/nowhere/b.json"), "--json"),
         (("--device", "abacus"), "abacus"),
     ],
 )

@@ -69,8 +69,8 @@ def test_files_and_table(tmp_path, capsys):
         (("--widths", "16,0,32"), "16,0,32"),
         (("--widths", "1,2,3,x"), "1,2,3,x"),
         (("--blocks", "triple"), "double, single, gated"),
-        (("--json", "/nowhere/b.json"), "--json /nowhere/b.json"),
-        (("--plot", "/nowhere/b.png"), "--plot /nowhere/b.png"),
+        (("--json", "/nowhere/b.json"), "--json"),
+        (("--plot", "/nowhere/b.png"), "--plot"),
         (("--device", "abacus"), "abacus"),
     ],
 )
