@@ -13,7 +13,7 @@ from typing import Any, TextIO
 
 from pp_cl import config
 from pp_cl.errors import UserError, quoted, suggestion
-from pp_cl.files.atomic import write_json
+from pp_cl.files.atomic import check_writable, write_json
 from pp_cl.presets import SHORT
 
 METRICS = ("psnr", "ssim", "lpips")
@@ -72,7 +72,7 @@ def words(known: Sequence[str]) -> Callable[[str], tuple[str, ...]]:
 
 
 # side of an image that the network takes
-side = integer(4, 2**15, 4)
+side = integer(4, 4096, 4)
 
 
 def widths(text: str) -> tuple[int, ...]:
@@ -118,11 +118,12 @@ def output_folder(text: str) -> str:
     while not there.exists():
         there = there.parent
     if not there.is_dir():
-        raise argparse.ArgumentTypeError(f"{quoted(text)}: {there} is no folder; choose another")
-    if not os.access(there, os.W_OK | os.X_OK):
-        raise argparse.ArgumentTypeError(
-            f"{quoted(text)}: {there} may not be written; choose another"
-        )
+        which = "" if there == Path(text).absolute() else f" {there}"
+        raise argparse.ArgumentTypeError(f"{text}:{which} is not a folder; choose another")
+    try:
+        check_writable(text, "choose another")
+    except UserError as error:
+        raise argparse.ArgumentTypeError(str(error)) from None
     return text
 
 
@@ -269,4 +270,4 @@ def read_number(
     try:
         return (integer if kind is int else number)(least, most)(text)
     except argparse.ArgumentTypeError as error:
-        raise UserError(f"{option} {error}") from None
+        raise UserError(f"{option} {text}: {str(error).rpartition(': ')[2]}") from None
