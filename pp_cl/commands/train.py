@@ -55,11 +55,14 @@ def run(options: argparse.Namespace) -> None:
     """Train, or say that there is nothing left to train."""
     from pp_cl.device.discover import open_device
     from pp_cl.files.run_folder import RunFolder
+    from pp_cl.files.scalars import writer_class
     from pp_cl.run import open_training
     from pp_cl.run_config import run_config, stored_state
     from pp_cl.training.memory import plan_lines
     from pp_cl.view.serve import serve_in_background
 
+    if options.tensorboard:
+        writer_class()  # refuses before the work where it is missing
     folder = RunFolder(options.out)
     given, is_new = _given_settings(options), not folder.config.exists()
     config = run_config(folder, options.scene, options.preset, given)
