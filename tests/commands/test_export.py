@@ -35,7 +35,7 @@ def failure(capsys, *words):
     capsys.readouterr()
     assert main(["export", *map(str, words)]) == 2
     error = capsys.readouterr().err.splitlines()
-    lines = [line for line in error if line.startswith("pp-cl: ")]
+    lines = [line for line in error if line.startswith("pp-cl")]
     assert len(lines) == 1 and error[-1] == lines[0]
     return lines[0]
 
