@@ -20,7 +20,20 @@ COLOURS = {"white": (1.0, 1.0, 1.0), "black": (0.0, 0.0, 0.0), "transparent": No
 MADE = ("orbit", "spiral")  # paths that the program makes
 SECONDS, FPS = 4, 30
 FASTEST_GIF = 50  # frames per second; browsers show faster ones slowly
-MOST_SIDE, MOST_FRAMES = 8192, 100_000
+MOST_FRAMES = 100_000
+
+
+def _colour(text):
+    """The type of --background: a key of COLOURS, or sRGB in [0, 1]."""
+    if text in COLOURS:
+        return text
+    try:
+        red, green, blue = map(shared.integer(0, 255), text.split(","))
+    except (ValueError, argparse.ArgumentTypeError):
+        raise argparse.ArgumentTypeError(
+            f"{text}: write white, black, transparent or R,G,B from 0 to 255"
+        ) from None
+    return red / 255, green / 255, blue / 255
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -39,18 +52,42 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         choices=(*FILMS, *IMAGES),
         help="a film (mp4, webm, gif) or frames (png, exr); by --out, else mp4",
     )
-    add("--size", metavar="WxH", help="pixels (default: those of the training)")
-    add("--fov", metavar="DEGREES", help="angle of view across the image (default: the scene's)")
-    add("--seconds", metavar="S", help=f"of an orbit or spiral ({SECONDS})")
-    add("--fps", metavar="F", help=f"frames per second ({FPS})")
+    add("--size", type=shared.size, metavar="WxH", help="pixels (default: those of the training)")
+    add(
+        "--fov",
+        type=shared.number(1, 150),
+        metavar="DEGREES",
+        help="angle of view across the image (default: the scene's)",
+    )
+    add(
+        "--seconds",
+        type=shared.number(1e-3, 1e5),
+        metavar="S",
+        help=f"of an orbit or spiral ({SECONDS})",
+    )
+    add(
+        "--fps",
+        type=shared.number(0.1, 240),
+        default=FPS,
+        metavar="F",
+        help=f"frames per second ({FPS})",
+    )
     add(
         "--background",
+        type=_colour,
         metavar="B",
         help="white (default), black, transparent or R,G,B from 0 to 255",
     )
-    add("--samples", default="1", metavar="N", help="per pixel: 1, 4, 9 or 16")
+    add(
+        "--samples",
+        type=int,
+        choices=(1, 4, 9, 16),
+        default=1,
+        metavar="N",
+        help="per pixel: 1, 4, 9 or 16",
+    )
     add("--features", action="store_true", help="in exr: the 16 features of each pixel too")
-    add("--scene", metavar="SCENE", help="where the run's scene is now, if it has moved")
+    shared.add_run_scene(parser)
     shared.add_device(parser)
 
 
@@ -61,14 +98,12 @@ def run(options: argparse.Namespace) -> None:
     from pp_cl.film import Frames, film_folder
     from pp_cl.trained import load_run
 
-    shared.refuse_empty(options)
     kind = _format(options)
-    style, size, fov = _style(options, kind), _size(options), _fov(options)
-    fps, count = _speed(options, kind)
+    style, count = _style(options, kind), _frame_count(options, kind)
     if kind in FILMS:
         check_video(kind)
     run = load_run(open_device(options.device), options.run_folder, scene=options.scene)
-    cameras = _cameras(run, options.path, count, size=size, fov=fov)
+    cameras = _cameras(run, options.path, count, size=options.size, fov=options.fov)
     sizes = {(camera.width, camera.height) for camera in cameras}
     if kind in FILMS and len(sizes) > 1:
         raise UserError(
@@ -80,7 +115,7 @@ def run(options: argparse.Namespace) -> None:
         with film_folder(out) as folder:
             frames = Frames(run, cameras, folder, style, replace=True)
             seconds = _render_with_bar(frames)
-            frames.write_film(out, fps)
+            frames.write_film(out, options.fps)
     else:
         seconds = _render_with_bar(Frames(run, cameras, out, style))
     made = f"{len(seconds)} of {len(cameras)} frames"
@@ -124,73 +159,35 @@ def _style(options, kind):
     """film.Style of the options."""
     from pp_cl.film import Style
 
-    samples = shared.read_number("--samples", options.samples, int, least=1, most=16)
-    if math.isqrt(samples) ** 2 != samples:
-        raise UserError(f"--samples {options.samples}: write 1, 4, 9 or 16")
     if options.background and kind == "exr":
         raise UserError("--background: OpenEXR keeps alpha in its place; leave it out")
-    background = _background(options.background or "white")
+    background = COLOURS.get(options.background or "white", options.background)
     if background is None and kind == "mp4":
         raise UserError("--background transparent: mp4 keeps no alpha; write .webm or frames")
     if options.features and kind != "exr":
         raise UserError("--features: only OpenEXR has room for them; use --format exr")
-    return Style("exr" if kind == "exr" else "png", background, samples, options.features)
+    return Style("exr" if kind == "exr" else "png", background, options.samples, options.features)
 
 
-def _background(text):
-    """sRGB in [0, 1], or None for transparent."""
-    if text in COLOURS:
-        return COLOURS[text]
-    words = text.split(",")
-    if len(words) != 3 or not all(_is_whole(w, 0, 255) for w in words):
-        raise UserError(
-            f"--background {text}: write white, black, transparent or R,G,B from 0 to 255"
-        )
-    return tuple(int(w) / 255 for w in words)
-
-
-def _speed(options, kind):
-    """(frames per second, frames of an orbit or spiral, 0 of other paths) of the options."""
-    most = FASTEST_GIF if kind == "gif" else 240
-    fps = shared.read_number("--fps", options.fps or str(FPS), float, least=0.1, most=most)
+def _frame_count(options, kind):
+    """Frames of an orbit or spiral, 0 of other paths."""
+    fps, seconds = options.fps, options.seconds
+    if kind == "gif" and fps > FASTEST_GIF:
+        raise UserError(f"--fps {fps:g}: a gif has at most {FASTEST_GIF} frames per second")
     if options.path not in MADE:
-        if options.seconds is not None:
+        if seconds is not None:
             raise UserError(
-                f"--seconds {options.seconds}: only an orbit or spiral has as many frames as asked"
-                " for; leave it out"
+                f"--seconds {seconds:g}: only an orbit or spiral has as many frames as asked for;"
+                " leave it out"
             )
-        return fps, 0
-    text = options.seconds or str(SECONDS)
-    seconds = shared.read_number("--seconds", text, float, least=1e-3, most=1e5)
-    count = round(seconds * fps)
+        return 0
+    count = round((seconds or SECONDS) * fps)
     if not 1 <= count <= MOST_FRAMES:
         raise UserError(
-            f"--seconds {text}: {seconds * fps:g} frames at {fps:g} a second; ask for 1 to"
+            f"--seconds {seconds:g}: {seconds * fps:g} frames at {fps:g} a second; ask for 1 to"
             f" {MOST_FRAMES}"
         )
-    return fps, count
-
-
-def _size(options):
-    """(width, height) of --size, None where it is not given."""
-    if options.size is None:
-        return None
-    words = options.size.lower().split("x")
-    if len(words) != 2 or not all(_is_whole(w, 16, MOST_SIDE) for w in words):
-        raise UserError(f"--size {options.size}: write WIDTHxHEIGHT, each from 16 to {MOST_SIDE}")
-    return int(words[0]), int(words[1])
-
-
-def _is_whole(word, least, most):
-    """Whether a word of digits is a number in [least, most]."""
-    return word.isascii() and word.isdigit() and len(word) < 9 and least <= int(word) <= most
-
-
-def _fov(options):
-    """Radians of --fov, None where it is not given."""
-    if options.fov is None:
-        return None
-    return math.radians(shared.read_number("--fov", options.fov, float, least=1, most=150))
+    return count
 
 
 def _cameras(run, path, count, *, size, fov):
@@ -200,7 +197,7 @@ def _cameras(run, path, count, *, size, fov):
 
     def shaped(camera):
         camera = camera.resized(*size) if size else camera
-        return camera.with_angle(fov) if fov else camera
+        return camera.with_angle(math.radians(fov)) if fov else camera
 
     if Path(path).suffix:
         return [shaped(camera) for camera in read_cameras(Path(path), size)]

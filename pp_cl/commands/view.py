@@ -15,14 +15,20 @@ from pp_cl.commands import options as shared
 
 HELP = "look at a run in the browser, also while it is trained"
 LOOPBACK = "127.0.0.1"
-PORT = "8733"
+PORT = 8733
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the command's options."""
     add = parser.add_argument
     add("run_folder", metavar="RUN", help="folder of the run, finished or not")
-    add("--port", default=PORT, metavar="P", help=f"port to listen on (default {PORT}; 0: any)")
+    add(
+        "--port",
+        type=shared.integer(0, 65535),
+        default=PORT,
+        metavar="P",
+        help=f"port to listen on (default {PORT}; 0: any)",
+    )
     add(
         "--host",
         default=LOOPBACK,
@@ -31,7 +37,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     add("--open", action="store_true", help="open the page in the default browser")
     add("--wait", action="store_true", help="wait for RUN to begin; end with the calling process")
-    add("--scene", metavar="SCENE", help="where the run's scene is now, if it has moved")
+    shared.add_run_scene(parser)
     shared.add_device(parser)
 
 
@@ -39,8 +45,6 @@ def run(options: argparse.Namespace) -> None:
     """Serve until Ctrl-C."""
     from pp_cl.view.serve import serve
 
-    shared.refuse_empty(options)
-    port = int(shared.read_number("--port", options.port, int, least=0, most=65535))
     if options.host != LOOPBACK:
         print(
             f"pp-cl: --host {options.host}: whoever can reach this address and learns the token can"
@@ -59,7 +63,7 @@ def run(options: argparse.Namespace) -> None:
         serve(
             options.run_folder,
             host=options.host,
-            port=port,
+            port=options.port,
             announce=announce,
             device=options.device,
             scene=options.scene,

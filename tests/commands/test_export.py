@@ -40,7 +40,7 @@ def failure(capsys, *words):
     capsys.readouterr()
     assert main(["export", *map(str, words)]) == 2
     error = capsys.readouterr().err.splitlines()
-    lines = [line for line in error if line.startswith("pp-cl: ")]
+    lines = [line for line in error if line.startswith("pp-cl")]
     assert len(lines) == 1 and error[-1] == lines[0]
     return lines[0]
 
@@ -90,7 +90,7 @@ WRONG = {
     "a file for a folder": (["{run}", "--format", "scene", "--out", "{run}/config.json"], "exists"),
     "a full folder": (["{run}", "--format", "scene", "--out", "{run}"], "exists already"),
     "other suffix": (["{run}", "--format", "mesh", "--out", "{tmp}/a.obj"], ".ply or .glb"),
-    "a weight that is none": (["{run}", "--format", "ply", "--min-weight", "x"], "--min-weight x"),
+    "a weight that is none": (["{run}", "--format", "ply", "--min-weight", "x"], "--min-weight"),
     "a weight for a page": (["{run}", "--format", "html", "--min-weight", "1"], "only ply and glb"),
     "a scene that is gone": (["{run}", "--format", "ply", "--scene", "{tmp}/gone"], "gone"),
     "no device": (["{run}", "--format", "ply", "--device", "abacus"], "abacus"),

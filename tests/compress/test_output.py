@@ -32,6 +32,8 @@ def test_the_command_writes_a_run(ball_run, tmp_path, capsys):
     assert main(["compress", str(ball_run), "--max-loss", "0.5dB", "--out", str(out)]) == 0
     printed = capsys.readouterr().out
     report = json.loads((out / "compress.json").read_text())
+    assert len(printed.splitlines()) == 2, "the result, and where it is"
+    assert sum(trial["taken"] for trial in report["trials"]) > 0
     assert "frames per second" in printed and report["loss"] <= 0.5 == report["most_loss"]
     assert report["bytes"][1] <= report["bytes"][0] / 1.9
     assert (out / "checkpoint.npz").stat().st_size < 1.1 * report["bytes"][1] + 20_000
@@ -47,8 +49,10 @@ def test_the_same_model_comes_back(ball_run, tmp_path, capsys, monkeypatch, dev)
     """What is written renders as what was measured."""
     monkeypatch.setattr(search_module, "TRIALS", ((1.0, "half", (True,)),))
     out = tmp_path / "small"
-    assert main(["compress", str(ball_run), "--max-loss", "3", "--out", str(out)]) == 0
+    assert main(["compress", str(ball_run), "--max-loss", "3", "--out", str(out), "-v"]) == 0
     report = json.loads((out / "compress.json").read_text())
+    printed = capsys.readouterr().out
+    assert all(trial["what"] in printed for trial in report["trials"])
     run = load_run(dev, out)
     assert run.model.cloud.sh[0].dtype == np.float16
     assert run.model.cloud.count == report["points"][1] < report["points"][0]
