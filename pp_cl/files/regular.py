@@ -11,6 +11,7 @@ from typing import BinaryIO
 from pp_cl.errors import UserError, shown
 
 MOST_REASON = 120  # characters
+MOST_PIXELS = 2 * 89_478_485  # of an image; Pillow refuses more. The largest sensors have 151 M
 
 
 @contextmanager
