@@ -73,10 +73,10 @@ class NpzFile:
         with ExitStack() as stack, _one_kind_of_error():
             self._archive = stack.enter_context(opened_zip(path))
             entries = self._archive.infolist()
-            if sum(entry.file_size for entry in entries) > path.stat().st_size:
-                raise ValueError("its arrays are not stored as they are")
             for entry in entries:
                 self._add(entry)
+            if sum(entry.file_size for entry in entries) > path.stat().st_size:
+                raise ValueError("two of its arrays share a part of the file")
             self._close = stack.pop_all().close
 
     def close(self) -> None:
