@@ -175,6 +175,25 @@ def test_cut_files(tmp_path, rng, share, read):
         assert read is image_size and share > 0.02, "a cut image was read"
 
 
+def test_parts_and_damage(tmp_path, capfd):
+    """A file of several parts is refused; the library's own words about a damaged one stay away."""
+    planes = {name: PLANE.copy() for name in "RGB"}
+    parts = [OpenEXR.Part({"name": n, "type": OpenEXR.scanlineimage}, planes) for n in "ab"]
+    OpenEXR.File(parts).write(str(tmp_path / "parts.exr"))
+    stored(tmp_path / "cut.exr", planes)
+    (tmp_path / "cut.exr").write_bytes((tmp_path / "cut.exr").read_bytes()[:-40])
+    for name, words in (("parts", "2 parts"), ("cut", "cannot be read as OpenEXR")):
+        with pytest.raises(UserError, match=words):
+            read_rgba(tmp_path / f"{name}.exr")
+    assert capfd.readouterr() == ("", "")
+
+
+def test_rows_beyond_a_strip(tmp_path, rng):
+    plane = rng.uniform(0, 1, (600, 3)).astype(np.float32)
+    stored(tmp_path / "a.exr", {"Y": plane})
+    assert np.abs(read_rgba(tmp_path / "a.exr")[..., 0] - srgb(plane)).max() <= 1
+
+
 def test_a_size_beyond_all_memory(tmp_path, monkeypatch):
     monkeypatch.setattr("pp_cl.files.exr.MOST_PIXELS", 100)
     stored(tmp_path / "a.exr", dict.fromkeys("RGB", PLANE.copy()))

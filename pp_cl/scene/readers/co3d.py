@@ -25,7 +25,7 @@ FILES = "a sequence of CO3D, whose frame_annotations.jgz lies one folder above"
 ANNOTATIONS = "frame_annotations.jgz"
 # characters of a file of annotations, and frames in it: the largest category has less than half
 MOST_TEXT, MOST_FRAMES = 2**30, 2**20
-MOST_KEPT = 2**24  # characters of the frames of one sequence: 10,000 of them
+MOST_KEPT = 2**22  # characters of the frames of one sequence: 3,500 of them
 SPACES = re.compile(r"\s*")
 PIECE = 2**18  # characters that are unpacked at once; a frame takes some 1,200
 # PyTorch3D: x left, y up, z forwards; OpenCV: x right, y down, z forwards
@@ -106,7 +106,10 @@ def _objects(opened):
     decode, text, at, left = json.JSONDecoder().raw_decode, "", 0, MOST_TEXT
     due = "["  # what may come next, besides spaces
     while due:
-        at = SPACES.match(text, at).end()
+        spaces = SPACES.match(text, at)
+        at = spaces.end()
+        if len(spaces[0]) >= PIECE:
+            raise ValueError(f"{PIECE} spaces in a row")
         if len(text) - at < PIECE and (piece := opened.read(PIECE)):
             left -= len(piece)
             if left < 0:

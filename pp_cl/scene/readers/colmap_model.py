@@ -131,7 +131,9 @@ def _lens(where, model, size, parameters):
 def _image(where, name, camera, numbers):
     """The Image; numbers: qw, qx, qy, qz, tx, ty, tz. Raises UserError beginning with `where`."""
     # it goes into messages of one line
-    if not 1 <= len(name) <= MOST_NAME or any(unicodedata.category(letter) == "Cc" for letter in name):
+    if not 1 <= len(name) <= MOST_NAME or any(
+        unicodedata.category(letter) == "Cc" for letter in name
+    ):
         raise UserError(f"{where}: {name[:80]!r} is no name of an image; rename it")
     numbers = np.array(numbers, np.float64)
     length = np.linalg.norm(numbers[:4]) if _are_numbers(numbers) else 0

@@ -196,6 +196,9 @@ BAD_FRAMES = {
     "height": ({"h": 19}, "h", "24x18", "train_1.png"),
     "distortion": ({"k4": 0.01}, "k4", "undistort"),
     "fisheye": ({"camera_model": "OPENCV_FISHEYE"}, "camera_model", "undistort"),
+    "fisheye of instant-ngp": ({"is_fisheye": True}, "is_fisheye", "undistort"),
+    "panorama": ({"camera_type": "equirectangular"}, "camera_type", "undistort"),
+    "an image twice": ({"file_path": "train_0.png"}, "file_path", "'train_0.png'", "twice"),
     "near only": ({"near": 1.0}, "far", "missing"),
     "far only": ({"far": 1.0}, "near", "missing"),
     "near 0": ({"near": 0, "far": 2}, "near", "above 0"),
@@ -251,6 +254,19 @@ def test_frame_that_is_no_object(tmp_path):
 def test_broken_json(tmp_path, text, words):
     (tmp_path / "transforms_train.json").write_text(text, errors="surrogateescape")
     refused(tmp_path, tmp_path / "transforms_train.json", *words)
+
+
+def test_a_copy_beside_transforms_json_is_no_split(tmp_path):
+    write_scene(tmp_path)
+    (tmp_path / "transforms_train.json").rename(tmp_path / "transforms.json")
+    (tmp_path / "transforms_backup.json").write_text("{}")
+    assert transforms.splits(tmp_path) == ["test", "train"]
+    assert len(load_scene(tmp_path).splits["train"]) == 2
+
+
+def test_what_is_perspective_by_its_keys_is_read(tmp_path):
+    keys = {"is_fisheye": False, "camera_type": "perspective", "orthographic": None}
+    assert len(train_views(tmp_path, **keys)) == 3
 
 
 def test_a_pipe_is_no_file_of_cameras(tmp_path):
