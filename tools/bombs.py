@@ -106,6 +106,7 @@ def _lists():
     return b'{"frames":[' + b"[]," * (20 * 2**20) + b"[]]}"
 
 
+LONG_FRAME = b'{"sequence_name":"sequence","x":[' + b"[]," * 40_000 + b"1]},"
 _nested = _text("transforms.json", b"[" * 10**6)
 CAMERA = struct.pack("<IiQQ3d", 1, 0, 10, 10, 5.0, 5.0, 5.0)
 IMAGE = struct.pack("<I7dI", 1, 1.0, 0, 0, 0, 0, 0, 0, 1) + b"a.png\0"
@@ -286,11 +287,7 @@ KINDS: dict[str, tuple[Callable[[Path], Path], Action, int]] = {
     "transforms.json, a million lists in each other": (_nested, _of_parent, 2),
     "frame_annotations.jgz, empty objects": (_annotations(b"{},", 13), _info, 2),
     "frame_annotations.jgz, spaces": (_annotations(b" ", 128), _info, 2),
-    "frame_annotations.jgz, a sequence of long frames": (
-        _annotations(b'{"sequence_name":"sequence","x":[' + b"[]," * 40_000 + b"1]},", 1),
-        _info,
-        2,
-    ),
+    "frame_annotations.jgz, a sequence of long frames": (_annotations(LONG_FRAME, 1), _info, 2),
     "cameras.bin, 4.6e18 cameras": (_colmap(_many_cameras, _long_track), _info, 2),
     "images.bin, 4.6e18 images": (_colmap(_one_camera, _many_images), _info, 2),
     "images.bin, 4.6e18 points of an image": (_colmap(_one_camera, _long_track), _info, 2),
@@ -316,11 +313,7 @@ KINDS: dict[str, tuple[Callable[[Path], Path], Action, int]] = {
     "PLY, 1e9 vertices": (_text("a.ply", _ply), _direct(read_mesh), 2),
     "GLB, a ball 20,000 times": (_text("a.glb", _glb), _direct(read_mesh), 2),
     "OBJ, sparse, 64 GiB": (_sparse("a.obj", 2**36), _direct(read_mesh), 2),
-    "a path of cameras, 20 million empty lists": (
-        _text("path.json", _lists),
-        _direct(read_cameras),
-        2,
-    ),
+    "path.json, 20 million empty lists": (_text("path.json", _lists), _direct(read_cameras), 2),
     "checkpoint.npz, 256 MiB of zeros": (_run(_checkpoint), _info, 2),
     "metrics.json, 20 million empty lists": (
         _run(_text("eval/metrics.json", _lists)),

@@ -11,9 +11,7 @@ from typing import BinaryIO
 from pp_cl.errors import UserError, shown
 
 MOST_REASON = 120  # characters
-MOST_VALUES = (
-    2**22
-)  # of a JSON file: 100,000 cameras of 40; with its text they take 0.8 GiB at most
+MOST_VALUES = 2**22  # of a JSON file: 100,000 cameras of 40; with its text they take 1 GiB at most
 MOST_PIXELS = 2 * 89_478_485  # of an image; Pillow refuses more. The largest sensors have 151 M
 
 
