@@ -14,7 +14,7 @@ from pp_cl.device.device import Device
 from pp_cl.errors import UserError
 from pp_cl.files.contact_sheet import contact_sheet
 from pp_cl.files.image import to_8bit
-from pp_cl.files.regular import read_regular
+from pp_cl.files.regular import read_json_text
 from pp_cl.files.run_folder import MOST_METRICS, RunFolder
 from pp_cl.scene.agreement import Disagreement, disagreements
 from pp_cl.scene.camera_path import looked_at, up_of
@@ -137,7 +137,7 @@ def _metrics(folder):
     if not file.exists():
         return {"metrics": None, "metrics_step": None}
     try:
-        result = json.loads(read_regular(file, MOST_METRICS))
+        result = json.loads(read_json_text(file, MOST_METRICS))
         values = {name: float(value) for name, value in result["mean"].items()}
         step = result.get("step")
         if not all(map(math.isfinite, values.values())) or type(step) not in (int, type(None)):
