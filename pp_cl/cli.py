@@ -9,11 +9,12 @@ import signal
 import sys
 import warnings
 from collections.abc import Sequence
-from contextlib import suppress
+from contextlib import nullcontext, redirect_stdout, suppress
 
 from pp_cl import __version__
 from pp_cl.commands.streams import usable_streams
-from pp_cl.errors import BuildError, Stopped, UserError, one_line
+from pp_cl.errors import BuildError, Stopped, UserError, one_line, quoted, suggestion
+from pp_cl.files.atomic import mend
 
 COMMANDS = (
     "devices",
@@ -36,11 +37,43 @@ COMMANDS = (
 SIGPIPE = 13  # Windows has no name for it
 
 
+class _UsageError(UserError):
+    """A command line that makes no sense. The message begins with the program's name."""
+
+
 class _Parser(argparse.ArgumentParser):
-    """argparse with one-line errors."""
+    """argparse with one-line errors that name the nearest word, without values that are empty, and
+    with a status that tells whether the help was printed.
+    """
 
     def error(self, message):
-        raise UserError(f"{self.prog}: {message}; see {self.prog} --help")
+        end = " " if message.endswith("?") else "; "
+        raise _UsageError(f"{self.prog}: {message}{end}see {self.prog} --help")
+
+    def parse_known_args(self, args=None, namespace=None):
+        options, unknown = super().parse_known_args(args, namespace)
+        if unknown:
+            word = next((word for word in unknown if word.startswith("-")), "")
+            near = suggestion(word.partition("=")[0], self._option_string_actions)
+            self.error(f"unrecognized arguments: {' '.join(unknown)}; {near}".rstrip("; "))
+        return options, unknown
+
+    def _get_value(self, action, text):
+        if text == "" and action.nargs != argparse.PARSER:
+            raise argparse.ArgumentError(action, "is empty; write it, or leave it out")
+        return super()._get_value(action, text)
+
+    def _check_value(self, action, value):
+        if action.choices is not None and value not in action.choices:
+            known = [str(choice) for choice in action.choices]
+            near, all_of_them = suggestion(str(value), known), ", ".join(known)
+            raise argparse.ArgumentError(
+                action, f"{quoted(value)}: {near}choose from {all_of_them}"
+            )
+
+    def _print_message(self, message, file=None):
+        if message:
+            print(message, end="", file=file or sys.stderr, flush=True)
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -65,10 +98,15 @@ def program(argv: Sequence[str] | None = None) -> int:
 def _run(argv):
     """The exit status of a command."""
     try:
-        options = _parser().parse_args(argv)
-        options.run(options)
+        options = _parse(sys.argv[1:] if argv is None else list(argv))
+        json_alone = getattr(options, "json", None) is sys.stdout
+        with redirect_stdout(sys.stderr) if json_alone else nullcontext():
+            options.run(options)
         sys.stdout.flush()
         return 0
+    except _UsageError as error:
+        _show(str(error))
+        return 2
     except UserError as error:
         return _fail(str(error))
     except Stopped as stopped:
@@ -77,7 +115,7 @@ def _run(argv):
         return _fail("nobody reads the output any more", 128 + SIGPIPE)
     except OSError as error:
         what = f"{error.filename or 'file'}: {error.strerror or error}"
-        return _fail(f"{what}; check the path, permissions and free space")
+        return _fail(f"{what}; {mend(error)}")
     except BuildError as error:
         print(error.log.rstrip(), file=sys.stderr)
         return _fail(
@@ -92,13 +130,31 @@ def _run(argv):
 
 def _show_warning(message, *_args, **_kwargs):
     """One line on stderr, without the place in our source."""
+    _show(f"pp-cl: {one_line(message)}")
+
+
+def _show(line):
     with suppress(OSError):  # of a full disk, which is no reason to stop
-        print(f"pp-cl: {one_line(message)}", file=sys.stderr, flush=True)
+        print(line, file=sys.stderr, flush=True)
 
 
 def _fail(message, status=2):
     _show_warning(message)
     return status
+
+
+def _parse(argv):
+    """The options. A word after --json is no FILE where the command would lack its RUN, as in
+    `pp-cl info --json RUN`.
+    """
+    parser = _parser()
+    try:
+        return parser.parse_args(argv)
+    except _UsageError as error:
+        with suppress(_UsageError):
+            if "--json" in argv:
+                return parser.parse_args([("--json=-" if w == "--json" else w) for w in argv])
+        raise error
 
 
 def _parser():

@@ -5,13 +5,13 @@ import json
 import math
 import os
 import warnings
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from functools import cache
 from pathlib import Path
 from typing import Any
 
-from pp_cl.errors import UserError, quoted, shown
+from pp_cl.errors import UserError, quoted, shown, suggestion
 from pp_cl.files.regular import read_regular
 from pp_cl.presets import ABSENT, ADDED, PRESETS, REMOVED, RENAMED
 from pp_cl.settings import NetworkConfig, PointsConfig, RasterConfig, SceneConfig, TrainConfig
@@ -68,10 +68,10 @@ def assign(config: Config, key: str, value: Any, origin: str) -> None:
         config.notes.append(f"{origin}: {key} is called {RENAMED[key]} now")
     section, _, name = RENAMED.get(key, key).partition(".")
     owner = dict(sections(config)).get(section)
-    if owner is None:
-        raise UserError(f"{origin}: unknown key {key!r}; keys look like train.iterations")
-    if name not in vars(owner):
-        raise UserError(f"{origin}: unknown key {key!r}; {section} has {', '.join(vars(owner))}")
+    if owner is None or name not in vars(owner):
+        near = suggestion(key, (f"{s}.{name}" for s, v in sections(config) for name in vars(v)))
+        known = f"{section} has {', '.join(vars(owner))}" if owner else "`train --help` lists them"
+        raise UserError(f"{origin}: unknown key {quoted(key)}; {near}{known}")
     setattr(owner, name, _convert(value, getattr(owner, name), f"{origin}: {key}"))
 
 
@@ -92,14 +92,16 @@ def _convert(value, example, where):
         raise UserError(f"{where}: {quoted(value)} is not {kind}") from None
 
 
-def _whole(value):
-    number = _finite(value)
+def whole(value: Any) -> int:
+    """A whole number, or its text, as 1e6. Raises ValueError or TypeError for anything else."""
+    number = finite(value)
     if number != int(number):
         raise ValueError
     return int(number)
 
 
-def _finite(value):
+def finite(value: Any) -> float:
+    """A finite number, or its text. Raises ValueError or TypeError for anything else."""
     number = float(value)
     if isinstance(value, bool) or not math.isfinite(number):
         raise ValueError
@@ -119,34 +121,41 @@ def _truth(value):
 
 # type of a setting: (its name in errors, conversion of a value or its text)
 KINDS = {
-    int: ("a whole number", _whole),
-    float: ("a finite number", _finite),
+    int: ("a whole number", whole),
+    float: ("a finite number", finite),
     str: ("a word", _word),
     bool: ("true or false", _truth),
 }
 
 
-def validate(config: Config, origin: str) -> None:
-    """Raise UserError naming the origin and the first key whose value is not allowed."""
+def validate(config: Config, origin: str, origins: Mapping[str, str] | None = None) -> None:
+    """Raise UserError naming the origin and the first key whose value is not allowed. origins: of
+    keys that come from elsewhere.
+    """
+
+    def where(key):
+        return f"{(origins or {}).get(key, origin)}: {key}"
+
     for section, values in sections(config):
         for item in dataclasses.fields(values):
-            _check(getattr(values, item.name), f"{origin}: {section}.{item.name}", **item.metadata)
-    _check_channels(config.network, origin)
+            key = f"{section}.{item.name}"
+            _check(getattr(values, item.name), where(key), **item.metadata)
+    _check_channels(config.network, where("network.channels"))
     if config.train.crop % 4:
         raise UserError(
-            f"{origin}: train.crop = {config.train.crop}; it must be a multiple of 4"
+            f"{where('train.crop')} = {config.train.crop}; it must be a multiple of 4"
             " (0: whole images)"
         )
 
 
-def _check_channels(network, origin):
+def _check_channels(network, where):
     """Raise UserError for network.channels that no network of these blocks can have."""
     numbers = network.channels.split(",") if network.channels else []
     count = CONVOLUTIONS[network.blocks]
     sound = all(n.isascii() and n.isdigit() and 1 <= len(n) <= 4 and int(n) for n in numbers)
     if numbers and not (sound and len(numbers) == count):
         raise UserError(
-            f"{origin}: network.channels = {quoted(network.channels)}; it must be {count} numbers"
+            f"{where} = {quoted(network.channels)}; it must be {count} numbers"
             f" from 1 to 9999 where network.blocks is {network.blocks}, or none"
         )
 
@@ -174,7 +183,7 @@ def configure(config: Config, scene: str, given: Iterable[tuple[str, Any, str]] 
         assign(config, key, value, origin)
     if config.scene.masks:
         assign(config, "scene.masks", str(Path(config.scene.masks).resolve()), "settings")
-    validate(config, "settings")
+    validate(config, "settings", {RENAMED.get(key, key): origin for key, _, origin in given})
     return config
 
 
@@ -234,12 +243,19 @@ def _read_settings(path):
     try:
         stored = json.loads(read_regular(path, MOST_BYTES))
     except OSError as error:
-        raise UserError(f"{path}: {error.strerror}; is this the folder of a run?") from None
+        mend = nearby_run(path.parent) or "is this the folder of a run?"
+        raise UserError(f"{path}: {error.strerror}; {mend}") from None
     except (ValueError, RecursionError) as error:
         raise UserError(f"{path}: not JSON ({shown(str(error))}); {MEND_SETTINGS}") from None
     if not isinstance(stored, dict):
         raise UserError(f"{path}: not settings but {quoted(stored, 40)}; {MEND_SETTINGS}")
     return stored
+
+
+def nearby_run(folder: Path) -> str:
+    """What to say of a folder that is no run's where the one of its name in runs/ is, else ""."""
+    near = folder.parent / "runs" / folder.name
+    return f"did you mean {near}?" if (near / "config.json").is_file() else ""
 
 
 def _stored_keys(path, stored, known):
@@ -308,9 +324,16 @@ def text_of(value: Any) -> str:
 
 
 def help_lines() -> list[str]:
-    """Lines `section.key = default  (help)` of all settings: the text of `--help`."""
+    """Lines `section.key = default  (help)` of all settings, each with the values of the presets
+    that differ: the text of `--help`.
+    """
     return [
         f"  {section}.{item.name} = {text_of(item.default)}  ({item.metadata['help']})"
+        + "".join(
+            f"  {name}: {text_of(changes[key])}"
+            for name, changes in PRESETS.items()
+            if (key := f"{section}.{item.name}") in changes
+        )
         for section, values in sections(Config())
         for item in dataclasses.fields(values)
     ]

@@ -1,4 +1,7 @@
-"""The exceptions a user may see."""
+"""The exceptions a user may see, and the words of their messages."""
+
+import difflib
+from collections.abc import Iterable
 
 MOST_LINE = 1000  # characters of a message: two long paths and a reason
 
@@ -59,3 +62,11 @@ def quoted(value: object, most: int = 100) -> str:
         return shown(repr(value), most)
     except (RecursionError, ValueError):  # nested deeply, or a number of thousands of digits
         return f"a {type(value).__name__}"
+
+
+def suggestion(word: str, words: Iterable[str]) -> str:
+    """`did you mean X? ` for the nearest of the words, to stand before the list of them all; empty
+    where none is near.
+    """
+    near = difflib.get_close_matches(word[:100], list(words), n=1)
+    return f"did you mean {near[0]}? " if near else ""

@@ -3,7 +3,7 @@
 import os
 import shutil
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path, PurePosixPath
 from typing import Any, NamedTuple
 
@@ -63,13 +63,17 @@ def evaluate(
     *,
     save_images: bool = False,
     out: Path | str | None = None,
+    published: bool = False,
+    on_view: Callable[[int, int], None] = lambda _measured, _views: None,
 ) -> dict[str, Any]:
     """Measure a run; writes metrics.json and comparison.png into the folder `out`, if not given
     RUN/eval, or RUN/eval/SPLIT for other splits than test, and returns the former.
 
     metrics: names out of psnr, ssim, lpips. save_images: write every view to images/ there, in
-    place of what an earlier evaluation left. Raises UserError for a missing or broken split, a
-    folder that may not be written, and an `out` that holds something else than an evaluation.
+    place of what an earlier evaluation left. published: put published results beside also where
+    they were measured on other views or sizes. on_view: called after each view with the number of
+    those measured and of all. Raises UserError for a missing or broken split, a folder that may not
+    be written, and an `out` that holds something else than an evaluation.
     """
     target = run.folder.evaluation(split) if out is None else Path(out)
     check_target(target, is_new=out is not None)
@@ -94,9 +98,10 @@ def evaluate(
             path = target / "images" / files[i]
             path.parent.mkdir(parents=True, exist_ok=True)
             write_png(path, image)
+        on_view(i + 1, len(views))
     means = mean([{name: row[name] for name in metrics} for row in rows])
     result = {"split": split, "device": run.dev.name, "mean": means, "per_image": rows}
-    result |= _about(run, costs) | _published(scene, split, views)
+    result |= _about(run, costs) | _published(scene, split, views, anyway=published)
     write_json(target / "metrics.json", result)
     write_comparison(target / "comparison.png", *zip(*shown, strict=True))
     return result
@@ -113,14 +118,15 @@ def check_target(target: Path, *, is_new: bool) -> None:
         raise UserError(f"{target}: holds other files; choose a new or empty folder for --out")
 
 
-def _published(scene, split, views):
-    """{"published": rows of the scene's test views, "published_differs": how this measurement
-    differs from them}.
+def _published(scene, split, views, *, anyway):
+    """{"published": rows of the scene, "published_differs": how this measurement differs from
+    them}. anyway: rows also where it does.
     """
     cameras = [view.file_camera for view in views]
-    rows = published_rows(scene.name, cameras) if split == "test" else {}
-    differs = differences(scene.name, cameras, views[0].file_downscale) if rows else ""
-    return {"published": rows, "published_differs": differs}
+    rows = published_rows(scene.name, cameras)
+    differs = differences(scene.name, cameras, views[0].file_downscale, split) if rows else ""
+    shown = anyway or not differs
+    return {"published": rows if shown else {}, "published_differs": differs if shown else ""}
 
 
 def _about(run, costs):

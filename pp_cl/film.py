@@ -2,16 +2,18 @@
 
 import hashlib
 import json
+import shutil
 import time
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from filelock import FileLock, Timeout
 
 from pp_cl.errors import UserError
-from pp_cl.files.atomic import remove_leftovers, write_json
-from pp_cl.files.contact_sheet import tiles
+from pp_cl.files.atomic import check_file, check_target, remove_leftovers, write_json
 from pp_cl.files.exr import write_exr
 from pp_cl.files.image import read_rgba, write_png
 from pp_cl.files.picture import WHITE
@@ -22,7 +24,6 @@ from pp_cl.trained import Run
 
 MOST_IDENTITY = 1000  # bytes of it
 IDENTITY = "frames.json"  # in the folder of the frames: what they show
-SHEET_FRAMES, SHEET_COLUMNS, SHEET_SIDE = 12, 4, 240  # a contact sheet's; pixels of a longer side
 
 
 @dataclass(frozen=True)
@@ -42,14 +43,29 @@ class Style:
 class Frames:
     """The frames of a run along a path, in a folder of their own.
 
-    Raises UserError where the folder holds something else, or frames that show something else.
+    replace: frames that are there and show something else make room. Raises UserError where the
+    folder cannot be written, or holds other files, or such frames and they are not replaced.
     """
 
-    def __init__(self, run: Run, cameras: Sequence[Camera], folder: Path, style: Style):
+    def __init__(
+        self,
+        run: Run,
+        cameras: Sequence[Camera],
+        folder: Path,
+        style: Style,
+        *,
+        replace: bool = False,
+    ):
         self.run, self.cameras, self.folder, self.style = run, cameras, folder, style
         self.paths = [folder / f"{i:05d}.{style.suffix}" for i in range(len(cameras))]
         self._identity = {"frames": self._digest(), "count": len(cameras)}
-        self._check_folder()
+        self._check_folder(replace)
+        check_target(folder / IDENTITY)
+        # Python stands for bytes that are no UTF-8 by these
+        if style.suffix == "exr" and any("\udc80" <= c <= "\udcff" for c in str(folder)):
+            raise UserError(
+                f"{folder}: OpenEXR writes no file whose name is no UTF-8; choose another --out"
+            )
 
     def _digest(self):
         """Of everything that the frames depend on."""
@@ -60,19 +76,26 @@ class Frames:
             digest.update(self.run.model.packed(camera).tobytes())
         return digest.hexdigest()
 
-    def _check_folder(self):
-        mend = "choose another --out, or delete it"
+    def _check_folder(self, replace):
         if self.folder.exists() and not self.folder.is_dir():
-            raise UserError(f"{self.folder}: is not a folder; {mend}")
-        if not self.folder.exists() or not any(self.folder.iterdir()):
+            raise UserError(f"{self.folder}: is not a folder; choose another --out")
+        if not self.folder.exists() or all(p.name.startswith(".") for p in self.folder.iterdir()):
             return
         file = self.folder / IDENTITY
         try:
             there = json.loads(read_regular(file, MOST_IDENTITY))
         except (OSError, ValueError, RecursionError):
-            raise UserError(f"{self.folder}: holds files that are no frames; {mend}") from None
+            raise UserError(
+                f"{self.folder}: holds files that are no frames; choose another --out"
+            ) from None
+        if there != self._identity and not replace:
+            raise UserError(
+                f"{self.folder}: holds frames of another model or path; choose another --out, or"
+                " delete it"
+            )
         if there != self._identity:
-            raise UserError(f"{self.folder}: holds frames of another model or path; {mend}")
+            for frame in self.folder.glob(f"*.{self.style.suffix}"):
+                frame.unlink()
 
     def render(self, on_frame: Callable[[float | None], None]) -> None:
         """Render the frames that are not there yet; on_frame is called after each one with its
@@ -96,30 +119,39 @@ class Frames:
         else:
             write_png(path, picture.image(style.background))
 
-    def images(self, chosen: Sequence[int] | None = None) -> Iterator[np.ndarray]:
-        """uint8 images, (H, W, 3) or with straight alpha (H, W, 4), of the chosen frames, else of
-        all.
-        """
-        transparent = self.style.suffix == "exr" or self.style.background is None
-        for i in range(len(self.paths)) if chosen is None else chosen:
-            image = read_rgba(self.paths[i])
-            yield image if transparent else image[..., :3]
-
-    def write_sheet(self, path: Path) -> None:
-        """Write a contact sheet of frames along the whole path."""
-        n = len(self.paths)
-        chosen = sorted({n * i // SHEET_FRAMES for i in range(SHEET_FRAMES)})
-        images = [_reduced(image) for image in self.images(chosen)]
-        write_png(path, tiles(images, min(SHEET_COLUMNS, len(images))))
+    def _images(self) -> Iterator[np.ndarray]:
+        """uint8 images, (H, W, 3) or with straight alpha (H, W, 4), of PNG frames."""
+        for path in self.paths:
+            image = read_rgba(path)
+            yield image if self.style.background is None else image[..., :3]
 
     def write_film(self, path: Path, fps: float) -> None:
         """Write all frames as a film; raises UserError as write_video does."""
-        write_video(path, self.images(), fps)
+        write_video(path, self._images(), fps)
 
 
-def _reduced(image):
-    """The uint8 image with a longer side of at most SHEET_SIDE pixels: every k-th pixel's block."""
-    k = -(-max(image.shape[:2]) // SHEET_SIDE)
-    height, width = image.shape[0] // k * k, image.shape[1] // k * k
-    blocks = image[:height, :width].reshape(height // k, k, width // k, k, -1)
-    return np.rint(blocks.mean(axis=(1, 3))).astype(np.uint8)
+@contextmanager
+def film_folder(film: Path) -> Iterator[Path]:
+    """A hidden folder beside a film, for its frames: removed when the block ends well, else kept
+    for the next time. Raises UserError where the film cannot be written, or another process makes
+    it.
+    """
+    check_file(film)
+    folder = film.with_name(f".{film.name}.frames")
+    check_target(folder)
+    folder.mkdir(parents=True, exist_ok=True)
+    lock = FileLock(folder / ".lock", timeout=0)
+    try:
+        lock.acquire()
+    except Timeout:
+        raise UserError(
+            f"{film}: another process makes it; wait for its end, or choose another --out"
+        ) from None
+    is_kept = True
+    try:
+        yield folder
+        is_kept = False
+    finally:
+        lock.release()
+        if not (is_kept and any(folder.glob("*.png"))):
+            shutil.rmtree(folder, ignore_errors=True)

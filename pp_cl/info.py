@@ -14,7 +14,7 @@ from pp_cl.device.device import Device
 from pp_cl.errors import UserError
 from pp_cl.files.contact_sheet import contact_sheet
 from pp_cl.files.image import to_8bit
-from pp_cl.files.regular import read_regular
+from pp_cl.files.regular import read_json_text
 from pp_cl.files.run_folder import MOST_METRICS, RunFolder
 from pp_cl.scene.agreement import Disagreement, disagreements
 from pp_cl.scene.camera_path import looked_at, up_of
@@ -137,7 +137,7 @@ def _metrics(folder):
     if not file.exists():
         return {"metrics": None, "metrics_step": None}
     try:
-        result = json.loads(read_regular(file, MOST_METRICS))
+        result = json.loads(read_json_text(file, MOST_METRICS))
         values = {name: float(value) for name, value in result["mean"].items()}
         step = result.get("step")
         if not all(map(math.isfinite, values.values())) or type(step) not in (int, type(None)):
@@ -178,12 +178,13 @@ def describe_scene(
     as configure takes them. Raises UserError for a scene that is missing or broken; what prevents a
     hull is a fact.
     """
+    given = list(given)
     config = configure(preset(preset_name), scene, given)
     path = config.scene.path
+    if "scene.downscale" not in [key for key, _, _ in given]:
+        assign(config, "scene.downscale", preset_downscale(path, preset_name), "preset")
     names = sorted(scene_splits(path), key=lambda split: (split == "test", split))
     frames = {split: scene_frames(path, split) for split in names}
-    downscale = preset_downscale(path, preset_name)
-    assign(config, "scene.downscale", downscale, "preset")
     views = open_scene(dev, config, ("train",)).splits["train"]
     hull, problem = _hull(dev, views, config)
     found = disagreements(views, hull.grid.box) if hull else []
@@ -197,7 +198,7 @@ def describe_scene(
         "depth_range": _stated_range(views),
         **_rig(views),
         "preset": preset_name,
-        "downscale": downscale,
+        "downscale": config.scene.downscale,
         "hull": _hull_facts(hull, [view.camera for view in views]),
         "problem": problem,
     }

@@ -20,9 +20,10 @@ from pp_cl.model import Model
 from pp_cl.network.unet import UNet
 from pp_cl.render import Renderer
 from pp_cl.scene.camera import Camera
-from pp_cl.scene.identity import difference
+from pp_cl.scene.identity import difference, kept_views
 from pp_cl.scene.load import Scene
 from pp_cl.scene.open import DEMO, open_scene, scene_frames
+from pp_cl.scene.photograph import Photograph
 from pp_cl.training.schedule import gamma_at
 from pp_cl.training.stored import load_run_state
 
@@ -60,23 +61,23 @@ class Run:
         """The run's scene with one split. Raises UserError where it is missing, broken or another
         one than the run has learned.
         """
-        self._check_scene()
+        self.check_scene()
         scene = open_scene(self.dev, self.config, (split,))
-        self._compare(split, scene.splits[split])
+        self._compare(lambda: scene.splits.get("train") or self._some_photographs())
         return scene
 
     def _some_photographs(self):
+        if not self.header.get("pixels"):
+            return []
         return open_scene(self.dev, self.config, ("train",), COMPARED_VIEWS).splits["train"]
 
-    def _compare(self, split, views):
-        """Raise UserError unless the scene's training views are those of the run; of other splits'
-        scenes only a few photographs are read for it.
+    def _compare(self, read):
+        """Raise UserError unless the scene's training views are those of the run. read: gives those
+        whose pixels are compared, too.
         """
         path, header = self.config.scene.path, self.header
         try:
-            listed = scene_frames(path)
-            if split != "train":
-                views = self._some_photographs() if header.get("pixels") else []
+            listed, views = scene_frames(path), read()
         except UserError as error:
             warnings.warn(
                 f"{path}: cannot be compared with the scene of {self.folder} ({error})",
@@ -89,19 +90,27 @@ class Run:
                 " where its own is with --scene"
             )
 
-    def cameras(self, split: str = "test") -> list[Camera]:
-        """The cameras of a split's views at the resolution of the run; no photograph is read.
-        Raises UserError as scene() does.
+    def photographs(self, split: str) -> list[Photograph]:
+        """A split's views without their pixels. The run itself keeps those of train; for others
+        raises UserError where the scene is missing, broken, or another one by names and cameras.
         """
-        self._check_scene()
-        settings = self.config.scene
-        frames = scene_frames(settings.path, split)
-        return [frame.camera.downscaled(settings.downscale) for frame in frames]
+        if split == "train":
+            return kept_views(self.header["views"])
+        self.check_scene()
+        listed = scene_frames(self.config.scene.path, split)
+        self._compare(list)
+        return listed
 
-    def _check_scene(self):
-        path = self.config.scene.path
-        if path != DEMO and not Path(path).is_dir():
-            raise UserError(f"{path}: the run's scene is not there; say where with --scene")
+    def cameras(self, split: str = "test") -> list[Camera]:
+        """The cameras of a split's views at the resolution of the run. Raises UserError as
+        photographs() does.
+        """
+        downscale = self.config.scene.downscale
+        return [one.camera.downscaled(downscale) for one in self.photographs(split)]
+
+    def check_scene(self) -> None:
+        """Raise UserError where the run's scene is not where its settings say."""
+        check_scene(self.config.scene.path)
 
     @cached_property
     def ball(self) -> tuple[np.ndarray, float]:
@@ -154,6 +163,12 @@ class Run:
         return max(distance - radius, NEAREST * radius), distance + radius
 
 
+def check_scene(path: str) -> None:
+    """Raise UserError where the folder of a run's scene is not there."""
+    if path != DEMO and not Path(path).is_dir():
+        raise UserError(f"{path}: the run's scene is not there; say where with --scene")
+
+
 def load_run(
     dev: Device,
     folder: Path | str,
@@ -166,6 +181,8 @@ def load_run(
     tolerance: in place of its network.tolerance; scene: the folder of its scene, if that has moved.
     Raises UserError naming the file that is missing or broken.
     """
+    if scene is not None:
+        check_scene(scene)
     folder = RunFolder(folder)
     config = load_config(folder.config)
     given = [] if tolerance is None else [("network.tolerance", tolerance, "tolerance")]

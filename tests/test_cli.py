@@ -24,7 +24,7 @@ def failure(capsys, *words):
     capsys.readouterr()
     assert main([str(w) for w in words]) == 2
     captured = capsys.readouterr()
-    lines = [line for line in captured.err.splitlines() if line.startswith("pp-cl: ")]
+    lines = [line for line in captured.err.splitlines() if line.startswith("pp-cl")]
     assert (
         len(lines) == 1
         and captured.err.rstrip().endswith(lines[0])
@@ -102,9 +102,10 @@ def test_a_damaged_scene_is_one_line_and_writes_nothing(name, scene, tmp_path, c
 @pytest.mark.parametrize(
     "words, named",
     [
-        (["--iterations", "0"], "train.iterations"),
+        (["--iterations", "0"], "--iterations: train.iterations"),
         (["--iterations", "x"], "--iterations"),
-        (["--points", "0"], "points.count"),
+        (["--points", "0"], "--points: points.count"),
+        (["--set", "train.crop=6"], "--set: train.crop"),
         (["--downscale", "20"], "--downscale"),
         (["--set", "train.sped=1"], "train.sped"),
         (["--set", "nonsense"], "--set nonsense"),
@@ -164,6 +165,31 @@ def test_without_a_command_or_with_an_unknown_one(capsys):
     assert "paint" in failure(capsys, "paint")
 
 
+@pytest.mark.parametrize(
+    "words, begin, near",
+    [
+        (["trian"], "pp-cl: ", "train"),
+        (["train", "demo", "--out", "a", "--iters", "6"], "pp-cl train: ", "--iterations"),
+        (["train", "demo", "--out", "a", "--preset", "smal"], "pp-cl train: ", "small"),
+        (["train", "demo", "--out", "a", "--set", "trian.seed=1"], "pp-cl: ", "train.seed"),
+        (["compare", "a", "b", "--metrics", "psrn"], "pp-cl compare: ", "psnr"),
+    ],
+)
+def test_the_nearest_word_is_named_behind_one_prefix(words, begin, near, capsys):
+    line = failure(capsys, *words)
+    assert line.startswith(begin)
+    assert f"did you mean {near}?" in line
+
+
+def test_a_run_that_lies_in_runs_is_named(tmp_path, capsys, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    run = tmp_path / "runs" / "mine"
+    run.mkdir(parents=True)
+    (run / "config.json").write_text("{}")
+    for command in ("eval", "info", "shape", "compress"):
+        assert "runs/mine?" in failure(capsys, command, "mine")
+
+
 def test_help_lists_settings_and_the_module_runs():
     run = subprocess.run(
         [sys.executable, "-m", "pp_cl", "train", "--help"],
@@ -173,6 +199,8 @@ def test_help_lists_settings_and_the_module_runs():
         check=True,
     )
     assert "train.sh_rate" in run.stdout and "--downscale" in run.stdout
+    (line,) = [x for x in run.stdout.splitlines() if x.startswith("  train.iterations = ")]
+    assert line.endswith("small: 6000  full: 11000  paper: 50000")
 
 
 def test_eval_of_nothing_and_of_broken_runs(tmp_path, capsys):
@@ -228,9 +256,11 @@ def test_a_kernel_that_does_not_build_is_one_line_below_the_log(
 
 def test_a_file_without_a_name_cannot_be_written(tmp_path, capsys):
     Image.fromarray(np.zeros((16, 16, 3), np.uint8)).save(tmp_path / "a.png")
-    for target in (".", "/", ".."):
+    for target in (".", "/", "..", "a" * 300):
         line = failure(capsys, "compare", tmp_path / "a.png", tmp_path / "a.png", "--json", target)
-        assert f"pp-cl: {target}: cannot be written" in line
+        assert f"--json: '{target[:10]}" in line
+    line = failure(capsys, "export", tmp_path, "--format", "ply", "--out", f"{'a' * 300}/b.ply")
+    assert "name" in line
 
 
 @pytest.mark.parametrize(

@@ -228,6 +228,19 @@ def test_a_scene_without_training_views_is_measured_with_one_line(run, tmp_path,
     assert "cannot be compared with the scene of" in told and "no split train" in told
 
 
+def test_published_rows_stand_beside_what_compares_or_on_request(run, tmp_path, capsys):
+    """The ball under the name of a CO3D sequence, whose images the run has reduced."""
+    scene = json.loads((run / "config.json").read_text())["scene"]["path"]
+    shutil.copytree(scene, tmp_path / "34_1479_4753")
+    command = ["eval", str(run), "--scene", str(tmp_path / "34_1479_4753"), "--out"]
+    for asked, rows in (([], 0), (["--published"], 5)):
+        out = tmp_path / f"eval{rows}"
+        assert main([*command, str(out), *asked]) == 0
+        told = capsys.readouterr().out
+        assert len(json.loads((out / "metrics.json").read_text())["published"]) == rows
+        assert ("PlenopticPoints" in told) == ("reduced 2 times" in told) == bool(rows)
+
+
 def test_an_unfinished_run_is_marked(tmp_path, capsys, monkeypatch):
     scene, out = write_ball_scene(tmp_path / "ball"), tmp_path / "run"
     train_and_interrupt(scene, out, 15, monkeypatch)

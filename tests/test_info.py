@@ -151,6 +151,15 @@ def test_a_scene_in_lines_and_the_preset_of_its_hull(scene, capsys):
     assert "-0.000" not in text
 
 
+def test_settings_are_of_scenes_and_a_moved_scene_of_runs(scene, finished, tmp_path, capsys):
+    path = write_ball_scene(tmp_path / "large", views=3, size=400)
+    assert main(["info", "--json", path, "--set", "scene.downscale=4"]) == 0
+    assert json.loads(capsys.readouterr().out)["downscale"] == 4
+    assert "--scene" in failure(capsys, scene, "--scene", scene)
+    for words in (["--masks", scene], ["--set", "train.seed=1"], ["--preset", "tiny"]):
+        assert words[0] in failure(capsys, finished, *words)
+
+
 def test_a_scene_without_masks_has_a_picture(tmp_path, facts, capsys):
     scene = Path(write_ball_scene(tmp_path / "ball", views=5))
     for path in (scene / "train").iterdir():

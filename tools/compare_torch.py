@@ -13,7 +13,7 @@ import numpy as np
 
 from pp_cl.bench import unet as bench
 from pp_cl.bench.timing import errors, interleave
-from pp_cl.commands.options import read_shape
+from pp_cl.commands.options import side, widths
 from pp_cl.device.discover import open_device
 from pp_cl.errors import UserError
 from pp_cl.files.atomic import write_json
@@ -144,12 +144,14 @@ def main(argv=None):
     parser.add_argument(
         "--widths",
         default="128,256,512",
+        type=widths,
         metavar="A,B,C",
         help="channels of the levels (128,256,512)",
     )
     parser.add_argument(
         "--size",
         default="256",
+        type=side,
         metavar="S",
         help="side of the image in pixels, a multiple of 4 (256)",
     )
@@ -165,7 +167,6 @@ def main(argv=None):
     parser.add_argument("--json", metavar="FILE", help="also write the result there")
     options = parser.parse_args(argv)
     try:
-        size, widths = read_shape(options.size, options.widths)
         if min(options.threads, options.runs) < 1:
             raise UserError("--threads, --runs: must be at least 1")
         torch = _import_torch()
@@ -173,8 +174,8 @@ def main(argv=None):
         result = compare(
             torch,
             open_device(options.device),
-            widths,
-            size,
+            options.widths,
+            options.size,
             variant=options.variant,
             rounds=options.runs,
         )

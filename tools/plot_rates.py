@@ -12,7 +12,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from pp_cl.bench.plots import check_files, save_figure
+from pp_cl.bench.plots import figure_of, save_figure
+from pp_cl.commands.options import figure_file
 from pp_cl.config import Config, preset
 from pp_cl.errors import UserError
 from pp_cl.presets import PRESETS
@@ -46,11 +47,11 @@ def draw(figure, config):
 def main(arguments: list[str] | None = None) -> int:
     """The exit status: 2 for bad input."""
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
-    parser.add_argument("out", metavar="OUT", help="a .png, .svg or .pdf file")
+    parser.add_argument("out", type=figure_file, metavar="OUT", help="a .png, .svg or .pdf file")
     parser.add_argument("--preset", choices=PRESETS, default="paper", help="(paper)")
     options = parser.parse_args(arguments)
     try:
-        figure = check_files(None, options.out, "OUT")
+        figure = figure_of(options.out, "OUT")
         draw(figure, preset(options.preset))
         save_figure(figure, options.out)
     except UserError as error:

@@ -16,7 +16,7 @@ import numpy as np
 
 from pp_cl.bench.timing import interleave
 from pp_cl.bench.unet import make_network
-from pp_cl.commands.options import read_shape
+from pp_cl.commands.options import add_widths
 from pp_cl.device.discover import open_device
 from pp_cl.errors import UserError
 from pp_cl.files.atomic import write_json
@@ -116,11 +116,7 @@ def main(argv=None):
     parser.add_argument(
         "--downscale", type=int, metavar="N", help="reduction of the photographs (the run's)"
     )
-    parser.add_argument(
-        "--widths",
-        metavar="A,B,C",
-        help="another network of these widths, with random weights (the run's)",
-    )
+    add_widths(parser, "another network of these widths, with random weights (the run's)")
     parser.add_argument(
         "--views", type=int, default=4, metavar="N", help="views, evenly spread (4)"
     )
@@ -131,10 +127,13 @@ def main(argv=None):
     try:
         if min(options.views, options.runs, options.downscale or 1) < 1:
             raise UserError("--views, --runs, --downscale: must be at least 1")
-        widths = read_shape("4", options.widths)[1] if options.widths else None
         dev = open_device(options.device)
         comparison = Comparison(
-            dev, Path(options.run), options.split, downscale=options.downscale, widths=widths
+            dev,
+            Path(options.run),
+            options.split,
+            downscale=options.downscale,
+            widths=options.widths,
         )
         number = min(options.views, len(comparison.views))
         rows = []

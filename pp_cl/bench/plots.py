@@ -9,16 +9,14 @@ from pp_cl.files.atomic import atomic_file
 INSTALL = "install it with `pip install 'pp-cl[plot]'`"
 
 
-def check_files(
-    json_file: str | None, plot_file: str | None, plot_option: str = "--plot"
-) -> Any | None:
-    """A matplotlib figure for the plot, None without one. Raises UserError naming the option if a
-    file cannot be written.
+def figure_of(file: str | None, option: str = "--plot") -> Any | None:
+    """A matplotlib figure for a file, None where there is to be none. Raises UserError naming the
+    option without matplotlib.
     """
-    for option, file in (("--json", json_file), (plot_option, plot_file)):
-        if file and not Path(file).resolve().parent.is_dir():
-            raise UserError(f"{option} {file}: no such folder; make it first")
-    return _figure(plot_file, plot_option) if plot_file else None
+    figure = new_figure((8, 6)) if file else None
+    if file and figure is None:
+        raise UserError(f"{option} {file}: needs matplotlib; {INSTALL}")
+    return figure
 
 
 def new_figure(size: tuple[float, float]) -> Any | None:
@@ -28,15 +26,6 @@ def new_figure(size: tuple[float, float]) -> Any | None:
     except ImportError:
         return None
     return Figure(figsize=size, layout="constrained")
-
-
-def _figure(path, option):
-    figure, suffix = new_figure((8, 6)), Path(path).suffix[1:].lower()
-    if figure is None:
-        raise UserError(f"{option} {path}: needs matplotlib; {INSTALL}")
-    if suffix not in figure.canvas.get_supported_filetypes():
-        raise UserError(f"{option} {path}: name a .png, .svg or .pdf file")
-    return figure
 
 
 def plot_time_and_error(figure: Any, title: str, rows: list[dict]) -> None:

@@ -6,7 +6,7 @@ from functools import partial
 from pathlib import Path
 
 from pp_cl.commands import options as shared
-from pp_cl.config import assign, preset
+from pp_cl.config import CONVOLUTIONS, assign, preset
 from pp_cl.errors import UserError
 
 HELP = "time against error of the convolutions, the network, the rasteriser, a training"
@@ -19,6 +19,7 @@ OPTIONS = {
     "train": ("scene", "points", "set", "report"),
     "model": ("runs", "plot"),
 }
+BLENDS = ("alpha", "softmax")
 VIEWS, ROUNDS = 3, 5  # of bench train: views of the scene, evenly spread, and rounds over them
 
 
@@ -36,52 +37,87 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     add(
         "--size",
+        type=shared.several(shared.side),
         metavar="S",
         help="side of the image in pixels, a multiple of 4 (256; raster: 200,400,800)",
     )
-    add(
-        "--widths",
-        metavar="A,B,C",
-        help="conv, unet: channels of the levels (128,256,512: the paper's)",
-    )
-    add(
-        "--blocks",
-        metavar="B",
-        help="conv, unet: double, single or gated (double)",
-    )
+    shared.add_widths(parser, "conv, unet: channels of the levels (128,256,512: the paper's)")
+    add("--blocks", choices=CONVOLUTIONS, help="conv, unet: of a level (double)")
     add(
         "--scene",
         metavar="SCENE",
-        help="raster: grid, discs on a grid (default), or pulsar, Pulsar's spheres; train: a"
-        " folder, or the word demo (default)",
+        help="what is timed. raster: made points, grid (discs on a grid, the default) or pulsar"
+        " (Pulsar's spheres); train: the folder of a scene, or the word demo (default)",
     )
     add(
         "--points",
+        type=shared.several(shared.integer(8, 2**27)),
         metavar="N,...",
         help="raster: numbers of points (10 thousand to 4 million); train: one (4 million)",
     )
     add("--runs", metavar="RUN,...", help="model: folders of runs; the first is reduced as well")
-    add("--blend", metavar="B,...", help="raster: of alpha,softmax (both)")
-    add("--tau", metavar="T,...", help="raster: weight that a pixel may drop (0,1e-4,1e-3,1e-2)")
-    add("--gamma", metavar="G", help="raster: depth sharpness of the blend (0.01)")
-    add("--budget", metavar="T", help="all: seconds that it may take, as 120 or 120s (120)")
+    add(
+        "--budget",
+        type=_seconds,
+        metavar="T",
+        help="all: seconds that it may take, as 120 or 120s (120)",
+    )
+    _add_blending(parser)
     shared.add_set(parser, "train: a setting in place of the paper preset's")
-    _add_outputs(add)
+    _add_outputs(parser)
     shared.add_tolerance(parser)
     shared.add_device(parser)
 
 
-def _add_outputs(add):
+def _seconds(text):
+    return shared.number(1, 86400)(text.removesuffix("s"))
+
+
+def _add_blending(parser):
+    """Options of bench raster alone."""
+    add = parser.add_argument
+    add(
+        "--blend",
+        type=shared.words(BLENDS),
+        metavar="B,...",
+        help="raster: of alpha,softmax (both)",
+    )
+    add(
+        "--tau",
+        type=shared.several(shared.number(0, 0.5)),
+        metavar="T,...",
+        help="raster: weight that a pixel may drop (0,1e-4,1e-3,1e-2)",
+    )
+    add(
+        "--gamma",
+        type=shared.number(1e-5, 1),
+        metavar="G",
+        help="raster: depth sharpness of the blend (0.01)",
+    )
+
+
+def _add_outputs(parser):
     """Options of what is written and printed."""
-    add("--out", metavar="DIR", help="all: folder of bench.json and bench.html (bench)")
+    add = parser.add_argument
+    add(
+        "--out",
+        type=shared.output_folder,
+        metavar="DIR",
+        help="all: folder of bench.json and bench.html (bench)",
+    )
     add(
         "--report",
         action="store_true",
         help="all, train: also print a table in Markdown of what the stages of a step took, beside"
         " what they must take by the device's bandwidth and rate",
     )
-    add("--json", metavar="FILE", help="also write the rows there")
-    add("--plot", metavar="FILE", help="also draw time against error there (.png, .svg, .pdf)")
+    shared.add_json(parser)
+    add(
+        "--plot",
+        type=shared.figure_file,
+        metavar="FILE",
+        help="also draw time against error there (.png, .svg, .pdf)",
+    )
 
 
 def run(options: argparse.Namespace) -> None:
@@ -101,7 +137,7 @@ def _refuse_foreign(options):
             " among them"
         )
     for name in {name for names in OPTIONS.values() for name in names} - {*OPTIONS[options.what]}:
-        if getattr(options, name):
+        if getattr(options, name) not in (None, False, []):
             raise UserError(f"--{name}: bench {options.what} has no such option; leave it out")
 
 
@@ -114,13 +150,11 @@ def _run_all(options):
 
     if options.json or options.plot or options.tolerance is not None:
         raise UserError("--json, --plot, --tolerance: of a single bench; name one, or use --out")
-    text = (options.budget or "120").removesuffix("s")
-    budget = shared.read_number("--budget", text, float, least=1, most=86400)
     folder = Path(options.out or "bench")
     folder.mkdir(parents=True, exist_ok=True)
     dev = _open_device(options)
     policy = load_policy(dev, preset("tiny").network.tolerance)
-    result = bench_overview(dev, policy, budget, partial(print, flush=True))
+    result = bench_overview(dev, policy, options.budget or 120, partial(print, flush=True))
     write_json(folder / "bench.json", result)
     write_text(folder / "bench.html", page_text(result))
     if options.report:
@@ -131,28 +165,19 @@ def _run_all(options):
 
 
 def _run_raster(options):
-    from pp_cl.bench.plots import check_files, save_figure
+    from pp_cl.bench.plots import figure_of, save_figure
     from pp_cl.bench.raster import HEAD, bench_raster, growth, line, plot
     from pp_cl.bench.raster_scenes import SCENES, Case
-    from pp_cl.raster.blend import BLENDS
 
     scene = options.scene or "grid"
     if scene not in SCENES:
         raise UserError(f"--scene {scene}: choose from {', '.join(SCENES)}")
-    points = options.points or "10000,63000,250000,1000000,4000000"
-    points = shared.read_numbers("--points", points, int, least=8, most=2**27)
-    sizes = shared.read_numbers("--size", options.size or "200,400,800", int, least=4, most=4096)
-    if any(side % 4 for side in sizes):
-        raise UserError(f"--size {options.size}: write multiples of 4")
-    taus = options.tau or "0,1e-4,1e-3,1e-2"
-    taus = shared.read_numbers("--tau", taus, float, least=0, most=0.5)
-    blends = (options.blend or "alpha,softmax").split(",")
-    if not set(blends) <= set(BLENDS):
-        raise UserError(f"--blend {options.blend}: choose from {', '.join(BLENDS)}")
-    cases = [Case(blend, tau) for blend in dict.fromkeys(blends) for tau in taus]
-    # the last gamma of a training, the sharpest
-    gamma = shared.read_number("--gamma", options.gamma or "0.01", float, least=1e-5, most=1)
-    figure = check_files(options.json, options.plot)
+    points = options.points or [10_000, 63_000, 250_000, 1_000_000, 4_000_000]
+    sizes = options.size or [200, 400, 800]
+    blends, taus = options.blend or BLENDS, options.tau or [0, 1e-4, 1e-3, 1e-2]
+    cases = [Case(blend, tau) for blend in blends for tau in taus]
+    gamma = options.gamma or 0.01  # the last one of a training, the sharpest
+    figure = figure_of(options.plot)
     dev = _open_device(options)
     print(HEAD)
     rows = []
@@ -173,17 +198,14 @@ def _run_raster(options):
 
 
 def _run_train(options):
-    from pp_cl.bench.plots import check_files
     from pp_cl.bench.train import WIDTHS, bench_train
     from pp_cl.config import configure
 
     config = configure(preset("paper"), options.scene or "demo", shared.read_set(options.set))
     if options.points:
-        points = shared.read_number("--points", options.points, int, least=8, most=2**27)
-        assign(config, "points.count", points, "--points")
+        assign(config, "points.count", _one(options, "points"), "--points")
     for note in config.notes:
         print(f"pp-cl: {note}", file=sys.stderr)
-    check_files(options.json, None)
     dev = _open_device(options)
     row = bench_train(dev, config, VIEWS, ROUNDS)
     print(
@@ -212,12 +234,12 @@ def _print_report(dev, config, counts, stages_ms):
 
 def _run_model(options):
     from pp_cl.bench.model import HEAD, bench_models, line, plot
-    from pp_cl.bench.plots import check_files, save_figure
+    from pp_cl.bench.plots import figure_of, save_figure
     from pp_cl.trained import load_run
 
     if not options.runs:
         raise UserError("--runs: missing; name the folder of a trained run")
-    figure = check_files(options.json, options.plot)
+    figure = figure_of(options.plot)
     dev = _open_device(options)
     runs = [load_run(dev, folder) for folder in options.runs.split(",")]
     print(HEAD)
@@ -233,15 +255,15 @@ def _run_model(options):
 
 def _run_network(options):
     from pp_cl.bench.conv import bench_conv
-    from pp_cl.bench.plots import check_files, plot_time_and_error, save_figure
+    from pp_cl.bench.plots import figure_of, plot_time_and_error, save_figure
     from pp_cl.bench.table import HEAD, line
     from pp_cl.bench.unet import bench_unet
     from pp_cl.layers.choice import load_policy
 
-    size, widths = shared.read_shape(options.size or "256", options.widths or "128,256,512")
-    blocks = shared.read_blocks(options.blocks or "double")
-    tolerance = shared.read_tolerance(options.tolerance)
-    figure = check_files(options.json, options.plot)
+    size = _one(options, "size") if options.size else 256
+    widths, blocks = options.widths or (128, 256, 512), options.blocks or "double"
+    tolerance = options.tolerance
+    figure = figure_of(options.plot)
     dev = _open_device(options)
     policy = load_policy(dev, preset("tiny").network.tolerance if tolerance is None else tolerance)
     print(f"{policy.origin}\n{HEAD}")
@@ -259,6 +281,15 @@ def _run_network(options):
         save_figure(figure, options.plot)
 
 
+def _one(options, name):
+    """The number of an option that only bench raster takes several of."""
+    numbers = getattr(options, name)
+    if len(numbers) > 1:
+        text = ",".join(map(str, numbers))
+        raise UserError(f"--{name} {text}: write one number for bench {options.what}")
+    return numbers[0]
+
+
 def _open_device(options):
     """The device asked for, named on the first line."""
     from pp_cl.device.discover import open_device
@@ -269,10 +300,6 @@ def _open_device(options):
 
 
 def _write_json(file, dev, rows, **more):
-    """Write the rows, if a file was asked for."""
-    from pp_cl.files.atomic import write_json
-
-    if file:
-        write_json(
-            file, {"device": dev.name, "platform": dev.info["platform"], "rows": rows} | more
-        )
+    """Write the rows, if that was asked for."""
+    result = {"device": dev.name, "platform": dev.info["platform"], "rows": rows} | more
+    shared.write_json_option(file, result)

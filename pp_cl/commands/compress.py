@@ -14,47 +14,55 @@ val, without one on every eighth training view; never on the test views."""
 COLUMNS = "{:20s} {:>8s} {:>8s} {:>10s} {:>10s} {:>7s}  {}".format
 
 
+def _decibels(text):
+    """The type of --max-loss."""
+    return shared.number(0, 20)(text.removesuffix("dB"))
+
+
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the command's options."""
     parser.add_argument("run_folder", metavar="RUN", help="folder of a finished run")
     parser.add_argument(
         "--max-loss",
+        type=_decibels,
         metavar="DB",
-        default="0.1",
+        default=0.1,
         help="the most that PSNR may lose, in dB, as 0.1 or 0.1dB (0.1)",
     )
     parser.add_argument(
         "--out", metavar="DIR", help="new folder of the compressed run (RUN-compressed)"
     )
-    parser.add_argument(
-        "--scene", metavar="SCENE", help="where the run's scene is now, if it has moved"
-    )
+    shared.add_run_scene(parser)
+    parser.add_argument("-v", "--verbose", action="store_true", help="print what is tried, too")
     shared.add_device(parser)
 
 
 def run(options: argparse.Namespace) -> None:
-    """Search, print what was tried, write the compressed run."""
-    from pp_cl.compress.output import REPORT, check_out, validation_views, write_compressed
+    """Search, write the compressed run, print what it saves and loses."""
+    from pp_cl.compress.output import (
+        REPORT,
+        check_finished,
+        validation_views,
+        write_compressed,
+    )
     from pp_cl.compress.reduction import Original, nbytes
     from pp_cl.compress.search import Search, frame_ms
     from pp_cl.device.discover import open_device
+    from pp_cl.files.atomic import check_new_folder
     from pp_cl.trained import load_run
 
-    most_loss = _decibels(options.max_loss)
+    out = Path(options.out or f"{Path(options.run_folder).resolve()}-compressed")
+    check_new_folder(out)
     whole = load_run(open_device(options.device), options.run_folder, scene=options.scene)
-    out = Path(options.out or f"{whole.folder.path.resolve()}-compressed")
-    check_out(whole, out)
+    check_finished(whole)
     which, views = validation_views(whole)
     original = Original.of(whole)
-    search = Search(original, views, most_loss)
-    print(f"{which}: {search.psnr:.2f} dB, may lose {most_loss:g}")
-    print(COLUMNS("tried", "PSNR", "loss", "points", "MiB", "speed", ""))
-    for trial in search.trials():
-        print(_line(trial), flush=True)
+    search = Search(original, views, options.max_loss)
+    trials = _trials(search, which, options.verbose)
     ms, sizes = frame_ms([whole, search.run], views), [nbytes(whole), nbytes(search.run)]
     report = {
         "of": str(whole.folder),
-        "most_loss": most_loss,
+        "most_loss": options.max_loss,
         "views": which,
         "psnr": search.psnr,
         "loss": search.loss,
@@ -63,6 +71,7 @@ def run(options: argparse.Namespace) -> None:
         "points": [whole.model.cloud.count, search.run.model.cloud.count],
         "frame_ms": ms,
         "device": whole.dev.name,
+        "trials": [vars(trial) | {"reduction": vars(trial.reduction)} for trial in trials],
     }
     write_compressed(original, search.reduction, out, report)
     print(
@@ -73,8 +82,22 @@ def run(options: argparse.Namespace) -> None:
     print(f"wrote {out} and {out / REPORT}; pp-cl eval {out} measures its test views")
 
 
-def _decibels(text):
-    return shared.read_number("--max-loss", text.removesuffix("dB"), float, least=0, most=20)
+def _trials(search, which, verbose):
+    """All that is tried, told while it is: as a table, or as a count on a terminal."""
+    from tqdm import tqdm
+
+    if verbose:
+        print(f"{which}: {search.psnr:.2f} dB, may lose {search.most_loss:g}")
+        print(COLUMNS("tried", "PSNR", "loss", "points", "MiB", "speed", ""), flush=True)
+    trials = []
+    disable = True if verbose else None  # None: where there is no terminal
+    with tqdm(desc="searching", unit="trial", leave=False, disable=disable) as bar:
+        for trial in search.trials():
+            trials.append(trial)
+            bar.update()
+            if verbose:
+                print(_line(trial), flush=True)
+    return trials
 
 
 def _line(trial):

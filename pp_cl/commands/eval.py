@@ -14,18 +14,28 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("run_folder", metavar="RUN", help="folder of the run")
     shared.add_metrics(parser)
     parser.add_argument("--split", default="test", help="train, val or test (default)")
+    shared.add_run_scene(parser)
     parser.add_argument(
-        "--scene", metavar="SCENE", help="where the run's scene is now, if it has moved"
-    )
-    parser.add_argument(
-        "--out", metavar="FOLDER", help="write there, not into RUN/eval, which then stays as it is"
+        "--out",
+        type=shared.output_folder,
+        metavar="FOLDER",
+        help="write there, not into RUN/eval, which then stays as it is",
     )
     parser.add_argument(
         "--save-images", action="store_true", help="write every view to RUN/eval/images/"
     )
     parser.add_argument(
-        "--chart", metavar="FILE", help="draw the run among the published results (PNG, SVG, PDF)"
+        "--published",
+        action="store_true",
+        help="put published results beside also where those are of other sizes or views",
     )
+    parser.add_argument(
+        "--chart",
+        type=shared.figure_file,
+        metavar="FILE",
+        help="draw the run among the published results (PNG, SVG, PDF)",
+    )
+    shared.add_json(parser)
     shared.add_open(parser)
     shared.add_tolerance(parser)
     shared.add_device(parser)
@@ -33,28 +43,38 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> None:
     """Evaluate, print the table."""
-    from pp_cl.bench.plots import check_files, plot_ranks, save_figure
+    from pp_cl.bench.plots import figure_of, plot_ranks, save_figure
+    from pp_cl.commands.progress import counted
     from pp_cl.device.discover import open_device
     from pp_cl.evaluate import check_target, evaluate
     from pp_cl.trained import load_run
 
-    metrics, tolerance = (
-        shared.read_metrics(options.metrics),
-        shared.read_tolerance(options.tolerance),
-    )
-    figure = check_files(None, options.chart, "--chart")
+    metrics, tolerance = options.metrics, options.tolerance
+    figure = figure_of(options.chart, "--chart")
     if options.out:
         check_target(Path(options.out), is_new=True)
     dev = open_device(options.device)
     run = load_run(dev, options.run_folder, tolerance=tolerance, scene=options.scene)
     print(run.policy.origin)
-    result = evaluate(run, options.split, metrics, save_images=options.save_images, out=options.out)
+    with counted("view") as on_view:
+        result = evaluate(
+            run,
+            options.split,
+            metrics,
+            save_images=options.save_images,
+            out=options.out,
+            published=options.published,
+            on_view=on_view,
+        )
     folder = run.folder
     if figure:
         figure.set_size_inches(4 * len(metrics), 6)
         plot_ranks(figure, list(metrics), _ranked(result, folder), _label(result, folder))
         save_figure(figure, options.chart)
+    shared.write_json_option(options.json, result)
     print(_table(result, folder))
+    if options.published and not result["published"]:
+        print("--published: no results are known of this scene")
     print(_summary(result))
     written = Path(options.out or folder.evaluation(options.split))
     print(

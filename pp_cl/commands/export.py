@@ -27,13 +27,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument(
         "--min-weight",
+        type=shared.number(0, 1e6),
         metavar="W",
         help="of ply and glb: leave out points whose blend weights sum to no more than W in every"
         " training view (0: those that none shows)",
     )
-    parser.add_argument(
-        "--scene", metavar="SCENE", help="where the run's scene is now, if it has moved"
-    )
+    shared.add_run_scene(parser)
     shared.add_device(parser)
 
 
@@ -44,7 +43,8 @@ def run(options: argparse.Namespace) -> None:
     from pp_cl.trained import load_run
 
     name, folder = options.format, Path(options.run_folder)
-    min_weight = _read_min_weight(options.min_weight, name)
+    if options.min_weight is not None and name not in OF_POINTS:
+        raise UserError(f"--min-weight: only {' and '.join(OF_POINTS)} leave out points")
     path = check_target(name, folder, Path(options.out) if options.out else None)
     run = load_run(open_device(options.device), folder, scene=options.scene)
     if not run.header["finished"]:
@@ -52,13 +52,4 @@ def run(options: argparse.Namespace) -> None:
             f"{folder}: unfinished, step {run.header['step']} of {run.config.train.iterations}; its"
             " last checkpoint is exported"
         )
-    print(f"wrote {path}: {export(run, name, path, min_weight)}")
-
-
-def _read_min_weight(text, name):
-    """The number of --min-weight, 0 where it was not given."""
-    if text is None:
-        return 0.0
-    if name not in OF_POINTS:
-        raise UserError(f"--min-weight {text}: only {' and '.join(OF_POINTS)} leave out points")
-    return shared.read_number("--min-weight", text, float, least=0, most=1e6)
+    print(f"wrote {path}: {export(run, name, path, options.min_weight or 0.0)}")

@@ -1,7 +1,6 @@
 """The command pp-cl info."""
 
 import argparse
-import json
 
 from pp_cl.commands import options as shared
 from pp_cl.errors import UserError
@@ -15,31 +14,43 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the command's options."""
     add = parser.add_argument
     add("subject", metavar="RUN|SCENE", help="folder of a run or of a scene, or the word demo")
-    add("--json", action="store_true", help="print JSON")
-    add("--picture", metavar="FILE", help="write photographs with the outline of the points (PNG)")
+    shared.add_json(parser)
+    add(
+        "--picture",
+        type=shared.output_file(".png"),
+        metavar="FILE",
+        help="write photographs with the outline of the points (PNG)",
+    )
     shared.add_open(parser)
-    add("--preset", choices=PRESETS, default="tiny", help="of a scene: whose hull (tiny)")
+    add("--preset", choices=PRESETS, help="of a scene: whose hull (tiny)")
     shared.add_masks(parser)
     shared.add_set(parser, "of a scene: another setting, such as scene.box")
-    add("--scene", metavar="SCENE", help="where the run's scene is now, if it has moved")
+    shared.add_run_scene(parser)
     shared.add_device(parser)
 
 
 def run(options: argparse.Namespace) -> None:
-    """Print the facts, write the picture. Raises UserError for --open without a picture."""
+    """Print the facts, write the picture. Raises UserError for options that do not fit."""
+    from pp_cl.config import nearby_run
     from pp_cl.files.image import write_png
     from pp_cl.files.run_folder import RunFolder
+    from pp_cl.scene.open import DEMO
 
     if options.open and not options.picture:
         raise UserError("--open: there is no picture; name its file with --picture FILE")
     folder = RunFolder(options.subject)
-    tell = _run_told if folder.config.exists() else _scene_told
-    facts, lines, image = tell(folder, options)
+    is_scene = options.subject == DEMO or folder.path.exists() or not nearby_run(folder.path)
+    is_run = folder.config.exists() or not is_scene
+    for name in ("masks", "mask_from", "set", "preset") if is_run else ("scene",):
+        if getattr(options, name):
+            what = "scene" if is_run else "run"
+            raise UserError(f"--{name.replace('_', '-')}: only of a {what}; leave it out")
+    facts, lines, image = (_run_told if is_run else _scene_told)(folder, options)
     if image is not None:
         write_png(options.picture, image)
         facts["picture"] = options.picture
         lines.append(f"wrote {options.picture}")
-    print(json.dumps(facts, indent=1) if options.json else "\n".join(lines))
+    shared.tell(options.json, facts, lines)
     if options.open:
         shared.show(options.picture)
 
@@ -62,7 +73,7 @@ def _scene_told(_folder, options):
 
     dev = open_device(options.device)
     given = shared.read_short(options, ("masks", "mask_from")) + shared.read_set(options.set)
-    facts, *shown = describe_scene(dev, options.subject, options.preset, given)
+    facts, *shown = describe_scene(dev, options.subject, options.preset or "tiny", given)
     image = picture(dev, *shown) if options.picture else None
     return facts, _scene_lines(facts), image
 

@@ -1,18 +1,185 @@
-"""Options that commands share, and the reading of their texts."""
+"""Options that commands share, and the types by which argparse reads texts: a function of the text
+that raises argparse.ArgumentTypeError.
+"""
 
 import argparse
-import math
+import json
+import os
 import sys
 import webbrowser
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
+from typing import Any, TextIO
 
-from pp_cl.config import assign, preset, validate
-from pp_cl.errors import UserError
+from pp_cl import config
+from pp_cl.errors import UserError, quoted, suggestion
+from pp_cl.files.atomic import check_writable, write_json
 from pp_cl.presets import SHORT
 
-MOST_DIGITS = 12
 METRICS = ("psnr", "ssim", "lpips")
+MOST_SIDE = 8192  # pixels of an image that is rendered
+MOST_NAME = 230  # bytes of a file's name: systems take 255, and a temporary one is longer
+
+# ---- types
+
+
+def integer(least: int, most: int, multiple: int = 1) -> Callable[[str], int]:
+    """The type of a whole number in [least, most], a multiple of another."""
+    which = f"a multiple of {multiple}" if multiple > 1 else "a whole number"
+    accepted = range(-(-least // multiple) * multiple, most + 1, multiple)
+    return _read(config.whole, lambda n: n in accepted, f"{which} from {least} to {most}")
+
+
+def number(least: float, most: float) -> Callable[[str], float]:
+    """The type of a finite number in [least, most]."""
+    what = f"one number from {least:g} to {most:g}"
+    return _read(config.finite, lambda x: least <= x <= most, what)
+
+
+def _read(convert, accepts, what):
+    """The type of what is written as `what`."""
+
+    def read(text):
+        try:
+            value = convert(text)
+            if accepts(value):
+                return value
+        except (ValueError, OverflowError):
+            pass
+        raise argparse.ArgumentTypeError(f"{quoted(text)}: write {what}")
+
+    return read
+
+
+def several(one: Callable[[str], Any]) -> Callable[[str], list]:
+    """The type of values of another type, separated by commas: ascending, each once."""
+    return lambda text: sorted({one(word) for word in text.split(",")})
+
+
+def words(known: Sequence[str]) -> Callable[[str], tuple[str, ...]]:
+    """The type of known words, separated by commas: in their order, each once."""
+
+    def read(text):
+        given = tuple(dict.fromkeys(word.strip() for word in text.split(",")))
+        for word in given:
+            if word not in known:
+                near = suggestion(word, known)
+                raise argparse.ArgumentTypeError(
+                    f"{quoted(word)}: {near}choose from {', '.join(known)}"
+                )
+        return given
+
+    return read
+
+
+# side of an image that the network takes
+side = integer(4, 4096, 4)
+
+
+def widths(text: str) -> tuple[int, ...]:
+    """The type of the channels of the network's three levels."""
+    found = tuple(map(integer(1, 4096), text.split(",")))
+    if len(found) != 3:
+        raise argparse.ArgumentTypeError(
+            f"{quoted(text)}: write three numbers of channels, as 128,256,512"
+        )
+    return found
+
+
+def size(text: str) -> tuple[int, int]:
+    """The type of (width, height) of an image."""
+    try:
+        width, height = map(integer(16, MOST_SIDE), text.lower().split("x"))
+    except (ValueError, argparse.ArgumentTypeError):
+        raise argparse.ArgumentTypeError(
+            f"{quoted(text)}: write WIDTHxHEIGHT, each from 16 to {MOST_SIDE}"
+        ) from None
+    return width, height
+
+
+def output_file(*suffixes: str) -> Callable[[str], str]:
+    """The type of a file to be written, with one of these suffixes where there are some."""
+
+    def read(text):
+        path = Path(text)
+        folder = path.absolute().parent
+        if len(os.fsencode(path.name)) > MOST_NAME:
+            problem = "its name is too long; choose a shorter one"
+        elif path.exists() and not path.is_file():
+            problem = "is no file; name one" if not path.is_dir() else "is a folder; name a file"
+        elif suffixes and path.suffix.lower() not in suffixes:
+            problem = f"name a file that ends in {' or '.join(suffixes)}"
+        elif not folder.is_dir():
+            problem = f"there is no folder {folder}; make it first"
+        elif not os.access(folder, os.W_OK | os.X_OK):
+            problem = f"{folder} may not be written; choose another folder"
+        else:
+            return text
+        raise argparse.ArgumentTypeError(f"{quoted(text)}: {problem}")
+
+    return read
+
+
+# a picture that matplotlib draws
+figure_file = output_file(".png", ".svg", ".pdf")
+
+
+def output_folder(text: str) -> str:
+    """The type of a folder to be written into, which need not exist."""
+    there = Path(text).absolute()
+    while not there.exists():
+        there = there.parent
+    if not there.is_dir():
+        which = "" if there == Path(text).absolute() else f" {there}"
+        raise argparse.ArgumentTypeError(f"{text}:{which} is not a folder; choose another")
+    try:
+        check_writable(text, "choose another")
+    except UserError as error:
+        raise argparse.ArgumentTypeError(str(error)) from None
+    return text
+
+
+# ---- options
+
+
+def add_json(parser: argparse.ArgumentParser) -> None:
+    """Add --json, for write_json_option and tell: the name of a file, or sys.stdout, which then
+    has nothing but the JSON: cli.main() sends what is printed meanwhile to stderr.
+    """
+    parser.add_argument(
+        "--json",
+        nargs="?",
+        const="-",
+        type=_json_target,
+        metavar="FILE",
+        help="write the result to FILE as JSON; without FILE (or -) print it in place of the text",
+    )
+
+
+def _json_target(text):
+    return sys.stdout if text == "-" else output_file()(text)
+
+
+def write_json_option(target: str | TextIO | None, value: Any) -> None:
+    """Write the result to where --json says, if it was given."""
+    if isinstance(target, str):
+        write_json(target, value)
+    elif target is not None:
+        print(json.dumps(value, indent=1, allow_nan=False), file=target, flush=True)
+
+
+def tell(target: str | TextIO | None, value: Any, lines: Iterable[str]) -> None:
+    """Write the result as write_json_option does, and print its lines, unless JSON is printed."""
+    write_json_option(target, value)
+    if target is None or isinstance(target, str):
+        print("\n".join(lines))
+
+
+def add_run_scene(parser: argparse.ArgumentParser) -> None:
+    """Add --scene of a command that works on a run."""
+    parser.add_argument(
+        "--scene", metavar="SCENE", help="where the run's scene is now, if it has moved"
+    )
 
 
 def add_device(parser: argparse.ArgumentParser) -> None:
@@ -23,19 +190,28 @@ def add_device(parser: argparse.ArgumentParser) -> None:
 
 
 def add_tolerance(parser: argparse.ArgumentParser) -> None:
-    """Add --tolerance, for read_tolerance."""
+    """Add --tolerance."""
     parser.add_argument(
-        "--tolerance", metavar="E", help="relative L2 error allowed for a convolution (1e-5)"
+        "--tolerance",
+        type=number(0, 1),
+        metavar="E",
+        help="relative L2 error allowed for a convolution (1e-5)",
     )
 
 
+def add_widths(parser: argparse.ArgumentParser, text: str) -> None:
+    """Add --widths. text: its help."""
+    parser.add_argument("--widths", type=widths, metavar="A,B,C", help=text)
+
+
 def add_metrics(parser: argparse.ArgumentParser) -> None:
-    """Add --metrics, for read_metrics."""
+    """Add --metrics."""
     parser.add_argument(
         "--metrics",
         nargs="?",
         const=",".join(METRICS),
         default="psnr,ssim",
+        type=words(METRICS),
         metavar="A,B",
         help="of psnr, ssim, lpips; bare = all three (default psnr,ssim)",
     )
@@ -63,32 +239,6 @@ def read_short(options: argparse.Namespace, names: Iterable[str]) -> list[tuple[
     ]
 
 
-def read_tolerance(text: str | None) -> float | None:
-    """The number of --tolerance; None where it was not given. Raises UserError naming it."""
-    if text is None:
-        return None
-    config = preset("tiny")
-    assign(config, "network.tolerance", text, "--tolerance")
-    validate(config, "--tolerance")
-    return config.network.tolerance
-
-
-def read_blocks(text: str) -> str:
-    """The word of --blocks. Raises UserError naming it."""
-    config = preset("tiny")
-    assign(config, "network.blocks", text, "--blocks")
-    validate(config, "--blocks")
-    return config.network.blocks
-
-
-def read_metrics(text: str) -> tuple[str, ...]:
-    """The names of --metrics. Raises UserError for unknown ones."""
-    names = tuple(n.strip() for n in text.split(",") if n.strip())
-    if not names or set(names) - set(METRICS):
-        raise UserError(f"--metrics {text}: choose from {', '.join(METRICS)}")
-    return names
-
-
 def add_open(parser: argparse.ArgumentParser) -> None:
     """Add --open, for show."""
     parser.add_argument(
@@ -100,24 +250,6 @@ def show(path: Path | str) -> None:
     """Open a picture with the system's viewer, or say that there is none."""
     if not webbrowser.open(Path(path).resolve().as_uri()):
         print(f"--open: this system names no viewer; open {path} yourself", file=sys.stderr)
-
-
-def whole(text: str) -> int:
-    """The whole number from 0 on in a text of at most MOST_DIGITS digits; -1 for anything else."""
-    return int(text) if text.isdecimal() and len(text) <= MOST_DIGITS else -1
-
-
-def read_shape(size: str, widths: str) -> tuple[int, tuple[int, ...]]:
-    """(side, channels of the three levels) of the texts of --size and --widths. Raises UserError
-    for what the network cannot have.
-    """
-    side = whole(size)
-    if side < 4 or side % 4:
-        raise UserError(f"--size {size}: the network takes multiples of 4")
-    numbers = [whole(n) for n in widths.split(",")]
-    if len(numbers) != 3 or min(numbers) < 1:
-        raise UserError(f"--widths {widths}: write three numbers of channels, as 128,256,512")
-    return side, tuple(numbers)
 
 
 def add_set(parser: argparse.ArgumentParser, text: str) -> None:
@@ -136,28 +268,3 @@ def read_set(texts: list[str]) -> list[tuple[str, str, str]]:
             raise UserError(f"--set {text}: write --set section.key=value")
         given.append((key.strip(), value.strip(), "--set"))
     return given
-
-
-def read_number(
-    option: str, text: str, kind: Callable[[float], float], *, least: float, most: float
-) -> float:
-    """The one number of an option. Raises UserError naming it."""
-    numbers = read_numbers(option, text, kind, least=least, most=most)
-    if len(numbers) > 1:
-        raise UserError(f"{option} {text}: write one number")
-    return numbers[0]
-
-
-def read_numbers(
-    option: str, text: str, kind: Callable[[float], float], *, least: float, most: float
-) -> list:
-    """Numbers of a comma-separated option, ascending, each once. Raises UserError naming it."""
-    try:
-        numbers = sorted({kind(float(word)) for word in text.split(",")})
-    except (ValueError, OverflowError):
-        numbers = []
-    if not numbers or not all(math.isfinite(x) and least <= x <= most for x in numbers):
-        raise UserError(
-            f"{option} {text}: write numbers from {least:g} to {most:g}, separated by commas"
-        )
-    return numbers

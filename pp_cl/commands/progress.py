@@ -1,9 +1,10 @@
-"""How a training shows that it goes on: one line on a terminal, elsewhere now and then a line."""
+"""How a command shows that it goes on: one line on a terminal, elsewhere now and then a line."""
 
 import os
 import sys
 import time
-from contextlib import suppress
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
 from typing import Any, TextIO
 
 from tqdm import tqdm
@@ -106,6 +107,32 @@ class Lines:
             file=self._stream,
             flush=True,
         )
+
+
+@contextmanager
+def counted(noun: str, stream: TextIO | None = None) -> Iterator[Callable[[int, int], None]]:
+    """What to call with the number of things done, and of all, whenever one more is done. stream:
+    sys.stderr if not given.
+    """
+    stream = stream or sys.stderr
+    start = told = time.monotonic()
+    with tqdm(
+        unit=noun, leave=False, mininterval=REDRAWN, file=stream, disable=not stream.isatty()
+    ) as bar:
+
+        def tell(done: int, total: int) -> None:
+            nonlocal told
+            if done == 1:
+                bar.reset(total)
+            bar.update()
+            now = time.monotonic()
+            if not bar.disable or now - told < LINES_APART:
+                return
+            told, left = now, round((now - start) / done * (total - done))
+            with suppress(OSError):  # as of Lines
+                print(f"{done} of {total} {noun}s, {clock(left)} left", file=stream, flush=True)
+
+        yield tell
 
 
 def clock(seconds: int) -> str:

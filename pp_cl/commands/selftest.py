@@ -14,14 +14,13 @@ fail, 2 there is no such device."""
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the command's options."""
-    parser.add_argument("--json", metavar="FILE", help="also write the results there")
+    shared.add_json(parser)
     shared.add_device(parser)
 
 
 def run(options: argparse.Namespace) -> None:
     """Run the cases, print the table. Raises Stopped, which names them, where cases fail."""
     from pp_cl.device.discover import open_device
-    from pp_cl.files.atomic import write_json
     from pp_cl.selftest.report import HEAD, as_json, line, setup
     from pp_cl.selftest.run import CASES, run_cases
 
@@ -33,8 +32,7 @@ def run(options: argparse.Namespace) -> None:
     for row in run_cases(dev, CASES):
         rows.append(row)
         print(line(row), flush=True)
-    if options.json:
-        write_json(options.json, as_json(dev, rows))
+    shared.write_json_option(options.json, as_json(dev, rows))
     seconds, failed = sum(row.seconds for row in rows), [row.case for row in rows if not row.passed]
     print(f"\n{len(rows)} cases in {seconds:.0f} s, {len(rows) - len(failed)} pass", flush=True)
     if failed:

@@ -1,7 +1,6 @@
 """The command pp-cl shape."""
 
 import argparse
-import math
 
 from pp_cl.commands import options as shared
 from pp_cl.errors import UserError
@@ -22,23 +21,37 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="FILE",
         help="of a run: the object's mesh in the scene's world; the demo has its own",
     )
-    add("--edge", metavar="E", help="of a mesh: the grid's edge in its units (default: 2^27 cells)")
-    add("--samples", metavar="N", default=str(SAMPLES), help="on the mesh (1024^3)")
-    add("--scene", metavar="SCENE", help="where the run's scene is now, if it has moved")
-    add("--json", metavar="FILE", help="also write the numbers there")
+    add(
+        "--edge",
+        type=shared.number(1e-30, 1e30),
+        metavar="E",
+        help="of a mesh: the grid's edge in its units (default: 2^27 cells)",
+    )
+    add(
+        "--samples",
+        type=shared.integer(1, SAMPLES),
+        metavar="N",
+        default=SAMPLES,
+        help="on the mesh (1024^3)",
+    )
+    shared.add_run_scene(parser)
+    shared.add_json(parser)
     shared.add_device(parser)
 
 
 def run(options: argparse.Namespace) -> None:
     """Measure, print the row. Raises UserError for options that do not fit the subject."""
+    from pp_cl.config import nearby_run
     from pp_cl.device.discover import open_device
-    from pp_cl.files.atomic import write_json
     from pp_cl.files.run_folder import RunFolder
     from pp_cl.metrics.shape import read_mesh
     from pp_cl.shape import mesh_shape, run_shape
 
-    samples, folder = _samples(options.samples), RunFolder(options.subject)
+    folder = RunFolder(options.subject)
     is_run = folder.path.is_dir()
+    if not folder.path.exists():
+        near = nearby_run(folder.path)
+        raise UserError(f"{folder}: no such file or folder; {near or 'name a run or a mesh'}")
     for given, name, of_run in (
         (options.mesh, "mesh", True),
         (options.scene, "scene", True),
@@ -46,33 +59,14 @@ def run(options: argparse.Namespace) -> None:
     ):
         if given is not None and of_run != is_run:
             raise UserError(f"--{name}: only of a {'run' if of_run else 'mesh'}; leave it out")
-    edge = None if options.edge is None else _edge(options.edge)
     mesh = options.mesh if is_run else options.subject
     mesh = None if mesh is None else read_mesh(mesh)
     dev = open_device(options.device)
     if is_run:
-        facts = run_shape(dev, folder, mesh, samples, scene=options.scene)
+        facts = run_shape(dev, folder, mesh, options.samples, scene=options.scene)
     else:
-        facts = mesh_shape(dev, mesh, edge, samples)
-    if options.json:
-        write_json(options.json, facts)
-    print("\n".join(_lines(facts)))
-
-
-def _samples(text):
-    if not 1 <= shared.whole(text) <= SAMPLES:
-        raise UserError(f"--samples {text}: must be a whole number from 1 to {SAMPLES}")
-    return shared.whole(text)
-
-
-def _edge(text):
-    try:
-        edge = float(text)
-    except ValueError:
-        edge = math.nan
-    if not 0 < edge < math.inf:
-        raise UserError(f"--edge {text}: must be a number above 0")
-    return edge
+        facts = mesh_shape(dev, mesh, options.edge, options.samples)
+    shared.tell(options.json, facts, _lines(facts))
 
 
 def _lines(facts):

@@ -35,7 +35,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the command's options."""
     add = parser.add_argument
     add("scenes", nargs="+", metavar="SCENE", help="folder of a scene, or the word demo")
-    add("--out", required=True, metavar="DIR", help="folder of the runs and the table")
+    add(
+        "--out",
+        required=True,
+        type=shared.output_folder,
+        metavar="DIR",
+        help="folder of the runs and the table",
+    )
     add("--seeds", default="0", metavar="A,B", help="a run for each (0)")
     add("--preset", choices=PRESETS, help="as of `pp-cl train` (tiny)")
     add("--iterations", metavar="N", help="steps of each training")
@@ -48,11 +54,16 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="a run for each value; / separates values that are lists; several --vary: every"
         " combination",
     )
-    add("--workers", metavar="N", help="runs at the same time (one for each device that works)")
+    add(
+        "--workers",
+        type=shared.integer(1, MOST_WORKERS),
+        metavar="N",
+        help="runs at the same time (one for each device that works)",
+    )
     add("--scheduler", metavar="ADDRESS", help="of a Dask cluster, instead of own workers")
     shared.add_metrics(parser)
     add("--dry-run", action="store_true", help="list the runs, start nothing")
-    add("--json", metavar="FILE", help="write what DIR/sweep.json holds there, too")
+    shared.add_json(parser)
 
 
 def run(options: argparse.Namespace) -> None:
@@ -70,7 +81,7 @@ def run(options: argparse.Namespace) -> None:
     if missing:
         rows |= _run(options, missing, len(rows))
     ordered = [_relative(rows[job.folder], out) for job in jobs]
-    write_tables(out, ordered, options.json)
+    shared.write_json_option(options.json, write_tables(out, ordered))
     print(text_table(ordered))
     print(f"wrote {out / 'sweep.json'} and {out / 'sweep.md'}")
     failed = sum("error" in row for row in ordered)
@@ -85,9 +96,8 @@ def _jobs(options):
 
     if options.scheduler and options.workers:
         raise UserError("--workers: the cluster of --scheduler has its own; leave one of both out")
-    _workers(options, 0)
-    if options.json and not Path(options.json).resolve().parent.is_dir():
-        raise UserError(f"--json {options.json}: no such folder; make it first")
+    if options.dry_run and options.json:
+        raise UserError("--json: a dry run measures nothing; leave one of both out")
     if RunFolder(options.out).config.exists():
         raise UserError(f"--out {options.out}: is the folder of a run; choose another")
     given = shared.read_set(options.set)
@@ -100,18 +110,11 @@ def _jobs(options):
         read_varied(options.vary),
         given=given,
         preset_name=options.preset,
-        metrics=shared.read_metrics(options.metrics),
+        metrics=options.metrics,
     )
     for note in notes:
         print(f"pp-cl: {note}", file=sys.stderr)
     return jobs
-
-
-def _workers(options, devices):
-    """The number of --workers, else of the devices."""
-    if options.workers is None:
-        return devices
-    return shared.read_number("--workers", options.workers, int, least=1, most=MOST_WORKERS)
 
 
 def _finished(job):
@@ -159,7 +162,7 @@ def _run(options, jobs, done):
             client = stack.enter_context(client_of(options.scheduler))
         else:
             devices = separate_devices()
-            workers = min(_workers(options, len(devices)), len(jobs))
+            workers = min(options.workers or len(devices), len(jobs))
             client = stack.enter_context(local_client(devices, workers))
         table = LiveTable(sys.stderr, jobs, done)
 

@@ -11,14 +11,14 @@ from pp_cl.config import help_lines
 from pp_cl.presets import PRESETS, SHORT
 
 HELP = "learn a scene; the same command resumes an unfinished run"
-EPILOG = "settings (--set), with the tiny preset's values:\n" + "\n".join(help_lines())
+EPILOG = "\n".join(("settings (--set), with tiny's values and those that differ:", *help_lines()))
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the command's options."""
     add = parser.add_argument
     add("scene", metavar="SCENE", help="folder of a scene, or the word demo")
-    add("--out", required=True, metavar="RUN", help="folder of the run")
+    add("--out", required=True, type=shared.output_folder, metavar="RUN", help="folder of the run")
     add(
         "--preset",
         choices=PRESETS,
@@ -55,11 +55,14 @@ def run(options: argparse.Namespace) -> None:
     """Train, or say that there is nothing left to train."""
     from pp_cl.device.discover import open_device
     from pp_cl.files.run_folder import RunFolder
+    from pp_cl.files.scalars import writer_class
     from pp_cl.run import open_training
     from pp_cl.run_config import run_config, stored_state
     from pp_cl.training.memory import plan_lines
     from pp_cl.view.serve import serve_in_background
 
+    if options.tensorboard:
+        writer_class()  # refuses before the work where it is missing
     folder = RunFolder(options.out)
     given, is_new = _given_settings(options), not folder.config.exists()
     config = run_config(folder, options.scene, options.preset, given)

@@ -14,11 +14,10 @@ HELP = "time the variants of the convolutions on this device, keep the fastest"
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the command's options."""
     parser.add_argument("--preset", choices=PRESETS, help="whose network and sizes (tiny)")
-    parser.add_argument(
-        "--widths", metavar="A,B,C", help="channels of the levels, if not the preset's"
-    )
+    shared.add_widths(parser, "channels of the levels, if not the preset's")
     parser.add_argument(
         "--size",
+        type=shared.side,
         metavar="S",
         help="side of the image in pixels, a multiple of 4, if not the preset's",
     )
@@ -34,13 +33,11 @@ def run(options: argparse.Namespace) -> None:
     from pp_cl.layers.choice import CHOICES, make_policy, shipped_order
 
     config = preset(options.preset or "tiny")
-    tolerance = shared.read_tolerance(options.tolerance)
+    tolerance = options.tolerance
     if tolerance is None:
         tolerance = config.network.tolerance
     evaluated = tune.EVALUATED[config.preset]
-    size, widths = shared.read_shape(
-        options.size or str(evaluated), options.widths or ",".join(map(str, config.network.widths))
-    )
+    size, widths = options.size or evaluated, options.widths or config.network.widths
     training = size if options.size else config.train.crop or evaluated
     dev = open_device(options.device)
     tune.check_cache()

@@ -1,23 +1,34 @@
 """The command pp-cl view."""
 
 import argparse
+import html
 import os
 import sys
+import tempfile
 import threading
 import webbrowser
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
 
 from pp_cl.commands import options as shared
 
 HELP = "look at a run in the browser, also while it is trained"
 LOOPBACK = "127.0.0.1"
-PORT = "8733"
+PORT = 8733
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the command's options."""
     add = parser.add_argument
     add("run_folder", metavar="RUN", help="folder of the run, finished or not")
-    add("--port", default=PORT, metavar="P", help=f"port to listen on (default {PORT}; 0: any)")
+    add(
+        "--port",
+        type=shared.integer(0, 65535),
+        default=PORT,
+        metavar="P",
+        help=f"port to listen on (default {PORT}; 0: any)",
+    )
     add(
         "--host",
         default=LOOPBACK,
@@ -26,7 +37,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     add("--open", action="store_true", help="open the page in the default browser")
     add("--wait", action="store_true", help="wait for RUN to begin; end with the calling process")
-    add("--scene", metavar="SCENE", help="where the run's scene is now, if it has moved")
+    shared.add_run_scene(parser)
     shared.add_device(parser)
 
 
@@ -34,7 +45,6 @@ def run(options: argparse.Namespace) -> None:
     """Serve until Ctrl-C."""
     from pp_cl.view.serve import serve
 
-    port = int(shared.read_number("--port", options.port, int, least=0, most=65535))
     if options.host != LOOPBACK:
         print(
             f"pp-cl: --host {options.host}: whoever can reach this address and learns the token can"
@@ -44,23 +54,42 @@ def run(options: argparse.Namespace) -> None:
 
     def announce(address):
         print(f"{options.run_folder}: {address}  (Ctrl-C ends)", flush=True)
-        if options.open:
-            _open(address)
+        if options.open and _has_windows():
+            file = stack.enter_context(_redirect(address))
+            # some browsers answer only when they are closed, and must not keep the server waiting
+            threading.Thread(target=webbrowser.open, args=(file.as_uri(),), daemon=True).start()
 
-    serve(
-        options.run_folder,
-        host=options.host,
-        port=port,
-        announce=announce,
-        device=options.device,
-        scene=options.scene,
-        wait=options.wait,
-    )
+    with ExitStack() as stack:
+        serve(
+            options.run_folder,
+            host=options.host,
+            port=options.port,
+            announce=announce,
+            device=options.device,
+            scene=options.scene,
+            wait=options.wait,
+        )
 
 
-def _open(address):
-    """Show the page in a browser, unless only one for terminals would answer."""
+def _has_windows():
+    """Whether a browser would answer that is not one for terminals."""
     windows = sys.platform in ("win32", "darwin")
-    if windows or any(os.environ.get(n) for n in ("BROWSER", "DISPLAY", "WAYLAND_DISPLAY")):
-        # some browsers answer only when they are closed, and must not keep the server waiting
-        threading.Thread(target=webbrowser.open, args=(address,), daemon=True).start()
+    return windows or any(os.environ.get(n) for n in ("BROWSER", "DISPLAY", "WAYLAND_DISPLAY"))
+
+
+@contextmanager
+def _redirect(address) -> Iterator[Path]:
+    """A page that leads to the address, for this user alone to read: everybody sees the arguments
+    of a browser, and the address holds the token. It is there until the block ends.
+    """
+    number, name = tempfile.mkstemp(".html", "pp-cl-view-")  # of mode 0600
+    address = html.escape(address)
+    with open(number, "w", encoding="utf-8") as file:
+        file.write(
+            f'<!DOCTYPE html><meta http-equiv="refresh" content="0;url={address}">'
+            f'<a href="{address}">{address}</a>\n'
+        )
+    try:
+        yield Path(name)
+    finally:
+        Path(name).unlink(missing_ok=True)

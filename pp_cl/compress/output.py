@@ -7,7 +7,7 @@ from typing import Any
 
 from pp_cl.compress.reduction import Original, Reduction
 from pp_cl.errors import UserError
-from pp_cl.files.atomic import atomic_folder, check_new_folder, write_json, write_text
+from pp_cl.files.atomic import atomic_folder, write_json, write_text
 from pp_cl.files.run_folder import RunFolder
 from pp_cl.scene.open import scene_splits
 from pp_cl.scene.views import View
@@ -22,6 +22,7 @@ def validation_views(run: Run) -> tuple[str, list[View]]:
     where the scene has none every eighth of the training views. Never those of a test. Raises
     UserError where the scene is missing or broken.
     """
+    run.check_scene()
     present = scene_splits(run.config.scene.path)
     split = "val" if "val" in present else "train"
     views = run.scene(split).splits[split]
@@ -32,11 +33,10 @@ def validation_views(run: Run) -> tuple[str, list[View]]:
     return f"{count} views of {split}", views
 
 
-def check_out(run: Run, out: Path) -> None:
-    """Raise UserError for a run that is not finished, and a folder that holds something."""
+def check_finished(run: Run) -> None:
+    """Raise UserError for a run that is not finished."""
     if not run.header["finished"]:
         raise UserError(f"{run.folder}: its training is not finished; finish it first")
-    check_new_folder(out)
 
 
 def write_compressed(

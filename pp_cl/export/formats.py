@@ -6,14 +6,14 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
+from pp_cl.errors import UserError
 from pp_cl.export.glb import write_point_glb
 from pp_cl.export.mesh import coloured_mesh, write_mesh
-from pp_cl.export.out import check_file, check_parent
 from pp_cl.export.page import page_text
 from pp_cl.export.ply import write_ply
 from pp_cl.export.points import coloured_points
 from pp_cl.export.renderings import renderings
-from pp_cl.files.atomic import check_new_folder, write_text
+from pp_cl.files.atomic import check_file, check_new_folder, write_text
 from pp_cl.scene.demo import write_scene
 from pp_cl.trained import Run
 
@@ -45,9 +45,11 @@ def check_target(name: str, folder: Path, out: Path | None) -> Path:
     """
     chosen = FORMATS[name]
     path = folder / "export" / chosen.name if out is None else out
-    check_file(path, chosen.suffixes) if chosen.suffixes else check_new_folder(path)
-    if out is not None:
-        check_parent(path)
+    if chosen.suffixes and path.suffix.lower() not in chosen.suffixes:
+        raise UserError(f"--out {path}: name a file that ends in {' or '.join(chosen.suffixes)}")
+    check_file(path) if chosen.suffixes else check_new_folder(path)
+    if out is not None and not path.parent.is_dir():
+        raise UserError(f"--out {path}: {path.parent} is no folder; make it first")
     return path
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import base64
 import html
 import json
+import os
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -53,7 +54,7 @@ def page_text(run: Run) -> str:
     folder = Path(__file__).parent
     page = (folder / "page.html").read_text("utf-8")
     parts = {
-        "title": html.escape(run.folder.path.resolve().name),
+        "title": html.escape(_shown_name(run.folder.path)),
         "header": json.dumps(_header(run, points)).replace("<", "\\u003c"),
         "points": base64.b64encode(points.rows.tobytes()).decode(),
         "script": (folder / "page.js").read_text("utf-8"),
@@ -61,6 +62,11 @@ def page_text(run: Run) -> str:
     for name, text in parts.items():
         page = page.replace(f"<!-- {name} -->", text)
     return page
+
+
+def _shown_name(folder):
+    """A folder's name as UTF-8 can hold it, which not all names of a file system are."""
+    return os.fsencode(folder.resolve().name).decode(errors="replace")
 
 
 def check_drawable(run: Run) -> None:

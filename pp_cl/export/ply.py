@@ -14,9 +14,8 @@ COMMENTS = (
     "red, green, blue: sRGB, as the run shows the point in the training view where it weighs most",
     "weight: blend weights of the point in that view, summed over its pixels",
     "opacity: of the point's centre, 0 to 1",
-    "f_dc_C: degree 0 of the spherical harmonics of feature C, C from 0 to 15; features are the",
-    "input of the run's network and no colours",
-    "f_D_K_C: coefficient K of degree D of feature C; basis and signs of PlenOctrees",
+    "feature_C_D_K: coefficient K of degree D of the spherical harmonics of feature C, C from 0 to",
+    "15; basis and signs of PlenOctrees; features are the input of the run's network, no colours",
 )
 COORDINATES, CHANNELS = ("x", "y", "z"), ("red", "green", "blue")
 
@@ -50,6 +49,6 @@ def _harmonics(points, cloud):
         values = np.float32(array.get()[points.rows])
         for k in range(block.count):
             order = block.first + k - block.degree**2  # within its degree
-            name = "f_dc" if block.degree == 0 else f"f_{block.degree}_{order}"
-            columns |= {f"{name}_{c}": values[:, k, c] for c in range(16)}
+            named = {f"feature_{c}_{block.degree}_{order}": values[:, k, c] for c in range(16)}
+            columns |= named
     return columns

@@ -33,7 +33,7 @@ def atomic_file(path: Path | str) -> Iterator[BinaryIO]:
     half-written stays behind.
     """
     path = Path(path)
-    temporary = path.parent / f".{path.name}.{os.getpid()}.tmp"  # `.` and `/` have no name
+    temporary = _temporary(path)
     try:
         with open(temporary, "wb") as file:
             yield file
@@ -47,10 +47,17 @@ def atomic_file(path: Path | str) -> Iterator[BinaryIO]:
         _remove(temporary)
 
 
+def _temporary(path):
+    """The name under which a file is written."""
+    return path.parent / f".{path.name}.{os.getpid()}.tmp"  # `.` and `/` have no name
+
+
 def mend(error: OSError) -> str:
     """What to do about a file that cannot be written."""
     if error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG):
         return "free some space"
+    if error.errno == errno.ENAMETOOLONG:
+        return "choose a shorter name"
     return "check the folder, its permissions and the disk"
 
 
@@ -103,9 +110,34 @@ def atomic_folder(folder: Path) -> Iterator[Path]:
 
 
 def check_new_folder(folder: Path) -> None:
-    """Raise UserError where atomic_folder would write over something."""
+    """Raise UserError where atomic_folder would write over something, or could not."""
     if folder.is_file() or (folder.is_dir() and any(folder.iterdir())):
         raise UserError(f"{folder}: exists already; choose a new or empty folder")
+    if folder.is_dir() and (os.path.ismount(folder) or folder.samefile(".")):
+        raise UserError(f"{folder}: cannot be replaced as a whole; name a new folder in it")
+    check_target(folder)
+
+
+def check_file(path: Path) -> None:
+    """Raise UserError where atomic_file or atomic_path could not write a file."""
+    if path.is_dir():
+        raise UserError(f"{path}: is a folder; name a file")
+    check_target(path)
+
+
+def check_target(path: Path) -> None:
+    """Raise UserError where nothing can be made under a path, or no folder above it: tried with a
+    temporary file in the first folder above that there is.
+    """
+    tried = Path(os.path.abspath(path))
+    try:
+        while not tried.parent.exists():
+            tried = tried.parent
+        _temporary(tried).touch()
+    except OSError as error:
+        raise UserError(f"{path}: cannot be written ({error.strerror}); {mend(error)}") from None
+    finally:
+        _remove(_temporary(tried))
 
 
 def check_writable(folder: Path | str, mend: str = "choose another --out") -> None:

@@ -11,11 +11,12 @@ from PIL import Image
 from pp_cl.errors import UserError
 from pp_cl.files.atomic import atomic_file
 from pp_cl.files.exr import exr_size, read_exr_rgba
-from pp_cl.files.regular import opened_regular, refusal
+from pp_cl.files.regular import MOST_PIXELS, opened_regular, refusal
 
 # Pillow warns of pixels by the hundred million, and of broken animations, in words of its own
 warnings.filterwarnings("ignore", module=r"PIL\.")
 FORMATS = ("PNG", "JPEG", "WEBP")
+ENDINGS = (".png", ".jpg", ".jpeg", ".webp", ".exr")  # of the files that read_rgba reads
 # Pillow's names of what converts to RGBA without loss
 EIGHT_BIT_MODES = ("RGBA", "RGB", "LA", "L", "PA", "P", "1")
 # bits per channel stand in the header chunk, the first of all
@@ -26,8 +27,8 @@ def read_rgba(path: Path | str) -> np.ndarray:
     """(H, W, 4) uint8 straight RGBA of an image file; gray and palette colours are expanded, no
     alpha means 255; OpenEXR as read_exr_rgba has it.
 
-    Raises UserError naming a file that is missing, truncated, no image, or has other than 8 bits a
-    channel.
+    Raises UserError naming a file that is missing, truncated, no image, larger than MOST_PIXELS, or
+    has other than 8 bits a channel.
     """
     if _is_exr(path):
         return read_exr_rgba(path)
@@ -73,6 +74,8 @@ def _opened(path, checked=True):
                 yield image
     except UserError:
         raise
+    except Image.DecompressionBombError:
+        raise UserError(f"{path}: more than {MOST_PIXELS} pixels; reduce the image") from None
     except FileNotFoundError:
         raise UserError(f"{path}: no such image; copy it there") from None
     # decoders meet broken bytes with whatever comes up: OSError, SyntaxError, struct.error

@@ -3,12 +3,13 @@ every array are looked at before an array is read.
 """
 
 import errno
+import io
 import math
 import re
 import stat
 import zipfile
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import NamedTuple
 
@@ -24,6 +25,28 @@ HEADER = re.compile(
     rb" 'shape': \(((?:\d{1,15}, ?)*(?:\d{1,15})?)\), \} *\n"
 )
 PIECE_BYTES = 2**24
+# bytes of a zip's directory: each entry takes about ten times its part of it as zipfile keeps it
+MOST_DIRECTORY = 2**24
+
+
+class _Pieces(io.FileIO):
+    """An opened file, of which at most MOST_DIRECTORY bytes are read at once."""
+
+    def read(self, size: int = -1) -> bytes:
+        if size > MOST_DIRECTORY:
+            raise ValueError(f"its directory is larger than {MOST_DIRECTORY} bytes")
+        return super().read(size)
+
+
+@contextmanager
+def opened_zip(path: Path) -> Iterator[zipfile.ZipFile]:
+    """The zip file, until the block ends. Raises OSError where it cannot be read, ValueError
+    for a directory of more than MOST_DIRECTORY bytes, and what zipfile raises.
+    """
+    if stat.S_ISFIFO(path.stat().st_mode):  # it would never end
+        raise ValueError("is no regular file")
+    with _Pieces(path) as file, zipfile.ZipFile(file) as archive:
+        yield archive
 
 
 class Form(NamedTuple):
@@ -40,35 +63,32 @@ class NpzFile:
     """An opened file. forms: {name: Form} of its arrays.
 
     Raises OSError where the file cannot be read, ValueError with the reason for anything else than
-    a file as numpy's savez writes it. Every array is as large as its part of the file.
+    a file as numpy's savez writes it. Every array is as large as its part of the file, and no part
+    is of two.
     """
 
     def __init__(self, path: Path) -> None:
-        found = path.stat()
-        if stat.S_ISFIFO(found.st_mode):  # it would never end
-            raise ValueError("is no regular file")
-        with _one_kind_of_error():
-            self._archive = zipfile.ZipFile(path)
         self.forms: dict[str, Form] = {}
         self._starts: dict[str, int] = {}
-        try:
-            with _one_kind_of_error():
-                for entry in self._archive.infolist():
-                    self._add(entry, found.st_size)
-        except BaseException:
-            self.close()
-            raise
+        with ExitStack() as stack, _one_kind_of_error():
+            self._archive = stack.enter_context(opened_zip(path))
+            entries = self._archive.infolist()
+            for entry in entries:
+                self._add(entry)
+            if sum(entry.file_size for entry in entries) > path.stat().st_size:
+                raise ValueError("two of its arrays share a part of the file")
+            self._close = stack.pop_all().close
 
     def close(self) -> None:
         """Close the file."""
-        self._archive.close()
+        self._close()
 
-    def _add(self, entry, file_size):
+    def _add(self, entry):
         name = entry.filename.removesuffix(".npy")
         if name == entry.filename or name in self.forms:
             raise ValueError(f"holds {shown(entry.filename, 40)}, which does not belong there")
         stored = entry.compress_type == zipfile.ZIP_STORED and not entry.flag_bits & 1
-        if not stored or entry.file_size != entry.compress_size or entry.file_size > file_size:
+        if not stored or entry.file_size != entry.compress_size:
             raise ValueError(f"{shown(name, 40)} is not stored as it is")
         with self._archive.open(entry) as member:
             form, start = _read_form(member)

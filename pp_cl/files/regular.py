@@ -11,6 +11,8 @@ from typing import BinaryIO
 from pp_cl.errors import UserError, shown
 
 MOST_REASON = 120  # characters
+MOST_VALUES = 2**22  # of a JSON file: 100,000 cameras of 40; with its text they take 1 GiB at most
+MOST_PIXELS = 2 * 89_478_485  # of an image; Pillow refuses more. The largest sensors have 151 M
 
 
 @contextmanager
@@ -35,6 +37,16 @@ def read_regular(path: Path | str, most: int, encoding: str = "utf-8") -> str:
     if len(content) > most:
         raise ValueError(f"larger than {most} bytes")
     return content.decode(encoding)
+
+
+def read_json_text(path: Path | str, most: int, encoding: str = "utf-8") -> str:
+    """read_regular() of JSON of at most MOST_VALUES values, of which each may take a hundred times
+    the memory of its text, such as {}. Raises ValueError for more.
+    """
+    text = read_regular(path, most, encoding)
+    if sum(map(text.count, ",[{")) > MOST_VALUES:
+        raise ValueError(f"more than {MOST_VALUES} values")
+    return text
 
 
 def refusal(path: Path | str, error: Exception, kind: str, mend: str = "copy it anew") -> UserError:

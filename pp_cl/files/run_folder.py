@@ -21,6 +21,7 @@ from pp_cl.files.regular import read_regular
 MASKS_PICTURE = "masks.png"
 MOST_OWNER = 1000  # bytes of the line that names the owner
 MOST_METRICS = 2**26  # bytes of a metrics.json; a view takes some hundred
+MOST_LOG = 2**25  # bytes of a log: 80,000 rows
 MOST_LINE = 2**16  # bytes of a row; a longer line is none of ours
 MOST_NUMBER = 1e300  # in a row
 
@@ -207,7 +208,13 @@ def _rows(path, step=math.inf):
 
 
 def _lines(path):
-    """The lines of a log, in pieces where they are too long."""
+    """The lines of a log, in pieces where they are too long. Raises UserError for a log that is too
+    long itself.
+    """
     if path.is_file():
+        if path.stat().st_size > MOST_LOG:
+            raise UserError(
+                f"{path}: is larger than {MOST_LOG} bytes; move it away, and raise train.log_every"
+            )
         with path.open("rb") as file:
             yield from iter(lambda: file.readline(MOST_LINE + 1), b"")

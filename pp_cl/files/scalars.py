@@ -9,6 +9,17 @@ from pp_cl.errors import UserError
 BESIDES = ("step", "seconds")  # numbers of a row of the log that are no curves
 
 
+def writer_class() -> type:
+    """What writes for TensorBoard. Raises UserError where tensorboardX is missing."""
+    try:
+        from tensorboardX import SummaryWriter
+    except ImportError:
+        raise UserError(
+            "--tensorboard: needs the package tensorboardX: pip install pp-cl[tensorboard]"
+        ) from None
+    return SummaryWriter
+
+
 class Scalars:
     """Writes the rows of a log into a folder that TensorBoard reads; the folder is made when the
     first row comes.
@@ -18,13 +29,8 @@ class Scalars:
     """
 
     def __init__(self, folder: Path, step: int) -> None:
-        try:
-            from tensorboardX import SummaryWriter
-        except ImportError:
-            raise UserError(
-                "--tensorboard: needs the package tensorboardX: pip install pp-cl[tensorboard]"
-            ) from None
-        self._make = lambda: SummaryWriter(str(folder), purge_step=step)
+        make = writer_class()
+        self._make = lambda: make(str(folder), purge_step=step)
         self._writer = None
 
     def __enter__(self) -> "Scalars":

@@ -5,6 +5,7 @@ from itertools import chain
 from pathlib import Path
 
 import numpy as np
+from PIL import Image
 
 from pp_cl.errors import UserError
 from pp_cl.files.atomic import atomic_path
@@ -15,15 +16,15 @@ MISSING = "films need the packages imageio and imageio-ffmpeg: pip install pp-cl
 
 def check_video(suffix: str) -> None:
     """Raise UserError with the command that mends it where a film of this format cannot be made."""
+    if suffix == "gif":
+        return
     try:
-        import imageio.v3  # noqa: F401
+        import imageio.v2  # noqa: F401
+        import imageio_ffmpeg
 
-        if suffix != "gif":
-            import imageio_ffmpeg
-
-            imageio_ffmpeg.get_ffmpeg_exe()
+        imageio_ffmpeg.get_ffmpeg_exe()
     except (ImportError, RuntimeError):
-        raise UserError(f"{MISSING}; or write frames with --format png") from None
+        raise UserError(f"{MISSING}; or write --format gif, or png for frames") from None
 
 
 def write_video(path: Path, frames: Iterable[np.ndarray], fps: float) -> None:
@@ -34,28 +35,42 @@ def write_video(path: Path, frames: Iterable[np.ndarray], fps: float) -> None:
     path: its suffix, one of FORMATS, chooses the format. Raises UserError naming the file when it
     cannot be written.
     """
-    import imageio.v2 as imageio
+    frames = (_even(frame) for frame in frames)
+    with atomic_path(path) as temporary:
+        (_write_gif if path.suffix.lower() == ".gif" else _write)(temporary, frames, fps)
 
-    frames = iter(frames)
-    first = next(frames)
-    options = _options(path.suffix[1:], first, fps)
-    with (
-        atomic_path(path) as temporary,
-        imageio.get_writer(str(temporary), **options) as writer,
-    ):
+
+def _write_gif(path, frames, fps):
+    images = map(Image.fromarray, frames)
+    options = {"save_all": True, "duration": 1000 / fps, "loop": 0}
+    next(images).save(path, append_images=images, **options)
+
+
+def _write(path, frames, fps):
+    """Raises OSError where the film is not whole: imageio says nothing of a full disk."""
+    import imageio.v2 as imageio
+    from imageio_ffmpeg import count_frames_and_secs
+
+    first, written = next(frames), 0
+    with imageio.get_writer(str(path), **_options(path.suffix.lower()[1:], first, fps)) as writer:
         for frame in chain([first], frames):
-            writer.append_data(_even(frame))
+            writer.append_data(frame)
+            written += 1
+    try:
+        there = count_frames_and_secs(path)[0]
+    except RuntimeError:
+        there = 0
+    if there != written:
+        raise OSError(f"{there} of its {written} frames were kept")
 
 
 def _options(suffix, frame, fps):
     """Of imageio's writer."""
-    if suffix == "gif":
-        return {"mode": "I", "duration": 1000 / fps, "loop": 0}
     alpha = frame.shape[2] == 4
     options = {
         "fps": fps,
         "macro_block_size": 1,
-        "ffmpeg_log_level": "error",
+        "ffmpeg_log_level": "quiet",  # of a full disk it says four lines
         "input_params": ["-threads", "2"],
     }
     if suffix == "mp4":

@@ -1,5 +1,6 @@
 """Metrics of an image, or of a folder of images, against the truth."""
 
+import mimetypes
 from pathlib import Path
 from typing import Any
 
@@ -7,10 +8,8 @@ import numpy as np
 
 from pp_cl.device.device import Device
 from pp_cl.errors import UserError
-from pp_cl.files.image import read_rgba
+from pp_cl.files.image import ENDINGS, read_rgba
 from pp_cl.metrics.psnr_ssim import Metrics, mean
-
-SUFFIXES = (".exr", ".png", ".jpg", ".jpeg")
 
 
 def compare(
@@ -23,8 +22,8 @@ def compare(
 
     metrics: names out of psnr, ssim, lpips; dev: only lpips needs one. Transparent images are
     composited over white. Returns {"mean": {metric: number}, "per_image": [{"name", metric: number,
-    ...}]}. Raises UserError naming a file that is missing, unreadable, without partner or of
-    another size than its partner.
+    ...}]}. Raises UserError naming a file that is missing, unreadable, an image of a format that is
+    not read, without partner or of another size than its partner.
     """
     pairs = _pairs(Path(prediction), Path(truth))
     measure = Metrics(dev, metrics)
@@ -46,12 +45,20 @@ def _pairs(prediction, truth):
                 "both folders must hold images of the same names"
             )
     if not names[0]:
-        raise UserError(f"{prediction}: no images ({', '.join(SUFFIXES)}) in it")
+        raise UserError(f"{prediction}: no images ({', '.join(ENDINGS)}) in it")
     return [(prediction / name, truth / name) for name in sorted(names[0])]
 
 
 def _image_names(folder):
-    return {path.name for path in folder.iterdir() if path.suffix.lower() in SUFFIXES}
+    """Names of the images in a folder, hidden files left out, as macOS puts them beside."""
+    paths = [path for path in folder.iterdir() if not path.name.startswith(".")]
+    for path in paths:
+        kind = mimetypes.guess_type(path.name, strict=False)[0] or ""
+        if kind.startswith("image/") and path.suffix.lower() not in ENDINGS:
+            raise UserError(
+                f"{path}: not a format that is read; convert it to PNG, or move it away"
+            )
+    return {path.name for path in paths if path.suffix.lower() in ENDINGS}
 
 
 def _measure(measure, prediction, truth):

@@ -8,7 +8,7 @@ from skimage.metrics import structural_similarity
 from pp_cl.device.device import Device
 from pp_cl.errors import UserError
 from pp_cl.files.image import to_8bit
-from pp_cl.layers.choice import ConvolutionPolicy
+from pp_cl.layers.choice import AUTO, ConvolutionPolicy
 from pp_cl.metrics.lpips import Lpips
 
 PSNR_CAP = 100.0  # dB of identical images: JSON has no infinity
@@ -50,8 +50,9 @@ def ssim(a: np.ndarray, b: np.ndarray) -> float:
 
 class Metrics:
     """The named metrics of image pairs. names: out of psnr, ssim, lpips; only lpips needs dev.
-    policy: whose blocking the convolutions of lpips take, None = as shipped; they are direct ones
-    at any tolerance, so that a metric does not depend on it.
+    policy: whose blocking the convolutions of lpips take, None = as shipped. Their variants are
+    those shipped for the device whatever its tolerance and tuning, so that a metric does not depend
+    on them.
     """
 
     def __init__(
@@ -61,8 +62,8 @@ class Metrics:
         policy: ConvolutionPolicy | None = None,
     ) -> None:
         self.names = names
-        direct = policy and replace(policy, variant="direct")
-        self._lpips = Lpips(dev, policy=direct) if "lpips" in names else None
+        shipped = policy and replace(policy, variant=AUTO, tolerance=None)
+        self._lpips = Lpips(dev, policy=shipped) if "lpips" in names else None
 
     def __call__(self, prediction: np.ndarray, truth: np.ndarray) -> dict[str, float]:
         """{name: number} of two float (H, W, 3) images in [0, 1], both rounded to 8 bits first.

@@ -49,21 +49,24 @@ def published_rows(scene_name: str, cameras: Sequence[Camera]) -> dict[str, dict
     return _rows(known, scene_name) if synthetic and scene_name in known["scenes"] else {}
 
 
-def differences(scene_name: str, cameras: Sequence[Camera], downscale: int) -> str:
+def differences(
+    scene_name: str, cameras: Sequence[Camera], downscale: int, split: str = "test"
+) -> str:
     """How a measurement of a published scene differs from the published ones, in words; "" if it
     does not. cameras: of the stored images of the views measured.
     """
     if scene_name in CO3D_SEQUENCES:
-        return "" if downscale == 1 else f"here: images reduced {downscale} times"
-    said = [
-        f"{views} views of {side}x{side} pixels"
-        for views, side in (
-            (f"{SYNTHETIC_VIEWS} test", SYNTHETIC_SIZE),
-            (len(cameras), SYNTHETIC_SIZE // downscale),
+        said = [f"split {split}"] * (split != "test")
+        said += [f"images reduced {downscale} times"] * (downscale > 1)
+        return f"here: {', '.join(said)}" if said else ""
+    published, here = (
+        f"{count} {kind} views of {side}x{side} pixels"
+        for count, kind, side in (
+            (SYNTHETIC_VIEWS, "test", SYNTHETIC_SIZE),
+            (len(cameras), split, SYNTHETIC_SIZE // downscale),
         )
-    ]
-    same = downscale == 1 and len(cameras) == SYNTHETIC_VIEWS
-    return "" if same else f"published: {said[0]}; here: {said[1]}"
+    )
+    return "" if here == published else f"published: {published}; here: {here}"
 
 
 def _rows(table, scene):

@@ -1,17 +1,21 @@
-"""By what a run knows its scene again, wherever it lies: the names and cameras of its training
-views, and their pixels.
+"""What a run keeps of its training views: their names and cameras, which rendering and exports
+begin with, and digests, by which it knows its scene again wherever that lies.
 """
 
+import base64
 import hashlib
 from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 
+from pp_cl.scene.camera import Camera
 from pp_cl.scene.photograph import Photograph
 from pp_cl.scene.views import View
 
 DIGITS = 16  # of a view's digest, hexadecimal: enough to tell pixels that were changed, not forged
+POSE, LENS, SIZE, RANGE = 12, 4, 2, 2  # numbers of a kept view; it may have no depth range
+MOST_SIDE, MOST_NUMBER = 2**24, 1e30  # what float32 holds as whole numbers, and as products
 
 
 def pixel_digest(image: np.ndarray) -> str:
@@ -21,11 +25,45 @@ def pixel_digest(image: np.ndarray) -> str:
 
 def identity(views: Sequence[View]) -> dict[str, Any]:
     """{"scene": digest of the names and cameras, "pixels": {name: digest} of the views, None where
-    the program makes them}: what the header of a checkpoint holds of its training views.
+    the program makes them, "views": for kept_views()}: what the header of a checkpoint holds of its
+    training views.
     """
     made = any(view.digest is None for view in views)
     pixels = None if made else {view.name: view.digest for view in views}
-    return {"scene": fingerprint(views), "pixels": pixels}
+    kept = [[view.name, packed_camera(view.file_camera, view.depth_range)] for view in views]
+    return {"scene": fingerprint(views), "pixels": pixels, "views": kept}
+
+
+def packed_camera(camera: Camera, depth_range: tuple[float, float] | None = None) -> str:
+    """A camera and its depth range as text: float64, half as long as in JSON's digits."""
+    numbers = [camera.fx, camera.fy, camera.cx, camera.cy, camera.width, camera.height]
+    numbers = [*camera.pose.ravel(), *numbers, *(depth_range or ())]
+    return base64.b64encode(np.array(numbers, "<f8")).decode()
+
+
+def kept_views(views: Any) -> list[Photograph]:
+    """The training views that identity() has kept. Raises ValueError for what it never makes."""
+    if not isinstance(views, list) or not views:
+        raise ValueError("no list of views")
+    return [_unpacked(view) for view in views]
+
+
+def _unpacked(view):
+    if not isinstance(view, list) or [type(part) for part in view] != [str, str]:
+        raise ValueError("a view without name or camera")
+    numbers = np.frombuffer(base64.b64decode(view[1], validate=True), "<f8")
+    if len(numbers) - (POSE + LENS + SIZE) not in (0, RANGE):
+        raise ValueError(f"a camera of {len(numbers)} numbers")
+    pose, (fx, fy, cx, cy, width, height, *near_far) = numbers[:POSE], numbers[POSE:].tolist()
+    pose = pose.reshape(3, 4).astype(np.float64)
+    turn = pose[:, :3]
+    sides = all(side.is_integer() and 1 <= side <= MOST_SIDE for side in (width, height))
+    if not (np.abs(numbers) < MOST_NUMBER).all() or min(fx, fy) <= 0 or not sides:
+        raise ValueError("a camera that shows nothing")
+    if not np.allclose(turn.T @ turn, np.eye(3), rtol=0, atol=1e-4):
+        raise ValueError("a camera whose axes are not orthonormal")
+    camera = Camera(pose, fx, fy, cx, cy, int(width), int(height))
+    return Photograph(view[0], camera, tuple(near_far) or None)
 
 
 def fingerprint(views: Sequence[View | Photograph]) -> str:

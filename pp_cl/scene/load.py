@@ -10,13 +10,14 @@ from typing import TypeVar
 
 from tqdm import tqdm
 
-from pp_cl.errors import UserError
+from pp_cl.errors import UserError, quoted
 from pp_cl.files.image import read_rgba
 from pp_cl.scene.distortion import undistort
 from pp_cl.scene.identity import pixel_digest
 from pp_cl.scene.masks import AS_GIVEN, MaskRule
 from pp_cl.scene.photograph import Photograph
 from pp_cl.scene.readers import co3d, colmap, llff, neus, nsvf, transforms
+from pp_cl.scene.readers.common import ENDINGS
 from pp_cl.scene.shrink import shrink, shrink_factor
 from pp_cl.scene.views import View, check_downscale
 
@@ -31,6 +32,8 @@ DECODED, UNDISTORTED, CUT_OUT = 18, 125, 160
 READING_BYTES = 3 * 2**28  # of the photographs that are read side by side
 
 LEAST_FOCAL, MOST_FOCAL = 1e-2, 1e7  # pixels; docs/scene_scale.md says what is measured
+
+NEARBY = 100  # entries of a folder without a scene in which one is looked for
 
 Item, Made = TypeVar("Item"), TypeVar("Made")
 
@@ -67,16 +70,45 @@ def evenly(items: Sequence[Item], most: int | None) -> list[Item]:
 def find_reader(path: str | Path) -> ModuleType:
     """The module of READERS for a folder. Raises UserError where it holds no scene."""
     folder = Path(path)
-    if not folder.is_dir():
+    check_folder(folder)
+    reader = _reader_of(folder)
+    if reader is None:
+        raise UserError(f"{folder}: no scene in it{_found_instead(folder)}")
+    return reader
+
+
+def check_folder(folder: Path) -> None:
+    """Raise UserError where a scene's folder is missing, no folder, or cannot be read."""
+    if folder.is_file():
         raise UserError(
-            f"{folder}: no such folder; give a folder with {_known_files()}, or the word demo"
+            f"{folder}: is a file; a scene is a folder, maybe {folder.absolute().parent}"
         )
+    if not folder.is_dir():
+        raise UserError(f"{folder}: no such folder; SCENE is a folder, or the word demo")
     if not os.access(folder, os.R_OK | os.X_OK):
         raise UserError(f"{folder}: cannot be read; check its permissions")
-    reader = next((reader for reader in READERS if reader.recognises(folder)), None)
-    if reader is None:
-        raise UserError(f"{folder}: no scene in it; it needs {_known_files()}")
-    return reader
+
+
+def _reader_of(folder):
+    return next((reader for reader in READERS if reader.recognises(folder)), None)
+
+
+def _found_instead(folder):
+    """What is in a folder without a scene, and where one is, in words."""
+    inside = sorted(entry for entry in folder.iterdir() if not entry.name.startswith("."))
+    for near in (folder.absolute().parent, *filter(Path.is_dir, inside[:NEARBY])):
+        if os.access(near, os.R_OK | os.X_OK) and (reader := _reader_of(near)):
+            return f"; {near} is one ({reader.FILES}); give that"
+    pictures = sum(entry.suffix.lower() in ENDINGS for entry in inside)
+    others = [entry.name for entry in inside if entry.suffix.lower() not in ENDINGS]
+    found = [f"{pictures} image{'s' * (pictures > 1)}"] * bool(pictures) + [
+        quoted(name, 40) for name in others[:3]
+    ]
+    found = ", ".join(found) + f" and {len(others) - 3} more" * (len(others) > 3)
+    return (
+        f": {found or 'nothing'}, but no file of cameras that is known, such as"
+        " transforms.json or sparse/0; docs/scenes.md has the formats, and how to make cameras"
+    )
 
 
 def load_scene(
@@ -173,10 +205,6 @@ def _view(photograph, factor, image, digest):
         shrunk=factor,
         unshrunk_camera=camera if factor > 1 else None,
     )
-
-
-def _known_files() -> str:
-    return " or ".join(reader.FILES for reader in READERS)
 
 
 def _check_alike(folder, photographs):

@@ -9,8 +9,7 @@ from skimage.color import rgb2lab
 from skimage.measure import label
 
 from pp_cl.errors import UserError
-from pp_cl.files.image import read_gray
-from pp_cl.scene.readers.common import ENDINGS
+from pp_cl.files.image import ENDINGS, read_gray
 
 BORDER_SHARE = 0.5  # of the border's pixels that must have its median colour
 OPAQUE = np.uint8(255)

@@ -11,6 +11,7 @@ from pathlib import Path
 from pp_cl.config import Config, assign, configure, preset, sections, text_of
 from pp_cl.errors import UserError
 from pp_cl.presets import RENAMED
+from pp_cl.scene.load import check_folder
 from pp_cl.scene.open import DEMO
 
 Given = tuple[str, str, str]  # key, text of the value, origin, as run_config.run_config takes them
@@ -166,8 +167,8 @@ def _names(scenes):
     """{scene: name}, in order. Names must differ, also where the file system ignores case."""
     names = {}
     for scene in scenes:
-        if scene != DEMO and not Path(scene).is_dir():
-            raise UserError(f"{scene}: no such folder; SCENE is a folder, or the word demo")
+        if scene != DEMO:
+            check_folder(Path(scene))
         name = DEMO if scene == DEMO else Path(scene).resolve().name
         for other, taken in names.items():
             if taken.casefold() == name.casefold():

@@ -5,7 +5,7 @@ import math
 from typing import Any
 
 from pp_cl.config import load_config
-from pp_cl.files.regular import read_regular
+from pp_cl.files.regular import read_json_text
 from pp_cl.files.run_folder import MOST_METRICS, RunFolder
 from pp_cl.run_config import run_config
 from pp_cl.sweep.plan import Job
@@ -56,7 +56,7 @@ def _measured(folder, header, metrics):
     metrics; None where there is none.
     """
     try:
-        result = json.loads(read_regular(folder.metrics("test"), MOST_METRICS))
+        result = json.loads(read_json_text(folder.metrics("test"), MOST_METRICS))
         means = {name: float(result["mean"][name]) for name in metrics}
         whole = result["finished"] is True and result["step"] == header["step"]
         values = means | {"points": int(result["points"]["final"]), "device": result["device"]}

@@ -128,10 +128,10 @@ def _escaped(text):
     return text.replace("|", "\\|")
 
 
-def write_tables(out: Path, rows: Sequence[Row], more: str | None = None) -> None:
-    """Write sweep.json and sweep.md of the rows to the folder; `more`: another JSON file."""
+def write_tables(out: Path, rows: Sequence[Row]) -> dict[str, Any]:
+    """Write sweep.json and sweep.md of the rows to the folder; returns what the former holds."""
     means = scene_means(rows)
     content = {"runs": list(rows), "scenes": means, "mean": overall_means(means)}
-    for file in filter(None, [out / "sweep.json", more]):
-        write_json(file, content)
+    write_json(out / "sweep.json", content)
     write_text(out / "sweep.md", markdown(rows))
+    return content

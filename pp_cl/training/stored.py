@@ -18,7 +18,7 @@ from pp_cl.files.run_folder import RunFolder
 from pp_cl.layers.choice import check_form
 from pp_cl.network.layers import parameter_table, unet_layers
 from pp_cl.raster.sh import SH_DEGREES, sh_blocks
-from pp_cl.scene.identity import DIGITS
+from pp_cl.scene.identity import DIGITS, kept_views
 from pp_cl.training.point_state import PointState, stored_name
 from pp_cl.training.schedule import ema_start, refine_steps
 
@@ -166,12 +166,20 @@ def _header_rules(config: Config) -> dict[str, Rule]:
     steps = config.train.iterations
     return {
         "scene": (lambda x: type(x) is str and 0 < len(x) <= MOST_TEXT, "a text"),
+        "views": (_are_views, "names and cameras of training views"),
         "step": (_whole_in(1, steps), f"one of the {steps} steps of its config.json"),
         "finished": (lambda x: type(x) is bool, "true or false"),
         "initial_points": (_whole_in(1, MOST_VERTICES), "a number of points"),
         "grid": (_is_grid, "three numbers, a length and three numbers of vertices"),
         "depth_range": (_is_depth_range, "near and far"),
     }
+
+
+def _are_views(views):
+    try:
+        return bool(kept_views(views))
+    except ValueError:
+        return False
 
 
 def _are_digests(pixels):

@@ -28,7 +28,8 @@ class Access:
     @property
     def address(self) -> str:
         """What to open in a browser."""
-        name = LOOPBACK[0] if self.host in ANY else self.host
+        # a socket of `::` takes no IPv4
+        name = {"0.0.0.0": LOOPBACK[0], "::": "::1"}.get(self.host, self.host)  # noqa: S104
         return f"http://{_bracketed(name)}:{self.port}/{self.token}/"
 
     def refusal(self, path: str, host: str, origin: str | None, *, socket: bool) -> str | None:

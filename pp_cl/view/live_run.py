@@ -27,9 +27,6 @@ from pp_cl.view.messages import LEAST_SIDE, Frame, ViewRequest
 
 DRAFT = 4  # times fewer pixels each way while the camera moves
 OWN_CAMERA = ("error", "photograph")  # are shown from the nearest training view's own camera
-# where no training view says how to look: from above one corner, 40 degrees wide
-START_SIZE, START_FOCAL, START_SIDE = 400, 550.0, (1.0, -1.0, 0.6)
-START_DISTANCE = 3.5  # radii of the object
 
 
 class LiveRun:
@@ -106,13 +103,12 @@ class LiveRun:
         if self._run is None:
             return None
         centre, radius = self._run.ball
-        cameras = [view.camera for view in self._views]
-        first = cameras[0] if cameras else _start_camera(centre, radius)
+        cameras = self._run.cameras("train")
         return {
             "centre": centre.tolist(),
             "radius": radius,
-            "up": up_of(cameras or [first]).tolist(),
-            "camera": frame_keys(first),
+            "up": up_of(cameras).tolist(),
+            "camera": frame_keys(cameras[0]),
             "views": [{"name": v.name, "camera": frame_keys(v.camera)} for v in self._views],
         }
 
@@ -203,11 +199,6 @@ def _training_views(run):
         return run.scene("train").splits["train"], None
     except UserError as error:
         return [], f"no training views: {error}"
-
-
-def _start_camera(centre, radius):
-    eye = centre + START_DISTANCE * radius * np.array(START_SIDE) / np.linalg.norm(START_SIDE)
-    return Camera.look_at(eye, centre, fx=START_FOCAL, width=START_SIZE, height=START_SIZE)
 
 
 def check_run(folder: Path | str) -> None:

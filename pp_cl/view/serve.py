@@ -7,6 +7,7 @@ import contextlib
 import errno
 import importlib.util
 import os
+import signal
 import socket
 import subprocess
 import sys
@@ -15,6 +16,7 @@ from pathlib import Path
 
 from pp_cl.device.discover import open_device
 from pp_cl.errors import UserError
+from pp_cl.trained import check_scene
 from pp_cl.view.access import Access
 from pp_cl.view.live_run import LiveRun, check_run
 
@@ -38,7 +40,8 @@ def serve(
     scene: str | None = None,
     wait: bool = False,
 ) -> None:
-    """Show the run in a folder in the browser until Ctrl-C, which ends it without an exception.
+    """Show the run in a folder in the browser until Ctrl-C or a signal to terminate, which end it
+    without an exception.
 
     port: 0 takes a free one. announce: called with the address once it listens. device: as `pp-cl
     devices` lists them. scene: where the run's scene is now. wait: for the folder to become a run,
@@ -49,10 +52,13 @@ def serve(
     check_installed()
     if not wait:
         check_run(folder)
+    if scene is not None:
+        check_scene(scene)
     with (
         contextlib.closing(_listen(host, port)) as listening,
         contextlib.suppress(KeyboardInterrupt),
     ):
+        signal.signal(signal.SIGTERM, signal.default_int_handler)
         access = Access(host, listening.getsockname()[1])
         live = LiveRun(open_device(device), folder, scene)
         asyncio.run(_serve(live, access, listening, announce=announce, parent=parent))

@@ -168,11 +168,12 @@ class ViewServer:
         try:
             self._tell(tab)
             tab.tell_log(self.log)
-            async for message in socket:
-                if message.type is WSMsgType.TEXT:
-                    self._request(tab, message.data)
-                else:
-                    tab.tell("refused", {"number": None, "line": "messages must be text"})
+            with contextlib.suppress(ConnectionError):  # of a pong to a tab that is gone
+                async for message in socket:
+                    if message.type is WSMsgType.TEXT:
+                        self._request(tab, message.data)
+                    else:
+                        tab.tell("refused", {"number": None, "line": "messages must be text"})
         finally:
             self.tabs.discard(tab)
             self.thread.forget(tab)

@@ -1,33 +1,100 @@
-"""Texts of options that commands share."""
+"""The types by which argparse reads options, and options that commands share."""
+
+import argparse
+import json
+import sys
 
 import pytest
 
-from pp_cl.commands.options import read_metrics, read_numbers, read_shape, read_tolerance
-from pp_cl.errors import UserError
+from pp_cl.cli import main
+from pp_cl.commands import options
+
+REFUSED = [
+    (options.integer(1, 16), ("16.5", "0", "17", "x", "nan", "1,2", "9" * 5000)),
+    (options.side, ("30", "-4", "0", "inf")),
+    (options.number(0.5, 2), ("0.4", "3", "nan", "1,2", "")),
+    (options.several(options.integer(1, 10)), ("1,,2", "1,11")),
+    (options.words(options.METRICS), ("beauty", "psnr,beauty", ",")),
+    (options.widths, ("1,2", "1,2,x", "0,1,2")),
+    (options.output_file(), (".", "/", "..", "no-such/a.json", "/dev/null", "a" * 300)),
+    (options.output_file(".png"), ("a.jpg", "png")),
+    (options.output_folder, (f"{__file__}/run", __file__)),
+]
 
 
-def test_numbers_are_read_ascending():
-    assert read_numbers("--points", "1e3,10,10", int, least=1, most=10**6) == [10, 1000]
-    with pytest.raises(UserError):
-        read_numbers("--points", "", int, least=1, most=10**6)
+@pytest.mark.parametrize("read, texts", REFUSED)
+def test_what_an_option_cannot_be_is_refused(read, texts):
+    for text in texts:
+        with pytest.raises(argparse.ArgumentTypeError):
+            read(text)
 
 
-def test_shape_is_a_side_and_three_widths():
-    assert read_shape("64", "16,32,48") == (64, (16, 32, 48))
-    for size, widths in (("30", "1,2,3"), ("-4", "1,2,3"), ("4", "1,2"), ("4", "1,2,x")):
-        with pytest.raises(UserError, match="^--(size|widths) "):
-            read_shape(size, widths)
+def test_texts_become_what_is_meant(tmp_path):
+    assert options.integer(1, 10**6)("1e3") == 1000
+    assert options.several(options.integer(1, 10**6))("1e3,10,10") == [10, 1000]
+    assert options.words(options.METRICS)("psnr, lpips") == ("psnr", "lpips")
+    assert options.side("64") == 64 and options.widths("16,32,48") == (16, 32, 48)
+    for text in (str(tmp_path / "new.PNG"), "new.png"):
+        assert options.output_file(".png")(text) == text
+    assert options.output_folder(str(tmp_path / "a" / "b")) == str(tmp_path / "a" / "b")
 
 
-def test_metrics_are_known_names():
-    assert read_metrics("psnr, lpips") == ("psnr", "lpips")
-    for text in ("", "beauty", "psnr,beauty"):
-        with pytest.raises(UserError, match="^--metrics"):
-            read_metrics(text)
+def test_json_goes_to_a_file_or_in_place_of_the_text(tmp_path, capsys, monkeypatch):
+    """One rule for every command; a RUN that follows --json is no file."""
+    monkeypatch.setattr("pp_cl.device.discover.list_devices", lambda: [])
+    file = tmp_path / "a.json"
+    for words in (["--json"], ["--json", "-"], ["--json=-"], ["--json", str(file)]):
+        assert main(["devices", *words]) == 2  # none works
+        assert capsys.readouterr().out == ("\n" if str(file) in words else "[]\n")
+    assert json.loads(file.read_text()) == []
 
 
-def test_tolerance_is_a_share_or_absent():
-    assert read_tolerance(None) is None and read_tolerance("1e-3") == 1e-3
-    for text in ("x", "2", "nan"):
-        with pytest.raises(UserError, match="^--tolerance"):
-            read_tolerance(text)
+def test_other_output_leaves_printed_json_alone(tmp_path, capsys, monkeypatch):
+    def talk(given):
+        print("measuring", given.subject)
+        options.write_json_option(given.json, {"a": 1})
+
+    monkeypatch.setattr("pp_cl.commands.info.run", talk)
+    assert main(["info", "--json", str(tmp_path)]) == 0
+    printed = capsys.readouterr()
+    assert json.loads(printed.out) == {"a": 1} and printed.err == f"measuring {tmp_path}\n"
+    assert sys.stdout is not sys.stderr
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ("compare", "a", "b", "--json"),
+        ("eval", "a", "--chart"),
+        ("eval", "a", "--scene"),
+        ("info", "a", "--device"),
+        ("export", "a", "--format", "ply", "--out"),
+        ("train", "a", "--out"),
+    ],
+)
+def test_an_empty_value_is_refused(words, capsys):
+    for given in ((*words, ""), (*words[:-1], f"{words[-1]}=")):
+        assert main(given) == 2
+        error = capsys.readouterr().err
+        assert f"{words[-1]}: is empty" in error and error.count("\n") == 1
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ("compare", "a.png", "a.png", "--json"),
+        ("eval", "a", "--json"),
+        ("selftest", "--json"),
+        ("bench", "conv", "--json"),
+        ("sweep", "demo", "--out", "a", "--json"),
+        ("shape", "a.ply", "--json"),
+        ("info", "a", "--picture"),
+        ("eval", "a", "--chart"),
+        ("bench", "conv", "--plot"),
+    ],
+)
+def test_a_file_that_cannot_be_written_is_noticed_before_the_work(words, capsys, monkeypatch):
+    monkeypatch.setattr("pp_cl.device.discover.open_device", lambda _: pytest.fail("work"))
+    assert main([*words, "/no/such/a.png"]) == 2
+    error = capsys.readouterr().err
+    assert f"{words[-1]}: '/no/such/a.png'" in error and error.count("\n") == 1

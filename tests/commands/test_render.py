@@ -1,14 +1,22 @@
 """`pp-cl render`: films and frames as asked for, what is taken up again, what is refused."""
 
+import json
+import os
+import shutil
+from pathlib import Path
+
 import imageio.v2 as imageio
 import numpy as np
+import OpenEXR
 import pytest
+from filelock import FileLock
 from support.runs import arguments
 from support.scenes import write_ball_scene
 
+from pp_cl import film
 from pp_cl.cli import main
-from pp_cl.files.exr import read_exr
 from pp_cl.files.image import read_rgba
+from pp_cl.trained import Run
 
 
 @pytest.fixture(scope="module")
@@ -19,24 +27,71 @@ def trained(tmp_path_factory):
     return str(folder / "run")
 
 
-def test_a_film_of_an_orbit(trained, tmp_path, capsys):
-    words = ["render", trained, "--out", str(tmp_path / "o"), "--seconds", "0.5", "--fps", "12"]
+def test_a_film_is_what_its_name_says_and_leaves_nothing_beside_it(trained, tmp_path, capsys):
+    film = tmp_path / "new" / "film.mp4"
+    words = ["render", trained, "--out", str(film), "--seconds", "0.5", "--fps", "12"]
     assert main([*words, "--size", "48x32"]) == 0
-    said = capsys.readouterr().out
-    assert "rendered 6 of 6 frames" in said and str(tmp_path / "o.mp4") in said
-    with imageio.get_reader(str(tmp_path / "o.mp4")) as film:
-        data = film.get_meta_data()
+    assert capsys.readouterr().out.splitlines()[1] == f"wrote {film}"
+    assert list(film.parent.iterdir()) == [film]
+    with imageio.get_reader(str(film)) as read:
+        data = read.get_meta_data()
         assert data["size"] == (48, 32) and data["fps"] == 12
-        assert sum(1 for _ in film.iter_data()) == 6
-    frames = [read_rgba(tmp_path / "o" / f"{i:05d}.png") for i in range(6)]
-    assert all(frame.shape == (32, 48, 4) for frame in frames)
-    assert np.abs(frames[0].astype(int) - frames[3]).max() > 20
-    assert read_rgba(tmp_path / "o.png").shape[2] == 4
+        frames = [frame.astype(int) for frame in read.iter_data()]
+    assert len(frames) == 6 and np.abs(frames[0] - frames[3]).max() > 20
+
+
+def test_a_film_that_was_interrupted_goes_on(trained, tmp_path, capsys, monkeypatch):
+    words = ["render", trained, "--out", str(tmp_path / "film.gif"), "--seconds", "1", "--fps", "4"]
+    write, done = film.write_png, []
+
+    def stopping(path, image):
+        if len(done) == 2:
+            raise KeyboardInterrupt
+        write(path, image)
+        done.append(path)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(film, "write_png", stopping)
+        assert main(words) == 130
+    assert not (tmp_path / "film.gif").exists()
+    with FileLock(done[0].parent / ".lock"):
+        assert main(words) == 2
+    assert "film.gif: another process" in capsys.readouterr().err
+    assert main(words) == 0
+    assert "rendered 2 of 4 frames" in capsys.readouterr().out
+    assert list(tmp_path.iterdir()) == [tmp_path / "film.gif"]
+    assert main([*words, "--background", "black"]) == 0  # a film is made anew
+    assert "rendered 4 of 4 frames" in capsys.readouterr().out
+    with imageio.get_reader(str(tmp_path / "film.gif")) as read:
+        assert read.get_length() == 4
+
+
+def test_sizes_have_folders_of_their_own_and_need_no_scene(trained, capsys):
+    """The run's name is no UTF-8, and its scene is gone."""
+    run = Path(trained)
+    run = shutil.copytree(run, run.with_name(os.fsdecode(b"run \xff")))
+    config = json.loads((run / "config.json").read_text())
+    config["scene"]["path"] = "/nowhere/at/all"
+    (run / "config.json").write_text(json.dumps(config))
+    words = ["render", str(run), "--seconds", "0.1", "--fps", "10"]
+    for more in ([], ["--size", "32x32"], ["--format", "png"], ["--path", "spiral"]):
+        assert main([*words, *more]) == 0
+    names = {path.name for path in (run / "render").iterdir()}
+    assert names == {"orbit_24x24.mp4", "orbit_32x32.mp4", "orbit_24x24", "spiral_24x24.mp4"}
+    capsys.readouterr()
+    for more, told in ((["--path", "test"], "/nowhere"), (["--format", "exr"], "choose another")):
+        assert main([*words[:2], *more]) == 2
+        assert told in capsys.readouterr().err
+
+
+def test_an_empty_folder_that_one_is_in_takes_frames(trained, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert main(["render", trained, "--path", "test", "--out", "."]) == 0
+    assert {path.name for path in tmp_path.iterdir()} == {"00000.png", "00001.png", "frames.json"}
 
 
 def test_frames_that_are_there_are_not_rendered_again(trained, tmp_path, capsys):
     words = ["render", trained, "--out", str(tmp_path / "o"), "--seconds", "1", "--fps", "4"]
-    words += ["--format", "png"]
     assert main(words) == 0
     whole = {p.name: p.read_bytes() for p in (tmp_path / "o").iterdir()}
     (tmp_path / "o" / "00002.png").unlink()
@@ -78,46 +133,60 @@ def test_transparent_frames_and_colours(trained, tmp_path):
 def test_exr_frames_hold_alpha_depth_and_features(trained, tmp_path):
     words = ["render", trained, "--path", "test", "--format", "exr", "--features", "--samples", "4"]
     assert main([*words, "--out", str(tmp_path / "e")]) == 0
-    channels = read_exr(tmp_path / "e" / "00000.exr")
+    file = OpenEXR.File(str(tmp_path / "e" / "00000.exr"), separate_channels=True)
+    channels = {name: channel.pixels for name, channel in file.channels().items()}
     assert len(channels) == 6 + 16 and channels["R"].shape == (24, 24)
     there = channels["A"] > 0.5
     distance = 4.0  # of the cameras from the ball's centre
     assert there.any() and (np.abs(channels["Z"][there] - distance) < 1).all()
     assert np.isinf(channels["Z"][channels["A"] == 0]).all()
-    assert (tmp_path / "e.png").exists()
 
 
-def test_a_sheet_of_a_spiral_and_a_file(trained, tmp_path):
-    assert main(["render", trained, "--path", "spiral", "--seconds", "0.2", "--fps", "10"]) == 0
-    words = ["--path", str(tmp_path / "path.json"), "--format", "gif", "--size", "32x32"]
+def test_cameras_of_a_file(trained, tmp_path):
+    words = ["--path", str(tmp_path / "path.json"), "--size", "32x32"]
     (tmp_path / "path.json").write_text(
         '{"camera_path": [{"fov": 40, "camera_to_world": [1,0,0,0, 0,1,0,0, 0,0,1,4, 0,0,0,1]}]}'
     )
-    assert main(["render", trained, *words, "--out", str(tmp_path / "file")]) == 0
+    assert main(["render", trained, *words, "--out", str(tmp_path / "file.gif")]) == 0
     assert (tmp_path / "file.gif").exists()
 
 
 @pytest.mark.parametrize(
     "words, named",
     [
-        (["--size", "0x32"], "--size 0x32"),
-        (["--size", "large"], "--size large"),
-        (["--fov", "nan"], "--fov nan"),
-        (["--fps", "0"], "--fps 0"),
-        (["--seconds", "-1"], "--seconds -1"),
+        (["--size", "0x32"], "--size"),
+        (["--size", "large"], "--size"),
+        (["--fov", "nan"], "--fov"),
+        (["--fps", "0"], "--fps"),
+        (["--seconds", "-1"], "--seconds"),
         (["--seconds", "0.001"], "--seconds 0.001"),
-        (["--samples", "3"], "--samples 3"),
-        (["--background", "red"], "--background red"),
-        (["--background", "transparent"], "mp4 keeps no alpha"),
+        (["--samples", "3"], "--samples"),
+        (["--background", "red"], "--background"),
+        (["--background", "transparent", "--out", "{tmp}/a.mp4"], "mp4 keeps no alpha"),
+        (["--background", "black", "--format", "exr"], "--background"),
         (["--features"], "--features"),
         (["--format", "avi"], "avi"),
+        (["--format", "mp4"], "/o: --format mp4"),
+        (["--format", "png", "--out", "{tmp}/a.mp4"], "a.mp4"),
+        (["--out", "{tmp}/a.avi"], "a.avi: films end in"),
+        (["--out", "{tmp}/film.mp4"], "film.mp4: is a folder"),
+        (["--out", "{tmp}/" + 245 * "x" + ".mp4"], "shorter name"),
+        (["--out", "/proc/a.mp4"], "/proc/a.mp4"),
+        (["--out", ""], "--out"),
+        (["--path", ""], "--path"),
+        (["--scene", "{tmp}/gone"], "gone"),
+        (["--fps", "60", "--out", "{tmp}/a.gif"], "--fps 60"),
+        (["--path", "test", "--seconds", "1"], "--seconds 1"),
         (["--path", "nowhere"], "nowhere"),
         (["--path", "nowhere.json"], "nowhere.json: no such file"),
         (["--out", "/proc/nothing"], "/proc/nothing"),
     ],
 )
-def test_wrong_options_are_one_line(trained, tmp_path, capsys, words, named):
+def test_wrong_options_are_one_line(trained, tmp_path, capsys, monkeypatch, words, named):
+    monkeypatch.setattr(Run, "render", None)  # that nothing is computed
+    (tmp_path / "film.mp4").mkdir()
     before = sorted(tmp_path.iterdir())
+    words = [word.format(tmp=tmp_path) for word in words]
     out = [] if "--out" in words else ["--out", str(tmp_path / "o")]
     assert main(["render", trained, *out, *words]) == 2
     error = capsys.readouterr().err
@@ -133,6 +202,8 @@ def test_no_run_is_one_line(tmp_path, capsys):
 
 def test_a_folder_with_other_files_is_left_alone(trained, tmp_path, capsys):
     (tmp_path / "mine.txt").write_text("x")
-    assert main(["render", trained, "--out", str(tmp_path), "--format", "png"]) == 2
-    assert "holds files that are no frames" in capsys.readouterr().err
+    for out in (str(tmp_path), "/"):
+        assert main(["render", trained, "--out", out]) == 2
+        told = capsys.readouterr().err
+        assert "holds files that are no frames" in told and "delete" not in told
     assert [p.name for p in tmp_path.iterdir()] == ["mine.txt"]

@@ -43,10 +43,11 @@ def test_errors_that_nobody_reads():
 def test_streams_that_are_full():
     with open("/dev/full", "wb") as full:
         assert program(NOTHING, stderr=full).returncode == 2
-        done = program(["devices"], stdout=full)
-    assert done.returncode == 2
-    assert done.stderr.startswith(b"pp-cl: file: No space left on device")
-    assert done.stderr.count(b"\n") == 1
+        for words in (["devices"], ["train", "--help"], ["--version"]):
+            done = program(words, stdout=full)
+            assert done.returncode == 2
+            assert done.stderr.startswith(b"pp-cl: file: No space left on device")
+            assert done.stderr.count(b"\n") == 1
 
 
 def test_streams_that_are_closed():

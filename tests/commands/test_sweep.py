@@ -50,8 +50,9 @@ def refusal(capsys, words):
 @pytest.mark.parametrize(
     "more, said",
     [
-        (["--workers", "0"], "--workers 0"),
-        (["--workers", "x"], "--workers x"),
+        (["--workers", "0"], "--workers"),
+        (["--workers", "x"], "--workers"),
+        (["--json", "--dry-run"], "--json"),
         (["--workers", "2", "--scheduler", "tcp://a"], "--workers"),
         (["--seeds", "a"], "--seeds"),
         (["--vary", "points.count"], "--vary points.count"),
@@ -60,7 +61,7 @@ def refusal(capsys, words):
         (["--set", "points"], "--set points"),
         (["--iterations", "x"], "--iterations: train.iterations: 'x'"),
         (["--set", "points.sh_degree=3"], "points.sh_degree = 3"),
-        (["--metrics", "a"], "--metrics a"),
+        (["--metrics", "a"], "--metrics"),
         (["--json", "none/a.json"], "none/a.json"),
     ],
 )

@@ -100,16 +100,21 @@ def test_a_training_shows_itself_and_ends_what_it_started(tmp_path, capfd, monke
     """The browser is a script that notes the address it gets, and what answers there."""
     browser, noted = tmp_path / "browser.py", tmp_path / "noted"
     browser.write_text(
-        "import sys, urllib.request\n"
-        "page = urllib.request.urlopen(sys.argv[1]).status\n"
-        f"open({str(noted)!r}, 'w').write(f'{{sys.argv[1]}} {{page}}')\n"
+        "import os, re, sys, urllib.request\n"
+        "mode = os.stat(sys.argv[1].removeprefix('file://')).st_mode & 0o777\n"
+        "text = urllib.request.urlopen(sys.argv[1]).read().decode()\n"
+        "address = re.search('url=([^\"]*)', text)[1]\n"
+        "page = urllib.request.urlopen(address).status\n"
+        f"open({str(noted)!r}, 'w').write(f'{{sys.argv[1]}} {{mode:o}} {{address}} {{page}}')\n"
     )
     monkeypatch.setenv("BROWSER", f"{sys.executable} {browser} %s")
     scene = write_ball_scene(tmp_path / "ball")
     wait_for_the_browser(monkeypatch, noted)
     assert main([*arguments(scene, tmp_path / "run", train__iterations=3), "--view"]) == 0
-    address, page = noted.read_text().split()
+    argument, mode, address, page = noted.read_text().split()
     assert page == "200" and address in capfd.readouterr().out
+    assert mode == "600" and address.split("/")[-2] not in argument
+    assert not os.path.exists(argument.removeprefix("file://"))
     with pytest.raises(urllib.error.URLError):
         status(address)
     assert json.loads((tmp_path / "run" / "log.jsonl").read_text().splitlines()[-1])["finished"]

@@ -8,7 +8,7 @@ import pytest
 
 from pp_cl.cli import main
 from pp_cl.compress import search as search_module
-from pp_cl.compress.output import check_out, validation_views
+from pp_cl.compress.output import check_finished, validation_views
 from pp_cl.errors import UserError
 from pp_cl.trained import load_run
 
@@ -32,6 +32,8 @@ def test_the_command_writes_a_run(ball_run, tmp_path, capsys):
     assert main(["compress", str(ball_run), "--max-loss", "0.5dB", "--out", str(out)]) == 0
     printed = capsys.readouterr().out
     report = json.loads((out / "compress.json").read_text())
+    assert len(printed.splitlines()) == 2, "the result, and where it is"
+    assert sum(trial["taken"] for trial in report["trials"]) > 0
     assert "frames per second" in printed and report["loss"] <= 0.5 == report["most_loss"]
     assert report["bytes"][1] <= report["bytes"][0] / 1.9
     assert (out / "checkpoint.npz").stat().st_size < 1.1 * report["bytes"][1] + 20_000
@@ -47,8 +49,10 @@ def test_the_same_model_comes_back(ball_run, tmp_path, capsys, monkeypatch, dev)
     """What is written renders as what was measured."""
     monkeypatch.setattr(search_module, "TRIALS", ((1.0, "half", (True,)),))
     out = tmp_path / "small"
-    assert main(["compress", str(ball_run), "--max-loss", "3", "--out", str(out)]) == 0
+    assert main(["compress", str(ball_run), "--max-loss", "3", "--out", str(out), "-v"]) == 0
     report = json.loads((out / "compress.json").read_text())
+    printed = capsys.readouterr().out
+    assert all(trial["what"] in printed for trial in report["trials"])
     run = load_run(dev, out)
     assert run.model.cloud.sh[0].dtype == np.float16
     assert run.model.cloud.count == report["points"][1] < report["points"][0]
@@ -64,6 +68,8 @@ def test_bad_input_ends_in_one_line(ball_run, tmp_path, capsys):
         ([str(ball_run), "--max-loss", "nan"], "--max-loss"),
         ([str(ball_run), "--max-loss", "much"], "--max-loss"),
         ([str(ball_run), "--out", str(tmp_path / "held")], "held"),
+        ([str(ball_run), "--out", ""], "--out"),
+        ([str(ball_run), "--out", str(tmp_path / ("x" * 300))], "name"),
         ([str(ball_run), "--scene", str(tmp_path / "gone")], "gone"),
         ([str(ball_run), "--device", "none such"], "none such"),
     ):
@@ -72,8 +78,8 @@ def test_bad_input_ends_in_one_line(ball_run, tmp_path, capsys):
         assert error.count("\n") == 1 and expected in error
 
 
-def test_an_unfinished_run_is_refused(dev, ball_run, tmp_path):
+def test_an_unfinished_run_is_refused(dev, ball_run):
     run = load_run(dev, ball_run)
     run.header["finished"] = False
     with pytest.raises(UserError, match="not finished"):
-        check_out(run, tmp_path / "new")
+        check_finished(run)

@@ -31,16 +31,15 @@ def test_it_reads_back_by_plyfile(run, written):
     stored = run.model.cloud.arrays(run.dev)
     by_degree = [stored[f"points.sh{degree}"].get()[points.rows] for degree in range(3)]
     for c in range(16):
-        assert (vertex[f"f_dc_{c}"] == by_degree[0][:, 0, c]).all()
-        for degree in (1, 2):
+        for degree in (0, 1, 2):
             for k in range(2 * degree + 1):
-                assert (vertex[f"f_{degree}_{k}_{c}"] == by_degree[degree][:, k, c]).all()
+                assert (vertex[f"feature_{c}_{degree}_{k}"] == by_degree[degree][:, k, c]).all()
     assert len(vertex.properties) == 8 + 9 * 16
 
 
 def test_the_header_explains_every_kind_of_property(written):
     comments = " ".join(plyfile.PlyData.read(str(written[0])).comments)
-    for name in ("red, green, blue:", "weight:", "opacity:", "f_dc_C:", "f_D_K_C:"):
+    for name in ("red, green, blue:", "weight:", "opacity:", "feature_C_D_K:"):
         assert name in comments
 
 

@@ -1,5 +1,8 @@
 """Films have the frames, the size and the speed that were asked for."""
 
+import subprocess
+import sys
+
 import imageio.v2 as imageio
 import imageio_ffmpeg
 import numpy as np
@@ -61,9 +64,30 @@ def test_a_place_that_cannot_be_written_is_one_line(tmp_path):
         write_video(tmp_path / "missing" / "film.mp4", frames(), 10)
 
 
-def test_a_missing_package_names_the_extra(monkeypatch):
-    import sys
+@pytest.mark.parametrize("suffix", ["mp4", "webm", "gif"])
+def test_a_full_disk_is_one_line_and_leaves_no_film(tmp_path, suffix):
+    """A limit on the size of a file stands for it, in a process of its own."""
+    script = (
+        "import resource, signal, sys\n"
+        "import numpy as np\n"
+        "from pathlib import Path\n"
+        "from pp_cl.errors import UserError\n"
+        "from pp_cl.files.video import write_video\n"
+        "signal.signal(signal.SIGXFSZ, signal.SIG_IGN)\n"
+        "resource.setrlimit(resource.RLIMIT_FSIZE, (20_000, 20_000))\n"
+        "noise = np.random.default_rng(0).integers(0, 255, (9, 96, 96, 3), dtype=np.uint8)\n"
+        "try:\n"
+        "    write_video(Path(sys.argv[1]), noise, 10)\n"
+        "except UserError as error:\n"
+        "    print(error)\n"
+    )
+    words = [sys.executable, "-c", script, str(tmp_path / f"film.{suffix}")]
+    done = subprocess.run(words, capture_output=True, text=True, timeout=60)
+    assert f"film.{suffix}: cannot be written" in done.stdout and done.stderr == ""
+    assert list(tmp_path.iterdir()) == []
 
+
+def test_a_missing_package_names_the_extra(monkeypatch):
     monkeypatch.setitem(sys.modules, "imageio_ffmpeg", None)
     with pytest.raises(UserError, match=r"pip install pp-cl\[video\]"):
         check_video("mp4")

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from PIL import Image
 
 from pp_cl.errors import UserError
 from pp_cl.files.image import write_png
@@ -34,6 +35,20 @@ def test_two_folders_by_name(folders):
     for row in result["per_image"]:
         assert row == compare(pred / row["name"], truth / row["name"], ("psnr",))["per_image"][0]
     assert result["mean"] == mean(result["per_image"])
+
+
+def test_every_image_of_a_folder_is_compared_or_refused(folders):
+    """A format that is not read is not left out in silence; a hidden file is no image."""
+    for folder in folders:
+        Image.open(folder / "a.png").save(folder / "c.webp", lossless=True)
+        Image.open(folder / "a.png").save(folder / "d.JPG")
+        (folder / "._a.png").write_bytes(b"resource fork")
+    result = compare(*folders, ("psnr",))
+    assert [row["name"] for row in result["per_image"]] == ["a.png", "b.png", "c.webp", "d.JPG"]
+    assert result["per_image"][2]["psnr"] == result["per_image"][0]["psnr"]
+    Image.open(folders[1] / "a.png").save(folders[1] / "e.tif")
+    with pytest.raises(UserError, match="truth/e.tif: "):
+        compare(*folders, ("psnr",))
 
 
 def test_transparent_images_lie_over_white(tmp_path):

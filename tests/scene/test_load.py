@@ -6,6 +6,7 @@ from support.same_scene import views
 from support.transforms_scenes import refused, write_scene
 
 from pp_cl.errors import UserError
+from pp_cl.files.image import write_png
 from pp_cl.scene.camera import Camera
 from pp_cl.scene.distortion import Distortion
 from pp_cl.scene.load import evenly, load_scene, reading
@@ -16,12 +17,17 @@ from tools.scene_formats import nerfstudio
 
 
 def test_missing_folder_format_and_split(tmp_path):
+    scene, above = tmp_path / "above" / "scene", tmp_path / "above"
+    (scene / "images").mkdir(parents=True)
     refused(tmp_path / "none", tmp_path / "none", "no such folder", "demo")
-    refused(tmp_path, tmp_path, "no scene in it", "transforms_train.json")
-    write_scene(tmp_path)
-    refused(tmp_path / "transforms_train.json", "no such folder")
-    write_scene(tmp_path, "val")
-    refused(tmp_path, tmp_path / "transforms_test.json", "train, val", splits=("test",))
+    write_png(scene / "a.png", np.zeros((8, 8, 3)))
+    refused(scene, scene, "no scene in it: 1 image, 'images'", "docs/scenes.md")
+    write_scene(scene)
+    refused(scene / "transforms_train.json", "is a file", scene)
+    refused(scene / "images", f"no scene in it; {scene} is one")
+    refused(above, f"no scene in it; {scene} is one")
+    write_scene(scene, "val")
+    refused(scene, scene / "transforms_test.json", "train, val", splits=("test",))
 
 
 def test_a_split_without_photographs(tmp_path):

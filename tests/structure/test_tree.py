@@ -1,6 +1,10 @@
 """The rules of the tree: who has found one file of a stage has found all three."""
 
+import ast
 import configparser
+import re
+import sys
+from importlib.metadata import packages_distributions
 from pathlib import Path
 
 import pytest
@@ -28,6 +32,24 @@ def test_setup_cfg_lists_every_package():
     folders = {path.parent for path in (ROOT / "pp_cl").rglob("*.py")}
     packages = {path.relative_to(ROOT).as_posix().replace("/", ".") for path in folders}
     assert set(setup["options"]["packages"].split()) == packages | {"pp_cl.cl"}
+
+
+def test_setup_cfg_declares_every_package_that_is_imported():
+    setup = configparser.ConfigParser()
+    setup.read(ROOT / "setup.cfg")
+    lists = setup["options"]["install_requires"], *setup["options.extras_require"].values()
+    declared = {re.split("[<>=]", line)[0] for text in lists for line in text.split()}
+    found, names = packages_distributions(), set()
+    for path in (p for top in ("pp_cl", "tests", "tools") for p in (ROOT / top).rglob("*.py")):
+        for node in ast.walk(ast.parse(path.read_text("utf-8"))):
+            if isinstance(node, ast.Import):
+                names |= {alias.name.partition(".")[0] for alias in node.names}
+            if isinstance(node, ast.ImportFrom) and not node.level:
+                names.add(node.module.partition(".")[0])
+    names -= sys.stdlib_module_names | {"pp_cl", "tests", "tools", "oracle", "support"}
+    packages = {name: found.get(name, [name])[0].lower().replace("_", "-") for name in names}
+    assert "numpy" in names
+    assert set(packages.values()) <= {name.lower() for name in declared}
 
 
 def test_files_are_short():

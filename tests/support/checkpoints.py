@@ -11,11 +11,14 @@ import pytest
 from pp_cl.config import preset
 from pp_cl.errors import UserError
 from pp_cl.files.checkpoint import save_checkpoint
+from pp_cl.scene.demo import demo_frames
+from pp_cl.scene.identity import packed_camera
 from pp_cl.training.stored import load_run_state, stored_forms
 
 POINTS, STEP, STEPS = 40, 50, 60
 HEADER = {
     "scene": "5ce0e",
+    "views": [[one.name, packed_camera(one.camera)] for one in demo_frames("train")[:3]],
     "step": STEP,
     "finished": False,
     "initial_points": 50,

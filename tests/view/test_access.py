@@ -62,6 +62,12 @@ def test_on_all_interfaces_numbers_are_let_in_and_names_are_not():
         assert "Host" in refusal(everywhere, host=host)
 
 
+def test_on_all_of_ipv6_the_address_is_one_of_ipv6():
+    everywhere = Access("::", 8733, "secret")
+    assert everywhere.address == "http://[::1]:8733/secret/"
+    assert refusal(everywhere, host="[::1]:8733", origin="http://[::1]:8733", socket=True) is None
+
+
 def test_other_addresses_know_themselves_only():
     other = Access("::1", 8733, "secret")
     assert other.address == "http://[::1]:8733/secret/"

@@ -145,6 +145,8 @@ def test_a_run_whose_photographs_are_gone_is_still_shown(dev, copied):
     assert live.refresh() and "/nowhere/at/all" in live.notice
     around = live.surroundings()
     assert around["views"] == []
+    first = load_run(dev, copied).cameras("train")[0]
+    assert around["camera"] == asking(first)["camera"]
     _, image = drawn(live, around["camera"])
     assert (image < 200).any()
     with pytest.raises(UserError, match="no training views"):

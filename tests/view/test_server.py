@@ -268,6 +268,12 @@ def test_broken_http_is_refused_and_leaves_no_traceback(dev, trained, capsys, ca
                 await here.ready(socket)
                 socket._response.connection.transport.abort()
             await until(lambda: not here.server.tabs)
+            async with here.tab() as socket:  # is gone before its pings are answered
+                await here.ready(socket)
+                for _ in range(3000):
+                    await socket.ping(b"x" * 100)
+                socket._response.connection.transport.abort()
+            await until(lambda: not here.server.tabs)
 
     asyncio.run(scenario())
     assert caplog.text == "" and capsys.readouterr().err == ""

@@ -55,7 +55,7 @@ class Case:
         if status not in ENDS:
             raise Finding(f"exit status {status}")
         lines = [line for line in err.getvalue().splitlines() if line]
-        errors = [line for line in lines if line.startswith("pp-cl: ")]
+        errors = [line for line in lines if line.startswith("pp-cl")]
         if status == 2 and (not errors or errors[-1] != lines[-1]):
             raise Finding(f"refused with another last line than pp-cl's: {lines[-1:]}")
         if status == 2:

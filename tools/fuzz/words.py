@@ -155,7 +155,7 @@ def _program(case, words, name, text):
     last = done.stderr.decode("utf-8", "replace").strip().splitlines()[-1:]
     if done.returncode not in (0, 2):
         raise Finding(f"the program's exit status {done.returncode}: {last}")
-    if done.returncode == 2 and not last[0].startswith("pp-cl: "):
+    if done.returncode == 2 and not last[0].startswith("pp-cl"):
         raise Finding(f"the program's last line: {last[0][:100]}")
 
 

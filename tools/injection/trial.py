@@ -118,7 +118,7 @@ def differences(run: Path, expected: dict[str, bytes]) -> list[str]:
 def complaints(outcome: Outcome, statuses: tuple[int, ...]) -> list[str]:
     """What is wrong with how a command ended. It may print warnings, but of its end one line."""
     lines = outcome.errors.splitlines()
-    told = [line for line in lines if line.startswith("pp-cl: ")]
+    told = [line for line in lines if line.startswith("pp-cl")]
     found = []
     if outcome.status not in statuses:
         found.append(f"status {outcome.status}")

@@ -10,12 +10,14 @@ from tokenize import TokenError
 
 import numpy as np
 
-from pp_cl.errors import UserError
-from pp_cl.files.regular import refusal
+from pp_cl.errors import UserError, shown
+from pp_cl.files.npz import opened_zip
+from pp_cl.files.regular import opened_regular, refusal
 
-MOST_BYTES = 2**28  # of all arrays of a file, as float64
+MOST_BYTES = 2**25  # of all arrays of a file, as float64: 100,000 cameras need some 25 million
 MOST_TEXT = 2**20  # bytes of a file with the numbers of one camera
 MOST = 1e30  # larger numbers are refused: float32 could not hold their products
+KINDS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)  # of numpy's savez and savez_compressed
 # What numpy and zipfile raise for bytes that are no array, besides the errors that say so.
 BROKEN = (
     OSError,
@@ -36,7 +38,7 @@ BROKEN = (
 def read_npy(file: Path) -> np.ndarray:
     """The array of a .npy file as float64. Raises UserError naming the file."""
     try:
-        with file.open("rb") as opened:
+        with opened_regular(file) as opened:
             return _checked(file, "", _read(opened, MOST_BYTES))
     except FileNotFoundError:
         raise UserError(f"{file}: no such file; copy it there") from None
@@ -49,15 +51,18 @@ def read_npz(file: Path, wanted: str) -> dict[str, np.ndarray]:
     Raises UserError naming the file and the member.
     """
     try:
-        with zipfile.ZipFile(file) as archive:
-            names = [n.removesuffix(".npy") for n in archive.namelist() if n.endswith(".npy")]
-            arrays, left = {}, MOST_BYTES
-            for name in names:
-                if name.startswith(wanted):
-                    with archive.open(f"{name}.npy") as opened:
-                        arrays[name] = _checked(file, f"{name}: ", _read(opened, left))
-                    left -= arrays[name].nbytes
-            return arrays
+        arrays, left = {}, MOST_BYTES
+        with opened_zip(file) as archive:
+            for entry in archive.infolist():
+                name = entry.filename.removesuffix(".npy")
+                if name == entry.filename or not name.startswith(wanted):
+                    continue
+                if entry.compress_type not in KINDS:  # others take memory of their own
+                    raise ValueError(f"{name} is packed as numpy does not")
+                with archive.open(entry) as opened:
+                    arrays[name] = _checked(file, f"{name}: ", _read(opened, left))
+                left -= arrays[name].nbytes
+        return arrays
     except FileNotFoundError:
         raise UserError(f"{file}: no such file; copy it there") from None
     except BROKEN as error:
@@ -66,18 +71,14 @@ def read_npz(file: Path, wanted: str) -> dict[str, np.ndarray]:
 
 def _read(opened, most):
     """The array of an opened .npy file, of numbers and of at most so many bytes as float64."""
-    version = np.lib.format.read_magic(opened)
-    header = (
-        np.lib.format.read_array_header_1_0
-        if version == (1, 0)
-        else np.lib.format.read_array_header_2_0
-    )
-    shape, fortran, dtype = header(opened)
+    if np.lib.format.read_magic(opened) != (1, 0):  # others have headers of up to 4 GiB
+        raise ValueError("is of another version than 1.0")
+    shape, fortran, dtype = np.lib.format.read_array_header_1_0(opened)
     if dtype.kind not in "fiu":
         raise ValueError(f"holds {dtype}, no numbers")
     count = math.prod(shape)
     if min(shape, default=0) < 0 or count * max(dtype.itemsize, 8) > most:
-        raise ValueError(f"claims the shape {shape}")
+        raise ValueError(f"claims the shape {shown(str(shape), 40)}, more than {MOST_BYTES} bytes")
     data = opened.read(count * dtype.itemsize)
     if len(data) < count * dtype.itemsize:
         raise ValueError("ends too early")

@@ -60,6 +60,8 @@ def _transforms_camera(frame, size):
 
 def _path_camera(frame, size):
     """Of nerfstudio's viewer: fov is the angle across the height, in degrees."""
+    if frame.get("camera_type") not in (None, "perspective"):
+        raise frame.error("camera_type", "only perspective is rendered; change it, and fov with it")
     width, height = _size(frame, ("render_width", "render_height"), size)
     fov = frame.number("fov", above=math.degrees(LEAST_ANGLE), below=180)
     if fov is None:

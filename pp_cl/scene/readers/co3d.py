@@ -6,6 +6,7 @@ scene's folder.
 import gzip
 import json
 import os
+import re
 import zlib
 from functools import lru_cache, partial
 from pathlib import Path, PurePosixPath
@@ -14,15 +15,19 @@ import numpy as np
 
 from pp_cl.errors import UserError, quoted
 from pp_cl.files.image import image_size
-from pp_cl.files.regular import refusal
+from pp_cl.files.regular import opened_regular, refusal
 from pp_cl.scene.camera import Camera
 from pp_cl.scene.photograph import Photograph
-from pp_cl.scene.readers.common import SPLITS, check_split, find_image, hold_out
+from pp_cl.scene.readers.common import SPLITS, check_split, find_image, hold_out, listing
 from pp_cl.scene.readers.frame import MOST, Frame, numbers, read_json, rigid
 
 FILES = "a sequence of CO3D, whose frame_annotations.jgz lies one folder above"
 ANNOTATIONS = "frame_annotations.jgz"
-MOST_TEXT = 2**31  # bytes of annotations; the largest category has a fifth of it
+# characters of a file of annotations, and frames in it: the largest category has less than half
+MOST_TEXT, MOST_FRAMES = 2**30, 2**20
+MOST_KEPT = 2**22  # characters of the frames of one sequence: 3,500 of them
+SPACES = re.compile(r"\s*")
+PIECE = 2**18  # characters that are unpacked at once; a frame takes some 1,200
 # PyTorch3D: x left, y up, z forwards; OpenCV: x right, y down, z forwards
 CV_FROM_P3D = np.diag([-1.0, -1.0, 1.0])
 # what focal lengths and principal points are multiplied with, of half the width and height
@@ -65,7 +70,7 @@ def read_split(folder: Path, split: str) -> list[Photograph]:
         chosen = hold_out(chosen, split)
     else:
         chosen = [frame for frame in chosen if _path(frame, "image") in listed[split]]
-    return [_photograph(folder, frame) for frame in chosen]
+    return [_photograph(folder, frame) for frame in listing(chosen)]
 
 
 def _whole(folder):
@@ -78,17 +83,47 @@ def _annotations(file, sequence, _changed):
     """[(index, annotation)] of a sequence's frames, of a file last changed then. Raises
     UserError.
     """
+    found, left = [], MOST_KEPT
     try:
-        with gzip.open(file) as opened:
-            text = opened.read(MOST_TEXT + 1)
-        if len(text) > MOST_TEXT:
-            raise UserError(f"{file}: holds more than {MOST_TEXT} bytes; give another file")
-        data = json.loads(text)
+        with opened_regular(file) as packed, gzip.open(packed, "rt", encoding="utf-8") as opened:
+            for index, (own, size) in enumerate(_objects(opened)):
+                if own.get("sequence_name") == sequence:
+                    found.append((index, own))
+                    left -= size
+                if left < 0 or index == MOST_FRAMES:
+                    raise ValueError(
+                        f"more than {MOST_FRAMES} frames, or {MOST_KEPT} characters of one sequence"
+                    )
     except (OSError, EOFError, zlib.error, ValueError, RecursionError) as error:
         raise refusal(file, error, "gzipped JSON") from None
-    if not isinstance(data, list) or not all(isinstance(own, dict) for own in data):
-        raise UserError(f"{file}: must hold a list of annotations; copy it anew")
-    return [(i, own) for i, own in enumerate(data) if own.get("sequence_name") == sequence]
+    return found
+
+
+def _objects(opened):
+    """(object, characters of it) of a JSON list of objects in a text file, one after the other.
+    Raises ValueError for anything else, or more than MOST_TEXT characters.
+    """
+    decode, text, at, left = json.JSONDecoder().raw_decode, "", 0, MOST_TEXT
+    due = "["  # what may come next, besides spaces
+    while due:
+        spaces = SPACES.match(text, at)
+        at = spaces.end()
+        if len(spaces[0]) >= PIECE:
+            raise ValueError(f"{PIECE} spaces in a row")
+        if len(text) - at < PIECE and (piece := opened.read(PIECE)):
+            left -= len(piece)
+            if left < 0:
+                raise ValueError(f"more than {MOST_TEXT} characters")
+            text, at = text[at:] + piece, 0
+        elif at == len(text) or text[at] not in due:
+            raise ValueError("is no list of annotations")
+        elif text[at] == "{":
+            own, end = decode(text, at)
+            yield own, end - at
+            at, due = end, ",]"
+        else:
+            due = {"[": "{]", ",": "{", "]": ""}[text[at]]
+            at += 1
 
 
 def _number(frame):

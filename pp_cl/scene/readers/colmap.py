@@ -15,7 +15,7 @@ from pp_cl.scene.camera import Camera
 from pp_cl.scene.distortion import Distortion
 from pp_cl.scene.photograph import Photograph
 from pp_cl.scene.readers.colmap_model import Image, Lens, is_model, read_model
-from pp_cl.scene.readers.common import SPLITS, check_split, find_image, hold_out
+from pp_cl.scene.readers.common import SPLITS, check_split, find_image, hold_out, listing
 
 FILES = "a sparse model of COLMAP beside images"
 PLACES = ("sparse/0", "sparse", "colmap/sparse/0", ".")
@@ -45,7 +45,7 @@ def read_split(folder: Path, split: str) -> list[Photograph]:
     ordered = sorted(images, key=lambda image: image.name)
     return [
         _photograph(folder, model, image, lenses[image.camera])
-        for image in hold_out(ordered, split)
+        for image in listing(hold_out(ordered, split))
     ]
 
 

@@ -40,8 +40,9 @@ MODELS = {
 }
 NAMES = {number: name for name, (number, _) in MODELS.items()}
 MOST_PIXELS = 2**20  # a side; beyond it a number is no size
-MOST_NAME = 4096  # bytes of an image's name
-MOST_LINE = 2**26  # characters of a line: a million 2D points
+MOST_ENTRIES = 2**17  # of a file, cameras or images
+MOST_NAME = 1024  # bytes of an image's name
+MOST_LINE = 2**22  # characters of a line: 150,000 2D points
 UNKNOWN = "is no known camera model; undistort with `colmap image_undistorter`, or copy it anew"
 POINT2D_BYTES = 24  # x, y and the id of a 3D point
 
@@ -76,7 +77,7 @@ def read_model(folder: Path) -> tuple[dict[int, Lens], list[Image]]:
     )
     lenses = _lenses(folder / f"cameras{suffix}", read_cameras)
     file = folder / f"images{suffix}"
-    images, names = list(read_images(file)), set()
+    images, names = list(_bounded(file, read_images(file))), set()
     if not images:
         raise UserError(f"{file}: holds no images; run COLMAP's mapper again")
     for image in images:
@@ -95,11 +96,19 @@ def read_model(folder: Path) -> tuple[dict[int, Lens], list[Image]]:
 def _lenses(file, read):
     """{id: Lens}. Raises UserError for two of one id."""
     lenses = {}
-    for identity, lens in read(file):
+    for identity, lens in _bounded(file, read(file)):
         if identity in lenses:
             raise UserError(f"{file}: camera {identity} stands there twice; remove one")
         lenses[identity] = lens
     return lenses
+
+
+def _bounded(file, entries):
+    """The entries. Raises UserError where they are more than MOST_ENTRIES."""
+    for count, entry in enumerate(entries):
+        if count == MOST_ENTRIES:
+            raise UserError(f"{file}: holds more than {MOST_ENTRIES} entries; split the model")
+        yield entry
 
 
 def is_model(folder: Path, suffix: str) -> bool:
@@ -122,7 +131,9 @@ def _lens(where, model, size, parameters):
 def _image(where, name, camera, numbers):
     """The Image; numbers: qw, qx, qy, qz, tx, ty, tz. Raises UserError beginning with `where`."""
     # it goes into messages of one line
-    if not name or any(unicodedata.category(letter) == "Cc" for letter in name):
+    if not 1 <= len(name) <= MOST_NAME or any(
+        unicodedata.category(letter) == "Cc" for letter in name
+    ):
         raise UserError(f"{where}: {name[:80]!r} is no name of an image; rename it")
     numbers = np.array(numbers, np.float64)
     length = np.linalg.norm(numbers[:4]) if _are_numbers(numbers) else 0
@@ -145,7 +156,10 @@ def _lines(file):
         with file.open(encoding="utf-8-sig") as opened:
             for number, line in enumerate(iter(lambda: opened.readline(MOST_LINE), ""), 1):
                 if len(line) == MOST_LINE:
-                    raise UserError(f"{file}: line {number}: does not end; copy it anew")
+                    raise UserError(
+                        f"{file}: line {number}: is longer than {MOST_LINE} characters; copy it"
+                        " anew"
+                    )
                 yield number, line.strip()
     except (OSError, ValueError) as error:
         raise refusal(file, error, "text") from None

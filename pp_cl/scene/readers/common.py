@@ -2,15 +2,18 @@
 that knows no splits.
 """
 
-from collections.abc import Callable, Sequence
+import os
+from collections.abc import Callable, Iterable, Sequence
 from functools import partial
 from pathlib import Path
 from typing import TypeVar
 
+from tqdm import tqdm
+
 from pp_cl.errors import UserError
+from pp_cl.files.image import ENDINGS
 
 HELD_OUT = 8  # one photograph of so many, the first among them, as LLFF and 3DGS do
-ENDINGS = (".png", ".jpg", ".jpeg", ".webp", ".exr")
 SPLITS = ["test", "train"]
 Item = TypeVar("Item")
 
@@ -25,18 +28,22 @@ def find_image(
     folder, by a symbolic link or otherwise, and for one where no image is.
     """
     try:
-        root = folder.resolve()
-        paths = [(root / (given + ending)).resolve() for ending in endings]
-        if not all(path.is_relative_to(root) for path in paths):
-            raise fail(f"{given!r} leaves the scene's folder; move the image into it")
-        found = [path for path in paths if path.is_file()]
-    # a loop of links, a name too long, a zero byte
-    except (OSError, RuntimeError, ValueError) as error:
+        root = os.path.realpath(folder)
+        for ending in endings:
+            path = os.path.realpath(os.path.join(root, given + ending))
+            if os.path.commonpath([root, path]) != root:
+                raise fail(f"{given!r} leaves the scene's folder; move the image into it")
+            if os.path.isfile(path):
+                return os.path.relpath(path, root).replace(os.sep, "/")
+    except (OSError, ValueError) as error:  # a name too long, a zero byte
         raise fail(f"{given[:80]!r} is not a usable path ({error})") from error
-    if not found:
-        tried = "".join(f", nor with {ending} added" for ending in endings if ending)
-        raise fail(f"no image at {given!r}{tried}; copy it there or remove the frame")
-    return found[0].relative_to(root).as_posix()
+    tried = "".join(f", nor with {ending} added" for ending in endings if ending)
+    raise fail(f"no image at {given[:80]!r}{tried}; copy it there or remove the frame")
+
+
+def listing(items: Sequence[Item]) -> Iterable[Item]:
+    """The items, of which a progress bar shows on a terminal where there are thousands."""
+    return tqdm(items, "listing", unit="image", leave=False, disable=None, delay=2)
 
 
 def folder_images(folder: Path, name: str) -> list[str]:

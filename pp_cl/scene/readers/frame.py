@@ -10,16 +10,24 @@ from typing import Any
 
 import numpy as np
 
-from pp_cl.errors import UserError
-from pp_cl.files.regular import read_regular, refusal
+from pp_cl.errors import UserError, quoted
+from pp_cl.files.regular import read_json_text, refusal
 from pp_cl.scene.camera import Camera
 from pp_cl.scene.distortion import Distortion
 
 COEFFICIENTS = ("k1", "k2", "p1", "p2", "k3")  # of Distortion
 # values of camera_model that are pinhole cameras when those coefficients are 0
 PINHOLES = ("PERSPECTIVE", "PINHOLE", "SIMPLE_PINHOLE", "OPENCV", "SIMPLE_RADIAL", "RADIAL")
+# keys by which nerfstudio and instant-ngp name lenses, and the values that are perspective; null,
+# false and 0 are too
+LENS_KEYS = {
+    "camera_model": PINHOLES,
+    "camera_type": ("PERSPECTIVE",),
+    **dict.fromkeys(("is_fisheye", "ftheta_p0", "latlong", "equirectangular", "orthographic"), ()),
+}
+UNDISTORT = "undistort the images to PINHOLE, as `colmap image_undistorter` does"
 
-MOST_BYTES = 2**30  # of a JSON file; a frame takes some hundred
+MOST_BYTES = 2**26  # of a JSON file: 100,000 frames of 670
 MOST = 1e30  # larger numbers are refused: float32 could not hold their products
 # largest eigenvalue of R^T R - 1 that is taken for rounding; NeRF-synthetic has 1e-6
 ROTATION_TOLERANCE = 1e-3
@@ -30,7 +38,7 @@ GL_FROM_CV = np.diag([1.0, -1.0, -1.0, 1.0])  # OpenGL: y up, z backward; OpenCV
 def read_json(file: Path) -> Any:
     """Content of a JSON file. Raises UserError naming the file and the place that is broken."""
     try:
-        data = json.loads(read_regular(file, MOST_BYTES, "utf-8-sig"))
+        data = json.loads(read_json_text(file, MOST_BYTES, "utf-8-sig"))
     except json.JSONDecodeError as error:
         raise UserError(
             f"{file}: line {error.lineno}, column {error.colno}: {error.msg}; correct the JSON"
@@ -107,20 +115,22 @@ def pinhole(frame: Frame, width: int, height: int) -> Camera:
 
 
 def distortion(frame: Frame) -> Distortion:
-    """The lens distortion of a frame in nerfstudio's format. Raises UserError for a model other
-    than OpenCV's.
+    """The lens distortion of a frame in the format of nerfstudio or instant-ngp. Raises UserError
+    for a lens other than OpenCV's perspective one.
     """
-    model = frame.get("camera_model")
-    if model is not None and model not in PINHOLES:
-        raise frame.error(
-            "camera_model", f"{model!r} is not modelled; undistort the images to PINHOLE"
-        )
+    check_perspective(frame)
     if frame.number("k4"):
-        raise frame.error(
-            "k4", "a fourth radial coefficient is not modelled; undistort the images to PINHOLE"
-        )
+        raise frame.error("k4", f"a fourth radial coefficient is not modelled; {UNDISTORT}")
     given = {key: frame.number(key) for key in COEFFICIENTS}
     return Distortion(**{key: value for key, value in given.items() if value is not None})
+
+
+def check_perspective(frame: Frame) -> None:
+    """Raise UserError where a key says that the frame's lens is no perspective one."""
+    for key, known in LENS_KEYS.items():
+        value = frame.get(key)
+        if value and str(value).upper() not in known:
+            raise frame.error(key, f"{quoted(value, 40)} is not modelled; {UNDISTORT}")
 
 
 def _focal_lengths(frame, width, height):
@@ -173,7 +183,7 @@ def rigid(value: Any, fail: Callable[[str], UserError]) -> np.ndarray:
         raise fail(f"has shape {matrix.shape}; must be 4x4 or 3x4 numbers")
     if not (np.abs(matrix) < MOST).all():
         raise fail("holds NaN, Inf or a huge number; must be a camera-to-world matrix")
-    if not np.allclose(matrix[3:], [0, 0, 0, 1], rtol=0, atol=1e-6):
+    if np.abs(matrix[3:] - [0, 0, 0, 1]).max(initial=0) > 1e-6:
         raise fail(f"its last row is {matrix[3].tolist()}; must be [0, 0, 0, 1]")
     u, scale, vt = np.linalg.svd(matrix[:3, :3])
     if np.abs(scale**2 - 1).max() > ROTATION_TOLERANCE or np.linalg.det(u @ vt) < 0:

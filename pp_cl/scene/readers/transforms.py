@@ -8,7 +8,7 @@ from pathlib import Path, PurePosixPath
 from pp_cl.errors import UserError
 from pp_cl.files.image import image_size
 from pp_cl.scene.photograph import Photograph
-from pp_cl.scene.readers.common import SPLITS, check_split, find_image, hold_out
+from pp_cl.scene.readers.common import SPLITS, check_split, find_image, hold_out, listing
 from pp_cl.scene.readers.frame import Frame, distortion, pinhole, read_json
 
 ENDINGS = ("", ".png", ".exr")  # of a file_path
@@ -40,15 +40,23 @@ def read_split(folder: Path, split: str) -> list[Photograph]:
     """
     file = folder / (f"transforms_{split}.json" if _split_files(folder) else SINGLE)
     check_split(file, split, splits(folder))
-    data = _read(file)
-    frames = [
-        _read_frame(folder, Frame(file, data, frame, index))
-        for index, frame in enumerate(data["frames"])
-    ]
+    data, read = _read(file), {}
+    for index, own in enumerate(listing(data["frames"])):
+        frame = Frame(file, data, own, index)
+        photograph = _read_frame(folder, frame)
+        if photograph.name in read:
+            raise frame.error("file_path", f"{photograph.name!r} stands there twice; remove one")
+        read[photograph.name] = photograph
+    frames = list(read.values())
     return _of_split(file, data, frames, split) if file.name == SINGLE else frames
 
 
 def _split_files(folder):
+    """The transforms_<split>.json of a scene that has one for training, or no transforms.json: else
+    they are copies beside it.
+    """
+    if (folder / SINGLE).is_file() and not (folder / "transforms_train.json").is_file():
+        return []
     return [file for file in folder.glob("transforms_*.json") if file.is_file()]
 
 

@@ -242,7 +242,7 @@ def test_bad_file(sequence, case):
 
 def test_annotations_beyond_all_bounds(sequence, monkeypatch):
     monkeypatch.setattr("pp_cl.scene.readers.co3d.MOST_TEXT", 1000)
-    refused(sequence, "more than 1000 bytes")
+    refused(sequence, "more than 1000 characters")
 
 
 def test_a_set_list_that_is_a_pipe_is_not_waited_for(sequence):

@@ -93,7 +93,9 @@ def test_angle_of_height_and_single_focal_length(tmp_path):
 def test_ways_to_name_an_image(tmp_path, given):
     (tmp_path / "sub").mkdir()
     (tmp_path / "linked.png").symlink_to("train_1.png")
-    view = train_views(tmp_path, file_path=given.format(folder=tmp_path))[0]
+    path = given.format(folder=tmp_path)
+    write_scene(tmp_path, edit=lambda data: data["frames"][1].update(file_path=path))
+    view = load_scene(tmp_path).splits["train"][1]
     assert view.name == "train_1.png" and np.array_equal(
         view.image, read_rgba(tmp_path / "train_1.png")
     )
@@ -148,7 +150,7 @@ BAD_FRAMES = {
     "no such image": ({"file_path": "./train_9"}, "file_path", "train_9"),
     "folder as image": ({"file_path": "."}, "file_path", "no image"),
     "zero byte": ({"file_path": "a\0b"}, "file_path", "not a usable path"),
-    "endless name": ({"file_path": "a" * 5000}, "file_path", "not a usable path"),
+    "endless name": ({"file_path": "a" * 5000}, "file_path", "no image at"),
     "parent folder": ({"file_path": "../secret.png"}, "file_path", "leaves the scene's folder"),
     "parent folder without ending": (
         {"file_path": "./x/../../secret"},
@@ -157,7 +159,7 @@ BAD_FRAMES = {
     ),
     "absolute": ({"file_path": "/etc/hostname"}, "file_path", "leaves the scene's folder"),
     "link out": ({"file_path": "link_out"}, "file_path", "leaves the scene's folder"),
-    "loop of links": ({"file_path": "loop"}, "file_path", "not a usable path"),
+    "loop of links": ({"file_path": "loop"}, "file_path", "no image at"),
     "no matrix": ({"transform_matrix": None}, "transform_matrix", "4x4 or 3x4"),
     "NaN": ({"transform_matrix": NAN_MATRIX.tolist()}, "transform_matrix", "NaN"),
     "infinite": ({"transform_matrix": (MATRIX[:3] + math.inf).tolist()}, "transform_matrix", "Inf"),
@@ -194,6 +196,9 @@ BAD_FRAMES = {
     "height": ({"h": 19}, "h", "24x18", "train_1.png"),
     "distortion": ({"k4": 0.01}, "k4", "undistort"),
     "fisheye": ({"camera_model": "OPENCV_FISHEYE"}, "camera_model", "undistort"),
+    "fisheye of instant-ngp": ({"is_fisheye": True}, "is_fisheye", "undistort"),
+    "panorama": ({"camera_type": "equirectangular"}, "camera_type", "undistort"),
+    "an image twice": ({"file_path": "train_0.png"}, "file_path", "'train_0.png'", "twice"),
     "near only": ({"near": 1.0}, "far", "missing"),
     "far only": ({"far": 1.0}, "near", "missing"),
     "near 0": ({"near": 0, "far": 2}, "near", "above 0"),
@@ -249,6 +254,19 @@ def test_frame_that_is_no_object(tmp_path):
 def test_broken_json(tmp_path, text, words):
     (tmp_path / "transforms_train.json").write_text(text, errors="surrogateescape")
     refused(tmp_path, tmp_path / "transforms_train.json", *words)
+
+
+def test_a_copy_beside_transforms_json_is_no_split(tmp_path):
+    write_scene(tmp_path)
+    (tmp_path / "transforms_train.json").rename(tmp_path / "transforms.json")
+    (tmp_path / "transforms_backup.json").write_text("{}")
+    assert transforms.splits(tmp_path) == ["test", "train"]
+    assert len(load_scene(tmp_path).splits["train"]) == 2
+
+
+def test_what_is_perspective_by_its_keys_is_read(tmp_path):
+    keys = {"is_fisheye": False, "camera_type": "perspective", "orthographic": None}
+    assert len(train_views(tmp_path, **keys)) == 3
 
 
 def test_a_pipe_is_no_file_of_cameras(tmp_path):
