@@ -4,19 +4,17 @@ import dataclasses
 import json
 import math
 import os
-import warnings
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
-from functools import cache
 from pathlib import Path
 from typing import Any
 
 from pp_cl.errors import UserError, quoted, shown, suggestion
 from pp_cl.files.regular import read_regular
-from pp_cl.presets import ABSENT, ADDED, PRESETS, REMOVED, RENAMED
+from pp_cl.presets import PRESETS
 from pp_cl.settings import NetworkConfig, PointsConfig, RasterConfig, SceneConfig, TrainConfig
 
-FORMAT = 4  # of config.json: raised when keys are added, change meaning or are removed
+FORMAT = 1  # of config.json: raised when keys are added, change meaning or are removed
 MOST_BYTES = 2**20  # of a config.json
 MOST_TEXT = 4096  # characters of a setting
 # by network.blocks, how many convolutions there are but the last
@@ -26,7 +24,7 @@ MEND_SETTINGS = "restore it or start a new run"
 
 @dataclass
 class Config:
-    """All settings of a run. notes: what the user should be told about how they were read."""
+    """All settings of a run."""
 
     preset: str = "tiny"
     scene: SceneConfig = field(default_factory=SceneConfig)
@@ -34,13 +32,10 @@ class Config:
     raster: RasterConfig = field(default_factory=RasterConfig)
     network: NetworkConfig = field(default_factory=NetworkConfig)
     train: TrainConfig = field(default_factory=TrainConfig)
-    notes: list[str] = field(default_factory=list, compare=False)
 
     def to_json(self) -> str:
         """The settings as JSON text: {"format": FORMAT, "preset": name, section: {name: value}}."""
-        stored = {"format": FORMAT, **dataclasses.asdict(self)}
-        del stored["notes"]
-        return json.dumps(stored, indent=1)
+        return json.dumps({"format": FORMAT, **dataclasses.asdict(self)}, indent=1)
 
 
 def preset(name: str) -> Config:
@@ -61,12 +56,8 @@ def sections(config: Config) -> Iterator[tuple[str, Any]]:
 
 
 def assign(config: Config, key: str, value: Any, origin: str) -> None:
-    """Set section.key from a value or its text; an old key sets the new one and leaves a note.
-    Raises UserError naming the origin and the key.
-    """
-    if key in RENAMED:
-        config.notes.append(f"{origin}: {key} is called {RENAMED[key]} now")
-    section, _, name = RENAMED.get(key, key).partition(".")
+    """Set section.key from a value or its text. Raises UserError naming the origin and the key."""
+    section, _, name = key.partition(".")
     owner = dict(sections(config)).get(section)
     if owner is None or name not in vars(owner):
         near = suggestion(key, (f"{s}.{name}" for s, v in sections(config) for name in vars(v)))
@@ -183,59 +174,41 @@ def configure(config: Config, scene: str, given: Iterable[tuple[str, Any, str]] 
         assign(config, key, value, origin)
     if config.scene.masks:
         assign(config, "scene.masks", str(Path(config.scene.masks).resolve()), "settings")
-    validate(config, "settings", {RENAMED.get(key, key): origin for key, _, origin in given})
+    validate(config, "settings", {key: origin for key, _, origin in given})
     return config
 
 
 def load_config(path: Path | str) -> Config:
-    """Config of a config.json. One of an earlier format may lack the keys of presets.ABSENT that
-    came later, and one without a format number have old keys: they leave one line as a warning.
-    Raises UserError naming the file and the key.
-    """
+    """Config of a config.json. Raises UserError naming the file and the key."""
     path = Path(path)
     stored = _read_settings(path)
-    number, name = _format(path, stored), stored.get("preset")
+    _check_format(path, stored)
+    name = stored.get("preset")
     if type(name) is not str or name not in PRESETS:
         raise UserError(
             f"{path}: key preset is missing or none of {', '.join(PRESETS)}; {MEND_SETTINGS}"
         )
     config = preset(name)
     known = {f"{s}.{item.name}" for s, v in sections(config) for item in dataclasses.fields(v)}
-    found = _stored_keys(path, stored, known | _earlier_keys(number))
-    found = {key: value for key, value in found.items() if key not in REMOVED}
-    lacking = known - {RENAMED.get(key, key) for key in found}
-    for key in sorted(lacking):
-        if key not in ABSENT or number >= ADDED.get(key, 1):
-            raise UserError(f"{path}: key {key} is missing; {MEND_SETTINGS}")
-        assign(config, key, ABSENT[key], str(path))
+    found = _stored_keys(path, stored, known)
+    for key in sorted(known - found.keys()):
+        raise UserError(f"{path}: key {key} is missing; {MEND_SETTINGS}")
     for key, value in found.items():
-        _check_type(config, RENAMED.get(key, key), value, f"{path}: {key}")
+        _check_type(config, key, value, f"{path}: {key}")
         assign(config, key, value, str(path))
-    config.notes.clear()  # one line says it all
-    if number < FORMAT:
-        renamed = found.keys() & RENAMED.keys()
-        _tell_of_earlier_version(path, number, tuple(sorted(lacking)), tuple(sorted(renamed)))
     validate(config, str(path))
     if not config.scene.path:
         raise UserError(f"{path}: scene.path is empty; {MEND_SETTINGS}")
     return config
 
 
-def _earlier_keys(number):
-    """The keys that a config.json of this format may hold beside today's."""
-    return {*(REMOVED if number < 3 else ()), *(() if number else RENAMED)}
-
-
-def _format(path, stored):
-    """The format number of a config.json, 0 where there is none."""
-    if "format" not in stored:
-        return 0
-    number = stored["format"]
-    if type(number) is not int or not 1 <= number <= FORMAT:
+def _check_format(path, stored):
+    """Raise UserError for a config.json of another format."""
+    number = stored.get("format")
+    if type(number) is not int or number != FORMAT:
         raise UserError(
             f"{path}: format is {quoted(number, 40)}, this version reads {FORMAT}; start a new run"
         )
-    return number
 
 
 def _read_settings(path):
@@ -300,20 +273,6 @@ def _is_path(text):
         return len(text) <= MOST_TEXT and b"\0" not in os.fsencode(text)
     except UnicodeEncodeError:
         return False
-
-
-@cache
-def _tell_of_earlier_version(path, number, lacking, renamed):
-    """Say once what was made of the settings of an earlier version."""
-    written = f"in format {number}" if number else "without a format number"
-    told = [f"{path}: written by an earlier version, {written}"]
-    if renamed:
-        others = f", and {len(renamed) - 1} other keys have new names" * (len(renamed) > 1)
-        told.append(f"{renamed[0]} is called {RENAMED[renamed[0]]} now{others}")
-    if lacking:
-        taken = ", ".join(f"{key} = {text_of(ABSENT[key]) or 'none'}" for key in lacking)
-        told.append(f"what it lacks is taken as {taken}")
-    warnings.warn("; ".join(told), stacklevel=3)
 
 
 def text_of(value: Any) -> str:

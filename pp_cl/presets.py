@@ -1,4 +1,4 @@
-"""The presets, and the names by which settings are or were known: data only."""
+"""The presets, and the short names of settings: data only."""
 
 # What differs from the defaults in config.py, which are the tiny preset: minutes on a CPU.
 PRESETS = {
@@ -67,64 +67,4 @@ SHORT = {
     "seed": "train.seed",
     "memory": "train.memory_gib",
     "tolerance": "network.tolerance",
-}
-
-# Old key: new key. Old keys are accepted in this version and noted in config.Config.notes.
-RENAMED = {
-    "points.footprint": "raster.footprint",
-    "points.radius": "raster.radius",
-    "points.gamma": "raster.gamma",
-    "points.max_tracked": "raster.max_tracked",
-    "points.stop": "raster.early_stop",
-    "points.tau": "raster.tau",
-    "points.mean_gradient": "raster.mean_gradient",
-    "train.phases": "train.pixel_jitter",
-    "train.feature_eps": "train.sh_eps",
-    "train.smooth": "train.sh_smoothing",
-    "train.smooth_every": "train.sh_smoothing_every",
-    "train.final_weight": "train.final_prune_weight",
-    "train.average": "train.ema",
-    "train.memory": "train.memory_gib",
-}
-
-
-# What a setting is taken for that a config.json of an earlier format may lack, since it came later:
-# what the program did before.
-ABSENT = {
-    "scene.mask_from": "given",
-    "scene.masks": "",
-    "scene.mask_tolerance": 10.0,
-    "scene.box": (0.0, 0.0, 0.0, 0.0, 0.0, 0.0),
-    "points.opacity": 1.0,
-    "points.sh_degree": 2,
-    "raster.blend": "softmax",
-    "raster.tau": 0.0,
-    "raster.window": "image",
-    "network.blocks": "double",
-    "network.channels": "",
-    "network.residual": False,
-    "network.tolerance": 1e-5,
-    "train.opacity_rate_steps": 0,
-    "train.smooth_l1": 0.0,
-    "train.mask_weight": 0.0,
-    "train.spread_weight": 0.0,
-    "train.perceptual_weight": 0.0,
-    "train.prune_looks": 100,
-    "train.refine_at": (1.0, 1.0),
-    "train.memory_gib": 0.0,
-    "train.eval_every": 0,
-    "train.checkpoint_minutes": 0.0,
-}
-
-# Settings of formats before 3, for the moments of the SH coefficients that Adam kept then, by their
-# names and older ones: a finished run is what it is without them.
-REMOVED = ("train.lazy_adam", "train.lazy", "train.moments_16bit", "train.half_moments")
-
-# The format of config.json that first had a key of ABSENT; the others came with format 1.
-ADDED = {
-    "train.checkpoint_minutes": 2,
-    "network.channels": 2,
-    "network.residual": 3,
-    "train.smooth_l1": 3,
-    "train.spread_weight": 4,
 }

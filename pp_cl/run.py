@@ -321,12 +321,6 @@ def _resume(config, views, net, stored, *, file):
     path = config.scene.path
     if told := difference(header, views, views):
         raise UserError(f"{file}: belongs to another scene than {path} ({told}); use another --out")
-    if "pixels" not in header:
-        warnings.warn(
-            f"{file}: was begun by a version that did not keep the photographs' digests; only names"
-            f" and cameras of {path} could be compared",
-            stacklevel=2,
-        )
     model = Model.load(net.dev, header, arrays, net, degree=config.points.sh_degree)
     trainer = Trainer(net.dev, config, model, views)
     trainer.restore(header["step"], arrays)

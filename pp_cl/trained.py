@@ -67,7 +67,7 @@ class Run:
         return scene
 
     def _some_photographs(self):
-        if not self.header.get("pixels"):
+        if not self.header["pixels"]:
             return []
         return open_scene(self.dev, self.config, ("train",), COMPARED_VIEWS).splits["train"]
 

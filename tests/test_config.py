@@ -3,7 +3,6 @@
 import json
 import os
 import re
-import warnings
 
 import numpy as np
 import pytest
@@ -11,7 +10,7 @@ import pytest
 from pp_cl.config import Config, assign, configure, help_lines, load_config, preset, validate
 from pp_cl.errors import UserError
 from pp_cl.network.layers import convolutions, unet_layers
-from pp_cl.presets import ABSENT, PRESETS, RENAMED
+from pp_cl.presets import PRESETS
 
 
 def test_the_scene_is_said_once():
@@ -28,87 +27,6 @@ def test_presets_are_valid_and_survive_json(name, tmp_path):
     validate(config, "preset")
     (tmp_path / "config.json").write_text(config.to_json())
     assert load_config(tmp_path / "config.json") == config
-
-
-@pytest.mark.parametrize("name", PRESETS)
-def test_what_an_earlier_version_did_not_know_is_taken_as_it_did(name, tmp_path):
-    """And told in one line; of a run without a format number alone."""
-    config = preset(name)
-    config.scene.path, config.train.seed = "demo", 3
-    stored = json.loads(config.to_json())
-    for key in ABSENT:
-        section, setting = key.split(".")
-        stored[section].pop(setting)
-    path = tmp_path / "config.json"
-    path.write_text(json.dumps(stored))
-    with pytest.raises(UserError, match="config.json: key network.blocks is missing"):
-        load_config(path)
-    del stored["format"]
-    path.write_text(json.dumps(stored))
-    with pytest.warns(UserWarning, match="config.json: written by an earlier version") as warned:
-        found = load_config(path)
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        assert load_config(path) == found  # told once
-    (line,) = (str(warning.message) for warning in warned)
-    assert "raster.blend = softmax" in line and "scene.masks = none" in line and "\n" not in line
-    for key, value in ABSENT.items():
-        assign(config, key, value, "test")
-    assert found == config
-    assert (found.raster.blend, found.points.opacity, found.train.refine_at) == (
-        "softmax",
-        1.0,
-        (1.0, 1.0),
-    )
-
-
-def test_a_run_of_format_1_lacks_what_came_with_format_2_alone(tmp_path):
-    stored, path = stored_settings(), tmp_path / "config.json"
-    stored["format"] = 1
-    del stored["train"]["checkpoint_minutes"]
-    path.write_text(json.dumps(stored))
-    with pytest.warns(UserWarning, match="earlier version, in format 1; .*minutes = 0.0") as warned:
-        assert load_config(path).train.checkpoint_minutes == 0
-    assert len(warned) == 1
-    del stored["train"]["eval_every"]
-    path.write_text(json.dumps(stored))
-    assert "key train.eval_every is missing" in refusal(path)
-    stored = stored_settings()
-    del stored["train"]["checkpoint_minutes"]
-    path.write_text(json.dumps(stored))
-    assert "key train.checkpoint_minutes is missing" in refusal(path)
-
-
-@pytest.mark.parametrize("old", RENAMED)
-def test_an_old_key_sets_the_new_one_and_is_noted(old):
-    new = RENAMED[old]
-    section, name = new.split(".")
-    value = getattr(getattr(preset("paper"), section), name)
-    config, expected = Config(), Config()
-    assign(config, old, value, "--set")
-    assign(expected, new, value, "--set")
-    assert config == expected
-    assert config.notes == [f"--set: {old} is called {new} now"] and not expected.notes
-
-
-def test_a_run_with_old_keys_loads_with_one_line(tmp_path):
-    expected = preset("paper")
-    expected.scene.path = "demo"
-    stored = json.loads(expected.to_json())
-    del stored["format"]
-    for old, new in RENAMED.items():
-        section, name = new.split(".")
-        former, former_name = old.split(".")
-        stored[former][former_name] = stored[section].pop(name)
-    assert stored.pop("raster") == {"blend": "softmax", "window": "image"}  # without former names
-    (tmp_path / "config.json").write_text(json.dumps(stored))
-    with pytest.warns(UserWarning, match="earlier version") as warned:
-        config = load_config(tmp_path / "config.json")
-    assert config == expected and not config.notes
-    (note,) = (str(warning.message) for warning in warned)
-    assert "config.json: " in note and "points.footprint is called raster.footprint now" in note
-    assert f"{len(RENAMED) - 1} other keys" in note
-    assert note.endswith("lacks is taken as raster.blend = softmax, raster.window = image")
 
 
 def test_paper_preset_keeps_the_supplementals_numbers():
@@ -190,20 +108,32 @@ def test_validate_refuses(key, value):
 TEXTS = {
     "half": (b"{", "not JSON"),
     "nothing": (b"", "not JSON"),
-    "no UTF-8": (b'{"preset": "\xff"}', "not JSON"),
+    "no UTF-8": (b'{"format": 1, "preset": "\xff"}', "not JSON"),
     "deep": (b"[" * 100_000, "not JSON"),
-    "5000 digits": (b'{"preset": ' + b"9" * 5000 + b"}", "not JSON"),
+    "5000 digits": (b'{"format": 1, "preset": ' + b"9" * 5000 + b"}", "not JSON"),
     "a list": (b"[]", "not settings"),
     "null": (b"null", "not settings"),
     "large": (b" " * 2**20 + b"{}", "larger than 1048576 bytes"),
-    "nothing in it": (b"{}", "preset"),
-    "a list for the preset": (b'{"preset": ["tiny"]}', "preset"),
-    "an unknown preset": (b'{"preset": "huge"}', "preset"),
-    "no more than a preset": (b'{"preset": "tiny"}', "key network.rate is missing"),
-    "a number for a section": (b'{"preset": "tiny", "train": 3}', "train is not an object"),
-    "an unknown key": (b'{"preset": "tiny", "train": {"x": 3}}', "unknown key train.x"),
-    "an unknown section": (b'{"preset": "tiny", "trains": {}}', "trains is no section"),
-    "out of line": (b'{"preset": "tiny", "a\\nb\\u001b[31m": {}}', r"a b\?\[31m is no section"),
+    "nothing in it": (b"{}", "format"),
+    "a list for the preset": (b'{"format": 1, "preset": ["tiny"]}', "preset"),
+    "an unknown preset": (b'{"format": 1, "preset": "huge"}', "preset"),
+    "no more than a preset": (b'{"format": 1, "preset": "tiny"}', "key network.blocks is missing"),
+    "a number for a section": (
+        b'{"format": 1, "preset": "tiny", "train": 3}',
+        "train is not an object",
+    ),
+    "an unknown key": (
+        b'{"format": 1, "preset": "tiny", "train": {"x": 3}}',
+        "unknown key train.x",
+    ),
+    "an unknown section": (
+        b'{"format": 1, "preset": "tiny", "trains": {}}',
+        "trains is no section",
+    ),
+    "out of line": (
+        b'{"format": 1, "preset": "tiny", "a\\nb\\u001b[31m": {}}',
+        r"a b\?\[31m is no section",
+    ),
 }
 
 
@@ -230,7 +160,7 @@ def stored_settings():
 
 
 VALUES = [
-    ("format", 5, "format is 5, this version reads 4"),
+    ("format", 5, "format is 5, this version reads 1"),
     ("format", 0, "format is 0"),
     ("format", True, "format is True"),
     ("format", "1", "format is '1'"),
@@ -284,10 +214,6 @@ def test_a_section_and_each_of_its_keys_must_be_there(tmp_path, section):
         del stored[section][name]
         path.write_text(json.dumps(stored))
         assert f"key {section}.{name} is missing" in refusal(path)
-        if f"{section}.{name}" not in ABSENT:  # no earlier version lacked it
-            del stored["format"]
-            path.write_text(json.dumps(stored))
-            assert f"key {section}.{name} is missing" in refusal(path)
     stored = stored_settings()
     del stored[section]
     path.write_text(json.dumps(stored))

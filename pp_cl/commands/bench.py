@@ -1,7 +1,6 @@
 """The command pp-cl bench."""
 
 import argparse
-import sys
 from functools import partial
 from pathlib import Path
 
@@ -204,8 +203,6 @@ def _run_train(options):
     config = configure(preset("paper"), options.scene or "demo", shared.read_set(options.set))
     if options.points:
         assign(config, "points.count", _one(options, "points"), "--points")
-    for note in config.notes:
-        print(f"pp-cl: {note}", file=sys.stderr)
     dev = _open_device(options)
     row = bench_train(dev, config, VIEWS, ROUNDS)
     print(

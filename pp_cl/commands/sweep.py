@@ -103,7 +103,7 @@ def _jobs(options):
     given = shared.read_set(options.set)
     if options.iterations:
         given = [(SHORT["iterations"], options.iterations, "--iterations"), *given]
-    jobs, notes = plan(
+    return plan(
         options.scenes,
         options.out,
         read_seeds(options.seeds),
@@ -112,9 +112,6 @@ def _jobs(options):
         preset_name=options.preset,
         metrics=options.metrics,
     )
-    for note in notes:
-        print(f"pp-cl: {note}", file=sys.stderr)
-    return jobs
 
 
 def _finished(job):

@@ -3,7 +3,6 @@
 import argparse
 import math
 import signal
-import sys
 from contextlib import ExitStack, nullcontext
 
 from pp_cl.commands import options as shared
@@ -66,8 +65,6 @@ def run(options: argparse.Namespace) -> None:
     folder = RunFolder(options.out)
     given, is_new = _given_settings(options), not folder.config.exists()
     config = run_config(folder, options.scene, options.preset, given)
-    for note in config.notes:
-        print(f"pp-cl: {note}", file=sys.stderr)
     stored = stored_state(folder, config)
     if stored and stored[0]["finished"]:
         print(

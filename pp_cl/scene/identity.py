@@ -83,11 +83,11 @@ def difference(
     """How training views differ from those of a checkpoint's header, in words; "" where they are
     the same.
 
-    listed: all of them; views: those whose pixels are compared, where the header knows any.
+    listed: all of them; views: those whose pixels are compared, where the header has their digests.
     """
     if fingerprint(listed) != header["scene"]:
         return "its training views have other names or cameras"
-    known = header.get("pixels") or {}
+    known = header["pixels"] or {}
     changed = [view.name for view in views if view.digest != known.get(view.name, view.digest)]
     more = f" and {len(changed) - 1} more" if len(changed) > 1 else ""
     return f"{changed[0]}{more}: other pixels, or another mask" if changed else ""

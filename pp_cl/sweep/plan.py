@@ -10,7 +10,6 @@ from pathlib import Path
 
 from pp_cl.config import Config, assign, configure, preset, sections, text_of
 from pp_cl.errors import UserError
-from pp_cl.presets import RENAMED
 from pp_cl.scene.load import check_folder
 from pp_cl.scene.open import DEMO
 
@@ -77,7 +76,6 @@ def read_varied(texts: Sequence[str]) -> list[tuple[str, list[str]]]:
         key, equals, values = (part.strip() for part in text.partition("="))
         if not equals or not values:
             raise UserError(f"--vary {text}: write --vary section.key=value,value")
-        key = RENAMED.get(key, key)
         if key in varied:
             raise UserError(f"--vary {text}: {key} is varied already; write its values in one")
         _check_free(key, f"--vary {text}")
@@ -126,24 +124,23 @@ def plan(
     given: Sequence[Given] = (),
     preset_name: str | None = None,
     metrics: Sequence[str] = ("psnr", "ssim"),
-) -> tuple[list[Job], list[str]]:
-    """(jobs, notes on old names of settings): scene by scene, setting by setting, seed by seed.
+) -> list[Job]:
+    """The jobs: scene by scene, setting by setting, seed by seed.
 
     given: what all runs share. Raises UserError for scenes that are missing or share a name, and
     for settings that make no sense.
     """
     for key, _, origin in given:
-        _check_free(RENAMED.get(key, key), origin)
-        if RENAMED.get(key, key) in dict(varied):
+        _check_free(key, origin)
+        if key in dict(varied):
             raise UserError(f"{origin} {key}: is varied too; leave one of both out")
-    names, jobs, notes = _names(scenes), [], []
+    names, jobs = _names(scenes), []
     keys = [key for key, _ in varied]
     for scene, name in names.items():
         for values in itertools.product(*(values for _, values in varied)):
             setting = tuple(zip(keys, values, strict=True))
             own = [(key, text, "--vary") for key, text in setting]
             config = configure(preset(preset_name or "tiny"), scene, [*given, *own])
-            notes = config.notes
             for seed in seeds:
                 everything = (*given, *own, ("train.seed", str(seed), "--seeds"))
                 jobs.append(
@@ -160,7 +157,7 @@ def plan(
                     )
                 )
     _check_folders(jobs)
-    return jobs, notes
+    return jobs
 
 
 def _names(scenes):

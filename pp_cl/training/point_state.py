@@ -14,17 +14,6 @@ from pp_cl.raster.sh import ShBlock
 from pp_cl.training.adam import Ema
 from pp_cl.training.rmsprop import SecondMoment
 
-# Names in a checkpoint where they differ: SH blocks are called after their first basis function.
-STORED_NAMES = {
-    "sh_0": "sh0",
-    "sh_1": "sh1",
-    "sh_2a": "sh4",
-    "sh_2b": "sh7",
-    "last_step": "last",
-    "peak_weight": "peak",
-    "look_count": "looks",
-}
-
 
 class PointState:
     """Moments, blend weights and averages of a point cloud; rows as in the cloud.
@@ -94,18 +83,12 @@ class PointState:
         """{name in a checkpoint: array}."""
         averages = {f"a.{name}": array for name, array in self.ema.arrays.items()}
         arrays = (self._arrays | averages).items()
-        return {stored_name(name): DeviceRows(self.dev, array) for name, array in arrays}
+        return {f"state.{name}": DeviceRows(self.dev, array) for name, array in arrays}
 
     def restore(self, cloud: PointCloud, arrays: dict[str, np.ndarray]) -> None:
         """Take the state out of the arrays of a checkpoint, as stored.py has checked it."""
         for name, array in self._arrays.items():
-            self.dev.write(array, arrays.pop(stored_name(name)))
+            self.dev.write(array, arrays.pop(f"state.{name}"))
         learned = cloud.learned()
-        keys = {name: stored_name(f"a.{name}") for name in learned}
+        keys = {name: f"state.a.{name}" for name in learned}
         self.ema.restore(learned, {n: arrays.pop(key) for n, key in keys.items() if key in arrays})
-
-
-def stored_name(name: str) -> str:
-    """The name of an array in a checkpoint, as in "m.sh_2a" -> "state.m.sh4"."""
-    kind, dot, array = name.rpartition(".")
-    return f"state.{kind}{dot}{STORED_NAMES.get(array, array)}"

@@ -19,7 +19,7 @@ from pp_cl.layers.choice import check_form
 from pp_cl.network.layers import parameter_table, unet_layers
 from pp_cl.raster.sh import SH_DEGREES, sh_blocks
 from pp_cl.scene.identity import DIGITS, kept_views
-from pp_cl.training.point_state import PointState, stored_name
+from pp_cl.training.point_state import PointState
 from pp_cl.training.schedule import ema_start, refine_steps
 
 MOST_VERTICES = 2**32  # an id has 32 bits
@@ -65,11 +65,9 @@ class StoredRun:
         missing = [key for key in rules if key not in header]
         if missing:
             self._refuse(f"its header lacks {', '.join(missing)}")
-        unknown = sorted(header.keys() - rules.keys() - {"format", "tuning", "pixels"})
+        unknown = sorted(header.keys() - rules.keys() - {"format", "tuning"})
         if unknown:
             self._refuse(f"its header holds {shown(unknown[0], 40)}, which this version knows not")
-        if "pixels" in header:
-            rules["pixels"] = _are_digests, "the digests of photographs"
         for key, (is_right, expected) in rules.items():
             if not is_right(header[key]):
                 self._refuse(f"{key} in its header is {quoted(header[key])}, expected {expected}")
@@ -95,8 +93,6 @@ class StoredRun:
         if not 0 < n <= most:
             self._refuse(f"points.ids is {ids or 'missing'}, expected 1 to {most} points")
         half = self.forms.get("points.sh0", ids).dtype == np.float16
-        if any(name.startswith(("state.m.sh", "state.mv.")) for name in self.forms):
-            self._refuse("begun by an earlier version, which kept other moments", "start a new run")
         expected = stored_forms(config, n, header["step"], half and header["finished"])
         for name in sorted(expected.keys() | self.forms.keys()):
             found, wanted = self.forms.get(name), expected.get(name)
@@ -149,7 +145,7 @@ def _training_state(config, n, step, network):
     if settings.ema and step >= ema_start(settings.iterations):
         points |= {f"a.{name}": row for name, row in PointState.ema_table(n, blocks).items()}
         table |= {f"average.{name}": row for name, row in network.items()}
-    return table | {stored_name(name): row for name, row in points.items()}
+    return table | {f"state.{name}": row for name, row in points.items()}
 
 
 def _refine_steps(config):
@@ -162,11 +158,12 @@ Rule = tuple[Callable[[Any], bool], str]  # whether a value is right, and what i
 
 
 def _header_rules(config: Config) -> dict[str, Rule]:
-    """{key of the header: Rule}, beside "format" and the optional "tuning" and "pixels"."""
+    """{key of the header: Rule}, beside "format" and the optional "tuning"."""
     steps = config.train.iterations
     return {
         "scene": (lambda x: type(x) is str and 0 < len(x) <= MOST_TEXT, "a text"),
         "views": (_are_views, "names and cameras of training views"),
+        "pixels": (_are_digests, "the digests of photographs"),
         "step": (_whole_in(1, steps), f"one of the {steps} steps of its config.json"),
         "finished": (lambda x: type(x) is bool, "true or false"),
         "initial_points": (_whole_in(1, MOST_VERTICES), "a number of points"),
@@ -234,8 +231,10 @@ def _array_rule(name: str, header: dict[str, Any]) -> Rule | None:
         )
     if name in ("points.opacity", "state.a.opacity"):
         return lambda a: a.min() >= 0 and a.max() <= 1, "opacities from 0 to 1"
-    if name == "state.last":
+    if name == "state.last_step":
         return lambda a: a.max() <= header["step"], "steps that are done"
-    if name in ("state.peak", "state.looks") or name.startswith(("state.v.", "moment.v.")):
+    if name in ("state.peak_weight", "state.look_count") or name.startswith(
+        ("state.v.", "moment.v.")
+    ):
         return lambda a: a.min() >= 0, "numbers from 0 on"
     return None

@@ -5,6 +5,7 @@ import pytest
 from oracle.conv import conv, conv_gradients
 from pp_cl.layers.winograd import winograd_backward_input, winograd_forward
 from pp_cl.layers.winograd_transform import transform_flipped_weights
+from pp_cl.reference.winograd import convolve
 from support.comparisons import relative_error
 from support.conv_layers import layer
 from support.winograd_layers import (
@@ -18,7 +19,6 @@ from support.winograd_layers import (
 
 from pp_cl.layers.choice import CHOICES, SHIPPED
 from pp_cl.layers.conv import Work, pack_weights
-from pp_cl.reference.winograd import convolve
 
 HALF = form(4, half=True)
 

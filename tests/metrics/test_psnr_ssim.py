@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 
 from pp_cl.errors import UserError
-from pp_cl.layers.choice import ConvolutionPolicy, make_policy
-from pp_cl.layers.choice import VARIANTS, shipped_order
+from pp_cl.layers.choice import VARIANTS, ConvolutionPolicy, make_policy, shipped_order
 from pp_cl.metrics import lpips
 from pp_cl.metrics.psnr_ssim import PSNR_CAP, Metrics, mean, psnr, ssim
 from pp_cl.reference.lpips import random_weights

@@ -6,6 +6,7 @@ import math
 import numpy as np
 import pytest
 from oracle.unet import unet, unet_gradients
+from pp_cl.reference.winograd import rounding_share
 from support.comparisons import relative_error
 from support.launches import check_parts
 from support.networks import plain_parameters
@@ -14,7 +15,6 @@ from pp_cl.layers.choice import make_policy
 from pp_cl.network.layers import BLOCKS, convolutions, multiplications, unet_layers
 from pp_cl.network.unet import UNet
 from pp_cl.reference.differences import numeric_gradient
-from pp_cl.reference.winograd import rounding_share
 from pp_cl.settings import NetworkConfig
 
 

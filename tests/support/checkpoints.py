@@ -51,8 +51,8 @@ def contents(config, step=STEP, n=POINTS):
     for name, form in stored_forms(config, n, step).items():
         arrays[name] = rng.random(form.shape).astype(form.dtype)
     arrays["points.ids"] = np.sort(rng.choice(9 * 8 * 7, n, replace=False)).astype(np.uint32)
-    if "state.last" in arrays:
-        arrays["state.last"] = rng.integers(0, step + 1, n).astype(np.uint32)
+    if "state.last_step" in arrays:
+        arrays["state.last_step"] = rng.integers(0, step + 1, n).astype(np.uint32)
     finished = step == config.train.iterations
     return HEADER | {"step": step, "finished": finished}, arrays
 

@@ -56,7 +56,7 @@ def test_all_arrays_follow(dev, rng, composited):
     assert model.grid == grid.refined() and after.keys() == before.keys()
     np.testing.assert_array_equal(model.grid_buffer.get(), grid.refined().packed(grid.centre))
     np.testing.assert_array_equal(after.pop("points.ids"), ids)
-    assert not after.pop("state.peak").any() and not after.pop("state.looks").any()
+    assert not after.pop("state.peak_weight").any() and not after.pop("state.look_count").any()
     for name, array in after.items():
         expected = before[name][parents]
         if composited and name in ("points.opacity", "state.a.opacity"):
