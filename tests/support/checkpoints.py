@@ -17,6 +17,7 @@ from pp_cl.training.stored import load_run_state, stored_forms
 
 POINTS, STEP, STEPS = 40, 50, 60
 HEADER = {
+    "pixels": None,
     "scene": "5ce0e",
     "views": [[one.name, packed_camera(one.camera)] for one in demo_frames("train")[:3]],
     "step": STEP,
