@@ -6,7 +6,9 @@ import time
 from pp_cl.commands import options as shared
 from pp_cl.config import preset
 from pp_cl.errors import UserError
-from pp_cl.presets import PRESETS
+from pp_cl.presets import IMAGE_SIZES, PRESETS
+
+UNREDUCED = 800  # pixels: side of the usual photographs where a preset takes them as they are
 
 HELP = "time the variants of the convolutions on this device, keep the fastest"
 
@@ -29,6 +31,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(options: argparse.Namespace) -> None:
     """Measure, print what is taken, store the tuning."""
     from pp_cl.bench import tune
+    from pp_cl.bench.estimate import network_layers
     from pp_cl.bench.table import TUNE_HEAD, blocking_line, tune_line
     from pp_cl.device.discover import open_device
     from pp_cl.layers.blocking import CHOICES
@@ -36,18 +39,20 @@ def run(options: argparse.Namespace) -> None:
     from pp_cl.layers.variants import shipped_order
 
     config = preset(options.preset or "tiny")
+    net = config.network
     tolerance = shared.read_tolerance(options.tolerance)
     if tolerance is None:
-        tolerance = config.network.tolerance
-    evaluated = tune.EVALUATED[config.preset]
-    size, widths = shared.read_shape(
-        options.size or str(evaluated), options.widths or ",".join(map(str, config.network.widths))
+        tolerance = net.tolerance
+    evaluated = IMAGE_SIZES[config.preset] or UNREDUCED
+    size, net.widths = shared.read_shape(
+        options.size or str(evaluated), options.widths or ",".join(map(str, net.widths))
     )
     training = size if options.size else config.train.crop or evaluated
     dev = open_device(options.device)
     tune.check_cache()
     print(
-        f"{dev.name} [{dev.info['platform']}], widths {','.join(map(str, widths))}, "
+        f"{dev.name} [{dev.info['platform']}], widths {','.join(map(str, net.widths))}, "
+        f"blocks {net.blocks}, "
         f"training at {training}x{training}, evaluation at {size}x{size}"
     )
     kind = make_policy(dev).device_class
@@ -67,7 +72,7 @@ def run(options: argparse.Namespace) -> None:
         print(tune_line(case.name, row, chosen, shipped_order(kind, case.shape)[0]), flush=True)
 
     start = time.perf_counter()
-    cases = tune.network_cases(widths, training, size)
+    cases = tune.network_cases(network_layers(config), training, size)
     tuning, shipped_ms = tune.run_tune(
         dev, cases, tolerance, on_blocking=show_blocking, on_row=show_row
     )
