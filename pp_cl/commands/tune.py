@@ -4,7 +4,7 @@ import argparse
 import time
 
 from pp_cl.commands import options as shared
-from pp_cl.config import preset
+from pp_cl.config import assign, preset
 from pp_cl.errors import UserError
 from pp_cl.presets import IMAGE_SIZES, PRESETS
 
@@ -38,22 +38,16 @@ def run(options: argparse.Namespace) -> None:
     from pp_cl.layers.policy import make_policy
     from pp_cl.layers.variants import shipped_order
 
-    config = preset(options.preset or "tiny")
+    config, training, size = _read_network(options)
     net = config.network
     tolerance = shared.read_tolerance(options.tolerance)
     if tolerance is None:
         tolerance = net.tolerance
-    evaluated = IMAGE_SIZES[config.preset] or UNREDUCED
-    size, net.widths = shared.read_shape(
-        options.size or str(evaluated), options.widths or ",".join(map(str, net.widths))
-    )
-    training = size if options.size else config.train.crop or evaluated
     dev = open_device(options.device)
     tune.check_cache()
     print(
         f"{dev.name} [{dev.info['platform']}], widths {','.join(map(str, net.widths))}, "
-        f"blocks {net.blocks}, "
-        f"training at {training}x{training}, evaluation at {size}x{size}"
+        f"blocks {net.blocks}, training at {training}x{training}, evaluation at {size}x{size}"
     )
     kind = make_policy(dev).device_class
 
@@ -80,6 +74,16 @@ def run(options: argparse.Namespace) -> None:
     _print_gain(
         tune.total_times(cases, tuning["rows"], shipped_ms, make_policy(dev, tolerance, tuning))
     )
+
+
+def _read_network(options):
+    """(Config of the network asked for, sides of its images in training and in evaluation)."""
+    config = preset(options.preset or "tiny")
+    evaluated = IMAGE_SIZES[config.preset] or UNREDUCED
+    widths = options.widths or ",".join(map(str, config.network.widths))
+    size, widths = shared.read_shape(options.size or str(evaluated), widths)
+    assign(config, "network.widths", widths, "--widths")
+    return config, size if options.size else config.train.crop or evaluated, size
 
 
 def _print_gain(times):

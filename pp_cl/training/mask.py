@@ -52,9 +52,7 @@ class MaskLoss:
             return None
         (height, width), (h, w), (left, top) = size, target_alpha.shape, offset
         self._buffers.require(self.table(height, width))
-        launch_groups(
-            self.dev,
-            "training/mask",
+        self._launch(
             "mask_gradient",
             height,
             ph=height,
@@ -70,9 +68,7 @@ class MaskLoss:
             grad_alpha=self._buffers.grad_alpha,
             row_term=self._buffers.row_term,
         )
-        launch_groups(
-            self.dev,
-            "training/mask",
+        self._launch(
             "mask_sum",
             1,
             ph=height,
@@ -87,3 +83,6 @@ class MaskLoss:
     def terms(self) -> dict[str, Reading]:
         """{"mask": the mean square of the last call of add()}, {} where there was none."""
         return {"mask": read_later(self.dev, self._buffers.mean)} if self._measured else {}
+
+    def _launch(self, kernel, groups, **arguments):
+        launch_groups(self.dev, "training/mask", kernel, groups, **arguments)
