@@ -251,6 +251,7 @@ class Renderer:
             if self._pairs.has_room(pairs):
                 self.cache.keep(key, pairs)
                 return pairs, weights, tiles
+            del pairs, weights  # else their arrays would stay beside the larger ones
 
     def backward(
         self,
