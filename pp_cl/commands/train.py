@@ -27,7 +27,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
             " of 800, longer; paper: the paper's numbers"
         ),
     )
-    add("--iterations", metavar="N", help="steps of training")
+    add("--iterations", metavar="N", help="steps of training; more of them extend a finished run")
     add("--points", metavar="N", help="wanted points on the grid")
     add(
         "--downscale", metavar="K", help="reduce the images K times (default: to the preset's size)"
@@ -56,17 +56,17 @@ def run(options: argparse.Namespace) -> None:
     from pp_cl.device.discover import open_device
     from pp_cl.files.run_folder import RunFolder
     from pp_cl.run import open_training
-    from pp_cl.run_config import run_config, stored_state
+    from pp_cl.run_config import is_finished, run_config, stored_state
     from pp_cl.training.memory import plan_lines
     from pp_cl.view.serve import serve_in_background
 
     folder = RunFolder(options.out)
     given, is_new = _given_settings(options), not folder.config.exists()
-    config = run_config(folder, options.scene, options.preset, given)
+    config = run_config(folder, options.scene, options.preset, given, extends=True)
     for note in config.notes:
         print(f"pp-cl: {note}", file=sys.stderr)
     stored = stored_state(folder, config)
-    if stored and stored[0]["finished"]:
+    if is_finished(stored, config):
         print(
             f"{folder} is finished ({stored[0]['step']} steps); `pp-cl eval {folder} --metrics`"
             " measures it"

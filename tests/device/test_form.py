@@ -35,7 +35,7 @@ IN_GPU_FORM = (
     "loss: perceptual",
     "metrics: distance of LPIPS",
     "adam: arrays",
-    "adam: points, sh_0",
+    "rmsprop: degree 2",
     "training: smoothing",
     "scene: demo",
 )
@@ -79,6 +79,10 @@ def test_groups(largest, items):
     of.is_cpu = True
     assert group_ranges(of, 7, 16) == (7, None)
     assert (group_items(of), group_ranges(of, 7)) == (1, (7, None))
+
+
+def test_the_cases_in_the_form_for_gpus_are_there():
+    assert set(IN_GPU_FORM) <= {case.name for case in CASES}
 
 
 @pytest.mark.parametrize(

@@ -29,8 +29,11 @@ WAYS = [
     {"raster.early_stop": "0"},
     {"train.ema": "false", "train.sh_smoothing": "0"},
     {"points.sh_degree": "1"},
+    # discs of 1.5 spacings
+    {"raster.footprint": "disc", "raster.radius": "0.09"},
     {"train.perceptual_weight": "0.1"},
-    {"train.refine_at": "0.4,0.7"},  # to points that are eight, then 64 times as many
+    # to points that are eight, then 64 times as many
+    {"train.refine_at": "0.4,0.7", "train.prune_weight": "0", "train.prune_opacity": "0"},
     {"train.refine_at": "1.0,0.9"},  # with the averages
 ]
 
@@ -84,7 +87,7 @@ def zero_weights():
 
 
 @pytest.mark.parametrize(
-    "changes", [*WAYS[:4], *(pytest.param(way, marks=pytest.mark.slow) for way in WAYS[4:])]
+    "changes", [*WAYS[:5], *(pytest.param(way, marks=pytest.mark.slow) for way in WAYS[5:])]
 )
 def test_the_plan_is_what_a_training_takes(dev, tmp_path, monkeypatch, changes):
     monkeypatch.setattr("pp_cl.metrics.lpips.load_weights", zero_weights)
@@ -164,8 +167,8 @@ def test_a_plan_that_goes_on_counts_no_pruning_twice(dev):
 
 
 def test_without_prunings_every_point_becomes_eight(dev):
-    changes = {"train__refine_at": "0.1,0.2", "train__prune_every": "9999"}
-    changes |= {"train__iterations": "100"}
+    changes = {"train__refine_at": "0.1,0.2", "train__iterations": "100"}
+    changes |= {"train__prune_weight": "0", "train__prune_opacity": "0"}
     plan = memory_plan(sketch(dev, "full", points=1000, **changes))
     assert [(m.name, m.points) for m in plan.moments] == [
         ("from step 0 on", 1000),

@@ -113,7 +113,7 @@ HEADERS = {
     "no whole step": ({"step": -1e29}, "step"),
     "step of true": ({"step": True}, "step"),
     "finished of 1": ({"finished": 1}, "finished"),
-    "finished before its end": ({"finished": True}, "finished at step 50, of 60"),
+    "extended from nowhere": ({"extended_from": 0}, "extended_from"),
     "not finished at its end": ({"step": STEPS}, "not finished at step 60"),
     "no points at the start": ({"initial_points": 0}, "initial_points"),
     "fewer points at the start than now": ({"initial_points": 39}, "points.ids"),
