@@ -51,7 +51,8 @@ def run_config(
             with opened_run(folder, stored) as run:
                 if run.header["step"] == stored.train.iterations:
                     most = max(config.train.iterations, stored.train.iterations)
-                    config.train.iterations = stored.train.iterations = most
+                    for one in (config, stored):
+                        assign(one, "train.iterations", most, "settings")
         _check_same(config, stored, folder)
     return config
 

@@ -37,8 +37,8 @@ kernel void neighbour_table(
     row[5] = find(ids, id + plane, i + 1, n);
 }
 
-// One work-item per `run` points: reads their neighbours, writes how many rows the furthest one lies
-// after its point.
+// One work-item per `run` points: reads their neighbours, writes how many rows the furthest one
+// lies after its point.
 kernel void furthest_neighbours(
     const uint n,                   // points
     const uint run,                 // points of a work-item

@@ -46,6 +46,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="also write the curves to RUN/tensorboard (needs pp-cl[tensorboard])",
     )
     add("--view", action="store_true", help="look on in the browser, as with `pp-cl view RUN`")
+    add("-v", "--verbose", action="store_true", help="print the memory plan buffer by buffer")
     shared.add_tolerance(parser)
     shared.add_set(parser, "any other setting, see below")
     shared.add_device(parser)
@@ -79,7 +80,10 @@ def run(options: argparse.Namespace) -> None:
     chosen = is_new and "scene.downscale" not in [key for key, _, _ in given]
     print(_images_line(training, chosen))
     print(_first_line(training))
-    print("\n".join(plan_lines(training.room.plan, dev)), flush=True)
+    if training.hull and (told := _left_out_line(config.train)):
+        print(told)
+    lines = plan_lines(training.room.plan, dev)
+    print("\n".join(lines if options.verbose else lines[:1]), flush=True)
     with serve_in_background(folder.path, options.device) if options.view else nullcontext():
         seconds = _run(training, options)
     print(
@@ -115,6 +119,19 @@ def _first_line(training):
         f" ({hull.seconds:.1f} s)"
         f"{capped if hull.capped else ''}"
     )
+
+
+def _left_out_line(train):
+    """That refinements are left out, where some are."""
+    from pp_cl.training.schedule import refine_steps
+
+    wanted, made = sum(share < 1 for share in train.refine_at), len(refine_steps(train))
+    if made < wanted:
+        return (
+            f"refinements: {made} of the {wanted} of train.refine_at, since in {train.iterations}"
+            " iterations nothing is pruned between them"
+        )
+    return ""
 
 
 def _images_line(training, chosen):

@@ -362,17 +362,17 @@ def tables_bytes(tables: Tables) -> int:
 
 
 def plan_lines(plan: Plan, dev: Device) -> list[str]:
-    """The plan as text: the device's buffers at their peak against its limits, and the host."""
+    """The plan as text: device and host at their peaks in one line, then the device's buffers."""
     peak, (what, largest) = plan.peak, plan.largest
     rows = [(what, len(table), table_bytes(table)) for what, table in peak.tables if table]
     rows.append(("total", sum(number for _, number, _ in rows), peak.device))
     host = plan.host(dev.is_cpu)
     return [
-        f"memory plan ({dev.name}: {dev.info['memory_bytes'] / MIB:.0f} MiB, at most"
-        f" {dev.info['max_allocation_bytes'] / MIB:.0f} at once); {peak.name}, {peak.points}"
-        " points:",
+        f"memory: {peak.device / MIB:.0f} of {dev.info['memory_bytes'] / MIB:.0f} MiB of {dev.name}"
+        f" ({peak.name}, {peak.points} points), {host / MIB:.0f} MiB of the host"
+        + (", the device's among them" if dev.is_cpu else ""),
         *(f"  {name:30s} {number:4d} buffers {size / MIB:9.1f} MiB" for name, number, size in rows),
-        f"  largest buffer: {largest / MIB:.1f} MiB ({what})",
-        f"  host: {host / MIB:.0f} MiB beside the program, {plan.photographs / MIB:.0f} of them"
-        " photographs" + (", the device's among them" if dev.is_cpu else ""),
+        f"  largest buffer: {largest / MIB:.1f} MiB ({what}), of at most"
+        f" {dev.info['max_allocation_bytes'] / MIB:.0f} at once",
+        f"  photographs on the host: {plan.photographs / MIB:.0f} MiB",
     ]

@@ -230,6 +230,7 @@ def test_large_photographs_are_planned_as_they_are_kept(dev):
 def test_the_plan_in_words(dev):
     plan = memory_plan(sketch(dev))
     lines = plan_lines(plan, dev)
+    assert f"memory: {plan.peak.device / 2**20:.0f} of " in lines[0]
     assert "averages, from step 6800 on" in lines[0] or "from step 0 on" in lines[0]
     sizes = [float(line.split()[-2]) for line in lines[1:-2]]
     assert sum(sizes[:-1]) == pytest.approx(sizes[-1], abs=2)
