@@ -73,7 +73,7 @@ class StoredRun:
         if "pixels" in header:
             rules["pixels"] = _are_digests, "the digests of photographs"
         if "extended_from" in header:
-            rules["extended_from"] = _whole_in(1, config.train.iterations), "a step that is done"
+            rules["extended_from"] = _is_done(header), "a step that is done"
         for key, (is_right, expected) in rules.items():
             if not is_right(header[key]):
                 self._refuse(f"{key} in its header is {quoted(header[key])}, expected {expected}")
@@ -184,6 +184,10 @@ def _are_digests(pixels):
 
 def _whole_in(least, most):
     return lambda x: type(x) is int and least <= x <= most
+
+
+def _is_done(header):
+    return lambda x: _whole_in(1, header["step"])(x)  # which is checked by then
 
 
 def _are_numbers(values, count):
