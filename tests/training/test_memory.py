@@ -24,6 +24,7 @@ from pp_cl.training.point_state import PointState
 
 POINTS = 27_000
 PAPER_POINTS = 4_040_533  # lego, supplemental Table 4
+SMOOTHED = {"train.sh_smoothing_every": "4"}  # so that the last few of 30 steps smooth too
 WAYS = [
     {},
     {"raster.early_stop": "0"},
@@ -32,9 +33,14 @@ WAYS = [
     # discs of 1.5 spacings
     {"raster.footprint": "disc", "raster.radius": "0.09"},
     {"train.perceptual_weight": "0.1"},
-    # to points that are eight, then 64 times as many
-    {"train.refine_at": "0.4,0.7", "train.prune_weight": "0", "train.prune_opacity": "0"},
-    {"train.refine_at": "1.0,0.9"},  # with the averages
+    # to points that are eight, then 64 times as many, which are smoothed
+    {
+        "train.refine_at": "0.4,0.7",
+        **SMOOTHED,
+        "train.prune_weight": "0",
+        "train.prune_opacity": "0",
+    },
+    {"train.refine_at": "1.0,0.9", **SMOOTHED},  # with the averages
 ]
 
 
