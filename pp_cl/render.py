@@ -35,6 +35,14 @@ PAPER_DEPTH_RANGE = (
 )
 
 
+def point_radius(settings: RasterConfig, edge: float, depth_range: tuple[float, float]) -> float:
+    """The points' radius in world units. edge: of the grid, world units."""
+    if settings.footprint == "soft":
+        return settings.radius * edge
+    near, far = depth_range
+    return settings.radius * (far - near) / PAPER_DEPTH_RANGE
+
+
 @dataclass(frozen=True)
 class ViewWeights:
     """Which points contribute to a view, and how much; valid until the next view is weighed.
@@ -341,8 +349,4 @@ class Renderer:
         return self._windowed[1]
 
     def _radius(self):
-        """The points' radius in world units."""
-        if self.settings.footprint == "soft":
-            return self.settings.radius * self.model.grid.edge
-        near, far = self.model.depth_range
-        return self.settings.radius * (far - near) / PAPER_DEPTH_RANGE
+        return point_radius(self.settings, self.model.grid.edge, self.model.depth_range)

@@ -36,7 +36,7 @@ IN_GPU_FORM = (
     "loss: perceptual",
     "metrics: distance of LPIPS",
     "adam: arrays",
-    "adam: points, sh_0",
+    "rmsprop: degree 2",
     "training: smoothing",
     "scene: demo",
 )
@@ -96,6 +96,10 @@ def test_groups_are_no_larger_than_a_kernel_allows(dev, monkeypatch, name):
     monkeypatch.setattr(dev, "_programs", {})
     case = next(case for case in CASES if case.name == name)
     assert [row.passed for row in run_cases(dev, [case])] == [True]
+
+
+def test_the_cases_in_the_form_for_gpus_are_there():
+    assert set(IN_GPU_FORM) <= {case.name for case in CASES}
 
 
 @pytest.mark.parametrize(
