@@ -60,7 +60,7 @@ class Model:
 
     def positions(self) -> np.ndarray:
         """(N, 3) float64 world positions of the points."""
-        return self.grid.positions(self.cloud.ids.get())
+        return self.grid.positions(self.dev.download(self.cloud.ids))
 
     def packed(self, camera: Camera, depth_range: tuple[float, float] | None = None) -> np.ndarray:
         """(20,) float32: a camera that sees the points of grid_buffer. depth_range: instead of the
@@ -74,7 +74,7 @@ class Model:
 
         Raises ValueError as Grid.children does.
         """
-        ids, parents = self.grid.children(self.cloud.ids.get())
+        ids, parents = self.grid.children(self.dev.download(self.cloud.ids))
         rows = self.dev.upload(parents)
         self.cloud.replace_by(self.dev, ids, rows)
         self.grid = self.grid.refined()

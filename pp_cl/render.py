@@ -35,6 +35,14 @@ PAPER_DEPTH_RANGE = (
 )
 
 
+def point_radius(settings: RasterConfig, edge: float, depth_range: tuple[float, float]) -> float:
+    """The points' radius in world units. edge: of the grid, world units."""
+    if settings.footprint == "soft":
+        return settings.radius * edge
+    near, far = depth_range
+    return settings.radius * (far - near) / PAPER_DEPTH_RANGE
+
+
 @dataclass(frozen=True)
 class ViewWeights:
     """Which points contribute to a view, and how much; valid until the next view is weighed.
@@ -251,6 +259,7 @@ class Renderer:
             if self._pairs.has_room(pairs):
                 self.cache.keep(key, pairs)
                 return pairs, weights, tiles
+            del pairs, weights  # else their arrays would stay beside the larger ones
 
     def backward(
         self,
@@ -340,8 +349,4 @@ class Renderer:
         return self._windowed[1]
 
     def _radius(self):
-        """The points' radius in world units."""
-        if self.settings.footprint == "soft":
-            return self.settings.radius * self.model.grid.edge
-        near, far = self.model.depth_range
-        return self.settings.radius * (far - near) / PAPER_DEPTH_RANGE
+        return point_radius(self.settings, self.model.grid.edge, self.model.depth_range)

@@ -4,7 +4,7 @@ import math
 import time
 import warnings
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -25,7 +25,7 @@ from pp_cl.metrics.psnr_ssim import psnr
 from pp_cl.model import Model
 from pp_cl.network.unet import UNet
 from pp_cl.presets import SHORT
-from pp_cl.run_config import Stored, run_config, stored_state
+from pp_cl.run_config import Stored, is_finished, run_config, stored_state
 from pp_cl.scene.agreement import disagreements
 from pp_cl.scene.bounds import listing
 from pp_cl.scene.grid import Grid
@@ -45,6 +45,7 @@ from pp_cl.training.stored import opened_run
 
 FIRST_PREVIEW = 10.0  # seconds; with a slow step and its writing it shows within 20
 MEASURED_VIEWS = 4
+NEVER = (1.0, 1.0)  # train.refine_at
 
 OnStep = Callable[[int, dict[str, Any] | None], None]
 
@@ -234,8 +235,9 @@ def open_training(
 ) -> Training:
     """A training in `folder`, from its checkpoint `stored` where it has one. Nothing is written.
 
-    Raises UserError for a scene or checkpoint that does not fit, for too little memory, and for a
-    folder that may not be written.
+    That of a finished training is gone on with up to config.train.iterations, with new moments and
+    without refinements. Raises UserError for a scene or checkpoint that does not fit, for too
+    little memory, and for a folder that may not be written.
     """
     check_writable(folder.path)
     tolerance = config.network.tolerance
@@ -244,7 +246,11 @@ def open_training(
     else:
         policy = load_policy(dev, tolerance)
     net = UNet.of_settings(dev, config.network, policy, seed=config.train.seed)
-    room = Room(config, net, scene_frames(config.scene.path))
+    begun = _begun(stored[0]) if stored else 0
+    goal = config
+    if begun:
+        goal = replace(config, train=replace(config.train, refine_at=NEVER))
+    room = Room(goal, net, scene_frames(config.scene.path))
     if stored:
         _check_stored(room, *stored)
     else:
@@ -252,11 +258,16 @@ def open_training(
     views = open_scene(dev, config, ("train",)).splits["train"]
     measured = _measured_views(dev, config) if config.train.eval_every else []
     if stored:
-        trainer, info, hull = _resume(config, views, net, stored, file=folder.checkpoint)
+        trainer, info, hull = _resume(goal, views, net, stored, file=folder.checkpoint)
     else:
         trainer, info, hull = _start(config, views, net, room)
     info["tuning"] = policy.tuning
     return Training(folder, config, trainer, info, room, hull, policy.origin, measured)
+
+
+def _begun(header):
+    """The step of the finished training that this one extends, 0 where it extends none."""
+    return header["step"] if header["finished"] else header.get("extended_from", 0)
 
 
 def _check_stored(room, header, arrays):
@@ -321,10 +332,15 @@ def _resume(config, views, net, stored, *, file):
     path = config.scene.path
     if told := difference(header, views, views):
         raise UserError(f"{file}: belongs to another scene than {path} ({told}); use another --out")
+    for name, array in arrays.items():
+        if array.dtype == np.float16:  # of a compressed run
+            arrays[name] = array.astype(np.float32)
     model = Model.load(net.dev, header, arrays, net, degree=config.points.sh_degree)
     trainer = Trainer(net.dev, config, model, views)
-    trainer.restore(header["step"], arrays)
-    return trainer, identity(views) | {"initial_points": header["initial_points"]}, None
+    begun = _begun(header)
+    trainer.restore(header["step"], arrays, begun)
+    info = identity(views) | {"initial_points": header["initial_points"]}
+    return trainer, info | ({"extended_from": begun} if begun else {}), None
 
 
 def train_scene(
@@ -338,7 +354,7 @@ def train_scene(
     **options: Any,
 ) -> Run:
     """Train a scene into the folder `out`, or go on with the run there; a finished one is left
-    alone.
+    alone, unless more iterations are asked for than it has.
 
     scene: a folder, or the word demo. device: as `pp-cl train --device`. settings: {"section.key":
     value}; options: the same by the short names of presets.SHORT, such as iterations. on_step: see
@@ -349,8 +365,9 @@ def train_scene(
         raise TypeError(f"train_scene() has no {min(unknown)}; it has {', '.join(SHORT)}, settings")
     settings = {SHORT[name]: value for name, value in options.items()} | (settings or {})
     folder = RunFolder(out)
-    config = run_config(folder, str(scene), preset, [(*s, "settings") for s in settings.items()])
+    given = [(*s, "settings") for s in settings.items()]
+    config = run_config(folder, str(scene), preset, given, extends=True)
     stored, dev = stored_state(folder, config), open_device(device)
-    if not (stored and stored[0]["finished"]):
+    if not is_finished(stored, config):
         open_training(dev, folder, config, stored).run(on_step)
     return load_run(dev, out)

@@ -9,7 +9,7 @@ from pp_cl.config import Config, assign, configure, load_config, preset, section
 from pp_cl.errors import UserError
 from pp_cl.files.run_folder import RunFolder
 from pp_cl.scene.open import preset_downscale
-from pp_cl.training.stored import load_run_state
+from pp_cl.training.stored import load_run_state, opened_run
 
 Stored = tuple[dict[str, Any], dict[str, np.ndarray]]  # header and arrays of a checkpoint
 
@@ -19,15 +19,18 @@ def run_config(
     scene: str,
     preset_name: str | None = None,
     given: Iterable[tuple[str, Any, str]] = (),
+    *,
+    extends: bool = False,
 ) -> Config:
     """Config of a training in `folder`: its stored one if it has one, else the preset's, with the
     given settings. Where these do not say scene.downscale, a new one reduces the images to about
     the preset's size.
 
     scene: a folder, or the word demo. given: (key, value or its text, origin), which a run with a
-    checkpoint must agree with; without one there is nothing that other settings would spoil. Raises
-    UserError naming the first setting that differs or makes no sense, or what is wrong with the
-    scene's files.
+    checkpoint must agree with; without one there is nothing that other settings would spoil.
+    extends: a finished run may have train.iterations given anew: with more of them it goes on, with
+    fewer it stays finished. Raises UserError naming the first setting that differs or makes no
+    sense, or what is wrong with the scene's files.
     """
     stored = load_config(folder.config) if folder.config.exists() else None
     if stored and preset_name not in (None, stored.preset):
@@ -44,6 +47,12 @@ def run_config(
         downscale = preset_downscale(config.scene.path, config.preset)
         assign(config, "scene.downscale", downscale, "preset")
     if stored and folder.checkpoint.exists():
+        if extends and config.train.iterations != stored.train.iterations:
+            with opened_run(folder, stored) as run:
+                if run.header["step"] == stored.train.iterations:
+                    most = max(config.train.iterations, stored.train.iterations)
+                    for one in (config, stored):
+                        assign(one, "train.iterations", most, "settings")
         _check_same(config, stored, folder)
     return config
 
@@ -72,8 +81,13 @@ def stored_state(folder: RunFolder, config: Config) -> Stored | None:
     """
     folder.check_usable()
     stored = load_run_state(folder, config) if folder.checkpoint.exists() else None
-    if folder.config.exists() and (stored is None or stored[0]["finished"]):
+    if folder.config.exists() and (stored is None or is_finished(stored, config)):
         path = load_config(folder.config).scene.path
         if path != config.scene.path:
             _refuse_setting(folder, "scene.path", path, config.scene.path)
     return stored
+
+
+def is_finished(stored: Stored | None, config: Config) -> bool:
+    """Whether a checkpoint is that of the last step."""
+    return stored is not None and stored[0]["step"] == config.train.iterations

@@ -21,7 +21,7 @@ from pp_cl.training.perceptual import PerceptualLoss
 from pp_cl.training.point_state import PointState
 from pp_cl.training.prune import judge, keep_indices
 from pp_cl.training.refine import refine
-from pp_cl.training.schedule import ema_weight, gamma_at, refine_steps, rising_weight
+from pp_cl.training.schedule import ema_start, ema_weight, gamma_at, refine_steps, rising_weight
 from pp_cl.training.smooth import Smoother
 from pp_cl.training.terms import StepTerms
 
@@ -30,7 +30,8 @@ class Trainer:
     """Optimises a model on views; every random choice is a function of (seed, step), so a run can
     start at any step.
 
-    step: number of steps done. state: what training keeps for each point.
+    step: number of steps done; begun: of those, how many were done when the moments began. state:
+    what training keeps for each point.
     """
 
     def __init__(self, dev: Device, config: Config, model: Model, views: list[View]):
@@ -41,7 +42,7 @@ class Trainer:
         self._composited = config.raster.blend == "alpha"
         self.model = model
         self.views = views
-        self.step = 0
+        self.step = self.begun = 0
         self.renderer = Renderer(dev, model, config.raster)
         self.loss = Loss(dev, self.config.ssim_weight, self.config.smooth_l1)
         self.mask_loss = MaskLoss(dev, self.config.mask_weight)
@@ -51,7 +52,7 @@ class Trainer:
         self._target = Target(dev)
         self._terms = None  # of the last step
         self._smoother = None  # made when it is due, anew when the points change
-        self._refine_steps = refine_steps(self.config.iterations, self.config.refine_at)
+        self._refine_steps = refine_steps(self.config)
         self._set_level()
 
     @property
@@ -101,7 +102,7 @@ class Trainer:
         grads = self.renderer.backward(rendered, *gradients, spread_weight=spread_weight)
         with self.dev.stage("update"):
             self.optimiser.update(
-                t + 1,
+                t + 1 - self.begun,
                 rates,
                 grads,
                 points=rendered.points,
@@ -273,13 +274,17 @@ class Trainer:
         self.check()
         return self.model.arrays() | self.optimiser.arrays()
 
-    def restore(self, step: int, arrays: dict[str, np.ndarray]) -> None:
+    def restore(self, step: int, arrays: dict[str, np.ndarray], begun: int) -> None:
         """Go on after `step` steps with the arrays of a checkpoint, which are taken out of
-        `arrays`; the model has been loaded already.
+        `arrays`; the model has been loaded already. Those of a finished training hold no more than
+        it: moments, and averages where they are due, begin there.
         """
-        self.step = step
+        self.step, self.begun = step, begun
         self._set_level()
-        self.optimiser.restore(arrays)
+        if arrays:
+            self.optimiser.restore(arrays)
+        elif self.config.ema and step >= ema_start(self.config.iterations):
+            self.optimiser.update_ema(1.0)
 
 
 def views_repeat(config: TrainConfig, downscale: int) -> bool:

@@ -199,6 +199,17 @@ def test_tau_and_early_stop_of_a_call_are_those_of_other_settings(dev, rng, blen
     np.testing.assert_array_equal(lasting.render(camera, GAMMA, early_stop=0.0), exact)
 
 
+@pytest.mark.parametrize("blend", BLENDS)
+def test_arrays_without_room_are_released_before_larger_ones_are_made(dev, rng, blend):
+    renderer = Renderer(dev, make_model(dev, rng, 300), RasterConfig(blend=blend))
+    near, far = (ring_cameras(1, size)[0] for size in (96, 48))
+    first = renderer.blend_weights(far, GAMMA).pairs.capacity
+    dev.reset_peak()
+    second = renderer.blend_weights(near, GAMMA).pairs.capacity
+    assert 0 < 2 * first < second
+    assert dev.peak_bytes == dev.bytes
+
+
 def test_a_window_around_the_object(dev, rng):
     """Where a point shows, the image is that of the whole network; elsewhere it is white."""
     model = make_model(dev, rng)

@@ -2,6 +2,7 @@
 that lack something.
 """
 
+import itertools
 import json
 import shutil
 
@@ -13,6 +14,7 @@ from support.scenes import write_ball_scene
 
 from pp_cl.cli import main
 from pp_cl.files.checkpoint import load_checkpoint, save_checkpoint
+from pp_cl.train import Trainer
 
 
 def test_a_finished_run_is_left_alone(scene, finished, capsys):
@@ -23,9 +25,64 @@ def test_a_finished_run_is_left_alone(scene, finished, capsys):
 
 
 def test_settings_are_taken_from_the_run_and_may_not_change(scene, finished, capsys):
-    assert main(["train", scene, "--out", str(finished)]) == 0
-    assert main(["train", scene, "--out", str(finished), "--iterations", "61"]) == 2
-    assert "train.iterations is 60 there, 61 asked for" in capsys.readouterr().err
+    words = ["train", scene, "--out", str(finished)]
+    assert main(words) == main([*words, "--iterations", "59"]) == 0
+    assert capsys.readouterr().out.count("is finished (60 steps)") == 2
+    assert main([*words, "--points", "1600", "--iterations", "61"]) == 2
+    assert "points.count is 1500 there, 1600 asked for" in capsys.readouterr().err
+
+
+@pytest.fixture(scope="module")
+def refined(scene, tmp_path_factory):
+    """(Folder of a finished run that was refined once, command line of a longer one)."""
+    out, changes = tmp_path_factory.mktemp("runs") / "refined", {"train__refine_at": "0.35,1"}
+    changes |= {"points__count": 300, "train__prune_looks": 4, "train__checkpoint_every": 3}
+
+    def words(out, iterations):
+        return arguments(scene, out, downscale=1, train__iterations=iterations, **changes)
+
+    assert main(words(out, 20)) == 0
+    return out, words
+
+
+@pytest.mark.parametrize("iterations, stop", [(22, 21), (80, 69)])
+def test_a_finished_run_is_extended_and_resumes_to_the_same_bytes(
+    refined, tmp_path, monkeypatch, iterations, stop
+):
+    """To averages that are due at once, and to a step by which another refinement would be due."""
+    (whole, stopped), (out, words) = [tmp_path / name for name in ("whole", "stopped")], refined
+    for folder in (whole, stopped):
+        shutil.copytree(out, folder)
+    assert main(words(whole, iterations)) == 0
+    header, _ = load_checkpoint(whole / "checkpoint.npz")
+    assert header["finished"] and (header["step"], header["extended_from"]) == (iterations, 20)
+    config = json.loads((whole / "config.json").read_text())
+    assert config["train"]["iterations"] == iterations
+    rows = [json.loads(line) for line in (whole / "log.jsonl").read_text().splitlines()]
+    assert [row["step"] for row in rows[:4]] == [5, 10, 15, 20] and rows[-2]["step"] == iterations
+    assert all(a["points"] >= b["points"] for a, b in itertools.pairwise(rows[3:]))
+    assert np.mean([row["loss"] for row in rows[-3:-1]]) < 1.1 * rows[3]["loss"]
+    for step in (20, stop):  # before the first step, and later on
+        with monkeypatch.context() as patch:
+            patch.setattr(Trainer, "train_step", interrupted_after(step))
+            assert main(words(stopped, iterations)) == 130
+        assert load_checkpoint(stopped / "checkpoint.npz")[0]["step"] == step
+        assert main(["eval", str(stopped), "--metrics", "psnr"]) == 0
+    assert main(words(stopped, 20)) == 2  # it is on its way to more
+    assert main(words(stopped, iterations)) == 0
+    name = "checkpoint.npz"
+    assert (stopped / name).read_bytes() == (whole / name).read_bytes()
+
+
+def interrupted_after(step, train_step=Trainer.train_step):
+    """A train_step() that is interrupted once so many steps are done."""
+
+    def stopping(self):
+        if self.step == step:
+            raise KeyboardInterrupt
+        return train_step(self)
+
+    return stopping
 
 
 def test_a_checkpoint_of_another_scene_is_refused(scene, tmp_path, capsys, monkeypatch):

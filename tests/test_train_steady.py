@@ -5,6 +5,7 @@ import collections
 import numpy as np
 import pyopencl as cl
 import pytest
+from pyopencl.array import Array
 
 import pp_cl.network.unet
 from pp_cl.config import configure, preset
@@ -95,6 +96,16 @@ def test_a_step_waits_once_and_allocates_nothing(dev, scene, tmp_path, monkeypat
             assert recorder.counts["waits"] <= step, recorder.counts
     assert recorder.counts["allocations"] == 0, recorder.counts
     assert recorder.counts["read"] > 0
+
+
+def test_a_step_keeps_no_copy_of_the_points_on_the_host(dev, scene, tmp_path, monkeypatch):
+    """As Array's get() and set() do, for as long as the device's array lives."""
+    trainer = make_trainer(dev, scene, tmp_path / "run", "tiny")
+    trainer.config.prune_every = trainer.config.sh_smoothing_every = 1
+    for name in ("get", "set"):
+        monkeypatch.setattr(Array, name, None)
+    trainer.train_step()
+    trainer.finish()
 
 
 def test_planned_steps_learn_the_same(dev, scene, tmp_path, monkeypatch):

@@ -35,7 +35,8 @@ EARLY = {"train.iterations": 30, "train.eval_every": 0}
 TRAININGS = {
     "tiny": ("tiny", {}),
     "small": ("small", {}),
-    "full": ("full", {"points.count": 30_000}),
+    # without pruning, or its second refinement would be left out
+    "full": ("full", {"points.count": 30_000, "train.prune_weight": 0, "train.prune_opacity": 0}),
     "paper": ("paper", {"points.count": 1_500_000, "scene.downscale": 4, "train.iterations": 4}),
     "paper in full": ("paper", {"train.iterations": 3}),  # 12 GiB on lego
     "phone": ("tiny", {"scene.downscale": 8}),

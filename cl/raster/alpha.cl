@@ -21,9 +21,6 @@
 #ifndef HAS_GRAD_ALPHA
 #define HAS_GRAD_ALPHA 0  // 0: grad_alpha is 0 and not read
 #endif
-#ifndef HAS_SPREAD
-#define HAS_SPREAD 0  // 0: spread_weight is 0 and not read
-#endif
 #define HAS_ROLES                                                                                  \
     (DROPS || MAX_TRACKED)  // else every pair is TRACKED, and pair_role is not touched
 
@@ -75,7 +72,7 @@ static inline float upper_float(const ulong word) {
 // g - B, with what the spread adds, of each pair that is not dropped.
 kernel __attribute__((vec_type_hint(float16))) void alpha_gain(
     const uint hw,                         // pixels
-    const float spread_weight,             // w, read with HAS_SPREAD
+    const float spread_weight,             // w, 0: none
     global const uint *pixel_offset,       // (HW+1)
     global const ulong *pair_key,          // (P) depth << 32 | pair
     global const ulong *pixel_entry,       // (P) weight << 32 | point; no point: the list ends
@@ -95,7 +92,7 @@ kernel __attribute__((vec_type_hint(float16))) void alpha_gain(
     float2 front = 0.0f, behind = 0.0f;  // sums of b and b z of the hits there
     uint end = begin;
     for (; end < pixel_offset[q + 1] && (uint)pixel_entry[end] != NONE; end++)
-        if (HAS_SPREAD) {
+        if (spread_weight > 0.0f) {
             const float z = upper_float(pair_key[end]) - nearest;
             front += upper_float(pixel_entry[end]) * (float2)(1.0f, z);
         }
@@ -104,7 +101,7 @@ kernel __attribute__((vec_type_hint(float16))) void alpha_gain(
     for (uint i = end; i-- > begin;) {
         const float b = upper_float(pixel_entry[i]);
         float own = dot16(G, point_features[(uint)pixel_entry[i]]);
-        if (HAS_SPREAD) {
+        if (spread_weight > 0.0f) {
             const float z = upper_float(pair_key[i]) - nearest;
             front -= b * (float2)(1.0f, z);
             own += 2.0f * spread_weight * (z * (front.x - behind.x) - (front.y - behind.y));

@@ -52,6 +52,9 @@ ALWAYS_INLINE Footprints footprints_load(
 
 // One work-item per LANES points: finds their hits again (project.cl counted them), writes them as
 // pairs and counts them at their pixels; does nothing where not all pairs have room.
+//
+// A compiler that rounds otherwise here than in project.cl finds one hit more or less of a point in
+// a million: one too many is left out, one that is missing becomes a pair without weight.
 kernel __attribute__((vec_type_hint(floats))) void pairs_fill(
     const uint n,                        // points
     const uint p,                        // pairs for which there is room
@@ -73,9 +76,11 @@ kernel __attribute__((vec_type_hint(floats))) void pairs_fill(
     const Camera cam = camera_load(camera);
     const Footprints f =
         footprints_load(&cam, first, count, radii, point_radius, point_camera, point_box);
-    uint next[LANES], corner[LANES];  // of each point: its next pair, the first pixel of its box
+    // of each point: its next pair, where they end, the first pixel of its box
+    uint next[LANES], end[LANES], corner[LANES];
     for (uint j = 0; j < count; j++) {
         next[j] = point_offset[first + j];
+        end[j] = point_offset[first + j + 1];
         corner[j] = f.box[1][j] * cam.width + f.box[0][j];
     }
     int row = 0, column = 0;
@@ -98,7 +103,7 @@ kernel __attribute__((vec_type_hint(floats))) void pairs_fill(
         }
         LANES_INTO(hits, found);
         for (uint j = 0; j < count; j++)
-            for (uint left = hits[j]; left; left &= left - 1) {
+            for (uint left = hits[j]; left && next[j] < end[j]; left &= left - 1) {
                 const uint k = 31 - clz(left & -left), pair = next[j]++;
                 const uint pixel = corner[j] + offset[k];
                 pair_pixel[pair] = pixel;
@@ -106,6 +111,13 @@ kernel __attribute__((vec_type_hint(floats))) void pairs_fill(
                 pair_place[pair] = upsample(as_uint(depth[k][j]), atomic_inc(&pixel_count[pixel]));
             }
     }
+    for (uint j = 0; j < count; j++)
+        for (uint pair = next[j]; pair < end[j]; pair++) {
+            const float depth = point_camera[first + j].w;
+            pair_pixel[pair] = corner[j];
+            pair_point_closeness[pair] = (uint2)(first + j, as_uint(0.0f));
+            pair_place[pair] = upsample(as_uint(depth), atomic_inc(&pixel_count[corner[j]]));
+        }
 }
 
 // One work-item per pair: writes its key at its place. Bits of floats >= 0 sort like the floats.

@@ -37,6 +37,25 @@ kernel void neighbour_table(
     row[5] = find(ids, id + plane, i + 1, n);
 }
 
+// One work-item per `run` points: reads their neighbours, writes how many rows the furthest one
+// lies after its point.
+kernel void furthest_neighbours(
+    const uint n,                   // points
+    const uint run,                 // points of a work-item
+    global const uint *neighbours,  // (N, 6)
+    global uint *furthest)          // (?) one number a work-item
+{
+    const uint g = get_global_id(0), first = g * run;
+    if (first >= n) return;
+    uint most = 0;
+    for (uint i = first; i < min(first + run, n); i++)
+        for (int side = 1; side < 6; side += 2) {
+            const uint j = neighbours[6 * (size_t)i + side];
+            most = max(most, j == NONE ? 0 : j - i);
+        }
+    furthest[g] = most;
+}
+
 // One work-item per part of a point of a chunk: reads all its coefficients and its neighbours',
 // writes the smoothed ones.
 kernel void smooth_gather(

@@ -34,10 +34,8 @@ from pp_cl.layers.choice import (
     tuning_file,
 )
 from pp_cl.layers.conv import Direction
-from pp_cl.network.layers import computations, convolutions, unet_layers
+from pp_cl.network.layers import Layer, computations, convolutions
 
-# Sides of a preset's pictures, in pixels, where they are evaluated; trainings take crops of them.
-EVALUATED = {"tiny": 200, "small": 400, "paper": 800}
 # A variant is given up when even its best of PROBES runs is HOPELESS times slower than the fastest.
 HOPELESS, PROBES = 3, 2
 # Pixels: side of the images on which blockings are tried, whatever the network's images: they
@@ -81,11 +79,11 @@ class Case:
         return ConvShape(self.direction, self.k, self.sources, self.co, self.side**2)
 
 
-def network_cases(widths: tuple[int, int, int], train_side: int, evaluated_side: int) -> list[Case]:
+def network_cases(layers: list[Layer], train_side: int, evaluated_side: int) -> list[Case]:
     """All distinct convolutions of a training step and of an evaluation's picture."""
     found = {}
     for side, training in ((train_side, True), (evaluated_side, False)):
-        for layer in convolutions(unet_layers(widths)):
+        for layer in convolutions(layers):
             for direction, source in computations(layer, training):
                 sources = layer.sources if source is None else (layer.sources[source],)
                 key = (direction, layer.kernel_size, sources, layer.channels, side >> layer.level)

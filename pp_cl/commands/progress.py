@@ -11,6 +11,8 @@ from tqdm import tqdm
 
 from pp_cl.run import Training
 
+BUILDING = 2  # steps in which nearly all kernels are built, if the driver has not kept them
+TOLD = "building kernels (once)"
 REDRAWN = 1  # seconds, at least, between two states of the bar
 LINES_APART = 30  # seconds, at least, between the lines in a file
 GIB = 2**30
@@ -29,31 +31,51 @@ def follow(training: Training, stream: TextIO | None = None) -> "Bar | Lines":
 
 
 class Bar:
-    """One line with rate, time left, PSNR, points and device memory, for a terminal."""
+    """One line with rate, time left, PSNR, points and device memory, for a terminal. It begins once
+    kernels are built, whose time says nothing of the steps to come.
+    """
 
     def __init__(self, training: Training, stream: TextIO) -> None:
-        self._dev, self._test = training.trainer.dev, ""
-        self._bar = tqdm(
-            total=training.config.train.iterations,
-            initial=training.trainer.step,
-            unit="step",
-            delay=1e-6,  # shows from the first step on, not above an error before it
-            mininterval=REDRAWN,
-            bar_format=FORMAT,
-            ncols=_columns(stream),
-            nrows=ROWS,
-            file=stream,
-        )
+        self._dev, self._stream, self._test = training.trainer.dev, stream, ""
+        self._first, self._steps = training.trainer.step, training.config.train.iterations
+        self._bar = None
 
     def __enter__(self) -> "Bar":
+        self._write(TOLD)
         return self
 
     def __exit__(self, *_: object) -> None:
-        self._bar.close()
+        if self._bar is None:
+            self._write("")
+        else:
+            self._bar.close()
+
+    def _write(self, text):
+        """Put a text in place of TOLD."""
+        self._stream.write(f"\r{text:{len(TOLD)}s}\r")
+        self._stream.flush()
+
+    def _opened(self, step):
+        self._write("")
+        return tqdm(
+            total=self._steps,
+            initial=step,
+            unit="step",
+            mininterval=REDRAWN,
+            bar_format=FORMAT,
+            ncols=_columns(self._stream),
+            nrows=ROWS,
+            file=self._stream,
+        )
 
     def __call__(self, step: int, row: dict[str, Any] | None) -> None:
         """Move on to a step."""
-        self._bar.update()
+        if step < self._first + BUILDING:
+            return
+        if self._bar is None:
+            self._bar = self._opened(step)
+        else:
+            self._bar.update()
         if row is None:
             return
         if "test_psnr" in row:
@@ -79,9 +101,10 @@ class Lines:
     def __init__(self, training: Training, stream: TextIO) -> None:
         self._dev, self._stream = training.trainer.dev, stream
         self._first, self._steps = training.trainer.step, training.config.train.iterations
-        self._start, self._next = time.monotonic(), 0.0
+        self._start, self._next = 0.0, 0.0
 
     def __enter__(self) -> "Lines":
+        self._print(TOLD)
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -89,24 +112,23 @@ class Lines:
 
     def __call__(self, step: int, row: dict[str, Any] | None) -> None:
         """Print a line, where the step has a row and the last line is long enough ago."""
-        now = time.monotonic()
-        if row is None or now < self._next:
-            return
-        self._next = now + LINES_APART
-        with suppress(OSError):  # of a full disk, which is no reason to stop
-            self._print(step, row, now)
+        now, done = time.monotonic(), step - self._first - BUILDING
+        if done <= 0:
+            self._start = now
+        elif row is not None and now >= self._next:
+            self._next = now + LINES_APART
+            rate = done / max(now - self._start, 1e-6)
+            left = round((self._steps - step) / rate)
+            test = f", test PSNR {row['test_psnr']:.2f}" if "test_psnr" in row else ""
+            self._print(
+                f"step {step} of {self._steps}, {rate:.3g} steps/s, {clock(left)} left,"
+                f" PSNR {row['psnr']:.2f}{test}, {row['points']} points,"
+                f" {self._dev.bytes / GIB:.2f} GiB"
+            )
 
-    def _print(self, step, row, now):
-        rate = (step - self._first) / max(now - self._start, 1e-6)
-        left = round((self._steps - step) / rate)
-        test = f", test PSNR {row['test_psnr']:.2f}" if "test_psnr" in row else ""
-        print(
-            f"step {step} of {self._steps}, {rate:.3g} steps/s, {clock(left)} left,"
-            f" PSNR {row['psnr']:.2f}{test}, {row['points']} points,"
-            f" {self._dev.bytes / GIB:.2f} GiB",
-            file=self._stream,
-            flush=True,
-        )
+    def _print(self, line):
+        with suppress(OSError):  # of a full disk, which is no reason to stop
+            print(line, file=self._stream, flush=True)
 
 
 @contextmanager

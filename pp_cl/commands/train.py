@@ -26,7 +26,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
             " of 800, longer; paper: the paper's numbers"
         ),
     )
-    add("--iterations", metavar="N", help="steps of training")
+    add("--iterations", metavar="N", help="steps of training; more of them extend a finished run")
     add("--points", metavar="N", help="wanted points on the grid")
     add(
         "--downscale", metavar="K", help="reduce the images K times (default: to the preset's size)"
@@ -45,6 +45,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="also write the curves to RUN/tensorboard (needs pp-cl[tensorboard])",
     )
     add("--view", action="store_true", help="look on in the browser, as with `pp-cl view RUN`")
+    add("-v", "--verbose", action="store_true", help="print the memory plan buffer by buffer")
     shared.add_tolerance(parser)
     shared.add_set(parser, "any other setting, see below")
     shared.add_device(parser)
@@ -56,7 +57,7 @@ def run(options: argparse.Namespace) -> None:
     from pp_cl.files.run_folder import RunFolder
     from pp_cl.files.scalars import writer_class
     from pp_cl.run import open_training
-    from pp_cl.run_config import run_config, stored_state
+    from pp_cl.run_config import is_finished, run_config, stored_state
     from pp_cl.training.memory import plan_lines
     from pp_cl.view.serve import serve_in_background
 
@@ -64,9 +65,9 @@ def run(options: argparse.Namespace) -> None:
         writer_class()  # refuses before the work where it is missing
     folder = RunFolder(options.out)
     given, is_new = _given_settings(options), not folder.config.exists()
-    config = run_config(folder, options.scene, options.preset, given)
+    config = run_config(folder, options.scene, options.preset, given, extends=True)
     stored = stored_state(folder, config)
-    if stored and stored[0]["finished"]:
+    if is_finished(stored, config):
         print(
             f"{folder} is finished ({stored[0]['step']} steps); `pp-cl eval {folder} --metrics`"
             " measures it"
@@ -79,7 +80,10 @@ def run(options: argparse.Namespace) -> None:
     chosen = is_new and "scene.downscale" not in [key for key, _, _ in given]
     print(_images_line(training, chosen))
     print(_first_line(training))
-    print("\n".join(plan_lines(training.room.plan, dev)), flush=True)
+    if training.hull and (told := _left_out_line(config.train)):
+        print(told)
+    lines = plan_lines(training.room.plan, dev)
+    print("\n".join(lines if options.verbose else lines[:1]), flush=True)
     with serve_in_background(folder.path, options.device) if options.view else nullcontext():
         seconds = _run(training, options)
     print(
@@ -115,6 +119,19 @@ def _first_line(training):
         f" ({hull.seconds:.1f} s)"
         f"{capped if hull.capped else ''}"
     )
+
+
+def _left_out_line(train):
+    """That refinements are left out, where some are."""
+    from pp_cl.training.schedule import refine_steps
+
+    wanted, made = sum(share < 1 for share in train.refine_at), len(refine_steps(train))
+    if made < wanted:
+        return (
+            f"refinements: {made} of the {wanted} of train.refine_at, since in {train.iterations}"
+            " iterations nothing is pruned between them"
+        )
+    return ""
 
 
 def _images_line(training, chosen):

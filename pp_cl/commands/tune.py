@@ -4,9 +4,11 @@ import argparse
 import time
 
 from pp_cl.commands import options as shared
-from pp_cl.config import preset
+from pp_cl.config import assign, preset
 from pp_cl.errors import UserError
-from pp_cl.presets import PRESETS
+from pp_cl.presets import IMAGE_SIZES, PRESETS
+
+UNREDUCED = 800  # pixels: side of the usual photographs where a preset takes them as they are
 
 HELP = "time the variants of the convolutions on this device, keep the fastest"
 
@@ -28,22 +30,19 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(options: argparse.Namespace) -> None:
     """Measure, print what is taken, store the tuning."""
     from pp_cl.bench import tune
+    from pp_cl.bench.estimate import network_layers
     from pp_cl.bench.table import TUNE_HEAD, blocking_line, tune_line
     from pp_cl.device.discover import open_device
     from pp_cl.layers.choice import CHOICES, make_policy, shipped_order
 
-    config = preset(options.preset or "tiny")
-    tolerance = options.tolerance
-    if tolerance is None:
-        tolerance = config.network.tolerance
-    evaluated = tune.EVALUATED[config.preset]
-    size, widths = options.size or evaluated, options.widths or config.network.widths
-    training = size if options.size else config.train.crop or evaluated
+    config, training, size = _read_network(options)
+    net = config.network
+    tolerance = net.tolerance if options.tolerance is None else options.tolerance
     dev = open_device(options.device)
     tune.check_cache()
     print(
-        f"{dev.name} [{dev.info['platform']}], widths {','.join(map(str, widths))}, "
-        f"training at {training}x{training}, evaluation at {size}x{size}"
+        f"{dev.name} [{dev.info['platform']}], widths {','.join(map(str, net.widths))}, "
+        f"blocks {net.blocks}, training at {training}x{training}, evaluation at {size}x{size}"
     )
     kind = make_policy(dev).device_class
 
@@ -62,7 +61,7 @@ def run(options: argparse.Namespace) -> None:
         print(tune_line(case.name, row, chosen, shipped_order(kind, case.shape)[0]), flush=True)
 
     start = time.perf_counter()
-    cases = tune.network_cases(widths, training, size)
+    cases = tune.network_cases(network_layers(config), training, size)
     tuning, shipped_ms = tune.run_tune(
         dev, cases, tolerance, on_blocking=show_blocking, on_row=show_row
     )
@@ -70,6 +69,16 @@ def run(options: argparse.Namespace) -> None:
     _print_gain(
         tune.total_times(cases, tuning["rows"], shipped_ms, make_policy(dev, tolerance, tuning))
     )
+
+
+def _read_network(options):
+    """(Config of the network asked for, sides of its images in training and in evaluation)."""
+    config = preset(options.preset or "tiny")
+    evaluated = IMAGE_SIZES[config.preset] or UNREDUCED
+    size = options.size or evaluated
+    if options.widths:
+        assign(config, "network.widths", options.widths, "--widths")
+    return config, size if options.size else config.train.crop or evaluated, size
 
 
 def _print_gain(times):

@@ -36,7 +36,7 @@ def compact_rows(dev: Device, array: Array, keep: Array) -> Array:
         _gather(dev, array, keep, scratch, first=start, count=count)
         if piece < m:
             dev.copy_rows(array, start, scratch, count)
-    return scratch if piece == m else dev.front(array, m)
+    return scratch if piece == m else array[:m]
 
 
 def gather_rows(dev: Device, array: Array, rows: Array) -> Array:

@@ -115,6 +115,10 @@ def _debug_level():
     return int(text)
 
 
+class Memory(cl.Buffer):
+    """A buffer whose end can be noticed: cl.Buffer takes no weak reference."""
+
+
 class Device:
     """One OpenCL device with its queue, programs and buffers. debug: PP_DEBUG
     (docs/environment.md). is_cpu: drivers and kernels take their form for CPUs. has_watchdog: long
@@ -276,14 +280,6 @@ class Device:
                 dst_offset=start * row_bytes,
             )
 
-    def front(self, array: Array, count: int) -> Array:
-        """The first `count` rows of an array of this device. Its buffer stays as large as it was,
-        and is counted so.
-        """
-        rows = array[:count]
-        weakref.finalize(rows, lambda whole: None, array)  # the array lives as long as its front
-        return rows
-
     def finish(self) -> None:
         """Wait until everything enqueued is done."""
         self.queue.finish()
@@ -340,13 +336,19 @@ class Device:
                 f" GiB at once and {total / 2**30:.2f} GiB in all, {self.bytes / 2**30:.2f} GiB are"
                 f" in use: {SMALLER}"
             )
-        array = self.attempt(
-            f"allocate {nbytes / 2**20:.0f} MiB", cl.array.empty, self.queue, shape, dtype
-        )
+        what = f"allocate {nbytes / 2**20:.0f} MiB"
+        return self.attempt(what, Array, self.queue, shape, dtype, allocator=self._counted)
+
+    def _counted(self, nbytes):
+        """Memory that is counted until the last array on it is gone, be it a slice or a view."""
+        memory = self._memory(nbytes)
         self.bytes += nbytes
         self.peak_bytes = max(self.peak_bytes, self.bytes)
-        weakref.finalize(array, self._released, nbytes)
-        return array
+        weakref.finalize(memory, self._released, nbytes)
+        return memory
+
+    def _memory(self, nbytes):
+        return Memory(self.context, cl.mem_flags.READ_WRITE, nbytes)
 
     def _released(self, nbytes):
         self.bytes -= nbytes

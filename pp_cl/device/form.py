@@ -51,7 +51,7 @@ def row_parts(dev: Any, on_gpu: int = 1) -> int:
 
 def group_items(dev: Any) -> int:
     """GROUP of kernels (cl/group.h): work-items that sum or scan together; a power of two on GPUs,
-    1 on CPUs.
+    1 on CPUs. Of kernels that the device runs in fewer, launch_groups() takes less.
     """
     if dev.is_cpu:
         return 1
@@ -59,12 +59,31 @@ def group_items(dev: Any) -> int:
     return 1 << most.bit_length() - 1
 
 
-def group_ranges(dev: Any, groups: int, members: int | None = None) -> tuple[int, int | None]:
-    """(work-items, work-group) of a kernel in which `members`, None = group_items(), work together,
-    `groups` times; on CPUs one work-item each. A work-group holds groups as a whole.
+def launch_groups(
+    dev: Any,
+    name: str,
+    kernel: str,
+    groups: int,
+    *,
+    defines: dict[str, int] | None = None,
+    **arguments,
+) -> None:
+    """Launch a kernel of cl/<name>.cl in which GROUP work-items work together, `groups` times. A
+    GPU's compiler may allow fewer of one kernel than the device runs of others.
+
+    defines: of the program, beside GROUP. arguments: by parameter name.
     """
-    if dev.is_cpu:
-        return groups, None
-    if members is None:
-        return groups * group_items(dev), group_items(dev)
-    return groups * members, max(members, SMALL_GROUP)
+    items, defines = group_items(dev), defines or {}
+    program = dev.program(name, GROUP=items, **defines)
+    while items > 1 and items > program.kernels[kernel].largest_group:
+        items //= 2
+        program = dev.program(name, GROUP=items, **defines)
+    local = None if dev.is_cpu else items
+    program.launch(kernel, groups * items, local, **arguments)
+
+
+def group_ranges(dev: Any, groups: int, members: int) -> tuple[int, int | None]:
+    """(work-items, work-group) of a kernel in which `members` work together, `groups` times; on
+    CPUs one work-item each. A work-group holds groups as a whole.
+    """
+    return (groups, None) if dev.is_cpu else (groups * members, max(members, SMALL_GROUP))

@@ -7,7 +7,7 @@ from pyopencl.array import Array
 
 from pp_cl.device.buffers import scratch
 from pp_cl.device.device import Device
-from pp_cl.device.form import group_items, group_ranges
+from pp_cl.device.form import launch_groups
 from pp_cl.device.transfer import Reading, read_later
 
 BLOCK = 512  # values that a work-item of a CPU scans
@@ -37,9 +37,10 @@ def _scan(dev, values, offsets, level):
     else:
         block_offset = scratch(dev, ("scan offset", level), 2, np.uint32)
         dev.fill(block_offset, 0)
-    _program(dev).launch(
+    _launch(
+        dev,
         "scan_offsets",
-        *group_ranges(dev, blocks),
+        blocks,
         n=n,
         b=blocks,
         values=values,
@@ -52,14 +53,14 @@ def _block_offsets(dev, kernel, n, blocks, *, level, **entries):
     """(blocks + 1,) prefix sums of what the kernel finds in each block of n entries."""
     block_offset = scratch(dev, ("scan offset", level), blocks + 1, np.uint32)
     block_sum = scratch(dev, ("scan sum", level), blocks, np.uint32)
-    ranges = group_ranges(dev, blocks)
-    _program(dev).launch(kernel, *ranges, n=n, b=blocks, block_sum=block_sum, **entries)
+    _launch(dev, kernel, blocks, n=n, b=blocks, block_sum=block_sum, **entries)
     _scan(dev, block_sum, block_offset, level + 1)
     return block_offset
 
 
-def _program(dev):
-    return dev.program("device/scan", BLOCK=block_values(dev), GROUP=group_items(dev))
+def _launch(dev, kernel, blocks, **arguments):
+    defines = {"BLOCK": block_values(dev)}
+    launch_groups(dev, "device/scan", kernel, blocks, defines=defines, **arguments)
 
 
 class DeviceList:
@@ -90,9 +91,10 @@ def nonzero(dev: Device, flags: Array, indices: Array) -> DeviceList:
     n = flags.size
     blocks = -(-n // block_values(dev))
     block_offset = _block_offsets(dev, "count_nonzero", n, blocks, level=0, flags=flags)
-    _program(dev).launch(
+    _launch(
+        dev,
         "scan_nonzero",
-        *group_ranges(dev, blocks),
+        blocks,
         n=n,
         b=blocks,
         flags=flags,

@@ -76,8 +76,7 @@ class Alpha(BlendWeights):
     ) -> Array:
         """As BlendWeights: G.f + g - B of each pair, B being G times what is composited behind."""
         gain = self._buffers.gain[: pairs.capacity]
-        has = {"HAS_GRAD_ALPHA": grad_alpha is not None, "HAS_SPREAD": spread_weight > 0}
-        self.dev.program("raster/alpha", **{name: int(x) for name, x in has.items()}).launch(
+        self.dev.program("raster/alpha", HAS_GRAD_ALPHA=int(grad_alpha is not None)).launch(
             "alpha_gain",
             pairs.pixels,
             hw=pairs.pixels,

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 from pyopencl.array import Array
 
-from pp_cl.device.buffers import Buffers, Table, grown
+from pp_cl.device.buffers import Buffers, Table
 from pp_cl.device.device import Device
 from pp_cl.device.scan import DeviceList, nonzero
 from pp_cl.raster.pairs import Pairs
@@ -125,7 +125,7 @@ class BlendWeights(ABC):
     def _reserve(self, pairs, has_roles):
         """The buffers (pair_weight, pair_role, pixel_entry) for these pairs."""
         p, b = pairs.capacity, self._buffers
-        self._capacity = grown(self._capacity, p)
+        self._capacity = max(self._capacity, p)
         table = self.table(pairs.points, self._capacity, has_roles)
         b.require(table | self.own_table(pairs.pixels, self._capacity))
         pair_role = b.pair_role[:p] if has_roles else b.pair_role

@@ -91,10 +91,11 @@ class PairBuilder:
 
         Raises UserError for more pairs than can be numbered or kept in the device's memory.
         """
-        pairs = self.enqueue(points, size)
-        while not self.has_room(pairs):
+        while True:
             pairs = self.enqueue(points, size)
-        return pairs
+            if self.has_room(pairs):
+                return pairs
+            del pairs  # else its arrays would stay beside the larger ones
 
     def has_room(self, pairs: Pairs) -> bool:
         """Whether there was room for the pairs; if not, the next ones will have it. Waits until

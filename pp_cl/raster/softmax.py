@@ -41,10 +41,10 @@ class Softmax(BlendWeights):
         drops = early_stop > 0 or tau > 0
         has_roles = drops or max_tracked > 0
         pair_weight, pair_role, pixel_entry = self._reserve(pairs, has_roles)
-        program = self.dev.program(
+        self._program = self.dev.program(
             "raster/softmax", LANES=lanes(self.dev), DROPS=int(drops), MAX_TRACKED=max_tracked
         )
-        program.launch(
+        self._program.launch(
             "softmax_weights",
             pairs.pixels,
             hw=pairs.pixels,
@@ -78,7 +78,7 @@ class Softmax(BlendWeights):
         if grad_alpha is not None or spread_weight > 0:
             raise ValueError("a softmax has no gradient of alpha and of spread")
         rest = self._buffers.rest
-        self.dev.program("raster/softmax").launch(
+        self._program.launch(
             "softmax_rest",
             pairs.pixels,
             hw=pairs.pixels,

@@ -38,6 +38,9 @@ WEIGHT = 2e-5
 OPACITY = 5e-5  # dL/do = share (1 + o z / gamma) s: two such factors
 MANY = 1e-4  # a sum of 20000 terms one by one: each rounds all those before it
 NEAREST = 1e-4  # e^100 of a depth near 1: its rounding, and that of the place, times 100
+UNIT = 2.0**-24  # a float's rounding
+ROUNDINGS = 4  # of an exponent, and in a row of a product of 16 terms
+LEAST = 2.0**-126  # the least float that every device has
 STEP = 1e-6
 DIFFERENCES = 2e-3  # depths and closeness are steep at the rim, where that step is no small one
 
@@ -124,6 +127,33 @@ def _smallest_gamma(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
         yield finite(*scene.gradients(np.ones((1, 1, 16))).values())
         expected = dense.blend(scene.geometry(), [np.float32(opacity)] * 3, 1e-5)["weight"]
         yield each(weight, expected[:, 0], 1e-2, floor=1e-28)
+
+
+def _opacity_bound(blended: Blended) -> np.ndarray:
+    """(N,) how far float32 may be from dL/do, in absolute size (docs/maths.md).
+
+    A product G.f rounds by its terms' size, an exponent o z/gamma by 1/gamma, and a numerator below
+    the least float is 0.
+    """
+    features, grad = blended.point_features, blended.grad
+    blend, inverse = blended.blend, 1 / blended.gamma
+    mean = dense.features(blend, features)
+    size = np.abs(features) @ np.abs(grad).T + np.abs(mean * grad).sum(axis=1)
+    gain = np.abs(features @ grad.T - (mean * grad).sum(axis=1))
+    gain += (blend["weight"] * gain).sum(axis=0)  # what an exponent's rounding moves the mean by
+    factor = 1 + blended.opacity[:, None] * np.abs(blend["z"]) * inverse
+    rounded = blend["share"] * (size + (1 + inverse) * gain) * UNIT * ROUNDINGS
+    underflow = LEAST * size
+    return np.where(blend["hit"], factor * (rounded + underflow), 0).sum(axis=1)
+
+
+def _sharp(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
+    """Where one hit has nearly all of the weight, dL/do is a rounding of 0 times 1/gamma."""
+    for kind in KINDS:
+        for gamma in (1e-3, 1e-5):
+            blended = Blended(dev, rng, kind=kind, gamma=gamma)
+            error = np.abs(blended.gradients()["opacity"] - blended.reference_gradients()[1])
+            yield no_more(error, _opacity_bound(blended), 0.0)
 
 
 def _nearest(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
@@ -223,6 +253,7 @@ CASES = (
     Case("softmax: early stop", _early_stop),
     Case("softmax: weights dropped by tau", _tau),
     Case("softmax: gamma of 1e-5", _smallest_gamma),
+    Case("softmax: dL/do at small gammas", _sharp),
     Case("softmax: nearest possible point", _nearest),
     Case("softmax: equal depths", _equal_depths),
     Case("softmax: opacities of 0", _zero_opacity),

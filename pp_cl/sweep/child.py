@@ -17,7 +17,7 @@ from pp_cl.errors import UserError
 from pp_cl.evaluate import evaluate
 from pp_cl.files.run_folder import RunFolder
 from pp_cl.run import open_training
-from pp_cl.run_config import run_config, stored_state
+from pp_cl.run_config import is_finished, run_config, stored_state
 from pp_cl.scene.open import scene_splits
 from pp_cl.sweep.plan import Job
 from pp_cl.trained import load_run
@@ -90,7 +90,7 @@ def _train(job, wish):
     folder = RunFolder(job.folder)
     config = run_config(folder, job.scene, job.preset, job.given)
     stored = stored_state(folder, config)
-    if stored and stored[0]["finished"]:
+    if is_finished(stored, config):
         return
     training = open_training(open_device(), folder, config, stored)
     with wish:

@@ -80,7 +80,7 @@ class Room:
         """Raise UserError as check_points does, where the least that the training can take does not
         fit.
         """
-        self._check(replace(self.sketch, spacing=0.0), advised=self.sketch)
+        self._check(replace(self.sketch, radius=0.0), advised=self.sketch)
 
     def check_points(
         self, grid: Grid, points: int, depth_range: tuple[float, float], step: int = 0

@@ -5,7 +5,7 @@ from pyopencl.array import Array
 
 from pp_cl.device.buffers import Buffers, Table
 from pp_cl.device.device import Device
-from pp_cl.device.form import group_items, group_ranges, lanes
+from pp_cl.device.form import group_items, lanes, launch_groups
 from pp_cl.layers.tiles import SIDE, grid_shape
 from pp_cl.network.tile_plan import grow
 
@@ -110,14 +110,26 @@ class Loss:
     def _sum(self, terms, sums):
         """Write sums (ROWS, 4) of terms (ROWS, M, 4)."""
         rows, m, _ = terms.shape
-        ranges = group_ranges(self.dev, rows)
-        self._launch("loss_sum", *ranges, rows=rows, m=m, terms=terms, sums=sums)
+        launch_groups(
+            self.dev,
+            "training/loss",
+            "loss_sum",
+            rows,
+            defines=self._defines,
+            rows=rows,
+            m=m,
+            terms=terms,
+            sums=sums,
+        )
 
-    def _launch(self, kernel, size, local=None, **arguments):
+    def _launch(self, kernel, size, **arguments):
+        program = self.dev.program("training/loss", GROUP=group_items(self.dev), **self._defines)
+        program.launch(kernel, size, **arguments)
+
+    @property
+    def _defines(self):
         values = lanes_of_loss(self.dev)
-        defines = {"LANES": values, "TAPS": TAPS, "MARGIN": MARGIN // values}
-        program = self.dev.program("training/loss", GROUP=group_items(self.dev), **defines)
-        program.launch(kernel, size, local, **arguments)
+        return {"LANES": values, "TAPS": TAPS, "MARGIN": MARGIN // values}
 
 
 def gradient_tiles(found: np.ndarray, size: tuple[int, int], offset: tuple[int, int]) -> np.ndarray:

@@ -5,7 +5,7 @@ from pyopencl.array import Array
 
 from pp_cl.device.buffers import Buffers, Table
 from pp_cl.device.device import Device
-from pp_cl.device.form import group_items, group_ranges
+from pp_cl.device.form import launch_groups
 from pp_cl.device.transfer import Reading, read_later
 
 
@@ -52,10 +52,9 @@ class MaskLoss:
             return None
         (height, width), (h, w), (left, top) = size, target_alpha.shape, offset
         self._buffers.require(self.table(height, width))
-        program = self.dev.program("training/mask", GROUP=group_items(self.dev))
-        program.launch(
+        self._launch(
             "mask_gradient",
-            *group_ranges(self.dev, height),
+            height,
             ph=height,
             pw=width,
             h=h,
@@ -69,9 +68,9 @@ class MaskLoss:
             grad_alpha=self._buffers.grad_alpha,
             row_term=self._buffers.row_term,
         )
-        program.launch(
+        self._launch(
             "mask_sum",
-            *group_ranges(self.dev, 1),
+            1,
             ph=height,
             pixels=h * w,
             weight=self.weight,
@@ -84,3 +83,6 @@ class MaskLoss:
     def terms(self) -> dict[str, Reading]:
         """{"mask": the mean square of the last call of add()}, {} where there was none."""
         return {"mask": read_later(self.dev, self._buffers.mean)} if self._measured else {}
+
+    def _launch(self, kernel, groups, **arguments):
+        launch_groups(self.dev, "training/mask", kernel, groups, **arguments)

@@ -20,21 +20,21 @@ from pp_cl.raster.pairs import PairBuilder
 from pp_cl.raster.point_cloud import PointCloud
 from pp_cl.raster.project import Projection
 from pp_cl.raster.sh import sh_blocks
-from pp_cl.render import NETWORK_MULTIPLE, Renderer
+from pp_cl.render import NETWORK_MULTIPLE, Renderer, point_radius
 from pp_cl.scene.camera import Camera
 from pp_cl.scene.grid import Grid
+from pp_cl.scene.hull import DEPTH_MARGIN
 from pp_cl.scene.load import reading
 from pp_cl.scene.open import DEMO, mask_rule
 from pp_cl.scene.photograph import Photograph
 from pp_cl.scene.shrink import kept_bytes, shrink_factor
-from pp_cl.settings import TrainConfig
 from pp_cl.training.crops import crop_side
 from pp_cl.training.loss import Loss, lanes_of_loss
 from pp_cl.training.mask import MaskLoss
 from pp_cl.training.optimiser import Optimiser
 from pp_cl.training.perceptual import PerceptualLoss
 from pp_cl.training.point_state import PointState
-from pp_cl.training.schedule import ema_start, refine_steps
+from pp_cl.training.schedule import ema_start, prunings, refine_steps
 from pp_cl.training.smooth import Smoother, chunk_points
 
 MIB, GIB = 2**20, 2**30
@@ -45,6 +45,8 @@ LATER_KEPT, LATER_SLOWER = 0.85, 0.068
 # bytes on the host: of pruning per point (weights, looks, opacities, and which stay), of refining
 # per point before it (the vertices of its eight in 64 bits, and their order)
 PRUNING_BYTES, REFINING_BYTES = 24, 320
+
+LEAST_RADIUS = 0.75  # pixels, as cl/raster/footprint.h has it
 
 Tables = list[tuple[str, Table]]  # what the buffers of each table are for
 
@@ -100,15 +102,15 @@ class Plan(NamedTuple):
 class Sketch:
     """What the memory of a training follows from.
 
-    photographs: of the training views. points: at `step`. spacing: of the points, pixels of the
-    largest photograph as it is stored. layers: of the grid, on which points may lie.
+    photographs: of the training views. points: at `step`. radius: of their footprints, pixels of
+    the largest photograph as it is stored. layers: of the grid, on which points may lie.
     """
 
     config: Config
     net: UNet
     photographs: Sequence[Photograph]
     points: int
-    spacing: float
+    radius: float
     layers: float
     step: int = 0
 
@@ -119,10 +121,11 @@ class Sketch:
         """
         points = config.points.count
         camera = _largest([one.camera for one in photographs])
-        pixels = math.pi / 6 * math.sqrt(4 / math.pi * camera.width * camera.height) ** 3
-        return cls(
-            config, net, photographs, points, (pixels / points) ** (1 / 3), points ** (1 / 3)
-        )
+        diameter = math.sqrt(4 / math.pi * camera.width * camera.height)
+        spacing = (math.pi / 6 * diameter**3 / points) ** (1 / 3)
+        deep = DEPTH_MARGIN * math.sqrt(3) * diameter  # of the cube around it, as depth_range()
+        radius = point_radius(config.raster, spacing, (0, deep))
+        return cls(config, net, photographs, points, radius, points ** (1 / 3))
 
     def on_grid(
         self, grid: Grid, points: int, depth_range: tuple[float, float], step: int = 0
@@ -133,15 +136,20 @@ class Sketch:
         # footprints grow by 1 / (z^2 cos) nearer by and off the axis: the mean over a cube, to
         # second order
         growth = 1 + (grid.diagonal / middle) ** 2 / 9
-        spacing = grid.edge * camera.fx / middle * math.sqrt(growth)
-        return replace(self, points=points, spacing=spacing, layers=grid.dims[2], step=step)
+        radius = point_radius(self.config.raster, grid.edge, depth_range)
+        radius *= camera.fx / middle * math.sqrt(growth)
+        return replace(self, points=points, radius=radius, layers=grid.dims[2], step=step)
 
     def with_points(self, points: int) -> "Sketch":
         """The same object with another number of points."""
         finer = (points / self.points) ** (1 / 3)
         return replace(
-            self, points=points, spacing=self.spacing / finer, layers=self.layers * finer
+            self, points=points, radius=self.finer_radius(finer), layers=self.layers * finer
         )
+
+    def finer_radius(self, times: float) -> float:
+        """`radius` on a grid of so many times finer a spacing, which soft footprints follow."""
+        return self.radius / (times if self.config.raster.footprint == "soft" else 1)
 
     def with_settings(self, **changes: int) -> "Sketch":
         """The same with other settings "downscale" and "crop"."""
@@ -164,8 +172,7 @@ class Sketch:
     @property
     def refinements(self) -> list[int]:
         """The steps of the refinements to come."""
-        train = self.config.train
-        return [s for s in refine_steps(train.iterations, train.refine_at) if s > self.step]
+        return [s for s in refine_steps(self.config.train) if s > self.step]
 
     @property
     def averages(self) -> float:
@@ -185,13 +192,14 @@ def memory_plan(sketch: Sketch) -> Plan:
 def _moments(sketch: Sketch) -> Iterator[Moment]:
     """From the sketch's step on: each level of refinement, the refining, and the averages."""
     train, n = sketch.config.train, sketch.points
-    steps = refine_steps(train.iterations, train.refine_at)
+    steps = refine_steps(train)
     start = max((s for s in steps if s <= sketch.step), default=0)
     to_come = sketch.refinements
     averages = sketch.averages
     for level, end in enumerate([*to_come, train.iterations]):
         now, left = max(start, sketch.step), len(to_come) - level
-        args = {"left": left, "spacing": sketch.spacing / 2**level, "start": now, "end": end}
+        radius = sketch.finer_radius(2**level)
+        args = {"left": left, "radius": radius, "start": now, "end": end}
         yield _moment(sketch, f"from step {now} on", n, ema=averages <= now, **args)
         before = _kept(train, start, now)
         if now < averages < end:
@@ -203,37 +211,29 @@ def _moments(sketch: Sketch) -> Iterator[Moment]:
             n, start = 8 * n, end
 
 
-def _prunings(train: TrainConfig, start: int, end: int) -> int:
-    """How often points may be pruned after the steps `start` to `end`, looked at since `start`."""
-    if train.prune_weight == 0 and train.prune_opacity == 0:
-        return 0
-    every, last = train.prune_every, min(end, train.iterations - 1)
-    return max(0, last // every - -(-(start + train.prune_looks) // every) + 1)
-
-
 def _kept(train, start, end):
     """The share of the points of a level, which began at step `start`, that the prunings up to
     `end` leave, an estimate.
     """
-    times = _prunings(train, start, end)
+    times = prunings(train, start, end)
     kept, slower = (LATER_KEPT, LATER_SLOWER) if start else (FIRST_KEPT, FIRST_SLOWER)
     return kept * times**-slower if times else 1.0
 
 
-def _moment(sketch, name, n, *, left, spacing, start, end, ema):
-    """A level at its most points. left: refinements to come. spacing: as Sketch has it."""
+def _moment(sketch, name, n, *, left, radius, start, end, ema):
+    """A level at its most points. left: refinements to come. radius: as Sketch has it."""
     train, blocks = sketch.config.train, sh_blocks(sketch.config.points.sh_degree)
-    prunes = _prunings(train, start, end) > 0
+    prunes = prunings(train, start, end) > 0
     row_bytes = max(64 * block.count for block in blocks)  # of the largest array of a point
     pruning = [("pruning (at most)", compact_table(n, row_bytes))] if prunes else []
-    tables = [*_kept_tables(sketch, n, ema), *pruning, *_stages(sketch, n, left, spacing)]
+    tables = [*_kept_tables(sketch, n, ema), *pruning, *_stages(sketch, n, left, radius)]
     every, last = train.checkpoint_every, min(end, train.iterations - 1)
     saves = start // every < last // every
     pieces = min(PIECE_BYTES, 64 * 8 * n) if saves else 0
     return Moment(name, n, tables, prunes * PRUNING_BYTES * n + 2 * pieces)
 
 
-def _refining(sketch, n, *, left, spacing, start, end, ema):
+def _refining(sketch, n, *, left, radius, start, end, ema):
     """Old and new arrays of the points live together, one array after the other, beside the
     buffers of the stages for the old points.
     """
@@ -245,7 +245,7 @@ def _refining(sketch, n, *, left, spacing, start, end, ema):
     tables = [
         *_kept_tables(sketch, 8 * n, ema),
         ("refining", last),
-        *_stages(sketch, n, left, spacing),
+        *_stages(sketch, n, left, radius),
     ]
     return Moment(f"refining after step {end}", 8 * n, tables, REFINING_BYTES * n)
 
@@ -261,7 +261,7 @@ def _kept_tables(sketch, n, ema):
     ]
 
 
-def _stages(sketch: Sketch, n: int, left: int, spacing: float) -> Tables:
+def _stages(sketch: Sketch, n: int, left: int, radius: float) -> Tables:
     """What the stages of a step and of a rendered preview take."""
     config, net = sketch.config, sketch.net
     train, downscale = config.train, config.scene.downscale
@@ -271,7 +271,7 @@ def _stages(sketch: Sketch, n: int, left: int, spacing: float) -> Tables:
     width, height = _crop(halved, crop_side(train.crop, left))
     target = (height, width, 3)
     photograph = (camera.height // sketch.shrunk, camera.width // sketch.shrunk, 4)
-    pairs = n * _pixels_per_point(config, spacing / downscale)
+    pairs = n * min(math.pi * max(LEAST_RADIUS, radius / downscale) ** 2, full[0] * full[1])
     return [
         ("smoothing (estimate)", _smoothing_table(sketch, n)),
         *_raster_tables(config.raster, n, full, pairs),
@@ -356,31 +356,23 @@ def _raster_tables(settings, n, size, pairs):
     ]
 
 
-def _pixels_per_point(config: Config, spacing: float) -> float:
-    """Mean area of a footprint in pixels. spacing: of the points, pixels."""
-    radius = 0.75  # the hard disc
-    if config.raster.footprint == "soft":
-        radius = max(radius, config.raster.radius * spacing)
-    return math.pi * radius**2
-
-
 def tables_bytes(tables: Tables) -> int:
     """Bytes of all buffers of the tables."""
     return sum(table_bytes(table) for _, table in tables)
 
 
 def plan_lines(plan: Plan, dev: Device) -> list[str]:
-    """The plan as text: the device's buffers at their peak against its limits, and the host."""
+    """The plan as text: device and host at their peaks in one line, then the device's buffers."""
     peak, (what, largest) = plan.peak, plan.largest
     rows = [(what, len(table), table_bytes(table)) for what, table in peak.tables if table]
     rows.append(("total", sum(number for _, number, _ in rows), peak.device))
     host = plan.host(dev.is_cpu)
     return [
-        f"memory plan ({dev.name}: {dev.info['memory_bytes'] / MIB:.0f} MiB, at most"
-        f" {dev.info['max_allocation_bytes'] / MIB:.0f} at once); {peak.name}, {peak.points}"
-        " points:",
+        f"memory: {peak.device / MIB:.0f} of {dev.info['memory_bytes'] / MIB:.0f} MiB of {dev.name}"
+        f" ({peak.name}, {peak.points} points), {host / MIB:.0f} MiB of the host"
+        + (", the device's among them" if dev.is_cpu else ""),
         *(f"  {name:30s} {number:4d} buffers {size / MIB:9.1f} MiB" for name, number, size in rows),
-        f"  largest buffer: {largest / MIB:.1f} MiB ({what})",
-        f"  host: {host / MIB:.0f} MiB beside the program, {plan.photographs / MIB:.0f} of them"
-        " photographs" + (", the device's among them" if dev.is_cpu else ""),
+        f"  largest buffer: {largest / MIB:.1f} MiB ({what}), of at most"
+        f" {dev.info['max_allocation_bytes'] / MIB:.0f} at once",
+        f"  photographs on the host: {plan.photographs / MIB:.0f} MiB",
     ]

@@ -7,7 +7,7 @@ from pyopencl.array import Array
 
 from pp_cl.device.buffers import Buffers, Table
 from pp_cl.device.device import Device
-from pp_cl.device.form import group_items, group_ranges, lanes
+from pp_cl.device.form import lanes, launch_groups
 from pp_cl.device.transfer import Reading, read_later
 from pp_cl.errors import UserError
 from pp_cl.layers.choice import ConvolutionPolicy
@@ -133,9 +133,8 @@ class PerceptualLoss:
 
     def _launch(self, kernel, groups, **arguments):
         """`groups`: how often group_items() of a GPU, or one work-item of a CPU, sum."""
-        macros = {"LANES": lanes(self.dev), "GROUP": group_items(self.dev)}
-        program = self.dev.program("training/perceptual", **macros)
-        program.launch(kernel, *group_ranges(self.dev, groups), **arguments)
+        defines = {"LANES": lanes(self.dev)}
+        launch_groups(self.dev, "training/perceptual", kernel, groups, defines=defines, **arguments)
 
 
 class _Places:

@@ -22,8 +22,8 @@ def keep_indices(
     weights, opacities: (N,) float32. NaN counts as too little. Where no point would remain, the
     one of the highest weight does (the first of several).
     """
-    weight = weights.get()
-    return _listed(dev, (weight >= least_weight) & (opacities.get() >= least_opacity), weight)
+    weight, opacity = dev.download(weights), dev.download(opacities)
+    return _listed(dev, (weight >= least_weight) & (opacity >= least_opacity), weight)
 
 
 def judge(dev: Device, state: PointState, opacities: Array, settings: TrainConfig) -> Array:
@@ -33,14 +33,15 @@ def judge(dev: Device, state: PointState, opacities: Array, settings: TrainConfi
     Others stay. A mean over the looks would drop what few views see, such as the inside of a gap.
     Raises Diverged for weights and opacities that are not finite: nothing would tell of them later.
     """
-    peak, looks, opacity = (a.get() for a in (state.peak_weight, state.look_count, opacities))
+    arrays = (state.peak_weight, state.look_count, opacities)
+    peak, looks, opacity = (dev.download(array) for array in arrays)
     broken = int((~np.isfinite(peak) | ~np.isfinite(opacity)).sum())
     if broken:
         raise Diverged(f"{broken} points have a weight or an opacity that is not finite")
     judged = looks >= settings.prune_looks
     passes = (peak >= settings.prune_weight) & (opacity >= settings.prune_opacity)
     for array, values in ((state.peak_weight, peak), (state.look_count, looks)):
-        array.set(np.where(judged, np.float32(0), values))
+        dev.write(array, np.where(judged, np.float32(0), values))
     return _listed(dev, ~judged | passes, peak)
 
 

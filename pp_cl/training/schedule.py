@@ -4,6 +4,8 @@ which counts from 0 to steps - 1.
 
 import math
 
+from pp_cl.settings import TrainConfig
+
 EMA_UPDATES = 200  # times the averages would be updated in all steps; the last 15 % do
 
 
@@ -29,11 +31,31 @@ def learning_rate(
     )
 
 
-def refine_steps(steps: int, shares: tuple[float, ...]) -> list[int]:
-    """The numbers of steps done, ascending, after which the grid is refined. shares: of the steps;
-    1: never.
+def prunings(train: TrainConfig, start: int, end: int) -> int:
+    """How often points may be pruned after the steps `start` to `end`, looked at since `start`."""
+    if not _prunes(train):
+        return 0
+    every, last = train.prune_every, min(end, train.iterations - 1)
+    return max(0, last // every - -(-(start + train.prune_looks) // every) + 1)
+
+
+def _prunes(train):
+    return train.prune_weight > 0 or train.prune_opacity > 0
+
+
+def refine_steps(train: TrainConfig) -> list[int]:
+    """The numbers of steps done, ascending, after which the grid is refined.
+
+    Each makes eight points of one. So a training that prunes leaves a further one out where nothing
+    would be pruned since the one before.
     """
-    return sorted(max(1, round(share * steps)) for share in shares if share < 1)
+    shares = (share for share in train.refine_at if share < 1)
+    steps = sorted({max(1, round(share * train.iterations)) for share in shares})
+    found = steps[:1]
+    for step in steps[1:]:
+        if prunings(train, found[-1], step) or not _prunes(train):
+            found.append(step)
+    return found
 
 
 def gamma_at(step: int, steps: int, first: float = 0.1, last: float = 0.01) -> float:

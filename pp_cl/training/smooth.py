@@ -8,9 +8,9 @@ from pp_cl.device.device import Device
 from pp_cl.device.form import lanes, row_parts
 from pp_cl.raster.sh import SH_BLOCKS
 
-NONE = 0xFFFFFFFF
 # points smoothed at a time: their new values stay in a CPU's cache until they are written back
 CHUNK = 16384
+REACH_RUN = 256  # points of which one work-item finds the furthest neighbour
 MOST_COEFFICIENTS = max(block.count for block in SH_BLOCKS)  # of one point in one array
 
 
@@ -37,11 +37,22 @@ class Smoother:
         _program(dev).launch(
             "neighbour_table", n, n=n, grid=grid, ids=ids, neighbours=self.neighbours
         )
-        after = self.neighbours.get()[:, 1::2]
-        places = np.arange(n, dtype=np.uint32)[:, None]
-        furthest = np.where(after == NONE, 0, after - places).max(initial=0)
-        self.chunk = chunk_points(n, int(furthest))
+        self.chunk = chunk_points(n, self._furthest(n))
         self._buffers.require(self.table(n, self.chunk))
+
+    def _furthest(self, n):
+        """How many rows the furthest of all neighbours lies after its point."""
+        runs = -(-n // REACH_RUN)
+        furthest = self.dev.empty((runs,), np.uint32)
+        _program(self.dev).launch(
+            "furthest_neighbours",
+            runs,
+            n=n,
+            run=REACH_RUN,
+            neighbours=self.neighbours,
+            furthest=furthest,
+        )
+        return int(self.dev.download(furthest).max(initial=0))
 
     @staticmethod
     def table(n: int, chunk: int) -> Table:

@@ -20,13 +20,14 @@ from pp_cl.network.layers import parameter_table, unet_layers
 from pp_cl.raster.sh import SH_DEGREES, sh_blocks
 from pp_cl.scene.identity import DIGITS, kept_views
 from pp_cl.training.point_state import PointState
-from pp_cl.training.schedule import ema_start, refine_steps
+from pp_cl.training.schedule import ema_start
 
 MOST_VERTICES = 2**32  # an id has 32 bits
 LEAST_LENGTH, MOST_LENGTH = 1e-30, 1e30  # world units; float32 would hold no products of others
 LEAST_SHARE = 1e-6  # of far, between it and near: float32 would hold them as one
 MOST_TEXT = 1000
 DIGEST = re.compile(f"[0-9a-f]{{{DIGITS}}}")
+OPTIONAL = {"format", "tuning", "extended_from"}  # keys of a header
 GRID = ("origin", "edge", "dims")
 
 
@@ -65,17 +66,17 @@ class StoredRun:
         missing = [key for key in rules if key not in header]
         if missing:
             self._refuse(f"its header lacks {', '.join(missing)}")
-        unknown = sorted(header.keys() - rules.keys() - {"format", "tuning"})
+        unknown = sorted(header.keys() - rules.keys() - OPTIONAL)
         if unknown:
             self._refuse(f"its header holds {shown(unknown[0], 40)}, which this version knows not")
+        if "extended_from" in header:
+            rules["extended_from"] = _is_done(header), "a step that is done"
         for key, (is_right, expected) in rules.items():
             if not is_right(header[key]):
                 self._refuse(f"{key} in its header is {quoted(header[key])}, expected {expected}")
-        if header["finished"] != (header["step"] == config.train.iterations):
-            state = "finished" if header["finished"] else "not finished"
+        if header["step"] == config.train.iterations and not header["finished"]:
             self._refuse(
-                f"it is {state} at step {header['step']}, of {config.train.iterations} in its"
-                " config.json"
+                f"it is not finished at step {header['step']}, the last in its config.json"
             )
         if header.get("tuning") is not None:
             try:
@@ -88,12 +89,13 @@ class StoredRun:
         ids = self.forms.get("points.ids")
         n = ids.shape[0] if ids and len(ids.shape) == 1 else 0
         header, mend = self.header, "its config.json may belong to another run"
-        refined = sum(t <= header["step"] for t in _refine_steps(config))
+        refined = sum(share < 1 for share in config.train.refine_at)
         most = min(math.prod(header["grid"]["dims"]), header["initial_points"] * 8**refined)
         if not 0 < n <= most:
             self._refuse(f"points.ids is {ids or 'missing'}, expected 1 to {most} points")
         half = self.forms.get("points.sh0", ids).dtype == np.float16
-        expected = stored_forms(config, n, header["step"], half and header["finished"])
+        step = None if header["finished"] else header["step"]
+        expected = stored_forms(config, n, step, half and header["finished"])
         for name in sorted(expected.keys() | self.forms.keys()):
             found, wanted = self.forms.get(name), expected.get(name)
             if wanted is None:
@@ -121,9 +123,9 @@ def load_run_state(
         return stored.header, stored.arrays()
 
 
-def stored_forms(config: Config, n: int, step: int, half: bool = False) -> dict[str, Form]:
-    """{name: Form} of the arrays that a checkpoint holds after `step` steps, with n points left.
-    half: with coefficients of 16 bits, as a compressed run has them.
+def stored_forms(config: Config, n: int, step: int | None, half: bool = False) -> dict[str, Form]:
+    """{name: Form} of the arrays that a checkpoint holds after `step` steps, None: of a finished
+    training, with n points left. half: with coefficients of 16 bits, as a compressed run has them.
     """
     degree, colours = config.points.sh_degree, np.float16 if half else np.float32
     settings = config.network
@@ -132,7 +134,7 @@ def stored_forms(config: Config, n: int, step: int, half: bool = False) -> dict[
     table = {"points.ids": ((n,), np.uint32), "points.opacity": ((n,), np.float32)}
     table |= {f"points.sh{d}": ((n, 2 * d + 1, 16), colours) for d in SH_DEGREES[: degree + 1]}
     table |= {f"net.{name}": row for name, row in network.items()}
-    if step < config.train.iterations:
+    if step is not None:
         table |= _training_state(config, n, step, network)
     return {name: Form(tuple(shape), np.dtype(dtype)) for name, (shape, dtype) in table.items()}
 
@@ -148,17 +150,13 @@ def _training_state(config, n, step, network):
     return table | {f"state.{name}": row for name, row in points.items()}
 
 
-def _refine_steps(config):
-    return refine_steps(config.train.iterations, config.train.refine_at)
-
-
 # --------------------------------------------------------------------------------------------------
 
 Rule = tuple[Callable[[Any], bool], str]  # whether a value is right, and what it should be
 
 
 def _header_rules(config: Config) -> dict[str, Rule]:
-    """{key of the header: Rule}, beside "format" and the optional "tuning"."""
+    """{key of the header: Rule}, beside those of OPTIONAL."""
     steps = config.train.iterations
     return {
         "scene": (lambda x: type(x) is str and 0 < len(x) <= MOST_TEXT, "a text"),
@@ -190,6 +188,10 @@ def _are_digests(pixels):
 
 def _whole_in(least, most):
     return lambda x: type(x) is int and least <= x <= most
+
+
+def _is_done(header):
+    return lambda x: _whole_in(1, header["step"])(x)  # which is checked by then
 
 
 def _are_numbers(values, count):

@@ -33,6 +33,7 @@ from pp_cl.layers.choice import (
     tuning_file,
 )
 from pp_cl.layers.conv import Direction
+from pp_cl.network.layers import unet_layers
 
 FORWARD, INPUT, WEIGHTS = Direction
 SMALL = ("--size", "8", "--widths", "16,16,16")
@@ -110,7 +111,8 @@ def measured(dev, case=CASE, blocking=()):
 
 
 def test_cases_of_a_network():
-    cases = network_cases((32, 64, 128), 128, 200)
+    layers = unet_layers((32, 64, 128), blocks="double")
+    cases = network_cases(layers, 128, 200)
     training = [c for c in cases if c.training]
     by_place = {(c.name, c.direction): c for c in training}
     # and dec0.b
@@ -130,8 +132,8 @@ def test_cases_of_a_network():
         50,
     }
     assert sum(c.count for c in evaluation) == 13
-    assert all(c.training for c in network_cases((32, 64, 128), 64, 64))
-    assert sum(c.count for c in network_cases((32, 64, 128), 64, 64)) == sum(counts.values())
+    assert all(c.training for c in network_cases(layers, 64, 64))
+    assert sum(c.count for c in network_cases(layers, 64, 64)) == sum(counts.values())
 
 
 # ---- what is concluded from times
@@ -314,18 +316,20 @@ def test_tune_stores_what_the_others_then_use(cache, capsys, monkeypatch):
 @pytest.mark.parametrize(
     "words, network",
     [
-        ([], ((32, 64, 128), 128, 200)),
-        (["--preset", "small"], ((32, 64, 128), 160, 400)),
-        (["--preset", "paper"], ((128, 256, 512), 800, 800)),
-        (["--size", "64"], ((32, 64, 128), 64, 64)),
-        (["--widths", "16,16,32", "--preset", "small"], ((16, 16, 32), 160, 400)),
+        ([], ((32, 64, 128), "single", 128, 200)),
+        (["--preset", "small"], ((32, 64, 128), "single", 160, 400)),
+        (["--preset", "full"], ((32, 64, 128), "single", 256, 800)),
+        (["--preset", "paper"], ((128, 256, 512), "double", 800, 800)),
+        (["--size", "64"], ((32, 64, 128), "single", 64, 64)),
+        (["--widths", "16,16,32", "--preset", "small"], ((16, 16, 32), "single", 160, 400)),
     ],
 )
 def test_network_and_sizes_asked_for(monkeypatch, words, network):
     called = []
     monkeypatch.setattr(tune, "network_cases", lambda *args: called.append(args) or [])
     assert main(["tune", *words, "--tolerance", "1e-6"]) == 0
-    assert called == [network]
+    widths, blocks, *sides = network
+    assert called == [(unet_layers(widths, blocks=blocks), *sides)]
 
 
 @pytest.mark.parametrize(

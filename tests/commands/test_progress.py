@@ -29,12 +29,14 @@ def training():
 
 
 def shown(training, stream, monkeypatch):
-    """What 300 steps print that take a second each and of which every tenth has a row."""
+    """What 300 steps print that take a second each, the first two of them a minute, and of which
+    every tenth has a row.
+    """
     now = [1000.0]
     monkeypatch.setattr("pp_cl.commands.progress.time.monotonic", lambda: now[0])
     with progress.follow(training, stream) as follower:
         for step in range(101, 401):
-            now[0] += 1
+            now[0] += 1 if step > 102 else 60
             test = {"test_psnr": 25.5} if step == 200 else {}
             follower(step, ROW | test if step % 10 == 0 else None)
     return stream.getvalue()
@@ -44,6 +46,7 @@ def test_elsewhere_there_is_a_plain_line_every_30_seconds(training, monkeypatch)
     text = shown(training, io.StringIO(), monkeypatch)
     lines = text.splitlines()
     assert "\r" not in text and "\x1b" not in text
+    assert lines.pop(0) == "building kernels (once)"
     assert [int(line.split()[1]) for line in lines] == list(range(110, 401, 30))
     assert lines[0] == ("step 110 of 400, 1 steps/s, 4:50 left, PSNR 27.31, 1200 points, 1.50 GiB")
     assert "PSNR 27.31, test PSNR 25.50, 1200" in lines[3]
@@ -70,6 +73,7 @@ def test_things_are_counted(monkeypatch):
 def test_a_terminal_has_one_line(training, monkeypatch):
     monkeypatch.setattr("pp_cl.commands.progress.REDRAWN", 0)
     text = shown(training, Terminal(), monkeypatch)
+    assert text.startswith("\rbuilding kernels (once)\r")
     assert text.count("\n") == 1 and text.endswith("\n")
     last = text.rstrip("\n").rpartition("\r")[2]
     assert last.startswith("100%|") and " 400/400, " in last and "step/s, 00:00 left" in last
@@ -81,14 +85,14 @@ def test_a_terminal_that_tells_no_size_shows_the_line(training, monkeypatch):
     master, slave = pty.openpty()
     monkeypatch.setattr("pp_cl.commands.progress.REDRAWN", 0)
     with open(slave, "w") as stream, progress.follow(training, stream) as follower:
-        follower(101, ROW)
-        follower(102, ROW)
+        for step in range(101, 105):
+            follower(step, ROW)
     text = b""
     with suppress(OSError):  # nobody writes any more
         while piece := os.read(master, 10_000):
             text += piece
     os.close(master)
-    assert b"102/400" in text and b"PSNR 27.3" in text
+    assert b"104/400" in text and b"PSNR 27.3" in text
 
 
 @pytest.mark.parametrize("seconds, text", [(0, "0:00"), (61, "1:01"), (36_610, "10:10:10")])

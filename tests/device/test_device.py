@@ -93,7 +93,10 @@ def test_memory_is_counted_and_given_back(plain):
     assert plain.bytes == plain.peak_bytes == 4000 + 8000
     del b
     assert (plain.bytes, plain.peak_bytes) == (4000, 12000)
+    part = a[:10].reshape(5, 2).view(np.uint32)  # as much as before, whoever holds it
     del a
+    assert plain.bytes == 4000
+    del part
     assert (plain.bytes, plain.peak_bytes) == (0, 12000)
 
 

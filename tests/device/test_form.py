@@ -14,6 +14,7 @@ from pp_cl.device.form import (
     row_parts,
     takes_cpu_form,
 )
+from pp_cl.device.launch import Kernel
 from pp_cl.errors import UserError
 from pp_cl.selftest.run import CASES, run_cases
 
@@ -35,7 +36,7 @@ IN_GPU_FORM = (
     "loss: perceptual",
     "metrics: distance of LPIPS",
     "adam: arrays",
-    "adam: points, sh_0",
+    "rmsprop: degree 2",
     "training: smoothing",
     "scene: demo",
 )
@@ -74,11 +75,31 @@ def test_lanes(dev, monkeypatch):
 def test_groups(largest, items):
     """A power of two that the device runs; none on CPUs, which take their work-group."""
     of = SimpleNamespace(is_cpu=False, device=SimpleNamespace(max_work_group_size=largest))
-    assert (group_items(of), group_ranges(of, 7)) == (items, (7 * items, items))
+    assert group_items(of) == items
     assert group_ranges(of, 7, 16) == (112, 64)
     of.is_cpu = True
     assert group_ranges(of, 7, 16) == (7, None)
-    assert (group_items(of), group_ranges(of, 7)) == (1, (7, None))
+    assert group_items(of) == 1
+
+
+@pytest.mark.parametrize("name", ["device: scan", "loss: L1 and SSIM", "loss: mask"])
+def test_groups_are_no_larger_than_a_kernel_allows(dev, monkeypatch, name):
+    """Compilers allow fewer work-items of kernels that take many registers."""
+    made = Kernel.__init__
+
+    def limited(kernel, *args, **named):
+        made(kernel, *args, **named)
+        kernel.largest_group = 32
+
+    monkeypatch.setattr(Kernel, "__init__", limited)
+    monkeypatch.setattr(dev, "is_cpu", False)
+    monkeypatch.setattr(dev, "_programs", {})
+    case = next(case for case in CASES if case.name == name)
+    assert [row.passed for row in run_cases(dev, [case])] == [True]
+
+
+def test_the_cases_in_the_form_for_gpus_are_there():
+    assert set(IN_GPU_FORM) <= {case.name for case in CASES}
 
 
 @pytest.mark.parametrize(

@@ -101,6 +101,15 @@ def test_gradients_of_the_spread_against_finite_differences(dev, rng):
     assert relative_error(gradients["opacity"], numeric) < 1e-5
 
 
+def test_a_spread_that_begins_at_0_takes_no_program_of_its_own(dev, rng, monkeypatch):
+    monkeypatch.setattr(dev, "_programs", {})
+    blended = alpha_scene(dev, rng)
+    blended.gradients()
+    built = set(dev._programs)
+    blended.gradients(spread_weight=1.0)
+    assert set(dev._programs) == built
+
+
 def test_hits_at_one_depth_and_single_hits_have_no_spread(dev):
     for z in ([0.5], [0.5] * 7):
         scene, _ = on_axis(dev, z, [0.5] * len(z), 0.1, rule="alpha")

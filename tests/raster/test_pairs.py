@@ -64,6 +64,38 @@ def test_radii_of_all_sizes(dev, rng, kind, n):
     )
 
 
+def by_point(pairs):
+    """[(pixels, closeness)] of each point."""
+    offsets = pairs.point_offset.get()[1:-1]
+    closeness = pairs.pair_point_closeness.get()[: pairs.total, 1].view(np.float32)
+    pixels = np.split(pairs.pair_pixel.get()[: pairs.total], offsets)
+    return list(zip(pixels, np.split(closeness, offsets), strict=True))
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_hits_that_were_counted_otherwise_stay_within_their_point(dev, rng, kind):
+    """As where a compiler rounds in one way where hits are counted, in another where they are
+    written: all other points' pairs are what they would be, and no slot is left undefined.
+    """
+    camera, n = make_camera(), 300
+    scene = PairedPoints(dev, camera, make_points(rng, n), 0.1, kind=kind)
+    counts = scene.projected.point_count.get().astype(np.int64)
+    change = np.where(counts > 2, rng.choice([-2, -1, 0, 0, 1, 2], n), 0)
+    assert {*change} == {-2, -1, 0, 1, 2}
+    planted = replace(scene.projected, point_count=dev.upload(counts + change, np.uint32))
+    pairs = PairBuilder(dev, Footprint(kind)).build(planted, scene.shape)
+    assert pairs.total == (counts + change).sum()
+    for one, other, difference in zip(by_point(scene.pairs), by_point(pairs), change, strict=True):
+        both = min(len(one[0]), len(other[0]))
+        assert len(other[0]) - len(one[0]) == difference
+        assert all(np.array_equal(a[:both], b[:both]) for a, b in zip(one, other, strict=True))
+        assert (other[1][both:] == 0).all()
+    pixels, keys = pairs.pair_pixel.get()[: pairs.total], pairs.pair_key.get()[: pairs.total]
+    assert np.array_equal(np.sort(keys & 0xFFFFFFFF), np.arange(pairs.total))
+    listed = np.diff(pairs.pixel_offset.get().astype(np.int64))
+    assert np.array_equal(listed, np.bincount(pixels, minlength=len(listed)))
+
+
 def test_a_crop_sees_the_same_hits(dev, rng):
     camera, positions = make_camera(40, 36), make_points(rng, 300)
     whole = PairedPoints(dev, camera, positions, 0.1).hits().reshape(-1, 36, 40)

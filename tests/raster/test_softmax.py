@@ -26,6 +26,12 @@ def test_weights(dev, rng, kind, gamma):
     assert np.array_equal(blended.scene.weights.shaded.get(), blended.scene.seen)
 
 
+def test_gradients_take_no_program_of_their_own(dev, rng, monkeypatch):
+    monkeypatch.setattr(dev, "_programs", {})
+    Blended(dev, rng).gradients()
+    assert [name for name, _ in dev._programs].count("raster/softmax") == 1
+
+
 @pytest.mark.parametrize("early_stop", [0.001, 0.05, 0.5])
 def test_early_stop(dev, rng, early_stop):
     blended = Blended(dev, rng, n=500, gamma=0.02, radius=0.4, early_stop=early_stop)

@@ -49,12 +49,12 @@ def settings(**changes):
 def contents(config, step=STEP, n=POINTS):
     """(header, {name: array}) that a run could have after `step` steps."""
     rng, arrays = np.random.default_rng(5), {}
-    for name, form in stored_forms(config, n, step).items():
+    finished = step == config.train.iterations
+    for name, form in stored_forms(config, n, None if finished else step).items():
         arrays[name] = rng.random(form.shape).astype(form.dtype)
     arrays["points.ids"] = np.sort(rng.choice(9 * 8 * 7, n, replace=False)).astype(np.uint32)
     if "state.last_step" in arrays:
         arrays["state.last_step"] = rng.integers(0, step + 1, n).astype(np.uint32)
-    finished = step == config.train.iterations
     return HEADER | {"step": step, "finished": finished}, arrays
 
 

@@ -1,15 +1,13 @@
 """Shared by the tests: guarded buffers, finite differences, real data."""
 
 import os
-import weakref
 from pathlib import Path
 
 import numpy as np
 import pyopencl as cl
-import pyopencl.array as cl_array
 import pytest
 
-from pp_cl.device.device import Device
+from pp_cl.device.device import Device, Memory
 
 DATA = Path(
     os.environ.get("PP_DATA") or Path(__file__).parents[2] / ".." / "shared" / "data"
@@ -36,22 +34,14 @@ class GuardedDevice(Device):
         super().__init__(device)
         self._guarded = []
 
-    def _allocate(self, shape, dtype):
-        dtype = np.dtype(dtype)
-        nbytes = int(np.prod(shape, dtype=np.int64)) * dtype.itemsize
-        if nbytes == 0:
-            return super()._allocate(shape, dtype)
+    def _memory(self, nbytes):
         poison = np.full(nbytes + self.canary_bytes, 0xFF, np.uint8)
         poison[nbytes:] = CANARY
-        buffer = cl.Buffer(
-            self.context, cl.mem_flags.READ_WRITE | cl.mem_flags.COPY_HOST_PTR, hostbuf=poison
-        )
-        array = cl_array.Array(self.queue, shape, dtype, data=buffer)
-        self.bytes += nbytes
-        self.peak_bytes = max(self.peak_bytes, self.bytes)
-        weakref.finalize(array, self._released, nbytes)
-        self._guarded.append((buffer, nbytes))
-        return array
+        flags = cl.mem_flags.READ_WRITE | cl.mem_flags.COPY_HOST_PTR
+        memory = Memory(self.context, flags, hostbuf=poison)
+        # a reference of its own, so that the device counts the memory as released in time
+        self._guarded.append((cl.Buffer.from_int_ptr(memory.int_ptr), nbytes))
+        return memory
 
     def check(self):
         """Fail if a kernel wrote behind a buffer allocated since the last check, temporary ones

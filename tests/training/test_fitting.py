@@ -231,7 +231,7 @@ def test_a_refinement_that_does_not_fit_keeps_what_is_learned(plain, tmp_path, m
     settings = {"train__refine_at": "0.5,1", "train__iterations": 40, "train__ema": "false"}
     settings |= {"train__prune_every": 1000, "train__checkpoint_every": 1000}
     monkeypatch.setattr(
-        "pp_cl.training.memory._prunings", lambda train, start, end: int(end > start)
+        "pp_cl.training.memory.prunings", lambda train, start, end: int(end > start)
     )
     monkeypatch.setattr("pp_cl.training.memory.FIRST_KEPT", 0.05)
     plain.info["memory_bytes"] = 50 * MIB

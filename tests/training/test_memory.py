@@ -24,14 +24,23 @@ from pp_cl.training.point_state import PointState
 
 POINTS = 27_000
 PAPER_POINTS = 4_040_533  # lego, supplemental Table 4
+SMOOTHED = {"train.sh_smoothing_every": "4"}  # so that the last few of 30 steps smooth too
 WAYS = [
     {},
     {"raster.early_stop": "0"},
     {"train.ema": "false", "train.sh_smoothing": "0"},
     {"points.sh_degree": "1"},
+    # discs of 1.5 spacings
+    {"raster.footprint": "disc", "raster.radius": "0.09"},
     {"train.perceptual_weight": "0.1"},
-    {"train.refine_at": "0.4,0.7"},  # to points that are eight, then 64 times as many
-    {"train.refine_at": "1.0,0.9"},  # with the averages
+    # to points that are eight, then 64 times as many, which are smoothed
+    {
+        "train.refine_at": "0.4,0.7",
+        **SMOOTHED,
+        "train.prune_weight": "0",
+        "train.prune_opacity": "0",
+    },
+    {"train.refine_at": "1.0,0.9", **SMOOTHED},  # with the averages
 ]
 
 
@@ -84,7 +93,7 @@ def zero_weights():
 
 
 @pytest.mark.parametrize(
-    "changes", [*WAYS[:4], *(pytest.param(way, marks=pytest.mark.slow) for way in WAYS[4:])]
+    "changes", [*WAYS[:5], *(pytest.param(way, marks=pytest.mark.slow) for way in WAYS[5:])]
 )
 def test_the_plan_is_what_a_training_takes(dev, tmp_path, monkeypatch, changes):
     monkeypatch.setattr("pp_cl.metrics.lpips.load_weights", zero_weights)
@@ -164,8 +173,8 @@ def test_a_plan_that_goes_on_counts_no_pruning_twice(dev):
 
 
 def test_without_prunings_every_point_becomes_eight(dev):
-    changes = {"train__refine_at": "0.1,0.2", "train__prune_every": "9999"}
-    changes |= {"train__iterations": "100"}
+    changes = {"train__refine_at": "0.1,0.2", "train__iterations": "100"}
+    changes |= {"train__prune_weight": "0", "train__prune_opacity": "0"}
     plan = memory_plan(sketch(dev, "full", points=1000, **changes))
     assert [(m.name, m.points) for m in plan.moments] == [
         ("from step 0 on", 1000),
@@ -227,6 +236,7 @@ def test_large_photographs_are_planned_as_they_are_kept(dev):
 def test_the_plan_in_words(dev):
     plan = memory_plan(sketch(dev))
     lines = plan_lines(plan, dev)
+    assert f"memory: {plan.peak.device / 2**20:.0f} of " in lines[0]
     assert "averages, from step 6800 on" in lines[0] or "from step 0 on" in lines[0]
     sizes = [float(line.split()[-2]) for line in lines[1:-2]]
     assert sum(sizes[:-1]) == pytest.approx(sizes[-1], abs=2)

@@ -5,7 +5,14 @@ import math
 import numpy as np
 import pytest
 
-from pp_cl.training.schedule import ema_weight, gamma_at, learning_rate, rising_weight
+from pp_cl.config import assign, preset
+from pp_cl.training.schedule import (
+    ema_weight,
+    gamma_at,
+    learning_rate,
+    refine_steps,
+    rising_weight,
+)
 
 SH_RATES = [
     (
@@ -50,6 +57,27 @@ def test_the_spread_weight_rises_from_nothing():
     weights = [rising_weight(step, 200, 3.0) for step in range(200)]
     assert weights[0] == 0 and weights[100] == pytest.approx(1.5) and max(weights) < 3
     np.testing.assert_allclose(np.diff(weights), 3 / 200)
+
+
+@pytest.mark.parametrize(
+    "name, iterations, changes, expected",
+    [
+        ("full", 11_000, {}, [3630, 7370]),
+        ("full", 1000, {}, [330, 670]),
+        ("full", 60, {}, [20]),  # 64 times as many points, of which none was pruned
+        ("full", 500, {}, [165]),  # the pruning at 250 finds points that were seen 85 times
+        ("full", 2, {}, [1]),
+        ("small", 100, {}, [35]),
+        ("full", 60, {"train.prune_weight": 0, "train.prune_opacity": 0}, [20, 40]),
+        ("full", 100, {"train.refine_at": "0.5,0.5", "train.prune_weight": 0}, [50]),
+        ("tiny", 8000, {}, []),
+    ],
+)
+def test_a_refinement_needs_a_pruning_since_the_one_before(name, iterations, changes, expected):
+    config = preset(name)
+    for key, value in {"train.iterations": iterations, **changes}.items():
+        assign(config, key, value, "test")
+    assert refine_steps(config.train) == expected
 
 
 def test_ema_weight():
