@@ -25,16 +25,16 @@ MARK = ".evaluation"  # file in a folder that evaluations may replace
 
 
 class Rendered(NamedTuple):
-    """A view as the run renders it. image, truth: (H, W, 3) float32 in [0, 1]. tau: what dropping
-    hits changed, empty at raster.tau 0. computed: fraction of the network's multiplications that
-    were computed; the others would have seen background alone.
+    """A view as the run renders it.
+
+    image, truth: (H, W, 3) float32 in [0, 1]. computed: fraction of the network's multiplications
+    that were computed; the others would have seen background alone.
     """
 
     name: str
     image: np.ndarray
     truth: np.ndarray
     seconds: float
-    tau: dict[str, float]
     computed: float
 
 
@@ -90,7 +90,7 @@ def evaluate(
     rows, costs, shown = [], [], []
     for i, rendered in enumerate(render_views(run, views)):
         image, truth = rendered.image, rendered.truth
-        rows.append({"name": rendered.name} | measure(image, truth) | rendered.tau)
+        rows.append({"name": rendered.name} | measure(image, truth))
         costs.append((rendered.seconds, rendered.computed))
         if i in {len(views) * row // SHOWN_VIEWS for row in range(SHOWN_VIEWS)}:
             shown.append((image, truth))
@@ -169,23 +169,4 @@ def render_views(run: Run, views: list[View]) -> Iterator[Rendered]:
         seconds = time.perf_counter() - start
         target.load(view)
         truth = target.whole()
-        tau = _effect_of_tau(run, view.camera) if run.config.raster.tau > 0 else {}
-        yield Rendered(view.name, image, truth, seconds, tau, result.computed_fraction)
-
-
-def _effect_of_tau(run, camera):
-    """{"tau_bound", "tau_feature_error", "tau_picture_error"} of a view.
-
-    The largest weight that a pixel dropped (or its bound), and the largest differences from tau 0:
-    of a feature over the range of the features, and of the image.
-    """
-    renderer, gamma = run.renderer, run.gamma
-    view = renderer.rasterise(camera, gamma)
-    bound, features = renderer.dropped_weights(view).get().max(initial=0), view.features.get()
-    exact = renderer.rasterise(camera, gamma, tau=0.0).features.get()
-    image, exact_image = (renderer.render(camera, gamma, tau=tau) for tau in (None, 0.0))
-    return {
-        "tau_bound": float(bound),
-        "tau_feature_error": float(np.abs(features - exact).max() / max(np.ptp(exact), 1e-30)),
-        "tau_picture_error": float(np.abs(image - exact_image).max()),
-    }
+        yield Rendered(view.name, image, truth, seconds, result.computed_fraction)

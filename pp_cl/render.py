@@ -6,7 +6,7 @@ project -> pairs -> blend weights -> shade the points that contribute -> blend f
 
 from __future__ import annotations
 
-from collections.abc import Callable, Hashable
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -16,17 +16,15 @@ from pp_cl.device.buffers import Buffers, Table
 from pp_cl.device.device import Device
 from pp_cl.device.transfer import send
 from pp_cl.files.picture import Picture
-from pp_cl.layers.tiles import SIDE, TileFlags, tiles_hit
+from pp_cl.layers.tiles import TileFlags, tiles_hit
 from pp_cl.model import Model
-from pp_cl.raster.blend import BACKGROUND, BLENDS, Blend
+from pp_cl.raster.blend import BLENDS, Blend
 from pp_cl.raster.blend_weights import PixelWeights
 from pp_cl.raster.depth import depth_forward
-from pp_cl.raster.pair_cache import PairCache
 from pp_cl.raster.pairs import PairBuilder, Pairs
 from pp_cl.raster.project import Footprint, ProjectedPoints, Projection
 from pp_cl.raster.shade import shade_forward
 from pp_cl.scene.camera import Camera
-from pp_cl.scene.window import ObjectWindow
 from pp_cl.settings import RasterConfig
 
 NETWORK_MULTIPLE = 4  # the U-Net halves its input twice
@@ -82,61 +80,35 @@ class RasterResult(ViewWeights):
 class RenderResult(RasterResult):
     """A RasterResult with the image that the network made of it, (H, W, 3) float32, unclamped.
 
-    computed_fraction: of the network's multiplications; the rest saw only background, or is not
-    shown. shown: (rows, columns) bool, the tiles of the image in which any point is where no others
-    were asked for (raster.window), None = all of them; `offset` is negative where its window begins
-    within the view.
+    computed_fraction: of the network's multiplications; the rest saw only background.
     """
 
     image: Array
     computed_fraction: float
-    shown: np.ndarray | None = None
 
     def clamped(self, camera: Camera) -> np.ndarray:
         """(H, W, 3) float32 image of the camera without the padding, clamped to [0, 1]."""
-        image = self.image.get()
-        if self.shown is not None:
-            height, width = image.shape[:2]
-            pixels = self.shown.repeat(SIDE, 0).repeat(SIDE, 1)[:height, :width]
-            image[~pixels] = BACKGROUND
-        return np.clip(self.placed(image, camera, BACKGROUND), 0, 1)
+        return np.clip(self.cropped(self.image.get(), camera), 0, 1)
 
-    def placed(self, array: np.ndarray, camera: Camera, outside: float) -> np.ndarray:
-        """(height, width, ...) of the camera: an array of the computed pixels without the padding;
-        `outside` where none was computed.
-        """
+    def cropped(self, array: np.ndarray, camera: Camera) -> np.ndarray:
+        """(height, width, ...) of the camera: an array of the padded pixels without the padding."""
         left, top = self.offset
-        rows, columns = (
-            slice(max(0, -start), min(size, length - start))
-            for start, size, length in zip(
-                (top, left), (camera.height, camera.width), array.shape[:2], strict=True
-            )
-        )
-        whole = np.full((camera.height, camera.width, *array.shape[2:]), outside, array.dtype)
-        whole[rows, columns] = array[
-            rows.start + top : rows.stop + top, columns.start + left : columns.stop + left
-        ]
-        return whole
+        return array[top : top + camera.height, left : left + camera.width]
 
 
 class Renderer:
-    """Renders a model. Its buffers are reused from view to view.
+    """Renders a model. Its buffers are reused from view to view."""
 
-    cache_bytes: device memory for the pairs of views that repeat (PairCache).
-    """
-
-    def __init__(self, dev: Device, model: Model, settings: RasterConfig, cache_bytes: int = 0):
+    def __init__(self, dev: Device, model: Model, settings: RasterConfig):
         self.dev = dev
         self.model = model
         self.settings = settings
-        self.cache = PairCache(dev, cache_bytes)
         self._footprint = footprint = Footprint(settings.footprint)
         self._projection = Projection(dev, footprint)
         self._pairs = PairBuilder(dev, footprint)
         self._weights = BLENDS[settings.blend](dev)
         self._blend = Blend(dev, footprint, self._weights, settings.mean_gradient)
         self._buffers = Buffers(dev)
-        self._windowed = None  # the points' ids and their ObjectWindow
 
     @staticmethod
     def table(n: int, height: int, width: int) -> Table:
@@ -157,12 +129,9 @@ class Renderer:
         differs: Callable[[], np.ndarray | None] = lambda: None,
         **options,
     ) -> RenderResult:
-        """Render a camera. training: keep what backward() needs, and all of the image; else
-        raster.window says what. differs: of UNet.plan_tiles(), asked once the device was waited
-        for. options: of rasterise().
+        """Render a camera. training: keep what backward() needs. differs: of UNet.plan_tiles(),
+        asked once the device was waited for. options: of rasterise().
         """
-        if not training and self.settings.window == "object":
-            return self._forward_object(camera, gamma, **options)
         raster, net = self.rasterise(camera, gamma, **options), self.model.net
         with self.dev.stage("network"):
             size, plan = raster.features.shape[:2], None
@@ -171,22 +140,6 @@ class Renderer:
             image = net.forward(raster.features, training, plan)
         fraction = plan.computed_fraction if plan else 1.0
         return RenderResult(**vars(raster), image=image, computed_fraction=fraction)
-
-    def _forward_object(self, camera, gamma, **options):
-        """forward() of what shows any point."""
-        padded, *offset = camera.padded(NETWORK_MULTIPLE)  # so that all tiles stay where they are
-        window, left, top = self._window().crop(padded)
-        raster, net = self.rasterise(window, gamma, **options), self.model.net
-        with self.dev.stage("network"):
-            plan = net.plan_shown(raster.features.shape[:2], raster.tiles.get())
-            image = net.forward(raster.features, False, plan)
-        share = window.width * window.height / (padded.width * padded.height)
-        return RenderResult(
-            **vars(raster) | {"offset": (offset[0] - left, offset[1] - top)},
-            image=image,
-            computed_fraction=share * plan.computed_fraction,
-            shown=plan.shown,
-        )
 
     def rasterise(self, camera: Camera, gamma: float, **options) -> RasterResult:
         """The blended features of a camera. options: of blend_weights()."""
@@ -210,16 +163,13 @@ class Renderer:
         *,
         dropout: float = 0.0,
         seed: int = 0,
-        key: Hashable = None,
-        tau: float | None = None,
         early_stop: float | None = None,
         depth_range: tuple[float, float] | None = None,
     ) -> ViewWeights:
         """The blend weights of a camera, which is padded to multiples of 4 pixels.
 
-        dropout: share of the points left out, at random by `seed`. key: names a view whose camera
-        and points are the same in every call until cache.clear(), so that its pairs may be cached.
-        tau, early_stop: instead of the settings'. depth_range: instead of the model's, which a
+        dropout: share of the points left out, at random by `seed`. early_stop: instead of the
+        settings'. depth_range: instead of the model's, which a
         camera may see beyond that is none of the scene's; a softmax of depth needs the model's.
         """
         cloud, settings, b = self.model.cloud, self.settings, self._buffers
@@ -240,16 +190,15 @@ class Renderer:
         drops = {
             "max_tracked": settings.max_tracked,
             "early_stop": settings.early_stop if early_stop is None else early_stop,
-            "tau": settings.tau if tau is None else tau,
         }
-        pairs, weights, tiles = self._weigh(points, size, gamma, key=key, drops=drops)
+        pairs, weights, tiles = self._weigh(points, size, gamma, drops)
         return ViewWeights(tuple(offset), points, pairs, weights, tiles)
 
-    def _weigh(self, points, size, gamma, *, key, drops):
+    def _weigh(self, points, size, gamma, drops):
         """(Pairs, PixelWeights, TileFlags): anew where there was no room for all pairs."""
         while True:
             with self.dev.stage("pairs"):
-                pairs = self.cache.get(key) or self._pairs.enqueue(points, size)
+                pairs = self._pairs.enqueue(points, size)
             with self.dev.stage("weights"):
                 weights = self._weights.compute(
                     pairs, points.camera_buffer, self.model.cloud.opacity, gamma, **drops
@@ -257,7 +206,6 @@ class Renderer:
             tiles = tiles_hit(self.dev, pairs.pixel_offset, size)
             tiles.get()  # the host's one wait for the device
             if self._pairs.has_room(pairs):
-                self.cache.keep(key, pairs)
                 return pairs, weights, tiles
             del pairs, weights  # else their arrays would stay beside the larger ones
 
@@ -310,10 +258,6 @@ class Renderer:
         """
         self._weights.raise_peaks(view.pairs, view.weights, peaks, looks)
 
-    def dropped_weights(self, view: ViewWeights) -> Array:
-        """(HW,) float32: the blend weight that tau dropped from each pixel, or a bound above it."""
-        return self._weights.dropped(view.pairs, view.weights)
-
     def render(self, camera: Camera, gamma: float, **options) -> np.ndarray:
         """(H, W, 3) float32 numpy image of the camera, clamped to [0, 1]. options: of
         blend_weights().
@@ -334,19 +278,10 @@ class Renderer:
         alpha, *depths = (array.get() for array in arrays)
         return Picture(
             result.clamped(camera),
-            result.placed(alpha, camera, 0.0),
-            *(result.placed(depth, camera, np.inf) for depth in depths),
-            features=result.placed(result.features.get(), camera, BACKGROUND) if features else None,
+            result.cropped(alpha, camera),
+            *(result.cropped(depth, camera) for depth in depths),
+            features=result.cropped(result.features.get(), camera) if features else None,
         )
-
-    def _window(self):
-        """The window around the present points."""
-        ids = self.model.cloud.ids
-        if self._windowed is None or self._windowed[0] is not ids:
-            margin = self.model.net.shown_margin
-            window = ObjectWindow(self.model.grid, ids.get(), self._radius(), margin)
-            self._windowed = ids, window
-        return self._windowed[1]
 
     def _radius(self):
         return point_radius(self.settings, self.model.grid.edge, self.model.depth_range)

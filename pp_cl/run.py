@@ -102,7 +102,6 @@ class Training:
         more memory than there is, with a checkpoint, and where numbers are no longer finite: then
         the last checkpoint stays.
         """
-        self.trainer.renderer.cache.set_budget(self.room.spare)
         with self.folder.owned():
             self._check_unchanged()
             self.folder.create(self.config.to_json())

@@ -92,18 +92,6 @@ class RasterConfig:
         0,
         0.5,
     )
-    tau: float = setting(
-        0.0,
-        "drop hits of a pixel whose blend weights sum to at most this (0: none)",
-        0,
-        0.5,
-    )
-    window: str = setting(
-        "image",
-        "what is rendered. image: all of it; object: the tiles of 4x4 pixels that show points,"
-        " the rest is white (a training renders its crops)",
-        choices=("image", "object"),
-    )
     mean_gradient: bool = setting(
         False, "divide a point's gradients by the number of its pixels, as Pulsar does"
     )
@@ -242,8 +230,7 @@ class TrainConfig:
     )
     memory_gib: float = setting(
         0.0,
-        "device memory that training may use, in GiB; what it does not need caches the hits of"
-        " repeating views (0: no cache)",
+        "device memory that training may use, in GiB (0: all)",
         0,
         2**20,
     )

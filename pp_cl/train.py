@@ -12,7 +12,6 @@ from pp_cl.model import Model
 from pp_cl.render import NETWORK_MULTIPLE, Renderer
 from pp_cl.scene.target import Target
 from pp_cl.scene.views import View
-from pp_cl.settings import TrainConfig
 from pp_cl.training.crops import BOX_MARGIN, crop_side, draw_start
 from pp_cl.training.loss import WHITE, Loss, gradient_tiles
 from pp_cl.training.mask import MaskLoss
@@ -94,7 +93,6 @@ class Trainer:
             seed=int(rng.integers(2**32)),
             training=True,
             differs=differs,
-            key=view_index if views_repeat(config, view.downscale) else None,
         )
         with self.dev.stage("loss"):
             gradients = self._losses(rendered, target, target_alpha)
@@ -234,7 +232,6 @@ class Trainer:
 
     def _forget_points(self):
         """Drop what was made for the present points."""
-        self.renderer.cache.clear()
         self._smoother = None
 
     def finish(self) -> None:
@@ -285,14 +282,6 @@ class Trainer:
             self.optimiser.restore(arrays)
         elif self.config.ema and step >= ema_start(self.config.iterations):
             self.optimiser.update_ema(1.0)
-
-
-def views_repeat(config: TrainConfig, downscale: int) -> bool:
-    """Whether every step sees a view as the last one did: whole images without jitter, all
-    points.
-    """
-    jitters = config.pixel_jitter and downscale > 1
-    return config.crop == 0 and config.dropout == 0 and not jitters
 
 
 def _halved(views, times):

@@ -31,7 +31,7 @@
 //
 // By pair: b, and T d, whose product with G.f - B is dL/do. A pixel drops the hits behind the
 // depth where T falls below `least`, as they could weigh no more than T in all; one more entry
-// follows, with no point and with T.
+// follows, with no point.
 kernel void alpha_weights(
     const uint hw,                             // pixels
     const float least,                         // T behind which hits are dropped; 0: none
@@ -59,7 +59,7 @@ kernel void alpha_weights(
         pixel_entry[i] = upsample(as_uint(T * alpha), hit.x);
         T *= fmax(1.0f - alpha, LEAST_THROUGH);
     }
-    if (i < end) pixel_entry[i] = upsample(as_uint(T), NONE);
+    if (i < end) pixel_entry[i] = NONE;
     transmittance[q] = T;
 }
 

@@ -1,28 +1,10 @@
-// What both blends know of the pairs and weights: which points contribute, how much, and what
-// pixels dropped.
+// What both blends know of the pairs and weights: which points contribute, and how much.
 #include "common.h"
 #include "raster/pair_role.h"
 
 #ifndef HAS_ROLES
 #define HAS_ROLES 1  // 0: every pair is tracked, and pair_role is not read
 #endif
-
-// One work-item per pixel: writes the weight that it dropped, or a bound of it where not all
-// dropped hits were weighed.
-kernel void dropped_weights(
-    const uint hw,                    // pixels
-    global const uint *pixel_offset,  // (HW+1)
-    global const ulong *pixel_entry,  // (P) weight << 32 | point
-    global float *pixel_dropped)      // (HW)
-{
-    const uint q = get_global_id(0);
-    if (q >= hw) return;
-    uint i = pixel_offset[q];
-    const uint end = pixel_offset[q + 1];
-    while (i < end && (uint)pixel_entry[i] != NONE)
-        i++;
-    pixel_dropped[q] = i < end ? as_float((uint)(pixel_entry[i] >> 32)) : 0.0f;
-}
 
 // One work-item per pixel: marks the points of its hits that are not dropped. Pixels share points,
 // so some write the same 1 to the same place.

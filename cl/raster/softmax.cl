@@ -15,7 +15,7 @@
 #include "raster/pair_role.h"
 
 #ifndef DROPS
-#define DROPS 1  // early_stop or tau may be above 0
+#define DROPS 1  // early_stop may be above 0
 #endif
 #ifndef MAX_TRACKED
 #define MAX_TRACKED 0  // nearest hits of a pixel that get gradients; 0: all
@@ -23,8 +23,7 @@
 #define HAS_ROLES                                                                                  \
     (DROPS || MAX_TRACKED)  // else every pair is TRACKED, and pair_role is not touched
 
-#define EPS 1e-6f    // depth of the background, as a z (Pulsar's background_normalized_depth)
-#define TAIL 0.125f  // a tail of hits whose bound is below this share of tau is not even weighed
+#define EPS 1e-6f  // depth of the background, as a z (Pulsar's background_normalized_depth)
 
 // What Eq. (1) needs of a batch of LANES hits. Lanes without a hit have opacity and closeness 0,
 // hence no weight.
@@ -53,50 +52,19 @@ ALWAYS_INLINE Hits load_hits(
     return h;
 }
 
-// One pixel's entries [begin, stop) hold the weights of its hits, and hits that weigh `dropped` are
-// gone already. Drops, from the back on, every hit with which `dropped` stays within tau, and
-// closes the gaps. Returns the end of the entries that remain.
-static inline uint drop_hits(
-    const uint begin,
-    const uint stop,
-    const float tau,
-    float *dropped,
-    global const ulong *pair_key,
-    global float2 *pair_weight,
-    global uchar *pair_role,
-    global ulong *pixel_entry) {
-    for (uint i = stop; i-- > begin;) {
-        const float sum = *dropped + as_float((uint)(pixel_entry[i] >> 32));
-        if (sum <= tau) {
-            *dropped = sum;
-            pair_weight[(uint)pair_key[i]] = 0.0f;
-            pair_role[(uint)pair_key[i]] = DROPPED;
-            pixel_entry[i] = NONE;
-        }
-    }
-    uint end = begin;
-    for (uint i = begin; i < stop; i++)
-        if ((uint)pixel_entry[i] != NONE) pixel_entry[end++] = pixel_entry[i];
-    return end;
-}
-
 // One work-item per pixel: reads its hits, nearest first, writes their weights by pair and, with
 // their points, by pixel.
 //
 // By pair: b, and b (1/o + z/gamma), finite at o = 0, whose product with G.(f - F) is dL/do. Only
-// the MAX_TRACKED nearest hits get gradients. A hit is dropped, with weight 0,
-// - by early_stop, with all behind it, once even an opaque, centred hit (o = d = 1) would have less
-//   than this share of the weight; differs from Pulsar: it looks only when its buffer is flushed;
-// - by tau, from the back on, while the sum of all dropped weights stays within tau; a tail so
-//   light that it is not weighed is not in D, and the background gets the weights of the other
-//   dropped hits.
+// the MAX_TRACKED nearest hits get gradients. A hit is dropped, with weight 0 and with all behind
+// it, once even an opaque, centred hit (o = d = 1) would have less than the share early_stop of the
+// weight; differs from Pulsar: it looks only when its buffer is flushed.
 // By pixel: the hits that are not dropped, by depth. If any were dropped, one more entry follows,
-// with no point and the dropped weight.
+// with no point.
 kernel __attribute__((vec_type_hint(floats))) void softmax_weights(
     const uint hw,  // pixels
     const float gamma,
     const float early_stop,                    // 0: none
-    const float tau,                           // 0: none
     global const float *camera,                // (20) camera.h
     global const uint *pixel_offset,           // (HW+1)
     global const ulong *pair_key,              // (P) depth << 32 | pair, sorted within a pixel
@@ -112,7 +80,6 @@ kernel __attribute__((vec_type_hint(floats))) void softmax_weights(
     const uint begin = pixel_offset[q], end = pixel_offset[q + 1];
     uint stop = end;
     float M = EPS / gamma, D = 1.0f;  // the background alone
-    float dropped = 0.0f;
     Hits h;
     for (uint first = begin; first < stop; first += LANES) {
         const uint count = min((uint)LANES, end - first);
@@ -125,12 +92,7 @@ kernel __attribute__((vec_type_hint(floats))) void softmax_weights(
         LANES_INTO(term, h.opacity * h.closeness * exp(fmin(a - M, 0.0f)));
         if (DROPS) LANES_INTO(best, exp(fmax(h.z, 0.0f) / gamma - M));
         for (uint j = 0; j < count && first + j < stop; j++) {
-            // no less than the weights of this hit and all that follow
-            const float bound = DROPS ? (end - first - j) * best[j] : 0.0f;
-            if (DROPS && bound < TAIL * tau * D) {
-                dropped = bound / D;
-                stop = first + j;
-            } else if (DROPS && best[j] < early_stop / (1.0f - early_stop) * D)
+            if (DROPS && best[j] < early_stop / (1.0f - early_stop) * D)
                 stop = first + j;
             else
                 D += term[j];
@@ -159,10 +121,7 @@ kernel __attribute__((vec_type_hint(floats))) void softmax_weights(
             pair_weight[(uint)pair_key[i]] = 0.0f;
             pair_role[(uint)pair_key[i]] = DROPPED;
         }
-        if (tau > 0.0f)
-            stop = drop_hits(
-                begin, stop, tau, &dropped, pair_key, pair_weight, pair_role, pixel_entry);
-        if (stop < end) pixel_entry[stop] = upsample(as_uint(dropped), NONE);
+        if (stop < end) pixel_entry[stop] = NONE;
     }
 }
 

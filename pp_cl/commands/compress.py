@@ -6,11 +6,11 @@ from pathlib import Path
 from pp_cl.commands import options as shared
 
 HELP = "make a trained model smaller and faster within a stated loss"
-EPILOG = """Tried in turn, each kept where the views below lose no more: coefficients of 16 bits,
-rendering only the tiles that show the object, no channels of the network that are dead or hardly
-weigh, stopping earlier along a pixel, faster convolutions, fewer harmonics, and at last fewer
-points, those that weigh least in any training view going first. The loss is measured on the split
-val, without one on every eighth training view; never on the test views."""
+EPILOG = """Tried in turn, each kept where the views below lose no more: coefficients of 16 bits, no
+channels of the network that are dead or hardly weigh, stopping earlier along a pixel, fewer
+harmonics, and at last fewer points, those that weigh least in any training view going first. The
+loss is measured on the split val, without one on every eighth training view; never on the test
+views."""
 COLUMNS = "{:20s} {:>8s} {:>8s} {:>10s} {:>10s} {:>7s}  {}".format
 
 

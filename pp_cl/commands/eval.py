@@ -122,20 +122,10 @@ def _cell(values, name):
 
 
 def _summary(result):
-    """What tau changed, where it did; points, work and time."""
-    lines, points, computed = [], result["points"], result["computed_fraction"]
-    if "tau_bound" in result["per_image"][0]:
-        bound, features, image = (
-            max(row[name] for row in result["per_image"])
-            for name in ("tau_bound", "tau_feature_error", "tau_picture_error")
-        )
-        lines.append(
-            f"raster.tau: dropped at most {bound:.1e} of a pixel; features off by {features:.1e} of"
-            f" their range, the image by {image:.1e}"
-        )
+    """Points, work and time."""
+    points, computed = result["points"], result["computed_fraction"]
     share = f"{computed:.0%} of the network's work, " if computed < 1 else ""
-    lines.append(
+    return (
         f"{points['final']} points ({points['initial']} at the start), {share}"
         f"{result['seconds_per_frame'] * 1e3:.0f} ms per frame on {result['device']}"
     )
-    return "\n".join(lines)

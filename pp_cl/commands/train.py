@@ -36,7 +36,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add(
         "--memory",
         metavar="GIB",
-        help="device memory to use; what is not needed caches the hits of repeating views",
+        help="device memory to use at most",
     )
     add("--eval-every", metavar="N", help="measure a few test views every N steps (never)")
     add(

@@ -34,7 +34,7 @@ class Reduction:
 
     keep: share of the points, those that weigh most. half: the SH coefficients have 16 bits.
     channels: of the network only those go on that weigh this share of their layer's heaviest; 0:
-    all. degree: of the SH. early_stop, tau, window: of raster; tolerance: network.tolerance.
+    all. degree: of the SH. early_stop: of raster.
     """
 
     keep: float
@@ -42,23 +42,16 @@ class Reduction:
     channels: float
     degree: int
     early_stop: float
-    tau: float
-    window: str
-    tolerance: float
 
     @classmethod
     def of(cls, run: Run) -> Reduction:
         """A run as it is."""
-        raster = run.config.raster
         return cls(
             keep=1.0,
             half=run.model.cloud.sh[0].dtype == np.float16,
             channels=0.0,
             degree=run.config.points.sh_degree,
-            early_stop=raster.early_stop,
-            tau=raster.tau,
-            window=raster.window,
-            tolerance=run.config.network.tolerance,
+            early_stop=run.config.raster.early_stop,
         )
 
     def settings(self) -> dict[str, object]:
@@ -66,9 +59,6 @@ class Reduction:
         return {
             "points.sh_degree": self.degree,
             "raster.early_stop": self.early_stop,
-            "raster.tau": self.tau,
-            "raster.window": self.window,
-            "network.tolerance": self.tolerance,
         }
 
 

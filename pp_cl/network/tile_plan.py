@@ -187,15 +187,6 @@ def gradient_radius(layers: list[Layer]) -> dict[str, int]:
     return radius
 
 
-def needed_radius(layers: list[Layer]) -> dict[str, int]:
-    """{name: pixels}: how far from a pixel of the image it depends on a layer's output."""
-    radius = dict.fromkeys([*(layer.name for layer in layers), "x"], 0)
-    for layer in reversed(layers):
-        for name in layer.inputs:
-            radius[name] = max(radius[name], radius[layer.name] + forward_radius(layer))
-    return radius
-
-
 class AllTiles:
     """A pass that computes all tiles."""
 
@@ -290,54 +281,13 @@ def _copies(tile_map, needed):
     return tile_map, copy_list(tile_map.source, needed & ~tile_map.computed)
 
 
-class ImagePlan(TilePlan):
-    """A pass that makes an image. computed_fraction: of the network's multiplications."""
-
-    def __init__(
-        self,
-        dev: Device,
-        layers: list[Layer],
-        size: tuple[int, int],
-        active: np.ndarray,
-        *,
-        radius: dict[str, int],
-        border: int = 0,
-    ):
-        radius = {name: pixels for name, pixels in radius.items() if name != "x"}  # x is given
-        super().__init__(dev, layers, size, active, radius=radius, border=border)
-        for layer in layers:
-            computed = self.maps[layer.name].computed
-            for name in layer.inputs:
-                if name != "x":
-                    needed = self.needed[name]
-                    needed |= needed_forward(layer, computed, needed.shape)
-        count = {c.name: c.multiplications(*self.size) for c in convolutions(layers)}
-        computed = sum(n * self.maps[name].computed.mean() for name, n in count.items())
-        self.computed_fraction = computed / sum(count.values())
-
-
-class ShownPlan(ImagePlan):
-    """The forward pass over an image of `size` of which only the tiles `shown`, (rows, columns)
-    bool, are wanted: they are as those of a whole image, the others hold any numbers.
-
-    Each layer computes what these depend on. What else the transforms of a tile read is a copy of
-    some tile: it has no part in the result, but must be a number.
-    """
-
-    def __init__(self, dev: Device, layers: list[Layer], size: tuple[int, int], shown: np.ndarray):
-        self.shown = shown
-        # no tile is near a border, so that all others are of one class
-        border = -max(size)
-        super().__init__(dev, layers, size, shown, radius=needed_radius(layers), border=border)
-
-
-class ForwardPlan(ImagePlan):
+class ForwardPlan(TilePlan):
     """The forward pass over an image of `size`, where x differs from the background in the tiles
     `active`.
 
     differs: (rows, columns) bool, the tiles of the image whose gradient may be another than that of
     others which see only background; None: all. affected: the tiles of the image that see more than
-    background.
+    background. computed_fraction: of the network's multiplications.
     """
 
     def __init__(
@@ -350,10 +300,20 @@ class ForwardPlan(ImagePlan):
         differs: np.ndarray | None = None,
     ):
         radius, last = receptive_radius(layers), layers[-1].name
-        super().__init__(dev, layers, size, active, radius=radius)
+        computed = {name: pixels for name, pixels in radius.items() if name != "x"}  # x is given
+        super().__init__(dev, layers, size, active, radius=computed)
+        for layer in layers:
+            of_layer = self.maps[layer.name].computed
+            for name in layer.inputs:
+                if name != "x":
+                    needed = self.needed[name]
+                    needed |= needed_forward(layer, of_layer, needed.shape)
         self.needed[last][:] = True
         self.affected = grow(active, -(-radius[last] // SIDE))
         self.differs = np.ones_like(active) if differs is None else differs
+        count = {c.name: c.multiplications(*size) for c in convolutions(layers)}
+        done = sum(n * self.maps[name].computed.mean() for name, n in count.items())
+        self.computed_fraction = done / sum(count.values())
 
     def backward(self, arrays: dict[str, Array]) -> BackwardPlan:
         """The backward pass; the activations in `arrays` are completed where it needs them."""

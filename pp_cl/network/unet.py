@@ -17,9 +17,8 @@ from pp_cl.layers.resample import (
     upsample2_backward,
     upsample2_forward,
 )
-from pp_cl.layers.tiles import SIDE
 from pp_cl.network.layers import convolutions, gradient_of, parameter_table, unet_layers
-from pp_cl.network.tile_plan import ForwardPlan, ImagePlan, ShownPlan, receptive_radius
+from pp_cl.network.tile_plan import ForwardPlan
 from pp_cl.network.workspace import Workspace, WorkspacePlan
 from pp_cl.settings import NetworkConfig
 
@@ -127,25 +126,12 @@ class UNet:
         plan = ForwardPlan(self.dev, self.layers, size, active, differs=differs)
         return plan.upload() if plan.computed_fraction <= MOST_COMPUTED else None
 
-    @property
-    def shown_margin(self) -> int:
-        """How far from what is not background, in pixels, anything matters to plan_shown()."""
-        radius = receptive_radius(self.layers)[self.layers[-1].name]
-        return radius + SIDE
-
-    def plan_shown(self, size: tuple[int, int], active: np.ndarray) -> ShownPlan:
-        """What to compute for the `active` tiles, (rows, columns) bool, of an image of `size` =
-        (height, width); the image is undefined elsewhere. Valid until the next plan.
-        """
-        return ShownPlan(self.dev, self.layers, size, active).upload()
-
-    def forward(self, x: Array, training: bool = True, plan: ImagePlan | None = None) -> Array:
+    def forward(self, x: Array, training: bool = True, plan: ForwardPlan | None = None) -> Array:
         """(H, W, 3) image of the features x (H, W, channels_in); H and W are multiples of 4.
 
         The result is in a buffer of the network: the next call overwrites it. training: keep what
-        backward needs. plan: of plan_tiles(), or of plan_shown() where nothing is trained,
-        None = compute all tiles. Raises ValueError for other sizes, RuntimeError for training once
-        frozen.
+        backward needs. plan: of plan_tiles(), None = compute all tiles. Raises ValueError for other
+        sizes, RuntimeError for training once frozen.
         """
         if training and self._frozen is not None:
             raise RuntimeError("UNet.freeze() was called: the network can no longer be trained")

@@ -13,10 +13,8 @@ from pp_cl.raster.pairs import Pairs
 
 
 class Alpha(BlendWeights):
-    """The weights T o d of cl/raster/alpha.cl.
-
-    A hit may weigh T in all, and so may all behind it together: early_stop and tau are one bound,
-    of which the higher counts.
+    """The weights T o d of cl/raster/alpha.cl. No hit behind early_stop could weigh more than that:
+    it, and all behind it together, weigh T at most.
     """
 
     gain_by_pair = True
@@ -36,20 +34,20 @@ class Alpha(BlendWeights):
         *,
         max_tracked: int = 0,
         early_stop: float = 0.0,
-        tau: float = 0.0,
     ) -> PixelWeights:
         """As BlendWeights; camera and gamma do not matter."""
-        least = max(early_stop, tau)
-        has_roles = least > 0 or max_tracked > 0
+        has_roles = early_stop > 0 or max_tracked > 0
         pair_weight, pair_role, pixel_entry = self._reserve(pairs, has_roles)
-        if least > 0:
+        if early_stop > 0:
             self.dev.fill(pair_role, DROPPED)
-        program = self.dev.program("raster/alpha", DROPS=int(least > 0), MAX_TRACKED=max_tracked)
+        program = self.dev.program(
+            "raster/alpha", DROPS=int(early_stop > 0), MAX_TRACKED=max_tracked
+        )
         program.launch(
             "alpha_weights",
             pairs.pixels,
             hw=pairs.pixels,
-            least=least,
+            least=early_stop,
             pixel_offset=pairs.pixel_offset,
             pair_key=pairs.pair_key,
             pair_point_closeness=pairs.pair_point_closeness,

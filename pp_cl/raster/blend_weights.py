@@ -26,9 +26,9 @@ class PixelWeights:
     pair_weight: (P, 2) float32, the weight b, and s, which times G.f - rest is dL/do
     (cl/raster/blend.cl); undefined where the pair is dropped. pair_role: (P,) uint8,
     cl/raster/pair_role.h. pixel_entry: (P,) uint64, weight bits << 32 | point, each pixel's hits by
-    depth; dropped hits end a pixel's list with an entry of no point that holds their weight or a
-    bound of it. shaded_list: `shaded` before its length is known. transmittance: (HW,) float32,
-    what is left for the background, None of a softmax.
+    depth; where hits are dropped, an entry of no point ends a pixel's list. shaded_list: `shaded`
+    before its length is known. transmittance: (HW,) float32, what is left for the background, None
+    of a softmax.
     """
 
     has_roles: bool
@@ -88,16 +88,13 @@ class BlendWeights(ABC):
         *,
         max_tracked: int = 0,
         early_stop: float = 0.0,
-        tau: float = 0.0,
     ) -> PixelWeights:
         """The weights of all pairs.
 
         opacity: (N,) float32 in [0, 1]. gamma: depth sharpness of the softmax. max_tracked: only
         this many nearest hits of a pixel get gradients (64 in the paper); 0: all. early_stop: in
         [0, 1): a pixel drops all hits behind the depth where no hit can have this share any more;
-        0: none. tau: in [0, 1): a pixel drops hits whose weights sum to at most tau; no feature of
-        the pixel changes by more than tau times the range of that feature over the pixel's points
-        and the background. 0: none.
+        0: none.
         """
 
     @abstractmethod
@@ -130,21 +127,6 @@ class BlendWeights(ABC):
         b.require(table | self.own_table(pairs.pixels, self._capacity))
         pair_role = b.pair_role[:p] if has_roles else b.pair_role
         return b.pair_weight[:p], pair_role, b.pixel_entry[:p]
-
-    def dropped(self, pairs: Pairs, weights: PixelWeights) -> Array:
-        """(HW,) float32: the weight that was dropped from each pixel, or a bound just above it; at
-        most tau, where no early_stop was given.
-        """
-        pixel_dropped = self.dev.empty((pairs.pixels,))
-        self._shared(weights).launch(
-            "dropped_weights",
-            pairs.pixels,
-            hw=pairs.pixels,
-            pixel_offset=pairs.pixel_offset,
-            pixel_entry=weights.pixel_entry,
-            pixel_dropped=pixel_dropped,
-        )
-        return pixel_dropped
 
     def raise_peaks(
         self, pairs: Pairs, weights: PixelWeights, point_peak: Array, point_looks: Array

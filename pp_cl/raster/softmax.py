@@ -15,7 +15,7 @@ from pp_cl.raster.pairs import Pairs
 
 class Softmax(BlendWeights):
     """The weights of Eq. (1). early_stop is Pulsar's percent_allowed_difference (0.001 in the
-    paper); tau drops hits from the back on.
+    paper).
     """
 
     gain_by_pair = False
@@ -35,14 +35,15 @@ class Softmax(BlendWeights):
         *,
         max_tracked: int = 0,
         early_stop: float = 0.0,
-        tau: float = 0.0,
     ) -> PixelWeights:
         """As BlendWeights."""
-        drops = early_stop > 0 or tau > 0
-        has_roles = drops or max_tracked > 0
+        has_roles = early_stop > 0 or max_tracked > 0
         pair_weight, pair_role, pixel_entry = self._reserve(pairs, has_roles)
         self._program = self.dev.program(
-            "raster/softmax", LANES=lanes(self.dev), DROPS=int(drops), MAX_TRACKED=max_tracked
+            "raster/softmax",
+            LANES=lanes(self.dev),
+            DROPS=int(early_stop > 0),
+            MAX_TRACKED=max_tracked,
         )
         self._program.launch(
             "softmax_weights",
@@ -50,7 +51,6 @@ class Softmax(BlendWeights):
             hw=pairs.pixels,
             gamma=gamma,
             early_stop=early_stop,
-            tau=tau,
             camera=camera_buffer,
             pixel_offset=pairs.pixel_offset,
             pair_key=pairs.pair_key,

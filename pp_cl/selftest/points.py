@@ -235,7 +235,7 @@ class Blended:
         self.geometry = self.scene.geometry()
         stop = blend.get("early_stop", 0.0)
         if rule == "alpha":
-            self.blend = dense.alpha(self.geometry, self.opacity, max(stop, blend.get("tau", 0.0)))
+            self.blend = dense.alpha(self.geometry, self.opacity, stop)
         else:
             self.blend = dense.blend(self.geometry, self.opacity, gamma, stop)
         self.weight = self.scene.weight()

@@ -152,7 +152,9 @@ def _shade(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
 def _depth(rule: str, dev: Device, rng: np.random.Generator) -> Iterator[Check]:
     """Alpha and mean depth by the blend weights; the median of three points by hand."""
     for n, kind in ((31, "soft"), (257, "soft"), (257, "sphere"), (33, "disc")):
-        blended = Blended(dev, rng, n, gamma=0.02, radius=0.4, rule=rule, tau=1e-2, kind=kind)
+        blended = Blended(
+            dev, rng, n, gamma=0.02, radius=0.4, rule=rule, early_stop=1e-2, kind=kind
+        )
         scene = blended.scene
         alpha, depth, _ = _depths(dev, scene)
         weight = np.where(blended.role == DROPPED, 0, scene.weight()).astype(np.float64)

@@ -8,7 +8,6 @@ from functools import partial
 import numpy as np
 
 from pp_cl.device.device import Device
-from pp_cl.raster.blend_weights import DROPPED
 from pp_cl.raster.project import KINDS
 from pp_cl.reference import dense
 from pp_cl.reference.differences import numeric_gradient
@@ -102,22 +101,6 @@ def _early_stop(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
         gradients, expected = blended.gradients(), blended.reference_gradients()
         yield relative(gradients["features"], expected[0], WEIGHT)
         yield relative(gradients["opacity"], expected[1], WEIGHT)
-
-
-def _tau(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
-    """What is dropped weighs no more than is said, and that is at most tau."""
-    for tau in (1e-4, 1e-2, 0.3):
-        blended = Blended(dev, rng, gamma=0.02, radius=0.3, tau=tau)
-        scene, hit = blended.scene, blended.geometry["hit"]
-        dropped = hit & (blended.role == DROPPED)
-        weight = np.where(dropped, blended.blend["weight"], 0).sum(axis=0)
-        said = scene.weighing.dropped(scene.pairs, scene.weights).get()
-        yield no_more(said, np.full_like(said, tau), 0.0)
-        # the weights are off by WEIGHT of themselves
-        yield no_more(weight, said * (1 + WEIGHT), 1e-10)
-        yield exact(scene.weights.shaded.get(), np.flatnonzero((hit & ~dropped).any(axis=1)))
-        kept = np.where(hit & ~dropped, blended.weight, 0).astype(np.float64)
-        yield relative(blended.gradients()["features"], kept @ blended.grad, WEIGHT)
 
 
 def _smallest_gamma(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
@@ -251,7 +234,6 @@ CASES = (
     Case("softmax: gradients of spheres", _spheres),
     Case("softmax: awkward sizes", _sizes),
     Case("softmax: early stop", _early_stop),
-    Case("softmax: weights dropped by tau", _tau),
     Case("softmax: gamma of 1e-5", _smallest_gamma),
     Case("softmax: dL/do at small gammas", _sharp),
     Case("softmax: nearest possible point", _nearest),

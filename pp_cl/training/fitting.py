@@ -70,12 +70,6 @@ class Room:
         held = resident_bytes() - (self.dev.bytes if self.dev.is_cpu else 0)
         self._program = held + driver
 
-    @property
-    def spare(self) -> int:
-        """Bytes that the plan leaves of the setting train.memory_gib; 0 without one."""
-        budget = self.sketch.config.train.memory_gib
-        return max(0, round(budget * GIB) - self.plan.peak.device)
-
     def check_unseen(self) -> None:
         """Raise UserError as check_points does, where the least that the training can take does not
         fit.

@@ -343,7 +343,7 @@ def _raster_tables(settings, n, size, pairs):
     """
     pixels, room = size[0] * size[1], grown(0, round(pairs))
     blend = BLENDS[settings.blend]
-    has_roles = settings.early_stop > 0 or settings.tau > 0 or settings.max_tracked > 0
+    has_roles = settings.early_stop > 0 or settings.max_tracked > 0
     return [
         ("projection", Projection.table(n)),
         ("pairs (estimate)", PairBuilder.table(n, pixels, room)),

@@ -92,7 +92,6 @@ class LiveRun:
             "iterations": config.train.iterations,
             "finished": header["finished"],
             "points": self._run.model.cloud.count,
-            "tau": config.raster.tau,
             "early_stop": config.raster.early_stop,
         }
 
@@ -151,7 +150,6 @@ class LiveRun:
             return to_8bit(photograph), None
         renderer = self._renderer(request.kept)
         options = {
-            "tau": request.tau,
             "early_stop": request.early_stop,
             "depth_range": run.depth_range(camera),
         }

@@ -20,7 +20,7 @@ LEAST_SIDE, MOST_SIDE, MOST_PIXELS = 16, 4096, 2**23  # of a picture, as page.js
 ROTATION_TOLERANCE = 1e-4  # largest element of R^T R - 1; a browser counts in float64
 MOST_NUMBER = 2**53 - 1  # what a browser counts to exactly
 # {name: (least, most)}; exposure in stops, kept as a share of the points
-RANGES = {"tau": (0, 0.5), "early_stop": (0, 0.5), "kept": (0.001, 1), "exposure": (-6, 6)}
+RANGES = {"early_stop": (0, 0.5), "kept": (0.001, 1), "exposure": (-6, 6)}
 INTRINSICS = {"fl_x": (1, 1e6), "fl_y": (1, 1e6), "cx": (-1e5, 1e5), "cy": (-1e5, 1e5)}
 MOST_DISTANCE = 1e15  # of an eye from the origin, world units: float32 holds its square
 
@@ -39,7 +39,6 @@ class ViewRequest:
     show: str
     camera: Camera
     draft: bool
-    tau: float
     early_stop: float
     kept: float
     exposure: float

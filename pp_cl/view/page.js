@@ -6,8 +6,8 @@ const RADIANS_PER_PIXEL = 0.008, ZOOM_PER_PIXEL = 0.0012, CLICK = 5;
 const $ = (id) => document.getElementById(id);
 const STILL = 180; // ms without movement until the full resolution is asked for
 const RECONNECT = 2000, NOTE = 4000; // ms
-const SLIDERS = ["tau", "early_stop", "kept", "exposure"];
-const CUBIC = ["tau", "early_stop"]; // most of their effect is near 0: value = 0.5 position^3
+const SLIDERS = ["early_stop", "kept", "exposure"];
+const CUBIC = ["early_stop"]; // most of their effect is near 0: value = 0.5 position^3
 const MOST_SIDE = 4096, MOST_PIXELS = 2 ** 23; // of a picture, as messages.py
 const OWN_CAMERA = ["error", "photograph"];
 
@@ -154,7 +154,7 @@ function resetSliders() {
 
 function showValues() {
   const texts = {
-    tau: short(value("tau")), early_stop: short(value("early_stop")),
+    early_stop: short(value("early_stop")),
     kept: `${Math.round(100 * value("kept"))} %`, exposure: `${value("exposure").toFixed(1)} stops`,
   };
   for (const id of SLIDERS) document.querySelector(`output[for=${id}]`).textContent = texts[id];
