@@ -171,7 +171,7 @@ def _is_aligned(*channels):
     return all(c % QUAD == 0 for c in channels)
 
 
-def quads(channels, aligned):
+def quads(channels: int, aligned: bool) -> int:
     """Groups of four of the output channels that a work-group computes: 16, 8 or 4, so that nothing
     is computed in vain. Channels that are not aligned are few.
     """

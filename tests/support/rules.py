@@ -22,8 +22,6 @@ FLOORS = [
 ]
 FLOOR = {wing: floor for floor, wings in enumerate(FLOORS) for wing in wings}
 
-MOST_PARAMETERS, MOST_POSITIONAL = 8, 4
-MOST_FUNCTION_LINES, MOST_FILE_LINES = 50, 400
 FUNCTIONS = (ast.FunctionDef, ast.AsyncFunctionDef)
 
 # Who may write to an attribute of another object, and why.
@@ -58,27 +56,6 @@ def imports_from_above(tree, path):
     above = {name.split(".")[1] for name in imported(tree)}
     above = {other for other in above if FLOOR.get(other, -1) > FLOOR[wing]}
     return [f"{wing} imports {other}" for other in sorted(above)]
-
-
-def long_parameter_lists(tree, path):
-    """At most 8 parameters, by name from the fifth on; self and cls do not count."""
-    found = []
-    for node in (n for n in ast.walk(tree) if isinstance(n, FUNCTIONS)):
-        positional = [a.arg for a in node.args.posonlyargs + node.args.args]
-        positional = [a for a in positional if a not in ("self", "cls")]
-        count = len(positional) + len(node.args.kwonlyargs)
-        if count > MOST_PARAMETERS:
-            found.append(f"{node.name}: {count} parameters")
-        elif len(positional) > MOST_POSITIONAL:
-            found.append(f"{node.name}: {len(positional)} positional parameters")
-    return found
-
-
-def long_functions(tree, path):
-    """A function has at most 50 lines."""
-    functions = (node for node in ast.walk(tree) if isinstance(node, FUNCTIONS))
-    lengths = {node.name: node.end_lineno - node.lineno + 1 for node in functions}
-    return [f"{name}: {n} lines" for name, n in lengths.items() if n > MOST_FUNCTION_LINES]
 
 
 def prints(tree, path):
