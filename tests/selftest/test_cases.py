@@ -1,5 +1,5 @@
-"""The cases of `pp-cl selftest`, each a test. Buffers are guarded: what strays, or is read before it
-is written, is seen.
+"""The cases of `pp-cl selftest`, each a test. The guards of the buffers show strays and reads of
+what nobody wrote.
 """
 
 import pytest
