@@ -108,6 +108,14 @@ def test_local_computes_all_of_the_channels_and_no_other():
     assert conv_local.quads(64, False) == 4
 
 
+def test_direct_work_items_fit_the_channels_and_the_width():
+    one = (1, 1, 1)
+    paired = replace(CPU, direct=(6, 2, one), direct_odd=(12, 1, one))
+    found = [conv_direct.fitting(paired, width, 64) for width in (100, 6, 5, 3)]
+    assert found == [(6, 2, one), (6, 2, one), (4, 2, one), (1, 2, one)]
+    assert conv_direct.fitting(paired, 100, 48) == (12, 1, one)  # three groups do not pair up
+
+
 @pytest.mark.parametrize("module", [DIRECT, LOCAL])
 @pytest.mark.parametrize("most", [20_000, large(1)])
 def test_parts_grow_when_memory_is_short(dev, rng, monkeypatch, module, most):
