@@ -108,6 +108,18 @@ def test_local_computes_all_of_the_channels_and_no_other():
     assert conv_local.quads(64, False) == 4
 
 
+@pytest.mark.parametrize(
+    "k, ci, co, first, c", [(3, 16, 16, 0, 16), (3, 48, 3, 16, 32), (1, 20, 32, 16, 4)]
+)
+def test_flipped_weights_are_exact(dev, rng, k, ci, co, first, c):
+    """And 0 for the channels beyond the last one."""
+    weight = rng.normal(size=(co, ci, k, k)).astype(np.float32)
+    given = dev.upload(pack_weights(weight)), first, c, co, Work.empty(dev, 0, 1 << 14)
+    expected = weight[:, first : first + c, ::-1, ::-1].transpose(1, 0, 2, 3)
+    flipped = conv_direct.flip_weights(dev, CPU, *given).get()
+    np.testing.assert_array_equal(flipped, pack_weights(expected))
+
+
 def test_direct_work_items_fit_the_channels_and_the_width():
     one = (1, 1, 1)
     paired = replace(CPU, direct=(6, 2, one), direct_odd=(12, 1, one))
@@ -188,9 +200,9 @@ def test_what_does_not_fit_together_is_refused(dev, module, k):
     def forward(sources=(x,), weight=weight, bias=bias, out=out, work=work, tiles=None):
         module.forward(dev, CPU, sources, weight, bias, out, relu=False, work=work, tiles=tiles)
 
-    def backward_input(first=0, grad_out=out, grad_x=x, work=work, tiles=None):
+    def backward_input(first=0, weight=weight, grad_out=out, work=work, tiles=None):
         given = {"mask": None, "work": work, "tiles": tiles}
-        module.backward_input(dev, CPU, weight, first, grad_out, grad_x, **given)
+        module.backward_input(dev, CPU, weight, first, grad_out, x, **given)
 
     def backward_weights(sources=(x,), grad_bias=bias, work=work, tiles=None):
         given = {"work": work, "tiles": tiles}
@@ -215,7 +227,7 @@ def test_what_does_not_fit_together_is_refused(dev, module, k):
             partial(forward, (zeros((4, 4, 3)),), zeros((2, k, k, 3, 16))),
             partial(forward, work=few),
             partial(backward_input, grad_out=zeros((4, 4, 20))),
-            partial(backward_input, first=8),
+            partial(backward_input, first=8, weight=zeros((2, k, k, 32, 16))),
             partial(backward_input, first=16),
             partial(backward_weights, work=Work(few.scratch, work.weights)),
             partial(backward_weights, work=Work(work.scratch, few.weights)),
