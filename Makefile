@@ -82,15 +82,14 @@ oclgrind: $(READY) ## run the tests of all kernels in Oclgrind (Debian's package
 		$(BIN)/python -m pytest -q -p no:cacheprovider -m "not large" $(ARGS) {}
 
 gpu-check: $(READY) ## compile and link all kernels for NVIDIA's, AMD's and Intel's GPUs, with no GPU; fetches Debian's compilers
-	@$(BIN)/python -m tools.gpu.builds
 	@$(BIN)/python -m tools.gpu_check $(ARGS)
 
 fuzz: $(READY) ## try damaged and odd input on all that pp-cl reads: COUNT (5000) examples of a property, SEED (0)
 	@COUNT=$(COUNT) $(BIN)/python -m pytest $(ON_ALL_CORES) --hypothesis-profile=fuzz --hypothesis-seed=$(SEED) \
 		$(ARGS) tests/test_fuzz.py tests/test_properties.py
 
-faults: $(READY) ## fail every write of a training and an evaluation, kill and stop them, fill the disk: a quarter of an hour
-	@$(BIN)/python -m tools.faults $(ARGS)
+faults: $(READY) ## fail every call that changes a file of a training and an evaluation, kill them: minutes
+	@FAULTS=all $(BIN)/python -m pytest $(ON_ALL_CORES) tests/test_faults.py $(ARGS)
 
 clean: ## remove .venv and everything built; runs/ stays
 	rm -rf .venv build dist *.egg-info .pytest_cache .ruff_cache
