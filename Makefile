@@ -5,7 +5,7 @@ READY := .venv/.ready
 KERNELS = $(shell find cl -name "*.cl" -o -name "*.h")
 
 # of `make fuzz`
-COUNT ?= 20000
+COUNT ?= 5000
 SEED ?= 0
 
 # Tests wait for builds of kernels, which use one core.
@@ -82,14 +82,14 @@ oclgrind: $(READY) ## run the tests of all kernels in Oclgrind (Debian's package
 		$(BIN)/python -m pytest -q -p no:cacheprovider -m "not large" $(ARGS) {}
 
 gpu-check: $(READY) ## compile and link all kernels for NVIDIA's, AMD's and Intel's GPUs, with no GPU; fetches Debian's compilers
-	@$(BIN)/python -m tools.gpu.builds
 	@$(BIN)/python -m tools.gpu_check $(ARGS)
 
-fuzz: $(READY) ## try damaged and odd input on all that pp-cl reads: COUNT (20000) inputs of SEED (0)
-	@$(BIN)/python -m tools.fuzz --count $(COUNT) --seed $(SEED) $(ARGS)
+fuzz: $(READY) ## try damaged and odd input on all that pp-cl reads: COUNT (5000) examples of a property, SEED (0)
+	@COUNT=$(COUNT) $(BIN)/python -m pytest $(ON_ALL_CORES) --hypothesis-profile=fuzz --hypothesis-seed=$(SEED) \
+		$(ARGS) tests/test_fuzz.py tests/test_properties.py
 
-faults: $(READY) ## fail every write of a training and an evaluation, kill and stop them, fill the disk: a quarter of an hour
-	@$(BIN)/python -m tools.faults $(ARGS)
+faults: $(READY) ## fail every call that changes a file of a training and an evaluation, kill them: minutes
+	@FAULTS=all $(BIN)/python -m pytest $(ON_ALL_CORES) tests/test_faults.py $(ARGS)
 
 clean: ## remove .venv and everything built; runs/ stays
 	rm -rf .venv build dist *.egg-info .pytest_cache .ruff_cache

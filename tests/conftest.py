@@ -7,6 +7,7 @@ import shutil
 
 import numpy as np
 import pytest
+from hypothesis import HealthCheck, settings
 from support.guarded import DATA, GuardedDevice, TracedDevice
 from support.runs import arguments
 from support.scenes import write_ball_scene
@@ -16,6 +17,24 @@ from pp_cl.device.discover import list_devices, open_device
 from pp_cl.device.launch import Program
 from pp_cl.files.cache import cache_folder, make_cache_folder
 from pp_cl.metrics.lpips_weights import WEIGHTS_FILE
+
+# of Hypothesis: the same few examples each time, or as many as `make fuzz` is told
+settings.register_profile(
+    "short",
+    max_examples=60,
+    deadline=None,
+    derandomize=True,
+    database=None,
+    suppress_health_check=list(HealthCheck),
+)
+settings.register_profile(
+    "fuzz",
+    settings.get_profile("short"),
+    max_examples=int(os.environ.get("COUNT", "5000")),
+    derandomize=False,
+    print_blob=True,
+)
+settings.load_profile("short")
 
 COUNTS = {"launches": 0, "data": 0}
 _launch = Program.launch

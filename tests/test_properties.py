@@ -5,7 +5,7 @@ import json
 import math
 
 import numpy as np
-from hypothesis import HealthCheck, given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
 
@@ -18,14 +18,6 @@ from pp_cl.scene.readers.frame import rigid
 from pp_cl.sweep.plan import read_seeds, read_varied
 from pp_cl.view.messages import read_request
 
-# the same examples each time, none kept; tmp_path is written over by each
-many = settings(
-    max_examples=60,
-    deadline=None,
-    derandomize=True,
-    database=None,
-    suppress_health_check=[HealthCheck.function_scoped_fixture, HealthCheck.too_slow],
-)
 json_values = st.recursive(
     st.none() | st.booleans() | st.integers() | st.floats() | st.text(),
     lambda inner: st.lists(inner, max_size=4) | st.dictionaries(st.text(), inner, max_size=4),
@@ -34,7 +26,6 @@ json_values = st.recursive(
 finite = st.floats(allow_nan=False, allow_infinity=False)
 
 
-@many
 @given(st.text() | st.text(min_size=1).map(lambda text: text * 300))
 def test_a_message_is_one_line_and_stays_as_it_is(text):
     line = one_line(text)
@@ -43,7 +34,6 @@ def test_a_message_is_one_line_and_stays_as_it_is(text):
         assert line == text
 
 
-@many
 @given(json_values, st.integers(10, 200))
 def test_foreign_values_are_short(value, most):
     for line in (quoted(value, most), shown(str(value), most)):
@@ -74,7 +64,6 @@ def given_settings(draw):
     return key, value
 
 
-@many
 @given(given_settings())
 def test_a_setting_is_itself_again_from_its_text(pair):
     key, value = pair
@@ -84,7 +73,6 @@ def test_a_setting_is_itself_again_from_its_text(pair):
     assert getattr(getattr(config, section), name) == value
 
 
-@many
 @given(given_settings())
 def test_settings_are_themselves_again_from_their_file(tmp_path, pair):
     config = preset("tiny")
@@ -97,7 +85,6 @@ def test_settings_are_themselves_again_from_their_file(tmp_path, pair):
         assert config.train.crop % 4 and "train.crop" in str(error)
 
 
-@many
 @given(json_values)
 def test_whatever_is_in_a_config_is_settings_or_one_line(tmp_path, value):
     stored = json.loads(preset("tiny").to_json()) | {"train": value}
@@ -110,7 +97,6 @@ def test_whatever_is_in_a_config_is_settings_or_one_line(tmp_path, value):
     raise AssertionError(f"{value!r} was taken for the settings of a training")
 
 
-@many
 @given(st.integers(0, 10**9), finite.filter(lambda x: 0 <= x < MOST_NUMBER), json_values)
 def test_a_row_of_the_log_is_finite_or_none(step, seconds, value):
     row = {"step": step, "seconds": seconds}
@@ -120,7 +106,6 @@ def test_a_row_of_the_log_is_finite_or_none(step, seconds, value):
     assert read_row(json.dumps(value)) is None or isinstance(value, dict)
 
 
-@many
 @given(st.binary(max_size=300))
 def test_no_bytes_of_a_log_or_of_a_message_are_an_error(data):
     row = read_row(data)
@@ -131,7 +116,6 @@ def test_no_bytes_of_a_log_or_of_a_message_are_an_error(data):
         assert str(error)
 
 
-@many
 @given(st.lists(st.lists(finite.filter(lambda x: abs(x) < MOST), min_size=1), max_size=6))
 def test_numbers_in_a_text_come_back_exactly(tmp_path, rows):
     text = "\n\n".join(" ".join(map(repr, row)) for row in rows)
@@ -139,7 +123,6 @@ def test_numbers_in_a_text_come_back_exactly(tmp_path, rows):
     assert read_numbers(tmp_path / "a.txt") == rows
 
 
-@many
 @given(st.dictionaries(st.from_regex(r"[a-z][a-z0-9.]{0,20}", fullmatch=True),
                        arrays.arrays(st.sampled_from([np.float32, np.uint32, np.uint8]),
                                      arrays.array_shapes(max_dims=4, max_side=4),
@@ -154,7 +137,6 @@ def test_a_checkpoint_comes_back(tmp_path, stored):
         assert found[name].dtype == array.dtype and np.array_equal(found[name], array)
 
 
-@many
 @given(arrays.arrays(np.float64, (3, 4), elements=st.floats(-2, 2)))
 def test_what_is_taken_for_a_pose_is_rigid(matrix):
     """Near to what was given, for random matrices and for rotations that are off by little."""
@@ -172,13 +154,11 @@ def test_what_is_taken_for_a_pose_is_rigid(matrix):
         assert np.abs(pose - given_matrix).max() < 1e-3
 
 
-@many
 @given(st.lists(st.integers(0, 2**31 - 1), min_size=1), st.sampled_from([",", " , "]))
 def test_seeds_are_sorted_and_each_once(seeds, comma):
     assert read_seeds(comma.join(map(str, seeds))) == sorted(set(seeds))
 
 
-@many
 @given(given_settings())
 def test_a_value_that_is_varied_has_one_text(pair):
     key, value = pair

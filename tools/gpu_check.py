@@ -1,165 +1,271 @@
-"""Compile and link every kernel as the drivers build it on GPUs, without a GPU.
+"""Compile and link every kernel as it is built on GPUs, without a GPU.
 
-    python -m tools.gpu_check                        # or make gpu-check
-    python -m tools.gpu_check --targets sm_80,pvc    # other GPUs: only errors and local memory fail
-    python -m tools.gpu_check --write                # write the table, shorten the known list
+    python -m tools.gpu_check                      # or make gpu-check
+    python -m tools.gpu_check --targets sm_80,pvc  # other GPUs: sm_*, gfx*, or a name ocloc knows
 
-Fails on a build that does not compile or link, on more than 32 KiB of local memory, and on any
-spill, private array, more than 128 registers and threads of 8 lanes that tools/gpu/known.json does
-not have, or has without need. Exit status: 1 for these, 2 where a compiler is missing.
+The selftest and two short trainings run on the device at hand in the form for GPUs (PP_FORM=gpu);
+each program that they build is compiled for NVIDIA (clang and libclc to PTX, then ptxas), AMD
+(clang and libclc, linked) and Intel (ocloc, the driver's own compiler). Fails on what does not
+compile or link, on spilled registers, and on more local memory than all GPUs have.
+
+Debian's packages of compilers that are absent are unpacked into build/gpu, not installed: that
+needs no root, and Intel's driver would be one more OpenCL platform. NVIDIA's ptxas is not free and
+in none of them. Exit status: 1 for a failure, 2 where a compiler is missing.
 """
 
 import argparse
-import json
+import io
 import os
+import re
+import shutil
+import subprocess
 import sys
+import sysconfig
+from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import asdict
+from contextlib import contextmanager, redirect_stderr, redirect_stdout
 from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import NamedTuple
+from unittest.mock import patch
 
-from pp_cl import __version__
-from pp_cl.device.device import kernel_folder
-from tools.gpu.builds import Build, read_builds
-from tools.gpu.compilers import BuildError, Usage, cached_build, version
-from tools.gpu.known import (
-    MOST_LOCAL,
-    complaints,
-    leftovers,
-    news,
-    read_known,
-    shortened,
-    write_known,
-)
-from tools.gpu.packages import CompilerMissing, unpack_missing
+from pp_cl.bench.peak import CopyBandwidth, PeakFlops
+from pp_cl.cli import main as pp_cl
+from pp_cl.device.device import INTEL_PLATFORM, STANDARD, Device, kernel_folder, vendor_options
+from pp_cl.device.discover import open_device
+from pp_cl.device.launch import Program
+from pp_cl.scene.demo import demo_scene, write_scene
+from pp_cl.selftest.run import CASES, run_cases
 
-TARGETS = ("sm_90", "gfx1100", "dg2")
-RESULTS = Path(__file__).parents[1] / "docs" / "results" / "gpu_check.json"
-HEADS = {
-    "sm_90": {"registers": "sm_90: registers", "spill": "spill, B", "private": "private, B"},
-    "gfx1100": {"registers": "gfx1100: VGPRs", "spill": "spill", "private": "scratch, B"},
-    "dg2": {"simd": "dg2: SIMD", "spill": "spill", "private": "private, B"},
-}
-
-Row = tuple[Build, str, str]  # build, kernel, target
+TARGETS = ("sm_90", "gfx1100", "dg2")  # Hopper, RDNA 3, Arc
+MOST_LOCAL = 32768  # bytes: Adreno, Mali, Apple's and older Intel GPUs have no more
+FOLDER = Path(__file__).parents[1] / "build" / "gpu"
+CLANG, LINKER, PTXAS, OCLOC = "clang-19", "ld.lld-19", "ptxas", "ocloc"
+LIBRARIES = {"sm_": "nvptx64--nvidiacl.bc", "gfx": "amdgcn--amdhsa.bc"}
+# {program or file: Debian's package of it}
+PACKAGES = {CLANG: "clang-19", LINKER: "lld-19", OCLOC: "intel-opencl-icd"}
+PACKAGES |= dict.fromkeys(LIBRARIES.values(), "libclc-19")
+CUDA = Path("/usr/local/cuda/bin")
+# What OpenCL asks of a division and of a square root, as NVIDIA's driver takes it.
+ULP = ("-mllvm", "-nvptx-prec-divf32=1", "-mllvm", "-nvptx-prec-sqrtf32=0")
 
 
-def compile_all(
-    compilers: dict[str, str], builds: dict[Build, set[str]], sources: Path
-) -> tuple[dict[Row, Usage], list[str]]:
-    """(what each launched kernel takes, a line for each build that failed). compilers: {target:
-    versions of its compilers}.
+class Build(NamedTuple):
+    """A program: cl/<file>.cl, built with -D for each macro "NAME=value"."""
+
+    file: str
+    macros: tuple[str, ...]
+
+    def __str__(self) -> str:
+        return " ".join((self.file, *self.macros))
+
+
+class CompilerMissing(Exception):
+    """Which compiler there is not, and how to come by it."""
+
+
+class BuildError(Exception):
+    """What a compiler or linker said of a build that failed."""
+
+
+@contextmanager
+def recorded() -> Iterator[dict[Build, set[str]]]:
+    """{program that any device builds meanwhile: its kernels that are launched}."""
+    builds, program, launch = {}, Device.program, Program.launch
+
+    def build(device, name, **defines):
+        found = program(device, name, **defines)
+        found.build = Build(name, tuple(f"{k}={v}" for k, v in sorted(defines.items())))
+        builds.setdefault(found.build, set())
+        return found
+
+    def noted(self, kernel_name, /, *args, **arguments):
+        builds[self.build].add(kernel_name)
+        launch(self, kernel_name, *args, **arguments)
+
+    with patch.object(Device, "program", build), patch.object(Program, "launch", noted):
+        yield builds
+
+
+def record() -> dict[Build, set[str]]:
+    """What is built and launched on a GPU: by the selftest, the two blends, the paper's network and
+    the measured peaks. Raises RuntimeError where something fails.
     """
+    with (
+        patch.dict(os.environ, {"PP_FORM": "gpu"}),
+        TemporaryDirectory() as folder,
+        recorded() as builds,
+    ):
+        dev = open_device()
+        failed = [row.case for row in run_cases(dev, CASES) if not row.passed]
+        PeakFlops(dev)
+        CopyBandwidth(dev).run()
+        write_scene(demo_scene(dev, size=16, most=4), f"{folder}/scene")
+        for preset in ("tiny", "paper"):
+            words = ["--points", "500", "--iterations", "2", "--preset", preset]
+            with redirect_stdout(io.StringIO()), redirect_stderr(io.StringIO()):
+                status = pp_cl(["train", f"{folder}/scene", "--out", f"{folder}/{preset}", *words])
+            if status:
+                failed.append(f"train --preset {preset}")
+    if failed:
+        raise RuntimeError(f"failed on the device at hand: {', '.join(failed)}")
+    return builds
 
-    def one(job):
-        target, build = job
+
+# --------------------------------------------------------------------------------------------------
+
+
+def environment() -> dict[str, str]:
+    """In which the unpacked programs find their libraries and each other."""
+    libraries = [str(path) for path in sorted((FOLDER / "usr" / "lib").glob("*-linux-gnu"))]
+    given = [os.environ[name] for name in ("LD_LIBRARY_PATH",) if os.environ.get(name)]
+    programs = [os.environ["PATH"], str(FOLDER / "usr" / "bin")]
+    paths = {"PATH": programs, "LD_LIBRARY_PATH": given + libraries}
+    return {**os.environ, **{name: os.pathsep.join(found) for name, found in paths.items()}}
+
+
+def find(name: str) -> str:
+    """The path of a program, or of a file of libclc. Raises CompilerMissing."""
+    places, mode = [environment()["PATH"]], os.X_OK
+    if name == PTXAS:
+        packages = Path(sysconfig.get_path("purelib"), "nvidia").glob(f"*/bin/{PTXAS}")
+        places += [str(CUDA), *(str(path.parent) for path in packages)]
+    elif name.endswith(".bc"):
+        # not /usr/lib/clc, where another version of LLVM may have put its own
+        places, mode = [str(FOLDER / "usr" / "lib" / "clc")], os.R_OK
+    found = shutil.which(name, mode, os.pathsep.join(places))
+    if not found:
+        wheel = "install CUDA's compiler, or nvidia-cuda-nvcc into .venv by pip"
+        source = wheel if name == PTXAS else f"it is in Debian's package {PACKAGES[name]}"
+        raise CompilerMissing(f"{name} is missing: {source}")
+    return found
+
+
+def unpack_missing() -> str:
+    """Unpack Debian's packages of what is absent. Returns what went wrong, else ""."""
+    wanted = dict.fromkeys(package for name, package in PACKAGES.items() if not _is_here(name))
+    if not wanted:
+        return ""
+    if not shutil.which("apt-get") or not shutil.which("dpkg"):
+        return "no apt-get here, which would fetch the compilers"
+    debs = FOLDER / "packages"
+    shutil.rmtree(debs, ignore_errors=True)
+    debs.mkdir(parents=True)
+    try:
+        plan = _run(["apt-get", "install", "--simulate", "--no-install-recommends", *wanted])
+        needed = dict.fromkeys([*wanted, *re.findall(r"(?m)^Inst (\S+)", plan)])
+        _run(["apt-get", "download", *needed], debs)
+        for deb in sorted(debs.glob("*.deb")):
+            _run(["dpkg", "-x", str(deb), str(FOLDER)])
+    except BuildError as error:
+        said = (str(error).splitlines() or ["no reason given"])[-1]
+        return f"apt-get or dpkg failed ({said}); apt-get update may help"
+    shutil.rmtree(debs)
+    return ""
+
+
+def _is_here(name):
+    try:
+        return bool(find(name))
+    except CompilerMissing:
+        return False
+
+
+def _run(command, folder=None):
+    """What a command prints. Raises BuildError."""
+    path = shutil.which(command[0], path=environment()["PATH"])
+    ran = subprocess.run(
+        [path or command[0], *command[1:]],
+        cwd=folder, env=environment(), capture_output=True, text=True, errors="replace",
+    )  # fmt: skip
+    said = ran.stdout + ran.stderr
+    if ran.returncode or "Build failed" in said:
+        raise BuildError(said.strip())
+    return said
+
+
+# --------------------------------------------------------------------------------------------------
+
+
+def compile_build(target: str, build: Build, sources: Path, folder: Path) -> str:
+    """What the compilers of a target say of a build. folder: for what is compiled. Raises
+    BuildError, CompilerMissing.
+    """
+    kind, file = target[:3], str(sources / f"{build.file}.cl")
+    platform = target if kind in LIBRARIES else INTEL_PLATFORM
+    options = [*STANDARD, *vendor_options({"type": "GPU", "platform": platform}, build.file)]
+    options += [f"-D{macro}" for macro in build.macros] + ["-I", str(sources)]
+    if kind not in LIBRARIES:
+        command = [find(OCLOC), "compile", "-file", file, "-device", target]
+        return _run([*command, "-options", " ".join(options), "-out_dir", str(folder)])
+    clang = [find(CLANG), "-x", "cl", "-O3", "-w", "-Wno-linker-warnings", *options, file]
+    clang += ["-Xclang", "-mlink-builtin-bitcode", "-Xclang", find(LIBRARIES[kind])]
+    if kind == "gfx":  # linked: only then undefined functions fail
+        remarks = ["-nogpulib", "-Rpass-analysis=kernel-resource-usage"]
+        link = [f"-fuse-ld={find(LINKER)}", "-o", str(folder / "x.co")]
+        return _run([*clang, "--target=amdgcn-amd-amdhsa", f"-mcpu={target}", *remarks, *link])
+    ptx = str(folder / "x.ptx")
+    clang += ["--target=nvptx64-nvidia-nvcl", "-Xclang", "-target-cpu", "-Xclang", target, *ULP]
+    _run([*clang, "-S", "-o", ptx])
+    return _run([find(PTXAS), "-v", f"-arch={target}", ptx, "-o", str(folder / "x.cubin")])
+
+
+def complaints(said: str) -> list[str]:
+    """A line for each kernel that spills or takes too much local memory, by what ptxas, clang for
+    AMD or ocloc printed.
+    """
+    found, kernel = [], ""
+    for line in said.splitlines():
+        named = re.search(r"entry function '(\w+)'|Function Name: (\w+)|kernel (\w+)\s", line)
+        kernel = next(filter(None, named.groups())) if named else kernel
+        spill = re.search(r"(\d+) bytes spill stores|Spill: (\d+)|spilled around (\d+)", line)
+        local = re.search(r"(\d+) bytes smem|LDS Size \[bytes/block\]: (\d+)", line)
+        if spill and int(next(filter(None, spill.groups()))):
+            found.append(f"{kernel}: spills {spill[0]}")
+        if local and int(local[1] or local[2]) > MOST_LOCAL:
+            found.append(f"{kernel}: {local[0]} of local memory; {MOST_LOCAL} are the most")
+    return found
+
+
+def check(target: str, build: Build, kernels: set[str]) -> list[str]:
+    """A line for each thing that is wrong with a build for a target. kernels: that are launched;
+    what others of the file take is of no interest.
+    """
+    with TemporaryDirectory() as folder:
         try:
-            return cached_build(target, build, sources, compilers[target])
+            said = compile_build(target, build, kernel_folder(), Path(folder))
+            wrong = [line for line in complaints(said) if line.partition(":")[0] in kernels]
         except BuildError as error:
-            return error
-
-    jobs = [(target, build) for target in compilers for build in sorted(builds)]
-    usages, failed = {}, []
-    with ThreadPoolExecutor(os.cpu_count()) as pool:
-        for (target, build), found in zip(jobs, pool.map(one, jobs), strict=True):
-            if isinstance(found, BuildError):
-                failed.append(f"{target} {build.label} does not build or link: {found}")
-                continue
-            for kernel in sorted(builds[build]):
-                if kernel in found:
-                    usages[build, kernel, target] = found[kernel]
-                else:
-                    failed.append(f"{target} {build.label}: its compiler does not name {kernel}")
-    return usages, failed
+            wrong = [f"does not build or link: {error}"]
+    return [f"{target} {build}: {line}" for line in wrong]
 
 
-def too_much_local(usages: dict[Row, Usage]) -> list[str]:
-    """A line for each kernel with more local memory than every GPU has."""
-    return [
-        f"{_name(row)}: {usage.local} bytes of local memory; {MOST_LOCAL} are the most"
-        for row, usage in usages.items()
-        if usage.local > MOST_LOCAL
-    ]
-
-
-def all_complaints(usages: dict[Row, Usage]) -> dict[str, dict[str, int]]:
-    """What is too much of each kernel, as tools/gpu/known.py has it."""
-    found = {_name(row): complaints(usage) for row, usage in usages.items()}
-    return {name: numbers for name, numbers in found.items() if numbers}
-
-
-def _name(row):
-    build, kernel, target = row
-    return f"{target} {build.label}: {kernel}"
-
-
-def results(usages: dict[Row, Usage], compilers: list[str]) -> dict:
-    """docs/results/gpu_check.json: a row for each kernel of each build. Numbers that are 0 are left
-    out.
-    """
-    rows = {}
-    for (build, kernel, target), usage in sorted(usages.items()):
-        row = rows.setdefault((build, kernel), {"build": build.label, "kernel": kernel})
-        row |= {f"{target}_{name}": n for name, n in asdict(usage).items() if n}
-    columns = [{"head": "build", "cell": "{build}"}, {"head": "kernel", "cell": "{kernel}"}]
-    for target, heads in HEADS.items():
-        columns += [{"head": h, "cell": f"{{{target}_{name}}}"} for name, h in heads.items()]
-    return {
-        "measured": f"what each kernel takes on GPUs, by {'; '.join(compilers)}",
-        "version": __version__,
-        "command": "python -m tools.gpu_check --write",
-        "columns": columns,
-        "rows": list(rows.values()),
-    }
-
-
-def print_table(usages: dict[Row, Usage]) -> None:
-    """A line for each kernel of each build, with what is not 0."""
-    lines = {}
-    for (build, kernel, target), usage in sorted(usages.items()):
-        numbers = ", ".join(f"{name} {n}" for name, n in asdict(usage).items() if n)
-        lines.setdefault((build, kernel), []).append(f"{target}: {numbers}")
-    for (build, kernel), texts in lines.items():
-        print(f"{build.label}: {kernel}", *texts, sep="\n    ")
-
-
-def usable(targets: list[str]) -> tuple[dict[str, str], list[str]]:
-    """({target: its compilers}, a line for each target whose compiler is missing)."""
-    problem = unpack_missing()
-    found, missing = {}, []
-    for target in targets:
-        try:
-            found[target] = version(target)
-        except CompilerMissing as error:
-            missing.append(f"{target} is not checked: {error}" + (f" ({problem})" * bool(problem)))
-    return found, missing
+def check_compilers(target: str, problem: str) -> list[str]:
+    """A line where a target's compilers are missing. problem: why they were not fetched."""
+    kind = target[:3]
+    names = {"sm_": (CLANG, PTXAS), "gfx": (CLANG, LINKER)}.get(kind, (OCLOC,))
+    try:
+        for name in (*names, *(LIBRARIES[kind] for _ in range(kind in LIBRARIES))):
+            find(name)
+    except CompilerMissing as error:
+        return [f"{target} is not checked: {error}" + (f" ({problem})" if problem else "")]
+    return []
 
 
 def main(arguments: list[str] | None = None) -> int:
     """Returns the exit status."""
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     parser.add_argument("--targets", default=",".join(TARGETS), help="sm_*, gfx*, ocloc's names")
-    parser.add_argument("--write", action="store_true", help="the table; shorten the known list")
-    given = parser.parse_args(arguments)
-    compilers, missing = usable(given.targets.split(","))
-    usages, failed = compile_all(compilers, read_builds(), kernel_folder())
-    judged = {row: usage for row, usage in usages.items() if row[2] in TARGETS}
-    found = all_complaints(judged)
-    targets = {target for _, _, target in judged}
-    known = {name: n for name, n in read_known().items() if name.split()[0] in targets}
-    print_table(usages)
-    wrong = failed + too_much_local(usages) + news(found, known)
-    if given.write and not failed and targets == set(TARGETS):
-        text = json.dumps(results(judged, sorted(set(compilers.values()))), indent=1)
-        RESULTS.write_text(f"{text}\n", "utf-8")
-        write_known(shortened(found, known))
-    else:
-        wrong += [] if failed else leftovers(found, known)
+    targets = parser.parse_args(arguments).targets.split(",")
+    problem = unpack_missing()
+    missing = [line for target in targets for line in check_compilers(target, problem)]
+    there = [target for target in targets if not check_compilers(target, problem)]
+    builds = record()
+    jobs = [(target, build, builds[build]) for target in there for build in sorted(builds)]
+    with ThreadPoolExecutor(os.cpu_count()) as pool:
+        wrong = [line for lines in pool.map(check, *zip(*jobs, strict=True)) for line in lines]
     print(*wrong, *missing, sep="\n", file=sys.stderr)
-    print(
-        f"{len(usages)} kernels for {', '.join(compilers) or 'no target'}: {len(found)} known to"
-        f" take too much, {len(wrong)} complaints",
-        file=sys.stderr,
-    )
+    print(f"{len(builds)} builds for {', '.join(there) or 'no target'}: {len(wrong)} complaints")
     return 1 if wrong else 2 if missing else 0
 
 

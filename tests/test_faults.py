@@ -1,0 +1,203 @@
+"""Calls that change files fail, processes are killed: one line, nothing half written under a final
+name, and the next start comes to the bytes of an undisturbed run.
+
+Some faults of each kind here; `make faults` (FAULTS=all) tries all of them.
+"""
+
+import errno
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+from support.faults import (
+    Faults,
+    content,
+    differences,
+    half_written,
+    leftovers,
+    run_command,
+)
+from support.runs import arguments, share_device
+from support.scenes import write_ball_scene
+
+ROOT = Path(__file__).parents[1]
+ALL = os.environ.get("FAULTS") == "all"
+PARTS = range(8 if ALL else 1)  # that workers share
+KILLS = 20 if ALL else 2  # of a part
+pytestmark = [
+    pytest.mark.skipif(not sys.platform.startswith("linux"), reason="asks /proc"),
+    pytest.mark.filterwarnings("error::pytest.PytestUnraisableExceptionWarning"),
+]
+# every mechanism of the loop is due in so many steps
+CHANGES = {
+    "train__iterations": 30,
+    "points__count": 300,
+    "network__blocks": "single",
+    "train__crop": 0,
+    "train__log_every": 5,
+}
+
+
+@pytest.fixture(scope="module")
+def bench(tmp_path_factory):
+    """One device for all commands."""
+    with pytest.MonkeyPatch.context() as patch:
+        share_device(patch)
+        yield Bench(tmp_path_factory.mktemp("faults").resolve())
+
+
+class Bench:
+    """A folder with a scene and templates of runs. run: where commands are disturbed."""
+
+    def __init__(self, folder):
+        scene, self.run = write_ball_scene(folder / "scene", 4, 16), folder / "run"
+        train = arguments(scene, self.run, downscale=1, **CHANGES)
+        evaluate = ["eval", str(self.run), "--save-images"]
+        interrupted, trained, evaluated = (
+            folder / name for name in ("cut", "trained", "evaluated")
+        )
+        last = numbers(self.calls(None, train), "replace checkpoint.npz")[-1]
+        shutil.copytree(self.run, trained)
+        with Faults(self.run, last):
+            restore(self.run, None)
+            run_command(train)
+        shutil.copytree(self.run, interrupted)
+        self.calls(trained, evaluate)
+        shutil.copytree(self.run, evaluated)
+        # {name: (what the run is at first, command, what it is undisturbed at the end)}
+        self.commands = {
+            "training": (None, train, content(trained)),
+            "training that goes on": (interrupted, train, content(trained)),
+            "evaluation": (trained, evaluate, content(evaluated)),
+            "evaluation again": (evaluated, evaluate, content(evaluated)),
+        }
+        self._seen = set()  # states from which the next start came to the right end
+
+    def calls(self, begin, words):
+        """The calls of a command that nothing disturbs."""
+        restore(self.run, begin)
+        with Faults(self.run) as faults:
+            assert run_command(words) == (0, [])
+        assert not half_written(self.run) + leftovers(self.run)
+        return faults.calls
+
+    def left(self, name, *, may_leave=False):
+        """What is wrong with what a disturbed command has left, and with the next start."""
+        _, words, expected = self.commands[name]
+        left = leftovers(self.run)
+        wrong = half_written(self.run) + ([] if may_leave else left)
+        files = frozenset(content(self.run).items())
+        if (name, files, bool(left)) not in self._seen:
+            after = run_command(words)[1] + differences(self.run, expected) + leftovers(self.run)
+            wrong += [f"the next start: {line}" for line in after]
+            if not after:
+                self._seen.add((name, files, bool(left)))
+        return wrong
+
+
+def restore(run, begin):
+    """Make the run a copy of a template, or nothing at all."""
+    shutil.rmtree(run, ignore_errors=True)
+    if begin:
+        shutil.copytree(begin, run)
+
+
+def numbers(calls, beginning):
+    """The numbers, from 1 on, of calls that begin so."""
+    return [n for n, call in enumerate(calls, 1) if call.startswith(beginning)]
+
+
+@pytest.mark.parametrize("part", PARTS)
+@pytest.mark.parametrize(
+    "name", ["training", "training that goes on", "evaluation", "evaluation again"]
+)
+def test_a_call_that_fails(bench, name, part):
+    """As of a broken disk, and as of a full one that stays so."""
+    begin, words, expected = bench.commands[name]
+    calls, wrong = bench.calls(begin, words), []
+    tried = range(1, len(calls) + 1)
+    if not ALL:  # the last of each kind
+        tried = sorted({call.split()[0]: n for n, call in enumerate(calls, 1)}.values())
+    for number in tried[part :: len(PARTS)]:
+        restore(bench.run, begin)
+        code, stays = ((errno.EIO, False), (errno.ENOSPC, True))[number % 2]
+        with Faults(bench.run, number, code, stays=stays) as faults:
+            status, found = run_command(words, bench.run)
+        assert len(faults.calls) >= number
+        if status == 0:
+            found += differences(bench.run, expected)
+        kind = faults.calls[number - 1].split()[0]
+        found += bench.left(name, may_leave=kind in ("unlink", "rmdir"))
+        wrong += [f"call {number} ({faults.calls[number - 1]}): {line}" for line in found]
+    assert wrong == []
+
+
+@pytest.mark.parametrize("part", PARTS)
+@pytest.mark.parametrize("name", ["training", "evaluation"])
+def test_a_process_that_is_killed(bench, name, part):
+    """Again and again, at random moments and in front of random calls; sometimes it comes to its
+    end.
+    """
+    begin, words, expected = bench.commands[name]
+    rng, count = np.random.default_rng(part), len(bench.calls(begin, words))
+    restore(bench.run, begin)
+    killed, ended, wrong = 0, 0, []
+    while killed < KILLS and ended < KILLS:
+        call = int(rng.integers(1, count + 1)) if killed % 2 == 0 else 0
+        process = subprocess.Popen(
+            [sys.executable, "-m", "support.faults", bench.run, str(call), *words],
+            env={**os.environ, "PYTHONPATH": os.pathsep.join([str(ROOT), str(ROOT / "tests")])},
+            stdout=subprocess.DEVNULL,
+        )
+        if not call:
+            time.sleep(rng.uniform(0.5, 4))
+            process.kill()
+        status = process.wait(120)
+        wrong += half_written(bench.run)
+        if status == -signal.SIGKILL:
+            killed += 1
+            continue
+        ended += 1
+        wrong += [f"status {status}"] if status else []
+        wrong += differences(bench.run, expected) + leftovers(bench.run)
+        restore(bench.run, begin)
+    wrong += bench.left(name, may_leave=True)
+    assert wrong == [] and killed
+
+
+@pytest.mark.parametrize("name", ["training that goes on", "evaluation"])
+def test_photographs_that_are_gone(bench, name):
+    begin, words, _ = bench.commands[name]
+    restore(bench.run, begin)
+    before, scene = content(bench.run), bench.run.parent / "scene"
+    scene.rename(scene.with_name("gone"))
+    try:
+        assert run_command(words, scene) == (2, [])
+    finally:
+        scene.with_name("gone").rename(scene)
+    assert differences(bench.run, before) == [] and bench.left(name) == []
+
+
+def test_what_is_wrong_is_found(bench, tmp_path):
+    """Half a file, another one, one too many."""
+    run, (begin, _, expected) = tmp_path / "run", bench.commands["evaluation"]
+    restore(run, begin)
+    assert half_written(run) == [] and "eval/metrics.json is missing" in differences(run, expected)
+    log = (run / "log.jsonl").read_bytes()
+    (run / "log.jsonl").write_bytes(log[:-9])  # its last row may be half there
+    assert half_written(run) == [] and "log.jsonl differs" in differences(run, expected)
+    (run / "log.jsonl").write_bytes(log[9:])
+    cut = ["checkpoint.npz", "config.json", "previews/step_000030.png"]
+    for name in cut:
+        (run / name).write_bytes((run / name).read_bytes()[:60])
+    (run / "odd").touch()
+    (run / ".a.7.tmp").touch()
+    found = sorted(line.partition(":")[0] for line in half_written(run))
+    assert found == sorted([*cut, "log.jsonl", "odd"]) and leftovers(run) == ["left .a.7.tmp"]
+    assert "odd is new" in differences(run, expected)
