@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 from oracle.unet import unet, unet_gradients
 from support.comparisons import relative_error
-from support.tiles import pixels_of
 
 import pp_cl.network.unet
 from pp_cl.layers.choice import make_policy
@@ -14,7 +13,6 @@ from pp_cl.layers.tiles import SIDE, grid_shape
 from pp_cl.network.layers import BLOCKS, convolutions, unet_layers
 from pp_cl.network.tile_plan import (
     LOSS_BORDER,
-    ForwardPlan,
     double,
     gradient_radius,
     grow,
@@ -76,44 +74,6 @@ def run(dev, net, x, grad_y, *, sparse):
     x = dev.upload(x)
     y = net.forward(x, True, plan).get()
     return [y, net.backward(dev.upload(grad_y)).get(), *[g.get() for g in net.gradients.values()]]
-
-
-@pytest.mark.parametrize("name, variant, blocks", CASES)
-def test_the_shown_tiles_are_the_dense_networks(dev, rng, name, variant, blocks):
-    """Its buffers are full of NaN at first and none comes to what is shown; two images of the same
-    features have the same bits, whatever was made between them.
-    """
-    x = rng.normal(size=(*SIZE, 16)).astype(np.float32)
-    features = np.full_like(x, BACKGROUND)
-    features[OBJECTS[name]] = x[OBJECTS[name]]
-    policy = make_policy(dev, variant=variant)
-    net = UNet(dev, (16, 32, 48), blocks=blocks, seed=1, policy=policy)
-    device_x = dev.upload(features)
-    plan = net.plan_shown(SIZE, active_tiles(features))
-    first = net.forward(device_x, False, plan).get()
-    other = dev.upload(x)
-    dense_of_other = net.forward(other, False).get()
-    dense = net.forward(device_x, False).get()
-    shown = pixels_of(plan.shown, *SIZE)
-    found = (features != BACKGROUND).any(2)
-    assert not (found & ~shown).any() and np.isfinite(dense_of_other).all()
-    if not shown.any():
-        return
-    assert relative_error(first[shown], dense[shown]) < 2e-6
-    plan = net.plan_shown(SIZE, active_tiles(features))
-    again = net.forward(device_x, False, plan).get()
-    assert np.array_equal(again[shown], first[shown])
-
-
-def test_what_is_not_shown_is_not_computed(dev, rng):
-    net = UNet(dev, (16, 32, 48), seed=1)
-    features = np.full((*SIZE, 16), BACKGROUND, np.float32)
-    features[60:81, 70:93] = 0
-    plan = net.plan_shown(SIZE, active_tiles(features))
-    forward = ForwardPlan(dev, net.layers, SIZE, active_tiles(features))
-    assert plan.computed_fraction < 0.6 * forward.computed_fraction
-    last = net.layers[-1].name
-    assert plan.maps[last].computed.sum() == plan.shown.sum() + 1  # and one for all others
 
 
 @pytest.mark.parametrize("name, variant, blocks", CASES)
