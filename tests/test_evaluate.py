@@ -83,24 +83,6 @@ def test_saved_images_are_what_was_measured(run):
         assert psnr(picture, truth) == pytest.approx(row["psnr"], abs=0.02)
 
 
-def test_what_tau_did_is_told(run, tmp_path, capsys):
-    copy = tmp_path / "run"
-    shutil.copytree(run, copy)
-    config = json.loads((copy / "config.json").read_text())
-    config["raster"]["tau"] = 1e-2
-    (copy / "config.json").write_text(json.dumps(config))
-    assert main(["eval", str(copy)]) == 0
-    result = json.loads((copy / "eval" / "metrics.json").read_text())
-    assert set(result["mean"]) == {"psnr", "ssim"}
-    for row in result["per_image"]:
-        assert (
-            0 < row["tau_bound"] <= 1e-2
-            and 0 < row["tau_feature_error"] <= 1e-2
-            and 0 < row["tau_picture_error"] < 0.1
-        )
-    assert "raster.tau: dropped at most" in capsys.readouterr().out
-
-
 def test_twice_gives_the_same_numbers_and_other_splits_work(run):
     results = []
     for _ in range(2):

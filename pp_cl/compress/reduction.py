@@ -104,7 +104,7 @@ class Original:
     def reduced(self, reduction: Reduction) -> Run:
         """The reduced run, on the same device."""
         run, config = self.run, self.config(reduction)
-        policy = load_policy(run.dev, reduction.tolerance)
+        policy = load_policy(run.dev, config.network.tolerance)
         net = UNet.of_settings(run.dev, config.network, policy)
         model = Model.load(
             run.dev,

@@ -36,6 +36,9 @@ def _forward(kind: str, dev: Device, rng: np.random.Generator) -> Iterator[Check
         yield absolute(blended.weight, blended.blend["weight"], WEIGHT)
         expected = dense.features(blended.blend, blended.point_features)
         yield relative(blended.features, expected, WEIGHT)
+        empty = ~blended.geometry["hit"].any(axis=0)
+        yield exact(blended.features[empty], np.ones((empty.sum(), 16)))
+        yield exact(blended.scene.weights.shaded.get(), blended.scene.seen)
         transmittance = blended.scene.weights.transmittance.get()
         yield absolute(transmittance, blended.blend["background"], WEIGHT)
 
@@ -64,23 +67,33 @@ def _sizes(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
 
 def _gradient_of_alpha(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
     """One of alpha is one of a feature that is 0 in all points, since the background's is 1."""
-    blended = Blended(dev, rng, rule="alpha")
-    grad_alpha = rng.normal(size=len(blended.grad))
-    blended.point_features[:, 15] = 0
-    blended.scene.blend(blended.opacity, 0.1, blended.point_features, rule="alpha")
-    blended.grad[:, 15] = -grad_alpha
-    expected = blended.reference_gradients()[1]
-    blended.grad[:, 15] = 0
-    gradients = blended.scene.gradients(blended.grad, grad_alpha)
-    yield relative(gradients["opacity"], expected, GRADIENT)
+    for options in ({"early_stop": 0.0}, {"early_stop": 0.05}):
+        blended = Blended(dev, rng, rule="alpha", **options)
+        grad_alpha = rng.normal(size=len(blended.grad))
+        blended.point_features[:, 15] = 0
+        features = blended.point_features
+        blended.scene.blend(blended.opacity, 0.1, features, rule="alpha", **options)
+        blended.grad[:, 15] = -grad_alpha
+        expected = blended.reference_gradients()
+        blended.grad[:, 15] = 0
+        gradients = blended.scene.gradients(blended.grad, grad_alpha)
+        yield relative(gradients["opacity"], expected[1], GRADIENT)
+        yield relative(gradients["features"][:, :15], expected[0][:, :15], GRADIENT)
 
 
 def _spread(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
     """Of hits of all weights, of those before an early stop, and of the tracked ones."""
-    for n, tracked, stop in ((257, 0, 0.0), (257, 0, 0.05), (257, 3, 0.0), (31, 0, 0.0)):
-        blended = Blended(dev, rng, n, rule="alpha", max_tracked=tracked, early_stop=stop)
+    for n, tracked, stop, mean in (
+        (257, 0, 0.0, False),
+        (257, 0, 0.05, False),
+        (257, 3, 0.0, False),
+        (33, 0, 0.0, True),
+        (31, 0, 0.0, False),
+    ):
+        options = {"max_tracked": tracked, "early_stop": stop, "mean": mean}
+        blended = Blended(dev, rng, n, rule="alpha", **options)
         blended.grad[:] = 0
-        expected = blended.reference_gradients(tracked, spread_weight=3.0)[1]
+        expected = blended.reference_gradients(tracked, mean, spread_weight=3.0)[1]
         gradients = blended.gradients(spread_weight=3.0)
         yield relative(gradients["opacity"], expected, GRADIENT)
         yield exact(gradients["features"], np.zeros((n, 16)))

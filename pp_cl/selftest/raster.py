@@ -15,7 +15,7 @@ from pp_cl.raster.sh import SH_BLOCKS
 from pp_cl.raster.shade import shade_forward
 from pp_cl.reference import dense
 from pp_cl.scene.grid import Grid
-from pp_cl.selftest.case import EPS, SIZES, Case, Check, each, exact, finite, relative
+from pp_cl.selftest.case import EPS, SIZES, Case, Check, each, exact, finite, no_more, relative
 from pp_cl.selftest.points import (
     AXIS,
     AXIS_RADIUS,
@@ -150,13 +150,13 @@ def _shade(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
 
 
 def _depth(rule: str, dev: Device, rng: np.random.Generator) -> Iterator[Check]:
-    """Alpha and mean depth by the blend weights; the median of three points by hand."""
+    """Alpha, mean and median depth by the blend weights; those of three points by hand."""
     for n, kind in ((31, "soft"), (257, "soft"), (257, "sphere"), (33, "disc")):
         blended = Blended(
             dev, rng, n, gamma=0.02, radius=0.4, rule=rule, early_stop=1e-2, kind=kind
         )
         scene = blended.scene
-        alpha, depth, _ = _depths(dev, scene)
+        alpha, depth, median = _depths(dev, scene)
         weight = np.where(blended.role == DROPPED, 0, scene.weight()).astype(np.float64)
         z = dense.surface_depth(scene.camera, blended.geometry, blended.radius, kind)
         total = weight.sum(axis=0)
@@ -165,6 +165,10 @@ def _depth(rule: str, dev: Device, rng: np.random.Generator) -> Iterator[Check]:
         yield exact(np.isinf(depth), ~hit)
         mean = (weight * z).sum(axis=0)[hit] / total[hit]
         yield relative(depth[hit], mean, SUMMED)
+        yield exact(np.isinf(median), ~hit)
+        low, high = _medians(blended, weight, z)
+        yield no_more(median[hit], high[hit], SUMMED * z.max())
+        yield no_more(low[hit], median[hit], SUMMED * z.max())
     scene, _ = blend_on_axis(dev, [0.9, 0.5, 0.1], [0.25, 1.0, 1.0], 0.1, rule="alpha")
     alpha, depth, median = _depths(dev, scene)
     near, far = depth_at(np.array([0.9, 0.5])) - AXIS_RADIUS
@@ -175,6 +179,22 @@ def _depth(rule: str, dev: Device, rng: np.random.Generator) -> Iterator[Check]:
         (median, near + (far - near) / 3),
     ):
         yield relative(actual, [expected], 8 * EPS)
+    scene, _ = blend_on_axis(dev, [0.9, 0.5], [0.0, 0.0], 0.1, rule="alpha")
+    yield exact(np.concatenate(_depths(dev, scene)), [0, np.inf, np.inf])
+
+
+def _medians(blended, weight, z):
+    """Two (HW,) between which the medians lie: where shares just below and above one half are
+    reached. weight, z: (N, HW).
+    """
+    hits, bounds = blended.geometry["hit"] & (blended.role != DROPPED), np.zeros((2, len(weight.T)))
+    for q in np.flatnonzero(weight.any(axis=0)):
+        order = np.argsort(blended.geometry["depth"][:, q], kind="stable")
+        listed = order[hits[order, q]]
+        reached = np.concatenate([[0], np.cumsum(weight[listed, q])])
+        depths = z[np.concatenate([listed[:1], listed]), q]  # the first hit alone has no slope
+        bounds[:, q] = np.interp(np.array([0.499999, 0.500001]) * reached[-1], reached, depths)
+    return np.sort(bounds, axis=0)
 
 
 def _depths(dev, scene):

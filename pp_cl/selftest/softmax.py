@@ -52,6 +52,7 @@ def _forward(kind: str, dev: Device, rng: np.random.Generator) -> Iterator[Check
         yield relative(blended.features, expected, WEIGHT)
         empty = ~blended.geometry["hit"].any(axis=0)
         yield exact(blended.features[empty], np.ones((empty.sum(), 16)))
+        yield exact(blended.scene.weights.shaded.get(), blended.scene.seen)
 
 
 def _backward(kind: str, dev: Device, rng: np.random.Generator) -> Iterator[Check]:
@@ -96,6 +97,8 @@ def _sizes(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
 def _early_stop(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
     for stop in (0.001, 0.05, 0.5):
         blended = Blended(dev, rng, 500, gamma=0.02, radius=0.4, early_stop=stop)
+        kept = blended.blend["hit"]
+        yield exact(blended.scene.weights.shaded.get(), np.flatnonzero(kept.any(axis=1)))
         expected = dense.features(blended.blend, blended.point_features)
         yield relative(blended.features, expected, WEIGHT)
         gradients, expected = blended.gradients(), blended.reference_gradients()

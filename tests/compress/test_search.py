@@ -45,7 +45,7 @@ def test_a_loss_without_bound_leaves_the_least(original, views):
 
 
 def test_what_is_not_faster_is_refused(original, views, monkeypatch):
-    monkeypatch.setattr(module, "TRIALS", ((1.0, "window", ("object",)),))
+    monkeypatch.setattr(module, "TRIALS", ((1.0, "early_stop", (0.5,)),))
     taken = []
     for new in (99.0, 97.0):
         monkeypatch.setattr(module, "frame_ms", lambda runs, views, new=new: [100.0, new])
@@ -61,9 +61,7 @@ def test_a_compressed_run_is_not_tried_again(original, views, monkeypatch):
     small = replace(
         Reduction.of(original.run),
         half=True,
-        window="object",
         early_stop=0.03,
-        tolerance=0.01,
         degree=0,
         channels=0.1,
     )

@@ -1,73 +1,48 @@
-"""The blend against its float64 twin, and its gradients against finite differences of that twin."""
+"""Both blends: gradients against finite differences of the float64 twins with which the selftest
+compares them, weights by hand, and the bits.
+"""
 
 import numpy as np
 import pytest
 from support.comparisons import relative_error
-from support.guarded import AWKWARD_SIZES
 
-from pp_cl.raster.project import KINDS
+from pp_cl.raster.blend import BLENDS
 from pp_cl.reference import dense as oracle
 from pp_cl.reference.differences import numeric_gradient
-from pp_cl.selftest.points import GAMMAS, Blended, PairedPoints
+from pp_cl.selftest.points import AXIS, Blended, PairedPoints, blend_on_axis
+
+UNTRACKED = 1  # cl/raster/pair_role.h
+CASES = [("softmax", 0.1), ("softmax", 0.01), ("alpha", 0.1)]
 
 
-@pytest.mark.parametrize("kind", KINDS)
-@pytest.mark.parametrize("gamma", GAMMAS)
-def test_features(dev, rng, kind, gamma):
-    blended = Blended(dev, rng, kind=kind, gamma=gamma)
-    assert (
-        relative_error(blended.features, oracle.features(blended.blend, blended.point_features))
-        < 2e-4
-    )
-    assert (blended.features[~blended.geometry["hit"].any(axis=0)] == 1).all()
+def features_of(blended, geometry, opacity, point_features):
+    """(HW, 16) float64 features by the blend's rule."""
+    if blended.rule == "alpha":
+        blend = oracle.alpha(geometry, opacity)
+    else:
+        blend = oracle.blend(geometry, opacity, blended.gamma)
+    return oracle.features(blend, point_features)
 
 
-@pytest.mark.parametrize("n", AWKWARD_SIZES)
-@pytest.mark.parametrize("size", [(1, 1), (31, 33)])
-def test_sizes(dev, rng, n, size):
-    blended = Blended(dev, rng, n=n, size=size)
-    assert (
-        relative_error(blended.features, oracle.features(blended.blend, blended.point_features))
-        < 1e-4
-    )
-    gradients, expected = blended.gradients(), blended.reference_gradients()
-    assert relative_error(gradients["features"], expected[0]) < 1e-4
-    assert relative_error(gradients["opacity"], expected[1]) < 1e-4
-
-
-@pytest.mark.parametrize("kind", KINDS)
-@pytest.mark.parametrize("gamma", GAMMAS)
-@pytest.mark.parametrize("mean", [False, True])
-@pytest.mark.parametrize("max_tracked", [0, 3])
-def test_gradients(dev, rng, kind, gamma, mean, max_tracked):
-    blended = Blended(dev, rng, kind=kind, gamma=gamma, mean=mean, max_tracked=max_tracked)
-    gradients, expected = blended.gradients(), blended.reference_gradients(max_tracked, mean)
-    assert relative_error(gradients["features"], expected[0]) < 2e-4
-    assert relative_error(gradients["opacity"], expected[1]) < 5e-4
-    unseen = ~blended.geometry["hit"].any(axis=1)
-    assert unseen.any()
-    assert (gradients["features"][unseen] == 0).all() and (gradients["opacity"][unseen] == 0).all()
-
-
-@pytest.mark.parametrize("gamma", GAMMAS)
-def test_gradients_against_finite_differences(dev, rng, gamma):
-    blended = Blended(dev, rng, n=60, gamma=gamma)
+@pytest.mark.parametrize("rule, gamma", CASES)
+def test_gradients_against_finite_differences(dev, rng, rule, gamma):
+    """Opacities of 0 and 1 included; a softmax has no logarithm of what lies below 0."""
+    blended = Blended(dev, rng, n=60, gamma=gamma, rule=rule)
     gradients = blended.gradients()
 
     def loss(opacity, point_features):
-        blend = oracle.blend(blended.geometry, opacity, gamma)
-        return (oracle.features(blend, point_features) * blended.grad).sum()
+        features = features_of(blended, blended.geometry, opacity, point_features)
+        return (features * blended.grad).sum()
+
+    def loss_of_opacity(opacity):
+        return loss(opacity, blended.point_features)
 
     opacity = blended.opacity.astype(np.float64)
-    inside = np.flatnonzero(opacity > 0)  # the oracle has no logarithm of what lies below 0
-    numeric = numeric_gradient(lambda o: loss(o, blended.point_features), opacity, 1e-6, inside)
+    inside, zero = np.flatnonzero(opacity > 0), np.flatnonzero(opacity == 0)
+    numeric = numeric_gradient(loss_of_opacity, opacity, 1e-6, inside)
     assert relative_error(gradients["opacity"][inside], numeric) < 5e-4
-    zero = np.flatnonzero(opacity == 0)
-    start = loss(opacity, blended.point_features)
-    one_sided = [
-        (loss(opacity + 1e-7 * (np.arange(60) == i), blended.point_features) - start) / 1e-7
-        for i in zero
-    ]
+    start, steps = loss_of_opacity(opacity), 1e-7 * np.eye(60)[zero]
+    one_sided = [(loss_of_opacity(opacity + step) - start) / 1e-7 for step in steps]
     assert relative_error(gradients["opacity"][zero], one_sided) < 1e-3
     assert np.abs(one_sided).max() > 0.1
 
@@ -76,41 +51,105 @@ def test_gradients_against_finite_differences(dev, rng, gamma):
     assert relative_error(gradients["features"].ravel()[some], numeric) < 1e-4
 
 
-@pytest.mark.parametrize("gamma", GAMMAS)
+@pytest.mark.parametrize("rule, gamma", CASES)
 @pytest.mark.parametrize("mean", [False, True])
-def test_sphere_gradients_against_finite_differences(dev, rng, gamma, mean):
+def test_sphere_gradients_against_finite_differences(dev, rng, rule, gamma, mean):
     n, step = 30, 1e-6
-    blended = Blended(dev, rng, n=n, kind="sphere", gamma=gamma, mean=mean)
+    blended = Blended(dev, rng, n=n, kind="sphere", gamma=gamma, rule=rule)
     blended.radius[-1] = 0.01  # below a pixel
     blended.positions[-1] = 0
-    opacity = blended.opacity
-    blended.scene = PairedPoints(
-        dev, blended.camera, blended.positions, blended.radius, kind="sphere"
-    )
-    blended.scene.blend(opacity, gamma, blended.point_features, mean=mean)
-    hit = blended.scene.hits()
-    gradients = blended.scene.sphere_gradients(blended.grad)
+    scene = PairedPoints(dev, blended.camera, blended.positions, blended.radius, kind="sphere")
+    scene.blend(blended.opacity, gamma, blended.point_features, mean=mean, rule=rule)
+    hit, gradients = scene.hits(), scene.sphere_gradients(blended.grad)
 
     def loss(positions, radius):
         geometry = oracle.geometry(blended.camera, positions, radius, "sphere") | {"hit": hit}
-        blend = oracle.blend(geometry, opacity, gamma)
-        return (oracle.features(blend, blended.point_features) * blended.grad).sum()
+        features = features_of(blended, geometry, blended.opacity, blended.point_features)
+        return (features * blended.grad).sum()
 
     scale = np.maximum(hit.sum(axis=1), 1) if mean else np.ones(n)
     radius = blended.radius.astype(np.float64)
-    numeric = (
-        numeric_gradient(lambda p: loss(p, radius), blended.positions, step).reshape(n, 3)
-        / scale[:, None]
-    )
-    assert relative_error(gradients["positions"], numeric) < 2e-3
-    assert np.abs(gradients["positions"][-1]).max() > 0
+    numeric = numeric_gradient(lambda p: loss(p, radius), blended.positions, step).reshape(n, 3)
+    assert relative_error(gradients["positions"], numeric / scale[:, None]) < 2e-3
+    assert gradients["positions"][-1].any() == (rule == "softmax")  # by its depth alone
     numeric = numeric_gradient(lambda r: loss(blended.positions, r), radius, step) / scale
     assert relative_error(gradients["radius"], numeric) < 2e-3
 
 
-def test_two_runs_give_the_same_bits(dev):
+def test_gradients_of_the_spread_against_finite_differences(dev, rng):
+    blended = Blended(dev, rng, n=60, rule="alpha")
+    blended.grad[:] = 0
+
+    def loss(opacity):
+        return oracle.spread(blended.geometry, oracle.alpha(blended.geometry, opacity)).sum()
+
+    numeric = numeric_gradient(loss, blended.opacity.astype(np.float64), 1e-5, np.arange(60))
+    assert np.abs(numeric).max() > 0.1
+    assert relative_error(blended.gradients(spread_weight=1.0)["opacity"], numeric) < 1e-5
+
+
+def test_hits_at_one_depth_and_single_hits_have_no_spread(dev):
+    for z in ([0.5], [0.5] * 7):
+        scene, _ = blend_on_axis(dev, z, [0.5] * len(z), 0.1, rule="alpha")
+        gradients = scene.gradients(np.zeros((1, 1, 16)), spread_weight=1e6)
+        assert (gradients["opacity"] == 0).all()
+
+
+def test_a_softmax_has_no_spread(dev, rng):
+    with pytest.raises(ValueError, match="spread"):
+        Blended(dev, rng).gradients(spread_weight=1.0)
+
+
+@pytest.mark.parametrize("rule", BLENDS)
+def test_gradients_take_no_program_of_their_own(dev, rng, monkeypatch, rule):
+    """Nor does a spread that begins at 0."""
+    monkeypatch.setattr(dev, "_programs", {})
+    blended = Blended(dev, rng, rule=rule)
+    blended.gradients()
+    built = set(dev._programs)
+    assert [name for name, _ in built].count("raster/softmax") == (rule == "softmax")
+    blended.gradients(spread_weight=float(rule == "alpha"))
+    assert set(dev._programs) == built
+
+
+def test_the_softmax_by_hand(dev):
+    """0.04 units of depth are one e-fold at gamma = 0.01 and a range of 4; the exponent scales with
+    the opacity, so a near faint point does not hide a far opaque one: this is no alpha
+    compositing.
+    """
+    _, (near, far) = blend_on_axis(dev, [0.5, 0.49], [1.0, 1.0], 0.01)
+    assert abs(np.log(near / far) - 1) < 1e-3
+    _, (near, far) = blend_on_axis(dev, [0.9, 0.6], [0.5, 1.0], 0.01)
+    assert near / far == pytest.approx(0.5 * np.exp(-15.0), rel=1e-3)
+    _, weight = blend_on_axis(dev, [0.5], [0.057], 0.01)
+    assert abs(weight[0] - 0.5) < 0.01  # a lone point is half visible at this opacity
+    scene, weight = blend_on_axis(dev, [0.9, 0.5], [1.0, 0.0], 0.01)
+    hidden = scene.gradients(np.ones((1, 1, 16)) * np.arange(16))["opacity"][1]
+    assert weight[1] == 0 and hidden != 0 and abs(hidden) < 1e-30
+
+
+def test_untracked_hits_without_weight_are_shaded(dev, rng):
+    """A weight may underflow to 0 beyond max_tracked; its point is in the pixels' lists, so it must
+    be shaded.
+    """
+    blended = Blended(dev, rng, n=300, gamma=1e-3, radius=0.4, max_tracked=1, early_stop=1e-30)
+    untracked_zero = (blended.role == UNTRACKED) & (blended.weight == 0)
+    assert untracked_zero.any() and np.isfinite(blended.features).all()
+
+
+@pytest.mark.parametrize("rule", BLENDS)
+@pytest.mark.parametrize("early_stop", [0.0, 1e-3])
+def test_two_runs_give_the_same_bits(dev, rule, early_stop):
     runs = []
     for _ in range(2):
-        blended = Blended(dev, np.random.default_rng(3), n=3000, radius=0.2)
-        runs.append([blended.features, *blended.gradients().values()])
+        rng = np.random.default_rng(3)
+        blended = Blended(dev, rng, n=3000, radius=0.2, rule=rule, early_stop=early_stop)
+        shaded, gradients = blended.scene.weights.shaded.get(), blended.gradients()
+        runs.append([blended.weight, shaded, blended.features, *gradients.values()])
     assert all(np.array_equal(a, b) for a, b in zip(*runs, strict=True))
+
+
+def test_a_point_at_the_eye(dev):
+    """It has no direction, and is left out even where near = 0 would let it in."""
+    scene = PairedPoints(dev, AXIS, np.zeros((1, 3)), 0.0, depth_range=(0.0, 6.0))
+    assert scene.projected.point_camera.get().tolist() == [[0, 0, 0, -1]]

@@ -1,9 +1,7 @@
-"""Spherical harmonics shading against its float64 twin."""
+"""Shading: coefficients of 16 bits, the twin's basis, and what is refused."""
 
 import numpy as np
 import pytest
-from support.comparisons import relative_error
-from support.guarded import AWKWARD_SIZES
 
 from pp_cl.raster.sh import SH_BLOCKS
 from pp_cl.raster.shade import shade_forward
@@ -11,58 +9,31 @@ from pp_cl.reference import dense as oracle
 from pp_cl.selftest.points import PairedPoints, make_camera, make_points
 
 
-class Shaded:
-    """Random coefficients of a random scene up to `degree`."""
-
-    def __init__(self, dev, rng, n, degree):
-        self.camera, self.positions = make_camera(), make_points(rng, n)
-        self.scene = PairedPoints(dev, self.camera, self.positions, 0.1)
-        self.sh = [
-            np.float32(rng.normal(size=(n, b.count, 16))) for b in SH_BLOCKS if b.degree <= degree
-        ]
-
-    def features(self):
-        """(N, 16) by the oracle."""
-        return oracle.shade(self.positions, self.camera.eye, np.concatenate(self.sh, axis=1))
-
-
-@pytest.mark.parametrize("degree", [0, 1, 2])
-@pytest.mark.parametrize("n", AWKWARD_SIZES)
-def test_forward(dev, rng, n, degree):
-    shaded = Shaded(dev, rng, n, degree)
-    kept = np.flatnonzero(oracle.kept(shaded.camera, shaded.positions, 0.1))
-    seen = np.sort(rng.choice(kept, (n + 1) // 2, replace=False))
+def shade(dev, sh):
+    """(N, 16) features of random points by coefficients; 7 where a point is not listed."""
+    n, camera = len(sh[0]), make_camera()
+    positions = make_points(np.random.default_rng(1), n)
+    scene = PairedPoints(dev, camera, positions, 0.1)
+    seen = np.flatnonzero(oracle.kept(camera, positions, 0.1))
     features = dev.upload(np.full((n, 16), 7.0), np.float32)
-    shade_forward(
-        dev,
-        shaded.scene.projected,
-        dev.upload(seen, np.uint32),
-        [dev.upload(c) for c in shaded.sh],
-        point_features=features,
-    )
-    assert relative_error(features.get()[seen], shaded.features()[seen]) < 1e-5
-    assert (np.delete(features.get(), seen, axis=0) == 7).all()
+    sh = [dev.upload(c, c.dtype) for c in sh]
+    shade_forward(dev, scene.projected, dev.upload(seen, np.uint32), sh, point_features=features)
+    return features.get()
+
+
+def coefficients(rng, n):
+    """Random ones of all degrees."""
+    return [np.float32(rng.normal(size=(n, b.count, 16))) for b in SH_BLOCKS]
 
 
 @pytest.mark.parametrize("degree", [0, 1, 2])
 def test_coefficients_of_16_bits(dev, rng, degree):
     """The same features as from their float32 values, to the last bits."""
-    shaded = Shaded(dev, rng, 257, degree)
-    shaded.sh[0][:3, 0, :4] = [0, -6e-8, 65504, 1e-5]  # denormal halves and the largest
-    stored = [np.float16(c) for c in shaded.sh]
-    seen = np.flatnonzero(oracle.kept(shaded.camera, shaded.positions, 0.1))
-    found = []
-    for sh in (stored, [np.float32(c) for c in stored]):
-        features = dev.upload(np.full((257, 16), 7.0), np.float32)
-        shade_forward(
-            dev,
-            shaded.scene.projected,
-            dev.upload(seen, np.uint32),
-            [dev.upload(c, c.dtype) for c in sh],
-            point_features=features,
-        )
-        found.append(features.get())
-    assert np.array_equal(*found) and np.isfinite(found[0]).all()
+    sh = [c for c, b in zip(coefficients(rng, 257), SH_BLOCKS, strict=True) if b.degree <= degree]
+    sh[0][:3, 0, :4] = [0, -6e-8, 65504, 1e-5]  # denormal halves and the largest
+    half = [np.float16(c) for c in sh]
+    found = [shade(dev, stored) for stored in (half, [np.float32(c) for c in half])]
+    assert np.array_equal(*found) and np.isfinite(found[0]).all() and (found[0] != 7).any()
 
 
 def test_the_basis_is_orthonormal(rng):
@@ -71,25 +42,9 @@ def test_the_basis_is_orthonormal(rng):
     assert np.abs(4 * np.pi * basis.T @ basis / len(basis) - np.eye(9)).max() < 0.02
 
 
-def test_wrong_shapes_are_refused(dev, rng):
-    shaded = Shaded(dev, rng, 31, 1)
+def test_wrong_shapes_and_half_a_degree_are_refused(dev, rng):
+    sh = coefficients(rng, 31)
     with pytest.raises(ValueError, match="sh_1 has shape"):
-        shade_forward(
-            dev,
-            shaded.scene.projected,
-            dev.upload(shaded.scene.seen, np.uint32),
-            [dev.upload(shaded.sh[0]), dev.empty((31, 5, 16))],
-            point_features=dev.empty((31, 16)),
-        )
-
-
-def test_half_a_degree_is_refused(dev, rng):
-    shaded = Shaded(dev, rng, 31, 2)
-    with pytest.raises(ValueError, match="3 arrays of coefficients end within degree 2"):
-        shade_forward(
-            dev,
-            shaded.scene.projected,
-            dev.upload(shaded.scene.seen, np.uint32),
-            [dev.upload(c) for c in shaded.sh[:3]],
-            point_features=dev.empty((31, 16)),
-        )
+        shade(dev, [sh[0], np.zeros((31, 5, 16), np.float32)])
+    with pytest.raises(ValueError, match="degree 2"):
+        shade(dev, sh[:3])

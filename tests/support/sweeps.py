@@ -17,7 +17,7 @@ GIVEN = [(key, str(value), "--set") for key, value in SETS.items()]
 
 def jobs_of(scenes, out, seeds=(0,), varied=(), **options):
     """The planned runs of a sweep with the small settings."""
-    return plan([str(s) for s in scenes], out, seeds, varied, **{"given": GIVEN} | options)[0]
+    return plan([str(s) for s in scenes], out, seeds, varied, **{"given": GIVEN} | options)
 
 
 def words_of(scenes, out, *more, changes=None):

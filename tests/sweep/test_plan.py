@@ -4,7 +4,7 @@ import pytest
 from support.sweeps import jobs_of
 
 from pp_cl.errors import UserError
-from pp_cl.sweep.plan import Job, plan, read_seeds, read_varied
+from pp_cl.sweep.plan import Job, read_seeds, read_varied
 
 
 @pytest.fixture
@@ -62,7 +62,7 @@ def test_nothing_varied_needs_no_folder_of_the_setting(tmp_path, scenes):
 
 
 def test_a_job_survives_its_way_to_a_process(tmp_path, scenes):
-    varied = [("raster.tau", ["0.5"])]
+    varied = [("raster.early_stop", ["0.5"])]
     (job,) = jobs_of(scenes[:1], tmp_path, [3], varied, metrics=("psnr",), preset_name="small")
     line = job.to_json()
     assert "\n" not in line and Job.from_json(line) == job
@@ -73,12 +73,6 @@ def test_iterations_are_those_of_preset_and_settings(tmp_path, scenes):
     varied = [("train.iterations", ["7", "9"])]
     jobs = jobs_of(scenes[:1], tmp_path, varied=varied, given=[])
     assert [job.iterations for job in jobs] == [7, 9]
-
-
-def test_an_old_key_is_varied_under_its_new_name_and_noted(tmp_path, scenes):
-    assert read_varied(["train.average=true,false"]) == [("train.ema", ["true", "false"])]
-    _, notes = plan(["demo"], tmp_path, [0], [], given=[("train.average", "true", "--set")])
-    assert notes == ["--set: train.average is called train.ema now"]
 
 
 @pytest.mark.parametrize("text, seeds", [("0", [0]), ("3,1,3, 2", [1, 2, 3]), ("1e2", [100])])
@@ -105,7 +99,7 @@ def test_what_is_no_seed(text):
         (["network.widths=16,16"], ["network.widths", "3 values"]),
         (["network.widths=16,16,16/"], ["network.widths", "3 values"]),
         (["points.count=1", "points.count=2"], ["varied already"]),
-        (["train.ema=true", "train.average=false"], ["train.ema", "varied already"]),
+        (["train.ema=true", "train.ema=false"], ["train.ema", "varied already"]),
         (["train.seed=1,2"], ["train.seed", "--seeds"]),
         (["scene.path=a,b"], ["scene.path", "arguments"]),
         (["train.sh_rate=nan"], ["train.sh_rate"]),

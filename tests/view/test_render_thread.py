@@ -50,7 +50,7 @@ class Listener:
 
 
 def request(number, show="colour", kind="frame"):
-    return ViewRequest(number, kind, show, None, False, 0.0, 0.0, 1.0, 0.0)
+    return ViewRequest(number, kind, show, None, False, 0.0, 1.0, 0.0)
 
 
 @pytest.fixture
