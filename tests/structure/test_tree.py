@@ -1,75 +1,15 @@
-"""The rules of the tree: who has found one file of a stage has found all three."""
+"""Who has found one file of a stage has found all three."""
 
-import configparser
 from pathlib import Path
 
-import pytest
-from support.rules import MOST_FILE_LINES, identifiers, retired_words
-
 ROOT = Path(__file__).parents[2]
-KERNEL_FILES = sorted((ROOT / "cl").rglob("*.cl"))
-SOURCES = sorted([*(ROOT / "pp_cl").rglob("*.py"), *KERNEL_FILES, *(ROOT / "cl").rglob("*.h")])
-GLOSSARY = ROOT / "docs" / "glossary.md"
 
 
 def test_every_kernel_file_has_its_module_and_its_test():
-    missing = []
-    for path in KERNEL_FILES:
+    files, missing = sorted((ROOT / "cl").rglob("*.cl")), []
+    for path in files:
         stem = path.relative_to(ROOT / "cl").with_suffix("")
         for other in (f"pp_cl/{stem}.py", f"tests/{stem.parent}/test_{stem.name}.py"):
             missing += [] if (ROOT / other).is_file() else [f"{stem}.cl: no {other}"]
-    assert KERNEL_FILES
+    assert files
     assert not missing
-
-
-def test_setup_cfg_lists_every_package():
-    setup = configparser.ConfigParser()
-    setup.read(ROOT / "setup.cfg")
-    folders = {path.parent for path in (ROOT / "pp_cl").rglob("*.py")}
-    packages = {path.relative_to(ROOT).as_posix().replace("/", ".") for path in folders}
-    assert set(setup["options"]["packages"].split()) == packages | {"pp_cl.cl"}
-
-
-def test_files_are_short():
-    lengths = {p.relative_to(ROOT): len(p.read_text("utf-8").splitlines()) for p in SOURCES}
-    assert not {str(p): n for p, n in lengths.items() if n >= MOST_FILE_LINES}
-
-
-PLANTED = """
-# Glossary
-
-| word | meaning |
-|---|---|
-| slot | memory |
-
-## Retired words
-
-| word | use instead |
-|---|---|
-| `wobble` | pixel jitter |
-| early out | early stop |
-
-## More
-
-| a | b |
-|---|---|
-| c | d |
-"""
-
-
-def test_retired_words_are_found():
-    words = retired_words(PLANTED)
-    assert words == {"wobble": "pixel jitter", "early_out": "early stop"}
-    python = '"""wobble"""\nx = "wobble"  # early_out\ndef wobble(): wobbles = 1 // early_out'
-    assert identifiers(python, ".py") & words.keys() == {"wobble", "early_out"}
-    assert not identifiers('"""wobble"""  # early_out', ".py") & words.keys()
-    assert identifiers("// early_out\n#define wobble 1", ".cl") & words.keys() == {"wobble"}
-
-
-def test_no_identifier_is_a_retired_word():
-    if not GLOSSARY.is_file():
-        pytest.skip("no docs/glossary.md")
-    words = retired_words(GLOSSARY.read_text("utf-8"))
-    found = {p: identifiers(p.read_text("utf-8"), p.suffix) & words.keys() for p in SOURCES}
-    assert words
-    assert not {str(p.relative_to(ROOT)): [(w, words[w]) for w in f] for p, f in found.items() if f}

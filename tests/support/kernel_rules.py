@@ -2,10 +2,6 @@
 
 import re
 
-from pp_cl.device.signature import parse_signatures
-
-MOST_PARAMETERS, MOST_COLUMNS = 12, 100
-
 
 def helpers_without_static(source):
     """Every function that is no kernel is static, those in macros included: a plain inline one has
@@ -17,20 +13,8 @@ def helpers_without_static(source):
     return [f"{name} is not static" for words, name in heads if not linked & set(words.split())]
 
 
-def long_parameter_lists(source):
-    """At most 12 parameters."""
-    counts = {name: len(p) for name, p in parse_signatures(source, "").items()}
-    return [f"{name}: {n} parameters" for name, n in counts.items() if n > MOST_PARAMETERS]
-
-
 def silent_kernels(source):
     """The lines above a kernel say who a work-item is, what it reads and what it writes."""
     heads = re.finditer(r"^kernel\b[^(]*(?:\(\(.*?\)\))?[^(]*?(\w+)\(", source, re.M)
     above = {m[1]: source[: m.start()].splitlines()[-1:] for m in heads}
     return [f"{n}: no comment above it" for n, x in above.items() if not x or x[0][:2] != "//"]
-
-
-def long_lines(source):
-    """At most 100 columns."""
-    lines = enumerate(source.splitlines(), 1)
-    return [f"line {i}: {len(x)} columns" for i, x in lines if len(x) > MOST_COLUMNS]
