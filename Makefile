@@ -27,7 +27,7 @@ help: ## print this list
 
 setup: $(READY) ## make .venv with pp-cl in it, and see to a working OpenCL device
 
-$(READY): setup.cfg pyproject.toml tools/setup_venv.sh tools/setup_opencl.py
+$(READY): setup.cfg setup.py pyproject.toml tools/setup_venv.sh tools/setup_opencl.py
 	@tools/setup_venv.sh $(PYTHON)
 	@$(BIN)/python tools/setup_opencl.py
 	@touch $@
@@ -59,9 +59,10 @@ bench: $(READY) ## time and error of the network and of its layers; ARGS="--size
 	$(BIN)/pp-cl bench unet $(ARGS)
 	$(BIN)/pp-cl bench conv $(ARGS)
 
-lint: $(READY) ## check the Python files (ruff) and the format of the kernels (clang-format)
+lint: $(READY) ## check the Python files (ruff, import-linter) and the format of the kernels (clang-format)
 	@$(BIN)/ruff check
 	@$(BIN)/ruff format --check
+	@$(BIN)/lint-imports --no-logo --no-cache
 	@$(BIN)/clang-format --dry-run --Werror $(KERNELS)
 
 format: $(READY) ## format the Python files and the kernels

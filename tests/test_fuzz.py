@@ -153,7 +153,7 @@ def picture(draw, folder):
     file = folder / f"picture.{kind.lower()}"
     if kind == "EXR":
         names = one(draw, "RGBA", "RGB", "Y", "YA", "Z", ("left.R", "left.G", "left.B", "A"))
-        values = noise[..., 0] / 255 * one(draw, 1, 1, 1e4, -1, math.nan, math.inf)
+        values = (noise[..., 0] + 1) / 256 * one(draw, 1, 1, 1e4, -1, math.nan, math.inf)
         values = values.astype(one(draw, np.float32, np.float16))
         write_exr(file, dict.fromkeys(names, values))
         return file, None

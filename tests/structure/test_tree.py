@@ -1,4 +1,4 @@
-"""The rules of the tree."""
+"""Kernel files have the module that launches them; packages that are imported are declared."""
 
 import ast
 import configparser
@@ -7,13 +7,8 @@ import sys
 from importlib.metadata import packages_distributions
 from pathlib import Path
 
-import pytest
-from support.rules import identifiers, retired_words
-
 ROOT = Path(__file__).parents[2]
 KERNEL_FILES = sorted((ROOT / "cl").rglob("*.cl"))
-SOURCES = sorted([*(ROOT / "pp_cl").rglob("*.py"), *KERNEL_FILES, *(ROOT / "cl").rglob("*.h")])
-GLOSSARY = ROOT / "docs" / "glossary.md"
 
 
 def test_every_kernel_file_is_launched_by_its_own_wing():
@@ -26,14 +21,6 @@ def test_every_kernel_file_is_launched_by_its_own_wing():
             orphans.append(name)
     assert KERNEL_FILES
     assert not orphans
-
-
-def test_setup_cfg_lists_every_package():
-    setup = configparser.ConfigParser()
-    setup.read(ROOT / "setup.cfg")
-    folders = {path.parent for path in (ROOT / "pp_cl").rglob("*.py")}
-    packages = {path.relative_to(ROOT).as_posix().replace("/", ".") for path in folders}
-    assert set(setup["options"]["packages"].split()) == packages | {"pp_cl.cl"}
 
 
 def test_setup_cfg_declares_every_package_that_is_imported():
@@ -52,43 +39,3 @@ def test_setup_cfg_declares_every_package_that_is_imported():
     packages = {name: found.get(name, [name])[0].lower().replace("_", "-") for name in names}
     assert "numpy" in names
     assert set(packages.values()) <= {name.lower() for name in declared}
-
-
-PLANTED = """
-# Glossary
-
-| word | meaning |
-|---|---|
-| slot | memory |
-
-## Retired words
-
-| word | use instead |
-|---|---|
-| `wobble` | pixel jitter |
-| early out | early stop |
-
-## More
-
-| a | b |
-|---|---|
-| c | d |
-"""
-
-
-def test_retired_words_are_found():
-    words = retired_words(PLANTED)
-    assert words == {"wobble": "pixel jitter", "early_out": "early stop"}
-    python = '"""wobble"""\nx = "wobble"  # early_out\ndef wobble(): wobbles = 1 // early_out'
-    assert identifiers(python, ".py") & words.keys() == {"wobble", "early_out"}
-    assert not identifiers('"""wobble"""  # early_out', ".py") & words.keys()
-    assert identifiers("// early_out\n#define wobble 1", ".cl") & words.keys() == {"wobble"}
-
-
-def test_no_identifier_is_a_retired_word():
-    if not GLOSSARY.is_file():
-        pytest.skip("no docs/glossary.md")
-    words = retired_words(GLOSSARY.read_text("utf-8"))
-    found = {p: identifiers(p.read_text("utf-8"), p.suffix) & words.keys() for p in SOURCES}
-    assert words
-    assert not {str(p.relative_to(ROOT)): [(w, words[w]) for w in f] for p, f in found.items() if f}

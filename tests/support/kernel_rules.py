@@ -2,8 +2,6 @@
 
 import re
 
-MOST_COLUMNS = 100
-
 
 def helpers_without_static(source):
     """Every function that is no kernel is static, those in macros included: a plain inline one has
@@ -20,9 +18,3 @@ def silent_kernels(source):
     heads = re.finditer(r"^kernel\b[^(]*(?:\(\(.*?\)\))?[^(]*?(\w+)\(", source, re.M)
     above = {m[1]: source[: m.start()].splitlines()[-1:] for m in heads}
     return [f"{n}: no comment above it" for n, x in above.items() if not x or x[0][:2] != "//"]
-
-
-def long_lines(source):
-    """At most 100 columns."""
-    lines = enumerate(source.splitlines(), 1)
-    return [f"line {i}: {len(x)} columns" for i, x in lines if len(x) > MOST_COLUMNS]
