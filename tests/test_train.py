@@ -19,7 +19,6 @@ from support.runs import arguments, train_and_interrupt
 
 from pp_cl import load
 from pp_cl.cli import main
-from pp_cl.config import FORMAT
 from pp_cl.files.checkpoint import load_checkpoint
 from pp_cl.train import Trainer
 
@@ -103,24 +102,6 @@ def test_a_network_of_other_blocks_than_the_checkpoints_is_refused(
     assert main(["eval", str(run)]) == 2
     told = capsys.readouterr().err
     assert "checkpoint.npz: " in told and "config.json" in told and told.count("\n") == 1
-
-
-def test_a_run_from_before_there_were_blocks_has_double_ones(scene, tmp_path, capsys):
-    whole, run = tmp_path / "whole", tmp_path / "run"
-    assert main(arguments(scene, whole, network__blocks="double")) == 0
-    shutil.copytree(whole, run)
-    stored = json.loads((run / "config.json").read_text())
-    assert stored["network"].pop("blocks") == "double" and stored.pop("format") == FORMAT
-    (run / "config.json").write_text(json.dumps(stored))
-    capsys.readouterr()
-    for folder in (whole, run):
-        assert main(["eval", str(folder)]) == 0
-    told = [line for line in capsys.readouterr().err.splitlines() if line.startswith("pp-cl: ")]
-    assert len(told) == 1 and "without a format number" in told[0]
-    assert told[0].startswith(f"pp-cl: {run / 'config.json'}: ")
-    assert told[0].endswith("what it lacks is taken as network.blocks = double")
-    one, other = (json.loads((f / "eval/metrics.json").read_text()) for f in (whole, run))
-    assert one["mean"] == other["mean"]
 
 
 def test_a_degree_of_rate_0_is_left_alone(scene, tmp_path, monkeypatch):
@@ -222,57 +203,6 @@ def test_a_full_disk_while_logging_is_one_line_and_the_run_goes_on(
     assert resumed.read_bytes() == whole.read_bytes()
     steps, expected = ([row["step"] for row in rows(out)] for out in (tmp_path / "run", finished))
     assert steps == expected
-
-
-def test_a_training_that_keeps_its_hits_ends_with_the_same_bytes(scene, tmp_path, monkeypatch):
-    """Of whole images without pixel jitter; also where there is room for some views only, and over
-    prunings.
-    """
-    whole = {"train__crop": 0, "train__pixel_jitter": "false", "train__dropout": 0}
-    whole |= {"train__iterations": 40, "train__prune_every": 15}
-    results, caches = [], []
-    for budget in (0, 300_000, 10**9):
-        monkeypatch.setattr("pp_cl.run.Room.spare", budget)
-        monkeypatch.setattr("pp_cl.train.Trainer.finish", _noting(caches, Trainer.finish))
-        out = tmp_path / str(budget)
-        assert main(arguments(scene, out, **whole)) == 0
-        results.append((out / "checkpoint.npz").read_bytes())
-        monkeypatch.undo()
-    assert results[0] == results[1] == results[2]
-    (none, _), (some, some_bytes), (all_views, _) = caches
-    assert none == 0 < some < all_views and some_bytes <= 300_000
-
-
-def _noting(caches, finish):
-    """Trainer.finish that first notes (views kept, bytes)."""
-
-    def noting(self):
-        caches.append((len(self.renderer.cache), self.renderer.cache.bytes))
-        finish(self)
-
-    return noting
-
-
-@pytest.mark.parametrize(
-    "changes, words, cached",
-    [
-        ({}, (), True),
-        ({"train__crop": 24}, (), False),
-        ({"train__dropout": 0.1}, (), False),
-        ({"train__pixel_jitter": "true"}, (), False),
-        ({"train__pixel_jitter": "true"}, ("--downscale", "1"), True),
-    ],
-)
-def test_hits_are_cached_only_of_views_that_repeat(
-    scene, tmp_path, monkeypatch, changes, words, cached
-):
-    whole = {"train__crop": 0, "train__pixel_jitter": "false", "train__dropout": 0} | changes
-    caches = []
-    monkeypatch.setattr("pp_cl.run.Room.spare", 10**9)
-    monkeypatch.setattr("pp_cl.train.Trainer.finish", _noting(caches, Trainer.finish))
-    settings = arguments(scene, tmp_path / "run", train__iterations=6, **whole)
-    assert main([*settings, *words]) == 0
-    assert (caches[0][0] > 0) == cached
 
 
 def test_a_capped_grid_is_told(scene, tmp_path, capsys, monkeypatch):
