@@ -11,6 +11,7 @@ from typing import NamedTuple
 import numpy as np
 from pyopencl.array import Array
 
+from pp_cl.bench.spheres import spheres_backward
 from pp_cl.device.device import Device
 from pp_cl.model import Model
 from pp_cl.network.unet import UNet
@@ -231,7 +232,7 @@ class PulsarScene(BenchScene):
 
         footprint = Footprint("sphere")
         self.projection, self.pairs = Projection(dev, footprint), PairBuilder(dev, footprint)
-        self.blends = {name: Blend(dev, footprint, BLENDS[name](dev)) for name in BLENDS}
+        self.blends = {name: Blend(dev, BLENDS[name](dev)) for name in BLENDS}
         self.camera_buffer = dev.upload(self.camera.packed(self.depth_range))
         self.point_radius = dev.upload([self.radius], np.float32)
         self.positions, self.point_opacity = dev.upload(positions), dev.upload(self.opacity)
@@ -269,7 +270,17 @@ class PulsarScene(BenchScene):
             )
             blend.backward(gradient)
         with self.dev.stage("spheres"):
-            blend.backward_spheres(gradient, result.points, self.point_opacity, self.gamma)
+            spheres_backward(
+                self.dev,
+                result.points,
+                result.pairs,
+                result.weights,
+                opacity=self.point_opacity,
+                gamma=self.gamma,
+                point_features=result.point_features,
+                grad_features=self.grad,
+                rest_or_gain=gradient.rest_or_gain,
+            )
 
     def dropped_weights(self, case: Case, result: RasterResult) -> np.ndarray:
         """As BenchScene."""
