@@ -11,9 +11,9 @@ SEED ?= 0
 # Tests wait for builds of kernels, which use one core.
 ON_ALL_CORES := --numprocesses auto --dist worksteal
 
-# The tests that the rule of three names for the kernel files, and those with the marker `kernels`.
-OCLGRIND = $(shell find cl -name "*.cl" | sed "s|^cl/\(.*\)/\(.*\).cl|tests/\1/test_\2.py|"; \
-	grep -rl "pytest.mark.kernels" --include="test_*.py" tests)
+# The tests that are named like a kernel file, and those with the marker `kernels`.
+OCLGRIND = $(wildcard $(shell find cl -name "*.cl" | sed "s|^cl/\(.*\)/\(.*\).cl|tests/\1/test_\2.py|")) \
+	$(shell grep -rl "pytest.mark.kernels" --include="test_*.py" tests)
 # Its check for uninitialised reads knows no optimised code and no forced inlining; it takes its options from here, where
 # pyopencl's cache does not see them.
 ON_OCLGRIND := OCL_ICD_VENDORS=/usr/lib/oclgrind/liboclgrind-rt-icd.so OCLGRIND_DATA_RACES=1 OCLGRIND_UNINITIALIZED=1 \

@@ -4,7 +4,7 @@ difference from the dense one.
     python tools/sparse_tiles.py RUN --downscale 1 --widths 128,256,512 --views 4 --json FILE
 
 Each view's features go through the same network computing all tiles and only the planned ones
-(pp_cl/network/sparse_tiles.py), in turn. The gradient of the image is the training loss's against
+(pp_cl/network/tile_plan.py), in turn. The gradient of the image is the training loss's against
 the photograph. Without --widths it is the run's own network.
 """
 

@@ -4,7 +4,7 @@
 // A work-item keeps BLOCKS x 16 output channels of PIXELS neighbouring pixels of a row in
 // registers. For each input channel it loads K weight vectors per block and PIXELS + K - 1
 // scalars, and does K * BLOCKS * PIXELS vector multiply-adds with them. PIXELS and BLOCKS are
-// chosen so that accumulators and weights fit a device's registers (pp_cl/layers/blocking.py).
+// chosen so that accumulators and weights fit a device's registers (Blocking in pp_cl/layers/conv.py).
 //
 // vec_type_hint: the vectors are written out; Intel's compiler would merge work-items into wider
 // ones.

@@ -1,12 +1,12 @@
-// Winograd's minimal filtering F(4 x 4, 3 x 3) on CPUs (Lavin and Gray 2016, arXiv 1509.09308): tiles of
-// 16 channels a vector, transformed in a slice of scratch memory for each compute unit.
+// Winograd's minimal filtering F(4 x 4, 3 x 3) on CPUs (Lavin and Gray 2016, arXiv 1509.09308):
+// tiles of 16 channels a vector, transformed in a slice of scratch memory for each compute unit.
 //
 // Along one line, M = 4 outputs y of a kernel w over S = 6 samples d are a product of polynomials,
 // evaluated at S points: y = A^T [(G w) o (B^T d)]. The functions below apply one matrix to S or
 // fewer values `step` apart, in place: along a tile's columns, then its rows.
 //
-// Points: 0, -P, P, -Q, Q, infinity, where P = 3/4 and Q = 3/2 halve the float32 error of the usual 1
-// and 2 and are exact in binary (cf. Barabasz et al. 2020, arXiv 1803.10986).
+// Points: 0, -P, P, -Q, Q, infinity, where P = 3/4 and Q = 3/2 halve the float32 error of the usual
+// 1 and 2 and are exact in binary (cf. Barabasz et al. 2020, arXiv 1803.10986).
 #ifndef PP_WINOGRAD_H
 #define PP_WINOGRAD_H
 #include "common.h"

@@ -75,14 +75,12 @@ class Variant:
     channels and 800 x 800 pixels}}; docs/convolutions.md has hard inputs. devices: classes of
     devices that it is offered to; the first in VARIANTS of those that a GPU is offered is shipped
     there. shipped_from: {direction: on CPUs, shipped for images of at least that many pixels}.
-    preferred: the device that prefers it, and the measurement that says so.
     """
 
     module: ModuleType
     errors: dict[int, dict[Direction, float]]
     devices: tuple[str, ...]
     shipped_from: dict[Direction, int]
-    preferred: str
 
     def can_run(self, k: int, *channels: int) -> bool:
         """Whether it takes a K x K kernel and these numbers of channels, of each source and of the
@@ -97,31 +95,21 @@ _DIRECT_ERRORS = {
     3: {FORWARD: 9e-7, INPUT: 1.3e-6, WEIGHTS: 3.5e-7},
     1: {FORWARD: 3.5e-7, INPUT: 4.5e-7, WEIGHTS: 4e-7},
 }
-# Below the least numbers of pixels too few tiles share the cost of transforming the weights.
-# Channels matter less: from 16 on, all of them gain. Winograd is not offered to GPUs: a work-item
-# holds a group of one lane, and GPU compilers spill 15 KB of its registers.
 VARIANTS = {
-    "local": Variant(
-        conv_local,
-        _DIRECT_ERRORS,
-        ("GPU",),
-        {},
-        "GPU: by what compilers say of its registers and instructions, not timed.",
-    ),
+    # by what GPU compilers say of its registers and instructions, not timed
+    "local": Variant(conv_local, _DIRECT_ERRORS, ("GPU",), {}),
     "direct": Variant(
-        conv_direct,
-        _DIRECT_ERRORS,
-        ("CPU", "GPU"),
-        {FORWARD: 0, INPUT: 0, WEIGHTS: 0},
-        "CPU: images of less than 900 pixels and channels beside the multiples of 16, 2 cores with"
-        " AVX-512.",
+        conv_direct, _DIRECT_ERRORS, ("CPU", "GPU"), {FORWARD: 0, INPUT: 0, WEIGHTS: 0}
     ),
+    # 2.7 times as fast as direct in the paper's network at 256x256, on 2 cores with AVX-512. In
+    # smaller images too few tiles share the cost of transforming the weights; channels matter less,
+    # from 16 on all gain. On GPUs a group would be one lane, and their compilers spill 15 KB of its
+    # registers.
     "winograd": Variant(
         conv_winograd,
         {3: {FORWARD: 2.2e-6, INPUT: 2.6e-6, WEIGHTS: 8.5e-7}},
         ("CPU",),
         {FORWARD: 900, INPUT: 900, WEIGHTS: 64},
-        "CPU: 2.7 times as fast as direct in the paper's network at 256x256, 2 cores with AVX-512.",
     ),
 }
 

@@ -180,19 +180,19 @@ def gradient_radius(layers: list[Layer]) -> dict[str, int]:
     """{name: pixels}: how far from its place a change of the image's gradient changes the gradient
     of a layer's output.
     """
-    radius = dict.fromkeys([*(layer.name for layer in layers), "x"], 0)
-    for layer in reversed(layers):
-        for name in layer.inputs:
-            radius[name] = max(radius[name], radius[layer.name] + backward_radius(layer))
-    return radius
+    return _radius_from_image(layers, backward_radius)
 
 
 def needed_radius(layers: list[Layer]) -> dict[str, int]:
     """{name: pixels}: how far from a pixel of the image it depends on a layer's output."""
+    return _radius_from_image(layers, forward_radius)
+
+
+def _radius_from_image(layers, radius_of):
     radius = dict.fromkeys([*(layer.name for layer in layers), "x"], 0)
     for layer in reversed(layers):
         for name in layer.inputs:
-            radius[name] = max(radius[name], radius[layer.name] + forward_radius(layer))
+            radius[name] = max(radius[name], radius[layer.name] + radius_of(layer))
     return radius
 
 

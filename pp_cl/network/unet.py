@@ -118,7 +118,7 @@ class UNet:
         tiles but the `active` ones, (rows, columns) bool; None = all, as few would be saved.
 
         Where the network sees only this background, one tile is computed in place of many equal
-        ones (sparse_tiles.py). The result is the same. differs: the tiles whose gradient of the
+        ones (tile_plan.py). The result is the same. differs: the tiles whose gradient of the
         image may not be that of others which see only background; None: all. Valid until the next
         plan.
         """

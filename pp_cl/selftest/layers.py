@@ -17,30 +17,43 @@ from pp_cl.layers.resample import (
     upsample2_backward,
     upsample2_forward,
 )
-from pp_cl.layers.tiles import copy_list, tiles_copy, tiles_find, tiles_hit
+from pp_cl.layers.tiles import (
+    SIDE,
+    copy_list,
+    grid_shape,
+    tiles_copy,
+    tiles_find,
+    tiles_hit,
+)
+from pp_cl.network.tile_plan import halve
 from pp_cl.reference import lpips, network
 from pp_cl.selftest.case import EPS, Case, Check, each, exact, relative
-from pp_cl.selftest.convolutions import Layer, within
-from pp_cl.selftest.hard_layers import hard_layers
+from pp_cl.selftest.convolutions import Layer, hard_layers, within
 
-# (height, width, channels of each part of the input, channels out, side of the kernel)
+# (size, channels of each part of the input, channels out, side of the kernel): tails of tiles, of
+# rows and of work-groups; groups of one, two and four blocks of 16 channels; parts of the gradient
+# of the weights by tiles and by channels
 SHAPES = (
-    (1, 1, (16,), 16, 3),
-    (1, 31, (16,), 32, 3),
-    (31, 33, (16, 32), 48, 3),
-    (257, 3, (32,), 16, 3),
-    (8, 8, (512,), 32, 3),
+    ((1, 1), (16,), 16, 3),
+    ((1, 31), (16,), 32, 3),
+    ((31, 33), (16, 32), 48, 3),
+    ((257, 3), (32,), 16, 3),
+    ((8, 8), (512,), 32, 3),
+    ((33, 97), (16,), 32, 3),
+    ((9, 7), (144,), 48, 3),
+    ((5, 6), (80,), 144, 3),
 )
-DIRECT_SHAPES = (*SHAPES, (5, 31, (3,), 20, 3), (31, 33, (16, 32), 48, 1), (1, 1, (3,), 3, 1))
+DIRECT_SHAPES = (
+    *SHAPES,
+    ((5, 31), (3,), 20, 3),
+    ((5, 21), (36,), 64, 3),
+    ((31, 33), (16, 32), 48, 1),
+    ((1, 1), (3,), 3, 1),
+)
 # of the largest value: sums of up to 4608 products, each rounded by half EPS, grow as their root,
 # 4e-6, of which the largest of the values seen has the more the longer the sum; those of F(4x4)
 # pass through transforms that enlarge it. In a gradient of weights a sum is as long as the image.
-EXACT, OF_F4 = 3e-6, 8e-6
-BOUNDS = {
-    "local": EXACT,
-    "direct": EXACT,
-    "winograd": OF_F4,
-}
+BOUNDS = {"local": 3e-6, "direct": 3e-6, "winograd": 8e-6}
 WEIGHTS_BOUND = 5e-6
 
 PLANES = ((1, 1, 16), (1, 5, 3), (31, 33, 17), (3, 257, 32))  # (H, W, C)
@@ -54,55 +67,44 @@ def _normal(rng, *shape):
 
 @cache
 def _layers():
-    """[Layer] of SHAPES and DIRECT_SHAPES, computed once for all variants."""
+    """[Layer] of DIRECT_SHAPES, the first of which are SHAPES, computed once for all variants."""
     rng = np.random.default_rng(3)
-    layers = []
-    for height, width, parts, co, k in DIRECT_SHAPES:
-        bound = 1 / np.sqrt(sum(parts) * k * k)  # PyTorch's initial size
-        weight = rng.uniform(-bound, bound, (co, sum(parts), k, k)).astype(np.float32)
-        bias = rng.uniform(-bound, bound, co).astype(np.float32)
-        inputs = [np.maximum(_normal(rng, height, width, c), 0) for c in parts]
-        layers.append(Layer(inputs, weight, bias, _normal(rng, height, width, co), relu=True))
-    return layers
+    return [Layer.random(rng, *shape) for shape in DIRECT_SHAPES]
 
 
-@cache
-def _hard_layers():
-    """{name: Layer}, computed once for all variants."""
-    layers = hard_layers(np.random.default_rng(7))
-    return {name: Layer([x], *others) for name, (x, *others) in layers.items()}
+_hard_layers = cache(hard_layers)
 
 
 def _convolution(variant: str, dev: Device, rng: np.random.Generator) -> Iterator[Check]:
     """All directions; awkward sizes, two sources, a masked gradient."""
-    blocking = SHIPPED[device_class(dev)]
+    module, bound = VARIANTS[variant].module, BOUNDS[variant]
     layers = _layers() if 1 in VARIANTS[variant].errors else _layers()[: len(SHAPES)]
     for layer in layers:
-        forward, weights, bias, *inputs = layer.results(dev, variant, blocking)
-        for result in (forward, *inputs):
-            yield relative(result.actual, result.expected, BOUNDS[variant])
-        for result in (weights, bias):
-            bound = max(WEIGHTS_BOUND, BOUNDS.get(variant, 0))
-            yield relative(result.actual, result.expected, bound)
+        results = layer.computed(dev, module, SHIPPED[device_class(dev)])
+        for actual, expected in zip(results, layer.expected, strict=True):
+            of_weights = expected.ndim != 3
+            yield relative(actual, expected, max(bound, WEIGHTS_BOUND) if of_weights else bound)
 
 
 def _hard_convolution(variant: str, dev: Device, rng: np.random.Generator) -> Iterator[Check]:
     """Large means, weights over six decades, values of 6e4 and 1e-7, 512 channels, zeros."""
     for layer in _hard_layers().values():
-        for result in layer.results(dev, variant, SHIPPED[device_class(dev)]):
-            yield within(result)
+        results = layer.computed(dev, VARIANTS[variant].module, SHIPPED[device_class(dev)])
+        yield from map(within, results, layer.expected)
 
 
 def _pool(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
-    """Means of 2x2 pixels; the gradient is added, and masked by a ReLU."""
+    """Means of 2x2 pixels; the gradient is added, and masked where a ReLU was pooled."""
     for h, w, c in PLANES:
         x, other = np.maximum(_normal(rng, 2 * h, 2 * w, c), 0), _normal(rng, 2 * h, 2 * w, c)
-        grad_out, out, grad_x = _normal(rng, h, w, c), dev.empty((h, w, c)), dev.upload(other)
-        avgpool2_forward(dev, dev.upload(x), out)
+        grad_out, out, device_x = _normal(rng, h, w, c), dev.empty((h, w, c)), dev.upload(x)
+        avgpool2_forward(dev, device_x, out)
         yield relative(out.get(), network.pool(x.astype(np.float64)), FOUR)
-        avgpool2_backward(dev, dev.upload(x), dev.upload(grad_out), grad_x)
-        expected = (other + network.pool_backward(grad_out.astype(np.float64))) * (x > 0)
-        yield relative(grad_x.get(), expected, FOUR)
+        added = other + network.pool_backward(grad_out.astype(np.float64))
+        for mask, expected in ((device_x, added * (x > 0)), (None, added)):
+            grad_x = dev.upload(other)
+            avgpool2_backward(dev, mask, dev.upload(grad_out), grad_x)
+            yield relative(grad_x.get(), expected, FOUR)
 
 
 def _max_pool(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
@@ -177,19 +179,33 @@ def _gated(dev, x, grad_out):
 
 
 def _tiles(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
-    """Which tiles of 4x4 pixels hold something, which have hits, copies of them."""
-    x = np.ones((8, 256, 20), np.float32)
-    chosen = rng.random((2, 64)) < 0.3
-    for row, column in np.argwhere(chosen):
-        y, z = 4 * row + rng.integers(4), 4 * column + rng.integers(4)
-        x[y, z, rng.integers(20)] = rng.choice([0.0, np.nan, np.inf, 1 + EPS])
-    array, source = dev.upload(x), np.full((2, 64), np.flatnonzero(~chosen)[0])
-    yield exact(tiles_find(dev, array, 1.0).get(), chosen)
-    hits = np.concatenate([[0], np.cumsum((x != 1).any(2))])
-    yield exact(tiles_hit(dev, dev.upload(hits, np.uint32), (8, 256)).get(), chosen)
-    copies = copy_list(source, chosen)
-    tiles_copy(dev, array, dev.upload(copies), len(copies))
-    yield exact(array.get(), np.ones_like(x))
+    """Which tiles hold something, which have hits, copies of them; tiles cut off by the border."""
+    for h, w, c in ((1, 1, 1), (3, 5, 16), (31, 33, 3), (4, 257, 20), (257, 8, 16)):
+        odd = rng.choice([0.0, np.nan, np.inf, 1 + EPS], (h, w, c))
+        x = np.where(rng.random((h, w, c)) < 0.02, odd, 1).astype(np.float32)
+        yield exact(tiles_find(dev, dev.upload(x), 1.0).get(), halve((x != 1).any(2), 2))
+        hits = rng.integers(1, 5, (h, w)) * (rng.random((h, w)) < 0.02)
+        offsets = dev.upload(np.concatenate([[0], np.cumsum(hits)]), np.uint32)
+        yield exact(tiles_hit(dev, offsets, (h, w)).get(), halve(hits > 0, 2))
+        yield _copied_tiles(dev, rng, _normal(rng, h, w, c))
+
+
+def _copied_tiles(dev, rng, x):
+    """Half of the tiles become copies of the first one of their shape."""
+    rows, columns = grid_shape(*x.shape[:2])
+    y, z = np.mgrid[: x.shape[0], : x.shape[1]]
+    cut = (np.arange(rows) * SIDE + SIDE > len(x))[:, None] * 2
+    cut = cut + (np.arange(columns) * SIDE + SIDE > x.shape[1])
+    _, first, kind = np.unique(cut, return_index=True, return_inverse=True)
+    source = first[kind.reshape(cut.shape)]
+    number = np.arange(rows * columns).reshape(cut.shape)
+    chosen = (rng.random(cut.shape) < 0.5) & (source != number)
+    copies, array = copy_list(source, chosen), dev.upload(x)
+    behind = np.full((3, 2), 2**30, np.int32)  # not to be read
+    tiles_copy(dev, array, dev.upload(np.concatenate([copies, behind])), len(copies))
+    tile = np.where(chosen, source, number)[y // SIDE, z // SIDE]
+    expected = x[tile // columns * SIDE + y % SIDE, tile % columns * SIDE + z % SIDE]
+    return exact(array.get(), expected)
 
 
 # Those for GPUs run on CPUs as well, slowly; those for CPUs might hang a GPU.

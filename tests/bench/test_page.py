@@ -93,7 +93,7 @@ def test_layers_are_added_up_where_a_variant_has_them_all():
     rows = [
         network_row("direct", "forward", 2.0, layer="a", rel_l2=1e-7),
         network_row("direct", "forward", 3.0, layer="b", rel_l2=4e-7),
-        network_row("winograd2", "forward", 1.0, layer="a"),
+        network_row("winograd", "forward", 1.0, layer="a"),
         network_row("direct", "input", 5.0, layer="a", rel_l2=0.0),
     ]
     assert layer_points(rows) == {

@@ -4,7 +4,6 @@ command as a user meets it.
 
 import json
 from collections import Counter
-from dataclasses import replace
 
 import pytest
 from support.tunings import tuning_of
@@ -37,9 +36,9 @@ from pp_cl.network.layers import unet_layers
 
 FORWARD, INPUT, WEIGHTS = Direction
 SMALL = ("--size", "8", "--widths", "16,16,16")
-CASE = Case("enc0.b", FORWARD, 3, (16,), 32, 32, 2, True)  # as shipped: winograd4
+CASE = Case("enc0.b", FORWARD, 3, (16,), 32, 32, 2, True)  # as shipped: winograd
 TUNED = {"winograd": (32, 8)}  # another blocking than the shipped one
-MS = {"direct": 3.0, "winograd2": 2.0, "winograd4": 1.0, "winograd4_half": 9.0}
+MS = {"direct": 2.0, "winograd": 1.0}
 
 
 @pytest.fixture(autouse=True)
@@ -178,40 +177,36 @@ def test_a_row_says_what_was_measured(dev, takes):
     }
     assert row["ms"] == pytest.approx(MS) and shipped_ms == pytest.approx(1.0)
     assert row["ms"].keys() == row["rel_l2"].keys() == set(offered(device_class(dev)))
-    assert 0 < row["rel_l2"]["winograd2"] < row["rel_l2"]["winograd4"] < 1e-5
-    weights, _ = measured(dev, replace(CASE, direction=WEIGHTS))
-    # half has no kernel of its own
-    assert weights["ms"].keys() == {"direct", "winograd2", "winograd4"}
+    assert 0 < row["rel_l2"]["direct"] < row["rel_l2"]["winograd"] < 1e-5
 
 
 @pytest.mark.usefixtures("cpu_form")
 def test_the_times_of_all_that_seem_faster_are_those_of_the_second_measurement(dev, takes):
     """The fastest may be beyond a tolerance, and the next one is then taken."""
-    first = MS | {"direct": 0.9, "winograd2": 0.5}
-    second = MS | {"direct": 0.8, "winograd2": 0.6, "winograd4": 1.1}
+    first, second = MS | {"direct": 0.5}, {"direct": 0.6, "winograd": 1.1}
     takes(lambda variant, blocking, measurement: (first, second)[measurement > 1][variant])
     row, shipped_ms = measured(dev)
     assert row["ms"] == pytest.approx(second) and shipped_ms == pytest.approx(1.1)
 
 
 @pytest.mark.usefixtures("cpu_form")
-@pytest.mark.parametrize("second, chosen", [(0.5, "winograd2"), (1.1, "winograd4")])
+@pytest.mark.parametrize("second, chosen", [(0.5, "direct"), (1.1, "winograd")])
 def test_a_faster_variant_must_be_so_twice(dev, takes, second, chosen):
     def ms(variant, blocking, measurement):
-        if variant != "winograd2":
+        if variant != "direct":
             return MS[variant]
         return second if measurement > 1 else 0.5
 
     takes(ms)
     row, shipped_ms = measured(dev)
-    assert row["ms"]["winograd2"] == pytest.approx(second) and shipped_ms == pytest.approx(1.0)
+    assert row["ms"]["direct"] == pytest.approx(second) and shipped_ms == pytest.approx(1.0)
     assert make_policy(dev, 1e-5, tuning_of(dev, [row])).choose(CASE.shape) == chosen
 
 
 @pytest.mark.usefixtures("cpu_form")
 def test_with_another_blocking_the_shipped_one_is_timed_too(dev, takes):
     def ms(variant, blocking, measurement):
-        shipped = variant == "winograd4" and blocking == make_policy(dev).blocking
+        shipped = variant == "winograd" and blocking == make_policy(dev).blocking
         return 1.5 if shipped else MS[variant]
 
     takes(ms)
@@ -236,7 +231,7 @@ def test_blocking_is_chosen_for_all_layers_together(dev, takes, second, chosen):
     fast = []
 
     def ms(variant, blocking, measurement):
-        if variant != "winograd4" or blocking.winograd != (128, 8):
+        if variant != "winograd" or blocking.winograd != (128, 8):
             return 2.0
         fast.append(measurement)
         return 1.0 if measurement == fast[0] else second
@@ -254,8 +249,8 @@ def test_the_table_names_what_is_chosen_within_the_tolerance(dev, takes, monkeyp
     takes(lambda variant, blocking, measurement: MS[variant])
     monkeypatch.setattr(tune, "network_cases", lambda *args: [CASE])
     for tolerance, end, status in (
-        ("1e-5", "winograd4", 0),
-        ("2.4e-7", "winograd2 instead of winograd4", 0),
+        ("1e-5", "winograd", 0),
+        ("2.4e-7", "direct instead of winograd", 0),
         ("1e-9", "none", 2),
     ):
         assert main(["tune", *SMALL, "--tolerance", tolerance]) == status

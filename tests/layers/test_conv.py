@@ -1,54 +1,32 @@
-"""cl/layers/conv.cl against float64."""
+"""The three convolutions beyond what the selftest compares with float64: some tiles, other
+launches and blockings, little memory, NaN, wrong shapes.
+"""
 
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pytest
-from oracle.conv import conv, conv_gradients
-from pp_cl.layers.conv_backward_weights import flip_weights
 from support.comparisons import relative_error
-from support.conv_layers import (
-    SHAPES,
-    check_backward_input,
-    check_hard_inputs,
-    check_same_bits,
-    layer,
-)
+from support.guarded import large
 from support.launches import check_parts
+from support.tiles import pixels_of, random_counts
 
-from pp_cl.layers.choice import SHIPPED
-from pp_cl.layers.conv import (
-    conv_backward_input,
-    conv_forward,
-    pack_bias,
-    pack_weights,
-    unpack_weights,
-)
-from pp_cl.reference.differences import numeric_gradient
+from pp_cl.layers import conv_direct, conv_local, conv_winograd
+from pp_cl.layers.choice import CHOICES, SHIPPED, VARIANTS
+from pp_cl.layers.conv import Direction, Work, pack_weights, unpack_weights
+from pp_cl.layers.tiles import some_tiles
+from pp_cl.network.tile_plan import grow
+from pp_cl.selftest.convolutions import Layer, within
 
-
-def run_forward(dev, x, weight, bias, relu, x2=None, blocking=SHIPPED["CPU"]):
-    out = dev.empty((*x.shape[:2], len(bias)))
-    conv_forward(
-        dev,
-        tuple(dev.upload(source) for source in (x, x2) if source is not None),
-        dev.upload(pack_weights(weight)),
-        dev.upload(pack_bias(bias)),
-        out=out,
-        relu=relu,
-        blocking=blocking,
-    )
-    return out.get()
-
-
-def run_backward_input(dev, x, weight, grad_out, masked, first=0, blocking=SHIPPED["CPU"]):
-    co, _, k, _ = weight.shape
-    flipped = dev.empty((-(-x.shape[2] // 16), k, k, co, 16))
-    flip_weights(dev, dev.upload(pack_weights(weight)), first, flipped, blocking=blocking)
-    grad_x = dev.empty(x.shape)
-    mask = dev.upload(x) if masked else None
-    conv_backward_input(dev, flipped, dev.upload(grad_out), grad_x, mask=mask, blocking=blocking)
-    return grad_x.get()
+CPU = SHIPPED["CPU"]
+DIRECT, LOCAL, WINOGRAD = (VARIANTS[name].module for name in ("direct", "local", "winograd"))
+# (module, side of the kernel)
+ALL = [
+    pytest.param(module, k, id=f"{module.__name__.rpartition('.')[2]} {k}x{k}")
+    for module, k in ((DIRECT, 1), (DIRECT, 3), (LOCAL, 1), (LOCAL, 3), (WINOGRAD, 3))
+]
+OF_3X3 = [param for param in ALL if param.values[1] == 3]
 
 
 def test_packing_is_exact(rng):
@@ -60,143 +38,200 @@ def test_packing_is_exact(rng):
     np.testing.assert_array_equal(unpack_weights(packed, 20), weight)
 
 
-@pytest.mark.parametrize("k", [1, 3])
-@pytest.mark.parametrize("shape", SHAPES)
-def test_forward(dev, rng, shape, k):
-    height, width, ci, co = shape
-    x = rng.normal(size=(height, width, ci)).astype(np.float32)
-    weight, bias = layer(rng, ci, co, k)
-    assert relative_error(run_forward(dev, x, weight, bias, False), conv(x, weight, bias)) < 3e-6
-    assert (
-        relative_error(run_forward(dev, x, weight, bias, True), conv(x, weight, bias, True)) < 3e-6
-    )
-
-
-@pytest.mark.parametrize("c1, c2", [(16, 16), (16, 48), (3, 20)])
-def test_two_sources_are_a_concatenation(dev, rng, c1, c2):
-    x = rng.normal(size=(7, 29, c1 + c2)).astype(np.float32)
-    weight, bias = layer(rng, c1 + c2, 32, 3)
-    actual = run_forward(
-        dev,
-        np.ascontiguousarray(x[..., :c1]),
-        weight,
-        bias,
-        True,
-        np.ascontiguousarray(x[..., c1:]),
-    )
-    assert relative_error(actual, conv(x, weight, bias, True)) < 3e-6
-
-
-@pytest.mark.parametrize("k", [1, 3])
-@pytest.mark.parametrize("shape", SHAPES)
-def test_backward_input(dev, rng, shape, k):
-    check_backward_input(dev, rng, shape, k, run_backward_input)
-
-
-def test_backward_input_of_the_second_source(dev, rng):
-    x2 = rng.normal(size=(9, 14, 20)).astype(np.float32)
-    weight, _ = layer(rng, 16 + 20, 48, 3)
-    grad_out = rng.normal(size=(9, 14, 48)).astype(np.float32)
-    expected = conv_gradients(np.concatenate([np.zeros((9, 14, 16)), x2], 2), weight, grad_out)[0][
-        ..., 16:
-    ]
-    assert (
-        relative_error(run_backward_input(dev, x2, weight, grad_out, False, first=16), expected)
-        < 3e-6
-    )
-
-
-def test_backward_input_by_finite_differences(dev, rng):
-    x = rng.normal(size=(3, 4, 3))
-    weight, bias = layer(rng, 3, 5, 3)
-    grad_out = rng.normal(size=(3, 4, 5)).astype(np.float32)
-    numeric = numeric_gradient(lambda v: (conv(v, weight, bias) * grad_out).sum(), x, 1e-4)
-    actual = run_backward_input(dev, x.astype(np.float32), weight, grad_out, False)
-    assert relative_error(actual.ravel(), numeric) < 3e-6
-
-
-def test_hard_inputs(dev, rng):
-    check_hard_inputs(dev, rng, run_forward, run_backward_input)
-
-
-def test_work_groups_of_a_gpu(dev, rng):
-    """The pixels and work-groups that other devices get: their tails reach beyond the image and the
-    channels.
+@pytest.mark.parametrize("module, k", ALL)
+@pytest.mark.parametrize("size", [(3, 2), (11, 14), large((31, 33)), large((6, 70))])
+def test_only_the_chosen_tiles(dev, rng, module, k, size):
+    """The bits are those with all tiles; the other tiles of a result keep their NaN. The gradient
+    of a tile that does not count may hold NaN, and so may inputs that no counted gradient sees.
     """
-    gpu = SHIPPED["GPU"]
-    for height, width, ci, co in ((5, 37, 16, 48), (3, 2, 3, 20)):
-        x, grad_out = (rng.normal(size=(height, width, c)).astype(np.float32) for c in (ci, co))
-        weight, bias = layer(rng, ci, co, 3)
-        assert (
-            relative_error(
-                run_forward(dev, x, weight, bias, False, blocking=gpu), conv(x, weight, bias)
-            )
-            < 3e-6
+    layer = Layer.random(rng, size, (16, 32), 48, k)
+    counts = random_counts(rng, *size)
+    tiles, count = some_tiles(dev, size, counts), pixels_of(counts, *size)[..., None]
+    whole, some = layer.computed(dev, module, CPU), layer.computed(dev, module, CPU, tiles)
+    for i in (0, 3, 4):  # the output and the gradients of the inputs
+        np.testing.assert_array_equal(some[i], np.where(count > 0, whole[i], np.nan))
+    seen = pixels_of(grow(counts > 0, k // 2), *size)[..., None]
+    parts = [np.where(seen, part, np.float32(np.nan)) for part in layer.parts]
+    poisoned = np.where(count > 0, layer.grad_out, np.float32(np.nan))
+    given = layer.weight, layer.bias
+    actual = Layer(parts, *given, poisoned).computed(dev, module, CPU, tiles)
+    expected = Layer(layer.parts, *given, layer.grad_out * count).expected
+    for i in (1, 2):  # those of the weights and the bias
+        assert relative_error(actual[i], expected[i]) < 1e-5
+
+
+@pytest.mark.parametrize("module, k", ALL[:4])
+def test_launches_in_parts_compute_the_same_bits(dev, rng, monkeypatch, module, k):
+    """As for a watchdog."""
+    layer = Layer.random(rng, (17, 30), (36,), 64, k)
+    prefix = "conv" if module is DIRECT else "conv_local"
+    for direction in ("forward", "backward_input", "backward_weights"):
+        launched = check_parts(
+            dev,
+            monkeypatch,
+            f"{prefix}_{direction}",
+            lambda: tuple(layer.computed(dev, module, SHIPPED["GPU"])),
         )
-        expected = conv_gradients(x, weight, grad_out)[0]
-        actual = run_backward_input(dev, x, weight, grad_out, False, blocking=gpu)
-        assert relative_error(actual, expected) < 3e-6
+        assert launched > 1, direction
 
 
+@pytest.mark.parametrize("size, channels", [large((9, 13), 144), large((131, 40), 48)])
+def test_winograds_bits_do_not_depend_on_compute_units(dev, rng, monkeypatch, size, channels):
+    layer = Layer.random(rng, size, (channels,), channels)
+    expected = layer.computed(dev, WINOGRAD, CPU)
+    for units in (1, 3, 100):
+        monkeypatch.setitem(dev.info, "compute_units", units)
+        for actual, same in zip(layer.computed(dev, WINOGRAD, CPU), expected, strict=True):
+            np.testing.assert_array_equal(actual, same)
+
+
+@pytest.mark.parametrize("most", [48, large(128)])
+def test_smaller_work_groups_compute_the_same_bits(dev, rng, monkeypatch, most):
+    layer = Layer.random(rng, (9, 30), (16,), 32)
+    expected, program = layer.computed(dev, LOCAL, CPU), dev.program
+
+    def limited(*args, **defines):
+        found = program(*args, **defines)
+        for kernel in found.kernels.values():
+            monkeypatch.setattr(kernel, "largest_group", most)
+        return found
+
+    monkeypatch.setattr(dev, "program", limited)
+    for actual, same in zip(layer.computed(dev, LOCAL, CPU), expected, strict=True):
+        np.testing.assert_array_equal(actual, same)
+
+
+def test_local_computes_all_of_the_channels_and_no_other():
+    """In groups of four, as many as divide the blocks of 16."""
+    expected = {3: 4, 16: 4, 20: 8, 32: 8, 48: 4, 64: 16, 80: 4, 96: 8, 128: 16, 512: 16}
+    assert {channels: conv_local.quads(channels, True) for channels in expected} == expected
+    assert conv_local.quads(64, False) == 4
+
+
+@pytest.mark.parametrize(
+    "k, ci, co, first, c", [(3, 16, 16, 0, 16), (3, 48, 3, 16, 32), (1, 20, 32, 16, 4)]
+)
+def test_flipped_weights_are_exact(dev, rng, k, ci, co, first, c):
+    """And 0 for the channels beyond the last one."""
+    weight = rng.normal(size=(co, ci, k, k)).astype(np.float32)
+    given = dev.upload(pack_weights(weight)), first, c, co, Work.empty(dev, 0, 1 << 14)
+    expected = weight[:, first : first + c, ::-1, ::-1].transpose(1, 0, 2, 3)
+    flipped = conv_direct.flip_weights(dev, CPU, *given).get()
+    np.testing.assert_array_equal(flipped, pack_weights(expected))
+
+
+def test_direct_work_items_fit_the_channels_and_the_width():
+    one = (1, 1, 1)
+    paired = replace(CPU, direct=(6, 2, one), direct_odd=(12, 1, one))
+    found = [conv_direct.fitting(paired, width, 64) for width in (100, 6, 5, 3)]
+    assert found == [(6, 2, one), (6, 2, one), (4, 2, one), (1, 2, one)]
+    assert conv_direct.fitting(paired, 100, 48) == (12, 1, one)  # three groups do not pair up
+
+
+@pytest.mark.parametrize("module", [DIRECT, LOCAL])
+@pytest.mark.parametrize("most", [20_000, large(1)])
+def test_parts_grow_when_memory_is_short(dev, rng, monkeypatch, module, most):
+    """Up to a single one."""
+    layer = Layer.random(rng, (33, 10), (16, 20), 48)
+    floats = conv_direct.partial_floats(33, (3, 3, 3, 36, 16))
+    monkeypatch.setattr(conv_direct, "PARTIAL_FLOATS", most)
+    assert conv_direct.partial_floats(33, (3, 3, 3, 36, 16)) < floats
+    results = layer.computed(dev, module, CPU)
+    for i in (1, 2):
+        assert relative_error(results[i], layer.expected[i]) < 5e-6
+
+
+# The many builds of some take half a minute each.
+FIELDS = {
+    "direct": (DIRECT, [((13, 13), (32, 16), 32), ((7, 37), (16,), 48), ((3, 2), (3,), 20)]),
+    "winograd_weights": (WINOGRAD, [((50, 31), (256,), 128), ((7, 7), (16,), 48)]),
+    "winograd": (WINOGRAD, [((50, 45), (256,), 80)]),
+    "winograd_narrow": (WINOGRAD, [((50, 31), (16,), 16), ((13, 13), (32, 16), 32)]),
+}
+SLOW = ("winograd", "winograd_narrow")
+
+
+@pytest.mark.parametrize(
+    "field", [pytest.param(f, marks=pytest.mark.slow) if f in SLOW else f for f in FIELDS]
+)
 @pytest.mark.large
-def test_same_bits_twice(dev, rng):
-    check_same_bits(dev, rng, run_forward)
+def test_every_blocking(dev, rng, field):
+    """Images of more tiles than are taken at a time, in no more memory than each asks for."""
+    module, shapes = FIELDS[field]
+    layers = [Layer.random(rng, *shape) for shape in shapes]
+    values = {value for choices in CHOICES.values() for value in choices.get(field, ())}
+    blockings = [replace(CPU, **{field: value}) for value in sorted(values)]
+    for blocking in [*blockings, *([SHIPPED["GPU"]] if module is DIRECT else [])]:
+        for layer in layers:
+            for result in map(within, layer.computed(dev, module, blocking), layer.expected):
+                assert result.share <= 1, blocking
+        dev.check()
 
 
-def test_wrong_shapes_are_refused(dev):
-    x, out = dev.zeros((4, 4, 16)), dev.zeros((4, 4, 32))
-    weight, bias = dev.zeros((2, 3, 3, 16, 16)), dev.zeros(32)
-    given = {"out": out, "relu": False, "blocking": SHIPPED["CPU"]}
-    with pytest.raises(ValueError, match="16 \\+ 16 to 32 channels"):
-        conv_forward(dev, (x, x), weight, bias, **given)
-    with pytest.raises(ValueError, match="bias"):
-        conv_forward(dev, (x,), weight, dev.zeros(16), **given)
-    with pytest.raises(ValueError, match="width"):
-        conv_forward(dev, (x,), weight, bias, **given | {"out": dev.zeros((4, 5, 32))})
-    with pytest.raises(ValueError, match="flipped"):
-        conv_backward_input(dev, weight, out, x, mask=None, blocking=SHIPPED["CPU"])
+def test_narrow_weights_have_a_blocking_of_their_own(dev):
+    """For two tiles of 128 x 128 channels at a time, and of more channels."""
+
+    def floats(co, **changed):
+        blocking, shape = replace(CPU, **changed), (co // 16, 3, 3, 128, 16)
+        return conv_winograd.work_floats(dev, blocking, Direction.FORWARD, 9, shape, 128)
+
+    assert floats(128, winograd_narrow=(2, 2)) < floats(128) == floats(128, winograd=(2, 2))
+    assert floats(144, winograd=(2, 2)) < floats(144) == floats(144, winograd_narrow=(2, 2))
 
 
-def test_relu_hides_no_nan(dev, rng):
-    x = rng.normal(size=(5, 7, 16)).astype(np.float32)
-    x[2, 3, 4] = np.nan
-    out = dev.empty((5, 7, 16))
-    weight, bias = pack_weights(rng.normal(size=(16, 16, 3, 3))), pack_bias(np.zeros(16))
-    conv_forward(
-        dev,
-        (dev.upload(x),),
-        dev.upload(weight),
-        dev.upload(bias),
-        out=out,
-        relu=True,
-        blocking=SHIPPED["CPU"],
-    )
-    bad = np.isnan(out.get()).all(axis=2)
-    assert bad[1:4, 2:5].all() and bad.sum() == 9
+@pytest.mark.parametrize("module, k", OF_3X3)
+@pytest.mark.exact
+def test_a_relu_hides_no_nan(dev, rng, module, k):
+    layer = Layer.random(rng, (9, 11), (16,), 16, k)
+    layer.parts[0][4, 5, 6] = np.nan
+    bad = np.isnan(layer.computed(dev, module, CPU)[0]).all(axis=2)
+    assert bad[3:6, 4:7].all() and not bad[:, 10].any()
+    assert bad.sum() == 9 or module is WINOGRAD  # more of the tiles that saw it
 
 
-def test_a_blocking_fits_the_channels_and_the_width():
-    paired = replace(SHIPPED["CPU"], direct=(6, 2, (1, 1, 1)))
-    assert paired.of_direct(100, 64) == paired.of_direct(6, 64) == (6, 2, (1, 1, 1))
-    assert paired.of_direct(5, 64) == (4, 2, (1, 1, 1))
-    assert paired.of_direct(3, 64) == (1, 2, (1, 1, 1))
-    assert paired.of_direct(100, 48) == (12, 1, (1, 1, 1))  # three groups do not pair up
-    single = replace(SHIPPED["CPU"], direct=(4, 1, (1, 1, 1)))
-    assert single.of_direct(100, 48) == single.of_direct(100, 64) == (4, 1, (1, 1, 1))
+@pytest.mark.parametrize("module, k", OF_3X3)
+def test_what_does_not_fit_together_is_refused(dev, module, k):
+    zeros, few = dev.zeros, Work.empty(dev)
+    x, out, weight, bias = zeros((4, 4, 16)), zeros((4, 4, 32)), zeros((2, k, k, 16, 16)), zeros(32)
+    floats = [module.work_floats(dev, CPU, way, 4, weight.shape, 16) for way in Direction]
+    work = Work.empty(dev, *map(max, zip(*floats, strict=True)))
+    grown = some_tiles(dev, (4, 8), np.ones((1, 2)))
 
+    def forward(sources=(x,), weight=weight, bias=bias, out=out, work=work, tiles=None):
+        module.forward(dev, CPU, sources, weight, bias, out, relu=False, work=work, tiles=tiles)
 
-def test_launches_in_parts_compute_the_same_bits(dev, rng, monkeypatch):
-    x, grad_out = (rng.normal(size=(13, 30, c)).astype(np.float32) for c in (20, 32))
-    weight, bias = layer(rng, 20, 32, 3)
-    given = {"blocking": SHIPPED["GPU"]}
-    launched = check_parts(
-        dev, monkeypatch, "conv_forward", lambda: run_forward(dev, x, weight, bias, True, **given)
-    )
-    assert launched == 4  # groups of 4 rows
-    launched = check_parts(
-        dev,
-        monkeypatch,
-        "conv_backward_input",
-        lambda: run_backward_input(dev, x, weight, grad_out, True, **given),
-    )
-    assert launched == 4
+    def backward_input(first=0, weight=weight, grad_out=out, work=work, tiles=None):
+        given = {"mask": None, "work": work, "tiles": tiles}
+        module.backward_input(dev, CPU, weight, first, grad_out, x, **given)
+
+    def backward_weights(sources=(x,), grad_bias=bias, work=work, tiles=None):
+        given = {"work": work, "tiles": tiles}
+        module.backward_weights(dev, CPU, sources, out, weight, grad_bias, **given)
+
+    for call in (forward, backward_input, backward_weights):
+        call()
+    wrong = [
+        partial(forward, (x, x)),
+        partial(forward, bias=zeros(16)),
+        partial(forward, out=zeros((4, 5, 32))),
+        partial(forward, tiles=grown),
+        partial(backward_input, work=few),
+        partial(backward_input, tiles=grown),
+        partial(backward_weights, (x, x)),
+        partial(backward_weights, grad_bias=zeros(16)),
+        partial(backward_weights, work=few),
+        partial(backward_weights, tiles=grown),
+    ]
+    if module is WINOGRAD:
+        wrong += [
+            partial(forward, (zeros((4, 4, 3)),), zeros((2, k, k, 3, 16))),
+            partial(forward, work=few),
+            partial(backward_input, grad_out=zeros((4, 4, 20))),
+            partial(backward_input, first=8, weight=zeros((2, k, k, 32, 16))),
+            partial(backward_input, first=16),
+            partial(backward_weights, work=Work(few.scratch, work.weights)),
+            partial(backward_weights, work=Work(work.scratch, few.weights)),
+        ]
+    for call in wrong:
+        with pytest.raises(ValueError, match="tiles|channels|floats|width"):
+            call()

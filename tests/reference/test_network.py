@@ -1,21 +1,30 @@
-"""pp_cl/reference/network.py against the tests' own float64 twins, which are written another
-way.
+"""The float64 twins of the layers against scipy's functions, their gradients as adjoints or by
+finite differences; that of the network against one written out by hand.
 """
 
 import numpy as np
 import pytest
-from oracle.conv import conv, conv_gradients
 from oracle.unet import unet, unet_gradients
+from scipy.ndimage import zoom
+from scipy.signal import correlate2d
+from scipy.special import expit
 from support.comparisons import relative_error
 
 from pp_cl.network.layers import BLOCKS, convolutions, unet_layers
+from pp_cl.reference.differences import numeric_gradient
 from pp_cl.reference.network import (
     convolution,
     convolution_at,
     convolution_backward_weights,
     flipped,
+    gate,
+    gate_backward,
     network,
     network_gradients,
+    pool,
+    pool_backward,
+    upsample,
+    upsample_backward,
 )
 
 
@@ -24,12 +33,42 @@ from pp_cl.reference.network import (
 def test_convolution_and_its_gradients(rng, height, width, ci, co, k):
     x, grad_out = (rng.normal(size=(height, width, c)).astype(np.float32) for c in (ci, co))
     weight, bias = rng.normal(size=(co, ci, k, k)).astype(np.float32), rng.normal(size=co)
-    expected, (grad_x, grad_weight, _) = conv(x, weight, bias), conv_gradients(x, weight, grad_out)
-    assert relative_error(convolution(x, weight, bias), expected) < 1e-13
-    assert relative_error(convolution(grad_out, flipped(weight)), grad_x) < 1e-13
-    assert relative_error(convolution_backward_weights(x, grad_out, k), grad_weight) < 1e-13
+    out = convolution(x, weight, bias)
+    wide = x.astype(np.float64), weight.astype(np.float64)
+    for o in range(co):
+        planes = [correlate2d(wide[0][..., i], wide[1][o, i], "same") for i in range(ci)]
+        assert relative_error(out[..., o], sum(planes) + bias[o]) < 1e-13
     pixels = rng.integers(0, height, 12), rng.integers(0, width, 12)
-    assert relative_error(convolution_at(x, weight, bias, pixels), expected[pixels]) < 1e-13
+    assert relative_error(convolution_at(x, weight, bias, pixels), out[pixels]) < 1e-13
+    # it is linear in both
+    of_x, of_weight = (
+        convolution(grad_out, flipped(weight)),
+        convolution_backward_weights(x, grad_out, k),
+    )
+    product = ((out - bias) * grad_out).sum()
+    assert (x * of_x).sum() == pytest.approx(product, rel=1e-9, abs=1e-9)
+    assert (weight * of_weight).sum() == pytest.approx(product, rel=1e-9, abs=1e-9)
+
+
+def test_pooling_and_upsampling(rng):
+    small, large = rng.normal(size=(3, 5, 2)), rng.normal(size=(6, 10, 2))
+    y, x = np.mgrid[:3, :5]
+    cells = [large[2 * y + dy, 2 * x + dx] for dy in (0, 1) for dx in (0, 1)]
+    assert relative_error(pool(large), np.mean(cells, 0)) < 1e-15
+    assert (pool_backward(small) * large).sum() == pytest.approx((small * pool(large)).sum())
+    wide = zoom(small, (2, 2, 1), order=1, mode="nearest", grid_mode=True)
+    assert relative_error(upsample(small), wide) < 1e-15
+    product = (upsample(small) * large).sum()
+    assert (upsample_backward(large) * small).sum() == pytest.approx(product)
+
+
+def test_gate(rng):
+    x, grad_out = rng.normal(0, 2, (3, 4, 10)), rng.normal(size=(3, 4, 5))
+    features, gates = x[..., :5], x[..., 5:]
+    elu = np.where(features > 0, features, np.exp(features) - 1)
+    assert relative_error(gate(x), elu * expit(gates)) < 1e-15
+    numeric = numeric_gradient(lambda v: (gate(v) * grad_out).sum(), x, 1e-5)
+    assert relative_error(gate_backward(x, grad_out).ravel(), numeric) < 1e-9
 
 
 @pytest.mark.parametrize("blocks", BLOCKS)

@@ -55,7 +55,7 @@ class A:
     def __init__(self, a: int):
         self.a, self.b = a, a
 
-    def f(self, a: int, b: int, c: int, d: int, *, e: int, f: int, g: int, h: int) -> None:
+    def f(self, a: int, *, b: int) -> None:
         raise UserError("print()")
 """
 

@@ -2,9 +2,7 @@
 
 import re
 
-from pp_cl.device.signature import parse_signatures
-
-MOST_PARAMETERS, MOST_COLUMNS = 12, 100
+MOST_COLUMNS = 100
 
 
 def helpers_without_static(source):
@@ -15,12 +13,6 @@ def helpers_without_static(source):
     heads = re.findall(r"^ *((?:\w+[\s*]+)+)(\w+)\s?\([^{};]*\)\s*\{", source, re.M)
     linked = {"static", "kernel", "ALWAYS_INLINE", "else"}
     return [f"{name} is not static" for words, name in heads if not linked & set(words.split())]
-
-
-def long_parameter_lists(source):
-    """At most 12 parameters."""
-    counts = {name: len(p) for name, p in parse_signatures(source, "").items()}
-    return [f"{name}: {n} parameters" for name, n in counts.items() if n > MOST_PARAMETERS]
 
 
 def silent_kernels(source):

@@ -2,8 +2,8 @@
 
 from pp_cl.layers.choice import FORMAT, device_key
 
-MS = {"direct": 3.0, "winograd2": 1.0, "winograd4": 2.0}
-REL_L2 = {"direct": 2e-7, "winograd2": 1e-7, "winograd4": 5e-7}
+MS = {"direct": 1.0, "winograd": 2.0}
+REL_L2 = {"direct": 2e-7, "winograd": 5e-7}
 
 
 def row(pixels=64 * 64, ms=MS, rel_l2=REL_L2, direction="forward", k=3, ci=64, co=32):

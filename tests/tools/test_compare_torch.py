@@ -29,7 +29,7 @@ def torch():
     )
 
 
-@pytest.mark.parametrize("variant", [AUTO, *(name for name, v in VARIANTS.items() if not v.half)])
+@pytest.mark.parametrize("variant", [AUTO, *VARIANTS])
 def test_the_twin_is_the_same_network(torch, dev, rng, variant):
     net = make_network(dev, (16, 32, 48), make_policy(dev, variant=variant))
     x, grad_image = (

@@ -1,4 +1,4 @@
-"""pp_cl/network/buffers.py: arrays that share a buffer never live at the same time."""
+"""Arrays that share a buffer never live at the same time."""
 
 from itertools import pairwise
 
