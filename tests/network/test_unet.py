@@ -6,7 +6,6 @@ import math
 import numpy as np
 import pytest
 from oracle.unet import unet, unet_gradients
-from pp_cl.reference.winograd import rounding_share
 from support.comparisons import relative_error
 from support.networks import plain_parameters
 

@@ -11,7 +11,7 @@ import numpy as np
 
 from pp_cl.bench.conv import RandomConv
 from pp_cl.bench.peak import CopyBandwidth, PeakFlops
-from pp_cl.bench.raster_scenes import SCENES, Case
+from pp_cl.bench.raster_scenes import SCENES
 from pp_cl.bench.unet import make_network, train_runner
 from pp_cl.config import Config, assign, preset
 from pp_cl.device.device import Device
@@ -115,11 +115,8 @@ def blends(dev: Device, views: list[View]) -> None:
             renderer.backward_features(result, dev.zeros(result.features.shape), grad)
         renderer.picture(camera, GAMMA)
     scene = SCENES["pulsar"](dev, 60, 16, GAMMA)
-    for blend, tau in product(BLENDS, (0.0, 0.01)):
-        case = Case(blend, tau)
-        result = scene.forward(case)
-        scene.backward(case, result)
-        scene.dropped_weights(case, result)
+    for blend in BLENDS:
+        scene.backward(blend, scene.forward(blend))
 
 
 def shadings(dev: Device, views: list[View]) -> None:
