@@ -28,8 +28,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         nargs="?",
         default="all",
         choices=OPTIONS,
-        help="all (default): all but model, at sizes that fit a budget of time; conv:"
-        " every layer of the network; unet: all of it; raster: points; train: a step without the"
+        help="all (default): conv, unet, raster and a training of the demo, at sizes that fit a"
+        " budget of time; conv: every layer of the network; unet: all of it; raster: points; train: a step without the"
         " network; model: frames per second against PSNR of a trained run",
     )
     add(
@@ -116,6 +116,7 @@ def _run_all(options):
     figure = figure_of(options.plot)
     dev = _open_device(options)
     policy = load_policy(dev, preset("tiny").network.tolerance)
+    print(policy.origin)
     result = bench_overview(dev, policy, options.budget or 120, partial(print, flush=True))
     print(f"{result['seconds']:.0f} s")
     shared.write_json_option(options.json, result)

@@ -5,20 +5,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pp_cl.bench import peak, timing
 from pp_cl.bench.raster import bench_raster, growth
 from pp_cl.bench.raster_scenes import SCENES
 from pp_cl.raster.blend import BLENDS
 from pp_cl.reference import dense as oracle_raster
 from pp_cl.reference.raster import PixelReference
 
-
-@pytest.fixture(autouse=True)
-def quick(monkeypatch):
-    """Short runs, and few of them."""
-    monkeypatch.setattr(peak, "COPY_BYTES", 2**16)
-    monkeypatch.setattr(timing, "SECONDS", 0.0)
-    monkeypatch.setattr(timing, "LEAST_ROUNDS", 2)
+pytestmark = pytest.mark.usefixtures("quick")
 
 
 @pytest.mark.parametrize("rule", BLENDS)
@@ -38,11 +31,8 @@ def test_float64_values_are_the_oracles(dev, name, rule):
     everyone = np.arange(scene.count)
     if name == "grid":
         sh = np.concatenate([v.get() for v in scene.renderers[rule].model.cloud.sh], 1)
-        np.testing.assert_allclose(
-            scene.exact_features(everyone),
-            oracle_raster.shade(positions, camera.eye, sh),
-            atol=1e-6,
-        )
+        shaded = oracle_raster.shade(positions, camera.eye, sh)
+        np.testing.assert_allclose(scene.exact_features(everyone), shaded, atol=1e-6)
     expected, compared = oracle_raster.features(blend, scene.exact_features(everyone)), 0
     for pixel in range(256):
         hits = reference.hits(pixel % 16, pixel // 16)
@@ -80,10 +70,8 @@ def test_rows(dev, name):
     )
     for row in rows:
         stages = row["stages_ms"]
-        assert (
-            stages.keys() == row["stages_bytes"].keys()
-            and min(*stages.values(), *row["stages_bytes"].values()) > 0
-        )
+        assert stages.keys() == row["stages_bytes"].keys()
+        assert min(*stages.values(), *row["stages_bytes"].values()) > 0
         assert row["forward_ms"] + row["backward_ms"] == pytest.approx(sum(stages.values()))
         assert row["forward_ms"] > stages["weights"] and row["backward_ms"] >= stages["backward"]
         moved = sum(row["stages_bytes"].values())
