@@ -29,8 +29,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         default="all",
         choices=OPTIONS,
         help="all (default): conv, unet, raster and a training of the demo, at sizes that fit a"
-        " budget of time; conv: every layer of the network; unet: all of it; raster: points; train: a step without the"
-        " network; model: frames per second against PSNR of a trained run",
+        " budget of time; conv: every layer of the network; unet: all of it; raster: points; train:"
+        " a step without the network; model: frames per second against PSNR of a trained run",
     )
     add(
         "--size",
