@@ -107,7 +107,7 @@ class Renderer:
         self._projection = Projection(dev, footprint)
         self._pairs = PairBuilder(dev, footprint)
         self._weights = BLENDS[settings.blend](dev)
-        self._blend = Blend(dev, footprint, self._weights, settings.mean_gradient)
+        self._blend = Blend(dev, self._weights, settings.mean_gradient)
         self._buffers = Buffers(dev)
 
     @staticmethod

@@ -135,8 +135,8 @@ def bench_conv(
     policy: ConvolutionPolicy,
     *,
     blocks: str = "double",
-) -> Iterator[dict]:
-    """Rows of every distinct convolution of the network at size x size, in all directions.
+) -> Iterator[list[dict]]:
+    """Rows of every distinct convolution of the network at size x size, a list for each direction.
 
     policy: its blocking is used; every variant is measured. blocks: as UNet takes them.
     """
@@ -152,7 +152,7 @@ def bench_conv(
         for direction in Direction:
             runs = {v: conv.runner(v, direction, policy) for v in conv.variants}
             found = {v: errors(*conv.result(v, direction, policy)) for v in conv.variants}
-            yield from variant_rows(
+            yield variant_rows(
                 {"layer": layer.name, "shape": shape, "direction": direction.value},
                 runs,
                 found,

@@ -11,12 +11,7 @@ from collections.abc import Iterator
 from dataclasses import replace
 from typing import Any
 
-from pp_cl.compress.reduction import (
-    Original,
-    Reduction,
-    measured_psnr,
-    nbytes,
-)
+from pp_cl.compress.reduction import Original, Reduction, measured_psnr, nbytes
 from pp_cl.compress.search import frame_ms
 from pp_cl.layers.choice import make_policy, offered
 from pp_cl.trained import Run
@@ -28,9 +23,7 @@ TRIED = {
     "half": (True,),
     "channels": (0.001, 0.01, 0.1),
     "degree": (1, 0),
-    "tau": (1e-4, 1e-3, 1e-2),
     "early_stop": (0.003, 0.01, 0.03),
-    "window": ("object",),
 }
 COLUMNS = "{:28} {:>9} {:>9} {:>8} {:>8} {:>7} {:>7}".format
 HEAD = COLUMNS("what", "points", "MiB", "PSNR", "loss", "ms", "speed")
@@ -91,16 +84,3 @@ def line(row: dict[str, Any]) -> str:
         f"{row['ms']:.1f}",
         f"{row['speed']:.2f}",
     )
-
-
-def plot(figure: Any, title: str, rows: list[dict[str, Any]]) -> None:
-    """Draw speed against loss, a colour for each way. figure: matplotlib's."""
-    axes = figure.add_subplot(
-        xlabel="frames per second, of the first run's", ylabel="PSNR lost, dB", title=title
-    )
-    axes.set_yscale("symlog", linthresh=0.01)
-    kinds = {row["what"]: row["what"].split()[0] for row in rows}
-    for i, kind in enumerate(dict.fromkeys(kinds.values())):
-        some = [row for row in rows if kinds[row["what"]] == kind]
-        speed, loss = [row["speed"] for row in some], [row["loss"] for row in some]
-        axes.plot(speed, loss, "os^Dv"[i % 5], color=f"C{i}", label=kind)

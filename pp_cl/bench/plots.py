@@ -1,56 +1,115 @@
 """Figures of the benches; matplotlib is an extra."""
 
+from itertools import product
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
+from pp_cl.bench.raster import curves
 from pp_cl.errors import UserError
 from pp_cl.files.atomic import atomic_file
 
-INSTALL = "install it with `pip install 'pp-cl[plot]'`"
+LEAST_ERROR = 1e-9  # an error of 0 has no logarithm: drawn there, far below float32's
+OVERVIEW_SIZE = (13, 9)  # inches
 
 
 def figure_of(file: str | None, option: str = "--plot") -> Any | None:
     """A matplotlib figure for a file, None where there is to be none. Raises UserError naming the
     option without matplotlib.
     """
-    figure = new_figure((8, 6)) if file else None
-    if file and figure is None:
-        raise UserError(f"{option} {file}: needs matplotlib; {INSTALL}")
-    return figure
-
-
-def new_figure(size: tuple[float, float]) -> Any | None:
-    """An empty matplotlib figure of so many inches, None without matplotlib."""
+    if not file:
+        return None
     try:
         from matplotlib.figure import Figure
     except ImportError:
-        return None
-    return Figure(figsize=size, layout="constrained")
+        raise UserError(
+            f"{option} {file}: needs matplotlib; install it with `pip install 'pp-cl[plot]'`"
+        ) from None
+    return Figure(figsize=(8, 6), layout="constrained")
 
 
-def plot_time_and_error(figure: Any, title: str, rows: list[dict]) -> None:
+def plot_time_and_error(axes: Any, rows: list[dict]) -> None:
     """Time against error, both logarithmic: a colour for each variant, a marker for each
-    direction.
+    direction. rows: of bench_conv() or bench_unet().
     """
-    axes = figure.add_subplot(
-        xscale="log", yscale="log", xlabel="milliseconds", ylabel="relative L2 error", title=title
-    )
+    axes.set(xscale="log", yscale="log", xlabel="milliseconds", ylabel="relative L2 error")
     directions, variants = (
         list(dict.fromkeys(row[key] for row in rows)) for key in ("direction", "variant")
     )
-    for d, direction in enumerate(directions):
-        for v, variant in enumerate(variants):
-            some = [
-                row for row in rows if row["direction"] == direction and row["variant"] == variant
-            ]
-            # an error of 0 has no logarithm: draw it far below float32's
-            axes.plot(
-                [row["ms"] for row in some],
-                [max(row["rel_l2"], 1e-9) for row in some],
-                "os^"[d],
-                color=f"C{v}",
-                label=f"{variant}, {direction}",
-            )
+    for (d, direction), (v, variant) in product(enumerate(directions), enumerate(variants)):
+        some = [row for row in rows if (row["direction"], row["variant"]) == (direction, variant)]
+        axes.plot(
+            [row["ms"] for row in some],
+            [max(row["rel_l2"], LEAST_ERROR) for row in some],
+            "os^"[d],
+            color=f"C{v}",
+            label=f"{variant}, {direction}",
+        )
+
+
+def plot_growth(axes: Any, rows: list[dict]) -> None:
+    """Time of the rasteriser against the number of points, with the least and the most. rows: of
+    bench_raster().
+    """
+    axes.set(
+        xscale="log", yscale="log", xlabel="points", ylabel="milliseconds, forward and backward"
+    )
+    numbers = [row["points"] for row in rows]
+    axes.set_xlim(min(numbers) / 2, max(numbers) * 2)  # left to itself, one number has no width
+    for c, ((size, blend), some) in enumerate(curves(rows).items()):
+        ms = np.array([row["ms"] for row in some])
+        least, most = np.array([row["ms_range"] for row in some]).T
+        axes.errorbar(
+            [row["points"] for row in some],
+            ms,
+            yerr=[ms - least, most - ms],
+            marker="os^Dv"[c % 5],
+            capsize=2,
+            label=f"side {size}, {blend}",
+        )
+
+
+def plot_models(axes: Any, rows: list[dict]) -> None:
+    """Speed against loss, a colour for each way to make a run smaller. rows: of bench_models()."""
+    axes.set(xlabel="frames per second, of the first run's", ylabel="PSNR lost, dB")
+    axes.set_yscale("symlog", linthresh=0.01)
+    kinds = {row["what"]: row["what"].split()[0] for row in rows}
+    for i, kind in enumerate(dict.fromkeys(kinds.values())):
+        some = [row for row in rows if kinds[row["what"]] == kind]
+        speed, loss = [row["speed"] for row in some], [row["loss"] for row in some]
+        axes.plot(speed, loss, "os^Dv"[i % 5], color=f"C{i}", label=kind)
+
+
+def plot_overview(figure: Any, result: dict[str, Any]) -> None:
+    """What bench_overview() measured, on four axes: speed against error of the largest network,
+    growth of the rasteriser, PSNR of a training, its stages.
+    """
+    figure.set_size_inches(OVERVIEW_SIZE)
+    network, raster, quality, stages = figure.subplots(2, 2).ravel()
+    side = max(row["shape"][0] for row in result["unet"])
+    network.set_title(f"the network at {side} x {side}")
+    plot_time_and_error(network, [row for row in result["unet"] if row["shape"][0] == side])
+    raster.set_title("the rasteriser")
+    plot_growth(raster, result["raster"])
+    training = result["training"]
+    quality.set(title="a training of the demo", xlabel="seconds", ylabel="PSNR, dB")
+    curve = training["curve"]
+    quality.plot([row["seconds"] for row in curve], [row["psnr"] for row in curve], marker="o")
+    _plot_stages(stages, training)
+
+
+def _plot_stages(axes, training):
+    """A bar for each stage of a step and of a frame, the first on top."""
+    axes.set(title="where its time goes", xlabel="milliseconds")
+    names = list(training["step_ms"])[::-1]
+    for key, label, offset in (("step_ms", "a step", 0.2), ("frame_ms", "a frame", -0.2)):
+        found = [
+            (i, training[key][name]["ms"]) for i, name in enumerate(names) if name in training[key]
+        ]
+        places, ms = zip(*found, strict=True)
+        axes.barh([i + offset for i in places], ms, height=0.4, label=label)
+    axes.set_yticks(range(len(names)), names)
 
 
 def plot_ranks(figure: Any, names: list[str], rows: list[tuple[str, dict]], own: str) -> None:

@@ -6,16 +6,15 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from functools import cached_property
-from typing import NamedTuple
 
 import numpy as np
 from pyopencl.array import Array
 
+from pp_cl.bench.spheres import spheres_backward
 from pp_cl.device.device import Device
 from pp_cl.model import Model
 from pp_cl.network.unet import UNet
 from pp_cl.raster.blend import BLENDS, Blend
-from pp_cl.raster.blend_weights import DROPPED
 from pp_cl.raster.pairs import PairBuilder
 from pp_cl.raster.project import Footprint, Projection
 from pp_cl.reference.raster import PixelReference, sh_basis
@@ -29,16 +28,6 @@ CHANNELS = 16
 ROW = 4 * CHANNELS  # bytes of the features of a point or a pixel
 # every coefficient of degrees 1 and 2; random ones would take minutes for 4 million points
 HIGHER_SH = 0.1
-
-
-class Case(NamedTuple):
-    """How a scene is blended: a key of BLENDS, and the weight that a pixel may drop."""
-
-    blend: str
-    tau: float
-
-
-EXACT = Case("softmax", 0.0)
 
 
 class BenchScene(ABC):
@@ -59,22 +48,18 @@ class BenchScene(ABC):
     grad: Array
 
     @abstractmethod
-    def forward(self, case: Case) -> RasterResult:
+    def forward(self, blend: str) -> RasterResult:
         """Rasterise the scene."""
 
     @abstractmethod
-    def backward(self, case: Case, result: RasterResult) -> None:
-        """All gradients from self.grad. result: of forward(case), the last one."""
-
-    @abstractmethod
-    def dropped_weights(self, case: Case, result: RasterResult) -> np.ndarray:
-        """(HW,) float32: the weight that each pixel dropped, or a bound above it."""
+    def backward(self, blend: str, result: RasterResult) -> None:
+        """All gradients from self.grad. result: of forward(blend), the last one."""
 
     @abstractmethod
     def exact_features(self, points: np.ndarray) -> np.ndarray:
         """(S, 16) float64 features of some points."""
 
-    def error(self, case: Case, features: np.ndarray) -> float:
+    def error(self, blend: str, features: np.ndarray) -> float:
         """Largest difference of features (H, W, 16) from float64, over their range, at SAMPLES
         pixels that the object covers.
 
@@ -88,7 +73,7 @@ class BenchScene(ABC):
                 own = self.opacity[hits[0]], self.exact_features(hits[0])
                 expected = (
                     self.reference.composited(hits, *own)
-                    if case.blend == "alpha"
+                    if blend == "alpha"
                     else self.reference.features(hits, *own, self.gamma)
                 )
                 difference = np.abs(features[row, column] - expected) / self.feature_range
@@ -99,7 +84,7 @@ class BenchScene(ABC):
     def covered_pixels(self) -> np.ndarray:
         """Indices of the pixels with hits. Rasterises the scene."""
         return np.flatnonzero(
-            np.diff(self.forward(EXACT).pairs.pixel_offset.get().astype(np.int64))
+            np.diff(self.forward("softmax").pairs.pixel_offset.get().astype(np.int64))
         )
 
     @cached_property
@@ -108,28 +93,23 @@ class BenchScene(ABC):
 
         Rasterises the scene.
         """
-        result = self.forward(EXACT)
+        result = self.forward("softmax")
         rows = result.point_features.get()[result.shaded.get()]
         return np.maximum(rows.max(axis=0), 1) - np.minimum(rows.min(axis=0), 1)
 
-    def moved_bytes(self, case: Case, result: RasterResult) -> dict[str, int]:
+    def moved_bytes(self, blend: str, result: RasterResult) -> dict[str, int]:
         """{stage: bytes} that the stages must read and write: every value used by each kernel,
         once.
         """
         n, p, hw, shaded = self.count, result.pairs.total, self.size**2, result.shaded.size
-        blended = p
-        if result.weights.has_roles:
-            blended -= int((result.weights.pair_role.get()[:p] == DROPPED).sum())
         # of a point: place, box, first pair; of a pair: pixel, point and closeness, place or key
         search, pair = 16 + 8 + 4, 4 + 8 + 8
-        roles = 2 * p + 6 * 4 * n if case.tau > 0 else 0
-        alpha = case.blend == "alpha"
-        rest = (8 + 8 + 4 + 4) * blended if alpha else 2 * ROW * hw
+        rest = (8 + 8 + 4 + 4) * p if blend == "alpha" else 2 * ROW * hw
         return {
             # find, scan, scatter, sort
             "pairs": n * search + 5 * 4 * n + 2 * p * pair + 2 * 8 * p + 4 * 4 * hw,
-            "weights": (blended if alpha else p) * (8 + 8 + 8 + 8) + 4 * n + 4 * hw + roles,
-            "blend": 8 * blended + ROW * shaded + (ROW + 4) * hw,
+            "weights": p * (8 + 8 + 8 + 8) + 4 * n + 4 * hw,
+            "blend": 8 * p + ROW * shaded + (ROW + 4) * hw,
             "backward": p * (4 + 8) + ROW * shaded + (ROW + 8) * n + (ROW + 4) * hw + rest,
         }
 
@@ -181,17 +161,13 @@ class GridScene(BenchScene):
             depth_range=self.depth_range,
         )
 
-    def forward(self, case: Case) -> RasterResult:
+    def forward(self, blend: str) -> RasterResult:
         """As BenchScene."""
-        return self.renderers[case.blend].rasterise(self.camera, self.gamma, tau=case.tau)
+        return self.renderers[blend].rasterise(self.camera, self.gamma)
 
-    def backward(self, case: Case, result: RasterResult) -> None:
+    def backward(self, blend: str, result: RasterResult) -> None:
         """Stage `backward`: gradients of features and opacities."""
-        self.renderers[case.blend].backward_features(result, self.grad)
-
-    def dropped_weights(self, case: Case, result: RasterResult) -> np.ndarray:
-        """As BenchScene."""
-        return self.renderers[case.blend].dropped_weights(result).get()
+        self.renderers[blend].backward_features(result, self.grad)
 
     def exact_features(self, points: np.ndarray) -> np.ndarray:
         """As BenchScene."""
@@ -200,11 +176,11 @@ class GridScene(BenchScene):
         higher = HIGHER_SH * basis[:, 1:].sum(1, keepdims=True)
         return basis[:, :1] * self.sh_0[points, 0].astype(np.float64) + higher
 
-    def moved_bytes(self, case: Case, result: RasterResult) -> dict[str, int]:
+    def moved_bytes(self, blend: str, result: RasterResult) -> dict[str, int]:
         """As BenchScene, with the stages of a grid and of harmonics."""
         shading = 4 + 16 + 9 * ROW + ROW
         own = {"project": self.count * (4 + 16 + 8 + 4), "shade": result.shaded.size * shading}
-        return own | super().moved_bytes(case, result)
+        return own | super().moved_bytes(blend, result)
 
 
 class PulsarScene(BenchScene):
@@ -231,7 +207,7 @@ class PulsarScene(BenchScene):
 
         footprint = Footprint("sphere")
         self.projection, self.pairs = Projection(dev, footprint), PairBuilder(dev, footprint)
-        self.blends = {name: Blend(dev, footprint, BLENDS[name](dev)) for name in BLENDS}
+        self.blends = {name: Blend(dev, BLENDS[name](dev)) for name in BLENDS}
         self.camera_buffer = dev.upload(self.camera.packed(self.depth_range))
         self.point_radius = dev.upload([self.radius], np.float32)
         self.positions, self.point_opacity = dev.upload(positions), dev.upload(self.opacity)
@@ -239,52 +215,58 @@ class PulsarScene(BenchScene):
         self.features = dev.empty((size, size, CHANNELS))
         self.grad = dev.upload(rng.standard_normal((size, size, CHANNELS), np.float32))
 
-    def forward(self, case: Case) -> RasterResult:
+    def forward(self, blend: str) -> RasterResult:
         """As BenchScene."""
-        blend = self.blends[case.blend]
+        blending = self.blends[blend]
         with self.dev.stage("project"):
             points = self.projection.spheres(self.camera_buffer, self.positions, self.point_radius)
         with self.dev.stage("pairs"):
             pairs = self.pairs.build(points, (self.size, self.size))
         with self.dev.stage("weights"):
-            weights = blend.weighing.compute(
-                pairs, self.camera_buffer, self.point_opacity, self.gamma, tau=case.tau
+            weights = blending.weighing.compute(
+                pairs, self.camera_buffer, self.point_opacity, self.gamma
             )
         with self.dev.stage("blend"):
-            blend.forward(pairs, weights, self.device_features, self.features)
+            blending.forward(pairs, weights, self.device_features, self.features)
         return RasterResult(
             (0, 0), points, pairs, weights, None, self.device_features, self.features
         )
 
-    def backward(self, case: Case, result: RasterResult) -> None:
+    def backward(self, blend: str, result: RasterResult) -> None:
         """Stages `backward` and `spheres`."""
-        blend = self.blends[case.blend]
+        blending = self.blends[blend]
         with self.dev.stage("backward"):
-            gradient = blend.gradient(
+            gradient = blending.gradient(
                 result.pairs,
                 result.weights,
                 result.point_features,
                 features=result.features,
                 grad_features=self.grad,
             )
-            blend.backward(gradient)
+            blending.backward(gradient)
         with self.dev.stage("spheres"):
-            blend.backward_spheres(gradient, result.points, self.point_opacity, self.gamma)
-
-    def dropped_weights(self, case: Case, result: RasterResult) -> np.ndarray:
-        """As BenchScene."""
-        return self.blends[case.blend].weighing.dropped(result.pairs, result.weights).get()
+            spheres_backward(
+                self.dev,
+                result.points,
+                result.pairs,
+                result.weights,
+                opacity=self.point_opacity,
+                gamma=self.gamma,
+                point_features=result.point_features,
+                grad_features=self.grad,
+                rest_or_gain=gradient.rest_or_gain,
+            )
 
     def exact_features(self, points: np.ndarray) -> np.ndarray:
         """As BenchScene."""
         return self.point_features[points].astype(np.float64)
 
-    def moved_bytes(self, case: Case, result: RasterResult) -> dict[str, int]:
+    def moved_bytes(self, blend: str, result: RasterResult) -> dict[str, int]:
         """As BenchScene, with the stages of spheres."""
         n, p, hw = self.count, result.pairs.total, self.size**2
         spheres = p * (4 + 8 + 8 + 8) + p * (4 + 8) + (ROW + 16 + 16) * n + 2 * (ROW + 4) * hw
         own = {"project": n * (12 + 16 + 8 + 4), "spheres": spheres}
-        return own | super().moved_bytes(case, result)
+        return own | super().moved_bytes(blend, result)
 
 
 SCENES = {scene.name: scene for scene in (GridScene, PulsarScene)}

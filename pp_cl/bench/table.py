@@ -1,7 +1,12 @@
-"""Lines of the printed tables of `pp-cl bench conv`, `bench unet` and `tune`."""
+"""Lines of the printed tables of `pp-cl bench conv`, `bench unet`, the demo's training and
+`pp-cl tune`.
+"""
+
+from typing import Any
 
 COLUMNS = "{:8} {:26} {:9} {:14} {:>9} {:>8} {:>5} {:>8} {:>8}".format
 HEAD = COLUMNS("layer", "shape", "direction", "variant", "ms", "GFLOP/s", "peak", "rel. L2", "max")
+STAGE = "{:16} {:>8} {:>8} {:>8} {:>8}".format
 TUNE_COLUMNS = "{:7} {:20} {:9} {:68} {:>8}  {}".format
 TUNE_HEAD = TUNE_COLUMNS("layer", "shape", "direction", "milliseconds", "rel. L2", "taken")
 
@@ -19,6 +24,20 @@ def line(row: dict) -> str:
         f"{row['rel_l2']:.1e}",
         f"{row['max_err']:.1e}",
     )
+
+
+def training_lines(training: dict[str, Any]) -> list[str]:
+    """The tables of bench_demo()."""
+    lines = ["{:>6} {:>9} {:>7}".format("step", "seconds", "PSNR")]
+    lines += [
+        f"{row['step']:6d} {row['seconds']:9.1f} {row['psnr']:7.2f}" for row in training["curve"]
+    ]
+    lines.append(STAGE("stage, ms", "step", "least", "most", "frame"))
+    for name, row in training["step_ms"].items():
+        frame = training["frame_ms"].get(name)
+        numbers = [f"{row[key]:.2f}" for key in ("ms", "least", "most")]
+        lines.append(STAGE(name, *numbers, f"{frame['ms']:.2f}" if frame else ""))
+    return lines
 
 
 def tune_line(name: str, row: dict, chosen: str | None, shipped: str) -> str:

@@ -1,5 +1,5 @@
-"""A short training of the demo: what a step and a frame spend their time on, and how PSNR grows
-with it.
+"""What a training spends its time on: a short one of the demo, and steps on a scene without the
+network.
 """
 
 from __future__ import annotations
@@ -17,8 +17,9 @@ from pp_cl.metrics.psnr_ssim import psnr
 from pp_cl.model import Model
 from pp_cl.network.unet import UNet
 from pp_cl.scene.hull import build_grid, depth_range
-from pp_cl.scene.open import open_scene
+from pp_cl.scene.open import open_scene, scene_box
 from pp_cl.train import Trainer
+from pp_cl.training.optimiser import Rates
 
 TRIED_STEPS = 4  # whose time says how many fit; the first builds the kernels and does not count
 TIMED_STEPS = 6  # the last ones, by stage
@@ -26,67 +27,118 @@ LEAST_STEPS, MOST_STEPS = 20, 8000
 MEASURED, MEASURED_VIEWS = 8, 4  # times that PSNR is measured, on how many views
 TIMED_FRAMES = 5
 
+STEP = 2000  # whose learning rates bench_step takes; all SH degrees move
+WIDTHS = (16, 16, 16)  # of its network, which is updated, but not run
+VIEWS, ROUNDS = 3, 5  # of the scene, evenly spread; over them
+FORWARD = ("project", "pairs", "weights", "shade", "blend")
 
-def bench_training(dev: Device, seconds: float) -> dict[str, Any]:
+
+def bench_demo(dev: Device, seconds: float) -> dict[str, Any]:
     """{"scene", "preset", "steps", "points", "curve": rows of {"step", "seconds", "psnr"},
-    "step_ms", "frame_ms": {stage: {"ms", "least", "most"}}, "counts": of estimate.Counts, means of
-    a few steps} of a training of about so many seconds, those of the measurements aside.
+    "step_ms", "frame_ms": {stage: {"ms", "least", "most"}}} of a training of about so many seconds,
+    those of the measurements aside.
 
     The stages of a step are those of the last ones, each waited for: without waiting they overlap.
     """
-    demo = _Demo(dev)
-    trial = demo.trainer(LEAST_STEPS)
+    config = configure(preset("tiny"), "demo")
+    # its look at all training views takes longer than the steps
+    assign(config, "train.final_prune_weight", 0.0, "bench")
+    views, hull = _open(dev, config)
+    measured = open_scene(dev, config, ("test",), most=MEASURED_VIEWS).splits["test"]
+    policy = load_policy(dev, config.network.tolerance)
+
+    def begin(steps):
+        assign(config, "train.iterations", steps, "bench")
+        net = UNet.of_settings(dev, config.network, policy)
+        return _trainer(dev, config, views, hull, net)
+
+    trial = begin(LEAST_STEPS)
     trial.train_step()
     start = time.perf_counter()
     for _ in range(TRIED_STEPS):
         trial.train_step()
     each = (time.perf_counter() - start) / TRIED_STEPS
-    trainer = demo.trainer(int(np.clip(seconds / each, LEAST_STEPS, MOST_STEPS)))
-    steps = trainer.config.iterations
-    curve, step_ms = _train(trainer, demo.measured)
+    trainer = begin(int(np.clip(seconds / each, LEAST_STEPS, MOST_STEPS)))
+    curve, step_ms = _train(trainer, measured)
     return {
         "scene": "demo",
         "preset": "tiny",
-        "steps": steps,
+        "steps": config.train.iterations,
         "points": trainer.model.cloud.count,
         "curve": curve,
         "step_ms": step_ms,
-        "counts": _counts(trainer),
-        "frame_ms": _frame(trainer, demo.measured[0]),
+        "frame_ms": _frame(trainer, measured[0]),
     }
 
 
-class _Demo:
-    """The demo and its hull. measured: a few test views."""
+def bench_step(
+    dev: Device, config: Config, views: int = VIEWS, rounds: int = ROUNDS
+) -> dict[str, Any]:
+    """{"points", "pairs", "shaded", "size", "stages_ms", "forward_ms", "backward_ms",
+    "peak_device_bytes"} of the rasteriser and the update, without the network; shaded: a share of
+    the points, size: (height, width) of the padded view.
 
-    def __init__(self, dev: Device):
-        self._dev = dev
-        config = self._config(LEAST_STEPS)
-        self._views = open_scene(dev, config, ("train",)).splits["train"]
-        self.measured = open_scene(dev, config, ("test",), most=MEASURED_VIEWS).splits["test"]
-        self._hull = build_grid(dev, self._views, config.points.count)
-        self._depth_range = depth_range(self._views, self._hull)
+    The points fill the scene's hull, with opacities in [0.3, 1], as a trained model has them; views
+    are whole images at the last gamma, dL/dfeatures is random. views: evenly spread over the
+    scene's. Times are medians over the views of all rounds; backward_ms includes the update.
+    """
+    trainer = _trainer(dev, config, *_open(dev, config), UNet(dev, widths=WIDTHS))
+    cloud, renderer = trainer.model.cloud, trainer.renderer
+    opacity = np.random.default_rng(0).uniform(0.3, 1, cloud.count).astype(np.float32)
+    cloud.opacity.set(opacity)
+    rates, grads, step = Rates.at(STEP, config.network, config.train), {}, 0
+    with dev.timed_stages() as seconds:
+        for round_ in range(rounds + 1):
+            if round_ == 1:
+                seconds.clear()  # the first round builds the programs
+            for i in range(views):
+                view = trainer.views[len(trainer.views) * i // views]
+                result = renderer.rasterise(view.camera, config.raster.gamma[1])
+                if i not in grads:
+                    values = np.random.default_rng(i).normal(size=result.features.shape) * 1e-6
+                    grads[i] = dev.upload(values, np.float32)
+                gradients = renderer.backward_features(result, grads[i])
+                step += 1
+                with dev.stage("update"):
+                    trainer.optimiser.update(
+                        step,
+                        rates,
+                        gradients,
+                        points=result.points,
+                        shaded=result.shaded,
+                        sh_eps=1e-10,
+                    )
+    stages = {name: row["ms"] for name, row in _spread(seconds).items()}
+    return {
+        "points": cloud.count,
+        "pairs": result.pairs.total,
+        "shaded": result.shaded.size / cloud.count,
+        "size": result.features.shape[:2],
+        "stages_ms": stages,
+        "forward_ms": sum(stages[name] for name in FORWARD),
+        "backward_ms": stages["backward"] + stages["update"],
+        "peak_device_bytes": dev.peak_bytes,
+    }
 
-    def _config(self, steps) -> Config:
-        config = configure(preset("tiny"), "demo")
-        assign(config, "train.iterations", steps, "bench")
-        # its look at all training views takes longer than the steps
-        assign(config, "train.final_prune_weight", 0.0, "bench")
-        return config
 
-    def trainer(self, steps: int) -> Trainer:
-        """A training of so many steps that begins."""
-        config, hull = self._config(steps), self._hull
-        policy = load_policy(self._dev, config.network.tolerance)
-        model = Model.create(
-            self._dev,
-            hull.grid,
-            hull.ids,
-            self._depth_range,
-            net=UNet.of_settings(self._dev, config.network, policy),
-            opacity=config.points.opacity,
-        )
-        return Trainer(self._dev, config, model, self._views)
+def _open(dev, config):
+    """The training views and the hull of a scene."""
+    views = open_scene(dev, config, ("train",)).splits["train"]
+    return views, build_grid(dev, views, config.points.count, scene_box(config))
+
+
+def _trainer(dev, config, views, hull, net):
+    """A training that begins."""
+    model = Model.create(
+        dev,
+        hull.grid,
+        hull.ids,
+        depth_range(views, hull),
+        net=net,
+        degree=config.points.sh_degree,
+        opacity=config.points.opacity,
+    )
+    return Trainer(dev, config, model, views)
 
 
 def _train(trainer, measured):
@@ -114,25 +166,6 @@ def _row(trainer, measured, seconds):
         psnr(to_8bit(trainer.render(view)), to_8bit(trainer.target(view))) for view in measured
     ]
     return {"step": trainer.step, "seconds": seconds, "psnr": float(np.mean(found))}
-
-
-def _counts(trainer):
-    """What steps like the last ones work on."""
-    pairs, shaded = [], []
-    for i in range(TIMED_STEPS):
-        index, box, jitter = trainer.draw(np.random.default_rng(i))
-        camera = trainer.views[index].crop_camera(box, jitter)
-        result = trainer.renderer.rasterise(camera, trainer.gamma[1])
-        pairs.append(result.pairs.total)
-        shaded.append(result.shaded.size)
-    height, width, _ = result.features.shape
-    return {
-        "points": trainer.model.cloud.count,
-        "pairs": round(np.mean(pairs)),
-        "shaded": round(np.mean(shaded)),
-        "height": height,
-        "width": width,
-    }
 
 
 def _frame(trainer, view):

@@ -2,7 +2,7 @@
 
 import argparse
 from functools import partial
-from pathlib import Path
+from itertools import chain
 
 from pp_cl.commands import options as shared
 from pp_cl.config import CONVOLUTIONS, assign, preset
@@ -11,15 +11,13 @@ from pp_cl.errors import UserError
 HELP = "time against error of the convolutions, the network, the rasteriser, a training"
 # the options that only some benches have
 OPTIONS = {
-    "all": ("budget", "out", "report"),
+    "all": ("budget", "plot"),
     "conv": ("size", "widths", "blocks", "plot"),
     "unet": ("size", "widths", "blocks", "plot", "tolerance"),
-    "raster": ("size", "scene", "points", "blend", "tau", "gamma", "plot"),
-    "train": ("scene", "points", "set", "report"),
+    "raster": ("size", "scene", "points", "blend", "gamma", "plot"),
+    "train": ("scene", "points", "set"),
     "model": ("runs", "plot"),
 }
-BLENDS = ("alpha", "softmax")
-VIEWS, ROUNDS = 3, 5  # of bench train: views of the scene, evenly spread, and rounds over them
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -30,9 +28,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         nargs="?",
         default="all",
         choices=OPTIONS,
-        help="all (default): a page about the device, from sizes that fit a budget of time; conv:"
-        " every layer of the network; unet: all of it; raster: points; train: a step without the"
-        " network; model: frames per second against PSNR of a trained run",
+        help="all (default): conv, unet, raster and a training of the demo, at sizes that fit a"
+        " budget of time; conv: every layer of the network; unet: all of it; raster: points; train:"
+        " a step without the network; model: frames per second against PSNR of a trained run",
     )
     add(
         "--size",
@@ -61,31 +59,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="T",
         help="all: seconds that it may take, as 120 or 120s (120)",
     )
-    _add_blending(parser)
-    shared.add_set(parser, "train: a setting in place of the paper preset's")
-    _add_outputs(parser)
-    shared.add_tolerance(parser)
-    shared.add_device(parser)
-
-
-def _seconds(text):
-    return shared.number(1, 86400)(text.removesuffix("s"))
-
-
-def _add_blending(parser):
-    """Options of bench raster alone."""
-    add = parser.add_argument
     add(
         "--blend",
-        type=shared.words(BLENDS),
+        type=shared.words(("alpha", "softmax")),
         metavar="B,...",
         help="raster: of alpha,softmax (both)",
-    )
-    add(
-        "--tau",
-        type=shared.several(shared.number(0, 0.5)),
-        metavar="T,...",
-        help="raster: weight that a pixel may drop (0,1e-4,1e-3,1e-2)",
     )
     add(
         "--gamma",
@@ -93,30 +71,20 @@ def _add_blending(parser):
         metavar="G",
         help="raster: depth sharpness of the blend (0.01)",
     )
-
-
-def _add_outputs(parser):
-    """Options of what is written and printed."""
-    add = parser.add_argument
-    add(
-        "--out",
-        type=shared.output_folder,
-        metavar="DIR",
-        help="all: folder of bench.json and bench.html (bench)",
-    )
-    add(
-        "--report",
-        action="store_true",
-        help="all, train: also print a table in Markdown of what the stages of a step took, beside"
-        " what they must take by the device's bandwidth and rate",
-    )
+    shared.add_set(parser, "train: a setting in place of the paper preset's")
     shared.add_json(parser)
     add(
         "--plot",
         type=shared.figure_file,
         metavar="FILE",
-        help="also draw time against error there (.png, .svg, .pdf)",
+        help="also draw a picture there (.png, .svg, .pdf)",
     )
+    shared.add_tolerance(parser)
+    shared.add_device(parser)
+
+
+def _seconds(text):
+    return shared.number(1, 86400)(text.removesuffix("s"))
 
 
 def run(options: argparse.Namespace) -> None:
@@ -142,69 +110,53 @@ def _refuse_foreign(options):
 
 def _run_all(options):
     from pp_cl.bench.overview import bench_overview
-    from pp_cl.bench.page import page_text
-    from pp_cl.config import configure
-    from pp_cl.files.atomic import write_json, write_text
+    from pp_cl.bench.plots import figure_of, plot_overview, save_figure
     from pp_cl.layers.choice import load_policy
 
-    if options.json or options.plot or options.tolerance is not None:
-        raise UserError("--json, --plot, --tolerance: of a single bench; name one, or use --out")
-    folder = Path(options.out or "bench")
-    folder.mkdir(parents=True, exist_ok=True)
+    figure = figure_of(options.plot)
     dev = _open_device(options)
     policy = load_policy(dev, preset("tiny").network.tolerance)
+    print(policy.origin)
     result = bench_overview(dev, policy, options.budget or 120, partial(print, flush=True))
-    write_json(folder / "bench.json", result)
-    write_text(folder / "bench.html", page_text(result))
-    if options.report:
-        training = result["training"]
-        stages = {name: row["ms"] for name, row in training["step_ms"].items()}
-        _print_report(dev, configure(preset("tiny"), "demo"), training["counts"], stages)
-    print(f"{result['seconds']:.0f} s; wrote {folder / 'bench.json'} and {folder / 'bench.html'}")
+    print(f"{result['seconds']:.0f} s")
+    shared.write_json_option(options.json, result)
+    if figure:
+        figure.suptitle(dev.name)
+        plot_overview(figure, result)
+        save_figure(figure, options.plot)
 
 
 def _run_raster(options):
-    from pp_cl.bench.plots import figure_of, save_figure
-    from pp_cl.bench.raster import HEAD, bench_raster, growth, line, plot
-    from pp_cl.bench.raster_scenes import SCENES, Case
+    from pp_cl.bench.plots import figure_of, plot_growth
+    from pp_cl.bench.raster import BLENDS, HEAD, bench_raster, growth, growth_line, line
+    from pp_cl.bench.raster_scenes import SCENES
 
     scene = options.scene or "grid"
     if scene not in SCENES:
         raise UserError(f"--scene {scene}: choose from {', '.join(SCENES)}")
     points = options.points or [10_000, 63_000, 250_000, 1_000_000, 4_000_000]
-    sizes = options.size or [200, 400, 800]
-    blends, taus = options.blend or BLENDS, options.tau or [0, 1e-4, 1e-3, 1e-2]
-    cases = [Case(blend, tau) for blend in blends for tau in taus]
+    sizes, blends = options.size or [200, 400, 800], options.blend or BLENDS
     gamma = options.gamma or 0.01  # the last one of a training, the sharpest
     figure = figure_of(options.plot)
     dev = _open_device(options)
-    print(HEAD)
-    rows = []
-    for row in bench_raster(dev, scene, points, sizes, cases=cases, gamma=gamma):
-        rows.append(row)
-        print(line(row), flush=True)
+    found = bench_raster(dev, scene, points, sizes, blends=blends, gamma=gamma)
+    rows = _print_rows(HEAD, line, found)
     fits = growth(rows)
     for fit in fits:
-        print(
-            f"side {fit['size']}, {fit['blend']}, tau {fit['tau']:g}: time grows as"
-            f" points^{fit['exponent']:.2f},"
-            f" at most ^{fit['steepest']:.2f} from one number to the next"
-        )
+        print(growth_line(fit))
     _write_json(options.json, dev, rows, growth=fits)
-    if figure:
-        plot(figure, f"raster, {scene}, gamma {gamma:g}, {dev.name}", rows)
-        save_figure(figure, options.plot)
+    _save_plot(figure, options, plot_growth, rows, f"raster, {scene}, gamma {gamma:g}, {dev.name}")
 
 
 def _run_train(options):
-    from pp_cl.bench.train import WIDTHS, bench_train
+    from pp_cl.bench.training import bench_step
     from pp_cl.config import configure
 
     config = configure(preset("paper"), options.scene or "demo", shared.read_set(options.set))
     if options.points:
         assign(config, "points.count", _one(options, "points"), "--points")
     dev = _open_device(options)
-    row = bench_train(dev, config, VIEWS, ROUNDS)
+    row = bench_step(dev, config)
     print(
         f"{row['points']} points, {row['pairs']} hits in a view, {row['shaded']:.0%} shaded,"
         f" {row['peak_device_bytes'] / 2**30:.2f} GiB at the peak"
@@ -212,26 +164,12 @@ def _run_train(options):
     for name, ms in row["stages_ms"].items():
         print(f"  {name:10s} {ms:9.2f} ms")
     print(f"forward {row['forward_ms']:.2f} ms, backward and update {row['backward_ms']:.2f} ms")
-    if options.report:
-        height, width = row["size"]
-        counts = {"points": row["points"], "pairs": row["pairs"], "height": height, "width": width}
-        counts["shaded"] = round(row["shaded"] * row["points"])
-        assign(config, "network.widths", WIDTHS, "bench")
-        stages = {name: ms for name, ms in row["stages_ms"].items() if name != "pairs"}  # kept ones
-        _print_report(dev, config, counts, stages)
     _write_json(options.json, dev, [row])
 
 
-def _print_report(dev, config, counts, stages_ms):
-    """A table to paste. counts: of estimate.Counts."""
-    from pp_cl.bench.estimate import Counts, report
-
-    print("", *report(dev, config, Counts(**counts), stages_ms), "", sep="\n")
-
-
 def _run_model(options):
-    from pp_cl.bench.model import HEAD, bench_models, line, plot
-    from pp_cl.bench.plots import figure_of, save_figure
+    from pp_cl.bench.model import HEAD, bench_models, line
+    from pp_cl.bench.plots import figure_of, plot_models
     from pp_cl.trained import load_run
 
     if not options.runs:
@@ -239,20 +177,14 @@ def _run_model(options):
     figure = figure_of(options.plot)
     dev = _open_device(options)
     runs = [load_run(dev, folder) for folder in options.runs.split(",")]
-    print(HEAD)
-    rows = []
-    for row in bench_models(runs):
-        rows.append(row)
-        print(line(row), flush=True)
+    rows = _print_rows(HEAD, line, bench_models(runs))
     _write_json(options.json, dev, rows)
-    if figure:
-        plot(figure, f"{runs[0].folder}, {dev.name}", rows)
-        save_figure(figure, options.plot)
+    _save_plot(figure, options, plot_models, rows, f"{runs[0].folder}, {dev.name}")
 
 
 def _run_network(options):
     from pp_cl.bench.conv import bench_conv
-    from pp_cl.bench.plots import figure_of, plot_time_and_error, save_figure
+    from pp_cl.bench.plots import figure_of, plot_time_and_error
     from pp_cl.bench.table import HEAD, line
     from pp_cl.bench.unet import bench_unet
     from pp_cl.layers.choice import load_policy
@@ -263,18 +195,37 @@ def _run_network(options):
     figure = figure_of(options.plot)
     dev = _open_device(options)
     policy = load_policy(dev, preset("tiny").network.tolerance if tolerance is None else tolerance)
-    print(f"{policy.origin}\n{HEAD}")
-    rows = []
-    bench = {"conv": bench_conv, "unet": bench_unet}[options.what]
-    for row in bench(dev, size, widths, policy, blocks=blocks):
-        rows.append(row)
-        print(line(row), flush=True)
+    print(policy.origin)
+    if options.what == "conv":
+        found = chain.from_iterable(bench_conv(dev, size, widths, policy, blocks=blocks))
+    else:
+        found = bench_unet(dev, size, widths, policy, blocks=blocks)
+    rows = _print_rows(HEAD, line, found)
     for direction, memory in {r["direction"]: r.get("memory_bytes") for r in rows}.items():
         if memory:
             print(f"the network's memory, {direction}: {memory / 2**20:.0f} MiB")
     _write_json(options.json, dev, rows)
+    title = f"{options.what}, {size} x {size}, {dev.name}"
+    _save_plot(figure, options, plot_time_and_error, rows, title)
+
+
+def _print_rows(head, line, found):
+    """The rows, each printed as soon as it is measured."""
+    print(head)
+    rows = []
+    for row in found:
+        rows.append(row)
+        print(line(row), flush=True)
+    return rows
+
+
+def _save_plot(figure, options, draw, rows, title):
+    """Draw the rows, if that was asked for."""
+    from pp_cl.bench.plots import save_figure
+
     if figure:
-        plot_time_and_error(figure, f"{options.what}, {size} x {size}, {dev.name}", rows)
+        axes = figure.add_subplot(title=title)
+        draw(axes, rows)
         save_figure(figure, options.plot)
 
 

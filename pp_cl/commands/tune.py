@@ -30,10 +30,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(options: argparse.Namespace) -> None:
     """Measure, print what is taken, store the tuning."""
     from pp_cl.bench import tune
-    from pp_cl.bench.estimate import network_layers
     from pp_cl.bench.table import TUNE_HEAD, blocking_line, tune_line
     from pp_cl.device.discover import open_device
     from pp_cl.layers.choice import CHOICES, make_policy, shipped_order
+    from pp_cl.network.layers import unet_layers
 
     config, training, size = _read_network(options)
     net = config.network
@@ -61,7 +61,8 @@ def run(options: argparse.Namespace) -> None:
         print(tune_line(case.name, row, chosen, shipped_order(kind, case.shape)[0]), flush=True)
 
     start = time.perf_counter()
-    cases = tune.network_cases(network_layers(config), training, size)
+    layers = unet_layers(net.widths, blocks=net.blocks, channels=net.channel_numbers)
+    cases = tune.network_cases(layers, training, size)
     tuning, shipped_ms = tune.run_tune(
         dev, cases, tolerance, on_blocking=show_blocking, on_row=show_row
     )

@@ -18,7 +18,6 @@ class Alpha(BlendWeights):
     """
 
     gain_by_pair = True
-    depends_on_depth = False
 
     @classmethod
     def own_table(cls, pixels: int, pairs: int) -> Table:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -14,7 +13,6 @@ from pp_cl.device.form import lanes, row_parts
 from pp_cl.raster.alpha import Alpha
 from pp_cl.raster.blend_weights import BlendWeights, PixelWeights
 from pp_cl.raster.pairs import Pairs
-from pp_cl.raster.project import Footprint, ProjectedPoints
 from pp_cl.raster.softmax import Softmax
 
 BLENDS: dict[str, type[BlendWeights]] = {"softmax": Softmax, "alpha": Alpha}  # raster.blend
@@ -46,7 +44,6 @@ class Blend:
     def __init__(
         self,
         dev: Device,
-        footprint: Footprint,
         weighing: BlendWeights,
         mean_gradient: bool = False,
     ):
@@ -57,7 +54,6 @@ class Blend:
             "LANES": lanes(dev, on_gpu=4),  # each work-item reads whole rows for its dot products
             "MEAN": int(mean_gradient),
             "GAIN_BY_PAIR": int(weighing.gain_by_pair),
-            **footprint.defines,
         }
         self._buffers = Buffers(dev)
 
@@ -119,56 +115,10 @@ class Blend:
         Points that are not shaded get zeros.
         """
         grads = self._buffers.grad_point_features, self._buffers.grad_opacity
-        self._launch_by_point(
-            "blend_backward",
-            gradient.pairs.points * self._row_parts,
-            gradient,
-            grad_point_features=grads[0],
-            grad_opacity=grads[1],
-        )
-        return grads
-
-    def backward_spheres(
-        self, gradient: BlendGradient, points: ProjectedPoints, opacity: Array, gamma: float
-    ) -> tuple[Array, Array]:
-        """(grad_positions (N, 3) in world axes, grad_radius (N,)) float32 of explicit spheres.
-
-        points, opacity, gamma: those of the forward pass.
-        """
-        pairs, n = gradient.pairs, gradient.pairs.points
-        grad_pair = self.dev.empty(gradient.weights.pair_weight.shape)
-        grad_positions, grad_radius = self.dev.empty((n, 3)), self.dev.empty((n,))
-        self._launch_by_point(
-            "blend_backward_pairs",
-            n,
-            gradient,
-            pair_point_closeness=pairs.pair_point_closeness,
-            grad_pair=grad_pair,
-        )
-        self._program(gradient.weights).launch(
-            "blend_backward_spheres",
-            n,
-            n=n,
-            radii=points.point_radius.size,
-            gamma=gamma if self.weighing.depends_on_depth else math.inf,
-            camera=points.camera_buffer,
-            point_radius=points.point_radius,
-            point_camera=points.point_camera,
-            opacity=opacity,
-            point_offset=pairs.point_offset,
-            pair_pixel=pairs.pair_pixel,
-            grad_pair=grad_pair,
-            grad_positions=grad_positions,
-            grad_radius=grad_radius,
-        )
-        return grad_positions, grad_radius
-
-    def _launch_by_point(self, kernel, size, gradient, **outputs):
-        """Launch a kernel that walks over the tracked pairs of each point."""
         pairs, weights = gradient.pairs, gradient.weights
         self._program(weights).launch(
-            kernel,
-            size,
+            "blend_backward",
+            pairs.points * self._row_parts,
             n=pairs.points,
             point_features=gradient.point_features,
             point_offset=pairs.point_offset,
@@ -177,8 +127,10 @@ class Blend:
             pair_role=weights.pair_role,
             grad_features=gradient.grad_features,
             rest_or_gain=gradient.rest_or_gain,
-            **outputs,
+            grad_point_features=grads[0],
+            grad_opacity=grads[1],
         )
+        return grads
 
     def _program(self, weights):
         return self.dev.program("raster/blend", HAS_ROLES=int(weights.has_roles), **self.defines)

@@ -50,12 +50,9 @@ class BlendWeights(ABC):
     """Computes blend weights and what their gradients need; the buffers grow and are reused.
 
     gain_by_pair: rest_or_gain() gives the gain of each pair, else the rest of each pixel.
-    depends_on_depth: the weights change with the depth of a hit, not only with the order of the
-    hits.
     """
 
     gain_by_pair: bool
-    depends_on_depth: bool
 
     def __init__(self, dev: Device):
         self.dev = dev

@@ -19,7 +19,6 @@ class Softmax(BlendWeights):
     """
 
     gain_by_pair = False
-    depends_on_depth = True
 
     @classmethod
     def own_table(cls, pixels: int, pairs: int) -> Table:

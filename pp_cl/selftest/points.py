@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import ArrayLike
 
+from pp_cl.bench.spheres import spheres_backward
 from pp_cl.device.device import Device
 from pp_cl.raster.blend import BLENDS, Blend
 from pp_cl.raster.blend_weights import DROPPED
@@ -115,9 +116,9 @@ class PairedPoints:
         """(H, W, 16) blended features; those of the points that are not shaded are set to NaN
         first. rule: of BLENDS. drops: of BlendWeights.compute().
         """
-        self.gamma, self.opacity = gamma, self.dev.upload(opacity, np.float32)
+        self.gamma, self.mean, self.opacity = gamma, mean, self.dev.upload(opacity, np.float32)
         self.weighing = BLENDS[rule](self.dev)
-        self.blending = Blend(self.dev, self.footprint, self.weighing, mean)
+        self.blending = Blend(self.dev, self.weighing, mean)
         self.weights = self.weighing.compute(
             self.pairs, self.camera_buffer, self.opacity, gamma, **drops
         )
@@ -154,8 +155,18 @@ class PairedPoints:
 
     def sphere_gradients(self, grad_features: np.ndarray) -> Gradients:
         """{"positions": (N, 3), "radius": (N,)} of the same."""
-        positions, radius = self.blending.backward_spheres(
-            self._gradient(grad_features), self.projected, self.opacity, self.gamma
+        gradient = self._gradient(grad_features)
+        positions, radius = spheres_backward(
+            self.dev,
+            self.projected,
+            self.pairs,
+            self.weights,
+            opacity=self.opacity,
+            gamma=self.gamma,
+            point_features=self.point_features,
+            grad_features=gradient.grad_features,
+            rest_or_gain=gradient.rest_or_gain,
+            mean=self.mean,
         )
         return {"positions": positions.get(), "radius": radius.get()}
 

@@ -9,5 +9,6 @@ from pp_cl.bench import peak, timing
 def quick(monkeypatch):
     """Short runs, and few of them."""
     monkeypatch.setattr(peak, "SECONDS", 0.0)
+    monkeypatch.setattr(peak, "COPY_BYTES", 2**16)
     monkeypatch.setattr(timing, "SECONDS", 0.0)
     monkeypatch.setattr(timing, "LEAST_ROUNDS", 2)

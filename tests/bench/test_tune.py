@@ -4,9 +4,10 @@ command as a user meets it.
 
 import json
 from collections import Counter
+from types import SimpleNamespace
 
 import pytest
-from support.tunings import tuning_of
+from support.tunings import row, tuning_of
 
 from pp_cl.bench import timing, tune
 from pp_cl.bench.conv import RandomConv
@@ -50,25 +51,13 @@ def cache(tmp_path, monkeypatch):
     return tmp_path / "cache"
 
 
-class Clock:
+@pytest.fixture
+def clock(monkeypatch):
     """Stands in for the module time: only what tests say takes time. measurement: number of the
     present call of time_runs(), from 1 on.
     """
-
-    def __init__(self):
-        self.now, self.measurement = 0.0, 0
-
-    def perf_counter(self):
-        return self.now
-
-    def sleep(self, seconds):
-        pass
-
-
-@pytest.fixture
-def clock(monkeypatch):
-    """The invented clock."""
-    made = Clock()
+    made = SimpleNamespace(now=0.0, measurement=0, sleep=lambda seconds: None)
+    made.perf_counter = lambda: made.now
     monkeypatch.setattr(timing, "time", made)
 
     def counted(runs):
@@ -125,11 +114,8 @@ def test_cases_of_a_network():
     # 13 convolutions, two of two sources
     assert counts == {FORWARD: 13, WEIGHTS: 13, INPUT: 15}
     evaluation = [c for c in cases if not c.training]
-    assert {c.direction for c in evaluation} == {FORWARD} and {c.side for c in evaluation} == {
-        200,
-        100,
-        50,
-    }
+    assert {c.direction for c in evaluation} == {FORWARD}
+    assert {c.side for c in evaluation} == {200, 100, 50}
     assert sum(c.count for c in evaluation) == 13
     assert all(c.training for c in network_cases(layers, 64, 64))
     assert sum(c.count for c in network_cases(layers, 64, 64)) == sum(counts.values())
@@ -149,58 +135,34 @@ def run_for(clock, name, runs, *seconds):
 
 
 def test_hopeless_runs_are_given_up(clock):
-    runs = Counter()
-    made = {n: run_for(clock, n, runs, s) for n, s in (("a", 1), ("b", 3.1), ("c", 2.9))}
-    assert time_runs(made) == pytest.approx({"a": 1e3, "b": 3.1e3, "c": 2.9e3})
-    assert runs["b"] < runs["a"] == runs["c"]
-
-
-def test_one_slow_probe_condemns_nobody(clock):
-    """The best of the probes counts: a machine that was busy for one run is not the variant's
-    fault.
-    """
-    runs = Counter()
-    made = {"a": run_for(clock, "a", runs, 1), "b": run_for(clock, "b", runs, 0.9, 9, 0.9)}
-    assert time_runs(made) == pytest.approx({"a": 1e3, "b": 0.9e3})
+    """By the best of the probes: a machine that was busy for one run is not the variant's fault."""
+    runs, seconds = Counter(), {"a": [1], "b": [3.1], "c": [2.9], "d": [1.1, 9, 1.1]}
+    made = {name: run_for(clock, name, runs, *times) for name, times in seconds.items()}
+    expected = {"a": 1e3, "b": 3.1e3, "c": 2.9e3, "d": 1.1e3}
+    assert time_runs(made) == pytest.approx(expected)
+    assert runs["b"] < runs["a"] == runs["c"] == runs["d"]
 
 
 @pytest.mark.usefixtures("cpu_form")
 def test_a_row_says_what_was_measured(dev, takes):
     takes(lambda variant, blocking, measurement: MS[variant])
-    row, shipped_ms = measured(dev)
-    assert {k: row[k] for k in ("direction", "k", "ci", "co", "pixels")} == {
-        "direction": "forward",
-        "k": 3,
-        "ci": 16,
-        "co": 32,
-        "pixels": 1024,
-    }
-    assert row["ms"] == pytest.approx(MS) and shipped_ms == pytest.approx(1.0)
-    assert row["ms"].keys() == row["rel_l2"].keys() == set(offered(device_class(dev)))
-    assert 0 < row["rel_l2"]["direct"] < row["rel_l2"]["winograd"] < 1e-5
+    found, shipped_ms = measured(dev)
+    about = [found[name] for name in ("direction", "k", "ci", "co", "pixels")]
+    assert about == ["forward", 3, 16, 32, 1024]
+    assert found["ms"] == pytest.approx(MS) and shipped_ms == pytest.approx(1.0)
+    assert found["ms"].keys() == found["rel_l2"].keys() == set(offered(device_class(dev)))
+    assert 0 < found["rel_l2"]["direct"] < found["rel_l2"]["winograd"] < 1e-5
 
 
 @pytest.mark.usefixtures("cpu_form")
-def test_the_times_of_all_that_seem_faster_are_those_of_the_second_measurement(dev, takes):
-    """The fastest may be beyond a tolerance, and the next one is then taken."""
-    first, second = MS | {"direct": 0.5}, {"direct": 0.6, "winograd": 1.1}
+@pytest.mark.parametrize("direct, chosen", [(0.6, "direct"), (1.2, "winograd")])
+def test_a_faster_variant_must_be_so_twice(dev, takes, direct, chosen):
+    """The times of the second measurement count: of the shipped variant, too."""
+    first, second = MS | {"direct": 0.5}, {"direct": direct, "winograd": 1.1}
     takes(lambda variant, blocking, measurement: (first, second)[measurement > 1][variant])
-    row, shipped_ms = measured(dev)
-    assert row["ms"] == pytest.approx(second) and shipped_ms == pytest.approx(1.1)
-
-
-@pytest.mark.usefixtures("cpu_form")
-@pytest.mark.parametrize("second, chosen", [(0.5, "direct"), (1.1, "winograd")])
-def test_a_faster_variant_must_be_so_twice(dev, takes, second, chosen):
-    def ms(variant, blocking, measurement):
-        if variant != "direct":
-            return MS[variant]
-        return second if measurement > 1 else 0.5
-
-    takes(ms)
-    row, shipped_ms = measured(dev)
-    assert row["ms"]["direct"] == pytest.approx(second) and shipped_ms == pytest.approx(1.0)
-    assert make_policy(dev, 1e-5, tuning_of(dev, [row])).choose(CASE.shape) == chosen
+    found, shipped_ms = measured(dev)
+    assert found["ms"] == pytest.approx(second) and shipped_ms == pytest.approx(1.1)
+    assert make_policy(dev, 1e-5, tuning_of(dev, [found])).choose(CASE.shape) == chosen
 
 
 @pytest.mark.usefixtures("cpu_form")
@@ -210,11 +172,11 @@ def test_with_another_blocking_the_shipped_one_is_timed_too(dev, takes):
         return 1.5 if shipped else MS[variant]
 
     takes(ms)
-    row, shipped_ms = measured(dev, blocking=TUNED)
-    assert shipped_ms == pytest.approx(1.5) and row["ms"] == pytest.approx(MS)
-    policy = make_policy(dev, 1e-5, tuning_of(dev, [row], TUNED))
+    found, shipped_ms = measured(dev, blocking=TUNED)
+    assert shipped_ms == pytest.approx(1.5) and found["ms"] == pytest.approx(MS)
+    policy = make_policy(dev, 1e-5, tuning_of(dev, [found], TUNED))
     # the network has the layer twice
-    assert total_times([CASE], [row], [shipped_ms], policy) == {
+    assert total_times([CASE], [found], [shipped_ms], policy) == {
         "a training step": pytest.approx((3.0, 2.0))
     }
 
@@ -261,17 +223,12 @@ def test_the_table_names_what_is_chosen_within_the_tolerance(dev, takes, monkeyp
 
 def test_an_earlier_tuning_of_other_layers_is_kept():
     def of(blocking, *rows):
-        rows = [
-            {"direction": "forward", "k": 3, "ci": ci, "co": 16, "pixels": 4, "ms": ms}
-            for ci, ms in rows
-        ]
-        return {"tile_shapes": blocking, "rows": rows}
+        return {"tile_shapes": blocking, "rows": [row(ci=ci, ms=ms) for ci, ms in rows]}
 
     new = of({}, (16, 1), (32, 2))
     assert merge(new, of({}, (32, 3), (64, 4))) == of({}, (16, 1), (32, 2), (64, 4))
-    assert (
-        merge(new, of({"winograd": (32, 8)}, (64, 4))) == new
-    )  # its times are of another blocking
+    # its times are of another blocking
+    assert merge(new, of({"winograd": (32, 8)}, (64, 4))) == new
 
 
 # ---- the command
@@ -289,11 +246,8 @@ def test_tune_stores_what_the_others_then_use(cache, capsys, monkeypatch):
         ("forward", 1, 64),
     }
     printed = capsys.readouterr().out
-    assert (
-        str(tuning_file(dev)) in printed
-        and "times as fast" in printed
-        and printed.count("enc0.a") == 3
-    )
+    assert str(tuning_file(dev)) in printed and "times as fast" in printed
+    assert printed.count("enc0.a") == 3
     assert [p.name for p in cache.iterdir()] == [tuning_file(dev).name]
     assert main(["bench", "unet", *SMALL]) == 0
     assert f"as tuned, {tuning_file(dev)}" in capsys.readouterr().out
@@ -313,7 +267,6 @@ def test_tune_stores_what_the_others_then_use(cache, capsys, monkeypatch):
     [
         ([], ((32, 64, 128), "single", 128, 200)),
         (["--preset", "small"], ((32, 64, 128), "single", 160, 400)),
-        (["--preset", "full"], ((32, 64, 128), "single", 256, 800)),
         (["--preset", "paper"], ((128, 256, 512), "double", 800, 800)),
         (["--size", "64"], ((32, 64, 128), "single", 64, 64)),
         (["--widths", "16,16,32", "--preset", "small"], ((16, 16, 32), "single", 160, 400)),
@@ -327,24 +280,11 @@ def test_network_and_sizes_asked_for(monkeypatch, words, network):
     assert called == [(unet_layers(widths, blocks=blocks), *sides)]
 
 
-@pytest.mark.parametrize(
-    "words, named",
-    [
-        (("--size", "30"), "--size"),
-        (("--widths", "16,32"), "--widths"),
-        (("--preset", "huge"), "--preset"),
-        (("--tolerance", "x"), "--tolerance"),
-        (("--tolerance", "-1"), "--tolerance"),
-        (("--tolerance", "2"), "--tolerance"),
-        (("--tolerance", "nan"), "--tolerance"),
-        (("--device", "abacus"), "abacus"),
-        (("fast",), "fast"),
-    ],
-)
-def test_bad_input_is_one_line(words, named, capsys, cache):
+@pytest.mark.parametrize("words", [("--size", "30"), ("--tolerance", "-1"), ("fast",)])
+def test_bad_input_is_one_line(words, capsys, cache):
     assert main(["tune", *SMALL, *words]) == 2
     captured = capsys.readouterr()
-    assert named in captured.err and captured.err.count("\n") == 1
+    assert words[0] in captured.err and captured.err.count("\n") == 1
     assert not cache.exists() or not list(cache.iterdir())
 
 
@@ -369,12 +309,5 @@ def test_where_nothing_can_be_stored_nothing_is_measured(tmp_path, monkeypatch, 
     temporary = tmp_path / f"{TEMPORARY_CACHE}x"
     temporary.mkdir()
     monkeypatch.setenv("XDG_CACHE_HOME", str(temporary))  # as device.py sets it for this process
-    with pytest.raises(UserError, match="nothing would be kept; set PP_CACHE"):
+    with pytest.raises(UserError, match="PP_CACHE"):
         tune.check_cache()
-
-
-def test_bench_conv_takes_no_tolerance_it_would_ignore(capsys):
-    assert main(["bench", "conv", *SMALL, "--tolerance", "1e-6"]) == 2
-    assert "--tolerance" in capsys.readouterr().err
-    assert main(["bench", "unet", *SMALL, "--tolerance", "1e-9"]) == 2
-    assert "tolerance 1e-09" in capsys.readouterr().err

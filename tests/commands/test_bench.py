@@ -1,103 +1,114 @@
-"""`pp-cl bench train`, and options that belong to another bench."""
+"""`pp-cl bench`: tables, files, and options that are refused."""
 
 import json
+import sys
 
 import pytest
-from support.bench_results import result
+from support.benches import KEYS
 from support.scenes import write_ball_scene
 
-from pp_cl.bench import estimate, overview
+from pp_cl.bench import overview, peak, timing
 from pp_cl.cli import main
+
+SMALL = {
+    "conv": ("--size", "8", "--widths", "16,16,16"),
+    "raster": ("--points", "60,500", "--size", "12,20"),
+}
+
+
+@pytest.fixture(autouse=True)
+def quick(monkeypatch):
+    """Short runs, and few of them."""
+    monkeypatch.setattr(peak, "COPY_BYTES", 2**16)
+    monkeypatch.setattr(peak, "SECONDS", 0.0)
+    monkeypatch.setattr(timing, "SECONDS", 0.0)
+    monkeypatch.setattr(timing, "LEAST_ROUNDS", 2)
+
+
+def bench(tmp_path, *words):
+    """What the bench wrote with --json."""
+    file = tmp_path / "b.json"
+    assert main(["bench", *words, "--json", str(file)]) == 0
+    return json.loads(file.read_text())
+
+
+def test_the_network_prints_and_writes_its_rows(tmp_path, capsys):
+    result = bench(tmp_path, "conv", *SMALL["conv"])
+    assert result["device"] and all(row.keys() >= KEYS for row in result["rows"])
+    printed = capsys.readouterr().out
+    rows = [row for row in result["rows"] if row["layer"] == "enc0.a"]
+    assert printed.count("enc0.a") == len(rows) > 3 and "GFLOP/s" in printed
+
+
+def test_the_rasteriser_prints_and_writes_its_rows(tmp_path, capsys):
+    result = bench(tmp_path, "raster", *SMALL["raster"])
+    assert result["device"] and len(result["rows"]) == 8 and len(result["growth"]) == 4
+    printed = capsys.readouterr().out
+    assert printed.count("grid ") == 8 and printed.count("time grows as") == 4
 
 
 def test_train_prints_and_writes_its_row(tmp_path, capsys):
-    scene, file = write_ball_scene(tmp_path / "ball", size=40), tmp_path / "b.json"
-    words = ["--scene", scene, "--points", "1500", "--set", "raster.tau=0.001"]
-    assert main(["bench", "train", *words, "--json", str(file)]) == 0
-    printed, result = capsys.readouterr().out, json.loads(file.read_text())
-    (row,) = result["rows"]
+    scene = write_ball_scene(tmp_path / "ball", size=40)
+    words = ["--scene", scene, "--points", "1500", "--set", "raster.early_stop=0.001"]
+    result = bench(tmp_path, "train", *words)
+    (row,), printed = result["rows"], capsys.readouterr().out
     assert result["device"] and f"{row['points']} points" in printed
     assert all(name in printed for name in row["stages_ms"])
-    assert "estimated" not in printed
 
 
-def test_train_reports_beside_an_estimate(tmp_path, capsys, monkeypatch):
-    monkeypatch.setattr(estimate, "measured_card", lambda dev: estimate.Card(1e9, 1e12))
-    scene = write_ball_scene(tmp_path / "ball", size=40)
-    assert main(["bench", "train", "--scene", scene, "--points", "1500", "--report"]) == 0
-    lines = capsys.readouterr().out.splitlines()
-    first = lines.index("| stage | measured, ms | estimated from these rates, ms |")
-    rows = [line.split("|")[1:-1] for line in lines[first + 2 :] if line]
-    # the pairs are kept, not built
-    assert [row[0].strip() for row in rows] == [
-        *("project", "weights", "shade", "blend", "backward", "update")
-    ]
-    measured, estimated = ([float(row[i]) for row in rows] for i in (1, 2))
-    assert min(measured) > 0 and min(estimated) > 0
-    # of a network of 16 channels: the paper's takes more than 0.1 s at 1 GB/s
-    assert estimated[-1] < 50
+def test_all_prints_its_tables_and_writes_its_numbers(tmp_path, capsys, monkeypatch):
+    def found(dev, policy, budget, tell):
+        tell("a table")
+        return {"budget": budget, "seconds": 2.6}
+
+    monkeypatch.setattr(overview, "bench_overview", found)
+    assert bench(tmp_path, "--budget", "3s") == {"budget": 3.0, "seconds": 2.6}
+    assert capsys.readouterr().out.endswith("a table\n3 s\n")
+
+
+@pytest.mark.parametrize("what", SMALL)
+def test_a_plot_is_drawn(tmp_path, what):
+    pytest.importorskip("matplotlib", reason="pictures need the extra `plot`")
+    file = tmp_path / "b.png"
+    assert main(["bench", what, *SMALL[what], "--plot", str(file)]) == 0
+    assert file.read_bytes().startswith(b"\x89PNG")
+
+
+def test_without_matplotlib_a_plot_is_refused(tmp_path, monkeypatch, capsys):
+    monkeypatch.setitem(sys.modules, "matplotlib.figure", None)
+    assert main(["bench", "--plot", str(tmp_path / "b.png")]) == 2
+    assert "pp-cl[plot]" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(
     "words, named",
     [
+        (["--budget", "0"], "--budget"),
+        (["--budget", "long"], "--budget"),
+        (["all", "--size", "64"], "--size"),
+        (["--tolerance", "1e-5"], "--tolerance"),
+        (["conv", "--tolerance", "1e-5"], "--tolerance"),
+        (["conv", "--points", "9"], "--points"),
+        (["unet", "--tolerance", "1e-9"], "tolerance 1e-09"),
+        (["unet", "--budget", "9"], "--budget"),
+        (["unet", "--scene", "demo"], "--scene"),
+        (["unet", "--blocks", "triple"], "double, single, gated"),
+        (["unet", "--json", "/nowhere/b.json"], "--json"),
+        (["unet", "--plot", "b.xyz"], "--plot"),
+        (["unet", "--device", "abacus"], "abacus"),
+        (["raster", "--set", "train.seed=1"], "--set"),
+        (["raster", "--gamma", "0.1,0.2"], "--gamma"),
+        (["raster", "--points", "0"], "--points"),
+        (["raster", "--blend", "alpha,beta"], "--blend"),
+        (["raster", "--widths", "16,16,16"], "--widths"),
+        (["raster", "--scene", "moon"], "--scene"),
         (["train", "--points", "10,20"], "--points 10,20: write one number"),
         (["train", "--set", "train.sped=1"], "train.sped"),
         (["train", "--scene", "/nowhere"], "/nowhere"),
-        (["train", "--tau", "0"], "--tau"),
         (["train", "--plot", "b.png"], "--plot"),
-        (["raster", "--set", "train.seed=1"], "--set"),
-        (["unet", "--scene", "demo"], "--scene"),
-        (["raster", "--gamma", "0.1,0.2"], "--gamma"),
     ],
 )
-def test_options_of_another_bench_are_one_line(words, named, capsys):
+def test_bad_input_is_one_line(words, named, capsys):
     assert main(["bench", *words]) == 2
     error = capsys.readouterr().err
     assert named in error and error.count("\n") == 1
-
-
-def test_all_writes_a_page_and_its_numbers(tmp_path, capsys, monkeypatch):
-    monkeypatch.setattr(overview, "bench_overview", lambda dev, policy, budget, tell: result())
-    assert main(["bench", "--budget", "3s", "--out", str(tmp_path / "page")]) == 0
-    assert json.loads((tmp_path / "page" / "bench.json").read_text()) == result()
-    assert "<h2>Time against error</h2>" in (tmp_path / "page" / "bench.html").read_text()
-    printed = capsys.readouterr().out
-    assert str(tmp_path / "page" / "bench.html") in printed and "estimated" not in printed
-
-
-def test_all_reports_beside_an_estimate(tmp_path, capsys, monkeypatch):
-    counts = {"points": 1000, "pairs": 5000, "shaded": 400, "height": 64, "width": 32}
-    found = result()
-    found["training"]["counts"] = counts
-    monkeypatch.setattr(overview, "bench_overview", lambda dev, policy, budget, tell: found)
-    monkeypatch.setattr(estimate, "measured_card", lambda dev: estimate.Card(1e9, 1e12))
-    assert main(["bench", "--report", "--out", str(tmp_path / "page")]) == 0
-    printed = capsys.readouterr().out
-    assert "tiny, 1000 points, 5000 hits and 400 shaded points in 32x64 pixels" in printed
-    assert "\n| project | 33.2 | 0.037 |\n" in printed  # 32 bytes a point, and a launch
-
-
-@pytest.mark.parametrize(
-    "words, named",
-    [
-        (["unet", "--report"], "--report"),
-        (["--budget", "0"], "--budget"),
-        (["--budget", "long"], "--budget"),
-        (["--json", "b.json"], "--json"),
-        (["all", "--size", "64"], "--size"),
-        (["unet", "--budget", "9"], "--budget"),
-        (["--tolerance", "1e-5"], "--tolerance"),
-    ],
-)
-def test_all_refuses_in_one_line(words, named, capsys):
-    assert main(["bench", *words]) == 2
-    error = capsys.readouterr().err
-    assert named in error and error.count("\n") == 1
-
-
-def test_a_folder_that_cannot_be_made_is_one_line(tmp_path, capsys):
-    (tmp_path / "file").write_text("x")
-    assert main(["bench", "--out", str(tmp_path / "file")]) == 2
-    error = capsys.readouterr().err
-    assert str(tmp_path / "file") in error and error.count("\n") == 1

@@ -32,7 +32,7 @@ FLIPS = [
     ("raster/blend", "sum + (1.0f - weights)", "sum + (1.0f + weights)", "softmax: forward, soft"),
     ("raster/alpha", "+ g - B;", "+ g + B;", "alpha: backward, disc"),
     ("raster/alpha", "front.x - behind.x", "front.x + behind.x", "alpha: spread"),
-    ("raster/blend", "dL_dR -= dL_ddepth", "dL_dR += dL_ddepth", "softmax: gradients of spheres"),
+    ("bench/spheres", "dL_dR -= dL_ddepth", "dL_dR += dL_ddepth", "softmax: gradients of spheres"),
     ("layers/conv", "[p] += value", "[p] -= value", "conv: direct, hard inputs"),
     ("layers/conv_backward_weights", "[i] += value", "[i] -= value", "conv: direct, hard inputs"),
     ("layers/conv_local", "+ p] += v", "+ p] -= v", "conv: local, hard inputs"),

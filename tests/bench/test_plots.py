@@ -1,0 +1,63 @@
+"""What is drawn, on axes that remember it, and that matplotlib can draw it."""
+
+from unittest.mock import MagicMock
+
+import pytest
+
+from pp_cl.bench.plots import figure_of, plot_models, plot_overview, save_figure
+
+
+def network_row(variant, direction, ms, side):
+    return {
+        "variant": variant, "direction": direction, "ms": ms, "shape": [side], "rel_l2": 0.0
+    }  # fmt: skip
+
+
+def raster_row(points, ms):
+    return {
+        "size": 200, "blend": "alpha", "points": points, "ms": ms, "ms_range": [ms - 1, ms + 2]
+    }  # fmt: skip
+
+
+RESULT = {
+    "unet": [
+        network_row("direct", "forward", 9.0, 64),
+        network_row("direct", "forward", 2.0, 128),
+        network_row("winograd", "train", 3.0, 128),
+    ],
+    "raster": [raster_row(2000, 8.0), raster_row(1000, 6.0)],
+    "training": {
+        "curve": [{"step": 9, "seconds": 4.5, "psnr": 21.25}],
+        "step_ms": {"project": {"ms": 1.0}, "network": {"ms": 2.0}, "update": {"ms": 3.0}},
+        "frame_ms": {"project": {"ms": 0.5}, "network": {"ms": 1.5}},
+    },
+}
+
+
+def test_all_benches_are_on_one_picture():
+    figure, axes = MagicMock(), [MagicMock() for _ in range(4)]
+    figure.subplots.return_value.ravel.return_value = axes
+    plot_overview(figure, RESULT)
+    network, raster, quality, stages = axes
+    drawn = {call.kwargs["label"]: call.args[:2] for call in network.plot.call_args_list}
+    assert drawn["direct, forward"] == ([2.0], [1e-9])  # of the largest image, error 0
+    assert drawn["winograd, train"] == ([3.0], [1e-9]) and drawn["direct, train"] == ([], [])
+    (curve,) = raster.errorbar.call_args_list
+    assert curve.args[0] == [1000, 2000] and curve.args[1].tolist() == [6.0, 8.0]
+    assert [list(side) for side in curve.kwargs["yerr"]] == [[1.0, 1.0], [2.0, 2.0]]
+    assert quality.plot.call_args.args == ([4.5], [21.25])
+    assert [list(call.args[1]) for call in stages.barh.call_args_list] == [[3, 2, 1], [1.5, 0.5]]
+    assert stages.set_yticks.call_args.args[1] == ["update", "network", "project"]
+
+
+def test_matplotlib_draws_them(tmp_path):
+    pytest.importorskip("matplotlib", reason="pictures need the extra `plot`")
+    rows = [{"what": what, "speed": 1.0, "loss": 0.1} for what in ("a", "keep 0.5", "keep 0.25")]
+    whole, models = tmp_path / "whole.png", tmp_path / "models.svg"
+    figure = figure_of(str(whole))
+    plot_overview(figure, RESULT)
+    save_figure(figure, str(whole))
+    figure = figure_of(str(models))
+    plot_models(figure.add_subplot(), rows)
+    save_figure(figure, str(models))
+    assert whole.read_bytes().startswith(b"\x89PNG") and "<svg" in models.read_text()
