@@ -122,21 +122,6 @@ def test_a_scene_whose_pixels_have_changed_is_refused(scene, tmp_path, capsys, m
     assert (out / "checkpoint.npz").read_bytes() == before
 
 
-def test_a_checkpoint_without_digests_goes_on_with_one_line(
-    scene, finished, tmp_path, capsys, monkeypatch
-):
-    out = tmp_path / "run"
-    train_and_interrupt(scene, out, 15, monkeypatch)
-    header, arrays = load_checkpoint(out / "checkpoint.npz")
-    del header["format"], header["pixels"]
-    save_checkpoint(out / "checkpoint.npz", header, arrays)
-    capsys.readouterr()
-    assert main(arguments(scene, out)) == 0
-    told = [line for line in capsys.readouterr().err.splitlines() if "digests" in line]
-    assert len(told) == 1 and str(out / "checkpoint.npz") in told[0]
-    assert (out / "checkpoint.npz").read_bytes() == (finished / "checkpoint.npz").read_bytes()
-
-
 @pytest.mark.parametrize("steps", [25, 5, 60])
 def test_another_scene_is_refused_at_any_state_of_the_run(
     scene, tmp_path, capsys, monkeypatch, steps

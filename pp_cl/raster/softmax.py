@@ -1,6 +1,4 @@
-"""The blend of Eq. (1), a softmax over the hits of a pixel, and which hits are dropped because they
-change a pixel by less than a bound.
-"""
+"""The blend of Eq. (1), a softmax over the hits of a pixel, and its early stop."""
 
 from __future__ import annotations
 
