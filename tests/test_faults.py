@@ -29,7 +29,7 @@ from support.scenes import write_ball_scene
 ROOT = Path(__file__).parents[1]
 ALL = os.environ.get("FAULTS") == "all"
 PARTS = range(8 if ALL else 1)  # that workers share
-KILLS = 20 if ALL else 2  # of a part
+KILLS = 8 if ALL else 2  # of a part
 pytestmark = [
     pytest.mark.skipif(not sys.platform.startswith("linux"), reason="asks /proc"),
     pytest.mark.filterwarnings("error::pytest.PytestUnraisableExceptionWarning"),
