@@ -208,7 +208,7 @@ def test_eval_of_nothing_and_of_broken_runs(tmp_path, capsys):
     run = tmp_path / "run"
     run.mkdir()
     (run / "config.json").write_text("{}")
-    assert "preset" in failure(capsys, "eval", run)
+    assert "format" in failure(capsys, "eval", run)
     config = preset("tiny")
     config.scene.path = "demo"
     (run / "config.json").write_text(config.to_json())

@@ -52,7 +52,7 @@ def plan_runs(
     """The runs, seed by seed. given: settings of all of them. Raises UserError as sweep.plan."""
     varied = read_varied([f"network.blocks={','.join(BLOCKS)}"])
     given = [*given, ("train.iterations", str(steps), "--steps")]
-    jobs, _ = plan([scene], out, seeds, varied, given=given, metrics=METRICS)
+    jobs = plan([scene], out, seeds, varied, given=given, metrics=METRICS)
     return sorted(jobs, key=lambda job: job.seed)
 
 

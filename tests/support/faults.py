@@ -127,7 +127,7 @@ def run_command(words, run=""):
         except Exception as error:
             return 1, [repr(error)]
     lines = errors.getvalue().splitlines()
-    told = [line for line in lines if line.startswith("pp-cl: ")]
+    told = [line for line in lines if line.startswith(("pp-cl: ", "pp-cl "))]
     wrong = [] if status in (0, 2) else [f"status {status}"]
     if status and (len(told) != 1 or lines[-1] != told[0] or str(run) not in told[0]):
         wrong.append(f"{len(told)} lines tell of it: {lines[-3:]}")

@@ -192,7 +192,7 @@ def command(*words):
     lines = [line for line in err.getvalue().splitlines() if line]
     assert status in (0, 2, 130), lines[-1:]
     if status == 2:
-        assert lines and lines[-1].startswith("pp-cl: "), lines[-1:]
+        assert lines and lines[-1].startswith(("pp-cl: ", "pp-cl ")), lines[-1:]
         assert "no memory left" not in lines[-1]
         check_line(lines[-1])
     return status
