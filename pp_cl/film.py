@@ -2,10 +2,9 @@
 
 import hashlib
 import json
-import shutil
 import time
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -24,6 +23,7 @@ from pp_cl.trained import Run
 
 MOST_IDENTITY = 1000  # bytes of it
 IDENTITY = "frames.json"  # in the folder of the frames: what they show
+LOCK = ".lock"
 
 
 @dataclass(frozen=True)
@@ -43,8 +43,7 @@ class Style:
 class Frames:
     """The frames of a run along a path, in a folder of their own.
 
-    replace: frames that are there and show something else make room. Raises UserError where the
-    folder cannot be written, or holds other files, or such frames and they are not replaced.
+    replace: frames that are there and show something else make room.
     """
 
     def __init__(
@@ -57,10 +56,9 @@ class Frames:
         replace: bool = False,
     ):
         self.run, self.cameras, self.folder, self.style = run, cameras, folder, style
+        self._replace = replace
         self.paths = [folder / f"{i:05d}.{style.suffix}" for i in range(len(cameras))]
         self._identity = {"frames": self._digest(), "count": len(cameras)}
-        self._check_folder(replace)
-        check_target(folder / IDENTITY)
         # Python stands for bytes that are no UTF-8 by these
         if style.suffix == "exr" and any("\udc80" <= c <= "\udcff" for c in str(folder)):
             raise UserError(
@@ -76,10 +74,8 @@ class Frames:
             digest.update(self.run.model.packed(camera).tobytes())
         return digest.hexdigest()
 
-    def _check_folder(self, replace):
-        if self.folder.exists() and not self.folder.is_dir():
-            raise UserError(f"{self.folder}: is not a folder; choose another --out")
-        if not self.folder.exists() or all(p.name.startswith(".") for p in self.folder.iterdir()):
+    def _check_folder(self):
+        if all(p.name.startswith(".") for p in self.folder.iterdir()):
             return
         file = self.folder / IDENTITY
         try:
@@ -88,7 +84,7 @@ class Frames:
             raise UserError(
                 f"{self.folder}: holds files that are no frames; choose another --out"
             ) from None
-        if there != self._identity and not replace:
+        if there != self._identity and not self._replace:
             raise UserError(
                 f"{self.folder}: holds frames of another model or path; choose another --out, or"
                 " delete it"
@@ -98,10 +94,11 @@ class Frames:
                 frame.unlink()
 
     def render(self, on_frame: Callable[[float | None], None]) -> None:
-        """Render the frames that are not there yet; on_frame is called after each one with its
-        seconds, None for one that was there.
+        """Render the frames that are not there yet into the folder, which this process owns;
+        on_frame is called after each one with its seconds, None for one that was there. Raises
+        UserError where it holds other files, or other frames and they are not replaced.
         """
-        self.folder.mkdir(parents=True, exist_ok=True)
+        self._check_folder()
         remove_leftovers(self.folder)
         write_json(self.folder / IDENTITY, self._identity)
         for camera, path in zip(self.cameras, self.paths, strict=True):
@@ -131,27 +128,46 @@ class Frames:
 
 
 @contextmanager
+def owned_folder(folder: Path, out: Path) -> Iterator[None]:
+    """While the block runs, no other process renders into the folder, which is made where it is
+    missing, and removed where it is empty in the end. Raises UserError naming `out` where another
+    does, or where it cannot be made.
+    """
+    if folder.exists() and not folder.is_dir():
+        raise UserError(f"{folder}: is not a folder; choose another --out")
+    check_target(folder / LOCK)
+    folder.mkdir(parents=True, exist_ok=True)
+    lock = FileLock(folder / LOCK, timeout=0)
+    try:
+        lock.acquire()
+    except Timeout:
+        raise UserError(
+            f"{out}: another process makes it; wait for its end, or choose another --out"
+        ) from None
+    try:
+        yield
+    finally:
+        # before the release: whoever comes next makes another
+        (folder / LOCK).unlink(missing_ok=True)
+        lock.release()
+        with suppress(OSError):
+            folder.rmdir()
+
+
+@contextmanager
 def film_folder(film: Path) -> Iterator[Path]:
     """A hidden folder beside a film, for its frames: removed when the block ends well, else kept
     for the next time. Raises UserError where the film cannot be written, or another process makes
     it.
     """
     check_file(film)
-    folder = film.with_name(f".{film.name}.frames")
-    check_target(folder)
-    folder.mkdir(parents=True, exist_ok=True)
-    lock = FileLock(folder / ".lock", timeout=0)
-    try:
-        lock.acquire()
-    except Timeout:
-        raise UserError(
-            f"{film}: another process makes it; wait for its end, or choose another --out"
-        ) from None
-    is_kept = True
-    try:
-        yield folder
-        is_kept = False
-    finally:
-        lock.release()
-        if not (is_kept and any(folder.glob("*.png"))):
-            shutil.rmtree(folder, ignore_errors=True)
+    folder, is_kept = film.with_name(f".{film.name}.frames"), True
+    with owned_folder(folder, film):
+        try:
+            yield folder
+            is_kept = False
+        finally:
+            if not (is_kept and any(folder.glob("*.png"))):
+                for file in set(folder.iterdir()) - {folder / LOCK}:
+                    with suppress(OSError):
+                        file.unlink()

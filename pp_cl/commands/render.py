@@ -72,6 +72,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="F",
         help=f"frames per second ({FPS})",
     )
+    _add_style(parser)
+    shared.add_run_scene(parser)
+    shared.add_device(parser)
+
+
+def _add_style(parser):
+    """Options of how a frame is rendered."""
+    add = parser.add_argument
     add(
         "--background",
         type=_colour,
@@ -87,15 +95,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="per pixel: 1, 4, 9 or 16",
     )
     add("--features", action="store_true", help="in exr: the 16 features of each pixel too")
-    shared.add_run_scene(parser)
-    shared.add_device(parser)
 
 
 def run(options: argparse.Namespace) -> None:
     """Render the frames that are missing, and make a film of them where one is asked for."""
     from pp_cl.device.discover import open_device
     from pp_cl.files.video import check_video
-    from pp_cl.film import Frames, film_folder
+    from pp_cl.film import Frames, film_folder, owned_folder
     from pp_cl.trained import load_run
 
     kind = _format(options)
@@ -117,7 +123,8 @@ def run(options: argparse.Namespace) -> None:
             seconds = _render_with_bar(frames)
             frames.write_film(out, options.fps)
     else:
-        seconds = _render_with_bar(Frames(run, cameras, out, style))
+        with owned_folder(out, out):
+            seconds = _render_with_bar(Frames(run, cameras, out, style))
     made = f"{len(seconds)} of {len(cameras)} frames"
     if seconds:
         made += f", {sorted(seconds)[len(seconds) // 2] * 1e3:.0f} ms each on {run.dev.name}"

@@ -25,8 +25,9 @@ DEFAULT_LOCAL = {1: (64,), 2: (16, 4), 3: (16, 4, 1)}
 # multiply-adds take half a second where 100 GFLOP/s are reached; see docs/devices.md.
 MOST_MULTIPLY_ADDS = 25e9
 
-# Shapes and sizes of launches that a kernel remembers, so that it checks and rounds them once.
-REMEMBERED = 4096
+# Shapes and sizes of launches that a kernel remembers, so that it checks and rounds them once: more
+# than a network's layers have. The numbers of visible points, new in each step, would fill memory.
+REMEMBERED = 64
 
 
 class Kernel:

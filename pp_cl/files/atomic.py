@@ -42,7 +42,7 @@ def atomic_file(path: Path | str) -> Iterator[BinaryIO]:
         os.replace(temporary, path)
         _sync_folder(path.parent)
     except OSError as error:
-        raise UserError(f"{path}: cannot be written ({error.strerror}); {mend(error)}") from error
+        raise _refusal(path, error) from error
     finally:
         _remove(temporary)
 
@@ -53,12 +53,24 @@ def _temporary(path):
 
 
 def mend(error: OSError) -> str:
-    """What to do about a file that cannot be written."""
+    """What to do about a file that cannot be opened or written."""
     if error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG):
         return "free some space"
+    if error.errno in (errno.EMFILE, errno.ENFILE):
+        return "allow more open files (ulimit -n)"
     if error.errno == errno.ENAMETOOLONG:
         return "choose a shorter name"
     return "check the folder, its permissions and the disk"
+
+
+def _refusal(path, error):
+    """The UserError of a path that cannot be written. error: an OSError, or one of a library."""
+    if isinstance(error, OSError) and error.errno:
+        return UserError(f"{path}: cannot be written ({error.strerror}); {mend(error)}")
+    reason = " ".join(str(error).split())[:120]
+    return UserError(
+        f"{path}: cannot be written ({reason}); check the folder, its permissions and free space"
+    )
 
 
 def _remove(temporary):
@@ -79,11 +91,7 @@ def atomic_path(path: Path) -> Iterator[Path]:
         yield temporary
         os.replace(temporary, path)
     except (OSError, RuntimeError) as error:  # libraries in C++ raise the latter
-        reason = " ".join(str(error).split())[:120]
-        raise UserError(
-            f"{path}: cannot be written ({reason}); check the folder, its permissions and free"
-            " space"
-        ) from error
+        raise _refusal(path, error) from error
     finally:
         _remove(temporary)
 
@@ -92,7 +100,8 @@ def atomic_path(path: Path) -> Iterator[Path]:
 def atomic_folder(folder: Path) -> Iterator[Path]:
     """A temporary folder that appears as `folder` only when the block ends well.
 
-    Raises UserError if that holds something, or cannot be written.
+    Raises UserError if that holds something, or cannot be written; one of a file in the temporary
+    folder names the place that it would have had.
     """
     folder = folder.resolve()
     check_new_folder(folder)
@@ -102,9 +111,9 @@ def atomic_folder(folder: Path) -> Iterator[Path]:
         yield unfinished
         os.replace(unfinished, folder)
     except OSError as error:
-        raise UserError(
-            f"{folder}: cannot be written ({error.strerror}); check permissions and free space"
-        ) from error
+        raise _refusal(folder, error) from error
+    except UserError as error:
+        raise UserError(str(error).replace(str(unfinished), str(folder))) from error
     finally:
         shutil.rmtree(unfinished, ignore_errors=True)
 
@@ -135,7 +144,7 @@ def check_target(path: Path) -> None:
             tried = tried.parent
         _temporary(tried).touch()
     except OSError as error:
-        raise UserError(f"{path}: cannot be written ({error.strerror}); {mend(error)}") from None
+        raise _refusal(path, error) from None
     finally:
         _remove(_temporary(tried))
 

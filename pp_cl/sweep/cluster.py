@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from typing import Any
 
-from pp_cl.errors import UserError
+from pp_cl.errors import UserError, one_line
 from pp_cl.sweep.plan import Job
 from pp_cl.sweep.result import failed_row
 from pp_cl.sweep.task import run_task
@@ -44,7 +44,7 @@ class _Deaf(WorkerPlugin):
 def local_client(devices: Sequence[str], workers: int) -> Iterator[Client]:
     """Dask with `workers` processes on this machine, which take the devices in turn, as indices of
     `pp-cl devices`. They listen on the loopback address alone, and only who has the certificate of
-    this very cluster can talk to them.
+    this very cluster can talk to them. Raises UserError where they do not start.
     """
     security = Security.temporary()
     place = {
@@ -67,9 +67,23 @@ def local_client(devices: Sequence[str], workers: int) -> Iterator[Client]:
     with ExitStack() as stack:
         stack.enter_context(dask.config.set(settings))
         scheduler = {"cls": Scheduler, "options": place | {"port": 0}}
-        cluster = SpecCluster(specs, scheduler, security=security, silence_logs=logging.CRITICAL)
-        stack.enter_context(cluster)
-        yield stack.enter_context(Client(cluster))
+        silent = {"silence_logs": logging.CRITICAL}
+        try:
+            cluster = SpecCluster(specs, scheduler, security=security, **silent)
+            client = Client(stack.enter_context(cluster))
+        except (OSError, RuntimeError) as error:
+            raise UserError(
+                f"the workers do not start ({_root(error)}); lower --workers, or raise the limits"
+                " of this shell (ulimit -a)"
+            ) from error
+        yield stack.enter_context(client)
+
+
+def _root(error):
+    """The error that began a chain of them."""
+    while error.__cause__ or error.__context__:
+        error = error.__cause__ or error.__context__
+    return one_line(error)
 
 
 @contextmanager

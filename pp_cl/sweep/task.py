@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from pp_cl.errors import UserError
+from pp_cl.files.atomic import mend
 from pp_cl.sweep.plan import Job
 from pp_cl.sweep.result import failed_row, finished_row
 
@@ -41,10 +42,14 @@ def supervise(job: Job, is_wanted: Callable[[], bool], worker: str) -> dict[str,
         return failed_row(
             job, f"{job.log.parent}: not there for worker {worker}; all must see the same files"
         )
-    with open(job.log, "ab") as log:
+    # unbuffered: a failed write leaves nothing that closing would try to write again
+    with open(job.log, "ab", buffering=0) as log:
         now = f"{datetime.now():%Y-%m-%d %H:%M:%S}"
-        log.write(f"{now} on worker {worker}, process {os.getpid()}\n".encode())
-        log.flush()
+        try:
+            log.write(f"{now} on worker {worker}, process {os.getpid()}\n".encode())
+        except OSError as error:
+            problem = f"cannot be written ({error.strerror}); {mend(error)}"
+            return failed_row(job, f"{job.log}: {problem}")
         begin = log.tell()
         process = subprocess.Popen(
             COMMAND, stdin=subprocess.PIPE, stdout=log, stderr=subprocess.STDOUT

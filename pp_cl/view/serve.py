@@ -58,7 +58,8 @@ def serve(
         contextlib.closing(_listen(host, port)) as listening,
         contextlib.suppress(KeyboardInterrupt),
     ):
-        signal.signal(signal.SIGTERM, signal.default_int_handler)
+        # asyncio ends its tasks one by one at Ctrl-C, and knows no other signal
+        signal.signal(signal.SIGTERM, lambda *_: signal.raise_signal(signal.SIGINT))
         access = Access(host, listening.getsockname()[1])
         live = LiveRun(open_device(device), folder, scene)
         asyncio.run(_serve(live, access, listening, announce=announce, parent=parent))

@@ -66,6 +66,18 @@ def test_a_film_that_was_interrupted_goes_on(trained, tmp_path, capsys, monkeypa
         assert read.get_length() == 4
 
 
+def test_a_folder_of_frames_has_one_writer(trained, tmp_path, capsys):
+    """Else two that begin at a time mix their frames."""
+    out = tmp_path / "frames"
+    words = ["render", trained, "--out", str(out), "--seconds", "0.2", "--fps", "10"]
+    out.mkdir()
+    with FileLock(out / ".lock"):
+        assert main(words) == 2
+    assert "frames: another process" in capsys.readouterr().err
+    assert main(words) == 0
+    assert {path.name for path in out.iterdir()} == {"00000.png", "00001.png", "frames.json"}
+
+
 def test_sizes_have_folders_of_their_own_and_need_no_scene(trained, capsys):
     """The run's name is no UTF-8, and its scene is gone."""
     run = Path(trained)

@@ -1,5 +1,6 @@
 """`pp-cl view` as a process, and beside a training."""
 
+import asyncio
 import json
 import os
 import signal
@@ -15,6 +16,7 @@ from support.runs import arguments
 from support.scenes import write_ball_scene
 
 from pp_cl.cli import main
+from pp_cl.view.serve import serve
 
 SECONDS = 60
 
@@ -59,6 +61,24 @@ def test_the_address_works_and_ctrl_c_ends_cleanly(begun):
     finally:
         process.kill()
     assert process.returncode == 0 and err == "" and out == ""
+
+
+def test_a_signal_to_terminate_in_the_midst_of_a_task_ends_cleanly(begun, caplog):
+    """What serves a tab, or the first lines of the server itself, may be interrupted by it."""
+    tasks = []
+
+    async def terminated():
+        signal.raise_signal(signal.SIGTERM)
+
+    def announce(_address):
+        tasks.append(asyncio.get_running_loop().create_task(terminated()))
+
+    before = signal.getsignal(signal.SIGTERM)
+    try:
+        serve(begun, host="127.0.0.1", port=0, announce=announce)
+    finally:
+        signal.signal(signal.SIGTERM, before)
+    assert tasks[0].done() and tasks[0].exception() is None and not caplog.records
 
 
 @pytest.mark.parametrize("name", ["", "nothing"])

@@ -1,5 +1,7 @@
 """Launches, the launcher's refusals, and the build of every kernel file."""
 
+import tracemalloc
+
 import numpy as np
 import pyopencl as cl
 import pytest
@@ -55,6 +57,26 @@ def test_numpy_scalars_and_tuples_are_taken(program, rows):
     np.testing.assert_allclose(
         rows["y"].get()[:, 0], 2 * rows["x"].get().sum(1) + np.arange(33) % 3, rtol=1e-6
     )
+
+
+def test_launches_of_ever_new_sizes_take_no_more_and_more_memory(program, dev):
+    """As in a training, each step of which sees another number of points."""
+    kernel, x, y = program.kernels["rows"], dev.empty((2000, 4)), dev.empty((2000, 1))
+    k = dev.upload(np.arange(3), np.uint32)
+
+    def checked(sizes):
+        for n in sizes:
+            kernel.arguments({"n": n, "scale": 1.0, "x": x[:n], "k": k, "y": y[:n]})
+            kernel.ranges(n, None)
+
+    tracemalloc.start()
+    try:
+        checked(range(1, 300))
+        begin = tracemalloc.get_traced_memory()[0]
+        checked(range(300, 2000))
+        assert tracemalloc.get_traced_memory()[0] - begin < 1700 * 64
+    finally:
+        tracemalloc.stop()
 
 
 def test_local_memory_and_any_shape(program, dev, rng):

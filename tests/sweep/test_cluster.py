@@ -1,5 +1,6 @@
 """Dask as a sweep uses it: who listens where, and what it says of tasks that fail."""
 
+import errno
 import importlib
 import os
 import signal
@@ -36,6 +37,20 @@ def test_workers_have_devices_of_their_own_and_listen_on_loopback_alone():
         }
     assert len(pids) == 4 and listening == {"127.0.0.1"}
     assert not any(psutil.pid_exists(pid) for pid in pids - {os.getpid()})
+
+
+def test_workers_that_do_not_start_are_one_line(monkeypatch):
+    """As where a process may open few files, of which each worker takes a dozen."""
+
+    class Failing(cluster.Nanny):
+        async def start_unsafe(self):
+            raise OSError(errno.EMFILE, os.strerror(errno.EMFILE))
+
+    monkeypatch.setattr(cluster, "Nanny", Failing)
+    with pytest.raises(UserError) as caught, cluster.local_client(["0:0"], 1):
+        pass
+    message = str(caught.value)
+    assert "workers" in message and "Too many open files" in message and "\n" not in message
 
 
 @pytest.mark.parametrize("address", ["tcp://127.0.0.1:1", "what://127.0.0.1:1"])

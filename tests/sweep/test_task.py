@@ -89,3 +89,9 @@ def test_a_worker_that_does_not_see_the_folder(job, tmp_path):
     row = task.supervise(job, lambda: True, "7")
     assert "worker 7" in row["error"] and "same files" in row["error"]
     assert str(tmp_path / "out" / "demo") in row["error"]
+
+
+def test_a_log_that_cannot_be_written_is_named(job):
+    job.log.symlink_to("/dev/full")
+    row = task.supervise(job, lambda: True, "7")
+    assert row["error"].startswith(f"{job.log}: ") and row["error"].endswith("free some space")
