@@ -12,7 +12,7 @@ from pp_cl.cli import main
 
 # {what is written: words of the command, without the file}; RUN and BALL stand for folders
 FILM = ["render", "RUN", "--seconds", "0.2", "--fps", "10", "--out"]
-RASTER = ["bench", "raster", "--size", "16", "--points", "100", "--tau", "0", "--blend", "alpha"]
+RASTER = ["bench", "raster", "--size", "16", "--points", "100", "--blend", "alpha"]
 OUTPUTS = {
     "film.gif": FILM,
     "film.mp4": FILM,
