@@ -3,6 +3,7 @@
 from collections.abc import Iterator
 from dataclasses import replace
 from functools import partial
+from itertools import product
 
 import numpy as np
 
@@ -127,23 +128,27 @@ def _equal_depths(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
 
 
 def _shade(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
-    """Harmonics of all degrees; points that are not listed keep their features."""
+    """Harmonics of all degrees, stored in 32 and in 16 bits; points that are not listed keep their
+    features.
+    """
     camera = make_camera()
     for n in SIZES:
         positions = make_points(rng, n)
         scene = PairedPoints(dev, camera, positions, 0.1)
         seen = np.flatnonzero(dense.kept(camera, positions, 0.1))[::2]
-        for degree in range(3):
-            sh = [rng.normal(size=(n, b.count, 16)) for b in SH_BLOCKS if b.degree <= degree]
+        for degree, dtype in product(range(3), (np.float32, np.float16)):
+            blocks = [block for block in SH_BLOCKS if block.degree <= degree]
+            sh = [rng.normal(size=(n, block.count, 16)).astype(dtype) for block in blocks]
             features = dev.upload(np.full((n, 16), 7.0), np.float32)
             shade_forward(
                 dev,
                 scene.projected,
                 dev.upload(seen, np.uint32),
-                [dev.upload(block, np.float32) for block in sh],
+                [dev.upload(block) for block in sh],
                 point_features=features,
             )
-            expected = dense.shade(positions, camera.eye, np.concatenate(sh, axis=1))
+            stored = np.concatenate(sh, axis=1).astype(np.float64)
+            expected = dense.shade(positions, camera.eye, stored)
             # nine products of a direction's squares: 5 roundings each, of values of up to 4
             yield relative(features.get()[seen], expected[seen], 1e-5)
             yield exact(np.delete(features.get(), seen, axis=0), np.full((n - len(seen), 16), 7))
