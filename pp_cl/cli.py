@@ -124,6 +124,10 @@ def _run(argv):
         )
     except MemoryError:
         return _fail("the host has no memory left; lower --points or raise --downscale")
+    except ImportError as error:
+        if "failed to map segment" not in str(error):  # as the loader says it
+            raise
+        return _fail(f"no memory to load a library ({error}); raise its limit (ulimit -v)")
     except KeyboardInterrupt:
         return _fail("interrupted", 128 + signal.SIGINT)
 

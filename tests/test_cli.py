@@ -310,3 +310,16 @@ def test_an_interrupt_while_the_first_is_told_of():
     """
     done = subprocess.run([sys.executable, "-c", dedent(lines)], capture_output=True, text=True)
     assert (done.returncode, done.stderr) == (130, "")
+
+
+def test_a_library_that_finds_no_memory_is_one_line_and_other_faults_of_it_are_bugs(
+    monkeypatch, capsys
+):
+    errors = [ImportError("x.so: failed to map segment from shared object"), ImportError("x")]
+    monkeypatch.setattr("pp_cl.commands.devices.run", lambda _: (_ for _ in ()).throw(errors[0]))
+    assert main(["devices"]) == 2
+    told = capsys.readouterr().err.splitlines()
+    assert len(told) == 1 and "x.so" in told[0] and "memory" in told[0]
+    del errors[0]
+    with pytest.raises(ImportError):
+        main(["devices"])
