@@ -173,6 +173,17 @@ def test_an_empty_view_is_the_background(dev, rng):
     assert not grad_features.get().any() and not grad_opacity.get().any()
 
 
+def test_a_call_may_see_beyond_the_models_depth_range(dev, rng):
+    model, camera = make_model(dev, rng), ring_cameras(1, 32)[0]
+    renderer, far = Renderer(dev, model, RasterConfig(blend="alpha")), model.depth_range[1]
+    back = camera.pose.copy()
+    back[:, 3] -= 2 * far * back[:, 2]
+    away = replace(camera, pose=back)
+    assert renderer.blend_weights(away, GAMMA).pairs.total == 0
+    seen = renderer.blend_weights(away, GAMMA, depth_range=(far, 4 * far))
+    assert seen.pairs.total > 0
+
+
 def test_dropout_leaves_out_its_share_and_pictures_are_repeatable(dev, rng):
     model, camera = make_model(dev, rng, 300), ring_cameras(1, 32)[0]
     renderer = Renderer(dev, model, RasterConfig())
