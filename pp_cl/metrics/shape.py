@@ -147,7 +147,8 @@ def sample_surface(
         dev.finish()
         advance(count)
     found = bits.get()
-    return Surface(around, found, int(np.unpackbits(found.view(np.uint8)).sum(dtype=np.int64)))
+    parts = np.array_split(found, -(-found.size // 2**20))  # a bit takes a byte for a moment
+    return Surface(around, found, sum(int(np.unpackbits(p.view(np.uint8)).sum()) for p in parts))
 
 
 def _grid_around(mesh, grid):
