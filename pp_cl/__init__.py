@@ -7,10 +7,10 @@ __version__ = "0.1.0"
 # what `from pp_cl import ...` gives, and the module that is imported for it when it is asked for
 _MODULES = {
     "open_device": "pp_cl.device.discover",
-    "train_scene": "pp_cl.run",
-    "load": "pp_cl.trained",
-    "load_run": "pp_cl.trained",
-    "evaluate_run": "pp_cl.evaluate",
+    "train_scene": "pp_cl.session",
+    "load": "pp_cl.run",
+    "load_run": "pp_cl.run",
+    "evaluate_run": "pp_cl.run",
     "Camera": "pp_cl.scene.camera",
     "Picture": "pp_cl.files.picture",
     "UserError": "pp_cl.errors",

@@ -1,372 +1,364 @@
-"""A training that starts or goes on in the folder of a run."""
+"""What a training leaves: a model that can be rendered from anywhere."""
 
 import math
+import os
+import shutil
 import time
 import warnings
-from collections.abc import Callable
-from dataclasses import dataclass, field, replace
-from pathlib import Path
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path, PurePosixPath
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from pp_cl.config import Config
+from pp_cl.config import Config, configure, load_config
 from pp_cl.device.device import Device
 from pp_cl.device.discover import open_device
-from pp_cl.errors import Diverged, UserError
-from pp_cl.files.atomic import check_writable
-from pp_cl.files.checkpoint import check_finite
+from pp_cl.errors import UserError
+from pp_cl.files.atomic import check_writable, remove_leftovers, write_json
 from pp_cl.files.contact_sheet import write_comparison
-from pp_cl.files.image import to_8bit, write_png
-from pp_cl.files.run_folder import MASKS_PICTURE, RunFolder
-from pp_cl.info import picture
-from pp_cl.layers.choice import load_policy, policy_of_run
-from pp_cl.metrics.psnr_ssim import psnr
+from pp_cl.files.image import write_png
+from pp_cl.files.picture import Picture, mean_picture
+from pp_cl.files.run_folder import RunFolder
+from pp_cl.layers.choice import ConvolutionPolicy, load_policy
+from pp_cl.metrics.psnr_ssim import Metrics, mean
+from pp_cl.metrics.published import differences, published_rows
 from pp_cl.model import Model
 from pp_cl.network.unet import UNet
-from pp_cl.presets import SHORT
-from pp_cl.run_config import Stored, is_finished, run_config, stored_state
-from pp_cl.scene.agreement import disagreements
-from pp_cl.scene.bounds import listing
-from pp_cl.scene.grid import Grid
-from pp_cl.scene.hull import build_grid, depth_range, spacing_pixels
-from pp_cl.scene.identity import difference, identity
-from pp_cl.scene.open import (
-    measured_split,
-    open_scene,
-    scene_box,
-    scene_frames,
-)
+from pp_cl.render import Renderer
+from pp_cl.scene.camera import Camera
+from pp_cl.scene.identity import difference, kept_views
+from pp_cl.scene.load import Scene
+from pp_cl.scene.open import DEMO, open_scene, scene_frames
+from pp_cl.scene.photograph import Photograph
+from pp_cl.scene.target import Target
 from pp_cl.scene.views import View
-from pp_cl.train import Trainer
-from pp_cl.trained import Run, load_run
-from pp_cl.training.fitting import Room
-from pp_cl.training.stored import opened_run
+from pp_cl.training.schedule import gamma_at
+from pp_cl.training.stored import load_run_state
 
-FIRST_PREVIEW = 10.0  # seconds; with a slow step and its writing it shows within 20
-MEASURED_VIEWS = 4
-NEVER = (1.0, 1.0)  # train.refine_at
-
-OnStep = Callable[[int, dict[str, Any] | None], None]
-
-
-class HullFacts(NamedTuple):
-    """The initial grid. capped: the largest grid allowed has fewer points than asked for. edge:
-    world units; spacing: the same in pixels; seconds it took. picture: of masks that disagree with
-    the others, None where all agree.
-    """
-
-    points: int
-    capped: bool
-    dims: tuple[int, int, int]
-    edge: float
-    spacing: float
-    depth_range: tuple[float, float]
-    seconds: float
-    picture: np.ndarray | None
+COMPARED_VIEWS = 2  # training photographs that tell whether a scene is the run's
+NEAREST = 0.05  # of a point to the eye, in radii of the object
 
 
 @dataclass
-class Training:
-    """A training that is ready to begin or to go on.
-
-    info: what its checkpoints' headers hold beside the model's. room: the memory there is, and the
-    plan of what is taken. hull: None if it goes on from a checkpoint. origin: of the choice of
-    convolutions, a line of text. measured: the views that train.eval_every measures.
+class Run:
+    """The model of a run's last checkpoint. header: of the checkpoint, see files/run_folder.py.
+    policy: of the convolutions.
     """
 
+    dev: Device
     folder: RunFolder
     config: Config
-    trainer: Trainer
-    info: dict[str, Any]
-    room: Room
-    hull: HullFacts | None
-    origin: str
-    measured: list[View]
-    _preview_by: float = field(default=math.inf, init=False)  # time.monotonic()'s seconds
-    _save_by: float = field(default=math.inf, init=False)
-    _saved: int = field(default=0, init=False)  # step of the checkpoint; 0: there is none
+    header: dict[str, Any]
+    model: Model
+    policy: ConvolutionPolicy
 
-    def run(
-        self,
-        on_step: OnStep | None = None,
-        is_stopped: Callable[[], bool] = lambda: False,
-    ) -> float:
-        """Train to the end with log, previews and checkpoints; returns the seconds of training,
-        those before an interruption included.
+    @cached_property
+    def renderer(self) -> Renderer:
+        """Renders the model, whose parameters must not change any more."""
+        self.model.net.freeze()
+        return Renderer(self.dev, self.model, self.config.raster)
 
-        on_step(step, row) is called after each step, with its row of the log where it has one.
-        is_stopped() is asked after each step: where it is true, a checkpoint is written and the
-        training ends there, to be gone on with. Raises UserError, before anything is written, where
-        another process trains into the folder; later on where a refinement or the averages take
-        more memory than there is, with a checkpoint, and where numbers are no longer finite: then
-        the last checkpoint stays.
+    @property
+    def gamma(self) -> float:
+        """Depth sharpness of the blend at the run's last step."""
+        return gamma_at(
+            self.header["step"], self.config.train.iterations, *self.config.raster.gamma
+        )
+
+    def scene(self, split: str) -> Scene:
+        """The run's scene with one split. Raises UserError where it is missing, broken or another
+        one than the run has learned.
         """
-        with self.folder.owned():
-            self._check_unchanged()
-            self.folder.create(self.config.to_json())
-            if self.hull and self.hull.picture is not None:
-                write_png(self.folder.path / MASKS_PICTURE, self.hull.picture)
-            self._saved = self.trainer.step
-            try:
-                return self._run(on_step, is_stopped)
-            except Diverged as error:
-                kept = f"{self.folder.checkpoint} of step {self._saved} is kept"
-                raise UserError(
-                    f"{error}; {kept if self._saved else 'nothing was kept'}: train into another"
-                    " --out with a lower network.rate or train.sh_rate"
-                ) from None
+        self.check_scene()
+        scene = open_scene(self.dev, self.config, (split,))
+        self._compare(lambda: scene.splits.get("train") or self._some_photographs())
+        return scene
 
-    def _check_unchanged(self):
-        """Raise UserError where another process trained into the folder since it was looked at."""
-        step = 0
-        if self.folder.checkpoint.exists():
-            with opened_run(self.folder, self.config) as stored:
-                step = stored.header["step"]
-        if step != self.trainer.step:
+    def _some_photographs(self):
+        if not self.header["pixels"]:
+            return []
+        return open_scene(self.dev, self.config, ("train",), COMPARED_VIEWS).splits["train"]
+
+    def _compare(self, read):
+        """Raise UserError unless the scene's training views are those of the run. read: gives those
+        whose pixels are compared, too.
+        """
+        path, header = self.config.scene.path, self.header
+        try:
+            listed, views = scene_frames(path), read()
+        except UserError as error:
+            warnings.warn(
+                f"{path}: cannot be compared with the scene of {self.folder} ({error})",
+                stacklevel=3,
+            )
+            return
+        if told := difference(header, listed, views):
             raise UserError(
-                f"{self.folder}: another training has gone on to step {step} meanwhile;"
-                " give the command again"
+                f"{self.folder.checkpoint}: belongs to another scene than {path} ({told}); say"
+                " where its own is with --scene"
             )
 
-    def _run(self, on_step, is_stopped):
-        trainer, settings = self.trainer, self.config.train
-        with self.folder.open_log(trainer.step) as log:
-            seconds = log.seconds
-            first = trainer.step + 1
-            self._expect_save()
-            while trainer.step < settings.iterations:
-                self._check_growth()
-                start = time.perf_counter()
-                terms = trainer.train_step()
-                seconds += time.perf_counter() - start
-                if trainer.step == first:  # the kernels are built
-                    self._expect_preview()
-                row = self._after_step(log, terms, seconds)
-                if on_step:
-                    on_step(trainer.step, row)
-                if is_stopped() and trainer.step < settings.iterations:
-                    self._save(finished=False)
-                    return seconds
-            check_finite(trainer.arrays())  # before averages take their place
-            start = time.perf_counter()
-            trainer.finish()
-            seconds += time.perf_counter() - start
-            # in front of the checkpoint: a row that has none is made again, a finished run is not
-            log.write(self._row(seconds) | {"points": trainer.model.cloud.count, "finished": True})
-            self._save(finished=True)
-        return seconds
-
-    def _check_growth(self):
-        """Keep what is learned where the next step would not fit the memory."""
-        try:
-            self.room.check_growth(self.trainer.model, self.trainer.step)
-        except UserError:
-            self._save(finished=False)
-            raise
-
-    def _after_step(self, log, terms, seconds):
-        """Row of the log, preview and checkpoint, where they are due; returns the row or None. The
-        checkpoint is the last: what it stands for is not made again.
+    def photographs(self, split: str) -> list[Photograph]:
+        """A split's views without their pixels. The run itself keeps those of train; for others
+        raises UserError where the scene is missing, broken, or another one by names and cameras.
         """
-        trainer, settings = self.trainer, self.config.train
-        step, last, row = trainer.step, trainer.step == settings.iterations, None
-        is_measured = settings.eval_every and step % settings.eval_every == 0
-        measured = self._measure() if is_measured else {}
-        if step % settings.log_every == 0 or last or is_measured:
-            state = {"points": trainer.model.cloud.count, "rates": trainer.rates()}
-            row = self._row(seconds) | terms.get() | state | measured
-            log.write(row)
-        due = settings.previews and step % -(-settings.iterations // settings.previews) == 0
-        if last or due or time.monotonic() >= self._preview_by:
-            self._preview()
-        due = step % settings.checkpoint_every == 0 or time.monotonic() >= self._save_by
-        if due and not last:
-            self._save(finished=False)
-        return row
+        if split == "train":
+            return kept_views(self.header["views"])
+        self.check_scene()
+        listed = scene_frames(self.config.scene.path, split)
+        self._compare(list)
+        return listed
 
-    def _row(self, seconds):
-        device = self.trainer.dev.name
-        return {"step": self.trainer.step, "seconds": round(seconds, 3), "device": device}
-
-    def _measure(self):
-        """{"test_psnr": mean over the measured views, of 8-bit images} of the present model."""
-        trainer = self.trainer
-        pairs = [(self._rendered(view), trainer.target(view)) for view in self.measured]
-        return {"test_psnr": float(np.mean([psnr(to_8bit(a), to_8bit(b)) for a, b in pairs]))}
-
-    def _expect_preview(self):
-        """Be due an early preview, by the clock, where the run has none yet. It is an extra, which
-        no later step depends on.
+    def cameras(self, split: str = "test") -> list[Camera]:
+        """The cameras of a split's views at the resolution of the run. Raises UserError as
+        photographs() does.
         """
-        wanted = self.config.train.previews and not any(self.folder.previews.glob("*.png"))
-        self._preview_by = time.monotonic() + FIRST_PREVIEW if wanted else math.inf
+        downscale = self.config.scene.downscale
+        return [one.camera.downscaled(downscale) for one in self.photographs(split)]
 
-    def _expect_save(self):
-        """Be due a checkpoint by the clock, which no step depends on."""
-        minutes = self.config.train.checkpoint_minutes
-        self._save_by = time.monotonic() + 60 * minutes if minutes else math.inf
+    def check_scene(self) -> None:
+        """Raise UserError where the run's scene is not where its settings say."""
+        check_scene(self.config.scene.path)
 
-    def _save(self, finished):
-        trainer = self.trainer
-        header = trainer.model.header() | self.info | {"step": trainer.step, "finished": finished}
-        self.folder.save(header, trainer.model.arrays() if finished else trainer.arrays())
-        self._expect_save()
-        self._saved = trainer.step
+    @cached_property
+    def ball(self) -> tuple[np.ndarray, float]:
+        """(centre (3,), radius), world units, of the smallest ball around the middle of the box of
+        the points that holds them all.
+        """
+        points = self.model.positions()
+        centre = (points.min(axis=0) + points.max(axis=0)) / 2
+        radius = np.linalg.norm(points - centre, axis=1).max() + self.model.grid.edge
+        return centre, float(radius)
 
-    def _preview(self):
-        """Prediction, truth and error of the first training view."""
-        trainer, view = self.trainer, self.trainer.views[0]
-        self._preview_by = math.inf
-        path = self.folder.previews / f"step_{trainer.step:06d}.png"
-        write_comparison(path, [self._rendered(view)], [trainer.target(view)])
+    def render(self, camera: Camera, *, samples: int = 1, features: bool = False) -> Picture:
+        """The model as the camera sees it.
 
-    def _rendered(self, view):
-        """The present model's image of a view. Raises Diverged where there is none."""
-        image = self.trainer.render(view)
-        if not np.isfinite(image).all():
-            raise Diverged(f"the image of {view.name} holds NaN after step {self.trainer.step}")
+        samples: a square number of images, shifted by fractions of a pixel, whose mean it is.
+        features: with the network's input. Raises ValueError for another number of samples,
+        UserError as checked() does.
+        """
+        side = math.isqrt(samples)
+        if samples < 1 or side * side != samples:
+            raise ValueError(f"{samples} samples are no square number")
+        shifts = (np.arange(side) + 0.5) / side - 0.5
+        options = {"features": features, "depth_range": self.depth_range(camera)}
+        pictures = [
+            self.renderer.picture(camera.shifted(dx, dy), self.gamma, **options)
+            for dy in shifts
+            for dx in shifts
+        ]
+        picture = mean_picture(pictures)
+        self.checked(picture.colour)
+        return picture
+
+    def checked(self, image: np.ndarray) -> np.ndarray:
+        """An image of the run. Raises UserError naming the checkpoint where it holds NaN: finite
+        parameters may be too large to compute with.
+        """
+        if np.isnan(image).any():
+            raise UserError(
+                f"{self.folder.checkpoint}: its parameters are too large, the image holds NaN;"
+                " restore a copy, or train anew with a lower network.rate or train.sh_rate"
+            )
         return image
 
-
-def open_training(
-    dev: Device, folder: RunFolder, config: Config, stored: Stored | None
-) -> Training:
-    """A training in `folder`, from its checkpoint `stored` where it has one. Nothing is written.
-
-    That of a finished training is gone on with up to config.train.iterations, with new moments and
-    without refinements. Raises UserError for a scene or checkpoint that does not fit, for too
-    little memory, and for a folder that may not be written.
-    """
-    check_writable(folder.path)
-    tolerance = config.network.tolerance
-    if stored:
-        policy = policy_of_run(dev, tolerance, stored[0].get("tuning"), folder.checkpoint)
-    else:
-        policy = load_policy(dev, tolerance)
-    net = UNet.of_settings(dev, config.network, policy, seed=config.train.seed)
-    begun = _begun(stored[0]) if stored else 0
-    goal = config
-    if begun:
-        goal = replace(config, train=replace(config.train, refine_at=NEVER))
-    room = Room(goal, net, scene_frames(config.scene.path))
-    if stored:
-        _check_stored(room, *stored)
-    else:
-        room.check_unseen()
-    views = open_scene(dev, config, ("train",)).splits["train"]
-    measured = _measured_views(dev, config) if config.train.eval_every else []
-    if stored:
-        trainer, info, hull = _resume(goal, views, net, stored, file=folder.checkpoint)
-    else:
-        trainer, info, hull = _start(config, views, net, room)
-    info["tuning"] = policy.tuning
-    return Training(folder, config, trainer, info, room, hull, policy.origin, measured)
+    def depth_range(self, camera: Camera) -> tuple[float, float] | None:
+        """(near, far) of a camera anywhere; None, the model's, where the blend depends on it."""
+        if self.config.raster.blend == "softmax":
+            return None
+        centre, radius = self.ball
+        distance = float(np.linalg.norm(camera.eye - centre))
+        return max(distance - radius, NEAREST * radius), distance + radius
 
 
-def _begun(header):
-    """The step of the finished training that this one extends, 0 where it extends none."""
-    return header["step"] if header["finished"] else header.get("extended_from", 0)
+def check_scene(path: str) -> None:
+    """Raise UserError where the folder of a run's scene is not there."""
+    if path != DEMO and not Path(path).is_dir():
+        raise UserError(f"{path}: the run's scene is not there; say where with --scene")
 
 
-def _check_stored(room, header, arrays):
-    grid, step = Grid.of_header(header["grid"]), header["step"]
-    room.check_points(grid, len(arrays["points.ids"]), header["depth_range"], step)
-
-
-def _measured_views(dev, config):
-    """A few views of the split val, else test."""
-    split = measured_split(config.scene.path)
-    return open_scene(dev, config, (split,), most=MEASURED_VIEWS).splits[split]
-
-
-def _start(config, views, net, room):
-    """(Trainer, info, HullFacts) of a training from its beginning."""
-    dev = net.dev
-    start = time.perf_counter()
-    hull = build_grid(dev, views, config.points.count, scene_box(config))
-    near_far = depth_range(views, hull)
-    room.check_points(hull.grid, len(hull.ids), near_far)
-    facts = HullFacts(
-        len(hull.ids),
-        hull.capped,
-        hull.grid.dims,
-        hull.grid.edge,
-        spacing_pixels(hull.grid, [view.camera for view in views]),
-        near_far,
-        time.perf_counter() - start,
-        _told_of_masks(dev, views, hull),
-    )
-    points = config.points
-    model = Model.create(
-        dev,
-        hull.grid,
-        hull.ids,
-        near_far,
-        net=net,
-        degree=points.sh_degree,
-        opacity=points.opacity,
-    )
-    trainer = Trainer(dev, config, model, views)
-    return trainer, identity(views) | {"initial_points": facts.points}, facts
-
-
-def _told_of_masks(dev, views, hull):
-    """Warn of masks that disagree with the others; their picture, None where all agree."""
-    found = disagreements(views, hull.grid.box)
-    if not found:
-        return None
-    worst = listing([f"{one.view.name} ({one.share:.0%} of it)" for one in found])
-    warnings.warn(
-        f"masks reject what the other views agree on: {worst}; see {MASKS_PICTURE} in the run's"
-        " folder",
-        stacklevel=2,
-    )
-    return picture(dev, views, hull, found)
-
-
-def _resume(config, views, net, stored, *, file):
-    """(Trainer, info, None) of a training that goes on."""
-    header, arrays = stored
-    path = config.scene.path
-    if told := difference(header, views, views):
-        raise UserError(f"{file}: belongs to another scene than {path} ({told}); use another --out")
-    for name, array in arrays.items():
-        if array.dtype == np.float16:  # of a compressed run
-            arrays[name] = array.astype(np.float32)
-    model = Model.load(net.dev, header, arrays, net, degree=config.points.sh_degree)
-    trainer = Trainer(net.dev, config, model, views)
-    begun = _begun(header)
-    trainer.restore(header["step"], arrays, begun)
-    info = identity(views) | {"initial_points": header["initial_points"]}
-    return trainer, info | ({"extended_from": begun} if begun else {}), None
-
-
-def train_scene(
-    scene: str,
-    out: Path | str,
-    preset: str | None = None,
-    device: str | None = None,
+def load_run(
+    dev: Device,
+    folder: Path | str,
     *,
-    settings: dict[str, Any] | None = None,
-    on_step: OnStep | None = None,
-    **options: Any,
+    tolerance: float | None = None,
+    scene: str | None = None,
 ) -> Run:
-    """Train a scene into the folder `out`, or go on with the run there; a finished one is left
-    alone, unless more iterations are asked for than it has.
+    """The run in a folder, finished or not.
 
-    scene: a folder, or the word demo. device: as `pp-cl train --device`. settings: {"section.key":
-    value}; options: the same by the short names of presets.SHORT, such as iterations. on_step: see
-    Training.run. Raises UserError as `pp-cl train` reports it.
+    tolerance: in place of its network.tolerance; scene: the folder of its scene, if that has moved.
+    Raises UserError naming the file that is missing or broken.
     """
-    unknown = set(options) - set(SHORT)
-    if unknown:
-        raise TypeError(f"train_scene() has no {min(unknown)}; it has {', '.join(SHORT)}, settings")
-    settings = {SHORT[name]: value for name, value in options.items()} | (settings or {})
-    folder = RunFolder(out)
-    given = [(*s, "settings") for s in settings.items()]
-    config = run_config(folder, str(scene), preset, given, extends=True)
-    stored, dev = stored_state(folder, config), open_device(device)
-    if not is_finished(stored, config):
-        open_training(dev, folder, config, stored).run(on_step)
-    return load_run(dev, out)
+    if scene is not None:
+        check_scene(scene)
+    folder = RunFolder(folder)
+    config = load_config(folder.config)
+    given = [] if tolerance is None else [("network.tolerance", tolerance, "tolerance")]
+    configure(config, scene or config.scene.path, given)
+    header, arrays = load_run_state(folder, config)
+    policy = load_policy(dev, config.network.tolerance)
+    net = UNet.of_settings(dev, config.network, policy)
+    model = Model.load(dev, header, arrays, net, degree=config.points.sh_degree)
+    return Run(dev, folder, config, header, model, policy)
+
+
+def load(folder: Path | str, device: str | None = None) -> Run:
+    """The run in a folder, on a device: as `pp-cl devices` lists them, else the default one. Raises
+    UserError naming the file that is missing or broken.
+    """
+    return load_run(open_device(device), folder)
+
+
+SHOWN_VIEWS = 4  # rows of the comparison image
+MARK = ".evaluation"  # file in a folder that evaluations may replace
+
+
+class Rendered(NamedTuple):
+    """A view as the run renders it.
+
+    image, truth: (H, W, 3) float32 in [0, 1]. computed: fraction of the network's multiplications
+    that were computed; the others would have seen background alone.
+    """
+
+    name: str
+    image: np.ndarray
+    truth: np.ndarray
+    seconds: float
+    computed: float
+
+
+def evaluate_run(
+    folder: Path | str,
+    split: str = "test",
+    metrics: tuple[str, ...] = ("psnr", "ssim"),
+    *,
+    save_images: bool = False,
+    device: str | None = None,
+    tolerance: float | None = None,
+    scene: str | None = None,
+    out: Path | str | None = None,
+) -> dict[str, Any]:
+    """evaluate() of the run in a folder. device: as `pp-cl eval --device`; tolerance, scene: as
+    load_run takes them.
+    """
+    run = load_run(open_device(device), folder, tolerance=tolerance, scene=scene)
+    return evaluate(run, split, metrics, save_images=save_images, out=out)
+
+
+def evaluate(
+    run: Run,
+    split: str,
+    metrics: tuple[str, ...],
+    *,
+    save_images: bool = False,
+    out: Path | str | None = None,
+    published: bool = False,
+    on_view: Callable[[int, int], None] = lambda _measured, _views: None,
+) -> dict[str, Any]:
+    """Measure a run; writes metrics.json and comparison.png into the folder `out`, if not given
+    RUN/eval, or RUN/eval/SPLIT for other splits than test, and returns the former.
+
+    metrics: names out of psnr, ssim, lpips. save_images: write every view to images/ there, in
+    place of what an earlier evaluation left. published: put published results beside also where
+    they were measured on other views or sizes. on_view: called after each view with the number of
+    those measured and of all. Raises UserError for a missing or broken split, a folder that may not
+    be written, and an `out` that holds something else than an evaluation.
+    """
+    target = run.folder.evaluation(split) if out is None else Path(out)
+    check_target(target, is_new=out is not None)
+    scene = run.scene(split)
+    views = scene.splits[split]
+    measure = Metrics(run.dev, metrics, run.policy)
+    target.mkdir(parents=True, exist_ok=True)
+    if out is not None:
+        (target / MARK).touch()
+    remove_leftovers(target)
+    if save_images and (target / "images").exists():
+        shutil.rmtree(target / "images")
+    files = image_files([view.name for view in views])
+    rows, costs, shown = [], [], []
+    for i, rendered in enumerate(render_views(run, views)):
+        image, truth = rendered.image, rendered.truth
+        rows.append({"name": rendered.name} | measure(image, truth))
+        costs.append((rendered.seconds, rendered.computed))
+        if i in {len(views) * row // SHOWN_VIEWS for row in range(SHOWN_VIEWS)}:
+            shown.append((image, truth))
+        if save_images:
+            path = target / "images" / files[i]
+            path.parent.mkdir(parents=True, exist_ok=True)
+            write_png(path, image)
+        on_view(i + 1, len(views))
+    means = mean([{name: row[name] for name in metrics} for row in rows])
+    result = {"split": split, "device": run.dev.name, "mean": means, "per_image": rows}
+    result |= _about(run, costs) | _published(scene, split, views, anyway=published)
+    write_json(target / "metrics.json", result)
+    write_comparison(target / "comparison.png", *zip(*shown, strict=True))
+    return result
+
+
+def check_target(target: Path, *, is_new: bool) -> None:
+    """Raise UserError where an evaluation cannot be written into a folder. is_new: nor if it holds
+    files of others, of which images/ would be removed.
+    """
+    if target.exists() and not target.is_dir():
+        raise UserError(f"{target}: is not a folder; choose another --out")
+    check_writable(target)
+    if is_new and target.exists() and not (target / MARK).exists() and any(target.iterdir()):
+        raise UserError(f"{target}: holds other files; choose a new or empty folder for --out")
+
+
+def _published(scene, split, views, *, anyway):
+    """{"published": rows of the scene, "published_differs": how this measurement differs from
+    them}. anyway: rows also where it does.
+    """
+    cameras = [view.file_camera for view in views]
+    rows = published_rows(scene.name, cameras)
+    differs = differences(scene.name, cameras, views[0].file_downscale, split) if rows else ""
+    shown = anyway or not differs
+    return {"published": rows if shown else {}, "published_differs": differs if shown else ""}
+
+
+def _about(run, costs):
+    """What metrics.json says of the run. costs: [(seconds, fraction computed)] of each view."""
+    seconds, computed = zip(*costs, strict=True)
+    return {
+        "step": run.header["step"],
+        "finished": run.header["finished"],
+        "points": {
+            "initial": run.header["initial_points"],
+            "final": run.model.cloud.count,
+            "grid": run.header["grid"]["dims"],
+        },
+        "seconds_per_frame": float(np.median(seconds)),
+        "computed_fraction": float(np.mean(computed)),
+    }
+
+
+def image_files(names: list[str]) -> list[PurePosixPath]:
+    """Relative paths of PNG files for views of these names: the folders in which they differ stay,
+    those that all of them share go.
+    """
+    paths = [PurePosixPath(name) for name in names]
+    shared = os.path.commonpath([path.parent for path in paths])
+    paths = [path.relative_to(shared) for path in paths]
+    files = [path.with_suffix(".png") for path in paths]
+    if len(set(files)) < len(files):  # a.jpg beside a.png
+        files = [path.with_name(f"{path.name}.png") for path in paths]
+    return files
+
+
+def render_views(run: Run, views: list[View]) -> Iterator[Rendered]:
+    """Each view as the run renders it, in turn."""
+    target = Target(run.dev)
+    run.render(views[0].camera)  # builds the programs
+    for view in views:
+        start = time.perf_counter()
+        result = run.renderer.forward(view.camera, run.gamma)
+        image = run.checked(result.clamped(view.camera))
+        seconds = time.perf_counter() - start
+        target.load(view)
+        truth = target.whole()
+        yield Rendered(view.name, image, truth, seconds, result.computed_fraction)

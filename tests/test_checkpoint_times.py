@@ -35,7 +35,7 @@ def saved(monkeypatch):
         return train_step(self)
 
     clock = SimpleNamespace(monotonic=lambda: now[0], perf_counter=time.perf_counter)
-    monkeypatch.setattr("pp_cl.run.time", clock)
+    monkeypatch.setattr("pp_cl.session.time", clock)
     monkeypatch.setattr(RunFolder, "save", saving)
     monkeypatch.setattr(Trainer, "train_step", stepping)
     return steps

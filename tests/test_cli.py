@@ -247,7 +247,7 @@ def test_a_kernel_that_does_not_build_is_one_line_below_the_log(
             "cl/a.cl does not build on a device with -DA=1", "<kernel>:3:\nno such type\n"
         )
 
-    monkeypatch.setattr("pp_cl.run.open_training", broken)
+    monkeypatch.setattr("pp_cl.session.open_training", broken)
     line = failure(capsys, "train", scene, "--out", tmp_path / "run", "--downscale", "1")
     assert line.startswith(
         "pp-cl: cl/a.cl does not build on a device with -DA=1; update the driver"

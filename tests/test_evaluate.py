@@ -13,9 +13,9 @@ from support.scenes import write_ball_scene
 from pp_cl.cli import main
 from pp_cl.config import Config
 from pp_cl.errors import UserError
-from pp_cl.evaluate import image_files
 from pp_cl.files.image import read_rgba
 from pp_cl.metrics.psnr_ssim import psnr
+from pp_cl.run import image_files
 from pp_cl.scene.open import open_scene
 
 
@@ -277,7 +277,7 @@ def test_an_evaluation_that_cannot_be_written_is_told_before_it_is_made(
 ):
     out = tmp_path / "there"
     monkeypatch.setattr("os.access", lambda path, _mode: Path(path) != tmp_path)
-    monkeypatch.setattr("pp_cl.evaluate.render_views", None)
+    monkeypatch.setattr("pp_cl.run.render_views", None)
     assert main(["eval", str(run), "--out", str(out)]) == 2
     assert f"{out}: may not be written" in capsys.readouterr().err and not out.exists()
 

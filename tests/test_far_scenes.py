@@ -18,7 +18,7 @@ from pp_cl.export.points import coloured_points, in_world
 from pp_cl.files.checkpoint import load_checkpoint
 from pp_cl.metrics.shape import read_mesh
 from pp_cl.model import Model
-from pp_cl.trained import load_run
+from pp_cl.run import load_run
 
 FAR = np.array([1e6, -1e6, 1e6])
 UNIT = 2.0**-24  # of the eyes: float64 holds them exactly 1e6 away, and the grid too

@@ -51,13 +51,13 @@ from pp_cl.layers.choice import (
 from pp_cl.metrics import lpips_weights
 from pp_cl.metrics.compare import compare
 from pp_cl.metrics.shape import overlap, read_mesh, sample_surface
-from pp_cl.run_config import run_config
 from pp_cl.scene.grid import Grid
 from pp_cl.scene.hull import build_grid, depth_range, spacing_pixels
 from pp_cl.scene.load import find_reader, load_scene
 from pp_cl.scene.masks import MaskRule
 from pp_cl.scene.readers.camera_file import read_cameras
 from pp_cl.scene.readers.frame import frame_keys
+from pp_cl.session import run_config
 from pp_cl.sweep.plan import Job, plan, read_seeds, read_varied
 from pp_cl.sweep.result import finished_row, progress
 from pp_cl.training.stored import load_run_state

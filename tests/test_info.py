@@ -16,7 +16,7 @@ from pp_cl.config import preset
 from pp_cl.files.checkpoint import load_checkpoint
 from pp_cl.files.contact_sheet import GAP, HEADER
 from pp_cl.files.image import read_rgba
-from pp_cl.info import OUTLINE
+from pp_cl.scene.outline import OUTLINE
 
 BALL = 0.8  # its radius, support.scenes
 

@@ -13,12 +13,12 @@ from pp_cl.files.contact_sheet import GAP, tiles
 from pp_cl.files.image import read_rgba
 from pp_cl.files.run_folder import RunFolder
 from pp_cl.network.unet import UNet
+from pp_cl.run import load_run
 from pp_cl.scene.demo import write_scene
 from pp_cl.scene.hull import build_grid
 from pp_cl.scene.load import Scene, load_scene
 from pp_cl.scene.open import preset_downscale, scene_frames
 from pp_cl.scene.views import View
-from pp_cl.trained import load_run
 from pp_cl.training.memory import Sketch, memory_plan
 
 SIZES = ((48, 48), (37, 29), (24, 40))

@@ -19,8 +19,7 @@ from pp_cl.device.discover import open_device
 from pp_cl.errors import UserError
 from pp_cl.files.image import read_rgba, to_8bit
 from pp_cl.files.run_folder import RunFolder
-from pp_cl.run import open_training
-from pp_cl.run_config import run_config
+from pp_cl.session import open_training, run_config
 
 
 @pytest.fixture(scope="module")

@@ -12,11 +12,11 @@ from support.scenes import write_ball_scene
 
 from pp_cl.cli import main
 from pp_cl.errors import UserError
+from pp_cl.facts.shape import mesh_shape, run_shape
 from pp_cl.files.run_folder import RunFolder
 from pp_cl.metrics.shape import Mesh, overlap, sample_surface
 from pp_cl.scene.hull import build_grid
 from pp_cl.scene.load import load_scene
-from pp_cl.shape import mesh_shape, run_shape
 
 
 @pytest.fixture(scope="module")

@@ -13,7 +13,7 @@ from pp_cl.device.device import Device
 from pp_cl.device.transfer import Reading
 from pp_cl.errors import UserError
 from pp_cl.files.run_folder import RunFolder
-from pp_cl.run import open_training
+from pp_cl.session import open_training
 
 COMPLETE = cl.command_execution_status.COMPLETE
 EVERY_STEP = {  # so that a step of any number does what most do

@@ -21,11 +21,11 @@ from pp_cl.config import load_config
 from pp_cl.device.device import Device
 from pp_cl.device.discover import open_device
 from pp_cl.errors import UserError
-from pp_cl.evaluate import evaluate_run
 from pp_cl.files.atomic import write_json
 from pp_cl.files.run_folder import RunFolder
 from pp_cl.network.layers import BLOCKS, convolutions, unet_layers
-from pp_cl.run import train_scene
+from pp_cl.run import evaluate_run
+from pp_cl.session import train_scene
 from pp_cl.sweep.plan import Job, plan, read_seeds, read_varied
 from pp_cl.sweep.result import finished_row
 

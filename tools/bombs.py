@@ -25,7 +25,7 @@ import OpenEXR
 import trimesh
 from PIL import Image
 
-import pp_cl.info  # its memory is to be there before a bomb
+import pp_cl.facts.info  # its memory is to be there before a bomb
 import pp_cl.metrics.compare  # noqa: F401
 from pp_cl import cli
 from pp_cl.config import preset

@@ -16,10 +16,10 @@ from pp_cl.export.harmonics import STEPS, basis, fit_harmonics
 from pp_cl.export.observe import directions, observe
 from pp_cl.files.image import to_8bit
 from pp_cl.metrics.psnr_ssim import psnr
+from pp_cl.run import Run, load
 from pp_cl.scene.demo import demo_mesh, distances
 from pp_cl.scene.grid import Grid
 from pp_cl.scene.target import Target
-from pp_cl.trained import Run, load
 
 SAMPLES = 60_000  # of a surface
 EXACT = Grid((-1.3, -1.3, -1.3), 0.01, (261, 261, 261))  # where exact distances are asked for

@@ -14,7 +14,7 @@ from typing import Any
 from pp_cl.compress.reduction import Original, Reduction, measured_psnr, nbytes
 from pp_cl.compress.search import frame_ms
 from pp_cl.layers.choice import make_policy, offered
-from pp_cl.trained import Run
+from pp_cl.run import Run
 
 VIEWS = 8
 # Fields of Reduction and what they are set to, one at a time.

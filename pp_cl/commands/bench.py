@@ -170,7 +170,7 @@ def _run_train(options):
 def _run_model(options):
     from pp_cl.bench.model import HEAD, bench_models, line
     from pp_cl.bench.plots import figure_of, plot_models
-    from pp_cl.trained import load_run
+    from pp_cl.run import load_run
 
     if not options.runs:
         raise UserError("--runs: missing; name the folder of a trained run")

@@ -49,7 +49,7 @@ def run(options: argparse.Namespace) -> None:
     from pp_cl.compress.search import Search, frame_ms
     from pp_cl.device.discover import open_device
     from pp_cl.files.atomic import check_new_folder
-    from pp_cl.trained import load_run
+    from pp_cl.run import load_run
 
     out = Path(options.out or f"{Path(options.run_folder).resolve()}-compressed")
     check_new_folder(out)

@@ -46,8 +46,7 @@ def run(options: argparse.Namespace) -> None:
     from pp_cl.bench.plots import figure_of, plot_ranks, save_figure
     from pp_cl.commands.progress import counted
     from pp_cl.device.discover import open_device
-    from pp_cl.evaluate import check_target, evaluate
-    from pp_cl.trained import load_run
+    from pp_cl.run import check_target, evaluate, load_run
 
     metrics, tolerance = options.metrics, options.tolerance
     figure = figure_of(options.chart, "--chart")

@@ -40,7 +40,7 @@ def run(options: argparse.Namespace) -> None:
     """Write the run, say what was written."""
     from pp_cl.device.discover import open_device
     from pp_cl.export.formats import check_target, export
-    from pp_cl.trained import load_run
+    from pp_cl.run import load_run
 
     name, folder = options.format, Path(options.run_folder)
     if options.min_weight is not None and name not in OF_POINTS:

@@ -58,7 +58,7 @@ def run(options: argparse.Namespace) -> None:
 def _run_told(folder, options):
     """(facts, lines, picture or None) of a run."""
     from pp_cl.device.discover import open_device
-    from pp_cl.info import run_facts, run_picture
+    from pp_cl.facts.info import run_facts, run_picture
 
     facts, image = run_facts(folder, options.scene), None
     if options.picture:
@@ -69,7 +69,7 @@ def _run_told(folder, options):
 def _scene_told(_folder, options):
     """The same of a scene."""
     from pp_cl.device.discover import open_device
-    from pp_cl.info import describe_scene, picture
+    from pp_cl.facts.info import describe_scene, picture
 
     dev = open_device(options.device)
     given = shared.read_short(options, ("masks", "mask_from")) + shared.read_set(options.set)

@@ -9,7 +9,7 @@ from typing import Any, TextIO
 
 from tqdm import tqdm
 
-from pp_cl.run import Training
+from pp_cl.session import Training
 
 BUILDING = 2  # steps in which nearly all kernels are built, if the driver has not kept them
 TOLD = "building kernels (once)"

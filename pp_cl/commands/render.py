@@ -100,9 +100,9 @@ def _add_style(parser):
 def run(options: argparse.Namespace) -> None:
     """Render the frames that are missing, and make a film of them where one is asked for."""
     from pp_cl.device.discover import open_device
+    from pp_cl.export.film import Frames, film_folder, owned_folder
     from pp_cl.files.video import check_video
-    from pp_cl.film import Frames, film_folder, owned_folder
-    from pp_cl.trained import load_run
+    from pp_cl.run import load_run
 
     kind = _format(options)
     style, count = _style(options, kind), _frame_count(options, kind)
@@ -164,7 +164,7 @@ def _default(run, path, sizes, kind):
 
 def _style(options, kind):
     """film.Style of the options."""
-    from pp_cl.film import Style
+    from pp_cl.export.film import Style
 
     if options.background and kind == "exr":
         raise UserError("--background: OpenEXR keeps alpha in its place; leave it out")

@@ -43,9 +43,9 @@ def run(options: argparse.Namespace) -> None:
     """Measure, print the row. Raises UserError for options that do not fit the subject."""
     from pp_cl.config import nearby_run
     from pp_cl.device.discover import open_device
+    from pp_cl.facts.shape import mesh_shape, run_shape
     from pp_cl.files.run_folder import RunFolder
     from pp_cl.metrics.shape import read_mesh
-    from pp_cl.shape import mesh_shape, run_shape
 
     folder = RunFolder(options.subject)
     is_run = folder.path.is_dir()

@@ -56,8 +56,7 @@ def run(options: argparse.Namespace) -> None:
     from pp_cl.device.discover import open_device
     from pp_cl.files.run_folder import RunFolder
     from pp_cl.files.scalars import writer_class
-    from pp_cl.run import open_training
-    from pp_cl.run_config import is_finished, run_config, stored_state
+    from pp_cl.session import is_finished, open_training, run_config, stored_state
     from pp_cl.training.memory import plan_lines
     from pp_cl.view.serve import serve_in_background
 

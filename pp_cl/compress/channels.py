@@ -12,8 +12,8 @@ from pp_cl.layers.conv import pack_bias, pack_weights, unpack_weights
 from pp_cl.layers.tiles import LANES
 from pp_cl.network.layers import Layer, convolutions
 from pp_cl.network.unet import UNet
+from pp_cl.run import Run
 from pp_cl.scene.camera import Camera
-from pp_cl.trained import Run
 
 MEASURED_VIEWS = 16
 

@@ -9,9 +9,9 @@ from pp_cl.compress.reduction import Original, Reduction
 from pp_cl.errors import UserError
 from pp_cl.files.atomic import atomic_folder, write_json, write_text
 from pp_cl.files.run_folder import RunFolder
+from pp_cl.run import Run
 from pp_cl.scene.open import scene_splits
 from pp_cl.scene.views import View
-from pp_cl.trained import Run
 
 REPORT = "compress.json"
 MOST_VIEWS, HELD_EVERY = 16, 8

@@ -15,15 +15,14 @@ from pp_cl.compress.channels import (
     reduced_parameters,
 )
 from pp_cl.config import Config, assign
-from pp_cl.evaluate import render_views
 from pp_cl.export.observe import observe
 from pp_cl.layers.choice import load_policy
 from pp_cl.metrics.psnr_ssim import Metrics
 from pp_cl.model import Model
 from pp_cl.network.unet import UNet
+from pp_cl.run import Run, render_views
 from pp_cl.scene.camera import Camera
 from pp_cl.scene.views import View
-from pp_cl.trained import Run
 
 LARGEST_HALF = 65504.0
 

@@ -9,8 +9,8 @@ import numpy as np
 
 from pp_cl.bench.timing import interleave
 from pp_cl.compress.reduction import Original, Reduction, measured_psnr, nbytes
+from pp_cl.run import Run
 from pp_cl.scene.views import View
-from pp_cl.trained import Run
 
 # What is tried in turn: the share of the loss that all so far may take, and the field's values,
 # from mild to harsh; the first that is too harsh ends it. What only makes rendering faster must do

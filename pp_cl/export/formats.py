@@ -14,8 +14,8 @@ from pp_cl.export.ply import write_ply
 from pp_cl.export.points import coloured_points
 from pp_cl.export.renderings import renderings
 from pp_cl.files.atomic import check_file, check_new_folder, write_text
+from pp_cl.run import Run
 from pp_cl.scene.demo import write_scene
-from pp_cl.trained import Run
 
 
 @dataclass(frozen=True)

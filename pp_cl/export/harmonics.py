@@ -13,8 +13,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from pp_cl.export.observe import directions, observe
+from pp_cl.run import Run
 from pp_cl.scene.camera import Camera
-from pp_cl.trained import Run
 
 COUNT = 9  # functions of basis()
 # Two steps more fit the training views better and the test views worse (docs/export.md).

@@ -18,7 +18,7 @@ from pp_cl.export.glb import glb_data, gltf_colours
 from pp_cl.export.ply import CHANNELS, COORDINATES
 from pp_cl.export.points import ColouredPoints, coloured_points, in_world
 from pp_cl.files.atomic import atomic_file
-from pp_cl.trained import Run
+from pp_cl.run import Run
 
 NEIGHBOURS = 4  # points that colour a vertex
 

@@ -11,8 +11,8 @@ from tqdm import tqdm
 
 from pp_cl.files.picture import Picture
 from pp_cl.render import NETWORK_MULTIPLE, ViewWeights
+from pp_cl.run import Run
 from pp_cl.scene.camera import Camera
-from pp_cl.trained import Run
 
 NO_POINT = 0xFFFFFFFF  # of a pixel entry: the hits behind it were dropped
 

@@ -13,7 +13,7 @@ import numpy as np
 
 from pp_cl.errors import UserError
 from pp_cl.export.harmonics import COUNT, fit_harmonics
-from pp_cl.trained import NEAREST, Run
+from pp_cl.run import NEAREST, Run
 
 # Bytes of a point: vertex (3, uint16), opacity (uint16), coefficients (27 and 1 unused, uint8).
 POINT = np.dtype([("vertex", "<u2", 3), ("opacity", "<u2"), ("colour", "u1", 28)])

@@ -10,8 +10,8 @@ from pp_cl.errors import UserError
 from pp_cl.export.observe import observe
 from pp_cl.files.image import to_8bit
 from pp_cl.files.picture import Picture
+from pp_cl.run import Run
 from pp_cl.scene.camera import Camera
-from pp_cl.trained import Run
 
 FINEST = 1e-3  # of the grid's edge: how far rounding to float32 may move a point in a file
 

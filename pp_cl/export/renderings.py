@@ -7,11 +7,10 @@ import warnings
 from tqdm import tqdm
 
 from pp_cl.errors import UserError
-from pp_cl.evaluate import image_files
 from pp_cl.files.image import to_8bit
+from pp_cl.run import Run, image_files
 from pp_cl.scene.load import Scene
 from pp_cl.scene.views import View
-from pp_cl.trained import Run
 
 
 def renderings(run: Run) -> Scene:

@@ -1,14 +1,35 @@
-"""The outline of points in a view."""
+"""Points drawn over photographs: their outline, and what masks that disagree reject of them."""
 
 import math
+from collections.abc import Sequence
+from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from skimage.morphology import closing, disk
 from skimage.segmentation import find_boundaries
 
+from pp_cl.device.device import Device
+from pp_cl.files.contact_sheet import contact_sheet
+from pp_cl.files.image import to_8bit
+from pp_cl.scene.agreement import Disagreement
 from pp_cl.scene.camera import Camera
 from pp_cl.scene.grid import Grid
-from pp_cl.scene.hull import spacing_pixels
+from pp_cl.scene.hull import Hull, spacing_pixels
+from pp_cl.scene.load import evenly
+from pp_cl.scene.target import Target
+from pp_cl.scene.views import View, fitting_downscale
+
+SHOWN_VIEWS, SHOWN_SIZE = 12, 320  # photographs of the picture, and their longer side in pixels
+OUTLINE = (255, 0, 160)  # a colour that few objects have
+REJECTED = np.array([127, 60, 0], np.uint8)  # added to what a mask should have held
+
+
+class Points(NamedTuple):
+    """Vertices of a grid. ids: (N,) uint32."""
+
+    grid: Grid
+    ids: np.ndarray
 
 
 def silhouette(grid: Grid, ids: np.ndarray, camera: Camera) -> np.ndarray:
@@ -39,3 +60,32 @@ def project(camera: Camera, positions: np.ndarray) -> np.ndarray:
     return np.stack(
         [camera.fx * right / ahead + camera.cx, camera.fy * down / ahead + camera.cy, depth]
     )
+
+
+def picture(
+    dev: Device,
+    views: Sequence[View],
+    points: Points | Hull | None,
+    disagreeing: Sequence[Disagreement] = (),
+) -> np.ndarray:
+    """uint8 (H, W, 3) contact sheet of up to 12 photographs over white, spread evenly over the
+    views, with the outline of the points drawn over them.
+
+    disagreeing: their views come first, tinted where they reject what the others agree on.
+    """
+    target, images = Target(dev), []
+    tinted = {one.view.name: one for one in disagreeing[:SHOWN_VIEWS]}
+    others = [view for view in views if view.name not in tinted]
+    shown = [one.view for one in tinted.values()] + evenly(others, SHOWN_VIEWS - len(tinted))
+    for view in shown:
+        size = view.stored_camera.width, view.stored_camera.height
+        small = view.reduced(fitting_downscale(size, SHOWN_SIZE))
+        target.load(small)
+        image = to_8bit(target.whole())
+        if view.name in tinted:
+            rejected = silhouette(*tinted[view.name][2:], small.camera)
+            image[rejected] = image[rejected] // 2 + REJECTED
+        if points:
+            image[outline(points.grid, points.ids, small.camera)] = OUTLINE
+        images.append(image)
+    return contact_sheet(images, [Path(view.name).name for view in shown])

@@ -14,13 +14,11 @@ from filelock import FileLock
 
 from pp_cl.device.discover import open_device
 from pp_cl.errors import UserError
-from pp_cl.evaluate import evaluate
 from pp_cl.files.run_folder import RunFolder
-from pp_cl.run import open_training
-from pp_cl.run_config import is_finished, run_config, stored_state
+from pp_cl.run import evaluate, load_run
 from pp_cl.scene.open import scene_splits
+from pp_cl.session import is_finished, open_training, run_config, stored_state
 from pp_cl.sweep.plan import Job
-from pp_cl.trained import load_run
 
 LONGEST = 600  # seconds, at most, from the wish to end to the end: a step and a checkpoint
 

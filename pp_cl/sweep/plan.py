@@ -13,7 +13,7 @@ from pp_cl.errors import UserError
 from pp_cl.scene.load import check_folder
 from pp_cl.scene.open import DEMO
 
-Given = tuple[str, str, str]  # key, text of the value, origin, as run_config.run_config takes them
+Given = tuple[str, str, str]  # key, text of the value, origin, as session.run_config takes them
 
 # Settings that tell the runs of a sweep apart by other means: what to write instead.
 TAKEN = {"train.seed": "--seeds", "scene.path": "more scenes as arguments"}

@@ -17,11 +17,11 @@ from pp_cl.files.image import to_8bit
 from pp_cl.files.run_folder import RunFolder
 from pp_cl.model import Model
 from pp_cl.render import NETWORK_MULTIPLE, Renderer
+from pp_cl.run import Run, load_run
 from pp_cl.scene.camera import Camera
 from pp_cl.scene.camera_path import up_of
 from pp_cl.scene.readers.frame import frame_keys
 from pp_cl.scene.target import Target
-from pp_cl.trained import Run, load_run
 from pp_cl.view import shown
 from pp_cl.view.messages import LEAST_SIDE, Frame, ViewRequest
 

@@ -16,7 +16,7 @@ from pathlib import Path
 
 from pp_cl.device.discover import open_device
 from pp_cl.errors import UserError
-from pp_cl.trained import check_scene
+from pp_cl.run import check_scene
 from pp_cl.view.access import Access
 from pp_cl.view.live_run import LiveRun, check_run
 

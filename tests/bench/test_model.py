@@ -10,7 +10,7 @@ from pp_cl.bench import model as module
 from pp_cl.bench.model import TRIED, bench_models, line
 from pp_cl.cli import main
 from pp_cl.compress.reduction import measured_psnr
-from pp_cl.trained import load_run
+from pp_cl.run import load_run
 
 
 @pytest.fixture(scope="module")

@@ -11,7 +11,7 @@ from support.scenes import write_ball_scene
 from pp_cl.cli import main
 from pp_cl.commands import export as command
 from pp_cl.export.formats import FORMATS
-from pp_cl.trained import Run
+from pp_cl.run import Run
 
 
 @pytest.fixture(scope="module")

@@ -13,10 +13,10 @@ from filelock import FileLock
 from support.runs import arguments
 from support.scenes import write_ball_scene
 
-from pp_cl import film
 from pp_cl.cli import main
+from pp_cl.export import film
 from pp_cl.files.image import read_rgba
-from pp_cl.trained import Run
+from pp_cl.run import Run
 
 
 @pytest.fixture(scope="module")

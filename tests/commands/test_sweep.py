@@ -16,12 +16,10 @@ from support.sweeps import jobs_of, pretend, words_of
 
 from pp_cl.cli import main
 from pp_cl.device.discover import open_device
-from pp_cl.evaluate import evaluate
 from pp_cl.files.checkpoint import load_checkpoint
 from pp_cl.files.run_folder import RunFolder
-from pp_cl.run import open_training
-from pp_cl.run_config import run_config
-from pp_cl.trained import load_run
+from pp_cl.run import evaluate, load_run
+from pp_cl.session import open_training, run_config
 
 ROOT = Path(__file__).parents[2]
 

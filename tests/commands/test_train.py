@@ -10,7 +10,7 @@ from support.scenes import write_ball_scene
 from pp_cl.cli import main
 from pp_cl.errors import UserError
 from pp_cl.files.run_folder import RunFolder
-from pp_cl.run_config import run_config
+from pp_cl.session import run_config
 
 
 def trained_lines(capsys, *words):
@@ -36,7 +36,7 @@ def test_a_run_keeps_the_size_of_its_images(tmp_path, capsys, monkeypatch):
     scene, out = write_ball_scene(tmp_path / "ball", size=300), tmp_path / "run"
     words = arguments(scene, out, downscale=1, train__iterations=6)
     with monkeypatch.context() as patch:
-        patch.setattr("pp_cl.run.Training._after_step", _interrupting)
+        patch.setattr("pp_cl.session.Training._after_step", _interrupting)
         assert main(words) == 130
     capsys.readouterr()
     assert main(["train", scene, "--out", str(out)]) == 0

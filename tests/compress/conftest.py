@@ -6,7 +6,7 @@ from support.scenes import write_ball_scene
 
 from pp_cl.cli import main
 from pp_cl.compress.reduction import Original
-from pp_cl.trained import load_run
+from pp_cl.run import load_run
 
 
 @pytest.fixture(scope="session")

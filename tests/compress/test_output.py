@@ -10,7 +10,7 @@ from pp_cl.cli import main
 from pp_cl.compress import search as search_module
 from pp_cl.compress.output import check_finished, validation_views
 from pp_cl.errors import UserError
-from pp_cl.trained import load_run
+from pp_cl.run import load_run
 
 
 def test_validation_views_are_never_those_of_the_test(dev, ball_run, tmp_path):

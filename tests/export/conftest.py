@@ -5,7 +5,7 @@ from support.runs import arguments
 from support.scenes import write_ball_scene
 
 from pp_cl.cli import main
-from pp_cl.trained import load_run
+from pp_cl.run import load_run
 
 
 @pytest.fixture(scope="session")

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from pp_cl.export.observe import directions, observe
-from pp_cl.trained import load_run
+from pp_cl.run import load_run
 
 
 def check(run):

@@ -16,8 +16,8 @@ from pp_cl.export.observe import directions, observe
 from pp_cl.export.page import POINT, check_drawable, pack, page_text
 from pp_cl.files.image import to_8bit
 from pp_cl.metrics.psnr_ssim import psnr
+from pp_cl.run import load_run
 from pp_cl.scene.camera import Camera
-from pp_cl.trained import load_run
 
 
 @pytest.fixture(scope="module")

@@ -7,9 +7,9 @@ import pytest
 
 from pp_cl.export.renderings import renderings
 from pp_cl.files.image import to_8bit
+from pp_cl.run import load_run
 from pp_cl.scene.demo import write_scene
 from pp_cl.scene.load import load_scene
-from pp_cl.trained import load_run
 
 
 def test_they_read_back_as_a_scene(run, tmp_path):

@@ -6,7 +6,7 @@ from support.checkpoints import contents
 from support.runs import SETTINGS
 
 from pp_cl.files.run_folder import RunFolder
-from pp_cl.run_config import run_config
+from pp_cl.session import run_config
 from pp_cl.sweep.plan import plan
 
 ITERATIONS = 16

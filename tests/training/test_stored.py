@@ -28,7 +28,7 @@ from pp_cl.config import load_config
 from pp_cl.errors import UserError
 from pp_cl.files.checkpoint import load_checkpoint, save_checkpoint
 from pp_cl.files.run_folder import RunFolder
-from pp_cl.trained import load_run
+from pp_cl.run import load_run
 from pp_cl.training.stored import load_run_state, opened_run, stored_forms
 from pp_cl.view.live_run import LiveRun
 from pp_cl.view.messages import read_request

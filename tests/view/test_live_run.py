@@ -11,7 +11,7 @@ from support.viewing import asking, decoded
 
 from pp_cl.errors import UserError
 from pp_cl.files.image import to_8bit
-from pp_cl.trained import load_run
+from pp_cl.run import load_run
 from pp_cl.view.live_run import (
     LiveRun,
     check_run,

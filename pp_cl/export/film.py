@@ -18,8 +18,8 @@ from pp_cl.files.image import read_rgba, write_png
 from pp_cl.files.picture import WHITE
 from pp_cl.files.regular import read_regular
 from pp_cl.files.video import write_video
+from pp_cl.run import Run
 from pp_cl.scene.camera import Camera
-from pp_cl.trained import Run
 
 MOST_IDENTITY = 1000  # bytes of it
 IDENTITY = "frames.json"  # in the folder of the frames: what they show

@@ -1,10 +1,9 @@
-"""What a run or a scene is, in numbers that JSON can hold, and in a picture."""
+"""What a run or a scene is, in numbers that JSON can hold."""
 
 import json
 import math
 from collections import Counter
 from collections.abc import Iterable, Sequence
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -12,15 +11,12 @@ import numpy as np
 from pp_cl.config import Config, assign, configure, load_config, preset
 from pp_cl.device.device import Device
 from pp_cl.errors import UserError
-from pp_cl.files.contact_sheet import contact_sheet
-from pp_cl.files.image import to_8bit
 from pp_cl.files.regular import read_json_text
 from pp_cl.files.run_folder import MOST_METRICS, RunFolder
 from pp_cl.scene.agreement import Disagreement, disagreements
 from pp_cl.scene.camera_path import looked_at, up_of
 from pp_cl.scene.grid import Grid
 from pp_cl.scene.hull import Hull, build_grid, spacing_pixels
-from pp_cl.scene.load import evenly
 from pp_cl.scene.open import (
     open_scene,
     preset_downscale,
@@ -29,25 +25,13 @@ from pp_cl.scene.open import (
     scene_frames,
     scene_splits,
 )
-from pp_cl.scene.outline import outline, silhouette
+from pp_cl.scene.outline import SHOWN_VIEWS, Points, picture
 from pp_cl.scene.photograph import Photograph
-from pp_cl.scene.target import Target
-from pp_cl.scene.views import MASK_THRESHOLD, View, fitting_downscale
+from pp_cl.scene.views import MASK_THRESHOLD, View
 from pp_cl.training.stored import opened_run
-
-SHOWN_VIEWS, SHOWN_SIZE = 12, 320  # photographs of the picture, and their longer side in pixels
-OUTLINE = (255, 0, 160)  # a colour that few objects have
-REJECTED = np.array([127, 60, 0], np.uint8)  # added to what a mask should have held
 
 Facts = dict[str, Any]
 Given = tuple[str, Any, str]  # a setting: key, value or its text, origin
-
-
-class Points(NamedTuple):
-    """Vertices of a grid. ids: (N,) uint32."""
-
-    grid: Grid
-    ids: np.ndarray
 
 
 # --------------------------------------------------------------------------------------------------
@@ -283,35 +267,3 @@ def _hull_facts(hull, cameras):
         "edge_pixels": spacing_pixels(grid, cameras),
         "box": grid.box.tolist(),
     }
-
-
-# --------------------------------------------------------------------------------------------------
-
-
-def picture(
-    dev: Device,
-    views: Sequence[View],
-    points: Points | Hull | None,
-    disagreeing: Sequence[Disagreement] = (),
-) -> np.ndarray:
-    """uint8 (H, W, 3) contact sheet of up to 12 photographs over white, spread evenly over the
-    views, with the outline of the points drawn over them.
-
-    disagreeing: their views come first, tinted where they reject what the others agree on.
-    """
-    target, images = Target(dev), []
-    tinted = {one.view.name: one for one in disagreeing[:SHOWN_VIEWS]}
-    others = [view for view in views if view.name not in tinted]
-    shown = [one.view for one in tinted.values()] + evenly(others, SHOWN_VIEWS - len(tinted))
-    for view in shown:
-        size = view.stored_camera.width, view.stored_camera.height
-        small = view.reduced(fitting_downscale(size, SHOWN_SIZE))
-        target.load(small)
-        image = to_8bit(target.whole())
-        if view.name in tinted:
-            rejected = silhouette(*tinted[view.name][2:], small.camera)
-            image[rejected] = image[rejected] // 2 + REJECTED
-        if points:
-            image[outline(points.grid, points.ids, small.camera)] = OUTLINE
-        images.append(image)
-    return contact_sheet(images, [Path(view.name).name for view in shown])

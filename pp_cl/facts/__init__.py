@@ -1,0 +1,1 @@
+"""What a run or a scene is, in numbers."""

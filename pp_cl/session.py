@@ -1,0 +1,452 @@
+"""A training that starts or goes on in the folder of a run."""
+
+import math
+import time
+import warnings
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from pp_cl.config import Config, assign, configure, load_config, preset, sections
+from pp_cl.device.device import Device
+from pp_cl.device.discover import open_device
+from pp_cl.errors import Diverged, UserError
+from pp_cl.files.atomic import check_writable
+from pp_cl.files.checkpoint import check_finite
+from pp_cl.files.contact_sheet import write_comparison
+from pp_cl.files.image import to_8bit, write_png
+from pp_cl.files.run_folder import MASKS_PICTURE, RunFolder
+from pp_cl.layers.choice import load_policy, policy_of_run
+from pp_cl.metrics.psnr_ssim import psnr
+from pp_cl.model import Model
+from pp_cl.network.unet import UNet
+from pp_cl.presets import SHORT
+from pp_cl.run import Run, load_run
+from pp_cl.scene.agreement import disagreements
+from pp_cl.scene.bounds import listing
+from pp_cl.scene.grid import Grid
+from pp_cl.scene.hull import build_grid, depth_range, spacing_pixels
+from pp_cl.scene.identity import difference, identity
+from pp_cl.scene.open import (
+    measured_split,
+    open_scene,
+    preset_downscale,
+    scene_box,
+    scene_frames,
+)
+from pp_cl.scene.outline import picture
+from pp_cl.scene.views import View
+from pp_cl.train import Trainer
+from pp_cl.training.fitting import Room
+from pp_cl.training.stored import load_run_state, opened_run
+
+FIRST_PREVIEW = 10.0  # seconds; with a slow step and its writing it shows within 20
+MEASURED_VIEWS = 4
+NEVER = (1.0, 1.0)  # train.refine_at
+
+Stored = tuple[dict[str, Any], dict[str, np.ndarray]]  # header and arrays of a checkpoint
+OnStep = Callable[[int, dict[str, Any] | None], None]
+
+
+class HullFacts(NamedTuple):
+    """The initial grid. capped: the largest grid allowed has fewer points than asked for. edge:
+    world units; spacing: the same in pixels; seconds it took. picture: of masks that disagree with
+    the others, None where all agree.
+    """
+
+    points: int
+    capped: bool
+    dims: tuple[int, int, int]
+    edge: float
+    spacing: float
+    depth_range: tuple[float, float]
+    seconds: float
+    picture: np.ndarray | None
+
+
+@dataclass
+class Training:
+    """A training that is ready to begin or to go on.
+
+    info: what its checkpoints' headers hold beside the model's. room: the memory there is, and the
+    plan of what is taken. hull: None if it goes on from a checkpoint. origin: of the choice of
+    convolutions, a line of text. measured: the views that train.eval_every measures.
+    """
+
+    folder: RunFolder
+    config: Config
+    trainer: Trainer
+    info: dict[str, Any]
+    room: Room
+    hull: HullFacts | None
+    origin: str
+    measured: list[View]
+    _preview_by: float = field(default=math.inf, init=False)  # time.monotonic()'s seconds
+    _save_by: float = field(default=math.inf, init=False)
+    _saved: int = field(default=0, init=False)  # step of the checkpoint; 0: there is none
+
+    def run(
+        self,
+        on_step: OnStep | None = None,
+        is_stopped: Callable[[], bool] = lambda: False,
+    ) -> float:
+        """Train to the end with log, previews and checkpoints; returns the seconds of training,
+        those before an interruption included.
+
+        on_step(step, row) is called after each step, with its row of the log where it has one.
+        is_stopped() is asked after each step: where it is true, a checkpoint is written and the
+        training ends there, to be gone on with. Raises UserError, before anything is written, where
+        another process trains into the folder; later on where a refinement or the averages take
+        more memory than there is, with a checkpoint, and where numbers are no longer finite: then
+        the last checkpoint stays.
+        """
+        with self.folder.owned():
+            self._check_unchanged()
+            self.folder.create(self.config.to_json())
+            if self.hull and self.hull.picture is not None:
+                write_png(self.folder.path / MASKS_PICTURE, self.hull.picture)
+            self._saved = self.trainer.step
+            try:
+                return self._run(on_step, is_stopped)
+            except Diverged as error:
+                kept = f"{self.folder.checkpoint} of step {self._saved} is kept"
+                raise UserError(
+                    f"{error}; {kept if self._saved else 'nothing was kept'}: train into another"
+                    " --out with a lower network.rate or train.sh_rate"
+                ) from None
+
+    def _check_unchanged(self):
+        """Raise UserError where another process trained into the folder since it was looked at."""
+        step = 0
+        if self.folder.checkpoint.exists():
+            with opened_run(self.folder, self.config) as stored:
+                step = stored.header["step"]
+        if step != self.trainer.step:
+            raise UserError(
+                f"{self.folder}: another training has gone on to step {step} meanwhile;"
+                " give the command again"
+            )
+
+    def _run(self, on_step, is_stopped):
+        trainer, settings = self.trainer, self.config.train
+        with self.folder.open_log(trainer.step) as log:
+            seconds = log.seconds
+            first = trainer.step + 1
+            self._expect_save()
+            while trainer.step < settings.iterations:
+                self._check_growth()
+                start = time.perf_counter()
+                terms = trainer.train_step()
+                seconds += time.perf_counter() - start
+                if trainer.step == first:  # the kernels are built
+                    self._expect_preview()
+                row = self._after_step(log, terms, seconds)
+                if on_step:
+                    on_step(trainer.step, row)
+                if is_stopped() and trainer.step < settings.iterations:
+                    self._save(finished=False)
+                    return seconds
+            check_finite(trainer.arrays())  # before averages take their place
+            start = time.perf_counter()
+            trainer.finish()
+            seconds += time.perf_counter() - start
+            # in front of the checkpoint: a row that has none is made again, a finished run is not
+            log.write(self._row(seconds) | {"points": trainer.model.cloud.count, "finished": True})
+            self._save(finished=True)
+        return seconds
+
+    def _check_growth(self):
+        """Keep what is learned where the next step would not fit the memory."""
+        try:
+            self.room.check_growth(self.trainer.model, self.trainer.step)
+        except UserError:
+            self._save(finished=False)
+            raise
+
+    def _after_step(self, log, terms, seconds):
+        """Row of the log, preview and checkpoint, where they are due; returns the row or None. The
+        checkpoint is the last: what it stands for is not made again.
+        """
+        trainer, settings = self.trainer, self.config.train
+        step, last, row = trainer.step, trainer.step == settings.iterations, None
+        is_measured = settings.eval_every and step % settings.eval_every == 0
+        measured = self._measure() if is_measured else {}
+        if step % settings.log_every == 0 or last or is_measured:
+            state = {"points": trainer.model.cloud.count, "rates": trainer.rates()}
+            row = self._row(seconds) | terms.get() | state | measured
+            log.write(row)
+        due = settings.previews and step % -(-settings.iterations // settings.previews) == 0
+        if last or due or time.monotonic() >= self._preview_by:
+            self._preview()
+        due = step % settings.checkpoint_every == 0 or time.monotonic() >= self._save_by
+        if due and not last:
+            self._save(finished=False)
+        return row
+
+    def _row(self, seconds):
+        device = self.trainer.dev.name
+        return {"step": self.trainer.step, "seconds": round(seconds, 3), "device": device}
+
+    def _measure(self):
+        """{"test_psnr": mean over the measured views, of 8-bit images} of the present model."""
+        trainer = self.trainer
+        pairs = [(self._rendered(view), trainer.target(view)) for view in self.measured]
+        return {"test_psnr": float(np.mean([psnr(to_8bit(a), to_8bit(b)) for a, b in pairs]))}
+
+    def _expect_preview(self):
+        """Be due an early preview, by the clock, where the run has none yet. It is an extra, which
+        no later step depends on.
+        """
+        wanted = self.config.train.previews and not any(self.folder.previews.glob("*.png"))
+        self._preview_by = time.monotonic() + FIRST_PREVIEW if wanted else math.inf
+
+    def _expect_save(self):
+        """Be due a checkpoint by the clock, which no step depends on."""
+        minutes = self.config.train.checkpoint_minutes
+        self._save_by = time.monotonic() + 60 * minutes if minutes else math.inf
+
+    def _save(self, finished):
+        trainer = self.trainer
+        header = trainer.model.header() | self.info | {"step": trainer.step, "finished": finished}
+        self.folder.save(header, trainer.model.arrays() if finished else trainer.arrays())
+        self._expect_save()
+        self._saved = trainer.step
+
+    def _preview(self):
+        """Prediction, truth and error of the first training view."""
+        trainer, view = self.trainer, self.trainer.views[0]
+        self._preview_by = math.inf
+        path = self.folder.previews / f"step_{trainer.step:06d}.png"
+        write_comparison(path, [self._rendered(view)], [trainer.target(view)])
+
+    def _rendered(self, view):
+        """The present model's image of a view. Raises Diverged where there is none."""
+        image = self.trainer.render(view)
+        if not np.isfinite(image).all():
+            raise Diverged(f"the image of {view.name} holds NaN after step {self.trainer.step}")
+        return image
+
+
+def open_training(
+    dev: Device, folder: RunFolder, config: Config, stored: Stored | None
+) -> Training:
+    """A training in `folder`, from its checkpoint `stored` where it has one. Nothing is written.
+
+    That of a finished training is gone on with up to config.train.iterations, with new moments and
+    without refinements. Raises UserError for a scene or checkpoint that does not fit, for too
+    little memory, and for a folder that may not be written.
+    """
+    check_writable(folder.path)
+    tolerance = config.network.tolerance
+    if stored:
+        policy = policy_of_run(dev, tolerance, stored[0].get("tuning"), folder.checkpoint)
+    else:
+        policy = load_policy(dev, tolerance)
+    net = UNet.of_settings(dev, config.network, policy, seed=config.train.seed)
+    begun = _begun(stored[0]) if stored else 0
+    goal = config
+    if begun:
+        goal = replace(config, train=replace(config.train, refine_at=NEVER))
+    room = Room(goal, net, scene_frames(config.scene.path))
+    if stored:
+        _check_stored(room, *stored)
+    else:
+        room.check_unseen()
+    views = open_scene(dev, config, ("train",)).splits["train"]
+    measured = _measured_views(dev, config) if config.train.eval_every else []
+    if stored:
+        trainer, info, hull = _resume(goal, views, net, stored, file=folder.checkpoint)
+    else:
+        trainer, info, hull = _start(config, views, net, room)
+    info["tuning"] = policy.tuning
+    return Training(folder, config, trainer, info, room, hull, policy.origin, measured)
+
+
+def _begun(header):
+    """The step of the finished training that this one extends, 0 where it extends none."""
+    return header["step"] if header["finished"] else header.get("extended_from", 0)
+
+
+def _check_stored(room, header, arrays):
+    grid, step = Grid.of_header(header["grid"]), header["step"]
+    room.check_points(grid, len(arrays["points.ids"]), header["depth_range"], step)
+
+
+def _measured_views(dev, config):
+    """A few views of the split val, else test."""
+    split = measured_split(config.scene.path)
+    return open_scene(dev, config, (split,), most=MEASURED_VIEWS).splits[split]
+
+
+def _start(config, views, net, room):
+    """(Trainer, info, HullFacts) of a training from its beginning."""
+    dev = net.dev
+    start = time.perf_counter()
+    hull = build_grid(dev, views, config.points.count, scene_box(config))
+    near_far = depth_range(views, hull)
+    room.check_points(hull.grid, len(hull.ids), near_far)
+    facts = HullFacts(
+        len(hull.ids),
+        hull.capped,
+        hull.grid.dims,
+        hull.grid.edge,
+        spacing_pixels(hull.grid, [view.camera for view in views]),
+        near_far,
+        time.perf_counter() - start,
+        _told_of_masks(dev, views, hull),
+    )
+    points = config.points
+    model = Model.create(
+        dev,
+        hull.grid,
+        hull.ids,
+        near_far,
+        net=net,
+        degree=points.sh_degree,
+        opacity=points.opacity,
+    )
+    trainer = Trainer(dev, config, model, views)
+    return trainer, identity(views) | {"initial_points": facts.points}, facts
+
+
+def _told_of_masks(dev, views, hull):
+    """Warn of masks that disagree with the others; their picture, None where all agree."""
+    found = disagreements(views, hull.grid.box)
+    if not found:
+        return None
+    worst = listing([f"{one.view.name} ({one.share:.0%} of it)" for one in found])
+    warnings.warn(
+        f"masks reject what the other views agree on: {worst}; see {MASKS_PICTURE} in the run's"
+        " folder",
+        stacklevel=2,
+    )
+    return picture(dev, views, hull, found)
+
+
+def _resume(config, views, net, stored, *, file):
+    """(Trainer, info, None) of a training that goes on."""
+    header, arrays = stored
+    path = config.scene.path
+    if told := difference(header, views, views):
+        raise UserError(f"{file}: belongs to another scene than {path} ({told}); use another --out")
+    for name, array in arrays.items():
+        if array.dtype == np.float16:  # of a compressed run
+            arrays[name] = array.astype(np.float32)
+    model = Model.load(net.dev, header, arrays, net, degree=config.points.sh_degree)
+    trainer = Trainer(net.dev, config, model, views)
+    begun = _begun(header)
+    trainer.restore(header["step"], arrays, begun)
+    info = identity(views) | {"initial_points": header["initial_points"]}
+    return trainer, info | ({"extended_from": begun} if begun else {}), None
+
+
+def train_scene(
+    scene: str,
+    out: Path | str,
+    preset: str | None = None,
+    device: str | None = None,
+    *,
+    settings: dict[str, Any] | None = None,
+    on_step: OnStep | None = None,
+    **options: Any,
+) -> Run:
+    """Train a scene into the folder `out`, or go on with the run there; a finished one is left
+    alone, unless more iterations are asked for than it has.
+
+    scene: a folder, or the word demo. device: as `pp-cl train --device`. settings: {"section.key":
+    value}; options: the same by the short names of presets.SHORT, such as iterations. on_step: see
+    Training.run. Raises UserError as `pp-cl train` reports it.
+    """
+    unknown = set(options) - set(SHORT)
+    if unknown:
+        raise TypeError(f"train_scene() has no {min(unknown)}; it has {', '.join(SHORT)}, settings")
+    settings = {SHORT[name]: value for name, value in options.items()} | (settings or {})
+    folder = RunFolder(out)
+    given = [(*s, "settings") for s in settings.items()]
+    config = run_config(folder, str(scene), preset, given, extends=True)
+    stored, dev = stored_state(folder, config), open_device(device)
+    if not is_finished(stored, config):
+        open_training(dev, folder, config, stored).run(on_step)
+    return load_run(dev, out)
+
+
+def run_config(
+    folder: RunFolder,
+    scene: str,
+    preset_name: str | None = None,
+    given: Iterable[tuple[str, Any, str]] = (),
+    *,
+    extends: bool = False,
+) -> Config:
+    """Config of a training in `folder`: its stored one if it has one, else the preset's, with the
+    given settings. Where these do not say scene.downscale, a new one reduces the images to about
+    the preset's size.
+
+    scene: a folder, or the word demo. given: (key, value or its text, origin), which a run with a
+    checkpoint must agree with; without one there is nothing that other settings would spoil.
+    extends: a finished run may have train.iterations given anew: with more of them it goes on, with
+    fewer it stays finished. Raises UserError naming the first setting that differs or makes no
+    sense, or what is wrong with the scene's files.
+    """
+    stored = load_config(folder.config) if folder.config.exists() else None
+    if stored and preset_name not in (None, stored.preset):
+        if folder.checkpoint.exists():
+            raise UserError(
+                f"{folder.config}: preset is {stored.preset} there, {preset_name} asked for; use"
+                " another --out"
+            )
+        stored = None
+    config = load_config(folder.config) if stored else preset(preset_name or "tiny")
+    given = list(given)
+    configure(config, scene, given)
+    if not stored and "scene.downscale" not in [key for key, _, _ in given]:
+        downscale = preset_downscale(config.scene.path, config.preset)
+        assign(config, "scene.downscale", downscale, "preset")
+    if stored and folder.checkpoint.exists():
+        if extends and config.train.iterations != stored.train.iterations:
+            with opened_run(folder, stored) as run:
+                if run.header["step"] == stored.train.iterations:
+                    most = max(config.train.iterations, stored.train.iterations)
+                    for one in (config, stored):
+                        assign(one, "train.iterations", most, "settings")
+        _check_same(config, stored, folder)
+    return config
+
+
+def _check_same(asked, stored, folder):
+    """Raise UserError naming the first setting that differs, the place of the scene aside: a
+    checkpoint knows its scene by more than that.
+    """
+    for (section, ours), (_, theirs) in zip(sections(asked), sections(stored), strict=True):
+        for name, value in vars(ours).items():
+            there = getattr(theirs, name)
+            if value != there and (section, name) != ("scene", "path"):
+                _refuse_setting(folder, f"{section}.{name}", there, value)
+
+
+def _refuse_setting(folder, key, there, asked):
+    raise UserError(
+        f"{folder.config}: {key} is {there} there, {asked} asked for; use another --out, or the"
+        " settings of the run"
+    )
+
+
+def stored_state(folder: RunFolder, config: Config) -> Stored | None:
+    """(header, arrays) of the folder's checkpoint, None where there is none. Raises UserError for a
+    folder or checkpoint that does not fit.
+    """
+    folder.check_usable()
+    stored = load_run_state(folder, config) if folder.checkpoint.exists() else None
+    if folder.config.exists() and (stored is None or is_finished(stored, config)):
+        path = load_config(folder.config).scene.path
+        if path != config.scene.path:
+            _refuse_setting(folder, "scene.path", path, config.scene.path)
+    return stored
+
+
+def is_finished(stored: Stored | None, config: Config) -> bool:
+    """Whether a checkpoint is that of the last step."""
+    return stored is not None and stored[0]["step"] == config.train.iterations
