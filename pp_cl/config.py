@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from pp_cl.errors import UserError, quoted, shown, suggestion
-from pp_cl.files.regular import read_regular
+from pp_cl.files.untrusted import read_regular
 from pp_cl.presets import PRESETS
 from pp_cl.settings import NetworkConfig, PointsConfig, RasterConfig, SceneConfig, TrainConfig
 

@@ -30,11 +30,9 @@ from pp_cl.network.unet import UNet
 from pp_cl.render import Renderer
 from pp_cl.scene.camera import Camera
 from pp_cl.scene.identity import difference, kept_views
-from pp_cl.scene.load import Scene
-from pp_cl.scene.open import DEMO, open_scene, scene_frames
-from pp_cl.scene.photograph import Photograph
+from pp_cl.scene.load import DEMO, Scene, open_scene, scene_frames
 from pp_cl.scene.target import Target
-from pp_cl.scene.views import View
+from pp_cl.scene.views import Photograph, View
 from pp_cl.training.schedule import gamma_at
 from pp_cl.training.stored import load_run_state
 

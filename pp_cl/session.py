@@ -25,18 +25,11 @@ from pp_cl.model import Model
 from pp_cl.network.unet import UNet
 from pp_cl.presets import SHORT
 from pp_cl.run import Run, load_run
-from pp_cl.scene.agreement import disagreements
-from pp_cl.scene.bounds import listing
+from pp_cl.scene.agreement import disagreements, listing
 from pp_cl.scene.grid import Grid
 from pp_cl.scene.hull import build_grid, depth_range, spacing_pixels
 from pp_cl.scene.identity import difference, identity
-from pp_cl.scene.open import (
-    measured_split,
-    open_scene,
-    preset_downscale,
-    scene_box,
-    scene_frames,
-)
+from pp_cl.scene.load import measured_split, open_scene, preset_downscale, scene_box, scene_frames
 from pp_cl.scene.outline import picture
 from pp_cl.scene.views import View
 from pp_cl.train import Trainer
@@ -250,12 +243,14 @@ def open_training(
     goal = config
     if begun:
         goal = replace(config, train=replace(config.train, refine_at=NEVER))
-    room = Room(goal, net, scene_frames(config.scene.path))
+    photographs = scene_frames(config.scene.path)
+    room = Room(goal, net, photographs)
     if stored:
         _check_stored(room, *stored)
     else:
         room.check_unseen()
-    views = open_scene(dev, config, ("train",)).splits["train"]
+    listed = {"train": photographs}
+    views = open_scene(dev, config, ("train",), listed=listed).splits["train"]
     measured = _measured_views(dev, config) if config.train.eval_every else []
     if stored:
         trainer, info, hull = _resume(goal, views, net, stored, file=folder.checkpoint)

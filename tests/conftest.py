@@ -15,7 +15,7 @@ from support.scenes import write_ball_scene
 from pp_cl.cli import main
 from pp_cl.device.discover import list_devices, open_device
 from pp_cl.device.launch import Program
-from pp_cl.files.cache import cache_folder, make_cache_folder
+from pp_cl.files.atomic import cache_folder, make_cache_folder
 from pp_cl.metrics.lpips_weights import WEIGHTS_FILE
 
 # of Hypothesis: the same few examples each time, or as many as `make fuzz` is told

@@ -16,7 +16,7 @@ from pp_cl.errors import UserError
 from pp_cl.files.image import read_rgba
 from pp_cl.metrics.psnr_ssim import psnr
 from pp_cl.run import image_files
-from pp_cl.scene.open import open_scene
+from pp_cl.scene.load import open_scene
 
 
 @pytest.fixture(scope="module")

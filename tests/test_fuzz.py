@@ -34,7 +34,6 @@ from support.fuzz_world import (
 
 from pp_cl.cli import COMMANDS
 from pp_cl.config import Config, load_config, sections
-from pp_cl.errors import UserError
 from pp_cl.files.checkpoint import load_checkpoint
 from pp_cl.files.exr import write_exr
 from pp_cl.files.image import image_size, read_gray, read_rgba
@@ -48,7 +47,6 @@ from pp_cl.layers.choice import (
     offered,
     tuning_file,
 )
-from pp_cl.metrics import lpips_weights
 from pp_cl.metrics.compare import compare
 from pp_cl.metrics.shape import overlap, read_mesh, sample_surface
 from pp_cl.scene.grid import Grid
@@ -374,25 +372,6 @@ def test_a_tuning(world, data):
         shape = ConvShape(one(data.draw, *Direction), 3, (16,), 16, one(data.draw, 1, 4096, 2**20))
         chosen = taken(lambda: policy.choose(shape))
         assert chosen in (None, *offered(device_class(world.device)))
-
-
-@fuzzed()
-@given(data=st.data())
-def test_weights_of_lpips(world, data):
-    """Nothing but the very weights is taken from the cache."""
-
-    def no_network(*_):
-        raise UserError("no network here")
-
-    names = [f"kernel{i}" for i in range(3)] + [f"bias{i}" for i in range(3)] + ["head0"]
-    file = world.cache / lpips_weights.WEIGHTS_FILE
-    with world.watched(), pytest.MonkeyPatch.context() as patch:
-        patch.setattr(lpips_weights, "download", no_network)
-        array = damage.npy(np.ones((4, 4), np.float32))
-        clear(file)
-        file.write_bytes(damage.archived([(f"{name}.npy", array) for name in names]))
-        damage.damage_file(data.draw, file)
-        assert taken(lpips_weights.load_weights) is None
 
 
 # --------------------------------------------------------------------------------------------------

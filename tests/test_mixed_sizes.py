@@ -14,10 +14,9 @@ from pp_cl.files.image import read_rgba
 from pp_cl.files.run_folder import RunFolder
 from pp_cl.network.unet import UNet
 from pp_cl.run import load_run
-from pp_cl.scene.demo import write_scene
 from pp_cl.scene.hull import build_grid
-from pp_cl.scene.load import Scene, load_scene
-from pp_cl.scene.open import preset_downscale, scene_frames
+from pp_cl.scene.load import load_scene, preset_downscale, scene_frames
+from pp_cl.scene.readers.transforms import write_scene
 from pp_cl.scene.views import View
 from pp_cl.training.memory import Sketch, memory_plan
 
@@ -38,7 +37,7 @@ def scene(tmp_path_factory):
             crop = camera.resized(width, height)
             views.append(View(f"{split}/r_{i}.png", crop, ball_image(crop)))
         splits[split] = views
-    write_scene(Scene("ball", None, splits), folder)
+    write_scene(splits, folder)
     return str(folder)
 
 

@@ -13,7 +13,7 @@ from pp_cl.config import Config, assign, load_config, preset, sections, text_of
 from pp_cl.errors import MOST_LINE, UserError, one_line, quoted, shown
 from pp_cl.files.checkpoint import load_checkpoint, save_checkpoint
 from pp_cl.files.run_folder import MOST_NUMBER, read_row
-from pp_cl.scene.readers.arrays import MOST, read_numbers
+from pp_cl.scene.readers.common import MOST, read_numbers
 from pp_cl.scene.readers.frame import rigid
 from pp_cl.sweep.plan import read_seeds, read_varied
 from pp_cl.view.messages import read_request

@@ -17,7 +17,7 @@ from pp_cl.config import configure, preset
 from pp_cl.device.discover import open_device
 from pp_cl.errors import UserError
 from pp_cl.files.atomic import atomic_folder
-from pp_cl.scene.open import open_scene, scene_splits
+from pp_cl.scene.load import open_scene, scene_splits
 from pp_cl.scene.readers.common import SPLITS, hold_out
 from pp_cl.scene.views import View
 

@@ -10,7 +10,8 @@ import trimesh
 
 from pp_cl.device.discover import open_device
 from pp_cl.errors import UserError
-from pp_cl.scene.demo import SIZE, demo_mesh, demo_scene, write_scene
+from pp_cl.scene.demo import SIZE, SPLITS, demo_mesh, demo_views
+from pp_cl.scene.readers.transforms import write_scene
 
 
 def main() -> int:
@@ -23,7 +24,8 @@ def main() -> int:
     options = parser.parse_args()
     try:
         dev = open_device()
-        write_scene(demo_scene(dev, size=options.size), options.folder)
+        splits = {split: demo_views(dev, split, size=options.size) for split in SPLITS}
+        write_scene(splits, options.folder)
     except UserError as error:
         print(f"demo_scene: {error}", file=sys.stderr)
         return 2

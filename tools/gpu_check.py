@@ -34,7 +34,8 @@ from pp_cl.cli import main as pp_cl
 from pp_cl.device.device import INTEL_PLATFORM, STANDARD, Device, kernel_folder, vendor_options
 from pp_cl.device.discover import open_device
 from pp_cl.device.launch import Program
-from pp_cl.scene.demo import demo_scene, write_scene
+from pp_cl.scene.demo import demo_views
+from pp_cl.scene.readers.transforms import write_scene
 from pp_cl.selftest.run import CASES, run_cases
 
 TARGETS = ("sm_90", "gfx1100", "dg2")  # Hopper, RDNA 3, Arc
@@ -100,7 +101,7 @@ def record() -> dict[Build, set[str]]:
         failed = [row.case for row in run_cases(dev, CASES) if not row.passed]
         PeakFlops(dev)
         CopyBandwidth(dev).run()
-        write_scene(demo_scene(dev, size=16, most=4), f"{folder}/scene")
+        write_scene({"train": demo_views(dev, "train", 4, 16)}, f"{folder}/scene")
         for preset in ("tiny", "paper"):
             words = ["--points", "500", "--iterations", "2", "--preset", preset]
             with redirect_stdout(io.StringIO()), redirect_stderr(io.StringIO()):

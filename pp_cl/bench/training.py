@@ -17,7 +17,7 @@ from pp_cl.metrics.psnr_ssim import psnr
 from pp_cl.model import Model
 from pp_cl.network.unet import UNet
 from pp_cl.scene.hull import build_grid, depth_range
-from pp_cl.scene.open import open_scene, scene_box
+from pp_cl.scene.load import open_scene, scene_box
 from pp_cl.train import Trainer
 from pp_cl.training.optimiser import Rates
 

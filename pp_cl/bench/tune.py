@@ -18,8 +18,7 @@ from pp_cl.bench.timing import errors, interleave
 from pp_cl.device.device import Device
 from pp_cl.device.discover import TEMPORARY_CACHE
 from pp_cl.errors import UserError
-from pp_cl.files.atomic import write_json
-from pp_cl.files.cache import make_cache_folder
+from pp_cl.files.atomic import make_cache_folder, write_json
 from pp_cl.layers.choice import (
     CHOICES,
     FORMAT,

@@ -34,7 +34,7 @@ def run(options: argparse.Namespace) -> None:
     from pp_cl.config import nearby_run
     from pp_cl.files.image import write_png
     from pp_cl.files.run_folder import RunFolder
-    from pp_cl.scene.open import DEMO
+    from pp_cl.scene.load import DEMO
 
     if options.open and not options.picture:
         raise UserError("--open: there is no picture; name its file with --picture FILE")

@@ -10,7 +10,7 @@ from pp_cl.errors import UserError
 from pp_cl.files.atomic import atomic_folder, write_json, write_text
 from pp_cl.files.run_folder import RunFolder
 from pp_cl.run import Run
-from pp_cl.scene.open import scene_splits
+from pp_cl.scene.load import scene_splits
 from pp_cl.scene.views import View
 
 REPORT = "compress.json"

@@ -16,7 +16,7 @@ from pp_cl.files.atomic import check_file, check_target, remove_leftovers, write
 from pp_cl.files.exr import write_exr
 from pp_cl.files.image import read_rgba, write_png
 from pp_cl.files.picture import WHITE
-from pp_cl.files.regular import read_regular
+from pp_cl.files.untrusted import read_regular
 from pp_cl.files.video import write_video
 from pp_cl.run import Run
 from pp_cl.scene.camera import Camera

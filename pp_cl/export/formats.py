@@ -15,7 +15,7 @@ from pp_cl.export.points import coloured_points
 from pp_cl.export.renderings import renderings
 from pp_cl.files.atomic import check_file, check_new_folder, write_text
 from pp_cl.run import Run
-from pp_cl.scene.demo import write_scene
+from pp_cl.scene.readers.transforms import write_scene
 
 
 @dataclass(frozen=True)
@@ -82,9 +82,9 @@ def _html(run, path, min_weight):
 
 
 def _scene(run, path, min_weight):
-    scene = renderings(run)
-    write_scene(scene, _in_folder(path))
-    return ", ".join(f"{len(views)} {split} views" for split, views in scene.splits.items())
+    splits = renderings(run)
+    write_scene(splits, _in_folder(path))
+    return ", ".join(f"{len(views)} {split} views" for split, views in splits.items())
 
 
 def _in_folder(path):

@@ -8,7 +8,7 @@ import trimesh
 
 from pp_cl.export.points import ColouredPoints
 from pp_cl.files.atomic import atomic_file
-from pp_cl.files.colour import srgb_to_linear
+from pp_cl.files.exr import srgb_to_linear
 from pp_cl.files.image import to_8bit
 
 

@@ -9,22 +9,20 @@ from tqdm import tqdm
 from pp_cl.errors import UserError
 from pp_cl.files.image import to_8bit
 from pp_cl.run import Run, image_files
-from pp_cl.scene.load import Scene
 from pp_cl.scene.views import View
 
 
-def renderings(run: Run) -> Scene:
-    """The train and test views at the run's resolution, each image the run's rendering of it as
-    straight RGBA; where the run's scene has no test views, or none that can be read, those are left
-    out with a warning that says why.
+def renderings(run: Run) -> dict[str, list[View]]:
+    """{split: views}: those of train and test at the run's resolution, each image the run's
+    rendering of it as straight RGBA; where the run's scene has no test views, or none that can be
+    read, those are left out with a warning that says why.
     """
     splits = {"train": run.photographs("train")}
     try:
         splits["test"] = run.photographs("test")
     except UserError as error:
         warnings.warn(f"no test views are exported: {error}", stacklevel=2)
-    rendered = {split: _rendered(run, split, listed) for split, listed in splits.items()}
-    return Scene(run.folder.path.name, None, rendered)
+    return {split: _rendered(run, split, listed) for split, listed in splits.items()}
 
 
 def _rendered(run, split, photographs):

@@ -11,13 +11,13 @@ import numpy as np
 from pp_cl.config import Config, assign, configure, load_config, preset
 from pp_cl.device.device import Device
 from pp_cl.errors import UserError
-from pp_cl.files.regular import read_json_text
 from pp_cl.files.run_folder import MOST_METRICS, RunFolder
+from pp_cl.files.untrusted import read_json_text
 from pp_cl.scene.agreement import Disagreement, disagreements
 from pp_cl.scene.camera_path import looked_at, up_of
 from pp_cl.scene.grid import Grid
 from pp_cl.scene.hull import Hull, build_grid, spacing_pixels
-from pp_cl.scene.open import (
+from pp_cl.scene.load import (
     open_scene,
     preset_downscale,
     scene_box,
@@ -26,8 +26,7 @@ from pp_cl.scene.open import (
     scene_splits,
 )
 from pp_cl.scene.outline import SHOWN_VIEWS, Points, picture
-from pp_cl.scene.photograph import Photograph
-from pp_cl.scene.views import MASK_THRESHOLD, View
+from pp_cl.scene.views import MASK_THRESHOLD, Photograph, View
 from pp_cl.training.stored import opened_run
 
 Facts = dict[str, Any]

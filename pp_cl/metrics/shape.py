@@ -11,7 +11,7 @@ import trimesh
 from pp_cl.device.device import Device
 from pp_cl.device.host import at_most_more
 from pp_cl.errors import UserError
-from pp_cl.files.regular import refusal
+from pp_cl.files.untrusted import refusal
 from pp_cl.scene.grid import Grid
 
 SAMPLES = 1024**3  # of the supplemental

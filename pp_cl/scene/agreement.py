@@ -1,18 +1,19 @@
-"""Masks that contradict those of the other views."""
+"""Masks that contradict those of the other views, and what to say of them."""
 
 from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
 
-from pp_cl.scene.bounds import mask_votes
-from pp_cl.scene.grid import Grid
-from pp_cl.scene.views import View
+from pp_cl.scene.grid import Grid, smallest_edge
+from pp_cl.scene.views import MASK_THRESHOLD, View
 
 # A view is told of if it alone rejects more than this share of the object, and several times what
 # is usual: every view carves a little that no other does, the more so where there are few. Lego's
 # views reach 0.03 with all 100 of them, and 0.15 with 20; a mask shifted by 15 % of the image 0.35.
 LEAST_SHARE, TIMES_MEDIAN, TIMES_EVEN = 0.05, 4.0, 4.0
+PROBED_CELLS = 32**3  # positions at which the masks are looked up
+NAMES_SHOWN = 3  # views named in a message
 AGREEING = 0.75  # of the other views that see a place, whose masks hold it
 
 
@@ -44,3 +45,66 @@ def disagreements(views: Sequence[View], box: np.ndarray) -> list[Disagreement]:
     least = max(LEAST_SHARE, TIMES_MEDIAN * float(np.median(shares)), TIMES_EVEN / len(views))
     worst = [i for i in np.argsort(-shares, kind="stable") if shares[i] > least]
     return [Disagreement(views[i], float(shares[i]), grid, np.flatnonzero(alone[i])) for i in worst]
+
+
+def explain_empty_hull(views: Sequence[View], box: np.ndarray) -> str:
+    """One line on why the masks leave no point: which views contradict most others.
+
+    It counts the masks that hold each of about 32^3 positions in a (2, 3) box.
+    """
+    empty = [view.name for view in views if view.image[..., 3].max() <= MASK_THRESHOLD]
+    if empty:
+        return (
+            f"{listing(empty)}: the mask is empty (no alpha above {MASK_THRESHOLD}): mend or remove"
+            " the image"
+        )
+    _, on_mask, beside = mask_votes(views, box)
+    agreeing = on_mask.sum(0).max()
+    objections = beside[:, on_mask.sum(0) == agreeing].mean(1)
+    names = [views[i].name for i in np.argsort(-objections, kind="stable") if objections[i] > 0]
+    if agreeing >= 0.75 * len(views) and names:
+        return (
+            f"{listing(names)}: the mask rejects every place that the other views agree on: check"
+            " its alpha and its camera"
+        )
+    names = listing([view.name for view in views])
+    return (
+        f"{names}: the masks leave no point, at most {agreeing} of {len(views)} meet in one place:"
+        " check the masks and the camera poses (camera-to-world; in transforms files x right, y"
+        " up, z backward)"
+    )
+
+
+def mask_votes(views: Sequence[View], box: np.ndarray) -> tuple[Grid, np.ndarray, np.ndarray]:
+    """(a grid of about 32^3 vertices in a (2, 3) box, (V, N) bool: which of its vertices fall onto
+    each view's mask, and which into its image beside the mask).
+    """
+    grid = Grid.centred_in(box, smallest_edge(box, PROBED_CELLS))
+    k, j, i = np.indices(grid.dims[::-1]).reshape(3, -1)
+    vertices = np.stack([i, j, k, np.ones_like(i)])
+    votes = [_votes_of(view, grid.projection(view.stored_camera) @ vertices) for view in views]
+    return grid, *np.stack(votes, axis=1)
+
+
+def _votes_of(view, projected):
+    """(2, N) bool: which positions fall onto the mask, and which into the image beside it.
+
+    projected: (3, N), as Grid.projection gives them.
+    """
+    u, v, depth = projected
+    height, width = view.image.shape[:2]
+    ahead = depth > 0
+    x, y = (np.floor(np.divide(a, depth, where=ahead, out=np.full_like(a, -1))) for a in (u, v))
+    inside = ahead & (x >= 0) & (x < width) & (y >= 0) & (y < height)
+    on = (
+        view.image[np.where(inside, y, 0).astype(int), np.where(inside, x, 0).astype(int), 3]
+        > MASK_THRESHOLD
+    )
+    return np.stack([inside & on, inside & ~on])
+
+
+def listing(names: Sequence[str]) -> str:
+    """A few of the names, and how many more there are."""
+    return ", ".join(names[:NAMES_SHOWN]) + (
+        f" and {len(names) - NAMES_SHOWN} more" if len(names) > NAMES_SHOWN else ""
+    )

@@ -1,4 +1,4 @@
-"""The box around the object that the masks allow, and why masks can leave no hull."""
+"""The box around the object that cameras and masks allow."""
 
 import math
 from collections.abc import Sequence
@@ -7,7 +7,7 @@ import numpy as np
 from scipy.optimize import linprog
 
 from pp_cl.errors import UserError
-from pp_cl.scene.grid import Grid, smallest_edge
+from pp_cl.scene.agreement import explain_empty_hull
 from pp_cl.scene.views import MASK_THRESHOLD, View
 
 # how far, in image sizes, an object that the image border cuts off may reach beyond the border
@@ -16,8 +16,6 @@ CROPPED_MARGIN = 0.5
 LEAST_REACH, MOST_REACH = 1e-12, 1e15
 LEAST_SHARE = 1e-9  # of a distance: less of it is rounding
 SOLVED, INFEASIBLE = 0, 2  # status of scipy.optimize.linprog
-PROBED_CELLS = 32**3  # positions at which an error's explanation looks up the masks
-NAMES_SHOWN = 3  # views named in an error
 
 
 def reach_of(views: Sequence[View]) -> float:
@@ -107,66 +105,3 @@ def _silhouette_planes(view, cropped_margin):
             normals.append(sign * camera.pose[:, :3] @ normal / np.linalg.norm(normal))
     normals = np.array(normals).reshape(-1, 3)
     return np.column_stack([normals, normals @ camera.eye])
-
-
-def explain_empty_hull(views: Sequence[View], box: np.ndarray) -> str:
-    """One line on why the masks leave no point: which views contradict most others.
-
-    It counts the masks that hold each of about 32^3 positions in a (2, 3) box.
-    """
-    empty = [view.name for view in views if view.image[..., 3].max() <= MASK_THRESHOLD]
-    if empty:
-        return (
-            f"{listing(empty)}: the mask is empty (no alpha above {MASK_THRESHOLD}): mend or remove"
-            " the image"
-        )
-    _, on_mask, beside = mask_votes(views, box)
-    agreeing = on_mask.sum(0).max()
-    objections = beside[:, on_mask.sum(0) == agreeing].mean(1)
-    names = [views[i].name for i in np.argsort(-objections, kind="stable") if objections[i] > 0]
-    if agreeing >= 0.75 * len(views) and names:
-        return (
-            f"{listing(names)}: the mask rejects every place that the other views agree on: check"
-            " its alpha and its camera"
-        )
-    names = listing([view.name for view in views])
-    return (
-        f"{names}: the masks leave no point, at most {agreeing} of {len(views)} meet in one place:"
-        " check the masks and the camera poses (camera-to-world; in transforms files x right, y"
-        " up, z backward)"
-    )
-
-
-def mask_votes(views: Sequence[View], box: np.ndarray) -> tuple[Grid, np.ndarray, np.ndarray]:
-    """(a grid of about 32^3 vertices in a (2, 3) box, (V, N) bool: which of its vertices fall onto
-    each view's mask, and which into its image beside the mask).
-    """
-    grid = Grid.centred_in(box, smallest_edge(box, PROBED_CELLS))
-    k, j, i = np.indices(grid.dims[::-1]).reshape(3, -1)
-    vertices = np.stack([i, j, k, np.ones_like(i)])
-    votes = [_votes_of(view, grid.projection(view.stored_camera) @ vertices) for view in views]
-    return grid, *np.stack(votes, axis=1)
-
-
-def _votes_of(view, projected):
-    """(2, N) bool: which positions fall onto the mask, and which into the image beside it.
-
-    projected: (3, N), as Grid.projection gives them.
-    """
-    u, v, depth = projected
-    height, width = view.image.shape[:2]
-    ahead = depth > 0
-    x, y = (np.floor(np.divide(a, depth, where=ahead, out=np.full_like(a, -1))) for a in (u, v))
-    inside = ahead & (x >= 0) & (x < width) & (y >= 0) & (y < height)
-    on = (
-        view.image[np.where(inside, y, 0).astype(int), np.where(inside, x, 0).astype(int), 3]
-        > MASK_THRESHOLD
-    )
-    return np.stack([inside & on, inside & ~on])
-
-
-def listing(names: Sequence[str]) -> str:
-    """A few of the names, and how many more there are."""
-    return ", ".join(names[:NAMES_SHOWN]) + (
-        f" and {len(names) - NAMES_SHOWN} more" if len(names) > NAMES_SHOWN else ""
-    )

@@ -3,22 +3,15 @@ must be downloaded.
 """
 
 import math
-from collections.abc import Iterable
-from pathlib import Path
 
 import numpy as np
 
 from pp_cl.device.device import Device
 from pp_cl.device.form import lanes
 from pp_cl.errors import UserError
-from pp_cl.files.atomic import atomic_folder, write_json
-from pp_cl.files.image import write_png
 from pp_cl.scene.camera import Camera
 from pp_cl.scene.grid import Grid
-from pp_cl.scene.load import Scene, evenly
-from pp_cl.scene.photograph import Photograph
-from pp_cl.scene.readers.frame import frame_keys
-from pp_cl.scene.views import View
+from pp_cl.scene.views import Photograph, View, evenly
 
 SPLITS = ("train", "test")
 SIZE = 400  # pixels
@@ -29,29 +22,21 @@ NO_DEPTH_RANGE = (0.0, math.inf)  # the rays are traced through the whole object
 OBJECT_BOX = ((-0.8, -0.8, -1.0), (0.8, 0.8, 0.92))  # holds the object
 
 
-def demo_scene(
-    dev: Device, splits: Iterable[str] = SPLITS, size: int = SIZE, *, most: int | None = None
-) -> Scene:
-    """Scene `demo` of 64 training and 16 test views of size x size pixels, rendered on the device;
-    it states no depth range. most: views of each split, spread evenly; None: all.
+def demo_views(dev: Device, split: str, most: int | None = None, size: int = SIZE) -> list[View]:
+    """The 64 training or 16 test views of size x size pixels, rendered on the device; they state no
+    depth range. most: of them, spread evenly; None: all.
 
     The training views spread evenly from a little below the horizon to the pole, the test views
     circle the object.
     """
-    views = {
-        split: [
-            View(frame.name, frame.camera, render(dev, frame.camera))
-            for frame in evenly(demo_frames(split, size), most)
-        ]
-        for split in splits
-    }
-    return Scene("demo", None, views)
+    return [
+        View(frame.name, frame.camera, render(dev, frame.camera))
+        for frame in evenly(demo_frames(split, size), most)
+    ]
 
 
 def demo_frames(split: str, size: int = SIZE) -> list[Photograph]:
-    """A split's views, without their images. Raises UserError for a
-    split that there is not.
-    """
+    """A split's views, without their images. Raises UserError for a split that there is not."""
     if split not in SPLITS:
         raise UserError(f"--split {split}: demo has {', '.join(SPLITS)}")
     cameras = _spread_cameras(size) if split == "train" else _circling_cameras(size)
@@ -104,45 +89,6 @@ def distances(dev: Device, grid: Grid) -> np.ndarray:
         distances=out,
     )
     return out.get().reshape(grid.dims[::-1])
-
-
-def write_scene(scene: Scene, folder: str | Path) -> None:
-    """Write the stored images of a Scene as a NeRF-synthetic folder (transforms_<split>.json and
-    PNG images) that load_scene reads.
-
-    Every frame has nerfstudio's fl_x, fl_y, cx, cy, w, h, and near and far if the scene states
-    them. The folder appears when it is complete. Raises UserError if it exists and is not empty, or
-    cannot be written.
-    """
-    with atomic_folder(Path(folder)) as unfinished:
-        write_splits(unfinished, scene.splits)
-
-
-def write_splits(folder: Path, splits: dict[str, list[View]]) -> None:
-    """Write views in write_scene's format into a folder that exists."""
-    for split, views in splits.items():
-        for view in views:
-            path = (folder / view.name).with_suffix(".png")
-            path.parent.mkdir(parents=True, exist_ok=True)
-            write_png(path, view.image)
-        write_json(folder / f"transforms_{split}.json", _transforms(views))
-
-
-def _transforms(views):
-    """Content of a transforms_<split>.json."""
-    camera = views[0].stored_camera
-    return {
-        "camera_angle_x": 2 * math.atan(0.5 * camera.width / camera.fx),
-        "frames": [_frame(view) for view in views],
-    }
-
-
-def _frame(view):
-    path = "./" + Path(view.name).with_suffix("").as_posix()
-    frame = {"file_path": path, **frame_keys(view.stored_camera)}
-    if view.depth_range:
-        frame["near"], frame["far"] = view.depth_range
-    return frame
 
 
 def _spread_cameras(size):

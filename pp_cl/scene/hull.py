@@ -9,7 +9,8 @@ from pyopencl.array import Array
 
 from pp_cl.device.device import Device
 from pp_cl.errors import UserError
-from pp_cl.scene.bounds import bounding_box, explain_empty_hull, reach_of
+from pp_cl.scene.agreement import explain_empty_hull
+from pp_cl.scene.bounds import bounding_box, reach_of
 from pp_cl.scene.camera import Camera
 from pp_cl.scene.grid import Grid, smallest_edge
 from pp_cl.scene.views import MASK_THRESHOLD, View

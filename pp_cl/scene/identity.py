@@ -10,8 +10,7 @@ from typing import Any
 import numpy as np
 
 from pp_cl.scene.camera import Camera
-from pp_cl.scene.photograph import Photograph
-from pp_cl.scene.views import View
+from pp_cl.scene.views import Photograph, View
 
 DIGITS = 16  # of a view's digest, hexadecimal: enough to tell pixels that were changed, not forged
 POSE, LENS, SIZE, RANGE = 12, 4, 2, 2  # numbers of a kept view; it may have no depth range

@@ -1,25 +1,40 @@
-"""Scenes: photographs of one object, with cameras and masks, from any format that READERS knows."""
+"""Scenes: photographs of one object with cameras and masks, from a folder in any format that
+READERS knows, or made by the program.
+"""
 
 import os
-from collections.abc import Callable, Iterable, Sequence
+import warnings
+from collections.abc import Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
 from types import ModuleType
-from typing import TypeVar
 
+import numpy as np
 from tqdm import tqdm
 
+from pp_cl.config import Config
+from pp_cl.device.device import Device
 from pp_cl.errors import UserError, quoted
-from pp_cl.files.image import read_rgba
+from pp_cl.files.image import ENDINGS, read_rgba
+from pp_cl.presets import IMAGE_SIZES
+from pp_cl.scene import demo
 from pp_cl.scene.distortion import undistort
 from pp_cl.scene.identity import pixel_digest
 from pp_cl.scene.masks import AS_GIVEN, MaskRule
-from pp_cl.scene.photograph import Photograph
 from pp_cl.scene.readers import co3d, colmap, llff, neus, nsvf, transforms
-from pp_cl.scene.readers.common import ENDINGS
-from pp_cl.scene.shrink import shrink, shrink_factor
-from pp_cl.scene.views import View, check_downscale
+from pp_cl.scene.views import (
+    MIN_SIDE,
+    Photograph,
+    View,
+    check_downscale,
+    evenly,
+    fitting_downscale,
+    shrink,
+    shrink_factor,
+)
+
+DEMO = "demo"  # the word that names the scene which the program makes itself
 
 # One module per format. FILES names the files it reads, recognises(folder) tells whether a folder
 # holds such files, splits(folder) names its splits, and read_split(folder, split) gives a list of
@@ -35,7 +50,7 @@ LEAST_FOCAL, MOST_FOCAL = 1e-2, 1e7  # pixels; docs/scene_scale.md says what is 
 
 NEARBY = 100  # entries of a folder without a scene in which one is looked for
 
-Item, Made = TypeVar("Item"), TypeVar("Made")
+Listed = Mapping[str, Sequence[Photograph]]  # photographs by the name of their split
 
 
 @dataclass(frozen=True)
@@ -61,10 +76,113 @@ class Scene:
         return replace(self, splits=splits)
 
 
-def evenly(items: Sequence[Item], most: int | None) -> list[Item]:
-    """At most `most` of the items, spread evenly, the first among them; None: all."""
-    n = len(items)
-    return list(items) if most is None or n <= most else [items[n * i // most] for i in range(most)]
+def open_scene(
+    dev: Device,
+    config: Config,
+    splits: tuple[str, ...],
+    most: int | None = None,
+    listed: Listed | None = None,
+) -> Scene:
+    """Scene of config.scene.path with the given splits, reduced config.scene.downscale times;
+    `demo` is rendered on the device.
+
+    most, listed: as load_scene() takes them.
+    """
+    path, downscale = config.scene.path, config.scene.downscale
+    if path == DEMO:
+        views = {split: demo.demo_views(dev, split, most) for split in splits}
+        return Scene(DEMO, None, views).reduced(downscale)
+    scene = load_scene(path, splits, most, mask_rule(config), downscale=downscale, listed=listed)
+    views = scene.splits.get("train", [])
+    is_box_wanted = most is not None or config.scene.mask_from == "box"
+    if views and not is_box_wanted and not any(view.has_mask for view in views):
+        warnings.warn(
+            f"{path}: no photograph has a mask: points fill the box that all cameras see;"
+            " --mask-from color cuts out a uniform background, --masks FOLDER takes masks,"
+            " --mask-from box says that it is meant",
+            stacklevel=2,
+        )
+    return scene
+
+
+def mask_rule(config: Config) -> MaskRule:
+    """How the masks of the run's scene are made."""
+    scene = config.scene
+    return MaskRule(scene.mask_from, scene.masks, scene.mask_tolerance)
+
+
+def scene_box(config: Config) -> np.ndarray | None:
+    """(2, 3) lower and upper corner of the setting scene.box, None where there is none. Raises
+    UserError for a box without volume.
+    """
+    corners = np.array(config.scene.box, np.float64).reshape(2, 3)
+    if not corners.any():
+        return None
+    box = np.stack([corners.min(0), corners.max(0)])
+    if not (box[1] > box[0]).all():
+        raise UserError("scene.box: its corners must differ in x, y and z")
+    return box
+
+
+def scene_format(path: str) -> str:
+    """The name of the reader of a scene; of `demo` the word itself. Raises UserError where there is
+    no scene.
+    """
+    return DEMO if path == DEMO else find_reader(path).__name__.rpartition(".")[2]
+
+
+def scene_splits(path: str) -> list[str]:
+    """The names of a scene's splits. Raises UserError where there is no scene."""
+    return list(demo.SPLITS) if path == DEMO else find_reader(path).splits(Path(path))
+
+
+def scene_frames(path: str | Path, split: str = "train") -> list[Photograph]:
+    """The photographs of a split, without their pixels. Raises UserError where there are none, and
+    for a camera that shows nothing in float32.
+    """
+    if path == DEMO:
+        return demo.demo_frames(split)
+    folder = Path(path)
+    photographs = find_reader(folder).read_split(folder, split)
+    if not photographs:
+        raise UserError(f"{folder}: split {split} has no photographs; add some")
+    for one in photographs:
+        _check_lens(folder / one.name, one.camera)
+    return photographs
+
+
+def _check_lens(image, camera):
+    focal, middle = (camera.fx, camera.fy), (camera.cx, camera.cy)
+    if not LEAST_FOCAL <= min(focal) <= max(focal) <= MOST_FOCAL:
+        what, least = f"focal lengths of {focal[0]:.3g} and {focal[1]:.3g}", LEAST_FOCAL
+    elif not -MOST_FOCAL <= min(middle) <= max(middle) <= MOST_FOCAL:
+        what, least = f"its principal point at {middle[0]:.3g}, {middle[1]:.3g}", -MOST_FOCAL
+    else:
+        return
+    raise UserError(
+        f"{image}: its camera has {what} pixels, which must be {least:g} to {MOST_FOCAL:g}; correct"
+        " the scene's file of cameras"
+    )
+
+
+def preset_downscale(path: str, preset: str) -> int:
+    """How many times a preset reduces the images of a scene, by the size of the largest training
+    image that leaves the smallest enough pixels. Raises UserError as scene_frames does.
+    """
+    sizes = _sizes(scene_frames(path))
+    fitting = fitting_downscale(max(sizes, key=max), IMAGE_SIZES[preset])
+    return max(1, min(fitting, min(map(min, sizes)) // MIN_SIDE))
+
+
+def measured_split(path: str) -> str:
+    """The split that tells how a training goes: val, else test. Raises UserError where the scene
+    has neither.
+    """
+    present = scene_splits(path)
+    for split in ("val", "test"):
+        if split in present:
+            return split
+    raise UserError(f"--eval-every: {path} has no split val or test; leave it out")
 
 
 def find_reader(path: str | Path) -> ModuleType:
@@ -100,10 +218,8 @@ def _found_instead(folder):
         if os.access(near, os.R_OK | os.X_OK) and (reader := _reader_of(near)):
             return f"; {near} is one ({reader.FILES}); give that"
     pictures = sum(entry.suffix.lower() in ENDINGS for entry in inside)
-    others = [entry.name for entry in inside if entry.suffix.lower() not in ENDINGS]
-    found = [f"{pictures} image{'s' * (pictures > 1)}"] * bool(pictures) + [
-        quoted(name, 40) for name in others[:3]
-    ]
+    others = [quoted(e.name, 40) for e in inside if e.suffix.lower() not in ENDINGS]
+    found = [f"{pictures} image{'s' * (pictures > 1)}"] * bool(pictures) + others[:3]
     found = ", ".join(found) + f" and {len(others) - 3} more" * (len(others) > 3)
     return (
         f": {found or 'nothing'}, but no file of cameras that is known, such as"
@@ -118,30 +234,34 @@ def load_scene(
     masks: MaskRule = AS_GIVEN,
     *,
     downscale: int | None = None,
+    listed: Listed | None = None,
 ) -> Scene:
     """Scene of the given splits from a folder; a progress bar shows on a terminal.
 
     most: views to read of each split, spread evenly; None: all. downscale: how many times its
     images are reduced, those of a large scene in part while they are read; None: as they are
-    stored. Raises UserError naming the file, and the key where there is one, for whatever is
-    missing, broken or contradictory.
+    stored. listed: what scene_frames() gave of some splits, so that their files are not read again.
+    Raises UserError naming the file, and the key where there is one, for whatever is missing,
+    broken or contradictory.
     """
-    reader, folder = find_reader(path), Path(path)
-    listed = {s: evenly(list_photographs(reader, folder, s), most) for s in splits}
-    everything = [photograph for photographs in listed.values() for photograph in photographs]
-    _check_alike(folder, everything)
-    for photograph in everything if downscale else ():
-        check_downscale(photograph.name, photograph.camera, downscale)
-    factor = shrink_factor(_sizes(everything), downscale or 1)
-    workers, _ = reading(everything, masks)
-    images = iter(
-        _side_by_side(lambda one: _read_image(folder, one, masks, factor), everything, workers)
+    folder, listed = Path(path), listed or {}
+    chosen = {s: evenly(listed.get(s) or scene_frames(folder, s), most) for s in splits}
+    photographs = [one for some in chosen.values() for one in some]
+    _check_alike(folder, photographs)
+    for one in photographs if downscale else ():
+        check_downscale(one.name, one.camera, downscale)
+    factor = shrink_factor(_sizes(photographs), downscale or 1)
+    with ThreadPoolExecutor(reading(photographs, masks)[0]) as pool:
+        found = pool.map(lambda one: _read_view(folder, one, masks, factor), photographs)
+        bar = tqdm(
+            found, "reading images", len(photographs), unit="image", leave=False, disable=None
+        )
+        views = iter(list(bar))
+    scene = Scene(
+        folder.resolve().name,
+        folder,
+        {split: [next(views) for _ in some] for split, some in chosen.items()},
     )
-    views = {
-        split: [_view(one, factor, *next(images)) for one in photographs]
-        for split, photographs in listed.items()
-    }
-    scene = Scene(folder.resolve().name, folder, views)
     return scene.reduced(downscale // factor) if downscale else scene
 
 
@@ -149,62 +269,19 @@ def reading(photographs: Sequence[Photograph], masks: MaskRule = AS_GIVEN) -> tu
     """(how many photographs are read side by side, bytes that this takes beside the images that
     stay): as many as there are cores, but no more than READING_BYTES hold.
     """
-    most = max(_bytes_of_reading(one, masks) for one in photographs)
+    is_cut_out = masks.source == "color" and not masks.folder
+    most = max(
+        (CUT_OUT if is_cut_out else UNDISTORTED if one.distortion else DECODED)
+        * one.camera.width
+        * one.camera.height
+        for one in photographs
+    )
     workers = max(1, min(os.cpu_count() or 1, READING_BYTES // most, len(photographs)))
     return workers, workers * most
 
 
-def _bytes_of_reading(photograph, masks):
-    per_pixel = DECODED
-    if photograph.distortion:
-        per_pixel = UNDISTORTED
-    if masks.source == "color" and not masks.folder:
-        per_pixel = CUT_OUT
-    return per_pixel * photograph.camera.width * photograph.camera.height
-
-
 def _sizes(photographs):
     return [(one.camera.width, one.camera.height) for one in photographs]
-
-
-def list_photographs(reader: ModuleType, folder: Path, split: str) -> list[Photograph]:
-    """The photographs of a split that a module of READERS lists. Raises UserError where there are
-    none, and for a camera that shows nothing in float32.
-    """
-    photographs = reader.read_split(folder, split)
-    if not photographs:
-        raise UserError(f"{folder}: split {split} has no photographs; add some")
-    for one in photographs:
-        _check_lens(folder / one.name, one.camera)
-    return photographs
-
-
-def _check_lens(image, camera):
-    """Raise UserError for a camera that shows nothing in float32."""
-    focal, middle = (camera.fx, camera.fy), (camera.cx, camera.cy)
-    if not LEAST_FOCAL <= min(focal) <= max(focal) <= MOST_FOCAL:
-        what, least = f"focal lengths of {focal[0]:.3g} and {focal[1]:.3g}", LEAST_FOCAL
-    elif not -MOST_FOCAL <= min(middle) <= max(middle) <= MOST_FOCAL:
-        what, least = f"its principal point at {middle[0]:.3g}, {middle[1]:.3g}", -MOST_FOCAL
-    else:
-        return
-    raise UserError(
-        f"{image}: its camera has {what} pixels, which must be {least:g} to {MOST_FOCAL:g}; correct"
-        " the scene's file of cameras"
-    )
-
-
-def _view(photograph, factor, image, digest):
-    camera = photograph.camera
-    return View(
-        photograph.name,
-        camera.downscaled(factor) if factor > 1 else camera,
-        image,
-        photograph.depth_range,
-        digest=digest,
-        shrunk=factor,
-        unshrunk_camera=camera if factor > 1 else None,
-    )
 
 
 def _check_alike(folder, photographs):
@@ -218,32 +295,26 @@ def _check_alike(folder, photographs):
             )
 
 
-def _read_image(folder, photograph, masks, factor):
-    """((H, W, 4) uint8 straight RGBA: the image with its mask, freed of distortion and reduced
-    `factor` times; the digest of its pixels before that). Raises UserError.
+def _read_view(folder, photograph, masks, factor):
+    """The View of a photograph: with its mask, freed of distortion and reduced `factor` times; the
+    digest is of its pixels before that. Raises UserError.
     """
-    image = read_rgba(folder / photograph.name)
+    file, camera, distortion = folder / photograph.name, photograph.camera, photograph.distortion
+    image = read_rgba(file)
     image = masks.apply(image, photograph.name, photograph.mask and folder / photograph.mask)
-    if photograph.distortion.folds(photograph.camera):
+    if distortion.folds(camera):
         raise UserError(
-            f"{folder / photograph.name}: its distortion coefficients fold the image over; correct"
-            " them, or undistort the images with the program that found them"
+            f"{file}: its distortion coefficients fold the image over; correct them, or undistort"
+            " the images with the program that found them"
         )
-    if photograph.distortion:
-        image = undistort(image, photograph.camera, photograph.distortion)
-    return shrink(image, factor), pixel_digest(image)
-
-
-def _side_by_side(read: Callable[[Item], Made], items: Sequence[Item], workers: int) -> list[Made]:
-    """[read(item)] in order. Raises the UserError of the first that fails."""
-    with ThreadPoolExecutor(workers) as pool:
-        return list(
-            tqdm(
-                pool.map(read, items),
-                "reading images",
-                len(items),
-                unit="image",
-                leave=False,
-                disable=None,
-            )
-        )
+    if distortion:
+        image = undistort(image, camera, distortion)
+    return View(
+        photograph.name,
+        camera.downscaled(factor) if factor > 1 else camera,
+        shrink(image, factor),
+        photograph.depth_range,
+        digest=pixel_digest(image),
+        shrunk=factor,
+        unshrunk_camera=camera if factor > 1 else None,
+    )

@@ -9,7 +9,8 @@ from skimage.color import rgb2lab
 from skimage.measure import label
 
 from pp_cl.errors import UserError
-from pp_cl.files.image import ENDINGS, read_gray
+from pp_cl.files.image import read_gray
+from pp_cl.scene.readers.common import mask_names
 
 BORDER_SHARE = 0.5  # of the border's pixels that must have its median colour
 OPAQUE = np.uint8(255)
@@ -49,14 +50,13 @@ AS_GIVEN = MaskRule()
 
 
 def _named(folder, name):
-    """The mask of a photograph in a folder: its path or its name, with the ending .png added or
-    another one. Raises UserError.
+    """The mask of a photograph in a folder, by the photograph's path or by its name alone. Raises
+    UserError.
     """
     path = PurePosixPath(name)
-    for stem in (path, PurePosixPath(path.name)):
-        for given in (f"{stem}.png", *(stem.with_suffix(ending) for ending in ENDINGS)):
-            if (folder / given).is_file():
-                return folder / given
+    for given in (*mask_names(name), *mask_names(path.name)):
+        if (folder / given).is_file():
+            return folder / given
     raise UserError(f"{folder}: no mask for {name}; add {path.stem}.png, white where the object is")
 
 

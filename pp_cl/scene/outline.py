@@ -16,9 +16,8 @@ from pp_cl.scene.agreement import Disagreement
 from pp_cl.scene.camera import Camera
 from pp_cl.scene.grid import Grid
 from pp_cl.scene.hull import Hull, spacing_pixels
-from pp_cl.scene.load import evenly
 from pp_cl.scene.target import Target
-from pp_cl.scene.views import View, fitting_downscale
+from pp_cl.scene.views import View, evenly, fitting_downscale
 
 SHOWN_VIEWS, SHOWN_SIZE = 12, 320  # photographs of the picture, and their longer side in pixels
 OUTLINE = (255, 0, 160)  # a colour that few objects have

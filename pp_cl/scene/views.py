@@ -1,13 +1,16 @@
-"""A photograph with its camera and mask, at its stored resolution and reduced."""
+"""Photographs with their cameras: listed by a scene, read with their pixels, and reduced."""
 
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
 from functools import cached_property
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from pp_cl.errors import UserError
 from pp_cl.scene.camera import Camera
+from pp_cl.scene.distortion import Distortion
 
 # Alpha (0 to 255) above which a pixel belongs to the object. Low, since a mask that is too large
 # costs points but one that is too small carves the object away, translucent parts first; not 0,
@@ -18,6 +21,28 @@ MASK_THRESHOLD = 8
 # pixels of a reduced image, each way: SSIM's window of 11 and the U-Net's two poolings need room
 MIN_SIDE = 16
 LEAST_SHARE = 0.75  # of the size that a preset is made for: further down, details would be lost
+# Of a scene's photographs in memory, as RGBA; more than this is reduced while it is read. A fixed
+# number, not what happens to be free: the same command gives the same bits on every machine.
+KEPT_BYTES = 2**29
+Item = TypeVar("Item")
+ROWS = 16  # of the smaller image at a time: what is summed stays in a cache
+
+
+@dataclass(frozen=True)
+class Photograph:
+    """A photograph that a scene lists, before its pixels are read.
+
+    name: path of the image relative to the scene's folder. camera: of the stored image, freed of
+    distortion. depth_range: (near, far), Euclidean distances in world units, if the format states
+    one. mask: path of its mask relative to the scene's folder, white where the object is; None: the
+    image's own alpha. distortion: of the image as it lies in the file.
+    """
+
+    name: str
+    camera: Camera
+    depth_range: tuple[float, float] | None = None
+    mask: str | None = None
+    distortion: Distortion = field(default_factory=Distortion)
 
 
 @dataclass(frozen=True, eq=False)
@@ -30,7 +55,7 @@ class View:
     file has none); not to be changed. depth_range: (near, far) of this camera, Euclidean distances
     in world units, if the dataset states one. digest: of the file's pixels, see scene/identity.py;
     None for one that the program makes itself. shrunk: how many times the stored image was reduced
-    while it was read from its file (scene/shrink.py). unshrunk_camera: of the file's image, where
+    while it was read from its file (shrink()). unshrunk_camera: of the file's image, where
     that is another one.
     """
 
@@ -131,7 +156,7 @@ def fitting_downscale(size: tuple[int, int], side: int | None) -> int:
     return min(fitting, key=lambda k: abs(longer / k - side), default=1)
 
 
-def _extent(occupied: np.ndarray, downscale: int, margin: int) -> tuple[int, int]:
+def _extent(occupied, downscale, margin):
     """(first, last + 1) reduced pixel of the occupied stored columns or rows (N,) bool, grown by
     the margin; the whole length if none is occupied.
     """
@@ -139,3 +164,59 @@ def _extent(occupied: np.ndarray, downscale: int, margin: int) -> tuple[int, int
     if found.size == 0:
         return 0, size
     return max(int(found[0]) - margin, 0), min(int(found[-1]) + 1 + margin, size)
+
+
+def shrink_factor(sizes: Sequence[tuple[int, int]], downscale: int) -> int:
+    """How many times to reduce photographs of these (width, height), in pixels, while they are
+    read, where a training reduces them `downscale` times: the least divisor of it with which they
+    take KEPT_BYTES at most, else all of it.
+    """
+    divisors = (f for f in range(1, downscale + 1) if downscale % f == 0)
+    return next((f for f in divisors if kept_bytes(sizes, f) <= KEPT_BYTES), downscale)
+
+
+def kept_bytes(sizes: Sequence[tuple[int, int]], factor: int) -> int:
+    """Bytes of the images that photographs of these (width, height) become."""
+    return sum(4 * (width // factor) * (height // factor) for width, height in sizes)
+
+
+def shrink(image: np.ndarray, factor: int) -> np.ndarray:
+    """(H // factor, W // factor, 4) uint8 straight RGBA of (H, W, 4): means of blocks of
+    factor x factor pixels on premultiplied colour, rounded. Rows and columns that fill no block are
+    cut off.
+    """
+    if factor == 1:
+        return image
+    height, width = image.shape[0] // factor, image.shape[1] // factor
+    small = np.empty((height, width, 4), np.uint8)
+    for first in range(0, height, ROWS):
+        last = min(first + ROWS, height)
+        _write_means(image[factor * first : factor * last, : factor * width], small[first:last])
+    return small
+
+
+def _write_means(image, small):
+    """shrink() of an image that blocks fill, into `small`."""
+    alpha = np.ascontiguousarray(image[..., 3])
+    opacity, area = _sums(alpha, small.shape[:2]), image[..., 0].size // small[..., 0].size
+    for i in range(3):
+        colour = _sums(np.multiply(image[..., i], alpha, dtype=np.uint16), small.shape[:2])
+        small[..., i] = (colour + opacity // 2) // np.maximum(opacity, 1)
+    small[..., 3] = (opacity + area // 2) // area
+
+
+def _sums(values, shape):
+    """uint32 sums of the blocks of one channel, of which there are `shape`: over rows first, whose
+    values lie side by side.
+    """
+    rows, columns = shape
+    values = values.reshape(rows, -1, values.shape[1]).sum(1, dtype=np.uint32)
+    return np.add.reduceat(
+        values, np.arange(0, values.shape[1], values.shape[1] // columns), axis=1
+    )
+
+
+def evenly(items: Sequence[Item], most: int | None) -> list[Item]:
+    """At most `most` of the items, spread evenly, the first among them; None: all."""
+    n = len(items)
+    return list(items) if most is None or n <= most else [items[n * i // most] for i in range(most)]

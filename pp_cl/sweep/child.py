@@ -16,7 +16,7 @@ from pp_cl.device.discover import open_device
 from pp_cl.errors import UserError
 from pp_cl.files.run_folder import RunFolder
 from pp_cl.run import evaluate, load_run
-from pp_cl.scene.open import scene_splits
+from pp_cl.scene.load import scene_splits
 from pp_cl.session import is_finished, open_training, run_config, stored_state
 from pp_cl.sweep.plan import Job
 

@@ -10,8 +10,7 @@ from pathlib import Path
 
 from pp_cl.config import Config, assign, configure, preset, sections, text_of
 from pp_cl.errors import UserError
-from pp_cl.scene.load import check_folder
-from pp_cl.scene.open import DEMO
+from pp_cl.scene.load import DEMO, check_folder
 
 Given = tuple[str, str, str]  # key, text of the value, origin, as session.run_config takes them
 

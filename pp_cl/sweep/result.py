@@ -5,8 +5,8 @@ import math
 from typing import Any
 
 from pp_cl.config import load_config
-from pp_cl.files.regular import read_json_text
 from pp_cl.files.run_folder import MOST_METRICS, RunFolder
+from pp_cl.files.untrusted import read_json_text
 from pp_cl.session import run_config
 from pp_cl.sweep.plan import Job
 from pp_cl.training.stored import opened_run

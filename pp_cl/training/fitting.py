@@ -12,8 +12,7 @@ from pp_cl.model import Model
 from pp_cl.network.unet import UNet
 from pp_cl.scene.grid import Grid
 from pp_cl.scene.hull import TOLERANCE
-from pp_cl.scene.photograph import Photograph
-from pp_cl.scene.views import MIN_SIDE
+from pp_cl.scene.views import MIN_SIDE, Photograph
 from pp_cl.training.memory import GIB, MIB, Plan, Sketch, memory_plan
 
 # What a driver's compiler takes of the host until all kernels of a training are built, measured;

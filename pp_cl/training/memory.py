@@ -24,10 +24,8 @@ from pp_cl.render import NETWORK_MULTIPLE, Renderer, point_radius
 from pp_cl.scene.camera import Camera
 from pp_cl.scene.grid import Grid
 from pp_cl.scene.hull import DEPTH_MARGIN
-from pp_cl.scene.load import reading
-from pp_cl.scene.open import DEMO, mask_rule
-from pp_cl.scene.photograph import Photograph
-from pp_cl.scene.shrink import kept_bytes, shrink_factor
+from pp_cl.scene.load import DEMO, mask_rule, reading
+from pp_cl.scene.views import Photograph, kept_bytes, shrink_factor
 from pp_cl.training.crops import crop_side
 from pp_cl.training.loss import Loss, lanes_of_loss
 from pp_cl.training.mask import MaskLoss

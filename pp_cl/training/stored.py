@@ -12,8 +12,7 @@ import numpy as np
 
 from pp_cl.config import Config
 from pp_cl.errors import UserError, quoted, shown
-from pp_cl.files.checkpoint import MEND, Checkpoint, opened_checkpoint
-from pp_cl.files.npz import Form
+from pp_cl.files.checkpoint import MEND, Checkpoint, Form, opened_checkpoint
 from pp_cl.files.run_folder import RunFolder
 from pp_cl.layers.choice import check_form
 from pp_cl.network.layers import parameter_table, unet_layers

@@ -3,8 +3,8 @@
 import os
 from pathlib import Path
 
-from pp_cl.files.regular import opened_regular
 from pp_cl.files.run_folder import read_row
+from pp_cl.files.untrusted import opened_regular
 
 NAMES = ("step", "loss", "psnr")
 

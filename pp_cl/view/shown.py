@@ -5,8 +5,8 @@ import io
 import numpy as np
 from PIL import Image
 
-from pp_cl.files.colour import linear_to_srgb, srgb_to_linear
 from pp_cl.files.contact_sheet import ERROR_GAIN
+from pp_cl.files.exr import linear_to_srgb, srgb_to_linear
 from pp_cl.files.image import to_8bit
 from pp_cl.scene.camera import Camera
 

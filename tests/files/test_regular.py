@@ -7,7 +7,7 @@ from zipfile import BadZipFile
 
 import pytest
 
-from pp_cl.files.regular import MOST_REASON, opened_regular, read_regular, refusal
+from pp_cl.files.untrusted import MOST_REASON, opened_regular, read_regular, refusal
 
 
 def test_a_file_of_at_most_so_many_bytes(tmp_path):

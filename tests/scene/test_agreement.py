@@ -9,11 +9,12 @@ from support.runs import arguments
 from support.scenes import write_ball_scene
 
 from pp_cl.cli import main
-from pp_cl.facts.info import REJECTED, describe_scene, picture
+from pp_cl.facts.info import describe_scene, picture
 from pp_cl.files.image import read_rgba, write_png
 from pp_cl.scene.agreement import disagreements
 from pp_cl.scene.hull import build_grid
 from pp_cl.scene.load import load_scene
+from pp_cl.scene.outline import REJECTED
 
 BOX = np.stack([CENTRE - RADIUS, CENTRE + RADIUS])
 
@@ -95,7 +96,7 @@ def test_the_scenes_facts_name_it_and_the_picture_shows_it_first(dev, scene, tmp
 
 
 def test_a_training_warns_and_leaves_the_picture(scene, tmp_path, capsys):
-    assert main(arguments(scene, tmp_path / "run", 1, train__iterations=2)) == 0
+    assert main(arguments(scene, tmp_path / "run", 1, train__iterations=2, points__count=500)) == 0
     error = capsys.readouterr().err
     assert "masks reject what the other views agree on: train/r_4.png (" in error
     assert read_rgba(tmp_path / "run" / "masks.png").shape[1] > 48

@@ -2,21 +2,16 @@
 gloss, the written folder.
 """
 
-import json
-from dataclasses import replace
-
 import numpy as np
 import pytest
 import trimesh
 from support.guarded import AWKWARD_SIZES
 
-from pp_cl.errors import UserError
 from pp_cl.reference.demo import CENTRE, coverage, distance
 from pp_cl.scene.camera import Camera
-from pp_cl.scene.demo import OBJECT_BOX, demo_mesh, demo_scene, distances, render, write_scene
+from pp_cl.scene.demo import OBJECT_BOX, SPLITS, demo_mesh, demo_views, distances, render
 from pp_cl.scene.grid import Grid
 from pp_cl.scene.hull import build_grid
-from pp_cl.scene.load import load_scene
 
 KEY = np.array([0.40, -0.52, 0.7547])  # direction of the key light
 
@@ -98,12 +93,11 @@ def test_the_mesh_is_the_object(dev):
 @pytest.mark.large
 def test_the_scene_shows_the_whole_mesh(dev):
     """64 + 16 views; the mesh projects onto the masks, which carve a hull that holds it."""
-    scene = demo_scene(dev, size=64)
-    assert (scene.name, scene.folder) == ("demo", None)
-    assert {split: len(views) for split, views in scene.splits.items()} == {"train": 64, "test": 16}
+    train, test = (demo_views(dev, split, size=64) for split in SPLITS)
+    assert (len(train), len(test)) == (64, 16)
     vertices, _ = demo_mesh(dev, 64)
     eyes = []
-    for view in scene.splits["train"] + scene.splits["test"]:
+    for view in train + test:
         camera, alpha = view.camera, np.pad(view.image[..., 3], 1)
         np.testing.assert_allclose(camera.pose[:, :3].T @ camera.pose[:, :3], np.eye(3), atol=1e-12)
         assert np.linalg.det(camera.pose[:, :3]) > 0 and view.depth_range is None
@@ -119,66 +113,14 @@ def test_the_scene_shows_the_whole_mesh(dev):
     gaps = np.linalg.norm(np.array(eyes)[:, None] - eyes, axis=-1) + 9 * np.eye(80)
     assert gaps.min() > 0.1, "two views are nearly the same"
 
-    hull = build_grid(dev, scene.splits["train"], 20000)
+    hull = build_grid(dev, train, 20000)
     lattice = hull.grid.positions(np.arange(np.prod(hull.grid.dims)))
     inside = distance(lattice) < 0
     kept = np.isin(np.arange(len(lattice)), hull.ids)
     assert inside.sum() > 2000 and kept[inside].all()
 
 
-@pytest.mark.large
-def test_a_split_can_be_made_alone(dev):
-    test, both = demo_scene(dev, ("test",), size=16), demo_scene(dev, size=16)
-    assert list(test.splits) == ["test"]
-    np.testing.assert_array_equal(test.splits["test"][5].image, both.splits["test"][5].image)
-
-
-@pytest.mark.large
-def test_a_reduced_scene_is_written_at_its_stored_resolution(dev, tmp_path):
-    scene = demo_scene(dev, ("test",), size=32)
-    write_scene(scene.reduced(2), tmp_path / "demo")
-    camera = load_scene(tmp_path / "demo", ("test",)).splits["test"][0].camera
-    assert replace(camera, pose=None) == replace(scene.splits["test"][0].camera, pose=None)
-
-
-@pytest.mark.large
-def test_a_written_scene_is_read_back(dev, tmp_path):
-    scene = demo_scene(dev, size=24)
-    folder = tmp_path / "new" / "demo"
-    write_scene(scene, folder)
-    again = load_scene(folder, ("train", "test"))
-    assert again.name == "demo"
-    for split, views in scene.splits.items():
-        assert [v.name for v in again.splits[split]] == [v.name for v in views]
-        for view, read in zip(views, again.splits[split], strict=True):
-            np.testing.assert_array_equal(read.image, view.image)
-            np.testing.assert_allclose(read.camera.pose, view.camera.pose, atol=1e-12)
-            assert replace(read.camera, pose=None) == replace(view.camera, pose=None)
-            assert read.depth_range is None
-    angle = json.loads((folder / "transforms_test.json").read_text())["camera_angle_x"]
-    assert angle == pytest.approx(0.6911112)
-
-
-@pytest.mark.large
-def test_a_depth_range_is_written(dev, tmp_path):
-    scene = demo_scene(dev, ("train",), size=16)
-    scene.splits["train"] = [
-        replace(view, depth_range=(1.5, 5.25)) for view in scene.splits["train"][:2]
-    ]
-    write_scene(scene, tmp_path / "demo")
-    again = load_scene(tmp_path / "demo")
-    assert [view.depth_range for view in again.splits["train"]] == [(1.5, 5.25)] * 2
-
-
-@pytest.mark.large
-def test_only_an_empty_folder_is_written(dev, tmp_path):
-    scene = demo_scene(dev, ("test",), size=16)
-    (tmp_path / "empty").mkdir()
-    write_scene(scene, tmp_path / "empty")
-    (tmp_path / "file").write_text("x")
-    for taken in ("empty", "file"):
-        with pytest.raises(UserError, match=f"{taken}: exists already"):
-            write_scene(scene, tmp_path / taken)
-    with pytest.raises(UserError, match="cannot be written"):
-        write_scene(scene, tmp_path / "file" / "inside")
-    assert sorted(p.name for p in tmp_path.iterdir()) == ["empty", "file"]
+def test_views_spread_evenly_are_some_of_all(dev):
+    few, every = demo_views(dev, "test", 4, 16), demo_views(dev, "test", size=16)
+    assert [view.name for view in few] == [f"test/r_{i}.png" for i in (0, 4, 8, 12)]
+    np.testing.assert_array_equal(few[1].image, every[4].image)

@@ -10,9 +10,8 @@ from PIL import Image
 from support.scenes import move_scene, write_ball_scene
 
 from pp_cl.scene.identity import difference, fingerprint, identity, kept_views, pixel_digest
-from pp_cl.scene.load import load_scene
+from pp_cl.scene.load import load_scene, scene_frames
 from pp_cl.scene.masks import MaskRule
-from pp_cl.scene.open import scene_frames
 
 
 @pytest.fixture

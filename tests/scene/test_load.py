@@ -9,10 +9,9 @@ from pp_cl.errors import UserError
 from pp_cl.files.image import write_png
 from pp_cl.scene.camera import Camera
 from pp_cl.scene.distortion import Distortion
-from pp_cl.scene.load import evenly, load_scene, reading
+from pp_cl.scene.load import load_scene, reading, scene_frames
 from pp_cl.scene.masks import MaskRule
-from pp_cl.scene.open import scene_frames
-from pp_cl.scene.photograph import Photograph
+from pp_cl.scene.views import Photograph, evenly
 from tools.scene_formats import nerfstudio
 
 

@@ -16,9 +16,8 @@ from pp_cl.config import configure, preset
 from pp_cl.errors import UserError
 from pp_cl.files.image import read_rgba, write_png
 from pp_cl.scene.hull import build_grid
-from pp_cl.scene.load import load_scene
+from pp_cl.scene.load import load_scene, open_scene, scene_box
 from pp_cl.scene.masks import MaskRule, cut_out
-from pp_cl.scene.open import open_scene, scene_box
 from pp_cl.scene.views import MASK_THRESHOLD
 
 TOLERANCE = 10.0

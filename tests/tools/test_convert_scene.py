@@ -8,8 +8,7 @@ from support.same_scene import held_out, same, views
 from support.scenes import write_ball_scene
 
 from pp_cl.errors import UserError
-from pp_cl.scene.load import load_scene
-from pp_cl.scene.open import scene_format
+from pp_cl.scene.load import load_scene, scene_format
 from tools.convert_scene import FORMATS, convert, dealt, main
 
 READER = {"nerf_synthetic": "transforms", "nerfstudio": "transforms"}

@@ -3,12 +3,12 @@
 import numpy as np
 import trimesh
 
-from pp_cl.scene.demo import demo_mesh, demo_scene
+from pp_cl.scene.demo import demo_frames, demo_mesh
 from tools.depth_error import DemoSurface, near_share, overlap, pixel_rays
 
 
 def test_the_depth_is_where_rays_meet_the_mesh(dev, rng):
-    camera = demo_scene(dev, ["test"], size=48).splits["test"][3].camera
+    camera = demo_frames("test", 48)[3].camera
     depth = DemoSurface(dev).depth(camera)
     vertices, faces = demo_mesh(dev, 256)
     rays = pixel_rays(camera)

@@ -15,7 +15,7 @@ from pp_cl.files.checkpoint import load_checkpoint
 from pp_cl.network.unet import UNet
 from pp_cl.scene.camera import Camera
 from pp_cl.scene.grid import Grid
-from pp_cl.scene.photograph import Photograph
+from pp_cl.scene.views import Photograph
 from pp_cl.training.fitting import Room
 from pp_cl.training.memory import GIB, MIB, memory_plan
 

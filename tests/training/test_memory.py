@@ -16,8 +16,8 @@ from pp_cl.network.unet import UNet
 from pp_cl.raster.point_cloud import PointCloud
 from pp_cl.scene.camera import Camera
 from pp_cl.scene.grid import Grid
-from pp_cl.scene.open import open_scene
-from pp_cl.scene.photograph import Photograph
+from pp_cl.scene.load import open_scene
+from pp_cl.scene.views import Photograph
 from pp_cl.train import Trainer
 from pp_cl.training.memory import Moment, Plan, Sketch, memory_plan, plan_lines
 from pp_cl.training.point_state import PointState

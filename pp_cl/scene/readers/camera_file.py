@@ -3,28 +3,20 @@ transforms.json, and the cameras.json of 3D Gaussian Splatting and brush.
 """
 
 import math
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 
 from pp_cl.errors import UserError
 from pp_cl.scene.camera import Camera
-from pp_cl.scene.readers.frame import (
-    GL_FROM_CV,
-    LEAST_ANGLE,
-    Frame,
-    distortion,
-    numbers,
-    pinhole,
-    read_json,
-    rigid_pose,
-)
+from pp_cl.scene.readers.common import read_json
+from pp_cl.scene.readers.frame import GL_FROM_CV, LEAST_ANGLE, Frame, distortion, pinhole, rigid
 
 FORMATS = (
     "a camera_path.json (with camera_path), a transforms.json (with frames), or a cameras.json (a"
     " list)"
 )
-POSE_SHAPES = {"rotation": (3, 3), "position": (3,)}
 MOST_PIXELS = 2**15  # a side; the pixel boxes of points are 16-bit
 
 
@@ -40,17 +32,14 @@ def read_cameras(file: Path, size: tuple[int, int] | None = None) -> list[Camera
     if isinstance(data, list):
         read, frames, listed, shared = _splatting_camera, data, "", {}
     elif isinstance(data, dict) and "camera_path" in data:
-        read, listed, shared = _path_camera, "camera_path", data
-        frames = data["camera_path"]
+        read, frames, listed, shared = _path_camera, data["camera_path"], "camera_path", data
     elif isinstance(data, dict) and "frames" in data:
         read, frames, listed, shared = _transforms_camera, data["frames"], "frames", data
     else:
         raise UserError(f"{file}: holds no cameras; give {FORMATS}")
     if not isinstance(frames, list) or not frames:
         raise UserError(f"{file}: {listed or 'the list'}: must hold one camera or more")
-    return [
-        read(Frame(file, shared, frame, index, listed), size) for index, frame in enumerate(frames)
-    ]
+    return [read(Frame(file, shared, own, i, listed), size) for i, own in enumerate(frames)]
 
 
 def _transforms_camera(frame, size):
@@ -69,7 +58,7 @@ def _path_camera(frame, size):
     matrix = frame.get("camera_to_world")
     if isinstance(matrix, list) and len(matrix) == 16:
         matrix = [matrix[row : row + 4] for row in range(0, 16, 4)]
-    pose = rigid_pose(frame, "camera_to_world", matrix) @ GL_FROM_CV
+    pose = rigid(matrix, partial(frame.error, "camera_to_world")) @ GL_FROM_CV
     focal = 0.5 * height / math.tan(math.radians(fov) / 2)
     return Camera(pose, focal, focal, width / 2, height / 2, width, height)
 
@@ -77,20 +66,12 @@ def _path_camera(frame, size):
 def _splatting_camera(frame, size):
     """Camera-to-world rotation with OpenCV's axes, and position."""
     width, height = _size(frame, ("width", "height"), size)
-    rotation, position = (_array(frame, key, s) for key, s in POSE_SHAPES.items())
-    pose = rigid_pose(frame, "rotation", np.column_stack([rotation, position]))
-    focal = [frame.number(key, above=0) for key in ("fx", "fy")]
-    if focal[0] is None:
+    matrix = np.column_stack([frame.array("rotation", (3, 3)), frame.array("position", (3,))])
+    pose = rigid(matrix, partial(frame.error, "rotation"))
+    fx, fy = (frame.number(key, above=0) for key in ("fx", "fy"))
+    if fx is None:
         raise frame.error("fx", "is missing; add the focal length in pixels")
-    fy = focal[0] if focal[1] is None else focal[1]
-    return Camera(pose, focal[0], fy, width / 2, height / 2, width, height)
-
-
-def _array(frame, key, shape):
-    array = numbers(frame.get(key))
-    if array is None or array.shape != shape:
-        raise frame.error(key, f"must be {'x'.join(map(str, shape))} numbers")
-    return array
+    return Camera(pose, fx, fx if fy is None else fy, width / 2, height / 2, width, height)
 
 
 def _size(frame, keys, given):

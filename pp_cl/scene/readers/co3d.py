@@ -15,11 +15,19 @@ import numpy as np
 
 from pp_cl.errors import UserError, quoted
 from pp_cl.files.image import image_size
-from pp_cl.files.regular import opened_regular, refusal
+from pp_cl.files.untrusted import opened_regular, refusal
 from pp_cl.scene.camera import Camera
-from pp_cl.scene.photograph import Photograph
-from pp_cl.scene.readers.common import SPLITS, check_split, find_image, hold_out, listing
-from pp_cl.scene.readers.frame import MOST, Frame, numbers, read_json, rigid
+from pp_cl.scene.readers.common import (
+    MOST,
+    SPLITS,
+    check_split,
+    find_image,
+    hold_out,
+    listing,
+    read_json,
+)
+from pp_cl.scene.readers.frame import Frame, rigid
+from pp_cl.scene.views import Photograph
 
 FILES = "a sequence of CO3D, whose frame_annotations.jgz lies one folder above"
 ANNOTATIONS = "frame_annotations.jgz"
@@ -180,8 +188,8 @@ def _camera(frame, size):
     if not isinstance(own, dict):
         raise frame.error("viewpoint", "is missing; remove the frame")
     view = Frame(frame.file, {}, own, frame.index, "viewpoint of frame ")
-    rotation, place = _numbers(view, "R", (3, 3)), _numbers(view, "T", (3,))
-    focal, centre = _numbers(view, "focal_length", (2,)), _numbers(view, "principal_point", (2,))
+    rotation, place = view.array("R", (3, 3)), view.array("T", (3,))
+    focal, centre = view.array("focal_length", (2,)), view.array("principal_point", (2,))
     half = np.array(size) / 2
     kind = own.get("intrinsics_format") or NORMALISED
     if kind not in (NORMALISED, ISOTROPIC):
@@ -193,13 +201,6 @@ def _camera(frame, size):
     to_world = rotation @ CV_FROM_P3D
     pose = rigid(np.column_stack([to_world, -rotation @ place]), partial(view.error, "R"))
     return Camera(pose, *(float(v) for v in (*focal, *centre)), *size)
-
-
-def _numbers(view, key, shape):
-    array = numbers(view.get(key))
-    if array is None or array.shape != shape or not (np.abs(array) < MOST).all():
-        raise view.error(key, f"must be {'x'.join(map(str, shape))} finite numbers")
-    return array
 
 
 # --------------------------------------------------------------------------------------------------

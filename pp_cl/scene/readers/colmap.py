@@ -2,8 +2,6 @@
 and, for objects, one of masks.
 """
 
-import os
-from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -13,14 +11,21 @@ from pp_cl.errors import UserError
 from pp_cl.files.image import image_size
 from pp_cl.scene.camera import Camera
 from pp_cl.scene.distortion import Distortion
-from pp_cl.scene.photograph import Photograph
 from pp_cl.scene.readers.colmap_model import Image, Lens, is_model, read_model
-from pp_cl.scene.readers.common import SPLITS, check_split, find_image, hold_out, listing
+from pp_cl.scene.readers.common import (
+    SPLITS,
+    check_split,
+    fail_at,
+    find_image,
+    find_mask,
+    hold_out,
+    listing,
+)
+from pp_cl.scene.views import Photograph
 
 FILES = "a sparse model of COLMAP beside images"
 PLACES = ("sparse/0", "sparse", "colmap/sparse/0", ".")
 IMAGES, MASKS = "images", "masks"
-LEAST_FOCAL, MOST_FOCAL = 1e-3, 1e9  # pixels
 
 
 def recognises(folder: Path) -> bool:
@@ -36,8 +41,8 @@ def splits(folder: Path) -> list[str]:
 def read_split(folder: Path, split: str) -> list[Photograph]:
     """The photographs of a split: test is every eighth in the order of their names.
 
-    An image's mask is masks/NAME.png, as COLMAP has it, or masks/NAME with the ending .png; with a
-    folder of masks, every image needs one. Raises UserError naming the file, and the image.
+    An image's mask is masks/NAME.png, as COLMAP has it, or masks/NAME with any ending of an image;
+    with a folder of masks, every image needs one. Raises UserError naming the file, and the image.
     """
     check_split(folder, split, SPLITS)
     model = _model_folder(folder)
@@ -57,7 +62,7 @@ def _model_folder(folder):
 
 
 def _photograph(folder, model, image: Image, lens: Lens):
-    fail = partial(_error, model, image.name)
+    fail = fail_at(model, image.name)
     name = find_image(folder, f"{IMAGES}/{image.name}", fail)
     size = image_size(folder / name)
     if size != (lens.width, lens.height):
@@ -70,11 +75,8 @@ def _photograph(folder, model, image: Image, lens: Lens):
     rotation = Rotation.from_quat([x, y, z, w]).as_matrix().T
     pose = np.column_stack([rotation, -rotation @ image.translation])
     camera = Camera(pose, fx, fy, cx, cy, *size)
-    return Photograph(name, camera, mask=_mask(folder, image.name, fail), distortion=distortion)
-
-
-def _error(model, name, text):
-    return UserError(f"{model}: {name}: {text}")
+    mask = find_mask(folder, MASKS, image.name, fail)
+    return Photograph(name, camera, mask=mask, distortion=distortion)
 
 
 def _intrinsics(folder, model, lens):
@@ -94,17 +96,4 @@ def _intrinsics(folder, model, lens):
             f" image_undistorter --image_path {folder / IMAGES} --input_path {model} --output_path"
             " NEW` and give NEW"
         )
-    if not all(LEAST_FOCAL < focal < MOST_FOCAL for focal in found[:2]):
-        raise UserError(f"{model}: a camera has the focal length {min(found[:2]):g}; mend it")
     return found
-
-
-def _mask(folder, name, fail):
-    """Path of the image's mask relative to the folder, None where there is no folder of masks."""
-    if not (folder / MASKS).is_dir():
-        return None
-    for given in (f"{name}.png", Path(name).with_suffix(".png").as_posix()):
-        # a name that is too long with .png is no file, where Path.is_file raises
-        if os.path.isfile(folder / MASKS / given):
-            return find_image(folder, f"{MASKS}/{given}", fail)
-    raise fail(f"has no mask {MASKS}/{name}.png; add it, or remove the folder {MASKS}")

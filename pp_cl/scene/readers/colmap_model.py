@@ -9,36 +9,35 @@ import struct
 import unicodedata
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
+from typing import NamedTuple
 
 import numpy as np
 
 from pp_cl.errors import UserError
-from pp_cl.files.regular import refusal
-from pp_cl.scene.readers.frame import MOST
+from pp_cl.files.untrusted import refusal
+from pp_cl.scene.readers.common import MOST
 
-# id in binary files, number of parameters, of every model of COLMAP that has a focal length
+# number of parameters of every model of COLMAP that has a focal length, in the order of their ids
 MODELS = {
-    "SIMPLE_PINHOLE": (0, 3),
-    "PINHOLE": (1, 4),
-    "SIMPLE_RADIAL": (2, 4),
-    "RADIAL": (3, 5),
-    "OPENCV": (4, 8),
-    "OPENCV_FISHEYE": (5, 8),
-    "FULL_OPENCV": (6, 12),
-    "FOV": (7, 5),
-    "SIMPLE_RADIAL_FISHEYE": (8, 4),
-    "RADIAL_FISHEYE": (9, 5),
-    "THIN_PRISM_FISHEYE": (10, 12),
-    "RAD_TAN_THIN_PRISM_FISHEYE": (11, 16),
-    "SIMPLE_DIVISION": (12, 4),
-    "DIVISION": (13, 5),
-    "SIMPLE_FISHEYE": (14, 3),
-    "FISHEYE": (15, 4),
-    "EUCM": (16, 6),
+    "SIMPLE_PINHOLE": 3,
+    "PINHOLE": 4,
+    "SIMPLE_RADIAL": 4,
+    "RADIAL": 5,
+    "OPENCV": 8,
+    "OPENCV_FISHEYE": 8,
+    "FULL_OPENCV": 12,
+    "FOV": 5,
+    "SIMPLE_RADIAL_FISHEYE": 4,
+    "RADIAL_FISHEYE": 5,
+    "THIN_PRISM_FISHEYE": 12,
+    "RAD_TAN_THIN_PRISM_FISHEYE": 16,
+    "SIMPLE_DIVISION": 4,
+    "DIVISION": 5,
+    "SIMPLE_FISHEYE": 3,
+    "FISHEYE": 4,
+    "EUCM": 6,
 }
-NAMES = {number: name for name, (number, _) in MODELS.items()}
 MOST_PIXELS = 2**20  # a side; beyond it a number is no size
 MOST_ENTRIES = 2**17  # of a file, cameras or images
 MOST_NAME = 1024  # bytes of an image's name
@@ -47,8 +46,7 @@ UNKNOWN = "is no known camera model; undistort with `colmap image_undistorter`, 
 POINT2D_BYTES = 24  # x, y and the id of a 3D point
 
 
-@dataclass(frozen=True)
-class Lens:
+class Lens(NamedTuple):
     """A camera of the model. parameters: as COLMAP orders them for this model."""
 
     model: str
@@ -57,14 +55,18 @@ class Lens:
     parameters: tuple[float, ...]
 
 
-@dataclass(frozen=True)
-class Image:
+class Image(NamedTuple):
     """An image of the model. rotation: (w, x, y, z) of a unit quaternion, world to camera."""
 
     name: str
     camera: int
     rotation: np.ndarray
     translation: np.ndarray
+
+
+def is_model(folder: Path, suffix: str) -> bool:
+    """True if the folder has cameras and images with this suffix, .bin or .txt."""
+    return all((folder / f"{name}{suffix}").is_file() for name in ("cameras", "images"))
 
 
 def read_model(folder: Path) -> tuple[dict[int, Lens], list[Image]]:
@@ -75,12 +77,14 @@ def read_model(folder: Path) -> tuple[dict[int, Lens], list[Image]]:
     read_cameras, read_images = (
         (_binary_cameras, _binary_images) if suffix == ".bin" else (_text_cameras, _text_images)
     )
-    lenses = _lenses(folder / f"cameras{suffix}", read_cameras)
+    lenses, images, names = {}, [], set()
+    file = folder / f"cameras{suffix}"
+    for identity, lens in _bounded(file, read_cameras):
+        if identity in lenses:
+            raise UserError(f"{file}: camera {identity} stands there twice; remove one")
+        lenses[identity] = lens
     file = folder / f"images{suffix}"
-    images, names = list(_bounded(file, read_images(file))), set()
-    if not images:
-        raise UserError(f"{file}: holds no images; run COLMAP's mapper again")
-    for image in images:
+    for image in _bounded(file, read_images):
         if image.camera not in lenses:
             raise UserError(
                 f"{file}: {image.name}: its camera {image.camera} is not in cameras{suffix}; copy"
@@ -90,50 +94,37 @@ def read_model(folder: Path) -> tuple[dict[int, Lens], list[Image]]:
         if name in names:
             raise UserError(f"{file}: {image.name}: stands there twice; remove one")
         names.add(name)
+        images.append(image)
+    if not images:
+        raise UserError(f"{file}: holds no images; run COLMAP's mapper again")
     return lenses, images
 
 
-def _lenses(file, read):
-    """{id: Lens}. Raises UserError for two of one id."""
-    lenses = {}
-    for identity, lens in _bounded(file, read(file)):
-        if identity in lenses:
-            raise UserError(f"{file}: camera {identity} stands there twice; remove one")
-        lenses[identity] = lens
-    return lenses
-
-
-def _bounded(file, entries):
-    """The entries. Raises UserError where they are more than MOST_ENTRIES."""
-    for count, entry in enumerate(entries):
+def _bounded(file, read):
+    """The entries of a file. Raises UserError where they are more than MOST_ENTRIES."""
+    for count, entry in enumerate(read(file)):
         if count == MOST_ENTRIES:
             raise UserError(f"{file}: holds more than {MOST_ENTRIES} entries; split the model")
         yield entry
-
-
-def is_model(folder: Path, suffix: str) -> bool:
-    """True if the folder has cameras and images with this suffix, .bin or .txt."""
-    return all((folder / f"{name}{suffix}").is_file() for name in ("cameras", "images"))
 
 
 def _lens(where, model, size, parameters):
     """The Lens. Raises UserError beginning with `where`."""
     if not all(1 <= side < MOST_PIXELS for side in size):
         raise UserError(f"{where}: {size[0]}x{size[1]} pixels is no size; copy the file anew")
-    if len(parameters) != MODELS[model][1] or not _are_numbers(parameters):
+    if len(parameters) != MODELS[model] or not _are_numbers(parameters):
         raise UserError(
-            f"{where}: {model} has {MODELS[model][1]} parameters, finite and not huge; copy the"
-            " file anew"
+            f"{where}: {model} has {MODELS[model]} parameters, finite and not huge; copy the file"
+            " anew"
         )
     return Lens(model, *size, tuple(parameters))
 
 
 def _image(where, name, camera, numbers):
     """The Image; numbers: qw, qx, qy, qz, tx, ty, tz. Raises UserError beginning with `where`."""
-    # it goes into messages of one line
-    if not 1 <= len(name) <= MOST_NAME or any(
-        unicodedata.category(letter) == "Cc" for letter in name
-    ):
+    # the name goes into messages of one line
+    has_controls = any(unicodedata.category(letter) == "Cc" for letter in name)
+    if has_controls or not 1 <= len(name) <= MOST_NAME:
         raise UserError(f"{where}: {name[:80]!r} is no name of an image; rename it")
     numbers = np.array(numbers, np.float64)
     length = np.linalg.norm(numbers[:4]) if _are_numbers(numbers) else 0
@@ -147,7 +138,7 @@ def _are_numbers(values):
     return all(abs(value) < MOST for value in values)
 
 
-# --------------------------------------------------------------------------------------------------
+# Text ---------------------------------------------------------------------------------------------
 
 
 def _lines(file):
@@ -156,10 +147,7 @@ def _lines(file):
         with file.open(encoding="utf-8-sig") as opened:
             for number, line in enumerate(iter(lambda: opened.readline(MOST_LINE), ""), 1):
                 if len(line) == MOST_LINE:
-                    raise UserError(
-                        f"{file}: line {number}: is longer than {MOST_LINE} characters; copy it"
-                        " anew"
-                    )
+                    raise ValueError(f"line {number} has {MOST_LINE} characters or more")
                 yield number, line.strip()
     except (OSError, ValueError) as error:
         raise refusal(file, error, "text") from None
@@ -196,9 +184,10 @@ def _text_images(file):
             raise UserError(
                 f"{where}: is not IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME; copy the file anew"
             ) from None
-        number, points = next(lines, (number, ""))
+        number, line = next(lines, (number, ""))
+        points = line.split()
         # else an image without its line of points would hide the next one
-        if not _is_points(points):
+        if len(points) % 3 or (points and not points[-1].lstrip("-").isdecimal()):
             raise UserError(
                 f"{file}: line {number}: must be the 2D points of {name[:80]!r}, X Y POINT3D_ID"
                 " each; give every image a second line, empty if it has none"
@@ -206,12 +195,7 @@ def _text_images(file):
         yield _image(where, name, camera, numbers)
 
 
-def _is_points(line):
-    words = line.split()
-    return len(words) % 3 == 0 and (not words or words[-1].lstrip("-").isdecimal())
-
-
-# --------------------------------------------------------------------------------------------------
+# Binary -------------------------------------------------------------------------------------------
 
 
 class _Bytes:
@@ -223,9 +207,8 @@ class _Bytes:
 
     def take(self, form):
         """The values of a struct format, little-endian."""
-        size = struct.calcsize("<" + form)
-        data = self.opened.read(size)
-        if len(data) < size:
+        data = self.opened.read(struct.calcsize("<" + form))
+        if len(data) < struct.calcsize("<" + form):
             raise self.too_short()
         return struct.unpack("<" + form, data)
 
@@ -248,35 +231,34 @@ class _Bytes:
         except UnicodeDecodeError:
             raise UserError(f"{self.file}: byte {at}: a name is not UTF-8; rename it") from None
 
-    def end(self):
-        at = self.opened.tell()
-        if at != self.size:
-            raise UserError(
-                f"{self.file}: goes on after its last entry, at byte {at}; copy it anew"
-            )
-
 
 @contextmanager
 def _opened(file) -> Iterator[_Bytes]:
+    """The file, which must be at its end when the block ends."""
     try:
         with file.open("rb") as opened:
-            yield _Bytes(file, opened)
+            data = _Bytes(file, opened)
+            yield data
+            if opened.tell() != data.size:
+                raise UserError(
+                    f"{file}: goes on after its last entry, at byte {opened.tell()}; copy it anew"
+                )
     except OSError as error:
         raise refusal(file, error, "COLMAP's") from None
 
 
 def _binary_cameras(file):
     """Each (id, Lens)."""
+    names = dict(enumerate(MODELS))
     with _opened(file) as data:
         (count,) = data.take("Q")
         for _ in range(count):  # a count that is too large ends at the file's end
             identity, number, width, height = data.take("IiQQ")
             where = f"{file}: camera {identity}"
-            if number not in NAMES:
+            if number not in names:
                 raise UserError(f"{where}: {number} {UNKNOWN}")
-            parameters = data.take("d" * MODELS[NAMES[number]][1])
-            yield identity, _lens(where, NAMES[number], (width, height), parameters)
-        data.end()
+            parameters = data.take("d" * MODELS[names[number]])
+            yield identity, _lens(where, names[number], (width, height), parameters)
 
 
 def _binary_images(file):
@@ -289,4 +271,3 @@ def _binary_images(file):
             (points,) = data.take("Q")
             data.skip(points * POINT2D_BYTES)
             yield _image(f"{file}: image {identity}", name, camera, numbers)
-        data.end()

@@ -1,31 +1,66 @@
-"""What several readers do: find an image that a file names, and split the photographs of a format
-that knows no splits.
+"""What readers share: images and masks that files name, numbers in files of JSON, of numpy and of
+text, and the splits of formats that know none.
 """
 
+import json
+import math
 import os
+import zipfile
 from collections.abc import Callable, Iterable, Sequence
-from functools import partial
-from pathlib import Path
-from typing import TypeVar
+from pathlib import Path, PurePosixPath
+from typing import Any, TypeVar
 
+import numpy as np
 from tqdm import tqdm
 
-from pp_cl.errors import UserError
+from pp_cl.errors import UserError, shown
+from pp_cl.files.checkpoint import opened_zip
 from pp_cl.files.image import ENDINGS
+from pp_cl.files.untrusted import opened_regular, read_json_text, read_regular, refusal
 
 HELD_OUT = 8  # one photograph of so many, the first among them, as LLFF and 3DGS do
-SPLITS = ["test", "train"]
+SPLITS = ["test", "train"]  # of a format that knows none
+MOST_JSON = 2**26  # bytes of a JSON file: 100,000 frames of 670
+MOST_ARRAYS = 2**25  # bytes of all arrays of a file, as float64: 100,000 cameras need 25 million
+MOST_TEXT = 2**20  # bytes of a file with the numbers of one camera
+MOST = 1e30  # larger numbers are refused: float32 could not hold their products
+KINDS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)  # of numpy's savez and savez_compressed
+
 Item = TypeVar("Item")
+Fail = Callable[[str], UserError]  # makes the error that names the file and the key
 
 
-def find_image(
-    folder: Path, given: str, fail: Callable[[str], UserError], endings: Sequence[str] = ("",)
-) -> str:
+# Splits -------------------------------------------------------------------------------------------
+
+
+def check_split(place: Path, split: str, present: Sequence[str]) -> None:
+    """Raise UserError naming the place where a scene has no such split."""
+    if split not in present:
+        raise UserError(
+            f"{place}: no split {split}; the splits of this scene are {', '.join(present)}"
+        )
+
+
+def hold_out(items: Sequence[Item], split: str) -> list[Item]:
+    """The items of split train or test, of a format without splits: test is every eighth."""
+    is_test = split == "test"
+    return [item for index, item in enumerate(items) if (index % HELD_OUT == 0) == is_test]
+
+
+def listing(items: Sequence[Item]) -> Iterable[Item]:
+    """The items, of which a progress bar shows on a terminal where there are thousands."""
+    return tqdm(items, "listing", unit="image", leave=False, disable=None, delay=2)
+
+
+# Images and masks ---------------------------------------------------------------------------------
+
+
+def find_image(folder: Path, given: str, fail: Fail, endings: Sequence[str] = ("",)) -> str:
     """Path relative to the scene's folder of the image that a file there calls `given`, with the
     first of the endings that exists.
 
-    fail(text) makes the error that names the file and the key. Raises it for a path that leaves the
-    folder, by a symbolic link or otherwise, and for one where no image is.
+    Raises fail(text) for a path that leaves the folder, by a symbolic link or otherwise, and for
+    one where no image is.
     """
     try:
         root = os.path.realpath(folder)
@@ -41,50 +76,136 @@ def find_image(
     raise fail(f"no image at {given[:80]!r}{tried}; copy it there or remove the frame")
 
 
-def listing(items: Sequence[Item]) -> Iterable[Item]:
-    """The items, of which a progress bar shows on a terminal where there are thousands."""
-    return tqdm(items, "listing", unit="image", leave=False, disable=None, delay=2)
-
-
 def folder_images(folder: Path, name: str) -> list[str]:
     """Paths relative to the scene's folder of the images in its folder `name`, sorted,
     hidden files left out. Raises UserError where there are none.
     """
-    files = sorted((folder / name).glob("*"))
     found = [
         file.name
-        for file in files
+        for file in sorted((folder / name).glob("*"))
         if file.suffix.lower() in ENDINGS and file.is_file() and not file.name.startswith(".")
     ]
     if not found:
         raise UserError(f"{folder / name}: no images in it; copy them there")
-    fail = partial(_error, folder / name)
+    fail = fail_at(folder / name)
     return [find_image(folder, f"{name}/{image}", fail) for image in found]
 
 
-def of_stem(folder: Path, name: str, stem: str) -> str:
-    """Path relative to the scene's folder of the image in its folder `name` with this stem. Raises
-    UserError where there is none.
+def mask_names(image: str) -> list[str]:
+    """What the mask of an image may be called in a folder of masks: its path there with .png added,
+    or with any ending of an image in place of its own.
     """
-    endings = [ending for ending in ENDINGS if (folder / name / f"{stem}{ending}").is_file()]
-    if not endings:
-        raise UserError(f"{folder / name}: no mask {stem}.png; add it, or remove the folder")
-    return find_image(folder, f"{name}/{stem}{endings[0]}", partial(_error, folder / name))
+    path = PurePosixPath(image)
+    return [f"{image}.png", *(str(path.with_suffix(ending)) for ending in ENDINGS)]
 
 
-def _error(place, text):
-    return UserError(f"{place}: {text}")
+def find_mask(folder: Path, masks: str, image: str, fail: Fail) -> str | None:
+    """Path relative to the scene's folder of the mask of an image in its folder `masks`; None where
+    there is no such folder. image: relative to the folder of images. Raises fail(text) for a mask
+    that is missing, or lies elsewhere.
+    """
+    if not (folder / masks).is_dir():
+        return None
+    for name in mask_names(image):
+        # a name that is too long with .png is no file, where Path.is_file raises
+        if os.path.isfile(folder / masks / name):
+            return find_image(folder, f"{masks}/{name}", fail)
+    raise fail(f"has no mask {masks}/{image}.png; add it, or remove the folder {masks}")
 
 
-def check_split(place: Path, split: str, present: Sequence[str]) -> None:
-    """Raise UserError naming the place where a scene has no such split."""
-    if split not in present:
+def fail_at(*place: object) -> Fail:
+    """fail(text) of a place: the file, and the part of it."""
+    return lambda text: UserError(f"{': '.join(map(str, place))}: {text}")
+
+
+# Files of numbers ---------------------------------------------------------------------------------
+
+
+def read_json(file: Path) -> Any:
+    """Content of a JSON file. Raises UserError naming the file and the place that is broken."""
+    try:
+        return json.loads(read_json_text(file, MOST_JSON, "utf-8-sig"))
+    except json.JSONDecodeError as error:
         raise UserError(
-            f"{place}: no split {split}; the splits of this scene are {', '.join(present)}"
-        )
+            f"{file}: line {error.lineno}, column {error.colno}: {error.msg}; correct the JSON"
+            " there"
+        ) from None
+    except (OSError, ValueError, RecursionError) as error:
+        raise refusal(file, error, "JSON") from error
 
 
-def hold_out(items: Sequence[Item], split: str) -> list[Item]:
-    """The items of split train or test, of a format without splits: test is every eighth."""
-    is_test = split == "test"
-    return [item for index, item in enumerate(items) if (index % HELD_OUT == 0) == is_test]
+def read_npy(file: Path) -> np.ndarray:
+    """The array of a .npy file as float64. Raises UserError naming the file."""
+    try:
+        with opened_regular(file) as opened:
+            return _checked(file, "", _read_array(opened, MOST_ARRAYS))
+    except UserError:
+        raise
+    except Exception as error:  # numpy meets broken bytes with whatever comes up
+        raise refusal(file, error, "numpy's arrays") from None
+
+
+def read_npz(file: Path, wanted: str) -> dict[str, np.ndarray]:
+    """{name: array as float64} of the members of a .npz file whose names begin with `wanted`.
+    Raises UserError naming the file and the member.
+    """
+    try:
+        arrays, left = {}, MOST_ARRAYS
+        with opened_zip(file) as archive:
+            for entry in archive.infolist():
+                name = entry.filename.removesuffix(".npy")
+                if name == entry.filename or not name.startswith(wanted):
+                    continue
+                if entry.compress_type not in KINDS:  # others take memory of their own
+                    raise ValueError(f"{name} is packed as numpy does not")
+                with archive.open(entry) as opened:
+                    arrays[name] = _checked(file, f"{name}: ", _read_array(opened, left))
+                left -= arrays[name].nbytes
+        return arrays
+    except UserError:
+        raise
+    except Exception as error:  # zipfile and numpy meet broken bytes with whatever comes up
+        raise refusal(file, error, "numpy's arrays") from None
+
+
+def _read_array(opened, most):
+    """The array of an opened .npy file, of numbers and of at most so many bytes as float64."""
+    if np.lib.format.read_magic(opened) != (1, 0):  # others have headers of up to 4 GiB
+        raise ValueError("is of another version than 1.0")
+    shape, fortran, dtype = np.lib.format.read_array_header_1_0(opened)
+    if dtype.kind not in "fiu":
+        raise ValueError(f"holds {dtype}, no numbers")
+    count = math.prod(shape)
+    if min(shape, default=0) < 0 or count * max(dtype.itemsize, 8) > most:
+        raise ValueError(f"claims the shape {shown(str(shape), 40)}, more than {most} bytes")
+    data = opened.read(count * dtype.itemsize)
+    if len(data) < count * dtype.itemsize:
+        raise ValueError("ends too early")
+    array = np.frombuffer(data, dtype, count)
+    return array.reshape(shape, order="F" if fortran else "C").astype(np.float64)
+
+
+def _checked(file, name, array):
+    if not (np.abs(array) < MOST).all():
+        raise UserError(f"{file}: {name}holds NaN, Inf or a huge number; write it anew")
+    return array
+
+
+def read_numbers(file: Path) -> list[list[float]]:
+    """The numbers of each line of a text file that has some. Raises UserError naming the file and
+    the line.
+    """
+    try:
+        lines = read_regular(file, MOST_TEXT).split("\n")
+    except (OSError, ValueError) as error:
+        raise refusal(file, error, "text") from None
+    rows = []
+    for number, line in enumerate(lines, 1):
+        try:
+            rows.append([float(word) for word in line.split()])
+        except ValueError:
+            raise UserError(
+                f"{file}: line {number}: {line[:60]!r} are no numbers; write it anew"
+            ) from None
+        _checked(file, f"line {number}: ", np.array(rows[-1]))
+    return [row for row in rows if row]

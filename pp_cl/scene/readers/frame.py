@@ -2,7 +2,6 @@
 
 import json
 import math
-from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -11,9 +10,9 @@ from typing import Any
 import numpy as np
 
 from pp_cl.errors import UserError, quoted
-from pp_cl.files.regular import read_json_text, refusal
 from pp_cl.scene.camera import Camera
 from pp_cl.scene.distortion import Distortion
+from pp_cl.scene.readers.common import MOST, Fail
 
 COEFFICIENTS = ("k1", "k2", "p1", "p2", "k3")  # of Distortion
 # values of camera_model that are pinhole cameras when those coefficients are 0
@@ -27,26 +26,10 @@ LENS_KEYS = {
 }
 UNDISTORT = "undistort the images to PINHOLE, as `colmap image_undistorter` does"
 
-MOST_BYTES = 2**26  # of a JSON file: 100,000 frames of 670
-MOST = 1e30  # larger numbers are refused: float32 could not hold their products
 # largest eigenvalue of R^T R - 1 that is taken for rounding; NeRF-synthetic has 1e-6
 ROTATION_TOLERANCE = 1e-3
 LEAST_ANGLE = 1e-7  # of view, radians: below it the tangent has no use for float32
 GL_FROM_CV = np.diag([1.0, -1.0, -1.0, 1.0])  # OpenGL: y up, z backward; OpenCV: y down, z forward
-
-
-def read_json(file: Path) -> Any:
-    """Content of a JSON file. Raises UserError naming the file and the place that is broken."""
-    try:
-        data = json.loads(read_json_text(file, MOST_BYTES, "utf-8-sig"))
-    except json.JSONDecodeError as error:
-        raise UserError(
-            f"{file}: line {error.lineno}, column {error.colno}: {error.msg}; correct the JSON"
-            " there"
-        ) from None
-    except (OSError, ValueError, RecursionError) as error:
-        raise refusal(file, error, "JSON") from error
-    return data
 
 
 @dataclass
@@ -88,6 +71,17 @@ class Frame:
             raise self.error(key, f"is {json.dumps(value)[:40]}; must be a finite number{bounds}")
         return float(value)
 
+    def array(self, key: str, shape: tuple[int, ...]) -> np.ndarray:
+        """Finite float64 array of a shape. Raises UserError where there is none."""
+        array = numbers(self.get(key))
+        if array is None or array.shape != shape or not (np.abs(array) < MOST).all():
+            raise self.error(key, f"must be {'x'.join(map(str, shape))} finite numbers")
+        return array
+
+    def pose(self, key: str) -> np.ndarray:
+        """rigid() of the value of a key."""
+        return rigid(self.get(key), partial(self.error, key))
+
 
 def frame_keys(camera: Camera) -> dict[str, Any]:
     """A camera in the format of nerfstudio's transforms files, which pinhole() reads."""
@@ -105,58 +99,46 @@ def frame_keys(camera: Camera) -> dict[str, Any]:
 
 def pinhole(frame: Frame, width: int, height: int) -> Camera:
     """The camera of a frame in the format of NeRF-synthetic and nerfstudio whose image has this
-    many pixels. Raises UserError naming the key that is missing or wrong.
+    many pixels; fy is fx where neither fl_y nor camera_angle_y says it. Raises UserError naming the
+    key that is missing or wrong.
     """
-    fx, fy = _focal_lengths(frame, width, height)
+    fx = _focal_length(frame, "fl_x", "camera_angle_x", width)
+    if fx is None:
+        raise frame.error("fl_x", "is missing, and so is camera_angle_x; add one of them")
+    fy = _focal_length(frame, "fl_y", "camera_angle_y", height)
     cx, cy = frame.number("cx"), frame.number("cy")
-    centre = (width / 2 if cx is None else cx, height / 2 if cy is None else cy)
-    pose = rigid_pose(frame, "transform_matrix", frame.get("transform_matrix"))
-    return Camera(pose @ GL_FROM_CV, fx, fy, *centre, width, height)
+    return Camera(
+        frame.pose("transform_matrix") @ GL_FROM_CV,
+        fx,
+        fx if fy is None else fy,
+        width / 2 if cx is None else cx,
+        height / 2 if cy is None else cy,
+        width,
+        height,
+    )
+
+
+def _focal_length(frame, length_key, angle_key, size):
+    """In pixels, from its key or from that of the angle of view; None where both are absent."""
+    length = frame.number(length_key, above=0)
+    angle = frame.number(angle_key, above=LEAST_ANGLE, below=math.pi)
+    if length is None and angle is not None:
+        length = 0.5 * size / math.tan(0.5 * angle)
+    return length
 
 
 def distortion(frame: Frame) -> Distortion:
     """The lens distortion of a frame in the format of nerfstudio or instant-ngp. Raises UserError
     for a lens other than OpenCV's perspective one.
     """
-    check_perspective(frame)
-    if frame.number("k4"):
-        raise frame.error("k4", f"a fourth radial coefficient is not modelled; {UNDISTORT}")
-    given = {key: frame.number(key) for key in COEFFICIENTS}
-    return Distortion(**{key: value for key, value in given.items() if value is not None})
-
-
-def check_perspective(frame: Frame) -> None:
-    """Raise UserError where a key says that the frame's lens is no perspective one."""
     for key, known in LENS_KEYS.items():
         value = frame.get(key)
         if value and str(value).upper() not in known:
             raise frame.error(key, f"{quoted(value, 40)} is not modelled; {UNDISTORT}")
-
-
-def _focal_lengths(frame, width, height):
-    """(fx, fy) in pixels from fl_x, fl_y or, where these are absent, the angles of view; fy is fx
-    if not given.
-    """
-    fx = _focal_length(frame, "fl_x", "camera_angle_x", width)
-    if fx is None:
-        raise frame.error("fl_x", "is missing, and so is camera_angle_x; add one of them")
-    fy = _focal_length(frame, "fl_y", "camera_angle_y", height)
-    return fx, fx if fy is None else fy
-
-
-def _focal_length(frame, length_key, angle_key, size):
-    length, angle = (
-        frame.number(length_key, above=0),
-        frame.number(angle_key, above=LEAST_ANGLE, below=math.pi),
-    )
-    if length is None and angle is not None:
-        length = 0.5 * size / math.tan(0.5 * angle)
-    return length
-
-
-def rigid_pose(frame: Frame, key: str, value: Any) -> np.ndarray:
-    """rigid() of the value of a frame's key."""
-    return rigid(value, partial(frame.error, key))
+    if frame.number("k4"):
+        raise frame.error("k4", f"a fourth radial coefficient is not modelled; {UNDISTORT}")
+    given = {key: frame.number(key) for key in COEFFICIENTS}
+    return Distortion(**{key: value for key, value in given.items() if value is not None})
 
 
 def numbers(value: Any) -> np.ndarray | None:
@@ -172,7 +154,7 @@ def numbers(value: Any) -> np.ndarray | None:
         return None
 
 
-def rigid(value: Any, fail: Callable[[str], UserError]) -> np.ndarray:
+def rigid(value: Any, fail: Fail) -> np.ndarray:
     """(3, 4) float64 pose of a 4x4 or 3x4 matrix, its rotation made orthonormal. Raises fail(text)
     where it holds no rotation and place.
     """

@@ -1,6 +1,5 @@
 """Reader of scenes as LLFF has them: poses_bounds.npy beside images/, and masks/ for objects."""
 
-from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -8,10 +7,17 @@ import numpy as np
 from pp_cl.errors import UserError
 from pp_cl.files.image import image_size
 from pp_cl.scene.camera import Camera
-from pp_cl.scene.photograph import Photograph
-from pp_cl.scene.readers.arrays import read_npy
-from pp_cl.scene.readers.common import SPLITS, check_split, folder_images, hold_out, of_stem
+from pp_cl.scene.readers.common import (
+    SPLITS,
+    check_split,
+    fail_at,
+    find_mask,
+    folder_images,
+    hold_out,
+    read_npy,
+)
 from pp_cl.scene.readers.frame import rigid
+from pp_cl.scene.views import Photograph
 
 FILES = "poses_bounds.npy (LLFF)"
 IMAGES, MASKS, POSES = "images", "masks", "poses_bounds.npy"
@@ -45,18 +51,13 @@ def read_split(folder: Path, split: str) -> list[Photograph]:
             f"{file}: has shape {rows.shape}, but {IMAGES}/ has {len(names)} images; must be"
             f" {len(names)}x{NUMBERS} numbers"
         )
-    has_masks = (folder / MASKS).is_dir()
     read = []
     for index, name in hold_out(list(enumerate(names)), split):
-        fail = partial(_error, file, index)
+        fail = fail_at(file, f"row {index}")
         camera = _camera(rows[index, :15].reshape(3, 5), image_size(folder / name), fail)
-        mask = of_stem(folder, MASKS, Path(name).stem) if has_masks else None
+        mask = find_mask(folder, MASKS, Path(name).name, fail_at(folder / name))
         read.append(Photograph(name, camera, mask=mask))
     return read
-
-
-def _error(file, index, text):
-    return UserError(f"{file}: row {index}: {text}")
 
 
 def _camera(matrix, size, fail):

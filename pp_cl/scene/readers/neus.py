@@ -3,7 +3,6 @@ with world_mat_i = K [R | t], images in image/, masks in mask/, all in the order
 """
 
 import re
-from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -12,14 +11,15 @@ from scipy.linalg import rq
 from pp_cl.errors import UserError
 from pp_cl.files.image import image_size
 from pp_cl.scene.camera import Camera
-from pp_cl.scene.photograph import Photograph
-from pp_cl.scene.readers.arrays import read_npz
 from pp_cl.scene.readers.common import (
     SPLITS,
     check_split,
+    fail_at,
     folder_images,
     hold_out,
+    read_npz,
 )
+from pp_cl.scene.views import Photograph
 
 FILES = "cameras_sphere.npz (NeuS, DTU)"
 CAMERAS = ("cameras_sphere.npz", "cameras.npz")
@@ -59,12 +59,12 @@ def read_split(folder: Path, split: str) -> list[Photograph]:
     for index, name in hold_out(list(enumerate(names)), split):
         key = f"world_mat_{index}"
         if key not in cameras:
-            raise _error(file, key, "is missing; number the cameras from 0 on")
-        camera = _camera(cameras[key], image_size(folder / name), partial(_error, file, key))
+            raise UserError(f"{file}: {key}: is missing; number the cameras from 0 on")
+        camera = _camera(cameras[key], image_size(folder / name), fail_at(file, key))
         key = f"scale_mat_{index}"
         depth_range = None
         if key in scales:
-            depth_range = _depth_range(scales[key], camera, partial(_error, file, key))
+            depth_range = _depth_range(scales[key], camera, fail_at(file, key))
         read.append(Photograph(name, camera, depth_range, masks[index]))
     return read
 
@@ -93,10 +93,6 @@ def _masks(folder, names):
                 " numbers of their images"
             )
     return masks
-
-
-def _error(file, key, text):
-    return UserError(f"{file}: {key}: {text}")
 
 
 def _camera(matrix, size, fail):

@@ -3,7 +3,6 @@ intrinsics.txt, and near_and_far.txt where it is there. bbox.txt, the box of NSV
 read.
 """
 
-from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -11,10 +10,9 @@ import numpy as np
 from pp_cl.errors import UserError
 from pp_cl.files.image import image_size
 from pp_cl.scene.camera import Camera
-from pp_cl.scene.photograph import Photograph
-from pp_cl.scene.readers.arrays import read_numbers
-from pp_cl.scene.readers.common import check_split, folder_images
+from pp_cl.scene.readers.common import check_split, fail_at, folder_images, read_numbers
 from pp_cl.scene.readers.frame import rigid
+from pp_cl.scene.views import Photograph
 
 FILES = "rgb, pose and intrinsics.txt (NSVF)"
 PREFIXES = {"0_": "train", "1_": "val", "2_": "test"}
@@ -46,7 +44,7 @@ def read_split(folder: Path, split: str) -> list[Photograph]:
     read = []
     for name in names[split]:
         pose, size = _pose(folder / POSES / f"{Path(name).stem}.txt"), image_size(folder / name)
-        values = _scaled(lens, size, partial(_error, file))
+        values = _scaled(lens, size, fail_at(file))
         read.append(Photograph(name, Camera(pose, *values, *size), depth_range))
     return read
 
@@ -68,16 +66,12 @@ def _names(folder):
     return names
 
 
-def _error(file, text):
-    return UserError(f"{file}: {text}")
-
-
 def _pose(file):
     """(3, 4) of a file of 4x4 numbers."""
     rows = read_numbers(file)
     if [len(row) for row in rows] != [4] * 4:
         raise UserError(f"{file}: must be 4x4 numbers, a camera-to-world matrix")
-    return rigid(rows, partial(_error, file))
+    return rigid(rows, fail_at(file))
 
 
 def _lens(file):

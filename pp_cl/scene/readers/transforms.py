@@ -1,15 +1,25 @@
 """Reader of scenes in the format of NeRF-synthetic, transforms_<split>.json, and of nerfstudio,
-transforms.json, with the keys of both: intrinsics and distortion per frame, masks, near and far.
+transforms.json, with the keys of both: intrinsics and distortion per frame, masks, near and far;
+and a writer of the former.
 """
 
+import math
 from functools import partial
 from pathlib import Path, PurePosixPath
 
 from pp_cl.errors import UserError
-from pp_cl.files.image import image_size
-from pp_cl.scene.photograph import Photograph
-from pp_cl.scene.readers.common import SPLITS, check_split, find_image, hold_out, listing
-from pp_cl.scene.readers.frame import Frame, distortion, pinhole, read_json
+from pp_cl.files.atomic import atomic_folder, write_json
+from pp_cl.files.image import image_size, write_png
+from pp_cl.scene.readers.common import (
+    SPLITS,
+    check_split,
+    find_image,
+    hold_out,
+    listing,
+    read_json,
+)
+from pp_cl.scene.readers.frame import Frame, distortion, frame_keys, pinhole
+from pp_cl.scene.views import Photograph, View
 
 ENDINGS = ("", ".png", ".exr")  # of a file_path
 FILES = "transforms_train.json or transforms.json"
@@ -132,3 +142,31 @@ def _depth_range(frame):
     if far <= near:
         raise frame.error("far", f"is {far:g}; must be above near, {near:g}")
     return near, far
+
+
+def write_scene(splits: dict[str, list[View]], folder: Path | str) -> None:
+    """Write the stored images of views as a scene of NeRF-synthetic; the folder appears when it is
+    complete. Raises UserError if it exists and is not empty, or cannot be written.
+    """
+    with atomic_folder(Path(folder)) as unfinished:
+        write_splits(splits, unfinished)
+
+
+def write_splits(splits: dict[str, list[View]], folder: Path) -> None:
+    """The same into a folder that exists. Every frame has nerfstudio's fl_x, fl_y, cx, cy, w, h,
+    and near and far if the views state them.
+    """
+    for split, views in splits.items():
+        frames = []
+        for view in views:
+            path = Path(view.name).with_suffix("")
+            (folder / path).parent.mkdir(parents=True, exist_ok=True)
+            write_png(folder / f"{path}.png", view.image)
+            frame = {"file_path": f"./{path.as_posix()}", **frame_keys(view.stored_camera)}
+            if view.depth_range:
+                frame["near"], frame["far"] = view.depth_range
+            frames.append(frame)
+        camera = views[0].stored_camera
+        angle = 2 * math.atan(0.5 * camera.width / camera.fx)
+        data = {"camera_angle_x": angle, "frames": frames}
+        write_json(folder / f"transforms_{split}.json", data)

@@ -8,7 +8,7 @@ import os
 
 import numpy as np
 import pytest
-from support.same_scene import held_out, same, views
+from support.same_scene import held_out, views
 from support.transforms_scenes import refused
 
 from pp_cl.errors import UserError
@@ -44,13 +44,6 @@ def edit(folder, change):
 
 
 # --------------------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("version", [1, 2])
-def test_both_versions_come_back(tmp_path, version):
-    given = held_out(views())
-    co3d.write(tmp_path, given, version)
-    same(tmp_path / "object" / "sequence", given)
 
 
 @pytest.mark.parametrize("size", [(40, 24), (24, 40), (33, 33)])
@@ -261,7 +254,3 @@ def test_a_size_that_is_nested_deeply_is_quoted(sequence):
     with pytest.raises(UserError, match=r"has the size \[\[") as caught:
         read_split(sequence, "train")
     assert len(str(caught.value)) < 400
-
-
-def test_an_unknown_split(sequence):
-    refused(sequence, "no split val", "test, train", splits=("val",))

@@ -12,7 +12,6 @@ from support.transforms_scenes import refused
 
 from pp_cl.files.image import write_png
 from pp_cl.scene.distortion import Distortion
-from pp_cl.scene.load import load_scene
 from pp_cl.scene.readers.colmap import read_split
 from pp_cl.scene.readers.colmap_model import read_model
 from tools.colmap_demo import align, cameras
@@ -145,22 +144,6 @@ def test_2d_points_take_no_memory(tmp_path):
     tracemalloc.stop()
 
 
-def test_without_masks_the_images_own_alpha_counts(written):
-    folder, _ = written
-    for file in (folder / "masks").iterdir():
-        file.unlink()
-    (folder / "masks").rmdir()
-    for view in load_scene(folder).splits["train"]:
-        assert (view.image[..., 3] == 255).all()
-
-
-def test_masks_with_the_ending_replaced(written):
-    folder, splits = written
-    for file in list((folder / "masks").iterdir()):
-        file.rename(file.with_name(file.name.removesuffix(".png")))
-    same(folder, splits)
-
-
 # --------------------------------------------------------------------------------------------------
 
 
@@ -192,7 +175,6 @@ BAD_TEXT = {
     "width": ("cameras.txt", replaced(2, "0"), "line 2", "0x22"),
     "a focal length that is no number": ("cameras.txt", replaced(4, "f"), "line 2", "PARAMS"),
     "NaN": ("cameras.txt", replaced(4, "nan"), "finite"),
-    "focal length 0": ("cameras.txt", replaced(4, "0"), "focal length 0"),
     "a parameter is missing": ("cameras.txt", second(lambda w: w[:-1]), "PINHOLE has 4"),
     "quaternion": ("images.txt", replaced(1, "3"), "000001.png", "unit quaternion"),
     "infinite place": ("images.txt", replaced(5, "inf"), "unit quaternion and place"),
@@ -277,29 +259,3 @@ def test_bad_bytes(binary, case):
     file = binary / "sparse" / "0" / name
     file.write_bytes(change(file.read_bytes()))
     refused(binary, file, *words)
-
-
-def test_a_missing_mask(written):
-    folder, _ = written
-    (folder / "masks" / "000003.png.png").unlink()
-    refused(folder, "000003.png", "no mask masks/000003.png.png")
-
-
-def test_a_name_that_is_too_long_for_a_mask(binary):
-    """255 bytes, the most that a file's name may have; with .png it would have more."""
-    name = "x" * 251 + ".png"
-    (binary / "images" / "000001.png").rename(binary / "images" / name)
-    (binary / "masks" / "000001.png.png").unlink()
-    file = binary / "sparse" / "0" / "images.bin"
-    file.write_bytes(file.read_bytes().replace(b"000001.png", name.encode()))
-    refused(binary, name, "has no mask")
-
-
-def test_a_mask_of_another_size(written):
-    folder, _ = written
-    write_png(folder / "masks" / "000003.png.png", np.zeros((4, 4)))
-    refused(folder, "masks/000003.png.png", "4x4")
-
-
-def test_an_unknown_split(written):
-    refused(written[0], "no split val", "test, train", splits=("val",))

@@ -111,13 +111,6 @@ def test_json_in_utf8_with_byte_order_mark(tmp_path):
     assert load_scene(tmp_path).splits["train"][0].name == "köpfe.png"
 
 
-def test_scene_behind_a_link(tmp_path):
-    write_scene(tmp_path)
-    link = tmp_path.parent / f"{tmp_path.name}_link"
-    link.symlink_to(tmp_path)
-    assert len(load_scene(link).splits["train"]) == 3
-
-
 def test_rows_and_rounding_of_the_pose(tmp_path, rng):
     """3x4 is read as 4x4 is; a rotation that is off by rounding comes out orthonormal."""
     exact = opengl_pose([1, 2, 0.5])

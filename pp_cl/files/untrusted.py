@@ -53,6 +53,8 @@ def refusal(path: Path | str, error: Exception, kind: str, mend: str = "copy it 
     """The UserError about a file that could not be read as `kind`: by the system's word, which has
     another mend than a content that is broken.
     """
+    if isinstance(error, FileNotFoundError):
+        return UserError(f"{path}: no such file; copy it there")
     if isinstance(error, OSError) and error.errno is not None:
         return UserError(
             f"{path}: cannot be read ({error.strerror}); check its permissions and the disk"
