@@ -13,7 +13,7 @@ import numpy as np
 
 from pp_cl.bench import unet as bench
 from pp_cl.bench.timing import errors, interleave
-from pp_cl.commands.options import side, widths
+from pp_cl.commands.options import integer, side, widths
 from pp_cl.device.discover import open_device
 from pp_cl.errors import UserError
 from pp_cl.files.atomic import write_json
@@ -81,21 +81,21 @@ class TorchNetwork:
 
 
 def compare(torch, dev, widths, size, *, variant, rounds):
-    """The measurement as a dictionary for JSON: see main()."""
+    """{"rel_l2": ours against float64, "forward": {"ours_ms", "torch_ms", "ratio"}, "train": the
+    same, forward and backward to the input and the weights}: medians, ratio = torch_ms / ours_ms.
+    """
     rng = np.random.default_rng(0)
     values = np.maximum(rng.normal(size=(size, size, bench.CHANNELS_IN)), 0).astype(np.float32)
     grads = rng.normal(size=(size, size, bench.CHANNELS_OUT)).astype(np.float32)
     net = bench.make_network(dev, widths, make_policy(dev, variant=variant))
     x, grad_image = dev.upload(values), dev.upload(grads)
-    twin = TorchNetwork(torch, net, torch.float32)
-    torch_x = twin.input(values)
-    torch_grad = twin.input(grads).detach()
-
-    exact = TorchNetwork(torch, net, torch.float64)
+    twin, exact = (TorchNetwork(torch, net, kind) for kind in (torch.float32, torch.float64))
+    torch_x, torch_grad = twin.input(values), twin.input(grads).detach()
     expected = exact.forward(exact.input(values)).numpy()[0].transpose(1, 2, 0)
-    rel_l2 = errors(net.forward(x, training=False).get(), expected)[0]
-    torch_rel_l2 = errors(twin.forward(torch_x).numpy()[0].transpose(1, 2, 0), expected)[0]
-
+    images = {
+        "rel_l2": net.forward(x, training=False).get(),
+        "torch_rel_l2": twin.forward(torch_x).numpy()[0].transpose(1, 2, 0),
+    }
     times = interleave(
         {
             ("forward", "ours"): bench.forward_runner(dev, net, x, grad_image),
@@ -115,10 +115,8 @@ def compare(torch, dev, widths, size, *, variant, rounds):
         "widths": list(widths),
         "size": size,
         "runs": rounds,
-        "rel_l2": rel_l2,
-        "torch_rel_l2": torch_rel_l2,
-        "forward": _summary(times, "forward"),
-        "train": _summary(times, "train"),
+        **{name: errors(image, expected)[0] for name, image in images.items()},
+        **{direction: _summary(times, direction) for direction in ("forward", "train")},
     }
 
 
@@ -131,46 +129,25 @@ def _summary(times, direction):
     return summary | {"ratio": summary["torch_ms"] / summary["ours_ms"]}
 
 
-def main(argv=None):
-    """Measure, print, write; returns the exit status.
-
-    The JSON holds {"rel_l2": ours against float64, "forward": {"ours_ms", "torch_ms", "ratio"},
-    "train": the same}: medians, ratio = torch_ms / ours_ms, train = forward and backward to the
-    input and the weights.
-    """
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument(
-        "--widths",
-        default="128,256,512",
-        type=widths,
-        metavar="A,B,C",
-        help="channels of the levels (128,256,512)",
-    )
-    parser.add_argument(
-        "--size",
-        default="256",
-        type=side,
-        metavar="S",
-        help="side of the image in pixels, a multiple of 4 (256)",
-    )
-    parser.add_argument(
-        "--variant",
-        choices=(AUTO, *VARIANTS),
-        default="auto",
-        help="of our convolutions (auto)",
-    )
-    parser.add_argument("--threads", type=int, default=2, metavar="N", help="PyTorch's (2)")
-    parser.add_argument("--runs", type=int, default=15, metavar="N", help="timed runs of each (15)")
-    parser.add_argument("--device", metavar="D", help="ours, as `pp-cl devices` prints them")
-    parser.add_argument("--json", metavar="FILE", help="also write the result there")
+def main(argv: list[str] | None = None) -> int:
+    """Measure, print, write; returns the exit status."""
+    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
+    add, count = parser.add_argument, integer(1, 10_000)
+    add("--widths", default="128,256,512", type=widths, metavar="A,B,C", help="of the levels")
+    add("--size", default="256", type=side, metavar="S", help="of the image, a multiple of 4 (256)")
+    add("--variant", choices=(AUTO, *VARIANTS), default="auto", help="of our convolutions (auto)")
+    add("--threads", type=count, default=2, metavar="N", help="PyTorch's (2)")
+    add("--runs", type=count, default=15, metavar="N", help="timed runs of each (15)")
+    add("--device", metavar="D", help="ours, as `pp-cl devices` prints them")
+    add("--json", metavar="FILE", help="also write the result there")
     options = parser.parse_args(argv)
     try:
-        if min(options.threads, options.runs) < 1:
-            raise UserError("--threads, --runs: must be at least 1")
-        torch = _import_torch()
-        torch.set_num_threads(options.threads)
+        import torch
+    except ImportError:
+        print("compare_torch: install PyTorch: `pip install torch==2.13.0`", file=sys.stderr)
+        return 2
+    torch.set_num_threads(options.threads)
+    try:
         result = compare(
             torch,
             open_device(options.device),
@@ -192,14 +169,6 @@ def main(argv=None):
             f" {row['ratio']:.2f}"
         )
     return 0
-
-
-def _import_torch():
-    try:
-        import torch
-    except ImportError:
-        raise UserError("PyTorch is missing; install it with `pip install torch==2.13.0`") from None
-    return torch
 
 
 if __name__ == "__main__":

@@ -29,7 +29,7 @@ from tempfile import TemporaryDirectory
 from typing import NamedTuple
 from unittest.mock import patch
 
-from pp_cl.bench.peak import CopyBandwidth, PeakFlops
+from pp_cl.bench.timing import CopyBandwidth, PeakFlops
 from pp_cl.cli import main as pp_cl
 from pp_cl.device.device import INTEL_PLATFORM, STANDARD, Device, kernel_folder, vendor_options
 from pp_cl.device.discover import open_device
@@ -59,10 +59,6 @@ class Build(NamedTuple):
 
     def __str__(self) -> str:
         return " ".join((self.file, *self.macros))
-
-
-class CompilerMissing(Exception):
-    """Which compiler there is not, and how to come by it."""
 
 
 class BuildError(Exception):
@@ -125,8 +121,8 @@ def environment() -> dict[str, str]:
     return {**os.environ, **{name: os.pathsep.join(found) for name, found in paths.items()}}
 
 
-def find(name: str) -> str:
-    """The path of a program, or of a file of libclc. Raises CompilerMissing."""
+def find(name: str) -> str | None:
+    """The path of a program, or of a file of libclc; None where there is none."""
     places, mode = [environment()["PATH"]], os.X_OK
     if name == PTXAS:
         packages = Path(sysconfig.get_path("purelib"), "nvidia").glob(f"*/bin/{PTXAS}")
@@ -134,17 +130,12 @@ def find(name: str) -> str:
     elif name.endswith(".bc"):
         # not /usr/lib/clc, where another version of LLVM may have put its own
         places, mode = [str(FOLDER / "usr" / "lib" / "clc")], os.R_OK
-    found = shutil.which(name, mode, os.pathsep.join(places))
-    if not found:
-        wheel = "install CUDA's compiler, or nvidia-cuda-nvcc into .venv by pip"
-        source = wheel if name == PTXAS else f"it is in Debian's package {PACKAGES[name]}"
-        raise CompilerMissing(f"{name} is missing: {source}")
-    return found
+    return shutil.which(name, mode, os.pathsep.join(places))
 
 
 def unpack_missing() -> str:
     """Unpack Debian's packages of what is absent. Returns what went wrong, else ""."""
-    wanted = dict.fromkeys(package for name, package in PACKAGES.items() if not _is_here(name))
+    wanted = dict.fromkeys(package for name, package in PACKAGES.items() if not find(name))
     if not wanted:
         return ""
     if not shutil.which("apt-get") or not shutil.which("dpkg"):
@@ -165,11 +156,18 @@ def unpack_missing() -> str:
     return ""
 
 
-def _is_here(name):
-    try:
-        return bool(find(name))
-    except CompilerMissing:
-        return False
+def missing(target: str, problem: str) -> list[str]:
+    """A line for each compiler of a target that is not there. problem: why it was not fetched."""
+    kind = target[:3]
+    names = {"sm_": (CLANG, PTXAS), "gfx": (CLANG, LINKER)}.get(kind, (OCLOC,))
+    told = []
+    for name in (*names, *([LIBRARIES[kind]] if kind in LIBRARIES else [])):
+        if not find(name):
+            mend = "install CUDA's compiler, or nvidia-cuda-nvcc into .venv by pip"
+            mend = mend if name == PTXAS else f"it is in Debian's package {PACKAGES[name]}"
+            why = f" ({problem})" if problem else ""
+            told.append(f"{target} is not checked: {name} is missing: {mend}{why}")
+    return told
 
 
 def _run(command, folder=None):
@@ -190,7 +188,7 @@ def _run(command, folder=None):
 
 def compile_build(target: str, build: Build, sources: Path, folder: Path) -> str:
     """What the compilers of a target say of a build. folder: for what is compiled. Raises
-    BuildError, CompilerMissing.
+    BuildError.
     """
     kind, file = target[:3], str(sources / f"{build.file}.cl")
     platform = target if kind in LIBRARIES else INTEL_PLATFORM
@@ -241,33 +239,21 @@ def check(target: str, build: Build, kernels: set[str]) -> list[str]:
     return [f"{target} {build}: {line}" for line in wrong]
 
 
-def check_compilers(target: str, problem: str) -> list[str]:
-    """A line where a target's compilers are missing. problem: why they were not fetched."""
-    kind = target[:3]
-    names = {"sm_": (CLANG, PTXAS), "gfx": (CLANG, LINKER)}.get(kind, (OCLOC,))
-    try:
-        for name in (*names, *(LIBRARIES[kind] for _ in range(kind in LIBRARIES))):
-            find(name)
-    except CompilerMissing as error:
-        return [f"{target} is not checked: {error}" + (f" ({problem})" if problem else "")]
-    return []
-
-
 def main(arguments: list[str] | None = None) -> int:
     """Returns the exit status."""
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     parser.add_argument("--targets", default=",".join(TARGETS), help="sm_*, gfx*, ocloc's names")
     targets = parser.parse_args(arguments).targets.split(",")
     problem = unpack_missing()
-    missing = [line for target in targets for line in check_compilers(target, problem)]
-    there = [target for target in targets if not check_compilers(target, problem)]
+    absent = [line for target in targets for line in missing(target, problem)]
+    there = [target for target in targets if not missing(target, problem)]
     builds = record()
     jobs = [(target, build, builds[build]) for target in there for build in sorted(builds)]
     with ThreadPoolExecutor(os.cpu_count()) as pool:
         wrong = [line for lines in pool.map(check, *zip(*jobs, strict=True)) for line in lines]
-    print(*wrong, *missing, sep="\n", file=sys.stderr)
+    print(*wrong, *absent, sep="\n", file=sys.stderr)
     print(f"{len(builds)} builds for {', '.join(there) or 'no target'}: {len(wrong)} complaints")
-    return 1 if wrong else 2 if missing else 0
+    return 1 if wrong else 2 if absent else 0
 
 
 if __name__ == "__main__":

@@ -16,7 +16,7 @@ import numpy as np
 
 from pp_cl.bench.timing import interleave
 from pp_cl.bench.unet import make_network
-from pp_cl.commands.options import add_widths
+from pp_cl.commands.options import add_widths, integer
 from pp_cl.device.discover import open_device
 from pp_cl.errors import UserError
 from pp_cl.files.atomic import write_json
@@ -25,6 +25,7 @@ from pp_cl.layers.tiles import tiles_find
 from pp_cl.render import Renderer
 from pp_cl.run import load_run
 from pp_cl.scene.target import Target
+from pp_cl.scene.views import evenly
 from pp_cl.training.loss import WHITE, Loss, gradient_tiles
 
 
@@ -43,7 +44,9 @@ class Comparison:
         self.loss = Loss(dev, self.config.train.ssim_weight, self.config.train.smooth_l1)
 
     def row(self, view, runs):
-        """A row of one view: size, computed fraction, times in ms, ratios, largest differences."""
+        """A row of one view: size, computed fraction, times in ms, ratios, largest differences,
+        over the dense result's largest value.
+        """
         camera = view.camera
         view_raster = self.renderer.rasterise(camera, self.config.raster.gamma[1])
         x = view_raster.features
@@ -58,19 +61,33 @@ class Comparison:
         chosen = plan()
         # of the image that has equal tiles: those of a dense one differ by rounding, of which the
         # SSIM's gradient makes a thousand times more
-        image = self.net.forward(x, False, chosen)
-        grad = self.loss.forward_backward(image, target, *view_raster.offset)
-        results = [self._results(x, grad, tiles) for tiles in (None, chosen)]
+        grad = self.loss.forward_backward(
+            self.net.forward(x, False, chosen), target, *view_raster.offset
+        )
+
+        def results(tiles):
+            image, grad_x = self.net.forward(x, True, tiles).get(), self.net.backward(grad).get()
+            return [image, grad_x, *[g.get() for g in self.net.gradients.values()]]
+
+        def runner(training, make_plan):
+            def run():
+                self.net.forward(x, training, make_plan())
+                if training:
+                    self.net.backward(grad)
+                self.dev.finish()
+
+            return run
+
         differences = [
-            float(np.abs(a - b).max() / np.abs(a).max()) for a, b in zip(*results, strict=True)
+            float(np.abs(a - b).max() / np.abs(a).max())
+            for a, b in zip(results(None), results(chosen), strict=True)
         ]
+        plans = {"dense": lambda: None, "sparse": plan}
         times = interleave(
             {
-                (direction, name): self._runner(
-                    x, grad if direction == "train" else None, make_plan
-                )
+                (direction, name): runner(direction == "train", make_plan)
                 for direction in ("forward", "train")
-                for name, make_plan in (("dense", None), ("sparse", plan))
+                for name, make_plan in plans.items()
             },
             runs,
         )
@@ -86,83 +103,39 @@ class Comparison:
             "grad_parameters_difference": max(differences[2:]),
         }
 
-    def _results(self, x, grad, plan):
-        image = self.net.forward(x, True, plan).get()
-        return [
-            image,
-            self.net.backward(grad).get(),
-            *[g.get() for g in self.net.gradients.values()],
-        ]
 
-    def _runner(self, x, grad, make_plan):
-        def run():
-            self.net.forward(x, grad is not None, make_plan() if make_plan else None)
-            if grad is not None:
-                self.net.backward(grad)
-            self.dev.finish()
-
-        return run
-
-
-def main(argv=None):
-    """Measure, print, write; returns the exit status. Differences: the largest over the dense
-    result's largest value.
-    """
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("run", metavar="RUN", help="the folder of a run")
-    parser.add_argument("--split", default="test", metavar="S", help="of the scene (test)")
-    parser.add_argument(
-        "--downscale", type=int, metavar="N", help="reduction of the photographs (the run's)"
-    )
+def main(argv: list[str] | None = None) -> int:
+    """Measure, print, write; returns the exit status."""
+    parser = argparse.ArgumentParser(description=__doc__.partition("\n\n")[0])
+    add, count = parser.add_argument, integer(1, 10_000)
+    add("run", metavar="RUN", help="the folder of a run")
+    add("--split", default="test", metavar="S", help="of the scene (test)")
+    add("--downscale", type=count, metavar="N", help="reduction of the photographs (the run's)")
     add_widths(parser, "another network of these widths, with random weights (the run's)")
-    parser.add_argument(
-        "--views", type=int, default=4, metavar="N", help="views, evenly spread (4)"
-    )
-    parser.add_argument("--runs", type=int, default=3, metavar="N", help="timed runs of each (3)")
-    parser.add_argument("--device", metavar="D", help="as `pp-cl devices` prints them")
-    parser.add_argument("--json", metavar="FILE", help="also write the result there")
+    add("--views", type=count, default=4, metavar="N", help="views, evenly spread (4)")
+    add("--runs", type=count, default=3, metavar="N", help="timed runs of each (3)")
+    add("--device", metavar="D", help="as `pp-cl devices` prints them")
+    add("--json", metavar="FILE", help="also write the result there")
     options = parser.parse_args(argv)
     try:
-        if min(options.views, options.runs, options.downscale or 1) < 1:
-            raise UserError("--views, --runs, --downscale: must be at least 1")
-        dev = open_device(options.device)
-        comparison = Comparison(
-            dev,
-            Path(options.run),
-            options.split,
-            downscale=options.downscale,
-            widths=options.widths,
-        )
-        number = min(options.views, len(comparison.views))
-        rows = []
-        for i in range(number):
-            rows.append(
-                comparison.row(comparison.views[len(comparison.views) * i // number], options.runs)
-            )
-            print(
-                "  ".join(
-                    f"{k} {v:.3g}" if isinstance(v, float) else f"{k} {v}"
-                    for k, v in rows[-1].items()
-                ),
-                flush=True,
-            )
+        dev, rows = open_device(options.device), []
+        given = {"downscale": options.downscale, "widths": options.widths}
+        comparison = Comparison(dev, Path(options.run), options.split, **given)
+        for view in evenly(comparison.views, options.views):
+            rows.append(comparison.row(view, options.runs))
+            told = (f"{k} {v:.3g}" if type(v) is float else f"{k} {v}" for k, v in rows[-1].items())
+            print("  ".join(told), flush=True)
         if options.json:
-            write_json(
-                options.json, {"device": dev.name, "platform": dev.info["platform"], "rows": rows}
-            )
+            about = {"device": dev.name, "platform": dev.info["platform"]}
+            write_json(options.json, about | {"rows": rows})
     except UserError as error:
         print(f"sparse_tiles: {error}", file=sys.stderr)
         return 2
-    mean = {
-        k: float(np.mean([row[k] for row in rows]))
-        for k in ("computed_fraction", "forward_ratio", "train_ratio")
-    }
+    names = ("computed_fraction", "forward_ratio", "train_ratio")
+    computed, forward, train = (float(np.mean([row[name] for row in rows])) for name in names)
     print(
-        f"{number} views: {mean['computed_fraction']:.0%} of the multiplications remain; forward"
-        f" {mean['forward_ratio']:.2f} times as fast as dense, with backward"
-        f" {mean['train_ratio']:.2f}"
+        f"{len(rows)} views: {computed:.0%} of the multiplications remain; forward {forward:.2f}"
+        f" times as fast as dense, with backward {train:.2f}"
     )
     return 0
 

@@ -13,7 +13,9 @@
 // ImageNet's mean and deviation, moved from [0, 1] to [-1, 1]: the constants of LPIPS
 #define SHIFT ((float3)(-0.030f, -0.088f, -0.188f))
 #define SCALE ((float3)(0.458f, 0.448f, 0.450f))
-#define ITEMS 64        // of a work-group
+#ifndef ITEMS
+#define ITEMS 64  // the most of a work-group
+#endif
 #define EPSILON 1e-10f  // LPIPS's own guard for pixels without features
 
 // One work-item per pixel of x: reads its colour in [0, 1], writes it scaled as the network was

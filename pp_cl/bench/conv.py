@@ -8,8 +8,7 @@ from collections.abc import Callable, Iterator
 
 import numpy as np
 
-from pp_cl.bench.peak import PeakFlops
-from pp_cl.bench.timing import errors, variant_rows
+from pp_cl.bench.timing import PeakFlops, errors, variant_rows
 from pp_cl.device.device import Device
 from pp_cl.layers.choice import VARIANTS, ConvolutionPolicy, device_class, offered
 from pp_cl.layers.conv import Direction, Work, pack_bias, pack_weights, unpack_weights

@@ -7,9 +7,9 @@ from collections.abc import Callable, Iterator
 from typing import Any
 
 from pp_cl import __version__
-from pp_cl.bench import raster, table
+from pp_cl.bench import raster, timing
 from pp_cl.bench.conv import bench_conv
-from pp_cl.bench.training import bench_demo
+from pp_cl.bench.training import bench_demo, training_lines
 from pp_cl.bench.unet import bench_unet
 from pp_cl.device.device import Device
 from pp_cl.layers.choice import ConvolutionPolicy
@@ -35,8 +35,8 @@ def bench_overview(
     """
     start, result = time.perf_counter(), {}
     for name, steps, factor, columns in (
-        ("conv", bench_conv(dev, CONV_SIZE, WIDTHS, policy), 1, table),
-        ("unet", network_steps(dev, policy), GROWTH, table),
+        ("conv", bench_conv(dev, CONV_SIZE, WIDTHS, policy), 1, timing),
+        ("unet", network_steps(dev, policy), GROWTH, timing),
         ("raster", raster_steps(dev), GROWTH, raster),
     ):
         tell(f"\n{name}, about {budget * SHARES[name]:.0f} s\n{columns.HEAD}")
@@ -49,7 +49,7 @@ def bench_overview(
         tell(raster.growth_line(fit))
     tell(f"\ntraining of the demo, about {budget * SHARES['training']:.0f} s")
     training = result["training"] = bench_demo(dev, budget * SHARES["training"] * TRAINED)
-    for line in table.training_lines(training):
+    for line in training_lines(training):
         tell(line)
     about = {
         "device": dev.name,

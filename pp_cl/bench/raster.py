@@ -17,9 +17,8 @@ from collections.abc import Iterator, Sequence
 
 import numpy as np
 
-from pp_cl.bench.peak import CopyBandwidth
 from pp_cl.bench.raster_scenes import SCENES
-from pp_cl.bench.timing import interleave
+from pp_cl.bench.timing import CopyBandwidth, interleave
 from pp_cl.device.device import Device
 
 BLENDS = ("alpha", "softmax")

@@ -1,4 +1,5 @@
-"""Times of runs in turn, rows of what was timed, and errors against float64.
+"""Times of runs in turn, rows of what was timed, errors against float64, and what the device can do
+at most: multiply-adds that never leave the registers, copies far larger than any cache.
 
 Times are wall clock, launches included: every run once a round, so that a machine that slows down
 slows all of them.
@@ -9,10 +10,19 @@ from collections.abc import Callable
 
 import numpy as np
 
-from pp_cl.bench.peak import PeakFlops
+from pp_cl.device.device import Device
+from pp_cl.layers.choice import device_class
+from pp_cl.layers.tiles import LANES
 
 # Rounds of a measurement: at least LEAST_ROUNDS, then until SECONDS are over or MOST_ROUNDS done.
 LEAST_ROUNDS, MOST_ROUNDS, SECONDS = 5, 50, 1.5
+
+# Of one run of PeakFlops: long against the 30 us of a launch, short enough to run between any two
+# others.
+PEAK_SECONDS = 0.02
+
+# Eight times what the caches of processors and GPUs hold: a copy inside a cache would be too fast.
+COPY_BYTES = 2**28
 
 
 def interleave(
@@ -52,6 +62,73 @@ def errors(actual: np.ndarray, expected: np.ndarray) -> tuple[float, float]:
     return float(np.linalg.norm(difference) / scale), float(np.abs(difference).max())
 
 
+class PeakFlops:
+    """A loop of multiply-adds in registers, long enough to be timed. flops: floating-point
+    operations of one run().
+    """
+
+    def __init__(self, dev: Device):
+        self.dev = dev
+        # A CPU core needs 2 units x 4 cycles of chains and has 32 vector registers. On a GPU the 16
+        # lanes of one chain are 16 chains already, and many work-items share a unit.
+        self.chains, per_unit, self.local = {"CPU": (16, 64, 1), "GPU": (2, 2048, 64)}[
+            device_class(dev)
+        ]
+        self.out = dev.empty((per_unit * dev.info["compute_units"], LANES))
+        self.rounds = 64
+        self.run()  # builds the kernel
+        while self._seconds() < PEAK_SECONDS:
+            self.rounds *= 2
+
+    @property
+    def flops(self) -> int:
+        """A multiply-add counts as two."""
+        return 2 * self.out.size * self.chains * self.rounds
+
+    def run(self, first: float = 0.0, factor: float = 0.5, term: float = 1.0) -> None:
+        """Run the loop and wait for it. The chains tend to term / (1 - factor): they neither
+        overflow nor vanish.
+        """
+        self.dev.program("bench/peak", CHAINS=self.chains).launch(
+            "peak",
+            len(self.out),
+            local=self.local,
+            n=len(self.out),
+            rounds=self.rounds,
+            first=first,
+            factor=factor,
+            term=term,
+            out=self.out,
+        )
+        self.dev.finish()
+
+    def _seconds(self):
+        start = time.perf_counter()
+        self.run()
+        return time.perf_counter() - start
+
+
+class CopyBandwidth:
+    """A copy of COPY_BYTES. bytes: moved by one run(), read and written."""
+
+    def __init__(self, dev: Device):
+        self.dev = dev
+        self.source = dev.zeros((COPY_BYTES // (4 * LANES), LANES))
+        self.target = dev.zeros(self.source.shape)
+        self.bytes = self.source.nbytes + self.target.nbytes
+
+    def run(self) -> None:
+        """Copy and wait for it."""
+        self.dev.program("bench/peak").launch(
+            "peak_copy",
+            len(self.source),
+            n=len(self.source),
+            source=self.source,
+            target=self.target,
+        )
+        self.dev.finish()
+
+
 def variant_rows(
     about: dict,
     runs: dict[str, Callable],
@@ -87,3 +164,22 @@ def variant_rows(
             }
         )
     return rows
+
+
+COLUMNS = "{:8} {:26} {:9} {:14} {:>9} {:>8} {:>5} {:>8} {:>8}".format
+HEAD = COLUMNS("layer", "shape", "direction", "variant", "ms", "GFLOP/s", "peak", "rel. L2", "max")
+
+
+def line(row: dict) -> str:
+    """A line of the printed table, of one of variant_rows()."""
+    return COLUMNS(
+        row["layer"],
+        "x".join(map(str, row["shape"])),
+        row["direction"],
+        row["variant"],
+        f"{row['ms']:.3f}",
+        f"{row['gflops']:.1f}",
+        f"{row['peak_share']:.0%}",
+        f"{row['rel_l2']:.1e}",
+        f"{row['max_err']:.1e}",
+    )

@@ -31,6 +31,7 @@ STEP = 2000  # whose learning rates bench_step takes; all SH degrees move
 WIDTHS = (16, 16, 16)  # of its network, which is updated, but not run
 VIEWS, ROUNDS = 3, 5  # of the scene, evenly spread; over them
 FORWARD = ("project", "pairs", "weights", "shade", "blend")
+STAGE = "{:16} {:>8} {:>8} {:>8} {:>8}".format
 
 
 def bench_demo(dev: Device, seconds: float) -> dict[str, Any]:
@@ -69,6 +70,20 @@ def bench_demo(dev: Device, seconds: float) -> dict[str, Any]:
         "step_ms": step_ms,
         "frame_ms": _frame(trainer, measured[0]),
     }
+
+
+def training_lines(training: dict[str, Any]) -> list[str]:
+    """The tables of bench_demo()."""
+    lines = ["{:>6} {:>9} {:>7}".format("step", "seconds", "PSNR")]
+    lines += [
+        f"{row['step']:6d} {row['seconds']:9.1f} {row['psnr']:7.2f}" for row in training["curve"]
+    ]
+    lines.append(STAGE("stage, ms", "step", "least", "most", "frame"))
+    for name, row in training["step_ms"].items():
+        frame = training["frame_ms"].get(name)
+        numbers = [f"{row[key]:.2f}" for key in ("ms", "least", "most")]
+        lines.append(STAGE(name, *numbers, f"{frame['ms']:.2f}" if frame else ""))
+    return lines
 
 
 def bench_step(

@@ -49,6 +49,9 @@ TRIED = {
 }
 
 
+COLUMNS = "{:7} {:20} {:9} {:68} {:>8}  {}".format
+
+
 @dataclass(frozen=True)
 class Case:
     """A convolution in one direction, as often as the network has it.
@@ -108,36 +111,31 @@ def tune_blocking(
     As in measure(), what seems faster than the shipped value must be so again.
     """
     choices = CHOICES[policy.device_class]
-    totals = time_blocking(dev, cases, choices, policy)
-    shipped = {name: choices[name][0] for name in totals}
-    best = {name: fastest(ms, shipped[name]) for name, ms in totals.items()}
-    pairs = {name: (shipped[name], value) for name, value in best.items() if value != shipped[name]}
-    for name, ms in time_blocking(dev, cases, pairs, policy).items():
+    totals = _time_blocking(dev, cases, choices, policy)
+    best = {name: fastest(ms, choices[name][0]) for name, ms in totals.items()}
+    pairs = {name: (choices[name][0], b) for name, b in best.items() if b != choices[name][0]}
+    for name, ms in _time_blocking(dev, cases, pairs, policy).items():
         totals[name] |= ms
-        best[name] = fastest(ms, shipped[name])
-    return {name: value for name, value in best.items() if value != shipped[name]}, totals
+        best[name] = fastest(ms, choices[name][0])
+    return {name: value for name, value in best.items() if value != choices[name][0]}, totals
 
 
-def time_blocking(
-    dev: Device, cases: list[Case], values: dict[str, tuple], policy: ConvolutionPolicy
-) -> dict[str, dict]:
+def _time_blocking(dev, cases, values, policy):
     """{field of Blocking: {value: total milliseconds over the training's 3x3 layers}}."""
     totals = {}
     for case in (c for c in cases if c.training and c.k == 3):
         used = [name for name in values if case.direction in TRIED[name][1]]
         conv = RandomConv(dev, case.k, BLOCKING_SIDE, case.sources, co=case.co) if used else None
-        for name in used:
-            variant = TRIED[name][0]
-            if variant in conv.variants:
-                runs = {
-                    value: conv.runner(
-                        variant, case.direction, _with_blocking(policy, {name: value})
-                    )
-                    for value in values[name]
-                }
-                total = totals.setdefault(name, dict.fromkeys(values[name], 0.0))
-                for value, ms in time_runs(runs).items():
-                    total[value] += case.count * ms
+        for name in (name for name in used if TRIED[name][0] in conv.variants):
+            runs = {
+                value: conv.runner(
+                    TRIED[name][0], case.direction, _with_blocking(policy, {name: value})
+                )
+                for value in values[name]
+            }
+            total = totals.setdefault(name, dict.fromkeys(values[name], 0.0))
+            for value, ms in time_runs(runs).items():
+                total[value] += case.count * ms
     return totals
 
 
@@ -177,17 +175,21 @@ def measure(
     }, shipped_ms
 
 
-def tune_layers(
-    dev: Device,
-    cases: list[Case],
-    shipped: ConvolutionPolicy,
-    tuned: ConvolutionPolicy,
-    *,
-    on_row: Callable[[Case, dict], None],
-) -> tuple[list[dict], list[float]]:
-    """(rows of all cases, their milliseconds as shipped). on_row: called with each case and its
-    row.
+def run_tune(
+    dev: Device, cases: list[Case], tolerance: float, tell: Callable[[str], None]
+) -> tuple[dict, list[float]]:
+    """(tuning of this device as layers/choice.py stores it, milliseconds of the cases as shipped).
+
+    tell: called with each line of the tables as soon as it is measured.
     """
+    shipped = make_policy(dev, tolerance)
+    blocking, times = tune_blocking(dev, cases, shipped)
+    for name, ms in times.items():
+        chosen = blocking.get(name, CHOICES[shipped.device_class][name][0])
+        values = [f"{_text(v)} {m:.2f}{' (taken)' * (v == chosen)}" for v, m in ms.items()]
+        tell(f"blocking of {name}, ms: {', '.join(values)}")
+    tell(COLUMNS("layer", "shape", "direction", "milliseconds", "rel. L2", "taken"))
+    tuned = _with_blocking(shipped, blocking)
     rows, shipped_ms, conv, layer = [], [], None, None
     for case in cases:
         if case.layer != layer:
@@ -196,29 +198,30 @@ def tune_layers(
         row, ms = measure(case, conv, shipped, tuned)
         rows.append(row)
         shipped_ms.append(ms)
-        on_row(case, row)
-    return rows, shipped_ms
-
-
-def run_tune(
-    dev: Device,
-    cases: list[Case],
-    tolerance: float,
-    *,
-    on_blocking: Callable[[dict, dict], None],
-    on_row: Callable[[Case, dict], None],
-) -> tuple[dict, list[float]]:
-    """(tuning of this device as layers/choice.py stores it, milliseconds of the cases as shipped).
-
-    on_blocking: called with the result of tune_blocking(); on_row: with each case and its row.
-    """
-    shipped = make_policy(dev, tolerance)
-    blocking, times = tune_blocking(dev, cases, shipped)
-    on_blocking(blocking, times)
-    tuned = _with_blocking(shipped, blocking)
-    rows, shipped_ms = tune_layers(dev, cases, shipped, tuned, on_row=on_row)
+        tell(_line(dev, tolerance, case, row))
     tuning = {"format": FORMAT, "device": device_key(dev), "tile_shapes": blocking, "rows": rows}
     return tuning, shipped_ms
+
+
+def _text(value):
+    """8/2/1x1x1 of 8, 2, (1, 1, 1)."""
+    parts = value if isinstance(value, tuple) else (value,)
+    return "/".join("x".join(map(str, p)) if isinstance(p, tuple) else str(p) for p in parts)
+
+
+def _line(dev, tolerance, case, row):
+    """The line of a row, with the variant that is taken within the tolerance."""
+    policy = make_policy(dev, tolerance, {"tile_shapes": {}, "rows": [row]})
+    times = ", ".join(f"{variant} {ms:.3f}" for variant, ms in row["ms"].items())
+    shape = "x".join(map(str, (case.side, case.side, row["ci"], row["co"], row["k"])))
+    try:
+        chosen = policy.choose(case.shape)
+    except UserError:  # no variant is exact enough
+        return COLUMNS(case.name, shape, row["direction"], times, "", "none")
+    shipped = shipped_order(policy.device_class, case.shape)[0]
+    taken = chosen if chosen == shipped else f"{chosen} instead of {shipped}"
+    error = f"{row['rel_l2'][chosen]:.1e}"
+    return COLUMNS(case.name, shape, row["direction"], times, error, taken)
 
 
 def check_cache() -> None:
@@ -238,6 +241,20 @@ def store(dev: Device, tuning: dict) -> Path:
     return tuning_file(dev)
 
 
+def merge(tuning: dict, earlier: dict) -> dict:
+    """The tuning, with the rows of an earlier one for other layers, if both were measured with the
+    same blocking.
+    """
+
+    def key(row):
+        return tuple(row[name] for name in ("direction", "k", "ci", "co", "pixels"))
+
+    if earlier["tile_shapes"] != tuning["tile_shapes"]:
+        return tuning
+    mine = {key(row) for row in tuning["rows"]}
+    return tuning | {"rows": tuning["rows"] + [r for r in earlier["rows"] if key(r) not in mine]}
+
+
 def total_times(
     cases: list[Case], rows: list[dict], shipped_ms: list[float], policy: ConvolutionPolicy
 ) -> dict[str, tuple[float, float]]:
@@ -245,30 +262,9 @@ def total_times(
     the convolutions. Raises UserError where no variant keeps the policy's tolerance.
     """
     found = {}
-    for training, what in ((True, "a training step"), (False, "a picture of the evaluation")):
-        some = [
-            (c, row, ms)
-            for c, row, ms in zip(cases, rows, shipped_ms, strict=True)
-            if c.training == training
-        ]
-        if some:
-            shipped = sum(c.count * ms for c, _, ms in some)
-            tuned = sum(c.count * row["ms"][policy.choose(c.shape)] for c, row, _ in some)
-            found[what] = shipped, tuned
+    for case, row, ms in zip(cases, rows, shipped_ms, strict=True):
+        what = "a training step" if case.training else "a picture of the evaluation"
+        shipped, tuned = found.get(what, (0.0, 0.0))
+        best = row["ms"][policy.choose(case.shape)]
+        found[what] = shipped + case.count * ms, tuned + case.count * best
     return found
-
-
-def merge(tuning: dict, earlier: dict) -> dict:
-    """The tuning, with the rows of an earlier one for other layers, if both were measured with the
-    same blocking.
-    """
-    if earlier["tile_shapes"] != tuning["tile_shapes"]:
-        return tuning
-    mine = {_key(row) for row in tuning["rows"]}
-    return tuning | {
-        "rows": tuning["rows"] + [row for row in earlier["rows"] if _key(row) not in mine]
-    }
-
-
-def _key(row):
-    return tuple(row[name] for name in ("direction", "k", "ci", "co", "pixels"))

@@ -10,8 +10,7 @@ from dataclasses import replace
 import numpy as np
 from pyopencl.array import Array
 
-from pp_cl.bench.peak import PeakFlops
-from pp_cl.bench.timing import errors, variant_rows
+from pp_cl.bench.timing import PeakFlops, errors, variant_rows
 from pp_cl.device.device import Device
 from pp_cl.layers.choice import AUTO, ConvolutionPolicy, offered
 from pp_cl.layers.conv import unpack_weights

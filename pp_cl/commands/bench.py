@@ -185,7 +185,7 @@ def _run_model(options):
 def _run_network(options):
     from pp_cl.bench.conv import bench_conv
     from pp_cl.bench.plots import figure_of, plot_time_and_error
-    from pp_cl.bench.table import HEAD, line
+    from pp_cl.bench.timing import HEAD, line
     from pp_cl.bench.unet import bench_unet
     from pp_cl.layers.choice import load_policy
 

@@ -2,10 +2,10 @@
 
 import argparse
 import time
+from functools import partial
 
 from pp_cl.commands import options as shared
 from pp_cl.config import assign, preset
-from pp_cl.errors import UserError
 from pp_cl.presets import IMAGE_SIZES, PRESETS
 
 UNREDUCED = 800  # pixels: side of the usual photographs where a preset takes them as they are
@@ -30,9 +30,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(options: argparse.Namespace) -> None:
     """Measure, print what is taken, store the tuning."""
     from pp_cl.bench import tune
-    from pp_cl.bench.table import TUNE_HEAD, blocking_line, tune_line
     from pp_cl.device.discover import open_device
-    from pp_cl.layers.choice import CHOICES, make_policy, shipped_order
+    from pp_cl.layers.choice import make_policy
     from pp_cl.network.layers import unet_layers
 
     config, training, size = _read_network(options)
@@ -44,32 +43,19 @@ def run(options: argparse.Namespace) -> None:
         f"{dev.name} [{dev.info['platform']}], widths {','.join(map(str, net.widths))}, "
         f"blocks {net.blocks}, training at {training}x{training}, evaluation at {size}x{size}"
     )
-    kind = make_policy(dev).device_class
-
-    def show_blocking(chosen, times):
-        shipped = {name: values[0] for name, values in CHOICES[kind].items()}
-        for name, ms in times.items():
-            print(blocking_line(name, ms, chosen.get(name, shipped[name])))
-        print(TUNE_HEAD, flush=True)
-
-    def show_row(case, row):
-        policy = make_policy(dev, tolerance, {"tile_shapes": {}, "rows": [row]})
-        try:
-            chosen = policy.choose(case.shape)
-        except UserError:
-            chosen = None
-        print(tune_line(case.name, row, chosen, shipped_order(kind, case.shape)[0]), flush=True)
-
     start = time.perf_counter()
     layers = unet_layers(net.widths, blocks=net.blocks, channels=net.channel_numbers)
     cases = tune.network_cases(layers, training, size)
-    tuning, shipped_ms = tune.run_tune(
-        dev, cases, tolerance, on_blocking=show_blocking, on_row=show_row
-    )
+    tuning, shipped_ms = tune.run_tune(dev, cases, tolerance, partial(print, flush=True))
     print(f"stored in {tune.store(dev, tuning)} ({time.perf_counter() - start:.0f} s)")
-    _print_gain(
-        tune.total_times(cases, tuning["rows"], shipped_ms, make_policy(dev, tolerance, tuning))
-    )
+    policy = make_policy(dev, tolerance, tuning)
+    for what, (shipped, tuned) in tune.total_times(
+        cases, tuning["rows"], shipped_ms, policy
+    ).items():
+        print(
+            f"convolutions of {what}: {shipped:.2f} ms as shipped, {tuned:.2f} ms as tuned, "
+            f"{shipped / tuned:.2f} times as fast"
+        )
 
 
 def _read_network(options):
@@ -80,12 +66,3 @@ def _read_network(options):
     if options.widths:
         assign(config, "network.widths", options.widths, "--widths")
     return config, size if options.size else config.train.crop or evaluated, size
-
-
-def _print_gain(times):
-    """What the tuning saves. times: {what: (milliseconds as shipped, as tuned)}."""
-    for what, (shipped, tuned) in times.items():
-        print(
-            f"convolutions of {what}: {shipped:.2f} ms as shipped, {tuned:.2f} ms as tuned, "
-            f"{shipped / tuned:.2f} times as fast"
-        )

@@ -12,7 +12,7 @@ from pp_cl.config import Config, assign, configure, load_config, preset
 from pp_cl.device.device import Device
 from pp_cl.errors import UserError
 from pp_cl.files.run_folder import MOST_METRICS, RunFolder
-from pp_cl.files.untrusted import read_json_text
+from pp_cl.files.untrusted import read_json_text, refusal
 from pp_cl.scene.agreement import Disagreement, disagreements
 from pp_cl.scene.camera_path import looked_at, up_of
 from pp_cl.scene.grid import Grid
@@ -119,23 +119,20 @@ def _metrics(folder):
     file = folder.metrics("test")
     if not file.exists():
         return {"metrics": None, "metrics_step": None}
+    again = f"run `pp-cl eval {folder}` again"
     try:
-        result = json.loads(read_json_text(file, MOST_METRICS))
+        text = read_json_text(file, MOST_METRICS)
+    except (OSError, ValueError) as error:
+        raise refusal(file, error, "metrics", again) from None
+    try:
+        result = json.loads(text)
         values = {name: float(value) for name, value in result["mean"].items()}
         step = result.get("step")
         if not all(map(math.isfinite, values.values())) or type(step) not in (int, type(None)):
             raise ValueError
         return {"metrics": values, "metrics_step": step}
-    except (
-        OSError,
-        ValueError,
-        KeyError,
-        TypeError,
-        AttributeError,
-        OverflowError,
-        RecursionError,
-    ):
-        raise UserError(f"{file}: holds no metrics; run `pp-cl eval {folder}` again") from None
+    except (ValueError, KeyError, TypeError, AttributeError, OverflowError, RecursionError):
+        raise UserError(f"{file}: holds no metrics; {again}") from None
 
 
 # --------------------------------------------------------------------------------------------------

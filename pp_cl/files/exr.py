@@ -81,7 +81,7 @@ def _straight(planes):
 def _header(path):
     """The header of a file of one part with pixels. Raises UserError."""
     if not Path(path).is_file():
-        raise UserError(f"{path}: no such image; copy it there")
+        raise UserError(f"{path}: no such file; copy it there")
     with _refused(path):
         parts = OpenEXR.File(str(path), header_only=True).parts
         headers = [part.header for part in parts]

@@ -100,7 +100,9 @@ def vgg_layers(widths: tuple[int, ...] = WIDTHS) -> list[VggConv]:
 
 def lpips_program(dev: Device) -> Program:
     """The Program of cl/metrics/lpips.cl in the device's form."""
-    return dev.program("metrics/lpips", LANES=lanes(dev), GROUP=row_parts(dev))
+    members = row_parts(dev)
+    items = group_ranges(dev, 1, members)[1] or 1
+    return dev.program("metrics/lpips", LANES=lanes(dev), GROUP=members, ITEMS=items)
 
 
 class Lpips:

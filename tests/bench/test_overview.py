@@ -4,7 +4,7 @@ import time
 
 import pytest
 
-from pp_cl.bench import overview, raster, table
+from pp_cl.bench import overview, raster, timing
 from pp_cl.bench.overview import bench_overview, raster_steps, within
 from pp_cl.layers.choice import make_policy
 
@@ -56,5 +56,5 @@ def test_the_least_of_everything(dev, monkeypatch):
     assert {row["shape"][0] for row in found["unet"]} == {16}
     assert {(row["points"] > 9000, row["size"]) for row in found["raster"]} == {(True, 200)}
     assert found["training"]["seconds"] < 1e-3
-    printed = [*map(table.line, found["conv"] + found["unet"]), *map(raster.line, found["raster"])]
+    printed = [*map(timing.line, found["conv"] + found["unet"]), *map(raster.line, found["raster"])]
     assert set(printed) < set(told) and "21.25" in " ".join(told)

@@ -2,8 +2,7 @@
 
 import numpy as np
 
-from pp_cl.files.contact_sheet import GAP, HEADER, comparison, contact_sheet, write_comparison
-from pp_cl.files.image import read_rgba
+from pp_cl.files.contact_sheet import GAP, HEADER, comparison, contact_sheet
 
 
 def tile(picture, row, column, height, width):
@@ -33,12 +32,6 @@ def test_tiles_stand_in_their_places(rng):
         tile(picture, 1, 2, 30, 40)[:5] == 0
     ).all()
     assert (picture[:HEADER] < 128).any(), "no captions"
-
-
-def test_picture_is_written(tmp_path):
-    image = np.full((16, 16, 3), 0.5)
-    write_comparison(tmp_path / "preview.png", [image], [image])
-    assert (read_rgba(tmp_path / "preview.png")[..., :3] == comparison([image], [image])).all()
 
 
 def test_photographs_stand_row_by_row_under_their_names(rng):

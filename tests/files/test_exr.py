@@ -1,15 +1,12 @@
 """OpenEXR files hold the values that went in, and are read as photographs."""
 
-import json
 import shutil
 
 import numpy as np
 import OpenEXR
 import pytest
-from support.runs import arguments
 from support.scenes import write_ball_scene
 
-from pp_cl.cli import main
 from pp_cl.errors import UserError
 from pp_cl.files.exr import write_exr
 from pp_cl.files.image import image_size, read_rgba
@@ -43,12 +40,6 @@ def test_all_channels_come_back(shown, tmp_path):
     np.testing.assert_array_equal(there["mean.Z"].pixels, shown.depth)
     np.testing.assert_array_equal(there["feature.03"].pixels, shown.features[..., 3])
     assert np.isinf(there["Z"].pixels[0, 0]) and there["R"].pixels[0, 0] == 0
-
-
-def test_a_broken_file_is_one_line(tmp_path):
-    (tmp_path / "a.exr").write_bytes(b"no image")
-    with pytest.raises(UserError, match="a.exr: cannot be read as OpenEXR"):
-        read_rgba(tmp_path / "a.exr")
 
 
 def test_a_place_that_cannot_be_written_is_one_line(shown, tmp_path):
@@ -202,19 +193,11 @@ def test_a_size_beyond_all_memory(tmp_path, monkeypatch):
             read(tmp_path / "a.exr")
 
 
-def test_a_missing_file(tmp_path):
-    for read in (read_rgba, image_size):
-        with pytest.raises(UserError, match="no such image"):
-            read(tmp_path / "a.exr")
-
-
 # --------------------------------------------------------------------------------------------------
 
 
 def test_a_scene_of_exr_images_is_the_scene_of_their_png_twins(tmp_path):
-    """Linear, premultiplied EXR in place of each PNG: the same photographs within a level, and a
-    training that sees the same.
-    """
+    """Linear, premultiplied EXR in place of each PNG: the same photographs within a level."""
     write_ball_scene(tmp_path / "png", views=6, size=40)
     shutil.copytree(tmp_path / "png", tmp_path / "exr")
     for file in (tmp_path / "exr").rglob("*.png"):
@@ -225,14 +208,8 @@ def test_a_scene_of_exr_images_is_the_scene_of_their_png_twins(tmp_path):
         channels = {name: np.ascontiguousarray(planes[..., i]) for i, name in enumerate("RGBA")}
         write_exr(file.with_suffix(".exr"), channels)
         file.unlink()
-    psnr = {}
-    for kind in ("png", "exr"):
-        scene, run = str(tmp_path / kind), str(tmp_path / f"{kind}_run")
-        assert main(arguments(scene, run, 1)) == 0 and main(["eval", run]) == 0
-        psnr[kind] = json.loads((tmp_path / f"{kind}_run/eval/metrics.json").read_text())["mean"]
     views = [load_scene(tmp_path / kind).splits["train"] for kind in ("png", "exr")]
     for a, b in zip(*views, strict=True):
         opaque = a.image[..., 3] == 255
         assert np.abs(a.image[opaque].astype(int) - b.image[opaque]).max() <= 1
         assert (a.image[..., 3] == b.image[..., 3]).all()
-    assert psnr["png"]["psnr"] == pytest.approx(psnr["exr"]["psnr"], abs=0.3)

@@ -117,12 +117,6 @@ def test_a_full_disk_is_one_line_that_names_the_log(folder):
         assert rows(folder) == ROWS[:2]
 
 
-def test_a_row_never_holds_nan(folder):
-    with folder.open_log(10) as log, pytest.raises(ValueError, match="not JSON compliant"):
-        log.write({"step": 15, "seconds": 1.5, "loss": float("nan")})
-    assert rows(folder) == ROWS[:2]
-
-
 def test_leftovers_are_removed_from_the_folder_and_the_previews(tmp_path):
     folder = RunFolder(tmp_path / "run")
     folder.previews.mkdir(parents=True)
@@ -130,12 +124,6 @@ def test_leftovers_are_removed_from_the_folder_and_the_previews(tmp_path):
         (place / ".step.png.999999999.tmp").write_bytes(b"half")
     folder.create("{}")
     assert [p.name for p in folder.path.rglob("*") if p.is_file()] == ["config.json"]
-
-
-def test_the_test_split_is_evaluated_into_eval_itself(tmp_path):
-    folder = RunFolder(tmp_path)
-    assert folder.evaluation("test") == tmp_path / "eval"
-    assert folder.evaluation("train") == tmp_path / "eval" / "train"
 
 
 def test_a_start_that_fails_early_leaves_a_folder_of_a_run_or_an_empty_one(tmp_path, monkeypatch):

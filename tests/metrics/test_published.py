@@ -7,7 +7,6 @@ import pytest
 
 from pp_cl.metrics.published import CO3D_SEQUENCES, METRICS, differences, published_rows, tables
 from pp_cl.scene.camera import Camera
-from pp_cl.scene.load import load_scene
 
 OURS = {"psnr": 33.00, "ssim": 0.975, "lpips": 0.026}
 PRINTED = {"psnr": 0.0051, "ssim": 0.00051, "lpips": 0.00051}  # half a unit of the last digit
@@ -76,10 +75,3 @@ def test_what_differs_is_said():
     assert differences("34_1479_4753", cameras(), 1) == ""
     assert differences("34_1479_4753", cameras(), 1, "train") == "here: split train"
     assert differences("34_1479_4753", cameras(), 2) == "here: images reduced 2 times"
-
-
-def test_the_real_scenes(data):
-    for folder, count in (("nerf_synthetic/lego", 20), ("ethiopian_head", 0)):
-        scene = load_scene(data / folder, ("test",))
-        stored = [view.stored_camera for view in scene.splits["test"]]
-        assert len(published_rows(scene.name, stored)) == count

@@ -78,29 +78,6 @@ def test_a_sphere_has_the_vertices_whose_cubes_it_cuts(dev):
     assert found.recall > 0.998 and found.precision > 0.995
 
 
-@pytest.mark.parametrize("size", AWKWARD_SIZES)
-def test_a_flat_square_has_one_layer(dev, size):
-    """Vertices at multiples of the edge on it: all of them, and none beside it."""
-    edge = 1 / size
-    surface = sample_surface(dev, SQUARE, Grid((0.0, 0, -edge), edge, (1, 1, 3)), 400_000)
-    assert surface.grid.dims == (size + 1, size + 1, 3)
-    found = members(surface)
-    assert not found[0].any() and not found[2].any()
-    assert found[1].mean() > 0.95
-
-
-def test_a_box_has_every_vertex_of_its_sides(dev):
-    """Sides at 0.39, 0.29 and 0.19 are nearest to the layers at 0.35, 0.25 and 0.15."""
-    box = trimesh.creation.box((0.78, 0.58, 0.38))
-    grid = Grid((-0.45, -0.35, -0.25), 0.1, (10, 8, 6))
-    surface = sample_surface(dev, Mesh(box.vertices, box.faces), grid, 200_000)
-    expected = np.zeros((6, 8, 10), bool)
-    expected[1:5, 1:7, 1:9] = True
-    expected[2:4, 2:6, 2:8] = False
-    np.testing.assert_array_equal(members(surface), expected)
-    assert surface.count == 8 * 6 * 4 - 6 * 4 * 2
-
-
 def test_launches_add_up(dev, monkeypatch):
     told = []
     one = sample_surface(dev, SQUARE, Grid((0.0, 0, 0), 0.03, (2, 2, 2)), 5000)
@@ -154,15 +131,9 @@ def test_meshes_are_read(tmp_path, suffix):
     np.testing.assert_allclose(np.ptp(mesh.vertices, axis=0), (1, 2, 3))
 
 
-def test_real_meshes_are_read(data):
-    mesh = read_mesh(data / "meshes" / "cow" / "cow.obj")
-    assert mesh.faces.shape[1] == 3 and np.isfinite(mesh.vertices).all()
-
-
 NAN_VERTEX = "OFF\n3 1 0\n0 0 nan\n1 0 0\n0 1 0\n3 0 1 2\n"
 BAD_FILES = {
     "empty": ("mesh.ply", b"", "cannot be read|no triangles"),
-    "no mesh": ("mesh.obj", b"hello", "no triangles|cannot be read"),
     "points only": ("mesh.off", b"OFF\n1 0 0\n0 0 0\n", "no triangles|cannot be read"),
     "NaN": ("mesh.off", NAN_VERTEX.encode(), "NaN"),
     "a face beyond": (
@@ -176,19 +147,15 @@ BAD_FILES = {
         "no triangles|cannot be read",
     ),
     "unknown kind": ("mesh.xyz1", b"1 2 3", "cannot be read"),
-    "truncated": ("mesh.stl", b"\0" * 90, "cannot be read|no triangles"),
+    "missing": ("mesh.stl", None, "no such file"),
 }
 
 
 @pytest.mark.parametrize("case", BAD_FILES)
 def test_a_bad_mesh_is_one_line(tmp_path, case):
     name, content, words = BAD_FILES[case]
-    (tmp_path / name).write_bytes(content)
+    if content is not None:
+        (tmp_path / name).write_bytes(content)
     with pytest.raises(UserError, match=words) as caught:
         read_mesh(tmp_path / name)
     assert str(tmp_path / name) in str(caught.value) and "\n" not in str(caught.value)
-
-
-def test_a_missing_mesh(tmp_path):
-    with pytest.raises(UserError, match="no such file"):
-        read_mesh(tmp_path / "mesh.ply")

@@ -13,7 +13,6 @@ from pp_cl.facts.info import describe_scene, picture
 from pp_cl.files.image import read_rgba, write_png
 from pp_cl.scene.agreement import disagreements
 from pp_cl.scene.hull import build_grid
-from pp_cl.scene.load import load_scene
 from pp_cl.scene.outline import REJECTED
 
 BOX = np.stack([CENTRE - RADIUS, CENTRE + RADIUS])
@@ -63,12 +62,6 @@ def test_without_masks_nothing_disagrees():
     views = ball_views(12)
     views[0] = replace(views[0], image=np.full_like(views[0].image, 255))
     assert disagreements(views, BOX) == []
-
-
-def test_real_scenes_have_none(dev, data):
-    for name in ("nerf_synthetic/lego", "ethiopian_head"):
-        views = load_scene(data / name).splits["train"]
-        assert disagreements(views, build_grid(dev, views, 20_000).grid.box) == []
 
 
 @pytest.fixture

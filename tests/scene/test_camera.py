@@ -46,12 +46,6 @@ def test_look_at_centres_the_target_and_points_up(rng):
         assert above[1] < 15 and above[0] == pytest.approx(20, abs=1e-6)
 
 
-def test_look_at_has_square_pixels_and_z_up_unless_told():
-    camera = Camera.look_at([3.0, 0, 0], [0, 0, 0], fx=50.0, width=40, height=30)
-    assert (camera.fx, camera.fy, camera.cx, camera.cy) == (50, 50, 20, 15)
-    np.testing.assert_array_equal(camera.pose[:, 1], [0, 0, -1])
-
-
 def test_crop_shift_and_downscale_move_pixels_as_they_say(rng):
     camera = make_camera(rng)
     points = points_in_front(camera, rng)

@@ -11,7 +11,7 @@ from pp_cl.scene.camera import Camera
 from pp_cl.scene.distortion import Distortion
 from pp_cl.scene.load import load_scene, reading, scene_frames
 from pp_cl.scene.masks import MaskRule
-from pp_cl.scene.views import Photograph, evenly
+from pp_cl.scene.views import Photograph
 from tools.scene_formats import nerfstudio
 
 
@@ -51,12 +51,6 @@ def test_some_views_of_a_split_are_read_and_no_others(tmp_path):
     (tmp_path / names[1]).write_bytes((tmp_path / names[1]).read_bytes()[:-200])
     few = load_scene(tmp_path, most=1).splits["train"]
     assert [view.name for view in few] == names[:1]
-
-
-def test_evenly_takes_the_first_and_the_same_steps():
-    assert evenly(range(8), 4) == [0, 2, 4, 6]
-    assert evenly(range(5), 4) == [0, 1, 2, 3] and evenly(range(3), 4) == [0, 1, 2]
-    assert evenly(range(3), None) == [0, 1, 2]
 
 
 @pytest.mark.parametrize(
@@ -126,18 +120,6 @@ def test_lego(data):
         )
         assert np.linalg.norm(view.camera.eye) == pytest.approx(4.031, abs=1e-2)
         assert alpha_at(view, [0, 0, 0.3]) == 255
-
-
-def test_ethiopian_head(data):
-    """An object away from the origin: its centre is seen in every photograph."""
-    scene = load_scene(data / "ethiopian_head", ("train", "test"))
-    assert [len(v) for v in scene.splits.values()] == [57, 9]
-    for view in scene.splits["train"] + scene.splits["test"]:
-        assert alpha_at(view, [-0.521, 1.297, 1.718]) > 250
-        near, far = view.depth_range
-        assert 3.3 < near < 3.7 and 3.9 < far < 5.1
-        x0, y0, x1, y1 = view.reduced(2).object_bounds(0)
-        assert 40 < x1 - x0 < 200 and 40 < y1 - y0 <= 200
 
 
 def alpha_at(view, point):

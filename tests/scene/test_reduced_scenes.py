@@ -10,7 +10,6 @@ from support.scenes import write_ball_scene
 from pp_cl.config import preset
 from pp_cl.errors import UserError
 from pp_cl.files.image import read_rgba
-from pp_cl.scene.hull import build_grid
 from pp_cl.scene.identity import difference, fingerprint, identity
 from pp_cl.scene.load import load_scene, open_scene, scene_frames
 from pp_cl.scene.target import Target
@@ -114,14 +113,6 @@ def test_targets_of_a_large_scene_are_within_its_rounding(dev, scene, monkeypatc
         error = np.abs(images[0] - images[1])
         # alpha and colour are rounded by half a level each
         assert error.max() <= 1 / 255 and error.mean() < 0.2 / 255
-
-
-def test_the_hull_of_a_large_scene_is_nearly_the_same(dev, scene, monkeypatch):
-    whole = opened(dev, scene, 2)
-    large(monkeypatch)
-    hulls = [build_grid(dev, views, 20_000) for views in (whole, opened(dev, scene, 2))]
-    edges = [hull.grid.edge for hull in hulls]
-    assert edges[1] == pytest.approx(edges[0], rel=0.05)
 
 
 def test_pixels_stay_as_stored_where_nothing_is_reduced(dev, scene, monkeypatch):

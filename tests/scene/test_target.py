@@ -8,7 +8,6 @@ from support.guarded import AWKWARD_SIZES
 
 from pp_cl.reference import target as oracle
 from pp_cl.scene.camera import Camera
-from pp_cl.scene.load import load_scene
 from pp_cl.scene.target import Target
 from pp_cl.scene.views import View
 
@@ -119,14 +118,6 @@ def test_loading_another_view_replaces_the_first(dev, rng):
         assert np.abs(target.crop((0, 0, 20, 20)).get() - expected).max() < TOLERANCE
 
 
-def test_two_crops_stand_side_by_side(dev, rng):
-    target = Target(dev)
-    target.load(random_view(rng, 40, 40).reduced(2))
-    first, second = target.crop((0, 0, 8, 8)).get(), target.crop((5, 5, 8, 8)).get()
-    assert not np.array_equal(first, second)
-    assert np.array_equal(first[5:, 5:], second[:3, :3])
-
-
 def test_another_reduction_of_the_view_that_is_loaded(dev, rng):
     view, target = random_view(rng, 48, 48), Target(dev)
     for downscale in (1, 3, 2):
@@ -134,9 +125,3 @@ def test_another_reduction_of_the_view_that_is_loaded(dev, rng):
         side = 48 // downscale
         expected = oracle.target_forward(view.image, downscale, 0, 0, width=side, height=side)
         assert np.abs(target.whole() - expected).max() < TOLERANCE
-
-
-def test_real_view(dev, data):
-    view = load_scene(data / "ethiopian_head", ("test",)).splits["test"][0]
-    check(dev, view, 2, (0, 0, 200, 200), (0, 0))
-    check(dev, view, 4, (20, 30, 64, 64), (3, 1))

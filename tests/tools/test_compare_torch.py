@@ -2,10 +2,8 @@
 promises.
 """
 
-import importlib.util
 import json
 import sys
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -13,12 +11,7 @@ from support.comparisons import relative_error
 
 from pp_cl.bench.unet import make_network, plain_parameters
 from pp_cl.layers.choice import AUTO, VARIANTS, make_policy
-
-SPEC = importlib.util.spec_from_file_location(
-    "compare_torch", Path(__file__).parents[2] / "tools" / "compare_torch.py"
-)
-TOOL = importlib.util.module_from_spec(SPEC)
-SPEC.loader.exec_module(TOOL)
+from tools.compare_torch import TorchNetwork, main
 
 
 @pytest.fixture
@@ -36,7 +29,7 @@ def test_the_twin_is_the_same_network(torch, dev, rng, variant):
         rng.normal(size=(16, 16, 16)).astype(np.float32),
         rng.normal(size=(16, 16, 3)).astype(np.float32),
     )
-    twin = TOOL.TorchNetwork(torch, net, torch.float64)
+    twin = TorchNetwork(torch, net, torch.float64)
     image = net.forward(dev.upload(x)).get()
     actual = {"x": net.backward(dev.upload(grad_image)).get()} | plain_parameters(
         net, net.gradients
@@ -51,23 +44,8 @@ def test_the_twin_is_the_same_network(torch, dev, rng, variant):
 
 def test_the_file(torch, tmp_path, capsys):
     file = tmp_path / "t.json"
-    assert (
-        TOOL.main(
-            [
-                "--widths",
-                "16,16,16",
-                "--size",
-                "8",
-                "--runs",
-                "3",
-                "--threads",
-                "1",
-                "--json",
-                str(file),
-            ]
-        )
-        == 0
-    )
+    words = ["--widths", "16,16,16", "--size", "8", "--runs", "3", "--threads", "1", "--json"]
+    assert main([*words, str(file)]) == 0
     result = json.loads(file.read_text())
     assert 0 < result["rel_l2"] < 1e-5 and result["threads"] == 1
     for direction in ("forward", "train"):
@@ -78,8 +56,9 @@ def test_the_file(torch, tmp_path, capsys):
 
 def test_without_torch_it_says_so(monkeypatch, capsys):
     monkeypatch.setitem(sys.modules, "torch", None)
-    assert TOOL.main(["--size", "8"]) == 2
+    assert main(["--size", "8"]) == 2
     assert "pip install torch==2.13.0" in capsys.readouterr().err
-    with pytest.raises(SystemExit):
-        TOOL.main(["--size", "9"])
-    assert TOOL.main(["--runs", "0"]) == 2
+    for words in (["--size", "9"], ["--runs", "0"]):
+        with pytest.raises(SystemExit):
+            main(words)
+        assert words[0] in capsys.readouterr().err

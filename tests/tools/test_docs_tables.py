@@ -1,16 +1,14 @@
 """tools/docs_tables.py: the documents hold the tables that it writes."""
 
-import importlib.util
 import json
 import re
 from pathlib import Path
 
 import pytest
 
+from tools import docs_tables as TOOL
+
 ROOT = Path(__file__).parents[2]
-SPEC = importlib.util.spec_from_file_location("docs_tables", ROOT / "tools" / "docs_tables.py")
-TOOL = importlib.util.module_from_spec(SPEC)
-SPEC.loader.exec_module(TOOL)
 
 RESULTS = {
     "measured": "times",

@@ -7,7 +7,7 @@ from pp_cl.device.device import Device, kernel_folder
 from pp_cl.device.discover import open_device
 from pp_cl.device.signature import parse_signatures
 from tools import gpu_check
-from tools.gpu_check import TARGETS, Build, check, check_compilers, complaints, main
+from tools.gpu_check import TARGETS, Build, check, complaints, main, missing
 
 CPU_FILES = {"layers/winograd", "layers/winograd_backward_weights", "layers/winograd_transform"}
 PTXAS = """ptxas info    : Compiling entry function 'one' for 'sm_90'
@@ -57,7 +57,7 @@ def test_what_is_too_much_is_read(text):
 @pytest.fixture(params=TARGETS)
 def target(request, tmp_path, monkeypatch):
     """Each target whose compilers are here; the kernels are those in tmp_path."""
-    for problem in check_compilers(request.param, ""):
+    for problem in missing(request.param, ""):
         pytest.skip(f"{problem}; make gpu-check fetches what it can")
     monkeypatch.setattr(gpu_check, "kernel_folder", lambda: tmp_path)
     return request.param
@@ -82,7 +82,7 @@ def test_what_compilers_say(target, tmp_path, text, macros, found):
 
 
 def test_a_missing_compiler_is_named_and_the_rest_checked(monkeypatch, capsys):
-    monkeypatch.setattr(gpu_check, "find", _nothing_but_ocloc)
+    monkeypatch.setattr(gpu_check, "find", lambda name: name if name == "ocloc" else None)
     monkeypatch.setattr(gpu_check, "unpack_missing", lambda: "no apt-get here")
     monkeypatch.setattr(gpu_check, "record", lambda: {Build("a", ()): {"one"}})
     monkeypatch.setattr(gpu_check, "compile_build", lambda *_: "")
@@ -94,12 +94,6 @@ def test_a_missing_compiler_is_named_and_the_rest_checked(monkeypatch, capsys):
     assert main(["--targets", "dg2"]) == 1
     monkeypatch.setattr(gpu_check, "record", lambda: {Build("a", ()): {"other"}})
     assert main(["--targets", "dg2"]) == 0
-
-
-def _nothing_but_ocloc(name):
-    if name != "ocloc":
-        raise gpu_check.CompilerMissing(f"{name} is missing")
-    return name
 
 
 def test_what_is_built_and_launched_is_recorded():

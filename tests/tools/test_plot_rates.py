@@ -1,20 +1,13 @@
 """tools/plot_rates.py: the curves are the published schedule; the picture needs matplotlib."""
 
-import importlib.util
 import sys
-from pathlib import Path
 
 import numpy as np
 import pytest
 
 from pp_cl.config import assign, preset
 from pp_cl.presets import PRESETS
-
-SPEC = importlib.util.spec_from_file_location(
-    "plot_rates", Path(__file__).parents[2] / "tools" / "plot_rates.py"
-)
-TOOL = importlib.util.module_from_spec(SPEC)
-SPEC.loader.exec_module(TOOL)
+from tools import plot_rates as TOOL
 
 # of degrees 0, 1, 2, worked out by hand
 PUBLISHED = {

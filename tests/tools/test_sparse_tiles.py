@@ -1,19 +1,13 @@
 """tools/sparse_tiles.py: the rows it prints are measurements of the run, and bad input is told."""
 
-import importlib.util
 import json
-from pathlib import Path
 
 import pytest
+from support.runs import arguments
 from support.scenes import write_ball_scene
 
-from pp_cl.cli import main
-
-SPEC = importlib.util.spec_from_file_location(
-    "sparse_tiles", Path(__file__).parents[2] / "tools" / "sparse_tiles.py"
-)
-TOOL = importlib.util.module_from_spec(SPEC)
-SPEC.loader.exec_module(TOOL)
+from pp_cl.cli import main as pp_cl
+from tools.sparse_tiles import main
 
 
 @pytest.fixture(scope="module")
@@ -21,33 +15,14 @@ def run(tmp_path_factory):
     """A run of a few steps on a ball in large pictures."""
     folder = tmp_path_factory.mktemp("sparse_tiles")
     scene = write_ball_scene(folder / "ball", size=300)
-    assert (
-        main(
-            [
-                "train",
-                scene,
-                "--out",
-                str(folder / "run"),
-                "--points",
-                "1500",
-                "--iterations",
-                "2",
-                "--downscale",
-                "1",
-                "--set",
-                "train.crop=28",
-                "--set",
-                "network.widths=16,16,16",
-            ]
-        )
-        == 0
-    )
+    changes = {"points__count": 1500, "train__iterations": 2, "train__crop": 28}
+    assert pp_cl(arguments(scene, folder / "run", 1, network__widths="16,16,16", **changes)) == 0
     return folder / "run"
 
 
 def test_rows(run, tmp_path, capsys):
     file = tmp_path / "a.json"
-    assert TOOL.main([str(run), "--views", "2", "--runs", "1", "--json", str(file)]) == 0
+    assert main([str(run), "--views", "2", "--runs", "1", "--json", str(file)]) == 0
     rows = json.loads(file.read_text())["rows"]
     assert len(rows) == 2
     for row in rows:
@@ -60,22 +35,17 @@ def test_rows(run, tmp_path, capsys):
         assert row["grad_features_difference"] < 1e-5
         assert row["grad_parameters_difference"] < 5e-6
     assert "of the multiplications remain" in capsys.readouterr().out
-    assert (
-        TOOL.main(
-            [str(run), "--views", "1", "--runs", "1", "--downscale", "2", "--widths", "16,16,32"]
-        )
-        == 0
-    )
+    words = ["--views", "1", "--runs", "1", "--downscale", "2", "--widths", "16,16,32"]
+    assert main([str(run), *words]) == 0
 
 
-def test_bad_input(run, capsys):
-    assert TOOL.main([str(run), "--views", "0"]) == 2
-    assert "--views" in capsys.readouterr().err
+@pytest.mark.parametrize("words", [["--views", "0"], ["--widths", "3"]])
+def test_bad_input(tmp_path, capsys, words):
     with pytest.raises(SystemExit):
-        TOOL.main([str(run), "--widths", "3"])
-    assert "--widths" in capsys.readouterr().err
+        main([str(tmp_path), *words])
+    assert words[0] in capsys.readouterr().err
 
 
 def test_a_missing_run(tmp_path, capsys):
-    assert TOOL.main([str(tmp_path)]) == 2
+    assert main([str(tmp_path)]) == 2
     assert str(tmp_path) in capsys.readouterr().err

@@ -1,7 +1,6 @@
 """What is opened, and what is said of what cannot be read."""
 
 import errno
-import json
 import os
 from zipfile import BadZipFile
 
@@ -19,18 +18,6 @@ def test_a_file_of_at_most_so_many_bytes(tmp_path):
         read_regular(file, 8)
     with opened_regular(file) as opened:
         assert opened.read(3) == b"\xef\xbb\xbf" and opened.seek(0) == 0
-
-
-def test_a_text_of_another_encoding(tmp_path):
-    (tmp_path / "a.txt").write_bytes("gr\u00fc\u00df".encode("latin-1"))
-    with pytest.raises(ValueError, match="utf-8"):
-        read_regular(tmp_path / "a.txt", 100)
-
-
-def test_a_link_is_followed(tmp_path):
-    (tmp_path / "a.txt").write_text("a")
-    (tmp_path / "b.txt").symlink_to("a.txt")
-    assert read_regular(tmp_path / "b.txt", 1) == "a"
 
 
 def test_what_is_no_file_is_not_waited_for(tmp_path):
@@ -57,8 +44,3 @@ def test_the_mend_fits_the_reason():
     assert said.startswith("a.npz: cannot be read as arrays (two lines xxx")
     assert said.endswith("...); write it anew") and len(said) < MOST_REASON + 60
     assert "(EOFError)" in str(refusal("a", EOFError(), "JSON"))
-
-
-def test_a_json_may_be_read_so(tmp_path):
-    (tmp_path / "a.json").write_text('{"a": [1, 2]}')
-    assert json.loads(read_regular(tmp_path / "a.json", 2**10)) == {"a": [1, 2]}
