@@ -25,7 +25,7 @@ from pp_cl.scene.load import (
     scene_frames,
     scene_splits,
 )
-from pp_cl.scene.outline import SHOWN_VIEWS, Points, picture
+from pp_cl.scene.outline import SHOWN_VIEWS, picture
 from pp_cl.scene.views import MASK_THRESHOLD, Photograph, View
 from pp_cl.training.stored import opened_run
 
@@ -81,7 +81,8 @@ def run_picture(dev: Device, folder: RunFolder, scene: str | None = None) -> np.
     """
     config = _config(folder, scene)
     with opened_run(folder, config) as stored:
-        points = Points(Grid.of_header(stored.header["grid"]), stored.array("points.ids"))
+        grid = Grid.of_header(stored.header["grid"])
+        points = Hull(grid, stored.array("points.ids"), capped=False)
     return picture(dev, open_scene(dev, config, ("train",), SHOWN_VIEWS).splits["train"], points)
 
 

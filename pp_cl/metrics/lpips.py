@@ -26,6 +26,8 @@ from pp_cl.metrics.lpips_weights import load_weights
 BLOCKS = (2, 2, 3, 3, 3)
 WIDTHS = (64, 128, 256, 512, 512)  # channels of the blocks
 LEAST_SIZE = 16  # pixels: four poolings leave one
+# in which convolutions are computed, and the source whose gradient is asked for
+DIRECTIONS = ((Direction.FORWARD, None), (Direction.BACKWARD_INPUT, 0))
 
 Size = tuple[int, int]  # (height, width)
 Place = Callable[[str, tuple[int, ...]], Array]
@@ -47,38 +49,6 @@ class VggConv:
         """As conv.pack_weights makes it."""
         return -(-self.co // LANES), 3, 3, self.ci, LANES
 
-    def choose(self, policy: ConvolutionPolicy, size: Size) -> "Choice":
-        """Its variants for an image of `size`."""
-        pixels = math.prod(size_of(size, self.block))
-        shapes = (
-            ConvShape(direction, 3, (self.ci,), self.co, pixels, source)
-            for direction, source in ((Direction.FORWARD, None), (Direction.BACKWARD_INPUT, 0))
-        )
-        return Choice(*(policy.convolution(shape) for shape in shapes))
-
-
-@dataclass(frozen=True)
-class Choice:
-    """The variants that compute a convolution."""
-
-    forward: ModuleType
-    backward: ModuleType
-
-    def work_floats(
-        self, dev: Device, policy: ConvolutionPolicy, layer: VggConv, size: Size
-    ) -> list[tuple[int, int]]:
-        """As conv_direct.work_floats, [forward, backward]."""
-        height, _ = size_of(size, layer.block)
-        return [
-            variant.work_floats(
-                dev, policy.blocking, direction, height, layer.weight_shape(), layer.ci
-            )
-            for variant, direction in (
-                (self.forward, Direction.FORWARD),
-                (self.backward, Direction.BACKWARD_INPUT),
-            )
-        ]
-
 
 def size_of(size: Size, block: int) -> Size:
     """(height, width) of a block's features for an image of `size`."""
@@ -96,6 +66,26 @@ def vgg_layers(widths: tuple[int, ...] = WIDTHS) -> list[VggConv]:
             ci, source = co, name
         source = f"pool{block + 1}"
     return layers
+
+
+def _variants(policy, layer, size):
+    """The modules that compute a convolution of an image of `size`: forward, and the gradient of
+    its input.
+    """
+    pixels = math.prod(size_of(size, layer.block))
+    return [
+        policy.convolution(ConvShape(direction, 3, (layer.ci,), layer.co, pixels, source))
+        for direction, source in DIRECTIONS
+    ]
+
+
+def _work_floats(dev, policy, layer, size):
+    """What _variants() need, as conv_direct.work_floats says it."""
+    height, _ = size_of(size, layer.block)
+    return [
+        variant.work_floats(dev, policy.blocking, direction, height, layer.weight_shape(), layer.ci)
+        for variant, (direction, _) in zip(_variants(policy, layer, size), DIRECTIONS, strict=True)
+    ]
 
 
 def lpips_program(dev: Device) -> Program:
@@ -132,7 +122,7 @@ class Lpips:
             self._weights[layer.name] = dev.upload(pack_weights(weights[f"kernel{i}"]))
             self._biases[layer.name] = dev.upload(weights[f"bias{i}"])
         self._size = None
-        self._choices: dict[str, Choice] = {}
+        self._choices: dict[str, list[ModuleType]] = {}
         self._laid_out: dict[str, Array | None] = {}
         self._tiles: list[Tiles] = []  # of each block
         self._work = Work.empty(dev)
@@ -146,8 +136,7 @@ class Lpips:
         """
         floats, work = {}, [(COUNTERS, 1)]
         for layer in vgg_layers(widths):
-            choice = layer.choose(policy, size)
-            needs = choice.work_floats(dev, policy, layer, size)
+            needs = _work_floats(dev, policy, layer, size)
             work += needs
             floats[f"weights of {layer.name}"] = math.prod(layer.weight_shape())
             floats[f"bias of {layer.name}"] = layer.co
@@ -280,18 +269,19 @@ class Lpips:
         self._size, self._laid_out, self._tiles, self._work = None, {}, [], None
         work = [(COUNTERS, 1)]
         for layer in vgg_layers(self.widths):
-            choice = self._choices[layer.name] = layer.choose(self.policy, size)
-            self._laid_out[layer.name] = choice.forward.lay_out(
+            forward, _ = self._choices[layer.name] = _variants(self.policy, layer, size)
+            self._laid_out[layer.name] = forward.lay_out(
                 self.dev, self.policy.blocking, self._weights[layer.name]
             )
-            needs = choice.work_floats(self.dev, self.policy, layer, size)
+            needs = _work_floats(self.dev, self.policy, layer, size)
             work += needs if self.training else needs[:1]
         self._tiles = [all_tiles(self.dev, *size_of(size, i)) for i in range(len(BLOCKS))]
         self._work = Work.empty(self.dev, *map(max, zip(*work, strict=True)))
         self._size = size
 
     def _convolve(self, layer, x, out):
-        self._choices[layer.name].forward.forward(
+        forward, _ = self._choices[layer.name]
+        forward.forward(
             self.dev,
             self.policy.blocking,
             (x,),
@@ -305,7 +295,8 @@ class Lpips:
         )
 
     def _convolve_backward(self, layer, grad_out, grad_x, mask):
-        self._choices[layer.name].backward.backward_input(
+        _, backward = self._choices[layer.name]
+        backward.backward_input(
             self.dev,
             self.policy.blocking,
             self._weights[layer.name],

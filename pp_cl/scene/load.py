@@ -38,7 +38,7 @@ DEMO = "demo"  # the word that names the scene which the program makes itself
 
 # One module per format. FILES names the files it reads, recognises(folder) tells whether a folder
 # holds such files, splits(folder) names its splits, and read_split(folder, split) gives a list of
-# Photograph without reading pixels. The first that recognises a folder reads it.
+# Photograph of one of them without reading pixels. The first that recognises a folder reads it.
 READERS = (transforms, co3d, neus, nsvf, colmap, llff)
 
 # Bytes per pixel of what reading takes at its peak, measured with 12 megapixels: decoding and a
@@ -142,8 +142,11 @@ def scene_frames(path: str | Path, split: str = "train") -> list[Photograph]:
     """
     if path == DEMO:
         return demo.demo_frames(split)
-    folder = Path(path)
-    photographs = find_reader(folder).read_split(folder, split)
+    folder, reader = Path(path), find_reader(path)
+    present = reader.splits(folder)
+    if split not in present:
+        raise UserError(f"{folder}: no split {split}; its splits are {', '.join(present)}")
+    photographs = reader.read_split(folder, split)
     if not photographs:
         raise UserError(f"{folder}: split {split} has no photographs; add some")
     for one in photographs:

@@ -3,7 +3,6 @@
 import math
 from collections.abc import Sequence
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 from skimage.morphology import closing, disk
@@ -22,13 +21,6 @@ from pp_cl.scene.views import View, evenly, fitting_downscale
 SHOWN_VIEWS, SHOWN_SIZE = 12, 320  # photographs of the picture, and their longer side in pixels
 OUTLINE = (255, 0, 160)  # a colour that few objects have
 REJECTED = np.array([127, 60, 0], np.uint8)  # added to what a mask should have held
-
-
-class Points(NamedTuple):
-    """Vertices of a grid. ids: (N,) uint32."""
-
-    grid: Grid
-    ids: np.ndarray
 
 
 def silhouette(grid: Grid, ids: np.ndarray, camera: Camera) -> np.ndarray:
@@ -64,7 +56,7 @@ def project(camera: Camera, positions: np.ndarray) -> np.ndarray:
 def picture(
     dev: Device,
     views: Sequence[View],
-    points: Points | Hull | None,
+    points: Hull | None,
     disagreeing: Sequence[Disagreement] = (),
 ) -> np.ndarray:
     """uint8 (H, W, 3) contact sheet of up to 12 photographs over white, spread evenly over the

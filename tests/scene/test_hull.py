@@ -154,19 +154,6 @@ def test_the_edge_is_found(dev, points, carvings):
 
 
 @pytest.mark.large
-def test_the_smallest_counts(dev):
-    for points in (1, 2):
-        assert len(build_grid(dev, ball_views(), points).ids) >= points
-
-
-@pytest.mark.large
-def test_two_runs_give_the_same_bits(dev):
-    first, second = (build_grid(dev, ball_views(), 5000) for _ in range(2))
-    assert first.grid == second.grid
-    np.testing.assert_array_equal(first.ids, second.ids)
-
-
-@pytest.mark.large
 def test_the_cell_cap_limits_the_grid(dev, carvings, monkeypatch):
     """The ball fills about half of its box, so 8000 cells hold some 4000 of the 7000 points asked
     for.

@@ -26,7 +26,7 @@ def test_missing_folder_format_and_split(tmp_path):
     refused(scene / "images", f"no scene in it; {scene} is one")
     refused(above, f"no scene in it; {scene} is one")
     write_scene(scene, "val")
-    refused(scene, scene / "transforms_test.json", "train, val", splits=("test",))
+    refused(scene, scene, "no split test", "train, val", splits=("test",))
 
 
 def test_a_split_without_photographs(tmp_path):

@@ -20,7 +20,6 @@ from pp_cl.scene.camera import Camera
 from pp_cl.scene.readers.common import (
     MOST,
     SPLITS,
-    check_split,
     find_image,
     hold_out,
     listing,
@@ -63,7 +62,6 @@ def read_split(folder: Path, split: str) -> list[Photograph]:
     Raises UserError naming the file and the frame.
     """
     folder = _whole(folder)
-    check_split(folder, split, splits(folder))
     file, listed = folder.parent / ANNOTATIONS, _set_list(folder)
     frames = [
         Frame(file, {}, own, index, "frames")

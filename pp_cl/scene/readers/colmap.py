@@ -14,7 +14,6 @@ from pp_cl.scene.distortion import Distortion
 from pp_cl.scene.readers.colmap_model import Image, Lens, is_model, read_model
 from pp_cl.scene.readers.common import (
     SPLITS,
-    check_split,
     fail_at,
     find_image,
     find_mask,
@@ -44,7 +43,6 @@ def read_split(folder: Path, split: str) -> list[Photograph]:
     An image's mask is masks/NAME.png, as COLMAP has it, or masks/NAME with any ending of an image;
     with a folder of masks, every image needs one. Raises UserError naming the file, and the image.
     """
-    check_split(folder, split, SPLITS)
     model = _model_folder(folder)
     lenses, images = read_model(model)
     ordered = sorted(images, key=lambda image: image.name)

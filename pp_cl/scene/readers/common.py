@@ -33,14 +33,6 @@ Fail = Callable[[str], UserError]  # makes the error that names the file and the
 # Splits -------------------------------------------------------------------------------------------
 
 
-def check_split(place: Path, split: str, present: Sequence[str]) -> None:
-    """Raise UserError naming the place where a scene has no such split."""
-    if split not in present:
-        raise UserError(
-            f"{place}: no split {split}; the splits of this scene are {', '.join(present)}"
-        )
-
-
 def hold_out(items: Sequence[Item], split: str) -> list[Item]:
     """The items of split train or test, of a format without splits: test is every eighth."""
     is_test = split == "test"
@@ -110,7 +102,8 @@ def find_mask(folder: Path, masks: str, image: str, fail: Fail) -> str | None:
         # a name that is too long with .png is no file, where Path.is_file raises
         if os.path.isfile(folder / masks / name):
             return find_image(folder, f"{masks}/{name}", fail)
-    raise fail(f"has no mask {masks}/{image}.png; add it, or remove the folder {masks}")
+    usual = PurePosixPath(image).with_suffix(".png")
+    raise fail(f"no mask {masks}/{image}.png or {masks}/{usual}; add one, or remove {masks}")
 
 
 def fail_at(*place: object) -> Fail:

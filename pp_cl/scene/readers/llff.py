@@ -9,7 +9,6 @@ from pp_cl.files.image import image_size
 from pp_cl.scene.camera import Camera
 from pp_cl.scene.readers.common import (
     SPLITS,
-    check_split,
     fail_at,
     find_mask,
     folder_images,
@@ -43,7 +42,6 @@ def read_split(folder: Path, split: str) -> list[Photograph]:
     far bound all that was photographed, not the object, and are left out. Raises UserError naming
     the file and the image.
     """
-    check_split(folder, split, SPLITS)
     file, names = folder / POSES, folder_images(folder, IMAGES)
     rows = read_npy(file)
     if rows.shape != (len(names), NUMBERS):

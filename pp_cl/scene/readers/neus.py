@@ -13,7 +13,6 @@ from pp_cl.files.image import image_size
 from pp_cl.scene.camera import Camera
 from pp_cl.scene.readers.common import (
     SPLITS,
-    check_split,
     fail_at,
     folder_images,
     hold_out,
@@ -44,7 +43,6 @@ def read_split(folder: Path, split: str) -> list[Photograph]:
     sphere around the object, which gives the depth range. Raises UserError naming the file and the
     member.
     """
-    check_split(folder, split, SPLITS)
     file = _file(folder)
     cameras, scales = read_npz(file, "world_mat_"), read_npz(file, "scale_mat_")
     names = folder_images(folder, IMAGES)

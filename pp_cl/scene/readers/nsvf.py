@@ -10,7 +10,7 @@ import numpy as np
 from pp_cl.errors import UserError
 from pp_cl.files.image import image_size
 from pp_cl.scene.camera import Camera
-from pp_cl.scene.readers.common import check_split, fail_at, folder_images, read_numbers
+from pp_cl.scene.readers.common import fail_at, folder_images, read_numbers
 from pp_cl.scene.readers.frame import rigid
 from pp_cl.scene.views import Photograph
 
@@ -38,7 +38,6 @@ def read_split(folder: Path, split: str) -> list[Photograph]:
     OpenCV's axes; near and far are Euclidean distances. Raises UserError naming the file.
     """
     names = _names(folder)
-    check_split(folder, split, sorted(names))
     file = folder / INTRINSICS
     lens, depth_range = _lens(file), _depth_range(folder / "near_and_far.txt")
     read = []

@@ -12,7 +12,6 @@ from pp_cl.files.atomic import atomic_folder, write_json
 from pp_cl.files.image import image_size, write_png
 from pp_cl.scene.readers.common import (
     SPLITS,
-    check_split,
     find_image,
     hold_out,
     listing,
@@ -49,7 +48,6 @@ def read_split(folder: Path, split: str) -> list[Photograph]:
     Raises UserError naming the file and the key that is missing or wrong.
     """
     file = folder / (f"transforms_{split}.json" if _split_files(folder) else SINGLE)
-    check_split(file, split, splits(folder))
     data, read = _read(file), {}
     for index, own in enumerate(listing(data["frames"])):
         frame = Frame(file, data, own, index)

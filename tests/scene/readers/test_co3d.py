@@ -138,13 +138,6 @@ def test_a_linked_sequence(sequence):
     assert [len(read_split(sequence, split)) for split in ("train", "test")] == [9, 2]
 
 
-def test_a_view_with_nothing_in_it_comes_back(tmp_path):
-    given = held_out(views())
-    given["train"][2].image[..., 3] = 0
-    co3d.write(tmp_path, given)
-    assert len(read_split(tmp_path / "object" / "sequence", "train")) == len(given["train"])
-
-
 @pytest.mark.parametrize(
     ("names", "version"),
     [
@@ -170,17 +163,10 @@ def view_change(**keys):
 BAD = {
     "no viewpoint": (lambda f: f.pop("viewpoint"), "viewpoint", "missing"),
     "R of another shape": (view_change(R=[[1, 0], [0, 1]]), "R", "3x3"),
-    "R in words": (view_change(R="turned"), "R", "3x3"),
     "R no rotation": (view_change(R=[[2, 0, 0], [0, 1, 0], [0, 0, 1]]), "no rotation"),
-    "R as strings": (view_change(R=[["1", 0, 0], [0, 1, 0], [0, 0, 1]]), "R", "3x3"),
-    "T of truth values": (view_change(T=[True, False, True]), "T", "3 finite numbers"),
     "T huge": (view_change(T=[0, 0, 1e200]), "T", "3 finite numbers"),
     "focal length denormal": (view_change(focal_length=[5e-324, 1]), "focal_length", "above 0"),
     "mass in words": (lambda f: f["mask"].update(mass="some"), "mask", "mass"),
-    "mass below 0": (lambda f: f["mask"].update(mass=-3), "mask", "mass"),
-    "T with NaN": (view_change(T=[0, 0, float("nan")]), "T", "finite"),
-    "one focal length": (view_change(focal_length=[2]), "focal_length", "2 finite numbers"),
-    "focal length 0": (view_change(focal_length=[0, 1]), "focal_length", "above 0"),
     "principal point": (view_change(principal_point=None), "principal_point"),
     "unknown NDC": (view_change(intrinsics_format="pixels"), "intrinsics_format", "pixels"),
     "no image": (lambda f: f.update(image=None), "image", "path"),
@@ -197,7 +183,6 @@ BAD = {
         "leaves the scene's folder",
     ),
     "size": (lambda f: f["image"].update(size=[30, 22]), "30x22"),
-    "mask in words": (lambda f: f.update(mask="white"), "mask", "path"),
     "no frame number": (lambda f: f.pop("frame_number"), "frame_number", "missing"),
 }
 
@@ -244,13 +229,3 @@ def test_a_set_list_that_is_a_pipe_is_not_waited_for(sequence):
     os.mkfifo(file)
     with pytest.raises(UserError, match=f"{file.name}: cannot be read .Not a regular file"):
         read_split(sequence, "train")
-
-
-def test_a_size_that_is_nested_deeply_is_quoted(sequence):
-    deep = []
-    for _ in range(400):
-        deep = [deep]
-    edit(sequence, lambda own: own["image"].update(size=deep))
-    with pytest.raises(UserError, match=r"has the size \[\[") as caught:
-        read_split(sequence, "train")
-    assert len(str(caught.value)) < 400

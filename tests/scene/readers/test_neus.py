@@ -140,19 +140,6 @@ def test_bad_cameras(scene, case):
     refused(scene, scene / FILE, *words)
 
 
-def test_more_images_than_cameras(scene):
-    write_png(scene / "image" / "zz.png", np.zeros((22, 30, 3)))
-    refused(scene, scene / FILE, "11 world_mat_i", "12 images")
-
-
-def test_missing_files(scene):
-    (scene / "mask" / "000003.png").unlink()
-    refused(scene, scene / "mask", "10 masks", "11 images")
-    for file in (scene / "image").iterdir():
-        file.unlink()
-    refused(scene, scene / "image", "no images")
-
-
 def test_masks_of_other_numbers(scene):
     (scene / "mask" / "000010.png").rename(scene / "mask" / "000011.png")
     refused(scene, scene / "mask" / "000011.png", "image/000010.png")

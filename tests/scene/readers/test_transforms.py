@@ -126,12 +126,6 @@ def test_rows_and_rounding_of_the_pose(tmp_path, rng):
         assert np.array_equal(pose[:, 3], exact[:3, 3])
 
 
-def test_image_without_alpha_is_all_object(tmp_path):
-    write_scene(tmp_path, count=1)
-    write_png(tmp_path / "train_0.png", np.zeros((SIZE[1], SIZE[0], 3), np.uint8))
-    assert (load_scene(tmp_path).splits["train"][0].image[..., 3] == 255).all()
-
-
 # --------------------------------------------------------------------------------------------------
 
 MATRIX = opengl_pose([3, 0, 1])
@@ -139,29 +133,14 @@ NAN_MATRIX = MATRIX * np.where(np.eye(4) == 1, np.nan, 1)
 
 BAD_FRAMES = {
     "no path": ({"file_path": None}, "file_path", "must be the path"),
-    "path is a number": ({"file_path": 3}, "file_path", "must be the path"),
     "no such image": ({"file_path": "./train_9"}, "file_path", "train_9"),
-    "folder as image": ({"file_path": "."}, "file_path", "no image"),
-    "zero byte": ({"file_path": "a\0b"}, "file_path", "not a usable path"),
-    "endless name": ({"file_path": "a" * 5000}, "file_path", "no image at"),
     "parent folder": ({"file_path": "../secret.png"}, "file_path", "leaves the scene's folder"),
-    "parent folder without ending": (
-        {"file_path": "./x/../../secret"},
-        "file_path",
-        "leaves the scene's folder",
-    ),
-    "absolute": ({"file_path": "/etc/hostname"}, "file_path", "leaves the scene's folder"),
     "link out": ({"file_path": "link_out"}, "file_path", "leaves the scene's folder"),
-    "loop of links": ({"file_path": "loop"}, "file_path", "no image at"),
     "no matrix": ({"transform_matrix": None}, "transform_matrix", "4x4 or 3x4"),
     "NaN": ({"transform_matrix": NAN_MATRIX.tolist()}, "transform_matrix", "NaN"),
-    "infinite": ({"transform_matrix": (MATRIX[:3] + math.inf).tolist()}, "transform_matrix", "Inf"),
     "3x3": ({"transform_matrix": MATRIX[:3, :3].tolist()}, "transform_matrix", "(3, 3)"),
-    "ragged": ({"transform_matrix": [[1, 2], [3]]}, "transform_matrix", "4x4 or 3x4"),
     "words": ({"transform_matrix": "unknown"}, "transform_matrix", "4x4 or 3x4"),
-    "texts": ({"transform_matrix": MATRIX.astype(str).tolist()}, "transform_matrix", "4x4 or 3x4"),
     "truths": ({"transform_matrix": np.eye(4, dtype=bool).tolist()}, "transform_matrix", "4x4"),
-    "huge": ({"transform_matrix": [[10**400] * 4] * 4}, "transform_matrix", "4x4 or 3x4"),
     "scaled": (
         {"transform_matrix": (MATRIX * [1.01, 1.01, 1.01, 1]).tolist()},
         "transform_matrix",
@@ -172,29 +151,19 @@ BAD_FRAMES = {
         "transform_matrix",
         "no rotation",
     ),
-    "zero": (
-        {"transform_matrix": (MATRIX * [0, 0, 0, 1]).tolist()},
-        "transform_matrix",
-        "no rotation",
-    ),
     "transposed": ({"transform_matrix": MATRIX.T.tolist()}, "transform_matrix", "last row"),
     "negative focal length": ({"fl_x": -5}, "fl_x", "above 0"),
     "focal length in words": ({"fl_x": "50mm"}, "fl_x", '"50mm"'),
-    "true": ({"fl_x": True}, "fl_x", "true"),
     "NaN number": ({"cx": math.nan}, "cx", "NaN"),
-    "infinite number": ({"cy": -math.inf}, "cy", "-Infinity"),
     "huge number": ({"fl_y": 10**400}, "fl_y", "finite"),
     "angle over pi": ({"camera_angle_x": 40}, "camera_angle_x", "below 3.14"),
     "width": ({"w": 48}, "w", "24x18", "train_1.png"),
-    "height": ({"h": 19}, "h", "24x18", "train_1.png"),
     "distortion": ({"k4": 0.01}, "k4", "undistort"),
     "fisheye": ({"camera_model": "OPENCV_FISHEYE"}, "camera_model", "undistort"),
     "fisheye of instant-ngp": ({"is_fisheye": True}, "is_fisheye", "undistort"),
-    "panorama": ({"camera_type": "equirectangular"}, "camera_type", "undistort"),
     "an image twice": ({"file_path": "train_0.png"}, "file_path", "'train_0.png'", "twice"),
     "near only": ({"near": 1.0}, "far", "missing"),
     "far only": ({"far": 1.0}, "near", "missing"),
-    "near 0": ({"near": 0, "far": 2}, "near", "above 0"),
     "far before near": ({"near": 3, "far": 2}, "far", "above near"),
 }
 
@@ -206,7 +175,6 @@ def test_bad_frame(tmp_path, case):
     folder.mkdir()
     write_png(tmp_path / "secret.png", np.zeros((SIZE[1], SIZE[0], 4), np.uint8))
     (folder / "link_out.png").symlink_to(tmp_path / "secret.png")
-    (folder / "loop").symlink_to("loop")
     change, key, *words = BAD_FRAMES[case]
     write_scene(folder, edit=lambda data: data["frames"][1].update(change))
     refused(folder, folder / "transforms_train.json", f"frames[1].{key}:", *words)
@@ -270,18 +238,3 @@ def test_a_pipe_is_no_file_of_cameras(tmp_path):
     (tmp_path / "transforms_train.json").unlink()
     os.mkfifo(tmp_path / "transforms_train.json")
     refused(tmp_path, tmp_path, "no scene in it")
-
-
-def test_json_cut_anywhere(tmp_path):
-    write_scene(tmp_path, count=1)
-    file = tmp_path / "transforms_train.json"
-    content = file.read_text()
-    for length in range(0, len(content), 7):
-        file.write_text(content[:length])
-        refused(tmp_path, file, "line 1")
-
-
-def test_missing_image(tmp_path):
-    write_scene(tmp_path)
-    (tmp_path / "train_2.png").unlink()
-    refused(tmp_path, "transforms_train.json: frames[2].file_path:", "train_2")
