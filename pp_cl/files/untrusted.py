@@ -1,4 +1,4 @@
-"""Files that other programs wrote, looked at before they are read."""
+"""Files that other programs wrote: checked to be regular and small enough before they are read."""
 
 import errno
 import os

@@ -8,8 +8,8 @@ import numpy as np
 from pp_cl.scene.grid import Grid, smallest_edge
 from pp_cl.scene.views import MASK_THRESHOLD, View
 
-# A view is told of if it alone rejects more than this share of the object, and several times what
-# is usual: every view carves a little that no other does, the more so where there are few. Lego's
+# pp-cl warns about a view that alone rejects more than this share of the object, and several times
+# the usual share: each view carves a little that no other does, more so where there are few. Lego's
 # views reach 0.03 with all 100 of them, and 0.15 with 20; a mask shifted by 15 % of the image 0.35.
 LEAST_SHARE, TIMES_MEDIAN, TIMES_EVEN = 0.05, 4.0, 4.0
 PROBED_CELLS = 32**3  # positions at which the masks are looked up

@@ -45,7 +45,7 @@ class Distortion:
         along_x, along_y = (
             np.stack([np.diff(a, axis=1)[1:], np.diff(a, axis=0)[:, 1:]]) for a in (x, y)
         )
-        # so written that NaN is a fold
+        # NaN counts as a fold
         return not (along_x[0] * along_y[1] - along_x[1] * along_y[0] > 0).all()
 
     def source_pixels(self, camera: Camera) -> np.ndarray:

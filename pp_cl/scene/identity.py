@@ -1,5 +1,5 @@
-"""What a run keeps of its training views: their names and cameras, which rendering and exports
-begin with, and digests, by which it knows its scene again wherever that lies.
+"""The names, cameras and pixel digests of the training views that a checkpoint keeps: to render
+without the scene, and to recognise it in another place.
 """
 
 import base64

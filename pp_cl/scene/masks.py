@@ -1,4 +1,4 @@
-"""Where the masks of photographs come from."""
+"""The mask of a photograph: from a file, from its alpha, from a uniform background, or none."""
 
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath

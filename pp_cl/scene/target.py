@@ -1,5 +1,5 @@
-"""The target of a rendering: a photograph on the device, reduced by area on premultiplied colour,
-over white.
+"""The image that a rendering is compared with: a photograph on the device, reduced by area on
+premultiplied colour, over white.
 """
 
 import numpy as np

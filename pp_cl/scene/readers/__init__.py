@@ -1,1 +1,1 @@
-"""One module a scene format."""
+"""Readers of scenes: one module a format, and what they share in common.py and frame.py."""
