@@ -19,7 +19,7 @@ def trained(tmp_path_factory):
     folder = tmp_path_factory.mktemp("model")
     scene = write_ball_scene(folder / "ball", views=9, size=40)
     for name, blocks in (("a", "double"), ("b", "single")):
-        changes = {"train__iterations": 2, "network__blocks": blocks, "train__previews": 0}
+        changes = {"train__iterations": 20, "network__blocks": blocks, "train__previews": 0}
         assert main(arguments(scene, folder / name, 1, **changes)) == 0
     return folder
 
