@@ -70,7 +70,7 @@ format: $(READY) ## format the Python files and the kernels
 	@$(BIN)/ruff format
 	@$(BIN)/clang-format -i $(KERNELS)
 
-docs: $(READY) ## write the tables in README.md and docs/ from docs/results/*.json
+docs: $(READY) ## write the tables, settings and commands in README.md and docs/
 	@$(BIN)/python tools/docs_tables.py
 
 wheel: $(READY) ## build the wheel into dist/

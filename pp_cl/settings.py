@@ -25,21 +25,24 @@ class SceneConfig:
 
     path: str = setting("", "folder of the scene, or the word demo")
     downscale: int = setting(
-        1, "reduce the images this many times; if not given, to about the preset's size", 1, 64
+        1, "reduce the images this many times (if not given: to about the preset's size)", 1, 64
     )
     mask_from: str = setting(
         "given",
-        "given: masks that the scene's format names, else alpha; alpha: the images' own; color: by"
-        " the uniform colour of the background; box, none: all opaque, points fill a box",
+        "given: the masks of the scene's format, else alpha; alpha: of the images; color: cut"
+        " out a uniform background; box, none: no masks, points fill a box",
         choices=("given", "alpha", "color", "box", "none"),
     )
     masks: str = setting("", "folder of masks named like the photographs, white on the object")
     mask_tolerance: float = setting(
-        10.0, "distance from the background's colour in CIELAB that is still background", 0.1, 100
+        10.0,
+        "largest CIELAB distance from the background's colour that still counts as background",
+        0.1,
+        100,
     )
     box: tuple = setting(
         (0.0, 0.0, 0.0, 0.0, 0.0, 0.0),
-        "x, y, z of two corners of a box that holds the points (zeros: none)",
+        "two corners x, y, z of a box that the points fill (zeros: none)",
         -1e30,
         1e30,
     )
@@ -49,7 +52,7 @@ class SceneConfig:
 class PointsConfig:
     """The point cloud."""
 
-    count: int = setting(250_000, "number of grid points aimed at in the visual hull", 1, 2**27)
+    count: int = setting(250_000, "points wanted in the visual hull", 1, 2**27)
     opacity: float = setting(0.1, "opacity of all points before training", 0, 1)
     sh_degree: int = setting(
         2, "degree of the spherical harmonics (SH): 0 (the same from all sides), 1 or 2", 0, 2
@@ -62,7 +65,8 @@ class RasterConfig:
 
     footprint: str = setting(
         "soft",
-        "soft: d = 1 - rho/R; disc: the paper's hard disc; sphere: Pulsar's rules for any radius",
+        "soft: opacity falls linearly to the rim; disc: the paper's hard disc; sphere: Pulsar's"
+        " rules, for any radius",
         choices=("soft", "disc", "sphere"),
     )
     radius: float = setting(
@@ -87,8 +91,7 @@ class RasterConfig:
     )
     early_stop: float = setting(
         0.001,
-        "early termination: stop blending a pixel once no further hit can contribute more than"
-        " this share (0: never)",
+        "stop blending a pixel once no further hit can weigh more than this share (0: never)",
         0,
         0.5,
     )
@@ -104,21 +107,23 @@ class NetworkConfig:
     widths: tuple = setting((32, 64, 128), "channels of its three levels", 1, 4096)
     blocks: str = setting(
         "single",
-        "what a level computes. double: two 3x3 convolutions with ReLU; single: one; gated: ELU of"
-        " one times the sigmoid of another",
+        "of a level. double: two 3x3 convolutions with ReLU; single: one; gated: ELU of one"
+        " times the sigmoid of another",
         choices=("double", "single", "gated"),
     )
     channels: str = setting(
         "",
-        "channels of each convolution but the last, in order, where a compressed model has fewer"
-        " than its widths say (none)",
+        "channels of each convolution but the last, of a compressed model (none)",
     )
     residual: bool = setting(True, "add a quarter of the first three features to the colours")
     rate: tuple = setting(
         (1e-3, 1e-4), "Adam's learning rate at the first and the last step", 1e-12, 100
     )
     tolerance: float = setting(
-        1e-5, "relative L2 error allowed for a convolution; the fastest variant is taken", 0, 1
+        1e-5,
+        "relative L2 error allowed for a convolution; the fastest variant within it is taken",
+        0,
+        1,
     )
 
     @property
@@ -134,28 +139,26 @@ class TrainConfig:
     iterations: int = setting(8_000, "training steps; every schedule ends at the last", 1, 10**8)
     seed: int = setting(0, "seed of all random choices", 0, 2**32 - 1)
     crop: int = setting(
-        128, "side in pixels of the square crop that a step trains on (0: whole images)", 0, 2**14
+        128, "side in pixels of the square crop of a step (0: whole images)", 0, 2**14
     )
     pixel_jitter: bool = setting(
         True, "shift the pixel grid of the downscaled image by a random sub-pixel offset each step"
     )
     ssim_weight: float = setting(0.2, "loss = smooth L1 + ssim_weight * (1 - SSIM)", 0, 10)
-    smooth_l1: float = setting(
-        0.05, "the slope of L1 falls to 0 in proportion to errors below this (0: L1)", 0, 1
-    )
+    smooth_l1: float = setting(0.05, "errors below this count by their square (0: L1)", 0, 1)
     mask_weight: float = setting(
         0.5,
-        "adds this times the mean square by which the rendered alpha differs from the"
-        " photograph's to the loss, where it is too low by a weight that rises from 0 at the first"
-        " step, with raster.blend=alpha and photographs that have masks (0: off)",
+        "mask term of the loss: mean square of rendered alpha minus mask; where alpha is too"
+        " low its weight rises from 0 during training; needs raster.blend=alpha and masks (0:"
+        " off)",
         0,
         1e3,
     )
     spread_weight: float = setting(
         0.6,
-        "adds up to this times the mean spread of the pixels, by how much their hits with"
-        " weight lie apart as a share of the grid's diagonal, to the loss, rising from 0 at the"
-        " first step, with raster.blend=alpha (0: off)",
+        "spread term of the loss: how far a pixel's weights lie apart along its ray, as a share"
+        " of the grid's diagonal; rises from 0 during training; needs raster.blend=alpha (0:"
+        " off)",
         0,
         1e3,
     )
@@ -172,8 +175,8 @@ class TrainConfig:
     )
     sh_eps: float = setting(
         0.01,
-        "eps of the SH coefficients' step, multiplied by 3*H*W of the training image, so that"
-        " it does not depend on the crop size",
+        "eps of the SH step, times 3*H*W of the training image, so that the crop size does not"
+        " matter",
         1e-30,
         1e3,
     )
@@ -182,15 +185,15 @@ class TrainConfig:
     )
     opacity_rate_steps: int = setting(
         1000,
-        "number of steps that opacity_rate is meant for: longer trainings multiply it by the square"
-        " root of this over their iterations (0: no matter how many)",
+        "steps that opacity_rate is meant for: longer trainings multiply it by the square root"
+        " of this over their iterations (0: never)",
         0,
         10**8,
     )
     dropout: float = setting(0.0, "share of the points left out at random in each step", 0, 0.95)
     sh_smoothing: float = setting(
         0.03,
-        "per step, pull the SH towards the mean of the grid neighbours by this times the SH"
+        "per step, pull the SH towards the mean of the grid neighbours by this times their"
         " learning rate (0: off)",
         0,
         0.25,
@@ -198,25 +201,26 @@ class TrainConfig:
     sh_smoothing_every: int = setting(16, "steps between two smoothings", 1, 10**8)
     prune_weight: float = setting(
         0.05,
-        "prune points that in no look have this blend weight, summed over the pixels (0: off)",
+        "prune points whose blend weight, summed over the pixels, reached this in none of the"
+        " steps that had them in view (0: off)",
         0,
         1e6,
     )
     prune_opacity: float = setting(0.01, "prune points with an opacity below this", 0, 1)
     prune_every: int = setting(250, "steps between two prunings", 1, 10**8)
     prune_looks: int = setting(
-        100, "number of steps that must have seen a point, hidden or not, to prune it", 1, 10**8
+        100, "steps that must have had a point in view before it may be pruned", 1, 10**8
     )
     refine_at: tuple = setting(
         (1.0, 1.0),
-        "shares of the iterations after which images double in size and points become eight each"
-        " (1: never); training begins on images reduced as often",
+        "shares of the iterations after which images double in size and a point becomes eight"
+        " (1: never); training begins on images that much smaller",
         0,
         1,
     )
     final_prune_weight: float = setting(
         0.05,
-        "after the last step, prune points that have this blend weight in no training view (0:"
+        "after the last step, prune points that reach this blend weight in no training view (0:"
         " off)",
         0,
         1e9,
@@ -226,7 +230,7 @@ class TrainConfig:
     )
     checkpoint_every: int = setting(1000, "steps between two checkpoints", 1, 10**8)
     checkpoint_minutes: float = setting(
-        10.0, "minutes after which the next step ends with a checkpoint (0: never)", 0, 10**6
+        10.0, "minutes after which the next step writes a checkpoint (0: never)", 0, 10**6
     )
     memory_gib: float = setting(
         0.0,
@@ -235,13 +239,11 @@ class TrainConfig:
         2**20,
     )
     log_every: int = setting(50, "steps between two rows of log.jsonl", 1, 10**8)
-    previews: int = setting(
-        4, "preview images written in the course of the run; the first comes early besides", 0, 1000
-    )
+    previews: int = setting(4, "preview images during the training, besides an early one", 0, 1000)
     eval_every: int = setting(
         0,
-        "steps between two measurements of a few views of the split val, else test: test_psnr in"
-        " log.jsonl (0: none)",
+        "steps between two measurements of a few views of the split val, else test: test_psnr"
+        " in log.jsonl (0: none)",
         0,
         10**8,
     )

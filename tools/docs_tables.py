@@ -1,9 +1,10 @@
-"""Write the tables of measurements in README.md and docs/ from docs/results/*.json.
+"""Write the generated parts of README.md and docs/: tables of measurements, settings, commands.
 
     python tools/docs_tables.py            # or make docs
 
-The table of docs/results/NAME.json stands between the lines `<!-- table: NAME -->` and
-`<!-- end table -->` of a Markdown file. A file of results holds
+A generated part stands between the lines `<!-- table: NAME -->` and `<!-- end table -->` of a
+Markdown file. NAME is `settings` (from pp_cl/settings.py and presets.py), `commands` (from the
+parsers of pp_cl/commands/), or that of a file docs/results/NAME.json, which holds
 
     measured   what the numbers are; machine, command, version, commit: how they were obtained.
                estimated, in its place: what numbers are that nobody measured
@@ -12,11 +13,19 @@ The table of docs/results/NAME.json stands between the lines `<!-- table: NAME -
     notes      sentences below the table, optional
 """
 
+import argparse
+import dataclasses
+import importlib
 import json
 import re
 import string
 import sys
+from collections.abc import Sequence
 from pathlib import Path
+
+from pp_cl.cli import COMMANDS
+from pp_cl.config import Config, sections, text_of
+from pp_cl.presets import PRESETS
 
 ROOT = Path(__file__).parents[1]
 BLOCK = re.compile(r"^(<!-- table: (\S+) -->\n).*?^(<!-- end table -->)$", re.DOTALL | re.MULTILINE)
@@ -44,6 +53,12 @@ def cell(template: str, row: dict) -> str:
     return re.sub(r"e([+-])0+(\d)", r"e\1\2", text).strip()  # 1e-06 -> 1e-6
 
 
+def markdown(heads: Sequence[str], rows: Sequence[Sequence[str]]) -> list[str]:
+    """The lines of a table."""
+    lines = ["| " + " | ".join(cells) + " |" for cells in (heads, *rows)]
+    return [lines[0], "|---" * len(heads) + "|", *lines[1:]]
+
+
 def table(results: dict) -> str:
     """Markdown of a file of results: what was measured (or estimated) and how, the table, the
     notes.
@@ -55,11 +70,63 @@ def table(results: dict) -> str:
     what = results[kind]
     heads = [column["head"] for column in results["columns"]]
     rows = [[cell(column["cell"], row) for column in results["columns"]] for row in results["rows"]]
-    lines = [f"{what[0].upper()}{what[1:]}. {origin}.", ""]
-    lines += ["| " + " | ".join(line) + " |" for line in (heads, ["---"] * len(heads), *rows)]
+    lines = [f"{what[0].upper()}{what[1:]}. {origin}.", "", *markdown(heads, rows)]
     for note in results.get("notes", ()):
         lines += ["", note]
     return "\n".join(lines)
+
+
+def settings() -> str:
+    """Every setting: its value in the preset tiny and in those that differ, and its help."""
+    rows = []
+    for section, values in sections(Config()):
+        for item in dataclasses.fields(values):
+            key = f"{section}.{item.name}"
+            others = [f"{n}: {text_of(c[key])}" for n, c in PRESETS.items() if key in c]
+            value = "; ".join([text_of(item.default), *others])
+            rows.append([f"`{key}`", value, item.metadata["help"].replace("|", "\\|")])
+    return "\n".join(markdown(["setting", "value", "meaning"], rows))
+
+
+def commands() -> str:
+    """Every command with its arguments; options of three commands or more come last."""
+    found = {name: _command(name) for name in COMMANDS}
+    users = {}
+    for name, (_, arguments) in found.items():
+        for argument in arguments:
+            users.setdefault(argument, []).append(name)
+    common = {
+        option: names
+        for option, names in users.items()
+        if len(names) >= 3 and option[0].startswith("-")
+    }
+    lines = []
+    for name, (what, arguments) in found.items():
+        others = ", ".join(f"`{a}`" for a, text in arguments if (a, text) in common)
+        lines += [f"## pp-cl {name}", "", f"{what[0].upper()}{what[1:]}. Also: {others}.", ""]
+        lines += [f"- `{a}`: {text}" for a, text in arguments if (a, text) not in common]
+        lines += [""] * bool(lines[-1])
+    lines += ["## Options of several commands", ""]
+    lines += [f"- `{a}` ({', '.join(names)}): {text}" for (a, text), names in common.items()]
+    return "\n".join(lines)
+
+
+def _command(name: str) -> tuple[str, list[tuple[str, str]]]:
+    """(its help, [(an argument as it is written, what it means)]) of a command."""
+    module = importlib.import_module(f"pp_cl.commands.{name}")
+    parser = argparse.ArgumentParser(add_help=False)
+    module.add_arguments(parser)
+    return module.HELP, [(_written(a), a.help.replace("%%", "%")) for a in parser._actions]
+
+
+def _written(action: argparse.Action) -> str:
+    """An argument as the command line has it, such as `--seed S`."""
+    if action.nargs == 0:
+        return ", ".join(action.option_strings)
+    value = action.metavar or "|".join(map(str, action.choices or [action.dest.upper()]))
+    if not action.option_strings:
+        return value
+    return f"{', '.join(action.option_strings)} {f'[{value}]' if action.nargs == '?' else value}"
 
 
 def read_results(folder: Path) -> dict[str, dict]:
@@ -69,16 +136,22 @@ def read_results(folder: Path) -> dict[str, dict]:
     }
 
 
-def with_tables(text: str, results: dict[str, dict]) -> str:
+def read_tables(folder: Path) -> dict[str, str]:
+    """{name: Markdown} of all that can be generated; folder: of the results."""
+    measured = {name: table(results) for name, results in read_results(folder).items()}
+    return measured | {"settings": settings(), "commands": commands()}
+
+
+def with_tables(text: str, tables: dict[str, str]) -> str:
     """The text with every table written anew. Raises TableError for a marker without partner, or
-    that names no results.
+    that names no table.
     """
 
     def written(block):
         begin, name, end = block.groups()
-        if name not in results:
+        if name not in tables:
             raise TableError(f"table {name}: there is no docs/results/{name}.json")
-        return f"{begin}\n{table(results[name])}\n\n{end}"
+        return f"{begin}\n{tables[name]}\n\n{end}"
 
     blocks = BLOCK.findall(text)
     if len(MARKER.findall(text)) != 2 * len(blocks):
@@ -95,11 +168,11 @@ def main(root: Path = ROOT) -> int:
     """Rewrite the tables of all documents, print the files that changed; returns the exit
     status.
     """
-    results = read_results(root / "docs" / "results")
+    tables = read_tables(root / "docs" / "results")
     for path in documents(root):
         old = path.read_text("utf-8")
         try:
-            new = with_tables(old, results)
+            new = with_tables(old, tables)
         except TableError as error:
             print(f"{path}: {error}", file=sys.stderr)
             return 2

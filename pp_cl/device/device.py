@@ -27,7 +27,7 @@ STANDARD = ("-cl-std=CL1.2", "-cl-kernel-arg-info")  # options of every build
 # Of Intel's driver of GPUs; others of that vendor refuse options that they do not know.
 INTEL_PLATFORM = "Intel(R) OpenCL"
 # Files with a kernel that spills, or becomes narrow, with the 128 registers that a thread has there
-# by default, and not with 256, of which half as many threads run (docs/gpu_check.md).
+# by default, and not with 256, of which half as many threads run (docs/devices.md).
 SPILLING_ON_INTEL = frozenset(
     (
         "layers/conv_backward_weights",
@@ -121,7 +121,7 @@ class Memory(cl.Buffer):
 
 class Device:
     """One OpenCL device with its queue, programs and buffers. debug: PP_DEBUG
-    (docs/environment.md). is_cpu: drivers and kernels take their form for CPUs. has_watchdog: long
+    (docs/devices.md). is_cpu: drivers and kernels take their form for CPUs. has_watchdog: long
     kernels are launched in parts.
     """
 

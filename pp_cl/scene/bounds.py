@@ -12,7 +12,7 @@ from pp_cl.scene.views import MASK_THRESHOLD, View
 
 # how far, in image sizes, an object that the image border cuts off may reach beyond the border
 CROPPED_MARGIN = 0.5
-# of the box of the eyes, world units: what float32 computes with (docs/scene_scale.md)
+# of the box of the eyes, world units: what float32 computes with (docs/scenes.md)
 LEAST_REACH, MOST_REACH = 1e-12, 1e15
 LEAST_SHARE = 1e-9  # of a distance: less of it is rounding
 SOLVED, INFEASIBLE = 0, 2  # status of scipy.optimize.linprog

@@ -217,7 +217,7 @@ def _search(dev, views, points, box):
 
 
 def depth_range(views: Sequence[View], hull: Hull) -> tuple[float, float]:
-    """(near, far) for all views, as Euclidean distances in world units (docs/scene_scale.md).
+    """(near, far) for all views, as Euclidean distances in world units (docs/scenes.md).
 
     The ball around the hull, DEPTH_MARGIN times enlarged, lies between them for every view. Where a
     camera is closer than that, near is half its distance from the hull's box, and inside the box

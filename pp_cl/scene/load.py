@@ -46,7 +46,7 @@ READERS = (transforms, co3d, neus, nsvf, colmap, llff)
 DECODED, UNDISTORTED, CUT_OUT = 18, 125, 160
 READING_BYTES = 3 * 2**28  # of the photographs that are read side by side
 
-LEAST_FOCAL, MOST_FOCAL = 1e-2, 1e7  # pixels; docs/scene_scale.md says what is measured
+LEAST_FOCAL, MOST_FOCAL = 1e-2, 1e7  # pixels; docs/scenes.md says what is measured
 
 NEARBY = 100  # entries of a folder without a scene in which one is looked for
 

@@ -1,4 +1,4 @@
-"""The documents: every file that they name exists, and the index names every document."""
+"""The documents: what they name exists, the README names every page, and they stay short."""
 
 import re
 from pathlib import Path
@@ -14,8 +14,9 @@ DOCUMENTS = [
 ]
 PATH = re.compile(r"`((?:pp_cl|cl|tests|tools|docs)/[\w./]+)`")
 PLACEHOLDER = re.compile(r"\bW/|\b(?:test_)?x\.")  # as in cl/W/x.cl
-# History: the changelog and a measurement name them.
+# History: the changelog names them.
 REMOVED = {"tools/paper_scale.py", "tools/active_tiles.py"}
+MOST_WORDS = 20_000  # of README.md and docs/, generated pages included
 
 
 def named_files(text: str, folder: Path) -> list[Path]:
@@ -37,19 +38,49 @@ def test_named_files_exist(path):
     assert not [str(file) for file in files if not file.exists()]
 
 
-@pytest.mark.parametrize("page", ["glossary", "architecture"])
-def test_files_below_pp_cl_exist(page):
-    text = (ROOT / "docs" / f"{page}.md").read_text("utf-8")
-    wings = "|".join(p.name for p in (ROOT / "pp_cl").iterdir() if p.is_dir())
-    names = re.findall(rf"`((?:(?:{wings})/)[\w/]+\.py)`", text)
+def test_files_in_the_architecture_exist():
+    text = (ROOT / "docs" / "architecture.md").read_text("utf-8")
+    names = {n for n in re.findall(r"`((?:\w+/)*\w+\.py)`", text) if not PLACEHOLDER.search(n)}
     assert names
-    assert not [name for name in names if not (ROOT / "pp_cl" / name).exists()]
+    assert not [n for n in names if not ((ROOT / n).exists() or (ROOT / "pp_cl" / n).exists())]
 
 
-def test_the_index_names_every_document():
-    text = (ROOT / "docs" / "index.md").read_text("utf-8")
-    linked = {path.resolve() for path in named_files(text, ROOT / "docs")}
-    assert {path for path in DOCUMENTS if path.name != "index.md"} <= linked
+def test_documents_named_in_the_code_exist():
+    sources = [
+        path
+        for folder in ("pp_cl", "cl", "tools", "tests")
+        for path in (ROOT / folder).rglob("*.[pch]*")
+        if path.suffix in (".py", ".cl", ".h")
+    ]
+    named = {w for p in sources for w in re.findall(r"\bdocs/\w+\.md", p.read_text("utf-8"))}
+    assert named
+    assert not [name for name in named if not (ROOT / name).exists()]
+
+
+def test_the_readme_names_every_document():
+    linked = {path.resolve() for path in named_files((ROOT / "README.md").read_text("utf-8"), ROOT)}
+    assert {path for path in DOCUMENTS if path.name != "README.md"} <= linked
+
+
+def test_links_into_a_page_name_one_of_its_headings():
+    broken = [
+        f"{path.name}: {page}#{anchor}"
+        for path in DOCUMENTS
+        for page, anchor in re.findall(r"\]\(([^)#:]*)#([^)]*)\)", path.read_text("utf-8"))
+        if anchor not in anchors(path.parent / page if page else path)
+    ]
+    assert not broken
+
+
+def anchors(page: Path) -> set[str]:
+    """The names by which links reach the headings of a page."""
+    headings = re.findall(r"(?m)^#+ (.*)$", page.read_text("utf-8"))
+    return {re.sub(r"[^\w -]", "", h.lower()).replace(" ", "-") for h in headings}
+
+
+def test_the_documents_stay_short():
+    pages = [ROOT / "README.md", *(ROOT / "docs").rglob("*.md")]
+    assert sum(len(path.read_text("utf-8").split()) for path in pages) <= MOST_WORDS
 
 
 @pytest.mark.parametrize(

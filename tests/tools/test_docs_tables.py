@@ -6,9 +6,12 @@ from pathlib import Path
 
 import pytest
 
+from pp_cl.cli import COMMANDS
+from pp_cl.config import Config, sections
 from tools import docs_tables as TOOL
 
 ROOT = Path(__file__).parents[2]
+TABLES = TOOL.read_tables(ROOT / "docs" / "results")
 
 RESULTS = {
     "measured": "times",
@@ -21,7 +24,7 @@ RESULTS = {
 TABLE = """Times. Measured with version 1 on a machine.
 
 | n | error |
-| --- | --- |
+|---|---|
 | 1,000 | 2.0e-6 |
 | 2 points | 0 |
 | x |  |
@@ -41,13 +44,21 @@ def test_an_estimate_is_not_called_measured():
 @pytest.mark.parametrize("path", TOOL.documents(ROOT), ids=lambda path: path.stem)
 def test_documents_are_up_to_date(path):
     text = path.read_text("utf-8")
-    assert TOOL.with_tables(text, TOOL.read_results(ROOT / "docs" / "results")) == text
+    assert TOOL.with_tables(text, TABLES) == text
 
 
-def test_all_results_are_shown_once():
+def test_all_results_are_shown_once_or_linked():
     text = "".join(path.read_text("utf-8") for path in TOOL.documents(ROOT))
     shown = re.findall(r"(?m)^<!-- table: (\S+) -->$", text)
-    assert sorted(shown) == sorted(TOOL.read_results(ROOT / "docs" / "results"))
+    linked = set(re.findall(r"results/(\w+)\.json", text)) - set(shown)
+    assert sorted([*shown, *linked]) == sorted(TABLES)
+
+
+def test_settings_and_commands_are_complete():
+    for section, values in sections(Config()):
+        assert all(f"| `{section}.{name}` |" in TABLES["settings"] for name in vars(values))
+    assert all(f"## pp-cl {name}\n" in TABLES["commands"] for name in COMMANDS)
+    assert "- `--seed S`: " in TABLES["commands"]
 
 
 def test_it_writes_what_changed_and_nothing_else(tmp_path, capsys):
