@@ -104,8 +104,8 @@ class Model:
         *,
         degree: int,
     ) -> Model:
-        """Model of a checkpoint's header and arrays, as training/stored.py has checked them; the
-        arrays are taken out of `arrays`, net takes the parameters stored there.
+        """Model of a checkpoint's header and arrays, as training/checkpoint.py has checked them;
+        the arrays are taken out of `arrays`, net takes the parameters stored there.
         """
         grid = Grid.of_header(header["grid"])
         cloud = PointCloud.load(dev, arrays, degree)

@@ -14,9 +14,9 @@ from pyopencl.array import Array
 
 from pp_cl.device.buffers import Buffers, Table
 from pp_cl.device.device import Device
-from pp_cl.device.transfer import send
+from pp_cl.device.transfer import Reading, send
 from pp_cl.files.picture import Picture
-from pp_cl.layers.tiles import TileFlags, tiles_hit
+from pp_cl.layers.tiles import tiles_hit
 from pp_cl.model import Model
 from pp_cl.raster.blend import BLENDS, Blend
 from pp_cl.raster.blend_weights import PixelWeights
@@ -53,7 +53,7 @@ class ViewWeights:
     points: ProjectedPoints
     pairs: Pairs
     weights: PixelWeights
-    tiles: TileFlags | None
+    tiles: Reading[np.ndarray] | None
 
     @property
     def camera_buffer(self) -> Array:
@@ -195,7 +195,7 @@ class Renderer:
         return ViewWeights(tuple(offset), points, pairs, weights, tiles)
 
     def _weigh(self, points, size, gamma, drops):
-        """(Pairs, PixelWeights, TileFlags): anew where there was no room for all pairs."""
+        """(Pairs, PixelWeights, tiles that have hits): anew where there was no room for all pairs."""
         while True:
             with self.dev.stage("pairs"):
                 pairs = self._pairs.enqueue(points, size)

@@ -35,8 +35,8 @@ from pp_cl.scene.open import DEMO, open_scene, scene_frames
 from pp_cl.scene.photograph import Photograph
 from pp_cl.scene.target import Target
 from pp_cl.scene.views import View
+from pp_cl.training.checkpoint import load_run_state
 from pp_cl.training.schedule import gamma_at
-from pp_cl.training.stored import load_run_state
 
 COMPARED_VIEWS = 2  # training photographs that tell whether a scene is the run's
 NEAREST = 0.05  # of a point to the eye, in radii of the object

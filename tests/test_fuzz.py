@@ -60,7 +60,7 @@ from pp_cl.scene.readers.frame import frame_keys
 from pp_cl.session import run_config
 from pp_cl.sweep.plan import Job, plan, read_seeds, read_varied
 from pp_cl.sweep.result import finished_row, progress
-from pp_cl.training.stored import load_run_state
+from pp_cl.training.checkpoint import load_run_state
 from pp_cl.view.follow import LogFollower
 from pp_cl.view.messages import read_request
 

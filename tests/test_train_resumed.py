@@ -140,7 +140,7 @@ def test_another_scene_is_refused_at_any_state_of_the_run(
 
 
 @pytest.mark.parametrize(
-    "lost", ["moment.m.enc0.a.weight", "state.v.sh", "state.last_step", "state.peak_weight"]
+    "lost", ["moment.m.enc0.a.weight", "state.v.sh", "state.last_step", "state.max_weight"]
 )
 def test_a_checkpoint_without_its_training_state_is_refused(
     scene, tmp_path, capsys, monkeypatch, lost

@@ -19,7 +19,7 @@ from pp_cl.network.unet import UNet
 from pp_cl.scene.hull import build_grid, depth_range
 from pp_cl.scene.open import open_scene, scene_box
 from pp_cl.train import Trainer
-from pp_cl.training.optimiser import Rates
+from pp_cl.training.schedule import Rates
 
 TRIED_STEPS = 4  # whose time says how many fit; the first builds the kernels and does not count
 TIMED_STEPS = 6  # the last ones, by stage
@@ -103,7 +103,7 @@ def bench_step(
                     trainer.optimiser.update(
                         step,
                         rates,
-                        gradients,
+                        *gradients,
                         points=result.points,
                         shaded=result.shaded,
                         sh_eps=1e-10,

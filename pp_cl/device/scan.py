@@ -1,7 +1,5 @@
 """Exclusive prefix sums on the device, and the list of the non-zero entries."""
 
-from functools import cached_property
-
 import numpy as np
 from pyopencl.array import Array
 
@@ -63,28 +61,13 @@ def _launch(dev, kernel, blocks, **arguments):
     launch_groups(dev, "device/scan", kernel, blocks, defines=defines, **arguments)
 
 
-class DeviceList:
-    """Indices that the device lists, ascending, and that it knows the number of.
-
-    total: Reading of one number, how many they are.
-    """
-
-    def __init__(self, total: Reading, indices: Array):
-        self._total, self._indices = total, indices
-
-    @cached_property
-    def array(self) -> Array:
-        """(S,) uint32 on the device; waits until their number is known."""
-        return self._indices[: int(self._total.get()[0])]
+def read_total(dev: Device, offsets: Array) -> Reading[int]:
+    """The last entry of `offsets`."""
+    return read_later(dev, offsets, len(offsets) - 1, lambda last: int(last[0]))
 
 
-def read_total(dev: Device, offsets: Array) -> Reading:
-    """The last entry of `offsets`, on its way."""
-    return read_later(dev, offsets, len(offsets) - 1)
-
-
-def nonzero(dev: Device, flags: Array, indices: Array) -> DeviceList:
-    """Where flags are not zero, listed in the front of `indices`.
+def nonzero(dev: Device, flags: Array, indices: Array) -> Reading[Array]:
+    """(S,) uint32 on the device, the front of `indices`: where flags are not zero, ascending.
 
     flags: (N) uint8, N >= 1. indices: (N) uint32.
     """
@@ -101,4 +84,4 @@ def nonzero(dev: Device, flags: Array, indices: Array) -> DeviceList:
         block_offset=block_offset,
         indices=indices,
     )
-    return DeviceList(read_total(dev, block_offset), indices)
+    return read_later(dev, block_offset, blocks, lambda total: indices[: int(total[0])])

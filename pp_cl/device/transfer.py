@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Hashable, Sequence
+from collections.abc import Callable, Hashable, Sequence
+from typing import Any, Generic, TypeVar
 
 import numpy as np
 import pyopencl as cl
@@ -11,23 +12,36 @@ from pyopencl.array import Array
 
 from pp_cl.device.device import Device
 
+T = TypeVar("T")
 
-class Reading:
-    """A copy of a device array that is on its way to the host."""
 
-    def __init__(self, event: cl.Event, values: np.ndarray):
-        self._event, self._values = event, values
+class Reading(Generic[T]):
+    """Something that the host knows once numbers have come from the device.
 
-    def get(self) -> np.ndarray:
-        """The values; waits until they are there."""
+    values: on their way until the event. convert: what they mean.
+    """
+
+    def __init__(self, event: cl.Event, values: np.ndarray, convert: Callable[[np.ndarray], T]):
+        self._event, self._values, self._convert = event, values, convert
+
+    def get(self) -> T:
+        """What the numbers mean; waits until they are there."""
         if self._event is not None:
             self._event.wait()
+            self._values = self._convert(self._values)
             self._event = None
         return self._values
 
 
-def read_later(dev: Device, array: Array, start: int = 0) -> Reading:
-    """A copy of array[start:], (N,), as the kernels enqueued so far will leave it."""
+def read_later(
+    dev: Device,
+    array: Array,
+    start: int = 0,
+    convert: Callable[[np.ndarray], Any] = lambda values: values,
+) -> Reading:
+    """array[start:], (N,), as the kernels enqueued so far will leave it. convert: applied once to
+    the numpy array, when it is asked for; what it raises, get() raises.
+    """
     values = np.empty(len(array) - start, array.dtype)
     event = dev.attempt(
         "download a buffer",
@@ -38,7 +52,7 @@ def read_later(dev: Device, array: Array, start: int = 0) -> Reading:
         src_offset=array.offset + start * array.dtype.itemsize,
         is_blocking=False,
     )
-    return Reading(event, values)
+    return Reading(event, values, convert)
 
 
 def send(dev: Device, array: Array, values: np.ndarray) -> None:

@@ -79,27 +79,17 @@ def checked_tiles(dev: Device, tiles: Tiles | None, height: int, width: int) -> 
     return tiles
 
 
-@dataclass(frozen=True)
-class TileFlags:
-    """What is true of which tiles, as the device finds out."""
-
-    shape: tuple[int, int]
-    reading: Reading
-
-    def get(self) -> np.ndarray:
-        """(rows, columns) bool; waits until it is known."""
-        return self.reading.get().reshape(self.shape) != 0
-
-
-def tiles_find(dev: Device, x: Array, background: float) -> TileFlags:
-    """The tiles of x (H, W, C) float32 in which some value is not `background`."""
+def tiles_find(dev: Device, x: Array, background: float) -> Reading[np.ndarray]:
+    """(rows, columns) bool: the tiles of x (H, W, C) float32 in which some value is not
+    `background`.
+    """
     h, w, c = x.shape
     return _flags(dev, "tiles_find", (h, w), c=c, background=background, x=x)
 
 
-def tiles_hit(dev: Device, pixel_offset: Array, size: tuple[int, int]) -> TileFlags:
-    """The tiles of an image of size (height, width) in which some pixel has hits, by its
-    Pairs.pixel_offset (HW+1,) uint32.
+def tiles_hit(dev: Device, pixel_offset: Array, size: tuple[int, int]) -> Reading[np.ndarray]:
+    """(rows, columns) bool: the tiles of an image of size (height, width) in which some pixel has
+    hits, by its Pairs.pixel_offset (HW+1,) uint32.
     """
     return _flags(dev, "tiles_hit", size, pixel_offset=pixel_offset)
 
@@ -144,4 +134,4 @@ def _flags(dev, kernel, size, **arguments):
     _program(dev).launch(
         kernel, tiles, h=size[0], w=size[1], flags=flags.reshape(shape), **arguments
     )
-    return TileFlags(shape, read_later(dev, flags))
+    return read_later(dev, flags, convert=lambda values: values.reshape(shape) != 0)

@@ -28,14 +28,15 @@ from pp_cl.layers.tiles import (
     all_tiles,
     all_tiles_buffers,
     copy_list,
+    grid_shape,
     tile_arrays,
     tiles_copy,
 )
 from pp_cl.network.layers import Layer, convolutions, levels_of
 
-# Pixels: tiles of the image's gradient that are nearer to its border are classes of their own,
-# because the loss sees the border from afar, too.
-LOSS_BORDER = 48
+# How far the loss sees, in pixels: from a target's pixel to the gradients that depend on it, by
+# two of SSIM's windows; and from the image's border, together with the network.
+LOSS_RADIUS, LOSS_BORDER = 10, 48
 
 
 # Sets of tiles are (rows, columns) bool.
@@ -62,6 +63,18 @@ def grow(tiles: np.ndarray, n: int = 1) -> np.ndarray:
         tiles[:, 1:] |= rows[:, :-1]
         tiles[:, :-1] |= rows[:, 1:]
     return tiles
+
+
+def gradient_tiles(found: np.ndarray, size: tuple[int, int], offset: tuple[int, int]) -> np.ndarray:
+    """The tiles of an image of `size` = (height, width) whose gradient of the loss depends on more
+    than an image of one colour before a white target, borders aside.
+
+    found: (?, ?) bool, the target's tiles that are not all white. offset: (left, top) of the target
+    in the image, less than a tile.
+    """
+    tiles = np.zeros(grid_shape(*size), bool)
+    tiles[: found.shape[0], : found.shape[1]] = found
+    return grow(tiles, -(-(LOSS_RADIUS + max(offset)) // SIDE))
 
 
 def halve(tiles: np.ndarray, levels: int = 1) -> np.ndarray:

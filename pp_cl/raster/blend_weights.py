@@ -12,7 +12,8 @@ from pyopencl.array import Array
 
 from pp_cl.device.buffers import Buffers, Table
 from pp_cl.device.device import Device
-from pp_cl.device.scan import DeviceList, nonzero
+from pp_cl.device.scan import nonzero
+from pp_cl.device.transfer import Reading
 from pp_cl.raster.pairs import Pairs
 
 DROPPED = 2  # cl/raster/pair_role.h
@@ -35,7 +36,7 @@ class PixelWeights:
     pair_weight: Array
     pair_role: Array
     pixel_entry: Array
-    shaded_list: DeviceList
+    shaded_list: Reading[Array]
     transmittance: Array | None = None
 
     @property
@@ -43,7 +44,7 @@ class PixelWeights:
         """(S,) uint32, ascending, the points with a hit that is not dropped: no other point's
         features are read, no other point gets a gradient. Waits until their number is known.
         """
-        return self.shaded_list.array
+        return self.shaded_list.get()
 
 
 class BlendWeights(ABC):

@@ -27,7 +27,7 @@ class Pairs:
     P is what there was room for: where there are more pairs, there are none of the pixels, and
     those of the points must not be read.
 
-    count: of one number, how many pairs there are.
+    count: how many pairs there are.
     point_offset: (N+1,) uint32, point i owns pairs point_offset[i] to point_offset[i+1].
     pixel_offset: (HW+1,) uint32, pixel q owns keys pixel_offset[q] to pixel_offset[q+1].
     pair_pixel: (P,) uint32, y*W + x. pair_point_closeness: (P, 2) uint32, the point, and the bits
@@ -35,7 +35,7 @@ class Pairs:
     each pixel by depth, then by point.
     """
 
-    count: Reading
+    count: Reading[int]
     point_offset: Array
     pixel_offset: Array
     pair_pixel: Array
@@ -45,7 +45,7 @@ class Pairs:
     @property
     def total(self) -> int:
         """The number of pairs; waits until it is known."""
-        return int(self.count.get()[0])
+        return self.count.get()
 
     @property
     def capacity(self) -> int:

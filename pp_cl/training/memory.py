@@ -31,11 +31,11 @@ from pp_cl.scene.shrink import kept_bytes, shrink_factor
 from pp_cl.training.crops import crop_side
 from pp_cl.training.loss import Loss, lanes_of_loss
 from pp_cl.training.mask import MaskLoss
-from pp_cl.training.optimiser import Optimiser
+from pp_cl.training.optim import Optimiser
 from pp_cl.training.perceptual import PerceptualLoss
-from pp_cl.training.point_state import PointState
 from pp_cl.training.schedule import ema_start, prunings, refine_steps
 from pp_cl.training.smooth import Smoother, chunk_points
+from pp_cl.training.state import PointState
 
 MIB, GIB = 2**20, 2**30
 # The share of the points that k prunings leave is about FIRST * k^-SLOWER on the initial grid, and

@@ -2,11 +2,11 @@
 
 import numpy as np
 import pytest
+from pp_cl.training.adam import Ema, adam_update, ema_update
 from support.comparisons import relative_error
 from support.guarded import AWKWARD_SIZES
 
 from pp_cl.reference import optim as oracle_optim
-from pp_cl.training.adam import Ema, adam_update, ema_update
 
 
 def moments(dev, parameter):

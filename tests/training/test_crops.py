@@ -2,7 +2,6 @@
 
 import numpy as np
 import pytest
-
 from pp_cl.training.crops import BOX_MARGIN, END_SHARE, draw_start
 
 

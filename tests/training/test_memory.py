@@ -20,7 +20,7 @@ from pp_cl.scene.open import open_scene
 from pp_cl.scene.photograph import Photograph
 from pp_cl.train import Trainer
 from pp_cl.training.memory import Moment, Plan, Sketch, memory_plan, plan_lines
-from pp_cl.training.point_state import PointState
+from pp_cl.training.state import PointState
 
 POINTS = 27_000
 PAPER_POINTS = 4_040_533  # lego, supplemental Table 4
@@ -120,8 +120,8 @@ def test_pruning_stays_within_the_plan(dev, tmp_path, monkeypatch):
     pruning = table_bytes(compact_table(POINTS, 192))
     assert pruning == POINTS * 4 + 10**6
     before, dev.peak_bytes = dev.bytes, dev.bytes
-    trainer.state.peak_weight.set(np.arange(POINTS, dtype=np.float32))
-    trainer.state.look_count.set(np.full(POINTS, 100, np.float32))
+    trainer.state.max_weight.set(np.arange(POINTS, dtype=np.float32))
+    trainer.state.times_seen.set(np.full(POINTS, 100, np.float32))
     trainer.prune()
     assert trainer.model.cloud.count == POINTS - 1
     assert dev.peak_bytes <= before + 10**6 + 2 * 4 * POINTS  # the weights and the list of the kept

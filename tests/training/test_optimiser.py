@@ -1,9 +1,9 @@
 """The learning rates of a step."""
 
 import pytest
+from pp_cl.training.optimiser import Rates
 
 from pp_cl.settings import NetworkConfig, TrainConfig
-from pp_cl.training.optimiser import Rates
 
 
 @pytest.mark.parametrize(

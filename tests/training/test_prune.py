@@ -8,8 +8,8 @@ from pp_cl.device.buffers import table_bytes
 from pp_cl.errors import Diverged
 from pp_cl.raster.point_cloud import PointCloud
 from pp_cl.settings import TrainConfig
-from pp_cl.training.point_state import PointState
 from pp_cl.training.prune import judge, keep_indices
+from pp_cl.training.state import PointState
 
 
 def kept(dev, weights, least_weight, opacities, least_opacity):
@@ -44,7 +44,7 @@ def test_compacting_never_takes_more_than_its_scratch(dev, rng, monkeypatch, sha
     del array  # else it is not released
     state = PointState(dev, cloud)
     state.ema.update(cloud.learned(), 1.0)
-    state.peak_weight.set(rng.random(1000).astype(np.float32))
+    state.max_weight.set(rng.random(1000).astype(np.float32))
     state.restore(
         cloud,
         {k: (1e3 * rng.random(a.shape)).astype(a.dtype) for k, a in state.arrays().items()},
@@ -78,15 +78,15 @@ def test_only_what_was_looked_at_is_judged(dev):
     settings = TrainConfig(prune_weight=0.1, prune_looks=10, prune_opacity=0.01, sh_rate=(1, 0, 0))
     cloud = PointCloud.create(dev, np.arange(6), 0)
     state = PointState(dev, cloud)
-    state.peak_weight.set(np.float32([0, 0, 0.09, 0.1, 100, 0]))
-    state.look_count.set(np.float32([9, 10, 10, 10, 1000, 10]))
+    state.max_weight.set(np.float32([0, 0, 0.09, 0.1, 100, 0]))
+    state.times_seen.set(np.float32([9, 10, 10, 10, 1000, 10]))
     opacity = dev.upload(np.float32([0, 1, 1, 1, 1, 1]))
     assert judge(dev, state, opacity, settings).get().tolist() == [0, 3, 4]
-    assert state.look_count.get().tolist() == [9, 0, 0, 0, 0, 0]
-    assert not state.peak_weight.get().any()
+    assert state.times_seen.get().tolist() == [9, 0, 0, 0, 0, 0]
+    assert not state.max_weight.get().any()
     opacity.set(np.float32([0, 1, 1, 0, 1, 1]))
-    state.look_count.set(np.float32([20, 9, 9, 20, 0, 0]))
-    state.peak_weight.set(np.float32([5, 0, 0, 5, 0, 0]))
+    state.times_seen.set(np.float32([20, 9, 9, 20, 0, 0]))
+    state.max_weight.set(np.float32([5, 0, 0, 5, 0, 0]))
     assert judge(dev, state, opacity, settings).get().tolist() == [1, 2, 4, 5]
 
 
@@ -96,7 +96,7 @@ def test_what_is_not_finite_is_told_of_and_not_pruned_away(dev, peak, opacity):
     settings = TrainConfig(prune_looks=10)
     cloud = PointCloud.create(dev, np.arange(2), 0)
     state = PointState(dev, cloud)
-    state.peak_weight.set(np.float32([0, peak]))
+    state.max_weight.set(np.float32([0, peak]))
     with pytest.raises(Diverged, match="^1 points have"):
         judge(dev, state, dev.upload(np.float32([1, opacity])), settings)
 
@@ -105,6 +105,6 @@ def test_one_judged_point_always_survives(dev):
     settings = TrainConfig(prune_looks=1, prune_weight=1.0)
     cloud = PointCloud.create(dev, np.arange(3), 2)
     state = PointState(dev, cloud)
-    state.peak_weight.set(np.float32([0.1, 0.3, 0.2]))
-    state.look_count.set(np.float32([10, 10, 10]))
+    state.max_weight.set(np.float32([0.1, 0.3, 0.2]))
+    state.times_seen.set(np.float32([10, 10, 10]))
     assert judge(dev, state, cloud.opacity, settings).get().tolist() == [1]

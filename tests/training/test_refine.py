@@ -2,12 +2,12 @@
 
 import numpy as np
 import pytest
+from pp_cl.training.refine import refine, split_opacity
 from support.guarded import AWKWARD_SIZES
 from support.models import fetched, make_model
 
 from pp_cl.scene.grid import Grid
-from pp_cl.training.point_state import PointState
-from pp_cl.training.refine import refine, split_opacity
+from pp_cl.training.state import PointState
 
 
 @pytest.mark.parametrize("n", AWKWARD_SIZES)
@@ -56,7 +56,7 @@ def test_all_arrays_follow(dev, rng, composited):
     assert model.grid == grid.refined() and after.keys() == before.keys()
     np.testing.assert_array_equal(model.grid_buffer.get(), grid.refined().packed(grid.centre))
     np.testing.assert_array_equal(after.pop("points.ids"), ids)
-    assert not after.pop("state.peak_weight").any() and not after.pop("state.look_count").any()
+    assert not after.pop("state.max_weight").any() and not after.pop("state.times_seen").any()
     for name, array in after.items():
         expected = before[name][parents]
         if composited and name in ("points.opacity", "state.a.opacity"):

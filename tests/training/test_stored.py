@@ -29,7 +29,7 @@ from pp_cl.errors import UserError
 from pp_cl.files.checkpoint import load_checkpoint, save_checkpoint
 from pp_cl.files.run_folder import RunFolder
 from pp_cl.run import load_run
-from pp_cl.training.stored import load_run_state, opened_run, stored_forms
+from pp_cl.training.checkpoint import load_run_state, opened_run, stored_forms
 from pp_cl.view.live_run import LiveRun
 from pp_cl.view.messages import read_request
 
@@ -209,7 +209,7 @@ ARRAYS = {
     "negative squares inside": ("moment.v.dec0.a.bias", lambda a: -a, "moment.v.dec0.a.bias"),
     "a step to come": ("state.last_step", lambda a: a + np.uint32(STEP + 1), "steps that are done"),
     "no last steps": ("state.last_step", None, "state.last_step is missing"),
-    "negative weights": ("state.peak_weight", lambda a: -a, "state.peak_weight holds other than"),
+    "negative weights": ("state.max_weight", lambda a: -a, "state.max_weight holds other than"),
     "an average too early": ("average.out.bias", ONE, "holds average.out.bias"),
     "what nobody asked for": ("photographs", ONE, "holds photographs, which does not belong"),
     "texts": ("net.out.bias", lambda a: np.array(["x"] * 16), "corrupt checkpoint"),

@@ -18,7 +18,7 @@ from support.checkpoints import (
 
 from pp_cl.errors import UserError
 from pp_cl.files.run_folder import RunFolder
-from pp_cl.training.stored import load_run_state
+from pp_cl.training.checkpoint import load_run_state
 
 
 @pytest.fixture

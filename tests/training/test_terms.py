@@ -2,10 +2,10 @@
 
 import numpy as np
 import pytest
+from pp_cl.training.terms import StepTerms
 
 from pp_cl.device.transfer import read_later
 from pp_cl.errors import Diverged
-from pp_cl.training.terms import StepTerms
 
 
 def step_terms(dev, values, **others):
