@@ -195,7 +195,7 @@ class Renderer:
         return ViewWeights(tuple(offset), points, pairs, weights, tiles)
 
     def _weigh(self, points, size, gamma, drops):
-        """(Pairs, PixelWeights, tiles that have hits): anew where there was no room for all pairs."""
+        """(Pairs, PixelWeights, tiles that have hits): anew if there was no room for all pairs."""
         while True:
             with self.dev.stage("pairs"):
                 pairs = self._pairs.enqueue(points, size)

@@ -41,7 +41,7 @@ from pp_cl.scene.outline import picture
 from pp_cl.scene.views import View
 from pp_cl.train import Trainer
 from pp_cl.training.checkpoint import load_run_state, opened_run
-from pp_cl.training.fitting import Room
+from pp_cl.training.memory import Room
 
 FIRST_PREVIEW = 10.0  # seconds; with a slow step and its writing it shows within 20
 MEASURED_VIEWS = 4
