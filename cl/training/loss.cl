@@ -9,7 +9,7 @@
 // pixel, so a step of one pixel is a step of 3 values.
 //
 // The kernels run in their order here: moments of the windows along y; along x, then SSIM and its
-// slopes; slopes spread along x; along y, with the gradient; sums. Scratch rows are BLOCKS vectors
+// slopes; slopes summed along x; along y, with the gradient; sums. Scratch rows are BLOCKS vectors
 // of LANES values long, MARGIN more than 3W values need, so that no tap along x needs a test.
 #include "group.h"
 #include "lanes.h"
@@ -129,17 +129,17 @@ kernel void loss_similarity(
 
 // One work-item per LANES values of a row of windows: sums the slopes of the 11 windows of the row
 // that see each value.
-kernel void loss_spread(
+kernel void loss_row_slopes(
     const uint v,                // rows of windows
     const uint blocks,           // vectors in a scratch row
     global const float *slopes,  // (V, 3, BLOCKS, LANES)
-    global float *spread)        // (V, 3, BLOCKS, LANES) without the last MARGIN blocks
+    global float *row_slopes)    // (V, 3, BLOCKS, LANES) without the last MARGIN blocks
 {
     const int b = get_global_id(0), y = get_global_id(1);
     if (b + MARGIN >= blocks || y >= v) return;
     for (int f = 0; f < 3; f++) {
         const size_t row = ((size_t)y * 3 + f) * blocks;
-        ((global floats *)spread)[row + b] =
+        ((global floats *)row_slopes)[row + b] =
             blur_along_x((global const floats *)slopes + row, LANES * (b + MARGIN), -3);
     }
 }
@@ -162,7 +162,7 @@ kernel void loss_gradient(
     const float beta,                // of smooth L1
     global const float *prediction,  // (PH, PW, 3)
     global const float *target,      // (H, W, 3)
-    global const float *spread,      // (V, 3, BLOCKS, LANES)
+    global const float *row_slopes,  // (V, 3, BLOCKS, LANES)
     global float *grad_prediction,   // (PH, PW, 3)
     global float4 *partial_terms)    // (ROWS, BLOCKS, 4) rows V to V + H - 1
 {
@@ -178,7 +178,7 @@ kernel void loss_gradient(
         floats slope_0 = 0.0f, slope_d = 0.0f, slope_s = 0.0f;
         for (int k = max(0, y - (int)v + 1); k < TAPS && k <= y; k++) {
             global const floats *row =
-                (global const floats *)spread + 3 * (size_t)blocks * (y - k) + b;
+                (global const floats *)row_slopes + 3 * (size_t)blocks * (y - k) + b;
             slope_0 += WINDOW[k] * row[0];
             slope_d += WINDOW[k] * row[blocks];
             slope_s += WINDOW[k] * row[2 * blocks];

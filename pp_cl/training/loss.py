@@ -58,7 +58,7 @@ class Loss:
         shapes = {
             "moments": (window_rows, 4, blocks, values),
             "slopes": (window_rows, 3, blocks, values),
-            "spread": (window_rows, 3, blocks, values),
+            "row_slopes": (window_rows, 3, blocks, values),
             "partial_terms": (window_rows + height, blocks, 4),
             "row_terms": (window_rows + height, 4),
             "grad_prediction": tuple(prediction_shape),
@@ -76,42 +76,61 @@ class Loss:
         ValueError where it reaches outside.
         """
         corner = corner_of(prediction.shape, target.shape, left, top)
-        height, width, _ = target.shape
-        b = self._buffers
+        (height, width, _), pw, b = target.shape, prediction.shape[1], self._buffers
         values = lanes_of_loss(self.dev)
         b.require(self.table(prediction.shape, target.shape, self.ssim_weight, values))
         window_rows, _, blocks, _ = b.moments.shape
-        rows, size = {"v": window_rows, "blocks": blocks}, (blocks, window_rows)
-        images = {"prediction": prediction, "target": target}
-        images |= {"pw": prediction.shape[1], "w": width, "corner": corner}
-        slopes, spread, partial_terms = b.slopes, b.spread, b.partial_terms
-
-        self._launch("loss_moments", size, moments=b.moments, **images, **rows)
-        self._launch(
-            "loss_similarity",
-            size,
+        program = self.dev.program("training/loss", GROUP=group_items(self.dev), **self._defines)
+        program.launch(
+            "loss_moments",
+            (blocks, window_rows),
+            v=window_rows,
             w=width,
+            pw=pw,
+            corner=corner,
+            blocks=blocks,
+            prediction=prediction,
+            target=target,
+            moments=b.moments,
+        )
+        program.launch(
+            "loss_similarity",
+            (blocks, window_rows),
+            v=window_rows,
+            w=width,
+            blocks=blocks,
             weight=self.ssim_weight,
             moments=b.moments,
-            slopes=slopes,
-            partial_terms=partial_terms,
-            **rows,
+            slopes=b.slopes,
+            partial_terms=b.partial_terms,
         )
-        self._launch("loss_spread", size, slopes=slopes, spread=spread, **rows)
+        program.launch(
+            "loss_row_slopes",
+            (blocks, window_rows),
+            v=window_rows,
+            blocks=blocks,
+            slopes=b.slopes,
+            row_slopes=b.row_slopes,
+        )
         if prediction.shape != target.shape:
             self.dev.fill(b.grad_prediction, 0)
-        self._launch(
+        program.launch(
             "loss_gradient",
             (blocks, height),
+            v=window_rows,
             h=height,
+            w=width,
+            pw=pw,
+            corner=corner,
+            blocks=blocks,
             beta=self.beta,
-            spread=spread,
+            prediction=prediction,
+            target=target,
+            row_slopes=b.row_slopes,
             grad_prediction=b.grad_prediction,
-            partial_terms=partial_terms,
-            **images,
-            **rows,
+            partial_terms=b.partial_terms,
         )
-        self._sum(partial_terms, b.row_terms)
+        self._sum(b.partial_terms, b.row_terms)
         self._sum(b.row_terms.reshape(1, -1, 4), self.terms[:4].reshape(1, 4))
         self._added = []
         return b.grad_prediction
@@ -142,7 +161,8 @@ class Loss:
         gradient.
         """
         pixel_spread = self._buffers.pixel_spread
-        self._launch(
+        program = self.dev.program("training/loss", GROUP=group_items(self.dev), **self._defines)
+        program.launch(
             "loss_pixel_spread",
             pairs.pixels,
             hw=pairs.pixels,
@@ -189,10 +209,6 @@ class Loss:
             terms=terms,
             sums=sums,
         )
-
-    def _launch(self, kernel, size, **arguments):
-        program = self.dev.program("training/loss", GROUP=group_items(self.dev), **self._defines)
-        program.launch(kernel, size, **arguments)
 
     @property
     def _defines(self):
