@@ -242,10 +242,8 @@ class Room:
             largest = max(64 * block.count for block in self._blocks)  # bytes of a point's array
             tables["pruning (at most)"] = compact_table(n, largest)
             host += PRUNING_BYTES * n
-        if (
-            start // train.checkpoint_every
-            < min(end, train.iterations - 1) // train.checkpoint_every
-        ):
+        every, last = train.checkpoint_every, min(end, train.iterations - 1)
+        if start // every < last // every:
             host += 2 * min(PIECE_BYTES, 64 * 8 * n)
         return MemoryPhase(name, n, tables, host)
 

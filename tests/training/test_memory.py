@@ -154,7 +154,8 @@ def planned(dev, base="tiny", points=171_262, step=0, **changes):
     [("tiny", 252_312, 252_312), ("small", 171_262, 94_523 * 8), ("full", 171_262, 455_094 * 8)],
 )
 def test_the_most_points_of_a_plan_are_near_those_of_lego(dev, name, first, most):
-    assert planned(dev, name, first).peak.points == pytest.approx(most, rel=0.1)
+    plan = planned(dev, name, first)
+    assert max(phase.points for phase in plan.phases) == pytest.approx(most, rel=0.1)
 
 
 def test_a_plan_that_goes_on_counts_no_pruning_twice(dev):
@@ -280,8 +281,8 @@ def test_a_buffer_over_the_largest_allocation(plain):
 def test_the_memory_asked_for(plain):
     needed = planned(plain, points=20_000).peak.device / GIB
     check(room(plain, train__memory_gib=f"{1.01 * needed:.4f}"))
-    text = refusal(room(plain, train__memory_gib=f"{0.8 * needed:.4f}"))
-    assert text.startswith(f"--memory {0.8 * needed:.4f}")
+    text = refusal(room(plain, train__memory_gib=f"{0.8 * needed:.3f}"))
+    assert text.startswith(f"--memory {round(0.8 * needed, 3)}")
     assert f"give --memory {np.ceil(100 * needed) / 100:g}" in text
 
 
@@ -300,7 +301,7 @@ def test_the_hosts_memory(plain, monkeypatch):
 def test_presets_on_a_device_of_four_gibibytes(plain, base):
     plain.info |= {"memory_bytes": 4 * GIB, "max_allocation_bytes": 2 * GIB}
     points = preset(base).points.count
-    if base == "paper":
+    if base in ("full", "paper"):
         refusal(room(plain, base), points)
     else:
         check(room(plain, base), points)
