@@ -139,8 +139,8 @@ class Training:
                 start = time.perf_counter()
                 terms = trainer.train_step()
                 seconds += time.perf_counter() - start
-                if trainer.step == first:  # the kernels are built
-                    self._expect_preview()
+                if trainer.step == first and self._lacks_previews():  # the kernels are built
+                    self._preview_by = time.monotonic() + FIRST_PREVIEW
                 row = self._after_step(log, terms, seconds)
                 if on_step:
                     on_step(trainer.step, row)
@@ -186,12 +186,8 @@ class Training:
         pairs = [(self._rendered(view), trainer.target(view)) for view in self.measured]
         return {"test_psnr": float(np.mean([psnr(to_8bit(a), to_8bit(b)) for a, b in pairs]))}
 
-    def _expect_preview(self):
-        """Be due an early preview, by the clock, where the run has none yet. It is an extra, which
-        no later step depends on.
-        """
-        wanted = self.config.train.previews and not any(self.folder.previews.glob("*.png"))
-        self._preview_by = time.monotonic() + FIRST_PREVIEW if wanted else math.inf
+    def _lacks_previews(self):
+        return self.config.train.previews and not any(self.folder.previews.glob("*.png"))
 
     def _expect_save(self):
         """Be due a checkpoint by the clock, which no step depends on."""

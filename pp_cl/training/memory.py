@@ -43,7 +43,8 @@ MIB, GIB = 2**20, 2**30
 # to 0.73 on lego with the presets tiny, small and full.
 KEPT_BY_PRUNING = 0.6
 # bytes on the host: of pruning per point (weights, looks, opacities, and which stay), of refining
-# per point before it (the vertices of its eight in 64 bits, and their order)
+# per point before it (the vertices of its eight in 64 bits, and their order); checkpoints are
+# written in pieces
 PRUNING_BYTES, REFINING_BYTES = 24, 320
 LEAST_RADIUS = 0.75  # pixels, as cl/raster/footprint.h has it
 # What a driver's compiler takes of the host until all kernels of a training are built, measured;
@@ -211,7 +212,7 @@ class Room:
         )
 
     def _phases(self, n, radius, layers, step):
-        """From the step on: each level of refinement, its averages, and the refining."""
+        """From the step on: each level of refinement, refining it, and the averages of the last."""
         train, phases = self._config.train, []
         averages, refinements = _averages(train), refine_steps(train)
         for level, end in enumerate([*refinements, train.iterations]):
@@ -219,43 +220,41 @@ class Room:
             if end <= step:
                 continue
             now, left = max(start, step), len(refinements) - level
+            prunes, to_come = prunings(train, start, end), prunings(train, now, end)
             stages = {"radius": radius, "layers": layers, "left": left}
-            span = {"start": start, "end": end}
-            phases.append(self._level(f"from step {now} on", n, averages <= now, **span, **stages))
-            if now < averages < end:
-                kept = round(n * _kept(train, **span, now=now, then=averages))
-                name = f"averages, from step {averages} on"
-                phases.append(self._level(name, kept, True, **span, **stages))
+            name = f"from step {now} on"
+            phases.append(self._level(name, n, averages <= now, prunes > 0, **stages))
+            n = round(n * KEPT_BY_PRUNING ** (to_come / max(1, prunes)))
             if left:
-                n = round(n * _kept(train, **span, now=now, then=end))
                 phases.append(self._refining(end, n, averages <= end, **stages))
                 n, layers = 8 * n, 2 * layers
                 radius /= 2 if self._config.raster.footprint == "soft" else 1
+            elif now < averages < end:
+                name = f"averages, from step {averages} on"
+                phases.append(self._level(name, n, True, prunes > 0, **stages))
         return phases
 
-    def _level(self, name, n, is_averaged, *, start, end, **stages):
-        """A level of refinement at its most points, with pruning and checkpoints."""
-        train = self._config.train
+    def _level(self, name, n, is_averaged, prunes, **stages):
+        """A level of refinement with its prunings and checkpoints."""
         tables = self._point_tables(n, is_averaged) | self._stages(n, **stages)
-        host = 0
-        if prunings(train, start, end):
-            largest = max(64 * block.count for block in self._blocks)  # bytes of a point's array
-            tables["pruning (at most)"] = compact_table(n, largest)
-            host += PRUNING_BYTES * n
-        every, last = train.checkpoint_every, min(end, train.iterations - 1)
-        if start // every < last // every:
-            host += 2 * min(PIECE_BYTES, 64 * 8 * n)
+        if prunes:
+            tables["pruning (at most)"] = compact_table(n, 64 * self._most_coefficients)
+        host = PRUNING_BYTES * n * prunes + 2 * min(PIECE_BYTES, 64 * 8 * n)
         return MemoryPhase(name, n, tables, host)
 
     def _refining(self, step, n, is_averaged, **stages):
         """Old and new arrays of the points live together, one array after the other, beside the
         buffers of the stages for the old points.
         """
-        most = max(block.count for block in self._blocks)
-        last = {"rows": ((8 * n,), np.uint32), "old": ((n, most, 16), np.float32)}
-        tables = self._point_tables(8 * n, is_averaged) | {"refining": last}
-        name, host = f"refining after step {step}", REFINING_BYTES * n
-        return MemoryPhase(name, 8 * n, tables | self._stages(n, **stages), host)
+        old = (n, self._most_coefficients, 16), np.float32
+        tables = self._point_tables(8 * n, is_averaged) | self._stages(n, **stages)
+        tables["refining"] = {"rows": ((8 * n,), np.uint32), "old": old}
+        return MemoryPhase(f"refining after step {step}", 8 * n, tables, REFINING_BYTES * n)
+
+    @property
+    def _most_coefficients(self):
+        """Of a point in one array."""
+        return max(block.count for block in self._blocks)
 
     @property
     def _blocks(self):
@@ -323,14 +322,6 @@ class Room:
 def _averages(train):
     """The step from which on averages are kept, infinite for never."""
     return ema_start(train.iterations) if train.ema else math.inf
-
-
-def _kept(train, *, start, end, now, then):
-    """The share of the points at step `now` of the level from `start` to `end` that is left at step
-    `then`, an estimate: all prunings of a level leave KEPT_BY_PRUNING.
-    """
-    between = prunings(train, start, then) - prunings(train, start, now)
-    return KEPT_BY_PRUNING ** (between / max(1, prunings(train, start, end)))
 
 
 def _crop(camera, side):

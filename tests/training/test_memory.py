@@ -193,16 +193,15 @@ def test_without_prunings_every_point_becomes_eight(dev):
     [
         ({}, True),
         ({"train__prune_every": "9000"}, False),
-        ({"train__prune_looks": "7999"}, False),
-        ({"train__prune_weight": "0"}, True),
         ({"train__prune_weight": "0", "train__prune_opacity": "0"}, False),
     ],
 )
 def test_pruning_is_planned_where_it_can_happen(dev, changes, prunes):
-    first = planned(dev, **changes).phases[0]
-    assert ("pruning (at most)" in first.tables) == prunes
-    # a checkpoint every 1000 steps passes through the host in pieces of 64 MiB
-    assert first.host == prunes * 24 * 171_262 + 2 * 2**26
+    plan = planned(dev, **changes)
+    assert ("pruning (at most)" in plan.phases[0].tables) == prunes
+    assert plan.phases[1].points == (round(0.6 * 171_262) if prunes else 171_262)
+    # a checkpoint passes through the host in pieces of 64 MiB
+    assert plan.phases[0].host == prunes * 24 * 171_262 + 2 * 2**26
 
 
 def test_the_host_holds_photographs_and_the_buffers_of_a_cpu():
