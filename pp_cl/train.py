@@ -92,23 +92,23 @@ class Trainer:
             dropout=config.dropout,
             seed=int(rng.integers(2**32)),
             training=True,
-            differs=differs,
+            gradient_tiles=differs,
         )
         with self.dev.stage("loss"):
             gradients = self._losses(rendered, target, target_alpha)
         spread_weight = self._spread_weight(target.shape[0] * target.shape[1])
-        grads = self.renderer.backward(rendered, *gradients, spread_weight=spread_weight)
+        grads = self.renderer.backward(rendered, *gradients, spread_weight)
         with self.dev.stage("update"):
             self.optimiser.update(
                 t + 1 - self.begun,
                 rates,
                 grads,
                 points=rendered.points,
-                shaded=rendered.shaded,
+                shaded=rendered.weights.shaded,
                 sh_eps=sh_eps,
             )
         with self.dev.stage("peaks"):
-            self.renderer.raise_peaks(rendered, self.state.peak_weight, self.state.look_count)
+            self.renderer.record_weights(rendered, self.state.peak_weight, self.state.look_count)
 
         self.step = t + 1
         self._read_terms()
@@ -128,7 +128,7 @@ class Trainer:
         grad_alpha = self.mask_loss.add(
             rendered.weights.transmittance,
             target_alpha,
-            size=rendered.features.shape[:2],
+            size=rendered.size,
             offset=rendered.offset,
             shortfall=rising_weight(self.step, self.config.iterations),
             terms=self.loss.terms,
@@ -243,8 +243,8 @@ class Trainer:
             cloud = self.model.cloud
             peaks, looks = (self.dev.zeros((cloud.count,)) for _ in range(2))
             for view in self.views:
-                weights = self.renderer.blend_weights(view.camera, self.gamma[1])
-                self.renderer.raise_peaks(weights, peaks, looks)
+                seen = self.renderer.forward(view.camera, self.gamma[1], until="weights")
+                self.renderer.record_weights(seen, peaks, looks)
             least = self.config.final_prune_weight, self.config.prune_opacity
             self._keep(
                 keep_indices(self.dev, peaks, least[0], cloud.opacity, least_opacity=least[1])

@@ -11,14 +11,16 @@ import numpy as np
 from pyopencl.array import Array
 
 from pp_cl.bench.spheres import spheres_backward
+from pp_cl.device.buffers import Buffers
 from pp_cl.device.device import Device
 from pp_cl.model import Model
 from pp_cl.network.unet import UNet
-from pp_cl.raster.blend import BLENDS, Blend
-from pp_cl.raster.pairs import PairBuilder
-from pp_cl.raster.project import Footprint, Projection
+from pp_cl.raster.blend import blend_backward, blend_forward
+from pp_cl.raster.pairs import find_all_pairs
+from pp_cl.raster.project import project_spheres
+from pp_cl.raster.weights import BLENDS, blend_weights
 from pp_cl.reference.raster import PixelReference, sh_basis
-from pp_cl.render import RasterResult, Renderer
+from pp_cl.render import Renderer, RenderResult
 from pp_cl.scene.camera import Camera
 from pp_cl.scene.grid import Grid
 from pp_cl.settings import RasterConfig
@@ -48,11 +50,11 @@ class BenchScene(ABC):
     grad: Array
 
     @abstractmethod
-    def forward(self, blend: str) -> RasterResult:
+    def forward(self, blend: str) -> RenderResult:
         """Rasterise the scene."""
 
     @abstractmethod
-    def backward(self, blend: str, result: RasterResult) -> None:
+    def backward(self, blend: str, result: RenderResult) -> None:
         """All gradients from self.grad. result: of forward(blend), the last one."""
 
     @abstractmethod
@@ -94,14 +96,14 @@ class BenchScene(ABC):
         Rasterises the scene.
         """
         result = self.forward("softmax")
-        rows = result.point_features.get()[result.shaded.get()]
+        rows = result.point_features.get()[result.weights.shaded.get()]
         return np.maximum(rows.max(axis=0), 1) - np.minimum(rows.min(axis=0), 1)
 
-    def moved_bytes(self, blend: str, result: RasterResult) -> dict[str, int]:
+    def moved_bytes(self, blend: str, result: RenderResult) -> dict[str, int]:
         """{stage: bytes} that the stages must read and write: every value used by each kernel,
         once.
         """
-        n, p, hw, shaded = self.count, result.pairs.total, self.size**2, result.shaded.size
+        n, p, hw, shaded = self.count, result.pairs.total, self.size**2, result.weights.shaded.size
         # of a point: place, box, first pair; of a pair: pixel, point and closeness, place or key
         search, pair = 16 + 8 + 4, 4 + 8 + 8
         rest = (8 + 8 + 4 + 4) * p if blend == "alpha" else 2 * ROW * hw
@@ -161,11 +163,11 @@ class GridScene(BenchScene):
             depth_range=self.depth_range,
         )
 
-    def forward(self, blend: str) -> RasterResult:
+    def forward(self, blend: str) -> RenderResult:
         """As BenchScene."""
-        return self.renderers[blend].rasterise(self.camera, self.gamma)
+        return self.renderers[blend].forward(self.camera, self.gamma, until="features")
 
-    def backward(self, blend: str, result: RasterResult) -> None:
+    def backward(self, blend: str, result: RenderResult) -> None:
         """Stage `backward`: gradients of features and opacities."""
         self.renderers[blend].backward_features(result, self.grad)
 
@@ -176,10 +178,13 @@ class GridScene(BenchScene):
         higher = HIGHER_SH * basis[:, 1:].sum(1, keepdims=True)
         return basis[:, :1] * self.sh_0[points, 0].astype(np.float64) + higher
 
-    def moved_bytes(self, blend: str, result: RasterResult) -> dict[str, int]:
+    def moved_bytes(self, blend: str, result: RenderResult) -> dict[str, int]:
         """As BenchScene, with the stages of a grid and of harmonics."""
         shading = 4 + 16 + 9 * ROW + ROW
-        own = {"project": self.count * (4 + 16 + 8 + 4), "shade": result.shaded.size * shading}
+        own = {
+            "project": self.count * (4 + 16 + 8 + 4),
+            "shade": result.weights.shaded.size * shading,
+        }
         return own | super().moved_bytes(blend, result)
 
 
@@ -205,9 +210,7 @@ class PulsarScene(BenchScene):
             self.camera, positions, self.radius, "sphere", depth_range=self.depth_range
         )
 
-        footprint = Footprint("sphere")
-        self.projection, self.pairs = Projection(dev, footprint), PairBuilder(dev, footprint)
-        self.blends = {name: Blend(dev, BLENDS[name](dev)) for name in BLENDS}
+        self.buffers, self.room = Buffers(dev), 1
         self.camera_buffer = dev.upload(self.camera.packed(self.depth_range))
         self.point_radius = dev.upload([self.radius], np.float32)
         self.positions, self.point_opacity = dev.upload(positions), dev.upload(self.opacity)
@@ -215,53 +218,73 @@ class PulsarScene(BenchScene):
         self.features = dev.empty((size, size, CHANNELS))
         self.grad = dev.upload(rng.standard_normal((size, size, CHANNELS), np.float32))
 
-    def forward(self, blend: str) -> RasterResult:
+    def forward(self, blend: str) -> RenderResult:
         """As BenchScene."""
-        blending = self.blends[blend]
-        with self.dev.stage("project"):
-            points = self.projection.spheres(self.camera_buffer, self.positions, self.point_radius)
-        with self.dev.stage("pairs"):
-            pairs = self.pairs.build(points, (self.size, self.size))
-        with self.dev.stage("weights"):
-            weights = blending.weighing.compute(
-                pairs, self.camera_buffer, self.point_opacity, self.gamma
+        dev, b, size = self.dev, self.buffers, (self.size, self.size)
+        with dev.stage("project"):
+            points = project_spheres(
+                dev,
+                b,
+                "sphere",
+                self.camera_buffer,
+                self.positions,
+                point_radius=self.point_radius,
             )
-        with self.dev.stage("blend"):
-            blending.forward(pairs, weights, self.device_features, self.features)
-        return RasterResult(
-            (0, 0), points, pairs, weights, None, self.device_features, self.features
+        with dev.stage("pairs"):
+            pairs = find_all_pairs(dev, b, points, size, self.room)
+            self.room = pairs.capacity
+        with dev.stage("weights"):
+            weights = blend_weights(
+                dev,
+                b,
+                pairs,
+                self.camera_buffer,
+                self.point_opacity,
+                blend=blend,
+                gamma=self.gamma,
+            )
+        with dev.stage("blend"):
+            blend_forward(dev, pairs, weights, self.device_features, self.features)
+        return RenderResult(
+            self.camera,
+            (0, 0),
+            size,
+            points,
+            pairs,
+            weights,
+            None,
+            self.device_features,
+            self.features,
         )
 
-    def backward(self, blend: str, result: RasterResult) -> None:
+    def backward(self, blend: str, result: RenderResult) -> None:
         """Stages `backward` and `spheres`."""
-        blending = self.blends[blend]
         with self.dev.stage("backward"):
-            gradient = blending.gradient(
+            blend_backward(
+                self.dev,
+                self.buffers,
                 result.pairs,
                 result.weights,
-                result.point_features,
+                point_features=result.point_features,
                 features=result.features,
                 grad_features=self.grad,
             )
-            blending.backward(gradient)
         with self.dev.stage("spheres"):
             spheres_backward(
                 self.dev,
                 result.points,
                 result.pairs,
                 result.weights,
+                self.buffers.pair_gain,
                 opacity=self.point_opacity,
                 gamma=self.gamma,
-                point_features=result.point_features,
-                grad_features=self.grad,
-                rest_or_gain=gradient.rest_or_gain,
             )
 
     def exact_features(self, points: np.ndarray) -> np.ndarray:
         """As BenchScene."""
         return self.point_features[points].astype(np.float64)
 
-    def moved_bytes(self, blend: str, result: RasterResult) -> dict[str, int]:
+    def moved_bytes(self, blend: str, result: RenderResult) -> dict[str, int]:
         """As BenchScene, with the stages of spheres."""
         n, p, hw = self.count, result.pairs.total, self.size**2
         spheres = p * (4 + 8 + 8 + 8) + p * (4 + 8) + (ROW + 16 + 16) * n + 2 * (ROW + 4) * hw

@@ -7,53 +7,44 @@ import math
 from pyopencl.array import Array
 
 from pp_cl.device.device import Device
-from pp_cl.raster.blend_weights import PixelWeights
 from pp_cl.raster.pairs import Pairs
 from pp_cl.raster.project import ProjectedPoints
+from pp_cl.raster.weights import BlendWeights
 
 
 def spheres_backward(
     dev: Device,
     points: ProjectedPoints,
     pairs: Pairs,
-    weights: PixelWeights,
+    weights: BlendWeights,
+    pair_gain: Array,
     *,
     opacity: Array,
     gamma: float,
-    point_features: Array,
-    grad_features: Array,
-    rest_or_gain: Array,
     mean: bool = False,
 ) -> tuple[Array, Array]:
     """(grad_positions (N, 3) in world axes, grad_radius (N,)) float32 of explicit spheres.
 
-    points, pairs, weights, opacity (N,), gamma, point_features (N, 16): those of the forward pass.
-    grad_features: dL/dfeatures, (H, W, 16). rest_or_gain: of the blend's backward pass. mean:
-    divide a point's gradients by its number of tracked pixels, as Pulsar does.
+    points, pairs, weights, opacity (N,), gamma: those of the forward pass. pair_gain: (P,), of
+    blend_backward(). mean: divide a point's gradients by its number of tracked pixels, as Pulsar
+    does.
     """
-    n, is_alpha = pairs.points, weights.transmittance is not None
-    program = dev.program(
-        "bench/spheres",
-        HAS_ROLES=int(weights.has_roles),
-        GAIN_BY_PAIR=int(is_alpha),
-        MEAN=int(mean),
-    )
+    n = pairs.points
+    program = dev.program("bench/spheres", HAS_ROLES=int(weights.has_roles), MEAN=int(mean))
     grad_pair = dev.empty(weights.pair_weight.shape)
     grad_positions, grad_radius = dev.empty((n, 3)), dev.empty((n,))
     program.launch(
         "spheres_backward_pairs",
         n,
         n=n,
-        point_features=point_features,
         point_offset=pairs.point_offset,
-        pair_pixel=pairs.pair_pixel,
         pair_weight=weights.pair_weight,
         pair_role=weights.pair_role,
-        grad_features=grad_features,
-        rest_or_gain=rest_or_gain,
+        pair_gain=pair_gain,
         pair_point_closeness=pairs.pair_point_closeness,
         grad_pair=grad_pair,
     )
+    is_alpha = weights.transmittance is not None
     program.launch(
         "spheres_backward",
         n,

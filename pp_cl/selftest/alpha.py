@@ -8,8 +8,8 @@ from functools import partial
 import numpy as np
 
 from pp_cl.device.device import Device
-from pp_cl.raster.blend_weights import DROPPED
-from pp_cl.raster.project import KINDS
+from pp_cl.raster.project import FOOTPRINTS
+from pp_cl.raster.weights import DROPPED
 from pp_cl.reference import dense
 from pp_cl.selftest.case import (
     SIZES,
@@ -172,8 +172,8 @@ def _faint(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
 
 
 CASES = (
-    *(Case(f"alpha: forward, {kind}", partial(_forward, kind)) for kind in KINDS),
-    *(Case(f"alpha: backward, {kind}", partial(_backward, kind)) for kind in KINDS),
+    *(Case(f"alpha: forward, {kind}", partial(_forward, kind)) for kind in FOOTPRINTS),
+    *(Case(f"alpha: backward, {kind}", partial(_backward, kind)) for kind in FOOTPRINTS),
     Case("alpha: awkward sizes", _sizes),
     Case("alpha: gradient of alpha", _gradient_of_alpha),
     Case("alpha: spread", _spread),

@@ -15,11 +15,7 @@ from pp_cl.device.rows import PIECE_BYTES
 from pp_cl.metrics.lpips import Lpips
 from pp_cl.network.layers import gradient_of
 from pp_cl.network.unet import UNet
-from pp_cl.raster.blend import BLENDS, Blend
-from pp_cl.raster.pairs import PairBuilder
-from pp_cl.raster.point_cloud import PointCloud
-from pp_cl.raster.project import Projection
-from pp_cl.raster.sh import sh_blocks
+from pp_cl.raster.points import PointCloud, sh_blocks
 from pp_cl.render import NETWORK_MULTIPLE, Renderer, point_radius
 from pp_cl.scene.camera import Camera
 from pp_cl.scene.grid import Grid
@@ -341,19 +337,7 @@ def _raster_tables(settings, n, size, pairs):
     """The tables of the stages from projection to blending. pairs: an estimated number, because the
     true one is known only when a view has been projected.
     """
-    pixels, room = size[0] * size[1], grown(0, round(pairs))
-    blend = BLENDS[settings.blend]
-    has_roles = settings.early_stop > 0 or settings.max_tracked > 0
-    return [
-        ("projection", Projection.table(n)),
-        ("pairs (estimate)", PairBuilder.table(n, pixels, room)),
-        (
-            "blend weights (estimate)",
-            blend.table(n, room, has_roles) | blend.own_table(pixels, room),
-        ),
-        ("blend", Blend.table(n)),
-        ("features", Renderer.table(n, *size)),
-    ]
+    return list(Renderer.tables(settings, n, size, grown(0, round(pairs))).items())
 
 
 def tables_bytes(tables: Tables) -> int:

@@ -9,8 +9,7 @@ from pp_cl.device.buffers import Table
 from pp_cl.device.compact import compact_rows, gather_rows
 from pp_cl.device.device import Device
 from pp_cl.device.rows import DeviceRows
-from pp_cl.raster.point_cloud import PointCloud
-from pp_cl.raster.sh import ShBlock
+from pp_cl.raster.points import PointCloud, ShBlock
 from pp_cl.training.adam import Ema
 from pp_cl.training.rmsprop import SecondMoment
 

@@ -13,8 +13,8 @@ from pyopencl.array import Array
 
 from pp_cl.device.device import Device
 from pp_cl.device.form import lanes, row_parts
+from pp_cl.raster.points import four_blocks, stored_degree
 from pp_cl.raster.project import ProjectedPoints
-from pp_cl.raster.sh import sh_arguments, stored_degree
 from pp_cl.training.adam import BETA2
 
 
@@ -57,7 +57,7 @@ def rmsprop_update(
     step: from 1 on. sh: arrays (N, count, 16) of SH_BLOCKS up to the end of one degree. rates: of
     the degrees 0, 1, 2. eps: of the gradient's unit.
     """
-    degree = max((d for d in range(stored_degree(len(sh)) + 1) if rates[d] > 0), default=None)
+    degree = max((d for d in range(stored_degree(sh) + 1) if rates[d] > 0), default=None)
     if degree is None:
         return
     shaded, grads, points = gradient.shaded, gradient.grad_point_features, gradient.points
@@ -74,6 +74,7 @@ def rmsprop_update(
         grad_point_features=grads,
         **moment._asdict(),
     )
+    sh_0, sh_1, sh_2a, sh_2b = four_blocks(sh)
     program.launch(
         "rmsprop_move",
         len(shaded) * row_parts(dev),
@@ -83,5 +84,8 @@ def rmsprop_update(
         point_camera=points.point_camera,
         scaled_grads=grads,
         **{f"rate_{d}": root * rate for d, rate in enumerate(rates)},
-        **sh_arguments(sh),
+        sh_0=sh_0,
+        sh_1=sh_1,
+        sh_2a=sh_2a,
+        sh_2b=sh_2b,
     )

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from support.comparisons import relative_error
 
-from pp_cl.raster.blend import BLENDS
+from pp_cl.raster.weights import BLENDS
 from pp_cl.reference import dense as oracle
 from pp_cl.reference.differences import numeric_gradient
 from pp_cl.selftest.points import AXIS, Blended, PairedPoints, blend_on_axis

@@ -10,8 +10,8 @@ import pytest
 from support.comparisons import relative_error
 
 from pp_cl.errors import UserError
-from pp_cl.raster.pairs import PairBuilder
-from pp_cl.raster.project import KINDS
+from pp_cl.raster.pairs import find_all_pairs
+from pp_cl.raster.project import FOOTPRINTS
 from pp_cl.reference import dense as oracle
 from pp_cl.selftest.points import PairedPoints, make_camera
 
@@ -43,7 +43,7 @@ def check(dev, rng, camera, positions, radius, kind, gamma=0.05, depth_range=ora
     return scene
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", FOOTPRINTS)
 @pytest.mark.parametrize("radius", [0.01, 0.3])
 def test_from_inside_the_object(dev, rng, kind, radius):
     """Points on all sides, also behind and beside the eye, and very near; an angle of view of 130
@@ -55,7 +55,7 @@ def test_from_inside_the_object(dev, rng, kind, radius):
     assert 20 < scene.seen.size < 300
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", FOOTPRINTS)
 def test_across_the_near_sphere_and_the_plane_of_the_eye(dev, rng, kind):
     """Spheres whose front is just before and just behind `near`, and some that reach beside and
     behind the eye.
@@ -148,10 +148,9 @@ def test_long_lists_do_not_take_quadratic_time(dev):
         positions = np.zeros((n, 3))
         positions[:, 2] = np.random.default_rng(1).permutation(np.linspace(2.2, 5.9, n))
         scene, seconds = PairedPoints(dev, camera, positions, 0.1), []
-        builder = PairBuilder(dev, scene.footprint)
         for _ in range(4):
             start = time.perf_counter()
-            builder.build(scene.projected, scene.shape)
+            find_all_pairs(dev, scene.buffers, scene.projected, scene.shape, scene.pairs.capacity)
             scene.blend(np.ones(n), 0.05, np.zeros((n, 16)), early_stop=1e-3)
             seconds.append(time.perf_counter() - start)
         return min(seconds)

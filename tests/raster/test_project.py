@@ -5,7 +5,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pp_cl.raster.project import KINDS, Footprint, Projection
+from pp_cl.device.buffers import Buffers
+from pp_cl.raster import project
+from pp_cl.raster.project import FOOTPRINTS
 from pp_cl.reference import dense as oracle
 from pp_cl.scene.grid import Grid
 from pp_cl.selftest.points import make_camera, make_points
@@ -13,13 +15,16 @@ from pp_cl.selftest.points import make_camera, make_points
 GRID = Grid((-1.1, -0.9, -0.7), 0.05, (45, 37, 29))
 
 
-def project_grid(dev, camera, ids, radius=0.0, **options):
+def project_grid(dev, camera, ids, **options):
     """(N, 4) positions in camera axes and distances of grid vertices."""
-    points = Projection(dev, Footprint("disc")).grid(
+    points = project.project_grid(
+        dev,
+        Buffers(dev),
+        "disc",
         dev.upload(camera.packed(oracle.DEPTH_RANGE)),
         dev.upload(GRID.packed()),
-        dev.upload(ids, np.uint32),
-        dev.upload([radius], np.float32),
+        point_id=dev.upload(ids, np.uint32),
+        point_radius=dev.zeros((1,)),
         **options,
     )
     return points.point_camera.get()
@@ -27,10 +32,13 @@ def project_grid(dev, camera, ids, radius=0.0, **options):
 
 def project_spheres(dev, camera, positions, radius, kind="soft", depth_range=oracle.DEPTH_RANGE):
     """((N, 4) camera positions, (N, 4) boxes)."""
-    points = Projection(dev, Footprint(kind)).spheres(
+    points = project.project_spheres(
+        dev,
+        Buffers(dev),
+        kind,
         dev.upload(camera.packed(depth_range)),
         dev.upload(positions, np.float32),
-        dev.upload(np.atleast_1d(radius), np.float32),
+        point_radius=dev.upload(np.atleast_1d(radius), np.float32),
     )
     return points.point_camera.get(), points.point_box.get()
 
@@ -70,7 +78,7 @@ def test_dropout_is_a_function_of_seed_and_id(dev):
     assert (project_grid(dev, camera, ids, dropout=0.0, seed=5)[:, 3] > 0).all()
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", FOOTPRINTS)
 def test_boxes_hold_the_hits_and_little_more(dev, rng, kind):
     camera = make_camera()
     n = 400
@@ -110,8 +118,3 @@ def test_boxes_reach_all_over_the_image_beside_the_eye(dev):
     )
     assert points[0, 3] > 0
     assert boxes[0].tolist() == [0, 0, camera.width - 1, camera.height - 1]
-
-
-def test_unknown_footprints_are_refused():
-    with pytest.raises(ValueError, match="no such footprint"):
-        Footprint("square")

@@ -83,7 +83,7 @@ class Case:
     def gradients(self):
         """{"features", "opacity", "positions", "radius"} in Pulsar's axes."""
         grad_image = self._padded(self["in_grad_image"])
-        gradients = self.scene.gradients(grad_image) | self.scene.sphere_gradients(grad_image)
+        gradients = self.scene.sphere_gradients(grad_image)
         gradients["features"] = gradients["features"][:, : len(self.shift)]
         gradients["positions"] = gradients["positions"] * MIRROR
         return gradients

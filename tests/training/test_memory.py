@@ -13,7 +13,7 @@ from pp_cl.device.compact import compact_table
 from pp_cl.metrics.lpips import WIDTHS, vgg_layers
 from pp_cl.model import Model
 from pp_cl.network.unet import UNet
-from pp_cl.raster.point_cloud import PointCloud
+from pp_cl.raster.points import PointCloud
 from pp_cl.scene.camera import Camera
 from pp_cl.scene.grid import Grid
 from pp_cl.scene.open import open_scene

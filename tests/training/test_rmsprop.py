@@ -5,7 +5,7 @@ import pytest
 from support.comparisons import relative_error
 from support.guarded import AWKWARD_SIZES
 
-from pp_cl.raster.sh import SH_DEGREES
+from pp_cl.raster.points import SH_DEGREES
 from pp_cl.reference import optim
 from pp_cl.selftest.updated_points import Cloud, gradients
 
