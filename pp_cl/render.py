@@ -24,7 +24,7 @@ from pp_cl.raster.depth import depth_forward
 from pp_cl.raster.pairs import Pairs, find_pairs, pairs_table, room_needed
 from pp_cl.raster.project import ProjectedPoints, project_grid, projection_table
 from pp_cl.raster.shade import shade_forward
-from pp_cl.raster.weights import BlendWeights, blend_weights, record_weights, weights_table
+from pp_cl.raster.weights import BlendWeights, blend_weights, weights_table
 from pp_cl.scene.camera import Camera
 from pp_cl.settings import RasterConfig
 
@@ -97,9 +97,7 @@ class Renderer:
         return {
             "projection": projection_table(n),
             "pairs (estimate)": pairs_table(n, pixels, pairs),
-            "blend weights (estimate)": weights_table(
-                n, pixels, pairs, blend=settings.blend, has_roles=has_roles
-            ),
+            "blend weights (estimate)": weights_table(n, pixels, pairs, has_roles),
             "features": _view_table(n, size),
             "gradients (estimate)": blend_backward_table(n, pairs),
         }
@@ -235,15 +233,6 @@ class Renderer:
                 spread_weight=spread_weight,
                 mean=self.settings.mean_gradient,
             )
-
-    def record_weights(self, view: RenderResult, max_weight: Array, times_seen: Array) -> None:
-        """Raise max_weight to each point's blend weights, summed over the view's pixels, where they
-        are higher, and add 1 to times_seen where the point has a pixel in the view, visible or not;
-        both (N,) float32.
-        """
-        record_weights(
-            self.dev, view.pairs, view.weights, max_weight=max_weight, times_seen=times_seen
-        )
 
     def render(self, camera: Camera, gamma: float, **options) -> np.ndarray:
         """(H, W, 3) float32 numpy image of the camera, clamped to [0, 1]. options: of forward()."""

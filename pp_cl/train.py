@@ -9,6 +9,7 @@ from pp_cl.device.transfer import read_later
 from pp_cl.errors import UserError
 from pp_cl.layers.tiles import tiles_find
 from pp_cl.model import Model
+from pp_cl.raster.weights import record_weights
 from pp_cl.render import NETWORK_MULTIPLE, Renderer
 from pp_cl.scene.target import Target
 from pp_cl.scene.views import View
@@ -108,7 +109,13 @@ class Trainer:
                 sh_eps=sh_eps,
             )
         with self.dev.stage("peaks"):
-            self.renderer.record_weights(rendered, self.state.peak_weight, self.state.look_count)
+            record_weights(
+                self.dev,
+                rendered.pairs,
+                rendered.weights,
+                self.state.peak_weight,
+                self.state.look_count,
+            )
 
         self.step = t + 1
         self._read_terms()
@@ -244,7 +251,7 @@ class Trainer:
             peaks, looks = (self.dev.zeros((cloud.count,)) for _ in range(2))
             for view in self.views:
                 seen = self.renderer.forward(view.camera, self.gamma[1], until="weights")
-                self.renderer.record_weights(seen, peaks, looks)
+                record_weights(self.dev, seen.pairs, seen.weights, peaks, looks)
             least = self.config.final_prune_weight, self.config.prune_opacity
             self._keep(
                 keep_indices(self.dev, peaks, least[0], cloud.opacity, least_opacity=least[1])

@@ -1,15 +1,61 @@
-"""Gradients of the positions and radii of spheres, which Pulsar has and no training needs: for
-parity with it.
+"""Spheres anywhere, as Pulsar has them, beside the engine's points on a grid: their projection, and
+the gradients of their positions and radii, which no training needs.
 """
 
 import math
 
 from pyopencl.array import Array
 
+from pp_cl.device.buffers import Buffers
 from pp_cl.device.device import Device
-from pp_cl.raster.pairs import Pairs
-from pp_cl.raster.project import ProjectedPoints
+from pp_cl.device.form import lanes
+from pp_cl.raster.pairs import Pairs, find_pairs, room_needed
+from pp_cl.raster.project import FOOTPRINTS, ProjectedPoints, projection_table
 from pp_cl.raster.weights import BlendWeights
+
+
+def project_spheres(
+    dev: Device,
+    b: Buffers,
+    footprint: str,
+    camera_buffer: Array,
+    positions: Array,
+    *,
+    point_radius: Array,
+) -> ProjectedPoints:
+    """Project points anywhere. positions: (N, 3) float32, world. point_radius: (1,) or (N,)."""
+    n = len(positions)
+    b.require(projection_table(n))
+    program = dev.program("raster/project", LANES=lanes(dev), FOOTPRINT=FOOTPRINTS.index(footprint))
+    program.launch(
+        "project_spheres",
+        -(-n // lanes(dev)),
+        n=n,
+        radii=point_radius.size,
+        camera=camera_buffer,
+        positions=positions,
+        point_radius=point_radius,
+        point_camera=b.point_camera,
+        point_box=b.point_box,
+        point_count=b.point_count,
+    )
+    return ProjectedPoints(
+        footprint, camera_buffer, b.point_camera, b.point_box, b.point_count, point_radius
+    )
+
+
+def find_all_pairs(
+    dev: Device, b: Buffers, points: ProjectedPoints, size: tuple[int, int], room: int = 1
+) -> Pairs:
+    """The hits in an image of size (height, width), with room for all, tried first with `room`.
+    Waits for the device. Raises UserError as room_needed() does.
+    """
+    while True:
+        pairs = find_pairs(dev, b, points, size, room)
+        room = room_needed(pairs)
+        if room == pairs.capacity:
+            return pairs
+        del pairs  # else its arrays would stay beside the larger ones
 
 
 def spheres_backward(

@@ -10,6 +10,7 @@ from scipy.sparse import csr_array
 from tqdm import tqdm
 
 from pp_cl.files.picture import Picture
+from pp_cl.raster.weights import record_weights
 from pp_cl.render import RenderResult
 from pp_cl.run import Run
 from pp_cl.scene.camera import Camera
@@ -33,7 +34,7 @@ class Observation:
         """(N,) float32: each point's blend weights, summed over the pixels."""
         dev, n = self.run.dev, self.run.model.cloud.count
         weights, seen = dev.zeros((n,)), dev.zeros((n,))
-        self.run.renderer.record_weights(self.view, weights, seen)
+        record_weights(dev, self.view.pairs, self.view.weights, weights, seen)
         return weights.get()
 
     def blend_matrix(self) -> csr_array:

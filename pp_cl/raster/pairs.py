@@ -149,20 +149,6 @@ def room_needed(pairs: Pairs) -> int:
     return grown(pairs.capacity, total)
 
 
-def find_all_pairs(
-    dev: Device, b: Buffers, points: ProjectedPoints, size: tuple[int, int], room: int = 1
-) -> Pairs:
-    """The hits in an image of size (height, width), with room for all, tried first with `room`.
-    Waits for the device. Raises UserError as room_needed() does.
-    """
-    while True:
-        pairs = find_pairs(dev, b, points, size, room)
-        room = room_needed(pairs)
-        if room == pairs.capacity:
-            return pairs
-        del pairs  # else its arrays would stay beside the larger ones
-
-
 def _sort_in_parallel(program, pairs, scratch):
     """Sort the keys of each pixel in place, one work-item per key."""
     capacity, pixels = pairs.capacity, pairs.pixels

@@ -79,33 +79,3 @@ def project_grid(
     return ProjectedPoints(
         footprint, camera_buffer, b.point_camera, b.point_box, b.point_count, point_radius
     )
-
-
-def project_spheres(
-    dev: Device,
-    b: Buffers,
-    footprint: str,
-    camera_buffer: Array,
-    positions: Array,
-    *,
-    point_radius: Array,
-) -> ProjectedPoints:
-    """Project points anywhere. positions: (N, 3) float32, world. point_radius: (1,) or (N,)."""
-    n = len(positions)
-    b.require(projection_table(n))
-    program = dev.program("raster/project", LANES=lanes(dev), FOOTPRINT=FOOTPRINTS.index(footprint))
-    program.launch(
-        "project_spheres",
-        -(-n // lanes(dev)),
-        n=n,
-        radii=point_radius.size,
-        camera=camera_buffer,
-        positions=positions,
-        point_radius=point_radius,
-        point_camera=b.point_camera,
-        point_box=b.point_box,
-        point_count=b.point_count,
-    )
-    return ProjectedPoints(
-        footprint, camera_buffer, b.point_camera, b.point_box, b.point_count, point_radius
-    )

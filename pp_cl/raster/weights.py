@@ -46,15 +46,15 @@ class BlendWeights:
         return self.shaded_list.array
 
 
-def weights_table(n: int, pixels: int, pairs: int, *, blend: str, has_roles: bool) -> Table:
-    """The buffers for n points, a number of pixels and room for a number of pairs. blend: one of
-    BLENDS. has_roles: see BlendWeights.
+def weights_table(n: int, pixels: int, pairs: int, has_roles: bool) -> Table:
+    """The buffers for n points, a number of pixels and room for a number of pairs. has_roles: see
+    BlendWeights.
     """
     return {
         "pair_weight": ((pairs, 2), np.float32),
         "pair_role": ((pairs if has_roles else 1,), np.uint8),
         "pixel_entry": ((pairs,), np.uint64),
-        "transmittance": ((pixels if blend == "alpha" else 1,), np.float32),
+        "transmittance": ((pixels,), np.float32),
         "point_is_shaded": ((n,), np.uint8),
         "shaded": ((n,), np.uint32),
     }
@@ -81,7 +81,7 @@ def blend_weights(
     """
     has_roles = early_stop > 0 or max_tracked > 0
     n, pixels = pairs.points, pairs.pixels
-    b.require(weights_table(n, pixels, pairs.capacity, blend=blend, has_roles=has_roles))
+    b.require(weights_table(n, pixels, pairs.capacity, has_roles))
     if blend == "alpha":
         _alpha_weights(dev, b, pairs, opacity, max_tracked, early_stop)
     else:
@@ -146,7 +146,7 @@ def _softmax_weights(dev, b, pairs, camera_buffer, opacity, gamma, max_tracked, 
 
 
 def record_weights(
-    dev: Device, pairs: Pairs, weights: BlendWeights, *, max_weight: Array, times_seen: Array
+    dev: Device, pairs: Pairs, weights: BlendWeights, max_weight: Array, times_seen: Array
 ) -> None:
     """Raise max_weight to each point's blend weights, summed over the pixels, where they are
     higher, and add 1 to times_seen where it has a hit, dropped or not; both (N,) float32.

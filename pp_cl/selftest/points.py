@@ -7,12 +7,10 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import ArrayLike
 
-from pp_cl.bench.spheres import spheres_backward
+from pp_cl.bench.spheres import find_all_pairs, project_spheres, spheres_backward
 from pp_cl.device.buffers import Buffers
 from pp_cl.device.device import Device
 from pp_cl.raster.blend import blend_backward, blend_forward
-from pp_cl.raster.pairs import find_all_pairs
-from pp_cl.raster.project import project_spheres
 from pp_cl.raster.weights import DROPPED, blend_weights
 from pp_cl.reference import dense
 from pp_cl.scene.camera import Camera, look_at
@@ -249,10 +247,7 @@ class Blended:
         ).reshape(-1, 16)
         self.geometry = self.scene.geometry()
         stop = blend.get("early_stop", 0.0)
-        if rule == "alpha":
-            self.blend = dense.alpha(self.geometry, self.opacity, stop)
-        else:
-            self.blend = dense.blend(self.geometry, self.opacity, gamma, stop)
+        self.blend = dense.blend_by_rule(rule, self.geometry, self.opacity, gamma, stop)
         self.weight = self.scene.weight()
         self.role = self.scene.dense(self.scene.roles())
 

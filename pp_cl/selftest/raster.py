@@ -216,7 +216,7 @@ def _record(rule: str, dev: Device, rng: np.random.Generator) -> Iterator[Check]
     blended = Blended(dev, rng, 500, gamma=0.02, radius=0.4, rule=rule, **options)
     before, seen = (dev.upload(x * np.arange(500), np.float32) for x in (2e-3, 1))
     highest, scene = before.copy(), blended.scene
-    record_weights(dev, scene.pairs, scene.weights, max_weight=highest, times_seen=seen)
+    record_weights(dev, scene.pairs, scene.weights, highest, seen)
     yield exact(seen.get() - np.arange(500), blended.geometry["hit"].any(axis=1))
     weight = blended.blend["weight"].sum(axis=1)
     yield relative(highest.get(), np.maximum(before.get(), weight), PLACED)
