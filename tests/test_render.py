@@ -14,7 +14,7 @@ from support.scenes import ring_cameras
 
 from pp_cl.raster.weights import BLENDS
 from pp_cl.reference import dense as oracle_raster
-from pp_cl.render import PAPER_DEPTH_RANGE, Renderer
+from pp_cl.render import Renderer
 from pp_cl.settings import RasterConfig
 
 GAMMA = 0.03
@@ -27,22 +27,13 @@ def chained(model, settings, camera, opacity=None, sh=None, tracked=0):
     padded, _, _ = camera.padded(4)
     positions = GRID.positions(model.cloud.ids.get())
     opacity = model.cloud.opacity.get().astype(np.float64) if opacity is None else opacity
-    sh = (
-        np.concatenate([array.get() for array in model.cloud.sh], 1).astype(np.float64)
-        if sh is None
-        else sh
+    if sh is None:
+        sh = np.concatenate([array.get() for array in model.cloud.sh], 1).astype(np.float64)
+    unit = GRID.edge if settings.footprint == "soft" else np.ptp(model.depth_range) / 4
+    geometry = oracle_raster.geometry(padded, positions, settings.radius * unit, settings.footprint)
+    blend = oracle_raster.blend_by_rule(
+        settings.blend, geometry, opacity, GAMMA, settings.early_stop
     )
-    spacing_or_world = (
-        GRID.edge if settings.footprint == "soft" else np.ptp(model.depth_range) / PAPER_DEPTH_RANGE
-    )
-    geometry = oracle_raster.geometry(
-        padded, positions, settings.radius * spacing_or_world, settings.footprint
-    )
-    alpha = settings.blend == "alpha"
-    if alpha:
-        blend = oracle_raster.alpha(geometry, opacity, settings.early_stop)
-    else:
-        blend = oracle_raster.blend(geometry, opacity, GAMMA, settings.early_stop)
     shaded = oracle_raster.shade(positions, padded.eye, sh)
     features = oracle_raster.features(blend, shaded)
     parameters = plain_parameters(model.net, model.net.parameters)
@@ -54,7 +45,7 @@ def chained(model, settings, camera, opacity=None, sh=None, tracked=0):
             features.reshape(*shape, 16), parameters, grad_picture
         )
         grad_features = grad_features.reshape(-1, 16)
-        if alpha:
+        if settings.blend == "alpha":
             grad_shaded, grad_opacity, _ = oracle_raster.alpha_gradients(
                 geometry,
                 blend,

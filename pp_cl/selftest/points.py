@@ -210,9 +210,6 @@ def blend_on_axis(
     return scene, scene.weight()[:, 0]
 
 
-GAMMAS = (0.1, 0.01)
-
-
 class Blended:
     """A random scene blended by the kernels and in float64, both with the kernels' hits, closeness
     and depth.
