@@ -10,8 +10,7 @@ from pyopencl.array import Array
 from pp_cl.device.device import Device
 from pp_cl.device.rows import DeviceRows
 from pp_cl.network.unet import UNet
-from pp_cl.raster.point_cloud import PointCloud
-from pp_cl.raster.sh import SH_DEGREES
+from pp_cl.raster.points import SH_DEGREES, PointCloud
 from pp_cl.scene.camera import Camera
 from pp_cl.scene.grid import Grid
 

@@ -357,7 +357,7 @@ def render_views(run: Run, views: list[View]) -> Iterator[Rendered]:
     for view in views:
         start = time.perf_counter()
         result = run.renderer.forward(view.camera, run.gamma)
-        image = run.checked(result.clamped(view.camera))
+        image = run.checked(result.clamped())
         seconds = time.perf_counter() - start
         target.load(view)
         truth = target.whole()

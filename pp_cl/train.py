@@ -10,6 +10,7 @@ from pp_cl.errors import UserError
 from pp_cl.layers.tiles import tiles_find
 from pp_cl.model import Model
 from pp_cl.network.tile_plan import gradient_tiles
+from pp_cl.raster.weights import record_weights
 from pp_cl.render import NETWORK_MULTIPLE, Renderer
 from pp_cl.scene.target import Target
 from pp_cl.scene.views import View
@@ -103,12 +104,12 @@ class Trainer:
             dropout=config.dropout,
             seed=int(rng.integers(2**32)),
             training=True,
-            differs=differs,
+            gradient_tiles=differs,
         )
         with self.dev.stage("loss"):
             grad_image, grad_alpha, spread_weight = self._losses(rendered, target, target_alpha)
         grad_point_features, grad_opacity = self.renderer.backward(
-            rendered, grad_image, grad_alpha, spread_weight=spread_weight
+            rendered, grad_image, grad_alpha, spread_weight
         )
         with self.dev.stage("update"):
             self.optimiser.update(
@@ -117,11 +118,17 @@ class Trainer:
                 grad_point_features,
                 grad_opacity,
                 points=rendered.points,
-                shaded=rendered.shaded,
+                shaded=rendered.weights.shaded,
                 sh_eps=config.sh_eps / target.size,
             )
-        with self.dev.stage("peaks"):
-            self.renderer.raise_peaks(rendered, self.state.max_weight, self.state.times_seen)
+        with self.dev.stage("max weights"):
+            record_weights(
+                self.dev,
+                rendered.pairs,
+                rendered.weights,
+                self.state.max_weight,
+                self.state.times_seen,
+            )
 
         self.step = t + 1
         self.check()
@@ -252,8 +259,8 @@ class Trainer:
             cloud = self.model.cloud
             max_weight, times_seen = (self.dev.zeros((cloud.count,)) for _ in range(2))
             for view in self.views:
-                weights = self.renderer.blend_weights(view.camera, self.gamma[1])
-                self.renderer.raise_peaks(weights, max_weight, times_seen)
+                seen = self.renderer.forward(view.camera, self.gamma[1], until="weights")
+                record_weights(self.dev, seen.pairs, seen.weights, max_weight, times_seen)
             self._keep(final_points_to_keep(self.dev, max_weight, cloud.opacity, self.config))
 
     def rates(self) -> dict:

@@ -45,7 +45,7 @@ class Comparison:
     def row(self, view, runs):
         """A row of one view: size, computed fraction, times in ms, ratios, largest differences."""
         camera = view.camera
-        view_raster = self.renderer.rasterise(camera, self.config.raster.gamma[1])
+        view_raster = self.renderer.forward(camera, self.config.raster.gamma[1], until="features")
         x = view_raster.features
         self.target.load(view)
         target = self.target.crop((0, 0, camera.width, camera.height))

@@ -1,17 +1,13 @@
 // Gradients of the positions and radii of spheres, for parity with Pulsar: no training needs them.
 //
-// l = o z / gamma + log d (softmax.cl): dL/dl = b (G.f - rest), dL/dd = dL/dl / d, with G and rest
-// as in raster/blend.cl.
+// l = o z / gamma + log d (softmax.cl): dL/dl = b gain, dL/dd = dL/dl / d, with the gain of
+// raster/blend.cl.
 #include "raster/footprint.h"
 #include "raster/pair_role.h"
-#include "reduce.h"
 
 // as in raster/blend.cl
 #ifndef HAS_ROLES
 #define HAS_ROLES 1
-#endif
-#ifndef GAIN_BY_PAIR
-#define GAIN_BY_PAIR 0
 #endif
 #ifndef MEAN
 #define MEAN 0
@@ -20,13 +16,10 @@
 // One work-item per sphere: reads what blend_backward reads, writes dL/dl and dL/dd of its pairs.
 kernel void spheres_backward_pairs(
     const uint n,                              // spheres
-    global const float16 *point_features,      // (N, 16)
     global const uint *point_offset,           // (N+1)
-    global const uint *pair_pixel,             // (P)
     global const float2 *pair_weight,          // (P, 2)
     global const uchar *pair_role,             // (?) P with HAS_ROLES
-    global const float16 *grad_features,       // (H, W, 16) G
-    global const float *rest_or_gain,          // (HW) rest, or with GAIN_BY_PAIR (P) G.f - rest
+    global const float *pair_gain,             // (P)
     global const uint2 *pair_point_closeness,  // (P, 2) point, bits of d
     global float2 *grad_pair)                  // (P, 2) dL/dl, dL/dd
 {
@@ -37,15 +30,9 @@ kernel void spheres_backward_pairs(
         tracked += !HAS_ROLES || pair_role[pair] == TRACKED;
     const float scale = MEAN && tracked ? 1.0f / tracked : 1.0f;
     for (uint pair = point_offset[i]; pair < point_offset[i + 1]; pair++) {
-        const uint q = pair_pixel[pair];
         const float b = pair_weight[pair].x, d = as_float(pair_point_closeness[pair].y);
-        float dL_dl = 0.0f;
-        if (!HAS_ROLES || pair_role[pair] == TRACKED) {
-            const float gain = GAIN_BY_PAIR
-                                   ? rest_or_gain[pair]
-                                   : dot16(grad_features[q], point_features[i]) - rest_or_gain[q];
-            dL_dl = scale * b * gain;
-        }
+        const bool is_tracked = !HAS_ROLES || pair_role[pair] == TRACKED;
+        const float dL_dl = is_tracked ? scale * b * pair_gain[pair] : 0.0f;
         grad_pair[pair] = (float2)(dL_dl, d > 0.0f ? dL_dl / d : 0.0f);
     }
 }

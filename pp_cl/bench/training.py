@@ -93,7 +93,7 @@ def bench_step(
                 seconds.clear()  # the first round builds the programs
             for i in range(views):
                 view = trainer.views[len(trainer.views) * i // views]
-                result = renderer.rasterise(view.camera, config.raster.gamma[1])
+                result = renderer.forward(view.camera, config.raster.gamma[1], until="features")
                 if i not in grads:
                     values = np.random.default_rng(i).normal(size=result.features.shape) * 1e-6
                     grads[i] = dev.upload(values, np.float32)
@@ -105,15 +105,15 @@ def bench_step(
                         rates,
                         *gradients,
                         points=result.points,
-                        shaded=result.shaded,
+                        shaded=result.weights.shaded,
                         sh_eps=1e-10,
                     )
     stages = {name: row["ms"] for name, row in _spread(seconds).items()}
     return {
         "points": cloud.count,
         "pairs": result.pairs.total,
-        "shaded": result.shaded.size / cloud.count,
-        "size": result.features.shape[:2],
+        "shaded": result.weights.shaded.size / cloud.count,
+        "size": result.size,
         "stages_ms": stages,
         "forward_ms": sum(stages[name] for name in FORWARD),
         "backward_ms": stages["backward"] + stages["update"],

@@ -32,7 +32,9 @@ def channel_weights(run: Run, cameras: Sequence[Camera]) -> Parameters:
     found = {x.name: np.zeros(x.channels) for x in convolutions(layers) if x.relu}
     some = list(cameras)[:: -(-len(cameras) // MEASURED_VIEWS)]
     for camera in some:
-        net.forward(run.renderer.rasterise(camera, run.gamma).features, training=True)
+        net.forward(
+            run.renderer.forward(camera, run.gamma, until="features").features, training=True
+        )
         for name, squares in found.items():
             squares += np.mean(net.output(name).get().astype(np.float64) ** 2, axis=(0, 1))
     parameters = {name: array.get() for name, array in net.parameters.items()}

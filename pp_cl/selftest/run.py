@@ -8,7 +8,7 @@ import numpy as np
 
 from pp_cl.device.device import Device
 from pp_cl.layers.choice import device_class, offered
-from pp_cl.selftest import alpha, device, layers, metrics, raster, scene, softmax, training
+from pp_cl.selftest import blend, device, layers, metrics, raster, scene, training
 from pp_cl.selftest.case import Case
 
 SEED = 7
@@ -16,8 +16,7 @@ CASES: tuple[Case, ...] = (
     *device.CASES,
     *scene.CASES,
     *raster.CASES,
-    *softmax.CASES,
-    *alpha.CASES,
+    *blend.CASES,
     *layers.CASES,
     *training.CASES,
     *metrics.CASES,

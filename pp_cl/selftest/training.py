@@ -8,7 +8,7 @@ import numpy as np
 
 from pp_cl.device.device import Device
 from pp_cl.layers.choice import make_policy
-from pp_cl.raster.sh import SH_DEGREES
+from pp_cl.raster.points import SH_DEGREES
 from pp_cl.reference import loss as reference_loss
 from pp_cl.reference import optim
 from pp_cl.reference.lpips import lpips, lpips_gradient, random_weights

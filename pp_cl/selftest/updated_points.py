@@ -5,8 +5,8 @@ from collections.abc import Sequence
 import numpy as np
 
 from pp_cl.device.device import Device
+from pp_cl.raster.points import SH_DEGREES, sh_blocks
 from pp_cl.raster.project import ProjectedPoints
-from pp_cl.raster.sh import SH_DEGREES, sh_blocks
 from pp_cl.reference import optim
 from pp_cl.scene.camera import Camera
 from pp_cl.scene.grid import Grid
@@ -79,7 +79,7 @@ def seen_points(dev: Device, positions: np.ndarray, camera: Camera) -> Projected
     distance = np.linalg.norm(towards, axis=1)
     rows = np.column_stack([towards @ camera.pose[:, :3], distance]).astype(np.float32)
     absent = (dev.zeros((1,)),) * 3
-    return ProjectedPoints(dev.upload(camera.packed((2.0, 6.0))), dev.upload(rows), *absent)
+    return ProjectedPoints("soft", dev.upload(camera.packed((2.0, 6.0))), dev.upload(rows), *absent)
 
 
 def gradients(rng: np.random.Generator, n: int) -> np.ndarray:

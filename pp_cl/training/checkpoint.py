@@ -17,7 +17,7 @@ from pp_cl.files.npz import Form
 from pp_cl.files.run_folder import RunFolder
 from pp_cl.layers.choice import check_form
 from pp_cl.network.layers import parameter_table, unet_layers
-from pp_cl.raster.sh import SH_DEGREES, sh_blocks
+from pp_cl.raster.points import SH_DEGREES, sh_blocks
 from pp_cl.scene.identity import DIGITS, kept_views
 from pp_cl.training.schedule import ema_start
 from pp_cl.training.state import PointState

@@ -12,8 +12,8 @@ from pp_cl.device.device import Device
 from pp_cl.device.form import group_items, lanes, launch_groups
 from pp_cl.device.transfer import Reading, read_later
 from pp_cl.errors import Diverged
-from pp_cl.raster.blend_weights import PixelWeights
 from pp_cl.raster.pairs import Pairs
+from pp_cl.raster.weights import BlendWeights
 
 TAPS = 11  # pixels, the side of an SSIM window
 MARGIN = 32  # values by which a scratch row is longer than needed, >= 3 * (TAPS - 1)
@@ -155,7 +155,7 @@ class Loss:
             terms=self.terms,
         )
 
-    def add_spread(self, pairs: Pairs, weights: PixelWeights, weight: float, scale: float) -> None:
+    def add_spread(self, pairs: Pairs, weights: BlendWeights, weight: float, scale: float) -> None:
         """Add weight times the spread, scale times the sum over a view's pixels, to the loss; after
         forward_backward() of the same view. Renderer.backward(spread_weight=weight * scale) has its
         gradient.

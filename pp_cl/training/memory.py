@@ -19,11 +19,7 @@ from pp_cl.metrics.lpips import Lpips
 from pp_cl.model import Model
 from pp_cl.network.layers import gradient_of
 from pp_cl.network.unet import UNet
-from pp_cl.raster.blend import BLENDS, Blend
-from pp_cl.raster.pairs import PairBuilder
-from pp_cl.raster.point_cloud import PointCloud
-from pp_cl.raster.project import Projection
-from pp_cl.raster.sh import sh_blocks
+from pp_cl.raster.points import PointCloud, sh_blocks
 from pp_cl.render import NETWORK_MULTIPLE, Renderer, point_radius
 from pp_cl.scene.grid import Grid
 from pp_cl.scene.load import reading
@@ -277,17 +273,10 @@ class Room:
         width, height = _crop(camera.downscaled(downscale << left), crop_side(train.crop, left))
         crop, full = _padded(width, height), _padded(*_crop(camera.downscaled(downscale), 0))
         area = math.pi * max(LEAST_RADIUS, radius / downscale) ** 2
-        pixels = full[0] * full[1]
-        pairs = grown(0, round(n * min(area, pixels)))
-        blend, has_roles = BLENDS[raster.blend], raster.early_stop > 0 or raster.max_tracked > 0
+        pairs = grown(0, round(n * min(area, full[0] * full[1])))
         target, shrunk = (height, width, 3), self._shrunk()
         tables = {
-            "projection": Projection.table(n),
-            "pairs (estimate)": PairBuilder.table(n, pixels, pairs),
-            "blend weights (estimate)": blend.table(n, pairs, has_roles)
-            | blend.own_table(pixels, pairs),
-            "blend": Blend.table(n),
-            "features": Renderer.table(n, *full),
+            **Renderer.tables(raster, n, full, pairs),
             f"network at {crop[1]}x{crop[0]}": _network_table(net, crop, True),
             f"previews at {full[1]}x{full[0]}": _preview_table(net, full),
             "loss": Loss.table((*crop, 3), target, train.ssim_weight, lanes_of_loss(net.dev)),

@@ -19,8 +19,8 @@ from pp_cl.device.device import Device
 from pp_cl.device.form import lanes, row_parts
 from pp_cl.device.rows import DeviceRows
 from pp_cl.model import Model
+from pp_cl.raster.points import four_blocks, stored_degree
 from pp_cl.raster.project import ProjectedPoints
-from pp_cl.raster.sh import sh_arguments, stored_degree
 from pp_cl.training.schedule import Rates
 from pp_cl.training.state import PointState
 
@@ -243,10 +243,10 @@ def rmsprop_update(
     point's last gradient, 0: none. Both start as zeros. rates: of the degrees 0, 1, 2. eps: of the
     gradient's unit.
     """
-    degree = max((d for d in range(stored_degree(len(sh)) + 1) if rates[d] > 0), default=None)
+    degree = max((d for d in range(stored_degree(sh) + 1) if rates[d] > 0), default=None)
     if degree is None:
         return
-    root = math.sqrt(1 - BETA2**step)
+    root, (sh_0, sh_1, sh_2a, sh_2b) = math.sqrt(1 - BETA2**step), four_blocks(sh)
     program = dev.program(
         "training/rmsprop",
         LANES=lanes(dev),
@@ -269,7 +269,10 @@ def rmsprop_update(
         grad_point_features=grad_point_features,
         last_step=last_step,
         v=v,
-        **sh_arguments(sh),
+        sh_0=sh_0,
+        sh_1=sh_1,
+        sh_2a=sh_2a,
+        sh_2b=sh_2b,
     )
     program.launch(
         "rmsprop_mark",

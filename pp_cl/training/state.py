@@ -10,8 +10,7 @@ from pyopencl.array import Array
 from pp_cl.device.buffers import Table
 from pp_cl.device.compact import compact_rows, gather_rows
 from pp_cl.device.device import Device
-from pp_cl.raster.point_cloud import PointCloud
-from pp_cl.raster.sh import ShBlock
+from pp_cl.raster.points import PointCloud, ShBlock
 
 
 class PointState:

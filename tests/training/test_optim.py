@@ -5,7 +5,7 @@ import pytest
 from support.comparisons import relative_error
 from support.models import make_model
 
-from pp_cl.raster.sh import SH_DEGREES
+from pp_cl.raster.points import SH_DEGREES
 from pp_cl.reference import optim
 from pp_cl.selftest.updated_points import Cloud, gradients
 from pp_cl.training.optim import Optimiser, adam_update, ema_update

@@ -6,7 +6,7 @@ from support.models import fetched
 
 from pp_cl.device.buffers import table_bytes
 from pp_cl.errors import Diverged
-from pp_cl.raster.point_cloud import PointCloud
+from pp_cl.raster.points import PointCloud
 from pp_cl.settings import TrainConfig
 from pp_cl.training.prune import final_points_to_keep, points_to_keep
 from pp_cl.training.state import PointState
