@@ -51,7 +51,7 @@ test-coarse: $(READY) ## run the tests of all kernels on PoCL with the coarse di
 	@PYOPENCL_BUILD_OPTIONS=-cl-fast-relaxed-math PP_DEVICE="Portable Computing Language" \
 		$(BIN)/python -m pytest $(ON_ALL_CORES) -m "not large and not exact" $(ARGS) $(sort $(OCLGRIND) tests/device/test_rounding.py)
 
-# Drivers and kernels have one form for CPUs and one for GPUs (pp_cl/device/form.py).
+# Drivers and kernels have one form for CPUs and one for GPUs (pp_cl/device/launch.py).
 test-gpu-form: $(READY) ## run the tests on PoCL with all drivers and kernels in the form that they have on GPUs
 	@PP_FORM=gpu PP_DEVICE="Portable Computing Language" $(BIN)/python -m pytest $(ON_ALL_CORES) $(ARGS)
 

@@ -14,7 +14,6 @@ from pyopencl.array import Array
 
 from pp_cl.device.buffers import Buffers, Table
 from pp_cl.device.device import Device
-from pp_cl.device.transfer import send
 from pp_cl.files.picture import Picture
 from pp_cl.layers.tiles import TileFlags, tiles_hit
 from pp_cl.model import Model
@@ -176,8 +175,8 @@ class Renderer:
         padded, *offset = camera.padded(NETWORK_MULTIPLE)
         size = (padded.height, padded.width)
         b.require(self.table(cloud.count, *size))
-        send(self.dev, b.camera_buffer, self.model.packed(padded, depth_range))
-        send(self.dev, b.point_radius, np.array([self._radius()], np.float32))
+        self.dev.send(b.camera_buffer, self.model.packed(padded, depth_range))
+        self.dev.send(b.point_radius, np.array([self._radius()], np.float32))
         with self.dev.stage("project"):
             points = self._projection.grid(
                 b.camera_buffer,

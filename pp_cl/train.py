@@ -9,11 +9,12 @@ from pp_cl.device.transfer import read_later
 from pp_cl.errors import UserError
 from pp_cl.layers.tiles import tiles_find
 from pp_cl.model import Model
+from pp_cl.network.tile_plan import gradient_tiles
 from pp_cl.render import NETWORK_MULTIPLE, Renderer
 from pp_cl.scene.target import Target
 from pp_cl.scene.views import View
 from pp_cl.training.crops import BOX_MARGIN, crop_side, draw_start
-from pp_cl.training.loss import WHITE, Loss, gradient_tiles
+from pp_cl.training.loss import WHITE, Loss
 from pp_cl.training.mask import MaskLoss
 from pp_cl.training.optimiser import Optimiser, Rates
 from pp_cl.training.perceptual import PerceptualLoss
@@ -176,7 +177,7 @@ class Trainer:
             self._terms.get()
 
     def _gradient_tiles(self, target, camera):
-        """UNet.plan_tiles()'s differs, to be asked for once the device was waited for."""
+        """UNet.plan_tiles()'s gradient_tiles, to be asked for once the device was waited for."""
         padded, *offset = camera.padded(NETWORK_MULTIPLE)
         size = padded.height, padded.width
         if self.perceptual.weight or not self.model.net.is_planned(size):

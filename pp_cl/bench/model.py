@@ -59,7 +59,7 @@ def bench_models(runs: list[Run]) -> Iterator[dict[str, Any]]:
         yield row(what, original.reduced(reduction))
     for name in offered(first.policy.device_class):
         run = original.reduced(Reduction.of(first))
-        run.model.net.use(make_policy(first.dev, variant=name))
+        run.model.net.policy = make_policy(first.dev, variant=name)
         yield row(f"convolutions by {name}", run)
 
 

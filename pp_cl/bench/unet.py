@@ -54,7 +54,7 @@ def bench_unet(
     device_x, device_grad = dev.upload(x), dev.upload(grad_image)
     flops = 2 * multiplications(net.layers, size, size)
     for direction, factor, runner in (("forward", 1, forward_runner), ("train", 3, train_runner)):
-        net.use(policies[AUTO])
+        net.policy = policies[AUTO]
         memory = sum(row[2] for row in net.memory_plan(size, size, direction == "train"))
         about = {
             "layer": "network",
@@ -77,7 +77,7 @@ def _by_policy(net, policy, run):
     """`run` of the network, as a function that runs it by a policy."""
 
     def changed():
-        net.use(policy)
+        net.policy = policy
         run()
 
     return changed
@@ -139,7 +139,7 @@ def network_errors(
     reference.network, in float64; grad_image: (H, W, 3).
     """
     parameters = plain_parameters(net, net.parameters)
-    net.use(policy)
+    net.policy = policy
     image = net.forward(dev.upload(outputs["x"], np.float32)).get()
     active = {layer.name: net.output(layer.name).get() > 0 for layer in net.layers if layer.relu}
     actual = {"x": net.backward(dev.upload(grad_image)).get()}

@@ -8,7 +8,7 @@ import numpy as np
 from pyopencl.array import Array
 
 from pp_cl.device.device import Device
-from pp_cl.device.form import lanes, row_parts
+from pp_cl.device.launch import lanes, row_parts
 from pp_cl.raster.project import ProjectedPoints
 from pp_cl.raster.sh import SH_BLOCKS, sh_arguments, stored_degree
 

@@ -6,7 +6,7 @@ import numpy as np
 from pyopencl.array import Array
 
 from pp_cl.device.buffers import Table
-from pp_cl.device.form import lanes
+from pp_cl.device.launch import lanes
 from pp_cl.raster.blend_weights import BlendWeights, PixelWeights
 from pp_cl.raster.pairs import Pairs
 

@@ -10,7 +10,7 @@ import numpy as np
 from pyopencl.array import Array
 
 from pp_cl.device.device import Device
-from pp_cl.device.form import lanes
+from pp_cl.device.launch import lanes
 
 BETA1, BETA2 = 0.9, 0.999  # Kingma & Ba 2015
 

@@ -5,12 +5,9 @@ from pyopencl.array import Array
 
 from pp_cl.device.buffers import Buffers, Table
 from pp_cl.device.device import Device
-from pp_cl.device.form import group_items, lanes, launch_groups
-from pp_cl.layers.tiles import SIDE, grid_shape
-from pp_cl.network.tile_plan import grow
+from pp_cl.device.launch import group_items, lanes, launch_groups
 
 TAPS = 11  # pixels, the side of an SSIM window
-REACH = 2 * (TAPS // 2)  # pixels over which the loss's gradient depends on the target
 WHITE = 1.0  # of a target where its photograph is transparent
 MARGIN = 32  # values by which a scratch row is longer than needed, >= 3 * (TAPS - 1)
 
@@ -130,18 +127,6 @@ class Loss:
     def _defines(self):
         values = lanes_of_loss(self.dev)
         return {"LANES": values, "TAPS": TAPS, "MARGIN": MARGIN // values}
-
-
-def gradient_tiles(found: np.ndarray, size: tuple[int, int], offset: tuple[int, int]) -> np.ndarray:
-    """(rows, columns) bool: the tiles of a prediction of `size` = (height, width) whose gradient
-    depends on more than a prediction of one colour before white, borders aside.
-
-    found: (?, ?) bool, the target's tiles that are not all white. offset: (left, top) of the target
-    in the prediction, less than a tile.
-    """
-    tiles = np.zeros(grid_shape(*size), bool)
-    tiles[: found.shape[0], : found.shape[1]] = found
-    return grow(tiles, -(-(REACH + max(offset)) // SIDE))
 
 
 def lanes_of_loss(dev: Device) -> int:

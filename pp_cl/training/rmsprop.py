@@ -12,7 +12,7 @@ from typing import NamedTuple
 from pyopencl.array import Array
 
 from pp_cl.device.device import Device
-from pp_cl.device.form import lanes, row_parts
+from pp_cl.device.launch import lanes, row_parts
 from pp_cl.raster.project import ProjectedPoints
 from pp_cl.raster.sh import sh_arguments, stored_degree
 from pp_cl.training.adam import BETA2

@@ -38,12 +38,6 @@ def tiny(tmp_path, monkeypatch):
     return tmp_path
 
 
-@pytest.fixture
-def plain(session_device):
-    """The tests' device without guards."""
-    return Device(session_device.device)
-
-
 # ---- buffers
 
 

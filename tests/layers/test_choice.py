@@ -196,14 +196,14 @@ def test_a_network_takes_what_was_tuned(dev, rng):
         {"winograd": (32, 8), "direct": (4, 2, (1, 1, 1))},
     ],
 )
-def test_the_memory_plan_follows_the_blocking(dev, blocking):
-    policy = make_policy(dev, DEFAULT, tuning_of(dev, blocking=blocking))
-    x, grad_y = dev.zeros((32, 36, 16)), dev.zeros((32, 36, 3))
-    before = dev.bytes
-    net = UNet(dev, (16, 32, 48), policy=policy)
+def test_the_memory_plan_follows_the_blocking(plain, blocking):
+    policy = make_policy(plain, DEFAULT, tuning_of(plain, blocking=blocking))
+    x, grad_y = plain.zeros((32, 36, 16)), plain.zeros((32, 36, 3))
+    before = plain.bytes
+    net = UNet(plain, (16, 32, 48), policy=policy)
     net.forward(x)
     net.backward(grad_y)
-    assert dev.bytes - before == sum(size for _, _, size in net.memory_plan(32, 36, True))
+    assert plain.bytes - before == sum(size for _, _, size in net.memory_plan(32, 36, True))
 
 
 # ---- the file

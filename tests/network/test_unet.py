@@ -94,7 +94,7 @@ def test_sizes_and_variants_may_change_between_images(dev, rng):
     for variant, size in (("winograd", (12, 16)), ("direct", (4, 8)), ("local", (16, 12))) * 2:
         x, grad_y = (dev.upload(normal(rng, *size, channels)) for channels in (16, 3))
         alone = UNet(dev, (16, 32, 48), seed=1, policy=make_policy(dev, variant=variant))
-        net.use(alone.policy)
+        net.policy = alone.policy
         net.forward(dev.zeros((20, 8, 16)), training=False)
         np.testing.assert_array_equal(net.forward(x).get(), alone.forward(x).get())
         np.testing.assert_array_equal(net.backward(grad_y).get(), alone.backward(grad_y).get())
@@ -139,15 +139,15 @@ def test_wrong_use_is_refused(dev):
     [("direct", "double"), ("winograd", "double"), ("auto", "single"), ("local", "gated")],
 )
 @pytest.mark.parametrize("training", [False, True])
-def test_memory_plan_is_what_is_allocated(dev, training, variant, blocks):
-    x, grad_y = dev.zeros((16, 20, 16)), dev.zeros((16, 20, 3))
-    before = dev.bytes
-    policy = make_policy(dev, variant=variant)
-    net = UNet(dev, (16, 32, 48), blocks=blocks, policy=policy)
+def test_memory_plan_is_what_is_allocated(plain, training, variant, blocks):
+    x, grad_y = plain.zeros((16, 20, 16)), plain.zeros((16, 20, 3))
+    before = plain.bytes
+    policy = make_policy(plain, variant=variant)
+    net = UNet(plain, (16, 32, 48), blocks=blocks, policy=policy)
     net.forward(x, training)
     if training:
         net.backward(grad_y)
-    assert dev.bytes - before == sum(row[2] for row in net.memory_plan(16, 20, training))
+    assert plain.bytes - before == sum(row[2] for row in net.memory_plan(16, 20, training))
 
 
 @pytest.mark.parametrize(

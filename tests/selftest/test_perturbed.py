@@ -12,7 +12,7 @@ from pp_cl.selftest.run import CASES, run_cases
 KERNELS = device_module.kernel_folder()
 # (kernel file, text that stands there once, what it becomes, the case that must fail)
 FLIPS = [
-    ("device/compact", "to[c] = from[c]", "to[c] = -from[c]", "device: compact and gather rows"),
+    ("device/rows", "to[c] = from[c]", "to[c] = -from[c]", "device: compact and gather rows"),
     ("device/scan", "sum = add_sat(sum, total)", "sum = add_sat(sum, -total)", "device: scan"),
     ("scene/demo", "y[lane] = p.y", "y[lane] = -p.y", "scene: demo"),
     ("scene/hull", "alive & seen", "alive | seen", "scene: hull"),
