@@ -11,7 +11,7 @@ import numpy as np
 from pp_cl.bench.peak import PeakFlops
 from pp_cl.bench.timing import errors, variant_rows
 from pp_cl.device.device import Device
-from pp_cl.layers.choice import VARIANTS, ConvolutionPolicy, device_class, offered
+from pp_cl.layers.choice import OFFERED, VARIANTS, ConvolutionPolicy, can_run, device_class
 from pp_cl.layers.conv import Direction, pack_bias, pack_weights, unpack_weights
 from pp_cl.layers.tiles import all_tiles
 from pp_cl.network.layers import convolutions, unet_layers
@@ -52,14 +52,14 @@ class RandomConv:
         self.out, self.grad_out = dev.empty((side, side, co)), dev.upload(self.plain_grad_out)
         self.tiles = all_tiles(dev, side, side)
         self.variants = [
-            name for name in offered(device_class(dev)) if VARIANTS[name].can_run(k, *sources, co)
+            name for name in OFFERED[device_class(dev)] if can_run(name, k, *sources, co)
         ]
 
     def runner(self, variant: str, direction: Direction, policy: ConvolutionPolicy) -> Callable:
         """A function that computes a direction by a variant, as the network does, and waits for
         it. policy: its blocking is used.
         """
-        conv, blocking = VARIANTS[variant].module, policy.blocking
+        conv, blocking = VARIANTS[variant], policy.blocking
         compute = {
             Direction.FORWARD: self._run_forward,
             Direction.BACKWARD_INPUT: self._run_backward_input,

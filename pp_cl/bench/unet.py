@@ -13,7 +13,7 @@ from pyopencl.array import Array
 from pp_cl.bench.peak import PeakFlops
 from pp_cl.bench.timing import errors, variant_rows
 from pp_cl.device.device import Device
-from pp_cl.layers.choice import AUTO, ConvolutionPolicy, offered
+from pp_cl.layers.choice import AUTO, OFFERED, ConvolutionPolicy
 from pp_cl.layers.conv import unpack_weights
 from pp_cl.network.layers import multiplications
 from pp_cl.network.unet import UNet
@@ -42,7 +42,7 @@ def bench_unet(
     grad_image = rng.normal(size=(size, size, CHANNELS_OUT)).astype(np.float32)
     # one network for all policies, so that large images fit
     net = make_network(dev, widths, policy, blocks)
-    names = (AUTO, *offered(policy.device_class))
+    names = (AUTO, *OFFERED[policy.device_class])
     policies = {name: replace(policy, variant=name) for name in names}
     parameters = plain_parameters(net, net.parameters)
     outputs = reference.network(net.layers, parameters, x[:CHECK_SIZE, :CHECK_SIZE])

@@ -46,7 +46,7 @@ def forward(
     tiles: Tiles | None = None,
     laid_out: Array | None = None,
 ) -> None:
-    """As conv_direct.forward."""
+    """See conv_direct.forward."""
     height, width, co = out.shape
     check_weights(sources, weight, bias, out)
     channels = [source.shape[2] for source in sources]
@@ -83,7 +83,7 @@ def backward_input(
     mask: Array | None,
     tiles: Tiles | None = None,
 ) -> None:
-    """As conv_direct.backward_input."""
+    """See conv_direct.backward_input."""
     height, width, c = grad_x.shape
     co = grad_out.shape[2]
     flipped = flip_weights(dev, blocking, weight, first, c, co)
@@ -117,7 +117,7 @@ def backward_weights(
     *,
     tiles: Tiles | None = None,
 ) -> None:
-    """As conv_direct.backward_weights. The order of the sums depends on the shapes and the number
+    """See conv_direct.backward_weights. The order of the sums depends on the shapes and the number
     of tiles alone.
     """
     height, width, co = grad_out.shape

@@ -39,7 +39,7 @@ def scratch_floats(
     weight_shape: tuple,
     c: int,
 ) -> dict[str, int]:
-    """As conv_direct.scratch_floats."""
+    """See conv_direct.scratch_floats."""
     blocks, _, _, ci, _ = weight_shape
     co = blocks * VECTOR
     if direction is Direction.BACKWARD_WEIGHTS:
@@ -77,7 +77,7 @@ def forward(
     tiles: Tiles | None = None,
     laid_out: Array | None = None,
 ) -> None:
-    """As conv_direct.forward. The result does not depend on the number of compute units."""
+    """See conv_direct.forward. The result does not depend on the number of compute units."""
     height, width, co = out.shape
     channels = [source.shape[2] for source in sources]
     _check_channels(*channels, co)
@@ -115,7 +115,7 @@ def backward_input(
     mask: Array | None,
     tiles: Tiles | None = None,
 ) -> None:
-    """As conv_direct.backward_input."""
+    """See conv_direct.backward_input."""
     height, width, c = grad_x.shape
     co = grad_out.shape[2]
     _check_channels(c, co)
@@ -148,7 +148,7 @@ def backward_weights(
     *,
     tiles: Tiles | None = None,
 ) -> None:
-    """As conv_direct.backward_weights. The order of the sums depends on the shapes and the number
+    """See conv_direct.backward_weights. The order of the sums depends on the shapes and the number
     of tiles alone.
     """
     height, width, co = grad_out.shape

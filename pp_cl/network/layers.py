@@ -16,6 +16,7 @@ from typing import Literal
 import numpy as np
 
 from pp_cl.device.buffers import Table
+from pp_cl.layers.choice import ConvShape
 from pp_cl.layers.conv import Direction
 from pp_cl.layers.tiles import VECTOR
 
@@ -49,6 +50,11 @@ class Layer:
     def weight_shape(self) -> tuple[int, int, int, int]:
         """(CO, CI, K, K) of a convolution's weights."""
         return self.channels, sum(self.sources), self.kernel_size, self.kernel_size
+
+    def shape(self, direction: Direction, source: int | None, height: int, width: int) -> ConvShape:
+        """By which a convolution's variant is chosen in an image of this size."""
+        pixels = (height >> self.level) * (width >> self.level)
+        return ConvShape(direction, self.kernel_size, self.sources, self.channels, pixels, source)
 
     def multiplications(self, height: int, width: int) -> int:
         """Multiplications of weights by values in a forward pass over an image of this size,
@@ -163,6 +169,18 @@ def gradient_of(name: str) -> str:
 def levels_of(layers: list[Layer]) -> dict[str, int]:
     """{name: level} of the network's input "x" and of all layers' outputs."""
     return {"x": 0} | {layer.name: layer.level for layer in layers}
+
+
+def array_shapes(layers: list[Layer], size: tuple[int, int]) -> dict[str, tuple[int, int, int]]:
+    """{name: (H, W, C)} of the outputs and of their gradients, x among them, in an image of `size`
+    = (height, width).
+    """
+    channels = {"x": sum(layers[0].sources)} | {layer.name: layer.channels for layer in layers}
+    shapes = {
+        name: (size[0] >> level, size[1] >> level, channels[name])
+        for name, level in levels_of(layers).items()
+    }
+    return shapes | {gradient_of(name): shape for name, shape in shapes.items()}
 
 
 def multiplications(layers: list[Layer], height: int, width: int) -> int:

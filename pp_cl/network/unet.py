@@ -4,16 +4,14 @@ forward and backward.
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
-from types import ModuleType
 
 import numpy as np
 from pyopencl.array import Array
 
-from pp_cl.device.buffers import PackedArrays, Table
+from pp_cl.device.buffers import PackedArrays
 from pp_cl.device.device import Device
-from pp_cl.layers.choice import ConvolutionPolicy, ConvShape, make_policy
-from pp_cl.layers.conv import Blocking, Direction, pack_bias, pack_weights
+from pp_cl.layers.choice import ConvolutionPolicy, make_policy
+from pp_cl.layers.conv import Direction, pack_bias, pack_weights
 from pp_cl.layers.gate import gate_backward, gate_forward
 from pp_cl.layers.output import output_backward, output_forward, residual_backward
 from pp_cl.layers.resample import (
@@ -25,7 +23,7 @@ from pp_cl.layers.resample import (
 from pp_cl.layers.tiles import all_tiles_buffers
 from pp_cl.network.layers import (
     Layer,
-    SharedBuffer,
+    array_shapes,
     computations,
     convolutions,
     gradient_of,
@@ -44,110 +42,43 @@ LEAST_PIXELS, MOST_COMPUTED = 1 << 16, 0.8
 MULTIPLE = 4  # pixels: two poolings halve the height and the width
 
 
-@dataclass(frozen=True, eq=False)  # compared by identity
-class PassPlan:
-    """What a network of these layers needs for images of `size` = (height, width), forward alone or
-    with the backward pass.
-
-    blocking: of the convolutions' kernels. convolutions: {(layer, direction, source): module} that
-    the policy chose. shapes: {name: shape} of the outputs and of their gradients, that of x and its
-    own among them. shared: the buffers of all but x. scratch: {name: floats} of the memory that the
-    convolutions of the device share.
-    """
-
-    layers: list[Layer]
-    size: tuple[int, int]
-    blocking: Blocking
-    convolutions: dict[tuple, ModuleType]
-    shapes: dict[str, tuple[int, int, int]]
-    shared: list[SharedBuffer]
-    scratch: dict[str, int]
-
-    def table(self) -> Table:
-        """{name: (shape, dtype)} of all device buffers of a pass."""
-        floats = {" = ".join(b.names): b.floats for b in self.shared} | self.scratch
-        table = {name: ((number,), np.float32) for name, number in floats.items()}
-        for level in sorted(set(levels_of(self.layers).values())):
-            tiles = all_tiles_buffers(self.size[0] >> level, self.size[1] >> level)
-            table |= {f"tiles of level {level}, {name}": row for name, row in tiles.items()}
-        return table
-
-
-def plan_pass(
-    dev: Device,
-    layers: list[Layer],
-    size: tuple[int, int],
-    training: bool,
-    *,
-    policy: ConvolutionPolicy,
-) -> PassPlan:
-    """The plan of a size. Raises UserError where no variant is as exact as the policy's
-    tolerance.
-    """
-    height, width = size
-    channels = {"x": sum(layers[0].sources)} | {layer.name: layer.channels for layer in layers}
-    shapes = {
-        name: (height >> level, width >> level, channels[name])
-        for name, level in levels_of(layers).items()
-    }
-    parameters, modules, scratch = parameter_table(layers), {}, {}
-    for layer in convolutions(layers):
-        rows, columns, _ = shapes[layer.name]
-        weight_shape, _ = parameters[layer.name + ".weight"]
-        for direction, source in computations(layer, training):
-            shape = ConvShape(
-                direction, layer.kernel_size, layer.sources, layer.channels, rows * columns, source
-            )
-            module = policy.convolution(shape)
-            modules[layer.name, direction, source] = module
-            needed = module.scratch_floats(
-                dev, policy.blocking, direction, rows, weight_shape, shape.ci
-            )
-            for name, floats in needed.items():
-                scratch[name] = max(floats, scratch.get(name, 0))
-    shapes |= {gradient_of(name): shape for name, shape in shapes.items()}
-    shared = share_buffers(lifetimes(layers, training), shapes)
-    return PassPlan(layers, size, policy.blocking, modules, shapes, shared, scratch)
-
-
 class FeatureMaps:
-    """The memory of a network's passes, forward alone or with the backward pass.
+    """The outputs of a network's layers and their gradients, for images of one size at a time.
 
-    plan: the one that is followed. arrays: {name: array} of the outputs and of their gradients
-    (layers.gradient_of), without x; some share a buffer, one after the other.
+    training: with the backward pass. size: (height, width). arrays: {name: array}, gradients by
+    gradient_of(name), without x; some share a buffer, one after the other.
     """
 
-    def __init__(self, dev: Device):
-        self.dev = dev
-        self.plan: PassPlan | None = None
+    def __init__(self, dev: Device, layers: list[Layer], training: bool):
+        self.dev, self.layers, self.training = dev, layers, training
+        self.size: tuple[int, int] | None = None
         self.arrays: dict[str, Array] = {}
         self._buffers: list[Array | None] = []
         self._all_tiles = None
 
-    def follow(self, plan: PassPlan) -> None:
-        """Compute by a plan from now on, in the same buffers where they are large enough: images of
-        a film differ in size. The arrays are undefined.
+    def resize(self, size: tuple[int, int]) -> None:
+        """Make room for images of this size, in the same buffers where they are large enough:
+        images of a film differ in size. The arrays are undefined then.
         """
-        if plan is self.plan:
+        if size == self.size:
             return
-        if self.plan is None or plan.size != self.plan.size:
-            self._all_tiles = None
-        self.plan, self.arrays = plan, {}
-        self._buffers += [None] * (len(plan.shared) - len(self._buffers))
-        for i, shared in enumerate(plan.shared):
-            if self._buffers[i] is None or self._buffers[i].size < shared.floats:
+        self.size, self.arrays, self._all_tiles = size, {}, None
+        shapes = array_shapes(self.layers, size)
+        shared = share_buffers(lifetimes(self.layers, self.training), shapes)
+        self._buffers += [None] * (len(shared) - len(self._buffers))
+        for i, buffer in enumerate(shared):
+            if self._buffers[i] is None or self._buffers[i].size < buffer.floats:
                 self._buffers[i] = None  # frees the old one first
-                self._buffers[i] = self.dev.empty((shared.floats,))
-        for shared, buffer in zip(plan.shared, self._buffers, strict=False):
-            for name in shared.names:
-                shape = plan.shapes[name]
-                self.arrays[name] = buffer[: math.prod(shape)].reshape(shape)
+                self._buffers[i] = self.dev.empty((buffer.floats,))
+            for name in buffer.names:
+                floats = math.prod(shapes[name])
+                self.arrays[name] = self._buffers[i][:floats].reshape(shapes[name])
 
     @property
     def all_tiles(self) -> AllTiles:
-        """Of an image of the plan's size."""
+        """Of an image of this size."""
         if self._all_tiles is None:
-            self._all_tiles = AllTiles(self.dev, self.plan.size, self.plan.layers)
+            self._all_tiles = AllTiles(self.dev, self.size, self.layers)
         return self._all_tiles
 
 
@@ -193,10 +124,10 @@ class UNet:
         table = parameter_table(self.layers)
         self.gradients = {name: dev.zeros(*row) for name, row in table.items()}
         self._relu_outputs = {layer.name for layer in self.layers if layer.relu}
-        self._plans = {}  # {(policy, size, training): PassPlan}
         self._maps = {}  # {training: FeatureMaps}
+        self._modules = {}  # {(policy, layer, direction, source, size): module of a convolution}
         self._tile_lists = {name: PackedArrays(dev) for name in ("forward", "backward")}
-        self._trained = None  # (plan, arrays, tiles) of the last forward(training=True)
+        self._trained = None  # (size, arrays, tiles) of the last forward(training=True)
         self._frozen = None  # {(layer, module): weights} once frozen
 
     @classmethod
@@ -259,16 +190,19 @@ class UNet:
             raise ValueError(
                 f"the network takes (4n, 4m, {self.channels_in}) features, not {x.shape}"
             )
-        maps = self._feature_maps((height, width), training)
+        if training not in self._maps:
+            self._maps[training] = FeatureMaps(self.dev, self.layers, training)
+        maps, size = self._maps[training], (height, width)
+        maps.resize(size)
         arrays = maps.arrays | {"x": x}
         tiles = plan or maps.all_tiles
         for layer in self.layers:
             sources, out = tuple(arrays[name] for name in layer.inputs), arrays[layer.name]
-            self._forward(maps.plan, layer, sources, out, tiles.tiles(layer.name))
+            self._forward(size, layer, sources, out, tiles.tiles(layer.name))
             tiles.fill_copies(layer.name, out)
         output_forward(self.dev, out, x if self._residual else None)
         if training:
-            self._trained = maps.plan, arrays, tiles
+            self._trained = size, arrays, tiles
         return out
 
     def backward(self, grad_y: Array) -> Array:
@@ -281,23 +215,23 @@ class UNet:
         """
         if self._trained is None:
             raise RuntimeError("UNet.backward needs a forward(training=True) before it")
-        (plan, arrays, tiles), self._trained = self._trained, None
+        (size, arrays, tiles), self._trained = self._trained, None
         output_backward(self.dev, grad_y, arrays[gradient_of(self.layers[-1].name)])
         tiles = tiles.backward(arrays, self._tile_lists["backward"])
         for layer in reversed(self.layers):
             grad = gradient_of(layer.name)
             tiles.fill_copies(grad, arrays[grad])
             if layer.kind == "conv":
-                self._backward_weights(plan, layer, arrays, tiles.tiles(grad))
+                self._backward_weights(size, layer, arrays, tiles.tiles(grad))
             for i, name in enumerate(layer.inputs):
-                self._backward_input(plan, layer, i, arrays, tiles.tiles(gradient_of(name)))
+                self._backward_input(size, layer, i, arrays, tiles.tiles(gradient_of(name)))
         grad_x = arrays[gradient_of("x")]
         tiles.fill_copies(gradient_of("x"), grad_x)
         if self._residual:
             residual_backward(self.dev, grad_y, grad_x)
         return grad_x
 
-    def _forward(self, plan, layer, sources, out, tiles):
+    def _forward(self, size, layer, sources, out, tiles):
         """Compute the tiles of a layer's output from its inputs."""
         if layer.kind == "gate":
             gate_forward(self.dev, sources[0], out, tiles=tiles)
@@ -306,20 +240,20 @@ class UNet:
         elif layer.kind == "upsample":
             upsample2_forward(self.dev, sources[0], out, tiles=tiles)
         else:
-            module = plan.convolutions[layer.name, Direction.FORWARD, None]
+            module = self._module(layer, Direction.FORWARD, None, size)
             module.forward(
                 self.dev,
-                plan.blocking,
+                self.policy.blocking,
                 sources,
                 self.parameters[layer.name + ".weight"],
                 self.parameters[layer.name + ".bias"],
                 out,
                 relu=layer.relu,
                 tiles=tiles,
-                laid_out=self._laid_out(plan, layer, module),
+                laid_out=self._laid_out(layer, module),
             )
 
-    def _backward_input(self, plan, layer, source, arrays, tiles):
+    def _backward_input(self, size, layer, source, arrays, tiles):
         """Compute the tiles of the gradient of a layer's input of number `source`."""
         name = layer.inputs[source]
         x, grad_x, grad_out = (
@@ -333,9 +267,9 @@ class UNet:
         elif layer.kind == "upsample":
             upsample2_backward(self.dev, grad_out, grad_x, tiles=tiles)
         else:
-            plan.convolutions[layer.name, Direction.BACKWARD_INPUT, source].backward_input(
+            self._module(layer, Direction.BACKWARD_INPUT, source, size).backward_input(
                 self.dev,
-                plan.blocking,
+                self.policy.blocking,
                 self.parameters[layer.name + ".weight"],
                 sum(layer.sources[:source]),
                 grad_out,
@@ -344,11 +278,11 @@ class UNet:
                 tiles=tiles,
             )
 
-    def _backward_weights(self, plan, layer, arrays, tiles):
+    def _backward_weights(self, size, layer, arrays, tiles):
         """Overwrite the gradients of a convolution's parameters."""
-        plan.convolutions[layer.name, Direction.BACKWARD_WEIGHTS, None].backward_weights(
+        self._module(layer, Direction.BACKWARD_WEIGHTS, None, size).backward_weights(
             self.dev,
-            plan.blocking,
+            self.policy.blocking,
             tuple(arrays[name] for name in layer.inputs),
             arrays[gradient_of(layer.name)],
             self.gradients[layer.name + ".weight"],
@@ -356,14 +290,22 @@ class UNet:
             tiles=tiles,
         )
 
-    def _laid_out(self, plan, layer, module):
+    def _module(self, layer, direction, source, size):
+        """The module that computes a convolution in an image of a size."""
+        key = self.policy, layer.name, direction, source, size
+        if key not in self._modules:
+            self._modules[key] = self.policy.convolution(layer.shape(direction, source, *size))
+        return self._modules[key]
+
+    def _laid_out(self, layer, module):
         """The weights as the module transforms them, once frozen; None = not in advance."""
         if self._frozen is None:
             return None
-        if (layer.name, module) not in self._frozen:
+        key = layer.name, module
+        if key not in self._frozen:
             weight = self.parameters[layer.name + ".weight"]
-            self._frozen[layer.name, module] = module.lay_out(self.dev, plan.blocking, weight)
-        return self._frozen[layer.name, module]
+            self._frozen[key] = module.lay_out(self.dev, self.policy.blocking, weight)
+        return self._frozen[key]
 
     def output(self, name: str) -> Array:
         """(H, W, C) output of the layer `name` in the last forward(training=True), until its
@@ -373,31 +315,33 @@ class UNet:
 
     def memory_plan(self, height: int, width: int, training: bool) -> list[tuple[str, tuple, int]]:
         """[(name, shape, bytes)] of all device buffers of this network once it has run at this
-        size.
+        size, what its convolutions share with others among them.
 
         Gradients of parameters are among them without training too: they are made with the network.
         Raises UserError where no variant is as exact as the policy's tolerance.
         """
-        parameters = parameter_table(self.layers)
-        table = self._plan((height, width), training).table() | parameters
+        size, parameters = (height, width), parameter_table(self.layers)
+        shared = share_buffers(lifetimes(self.layers, training), array_shapes(self.layers, size))
+        floats = {" = ".join(buffer.names): buffer.floats for buffer in shared}
+        for layer in convolutions(self.layers):
+            weight_shape, _ = parameters[layer.name + ".weight"]
+            for direction, source in computations(layer, training):
+                needed = self._module(layer, direction, source, size).scratch_floats(
+                    self.dev,
+                    self.policy.blocking,
+                    direction,
+                    height >> layer.level,
+                    weight_shape,
+                    layer.shape(direction, source, *size).ci,
+                )
+                for name, number in needed.items():
+                    floats[name] = max(number, floats.get(name, 0))
+        table = {name: ((number,), np.float32) for name, number in floats.items()} | parameters
         table |= {gradient_of(name): row for name, row in parameters.items()}
+        for level in set(levels_of(self.layers).values()):
+            tiles = all_tiles_buffers(height >> level, width >> level)
+            table |= {f"tiles of level {level}, {name}": row for name, row in tiles.items()}
         return [
             (name, shape, math.prod(shape) * np.dtype(dtype).itemsize)
             for name, (shape, dtype) in table.items()
         ]
-
-    def _plan(self, size, training):
-        key = self.policy, size, training
-        if key not in self._plans:
-            self._plans[key] = plan_pass(self.dev, self.layers, size, training, policy=self.policy)
-        return self._plans[key]
-
-    def _feature_maps(self, size, training):
-        """The buffers for this size."""
-        if training not in self._maps:
-            self._maps[training] = FeatureMaps(self.dev)
-        maps, plan = self._maps[training], self._plan(size, training)
-        if training and plan is not maps.plan:
-            self._trained = None
-        maps.follow(plan)
-        return maps

@@ -20,7 +20,7 @@ from pp_cl.network.tile_plan import grow
 from pp_cl.selftest.convolutions import Layer, within
 
 CPU = SHIPPED["CPU"]
-DIRECT, LOCAL, WINOGRAD = (VARIANTS[name].module for name in ("direct", "local", "winograd"))
+DIRECT, LOCAL, WINOGRAD = (VARIANTS[name] for name in ("direct", "local", "winograd"))
 # (module, side of the kernel)
 ALL = [
     pytest.param(module, k, id=f"{module.__name__.rpartition('.')[2]} {k}x{k}")
