@@ -150,7 +150,7 @@ def backward_weights(
     check_weights(sources, grad_weight, grad_bias, grad_out)
     partial = dev.scratch(PARTIAL, partial_floats(height, grad_weight.shape))
     tiles = checked_tiles(dev, tiles, height, width)
-    parts, rows = _parts(height, grad_weight.shape)
+    parts, rows = image_parts(height, grad_weight.shape)
     first = 0
     for source in sources:
         c = source.shape[2]
@@ -215,16 +215,11 @@ def fitting(blocking: Blocking, width: int, channels: int) -> tuple[int, int, tu
 def partial_floats(height: int, weight_shape: tuple) -> int:
     """Floats of PARTIAL that backward_weights() needs for an image `height` high."""
     blocks, k, _, ci, _ = weight_shape
-    return most_parts(height, weight_shape) * blocks * (k * k * ci + 1) * VECTOR
+    return image_parts(height, weight_shape)[0] * blocks * (k * k * ci + 1) * VECTOR
 
 
-def most_parts(height: int, weight_shape: tuple) -> int:
-    """Into how many parts the sum over an image `height` high is cut."""
-    return _parts(height, weight_shape)[0]
-
-
-def _parts(height, weight_shape):
-    """(parts, rows of each) of the sum over an image."""
+def image_parts(height: int, weight_shape: tuple) -> tuple[int, int]:
+    """(parts, rows of each) into which the sum over an image `height` high is cut."""
     blocks, k, _, ci, _ = weight_shape
     limit = max(1, PARTIAL_FLOATS // (blocks * (k * k * ci + 1) * VECTOR))
     rows = max(ROWS_PER_PART, -(-height // limit))

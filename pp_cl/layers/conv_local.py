@@ -11,8 +11,8 @@ from pp_cl.layers.conv import Blocking, check_weights, sum_parts
 from pp_cl.layers.conv_direct import (
     PARTIAL,
     flip_weights,
+    image_parts,
     lay_out,
-    most_parts,
     partial_floats,
     scratch_floats,
 )
@@ -125,7 +125,7 @@ def backward_weights(
     check_weights(sources, grad_weight, grad_bias, grad_out)
     partial = dev.scratch(PARTIAL, partial_floats(height, grad_weight.shape))
     tiles = checked_tiles(dev, tiles, height, width)
-    run = max(SUMMED, -(-tiles.number // most_parts(height, grad_weight.shape)))
+    run = max(SUMMED, -(-tiles.number // image_parts(height, grad_weight.shape)[0]))
     parts = -(-tiles.number // run)
     first = 0
     for source in sources:

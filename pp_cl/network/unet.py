@@ -62,7 +62,7 @@ class FeatureMaps:
         """
         if size == self.size:
             return
-        self.size, self.arrays, self._all_tiles = size, {}, None
+        self.size, self.arrays, self._all_tiles = None, {}, None
         shapes = array_shapes(self.layers, size)
         shared = share_buffers(lifetimes(self.layers, self.training), shapes)
         self._buffers += [None] * (len(shared) - len(self._buffers))
@@ -73,6 +73,7 @@ class FeatureMaps:
             for name in buffer.names:
                 floats = math.prod(shapes[name])
                 self.arrays[name] = self._buffers[i][:floats].reshape(shapes[name])
+        self.size = size
 
     @property
     def all_tiles(self) -> AllTiles:
@@ -192,6 +193,8 @@ class UNet:
             )
         if training not in self._maps:
             self._maps[training] = FeatureMaps(self.dev, self.layers, training)
+        if training:
+            self._trained = None  # its arrays are overwritten
         maps, size = self._maps[training], (height, width)
         maps.resize(size)
         arrays = maps.arrays | {"x": x}
@@ -256,9 +259,8 @@ class UNet:
     def _backward_input(self, size, layer, source, arrays, tiles):
         """Compute the tiles of the gradient of a layer's input of number `source`."""
         name = layer.inputs[source]
-        x, grad_x, grad_out = (
-            arrays[key] for key in (name, gradient_of(name), gradient_of(layer.name))
-        )
+        x, grad_x = arrays[name], arrays[gradient_of(name)]
+        grad_out = arrays[gradient_of(layer.name)]
         mask = x if name in self._relu_outputs else None
         if layer.kind == "gate":
             gate_backward(self.dev, x, grad_out, grad_x, tiles=tiles)

@@ -191,23 +191,6 @@ def test_a_network_takes_what_was_tuned(dev, rng):
         UNet(dev, (16, 16, 16), policy=make_policy(dev, 1e-6)).memory_plan(64, 64, True)
 
 
-@pytest.mark.parametrize(
-    "blocking",
-    [
-        {"winograd": (128, 8), "winograd_weights": 64},
-        {"winograd": (32, 8), "direct": (4, 2, (1, 1, 1))},
-    ],
-)
-def test_the_memory_plan_follows_the_blocking(plain, blocking):
-    policy = make_policy(plain, DEFAULT, tuning_of(plain, blocking=blocking))
-    x, grad_y = plain.zeros((32, 36, 16)), plain.zeros((32, 36, 3))
-    before = plain.bytes
-    net = UNet(plain, (16, 32, 48), policy=policy)
-    net.forward(x)
-    net.backward(grad_y)
-    assert plain.bytes - before == sum(size for _, _, size in net.memory_plan(32, 36, True))
-
-
 # ---- the file
 
 
@@ -253,8 +236,6 @@ BROKEN = {
     "empty": b"",
     "binary": b"\xff\xfe\x00",
     "cut": b'{"format": 1,',
-    "no object": b"[]",
-    "other": b'{"a": 1}',
     "deep": b"[" * 100_000,
     "5000 digits": b'{"format": ' + b"9" * 5000 + b"}",
     "large": b" " * 2**24 + b"{}",
@@ -268,23 +249,14 @@ NESTED = json.loads("[" * 900 + "]" * 900)
     [
         *(pytest.param(content, id=name) for name, content in BROKEN.items()),
         {"format": 2},
-        {"device": {}},
         {"device": None},
         {"tile_shapes": {"winograd": [63, 7]}},
-        {"tile_shapes": {"fft": [8]}},
         {"tile_shapes": {"winograd": [True, 7]}},
         {"tile_shapes": {"winograd": [64.0, 8]}},
         {"tile_shapes": {"winograd": NESTED}},
-        {"tile_shapes": None},
         {"rows": None},
-        {"rows": {}},
-        {"rows": "fast"},
-        {"rows": [1]},
         {"rows": [{}]},
         {"rows": [row(direction="up")]},
-        {"rows": [row(direction=["forward"])]},
-        {"rows": [row(pixels=0)]},
-        {"rows": [row(pixels=2.5)]},
         {"rows": [row(pixels=True)]},
         {"rows": [row(pixels=10**400)]},
         {"rows": [row(ms={}, rel_l2={})]},

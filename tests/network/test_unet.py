@@ -1,7 +1,7 @@
 """The network against float64, its buffers, and what is refused."""
 
-import dataclasses
 import math
+from dataclasses import fields, replace
 from itertools import pairwise
 
 import numpy as np
@@ -108,19 +108,24 @@ def test_wrong_use_is_refused(dev):
 
 
 @pytest.mark.parametrize(
-    "variant, blocks",
-    [("direct", "double"), ("winograd", "double"), ("auto", "single"), ("local", "gated")],
+    "variant, blocks, blocking",
+    [
+        ("direct", "double", {"direct": (4, 2, (1, 1, 1))}),
+        ("winograd", "double", {"winograd": (128, 8), "winograd_weights": 64}),
+        ("auto", "single", {"winograd": (32, 8)}),
+        ("local", "gated", {}),
+    ],
 )
 @pytest.mark.parametrize("training", [False, True])
-def test_memory_plan_is_what_is_allocated(plain, training, variant, blocks):
-    x, grad_y = plain.zeros((16, 20, 16)), plain.zeros((16, 20, 3))
-    before = plain.bytes
-    policy = make_policy(plain, variant=variant)
+def test_memory_plan_is_what_is_allocated(plain, training, variant, blocks, blocking):
+    x, grad_y = plain.zeros((32, 36, 16)), plain.zeros((32, 36, 3))
+    before, policy = plain.bytes, make_policy(plain, variant=variant)
+    policy = replace(policy, blocking=replace(policy.blocking, **blocking))
     net = UNet(plain, (16, 32, 48), blocks=blocks, policy=policy)
     net.forward(x, training)
     if training:
         net.backward(grad_y)
-    assert plain.bytes - before == sum(row[2] for row in net.memory_plan(16, 20, training))
+    assert plain.bytes - before == sum(row[2] for row in net.memory_plan(32, 36, training))
 
 
 @pytest.mark.parametrize(
@@ -138,7 +143,7 @@ def test_size_of_the_papers_network(blocks, parameters, operations):
 
 
 def test_the_setting_names_the_blocks():
-    (item,) = (field for field in dataclasses.fields(NetworkConfig) if field.name == "blocks")
+    (item,) = (field for field in fields(NetworkConfig) if field.name == "blocks")
     assert item.metadata["choices"] == BLOCKS
 
 
