@@ -15,7 +15,7 @@ from pyopencl.array import Array
 
 from pp_cl.device.buffers import Buffers, Table
 from pp_cl.device.device import Device
-from pp_cl.device.transfer import Reading, send
+from pp_cl.device.transfer import Reading
 from pp_cl.files.picture import Picture
 from pp_cl.layers.tiles import tiles_hit
 from pp_cl.model import Model
@@ -127,7 +127,7 @@ class Renderer:
         padded, *offset = camera.padded(NETWORK_MULTIPLE)
         size = (padded.height, padded.width)
         b.require(_view_table(cloud.count, size))
-        send(dev, b.camera_buffer, self.model.packed(padded, depth_range))
+        dev.send(b.camera_buffer, self.model.packed(padded, depth_range))
         self._set_radius()
         with dev.stage("project"):
             points = project_grid(
@@ -190,7 +190,7 @@ class Renderer:
         model = self.model
         radius = point_radius(self.settings, model.grid.edge, model.depth_range)
         if radius != self._radius:
-            send(self.dev, self._buffers.point_radius, np.array([radius], np.float32))
+            self.dev.send(self._buffers.point_radius, np.array([radius], np.float32))
             self._radius = radius
 
     def backward(

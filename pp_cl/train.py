@@ -192,7 +192,7 @@ class Trainer:
             self._terms.get()
 
     def _gradient_tiles(self, target, camera):
-        """UNet.plan_tiles()'s differs, to be asked for once the device was waited for."""
+        """UNet.plan_tiles()'s gradient_tiles, to be asked for once the device was waited for."""
         padded, *offset = camera.padded(NETWORK_MULTIPLE)
         size = padded.height, padded.width
         if self.perceptual_loss or not self.model.net.is_planned(size):

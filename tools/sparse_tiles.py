@@ -22,10 +22,11 @@ from pp_cl.errors import UserError
 from pp_cl.files.atomic import write_json
 from pp_cl.layers.choice import make_policy
 from pp_cl.layers.tiles import tiles_find
+from pp_cl.network.tile_plan import gradient_tiles
 from pp_cl.render import Renderer
 from pp_cl.run import load_run
 from pp_cl.scene.target import Target
-from pp_cl.training.loss import WHITE, Loss, gradient_tiles
+from pp_cl.training.loss import WHITE, Loss
 
 
 class Comparison:

@@ -6,7 +6,7 @@ import time
 
 from pp_cl.device.device import Device
 from pp_cl.layers.choice import device_class
-from pp_cl.layers.tiles import LANES
+from pp_cl.layers.tiles import VECTOR
 
 # Of one run: long against the 30 us of a launch, short enough to run between any two others.
 SECONDS = 0.02
@@ -27,7 +27,7 @@ class PeakFlops:
         self.chains, per_unit, self.local = {"CPU": (16, 64, 1), "GPU": (2, 2048, 64)}[
             device_class(dev)
         ]
-        self.out = dev.empty((per_unit * dev.info["compute_units"], LANES))
+        self.out = dev.empty((per_unit * dev.info["compute_units"], VECTOR))
         self.rounds = 64
         self.run()  # builds the kernel
         while self._seconds() < SECONDS:
@@ -66,7 +66,7 @@ class CopyBandwidth:
 
     def __init__(self, dev: Device):
         self.dev = dev
-        self.source = dev.zeros((COPY_BYTES // (4 * LANES), LANES))
+        self.source = dev.zeros((COPY_BYTES // (4 * VECTOR), VECTOR))
         self.target = dev.zeros(self.source.shape)
         self.bytes = self.source.nbytes + self.target.nbytes
 

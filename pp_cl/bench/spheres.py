@@ -8,7 +8,7 @@ from pyopencl.array import Array
 
 from pp_cl.device.buffers import Buffers
 from pp_cl.device.device import Device
-from pp_cl.device.form import lanes
+from pp_cl.device.launch import lanes
 from pp_cl.raster.pairs import Pairs, find_pairs, room_needed
 from pp_cl.raster.project import FOOTPRINTS, ProjectedPoints, projection_table
 from pp_cl.raster.weights import BlendWeights

@@ -9,7 +9,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from pp_cl.layers.conv import pack_bias, pack_weights, unpack_weights
-from pp_cl.layers.tiles import LANES
+from pp_cl.layers.tiles import VECTOR
 from pp_cl.network.layers import Layer, convolutions
 from pp_cl.network.unet import UNet
 from pp_cl.run import Run
@@ -80,7 +80,7 @@ def kept_channels(
         if layer.name in weights:
             weight = weights[layer.name]
             count = int((weight >= least * weight.max()).sum()) if least > 0 else len(weight)
-            count = min(-(-max(1, count) // LANES) * LANES, len(weight))
+            count = min(-(-max(1, count) // VECTOR) * VECTOR, len(weight))
             kept[layer.name] = np.sort(np.argsort(-weight, kind="stable")[:count])
         elif layer.kind == "pool" and layer.inputs[0] in kept:
             kept[layer.name] = kept[layer.inputs[0]]

@@ -3,9 +3,8 @@
 import numpy as np
 from pyopencl.array import Array
 
-from pp_cl.device.buffers import scratch
 from pp_cl.device.device import Device
-from pp_cl.device.form import launch_groups
+from pp_cl.device.launch import launch_groups
 from pp_cl.device.transfer import Reading, read_later
 
 BLOCK = 512  # values that a work-item of a CPU scans
@@ -33,7 +32,7 @@ def _scan(dev, values, offsets, level):
     if blocks > 1:
         block_offset = _block_offsets(dev, "scan_sums", n, blocks, level=level, values=values)
     else:
-        block_offset = scratch(dev, ("scan offset", level), 2, np.uint32)
+        block_offset = dev.scratch(("scan offset", level), 2, np.uint32)[:2]
         dev.fill(block_offset, 0)
     _launch(
         dev,
@@ -49,8 +48,8 @@ def _scan(dev, values, offsets, level):
 
 def _block_offsets(dev, kernel, n, blocks, *, level, **entries):
     """(blocks + 1,) prefix sums of what the kernel finds in each block of n entries."""
-    block_offset = scratch(dev, ("scan offset", level), blocks + 1, np.uint32)
-    block_sum = scratch(dev, ("scan sum", level), blocks, np.uint32)
+    block_offset = dev.scratch(("scan offset", level), blocks + 1, np.uint32)[: blocks + 1]
+    block_sum = dev.scratch(("scan sum", level), blocks, np.uint32)[:blocks]
     _launch(dev, kernel, blocks, n=n, b=blocks, block_sum=block_sum, **entries)
     _scan(dev, block_sum, block_offset, level + 1)
     return block_offset

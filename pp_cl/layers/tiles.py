@@ -10,12 +10,12 @@ from dataclasses import dataclass
 import numpy as np
 from pyopencl.array import Array
 
-from pp_cl.device.buffers import Table, scratch
+from pp_cl.device.buffers import Table
 from pp_cl.device.device import Device
-from pp_cl.device.form import channel_ranges, lanes
+from pp_cl.device.launch import channel_ranges, lanes
 from pp_cl.device.transfer import Reading, read_later
 
-LANES = 16  # channels in one float16
+VECTOR = 16  # channels in one float16
 # pixels: the outputs of F(4x4, 3x3), and one pixel after the network has halved its input twice
 SIDE = 4
 
@@ -130,7 +130,7 @@ def _program(dev):
 def _flags(dev, kernel, size, **arguments):
     shape = grid_shape(*size)
     tiles = shape[0] * shape[1]
-    flags = scratch(dev, "tile flags", tiles, np.int32)
+    flags = dev.scratch("tile flags", tiles, np.int32)[:tiles]
     _program(dev).launch(
         kernel, tiles, h=size[0], w=size[1], flags=flags.reshape(shape), **arguments
     )

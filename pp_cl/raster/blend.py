@@ -9,7 +9,7 @@ from pyopencl.array import Array
 
 from pp_cl.device.buffers import Buffers, Table
 from pp_cl.device.device import Device
-from pp_cl.device.form import lanes, row_parts
+from pp_cl.device.launch import lanes, row_parts
 from pp_cl.raster.pairs import Pairs
 from pp_cl.raster.weights import BlendWeights
 

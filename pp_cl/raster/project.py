@@ -9,7 +9,7 @@ from pyopencl.array import Array
 
 from pp_cl.device.buffers import Buffers, Table
 from pp_cl.device.device import Device
-from pp_cl.device.form import lanes
+from pp_cl.device.launch import lanes
 
 FOOTPRINTS = ("disc", "soft", "sphere")  # numbered as in cl/raster/footprint.h, which explains them
 

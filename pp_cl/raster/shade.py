@@ -6,7 +6,7 @@ import numpy as np
 from pyopencl.array import Array
 
 from pp_cl.device.device import Device
-from pp_cl.device.form import lanes, row_parts
+from pp_cl.device.launch import lanes, row_parts
 from pp_cl.raster.points import four_blocks, stored_degree
 from pp_cl.raster.project import ProjectedPoints
 

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from pp_cl.device.device import Device
-from pp_cl.device.form import lanes
+from pp_cl.device.launch import lanes
 from pp_cl.errors import UserError
 from pp_cl.files.atomic import atomic_folder, write_json
 from pp_cl.files.image import write_png

@@ -9,7 +9,7 @@ from pyopencl.array import Array
 
 from pp_cl.device.buffers import Buffers, Table
 from pp_cl.device.device import Device
-from pp_cl.device.form import launch_groups
+from pp_cl.device.launch import launch_groups
 
 
 class MaskLoss:

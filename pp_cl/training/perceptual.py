@@ -7,7 +7,7 @@ from pyopencl.array import Array
 
 from pp_cl.device.buffers import Buffers, Table
 from pp_cl.device.device import Device
-from pp_cl.device.form import lanes, launch_groups
+from pp_cl.device.launch import lanes, launch_groups
 from pp_cl.errors import UserError
 from pp_cl.layers.choice import ConvolutionPolicy
 from pp_cl.metrics.lpips import BLOCKS, LEAST_SIZE, WIDTHS, Lpips, size_of, vgg_layers
@@ -32,7 +32,7 @@ class PerceptualLoss:
     ):
         self.dev = dev
         self.weight = weight
-        self._network = Lpips(dev, weights, policy, training=True)
+        self._network = Lpips(dev, weights, policy)
         self._buffers = Buffers(dev)
 
     @staticmethod

@@ -7,7 +7,7 @@ from pyopencl.array import Array
 
 from pp_cl.device.buffers import Buffers, Table
 from pp_cl.device.device import Device
-from pp_cl.device.form import lanes, row_parts
+from pp_cl.device.launch import lanes, row_parts
 from pp_cl.raster.points import SH_BLOCKS
 
 # points smoothed at a time: their new values stay in a CPU's cache until they are written back

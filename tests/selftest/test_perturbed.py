@@ -12,7 +12,7 @@ from pp_cl.selftest.run import CASES, run_cases
 KERNELS = device_module.kernel_folder()
 # (kernel file, text that stands there once, what it becomes, the case that must fail)
 FLIPS = [
-    ("device/compact", "to[c] = from[c]", "to[c] = -from[c]", "device: compact and gather rows"),
+    ("device/rows", "to[c] = from[c]", "to[c] = -from[c]", "device: compact and gather rows"),
     ("device/scan", "sum = add_sat(sum, total)", "sum = add_sat(sum, -total)", "device: scan"),
     ("scene/demo", "y[lane] = p.y", "y[lane] = -p.y", "scene: demo"),
     ("scene/hull", "alive & seen", "alive | seen", "scene: hull"),
@@ -70,7 +70,7 @@ def at_length():
 )
 def test_a_flip_fails_its_case(dev, tmp_path, monkeypatch, file, text, flipped, name):
     case = next(case for case in CASES if case.name == name)
-    monkeypatch.setattr(dev, "is_cpu", takes_cpu_form(dev, file, text))
+    monkeypatch.setattr(dev, "is_cpu", acts_as_cpu(dev, file, text))
     assert [row.passed for row in run_cases(dev, [case])] == [True]
     folder = flipped_folder(tmp_path, file, text, flipped)
     monkeypatch.setattr(device_module, "kernel_folder", lambda: folder)
@@ -79,8 +79,8 @@ def test_a_flip_fails_its_case(dev, tmp_path, monkeypatch, file, text, flipped, 
     assert [row.case for row in run_cases(dev, [case]) if not row.passed] == [name]
 
 
-def takes_cpu_form(dev, file, text):
-    """The device's own form, but of what one form alone runs."""
+def acts_as_cpu(dev, file, text):
+    """What the device does, but for what CPUs or GPUs alone run."""
     if text == "sorted[middle] <":
         return False
     return dev.is_cpu or text == "keys[a] < keys[b]" or file.startswith("layers/winograd")
