@@ -18,7 +18,7 @@ def test_exclusive_scan(dev, rng, n):
     offsets = dev.empty((n + 1,), np.uint32)
     exclusive_scan(dev, dev.upload(values), offsets)
     assert np.array_equal(offsets.get(), np.concatenate([[0], np.cumsum(values)]))
-    assert read_total(dev, offsets).get() == [values.sum()]
+    assert read_total(dev, offsets).get() == values.sum()
 
 
 @pytest.mark.parametrize("n", SIZES)
@@ -27,7 +27,7 @@ def test_nonzero(dev, rng, n, share):
     flags = rng.integers(1, 256, n).astype(np.uint8) * (rng.random(n) < share).astype(np.uint8)
     indices = dev.empty((n,), np.uint32)
     listed = nonzero(dev, dev.upload(flags), indices)
-    assert np.array_equal(listed.array.get(), np.flatnonzero(flags))
+    assert np.array_equal(listed.get().get(), np.flatnonzero(flags))
 
 
 def test_values_are_summed_exactly_up_to_32_bits(dev):
