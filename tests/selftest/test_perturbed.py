@@ -47,7 +47,7 @@ FLIPS = [
     ("layers/tiles", "line[i] != background", "line[i] == background", "layers: tiles"),
     ("training/loss", "* slope + slope_0", "* slope - slope_0", "loss: L1 and SSIM"),
     ("training/mask", "1.0f - transmittance", "1.0f + transmittance", "loss: mask"),
-    ("training/loss", "(z - nearest) * weights - depths", "(z - nearest) * weights + depths", "loss: spread"),
+    ("training/loss", "weights - depths", "weights + depths", "loss: spread"),
     ("training/loss", "terms[0] += weight", "terms[0] -= weight", "loss: sum of its terms"),
     ("training/perceptual", "= of_row /", "= -of_row /", "loss: perceptual"),
     ("training/adam", "(g - m_new)", "(g + m_new)", "adam: arrays"),
