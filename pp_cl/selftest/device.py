@@ -33,7 +33,7 @@ def _nonzero(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
         flags = rng.integers(1, 256, n) * (rng.random(n) < share)
         indices = dev.empty((n,), np.uint32)
         listed = nonzero(dev, dev.upload(flags, np.uint8), indices)
-        yield exact(listed.array.get(), np.flatnonzero(flags))
+        yield exact(listed.get().get(), np.flatnonzero(flags))
 
 
 def _compact(dev: Device, rng: np.random.Generator) -> Iterator[Check]:

@@ -32,7 +32,7 @@ def test_the_state_follows(dev, rng):
     model = make_model(dev, rng)
     state = PointState(dev, model.cloud)
     learned = model.cloud.learned().items()
-    state.averages |= {name: dev.upload(rng.random(array.shape)) for name, array in learned}
+    state.averages |= {name: dev.empty(array.shape) for name, array in learned}
     for array in state.arrays().values():
         array.set((99 * rng.random(array.shape)).astype(array.dtype))
     grid, before = model.grid, fetched(model.cloud.arrays(dev) | state.arrays())
