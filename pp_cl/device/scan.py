@@ -32,7 +32,7 @@ def _scan(dev, values, offsets, level):
     if blocks > 1:
         block_offset = _block_offsets(dev, "scan_sums", n, blocks, level=level, values=values)
     else:
-        block_offset = dev.scratch(("scan offset", level), 2, np.uint32)[:2]
+        block_offset = _scratch(dev, ("scan offset", level), 2)
         dev.fill(block_offset, 0)
     _launch(
         dev,
@@ -48,11 +48,16 @@ def _scan(dev, values, offsets, level):
 
 def _block_offsets(dev, kernel, n, blocks, *, level, **entries):
     """(blocks + 1,) prefix sums of what the kernel finds in each block of n entries."""
-    block_offset = dev.scratch(("scan offset", level), blocks + 1, np.uint32)[: blocks + 1]
-    block_sum = dev.scratch(("scan sum", level), blocks, np.uint32)[:blocks]
+    block_offset = _scratch(dev, ("scan offset", level), blocks + 1)
+    block_sum = _scratch(dev, ("scan sum", level), blocks)
     _launch(dev, kernel, blocks, n=n, b=blocks, block_sum=block_sum, **entries)
     _scan(dev, block_sum, block_offset, level + 1)
     return block_offset
+
+
+def _scratch(dev, name, n):
+    """(n,) uint32, of a power of two: numbers of pairs differ from step to step."""
+    return dev.scratch(name, 1 << (n - 1).bit_length(), np.uint32)[:n]
 
 
 def _launch(dev, kernel, blocks, **arguments):
