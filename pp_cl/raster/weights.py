@@ -29,7 +29,8 @@ class BlendWeights:
     pair's gain is dL/do (cl/raster/blend.cl); undefined where the pair is dropped. pair_role: (P,)
     uint8, cl/raster/pair_role.h. pixel_entry: (P,) uint64, weight bits << 32 | point, each pixel's
     hits by depth; where hits are dropped, an entry of no point ends a pixel's list. shaded_list:
-    `shaded` before its length is known. transmittance: (HW,) float32 behind all hits, None of a softmax.
+    `shaded` before its length is known. transmittance: (HW,) float32 behind all hits, None of a
+    softmax.
     """
 
     blend: str
