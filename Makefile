@@ -51,8 +51,8 @@ test-coarse: $(READY) ## run the tests of all kernels on PoCL with the coarse di
 	@PYOPENCL_BUILD_OPTIONS=-cl-fast-relaxed-math PP_DEVICE="Portable Computing Language" \
 		$(BIN)/python -m pytest $(ON_ALL_CORES) -m "not large and not exact" $(ARGS) $(sort $(OCLGRIND) tests/device/test_rounding.py)
 
-# Drivers and kernels have one form for CPUs and one for GPUs (pp_cl/device/form.py).
-test-gpu-form: $(READY) ## run the tests on PoCL with all drivers and kernels in the form that they have on GPUs
+# Drivers and kernels work in one way on CPUs and in another on GPUs (pp_cl/device/launch.py).
+test-gpu-form: $(READY) ## run the tests on PoCL with all drivers and kernels working as on GPUs
 	@PP_FORM=gpu PP_DEVICE="Portable Computing Language" $(BIN)/python -m pytest $(ON_ALL_CORES) $(ARGS)
 
 bench: $(READY) ## time and error of the network and of its layers; ARGS="--size 200 --widths 32,64,128" for others

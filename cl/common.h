@@ -14,6 +14,8 @@
 // 16 channels of one pixel or point
 #define CHANNELS 16
 
+#define BACKGROUND 1.0f  // every feature of a pixel without hits
+
 // A well mixed integer (lowbias32 by Chris Wellons).
 static inline uint scramble(uint x) {
     x ^= x >> 16;

@@ -10,8 +10,7 @@ from pyopencl.array import Array
 from pp_cl.device.device import Device
 from pp_cl.device.rows import DeviceRows
 from pp_cl.network.unet import UNet
-from pp_cl.raster.point_cloud import PointCloud
-from pp_cl.raster.sh import SH_DEGREES
+from pp_cl.raster.points import SH_DEGREES, PointCloud
 from pp_cl.scene.camera import Camera
 from pp_cl.scene.grid import Grid
 
@@ -104,8 +103,8 @@ class Model:
         *,
         degree: int,
     ) -> Model:
-        """Model of a checkpoint's header and arrays, as training/stored.py has checked them; the
-        arrays are taken out of `arrays`, net takes the parameters stored there.
+        """Model of a checkpoint's header and arrays, as training/checkpoint.py has checked them;
+        the arrays are taken out of `arrays`, net takes the parameters stored there.
         """
         grid = Grid.of_header(header["grid"])
         cloud = PointCloud.load(dev, arrays, degree)

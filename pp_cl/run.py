@@ -33,8 +33,8 @@ from pp_cl.scene.identity import difference, kept_views
 from pp_cl.scene.load import DEMO, Scene, open_scene, scene_frames
 from pp_cl.scene.target import Target
 from pp_cl.scene.views import Photograph, View
+from pp_cl.training.checkpoint import load_run_state
 from pp_cl.training.schedule import gamma_at
-from pp_cl.training.stored import load_run_state
 
 COMPARED_VIEWS = 2  # training photographs that tell whether a scene is the run's
 NEAREST = 0.05  # of a point to the eye, in radii of the object
@@ -355,7 +355,7 @@ def render_views(run: Run, views: list[View]) -> Iterator[Rendered]:
     for view in views:
         start = time.perf_counter()
         result = run.renderer.forward(view.camera, run.gamma)
-        image = run.checked(result.clamped(view.camera))
+        image = run.checked(result.clamped())
         seconds = time.perf_counter() - start
         target.load(view)
         truth = target.whole()

@@ -27,14 +27,14 @@ from pp_cl.presets import SHORT
 from pp_cl.run import Run, load_run
 from pp_cl.scene.agreement import disagreements, listing
 from pp_cl.scene.grid import Grid
-from pp_cl.scene.hull import build_grid, depth_range, spacing_pixels
+from pp_cl.scene.hull import build_grid, depth_range
 from pp_cl.scene.identity import difference, identity
 from pp_cl.scene.load import measured_split, open_scene, preset_downscale, scene_box, scene_frames
 from pp_cl.scene.outline import picture
 from pp_cl.scene.views import View
 from pp_cl.train import Trainer
-from pp_cl.training.fitting import Room
-from pp_cl.training.stored import load_run_state, opened_run
+from pp_cl.training.checkpoint import load_run_state, opened_run
+from pp_cl.training.memory import Room
 
 FIRST_PREVIEW = 10.0  # seconds; with a slow step and its writing it shows within 20
 MEASURED_VIEWS = 4
@@ -45,17 +45,11 @@ OnStep = Callable[[int, dict[str, Any] | None], None]
 
 
 class HullFacts(NamedTuple):
-    """The initial grid. capped: the largest grid allowed has fewer points than asked for. edge:
-    world units; spacing: the same in pixels; seconds it took. picture: of masks that disagree with
-    the others, None where all agree.
+    """How the initial grid was found. capped: the largest grid allowed has fewer points than asked
+    for. picture: of masks that disagree with the others, None where all agree.
     """
 
-    points: int
     capped: bool
-    dims: tuple[int, int, int]
-    edge: float
-    spacing: float
-    depth_range: tuple[float, float]
     seconds: float
     picture: np.ndarray | None
 
@@ -130,12 +124,16 @@ class Training:
             first = trainer.step + 1
             self._expect_save()
             while trainer.step < settings.iterations:
-                self._check_growth()
+                try:
+                    self.room.check_growth(trainer.model, trainer.step)
+                except UserError:  # the next step would not fit the memory
+                    self._save(finished=False)
+                    raise
                 start = time.perf_counter()
                 terms = trainer.train_step()
                 seconds += time.perf_counter() - start
-                if trainer.step == first:  # the kernels are built
-                    self._expect_preview()
+                if trainer.step == first and self._lacks_previews():  # the kernels are built
+                    self._preview_by = time.monotonic() + FIRST_PREVIEW
                 row = self._after_step(log, terms, seconds)
                 if on_step:
                     on_step(trainer.step, row)
@@ -150,14 +148,6 @@ class Training:
             log.write(self._row(seconds) | {"points": trainer.model.cloud.count, "finished": True})
             self._save(finished=True)
         return seconds
-
-    def _check_growth(self):
-        """Keep what is learned where the next step would not fit the memory."""
-        try:
-            self.room.check_growth(self.trainer.model, self.trainer.step)
-        except UserError:
-            self._save(finished=False)
-            raise
 
     def _after_step(self, log, terms, seconds):
         """Row of the log, preview and checkpoint, where they are due; returns the row or None. The
@@ -189,12 +179,8 @@ class Training:
         pairs = [(self._rendered(view), trainer.target(view)) for view in self.measured]
         return {"test_psnr": float(np.mean([psnr(to_8bit(a), to_8bit(b)) for a, b in pairs]))}
 
-    def _expect_preview(self):
-        """Be due an early preview, by the clock, where the run has none yet. It is an extra, which
-        no later step depends on.
-        """
-        wanted = self.config.train.previews and not any(self.folder.previews.glob("*.png"))
-        self._preview_by = time.monotonic() + FIRST_PREVIEW if wanted else math.inf
+    def _lacks_previews(self):
+        return self.config.train.previews and not any(self.folder.previews.glob("*.png"))
 
     def _expect_save(self):
         """Be due a checkpoint by the clock, which no step depends on."""
@@ -233,67 +219,47 @@ def open_training(
     little memory, and for a folder that may not be written.
     """
     check_writable(folder.path)
-    tolerance = config.network.tolerance
-    if stored:
-        policy = policy_of_run(dev, tolerance, stored[0].get("tuning"), folder.checkpoint)
-    else:
+    tolerance, begun, goal = config.network.tolerance, 0, config
+    if stored is None:
         policy = load_policy(dev, tolerance)
+    else:
+        header, arrays = stored
+        policy = policy_of_run(dev, tolerance, header.get("tuning"), folder.checkpoint)
+        begun = header["step"] if header["finished"] else header.get("extended_from", 0)
+        if begun:
+            goal = replace(config, train=replace(config.train, refine_at=NEVER))
     net = UNet.of_settings(dev, config.network, policy, seed=config.train.seed)
-    begun = _begun(stored[0]) if stored else 0
-    goal = config
-    if begun:
-        goal = replace(config, train=replace(config.train, refine_at=NEVER))
     photographs = scene_frames(config.scene.path)
     room = Room(goal, net, photographs)
-    if stored:
-        _check_stored(room, *stored)
-    else:
+    if stored is None:
         room.check_unseen()
+    else:
+        grid, points = Grid.of_header(header["grid"]), len(arrays["points.ids"])
+        room.check_points(grid, points, header["depth_range"], header["step"])
     listed = {"train": photographs}
     views = open_scene(dev, config, ("train",), listed=listed).splits["train"]
-    measured = _measured_views(dev, config) if config.train.eval_every else []
-    if stored:
-        trainer, info, hull = _resume(goal, views, net, stored, file=folder.checkpoint)
+    measured = []
+    if config.train.eval_every:
+        split = measured_split(config.scene.path)  # val, else test
+        measured = open_scene(dev, config, (split,), most=MEASURED_VIEWS).splits[split]
+    if stored is None:
+        trainer, hull = _start(config, views, net, room)
+        points = trainer.model.cloud.count
     else:
-        trainer, info, hull = _start(config, views, net, room)
-    info["tuning"] = policy.tuning
+        trainer, hull = _resume(goal, views, net, stored, begun, file=folder.checkpoint), None
+        points = header["initial_points"]
+    info = identity(views) | {"initial_points": points, "tuning": policy.tuning}
+    info |= {"extended_from": begun} if begun else {}
     return Training(folder, config, trainer, info, room, hull, policy.origin, measured)
 
 
-def _begun(header):
-    """The step of the finished training that this one extends, 0 where it extends none."""
-    return header["step"] if header["finished"] else header.get("extended_from", 0)
-
-
-def _check_stored(room, header, arrays):
-    grid, step = Grid.of_header(header["grid"]), header["step"]
-    room.check_points(grid, len(arrays["points.ids"]), header["depth_range"], step)
-
-
-def _measured_views(dev, config):
-    """A few views of the split val, else test."""
-    split = measured_split(config.scene.path)
-    return open_scene(dev, config, (split,), most=MEASURED_VIEWS).splits[split]
-
-
 def _start(config, views, net, room):
-    """(Trainer, info, HullFacts) of a training from its beginning."""
-    dev = net.dev
-    start = time.perf_counter()
-    hull = build_grid(dev, views, config.points.count, scene_box(config))
+    """(Trainer, HullFacts) of a training from its beginning."""
+    dev, points, start = net.dev, config.points, time.perf_counter()
+    hull = build_grid(dev, views, points.count, scene_box(config))
     near_far = depth_range(views, hull)
     room.check_points(hull.grid, len(hull.ids), near_far)
-    facts = HullFacts(
-        len(hull.ids),
-        hull.capped,
-        hull.grid.dims,
-        hull.grid.edge,
-        spacing_pixels(hull.grid, [view.camera for view in views]),
-        near_far,
-        time.perf_counter() - start,
-        _told_of_masks(dev, views, hull),
-    )
-    points = config.points
+    facts = HullFacts(hull.capped, time.perf_counter() - start, _told_of_masks(dev, views, hull))
     model = Model.create(
         dev,
         hull.grid,
@@ -303,8 +269,7 @@ def _start(config, views, net, room):
         degree=points.sh_degree,
         opacity=points.opacity,
     )
-    trainer = Trainer(dev, config, model, views)
-    return trainer, identity(views) | {"initial_points": facts.points}, facts
+    return Trainer(dev, config, model, views), facts
 
 
 def _told_of_masks(dev, views, hull):
@@ -321,8 +286,10 @@ def _told_of_masks(dev, views, hull):
     return picture(dev, views, hull, found)
 
 
-def _resume(config, views, net, stored, *, file):
-    """(Trainer, info, None) of a training that goes on."""
+def _resume(config, views, net, stored, begun, *, file):
+    """Trainer of a training that goes on. begun: the step of the finished training that it extends,
+    0: of none.
+    """
     header, arrays = stored
     path = config.scene.path
     if told := difference(header, views, views):
@@ -332,10 +299,8 @@ def _resume(config, views, net, stored, *, file):
             arrays[name] = array.astype(np.float32)
     model = Model.load(net.dev, header, arrays, net, degree=config.points.sh_degree)
     trainer = Trainer(net.dev, config, model, views)
-    begun = _begun(header)
     trainer.restore(header["step"], arrays, begun)
-    info = identity(views) | {"initial_points": header["initial_points"]}
-    return trainer, info | ({"extended_from": begun} if begun else {}), None
+    return trainer
 
 
 def train_scene(

@@ -5,24 +5,35 @@ import numpy as np
 from pp_cl.config import Config
 from pp_cl.device.device import Device
 from pp_cl.device.rows import DeviceRows
-from pp_cl.device.transfer import read_later
+from pp_cl.device.transfer import Reading
 from pp_cl.errors import UserError
 from pp_cl.layers.tiles import tiles_find
 from pp_cl.model import Model
+from pp_cl.network.tile_plan import gradient_tiles
+from pp_cl.raster.weights import record_weights
 from pp_cl.render import NETWORK_MULTIPLE, Renderer
 from pp_cl.scene.target import Target
 from pp_cl.scene.views import View
-from pp_cl.training.crops import BOX_MARGIN, crop_side, draw_start
-from pp_cl.training.loss import WHITE, Loss, gradient_tiles
+from pp_cl.training.loss import Loss
 from pp_cl.training.mask import MaskLoss
-from pp_cl.training.optimiser import Optimiser, Rates
+from pp_cl.training.optim import Optimiser
 from pp_cl.training.perceptual import PerceptualLoss
-from pp_cl.training.point_state import PointState
-from pp_cl.training.prune import judge, keep_indices
-from pp_cl.training.refine import refine
-from pp_cl.training.schedule import ema_start, ema_weight, gamma_at, refine_steps, rising_weight
+from pp_cl.training.prune import final_points_to_keep, points_to_keep
+from pp_cl.training.schedule import (
+    BOX_MARGIN,
+    Rates,
+    crop_side,
+    draw_start,
+    ema_start,
+    ema_weight,
+    gamma_at,
+    refine_steps,
+    rising_weight,
+)
 from pp_cl.training.smooth import Smoother
-from pp_cl.training.terms import StepTerms
+from pp_cl.training.state import PointState, split_opacity
+
+WHITE = 1.0  # of a target where its photograph is transparent
 
 
 class Trainer:
@@ -45,11 +56,13 @@ class Trainer:
         self.renderer = Renderer(dev, model, config.raster)
         self.loss = Loss(dev, self.config.ssim_weight, self.config.smooth_l1)
         self.mask_loss = MaskLoss(dev, self.config.mask_weight)
-        self.perceptual = PerceptualLoss(dev, self.config.perceptual_weight, model.net.policy)
+        self.perceptual_loss = None
+        if weight := self.config.perceptual_weight:
+            self.perceptual_loss = PerceptualLoss(dev, weight, model.net.policy)
         self.state = PointState(dev, model.cloud)
         self.optimiser = Optimiser(dev, model, self.state)
         self._target = Target(dev)
-        self._terms = None  # of the last step
+        self._terms: Reading[dict[str, float]] | None = None  # of the loss of the last step
         self._smoother = None  # made when it is due, anew when the points change
         self._refine_steps = refine_steps(self.config)
         self._set_level()
@@ -68,9 +81,9 @@ class Trainer:
 
     # ----------------------------------------------------------------------------------------------
 
-    def train_step(self) -> StepTerms:
-        """One step, which the device may still be at. Raises Diverged if a term of the loss of the
-        step before is not finite.
+    def train_step(self) -> Reading[dict[str, float]]:
+        """One step, which the device may still be at; returns the terms of its loss. Raises
+        Diverged if one of the step before is not finite.
         """
         t, config = self.step, self.config
         rng = np.random.default_rng((config.seed, t))
@@ -85,63 +98,72 @@ class Trainer:
             target_alpha = self._target.alpha(box, jitter) if view.has_mask else None
             differs = self._gradient_tiles(target, camera)
 
-        sh_eps = config.sh_eps / target.size
         rendered = self.renderer.forward(
             camera,
             gamma_at(t, config.iterations, *self.gamma),
             dropout=config.dropout,
             seed=int(rng.integers(2**32)),
             training=True,
-            differs=differs,
+            gradient_tiles=differs,
         )
         with self.dev.stage("loss"):
-            gradients = self._losses(rendered, target, target_alpha)
-        spread_weight = self._spread_weight(target.shape[0] * target.shape[1])
-        grads = self.renderer.backward(rendered, *gradients, spread_weight=spread_weight)
+            grad_image, grad_alpha, spread_weight = self._losses(rendered, target, target_alpha)
+        grad_point_features, grad_opacity = self.renderer.backward(
+            rendered, grad_image, grad_alpha, spread_weight
+        )
         with self.dev.stage("update"):
             self.optimiser.update(
                 t + 1 - self.begun,
                 rates,
-                grads,
+                grad_point_features,
+                grad_opacity,
                 points=rendered.points,
-                shaded=rendered.shaded,
-                sh_eps=sh_eps,
+                shaded=rendered.weights.shaded,
+                sh_eps=config.sh_eps / target.size,
             )
-        with self.dev.stage("peaks"):
-            self.renderer.raise_peaks(rendered, self.state.peak_weight, self.state.look_count)
+        with self.dev.stage("max weights"):
+            record_weights(
+                self.dev,
+                rendered.pairs,
+                rendered.weights,
+                self.state.max_weight,
+                self.state.times_seen,
+            )
 
         self.step = t + 1
-        self._read_terms()
+        self.check()
+        self._terms = self.loss.read(self.step)
         self._regularise(rates)
         return self._terms
 
     def _losses(self, rendered, target, target_alpha):
-        """(dL/dimage, dL/dalpha or None) of what is rendered; their sum is in self.loss.terms."""
-        grad_image = self.loss.forward_backward(rendered.image, target, *rendered.offset)
-        self.perceptual.add(
-            rendered.image,
-            target,
-            rendered.offset,
-            grad_prediction=grad_image,
-            terms=self.loss.terms,
-        )
-        grad_alpha = self.mask_loss.add(
-            rendered.weights.transmittance,
-            target_alpha,
-            size=rendered.features.shape[:2],
-            offset=rendered.offset,
-            shortfall=rising_weight(self.step, self.config.iterations),
-            terms=self.loss.terms,
-        )
-        return grad_image, grad_alpha
+        """(dL/dimage, dL/dalpha or None, weight of each pixel's spread for depths in world units)
+        of what is rendered; the loss and its terms are in self.loss.
+        """
+        config, loss, steps = self.config, self.loss, self.config.iterations
+        image, weights, offset = rendered.image, rendered.weights, rendered.offset
+        pixels = target.shape[0] * target.shape[1]
+        grad_alpha, pixel_weight = None, 0.0
 
-    def _spread_weight(self, pixels):
-        """That of the spread of each of so many pixels at this step, for depths in world units."""
-        if not self._composited:
-            return 0.0
-        config = self.config
-        mean = rising_weight(self.step, config.iterations, config.spread_weight)
-        return mean / (pixels * self.model.grid.diagonal)
+        grad_image = loss.forward_backward(image, target, *offset)
+        if self.perceptual_loss:
+            distances = self.perceptual_loss.add_gradient(image, target, offset, grad_image)
+            loss.add("lpips", distances, config.perceptual_weight)
+        if self._composited and config.mask_weight > 0 and target_alpha is not None:
+            squares, grad_alpha = self.mask_loss.forward_backward(
+                weights.transmittance,
+                target_alpha,
+                size=image.shape[:2],
+                offset=offset,
+                shortfall=rising_weight(self.step, steps),
+            )
+            loss.add("mask", squares, config.mask_weight, 1 / pixels)
+        if self._composited and config.spread_weight > 0:
+            spread_weight = rising_weight(self.step, steps, config.spread_weight)
+            all_depths = pixels * self.model.grid.diagonal
+            loss.add_spread(rendered.pairs, weights, spread_weight, 1 / all_depths)
+            pixel_weight = spread_weight / all_depths
+        return grad_image, grad_alpha, pixel_weight
 
     def draw(
         self, rng: np.random.Generator
@@ -164,22 +186,16 @@ class Trainer:
         top = draw_start(rng, y0, y1, height, limit=camera.height)
         return index, (left, top, width, height), jitter
 
-    def _read_terms(self):
-        """Of this step; those of the one before are checked, which the device has done."""
-        self.check()
-        others = self.mask_loss.terms() | self.perceptual.terms()
-        self._terms = StepTerms(self.step, read_later(self.dev, self.loss.terms), others)
-
     def check(self) -> None:
         """Raise Diverged if a term of the loss of the last step is not finite."""
         if self._terms:
             self._terms.get()
 
     def _gradient_tiles(self, target, camera):
-        """UNet.plan_tiles()'s differs, to be asked for once the device was waited for."""
+        """UNet.plan_tiles()'s gradient_tiles, to be asked for once the device was waited for."""
         padded, *offset = camera.padded(NETWORK_MULTIPLE)
         size = padded.height, padded.width
-        if self.perceptual.weight or not self.model.net.is_planned(size):
+        if self.perceptual_loss or not self.model.net.is_planned(size):
             return lambda: None
         found = tiles_find(self.dev, target, WHITE)
         return lambda: gradient_tiles(found.get(), size, offset)
@@ -203,7 +219,7 @@ class Trainer:
             self._refine()
 
     def _smooth(self, rates):
-        """Pull every SH coefficient towards the mean of its grid neighbours, outside Adam."""
+        """Pull every SH coefficient towards the mean of its grid neighbours."""
         cloud = self.model.cloud
         if self._smoother is None:
             self._smoother = Smoother(self.dev, self.model.grid_buffer, cloud.ids)
@@ -213,26 +229,26 @@ class Trainer:
                 self._smoother.smooth(sh, pull * rates.sh[block.degree])
 
     def prune(self) -> None:
-        """Drop the points that were looked at often enough and weigh too little."""
-        self._keep(judge(self.dev, self.state, self.model.cloud.opacity, self.config))
+        """Drop the points that were seen often enough and weigh too little."""
+        self._keep(points_to_keep(self.dev, self.state, self.model.cloud.opacity, self.config))
 
     def _keep(self, rows):
         """Drop all points but `rows`, with their training state."""
         if len(rows) < self.model.cloud.count:
-            self._forget_points()
+            self._smoother = None
             self.model.cloud.compact(self.dev, rows)
             self.state.compact(self.dev, rows)
 
     def _refine(self):
         """Go on to images of twice the size and points of half the spacing."""
-        self._forget_points()
-        with self.dev.stage("refining"):
-            refine(self.dev, self.model, self.state, composited=self._composited)
-        self._set_level()
-
-    def _forget_points(self):
-        """Drop what was made for the present points."""
         self._smoother = None
+        with self.dev.stage("refining"):
+            self.state.refine(self.dev, self.model.refine())
+            if self._composited:
+                split_opacity(self.dev, self.model.cloud.opacity)
+                if "opacity" in self.state.averages:
+                    split_opacity(self.dev, self.state.averages["opacity"])
+        self._set_level()
 
     def finish(self) -> None:
         """Adopt the averages, and drop the points that hardly weigh anything in any training
@@ -241,14 +257,11 @@ class Trainer:
         self.optimiser.apply_ema()
         if self.config.final_prune_weight > 0:
             cloud = self.model.cloud
-            peaks, looks = (self.dev.zeros((cloud.count,)) for _ in range(2))
+            max_weight, times_seen = (self.dev.zeros((cloud.count,)) for _ in range(2))
             for view in self.views:
-                weights = self.renderer.blend_weights(view.camera, self.gamma[1])
-                self.renderer.raise_peaks(weights, peaks, looks)
-            least = self.config.final_prune_weight, self.config.prune_opacity
-            self._keep(
-                keep_indices(self.dev, peaks, least[0], cloud.opacity, least_opacity=least[1])
-            )
+                seen = self.renderer.forward(view.camera, self.gamma[1], until="weights")
+                record_weights(self.dev, seen.pairs, seen.weights, max_weight, times_seen)
+            self._keep(final_points_to_keep(self.dev, max_weight, cloud.opacity, self.config))
 
     def rates(self) -> dict:
         """The learning rates of the last step, for the log."""

@@ -13,6 +13,7 @@ from support.runs import arguments
 from support.scenes import write_ball_scene
 
 from pp_cl.cli import main
+from pp_cl.device.device import Device
 from pp_cl.device.discover import list_devices, open_device
 from pp_cl.device.launch import Program
 from pp_cl.files.atomic import cache_folder, make_cache_folder
@@ -98,6 +99,12 @@ def dev(session_device):
     yield session_device
     session_device.finish()
     session_device.check()
+
+
+@pytest.fixture
+def plain(session_device):
+    """The tests' device without guards, and without the scratch of other tests."""
+    return Device(session_device.device)
 
 
 @pytest.fixture

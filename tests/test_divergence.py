@@ -10,7 +10,7 @@ from support.runs import arguments
 
 from pp_cl.cli import main
 from pp_cl.files.checkpoint import load_checkpoint
-from pp_cl.training.optimiser import Optimiser
+from pp_cl.training.optim import Optimiser
 
 
 def rows(out):

@@ -39,12 +39,12 @@ from pp_cl.files.exr import write_exr
 from pp_cl.files.image import image_size, read_gray, read_rgba
 from pp_cl.files.run_folder import Log, RunFolder
 from pp_cl.layers.choice import (
+    OFFERED,
     ConvShape,
     Direction,
     device_class,
     device_key,
     load_policy,
-    offered,
     tuning_file,
 )
 from pp_cl.metrics.compare import compare
@@ -58,7 +58,7 @@ from pp_cl.scene.readers.frame import frame_keys
 from pp_cl.session import run_config
 from pp_cl.sweep.plan import Job, plan, read_seeds, read_varied
 from pp_cl.sweep.result import finished_row, progress
-from pp_cl.training.stored import load_run_state
+from pp_cl.training.checkpoint import load_run_state
 from pp_cl.view.follow import LogFollower
 from pp_cl.view.messages import read_request
 
@@ -371,7 +371,7 @@ def test_a_tuning(world, data):
         policy = taken(lambda: load_policy(world.device, one(data.draw, 1e-5, 1e-3)))
         shape = ConvShape(one(data.draw, *Direction), 3, (16,), 16, one(data.draw, 1, 4096, 2**20))
         chosen = taken(lambda: policy.choose(shape))
-        assert chosen in (None, *offered(device_class(world.device)))
+        assert chosen in (None, *OFFERED[device_class(world.device)])
 
 
 # --------------------------------------------------------------------------------------------------

@@ -18,7 +18,7 @@ from pp_cl.scene.hull import build_grid
 from pp_cl.scene.load import load_scene, preset_downscale, scene_frames
 from pp_cl.scene.readers.transforms import write_scene
 from pp_cl.scene.views import View
-from pp_cl.training.memory import Sketch, memory_plan
+from pp_cl.training.memory import Room
 
 SIZES = ((48, 48), (37, 29), (24, 40))
 
@@ -114,10 +114,9 @@ def test_the_memory_plan_is_for_the_largest(dev, scene, crop, side):
     net = UNet(dev, config.network.widths)
     frames, plans = scene_frames(scene), []
     for order in (frames, frames[::-1]):
-        sketch = Sketch.unseen(config, net, order).on_grid(hull.grid, len(hull.ids), (2, 6))
-        plans.append(memory_plan(sketch))
+        plans.append(Room(config, net, order).plan_points(hull.grid, len(hull.ids), (2, 6)))
     assert plans[0] == plans[1]
-    told = dict(plans[0].peak.tables)
+    told = plans[0].peak.tables
     assert f"network at {side}x{side}" in told and "previews at 48x48" in told
 
 

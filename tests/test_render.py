@@ -12,9 +12,9 @@ from support.models import GRID, make_model
 from support.networks import plain_parameters
 from support.scenes import ring_cameras
 
-from pp_cl.raster.blend import BLENDS
+from pp_cl.raster.weights import BLENDS
 from pp_cl.reference import dense as oracle_raster
-from pp_cl.render import PAPER_DEPTH_RANGE, Renderer
+from pp_cl.render import Renderer
 from pp_cl.settings import RasterConfig
 
 GAMMA = 0.03
@@ -27,22 +27,13 @@ def chained(model, settings, camera, opacity=None, sh=None, tracked=0):
     padded, _, _ = camera.padded(4)
     positions = GRID.positions(model.cloud.ids.get())
     opacity = model.cloud.opacity.get().astype(np.float64) if opacity is None else opacity
-    sh = (
-        np.concatenate([array.get() for array in model.cloud.sh], 1).astype(np.float64)
-        if sh is None
-        else sh
+    if sh is None:
+        sh = np.concatenate([array.get() for array in model.cloud.sh], 1).astype(np.float64)
+    unit = GRID.edge if settings.footprint == "soft" else np.ptp(model.depth_range) / 4
+    geometry = oracle_raster.geometry(padded, positions, settings.radius * unit, settings.footprint)
+    blend = oracle_raster.blend_by_rule(
+        settings.blend, geometry, opacity, GAMMA, settings.early_stop
     )
-    spacing_or_world = (
-        GRID.edge if settings.footprint == "soft" else np.ptp(model.depth_range) / PAPER_DEPTH_RANGE
-    )
-    geometry = oracle_raster.geometry(
-        padded, positions, settings.radius * spacing_or_world, settings.footprint
-    )
-    alpha = settings.blend == "alpha"
-    if alpha:
-        blend = oracle_raster.alpha(geometry, opacity, settings.early_stop)
-    else:
-        blend = oracle_raster.blend(geometry, opacity, GAMMA, settings.early_stop)
     shaded = oracle_raster.shade(positions, padded.eye, sh)
     features = oracle_raster.features(blend, shaded)
     parameters = plain_parameters(model.net, model.net.parameters)
@@ -54,7 +45,7 @@ def chained(model, settings, camera, opacity=None, sh=None, tracked=0):
             features.reshape(*shape, 16), parameters, grad_picture
         )
         grad_features = grad_features.reshape(-1, 16)
-        if alpha:
+        if settings.blend == "alpha":
             grad_shaded, grad_opacity, _ = oracle_raster.alpha_gradients(
                 geometry,
                 blend,
@@ -151,10 +142,10 @@ def test_padding_does_not_move_the_picture(dev, rng):
     """
     model, camera = make_model(dev, rng), ring_cameras(1, 32)[0]
     renderer = Renderer(dev, model, RasterConfig())
-    whole = renderer.rasterise(camera, GAMMA).features.get()
+    whole = renderer.forward(camera, GAMMA, until="features").features.get()
     odd = camera.crop(5, 7, 21, 19)
     assert renderer.render(odd, GAMMA).shape == (19, 21, 3)
-    result = renderer.rasterise(odd, GAMMA)
+    result = renderer.forward(odd, GAMMA, until="features")
     left, top = result.offset
     inner = result.features.get()[top : top + 19, left : left + 21]
     np.testing.assert_allclose(inner, whole[7:26, 5:26], atol=2e-5)
@@ -179,16 +170,18 @@ def test_a_call_may_see_beyond_the_models_depth_range(dev, rng):
     back = camera.pose.copy()
     back[:, 3] -= 2 * far * back[:, 2]
     away = replace(camera, pose=back)
-    assert renderer.blend_weights(away, GAMMA).pairs.total == 0
-    seen = renderer.blend_weights(away, GAMMA, depth_range=(far, 4 * far))
+    assert renderer.forward(away, GAMMA, until="weights").pairs.total == 0
+    seen = renderer.forward(away, GAMMA, until="weights", depth_range=(far, 4 * far))
     assert seen.pairs.total > 0
 
 
 def test_dropout_leaves_out_its_share_and_pictures_are_repeatable(dev, rng):
     model, camera = make_model(dev, rng, 300), ring_cameras(1, 32)[0]
     renderer = Renderer(dev, model, RasterConfig())
-    everyone = renderer.blend_weights(camera, GAMMA).pairs.point_offset.get()
-    some = renderer.blend_weights(camera, GAMMA, dropout=0.5, seed=1).pairs.point_offset.get()
+    everyone = renderer.forward(camera, GAMMA, until="weights").pairs.point_offset.get()
+    some = renderer.forward(
+        camera, GAMMA, until="weights", dropout=0.5, seed=1
+    ).pairs.point_offset.get()
     everyone, some = (np.count_nonzero(np.diff(offsets)) for offsets in (everyone, some))
     assert 0.35 * everyone < some < 0.65 * everyone
     first = renderer.render(camera, GAMMA)
@@ -213,8 +206,8 @@ def test_the_early_stop_of_a_call_is_that_of_other_settings(dev, rng, blend):
 def test_arrays_without_room_are_released_before_larger_ones_are_made(dev, rng, blend):
     renderer = Renderer(dev, make_model(dev, rng, 300), RasterConfig(blend=blend))
     near, far = (ring_cameras(1, size)[0] for size in (96, 48))
-    first = renderer.blend_weights(far, GAMMA).pairs.capacity
+    first = renderer.forward(far, GAMMA, until="weights").pairs.capacity
     dev.reset_peak()
-    second = renderer.blend_weights(near, GAMMA).pairs.capacity
+    second = renderer.forward(near, GAMMA, until="weights").pairs.capacity
     assert 0 < 2 * first < second
     assert dev.peak_bytes == dev.bytes

@@ -13,7 +13,7 @@ from support.runs import arguments, train_and_interrupt
 from support.scenes import write_ball_scene
 
 from pp_cl.cli import main
-from pp_cl.files.checkpoint import load_checkpoint, save_checkpoint
+from pp_cl.files.checkpoint import load_checkpoint
 from pp_cl.train import Trainer
 
 
@@ -85,18 +85,6 @@ def interrupted_after(step, train_step=Trainer.train_step):
     return stopping
 
 
-def test_a_checkpoint_of_another_scene_is_refused(scene, tmp_path, capsys, monkeypatch):
-    out = tmp_path / "run"
-    train_and_interrupt(scene, out, 15, monkeypatch)
-    header, arrays = load_checkpoint(out / "checkpoint.npz")
-    header.pop("format")
-    save_checkpoint(out / "checkpoint.npz", header | {"scene": "0" * 64}, arrays)
-    before = (out / "checkpoint.npz").read_bytes()
-    assert main(arguments(scene, out)) == 2
-    assert "belongs to another scene" in capsys.readouterr().err
-    assert (out / "checkpoint.npz").read_bytes() == before
-
-
 def test_a_scene_that_has_moved_is_known_by_its_views(scene, finished, tmp_path, monkeypatch):
     train_and_interrupt(scene, tmp_path / "run", 25, monkeypatch)
     shutil.copytree(scene, tmp_path / "moved")
@@ -139,22 +127,28 @@ def test_another_scene_is_refused_at_any_state_of_the_run(
     assert {p.name: p.read_bytes() for p in out.iterdir() if p.is_file()} == before
 
 
-@pytest.mark.parametrize(
-    "lost", ["moment.m.enc0.a.weight", "state.v.sh", "state.last_step", "state.peak_weight"]
-)
-def test_a_checkpoint_without_its_training_state_is_refused(
-    scene, tmp_path, capsys, monkeypatch, lost
-):
-    train_and_interrupt(scene, tmp_path / "run", 15, monkeypatch)
-    header, arrays = load_checkpoint(tmp_path / "run" / "checkpoint.npz")
-    arrays.pop(lost)
-    save_checkpoint(
-        tmp_path / "run" / "checkpoint.npz",
-        {k: v for k, v in header.items() if k != "format"},
-        arrays,
-    )
-    assert main(arguments(scene, tmp_path / "run")) == 2
-    assert lost in capsys.readouterr().err
-    save_checkpoint(tmp_path / "run" / "checkpoint.npz", {"step": 10}, arrays)
-    assert main(arguments(scene, tmp_path / "run")) == 2
-    assert "header lacks scene" in capsys.readouterr().err
+@pytest.mark.parametrize("share, stops", [(0.3, (12, 33)), (0.9, (52, 57))])
+def test_a_refined_run_resumes_to_the_same_bytes(tmp_path, monkeypatch, share, stops):
+    """Stopped before and after the refinement, which may come after the averages' beginning."""
+    scene = write_ball_scene(tmp_path / "ball")
+    changes = {"train__refine_at": f"{share},1", "points__count": 300, "train__prune_looks": 4}
+    changes["downscale"] = 1
+    assert main(arguments(scene, tmp_path / "whole", **changes)) == 0
+    whole = (tmp_path / "whole" / "checkpoint.npz").read_bytes()
+    log = (tmp_path / "whole" / "log.jsonl").read_text().splitlines()
+    points = {row["step"]: row["points"] for row in map(json.loads, log[:-1])}
+    after = round(60 * share) // 5 * 5 + 5
+    assert points[after] > 4 * points[after - 5]
+    for steps in stops:
+        out = tmp_path / str(steps)
+        train_and_interrupt(scene, out, steps, monkeypatch, **changes)
+        assert main(arguments(scene, out, **changes)) == 0
+        assert (out / "checkpoint.npz").read_bytes() == whole
+
+
+def test_images_too_small_to_halve_are_one_line(tmp_path, capsys):
+    scene = write_ball_scene(tmp_path / "ball")
+    words = arguments(scene, tmp_path / "small", train__refine_at="0.3,0.6", train__prune_looks=4)
+    assert main(words) == 2
+    error = capsys.readouterr().err
+    assert "train.refine_at halves the images 2 times" in error and error.count("\n") == 1

@@ -17,7 +17,7 @@ from pp_cl.commands.options import figure_file
 from pp_cl.config import Config, preset
 from pp_cl.errors import UserError
 from pp_cl.presets import PRESETS
-from pp_cl.training.optimiser import Rates
+from pp_cl.training.schedule import Rates
 
 SAMPLES = 501  # of a curve
 

@@ -22,11 +22,13 @@ from pp_cl.errors import UserError
 from pp_cl.files.atomic import write_json
 from pp_cl.layers.choice import make_policy
 from pp_cl.layers.tiles import tiles_find
+from pp_cl.network.tile_plan import gradient_tiles
 from pp_cl.render import Renderer
 from pp_cl.run import load_run
 from pp_cl.scene.target import Target
 from pp_cl.scene.views import evenly
-from pp_cl.training.loss import WHITE, Loss, gradient_tiles
+from pp_cl.train import WHITE
+from pp_cl.training.loss import Loss
 
 
 class Comparison:
@@ -48,7 +50,7 @@ class Comparison:
         over the dense result's largest value.
         """
         camera = view.camera
-        view_raster = self.renderer.rasterise(camera, self.config.raster.gamma[1])
+        view_raster = self.renderer.forward(camera, self.config.raster.gamma[1], until="features")
         x = view_raster.features
         self.target.load(view)
         target = self.target.crop((0, 0, camera.width, camera.height))

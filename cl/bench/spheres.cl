@@ -1,7 +1,7 @@
 // Gradients of the positions and radii of spheres, for parity with Pulsar: no training needs them.
 //
-// l = o z / gamma + log d (softmax.cl): dL/dl = b (G.f - rest), dL/dd = dL/dl / d, with G and rest
-// as in raster/blend.cl.
+// l = o z / gamma + log d (softmax.cl): dL/dl = b gain, dL/dd = dL/dl / d, with the gain of
+// raster/blend.cl.
 #include "raster/footprint.h"
 #include "raster/pair_role.h"
 #include "reduce.h"
@@ -10,8 +10,8 @@
 #ifndef HAS_ROLES
 #define HAS_ROLES 1
 #endif
-#ifndef GAIN_BY_PAIR
-#define GAIN_BY_PAIR 0
+#ifndef HAS_PAIR_GAIN
+#define HAS_PAIR_GAIN 1
 #endif
 #ifndef MEAN
 #define MEAN 0
@@ -25,8 +25,9 @@ kernel void spheres_backward_pairs(
     global const uint *pair_pixel,             // (P)
     global const float2 *pair_weight,          // (P, 2)
     global const uchar *pair_role,             // (?) P with HAS_ROLES
+    global const float *pair_gain,             // (?) P with HAS_PAIR_GAIN
+    global const float *pixel_rest,            // (?) HW without
     global const float16 *grad_features,       // (H, W, 16) G
-    global const float *rest_or_gain,          // (HW) rest, or with GAIN_BY_PAIR (P) G.f - rest
     global const uint2 *pair_point_closeness,  // (P, 2) point, bits of d
     global float2 *grad_pair)                  // (P, 2) dL/dl, dL/dd
 {
@@ -41,9 +42,9 @@ kernel void spheres_backward_pairs(
         const float b = pair_weight[pair].x, d = as_float(pair_point_closeness[pair].y);
         float dL_dl = 0.0f;
         if (!HAS_ROLES || pair_role[pair] == TRACKED) {
-            const float gain = GAIN_BY_PAIR
-                                   ? rest_or_gain[pair]
-                                   : dot16(grad_features[q], point_features[i]) - rest_or_gain[q];
+            const float gain = HAS_PAIR_GAIN
+                                   ? pair_gain[pair]
+                                   : dot16(grad_features[q], point_features[i]) - pixel_rest[q];
             dL_dl = scale * b * gain;
         }
         grad_pair[pair] = (float2)(dL_dl, d > 0.0f ? dL_dl / d : 0.0f);

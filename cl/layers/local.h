@@ -44,12 +44,6 @@ static inline void store4(const float4 value, global float *p, const int count) 
 #endif
 }
 
-// The first pixel of tile number `tile`.
-static inline int2 tile_corner(const int tile, const int width) {
-    const int columns = tile_columns(width);
-    return (int2)(tile % columns * SIDE, tile / columns * SIDE);
-}
-
 // 4 channels, of which `count` exist, of a pixel from `c` on; 0 outside of the image.
 static inline float4 pixel4(
     global const float *image,

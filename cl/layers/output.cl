@@ -2,8 +2,6 @@
 // connection around the whole network share * (feature - background) of its first three features.
 #include "common.h"
 
-#define BACKGROUND 1.0f  // of every feature, as in raster/blend.cl
-
 // One work-item per pixel: reads its output and, with residual, its features; writes its colours.
 kernel void output_forward(
     const uint n,         // pixels

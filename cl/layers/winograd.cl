@@ -16,9 +16,9 @@
 #ifndef BLOCKS
 #define BLOCKS 2  // groups of 16 output channels multiplied together; divides their number
 #endif
-#ifndef GROUP
-// tiles multiplied together: BLOCKS * GROUP accumulators and BLOCKS weights fit AVX-512
-#define GROUP 8
+#ifndef TOGETHER
+// tiles multiplied together: BLOCKS * TOGETHER accumulators and BLOCKS weights fit AVX-512
+#define TOGETHER 8
 #endif
 // Vectors of a work-item's scratch: the values of ci channels, their products of co channels, a
 // patch for load_tile.
@@ -35,12 +35,12 @@ ALWAYS_INLINE void multiply(
     const int padded) {
     for (int position = 0; position < POSITIONS; position++)
         for (int block = 0; block < blocks; block += BLOCKS)
-            for (int tile = 0; tile < padded; tile += GROUP) {
-                float16 acc[BLOCKS][GROUP];
+            for (int tile = 0; tile < padded; tile += TOGETHER) {
+                float16 acc[BLOCKS][TOGETHER];
 #pragma unroll
                 for (int b = 0; b < BLOCKS; b++)
 #pragma unroll
-                    for (int i = 0; i < GROUP; i++)
+                    for (int i = 0; i < TOGETHER; i++)
                         acc[b][i] = 0.0f;
                 for (int chunk = 0; chunk < ci / 16; chunk++) {
                     global const float *value =
@@ -53,7 +53,7 @@ ALWAYS_INLINE void multiply(
                         for (int b = 0; b < BLOCKS; b++)
                             wc[b] = transformed[weight + b * ci + c];
 #pragma unroll
-                        for (int i = 0; i < GROUP; i++)
+                        for (int i = 0; i < TOGETHER; i++)
 #pragma unroll
                             for (int b = 0; b < BLOCKS; b++)
                                 acc[b][i] += value[i * 16 + c] * wc[b];
@@ -62,7 +62,7 @@ ALWAYS_INLINE void multiply(
 #pragma unroll
                 for (int b = 0; b < BLOCKS; b++)
 #pragma unroll
-                    for (int i = 0; i < GROUP; i++)
+                    for (int i = 0; i < TOGETHER; i++)
                         m[position * PITCH(blocks * 16) + (block + b) * TILES + tile + i] =
                             acc[b][i];
             }
@@ -82,7 +82,7 @@ ALWAYS_INLINE void transform_back(
     const int count) {
     const int height = tile_list[0], width = tile_list[1], pitch = PITCH(co);
     for (int tile = 0; tile < count; tile++) {
-        const int2 corner = tile_corner(tile_list, first + tile);
+        const int2 corner = listed_corner(tile_list, first + tile);
         for (int block = 0; block < co / 16; block++) {
             float16 t[POSITIONS];
 #pragma unroll
@@ -132,9 +132,9 @@ ALWAYS_INLINE void convolve(
     const int tiles = tile_list[2];
     const int share = (tiles + get_global_size(0) - 1) / get_global_size(0);
     const int rounds = (share + TILES - 1) / TILES;  // of about the same size
-    const int step = ((share + rounds - 1) / rounds + GROUP - 1) / GROUP * GROUP;
+    const int step = ((share + rounds - 1) / rounds + TOGETHER - 1) / TOGETHER * TOGETHER;
     for (int first = take(scratch, step); first < tiles; first = take(scratch, step)) {
-        const int count = min(step, tiles - first), padded = (count + GROUP - 1) / GROUP * GROUP;
+        const int count = min(step, tiles - first), padded = (count + TOGETHER - 1) / TOGETHER * TOGETHER;
         for (int source = 0; source < (c2 ? 2 : 1); source++)
             transform_tiles(
                 v + (source ? c1 / 16 * TILES : 0), PITCH(ci), patch, source ? x2 : x,

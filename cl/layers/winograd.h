@@ -125,9 +125,8 @@ ALWAYS_INLINE void transform_kernel_tile(float16 *t) {
 #define PITCH(channels) ((channels) / 16 * TILES + 1)
 
 // The corner of the i-th tile of tile_list: height, width, number, and the tiles of tiles.h.
-static inline int2 tile_corner(global const int *tile_list, const int i) {
-    const int columns = tile_columns(tile_list[1]), tile = tile_list[3 + i];
-    return (int2)(tile % columns, tile / columns) * SIDE;
+static inline int2 listed_corner(global const int *tile_list, const int i) {
+    return tile_corner(tile_list[3 + i], tile_list[1]);
 }
 
 // A scratch begins with a vector for two counters, both 0 between kernels: how much of the work is
@@ -197,7 +196,7 @@ ALWAYS_INLINE void transform_tiles(
     const int padded) {
     const int height = tile_list[0], width = tile_list[1];
     for (int tile = 0; tile < padded; tile++) {
-        const int2 corner = tile_corner(tile_list, first + min(tile, count - 1)) - 1;
+        const int2 corner = listed_corner(tile_list, first + min(tile, count - 1)) - 1;
         for (int chunk = 0; chunk < chunks; chunk++) {
             float16 t[POSITIONS];
             load_tile(

@@ -41,7 +41,7 @@ ALWAYS_INLINE void transform_gradients(
         // summed apart: one sum over the whole image would lose digits
         float16 round = 0.0f;
         for (int tile = 0; tile < count; tile++) {
-            const int2 corner = tile_corner(tile_list, first + tile);
+            const int2 corner = listed_corner(tile_list, first + tile);
             const float times = tile_count[tile_list[3 + first + tile]];
             float16 t[POSITIONS], sum = 0.0f;
             load_tile(

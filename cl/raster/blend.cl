@@ -1,11 +1,19 @@
-// Features blended by the weights of softmax.cl or alpha.cl, and gradients by gathering.
+// Features blended by the weights of alpha.cl or softmax.cl, and gradients by gathering.
 //
-// F = sum b_i f_i + b_0 * 1, with G = dL/dF
-// dL/df_i = sum b_i G,  dL/do_i = sum s_i (G.f_i - rest)
+// F = sum b_i f_i + b_0 BACKGROUND, with G = dL/dF
+// dL/df_i = sum b_i G,  dL/do_i = sum s_i gain_i
 //
-// s_i is the second value of pair_weight; rest is what takes the place of a hit that fades: in the
-// softmax all of the pixel's hits, G.F, in alpha compositing those behind it, where alpha.cl has
-// computed the difference already.
+// s_i is the second value of pair_weight. The gain of a hit is G.f_i minus G times what takes its
+// place where it fades.
+//
+// In the softmax that is the blend of all hits: gain_i = G.f_i - G.F, of which the latter is the
+// pixel's rest.
+//
+// In alpha compositing it is B_i, G times the features composited of all that lies behind the hit:
+// gain_i = G.f_i - B_i, with nothing divided by 1 - alpha. A gradient g of the pixel's alpha, 1 -
+// T, is that of a feature which all points have and the background has not: G.f becomes G.f + g.
+// The spread of the pixel, w sum_ij b_i b_j |z_i - z_j| (Mip-NeRF 360, Eq. 15, its distortion),
+// adds its derivative with respect to b_i in the same way.
 //
 // vec_type_hint: the vectors are written out; Intel's compiler would merge work-items into wider
 // ones, up to 8 times slower.
@@ -17,15 +25,17 @@
 #ifndef HAS_ROLES
 #define HAS_ROLES 1  // 0: every pair is tracked, and pair_role is not read
 #endif
-#ifndef GAIN_BY_PAIR
-#define GAIN_BY_PAIR 0  // 1: G.f_i - rest of each pair is given; 0: rest of each pixel
+#ifndef HAS_PAIR_GAIN
+#define HAS_PAIR_GAIN 1  // 0: the gains of a softmax follow from pixel_rest
 #endif
 #ifndef MEAN
 #define MEAN 0  // 1: gradients are divided by the number of pixels that track the point (Pulsar)
 #endif
 
-// G.f_i - rest of a pair in pixel q; `product`, G.f_i, is computed only where it is needed
-#define GAIN(pair, q, product) (GAIN_BY_PAIR ? rest_or_gain[pair] : (product) - rest_or_gain[q])
+// The depth of a key, the weight of an entry.
+static inline float upper_float(const ulong word) {
+    return as_float((uint)(word >> 32));
+}
 
 // One work-item per part of a pixel: reads its hits and their points' features, writes the blended
 // features.
@@ -41,12 +51,72 @@ kernel void blend_forward(
     floats sum = 0.0f;
     float weights = 0.0f;
     for (uint i = pixel_offset[q]; i < pixel_offset[q + 1] && (uint)pixel_entry[i] != NONE; i++) {
-        const float b = as_float((uint)(pixel_entry[i] >> 32));
+        const float b = upper_float(pixel_entry[i]);
         sum += b * load_part(point_features, (uint)pixel_entry[i]);
         weights += b;
     }
-    // the background's features are 1, its weight is what is left
-    store_part(sum + (1.0f - weights), features, q);
+    store_part(sum + (1.0f - weights) * BACKGROUND, features, q);
+}
+
+// One work-item per pixel: writes G.F, its rest in the softmax.
+kernel void softmax_rest(
+    const uint hw,                        // pixels
+    global const float16 *features,       // (H, W, 16) F
+    global const float16 *grad_features,  // (H, W, 16) G
+    global float *pixel_rest)             // (HW)
+{
+    const uint q = get_global_id(0);
+    if (q >= hw) return;
+    pixel_rest[q] = dot16(grad_features[q], features[q]);
+}
+
+// One work-item per pixel: reads its hits, farthest first, and their points' features, writes the
+// gain of each pair that is not dropped, with those of alpha and of the spread.
+kernel __attribute__((vec_type_hint(float16))) void alpha_gain(
+    const uint hw,  // pixels
+    const int has_grad_alpha,
+    const float spread_weight,             // w, 0: none
+    global const uint *pixel_offset,       // (HW+1)
+    global const ulong *pair_key,          // (P) depth << 32 | pair
+    global const ulong *pixel_entry,       // (P) weight << 32 | point; no point: the list ends
+    global const float *transmittance,     // (HW)
+    global const float16 *point_features,  // (N, 16)
+    global const float16 *grad_features,   // (H, W, 16) G
+    global const float *grad_alpha,        // (HW) g, not read without has_grad_alpha
+    global float *pair_gain)               // (P)
+{
+    const uint q = get_global_id(0);
+    if (q >= hw) return;
+    const float16 G = grad_features[q];
+    const float g = has_grad_alpha ? grad_alpha[q] : 0.0f;
+    const uint begin = pixel_offset[q];
+    // depths count from here, so that sums of them keep their digits
+    const float nearest = begin < pixel_offset[q + 1] ? upper_float(pair_key[begin]) : 0.0f;
+    float2 front = 0.0f, behind = 0.0f;  // sums of b and b z of the hits there
+    uint end = begin;
+    for (; end < pixel_offset[q + 1] && (uint)pixel_entry[end] != NONE; end++)
+        if (spread_weight > 0.0f) {
+            const float z = upper_float(pair_key[end]) - nearest;
+            front += upper_float(pixel_entry[end]) * (float2)(1.0f, z);
+        }
+    float T = transmittance[q];
+    float B = dot16(G, (float16)(BACKGROUND));
+    for (uint i = end; i-- > begin;) {
+        const float b = upper_float(pixel_entry[i]);
+        float own = dot16(G, point_features[(uint)pixel_entry[i]]);
+        if (spread_weight > 0.0f) {
+            const float z = upper_float(pair_key[i]) - nearest;
+            front -= b * (float2)(1.0f, z);
+            own += 2.0f * spread_weight * (z * (front.x - behind.x) - (front.y - behind.y));
+            behind += b * (float2)(1.0f, z);
+        }
+        const float gain = own + g - B;
+        pair_gain[(uint)pair_key[i]] = gain;
+        if (b > 0.0f) {
+            T += b;  // in front of this hit
+            B += b / T * gain;
+        }
+    }
 }
 
 // One work-item per part of a point: reads its pairs and their pixels' gradients, writes the
@@ -58,8 +128,9 @@ kernel __attribute__((vec_type_hint(floats))) void blend_backward(
     global const uint *pair_pixel,         // (P)
     global const float2 *pair_weight,      // (P, 2)
     global const uchar *pair_role,         // (?) P with HAS_ROLES
+    global const float *pair_gain,         // (?) P with HAS_PAIR_GAIN
+    global const float *pixel_rest,        // (?) HW without
     global const float16 *grad_features,   // (H, W, 16) G
-    global const float *rest_or_gain,      // (HW) rest, or with GAIN_BY_PAIR (P) G.f_i - rest
     global float16 *grad_point_features,   // (N, 16)
     global float *grad_opacity)            // (N)
 {
@@ -72,8 +143,11 @@ kernel __attribute__((vec_type_hint(floats))) void blend_backward(
         if (HAS_ROLES && pair_role[pair] != TRACKED) continue;
         const float2 weight = pair_weight[pair];
         const uint q = pair_pixel[pair];
+        const float gain = HAS_PAIR_GAIN
+                               ? pair_gain[pair]
+                               : dot16(grad_features[q], point_features[i]) - pixel_rest[q];
         dL_df += weight.x * load_part(grad_features, q);
-        dL_do += weight.y * GAIN(pair, q, dot16(grad_features[q], point_features[i]));
+        dL_do += weight.y * gain;
         tracked++;
     }
     const float scale = MEAN && tracked ? 1.0f / tracked : 1.0f;

@@ -5,11 +5,6 @@
 // lies in front of their centres.
 #include "common.h"
 #include "raster/footprint.h"
-#include "raster/pair_role.h"
-
-#ifndef HAS_ROLES
-#define HAS_ROLES 1  // 0: no pair is dropped, and pair_role is not read
-#endif
 
 // Distance from the eye. range: the pair's depth. d: its closeness.
 static inline float surface_range(const float range, const float radius, const float d) {
@@ -27,8 +22,7 @@ kernel void depth_forward(
     global const uint *pixel_offset,           // (HW+1)
     global const ulong *pair_key,              // (P) depth << 32 | pair, sorted within a pixel
     global const uint2 *pair_point_closeness,  // (P, 2) point, bits of d
-    global const float2 *pair_weight,          // (P, 2) b and another
-    global const uchar *pair_role,             // (?) P with HAS_ROLES
+    global const ulong *pixel_entry,           // (P) weight << 32 | point; no point: the list ends
     global float *pixel_alpha,                 // (H, W)
     global float *pixel_depth,                 // (H, W) infinite where nothing is hit, as the next
     global float *pixel_median)                // (H, W)
@@ -37,29 +31,25 @@ kernel void depth_forward(
     if (q >= hw) return;
     const Camera cam = camera_load(camera);
     const float axis = camera_ray(&cam, q % cam.width, q / cam.width).z;
-    const uint begin = pixel_offset[q], end = pixel_offset[q + 1];
+    const uint begin = pixel_offset[q];
+    uint end = begin;
     float alpha = 0.0f;
-    for (uint i = begin; i < end; i++) {
-        const uint pair = (uint)pair_key[i];
-        if (!HAS_ROLES || pair_role[pair] != DROPPED) alpha += pair_weight[pair].x;
-    }
-    bool is_first = true;
+    for (; end < pixel_offset[q + 1] && (uint)pixel_entry[end] != NONE; end++)
+        alpha += as_float((uint)(pixel_entry[end] >> 32));
     float depth = 0.0f, reached = 0.0f, before = 0.0f, median = 0.0f;
     for (uint i = begin; i < end; i++) {
-        const uint pair = (uint)pair_key[i];
-        if (HAS_ROLES && pair_role[pair] == DROPPED) continue;
-        const uint2 hit = pair_point_closeness[pair];
-        const float b = pair_weight[pair].x, radius = point_radius[radii == 1 ? 0 : hit.x];
+        const uint2 hit = pair_point_closeness[(uint)pair_key[i]];
+        const float b = as_float((uint)(pixel_entry[i] >> 32));
         const float range = as_float((uint)(pair_key[i] >> 32));
+        const float radius = point_radius[radii == 1 ? 0 : hit.x];
         const float z = axis * surface_range(range, radius, as_float(hit.y));
         depth += b * z;
         if (reached < 0.5f * alpha) {
             const float share = b > 0.0f ? fmin((0.5f * alpha - reached) / b, 1.0f) : 1.0f;
-            median = is_first ? z : before + share * (z - before);
+            median = i == begin ? z : before + share * (z - before);
         }
         reached += b;
         before = z;
-        is_first = false;
     }
     pixel_alpha[q] = fmin(alpha, 1.0f);
     pixel_depth[q] = alpha > 0.0f ? depth / alpha : INFINITY;

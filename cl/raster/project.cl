@@ -1,4 +1,4 @@
-// Points to camera axes, which of them are left out, and how many pixels each one hits.
+// Points to camera axes, which of them are culled, and how many pixels each one hits.
 #include "common.h"
 #include "camera.h"
 #include "grid.h"
@@ -42,8 +42,8 @@ ALWAYS_INLINE void tangents(
     *last = LANED(convert_int)(to + 2.0f) - 2 + round_last;
 }
 
-// Points in world axes to camera axes, each with the box of pixels that it may hit. A point is left
-// out, with (0, 0, 0, -1) and no pixel, if it is too near or too far (measured at the sphere's
+// Points in world axes to camera axes, each with the box of pixels that it may hit. A point is
+// culled, with (0, 0, 0, -1) and no pixel, if it is too near or too far (measured at the sphere's
 // front, as in Pulsar), behind the eye, or not finite, for which every comparison is false.
 ALWAYS_INLINE Footprints project(
     const Camera *cam,
@@ -128,7 +128,7 @@ kernel __attribute__((vec_type_hint(floats))) void project_grid(
     global const float *grid,          // (8) grid.h
     global const uint *point_id,       // (N)
     global const float *point_radius,  // (1) of every point
-    global float4 *point_camera,       // (N, 4) x, y, z, t; t = -1: left out
+    global float4 *point_camera,       // (N, 4) x, y, z, t; t = -1: culled or dropped out
     global ushort4 *point_box,  // (N, 4) first x, first y, last x, last y; none where last < first
     global uint *point_count)   // (N)
 {
@@ -160,7 +160,7 @@ kernel __attribute__((vec_type_hint(floats))) void project_spheres(
     global const float *camera,        // (20) camera.h
     global const float *positions,     // (N, 3) world
     global const float *point_radius,  // (radii)
-    global float4 *point_camera,       // (N, 4) x, y, z, t; t = -1: left out
+    global float4 *point_camera,       // (N, 4) x, y, z, t; t = -1: culled or dropped out
     global ushort4 *point_box,  // (N, 4) first x, first y, last x, last y; none where last < first
     global uint *point_count)   // (N)
 {

@@ -1,5 +1,5 @@
 // The blend weights of Eq. (1) of the PlenopticPoints supplemental: each pixel's softmax over its
-// hits; which of them are dropped; and what that means for the points.
+// hits, and which of them are dropped.
 //
 // a_i = o_i z_i/gamma,  b_i = o_i d_i exp(a_i - M)/D,  b_0 = exp(EPS/gamma - M)/D
 //
@@ -55,10 +55,10 @@ ALWAYS_INLINE Hits load_hits(
 // One work-item per pixel: reads its hits, nearest first, writes their weights by pair and, with
 // their points, by pixel.
 //
-// By pair: b, and b (1/o + z/gamma), finite at o = 0, whose product with G.(f - F) is dL/do. Only
-// the MAX_TRACKED nearest hits get gradients. A hit is dropped, with weight 0 and with all behind
-// it, once even an opaque, centred hit (o = d = 1) would have less than the share early_stop of the
-// weight; differs from Pulsar: it looks only when its buffer is flushed.
+// By pair: b, and b (1/o + z/gamma), finite at o = 0, whose product with the gain is dL/do
+// (blend.cl). Only the MAX_TRACKED nearest hits get gradients. A hit is dropped, with weight 0 and
+// with all behind it, once even an opaque, centred hit (o = d = 1) would have less than the share
+// early_stop of the weight; differs from Pulsar: it looks only when its buffer is flushed.
 // By pixel: the hits that are not dropped, by depth. If any were dropped, one more entry follows,
 // with no point.
 kernel __attribute__((vec_type_hint(floats))) void softmax_weights(
@@ -123,16 +123,4 @@ kernel __attribute__((vec_type_hint(floats))) void softmax_weights(
         }
         if (stop < end) pixel_entry[stop] = NONE;
     }
-}
-
-// One work-item per pixel: writes G.F, which a hit's G.f is compared with.
-kernel void softmax_rest(
-    const uint hw,                        // pixels
-    global const float16 *features,       // (H, W, 16) F
-    global const float16 *grad_features,  // (H, W, 16) G
-    global float *rest)                   // (HW)
-{
-    const uint q = get_global_id(0);
-    if (q >= hw) return;
-    rest[q] = dot16(grad_features[q], features[q]);
 }

@@ -9,7 +9,7 @@
 // pixel, so a step of one pixel is a step of 3 values.
 //
 // The kernels run in their order here: moments of the windows along y; along x, then SSIM and its
-// slopes; slopes spread along x; along y, with the gradient; sums. Scratch rows are BLOCKS vectors
+// slopes; slopes summed along x; along y, with the gradient; sums. Scratch rows are BLOCKS vectors
 // of LANES values long, MARGIN more than 3W values need, so that no tap along x needs a test.
 #include "group.h"
 #include "lanes.h"
@@ -129,17 +129,17 @@ kernel void loss_similarity(
 
 // One work-item per LANES values of a row of windows: sums the slopes of the 11 windows of the row
 // that see each value.
-kernel void loss_spread(
+kernel void loss_row_slopes(
     const uint v,                // rows of windows
     const uint blocks,           // vectors in a scratch row
     global const float *slopes,  // (V, 3, BLOCKS, LANES)
-    global float *spread)        // (V, 3, BLOCKS, LANES) without the last MARGIN blocks
+    global float *row_slopes)    // (V, 3, BLOCKS, LANES) without the last MARGIN blocks
 {
     const int b = get_global_id(0), y = get_global_id(1);
     if (b + MARGIN >= blocks || y >= v) return;
     for (int f = 0; f < 3; f++) {
         const size_t row = ((size_t)y * 3 + f) * blocks;
-        ((global floats *)spread)[row + b] =
+        ((global floats *)row_slopes)[row + b] =
             blur_along_x((global const floats *)slopes + row, LANES * (b + MARGIN), -3);
     }
 }
@@ -162,7 +162,7 @@ kernel void loss_gradient(
     const float beta,                // of smooth L1
     global const float *prediction,  // (PH, PW, 3)
     global const float *target,      // (H, W, 3)
-    global const float *spread,      // (V, 3, BLOCKS, LANES)
+    global const float *row_slopes,  // (V, 3, BLOCKS, LANES)
     global float *grad_prediction,   // (PH, PW, 3)
     global float4 *partial_terms)    // (ROWS, BLOCKS, 4) rows V to V + H - 1
 {
@@ -178,7 +178,7 @@ kernel void loss_gradient(
         floats slope_0 = 0.0f, slope_d = 0.0f, slope_s = 0.0f;
         for (int k = max(0, y - (int)v + 1); k < TAPS && k <= y; k++) {
             global const floats *row =
-                (global const floats *)spread + 3 * (size_t)blocks * (y - k) + b;
+                (global const floats *)row_slopes + 3 * (size_t)blocks * (y - k) + b;
             slope_0 += WINDOW[k] * row[0];
             slope_d += WINDOW[k] * row[blocks];
             slope_s += WINDOW[k] * row[2 * blocks];
@@ -192,6 +192,31 @@ kernel void loss_gradient(
         squared = scale * SUM_LANES(d * d);
     }
     partial_terms[(size_t)blocks * (v + y) + b] = (float4)(smooth, absolute, 0.0f, squared);
+}
+
+// One work-item per pixel: reads its hits, nearest first, writes its spread sum_ij b_i b_j |z_i -
+// z_j| of their weights and depths (Mip-NeRF 360, Eq. 15, its distortion), whose gradient the blend
+// computes.
+kernel void loss_pixel_spread(
+    const uint hw,                    // pixels
+    global const uint *pixel_offset,  // (HW+1)
+    global const ulong *pair_key,     // (P) depth << 32 | pair
+    global const ulong *pixel_entry,  // (P) weight << 32 | point; no point: the list ends
+    global float *pixel_spread)       // (HW)
+{
+    const uint q = get_global_id(0);
+    if (q >= hw) return;
+    const uint begin = pixel_offset[q], end = pixel_offset[q + 1];
+    float nearest = 0.0f, weights = 0.0f, depths = 0.0f, spread = 0.0f;
+    for (uint i = begin; i < end && (uint)pixel_entry[i] != NONE; i++) {
+        const float b = as_float((uint)(pixel_entry[i] >> 32));
+        const float z = as_float((uint)(pair_key[i] >> 32));
+        if (i == begin) nearest = z;  // depths count from here, so that sums of them keep digits
+        spread += 2.0f * b * ((z - nearest) * weights - depths);
+        weights += b;
+        depths += b * (z - nearest);
+    }
+    pixel_spread[q] = spread;
 }
 
 // GROUP work-items per row: the sum of its terms.
@@ -209,4 +234,25 @@ kernel void loss_sum(
         sum += terms[row * m + i];
     sum = group_sum4(sum, shared);
     if (MEMBER == 0) sums[row] = sum;
+}
+
+// GROUP work-items: write a further term, the scaled sum of the values, and ADD it, weighted, to the
+// loss.
+kernel void loss_add(
+    const uint n,
+    const uint term,  // which of the terms it is
+    const float scale,
+    const float weight,          // of the term in the loss
+    global const float *values,  // (n)
+    global float *terms)         // (?) the loss, and its terms
+{
+    SHARED(float, shared, GROUP);
+    if (GROUP_ID > 0) return;
+    float sum = 0.0f;
+    for (uint i = MEMBER; i < n; i += GROUP)
+        sum += values[i];
+    sum = group_sum(sum, shared);
+    if (MEMBER > 0) return;
+    terms[term] = scale * sum;
+    terms[0] += weight * (scale * sum);
 }

@@ -37,23 +37,3 @@ kernel void mask_gradient(
     sum = group_sum(sum, shared);
     if (MEMBER == 0) row_term[y] = sum;
 }
-
-// GROUP work-items: write the mean of the squares, and ADD it, weighted, to the loss.
-kernel void mask_sum(
-    const uint ph,      // rows of the padded image
-    const uint pixels,  // of the target
-    const float weight,
-    global const float *row_term,  // (PH)
-    global float *mean,            // (1)
-    global float *terms)           // (4) the loss's; accumulates in the first
-{
-    SHARED(float, shared, GROUP);
-    if (GROUP_ID > 0) return;
-    float sum = 0.0f;
-    for (uint y = MEMBER; y < ph; y += GROUP)
-        sum += row_term[y];
-    sum = group_sum(sum, shared);
-    if (MEMBER > 0) return;
-    mean[0] = sum / pixels;
-    terms[0] += weight * mean[0];
-}

@@ -20,22 +20,3 @@ kernel void perceptual_rows(
     const float of_row = group_sum(SUM_LANES(sum), shared);
     if (MEMBER == 0) row_term[first + y] = of_row / ((float)h * w);
 }
-
-// GROUP work-items: write the sum of the rows, LPIPS, and ADD it, weighted, to the loss.
-kernel void perceptual_sum(
-    const uint n,                  // rows of all blocks
-    const float weight,            // of LPIPS
-    global const float *row_term,  // (n)
-    global float *distance,        // (1) LPIPS
-    global float *terms)           // (4) the loss's; accumulates in the first
-{
-    SHARED(float, shared, GROUP);
-    if (GROUP_ID > 0) return;
-    float sum = 0.0f;
-    for (uint i = MEMBER; i < n; i += GROUP)
-        sum += row_term[i];
-    sum = group_sum(sum, shared);
-    if (MEMBER > 0) return;
-    distance[0] = sum;
-    terms[0] += weight * sum;
-}

@@ -23,29 +23,6 @@
 #endif
 #define MEAN_SQUARE 0.07957747f  // 1 / (4 pi), of each harmonic over all directions
 
-// One work-item per shaded point: takes its gradient into v, and divides the gradient by the root
-// of v.
-kernel void rmsprop_scale(
-    const uint s,                         // shaded points
-    const uint step,                      // from 1
-    const float eps,                      // eps * sqrt(1 - beta2^step)
-    global const uint *shaded,            // (S) their indices
-    global uint *last_step,               // (N) of each point's last gradient, 0: none
-    global float16 *v,                    // (N, 16)
-    global float16 *grad_point_features)  // (N, 16) G, then G / (sqrt(v) + eps), of the shaded
-{
-    const uint g = get_global_id(0);
-    if (g >= s) return;
-    const uint i = shaded[g];
-    const float16 G = grad_point_features[i];
-    if (!any(G != 0.0f)) return;  // a NaN is a gradient
-    const float16 moment =
-        exp2((step - last_step[i]) * LOG_BETA2) * v[i] + DECAY2 * MEAN_SQUARE * (G * G);
-    last_step[i] = step;
-    v[i] = moment;
-    grad_point_features[i] = G / (sqrt(moment) + eps);
-}
-
 // Moves `count` coefficients of point i, from basis function `first` on.
 #define MOVE(sh, first, count, rate)                                                               \
     {                                                                                              \
@@ -55,26 +32,34 @@ kernel void rmsprop_scale(
         }                                                                                          \
     }
 
-// One work-item per part of a shaded point: moves its coefficients.
+// One work-item per part of a shaded point: takes its gradient into v, and moves its coefficients.
 kernel void rmsprop_move(
     const uint s,        // shaded points
+    const uint step,     // from 1
+    const float eps,     // eps * sqrt(1 - beta2^step)
     const float rate_0,  // learning rate * sqrt(1 - beta2^step), by degree
     const float rate_1,
     const float rate_2,
-    global const uint *shaded,           // (S) their indices
-    global const float *camera,          // (20) camera.h
-    global const float4 *point_camera,   // (N, 4) x, y, z, distance
-    global const float16 *scaled_grads,  // (N, 16) of rmsprop_scale
-    global float16 *sh_0,                // (N, 1, 16)
-    global float16 *sh_1,                // (?, ?, 16) (N, 3, 16), untouched at degree 0
-    global float16 *sh_2a,               // (?, ?, 16) (N, 3, 16), untouched below degree 2
-    global float16 *sh_2b)               // (?, ?, 16) (N, 2, 16), untouched below degree 2
+    global const uint *shaded,                  // (S) their indices
+    global const float *camera,                 // (20) camera.h
+    global const float4 *point_camera,          // (N, 4) x, y, z, distance
+    global const float16 *grad_point_features,  // (N, 16) G, of the shaded
+    global const uint *last_step,               // (N) of each point's last gradient, 0: none
+    global float16 *v,                          // (N, 16)
+    global float16 *sh_0,                       // (N, 1, 16)
+    global float16 *sh_1,                       // (?, ?, 16) (N, 3, 16), untouched at degree 0
+    global float16 *sh_2a,                      // (?, ?, 16) (N, 3, 16), untouched below degree 2
+    global float16 *sh_2b)                      // (?, ?, 16) (N, 2, 16), untouched below degree 2
 {
     const size_t g = get_global_id(0) / ROW_PARTS;
     if (g >= s) return;
     const size_t i = shaded[g];
-    const floats scaled = load_part(scaled_grads, i);
-    if (!ANY_LANE(scaled != 0.0f)) return;
+    if (!any(grad_point_features[i] != 0.0f)) return;  // a NaN is a gradient
+    const floats G = load_part(grad_point_features, i);
+    const floats moment =
+        exp2((step - last_step[i]) * LOG_BETA2) * load_part(v, i) + DECAY2 * MEAN_SQUARE * (G * G);
+    store_part(moment, v, i);
+    const floats scaled = G / (sqrt(moment) + eps);
     float basis[9];
     sh_basis_of_point(camera, point_camera[i], basis);
     MOVE(sh_0, 0, 1, rate_0)
@@ -83,4 +68,18 @@ kernel void rmsprop_move(
         MOVE(sh_2a, 4, 3, rate_2)
         MOVE(sh_2b, 7, 2, rate_2)
     }
+}
+
+// One work-item per shaded point: writes the step of its gradient, once all its parts have moved.
+kernel void rmsprop_mark(
+    const uint s,                               // shaded points
+    const uint step,                            // from 1
+    global const uint *shaded,                  // (S) their indices
+    global const float16 *grad_point_features,  // (N, 16) G, of the shaded
+    global uint *last_step)                     // (N)
+{
+    const uint g = get_global_id(0);
+    if (g >= s) return;
+    const uint i = shaded[g];
+    if (any(grad_point_features[i] != 0.0f)) last_step[i] = step;
 }

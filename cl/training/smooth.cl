@@ -1,5 +1,4 @@
-// Smoothing of the SH coefficients over the grid, outside Adam: f += amount * (mean of the
-// neighbours - f).
+// Smoothing of the SH coefficients over the grid: f += amount * (mean of the neighbours - f).
 #include "common.h"
 #include "lanes.h"
 

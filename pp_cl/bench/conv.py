@@ -10,8 +10,8 @@ import numpy as np
 
 from pp_cl.bench.timing import PeakFlops, errors, variant_rows
 from pp_cl.device.device import Device
-from pp_cl.layers.choice import VARIANTS, ConvolutionPolicy, device_class, offered
-from pp_cl.layers.conv import Direction, Work, pack_bias, pack_weights, unpack_weights
+from pp_cl.layers.choice import OFFERED, VARIANTS, ConvolutionPolicy, can_run, device_class
+from pp_cl.layers.conv import Direction, pack_bias, pack_weights, unpack_weights
 from pp_cl.layers.tiles import all_tiles
 from pp_cl.network.layers import convolutions, unet_layers
 from pp_cl.reference import network as reference
@@ -51,20 +51,14 @@ class RandomConv:
         self.out, self.grad_out = dev.empty((side, side, co)), dev.upload(self.plain_grad_out)
         self.tiles = all_tiles(dev, side, side)
         self.variants = [
-            name for name in offered(device_class(dev)) if VARIANTS[name].can_run(k, *sources, co)
+            name for name in OFFERED[device_class(dev)] if can_run(name, k, *sources, co)
         ]
 
     def runner(self, variant: str, direction: Direction, policy: ConvolutionPolicy) -> Callable:
         """A function that computes a direction by a variant, as the network does, and waits for
         it. policy: its blocking is used.
         """
-        conv, blocking = VARIANTS[variant].module, policy.blocking
-        channels = [x.shape[2] for x in self.x]
-        needs = [
-            conv.work_floats(self.dev, blocking, direction, self.out.shape[0], self.weight.shape, c)
-            for c in (channels if direction is Direction.BACKWARD_INPUT else [sum(channels)])
-        ]
-        work = Work.empty(self.dev, *(max(n) for n in zip(*needs, strict=True)))
+        conv, blocking = VARIANTS[variant], policy.blocking
         compute = {
             Direction.FORWARD: self._run_forward,
             Direction.BACKWARD_INPUT: self._run_backward_input,
@@ -72,27 +66,47 @@ class RandomConv:
         }[direction]
 
         def run():
-            compute(conv, blocking, {"work": work, "tiles": self.tiles})
+            compute(conv, blocking)
             self.dev.finish()
 
         return run
 
-    def _run_forward(self, conv, blocking, given):
+    def _run_forward(self, conv, blocking):
         conv.forward(
-            self.dev, blocking, self.x, self.weight, self.bias, self.out, relu=self.relu, **given
+            self.dev,
+            blocking,
+            self.x,
+            self.weight,
+            self.bias,
+            self.out,
+            relu=self.relu,
+            tiles=self.tiles,
         )
 
-    def _run_backward_input(self, conv, blocking, given):
+    def _run_backward_input(self, conv, blocking):
         first = 0
         for x, grad_x in zip(self.x, self.grad_x, strict=True):
             conv.backward_input(
-                self.dev, blocking, self.weight, first, self.grad_out, grad_x, mask=x, **given
+                self.dev,
+                blocking,
+                self.weight,
+                first,
+                self.grad_out,
+                grad_x,
+                mask=x,
+                tiles=self.tiles,
             )
             first += x.shape[2]
 
-    def _run_backward_weights(self, conv, blocking, given):
+    def _run_backward_weights(self, conv, blocking):
         conv.backward_weights(
-            self.dev, blocking, self.x, self.grad_out, self.grad_weight, self.grad_bias, **given
+            self.dev,
+            blocking,
+            self.x,
+            self.grad_out,
+            self.grad_weight,
+            self.grad_bias,
+            tiles=self.tiles,
         )
 
     def result(

@@ -62,7 +62,7 @@ def _rows(dev, bench, blends, *, copy, before):
             "gamma": bench.gamma,
             "blend": blend,
             "pairs": result.pairs.total,
-            "shaded": int(result.shaded.size),
+            "shaded": int(result.weights.shaded.size),
             "forward_ms": forward,
             "backward_ms": backward,
             "ms": float(np.median(whole_ms[blend])),

@@ -4,60 +4,54 @@ sampled pixels.
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
+from dataclasses import replace
 from functools import cached_property
 
 import numpy as np
-from pyopencl.array import Array
 
-from pp_cl.bench.spheres import spheres_backward
+from pp_cl.bench.spheres import find_all_pairs, project_spheres, spheres_backward
+from pp_cl.device.buffers import Buffers
 from pp_cl.device.device import Device
 from pp_cl.model import Model
 from pp_cl.network.unet import UNet
-from pp_cl.raster.blend import BLENDS, Blend
-from pp_cl.raster.pairs import PairBuilder
-from pp_cl.raster.project import Footprint, Projection
-from pp_cl.reference.raster import PixelReference, sh_basis
-from pp_cl.render import RasterResult, Renderer
+from pp_cl.raster.blend import blend_backward, blend_forward
+from pp_cl.raster.weights import BLENDS, blend_weights
+from pp_cl.reference import dense
+from pp_cl.render import Renderer, RenderResult
 from pp_cl.scene.camera import Camera
 from pp_cl.scene.grid import Grid
 from pp_cl.settings import RasterConfig
 
 SAMPLES = 64  # pixels compared with float64
+ROUNDING = 4 * np.finfo(np.float32).eps  # of the distance from a ray, in shares of the range
 CHANNELS = 16
 ROW = 4 * CHANNELS  # bytes of the features of a point or a pixel
 # every coefficient of degrees 1 and 2; random ones would take minutes for 4 million points
 HIGHER_SH = 0.1
 
 
-class BenchScene(ABC):
+class BenchScene:
     """A camera, points, and their rasterisation in stages (Device.stage).
 
     name: of the scene. forward_stages: the stages of forward(); those of backward() are timed
-    beside them. size: side of the image in pixels. count: number of points. opacity: (N,) float32.
-    reference: PixelReference. grad: (H, W, 16) device array, dL/dfeatures.
+    beside them. size: side of the image in pixels. count: number of points. positions: (N, 3),
+    world, all in view. radius: one number, world units, no more than a few pixels. opacity: (N,)
+    float32. grad: (H, W, 16) device array, dL/dfeatures.
     """
 
-    name: str
-    forward_stages: tuple[str, ...]
-    size: int
-    gamma: float
-    count: int
-    opacity: np.ndarray
-    reference: PixelReference
-    grad: Array
+    radius = 0.0015
 
-    @abstractmethod
-    def forward(self, blend: str) -> RasterResult:
+    def forward(self, blend: str) -> RenderResult:
         """Rasterise the scene."""
+        raise NotImplementedError
 
-    @abstractmethod
-    def backward(self, blend: str, result: RasterResult) -> None:
+    def backward(self, blend: str, result: RenderResult) -> None:
         """All gradients from self.grad. result: of forward(blend), the last one."""
+        raise NotImplementedError
 
-    @abstractmethod
     def exact_features(self, points: np.ndarray) -> np.ndarray:
         """(S, 16) float64 features of some points."""
+        raise NotImplementedError
 
     def error(self, blend: str, features: np.ndarray) -> float:
         """Largest difference of features (H, W, 16) from float64, over their range, at SAMPLES
@@ -68,17 +62,37 @@ class BenchScene(ABC):
         rng, largest = np.random.default_rng(1), 0.0
         for pixel in rng.permutation(self.covered_pixels)[:SAMPLES]:
             row, column = divmod(int(pixel), self.size)
-            hits = self.reference.hits(column, row)
-            if hits is not None:
-                own = self.opacity[hits[0]], self.exact_features(hits[0])
-                expected = (
-                    self.reference.composited(hits, *own)
-                    if blend == "alpha"
-                    else self.reference.features(hits, *own, self.gamma)
-                )
+            expected = self.exact_pixel(blend, column, row)
+            if expected is not None:
                 difference = np.abs(features[row, column] - expected) / self.feature_range
                 largest = max(largest, float(difference.max()))
         return largest
+
+    def exact_pixel(self, blend: str, column: int, row: int) -> np.ndarray | None:
+        """(16,) float64 features of a pixel; None where float32's rounding may decide over a
+        hit.
+        """
+        camera = self.camera
+        x, y, z = self._camera_space
+        # half as wide again: far from the axis, pixels see more than a circle
+        window = 1 + 1.5 * max(dense.LEAST_RADIUS, self.radius * camera.fx / z.min())
+        beside = np.abs(camera.fx * x / z + camera.cx - column - 0.5) < window
+        near = np.flatnonzero(beside & (np.abs(camera.fy * y / z + camera.cy - row - 0.5) < window))
+        geometry = dense.geometry(
+            camera.crop(column, row, 1, 1),
+            self.positions[near],
+            self.radius,
+            self.footprint,
+            depth_range=self.depth_range,
+        )
+        if (geometry["margin"] < ROUNDING * camera.fx).any():
+            return None
+        exact = dense.blend_by_rule(blend, geometry, self.opacity[near], self.gamma)
+        return dense.features(exact, self.exact_features(near))[0]
+
+    @cached_property
+    def _camera_space(self):
+        return dense.camera_space(self.camera, self.positions).T
 
     @cached_property
     def covered_pixels(self) -> np.ndarray:
@@ -94,14 +108,14 @@ class BenchScene(ABC):
         Rasterises the scene.
         """
         result = self.forward("softmax")
-        rows = result.point_features.get()[result.shaded.get()]
+        rows = result.point_features.get()[result.weights.shaded.get()]
         return np.maximum(rows.max(axis=0), 1) - np.minimum(rows.min(axis=0), 1)
 
-    def moved_bytes(self, blend: str, result: RasterResult) -> dict[str, int]:
+    def moved_bytes(self, blend: str, result: RenderResult) -> dict[str, int]:
         """{stage: bytes} that the stages must read and write: every value used by each kernel,
         once.
         """
-        n, p, hw, shaded = self.count, result.pairs.total, self.size**2, result.shaded.size
+        n, p, hw, shaded = self.count, result.pairs.total, self.size**2, result.weights.shaded.size
         # of a point: place, box, first pair; of a pair: pixel, point and closeness, place or key
         search, pair = 16 + 8 + 4, 4 + 8 + 8
         rest = (8 + 8 + 4 + 4) * p if blend == "alpha" else 2 * ROW * hw
@@ -123,7 +137,7 @@ class GridScene(BenchScene):
     """
 
     name, forward_stages = "grid", ("project", "pairs", "weights", "shade", "blend")
-    depth_range = (2.0, 6.0)
+    footprint, depth_range = "disc", (2.0, 6.0)
 
     def __init__(self, dev: Device, n: int, size: int, gamma: float):
         rng = np.random.default_rng(0)
@@ -148,38 +162,34 @@ class GridScene(BenchScene):
         model.cloud.sh[0].set(self.sh_0)
         for coefficients in model.cloud.sh[1:]:
             dev.fill(coefficients, HIGHER_SH)
-        disc = {"footprint": "disc", "radius": 0.0015, "early_stop": 0.0}
+        disc = RasterConfig(footprint="disc", radius=self.radius, early_stop=0.0)
         self.renderers = {
-            blend: Renderer(dev, model, RasterConfig(blend=blend, **disc)) for blend in BLENDS
+            blend: Renderer(dev, model, replace(disc, blend=blend)) for blend in BLENDS
         }
         self.grad = dev.upload(rng.standard_normal((size, size, CHANNELS), np.float32))
-        self.reference = PixelReference(
-            self.camera,
-            grid.positions(ids),
-            disc["radius"],
-            "disc",
-            depth_range=self.depth_range,
-        )
+        self.positions = grid.positions(ids)
 
-    def forward(self, blend: str) -> RasterResult:
-        """As BenchScene."""
-        return self.renderers[blend].rasterise(self.camera, self.gamma)
+    def forward(self, blend: str) -> RenderResult:
+        """See BenchScene."""
+        return self.renderers[blend].forward(self.camera, self.gamma, until="features")
 
-    def backward(self, blend: str, result: RasterResult) -> None:
+    def backward(self, blend: str, result: RenderResult) -> None:
         """Stage `backward`: gradients of features and opacities."""
         self.renderers[blend].backward_features(result, self.grad)
 
     def exact_features(self, points: np.ndarray) -> np.ndarray:
-        """As BenchScene."""
-        directions = self.reference.points[points] / self.reference.range[points, None]
-        basis = sh_basis(directions @ self.camera.pose[:, :3].T)
-        higher = HIGHER_SH * basis[:, 1:].sum(1, keepdims=True)
-        return basis[:, :1] * self.sh_0[points, 0].astype(np.float64) + higher
+        """See BenchScene."""
+        coefficients = np.full((len(points), 9, CHANNELS), HIGHER_SH)
+        coefficients[:, 0] = self.sh_0[points, 0]
+        return dense.shade(self.positions[points], self.camera.eye, coefficients)
 
-    def moved_bytes(self, blend: str, result: RasterResult) -> dict[str, int]:
-        """As BenchScene, with the stages of a grid and of harmonics."""
+    def moved_bytes(self, blend: str, result: RenderResult) -> dict[str, int]:
+        """See BenchScene, with the stages of a grid and of harmonics."""
         shading = 4 + 16 + 9 * ROW + ROW
-        own = {"project": self.count * (4 + 16 + 8 + 4), "shade": result.shaded.size * shading}
+        own = {
+            "project": self.count * (4 + 16 + 8 + 4),
+            "shade": result.weights.shaded.size * shading,
+        }
         return own | super().moved_bytes(blend, result)
 
 
@@ -192,77 +202,93 @@ class PulsarScene(BenchScene):
     """
 
     name, forward_stages = "pulsar", ("project", "pairs", "weights", "blend")
-    radius, depth_range = 0.0015, (0.6, 2.5)
+    footprint, depth_range = "sphere", (0.6, 2.5)
 
     def __init__(self, dev: Device, n: int, size: int, gamma: float):
         rng = np.random.default_rng(0)
         self.dev, self.size, self.gamma, self.count = dev, size, gamma, n
         self.camera = Camera(np.eye(3, 4), size, size, size / 2, size / 2, size, size)
         self.opacity = np.ones(n, np.float32)
-        positions = rng.random((n, 3), np.float32) + np.float32([-0.5, -0.5, 1])
+        self.positions = rng.random((n, 3), np.float32) + np.float32([-0.5, -0.5, 1])
         self.point_features = rng.random((n, CHANNELS), np.float32)
-        self.reference = PixelReference(
-            self.camera, positions, self.radius, "sphere", depth_range=self.depth_range
-        )
-
-        footprint = Footprint("sphere")
-        self.projection, self.pairs = Projection(dev, footprint), PairBuilder(dev, footprint)
-        self.blends = {name: Blend(dev, BLENDS[name](dev)) for name in BLENDS}
+        self.buffers, self.room = {blend: Buffers(dev) for blend in BLENDS}, 1
         self.camera_buffer = dev.upload(self.camera.packed(self.depth_range))
         self.point_radius = dev.upload([self.radius], np.float32)
-        self.positions, self.point_opacity = dev.upload(positions), dev.upload(self.opacity)
+        self.point_positions, self.point_opacity = map(dev.upload, (self.positions, self.opacity))
         self.device_features = dev.upload(self.point_features)
         self.features = dev.empty((size, size, CHANNELS))
         self.grad = dev.upload(rng.standard_normal((size, size, CHANNELS), np.float32))
 
-    def forward(self, blend: str) -> RasterResult:
-        """As BenchScene."""
-        blending = self.blends[blend]
-        with self.dev.stage("project"):
-            points = self.projection.spheres(self.camera_buffer, self.positions, self.point_radius)
-        with self.dev.stage("pairs"):
-            pairs = self.pairs.build(points, (self.size, self.size))
-        with self.dev.stage("weights"):
-            weights = blending.weighing.compute(
-                pairs, self.camera_buffer, self.point_opacity, self.gamma
+    def forward(self, blend: str) -> RenderResult:
+        """See BenchScene."""
+        dev, b, size = self.dev, self.buffers[blend], (self.size, self.size)
+        with dev.stage("project"):
+            points = project_spheres(
+                dev,
+                b,
+                self.footprint,
+                self.camera_buffer,
+                self.point_positions,
+                point_radius=self.point_radius,
             )
-        with self.dev.stage("blend"):
-            blending.forward(pairs, weights, self.device_features, self.features)
-        return RasterResult(
-            (0, 0), points, pairs, weights, None, self.device_features, self.features
+        with dev.stage("pairs"):
+            pairs = find_all_pairs(dev, b, points, size, self.room)
+            self.room = pairs.capacity
+        with dev.stage("weights"):
+            weights = blend_weights(
+                dev,
+                b,
+                pairs,
+                self.camera_buffer,
+                self.point_opacity,
+                blend=blend,
+                gamma=self.gamma,
+            )
+        with dev.stage("blend"):
+            blend_forward(dev, pairs, weights, self.device_features, self.features)
+        return RenderResult(
+            self.camera,
+            (0, 0),
+            size,
+            points,
+            pairs,
+            weights,
+            None,
+            self.device_features,
+            self.features,
         )
 
-    def backward(self, blend: str, result: RasterResult) -> None:
+    def backward(self, blend: str, result: RenderResult) -> None:
         """Stages `backward` and `spheres`."""
-        blending = self.blends[blend]
         with self.dev.stage("backward"):
-            gradient = blending.gradient(
+            blend_backward(
+                self.dev,
+                self.buffers[blend],
                 result.pairs,
                 result.weights,
-                result.point_features,
+                point_features=result.point_features,
                 features=result.features,
                 grad_features=self.grad,
             )
-            blending.backward(gradient)
         with self.dev.stage("spheres"):
             spheres_backward(
                 self.dev,
                 result.points,
                 result.pairs,
                 result.weights,
+                self.buffers[blend],
                 opacity=self.point_opacity,
                 gamma=self.gamma,
                 point_features=result.point_features,
                 grad_features=self.grad,
-                rest_or_gain=gradient.rest_or_gain,
             )
 
     def exact_features(self, points: np.ndarray) -> np.ndarray:
-        """As BenchScene."""
+        """See BenchScene."""
         return self.point_features[points].astype(np.float64)
 
-    def moved_bytes(self, blend: str, result: RasterResult) -> dict[str, int]:
-        """As BenchScene, with the stages of spheres."""
+    def moved_bytes(self, blend: str, result: RenderResult) -> dict[str, int]:
+        """See BenchScene, with the stages of spheres."""
         n, p, hw = self.count, result.pairs.total, self.size**2
         spheres = p * (4 + 8 + 8 + 8) + p * (4 + 8) + (ROW + 16 + 16) * n + 2 * (ROW + 4) * hw
         own = {"project": n * (12 + 16 + 8 + 4), "spheres": spheres}

@@ -12,7 +12,7 @@ import numpy as np
 
 from pp_cl.device.device import Device
 from pp_cl.layers.choice import device_class
-from pp_cl.layers.tiles import LANES
+from pp_cl.layers.tiles import VECTOR
 
 # Rounds of a measurement: at least LEAST_ROUNDS, then until SECONDS are over or MOST_ROUNDS done.
 LEAST_ROUNDS, MOST_ROUNDS, SECONDS = 5, 50, 1.5
@@ -74,7 +74,7 @@ class PeakFlops:
         self.chains, per_unit, self.local = {"CPU": (16, 64, 1), "GPU": (2, 2048, 64)}[
             device_class(dev)
         ]
-        self.out = dev.empty((per_unit * dev.info["compute_units"], LANES))
+        self.out = dev.empty((per_unit * dev.info["compute_units"], VECTOR))
         self.rounds = 64
         self.run()  # builds the kernel
         while self._seconds() < PEAK_SECONDS:
@@ -113,7 +113,7 @@ class CopyBandwidth:
 
     def __init__(self, dev: Device):
         self.dev = dev
-        self.source = dev.zeros((COPY_BYTES // (4 * LANES), LANES))
+        self.source = dev.zeros((COPY_BYTES // (4 * VECTOR), VECTOR))
         self.target = dev.zeros(self.source.shape)
         self.bytes = self.source.nbytes + self.target.nbytes
 

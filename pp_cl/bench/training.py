@@ -19,7 +19,7 @@ from pp_cl.network.unet import UNet
 from pp_cl.scene.hull import build_grid, depth_range
 from pp_cl.scene.load import open_scene, scene_box
 from pp_cl.train import Trainer
-from pp_cl.training.optimiser import Rates
+from pp_cl.training.schedule import Rates
 
 TRIED_STEPS = 4  # whose time says how many fit; the first builds the kernels and does not count
 TIMED_STEPS = 6  # the last ones, by stage
@@ -108,7 +108,7 @@ def bench_step(
                 seconds.clear()  # the first round builds the programs
             for i in range(views):
                 view = trainer.views[len(trainer.views) * i // views]
-                result = renderer.rasterise(view.camera, config.raster.gamma[1])
+                result = renderer.forward(view.camera, config.raster.gamma[1], until="features")
                 if i not in grads:
                     values = np.random.default_rng(i).normal(size=result.features.shape) * 1e-6
                     grads[i] = dev.upload(values, np.float32)
@@ -118,17 +118,17 @@ def bench_step(
                     trainer.optimiser.update(
                         step,
                         rates,
-                        gradients,
+                        *gradients,
                         points=result.points,
-                        shaded=result.shaded,
+                        shaded=result.weights.shaded,
                         sh_eps=1e-10,
                     )
     stages = {name: row["ms"] for name, row in _spread(seconds).items()}
     return {
         "points": cloud.count,
         "pairs": result.pairs.total,
-        "shaded": result.shaded.size / cloud.count,
-        "size": result.features.shape[:2],
+        "shaded": result.weights.shaded.size / cloud.count,
+        "size": result.size,
         "stages_ms": stages,
         "forward_ms": sum(stages[name] for name in FORWARD),
         "backward_ms": stages["backward"] + stages["update"],

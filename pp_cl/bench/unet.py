@@ -12,7 +12,7 @@ from pyopencl.array import Array
 
 from pp_cl.bench.timing import PeakFlops, errors, variant_rows
 from pp_cl.device.device import Device
-from pp_cl.layers.choice import AUTO, ConvolutionPolicy, offered
+from pp_cl.layers.choice import AUTO, OFFERED, ConvolutionPolicy
 from pp_cl.layers.conv import unpack_weights
 from pp_cl.network.layers import multiplications
 from pp_cl.network.unet import UNet
@@ -41,7 +41,7 @@ def bench_unet(
     grad_image = rng.normal(size=(size, size, CHANNELS_OUT)).astype(np.float32)
     # one network for all policies, so that large images fit
     net = make_network(dev, widths, policy, blocks)
-    names = (AUTO, *offered(policy.device_class))
+    names = (AUTO, *OFFERED[policy.device_class])
     policies = {name: replace(policy, variant=name) for name in names}
     parameters = plain_parameters(net, net.parameters)
     outputs = reference.network(net.layers, parameters, x[:CHECK_SIZE, :CHECK_SIZE])
@@ -53,7 +53,7 @@ def bench_unet(
     device_x, device_grad = dev.upload(x), dev.upload(grad_image)
     flops = 2 * multiplications(net.layers, size, size)
     for direction, factor, runner in (("forward", 1, forward_runner), ("train", 3, train_runner)):
-        net.use(policies[AUTO])
+        net.policy = policies[AUTO]
         memory = sum(row[2] for row in net.memory_plan(size, size, direction == "train"))
         about = {
             "layer": "network",
@@ -76,7 +76,7 @@ def _by_policy(net, policy, run):
     """`run` of the network, as a function that runs it by a policy."""
 
     def changed():
-        net.use(policy)
+        net.policy = policy
         run()
 
     return changed
@@ -138,7 +138,7 @@ def network_errors(
     reference.network, in float64; grad_image: (H, W, 3).
     """
     parameters = plain_parameters(net, net.parameters)
-    net.use(policy)
+    net.policy = policy
     image = net.forward(dev.upload(outputs["x"], np.float32)).get()
     active = {layer.name: net.output(layer.name).get() > 0 for layer in net.layers if layer.relu}
     actual = {"x": net.backward(dev.upload(grad_image)).get()}

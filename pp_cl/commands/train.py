@@ -100,21 +100,22 @@ def _given_settings(options):
 
 def _first_line(training):
     """What the training begins with: a grid, or a checkpoint."""
-    from pp_cl.scene.hull import CELL_CAP
+    from pp_cl.scene.hull import CELL_CAP, spacing_pixels
 
-    hull = training.hull
+    hull, trainer = training.hull, training.trainer
+    points = trainer.model.cloud.count
     if hull is None:
-        trainer = training.trainer
-        return f"resuming at step {trainer.step} with {trainer.model.cloud.count} points"
-    near, far = hull.depth_range
+        return f"resuming at step {trainer.step} with {points} points"
+    grid, (near, far) = trainer.model.grid, trainer.model.depth_range
+    spacing = spacing_pixels(grid, [view.camera for view in trainer.views])
     asked = training.config.points.count
     capped = (
-        f"\nhull: only {hull.points} of the {asked} points asked for, since a finer grid would have"
+        f"\nhull: only {points} of the {asked} points asked for, since a finer grid would have"
         f" more than {CELL_CAP} cells"
     )
     return (
-        f"hull: {hull.points} points on a {'x'.join(map(str, hull.dims))} grid, edge"
-        f" {hull.edge:.6g} ({hull.spacing:.2f} pixels), depth {near:.3f} to {far:.3f}"
+        f"hull: {points} points on a {'x'.join(map(str, grid.dims))} grid, edge"
+        f" {grid.edge:.6g} ({spacing:.2f} pixels), depth {near:.3f} to {far:.3f}"
         f" ({hull.seconds:.1f} s)"
         f"{capped if hull.capped else ''}"
     )

@@ -9,7 +9,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from pp_cl.layers.conv import pack_bias, pack_weights, unpack_weights
-from pp_cl.layers.tiles import LANES
+from pp_cl.layers.tiles import VECTOR
 from pp_cl.network.layers import Layer, convolutions
 from pp_cl.network.unet import UNet
 from pp_cl.run import Run
@@ -32,7 +32,9 @@ def channel_weights(run: Run, cameras: Sequence[Camera]) -> Parameters:
     found = {x.name: np.zeros(x.channels) for x in convolutions(layers) if x.relu}
     some = list(cameras)[:: -(-len(cameras) // MEASURED_VIEWS)]
     for camera in some:
-        net.forward(run.renderer.rasterise(camera, run.gamma).features, training=True)
+        net.forward(
+            run.renderer.forward(camera, run.gamma, until="features").features, training=True
+        )
         for name, squares in found.items():
             squares += np.mean(net.output(name).get().astype(np.float64) ** 2, axis=(0, 1))
     parameters = {name: array.get() for name, array in net.parameters.items()}
@@ -78,7 +80,7 @@ def kept_channels(
         if layer.name in weights:
             weight = weights[layer.name]
             count = int((weight >= least * weight.max()).sum()) if least > 0 else len(weight)
-            count = min(-(-max(1, count) // LANES) * LANES, len(weight))
+            count = min(-(-max(1, count) // VECTOR) * VECTOR, len(weight))
             kept[layer.name] = np.sort(np.argsort(-weight, kind="stable")[:count])
         elif layer.kind == "pool" and layer.inputs[0] in kept:
             kept[layer.name] = kept[layer.inputs[0]]

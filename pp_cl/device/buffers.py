@@ -1,11 +1,11 @@
 """Device arrays declared as a table, {name: (shape, dtype)}: what a stage allocates and what the
-memory plan counts.
+memory plan counts; and arrays that are packed into one buffer.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Hashable
+from collections.abc import Sequence
 
 import numpy as np
 from pyopencl.array import Array
@@ -23,17 +23,6 @@ def table_bytes(table: Table) -> int:
 def grown(capacity: int, needed: int) -> int:
     """The capacity, or a quarter more than `needed` where that is more than it holds."""
     return capacity if needed <= capacity else needed + needed // 4
-
-
-def scratch(dev: Device, name: Hashable, n: int, dtype: type) -> Array:
-    """(n,) uninitialised, in memory that all calls with this name share: only for what kernels
-    enqueued before the next such call read.
-    """
-    held = dev.scratch.get(name)
-    if held is None or len(held) < n or held.dtype != dtype:
-        held = dev.scratch[name] = None  # frees the old one first
-        held = dev.scratch[name] = dev.empty((grown(0, n),), dtype)
-    return held[:n]
 
 
 class Buffers:
@@ -68,3 +57,38 @@ class Buffers:
             return self._arrays[name]
         except KeyError:
             raise AttributeError(f"no buffer {name!r} was required yet") from None
+
+
+class PackedArrays:
+    """Device arrays in one buffer, which one transfer overwrites."""
+
+    def __init__(self, dev: Device):
+        self._dev = dev
+        self._rows: list[tuple[tuple[int, ...], type]] = []
+        self._starts, self._whole, self._arrays = [], None, []
+
+    def send(
+        self, rows: list[tuple[tuple[int, ...], type]], values: Sequence[np.ndarray]
+    ) -> list[Array]:
+        """Arrays of these shapes and dtypes, in the same memory as those before if these were the
+        same, overwritten after what is enqueued. values: of these dtypes; what is behind shorter
+        ones is undefined.
+        """
+        if rows != self._rows:
+            self._allocate(rows)
+        packed = np.empty(self._whole.shape, np.uint8)
+        for start, value in zip(self._starts, values, strict=True):
+            octets = np.ascontiguousarray(value).reshape(-1).view(np.uint8)
+            packed[start : start + value.nbytes] = octets
+        self._dev.send(self._whole, packed)
+        return self._arrays
+
+    def _allocate(self, rows):
+        self._rows, self._whole, self._arrays = rows, None, []  # frees the old ones first
+        align = self._dev.device.mem_base_addr_align // 8
+        sizes = [max(1, math.prod(shape) * np.dtype(dtype).itemsize) for shape, dtype in rows]
+        *self._starts, end = np.cumsum([0, *(-(-size // align) * align for size in sizes)])
+        self._whole = self._dev.empty((int(end),), np.uint8)
+        for (shape, dtype), start, size in zip(rows, self._starts, sizes, strict=True):
+            region = self._whole.base_data.get_sub_region(int(start), size)
+            self._arrays.append(Array(self._dev.queue, shape, dtype, data=region))

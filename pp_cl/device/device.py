@@ -1,5 +1,5 @@
-"""OpenCL devices: choosing one, building programs, allocating buffers. All vendor quirks live
-here.
+"""An OpenCL device: builds programs, allocates and copies buffers, times stages and kernels. All
+vendor quirks live here.
 """
 
 import atexit
@@ -8,7 +8,7 @@ import sys
 import time
 import weakref
 from collections import defaultdict, deque
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Hashable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -18,7 +18,6 @@ import pyopencl as cl
 from numpy.typing import ArrayLike
 from pyopencl.array import Array
 
-from pp_cl.device.form import takes_cpu_form
 from pp_cl.device.launch import Kernel, Program
 from pp_cl.errors import UserError
 
@@ -50,6 +49,17 @@ def has_watchdog(device: cl.Device) -> bool:
         return bool(device.kernel_exec_timeout_nv)
     except (cl.Error, AttributeError):
         return True
+
+
+def acts_as_cpu(device: cl.Device) -> bool:
+    """Whether drivers and kernels work as they do on CPUs: on CPUs, unless PP_FORM=gpu.
+
+    Raises UserError for another PP_FORM.
+    """
+    asked = os.environ.get("PP_FORM")
+    if asked not in (None, "", "gpu"):
+        raise UserError(f"PP_FORM={asked}: must be gpu, or unset")
+    return not asked and bool(device.type & cl.device_type.CPU)
 
 
 def kernel_folder() -> Path:
@@ -121,7 +131,7 @@ class Memory(cl.Buffer):
 
 class Device:
     """One OpenCL device with its queue, programs and buffers. debug: PP_DEBUG
-    (docs/devices.md). is_cpu: drivers and kernels take their form for CPUs. has_watchdog: long
+    (docs/devices.md). is_cpu: drivers and kernels work as they do on CPUs. has_watchdog: long
     kernels are launched in parts.
     """
 
@@ -129,14 +139,15 @@ class Device:
         self.device = device
         self.name = device.name.strip()
         self.info = describe(device)
-        self.is_cpu = takes_cpu_form(device)
+        self.is_cpu = acts_as_cpu(device)
         self.has_watchdog = not self.is_cpu and has_watchdog(device)
         self.debug = _debug_level()
         self.context = cl.Context([device])
         properties = cl.command_queue_properties.PROFILING_ENABLE if self.debug else 0
         self.queue = cl.CommandQueue(self.context, properties=properties)
         self.bytes = self.peak_bytes = 0
-        self.sent, self.scratch = deque(), {}  # of transfer.send(), buffers.scratch()
+        self._sent = deque()  # events of send()
+        self._scratch = {}  # {name: array} of scratch()
         self._programs = {}
         self._seconds = defaultdict(list)
         self._stage_seconds = defaultdict(list) if self.debug else None
@@ -195,6 +206,19 @@ class Device:
             self.fill(array, 0)
         return array
 
+    def scratch(self, name: Hashable, n: int, dtype: type = np.float32, *, zeros: int = 0) -> Array:
+        """(n,) or longer, uninitialised, in memory that all calls with this name share: only for
+        what kernels enqueued before the next such call read. zeros: values at its front that are
+        0 when it is allocated, for kernels that leave zeros there.
+        """
+        held = self._scratch.get(name)
+        if held is None or len(held) < n or held.dtype != dtype:
+            held = self._scratch[name] = None  # frees the old one first
+            held = self._scratch[name] = self.empty((n,), dtype)
+            if zeros:
+                self.fill(held[:zeros], 0)
+        return held
+
     def zeros(self, shape: int | tuple[int, ...], dtype: type = np.float32) -> Array:
         """Array of zeros on the device."""
         array = self._allocate(shape, dtype)
@@ -213,30 +237,28 @@ class Device:
 
         Array.set, as Array.get, would keep the numpy array alive as long as the device's.
         """
+        if array.size:
+            self._upload(array, values, is_blocking=True)
+
+    def send(self, array: Array, values: np.ndarray) -> None:
+        """The same after what is enqueued, without waiting: `values` must not change any more."""
+        self._sent.append(self._upload(array, values, is_blocking=False))
+        # an event that is dropped waits for the end of its transfer
+        while len(self._sent) > 1 and _is_complete(self._sent[0]):
+            self._sent.popleft()
+
+    def _upload(self, array, values, *, is_blocking):
         if values.shape != array.shape or values.dtype != array.dtype:
             raise ValueError(f"write: {values.shape} {values.dtype} to {array.shape} {array.dtype}")
-        if array.size:
-            self.attempt(
-                "upload a buffer",
-                cl.enqueue_copy,
-                self.queue,
-                array.base_data,
-                np.ascontiguousarray(values),
-                dst_offset=array.offset,
-            )
+        values = np.ascontiguousarray(values)
+        place = {"dst_offset": array.offset, "is_blocking": is_blocking}
+        return self._copy("upload a buffer", array.base_data, values, **place)
 
     def download(self, array: Array) -> np.ndarray:
         """Copy of an array of this device."""
         values = np.empty(array.shape, array.dtype)
         if array.size:
-            self.attempt(
-                "download a buffer",
-                cl.enqueue_copy,
-                self.queue,
-                values,
-                array.base_data,
-                src_offset=array.offset,
-            )
+            self._copy("download a buffer", values, array.base_data, src_offset=array.offset)
         return values
 
     def fill(self, array: Array, value: float) -> None:
@@ -270,15 +292,11 @@ class Device:
                 f"copy: {source.shape} {source.dtype} into {target.shape} {target.dtype}"
             )
         if count:
-            self.attempt(
-                "copy a buffer",
-                cl.enqueue_copy,
-                self.queue,
-                target.data,
-                source.data,
-                byte_count=count * row_bytes,
-                dst_offset=start * row_bytes,
-            )
+            size = {"byte_count": count * row_bytes, "dst_offset": start * row_bytes}
+            self._copy("copy a buffer", target.data, source.data, **size)
+
+    def _copy(self, what, target, source, **place):
+        return self.attempt(what, cl.enqueue_copy, self.queue, target, source, **place)
 
     def finish(self) -> None:
         """Wait until everything enqueued is done."""
@@ -387,3 +405,7 @@ class Device:
                 f"{label:40s} {len(seconds):7d} x {median:9.3f} ms, {total:9.3f} s in all",
                 file=sys.stderr,
             )
+
+
+def _is_complete(event):
+    return event.command_execution_status == cl.command_execution_status.COMPLETE

@@ -1,5 +1,5 @@
-"""Kernels launched by argument name, with shapes checked against the comments of their
-signatures.
+"""Kernels launched by argument name, with shapes checked against the comments of their signatures;
+and how many values a work-item takes, on CPUs and on GPUs.
 """
 
 import math
@@ -13,8 +13,7 @@ import numpy as np
 import pyopencl as cl
 import pyopencl.array as cl_array
 
-from pp_cl.device.formula import evaluate, names_in, parse_formula
-from pp_cl.device.signature import Parameter, parse_signatures
+from pp_cl.device.signature import Parameter, compile_formula, parse_signatures
 from pp_cl.errors import BuildError, UserError
 
 # Work-group sizes when the caller names none. They are fixed, and the global size is rounded up to
@@ -24,6 +23,9 @@ DEFAULT_LOCAL = {1: (64,), 2: (16, 4), 3: (16, 4, 1)}
 # Systems reset a GPU that draws the screen when one kernel takes about 2 seconds. So many
 # multiply-adds take half a second where 100 GFLOP/s are reached; see docs/devices.md.
 MOST_MULTIPLY_ADDS = 25e9
+
+SMALL_GROUP = 64  # work-items: no fewer fill what a GPU runs in step
+LARGEST_GROUP = 256  # work-items: what GPUs run of any kernel
 
 # Shapes and sizes of launches that a kernel remembers, so that it checks and rounds them once: more
 # than a network's layers have. The numbers of visible points, new in each step, would fill memory.
@@ -52,7 +54,7 @@ class Kernel:
         self.label = label
         self._device_name = device.name.strip()
         words = {word for p in parameters for word in p.shape or () if word != "?"}
-        names = set().union(*(names_in(parse_formula(word)) for word in words))
+        names = {name for word in words for name in compile_formula(word).co_names}
         self._macros = {name: int(defines[name]) for name in names & defines.keys()}
         letters = {name.lower() for name in names}
         # (parameter, dtype of a buffer, letter that a scalar gives a size to) in order
@@ -176,11 +178,12 @@ class Kernel:
         for word, size, has in sorted(dimensions, key=lambda d: not d[0].isidentifier()):
             if word == "?":
                 continue
-            expected = evaluate(
-                parse_formula(word), lambda n: self._macros.get(n, sizes.get(n.lower()))
-            )
-            if expected is None:  # a letter's first buffer
+            formula = compile_formula(word)
+            known = {n: self._macros.get(n, sizes.get(n.lower())) for n in formula.co_names}
+            if None in known.values():  # a letter's first buffer
                 expected = sizes.setdefault(word.lower(), size)
+            else:
+                expected = eval(formula, {}, known)  # noqa: S307 - checked by compile_formula()
             if size != expected:
                 raise ValueError(f"{has} with {word} = {expected}")
 
@@ -286,3 +289,70 @@ class Program:
                 self.device.queue.flush()
             if self.device.debug:
                 self.device.observe(kernel, event, arguments)
+
+
+# ---- how much a work-item does; dev: a pp_cl.device.device.Device
+
+
+def lanes(dev: Any, on_gpu: int = 1) -> int:
+    """LANES of kernels (cl/lanes.h): neighbouring values that one work-item takes. on_gpu: how many
+    on GPUs, 1 or 4.
+
+    A CPU's core has vectors of 16 floats and works on one item at a time. A GPU runs 32 or 64 items
+    in step, which reach memory together, and keeps the values of each in registers: 16 of
+    everything do not fit.
+    """
+    return 16 if dev.is_cpu else on_gpu
+
+
+def row_parts(dev: Any, on_gpu: int = 1) -> int:
+    """Work-items for the 16 channels of a row, LANES each. on_gpu: as for lanes()."""
+    return 16 // lanes(dev, on_gpu)
+
+
+def channel_ranges(
+    dev: Any, height: int, width: int, channels: int
+) -> tuple[tuple[int, int, int], tuple[int, int, int]]:
+    """(work-items, work-group) of a kernel with an item per (LANES channels, x, y) of a feature map
+    (height, width, channels). On GPUs those in step are neighbours in memory.
+    """
+    size = (-(-channels // lanes(dev)), width, height)
+    return size, (1, 16, 4) if dev.is_cpu else (16, 4, 1)
+
+
+def group_ranges(dev: Any, groups: int, members: int) -> tuple[int, int | None]:
+    """(work-items, work-group) of a kernel in which `members` work together, `groups` times; on
+    CPUs one work-item each. A work-group holds groups as a whole.
+    """
+    return (groups, None) if dev.is_cpu else (groups * members, max(members, SMALL_GROUP))
+
+
+def group_items(dev: Any) -> int:
+    """GROUP of kernels (cl/group.h): work-items that sum or scan together; a power of two on GPUs,
+    1 on CPUs. Of kernels that the device runs in fewer, launch_groups() takes less.
+    """
+    if dev.is_cpu:
+        return 1
+    return 1 << min(LARGEST_GROUP, dev.device.max_work_group_size).bit_length() - 1
+
+
+def launch_groups(
+    dev: Any,
+    name: str,
+    kernel: str,
+    groups: int,
+    *,
+    defines: dict[str, int] | None = None,
+    **arguments,
+) -> None:
+    """Launch a kernel of cl/<name>.cl in which GROUP work-items work together, `groups` times. A
+    GPU's compiler may allow fewer of one kernel than the device runs of others.
+
+    defines: of the program, beside GROUP. arguments: by parameter name.
+    """
+    items, defines = group_items(dev), defines or {}
+    program = dev.program(name, GROUP=items, **defines)
+    while items > 1 and items > program.kernels[kernel].largest_group:
+        items //= 2
+        program = dev.program(name, GROUP=items, **defines)
+    program.launch(kernel, groups * items, None if dev.is_cpu else items, **arguments)

@@ -1,13 +1,10 @@
 """Exclusive prefix sums on the device, and the list of the non-zero entries."""
 
-from functools import cached_property
-
 import numpy as np
 from pyopencl.array import Array
 
-from pp_cl.device.buffers import scratch
 from pp_cl.device.device import Device
-from pp_cl.device.form import launch_groups
+from pp_cl.device.launch import launch_groups
 from pp_cl.device.transfer import Reading, read_later
 
 BLOCK = 512  # values that a work-item of a CPU scans
@@ -35,7 +32,7 @@ def _scan(dev, values, offsets, level):
     if blocks > 1:
         block_offset = _block_offsets(dev, "scan_sums", n, blocks, level=level, values=values)
     else:
-        block_offset = scratch(dev, ("scan offset", level), 2, np.uint32)
+        block_offset = _scratch(dev, ("scan offset", level), 2)
         dev.fill(block_offset, 0)
     _launch(
         dev,
@@ -51,11 +48,16 @@ def _scan(dev, values, offsets, level):
 
 def _block_offsets(dev, kernel, n, blocks, *, level, **entries):
     """(blocks + 1,) prefix sums of what the kernel finds in each block of n entries."""
-    block_offset = scratch(dev, ("scan offset", level), blocks + 1, np.uint32)
-    block_sum = scratch(dev, ("scan sum", level), blocks, np.uint32)
+    block_offset = _scratch(dev, ("scan offset", level), blocks + 1)
+    block_sum = _scratch(dev, ("scan sum", level), blocks)
     _launch(dev, kernel, blocks, n=n, b=blocks, block_sum=block_sum, **entries)
     _scan(dev, block_sum, block_offset, level + 1)
     return block_offset
+
+
+def _scratch(dev, name, n):
+    """(n,) uint32, of a power of two: numbers of pairs differ from step to step."""
+    return dev.scratch(name, 1 << (n - 1).bit_length(), np.uint32)[:n]
 
 
 def _launch(dev, kernel, blocks, **arguments):
@@ -63,28 +65,13 @@ def _launch(dev, kernel, blocks, **arguments):
     launch_groups(dev, "device/scan", kernel, blocks, defines=defines, **arguments)
 
 
-class DeviceList:
-    """Indices that the device lists, ascending, and that it knows the number of.
-
-    total: Reading of one number, how many they are.
-    """
-
-    def __init__(self, total: Reading, indices: Array):
-        self._total, self._indices = total, indices
-
-    @cached_property
-    def array(self) -> Array:
-        """(S,) uint32 on the device; waits until their number is known."""
-        return self._indices[: int(self._total.get()[0])]
+def read_total(dev: Device, offsets: Array) -> Reading[int]:
+    """The last entry of `offsets`."""
+    return read_later(dev, offsets, len(offsets) - 1, lambda last: int(last[0]))
 
 
-def read_total(dev: Device, offsets: Array) -> Reading:
-    """The last entry of `offsets`, on its way."""
-    return read_later(dev, offsets, len(offsets) - 1)
-
-
-def nonzero(dev: Device, flags: Array, indices: Array) -> DeviceList:
-    """Where flags are not zero, listed in the front of `indices`.
+def nonzero(dev: Device, flags: Array, indices: Array) -> Reading[Array]:
+    """(S,) uint32 on the device, the front of `indices`: where flags are not zero, ascending.
 
     flags: (N) uint8, N >= 1. indices: (N) uint32.
     """
@@ -101,4 +88,4 @@ def nonzero(dev: Device, flags: Array, indices: Array) -> DeviceList:
         block_offset=block_offset,
         indices=indices,
     )
-    return DeviceList(read_total(dev, block_offset), indices)
+    return read_later(dev, block_offset, blocks, lambda total: indices[: int(total[0])])

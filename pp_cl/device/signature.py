@@ -1,16 +1,16 @@
-"""The signatures of kernels, parsed from their source.
+"""The signatures of kernels, parsed from their source: names, types, and the shapes of buffers.
 
 So they are known on drivers that give no argument info as well; the tests compare them with the
 driver's own (-cl-kernel-arg-info).
 """
 
+import functools
 import re
 from dataclasses import dataclass
 from functools import cached_property
+from types import CodeType
 
 import numpy as np
-
-from pp_cl.device.formula import parse_formula
 
 SCALARS = {
     "char": np.int8,
@@ -34,6 +34,7 @@ _PARAMETER = re.compile(
     r"([a-z]+?)(\d*)\s*(\*?)\s*(?:restrict\s+)?(\w+)$"
 )
 _SHAPE = re.compile(r"^\(([^()]*(?:\([^()]*\)[^()]*)*)\)")
+_FORMULA = re.compile(r"\(*\w+\)*(?: ?[-+*/] ?\(*\w+\)*)*")
 
 
 @dataclass(frozen=True)
@@ -97,9 +98,24 @@ def _parse_parameter(code, comment, where):
         shape = tuple(w.strip() for w in words.group(1).split(",") if w.strip())
         shape = None if shape == ("...",) else shape
         try:
-            [parse_formula(word) for word in shape or () if word != "?"]
+            [compile_formula(word) for word in shape or () if word != "?"]
         except ValueError as error:
             raise ValueError(f"{where}: {name}: {error}") from None
     return Parameter(
         name, space or "", SCALARS[base], int(width or 1), "const" in qualifiers, shape
     )
+
+
+@functools.cache
+def compile_formula(text: str) -> CodeType:
+    """A dimension in a buffer's comment, such as `N+1`, `c1 + c2` or `(H-1)/2`, for eval().
+    co_names are the names in it; the division is one of whole numbers.
+
+    Raises ValueError for what is no formula of integers, names, brackets and + - * /.
+    """
+    try:
+        if not _FORMULA.fullmatch(text):
+            raise SyntaxError
+        return compile(text.replace("/", "//"), text, "eval")
+    except SyntaxError:
+        raise ValueError(f"{text!r} is no formula of integers, names and + - * /") from None

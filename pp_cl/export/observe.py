@@ -10,7 +10,8 @@ from scipy.sparse import csr_array
 from tqdm import tqdm
 
 from pp_cl.files.picture import Picture
-from pp_cl.render import NETWORK_MULTIPLE, ViewWeights
+from pp_cl.raster.weights import record_weights
+from pp_cl.render import RenderResult
 from pp_cl.run import Run
 from pp_cl.scene.camera import Camera
 
@@ -23,7 +24,7 @@ class Observation:
 
     run: Run
     camera: Camera
-    view: ViewWeights
+    view: RenderResult
 
     def picture(self) -> Picture:
         """The view as the run renders it."""
@@ -32,14 +33,13 @@ class Observation:
     def point_weights(self) -> np.ndarray:
         """(N,) float32: each point's blend weights, summed over the pixels."""
         dev, n = self.run.dev, self.run.model.cloud.count
-        weights, looks = dev.zeros((n,)), dev.zeros((n,))
-        self.run.renderer.raise_peaks(self.view, weights, looks)
+        weights, seen = dev.zeros((n,)), dev.zeros((n,))
+        record_weights(dev, self.view.pairs, self.view.weights, weights, seen)
         return weights.get()
 
     def blend_matrix(self) -> csr_array:
         """(HW, N) float32: the blend weight of each point in each pixel y*W + x."""
-        pairs, camera = self.view.pairs, self.camera
-        padded, left, top = camera.padded(NETWORK_MULTIPLE)
+        pairs = self.view.pairs
         entry = self.view.weights.pixel_entry.get()[: pairs.total]
         point = (entry & NO_POINT).astype(np.uint32)
         weight = (entry >> np.uint64(32)).astype(np.uint32).view(np.float32)
@@ -48,10 +48,10 @@ class Observation:
         ends = np.concatenate([[0], np.cumsum(point == NO_POINT)])
         valid = ends[1:] == np.repeat(ends[offset[:-1]], np.diff(offset))
         kept = np.concatenate([[0], np.cumsum(valid)])[offset]
-        shape = padded.height * padded.width, pairs.points
+        shape = pairs.pixels, pairs.points
         matrix = csr_array((weight[valid], point[valid].astype(np.int32), kept), shape=shape)
-        rows = np.arange(padded.height)[top : top + camera.height, None] * padded.width
-        return matrix[(rows + np.arange(left, left + camera.width)).ravel()]
+        pixels = np.arange(pairs.pixels).reshape(self.view.size)
+        return matrix[self.view.cropped(pixels).ravel()]
 
 
 def observe(run: Run, cameras: list[Camera], text: str) -> Iterator[Observation]:
@@ -59,7 +59,7 @@ def observe(run: Run, cameras: list[Camera], text: str) -> Iterator[Observation]
     on a terminal.
     """
     for camera in tqdm(cameras, desc=text, unit="view", leave=False, disable=None):
-        yield Observation(run, camera, run.renderer.blend_weights(camera, run.gamma))
+        yield Observation(run, camera, run.renderer.forward(camera, run.gamma, until="weights"))
 
 
 def directions(positions: np.ndarray, camera: Camera) -> np.ndarray:

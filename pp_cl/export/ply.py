@@ -7,7 +7,7 @@ import plyfile
 
 from pp_cl.export.points import ColouredPoints
 from pp_cl.files.atomic import atomic_file
-from pp_cl.raster.point_cloud import PointCloud
+from pp_cl.raster.points import PointCloud
 
 COMMENTS = (
     "pp-cl: points of a run, world axes and units of its scene",

@@ -27,7 +27,7 @@ from pp_cl.scene.load import (
 )
 from pp_cl.scene.outline import SHOWN_VIEWS, picture
 from pp_cl.scene.views import MASK_THRESHOLD, Photograph, View
-from pp_cl.training.stored import opened_run
+from pp_cl.training.checkpoint import opened_run
 
 Facts = dict[str, Any]
 Given = tuple[str, Any, str]  # a setting: key, value or its text, origin

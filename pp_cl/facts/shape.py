@@ -19,7 +19,7 @@ from pp_cl.scene.demo import demo_mesh
 from pp_cl.scene.grid import Grid, smallest_edge
 from pp_cl.scene.hull import CELL_CAP, build_grid
 from pp_cl.scene.load import DEMO, open_scene, scene_box
-from pp_cl.training.stored import opened_run
+from pp_cl.training.checkpoint import opened_run
 
 DEMO_RESOLUTION = 512  # vertices of the demo's mesh along its longest side
 

@@ -186,8 +186,8 @@ def _refuse_constant(name):
 
 @contextmanager
 def opened_checkpoint(path: Path | str) -> Iterator[Checkpoint]:
-    """The checkpoint, until the block ends. training/stored.py compares it with the settings of its
-    run.
+    """The checkpoint, until the block ends. training/checkpoint.py compares it with its
+    run's settings.
 
     Raises UserError naming the file when it is missing, truncated, corrupt or of another format.
     """

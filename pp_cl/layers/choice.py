@@ -66,51 +66,26 @@ def device_class(dev: Device) -> str:
     return "CPU" if dev.is_cpu else "GPU"
 
 
-@dataclass(frozen=True)
-class Variant:
-    """One way to compute a convolution.
-
-    module: that computes it. errors: {K: {direction: bound on the relative L2 errors that `pp-cl
-    bench conv` measured for K x K layers, of a ReLU's outputs or normal gradients, with up to 512
-    channels and 800 x 800 pixels}}; docs/convolutions.md has hard inputs. devices: classes of
-    devices that it is offered to; the first in VARIANTS of those that a GPU is offered is shipped
-    there. shipped_from: {direction: on CPUs, shipped for images of at least that many pixels}.
-    """
-
-    module: ModuleType
-    errors: dict[int, dict[Direction, float]]
-    devices: tuple[str, ...]
-    shipped_from: dict[Direction, int]
-
-    def can_run(self, k: int, *channels: int) -> bool:
-        """Whether it takes a K x K kernel and these numbers of channels, of each source and of the
-        output.
-        """
-        return k in self.errors and (
-            self.module is not conv_winograd or conv_winograd.fits(*channels)
-        )
-
-
+VARIANTS = {"local": conv_local, "direct": conv_direct, "winograd": conv_winograd}
+# {class of device: the variants that it is offered}. By what GPU compilers say of registers and
+# instructions, "local" is the faster one there, not timed; Winograd's groups would be one lane, and
+# spill 15 KB of registers.
+OFFERED = {"CPU": ("direct", "winograd"), "GPU": ("local", "direct")}
+# {direction: pixels}: on CPUs shipped for images of at least so many. Winograd's is 2.7 times as
+# fast as direct in the paper's network at 256x256, on 2 cores with AVX-512. In smaller images too
+# few tiles share the cost of transforming the weights; channels matter less, from 16 on all gain.
+WINOGRAD_FROM = {FORWARD: 900, INPUT: 900, WEIGHTS: 64}
+# {variant: {K: {direction: bound on the relative L2 errors that `pp-cl bench conv` measured for
+# K x K layers, of a ReLU's outputs or normal gradients, with up to 512 channels and 800 x 800
+# pixels}}}; docs/convolutions.md has hard inputs.
 _DIRECT_ERRORS = {
     3: {FORWARD: 9e-7, INPUT: 1.3e-6, WEIGHTS: 3.5e-7},
     1: {FORWARD: 3.5e-7, INPUT: 4.5e-7, WEIGHTS: 4e-7},
 }
-VARIANTS = {
-    # by what GPU compilers say of its registers and instructions, not timed
-    "local": Variant(conv_local, _DIRECT_ERRORS, ("GPU",), {}),
-    "direct": Variant(
-        conv_direct, _DIRECT_ERRORS, ("CPU", "GPU"), {FORWARD: 0, INPUT: 0, WEIGHTS: 0}
-    ),
-    # 2.7 times as fast as direct in the paper's network at 256x256, on 2 cores with AVX-512. In
-    # smaller images too few tiles share the cost of transforming the weights; channels matter less,
-    # from 16 on all gain. On GPUs a group would be one lane, and their compilers spill 15 KB of its
-    # registers.
-    "winograd": Variant(
-        conv_winograd,
-        {3: {FORWARD: 2.2e-6, INPUT: 2.6e-6, WEIGHTS: 8.5e-7}},
-        ("CPU",),
-        {FORWARD: 900, INPUT: 900, WEIGHTS: 64},
-    ),
+ERRORS = {
+    "local": _DIRECT_ERRORS,
+    "direct": _DIRECT_ERRORS,
+    "winograd": {3: {FORWARD: 2.2e-6, INPUT: 2.6e-6, WEIGHTS: 8.5e-7}},
 }
 
 
@@ -135,26 +110,19 @@ class ConvShape:
         return sum(self.sources) if self.source is None else self.sources[self.source]
 
 
-def offered(device_class: str) -> list[str]:
-    """The names of the variants that are worth trying on a class of devices."""
-    return [name for name, variant in VARIANTS.items() if device_class in variant.devices]
+def can_run(variant: str, k: int, *channels: int) -> bool:
+    """Whether a variant takes a K x K kernel and these numbers of channels, of each source and of
+    the output.
+    """
+    return k in ERRORS[variant] and (variant != "winograd" or conv_winograd.fits(*channels))
 
 
 def shipped_order(device_class: str, shape: ConvShape) -> list[str]:
     """The variants that can run a convolution, the shipped choice first."""
-    names = [
-        name
-        for name in offered(device_class)
-        if VARIANTS[name].can_run(shape.k, *shape.sources, shape.co)
-    ]
-    if device_class != "CPU":
-        return names
-
-    def least_pixels(name):
-        least = VARIANTS[name].shipped_from.get(shape.direction)
-        return -1 if least is None or least > shape.pixels else least
-
-    return sorted(names, key=least_pixels, reverse=True)
+    names = [n for n in OFFERED[device_class] if can_run(n, shape.k, *shape.sources, shape.co)]
+    if "winograd" in names and shape.pixels >= WINOGRAD_FROM[shape.direction]:
+        names.reverse()
+    return names
 
 
 @dataclass(frozen=True, eq=False)  # compared, and used as a key, by identity
@@ -184,17 +152,19 @@ class ConvolutionPolicy:
         tolerance.
 
         Times and errors are those measured for these channels at the nearest number of pixels, at
-        most LARGEST_RATIO times more or less. Where there are none, the errors are the
-        registry's, and the first variant of shipped_order() that is exact enough is taken.
+        most LARGEST_RATIO times more or less. Where there are none, the errors are
+        ERRORS, and the first variant of shipped_order() that is exact enough is taken.
         """
         if self.variant != AUTO:
-            can_run = VARIANTS[self.variant].can_run(shape.k, *shape.sources, shape.co)
-            return self.variant if can_run else "direct"
+            takes = can_run(self.variant, shape.k, *shape.sources, shape.co)
+            return self.variant if takes else "direct"
         order = shipped_order(self.device_class, shape)
         if self.tolerance is None:
             return order[0]
         row = nearest_row(self._rows, shape) or {"ms": {}, "rel_l2": {}}
-        errors = {name: row["rel_l2"].get(name, _shipped_error(name, shape)) for name in order}
+        errors = {
+            name: row["rel_l2"].get(name, ERRORS[name][shape.k][shape.direction]) for name in order
+        }
         exact = [name for name in order if errors[name] <= self.tolerance]
         if not exact:
             best = min(order, key=errors.get)
@@ -213,7 +183,7 @@ class ConvolutionPolicy:
 
     def convolution(self, shape: ConvShape) -> ModuleType:
         """The module that computes a convolution. Raises UserError as choose()."""
-        return VARIANTS[self.choose(shape)].module
+        return VARIANTS[self.choose(shape)]
 
     @property
     def _rows(self):
@@ -230,10 +200,6 @@ def _up(value):
     """`value` rounded up to two significant digits."""
     digit = 10.0 ** (math.floor(math.log10(value)) - 1) if value > 0 else 1.0
     return math.ceil(value / digit) * digit
-
-
-def _shipped_error(name, shape):
-    return VARIANTS[name].errors[shape.k][shape.direction]
 
 
 def make_policy(
@@ -351,19 +317,14 @@ def read_tuning(dev: Device) -> dict:
         tuning = json.loads(read_regular(tuning_file(dev), MOST_BYTES))
     except RecursionError:
         raise ValueError("lists within lists") from None
-    check_tuning(tuning, dev)
-    return tuning | {"tile_shapes": stored_blocking(tuning)}
-
-
-def check_tuning(tuning: dict, dev: Device) -> None:
-    """Raise ValueError with the reason unless `tuning` was measured on this device as it is."""
     check_form(tuning)
     check_blocking(tuning, dev)
     for name, value in device_key(dev).items():
-        if tuning["device"][name] != value:
-            found = tuning["device"][name]
+        found = tuning["device"][name]
+        if found != value:
             found = shown(found) if isinstance(found, str) else quoted(found)
             raise ValueError(f"measured with {name} {found}, here it is {value}")
+    return tuning | {"tile_shapes": stored_blocking(tuning)}
 
 
 def check_blocking(tuning: dict, dev: Device) -> None:

@@ -1,9 +1,10 @@
 """What the three ways to compute a convolution share: how weights are laid out, how work is cut,
-memory to work in, and checks.
+and checks.
 
-conv_direct.py, conv_winograd.py and conv_local.py have the same five functions: work_floats,
-lay_out, forward, backward_input and backward_weights. All are convolutions K x K (K = 1 or 3) of
-stride 1 with zero padding K // 2; choice.py says which of them computes one.
+conv_direct.py, conv_winograd.py and conv_local.py have the same five functions: scratch_floats,
+lay_out, forward, backward_input and backward_weights, which conv_direct.py describes. All are
+convolutions K x K (K = 1 or 3) of stride 1 with zero padding K // 2; choice.py says which of them
+computes one.
 """
 
 from dataclasses import dataclass
@@ -13,10 +14,8 @@ import numpy as np
 from pyopencl.array import Array
 
 from pp_cl.device.device import Device
-from pp_cl.device.form import lanes, row_parts
-from pp_cl.layers.tiles import LANES
-
-COUNTERS = LANES  # floats at the start of a scratch: counters of cl/layers/winograd.h
+from pp_cl.device.launch import lanes, row_parts
+from pp_cl.layers.tiles import VECTOR
 
 
 class Direction(Enum):
@@ -55,53 +54,23 @@ class Blocking:
     winograd_weights: int = 32
 
 
-@dataclass
-class Work:
-    """Device memory for convolutions to work in; several may share one, one after the other.
-
-    scratch: float32, at least as many floats as the largest convolution needs. The first COUNTERS
-    are 0 between kernels; only Winograd's use it. weights: float32, weights flipped or transformed
-    for a kernel, or the parts of their gradients.
-    """
-
-    scratch: Array
-    weights: Array
-
-    @classmethod
-    def empty(cls, dev: Device, scratch: int = COUNTERS, weights: int = 1) -> "Work":
-        """Room for that many floats, at least COUNTERS and one."""
-        work = cls(dev.empty(0), dev.empty(0))
-        work.grow(dev, max(COUNTERS, scratch), max(1, weights))
-        return work
-
-    def grow(self, dev: Device, scratch: int, weights: int) -> None:
-        """Make room for that many floats, if there is less."""
-        if self.scratch.size < scratch:
-            self.scratch = None  # frees the old array before allocating
-            self.scratch = dev.empty(scratch)
-            dev.fill(self.scratch[:COUNTERS], 0)
-        if self.weights.size < weights:
-            self.weights = None
-            self.weights = dev.empty(weights)
-
-
 def pack_weights(weight: np.ndarray, dtype: type = np.float32) -> np.ndarray:
     """(CO, CI, K, K) -> (ceil(CO / 16), K, K, CI, 16), output channels beyond CO zero."""
     co, ci, k, _ = weight.shape
-    packed = np.zeros((-(-co // LANES) * LANES, ci, k, k), dtype)
+    packed = np.zeros((-(-co // VECTOR) * VECTOR, ci, k, k), dtype)
     packed[:co] = weight
-    return np.ascontiguousarray(packed.reshape(-1, LANES, ci, k, k).transpose(0, 3, 4, 2, 1))
+    return np.ascontiguousarray(packed.reshape(-1, VECTOR, ci, k, k).transpose(0, 3, 4, 2, 1))
 
 
 def unpack_weights(packed: np.ndarray, co: int) -> np.ndarray:
     """The inverse of pack_weights: (CO, CI, K, K)."""
     blocks, k, _, ci, _ = packed.shape
-    return packed.transpose(0, 4, 3, 1, 2).reshape(blocks * LANES, ci, k, k)[:co]
+    return packed.transpose(0, 4, 3, 1, 2).reshape(blocks * VECTOR, ci, k, k)[:co]
 
 
 def pack_bias(bias: np.ndarray, dtype: type = np.float32) -> np.ndarray:
     """(CO,) -> (ceil(CO / 16) * 16,), padded with zeros."""
-    return np.pad(np.asarray(bias, dtype), (0, -len(bias) % LANES))
+    return np.pad(np.asarray(bias, dtype), (0, -len(bias) % VECTOR))
 
 
 def check_weights(sources: tuple[Array, ...], weight: Array, bias: Array, out: Array) -> None:
@@ -110,19 +79,13 @@ def check_weights(sources: tuple[Array, ...], weight: Array, bias: Array, out: A
     CO).
     """
     co, channels = out.shape[2], [source.shape[2] for source in sources]
-    blocks = -(-co // LANES)
-    expected = blocks, sum(channels), (blocks * LANES,)
+    blocks = -(-co // VECTOR)
+    expected = blocks, sum(channels), (blocks * VECTOR,)
     if (weight.shape[0], weight.shape[3], bias.shape) != expected:
         raise ValueError(
             f"convolution of {' + '.join(map(str, channels))} to {co} channels: weight is"
             f" {weight.shape}, bias {bias.shape}"
         )
-
-
-def check_size(what: str, array: Array, floats: int) -> None:
-    """Raise ValueError if an array is too small."""
-    if array.size < floats:
-        raise ValueError(f"convolution: {what} of {array.size} floats, needs {floats}")
 
 
 def sum_parts(

@@ -5,8 +5,8 @@ import math
 from pyopencl.array import Array
 
 from pp_cl.device.device import Device
-from pp_cl.layers.conv import Blocking, Direction, Work, check_size, check_weights, sum_parts
-from pp_cl.layers.tiles import LANES, SIDE, Tiles, checked_tiles
+from pp_cl.layers.conv import Blocking, Direction, check_weights, sum_parts
+from pp_cl.layers.tiles import SIDE, VECTOR, Tiles, checked_tiles
 
 # Rows of the image that one work-item sums for the gradient of the weights: few enough to stay in a
 # core's cache, and enough parts for all cores.
@@ -15,23 +15,28 @@ ROWS_PER_PART = 8
 PARTIAL_FLOATS = 1 << 24
 
 
-def work_floats(
+# Names of the memory that convolutions share (Device.scratch()).
+FLIPPED, PARTIAL = "flipped weights", "parts of the weights' gradients"
+
+
+def scratch_floats(
     _dev: Device,
     _blocking: Blocking,
     direction: Direction,
     height: int,
     weight_shape: tuple,
     c: int,
-) -> tuple[int, int]:
-    """(floats of Work.scratch, floats of Work.weights) for an image `height` high.
+) -> dict[str, int]:
+    """{name of Device.scratch(): floats} for an image `height` high.
 
     weight_shape: (ceil(CO/16), K, K, CI, 16); c: input channels, of a gradient of the input those
     of the one source.
     """
     if direction is Direction.BACKWARD_WEIGHTS:
-        return 0, partial_floats(height, weight_shape)
-    flipped = math.prod(_flipped_shape(weight_shape, c, weight_shape[0] * LANES))
-    return 0, flipped if direction is Direction.BACKWARD_INPUT else 0
+        return {PARTIAL: partial_floats(height, weight_shape)}
+    if direction is Direction.BACKWARD_INPUT:
+        return {FLIPPED: math.prod(_flipped_shape(weight_shape, c, weight_shape[0] * VECTOR))}
+    return {}
 
 
 def lay_out(_dev: Device, _blocking: Blocking, _weight: Array) -> None:
@@ -47,16 +52,15 @@ def forward(
     out: Array,
     *,
     relu: bool,
-    work: Work,
     tiles: Tiles | None = None,
     laid_out: Array | None = None,
 ) -> None:
     """out = convolution of the sources' concatenation + bias, then max(., 0) if relu.
 
     sources: one or two of (H, W, C1), (H, W, C2); weight: (ceil(CO/16), K, K, C1 + C2, 16); bias:
-    (ceil(CO/16) * 16,); out: (H, W, CO), all float32; work: at least work_floats(); tiles: those of
-    out to compute, None = all; laid_out: lay_out(weight), None = computed here if it is needed.
-    Raises ValueError when shapes do not fit together.
+    (ceil(CO/16) * 16,); out: (H, W, CO), all float32; tiles: those of out to compute, None = all;
+    laid_out: lay_out(weight), None = computed here if it is needed. Raises ValueError when shapes
+    do not fit together.
     """
     height, width, co = out.shape
     check_weights(sources, weight, bias, out)
@@ -93,7 +97,6 @@ def backward_input(
     grad_x: Array,
     *,
     mask: Array | None,
-    work: Work,
     tiles: Tiles | None = None,
 ) -> None:
     """grad_x = gradient of a convolution's input, 0 where mask <= 0.
@@ -104,7 +107,7 @@ def backward_input(
     compute, None = all. Raises ValueError when shapes do not fit together.
     """
     height, width, c = grad_x.shape
-    flipped = flip_weights(dev, blocking, weight, first, c, grad_out.shape[2], work)
+    flipped = flip_weights(dev, blocking, weight, first, c, grad_out.shape[2])
     tiles = checked_tiles(dev, tiles, height, width)
     program, size, work_group = _program(dev, blocking, flipped.shape[1], grad_x.shape)
     program.launch(
@@ -134,7 +137,6 @@ def backward_weights(
     grad_weight: Array,
     grad_bias: Array,
     *,
-    work: Work,
     tiles: Tiles | None = None,
 ) -> None:
     """Overwrite grad_weight and grad_bias, shaped as forward()'s, with the gradients of forward(
@@ -146,9 +148,9 @@ def backward_weights(
     height, width, co = grad_out.shape
     blocks, k, _, ci, _ = grad_weight.shape
     check_weights(sources, grad_weight, grad_bias, grad_out)
-    check_size("parts", work.weights, partial_floats(height, grad_weight.shape))
+    partial = dev.scratch(PARTIAL, partial_floats(height, grad_weight.shape))
     tiles = checked_tiles(dev, tiles, height, width)
-    parts, rows = _parts(height, grad_weight.shape)
+    parts, rows = image_parts(height, grad_weight.shape)
     first = 0
     for source in sources:
         c = source.shape[2]
@@ -169,29 +171,28 @@ def backward_weights(
             x=source,
             grad_out=grad_out,
             tile_count=tiles.count,
-            partial=work.weights,
+            partial=partial,
         )
         first += c
-    sum_parts(dev, work.weights, grad_weight, grad_bias, parts=parts)
+    sum_parts(dev, partial, grad_weight, grad_bias, parts=parts)
 
 
 def flip_weights(
-    dev: Device, blocking: Blocking, weight: Array, first: int, c: int, co: int, work: Work
+    dev: Device, blocking: Blocking, weight: Array, first: int, c: int, co: int
 ) -> Array:
-    """(ceil(c/16), K, K, co, 16) in work.weights: the weights with the kernel mirrored and the
-    roles of input and output channels exchanged.
+    """(ceil(c/16), K, K, co, 16) in scratch: the weights with the kernel mirrored and the roles of
+    input and output channels exchanged.
 
     weight: (ceil(CO/16), K, K, CI, 16); c: input channels taken from `first` on, CI - first or
     less, a multiple of 16 unless they reach CI.
     """
     k, ci = weight.shape[1], weight.shape[3]
     shape = _flipped_shape(weight.shape, c, co)
-    check_size("flipped weights", work.weights, math.prod(shape))
-    flipped = work.weights[: math.prod(shape)].reshape(shape)
+    flipped = dev.scratch(FLIPPED, math.prod(shape))[: math.prod(shape)].reshape(shape)
     _weights_program(dev, blocking, k, ci)[0].launch(
         "conv_flip_weights",
         (co, k * k, shape[0]),
-        c=min(ci - first, shape[0] * LANES),
+        c=min(ci - first, shape[0] * VECTOR),
         co=co,
         first=first,
         ci=ci,
@@ -206,39 +207,34 @@ def fitting(blocking: Blocking, width: int, channels: int) -> tuple[int, int, tu
     computes groups or a row in vain.
     """
     pixels, groups, work_group = blocking.direct
-    if -(-channels // LANES) % groups:
+    if -(-channels // VECTOR) % groups:
         pixels, groups, work_group = blocking.direct_odd
     return next(p for p in (pixels, 8, 4, 1) if p <= width), groups, work_group
 
 
 def partial_floats(height: int, weight_shape: tuple) -> int:
-    """Floats of Work.weights that backward_weights() needs for an image `height` high."""
+    """Floats of PARTIAL that backward_weights() needs for an image `height` high."""
     blocks, k, _, ci, _ = weight_shape
-    return most_parts(height, weight_shape) * blocks * (k * k * ci + 1) * LANES
+    return image_parts(height, weight_shape)[0] * blocks * (k * k * ci + 1) * VECTOR
 
 
-def most_parts(height: int, weight_shape: tuple) -> int:
-    """Into how many parts the sum over an image `height` high is cut."""
-    return _parts(height, weight_shape)[0]
-
-
-def _parts(height, weight_shape):
-    """(parts, rows of each) of the sum over an image."""
+def image_parts(height: int, weight_shape: tuple) -> tuple[int, int]:
+    """(parts, rows of each) into which the sum over an image `height` high is cut."""
     blocks, k, _, ci, _ = weight_shape
-    limit = max(1, PARTIAL_FLOATS // (blocks * (k * k * ci + 1) * LANES))
+    limit = max(1, PARTIAL_FLOATS // (blocks * (k * k * ci + 1) * VECTOR))
     rows = max(ROWS_PER_PART, -(-height // limit))
     return -(-height // rows), rows
 
 
 def _flipped_shape(weight_shape, c, co):
-    return -(-c // LANES), *weight_shape[1:3], co, LANES
+    return -(-c // VECTOR), *weight_shape[1:3], co, VECTOR
 
 
 def _program(dev, blocking, k, shape):
     """(program, global size, work-group) for a result of shape (H, W, C)."""
     height, width, channels = shape
     pixels, groups, work_group = fitting(blocking, width, channels)
-    size = (-(-width // pixels), height, -(-channels // (LANES * groups)))
+    size = (-(-width // pixels), height, -(-channels // (VECTOR * groups)))
     return dev.program("layers/conv", KERNEL_SIZE=k, PIXELS=pixels, BLOCKS=groups), size, work_group
 
 

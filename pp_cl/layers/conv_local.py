@@ -1,5 +1,5 @@
 """Direct convolutions for GPUs: a work-group shares inputs and weights in local memory, and
-computes tiles of a list. Any channels, 1x1 and 3x3; weights and work memory are conv_direct's.
+computes tiles of a list. Any channels, 1x1 and 3x3; weights and scratch are conv_direct's.
 """
 
 import math
@@ -7,17 +7,18 @@ import math
 from pyopencl.array import Array
 
 from pp_cl.device.device import Device
-from pp_cl.layers.conv import Blocking, Work, check_size, check_weights, sum_parts
+from pp_cl.layers.conv import Blocking, check_weights, sum_parts
 from pp_cl.layers.conv_direct import (
+    PARTIAL,
     flip_weights,
+    image_parts,
     lay_out,
-    most_parts,
     partial_floats,
-    work_floats,
+    scratch_floats,
 )
-from pp_cl.layers.tiles import LANES, SIDE, Tiles, checked_tiles
+from pp_cl.layers.tiles import SIDE, VECTOR, Tiles, checked_tiles
 
-__all__ = ["backward_input", "backward_weights", "forward", "lay_out", "work_floats"]
+__all__ = ["backward_input", "backward_weights", "forward", "lay_out", "scratch_floats"]
 
 QUAD = 4  # channels of a work-item
 # Pixels of a work-item: two lines of a tile, ROWS in cl/layers/conv_local.cl.
@@ -42,11 +43,10 @@ def forward(
     out: Array,
     *,
     relu: bool,
-    work: Work,
     tiles: Tiles | None = None,
     laid_out: Array | None = None,
 ) -> None:
-    """As conv_direct.forward."""
+    """See conv_direct.forward."""
     height, width, co = out.shape
     check_weights(sources, weight, bias, out)
     channels = [source.shape[2] for source in sources]
@@ -81,13 +81,12 @@ def backward_input(
     grad_x: Array,
     *,
     mask: Array | None,
-    work: Work,
     tiles: Tiles | None = None,
 ) -> None:
-    """As conv_direct.backward_input."""
+    """See conv_direct.backward_input."""
     height, width, c = grad_x.shape
     co = grad_out.shape[2]
-    flipped = flip_weights(dev, blocking, weight, first, c, co, work)
+    flipped = flip_weights(dev, blocking, weight, first, c, co)
     tiles = checked_tiles(dev, tiles, height, width)
     program, size, work_group = _program(
         dev, "conv_local_backward_input", flipped.shape[1], tiles, c, [co]
@@ -116,18 +115,17 @@ def backward_weights(
     grad_weight: Array,
     grad_bias: Array,
     *,
-    work: Work,
     tiles: Tiles | None = None,
 ) -> None:
-    """As conv_direct.backward_weights. The order of the sums depends on the shapes and the number
+    """See conv_direct.backward_weights. The order of the sums depends on the shapes and the number
     of tiles alone.
     """
     height, width, co = grad_out.shape
     blocks, k, _, ci, _ = grad_weight.shape
     check_weights(sources, grad_weight, grad_bias, grad_out)
-    check_size("parts", work.weights, partial_floats(height, grad_weight.shape))
+    partial = dev.scratch(PARTIAL, partial_floats(height, grad_weight.shape))
     tiles = checked_tiles(dev, tiles, height, width)
-    run = max(SUMMED, -(-tiles.number // most_parts(height, grad_weight.shape)))
+    run = max(SUMMED, -(-tiles.number // image_parts(height, grad_weight.shape)[0]))
     parts = -(-tiles.number // run)
     first = 0
     for source in sources:
@@ -148,12 +146,12 @@ def backward_weights(
             grad_out=grad_out,
             tile_list=tiles.list,
             tile_count=tiles.count,
-            partial=work.weights,
+            partial=partial,
         )
         first += c
     program.launch(
         "conv_local_backward_bias",
-        (blocks * LANES, parts),
+        (blocks * VECTOR, parts),
         per_block=k * k * ci,
         parts=parts,
         co=co,
@@ -161,9 +159,9 @@ def backward_weights(
         grad_out=grad_out,
         tile_list=tiles.list,
         tile_count=tiles.count,
-        partial=work.weights,
+        partial=partial,
     )
-    sum_parts(dev, work.weights, grad_weight, grad_bias, parts=parts)
+    sum_parts(dev, partial, grad_weight, grad_bias, parts=parts)
 
 
 def _is_aligned(*channels):
@@ -175,8 +173,8 @@ def quads(channels: int, aligned: bool) -> int:
     """Groups of four of the output channels that a work-group computes: 16, 8 or 4, so that nothing
     is computed in vain. Channels that are not aligned are few.
     """
-    blocks = -(-channels // LANES)
-    return LANES // QUAD * (math.gcd(blocks, 4) if aligned else 1)
+    blocks = -(-channels // VECTOR)
+    return VECTOR // QUAD * (math.gcd(blocks, 4) if aligned else 1)
 
 
 def _program(dev, kernel, k, tiles, channels, inputs):

@@ -5,16 +5,9 @@ than the direct ones, at two or three times the error. Channels come in multiple
 from pyopencl.array import Array
 
 from pp_cl.device.device import Device
-from pp_cl.layers.conv import (
-    COUNTERS,
-    Blocking,
-    Direction,
-    Work,
-    check_size,
-    check_weights,
-    sum_parts,
-)
-from pp_cl.layers.tiles import LANES, SIDE, Tiles, checked_tiles
+from pp_cl.layers.conv import Blocking, Direction, check_weights, sum_parts
+from pp_cl.layers.conv_direct import PARTIAL
+from pp_cl.layers.tiles import SIDE, VECTOR, Tiles, checked_tiles
 
 POSITIONS = (SIDE + 2) ** 2  # values of a transformed tile
 # Weights of at most so many channels in times channels out are narrow: transformed they take 2.25
@@ -28,39 +21,46 @@ CI_PART, CO_PART = 128, 128
 # The tiles are cut in their place, into 2, 4, 8 or 16 parts of LEAST_TILES or more.
 NARROW_SUMS = 64 * 128
 LEAST_TILES, MOST_PARTS = 80, 16
+# Names of the memory that convolutions share (Device.scratch()).
+SLICES, TRANSFORMED = "Winograd: slices of the compute units", "Winograd: transformed weights"
+COUNTERS = VECTOR  # floats at the front of SLICES, 0 between kernels (cl/layers/winograd.h)
 
 
 def fits(*channels: int) -> bool:
     """Whether these numbers of channels are multiples of 16."""
-    return all(c and c % LANES == 0 for c in channels)
+    return all(c and c % VECTOR == 0 for c in channels)
 
 
-def work_floats(
+def scratch_floats(
     dev: Device,
     blocking: Blocking,
     direction: Direction,
-    height: int,
+    _height: int,
     weight_shape: tuple,
     c: int,
-) -> tuple[int, int]:
-    """As conv_direct.work_floats."""
+) -> dict[str, int]:
+    """See conv_direct.scratch_floats."""
+    blocks, _, _, ci, _ = weight_shape
+    co = blocks * VECTOR
     if direction is Direction.BACKWARD_WEIGHTS:
-        return _weights_gradient_floats(dev, blocking, weight_shape)
-    co = weight_shape[0] * LANES
-    return _scratch_floats(dev, blocking, c, co), transformed_floats(c, co)
+        return {
+            SLICES: _gradient_slices(dev, blocking, ci, co),
+            PARTIAL: _partial_floats(ci, co),
+        }
+    return {SLICES: _slices(dev, blocking, c, co), TRANSFORMED: transformed_floats(c, co)}
 
 
 def transformed_floats(ci: int, co: int) -> int:
     """Floats of the transformed weights of ci to co channels, as cl/layers/winograd.h lays them
     out.
     """
-    return POSITIONS * (ci * co + LANES)
+    return POSITIONS * (ci * co + VECTOR)
 
 
 def lay_out(dev: Device, _blocking: Blocking, weight: Array) -> Array:
     """The weights (CO/16, 3, 3, CI, 16) transformed, in a new array."""
     blocks, _, _, ci, _ = weight.shape
-    laid_out = dev.empty(transformed_floats(ci, blocks * LANES))
+    laid_out = dev.empty(transformed_floats(ci, blocks * VECTOR))
     _transform(dev, weight, laid_out)
     return laid_out
 
@@ -74,19 +74,17 @@ def forward(
     out: Array,
     *,
     relu: bool,
-    work: Work,
     tiles: Tiles | None = None,
     laid_out: Array | None = None,
 ) -> None:
-    """As conv_direct.forward. The result does not depend on the number of compute units."""
+    """See conv_direct.forward. The result does not depend on the number of compute units."""
     height, width, co = out.shape
     channels = [source.shape[2] for source in sources]
     _check_channels(*channels, co)
     check_weights(sources, weight, bias, out)
     if laid_out is None:
-        _transform(dev, weight, work.weights)
-        laid_out = work.weights
-    check_size("scratch", work.scratch, _scratch_floats(dev, blocking, sum(channels), co))
+        laid_out = dev.scratch(TRANSFORMED, transformed_floats(sum(channels), co))
+        _transform(dev, weight, laid_out)
     tiles = checked_tiles(dev, tiles, height, width)
     _program(dev, blocking, sum(channels), co).launch(
         "winograd_forward",
@@ -102,7 +100,7 @@ def forward(
         bias=bias,
         tile_list=tiles.list,
         out=out,
-        scratch=work.scratch,
+        scratch=dev.scratch(SLICES, _slices(dev, blocking, sum(channels), co), zeros=COUNTERS),
     )
 
 
@@ -115,15 +113,14 @@ def backward_input(
     grad_x: Array,
     *,
     mask: Array | None,
-    work: Work,
     tiles: Tiles | None = None,
 ) -> None:
-    """As conv_direct.backward_input."""
+    """See conv_direct.backward_input."""
     height, width, c = grad_x.shape
     co = grad_out.shape[2]
     _check_channels(c, co)
-    _transform_flipped(dev, weight, first, c, work.weights)
-    check_size("scratch", work.scratch, _scratch_floats(dev, blocking, co, c))
+    flipped = dev.scratch(TRANSFORMED, transformed_floats(co, c))
+    _transform_flipped(dev, weight, first, c, flipped)
     tiles = checked_tiles(dev, tiles, height, width)
     _program(dev, blocking, co, c).launch(
         "winograd_backward_input",
@@ -133,11 +130,11 @@ def backward_input(
         co=co,
         masked=mask is not None,
         x=grad_x if mask is None else mask,
-        flipped=work.weights,
+        flipped=flipped,
         grad_out=grad_out,
         tile_list=tiles.list,
         grad_x=grad_x,
-        scratch=work.scratch,
+        scratch=dev.scratch(SLICES, _slices(dev, blocking, co, c), zeros=COUNTERS),
     )
 
 
@@ -149,23 +146,21 @@ def backward_weights(
     grad_weight: Array,
     grad_bias: Array,
     *,
-    work: Work,
     tiles: Tiles | None = None,
 ) -> None:
-    """As conv_direct.backward_weights. The order of the sums depends on the shapes and the number
+    """See conv_direct.backward_weights. The order of the sums depends on the shapes and the number
     of tiles alone.
     """
     height, width, co = grad_out.shape
     channels = [source.shape[2] for source in sources]
     _check_channels(*channels, co)
     check_weights(sources, grad_weight, grad_bias, grad_out)
-    needed = _weights_gradient_floats(dev, blocking, grad_weight.shape)
-    check_size("scratch", work.scratch, needed[0])
-    check_size("parts", work.weights, needed[1])
+    ci = sum(channels)
     tiles = checked_tiles(dev, tiles, height, width)
-    tile_parts = _tile_parts(tiles.number, sum(channels), co)
-    ci_part = sum(channels) if tile_parts > 1 else _ci_part(dev, sum(channels), co)
-    parts = tile_parts * -(-sum(channels) // ci_part) * -(-co // CO_PART)
+    tile_parts = _tile_parts(tiles.number, ci, co)
+    ci_part = ci if tile_parts > 1 else _ci_part(dev, ci, co)
+    parts = tile_parts * -(-ci // ci_part) * -(-co // CO_PART)
+    partial = dev.scratch(PARTIAL, _partial_floats(ci, co))
     dev.program(
         "layers/winograd_backward_weights",
         TILES=blocking.winograd_weights,
@@ -185,20 +180,19 @@ def backward_weights(
         grad_out=grad_out,
         tile_list=tiles.list,
         tile_count=tiles.count,
-        partial=work.weights,
-        scratch=work.scratch,
+        partial=partial,
+        scratch=dev.scratch(SLICES, _gradient_slices(dev, blocking, ci, co), zeros=COUNTERS),
     )
-    sum_parts(dev, work.weights, grad_weight, grad_bias, parts=tile_parts)
+    sum_parts(dev, partial, grad_weight, grad_bias, parts=tile_parts)
 
 
 def _transform(dev, weight, transformed):
     """Fill transformed from weight (CO/16, 3, 3, CI, 16) for the forward pass."""
     blocks, _, _, ci, _ = weight.shape
-    check_size("transformed weights", transformed, transformed_floats(ci, blocks * LANES))
     dev.program("layers/winograd_transform").launch(
         "winograd_transform_weights",
         (ci, blocks),
-        local=(LANES, 1),
+        local=(VECTOR, 1),
         ci=ci,
         blocks=blocks,
         weight=weight,
@@ -209,16 +203,15 @@ def _transform(dev, weight, transformed):
 def _transform_flipped(dev, weight, first, c, transformed):
     """Fill transformed for the gradient of the c input channels from `first` on."""
     blocks, _, _, ci, _ = weight.shape
-    co = blocks * LANES
-    if first % LANES or first + c > ci:
+    co = blocks * VECTOR
+    if first % VECTOR or first + c > ci:
         raise ValueError(f"Winograd input gradient of {c} channels from {first} on, of {ci}")
-    check_size("transformed weights", transformed, transformed_floats(co, c))
     dev.program("layers/winograd_transform").launch(
         "winograd_transform_flipped_weights",
-        (co, c // LANES),
-        local=(LANES, 1),
+        (co, c // VECTOR),
+        local=(VECTOR, 1),
         co=co,
-        blocks=c // LANES,
+        blocks=c // VECTOR,
         first=first,
         ci=ci,
         weight=weight,
@@ -233,36 +226,38 @@ def _check_channels(*channels):
         )
 
 
-def _tiles_and_group(blocking, ci, co):
-    """(tiles transformed at a time, tiles multiplied together)."""
+def _tiles_at_once(blocking, ci, co):
+    """Tiles (transformed, multiplied together) at a time."""
     return blocking.winograd_narrow if ci * co <= NARROW else blocking.winograd
 
 
-def _scratch_floats(dev, blocking, ci, co):
-    """Floats of Work.scratch of a convolution of ci to co channels, or of its input gradient."""
-    vectors = (ci + co) * _tiles_and_group(blocking, ci, co)[0] + 3 * LANES
-    return COUNTERS + dev.info["compute_units"] * POSITIONS * vectors
-
-
 def _program(dev, blocking, ci, co):
-    tiles, group = _tiles_and_group(blocking, ci, co)
-    return dev.program("layers/winograd", TILES=tiles, GROUP=group, BLOCKS=_paired_blocks(co))
+    tiles, together = _tiles_at_once(blocking, ci, co)
+    return dev.program("layers/winograd", TILES=tiles, TOGETHER=together, BLOCKS=_paired_blocks(co))
 
 
 def _paired_blocks(channels):
     """Groups of 16 output channels that are multiplied together."""
-    return 1 if channels // LANES % 2 else 2
+    return 1 if channels // VECTOR % 2 else 2
 
 
-def _weights_gradient_floats(dev, blocking, weight_shape):
-    """Floats of (Work.scratch, Work.weights) for backward_weights()."""
-    blocks, _, _, ci, _ = weight_shape
-    ci_part, co_part = min(CI_PART, ci), min(CO_PART, blocks * LANES)
-    values = (ci_part + co_part) // LANES * blocking.winograd_weights
-    vectors = POSITIONS * (values + 3 + ci_part * co_part // LANES) + co_part // LANES
-    parts = MOST_PARTS if _is_narrow(ci, blocks * LANES) else 1
-    scratch = COUNTERS + dev.info["compute_units"] * vectors * LANES
-    return scratch, parts * blocks * (9 * ci + 1) * LANES
+def _slices(dev, blocking, ci, co):
+    """Floats of SLICES for a convolution of ci to co channels, or for its input gradient."""
+    vectors = (ci + co) * _tiles_at_once(blocking, ci, co)[0] + 3 * VECTOR
+    return COUNTERS + dev.info["compute_units"] * POSITIONS * vectors
+
+
+def _gradient_slices(dev, blocking, ci, co):
+    """Floats of SLICES for backward_weights()."""
+    ci_part, co_part = min(CI_PART, ci), min(CO_PART, co)
+    values = (ci_part + co_part) // VECTOR * blocking.winograd_weights
+    vectors = POSITIONS * (values + 3 + ci_part * co_part // VECTOR) + co_part // VECTOR
+    return COUNTERS + dev.info["compute_units"] * vectors * VECTOR
+
+
+def _partial_floats(ci, co):
+    """Floats of PARTIAL for backward_weights()."""
+    return (MOST_PARTS if _is_narrow(ci, co) else 1) * (9 * ci + 1) * co
 
 
 def _is_narrow(ci, co):
@@ -282,4 +277,4 @@ def _ci_part(dev, ci, co):
     gets a part.
     """
     wanted = -(-dev.info["compute_units"] // -(-co // CO_PART))
-    return min(CI_PART, max(1, ci // (LANES * wanted)) * LANES)
+    return min(CI_PART, max(1, ci // (VECTOR * wanted)) * VECTOR)

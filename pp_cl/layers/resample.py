@@ -6,7 +6,7 @@ tiles: those of the result to compute, None = all.
 from pyopencl.array import Array
 
 from pp_cl.device.device import Device
-from pp_cl.device.form import channel_ranges, lanes
+from pp_cl.device.launch import channel_ranges, lanes
 from pp_cl.layers.tiles import Tiles, checked_tiles
 
 

@@ -10,12 +10,12 @@ from dataclasses import dataclass
 import numpy as np
 from pyopencl.array import Array
 
-from pp_cl.device.buffers import Table, scratch
+from pp_cl.device.buffers import Table
 from pp_cl.device.device import Device
-from pp_cl.device.form import channel_ranges, lanes
+from pp_cl.device.launch import channel_ranges, lanes
 from pp_cl.device.transfer import Reading, read_later
 
-LANES = 16  # channels in one float16
+VECTOR = 16  # channels in one float16
 # pixels: the outputs of F(4x4, 3x3), and one pixel after the network has halved its input twice
 SIDE = 4
 
@@ -79,27 +79,17 @@ def checked_tiles(dev: Device, tiles: Tiles | None, height: int, width: int) -> 
     return tiles
 
 
-@dataclass(frozen=True)
-class TileFlags:
-    """What is true of which tiles, as the device finds out."""
-
-    shape: tuple[int, int]
-    reading: Reading
-
-    def get(self) -> np.ndarray:
-        """(rows, columns) bool; waits until it is known."""
-        return self.reading.get().reshape(self.shape) != 0
-
-
-def tiles_find(dev: Device, x: Array, background: float) -> TileFlags:
-    """The tiles of x (H, W, C) float32 in which some value is not `background`."""
+def tiles_find(dev: Device, x: Array, background: float) -> Reading[np.ndarray]:
+    """(rows, columns) bool: the tiles of x (H, W, C) float32 in which some value is not
+    `background`.
+    """
     h, w, c = x.shape
     return _flags(dev, "tiles_find", (h, w), c=c, background=background, x=x)
 
 
-def tiles_hit(dev: Device, pixel_offset: Array, size: tuple[int, int]) -> TileFlags:
-    """The tiles of an image of size (height, width) in which some pixel has hits, by its
-    Pairs.pixel_offset (HW+1,) uint32.
+def tiles_hit(dev: Device, pixel_offset: Array, size: tuple[int, int]) -> Reading[np.ndarray]:
+    """(rows, columns) bool: the tiles of an image of size (height, width) in which some pixel has
+    hits, by its Pairs.pixel_offset (HW+1,) uint32.
     """
     return _flags(dev, "tiles_hit", size, pixel_offset=pixel_offset)
 
@@ -140,8 +130,8 @@ def _program(dev):
 def _flags(dev, kernel, size, **arguments):
     shape = grid_shape(*size)
     tiles = shape[0] * shape[1]
-    flags = scratch(dev, "tile flags", tiles, np.int32)
+    flags = dev.scratch("tile flags", tiles, np.int32)[:tiles]
     _program(dev).launch(
         kernel, tiles, h=size[0], w=size[1], flags=flags.reshape(shape), **arguments
     )
-    return TileFlags(shape, read_later(dev, flags))
+    return read_later(dev, flags, convert=lambda values: values.reshape(shape) != 0)

@@ -11,15 +11,15 @@ from types import ModuleType
 import numpy as np
 from pyopencl.array import Array
 
-from pp_cl.device.buffers import Table, scratch
+from pp_cl.device.buffers import Table
 from pp_cl.device.device import Device
-from pp_cl.device.form import group_ranges, lanes, row_parts
-from pp_cl.device.launch import Program
+from pp_cl.device.launch import Program, group_ranges, lanes, row_parts
 from pp_cl.errors import UserError
 from pp_cl.layers.choice import ConvolutionPolicy, ConvShape, make_policy
-from pp_cl.layers.conv import COUNTERS, Direction, Work, pack_weights
+from pp_cl.layers.conv import Direction, pack_weights
+from pp_cl.layers.conv_winograd import TRANSFORMED
 from pp_cl.layers.resample import maxpool2_backward, maxpool2_forward
-from pp_cl.layers.tiles import LANES, Tiles, all_tiles, all_tiles_buffers
+from pp_cl.layers.tiles import VECTOR, Tiles, all_tiles, all_tiles_buffers
 from pp_cl.metrics.lpips_weights import load_weights
 
 # convolutions between the poolings of VGG16; the last one of each block is compared
@@ -47,7 +47,7 @@ class VggConv:
 
     def weight_shape(self) -> tuple[int, ...]:
         """As conv.pack_weights makes it."""
-        return -(-self.co // LANES), 3, 3, self.ci, LANES
+        return -(-self.co // VECTOR), 3, 3, self.ci, VECTOR
 
 
 def size_of(size: Size, block: int) -> Size:
@@ -79,11 +79,13 @@ def _variants(policy, layer, size):
     ]
 
 
-def _work_floats(dev, policy, layer, size):
-    """What _variants() need, as conv_direct.work_floats says it."""
+def _scratch_floats(dev, policy, layer, size):
+    """What _variants() need, as conv_direct.scratch_floats says it, [forward, backward]."""
     height, _ = size_of(size, layer.block)
     return [
-        variant.work_floats(dev, policy.blocking, direction, height, layer.weight_shape(), layer.ci)
+        variant.scratch_floats(
+            dev, policy.blocking, direction, height, layer.weight_shape(), layer.ci
+        )
         for variant, (direction, _) in zip(_variants(policy, layer, size), DIRECTIONS, strict=True)
     ]
 
@@ -99,7 +101,7 @@ class Lpips:
     """The network, prepared for images of one size at a time, and the distance of image pairs.
 
     weights: as load_weights() returns them, which is the default (and may raise UserError). policy:
-    of the convolutions, None = as shipped. training: backward() will be called.
+    of the convolutions, None = as shipped.
     """
 
     def __init__(
@@ -107,13 +109,10 @@ class Lpips:
         dev: Device,
         weights: dict[str, np.ndarray] | None = None,
         policy: ConvolutionPolicy | None = None,
-        *,
-        training: bool = False,
     ):
         weights = load_weights() if weights is None else weights
         self.dev = dev
         self.policy = policy or make_policy(dev)
-        self.training = training
         self.program = lpips_program(dev)
         self.heads = [dev.upload(weights[f"head{i}"]) for i in range(len(BLOCKS))]
         self.widths = tuple(head.size for head in self.heads)
@@ -125,7 +124,6 @@ class Lpips:
         self._choices: dict[str, list[ModuleType]] = {}
         self._laid_out: dict[str, Array | None] = {}
         self._tiles: list[Tiles] = []  # of each block
-        self._work = Work.empty(dev)
 
     @staticmethod
     def table(
@@ -134,14 +132,14 @@ class Lpips:
         """The device buffers of a network that is trained with, for images of `size`: weights, work
         and tiles, without feature maps.
         """
-        floats, work = {}, [(COUNTERS, 1)]
+        floats = {}
         for layer in vgg_layers(widths):
-            needs = _work_floats(dev, policy, layer, size)
-            work += needs
+            forward, backward = _scratch_floats(dev, policy, layer, size)
+            for name, needed in (*forward.items(), *backward.items()):
+                floats[name] = max(needed, floats.get(name, 0))
             floats[f"weights of {layer.name}"] = math.prod(layer.weight_shape())
             floats[f"bias of {layer.name}"] = layer.co
-            floats[f"transformed weights of {layer.name}"] = needs[0][1]
-        floats["work: scratch"], floats["work: weights"] = map(max, zip(*work, strict=True))
+            floats[f"transformed weights of {layer.name}"] = forward.get(TRANSFORMED, 0)
         table = {name: ((number,), np.float32) for name, number in floats.items()}
         for block, width in enumerate(widths):
             table[f"head {block}"] = (width,), np.float32
@@ -186,7 +184,7 @@ class Lpips:
         def place(name, shape):
             held = image if name.startswith("features") else next(turns)
             n = math.prod(shape)
-            return scratch(self.dev, ("lpips", held), n, np.float32).reshape(shape)
+            return self.dev.scratch(("lpips", held), n)[:n].reshape(shape)
 
         return place
 
@@ -263,20 +261,16 @@ class Lpips:
     # ----------------------------------------------------------------------------------------------
 
     def _prepare(self, size):
-        """Variants, transformed weights, tiles and work for images of this size."""
+        """Variants, transformed weights and tiles for images of this size."""
         if size == self._size:
             return
-        self._size, self._laid_out, self._tiles, self._work = None, {}, [], None
-        work = [(COUNTERS, 1)]
+        self._size, self._laid_out, self._tiles = None, {}, []
         for layer in vgg_layers(self.widths):
             forward, _ = self._choices[layer.name] = _variants(self.policy, layer, size)
             self._laid_out[layer.name] = forward.lay_out(
                 self.dev, self.policy.blocking, self._weights[layer.name]
             )
-            needs = _work_floats(self.dev, self.policy, layer, size)
-            work += needs if self.training else needs[:1]
         self._tiles = [all_tiles(self.dev, *size_of(size, i)) for i in range(len(BLOCKS))]
-        self._work = Work.empty(self.dev, *map(max, zip(*work, strict=True)))
         self._size = size
 
     def _convolve(self, layer, x, out):
@@ -289,7 +283,6 @@ class Lpips:
             self._biases[layer.name],
             out,
             relu=True,
-            work=self._work,
             tiles=self._tiles[layer.block],
             laid_out=self._laid_out[layer.name],
         )
@@ -304,7 +297,6 @@ class Lpips:
             grad_out,
             grad_x,
             mask=mask,
-            work=self._work,
             tiles=self._tiles[layer.block],
         )
 

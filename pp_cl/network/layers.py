@@ -8,6 +8,7 @@ with a 1x1 convolution and a concatenation [upsampled, skip] on the way up; the 
 upsampling weights of a pixel add up to 1, so they commute, bias included, and it costs a quarter.
 """
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Literal
@@ -15,8 +16,9 @@ from typing import Literal
 import numpy as np
 
 from pp_cl.device.buffers import Table
+from pp_cl.layers.choice import ConvShape
 from pp_cl.layers.conv import Direction
-from pp_cl.layers.tiles import LANES
+from pp_cl.layers.tiles import VECTOR
 
 
 @dataclass(frozen=True)
@@ -40,9 +42,19 @@ class Layer:
     kernel_size: int = 0
     relu: bool = False
 
+    @property
+    def reads_input_backward(self) -> bool:
+        """Whether the backward pass reads the inputs."""
+        return self.kind != "upsample"
+
     def weight_shape(self) -> tuple[int, int, int, int]:
         """(CO, CI, K, K) of a convolution's weights."""
         return self.channels, sum(self.sources), self.kernel_size, self.kernel_size
+
+    def shape(self, direction: Direction, source: int | None, height: int, width: int) -> ConvShape:
+        """By which a convolution's variant is chosen in an image of this size."""
+        pixels = (height >> self.level) * (width >> self.level)
+        return ConvShape(direction, self.kernel_size, self.sources, self.channels, pixels, source)
 
     def multiplications(self, height: int, width: int) -> int:
         """Multiplications of weights by values in a forward pass over an image of this size,
@@ -143,9 +155,9 @@ def parameter_table(layers: list[Layer]) -> Table:
     table = {}
     for layer in convolutions(layers):
         co, ci, k, _ = layer.weight_shape()
-        blocks = -(-co // LANES)
-        table[layer.name + ".weight"] = (blocks, k, k, ci, LANES), np.float32
-        table[layer.name + ".bias"] = (blocks * LANES,), np.float32
+        blocks = -(-co // VECTOR)
+        table[layer.name + ".weight"] = (blocks, k, k, ci, VECTOR), np.float32
+        table[layer.name + ".bias"] = (blocks * VECTOR,), np.float32
     return table
 
 
@@ -159,6 +171,80 @@ def levels_of(layers: list[Layer]) -> dict[str, int]:
     return {"x": 0} | {layer.name: layer.level for layer in layers}
 
 
+def array_shapes(layers: list[Layer], size: tuple[int, int]) -> dict[str, tuple[int, int, int]]:
+    """{name: (H, W, C)} of the outputs and of their gradients, x among them, in an image of `size`
+    = (height, width).
+    """
+    channels = {"x": sum(layers[0].sources)} | {layer.name: layer.channels for layer in layers}
+    shapes = {
+        name: (size[0] >> level, size[1] >> level, channels[name])
+        for name, level in levels_of(layers).items()
+    }
+    return shapes | {gradient_of(name): shape for name, shape in shapes.items()}
+
+
 def multiplications(layers: list[Layer], height: int, width: int) -> int:
     """Multiplications of weights by values in a forward pass over an image of this size."""
     return sum(layer.multiplications(height, width) for layer in layers)
+
+
+# ---- arrays that share memory
+
+
+def lifetimes(layers: list[Layer], training: bool) -> list[tuple[str, int, int]]:
+    """[(name, first, last)] of a network's arrays, in layers of its forward and backward pass, by
+    first use.
+
+    The network's input "x" is not among them: it belongs to the caller.
+    """
+    schedule = [(*layer.inputs, layer.name) for layer in layers]
+    if training:
+        for layer in reversed(layers):
+            read = layer.inputs if layer.reads_input_backward else ()
+            written = [gradient_of(name) for name in layer.inputs]
+            schedule.append((*read, gradient_of(layer.name), *written))
+    found = {}
+    for time, names in enumerate(schedule):
+        for name in names:
+            found[name] = (found.get(name, (time,))[0], time)
+    del found["x"]
+    last = layers[-1].name
+    found[last] = (found[last][0], len(schedule))  # the caller may read it after backward
+    return [(name, *lifetime) for name, lifetime in found.items()]
+
+
+@dataclass
+class SharedBuffer:
+    """A buffer of so many floats that holds several arrays, one after the other; free from a step
+    on.
+    """
+
+    floats: int
+    names: list[str]
+    free_from: int
+
+
+def share_buffers(
+    lifetimes: list[tuple[str, int, int]], shapes: dict[str, tuple]
+) -> list[SharedBuffer]:
+    """Buffers in which no two arrays live at the same time.
+
+    lifetimes: [(name, first, last)] by first use. An array takes the free buffer that fits it best;
+    if none is large enough, the largest free one grows.
+    """
+    buffers = []
+    for name, first, last in lifetimes:
+        floats = math.prod(shapes[name])
+        free = [b for b in buffers if b.free_from <= first]
+        large = [b for b in free if b.floats >= floats]
+        if large:
+            buffer = min(large, key=lambda b: b.floats)
+        elif free:
+            buffer = max(free, key=lambda b: b.floats)
+        else:
+            buffer = SharedBuffer(0, [], 0)
+            buffers.append(buffer)
+        buffer.floats = max(buffer.floats, floats)
+        buffer.names.append(name)
+        buffer.free_from = last + 1
+    return buffers

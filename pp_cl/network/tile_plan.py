@@ -9,6 +9,9 @@ tiles. The results are the same but for rounding: Winograd's transforms mix the 
 
 The backward pass has classes of its own: of the tiles where the network saw only background, those
 whose gradient of the image is their representative's.
+
+Feature maps have the names of UNet's arrays: those of the layers, and gradient_of() them. Sets of
+tiles are (rows, columns) bool.
 """
 
 from __future__ import annotations
@@ -20,25 +23,23 @@ import numpy as np
 from pyopencl.array import Array
 from scipy.ndimage import distance_transform_cdt
 
+from pp_cl.device.buffers import PackedArrays
 from pp_cl.device.device import Device
-from pp_cl.device.transfer import shared_parts
 from pp_cl.layers.tiles import (
     SIDE,
     Tiles,
     all_tiles,
     all_tiles_buffers,
     copy_list,
+    grid_shape,
     tile_arrays,
     tiles_copy,
 )
-from pp_cl.network.layers import Layer, convolutions, levels_of
+from pp_cl.network.layers import Layer, convolutions, gradient_of, levels_of
 
-# Pixels: tiles of the image's gradient that are nearer to its border are classes of their own,
-# because the loss sees the border from afar, too.
-LOSS_BORDER = 48
-
-
-# Sets of tiles are (rows, columns) bool.
+# How far the loss sees, in pixels: from a target's pixel to the gradients that depend on it, by
+# two of SSIM's windows; and from the image's border, together with the network.
+LOSS_RADIUS, LOSS_BORDER = 10, 48
 
 
 def distance(tiles: np.ndarray) -> np.ndarray:
@@ -51,7 +52,7 @@ def distance(tiles: np.ndarray) -> np.ndarray:
 
 
 def grow(tiles: np.ndarray, n: int = 1) -> np.ndarray:
-    """(rows, columns) bool: the tiles within n tiles, diagonals included, of those that are set."""
+    """The tiles within n tiles, diagonals included, of those that are set."""
     if n > 2:  # fewer are faster step by step
         return distance(tiles) <= n
     for _ in range(n):
@@ -77,21 +78,58 @@ def double(tiles: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
     return tiles.repeat(2, 0).repeat(2, 1)[: shape[0], : shape[1]]
 
 
-def forward_radius(layer: Layer) -> int:
+def gradient_tiles(found: np.ndarray, size: tuple[int, int], offset: tuple[int, int]) -> np.ndarray:
+    """The tiles of an image of `size` = (height, width) whose gradient of the loss depends on more
+    than an image of one colour before a white target, borders aside.
+
+    found: (?, ?) bool, the target's tiles that are not all white. offset: (left, top) of the target
+    in the image, less than a tile.
+    """
+    tiles = np.zeros(grid_shape(*size), bool)
+    tiles[: found.shape[0], : found.shape[1]] = found
+    return grow(tiles, _tiles_of(LOSS_RADIUS + max(offset)))
+
+
+def _tiles_of(pixels):
+    """How many tiles so many pixels reach."""
+    return -(-pixels // SIDE)
+
+
+def receptive_radius(layers: list[Layer]) -> dict[str, int]:
+    """{name: pixels}: how far from its place a change of x changes the output of a layer."""
+    radius = {"x": 0}
+    for layer in layers:
+        radius[layer.name] = max(radius[name] for name in layer.inputs) + _forward_radius(layer)
+    return radius
+
+
+def gradient_radius(layers: list[Layer]) -> dict[str, int]:
+    """{name: pixels}: how far from its place a change of the image's gradient changes the gradient
+    of a layer's output, or of x.
+    """
+    radius = dict.fromkeys([gradient_of(layer.name) for layer in layers], 0)
+    for layer in reversed(layers):
+        reached = radius[gradient_of(layer.name)] + _backward_radius(layer)
+        for grad in map(gradient_of, layer.inputs):
+            radius[grad] = max(radius.get(grad, 0), reached)
+    return radius
+
+
+def _forward_radius(layer):
     """How far from its place a change of the input changes the output, in pixels of the image."""
     if layer.kind == "conv":
         return layer.kernel_size // 2 << layer.level
     return {"gate": 0, "pool": 1, "upsample": 2}[layer.kind] << layer.level >> 1
 
 
-def backward_radius(layer: Layer) -> int:
+def _backward_radius(layer):
     """The same from the gradient of the output to the gradient of the input."""
     if layer.kind == "conv":
-        return forward_radius(layer)
+        return _forward_radius(layer)
     return {"gate": 0, "pool": 0, "upsample": 2}[layer.kind] << layer.level
 
 
-def needed_forward(layer: Layer, computed: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
+def _read_forward(layer, computed, shape):
     """(rows, columns) = shape bool: tiles of an input that the computed tiles of the output
     read.
     """
@@ -102,7 +140,7 @@ def needed_forward(layer: Layer, computed: np.ndarray, shape: tuple[int, int]) -
     return grow(computed) if layer.kernel_size > 1 else computed
 
 
-def needed_backward(layer: Layer, computed: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
+def _read_backward(layer, computed, shape):
     """(rows, columns) = shape bool: tiles of the gradient of the output that the computed tiles of
     an input's gradient read.
     """
@@ -110,24 +148,18 @@ def needed_backward(layer: Layer, computed: np.ndarray, shape: tuple[int, int]) 
         return halve(computed)
     if layer.kind == "upsample":
         return grow(double(computed, shape))
-    return needed_forward(layer, computed, shape)
-
-
-def reads_input_backward(layer: Layer) -> bool:
-    """Whether the backward pass reads the inputs."""
-    return layer.kind != "upsample"
+    return _read_forward(layer, computed, shape)
 
 
 @dataclass(frozen=True)
 class TileMap:
-    """The tiles of one feature map, whose height and width are those of the image divided by
-    2**level.
+    """The tiles of one feature map of `size` = (height, width).
 
     source: (rows, columns) int, the number of the computed tile that has the same values: the
     tile's own, or its class's representative.
     """
 
-    level: int
+    size: tuple[int, int]
     source: np.ndarray
 
     @cached_property
@@ -144,11 +176,10 @@ class TileMap:
 
 
 def map_tiles(size: tuple[int, int], level: int, active: np.ndarray, border: int) -> TileMap:
-    """TileMap of a feature map in an image of `size` = (height, width): `active` tiles are always
-    computed, all others are grouped into classes of equal tiles.
-
-    active: (rows, columns) bool. border: tiles of level 0 from the border of the image within which
-    a tile may depend on its distance from it.
+    """TileMap of a feature map in an image of `size` = (height, width), whose height and width are
+    divided by 2**level: `active` tiles are always computed, all others are grouped into classes of
+    equal tiles. border: tiles of level 0 from the border of the image within which a tile may
+    depend on its distance from it.
     """
     rows, columns = (_classes(length, level, border * SIDE) for length in size)
     classes = (rows[:, None] * (columns.max() + 1) + columns).ravel()
@@ -157,7 +188,7 @@ def map_tiles(size: tuple[int, int], level: int, active: np.ndarray, border: int
     # assigned backwards, so that the first tile of a class remains
     representative[classes[idle[::-1]]] = idle[::-1]
     source[idle] = representative[classes[idle]]
-    return TileMap(level, source.reshape(active.shape))
+    return TileMap((size[0] >> level, size[1] >> level), source.reshape(active.shape))
 
 
 def _classes(length, level, border):
@@ -168,45 +199,25 @@ def _classes(length, level, border):
     return np.where(near, np.arange(len(start)), len(start))
 
 
-def receptive_radius(layers: list[Layer]) -> dict[str, int]:
-    """{name: pixels}: how far from its place a change of x changes the output of a layer."""
-    radius = {"x": 0}
-    for layer in layers:
-        radius[layer.name] = max(radius[name] for name in layer.inputs) + forward_radius(layer)
-    return radius
-
-
-def gradient_radius(layers: list[Layer]) -> dict[str, int]:
-    """{name: pixels}: how far from its place a change of the image's gradient changes the gradient
-    of a layer's output.
-    """
-    radius = dict.fromkeys([*(layer.name for layer in layers), "x"], 0)
-    for layer in reversed(layers):
-        for name in layer.inputs:
-            radius[name] = max(radius[name], radius[layer.name] + backward_radius(layer))
-    return radius
-
-
 class AllTiles:
     """A pass that computes all tiles."""
 
     computed_fraction = 1.0
 
     def __init__(self, dev: Device, size: tuple[int, int], layers: list[Layer]):
-        self._levels = levels_of(layers)
-        self._tiles = {
-            level: all_tiles(dev, size[0] >> level, size[1] >> level)
-            for level in sorted(set(self._levels.values()))
-        }
+        levels = levels_of(layers)
+        tiles = {n: all_tiles(dev, size[0] >> n, size[1] >> n) for n in set(levels.values())}
+        self._tiles = {name: tiles[level] for name, level in levels.items()}
+        self._tiles |= {gradient_of(name): of_level for name, of_level in self._tiles.items()}
 
     def tiles(self, name: str) -> Tiles:
         """The tiles of a feature map to compute."""
-        return self._tiles[self._levels[name]]
+        return self._tiles[name]
 
     def fill_copies(self, name: str, array: Array) -> None:
         """Nothing: there are no copies."""
 
-    def backward(self, arrays: dict[str, Array]) -> AllTiles:
+    def backward(self, arrays: dict[str, Array], lists: PackedArrays) -> AllTiles:
         """The backward pass after this forward pass."""
         return self
 
@@ -214,11 +225,10 @@ class AllTiles:
 class TilePlan:
     """A pass that computes some tiles of each feature map.
 
-    size: (height, width) of the image. active: (rows, columns) bool, the tiles of the image where
-    the pass starts. radius: {name: pixels} of the feature maps that the pass computes: tiles within
-    that distance of `active` are computed; within `border` tiles more than that from the image's
-    border they are classes of their own. maps: {name: TileMap}. needed: {name: (rows, columns)
-    bool}, the tiles that a later layer reads.
+    size: (height, width) of the image. active: the tiles of the image where the pass starts.
+    radius: {name: pixels} of the feature maps that the pass computes: tiles within that distance of
+    `active` are computed; within `border` tiles more than that from the image's border they are
+    classes of their own. maps: {name: TileMap}. needed: {name: tiles that a layer reads}.
     """
 
     def __init__(
@@ -232,41 +242,36 @@ class TilePlan:
         border: int = 0,
     ):
         self.dev, self.layers, self.size = dev, layers, size
-        made, levels, away = {}, levels_of(layers), distance(active)
-        self.maps = {}
+        levels, away, made = levels_of(layers), distance(active), {}
+        levels |= {gradient_of(name): level for name, level in levels.items()}
+        self.maps: dict[str, TileMap] = {}
         for name, pixels in radius.items():
-            level, n = levels[name], -(-pixels // SIDE)
-            if (level, n) not in made:
-                near = halve(away <= n, level)
-                made[level, n] = map_tiles(size, level, near, border + n)
-            self.maps[name] = made[level, n]
+            level, n = key = levels[name], _tiles_of(pixels)
+            if key not in made:
+                made[key] = map_tiles(size, level, halve(away <= n, level), border + n)
+            self.maps[name] = made[key]
         self.needed = {name: np.zeros_like(m.computed) for name, m in self.maps.items()}
-        self._tiles, self._copies = {}, {}
+        self._tiles: dict[int, Tiles] = {}  # {id of a TileMap: its tiles}
+        self._copies: dict[str, tuple[Array, int]] = {}  # {name: arguments of tiles_copy()}
 
-    def upload(self) -> TilePlan:
-        """The plan, with all lists on the device, until the next one of its class is."""
+    def upload(self, lists: PackedArrays, copied: dict[str, TileMap]) -> None:
+        """Bring all lists to the device, where they are valid until `lists` holds others.
+
+        copied: {name: TileMap} of the feature maps in `needed`, tiles of which are copied.
+        """
         maps = {id(tile_map): tile_map for tile_map in self.maps.values()}
-        copies = self._copy_lists()
-        forms = [form for m in maps.values() for form in all_tiles_buffers(*self._size(m)).values()]
-        forms += [((tile_map.source.size, 2), np.int32) for tile_map, _ in copies.values()]
-        parts = shared_parts(self.dev, type(self), forms)
-        lists = [part for m in maps.values() for part in tile_arrays(self._size(m), m.count())]
-        parts.send([*lists, *(from_to for _, from_to in copies.values())])
-        arrays = iter(parts.arrays)
+        rows = [row for m in maps.values() for row in all_tiles_buffers(*m.size).values()]
+        rows += [((copied[name].source.size, 2), np.int32) for name in self.needed]
+        values = [part for m in maps.values() for part in tile_arrays(m.size, m.count())]
+        copies = {
+            name: copy_list(copied[name].source, needed & ~copied[name].computed)
+            for name, needed in self.needed.items()
+        }
+        arrays = iter(lists.send(rows, [*values, *copies.values()]))
         for key, m in maps.items():
-            self._tiles[key] = Tiles(
-                self._size(m), int(m.computed.sum()), next(arrays), next(arrays)
-            )
-        for (name, (_, from_to)), array in zip(copies.items(), arrays, strict=True):
+            self._tiles[key] = Tiles(m.size, int(m.computed.sum()), next(arrays), next(arrays))
+        for (name, from_to), array in zip(copies.items(), arrays, strict=True):
             self._copies[name] = array, len(from_to)
-        return self
-
-    def _size(self, tile_map):
-        return self.size[0] >> tile_map.level, self.size[1] >> tile_map.level
-
-    def _copy_lists(self):
-        """{name of a feature map: (TileMap, copy_list() of its needed tiles not computed)}."""
-        return {name: _copies(self.maps[name], needed) for name, needed in self.needed.items()}
 
     def tiles(self, name: str) -> Tiles:
         """The tiles of a feature map to compute; of a plan that is on the device."""
@@ -277,17 +282,13 @@ class TilePlan:
         tiles_copy(self.dev, array, *self._copies[name])
 
 
-def _copies(tile_map, needed):
-    return tile_map, copy_list(tile_map.source, needed & ~tile_map.computed)
-
-
 class ForwardPlan(TilePlan):
     """The forward pass over an image of `size`, where x differs from the background in the tiles
     `active`.
 
-    differs: (rows, columns) bool, the tiles of the image whose gradient may be another than that of
-    others which see only background; None: all. affected: the tiles of the image that see more than
-    background. computed_fraction: of the network's multiplications.
+    gradient_tiles: the tiles of the image whose gradient may be another than that of others which
+    see only background; None: all. affected: the tiles of the image that see more than background.
+    computed_fraction: of the network's multiplications.
     """
 
     def __init__(
@@ -297,7 +298,7 @@ class ForwardPlan(TilePlan):
         size: tuple[int, int],
         active: np.ndarray,
         *,
-        differs: np.ndarray | None = None,
+        gradient_tiles: np.ndarray | None = None,
     ):
         radius, last = receptive_radius(layers), layers[-1].name
         computed = {name: pixels for name, pixels in radius.items() if name != "x"}  # x is given
@@ -307,54 +308,41 @@ class ForwardPlan(TilePlan):
             for name in layer.inputs:
                 if name != "x":
                     needed = self.needed[name]
-                    needed |= needed_forward(layer, of_layer, needed.shape)
+                    needed |= _read_forward(layer, of_layer, needed.shape)
         self.needed[last][:] = True
-        self.affected = grow(active, -(-radius[last] // SIDE))
-        self.differs = np.ones_like(active) if differs is None else differs
+        self.affected = grow(active, _tiles_of(radius[last]))
+        self.gradient_tiles = np.ones_like(active) if gradient_tiles is None else gradient_tiles
         count = {c.name: c.multiplications(*size) for c in convolutions(layers)}
         done = sum(n * self.maps[name].computed.mean() for name, n in count.items())
         self.computed_fraction = done / sum(count.values())
 
-    def backward(self, arrays: dict[str, Array]) -> BackwardPlan:
-        """The backward pass; the activations in `arrays` are completed where it needs them."""
-        plan = BackwardPlan(self).upload()
-        plan.fill_activations(arrays)
+    def backward(self, arrays: dict[str, Array], lists: PackedArrays) -> BackwardPlan:
+        """The backward pass, on the device; the outputs in `arrays` are completed where it reads
+        them.
+        """
+        plan = BackwardPlan(self)
+        plan.upload(lists, self.maps | plan.maps)
+        for name in plan.needed.keys() - plan.maps.keys():
+            plan.fill_copies(name, arrays[name])
         return plan
 
 
 class BackwardPlan(TilePlan):
-    """The backward pass after a forward pass.
-
-    activations: {name: (rows, columns) bool}, the tiles of forward outputs that it reads, as inputs
-    of layers and as masks of ReLUs.
+    """The backward pass after a forward pass. Among the needed tiles are those of forward outputs
+    that it reads, as inputs of layers and as masks of ReLUs.
     """
 
     def __init__(self, forward: ForwardPlan):
         dev, layers, size = forward.dev, forward.layers, forward.size
-        radius = receptive_radius(layers)[layers[-1].name]
-        border = -(-max(LOSS_BORDER, radius) // SIDE)
-        active = forward.affected | forward.differs
+        border = _tiles_of(max(LOSS_BORDER, receptive_radius(layers)[layers[-1].name]))
+        active = forward.affected | forward.gradient_tiles
         super().__init__(dev, layers, size, active, radius=gradient_radius(layers), border=border)
-        self._forward_maps = forward.maps
-        self.activations = {}
         for layer in layers:
-            out = self.maps[layer.name].computed
+            out = self.maps[gradient_of(layer.name)].computed
             for name in layer.inputs:
-                at_input = self.maps[name].computed
-                self.needed[layer.name] |= needed_backward(layer, at_input, out.shape)
-                if reads_input_backward(layer) and name != "x":
-                    reads = needed_forward(layer, out, at_input.shape) | at_input
-                    self.activations[name] = self.activations.get(name, False) | reads
-        self.needed["x"][:] = True
-
-    def _copy_lists(self):
-        """Those of the gradients, and of the activations."""
-        maps, activations = self._forward_maps, self.activations.items()
-        return super()._copy_lists() | {
-            ("activation", name): _copies(maps[name], needed) for name, needed in activations
-        }
-
-    def fill_activations(self, arrays: dict[str, Array]) -> None:
-        """Complete the forward outputs {name: array} where the pass reads them."""
-        for name in self.activations:
-            self.fill_copies(("activation", name), arrays[name])
+                at_input = self.maps[gradient_of(name)].computed
+                self.needed[gradient_of(layer.name)] |= _read_backward(layer, at_input, out.shape)
+                if layer.reads_input_backward and name != "x":
+                    reads = _read_forward(layer, out, at_input.shape) | at_input
+                    self.needed[name] = self.needed.get(name, False) | reads
+        self.needed[gradient_of("x")][:] = True

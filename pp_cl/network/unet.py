@@ -1,4 +1,6 @@
-"""The U-Net on a device: its parameters, and its layers run in order, forward and backward."""
+"""The U-Net on a device: its parameters, the memory it works in, and its layers run in order,
+forward and backward.
+"""
 
 import math
 from collections.abc import Sequence
@@ -6,6 +8,7 @@ from collections.abc import Sequence
 import numpy as np
 from pyopencl.array import Array
 
+from pp_cl.device.buffers import PackedArrays
 from pp_cl.device.device import Device
 from pp_cl.layers.choice import ConvolutionPolicy, make_policy
 from pp_cl.layers.conv import Direction, pack_bias, pack_weights
@@ -17,9 +20,20 @@ from pp_cl.layers.resample import (
     upsample2_backward,
     upsample2_forward,
 )
-from pp_cl.network.layers import convolutions, gradient_of, parameter_table, unet_layers
-from pp_cl.network.tile_plan import ForwardPlan
-from pp_cl.network.workspace import Workspace, WorkspacePlan
+from pp_cl.layers.tiles import all_tiles_buffers
+from pp_cl.network.layers import (
+    Layer,
+    array_shapes,
+    computations,
+    convolutions,
+    gradient_of,
+    levels_of,
+    lifetimes,
+    parameter_table,
+    share_buffers,
+    unet_layers,
+)
+from pp_cl.network.tile_plan import AllTiles, ForwardPlan
 from pp_cl.settings import NetworkConfig
 
 # Background tiles are skipped only in images of at least LEAST_PIXELS pixels, and only if at most
@@ -28,14 +42,56 @@ LEAST_PIXELS, MOST_COMPUTED = 1 << 16, 0.8
 MULTIPLE = 4  # pixels: two poolings halve the height and the width
 
 
+class FeatureMaps:
+    """The outputs of a network's layers and their gradients, for images of one size at a time.
+
+    training: with the backward pass. size: (height, width). arrays: {name: array}, gradients by
+    gradient_of(name), without x; some share a buffer, one after the other.
+    """
+
+    def __init__(self, dev: Device, layers: list[Layer], training: bool):
+        self.dev, self.layers, self.training = dev, layers, training
+        self.size: tuple[int, int] | None = None
+        self.arrays: dict[str, Array] = {}
+        self._buffers: list[Array | None] = []
+        self._all_tiles = None
+
+    def resize(self, size: tuple[int, int]) -> None:
+        """Make room for images of this size, in the same buffers where they are large enough:
+        images of a film differ in size. The arrays are undefined then.
+        """
+        if size == self.size:
+            return
+        self.size, self.arrays, self._all_tiles = None, {}, None
+        shapes = array_shapes(self.layers, size)
+        shared = share_buffers(lifetimes(self.layers, self.training), shapes)
+        self._buffers += [None] * (len(shared) - len(self._buffers))
+        for i, buffer in enumerate(shared):
+            if self._buffers[i] is None or self._buffers[i].size < buffer.floats:
+                self._buffers[i] = None  # frees the old one first
+                self._buffers[i] = self.dev.empty((buffer.floats,))
+            for name in buffer.names:
+                floats = math.prod(shapes[name])
+                self.arrays[name] = self._buffers[i][:floats].reshape(shapes[name])
+        self.size = size
+
+    @property
+    def all_tiles(self) -> AllTiles:
+        """Of an image of this size."""
+        if self._all_tiles is None:
+            self._all_tiles = AllTiles(self.dev, self.size, self.layers)
+        return self._all_tiles
+
+
 class UNet:
     """The network, its parameters and gradients, and the buffers it works in.
 
     widths: channels of the three levels. blocks: what a level computes, of layers.BLOCKS.
-    channels: as unet_layers() takes them.
-    policy: which variants its convolutions take, None = as shipped, whatever their error. layers:
-    in the order of the forward pass. parameters, gradients: {"enc0.a.weight":
-    (ceil(CO/16), K, K, CI, 16), "enc0.a.bias": (ceil(CO/16) * 16,), ...} float32 on the device.
+    channels: as unet_layers() takes them. residual: adds output.SHARE of the first three features
+    to the image. policy: which variants its convolutions take from the next image on, None = as
+    shipped, whatever their error. layers: in the order of the forward pass. parameters, gradients:
+    {"enc0.a.weight": (ceil(CO/16), K, K, CI, 16), "enc0.a.bias": (ceil(CO/16) * 16,), ...} float32
+    on the device.
     Weights and biases start uniform in +-1/sqrt(CI K K) (PyTorch's default for Conv2d), output
     channels beyond CO at 0, with gradient 0.
     """
@@ -49,11 +105,12 @@ class UNet:
         *,
         blocks: str = "double",
         channels: Sequence[int] = (),
+        residual: bool = False,
         seed: int = 0,
         policy: ConvolutionPolicy | None = None,
     ):
         self.dev = dev
-        self._residual = False
+        self._residual = residual
         self.layers = unet_layers(widths, channels_in, channels_out, blocks, channels=channels)
         self.channels_in = channels_in
         self.policy = policy or make_policy(dev)
@@ -68,9 +125,10 @@ class UNet:
         table = parameter_table(self.layers)
         self.gradients = {name: dev.zeros(*row) for name, row in table.items()}
         self._relu_outputs = {layer.name for layer in self.layers if layer.relu}
-        self._plans = {}  # {(policy, size, training): WorkspacePlan}
-        self._workspaces = {}  # {training: Workspace}
-        self._trained = None  # (workspace, arrays, tile plan) of the last forward(training=True)
+        self._maps = {}  # {training: FeatureMaps}
+        self._modules = {}  # {(policy, layer, direction, source, size): module of a convolution}
+        self._tile_lists = {name: PackedArrays(dev) for name in ("forward", "backward")}
+        self._trained = None  # (size, arrays, tiles) of the last forward(training=True)
         self._frozen = None  # {(layer, module): weights} once frozen
 
     @classmethod
@@ -78,32 +136,22 @@ class UNet:
         cls, dev: Device, settings: NetworkConfig, policy: ConvolutionPolicy, *, seed: int = 0
     ) -> "UNet":
         """The network of a run."""
-        net = cls(
+        return cls(
             dev,
             settings.widths,
             blocks=settings.blocks,
             channels=settings.channel_numbers,
+            residual=settings.residual,
             seed=seed,
             policy=policy,
         )
-        if settings.residual:
-            net.connect_residual()
-        return net
-
-    def connect_residual(self) -> None:
-        """From the next image on, add output.SHARE of the first three features to it."""
-        self._residual = True
-
-    def use(self, policy: ConvolutionPolicy) -> None:
-        """Take the variants of another policy from the next image on."""
-        self.policy = policy
 
     def freeze(self) -> None:
         """From now on the parameters do not change: their weights are transformed for the kernels
         once, not for each image, and training is refused.
         """
         self._frozen = {}
-        self._workspaces.clear()
+        self._maps.clear()
 
     @staticmethod
     def is_planned(size: tuple[int, int]) -> bool:
@@ -111,20 +159,23 @@ class UNet:
         return math.prod(size) >= LEAST_PIXELS
 
     def plan_tiles(
-        self, size: tuple[int, int], active: np.ndarray, differs: np.ndarray | None = None
+        self, size: tuple[int, int], active: np.ndarray, gradient_tiles: np.ndarray | None = None
     ) -> ForwardPlan | None:
         """Which tiles to compute for features of `size` = (height, width) that are the same in all
         tiles but the `active` ones, (rows, columns) bool; None = all, as few would be saved.
 
         Where the network sees only this background, one tile is computed in place of many equal
-        ones (tile_plan.py). The result is the same. differs: the tiles whose gradient of the
+        ones (tile_plan.py). The result is the same. gradient_tiles: the tiles whose gradient of the
         image may not be that of others which see only background; None: all. Valid until the next
         plan.
         """
         if not self.is_planned(size):
             return None
-        plan = ForwardPlan(self.dev, self.layers, size, active, differs=differs)
-        return plan.upload() if plan.computed_fraction <= MOST_COMPUTED else None
+        plan = ForwardPlan(self.dev, self.layers, size, active, gradient_tiles=gradient_tiles)
+        if plan.computed_fraction > MOST_COMPUTED:
+            return None
+        plan.upload(self._tile_lists["forward"], plan.maps)
+        return plan
 
     def forward(self, x: Array, training: bool = True, plan: ForwardPlan | None = None) -> Array:
         """(H, W, 3) image of the features x (H, W, channels_in); H and W are multiples of 4.
@@ -140,16 +191,21 @@ class UNet:
             raise ValueError(
                 f"the network takes (4n, 4m, {self.channels_in}) features, not {x.shape}"
             )
-        workspace = self._workspace((height, width), training)
-        arrays = workspace.arrays | {"x": x}
-        tiles = plan or workspace.all_tiles
+        if training not in self._maps:
+            self._maps[training] = FeatureMaps(self.dev, self.layers, training)
+        if training:
+            self._trained = None  # its arrays are overwritten
+        maps, size = self._maps[training], (height, width)
+        maps.resize(size)
+        arrays = maps.arrays | {"x": x}
+        tiles = plan or maps.all_tiles
         for layer in self.layers:
             sources, out = tuple(arrays[name] for name in layer.inputs), arrays[layer.name]
-            self._forward(workspace, layer, sources, out, tiles.tiles(layer.name))
+            self._forward(size, layer, sources, out, tiles.tiles(layer.name))
             tiles.fill_copies(layer.name, out)
         output_forward(self.dev, out, x if self._residual else None)
         if training:
-            self._trained = workspace, arrays, tiles
+            self._trained = size, arrays, tiles
         return out
 
     def backward(self, grad_y: Array) -> Array:
@@ -162,36 +218,23 @@ class UNet:
         """
         if self._trained is None:
             raise RuntimeError("UNet.backward needs a forward(training=True) before it")
-        (workspace, arrays, tiles), self._trained = self._trained, None
-        grad_last = arrays[gradient_of(self.layers[-1].name)]
-        output_backward(self.dev, grad_y, grad_last)
-        tiles = tiles.backward(arrays)
+        (size, arrays, tiles), self._trained = self._trained, None
+        output_backward(self.dev, grad_y, arrays[gradient_of(self.layers[-1].name)])
+        tiles = tiles.backward(arrays, self._tile_lists["backward"])
         for layer in reversed(self.layers):
-            sources = tuple(arrays[name] for name in layer.inputs)
-            grad_out = arrays[gradient_of(layer.name)]
-            tiles.fill_copies(layer.name, grad_out)
+            grad = gradient_of(layer.name)
+            tiles.fill_copies(grad, arrays[grad])
             if layer.kind == "conv":
-                self._backward_weights(workspace, layer, sources, grad_out, tiles.tiles(layer.name))
+                self._backward_weights(size, layer, arrays, tiles.tiles(grad))
             for i, name in enumerate(layer.inputs):
-                grad_x = arrays[gradient_of(name)]
-                mask = sources[i] if name in self._relu_outputs else None
-                if layer.kind == "conv":
-                    self._backward_input(
-                        workspace, layer, i, grad_out, grad_x, mask=mask, tiles=tiles.tiles(name)
-                    )
-                elif layer.kind == "gate":
-                    gate_backward(self.dev, sources[i], grad_out, grad_x, tiles=tiles.tiles(name))
-                elif layer.kind == "pool":  # adds to the gradient of the skip
-                    avgpool2_backward(self.dev, mask, grad_out, grad_x, tiles=tiles.tiles(name))
-                else:
-                    upsample2_backward(self.dev, grad_out, grad_x, tiles=tiles.tiles(name))
+                self._backward_input(size, layer, i, arrays, tiles.tiles(gradient_of(name)))
         grad_x = arrays[gradient_of("x")]
-        tiles.fill_copies("x", grad_x)
+        tiles.fill_copies(gradient_of("x"), grad_x)
         if self._residual:
             residual_backward(self.dev, grad_y, grad_x)
         return grad_x
 
-    def _forward(self, workspace, layer, sources, out, tiles):
+    def _forward(self, size, layer, sources, out, tiles):
         """Compute the tiles of a layer's output from its inputs."""
         if layer.kind == "gate":
             gate_forward(self.dev, sources[0], out, tiles=tiles)
@@ -200,55 +243,71 @@ class UNet:
         elif layer.kind == "upsample":
             upsample2_forward(self.dev, sources[0], out, tiles=tiles)
         else:
-            conv = workspace.plan.convolutions[layer.name, Direction.FORWARD, None]
-            conv.forward(
+            module = self._module(layer, Direction.FORWARD, None, size)
+            module.forward(
                 self.dev,
-                workspace.plan.blocking,
+                self.policy.blocking,
                 sources,
                 self.parameters[layer.name + ".weight"],
                 self.parameters[layer.name + ".bias"],
                 out,
                 relu=layer.relu,
-                work=workspace.work,
                 tiles=tiles,
-                laid_out=self._laid_out(workspace, layer, conv),
+                laid_out=self._laid_out(layer, module),
             )
 
-    def _backward_input(self, workspace, layer, source, grad_out, grad_x, *, mask, tiles):
-        """Compute the tiles of grad_x, the gradient of a convolution's input of number `source`."""
-        workspace.plan.convolutions[layer.name, Direction.BACKWARD_INPUT, source].backward_input(
-            self.dev,
-            workspace.plan.blocking,
-            self.parameters[layer.name + ".weight"],
-            sum(layer.sources[:source]),
-            grad_out,
-            grad_x,
-            mask=mask,
-            work=workspace.work,
-            tiles=tiles,
-        )
+    def _backward_input(self, size, layer, source, arrays, tiles):
+        """Compute the tiles of the gradient of a layer's input of number `source`."""
+        name = layer.inputs[source]
+        x, grad_x = arrays[name], arrays[gradient_of(name)]
+        grad_out = arrays[gradient_of(layer.name)]
+        mask = x if name in self._relu_outputs else None
+        if layer.kind == "gate":
+            gate_backward(self.dev, x, grad_out, grad_x, tiles=tiles)
+        elif layer.kind == "pool":  # adds to the gradient of the skip
+            avgpool2_backward(self.dev, mask, grad_out, grad_x, tiles=tiles)
+        elif layer.kind == "upsample":
+            upsample2_backward(self.dev, grad_out, grad_x, tiles=tiles)
+        else:
+            self._module(layer, Direction.BACKWARD_INPUT, source, size).backward_input(
+                self.dev,
+                self.policy.blocking,
+                self.parameters[layer.name + ".weight"],
+                sum(layer.sources[:source]),
+                grad_out,
+                grad_x,
+                mask=mask,
+                tiles=tiles,
+            )
 
-    def _backward_weights(self, workspace, layer, sources, grad_out, tiles):
+    def _backward_weights(self, size, layer, arrays, tiles):
         """Overwrite the gradients of a convolution's parameters."""
-        workspace.plan.convolutions[layer.name, Direction.BACKWARD_WEIGHTS, None].backward_weights(
+        self._module(layer, Direction.BACKWARD_WEIGHTS, None, size).backward_weights(
             self.dev,
-            workspace.plan.blocking,
-            sources,
-            grad_out,
+            self.policy.blocking,
+            tuple(arrays[name] for name in layer.inputs),
+            arrays[gradient_of(layer.name)],
             self.gradients[layer.name + ".weight"],
             self.gradients[layer.name + ".bias"],
-            work=workspace.work,
             tiles=tiles,
         )
 
-    def _laid_out(self, workspace, layer, conv):
-        """The weights as conv.forward() transforms them, once frozen; None = not in advance."""
+    def _module(self, layer, direction, source, size):
+        """The module that computes a convolution in an image of a size."""
+        key = self.policy, layer.name, direction, source, size
+        if key not in self._modules:
+            self._modules[key] = self.policy.convolution(layer.shape(direction, source, *size))
+        return self._modules[key]
+
+    def _laid_out(self, layer, module):
+        """The weights as the module transforms them, once frozen; None = not in advance."""
         if self._frozen is None:
             return None
-        if (layer.name, conv) not in self._frozen:
+        key = layer.name, module
+        if key not in self._frozen:
             weight = self.parameters[layer.name + ".weight"]
-            self._frozen[layer.name, conv] = conv.lay_out(self.dev, workspace.plan.blocking, weight)
-        return self._frozen[layer.name, conv]
+            self._frozen[key] = module.lay_out(self.dev, self.policy.blocking, weight)
+        return self._frozen[key]
 
     def output(self, name: str) -> Array:
         """(H, W, C) output of the layer `name` in the last forward(training=True), until its
@@ -258,33 +317,33 @@ class UNet:
 
     def memory_plan(self, height: int, width: int, training: bool) -> list[tuple[str, tuple, int]]:
         """[(name, shape, bytes)] of all device buffers of this network once it has run at this
-        size.
+        size, what its convolutions share with others among them.
 
         Gradients of parameters are among them without training too: they are made with the network.
         Raises UserError where no variant is as exact as the policy's tolerance.
         """
-        parameters = parameter_table(self.layers)
-        table = self._plan((height, width), training).buffers() | parameters
+        size, parameters = (height, width), parameter_table(self.layers)
+        shared = share_buffers(lifetimes(self.layers, training), array_shapes(self.layers, size))
+        floats = {" = ".join(buffer.names): buffer.floats for buffer in shared}
+        for layer in convolutions(self.layers):
+            weight_shape, _ = parameters[layer.name + ".weight"]
+            for direction, source in computations(layer, training):
+                needed = self._module(layer, direction, source, size).scratch_floats(
+                    self.dev,
+                    self.policy.blocking,
+                    direction,
+                    height >> layer.level,
+                    weight_shape,
+                    layer.shape(direction, source, *size).ci,
+                )
+                for name, number in needed.items():
+                    floats[name] = max(number, floats.get(name, 0))
+        table = {name: ((number,), np.float32) for name, number in floats.items()} | parameters
         table |= {gradient_of(name): row for name, row in parameters.items()}
+        for level in set(levels_of(self.layers).values()):
+            tiles = all_tiles_buffers(height >> level, width >> level)
+            table |= {f"tiles of level {level}, {name}": row for name, row in tiles.items()}
         return [
             (name, shape, math.prod(shape) * np.dtype(dtype).itemsize)
             for name, (shape, dtype) in table.items()
         ]
-
-    def _plan(self, size, training):
-        key = self.policy, size, training
-        if key not in self._plans:
-            self._plans[key] = WorkspacePlan(
-                self.dev, self.layers, size, training, policy=self.policy
-            )
-        return self._plans[key]
-
-    def _workspace(self, size, training):
-        """The buffers for this size."""
-        if training not in self._workspaces:
-            self._workspaces[training] = Workspace(self.dev)
-        workspace, plan = self._workspaces[training], self._plan(size, training)
-        if training and plan is not workspace.plan:
-            self._trained = None
-        workspace.follow(plan)
-        return workspace

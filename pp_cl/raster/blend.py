@@ -1,136 +1,127 @@
-"""The blend of features by their weights, and its gradients gathered by point."""
+"""The features of each pixel, blended of its hits by their weights, and the gradients of that,
+gathered by point.
+"""
 
 from __future__ import annotations
-
-from dataclasses import dataclass
 
 import numpy as np
 from pyopencl.array import Array
 
 from pp_cl.device.buffers import Buffers, Table
 from pp_cl.device.device import Device
-from pp_cl.device.form import lanes, row_parts
-from pp_cl.raster.alpha import Alpha
-from pp_cl.raster.blend_weights import BlendWeights, PixelWeights
+from pp_cl.device.launch import lanes, row_parts
 from pp_cl.raster.pairs import Pairs
-from pp_cl.raster.softmax import Softmax
+from pp_cl.raster.weights import BlendWeights
 
-BLENDS: dict[str, type[BlendWeights]] = {"softmax": Softmax, "alpha": Alpha}  # raster.blend
-BACKGROUND = 1.0  # every feature of a pixel without hits (cl/raster/blend.cl)
+ON_GPU = 4  # lanes there: each work-item reads vectors
 
 
-@dataclass(frozen=True)
-class BlendGradient:
-    """What all gradients of one blend are made of.
+def blend_forward(
+    dev: Device, pairs: Pairs, weights: BlendWeights, point_features: Array, features: Array
+) -> None:
+    """Write features (H, W, 16) from point_features (N, 16), both float32.
 
-    point_features: (N, 16), as in Blend.forward. grad_features: (H, W, 16), G = dL/dF.
-    rest_or_gain: of BlendWeights. All float32.
+    Of point_features only the rows weights.shaded are read.
     """
+    _program(dev, weights).launch(
+        "blend_forward",
+        pairs.pixels * row_parts(dev, ON_GPU),
+        hw=pairs.pixels,
+        pixel_offset=pairs.pixel_offset,
+        pixel_entry=weights.pixel_entry,
+        point_features=point_features,
+        features=features,
+    )
 
-    pairs: Pairs
-    weights: PixelWeights
-    point_features: Array
-    grad_features: Array
-    rest_or_gain: Array
 
-
-class Blend:
-    """Blends features by PixelWeights.
-
-    weighing: what computes them. mean_gradient: a point's gradients are divided by its number of
-    tracked pixels, as Pulsar does.
+def blend_backward_table(n: int, pixels: int, pairs: int, blend: str) -> Table:
+    """The buffers of the backward pass for n points, a number of pixels and room for a number of
+    pairs. blend: one of BLENDS.
     """
+    return {
+        "pair_gain": ((pairs if blend == "alpha" else 1,), np.float32),
+        "pixel_rest": ((pixels if blend == "softmax" else 1,), np.float32),
+        "grad_point_features": ((n, 16), np.float32),
+        "grad_opacity": ((n,), np.float32),
+    }
 
-    def __init__(
-        self,
-        dev: Device,
-        weighing: BlendWeights,
-        mean_gradient: bool = False,
-    ):
-        self.dev = dev
-        self.weighing = weighing
-        self._row_parts = row_parts(dev, on_gpu=4)
-        self.defines = {
-            "LANES": lanes(dev, on_gpu=4),  # each work-item reads whole rows for its dot products
-            "MEAN": int(mean_gradient),
-            "GAIN_BY_PAIR": int(weighing.gain_by_pair),
-        }
-        self._buffers = Buffers(dev)
 
-    @staticmethod
-    def table(n: int) -> Table:
-        """The buffers for n points."""
-        return {
-            "grad_point_features": ((n, 16), np.float32),
-            "grad_opacity": ((n,), np.float32),
-        }
+def blend_backward(
+    dev: Device,
+    b: Buffers,
+    pairs: Pairs,
+    weights: BlendWeights,
+    *,
+    point_features: Array,
+    features: Array,
+    grad_features: Array,
+    grad_alpha: Array | None = None,
+    spread_weight: float = 0.0,
+    mean: bool = False,
+) -> tuple[Array, Array]:
+    """(grad_point_features (N, 16), grad_opacity (N,)) float32, valid until the next call; points
+    that are not shaded get zeros. b.pair_gain or b.pixel_rest then hold what the gains of the pairs
+    are, or follow from (cl/raster/blend.cl).
 
-    def forward(
-        self, pairs: Pairs, weights: PixelWeights, point_features: Array, features: Array
-    ) -> None:
-        """Write features (H, W, 16) from point_features (N, 16), both float32.
-
-        Of point_features only the rows weights.shaded are read.
-        """
-        self._program(weights).launch(
-            "blend_forward",
-            pairs.pixels * self._row_parts,
+    point_features, features: of blend_forward(). grad_features: dL/dfeatures (H, W, 16).
+    grad_alpha: (HW,), dL/d(1 - transmittance); None: 0. spread_weight: adds this times sum_ij b_i
+    b_j |z_i - z_j| of every pixel to the loss, with b and z the weights and depths (world units) of
+    its hits; no gradient of the depths is formed. mean: a point's gradients are divided by its
+    number of tracked pixels, as Pulsar does. Raises ValueError for grad_alpha or a spread of a
+    softmax, which has no transmittance.
+    """
+    b.require(blend_backward_table(pairs.points, pairs.pixels, pairs.capacity, weights.blend))
+    program = _program(dev, weights, mean)
+    if weights.blend == "softmax":
+        if grad_alpha is not None or spread_weight > 0:
+            raise ValueError("a softmax has no gradient of alpha and of spread")
+        program.launch(
+            "softmax_rest",
+            pairs.pixels,
             hw=pairs.pixels,
-            pixel_offset=pairs.pixel_offset,
-            pixel_entry=weights.pixel_entry,
-            point_features=point_features,
-            features=features,
-        )
-
-    def gradient(
-        self,
-        pairs: Pairs,
-        weights: PixelWeights,
-        point_features: Array,
-        *,
-        features: Array,
-        grad_features: Array,
-        grad_alpha: Array | None = None,
-        spread_weight: float = 0.0,
-    ) -> BlendGradient:
-        """Prepare the backward pass of forward(pairs, weights, point_features, features).
-
-        grad_alpha, spread_weight: as BlendWeights.rest_or_gain takes them.
-        """
-        self._buffers.require(self.table(pairs.points))
-        rest_or_gain = self.weighing.rest_or_gain(
-            pairs,
-            weights,
-            point_features,
             features=features,
             grad_features=grad_features,
-            grad_alpha=grad_alpha,
+            pixel_rest=b.pixel_rest,
+        )
+    else:
+        program.launch(
+            "alpha_gain",
+            pairs.pixels,
+            hw=pairs.pixels,
+            has_grad_alpha=int(grad_alpha is not None),
             spread_weight=spread_weight,
+            pixel_offset=pairs.pixel_offset,
+            pair_key=pairs.pair_key,
+            pixel_entry=weights.pixel_entry,
+            transmittance=weights.transmittance,
+            point_features=point_features,
+            grad_features=grad_features,
+            grad_alpha=weights.transmittance if grad_alpha is None else grad_alpha,
+            pair_gain=b.pair_gain,
         )
-        return BlendGradient(pairs, weights, point_features, grad_features, rest_or_gain)
+    program.launch(
+        "blend_backward",
+        pairs.points * row_parts(dev, ON_GPU),
+        n=pairs.points,
+        point_features=point_features,
+        point_offset=pairs.point_offset,
+        pair_pixel=pairs.pair_pixel,
+        pair_weight=weights.pair_weight,
+        pair_role=weights.pair_role,
+        pair_gain=b.pair_gain,
+        pixel_rest=b.pixel_rest,
+        grad_features=grad_features,
+        grad_point_features=b.grad_point_features,
+        grad_opacity=b.grad_opacity,
+    )
+    return b.grad_point_features, b.grad_opacity
 
-    def backward(self, gradient: BlendGradient) -> tuple[Array, Array]:
-        """(grad_point_features (N, 16), grad_opacity (N,)) float32, valid until the next call.
 
-        Points that are not shaded get zeros.
-        """
-        grads = self._buffers.grad_point_features, self._buffers.grad_opacity
-        pairs, weights = gradient.pairs, gradient.weights
-        self._program(weights).launch(
-            "blend_backward",
-            pairs.points * self._row_parts,
-            n=pairs.points,
-            point_features=gradient.point_features,
-            point_offset=pairs.point_offset,
-            pair_pixel=pairs.pair_pixel,
-            pair_weight=weights.pair_weight,
-            pair_role=weights.pair_role,
-            grad_features=gradient.grad_features,
-            rest_or_gain=gradient.rest_or_gain,
-            grad_point_features=grads[0],
-            grad_opacity=grads[1],
-        )
-        return grads
-
-    def _program(self, weights):
-        return self.dev.program("raster/blend", HAS_ROLES=int(weights.has_roles), **self.defines)
+def _program(dev, weights, mean=False):
+    return dev.program(
+        "raster/blend",
+        LANES=lanes(dev, ON_GPU),
+        HAS_ROLES=int(weights.has_roles),
+        HAS_PAIR_GAIN=int(weights.blend == "alpha"),
+        MEAN=int(mean),
+    )

@@ -1,45 +1,30 @@
-"""Alpha and depth of a view, from the blend weights of its pixels."""
+"""Alpha and depth of a view, from the blend weights of its pixels, without the network."""
 
 from __future__ import annotations
-
-from typing import NamedTuple
 
 from pyopencl.array import Array
 
 from pp_cl.device.device import Device
-from pp_cl.raster.blend_weights import PixelWeights
 from pp_cl.raster.pairs import Pairs
-from pp_cl.raster.project import Footprint, ProjectedPoints
-
-
-class AlphaDepth(NamedTuple):
-    """What the points alone tell of a view, before the network; float32 arrays (H, W).
-
-    alpha: share of the pixel that is not background, in [0, 1]. depth: of the surface, along the
-    camera's axis, world units, mean by blend weight; median: where half of the weight is reached,
-    interpolated between hits; both infinite where alpha is 0.
-    """
-
-    alpha: Array
-    depth: Array
-    median: Array
+from pp_cl.raster.project import FOOTPRINTS, ProjectedPoints
+from pp_cl.raster.weights import BlendWeights
 
 
 def depth_forward(
     dev: Device,
     points: ProjectedPoints,
     pairs: Pairs,
-    weights: PixelWeights,
-    *,
-    footprint: Footprint,
+    weights: BlendWeights,
     size: tuple[int, int],
-) -> AlphaDepth:
-    """AlphaDepth of the view that points, pairs and weights belong to. footprint: theirs. size:
-    (H, W).
+) -> tuple[Array, Array, Array]:
+    """(alpha, depth, median) of the view that points, pairs and weights belong to, float32 (H, W).
+
+    alpha: share of the pixel that is not background, in [0, 1]. depth: of the surface, along the
+    camera's axis, world units, mean by blend weight; median: where half of the weight is reached,
+    interpolated between hits; both infinite where alpha is 0. size: (H, W).
     """
-    found = AlphaDepth(*(dev.empty(size) for _ in range(3)))
-    defines = {"HAS_ROLES": int(weights.has_roles), **footprint.defines}
-    dev.program("raster/depth", **defines).launch(
+    alpha, depth, median = (dev.empty(size) for _ in range(3))
+    dev.program("raster/depth", FOOTPRINT=FOOTPRINTS.index(points.footprint)).launch(
         "depth_forward",
         pairs.pixels,
         hw=pairs.pixels,
@@ -49,10 +34,9 @@ def depth_forward(
         pixel_offset=pairs.pixel_offset,
         pair_key=pairs.pair_key,
         pair_point_closeness=pairs.pair_point_closeness,
-        pair_weight=weights.pair_weight,
-        pair_role=weights.pair_role,
-        pixel_alpha=found.alpha,
-        pixel_depth=found.depth,
-        pixel_median=found.median,
+        pixel_entry=weights.pixel_entry,
+        pixel_alpha=alpha,
+        pixel_depth=depth,
+        pixel_median=median,
     )
-    return found
+    return alpha, depth, median

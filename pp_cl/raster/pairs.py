@@ -9,11 +9,11 @@ from pyopencl.array import Array
 
 from pp_cl.device.buffers import Buffers, Table, grown
 from pp_cl.device.device import Device
-from pp_cl.device.form import lanes
+from pp_cl.device.launch import lanes
 from pp_cl.device.scan import exclusive_scan, read_total
 from pp_cl.device.transfer import Reading
 from pp_cl.errors import UserError
-from pp_cl.raster.project import Footprint, ProjectedPoints
+from pp_cl.raster.project import FOOTPRINTS, ProjectedPoints
 
 MOST_PAIRS = 2**32 - 1  # pairs are numbered by uint32
 RUN = 64  # keys ranked at once by comparing all with all; longer lists are merged
@@ -22,12 +22,12 @@ LONG_LIST = RUN * RUN  # keys of lists that GPUs merge in more than one pass
 
 @dataclass(frozen=True)
 class Pairs:
-    """The hits of a view of N points and HW pixels, valid until the next one is built.
+    """The hits of a view of N points and HW pixels, valid until the next ones are found.
 
-    P is what there was room for: where there are more pairs, there are none of the pixels, and
-    those of the points must not be read.
+    There is room for P pairs. If there are more, the pixels have none, and the other arrays must
+    not be read: find them again with more room.
 
-    count: of one number, how many pairs there are.
+    count: how many pairs there are.
     point_offset: (N+1,) uint32, point i owns pairs point_offset[i] to point_offset[i+1].
     pixel_offset: (HW+1,) uint32, pixel q owns keys pixel_offset[q] to pixel_offset[q+1].
     pair_pixel: (P,) uint32, y*W + x. pair_point_closeness: (P, 2) uint32, the point, and the bits
@@ -35,7 +35,7 @@ class Pairs:
     each pixel by depth, then by point.
     """
 
-    count: Reading
+    count: Reading[int]
     point_offset: Array
     pixel_offset: Array
     pair_pixel: Array
@@ -45,7 +45,7 @@ class Pairs:
     @property
     def total(self) -> int:
         """The number of pairs; waits until it is known."""
-        return int(self.count.get()[0])
+        return self.count.get()
 
     @property
     def capacity(self) -> int:
@@ -63,108 +63,122 @@ class Pairs:
         return self.pixel_offset.size - 1
 
 
-class PairBuilder:
-    """Finds and sorts the hits of projected points; the buffers grow and are reused."""
+def pairs_table(n: int, pixels: int, pairs: int) -> Table:
+    """The buffers for n points, a number of pixels and room for a number of pairs."""
+    return {
+        "point_offset": ((n + 1,), np.uint32),
+        "pixel_count": ((pixels,), np.uint32),
+        "pixel_offset": ((pixels + 1,), np.uint32),
+        "pair_pixel": ((pairs,), np.uint32),
+        "pair_point_closeness": ((pairs, 2), np.uint32),
+        "pair_key": ((pairs,), np.uint64),
+        # depths and places in the pixels' lists until the keys are written, then for sorting them
+        "pair_scratch": ((pairs,), np.uint64),
+    }
 
-    def __init__(self, dev: Device, footprint: Footprint):
-        self.dev = dev
-        self._lanes = lanes(dev)
-        self.program = dev.program("raster/pairs", LANES=self._lanes, RUN=RUN, **footprint.defines)
-        self._buffers = Buffers(dev)
-        self._capacity = 0
 
-    @staticmethod
-    def table(n: int, pixels: int, pairs: int) -> Table:
-        """The buffers for n points, a number of pixels and room for a number of pairs."""
-        return {
-            "point_offset": ((n + 1,), np.uint32),
-            "pixel_count": ((pixels,), np.uint32),
-            "pixel_offset": ((pixels + 1,), np.uint32),
-            "pair_pixel": ((pairs,), np.uint32),
-            "pair_point_closeness": ((pairs, 2), np.uint32),
-            "pair_key": ((pairs,), np.uint64),
-            "pair_scratch": ((pairs,), np.uint64),
-        }
-
-    def build(self, points: ProjectedPoints, size: tuple[int, int]) -> Pairs:
-        """Pairs of an image of size (height, width), with room for all. Waits for the device.
-
-        Raises UserError for more pairs than can be numbered or kept in the device's memory.
-        """
-        while True:
-            pairs = self.enqueue(points, size)
-            if self.has_room(pairs):
-                return pairs
-            del pairs  # else its arrays would stay beside the larger ones
-
-    def has_room(self, pairs: Pairs) -> bool:
-        """Whether there was room for the pairs; if not, the next ones will have it. Waits until
-        their number is known. Raises UserError as build() does.
-        """
-        total = pairs.total
-        if total >= MOST_PAIRS:
-            raise UserError(
-                f"the points of one view cover more than {MOST_PAIRS} pixels in all: "
-                "lower --points, raise --downscale, or lower raster.radius"
-            )
-        if total > pairs.capacity:
-            self._capacity = grown(self._capacity, total)
-        return total <= pairs.capacity
-
-    def enqueue(self, points: ProjectedPoints, size: tuple[int, int]) -> Pairs:
-        """As build(), but without waiting, and perhaps without room."""
-        n, pixels, b = len(points.point_box), size[0] * size[1], self._buffers
-        capacity = max(1, self._capacity)
-        b.require(self.table(n, pixels, capacity))
-        exclusive_scan(self.dev, points.point_count, b.point_offset)
-        count = read_total(self.dev, b.point_offset)
-        self.dev.fill(b.pixel_count, 0)
-        self.program.launch(
-            "pairs_fill",
-            -(-n // self._lanes),
-            n=n,
-            p=capacity,
-            radii=points.point_radius.size,
-            camera=points.camera_buffer,
-            point_radius=points.point_radius,
-            point_camera=points.point_camera,
-            point_box=points.point_box,
-            point_offset=b.point_offset,
-            pair_pixel=b.pair_pixel,
-            pair_point_closeness=b.pair_point_closeness,
-            pair_place=b.pair_scratch,
-            pixel_count=b.pixel_count,
+def find_pairs(
+    dev: Device, b: Buffers, points: ProjectedPoints, size: tuple[int, int], room: int = 1
+) -> Pairs:
+    """The hits in an image of size (height, width), if there are no more than `room`; does not wait
+    for the device.
+    """
+    n, pixels = len(points.point_box), size[0] * size[1]
+    b.require(pairs_table(n, pixels, room))
+    pair_place = b.pair_scratch
+    program = dev.program(
+        "raster/pairs", LANES=lanes(dev), RUN=RUN, FOOTPRINT=FOOTPRINTS.index(points.footprint)
+    )
+    exclusive_scan(dev, points.point_count, b.point_offset)
+    count = read_total(dev, b.point_offset)
+    dev.fill(b.pixel_count, 0)
+    program.launch(
+        "pairs_fill",
+        -(-n // lanes(dev)),
+        n=n,
+        p=room,
+        radii=points.point_radius.size,
+        camera=points.camera_buffer,
+        point_radius=points.point_radius,
+        point_camera=points.point_camera,
+        point_box=points.point_box,
+        point_offset=b.point_offset,
+        pair_pixel=b.pair_pixel,
+        pair_point_closeness=b.pair_point_closeness,
+        pair_place=pair_place,
+        pixel_count=b.pixel_count,
+    )
+    exclusive_scan(dev, b.pixel_count, b.pixel_offset)
+    program.launch(
+        "pairs_scatter",
+        room,
+        p=room,
+        hw=pixels,
+        pair_pixel=b.pair_pixel,
+        pair_place=pair_place,
+        pixel_offset=b.pixel_offset,
+        pair_key=b.pair_key,
+    )
+    pairs = Pairs(
+        count, b.point_offset, b.pixel_offset, b.pair_pixel, b.pair_point_closeness, b.pair_key
+    )
+    if dev.is_cpu:
+        program.launch(
+            "pairs_sort",
+            pixels,
+            hw=pixels,
+            pixel_offset=b.pixel_offset,
+            scratch=b.pair_scratch,
+            pair_key=b.pair_key,
         )
-        exclusive_scan(self.dev, b.pixel_count, b.pixel_offset)
-        self.program.launch(
-            "pairs_scatter",
+    else:
+        _sort_in_parallel(program, pairs, b.pair_scratch)
+    return pairs
+
+
+def room_needed(pairs: Pairs) -> int:
+    """The room that these pairs have, or a larger one with which they fit. Waits until their number
+    is known. Raises UserError for more than can be numbered.
+    """
+    total = pairs.total
+    if total >= MOST_PAIRS:
+        raise UserError(
+            f"the points of one view cover more than {MOST_PAIRS} pixels in all: "
+            "lower --points, raise --downscale, or lower raster.radius"
+        )
+    return grown(pairs.capacity, total)
+
+
+def _sort_in_parallel(program, pairs, scratch):
+    """Sort the keys of each pixel in place, one work-item per key."""
+    capacity, pixels = pairs.capacity, pairs.pixels
+    program.launch(
+        "pairs_sort_runs",
+        capacity,
+        p=capacity,
+        hw=pixels,
+        pair_pixel=pairs.pair_pixel,
+        pixel_offset=pairs.pixel_offset,
+        pair_key=pairs.pair_key,
+        sorted=scratch,
+    )
+
+    def merge(source, target, width, group, least):
+        program.launch(
+            "pairs_merge_runs",
             capacity,
             p=capacity,
             hw=pixels,
-            pair_pixel=b.pair_pixel,
-            pair_place=b.pair_scratch,
-            pixel_offset=b.pixel_offset,
-            pair_key=b.pair_key,
+            width=width,
+            group=group,
+            least=least,
+            pair_pixel=pairs.pair_pixel,
+            pixel_offset=pairs.pixel_offset,
+            sorted=source,
+            pair_key=target,
         )
-        self._sort(pixels, capacity)
-        fields = ("point_offset", "pixel_offset", "pair_pixel", "pair_point_closeness", "pair_key")
-        return Pairs(count, **{name: getattr(b, name) for name in fields})
 
-    def _sort(self, pixels, capacity):
-        """Sort the keys of each pixel in place."""
-        b = self._buffers
-        keys = {"hw": pixels, "pixel_offset": b.pixel_offset, "pair_key": b.pair_key}
-        if self.dev.is_cpu:
-            self.program.launch("pairs_sort", pixels, scratch=b.pair_scratch, **keys)
-            return
-        keys |= {"p": capacity, "pair_pixel": b.pair_pixel, "sorted": b.pair_scratch}
-        self.program.launch("pairs_sort_runs", capacity, **keys)
-        self._merge(capacity, keys, width=RUN, group=LONG_LIST, least=0)
-        if capacity > LONG_LIST:  # there and back, for the lists that are longer
-            group = LONG_LIST * RUN
-            there = {"sorted": b.pair_key, "pair_key": b.pair_scratch}
-            self._merge(capacity, keys | there, width=LONG_LIST, group=group, least=LONG_LIST)
-            self._merge(capacity, keys, width=group, group=MOST_PAIRS, least=LONG_LIST)
-
-    def _merge(self, capacity, keys, **runs):
-        self.program.launch("pairs_merge_runs", capacity, **keys, **runs)
+    merge(scratch, pairs.pair_key, RUN, LONG_LIST, 0)
+    if capacity > LONG_LIST:  # there and back, for the lists that are longer
+        merge(pairs.pair_key, scratch, LONG_LIST, LONG_LIST * RUN, LONG_LIST)
+        merge(scratch, pairs.pair_key, LONG_LIST * RUN, MOST_PAIRS, LONG_LIST)

@@ -6,8 +6,6 @@ from typing import Any
 
 import numpy as np
 
-from pp_cl.reference.raster import sh_basis
-
 Arrays = dict[str, np.ndarray]
 
 EPS = 1e-6
@@ -239,6 +237,15 @@ def alpha(geometry_: Arrays, opacity: np.ndarray, least: float = 0.0) -> Arrays:
     }
 
 
+def blend_by_rule(
+    rule: str, geometry_: Arrays, opacity: np.ndarray, gamma: float, stop: float = 0.0
+) -> Arrays:
+    """alpha() or blend(). rule: "alpha" or "softmax"."""
+    if rule == "alpha":
+        return alpha(geometry_, opacity, stop)
+    return blend(geometry_, opacity, gamma, stop)
+
+
 def distances(geometry_: Arrays, blend_: Arrays) -> np.ndarray:
     """(N, HW) sum_j b_j |z_i - z_j| of the hits that are used; 0 elsewhere."""
     depth, weight, hit = geometry_["depth"], blend_["weight"], blend_["hit"]
@@ -284,6 +291,26 @@ def alpha_gradients(
     dL_do = (slope * geometry_["closeness"]).sum(axis=1)
     weight = np.where(tracked, blend_["weight"], 0)
     return scale[:, None] * (weight @ G), scale * dL_do, scale[:, None] * slope
+
+
+def sh_basis(directions: np.ndarray) -> np.ndarray:
+    """(N, 9) real harmonics of degrees 0 to 2 of unit directions (N, 3), as cl/sh.h orders them."""
+    x, y, z = np.asarray(directions, np.float64).T
+    first, second = np.sqrt(3 / (4 * np.pi)), np.sqrt(15 / (4 * np.pi))
+    return np.stack(
+        [
+            np.full_like(x, 0.5 / np.sqrt(np.pi)),
+            -first * y,
+            first * z,
+            -first * x,
+            second * x * y,
+            -second * y * z,
+            np.sqrt(5 / (16 * np.pi)) * (3 * z * z - 1),
+            -second * x * z,
+            0.5 * second * (x * x - y * y),
+        ],
+        -1,
+    )
 
 
 def shade(positions: np.ndarray, eye: np.ndarray, coefficients: np.ndarray) -> np.ndarray:

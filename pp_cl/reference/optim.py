@@ -4,7 +4,7 @@ coefficients, grid smoothing.
 
 import numpy as np
 
-from pp_cl.reference.raster import sh_basis
+from pp_cl.reference.dense import sh_basis
 
 
 class Adam:

@@ -7,7 +7,7 @@ import math
 import numpy as np
 
 from pp_cl.device.device import Device
-from pp_cl.device.form import lanes
+from pp_cl.device.launch import lanes
 from pp_cl.errors import UserError
 from pp_cl.scene.camera import Camera
 from pp_cl.scene.grid import Grid

@@ -7,7 +7,6 @@ from pyopencl.array import Array
 
 from pp_cl.device.buffers import Buffers
 from pp_cl.device.device import Device
-from pp_cl.device.transfer import send
 from pp_cl.scene.views import View
 
 
@@ -29,7 +28,7 @@ class Target:
         if self._view is None or self._view.image is not view.image:
             if self._image is None or self._image.shape != view.image.shape:
                 self._image = self.dev.empty(view.image.shape, np.uint8)
-            send(self.dev, self._image, view.image)
+            self.dev.send(self._image, view.image)
         self._view = view
 
     def crop(self, box: tuple[int, int, int, int], jitter: tuple[int, int] = (0, 0)) -> Array:

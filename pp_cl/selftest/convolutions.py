@@ -6,7 +6,7 @@ from types import ModuleType
 import numpy as np
 
 from pp_cl.device.device import Device
-from pp_cl.layers.conv import Blocking, Direction, Work, pack_bias, pack_weights
+from pp_cl.layers.conv import Blocking, pack_bias, pack_weights
 from pp_cl.layers.tiles import Tiles
 from pp_cl.reference.network import convolution, convolution_backward_weights, flipped
 from pp_cl.selftest.case import Check, allowed
@@ -69,23 +69,14 @@ class Layer:
     def computed(
         self, dev: Device, conv: ModuleType, blocking: Blocking, tiles: Tiles | None = None
     ) -> list[np.ndarray]:
-        """As `expected`, by a module of convolutions with no more memory than it asks for. tiles:
-        of the output, and of the gradients.
-        """
+        """As `expected`, by a module of convolutions. tiles: of output and gradients."""
         sources = tuple(dev.upload(part) for part in self.parts)
         weight, bias = dev.upload(pack_weights(self.weight)), dev.upload(pack_bias(self.bias))
         grad_out = dev.upload(self.grad_out)
 
-        def given(direction, c):
-            height = len(self.grad_out)
-            floats = conv.work_floats(dev, blocking, direction, height, weight.shape, c)
-            return {"work": Work.empty(dev, *floats), "tiles": tiles}
-
-        ci = self.weight.shape[1]
         out, grad_weight, grad_bias = (dev.empty(a.shape) for a in self.expected[:3])
-        forward, weights = given(Direction.FORWARD, ci), given(Direction.BACKWARD_WEIGHTS, ci)
-        conv.forward(dev, blocking, sources, weight, bias, out, relu=self.relu, **forward)
-        conv.backward_weights(dev, blocking, sources, grad_out, grad_weight, grad_bias, **weights)
+        conv.forward(dev, blocking, sources, weight, bias, out, relu=self.relu, tiles=tiles)
+        conv.backward_weights(dev, blocking, sources, grad_out, grad_weight, grad_bias, tiles=tiles)
         first, results = 0, [out, grad_weight, grad_bias]
         for source in sources:
             results.append(dev.empty(source.shape))
@@ -97,7 +88,7 @@ class Layer:
                 grad_out,
                 results[-1],
                 mask=source if self.relu else None,
-                **given(Direction.BACKWARD_INPUT, source.shape[2]),
+                tiles=tiles,
             )
             first += source.shape[2]
         return [array.get() for array in results]

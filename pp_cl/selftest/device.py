@@ -1,34 +1,39 @@
 """Cases of prefix sums and of rows that are moved: exact, as all of it is integers and copies."""
 
 from collections.abc import Iterator
+from itertools import product
 
 import numpy as np
 
-from pp_cl.device.compact import compact_rows, gather_rows
 from pp_cl.device.device import Device
+from pp_cl.device.launch import LARGEST_GROUP
+from pp_cl.device.rows import compact_rows, gather_rows
 from pp_cl.device.scan import block_values, exclusive_scan, nonzero
 from pp_cl.selftest.case import SIZES, Case, Check, exact
 
 
 def _scan(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
-    """One block, its edges, two levels and three; sums up to 32 bits."""
+    """One block, its edges, two levels and three; sums beyond 32 bits."""
     block = block_values(dev)
     for n in (*SIZES, block, block + 1, block * block + 1):
         values = rng.integers(0, 9, n, dtype=np.uint32)
         offsets = dev.empty((n + 1,), np.uint32)
         exclusive_scan(dev, dev.upload(values), offsets)
         yield exact(offsets.get(), np.concatenate([[0], np.cumsum(values)]))
-    offsets = dev.empty((4,), np.uint32)
-    exclusive_scan(dev, dev.upload([2**31, 2**31 - 1, 0], np.uint32), offsets)
-    yield exact(offsets.get(), [0, 2**31, 2**32 - 1, 2**32 - 1])
+    # within a group, and from one block to the next, sums above the largest uint stay there
+    for n in (3, LARGEST_GROUP, 2 * block + 7):
+        for value in (2**31 - 1, 2**29 + 1):
+            offsets = dev.empty((n + 1,), np.uint32)
+            exclusive_scan(dev, dev.upload(np.full(n, value), np.uint32), offsets)
+            yield exact(offsets.get(), np.minimum(np.arange(n + 1) * value, 2**32 - 1))
 
 
 def _nonzero(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
-    for n in (*SIZES, block_values(dev) + 1):
-        flags = rng.integers(1, 256, n) * (rng.random(n) < 0.3)
+    for n, share in product((*SIZES, block_values(dev) + 1), (0.0, 0.3, 1.0)):
+        flags = rng.integers(1, 256, n) * (rng.random(n) < share)
         indices = dev.empty((n,), np.uint32)
         listed = nonzero(dev, dev.upload(flags, np.uint8), indices)
-        yield exact(listed.array.get(), np.flatnonzero(flags))
+        yield exact(listed.get().get(), np.flatnonzero(flags))
 
 
 def _compact(dev: Device, rng: np.random.Generator) -> Iterator[Check]:

@@ -6,7 +6,7 @@ from functools import cache, partial
 import numpy as np
 
 from pp_cl.device.device import Device
-from pp_cl.layers.choice import SHIPPED, VARIANTS, device_class
+from pp_cl.layers.choice import ERRORS, OFFERED, SHIPPED, VARIANTS, device_class
 from pp_cl.layers.gate import gate_backward, gate_forward
 from pp_cl.layers.output import SHARE, output_backward, output_forward, residual_backward
 from pp_cl.layers.resample import (
@@ -77,8 +77,8 @@ _hard_layers = cache(hard_layers)
 
 def _convolution(variant: str, dev: Device, rng: np.random.Generator) -> Iterator[Check]:
     """All directions; awkward sizes, two sources, a masked gradient."""
-    module, bound = VARIANTS[variant].module, BOUNDS[variant]
-    layers = _layers() if 1 in VARIANTS[variant].errors else _layers()[: len(SHAPES)]
+    module, bound = VARIANTS[variant], BOUNDS[variant]
+    layers = _layers() if 1 in ERRORS[variant] else _layers()[: len(SHAPES)]
     for layer in layers:
         results = layer.computed(dev, module, SHIPPED[device_class(dev)])
         for actual, expected in zip(results, layer.expected, strict=True):
@@ -89,7 +89,7 @@ def _convolution(variant: str, dev: Device, rng: np.random.Generator) -> Iterato
 def _hard_convolution(variant: str, dev: Device, rng: np.random.Generator) -> Iterator[Check]:
     """Large means, weights over six decades, values of 6e4 and 1e-7, 512 channels, zeros."""
     for layer in _hard_layers().values():
-        results = layer.computed(dev, VARIANTS[variant].module, SHIPPED[device_class(dev)])
+        results = layer.computed(dev, VARIANTS[variant], SHIPPED[device_class(dev)])
         yield from map(within, results, layer.expected)
 
 
@@ -209,7 +209,7 @@ def _copied_tiles(dev, rng, x):
 
 
 # Those for GPUs run on CPUs as well, slowly; those for CPUs might hang a GPU.
-_ONLY = {name: None if "GPU" in variant.devices else name for name, variant in VARIANTS.items()}
+_ONLY = {name: None if name in OFFERED["GPU"] else name for name in VARIANTS}
 
 CASES = (
     *(Case(f"conv: {v}", partial(_convolution, v), _ONLY[v]) for v in VARIANTS),

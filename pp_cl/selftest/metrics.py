@@ -5,7 +5,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from pp_cl.device.device import Device
-from pp_cl.device.form import group_ranges, row_parts
+from pp_cl.device.launch import group_ranges, row_parts
 from pp_cl.metrics.lpips import Lpips, lpips_program
 from pp_cl.metrics.shape import Mesh, sample_surface
 from pp_cl.reference import lpips

@@ -7,12 +7,11 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import ArrayLike
 
-from pp_cl.bench.spheres import spheres_backward
+from pp_cl.bench.spheres import find_all_pairs, project_spheres, spheres_backward
+from pp_cl.device.buffers import Buffers
 from pp_cl.device.device import Device
-from pp_cl.raster.blend import BLENDS, Blend
-from pp_cl.raster.blend_weights import DROPPED
-from pp_cl.raster.pairs import PairBuilder
-from pp_cl.raster.project import Footprint, Projection
+from pp_cl.raster.blend import blend_backward, blend_forward
+from pp_cl.raster.weights import DROPPED, blend_weights
 from pp_cl.reference import dense
 from pp_cl.scene.camera import Camera, look_at
 
@@ -58,14 +57,16 @@ class PairedPoints:
         self.dev, self.camera, self.n = dev, camera, len(positions)
         self._exact, self.depth_range = (positions, radius, kind), depth_range
         self.shape = (camera.height, camera.width)
-        self.footprint = Footprint(kind)
-        self.camera_buffer = dev.upload(camera.packed(depth_range))
-        self.projected = Projection(dev, self.footprint).spheres(
-            self.camera_buffer,
+        self.buffers = Buffers(dev)
+        self.projected = project_spheres(
+            dev,
+            self.buffers,
+            kind,
+            dev.upload(camera.packed(depth_range)),
             dev.upload(positions, np.float32),
-            dev.upload(np.atleast_1d(radius), np.float32),
+            point_radius=dev.upload(np.atleast_1d(radius), np.float32),
         )
-        self.pairs = PairBuilder(dev, self.footprint).build(self.projected, self.shape)
+        self.pairs = find_all_pairs(dev, self.buffers, self.projected, self.shape)
 
     @property
     def seen(self) -> np.ndarray:
@@ -114,20 +115,25 @@ class PairedPoints:
         **drops: float,
     ) -> np.ndarray:
         """(H, W, 16) blended features; those of the points that are not shaded are set to NaN
-        first. rule: of BLENDS. drops: of BlendWeights.compute().
+        first. rule: of BLENDS. drops: max_tracked and early_stop.
         """
         self.gamma, self.mean, self.opacity = gamma, mean, self.dev.upload(opacity, np.float32)
-        self.weighing = BLENDS[rule](self.dev)
-        self.blending = Blend(self.dev, self.weighing, mean)
-        self.weights = self.weighing.compute(
-            self.pairs, self.camera_buffer, self.opacity, gamma, **drops
+        self.weights = blend_weights(
+            self.dev,
+            self.buffers,
+            self.pairs,
+            self.projected.camera_buffer,
+            self.opacity,
+            blend=rule,
+            gamma=gamma,
+            **drops,
         )
         shaded = np.isin(np.arange(self.n), self.weights.shaded.get())
         self.point_features = self.dev.upload(
             np.where(shaded[:, None], point_features, np.nan), np.float32
         )
         self.features = self.dev.empty((*self.shape, 16))
-        self.blending.forward(self.pairs, self.weights, self.point_features, self.features)
+        blend_forward(self.dev, self.pairs, self.weights, self.point_features, self.features)
         return self.features.get()
 
     def weight(self) -> np.ndarray:
@@ -149,40 +155,41 @@ class PairedPoints:
         """{"features": (N, 16), "opacity": (N,)} of sum(features * grad_features) and, where given,
         sum(alpha * grad_alpha) and the pixels' spread times its weight, after blend().
         """
-        gradient = self._gradient(grad_features, grad_alpha, spread_weight)
-        features, opacity = self.blending.backward(gradient)
+        if grad_alpha is not None:
+            grad_alpha = self.dev.upload(grad_alpha, np.float32)
+        features, opacity = blend_backward(
+            self.dev,
+            self.buffers,
+            self.pairs,
+            self.weights,
+            point_features=self.point_features,
+            features=self.features,
+            grad_features=self._uploaded(grad_features),
+            grad_alpha=grad_alpha,
+            spread_weight=spread_weight,
+            mean=self.mean,
+        )
         return {"features": features.get(), "opacity": opacity.get()}
 
     def sphere_gradients(self, grad_features: np.ndarray) -> Gradients:
-        """{"positions": (N, 3), "radius": (N,)} of the same."""
-        gradient = self._gradient(grad_features)
+        """{"positions": (N, 3), "radius": (N,)} of the same, and those of gradients()."""
+        gradients = self.gradients(grad_features)
         positions, radius = spheres_backward(
             self.dev,
             self.projected,
             self.pairs,
             self.weights,
+            self.buffers,
             opacity=self.opacity,
             gamma=self.gamma,
             point_features=self.point_features,
-            grad_features=gradient.grad_features,
-            rest_or_gain=gradient.rest_or_gain,
+            grad_features=self._uploaded(grad_features),
             mean=self.mean,
         )
-        return {"positions": positions.get(), "radius": radius.get()}
+        return gradients | {"positions": positions.get(), "radius": radius.get()}
 
-    def _gradient(self, grad_features, grad_alpha=None, spread_weight=0.0):
-        if grad_alpha is not None:
-            grad_alpha = self.dev.upload(grad_alpha, np.float32)
-        grad = self.dev.upload(np.reshape(grad_features, (*self.shape, 16)), np.float32)
-        return self.blending.gradient(
-            self.pairs,
-            self.weights,
-            self.point_features,
-            features=self.features,
-            grad_features=grad,
-            grad_alpha=grad_alpha,
-            spread_weight=spread_weight,
-        )
+    def _uploaded(self, grad_features):
+        return self.dev.upload(np.reshape(grad_features, (*self.shape, 16)), np.float32)
 
 
 NEAR, FAR = dense.DEPTH_RANGE
@@ -206,9 +213,6 @@ def blend_on_axis(
     scene = PairedPoints(dev, AXIS, positions, AXIS_RADIUS)
     scene.blend(np.asarray(opacity), gamma, np.resize(np.eye(16), (len(z), 16)), **options)
     return scene, scene.weight()[:, 0]
-
-
-GAMMAS = (0.1, 0.01)
 
 
 class Blended:
@@ -245,10 +249,7 @@ class Blended:
         ).reshape(-1, 16)
         self.geometry = self.scene.geometry()
         stop = blend.get("early_stop", 0.0)
-        if rule == "alpha":
-            self.blend = dense.alpha(self.geometry, self.opacity, stop)
-        else:
-            self.blend = dense.blend(self.geometry, self.opacity, gamma, stop)
+        self.blend = dense.blend_by_rule(rule, self.geometry, self.opacity, gamma, stop)
         self.weight = self.scene.weight()
         self.role = self.scene.dense(self.scene.roles())
 

@@ -7,13 +7,13 @@ from itertools import product
 
 import numpy as np
 
+from pp_cl.device.buffers import Buffers
 from pp_cl.device.device import Device
-from pp_cl.raster.blend import BLENDS
-from pp_cl.raster.blend_weights import DROPPED
 from pp_cl.raster.depth import depth_forward
-from pp_cl.raster.project import KINDS, Footprint, Projection
-from pp_cl.raster.sh import SH_BLOCKS
+from pp_cl.raster.points import SH_BLOCKS
+from pp_cl.raster.project import FOOTPRINTS, project_grid
 from pp_cl.raster.shade import shade_forward
+from pp_cl.raster.weights import BLENDS, DROPPED, record_weights
 from pp_cl.reference import dense
 from pp_cl.scene.grid import Grid
 from pp_cl.selftest.case import EPS, SIZES, Case, Check, each, exact, finite, no_more, relative
@@ -43,11 +43,14 @@ def _project(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
     for n in SIZES:
         ids = rng.choice(np.prod(GRID.dims), n, replace=False)
         ids[0] = np.prod(GRID.dims) - 1
-        points = Projection(dev, Footprint("disc")).grid(
+        points = project_grid(
+            dev,
+            Buffers(dev),
+            "disc",
             dev.upload(camera.packed(dense.DEPTH_RANGE)),
             dev.upload(GRID.packed()),
-            dev.upload(ids, np.uint32),
-            dev.zeros((1,)),
+            point_id=dev.upload(ids, np.uint32),
+            point_radius=dev.zeros((1,)),
         )
         place = dense.camera_space(camera, GRID.positions(ids))
         yield relative(points.point_camera.get()[:, :3], place, PLACED)
@@ -70,7 +73,7 @@ def _not_finite(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
         yield exact(scene.seen, [0, 2])
         features = scene.blend(np.ones(3), 0.01, np.ones((3, 16)) * 2)
         ones = np.ones((1, 1, 16))
-        gradients = scene.gradients(ones) | scene.sphere_gradients(ones)
+        gradients = scene.sphere_gradients(ones)
         yield finite(features, *gradients.values())
         yield exact([g[1].any() for g in gradients.values()], [False] * 4)
 
@@ -78,7 +81,7 @@ def _not_finite(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
 def _behind(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
     """Points behind the eye, on its plane and at the eye are left out."""
     positions = np.array([[0, 0, -3.0], [0, 0, 0], [3.0, 0, 0], [0, 3.0, 1e-9], [0, 0, 3.0]])
-    for kind in KINDS:
+    for kind in FOOTPRINTS:
         scene = PairedPoints(dev, AXIS, positions, 0.01, kind=kind, depth_range=(1e-3, FAR))
         yield exact(scene.projected.point_camera.get()[:, 3], [-1, -1, -1, -1, 3])
         yield exact(scene.seen, [4])
@@ -203,30 +206,29 @@ def _medians(blended, weight, z):
 
 
 def _depths(dev, scene):
-    view = scene.projected, scene.pairs, scene.weights
-    arrays = depth_forward(dev, *view, footprint=scene.footprint, size=scene.shape)
+    arrays = depth_forward(dev, scene.projected, scene.pairs, scene.weights, scene.shape)
     return [array.get().ravel() for array in arrays]
 
 
-def _peaks(rule: str, dev: Device, rng: np.random.Generator) -> Iterator[Check]:
-    """The highest weight of each point, and how often it was looked at."""
+def _record(rule: str, dev: Device, rng: np.random.Generator) -> Iterator[Check]:
+    """The highest weight of each point, and how often it was seen."""
     options = {"early_stop": 0.05, "max_tracked": 2}
     blended = Blended(dev, rng, 500, gamma=0.02, radius=0.4, rule=rule, **options)
-    before, looks = (dev.upload(x * np.arange(500), np.float32) for x in (2e-3, 1))
-    peak, scene = before.copy(), blended.scene
-    scene.weighing.raise_peaks(scene.pairs, scene.weights, peak, looks)
-    yield exact(looks.get() - np.arange(500), blended.geometry["hit"].any(axis=1))
+    before, seen = (dev.upload(x * np.arange(500), np.float32) for x in (2e-3, 1))
+    highest, scene = before.copy(), blended.scene
+    record_weights(dev, scene.pairs, scene.weights, highest, seen)
+    yield exact(seen.get() - np.arange(500), blended.geometry["hit"].any(axis=1))
     weight = blended.blend["weight"].sum(axis=1)
-    yield relative(peak.get(), np.maximum(before.get(), weight), PLACED)
+    yield relative(highest.get(), np.maximum(before.get(), weight), PLACED)
 
 
 CASES = (
     Case("raster: project", _project),
     Case("raster: positions that are not finite", _not_finite),
     Case("raster: points behind and at the eye", _behind),
-    *(Case(f"raster: pairs, {kind}", partial(_pairs, kind)) for kind in KINDS),
+    *(Case(f"raster: pairs, {kind}", partial(_pairs, kind)) for kind in FOOTPRINTS),
     Case("raster: thousands of equal depths", _equal_depths),
     Case("raster: shade", _shade),
     *(Case(f"raster: depth, {rule}", partial(_depth, rule)) for rule in BLENDS),
-    *(Case(f"raster: highest weights, {rule}", partial(_peaks, rule)) for rule in BLENDS),
+    *(Case(f"raster: highest weights, {rule}", partial(_record, rule)) for rule in BLENDS),
 )

@@ -1,5 +1,6 @@
 """Cases of what a training step does: losses, Adam, smoothing, EMA, refining."""
 
+import itertools
 from collections.abc import Iterator
 from functools import partial
 
@@ -7,7 +8,7 @@ import numpy as np
 
 from pp_cl.device.device import Device
 from pp_cl.layers.choice import make_policy
-from pp_cl.raster.sh import SH_DEGREES
+from pp_cl.raster.points import SH_DEGREES
 from pp_cl.reference import loss as reference_loss
 from pp_cl.reference import optim
 from pp_cl.reference.lpips import lpips, lpips_gradient, random_weights
@@ -24,12 +25,12 @@ from pp_cl.selftest.case import (
     relative,
 )
 from pp_cl.selftest.updated_points import Cloud, gradients
-from pp_cl.training.adam import adam_update, ema_update
-from pp_cl.training.loss import Loss
+from pp_cl.training.loss import FURTHER, Loss
 from pp_cl.training.mask import MaskLoss
+from pp_cl.training.optim import adam_update, ema_update
 from pp_cl.training.perceptual import PerceptualLoss
-from pp_cl.training.refine import split_opacity
 from pp_cl.training.smooth import Smoother
+from pp_cl.training.state import split_opacity
 
 LOSS = 16 * EPS  # 22 taps of a window, in two passes, and the sums of rows and columns
 FLAT = 3e-6  # variances of nothing: rounding of Var[d] over C2 = 0.03^2
@@ -59,7 +60,7 @@ def _loss_checks(dev, prediction, target, weights, *bounds):
     loss = Loss(dev, *weights)
     grad = loss.forward_backward(dev.upload(prediction), dev.upload(target)).get()
     terms, expected = reference_loss.loss(prediction, target, *weights)
-    yield each(loss.terms.get(), terms, bounds[0], floor=1e-10 / bounds[0])
+    yield each(loss.terms.get()[:4], terms, bounds[0], floor=1e-10 / bounds[0])
     yield relative(grad, expected, bounds[-1])
 
 
@@ -80,7 +81,7 @@ def _hard_loss(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
 def _equal_images(dev, image):
     loss = Loss(dev, 0.2)
     grad = loss.forward_backward(dev.upload(image), dev.upload(image)).get()
-    yield exact(loss.terms.get(), np.zeros(4))
+    yield exact(loss.terms.get(), np.zeros(8))
     yield exact(grad, np.zeros_like(image))
 
 
@@ -92,21 +93,66 @@ def _mask_loss(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
     for side in SIZES:
         size, inside = (side + 3, 36), np.s_[top : top + side, left : left + width]
         transmittance, mask = rng.random(size), rng.random((side, width))
-        loss, terms = MaskLoss(dev, weight), dev.upload([1, 2, 3, 4], np.float32)
-        grad = loss.add(
+        squares, grad = MaskLoss(dev, weight).forward_backward(
             dev.upload(transmittance.ravel(), np.float32),
             dev.upload(mask, np.float32),
             size=size,
             offset=(left, top),
             shortfall=shortfall,
-            terms=terms,
         )
         difference = 1 - transmittance[inside] - mask
         weighted = np.where(difference < 0, shortfall, 1) * difference
-        yield relative(terms.get(), [1 + weight * np.mean(weighted * difference), 2, 3, 4], 8 * EPS)
+        sums = np.zeros(size[0])
+        sums[top : top + side] = (weighted * difference).sum(axis=1)
+        yield relative(squares.get(), sums, 8 * EPS)
         expected = np.zeros(size)
         expected[inside] = 2 * weight * weighted / mask.size
         yield relative(grad.get().reshape(size), expected, 8 * EPS)
+
+
+def _sum_of_terms(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
+    """The loss is that of the image and the weighted sums of all that is added."""
+    prediction, target = _images(rng, 12, 33)
+    for n in SIZES:
+        loss, expected = Loss(dev, 0.2), np.zeros(8)
+        expected[:4], _ = reference_loss.loss(prediction, target, 0.2)
+        for _ in range(2):  # each time anew
+            loss.forward_backward(dev.upload(prediction), dev.upload(target))
+            for i, name in enumerate(FURTHER):
+                values = rng.random(n).astype(np.float32)
+                loss.add(name, dev.upload(values), 0.5 + i, scale=1 / n)
+                expected[4 + i] = values.mean(dtype=np.float64)
+        expected[0] += expected[4:7] @ (0.5, 1.5, 2.5)
+        yield each(loss.terms.get(), expected, LOSS)
+
+
+def _spread(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
+    """sum_ij b_i b_j |z_i - z_j| of each pixel's hits; some have none, some lists end early."""
+    for pixels in SIZES:
+        lengths = rng.integers(0, 9, pixels)
+        offset = np.concatenate([[0], np.cumsum(lengths)])
+        b, z = rng.random((2, offset[-1])).astype(np.float32)
+        order = np.lexsort((z, np.repeat(np.arange(pixels), lengths)))
+        z = (100 + z[order]).astype(np.float32)
+        entry = b.view(np.uint32).astype(np.uint64) << np.uint64(32)
+        entry[rng.random(len(entry)) < 0.1] += np.uint64(2**32 - 1)
+        ended = (entry & np.uint64(2**32 - 1)) > 0
+        expected = []
+        for first, end in itertools.pairwise(offset):
+            stop = first + np.argmax(np.append(ended[first:end], True))
+            weights, depths = b[first:stop].astype(np.float64), z[first:stop].astype(np.float64)
+            expected.append(weights @ np.abs(depths[:, None] - depths) @ weights)
+        spread = dev.empty((pixels,))
+        dev.program("training/loss").launch(
+            "loss_pixel_spread",
+            pixels,
+            hw=pixels,
+            pixel_offset=dev.upload(offset, np.uint32),
+            pair_key=dev.upload(z.view(np.uint32).astype(np.uint64) << np.uint64(32)),
+            pixel_entry=dev.upload(entry),
+            pixel_spread=spread,
+        )
+        yield absolute(spread.get(), expected, 64 * EPS)  # of up to 28 products below 1, twice
 
 
 def _perceptual_loss(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
@@ -115,11 +161,11 @@ def _perceptual_loss(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
         target = rng.uniform(0, 1, (*size, 3))
         prediction = target + rng.normal(0, 0.2, target.shape)
         loss = PerceptualLoss(dev, 0.3, make_policy(dev, variant="direct"), weights)
-        terms, grad = dev.zeros((4,)), dev.zeros(target.shape)
         images = [dev.upload(image, np.float32) for image in (prediction, target)]
-        loss.add(*images, (0, 0), grad_prediction=grad, terms=terms)
+        grad = dev.zeros(target.shape)
+        distances = loss.add_gradient(*images, (0, 0), grad).get()
         given = [image.get().astype(np.float64) for image in images]
-        yield relative(terms.get(), [0.3 * lpips(*given, weights), 0, 0, 0], DEEP)
+        yield relative(distances.sum(dtype=np.float64), lpips(*given, weights), DEEP)
         yield relative(grad.get(), 0.3 * lpips_gradient(*given, weights), DEEP)
 
 
@@ -263,6 +309,8 @@ CASES = (
     Case("loss: L1 and SSIM", _loss),
     Case("loss: flat and equal images", _hard_loss),
     Case("loss: mask", _mask_loss),
+    Case("loss: spread", _spread),
+    Case("loss: sum of its terms", _sum_of_terms),
     Case("loss: perceptual", _perceptual_loss),
     Case("adam: arrays", _adam),
     Case("adam: gradients of 0, 1e-20 and 1e10", _adam_extremes),

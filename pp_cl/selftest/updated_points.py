@@ -5,12 +5,12 @@ from collections.abc import Sequence
 import numpy as np
 
 from pp_cl.device.device import Device
+from pp_cl.raster.points import SH_DEGREES, sh_blocks
 from pp_cl.raster.project import ProjectedPoints
-from pp_cl.raster.sh import SH_DEGREES, sh_blocks
 from pp_cl.reference import optim
 from pp_cl.scene.camera import Camera
 from pp_cl.scene.grid import Grid
-from pp_cl.training.rmsprop import SecondMoment, ShGradient, rmsprop_update
+from pp_cl.training.optim import rmsprop_update
 
 GRID = Grid((-0.7, -0.5, -0.6), 0.05, (23, 19, 31))
 SH_EPS = 4e-7  # of the tiny preset
@@ -30,7 +30,7 @@ class Cloud:
         self.start = rng.standard_normal((n, count, 16)).astype(np.float32)
         self.twin = optim.RmsProp(self.start, optim.basis(GRID.positions(ids), EYE)[:, :count])
         self.sh = [dev.upload(self.start[:, b.first : b.first + b.count]) for b in self.blocks]
-        self.moment = SecondMoment(dev.zeros((n, 16)), dev.zeros((n,), np.uint32))
+        self.v, self.last_step = dev.zeros((n, 16)), dev.zeros((n,), np.uint32)
         self._points = seen_points(dev, GRID.positions(ids), CAMERA)
 
     def step(
@@ -47,9 +47,17 @@ class Cloud:
         self.steps = step or self.steps + 1
         seen = np.isin(np.arange(self.n), shaded)[:, None]
         features = self.dev.upload(np.where(seen, grad_features, np.nan), np.float32)
-        gradient = ShGradient(self._points, self.dev.upload(shaded, np.uint32), features)
         rmsprop_update(
-            self.dev, self.steps, gradient, self.sh, moment=self.moment, rates=rates, eps=SH_EPS
+            self.dev,
+            self.steps,
+            self._points,
+            self.dev.upload(shaded, np.uint32),
+            features,
+            self.sh,
+            v=self.v,
+            last_step=self.last_step,
+            rates=rates,
+            eps=SH_EPS,
         )
         self.twin.step(
             self.steps, np.where(seen, grad_features, 0), np.repeat(rates, (1, 3, 5)), SH_EPS
@@ -61,8 +69,8 @@ class Cloud:
 
     def second_moment(self) -> np.ndarray:
         """(N, 16) float64: with the decay that waits."""
-        v, last = (array.get() for array in self.moment)
-        return v * 0.999 ** (self.steps - last.astype(np.float64))[:, None]
+        waited = self.steps - self.last_step.get().astype(np.float64)
+        return self.v.get() * 0.999 ** waited[:, None]
 
 
 def seen_points(dev: Device, positions: np.ndarray, camera: Camera) -> ProjectedPoints:
@@ -71,7 +79,7 @@ def seen_points(dev: Device, positions: np.ndarray, camera: Camera) -> Projected
     distance = np.linalg.norm(towards, axis=1)
     rows = np.column_stack([towards @ camera.pose[:, :3], distance]).astype(np.float32)
     absent = (dev.zeros((1,)),) * 3
-    return ProjectedPoints(dev.upload(camera.packed((2.0, 6.0))), dev.upload(rows), *absent)
+    return ProjectedPoints("soft", dev.upload(camera.packed((2.0, 6.0))), dev.upload(rows), *absent)
 
 
 def gradients(rng: np.random.Generator, n: int) -> np.ndarray:

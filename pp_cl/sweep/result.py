@@ -9,7 +9,7 @@ from pp_cl.files.run_folder import MOST_METRICS, RunFolder
 from pp_cl.files.untrusted import read_json_text
 from pp_cl.session import run_config
 from pp_cl.sweep.plan import Job
-from pp_cl.training.stored import opened_run
+from pp_cl.training.checkpoint import opened_run
 
 
 def about(job: Job) -> dict[str, Any]:

@@ -1,36 +1,43 @@
-"""The training loss: smooth L1 + weight * (1 - SSIM), and its gradient."""
+"""The training loss: smooth L1 and SSIM of an image with their gradient, and the sum with all other
+terms.
+"""
+
+import math
 
 import numpy as np
 from pyopencl.array import Array
 
 from pp_cl.device.buffers import Buffers, Table
 from pp_cl.device.device import Device
-from pp_cl.device.form import group_items, lanes, launch_groups
-from pp_cl.layers.tiles import SIDE, grid_shape
-from pp_cl.network.tile_plan import grow
+from pp_cl.device.launch import group_items, lanes, launch_groups
+from pp_cl.device.transfer import Reading, read_later
+from pp_cl.errors import Diverged
+from pp_cl.raster.pairs import Pairs
+from pp_cl.raster.weights import BlendWeights
 
 TAPS = 11  # pixels, the side of an SSIM window
-REACH = 2 * (TAPS // 2)  # pixels over which the loss's gradient depends on the target
-WHITE = 1.0  # of a target where its photograph is transparent
 MARGIN = 32  # values by which a scratch row is longer than needed, >= 3 * (TAPS - 1)
+FURTHER = ("mask", "spread", "lpips")  # terms that not every training has
 
 
 class Loss:
-    """L = mean D(p - t) + ssim_weight * (1 - SSIM(p, t)) over an image; holds its scratch buffers.
+    """L = mean D(p - t) + ssim_weight * (1 - SSIM(p, t)) over an image, and what add() adds; holds
+    its scratch buffers.
 
     D is smooth L1 (Girshick 2015): d^2 / (2 beta) below beta, |d| - beta/2 from there on; L1 where
     beta is 0.
     SSIM (Wang et al. 2004): 11x11 Gaussian windows of sigma 1.5 inside the image, k1 .01, k2 .03,
     range 1, population variances, mean over channels and windows. It is off (its term reads 0)
-    where ssim_weight is 0 or a side of the target is below 11 pixels. terms: (4,) float32 on the
-    device after a call: L, L1, 1 - SSIM, mean squared error.
+    where ssim_weight is 0 or a side of the target is below 11 pixels. terms: (8,) float32 on the
+    device: L, L1, 1 - SSIM, mean squared error, those of FURTHER, 0.
     """
 
     def __init__(self, dev: Device, ssim_weight: float, beta: float = 0.0):
         self.dev = dev
         self.beta = beta
         self.ssim_weight = ssim_weight
-        self.terms = dev.zeros((4,))
+        self.terms = dev.zeros((8,))
+        self._added = []  # of FURTHER, in this step
         self._buffers = Buffers(dev)
 
     @staticmethod
@@ -51,61 +58,142 @@ class Loss:
         shapes = {
             "moments": (window_rows, 4, blocks, values),
             "slopes": (window_rows, 3, blocks, values),
-            "spread": (window_rows, 3, blocks, values),
+            "row_slopes": (window_rows, 3, blocks, values),
             "partial_terms": (window_rows + height, blocks, 4),
             "row_terms": (window_rows + height, 4),
             "grad_prediction": tuple(prediction_shape),
+            "pixel_spread": (math.prod(prediction_shape[:2]),),
         }
         return {name: (shape, np.float32) for name, shape in shapes.items()}
 
     def forward_backward(
         self, prediction: Array, target: Array, left: int = 0, top: int = 0
     ) -> Array:
-        """dL/dprediction, (PH, PW, 3) float32, valid until the next call; sets `terms`.
+        """dL/dprediction, (PH, PW, 3) float32, valid until the next call; begins `terms` anew.
 
         prediction: (PH, PW, 3) float32, unclamped. target: (H, W, 3) float32, lies on the
         prediction's columns left..left+W and rows top..top+H; the gradient is 0 elsewhere. Raises
         ValueError where it reaches outside.
         """
         corner = corner_of(prediction.shape, target.shape, left, top)
-        height, width, _ = target.shape
-        b = self._buffers
+        (height, width, _), pw, b = target.shape, prediction.shape[1], self._buffers
         values = lanes_of_loss(self.dev)
         b.require(self.table(prediction.shape, target.shape, self.ssim_weight, values))
         window_rows, _, blocks, _ = b.moments.shape
-        rows, size = {"v": window_rows, "blocks": blocks}, (blocks, window_rows)
-        images = {"prediction": prediction, "target": target}
-        images |= {"pw": prediction.shape[1], "w": width, "corner": corner}
-        slopes, spread, partial_terms = b.slopes, b.spread, b.partial_terms
-
-        self._launch("loss_moments", size, moments=b.moments, **images, **rows)
-        self._launch(
-            "loss_similarity",
-            size,
+        program = self.dev.program("training/loss", GROUP=group_items(self.dev), **self._defines)
+        program.launch(
+            "loss_moments",
+            (blocks, window_rows),
+            v=window_rows,
             w=width,
+            pw=pw,
+            corner=corner,
+            blocks=blocks,
+            prediction=prediction,
+            target=target,
+            moments=b.moments,
+        )
+        program.launch(
+            "loss_similarity",
+            (blocks, window_rows),
+            v=window_rows,
+            w=width,
+            blocks=blocks,
             weight=self.ssim_weight,
             moments=b.moments,
-            slopes=slopes,
-            partial_terms=partial_terms,
-            **rows,
+            slopes=b.slopes,
+            partial_terms=b.partial_terms,
         )
-        self._launch("loss_spread", size, slopes=slopes, spread=spread, **rows)
+        program.launch(
+            "loss_row_slopes",
+            (blocks, window_rows),
+            v=window_rows,
+            blocks=blocks,
+            slopes=b.slopes,
+            row_slopes=b.row_slopes,
+        )
         if prediction.shape != target.shape:
             self.dev.fill(b.grad_prediction, 0)
-        self._launch(
+        program.launch(
             "loss_gradient",
             (blocks, height),
+            v=window_rows,
             h=height,
+            w=width,
+            pw=pw,
+            corner=corner,
+            blocks=blocks,
             beta=self.beta,
-            spread=spread,
+            prediction=prediction,
+            target=target,
+            row_slopes=b.row_slopes,
             grad_prediction=b.grad_prediction,
-            partial_terms=partial_terms,
-            **images,
-            **rows,
+            partial_terms=b.partial_terms,
         )
-        self._sum(partial_terms, b.row_terms)
-        self._sum(b.row_terms.reshape(1, -1, 4), self.terms.reshape(1, 4))
+        self._sum(b.partial_terms, b.row_terms)
+        self._sum(b.row_terms.reshape(1, -1, 4), self.terms[:4].reshape(1, 4))
+        self._added = []
         return b.grad_prediction
+
+    def add(self, name: str, values: Array, weight: float, scale: float = 1.0) -> None:
+        """Add weight times a term of FURTHER, which is scale * sum(values), to the loss.
+
+        values: (n,) float32.
+        """
+        self._added.append(name)
+        launch_groups(
+            self.dev,
+            "training/loss",
+            "loss_add",
+            1,
+            defines=self._defines,
+            n=len(values),
+            term=4 + FURTHER.index(name),
+            scale=scale,
+            weight=weight,
+            values=values,
+            terms=self.terms,
+        )
+
+    def add_spread(self, pairs: Pairs, weights: BlendWeights, weight: float, scale: float) -> None:
+        """Add weight times the spread, scale times the sum over a view's pixels, to the loss; after
+        forward_backward() of the same view. Renderer.backward(spread_weight=weight * scale) has its
+        gradient.
+        """
+        pixel_spread = self._buffers.pixel_spread
+        program = self.dev.program("training/loss", GROUP=group_items(self.dev), **self._defines)
+        program.launch(
+            "loss_pixel_spread",
+            pairs.pixels,
+            hw=pairs.pixels,
+            pixel_offset=pairs.pixel_offset,
+            pair_key=pairs.pair_key,
+            pixel_entry=weights.pixel_entry,
+            pixel_spread=pixel_spread,
+        )
+        self.add("spread", pixel_spread, weight, scale)
+
+    def read(self, step: int) -> Reading[dict[str, float]]:
+        """{"loss", "l1", "ssim", "psnr"} of the crop of a step, from 1 on, and the terms that were
+        added. Asking for them raises Diverged if one is not finite.
+        """
+        added = list(self._added)
+
+        def by_name(values: np.ndarray) -> dict[str, float]:
+            total, l1, dissimilarity, mse, *further = map(float, values)
+            terms = {
+                "loss": total,
+                "l1": l1,
+                "ssim": 1 - dissimilarity,
+                "psnr": -10 * math.log10(max(mse, 1e-10)),
+                **{name: further[FURTHER.index(name)] for name in added},
+            }
+            broken = [name for name, value in terms.items() if not math.isfinite(value)]
+            if broken:
+                raise Diverged(f"the loss is not finite at step {step} ({', '.join(broken)})")
+            return terms
+
+        return read_later(self.dev, self.terms, convert=by_name)
 
     def _sum(self, terms, sums):
         """Write sums (ROWS, 4) of terms (ROWS, M, 4)."""
@@ -122,26 +210,10 @@ class Loss:
             sums=sums,
         )
 
-    def _launch(self, kernel, size, **arguments):
-        program = self.dev.program("training/loss", GROUP=group_items(self.dev), **self._defines)
-        program.launch(kernel, size, **arguments)
-
     @property
     def _defines(self):
         values = lanes_of_loss(self.dev)
         return {"LANES": values, "TAPS": TAPS, "MARGIN": MARGIN // values}
-
-
-def gradient_tiles(found: np.ndarray, size: tuple[int, int], offset: tuple[int, int]) -> np.ndarray:
-    """(rows, columns) bool: the tiles of a prediction of `size` = (height, width) whose gradient
-    depends on more than a prediction of one colour before white, borders aside.
-
-    found: (?, ?) bool, the target's tiles that are not all white. offset: (left, top) of the target
-    in the prediction, less than a tile.
-    """
-    tiles = np.zeros(grid_shape(*size), bool)
-    tiles[: found.shape[0], : found.shape[1]] = found
-    return grow(tiles, -(-(REACH + max(offset)) // SIDE))
 
 
 def lanes_of_loss(dev: Device) -> int:

@@ -1,66 +1,65 @@
-"""The memory a training will take, summed over the tables of its stages before they allocate."""
+"""Whether a training fits the memory of device and host: the buffer tables of its stages, summed
+before anything is allocated, against what there is.
+"""
 
 import math
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
 
 from pp_cl.config import Config
 from pp_cl.device.buffers import Table, grown, table_bytes
-from pp_cl.device.compact import compact_table
 from pp_cl.device.device import Device
-from pp_cl.device.rows import PIECE_BYTES
+from pp_cl.device.host import available_bytes, resident_bytes
+from pp_cl.device.rows import PIECE_BYTES, compact_table
+from pp_cl.errors import UserError
 from pp_cl.metrics.lpips import Lpips
+from pp_cl.model import Model
 from pp_cl.network.layers import gradient_of
 from pp_cl.network.unet import UNet
-from pp_cl.raster.blend import BLENDS, Blend
-from pp_cl.raster.pairs import PairBuilder
-from pp_cl.raster.point_cloud import PointCloud
-from pp_cl.raster.project import Projection
-from pp_cl.raster.sh import sh_blocks
+from pp_cl.raster.points import PointCloud, sh_blocks
 from pp_cl.render import NETWORK_MULTIPLE, Renderer, point_radius
-from pp_cl.scene.camera import Camera
 from pp_cl.scene.grid import Grid
-from pp_cl.scene.hull import DEPTH_MARGIN
 from pp_cl.scene.load import DEMO, mask_rule, reading
 from pp_cl.scene.views import Photograph, kept_bytes, shrink_factor
-from pp_cl.training.crops import crop_side
 from pp_cl.training.loss import Loss, lanes_of_loss
 from pp_cl.training.mask import MaskLoss
-from pp_cl.training.optimiser import Optimiser
+from pp_cl.training.optim import Optimiser
 from pp_cl.training.perceptual import PerceptualLoss
-from pp_cl.training.point_state import PointState
-from pp_cl.training.schedule import ema_start, prunings, refine_steps
+from pp_cl.training.schedule import crop_side, ema_start, prunings, refine_steps
 from pp_cl.training.smooth import Smoother, chunk_points
+from pp_cl.training.state import PointState
 
 MIB, GIB = 2**20, 2**30
-# The share of the points that k prunings leave is about FIRST * k^-SLOWER on the initial grid, and
-# on a refined one; measured on lego with the presets tiny, small and full.
-FIRST_KEPT, FIRST_SLOWER = 0.745, 0.155
-LATER_KEPT, LATER_SLOWER = 0.85, 0.068
+# The share of the points that pruning leaves by the next refinement or the last step, about: 0.45
+# to 0.73 on lego with the presets tiny, small and full.
+KEPT_BY_PRUNING = 0.6
 # bytes on the host: of pruning per point (weights, looks, opacities, and which stay), of refining
-# per point before it (the vertices of its eight in 64 bits, and their order)
+# per point before it (the vertices of its eight in 64 bits, and their order); checkpoints are
+# written in pieces
 PRUNING_BYTES, REFINING_BYTES = 24, 320
-
 LEAST_RADIUS = 0.75  # pixels, as cl/raster/footprint.h has it
+# What a driver's compiler takes of the host until all kernels of a training are built, measured;
+# of a platform that is not listed the most.
+DRIVER_BYTES = {"Portable Computing Language": 80 * MIB, "Intel(R) OpenCL": 620 * MIB}
 
-Tables = list[tuple[str, Table]]  # what the buffers of each table are for
 
+class MemoryPhase(NamedTuple):
+    """What is allocated at once in a part of a training.
 
-class Moment(NamedTuple):
-    """What is allocated at once at some time of a training. host: bytes of numpy arrays."""
+    tables: {what the buffers are for: their table}. host: bytes of numpy arrays.
+    """
 
     name: str
     points: int
-    tables: Tables
+    tables: dict[str, Table]
     host: int
 
     @property
     def device(self) -> int:
         """Bytes of all buffers."""
-        return tables_bytes(self.tables)
+        return sum(map(table_bytes, self.tables.values()))
 
 
 class Plan(NamedTuple):
@@ -68,22 +67,22 @@ class Plan(NamedTuple):
     those, while they are read.
     """
 
-    moments: list[Moment]
+    phases: list[MemoryPhase]
     photographs: int
     reading: int
 
     @property
-    def peak(self) -> Moment:
-        """The moment with the most bytes on the device."""
-        return max(self.moments, key=lambda moment: moment.device)
+    def peak(self) -> MemoryPhase:
+        """The phase with the most bytes on the device."""
+        return max(self.phases, key=lambda phase: phase.device)
 
     @property
     def largest(self) -> tuple[str, int]:
         """(what it is for, bytes) of the largest buffer."""
         sizes = (
             (f"{what}: {name}", table_bytes({name: row}))
-            for moment in self.moments
-            for what, table in moment.tables
+            for phase in self.phases
+            for what, table in phase.tables.items()
             for name, row in table.items()
         )
         return max(sizes, key=lambda size: size[1])
@@ -92,205 +91,223 @@ class Plan(NamedTuple):
         """Most bytes that the host holds beside the program itself. is_cpu: of the device, whose
         buffers are the host's memory as well.
         """
-        training = max(moment.host + is_cpu * moment.device for moment in self.moments)
+        training = max(phase.host + is_cpu * phase.device for phase in self.phases)
         return self.photographs + max(training, self.reading)
 
 
-@dataclass(frozen=True)
-class Sketch:
-    """What the memory of a training follows from.
+class Room:
+    """The memory there is for a training; made before anything of it is allocated.
 
-    photographs: of the training views. points: at `step`. radius: of their footprints, pixels of
-    the largest photograph as it is stored. layers: of the grid, on which points may lie.
+    photographs: of the training views. plan: that of the last check, None before.
     """
 
-    config: Config
-    net: UNet
-    photographs: Sequence[Photograph]
-    points: int
-    radius: float
-    layers: float
-    step: int = 0
+    def __init__(self, config: Config, net: UNet, photographs: Sequence[Photograph]):
+        self.dev = net.dev
+        self.plan: Plan | None = None
+        self._config, self._net, self._photographs = config, net, photographs
+        cameras = [one.camera for one in photographs]
+        self._largest = max(cameras, key=lambda camera: (camera.width * camera.height, camera.fx))
+        driver = DRIVER_BYTES.get(self.dev.info["platform"], max(DRIVER_BYTES.values()))
+        held = resident_bytes() - (self.dev.bytes if self.dev.is_cpu else 0)
+        self._program = held + driver
 
-    @classmethod
-    def unseen(cls, config: Config, net: UNet, photographs: Sequence[Photograph]) -> "Sketch":
-        """Before the photographs are read and the hull is known: for a ball that fills the largest
-        of them.
+    @property
+    def host_bytes(self) -> int:
+        """What this process takes of the host at its peak, by the plan."""
+        return self._program + self.plan.host(self.dev.is_cpu)
+
+    def check_unseen(self) -> None:
+        """Before the photographs are read and the hull is known: raise UserError as check_points
+        does where the least that the training can take does not fit.
         """
-        points = config.points.count
-        camera = _largest([one.camera for one in photographs])
-        diameter = math.sqrt(4 / math.pi * camera.width * camera.height)
-        spacing = (math.pi / 6 * diameter**3 / points) ** (1 / 3)
-        deep = DEPTH_MARGIN * math.sqrt(3) * diameter  # of the cube around it, as depth_range()
-        radius = point_radius(config.raster, spacing, (0, deep))
-        return cls(config, net, photographs, points, radius, points ** (1 / 3))
+        points = self._config.points.count
+        self._check(self._planned(points, 0.0, points ** (1 / 3), step=0))
 
-    def on_grid(
+    def check_points(
         self, grid: Grid, points: int, depth_range: tuple[float, float], step: int = 0
-    ) -> "Sketch":
-        """The same with points on a grid, seen from the middle of the depth range."""
-        camera = _largest([one.camera for one in self.photographs])
+    ) -> None:
+        """Raise UserError, naming the settings to change, where a training with these points of a
+        grid does not fit from a step on.
+        """
+        self._check(self.plan_points(grid, points, depth_range, step))
+
+    def check_growth(self, model: Model, step: int) -> None:
+        """Before the step after `step`: the same where it refines the grid or begins the averages,
+        as it is known only now how many points are left.
+        """
+        train, points = self._config.train, model.cloud.count
+        if step + 1 in refine_steps(train) or (train.ema and step + 1 == _averages(train)):
+            try:
+                self.check_points(model.grid, points, model.depth_range, step)
+            except UserError as error:
+                raise UserError(
+                    f"step {step}: to go on with {points} points, {error}, in another --out"
+                ) from None
+
+    def plan_points(
+        self, grid: Grid, points: int, depth_range: tuple[float, float], step: int = 0
+    ) -> Plan:
+        """The memory of a training with these points from a step on, seen from the middle of the
+        depth range. Pairs and points after prunings to come are estimates.
+        """
         middle = sum(depth_range) / 2
         # footprints grow by 1 / (z^2 cos) nearer by and off the axis: the mean over a cube, to
         # second order
         growth = 1 + (grid.diagonal / middle) ** 2 / 9
-        radius = point_radius(self.config.raster, grid.edge, depth_range)
-        radius *= camera.fx / middle * math.sqrt(growth)
-        return replace(self, points=points, radius=radius, layers=grid.dims[2], step=step)
+        radius = point_radius(self._config.raster, grid.edge, depth_range)
+        pixels = radius * self._largest.fx / middle * math.sqrt(growth)
+        return self._planned(points, pixels, grid.dims[2], step)
 
-    def with_points(self, points: int) -> "Sketch":
-        """The same object with another number of points."""
-        finer = (points / self.points) ** (1 / 3)
-        return replace(
-            self, points=points, radius=self.finer_radius(finer), layers=self.layers * finer
+    def _check(self, plan):
+        problem, lower = self._problem(plan)
+        if problem:
+            raise UserError(f"{problem}: {lower}, or choose another device (`pp-cl devices`)")
+        self.plan = plan
+
+    def _problem(self, plan):
+        """(what of the plan is too much, what to do about it); ("", "") where all fits."""
+        dev, info, (what, largest) = self.dev, self.dev.info, plan.largest
+        device, host, available = plan.peak.device, plan.host(dev.is_cpu), available_bytes()
+        lower = "lower --points or train.crop, or raise --downscale"
+        if largest > info["max_allocation_bytes"]:
+            most = _size(info["max_allocation_bytes"])
+            return (
+                f"a buffer of {_size(largest)} ({what}) is more than the {most} that {dev.name}"
+                " allocates at once",
+                lower,
+            )
+        if device > info["memory_bytes"]:
+            has = _size(info["memory_bytes"])
+            return f"the training needs {_size(device)}, {dev.name} has {has}", lower
+        if available is not None and host > available - self._program:
+            free = _size(max(0, available - self._program))
+            return f"the training needs {_size(host)} of the host's memory, {free} are free", lower
+        budget = self._config.train.memory_gib
+        if budget and device > budget * GIB:
+            needed = math.ceil(device / GIB * 100) / 100
+            return (
+                f"--memory {budget:g}: the training needs {_size(device)}",
+                f"give --memory {needed:g}, {lower}",
+            )
+        return "", ""
+
+    # ---- the plan
+
+    def _planned(self, points, radius, layers, step):
+        """radius: of the footprints, pixels of the largest photograph as it is stored. layers: of
+        the grid, on which points may lie.
+        """
+        _, beside = reading(self._photographs, mask_rule(self._config))
+        return Plan(
+            self._phases(points, radius, layers, step),
+            photographs=kept_bytes(self._sizes, self._shrunk()),
+            reading=0 if self._config.scene.path == DEMO else beside,
         )
 
-    def finer_radius(self, times: float) -> float:
-        """`radius` on a grid of so many times finer a spacing, which soft footprints follow."""
-        return self.radius / (times if self.config.raster.footprint == "soft" else 1)
+    def _phases(self, n, radius, layers, step):
+        """From the step on: each level of refinement, refining it, and the averages of the last."""
+        train, phases = self._config.train, []
+        averages, refinements = _averages(train), refine_steps(train)
+        for level, end in enumerate([*refinements, train.iterations]):
+            start = refinements[level - 1] if level else 0
+            if end <= step:
+                continue
+            now, left = max(start, step), len(refinements) - level
+            prunes, to_come = prunings(train, start, end), prunings(train, now, end)
+            stages = {"radius": radius, "layers": layers, "left": left}
+            name = f"from step {now} on"
+            phases.append(self._level(name, n, averages <= now, prunes > 0, **stages))
+            n = round(n * KEPT_BY_PRUNING ** (to_come / max(1, prunes)))
+            if left:
+                phases.append(self._refining(end, n, averages <= end, **stages))
+                n, layers = 8 * n, 2 * layers
+                radius /= 2 if self._config.raster.footprint == "soft" else 1
+            elif now < averages < end:
+                name = f"averages, from step {averages} on"
+                phases.append(self._level(name, n, True, prunes > 0, **stages))
+        return phases
 
-    def with_settings(self, **changes: int) -> "Sketch":
-        """The same with other settings "downscale" and "crop"."""
-        config = self.config
-        scene = replace(config.scene, downscale=changes.get("downscale", config.scene.downscale))
-        train = replace(config.train, crop=changes.get("crop", config.train.crop))
-        return replace(self, config=replace(config, scene=scene, train=train))
+    def _level(self, name, n, is_averaged, prunes, **stages):
+        """A level of refinement with its prunings and checkpoints."""
+        tables = self._point_tables(n, is_averaged) | self._stages(n, **stages)
+        if prunes:
+            tables["pruning (at most)"] = compact_table(n, 64 * self._most_coefficients)
+        host = PRUNING_BYTES * n * prunes + 2 * min(PIECE_BYTES, 64 * 8 * n)
+        return MemoryPhase(name, n, tables, host)
+
+    def _refining(self, step, n, is_averaged, **stages):
+        """Old and new arrays of the points live together, one array after the other, beside the
+        buffers of the stages for the old points.
+        """
+        old = (n, self._most_coefficients, 16), np.float32
+        tables = self._point_tables(8 * n, is_averaged) | self._stages(n, **stages)
+        tables["refining"] = {"rows": ((8 * n,), np.uint32), "old": old}
+        return MemoryPhase(f"refining after step {step}", 8 * n, tables, REFINING_BYTES * n)
 
     @property
-    def sizes(self) -> list[tuple[int, int]]:
-        """(width, height) of the photographs in their files."""
-        return [(one.camera.width, one.camera.height) for one in self.photographs]
+    def _most_coefficients(self):
+        """Of a point in one array."""
+        return max(block.count for block in self._blocks)
 
     @property
-    def shrunk(self) -> int:
-        """How many times the photographs are reduced while they are read."""
-        scene = self.config.scene
-        return 1 if scene.path == DEMO else shrink_factor(self.sizes, scene.downscale)
+    def _blocks(self):
+        return sh_blocks(self._config.points.sh_degree)
 
-    @property
-    def refinements(self) -> list[int]:
-        """The steps of the refinements to come."""
-        return [s for s in refine_steps(self.config.train) if s > self.step]
+    def _point_tables(self, n, is_averaged):
+        """What stays from step to step."""
+        averages = PointState.ema_table(n, self._blocks) if is_averaged else {}
+        return {
+            "points": PointCloud.table(n, self._blocks),
+            "training state of the points": PointState.table(n),
+            "averages of the points": averages,
+            "optimiser": Optimiser.table(self._net.parameters, is_averaged),
+        }
 
-    @property
-    def averages(self) -> float:
-        """The step from which on averages are kept, infinite for never."""
-        train = self.config.train
-        return ema_start(train.iterations) if train.ema else math.inf
-
-
-def memory_plan(sketch: Sketch) -> Plan:
-    """The memory of the training. Pairs and points after prunings to come are estimates."""
-    made = sketch.config.scene.path == DEMO
-    _, beside = reading(sketch.photographs, mask_rule(sketch.config))
-    photographs = kept_bytes(sketch.sizes, sketch.shrunk)
-    return Plan(list(_moments(sketch)), photographs, 0 if made else beside)
-
-
-def _moments(sketch: Sketch) -> Iterator[Moment]:
-    """From the sketch's step on: each level of refinement, the refining, and the averages."""
-    train, n = sketch.config.train, sketch.points
-    steps = refine_steps(train)
-    start = max((s for s in steps if s <= sketch.step), default=0)
-    to_come = sketch.refinements
-    averages = sketch.averages
-    for level, end in enumerate([*to_come, train.iterations]):
-        now, left = max(start, sketch.step), len(to_come) - level
-        radius = sketch.finer_radius(2**level)
-        args = {"left": left, "radius": radius, "start": now, "end": end}
-        yield _moment(sketch, f"from step {now} on", n, ema=averages <= now, **args)
-        before = _kept(train, start, now)
-        if now < averages < end:
-            kept = round(n * _kept(train, start, averages) / before)
-            yield _moment(sketch, f"averages, from step {averages} on", kept, ema=True, **args)
-        n = round(n * _kept(train, start, end) / before)
-        if left:
-            yield _refining(sketch, n, ema=averages <= end, **args)
-            n, start = 8 * n, end
-
-
-def _kept(train, start, end):
-    """The share of the points of a level, which began at step `start`, that the prunings up to
-    `end` leave, an estimate.
-    """
-    times = prunings(train, start, end)
-    kept, slower = (LATER_KEPT, LATER_SLOWER) if start else (FIRST_KEPT, FIRST_SLOWER)
-    return kept * times**-slower if times else 1.0
-
-
-def _moment(sketch, name, n, *, left, radius, start, end, ema):
-    """A level at its most points. left: refinements to come. radius: as Sketch has it."""
-    train, blocks = sketch.config.train, sh_blocks(sketch.config.points.sh_degree)
-    prunes = prunings(train, start, end) > 0
-    row_bytes = max(64 * block.count for block in blocks)  # of the largest array of a point
-    pruning = [("pruning (at most)", compact_table(n, row_bytes))] if prunes else []
-    tables = [*_kept_tables(sketch, n, ema), *pruning, *_stages(sketch, n, left, radius)]
-    every, last = train.checkpoint_every, min(end, train.iterations - 1)
-    saves = start // every < last // every
-    pieces = min(PIECE_BYTES, 64 * 8 * n) if saves else 0
-    return Moment(name, n, tables, prunes * PRUNING_BYTES * n + 2 * pieces)
-
-
-def _refining(sketch, n, *, left, radius, start, end, ema):
-    """Old and new arrays of the points live together, one array after the other, beside the
-    buffers of the stages for the old points.
-    """
-    blocks = sh_blocks(sketch.config.points.sh_degree)
-    last = {
-        "rows": ((8 * n,), np.uint32),
-        "old": ((n, max(b.count for b in blocks), 16), np.float32),
-    }
-    tables = [
-        *_kept_tables(sketch, 8 * n, ema),
-        ("refining", last),
-        *_stages(sketch, n, left, radius),
-    ]
-    return Moment(f"refining after step {end}", 8 * n, tables, REFINING_BYTES * n)
-
-
-def _kept_tables(sketch, n, ema):
-    """What stays from step to step. ema: with the averages."""
-    blocks = sh_blocks(sketch.config.points.sh_degree)
-    return [
-        ("points", PointCloud.table(n, blocks)),
-        ("training state of the points", PointState.table(n)),
-        ("averages of the points", PointState.ema_table(n, blocks) if ema else {}),
-        ("optimiser", Optimiser.table(sketch.net.parameters, ema)),
-    ]
-
-
-def _stages(sketch: Sketch, n: int, left: int, radius: float) -> Tables:
-    """What the stages of a step and of a rendered preview take."""
-    config, net = sketch.config, sketch.net
-    train, downscale = config.train, config.scene.downscale
-    camera = _largest([one.camera for one in sketch.photographs])
-    whole, halved = camera.downscaled(downscale), camera.downscaled(downscale * 2**left)
-    crop, full = _padded(_crop(halved, crop_side(train.crop, left))), _padded(_crop(whole, 0))
-    width, height = _crop(halved, crop_side(train.crop, left))
-    target = (height, width, 3)
-    photograph = (camera.height // sketch.shrunk, camera.width // sketch.shrunk, 4)
-    pairs = n * min(math.pi * max(LEAST_RADIUS, radius / downscale) ** 2, full[0] * full[1])
-    return [
-        ("smoothing (estimate)", _smoothing_table(sketch, n)),
-        *_raster_tables(config.raster, n, full, pairs),
-        (f"network at {crop[1]}x{crop[0]}", _network_table(net, crop, True)),
-        (f"previews at {full[1]}x{full[0]}", _preview_table(net, full)),
-        ("loss", Loss.table((*crop, 3), target, train.ssim_weight, lanes_of_loss(net.dev))),
-        ("mask loss", MaskLoss.table(*crop) if train.mask_weight else {}),
-        *(_perceptual_tables(net, target) if train.perceptual_weight else ()),
-        (
-            "photograph and target",
-            {
-                "image": (photograph, np.uint8),
+    def _stages(self, n, *, radius, layers, left):
+        """What the stages of a step and of a rendered preview take. left: refinements to come."""
+        config, net, camera = self._config, self._net, self._largest
+        train, raster, downscale = config.train, config.raster, config.scene.downscale
+        width, height = _crop(camera.downscaled(downscale << left), crop_side(train.crop, left))
+        crop, full = _padded(width, height), _padded(*_crop(camera.downscaled(downscale), 0))
+        area = math.pi * max(LEAST_RADIUS, radius / downscale) ** 2
+        pairs = grown(0, round(n * min(area, full[0] * full[1])))
+        target, shrunk = (height, width, 3), self._shrunk()
+        tables = {
+            **Renderer.tables(raster, n, full, pairs),
+            f"network at {crop[1]}x{crop[0]}": _network_table(net, crop, True),
+            f"previews at {full[1]}x{full[0]}": _preview_table(net, full),
+            "loss": Loss.table((*crop, 3), target, train.ssim_weight, lanes_of_loss(net.dev)),
+            "photograph and target": {
+                "image": ((camera.height // shrunk, camera.width // shrunk, 4), np.uint8),
                 "target": (target, np.float32),
                 "alpha": (target[:2], np.float32),
             },
-        ),
-    ]
+        }
+        if train.sh_smoothing > 0:
+            # its chunk follows from the neighbours, which lie about a layer of the grid apart
+            chunk = chunk_points(n, round(n / layers))
+            tables["smoothing (estimate)"] = Smoother.table(n, chunk)
+        if train.mask_weight > 0:
+            tables["mask loss"] = MaskLoss.table(*crop)
+        if train.perceptual_weight > 0:
+            tables["perceptual loss"] = PerceptualLoss.table(target)
+            tables["network of LPIPS"] = Lpips.table(net.dev, net.policy, target[:2])
+        return tables
+
+    def _shrunk(self):
+        """How many times the photographs are reduced while they are read."""
+        scene = self._config.scene
+        return 1 if scene.path == DEMO else shrink_factor(self._sizes, scene.downscale)
+
+    @property
+    def _sizes(self):
+        """[(width, height)] of the photographs in their files."""
+        return [(one.camera.width, one.camera.height) for one in self._photographs]
 
 
-def _largest(cameras: Sequence[Camera]) -> Camera:
-    return max(cameras, key=lambda camera: (camera.width * camera.height, camera.fx))
+def _averages(train):
+    """The step from which on averages are kept, infinite for never."""
+    return ema_start(train.iterations) if train.ema else math.inf
 
 
 def _crop(camera, side):
@@ -298,19 +315,9 @@ def _crop(camera, side):
     return tuple(min(side, size) if side else size for size in (camera.width, camera.height))
 
 
-def _padded(size):
+def _padded(width, height):
     """(height, width) in whole multiples of what the network needs."""
-    return tuple(side + -side % NETWORK_MULTIPLE for side in size[::-1])
-
-
-def _smoothing_table(sketch, n):
-    """The Smoother's. Its chunk depends on the neighbours, which are not known yet: they are about
-    a layer of the grid apart.
-    """
-    if sketch.config.train.sh_smoothing == 0:
-        return {}
-    layers = sketch.layers * (n / sketch.points) ** (1 / 3)
-    return Smoother.table(n, chunk_points(n, round(n / layers)))
+    return height + -height % NETWORK_MULTIPLE, width + -width % NETWORK_MULTIPLE
 
 
 def _network_table(net, size, training):
@@ -328,41 +335,15 @@ def _preview_table(net, size):
     }
 
 
-def _perceptual_tables(net, target):
-    return [
-        ("perceptual loss", PerceptualLoss.table(target)),
-        ("network of LPIPS", Lpips.table(net.dev, net.policy, target[:2])),
-    ]
-
-
-def _raster_tables(settings, n, size, pairs):
-    """The tables of the stages from projection to blending. pairs: an estimated number, because the
-    true one is known only when a view has been projected.
-    """
-    pixels, room = size[0] * size[1], grown(0, round(pairs))
-    blend = BLENDS[settings.blend]
-    has_roles = settings.early_stop > 0 or settings.max_tracked > 0
-    return [
-        ("projection", Projection.table(n)),
-        ("pairs (estimate)", PairBuilder.table(n, pixels, room)),
-        (
-            "blend weights (estimate)",
-            blend.table(n, room, has_roles) | blend.own_table(pixels, room),
-        ),
-        ("blend", Blend.table(n)),
-        ("features", Renderer.table(n, *size)),
-    ]
-
-
-def tables_bytes(tables: Tables) -> int:
-    """Bytes of all buffers of the tables."""
-    return sum(table_bytes(table) for _, table in tables)
+def _size(size):
+    """Bytes in a unit that shows three digits."""
+    return f"{size / GIB:.2f} GiB" if size >= GIB else f"{size / MIB:.3g} MiB"
 
 
 def plan_lines(plan: Plan, dev: Device) -> list[str]:
     """The plan as text: device and host at their peaks in one line, then the device's buffers."""
     peak, (what, largest) = plan.peak, plan.largest
-    rows = [(what, len(table), table_bytes(table)) for what, table in peak.tables if table]
+    rows = [(what, len(table), table_bytes(table)) for what, table in peak.tables.items() if table]
     rows.append(("total", sum(number for _, number, _ in rows), peak.device))
     host = plan.host(dev.is_cpu)
     return [

@@ -7,8 +7,7 @@ from pyopencl.array import Array
 
 from pp_cl.device.buffers import Buffers, Table
 from pp_cl.device.device import Device
-from pp_cl.device.form import lanes, launch_groups
-from pp_cl.device.transfer import Reading, read_later
+from pp_cl.device.launch import lanes, launch_groups
 from pp_cl.errors import UserError
 from pp_cl.layers.choice import ConvolutionPolicy
 from pp_cl.metrics.lpips import BLOCKS, LEAST_SIZE, WIDTHS, Lpips, size_of, vgg_layers
@@ -18,10 +17,10 @@ FEATURES = tuple(f"features{block}" for block in range(len(BLOCKS)))
 
 
 class PerceptualLoss:
-    """Adds weight * LPIPS(prediction, target) to a loss; holds the network and its feature maps.
+    """weight * LPIPS(prediction, target); holds the network and its feature maps.
 
-    At weight 0 it reads no weights, allocates nothing and adds nothing. policy: of the
-    convolutions. weights: of the network, None = load_weights()'s (which may raise UserError).
+    policy: of the convolutions. weights: of the network, None = load_weights()'s (which may raise
+    UserError).
     """
 
     def __init__(
@@ -33,7 +32,7 @@ class PerceptualLoss:
     ):
         self.dev = dev
         self.weight = weight
-        self._network = Lpips(dev, weights, policy, training=True) if weight else None
+        self._network = Lpips(dev, weights, policy)
         self._buffers = Buffers(dev)
 
     @staticmethod
@@ -63,29 +62,21 @@ class PerceptualLoss:
             "scratch_1": (largest,),
             "distance": (height * width,),
             "row_term": (sum(height >> block for block in range(len(BLOCKS))),),
-            "total": (1,),
         }
         return {name: (shape, np.float32) for name, shape in shapes.items()}
 
-    def add(
-        self,
-        prediction: Array,
-        target: Array,
-        offset: tuple[int, int],
-        *,
-        grad_prediction: Array,
-        terms: Array,
-    ) -> None:
-        """Adds weight * LPIPS to terms[0], and its gradient to grad_prediction (PH, PW, 3).
+    def add_gradient(
+        self, prediction: Array, target: Array, offset: tuple[int, int], grad_prediction: Array
+    ) -> Array:
+        """Adds the gradient to grad_prediction (PH, PW, 3); returns numbers (?,) float32 whose sum
+        is LPIPS, valid until the next call.
 
         prediction, target, offset = (left, top): as Loss.forward_backward takes them. Neither image
         is clamped. Raises UserError for a target that is too small for the network.
         """
-        if self._network is None:
-            return
         corner = corner_of(prediction.shape, target.shape, *offset)
         with self.dev.stage("perceptual loss"):
-            maps, targets = self._forward(prediction, target, corner, terms)
+            maps, targets = self._forward(prediction, target, corner)
             self._network.backward(
                 maps.kept,
                 targets,
@@ -94,8 +85,9 @@ class PerceptualLoss:
                 grad_image=grad_prediction,
                 corner=corner,
             )
+        return self._buffers.row_term
 
-    def _forward(self, prediction, target, corner, terms):
+    def _forward(self, prediction, target, corner):
         """(_Places of the prediction's maps, the target's features)."""
         b, network, size = self._buffers, self._network, target.shape[:2]
         b.require(self.table(target.shape, network.widths))
@@ -106,9 +98,13 @@ class PerceptualLoss:
             height, width, _ = features.shape
             distance = b.distance[: height * width].reshape(height, width)
             network.compare(block, features, targets[block], distance)
-            self._launch(
+            # GROUP work-items of a GPU, or one of a CPU, sum a row
+            launch_groups(
+                self.dev,
+                "training/perceptual",
                 "perceptual_rows",
                 height,
+                defines={"LANES": lanes(self.dev)},
                 h=height,
                 w=width,
                 first=rows,
@@ -116,25 +112,7 @@ class PerceptualLoss:
                 row_term=b.row_term,
             )
             rows += height
-        self._launch(
-            "perceptual_sum",
-            1,
-            n=rows,
-            weight=self.weight,
-            row_term=b.row_term,
-            distance=b.total,
-            terms=terms,
-        )
         return maps, targets
-
-    def terms(self) -> dict[str, Reading]:
-        """{"lpips": LPIPS of the last call of add()}, {} at weight 0."""
-        return {"lpips": read_later(self.dev, self._buffers.total)} if self._network else {}
-
-    def _launch(self, kernel, groups, **arguments):
-        """`groups`: how often group_items() of a GPU, or one work-item of a CPU, sum."""
-        defines = {"LANES": lanes(self.dev)}
-        launch_groups(self.dev, "training/perceptual", kernel, groups, defines=defines, **arguments)
 
 
 class _Places:

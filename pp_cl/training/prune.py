@@ -6,47 +6,43 @@ from pyopencl.array import Array
 from pp_cl.device.device import Device
 from pp_cl.errors import Diverged
 from pp_cl.settings import TrainConfig
-from pp_cl.training.point_state import PointState
+from pp_cl.training.state import PointState
 
 
-def keep_indices(
-    dev: Device,
-    weights: Array,
-    least_weight: float,
-    opacities: Array,
-    *,
-    least_opacity: float,
-) -> Array:
-    """(M,) uint32, ascending: the points with weight >= least_weight and opacity >= least_opacity.
+def points_to_keep(dev: Device, state: PointState, opacity: Array, settings: TrainConfig) -> Array:
+    """(M,) uint32, ascending: the points that stay in the course of training. One that was seen in
+    train.prune_looks steps must have weighed train.prune_weight in one of them, and have
+    train.prune_opacity; its counts start anew. Others stay.
 
-    weights, opacities: (N,) float32. NaN counts as too little. Where no point would remain, the
-    one of the highest weight does (the first of several).
+    A mean over the steps would drop what few views see, such as the inside of a gap. Raises
+    Diverged for weights and opacities that are not finite: nothing would tell of them later.
     """
-    weight, opacity = dev.download(weights), dev.download(opacities)
-    return _listed(dev, (weight >= least_weight) & (opacity >= least_opacity), weight)
-
-
-def judge(dev: Device, state: PointState, opacities: Array, settings: TrainConfig) -> Array:
-    """The same by the looks of training: a point that was looked at train.prune_looks times must
-    have weighed train.prune_weight in one of them, and have train.prune_opacity; both start anew.
-
-    Others stay. A mean over the looks would drop what few views see, such as the inside of a gap.
-    Raises Diverged for weights and opacities that are not finite: nothing would tell of them later.
-    """
-    arrays = (state.peak_weight, state.look_count, opacities)
-    peak, looks, opacity = (dev.download(array) for array in arrays)
-    broken = int((~np.isfinite(peak) | ~np.isfinite(opacity)).sum())
+    weight, seen, opacity = map(dev.download, (state.max_weight, state.times_seen, opacity))
+    broken = int((~np.isfinite(weight) | ~np.isfinite(opacity)).sum())
     if broken:
         raise Diverged(f"{broken} points have a weight or an opacity that is not finite")
-    judged = looks >= settings.prune_looks
-    passes = (peak >= settings.prune_weight) & (opacity >= settings.prune_opacity)
-    for array, values in ((state.peak_weight, peak), (state.look_count, looks)):
-        dev.write(array, np.where(judged, np.float32(0), values))
-    return _listed(dev, ~judged | passes, peak)
+    judged = seen >= settings.prune_looks
+    passes = (weight >= settings.prune_weight) & (opacity >= settings.prune_opacity)
+    dev.write(state.max_weight, np.where(judged, np.float32(0), weight))
+    dev.write(state.times_seen, np.where(judged, np.float32(0), seen))
+    return _listed(dev, ~judged | passes, weight)
+
+
+def final_points_to_keep(
+    dev: Device, max_weight: Array, opacity: Array, settings: TrainConfig
+) -> Array:
+    """(M,) uint32, ascending: the points of a finished training that weigh at least
+    train.final_prune_weight and have train.prune_opacity. NaN counts as too little.
+
+    max_weight: (N,) float32, the highest blend weight in a training view.
+    """
+    weight, opacity = dev.download(max_weight), dev.download(opacity)
+    keep = (weight >= settings.final_prune_weight) & (opacity >= settings.prune_opacity)
+    return _listed(dev, keep, weight)
 
 
 def _listed(dev, keep, weight):
-    """Indices of the points to keep, at least one."""
+    """Indices of the points to keep; the heaviest (the first of several) where none would be."""
     indices = np.flatnonzero(keep)
     if indices.size == 0:
         indices = [np.argmax(np.nan_to_num(weight, nan=-np.inf))]

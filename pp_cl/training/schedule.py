@@ -1,12 +1,49 @@
-"""Learning rates, gamma, and the weights of EMA and spread, as pure functions of the step,
-which counts from 0 to steps - 1.
+"""What changes in the course of a training, as functions of the step, which counts from 0 to
+steps - 1: learning rates, gamma, weights, refinements, averages, and the crop that a step sees.
 """
 
-import math
+from __future__ import annotations
 
-from pp_cl.settings import TrainConfig
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from pp_cl.settings import NetworkConfig, TrainConfig
 
 EMA_UPDATES = 200  # times the averages would be updated in all steps; the last 15 % do
+BOX_MARGIN = 8  # pixels around the object from which crops are drawn
+CROP_LOSS = 0.25  # of the crop's side for every halving of the images
+END_SHARE = 0.25  # of the crops that show one end of the object, at least
+
+
+@dataclass(frozen=True)
+class Rates:
+    """The learning rates of one step. sh: of the degrees 0, 1, 2."""
+
+    sh: tuple[float, ...]
+    opacity: float
+    network: float
+
+    @classmethod
+    def at(cls, step: int, network: NetworkConfig, train: TrainConfig) -> Rates:
+        """The rates of a step from 0 on."""
+        steps = train.iterations
+        sh = tuple(
+            learning_rate(
+                step, steps, first, first * train.sh_rate_decay, delay_steps=round(delay * steps)
+            )
+            if first
+            else 0.0
+            for first, delay in zip(train.sh_rate, train.sh_delay, strict=True)
+        )
+        # opacities travel about as far in a long training as in a short one
+        scale = math.sqrt(min(1.0, train.opacity_rate_steps / steps or 1.0))
+        return cls(
+            sh,
+            scale * learning_rate(step, steps, *train.opacity_rate),
+            learning_rate(step, steps, *network.rate),
+        )
 
 
 def learning_rate(
@@ -86,3 +123,28 @@ def ema_weight(step: int, steps: int) -> float:
     if since < 0 or since % every:
         return 0.0
     return 1.0 if since == 0 else 1 - math.exp(-every / (0.05 * steps))
+
+
+def crop_side(side: int, halvings: int) -> int:
+    """The setting train.crop, for images halved this many times: whole quads of pixels."""
+    return 4 * round(side * (1 - CROP_LOSS * halvings) / 4)
+
+
+def draw_start(rng: np.random.Generator, low: int, high: int, size: int, *, limit: int) -> int:
+    """First pixel of a crop of `size` that shows a part of [low, high) as large as possible, inside
+    [0, limit).
+
+    The object's two ends are each in a share END_SHARE of the crops if not in more: uniform draws
+    hardly ever show the ends of what is much wider than a crop.
+    """
+    first, last = sorted((low, high - size))
+    first, last = max(first, 0), max(min(last, limit - size), 0)
+    start = int(rng.integers(first, last + 1))
+    end, inside = rng.random(), int(rng.integers(BOX_MARGIN + 1))
+    uniform = min((BOX_MARGIN + 1) / (last - first + 1), END_SHARE)
+    drawn = (END_SHARE - uniform) / (1 - 2 * uniform)
+    if high - low > size and end < drawn:
+        start = min(first + inside, last)
+    elif high - low > size and end > 1 - drawn:
+        start = max(last - inside, first)
+    return start

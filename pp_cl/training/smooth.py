@@ -1,12 +1,14 @@
-"""Smoothing of the SH coefficients over the grid, outside Adam: it leaves the moments alone."""
+"""Smoothing of the SH coefficients over the grid, beside the optimiser, whose moments it leaves
+alone.
+"""
 
 import numpy as np
 from pyopencl.array import Array
 
 from pp_cl.device.buffers import Buffers, Table
 from pp_cl.device.device import Device
-from pp_cl.device.form import lanes, row_parts
-from pp_cl.raster.sh import SH_BLOCKS
+from pp_cl.device.launch import lanes, row_parts
+from pp_cl.raster.points import SH_BLOCKS
 
 # points smoothed at a time: their new values stay in a CPU's cache until they are written back
 CHUNK = 16384
@@ -64,37 +66,47 @@ class Smoother:
         """Move every coefficient f, in place: f += amount * (mean of the existing neighbours' f -
         f).
 
-        All reads see the old values; a point without neighbours keeps its own. amount: 0 to 1; 4 *
-        lambda * learning rate for every fourth step. sh: (N, K, 16) float32, K up to 3; ValueError
-        beyond.
+        All reads see the old values; a point without neighbours keeps its own. amount: 0 to 1. sh:
+        (N, K, 16) float32, K up to 3; ValueError beyond.
         """
-        launch, parts = _program(self.dev).launch, row_parts(self.dev)
-        n, coefficients, _ = sh.shape
-        if coefficients > MOST_COEFFICIENTS:
+        n, k, _ = sh.shape
+        if k > MOST_COEFFICIENTS:
             raise ValueError(f"at most {MOST_COEFFICIENTS} coefficients a point: {sh.shape}")
-        slots = (self._buffers.even, self._buffers.odd)
-        waiting = None
-        for start in range(0, n, self.chunk):
-            part = {
-                "first": start,
-                "count": min(self.chunk, n - start),
-                "smoothed": slots[start // self.chunk % 2],
-                "n": n,
-                "k": coefficients,
-                "sh": sh,
-            }
-            launch(
+        computed = None  # (first, count, smoothed) of the chunk that is not written back yet
+        for i, first in enumerate(range(0, n, self.chunk)):
+            count = min(self.chunk, n - first)
+            smoothed = self._buffers.odd if i % 2 else self._buffers.even
+            _program(self.dev).launch(
                 "smooth_gather",
-                part["count"] * parts,
-                neighbours=self.neighbours,
+                count * row_parts(self.dev),
+                n=n,
+                first=first,
+                count=count,
+                k=k,
                 amount=amount,
-                **part,
+                neighbours=self.neighbours,
+                sh=sh,
+                smoothed=smoothed,
             )
-            if waiting:
-                launch("smooth_write_back", waiting["count"] * parts, **waiting)
-            waiting = part
-        if waiting:
-            launch("smooth_write_back", waiting["count"] * parts, **waiting)
+            if computed:
+                self._write_back(sh, *computed)
+            computed = first, count, smoothed
+        if computed:
+            self._write_back(sh, *computed)
+
+    def _write_back(self, sh, first, count, smoothed):
+        """Write the smoothed coefficients of a chunk to its points."""
+        n, k, _ = sh.shape
+        _program(self.dev).launch(
+            "smooth_write_back",
+            count * row_parts(self.dev),
+            n=n,
+            first=first,
+            count=count,
+            k=k,
+            smoothed=smoothed,
+            sh=sh,
+        )
 
 
 def _program(dev):

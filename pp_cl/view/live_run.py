@@ -16,7 +16,7 @@ from pp_cl.errors import UserError
 from pp_cl.files.image import to_8bit
 from pp_cl.files.run_folder import RunFolder
 from pp_cl.model import Model
-from pp_cl.render import NETWORK_MULTIPLE, Renderer
+from pp_cl.render import Renderer
 from pp_cl.run import Run, load_run
 from pp_cl.scene.camera import Camera
 from pp_cl.scene.camera_path import up_of
@@ -233,9 +233,7 @@ def most_opaque(model: Model, network: Any, share: float) -> Model:
 
 
 def hits_per_pixel(renderer: Renderer, camera: Camera, gamma: float, **options: Any) -> np.ndarray:
-    """(H, W) int64: the hits of each pixel. options: of Renderer.blend_weights()."""
-    view = renderer.blend_weights(camera, gamma, **options)
-    padded, left, top = camera.padded(NETWORK_MULTIPLE)
+    """(H, W) int64: the hits of each pixel. options: of Renderer.forward()."""
+    view = renderer.forward(camera, gamma, until="weights", **options)
     hits = np.diff(view.pairs.pixel_offset.get().astype(np.int64))
-    hits = hits.reshape(padded.height, padded.width)
-    return hits[top : top + camera.height, left : left + camera.width]
+    return view.cropped(hits.reshape(view.size))

@@ -6,7 +6,7 @@ from support.benches import KEYS
 
 from pp_cl.bench.conv import RandomConv, bench_conv
 from pp_cl.bench.timing import errors
-from pp_cl.layers.choice import device_class, make_policy, offered
+from pp_cl.layers.choice import OFFERED, device_class, make_policy
 from pp_cl.layers.conv import Direction
 
 pytestmark = pytest.mark.usefixtures("quick")
@@ -19,7 +19,7 @@ pytestmark = pytest.mark.usefixtures("quick")
 @pytest.mark.parametrize("direction", Direction)
 def test_a_layer_is_compared_with_the_truth(dev, direction, k, sources, co, choice):
     conv, policy = RandomConv(dev, k, 13, sources, co=co), make_policy(dev)
-    assert conv.variants == (offered(device_class(dev)) if choice else ["direct"])
+    assert conv.variants == ([*OFFERED[device_class(dev)]] if choice else ["direct"])
     for variant in conv.variants:
         actual, expected = conv.result(variant, direction, policy)
         assert actual.shape == expected.shape and expected.dtype == np.float64

@@ -7,45 +7,34 @@ import pytest
 
 from pp_cl.bench.raster import bench_raster, growth
 from pp_cl.bench.raster_scenes import SCENES
-from pp_cl.raster.blend import BLENDS
-from pp_cl.reference import dense as oracle_raster
-from pp_cl.reference.raster import PixelReference
+from pp_cl.raster.weights import BLENDS
+from pp_cl.reference import dense
 
 pytestmark = pytest.mark.usefixtures("quick")
 
 
 @pytest.mark.parametrize("rule", BLENDS)
 @pytest.mark.parametrize("name", SCENES)
-def test_float64_values_are_the_oracles(dev, name, rule):
+def test_float64_values_of_a_pixel_are_those_by_all_points(dev, name, rule):
     scene = SCENES[name](dev, 400, 16, 0.05)
-    camera, reference = scene.camera, scene.reference
-    positions = reference.points @ camera.pose[:, :3].T + camera.eye
-    geometry = oracle_raster.geometry(
-        camera, positions, reference.radius, reference.kind, depth_range=scene.depth_range
+    geometry = dense.geometry(
+        scene.camera,
+        scene.positions,
+        scene.radius,
+        scene.footprint,
+        depth_range=scene.depth_range,
     )
-    blend = (
-        oracle_raster.alpha(geometry, scene.opacity)
-        if rule == "alpha"
-        else oracle_raster.blend(geometry, scene.opacity, 0.05)
-    )
-    everyone = np.arange(scene.count)
+    blend = dense.blend_by_rule(rule, geometry, scene.opacity, 0.05)
+    everyone = scene.exact_features(np.arange(scene.count))
     if name == "grid":
         sh = np.concatenate([v.get() for v in scene.renderers[rule].model.cloud.sh], 1)
-        shaded = oracle_raster.shade(positions, camera.eye, sh)
-        np.testing.assert_allclose(scene.exact_features(everyone), shaded, atol=1e-6)
-    expected, compared = oracle_raster.features(blend, scene.exact_features(everyone)), 0
-    for pixel in range(256):
-        hits = reference.hits(pixel % 16, pixel // 16)
-        if hits is not None:
-            own = scene.opacity[hits[0]], scene.exact_features(hits[0])
-            actual = (
-                reference.composited(hits, *own)
-                if rule == "alpha"
-                else reference.features(hits, *own, 0.05)
-            )
-            np.testing.assert_allclose(actual, expected[pixel], atol=1e-9)
-            compared += len(hits[0]) > 0
-    assert compared > 50
+        shaded = dense.shade(scene.positions, scene.camera.eye, sh)
+        np.testing.assert_allclose(everyone, shaded, atol=1e-6)
+    expected = dense.features(blend, everyone)
+    actual = [scene.exact_pixel(rule, pixel % 16, pixel // 16) for pixel in range(256)]
+    found = [i for i in range(256) if actual[i] is not None]
+    np.testing.assert_allclose([actual[i] for i in found], expected[found], atol=1e-9)
+    assert geometry["hit"].any(axis=0)[found].sum() > 50
 
 
 @pytest.mark.parametrize("offset, clear", [(0.74, True), (0.75, False), (0.76, True)])
@@ -53,11 +42,12 @@ def test_pixels_that_rounding_decides_are_left_out(dev, offset, clear):
     """A point whose disc's rim passes through a pixel's centre: 1/1600 of a radian is the width of
     a pixel.
     """
-    camera = replace(SCENES["pulsar"](dev, 8, 16, 0.1).camera, fx=1600.0, fy=1600.0, cx=8.5, cy=8.5)
+    scene = SCENES["pulsar"](dev, 1, 16, 0.1)
+    scene.footprint, scene.radius = "disc", 1e-6
+    scene.camera = replace(scene.camera, fx=1600.0, fy=1600.0, cx=8.5, cy=8.5)
     angle = 2 * np.arcsin(offset / 3200)  # the chord to the ray straight ahead is offset / 1600
-    position = 1.5 * np.array([[np.sin(angle), 0, np.cos(angle)]])
-    reference = PixelReference(camera, position, 1e-6, "disc", depth_range=(0.6, 2.5))
-    assert (reference.hits(8, 8) is not None) == clear
+    scene.positions = 1.5 * np.array([[np.sin(angle), 0, np.cos(angle)]])
+    assert (scene.exact_pixel("alpha", 8, 8) is not None) == clear
 
 
 @pytest.mark.parametrize("name", SCENES)

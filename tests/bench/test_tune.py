@@ -25,11 +25,11 @@ from pp_cl.device.discover import TEMPORARY_CACHE, open_device
 from pp_cl.errors import UserError
 from pp_cl.layers.choice import (
     CHOICES,
+    OFFERED,
     device_class,
     device_key,
     load_tuning,
     make_policy,
-    offered,
     tuning_file,
 )
 from pp_cl.layers.conv import Direction
@@ -150,7 +150,7 @@ def test_a_row_says_what_was_measured(dev, takes):
     about = [found[name] for name in ("direction", "k", "ci", "co", "pixels")]
     assert about == ["forward", 3, 16, 32, 1024]
     assert found["ms"] == pytest.approx(MS) and shipped_ms == pytest.approx(1.0)
-    assert found["ms"].keys() == found["rel_l2"].keys() == set(offered(device_class(dev)))
+    assert found["ms"].keys() == found["rel_l2"].keys() == set(OFFERED[device_class(dev)])
     assert 0 < found["rel_l2"]["direct"] < found["rel_l2"]["winograd"] < 1e-5
 
 

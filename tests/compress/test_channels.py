@@ -70,7 +70,7 @@ def test_weights_are_of_what_is_put_out_and_read(original):
     mean = 0.0
     parameters = plain_parameters(net, net.parameters)
     for camera in cameras:
-        x = run.renderer.rasterise(camera, run.gamma).features.get()
+        x = run.renderer.forward(camera, run.gamma, until="features").features.get()
         values = unet(x, parameters, "single")[1]["dec0.a"]
         mean = mean + np.mean(values**2, axis=(0, 1)) / len(cameras)
     out = unpack_weights(net.parameters["out.weight"].get(), 3)[:, :, 0, 0]

@@ -2,6 +2,7 @@
 
 import atexit
 import os
+import re
 import subprocess
 import sys
 import time
@@ -12,7 +13,7 @@ import pytest
 from support.guarded import GuardedDevice
 
 from pp_cl.device import device as device_module
-from pp_cl.device.device import Device, kernel_folder
+from pp_cl.device.device import Device, acts_as_cpu, kernel_folder
 from pp_cl.device.discover import list_devices, open_device
 from pp_cl.errors import BuildError, UserError
 
@@ -38,24 +39,21 @@ def tiny(tmp_path, monkeypatch):
     return tmp_path
 
 
-@pytest.fixture
-def plain(session_device):
-    """The tests' device without guards."""
-    return Device(session_device.device)
-
-
 # ---- buffers
 
 
 def test_upload_fill_zeros_copy(dev, rng):
-    values = rng.random((31, 16)).astype(np.float32)
-    a, b = dev.upload(values), dev.zeros((31, 16))
-    assert np.array_equal(b.get(), np.zeros_like(values))
+    values = rng.random((16, 31)).T  # float64, not contiguous
+    a, b = dev.upload(values, np.float32), dev.zeros((31, 16))
+    assert np.array_equal(b.get(), np.zeros((31, 16)))
     dev.copy(b, a)
-    assert np.array_equal(b.get(), values)
+    assert np.array_equal(b.get(), values.astype(np.float32))
     dev.fill(a, 2.5)
-    assert np.array_equal(a.get(), np.full_like(values, 2.5))
-    assert np.array_equal(b.get(), values)
+    assert np.array_equal(a.get(), np.full((31, 16), 2.5))
+    assert np.array_equal(b.get(), values.astype(np.float32))
+    for other in (dev.zeros((30, 16)), dev.zeros((31, 16), np.uint32)):
+        with pytest.raises(ValueError, match="copy"):
+            dev.copy(b, other)
 
 
 @pytest.mark.parametrize("dtype", [np.uint8, np.int32, np.uint32, np.float32, np.uint64])
@@ -66,13 +64,6 @@ def test_fill_every_dtype(dev, dtype):
     assert np.array_equal(a.get(), np.full(257, 7, dtype))
 
 
-def test_upload_converts_and_takes_views(dev):
-    values = np.arange(12.0).reshape(3, 4).T  # float64, not contiguous
-    a = dev.upload(values, np.float32)
-    assert a.dtype == np.float32
-    assert np.array_equal(a.get(), values)
-
-
 def test_zero_size_arrays(dev):
     a, b = dev.empty((0, 16)), dev.zeros((0, 16))
     dev.fill(a, 1)
@@ -80,11 +71,22 @@ def test_zero_size_arrays(dev):
     assert a.get().shape == dev.upload(np.empty((0, 16), np.float32)).get().shape == (0, 16)
 
 
-def test_copy_refuses_another_size_or_dtype(dev):
-    with pytest.raises(ValueError, match="copy"):
-        dev.copy(dev.zeros((3,)), dev.zeros((4,)))
-    with pytest.raises(ValueError, match="copy"):
-        dev.copy(dev.zeros((3,)), dev.zeros((3,), np.uint32))
+@pytest.mark.parametrize("values", [np.zeros(8, np.float32), np.zeros(9, np.float64)])
+def test_writing_what_does_not_fit(dev, values):
+    for write in (dev.write, dev.send):
+        with pytest.raises(ValueError, match="write"):
+            write(dev.zeros((9,)), values)
+
+
+def test_scratch_is_shared_by_name_and_grows(plain):
+    first = plain.scratch("a", 100, zeros=16)
+    assert not first[:16].get().any()
+    plain.fill(first, 1)
+    assert plain.scratch("a", 50, zeros=16) is first and first.get().all()
+    assert plain.scratch("b", 50) is not first
+    del first
+    assert plain.scratch("a", 101, np.uint32).dtype == np.uint32
+    assert plain.bytes == 4 * (101 + 50) and plain.peak_bytes == plain.bytes
 
 
 def test_memory_is_counted_and_given_back(plain):
@@ -111,17 +113,32 @@ def test_a_buffer_over_the_largest_allocation_is_refused(plain):
 
 def test_a_smaller_largest_allocation_can_be_asked_for(monkeypatch):
     largest = open_device().info["max_allocation_bytes"]
-    monkeypatch.setenv("PP_MAX_ALLOCATION", "0.5")
-    assert open_device().info["max_allocation_bytes"] == 2**19
-    monkeypatch.setenv("PP_MAX_ALLOCATION", "1e9")
-    assert open_device().info["max_allocation_bytes"] == largest
+    for text, expected in (("0.5", 2**19), ("1e9", largest)):
+        monkeypatch.setenv("PP_MAX_ALLOCATION", text)
+        assert open_device().info["max_allocation_bytes"] == expected
 
 
-@pytest.mark.parametrize("text", ["0", "-1", "nan", "much"])
-def test_a_bad_largest_allocation_is_one_line(monkeypatch, text):
-    monkeypatch.setenv("PP_MAX_ALLOCATION", text)
-    with pytest.raises(UserError, match=f"PP_MAX_ALLOCATION={text}: must be a number of MiB"):
+@pytest.mark.parametrize(
+    "variable, text",
+    [("PP_MAX_ALLOCATION", t) for t in ("0", "-1", "nan", "much")]
+    + [("PP_DEBUG", t) for t in ("4", "-1", "yes", "1.5")]
+    + [("PP_FORM", "tpu")],
+)
+def test_a_bad_variable_is_one_line(monkeypatch, variable, text):
+    monkeypatch.setenv(variable, text)
+    with pytest.raises(UserError, match=f"^{variable}={text}: .*") as error:
         open_device()
+    assert "\n" not in str(error.value)
+
+
+def test_a_cpu_works_as_one_unless_told_otherwise(dev, monkeypatch):
+    of_device = bool(dev.device.type & cl.device_type.CPU)
+    monkeypatch.delenv("PP_FORM", raising=False)
+    assert acts_as_cpu(dev.device) == of_device
+    monkeypatch.setenv("PP_FORM", "")
+    assert acts_as_cpu(dev.device) == of_device
+    monkeypatch.setenv("PP_FORM", "gpu")
+    assert not acts_as_cpu(dev.device) and not open_device().is_cpu
 
 
 def test_all_buffers_together_are_held_to_the_memory(plain):
@@ -133,24 +150,17 @@ def test_all_buffers_together_are_held_to_the_memory(plain):
     plain.empty((50,))
 
 
-@pytest.mark.parametrize("error", [cl.MemoryError, cl.RuntimeError])
+@pytest.mark.parametrize("error", [cl.MemoryError, cl.RuntimeError, cl.LogicError])
 def test_a_driver_that_gives_up_is_a_user_error(plain, error):
+    """And a wrong call of it keeps its traceback."""
+
     def refuse(*_):
         raise error("clEnqueueNDRangeKernel failed: OUT_OF_RESOURCES")
 
-    with pytest.raises(
-        UserError, match=r"cannot run x.cl:y \(.*OUT_OF_RESOURCES.*lower --points"
-    ) as caught:
+    with pytest.raises(error if error is cl.LogicError else UserError) as caught:
         plain.attempt("run x.cl:y", refuse, 1)
-    assert "\n" not in str(caught.value)
-
-
-def test_a_wrong_call_of_the_driver_keeps_its_traceback(plain):
-    def refuse():
-        raise cl.LogicError("INVALID_KERNEL_ARGS")
-
-    with pytest.raises(cl.LogicError):
-        plain.attempt("run", refuse)
+    if error is not cl.LogicError:
+        assert re.match(r"\S.* cannot run x.cl:y \(.*OUT_OF_RES.*lower --points", str(caught.value))
 
 
 def test_fresh_guarded_buffers_are_nan(dev):
@@ -159,10 +169,6 @@ def test_fresh_guarded_buffers_are_nan(dev):
 
 
 # ---- programs and debug levels
-
-
-def test_kernel_folder_holds_the_headers():
-    assert (kernel_folder() / "common.h").is_file()
 
 
 def test_programs_are_built_once_for_each_define(plain, tiny):
@@ -197,6 +203,8 @@ def test_intels_gpus_take_more_registers_for_files_that_spill(platform, kind, la
     expected = ("-cl-intel-256-GRF-per-thread",) if large else ()
     assert device_module.vendor_options(info, "layers/conv_backward_weights") == expected
     assert device_module.vendor_options(info, "raster/shade") == ()
+    files = device_module.SPILLING_ON_INTEL
+    assert all((kernel_folder() / f"{name}.cl").is_file() for name in files)
 
 
 @pytest.mark.parametrize("said, expected", [(1, True), (0, False), (None, True)])
@@ -213,11 +221,6 @@ def test_only_nvidias_driver_rules_out_a_watchdog(said, expected):
 
 def test_a_cpu_has_no_watchdog(plain):
     assert plain.has_watchdog is not plain.is_cpu
-
-
-def test_files_with_options_of_a_vendor_exist():
-    files = device_module.SPILLING_ON_INTEL
-    assert all((kernel_folder() / f"{name}.cl").is_file() for name in files)
 
 
 def test_a_build_takes_the_options_of_its_vendor(plain, tiny, monkeypatch):
@@ -254,8 +257,9 @@ def debugged(session_device, tiny, monkeypatch):
         atexit.unregister(device.print_profile)
 
 
-def test_debug_0_measures_nothing(debugged):
-    assert debugged("0", [1]).profile() == {}
+@pytest.mark.parametrize("level, labels", [("0", []), ("3", ["tiny.cl:divide"])])
+def test_debug_0_measures_nothing_and_3_is_content_with_numbers(debugged, level, labels):
+    assert list(debugged(level, [1, 2, 3]).profile()) == labels
 
 
 @pytest.mark.parametrize("level, label", [("1", "tiny.cl "), ("2", "tiny.cl:divide ")])
@@ -276,17 +280,6 @@ def test_debug_1_times_files_and_2_times_kernels(debugged, capsys, level, label)
 def test_debug_3_finds_a_nan(debugged, guarded):
     with pytest.raises(FloatingPointError, match="tiny.cl:divide: y has 2 NaN or Inf, first at 1"):
         debugged("3", [1, 0, 2, 0], guarded)
-
-
-def test_debug_3_is_content_with_numbers(debugged):
-    assert list(debugged("3", [1, 2, 3]).profile()) == ["tiny.cl:divide"]
-
-
-@pytest.mark.parametrize("text", ["4", "-1", "yes", "1.5"])
-def test_a_bad_debug_level_is_a_user_error(session_device, monkeypatch, text):
-    monkeypatch.setenv("PP_DEBUG", text)
-    with pytest.raises(UserError, match=f"PP_DEBUG={text}"):
-        Device(session_device.device)
 
 
 def test_the_profile_is_printed_at_exit(session_device, tiny):

@@ -39,7 +39,7 @@ def test_it_blends_what_the_rasteriser_blends(run):
     camera = run.cameras("test")[0]
     (seen,) = observe(run, [camera], "test")
     matrix = seen.blend_matrix()
-    raster = run.renderer.rasterise(camera, run.gamma)
+    raster = run.renderer.forward(camera, run.gamma, until="features")
     points = np.zeros(raster.point_features.shape, np.float32)
     shaded = raster.shaded.get()
     points[shaded] = raster.point_features.get()[shaded]

@@ -19,14 +19,16 @@ from pp_cl.files.atomic import write_json
 from pp_cl.files.checkpoint import load_checkpoint, save_checkpoint
 from pp_cl.layers.choice import (
     CHOICES,
+    ERRORS,
+    OFFERED,
     SHIPPED,
     VARIANTS,
     ConvShape,
+    can_run,
     fastest,
     load_policy,
     load_tuning,
     make_policy,
-    offered,
     policy_of_run,
     tuning_file,
 )
@@ -69,9 +71,9 @@ def test_the_shipped_choice(dev, monkeypatch, direction):
     assert shipped((16, 32), 16, 4096) == "winograd"
     for sources, co, k in (((3,), 64, 3), ((64,), 20, 3), ((24, 24), 16, 3), ((128,), 128, 1)):
         assert shipped(sources, co, 4096, k) == "direct"
-    assert offered("CPU") == ["direct", "winograd"]
+    assert OFFERED["CPU"] == ("direct", "winograd")
     monkeypatch.setattr(dev, "is_cpu", False)
-    assert offered("GPU") == ["local", "direct"]  # one work-item a compute unit suits no GPU
+    assert OFFERED["GPU"] == ("local", "direct")  # one work-item a compute unit suits no GPU
     for k, co in ((3, 128), (3, 3), (1, 64)):
         assert shipped((128,), co, 4096, k) == "local"
 
@@ -91,10 +93,10 @@ def test_a_variant_asked_for_runs_where_it_can(dev):
 @pytest.mark.parametrize("direction", Direction)
 def test_shipped_errors_bound_what_is_measured(dev, direction, sources, co, side, k):
     conv = RandomConv(dev, k, side, sources, co=co)
-    for name, variant in VARIANTS.items():
-        if variant.can_run(k, *sources, co):
+    for name in VARIANTS:
+        if can_run(name, k, *sources, co):
             error = errors(*conv.result(name, direction, make_policy(dev)))[0]
-            assert error <= variant.errors[k][direction], name
+            assert error <= ERRORS[name][k][direction], name
 
 
 def test_what_pp_cl_tune_tries():
@@ -147,8 +149,8 @@ def test_a_variant_beyond_the_tolerance_is_not_taken(dev):
     rows = [row(ms=MS | {"winograd": 0.1})]
     assert pick(dev, rows, 5e-7) == "winograd"
     assert pick(dev, rows, 4.9e-7) == "direct"
-    assert pick(dev, [], VARIANTS["winograd"].errors[3][FORWARD]) == "winograd"
-    assert pick(dev, [], VARIANTS["direct"].errors[3][FORWARD]) == "direct"
+    assert pick(dev, [], ERRORS["winograd"][3][FORWARD]) == "winograd"
+    assert pick(dev, [], ERRORS["direct"][3][FORWARD]) == "direct"
 
 
 def test_what_no_variant_keeps_is_refused_with_the_least(dev):
@@ -177,7 +179,7 @@ def test_a_network_takes_what_was_tuned(dev, rng):
     def image(policy):
         return UNet(dev, (16, 16, 16), policy=policy).forward(x, False).get()
 
-    expected = {variant: image(make_policy(dev, variant=variant)) for variant in offered("CPU")}
+    expected = {variant: image(make_policy(dev, variant=variant)) for variant in OFFERED["CPU"]}
     assert not np.array_equal(*expected.values())
     for variant in expected:
         ms, rel_l2 = MS | {variant: 0.1}, dict.fromkeys(MS, 1e-7)
@@ -187,23 +189,6 @@ def test_a_network_takes_what_was_tuned(dev, rng):
     np.testing.assert_array_equal(image(make_policy(dev, 1e-6)), expected["direct"])
     with pytest.raises(UserError, match="tolerance 1e-06.*input"):
         UNet(dev, (16, 16, 16), policy=make_policy(dev, 1e-6)).memory_plan(64, 64, True)
-
-
-@pytest.mark.parametrize(
-    "blocking",
-    [
-        {"winograd": (128, 8), "winograd_weights": 64},
-        {"winograd": (32, 8), "direct": (4, 2, (1, 1, 1))},
-    ],
-)
-def test_the_memory_plan_follows_the_blocking(dev, blocking):
-    policy = make_policy(dev, DEFAULT, tuning_of(dev, blocking=blocking))
-    x, grad_y = dev.zeros((32, 36, 16)), dev.zeros((32, 36, 3))
-    before = dev.bytes
-    net = UNet(dev, (16, 32, 48), policy=policy)
-    net.forward(x)
-    net.backward(grad_y)
-    assert dev.bytes - before == sum(size for _, _, size in net.memory_plan(32, 36, True))
 
 
 # ---- the file
@@ -251,8 +236,6 @@ BROKEN = {
     "empty": b"",
     "binary": b"\xff\xfe\x00",
     "cut": b'{"format": 1,',
-    "no object": b"[]",
-    "other": b'{"a": 1}',
     "deep": b"[" * 100_000,
     "5000 digits": b'{"format": ' + b"9" * 5000 + b"}",
     "large": b" " * 2**24 + b"{}",
@@ -266,23 +249,14 @@ NESTED = json.loads("[" * 900 + "]" * 900)
     [
         *(pytest.param(content, id=name) for name, content in BROKEN.items()),
         {"format": 2},
-        {"device": {}},
         {"device": None},
         {"tile_shapes": {"winograd": [63, 7]}},
-        {"tile_shapes": {"fft": [8]}},
         {"tile_shapes": {"winograd": [True, 7]}},
         {"tile_shapes": {"winograd": [64.0, 8]}},
         {"tile_shapes": {"winograd": NESTED}},
-        {"tile_shapes": None},
         {"rows": None},
-        {"rows": {}},
-        {"rows": "fast"},
-        {"rows": [1]},
         {"rows": [{}]},
         {"rows": [row(direction="up")]},
-        {"rows": [row(direction=["forward"])]},
-        {"rows": [row(pixels=0)]},
-        {"rows": [row(pixels=2.5)]},
         {"rows": [row(pixels=True)]},
         {"rows": [row(pixels=10**400)]},
         {"rows": [row(ms={}, rel_l2={})]},

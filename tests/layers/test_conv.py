@@ -1,5 +1,5 @@
 """The three convolutions beyond what the selftest compares with float64: some tiles, other
-launches and blockings, little memory, NaN, wrong shapes.
+launches and blockings, NaN, wrong shapes.
 """
 
 from dataclasses import replace
@@ -14,13 +14,13 @@ from support.tiles import pixels_of, random_counts
 
 from pp_cl.layers import conv_direct, conv_local, conv_winograd
 from pp_cl.layers.choice import CHOICES, SHIPPED, VARIANTS
-from pp_cl.layers.conv import Direction, Work, pack_weights, unpack_weights
+from pp_cl.layers.conv import Direction, pack_weights, unpack_weights
 from pp_cl.layers.tiles import some_tiles
 from pp_cl.network.tile_plan import grow
 from pp_cl.selftest.convolutions import Layer, within
 
 CPU = SHIPPED["CPU"]
-DIRECT, LOCAL, WINOGRAD = (VARIANTS[name].module for name in ("direct", "local", "winograd"))
+DIRECT, LOCAL, WINOGRAD = (VARIANTS[name] for name in ("direct", "local", "winograd"))
 # (module, side of the kernel)
 ALL = [
     pytest.param(module, k, id=f"{module.__name__.rpartition('.')[2]} {k}x{k}")
@@ -120,7 +120,7 @@ def test_local_computes_all_of_the_channels_and_no_other():
 def test_flipped_weights_are_exact(dev, rng, k, ci, co, first, c):
     """And 0 for the channels beyond the last one."""
     weight = rng.normal(size=(co, ci, k, k)).astype(np.float32)
-    given = dev.upload(pack_weights(weight)), first, c, co, Work.empty(dev, 0, 1 << 14)
+    given = dev.upload(pack_weights(weight)), first, c, co
     expected = weight[:, first : first + c, ::-1, ::-1].transpose(1, 0, 2, 3)
     flipped = conv_direct.flip_weights(dev, CPU, *given).get()
     np.testing.assert_array_equal(flipped, pack_weights(expected))
@@ -180,7 +180,8 @@ def test_narrow_weights_have_a_blocking_of_their_own(dev):
 
     def floats(co, **changed):
         blocking, shape = replace(CPU, **changed), (co // 16, 3, 3, 128, 16)
-        return conv_winograd.work_floats(dev, blocking, Direction.FORWARD, 9, shape, 128)
+        floats = conv_winograd.scratch_floats(dev, blocking, Direction.FORWARD, 9, shape, 128)
+        return floats[conv_winograd.SLICES]
 
     assert floats(128, winograd_narrow=(2, 2)) < floats(128) == floats(128, winograd=(2, 2))
     assert floats(144, winograd=(2, 2)) < floats(144) == floats(144, winograd_narrow=(2, 2))
@@ -199,22 +200,18 @@ def test_a_relu_hides_no_nan(dev, rng, module, k):
 
 @pytest.mark.parametrize("module, k", OF_3X3)
 def test_what_does_not_fit_together_is_refused(dev, module, k):
-    zeros, few = dev.zeros, Work.empty(dev)
+    zeros = dev.zeros
     x, out, weight, bias = zeros((4, 4, 16)), zeros((4, 4, 32)), zeros((2, k, k, 16, 16)), zeros(32)
-    floats = [module.work_floats(dev, CPU, way, 4, weight.shape, 16) for way in Direction]
-    work = Work.empty(dev, *map(max, zip(*floats, strict=True)))
     grown = some_tiles(dev, (4, 8), np.ones((1, 2)))
 
-    def forward(sources=(x,), weight=weight, bias=bias, out=out, work=work, tiles=None):
-        module.forward(dev, CPU, sources, weight, bias, out, relu=False, work=work, tiles=tiles)
+    def forward(sources=(x,), weight=weight, bias=bias, out=out, tiles=None):
+        module.forward(dev, CPU, sources, weight, bias, out, relu=False, tiles=tiles)
 
-    def backward_input(first=0, weight=weight, grad_out=out, work=work, tiles=None):
-        given = {"mask": None, "work": work, "tiles": tiles}
-        module.backward_input(dev, CPU, weight, first, grad_out, x, **given)
+    def backward_input(first=0, weight=weight, grad_out=out, tiles=None):
+        module.backward_input(dev, CPU, weight, first, grad_out, x, mask=None, tiles=tiles)
 
-    def backward_weights(sources=(x,), grad_bias=bias, work=work, tiles=None):
-        given = {"work": work, "tiles": tiles}
-        module.backward_weights(dev, CPU, sources, out, weight, grad_bias, **given)
+    def backward_weights(sources=(x,), grad_bias=bias, tiles=None):
+        module.backward_weights(dev, CPU, sources, out, weight, grad_bias, tiles=tiles)
 
     for call in (forward, backward_input, backward_weights):
         call()
@@ -223,23 +220,18 @@ def test_what_does_not_fit_together_is_refused(dev, module, k):
         partial(forward, bias=zeros(16)),
         partial(forward, out=zeros((4, 5, 32))),
         partial(forward, tiles=grown),
-        partial(backward_input, work=few),
         partial(backward_input, tiles=grown),
         partial(backward_weights, (x, x)),
         partial(backward_weights, grad_bias=zeros(16)),
-        partial(backward_weights, work=few),
         partial(backward_weights, tiles=grown),
     ]
     if module is WINOGRAD:
         wrong += [
             partial(forward, (zeros((4, 4, 3)),), zeros((2, k, k, 3, 16))),
-            partial(forward, work=few),
             partial(backward_input, grad_out=zeros((4, 4, 20))),
             partial(backward_input, first=8, weight=zeros((2, k, k, 32, 16))),
             partial(backward_input, first=16),
-            partial(backward_weights, work=Work(few.scratch, work.weights)),
-            partial(backward_weights, work=Work(work.scratch, few.weights)),
         ]
     for call in wrong:
-        with pytest.raises(ValueError, match="tiles|channels|floats|width"):
+        with pytest.raises(ValueError, match="tiles|channels|width"):
             call()

@@ -25,9 +25,7 @@ def test_it_adds_to_the_network(dev, rng):
     grad_y = rng.standard_normal((8, 12, 3)).astype(np.float32)
     images, grads = [], []
     for residual in (False, True):
-        net = UNet(dev, (16, 16, 16), blocks="single")
-        if residual:
-            net.connect_residual()
+        net = UNet(dev, (16, 16, 16), blocks="single", residual=residual)
         images.append(net.forward(dev.upload(x)).get())
         grads.append(net.backward(dev.upload(grad_y)).get())
     np.testing.assert_array_equal(images[1][0], images[0][0])

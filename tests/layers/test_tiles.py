@@ -17,8 +17,8 @@ from pp_cl.layers.resample import (
     upsample2_forward,
 )
 from pp_cl.layers.tiles import (
-    LANES,
     SIDE,
+    VECTOR,
     all_tiles,
     all_tiles_buffers,
     checked_tiles,
@@ -83,7 +83,7 @@ def test_layers_compute_the_chosen_tiles(dev, rng, height, width, channels):
     "file, name, value",
     [
         ("layers/tiles.h", "SIDE", SIDE),
-        ("common.h", "CHANNELS", LANES),
+        ("common.h", "CHANNELS", VECTOR),
         ("layers/conv_local.cl", "ROWS", SIDE // TILE_PARTS),
     ],
 )

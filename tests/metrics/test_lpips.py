@@ -5,7 +5,7 @@ import pytest
 from PIL import Image
 from support.comparisons import relative_error
 
-from pp_cl.device.form import group_ranges, row_parts
+from pp_cl.device.launch import group_ranges, row_parts
 from pp_cl.errors import UserError
 from pp_cl.metrics import lpips_weights
 from pp_cl.metrics.lpips import Lpips, lpips_program

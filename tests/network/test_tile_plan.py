@@ -4,15 +4,15 @@ from collections import Counter
 
 import numpy as np
 import pytest
-from oracle.unet import unet, unet_gradients
 from support.comparisons import relative_error
 
 import pp_cl.network.unet
 from pp_cl.layers.choice import make_policy
 from pp_cl.layers.tiles import SIDE, grid_shape
-from pp_cl.network.layers import BLOCKS, convolutions, unet_layers
+from pp_cl.network.layers import BLOCKS, convolutions, gradient_of, unet_layers
 from pp_cl.network.tile_plan import (
     LOSS_BORDER,
+    LOSS_RADIUS,
     double,
     gradient_radius,
     grow,
@@ -22,6 +22,8 @@ from pp_cl.network.tile_plan import (
 )
 from pp_cl.network.unet import UNet
 from pp_cl.raster.blend import BACKGROUND
+from pp_cl.reference.network import network, network_gradients
+from pp_cl.training.loss import TAPS
 
 LAYERS = unet_layers((16, 16, 16))
 GRADIENT = np.float32([0.3, -0.2, 0.1])
@@ -69,8 +71,8 @@ def active_tiles(x):
 
 def run(dev, net, x, grad_y, *, sparse):
     """[image, gradient of x, gradients of the parameters] as the device computes them."""
-    differs = halve((grad_y != GRADIENT).any(2), 2)
-    plan = net.plan_tiles(x.shape[:2], active_tiles(x), differs) if sparse else None
+    other = halve((grad_y != GRADIENT).any(2), 2)
+    plan = net.plan_tiles(x.shape[:2], active_tiles(x), other) if sparse else None
     x = dev.upload(x)
     y = net.forward(x, True, plan).get()
     return [y, net.backward(dev.upload(grad_y)).get(), *[g.get() for g in net.gradients.values()]]
@@ -128,7 +130,8 @@ def test_radius_is_what_a_change_reaches(rng, blocks):
     for layer in convolutions(layers):
         parameters[f"{layer.name}.weight"] = rng.uniform(0.5, 1, layer.weight_shape())
         parameters[f"{layer.name}.bias"] = np.ones(layer.channels)
-    before, reached = unet(ones, parameters, blocks)[1], Counter()
+    before, reached = network(layers, parameters, ones), Counter()
+    active = {name: values > 0 for name, values in before.items()}
 
     def reach(name, change, place):
         scale = 96 // len(change)
@@ -139,11 +142,12 @@ def test_radius_is_what_a_change_reaches(rng, blocks):
     for place in range(48, 52):
         impulse = np.zeros_like(ones)
         impulse[place, place] = 1
-        for name, value in unet(ones + impulse, parameters, blocks)[1].items():
-            if name not in ("wide1", "wide0", "up1", "up0"):  # the oracle enlarges first
-                reach(name, value - before[name], place)
-        reach("grad x", unet_gradients(ones, parameters, impulse, blocks)[0], place)
-    radius = receptive_radius(layers) | {"grad x": gradient_radius(layers)["x"]}
+        for name, value in network(layers, parameters, ones + impulse).items():
+            reach(name, value - before[name], place)
+        gradients = network_gradients(layers, parameters, before, active, grad_image=impulse)
+        reach(gradient_of("x"), gradients["x"], place)
+    radius = receptive_radius(layers) | gradient_radius(layers)
+    radius["image"] = radius["out"]
     for name, far in reached.items():
         assert far <= radius[name] <= far + 3, name
 
@@ -195,4 +199,5 @@ def test_the_loss_sees_the_border_no_further():
     """The margin that is compared tile by tile holds what the forward pass and a window of the
     SSIM's gradient reach.
     """
-    assert receptive_radius(LAYERS)["out"] + 2 * 5 <= LOSS_BORDER
+    assert LOSS_RADIUS == 2 * (TAPS // 2)
+    assert receptive_radius(LAYERS)["out"] + LOSS_RADIUS <= LOSS_BORDER

@@ -6,22 +6,13 @@ import numpy as np
 import pytest
 from support.comparisons import relative_error
 
-from pp_cl.raster.blend import BLENDS
+from pp_cl.raster.weights import BLENDS
 from pp_cl.reference import dense as oracle
 from pp_cl.reference.differences import numeric_gradient
 from pp_cl.selftest.points import AXIS, Blended, PairedPoints, blend_on_axis
 
 UNTRACKED = 1  # cl/raster/pair_role.h
 CASES = [("softmax", 0.1), ("softmax", 0.01), ("alpha", 0.1)]
-
-
-def features_of(blended, geometry, opacity, point_features):
-    """(HW, 16) float64 features by the blend's rule."""
-    if blended.rule == "alpha":
-        blend = oracle.alpha(geometry, opacity)
-    else:
-        blend = oracle.blend(geometry, opacity, blended.gamma)
-    return oracle.features(blend, point_features)
 
 
 @pytest.mark.parametrize("rule, gamma", CASES)
@@ -31,8 +22,8 @@ def test_gradients_against_finite_differences(dev, rng, rule, gamma):
     gradients = blended.gradients()
 
     def loss(opacity, point_features):
-        features = features_of(blended, blended.geometry, opacity, point_features)
-        return (features * blended.grad).sum()
+        blend = oracle.blend_by_rule(rule, blended.geometry, opacity, gamma)
+        return (oracle.features(blend, point_features) * blended.grad).sum()
 
     def loss_of_opacity(opacity):
         return loss(opacity, blended.point_features)
@@ -49,31 +40,6 @@ def test_gradients_against_finite_differences(dev, rng, rule, gamma):
     some = rng.choice(60 * 16, 50, replace=False)
     numeric = numeric_gradient(lambda f: loss(opacity, f), blended.point_features, 1e-4, some)
     assert relative_error(gradients["features"].ravel()[some], numeric) < 1e-4
-
-
-@pytest.mark.parametrize("rule, gamma", CASES)
-@pytest.mark.parametrize("mean", [False, True])
-def test_sphere_gradients_against_finite_differences(dev, rng, rule, gamma, mean):
-    n, step = 30, 1e-6
-    blended = Blended(dev, rng, n=n, kind="sphere", gamma=gamma, rule=rule)
-    blended.radius[-1] = 0.01  # below a pixel
-    blended.positions[-1] = 0
-    scene = PairedPoints(dev, blended.camera, blended.positions, blended.radius, kind="sphere")
-    scene.blend(blended.opacity, gamma, blended.point_features, mean=mean, rule=rule)
-    hit, gradients = scene.hits(), scene.sphere_gradients(blended.grad)
-
-    def loss(positions, radius):
-        geometry = oracle.geometry(blended.camera, positions, radius, "sphere") | {"hit": hit}
-        features = features_of(blended, geometry, blended.opacity, blended.point_features)
-        return (features * blended.grad).sum()
-
-    scale = np.maximum(hit.sum(axis=1), 1) if mean else np.ones(n)
-    radius = blended.radius.astype(np.float64)
-    numeric = numeric_gradient(lambda p: loss(p, radius), blended.positions, step).reshape(n, 3)
-    assert relative_error(gradients["positions"], numeric / scale[:, None]) < 2e-3
-    assert gradients["positions"][-1].any() == (rule == "softmax")  # by its depth alone
-    numeric = numeric_gradient(lambda r: loss(blended.positions, r), radius, step) / scale
-    assert relative_error(gradients["radius"], numeric) < 2e-3
 
 
 def test_gradients_of_the_spread_against_finite_differences(dev, rng):
@@ -98,18 +64,6 @@ def test_hits_at_one_depth_and_single_hits_have_no_spread(dev):
 def test_a_softmax_has_no_spread(dev, rng):
     with pytest.raises(ValueError, match="spread"):
         Blended(dev, rng).gradients(spread_weight=1.0)
-
-
-@pytest.mark.parametrize("rule", BLENDS)
-def test_gradients_take_no_program_of_their_own(dev, rng, monkeypatch, rule):
-    """Nor does a spread that begins at 0."""
-    monkeypatch.setattr(dev, "_programs", {})
-    blended = Blended(dev, rng, rule=rule)
-    blended.gradients()
-    built = set(dev._programs)
-    assert [name for name, _ in built].count("raster/softmax") == (rule == "softmax")
-    blended.gradients(spread_weight=float(rule == "alpha"))
-    assert set(dev._programs) == built
 
 
 def test_the_softmax_by_hand(dev):

@@ -13,8 +13,7 @@ def test_soft_points_are_balls(dev, rng):
     for position in rng.uniform(-0.5, 0.5, (4, 3)):
         scene = PairedPoints(dev, make_camera(24, 20), position[None], radius)
         scene.blend(np.ones(1), 0.1, np.zeros((1, 16)), rule="alpha")
-        view = scene.projected, scene.pairs, scene.weights
-        arrays = depth_forward(dev, *view, footprint=scene.footprint, size=scene.shape)
+        arrays = depth_forward(dev, scene.projected, scene.pairs, scene.weights, scene.shape)
         alpha, depth, median = (array.get().ravel() for array in arrays)
         ray = dense.rays(scene.camera)
         centre = dense.camera_space(scene.camera, position[None])[0]

@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 from support.guarded import large
 
-from pp_cl.raster.pairs import PairBuilder
-from pp_cl.raster.project import KINDS, Footprint
+from pp_cl.bench.spheres import find_all_pairs
+from pp_cl.device.buffers import Buffers
+from pp_cl.raster.project import FOOTPRINTS
 from pp_cl.reference import dense as oracle
 from pp_cl.selftest.points import PairedPoints, make_camera, make_points
 
@@ -20,7 +21,7 @@ def by_point(pairs):
     return list(zip(pixels, np.split(closeness, offsets), strict=True))
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", FOOTPRINTS)
 def test_hits_that_were_counted_otherwise_stay_within_their_point(dev, rng, kind):
     """As where a compiler rounds in one way where hits are counted, in another where they are
     written: all other points' pairs are what they would be, and no slot is left undefined.
@@ -31,7 +32,7 @@ def test_hits_that_were_counted_otherwise_stay_within_their_point(dev, rng, kind
     change = np.where(counts > 2, rng.choice([-2, -1, 0, 0, 1, 2], n), 0)
     assert {*change} == {-2, -1, 0, 1, 2}
     planted = replace(scene.projected, point_count=dev.upload(counts + change, np.uint32))
-    pairs = PairBuilder(dev, Footprint(kind)).build(planted, scene.shape)
+    pairs = find_all_pairs(dev, Buffers(dev), planted, scene.shape)
     assert pairs.total == (counts + change).sum()
     for one, other, difference in zip(by_point(scene.pairs), by_point(pairs), change, strict=True):
         both = min(len(one[0]), len(other[0]))
@@ -90,15 +91,9 @@ def bits(pairs):
 
 def test_buffers_serve_views_of_any_size(dev, rng):
     few, many = make_points(rng, 31), make_points(rng, 257)
-    builder = PairBuilder(dev, Footprint("soft"))
+    buffers = Buffers(dev)
     for positions, size in ((many, (33, 31)), (few, (5, 9)), (many[:1], (1, 1)), (many, (33, 31))):
         view = replace(make_camera(*size), cx=size[0] / 2, cy=size[1] / 2)
         scene = PairedPoints(dev, view, positions, 0.3)
-        used = builder.build(scene.projected, scene.shape)
+        used = find_all_pairs(dev, buffers, scene.projected, scene.shape)
         assert all(map(np.array_equal, bits(scene.pairs), bits(used)))
-
-
-def test_two_builds_give_the_same_bits(dev, rng):
-    camera, positions = make_camera(40, 36), make_points(rng, 5000)
-    first, second = (PairedPoints(dev, camera, positions, 0.15).pairs for _ in range(2))
-    assert all(map(np.array_equal, bits(first), bits(second))) and first.total > 20_000

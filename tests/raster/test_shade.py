@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from pp_cl.raster.sh import SH_BLOCKS
+from pp_cl.raster.points import SH_BLOCKS
 from pp_cl.raster.shade import shade_forward
 from pp_cl.reference import dense as oracle
 from pp_cl.selftest.points import PairedPoints, make_camera, make_points
@@ -40,11 +40,3 @@ def test_the_basis_is_orthonormal(rng):
     directions = rng.normal(size=(400_000, 3))
     basis = oracle.sh_basis(directions / np.linalg.norm(directions, axis=1, keepdims=True))
     assert np.abs(4 * np.pi * basis.T @ basis / len(basis) - np.eye(9)).max() < 0.02
-
-
-def test_wrong_shapes_and_half_a_degree_are_refused(dev, rng):
-    sh = coefficients(rng, 31)
-    with pytest.raises(ValueError, match="sh_1 has shape"):
-        shade(dev, [sh[0], np.zeros((31, 5, 16), np.float32)])
-    with pytest.raises(ValueError, match="degree 2"):
-        shade(dev, sh[:3])

@@ -1,10 +1,10 @@
 """The float64 twins of the layers against scipy's functions, their gradients as adjoints or by
-finite differences; that of the network against one written out by hand.
+finite differences; that of the network against one written out by hand, and its differences.
 """
 
 import numpy as np
 import pytest
-from oracle.unet import unet, unet_gradients
+from oracle.unet import unet
 from scipy.ndimage import zoom
 from scipy.signal import correlate2d
 from scipy.special import expit
@@ -73,21 +73,28 @@ def test_gate(rng):
 
 @pytest.mark.parametrize("blocks", BLOCKS)
 def test_network_and_its_gradients(rng, blocks):
-    widths, layers = (4, 5, 6), unet_layers((4, 5, 6), 7, 3, blocks)
+    """Steps this small cross no kink of a ReLU: but for gates the network is piecewise linear in
+    each parameter, so the differences are exact there.
+    """
+    layers = unet_layers((4, 5, 6), 7, 3, blocks)
     parameters = {}
     for layer in convolutions(layers):
-        parameters |= {
-            layer.name + ".weight": 0.2 * rng.normal(size=layer.weight_shape()),
-            layer.name + ".bias": rng.normal(size=layer.channels),
-        }
+        parameters[layer.name + ".weight"] = 0.2 * rng.normal(size=layer.weight_shape())
+        parameters[layer.name + ".bias"] = rng.normal(size=layer.channels)
     x, grad_image = rng.normal(size=(8, 12, 7)), rng.normal(size=(8, 12, 3))
     outputs = network(layers, parameters, x)
-    assert outputs["pool1"].shape == (2, 3, widths[1])
+    assert outputs["pool1"].shape == (2, 3, 5)
     assert relative_error(outputs["image"], unet(x, parameters, blocks)[0]) < 1e-13
     active = {name: values > 0 for name, values in outputs.items()}
     gradients = network_gradients(layers, parameters, outputs, active, grad_image=grad_image)
-    expected_x, expected = unet_gradients(x, parameters, grad_image, blocks)
-    assert relative_error(gradients.pop("x"), expected_x) < 1e-13
-    assert gradients.keys() == expected.keys()
-    for name, gradient in gradients.items():
-        assert relative_error(gradient, expected[name]) < 1e-12, name
+    assert gradients.keys() == parameters.keys() | {"x"}
+
+    def loss(name, values):
+        changed = parameters | {name: values}
+        return (unet(changed.pop("x", x), changed, blocks)[0] * grad_image).sum()
+
+    for name, values in (parameters | {"x": x}).items():
+        flat = gradients[name].ravel()
+        some = [*np.argsort(-np.abs(flat))[:4], *rng.integers(0, flat.size, 4)]
+        numeric = numeric_gradient(lambda v, name=name: loss(name, v), values, 1e-6, some)
+        assert relative_error(flat[some], numeric) < 1e-6, name

@@ -4,6 +4,7 @@ what nobody wrote.
 
 import pytest
 
+from pp_cl.device.launch import Kernel
 from pp_cl.selftest.run import CASES, run_case
 
 pytestmark = pytest.mark.kernels
@@ -27,3 +28,54 @@ def test_passes(dev, case):
 
 def test_names_are_unique():
     assert len({case.name for case in CASES}) == len(CASES)
+
+
+# of the kernels that work in another way on GPUs; `make test-gpu-form` runs all tests so
+GPU_CASES = (
+    "device: scan",
+    "device: compact and gather rows",
+    "raster: project",
+    "raster: thousands of equal depths",
+    "raster: shade",
+    "softmax: forward, soft",
+    "softmax: backward, soft",
+    "layers: mean pooling",
+    "layers: upsampling",
+    "layers: gate",
+    "layers: tiles",
+    "loss: L1 and SSIM",
+    "loss: mask",
+    "loss: perceptual",
+    "metrics: distance of LPIPS",
+    "adam: arrays",
+    "rmsprop: degree 2",
+    "training: smoothing",
+    "scene: demo",
+)
+BY_NAME = {case.name: case for case in CASES}
+
+
+@pytest.mark.large
+@pytest.mark.parametrize(
+    "name",
+    [*GPU_CASES[:5], *(pytest.param(name, marks=pytest.mark.slow) for name in GPU_CASES[5:])],
+)
+def test_as_on_gpus(dev, monkeypatch, name):
+    monkeypatch.setattr(dev, "is_cpu", False)
+    assert run_case(dev, BY_NAME[name]).passed
+
+
+@pytest.mark.large
+@pytest.mark.parametrize("name", ["device: scan", "loss: L1 and SSIM", "loss: mask"])
+def test_groups_are_no_larger_than_a_kernel_allows(dev, monkeypatch, name):
+    """Compilers allow fewer work-items of kernels that take many registers."""
+    made = Kernel.__init__
+
+    def limited(kernel, *args, **named):
+        made(kernel, *args, **named)
+        kernel.largest_group = 32
+
+    monkeypatch.setattr(Kernel, "__init__", limited)
+    monkeypatch.setattr(dev, "is_cpu", False)
+    monkeypatch.setattr(dev, "_programs", {})
+    assert run_case(dev, BY_NAME[name]).passed

@@ -12,7 +12,7 @@ from pp_cl.selftest.run import CASES, run_cases
 KERNELS = device_module.kernel_folder()
 # (kernel file, text that stands there once, what it becomes, the case that must fail)
 FLIPS = [
-    ("device/compact", "to[c] = from[c]", "to[c] = -from[c]", "device: compact and gather rows"),
+    ("device/rows", "to[c] = from[c]", "to[c] = -from[c]", "device: compact and gather rows"),
     ("device/scan", "sum = add_sat(sum, total)", "sum = add_sat(sum, -total)", "device: scan"),
     ("scene/demo", "y[lane] = p.y", "y[lane] = -p.y", "scene: demo"),
     ("scene/hull", "alive & seen", "alive | seen", "scene: hull"),
@@ -23,15 +23,15 @@ FLIPS = [
     ("raster/shade", "features += basis[4 + b]", "features -= basis[4 + b]", "raster: shade"),
     ("raster/depth", "depth += b *", "depth -= b *", "raster: depth, softmax"),
     ("raster/depth", "before + share", "before - share", "raster: depth, alpha"),
-    ("raster/blend_weights", "sum += pair", "sum -= pair", "raster: highest weights, alpha"),
+    ("raster/weights", "sum += pair", "sum -= pair", "raster: highest weights, alpha"),
     ("raster/softmax", "a - M, 0.0f)) / D", "a + M, 0.0f)) / D", "softmax: forward, disc"),
     ("raster/softmax", "share * (1.0f + a)", "share * (1.0f - a)", "softmax: backward, soft"),
     ("raster/alpha", "fmax(1.0f - alpha", "fmax(1.0f + alpha", "alpha: forward, soft"),
-    ("raster/alpha", "b / T * more", "T / b * more", "alpha: backward, soft"),
-    ("raster/alpha", "+ g - B;", "- g - B;", "alpha: gradient of alpha"),
+    ("raster/blend", "b / T * gain", "T / b * gain", "alpha: backward, soft"),
+    ("raster/blend", "+ g - B;", "- g - B;", "alpha: gradient of alpha"),
     ("raster/blend", "sum + (1.0f - weights)", "sum + (1.0f + weights)", "softmax: forward, soft"),
-    ("raster/alpha", "+ g - B;", "+ g + B;", "alpha: backward, disc"),
-    ("raster/alpha", "front.x - behind.x", "front.x + behind.x", "alpha: spread"),
+    ("raster/blend", "+ g - B;", "+ g + B;", "alpha: backward, disc"),
+    ("raster/blend", "front.x - behind.x", "front.x + behind.x", "alpha: spread"),
     ("bench/spheres", "dL_dR -= dL_ddepth", "dL_dR += dL_ddepth", "softmax: gradients of spheres"),
     ("layers/conv", "[p] += value", "[p] -= value", "conv: direct, hard inputs"),
     ("layers/conv_backward_weights", "[i] += value", "[i] -= value", "conv: direct, hard inputs"),
@@ -47,7 +47,9 @@ FLIPS = [
     ("layers/tiles", "line[i] != background", "line[i] == background", "layers: tiles"),
     ("training/loss", "* slope + slope_0", "* slope - slope_0", "loss: L1 and SSIM"),
     ("training/mask", "1.0f - transmittance", "1.0f + transmittance", "loss: mask"),
-    ("training/perceptual", "terms[0] += weight", "terms[0] -= weight", "loss: perceptual"),
+    ("training/loss", "weights - depths", "weights + depths", "loss: spread"),
+    ("training/loss", "terms[0] += weight", "terms[0] -= weight", "loss: sum of its terms"),
+    ("training/perceptual", "= of_row /", "= -of_row /", "loss: perceptual"),
     ("training/adam", "(g - m_new)", "(g + m_new)", "adam: arrays"),
     ("training/adam", "- rate * m_new", "+ rate * m_new", "adam: gradients of 0, 1e-20 and 1e10"),
     ("training/rmsprop", "- rate * basis", "+ rate * basis", "rmsprop: degree 2"),
@@ -70,7 +72,7 @@ def at_length():
 )
 def test_a_flip_fails_its_case(dev, tmp_path, monkeypatch, file, text, flipped, name):
     case = next(case for case in CASES if case.name == name)
-    monkeypatch.setattr(dev, "is_cpu", takes_cpu_form(dev, file, text))
+    monkeypatch.setattr(dev, "is_cpu", acts_as_cpu(dev, file, text))
     assert [row.passed for row in run_cases(dev, [case])] == [True]
     folder = flipped_folder(tmp_path, file, text, flipped)
     monkeypatch.setattr(device_module, "kernel_folder", lambda: folder)
@@ -79,8 +81,8 @@ def test_a_flip_fails_its_case(dev, tmp_path, monkeypatch, file, text, flipped, 
     assert [row.case for row in run_cases(dev, [case]) if not row.passed] == [name]
 
 
-def takes_cpu_form(dev, file, text):
-    """The device's own form, but of what one form alone runs."""
+def acts_as_cpu(dev, file, text):
+    """What the device does, but for what CPUs or GPUs alone run."""
     if text == "sorted[middle] <":
         return False
     return dev.is_cpu or text == "keys[a] < keys[b]" or file.startswith("layers/winograd")

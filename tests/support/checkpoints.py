@@ -13,7 +13,7 @@ from pp_cl.errors import UserError
 from pp_cl.files.checkpoint import save_checkpoint
 from pp_cl.scene.demo import demo_frames
 from pp_cl.scene.identity import packed_camera
-from pp_cl.training.stored import load_run_state, stored_forms
+from pp_cl.training.checkpoint import load_run_state, stored_forms
 
 POINTS, STEP, STEPS = 40, 50, 60
 HEADER = {

@@ -43,6 +43,10 @@ class GuardedDevice(Device):
         self._guarded.append((cl.Buffer.from_int_ptr(memory.int_ptr), nbytes))
         return memory
 
+    def scratch(self, name, n, dtype=np.float32, **options):
+        """As Device.scratch, with no more memory than is asked for."""
+        return super().scratch((name, n), n, dtype, **options)
+
     def check(self):
         """Fail if a kernel wrote behind a buffer allocated since the last check, temporary ones
         included.

@@ -2,9 +2,9 @@
 
 import pytest
 
-from pp_cl.device.compact import gather_rows
 from pp_cl.device.device import Device, kernel_folder
 from pp_cl.device.discover import open_device
+from pp_cl.device.rows import gather_rows
 from pp_cl.device.signature import parse_signatures
 from tools import gpu_check
 from tools.gpu_check import TARGETS, Build, check, complaints, main, missing
@@ -101,7 +101,7 @@ def test_what_is_built_and_launched_is_recorded():
         dev = open_device()
         gather_rows(dev, dev.zeros((3, 4)), dev.upload([2, 0], "uint32"))
     assert [(build.file, kernels) for build, kernels in builds.items()] == [
-        ("device/compact", {"gather_rows"})
+        ("device/rows", {"gather_rows"})
     ]
     assert Device.program.__name__ == "program"
 

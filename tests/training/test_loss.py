@@ -1,4 +1,4 @@
-"""cl/training/loss.cl against its float64 twin, scikit-image and finite differences."""
+"""The loss against scikit-image and finite differences; the selftest compares it with float64."""
 
 import numpy as np
 import pytest
@@ -6,11 +6,10 @@ from skimage.metrics import structural_similarity
 from support.comparisons import relative_error
 from support.guarded import AWKWARD_SIZES
 
+from pp_cl.errors import Diverged
 from pp_cl.reference import loss as oracle_loss
 from pp_cl.reference.differences import numeric_gradient
 from pp_cl.training.loss import Loss
-
-SIZES = [(11, 11), (12, 33), (31, 16), (33, 31), (40, 257)]
 
 
 def images(rng, height, width, noise=0.1):
@@ -28,17 +27,7 @@ def images(rng, height, width, noise=0.1):
 def run(dev, prediction, target, weight, beta=0.0, **offset):
     loss = Loss(dev, weight, beta)
     grad = loss.forward_backward(dev.upload(prediction), dev.upload(target), **offset)
-    return loss.terms.get(), grad.get()
-
-
-@pytest.mark.parametrize("size", SIZES)
-@pytest.mark.parametrize("weight, beta", [(0.2, 0.0), (1.0, 0.0), (0.1, 0.05), (0.2, 1.0)])
-def test_matches_oracle(dev, rng, size, weight, beta):
-    prediction, target = images(rng, *size)
-    terms, grad = run(dev, prediction, target, weight, beta)
-    expected_terms, expected_grad = oracle_loss.loss(prediction, target, weight, beta)
-    np.testing.assert_allclose(terms, expected_terms, rtol=2e-6)
-    assert relative_error(grad, expected_grad) < 2e-6
+    return loss.terms.get()[:4], grad.get()
 
 
 @pytest.mark.parametrize("beta", [0.0, 0.05])
@@ -83,53 +72,6 @@ def test_ssim_is_scikit_images(dev, rng):
     assert terms[2] == pytest.approx(1 - expected, rel=2e-6)
 
 
-@pytest.mark.parametrize(
-    ("size", "weight"),
-    [((10, 40), 0.2), ((40, 10), 0.2), ((1, 1), 0.2), ((1, 257), 0.2), ((33, 31), 0.0)],
-)
-def test_without_ssim(dev, rng, size, weight):
-    prediction, target = images(rng, *size)
-    terms, grad = run(dev, prediction, target, weight)
-    expected_terms, expected_grad = oracle_loss.loss(prediction, target, weight)
-    np.testing.assert_allclose(terms, expected_terms, rtol=2e-6)
-    assert terms[2] == 0
-    np.testing.assert_allclose(grad, expected_grad, rtol=1e-6)
-
-
-@pytest.mark.parametrize("level", [0.0, 0.5, 1.0])
-def test_equal_images_have_no_loss_and_no_gradient(dev, rng, level):
-    for target in (np.full((20, 30, 3), level, np.float32), images(rng, 20, 30)[1]):
-        terms, grad = run(dev, target, target, 0.2)
-        assert not terms.any()
-        assert not grad.any()
-
-
-@pytest.mark.parametrize(
-    "levels", [(0.0, 1.0), (1.0, 0.0), (1.0, 0.999), (0.3, 0.3001), (-2.0, 0.0)]
-)
-def test_flat_images(dev, levels):
-    prediction, target = (np.full((20, 30, 3), level, np.float32) for level in levels)
-    terms, grad = run(dev, prediction, target, 0.2)
-    expected_terms, expected_grad = oracle_loss.loss(prediction, target, 0.2)
-    # 1 - SSIM: rounding of Var[d] over C2
-    np.testing.assert_allclose(terms, expected_terms, rtol=3e-6, atol=1e-10)
-    assert relative_error(grad, expected_grad) < 3e-6
-
-
-@pytest.mark.parametrize("level", [0.0, 1.0])
-def test_almost_flat_images(dev, rng, level):
-    """Variances far below the squares they are the difference of: the textbook form in float32 is
-    off by 2e-3 at level 1.
-    """
-    target = level + 1e-3 * rng.standard_normal((24, 35, 3))
-    prediction = target + 1e-3 * rng.standard_normal(target.shape)
-    prediction, target = prediction.astype(np.float32), target.astype(np.float32)
-    terms, grad = run(dev, prediction, target, 1.0)
-    expected_terms, expected_grad = oracle_loss.loss(prediction, target, 1.0)
-    np.testing.assert_allclose(terms, expected_terms, rtol=1e-5)
-    assert relative_error(grad, expected_grad) < 3e-5
-
-
 @pytest.mark.parametrize(("left", "top"), [(0, 0), (1, 2), (3, 1)])
 def test_target_inside_a_larger_prediction(dev, rng, left, top):
     prediction, target = images(rng, 22, 29)
@@ -158,15 +100,8 @@ def test_sizes_may_change_between_calls(dev, rng):
         prediction, target = images(rng, *size)
         grad = loss.forward_backward(dev.upload(prediction), dev.upload(target))
         expected_terms, expected_grad = oracle_loss.loss(prediction, target, 0.2)
-        np.testing.assert_allclose(loss.terms.get(), expected_terms, rtol=2e-6)
+        np.testing.assert_allclose(loss.terms.get()[:4], expected_terms, rtol=2e-6)
         assert relative_error(grad.get(), expected_grad) < 2e-6
-
-
-def test_same_bits_twice(dev, rng):
-    prediction, target = images(rng, 64, 80)
-    first, second = run(dev, prediction, target, 0.2), run(dev, prediction, target, 0.2)
-    assert first[0].tobytes() == second[0].tobytes()
-    assert first[1].tobytes() == second[1].tobytes()
 
 
 def float32_sum(terms, group):
@@ -191,9 +126,36 @@ def test_terms_are_summed_in_a_fixed_order(dev, rng, m, group):
     assert np.array_equal(sums.get(), [float32_sum(row, group) for row in terms])
 
 
-def test_a_tree_is_more_exact(rng):
-    """Than one work-item that sums them all."""
-    terms = rng.uniform(0, 1, (1590, 4)).astype(np.float32)
-    exact = terms.sum(axis=0, dtype=np.float64)
-    serial, tree = (np.abs(float32_sum(terms, group) - exact).max() for group in (1, 256))
-    assert 5 * tree < serial
+def test_its_terms_by_name(dev, rng):
+    """As they are when they are asked for, though the next step has begun."""
+    loss, images_of = Loss(dev, 0.2), [images(rng, 20, 31) for _ in range(2)]
+    readings = []
+    for step, (prediction, target) in enumerate(images_of):
+        loss.forward_backward(dev.upload(prediction), dev.upload(target))
+        if step == 0:
+            loss.add("mask", dev.upload([0.25, 0.5], np.float32), 2.0, scale=0.5)
+        readings.append(loss.read(step + 1))
+    for step, (prediction, target) in enumerate(images_of):
+        expected, _ = oracle_loss.loss(prediction, target, 0.2)
+        found = readings[step].get()
+        assert found.pop("loss") == pytest.approx(expected[0] + 0.75 * (step == 0), rel=1e-5)
+        assert found.pop("ssim") == pytest.approx(1 - expected[2], rel=1e-5)
+        assert found.pop("psnr") == pytest.approx(-10 * np.log10(expected[3]), rel=1e-5)
+        assert found == pytest.approx({"l1": expected[1]} | ({} if step else {"mask": 0.375}))
+
+
+@pytest.mark.parametrize(
+    "values, named",
+    [
+        ([np.nan, 0, 0, 0], "loss"),
+        ([np.inf, np.inf, 0, 0], "loss, l1"),
+        ([1e30, 1e30, 0.5, np.inf], "psnr"),  # the mean square overflows before the loss does
+    ],
+)
+def test_terms_that_are_not_finite_are_told_as_often_as_asked(dev, values, named):
+    loss = Loss(dev, 0.2)
+    loss.terms.set(np.float32([*values, 0, 0, 0, 0]))
+    reading = loss.read(7)
+    for _ in range(2):
+        with pytest.raises(Diverged, match=rf"at step 7 \({named}\)$"):
+            reading.get()

@@ -1,26 +1,28 @@
-"""The memory plan against what a training really allocates."""
+"""The memory plan against what a training really allocates, and what is refused by it."""
 
 import gc
-from dataclasses import replace
 
 import numpy as np
 import pytest
+from support.runs import arguments
 from support.scenes import write_ball_scene
 
+from pp_cl.cli import main
 from pp_cl.config import assign, preset
 from pp_cl.device.buffers import table_bytes
-from pp_cl.device.compact import compact_table
+from pp_cl.device.device import Device
+from pp_cl.device.rows import compact_table
+from pp_cl.errors import UserError
+from pp_cl.files.checkpoint import load_checkpoint
 from pp_cl.metrics.lpips import WIDTHS, vgg_layers
 from pp_cl.model import Model
 from pp_cl.network.unet import UNet
-from pp_cl.raster.point_cloud import PointCloud
 from pp_cl.scene.camera import Camera
 from pp_cl.scene.grid import Grid
 from pp_cl.scene.load import open_scene
 from pp_cl.scene.views import Photograph
 from pp_cl.train import Trainer
-from pp_cl.training.memory import Moment, Plan, Sketch, memory_plan, plan_lines
-from pp_cl.training.point_state import PointState
+from pp_cl.training.memory import GIB, MIB, MemoryPhase, Plan, Room, plan_lines
 
 POINTS = 27_000
 PAPER_POINTS = 4_040_533  # lego, supplemental Table 4
@@ -76,8 +78,8 @@ def trained(dev, folder, changes, base="tiny"):
     model = Model.create(dev, grid, np.arange(side**3), (2.0, 6.0), net=net, degree=degree)
     views = open_scene(dev, config, ("train",)).splits["train"]
     trainer = Trainer(dev, config, model, views)
-    sketch = Sketch.unseen(config, net, [Photograph(v.name, v.file_camera) for v in views])
-    plan = memory_plan(sketch.on_grid(grid, side**3, (2.0, 6.0)))
+    room = Room(config, net, [Photograph(v.name, v.file_camera) for v in views])
+    plan = room.plan_points(grid, side**3, (2.0, 6.0))
     for _ in range(30):
         trainer.train_step()
     trainer.render(views[0])
@@ -99,29 +101,23 @@ def test_the_plan_is_what_a_training_takes(dev, tmp_path, monkeypatch, changes):
     monkeypatch.setattr("pp_cl.metrics.lpips.load_weights", zero_weights)
     trainer, plan, peak = trained(dev, tmp_path / "ball", changes)
     points = trainer.model.cloud.count
-    blocks = trainer.model.cloud.blocks
     assert plan.peak.points == points and 0.8 * POINTS < points <= POINTS
     assert 0.96 * peak < plan.peak.device < 1.04 * peak
-    held = sum(
-        a.nbytes for a in (trainer.model.cloud.arrays(dev) | trainer.state.arrays()).values()
-    )
-    tables = [
-        PointCloud.table(points, blocks),
-        PointState.table(points),
-        PointState.ema_table(points, blocks) if trainer.config.ema else {},
-    ]
-    assert held == sum(map(table_bytes, tables))
+    held = trainer.model.cloud.arrays(dev) | trainer.optimiser.arrays()
+    kept = ("points", "training state of the points", "averages of the points", "optimiser")
+    planned = sum(table_bytes(plan.phases[-1].tables[name]) for name in kept)
+    assert sum(array.nbytes for array in held.values()) == planned
 
 
 def test_pruning_stays_within_the_plan(dev, tmp_path, monkeypatch):
-    monkeypatch.setattr("pp_cl.device.compact.SCRATCH_BYTES", 10**6)
+    monkeypatch.setattr("pp_cl.device.rows.SCRATCH_BYTES", 10**6)
     others = dev.bytes  # what fixtures of other tests hold
     trainer, plan, _ = trained(dev, tmp_path / "ball", {"raster.radius": "0.75"})
     pruning = table_bytes(compact_table(POINTS, 192))
     assert pruning == POINTS * 4 + 10**6
     before, dev.peak_bytes = dev.bytes, dev.bytes
-    trainer.state.peak_weight.set(np.arange(POINTS, dtype=np.float32))
-    trainer.state.look_count.set(np.full(POINTS, 100, np.float32))
+    trainer.state.max_weight.set(np.arange(POINTS, dtype=np.float32))
+    trainer.state.times_seen.set(np.full(POINTS, 100, np.float32))
     trainer.prune()
     assert trainer.model.cloud.count == POINTS - 1
     assert dev.peak_bytes <= before + 10**6 + 2 * 4 * POINTS  # the weights and the list of the kept
@@ -134,49 +130,47 @@ def test_the_papers_scale_fits_six_gibibytes(dev, tmp_path):
     assert peak < 6 * 2**30 * POINTS / PAPER_POINTS
 
 
-def sketch(dev, base="tiny", points=171_262, step=0, **changes):
-    """Of a preset with a small network and one photograph; `points` on the initial grid."""
+GRID = Grid((0, 0, 0), 0.02, (64, 64, 64))
+
+
+def room(dev, base="tiny", images=3, size=(800, 600), **changes):
+    """Of a training with a small network."""
     config = preset(base)
-    for key, value in {"network.widths": "4,4,4", **changes}.items():
+    settings = {"network.widths": "16,16,16"} | changes
+    for key, value in settings.items():
         assign(config, key.replace("__", "."), value, "test")
-    camera = Camera(np.eye(3, 4), 900, 900, 400, 300, 800, 600)
+    width, height = size
+    camera = Camera(np.eye(3, 4), width, width, width / 2, height / 2, width, height)
     net = UNet(dev, widths=config.network.widths)
-    found = Sketch.unseen(config, net, [Photograph("a.png", camera)] * 3)
-    return found.on_grid(Grid((0, 0, 0), 0.02, (64, 64, 64)), points, (2, 6), step)
+    return Room(config, net, [Photograph(f"{i}.png", camera) for i in range(images)])
 
 
-# points that trainings on lego had: preset, points at first, [(step, points)]
-LEGO = [
-    ("tiny", 252_312, [(6800, 112_900)]),
-    ("small", 171_262, [(2100, 94_523 * 8), (5100, 555_797)]),
-    ("full", 171_262, [(3630, 83_478 * 8), (7370, 455_094 * 8)]),
-]
+def planned(dev, base="tiny", points=171_262, step=0, **changes):
+    return room(dev, base, **changes).plan_points(GRID, points, (2, 6), step)
 
 
-@pytest.mark.parametrize("name, first, later", LEGO)
-def test_the_points_of_a_plan_are_near_those_of_lego(dev, name, first, later):
-    plan = memory_plan(sketch(dev, name, first))
-    starts = {m.name.split()[-2]: m.points for m in plan.moments if "refining" not in m.name}
-    assert plan.moments[0].points == first
-    for step, points in later:
-        assert starts[str(step)] == pytest.approx(points, rel=0.06)
+@pytest.mark.parametrize(
+    "name, first, most",
+    [("tiny", 252_312, 252_312), ("small", 171_262, 94_523 * 8), ("full", 171_262, 455_094 * 8)],
+)
+def test_the_most_points_of_a_plan_are_near_those_of_lego(dev, name, first, most):
+    plan = planned(dev, name, first)
+    assert max(phase.points for phase in plan.phases) == pytest.approx(most, rel=0.1)
 
 
 def test_a_plan_that_goes_on_counts_no_pruning_twice(dev):
-    whole = memory_plan(sketch(dev, "small"))
-    halfway = sketch(dev, "small", points=118_025, step=600)
-    assert memory_plan(halfway).moments[-1].points == pytest.approx(
-        whole.moments[-1].points, rel=0.05
-    )
-    last = memory_plan(sketch(dev, "small", points=600_000, step=4000))
-    assert [m.name for m in last.moments] == ["from step 4000 on", "averages, from step 5100 on"]
+    halfway = planned(dev, "small", points=118_025, step=600)
+    assert halfway.peak.points < planned(dev, "small").peak.points  # so it goes on where it began
+    last = planned(dev, "small", points=600_000, step=4000)
+    assert [p.name for p in last.phases] == ["from step 4000 on", "averages, from step 5100 on"]
+    assert last.phases[0].points == 600_000
 
 
 def test_without_prunings_every_point_becomes_eight(dev):
     changes = {"train__refine_at": "0.1,0.2", "train__iterations": "100"}
     changes |= {"train__prune_weight": "0", "train__prune_opacity": "0"}
-    plan = memory_plan(sketch(dev, "full", points=1000, **changes))
-    assert [(m.name, m.points) for m in plan.moments] == [
+    plan = planned(dev, "full", points=1000, scene__downscale="1", **changes)
+    assert [(p.name, p.points) for p in plan.phases] == [
         ("from step 0 on", 1000),
         ("refining after step 10", 8000),
         ("from step 10 on", 8000),
@@ -184,15 +178,14 @@ def test_without_prunings_every_point_becomes_eight(dev):
         ("from step 20 on", 64000),
         ("averages, from step 85 on", 64000),
     ]
-    tables = [dict(m.tables) for m in plan.moments]
-    # crops of a quarter, of half and of the whole size; photographs as they are stored
+    # crops of a quarter, of half and of the whole size
     sides = [128, 128, 192, 192, 256, 256]
+    tables = [phase.tables for phase in plan.phases]
     assert all(f"network at {x}x{x}" in t for x, t in zip(sides, tables, strict=True))
     assert [bool(t["averages of the points"]) for t in tables] == 5 * [False] + [True]
-    refining = tables[3]["refining"]
-    assert table_bytes(refining) == 4 * 64_000 + 192 * 8000
-    assert plan.moments[3].host == 320 * 8000
-    assert plan.peak is plan.moments[-1]
+    assert table_bytes(tables[3]["refining"]) == 4 * 64_000 + 192 * 8000
+    assert plan.phases[3].host == 320 * 8000
+    assert plan.peak is plan.phases[-1]
 
 
 @pytest.mark.parametrize(
@@ -200,22 +193,24 @@ def test_without_prunings_every_point_becomes_eight(dev):
     [
         ({}, True),
         ({"train__prune_every": "9000"}, False),
-        ({"train__prune_looks": "7999"}, False),
-        ({"train__prune_weight": "0"}, True),
         ({"train__prune_weight": "0", "train__prune_opacity": "0"}, False),
     ],
 )
 def test_pruning_is_planned_where_it_can_happen(dev, changes, prunes):
-    first = memory_plan(sketch(dev, **changes)).moments[0]
-    assert ("pruning (at most)" in dict(first.tables)) == prunes
-    # a checkpoint every 1000 steps passes through the host in pieces of 64 MiB
-    assert first.host == prunes * 24 * 171_262 + 2 * 2**26
+    plan = planned(dev, **changes)
+    assert ("pruning (at most)" in plan.phases[0].tables) == prunes
+    assert plan.phases[1].points == (round(0.6 * 171_262) if prunes else 171_262)
+    # a checkpoint passes through the host in pieces of 64 MiB
+    assert plan.phases[0].host == prunes * 24 * 171_262 + 2 * 2**26
 
 
 def test_the_host_holds_photographs_and_the_buffers_of_a_cpu():
-    buffers = [("a", {"x": ((100,), np.float32), "y": ((3,), np.uint8)})]
-    moments = [Moment("now", 1, buffers, 1000), Moment("then", 2, buffers * 2, 7)]
-    plan = Plan(moments, photographs=5000, reading=900)
+    buffers = {"a": {"x": ((100,), np.float32), "y": ((3,), np.uint8)}}
+    phases = [
+        MemoryPhase("now", 1, buffers, 1000),
+        MemoryPhase("then", 2, buffers | {"b": buffers["a"]}, 7),
+    ]
+    plan = Plan(phases, photographs=5000, reading=900)
     assert plan.peak.name == "then" and plan.peak.device == 806
     assert plan.largest == ("a: x", 400)
     assert plan.host(is_cpu=False) == 6000 and plan.host(is_cpu=True) == 5000 + 1403
@@ -223,21 +218,128 @@ def test_the_host_holds_photographs_and_the_buffers_of_a_cpu():
 
 
 def test_large_photographs_are_planned_as_they_are_kept(dev):
-    few = sketch(dev, scene__downscale="8")
-    phone = Camera(np.eye(3, 4), 4000, 4000, 2000, 1500, 4000, 3000)
-    many = replace(few, photographs=[Photograph("a.png", phone)] * 300)
-    assert many.shrunk == 8 and few.shrunk == 1
-    plan = memory_plan(many)
+    plan = planned(dev, images=300, size=(4000, 3000), scene__downscale="8")
     assert plan.photographs == 300 * 500 * 375 * 4
-    assert dict(plan.peak.tables)["photograph and target"]["image"][0] == (375, 500, 4)
-    assert memory_plan(few).photographs == 3 * 800 * 600 * 4
+    assert plan.peak.tables["photograph and target"]["image"][0] == (375, 500, 4)
+    assert planned(dev, scene__downscale="8").photographs == 3 * 800 * 600 * 4
 
 
 def test_the_plan_in_words(dev):
-    plan = memory_plan(sketch(dev))
+    plan = planned(dev)
     lines = plan_lines(plan, dev)
-    assert f"memory: {plan.peak.device / 2**20:.0f} of " in lines[0]
-    assert "averages, from step 6800 on" in lines[0] or "from step 0 on" in lines[0]
+    assert f"memory: {plan.peak.device / 2**20:.0f} of " in lines[0] and plan.peak.name in lines[0]
     sizes = [float(line.split()[-2]) for line in lines[1:-2]]
     assert sum(sizes[:-1]) == pytest.approx(sizes[-1], abs=2)
     assert "largest buffer" in lines[-2] and "photographs" in lines[-1]
+
+
+# ---- what there is
+
+
+@pytest.fixture
+def plain(dev, monkeypatch):
+    """A device of the test's own, in a machine with memory to spare."""
+    monkeypatch.setattr("pp_cl.training.memory.available_bytes", lambda: 2**45)
+    made = Device(dev.device)
+    made.info |= {"memory_bytes": 2**45, "max_allocation_bytes": 2**45}
+    return made
+
+
+def check(made, points=20_000):
+    made.check_points(GRID, points, (2, 6))
+
+
+def refusal(made, points=20_000):
+    """The one line by which a training is refused; it names what to lower."""
+    with pytest.raises(UserError) as caught:
+        check(made, points)
+    text = str(caught.value)
+    assert "\n" not in text
+    assert all(word in text for word in ("--points", "--downscale", "train.crop"))
+    return text
+
+
+def test_what_fits_is_accepted_and_a_byte_less_is_not(plain):
+    device = planned(plain, points=20_000).peak.device
+    plain.info["memory_bytes"] = device
+    made = room(plain)
+    check(made)
+    assert made.plan.peak.device == device
+    plain.info["memory_bytes"] = device - 1
+    assert plain.name in refusal(room(plain))
+
+
+def test_a_buffer_over_the_largest_allocation(plain):
+    _, largest = planned(plain, points=20_000).largest
+    plain.info["max_allocation_bytes"] = largest
+    check(room(plain))
+    plain.info["max_allocation_bytes"] = largest - 1
+    assert "allocates at once" in refusal(room(plain))
+
+
+def test_the_memory_asked_for(plain):
+    needed = planned(plain, points=20_000).peak.device / GIB
+    check(room(plain, train__memory_gib=f"{1.01 * needed:.4f}"))
+    text = refusal(room(plain, train__memory_gib=f"{0.8 * needed:.3f}"))
+    assert text.startswith(f"--memory {round(0.8 * needed, 3)}")
+    assert f"give --memory {np.ceil(100 * needed) / 100:g}" in text
+
+
+def test_the_hosts_memory(plain, monkeypatch):
+    """Of photographs and of a CPU's buffers; a system that does not tell refuses nothing."""
+    photographs = {"images": 300, "size": (4000, 3000), "scene__downscale": "1"}
+    available = "pp_cl.training.memory.available_bytes"
+    monkeypatch.setattr(available, lambda: 2 * GIB)
+    assert "of the host's memory" in refusal(room(plain, **photographs))
+    check(room(plain))
+    monkeypatch.setattr(available, lambda: None)
+    check(room(plain, **photographs))
+
+
+@pytest.mark.parametrize("base", ["tiny", "small", "paper"])
+def test_presets_on_a_device_of_four_gibibytes(plain, base):
+    plain.info |= {"memory_bytes": 4 * GIB, "max_allocation_bytes": 2 * GIB}
+    points = preset(base).points.count
+    if base == "paper":
+        refusal(room(plain, base), points)
+    else:
+        check(room(plain, base), points)
+
+
+def test_before_the_hull_is_known_no_more_is_refused_than_must_be(plain):
+    made = room(plain)
+    plain.info["memory_bytes"] = planned(plain, points=preset("tiny").points.count).peak.device
+    made.check_unseen()
+    plain.info["memory_bytes"] = MIB
+    with pytest.raises(UserError):
+        made.check_unseen()
+
+
+def run(dev, monkeypatch, *words):
+    """Status of a command on a device."""
+    monkeypatch.setattr("pp_cl.device.discover.open_device", lambda choice: dev)
+    return main(list(words))
+
+
+@pytest.mark.slow
+def test_a_refinement_that_does_not_fit_keeps_what_is_learned(plain, tmp_path, monkeypatch, capsys):
+    """More points are left than the plan took them to be."""
+    scene = write_ball_scene(tmp_path / "ball", size=64)
+    settings = {"train__refine_at": "0.5,1", "train__iterations": 40, "train__ema": "false"}
+    settings |= {"train__prune_every": 1000, "train__checkpoint_every": 1000}
+    monkeypatch.setattr("pp_cl.training.memory.KEPT_BY_PRUNING", 0.05)
+    monkeypatch.setattr(
+        "pp_cl.training.memory.prunings", lambda train, start, end: int(end > start + 1)
+    )
+    plain.info["memory_bytes"] = 50 * MIB
+
+    def train(name, points):
+        words = arguments(scene, tmp_path / name, downscale=1, points__count=points, **settings)
+        return run(plain, monkeypatch, *words)
+
+    assert train("run", 5000) == 2
+    told = capsys.readouterr().err.splitlines()[-1]
+    assert "step 19: to go on with " in told and told.endswith("in another --out")
+    assert load_checkpoint(tmp_path / "run/checkpoint.npz")[0]["step"] == 19
+    plain.info["memory_bytes"] = GIB
+    assert train("run", 5000) == 0

@@ -2,24 +2,13 @@
 
 import numpy as np
 import pytest
-from support.guarded import AWKWARD_SIZES
 from support.models import fetched, make_model
 
+from pp_cl.config import configure, preset
+from pp_cl.files.run_folder import RunFolder
 from pp_cl.scene.grid import Grid
-from pp_cl.training.point_state import PointState
-from pp_cl.training.refine import refine, split_opacity
-
-
-@pytest.mark.parametrize("n", AWKWARD_SIZES)
-def test_split_opacity(dev, rng, n):
-    """Two points let through what one did; small opacities halve to float32's accuracy."""
-    opacity = np.float32(rng.uniform(0, 1, n))
-    opacity[::5], opacity[1::5], opacity[2::5] = 0, 1, 1e-7
-    array = dev.upload(opacity)
-    split_opacity(dev, array)
-    exact = opacity.astype(np.float64) / (1 + np.sqrt(1 - opacity.astype(np.float64)))
-    np.testing.assert_allclose(array.get(), exact, rtol=3e-7)
-    assert np.allclose((1 - exact) ** 2, 1 - opacity)
+from pp_cl.session import open_training
+from pp_cl.training.state import PointState
 
 
 def test_children_are_centred_on_their_parent():
@@ -38,27 +27,38 @@ def test_a_grid_beyond_32_bits_is_refused():
         Grid((0, 0, 0), 1.0, (1024, 1024, 513)).children(np.array([0]))
 
 
-@pytest.mark.parametrize("composited", [False, True])
-def test_all_arrays_follow(dev, rng, composited):
+def test_the_state_follows(dev, rng):
+    """Each point's rows, averages among them; weights and looks start anew."""
     model = make_model(dev, rng)
     state = PointState(dev, model.cloud)
-    state.ema.update(model.cloud.learned(), 1.0)
-    stored = state.arrays()
-    state.restore(
-        model.cloud, {k: (99 * rng.random(a.shape)).astype(a.dtype) for k, a in stored.items()}
-    )
-    state.ema.arrays["opacity"].set(rng.random(model.cloud.count).astype(np.float32))
+    learned = model.cloud.learned().items()
+    state.averages |= {name: dev.empty(array.shape) for name, array in learned}
+    for array in state.arrays().values():
+        array.set((99 * rng.random(array.shape)).astype(array.dtype))
     grid, before = model.grid, fetched(model.cloud.arrays(dev) | state.arrays())
     ids, parents = grid.children(before["points.ids"])
-    refine(dev, model, state, composited=composited)
+    state.refine(dev, model.refine())
 
     after = fetched(model.cloud.arrays(dev) | state.arrays())
     assert model.grid == grid.refined() and after.keys() == before.keys()
     np.testing.assert_array_equal(model.grid_buffer.get(), grid.refined().packed(grid.centre))
     np.testing.assert_array_equal(after.pop("points.ids"), ids)
-    assert not after.pop("state.peak_weight").any() and not after.pop("state.look_count").any()
+    assert not after.pop("state.max_weight").any() and not after.pop("state.times_seen").any()
     for name, array in after.items():
-        expected = before[name][parents]
-        if composited and name in ("points.opacity", "state.a.opacity"):
-            expected = 1 - np.sqrt(1 - expected)
-        np.testing.assert_allclose(array, expected, atol=1e-6)
+        np.testing.assert_array_equal(array, before[name][parents])
+
+
+@pytest.mark.parametrize("blend", ["alpha", "softmax"])
+def test_refined_points_let_as_much_light_through(dev, scene, tmp_path, blend):
+    """Two behind one another what one did, in alpha compositing; averages among them."""
+    given = {"points.count": 300, "raster.blend": blend, "train.refine_at": "0.5,1"}
+    given["scene.downscale"] = 1
+    config = configure(preset("tiny"), scene, [(k, v, "test") for k, v in given.items()])
+    trainer = open_training(dev, RunFolder(tmp_path / "run"), config, None).trainer
+    trainer.optimiser.update_ema(1.0)
+    opacities = trainer.model.cloud, trainer.state.averages
+    before = opacities[0].opacity.get(), opacities[1]["opacity"].get()
+    trainer._refine()
+    for old, new in zip(before, (opacities[0].opacity, opacities[1]["opacity"]), strict=True):
+        expected = 1 - np.sqrt(1 - old[0]) if blend == "alpha" else old[0]
+        np.testing.assert_allclose(new.get(), expected, rtol=1e-5)

@@ -6,7 +6,12 @@ import numpy as np
 import pytest
 
 from pp_cl.config import assign, preset
+from pp_cl.settings import NetworkConfig, TrainConfig
 from pp_cl.training.schedule import (
+    BOX_MARGIN,
+    END_SHARE,
+    Rates,
+    draw_start,
     ema_weight,
     gamma_at,
     learning_rate,
@@ -93,3 +98,53 @@ def test_short_trainings_average_too(steps):
     weights = [ema_weight(step, steps) for step in range(steps)]
     assert next(w for w in weights if w) == 1
     assert all(0 <= w <= 1 for w in weights)
+
+
+@pytest.mark.parametrize(
+    "steps, meant_for, scale", [(100, 1000, 1), (1000, 1000, 1), (9000, 1000, 1 / 3), (9000, 0, 1)]
+)
+def test_opacities_are_slower_in_longer_trainings(steps, meant_for, scale):
+    settings = TrainConfig(iterations=steps, opacity_rate_steps=meant_for)
+    first, last = (Rates.at(step, NetworkConfig(), settings) for step in (0, steps))
+    assert (first.opacity, last.opacity) == pytest.approx((0.1 * scale, 0.01 * scale))
+    assert (first.network, last.network) == pytest.approx((1e-3, 1e-4))
+
+
+@pytest.mark.parametrize(
+    "low, high, size, limit",
+    [
+        (10, 50, 16, 64),
+        (20, 30, 16, 64),
+        (0, 5, 16, 64),
+        (60, 64, 16, 64),
+        (0, 64, 64, 64),
+        (3, 60, 64, 64),
+    ],
+)
+def test_crops_stay_inside_and_show_the_object(low, high, size, limit):
+    starts = {
+        draw_start(np.random.default_rng(i), low, high, size, limit=limit) for i in range(300)
+    }
+    assert min(starts) >= 0 and max(starts) + size <= limit
+    for start in starts:
+        shown = min(high, start + size) - max(low, start)
+        assert shown == min(size, high - low)
+    assert len(starts) == max(
+        1, min(max(low, high - size), limit - size) - max(min(low, high - size), 0) + 1
+    )
+
+
+@pytest.mark.parametrize(
+    "low, high, size, limit", [(10, 400, 64, 800), (0, 617, 256, 800), (17, 183, 128, 200)]
+)
+def test_a_quarter_of_the_crops_shows_an_end_of_the_object(low, high, size, limit):
+    """Drawn uniformly they would hardly ever; what lies between is seen as often, within a half."""
+    seen, draws = np.zeros(limit), 3000
+    for i in range(draws):
+        start = draw_start(np.random.default_rng(i), low, high, size, limit=limit)
+        seen[start : start + size] += 1 / draws
+    ends = seen[[low + BOX_MARGIN, high - BOX_MARGIN - 1]]
+    assert ends == pytest.approx(END_SHARE, abs=0.03)
+    inner = seen[low + BOX_MARGIN : high - BOX_MARGIN]
+    fair = size / (high - low)
+    assert inner.min() > min(0.5 * fair, END_SHARE - 0.03)

@@ -97,7 +97,7 @@ def test_hits_are_those_of_the_pairs(dev, live, trained):
     wider, left, top = camera.padded(4)
     all_hits = hits_per_pixel(run.renderer, wider, run.gamma)
     np.testing.assert_array_equal(hits, all_hits[top : top + 43, left : left + 45])
-    assert all_hits.sum() == run.renderer.blend_weights(wider, run.gamma).pairs.total
+    assert all_hits.sum() == run.renderer.forward(wider, run.gamma, until="weights").pairs.total
     fewer = drawn(live, camera, show="hits", kept=0.2)[0]["scale"]
     assert 0 < fewer[1] < hits.max()
 

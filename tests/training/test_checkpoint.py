@@ -29,7 +29,7 @@ from pp_cl.errors import UserError
 from pp_cl.files.checkpoint import load_checkpoint, save_checkpoint
 from pp_cl.files.run_folder import RunFolder
 from pp_cl.run import load_run
-from pp_cl.training.stored import load_run_state, opened_run, stored_forms
+from pp_cl.training.checkpoint import load_run_state, opened_run, stored_forms
 from pp_cl.view.live_run import LiveRun
 from pp_cl.view.messages import read_request
 
@@ -85,32 +85,20 @@ def test_a_training_writes_what_is_expected(scene, tmp_path, monkeypatch, every,
 
 HEADERS = {
     "depth range of one": ({"depth_range": [2.0]}, "depth_range"),
-    "depth range of three": ({"depth_range": [2.0, 4.0, 6.0]}, "depth_range"),
     "far before near": ({"depth_range": [6.0, 2.0]}, "depth_range"),
     "near behind the eye": ({"depth_range": [-1.0, 2.0]}, "depth_range"),
-    "depths as texts": ({"depth_range": ["2", "6"]}, "depth_range"),
     "depth of NaN": ({"depth_range": [2.0, float("nan")]}, "corrupt checkpoint"),
     "no depth": ({"depth_range": [0.0, 1e-300]}, "depth_range"),
     "near and far as one": ({"depth_range": [2.0, 2.0 + 1e-9]}, "depth_range"),
-    "depth beyond float32": ({"depth_range": [2.0, 1e39]}, "depth_range"),
     "dims as a text": ({"grid": HEADER["grid"] | {"dims": "987"}}, "grid"),
-    "two dims": ({"grid": HEADER["grid"] | {"dims": [9, 8]}}, "grid"),
-    "negative dims": ({"grid": HEADER["grid"] | {"dims": [9, -8, -7]}}, "grid"),
     "no vertices": ({"grid": HEADER["grid"] | {"dims": [9, 8, 0]}}, "grid"),
     "dims that are no whole numbers": ({"grid": HEADER["grid"] | {"dims": [9.0, 8, 7]}}, "grid"),
     "more vertices than ids": ({"grid": HEADER["grid"] | {"dims": [2**20, 2**20, 2]}}, "grid"),
     "negative edge": ({"grid": HEADER["grid"] | {"edge": -0.25}}, "grid"),
     "edge of NaN": ({"grid": HEADER["grid"] | {"edge": float("nan")}}, "corrupt checkpoint"),
-    "edge of true": ({"grid": HEADER["grid"] | {"edge": True}}, "grid"),
-    "grid without origin": ({"grid": {"edge": 0.25, "dims": [9, 8, 7]}}, "grid"),
-    "grid of more": ({"grid": HEADER["grid"] | {"angle": 3}}, "grid"),
     "no grid": ({"grid": [1, 2]}, "grid"),
     "step as a text": ({"step": "50"}, "step"),
-    "step as a list": ({"step": [50]}, "step"),
-    "negative step": ({"step": -5}, "step"),
     "step past the end": ({"step": 10**9}, "step"),
-    "step of 400 digits": ({"step": 10**400}, "step"),
-    "no whole step": ({"step": -1e29}, "step"),
     "step of true": ({"step": True}, "step"),
     "finished of 1": ({"finished": 1}, "finished"),
     "extended from nowhere": ({"extended_from": 0}, "extended_from"),
@@ -118,24 +106,16 @@ HEADERS = {
     "not finished at its end": ({"step": STEPS}, "not finished at step 60"),
     "no points at the start": ({"initial_points": 0}, "initial_points"),
     "fewer points at the start than now": ({"initial_points": 39}, "points.ids"),
-    "half a point": ({"initial_points": 50.5}, "initial_points"),
-    "scene of a number": ({"scene": 7}, "scene"),
     "scene without end": ({"scene": "x" * 10**6}, "scene"),
     "views of nothing": ({"views": []}, "views"),
     "a view without a camera": ({"views": [["r_0.png"]]}, "views"),
-    "a view of no letters": ({"views": [["r_0.png", "\u00e9"]]}, "views"),
-    "a camera of some bytes": ({"views": [["r_0.png", "AAAA"]]}, "views"),
     "a camera of zeros": ({"views": [["r_0.png", "A" * 192]]}, "views"),
     "pixels of a list": ({"pixels": ["0" * 16]}, "pixels"),
-    "pixels of nothing": ({"pixels": {}}, "pixels"),
-    "pixels of a number": ({"pixels": {"r_0.png": 7}}, "pixels"),
     "pixels of another length": ({"pixels": {"r_0.png": "0" * 17}}, "pixels"),
     "pixels of other letters": ({"pixels": {"r_0.png": "g" * 16}}, "pixels"),
     "an unknown key": ({"col\nour\x1b[31m": 1}, "header holds col our?[31m"),
     "tuning of a list": ({"tuning": []}, "tuning"),
-    "tuning of nothing": ({"tuning": {}}, "tuning"),
     "another format": ({"format": 2}, "format 2"),
-    "format without end": ({"format": "y" * 10**6}, "format 'yyy"),
 }
 
 
@@ -183,7 +163,6 @@ def test_a_header_of_other_text_is_refused(folder, config, text):
 ARRAYS = {
     "ids reversed": ("points.ids", lambda a: a[::-1].copy(), "ascending order"),
     "ids equal": ("points.ids", lambda a: np.full_like(a, 7), "ascending order"),
-    "an id twice": ("points.ids", lambda a: np.sort(np.append(a[1:], a[5])), "ascending order"),
     "ids outside": ("points.ids", lambda a: np.append(a[:-1], ids(9 * 8 * 7)), "vertices"),
     "ids with a sign": ("points.ids", lambda a: a.astype(np.int32), "int32 (40,)"),
     "ids in two columns": ("points.ids", lambda a: a.reshape(20, 2), "expected 1 to 50 points"),
@@ -192,26 +171,18 @@ ARRAYS = {
     "no ids": ("points.ids", None, "points.ids is missing"),
     "an id less than opacities": ("points.ids", lambda a: a[:-1], "expected float32 (39,"),
     "negative opacity": ("points.opacity", lambda a: a - 1, "opacities from 0 to 1"),
-    "huge opacity": ("points.opacity", lambda a: a + np.float32(1e30), "opacities from 0 to 1"),
     "opacity of NaN": ("points.opacity", lambda a: a * np.float32("nan"), "NaN or Inf"),
-    "infinite colour": ("points.sh0", lambda a: a + np.float32("inf"), "points.sh0 holds NaN"),
     "colours of doubles": ("points.sh1", lambda a: a.astype(float), "float64 (40, 3, 16)"),
     "no degree 2": ("points.sh2", None, "points.sh2 is missing, expected float32 (40, 5, 16)"),
-    "a degree more": ("points.sh3", ONE, "holds points.sh3, which does not belong"),
     "a layer less": ("net.up1.bias", None, "net.up1.bias is missing"),
     "a layer more": ("net.enc3.a.bias", ONE, "holds net.enc3.a.bias"),
-    "a wider layer": ("net.out.bias", lambda a: np.append(a, a), "net.out.bias is float32 (32,)"),
-    "weights of other order": ("net.out.weight", lambda a: a[0], "expected float32 (1, 1, 1, 16"),
-    "moments less": ("moment.m.enc0.a.weight", None, "moment.m.enc0.a.weight is missing"),
     "moments of halves": ("moment.v.out.bias", lambda a: a.astype(np.float16), "float16"),
     "moments of fewer": ("state.v.sh", lambda a: a[1:], "state.v.sh is float32 (39, 16)"),
     "negative squares": ("state.v.sh", lambda a: -a, "state.v.sh holds other than"),
     "negative squares inside": ("moment.v.dec0.a.bias", lambda a: -a, "moment.v.dec0.a.bias"),
     "a step to come": ("state.last_step", lambda a: a + np.uint32(STEP + 1), "steps that are done"),
-    "no last steps": ("state.last_step", None, "state.last_step is missing"),
-    "negative weights": ("state.peak_weight", lambda a: -a, "state.peak_weight holds other than"),
+    "negative weights": ("state.max_weight", lambda a: -a, "state.max_weight holds other than"),
     "an average too early": ("average.out.bias", ONE, "holds average.out.bias"),
-    "what nobody asked for": ("photographs", ONE, "holds photographs, which does not belong"),
     "texts": ("net.out.bias", lambda a: np.array(["x"] * 16), "corrupt checkpoint"),
 }
 
@@ -227,20 +198,12 @@ def test_an_array_that_cannot_be_is_refused(folder, config, name, change, told):
     assert told in refusal(folder, config)
 
 
-@pytest.mark.parametrize(
-    "step, name, told",
-    [
-        (55, "average.out.bias", "average.out.bias is missing"),
-        (55, "state.a.opacity", "state.a.opacity is missing"),
-    ],
-)
-def test_averages_are_there_once_they_have_begun(folder, config, step, name, told):
-    header, arrays = contents(config, step)
-    write_run(folder, config, header, arrays)
-    load_run_state(folder, config)
+@pytest.mark.parametrize("name", ["average.out.bias", "state.a.opacity"])
+def test_averages_are_there_once_they_have_begun(folder, config, name):
+    header, arrays = contents(config, 55)
     del arrays[name]
     write_run(folder, config, header, arrays)
-    assert told in refusal(folder, config)
+    assert f"{name} is missing" in refusal(folder, config)
 
 
 def test_a_finished_run_holds_no_state_and_an_unfinished_one_does(folder, config):
@@ -280,15 +243,11 @@ def trained(scene, tmp_path_factory):
 
 BROKEN = {
     "ids": lambda header, arrays: arrays.update({"points.ids": arrays["points.ids"][::-1].copy()}),
-    "member": lambda header, arrays: arrays.update(extra=ONE),
     "step": lambda header, arrays: header.update(step=-5),
-    "opacity": lambda header, arrays: arrays["points.opacity"].fill(-1),
 }
 TOLD = {
     "ids": "points.ids holds other than vertices of its grid in ascending order",
-    "member": "holds extra, which does not belong there",
     "step": "step in its header is -5, expected one of the 60 steps",
-    "opacity": "points.opacity holds other than opacities from 0 to 1",
 }
 
 
@@ -310,8 +269,6 @@ def test_every_reader_says_the_same(scene, trained, dev, tmp_path, capsys, kind)
         arguments(scene, finished),
         arguments(scene, young),
     ]
-    if kind == "opacity":
-        del commands[1]  # info reads the ids alone
     for words in commands:
         folder = young if str(young) in words else finished
         capsys.readouterr()

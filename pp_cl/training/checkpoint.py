@@ -16,10 +16,10 @@ from pp_cl.files.checkpoint import MEND, Checkpoint, Form, opened_checkpoint
 from pp_cl.files.run_folder import RunFolder
 from pp_cl.layers.choice import check_form
 from pp_cl.network.layers import parameter_table, unet_layers
-from pp_cl.raster.sh import SH_DEGREES, sh_blocks
+from pp_cl.raster.points import SH_DEGREES, sh_blocks
 from pp_cl.scene.identity import DIGITS, kept_views
-from pp_cl.training.point_state import PointState
 from pp_cl.training.schedule import ema_start
+from pp_cl.training.state import PointState
 
 MOST_VERTICES = 2**32  # an id has 32 bits
 LEAST_LENGTH, MOST_LENGTH = 1e-30, 1e30  # world units; float32 would hold no products of others
@@ -234,7 +234,7 @@ def _array_rule(name: str, header: dict[str, Any]) -> Rule | None:
         return lambda a: a.min() >= 0 and a.max() <= 1, "opacities from 0 to 1"
     if name == "state.last_step":
         return lambda a: a.max() <= header["step"], "steps that are done"
-    if name in ("state.peak_weight", "state.look_count") or name.startswith(
+    if name in ("state.max_weight", "state.times_seen") or name.startswith(
         ("state.v.", "moment.v.")
     ):
         return lambda a: a.min() >= 0, "numbers from 0 on"

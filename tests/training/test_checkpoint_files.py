@@ -16,9 +16,7 @@ from support.checkpoints import (
     write_run,
 )
 
-from pp_cl.errors import UserError
 from pp_cl.files.run_folder import RunFolder
-from pp_cl.training.stored import load_run_state
 
 
 @pytest.fixture
@@ -145,49 +143,3 @@ def test_a_file_that_may_not_be_read_is_not_called_corrupt(folder, config, monke
     monkeypatch.setattr(zipfile, "ZipFile", refused)
     line = refusal(folder, config)
     assert "cannot be read (Permission denied)" in line and "delete" not in line
-
-
-def mutated(data, rng):
-    """A copy with a few random changes, half of them in the directory or an array's header."""
-    data = bytearray(data)
-    for _ in range(rng.integers(1, 4)):
-        marks = (b"PK\x01\x02", b"PK\x03\x04", b"\x93NUMPY", b"PK\x05\x06")
-        start = data.find(marks[rng.integers(4)], rng.integers(len(data)))
-        place = int(rng.integers(len(data)))
-        if start >= 0 and rng.random() < 0.7:
-            place = min(start + int(rng.integers(120)), len(data) - 1)
-        length = int(rng.integers(1, 40))
-        kind = rng.integers(6)
-        if kind == 0:
-            data[place] ^= 1 << rng.integers(8)
-        elif kind == 1:
-            data[place] = rng.integers(256)
-        elif kind == 2:
-            data[place : place + 4] = rng.choice([b"\xff\xff\xff\xff", b"\0\0\0\0", b"\0\0\0\x80"])
-        elif kind == 3:
-            del data[place : place + length]
-        elif kind == 4:
-            data[place:place] = data[place : place + length]
-        else:
-            other = int(rng.integers(len(data)))
-            data[place : place + length] = data[other : other + length]
-    return bytes(data)
-
-
-def test_of_random_changes_all_are_refused_or_change_nothing(folder, config):
-    header, arrays = contents(config)
-    write_run(folder, config, header, arrays)
-    whole, refused = folder.checkpoint.read_bytes(), 0
-    for seed in range(300):
-        folder.checkpoint.write_bytes(mutated(whole, np.random.default_rng(seed)))
-        try:
-            with warnings.catch_warnings():
-                warnings.simplefilter("error")
-                found_header, found = load_run_state(folder, config)
-        except UserError as error:
-            assert str(error).isprintable() and str(folder.checkpoint) in str(error), seed
-            refused += 1
-            continue
-        assert found_header == {"format": 1, **header} and found.keys() == arrays.keys(), seed
-        assert all(np.array_equal(found[name], arrays[name]) for name in arrays), seed
-    assert refused > 200

@@ -1,17 +1,63 @@
-"""What is learned of the points, one row each."""
+"""The points: what is learned of each, and how its spherical harmonics are stored."""
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
 from pyopencl.array import Array
 
 from pp_cl.device.buffers import Table
-from pp_cl.device.compact import compact_rows, gather_rows
 from pp_cl.device.device import Device
-from pp_cl.device.rows import DeviceRows
-from pp_cl.raster.sh import SH_BLOCKS, SH_DEGREES, ShBlock, sh_blocks
+from pp_cl.device.rows import DeviceRows, compact_rows, gather_rows
+
+
+@dataclass(frozen=True)
+class ShBlock:
+    """The SH coefficients of one array (N, count, 16): `count` of one degree, those of the basis
+    functions `first`, `first` + 1, ...
+
+    name: sh_ and the degree, then a or b where a degree fills two arrays.
+    """
+
+    name: str
+    first: int
+    count: int
+
+    @property
+    def degree(self) -> int:
+        """0, 1 or 2."""
+        return math.isqrt(self.first)
+
+
+# Degree 2 fills two arrays: no array takes more than 192 bytes a point, so that 4.04 million
+# points fit devices that allocate at most 1 GiB at once. The layout is the same everywhere, and so
+# are the bits.
+SH_BLOCKS = (
+    ShBlock("sh_0", 0, 1),
+    ShBlock("sh_1", 1, 3),
+    ShBlock("sh_2a", 4, 3),
+    ShBlock("sh_2b", 7, 2),
+)
+SH_DEGREES = (0, 1, 2)
+
+
+def sh_blocks(degree: int) -> tuple[ShBlock, ...]:
+    """Those of SH_BLOCKS up to a degree."""
+    return tuple(block for block in SH_BLOCKS if block.degree <= degree)
+
+
+def stored_degree(sh: list[Array]) -> int:
+    """The highest degree of coefficients in arrays of the first SH_BLOCKS."""
+    return SH_BLOCKS[len(sh) - 1].degree
+
+
+def four_blocks(sh: list[Array]) -> list[Array]:
+    """Arrays of all SH_BLOCKS for a kernel's arguments: the first one stands for those that are
+    absent, which a kernel built for the stored degree does not read.
+    """
+    return [*sh, *[sh[0]] * (len(SH_BLOCKS) - len(sh))]
 
 
 @dataclass
@@ -46,10 +92,9 @@ class PointCloud:
     @classmethod
     def create(cls, dev: Device, ids: np.ndarray, degree: int, opacity: float = 1.0) -> PointCloud:
         """Points of one opacity with SH coefficients of 0. ids: (N), ascending."""
-        blocks, n = sh_blocks(degree), len(ids)
-        table = cls.table(n, blocks)
+        n = len(ids)
         opacities = dev.upload(np.full(n, opacity, np.float32))
-        sh = [dev.zeros(*table[block.name]) for block in blocks]
+        sh = [dev.zeros((n, block.count, 16)) for block in sh_blocks(degree)]
         return cls(dev.upload(ids, np.uint32), opacities, sh)
 
     def learned(self) -> dict[str, Array]:
@@ -66,8 +111,7 @@ class PointCloud:
 
     def rows(self, dev: Device, keep: Array) -> PointCloud:
         """A copy of the rows `keep`, (M) uint32, ascending."""
-        sh = [gather_rows(dev, array, keep) for array in self.sh]
-        ids, opacity = (gather_rows(dev, array, keep) for array in (self.ids, self.opacity))
+        ids, opacity, *sh = (gather_rows(dev, a, keep) for a in (self.ids, self.opacity, *self.sh))
         return PointCloud(ids, opacity, sh)
 
     def replace_by(self, dev: Device, ids: np.ndarray, rows: Array) -> None:
@@ -85,7 +129,7 @@ class PointCloud:
         """
         stored = {"ids": DeviceRows(dev, self.ids), "opacity": DeviceRows(dev, self.opacity)}
         blocks = list(zip(self.blocks, self.sh, strict=True))
-        for degree in sorted({block.degree for block in self.blocks}):
+        for degree in range(stored_degree(self.sh) + 1):
             parts = [array for block, array in blocks if block.degree == degree]
             stored[f"sh{degree}"] = DeviceRows(dev, *parts)
         return {f"points.{name}": rows for name, rows in stored.items()}

@@ -1,4 +1,5 @@
-// What both blends know of the pairs and weights: which points contribute, and how much.
+// What the weights of either blend say of the points: which ones are visible, and how much each
+// weighs.
 #include "common.h"
 #include "raster/pair_role.h"
 
@@ -22,20 +23,20 @@ kernel void find_shaded_points(
 }
 
 // One work-item per point: reads the weights of its pairs, keeps their sum if it is the highest so
-// far, and adds one look if there is a pair.
-kernel void raise_point_peaks(
+// far, and counts the view if there is a pair.
+kernel void record_weights(
     const uint n,                      // points
     global const uint *point_offset,   // (N+1)
     global const float2 *pair_weight,  // (P, 2)
     global const uchar *pair_role,     // (?) P with HAS_ROLES
-    global float *point_peak,          // (N) read and written
-    global float *point_looks)         // (N) accumulates
+    global float *max_weight,          // (N) read and written
+    global float *times_seen)          // (N) accumulates
 {
     const uint i = get_global_id(0);
     if (i >= n) return;
     float sum = 0.0f;
     for (uint pair = point_offset[i]; pair < point_offset[i + 1]; pair++)
         if (!HAS_ROLES || pair_role[pair] != DROPPED) sum += pair_weight[pair].x;
-    point_peak[i] = fmax(point_peak[i], sum);
-    if (point_offset[i] < point_offset[i + 1]) point_looks[i] += 1.0f;
+    max_weight[i] = fmax(max_weight[i], sum);
+    if (point_offset[i] < point_offset[i + 1]) times_seen[i] += 1.0f;
 }

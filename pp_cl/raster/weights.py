@@ -1,0 +1,166 @@
+"""The blend weight of each hit in its pixel, by alpha compositing or by the paper's softmax; which
+points they make visible, and how much each one weighs.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from pyopencl.array import Array
+
+from pp_cl.device.buffers import Buffers, Table
+from pp_cl.device.device import Device
+from pp_cl.device.launch import lanes
+from pp_cl.device.scan import nonzero
+from pp_cl.device.transfer import Reading
+from pp_cl.raster.pairs import Pairs
+
+BLENDS = ("softmax", "alpha")
+DROPPED = 2  # cl/raster/pair_role.h
+
+
+@dataclass(frozen=True)
+class BlendWeights:
+    """The blend weights of a Pairs object, valid until the next ones are computed.
+
+    blend: one of BLENDS. has_roles: some pairs may be untracked or dropped; else all are tracked
+    and pair_role is unread. pair_weight: (P, 2) float32, the weight b, and s, which times the
+    pair's gain is dL/do (cl/raster/blend.cl); undefined where the pair is dropped. pair_role: (P,)
+    uint8, cl/raster/pair_role.h. pixel_entry: (P,) uint64, weight bits << 32 | point, each pixel's
+    hits by depth; where hits are dropped, an entry of no point ends a pixel's list. shaded_list:
+    `shaded` before its length is known. transmittance: (HW,) float32 behind all hits, None of a
+    softmax.
+    """
+
+    blend: str
+    has_roles: bool
+    pair_weight: Array
+    pair_role: Array
+    pixel_entry: Array
+    shaded_list: Reading[Array]
+    transmittance: Array | None
+
+    @property
+    def shaded(self) -> Array:
+        """(S,) uint32, ascending, the points with a hit that is not dropped: no other point's
+        features are read, no other point gets a gradient. Waits until their number is known.
+        """
+        return self.shaded_list.get()
+
+
+def weights_table(n: int, pixels: int, pairs: int, has_roles: bool) -> Table:
+    """The buffers for n points, a number of pixels and room for a number of pairs. has_roles: see
+    BlendWeights.
+    """
+    return {
+        "pair_weight": ((pairs, 2), np.float32),
+        "pair_role": ((pairs if has_roles else 1,), np.uint8),
+        "pixel_entry": ((pairs,), np.uint64),
+        "transmittance": ((pixels,), np.float32),
+        "point_is_shaded": ((n,), np.uint8),
+        "shaded": ((n,), np.uint32),
+    }
+
+
+def blend_weights(
+    dev: Device,
+    b: Buffers,
+    pairs: Pairs,
+    camera_buffer: Array,
+    opacity: Array,
+    *,
+    blend: str,
+    gamma: float,
+    max_tracked: int = 0,
+    early_stop: float = 0.0,
+) -> BlendWeights:
+    """The weights of all pairs.
+
+    opacity: (N,) float32 in [0, 1]. blend: one of BLENDS. gamma: depth sharpness of the softmax.
+    max_tracked: only this many nearest hits of a pixel get gradients (64 in the paper); 0: all.
+    early_stop: in [0, 1): a pixel drops all hits behind the depth where no hit can have this share
+    any more (0.001 in the paper); 0: none.
+    """
+    has_roles = early_stop > 0 or max_tracked > 0
+    n, pixels = pairs.points, pairs.pixels
+    b.require(weights_table(n, pixels, pairs.capacity, has_roles))
+    if blend == "alpha":
+        _alpha_weights(dev, b, pairs, opacity, max_tracked, early_stop)
+    else:
+        _softmax_weights(dev, b, pairs, camera_buffer, opacity, gamma, max_tracked, early_stop)
+    dev.fill(b.point_is_shaded, 0)
+    dev.program("raster/weights", HAS_ROLES=int(has_roles)).launch(
+        "find_shaded_points",
+        pixels,
+        hw=pixels,
+        pixel_offset=pairs.pixel_offset,
+        pixel_entry=b.pixel_entry,
+        point_is_shaded=b.point_is_shaded,
+    )
+    shaded_list = nonzero(dev, b.point_is_shaded, b.shaded)
+    transmittance = b.transmittance if blend == "alpha" else None
+    return BlendWeights(
+        blend, has_roles, b.pair_weight, b.pair_role, b.pixel_entry, shaded_list, transmittance
+    )
+
+
+def _alpha_weights(dev, b, pairs, opacity, max_tracked, early_stop):
+    """T o d: no hit behind early_stop could weigh more than that, nor all of them together."""
+    if early_stop > 0:
+        dev.fill(b.pair_role, DROPPED)
+    program = dev.program("raster/alpha", DROPS=int(early_stop > 0), MAX_TRACKED=max_tracked)
+    program.launch(
+        "alpha_weights",
+        pairs.pixels,
+        hw=pairs.pixels,
+        early_stop=early_stop,
+        pixel_offset=pairs.pixel_offset,
+        pair_key=pairs.pair_key,
+        pair_point_closeness=pairs.pair_point_closeness,
+        opacity=opacity,
+        pair_weight=b.pair_weight,
+        pair_role=b.pair_role,
+        pixel_entry=b.pixel_entry,
+        transmittance=b.transmittance,
+    )
+
+
+def _softmax_weights(dev, b, pairs, camera_buffer, opacity, gamma, max_tracked, early_stop):
+    """Eq. (1); early_stop is Pulsar's percent_allowed_difference."""
+    program = dev.program(
+        "raster/softmax", LANES=lanes(dev), DROPS=int(early_stop > 0), MAX_TRACKED=max_tracked
+    )
+    program.launch(
+        "softmax_weights",
+        pairs.pixels,
+        hw=pairs.pixels,
+        gamma=gamma,
+        early_stop=early_stop,
+        camera=camera_buffer,
+        pixel_offset=pairs.pixel_offset,
+        pair_key=pairs.pair_key,
+        pair_point_closeness=pairs.pair_point_closeness,
+        opacity=opacity,
+        pair_weight=b.pair_weight,
+        pair_role=b.pair_role,
+        pixel_entry=b.pixel_entry,
+    )
+
+
+def record_weights(
+    dev: Device, pairs: Pairs, weights: BlendWeights, max_weight: Array, times_seen: Array
+) -> None:
+    """Raise max_weight to each point's blend weights, summed over the pixels, where they are
+    higher, and add 1 to times_seen where it has a hit, dropped or not; both (N,) float32.
+    """
+    dev.program("raster/weights", HAS_ROLES=int(weights.has_roles)).launch(
+        "record_weights",
+        pairs.points,
+        n=pairs.points,
+        point_offset=pairs.point_offset,
+        pair_weight=weights.pair_weight,
+        pair_role=weights.pair_role,
+        max_weight=max_weight,
+        times_seen=times_seen,
+    )

@@ -1,0 +1,364 @@
+"""Cases of the two blends, alpha compositing and the softmax of Eq. (1): weights, features,
+gradients, and where a naive formula overflows, divides by zero or hangs.
+"""
+
+from collections.abc import Iterator
+from functools import partial
+
+import numpy as np
+
+from pp_cl.device.device import Device
+from pp_cl.raster.project import FOOTPRINTS
+from pp_cl.raster.weights import BLENDS, DROPPED
+from pp_cl.reference import dense
+from pp_cl.reference.differences import numeric_gradient
+from pp_cl.selftest.case import (
+    SIZES,
+    Case,
+    Check,
+    absolute,
+    each,
+    exact,
+    finite,
+    no_more,
+    relative,
+)
+from pp_cl.selftest.points import (
+    AXIS,
+    FAR,
+    Blended,
+    PairedPoints,
+    blend_on_axis,
+    depth_at,
+    make_camera,
+    make_points,
+)
+
+# alpha: a closeness is off by 1e-6, as the places are (project); the product of some ten 1 - alpha
+# of them by as many times that. softmax: exponents o z / gamma of up to 100 are off by 100 EPS
+WEIGHT = {"alpha": 1e-5, "softmax": 2e-5}
+GRADIENT = 2e-5  # alpha: T, and what is composited behind, each off by its WEIGHT
+# softmax: dL/do = share (1 + o z / gamma) s, two factors that are each off by its WEIGHT
+OPACITY = {"alpha": GRADIENT, "softmax": 5e-5}
+MANY = 1e-4  # a sum of 20000 terms one by one: each rounds all those before it
+NEAREST = 1e-4  # e^100 of a depth near 1: its rounding, and that of the place, times 100
+UNIT = 2.0**-24  # a float's rounding
+ROUNDINGS = 4  # of an exponent, and in a row of a product of 16 terms
+LEAST = 2.0**-126  # the least float that every device has
+STEP = 1e-6
+DIFFERENCES = 2e-3  # depths and closeness are steep at the rim, where that step is no small one
+
+
+def _forward(rule: str, kind: str, dev: Device, rng: np.random.Generator) -> Iterator[Check]:
+    for gamma in (0.1, 0.01):
+        blended = Blended(dev, rng, kind=kind, gamma=gamma, rule=rule)
+        weights = blended.scene.weights
+        yield absolute(blended.weight, blended.blend["weight"], WEIGHT[rule])
+        expected = dense.features(blended.blend, blended.point_features)
+        yield relative(blended.features, expected, WEIGHT[rule])
+        empty = ~blended.geometry["hit"].any(axis=0)
+        yield exact(blended.features[empty], np.ones((empty.sum(), 16)))
+        yield exact(weights.shaded.get(), blended.scene.seen)
+        if rule == "alpha":
+            background = blended.blend["background"]
+            yield absolute(weights.transmittance.get(), background, WEIGHT[rule])
+
+
+def _backward(rule: str, kind: str, dev: Device, rng: np.random.Generator) -> Iterator[Check]:
+    for gamma, mean, tracked in ((0.1, False, 0), (0.01, False, 3), (0.01, True, 0)):
+        options = {"mean": mean, "max_tracked": tracked, "rule": rule}
+        blended = Blended(dev, rng, kind=kind, gamma=gamma, **options)
+        gradients, expected = blended.gradients(), blended.reference_gradients(tracked, mean)
+        yield relative(gradients["features"], expected[0], GRADIENT)
+        yield relative(gradients["opacity"], expected[1], OPACITY[rule])
+        unseen = ~blended.geometry["hit"].any(axis=1)
+        yield exact(gradients["opacity"][unseen], np.zeros(unseen.sum()))
+
+
+def _check_blended(blended: Blended) -> Iterator[Check]:
+    expected = dense.features(blended.blend, blended.point_features)
+    yield relative(blended.features, expected, GRADIENT)
+    gradients, expected = blended.gradients(), blended.reference_gradients()
+    yield relative(gradients["features"], expected[0], GRADIENT)
+    yield relative(gradients["opacity"], expected[1], GRADIENT)
+
+
+def _sizes(rule: str, dev: Device, rng: np.random.Generator) -> Iterator[Check]:
+    for n in SIZES:
+        for size in ((1, 1), (31, 33)):
+            yield from _check_blended(Blended(dev, rng, n, size=size, rule=rule))
+
+
+def _early_stop(rule: str, dev: Device, rng: np.random.Generator) -> Iterator[Check]:
+    """Nothing in front of the stop is dropped, all behind it is."""
+    for stop in (0.001, 0.05, 0.5):
+        options = {"gamma": 0.02, "radius": 0.4, "rule": rule, "early_stop": stop}
+        blended = Blended(dev, rng, 500, **options)
+        hit, kept = blended.geometry["hit"], blended.blend["hit"]
+        yield exact(hit & (blended.role == DROPPED), hit & ~kept)
+        yield exact(blended.scene.weights.shaded.get(), np.flatnonzero(kept.any(axis=1)))
+        yield from _check_blended(blended)
+
+
+def _zero_opacity(rule: str, dev: Device, rng: np.random.Generator) -> Iterator[Check]:
+    """The picture is the background; every opacity has a gradient by which it can come back."""
+    for gamma, stop in ((0.1, 0.0), (0.01, 0.0), (1e-5, 0.0), (0.1, 1e-3)):
+        options = {"rule": rule, "early_stop": stop}
+        scene, weight = blend_on_axis(dev, [0.9, 0.5, 0.2], [0.0] * 3, gamma, **options)
+        yield exact(weight, np.zeros(3))
+        yield exact(scene.features.get(), np.ones((1, 1, 16)))
+        gradients = scene.gradients(np.ones((1, 1, 16)))
+        # d G.(f - bg), of a softmax exp(-M) / D with D = 1: a handful of roundings
+        expected = scene.geometry()["closeness"][:, 0] * (1 - 16)
+        if rule == "softmax":
+            expected *= np.exp(-1e-6 / gamma)
+        yield relative(gradients["opacity"], expected, 1e-5)
+        yield exact(gradients["features"], np.zeros((3, 16)))
+
+
+def _spheres(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
+    """Gradients of positions and radii, against finite differences; one sphere is below a pixel."""
+    camera, n, gamma = make_camera(), 30, 0.1
+    positions, radius = make_points(rng, n), np.float32(rng.uniform(0.05, 0.5, n))
+    positions[-1], radius[-1] = 0, 0.01
+    opacity, features = np.float32(rng.uniform(0, 1, n)), rng.normal(size=(n, 16))
+    scene = PairedPoints(dev, camera, positions, radius, kind="sphere")
+    hit, grad = scene.hits(), rng.normal(size=(camera.width * camera.height, 16))
+    for rule in BLENDS:
+        scene.blend(opacity, gamma, features, rule=rule)
+        gradients = scene.sphere_gradients(grad)
+
+        def loss(positions, radius, rule=rule):
+            geometry = dense.geometry(camera, positions, radius, "sphere") | {"hit": hit}
+            blend = dense.blend_by_rule(rule, geometry, opacity, gamma)
+            return (dense.features(blend, features) * grad).sum()
+
+        places, radii = positions.astype(np.float64), radius.astype(np.float64)
+        numeric = numeric_gradient(partial(loss, radius=radii), places, STEP)
+        yield relative(gradients["positions"].ravel(), numeric, DIFFERENCES)
+        numeric = numeric_gradient(partial(loss, places), radii, STEP)
+        yield relative(gradients["radius"], numeric, DIFFERENCES)
+
+
+def _smallest_gamma(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
+    """gamma = 1e-5 makes exponents of 1e5, which are off by 1e-2: so are the weights."""
+    for opacity in (1.0, 0.3, 1e-3, 1e-38):
+        scene, weight = blend_on_axis(dev, [0.9, 0.8, 0.1], [opacity] * 3, 1e-5)
+        yield finite(*scene.gradients(np.ones((1, 1, 16))).values())
+        expected = dense.blend(scene.geometry(), [np.float32(opacity)] * 3, 1e-5)["weight"]
+        yield each(weight, expected[:, 0], 1e-2, floor=1e-28)
+
+
+def _opacity_bound(blended: Blended) -> np.ndarray:
+    """(N,) how far float32 may be from dL/do, in absolute size (docs/maths.md).
+
+    A product G.f rounds by its terms' size, an exponent o z/gamma by 1/gamma, and a numerator below
+    the least float is 0.
+    """
+    features, grad = blended.point_features, blended.grad
+    blend, inverse = blended.blend, 1 / blended.gamma
+    mean = dense.features(blend, features)
+    size = np.abs(features) @ np.abs(grad).T + np.abs(mean * grad).sum(axis=1)
+    gain = np.abs(features @ grad.T - (mean * grad).sum(axis=1))
+    gain += (blend["weight"] * gain).sum(axis=0)  # what an exponent's rounding moves the mean by
+    factor = 1 + blended.opacity[:, None] * np.abs(blend["z"]) * inverse
+    rounded = blend["share"] * (size + (1 + inverse) * gain) * UNIT * ROUNDINGS
+    underflow = LEAST * size
+    return np.where(blend["hit"], factor * (rounded + underflow), 0).sum(axis=1)
+
+
+def _sharp(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
+    """Where one hit has nearly all of the weight, dL/do is a rounding of 0 times 1/gamma."""
+    for kind in FOOTPRINTS:
+        for gamma in (1e-3, 1e-5):
+            blended = Blended(dev, rng, kind=kind, gamma=gamma)
+            error = np.abs(blended.gradients()["opacity"] - blended.reference_gradients()[1])
+            yield no_more(error, _opacity_bound(blended), 0.0)
+
+
+def _nearest(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
+    """exp(z / gamma) = e^100 at z = 1 is above the largest float."""
+    radius = 2.0**-10
+    places = np.stack([np.zeros(3), np.zeros(3), depth_at([1.0, 0.99, 0.5]) + radius], -1)
+    features = PairedPoints(dev, AXIS, places, radius, kind="sphere").blend(
+        [1, 1, 1], 0.01, np.eye(3, 16)
+    )
+    e = np.exp([0.0, -1.0, -50.0])
+    yield each(features[0, 0, :3], e / e.sum(), NEAREST, floor=1e-3)
+
+
+def _equal_depths_softmax(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
+    """Shared equally; tracked in the order of the indices."""
+    for gamma in (0.1, 0.01, 1e-5):
+        for count in (2, 3, 16, 17, 100):
+            _, weight = blend_on_axis(dev, [0.7] * count, [1.0] * count, gamma)
+            yield exact(weight, np.full_like(weight, weight[0]))
+            # at gamma = 0.1 the background keeps up to e^-7 / 2, less than 1e-3
+            yield absolute(weight.sum(), 1, 1e-2 if gamma == 0.1 else 1e-5)
+    scene, _ = blend_on_axis(dev, [0.7] * 5, [1.0] * 5, 0.1, max_tracked=2)
+    tracked = scene.gradients(np.ones((1, 1, 16)))["features"].any(axis=1)
+    yield exact(tracked, [True, True, False, False, False])
+
+
+def _many_hits(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
+    z, opacity = rng.uniform(0.1, 0.99, 20_000), np.float32(rng.uniform(0, 1, 20_000))
+    for gamma in (0.1, 0.01):
+        scene, weight = blend_on_axis(dev, z, opacity, gamma)
+        blend = dense.blend(scene.geometry(), opacity, gamma)
+        yield relative(weight, blend["weight"][:, 0], MANY)
+        expected = dense.features(blend, np.resize(np.eye(16), (20_000, 16)))
+        yield relative(scene.features.get().reshape(1, 16), expected, MANY)
+
+
+def _rims(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
+    """A sphere hit on the very rim, where d = 0; one through whose centre the ray goes; one beyond
+    far, which the early stop spares.
+    """
+    ones = np.ones((1, 1, 16))
+    # rho = |(3, 0, 4) - 5 (0, 0, 1)|
+    rim = PairedPoints(
+        dev,
+        AXIS,
+        np.array([[3.0, 0, 4.0]]),
+        np.sqrt(10.0),
+        kind="sphere",
+        depth_range=(1.8, 10.0),
+    )
+    yield exact(rim.pairs.total, 1)
+    yield exact(rim.blend([1.0], 0.005, np.full((1, 16), 2.0)), ones)
+    for gradient in rim.sphere_gradients(ones).values():
+        yield exact(gradient, np.zeros_like(gradient))
+
+    through = PairedPoints(dev, AXIS, np.array([[0, 0, 3.0]]), 0.5, kind="sphere")
+    through.blend([0.5], 0.1, np.full((1, 16), 2.0))
+    gradients = through.sphere_gradients(ones)
+    yield finite(*gradients.values())
+    yield exact(np.sign(gradients["positions"]), [[0, 0, -1]])
+    yield exact(np.sign(gradients["radius"]), [1])
+
+    beyond = PairedPoints(dev, AXIS, np.array([[0, 0, FAR + 0.3]]), 0.4)
+    weight = 1 - beyond.blend([0.133], 0.01, np.zeros((1, 16)), early_stop=0.01)[0, 0, 0]
+    expected = 0.133 * np.exp(-0.133 * 0.075 / 0.01)
+    yield relative(weight, expected / (1 + expected), 1e-3)  # 1 - b cancels two digits
+
+
+def _empty(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
+    camera = make_camera(31, 33)
+    for rule in ("softmax", "alpha"):
+        scene = PairedPoints(dev, camera, np.array([[100.0, 0, 3.0], [0, 0, 300.0]]), 0.01)
+        features = scene.blend([1, 1], 0.01, np.zeros((2, 16)), rule=rule)
+        yield exact(features, np.ones((33, 31, 16)))
+        for gradient in scene.gradients(np.ones((33, 31, 16))).values():
+            yield exact(gradient, np.zeros_like(gradient))
+
+
+def _gradient_of_alpha(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
+    """One of alpha is one of a feature that is 0 in all points, since the background's is 1."""
+    for options in ({"early_stop": 0.0}, {"early_stop": 0.05}):
+        blended = Blended(dev, rng, rule="alpha", **options)
+        grad_alpha = rng.normal(size=len(blended.grad))
+        blended.point_features[:, 15] = 0
+        features = blended.point_features
+        blended.scene.blend(blended.opacity, 0.1, features, rule="alpha", **options)
+        blended.grad[:, 15] = -grad_alpha
+        expected = blended.reference_gradients()
+        blended.grad[:, 15] = 0
+        gradients = blended.scene.gradients(blended.grad, grad_alpha)
+        yield relative(gradients["opacity"], expected[1], GRADIENT)
+        yield relative(gradients["features"][:, :15], expected[0][:, :15], GRADIENT)
+
+
+def _spread(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
+    """Of hits of all weights, of those before an early stop, and of the tracked ones."""
+    for n, tracked, stop, mean in (
+        (257, 0, 0.0, False),
+        (257, 0, 0.05, False),
+        (257, 3, 0.0, False),
+        (33, 0, 0.0, True),
+        (31, 0, 0.0, False),
+    ):
+        options = {"max_tracked": tracked, "early_stop": stop, "mean": mean}
+        blended = Blended(dev, rng, n, rule="alpha", **options)
+        blended.grad[:] = 0
+        expected = blended.reference_gradients(tracked, mean, spread_weight=3.0)[1]
+        gradients = blended.gradients(spread_weight=3.0)
+        yield relative(gradients["opacity"], expected, GRADIENT)
+        yield exact(gradients["features"], np.zeros((n, 16)))
+
+
+def _opaque(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
+    """alpha = 1: no weight behind it, no division by 1 - alpha, a gradient by which it can fade."""
+    scene, weight = _composited(dev, [0.5, 1.0, 1.0, 0.3])
+    yield absolute(weight, [0.5, 0.5, 0, 0], 1e-7)  # a rounding
+    gradients = scene.gradients(np.arange(16.0).reshape(1, 1, 16))
+    yield absolute(gradients["opacity"], [-1, -0.5, 0, 0], WEIGHT["alpha"])
+
+
+def _composited(dev, opacity, **options):
+    """Hits one behind another in a single pixel."""
+    z = np.linspace(0.9, 0.1, len(opacity))
+    return blend_on_axis(dev, z, opacity, 0.1, rule="alpha", **options)
+
+
+def _equal_depths_alpha(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
+    """Ordered, and tracked, by index."""
+    for count in (5, 17, 100):
+        given = [0.7] * count, [0.5] * count
+        scene, weight = blend_on_axis(dev, *given, 0.1, rule="alpha", max_tracked=2)
+        yield each(weight, 0.5 ** np.arange(1, count + 1), WEIGHT["alpha"])
+        tracked = scene.gradients(np.ones((1, 1, 16)))["features"].any(axis=1)
+        yield exact(tracked, np.arange(count) < 2)
+
+
+def _underflow(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
+    """20000 hits: the transmittance falls below the smallest number, with nothing not finite."""
+    z, opacity = rng.uniform(0.1, 0.99, 20_000), np.float32(rng.uniform(0, 1, 20_000))
+    order = np.argsort(-z)
+    through = np.concatenate([[1], np.cumprod(1 - opacity[order].astype(np.float64))[:-1]])
+    for least in (0.0, 1e-3):
+        scene, weight = blend_on_axis(dev, z, opacity, 0.1, rule="alpha", early_stop=least)
+        expected = np.zeros(len(z))
+        expected[order] = np.where(through >= least, through * opacity[order], 0)
+        # down to 1e-30, some hundred factors of half EPS each
+        yield each(weight, expected, 1e-4, floor=1e-26)
+        yield finite(*scene.gradients(rng.normal(size=(1, 1, 16))).values())
+
+
+def _faint(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
+    """A thousand hits of 1e-3 let exp(-1) through: a thousand roundings that mostly cancel."""
+    scene, weight = _composited(dev, np.full(1000, 1e-3))
+    yield absolute(1 - weight.sum(), (1 - 1e-3) ** 1000, 1e-5)
+    gradient = scene.gradients(np.ones((1, 1, 16)))["opacity"]
+    yield exact(gradient < 0, np.ones(1000, bool))
+
+
+def _of_both(what, function):
+    """A case of each blend."""
+    return [Case(f"{rule}: {what}", partial(function, rule)) for rule in BLENDS]
+
+
+CASES = (
+    *(
+        Case(f"{rule}: {what}, {kind}", partial(function, rule, kind))
+        for rule in BLENDS
+        for what, function in (("forward", _forward), ("backward", _backward))
+        for kind in FOOTPRINTS
+    ),
+    *_of_both("awkward sizes", _sizes),
+    *_of_both("early stop", _early_stop),
+    *_of_both("opacities of 0", _zero_opacity),
+    Case("softmax: gradients of spheres", _spheres),
+    Case("softmax: gamma of 1e-5", _smallest_gamma),
+    Case("softmax: dL/do at small gammas", _sharp),
+    Case("softmax: nearest possible point", _nearest),
+    Case("softmax: equal depths", _equal_depths_softmax),
+    Case("softmax: 20000 hits in a pixel", _many_hits),
+    Case("softmax: rims and centres of spheres", _rims),
+    Case("softmax: an empty view", _empty),
+    Case("alpha: gradient of alpha", _gradient_of_alpha),
+    Case("alpha: spread", _spread),
+    Case("alpha: opacities of 1", _opaque),
+    Case("alpha: equal depths", _equal_depths_alpha),
+    Case("alpha: transmittance that underflows", _underflow),
+    Case("alpha: faint hits", _faint),
+)

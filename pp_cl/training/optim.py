@@ -1,0 +1,290 @@
+"""The update of everything that is learned: RMSprop of the SH coefficients, Adam of the opacities
+and of the network, and the moving average (EMA) of all.
+
+Adam is torch's: every value moves in every step by its momentum, whether it received a gradient or
+not. A point whose features have no gradient does not move, so RMSprop touches only what the image
+shows; cl/training/rmsprop.cl has its formulas, docs/maths.md the reasons.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+from pyopencl.array import Array
+
+from pp_cl.device.buffers import Table
+from pp_cl.device.device import Device
+from pp_cl.device.launch import lanes, row_parts
+from pp_cl.device.rows import DeviceRows
+from pp_cl.model import Model
+from pp_cl.raster.points import four_blocks, stored_degree
+from pp_cl.raster.project import ProjectedPoints
+from pp_cl.training.schedule import Rates
+from pp_cl.training.state import PointState
+
+BETA1, BETA2 = 0.9, 0.999  # Kingma & Ba 2015
+DECAY1, DECAY2 = f"{1 - BETA1:.9g}f", f"{1 - BETA2:.9g}f"
+OPACITY_EPS = 1e-15  # opacity gradients span many decades; clamping bounds the step instead
+NETWORK_EPS = 1e-8  # PyTorch's default
+
+
+class Optimiser:
+    """Updates points and network; owns the network's moments and averages, the points' are in
+    `state`.
+
+    moments: {name of a parameter: Adam's {"m": array, "v": array}}. averages: {name: array}, empty
+    before update_ema().
+    """
+
+    def __init__(self, dev: Device, model: Model, state: PointState):
+        self.dev = dev
+        self.model = model
+        self.state = state
+        self.moments = {
+            name: {kind: dev.zeros(array.shape) for kind in "mv"}
+            for name, array in model.net.parameters.items()
+        }
+        self.averages: dict[str, Array] = {}
+
+    @staticmethod
+    def table(parameters: dict[str, Array], ema: bool) -> Table:
+        """The arrays for these parameters of a network. ema: averages among them."""
+        return {
+            f"{kind}.{name}": (array.shape, np.float32)
+            for name, array in parameters.items()
+            for kind in (("m", "v", "ema") if ema else ("m", "v"))
+        }
+
+    def update(
+        self,
+        step: int,
+        rates: Rates,
+        grad_point_features: Array,
+        grad_opacity: Array,
+        *,
+        points: ProjectedPoints,
+        shaded: Array,
+        sh_eps: float,
+    ) -> None:
+        """One step by the gradients of the points' features (N, 16) and opacities (N,), and by
+        those of the network, which lie in model.net.gradients.
+
+        step: from 1. points: in the image that the gradients belong to. shaded: (S) uint32, those
+        that make it up; no others have a gradient of their features. sh_eps: eps of the SH
+        coefficients' step.
+        """
+        cloud, net, state = self.model.cloud, self.model.net, self.state
+        rmsprop_update(
+            self.dev,
+            step,
+            points,
+            shaded,
+            grad_point_features,
+            cloud.sh,
+            v=state.sh_v,
+            last_step=state.last_step,
+            rates=rates.sh,
+            eps=sh_eps,
+        )
+        adam_update(
+            self.dev,
+            cloud.opacity,
+            grad_opacity,
+            state.opacity_moments,
+            step=step,
+            rate=rates.opacity,
+            eps=OPACITY_EPS,
+            bounded=True,
+        )
+        for name, parameter in net.parameters.items():
+            adam_update(
+                self.dev,
+                parameter,
+                net.gradients[name],
+                self.moments[name],
+                step=step,
+                rate=rates.network,
+                eps=NETWORK_EPS,
+            )
+
+    def update_ema(self, weight: float) -> None:
+        """Move the averages of points and network towards the present values by `weight`; a weight
+        of 1 starts them there.
+        """
+        for averages, parameters in self._averaged():
+            for name, parameter in parameters.items():
+                if name not in averages:
+                    averages[name] = self.dev.empty(parameter.shape)
+                    self.dev.copy(averages[name], parameter)
+                else:
+                    ema_update(self.dev, averages[name], parameter, weight)
+
+    def apply_ema(self) -> None:
+        """Make the averages, where there are any, the model's values, and release them."""
+        for averages, parameters in self._averaged():
+            for name in list(averages):
+                self.dev.copy(parameters[name], averages.pop(name))
+
+    def _averaged(self):
+        """[(averages, the parameters of the same names)] of the points and of the network."""
+        return [
+            (self.state.averages, self.model.cloud.learned()),
+            (self.averages, self.model.net.parameters),
+        ]
+
+    def arrays(self) -> dict[str, DeviceRows]:
+        """{name in a checkpoint: array} of all but the model's own arrays."""
+        network = {
+            f"moment.{kind}.{name}": array
+            for name, arrays in self.moments.items()
+            for kind, array in arrays.items()
+        }
+        network |= {f"average.{name}": array for name, array in self.averages.items()}
+        return {
+            name: DeviceRows(self.dev, array)
+            for name, array in (self.state.arrays() | network).items()
+        }
+
+    def restore(self, arrays: dict[str, np.ndarray]) -> None:
+        """Take the state, as written by arrays(), out of the arrays of a checkpoint."""
+        for averages, parameters in self._averaged():
+            prefix = "average." if averages is self.averages else "state.a."
+            for name, parameter in parameters.items():
+                if prefix + name in arrays:
+                    stored = arrays.pop(prefix + name)
+                    averages[name] = self.dev.upload(stored.reshape(parameter.shape))
+        for name, moments in self.moments.items():
+            for kind, array in moments.items():
+                self.dev.write(array, arrays.pop(f"moment.{kind}.{name}"))
+        for name, array in self.state.arrays().items():
+            if not name.startswith("state.a."):
+                self.dev.write(array, arrays.pop(name))
+
+
+def adam_update(
+    dev: Device,
+    parameter: Array,
+    grad: Array,
+    moments: dict[str, Array],
+    *,
+    step: int,
+    rate: float,
+    eps: float,
+    bounded: bool = False,
+) -> None:
+    """One dense Adam step of `parameter`, in place.
+
+    parameter, grad, moments "m" and "v": float32 arrays of one shape, any; the moments start as
+    zeros. step: from 1 on. bounded: the parameter stays in [0, 1]. Raises ValueError when the
+    shapes differ.
+    """
+    _same_shape(parameter, grad, *moments.values())
+    # rate (m / c1) / (sqrt(v / c2) + eps) = (rate root / c1) m / (sqrt(v) + eps root)
+    root = math.sqrt(1 - BETA2**step)
+    program = dev.program(
+        "training/adam", LANES=lanes(dev), DECAY1=DECAY1, DECAY2=DECAY2, BOUNDED=int(bounded)
+    )
+    program.launch(
+        "adam_update",
+        -(-parameter.size // lanes(dev)),
+        n=parameter.size,
+        rate=rate * root / (1 - BETA1**step),
+        eps=eps * root,
+        grad=grad,
+        parameter=parameter,
+        m=moments["m"],
+        v=moments["v"],
+    )
+
+
+def ema_update(dev: Device, ema: Array, parameter: Array, weight: float) -> None:
+    """Move an EMA, in place: ema += weight * (parameter - ema). A weight of 1 copies, whatever it
+    held.
+
+    ema, parameter: float32 arrays of one shape, any. Raises ValueError when the shapes differ.
+    """
+    _same_shape(ema, parameter)
+    if weight == 1:
+        dev.copy(ema, parameter)
+        return
+    program = dev.program("training/adam", LANES=lanes(dev), DECAY1=DECAY1, DECAY2=DECAY2)
+    program.launch(
+        "ema_update",
+        -(-parameter.size // lanes(dev)),
+        n=parameter.size,
+        weight=weight,
+        parameter=parameter,
+        ema=ema,
+    )
+
+
+def rmsprop_update(
+    dev: Device,
+    step: int,
+    points: ProjectedPoints,
+    shaded: Array,
+    grad_point_features: Array,
+    sh: Sequence[Array],
+    *,
+    v: Array,
+    last_step: Array,
+    rates: Sequence[float],
+    eps: float,
+) -> None:
+    """One step of the SH coefficients of all points with a gradient, in place. The coefficients'
+    gradient is the product of the harmonics in the direction from the eye to the point and the
+    gradient of the point's features; it is never formed.
+
+    step: from 1 on. points, shaded: as Optimiser.update() takes them. grad_point_features: (N, 16),
+    of which only the shaded rows are read. sh: arrays (N, count, 16) of SH_BLOCKS up to the end of
+    one degree. v: (N, 16) float32, second moments, of each feature. last_step: (N,) uint32, of each
+    point's last gradient, 0: none. Both start as zeros. rates: of the degrees 0, 1, 2. eps: of the
+    gradient's unit.
+    """
+    degree = max((d for d in range(stored_degree(sh) + 1) if rates[d] > 0), default=None)
+    if degree is None:
+        return
+    root, (sh_0, sh_1, sh_2a, sh_2b) = math.sqrt(1 - BETA2**step), four_blocks(sh)
+    program = dev.program(
+        "training/rmsprop",
+        LANES=lanes(dev),
+        DEGREE=degree,
+        DECAY2=DECAY2,
+        LOG_BETA2=f"{math.log2(BETA2):.9g}f",
+    )
+    program.launch(
+        "rmsprop_move",
+        len(shaded) * row_parts(dev),
+        s=len(shaded),
+        step=step,
+        eps=root * eps,
+        rate_0=root * rates[0],
+        rate_1=root * rates[1],
+        rate_2=root * rates[2],
+        shaded=shaded,
+        camera=points.camera_buffer,
+        point_camera=points.point_camera,
+        grad_point_features=grad_point_features,
+        last_step=last_step,
+        v=v,
+        sh_0=sh_0,
+        sh_1=sh_1,
+        sh_2a=sh_2a,
+        sh_2b=sh_2b,
+    )
+    program.launch(
+        "rmsprop_mark",
+        len(shaded),
+        s=len(shaded),
+        step=step,
+        shaded=shaded,
+        grad_point_features=grad_point_features,
+        last_step=last_step,
+    )
+
+
+def _same_shape(first, *others):
+    if any(array.shape != first.shape for array in others):
+        raise ValueError(f"arrays of one shape wanted: {[a.shape for a in (first, *others)]}")

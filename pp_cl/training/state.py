@@ -1,0 +1,99 @@
+"""What training keeps for each point beside what is learned: moments, averages, and how much the
+point has weighed.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from pyopencl.array import Array
+
+from pp_cl.device.buffers import Table
+from pp_cl.device.device import Device
+from pp_cl.device.rows import compact_rows, gather_rows
+from pp_cl.raster.points import PointCloud, ShBlock
+
+
+class PointState:
+    """Rows as in the cloud; all but the averages start as zeros.
+
+    averages: {name of PointCloud.learned(): EMA}, empty before Optimiser.update_ema().
+    """
+
+    def __init__(self, dev: Device, cloud: PointCloud):
+        self._arrays = {name: dev.zeros(*row) for name, row in self.table(cloud.count).items()}
+        self.averages: dict[str, Array] = {}
+
+    @staticmethod
+    def table(n: int) -> Table:
+        """The arrays of n points without the averages."""
+        return {
+            "max_weight": ((n,), np.float32),
+            "times_seen": ((n,), np.float32),
+            "m.opacity": ((n,), np.float32),
+            "v.opacity": ((n,), np.float32),
+            "v.sh": ((n, 16), np.float32),
+            "last_step": ((n,), np.uint32),
+        }
+
+    @staticmethod
+    def ema_table(n: int, blocks: tuple[ShBlock, ...]) -> Table:
+        """The averages of n points."""
+        table = PointCloud.table(n, blocks)
+        del table["ids"]
+        return table
+
+    @property
+    def max_weight(self) -> Array:
+        """(N) float32: the highest blend weight in an image since the point was last judged, summed
+        over the pixels.
+        """
+        return self._arrays["max_weight"]
+
+    @property
+    def times_seen(self) -> Array:
+        """(N) float32: steps since then that had the point in their image, hidden or not."""
+        return self._arrays["times_seen"]
+
+    @property
+    def sh_v(self) -> Array:
+        """(N, 16) float32: RMSprop's second moments of the SH coefficients, of each feature."""
+        return self._arrays["v.sh"]
+
+    @property
+    def last_step(self) -> Array:
+        """(N,) uint32: the step of each point's last gradient of its features, 0: none."""
+        return self._arrays["last_step"]
+
+    @property
+    def opacity_moments(self) -> dict[str, Array]:
+        """Adam's "m" and "v", (N,) each."""
+        return {kind: self._arrays[f"{kind}.opacity"] for kind in "mv"}
+
+    def compact(self, dev: Device, keep: Array) -> None:
+        """Drop all rows but `keep`, (M) uint32, ascending; one array after the other."""
+        for arrays in (self._arrays, self.averages):
+            for name in arrays:
+                arrays[name] = compact_rows(dev, arrays[name], keep)
+
+    def refine(self, dev: Device, parents: Array) -> None:
+        """Become the state of points that each take over that of point parents[i], (M,) uint32, but
+        for weights and looks, which start anew.
+        """
+        for arrays in (self._arrays, self.averages):
+            for name in arrays:
+                arrays[name] = gather_rows(dev, arrays[name], parents)
+        for array in (self.max_weight, self.times_seen):
+            dev.fill(array, 0)
+
+    def arrays(self) -> dict[str, Array]:
+        """{name in a checkpoint: array}."""
+        averages = {f"a.{name}": array for name, array in self.averages.items()}
+        return {f"state.{name}": array for name, array in (self._arrays | averages).items()}
+
+
+def split_opacity(dev: Device, opacity: Array) -> None:
+    """Replace every opacity o in [0, 1], (N,) float32, by 1 - sqrt(1 - o), in place: of the points
+    of a refined grid two lie behind one another in place of one, and let as much light through.
+    """
+    n = len(opacity)
+    dev.program("training/refine").launch("split_opacity", n, n=n, opacity=opacity)

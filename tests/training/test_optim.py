@@ -1,0 +1,115 @@
+"""What the selftest's cases of Adam, RMSprop and averages leave open."""
+
+import numpy as np
+import pytest
+from support.comparisons import relative_error
+from support.models import make_model
+
+from pp_cl.raster.points import SH_DEGREES
+from pp_cl.reference import optim
+from pp_cl.selftest.updated_points import Cloud, gradients
+from pp_cl.training.optim import Optimiser, adam_update, ema_update
+from pp_cl.training.state import PointState
+
+
+def moments(dev, parameter):
+    """Adam's, of a parameter: zeros."""
+    return {kind: dev.zeros(parameter.shape) for kind in "mv"}
+
+
+def test_momentum_goes_on_without_a_gradient(dev, rng):
+    """In arrays of any rank, for as long as training takes."""
+    start = rng.standard_normal((3, 11)).astype(np.float32)
+    slope = rng.standard_normal((3, 11)).astype(np.float32)
+    parameter, oracle = dev.upload(start), optim.Adam(start)
+    state = moments(dev, start)
+    for step in range(1, 1001):
+        grad = slope * (0.3 + rng.standard_normal((3, 11)).astype(np.float32)) * (step % 3 > 0)
+        adam_update(
+            dev, parameter, dev.upload(grad, np.float32), state, step=step, rate=0.02, eps=1e-8
+        )
+        oracle.step(grad, 0.02, 1e-8)
+    assert np.abs(oracle.parameter - start).max() > 1
+    assert relative_error(parameter.get(), oracle.parameter) < 1e-5
+
+
+def test_refuses_different_shapes(dev):
+    a, b = dev.zeros((4, 3)), dev.zeros((3, 4))
+    with pytest.raises(ValueError, match="one shape"):
+        adam_update(dev, a, b, moments(dev, a), step=1, rate=0.1, eps=1e-8)
+    with pytest.raises(ValueError, match="one shape"):
+        ema_update(dev, a, b, 0.5)
+
+
+@pytest.mark.exact
+def test_a_nan_is_not_hidden(dev):
+    opacity, grad = dev.zeros((31,)), dev.upload(np.full(31, np.nan), np.float32)
+    state = moments(dev, opacity)
+    adam_update(dev, opacity, grad, state, step=1, rate=0.03, eps=1e-15, bounded=True)
+    assert np.isnan(opacity.get()).all()
+
+
+def test_averages_start_as_copies_and_are_applied_and_released(dev, rng):
+    model = make_model(dev, rng)
+    optimiser = Optimiser(dev, model, PointState(dev, model.cloud))
+    before = dev.bytes
+    parameters = model.cloud.learned() | model.net.parameters
+    start = {name: array.get() for name, array in parameters.items()}
+    optimiser.update_ema(0.25)  # the first one copies, whatever its weight
+    for array in parameters.values():
+        dev.fill(array, 0)
+    optimiser.update_ema(0.25)
+    assert {name.split(".", 1)[0] for name in optimiser.arrays()} == {"state", "moment", "average"}
+    optimiser.apply_ema()
+    assert dev.bytes == before
+    for name, array in parameters.items():
+        np.testing.assert_allclose(array.get(), 0.75 * start[name], rtol=1e-6)
+        dev.fill(array, 0)
+    optimiser.apply_ema()  # there are none any more
+    assert not any(array.get().any() for array in parameters.values())
+
+
+def test_rmsprop_is_adam_without_a_first_moment_on_the_average_over_directions(rng):
+    """Of the oracle: for one gradient seen from everywhere, v is the mean of those that Adam keeps
+    of the coefficients, and the moves are Adam's with that mean.
+    """
+    directions = rng.standard_normal((20_000, 3))
+    basis = optim.basis(directions, np.zeros(3))
+    grad = 1e-4 * np.ones((len(basis), 16))
+    twin = optim.RmsProp(np.zeros((len(basis), 9, 16)), basis)
+    adam = optim.Adam(np.zeros((len(basis), 9, 16)), beta1=0.0)
+    twin.step(1, grad, np.ones(9), 0.0)
+    adam.step(basis[:, :, None] * grad[:, None], 1.0, 0.0)
+    np.testing.assert_allclose(adam.v[:, :, 0].mean(axis=0), twin.v[0, 0], rtol=0.03)
+    for degree in SH_DEGREES:
+        of_degree = adam.v[:, degree**2 : (degree + 1) ** 2, 0].mean(axis=1)
+        np.testing.assert_allclose(of_degree, twin.v[:, 0], rtol=1e-9)  # in every direction
+    shared = np.sqrt(adam.v / twin.v[:, None])
+    np.testing.assert_allclose(adam.parameter * shared, twin.sh, rtol=1e-9, atol=1e-12)
+
+
+def test_points_without_a_gradient_keep_their_values(dev, rng):
+    cloud, shaded = Cloud(dev, rng, 257), np.arange(0, 257, 2)
+    for _ in range(2):
+        before = cloud.coefficients(), cloud.v.get(), cloud.last_step.get()
+        cloud.step(gradients(rng, 257), shaded)
+        after = cloud.coefficients(), cloud.v.get(), cloud.last_step.get()
+        moved = np.isin(np.arange(257), shaded) & (np.arange(257) % 3 > 0)
+        for new, old in zip(after, before, strict=True):
+            np.testing.assert_array_equal(new[~moved], old[~moved])
+            assert (new[moved] != old[moved]).any()
+        assert (after[2][moved] == cloud.steps).all()
+    cloud.step(gradients(rng, 257), np.array([], int))
+    np.testing.assert_array_equal(cloud.coefficients(), after[0])
+
+
+@pytest.mark.parametrize("rates", [(0.1, 0, 0), (0.1, 0.05, 0), (0, 0.05, 0.02), (0, 0, 0)])
+def test_degrees_at_rate_0_stay(dev, rng, rates):
+    cloud = Cloud(dev, rng, 31)
+    for _ in range(3):
+        cloud.step(gradients(rng, 31), np.arange(31), rates=rates)
+    found = cloud.coefficients()
+    assert relative_error(found, cloud.twin.sh) < 1e-6
+    for degree, rate in enumerate(rates):
+        part = np.s_[:, degree**2 : (degree + 1) ** 2]
+        assert (found[part] == cloud.start[part]).all() == (rate == 0)
