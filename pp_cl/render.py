@@ -99,7 +99,7 @@ class Renderer:
             "pairs (estimate)": pairs_table(n, pixels, pairs),
             "blend weights (estimate)": weights_table(n, pixels, pairs, has_roles),
             "features": _view_table(n, size),
-            "gradients (estimate)": blend_backward_table(n, pairs),
+            "gradients (estimate)": blend_backward_table(n, pixels, pairs, settings.blend),
         }
 
     def forward(

@@ -4,10 +4,14 @@
 // raster/blend.cl.
 #include "raster/footprint.h"
 #include "raster/pair_role.h"
+#include "reduce.h"
 
 // as in raster/blend.cl
 #ifndef HAS_ROLES
 #define HAS_ROLES 1
+#endif
+#ifndef HAS_PAIR_GAIN
+#define HAS_PAIR_GAIN 1
 #endif
 #ifndef MEAN
 #define MEAN 0
@@ -16,10 +20,14 @@
 // One work-item per sphere: reads what blend_backward reads, writes dL/dl and dL/dd of its pairs.
 kernel void spheres_backward_pairs(
     const uint n,                              // spheres
+    global const float16 *point_features,      // (N, 16)
     global const uint *point_offset,           // (N+1)
+    global const uint *pair_pixel,             // (P)
     global const float2 *pair_weight,          // (P, 2)
     global const uchar *pair_role,             // (?) P with HAS_ROLES
-    global const float *pair_gain,             // (P)
+    global const float *pair_gain,             // (?) P with HAS_PAIR_GAIN
+    global const float *pixel_rest,            // (?) HW without
+    global const float16 *grad_features,       // (H, W, 16) G
     global const uint2 *pair_point_closeness,  // (P, 2) point, bits of d
     global float2 *grad_pair)                  // (P, 2) dL/dl, dL/dd
 {
@@ -30,9 +38,15 @@ kernel void spheres_backward_pairs(
         tracked += !HAS_ROLES || pair_role[pair] == TRACKED;
     const float scale = MEAN && tracked ? 1.0f / tracked : 1.0f;
     for (uint pair = point_offset[i]; pair < point_offset[i + 1]; pair++) {
+        const uint q = pair_pixel[pair];
         const float b = pair_weight[pair].x, d = as_float(pair_point_closeness[pair].y);
-        const bool is_tracked = !HAS_ROLES || pair_role[pair] == TRACKED;
-        const float dL_dl = is_tracked ? scale * b * pair_gain[pair] : 0.0f;
+        float dL_dl = 0.0f;
+        if (!HAS_ROLES || pair_role[pair] == TRACKED) {
+            const float gain = HAS_PAIR_GAIN
+                                   ? pair_gain[pair]
+                                   : dot16(grad_features[q], point_features[i]) - pixel_rest[q];
+            dL_dl = scale * b * gain;
+        }
         grad_pair[pair] = (float2)(dL_dl, d > 0.0f ? dL_dl / d : 0.0f);
     }
 }

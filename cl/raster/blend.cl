@@ -6,7 +6,8 @@
 // s_i is the second value of pair_weight. The gain of a hit is G.f_i minus G times what takes its
 // place where it fades.
 //
-// In the softmax that is the blend of all hits: gain_i = G.(f_i - F).
+// In the softmax that is the blend of all hits: gain_i = G.f_i - G.F, of which the latter is the
+// pixel's rest.
 //
 // In alpha compositing it is B_i, G times the features composited of all that lies behind the hit:
 // gain_i = G.f_i - B_i, with nothing divided by 1 - alpha. A gradient g of the pixel's alpha, 1 -
@@ -23,6 +24,9 @@
 
 #ifndef HAS_ROLES
 #define HAS_ROLES 1  // 0: every pair is tracked, and pair_role is not read
+#endif
+#ifndef HAS_PAIR_GAIN
+#define HAS_PAIR_GAIN 1  // 0: the gains of a softmax follow from pixel_rest
 #endif
 #ifndef MEAN
 #define MEAN 0  // 1: gradients are divided by the number of pixels that track the point (Pulsar)
@@ -54,24 +58,16 @@ kernel void blend_forward(
     store_part(sum + (1.0f - weights) * BACKGROUND, features, q);
 }
 
-// One work-item per pixel: reads its hits and their points' features, writes the gain of each pair
-// that is not dropped.
-kernel __attribute__((vec_type_hint(float16))) void softmax_gain(
-    const uint hw,                         // pixels
-    global const uint *pixel_offset,       // (HW+1)
-    global const ulong *pair_key,          // (P) depth << 32 | pair
-    global const ulong *pixel_entry,       // (P) weight << 32 | point; no point: the list ends
-    global const float16 *point_features,  // (N, 16)
-    global const float16 *features,        // (H, W, 16) F
-    global const float16 *grad_features,   // (H, W, 16) G
-    global float *pair_gain)               // (P)
+// One work-item per pixel: writes G.F, its rest in the softmax.
+kernel void softmax_rest(
+    const uint hw,                        // pixels
+    global const float16 *features,       // (H, W, 16) F
+    global const float16 *grad_features,  // (H, W, 16) G
+    global float *pixel_rest)             // (HW)
 {
     const uint q = get_global_id(0);
     if (q >= hw) return;
-    const float16 G = grad_features[q];
-    const float mean = dot16(G, features[q]);
-    for (uint i = pixel_offset[q]; i < pixel_offset[q + 1] && (uint)pixel_entry[i] != NONE; i++)
-        pair_gain[(uint)pair_key[i]] = dot16(G, point_features[(uint)pixel_entry[i]]) - mean;
+    pixel_rest[q] = dot16(grad_features[q], features[q]);
 }
 
 // One work-item per pixel: reads its hits, farthest first, and their points' features, writes the
@@ -126,15 +122,17 @@ kernel __attribute__((vec_type_hint(float16))) void alpha_gain(
 // One work-item per part of a point: reads its pairs and their pixels' gradients, writes the
 // gradients of its features and, the first one, of its opacity.
 kernel __attribute__((vec_type_hint(floats))) void blend_backward(
-    const uint n,                         // points
-    global const uint *point_offset,      // (N+1)
-    global const uint *pair_pixel,        // (P)
-    global const float2 *pair_weight,     // (P, 2)
-    global const uchar *pair_role,        // (?) P with HAS_ROLES
-    global const float *pair_gain,        // (P)
-    global const float16 *grad_features,  // (H, W, 16) G
-    global float16 *grad_point_features,  // (N, 16)
-    global float *grad_opacity)           // (N)
+    const uint n,                          // points
+    global const float16 *point_features,  // (N, 16)
+    global const uint *point_offset,       // (N+1)
+    global const uint *pair_pixel,         // (P)
+    global const float2 *pair_weight,      // (P, 2)
+    global const uchar *pair_role,         // (?) P with HAS_ROLES
+    global const float *pair_gain,         // (?) P with HAS_PAIR_GAIN
+    global const float *pixel_rest,        // (?) HW without
+    global const float16 *grad_features,   // (H, W, 16) G
+    global float16 *grad_point_features,   // (N, 16)
+    global float *grad_opacity)            // (N)
 {
     const uint i = get_global_id(0) / ROW_PARTS;
     if (i >= n) return;
@@ -144,8 +142,12 @@ kernel __attribute__((vec_type_hint(floats))) void blend_backward(
     for (uint pair = point_offset[i]; pair < point_offset[i + 1]; pair++) {
         if (HAS_ROLES && pair_role[pair] != TRACKED) continue;
         const float2 weight = pair_weight[pair];
-        dL_df += weight.x * load_part(grad_features, pair_pixel[pair]);
-        dL_do += weight.y * pair_gain[pair];
+        const uint q = pair_pixel[pair];
+        const float gain = HAS_PAIR_GAIN
+                               ? pair_gain[pair]
+                               : dot16(grad_features[q], point_features[i]) - pixel_rest[q];
+        dL_df += weight.x * load_part(grad_features, q);
+        dL_do += weight.y * gain;
         tracked++;
     }
     const float scale = MEAN && tracked ? 1.0f / tracked : 1.0f;

@@ -211,7 +211,7 @@ class PulsarScene(BenchScene):
         self.opacity = np.ones(n, np.float32)
         self.positions = rng.random((n, 3), np.float32) + np.float32([-0.5, -0.5, 1])
         self.point_features = rng.random((n, CHANNELS), np.float32)
-        self.buffers, self.room = Buffers(dev), 1
+        self.buffers, self.room = {blend: Buffers(dev) for blend in BLENDS}, 1
         self.camera_buffer = dev.upload(self.camera.packed(self.depth_range))
         self.point_radius = dev.upload([self.radius], np.float32)
         self.point_positions, self.point_opacity = map(dev.upload, (self.positions, self.opacity))
@@ -221,7 +221,7 @@ class PulsarScene(BenchScene):
 
     def forward(self, blend: str) -> RenderResult:
         """See BenchScene."""
-        dev, b, size = self.dev, self.buffers, (self.size, self.size)
+        dev, b, size = self.dev, self.buffers[blend], (self.size, self.size)
         with dev.stage("project"):
             points = project_spheres(
                 dev,
@@ -263,7 +263,7 @@ class PulsarScene(BenchScene):
         with self.dev.stage("backward"):
             blend_backward(
                 self.dev,
-                self.buffers,
+                self.buffers[blend],
                 result.pairs,
                 result.weights,
                 point_features=result.point_features,
@@ -276,9 +276,11 @@ class PulsarScene(BenchScene):
                 result.points,
                 result.pairs,
                 result.weights,
-                self.buffers.pair_gain,
+                self.buffers[blend],
                 opacity=self.point_opacity,
                 gamma=self.gamma,
+                point_features=result.point_features,
+                grad_features=self.grad,
             )
 
     def exact_features(self, points: np.ndarray) -> np.ndarray:

@@ -63,34 +63,44 @@ def spheres_backward(
     points: ProjectedPoints,
     pairs: Pairs,
     weights: BlendWeights,
-    pair_gain: Array,
+    b: Buffers,
     *,
     opacity: Array,
     gamma: float,
+    point_features: Array,
+    grad_features: Array,
     mean: bool = False,
 ) -> tuple[Array, Array]:
     """(grad_positions (N, 3) in world axes, grad_radius (N,)) float32 of explicit spheres.
 
-    points, pairs, weights, opacity (N,), gamma: those of the forward pass. pair_gain: (P,), of
-    blend_backward(). mean: divide a point's gradients by its number of tracked pixels, as Pulsar
-    does.
+    points, pairs, weights, opacity (N,), gamma, point_features (N, 16): those of the forward pass.
+    b, grad_features (H, W, 16): of blend_backward(), which has run. mean: divide a point's
+    gradients by its number of tracked pixels, as Pulsar does.
     """
-    n = pairs.points
-    program = dev.program("bench/spheres", HAS_ROLES=int(weights.has_roles), MEAN=int(mean))
+    n, is_alpha = pairs.points, weights.blend == "alpha"
+    program = dev.program(
+        "bench/spheres",
+        HAS_ROLES=int(weights.has_roles),
+        HAS_PAIR_GAIN=int(is_alpha),
+        MEAN=int(mean),
+    )
     grad_pair = dev.empty(weights.pair_weight.shape)
     grad_positions, grad_radius = dev.empty((n, 3)), dev.empty((n,))
     program.launch(
         "spheres_backward_pairs",
         n,
         n=n,
+        point_features=point_features,
         point_offset=pairs.point_offset,
+        pair_pixel=pairs.pair_pixel,
         pair_weight=weights.pair_weight,
         pair_role=weights.pair_role,
-        pair_gain=pair_gain,
+        pair_gain=b.pair_gain,
+        pixel_rest=b.pixel_rest,
+        grad_features=grad_features,
         pair_point_closeness=pairs.pair_point_closeness,
         grad_pair=grad_pair,
     )
-    is_alpha = weights.transmittance is not None
     program.launch(
         "spheres_backward",
         n,

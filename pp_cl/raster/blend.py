@@ -34,10 +34,13 @@ def blend_forward(
     )
 
 
-def blend_backward_table(n: int, pairs: int) -> Table:
-    """The buffers of the backward pass for n points and room for a number of pairs."""
+def blend_backward_table(n: int, pixels: int, pairs: int, blend: str) -> Table:
+    """The buffers of the backward pass for n points, a number of pixels and room for a number of
+    pairs. blend: one of BLENDS.
+    """
     return {
-        "pair_gain": ((pairs,), np.float32),
+        "pair_gain": ((pairs if blend == "alpha" else 1,), np.float32),
+        "pixel_rest": ((pixels if blend == "softmax" else 1,), np.float32),
         "grad_point_features": ((n, 16), np.float32),
         "grad_opacity": ((n,), np.float32),
     }
@@ -57,7 +60,8 @@ def blend_backward(
     mean: bool = False,
 ) -> tuple[Array, Array]:
     """(grad_point_features (N, 16), grad_opacity (N,)) float32, valid until the next call; points
-    that are not shaded get zeros. b.pair_gain then holds the pairs' gains (cl/raster/blend.cl).
+    that are not shaded get zeros. b.pair_gain or b.pixel_rest then hold what the gains of the pairs
+    are, or follow from (cl/raster/blend.cl).
 
     point_features, features: of blend_forward(). grad_features: dL/dfeatures (H, W, 16).
     grad_alpha: (HW,), dL/d(1 - transmittance); None: 0. spread_weight: adds this times sum_ij b_i
@@ -66,22 +70,18 @@ def blend_backward(
     number of tracked pixels, as Pulsar does. Raises ValueError for grad_alpha or a spread of a
     softmax, which has no transmittance.
     """
-    b.require(blend_backward_table(pairs.points, pairs.capacity))
+    b.require(blend_backward_table(pairs.points, pairs.pixels, pairs.capacity, weights.blend))
     program = _program(dev, weights, mean)
-    if weights.transmittance is None:
+    if weights.blend == "softmax":
         if grad_alpha is not None or spread_weight > 0:
             raise ValueError("a softmax has no gradient of alpha and of spread")
         program.launch(
-            "softmax_gain",
+            "softmax_rest",
             pairs.pixels,
             hw=pairs.pixels,
-            pixel_offset=pairs.pixel_offset,
-            pair_key=pairs.pair_key,
-            pixel_entry=weights.pixel_entry,
-            point_features=point_features,
             features=features,
             grad_features=grad_features,
-            pair_gain=b.pair_gain,
+            pixel_rest=b.pixel_rest,
         )
     else:
         program.launch(
@@ -103,11 +103,13 @@ def blend_backward(
         "blend_backward",
         pairs.points * row_parts(dev, ON_GPU),
         n=pairs.points,
+        point_features=point_features,
         point_offset=pairs.point_offset,
         pair_pixel=pairs.pair_pixel,
         pair_weight=weights.pair_weight,
         pair_role=weights.pair_role,
         pair_gain=b.pair_gain,
+        pixel_rest=b.pixel_rest,
         grad_features=grad_features,
         grad_point_features=b.grad_point_features,
         grad_opacity=b.grad_opacity,
@@ -117,5 +119,9 @@ def blend_backward(
 
 def _program(dev, weights, mean=False):
     return dev.program(
-        "raster/blend", LANES=lanes(dev, ON_GPU), HAS_ROLES=int(weights.has_roles), MEAN=int(mean)
+        "raster/blend",
+        LANES=lanes(dev, ON_GPU),
+        HAS_ROLES=int(weights.has_roles),
+        HAS_PAIR_GAIN=int(weights.blend == "alpha"),
+        MEAN=int(mean),
     )

@@ -23,14 +23,16 @@ DROPPED = 2  # cl/raster/pair_role.h
 class BlendWeights:
     """The blend weights of a Pairs object, valid until the next ones are computed.
 
-    has_roles: some pairs may be untracked or dropped; else all are tracked and pair_role is unread.
-    pair_weight: (P, 2) float32, the weight b, and s, which times the pair's gain is dL/do
-    (cl/raster/blend.cl); undefined where the pair is dropped. pair_role: (P,) uint8,
-    cl/raster/pair_role.h. pixel_entry: (P,) uint64, weight bits << 32 | point, each pixel's hits by
-    depth; where hits are dropped, an entry of no point ends a pixel's list. shaded_list: `shaded`
-    before its length is known. transmittance: (HW,) float32 behind all hits, None of a softmax.
+    blend: one of BLENDS. has_roles: some pairs may be untracked or dropped; else all are tracked
+    and pair_role is unread. pair_weight: (P, 2) float32, the weight b, and s, which times the
+    pair's gain is dL/do (cl/raster/blend.cl); undefined where the pair is dropped. pair_role: (P,)
+    uint8, cl/raster/pair_role.h. pixel_entry: (P,) uint64, weight bits << 32 | point, each pixel's
+    hits by depth; where hits are dropped, an entry of no point ends a pixel's list. shaded_list:
+    `shaded` before its length is known. transmittance: (HW,) float32 behind all hits, None of a
+    softmax.
     """
 
+    blend: str
     has_roles: bool
     pair_weight: Array
     pair_role: Array
@@ -98,7 +100,7 @@ def blend_weights(
     shaded_list = nonzero(dev, b.point_is_shaded, b.shaded)
     transmittance = b.transmittance if blend == "alpha" else None
     return BlendWeights(
-        has_roles, b.pair_weight, b.pair_role, b.pixel_entry, shaded_list, transmittance
+        blend, has_roles, b.pair_weight, b.pair_role, b.pixel_entry, shaded_list, transmittance
     )
 
 

@@ -164,7 +164,7 @@ class PairedPoints:
             self.weights,
             point_features=self.point_features,
             features=self.features,
-            grad_features=self.dev.upload(np.reshape(grad_features, (*self.shape, 16)), np.float32),
+            grad_features=self._uploaded(grad_features),
             grad_alpha=grad_alpha,
             spread_weight=spread_weight,
             mean=self.mean,
@@ -179,12 +179,17 @@ class PairedPoints:
             self.projected,
             self.pairs,
             self.weights,
-            self.buffers.pair_gain,
+            self.buffers,
             opacity=self.opacity,
             gamma=self.gamma,
+            point_features=self.point_features,
+            grad_features=self._uploaded(grad_features),
             mean=self.mean,
         )
         return gradients | {"positions": positions.get(), "radius": radius.get()}
+
+    def _uploaded(self, grad_features):
+        return self.dev.upload(np.reshape(grad_features, (*self.shape, 16)), np.float32)
 
 
 NEAR, FAR = dense.DEPTH_RANGE
