@@ -41,7 +41,7 @@ def test_it_blends_what_the_rasteriser_blends(run):
     matrix = seen.blend_matrix()
     raster = run.renderer.forward(camera, run.gamma, until="features")
     points = np.zeros(raster.point_features.shape, np.float32)
-    shaded = raster.shaded.get()
+    shaded = raster.weights.shaded.get()
     points[shaded] = raster.point_features.get()[shaded]
     blended = matrix @ points + (1 - matrix.sum(1))[:, None]  # the background's features are 1
     features = run.render(camera, features=True).features.reshape(-1, 16)

@@ -58,9 +58,7 @@ def test_dropout_is_a_function_of_seed_and_id(dev):
 
 @pytest.mark.parametrize("kind", FOOTPRINTS)
 def test_boxes_hold_the_hits_and_little_more(dev, rng, kind):
-    """At most a column and a row more on each side, but corners of discs that no pixel centre is
-    in.
-    """
+    """At most three columns and rows more on each side: a disc's tip may miss all pixel centres."""
     camera = make_camera()
     positions, radius = make_points(rng, 400), rng.uniform(0.05, 0.4, 400)
     scene = PairedPoints(dev, camera, positions, radius, kind=kind)
@@ -71,6 +69,6 @@ def test_boxes_hold_the_hits_and_little_more(dev, rng, kind):
         first, last = boxes[i, :2], boxes[i, 2:]
         least, most = (columns.min(), rows.min()), (columns.max(), rows.max())
         assert (first <= least).all() and (last >= most).all()
-        assert (first >= np.subtract(least, 1)).all() and (last <= np.add(most, 1)).all()
+        assert (first >= np.subtract(least, 3)).all() and (last <= np.add(most, 3)).all()
         compared += 1
     assert compared > 200
