@@ -134,7 +134,8 @@ ALWAYS_INLINE void convolve(
     const int rounds = (share + TILES - 1) / TILES;  // of about the same size
     const int step = ((share + rounds - 1) / rounds + TOGETHER - 1) / TOGETHER * TOGETHER;
     for (int first = take(scratch, step); first < tiles; first = take(scratch, step)) {
-        const int count = min(step, tiles - first), padded = (count + TOGETHER - 1) / TOGETHER * TOGETHER;
+        const int count = min(step, tiles - first),
+                  padded = (count + TOGETHER - 1) / TOGETHER * TOGETHER;
         for (int source = 0; source < (c2 ? 2 : 1); source++)
             transform_tiles(
                 v + (source ? c1 / 16 * TILES : 0), PITCH(ci), patch, source ? x2 : x,
