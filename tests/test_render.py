@@ -6,7 +6,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from oracle.unet import unet, unet_gradients
 from support.comparisons import relative_error
 from support.models import GRID, make_model
 from support.networks import plain_parameters
@@ -14,6 +13,7 @@ from support.scenes import ring_cameras
 
 from pp_cl.raster.weights import BLENDS
 from pp_cl.reference import dense as oracle_raster
+from pp_cl.reference.network import network, network_gradients
 from pp_cl.render import Renderer
 from pp_cl.settings import RasterConfig
 
@@ -38,13 +38,13 @@ def chained(model, settings, camera, opacity=None, sh=None, tracked=0):
     features = oracle_raster.features(blend, shaded)
     parameters = plain_parameters(model.net, model.net.parameters)
     shape = (padded.height, padded.width)
-    picture, _ = unet(features.reshape(*shape, 16), parameters)
+    layers = model.net.layers
+    outputs = network(layers, parameters, features.reshape(*shape, 16))
+    active = {name: values > 0 for name, values in outputs.items()}
 
     def backward(grad_picture):
-        grad_features, grad_net = unet_gradients(
-            features.reshape(*shape, 16), parameters, grad_picture
-        )
-        grad_features = grad_features.reshape(-1, 16)
+        grad_net = network_gradients(layers, parameters, outputs, active, grad_image=grad_picture)
+        grad_features = grad_net.pop("x").reshape(-1, 16)
         if settings.blend == "alpha":
             grad_shaded, grad_opacity, _ = oracle_raster.alpha_gradients(
                 geometry,
@@ -71,7 +71,7 @@ def chained(model, settings, camera, opacity=None, sh=None, tracked=0):
         )
         return grad_shaded, grad_opacity, basis[:, :, None] * grad_shaded[:, None], grad_net
 
-    return picture, backward
+    return outputs["image"], backward
 
 
 SETTINGS = {

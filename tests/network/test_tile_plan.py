@@ -21,10 +21,10 @@ from pp_cl.network.tile_plan import (
     receptive_radius,
 )
 from pp_cl.network.unet import UNet
-from pp_cl.raster.blend import BACKGROUND
 from pp_cl.reference.network import network, network_gradients
 from pp_cl.training.loss import TAPS
 
+BACKGROUND = 1.0  # of a pixel without hits, cl/common.h
 LAYERS = unet_layers((16, 16, 16))
 GRADIENT = np.float32([0.3, -0.2, 0.1])
 SIZE = (148, 180)  # room for a class inside; levels 1 and 2 end in tiles that are cut off
