@@ -5,6 +5,8 @@ Bad input is one line on stderr and exit status 2.
 
 import argparse
 import importlib
+import io
+import os
 import signal
 import sys
 import warnings
@@ -12,7 +14,6 @@ from collections.abc import Sequence
 from contextlib import nullcontext, redirect_stdout, suppress
 
 from pp_cl import __version__
-from pp_cl.commands.streams import usable_streams
 from pp_cl.errors import BuildError, Stopped, UserError, one_line, quoted, suggestion
 from pp_cl.files.atomic import mend
 
@@ -76,27 +77,32 @@ class _Parser(argparse.ArgumentParser):
             print(message, end="", file=file or sys.stderr, flush=True)
 
 
-def main(argv: Sequence[str] | None = None) -> int:
-    """Run a command; returns the exit status."""
-    warnings.showwarning = _show_warning
-    with usable_streams():
-        return _run(argv)
-
-
 def program(argv: Sequence[str] | None = None) -> int:
-    """main() of a process of its own: a further Ctrl-C ends what Python does after it, without a
-    traceback.
+    """main() of a process of its own: a further Ctrl-C ends what Python does after it, and streams
+    may be as shells give them: closed, full, without a reader.
     """
+    for name in ("stdout", "stderr"):
+        if getattr(sys, name) is None:
+            setattr(sys, name, open(os.devnull, "w", encoding="utf-8"))  # noqa: SIM115
     try:
         return main(argv)
     except KeyboardInterrupt:  # a second one, where main() told of the first
         return 128 + signal.SIGINT
     finally:
         signal.signal(signal.SIGINT, signal.SIG_DFL)
+        for stream in (sys.stdout, sys.stderr):
+            try:
+                stream.flush()
+            except OSError:  # what is left goes nowhere, or Python would try again and report that
+                os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())
 
 
-def _run(argv):
-    """The exit status of a command."""
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run a command; returns the exit status."""
+    warnings.showwarning = _show_warning
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):  # letters that its encoding lacks
+            stream.reconfigure(errors="backslashreplace")
     try:
         options = _parse(sys.argv[1:] if argv is None else list(argv))
         json_alone = getattr(options, "json", None) is sys.stdout

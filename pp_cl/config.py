@@ -1,4 +1,4 @@
-"""All settings of a run, from presets, texts and JSON, which lies beside the result."""
+"""The settings of a run, from presets, texts and its config.json; errors name the key."""
 
 import dataclasses
 import json
@@ -100,8 +100,9 @@ def finite(value: Any) -> float:
 
 
 def _word(value):
-    word = str(value)
-    if not _is_path(word):
+    """A text that a system can take as the name of a file."""
+    word = os.fspath(value)
+    if not isinstance(word, str) or len(word) > MOST_TEXT or b"\0" in os.fsencode(word):
         raise ValueError
     return word
 
@@ -181,38 +182,6 @@ def configure(config: Config, scene: str, given: Iterable[tuple[str, Any, str]] 
 def load_config(path: Path | str) -> Config:
     """Config of a config.json. Raises UserError naming the file and the key."""
     path = Path(path)
-    stored = _read_settings(path)
-    _check_format(path, stored)
-    name = stored.get("preset")
-    if type(name) is not str or name not in PRESETS:
-        raise UserError(
-            f"{path}: key preset is missing or none of {', '.join(PRESETS)}; {MEND_SETTINGS}"
-        )
-    config = preset(name)
-    known = {f"{s}.{item.name}" for s, v in sections(config) for item in dataclasses.fields(v)}
-    found = _stored_keys(path, stored, known)
-    for key in sorted(known - found.keys()):
-        raise UserError(f"{path}: key {key} is missing; {MEND_SETTINGS}")
-    for key, value in found.items():
-        _check_type(config, key, value, f"{path}: {key}")
-        assign(config, key, value, str(path))
-    validate(config, str(path))
-    if not config.scene.path:
-        raise UserError(f"{path}: scene.path is empty; {MEND_SETTINGS}")
-    return config
-
-
-def _check_format(path, stored):
-    """Raise UserError for a config.json of another format."""
-    number = stored.get("format")
-    if type(number) is not int or number != FORMAT:
-        raise UserError(
-            f"{path}: format is {quoted(number, 40)}, this version reads {FORMAT}; start a new run"
-        )
-
-
-def _read_settings(path):
-    """The object in a config.json."""
     try:
         stored = json.loads(read_regular(path, MOST_BYTES))
     except OSError as error:
@@ -222,57 +191,52 @@ def _read_settings(path):
         raise UserError(f"{path}: not JSON ({shown(str(error))}); {MEND_SETTINGS}") from None
     if not isinstance(stored, dict):
         raise UserError(f"{path}: not settings but {quoted(stored, 40)}; {MEND_SETTINGS}")
-    return stored
+    number, name = stored.pop("format", None), stored.pop("preset", None)
+    if type(number) is not int or number != FORMAT:
+        raise UserError(
+            f"{path}: format is {quoted(number, 40)}, this version reads {FORMAT}; start a new run"
+        )
+    if type(name) is not str or name not in PRESETS:
+        raise UserError(
+            f"{path}: key preset is missing or none of {', '.join(PRESETS)}; {MEND_SETTINGS}"
+        )
+    config = preset(name)
+    ours = dict(sections(config))
+    for section, values in stored.items():
+        where = f"{path}: {shown(section, 40)}"
+        if section not in ours or not isinstance(values, dict):
+            raise UserError(f"{where} is no section of settings; {MEND_SETTINGS}")
+        if unknown := sorted(values.keys() - vars(ours[section]).keys()):
+            key = f"{section}.{shown(unknown[0], 60)}"
+            raise UserError(f"{path}: unknown key {key}; {MEND_SETTINGS}")
+    for section, own in ours.items():
+        for key, example in vars(own).items():
+            where = f"{path}: {section}.{key}"
+            if key not in stored.get(section, {}):
+                raise UserError(f"{where} is missing; {MEND_SETTINGS}")
+            value = stored[section][key]
+            if not _is_alike(value, example):
+                raise UserError(
+                    f"{where} is {quoted(value, 40)}, not like {text_of(example)}; {MEND_SETTINGS}"
+                )
+            setattr(own, key, _convert(value, example, where))
+    validate(config, str(path))
+    if not config.scene.path:
+        raise UserError(f"{path}: scene.path is empty; {MEND_SETTINGS}")
+    return config
+
+
+def _is_alike(value, example):
+    """Whether a value of JSON is of a setting's type: texts and truth values are no numbers."""
+    if isinstance(example, tuple):
+        return isinstance(value, list) and all(_is_alike(one, example[0]) for one in value)
+    return type(value) in ((int, float) if type(example) in (int, float) else (type(example),))
 
 
 def nearby_run(folder: Path) -> str:
     """What to say of a folder that is no run's where the one of its name in runs/ is, else ""."""
     near = folder.parent / "runs" / folder.name
     return f"did you mean {near}?" if (near / "config.json").is_file() else ""
-
-
-def _stored_keys(path, stored, known):
-    """{"section.key": value} of the object in a config.json, all of them known."""
-    found = {}
-    for section, values in stored.items():
-        if section in ("format", "preset"):
-            continue
-        where = f"{path}: {shown(section, 40)}"
-        if section not in {key.partition(".")[0] for key in known}:
-            raise UserError(f"{where} is no section of settings; {MEND_SETTINGS}")
-        if not isinstance(values, dict):
-            raise UserError(f"{where} is not an object; {MEND_SETTINGS}")
-        found |= {f"{section}.{name}": value for name, value in values.items()}
-    unknown = sorted(found.keys() - known)
-    if unknown:
-        raise UserError(f"{path}: unknown key {shown(unknown[0], 60)}; {MEND_SETTINGS}")
-    return found
-
-
-def _check_type(config, key, value, where):
-    """Raise UserError unless a stored value is of its setting's type; texts and truth values are no
-    numbers.
-    """
-    section, _, name = key.partition(".")
-    example = getattr(getattr(config, section), name)
-    pairs = [(value, example)]
-    if isinstance(example, tuple) and isinstance(value, list):
-        pairs = list(zip(value, example, strict=False))  # assign() counts them
-    for one, wanted in pairs:
-        allowed = (int, float) if type(wanted) in (int, float) else (type(wanted),)
-        if type(one) not in allowed:
-            kind = KINDS[type(wanted)][0] if type(wanted) in KINDS else f"{len(example)} values"
-            raise UserError(f"{where} is {quoted(one, 40)}, not {kind}; {MEND_SETTINGS}")
-        if type(one) is str and not _is_path(one):
-            raise UserError(f"{where} is {quoted(one, 40)}, no text; {MEND_SETTINGS}")
-
-
-def _is_path(text):
-    """Whether a system can take the text as the name of a file."""
-    try:
-        return len(text) <= MOST_TEXT and b"\0" not in os.fsencode(text)
-    except UnicodeEncodeError:
-        return False
 
 
 def text_of(value: Any) -> str:

@@ -1,4 +1,4 @@
-"""The exceptions a user may see, and the words of their messages."""
+"""The exceptions whose one line a user sees, and what keeps foreign text on that line."""
 
 import difflib
 from collections.abc import Iterable

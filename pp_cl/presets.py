@@ -1,6 +1,6 @@
 """The presets, and the short names of settings: data only."""
 
-# What differs from the defaults in config.py, which are the tiny preset: minutes on a CPU.
+# What differs from the defaults in settings.py, which are the tiny preset: minutes on a CPU.
 PRESETS = {
     "tiny": {},
     # for 400 x 400: begins at half the size; 20 minutes on a CPU
@@ -56,7 +56,7 @@ PRESETS = {
 # as they are.
 IMAGE_SIZES = {"tiny": 200, "small": 400, "full": None, "paper": None}
 
-# Settings with a short name on the command line and in run.train_scene().
+# Settings with a short name on the command line and in session.train_scene().
 SHORT = {
     "iterations": "train.iterations",
     "points": "points.count",

@@ -1,4 +1,4 @@
-"""What a training leaves: a model that can be rendered from anywhere."""
+"""A trained model in the folder of a run: load it, render it from anywhere, evaluate it."""
 
 import math
 import os

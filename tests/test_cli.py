@@ -47,20 +47,11 @@ def edit(scene, change):
     path.write_text(json.dumps(content))
 
 
-def set_matrix(value):
-    def change(content):
-        content["frames"][1]["transform_matrix"] = value
-
-    return change
+def damaged_frame(**changes):
+    return lambda s: edit(s, lambda content: content["frames"][1].update(changes))
 
 
-def set_path(value):
-    def change(content):
-        content["frames"][1]["file_path"] = value
-
-    return change
-
-
+# what the readers' own tests have in full
 DAMAGE = {
     "no such folder": (lambda s: s.rename(s.parent / "elsewhere"), "ball"),
     "missing json": (lambda s: (s / "transforms_train.json").unlink(), "transforms_train.json"),
@@ -68,23 +59,9 @@ DAMAGE = {
         lambda s: (s / "transforms_train.json").write_text('{"frames": ['),
         "transforms_train.json",
     ),
-    "missing key": (lambda s: edit(s, lambda c: c.pop("camera_angle_x")), "camera_angle_x"),
-    "missing matrix": (
-        lambda s: edit(s, lambda c: c["frames"][1].pop("transform_matrix")),
-        "transform_matrix",
-    ),
-    "zero frames": (lambda s: edit(s, lambda c: c.update(frames=[])), "frames"),
-    "nan matrix": (lambda s: edit(s, set_matrix([[float("nan")] * 4] * 4)), "transform_matrix"),
-    "wrong shape": (lambda s: edit(s, set_matrix([[1, 0], [0, 1]])), "transform_matrix"),
-    "path leaves": (lambda s: edit(s, set_path("../../secret")), "file_path"),
+    "path leaves": (damaged_frame(file_path="../../secret"), "file_path"),
+    "wrong shape": (damaged_frame(transform_matrix=[[1, 0], [0, 1]]), "transform_matrix"),
     "missing image": (lambda s: (s / "train" / "r_1.png").unlink(), "train/r_1"),
-    "truncated image": (
-        lambda s: (s / "train" / "r_1.png").write_bytes(
-            (s / "train" / "r_1.png").read_bytes()[:200]
-        ),
-        "r_1.png",
-    ),
-    "other size": (lambda s: Image.new("RGBA", (20, 20)).save(s / "train" / "r_1.png"), "r_1.png"),
     "empty mask": (lambda s: Image.new("RGBA", (32, 32)).save(s / "train" / "r_1.png"), "r_1.png"),
 }
 
@@ -133,18 +110,7 @@ def test_a_foreign_folder_is_not_written_into(scene, tmp_path, capsys):
 
 def test_a_folder_that_cannot_be_made_is_one_line(scene, tmp_path, capsys):
     (tmp_path / "file").write_text("")
-    line = failure(
-        capsys,
-        "train",
-        scene,
-        "--out",
-        tmp_path / "file" / "run",
-        "--points",
-        500,
-        "--iterations",
-        2,
-    )
-    assert "file/run" in line
+    assert "file/run" in failure(capsys, "train", scene, "--out", tmp_path / "file" / "run")
 
 
 def test_no_device_says_what_to_install(scene, tmp_path, capsys, monkeypatch):
@@ -219,24 +185,13 @@ def test_eval_of_nothing_and_of_broken_runs(tmp_path, capsys):
 
 
 def test_compare_writes_the_table_and_the_file(tmp_path, capsys):
-    rng = np.random.default_rng(0)
-    for name in ("a", "b"):
-        Image.fromarray(rng.integers(0, 256, (24, 24, 3), np.uint8)).save(tmp_path / f"{name}.png")
-    assert (
-        main(
-            [
-                "compare",
-                str(tmp_path / "a.png"),
-                str(tmp_path / "b.png"),
-                "--json",
-                str(tmp_path / "m.json"),
-            ]
-        )
-        == 0
-    )
+    rng, files = np.random.default_rng(0), [str(tmp_path / f"{name}.png") for name in "ab"]
+    for file in files:
+        Image.fromarray(rng.integers(0, 256, (24, 24, 3), np.uint8)).save(file)
+    assert main(["compare", *files, "--json", str(tmp_path / "m.json")]) == 0
     result = json.loads((tmp_path / "m.json").read_text())
     assert f"{result['mean']['psnr']:.4f}" in capsys.readouterr().out
-    assert "none.png" in failure(capsys, "compare", tmp_path / "none.png", tmp_path / "b.png")
+    assert "none.png" in failure(capsys, "compare", tmp_path / "none.png", files[1])
 
 
 def test_a_kernel_that_does_not_build_is_one_line_below_the_log(
@@ -254,29 +209,6 @@ def test_a_kernel_that_does_not_build_is_one_line_below_the_log(
     )
 
 
-def test_a_file_without_a_name_cannot_be_written(tmp_path, capsys):
-    Image.fromarray(np.zeros((16, 16, 3), np.uint8)).save(tmp_path / "a.png")
-    for target in (".", "/", "..", "a" * 300):
-        line = failure(capsys, "compare", tmp_path / "a.png", tmp_path / "a.png", "--json", target)
-        assert f"--json: '{target[:10]}" in line
-    line = failure(capsys, "export", tmp_path, "--format", "ply", "--out", f"{'a' * 300}/b.ply")
-    assert "name" in line
-
-
-@pytest.mark.parametrize(
-    "words",
-    [
-        ("bench", "unet", "--size", "9" * 5000),
-        ("bench", "unet", "--widths", "16,16," + "9" * 5000),
-        ("shape", "none.ply", "--samples", "9" * 5000),
-        ("render", "none", "--size", f"{'9' * 5000}x16"),
-        ("render", "none", "--background", f"0,0,{'9' * 5000}"),
-    ],
-)
-def test_numbers_without_end_are_one_line(words, capsys):
-    assert words[2] in failure(capsys, *words)
-
-
 def test_what_was_typed_breaks_no_line(tmp_path, capsys):
     line = failure(capsys, "eval", f"{tmp_path}/a\nb\x1b[31m")
     assert f"{tmp_path}/a b?[31m/config.json" in line
@@ -284,7 +216,11 @@ def test_what_was_typed_breaks_no_line(tmp_path, capsys):
 
 @pytest.mark.parametrize(
     "told, then, status",
-    [("130", "os.kill(os.getpid(), signal.SIGINT)", -signal.SIGINT), ("1 / 0", "", 1)],
+    [
+        ("130", "os.kill(os.getpid(), signal.SIGINT)", -signal.SIGINT),
+        ("os.kill(os.getpid(), signal.SIGINT)", "raise SystemExit(told)", 130),
+        ("1 / 0", "", 1),
+    ],
 )
 def test_a_further_interrupt_shows_no_traceback(told, then, status):
     """Of a process whose main() has told of the first."""
@@ -298,18 +234,6 @@ def test_a_further_interrupt_shows_no_traceback(told, then, status):
     done = subprocess.run([sys.executable, "-c", dedent(lines)], capture_output=True, text=True)
     assert done.returncode == status
     assert ("Traceback" in done.stderr) == (status == 1)
-
-
-def test_an_interrupt_while_the_first_is_told_of():
-    lines = """
-        from pp_cl import cli
-        def main(argv):
-            raise KeyboardInterrupt
-        cli.main = main
-        raise SystemExit(cli.program())
-    """
-    done = subprocess.run([sys.executable, "-c", dedent(lines)], capture_output=True, text=True)
-    assert (done.returncode, done.stderr) == (130, "")
 
 
 def test_a_library_that_finds_no_memory_is_one_line_and_other_faults_of_it_are_bugs(

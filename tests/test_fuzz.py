@@ -59,7 +59,6 @@ from pp_cl.session import run_config
 from pp_cl.sweep.plan import Job, plan, read_seeds, read_varied
 from pp_cl.sweep.result import finished_row, progress
 from pp_cl.training.checkpoint import load_run_state
-from pp_cl.view.follow import LogFollower
 from pp_cl.view.messages import read_request
 
 MOST_MEMORY = 2**26  # bytes of pixels that a small file may unfold to without a word
@@ -321,9 +320,6 @@ def test_a_log(world, data):
         damage.damage_file(data.draw, run.log)
         for row in taken(run.rows) or ():
             check_finite(step=row["step"], seconds=row["seconds"])
-        follower = LogFollower(run.log)
-        follower.poll()
-        check_finite(curves=[x for row in follower.rows for x in row])
         taken(lambda: progress(job(world, run)))
         tell(run)
         log = taken(lambda: Log(run.log, one(data.draw, 0, 2, 4)))
@@ -434,7 +430,6 @@ def test_a_sweep(world, varied, seeds, scenes):
         jobs = taken(lambda: plan(scenes, out, read_seeds(seeds), read_varied(varied))) or []
         for one_job in jobs:
             assert os.path.realpath(one_job.folder).startswith(os.path.realpath(out) + "/")
-            assert Job.from_json(one_job.to_json()) == one_job
         assert len({one_job.folder for one_job in jobs}) == len(jobs)
 
 

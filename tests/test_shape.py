@@ -70,11 +70,6 @@ def test_a_mesh_alone(dev, mesh):
     assert mesh_shape(dev, mesh, 0.1, 100_000)["grid"]["edge"] == 0.1
 
 
-def test_a_run_without_a_mesh_is_asked_for_one(dev, trained):
-    with pytest.raises(UserError, match="--mesh"):
-        run_shape(dev, RunFolder(trained), None, 100)
-
-
 def test_another_scene_is_noticed(dev, mesh, trained, tmp_path):
     other = write_ball_scene(tmp_path / "other", views=5, size=40)
     with pytest.raises(UserError, match="not the one that the run began with"):
@@ -109,6 +104,7 @@ WRONG = {
     "a run without mesh": (["RUN"], "--mesh FILE"),
     "a mesh that is missing": (["RUN", "--mesh", "none.ply"], "none.ply"),
     "a folder that is no run": (["EMPTY"], "config.json"),
+    "a run that has no checkpoint": (["YOUNG", "--mesh", "MESH"], "checkpoint"),
 }
 
 
@@ -117,15 +113,10 @@ def test_wrong_input_is_one_line(case, mesh, trained, tmp_path, capsys, monkeypa
     monkeypatch.chdir(tmp_path)
     trimesh.Trimesh(mesh.vertices, mesh.faces).export("ball.ply")
     (tmp_path / "empty").mkdir()
-    names = {"RUN": str(trained), "MESH": "ball.ply", "EMPTY": "empty"}
+    shutil.copytree(trained, "young")
+    (tmp_path / "young" / "checkpoint.npz").unlink()
+    names = {"RUN": str(trained), "MESH": "ball.ply", "EMPTY": "empty", "YOUNG": "young"}
     words, said = WRONG[case]
     assert main(["shape", *(names.get(word, word) for word in words)]) == 2
     [line] = [x for x in capsys.readouterr().err.splitlines() if x.startswith("pp-cl")]
     assert said in line
-
-
-def test_a_run_without_a_checkpoint(dev, mesh, trained, tmp_path):
-    shutil.copytree(trained, tmp_path / "run")
-    (tmp_path / "run" / "checkpoint.npz").unlink()
-    with pytest.raises(UserError, match="checkpoint"):
-        run_shape(dev, RunFolder(tmp_path / "run"), mesh, 100)

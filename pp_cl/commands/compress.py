@@ -4,6 +4,7 @@ import argparse
 from pathlib import Path
 
 from pp_cl.commands import options as shared
+from pp_cl.errors import UserError
 
 HELP = "make a trained model smaller and faster within a stated loss"
 EPILOG = """Tried in turn, each kept where the views below lose no more: coefficients of 16 bits, no
@@ -39,14 +40,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> None:
     """Search, write the compressed run, print what it saves and loses."""
-    from pp_cl.compress.output import (
-        REPORT,
-        check_finished,
-        validation_views,
-        write_compressed,
-    )
-    from pp_cl.compress.reduction import Original, nbytes
-    from pp_cl.compress.search import Search, frame_ms
+    from pp_cl.compress.reduction import REPORT, Original, nbytes
+    from pp_cl.compress.search import Search, frame_ms, validation_views
     from pp_cl.device.discover import open_device
     from pp_cl.files.atomic import check_new_folder
     from pp_cl.run import load_run
@@ -54,7 +49,8 @@ def run(options: argparse.Namespace) -> None:
     out = Path(options.out or f"{Path(options.run_folder).resolve()}-compressed")
     check_new_folder(out)
     whole = load_run(open_device(options.device), options.run_folder, scene=options.scene)
-    check_finished(whole)
+    if not whole.header["finished"]:
+        raise UserError(f"{whole.folder}: its training is not finished; finish it first")
     which, views = validation_views(whole)
     original = Original.of(whole)
     search = Search(original, views, options.max_loss)
@@ -73,7 +69,7 @@ def run(options: argparse.Namespace) -> None:
         "device": whole.dev.name,
         "trials": [vars(trial) | {"reduction": vars(trial.reduction)} for trial in trials],
     }
-    write_compressed(original, search.reduction, out, report)
+    original.write(search.reduction, out, report)
     print(
         f"{sizes[0] / 2**20:.1f} to {sizes[1] / 2**20:.1f} MiB ({sizes[0] / sizes[1]:.1f} times"
         f" less), {1e3 / ms[0]:.1f} to {1e3 / ms[1]:.1f} frames per second"

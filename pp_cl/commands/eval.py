@@ -17,7 +17,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     shared.add_run_scene(parser)
     parser.add_argument(
         "--out",
-        type=shared.output_folder,
         metavar="FOLDER",
         help="write there, not into RUN/eval, which then stays as it is",
     )

@@ -13,12 +13,11 @@ from typing import Any, TextIO
 
 from pp_cl import config
 from pp_cl.errors import UserError, quoted, suggestion
-from pp_cl.files.atomic import check_writable, write_json
+from pp_cl.files.atomic import check_target, write_json
 from pp_cl.presets import SHORT
 
 METRICS = ("psnr", "ssim", "lpips")
 MOST_SIDE = 8192  # pixels of an image that is rendered
-MOST_NAME = 230  # bytes of a file's name: systems take 255, and a temporary one is longer
 
 # ---- types
 
@@ -101,42 +100,28 @@ def output_file(*suffixes: str) -> Callable[[str], str]:
     """The type of a file to be written, with one of these suffixes where there are some."""
 
     def read(text):
-        path = Path(text)
-        folder = path.absolute().parent
-        if len(os.fsencode(path.name)) > MOST_NAME:
-            problem = "its name is too long; choose a shorter one"
-        elif path.exists() and not path.is_file():
-            problem = "is no file; name one" if not path.is_dir() else "is a folder; name a file"
-        elif suffixes and path.suffix.lower() not in suffixes:
-            problem = f"name a file that ends in {' or '.join(suffixes)}"
-        elif not folder.is_dir():
-            problem = f"there is no folder {folder}; make it first"
-        elif not os.access(folder, os.W_OK | os.X_OK):
-            problem = f"{folder} may not be written; choose another folder"
-        else:
-            return text
-        raise argparse.ArgumentTypeError(f"{quoted(text)}: {problem}")
+        path, folder = Path(text), os.path.dirname(os.path.abspath(text))
+        if suffixes and path.suffix.lower() not in suffixes:
+            raise argparse.ArgumentTypeError(
+                f"{quoted(text)}: name a file that ends in {' or '.join(suffixes)}"
+            )
+        if os.path.exists(path) and not os.path.isfile(path):
+            raise argparse.ArgumentTypeError(f"{quoted(text)}: is no file; name one")
+        if not os.path.isdir(folder):
+            raise argparse.ArgumentTypeError(
+                f"{quoted(text)}: there is no folder {folder}; make it first"
+            )
+        try:
+            check_target(path)
+        except UserError as error:
+            raise argparse.ArgumentTypeError(str(error)) from None
+        return text
 
     return read
 
 
 # a picture that matplotlib draws
 figure_file = output_file(".png", ".svg", ".pdf")
-
-
-def output_folder(text: str) -> str:
-    """The type of a folder to be written into, which need not exist."""
-    there = Path(text).absolute()
-    while not there.exists():
-        there = there.parent
-    if not there.is_dir():
-        which = "" if there == Path(text).absolute() else f" {there}"
-        raise argparse.ArgumentTypeError(f"{text}:{which} is not a folder; choose another")
-    try:
-        check_writable(text, "choose another")
-    except UserError as error:
-        raise argparse.ArgumentTypeError(str(error)) from None
-    return text
 
 
 # ---- options

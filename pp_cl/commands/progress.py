@@ -1,6 +1,9 @@
-"""How a command shows that it goes on: one line on a terminal, elsewhere now and then a line."""
+"""How a long command shows that it goes on, on a terminal and elsewhere, and how Ctrl-C and SIGTERM
+stop it in good order.
+"""
 
-import os
+import shutil
+import signal
 import sys
 import time
 from collections.abc import Callable, Iterator
@@ -12,123 +15,77 @@ from tqdm import tqdm
 from pp_cl.session import Training
 
 BUILDING = 2  # steps in which nearly all kernels are built, if the driver has not kept them
-TOLD = "building kernels (once)"
 REDRAWN = 1  # seconds, at least, between two states of the bar
 LINES_APART = 30  # seconds, at least, between the lines in a file
 GIB = 2**30
 # tqdm's, with little beside what follows; it is cut off at the right border
 FORMAT = "{percentage:3.0f}%|{bar}| {n_fmt}/{total_fmt}, {rate_fmt}, {remaining} left{postfix}"
 # of a terminal that does not tell its size, where tqdm would show nothing
-WIDTH, ROWS = 100, 20
+SIZE = 100, 20
+STOPPING = (signal.SIGINT, signal.SIGTERM)
 
 
-def follow(training: Training, stream: TextIO | None = None) -> "Bar | Lines":
-    """What to enter while a training runs and to call after each of its steps, with the step and
-    its row of the log. stream: sys.stderr if not given.
-    """
-    stream = stream or sys.stderr
-    return Bar(training, stream) if stream.isatty() else Lines(training, stream)
-
-
-class Bar:
-    """One line with rate, time left, PSNR, points and device memory, for a terminal. It begins once
-    kernels are built, whose time says nothing of the steps to come.
+class Progress:
+    """Rate, time left, PSNR, points and device memory of a training: to be entered while it runs,
+    and called after each of its steps with the step and its row of the log. It begins once kernels
+    are built, whose time says nothing of the steps to come. stream: sys.stderr if not given.
     """
 
-    def __init__(self, training: Training, stream: TextIO) -> None:
-        self._dev, self._stream, self._test = training.trainer.dev, stream, ""
-        self._first, self._steps = training.trainer.step, training.config.train.iterations
-        self._bar = None
+    def __init__(self, training: Training, stream: TextIO | None = None) -> None:
+        self._dev, self._stream = training.trainer.dev, stream or sys.stderr
+        self._built = training.trainer.step + BUILDING
+        self._steps = training.config.train.iterations
+        self._bar, self._test, self._start, self._next = None, "", 0.0, 0.0
 
-    def __enter__(self) -> "Bar":
-        self._write(TOLD)
+    def __enter__(self) -> "Progress":
+        _print("building kernels (once)", self._stream)
         return self
 
     def __exit__(self, *_: object) -> None:
-        if self._bar is None:
-            self._write("")
-        else:
+        if self._bar is not None:
             self._bar.close()
 
-    def _write(self, text):
-        """Put a text in place of TOLD."""
-        self._stream.write(f"\r{text:{len(TOLD)}s}\r")
-        self._stream.flush()
+    def __call__(self, step: int, row: dict[str, Any] | None) -> None:
+        """Move on to a step."""
+        now = time.monotonic()
+        if step == self._built:
+            self._start = now
+            if self._stream.isatty():
+                self._bar = self._opened(step)
+        elif self._bar is not None:
+            self._bar.update()
+        if step <= self._built or row is None:
+            return
+        if "test_psnr" in row:
+            self._test = f" (test {row['test_psnr']:.2f})"
+        memory = self._dev.bytes / GIB
+        text = f"PSNR {row['psnr']:.2f}{self._test}, {row['points']} points, {memory:.2f} GiB"
+        if self._bar is not None:
+            self._bar.set_postfix_str(text, refresh=False)
+        elif now >= self._next:
+            self._next = now + LINES_APART
+            rate = (step - self._built) / max(now - self._start, 1e-6)
+            left = tqdm.format_interval((self._steps - step) / rate)
+            line = f"step {step} of {self._steps}, {rate:.3g} steps/s, {left} left, {text}"
+            _print(line, self._stream)
 
     def _opened(self, step):
-        self._write("")
+        columns, rows = shutil.get_terminal_size(SIZE)
         return tqdm(
             total=self._steps,
             initial=step,
             unit="step",
             mininterval=REDRAWN,
             bar_format=FORMAT,
-            ncols=_columns(self._stream),
-            nrows=ROWS,
+            ncols=columns,
+            nrows=rows,
             file=self._stream,
         )
 
-    def __call__(self, step: int, row: dict[str, Any] | None) -> None:
-        """Move on to a step."""
-        if step < self._first + BUILDING:
-            return
-        if self._bar is None:
-            self._bar = self._opened(step)
-        else:
-            self._bar.update()
-        if row is None:
-            return
-        if "test_psnr" in row:
-            self._test = f" (test {row['test_psnr']:.1f})"
-        self._bar.set_postfix_str(
-            f"PSNR {row['psnr']:.1f}{self._test}, {row['points']} points,"
-            f" {self._dev.bytes / GIB:.2f} GiB",
-            refresh=False,
-        )
 
-
-def _columns(stream):
-    """Columns of the terminal."""
-    try:
-        return os.get_terminal_size(stream.fileno()).columns or WIDTH
-    except (OSError, ValueError):
-        return WIDTH
-
-
-class Lines:
-    """Plain lines, of rows of the log that are LINES_APART seconds apart: for files and pipes."""
-
-    def __init__(self, training: Training, stream: TextIO) -> None:
-        self._dev, self._stream = training.trainer.dev, stream
-        self._first, self._steps = training.trainer.step, training.config.train.iterations
-        self._start, self._next = 0.0, 0.0
-
-    def __enter__(self) -> "Lines":
-        self._print(TOLD)
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        pass
-
-    def __call__(self, step: int, row: dict[str, Any] | None) -> None:
-        """Print a line, where the step has a row and the last line is long enough ago."""
-        now, done = time.monotonic(), step - self._first - BUILDING
-        if done <= 0:
-            self._start = now
-        elif row is not None and now >= self._next:
-            self._next = now + LINES_APART
-            rate = done / max(now - self._start, 1e-6)
-            left = round((self._steps - step) / rate)
-            test = f", test PSNR {row['test_psnr']:.2f}" if "test_psnr" in row else ""
-            self._print(
-                f"step {step} of {self._steps}, {rate:.3g} steps/s, {clock(left)} left,"
-                f" PSNR {row['psnr']:.2f}{test}, {row['points']} points,"
-                f" {self._dev.bytes / GIB:.2f} GiB"
-            )
-
-    def _print(self, line):
-        with suppress(OSError):  # of a full disk, which is no reason to stop
-            print(line, file=self._stream, flush=True)
+def _print(line, stream):
+    with suppress(OSError):  # of a full disk, which is no reason to stop
+        print(line, file=stream, flush=True)
 
 
 @contextmanager
@@ -148,17 +105,34 @@ def counted(noun: str, stream: TextIO | None = None) -> Iterator[Callable[[int, 
                 bar.reset(total)
             bar.update()
             now = time.monotonic()
-            if not bar.disable or now - told < LINES_APART:
-                return
-            told, left = now, round((now - start) / done * (total - done))
-            with suppress(OSError):  # as of Lines
-                print(f"{done} of {total} {noun}s, {clock(left)} left", file=stream, flush=True)
+            if bar.disable and now - told >= LINES_APART:
+                told, left = now, tqdm.format_interval((now - start) / done * (total - done))
+                _print(f"{done} of {total} {noun}s, {left} left", stream)
 
         yield tell
 
 
-def clock(seconds: int) -> str:
-    """h:mm:ss, or m:ss below an hour."""
-    minutes, rest = divmod(seconds, 60)
-    hours, minutes = divmod(minutes, 60)
-    return f"{hours}:{minutes:02d}:{rest:02d}" if hours else f"{minutes}:{rest:02d}"
+@contextmanager
+def first_signal() -> Iterator[list[int]]:
+    """A list that is empty until Ctrl-C or SIGTERM comes, and then holds its number. A second one
+    does what it did before. To be entered in the main thread.
+    """
+    caught = []
+    before = {number: signal.getsignal(number) for number in STOPPING}
+    # nohup, and & in a script, leave signals ignored; None is a handler that is not Python's
+    before = {n: handler for n, handler in before.items() if handler not in (signal.SIG_IGN, None)}
+
+    def restore():
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+    def note(number, _frame):
+        caught.append(number)
+        restore()
+
+    for number in before:
+        signal.signal(number, note)
+    try:
+        yield caught
+    finally:
+        restore()

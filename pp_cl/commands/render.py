@@ -3,6 +3,7 @@
 import argparse
 import math
 import mimetypes
+import statistics
 from pathlib import Path
 
 from pp_cl.commands import options as shared
@@ -72,14 +73,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="F",
         help=f"frames per second ({FPS})",
     )
-    _add_style(parser)
-    shared.add_run_scene(parser)
-    shared.add_device(parser)
-
-
-def _add_style(parser):
-    """Options of how a frame is rendered."""
-    add = parser.add_argument
     add(
         "--background",
         type=_colour,
@@ -95,12 +88,16 @@ def _add_style(parser):
         help="per pixel: 1, 4, 9 or 16",
     )
     add("--features", action="store_true", help="in exr: the 16 features of each pixel too")
+    shared.add_run_scene(parser)
+    shared.add_device(parser)
 
 
 def run(options: argparse.Namespace) -> None:
     """Render the frames that are missing, and make a film of them where one is asked for."""
+    from tqdm import tqdm
+
     from pp_cl.device.discover import open_device
-    from pp_cl.export.film import Frames, film_folder, owned_folder
+    from pp_cl.export.film import render_film, render_frames
     from pp_cl.files.video import check_video
     from pp_cl.run import load_run
 
@@ -117,17 +114,21 @@ def run(options: argparse.Namespace) -> None:
             " WxH, or --format png"
         )
     out = Path(options.out) if options.out else _default(run, options.path, sizes, kind)
-    if kind in FILMS:
-        with film_folder(out) as folder:
-            frames = Frames(run, cameras, folder, style, replace=True)
-            seconds = _render_with_bar(frames)
-            frames.write_film(out, options.fps)
-    else:
-        with owned_folder(out, out):
-            seconds = _render_with_bar(Frames(run, cameras, out, style))
+    seconds = []
+    with tqdm(total=len(cameras), unit="frame", disable=None) as bar:
+
+        def on_frame(took):
+            bar.update()
+            if took is not None:
+                seconds.append(took)
+
+        if kind in FILMS:
+            render_film(run, cameras, out, options.fps, style, on_frame)
+        else:
+            render_frames(run, cameras, out, style, on_frame)
     made = f"{len(seconds)} of {len(cameras)} frames"
     if seconds:
-        made += f", {sorted(seconds)[len(seconds) // 2] * 1e3:.0f} ms each on {run.dev.name}"
+        made += f", {statistics.median(seconds) * 1e3:.0f} ms each on {run.dev.name}"
     print(f"rendered {made}")
     print(f"wrote {out}")
 
@@ -214,19 +215,3 @@ def _cameras(run, path, count, *, size, fov):
     around, first = Surroundings(photographs, run.model.positions()), shaped(photographs[0])
     make = around.orbit if path == "orbit" else around.spiral
     return make(first, count)
-
-
-def _render_with_bar(frames):
-    """Seconds of each frame that was rendered, under a progress bar on a terminal."""
-    from tqdm import tqdm
-
-    seconds = []
-    with tqdm(total=len(frames.paths), unit="frame", disable=None) as bar:
-
-        def on_frame(took):
-            bar.update()
-            if took is not None:
-                seconds.append(took)
-
-        frames.render(on_frame)
-    return seconds

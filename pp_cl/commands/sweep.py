@@ -2,7 +2,7 @@
 
 import argparse
 import sys
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from pathlib import Path
 
 from pp_cl.commands import options as shared
@@ -27,7 +27,6 @@ or use Dask's certificates:
   PP_DEVICE=0:0 dask worker tcp://127.0.0.1:8786 --host 127.0.0.1 --nthreads 1
   pp-cl sweep lego --out sweeps/a --scheduler tcp://127.0.0.1:8786
 """
-PATIENCE = 600  # seconds that trainings have to write their checkpoints when the sweep is stopped
 MOST_WORKERS = 256
 
 
@@ -38,7 +37,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add(
         "--out",
         required=True,
-        type=shared.output_folder,
         metavar="DIR",
         help="folder of the runs and the table",
     )
@@ -68,13 +66,18 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> None:
     """Run what is missing, print the table. Raises Stopped where runs failed."""
+    from pp_cl.sweep.result import finished_row
     from pp_cl.sweep.table import text_table, write_tables
 
     jobs, out = _jobs(options), Path(options.out)
     if options.dry_run:
         _print_plan(jobs)
         return
-    rows = {job.folder: row for job in jobs if (row := _finished(job)[0])}
+    rows = {}
+    for job in jobs:
+        with suppress(UserError):  # which the job meets again, and tells in its row
+            if row := finished_row(job):
+                rows[job.folder] = row
     missing = [job for job in jobs if job.folder not in rows]
     print(f"{len(jobs)} runs, {len(rows)} of them finished already", flush=True)
     out.mkdir(parents=True, exist_ok=True)
@@ -114,67 +117,62 @@ def _jobs(options):
     )
 
 
-def _finished(job):
-    """(row or None, why the folder cannot be used or None)."""
-    from pp_cl.sweep.result import finished_row
-
-    try:
-        return finished_row(job), None
-    except UserError as error:
-        return None, str(error)
-
-
 def _print_plan(jobs):
     """What would be run, and what has been."""
-    from pp_cl.sweep.result import progress
+    from pp_cl.files.run_folder import RunFolder
+    from pp_cl.sweep.result import finished_row, progress
     from pp_cl.sweep.table import values_text
 
     done = 0
     for job in jobs:
-        row, problem = _finished(job)
-        done += row is not None
-        if row:
-            state = f"finished: {values_text(row)}"
-        elif problem:
-            state = f"will fail: {problem}"
-        else:
-            state = f"to go on: {progress(job)}" if job.lock.exists() else "to do"
+        state = f"to go on: {progress(job)}" if RunFolder(job.folder).config.exists() else "to do"
+        try:
+            if row := finished_row(job):
+                state = f"finished: {values_text(row)}"
+                done += 1
+        except UserError as error:
+            state = f"will fail: {error}"
         print(f"{job}: {state}")
     print(f"{len(jobs)} runs, {done} of them finished already; nothing was started")
 
 
 def _run(options, jobs, done):
-    """{folder: row} of the jobs. Raises Stopped after Ctrl-C or SIGTERM."""
-    from pp_cl.commands.live_table import LiveTable
-    from pp_cl.commands.signals import first_signal
-    from pp_cl.device.discover import separate_devices
-    from pp_cl.sweep.cluster import await_ends, client_of, local_client, run_jobs
-    from pp_cl.sweep.task import prepare
+    """{folder: row} of the jobs: a line for each that ends, and on a terminal below them a bar with
+    those at work. Raises Stopped after Ctrl-C or SIGTERM.
+    """
+    from tqdm import tqdm
 
-    rows = {}
+    from pp_cl.commands.progress import first_signal
+    from pp_cl.device.discover import separate_devices
+    from pp_cl.sweep.cluster import client_of, local_client, run_jobs
+    from pp_cl.sweep.result import progress
+    from pp_cl.sweep.table import run_text, values_text
+
+    rows, total = {}, done + len(jobs)
     with ExitStack() as stack:
         caught = stack.enter_context(first_signal())
-        prepare(jobs)
         if options.scheduler:
             client = stack.enter_context(client_of(options.scheduler))
         else:
             devices = separate_devices()
             workers = min(options.workers or len(devices), len(jobs))
             client = stack.enter_context(local_client(devices, workers))
-        table = LiveTable(sys.stderr, jobs, done)
+        bar = stack.enter_context(tqdm(total=total, initial=done, unit="run", disable=None))
 
         def on_row(job, row):
             rows[job.folder] = row
-            table.end(row)
+            text = f"[{done + len(rows)} of {total}] {run_text(row)}: {values_text(row)}"
+            tqdm.write(text, file=sys.stderr)
+            bar.update()
 
-        run_jobs(client, jobs, on_row=on_row, on_tick=table.tick, is_stopped=lambda: bool(caught))
-        if len(rows) < len(jobs):
-            for job in await_ends(table.at_work(), PATIENCE):
-                print(f"pp-cl: {job.folder}: a process still works there", file=sys.stderr)
-            left = len(jobs) - len(rows)
-            raise Stopped(
-                f"stopped with {left} runs left; the same command goes on", 128 + caught[0]
-            )
+        def on_tick(at_work):
+            if not bar.disable:
+                bar.set_postfix_str("; ".join(f"{job}: {progress(job)}" for job in at_work))
+
+        run_jobs(client, jobs, on_row=on_row, on_tick=on_tick, is_stopped=lambda: bool(caught))
+    if len(rows) < len(jobs):
+        left = len(jobs) - len(rows)
+        raise Stopped(f"stopped with {left} runs left; the same command goes on", 128 + caught[0])
     return rows
 
 

@@ -17,7 +17,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the command's options."""
     add = parser.add_argument
     add("scene", metavar="SCENE", help="folder of a scene, or the word demo")
-    add("--out", required=True, type=shared.output_folder, metavar="RUN", help="folder of the run")
+    add("--out", required=True, metavar="RUN", help="folder of the run")
     add(
         "--preset",
         choices=PRESETS,
@@ -162,14 +162,13 @@ def _sizes(cameras):
 
 def _run(training, options):
     """Seconds of the training, run to its end. Raises Stopped after Ctrl-C or SIGTERM."""
-    from pp_cl.commands.progress import follow
-    from pp_cl.commands.signals import first_signal
+    from pp_cl.commands.progress import Progress, first_signal
     from pp_cl.errors import Stopped
     from pp_cl.files.scalars import Scalars
 
     trainer, folder = training.trainer, training.folder
     with ExitStack() as stack:
-        followers = [stack.enter_context(follow(training))]
+        followers = [stack.enter_context(Progress(training))]
         if options.tensorboard:
             scalars = Scalars(folder.path / "tensorboard", trainer.step)
             followers.append(stack.enter_context(scalars))

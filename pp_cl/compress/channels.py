@@ -28,7 +28,10 @@ def channel_weights(run: Run, cameras: Sequence[Camera]) -> Parameters:
     layers = run.model.net.layers
     if any(layer.kind == "gate" for layer in layers):
         return {}
-    net = _copied(run)
+    # a copy, which keeps what its layers put out
+    net = UNet.of_settings(run.dev, run.config.network, run.policy)
+    for name, parameter in net.parameters.items():
+        run.dev.copy(parameter, run.model.net.parameters[name])
     found = {x.name: np.zeros(x.channels) for x in convolutions(layers) if x.relu}
     some = list(cameras)[:: -(-len(cameras) // MEASURED_VIEWS)]
     for camera in some:
@@ -42,31 +45,20 @@ def channel_weights(run: Run, cameras: Sequence[Camera]) -> Parameters:
     return {name: np.sqrt(s / len(some)) * read[name] for name, s in found.items()}
 
 
-def _copied(run):
-    """A copy of the run's network, which keeps what its layers put out."""
-    net = UNet.of_settings(run.dev, run.config.network, run.policy)
-    for name, parameter in net.parameters.items():
-        run.dev.copy(parameter, run.model.net.parameters[name])
-    return net
-
-
 def _norms_of_readers(layers, parameters):
     """{layer: (C,)}: the norm of all weights that read a channel, through pooling too."""
     squares = {layer.name: np.zeros(layer.channels) for layer in layers}
     for layer in reversed(layers):
         if layer.kind == "conv":
             weight = unpack_weights(parameters[f"{layer.name}.weight"], layer.channels)
-            parts = np.split((weight.astype(np.float64) ** 2).sum((0, 2, 3)), _ends(layer))
+            read = (weight.astype(np.float64) ** 2).sum((0, 2, 3))
+            parts = np.split(read, np.cumsum(layer.sources)[:-1])
         else:
             parts = [squares[layer.name]]
         for name, part in zip(layer.inputs, parts, strict=True):
             if name != "x":
                 squares[name] += part
     return {name: np.sqrt(s) for name, s in squares.items()}
-
-
-def _ends(layer):
-    return np.cumsum(layer.sources)[:-1]
 
 
 def kept_channels(
@@ -106,8 +98,3 @@ def reduced_parameters(
         bias = parameters[f"{layer.name}.bias"][: layer.channels]
         reduced[f"{layer.name}.bias"] = pack_bias(bias[kept[layer.name]])
     return reduced
-
-
-def channels_text(layers: Sequence[Layer], kept: dict[str, np.ndarray]) -> str:
-    """network.channels of that network."""
-    return ",".join(str(len(kept[layer.name])) for layer in convolutions(list(layers))[:-1])

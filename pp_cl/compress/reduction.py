@@ -1,30 +1,34 @@
-"""What can be taken from a trained model, and what is left of it."""
+"""A trained model with fewer points, channels or harmonics, or coefficients of 16 bits: what can be
+taken from it, and the run that is left.
+"""
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 
-from pp_cl.compress.channels import (
-    channel_weights,
-    channels_text,
-    kept_channels,
-    reduced_parameters,
-)
-from pp_cl.config import Config, assign
+from pp_cl.compress.channels import channel_weights, kept_channels, reduced_parameters
+from pp_cl.config import Config
 from pp_cl.export.observe import observe
+from pp_cl.files.atomic import atomic_folder, write_json, write_text
+from pp_cl.files.run_folder import RunFolder
 from pp_cl.layers.choice import load_policy
 from pp_cl.metrics.psnr_ssim import Metrics
 from pp_cl.model import Model
+from pp_cl.network.layers import convolutions
 from pp_cl.network.unet import UNet
 from pp_cl.run import Run, render_views
 from pp_cl.scene.camera import Camera
 from pp_cl.scene.views import View
 
 LARGEST_HALF = 65504.0
+REPORT = "compress.json"
 
 
 @dataclass(frozen=True)
@@ -52,13 +56,6 @@ class Reduction:
             degree=run.config.points.sh_degree,
             early_stop=run.config.raster.early_stop,
         )
-
-    def settings(self) -> dict[str, object]:
-        """{key: value} of the settings that say how the reduced model is rendered."""
-        return {
-            "points.sh_degree": self.degree,
-            "raster.early_stop": self.early_stop,
-        }
 
 
 @dataclass(frozen=True)
@@ -90,7 +87,9 @@ class Original:
             if degree and int(degree) > reduction.degree:
                 continue
             array = array[kept] if name.startswith("points.") else array
-            arrays[name] = _half(array) if degree and reduction.half else array
+            if degree and reduction.half:  # what is beyond the largest number becomes that
+                array = np.clip(array, -LARGEST_HALF, LARGEST_HALF).astype(np.float16)
+            arrays[name] = array
         layers = self.run.model.net.layers
         parameters = {n.removeprefix("net."): a for n, a in arrays.items() if n.startswith("net.")}
         reduced = reduced_parameters(layers, parameters, self._kept(reduction))
@@ -105,30 +104,28 @@ class Original:
         run, config = self.run, self.config(reduction)
         policy = load_policy(run.dev, config.network.tolerance)
         net = UNet.of_settings(run.dev, config.network, policy)
-        model = Model.load(
-            run.dev,
-            run.header,
-            self.reduced_arrays(reduction),
-            net,
-            degree=reduction.degree,
-        )
+        arrays = self.reduced_arrays(reduction)
+        model = Model.load(run.dev, run.header, arrays, net, degree=reduction.degree)
         return replace(run, config=config, model=model, policy=policy)
 
     def config(self, reduction: Reduction) -> Config:
         """The settings of a reduced run."""
-        config = self.run.config
-        config = replace(
-            config,
-            points=replace(config.points),
-            raster=replace(config.raster),
-            network=replace(config.network),
-        )
-        for key, value in reduction.settings().items():
-            assign(config, key, value, "compress")
+        config = copy.deepcopy(self.run.config)
+        config.points.sh_degree = reduction.degree
+        config.raster.early_stop = reduction.early_stop
         if reduction.channels > 0 and self.channel_weights:
-            text = channels_text(self.run.model.net.layers, self._kept(reduction))
-            assign(config, "network.channels", text, "compress")
+            kept = self._kept(reduction)
+            layers = convolutions(self.run.model.net.layers)[:-1]
+            config.network.channels = ",".join(str(len(kept[layer.name])) for layer in layers)
         return config
+
+    def write(self, reduction: Reduction, out: Path, report: dict[str, Any]) -> None:
+        """Write a run folder that evaluates, renders and exports like any other, and the report."""
+        with atomic_folder(out) as unfinished:
+            folder = RunFolder(unfinished)
+            write_text(folder.config, self.config(reduction).to_json() + "\n")
+            folder.save(self.run.header, self.reduced_arrays(reduction))
+            write_json(unfinished / REPORT, report)
 
 
 def point_weights(run: Run, cameras: list[Camera]) -> np.ndarray:
@@ -159,8 +156,3 @@ def measured_psnr(run: Run, views: Sequence[View]) -> float:
     measure = Metrics(run.dev, ("psnr",))
     rows = [measure(seen.image, seen.truth)["psnr"] for seen in render_views(run, list(views))]
     return float(np.mean(rows))
-
-
-def _half(array):
-    """The nearest numbers of 16 bits; what is beyond the largest becomes that."""
-    return np.clip(array, -LARGEST_HALF, LARGEST_HALF).astype(np.float16)

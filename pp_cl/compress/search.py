@@ -10,6 +10,7 @@ import numpy as np
 from pp_cl.bench.timing import interleave
 from pp_cl.compress.reduction import Original, Reduction, measured_psnr, nbytes
 from pp_cl.run import Run
+from pp_cl.scene.load import scene_splits
 from pp_cl.scene.views import View
 
 # What is tried in turn: the share of the loss that all so far may take, and the field's values,
@@ -22,9 +23,10 @@ TRIALS = (
     (0.6, "degree", (1, 0)),
 )
 SMALLER = ("half", "degree")  # these take memory as well
-LEAST_KEPT, STEPS_OF_KEPT = 0.05, 0.01
+LEAST_KEPT = 5  # % of the points
 FASTER = 0.98  # of the time, at most, counts as faster
 TIMED_VIEWS, ROUNDS = 4, 9
+MOST_VIEWS, HELD_EVERY = 16, 8  # of validation
 
 
 @dataclass(frozen=True)
@@ -87,15 +89,31 @@ class Search:
 
     def _prune(self):
         """Halve the interval of the shares of points that may do."""
-        fails, fits = round(LEAST_KEPT / STEPS_OF_KEPT) - 1, round(1 / STEPS_OF_KEPT)
+        fails, fits = LEAST_KEPT - 1, 100
         while fits - fails > 1:
-            share = (fails + fits) // 2 * STEPS_OF_KEPT
-            trial = self._try(f"points {share:.0%}", {"keep": share})
+            middle = (fails + fits) // 2
+            trial = self._try(f"points {middle}%", {"keep": middle / 100})
             yield trial
             if trial.taken:
-                fits = (fails + fits) // 2
+                fits = middle
             else:
-                fails = (fails + fits) // 2
+                fails = middle
+
+
+def validation_views(run: Run) -> tuple[str, list[View]]:
+    """(which they are, views) to measure a loss on, at most MOST_VIEWS: those of the split val,
+    where the scene has none every eighth of the training views. Never those of a test. Raises
+    UserError where the scene is missing or broken.
+    """
+    run.check_scene()
+    present = scene_splits(run.config.scene.path)
+    split = "val" if "val" in present else "train"
+    views = run.scene(split).splits[split]
+    if split == "train":
+        views = views[::HELD_EVERY]
+    count = min(MOST_VIEWS, len(views))
+    views = [views[i * len(views) // count] for i in range(count)]
+    return f"{count} views of {split}", views
 
 
 def frame_ms(runs: list[Run], views: list[View]) -> list[float]:

@@ -1,14 +1,16 @@
-"""Frames of a run along a path of cameras, which a later call goes on with, and films of them."""
+"""Renders a run along a path of cameras: frames in a folder, which a later call goes on with, and
+films of them.
+"""
 
 import hashlib
 import json
+import shutil
 import time
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
-import numpy as np
 from filelock import FileLock, Timeout
 
 from pp_cl.errors import UserError
@@ -23,7 +25,7 @@ from pp_cl.scene.camera import Camera
 
 MOST_IDENTITY = 1000  # bytes of it
 IDENTITY = "frames.json"  # in the folder of the frames: what they show
-LOCK = ".lock"
+OnFrame = Callable[[float | None], None]
 
 
 @dataclass(frozen=True)
@@ -40,134 +42,105 @@ class Style:
     features: bool = False
 
 
-class Frames:
-    """The frames of a run along a path, in a folder of their own.
+def render_frames(
+    run: Run,
+    cameras: Sequence[Camera],
+    folder: Path,
+    style: Style,
+    on_frame: OnFrame,
+    *,
+    replace: bool = False,
+) -> list[Path]:
+    """Render the frames of the cameras that are not there yet into a folder; returns the files.
 
-    replace: frames that are there and show something else make room.
+    on_frame: called after each one with its seconds, None for one that was there. replace: frames
+    that are there and show something else make room. Raises UserError for a folder that cannot be
+    made, holds other files, or other frames that are not replaced, and where another process
+    renders into it.
     """
-
-    def __init__(
-        self,
-        run: Run,
-        cameras: Sequence[Camera],
-        folder: Path,
-        style: Style,
-        *,
-        replace: bool = False,
-    ):
-        self.run, self.cameras, self.folder, self.style = run, cameras, folder, style
-        self._replace = replace
-        self.paths = [folder / f"{i:05d}.{style.suffix}" for i in range(len(cameras))]
-        self._identity = {"frames": self._digest(), "count": len(cameras)}
-        # Python stands for bytes that are no UTF-8 by these
-        if style.suffix == "exr" and any("\udc80" <= c <= "\udcff" for c in str(folder)):
-            raise UserError(
-                f"{folder}: OpenEXR writes no file whose name is no UTF-8; choose another --out"
-            )
-
-    def _digest(self):
-        """Of everything that the frames depend on."""
-        checkpoint = self.run.folder.checkpoint.stat()
-        digest = hashlib.sha256(repr((self.style, self.run.header["step"])).encode())
-        digest.update(f"{checkpoint.st_size} {checkpoint.st_mtime_ns}".encode())
-        for camera in self.cameras:
-            digest.update(self.run.model.packed(camera).tobytes())
-        return digest.hexdigest()
-
-    def _check_folder(self):
-        if all(p.name.startswith(".") for p in self.folder.iterdir()):
-            return
-        file = self.folder / IDENTITY
-        try:
-            there = json.loads(read_regular(file, MOST_IDENTITY))
-        except (OSError, ValueError, RecursionError):
-            raise UserError(
-                f"{self.folder}: holds files that are no frames; choose another --out"
-            ) from None
-        if there != self._identity and not self._replace:
-            raise UserError(
-                f"{self.folder}: holds frames of another model or path; choose another --out, or"
-                " delete it"
-            )
-        if there != self._identity:
-            for frame in self.folder.glob(f"*.{self.style.suffix}"):
+    # Python stands for bytes that are no UTF-8 by these
+    if style.suffix == "exr" and any("\udc80" <= c <= "\udcff" for c in str(folder)):
+        raise UserError(
+            f"{folder}: OpenEXR writes no file whose name is no UTF-8; choose another --out"
+        )
+    identity = {"frames": _digest(run, cameras, style), "count": len(cameras)}
+    paths = [folder / f"{i:05d}.{style.suffix}" for i in range(len(cameras))]
+    with _owned(folder):
+        if _identity_of(folder) not in (None, identity):
+            if not replace:
+                raise UserError(
+                    f"{folder}: holds frames of another model or path; choose another --out, or"
+                    " delete it"
+                )
+            for frame in folder.glob(f"*.{style.suffix}"):
                 frame.unlink()
-
-    def render(self, on_frame: Callable[[float | None], None]) -> None:
-        """Render the frames that are not there yet into the folder, which this process owns;
-        on_frame is called after each one with its seconds, None for one that was there. Raises
-        UserError where it holds other files, or other frames and they are not replaced.
-        """
-        self._check_folder()
-        remove_leftovers(self.folder)
-        write_json(self.folder / IDENTITY, self._identity)
-        for camera, path in zip(self.cameras, self.paths, strict=True):
-            start = time.perf_counter()
-            there = path.exists()
+        remove_leftovers(folder)
+        write_json(folder / IDENTITY, identity)
+        for camera, path in zip(cameras, paths, strict=True):
+            start, there = time.perf_counter(), path.exists()
             if not there:
-                self._render(camera, path)
+                picture = run.render(camera, samples=style.samples, features=style.features)
+                if style.suffix == "exr":
+                    write_exr(path, picture.channels())
+                else:
+                    write_png(path, picture.image(style.background))
             on_frame(None if there else time.perf_counter() - start)
+    return paths
 
-    def _render(self, camera, path):
-        style = self.style
-        picture = self.run.render(camera, samples=style.samples, features=style.features)
-        if style.suffix == "exr":
-            write_exr(path, picture.channels())
-        else:
-            write_png(path, picture.image(style.background))
 
-    def _images(self) -> Iterator[np.ndarray]:
-        """uint8 images, (H, W, 3) or with straight alpha (H, W, 4), of PNG frames."""
-        for path in self.paths:
-            image = read_rgba(path)
-            yield image if self.style.background is None else image[..., :3]
+def render_film(
+    run: Run, cameras: Sequence[Camera], film: Path, fps: float, style: Style, on_frame: OnFrame
+) -> None:
+    """Render a film, whose frames are in a hidden folder beside it until it is written, for a later
+    call to go on with. Raises UserError as render_frames and write_video do.
+    """
+    check_file(film)
+    folder = film.with_name(f".{film.name}.frames")
+    paths = render_frames(run, cameras, folder, style, on_frame, replace=True)
+    images = (read_rgba(path) for path in paths)
+    if style.background is not None:
+        images = (image[..., :3] for image in images)
+    write_video(film, images, fps)
+    shutil.rmtree(folder)
 
-    def write_film(self, path: Path, fps: float) -> None:
-        """Write all frames as a film; raises UserError as write_video does."""
-        write_video(path, self._images(), fps)
+
+def _digest(run, cameras, style):
+    """Of everything that the frames depend on."""
+    checkpoint = run.folder.checkpoint.stat()
+    digest = hashlib.sha256(repr((style, run.header["step"])).encode())
+    digest.update(f"{checkpoint.st_size} {checkpoint.st_mtime_ns}".encode())
+    for camera in cameras:
+        digest.update(run.model.packed(camera).tobytes())
+    return digest.hexdigest()
+
+
+def _identity_of(folder):
+    """What the frames in a folder show, None where there are none. Raises UserError for a folder
+    that holds something else.
+    """
+    if all(path.name.startswith(".") for path in folder.iterdir()):
+        return None
+    try:
+        return json.loads(read_regular(folder / IDENTITY, MOST_IDENTITY))
+    except (OSError, ValueError, RecursionError):
+        raise UserError(f"{folder}: holds files that are no frames; choose another --out") from None
 
 
 @contextmanager
-def owned_folder(folder: Path, out: Path) -> Iterator[None]:
+def _owned(folder) -> Iterator[None]:
     """While the block runs, no other process renders into the folder, which is made where it is
-    missing, and removed where it is empty in the end. Raises UserError naming `out` where another
-    does, or where it cannot be made.
+    missing.
     """
     if folder.exists() and not folder.is_dir():
         raise UserError(f"{folder}: is not a folder; choose another --out")
-    check_target(folder / LOCK)
+    if folder.exists():
+        _identity_of(folder)  # no lock is made in a folder of others
+    check_target(folder / IDENTITY)
     folder.mkdir(parents=True, exist_ok=True)
-    lock = FileLock(folder / LOCK, timeout=0)
     try:
-        lock.acquire()
+        with FileLock(folder / ".lock", timeout=0):
+            yield
     except Timeout:
         raise UserError(
-            f"{out}: another process makes it; wait for its end, or choose another --out"
+            f"{folder}: another process renders there; wait for its end, or choose another --out"
         ) from None
-    try:
-        yield
-    finally:
-        # before the release: whoever comes next makes another
-        (folder / LOCK).unlink(missing_ok=True)
-        lock.release()
-        with suppress(OSError):
-            folder.rmdir()
-
-
-@contextmanager
-def film_folder(film: Path) -> Iterator[Path]:
-    """A hidden folder beside a film, for its frames: removed when the block ends well, else kept
-    for the next time. Raises UserError where the film cannot be written, or another process makes
-    it.
-    """
-    check_file(film)
-    folder, is_kept = film.with_name(f".{film.name}.frames"), True
-    with owned_folder(folder, film):
-        try:
-            yield folder
-            is_kept = False
-        finally:
-            if not (is_kept and any(folder.glob("*.png"))):
-                for file in set(folder.iterdir()) - {folder / LOCK}:
-                    with suppress(OSError):
-                        file.unlink()

@@ -8,13 +8,11 @@ squared differences from the run's own renderings of the training views, by conj
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
+from scipy.sparse.linalg import LinearOperator, cg
 
 from pp_cl.export.observe import directions, observe
 from pp_cl.run import Run
-from pp_cl.scene.camera import Camera
 
 COUNT = 9  # functions of basis()
 # Two steps more fit the training views better and the test views worse (docs/export.md).
@@ -37,66 +35,42 @@ def fit_harmonics(run: Run, steps: int = STEPS, count: int = COUNT) -> np.ndarra
     each of the run's points.
 
     Colours are blended as the features are, over white, and clamped at last: one point's may lie
-    outside [0, 1].
-    """
-    system = _System(run, run.cameras("train"), count)
-    residual, inverse = system.start()
-    solution = np.zeros_like(residual)
-    direction, last = np.zeros_like(residual), 1.0
-    for step in range(steps + 1):
-        scaled = inverse @ residual
-        product = float(np.vdot(residual, scaled))
-        if product == 0:
-            break
-        direction = scaled + (product / last if step else 0.0) * direction
-        last = product
-        image = system.apply(direction)
-        length = product / float(np.vdot(direction, image))
-        solution += np.float32(length) * direction
-        residual -= np.float32(length) * image
-    return solution
-
-
-@dataclass
-class _System:
-    """The normal equations of the fit: A c = b. Blend weights are computed anew in every pass,
+    outside [0, 1]. The normal equations A c = b are solved by `steps` + 1 steps of conjugate
+    gradients, preconditioned by A's blocks of a point. Blend weights are computed anew in each,
     since those of all views would fill the memory.
     """
+    cameras, n = run.cameras("train"), run.model.cloud.count
+    positions = run.model.grid.positions(run.model.cloud.ids.get())
 
-    run: Run
-    cameras: list[Camera]
-    count: int
+    def passes(text):
+        """(observation, blend matrix (HW, N), basis (N, count)) of each view."""
+        for seen in observe(run, cameras, text):
+            at = basis(directions(positions, seen.camera))[:, :count]
+            yield seen, seen.blend_matrix(), at
 
-    def start(self):
-        """(b (N, count, 3), the inverses of A's blocks (N, count, count)), float32."""
-        n, count = self.run.model.cloud.count, self.count
-        b, blocks = np.zeros((n, count, 3), np.float32), np.zeros((n, count, count), np.float32)
-        for seen, matrix, at in self._passes("colours"):
-            picture = seen.picture()
-            colour = (picture.colour - (1 - picture.alpha)[..., None]).reshape(-1, 3)
-            weight = matrix.sum(0)
-            b += at[:, :, None] * (matrix.T @ colour)[:, None]
-            blocks += (weight[:, None] * at)[:, :, None] * at[:, None]
-        self.ridge = RIDGE * blocks[:, :1, 0] * (np.arange(count) > 0) + LEAST
-        diagonal = np.arange(count)
-        blocks[:, diagonal, diagonal] += self.ridge
-        return b, np.linalg.inv(blocks)
+    b, blocks = np.zeros((n, count, 3), np.float32), np.zeros((n, count, count), np.float32)
+    for seen, matrix, at in passes("colours"):
+        picture = seen.picture()
+        colour = (picture.colour - (1 - picture.alpha)[..., None]).reshape(-1, 3)
+        weight = matrix.sum(0)
+        b += at[:, :, None] * (matrix.T @ colour)[:, None]
+        blocks += (weight[:, None] * at)[:, :, None] * at[:, None]
+    ridge = RIDGE * blocks[:, :1, 0] * (np.arange(count) > 0) + LEAST
+    diagonal = np.arange(count)
+    blocks[:, diagonal, diagonal] += ridge
+    inverse = np.linalg.inv(blocks)
 
-    def apply(self, coefficients):
-        """A times coefficients (N, count, 3)."""
-        result = self.ridge[..., None] * coefficients
-        for _, matrix, at in self._passes("harmonics"):
+    def product(flat):
+        coefficients = flat.reshape(b.shape)
+        result = ridge[..., None] * coefficients
+        for _, matrix, at in passes("harmonics"):
             colour = np.einsum("nk,nkc->nc", at, coefficients)
             result += at[:, :, None] * (matrix.T @ (matrix @ colour))[:, None]
-        return result
+        return result.ravel()
 
-    def _passes(self, text):
-        """(observation, blend matrix, basis (N, count)) of each view."""
-        grid, cloud = self.run.model.grid, self.run.model.cloud
-        positions = grid.positions(cloud.ids.get())
-        for seen in observe(self.run, self.cameras, text):
-            yield (
-                seen,
-                seen.blend_matrix(),
-                basis(directions(positions, seen.camera))[:, : self.count],
-            )
+    def operator(function):
+        return LinearOperator((b.size, b.size), matvec=function, dtype=np.float32)
+
+    preconditioner = operator(lambda flat: (inverse @ flat.reshape(b.shape)).ravel())
+    solution, _ = cg(operator(product), b.ravel(), maxiter=steps + 1, M=preconditioner)
+    return solution.reshape(b.shape).astype(np.float32)

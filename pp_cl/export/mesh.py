@@ -14,9 +14,15 @@ from tqdm import tqdm
 
 from pp_cl.errors import UserError
 from pp_cl.export.fusion import box_around, fuse
-from pp_cl.export.glb import glb_data, gltf_colours
-from pp_cl.export.ply import CHANNELS, COORDINATES
-from pp_cl.export.points import ColouredPoints, coloured_points, in_world
+from pp_cl.export.points import (
+    ColouredPoints,
+    coloured_points,
+    glb_data,
+    gltf_colours,
+    in_world,
+    place_and_colour,
+    table_of,
+)
 from pp_cl.files.atomic import atomic_file
 from pp_cl.run import Run
 
@@ -68,32 +74,18 @@ def _colours(vertices, points: ColouredPoints, edge):
 
 def write_mesh(path: Path | str, mesh: Mesh) -> None:
     """Write a PLY or GLB file, by the suffix. Raises UserError as atomic_file does."""
-    is_glb = Path(path).suffix.lower() == ".glb"
-    colours = gltf_colours(mesh.colours) if is_glb else mesh.colours
+    if Path(path).suffix.lower() == ".glb":
+        colours = gltf_colours(mesh.colours)
 
-    def make(vertices):
-        return trimesh.Trimesh(vertices, mesh.faces, vertex_colors=colours, process=False)
+        def make(vertices):
+            return trimesh.Trimesh(vertices, mesh.faces, vertex_colors=colours, process=False)
 
-    with atomic_file(path) as file:
-        if is_glb:
+        with atomic_file(path) as file:
             file.write(glb_data(mesh.vertices, make))
-        elif mesh.vertices.dtype == np.float32:
-            file.write(make(mesh.vertices).export(file_type="ply"))
-        else:
-            _ply_of_doubles(mesh).write(file)
-
-
-def _ply_of_doubles(mesh):
-    """The same as trimesh writes, with coordinates of float64."""
-    table = np.empty(
-        len(mesh.vertices),
-        [*((name, "<f8") for name in COORDINATES), *((name, "u1") for name in CHANNELS)],
-    )
-    columns = [*mesh.vertices.T, *mesh.colours.T]
-    for name, column in zip((*COORDINATES, *CHANNELS), columns, strict=True):
-        table[name] = column
+        return
     faces = np.empty(len(mesh.faces), [("vertex_indices", "<i4", (3,))])
     faces["vertex_indices"] = mesh.faces
-    parts = {"vertex": table, "face": faces}
+    parts = {"vertex": table_of(place_and_colour(mesh.vertices, mesh.colours)), "face": faces}
     elements = [plyfile.PlyElement.describe(part, name) for name, part in parts.items()]
-    return plyfile.PlyData(elements, byte_order="<")
+    with atomic_file(path) as file:
+        plyfile.PlyData(elements, byte_order="<").write(file)

@@ -6,7 +6,6 @@ import base64
 import html
 import json
 import os
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -21,19 +20,11 @@ OUTLIERS = 1e-3  # share of the coefficients at either end that is clipped: they
 FIELD_OF_VIEW = 40.0  # degrees from the top of the page to its bottom
 
 
-@dataclass(frozen=True)
-class PackedPoints:
-    """Points as the page keeps them. rows: (N,) of POINT. low, span: (9,) float32; byte v of
-    coefficient k stands for low[k] + span[k] v / 255.
+def pack(run: Run, coefficients: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """The run's points with coefficients (N, 9, 3) of their colours, as the page keeps them: (N,)
+    rows of POINT; low and span, (9,) float32: byte v of coefficient k stands for low[k] + span[k] v
+    / 255.
     """
-
-    rows: np.ndarray
-    low: np.ndarray
-    span: np.ndarray
-
-
-def pack(run: Run, coefficients: np.ndarray) -> PackedPoints:
-    """The run's points with coefficients (N, 9, 3) of their colours."""
     nx, ny, _ = run.model.grid.dims
     ids = run.model.cloud.ids.get().astype(np.int64)
     rows = np.zeros(len(ids), POINT)
@@ -44,29 +35,25 @@ def pack(run: Run, coefficients: np.ndarray) -> PackedPoints:
     span = np.maximum(high - low, np.float32(1e-6))
     scaled = (coefficients - low[:, None]) / span[:, None] * 255
     rows["colour"][:, : 3 * COUNT] = np.rint(scaled.clip(0, 255)).reshape(len(ids), -1)
-    return PackedPoints(rows, low, span)
+    return rows, low, span
 
 
 def page_text(run: Run) -> str:
     """The page. Raises UserError as check_drawable does."""
     check_drawable(run)
-    points = pack(run, fit_harmonics(run))
+    rows, low, span = pack(run, fit_harmonics(run))
     folder = Path(__file__).parent
     page = (folder / "page.html").read_text("utf-8")
+    name = run.folder.path.resolve().name  # which may be no UTF-8
     parts = {
-        "title": html.escape(_shown_name(run.folder.path)),
-        "header": json.dumps(_header(run, points)).replace("<", "\\u003c"),
-        "points": base64.b64encode(points.rows.tobytes()).decode(),
+        "title": html.escape(os.fsencode(name).decode(errors="replace")),
+        "header": json.dumps(_header(run, low, span)).replace("<", "\\u003c"),
+        "points": base64.b64encode(rows.tobytes()).decode(),
         "script": (folder / "page.js").read_text("utf-8"),
     }
     for name, text in parts.items():
         page = page.replace(f"<!-- {name} -->", text)
     return page
-
-
-def _shown_name(folder):
-    """A folder's name as UTF-8 can hold it, which not all names of a file system are."""
-    return os.fsencode(folder.resolve().name).decode(errors="replace")
 
 
 def check_drawable(run: Run) -> None:
@@ -82,7 +69,7 @@ def check_drawable(run: Run) -> None:
         )
 
 
-def _header(run, points):
+def _header(run, low, span):
     """What the page must know beside the points."""
     grid = run.model.grid
     centre, radius = run.ball
@@ -92,7 +79,7 @@ def _header(run, points):
     up = up / np.linalg.norm(up) if np.linalg.norm(up) > 1e-3 else np.array([0.0, 0.0, 1.0])
     eye = centre + _first_offset(poses[0, :, 3] - centre, up) * radius
     return {
-        "count": len(points.rows),
+        "count": run.model.cloud.count,
         "stride": POINT.itemsize,
         "origin": [float(x) for x in grid.origin],
         "edge": float(grid.edge),
@@ -100,8 +87,8 @@ def _header(run, points):
         "nearest": float(NEAREST * radius),
         "centre": centre.tolist(),
         "pixel": min(_pixel_width(camera, centre) for camera in cameras),
-        "low": points.low.tolist(),
-        "span": points.span.tolist(),
+        "low": low.tolist(),
+        "span": span.tolist(),
         "eye": eye.tolist(),
         "up": up.tolist(),
         "fov": FIELD_OF_VIEW,

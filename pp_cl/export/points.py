@@ -1,18 +1,34 @@
-"""The points of a run with the colours that its network gives them."""
+"""The points of a run with the colours that its network gives them, as PLY and GLB files."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
+import plyfile
+import trimesh
 
 from pp_cl.errors import UserError
 from pp_cl.export.observe import observe
+from pp_cl.files.atomic import atomic_file
+from pp_cl.files.exr import srgb_to_linear
 from pp_cl.files.image import to_8bit
 from pp_cl.files.picture import Picture
+from pp_cl.raster.points import PointCloud
 from pp_cl.run import Run
 from pp_cl.scene.camera import Camera
 
+COMMENTS = (
+    "pp-cl: points of a run, world axes and units of its scene",
+    "red, green, blue: sRGB, as the run shows the point in the training view where it weighs most",
+    "weight: blend weights of the point in that view, summed over its pixels",
+    "opacity: of the point's centre, 0 to 1",
+    "feature_C_D_K: coefficient K of degree D of the spherical harmonics of feature C, C from 0 to",
+    "15; basis and signs of PlenOctrees; features are the input of the run's network, no colours",
+)
+COORDINATES, CHANNELS = ("x", "y", "z"), ("red", "green", "blue")
 FINEST = 1e-3  # of the grid's edge: how far rounding to float32 may move a point in a file
 
 
@@ -77,3 +93,65 @@ def _colours(picture: Picture, camera: Camera, positions):
     column = column.clip(0, camera.width - 1).astype(np.int64)  # a seen point has z > 0
     row = row.clip(0, camera.height - 1).astype(np.int64)
     return to_8bit(picture.rgba()[row, column, :3])
+
+
+def write_ply(path: Path | str, points: ColouredPoints, cloud: PointCloud) -> None:
+    """Write a binary little-endian PLY file of points and of what `cloud` learned of them. Raises
+    UserError as atomic_file does.
+    """
+    columns = place_and_colour(points.positions, points.colours)
+    columns |= {"opacity": points.opacity, "weight": points.weight}
+    for block, array in zip(cloud.blocks, cloud.sh, strict=True):
+        values = np.float32(array.get()[points.rows])
+        for k in range(block.count):
+            order = block.first + k - block.degree**2  # within its degree
+            named = {f"feature_{c}_{block.degree}_{order}": values[:, k, c] for c in range(16)}
+            columns |= named
+    element = plyfile.PlyElement.describe(table_of(columns), "vertex")
+    data = plyfile.PlyData([element], byte_order="<", comments=list(COMMENTS))
+    with atomic_file(path) as file:
+        data.write(file)
+
+
+def place_and_colour(positions: np.ndarray, colours: np.ndarray) -> dict[str, np.ndarray]:
+    """{property of a PLY vertex: (M,) array} of positions and colours, both (M, 3)."""
+    columns = dict(zip(COORDINATES, positions.T, strict=True))
+    return columns | dict(zip(CHANNELS, colours.T, strict=True))
+
+
+def table_of(columns: dict[str, np.ndarray]) -> np.ndarray:
+    """(M,) records, little-endian, of named columns (M,)."""
+    names = list(columns)
+    formats = [column.dtype.newbyteorder("<") for column in columns.values()]
+    return np.rec.fromarrays(list(columns.values()), dtype=list(zip(names, formats, strict=True)))
+
+
+def write_glb(path: Path | str, points: ColouredPoints) -> None:
+    """Write a GLB file of coloured points. Raises UserError as atomic_file does."""
+    colours = gltf_colours(points.colours)
+    data = glb_data(points.positions, lambda positions: trimesh.PointCloud(positions, colours))
+    with atomic_file(path) as file:
+        file.write(data)
+
+
+def glb_data(
+    positions: np.ndarray, make: Callable[[np.ndarray], trimesh.parent.Geometry3D]
+) -> bytes:
+    """The GLB file of what make() makes of (M, 3) positions. glTF 2.0 keeps these in float32, so
+    those of float64 are moved to the origin, and the file's node moves them back.
+    """
+    if positions.dtype == np.float32:
+        return make(positions).export(file_type="glb")
+    centre = np.rint(positions.mean(0))
+    scene, place = trimesh.Scene(), np.eye(4)
+    place[:3, 3] = centre
+    scene.add_geometry(make(positions - centre), transform=place)
+    return scene.export(file_type="glb")
+
+
+def gltf_colours(colours: np.ndarray) -> np.ndarray:
+    """(M, 4) uint8 linear RGBA of (M, 3) uint8 sRGB: glTF 2.0 keeps vertex colours in linear
+    light.
+    """
+    linear = to_8bit(srgb_to_linear(colours / np.float32(255)))
+    return np.column_stack([linear, np.full(len(colours), 255, np.uint8)])

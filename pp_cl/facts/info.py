@@ -1,14 +1,14 @@
-"""What a run or a scene is, in numbers that JSON can hold."""
+"""Facts about a run or a scene for `pp-cl info`, in numbers that JSON can hold."""
 
 import json
 import math
 from collections import Counter
-from collections.abc import Iterable, Sequence
-from typing import Any, NamedTuple
+from collections.abc import Iterable
+from typing import Any
 
 import numpy as np
 
-from pp_cl.config import Config, assign, configure, load_config, preset
+from pp_cl.config import assign, configure, load_config, preset
 from pp_cl.device.device import Device
 from pp_cl.errors import UserError
 from pp_cl.files.run_folder import MOST_METRICS, RunFolder
@@ -26,7 +26,7 @@ from pp_cl.scene.load import (
     scene_splits,
 )
 from pp_cl.scene.outline import SHOWN_VIEWS, picture
-from pp_cl.scene.views import MASK_THRESHOLD, Photograph, View
+from pp_cl.scene.views import MASK_THRESHOLD, View
 from pp_cl.training.checkpoint import opened_run
 
 Facts = dict[str, Any]
@@ -42,7 +42,8 @@ def run_facts(folder: RunFolder, scene: str | None = None) -> Facts:
     scene: where its scene is now, if it has moved. Raises UserError naming the file that is missing
     or broken.
     """
-    config = _config(folder, scene)
+    config, rows, measured = _config(folder, scene), folder.rows(), read_metrics(folder)
+    last = rows[-1] if rows else {}
     facts = {
         "run": str(folder),
         "preset": config.preset,
@@ -59,8 +60,11 @@ def run_facts(folder: RunFolder, scene: str | None = None) -> Facts:
         "points": None,
         "grid": None,
         "checkpoint_bytes": None,
-        **_logged(folder),
-        **_metrics(folder),
+        "device": last.get("device"),
+        "seconds": last.get("seconds"),
+        "psnr": next((row["psnr"] for row in reversed(rows) if "psnr" in row), None),
+        "metrics": measured and measured["mean"],
+        "metrics_step": measured and measured["step"],
     }
     if folder.checkpoint.exists():
         with opened_run(folder, config) as stored:
@@ -101,25 +105,13 @@ def _edge_pixels(config, grid):
     return spacing_pixels(grid, cameras)
 
 
-def _logged(folder):
-    """{"device", "seconds"} of the last row of the log, and the last "psnr"."""
-    rows = folder.rows()
-    last = rows[-1] if rows else {}
-    values = [row["psnr"] for row in rows if "psnr" in row]
-    return {
-        "device": last.get("device"),
-        "seconds": last.get("seconds"),
-        "psnr": values[-1] if values else None,
-    }
-
-
-def _metrics(folder):
-    """{"metrics": means of the evaluation of the test split, "metrics_step": the step it was made
-    at}, None where there is none, or it does not tell.
+def read_metrics(folder: RunFolder) -> Facts | None:
+    """{"mean": {metric: value}, "step", "finished", "points" that were left, "device"} of the
+    evaluation of the test split, None where there is none. Raises UserError for a broken one.
     """
     file = folder.metrics("test")
     if not file.exists():
-        return {"metrics": None, "metrics_step": None}
+        return None
     again = f"run `pp-cl eval {folder}` again"
     try:
         text = read_json_text(file, MOST_METRICS)
@@ -127,33 +119,37 @@ def _metrics(folder):
         raise refusal(file, error, "metrics", again) from None
     try:
         result = json.loads(text)
-        values = {name: float(value) for name, value in result["mean"].items()}
-        step = result.get("step")
-        if not all(map(math.isfinite, values.values())) or type(step) not in (int, type(None)):
+        found = {
+            "mean": {name: float(value) for name, value in result["mean"].items()},
+            "step": result["step"],
+            "finished": result["finished"],
+            "points": result["points"]["final"],
+            "device": result["device"],
+        }
+        kinds = {"step": int, "finished": bool, "points": int, "device": str}
+        is_right = all(type(found[key]) is kind for key, kind in kinds.items())
+        if not (is_right and all(map(math.isfinite, found["mean"].values()))):
             raise ValueError
-        return {"metrics": values, "metrics_step": step}
-    except (ValueError, KeyError, TypeError, AttributeError, OverflowError, RecursionError):
+    except (
+        ValueError,
+        LookupError,
+        TypeError,
+        AttributeError,
+        ArithmeticError,
+        RecursionError,
+    ):
         raise UserError(f"{file}: holds no metrics; {again}") from None
+    return found
 
 
 # --------------------------------------------------------------------------------------------------
 
 
-class Described(NamedTuple):
-    """A scene. hull: None where the masks give none. disagreeing: masks that the others
-    contradict.
-    """
-
-    facts: Facts
-    views: list[View]
-    hull: Hull | None
-    disagreeing: list[Disagreement]
-
-
 def describe_scene(
     dev: Device, scene: str, preset_name: str, given: Iterable[Given] = ()
-) -> Described:
-    """What a scene is, from its training views and the cameras of the others.
+) -> tuple[Facts, list[View], Hull | None, list[Disagreement]]:
+    """(what a scene is, from its training views and the cameras of the others; those views; their
+    hull, None where the masks give none; the masks that the others contradict).
 
     preset_name: whose number of points the hull gets, and whose size the images. given: settings,
     as configure takes them. Raises UserError for a scene that is missing or broken; what prevents a
@@ -167,54 +163,61 @@ def describe_scene(
     names = sorted(scene_splits(path), key=lambda split: (split == "test", split))
     frames = {split: scene_frames(path, split) for split in names}
     views = open_scene(dev, config, ("train",)).splits["train"]
-    hull, problem = _hull(dev, views, config)
+    hull, problem = None, None
+    try:
+        hull = build_grid(dev, views, config.points.count, scene_box(config))
+    except UserError as error:
+        problem = str(error)
     found = disagreements(views, hull.grid.box) if hull else []
+    sizes = Counter(f"{f.camera.width}x{f.camera.height}" for fs in frames.values() for f in fs)
+    ranges = np.array([view.depth_range for view in views if view.depth_range])
+    cameras, stored = ([getattr(v, name) for v in views] for name in ("camera", "stored_camera"))
+    centre = looked_at(stored)
     facts = {
         "scene": path,
         "format": scene_format(path),
         "splits": {split: len(listed) for split, listed in frames.items()},
-        "images": _sizes([frame for listed in frames.values() for frame in listed]),
-        **_lenses(views),
-        "masks": _masks(views) | {"disagreeing": _disagreeing(found)},
-        "depth_range": _stated_range(views),
-        **_rig(views),
+        "images": dict(sizes),
+        **_lenses([view.file_camera for view in views]),
+        "masks": _masks(views)
+        | {"disagreeing": [{"view": one.view.name, "share": one.share} for one in found]},
+        "depth_range": [float(ranges.min()), float(ranges.max())] if len(ranges) else None,
+        "looked_at": centre.tolist(),
+        "distances": _range([np.linalg.norm(camera.eye - centre) for camera in stored]),
+        "up": up_of(stored).tolist(),
         "preset": preset_name,
         "downscale": config.scene.downscale,
-        "hull": _hull_facts(hull, [view.camera for view in views]),
+        "hull": None,
         "problem": problem,
     }
-    return Described(facts, views, hull, found)
-
-
-def _hull(dev, views, config: Config):
-    """(Hull, None), or (None, why there is none)."""
-    try:
-        return build_grid(dev, views, config.points.count, scene_box(config)), None
-    except UserError as error:
-        return None, str(error)
-
-
-def _sizes(frames: Sequence[Photograph]):
-    return dict(Counter(f"{frame.camera.width}x{frame.camera.height}" for frame in frames))
+    if hull:
+        facts["hull"] = {
+            "points": len(hull.ids),
+            "capped": hull.capped,
+            "dims": list(hull.grid.dims),
+            "edge": hull.grid.edge,
+            "edge_pixels": spacing_pixels(hull.grid, cameras),
+            "box": hull.grid.box.tolist(),
+        }
+    return facts, views, hull, found
 
 
 def _range(values):
     return [float(min(values)), float(max(values))]
 
 
-def _lenses(views):
-    """Least and most of the training views: focal length, angles of view."""
-    cameras = [view.file_camera for view in views]
-    angles = [
-        [math.degrees(2 * math.atan(size / (2 * focal))) for size, focal in pairs]
-        for pairs in (
-            [(c.width, c.fx) for c in cameras],
-            [(c.height, c.fy) for c in cameras],
-        )
-    ]
+def _lenses(cameras):
+    """Least and most of the cameras: focal length in pixels, angles of view in degrees."""
+
+    def angles(pairs):
+        return _range([math.degrees(2 * math.atan(size / (2 * focal))) for size, focal in pairs])
+
     return {
         "focal_pixels": _range([focal for c in cameras for focal in (c.fx, c.fy)]),
-        "field_of_view": {"x": _range(angles[0]), "y": _range(angles[1])},
+        "field_of_view": {
+            "x": angles((c.width, c.fx) for c in cameras),
+            "y": angles((c.height, c.fy) for c in cameras),
+        },
     }
 
 
@@ -227,40 +230,4 @@ def _masks(views):
     return {
         "with_alpha": len(masks) / len(views),
         "object": float(np.mean(shares)) if shares else None,
-    }
-
-
-def _disagreeing(found):
-    return [{"view": one.view.name, "share": one.share} for one in found]
-
-
-def _stated_range(views):
-    ranges = [view.depth_range for view in views if view.depth_range]
-    if not ranges:
-        return None
-    return [min(near for near, _ in ranges), max(far for _, far in ranges)]
-
-
-def _rig(views):
-    """What the cameras look at, their distances from it, and the direction up."""
-    cameras = [view.stored_camera for view in views]
-    centre = looked_at(cameras)
-    return {
-        "looked_at": centre.tolist(),
-        "distances": _range([np.linalg.norm(camera.eye - centre) for camera in cameras]),
-        "up": up_of(cameras).tolist(),
-    }
-
-
-def _hull_facts(hull, cameras):
-    if hull is None:
-        return None
-    grid = hull.grid
-    return {
-        "points": len(hull.ids),
-        "capped": hull.capped,
-        "dims": list(grid.dims),
-        "edge": grid.edge,
-        "edge_pixels": spacing_pixels(grid, cameras),
-        "box": grid.box.tolist(),
     }

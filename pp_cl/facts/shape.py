@@ -2,8 +2,6 @@
 of the PlenopticPoints supplemental.
 """
 
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from dataclasses import asdict
 from typing import Any
 
@@ -30,9 +28,19 @@ def mesh_shape(dev: Device, mesh: Mesh, edge: float | None, samples: int) -> dic
     """
     box = np.stack([mesh.vertices.min(0), mesh.vertices.max(0)])
     chosen = edge or smallest_edge(box, CELL_CAP)
-    with _progress(samples) as advance:
-        surface = sample_surface(dev, mesh, Grid.centred_in(box, chosen), samples, advance=advance)
-    return {"grid": _grid_facts(surface.grid), "samples": samples, "surface": surface.count}
+    surface = _sampled(dev, mesh, Grid.centred_in(box, chosen), samples)
+    return _facts(surface.grid, surface, samples)
+
+
+def _sampled(dev, mesh, grid, samples):
+    """sample_surface() under a progress bar, which shows on a terminal."""
+    with tqdm(total=samples, desc="sampling", unit_scale=True, leave=False, disable=None) as bar:
+        return sample_surface(dev, mesh, grid, samples, advance=bar.update)
+
+
+def _facts(grid, surface, samples):
+    facts = {"grid": {"dims": list(grid.dims), "edge": grid.edge}}
+    return facts | {"samples": samples, "surface": surface.count}
 
 
 def run_shape(
@@ -53,12 +61,8 @@ def run_shape(
     with opened_run(folder, config) as stored:
         grid, after = Grid.of_header(stored.header["grid"]), stored.array("points.ids")
     before = _points_before(dev, config, grid)
-    with _progress(samples) as advance:
-        surface = sample_surface(dev, mesh, grid, samples, advance=advance)
-    return {
-        "grid": _grid_facts(grid),
-        "samples": samples,
-        "surface": surface.count,
+    surface = _sampled(dev, mesh, grid, samples)
+    return _facts(grid, surface, samples) | {
         "before": asdict(overlap(surface, grid, before)),
         "after": asdict(overlap(surface, grid, after)),
     }
@@ -81,14 +85,3 @@ def _points_before(dev, config: Config, grid):
             " scene is with --scene"
         )
     return ids
-
-
-def _grid_facts(grid):
-    return {"dims": list(grid.dims), "edge": grid.edge}
-
-
-@contextmanager
-def _progress(samples: int) -> Iterator[Callable[[int], object]]:
-    """What advances a progress bar, which shows on a terminal."""
-    with tqdm(total=samples, desc="sampling", unit_scale=True, leave=False, disable=None) as bar:
-        yield bar.update

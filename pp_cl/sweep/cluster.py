@@ -2,24 +2,34 @@
 
 import asyncio
 import logging
+import os
 import signal
+import threading
 import time
+import traceback
 import uuid
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
+from datetime import datetime
 from typing import Any
 
+from tqdm import tqdm
+
+from pp_cl.device.discover import open_device
 from pp_cl.errors import UserError, one_line
+from pp_cl.files.run_folder import RunFolder
+from pp_cl.run import evaluate, load_run
+from pp_cl.scene.load import scene_splits
+from pp_cl.session import is_finished, open_training, run_config, stored_state
 from pp_cl.sweep.plan import Job
-from pp_cl.sweep.result import failed_row
-from pp_cl.sweep.task import run_task
+from pp_cl.sweep.result import failed_row, finished_row
 
 try:
     import dask
     from cryptography import x509  # noqa: F401 what Dask makes certificates with
     from distributed import Client, Nanny, Scheduler, Security, SpecCluster, WorkerPlugin
+    from distributed import get_worker as dask_worker
     from distributed.scheduler import KilledWorker
-    from filelock import FileLock, Timeout
 except ImportError as error:
     raise UserError(
         f"pp-cl sweep needs Dask ({error.name} is missing); install it with"
@@ -28,7 +38,93 @@ except ImportError as error:
 
 LOOPBACK = "127.0.0.1"
 ANSWER = 20  # seconds that a scheduler, and its first worker, have to answer
-TICK = 0.2  # seconds between two looks at the runs
+TICK = 0.5  # seconds between two looks at the runs
+PATIENCE = 600  # seconds that trainings have to write their checkpoints when the sweep is stopped
+
+# ---- on a worker
+
+
+def run_task(job: Job) -> dict[str, Any]:
+    """The row of a job, trained and evaluated by the Dask worker that calls this."""
+    # its own is shared between processes, and a worker that is killed would leak it with a warning
+    tqdm.set_lock(threading.RLock())
+    worker = dask_worker()
+    key = worker.get_current_task()
+
+    def is_cancelled():
+        """Dask ends no thread, but notes in the worker that nobody waits for its task."""
+        task = worker.state.tasks.get(key)
+        return task is None or task.state in ("cancelled", "released", "forgotten")
+
+    return run_job(job, is_cancelled, str(worker.name))
+
+
+def run_job(job: Job, is_stopped: Callable[[], bool], worker: str) -> dict[str, Any]:
+    """The row of a job, trained and evaluated as far as it is not; a failed one says why.
+
+    is_stopped: asked after each step; where it is true, the training ends with a checkpoint.
+    worker: its name, for the job's log, which gets what is printed meanwhile.
+    """
+    if not job.log.parent.is_dir():
+        return failed_row(
+            job, f"{job.log.parent}: not there for worker {worker}; all must see the same files"
+        )
+    try:
+        with _printing_to(job.log) as log:
+            now = f"{datetime.now():%Y-%m-%d %H:%M:%S}"
+            print(f"{now} on worker {worker}, process {os.getpid()}", file=log)
+            try:
+                return _trained_and_evaluated(job, is_stopped)
+            except Exception:
+                traceback.print_exc(file=log)
+                raise
+    except UserError as error:
+        return failed_row(job, str(error))
+    except OSError as error:
+        what = f"{error.filename or job.log}: {error.strerror or error}"
+        return failed_row(job, f"{what}; check the disk")
+    except MemoryError:
+        return failed_row(
+            job, "the host has no memory left; lower points.count or raise scene.downscale"
+        )
+
+
+@contextmanager
+def _printing_to(log):
+    """While the block runs, standard output and error of this process are appended to a file, which
+    it is given.
+    """
+    with open(log, "a", buffering=1, encoding="utf-8") as file:
+        kept = [os.dup(number) for number in (1, 2)]
+        try:
+            for number in (1, 2):
+                os.dup2(file.fileno(), number)
+            yield file
+        finally:
+            for number, before in zip((1, 2), kept, strict=True):
+                os.dup2(before, number)
+                os.close(before)
+
+
+def _trained_and_evaluated(job, is_stopped):
+    """The row of the job. Raises UserError as training and evaluation do."""
+    if row := finished_row(job):
+        return row
+    if "test" not in scene_splits(job.scene):
+        raise UserError(f"{job.scene}: has no split test, which a sweep measures; add one")
+    folder, dev = RunFolder(job.folder), open_device()
+    config = run_config(folder, job.scene, job.preset, job.given)
+    stored = stored_state(folder, config)
+    if not is_finished(stored, config):
+        training = open_training(dev, folder, config, stored)
+        training.run(is_stopped=is_stopped)
+        if training.trainer.step < config.train.iterations:
+            return failed_row(job, "stopped")
+    evaluate(load_run(dev, job.folder), "test", job.metrics)
+    return finished_row(job)
+
+
+# ---- the cluster
 
 
 class _Deaf(WorkerPlugin):
@@ -67,9 +163,10 @@ def local_client(devices: Sequence[str], workers: int) -> Iterator[Client]:
     with ExitStack() as stack:
         stack.enter_context(dask.config.set(settings))
         scheduler = {"cls": Scheduler, "options": place | {"port": 0}}
-        silent = {"silence_logs": logging.CRITICAL}
         try:
-            cluster = SpecCluster(specs, scheduler, security=security, **silent)
+            cluster = SpecCluster(
+                specs, scheduler, security=security, silence_logs=logging.CRITICAL
+            )
             client = Client(stack.enter_context(cluster))
         except (OSError, RuntimeError) as error:
             raise UserError(
@@ -121,12 +218,14 @@ def run_jobs(
     jobs: Sequence[Job],
     *,
     on_row: Callable[[Job, dict[str, Any]], None],
-    on_tick: Callable[[], None],
+    on_tick: Callable[[list[Job]], None],
     is_stopped: Callable[[], bool],
 ) -> None:
-    """Run the jobs, their folders' parents being there; on_row(job, row) is called for each that
-    ends, on_tick() now and then. Where is_stopped() is true, the trainings are told to end.
+    """Run the jobs. on_row(job, row) is called for each that ends, on_tick(jobs at work) now and
+    then. Where is_stopped() is true, trainings write their checkpoints and end.
     """
+    for job in jobs:
+        job.log.parent.mkdir(parents=True, exist_ok=True)
     sweep = uuid.uuid4().hex  # keys of their own: a scheduler may have those of another sweep
     pending = {
         client.submit(run_task, job, key=f"pp-cl-{sweep}-{i}", pure=False): job
@@ -136,10 +235,21 @@ def run_jobs(
         for future in [future for future in pending if future.done()]:
             job = pending.pop(future)
             on_row(job, _row(future, job))
-            future.release()
-        on_tick()
+        running = _running(client)
+        on_tick([job for future, job in pending.items() if future.key in running])
         time.sleep(TICK)
+    running = _running(client)
+    stopped = [job for future, job in pending.items() if future.key in running]
     client.cancel(list(pending))
+    _await_ends(stopped)
+
+
+def _running(client):
+    """The keys of the tasks that workers have; none where the scheduler does not answer."""
+    try:
+        return {key for keys in client.processing().values() for key in keys}
+    except (OSError, asyncio.TimeoutError):
+        return set()
 
 
 def _row(future, job):
@@ -151,19 +261,16 @@ def _row(future, job):
     error = future.exception()
     if isinstance(error, KilledWorker):
         return failed_row(job, f"several workers ended while they had this run; see {job.log}")
-    return failed_row(job, f"{type(error).__name__}: {(str(error).splitlines() or [''])[0]}")
+    return failed_row(job, f"{type(error).__name__}: {one_line(error, 200)}; see {job.log}")
 
 
-def await_ends(jobs: Sequence[Job], seconds: float) -> list[Job]:
-    """Wait until no process works in the folders of the jobs; returns those where one still does
-    after so many seconds.
-    """
-    last, left = time.monotonic() + seconds, []
+def _await_ends(jobs):
+    """Wait, at most PATIENCE seconds, until nobody trains into the folders of the jobs."""
+    last = time.monotonic() + PATIENCE
     for job in jobs:
-        if job.lock.exists():
+        while time.monotonic() < last:
             try:
-                with FileLock(job.lock, timeout=max(last - time.monotonic(), 0)):
-                    pass
-            except Timeout:
-                left.append(job)
-    return left
+                with RunFolder(job.folder).owned():
+                    break
+            except UserError:
+                time.sleep(TICK)

@@ -1,12 +1,10 @@
 """The runs of a sweep: scenes x settings x seeds, and the folder of each."""
 
-import dataclasses
 import itertools
-import json
-import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from urllib.parse import quote
 
 from pp_cl.config import Config, assign, configure, preset, sections, text_of
 from pp_cl.errors import UserError
@@ -36,34 +34,13 @@ class Job:
     iterations: int
 
     def __str__(self) -> str:
-        return " ".join(filter(None, [self.name, self.setting, f"seed {self.seed}"]))
-
-    @property
-    def setting(self) -> str:
-        """What is varied, as the table shows it; empty where nothing is."""
-        return " ".join(f"{key}={text}" for key, text in self.varied)
+        setting = (f"{key}={text}" for key, text in self.varied)
+        return " ".join([self.name, *setting, f"seed {self.seed}"])
 
     @property
     def log(self) -> Path:
-        """What the run's processes say, beside its folder."""
+        """What is printed while the job runs, beside its folder."""
         return Path(f"{self.folder}.log")
-
-    @property
-    def lock(self) -> Path:
-        """File that the process which works in the folder holds locked."""
-        return Path(self.folder) / ".sweep.lock"
-
-    def to_json(self) -> str:
-        """One line that from_json() reads."""
-        return json.dumps(dataclasses.asdict(self))
-
-    @classmethod
-    def from_json(cls, text: str) -> "Job":
-        """The job of a line of to_json()."""
-        values = json.loads(text)
-        for name in ("varied", "given"):
-            values[name] = tuple(map(tuple, values[name]))
-        return cls(**values | {"metrics": tuple(values["metrics"])})
 
 
 def read_varied(texts: Sequence[str]) -> list[tuple[str, list[str]]]:
@@ -88,7 +65,7 @@ def read_varied(texts: Sequence[str]) -> list[tuple[str, list[str]]]:
 
 def _canonical(key, text):
     """The value's text as the program writes it: 1e3 and 1000 are one value."""
-    config = preset("tiny")
+    config = Config()
     assign(config, key, text, "--vary")
     return text_of(_value(config, key))
 
@@ -108,8 +85,7 @@ def read_seeds(text: str) -> list[int]:
     """The seeds of --seeds, ascending, each once. Raises UserError for what is no seed."""
     seeds = set()
     for word in text.split(","):
-        config = preset("tiny")
-        configure(config, DEMO, [("train.seed", word.strip(), "--seeds")])
+        config = configure(Config(), DEMO, [("train.seed", word.strip(), "--seeds")])
         seeds.add(config.train.seed)
     return sorted(seeds)
 
@@ -133,61 +109,50 @@ def plan(
         _check_free(key, origin)
         if key in dict(varied):
             raise UserError(f"{origin} {key}: is varied too; leave one of both out")
-    names, jobs = _names(scenes), []
+    jobs = []
     keys = [key for key, _ in varied]
-    for scene, name in names.items():
+    for scene, name in _names(scenes).items():
         for values in itertools.product(*(values for _, values in varied)):
             setting = tuple(zip(keys, values, strict=True))
-            own = [(key, text, "--vary") for key, text in setting]
-            config = configure(preset(preset_name or "tiny"), scene, [*given, *own])
-            for seed in seeds:
-                everything = (*given, *own, ("train.seed", str(seed), "--seeds"))
-                jobs.append(
-                    Job(
-                        config.scene.path,
-                        name,
-                        setting,
-                        seed,
-                        str(_folder(Path(out).resolve(), name, setting, seed)),
-                        preset_name,
-                        everything,
-                        tuple(metrics),
-                        config.train.iterations,
-                    )
+            own = [*given, *((key, text, "--vary") for key, text in setting)]
+            config = configure(preset(preset_name or "tiny"), scene, own)
+            folder = Path(out).resolve() / name
+            if setting:
+                folder /= "_".join(f"{key}={_file_name(text)}" for key, text in setting)
+            jobs += [
+                Job(
+                    scene=config.scene.path,
+                    name=name,
+                    varied=setting,
+                    seed=seed,
+                    folder=str(folder / f"seed-{seed}"),
+                    preset=preset_name,
+                    given=(*own, ("train.seed", str(seed), "--seeds")),
+                    metrics=tuple(metrics),
+                    iterations=config.train.iterations,
                 )
-    _check_folders(jobs)
+                for seed in seeds
+            ]
     return jobs
 
 
 def _names(scenes):
     """{scene: name}, in order. Names must differ, also where the file system ignores case."""
-    names = {}
+    names, taken = {}, {}
     for scene in scenes:
         if scene != DEMO:
             check_folder(Path(scene))
         name = DEMO if scene == DEMO else Path(scene).resolve().name
-        for other, taken in names.items():
-            if taken.casefold() == name.casefold():
-                raise UserError(
-                    f"{scene}: is called {name}, as {other} is, and runs are kept under the name;"
-                    " rename one, or sweep it into another --out"
-                )
+        other = taken.setdefault(name.casefold(), scene)
+        if other != scene:
+            raise UserError(
+                f"{scene}: is called {name}, as {other} is, and runs are kept under the name;"
+                " rename one, or sweep it into another --out"
+            )
         names[scene] = name
     return names
 
 
-def _folder(out, name, setting, seed):
-    slug = "_".join(f"{key}={re.sub('[^a-zA-Z0-9.+-]', '-', text)}" for key, text in setting)
-    return out.joinpath(name, *([slug] if slug else []), f"seed-{seed}")
-
-
-def _check_folders(jobs):
-    """Values that differ only in what a file name cannot hold would share a folder."""
-    taken = {}
-    for job in jobs:
-        other = taken.setdefault(job.folder.casefold(), job)
-        if other is not job:
-            raise UserError(
-                f"--vary: {job.setting} and {other.setting} would share the folder {job.folder};"
-                " sweep them into two --out"
-            )
+def _file_name(text):
+    """A text as part of a file's name, another one for each text."""
+    return quote(text, safe=",", errors="surrogateescape")

@@ -1,7 +1,7 @@
 """The table of a sweep: means over seeds, means over scenes, as text, Markdown and JSON."""
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -9,30 +9,25 @@ from pp_cl.files.atomic import write_json, write_text
 
 Row = dict[str, Any]  # of a run, see sweep/result.py, or of means
 
-# column: (key of a row, text of its value)
-DECIMALS: dict[str, tuple[str, Callable[[float], str]]] = {
-    "PSNR": ("psnr", "{:.2f}".format),
-    "SSIM": ("ssim", "{:.4f}".format),
-    "LPIPS": ("lpips", "{:.4f}".format),
-    "points": ("points", "{:.0f}".format),
-    "seconds": ("seconds", "{:.1f}".format),
+# {key of a row: (column, format of a number)}
+COLUMNS = {
+    "psnr": ("PSNR", ".2f"),
+    "ssim": ("SSIM", ".4f"),
+    "lpips": ("LPIPS", ".4f"),
+    "points": ("points", ".0f"),
+    "seconds": ("seconds", ".1f"),
 }
-MEASURED = tuple(key for key, _ in DECIMALS.values())
 
 
 def scene_means(rows: Sequence[Row]) -> list[Row]:
     """{"scene", "settings", "runs", "failed"} and the means over the seeds that went well, for each
     scene and setting, in the order of the rows.
     """
-    groups: dict[tuple, list[Row]] = {}
-    for row in rows:
-        groups.setdefault((row["scene"], *row["settings"].items()), []).append(row)
     means = []
-    for group in groups.values():
+    for group in _groups(rows, ("scene", "settings")):
         good = [row for row in group if "error" not in row]
         head = {"scene": group[0]["scene"], "settings": group[0]["settings"]}
-        counts = {"runs": len(good), "failed": len(group) - len(good)}
-        means.append(head | counts | _mean(good))
+        means.append(head | {"runs": len(good), "failed": len(group) - len(good)} | _mean(good))
     return means
 
 
@@ -40,20 +35,25 @@ def overall_means(means: Sequence[Row]) -> list[Row]:
     """{"settings", "scenes", "missing"} and the means over the scenes, each of which counts the
     same, for each setting of scene_means(). missing: scenes without a run that went well.
     """
-    groups: dict[tuple, list[Row]] = {}
-    for row in means:
-        groups.setdefault(tuple(row["settings"].items()), []).append(row)
     overall = []
-    for group in groups.values():
+    for group in _groups(means, ("settings",)):
         good = [row for row in group if row["runs"]]
         counts = {"scenes": len(good), "missing": len(group) - len(good)}
         overall.append({"settings": group[0]["settings"]} | counts | _mean(good))
     return overall
 
 
+def _groups(rows, keys):
+    """Lists of the rows whose values under the keys are the same."""
+    groups: dict[str, list[Row]] = {}
+    for row in rows:
+        groups.setdefault(repr([row[key] for key in keys]), []).append(row)
+    return groups.values()
+
+
 def _mean(rows):
     """{key: mean} of what is measured; a key that a row lacks is left out."""
-    columns = {key: [row.get(key) for row in rows] for key in MEASURED}
+    columns = {key: [row.get(key) for row in rows] for key in COLUMNS}
     return {
         key: math.fsum(values) / len(values)
         for key, values in columns.items()
@@ -66,23 +66,21 @@ def cells(rows: Sequence[Row]) -> list[list[str]]:
     a line for the mean of each setting.
     """
     means = scene_means(rows)
-    overall = overall_means(means)
-    shown = [name for name, (key, _) in DECIMALS.items() if any(key in row for row in means)]
+    shown = [key for key in COLUMNS if any(key in row for row in means)]
     varies = any(row["settings"] for row in means)
-    lines = [["scene", *(["setting"] if varies else []), "runs", *shown]]
-    entries = [(row["scene"], row["runs"], row["failed"], row) for row in means]
+    lines = [["scene", *["setting"] * varies, "runs", *(COLUMNS[key][0] for key in shown)]]
+    entries = [(row["scene"], row["runs"], row["failed"], "", row) for row in means]
     if len({row["scene"] for row in means}) > 1:
-        entries += [("mean", row["scenes"], row["missing"], row) for row in overall]
-    for name, good, bad, row in entries:
-        what = " scenes" if name == "mean" else ""
+        overall = overall_means(means)
+        entries += [("mean", row["scenes"], row["missing"], " scenes", row) for row in overall]
+    for name, good, bad, what, row in entries:
         count = f"{good} of {good + bad}{what}" if bad else f"{good}{what}"
-        setting = [setting_text(row)] if varies else []
-        values = [text(row[key]) if key in row else "-" for key, text in map(DECIMALS.get, shown)]
-        lines.append([name, *setting, count, *values])
+        values = [format(row[key], COLUMNS[key][1]) if key in row else "-" for key in shown]
+        lines.append([name, *[_setting_text(row)] * varies, count, *values])
     return lines
 
 
-def setting_text(row: Row) -> str:
+def _setting_text(row):
     """What is varied in a row, as --vary takes it."""
     return " ".join(f"{key}={text}" for key, text in row["settings"].items())
 
@@ -111,21 +109,21 @@ def markdown(rows: Sequence[Row]) -> str:
     return table + ("\nFailed:\n\n" + "".join(failed) if failed else "")
 
 
+def _escaped(text):
+    return text.replace("|", "\\|")
+
+
 def run_text(row: Row) -> str:
     """The run of a row: scene, setting and seed."""
-    return " ".join(filter(None, [row["scene"], setting_text(row), f"seed {row['seed']}"]))
+    return " ".join(filter(None, [row["scene"], _setting_text(row), f"seed {row['seed']}"]))
 
 
 def values_text(row: Row) -> str:
     """What was measured of a run, or why it failed, in one line."""
     if "error" in row:
         return f"failed: {row['error']}"
-    present = {name: pair for name, pair in DECIMALS.items() if row.get(pair[0]) is not None}
-    return ", ".join(f"{name} {text(row[key])}" for name, (key, text) in present.items())
-
-
-def _escaped(text):
-    return text.replace("|", "\\|")
+    present = {key: column for key, column in COLUMNS.items() if row.get(key) is not None}
+    return ", ".join(f"{name} {row[key]:{form}}" for key, (name, form) in present.items())
 
 
 def write_tables(out: Path, rows: Sequence[Row]) -> dict[str, Any]:

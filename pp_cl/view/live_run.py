@@ -1,5 +1,5 @@
-"""The run that is looked at: its last checkpoint, taken up anew when it is replaced, and what it
-shows to a camera.
+"""What the viewer shows: the last checkpoint of a run, drawn for a camera, and the log; both are
+read again when they change.
 """
 
 from __future__ import annotations
@@ -10,7 +10,6 @@ from typing import Any
 
 import numpy as np
 
-from pp_cl.config import load_config
 from pp_cl.device.device import Device
 from pp_cl.errors import UserError
 from pp_cl.files.image import to_8bit
@@ -23,14 +22,15 @@ from pp_cl.scene.camera_path import up_of
 from pp_cl.scene.readers.frame import frame_keys
 from pp_cl.scene.target import Target
 from pp_cl.view import shown
-from pp_cl.view.messages import LEAST_SIDE, Frame, ViewRequest
+from pp_cl.view.messages import LEAST_SIDE, ViewRequest
 
 DRAFT = 4  # times fewer pixels each way while the camera moves
+LOGGED = ("step", "loss", "psnr")
 OWN_CAMERA = ("error", "photograph")  # are shown from the nearest training view's own camera
 
 
 class LiveRun:
-    """A run folder that may still be trained into; used from one thread.
+    """A run folder that may still be trained into; used by one thread at a time.
 
     waiting: why there is nothing to draw yet, one line, or None. notice: one line about photographs
     that are missing, or None. loads: how often a checkpoint was taken up.
@@ -45,7 +45,7 @@ class LiveRun:
         self._scene_path = scene
         self._run: Run | None = None
         self._views: list | None = None
-        self._stamp = None
+        self._stamp = self._log_stamp = None
         self._fewer = None  # (share, Renderer) of the points last kept
         self._target = Target(dev)
 
@@ -53,26 +53,35 @@ class LiveRun:
         """Take up the checkpoint if it is another one than last time; whether anything changed. A
         broken one leaves the last model in place, or a line in `waiting`.
         """
-        try:
-            found = self.folder.checkpoint.stat()
-        except OSError:
-            return False
-        stamp = found.st_mtime_ns, found.st_size, found.st_ino
-        if stamp == self._stamp:
+        stamp = _stamp(self.folder.checkpoint)
+        if stamp in (None, self._stamp):
             return False
         self._stamp = stamp
         try:
             run = load_run(self.dev, self.folder.path, scene=self._scene_path)
         except UserError as error:
-            self.waiting, self.notice = (
-                (str(error), None) if self._run is None else (None, str(error))
-            )
+            if self._run is None:
+                self.waiting = str(error)
+            else:
+                self.notice = str(error)
             return True
         if self._views is None:
             self._views, self.notice = _training_views(run)
         self._run, self._fewer, self.waiting = run, None, None
         self.loads += 1
         return True
+
+    def new_rows(self) -> list[list[float]] | None:
+        """[[step, loss, psnr]] of the log where it has changed since the last call, else None."""
+        stamp = _stamp(self.folder.log)
+        if stamp in (None, self._log_stamp):
+            return None
+        self._log_stamp = stamp
+        try:
+            rows = self.folder.rows()
+        except UserError:  # a log that is too large
+            return None
+        return [[row[key] for key in LOGGED] for row in rows if all(key in row for key in LOGGED)]
 
     def facts(self) -> dict[str, Any]:
         """What the page shows about the run, JSON-able."""
@@ -84,16 +93,15 @@ class LiveRun:
             "device": self.dev.name,
             "platform": self.dev.info["platform"],
         }
-        if self._run is None:
-            return facts
-        header, config = self._run.header, self._run.config
-        return facts | {
-            "step": header["step"],
-            "iterations": config.train.iterations,
-            "finished": header["finished"],
-            "points": self._run.model.cloud.count,
-            "early_stop": config.raster.early_stop,
-        }
+        if run := self._run:
+            facts |= {
+                "step": run.header["step"],
+                "iterations": run.config.train.iterations,
+                "finished": run.header["finished"],
+                "points": run.model.cloud.count,
+                "early_stop": run.config.raster.early_stop,
+            }
+        return facts
 
     def surroundings(self) -> dict[str, Any] | None:
         """What the page turns around and draws beside the picture, JSON-able: the object's centre
@@ -111,15 +119,18 @@ class LiveRun:
             "views": [{"name": v.name, "camera": frame_keys(v.camera)} for v in self._views],
         }
 
-    def draw(self, request: ViewRequest) -> Frame:
-        """The picture that is asked for. Raises UserError where there is none to be had."""
-        if self._run is None:
+    def draw(self, request: ViewRequest) -> tuple[dict[str, Any], bytes]:
+        """(facts, JSON-able; PNG or JPEG file) of the picture that is asked for. Raises UserError
+        where there is none to be had.
+        """
+        run = self._run
+        if run is None:
             raise UserError(self.waiting)
         start, index, camera = time.perf_counter(), None, request.camera
         if request.show in OWN_CAMERA:
             if not self._views:
                 raise UserError(self.notice)
-            index = nearest_view([v.camera for v in self._views], camera, self._run.ball[0])
+            index = nearest_view([v.camera for v in self._views], camera, run.ball[0])
             camera = self._views[index].camera
         factor = draft_factor(camera) if request.draft else 1
         camera = camera.downscaled(factor)
@@ -129,7 +140,7 @@ class LiveRun:
             image = shown.exposed(image, request.exposure)
         lossless = request.kind == "snapshot"
         data = shown.encoded(image, lossless)
-        facts = {
+        return {
             "type": request.kind,
             "number": request.number,
             "show": request.show,
@@ -138,10 +149,9 @@ class LiveRun:
             "camera": frame_keys(camera),
             "view": index,
             "scale": scale,
-            "step": self._run.header["step"],
+            "step": run.header["step"],
             "milliseconds": round(1e3 * (time.perf_counter() - start), 1),
-        }
-        return Frame(request.kind, facts, data)
+        }, data
 
     def _image(self, request, camera, photograph):
         """((H, W, 3) uint8, (lowest, highest) of its colour scale or None)."""
@@ -199,9 +209,13 @@ def _training_views(run):
         return [], f"no training views: {error}"
 
 
-def check_run(folder: Path | str) -> None:
-    """Raise UserError unless the folder has the settings of a run; a checkpoint may come later."""
-    load_config(RunFolder(folder).config)
+def _stamp(path):
+    """What differs when a file is replaced or grows; None where there is none."""
+    try:
+        found = path.stat()
+    except OSError:
+        return None
+    return found.st_mtime_ns, found.st_size, found.st_ino
 
 
 def nearest_view(cameras: list[Camera], camera: Camera, centre: np.ndarray) -> int:

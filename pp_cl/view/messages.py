@@ -1,4 +1,4 @@
-"""What a tab of the browser asks for, read without trust, and how an answer is packed."""
+"""Reads what a browser tab asks for, trusting nothing of it, and packs the answers."""
 
 from __future__ import annotations
 
@@ -44,20 +44,12 @@ class ViewRequest:
     exposure: float
 
 
-@dataclass(frozen=True)
-class Frame:
-    """An answer: facts about a picture, JSON-able, and the picture as a PNG or JPEG file."""
-
-    kind: str
-    facts: dict[str, Any]
-    data: bytes
-
-    def packed(self, **more: Any) -> bytes:
-        """One message: the length of the facts, 4 bytes, little-endian; facts and `more` as JSON;
-        the file.
-        """
-        facts = json.dumps(self.facts | more, allow_nan=False).encode()
-        return len(facts).to_bytes(4, "little") + facts + self.data
+def packed(facts: dict[str, Any], image: bytes) -> bytes:
+    """One message of facts, JSON-able, and an image file: the length of the facts, 4 bytes,
+    little-endian; the facts as JSON; the file.
+    """
+    text = json.dumps(facts, allow_nan=False).encode()
+    return len(text).to_bytes(4, "little") + text + image
 
 
 def read_request(text: str) -> ViewRequest:
@@ -71,7 +63,7 @@ def read_request(text: str) -> ViewRequest:
     if type(message.get("draft")) is not bool:
         raise UserError("draft: must be true or false")
     return ViewRequest(
-        number=_whole(message, "number", (0, MOST_NUMBER)),
+        number=_number(message, "number", (0, MOST_NUMBER), whole=True),
         kind=_word(message, "kind", KINDS),
         show=_word(message, "show", SHOWN),
         camera=_camera(message.get("camera")),
@@ -84,7 +76,8 @@ def _camera(facts):
     """The Camera of such facts. Raises UserError naming what is wrong."""
     if not isinstance(facts, dict):
         raise UserError("camera: is missing")
-    width, height = (_whole(facts, key, (LEAST_SIDE, MOST_SIDE), "camera.") for key in "wh")
+    sides = LEAST_SIDE, MOST_SIDE
+    width, height = (_number(facts, key, sides, "camera.", whole=True) for key in "wh")
     if width * height > MOST_PIXELS:
         raise UserError(f"camera: {width}x{height} pixels are more than {MOST_PIXELS}")
     lens = [_number(facts, key, limits, "camera.") for key, limits in INTRINSICS.items()]
@@ -122,17 +115,11 @@ def _is_number(value):
     return type(value) is float and math.isfinite(value)
 
 
-def _number(message, key, limits, prefix=""):
+def _number(message, key, limits, prefix="", whole=False):
     value, (least, most) = message.get(key), limits
-    if not _is_number(value) or not least <= value <= most:
-        raise UserError(f"{prefix}{key}: must be a number from {least:g} to {most:g}")
-    return float(value)
-
-
-def _whole(message, key, limits, prefix=""):
-    value, (least, most) = message.get(key), limits
-    if type(value) is not int or not least <= value <= most:
-        raise UserError(f"{prefix}{key}: must be a whole number from {least} to {most}")
+    if not _is_number(value) or (whole and type(value) is not int) or not least <= value <= most:
+        kind = "a whole number" if whole else "a number"
+        raise UserError(f"{prefix}{key}: must be {kind} from {least:g} to {most:g}")
     return value
 
 

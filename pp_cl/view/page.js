@@ -38,7 +38,7 @@ function connect() {
 function take(message) {
   if (message.type === "facts") takeFacts(message);
   else if (message.type === "surroundings") takeSurroundings(message);
-  else if (message.type === "log") { rows = rows.slice(0, message.first).concat(message.rows); showCurve(); }
+  else if (message.type === "log") { rows = message.rows; showCurve(); }
   else if (message.type === "refused") note(message.line, true);
 }
 

@@ -1,4 +1,4 @@
-"""Starting and ending the server."""
+"""Starts and ends the viewer's server, in this process or beside a training."""
 
 from __future__ import annotations
 
@@ -14,11 +14,13 @@ import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
+from pp_cl.config import load_config
 from pp_cl.device.discover import open_device
 from pp_cl.errors import UserError
+from pp_cl.files.run_folder import RunFolder
 from pp_cl.run import check_scene
 from pp_cl.view.access import Access
-from pp_cl.view.live_run import LiveRun, check_run
+from pp_cl.view.live_run import LiveRun
 
 WAIT_SECONDS = 0.5  # between two looks for what is waited for
 GRACE_SECONDS = 10.0  # for a server in the background to end
@@ -51,7 +53,7 @@ def serve(
     parent = os.getppid() if wait else None  # first of all: it may be gone once it is answered
     check_installed()
     if not wait:
-        check_run(folder)
+        load_config(RunFolder(folder).config)
     if scene is not None:
         check_scene(scene)
     with (
@@ -103,7 +105,7 @@ def _listen(host, port):
 
 
 async def _serve(live, access, listening, *, announce, parent):
-    """Serve until cancelled, until the render thread has failed, or until the parent, a process,
+    """Serve until cancelled, until drawing fails, which is a bug, or until the parent, a process,
     is gone; None: that does not matter.
     """
     from aiohttp import web
@@ -116,12 +118,11 @@ async def _serve(live, access, listening, *, announce, parent):
     try:
         await web.SockSite(runner, listening).start()
         announce(access.address)
-        ends = [server.failed]
+        ends = [asyncio.create_task(server.draw())]
         if parent is not None:
             ends.append(asyncio.create_task(_ended(parent)))
-        await asyncio.wait(ends, return_when=asyncio.FIRST_COMPLETED)
-        if server.failed.done():
-            server.failed.result()  # raises
+        done, _ = await asyncio.wait(ends, return_when=asyncio.FIRST_COMPLETED)
+        done.pop().result()
     finally:
         await runner.cleanup()
 

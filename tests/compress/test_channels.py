@@ -8,7 +8,7 @@ from oracle.unet import unet
 from support.comparisons import relative_error
 from support.networks import plain_parameters
 
-from pp_cl.compress.channels import channels_text, kept_channels, reduced_parameters
+from pp_cl.compress.channels import kept_channels, reduced_parameters
 from pp_cl.compress.reduction import Reduction
 from pp_cl.layers.conv import unpack_weights
 from pp_cl.network.layers import convolutions
@@ -39,7 +39,7 @@ def test_dead_channels_go_for_nothing(dev, rng, blocks):
     net, weights = planted(dev, rng, blocks)
     kept = kept_channels(net.layers, weights, 1e-3)
     parameters = {name: array.get() for name, array in net.parameters.items()}
-    channels = [int(n) for n in channels_text(net.layers, kept).split(",")]
+    channels = [len(kept[layer.name]) for layer in convolutions(net.layers)[:-1]]
     small = UNet(dev, (32, 48, 64), blocks=blocks, channels=channels)
     for name, values in reduced_parameters(net.layers, parameters, kept).items():
         small.parameters[name].set(values)

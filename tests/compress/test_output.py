@@ -4,12 +4,11 @@ import json
 import shutil
 
 import numpy as np
-import pytest
+from support.runs import train_and_interrupt
 
 from pp_cl.cli import main
 from pp_cl.compress import search as search_module
-from pp_cl.compress.output import check_finished, validation_views
-from pp_cl.errors import UserError
+from pp_cl.compress.search import validation_views
 from pp_cl.run import load_run
 
 
@@ -27,36 +26,26 @@ def test_validation_views_are_never_those_of_the_test(dev, ball_run, tmp_path):
     assert which == f"{len(views)} views of val"
 
 
-def test_the_command_writes_a_run(ball_run, tmp_path, capsys):
-    out = tmp_path / "small"
-    assert main(["compress", str(ball_run), "--max-loss", "0.5dB", "--out", str(out)]) == 0
-    printed = capsys.readouterr().out
-    report = json.loads((out / "compress.json").read_text())
-    assert len(printed.splitlines()) == 2, "the result, and where it is"
-    assert sum(trial["taken"] for trial in report["trials"]) > 0
-    assert "frames per second" in printed and report["loss"] <= 0.5 == report["most_loss"]
-    assert report["bytes"][1] <= report["bytes"][0] / 1.9
-    assert (out / "checkpoint.npz").stat().st_size < 1.1 * report["bytes"][1] + 20_000
-    assert main(["eval", str(out), "--metrics", "psnr"]) == 0
-    assert main(["info", str(out)]) == 0
-    assert main(["export", str(out), "--format", "ply", "--out", str(tmp_path / "a.ply")]) == 0
-    capsys.readouterr()
-    assert main(["compress", str(ball_run), "--out", str(out)]) == 2
-    assert str(out) in capsys.readouterr().err
-
-
-def test_the_same_model_comes_back(ball_run, tmp_path, capsys, monkeypatch, dev):
-    """What is written renders as what was measured."""
+def test_the_command_writes_a_run(ball_run, tmp_path, capsys, monkeypatch, dev):
+    """What is written is what was measured, and a run like any other."""
     monkeypatch.setattr(search_module, "TRIALS", ((1.0, "half", (True,)),))
     out = tmp_path / "small"
-    assert main(["compress", str(ball_run), "--max-loss", "3", "--out", str(out), "-v"]) == 0
-    report = json.loads((out / "compress.json").read_text())
+    assert main(["compress", str(ball_run), "--max-loss", "3dB", "--out", str(out), "-v"]) == 0
     printed = capsys.readouterr().out
+    report = json.loads((out / "compress.json").read_text())
     assert all(trial["what"] in printed for trial in report["trials"])
+    assert "frames per second" in printed and report["loss"] <= 3 == report["most_loss"]
+    assert report["bytes"][1] <= report["bytes"][0] / 1.9
+    assert (out / "checkpoint.npz").stat().st_size < 1.1 * report["bytes"][1] + 20_000
     run = load_run(dev, out)
     assert run.model.cloud.sh[0].dtype == np.float16
     assert run.model.cloud.count == report["points"][1] < report["points"][0]
-    assert json.loads((out / "config.json").read_text())["scene"]["path"]
+    assert run.config.scene.path == load_run(dev, ball_run).config.scene.path
+    for words in (["eval", "--metrics", "psnr"], ["export", "--format", "ply"]):
+        assert main([words[0], str(out), *words[1:]]) == 0
+    capsys.readouterr()
+    assert main(["compress", str(ball_run), "--out", str(out)]) == 2
+    assert str(out) in capsys.readouterr().err
 
 
 def test_bad_input_ends_in_one_line(ball_run, tmp_path, capsys):
@@ -78,8 +67,8 @@ def test_bad_input_ends_in_one_line(ball_run, tmp_path, capsys):
         assert error.count("\n") == 1 and expected in error
 
 
-def test_an_unfinished_run_is_refused(dev, ball_run):
-    run = load_run(dev, ball_run)
-    run.header["finished"] = False
-    with pytest.raises(UserError, match="not finished"):
-        check_finished(run)
+def test_an_unfinished_run_is_refused(ball_run, tmp_path, capsys, monkeypatch):
+    train_and_interrupt(str(ball_run.parent / "ball"), tmp_path / "run", 12, monkeypatch)
+    capsys.readouterr()
+    assert main(["compress", str(tmp_path / "run")]) == 2
+    assert "not finished" in capsys.readouterr().err

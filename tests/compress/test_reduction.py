@@ -46,7 +46,7 @@ def test_a_run_as_it_is_stays_as_it_is(original):
 
 
 def test_fewer_points_of_16_bits_and_a_lower_degree(original):
-    reduction = replace(Reduction.of(original.run), keep=0.5, half=True, degree=1)
+    reduction = replace(Reduction.of(original.run), keep=0.5, half=True, degree=1, early_stop=0.01)
     arrays = original.reduced_arrays(reduction)
     kept = heaviest(original.weights, 0.5)
     n = len(original.weights)
@@ -61,6 +61,7 @@ def test_fewer_points_of_16_bits_and_a_lower_degree(original):
     run = original.reduced(reduction)
     assert nbytes(run) == len(kept) * (4 + 4 + 4 * 16 * 2) + network
     assert run.model.cloud.count == len(kept) and run.config.points.sh_degree == 1
+    assert run.renderer.settings.early_stop == 0.01 != original.run.config.raster.early_stop
     camera = run.cameras("train")[0]
     assert np.isfinite(run.render(camera).colour).all()
 
@@ -69,14 +70,6 @@ def test_16_bits_hold_what_is_larger(original):
     original.arrays["points.sh0"][0, 0, :2] = [1e6, -1e6]
     arrays = original.reduced_arrays(replace(Reduction.of(original.run), half=True))
     assert arrays["points.sh0"][0, 0, :2].tolist() == [65504, -65504]
-
-
-def test_settings_of_rendering_are_the_reduced_runs_own(original):
-    before = original.run.config.raster.early_stop
-    run = original.reduced(replace(Reduction.of(original.run), early_stop=0.01))
-    assert run.config.raster.early_stop == 0.01 != before
-    assert run.renderer.settings == run.config.raster
-    assert original.run.config.raster.early_stop == before
 
 
 def test_psnr_is_the_mean_over_the_views(original):

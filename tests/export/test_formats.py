@@ -1,11 +1,15 @@
-"""Every format, from run to file."""
+"""Every format, from run to file; renderings as a scene."""
 
 import shutil
 
+import numpy as np
 import pytest
 
-from pp_cl.export.formats import FORMATS, check_target, export
+from pp_cl.export.formats import FORMATS, check_target, export, renderings
+from pp_cl.files.image import to_8bit
+from pp_cl.run import load_run
 from pp_cl.scene.load import load_scene
+from pp_cl.scene.readers.transforms import write_scene
 
 
 @pytest.mark.parametrize("name", FORMATS)
@@ -27,3 +31,29 @@ def test_a_scene_can_be_given_its_folder(run, tmp_path):
     path = check_target("scene", tmp_path, tmp_path / "empty")
     assert export(run, "scene", path) == "12 train views, 2 test views"
     assert len(load_scene(path, ("test",)).splits["test"]) == 2
+
+
+def test_they_read_back_as_a_scene(run, tmp_path):
+    write_scene(renderings(run), tmp_path / "scene")
+    scene = load_scene(tmp_path / "scene", ("train", "test"))
+    for split in ("train", "test"):
+        views = scene.splits[split]
+        for view, camera in zip(views, run.cameras(split), strict=True):
+            assert view.camera.pose == pytest.approx(camera.pose)
+            for name in ("fx", "fy", "cx", "cy", "width", "height"):
+                assert getattr(view.camera, name) == pytest.approx(getattr(camera, name))
+            picture = run.render(camera)
+            assert np.array_equal(view.image, to_8bit(picture.rgba()))
+            rgba = view.image / 255
+            over_white = rgba[..., :3] * rgba[..., 3:] + 1 - rgba[..., 3:]
+            covered = picture.alpha > 0.2  # below, colours that alpha cannot carry are cut
+            assert np.abs(over_white - picture.colour)[covered].mean() < 0.01
+
+
+def test_a_scene_without_test_views_gives_training_views(run, run_folder, tmp_path):
+    shutil.copytree(run.config.scene.path, tmp_path / "ball")
+    (tmp_path / "ball" / "transforms_test.json").unlink()
+    moved = load_run(run.dev, run_folder, scene=str(tmp_path / "ball"))
+    with pytest.warns(UserWarning, match="no test views are exported: .*test"):
+        splits = renderings(moved).splits
+    assert {split: len(views) for split, views in splits.items()} == {"train": 12}

@@ -51,10 +51,6 @@ def test_the_runs_own_images_are_reproduced(run):
         assert -10 * np.log10(np.mean(error**2)) > 25
 
 
-def test_the_same_run_gives_the_same_numbers(run):
-    assert np.array_equal(fit_harmonics(run), fit_harmonics(run))
-
-
 def test_points_that_no_view_shows_keep_zero(run):
     found = fit_harmonics(run)
     weights = sum(seen.point_weights() for seen in observe(run, run.cameras("train"), ""))

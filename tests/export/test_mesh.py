@@ -1,14 +1,13 @@
 """The mesh lies on the ball, and reads back as it was."""
 
-import meshio
 import numpy as np
 import pytest
 import trimesh
 
 from pp_cl.errors import UserError
 from pp_cl.export import mesh as module
-from pp_cl.export.glb import gltf_colours
 from pp_cl.export.mesh import coloured_mesh, surface, write_mesh
+from pp_cl.export.points import gltf_colours
 
 RADIUS = 0.8  # of the ball
 
@@ -44,15 +43,6 @@ def test_it_reads_back_by_trimesh(mesh, suffix, tmp_path):
         assert np.array_equal(read.visual.vertex_colors[:, :3], mesh.colours)
     assert np.array_equal(np.float32(read.vertices), mesh.vertices)
     assert np.array_equal(read.faces, mesh.faces)
-
-
-def test_it_reads_back_by_meshio(mesh, tmp_path):
-    write_mesh(tmp_path / "a.ply", mesh)
-    read = meshio.read(tmp_path / "a.ply")
-    assert np.array_equal(np.float32(read.points), mesh.vertices)
-    assert np.array_equal(read.cells_dict["triangle"], mesh.faces)
-    colours = np.stack([read.point_data[name] for name in ("red", "green", "blue")], 1)
-    assert np.array_equal(colours.view(np.uint8), mesh.colours)  # meshio knows no uchar
 
 
 def test_no_surface_is_one_line(run, monkeypatch):

@@ -78,12 +78,12 @@ def test_points_are_kept_to_within_a_step(run, page):
 
 def test_coefficients_are_kept_to_within_a_step(run, rng):
     known = rng.normal(size=(run.model.cloud.count, 9, 3)).astype(np.float32)
-    points = pack(run, known)
-    values = points.rows["colour"][:, :27].reshape(-1, 9, 3)
-    found = points.low[:, None] + points.span[:, None] * (values / np.float32(255))
-    inside = (known > points.low[:, None]) & (known < (points.low + points.span)[:, None])
+    rows, low, span = pack(run, known)
+    values = rows["colour"][:, :27].reshape(-1, 9, 3)
+    found = low[:, None] + span[:, None] * (values / np.float32(255))
+    inside = (known > low[:, None]) & (known < (low + span)[:, None])
     assert 0.99 < inside.mean() < 1
-    assert np.abs(found - known)[inside].max() <= points.span.max() / 255 * 0.51
+    assert np.abs(found - known)[inside].max() <= span.max() / 255 * 0.51
 
 
 def test_what_it_keeps_shows_what_the_run_shows(run, page):

@@ -1,11 +1,13 @@
-"""Each point has the colour of the view in which it weighs most."""
+"""Each point has the colour of the view in which it weighs most; the files hold what went in."""
 
 import numpy as np
+import plyfile
 import pytest
+import trimesh
 
 from pp_cl.errors import UserError
 from pp_cl.export.observe import observe
-from pp_cl.export.points import coloured_points
+from pp_cl.export.points import coloured_points, gltf_colours, write_glb, write_ply
 from pp_cl.files.image import to_8bit
 
 
@@ -41,3 +43,57 @@ def test_points_of_little_weight_are_left_out(run, points):
 def test_no_points_are_one_line(run):
     with pytest.raises(UserError, match="--min-weight 1000: no point weighs more"):
         coloured_points(run, min_weight=1000)
+
+
+@pytest.fixture(scope="module")
+def written(run, tmp_path_factory):
+    """(file, points)."""
+    path, points = tmp_path_factory.mktemp("ply") / "a.ply", coloured_points(run, min_weight=0.05)
+    write_ply(path, points, run.model.cloud)
+    return path, points
+
+
+def test_the_ply_reads_back_by_plyfile(run, written):
+    path, points = written
+    data = plyfile.PlyData.read(str(path))
+    vertex = data["vertex"]
+    assert not data.text and data.byte_order == "<" and len(vertex) == len(points.rows)
+    for axis, name in enumerate(("x", "y", "z")):
+        assert vertex[name].dtype == "f4" and (vertex[name] == points.positions[:, axis]).all()
+    for channel, name in enumerate(("red", "green", "blue")):
+        assert vertex[name].dtype == "u1" and (vertex[name] == points.colours[:, channel]).all()
+    assert (vertex["opacity"] == points.opacity).all()
+    assert (vertex["weight"] == points.weight).all()
+    stored = run.model.cloud.arrays(run.dev)
+    by_degree = [stored[f"points.sh{degree}"].get()[points.rows] for degree in range(3)]
+    for c in range(16):
+        for degree in (0, 1, 2):
+            for k in range(2 * degree + 1):
+                assert (vertex[f"feature_{c}_{degree}_{k}"] == by_degree[degree][:, k, c]).all()
+    assert len(vertex.properties) == 8 + 9 * 16
+    comments = " ".join(data.comments)
+    for name in ("red, green, blue:", "weight:", "opacity:", "feature_C_D_K:"):
+        assert name in comments
+
+
+def test_the_ply_reads_back_by_trimesh(written):
+    path, points = written
+    cloud = trimesh.load(path)
+    assert np.array_equal(np.float32(cloud.vertices), points.positions)
+    assert np.array_equal(cloud.colors[:, :3], points.colours)
+
+
+def test_the_glb_reads_back_by_trimesh(points, tmp_path):
+    write_glb(tmp_path / "a.glb", points)
+    (cloud,) = trimesh.load(tmp_path / "a.glb").geometry.values()
+    assert isinstance(cloud, trimesh.PointCloud)
+    assert np.array_equal(np.float32(cloud.vertices), points.positions)
+    assert np.array_equal(cloud.colors, gltf_colours(points.colours))
+
+
+def test_colours_are_in_linear_light():
+    srgb = np.repeat(np.uint8([[0], [10], [128], [255]]), 3, axis=1)
+    # IEC 61966-2-1: 10 is on its straight part
+    expected = [0, round(10 / 12.92), round(255 * ((128 / 255 + 0.055) / 1.055) ** 2.4), 255]
+    assert gltf_colours(srgb)[:, 0].tolist() == expected
+    assert (gltf_colours(srgb)[:, 3] == 255).all()

@@ -9,7 +9,6 @@ import pytest
 
 from pp_cl.errors import UserError
 from pp_cl.files.run_folder import RunFolder
-from pp_cl.view.follow import LogFollower
 
 ROWS = [{"step": step, "seconds": step / 10, "loss": 1.0} for step in (5, 10, 15)]
 
@@ -85,9 +84,6 @@ def test_a_damaged_log_is_cut_off_there(folder, line):
         assert log.seconds == 0.5 and rows(folder) == ROWS[:1]
     (told,) = (str(warning.message) for warning in warned)
     assert told.startswith(f"{folder.log}: ") and told.isprintable()
-    log = LogFollower(folder.log)
-    log.poll()
-    assert log.rows == [] and folder.rows() == ROWS[:1]
 
 
 def test_what_will_be_made_again_may_be_damaged(folder, recwarn):

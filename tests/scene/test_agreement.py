@@ -9,11 +9,11 @@ from support.runs import arguments
 from support.scenes import write_ball_scene
 
 from pp_cl.cli import main
-from pp_cl.facts.info import describe_scene, picture
+from pp_cl.facts.info import describe_scene
 from pp_cl.files.image import read_rgba, write_png
 from pp_cl.scene.agreement import disagreements
 from pp_cl.scene.hull import build_grid
-from pp_cl.scene.outline import REJECTED
+from pp_cl.scene.outline import REJECTED, picture
 
 BOX = np.stack([CENTRE - RADIUS, CENTRE + RADIUS])
 

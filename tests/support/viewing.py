@@ -51,7 +51,7 @@ class Client:
                 self.last[found["type"]] = found
             else:
                 raise ConnectionError(f"{message.type} {message.data}")
-            if kind in (found[0]["type"] if isinstance(found, tuple) else found["type"]):
+            if (found[0] if isinstance(found, tuple) else found)["type"] in kind.split():
                 return found
 
     async def ask(self, camera, **changes):
@@ -78,12 +78,6 @@ class Served:
         headers = {"Origin": self.origin} | headers
         return self.session.ws_connect(f"{self.access.address}socket", headers=headers)
 
-    async def ready_to_wait(self, socket):
-        """The Client of a websocket, when it knows how the run is."""
-        client = Client(socket)
-        await client.receive("facts")
-        return client
-
     async def ready(self, socket):
         """The Client of a websocket, when the model is loaded."""
         client = Client(socket)
@@ -92,18 +86,20 @@ class Served:
 
 
 @contextlib.asynccontextmanager
-async def served(dev, folder):
-    """Served for the run in a folder."""
+async def served(dev, folder, stand_in=lambda live: live):
+    """Served for the run in a folder. stand_in: what is drawn with, of the LiveRun."""
     with contextlib.closing(socket.create_server(("127.0.0.1", 0))) as listening:
         access = Access("127.0.0.1", listening.getsockname()[1])
-        server = ViewServer(LiveRun(dev, folder), access)
+        server = ViewServer(stand_in(LiveRun(dev, folder)), access)
         runner = server.runner()
         await runner.setup()
+        drawing = asyncio.create_task(server.draw())
         try:
             await web.SockSite(runner, listening).start()
             async with aiohttp.ClientSession() as session:
                 yield Served(server, access, session)
         finally:
             await runner.cleanup()
-        if server.failed.done():
-            server.failed.result()
+            drawing.cancel()
+        with contextlib.suppress(asyncio.CancelledError):
+            await drawing

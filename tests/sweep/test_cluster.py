@@ -5,16 +5,20 @@ import importlib
 import os
 import signal
 import sys
+from contextlib import ExitStack
 from types import SimpleNamespace
 
 import psutil
 import pytest
 from distributed.scheduler import KilledWorker
-from filelock import FileLock
+from support.scenes import write_ball_scene
 from support.sweeps import jobs_of
 
 from pp_cl.errors import UserError
+from pp_cl.files.checkpoint import load_checkpoint
+from pp_cl.files.run_folder import RunFolder
 from pp_cl.sweep import cluster
+from pp_cl.sweep.result import finished_row
 
 
 def _about_worker():
@@ -101,22 +105,99 @@ def test_tasks_that_end_without_a_row(tmp_path):
     row = cluster._row(future("error", killed), job)
     assert row["error"].startswith("several workers ended") and str(job.log) in row["error"]
     row = cluster._row(future("error", ValueError("odd\nmore")), job)
-    assert row["error"] == "ValueError: odd"
-    assert cluster._row(future("error", ValueError()), job)["error"] == "ValueError: "
+    assert row["error"] == f"ValueError: odd more; see {job.log}"
     assert "scheduler is gone" in cluster._row(future("cancelled"), job)["error"]
 
 
-def test_it_is_told_where_a_process_still_works(tmp_path):
-    jobs = jobs_of(["demo"], tmp_path, [1, 2, 3])
-    for job in jobs[:2]:
-        job.lock.parent.mkdir(parents=True)
-        job.lock.touch()
-    with FileLock(jobs[0].lock):
-        assert cluster.await_ends(jobs, 0.1) == [jobs[0]]
-    assert cluster.await_ends(jobs, 0.1) == []
+@pytest.fixture
+def job(tmp_path):
+    """A planned run of a small scene, whose log has a folder."""
+    (job,) = jobs_of([write_ball_scene(tmp_path / "ball")], tmp_path / "out", [4])
+    job.log.parent.mkdir(parents=True)
+    return job
 
 
-@pytest.mark.parametrize("package", ["distributed", "filelock", "cryptography"])
+def test_a_stopped_run_goes_on_and_is_measured(job):
+    """The checkpoint that it leaves holds the step that it was stopped in."""
+    asked = []
+
+    def is_stopped():
+        asked.append(0)
+        return len(asked) == 6
+
+    row = cluster.run_job(job, is_stopped, "7")
+    assert row["error"] == "stopped" and (row["scene"], row["seed"]) == ("ball", 4)
+    header, _ = load_checkpoint(RunFolder(job.folder).checkpoint)
+    assert header["step"] == 6 and not header["finished"]
+    row = cluster.run_job(job, lambda: False, "7")
+    assert row == finished_row(job) and row["psnr"] > 5
+    lines = job.log.read_text().splitlines()
+    assert len([line for line in lines if "on worker 7, process" in line]) == 2
+    checkpoint = RunFolder(job.folder).checkpoint.stat()
+    assert cluster.run_job(job, None, "7") == row  # is not trained again
+    assert RunFolder(job.folder).checkpoint.stat() == checkpoint
+
+
+@pytest.mark.parametrize(
+    "error, said",
+    [
+        (UserError("x: mend it"), "x: mend it"),
+        (OSError(28, "No space left", "a.npz"), "a.npz: No space left; check the disk"),
+        (MemoryError(), "the host has no memory left"),
+    ],
+)
+def test_what_goes_wrong_is_the_rows_error(job, monkeypatch, error, said):
+    def failing(*_):
+        os.write(2, b"said meanwhile\n")
+        raise error
+
+    monkeypatch.setattr(cluster, "open_training", failing)
+    assert cluster.run_job(job, None, "7")["error"].startswith(said)
+    assert "said meanwhile\n" in job.log.read_text()
+
+
+def test_a_bug_is_raised_with_its_traceback_in_the_log(job, monkeypatch):
+    monkeypatch.setattr(cluster, "open_training", None)
+    with pytest.raises(TypeError):
+        cluster.run_job(job, None, "7")
+    assert "Traceback" in job.log.read_text()
+
+
+def test_a_worker_that_does_not_see_the_folder(job):
+    job.log.parent.rmdir()
+    error = cluster.run_job(job, None, "7")["error"]
+    assert "worker 7" in error and str(job.log.parent) in error
+
+
+def test_a_log_that_cannot_be_written_is_named(job):
+    job.log.symlink_to("/dev/full")
+    assert cluster.run_job(job, None, "7")["error"].startswith(f"{job.log}: ")
+
+
+def test_a_scene_that_cannot_be_measured_is_not_trained(tmp_path):
+    scene = write_ball_scene(tmp_path / "ball", splits=("train",))
+    (job,) = jobs_of([scene], tmp_path / "out")
+    job.log.parent.mkdir(parents=True)
+    assert "no split test" in cluster.run_job(job, None, "7")["error"]
+    assert not RunFolder(job.folder).config.exists()
+
+
+def test_the_end_of_trainings_is_awaited(tmp_path, monkeypatch):
+    jobs, waited = jobs_of(["demo"], tmp_path, [1, 2]), []
+    with ExitStack() as stack:
+        stack.enter_context(RunFolder(jobs[1].folder).owned())
+
+        def sleep(_):
+            waited.append(0)
+            if len(waited) == 3:
+                stack.close()
+
+        monkeypatch.setattr(cluster.time, "sleep", sleep)
+        cluster._await_ends(jobs)
+    assert len(waited) == 3
+
+
+@pytest.mark.parametrize("package", ["distributed", "cryptography"])
 def test_a_missing_package_is_one_line(monkeypatch, package):
     monkeypatch.setitem(sys.modules, package, None)
     monkeypatch.delitem(sys.modules, "pp_cl.sweep.cluster")

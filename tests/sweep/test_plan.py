@@ -1,10 +1,12 @@
 """Which runs a sweep has, and where."""
 
+from pathlib import Path
+
 import pytest
 from support.sweeps import jobs_of
 
 from pp_cl.errors import UserError
-from pp_cl.sweep.plan import Job, read_seeds, read_varied
+from pp_cl.sweep.plan import read_seeds, read_varied
 
 
 @pytest.fixture
@@ -35,7 +37,7 @@ def test_every_combination_is_a_run_of_its_own(tmp_path, scenes):
     jobs = jobs_of(scenes, tmp_path / "out", [1, 5], varied, given=[])
     assert len(jobs) == len({job.folder for job in jobs}) == 2 * 2 * 2 * 2
     slugs = [
-        f"points.count={count}_network.widths={width}-{width}-{width}"
+        f"points.count={count}_network.widths={width},{width},{width}"
         for count in (1000, 2000)
         for width in (16, 32)
     ]
@@ -45,7 +47,6 @@ def test_every_combination_is_a_run_of_its_own(tmp_path, scenes):
         str(out / scene / slug / f"seed-{seed}") for scene, slug, seed in expected
     ]
     job = jobs[2]
-    assert job.setting == "points.count=1000 network.widths=32,32,32" and job.seed == 1
     assert str(job) == "a points.count=1000 network.widths=32,32,32 seed 1"
     assert [given[:2] for given in job.given] == [
         ("points.count", "1000"),
@@ -57,15 +58,8 @@ def test_every_combination_is_a_run_of_its_own(tmp_path, scenes):
 def test_nothing_varied_needs_no_folder_of_the_setting(tmp_path, scenes):
     (job,) = jobs_of(scenes[:1], tmp_path / "out", [3])
     assert job.folder == str(tmp_path / "out" / "a" / "seed-3")
-    assert job.setting == "" and str(job) == "a seed 3"
+    assert str(job) == "a seed 3"
     assert job.log == tmp_path / "out" / "a" / "seed-3.log"
-
-
-def test_a_job_survives_its_way_to_a_process(tmp_path, scenes):
-    varied = [("raster.early_stop", ["0.5"])]
-    (job,) = jobs_of(scenes[:1], tmp_path, [3], varied, metrics=("psnr",), preset_name="small")
-    line = job.to_json()
-    assert "\n" not in line and Job.from_json(line) == job
 
 
 def test_iterations_are_those_of_preset_and_settings(tmp_path, scenes):
@@ -134,8 +128,8 @@ def test_a_scene_that_is_not_there(tmp_path):
     refused(lambda: jobs_of([tmp_path / "none"], tmp_path), str(tmp_path / "none"), "no such")
 
 
-def test_values_that_one_folder_would_hold(tmp_path, monkeypatch):
-    """No setting of today takes such words."""
-    varied = [("scene.mask_from", ["a/b", "a:b"])]
-    monkeypatch.setattr("pp_cl.config._check", lambda *_, **__: None)
-    refused(lambda: jobs_of(["demo"], tmp_path, varied=varied), "a/b", "a:b", "share the folder")
+def test_each_value_has_a_folder_of_its_own_in_the_sweeps(tmp_path):
+    values = ["a/b", "a:b", "..", "a b"]
+    jobs = jobs_of(["demo"], tmp_path, varied=[("scene.masks", values)])
+    parents = {Path(job.folder).parent for job in jobs}
+    assert len(parents) == len(values) and {p.parent for p in parents} == {tmp_path / "demo"}

@@ -14,7 +14,6 @@ from pp_cl.files.image import to_8bit
 from pp_cl.run import load_run
 from pp_cl.view.live_run import (
     LiveRun,
-    check_run,
     draft_factor,
     hits_per_pixel,
     most_opaque,
@@ -25,8 +24,8 @@ from pp_cl.view.messages import SHOWN, read_request
 
 def drawn(live, camera, **changes):
     """(facts, image) that a LiveRun draws."""
-    frame = live.draw(read_request(json.dumps(asking(camera, **changes))))
-    return frame.facts, decoded(frame.data)
+    facts, data = live.draw(read_request(json.dumps(asking(camera, **changes))))
+    return facts, decoded(data)
 
 
 @pytest.fixture
@@ -167,8 +166,14 @@ def test_the_nearest_view_counts_place_and_direction():
     assert nearest_view([away, cameras[2]], cameras[2], centre) == 1
 
 
-def test_what_is_no_run_is_one_line(tmp_path):
-    with pytest.raises(UserError, match="folder of a run"):
-        check_run(tmp_path)
-    with pytest.raises(UserError, match="folder of a run"):
-        check_run(tmp_path / "nothing")
+def test_rows_of_the_log_that_are_no_rows_are_left_out(dev, copied):
+    lines = (copied / "log.jsonl").read_text().splitlines(keepends=True)
+    live = LiveRun(dev, copied)
+    rows = live.new_rows()
+    assert len(rows) == len(lines) - 1 and len(rows[0]) == 3  # the last says "finished"
+    assert live.new_rows() is None
+    (copied / "log.jsonl").write_text(lines[0] + lines[1][:9])
+    assert live.new_rows() == rows[:1]
+    (copied / "log.jsonl").unlink()
+    os.mkfifo(copied / "log.jsonl")  # is not waited for
+    assert not live.new_rows()

@@ -80,7 +80,7 @@ def test_a_frustum_is_clicked_the_camera_copied_and_the_device_shown(dev, traine
             for _ in range(3):  # until other views are inside of the picture
                 await still(page, page.mouse("mouseWheel", *MIDDLE, deltaX=0, deltaY=400))
             before = await copied_camera(page)
-            views = here.server._surroundings["views"]
+            views = here.server._told["surroundings"]["views"]
             place, name = await place_of_a_frustum(page, {view["name"] for view in views})
             await still(page, page.drag(place, []))
             after = await copied_camera(page)
@@ -125,9 +125,9 @@ def test_dragging_brings_frames_and_a_second_tab_is_another(dev, trained):
                 await asyncio.sleep(0.05)
                 if not here.server.tabs:
                     break
-            drawn = here.server.thread.drawn
+            drawn = here.server.drawn
             await asyncio.sleep(0.5)
-            assert not here.server.tabs and here.server.thread.drawn == drawn
+            assert not here.server.tabs and here.server.drawn == drawn
 
     asyncio.run(scenario())
 
@@ -147,7 +147,7 @@ def test_fingers_turn_and_pinch_on_a_small_screen(dev, trained):
             apart = [(180 - 8 * i, 200) for i in range(9)], [(220 + 8 * i, 200) for i in range(9)]
             assert await still(page, page.touch(*apart)) not in (first, turned)
             after = await copied_camera(page)
-            view = here.server._surroundings
+            view = here.server._told["surroundings"]
             away = [np.subtract(eye_of(c), view["centre"]) for c in (after, view["camera"])]
             assert np.linalg.norm(away[0]) < 0.7 * np.linalg.norm(away[1])
 
@@ -197,6 +197,6 @@ def test_the_page_waits_for_a_checkpoint_and_shows_the_curve(dev, copied):
             turned = await still(page, page.drag(MIDDLE, [(9, 4)] * 8))
             touch = asyncio.to_thread((copied / "checkpoint.npz").touch)
             assert await still(page, touch) == turned  # drawn anew, and the camera has stayed
-            assert here.server.thread.live.loads == 2 and not page.said
+            assert here.server.live.loads == 2 and not page.said
 
     asyncio.run(scenario())

@@ -1,17 +1,20 @@
 """The server as tabs talk to it, without a browser."""
 
 import asyncio
+import contextlib
 import json
 import os
+import threading
 
 import aiohttp
-import numpy as np
 import pytest
 from aiohttp import WSServerHandshakeError
-from support.viewing import SECONDS, asking, served
+from support.scenes import ring_cameras
+from support.viewing import SECONDS, Client, asking, served
 
-from pp_cl.view.messages import SHOWN
-from pp_cl.view.server import SocketTab
+from pp_cl.errors import UserError
+
+CAMERA = ring_cameras(1, 48)[0]
 
 HEADERS = {
     "Referrer-Policy": "no-referrer",
@@ -23,10 +26,10 @@ HEADERS = {
 
 async def until(condition):
     """Wait until condition() holds."""
-    for _ in range(SECONDS * 20):
+    for _ in range(SECONDS * 50):
         if condition():
             return
-        await asyncio.sleep(0.05)
+        await asyncio.sleep(0.02)
     raise AssertionError("nothing happened")
 
 
@@ -61,73 +64,46 @@ def test_files_come_with_their_headers_and_nothing_else_does(dev, trained):
     asyncio.run(scenario())
 
 
-@pytest.mark.parametrize(
-    "headers", [{"Host": "evil.example"}, {"Host": "127.0.0.1"}, {"Origin": "http://evil.example"}]
-)
-def test_a_foreign_host_or_origin_is_refused(dev, trained, headers):
+def test_a_foreign_host_or_origin_and_a_wrong_token_are_refused(dev, trained):
+    foreign = {"Host": "evil.example"}, {"Host": "127.0.0.1"}, {"Origin": "http://evil.example"}
+
     async def scenario():
         async with served(dev, trained) as here:
-            async with here.session.get(here.access.address, headers=headers) as response:
-                assert response.status == 403 and HEADERS.items() <= dict(response.headers).items()
-            with pytest.raises(WSServerHandshakeError) as caught:
-                await here.tab(**headers)
-            assert caught.value.status == 403 and not here.server.tabs
-
-    asyncio.run(scenario())
-
-
-def test_a_missing_or_wrong_token_is_refused(dev, trained):
-    async def scenario():
-        async with served(dev, trained) as here:
-            token = here.access.token
+            token, get = here.access.token, here.session.get
+            for headers in foreign:
+                async with get(here.access.address, headers=headers) as response:
+                    assert response.status == 403
+                    assert HEADERS.items() <= dict(response.headers).items()
+                with pytest.raises(WSServerHandshakeError) as caught:
+                    await here.tab(**headers)
+                assert caught.value.status == 403 and not here.server.tabs
             for path in ("/", "/socket", "/page.js", f"/{token[:-1]}/", f"/{token}x/page.js"):
-                async with here.session.get(here.origin + path) as response:
+                async with get(here.origin + path) as response:
                     assert response.status == 403
             with pytest.raises(WSServerHandshakeError) as caught:
                 await here.session.ws_connect(
                     f"{here.origin}/wrong/socket", headers={"Origin": here.origin}
                 )
             assert caught.value.status == 403
-            async with here.session.get(f"{here.origin}/{token}/") as response:
-                assert response.status == 200
 
     asyncio.run(scenario())
 
 
-def test_every_switch_and_slider_changes_the_picture(dev, trained):
-    async def scenario():
-        async with served(dev, trained) as here, here.tab() as socket:
-            tab = await here.ready(socket)
-            camera = tab.last["surroundings"]["views"][3]["camera"]
-            pictures = [(await tab.ask(camera, show=show))[1] for show in SHOWN]
-            changes = ({"early_stop": 0.2}, {"kept": 0.2}, {"exposure": 2})
-            pictures += [(await tab.ask(camera, **change))[1] for change in changes]
-            assert len({picture.tobytes() for picture in pictures}) == len(SHOWN) + len(changes)
-            facts, again = await tab.ask(camera, number=77)
-            np.testing.assert_array_equal(again, pictures[0])
-            assert facts["number"] == 77 and facts["milliseconds"] > 0 and facts["per_second"] > 0
-            snapshot, _ = await tab.ask(camera, kind="snapshot")
-            assert snapshot["mime"] == "image/png"
-
-    asyncio.run(scenario())
-
-
-def test_a_camera_of_nan_is_one_line_and_the_tab_goes_on(dev, trained):
+def test_bad_requests_are_one_line_and_the_tab_goes_on(dev, trained):
     async def scenario():
         async with served(dev, trained) as here, here.tab() as socket:
             tab = await here.ready(socket)
             camera = tab.last["surroundings"]["camera"]
-            for text in (
-                json.dumps(asking(camera | {"cx": float("nan")})),
-                json.dumps(asking(camera | {"transform_matrix": [[None] * 4] * 4})),
-                "{",
-            ):
+            for text in (json.dumps(asking(camera | {"cx": float("nan")})), "{"):
                 await socket.send_str(text)
                 line = (await tab.receive("refused"))["line"]
                 assert line and "\n" not in line and "Traceback" not in line
             await socket.send_bytes(b"\x00")
             assert "text" in (await tab.receive("refused"))["line"]
-            assert (await tab.ask(camera))[1].shape == (24, 24, 3)
+            facts, image = await tab.ask(camera, number=77)
+            assert image.shape == (24, 24, 3) and facts["number"] == 77
+            snapshot, _ = await tab.ask(camera, kind="snapshot")
+            assert snapshot["mime"] == "image/png" and facts["mime"] == "image/jpeg"
 
     asyncio.run(scenario())
 
@@ -146,39 +122,102 @@ def test_a_message_that_is_too_long_ends_the_tab_alone(dev, trained):
     asyncio.run(scenario())
 
 
-def test_of_many_requests_the_newest_is_answered(dev, trained):
+class GatedRun:
+    """Stands in for a LiveRun: draws a request each time the gate is opened."""
+
+    def __init__(self, live):
+        self.folder, self.gate, self.begun = live.folder, threading.Semaphore(0), []
+
+    def refresh(self):
+        return False
+
+    def new_rows(self):
+        return None
+
+    def facts(self):
+        return {}
+
+    def draw(self, request):
+        self.begun.append(request.number)
+        assert self.gate.acquire(timeout=SECONDS)
+        if request.show == "error":
+            raise UserError("no training views")
+        if request.show == "hits":
+            raise ZeroDivisionError
+        return {"type": request.kind, "number": request.number}, b""
+
+
+@contextlib.asynccontextmanager
+async def gated(dev, trained):
+    """(Served, GatedRun, Client of a tab whose first request is in work)."""
+    async with served(dev, trained, GatedRun) as here, here.tab() as socket:
+        run, tab = here.server.live, Client(socket)
+        await send(tab, 1)
+        await until(lambda: run.begun == [1])
+        yield here, run, tab
+
+
+async def send(tab, number, **changes):
+    await tab.socket.send_str(json.dumps(asking(CAMERA, number=number, **changes)))
+
+
+def asked(here):
+    """The numbers of the requests that wait."""
+    return [request.number for request in here.server._asked.values()]
+
+
+async def numbers(run, tab, count):
+    """Of the next pictures."""
+    found = []
+    for _ in range(count):
+        run.gate.release()
+        facts, _ = await tab.receive("frame snapshot")
+        found.append(facts["number"])
+    return found
+
+
+def test_the_newest_request_of_each_kind_is_answered(dev, trained):
     async def scenario():
-        async with served(dev, trained) as here, here.tab() as socket:
-            tab = await here.ready(socket)
-            camera = tab.last["surroundings"]["camera"]
-            drawn = here.server.thread.drawn
-            for number in range(1, 201):
-                await socket.send_str(json.dumps(asking(camera, number=number)))
-            numbers = [(await tab.receive("frame"))[0]["number"]]
-            while numbers[-1] < 200:
-                numbers.append((await tab.receive("frame"))[0]["number"])
-            assert numbers == sorted(numbers) and len(numbers) < 200
-            assert here.server.thread.drawn - drawn < 200
+        async with gated(dev, trained) as (here, run, tab):
+            for number in (2, 3, 4):
+                await send(tab, number)
+            await send(tab, 5, kind="snapshot")
+            await until(lambda: len(here.server._asked) == 2)
+            assert await numbers(run, tab, 3) == [1, 4, 5] and here.server.drawn == 3
 
     asyncio.run(scenario())
 
 
-def test_a_closed_tab_stops_its_rendering(dev, trained):
+def test_tabs_take_turns_and_nothing_is_drawn_for_a_closed_one(dev, trained):
     async def scenario():
-        async with served(dev, trained) as here:
-            async with here.tab() as socket:
-                tab = await here.ready(socket)
-                camera = tab.last["surroundings"]["camera"] | {"w": 400, "h": 400}
-                await socket.send_str(json.dumps(asking(camera)))
-            await until(lambda: not here.server.tabs)
-            await asyncio.sleep(0.2)
-            drawn = here.server.thread.drawn
-            async with here.tab() as socket:  # the thread is free for others
-                tab = await here.ready(socket)
-                await tab.ask(tab.last["surroundings"]["camera"])
-            assert drawn <= here.server.thread.drawn - 1 <= drawn + 1
+        async with gated(dev, trained) as (here, run, tab), here.tab() as socket:
+            other = Client(socket)
+            async with here.tab() as closed:
+                for one, number in ((tab, 2), (Client(closed), 3), (other, 9), (tab, 4)):
+                    await send(one, number)
+                    await until(
+                        lambda n=number: n in (r.number for r in here.server._asked.values())
+                    )
+            await until(lambda: len(here.server.tabs) == 2)
+            assert await numbers(run, tab, 2) == [1, 4] and await numbers(run, other, 1) == [9]
+            assert run.begun == [1, 4, 9]
 
     asyncio.run(scenario())
+
+
+def test_a_picture_that_cannot_be_had_is_a_line_and_a_bug_ends_the_server(dev, trained):
+    async def scenario():
+        async with gated(dev, trained) as (_, run, tab):
+            await send(tab, 2, show="error")
+            assert await numbers(run, tab, 1) == [1]
+            run.gate.release()
+            assert (await tab.receive("refused"))["line"] == "no training views"
+            await send(tab, 3, show="hits")
+            run.gate.release()
+            await until(lambda: len(run.begun) == 3)
+
+    with pytest.raises(ZeroDivisionError):
+        asyncio.run(scenario())
 
 
 def test_there_are_not_more_tabs_than_allowed(dev, trained, monkeypatch):
@@ -202,52 +241,25 @@ def test_a_training_is_followed(dev, copied):
 
     async def scenario():
         async with served(dev, copied) as here, here.tab() as socket:
-            tab = await here.ready_to_wait(socket)
-            assert "waiting" in tab.last["facts"]["waiting"]
-            while not tab.last.get("log", {}).get("rows"):
-                await tab.receive("log")
-            assert [row[0] for row in tab.last["log"]["rows"]] == [5]
+            tab = Client(socket)
+            assert "waiting" in (await tab.receive("facts"))["waiting"]
+            assert [row[0] for row in (await tab.receive("log"))["rows"]] == [5]
             with (copied / "log.jsonl").open("ab") as file:
                 file.write(lines[1][9:] + lines[2])
-            added = await tab.receive("log")
-            assert added["first"] == 1 and [row[0] for row in added["rows"]] == [10, 15]
+            assert [row[0] for row in (await tab.receive("log"))["rows"]] == [5, 10, 15]
             (copied / "new.npz").write_bytes(whole)
             (copied / "new.npz").replace(copied / "checkpoint.npz")
             camera = (await tab.receive("surroundings"))["camera"]
             assert tab.last["facts"]["loads"] == 1 and tab.last["facts"]["waiting"] is None
             await tab.ask(camera)
+            async with here.tab() as second:  # knows the same
+                assert len((await Client(second).receive("log"))["rows"]) == 3
+            (copied / "log.jsonl").unlink()
+            (copied / "log.jsonl").write_bytes(lines[0])  # a training that begins anew
+            assert [row[0] for row in (await tab.receive("log"))["rows"]] == [5]
             os.utime(copied / "checkpoint.npz", ns=(1, 1))
             while tab.last["facts"]["loads"] < 2:
                 await tab.receive("facts")
-
-    asyncio.run(scenario())
-
-
-def test_a_tab_gets_each_row_once_and_no_message_without_rows():
-    class Log:
-        starts, rows = 0, []
-
-    async def scenario():
-        tab, log = SocketTab(None), Log()
-        tab.tell_log(log)
-        assert sent(tab) == []
-        log.rows = [[5], [10]]
-        tab.tell_log(log)
-        tab.tell_log(log)
-        log.rows = [[5], [10], [15]]
-        tab.tell_log(log)
-        assert sent(tab) == [(0, [[5], [10]]), (2, [[15]])]
-        log.starts, log.rows = 1, []
-        tab.tell_log(log)
-        tab.tell_log(log)
-        assert sent(tab)[2:] == [(0, [])]  # the page forgets what it had
-        log.rows = [[5]]
-        tab.tell_log(log)
-        assert sent(tab)[2:] == [(0, [[5]])]  # in its place, as it was not sent yet
-
-    def sent(tab):
-        messages = [json.loads(text) for text in tab._outbox.values()]
-        return [(message["first"], message["rows"]) for message in messages]
 
     asyncio.run(scenario())
 
