@@ -1,10 +1,12 @@
 """A device: its buffers, its errors, its programs and its debug levels."""
 
 import atexit
+import gc
 import os
 import subprocess
 import sys
 import time
+import weakref
 
 import numpy as np
 import pyopencl as cl
@@ -12,6 +14,7 @@ import pytest
 from support.guarded import GuardedDevice
 
 from pp_cl.device import device as device_module
+from pp_cl.device.buffers import scratch
 from pp_cl.device.device import Device, kernel_folder
 from pp_cl.device.discover import list_devices, open_device
 from pp_cl.errors import BuildError, UserError
@@ -42,6 +45,16 @@ def tiny(tmp_path, monkeypatch):
 def plain(session_device):
     """The tests' device without guards."""
     return Device(session_device.device)
+
+
+def test_a_device_that_nobody_has_is_gone_with_its_memory(session_device):
+    device = Device(session_device.device)
+    scratch(device, "mine", 100, np.float32)
+    device.program("training/adam")
+    gone = weakref.ref(device)
+    del device
+    gc.collect()
+    assert gone() is None
 
 
 # ---- buffers
