@@ -20,34 +20,10 @@ from pp_cl.scene.open import open_scene
 
 
 @pytest.fixture(scope="module")
-def run(tmp_path_factory):
+def run(runs, tmp_path_factory):
     """A finished run on the ball, at a size whose reduction is no multiple of 4."""
-    folder = tmp_path_factory.mktemp("evaluate")
-    scene = write_ball_scene(folder / "ball", size=60)
-    assert (
-        main(
-            [
-                "train",
-                scene,
-                "--out",
-                str(folder / "run"),
-                "--downscale",
-                "2",
-                "--points",
-                "1500",
-                "--iterations",
-                "40",
-                "--set",
-                "train.crop=28",
-                "--set",
-                "network.widths=16,16,16",
-                "--set",
-                "train.final_prune_weight=0",
-            ]
-        )
-        == 0
-    )
-    return folder / "run"
+    changes = {"train__iterations": 40, "train__crop": 28, "train__final_prune_weight": 0}
+    return runs.trained(tmp_path_factory.mktemp("evaluate") / "run", runs.ball(size=60), **changes)
 
 
 def test_metrics_file_and_pictures(run, capsys):

@@ -22,10 +22,9 @@ BALL = 0.8  # its radius, support.scenes
 
 
 @pytest.fixture(scope="module")
-def finished(scene, tmp_path_factory):
+def finished(runs, scene, tmp_path_factory):
     """Folder of a finished and evaluated run."""
-    out = tmp_path_factory.mktemp("runs") / "run"
-    assert main(arguments(scene, out)) == 0
+    out = runs.trained(tmp_path_factory.mktemp("runs") / "run", scene)
     assert main(["eval", str(out), "--metrics", "psnr"]) == 0
     return out
 

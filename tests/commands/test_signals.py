@@ -20,11 +20,9 @@ ROOT = Path(__file__).parents[2]
 
 
 @pytest.fixture(scope="module")
-def whole(scene, tmp_path_factory):
+def whole(finished):
     """The checkpoint of a training that was not stopped."""
-    out = tmp_path_factory.mktemp("runs") / "whole"
-    assert main(arguments(scene, out)) == 0
-    return (out / "checkpoint.npz").read_bytes()
+    return (finished / "checkpoint.npz").read_bytes()
 
 
 def signalling(monkeypatch, at, number):

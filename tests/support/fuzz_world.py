@@ -17,7 +17,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from support.runs import share_device
 from support.scenes import ball_image, ring_cameras
 
 from pp_cl.cli import main
@@ -69,10 +68,10 @@ def ball_views():
 
 
 class World:
-    """Templates below a folder, each made when it is asked for, and the one device of all runs."""
+    """Templates below a folder, each made when it is asked for, and the device of all runs."""
 
-    def __init__(self, folder):
-        self._folder = folder
+    def __init__(self, folder, device):
+        self._folder, self.device = folder, device
         self.cache = folder / "cache"
 
     def scene(self, name="nerf_synthetic", folder=None):
@@ -146,18 +145,15 @@ def _hang(*_):
 
 
 @contextlib.contextmanager
-def opened_world(folder):
-    """A World whose device the command line works on unless it names another."""
-    world = World(folder)
+def opened_world(folder, device):
+    """A World with the device that commands work on."""
+    world = World(folder, device)
     world.cache.mkdir()
     limits = resource.getrlimit(resource.RLIMIT_AS)
     used = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
     handler = signal.signal(signal.SIGALRM, _hang)
     with pytest.MonkeyPatch.context() as patch:
-        world.device = share_device(patch)
         patch.setenv("PP_CACHE", str(world.cache))
-        patch.delenv("PP_DEBUG", raising=False)
-        patch.delenv("PP_MAX_ALLOCATION", raising=False)
         resource.setrlimit(resource.RLIMIT_AS, (used + MEMORY, limits[1]))
         try:
             world.run(folder, finished=True)  # builds the kernels, which no input has to wait for
