@@ -16,6 +16,8 @@ from support.sweeps import jobs_of
 from pp_cl.errors import UserError
 from pp_cl.sweep import cluster
 
+pytestmark = pytest.mark.slow
+
 
 def _about_worker():
     return os.environ.get("PP_DEVICE"), os.getpid(), signal.getsignal(signal.SIGINT)

@@ -9,6 +9,8 @@ import pytest
 
 from tools.bombs import KINDS
 
+pytestmark = pytest.mark.slow
+
 ROOT = Path(__file__).parents[2]
 MOST_MIB = 512
 

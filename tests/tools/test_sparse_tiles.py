@@ -9,6 +9,8 @@ from support.scenes import write_ball_scene
 
 from pp_cl.cli import main
 
+pytestmark = pytest.mark.slow
+
 SPEC = importlib.util.spec_from_file_location(
     "sparse_tiles", Path(__file__).parents[2] / "tools" / "sparse_tiles.py"
 )
