@@ -1,4 +1,4 @@
-"""Fixtures: the device that works, guarded; the count of launches and of tests with real data."""
+"""Fixtures: the guarded device of all tests and commands, scenes and runs that tests share."""
 
 import os
 import shutil
@@ -12,7 +12,6 @@ from support.runs import Runs
 from pp_cl.device import discover
 from pp_cl.device.device import Device
 from pp_cl.device.discover import open_device
-from pp_cl.device.launch import Program
 from pp_cl.files.cache import cache_folder, make_cache_folder
 from pp_cl.metrics.lpips_weights import WEIGHTS_FILE
 
@@ -33,17 +32,6 @@ settings.register_profile(
     print_blob=True,
 )
 settings.load_profile("short")
-
-COUNTS = {"launches": 0, "data": 0}
-_launch = Program.launch
-
-
-def _counted_launch(self, *args, **kwargs):
-    COUNTS["launches"] += 1
-    return _launch(self, *args, **kwargs)
-
-
-Program.launch = _counted_launch
 
 
 @pytest.fixture(scope="session", autouse=True)
@@ -93,9 +81,13 @@ def _variables():
 
 @pytest.fixture(autouse=True)
 def no_stray_writes(session_device):
-    """The canaries are checked when a test ends, whoever ran the kernels."""
+    """The canaries are checked when a test ends, whoever ran the kernels.
+
+    No scratch memory stays: its values could stand for what another test forgets to write.
+    """
     yield
     session_device.check()
+    session_device.scratch.clear()
 
 
 @pytest.fixture
@@ -122,7 +114,6 @@ def data():
     """The folder of real data (PP_DATA); skips where there is none."""
     if not DATA.is_dir():
         pytest.skip(f"no real data at {DATA}; set PP_DATA")
-    COUNTS["data"] += 1
     return DATA
 
 
@@ -146,25 +137,3 @@ def scene(runs):
 def finished(runs, scene, tmp_path_factory):
     """Folder of an uninterrupted run, the module's own."""
     return runs.trained(tmp_path_factory.mktemp("runs") / "whole", scene)
-
-
-def pytest_terminal_summary(terminalreporter):
-    """Say what really ran."""
-    terminalreporter.write_line(
-        f"kernel launches: {COUNTS['launches']}; tests on real data: {COUNTS['data']}"
-    )
-
-
-@pytest.hookimpl(optionalhook=True)
-def pytest_testnodedown(node, error):
-    """Take over what a worker of pytest-xdist has counted."""
-    for name, count in getattr(node, "workeroutput", {}).get("counts", {}).items():
-        COUNTS[name] += count
-
-
-def pytest_sessionfinish(session, exitstatus):
-    """A whole run that launched no kernel has tested nothing."""
-    if hasattr(session.config, "workeroutput"):  # a worker, whose counts go to the first process
-        session.config.workeroutput["counts"] = COUNTS
-    elif session.testscollected > 100 and COUNTS["launches"] == 0:
-        session.exitstatus = 1

@@ -41,7 +41,6 @@ def saved(monkeypatch):
     return steps
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(
     "every, minutes, expected",
     [

@@ -57,16 +57,7 @@ FLIPS = [
 ]  # fmt: skip
 
 
-def at_length():
-    """FLIPS; a file's second and third are tests at more length."""
-    files = [flip[0] for flip in FLIPS]
-    for i, flip in enumerate(FLIPS):
-        yield pytest.param(*flip, marks=[pytest.mark.slow] if flip[0] in files[:i] else [])
-
-
-@pytest.mark.parametrize(
-    "file, text, flipped, name", list(at_length()), ids=lambda v: v.replace("/", ".")
-)
+@pytest.mark.parametrize("file, text, flipped, name", FLIPS, ids=lambda v: v.replace("/", "."))
 def test_a_flip_fails_its_case(dev, tmp_path, monkeypatch, file, text, flipped, name):
     case = next(case for case in CASES if case.name == name)
     monkeypatch.setattr(dev, "is_cpu", takes_cpu_form(dev, file, text))

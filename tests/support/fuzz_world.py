@@ -4,8 +4,8 @@ input that is taken and sound, or refused in one line with exit status 2.
 
 import contextlib
 import faulthandler
+import functools
 import importlib
-import io
 import json
 import os
 import resource
@@ -17,9 +17,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from support import runs
 from support.scenes import ball_image, ring_cameras
 
-from pp_cl.cli import main
 from pp_cl.errors import UserError
 from pp_cl.files.checkpoint import load_checkpoint
 from pp_cl.files.run_folder import RunFolder
@@ -53,10 +53,8 @@ SETTINGS = {
 }
 
 
-def set_words(**changes):
-    """--set words of a training that takes a moment; train__crop=8 sets train.crop."""
-    values = SETTINGS | {key.replace("__", "."): value for key, value in changes.items()}
-    return [word for key, value in values.items() for word in ("--set", f"{key}={value}")]
+# --set words of a training that takes a moment
+set_words = functools.partial(runs.set_words, SETTINGS)
 
 
 def ball_views():
@@ -179,13 +177,7 @@ def taken(function):
 
 def command(*words):
     """The exit status of the command line: 0, 2 with one line as the last, or 130."""
-    out, err = io.StringIO(), io.StringIO()
-    with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
-        try:
-            status = main([str(word) for word in words])
-        except SystemExit as end:  # --help
-            status = end.code or 0
-    lines = [line for line in err.getvalue().splitlines() if line]
+    status, lines = runs.spoken(words)
     assert status in (0, 2, 130), lines[-1:]
     if status == 2:
         assert lines and lines[-1].startswith(("pp-cl: ", "pp-cl ")), lines[-1:]

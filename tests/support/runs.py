@@ -1,7 +1,9 @@
 """Trainings started, interrupted and resumed as a user does; finished ones that tests share."""
 
+import contextlib
 import functools
 import hashlib
+import io
 import json
 import shutil
 from pathlib import Path
@@ -28,9 +30,25 @@ SETTINGS = {
 
 def arguments(scene, out, downscale=2, **changes):
     """Command line of a small training."""
-    settings = SETTINGS | {k.replace("__", "."): v for k, v in changes.items()}
-    sets = [word for key, value in settings.items() for word in ("--set", f"{key}={value}")]
+    sets = set_words(SETTINGS, **changes)
     return ["train", scene, "--out", str(out), "--downscale", str(downscale), *sets]
+
+
+def set_words(settings, **changes):
+    """--set words of settings; train__crop=8 sets train.crop."""
+    settings = settings | {key.replace("__", "."): value for key, value in changes.items()}
+    return [word for key, value in settings.items() for word in ("--set", f"{key}={value}")]
+
+
+def spoken(words):
+    """(exit status, lines on stderr) of a command."""
+    errors = io.StringIO()
+    with contextlib.redirect_stdout(io.StringIO()), contextlib.redirect_stderr(errors):
+        try:
+            status = main([str(word) for word in words])
+        except SystemExit as end:  # --help
+            status = end.code or 0
+    return status, [line for line in errors.getvalue().splitlines() if line]
 
 
 class Runs:
