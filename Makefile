@@ -39,7 +39,7 @@ demo: $(READY) ## train the demo scene into runs/demo and evaluate it: minutes o
 test: $(READY) ## run the tests on the device of PP_DEVICE, else on the default one, a process a core
 	@$(BIN)/python -m pytest $(ON_ALL_CORES) $(ARGS)
 
-test-slow: $(READY) ## run the tests that `make test` leaves out: what others show in part, at more length
+test-slow: $(READY) ## run the tests that `make test` leaves out: long ones of tools and Dask, and what others show in part
 	@$(BIN)/python -m pytest $(ON_ALL_CORES) -m slow $(ARGS)
 
 test-intel: $(READY) ## the same on Intel's CPU runtime, installed into .venv if need be (x86-64)

@@ -112,6 +112,6 @@ class TracedDevice(GuardedDevice):
         """Fail if Oclgrind has reported anything since the last check; all buffers stay in
         _guarded.
         """
-        reports = self._log.read_text()
+        reports, self._unchecked = self._log.read_text(), 0
         new, self._reported = reports[self._reported :], len(reports)
         assert not new, new[:2000]
