@@ -8,7 +8,7 @@ KERNELS = $(shell find cl -name "*.cl" -o -name "*.h")
 COUNT ?= 5000
 SEED ?= 0
 
-# Tests wait for builds of kernels, which use one core.
+# No test needs another in its process: runs that several use are trained once for all (tests/support/runs.py).
 ON_ALL_CORES := --numprocesses auto --dist worksteal
 
 # The tests that are named like a kernel file, and those with the marker `kernels`.
@@ -36,10 +36,10 @@ demo: $(READY) ## train the demo scene into runs/demo and evaluate it: minutes o
 	$(BIN)/pp-cl train demo --preset tiny --iterations 1500 --out runs/demo
 	$(BIN)/pp-cl eval runs/demo --metrics
 
-test: $(READY) ## run the tests on the device of PP_DEVICE, else on all that work, a process a core
+test: $(READY) ## run the tests on the device of PP_DEVICE, else on the default one, a process a core
 	@$(BIN)/python -m pytest $(ON_ALL_CORES) $(ARGS)
 
-test-slow: $(READY) ## run the tests that `make test` leaves out: what others show in part, at more length
+test-slow: $(READY) ## run the tests that `make test` leaves out: long ones of tools and Dask, and what others show in part
 	@$(BIN)/python -m pytest $(ON_ALL_CORES) -m slow $(ARGS)
 
 test-intel: $(READY) ## the same on Intel's CPU runtime, installed into .venv if need be (x86-64)

@@ -1,6 +1,4 @@
-"""Fixtures: each device that works, guarded; the count of kernels launched and of tests that had
-real data.
-"""
+"""Fixtures: the guarded device of all tests and commands, scenes and runs that tests share."""
 
 import os
 import shutil
@@ -9,13 +7,11 @@ import numpy as np
 import pytest
 from hypothesis import HealthCheck, settings
 from support.guarded import DATA, GuardedDevice, TracedDevice
-from support.runs import arguments
-from support.scenes import write_ball_scene
+from support.runs import Runs
 
-from pp_cl.cli import main
+from pp_cl.device import discover
 from pp_cl.device.device import Device
-from pp_cl.device.discover import list_devices, open_device
-from pp_cl.device.launch import Program
+from pp_cl.device.discover import open_device
 from pp_cl.files.atomic import cache_folder, make_cache_folder
 from pp_cl.metrics.lpips_weights import WEIGHTS_FILE
 
@@ -37,17 +33,6 @@ settings.register_profile(
 )
 settings.load_profile("short")
 
-COUNTS = {"launches": 0, "data": 0}
-_launch = Program.launch
-
-
-def _counted_launch(self, *args, **kwargs):
-    COUNTS["launches"] += 1
-    return _launch(self, *args, **kwargs)
-
-
-Program.launch = _counted_launch
-
 
 @pytest.fixture(scope="session", autouse=True)
 def cache_of_its_own(tmp_path_factory):
@@ -66,39 +51,49 @@ def cache_of_its_own(tmp_path_factory):
         shutil.move(lent, make_cache_folder() / WEIGHTS_FILE)
 
 
-def devices():
-    """PP_DEVICE, else the indices of all devices that work; None, the default one, if that is all
-    there is.
+@pytest.fixture(scope="session", autouse=True)
+def session_device(tmp_path_factory):
+    """The one device of a process: tests and the commands that they run share its built kernels.
+
+    Its buffers are guarded; traced where Oclgrind watches reads. Where a test asks for another
+    form, debug level or limit, a command has a device of its own.
     """
-    if os.environ.get("PP_DEVICE"):
-        return [os.environ["PP_DEVICE"]]
-    found = [index for index, _, problem in list_devices() if problem is None]
-    return found if len(found) > 1 else [None]
+    if os.environ.get("OCLGRIND_UNINITIALIZED") == "1":
+        log = tmp_path_factory.mktemp("oclgrind") / "log"
+        os.environ["OCLGRIND_LOG"] = str(log)
+        device = TracedDevice(open_device().device, log)
+    else:
+        device = GuardedDevice(open_device().device)
+    wanted = _variables()
+
+    def shared(opened):
+        return device if (opened, _variables()) == (device.device, wanted) else Device(opened)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(discover, "Device", shared)
+        yield device
 
 
-DEVICES = devices()
+def _variables():
+    """What a Device asks the environment for."""
+    return [os.environ.get(name) for name in ("PP_DEBUG", "PP_FORM", "PP_MAX_ALLOCATION")]
 
 
-@pytest.fixture(
-    scope="session",
-    params=DEVICES,
-    ids=[f"device {name}" if name else "device" for name in DEVICES],
-)
-def session_device(request, tmp_path_factory):
-    """A device with guarded buffers; with traced ones where Oclgrind watches reads."""
-    if os.environ.get("OCLGRIND_UNINITIALIZED") != "1":
-        return GuardedDevice(open_device(request.param).device)
-    log = tmp_path_factory.mktemp("oclgrind") / "log"
-    os.environ["OCLGRIND_LOG"] = str(log)
-    return TracedDevice(open_device(request.param).device, log)
+@pytest.fixture(autouse=True)
+def no_stray_writes(session_device):
+    """The canaries are checked when a test ends, whoever ran the kernels.
+
+    No scratch memory stays: its values could stand for what another test forgets to write.
+    """
+    yield
+    session_device.check()
+    session_device._scratch.clear()
 
 
 @pytest.fixture
 def dev(session_device):
-    """The guarded device; the canaries are checked when the test ends."""
-    yield session_device
-    session_device.finish()
-    session_device.check()
+    """The guarded device."""
+    return session_device
 
 
 @pytest.fixture
@@ -125,41 +120,26 @@ def data():
     """The folder of real data (PP_DATA); skips where there is none."""
     if not DATA.is_dir():
         pytest.skip(f"no real data at {DATA}; set PP_DATA")
-    COUNTS["data"] += 1
     return DATA
 
 
-@pytest.fixture(scope="module")
-def scene(tmp_path_factory):
-    """Folder of a small scene."""
-    return write_ball_scene(tmp_path_factory.mktemp("scene") / "ball")
+@pytest.fixture(scope="session")
+def runs(tmp_path_factory, session_device):
+    """Scenes and finished runs that all processes share."""
+    folder = tmp_path_factory.getbasetemp()
+    if os.environ.get("PYTEST_XDIST_WORKER"):  # whose folder is inside that of all
+        folder = folder.parent
+    (folder / "shared").mkdir(exist_ok=True)
+    return Runs(folder / "shared")
+
+
+@pytest.fixture(scope="session")
+def scene(runs):
+    """Folder of a small scene, not to be changed."""
+    return runs.ball()
 
 
 @pytest.fixture(scope="module")
-def finished(scene, tmp_path_factory):
-    """Folder of an uninterrupted run."""
-    out = tmp_path_factory.mktemp("runs") / "whole"
-    assert main(arguments(scene, out)) == 0
-    return out
-
-
-def pytest_terminal_summary(terminalreporter):
-    """Say what really ran."""
-    terminalreporter.write_line(
-        f"kernel launches: {COUNTS['launches']}; tests on real data: {COUNTS['data']}"
-    )
-
-
-@pytest.hookimpl(optionalhook=True)
-def pytest_testnodedown(node, error):
-    """Take over what a worker of pytest-xdist has counted."""
-    for name, count in getattr(node, "workeroutput", {}).get("counts", {}).items():
-        COUNTS[name] += count
-
-
-def pytest_sessionfinish(session, exitstatus):
-    """A whole run that launched no kernel has tested nothing."""
-    if hasattr(session.config, "workeroutput"):  # a worker, whose counts go to the first process
-        session.config.workeroutput["counts"] = COUNTS
-    elif session.testscollected > 100 and COUNTS["launches"] == 0:
-        session.exitstatus = 1
+def finished(runs, scene, tmp_path_factory):
+    """Folder of an uninterrupted run, the module's own."""
+    return runs.trained(tmp_path_factory.mktemp("runs") / "whole", scene)

@@ -14,10 +14,10 @@ RARELY = {"train__checkpoint_every": 1000}
 
 
 @pytest.fixture(scope="module")
-def whole(scene, tmp_path_factory):
+def whole(runs, scene, tmp_path_factory):
     """The checkpoint of a training with none before the end."""
     out = tmp_path_factory.mktemp("runs") / "whole"
-    assert main(arguments(scene, out, **RARELY, train__checkpoint_minutes=0)) == 0
+    runs.trained(out, scene, **RARELY, train__checkpoint_minutes=0)
     return (out / "checkpoint.npz").read_bytes()
 
 
@@ -41,7 +41,6 @@ def saved(monkeypatch):
     return steps
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(
     "every, minutes, expected",
     [

@@ -33,13 +33,7 @@ DIVERGENCES = {
 }
 
 
-@pytest.mark.parametrize(
-    "case",
-    [
-        case if case == "points" else pytest.param(case, marks=pytest.mark.slow)
-        for case in DIVERGENCES
-    ],
-)
+@pytest.mark.parametrize("case", DIVERGENCES)
 def test_a_training_that_diverges_keeps_its_last_good_checkpoint(
     scene, tmp_path, capsys, monkeypatch, case
 ):

@@ -20,13 +20,10 @@ from pp_cl.scene.load import open_scene
 
 
 @pytest.fixture(scope="module")
-def run(tmp_path_factory):
+def run(runs, tmp_path_factory):
     """A finished run on the ball, at a size whose reduction is no multiple of 4."""
-    folder = tmp_path_factory.mktemp("evaluate")
-    scene = write_ball_scene(folder / "ball", size=60)
     changes = {"train__iterations": 40, "train__crop": 28, "train__final_prune_weight": 0}
-    assert main(arguments(scene, folder / "run", **changes)) == 0
-    return folder / "run"
+    return runs.trained(tmp_path_factory.mktemp("evaluate") / "run", runs.ball(size=60), **changes)
 
 
 def test_the_files_hold_what_was_measured_and_shown(run, capsys):

@@ -23,7 +23,7 @@ from support.faults import (
     leftovers,
     run_command,
 )
-from support.runs import arguments, share_device
+from support.runs import arguments
 from support.scenes import write_ball_scene
 
 ROOT = Path(__file__).parents[1]
@@ -46,10 +46,7 @@ CHANGES = {
 
 @pytest.fixture(scope="module")
 def bench(tmp_path_factory):
-    """One device for all commands."""
-    with pytest.MonkeyPatch.context() as patch:
-        share_device(patch)
-        yield Bench(tmp_path_factory.mktemp("faults").resolve())
+    return Bench(tmp_path_factory.mktemp("faults").resolve())
 
 
 class Bench:

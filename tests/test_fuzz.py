@@ -76,8 +76,8 @@ ENDING = {
 
 
 @pytest.fixture(scope="module")
-def world(tmp_path_factory):
-    with opened_world(tmp_path_factory.mktemp("fuzz")) as world:
+def world(tmp_path_factory, session_device):
+    with opened_world(tmp_path_factory.mktemp("fuzz"), session_device) as world:
         yield world
 
 

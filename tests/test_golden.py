@@ -9,6 +9,7 @@ import tempfile
 from pathlib import Path
 
 import pytest
+from support.runs import set_words
 from support.scenes import write_ball_scene
 
 from pp_cl.cli import main
@@ -42,8 +43,7 @@ def measure(folder):
     """{"loss": {step: loss}, "psnr": dB on the test views, "points": their final number}."""
     scene = write_ball_scene(folder / "ball", views=12, size=96)
     out = folder / "run"
-    sets = [word for key, value in SETTINGS.items() for word in ("--set", f"{key}={value}")]
-    assert main(["train", scene, "--out", str(out), *sets]) == 0
+    assert main(["train", scene, "--out", str(out), *set_words(SETTINGS)]) == 0
     assert main(["eval", str(out)]) == 0
     rows = [json.loads(line) for line in (out / "log.jsonl").read_text().splitlines()]
     metrics = json.loads((out / "eval" / "metrics.json").read_text())

@@ -20,8 +20,8 @@ from pp_cl.scene.load import load_scene
 
 
 @pytest.fixture(scope="module")
-def scene(tmp_path_factory):
-    return write_ball_scene(tmp_path_factory.mktemp("shape") / "ball", views=6, size=40)
+def scene(runs):
+    return runs.ball(views=6, size=40)
 
 
 @pytest.fixture(scope="module")
@@ -31,8 +31,9 @@ def mesh():
 
 
 @pytest.fixture(scope="module")
-def trained(scene, tmp_path_factory):
-    return train(scene, tmp_path_factory.mktemp("shape") / "run", points__count=1000)
+def trained(runs, scene, tmp_path_factory):
+    out = tmp_path_factory.mktemp("shape") / "run"
+    return runs.trained(out, scene, 1, train__iterations=20, points__count=1000)
 
 
 def train(scene, out, **changes):

@@ -74,10 +74,9 @@ class Recorder:
     [
         ("tiny", False),
         ("paper", True),
-        *(
-            pytest.param(*case, marks=pytest.mark.slow)
-            for case in (("tiny", True), ("paper", False), ("paper, crops", True))
-        ),
+        ("tiny", True),
+        ("paper", False),
+        ("paper, crops", True),
     ],
 )
 def test_a_step_waits_once_and_allocates_nothing(dev, scene, tmp_path, monkeypatch, name, planned):

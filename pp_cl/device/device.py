@@ -125,6 +125,13 @@ def _debug_level():
     return int(text)
 
 
+def _released(device, nbytes):
+    """Memory of a device has ended. device: a weak reference."""
+    alive = device()
+    if alive is not None:
+        alive.bytes -= nbytes
+
+
 class Memory(cl.Buffer):
     """A buffer whose end can be noticed: cl.Buffer takes no weak reference."""
 
@@ -362,14 +369,12 @@ class Device:
         memory = self._memory(nbytes)
         self.bytes += nbytes
         self.peak_bytes = max(self.peak_bytes, self.bytes)
-        weakref.finalize(memory, self._released, nbytes)
+        # weakly: scratch memory that kept its device alive would never end, nor would the device
+        weakref.finalize(memory, _released, weakref.ref(self), nbytes)
         return memory
 
     def _memory(self, nbytes):
         return Memory(self.context, cl.mem_flags.READ_WRITE, nbytes)
-
-    def _released(self, nbytes):
-        self.bytes -= nbytes
 
     def observe(self, kernel: Kernel, event: cl.Event, arguments: dict[str, Any]) -> None:
         """PP_DEBUG 1, 2: wait, note the kernel's time. PP_DEBUG 3: stop at the first NaN or Inf in

@@ -3,8 +3,6 @@
 import json
 
 import pytest
-from support.runs import arguments
-from support.scenes import write_ball_scene
 
 from pp_cl.bench import model as module
 from pp_cl.bench.model import TRIED, bench_models, line
@@ -14,13 +12,12 @@ from pp_cl.run import load_run
 
 
 @pytest.fixture(scope="module")
-def trained(tmp_path_factory):
+def trained(runs, tmp_path_factory):
     """Two runs of 20 steps, the second with one convolution a level."""
-    folder = tmp_path_factory.mktemp("model")
-    scene = write_ball_scene(folder / "ball", views=9, size=40)
+    folder, scene = tmp_path_factory.mktemp("model"), runs.ball(views=9, size=40)
     for name, blocks in (("a", "double"), ("b", "single")):
         changes = {"train__iterations": 20, "network__blocks": blocks, "train__previews": 0}
-        assert main(arguments(scene, folder / name, 1, **changes)) == 0
+        runs.trained(folder / name, scene, 1, **changes)
     return folder
 
 

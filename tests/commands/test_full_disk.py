@@ -5,8 +5,6 @@ import os
 import shutil
 
 import pytest
-from support.runs import arguments
-from support.scenes import write_ball_scene
 
 from pp_cl.cli import main
 
@@ -32,12 +30,9 @@ OUTPUTS = {
 
 
 @pytest.fixture(scope="module")
-def folders(tmp_path_factory):
+def folders(scene, finished):
     """{name: folder} of a small run and its scene."""
-    folder = tmp_path_factory.mktemp("disk")
-    ball = write_ball_scene(folder / "ball")
-    assert main(arguments(ball, folder / "run", train__iterations=30)) == 0
-    return {"RUN": str(folder / "run"), "BALL": ball}
+    return {"RUN": str(finished), "BALL": scene}
 
 
 def full(*_):

@@ -10,8 +10,6 @@ import numpy as np
 import OpenEXR
 import pytest
 from filelock import FileLock
-from support.runs import arguments
-from support.scenes import write_ball_scene
 
 from pp_cl.cli import main
 from pp_cl.export import film
@@ -20,11 +18,9 @@ from pp_cl.run import Run
 
 
 @pytest.fixture(scope="module")
-def trained(tmp_path_factory):
+def trained(finished):
     """Folder of a small run, as text."""
-    folder = tmp_path_factory.mktemp("render")
-    assert main(arguments(write_ball_scene(folder / "ball"), folder / "run")) == 0
-    return str(folder / "run")
+    return str(finished)
 
 
 def test_a_film_is_what_its_name_says_and_leaves_nothing_beside_it(trained, tmp_path, capsys):

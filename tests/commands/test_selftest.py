@@ -33,7 +33,8 @@ def test_all_pass(few, dev, tmp_path, capsys):
     assert stored["passed"] and [row["case"] for row in stored["cases"]] == list(NAMES)
 
 
-def test_a_perturbed_kernel_is_status_1_and_named(few, tmp_path, monkeypatch, capsys):
+def test_a_perturbed_kernel_is_status_1_and_named(few, dev, tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(dev, "_programs", {})
     shutil.copytree(device_module.kernel_folder(), tmp_path / "cl")
     path = tmp_path / "cl" / "training" / "refine.cl"
     path.write_text(path.read_text().replace("1.0f + sqrt", "1.0f - sqrt"))

@@ -18,7 +18,7 @@ from pp_cl.train import Trainer
 ROOT = Path(__file__).parents[2]
 
 
-@pytest.fixture
+@pytest.fixture(scope="module")
 def whole(finished):
     """The checkpoint of a training that was not stopped."""
     return (finished / "checkpoint.npz").read_bytes()

@@ -1,11 +1,13 @@
 """A device: its buffers, its errors, its programs and its debug levels."""
 
 import atexit
+import gc
 import os
 import re
 import subprocess
 import sys
 import time
+import weakref
 
 import numpy as np
 import pyopencl as cl
@@ -37,6 +39,16 @@ def tiny(tmp_path, monkeypatch):
     (tmp_path / "tiny.cl").write_text(TINY)
     monkeypatch.setattr(device_module, "kernel_folder", lambda: tmp_path)
     return tmp_path
+
+
+def test_a_device_that_nobody_has_is_gone_with_its_memory(session_device):
+    device = Device(session_device.device)
+    device.scratch("mine", 100)
+    device.program("training/adam")
+    gone = weakref.ref(device)
+    del device
+    gc.collect()
+    assert gone() is None
 
 
 # ---- buffers

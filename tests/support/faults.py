@@ -15,7 +15,9 @@ import sys
 from pathlib import Path
 from unittest.mock import patch
 
-from pp_cl.cli import main, program
+from support.runs import spoken
+
+from pp_cl.cli import program
 from pp_cl.errors import UserError
 from pp_cl.files.checkpoint import load_checkpoint
 from pp_cl.files.image import read_rgba
@@ -120,13 +122,10 @@ def run_command(words, run=""):
     """(exit status, what is wrong with how it ended): it may warn, and tells of its end in one
     line, which names a file of the run.
     """
-    errors = io.StringIO()
-    with contextlib.redirect_stdout(io.StringIO()), contextlib.redirect_stderr(errors):
-        try:
-            status = main([str(word) for word in words])
-        except Exception as error:
-            return 1, [repr(error)]
-    lines = errors.getvalue().splitlines()
+    try:
+        status, lines = spoken(words)
+    except Exception as error:
+        return 1, [repr(error)]
     told = [line for line in lines if line.startswith(("pp-cl: ", "pp-cl "))]
     wrong = [] if status in (0, 2) else [f"status {status}"]
     if status and (len(told) != 1 or lines[-1] != told[0] or str(run) not in told[0]):

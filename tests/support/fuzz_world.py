@@ -4,8 +4,8 @@ input that is taken and sound, or refused in one line with exit status 2.
 
 import contextlib
 import faulthandler
+import functools
 import importlib
-import io
 import json
 import os
 import resource
@@ -17,10 +17,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from support.runs import share_device
+from support import runs
 from support.scenes import ball_image, ring_cameras
 
-from pp_cl.cli import main
 from pp_cl.errors import UserError
 from pp_cl.files.checkpoint import load_checkpoint
 from pp_cl.files.run_folder import RunFolder
@@ -54,10 +53,8 @@ SETTINGS = {
 }
 
 
-def set_words(**changes):
-    """--set words of a training that takes a moment; train__crop=8 sets train.crop."""
-    values = SETTINGS | {key.replace("__", "."): value for key, value in changes.items()}
-    return [word for key, value in values.items() for word in ("--set", f"{key}={value}")]
+# --set words of a training that takes a moment
+set_words = functools.partial(runs.set_words, SETTINGS)
 
 
 def ball_views():
@@ -69,10 +66,10 @@ def ball_views():
 
 
 class World:
-    """Templates below a folder, each made when it is asked for, and the one device of all runs."""
+    """Templates below a folder, each made when it is asked for, and the device of all runs."""
 
-    def __init__(self, folder):
-        self._folder = folder
+    def __init__(self, folder, device):
+        self._folder, self.device = folder, device
         self.cache = folder / "cache"
 
     def scene(self, name="nerf_synthetic", folder=None):
@@ -146,18 +143,15 @@ def _hang(*_):
 
 
 @contextlib.contextmanager
-def opened_world(folder):
-    """A World whose device the command line works on unless it names another."""
-    world = World(folder)
+def opened_world(folder, device):
+    """A World with the device that commands work on."""
+    world = World(folder, device)
     world.cache.mkdir()
     limits = resource.getrlimit(resource.RLIMIT_AS)
     used = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
     handler = signal.signal(signal.SIGALRM, _hang)
     with pytest.MonkeyPatch.context() as patch:
-        world.device = share_device(patch)
         patch.setenv("PP_CACHE", str(world.cache))
-        patch.delenv("PP_DEBUG", raising=False)
-        patch.delenv("PP_MAX_ALLOCATION", raising=False)
         resource.setrlimit(resource.RLIMIT_AS, (used + MEMORY, limits[1]))
         try:
             world.run(folder, finished=True)  # builds the kernels, which no input has to wait for
@@ -183,13 +177,7 @@ def taken(function):
 
 def command(*words):
     """The exit status of the command line: 0, 2 with one line as the last, or 130."""
-    out, err = io.StringIO(), io.StringIO()
-    with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
-        try:
-            status = main([str(word) for word in words])
-        except SystemExit as end:  # --help
-            status = end.code or 0
-    lines = [line for line in err.getvalue().splitlines() if line]
+    status, lines = runs.spoken(words)
     assert status in (0, 2, 130), lines[-1:]
     if status == 2:
         assert lines and lines[-1].startswith(("pp-cl: ", "pp-cl ")), lines[-1:]

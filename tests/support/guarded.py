@@ -1,6 +1,7 @@
 """Shared by the tests: guarded buffers, finite differences, real data."""
 
 import os
+import weakref
 from pathlib import Path
 
 import numpy as np
@@ -16,6 +17,7 @@ DATA = Path(
 AWKWARD_SIZES = (1, 31, 33, 257)  # below, at and beside every vector width and work-group size
 CANARY_BYTES = 256
 CANARY = 0xA5
+MOST_UNCHECKED = 2**28  # bytes of buffers that are gone and wait for a check
 
 
 def large(*values):
@@ -32,15 +34,19 @@ class GuardedDevice(Device):
 
     def __init__(self, device):
         super().__init__(device)
-        self._guarded = []
+        self._guarded, self._unchecked = [], 0
 
     def _memory(self, nbytes):
+        if self._unchecked > MOST_UNCHECKED:
+            self.check()
         poison = np.full(nbytes + self.canary_bytes, 0xFF, np.uint8)
         poison[nbytes:] = CANARY
         flags = cl.mem_flags.READ_WRITE | cl.mem_flags.COPY_HOST_PTR
         memory = Memory(self.context, flags, hostbuf=poison)
         # a reference of its own, so that the device counts the memory as released in time
-        self._guarded.append((cl.Buffer.from_int_ptr(memory.int_ptr), nbytes))
+        buffer = cl.Buffer.from_int_ptr(memory.int_ptr)
+        self._guarded.append((weakref.ref(memory), buffer, nbytes))
+        self._unchecked += nbytes
         return memory
 
     def scratch(self, name, n, dtype=np.float32, **options):
@@ -48,14 +54,16 @@ class GuardedDevice(Device):
         return super().scratch((name, n), n, dtype, **options)
 
     def check(self):
-        """Fail if a kernel wrote behind a buffer allocated since the last check, temporary ones
-        included.
+        """Fail if a kernel wrote behind a buffer that is in use or was since the last check,
+        temporary ones included.
         """
-        guarded, self._guarded = self._guarded, []
+        self.finish()
+        guarded, self._guarded, self._unchecked = self._guarded, [], 0
         tail = np.empty(CANARY_BYTES, np.uint8)
-        for buffer, nbytes in guarded:
+        for _, buffer, nbytes in guarded:
             cl.enqueue_copy(self.queue, tail, buffer, src_offset=nbytes)
             assert (tail == CANARY).all(), f"a kernel wrote behind a buffer of {nbytes} bytes"
+        self._guarded = [entry for entry in guarded if entry[0]() is not None]
 
 
 class TracedDevice(GuardedDevice):
@@ -108,6 +116,6 @@ class TracedDevice(GuardedDevice):
         """Fail if Oclgrind has reported anything since the last check; all buffers stay in
         _guarded.
         """
-        reports = self._log.read_text()
+        reports, self._unchecked = self._log.read_text(), 0
         new, self._reported = reports[self._reported :], len(reports)
         assert not new, new[:2000]

@@ -1,13 +1,17 @@
-"""Trainings started, interrupted and resumed as a user does."""
+"""Trainings started, interrupted and resumed as a user does; finished ones that tests share."""
 
-import importlib
-import os
-import pkgutil
-import sys
+import contextlib
+import functools
+import hashlib
+import io
+import json
+import shutil
+from pathlib import Path
 
-import pp_cl
+from filelock import FileLock
+from support.scenes import write_ball_scene
+
 from pp_cl.cli import main
-from pp_cl.device.discover import open_device
 from pp_cl.train import Trainer
 
 # Every mechanism of the loop is due several times within 60 steps.
@@ -26,9 +30,64 @@ SETTINGS = {
 
 def arguments(scene, out, downscale=2, **changes):
     """Command line of a small training."""
-    settings = SETTINGS | {k.replace("__", "."): v for k, v in changes.items()}
-    sets = [word for key, value in settings.items() for word in ("--set", f"{key}={value}")]
+    sets = set_words(SETTINGS, **changes)
     return ["train", scene, "--out", str(out), "--downscale", str(downscale), *sets]
+
+
+def set_words(settings, **changes):
+    """--set words of settings; train__crop=8 sets train.crop."""
+    settings = settings | {key.replace("__", "."): value for key, value in changes.items()}
+    return [word for key, value in settings.items() for word in ("--set", f"{key}={value}")]
+
+
+def spoken(words):
+    """(exit status, lines on stderr) of a command."""
+    errors = io.StringIO()
+    with contextlib.redirect_stdout(io.StringIO()), contextlib.redirect_stderr(errors):
+        try:
+            status = main([str(word) for word in words])
+        except SystemExit as end:  # --help
+            status = end.code or 0
+    return status, [line for line in errors.getvalue().splitlines() if line]
+
+
+class Runs:
+    """Scenes and finished runs, each made once for all processes of a test run."""
+
+    def __init__(self, folder):
+        self._folder = folder
+
+    def made(self, name, make):
+        """The folder of this name that make(folder) has filled; nobody changes what is in it."""
+        folder = self._folder / name
+        with FileLock(f"{folder}.lock"):
+            if not folder.exists():
+                try:
+                    make(folder)
+                except BaseException:
+                    shutil.rmtree(folder, ignore_errors=True)
+                    raise
+        return folder
+
+    def ball(self, **shape):
+        """Folder of a scene of write_ball_scene(), as text."""
+        make = functools.partial(write_ball_scene, **shape)
+        return str(self.made(_name("ball", shape), make))
+
+    def trained(self, out, scene, downscale=2, **changes):
+        """Make `out` what a small training on a scene of ball() leaves. Returns it."""
+
+        def train(folder):
+            assert main(arguments(scene, folder, downscale, **changes)) == 0
+
+        name = _name(Path(scene).name, {"downscale": downscale} | changes)
+        return Path(shutil.copytree(self.made(name, train), out))
+
+
+def _name(kind, values):
+    """A file's name for values of a kind."""
+    text = json.dumps(values, sort_keys=True)
+    return f"{kind}-{hashlib.sha256(text.encode()).hexdigest()[:16]}"
 
 
 def train_and_interrupt(scene, out, steps, monkeypatch, **changes):
@@ -44,22 +103,3 @@ def train_and_interrupt(scene, out, steps, monkeypatch, **changes):
     with monkeypatch.context() as patch:
         patch.setattr(Trainer, "train_step", stopping)
         assert main(arguments(scene, out, **changes)) == 130
-
-
-def share_device(patch):
-    """Let all commands work on one device, whose programs stay built, until a MonkeyPatch is
-    undone, unless a command names one. Returns it.
-    """
-    for module in pkgutil.walk_packages(pp_cl.__path__, "pp_cl."):
-        if not module.name.endswith("__main__"):
-            importlib.import_module(module.name)
-    device = open_device()
-
-    def shared(choice=None):
-        named = choice or os.environ.get("PP_DEVICE") or os.environ.get("PP_MAX_ALLOCATION")
-        return open_device(choice) if named else device
-
-    for name, module in list(sys.modules.items()):
-        if name.startswith("pp_cl.") and getattr(module, "open_device", None) is open_device:
-            patch.setattr(module, "open_device", shared)
-    return device

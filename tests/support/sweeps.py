@@ -3,7 +3,7 @@
 import json
 
 from support.checkpoints import contents
-from support.runs import SETTINGS
+from support.runs import SETTINGS, set_words
 
 from pp_cl.files.run_folder import RunFolder
 from pp_cl.session import run_config
@@ -22,8 +22,7 @@ def jobs_of(scenes, out, seeds=(0,), varied=(), **options):
 
 def words_of(scenes, out, *more, changes=None):
     """Command line of the same sweep, with other settings where there are changes."""
-    settings = SETS | (changes or {})
-    sets = [word for key, value in settings.items() for word in ("--set", f"{key}={value}")]
+    sets = set_words(SETS | (changes or {}))
     return ["sweep", *map(str, scenes), "--out", str(out), *sets, *map(str, more)]
 
 

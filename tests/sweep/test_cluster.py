@@ -20,6 +20,8 @@ from pp_cl.files.run_folder import RunFolder
 from pp_cl.sweep import cluster
 from pp_cl.sweep.result import finished_row
 
+pytestmark = pytest.mark.slow
+
 
 def _about_worker():
     return os.environ.get("PP_DEVICE"), os.getpid(), signal.getsignal(signal.SIGINT)

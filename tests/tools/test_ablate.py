@@ -9,6 +9,8 @@ from support.scenes import write_ball_scene
 
 from pp_cl.train import Trainer
 
+pytestmark = pytest.mark.slow
+
 
 def load_tool(name):
     path = Path(__file__).parents[2] / "tools" / f"{name}.py"

@@ -9,6 +9,8 @@ from scipy.spatial.transform import Rotation
 from pp_cl.files.image import read_rgba
 from tools.colmap_demo import ROOM, align, cameras, room, write_photographs
 
+pytestmark = pytest.mark.slow
+
 
 def test_the_wall_is_the_same_from_everywhere():
     """A place on the wall has one colour, whichever camera shows it, up to interpolation."""

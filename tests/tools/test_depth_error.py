@@ -1,10 +1,13 @@
 """The exact depth of the demo against the mesh of the same object, and the measures."""
 
 import numpy as np
+import pytest
 import trimesh
 
 from pp_cl.scene.demo import demo_frames, demo_mesh
 from tools.depth_error import DemoSurface, near_share, overlap, pixel_rays
+
+pytestmark = pytest.mark.slow
 
 
 def test_the_depth_is_where_rays_meet_the_mesh(dev, rng):

@@ -8,6 +8,7 @@ import pytest
 from support.scenes import write_ball_scene
 
 from pp_cl.config import assign, preset, validate
+from pp_cl.device.device import Device
 from pp_cl.scene.load import load_scene
 
 SPEC = importlib.util.spec_from_file_location(
@@ -27,7 +28,8 @@ def test_the_settings_of_each_training_are_allowed(name):
     validate(config, name)
 
 
-def test_a_row_is_what_a_training_took(tmp_path, monkeypatch):
+def test_a_row_is_what_a_training_took(session_device, tmp_path, monkeypatch):
+    monkeypatch.setattr(TOOL, "open_device", lambda: Device(session_device.device))
     monkeypatch.setitem(TOOL.TRAININGS, "mini", ("tiny", SETTINGS))
     row = TOOL.peaks("mini", write_ball_scene(tmp_path / "ball"))
     assert row["name"] == "mini" and 300 < row["points"] < 500

@@ -9,6 +9,8 @@ from support.scenes import write_ball_scene
 from pp_cl.cli import main as pp_cl
 from tools.sparse_tiles import main
 
+pytestmark = pytest.mark.slow
+
 
 @pytest.fixture(scope="module")
 def run(tmp_path_factory):

@@ -232,13 +232,12 @@ def test_coefficients_of_16_bits_are_those_of_a_finished_run_in_all_degrees(fold
 
 
 @pytest.fixture(scope="module")
-def trained(scene, tmp_path_factory):
+def trained(scene, finished, tmp_path_factory):
     """(folder of a finished run, of one interrupted at step 20)."""
-    out = tmp_path_factory.mktemp("runs")
+    young = tmp_path_factory.mktemp("runs") / "young"
     with pytest.MonkeyPatch.context() as patch:
-        train_and_interrupt(scene, out / "young", 25, patch)
-    assert main(arguments(scene, out / "run")) == 0
-    return out / "run", out / "young"
+        train_and_interrupt(scene, young, 25, patch)
+    return finished, young
 
 
 BROKEN = {
