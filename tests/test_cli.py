@@ -54,7 +54,7 @@ def damaged_frame(**changes):
 # what the readers' own tests have in full
 DAMAGE = {
     "no such folder": (lambda s: s.rename(s.parent / "elsewhere"), "ball"),
-    "missing json": (lambda s: (s / "transforms_train.json").unlink(), "transforms_train.json"),
+    "missing json": (lambda s: (s / "transforms_train.json").unlink(), "ball: no split train"),
     "broken json": (
         lambda s: (s / "transforms_train.json").write_text('{"frames": ['),
         "transforms_train.json",

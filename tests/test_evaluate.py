@@ -121,7 +121,7 @@ def test_a_scene_that_has_moved_is_one_line_and_may_be_named(run, tmp_path, caps
 
 def test_a_missing_split_is_one_line(run, capsys):
     assert main(["eval", str(run), "--split", "val"]) == 2
-    assert "ball: no split val" in capsys.readouterr().err
+    assert ": no split val" in capsys.readouterr().err
 
 
 def test_the_demo_has_no_validation_views(dev, capsys):

@@ -34,6 +34,7 @@ def shown(training, stream, monkeypatch):
     """
     now = [1000.0]
     monkeypatch.setattr("pp_cl.commands.progress.time.monotonic", lambda: now[0])
+    monkeypatch.setenv("COLUMNS", "120")  # the rate, as tqdm measures it, has any number of digits
     with progress.Progress(training, stream) as follower:
         for step in range(101, 401):
             now[0] += 1 if step > 102 else 60
@@ -58,6 +59,7 @@ def test_things_are_counted(monkeypatch):
     now = [1000.0]
     monkeypatch.setattr("pp_cl.commands.progress.REDRAWN", 0)
     monkeypatch.setattr("pp_cl.commands.progress.time.monotonic", lambda: now[0])
+    monkeypatch.setenv("COLUMNS", "120")  # the rate, as tqdm measures it, has any number of digits
     plain, terminal = io.StringIO(), Terminal()
     for stream in (plain, terminal):
         with progress.counted("view", stream) as tell:

@@ -9,6 +9,7 @@ from support.runs import train_and_interrupt
 from pp_cl.cli import main
 from pp_cl.compress import search as search_module
 from pp_cl.compress.search import validation_views
+from pp_cl.config import load_config
 from pp_cl.run import load_run
 
 
@@ -68,7 +69,8 @@ def test_bad_input_ends_in_one_line(ball_run, tmp_path, capsys):
 
 
 def test_an_unfinished_run_is_refused(ball_run, tmp_path, capsys, monkeypatch):
-    train_and_interrupt(str(ball_run.parent / "ball"), tmp_path / "run", 12, monkeypatch)
+    scene = load_config(ball_run / "config.json").scene.path
+    train_and_interrupt(scene, tmp_path / "run", 12, monkeypatch)
     capsys.readouterr()
     assert main(["compress", str(tmp_path / "run")]) == 2
     assert "not finished" in capsys.readouterr().err

@@ -55,5 +55,5 @@ def test_a_scene_without_test_views_gives_training_views(run, run_folder, tmp_pa
     (tmp_path / "ball" / "transforms_test.json").unlink()
     moved = load_run(run.dev, run_folder, scene=str(tmp_path / "ball"))
     with pytest.warns(UserWarning, match="no test views are exported: .*test"):
-        splits = renderings(moved).splits
+        splits = renderings(moved)
     assert {split: len(views) for split, views in splits.items()} == {"train": 12}

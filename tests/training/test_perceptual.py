@@ -74,12 +74,12 @@ def test_sizes_may_change_between_calls_and_bits_stay(dev, rng, weights):
 
 
 @pytest.mark.large
-def test_tables_are_what_it_takes(dev, rng, weights):
-    before, policy, size = dev.bytes, make_policy(dev), (64, 40)
-    loss = PerceptualLoss(dev, WEIGHT, policy, weights)
+def test_tables_are_what_it_takes(plain, rng, weights):
+    before, policy, size = plain.bytes, make_policy(plain), (64, 40)
+    loss = PerceptualLoss(plain, WEIGHT, policy, weights)
     run(loss, *images(rng, *size))
-    tables = [PerceptualLoss.table((*size, 3), WIDTHS), Lpips.table(dev, policy, size, WIDTHS)]
-    assert dev.bytes - before == sum(map(table_bytes, tables))
+    tables = [PerceptualLoss.table((*size, 3), WIDTHS), Lpips.table(plain, policy, size, WIDTHS)]
+    assert plain.bytes - before == sum(map(table_bytes, tables))
 
 
 def _no_weights():
