@@ -11,12 +11,9 @@ from support.runs import arguments, train_and_interrupt
 from support.scenes import write_ball_scene
 
 from pp_cl.cli import main
-from pp_cl.config import Config
-from pp_cl.errors import UserError
 from pp_cl.files.image import read_rgba
 from pp_cl.metrics.psnr_ssim import psnr
 from pp_cl.run import image_files
-from pp_cl.scene.load import open_scene
 
 
 @pytest.fixture(scope="module")
@@ -119,18 +116,6 @@ def test_a_scene_that_has_moved_is_one_line_and_may_be_named(run, tmp_path, caps
     assert str(tmp_path / "other") in capsys.readouterr().err
 
 
-def test_a_missing_split_is_one_line(run, capsys):
-    assert main(["eval", str(run), "--split", "val"]) == 2
-    assert ": no split val" in capsys.readouterr().err
-
-
-def test_the_demo_has_no_validation_views(dev, capsys):
-    config = Config()
-    config.scene.path = "demo"
-    with pytest.raises(UserError, match="--split val: demo has train, test"):
-        open_scene(dev, config, ("val",))
-
-
 def changed_scene(run, tmp_path, split, name):
     """(copy of the run's scene in which a pixel of a photograph differs)."""
     scene = json.loads((run / "config.json").read_text())["scene"]["path"]
@@ -216,17 +201,6 @@ def test_an_evaluation_is_written_elsewhere_on_request(run, tmp_path, capsys):
     (out / "images" / "old.png").write_bytes(b"")
     assert main(["eval", str(copy), "--save-images", "--out", str(out)]) == 0
     assert files_of(out) == first
-
-
-def test_an_evaluation_does_not_replace_what_is_not_one(run, tmp_path, capsys):
-    (tmp_path / "images").mkdir()
-    (tmp_path / "images" / "holiday.png").write_bytes(b"mine")
-    (tmp_path / "file").write_text("mine")
-    for out, named in ((tmp_path, "holds other files"), (tmp_path / "file", "is not a folder")):
-        assert main(["eval", str(run), "--save-images", "--out", str(out)]) == 2
-        assert f"{out}: {named}" in capsys.readouterr().err
-    assert (tmp_path / "images" / "holiday.png").read_bytes() == b"mine"
-    assert (tmp_path / "file").read_text() == "mine"
 
 
 def test_an_evaluation_that_cannot_be_written_is_told_before_it_is_made(

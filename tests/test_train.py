@@ -153,13 +153,6 @@ def test_a_capped_grid_is_told(scene, tmp_path, capsys, monkeypatch):
     assert 500 < int(told[1]) < 1500
 
 
-def test_a_memory_that_is_too_small_is_one_line(scene, tmp_path, capsys):
-    assert main([*arguments(scene, tmp_path / "run"), "--memory", "0.001"]) == 2
-    captured = capsys.readouterr()
-    assert "--memory 0.001" in captured.err and captured.err.count("\n") == 1
-    assert not (tmp_path / "run").exists()
-
-
 @pytest.mark.parametrize("footprint, radius", [("disc", 0.0015), ("sphere", 0.05)])
 def test_the_other_footprints_train_too(scene, tmp_path, footprint, radius):
     out = tmp_path / "run"

@@ -95,12 +95,6 @@ def test_a_start_without_a_checkpoint_keeps_what_is_not_said_anew(tmp_path, monk
     assert (config.scene.downscale, config.points.count, config.train.crop) == (2, 1500, 24)
 
 
-def test_the_scene_is_named_in_one_place(tmp_path, capsys):
-    words = arguments(tmp_path / "a", tmp_path / "run", scene__path=tmp_path / "b")
-    assert main([str(word) for word in words]) == 2
-    assert "--set: scene.path is what SCENE or --scene says" in capsys.readouterr().err
-
-
 def test_a_folder_that_may_not_be_written_is_told_before_the_hull(tmp_path, capsys, monkeypatch):
     scene, out = write_ball_scene(tmp_path / "ball"), tmp_path / "there" / "run"
     monkeypatch.setattr("os.access", lambda path, _mode: Path(path) != tmp_path)
