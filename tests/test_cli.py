@@ -6,7 +6,6 @@ import json
 import signal
 import subprocess
 import sys
-from pathlib import Path
 from textwrap import dedent
 
 import numpy as np
@@ -50,19 +49,6 @@ def test_a_run_that_lies_in_runs_is_named(tmp_path, capsys, monkeypatch):
     (run / "config.json").write_text("{}")
     for command in ("eval", "info", "shape", "compress"):
         assert "runs/mine?" in failure(capsys, command, "mine")
-
-
-def test_help_lists_settings_and_the_module_runs():
-    run = subprocess.run(
-        [sys.executable, "-m", "pp_cl", "train", "--help"],
-        capture_output=True,
-        text=True,
-        cwd=Path(__file__).parents[1],
-        check=True,
-    )
-    assert "train.sh_rate" in run.stdout and "--downscale" in run.stdout
-    (line,) = [x for x in run.stdout.splitlines() if x.startswith("  train.iterations = ")]
-    assert line.endswith("small: 6000  full: 11000  paper: 50000")
 
 
 def test_compare_writes_the_table_and_the_file(tmp_path, capsys):

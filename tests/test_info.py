@@ -74,15 +74,6 @@ def test_a_run_says_what_its_files_say(scene, finished, facts):
     }
 
 
-def test_a_run_in_lines(finished, capsys):
-    assert main(["info", str(finished)]) == 0
-    text = capsys.readouterr().out
-    network = "16, 16, 16 channels, single blocks"
-    for part in ("preset tiny", "step 60 of 60, finished", "at the start)", network):
-        assert part in text
-    assert "pixels)" in text and "MiB" in text and "psnr" in text
-
-
 def test_an_unfinished_run_and_one_without_a_checkpoint(scene, tmp_path, facts, monkeypatch):
     train_and_interrupt(scene, tmp_path / "run", 25, monkeypatch)
     found = facts(tmp_path / "run")

@@ -49,6 +49,7 @@ REFUSED = [
     ("bench unet --plot b.xyz", "--plot"),
     ("sweep demo --out new --json none/a.json", "none/a.json"),
     ("selftest --json none/a.json", "none/a.json"),
+    *((f"{command} --out /proc/a", "/proc/a") for command in ("train BALL", "eval run")),
     ("train BALL --out full", "full"),
     ("train BALL --out file", "file"),
     ("train BALL --out file/new", "file/new"),
