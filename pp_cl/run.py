@@ -70,7 +70,7 @@ class Run:
         """The run's scene with one split. Raises UserError where it is missing, broken or another
         one than the run has learned.
         """
-        self.check_scene()
+        check_scene(self.config.scene.path)
         scene = open_scene(self.dev, self.config, (split,))
         self._compare(lambda: scene.splits.get("train") or self._some_photographs())
         return scene
@@ -105,7 +105,7 @@ class Run:
         """
         if split == "train":
             return kept_views(self.header["views"])
-        self.check_scene()
+        check_scene(self.config.scene.path)
         listed = scene_frames(self.config.scene.path, split)
         self._compare(list)
         return listed
@@ -116,10 +116,6 @@ class Run:
         """
         downscale = self.config.scene.downscale
         return [one.camera.downscaled(downscale) for one in self.photographs(split)]
-
-    def check_scene(self) -> None:
-        """Raise UserError where the run's scene is not where its settings say."""
-        check_scene(self.config.scene.path)
 
     @cached_property
     def ball(self) -> tuple[np.ndarray, float]:

@@ -15,7 +15,7 @@ from pp_cl.files.checkpoint import load_checkpoint, save_checkpoint
 from pp_cl.files.run_folder import MOST_NUMBER, read_row
 from pp_cl.scene.readers.common import MOST, read_numbers
 from pp_cl.scene.readers.frame import rigid
-from pp_cl.sweep.plan import read_seeds, read_varied
+from pp_cl.sweep.plan import read_varied
 
 json_values = st.recursive(
     st.none() | st.booleans() | st.integers() | st.floats() | st.text(),
@@ -129,11 +129,6 @@ def test_what_is_taken_for_a_pose_is_rigid(matrix):
         assert np.allclose(pose[:, :3] @ pose[:, :3].T, np.eye(3), atol=1e-12)
         assert np.linalg.det(pose[:, :3]) > 0
         assert np.abs(pose - given_matrix).max() < 1e-3
-
-
-@given(st.lists(st.integers(0, 2**31 - 1), min_size=1), st.sampled_from([",", " , "]))
-def test_seeds_are_sorted_and_each_once(seeds, comma):
-    assert read_seeds(comma.join(map(str, seeds))) == sorted(set(seeds))
 
 
 @given(given_settings())

@@ -238,18 +238,14 @@ def show(path: Path | str) -> None:
 
 
 def add_set(parser: argparse.ArgumentParser, text: str) -> None:
-    """Add --set, for read_set. text: its help."""
+    """Add --set: [(key, text of the value, origin)]. text: its help."""
     parser.add_argument(
-        "--set", action="append", default=[], metavar="SECTION.KEY=VALUE", help=text
+        "--set", action="append", default=[], type=_setting, metavar="SECTION.KEY=VALUE", help=text
     )
 
 
-def read_set(texts: list[str]) -> list[tuple[str, str, str]]:
-    """[(key, value, origin)] of the texts of --set. Raises UserError for one without =."""
-    given = []
-    for text in texts:
-        key, equals, value = text.partition("=")
-        if not equals:
-            raise UserError(f"--set {text}: write --set section.key=value")
-        given.append((key.strip(), value.strip(), "--set"))
-    return given
+def _setting(text):
+    key, equals, value = text.partition("=")
+    if not equals:
+        raise argparse.ArgumentTypeError(f"{quoted(text)}: write section.key=value")
+    return key.strip(), value.strip(), "--set"

@@ -115,7 +115,7 @@ REFUSED = [
     (f"{TRAIN} --downscale 2 --points 300 --set train.refine_at=0.3,0.6", "train.refine_at"),
     (f"{TRAIN} --set train.crop=6", "--set: train.crop"),
     (f"{TRAIN} --set train.sped=1", "train.sped"),
-    (f"{TRAIN} --set nonsense", "--set nonsense"),
+    (f"{TRAIN} --set nonsense", "--set"),
     (f"{TRAIN} --set scene.path=b", "scene.path"),
     (f"{TRAIN} --preset huge", "--preset"),
     ("sweep demo --out new --seeds a", "--seeds"),
