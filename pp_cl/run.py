@@ -262,7 +262,7 @@ def evaluate(
     be written, and an `out` that holds something else than an evaluation.
     """
     target = run.folder.evaluation(split) if out is None else Path(out)
-    check_target(target, is_new=out is not None)
+    _check_target(target, is_new=out is not None)
     scene = run.scene(split)
     views = scene.splits[split]
     measure = Metrics(run.dev, metrics, run.policy)
@@ -293,7 +293,7 @@ def evaluate(
     return result
 
 
-def check_target(target: Path, *, is_new: bool) -> None:
+def _check_target(target, *, is_new):
     """Raise UserError where an evaluation cannot be written into a folder. is_new: nor if it holds
     files of others, of which images/ would be removed.
     """

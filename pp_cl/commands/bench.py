@@ -110,9 +110,8 @@ def _refuse_foreign(options):
             "--tolerance: bench conv shows every variant; give it to bench unet, whose auto picks"
             " among them"
         )
-    for name in {name for names in OPTIONS.values() for name in names} - {*OPTIONS[options.what]}:
-        if getattr(options, name) not in (None, False, []):
-            raise UserError(f"--{name}: bench {options.what} has no such option; leave it out")
+    foreign = {name for names in OPTIONS.values() for name in names} - {*OPTIONS[options.what]}
+    shared.refuse(options, foreign, f"bench {options.what} has no such option")
 
 
 # ---- each bench: (what --json writes, draws it into a figure)

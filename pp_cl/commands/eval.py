@@ -45,12 +45,10 @@ def run(options: argparse.Namespace) -> None:
     from pp_cl.bench.plots import figure_of, plot_ranks, save_figure
     from pp_cl.commands.progress import counted
     from pp_cl.device.discover import open_device
-    from pp_cl.run import check_target, evaluate, load_run
+    from pp_cl.run import evaluate, load_run
 
     metrics, tolerance = options.metrics, options.tolerance
     figure = figure_of(options.chart, "--chart")
-    if options.out:
-        check_target(Path(options.out), is_new=True)
     dev = open_device(options.device)
     run = load_run(dev, options.run_folder, tolerance=tolerance, scene=options.scene)
     print(run.policy.origin)

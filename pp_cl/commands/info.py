@@ -43,10 +43,10 @@ def run(options: argparse.Namespace) -> None:
     folder = RunFolder(options.subject)
     is_scene = options.subject == DEMO or folder.path.exists() or not nearby_run(folder.path)
     is_run = folder.config.exists() or not is_scene
-    for name in ("masks", "mask_from", "set", "preset") if is_run else ("scene",):
-        if getattr(options, name):
-            what = "scene" if is_run else "run"
-            raise UserError(f"--{name.replace('_', '-')}: only of a {what}; leave it out")
+    if is_run:
+        shared.refuse(options, ("masks", "mask_from", "set", "preset"), "only of a scene")
+    else:
+        shared.refuse(options, ("scene",), "only of a run")
     image = None
     if is_run:
         facts = run_facts(folder, options.scene)

@@ -127,6 +127,14 @@ figure_file = output_file(".png", ".svg", ".pdf")
 # ---- options
 
 
+def refuse(options: argparse.Namespace, names: Iterable[str], why: str) -> None:
+    """Raise UserError for an option out of `names` that was given. why: it makes no sense here."""
+    for name in names:
+        value = getattr(options, name)
+        if not (value is None or value is False or value == []):
+            raise UserError(f"--{name.replace('_', '-')}: {why}; leave it out")
+
+
 def add_json(parser: argparse.ArgumentParser) -> None:
     """Add --json, for write_json_option and tell: the name of a file, or sys.stdout, which then
     has nothing but the JSON: cli.main() sends what is printed meanwhile to stderr.
