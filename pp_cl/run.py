@@ -70,7 +70,7 @@ class Run:
         """The run's scene with one split. Raises UserError where it is missing, broken or another
         one than the run has learned.
         """
-        self.check_scene()
+        check_scene(self.config.scene.path)
         scene = open_scene(self.dev, self.config, (split,))
         self._compare(lambda: scene.splits.get("train") or self._some_photographs())
         return scene
@@ -105,7 +105,7 @@ class Run:
         """
         if split == "train":
             return kept_views(self.header["views"])
-        self.check_scene()
+        check_scene(self.config.scene.path)
         listed = scene_frames(self.config.scene.path, split)
         self._compare(list)
         return listed
@@ -116,10 +116,6 @@ class Run:
         """
         downscale = self.config.scene.downscale
         return [one.camera.downscaled(downscale) for one in self.photographs(split)]
-
-    def check_scene(self) -> None:
-        """Raise UserError where the run's scene is not where its settings say."""
-        check_scene(self.config.scene.path)
 
     @cached_property
     def ball(self) -> tuple[np.ndarray, float]:
@@ -266,7 +262,7 @@ def evaluate(
     be written, and an `out` that holds something else than an evaluation.
     """
     target = run.folder.evaluation(split) if out is None else Path(out)
-    check_target(target, is_new=out is not None)
+    _check_target(target, is_new=out is not None)
     scene = run.scene(split)
     views = scene.splits[split]
     measure = Metrics(run.dev, metrics, run.policy)
@@ -297,7 +293,7 @@ def evaluate(
     return result
 
 
-def check_target(target: Path, *, is_new: bool) -> None:
+def _check_target(target, *, is_new):
     """Raise UserError where an evaluation cannot be written into a folder. is_new: nor if it holds
     files of others, of which images/ would be removed.
     """

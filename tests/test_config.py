@@ -5,17 +5,10 @@ import os
 
 import pytest
 
-from pp_cl.config import Config, assign, configure, help_lines, load_config, preset, validate
+from pp_cl.config import Config, assign, help_lines, load_config, preset, validate
 from pp_cl.errors import UserError
 from pp_cl.network.layers import convolutions, unet_layers
 from pp_cl.presets import PRESETS
-
-
-def test_the_scene_is_said_once():
-    with pytest.raises(UserError, match="^--set: scene.path is what SCENE"):
-        configure(
-            preset("tiny"), "demo", [("train.crop", "8", "--set"), ("scene.path", "x", "--set")]
-        )
 
 
 @pytest.mark.parametrize("name", PRESETS)

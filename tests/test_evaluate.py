@@ -2,7 +2,6 @@
 
 import json
 import shutil
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -11,12 +10,9 @@ from support.runs import arguments, train_and_interrupt
 from support.scenes import write_ball_scene
 
 from pp_cl.cli import main
-from pp_cl.config import Config
-from pp_cl.errors import UserError
 from pp_cl.files.image import read_rgba
 from pp_cl.metrics.psnr_ssim import psnr
 from pp_cl.run import image_files
-from pp_cl.scene.load import open_scene
 
 
 @pytest.fixture(scope="module")
@@ -76,59 +72,6 @@ def test_what_an_earlier_evaluation_left_goes_with_the_next(run):
 )
 def test_every_image_has_a_file_of_its_own(names, files):
     assert [str(path) for path in image_files(names)] == files
-
-
-def test_views_of_one_name_in_two_folders_are_both_saved(run, tmp_path):
-    """The scene lies elsewhere by now, and its test views in two folders."""
-    copy = tmp_path / "run"
-    shutil.copytree(run, copy)
-    assert main(["eval", str(copy), "--save-images"]) == 0
-    before = json.loads((copy / "eval" / "metrics.json").read_text())
-    moved = move_scene(copy, tmp_path / "moved")
-    content = json.loads((moved / "transforms_test.json").read_text())
-    for i, frame in enumerate(content["frames"]):
-        (moved / f"cam{i}").mkdir()
-        (moved / "test" / f"r_{i}.png").rename(moved / f"cam{i}" / "0001.png")
-        frame["file_path"] = f"./cam{i}/0001"
-    (moved / "transforms_test.json").write_text(json.dumps(content))
-    images = {i: (copy / "eval" / "images" / f"r_{i}.png").read_bytes() for i in range(2)}
-    assert main(["eval", str(copy), "--save-images", "--scene", str(moved)]) == 0
-    for i, image in images.items():
-        assert (copy / "eval" / "images" / f"cam{i}" / "0001.png").read_bytes() == image
-    assert json.loads((copy / "eval" / "metrics.json").read_text())["mean"] == before["mean"]
-
-
-def move_scene(run, to):
-    """Copy the run's scene to a new place and forget the old one."""
-    config = json.loads((run / "config.json").read_text())
-    shutil.copytree(config["scene"]["path"], to)
-    config["scene"]["path"] = str(to.parent / "gone")
-    (run / "config.json").write_text(json.dumps(config))
-    return to
-
-
-def test_a_scene_that_has_moved_is_one_line_and_may_be_named(run, tmp_path, capsys):
-    copy = tmp_path / "run"
-    shutil.copytree(run, copy)
-    moved = move_scene(copy, tmp_path / "moved")
-    assert main(["eval", str(copy)]) == 2
-    error = capsys.readouterr().err
-    assert str(tmp_path / "gone") in error and "--scene" in error and error.count("\n") == 1
-    assert main(["eval", str(copy), "--scene", str(moved)]) == 0
-    assert main(["eval", str(copy), "--scene", str(tmp_path / "other")]) == 2
-    assert str(tmp_path / "other") in capsys.readouterr().err
-
-
-def test_a_missing_split_is_one_line(run, capsys):
-    assert main(["eval", str(run), "--split", "val"]) == 2
-    assert ": no split val" in capsys.readouterr().err
-
-
-def test_the_demo_has_no_validation_views(dev, capsys):
-    config = Config()
-    config.scene.path = "demo"
-    with pytest.raises(UserError, match="--split val: demo has train, test"):
-        open_scene(dev, config, ("val",))
 
 
 def changed_scene(run, tmp_path, split, name):
@@ -216,24 +159,3 @@ def test_an_evaluation_is_written_elsewhere_on_request(run, tmp_path, capsys):
     (out / "images" / "old.png").write_bytes(b"")
     assert main(["eval", str(copy), "--save-images", "--out", str(out)]) == 0
     assert files_of(out) == first
-
-
-def test_an_evaluation_does_not_replace_what_is_not_one(run, tmp_path, capsys):
-    (tmp_path / "images").mkdir()
-    (tmp_path / "images" / "holiday.png").write_bytes(b"mine")
-    (tmp_path / "file").write_text("mine")
-    for out, named in ((tmp_path, "holds other files"), (tmp_path / "file", "is not a folder")):
-        assert main(["eval", str(run), "--save-images", "--out", str(out)]) == 2
-        assert f"{out}: {named}" in capsys.readouterr().err
-    assert (tmp_path / "images" / "holiday.png").read_bytes() == b"mine"
-    assert (tmp_path / "file").read_text() == "mine"
-
-
-def test_an_evaluation_that_cannot_be_written_is_told_before_it_is_made(
-    run, tmp_path, capsys, monkeypatch
-):
-    out = tmp_path / "there"
-    monkeypatch.setattr("os.access", lambda path, _mode: Path(path) != tmp_path)
-    monkeypatch.setattr("pp_cl.run.render_views", None)
-    assert main(["eval", str(run), "--out", str(out)]) == 2
-    assert f"{out}: may not be written" in capsys.readouterr().err and not out.exists()

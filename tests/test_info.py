@@ -12,7 +12,6 @@ from support.runs import arguments, train_and_interrupt
 from support.scenes import write_ball_scene
 
 from pp_cl.cli import main
-from pp_cl.config import preset
 from pp_cl.files.checkpoint import load_checkpoint
 from pp_cl.files.contact_sheet import GAP, HEADER
 from pp_cl.files.image import read_rgba
@@ -73,15 +72,6 @@ def test_a_run_says_what_its_files_say(scene, finished, facts):
         "blocks": "single",
         "parameters": parameters,
     }
-
-
-def test_a_run_in_lines(finished, capsys):
-    assert main(["info", str(finished)]) == 0
-    text = capsys.readouterr().out
-    network = "16, 16, 16 channels, single blocks"
-    for part in ("preset tiny", "step 60 of 60, finished", "at the start)", network):
-        assert part in text
-    assert "pixels)" in text and "MiB" in text and "psnr" in text
 
 
 def test_an_unfinished_run_and_one_without_a_checkpoint(scene, tmp_path, facts, monkeypatch):
@@ -149,13 +139,10 @@ def test_a_scene_in_lines_and_the_preset_of_its_hull(scene, capsys):
     assert "-0.000" not in text
 
 
-def test_settings_are_of_scenes_and_a_moved_scene_of_runs(scene, finished, tmp_path, capsys):
+def test_a_scene_takes_settings(tmp_path, capsys):
     path = write_ball_scene(tmp_path / "large", views=3, size=400)
     assert main(["info", "--json", path, "--set", "scene.downscale=4"]) == 0
     assert json.loads(capsys.readouterr().out)["downscale"] == 4
-    assert "--scene" in failure(capsys, scene, "--scene", scene)
-    for words in (["--masks", scene], ["--set", "train.seed=1"], ["--preset", "tiny"]):
-        assert words[0] in failure(capsys, finished, *words)
 
 
 def test_a_scene_without_masks_or_hull_has_a_picture(tmp_path, facts, capsys):
@@ -207,16 +194,6 @@ def test_the_demo_is_a_scene_too(facts, monkeypatch):
     found = facts("demo")
     assert found["format"] == "demo" and found["splits"] == {"train": 6, "test": 16}
     assert found["downscale"] == 2 and found["distances"] == pytest.approx([3.4, 3.4])
-
-
-def test_what_is_neither_is_one_line(tmp_path, capsys):
-    assert "no such folder" in failure(capsys, tmp_path / "none")
-    assert "no scene in it" in failure(capsys, tmp_path)
-    config = preset("tiny")
-    config.scene.path = "demo"
-    (tmp_path / "config.json").write_text(config.to_json())
-    (tmp_path / "checkpoint.npz").write_bytes(b"PK\x03\x04 not really")
-    assert "corrupt checkpoint" in failure(capsys, tmp_path)
 
 
 def test_a_broken_evaluation_is_one_line(finished, tmp_path, capsys):

@@ -15,8 +15,7 @@ from pp_cl.files.checkpoint import load_checkpoint, save_checkpoint
 from pp_cl.files.run_folder import MOST_NUMBER, read_row
 from pp_cl.scene.readers.common import MOST, read_numbers
 from pp_cl.scene.readers.frame import rigid
-from pp_cl.sweep.plan import read_seeds, read_varied
-from pp_cl.view.messages import read_request
+from pp_cl.sweep.plan import read_varied
 
 json_values = st.recursive(
     st.none() | st.booleans() | st.integers() | st.floats() | st.text(),
@@ -85,18 +84,6 @@ def test_settings_are_themselves_again_from_their_file(tmp_path, pair):
         assert config.train.crop % 4 and "train.crop" in str(error)
 
 
-@given(json_values)
-def test_whatever_is_in_a_config_is_settings_or_one_line(tmp_path, value):
-    stored = json.loads(preset("tiny").to_json()) | {"train": value}
-    (tmp_path / "config.json").write_text(json.dumps(stored))
-    try:
-        load_config(tmp_path / "config.json")
-    except UserError as error:
-        assert str(error).startswith(f"{tmp_path}/config.json: ")
-        return
-    raise AssertionError(f"{value!r} was taken for the settings of a training")
-
-
 @given(st.integers(0, 10**9), finite.filter(lambda x: 0 <= x < MOST_NUMBER), json_values)
 def test_a_row_of_the_log_is_finite_or_none(step, seconds, value):
     row = {"step": step, "seconds": seconds}
@@ -104,16 +91,6 @@ def test_a_row_of_the_log_is_finite_or_none(step, seconds, value):
     read = read_row(json.dumps(row | {"more": value}))
     assert read is None or json.loads(json.dumps(read, allow_nan=False)) == row | {"more": value}
     assert read_row(json.dumps(value)) is None or isinstance(value, dict)
-
-
-@given(st.binary(max_size=300))
-def test_no_bytes_of_a_log_or_of_a_message_are_an_error(data):
-    row = read_row(data)
-    assert row is None or row["step"] >= 0
-    try:
-        read_request(data.decode("utf-8", "replace"))
-    except UserError as error:
-        assert str(error)
 
 
 @given(st.lists(st.lists(finite.filter(lambda x: abs(x) < MOST), min_size=1), max_size=6))
@@ -152,11 +129,6 @@ def test_what_is_taken_for_a_pose_is_rigid(matrix):
         assert np.allclose(pose[:, :3] @ pose[:, :3].T, np.eye(3), atol=1e-12)
         assert np.linalg.det(pose[:, :3]) > 0
         assert np.abs(pose - given_matrix).max() < 1e-3
-
-
-@given(st.lists(st.integers(0, 2**31 - 1), min_size=1), st.sampled_from([",", " , "]))
-def test_seeds_are_sorted_and_each_once(seeds, comma):
-    assert read_seeds(comma.join(map(str, seeds))) == sorted(set(seeds))
 
 
 @given(given_settings())

@@ -1,7 +1,6 @@
 """A run's points against the surface of its object: a row of Table 4."""
 
 import json
-import shutil
 from dataclasses import asdict
 
 import numpy as np
@@ -91,33 +90,3 @@ def test_the_command_prints_and_writes_the_row(mesh, trained, tmp_path, capsys):
     assert lines[-1].split()[1:3] == [str(facts["after"]["points"]), f"{facts['after']['iou']:.4f}"]
     assert main(["shape", str(file), "--edge", "0.2", "--samples", "1000"]) == 0
     assert "edge 0.2" in capsys.readouterr().out
-
-
-WRONG = {
-    "no such subject": (["nothing"], "no such file"),
-    "samples 0": (["RUN", "--samples", "0"], "--samples"),
-    "samples in words": (["RUN", "--samples", "many"], "--samples"),
-    "too many samples": (["RUN", "--samples", str(2**31)], "--samples"),
-    "edge of a run": (["RUN", "--edge", "1"], "--edge"),
-    "mesh of a mesh": (["MESH", "--mesh", "MESH"], "--mesh"),
-    "edge 0": (["MESH", "--edge", "0"], "--edge"),
-    "edge NaN": (["MESH", "--edge", "nan"], "--edge"),
-    "a run without mesh": (["RUN"], "--mesh FILE"),
-    "a mesh that is missing": (["RUN", "--mesh", "none.ply"], "none.ply"),
-    "a folder that is no run": (["EMPTY"], "config.json"),
-    "a run that has no checkpoint": (["YOUNG", "--mesh", "MESH"], "checkpoint"),
-}
-
-
-@pytest.mark.parametrize("case", WRONG)
-def test_wrong_input_is_one_line(case, mesh, trained, tmp_path, capsys, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    trimesh.Trimesh(mesh.vertices, mesh.faces).export("ball.ply")
-    (tmp_path / "empty").mkdir()
-    shutil.copytree(trained, "young")
-    (tmp_path / "young" / "checkpoint.npz").unlink()
-    names = {"RUN": str(trained), "MESH": "ball.ply", "EMPTY": "empty", "YOUNG": "young"}
-    words, said = WRONG[case]
-    assert main(["shape", *(names.get(word, word) for word in words)]) == 2
-    [line] = [x for x in capsys.readouterr().err.splitlines() if x.startswith("pp-cl")]
-    assert said in line

@@ -3,13 +3,7 @@ not.
 """
 
 import json
-import os
 import re
-import signal
-import subprocess
-import sys
-import time
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -118,46 +112,12 @@ def test_bounded_memory_gives_the_same_bytes(scene, tmp_path, capsys, monkeypatc
     assert not (tmp_path / "smaller").exists()
 
 
-def test_killed_again_and_again_it_ends_with_the_same_bytes(scene, finished, tmp_path):
-    out = tmp_path / "killed"
-    command = [sys.executable, "-m", "pp_cl", *arguments(scene, out)]
-    environment = os.environ | {"PYTHONPATH": str(Path(__file__).parents[1])}
-    kills = 0
-    for wait in (0.3, 0.05, 0.6, 0.0):
-        process = subprocess.Popen(
-            command, env=environment, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
-        )
-        before = (out / "log.jsonl").stat().st_size if (out / "log.jsonl").exists() else 0
-        while process.poll() is None and not (
-            (out / "log.jsonl").exists() and (out / "log.jsonl").stat().st_size > before
-        ):
-            time.sleep(0.01)
-        time.sleep(wait)
-        if process.poll() is None:
-            process.send_signal(signal.SIGKILL)
-            kills += 1
-        process.wait()
-    assert kills >= 2, "the run ended before it could be killed"
-    subprocess.run(
-        command, env=environment, check=True, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
-    )
-    assert (out / "checkpoint.npz").read_bytes() == (finished / "checkpoint.npz").read_bytes()
-    assert not list(out.glob(".*.tmp"))
-
-
 def test_a_capped_grid_is_told(scene, tmp_path, capsys, monkeypatch):
     """The ball fills about half of its box, so 1500 cells hold some 750 points."""
     monkeypatch.setattr("pp_cl.scene.hull.CELL_CAP", 1500)
     assert main(arguments(scene, tmp_path / "run", train__iterations=1)) == 0
     told = re.search(r"^hull: only (\d+) of the 1500 points .*$", capsys.readouterr().out, re.M)
     assert 500 < int(told[1]) < 1500
-
-
-def test_a_memory_that_is_too_small_is_one_line(scene, tmp_path, capsys):
-    assert main([*arguments(scene, tmp_path / "run"), "--memory", "0.001"]) == 2
-    captured = capsys.readouterr()
-    assert "--memory 0.001" in captured.err and captured.err.count("\n") == 1
-    assert not (tmp_path / "run").exists()
 
 
 @pytest.mark.parametrize("footprint, radius", [("disc", 0.0015), ("sphere", 0.05)])

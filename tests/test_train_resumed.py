@@ -144,11 +144,3 @@ def test_a_refined_run_resumes_to_the_same_bytes(tmp_path, monkeypatch, share, s
         train_and_interrupt(scene, out, steps, monkeypatch, **changes)
         assert main(arguments(scene, out, **changes)) == 0
         assert (out / "checkpoint.npz").read_bytes() == whole
-
-
-def test_images_too_small_to_halve_are_one_line(tmp_path, capsys):
-    scene = write_ball_scene(tmp_path / "ball")
-    words = arguments(scene, tmp_path / "small", train__refine_at="0.3,0.6", train__prune_looks=4)
-    assert main(words) == 2
-    error = capsys.readouterr().err
-    assert "train.refine_at halves the images 2 times" in error and error.count("\n") == 1

@@ -16,7 +16,7 @@ import sys
 from pathlib import Path
 
 import pp_cl
-from pp_cl.commands.options import add_device, add_set, read_set
+from pp_cl.commands.options import add_device, add_set, integer, several
 from pp_cl.config import load_config
 from pp_cl.device.device import Device
 from pp_cl.device.discover import open_device
@@ -26,7 +26,7 @@ from pp_cl.files.run_folder import RunFolder
 from pp_cl.network.layers import BLOCKS, convolutions, unet_layers
 from pp_cl.run import evaluate_run
 from pp_cl.session import train_scene
-from pp_cl.sweep.plan import Job, plan, read_seeds, read_varied
+from pp_cl.sweep.plan import Job, plan, read_varied
 from pp_cl.sweep.result import finished_row
 
 ROOT = Path(__file__).parents[1]
@@ -139,7 +139,8 @@ def read_options(arguments: list[str] | None) -> argparse.Namespace:
     add("--out", type=Path, required=True, metavar="FOLDER", help="of the runs")
     add("--downscale", metavar="N", help="reduce the images this many times (as pp-cl train)")
     add("--steps", type=int, default=1150, metavar="N", help="of each training (1150)")
-    add("--seeds", default="1,2,3", metavar="S,...", help="(1,2,3)")
+    seeds = several(integer(0, 2**32 - 1))
+    add("--seeds", type=seeds, default="1,2,3", metavar="S,...", help="(1,2,3)")
     file = ROOT / "docs" / "results" / "ablation_blocks.json"
     add("--json", type=Path, default=file, metavar="FILE", help="docs/results/ablation_blocks.json")
     add_set(parser, "a setting of all runs")
@@ -151,8 +152,9 @@ def command_of(options: argparse.Namespace) -> str:
     """What was typed, as a document shows it."""
     words = ["python tools/ablate.py", f".../{Path(options.scene).name}"]
     words += [f"--downscale {options.downscale}"] * bool(options.downscale)
-    words += [f"--steps {options.steps}", f"--seeds {options.seeds}", "--out FOLDER"]
-    return " ".join(words + [f"--set {text}" for text in options.set])
+    seeds = ",".join(map(str, options.seeds))
+    words += [f"--steps {options.steps}", f"--seeds {seeds}", "--out FOLDER"]
+    return " ".join(words + [f"--set {key}={text}" for key, text, _ in options.set])
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -161,11 +163,10 @@ def main(arguments: list[str] | None = None) -> int:
     try:
         if not options.json.resolve().parent.is_dir():
             raise UserError(f"--json {options.json}: no such folder; make it first")
-        given = read_set(options.set)
+        given = options.set
         if options.downscale:
             given.append(("scene.downscale", options.downscale, "--downscale"))
-        seeds = read_seeds(options.seeds)
-        jobs = plan_runs(options.scene, options.out, options.steps, seeds, given=given)
+        jobs = plan_runs(options.scene, options.out, options.steps, options.seeds, given=given)
         dev, rows = open_device(options.device), []
         for job in jobs:
             rows.append(run_job(job, options.device))

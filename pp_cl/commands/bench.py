@@ -91,9 +91,16 @@ def run(options: argparse.Namespace) -> None:
     """Measure, print the table, write the files asked for. Raises UserError, before anything is
     measured, for options that make no sense and files that cannot be written.
     """
+    from pp_cl.bench.plots import figure_of, save_figure
+
     _refuse_foreign(options)
+    figure = figure_of(options.plot)
     own = {"all": _run_all, "raster": _run_raster, "train": _run_train, "model": _run_model}
-    own.get(options.what, _run_network)(options)
+    result, draw = own.get(options.what, _run_network)(options)
+    shared.write_json_option(options.json, result)
+    if figure:
+        draw(figure)
+        save_figure(figure, options.plot)
 
 
 def _refuse_foreign(options):
@@ -103,31 +110,33 @@ def _refuse_foreign(options):
             "--tolerance: bench conv shows every variant; give it to bench unet, whose auto picks"
             " among them"
         )
-    for name in {name for names in OPTIONS.values() for name in names} - {*OPTIONS[options.what]}:
-        if getattr(options, name) not in (None, False, []):
-            raise UserError(f"--{name}: bench {options.what} has no such option; leave it out")
+    foreign = {name for names in OPTIONS.values() for name in names} - {*OPTIONS[options.what]}
+    shared.refuse(options, foreign, f"bench {options.what} has no such option")
+
+
+# ---- each bench: (what --json writes, draws it into a figure)
 
 
 def _run_all(options):
     from pp_cl.bench.overview import bench_overview
-    from pp_cl.bench.plots import figure_of, plot_overview, save_figure
+    from pp_cl.bench.plots import plot_overview
     from pp_cl.layers.choice import load_policy
 
-    figure = figure_of(options.plot)
     dev = _open_device(options)
     policy = load_policy(dev, preset("tiny").network.tolerance)
     print(policy.origin)
     result = bench_overview(dev, policy, options.budget or 120, partial(print, flush=True))
     print(f"{result['seconds']:.0f} s")
-    shared.write_json_option(options.json, result)
-    if figure:
+
+    def draw(figure):
         figure.suptitle(dev.name)
         plot_overview(figure, result)
-        save_figure(figure, options.plot)
+
+    return result, draw
 
 
 def _run_raster(options):
-    from pp_cl.bench.plots import figure_of, plot_growth
+    from pp_cl.bench.plots import plot_growth
     from pp_cl.bench.raster import BLENDS, HEAD, bench_raster, growth, growth_line, line
     from pp_cl.bench.raster_scenes import SCENES
 
@@ -137,22 +146,21 @@ def _run_raster(options):
     points = options.points or [10_000, 63_000, 250_000, 1_000_000, 4_000_000]
     sizes, blends = options.size or [200, 400, 800], options.blend or BLENDS
     gamma = options.gamma or 0.01  # the last one of a training, the sharpest
-    figure = figure_of(options.plot)
     dev = _open_device(options)
     found = bench_raster(dev, scene, points, sizes, blends=blends, gamma=gamma)
     rows = _print_rows(HEAD, line, found)
     fits = growth(rows)
     for fit in fits:
         print(growth_line(fit))
-    _write_json(options.json, dev, rows, growth=fits)
-    _save_plot(figure, options, plot_growth, rows, f"raster, {scene}, gamma {gamma:g}, {dev.name}")
+    title = f"raster, {scene}, gamma {gamma:g}, {dev.name}"
+    return _result(dev, rows) | {"growth": fits}, partial(_draw, plot_growth, rows, title)
 
 
 def _run_train(options):
     from pp_cl.bench.training import bench_step
     from pp_cl.config import configure
 
-    config = configure(preset("paper"), options.scene or "demo", shared.read_set(options.set))
+    config = configure(preset("paper"), options.scene or "demo", options.set)
     if options.points:
         assign(config, "points.count", _one(options, "points"), "--points")
     dev = _open_device(options)
@@ -164,27 +172,25 @@ def _run_train(options):
     for name, ms in row["stages_ms"].items():
         print(f"  {name:10s} {ms:9.2f} ms")
     print(f"forward {row['forward_ms']:.2f} ms, backward and update {row['backward_ms']:.2f} ms")
-    _write_json(options.json, dev, [row])
+    return _result(dev, [row]), None
 
 
 def _run_model(options):
     from pp_cl.bench.model import HEAD, bench_models, line
-    from pp_cl.bench.plots import figure_of, plot_models
+    from pp_cl.bench.plots import plot_models
     from pp_cl.run import load_run
 
     if not options.runs:
         raise UserError("--runs: missing; name the folder of a trained run")
-    figure = figure_of(options.plot)
     dev = _open_device(options)
     runs = [load_run(dev, folder) for folder in options.runs.split(",")]
     rows = _print_rows(HEAD, line, bench_models(runs))
-    _write_json(options.json, dev, rows)
-    _save_plot(figure, options, plot_models, rows, f"{runs[0].folder}, {dev.name}")
+    return _result(dev, rows), partial(_draw, plot_models, rows, f"{runs[0].folder}, {dev.name}")
 
 
 def _run_network(options):
     from pp_cl.bench.conv import bench_conv
-    from pp_cl.bench.plots import figure_of, plot_time_and_error
+    from pp_cl.bench.plots import plot_time_and_error
     from pp_cl.bench.timing import HEAD, line
     from pp_cl.bench.unet import bench_unet
     from pp_cl.layers.choice import load_policy
@@ -192,7 +198,6 @@ def _run_network(options):
     size = _one(options, "size") if options.size else 256
     widths, blocks = options.widths or (128, 256, 512), options.blocks or "double"
     tolerance = options.tolerance
-    figure = figure_of(options.plot)
     dev = _open_device(options)
     policy = load_policy(dev, preset("tiny").network.tolerance if tolerance is None else tolerance)
     print(policy.origin)
@@ -204,9 +209,8 @@ def _run_network(options):
     for direction, memory in {r["direction"]: r.get("memory_bytes") for r in rows}.items():
         if memory:
             print(f"the network's memory, {direction}: {memory / 2**20:.0f} MiB")
-    _write_json(options.json, dev, rows)
     title = f"{options.what}, {size} x {size}, {dev.name}"
-    _save_plot(figure, options, plot_time_and_error, rows, title)
+    return _result(dev, rows), partial(_draw, plot_time_and_error, rows, title)
 
 
 def _print_rows(head, line, found):
@@ -219,14 +223,12 @@ def _print_rows(head, line, found):
     return rows
 
 
-def _save_plot(figure, options, draw, rows, title):
-    """Draw the rows, if that was asked for."""
-    from pp_cl.bench.plots import save_figure
+def _draw(plot, rows, title, figure):
+    plot(figure.add_subplot(title=title), rows)
 
-    if figure:
-        axes = figure.add_subplot(title=title)
-        draw(axes, rows)
-        save_figure(figure, options.plot)
+
+def _result(dev, rows):
+    return {"device": dev.name, "platform": dev.info["platform"], "rows": rows}
 
 
 def _one(options, name):
@@ -245,9 +247,3 @@ def _open_device(options):
     dev = open_device(options.device)
     print(f"{dev.name} [{dev.info['platform']}]")
     return dev
-
-
-def _write_json(file, dev, rows, **more):
-    """Write the rows, if that was asked for."""
-    result = {"device": dev.name, "platform": dev.info["platform"], "rows": rows} | more
-    shared.write_json_option(file, result)

@@ -45,12 +45,10 @@ def run(options: argparse.Namespace) -> None:
     from pp_cl.bench.plots import figure_of, plot_ranks, save_figure
     from pp_cl.commands.progress import counted
     from pp_cl.device.discover import open_device
-    from pp_cl.run import check_target, evaluate, load_run
+    from pp_cl.run import evaluate, load_run
 
     metrics, tolerance = options.metrics, options.tolerance
     figure = figure_of(options.chart, "--chart")
-    if options.out:
-        check_target(Path(options.out), is_new=True)
     dev = open_device(options.device)
     run = load_run(dev, options.run_folder, tolerance=tolerance, scene=options.scene)
     print(run.policy.origin)
@@ -65,12 +63,17 @@ def run(options: argparse.Namespace) -> None:
             on_view=on_view,
         )
     folder = run.folder
+    state = "" if result["finished"] else f", unfinished, step {result['step']}"
+    own = f"{folder} ({len(result['per_image'])} views{state})"
+    ranked = [(own, result["mean"]), *result["published"].items()]
+    if "psnr" in metrics:
+        ranked.sort(key=lambda row: -row[1]["psnr"])
     if figure:
         figure.set_size_inches(4 * len(metrics), 6)
-        plot_ranks(figure, list(metrics), _ranked(result, folder), _label(result, folder))
+        plot_ranks(figure, list(metrics), ranked, own)
         save_figure(figure, options.chart)
     shared.write_json_option(options.json, result)
-    print(_table(result, folder))
+    print(_table(result, ranked, len(own)))
     if options.published and not result["published"]:
         print("--published: no results are known of this scene")
     print(_summary(result))
@@ -83,34 +86,18 @@ def run(options: argparse.Namespace) -> None:
         shared.show(written / "comparison.png")
 
 
-def _table(result, folder):
-    """The run's means among the published ones, the best PSNR first."""
-    names, published = list(result["mean"]), result["published"]
-    width = max(28, len(_label(result, folder)) + 2)
+def _table(result, ranked, width):
+    """The run's means among the published ones, the best PSNR first. ranked: [(label, values)]."""
+    names, width = list(result["mean"]), max(28, width + 2)
     lines = [f"{'':{width}s}" + "".join(f"{n:>10s}" for n in names)]
-    for label, values in _ranked(result, folder):
+    for label, values in ranked:
         cells = (_cell(values, name) for name in names)
         lines.append(f"{label:{width}s}" + "".join(cells).rstrip())
     if result["published_differs"]:
         lines.append(result["published_differs"])
-    if "lpips" in names and any(OTHER_LPIPS in values for values in published.values()):
+    if "lpips" in names and any(OTHER_LPIPS in values for _, values in ranked):
         lines.append("* LPIPS by AlexNet, which cannot be compared with the others, by VGG16")
     return "\n".join(lines)
-
-
-def _label(result, folder):
-    state = "" if result["finished"] else f", unfinished, step {result['step']}"
-    return f"{folder} ({len(result['per_image'])} views{state})"
-
-
-def _ranked(result, folder):
-    """[(label, values)] of the run and of the published rows, the best PSNR first where it was
-    measured.
-    """
-    rows = [(_label(result, folder), result["mean"]), *result["published"].items()]
-    if "psnr" in result["mean"]:
-        rows.sort(key=lambda row: -row[1]["psnr"])
-    return rows
 
 
 def _cell(values, name):

@@ -4,7 +4,6 @@ import argparse
 from pathlib import Path
 
 from pp_cl.commands import options as shared
-from pp_cl.errors import UserError
 
 HELP = "write a run in a format that other programs open"
 EPILOG = """formats:
@@ -43,8 +42,8 @@ def run(options: argparse.Namespace) -> None:
     from pp_cl.run import load_run
 
     name, folder = options.format, Path(options.run_folder)
-    if options.min_weight is not None and name not in OF_POINTS:
-        raise UserError(f"--min-weight: only {' and '.join(OF_POINTS)} leave out points")
+    if name not in OF_POINTS:
+        shared.refuse(options, ("min_weight",), f"only {' and '.join(OF_POINTS)} leave out points")
     path = check_target(name, folder, Path(options.out) if options.out else None)
     run = load_run(open_device(options.device), folder, scene=options.scene)
     if not run.header["finished"]:

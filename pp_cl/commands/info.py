@@ -32,6 +32,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(options: argparse.Namespace) -> None:
     """Print the facts, write the picture. Raises UserError for options that do not fit."""
     from pp_cl.config import nearby_run
+    from pp_cl.device.discover import open_device
+    from pp_cl.facts.info import describe_scene, picture, run_facts, run_picture
     from pp_cl.files.image import write_png
     from pp_cl.files.run_folder import RunFolder
     from pp_cl.scene.load import DEMO
@@ -41,11 +43,21 @@ def run(options: argparse.Namespace) -> None:
     folder = RunFolder(options.subject)
     is_scene = options.subject == DEMO or folder.path.exists() or not nearby_run(folder.path)
     is_run = folder.config.exists() or not is_scene
-    for name in ("masks", "mask_from", "set", "preset") if is_run else ("scene",):
-        if getattr(options, name):
-            what = "scene" if is_run else "run"
-            raise UserError(f"--{name.replace('_', '-')}: only of a {what}; leave it out")
-    facts, lines, image = (_run_told if is_run else _scene_told)(folder, options)
+    if is_run:
+        shared.refuse(options, ("masks", "mask_from", "set", "preset"), "only of a scene")
+    else:
+        shared.refuse(options, ("scene",), "only of a run")
+    image = None
+    if is_run:
+        facts = run_facts(folder, options.scene)
+        if options.picture:
+            image = run_picture(open_device(options.device), folder, options.scene)
+    else:
+        dev = open_device(options.device)
+        given = shared.read_short(options, ("masks", "mask_from")) + options.set
+        facts, *shown = describe_scene(dev, options.subject, options.preset or "tiny", given)
+        image = picture(dev, *shown) if options.picture else None
+    lines = (_run_lines if is_run else _scene_lines)(facts)
     if image is not None:
         write_png(options.picture, image)
         facts["picture"] = options.picture
@@ -53,29 +65,6 @@ def run(options: argparse.Namespace) -> None:
     shared.tell(options.json, facts, lines)
     if options.open:
         shared.show(options.picture)
-
-
-def _run_told(folder, options):
-    """(facts, lines, picture or None) of a run."""
-    from pp_cl.device.discover import open_device
-    from pp_cl.facts.info import run_facts, run_picture
-
-    facts, image = run_facts(folder, options.scene), None
-    if options.picture:
-        image = run_picture(open_device(options.device), folder, options.scene)
-    return facts, _run_lines(facts), image
-
-
-def _scene_told(_folder, options):
-    """The same of a scene."""
-    from pp_cl.device.discover import open_device
-    from pp_cl.facts.info import describe_scene, picture
-
-    dev = open_device(options.device)
-    given = shared.read_short(options, ("masks", "mask_from")) + shared.read_set(options.set)
-    facts, *shown = describe_scene(dev, options.subject, options.preset or "tiny", given)
-    image = picture(dev, *shown) if options.picture else None
-    return facts, _scene_lines(facts), image
 
 
 def _line(name, text):

@@ -127,6 +127,14 @@ figure_file = output_file(".png", ".svg", ".pdf")
 # ---- options
 
 
+def refuse(options: argparse.Namespace, names: Iterable[str], why: str) -> None:
+    """Raise UserError for an option out of `names` that was given. why: it makes no sense here."""
+    for name in names:
+        value = getattr(options, name)
+        if not (value is None or value is False or value == []):
+            raise UserError(f"--{name.replace('_', '-')}: {why}; leave it out")
+
+
 def add_json(parser: argparse.ArgumentParser) -> None:
     """Add --json, for write_json_option and tell: the name of a file, or sys.stdout, which then
     has nothing but the JSON: cli.main() sends what is printed meanwhile to stderr.
@@ -238,18 +246,14 @@ def show(path: Path | str) -> None:
 
 
 def add_set(parser: argparse.ArgumentParser, text: str) -> None:
-    """Add --set, for read_set. text: its help."""
+    """Add --set: [(key, text of the value, origin)]. text: its help."""
     parser.add_argument(
-        "--set", action="append", default=[], metavar="SECTION.KEY=VALUE", help=text
+        "--set", action="append", default=[], type=_setting, metavar="SECTION.KEY=VALUE", help=text
     )
 
 
-def read_set(texts: list[str]) -> list[tuple[str, str, str]]:
-    """[(key, value, origin)] of the texts of --set. Raises UserError for one without =."""
-    given = []
-    for text in texts:
-        key, equals, value = text.partition("=")
-        if not equals:
-            raise UserError(f"--set {text}: write --set section.key=value")
-        given.append((key.strip(), value.strip(), "--set"))
-    return given
+def _setting(text):
+    key, equals, value = text.partition("=")
+    if not equals:
+        raise argparse.ArgumentTypeError(f"{quoted(text)}: write section.key=value")
+    return key.strip(), value.strip(), "--set"

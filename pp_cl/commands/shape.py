@@ -52,19 +52,13 @@ def run(options: argparse.Namespace) -> None:
     if not folder.path.exists():
         near = nearby_run(folder.path)
         raise UserError(f"{folder}: no such file or folder; {near or 'name a run or a mesh'}")
-    for given, name, of_run in (
-        (options.mesh, "mesh", True),
-        (options.scene, "scene", True),
-        (options.edge, "edge", False),
-    ):
-        if given is not None and of_run != is_run:
-            raise UserError(f"--{name}: only of a {'run' if of_run else 'mesh'}; leave it out")
-    mesh = options.mesh if is_run else options.subject
-    mesh = None if mesh is None else read_mesh(mesh)
-    dev = open_device(options.device)
     if is_run:
+        shared.refuse(options, ("edge",), "only of a mesh")
+        mesh, dev = read_mesh(options.mesh) if options.mesh else None, open_device(options.device)
         facts = run_shape(dev, folder, mesh, options.samples, scene=options.scene)
     else:
+        shared.refuse(options, ("mesh", "scene"), "only of a run")
+        mesh, dev = read_mesh(options.subject), open_device(options.device)
         facts = mesh_shape(dev, mesh, options.edge, options.samples)
     shared.tell(options.json, facts, _lines(facts))
 

@@ -40,7 +40,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="DIR",
         help="folder of the runs and the table",
     )
-    add("--seeds", default="0", metavar="A,B", help="a run for each (0)")
+    add(
+        "--seeds",
+        type=shared.several(shared.integer(0, 2**32 - 1)),
+        default="0",
+        metavar="A,B",
+        help="a run for each (0)",
+    )
     add("--preset", choices=PRESETS, help="as of `pp-cl train` (tiny)")
     add("--iterations", metavar="N", help="steps of each training")
     shared.add_set(parser, "a setting of all runs, as of `pp-cl train`")
@@ -95,7 +101,7 @@ def run(options: argparse.Namespace) -> None:
 def _jobs(options):
     """The runs that the options ask for. Raises UserError."""
     from pp_cl.files.run_folder import RunFolder
-    from pp_cl.sweep.plan import plan, read_seeds, read_varied
+    from pp_cl.sweep.plan import plan, read_varied
 
     if options.scheduler and options.workers:
         raise UserError("--workers: the cluster of --scheduler has its own; leave one of both out")
@@ -103,13 +109,13 @@ def _jobs(options):
         raise UserError("--json: a dry run measures nothing; leave one of both out")
     if RunFolder(options.out).config.exists():
         raise UserError(f"--out {options.out}: is the folder of a run; choose another")
-    given = shared.read_set(options.set)
+    given = options.set
     if options.iterations:
         given = [(SHORT["iterations"], options.iterations, "--iterations"), *given]
     return plan(
         options.scenes,
         options.out,
-        read_seeds(options.seeds),
+        options.seeds,
         read_varied(options.vary),
         given=given,
         preset_name=options.preset,

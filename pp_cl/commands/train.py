@@ -63,7 +63,7 @@ def run(options: argparse.Namespace) -> None:
     if options.tensorboard:
         writer_class()  # refuses before the work where it is missing
     folder = RunFolder(options.out)
-    given, is_new = _given_settings(options), not folder.config.exists()
+    given, is_new = shared.read_short(options, SHORT) + options.set, not folder.config.exists()
     config = run_config(folder, options.scene, options.preset, given, extends=True)
     stored = stored_state(folder, config)
     if is_finished(stored, config):
@@ -91,11 +91,6 @@ def run(options: argparse.Namespace) -> None:
         f" ({training.info['initial_points']} at the start);"
         f" wrote {folder.checkpoint}"
     )
-
-
-def _given_settings(options):
-    """[(key, text, origin)] of every setting on the command line."""
-    return shared.read_short(options, SHORT) + shared.read_set(options.set)
 
 
 def _first_line(training):

@@ -9,7 +9,7 @@ import numpy as np
 
 from pp_cl.bench.timing import interleave
 from pp_cl.compress.reduction import Original, Reduction, measured_psnr, nbytes
-from pp_cl.run import Run
+from pp_cl.run import Run, check_scene
 from pp_cl.scene.load import scene_splits
 from pp_cl.scene.views import View
 
@@ -105,7 +105,7 @@ def validation_views(run: Run) -> tuple[str, list[View]]:
     where the scene has none every eighth of the training views. Never those of a test. Raises
     UserError where the scene is missing or broken.
     """
-    run.check_scene()
+    check_scene(run.config.scene.path)
     present = scene_splits(run.config.scene.path)
     split = "val" if "val" in present else "train"
     views = run.scene(split).splits[split]

@@ -112,13 +112,8 @@ def read_metrics(folder: RunFolder) -> Facts | None:
     file = folder.metrics("test")
     if not file.exists():
         return None
-    again = f"run `pp-cl eval {folder}` again"
     try:
-        text = read_json_text(file, MOST_METRICS)
-    except (OSError, ValueError) as error:
-        raise refusal(file, error, "metrics", again) from None
-    try:
-        result = json.loads(text)
+        result = json.loads(read_json_text(file, MOST_METRICS))
         found = {
             "mean": {name: float(value) for name, value in result["mean"].items()},
             "step": result["step"],
@@ -129,16 +124,17 @@ def read_metrics(folder: RunFolder) -> Facts | None:
         kinds = {"step": int, "finished": bool, "points": int, "device": str}
         is_right = all(type(found[key]) is kind for key, kind in kinds.items())
         if not (is_right and all(map(math.isfinite, found["mean"].values()))):
-            raise ValueError
+            raise ValueError("values of another kind")
     except (
+        OSError,
         ValueError,
         LookupError,
         TypeError,
         AttributeError,
         ArithmeticError,
         RecursionError,
-    ):
-        raise UserError(f"{file}: holds no metrics; {again}") from None
+    ) as error:
+        raise refusal(file, error, "metrics", f"run `pp-cl eval {folder}` again") from None
     return found
 
 

@@ -81,15 +81,6 @@ def _check_free(key, origin):
         raise UserError(f"{origin}: {key} cannot be set in a sweep; write {TAKEN[key]}")
 
 
-def read_seeds(text: str) -> list[int]:
-    """The seeds of --seeds, ascending, each once. Raises UserError for what is no seed."""
-    seeds = set()
-    for word in text.split(","):
-        config = configure(Config(), DEMO, [("train.seed", word.strip(), "--seeds")])
-        seeds.add(config.train.seed)
-    return sorted(seeds)
-
-
 def plan(
     scenes: Sequence[str],
     out: Path | str,

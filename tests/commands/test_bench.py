@@ -78,37 +78,3 @@ def test_without_matplotlib_a_plot_is_refused(tmp_path, monkeypatch, capsys):
     monkeypatch.setitem(sys.modules, "matplotlib.figure", None)
     assert main(["bench", "--plot", str(tmp_path / "b.png")]) == 2
     assert "pp-cl[plot]" in capsys.readouterr().err
-
-
-@pytest.mark.parametrize(
-    "words, named",
-    [
-        (["--budget", "0"], "--budget"),
-        (["--budget", "long"], "--budget"),
-        (["all", "--size", "64"], "--size"),
-        (["--tolerance", "1e-5"], "--tolerance"),
-        (["conv", "--tolerance", "1e-5"], "--tolerance"),
-        (["conv", "--points", "9"], "--points"),
-        (["unet", "--tolerance", "1e-9"], "tolerance 1e-09"),
-        (["unet", "--budget", "9"], "--budget"),
-        (["unet", "--scene", "demo"], "--scene"),
-        (["unet", "--blocks", "triple"], "double, single, gated"),
-        (["unet", "--json", "/nowhere/b.json"], "--json"),
-        (["unet", "--plot", "b.xyz"], "--plot"),
-        (["unet", "--device", "abacus"], "abacus"),
-        (["raster", "--set", "train.seed=1"], "--set"),
-        (["raster", "--gamma", "0.1,0.2"], "--gamma"),
-        (["raster", "--points", "0"], "--points"),
-        (["raster", "--blend", "alpha,beta"], "--blend"),
-        (["raster", "--widths", "16,16,16"], "--widths"),
-        (["raster", "--scene", "moon"], "--scene"),
-        (["train", "--points", "10,20"], "--points 10,20: write one number"),
-        (["train", "--set", "train.sped=1"], "train.sped"),
-        (["train", "--scene", "/nowhere"], "/nowhere"),
-        (["train", "--plot", "b.png"], "--plot"),
-    ],
-)
-def test_bad_input_is_one_line(words, named, capsys):
-    assert main(["bench", *words]) == 2
-    error = capsys.readouterr().err
-    assert named in error and error.count("\n") == 1

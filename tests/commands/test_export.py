@@ -10,7 +10,6 @@ from support.scenes import write_ball_scene
 
 from pp_cl.cli import main
 from pp_cl.export.formats import FORMATS
-from pp_cl.run import Run
 
 
 @pytest.fixture(scope="module")
@@ -34,16 +33,6 @@ def copied(unfinished, tmp_path):
     return run
 
 
-def failure(capsys, *words):
-    """The one line on stderr of a command that must end with exit status 2."""
-    capsys.readouterr()
-    assert main(["export", *map(str, words)]) == 2
-    error = capsys.readouterr().err.splitlines()
-    lines = [line for line in error if line.startswith("pp-cl")]
-    assert len(lines) == 1 and error[-1] == lines[0]
-    return lines[0]
-
-
 # so little training shows no surface; tests/export/test_formats.py writes a mesh
 @pytest.mark.parametrize("name", [name for name in FORMATS if name != "mesh"])
 def test_every_format_goes_to_its_place_and_the_run_is_named_unfinished(name, copied, capsys):
@@ -63,59 +52,3 @@ def test_out_says_where(copied, tmp_path, capsys):
     words = ["--format", "ply", "--out", str(out), "--min-weight", "0.3"]
     assert main(["export", str(copied), *words]) == 0
     assert out.stat().st_size < whole and not (copied / "export").exists()
-
-
-def forbidden(tmp_path):
-    """A folder that may not be written: root may write everywhere but into /proc."""
-    folder = tmp_path / "forbidden"
-    folder.mkdir(mode=0o500)
-    return "/proc" if os.access(folder, os.W_OK) else folder
-
-
-WRONG = {
-    "no such run": (["{tmp}/none", "--format", "ply"], "none"),
-    "no format": (["{run}"], "--format"),
-    "unknown format": (["{run}", "--format", "obj"], "obj"),
-    "a folder for a file": (["{run}", "--format", "ply", "--out", "{tmp}/a.ply"], "is a folder"),
-    "an empty name": (["{run}", "--format", "ply", "--out", ""], "--out"),
-    "an empty scene": (["{run}", "--format", "ply", "--scene", ""], "--scene"),
-    "a long name": (["{run}", "--format", "ply", "--out", "{tmp}/" + 250 * "x" + ".ply"], "name"),
-    "here": (["{run}", "--format", "scene", "--out", "."], "name a new folder in it"),
-    "no folder": (["{run}", "--format", "glb", "--out", "{tmp}/no/a.glb"], "is no folder"),
-    "a file for a folder": (["{run}", "--format", "scene", "--out", "{run}/config.json"], "exists"),
-    "a full folder": (["{run}", "--format", "scene", "--out", "{run}"], "exists already"),
-    "other suffix": (["{run}", "--format", "mesh", "--out", "{tmp}/a.obj"], ".ply or .glb"),
-    "a weight that is none": (["{run}", "--format", "ply", "--min-weight", "x"], "--min-weight"),
-    "a weight for a page": (["{run}", "--format", "html", "--min-weight", "1"], "only ply and glb"),
-    "a scene that is gone": (["{run}", "--format", "ply", "--scene", "{tmp}/gone"], "gone"),
-    "no device": (["{run}", "--format", "ply", "--device", "abacus"], "abacus"),
-}
-
-
-@pytest.mark.parametrize("name", WRONG)
-def test_wrong_input_is_one_line_and_writes_nothing(name, copied, tmp_path, capsys, monkeypatch):
-    (tmp_path / "a.ply").mkdir()
-    (tmp_path / "here").mkdir()
-    monkeypatch.chdir(tmp_path / "here")
-    monkeypatch.setattr(Run, "render", None)  # that nothing is computed
-    before = sorted(tmp_path.rglob("*"))
-    words, named = WRONG[name]
-    words = [word.format(run=copied, tmp=tmp_path) for word in words]
-    assert named in failure(capsys, *words)
-    assert sorted(tmp_path.rglob("*")) == before
-
-
-@pytest.mark.parametrize("name", ["ply", "glb", "html", "scene"])
-def test_a_folder_that_may_not_be_written_is_one_line(name, copied, tmp_path, capsys, monkeypatch):
-    monkeypatch.setattr(Run, "render", None)
-    out = os.path.join(forbidden(tmp_path), "a" + (FORMATS[name][1] or ("",))[0])
-    assert out in failure(capsys, copied, "--format", name, "--out", out)
-    assert not os.path.exists(out)
-
-
-def test_a_run_of_softmax_has_no_page(copied, capsys):
-    config = json.loads((copied / "config.json").read_text())
-    config["raster"]["blend"] = "softmax"
-    (copied / "config.json").write_text(json.dumps(config))
-    assert "raster.blend softmax" in failure(capsys, copied, "--format", "html")
-    assert not (copied / "export").exists()

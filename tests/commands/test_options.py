@@ -76,19 +76,3 @@ def test_an_empty_value_is_refused(words, capsys):
         assert main(given) == 2
         error = capsys.readouterr().err
         assert f"{words[-1]}: is empty" in error and error.count("\n") == 1
-
-
-@pytest.mark.parametrize(
-    "words",
-    [
-        ("compare", "a.png", "a.png", "--json"),
-        ("eval", "a", "--json"),
-        ("info", "a", "--picture"),
-        ("bench", "conv", "--plot"),
-    ],
-)
-def test_a_file_that_cannot_be_written_is_noticed_before_the_work(words, capsys, monkeypatch):
-    monkeypatch.setattr("pp_cl.device.discover.open_device", lambda _: pytest.fail("work"))
-    assert main([*words, "/no/such/a.png"]) == 2
-    error = capsys.readouterr().err
-    assert f"{words[-1]}: '/no/such/a.png'" in error and error.count("\n") == 1

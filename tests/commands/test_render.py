@@ -14,7 +14,6 @@ from filelock import FileLock
 from pp_cl.cli import main
 from pp_cl.export import film
 from pp_cl.files.image import read_rgba
-from pp_cl.run import Run
 
 
 @pytest.fixture(scope="module")
@@ -146,61 +145,3 @@ def test_cameras_of_a_file(trained, tmp_path):
     )
     assert main(["render", trained, *words, "--out", str(tmp_path / "file.gif")]) == 0
     assert (tmp_path / "file.gif").exists()
-
-
-@pytest.mark.parametrize(
-    "words, named",
-    [
-        (["--size", "0x32"], "--size"),
-        (["--size", "large"], "--size"),
-        (["--fov", "nan"], "--fov"),
-        (["--fps", "0"], "--fps"),
-        (["--seconds", "-1"], "--seconds"),
-        (["--seconds", "0.001"], "--seconds 0.001"),
-        (["--samples", "3"], "--samples"),
-        (["--background", "red"], "--background"),
-        (["--background", "transparent", "--out", "{tmp}/a.mp4"], "mp4 keeps no alpha"),
-        (["--background", "black", "--format", "exr"], "--background"),
-        (["--features"], "--features"),
-        (["--format", "avi"], "avi"),
-        (["--format", "mp4"], "/o: --format mp4"),
-        (["--format", "png", "--out", "{tmp}/a.mp4"], "a.mp4"),
-        (["--out", "{tmp}/a.avi"], "a.avi: films end in"),
-        (["--out", "{tmp}/film.mp4"], "film.mp4: is a folder"),
-        (["--out", "{tmp}/" + 245 * "x" + ".mp4"], "shorter name"),
-        (["--out", "/proc/a.mp4"], "/proc/a.mp4"),
-        (["--out", ""], "--out"),
-        (["--path", ""], "--path"),
-        (["--scene", "{tmp}/gone"], "gone"),
-        (["--fps", "60", "--out", "{tmp}/a.gif"], "--fps 60"),
-        (["--path", "test", "--seconds", "1"], "--seconds 1"),
-        (["--path", "nowhere"], "nowhere"),
-        (["--path", "nowhere.json"], "nowhere.json: no such file"),
-        (["--out", "/proc/nothing"], "/proc/nothing"),
-    ],
-)
-def test_wrong_options_are_one_line(trained, tmp_path, capsys, monkeypatch, words, named):
-    monkeypatch.setattr(Run, "render", None)  # that nothing is computed
-    (tmp_path / "film.mp4").mkdir()
-    before = sorted(tmp_path.iterdir())
-    words = [word.format(tmp=tmp_path) for word in words]
-    out = [] if "--out" in words else ["--out", str(tmp_path / "o")]
-    assert main(["render", trained, *out, *words]) == 2
-    error = capsys.readouterr().err
-    assert named in error and error.count("\n") == 1
-    assert sorted(tmp_path.iterdir()) == before
-
-
-def test_no_run_is_one_line(tmp_path, capsys):
-    assert main(["render", str(tmp_path)]) == 2
-    error = capsys.readouterr().err
-    assert str(tmp_path) in error and error.count("\n") == 1
-
-
-def test_a_folder_with_other_files_is_left_alone(trained, tmp_path, capsys):
-    (tmp_path / "mine.txt").write_text("x")
-    for out in (str(tmp_path), "/"):
-        assert main(["render", trained, "--out", out]) == 2
-        told = capsys.readouterr().err
-        assert "holds files that are no frames" in told and "delete" not in told
-    assert [p.name for p in tmp_path.iterdir()] == ["mine.txt"]

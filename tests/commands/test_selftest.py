@@ -56,15 +56,3 @@ def test_a_case_that_raises_is_a_line(few, monkeypatch, capsys):
     out, err = capsys.readouterr()
     assert "    RuntimeError: no way" in out.splitlines() and out.count(" yes") == 3
     assert err == "pp-cl: selftest: 1 failed: a: b\n"
-
-
-def test_an_unknown_device_is_one_line(capsys):
-    assert main(["selftest", "--device", "no such device"]) == 2
-    out, err = capsys.readouterr()
-    assert not out and err.count("\n") == 1 and "no such OpenCL device" in err
-
-
-def test_a_file_that_cannot_be_written_is_one_line(few, tmp_path, capsys):
-    assert main(["selftest", "--json", str(tmp_path / "none" / "a.json")]) == 2
-    err = capsys.readouterr().err
-    assert err.count("\n") == 1 and "none/a.json" in err

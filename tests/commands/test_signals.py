@@ -2,9 +2,6 @@
 
 import os
 import signal
-import subprocess
-import sys
-import time
 from pathlib import Path
 
 import pytest
@@ -86,21 +83,6 @@ def test_other_commands_promise_nothing(capsys, monkeypatch):
     monkeypatch.setattr("pp_cl.commands.compare.run", interrupted)
     assert main(["compare", "a", "b"]) == 130
     assert capsys.readouterr().err == "pp-cl: interrupted\n"
-
-
-def test_a_process_that_is_terminated_says_how_to_go_on(scene, tmp_path):
-    """As a scheduler does it; the log is no terminal."""
-    out = tmp_path / "run"
-    command = [sys.executable, "-m", "pp_cl", *arguments(scene, out, train__iterations=100_000)]
-    with open(tmp_path / "text", "wb") as text:
-        process = subprocess.Popen(command, cwd=ROOT, stdout=text, stderr=text)
-    while process.poll() is None and not (out / "checkpoint.npz").exists():
-        time.sleep(0.01)
-    process.send_signal(signal.SIGTERM)
-    assert process.wait() == 143
-    text = (tmp_path / "text").read_bytes()
-    assert b"\r" not in text and b"Traceback" not in text
-    assert text.splitlines()[-1].endswith(b"the same command goes on")
 
 
 def test_ignored_signals_stay_ignored(monkeypatch):

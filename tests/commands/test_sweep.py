@@ -44,35 +44,6 @@ def refusal(capsys, words):
     return line
 
 
-@pytest.mark.parametrize(
-    "more, said",
-    [
-        (["--workers", "0"], "--workers"),
-        (["--workers", "x"], "--workers"),
-        (["--json", "--dry-run"], "--json"),
-        (["--workers", "2", "--scheduler", "tcp://a"], "--workers"),
-        (["--seeds", "a"], "--seeds"),
-        (["--vary", "points.count"], "--vary points.count"),
-        (["--vary", "points.count=1,2"], "is varied too"),
-        (["--set", "train.seed=1"], "--seeds"),
-        (["--set", "points"], "--set points"),
-        (["--iterations", "x"], "--iterations: train.iterations: 'x'"),
-        (["--set", "points.sh_degree=3"], "points.sh_degree = 3"),
-        (["--metrics", "a"], "--metrics"),
-        (["--json", "none/a.json"], "none/a.json"),
-    ],
-)
-def test_bad_input_ends_before_anything_starts(tmp_path, capsys, nothing_starts, more, said):
-    assert said in refusal(capsys, words_of(["demo"], tmp_path / "out", *more))
-    assert not (tmp_path / "out").exists()
-
-
-def test_the_folder_of_a_run_is_no_folder_for_a_sweep(tmp_path, capsys, nothing_starts):
-    (job,) = jobs_of(["demo"], tmp_path)
-    pretend(job, 20.0)
-    assert "is the folder of a run" in refusal(capsys, words_of(["demo"], job.folder))
-
-
 def test_a_dry_run_says_what_would_be_done(tmp_path, capsys, nothing_starts):
     jobs = jobs_of(["demo"], tmp_path / "out", [1, 2, 3, 4])
     pretend(jobs[1], 20.0, 0.5)

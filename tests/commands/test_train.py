@@ -1,7 +1,6 @@
 """`pp-cl train`: what it prints about how settings were read."""
 
 import json
-from pathlib import Path
 
 import pytest
 from support.runs import arguments
@@ -93,21 +92,6 @@ def test_a_start_without_a_checkpoint_keeps_what_is_not_said_anew(tmp_path, monk
     config = run_config(folder, scene, None, [("network.rate", "1e-3,1e-4", "--set")])
     assert config.network.rate == (1e-3, 1e-4)
     assert (config.scene.downscale, config.points.count, config.train.crop) == (2, 1500, 24)
-
-
-def test_the_scene_is_named_in_one_place(tmp_path, capsys):
-    words = arguments(tmp_path / "a", tmp_path / "run", scene__path=tmp_path / "b")
-    assert main([str(word) for word in words]) == 2
-    assert "--set: scene.path is what SCENE or --scene says" in capsys.readouterr().err
-
-
-def test_a_folder_that_may_not_be_written_is_told_before_the_hull(tmp_path, capsys, monkeypatch):
-    scene, out = write_ball_scene(tmp_path / "ball"), tmp_path / "there" / "run"
-    monkeypatch.setattr("os.access", lambda path, _mode: Path(path) != tmp_path)
-    assert main(arguments(scene, out)) == 2
-    captured = capsys.readouterr()
-    assert f"{out}: may not be written" in captured.err and "hull" not in captured.out
-    assert not out.parent.exists()
 
 
 def test_a_row_and_a_preview_stand_before_the_checkpoint_that_holds_their_step(

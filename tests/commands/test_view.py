@@ -82,13 +82,6 @@ def test_a_signal_to_terminate_in_the_midst_of_a_task_ends_cleanly(begun, caplog
     assert tasks[0].done() and tasks[0].exception() is None and not caplog.records
 
 
-@pytest.mark.parametrize("name", ["", "nothing"])
-def test_what_is_no_run_is_one_line_and_status_2(tmp_path, capsys, name):
-    assert main(["view", str(tmp_path / name), "--port", "0"]) == 2
-    lines = capsys.readouterr().err.splitlines()
-    assert len(lines) == 1 and "config.json" in lines[0]
-
-
 def test_a_busy_port_is_one_line_and_status_2(begun, capsys):
     with socket.create_server(("127.0.0.1", 0)) as other:
         port = other.getsockname()[1]

@@ -49,25 +49,6 @@ def test_the_command_writes_a_run(ball_run, tmp_path, capsys, monkeypatch, dev):
     assert str(out) in capsys.readouterr().err
 
 
-def test_bad_input_ends_in_one_line(ball_run, tmp_path, capsys):
-    (tmp_path / "held").mkdir()
-    (tmp_path / "held" / "file").write_text("x")
-    for words, expected in (
-        ([str(tmp_path / "none")], "none"),
-        ([str(ball_run), "--max-loss", "-1"], "--max-loss"),
-        ([str(ball_run), "--max-loss", "nan"], "--max-loss"),
-        ([str(ball_run), "--max-loss", "much"], "--max-loss"),
-        ([str(ball_run), "--out", str(tmp_path / "held")], "held"),
-        ([str(ball_run), "--out", ""], "--out"),
-        ([str(ball_run), "--out", str(tmp_path / ("x" * 300))], "name"),
-        ([str(ball_run), "--scene", str(tmp_path / "gone")], "gone"),
-        ([str(ball_run), "--device", "none such"], "none such"),
-    ):
-        assert main(["compress", *words]) == 2
-        error = capsys.readouterr().err
-        assert error.count("\n") == 1 and expected in error
-
-
 def test_an_unfinished_run_is_refused(ball_run, tmp_path, capsys, monkeypatch):
     scene = load_config(ball_run / "config.json").scene.path
     train_and_interrupt(scene, tmp_path / "run", 12, monkeypatch)

@@ -6,7 +6,7 @@ import pytest
 
 from pp_cl.compress import search as module
 from pp_cl.compress.reduction import Reduction, measured_psnr
-from pp_cl.compress.search import Search, frame_ms
+from pp_cl.compress.search import Search
 
 
 @pytest.fixture
@@ -68,8 +68,3 @@ def test_a_compressed_run_is_not_tried_again(original, views, monkeypatch):
     search = Search(original, views, 20.0)
     search.reduction = small
     assert not list(search.trials())
-
-
-def test_times_are_of_a_frame(original, views):
-    first, second = frame_ms([original.run, original.run], views)
-    assert 0 < first < 10 * second < 100 * first

@@ -1,10 +1,8 @@
 """Dask as a sweep uses it: who listens where, and what it says of tasks that fail."""
 
 import errno
-import importlib
 import os
 import signal
-import sys
 from contextlib import ExitStack
 from types import SimpleNamespace
 
@@ -197,11 +195,3 @@ def test_the_end_of_trainings_is_awaited(tmp_path, monkeypatch):
         monkeypatch.setattr(cluster.time, "sleep", sleep)
         cluster._await_ends(jobs)
     assert len(waited) == 3
-
-
-@pytest.mark.parametrize("package", ["distributed", "cryptography"])
-def test_a_missing_package_is_one_line(monkeypatch, package):
-    monkeypatch.setitem(sys.modules, package, None)
-    monkeypatch.delitem(sys.modules, "pp_cl.sweep.cluster")
-    with pytest.raises(UserError, match=r"pip install 'pp-cl\[sweep\]'"):
-        importlib.import_module("pp_cl.sweep.cluster")

@@ -6,7 +6,7 @@ import pytest
 from support.sweeps import jobs_of
 
 from pp_cl.errors import UserError
-from pp_cl.sweep.plan import read_seeds, read_varied
+from pp_cl.sweep.plan import read_varied
 
 
 @pytest.fixture
@@ -67,16 +67,6 @@ def test_iterations_are_those_of_preset_and_settings(tmp_path, scenes):
     varied = [("train.iterations", ["7", "9"])]
     jobs = jobs_of(scenes[:1], tmp_path, varied=varied, given=[])
     assert [job.iterations for job in jobs] == [7, 9]
-
-
-@pytest.mark.parametrize("text, seeds", [("0", [0]), ("3,1,3, 2", [1, 2, 3]), ("1e2", [100])])
-def test_seeds(text, seeds):
-    assert read_seeds(text) == seeds
-
-
-@pytest.mark.parametrize("text", ["", "1,", "1.5", "-1", "a", "nan", "inf"])
-def test_what_is_no_seed(text):
-    refused(lambda: read_seeds(text), "train.seed")
 
 
 @pytest.mark.parametrize(

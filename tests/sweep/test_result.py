@@ -29,17 +29,10 @@ def test_a_run_that_is_trained_and_measured(job):
     }
 
 
-def test_no_folder_no_row(job):
+@pytest.mark.parametrize("what", [{"finished": False}, {"step": 3}])
+def test_what_is_not_trained_and_measured_to_its_end_has_no_row(job, what):
     assert finished_row(job) is None
-
-
-def test_a_training_that_is_not_at_its_end(job):
-    pretend(job, 21.5, finished=False)
-    assert finished_row(job) is None
-
-
-def test_a_measurement_of_an_earlier_checkpoint(job):
-    pretend(job, 21.5, step=3)
+    pretend(job, 21.5, **what)
     assert finished_row(job) is None
 
 

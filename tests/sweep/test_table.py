@@ -5,12 +5,10 @@ import json
 import pytest
 
 from pp_cl.sweep.table import (
-    cells,
     markdown,
     overall_means,
     scene_means,
     text_table,
-    values_text,
     write_tables,
 )
 
@@ -107,23 +105,6 @@ def test_the_printed_table():
     ]
 
 
-def test_the_table_of_failures_alone():
-    assert [line[0] for line in cells(ROWS[:2])] == ["scene", "a"]  # no mean of one scene
-    assert cells([row("a", 1), row("b", 1)]) == [
-        ["scene", "runs"],
-        ["a", "0 of 1"],
-        ["b", "0 of 1"],
-        ["mean", "0 of 2 scenes"],
-    ]
-
-
-def test_settings_and_lpips_have_columns_where_there_are_any():
-    rows = [ROWS[0] | {"lpips": 0.125, "settings": {"points.count": "5", "train.ema": "true"}}]
-    head, line = cells(rows)
-    assert head == ["scene", "setting", "runs", "PSNR", "SSIM", "LPIPS", "points", "seconds"]
-    assert line[1] == "points.count=5 train.ema=true" and line[5] == "0.1250"
-
-
 def test_markdown_names_what_failed():
     rows = [*ROWS[:3], row("b|c", 2, error="x | y")]
     text = markdown(rows).splitlines()
@@ -134,13 +115,6 @@ def test_markdown_names_what_failed():
     ]
     assert text[-3:] == ["Failed:", "", "- b\\|c seed 2: x \\| y"]
     assert "Failed" not in markdown(ROWS[:3])
-
-
-def test_a_run_in_one_line():
-    line = "PSNR 20.00, SSIM 0.5000, points 100, seconds 1.0"
-    assert values_text(ROWS[0]) == line
-    assert values_text(ROWS[0] | {"seconds": None}) == "PSNR 20.00, SSIM 0.5000, points 100"
-    assert values_text(ROWS[3]) == "failed: broken"
 
 
 def test_the_files(tmp_path):

@@ -91,7 +91,6 @@ def test_a_small_ablation_and_the_same_again(tmp_path, monkeypatch, capsys):
     "words, named",
     [
         (["--json", "/nowhere/a.json"], "--json /nowhere/a.json"),
-        (["--seeds", "x"], "--seeds"),
         (["--steps", "0"], "train.iterations"),
         (["--set", "network.blocks=single"], "network.blocks"),
         (["--set", "train.seed=1"], "train.seed"),

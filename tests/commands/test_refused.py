@@ -1,0 +1,177 @@
+"""Bad input to any command ends with status 2 and one line that names it, before anything is
+computed or written.
+"""
+
+import shutil
+import sys
+from pathlib import Path
+
+import pytest
+import trimesh
+
+from pp_cl.cli import main
+from pp_cl.run import Run
+
+TRAIN = "train BALL --out new"
+OF_RUNS = ("eval", "render", "view", "export --format ply", "compress", "info --picture a.png")
+SHAPE = "shape --mesh ball.ply"
+REFUSED = [
+    ("", "command"),
+    ("trian", "did you mean train?"),
+    (f"{TRAIN} --iters 6", "did you mean --iterations?"),
+    (f"{TRAIN} --preset smal", "did you mean small?"),
+    (f"{TRAIN} --set trian.seed=1", "did you mean train.seed?"),
+    ("compare a b --metrics psrn", "did you mean psnr?"),
+    # what is missing, broken or not what it is to be
+    *((f"{command} none", "none") for command in (*OF_RUNS, SHAPE)),
+    *((f"{command} empty", "empty") for command in (*OF_RUNS, SHAPE)),
+    *((f"{command} young", "checkpoint.npz") for command in (*OF_RUNS, SHAPE) if command != "view"),
+    *((f"{command} corrupt", "corrupt/checkpoint.npz") for command in ("eval", "info", "render")),
+    *((f"{command} run --scene gone", "gone") for command in (*OF_RUNS, SHAPE)),
+    ("eval run --split val", "val"),
+    ("eval unknown", "unknown/config.json"),
+    ("train none --out new", "none"),
+    ("train broken --out new --points 500", "transforms_train.json"),
+    ("sweep none --out new", "none"),
+    ("compare none.png none.png", "none.png"),
+    ("info broken", "transforms_train.json"),
+    ("render run --path nowhere", "nowhere"),
+    ("render run --path nowhere.json", "nowhere.json"),
+    ("shape run --mesh none.ply", "none.ply"),
+    ("shape run", "--mesh"),
+    ("bench train --scene none", "none"),
+    # where nothing can be written
+    ("compare a.png a.png --json /no/such/a.json", "--json"),
+    ("eval run --json /no/such/a.json", "--json"),
+    ("eval run --chart /no/such/a.png", "--chart"),
+    ("info run --picture /no/such/a.png", "--picture"),
+    ("bench conv --plot /no/such/a.png", "--plot"),
+    ("bench unet --plot b.xyz", "--plot"),
+    ("sweep demo --out new --json none/a.json", "none/a.json"),
+    ("selftest --json none/a.json", "none/a.json"),
+    *((f"{command} --out /proc/a", "/proc/a") for command in ("train BALL", "eval run")),
+    ("train BALL --out full", "full"),
+    ("train BALL --out file", "file"),
+    ("train BALL --out file/new", "file/new"),
+    ("sweep demo --out run", "run"),
+    ("eval run --save-images --out full", "full"),
+    ("eval run --out file", "file"),
+    ("compress run --out full", "full"),
+    ("compress run --out " + 300 * "x", "name"),
+    ("render run --out full", "full"),
+    ("render run --out /", "/"),
+    ("render run --out folder.mp4", "folder.mp4"),
+    ("render run --out " + 245 * "x" + ".mp4", "name"),
+    *((f"render run --out /proc/{name}", f"/proc/{name}") for name in ("a.mp4", "nothing")),
+    ("export run --format ply --out folder.ply", "folder.ply"),
+    ("export run --format ply --out " + 250 * "x" + ".ply", "name"),
+    ("export run --format glb --out none/a.glb", "none"),
+    ("export run --format mesh --out a.obj", ".ply or .glb"),
+    ("export run --format scene --out .", "folder"),
+    *((f"export run --format scene --out {name}", name) for name in ("full", "file")),
+    *(
+        (f"export run --format {name} --out /proc/a{suffix}", "/proc/a")
+        for name, suffix in {"ply": ".ply", "glb": ".glb", "html": ".html", "scene": ""}.items()
+    ),
+    # devices
+    *((f"{command} run --device abacus", "abacus") for command in ("eval", "render", "compress")),
+    *((f"{command} --device abacus", "abacus") for command in (TRAIN, "bench unet", "selftest")),
+    # options that are unknown, of other commands or subjects, or do not fit each other
+    (f"{TRAIN} --speed 9", "--speed"),
+    ("info run --scene run --masks run", "--masks"),
+    ("info run --set train.seed=1", "--set"),
+    ("info run --preset tiny", "--preset"),
+    ("info run --open", "--picture"),
+    ("info BALL --scene BALL", "--scene"),
+    ("shape run --edge 1", "--edge"),
+    ("shape ball.ply --mesh ball.ply", "--mesh"),
+    ("sweep demo --out new --json --dry-run", "--json"),
+    ("sweep demo --out new --workers 2 --scheduler tcp://a", "--workers"),
+    ("sweep demo --out new --vary points.count=1,2 --set points.count=3", "points.count"),
+    ("bench all --size 64", "--size"),
+    ("bench --tolerance 1e-5", "--tolerance"),
+    ("bench conv --tolerance 1e-5", "--tolerance"),
+    ("bench conv --points 9", "--points"),
+    ("bench unet --budget 9", "--budget"),
+    ("bench unet --scene demo", "--scene"),
+    ("bench raster --set train.seed=1", "--set"),
+    ("bench raster --widths 16,16,16", "--widths"),
+    ("bench train --plot b.png", "--plot"),
+    ("bench model", "--runs"),
+    ("export run --format html --min-weight 1", "--min-weight"),
+    ("render run --background transparent --out a.mp4", "--background"),
+    ("render run --background black --format exr --out new", "--background"),
+    ("render run --features", "--features"),
+    ("render run --format mp4 --out new", "--format"),
+    ("render run --format png --out a.mp4", "a.mp4"),
+    ("render run --out a.avi", "a.avi"),
+    ("render run --fps 60 --out a.gif", "--fps"),
+    ("render run --path test --seconds 1", "--seconds"),
+    # values that make no sense
+    (f"{TRAIN} --iterations 0", "--iterations: train.iterations"),
+    (f"{TRAIN} --iterations x", "--iterations"),
+    (f"{TRAIN} --downscale 20", "--downscale"),
+    (f"{TRAIN} --memory 0.001", "--memory 0.001"),
+    (f"{TRAIN} --downscale 2 --points 300 --set train.refine_at=0.3,0.6", "train.refine_at"),
+    (f"{TRAIN} --set train.crop=6", "--set: train.crop"),
+    (f"{TRAIN} --set train.sped=1", "train.sped"),
+    (f"{TRAIN} --set nonsense", "--set"),
+    (f"{TRAIN} --set scene.path=b", "scene.path"),
+    (f"{TRAIN} --preset huge", "--preset"),
+    ("sweep demo --out new --seeds a", "--seeds"),
+    ("sweep demo --out new --vary points.count", "--vary points.count"),
+    ("sweep demo --out new --workers 0", "--workers"),
+    ("sweep demo --out new --set train.seed=1", "--seeds"),
+    ("sweep demo --out new --set points.sh_degree=3", "points.sh_degree"),
+    ("eval run --metrics beauty", "--metrics"),
+    ("view run --port 70000", "--port"),
+    ("bench --budget long", "--budget"),
+    ("bench unet --tolerance 1e-9", "tolerance"),
+    ("bench unet --blocks triple", "--blocks"),
+    ("bench raster --gamma 0.1,0.2", "--gamma"),
+    ("bench raster --blend alpha,beta", "--blend"),
+    ("bench raster --scene moon", "--scene"),
+    ("bench train --points 10,20", "--points"),
+    ("shape run --samples 0", "--samples"),
+    ("shape ball.ply --edge nan", "--edge"),
+    ("compress run --max-loss much", "--max-loss"),
+    ("export run", "--format"),
+    ("export run --format obj", "obj"),
+    ("export run --format ply --min-weight x", "--min-weight"),
+    ("render run --size large", "--size"),
+    ("render run --fov nan", "--fov"),
+    ("render run --seconds 0.001", "--seconds"),
+    ("render run --samples 3", "--samples"),
+    ("render run --background red", "--background"),
+]
+
+
+@pytest.fixture
+def folder(scene, finished, tmp_path, monkeypatch):
+    """The folder that one is in: a run, runs that lack something, a mesh, files in the way."""
+    monkeypatch.chdir(tmp_path)
+    for name in ("run", "young", "corrupt", "unknown"):
+        shutil.copytree(finished, name)
+    Path("young/checkpoint.npz").unlink()
+    Path("corrupt/checkpoint.npz").write_bytes(b"PK\x03\x04 not really")
+    Path("unknown/config.json").write_text("{}")
+    shutil.copytree(scene, "broken")
+    Path("broken/transforms_train.json").write_text('{"frames": [')
+    for name in ("empty", "full", "folder.mp4", "folder.ply"):
+        Path(name).mkdir()
+    Path("full/holiday.jpg").write_bytes(b"")
+    Path("file").write_bytes(b"")
+    trimesh.creation.icosphere(subdivisions=1).export("ball.ply")
+    return tmp_path
+
+
+@pytest.mark.parametrize("line, named", REFUSED, ids=[line[:60] for line, _ in REFUSED])
+def test_bad_input_is_one_line_and_nothing_is_done(folder, scene, capsys, monkeypatch, line, named):
+    monkeypatch.setattr(Run, "render", None)  # that nothing is computed
+    monkeypatch.setitem(sys.modules, "pp_cl.sweep.cluster", None)
+    before = sorted(folder.rglob("*"))
+    assert main([scene if word == "BALL" else word for word in line.split()]) == 2
+    said = capsys.readouterr().err.splitlines()
+    assert [text for text in said if text.startswith("pp-cl")] == said[-1:]
+    assert named in said[-1]
+    assert sorted(folder.rglob("*")) == before
