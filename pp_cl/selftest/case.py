@@ -73,12 +73,6 @@ def exact(actual: ArrayLike, expected: ArrayLike) -> Check:
     return Check(float(np.count_nonzero(actual != expected)), 0.0)
 
 
-def no_more(actual: ArrayLike, most: ArrayLike, bound: float) -> Check:
-    """By how much values exceed the most that they may be. bound: of that."""
-    excess, _ = _difference(np.maximum(actual, most), most)
-    return Check(float(excess.max(initial=0)), bound)
-
-
 def finite(*arrays: np.ndarray) -> Check:
     """How many values are NaN or infinite. The bound is 0."""
     return Check(float(sum(np.count_nonzero(~np.isfinite(a)) for a in arrays)), 0.0)

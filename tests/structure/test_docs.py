@@ -15,7 +15,14 @@ DOCUMENTS = [
 PATH = re.compile(r"`((?:pp_cl|cl|tests|tools|docs)/[\w./]+)`")
 PLACEHOLDER = re.compile(r"\bW/|\b(?:test_)?x\.")  # as in cl/W/x.cl
 # History: the changelog names them.
-REMOVED = {"tools/paper_scale.py", "tools/active_tiles.py"}
+REMOVED = {
+    "tests/oracle/",
+    "tools/ablate.py",
+    "tools/active_tiles.py",
+    "tools/demo_scene.py",
+    "tools/paper_scale.py",
+    "tools/plot_rates.py",
+}
 MOST_WORDS = 20_000  # of README.md and docs/, generated pages included
 
 
