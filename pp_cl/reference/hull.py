@@ -4,16 +4,12 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
 
 
 def dilated_mask(alpha: np.ndarray, threshold: int) -> np.ndarray:
     """(H, W) bool: some pixel of the 3x3 neighbourhood has an alpha above the threshold."""
-    height, width = alpha.shape
-    mask = np.zeros((height, width), bool)
-    for y in range(height):
-        for x in range(width):
-            mask[y, x] = (alpha[max(y - 1, 0) : y + 2, max(x - 1, 0) : x + 2] > threshold).any()
-    return mask
+    return sliding_window_view(np.pad(alpha > threshold, 1), (3, 3)).any((2, 3))
 
 
 def kept(

@@ -186,13 +186,13 @@ def _adam(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
     yield each(parameter, np.full(257, 0.5), 4e-7)
 
 
-def _adam_steps(dev, start, grads, *, rate, eps):
+def _adam_steps(dev, start, grads, **options):
     """(float64 twin, parameter, moments) after a step with each gradient."""
     parameter = dev.upload(start, np.float32)
-    twin, state = optim.Adam(parameter.get()), _moments(dev, parameter)
+    twin, state = optim.Adam(parameter.get()), {kind: dev.zeros(parameter.shape) for kind in "mv"}
     for step, grad in enumerate(grads.astype(np.float32), 1):
-        adam_update(dev, parameter, dev.upload(grad), state, step=step, rate=rate, eps=eps)
-        twin.step(grad, rate, eps)
+        adam_update(dev, parameter, dev.upload(grad), state, step=step, **options)
+        twin.step(grad, **options)
     return twin, parameter.get(), state
 
 
@@ -208,10 +208,6 @@ def _adam_extremes(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
     _, parameter, state = _adam_steps(dev, start, np.zeros((3, 33)), rate=0.5, eps=1e-15)
     yield exact(parameter, start)
     yield exact(state["v"].get(), np.zeros(33))
-
-
-def _moments(dev, parameter):
-    return {kind: dev.zeros(parameter.shape) for kind in "mv"}
 
 
 def _rmsprop(degree: int, dev: Device, rng: np.random.Generator) -> Iterator[Check]:
@@ -254,14 +250,9 @@ def _rmsprop_extremes(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
 
 def _bounded_opacity(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
     """Huge gradients keep it in [0, 1], at the values of float64."""
-    opacity = dev.upload(rng.random(257), np.float32)
-    twin, state = optim.Adam(opacity.get()), _moments(dev, opacity)
-    for step in range(1, 21):
-        drift = 1e4 * (rng.standard_normal(257) + np.linspace(-2, 2, 257))
-        grad = dev.upload(drift, np.float32)
-        adam_update(dev, opacity, grad, state, step=step, rate=0.03, eps=1e-15, bounded=True)
-        twin.step(grad.get(), 0.03, 1e-15, low=0, high=1)
-    moved = opacity.get()
+    grads = 1e4 * (rng.standard_normal((20, 257)) + np.linspace(-2, 2, 257))
+    options = {"rate": 0.03, "eps": 1e-15, "bounded": True}
+    twin, moved, _ = _adam_steps(dev, rng.random(257), grads, **options)
     yield finite(moved)
     yield exact([moved.min(), moved.max()], [0, 1])
     yield absolute(moved, twin.parameter, 2e-6)  # twenty moves of 0.03
