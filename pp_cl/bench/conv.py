@@ -129,10 +129,8 @@ class RandomConv:
     on random data. variants: names of those that are offered to the device and can run it.
     """
 
-    def __init__(
-        self, dev: Device, k: int, side: int, sources: tuple[int, ...], *, co: int, seed: int = 0
-    ):
-        rng = np.random.default_rng(seed)
+    def __init__(self, dev: Device, k: int, side: int, sources: tuple[int, ...], co: int):
+        rng = np.random.default_rng(0)
         self.layer = Layer.random(rng, (side, side), sources, co, k)
         self.uploaded = UploadedLayer(dev, self.layer)
         self.tiles = all_tiles(dev, side, side)
