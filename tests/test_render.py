@@ -45,26 +45,14 @@ def chained(model, settings, camera, opacity=None, sh=None, tracked=0):
     def backward(grad_picture):
         grad_net = network_gradients(layers, parameters, outputs, active, grad_image=grad_picture)
         grad_features = grad_net.pop("x").reshape(-1, 16)
-        if settings.blend == "alpha":
-            grad_shaded, grad_opacity, _ = oracle_raster.alpha_gradients(
-                geometry,
-                blend,
-                shaded,
-                grad_features,
-                max_tracked=tracked,
-                mean=settings.mean_gradient,
-            )
-        else:
-            grad_shaded, grad_opacity, _ = oracle_raster.blend_gradients(
-                geometry,
-                blend,
-                opacity,
-                shaded,
-                grad_features=grad_features,
-                gamma=GAMMA,
-                max_tracked=tracked,
-                mean=settings.mean_gradient,
-            )
+        grad_shaded, grad_opacity = oracle_raster.gradients(
+            geometry,
+            blend,
+            shaded,
+            grad_features,
+            max_tracked=tracked,
+            mean=settings.mean_gradient,
+        )
         directions = positions - padded.eye
         basis = oracle_raster.sh_basis(
             directions / np.linalg.norm(directions, axis=1, keepdims=True)

@@ -1,8 +1,8 @@
 """The demo's object in a textured room, as photographs for COLMAP, and how well COLMAP finds their
 cameras.
 
-    python tools/colmap_demo.py photographs FOLDER     # FOLDER/images and FOLDER/masks
-    python tools/colmap_demo.py compare FOLDER         # the model in FOLDER/sparse/0 with the truth
+    python -m tools.colmap_demo photographs FOLDER     # FOLDER/images and FOLDER/masks
+    python -m tools.colmap_demo compare FOLDER         # the model in FOLDER/sparse/0 with the truth
 
 Between the two, COLMAP without a GPU (docs/scenes.md).
 """
@@ -23,6 +23,7 @@ from pp_cl.files.image import write_png
 from pp_cl.scene.camera import Camera
 from pp_cl.scene.demo import demo_frames, render
 from pp_cl.scene.readers.colmap import read_split
+from tools.depth_error import pixel_rays
 
 WIDER = 1.6  # angle of view, so that the room is seen around the object
 ROOM = 6.0  # radius of the room, world units; the cameras are 3.4 from its middle
@@ -48,9 +49,7 @@ def cameras(size: int) -> list[Camera]:
 
 def room(camera: Camera) -> np.ndarray:
     """(H, W, 3) colours in [0, 1] of the room's wall: noise on a sphere around the origin."""
-    y, x = np.mgrid[: camera.height, : camera.width] + 0.5
-    flat = (x - camera.cx) / camera.fx, (y - camera.cy) / camera.fy, np.ones_like(x)
-    rays = np.stack(flat, -1) @ camera.pose[:, :3].T
+    rays = pixel_rays(camera)
     rays /= np.linalg.norm(rays, axis=-1, keepdims=True)
     along = rays @ camera.eye
     distance = -along + np.sqrt(along**2 + ROOM**2 - camera.eye @ camera.eye)

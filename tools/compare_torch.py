@@ -98,9 +98,9 @@ def compare(torch, dev, widths, size, *, variant, rounds):
     }
     times = interleave(
         {
-            ("forward", "ours"): bench.forward_runner(dev, net, x, grad_image),
+            ("forward", "ours"): bench.network_runner(net, net.policy, x),
             ("forward", "torch"): lambda: twin.forward(torch_x),
-            ("train", "ours"): bench.train_runner(dev, net, x, grad_image),
+            ("train", "ours"): bench.network_runner(net, net.policy, x, grad_image),
             ("train", "torch"): lambda: twin.train(torch_x, torch_grad),
         },
         rounds,

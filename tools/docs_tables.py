@@ -6,10 +6,10 @@ A generated part stands between the lines `<!-- table: NAME -->` and `<!-- end t
 Markdown file. NAME is `settings` (from pp_cl/settings.py and presets.py), `commands` (from the
 parsers of pp_cl/commands/), or that of a file docs/results/NAME.json, which holds
 
-    measured   what the numbers are; machine, command, version, commit: how they were obtained.
-               estimated, in its place: what numbers are that nobody measured
+    measured   what the numbers are; machine, command, version, commit: how they were obtained
     columns    [{"head": text, "cell": format}]: format is a str.format of the row's keys
-    rows       [{key: value}]; a key that a row lacks is printed as nothing
+    rows       [{key: value}]; a cell of which a row has no key is empty, and a text that a row
+               lacks is printed as nothing
     notes      sentences below the table, optional
 """
 
@@ -20,6 +20,7 @@ import json
 import re
 import string
 import sys
+from collections import defaultdict
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -36,19 +37,12 @@ class TableError(Exception):
     """What is wrong with a marker or with a file of results."""
 
 
-class _Missing:
-    """The value of a key that a row lacks: nothing, in any format."""
-
-    def __format__(self, spec):
-        return ""
-
-
 def cell(template: str, row: dict) -> str:
     """The template filled from the row; empty if the row has none of its keys."""
     keys = {name for _, name, _, _ in string.Formatter().parse(template) if name}
     if keys and not keys & row.keys():
         return ""
-    text = template.format(**{key: row.get(key, _Missing()) for key in keys})
+    text = template.format_map(defaultdict(str, row))
     text = re.sub(r"\b0\.?0*e[+]00", "0", text)  # 0.0e+00 -> 0
     return re.sub(r"e([+-])0+(\d)", r"e\1\2", text).strip()  # 1e-06 -> 1e-6
 
@@ -60,14 +54,11 @@ def markdown(heads: Sequence[str], rows: Sequence[Sequence[str]]) -> list[str]:
 
 
 def table(results: dict) -> str:
-    """Markdown of a file of results: what was measured (or estimated) and how, the table, the
-    notes.
-    """
-    kind = "estimated" if "estimated" in results else "measured"
-    origin = f"{kind.capitalize()} with version {results['version']}"
+    """Markdown of a file of results: what was measured and how, the table, the notes."""
+    origin = f"Measured with version {results['version']}"
     origin += f" on {results['machine']}" if "machine" in results else ""
     origin += f": `{results['command']}`" if "command" in results else ""
-    what = results[kind]
+    what = results["measured"]
     heads = [column["head"] for column in results["columns"]]
     rows = [[cell(column["cell"], row) for column in results["columns"]] for row in results["rows"]]
     lines = [f"{what[0].upper()}{what[1:]}. {origin}.", "", *markdown(heads, rows)]

@@ -4,15 +4,17 @@ Errors are against float64 (reference/network.py): of outputs and input gradient
 of weights' gradients at SAMPLE_CHANNELS x SAMPLE_CHANNELS channels and every tap.
 """
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
+from functools import cached_property
+from types import ModuleType
 
 import numpy as np
 
 from pp_cl.bench.timing import PeakFlops, errors, variant_rows
 from pp_cl.device.device import Device
 from pp_cl.layers.choice import OFFERED, VARIANTS, ConvolutionPolicy, can_run, device_class
-from pp_cl.layers.conv import Direction, pack_bias, pack_weights, unpack_weights
-from pp_cl.layers.tiles import all_tiles
+from pp_cl.layers.conv import Blocking, Direction, pack_bias, pack_weights, unpack_weights
+from pp_cl.layers.tiles import Tiles, all_tiles
 from pp_cl.network.layers import convolutions, unet_layers
 from pp_cl.reference import network as reference
 
@@ -20,36 +22,120 @@ SAMPLES = 256  # pixels: some of every place in the tiles of any variant
 SAMPLE_CHANNELS = 16
 
 
-class RandomConv:
-    """A K x K convolution of one or two sources to `co` channels at side x side pixels, with ReLU
-    where K is 3, on random data.
+class Layer:
+    """A convolution with its input.
 
-    The sources are a ReLU's outputs, weights and bias of PyTorch's initial size, the gradient given
-    is normal. variants: names of those that are offered to the device and can run it.
+    parts: (H, W, C) float32, what is concatenated to the input. weight: (CO, CI, K, K). bias:
+    (CO,). grad_out: (H, W, CO). relu: whether the output passes through one; the gradient of the
+    input is masked by the input's own.
     """
 
     def __init__(
-        self, dev: Device, k: int, side: int, sources: tuple[int, ...], *, co: int, seed: int = 0
+        self,
+        parts: Sequence[np.ndarray],
+        weight: np.ndarray,
+        bias: np.ndarray,
+        grad_out: np.ndarray,
+        *,
+        relu: bool = False,
     ):
-        rng = np.random.default_rng(seed)
-        ci = sum(sources)
-        bound = 1 / np.sqrt(ci * k * k)
-        self.dev, self.k, self.relu = dev, k, k == 3
-        self.plain_x = np.maximum(rng.normal(size=(side, side, ci)), 0).astype(np.float32)
-        self.plain_weight = rng.uniform(-bound, bound, (co, ci, k, k)).astype(np.float32)
-        self.plain_bias = rng.uniform(-bound, bound, co).astype(np.float32)
-        self.plain_grad_out = rng.normal(size=(side, side, co)).astype(np.float32)
-        self.pixels = tuple(rng.integers(0, side, (2, SAMPLES)))
-        self.channels = [np.sort(rng.permutation(n)[:SAMPLE_CHANNELS]) for n in (co, ci)]
+        self.parts, self.weight, self.bias = tuple(parts), weight, bias
+        self.grad_out, self.relu = grad_out, relu
+        self.x = np.concatenate(self.parts, 2)
 
-        splits = np.split(self.plain_x, np.cumsum(sources)[:-1], axis=2)
-        self.x = tuple(dev.upload(s) for s in splits)
-        self.grad_x = [dev.empty(s.shape) for s in splits]
-        self.weight = dev.upload(pack_weights(self.plain_weight))
-        self.bias = dev.upload(pack_bias(self.plain_bias))
+    @classmethod
+    def random(
+        cls,
+        rng: np.random.Generator,
+        size: tuple[int, int],
+        channels: tuple[int, ...],
+        co: int,
+        k: int = 3,
+    ) -> "Layer":
+        """Of a ReLU's outputs of so many `channels`, with weights of PyTorch's initial size and
+        normal gradients.
+        """
+        bound = 1 / np.sqrt(sum(channels) * k * k)
+        weight = rng.uniform(-bound, bound, (co, sum(channels), k, k)).astype(np.float32)
+        bias = rng.uniform(-bound, bound, co).astype(np.float32)
+        parts = [np.maximum(rng.normal(size=(*size, c)), 0).astype(np.float32) for c in channels]
+        return cls(parts, weight, bias, rng.normal(size=(*size, co)).astype(np.float32), relu=True)
+
+    @cached_property
+    def expected(self) -> list[np.ndarray]:
+        """Float64 [output, gradients of the weights and the bias as the device lays them out,
+        gradient of each part].
+        """
+        out = reference.convolution(self.x, self.weight, self.bias)
+        grad_x = reference.convolution(self.grad_out, reference.flipped(self.weight))
+        grad_x *= self.x > 0 if self.relu else 1
+        k = self.weight.shape[2]
+        grad_weight = reference.convolution_backward_weights(self.x, self.grad_out, k)
+        firsts = np.cumsum([part.shape[2] for part in self.parts])[:-1]
+        return [
+            np.maximum(out, 0) if self.relu else out,
+            pack_weights(grad_weight, np.float64),
+            pack_bias(self.grad_out.sum((0, 1), dtype=np.float64), np.float64),
+            *np.split(grad_x, firsts, 2),
+        ]
+
+    def computed(
+        self, dev: Device, conv: ModuleType, blocking: Blocking, tiles: Tiles | None = None
+    ) -> list[np.ndarray]:
+        """What `expected` lists, by a module of convolutions. tiles: of output and gradients."""
+        uploaded = UploadedLayer(dev, self)
+        for direction in Direction:
+            uploaded.compute(conv, blocking, direction, tiles)
+        results = uploaded.out, uploaded.grad_weight, uploaded.grad_bias, *uploaded.grad_parts
+        return [array.get() for array in results]
+
+
+class UploadedLayer:
+    """The arrays of a Layer on the device, and those that its convolution fills."""
+
+    def __init__(self, dev: Device, layer: Layer):
+        self.dev, self.relu = dev, layer.relu
+        self.parts = tuple(dev.upload(part) for part in layer.parts)
+        self.weight = dev.upload(pack_weights(layer.weight))
+        self.bias, self.grad_out = dev.upload(pack_bias(layer.bias)), dev.upload(layer.grad_out)
+        self.out = dev.empty(self.grad_out.shape)
+        self.grad_parts = [dev.empty(part.shape) for part in layer.parts]
         self.grad_weight, self.grad_bias = dev.empty(self.weight.shape), dev.empty(self.bias.shape)
-        self.out, self.grad_out = dev.empty((side, side, co)), dev.upload(self.plain_grad_out)
+
+    def compute(
+        self, conv: ModuleType, blocking: Blocking, direction: Direction, tiles: Tiles | None
+    ) -> None:
+        """Compute a direction by a module of convolutions, as the network does."""
+        dev, parts, weight, grad_out = self.dev, self.parts, self.weight, self.grad_out
+        if direction == Direction.FORWARD:
+            conv.forward(
+                dev, blocking, parts, weight, self.bias, self.out, relu=self.relu, tiles=tiles
+            )
+        elif direction == Direction.BACKWARD_WEIGHTS:
+            gradients = self.grad_weight, self.grad_bias
+            conv.backward_weights(dev, blocking, parts, grad_out, *gradients, tiles=tiles)
+        else:
+            first = 0
+            for part, grad in zip(parts, self.grad_parts, strict=True):
+                mask = part if self.relu else None
+                conv.backward_input(
+                    dev, blocking, weight, first, grad_out, grad, mask=mask, tiles=tiles
+                )
+                first += part.shape[2]
+
+
+class RandomConv:
+    """A K x K convolution of one or two sources to `co` channels at side x side pixels, with ReLU,
+    on random data. variants: names of those that are offered to the device and can run it.
+    """
+
+    def __init__(self, dev: Device, k: int, side: int, sources: tuple[int, ...], co: int):
+        rng = np.random.default_rng(0)
+        self.layer = Layer.random(rng, (side, side), sources, co, k)
+        self.uploaded = UploadedLayer(dev, self.layer)
         self.tiles = all_tiles(dev, side, side)
+        self.pixels = tuple(rng.integers(0, side, (2, SAMPLES)))
+        self.channels = [np.sort(rng.permutation(n)[:SAMPLE_CHANNELS]) for n in (co, sum(sources))]
         self.variants = [
             name for name in OFFERED[device_class(dev)] if can_run(name, k, *sources, co)
         ]
@@ -58,86 +144,31 @@ class RandomConv:
         """A function that computes a direction by a variant, as the network does, and waits for
         it. policy: its blocking is used.
         """
-        conv, blocking = VARIANTS[variant], policy.blocking
-        compute = {
-            Direction.FORWARD: self._run_forward,
-            Direction.BACKWARD_INPUT: self._run_backward_input,
-            Direction.BACKWARD_WEIGHTS: self._run_backward_weights,
-        }[direction]
 
         def run():
-            compute(conv, blocking)
-            self.dev.finish()
+            self.uploaded.compute(VARIANTS[variant], policy.blocking, direction, self.tiles)
+            self.uploaded.dev.finish()
 
         return run
-
-    def _run_forward(self, conv, blocking):
-        conv.forward(
-            self.dev,
-            blocking,
-            self.x,
-            self.weight,
-            self.bias,
-            self.out,
-            relu=self.relu,
-            tiles=self.tiles,
-        )
-
-    def _run_backward_input(self, conv, blocking):
-        first = 0
-        for x, grad_x in zip(self.x, self.grad_x, strict=True):
-            conv.backward_input(
-                self.dev,
-                blocking,
-                self.weight,
-                first,
-                self.grad_out,
-                grad_x,
-                mask=x,
-                tiles=self.tiles,
-            )
-            first += x.shape[2]
-
-    def _run_backward_weights(self, conv, blocking):
-        conv.backward_weights(
-            self.dev,
-            blocking,
-            self.x,
-            self.grad_out,
-            self.grad_weight,
-            self.grad_bias,
-            tiles=self.tiles,
-        )
 
     def result(
         self, variant: str, direction: Direction, policy: ConvolutionPolicy
     ) -> tuple[np.ndarray, np.ndarray]:
         """(computed, float64) values of the sample."""
         self.runner(variant, direction, policy)()
-        return {
-            Direction.FORWARD: self._forward,
-            Direction.BACKWARD_INPUT: self._backward_input,
-            Direction.BACKWARD_WEIGHTS: self._backward_weights,
-        }[direction]()
-
-    def _forward(self):
-        expected = reference.convolution_at(
-            self.plain_x, self.plain_weight, self.plain_bias, self.pixels
-        )
-        return self.out.get()[self.pixels], np.maximum(expected, 0) if self.relu else expected
-
-    def _backward_input(self):
-        expected = reference.convolution_at(
-            self.plain_grad_out, reference.flipped(self.plain_weight), 0.0, self.pixels
-        )
-        actual = np.concatenate([grad.get()[self.pixels] for grad in self.grad_x], 1)
-        return actual, expected * (self.plain_x[self.pixels] > 0)
-
-    def _backward_weights(self):
+        layer, uploaded, at = self.layer, self.uploaded, self.pixels
+        if direction == Direction.FORWARD:
+            expected = reference.convolution_at(layer.x, layer.weight, layer.bias, at)
+            return uploaded.out.get()[at], np.maximum(expected, 0)
+        if direction == Direction.BACKWARD_INPUT:
+            flipped = reference.flipped(layer.weight)
+            expected = reference.convolution_at(layer.grad_out, flipped, 0.0, at)
+            actual = np.concatenate([grad.get()[at] for grad in uploaded.grad_parts], 1)
+            return actual, expected * (layer.x[at] > 0)
         co, ci = self.channels
-        actual = unpack_weights(self.grad_weight.get(), self.out.shape[2])[np.ix_(co, ci)]
+        actual = unpack_weights(uploaded.grad_weight.get(), len(layer.weight))[np.ix_(co, ci)]
         return actual, reference.convolution_backward_weights(
-            self.plain_x[..., ci], self.plain_grad_out[..., co], self.k
+            layer.x[..., ci], layer.grad_out[..., co], layer.weight.shape[2]
         )
 
 

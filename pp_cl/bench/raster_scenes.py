@@ -31,7 +31,10 @@ HIGHER_SH = 0.1
 
 
 class BenchScene:
-    """A camera, points, and their rasterisation in stages (Device.stage).
+    """What the scenes share: float64 features of pixels, and the bytes that the stages move.
+
+    A scene has forward(blend) and backward(blend, result of the last forward), which rasterise it
+    in stages (Device.stage), and exact_features(points), (S, 16) in float64.
 
     name: of the scene. forward_stages: the stages of forward(); those of backward() are timed
     beside them. size: side of the image in pixels. count: number of points. positions: (N, 3),
@@ -40,18 +43,6 @@ class BenchScene:
     """
 
     radius = 0.0015
-
-    def forward(self, blend: str) -> RenderResult:
-        """Rasterise the scene."""
-        raise NotImplementedError
-
-    def backward(self, blend: str, result: RenderResult) -> None:
-        """All gradients from self.grad. result: of forward(blend), the last one."""
-        raise NotImplementedError
-
-    def exact_features(self, points: np.ndarray) -> np.ndarray:
-        """(S, 16) float64 features of some points."""
-        raise NotImplementedError
 
     def error(self, blend: str, features: np.ndarray) -> float:
         """Largest difference of features (H, W, 16) from float64, over their range, at SAMPLES
@@ -170,7 +161,7 @@ class GridScene(BenchScene):
         self.positions = grid.positions(ids)
 
     def forward(self, blend: str) -> RenderResult:
-        """See BenchScene."""
+        """Project, find pairs, weigh, shade and blend, by the renderer."""
         return self.renderers[blend].forward(self.camera, self.gamma, until="features")
 
     def backward(self, blend: str, result: RenderResult) -> None:
@@ -178,13 +169,13 @@ class GridScene(BenchScene):
         self.renderers[blend].backward_features(result, self.grad)
 
     def exact_features(self, points: np.ndarray) -> np.ndarray:
-        """See BenchScene."""
+        """(S, 16) float64 features of some points, shaded."""
         coefficients = np.full((len(points), 9, CHANNELS), HIGHER_SH)
         coefficients[:, 0] = self.sh_0[points, 0]
         return dense.shade(self.positions[points], self.camera.eye, coefficients)
 
     def moved_bytes(self, blend: str, result: RenderResult) -> dict[str, int]:
-        """See BenchScene, with the stages of a grid and of harmonics."""
+        """Bytes by stage, with the stages of a grid and of harmonics."""
         shading = 4 + 16 + 9 * ROW + ROW
         own = {
             "project": self.count * (4 + 16 + 8 + 4),
@@ -220,7 +211,7 @@ class PulsarScene(BenchScene):
         self.grad = dev.upload(rng.standard_normal((size, size, CHANNELS), np.float32))
 
     def forward(self, blend: str) -> RenderResult:
-        """See BenchScene."""
+        """Project, find pairs, weigh and blend."""
         dev, b, size = self.dev, self.buffers[blend], (self.size, self.size)
         with dev.stage("project"):
             points = project_spheres(
@@ -284,11 +275,11 @@ class PulsarScene(BenchScene):
             )
 
     def exact_features(self, points: np.ndarray) -> np.ndarray:
-        """See BenchScene."""
+        """(S, 16) float64 features of some points."""
         return self.point_features[points].astype(np.float64)
 
     def moved_bytes(self, blend: str, result: RenderResult) -> dict[str, int]:
-        """See BenchScene, with the stages of spheres."""
+        """Bytes by stage, with the stages of spheres."""
         n, p, hw = self.count, result.pairs.total, self.size**2
         spheres = p * (4 + 8 + 8 + 8) + p * (4 + 8) + (ROW + 16 + 16) * n + 2 * (ROW + 4) * hw
         own = {"project": n * (12 + 16 + 8 + 4), "spheres": spheres}

@@ -72,8 +72,8 @@ class Case:
 
     @property
     def layer(self) -> tuple:
-        """(k, sources, co, side): what a RandomConv is made of."""
-        return self.k, self.sources, self.co, self.side
+        """(k, side, sources, co): what a RandomConv is made of."""
+        return self.k, self.side, self.sources, self.co
 
     @property
     def shape(self) -> ConvShape:
@@ -125,7 +125,7 @@ def _time_blocking(dev, cases, values, policy):
     totals = {}
     for case in (c for c in cases if c.training and c.k == 3):
         used = [name for name in values if case.direction in TRIED[name][1]]
-        conv = RandomConv(dev, case.k, BLOCKING_SIDE, case.sources, co=case.co) if used else None
+        conv = RandomConv(dev, case.k, BLOCKING_SIDE, case.sources, case.co) if used else None
         for name in (name for name in used if TRIED[name][0] in conv.variants):
             runs = {
                 value: conv.runner(
@@ -194,7 +194,7 @@ def run_tune(
     for case in cases:
         if case.layer != layer:
             conv, layer = None, case.layer  # frees the old one first
-            conv = RandomConv(dev, case.k, case.side, case.sources, co=case.co)
+            conv = RandomConv(dev, *case.layer)
         row, ms = measure(case, conv, shipped, tuned)
         rows.append(row)
         shipped_ms.append(ms)

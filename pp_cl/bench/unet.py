@@ -52,7 +52,7 @@ def bench_unet(
     }
     device_x, device_grad = dev.upload(x), dev.upload(grad_image)
     flops = 2 * multiplications(net.layers, size, size)
-    for direction, factor, runner in (("forward", 1, forward_runner), ("train", 3, train_runner)):
+    for direction, factor, grad in (("forward", 1, None), ("train", 3, device_grad)):
         net.policy = policies[AUTO]
         memory = sum(row[2] for row in net.memory_plan(size, size, direction == "train"))
         about = {
@@ -62,24 +62,13 @@ def bench_unet(
             "direction": direction,
             "memory_bytes": memory,
         }
-        run = runner(dev, net, device_x, device_grad)
         yield from variant_rows(
             about,
-            {name: _by_policy(net, p, run) for name, p in policies.items()},
+            {name: network_runner(net, p, device_x, grad) for name, p in policies.items()},
             {name: found[name][direction] for name in names},
             flops=factor * flops,
             peak=peak,
         )
-
-
-def _by_policy(net, policy, run):
-    """`run` of the network, as a function that runs it by a policy."""
-
-    def changed():
-        net.policy = policy
-        run()
-
-    return changed
 
 
 def make_network(
@@ -101,23 +90,19 @@ def make_network(
     return net
 
 
-def forward_runner(dev: Device, net: UNet, x: Array, grad_image: Array) -> Callable:
-    """A function that makes an image, as evaluation does, and waits for it."""
+def network_runner(
+    net: UNet, policy: ConvolutionPolicy, x: Array, grad_image: Array | None = None
+) -> Callable:
+    """A function that makes an image by a policy, as evaluation does, and waits for it; with an
+    image's gradient it makes all gradients, too, as training does.
+    """
 
     def run():
-        net.forward(x, training=False)
-        dev.finish()
-
-    return run
-
-
-def train_runner(dev: Device, net: UNet, x: Array, grad_image: Array) -> Callable:
-    """A function that makes an image and then all gradients, and waits for them."""
-
-    def run():
-        net.forward(x)
-        net.backward(grad_image)
-        dev.finish()
+        net.policy = policy
+        net.forward(x, training=grad_image is not None)
+        if grad_image is not None:
+            net.backward(grad_image)
+        net.dev.finish()
 
     return run
 

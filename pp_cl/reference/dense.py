@@ -140,8 +140,8 @@ def order(geometry_: Arrays) -> np.ndarray:
 
 
 def blend(geometry_: Arrays, opacity: np.ndarray, gamma: float, stop: float = 0.0) -> Arrays:
-    """Dict: weight (N, HW) b; share (N, HW) b/o, its limit at o = 0; z (N, HW); background (HW,)
-    b_0; hit (N, HW) used.
+    """Dict: weight (N, HW) b; share (N, HW) b/o, its limit at o = 0; by_opacity (N, HW), what the
+    logarithm's derivative by o is times b; z (N, HW); background (HW,) b_0; hit (N, HW) used.
     """
     hit, d, z = geometry_["hit"], geometry_["closeness"], geometry_["z"]
     o = np.asarray(opacity, np.float64)[:, None]
@@ -152,9 +152,11 @@ def blend(geometry_: Arrays, opacity: np.ndarray, gamma: float, stop: float = 0.
         log_share = np.where(hit, np.log(d) + o * z / gamma, -np.inf)
     m = np.maximum(EPS / gamma, log_weight.max(axis=0, initial=-np.inf))
     total = m + np.log(np.exp(EPS / gamma - m) + np.exp(log_weight - m).sum(axis=0))
+    share = np.exp(log_share - total)
     return {
         "weight": np.exp(log_weight - total),
-        "share": np.exp(log_share - total),
+        "share": share,
+        "by_opacity": share * (1 + o * z / gamma),
         "z": z,
         "hit": hit,
         "background": np.exp(EPS / gamma - total),
@@ -185,31 +187,6 @@ def features(blend_: Arrays, point_features: np.ndarray) -> np.ndarray:
     return (
         blend_["weight"].T @ np.asarray(point_features, np.float64) + blend_["background"][:, None]
     )
-
-
-def blend_gradients(
-    geometry_: Arrays,
-    blend_: Arrays,
-    opacity: np.ndarray,
-    point_features: np.ndarray,
-    *,
-    grad_features: np.ndarray,
-    gamma: float,
-    max_tracked: int = 0,
-    mean: bool = False,
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """(dL/df (N, C), dL/do (N,), dL/dl (N, HW)) of grad_features (HW, C) for the max_tracked
-    nearest hits (0: all).
-    """
-    G, f = np.asarray(grad_features, np.float64), np.asarray(point_features, np.float64)
-    s = f @ G.T - (G * features(blend_, f)).sum(axis=1)
-    tracked = blend_["hit"] & (order(geometry_) < max_tracked) if max_tracked else blend_["hit"]
-    scale = 1 / np.maximum(tracked.sum(axis=1), 1) if mean else np.ones(len(f))
-    weight, share = np.where(tracked, blend_["weight"], 0), np.where(tracked, blend_["share"], 0)
-    dL_do = (share * (1 + np.asarray(opacity, np.float64)[:, None] * blend_["z"] / gamma) * s).sum(
-        axis=1
-    )
-    return scale[:, None] * (weight @ G), scale * dL_do, scale[:, None] * weight * s
 
 
 def alpha(geometry_: Arrays, opacity: np.ndarray, least: float = 0.0) -> Arrays:
@@ -261,7 +238,7 @@ def spread(geometry_: Arrays, blend_: Arrays) -> np.ndarray:
     return (blend_["weight"] * distances(geometry_, blend_)).sum(axis=0)
 
 
-def alpha_gradients(
+def gradients(
     geometry_: Arrays,
     blend_: Arrays,
     point_features: np.ndarray,
@@ -270,27 +247,37 @@ def alpha_gradients(
     max_tracked: int = 0,
     mean: bool = False,
     spread_weight: float = 0.0,
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """(dL/df (N, C), dL/do (N,), dL/dalpha (N, HW)) as blend_gradients, of a loss to which the
-    pixels' spread is added with this weight.
+) -> tuple[np.ndarray, np.ndarray]:
+    """(dL/df (N, C), dL/do (N,)) of grad_features (HW, C) for the max_tracked nearest hits (0:
+    all). mean: over a point's tracked hits, not their sum. spread_weight: of the pixels' spread,
+    which is added to the loss; of alpha() alone.
     """
     G, f = np.asarray(grad_features, np.float64), np.asarray(point_features, np.float64)
     own, ranks = f @ G.T, order(geometry_)
-    if spread_weight:
-        own += 2 * spread_weight * distances(geometry_, blend_)
+    if "through" in blend_:
+        if spread_weight:
+            own += 2 * spread_weight * distances(geometry_, blend_)
+        slope = _alpha_slope(blend_, own, G.sum(axis=1), ranks) * geometry_["closeness"]
+    else:
+        slope = blend_["by_opacity"] * (own - (G * features(blend_, f)).sum(axis=1))
+    tracked = blend_["hit"] & (ranks < max_tracked) if max_tracked else blend_["hit"]
+    scale = 1 / np.maximum(tracked.sum(axis=1), 1) if mean else np.ones(len(f))
+    weight, slope = np.where(tracked, blend_["weight"], 0), np.where(tracked, slope, 0)
+    return scale[:, None] * (weight @ G), scale * slope.sum(axis=1)
+
+
+def _alpha_slope(blend_, own, background, ranks):
+    """(N, HW) dL/dalpha of the hits that are used. own: G times a point's features. background:
+    (HW,), G times those behind all hits.
+    """
     slope = np.zeros_like(own)
     for q in np.flatnonzero(blend_["hit"].any(axis=0)):
         points = np.flatnonzero(blend_["hit"][:, q])
-        rest = G[q].sum()  # G times what is composited behind a hit
+        rest = background[q]  # G times what is composited behind a hit
         for i in points[np.argsort(-ranks[points, q])]:
             slope[i, q] = blend_["through"][i, q] * (own[i, q] - rest)
             rest += blend_["alpha"][i, q] * (own[i, q] - rest)
-    tracked = blend_["hit"] & (ranks < max_tracked) if max_tracked else blend_["hit"]
-    scale = 1 / np.maximum(tracked.sum(axis=1), 1) if mean else np.ones(len(f))
-    slope = np.where(tracked, slope, 0)
-    dL_do = (slope * geometry_["closeness"]).sum(axis=1)
-    weight = np.where(tracked, blend_["weight"], 0)
-    return scale[:, None] * (weight @ G), scale * dL_do, scale[:, None] * slope
+    return slope
 
 
 def sh_basis(directions: np.ndarray) -> np.ndarray:

@@ -15,10 +15,6 @@ def scaled_input(image: np.ndarray) -> np.ndarray:
     return (2 * image - 1 - np.array([-0.030, -0.088, -0.188])) / np.array([0.458, 0.448, 0.450])
 
 
-def _convolve_relu(x, kernel, bias):
-    return np.maximum(convolution(x, kernel, bias), 0)
-
-
 def maxpool2(x: np.ndarray) -> np.ndarray:
     """Largest value of each 2x2 cell; an odd last row or column is dropped."""
     height, width, channels = x.shape[0] // 2, x.shape[1] // 2, x.shape[2]
@@ -44,22 +40,28 @@ def pixel_distance(a: np.ndarray, b: np.ndarray, head: np.ndarray) -> np.ndarray
     return ((unit_a - unit_b) ** 2) @ head
 
 
+def _features(image, weights):
+    """(input of each convolution, output of each block) of an image in [0, 1]."""
+    x, inputs, outputs = scaled_input(image), [], []
+    for block, convolutions in enumerate(BLOCKS):
+        x = maxpool2(x) if block else x
+        for _ in range(convolutions):
+            layer = len(inputs)
+            inputs.append(x)
+            x = convolution(x, weights[f"kernel{layer}"], weights[f"bias{layer}"])
+            x = np.maximum(x, 0)
+        outputs.append(x)
+    return inputs, outputs
+
+
 def lpips(a: np.ndarray, b: np.ndarray, weights: Weights) -> float:
     """Distance of two (H, W, 3) images in [0, 1]; weights as pp_cl.lpips_weights.load_weights()
     names them.
     """
-    weights = {name: array.astype(np.float64) for name, array in weights.items()}
-    x, y = scaled_input(a), scaled_input(b)
-    layer, total = 0, 0.0
-    for block, convolutions in enumerate(BLOCKS):
-        if block:
-            x, y = maxpool2(x), maxpool2(y)
-        for _ in range(convolutions):
-            kernel, bias = weights[f"kernel{layer}"], weights[f"bias{layer}"]
-            x, y = _convolve_relu(x, kernel, bias), _convolve_relu(y, kernel, bias)
-            layer += 1
-        total += pixel_distance(x, y, weights[f"head{block}"]).mean()
-    return total
+    pairs = zip(_features(a, weights)[1], _features(b, weights)[1], strict=True)
+    return sum(
+        pixel_distance(x, y, weights[f"head{block}"]).mean() for block, (x, y) in enumerate(pairs)
+    )
 
 
 def pixel_distance_gradient(a: np.ndarray, b: np.ndarray, head: np.ndarray) -> np.ndarray:
@@ -74,22 +76,11 @@ def pixel_distance_gradient(a: np.ndarray, b: np.ndarray, head: np.ndarray) -> n
 
 def lpips_gradient(a: np.ndarray, b: np.ndarray, weights: Weights) -> np.ndarray:
     """Gradient of lpips(a, b, weights) by a, (H, W, 3)."""
-    weights = {name: array.astype(np.float64) for name, array in weights.items()}
-    inputs, features = [], []  # of each convolution; of each block, of both images
-    for image in (a, b):
-        x, seen, found, layer = scaled_input(image), [], [], 0
-        for block, convolutions in enumerate(BLOCKS):
-            x = maxpool2(x) if block else x
-            for _ in range(convolutions):
-                seen.append(x)
-                x = _convolve_relu(x, weights[f"kernel{layer}"], weights[f"bias{layer}"])
-                layer += 1
-            found.append(x)
-        inputs, features = inputs or seen, [*features, found]
-
+    (inputs, features_a), (_, features_b) = _features(a, weights), _features(b, weights)
+    layer = len(inputs)
     grad = None
     for block in reversed(range(len(BLOCKS))):
-        x, y = (found[block] for found in features)
+        x, y = features_a[block], features_b[block]
         here = pixel_distance_gradient(x, y, weights[f"head{block}"]) / (x.shape[0] * x.shape[1])
         grad = here if grad is None else here + maxpool2_gradient(x, grad)
         for _ in range(BLOCKS[block]):

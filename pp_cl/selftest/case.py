@@ -41,29 +41,22 @@ class Case:
 
 def relative(actual: ArrayLike, expected: ArrayLike, bound: float) -> Check:
     """The largest error over the largest expected value. bound: of that."""
-    difference, expected = _difference(actual, expected)
-    scale = np.abs(expected).max(initial=0)
-    return Check(float(difference.max(initial=0) / max(scale, 1e-30)), bound)
+    return Check(_largest(actual, expected, np.abs(expected).max(initial=0)), bound)
 
 
 def absolute(actual: ArrayLike, expected: ArrayLike, bound: float) -> Check:
     """The largest error. bound: of that."""
-    return Check(float(_difference(actual, expected)[0].max(initial=0)), bound)
+    return Check(_largest(actual, expected, 1.0), bound)
 
 
 def each(actual: ArrayLike, expected: ArrayLike, bound: float, floor: float = 0.0) -> Check:
     """The largest error of a value over that value, or over `floor` more. bound: of that."""
-    difference, expected = _difference(actual, expected)
-    scale = np.abs(expected) + floor
-    shares = np.divide(difference, scale, out=difference.copy(), where=scale > 0)
-    return Check(float(shares.max(initial=0)), bound)
+    return Check(_largest(actual, expected, np.abs(expected) + floor), bound)
 
 
 def allowed(actual: ArrayLike, expected: ArrayLike, most: np.ndarray) -> Check:
     """The largest error as a share of what it may be at that place, so that the bound is 1."""
-    difference, _ = _difference(actual, expected)
-    shares = np.divide(difference, most, out=np.where(difference > 0, np.inf, 0.0), where=most > 0)
-    return Check(float(shares.max(initial=0)), 1.0)
+    return Check(_largest(actual, expected, most), 1.0)
 
 
 def exact(actual: ArrayLike, expected: ArrayLike) -> Check:
@@ -73,23 +66,21 @@ def exact(actual: ArrayLike, expected: ArrayLike) -> Check:
     return Check(float(np.count_nonzero(actual != expected)), 0.0)
 
 
-def no_more(actual: ArrayLike, most: ArrayLike, bound: float) -> Check:
-    """By how much values exceed the most that they may be. bound: of that."""
-    excess, _ = _difference(np.maximum(actual, most), most)
-    return Check(float(excess.max(initial=0)), bound)
-
-
 def finite(*arrays: np.ndarray) -> Check:
     """How many values are NaN or infinite. The bound is 0."""
     return Check(float(sum(np.count_nonzero(~np.isfinite(a)) for a in arrays)), 0.0)
 
 
-def _difference(actual, expected):
-    """(absolute differences, infinite where `actual` is not finite; expected) in float64."""
+def _largest(actual, expected, scale):
+    """The largest error over the scale at its place; infinite for what is not finite, and where
+    there may be no error.
+    """
     actual, expected = np.asarray(actual, np.float64), np.asarray(expected, np.float64)
     _same_shape(actual, expected)
-    with np.errstate(invalid="ignore"):
-        return np.where(np.isfinite(actual), np.abs(actual - expected), np.inf), expected
+    with np.errstate(all="ignore"):
+        error = np.abs(actual - expected)
+        error = np.where(np.isfinite(error), error, np.inf)
+        return float(np.where(error > 0, error / scale, 0.0).max(initial=0))
 
 
 def _same_shape(actual, expected):

@@ -259,25 +259,14 @@ class Blended:
 
     def reference_gradients(
         self, max_tracked: int = 0, mean: bool = False, spread_weight: float = 0.0
-    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """The same in float64: (features, opacity, by pair and logit, or by pair and alpha)."""
-        if self.rule == "alpha":
-            return dense.alpha_gradients(
-                self.geometry,
-                self.blend,
-                self.point_features,
-                self.grad,
-                max_tracked=max_tracked,
-                mean=mean,
-                spread_weight=spread_weight,
-            )
-        return dense.blend_gradients(
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """The same in float64: (features, opacity)."""
+        return dense.gradients(
             self.geometry,
             self.blend,
-            self.opacity,
             self.point_features,
-            grad_features=self.grad,
-            gamma=self.gamma,
+            self.grad,
             max_tracked=max_tracked,
             mean=mean,
+            spread_weight=spread_weight,
         )

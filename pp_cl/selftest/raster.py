@@ -16,7 +16,7 @@ from pp_cl.raster.shade import shade_forward
 from pp_cl.raster.weights import BLENDS, DROPPED, record_weights
 from pp_cl.reference import dense
 from pp_cl.scene.grid import Grid
-from pp_cl.selftest.case import EPS, SIZES, Case, Check, each, exact, finite, no_more, relative
+from pp_cl.selftest.case import EPS, SIZES, Case, Check, absolute, each, exact, finite, relative
 from pp_cl.selftest.points import (
     AXIS,
     AXIS_RADIUS,
@@ -175,8 +175,7 @@ def _depth(rule: str, dev: Device, rng: np.random.Generator) -> Iterator[Check]:
         yield relative(depth[hit], mean, SUMMED)
         yield exact(np.isinf(median), ~hit)
         low, high = _medians(blended, weight, z)
-        yield no_more(median[hit], high[hit], SUMMED * z.max())
-        yield no_more(low[hit], median[hit], SUMMED * z.max())
+        yield absolute(median[hit], np.clip(median, low, high)[hit], SUMMED * z.max())
     scene, _ = blend_on_axis(dev, [0.9, 0.5, 0.1], [0.25, 1.0, 1.0], 0.1, rule="alpha")
     alpha, depth, median = _depths(dev, scene)
     near, far = depth_at(np.array([0.9, 0.5])) - AXIS_RADIUS

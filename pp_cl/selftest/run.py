@@ -15,7 +15,7 @@ import pyopencl
 from pp_cl import __version__
 from pp_cl.device.device import Device
 from pp_cl.layers.choice import OFFERED, device_class
-from pp_cl.selftest import blend, device, layers, metrics, raster, scene, training
+from pp_cl.selftest import blend, device, layers, loss, metrics, optim, raster, scene
 from pp_cl.selftest.case import Case
 
 SEED = 7
@@ -27,7 +27,8 @@ CASES: tuple[Case, ...] = (
     *raster.CASES,
     *blend.CASES,
     *layers.CASES,
-    *training.CASES,
+    *loss.CASES,
+    *optim.CASES,
     *metrics.CASES,
 )
 

@@ -5,9 +5,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from pp_cl.device.device import Device
-from pp_cl.reference import demo
-from pp_cl.reference.hull import dilated_mask, kept
-from pp_cl.reference.target import target_forward
+from pp_cl.reference.scene import dilated_mask, distance, kept, target_forward
 from pp_cl.scene.camera import Camera
 from pp_cl.scene.demo import distances
 from pp_cl.scene.grid import Grid
@@ -91,7 +89,7 @@ def _demo(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
     for n in SIZES:
         for start in ((-0.8, 0.02, 0.1), (-0.5, -0.45, -0.9)):
             grid = Grid(start, 1.6 / n, (n, 1, 1))
-            expected = demo.distance(grid.positions(np.arange(n)))
+            expected = distance(grid.positions(np.arange(n)))
             yield absolute(distances(dev, grid).ravel(), expected, DEMO)
 
 

@@ -4,7 +4,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from oracle.unet import unet
 from support.comparisons import relative_error
 from support.networks import plain_parameters
 
@@ -13,6 +12,7 @@ from pp_cl.compress.reduction import Reduction
 from pp_cl.layers.conv import unpack_weights
 from pp_cl.network.layers import convolutions
 from pp_cl.network.unet import UNet
+from pp_cl.reference.network import network
 
 DEAD = {"enc0.b": 20, "enc1.a": 33, "enc2.b": 17, "dec1.a": 40, "dec0.b": 1}
 
@@ -51,7 +51,7 @@ def test_dead_channels_go_for_nothing(dev, rng, blocks):
     x = rng.normal(size=(36, 44, 16)).astype(np.float32)
     whole, less = (n.forward(dev.upload(x), False).get() for n in (net, small))
     assert relative_error(less, whole) < 1e-6
-    expected = unet(x, plain_parameters(small, small.parameters), blocks)[0]
+    expected = network(small.layers, plain_parameters(small, small.parameters), x)["image"]
     assert relative_error(less, expected) < 3e-6
 
 
@@ -71,7 +71,7 @@ def test_weights_are_of_what_is_put_out_and_read(original):
     parameters = plain_parameters(net, net.parameters)
     for camera in cameras:
         x = run.renderer.forward(camera, run.gamma, until="features").features.get()
-        values = unet(x, parameters, "single")[1]["dec0.a"]
+        values = network(net.layers, parameters, x)["dec0.a"]
         mean = mean + np.mean(values**2, axis=(0, 1)) / len(cameras)
     out = unpack_weights(net.parameters["out.weight"].get(), 3)[:, :, 0, 0]
     expected = np.sqrt(mean * (out.astype(np.float64) ** 2).sum(0))

@@ -12,12 +12,13 @@ from support.guarded import large
 from support.launches import check_parts
 from support.tiles import pixels_of, random_counts
 
+from pp_cl.bench.conv import Layer
 from pp_cl.layers import conv_direct, conv_local, conv_winograd
 from pp_cl.layers.choice import CHOICES, SHIPPED, VARIANTS
 from pp_cl.layers.conv import Direction, pack_weights, unpack_weights
 from pp_cl.layers.tiles import some_tiles
 from pp_cl.network.tile_plan import grow
-from pp_cl.selftest.convolutions import Layer, within
+from pp_cl.selftest.layers import within
 
 CPU = SHIPPED["CPU"]
 DIRECT, LOCAL, WINOGRAD = (VARIANTS[name] for name in ("direct", "local", "winograd"))

@@ -35,9 +35,7 @@ def check(dev, rng, camera, positions, radius, kind, gamma=0.05, depth_range=ora
     assert np.abs(features - oracle.features(blend, point_features))[inner].max() < 1e-3
     grad = rng.normal(size=(len(inner), 16)) * inner[:, None]
     gradients = scene.gradients(grad)
-    expected = oracle.blend_gradients(
-        geometry | {"hit": hits}, blend, opacity, point_features, grad_features=grad, gamma=gamma
-    )
+    expected = oracle.gradients(geometry | {"hit": hits}, blend, point_features, grad)
     assert relative_error(gradients["features"], expected[0]) < 1e-3
     assert relative_error(gradients["opacity"], expected[1]) < 2e-3
     return scene

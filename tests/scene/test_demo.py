@@ -7,7 +7,7 @@ import pytest
 import trimesh
 from support.guarded import AWKWARD_SIZES
 
-from pp_cl.reference.demo import CENTRE, coverage, distance
+from pp_cl.reference.scene import CENTRE, coverage, distance
 from pp_cl.scene.camera import Camera
 from pp_cl.scene.demo import OBJECT_BOX, SPLITS, demo_mesh, demo_views, distances, render
 from pp_cl.scene.grid import Grid

@@ -11,7 +11,7 @@ from support.guarded import AWKWARD_SIZES
 from support.launches import check_parts
 
 from pp_cl.errors import UserError
-from pp_cl.reference.hull import dilated_mask, kept
+from pp_cl.reference.scene import dilated_mask, kept
 from pp_cl.scene import hull
 from pp_cl.scene.bounds import bounding_box
 from pp_cl.scene.camera import Camera

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from support.guarded import AWKWARD_SIZES
 
-from pp_cl.reference import target as oracle
+from pp_cl.reference import scene as oracle
 from pp_cl.scene.camera import Camera
 from pp_cl.scene.target import Target
 from pp_cl.scene.views import View

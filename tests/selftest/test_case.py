@@ -42,15 +42,13 @@ def test_no_values_have_no_error(measure):
 
 
 def test_what_must_be_zero_may_not_differ():
-    zeros = np.zeros(3)
-    assert case.allowed([0, 1e-30, 0], zeros, zeros).error == np.inf
-    assert case.relative([0, 1e-30, 0], zeros, 1e-6).error == 1
-    assert case.each([0, 1e-30, 0], zeros, 1e-6).error == 1e-30
+    zeros, actual = np.zeros(3), [0, 1e-30, 0]
+    checks = case.allowed(actual, zeros, zeros), case.relative(actual, zeros, 1e-6)
+    for check in (*checks, case.each(actual, zeros, 1e-6)):
+        assert check.error == np.inf
 
 
-def test_excess():
-    assert case.no_more([0.5, 1.5, -9.0], [1.0, 1.0, 1.0], 0.1) == (0.5, 0.1)
-    assert case.no_more([np.nan], [1.0], 0.1).error == np.inf
+def test_values_that_are_not_finite_are_counted():
     assert case.finite(np.array([1, np.nan]), np.array([np.inf])) == (2, 0)
 
 

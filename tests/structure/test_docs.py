@@ -14,15 +14,13 @@ DOCUMENTS = [
 ]
 PATH = re.compile(r"`((?:pp_cl|cl|tests|tools|docs)/[\w./]+)`")
 PLACEHOLDER = re.compile(r"\bW/|\b(?:test_)?x\.")  # as in cl/W/x.cl
-# History: the changelog names them.
-REMOVED = {"tools/paper_scale.py", "tools/active_tiles.py"}
 MOST_WORDS = 20_000  # of README.md and docs/, generated pages included
 
 
 def named_files(text: str, folder: Path) -> list[Path]:
     """The files that a document in `folder` links to, or names as a path from the root."""
     links = re.findall(r"\]\(([^)#:]+)(?:#[^)]*)?\)", text)
-    paths = {p for p in PATH.findall(text) if not PLACEHOLDER.search(p)} - REMOVED
+    paths = {p for p in PATH.findall(text) if not PLACEHOLDER.search(p)}
     return [folder / link for link in links] + [ROOT / path for path in sorted(paths)]
 
 

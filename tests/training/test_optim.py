@@ -7,7 +7,7 @@ from support.models import make_model
 
 from pp_cl.raster.points import SH_DEGREES
 from pp_cl.reference import optim
-from pp_cl.selftest.updated_points import Cloud, gradients
+from pp_cl.selftest.optim import Cloud, gradients
 from pp_cl.training.optim import Optimiser, adam_update, ema_update
 from pp_cl.training.state import PointState
 

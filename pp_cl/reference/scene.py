@@ -1,16 +1,68 @@
-"""Float64 twin of the object in cl/scene/demo.cl, built from segments and circles, and of the rays'
-hits.
+"""Float64 twins of a scene's preparation: which positions the masks keep, training targets, and the
+demo's object, built from segments and circles, with the hits of its rays.
 """
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
 
 CENTRE = np.array([0, 0, 0.15])  # of the globe
 MERIDIAN = np.array([0.819152, 0.573576, 0])
 WHEEL = np.array([-0.242404, 0.346188, 0.906308])
 WHEEL_V = np.cross(WHEEL, MERIDIAN)
 ECLIPTIC = np.cos(np.pi / 3) * MERIDIAN + np.sin(np.pi / 3) * WHEEL_V
+
+
+def dilated_mask(alpha: np.ndarray, threshold: int) -> np.ndarray:
+    """(H, W) bool: some pixel of the 3x3 neighbourhood has an alpha above the threshold."""
+    return sliding_window_view(np.pad(alpha > threshold, 1), (3, 3)).any((2, 3))
+
+
+def kept(
+    views: Sequence[Any], positions: np.ndarray, threshold: int
+) -> tuple[np.ndarray, np.ndarray]:
+    """((N,) bool kept, (N,) pixels to the nearest pixel border of any view that has the position
+    before it).
+    """
+    seen = np.zeros(len(positions), bool)
+    alive = np.ones(len(positions), bool)
+    border = np.full(len(positions), np.inf)
+    for view in views:
+        camera, mask = view.stored_camera, dilated_mask(view.image[..., 3], threshold)
+        x, y, z = camera.pose[:, :3].T @ (positions - camera.eye).T
+        front = np.flatnonzero(z > 0)
+        x, y, z = x[front], y[front], z[front]
+        u, v = camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy
+        away = np.minimum(np.abs(u - np.round(u)), np.abs(v - np.round(v)))
+        border[front] = np.minimum(border[front], away)
+        inside = (u >= 0) & (u < camera.width) & (v >= 0) & (v < camera.height)
+        front, u, v = front[inside], u[inside].astype(int), v[inside].astype(int)
+        seen[front] = True
+        alive[front] &= mask[v, u]
+    return alive & seen, border
+
+
+def target_forward(
+    image: np.ndarray, downscale: int, left: int, top: int, *, width: int, height: int
+) -> np.ndarray:
+    """(height, width, 3): means over white of the downscale x downscale blocks, from (left, top)
+    on, of an (H, W, 4) uint8 image.
+    """
+    colour, alpha = image[..., :3] / 255.0, image[..., 3:] / 255.0
+    over_white = colour * alpha + (1 - alpha)
+    target = np.ones((height, width, 3))
+    for y in range(height):
+        for x in range(width):
+            rows, columns = (
+                slice(max(first, 0), max(first + downscale, 0))
+                for first in (top + downscale * y, left + downscale * x)
+            )
+            block = over_white[rows, columns]
+            if block.size:
+                target[y, x] = block.mean((0, 1))
+    return target
 
 
 def _segment(p, a, b):
