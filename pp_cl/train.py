@@ -3,9 +3,8 @@
 import numpy as np
 
 from pp_cl.config import Config
+from pp_cl.device.buffers import DeviceRows, Reading
 from pp_cl.device.device import Device
-from pp_cl.device.rows import DeviceRows
-from pp_cl.device.transfer import Reading
 from pp_cl.errors import UserError
 from pp_cl.layers.tiles import tiles_find
 from pp_cl.model import Model

@@ -13,7 +13,7 @@ from pyopencl.array import Array
 from pp_cl.bench.timing import PeakFlops, errors, variant_rows
 from pp_cl.device.device import Device
 from pp_cl.layers.choice import AUTO, OFFERED, ConvolutionPolicy
-from pp_cl.layers.conv import unpack_weights
+from pp_cl.layers.conv_direct import unpack_weights
 from pp_cl.network.layers import multiplications
 from pp_cl.network.unet import UNet
 from pp_cl.reference import network as reference

@@ -7,14 +7,16 @@ import math
 from pyopencl.array import Array
 
 from pp_cl.device.device import Device
-from pp_cl.layers.conv import Blocking, check_weights, sum_parts
 from pp_cl.layers.conv_direct import (
     PARTIAL,
+    Blocking,
+    check_weights,
     flip_weights,
     image_parts,
     lay_out,
     partial_floats,
     scratch_floats,
+    sum_parts,
 )
 from pp_cl.layers.tiles import SIDE, VECTOR, Tiles, checked_tiles
 

@@ -11,12 +11,15 @@ from pyopencl.array import Array
 from pp_cl.device.buffers import PackedArrays
 from pp_cl.device.device import Device
 from pp_cl.layers.choice import ConvolutionPolicy, make_policy
-from pp_cl.layers.conv import Direction, pack_bias, pack_weights
-from pp_cl.layers.gate import gate_backward, gate_forward
-from pp_cl.layers.output import output_backward, output_forward, residual_backward
-from pp_cl.layers.resample import (
+from pp_cl.layers.conv_direct import Direction, pack_bias, pack_weights
+from pp_cl.layers.simple import (
     avgpool2_backward,
     avgpool2_forward,
+    gate_backward,
+    gate_forward,
+    output_backward,
+    output_forward,
+    residual_backward,
     upsample2_backward,
     upsample2_forward,
 )

@@ -6,7 +6,7 @@ from types import ModuleType
 import numpy as np
 
 from pp_cl.device.device import Device
-from pp_cl.layers.conv import Blocking, pack_bias, pack_weights
+from pp_cl.layers.conv_direct import Blocking, pack_bias, pack_weights
 from pp_cl.layers.tiles import Tiles
 from pp_cl.reference.network import convolution, convolution_backward_weights, flipped
 from pp_cl.selftest.case import Check, allowed

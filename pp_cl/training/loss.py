@@ -7,10 +7,9 @@ import math
 import numpy as np
 from pyopencl.array import Array
 
-from pp_cl.device.buffers import Buffers, Table
+from pp_cl.device.buffers import Buffers, Reading, Table, read_later
 from pp_cl.device.device import Device
 from pp_cl.device.launch import group_items, lanes, launch_groups
-from pp_cl.device.transfer import Reading, read_later
 from pp_cl.errors import Diverged
 from pp_cl.raster.pairs import Pairs
 from pp_cl.raster.weights import BlendWeights

@@ -9,10 +9,9 @@ from typing import NamedTuple
 import numpy as np
 
 from pp_cl.config import Config
-from pp_cl.device.buffers import Table, grown, table_bytes
+from pp_cl.device.buffers import PIECE_BYTES, Table, compact_table, grown, table_bytes
 from pp_cl.device.device import Device
 from pp_cl.device.host import available_bytes, resident_bytes
-from pp_cl.device.rows import PIECE_BYTES, compact_table
 from pp_cl.errors import UserError
 from pp_cl.metrics.lpips import Lpips
 from pp_cl.model import Model

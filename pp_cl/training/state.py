@@ -7,9 +7,8 @@ from __future__ import annotations
 import numpy as np
 from pyopencl.array import Array
 
-from pp_cl.device.buffers import Table
+from pp_cl.device.buffers import Table, compact_rows, gather_rows
 from pp_cl.device.device import Device
-from pp_cl.device.rows import compact_rows, gather_rows
 from pp_cl.raster.points import PointCloud, ShBlock
 
 

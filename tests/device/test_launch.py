@@ -11,14 +11,15 @@ from support.toy_kernels import SOURCE
 from pp_cl.device import device as device_module
 from pp_cl.device import launch
 from pp_cl.device.launch import (
+    SCALARS,
     channel_ranges,
     cut,
     group_items,
     group_ranges,
     lanes,
+    parse_signatures,
     row_parts,
 )
-from pp_cl.device.signature import SCALARS, parse_signatures
 from pp_cl.errors import UserError
 
 KERNEL_FOLDER = device_module.kernel_folder()  # before any test replaces it

@@ -32,7 +32,7 @@ from pp_cl.layers.choice import (
     policy_of_run,
     tuning_file,
 )
-from pp_cl.layers.conv import Direction
+from pp_cl.layers.conv_direct import Direction
 from pp_cl.network.unet import UNet
 
 pytestmark = pytest.mark.usefixtures("cpu_form")

@@ -14,7 +14,7 @@ from support.tiles import pixels_of, random_counts
 
 from pp_cl.layers import conv_direct, conv_local, conv_winograd
 from pp_cl.layers.choice import CHOICES, SHIPPED, VARIANTS
-from pp_cl.layers.conv import Direction, pack_weights, unpack_weights
+from pp_cl.layers.conv_direct import Direction, pack_weights, unpack_weights
 from pp_cl.layers.tiles import some_tiles
 from pp_cl.network.tile_plan import grow
 from pp_cl.selftest.convolutions import Layer, within

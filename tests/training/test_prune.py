@@ -44,7 +44,7 @@ def test_one_point_always_survives(dev, weights, survivor):
 def test_compacting_never_takes_more_than_its_scratch(dev, rng, monkeypatch, share):
     """Every row of the cloud and of its training state, averages included."""
     scratch = 40_000
-    monkeypatch.setattr("pp_cl.device.rows.SCRATCH_BYTES", scratch)
+    monkeypatch.setattr("pp_cl.device.buffers.SCRATCH_BYTES", scratch)
     cloud = PointCloud.create(dev, np.arange(1000), 2)
     for array in cloud.learned().values():
         array.set(rng.random(array.shape).astype(np.float32))
