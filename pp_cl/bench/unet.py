@@ -11,6 +11,7 @@ import numpy as np
 from pyopencl.array import Array
 
 from pp_cl.bench.timing import PeakFlops, errors, variant_rows
+from pp_cl.device.buffers import table_bytes
 from pp_cl.device.device import Device
 from pp_cl.layers.choice import AUTO, OFFERED, ConvolutionPolicy
 from pp_cl.layers.conv_direct import unpack_weights
@@ -54,7 +55,7 @@ def bench_unet(
     flops = 2 * multiplications(net.layers, size, size)
     for direction, factor, runner in (("forward", 1, forward_runner), ("train", 3, train_runner)):
         net.policy = policies[AUTO]
-        memory = sum(row[2] for row in net.memory_plan(size, size, direction == "train"))
+        memory = table_bytes(net.memory_plan(size, size, direction == "train"))
         about = {
             "layer": "network",
             "shape": [size, size, CHANNELS_IN, *widths, CHANNELS_OUT],

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 import numpy as np
 from pyopencl.array import Array
 
-from pp_cl.device.buffers import PackedArrays
+from pp_cl.device.buffers import PackedArrays, Table
 from pp_cl.device.device import Device
 from pp_cl.layers.choice import ConvolutionPolicy, make_policy
 from pp_cl.layers.conv_direct import Direction, pack_bias, pack_weights
@@ -318,8 +318,8 @@ class UNet:
         """
         return self._trained[1][name]
 
-    def memory_plan(self, height: int, width: int, training: bool) -> list[tuple[str, tuple, int]]:
-        """[(name, shape, bytes)] of all device buffers of this network once it has run at this
+    def memory_plan(self, height: int, width: int, training: bool) -> Table:
+        """All device buffers of this network once it has run at this
         size, what its convolutions share with others among them.
 
         Gradients of parameters are among them without training too: they are made with the network.
@@ -346,7 +346,4 @@ class UNet:
         for level in set(levels_of(self.layers).values()):
             tiles = all_tiles_buffers(height >> level, width >> level)
             table |= {f"tiles of level {level}, {name}": row for name, row in tiles.items()}
-        return [
-            (name, shape, math.prod(shape) * np.dtype(dtype).itemsize)
-            for name, (shape, dtype) in table.items()
-        ]
+        return table

@@ -273,7 +273,7 @@ class Room:
         target, shrunk = (height, width, 3), self._shrunk()
         tables = {
             **Renderer.tables(raster, n, full, pairs),
-            f"network at {crop[1]}x{crop[0]}": _network_table(net, crop, True),
+            f"network at {crop[1]}x{crop[0]}": net.memory_plan(*crop, True),
             f"previews at {full[1]}x{full[0]}": _preview_table(net, full),
             "loss": Loss.table((*crop, 3), target, train.ssim_weight, lanes_of_loss(net.dev)),
             "photograph and target": {
@@ -319,19 +319,11 @@ def _padded(width, height):
     return height + -height % NETWORK_MULTIPLE, width + -width % NETWORK_MULTIPLE
 
 
-def _network_table(net, size, training):
-    plan = net.memory_plan(*size, training)
-    return {f"{i} {name}": (shape, np.float32) for i, (name, shape, _) in enumerate(plan)}
-
-
 def _preview_table(net, size):
     """The buffers of whole images that are rendered, beside the network's parameters."""
     own = {name for p in net.parameters for name in (p, gradient_of(p))}
-    return {
-        f"{i} {name}": (shape, np.float32)
-        for i, (name, shape, _) in enumerate(net.memory_plan(*size, False))
-        if name not in own
-    }
+    plan = net.memory_plan(*size, False)
+    return {name: row for name, row in plan.items() if name not in own}
 
 
 def _size(size):
