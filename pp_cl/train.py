@@ -13,11 +13,9 @@ from pp_cl.raster.weights import record_weights
 from pp_cl.render import NETWORK_MULTIPLE, Renderer
 from pp_cl.scene.target import Target
 from pp_cl.scene.views import View
-from pp_cl.training.loss import Loss
-from pp_cl.training.mask import MaskLoss
+from pp_cl.training.loss import Loss, MaskLoss
 from pp_cl.training.optim import Optimiser
 from pp_cl.training.perceptual import PerceptualLoss
-from pp_cl.training.prune import final_points_to_keep, points_to_keep
 from pp_cl.training.schedule import (
     BOX_MARGIN,
     Rates,
@@ -30,7 +28,7 @@ from pp_cl.training.schedule import (
     rising_weight,
 )
 from pp_cl.training.smooth import Smoother
-from pp_cl.training.state import PointState, split_opacity
+from pp_cl.training.state import PointState, final_points_to_keep, points_to_keep, split_opacity
 
 WHITE = 1.0  # of a target where its photograph is transparent
 

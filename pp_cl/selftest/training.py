@@ -25,8 +25,7 @@ from pp_cl.selftest.case import (
     relative,
 )
 from pp_cl.selftest.updated_points import Cloud, gradients
-from pp_cl.training.loss import FURTHER, Loss
-from pp_cl.training.mask import MaskLoss
+from pp_cl.training.loss import FURTHER, Loss, MaskLoss
 from pp_cl.training.optim import adam_update, ema_update
 from pp_cl.training.perceptual import PerceptualLoss
 from pp_cl.training.smooth import Smoother

@@ -22,8 +22,7 @@ from pp_cl.render import NETWORK_MULTIPLE, Renderer, point_radius
 from pp_cl.scene.grid import Grid
 from pp_cl.scene.load import DEMO, mask_rule, reading
 from pp_cl.scene.views import Photograph, kept_bytes, shrink_factor
-from pp_cl.training.loss import Loss, lanes_of_loss
-from pp_cl.training.mask import MaskLoss
+from pp_cl.training.loss import Loss, MaskLoss, lanes_of_loss
 from pp_cl.training.optim import Optimiser
 from pp_cl.training.perceptual import PerceptualLoss
 from pp_cl.training.schedule import crop_side, ema_start, prunings, refine_steps
