@@ -134,14 +134,6 @@ def test_parts_are_joined(dev, rng, monkeypatch, n, piece):
     np.testing.assert_array_equal(rows.get(), np.concatenate(parts, 1))
 
 
-@pytest.mark.parametrize("shape", [(5,), (5, 2, 3, 4)])
-def test_one_array_of_any_shape(dev, shape):
-    values = np.arange(np.prod(shape), dtype=np.uint32).reshape(shape)
-    rows = DeviceRows(dev, dev.upload(values))
-    assert rows.shape == shape
-    np.testing.assert_array_equal(rows.get(), values)
-
-
 def test_what_was_fetched_or_written_is_not_kept(dev):
     """pyopencl's own get and set tie the numpy array to the device's."""
     array = dev.upload(np.arange(9, dtype=np.float32))

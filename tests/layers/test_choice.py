@@ -206,14 +206,6 @@ def test_a_tuning_is_stored_and_read_again(dev, cache, capsys):
     assert tuning_file(dev).parent == cache
 
 
-def test_without_one_the_device_class_is_named(dev, monkeypatch):
-    cpu = load_policy(dev, DEFAULT).origin
-    monkeypatch.setattr(dev, "is_cpu", False)
-    gpu = load_policy(dev, DEFAULT).origin
-    assert "CPU" in cpu and "no GPU has been measured" in gpu
-    assert "pp-cl tune" in cpu and "pp-cl tune" in gpu
-
-
 @pytest.mark.parametrize("name", ["driver", "compute_units", "name", "platform", "pp_cl"])
 def test_a_foreign_devices_tuning_is_not_used(dev, name):
     tuning = tuning_of(dev, [row()])
