@@ -213,8 +213,11 @@ class Kernel:
 
         Raises UserError when the work-group is too large for the device.
         """
-        size = tuple(np.ravel(size).tolist())
-        local = self._default_group(len(size)) if local is None else tuple(np.ravel(local).tolist())
+        size = tuple(map(int, size if isinstance(size, tuple) else (size,)))
+        if local is None:
+            local = self._default_group(len(size))
+        elif not isinstance(local, tuple):
+            local = (local,)
         if 0 in size:
             return None
         if math.prod(local) > self.largest_group:

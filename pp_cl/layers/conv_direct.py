@@ -298,16 +298,6 @@ def flip_weights(
     return flipped
 
 
-def fitting(blocking: Blocking, width: int, channels: int) -> tuple[int, int, tuple]:
-    """(pixels of a row, groups of 16 output channels, work-group) of a work-item, of which none
-    computes groups or a row in vain.
-    """
-    pixels, groups, work_group = blocking.direct
-    if -(-channels // VECTOR) % groups:
-        pixels, groups, work_group = blocking.direct_odd
-    return next(p for p in (pixels, 8, 4, 1) if p <= width), groups, work_group
-
-
 def partial_floats(height: int, weight_shape: tuple) -> int:
     """Floats of PARTIAL that backward_weights() needs for an image `height` high."""
     blocks, k, _, ci, _ = weight_shape
@@ -327,9 +317,14 @@ def _flipped_shape(weight_shape, c, co):
 
 
 def _program(dev, blocking, k, shape):
-    """(program, global size, work-group) for a result of shape (H, W, C)."""
+    """(program, global size, work-group) for a result of shape (H, W, C); no work-item computes
+    groups of channels or a row in vain.
+    """
     height, width, channels = shape
-    pixels, groups, work_group = fitting(blocking, width, channels)
+    pixels, groups, work_group = blocking.direct
+    if -(-channels // VECTOR) % groups:
+        pixels, groups, work_group = blocking.direct_odd
+    pixels = next(p for p in (pixels, 8, 4, 1) if p <= width)
     size = (-(-width // pixels), height, -(-channels // (VECTOR * groups)))
     return dev.program("layers/conv", KERNEL_SIZE=k, PIXELS=pixels, BLOCKS=groups), size, work_group
 
