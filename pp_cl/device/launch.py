@@ -31,8 +31,8 @@ MOST_MULTIPLY_ADDS = 25e9
 SMALL_GROUP = 64  # work-items: no fewer fill what a GPU runs in step
 LARGEST_GROUP = 256  # work-items: what GPUs run of any kernel
 
-# Shapes and sizes of launches that a kernel remembers, so that it checks them once: more than a
-# network's layers have. The numbers of visible points, new in each step, would fill memory.
+# Shapes and sizes of launches that a kernel remembers, so that it checks and rounds them once: more
+# than a network's layers have. The numbers of visible points, new in each step, would fill memory.
 REMEMBERED = 64
 
 
@@ -169,8 +169,18 @@ class Kernel:
         words = {word for p in parameters for word in p.shape or () if word != "?"}
         names = {name for word in words for name in compile_formula(word).co_names}
         self._macros = {name: int(defines[name]) for name in names & defines.keys()}
-        self._letters = {name.lower() for name in names}
+        letters = {name.lower() for name in names}
+        # (parameter, dtype of a buffer, letter that a scalar gives a size to) in order
+        self._slots = [
+            (
+                p,
+                np.dtype(p.dtype) if p.space in ("global", "constant") else None,
+                p.name.lower() if not p.space and p.name.lower() in letters else None,
+            )
+            for p in parameters
+        ]
         self._checked = set()  # shapes and sizes already found right
+        self._ranges = {}  # {(size, work-group) as given: as enqueued}
 
     def arguments(self, values: dict[str, Any]) -> list[Any]:
         """OpenCL arguments in order, from {name: pyopencl Array, number or cl.LocalMemory}. Raises
@@ -181,23 +191,24 @@ class Kernel:
             unknown = [n for n in values if n not in self.names]
             raise TypeError(f"{self.label}: missing {missing}, unknown {unknown}")
         arguments, shapes, sizes = [], [], {}
-        for p in self.parameters:
+        for p, dtype, letter in self._slots:
             value = values[p.name]
-            if p.space in ("global", "constant"):
-                if not isinstance(value, cl_array.Array) or value.dtype != p.dtype:
+            if dtype:
+                if not isinstance(value, cl_array.Array) or value.dtype != dtype:
                     raise TypeError(
                         f"{self.label}: {p.name} is {_kind(value)}, expected a device array of "
-                        f"{np.dtype(p.dtype)}"
+                        f"{dtype}"
                     )
                 arguments.append(value.data)
                 shapes.append((value.shape, value.strides))
             elif p.space == "local":
                 arguments.append(value)
             else:
-                number = self._scalar(p, value)
+                quick = type(value) is int and p.limits and p.limits[0] <= value <= p.limits[1]
+                number = value if quick else self._scalar(p, value)
                 arguments.append(number)
-                if p.name.lower() in self._letters:
-                    sizes[p.name.lower()] = int(number)
+                if letter:
+                    sizes[letter] = int(number)
         key = (*shapes, *sizes.values())
         if key not in self._checked:
             self._check_buffers(values, sizes)
@@ -213,11 +224,19 @@ class Kernel:
 
         Raises UserError when the work-group is too large for the device.
         """
-        size = tuple(map(int, size if isinstance(size, tuple) else (size,)))
+        key = size, local
+        if key not in self._ranges:
+            if len(self._ranges) > REMEMBERED:
+                self._ranges.clear()
+            self._ranges[key] = self._rounded(size, local)
+        return self._ranges[key]
+
+    def _rounded(self, size, local):
+        size = (int(size),) if np.isscalar(size) else tuple(int(s) for s in size)
         if local is None:
             local = self._default_group(len(size))
-        elif not isinstance(local, tuple):
-            local = (local,)
+        else:
+            local = (local,) if np.isscalar(local) else tuple(local)
         if 0 in size:
             return None
         if math.prod(local) > self.largest_group:

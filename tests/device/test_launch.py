@@ -71,6 +71,7 @@ def test_launches_of_ever_new_sizes_take_no_more_and_more_memory(program, dev):
     def checked(sizes):
         for n in sizes:
             kernel.arguments({"n": n, "scale": 1.0, "x": x[:n], "k": k, "y": y[:n]})
+            kernel.ranges(n, None)
 
     tracemalloc.start()
     try:
@@ -333,6 +334,7 @@ def test_file_builds_alone_and_its_signatures_agree_with_the_driver(dev, stem):
 def test_a_default_work_group_fits_the_device(program, monkeypatch, limit, groups):
     kernel = program.kernels["rows"]
     monkeypatch.setattr(kernel, "largest_group", limit)
+    monkeypatch.setattr(kernel, "_ranges", {})
     for group in groups:
         rounded, local = kernel.ranges(tuple(5 for _ in group), None)
         assert local == group

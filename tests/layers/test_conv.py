@@ -89,6 +89,7 @@ def test_smaller_work_groups_compute_the_same_bits(dev, rng, monkeypatch, most):
             patch.setattr(kernel, "largest_group", most)
         return found
 
+    # first, as sizes that were launched are not checked again
     with monkeypatch.context() as patch:
         patch.setattr(dev, "program", limited)
         results = layer.computed(dev, LOCAL, CPU)
