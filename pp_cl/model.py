@@ -7,8 +7,8 @@ from __future__ import annotations
 import numpy as np
 from pyopencl.array import Array
 
+from pp_cl.device.buffers import DeviceRows
 from pp_cl.device.device import Device
-from pp_cl.device.rows import DeviceRows
 from pp_cl.network.unet import UNet
 from pp_cl.raster.points import SH_DEGREES, PointCloud
 from pp_cl.scene.camera import Camera

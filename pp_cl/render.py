@@ -13,17 +13,15 @@ from typing import Literal
 import numpy as np
 from pyopencl.array import Array
 
-from pp_cl.device.buffers import Buffers, Table
+from pp_cl.device.buffers import Buffers, Reading, Table
 from pp_cl.device.device import Device
-from pp_cl.device.transfer import Reading
 from pp_cl.files.picture import Picture
 from pp_cl.layers.tiles import tiles_hit
 from pp_cl.model import Model
-from pp_cl.raster.blend import blend_backward, blend_backward_table, blend_forward
+from pp_cl.raster.blend import blend_backward, blend_backward_table, blend_forward, shade_forward
 from pp_cl.raster.depth import depth_forward
 from pp_cl.raster.pairs import Pairs, find_pairs, pairs_table, room_needed
 from pp_cl.raster.project import ProjectedPoints, project_grid, projection_table
-from pp_cl.raster.shade import shade_forward
 from pp_cl.raster.weights import BlendWeights, blend_weights, weights_table
 from pp_cl.scene.camera import Camera
 from pp_cl.settings import RasterConfig

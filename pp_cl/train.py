@@ -3,9 +3,8 @@
 import numpy as np
 
 from pp_cl.config import Config
+from pp_cl.device.buffers import DeviceRows, Reading
 from pp_cl.device.device import Device
-from pp_cl.device.rows import DeviceRows
-from pp_cl.device.transfer import Reading
 from pp_cl.errors import UserError
 from pp_cl.layers.tiles import tiles_find
 from pp_cl.model import Model
@@ -14,11 +13,9 @@ from pp_cl.raster.weights import record_weights
 from pp_cl.render import NETWORK_MULTIPLE, Renderer
 from pp_cl.scene.target import Target
 from pp_cl.scene.views import View
-from pp_cl.training.loss import Loss
-from pp_cl.training.mask import MaskLoss
+from pp_cl.training.loss import Loss, MaskLoss
 from pp_cl.training.optim import Optimiser
 from pp_cl.training.perceptual import PerceptualLoss
-from pp_cl.training.prune import final_points_to_keep, points_to_keep
 from pp_cl.training.schedule import (
     BOX_MARGIN,
     Rates,
@@ -31,7 +28,7 @@ from pp_cl.training.schedule import (
     rising_weight,
 )
 from pp_cl.training.smooth import Smoother
-from pp_cl.training.state import PointState, split_opacity
+from pp_cl.training.state import PointState, final_points_to_keep, points_to_keep, split_opacity
 
 WHITE = 1.0  # of a target where its photograph is transparent
 

@@ -100,7 +100,7 @@ def test_bounded_memory_gives_the_same_bytes(scene, tmp_path, capsys, monkeypatc
     changes = {"points__count": 50_000, "train__iterations": 24, "train__prune_every": 8}
     assert main(arguments(scene, tmp_path / "free", **changes)) == 0
     points = load_checkpoint(tmp_path / "free" / "checkpoint.npz")[0]["initial_points"]
-    monkeypatch.setattr("pp_cl.device.rows.SCRATCH_BYTES", 100_000)
+    monkeypatch.setattr("pp_cl.device.buffers.SCRATCH_BYTES", 100_000)
     monkeypatch.setenv("PP_MAX_ALLOCATION", str(200 * points / 2**20))
     assert main(arguments(scene, tmp_path / "bounded", **changes)) == 0
     assert (tmp_path / "bounded" / "checkpoint.npz").read_bytes() == (

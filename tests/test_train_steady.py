@@ -9,8 +9,8 @@ from pyopencl.array import Array
 
 import pp_cl.network.unet
 from pp_cl.config import configure, preset
+from pp_cl.device.buffers import Reading
 from pp_cl.device.device import Device
-from pp_cl.device.transfer import Reading
 from pp_cl.files.run_folder import RunFolder
 from pp_cl.session import open_training
 

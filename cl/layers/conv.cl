@@ -5,7 +5,7 @@
 // registers. For each input channel it loads K weight vectors per block and PIXELS + K - 1
 // scalars, and does K * BLOCKS * PIXELS vector multiply-adds with them. PIXELS and BLOCKS are
 // chosen so that accumulators and weights fit a device's registers (Blocking in
-// pp_cl/layers/conv.py).
+// pp_cl/layers/conv_direct.py).
 //
 // vec_type_hint: the vectors are written out; Intel's compiler would merge work-items into wider
 // ones.

@@ -13,7 +13,7 @@ import numpy as np
 from pp_cl.bench.timing import PeakFlops, errors, variant_rows
 from pp_cl.device.device import Device
 from pp_cl.layers.choice import OFFERED, VARIANTS, ConvolutionPolicy, can_run, device_class
-from pp_cl.layers.conv import Blocking, Direction, pack_bias, pack_weights, unpack_weights
+from pp_cl.layers.conv_direct import Blocking, Direction, pack_bias, pack_weights, unpack_weights
 from pp_cl.layers.tiles import Tiles, all_tiles
 from pp_cl.network.layers import convolutions, unet_layers
 from pp_cl.reference import network as reference

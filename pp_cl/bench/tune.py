@@ -32,7 +32,7 @@ from pp_cl.layers.choice import (
     shipped_order,
     tuning_file,
 )
-from pp_cl.layers.conv import Direction
+from pp_cl.layers.conv_direct import Direction
 from pp_cl.network.layers import Layer, computations, convolutions
 
 # A variant is given up when even its best of PROBES runs is HOPELESS times slower than the fastest.

@@ -11,9 +11,10 @@ import numpy as np
 from pyopencl.array import Array
 
 from pp_cl.bench.timing import PeakFlops, errors, variant_rows
+from pp_cl.device.buffers import table_bytes
 from pp_cl.device.device import Device
 from pp_cl.layers.choice import AUTO, OFFERED, ConvolutionPolicy
-from pp_cl.layers.conv import unpack_weights
+from pp_cl.layers.conv_direct import unpack_weights
 from pp_cl.network.layers import multiplications
 from pp_cl.network.unet import UNet
 from pp_cl.reference import network as reference
@@ -54,7 +55,7 @@ def bench_unet(
     flops = 2 * multiplications(net.layers, size, size)
     for direction, factor, grad in (("forward", 1, None), ("train", 3, device_grad)):
         net.policy = policies[AUTO]
-        memory = sum(row[2] for row in net.memory_plan(size, size, direction == "train"))
+        memory = table_bytes(net.memory_plan(size, size, direction == "train"))
         about = {
             "layer": "network",
             "shape": [size, size, CHANNELS_IN, *widths, CHANNELS_OUT],

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from pp_cl.layers.conv import pack_bias, pack_weights, unpack_weights
+from pp_cl.layers.conv_direct import pack_bias, pack_weights, unpack_weights
 from pp_cl.layers.tiles import VECTOR
 from pp_cl.network.layers import Layer, convolutions
 from pp_cl.network.unet import UNet

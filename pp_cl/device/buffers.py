@@ -1,17 +1,26 @@
-"""Device arrays declared as a table, {name: (shape, dtype)}: what a stage allocates and what the
-memory plan counts; and arrays that are packed into one buffer.
+"""Device arrays by many: declared as a table, {name: (shape, dtype)}, which the memory plan counts
+too; packed into one buffer; read without waiting; and their rows gathered, kept or read piecewise.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
+from typing import Any, Generic, TypeVar
 
 import numpy as np
+import pyopencl as cl
 from pyopencl.array import Array
 
 from pp_cl.device.device import Device
+from pp_cl.device.launch import row_parts
 
+# bytes of the scratch that rows are moved through: 1.4 % of a training with 4 million points
+SCRATCH_BYTES = 2**27
+PIECE_BYTES = 2**26  # that the host reads at a time
+CHANNELS = 16  # words of a row of features
+
+T = TypeVar("T")
 Table = dict[str, tuple[tuple[int, ...], type]]
 
 
@@ -92,3 +101,133 @@ class PackedArrays:
         for (shape, dtype), start, size in zip(rows, self._starts, sizes, strict=True):
             region = self._whole.base_data.get_sub_region(int(start), size)
             self._arrays.append(Array(self._dev.queue, shape, dtype, data=region))
+
+
+class Reading(Generic[T]):
+    """Something that the host knows once numbers have come from the device.
+
+    values: on their way until the event. convert: what they mean.
+    """
+
+    def __init__(self, event: cl.Event, values: np.ndarray, convert: Callable[[np.ndarray], T]):
+        self._event, self._values, self._convert = event, values, convert
+
+    def get(self) -> T:
+        """What the numbers mean; waits until they are there."""
+        if self._event is not None:
+            self._event.wait()
+            self._values = self._convert(self._values)
+            self._event = None
+        return self._values
+
+
+def read_later(
+    dev: Device,
+    array: Array,
+    start: int = 0,
+    convert: Callable[[np.ndarray], Any] = lambda values: values,
+) -> Reading:
+    """array[start:], (N,), as the kernels enqueued so far will leave it. convert: applied once to
+    the numpy array, when it is asked for; what it raises, get() raises.
+    """
+    values = np.empty(len(array) - start, array.dtype)
+    event = dev.attempt(
+        "download a buffer",
+        cl.enqueue_copy,
+        dev.queue,
+        values,
+        array.base_data,
+        src_offset=array.offset + start * array.dtype.itemsize,
+        is_blocking=False,
+    )
+    return Reading(event, values, convert)
+
+
+# ---- rows; none of it takes a second array of a model's size, which may not fit into memory
+
+
+def compact_table(n: int, row_bytes: int) -> Table:
+    """What compact_rows() of arrays of n rows takes at most: the list of the rows that stay, and
+    the scratch. row_bytes: of the array with the largest rows.
+    """
+    scratch = min(SCRATCH_BYTES, n * row_bytes)
+    return {"keep": ((n,), np.uint32), "scratch": ((scratch,), np.uint8)}
+
+
+def compact_rows(dev: Device, array: Array, keep: Array) -> Array:
+    """The rows `keep` of `array`, which is overwritten.
+
+    Rows that fit SCRATCH_BYTES become an array of their own. Others move to the front of the same
+    buffer, piece by piece: ascending indices never lie before their new place, so a piece
+    overwrites nothing that a later one reads. array: (N, ...), rows of whole 4-byte words. keep:
+    (M,) uint32, ascending.
+    """
+    m, row_bytes = len(keep), array.nbytes // len(array)
+    piece = min(m, max(1, SCRATCH_BYTES // row_bytes))
+    scratch = dev.empty((piece, *array.shape[1:]), array.dtype)
+    for start in range(0, m, piece):
+        count = min(piece, m - start)
+        _gather(dev, array, keep, scratch, first=start, count=count)
+        if piece < m:
+            dev.copy_rows(array, start, scratch, count)
+    return scratch if piece == m else array[:m]
+
+
+def gather_rows(dev: Device, array: Array, rows: Array) -> Array:
+    """A new array of the rows `rows` of `array`, (N, ...) of whole 4-byte words. rows: (M,) uint32,
+    in any order, with repetitions.
+    """
+    gathered = dev.empty((len(rows), *array.shape[1:]), array.dtype)
+    _gather(dev, array, rows, gathered, first=0, count=len(rows))
+    return gathered
+
+
+def _gather(dev, array, rows, target, *, first, count):
+    """Copy the rows rows[first] to rows[first + count] of `array` to the front of `target`."""
+    words = array.nbytes // len(array) // 4
+    items = row_parts(dev) if words >= CHANNELS else 1
+    dev.program("device/rows", GROUP=items).launch(
+        "gather_rows",
+        count * items,
+        first=first,
+        m=count,
+        r=words,
+        indices=rows,
+        source=_words(array),
+        target=_words(target),
+    )
+
+
+def _words(array):
+    """The same memory as (rows, words) uint32."""
+    return array.reshape(len(array), -1).view(np.uint32)
+
+
+class DeviceRows:
+    """Arrays (N, ...) of a device side by side, joined along their second axis. Fetched when asked
+    for: they must not change before. shape, dtype: of the joined array.
+    """
+
+    def __init__(self, dev: Device, *parts: Array) -> None:
+        self._dev, self._parts = dev, parts
+        first = parts[0]
+        joined = (sum(part.shape[1] for part in parts),) if len(parts) > 1 else first.shape[1:2]
+        self.shape = (*first.shape[:1], *joined, *first.shape[2:])
+        self.dtype = first.dtype
+
+    @property
+    def nbytes(self) -> int:
+        """Bytes of the joined array."""
+        return sum(part.nbytes for part in self._parts)
+
+    def pieces(self) -> Iterator[np.ndarray]:
+        """The rows in numpy arrays of at most PIECE_BYTES, or of one row."""
+        count = self.shape[0]
+        rows = max(1, PIECE_BYTES * count // max(1, self.nbytes))
+        for start in range(0, count, rows):
+            columns = [self._dev.download(part[start : start + rows]) for part in self._parts]
+            yield np.concatenate(columns, 1) if len(columns) > 1 else columns[0]
+
+    def get(self) -> np.ndarray:
+        """The joined array."""
+        return np.concatenate([*self.pieces()] or [np.empty(self.shape, self.dtype)])

@@ -3,9 +3,9 @@
 import numpy as np
 from pyopencl.array import Array
 
+from pp_cl.device.buffers import Reading, read_later
 from pp_cl.device.device import Device
 from pp_cl.device.launch import launch_groups
-from pp_cl.device.transfer import Reading, read_later
 
 BLOCK = 512  # values that a work-item of a CPU scans
 BLOCK_ON_GPU = 2048  # values that a work-group scans: four million take two levels

@@ -36,7 +36,7 @@ MOST_DIRECTORY = 2**24
 
 
 class Rows(Protocol):
-    """An array that comes in pieces, as device/rows.py has them."""
+    """An array that comes in pieces, as device/buffers.py has them."""
 
     shape: tuple[int, ...]
     dtype: np.dtype

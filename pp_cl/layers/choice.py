@@ -23,7 +23,7 @@ from pp_cl.errors import UserError, quoted, shown
 from pp_cl.files.atomic import cache_folder
 from pp_cl.files.untrusted import read_regular
 from pp_cl.layers import conv_direct, conv_local, conv_winograd
-from pp_cl.layers.conv import Blocking, Direction
+from pp_cl.layers.conv_direct import Blocking, Direction
 
 AUTO = "auto"
 FORWARD, INPUT, WEIGHTS = Direction

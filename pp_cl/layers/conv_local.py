@@ -7,14 +7,16 @@ import math
 from pyopencl.array import Array
 
 from pp_cl.device.device import Device
-from pp_cl.layers.conv import Blocking, check_weights, sum_parts
 from pp_cl.layers.conv_direct import (
     PARTIAL,
+    Blocking,
+    check_weights,
     flip_weights,
     image_parts,
     lay_out,
     partial_floats,
     scratch_floats,
+    sum_parts,
 )
 from pp_cl.layers.tiles import SIDE, VECTOR, Tiles, checked_tiles
 
@@ -169,7 +171,7 @@ def _is_aligned(*channels):
     return all(c % QUAD == 0 for c in channels)
 
 
-def quads(channels: int, aligned: bool) -> int:
+def _quads(channels, aligned):
     """Groups of four of the output channels that a work-group computes: 16, 8 or 4, so that nothing
     is computed in vain. Channels that are not aligned are few.
     """
@@ -182,7 +184,7 @@ def _program(dev, kernel, k, tiles, channels, inputs):
     largest groups that the device runs.
     """
     aligned = _is_aligned(channels, *inputs)
-    in_group = quads(channels, aligned)
+    in_group = _quads(channels, aligned)
     for items in (n for n in GROUPS if n >= TILE_PARTS * in_group):
         program = dev.program(
             "layers/conv_local",
@@ -200,7 +202,7 @@ def _program(dev, kernel, k, tiles, channels, inputs):
 def _weights_program(dev, k, c, co):
     """(program, groups of four output channels and work-items of a work-group)."""
     aligned = _is_aligned(c, co)
-    most = quads(co, aligned)
+    most = _quads(co, aligned)
     for in_group in (n for n in (16, 8, 4) if n <= most):
         items = CI_QUADS[k] * in_group * k
         program = dev.program(

@@ -5,8 +5,7 @@ than the direct ones, at two or three times the error. Channels come in multiple
 from pyopencl.array import Array
 
 from pp_cl.device.device import Device
-from pp_cl.layers.conv import Blocking, Direction, check_weights, sum_parts
-from pp_cl.layers.conv_direct import PARTIAL
+from pp_cl.layers.conv_direct import PARTIAL, Blocking, Direction, check_weights, sum_parts
 from pp_cl.layers.tiles import SIDE, VECTOR, Tiles, checked_tiles
 
 POSITIONS = (SIDE + 2) ** 2  # values of a transformed tile

@@ -10,10 +10,9 @@ from dataclasses import dataclass
 import numpy as np
 from pyopencl.array import Array
 
-from pp_cl.device.buffers import Table
+from pp_cl.device.buffers import Reading, Table, read_later
 from pp_cl.device.device import Device
 from pp_cl.device.launch import channel_ranges, lanes
-from pp_cl.device.transfer import Reading, read_later
 
 VECTOR = 16  # channels in one float16
 # pixels: the outputs of F(4x4, 3x3), and one pixel after the network has halved its input twice

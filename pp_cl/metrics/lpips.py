@@ -16,9 +16,9 @@ from pp_cl.device.device import Device
 from pp_cl.device.launch import Program, group_ranges, lanes, row_parts
 from pp_cl.errors import UserError
 from pp_cl.layers.choice import ConvolutionPolicy, ConvShape, make_policy
-from pp_cl.layers.conv import Direction, pack_weights
+from pp_cl.layers.conv_direct import Direction, pack_weights
 from pp_cl.layers.conv_winograd import TRANSFORMED
-from pp_cl.layers.resample import maxpool2_backward, maxpool2_forward
+from pp_cl.layers.simple import maxpool2_backward, maxpool2_forward
 from pp_cl.layers.tiles import VECTOR, Tiles, all_tiles, all_tiles_buffers
 from pp_cl.metrics.lpips_weights import load_weights
 

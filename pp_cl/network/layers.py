@@ -17,7 +17,7 @@ import numpy as np
 
 from pp_cl.device.buffers import Table
 from pp_cl.layers.choice import ConvShape
-from pp_cl.layers.conv import Direction
+from pp_cl.layers.conv_direct import Direction
 from pp_cl.layers.tiles import VECTOR
 
 

@@ -202,8 +202,6 @@ def _classes(length, level, border):
 class AllTiles:
     """A pass that computes all tiles."""
 
-    computed_fraction = 1.0
-
     def __init__(self, dev: Device, size: tuple[int, int], layers: list[Layer]):
         levels = levels_of(layers)
         tiles = {n: all_tiles(dev, size[0] >> n, size[1] >> n) for n in set(levels.values())}

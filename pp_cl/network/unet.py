@@ -8,15 +8,18 @@ from collections.abc import Sequence
 import numpy as np
 from pyopencl.array import Array
 
-from pp_cl.device.buffers import PackedArrays
+from pp_cl.device.buffers import PackedArrays, Table
 from pp_cl.device.device import Device
 from pp_cl.layers.choice import ConvolutionPolicy, make_policy
-from pp_cl.layers.conv import Direction, pack_bias, pack_weights
-from pp_cl.layers.gate import gate_backward, gate_forward
-from pp_cl.layers.output import output_backward, output_forward, residual_backward
-from pp_cl.layers.resample import (
+from pp_cl.layers.conv_direct import Direction, pack_bias, pack_weights
+from pp_cl.layers.simple import (
     avgpool2_backward,
     avgpool2_forward,
+    gate_backward,
+    gate_forward,
+    output_backward,
+    output_forward,
+    residual_backward,
     upsample2_backward,
     upsample2_forward,
 )
@@ -315,8 +318,8 @@ class UNet:
         """
         return self._trained[1][name]
 
-    def memory_plan(self, height: int, width: int, training: bool) -> list[tuple[str, tuple, int]]:
-        """[(name, shape, bytes)] of all device buffers of this network once it has run at this
+    def memory_plan(self, height: int, width: int, training: bool) -> Table:
+        """All device buffers of this network once it has run at this
         size, what its convolutions share with others among them.
 
         Gradients of parameters are among them without training too: they are made with the network.
@@ -343,7 +346,4 @@ class UNet:
         for level in set(levels_of(self.layers).values()):
             tiles = all_tiles_buffers(height >> level, width >> level)
             table |= {f"tiles of level {level}, {name}": row for name, row in tiles.items()}
-        return [
-            (name, shape, math.prod(shape) * np.dtype(dtype).itemsize)
-            for name, (shape, dtype) in table.items()
-        ]
+        return table

@@ -7,11 +7,10 @@ from dataclasses import dataclass
 import numpy as np
 from pyopencl.array import Array
 
-from pp_cl.device.buffers import Buffers, Table, grown
+from pp_cl.device.buffers import Buffers, Reading, Table, grown
 from pp_cl.device.device import Device
 from pp_cl.device.launch import lanes
 from pp_cl.device.scan import exclusive_scan, read_total
-from pp_cl.device.transfer import Reading
 from pp_cl.errors import UserError
 from pp_cl.raster.project import FOOTPRINTS, ProjectedPoints
 

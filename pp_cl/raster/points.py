@@ -8,9 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 from pyopencl.array import Array
 
-from pp_cl.device.buffers import Table
+from pp_cl.device.buffers import DeviceRows, Table, compact_rows, gather_rows
 from pp_cl.device.device import Device
-from pp_cl.device.rows import DeviceRows, compact_rows, gather_rows
 
 
 @dataclass(frozen=True)

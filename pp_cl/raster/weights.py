@@ -9,11 +9,10 @@ from dataclasses import dataclass
 import numpy as np
 from pyopencl.array import Array
 
-from pp_cl.device.buffers import Buffers, Table
+from pp_cl.device.buffers import Buffers, Reading, Table
 from pp_cl.device.device import Device
 from pp_cl.device.launch import lanes
 from pp_cl.device.scan import nonzero
-from pp_cl.device.transfer import Reading
 from pp_cl.raster.pairs import Pairs
 
 BLENDS = ("softmax", "alpha")

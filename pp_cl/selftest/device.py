@@ -5,9 +5,9 @@ from itertools import product
 
 import numpy as np
 
+from pp_cl.device.buffers import compact_rows, gather_rows
 from pp_cl.device.device import Device
 from pp_cl.device.launch import LARGEST_GROUP
-from pp_cl.device.rows import compact_rows, gather_rows
 from pp_cl.device.scan import block_values, exclusive_scan, nonzero
 from pp_cl.selftest.case import SIZES, Case, Check, exact
 

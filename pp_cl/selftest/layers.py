@@ -8,13 +8,17 @@ import numpy as np
 from pp_cl.bench.conv import Layer
 from pp_cl.device.device import Device
 from pp_cl.layers.choice import ERRORS, OFFERED, SHIPPED, VARIANTS, device_class
-from pp_cl.layers.gate import gate_backward, gate_forward
-from pp_cl.layers.output import SHARE, output_backward, output_forward, residual_backward
-from pp_cl.layers.resample import (
+from pp_cl.layers.simple import (
+    SHARE,
     avgpool2_backward,
     avgpool2_forward,
+    gate_backward,
+    gate_forward,
     maxpool2_backward,
     maxpool2_forward,
+    output_backward,
+    output_forward,
+    residual_backward,
     upsample2_backward,
     upsample2_forward,
 )

@@ -10,8 +10,7 @@ from pp_cl.layers.choice import make_policy
 from pp_cl.reference import loss as reference_loss
 from pp_cl.reference.lpips import lpips, lpips_gradient, random_weights
 from pp_cl.selftest.case import EPS, SIZES, Case, Check, absolute, each, exact, relative
-from pp_cl.training.loss import FURTHER, Loss
-from pp_cl.training.mask import MaskLoss
+from pp_cl.training.loss import FURTHER, Loss, MaskLoss
 from pp_cl.training.perceptual import PerceptualLoss
 
 LOSS = 16 * EPS  # 22 taps of a window, in two passes, and the sums of rows and columns

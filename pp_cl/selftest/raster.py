@@ -9,10 +9,10 @@ import numpy as np
 
 from pp_cl.device.buffers import Buffers
 from pp_cl.device.device import Device
+from pp_cl.raster.blend import shade_forward
 from pp_cl.raster.depth import depth_forward
 from pp_cl.raster.points import SH_BLOCKS
 from pp_cl.raster.project import FOOTPRINTS, project_grid
-from pp_cl.raster.shade import shade_forward
 from pp_cl.raster.weights import BLENDS, DROPPED, record_weights
 from pp_cl.reference import dense
 from pp_cl.scene.grid import Grid

@@ -69,7 +69,10 @@ class StoredRun:
         if unknown:
             self._refuse(f"its header holds {shown(unknown[0], 40)}, which this version knows not")
         if "extended_from" in header:
-            rules["extended_from"] = _is_done(header), "a step that is done"
+            rules["extended_from"] = (
+                lambda x: type(x) is int and 1 <= x <= header["step"],  # which is checked before
+                "a step that is done",
+            )
         for key, (is_right, expected) in rules.items():
             if not is_right(header[key]):
                 self._refuse(f"{key} in its header is {quoted(header[key])}, expected {expected}")
@@ -187,10 +190,6 @@ def _are_digests(pixels):
 
 def _whole_in(least, most):
     return lambda x: type(x) is int and least <= x <= most
-
-
-def _is_done(header):
-    return lambda x: _whole_in(1, header["step"])(x)  # which is checked by then
 
 
 def _are_numbers(values, count):

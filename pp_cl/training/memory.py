@@ -9,10 +9,9 @@ from typing import NamedTuple
 import numpy as np
 
 from pp_cl.config import Config
-from pp_cl.device.buffers import Table, grown, table_bytes
+from pp_cl.device.buffers import PIECE_BYTES, Table, compact_table, grown, table_bytes
 from pp_cl.device.device import Device
 from pp_cl.device.host import available_bytes, resident_bytes
-from pp_cl.device.rows import PIECE_BYTES, compact_table
 from pp_cl.errors import UserError
 from pp_cl.metrics.lpips import Lpips
 from pp_cl.model import Model
@@ -23,8 +22,7 @@ from pp_cl.render import NETWORK_MULTIPLE, Renderer, point_radius
 from pp_cl.scene.grid import Grid
 from pp_cl.scene.load import DEMO, mask_rule, reading
 from pp_cl.scene.views import Photograph, kept_bytes, shrink_factor
-from pp_cl.training.loss import Loss, lanes_of_loss
-from pp_cl.training.mask import MaskLoss
+from pp_cl.training.loss import Loss, MaskLoss, lanes_of_loss
 from pp_cl.training.optim import Optimiser
 from pp_cl.training.perceptual import PerceptualLoss
 from pp_cl.training.schedule import crop_side, ema_start, prunings, refine_steps
@@ -274,7 +272,7 @@ class Room:
         target, shrunk = (height, width, 3), self._shrunk()
         tables = {
             **Renderer.tables(raster, n, full, pairs),
-            f"network at {crop[1]}x{crop[0]}": _network_table(net, crop, True),
+            f"network at {crop[1]}x{crop[0]}": net.memory_plan(*crop, True),
             f"previews at {full[1]}x{full[0]}": _preview_table(net, full),
             "loss": Loss.table((*crop, 3), target, train.ssim_weight, lanes_of_loss(net.dev)),
             "photograph and target": {
@@ -320,19 +318,11 @@ def _padded(width, height):
     return height + -height % NETWORK_MULTIPLE, width + -width % NETWORK_MULTIPLE
 
 
-def _network_table(net, size, training):
-    plan = net.memory_plan(*size, training)
-    return {f"{i} {name}": (shape, np.float32) for i, (name, shape, _) in enumerate(plan)}
-
-
 def _preview_table(net, size):
     """The buffers of whole images that are rendered, beside the network's parameters."""
     own = {name for p in net.parameters for name in (p, gradient_of(p))}
-    return {
-        f"{i} {name}": (shape, np.float32)
-        for i, (name, shape, _) in enumerate(net.memory_plan(*size, False))
-        if name not in own
-    }
+    plan = net.memory_plan(*size, False)
+    return {name: row for name, row in plan.items() if name not in own}
 
 
 def _size(size):

@@ -14,10 +14,9 @@ from collections.abc import Sequence
 import numpy as np
 from pyopencl.array import Array
 
-from pp_cl.device.buffers import Table
+from pp_cl.device.buffers import DeviceRows, Table
 from pp_cl.device.device import Device
 from pp_cl.device.launch import lanes, row_parts
-from pp_cl.device.rows import DeviceRows
 from pp_cl.model import Model
 from pp_cl.raster.points import four_blocks, stored_degree
 from pp_cl.raster.project import ProjectedPoints

@@ -1,5 +1,5 @@
 """What training keeps for each point beside what is learned: moments, averages, and how much the
-point has weighed.
+point has weighed; and which points are pruned by it.
 """
 
 from __future__ import annotations
@@ -7,10 +7,11 @@ from __future__ import annotations
 import numpy as np
 from pyopencl.array import Array
 
-from pp_cl.device.buffers import Table
+from pp_cl.device.buffers import Table, compact_rows, gather_rows
 from pp_cl.device.device import Device
-from pp_cl.device.rows import compact_rows, gather_rows
+from pp_cl.errors import Diverged
 from pp_cl.raster.points import PointCloud, ShBlock
+from pp_cl.settings import TrainConfig
 
 
 class PointState:
@@ -97,3 +98,43 @@ def split_opacity(dev: Device, opacity: Array) -> None:
     """
     n = len(opacity)
     dev.program("training/refine").launch("split_opacity", n, n=n, opacity=opacity)
+
+
+def points_to_keep(dev: Device, state: PointState, opacity: Array, settings: TrainConfig) -> Array:
+    """(M,) uint32, ascending: the points that stay in the course of training. One that was seen in
+    train.prune_looks steps must have weighed train.prune_weight in one of them, and have
+    train.prune_opacity; its counts start anew. Others stay.
+
+    A mean over the steps would drop what few views see, such as the inside of a gap. Raises
+    Diverged for weights and opacities that are not finite: nothing would tell of them later.
+    """
+    weight, seen, opacity = map(dev.download, (state.max_weight, state.times_seen, opacity))
+    broken = int((~np.isfinite(weight) | ~np.isfinite(opacity)).sum())
+    if broken:
+        raise Diverged(f"{broken} points have a weight or an opacity that is not finite")
+    judged = seen >= settings.prune_looks
+    passes = (weight >= settings.prune_weight) & (opacity >= settings.prune_opacity)
+    dev.write(state.max_weight, np.where(judged, np.float32(0), weight))
+    dev.write(state.times_seen, np.where(judged, np.float32(0), seen))
+    return _listed(dev, ~judged | passes, weight)
+
+
+def final_points_to_keep(
+    dev: Device, max_weight: Array, opacity: Array, settings: TrainConfig
+) -> Array:
+    """(M,) uint32, ascending: the points of a finished training that weigh at least
+    train.final_prune_weight and have train.prune_opacity. NaN counts as too little.
+
+    max_weight: (N,) float32, the highest blend weight in a training view.
+    """
+    weight, opacity = dev.download(max_weight), dev.download(opacity)
+    keep = (weight >= settings.final_prune_weight) & (opacity >= settings.prune_opacity)
+    return _listed(dev, keep, weight)
+
+
+def _listed(dev, keep, weight):
+    """Indices of the points to keep; the heaviest (the first of several) where none would be."""
+    indices = np.flatnonzero(keep)
+    if indices.size == 0:
+        indices = [np.argmax(np.nan_to_num(weight, nan=-np.inf))]
+    return dev.upload(indices, np.uint32)

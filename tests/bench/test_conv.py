@@ -7,7 +7,7 @@ from support.benches import KEYS
 from pp_cl.bench.conv import RandomConv, bench_conv
 from pp_cl.bench.timing import errors
 from pp_cl.layers.choice import OFFERED, device_class, make_policy
-from pp_cl.layers.conv import Direction
+from pp_cl.layers.conv_direct import Direction
 
 pytestmark = pytest.mark.usefixtures("quick")
 

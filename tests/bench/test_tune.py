@@ -32,7 +32,7 @@ from pp_cl.layers.choice import (
     make_policy,
     tuning_file,
 )
-from pp_cl.layers.conv import Direction
+from pp_cl.layers.conv_direct import Direction
 from pp_cl.network.layers import unet_layers
 
 FORWARD, INPUT, WEIGHTS = Direction

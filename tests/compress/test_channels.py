@@ -9,7 +9,7 @@ from support.networks import plain_parameters
 
 from pp_cl.compress.channels import kept_channels, reduced_parameters
 from pp_cl.compress.reduction import Reduction
-from pp_cl.layers.conv import unpack_weights
+from pp_cl.layers.conv_direct import unpack_weights
 from pp_cl.network.layers import convolutions
 from pp_cl.network.unet import UNet
 from pp_cl.reference.network import network

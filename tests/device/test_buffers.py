@@ -1,9 +1,20 @@
-"""A table of arrays is allocated as declared, only what changed anew; packed arrays."""
+"""Tables of arrays, packed arrays, transfers that are not waited for, and rows moved without a
+second array; the selftest has sizes and gathers.
+"""
+
+import weakref
 
 import numpy as np
 import pytest
 
-from pp_cl.device.buffers import Buffers, PackedArrays, table_bytes
+from pp_cl.device.buffers import (
+    Buffers,
+    DeviceRows,
+    PackedArrays,
+    compact_rows,
+    read_later,
+    table_bytes,
+)
 
 TABLE = {"place": ((5, 4), np.float32), "box": ((5, 4), np.uint16)}
 
@@ -63,3 +74,72 @@ def test_a_kernel_reads_a_packed_array(dev):
     first, second = PackedArrays(dev).send(rows, [np.arange(5, dtype="f4"), np.float32([7, -2, 3])])
     dev.copy(first[:3], second)
     assert first.get().tolist() == [7, -2, 3, 3, 4] and second.get().tolist() == [7, -2, 3]
+
+
+def test_a_reading_is_what_the_kernels_before_it_left(dev, rng):
+    """Whatever is enqueued after it."""
+    first, second = (rng.normal(size=257).astype(np.float32) for _ in range(2))
+    array = dev.upload(first)
+    before = read_later(dev, array)
+    dev.send(array, second)
+    after = read_later(dev, array, 250)
+    dev.fill(array, 0)
+    assert np.array_equal(after.get(), second[250:]) and np.array_equal(before.get(), first)
+    assert before.get() is before.get()
+
+
+def test_what_is_sent_may_be_dropped_at_once(dev, rng):
+    """The host's copy lives until it has arrived, and no longer."""
+    array, expected = dev.empty((31, 7), np.int32), None
+    for _ in range(20):
+        expected = rng.integers(0, 99, (31, 7), dtype=np.int32)
+        dev.send(array, expected.copy())
+    assert np.array_equal(array.get(), expected)
+    dev.send(array, expected)
+    dev.finish()
+    dev.send(array, expected)
+    assert len(dev._sent) <= 2
+    for wrong in (expected.T, expected.astype(np.float32)):
+        with pytest.raises(ValueError, match="write: "):
+            dev.send(array, wrong)
+
+
+@pytest.mark.parametrize("shape", [(), (16,), (3, 16), (7,)])
+@pytest.mark.parametrize("pieces", [1, 3, 1000])
+def test_compact(dev, rng, monkeypatch, shape, pieces):
+    """As a new array, in place by a few pieces, and in place row by row; every bit is kept."""
+    source = rng.integers(0, 2**32, (257, *shape), dtype=np.uint32).view(np.float32)
+    indices = np.flatnonzero(rng.random(257) < 0.6).astype(np.uint32)
+    scratch_bytes = 4 * int(np.prod(shape)) * -(-len(indices) // pieces)
+    monkeypatch.setattr("pp_cl.device.buffers.SCRATCH_BYTES", scratch_bytes)
+    before, array = dev.bytes, dev.upload(source)
+    rows = compact_rows(dev, array, dev.upload(indices))
+    np.testing.assert_array_equal(rows.get().view(np.uint32), source[indices].view(np.uint32))
+    assert (rows.base_data is array.base_data) == (pieces > 1)
+    del array
+    assert dev.bytes == before + (source.nbytes if pieces > 1 else rows.nbytes)
+    again = compact_rows(dev, rows, dev.upload(np.zeros(1, np.uint32)))
+    del rows
+    assert dev.bytes == before + again.nbytes
+
+
+@pytest.mark.parametrize("piece", [1, 4 * 48 * 7, 2**26])
+@pytest.mark.parametrize("n", [0, 1, 31, 257])
+def test_parts_are_joined(dev, rng, monkeypatch, n, piece):
+    monkeypatch.setattr("pp_cl.device.buffers.PIECE_BYTES", piece)
+    parts = [rng.random((n, c, 16)).astype(np.float32) for c in (1, 2)]
+    rows = DeviceRows(dev, *map(dev.upload, parts))
+    assert rows.shape == (n, 3, 16) and rows.dtype == np.float32 and rows.nbytes == 192 * n
+    assert all(p.nbytes <= max(piece, 192) for p in rows.pieces())
+    np.testing.assert_array_equal(rows.get(), np.concatenate(parts, 1))
+
+
+def test_what_was_fetched_or_written_is_not_kept(dev):
+    """pyopencl's own get and set tie the numpy array to the device's."""
+    array = dev.upload(np.arange(9, dtype=np.float32))
+    fetched, written = dev.download(array), np.zeros(9, np.float32)
+    dev.write(array, written)
+    dead = [weakref.ref(fetched), weakref.ref(written)]
+    del fetched, written
+    assert [ref() for ref in dead] == [None, None]
+    assert not dev.download(array).any()

@@ -231,10 +231,6 @@ def test_only_nvidias_driver_rules_out_a_watchdog(said, expected):
     assert device_module.has_watchdog(Driver()) is expected
 
 
-def test_a_cpu_has_no_watchdog(plain):
-    assert plain.has_watchdog is not plain.is_cpu
-
-
 def test_a_build_takes_the_options_of_its_vendor(plain, tiny, monkeypatch):
     monkeypatch.setattr(device_module, "vendor_options", lambda info, name: ("-DDOUBLED=1",))
     (tiny / "doubled.cl").write_text(

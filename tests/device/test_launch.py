@@ -11,14 +11,15 @@ from support.toy_kernels import SOURCE
 from pp_cl.device import device as device_module
 from pp_cl.device import launch
 from pp_cl.device.launch import (
+    SCALARS,
     channel_ranges,
     cut,
     group_items,
     group_ranges,
     lanes,
+    parse_signatures,
     row_parts,
 )
-from pp_cl.device.signature import SCALARS, parse_signatures
 from pp_cl.errors import UserError
 
 KERNEL_FOLDER = device_module.kernel_folder()  # before any test replaces it
@@ -341,35 +342,6 @@ def test_a_default_work_group_fits_the_device(program, monkeypatch, limit, group
 
 
 # ---- signatures
-
-
-def test_parsed_signature():
-    signatures = parse_signatures(SOURCE, "toy.cl")
-    assert list(signatures) == ["rows", "copied", "behind", "formulas"]
-    n, scale, x, k, y = signatures["rows"]
-    assert (n.name, n.space, n.dtype, n.shape) == ("n", "", np.uint32, None)
-    assert (scale.name, scale.dtype) == ("scale", np.float32)
-    assert (x.space, x.dtype, x.width, x.const) == ("global", np.float32, 4, True)
-    assert x.shape == ("N", "WIDTH")
-    assert (k.space, k.dtype, k.width, k.shape) == ("constant", np.uint32, 1, ("3",))
-    assert (y.const, y.shape) == (False, ("N", "1"))
-    assert [p.space for p in signatures["copied"]] == ["global", "local", "global"]
-    assert signatures["copied"][2].shape is None
-
-
-@pytest.mark.parametrize(
-    "head, names",
-    [
-        ("kernel void f() {", []),
-        ("__kernel void f(\n    const int a)\n{", ["a"]),
-        ("kernel __attribute__((vec_type_hint(float))) void f(\n    const uchar b) {", ["b"]),
-        ("kernel void f(\n    global float *restrict x  // (N, (H-1)/2, ?) nested\n) {", ["x"]),
-    ],
-)
-def test_heads_that_are_understood(head, names):
-    parameters = parse_signatures(head + "\n}\n", "f.cl")["f"]
-    assert [p.name for p in parameters] == names
-    assert all(p.shape in (None, ("N", "(H-1)/2", "?")) for p in parameters)
 
 
 @pytest.mark.parametrize(

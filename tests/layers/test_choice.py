@@ -32,7 +32,7 @@ from pp_cl.layers.choice import (
     policy_of_run,
     tuning_file,
 )
-from pp_cl.layers.conv import Direction
+from pp_cl.layers.conv_direct import Direction
 from pp_cl.network.unet import UNet
 
 pytestmark = pytest.mark.usefixtures("cpu_form")
@@ -204,14 +204,6 @@ def test_a_tuning_is_stored_and_read_again(dev, cache, capsys):
     assert policy.blocking.winograd == (32, 8) and policy.blocking.direct == (4, 2, (1, 1, 1))
     assert policy.choose(SHAPE) == "direct"
     assert tuning_file(dev).parent == cache
-
-
-def test_without_one_the_device_class_is_named(dev, monkeypatch):
-    cpu = load_policy(dev, DEFAULT).origin
-    monkeypatch.setattr(dev, "is_cpu", False)
-    gpu = load_policy(dev, DEFAULT).origin
-    assert "CPU" in cpu and "no GPU has been measured" in gpu
-    assert "pp-cl tune" in cpu and "pp-cl tune" in gpu
 
 
 @pytest.mark.parametrize("name", ["driver", "compute_units", "name", "platform", "pp_cl"])

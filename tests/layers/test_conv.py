@@ -13,9 +13,8 @@ from support.launches import check_parts
 from support.tiles import pixels_of, random_counts
 
 from pp_cl.bench.conv import Layer
-from pp_cl.layers import conv_direct, conv_local, conv_winograd
+from pp_cl.layers import conv_direct
 from pp_cl.layers.choice import CHOICES, SHIPPED, VARIANTS
-from pp_cl.layers.conv import Direction, pack_weights, unpack_weights
 from pp_cl.layers.tiles import some_tiles
 from pp_cl.network.tile_plan import grow
 from pp_cl.selftest.layers import within
@@ -28,15 +27,6 @@ ALL = [
     for module, k in ((DIRECT, 1), (DIRECT, 3), (LOCAL, 1), (LOCAL, 3), (WINOGRAD, 3))
 ]
 OF_3X3 = [param for param in ALL if param.values[1] == 3]
-
-
-def test_packing_is_exact(rng):
-    weight = rng.normal(size=(20, 5, 3, 3)).astype(np.float32)
-    packed = pack_weights(weight)
-    assert packed.shape == (2, 3, 3, 5, 16)
-    assert packed[1, 2, 0, 4, 3] == weight[19, 4, 2, 0]
-    assert not packed[1, ..., 4:].any()
-    np.testing.assert_array_equal(unpack_weights(packed, 20), weight)
 
 
 @pytest.mark.parametrize("module, k", ALL)
@@ -108,33 +98,6 @@ def test_smaller_work_groups_compute_the_same_bits(dev, rng, monkeypatch, most):
         np.testing.assert_array_equal(actual, same)
 
 
-def test_local_computes_all_of_the_channels_and_no_other():
-    """In groups of four, as many as divide the blocks of 16."""
-    expected = {3: 4, 16: 4, 20: 8, 32: 8, 48: 4, 64: 16, 80: 4, 96: 8, 128: 16, 512: 16}
-    assert {channels: conv_local.quads(channels, True) for channels in expected} == expected
-    assert conv_local.quads(64, False) == 4
-
-
-@pytest.mark.parametrize(
-    "k, ci, co, first, c", [(3, 16, 16, 0, 16), (3, 48, 3, 16, 32), (1, 20, 32, 16, 4)]
-)
-def test_flipped_weights_are_exact(dev, rng, k, ci, co, first, c):
-    """And 0 for the channels beyond the last one."""
-    weight = rng.normal(size=(co, ci, k, k)).astype(np.float32)
-    given = dev.upload(pack_weights(weight)), first, c, co
-    expected = weight[:, first : first + c, ::-1, ::-1].transpose(1, 0, 2, 3)
-    flipped = conv_direct.flip_weights(dev, CPU, *given).get()
-    np.testing.assert_array_equal(flipped, pack_weights(expected))
-
-
-def test_direct_work_items_fit_the_channels_and_the_width():
-    one = (1, 1, 1)
-    paired = replace(CPU, direct=(6, 2, one), direct_odd=(12, 1, one))
-    found = [conv_direct.fitting(paired, width, 64) for width in (100, 6, 5, 3)]
-    assert found == [(6, 2, one), (6, 2, one), (4, 2, one), (1, 2, one)]
-    assert conv_direct.fitting(paired, 100, 48) == (12, 1, one)  # three groups do not pair up
-
-
 @pytest.mark.large
 @pytest.mark.parametrize("module", [DIRECT, LOCAL])
 @pytest.mark.parametrize("most", [20_000, 1])
@@ -174,18 +137,6 @@ def test_every_blocking(dev, rng, field):
             for result in map(within, layer.computed(dev, module, blocking), layer.expected):
                 assert result.share <= 1, blocking
         dev.check()
-
-
-def test_narrow_weights_have_a_blocking_of_their_own(dev):
-    """For two tiles of 128 x 128 channels at a time, and of more channels."""
-
-    def floats(co, **changed):
-        blocking, shape = replace(CPU, **changed), (co // 16, 3, 3, 128, 16)
-        floats = conv_winograd.scratch_floats(dev, blocking, Direction.FORWARD, 9, shape, 128)
-        return floats[conv_winograd.SLICES]
-
-    assert floats(128, winograd_narrow=(2, 2)) < floats(128) == floats(128, winograd=(2, 2))
-    assert floats(144, winograd=(2, 2)) < floats(144) == floats(144, winograd_narrow=(2, 2))
 
 
 @pytest.mark.parametrize("module, k", OF_3X3)

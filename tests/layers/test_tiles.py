@@ -9,10 +9,11 @@ from support.tiles import pixels_of, random_counts
 
 from pp_cl.device.device import kernel_folder
 from pp_cl.layers.conv_local import TILE_PARTS
-from pp_cl.layers.gate import gate_backward, gate_forward
-from pp_cl.layers.resample import (
+from pp_cl.layers.simple import (
     avgpool2_backward,
     avgpool2_forward,
+    gate_backward,
+    gate_forward,
     upsample2_backward,
     upsample2_forward,
 )

@@ -13,9 +13,7 @@ from pp_cl.network.layers import BLOCKS, convolutions, gradient_of, unet_layers
 from pp_cl.network.tile_plan import (
     LOSS_BORDER,
     LOSS_RADIUS,
-    double,
     gradient_radius,
-    grow,
     halve,
     map_tiles,
     receptive_radius,
@@ -150,23 +148,6 @@ def test_radius_is_what_a_change_reaches(rng, blocks):
     radius["image"] = radius["out"]
     for name, far in reached.items():
         assert far <= radius[name] <= far + 3, name
-
-
-@pytest.mark.parametrize("n", [1, 2, 7, 60])
-def test_grow_halve_and_double(rng, n):
-    tiles = rng.random((31, 17)) < 0.01
-    grown = grow(tiles, n)
-    for r, c in np.ndindex(tiles.shape):
-        assert grown[r, c] == tiles[max(r - n, 0) : r + n + 1, max(c - n, 0) : c + n + 1].any()
-    half = halve(tiles)
-    assert half.shape == (16, 9)
-    assert all(
-        half[r, c] == tiles[2 * r : 2 * r + 2, 2 * c : 2 * c + 2].any()
-        for r, c in np.ndindex(half.shape)
-    )
-    np.testing.assert_array_equal(halve(tiles, 2), halve(half))
-    np.testing.assert_array_equal(halve(double(half, tiles.shape)), half)
-    assert double(half, tiles.shape).shape == tiles.shape
 
 
 @pytest.mark.parametrize("level", [0, 1, 2])

@@ -45,14 +45,6 @@ def test_hits_that_were_counted_otherwise_stay_within_their_point(dev, rng, kind
     assert np.array_equal(listed, np.bincount(pixels, minlength=len(listed)))
 
 
-def test_a_crop_sees_the_same_hits(dev, rng):
-    camera, positions = make_camera(40, 36), make_points(rng, 300)
-    whole = PairedPoints(dev, camera, positions, 0.1).hits().reshape(-1, 36, 40)
-    crop = PairedPoints(dev, camera.crop(11, 7, 13, 17), positions, 0.1).hits().reshape(-1, 17, 13)
-    assert np.array_equal(crop, whole[:, 7:24, 11:24])
-    assert crop.any()
-
-
 def test_every_visible_point_hits_a_pixel(dev, rng):
     camera = replace(make_camera(40, 36), fy=30.0)
     slopes = rng.uniform(-0.3, 0.3, (2000, 2))

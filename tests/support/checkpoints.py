@@ -2,7 +2,6 @@
 
 import json
 import warnings
-import zipfile
 from unittest.mock import patch
 
 import numpy as np
@@ -64,19 +63,6 @@ def write_run(folder, config, header, arrays):
     folder.config.write_text(config.to_json())
     with patch("pp_cl.files.checkpoint._check_piece"):
         save_checkpoint(folder.checkpoint, header, arrays)
-
-
-def write_header(path, text):
-    """Replace the header of a checkpoint by bytes that need not be JSON."""
-    with zipfile.ZipFile(path) as old:
-        members = {entry.filename: old.read(entry) for entry in old.infolist()}
-    with zipfile.ZipFile(path, "w") as new:
-        for name, data in members.items():
-            if name == "header.npy":
-                with new.open(name, "w") as file:
-                    np.save(file, np.frombuffer(text, np.uint8))
-            else:
-                new.writestr(name, data)
 
 
 def header_text(**changes):

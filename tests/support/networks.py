@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from pp_cl.layers.conv import unpack_weights
+from pp_cl.layers.conv_direct import unpack_weights
 
 
 def plain_parameters(net, arrays):

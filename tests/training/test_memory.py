@@ -9,9 +9,8 @@ from support.scenes import write_ball_scene
 
 from pp_cl.cli import main
 from pp_cl.config import assign, preset
-from pp_cl.device.buffers import table_bytes
+from pp_cl.device.buffers import compact_table, table_bytes
 from pp_cl.device.device import Device
-from pp_cl.device.rows import compact_table
 from pp_cl.errors import UserError
 from pp_cl.files.checkpoint import load_checkpoint
 from pp_cl.metrics.lpips import WIDTHS, vgg_layers
@@ -110,7 +109,7 @@ def test_the_plan_is_what_a_training_takes(plain, tmp_path, monkeypatch, changes
 
 
 def test_pruning_stays_within_the_plan(plain, tmp_path, monkeypatch):
-    monkeypatch.setattr("pp_cl.device.rows.SCRATCH_BYTES", 10**6)
+    monkeypatch.setattr("pp_cl.device.buffers.SCRATCH_BYTES", 10**6)
     others = plain.bytes  # what fixtures of other tests hold
     trainer, plan, _ = trained(plain, tmp_path / "ball", {"raster.radius": "0.75"})
     pruning = table_bytes(compact_table(POINTS, 192))

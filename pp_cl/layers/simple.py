@@ -1,0 +1,234 @@
+"""The network's layers that are no convolutions, on (H, W, C) float32 feature maps: gates, pooling,
+bilinear upsampling, and the image at the end.
+
+tiles: those of the result to compute, None = all. All raise ValueError for shapes that do not fit.
+"""
+
+from pyopencl.array import Array
+
+from pp_cl.device.device import Device
+from pp_cl.device.launch import channel_ranges, lanes
+from pp_cl.layers.tiles import Tiles, checked_tiles
+
+SHARE = 0.25  # of a feature in its colour; features differ by about four times as much
+
+
+def gate_forward(dev: Device, x: Array, out: Array, *, tiles: Tiles | None = None) -> None:
+    """out (H, W, C) = ELU(features) * sigmoid(gates). x: (H, W, 2 C), the features of each pixel
+    and then its gates.
+    """
+    h, w, c = _check_gate(x, out)
+    size, work_group = channel_ranges(dev, h, w, c)
+    dev.program("layers/gate", LANES=lanes(dev)).launch(
+        "gate_forward",
+        size,
+        work_group,
+        h=h,
+        w=w,
+        c=c,
+        x=x,
+        out=out,
+        tile_count=checked_tiles(dev, tiles, h, w).count,
+    )
+
+
+def gate_backward(
+    dev: Device, x: Array, grad_out: Array, grad_x: Array, *, tiles: Tiles | None = None
+) -> None:
+    """grad_x (H, W, 2 C) = gradient of gate_forward, given grad_out (H, W, C)."""
+    h, w, c = _check_gate(x, grad_out)
+    size, work_group = channel_ranges(dev, h, w, c)
+    dev.program("layers/gate", LANES=lanes(dev)).launch(
+        "gate_backward",
+        size,
+        work_group,
+        h=h,
+        w=w,
+        c=c,
+        x=x,
+        grad_out=grad_out,
+        grad_x=grad_x,
+        tile_count=checked_tiles(dev, tiles, h, w).count,
+    )
+
+
+def avgpool2_forward(dev: Device, x: Array, out: Array, *, tiles: Tiles | None = None) -> None:
+    """out (H, W, C) = mean of 2x2 pixels of x (2H, 2W, C)."""
+    h, w, c = _check_double(out, x)
+    _launch(
+        dev,
+        "avgpool2_forward",
+        (h, w, c),
+        h=h,
+        w=w,
+        c=c,
+        x=x,
+        out=out,
+        tile_count=checked_tiles(dev, tiles, h, w).count,
+    )
+
+
+def avgpool2_backward(
+    dev: Device,
+    mask: Array | None,
+    grad_out: Array,
+    grad_x: Array,
+    *,
+    tiles: Tiles | None = None,
+) -> None:
+    """Adds the gradient of avgpool2_forward to grad_x (2H, 2W, C), then sets grad_x to 0 where mask
+    <= 0.
+
+    mask: what was pooled, where it is a ReLU's output, else None; grad_x: gradient of its other
+    use; grad_out: (H, W, C).
+    """
+    h, w, c = _check_double(grad_out, grad_x)
+    _launch(
+        dev,
+        "avgpool2_backward",
+        (2 * h, 2 * w, c),
+        h=h,
+        w=w,
+        c=c,
+        masked=mask is not None,
+        x=grad_x if mask is None else mask,
+        grad_out=grad_out,
+        grad_x=grad_x,
+        tile_count=checked_tiles(dev, tiles, 2 * h, 2 * w).count,
+    )
+
+
+def maxpool2_forward(dev: Device, x: Array, out: Array) -> None:
+    """out (H // 2, W // 2, C) = largest of 2x2 pixels of x (H, W, C)."""
+    h, w, c = _check_half(x, out)
+    _launch(dev, "maxpool2_forward", (h, w, c), h=h, w=w, c=c, x_width=x.shape[1], x=x, out=out)
+
+
+def maxpool2_backward(dev: Device, x: Array, grad_out: Array, grad_x: Array) -> None:
+    """Adds the gradient of maxpool2_forward to grad_x (H, W, C), where x > 0.
+
+    x: the ReLU's output that was pooled; grad_x: gradient of that ReLU's input, as far as the
+    output's other use goes; grad_out: (H // 2, W // 2, C).
+    """
+    h, w, c = _check_half(x, grad_out)
+    _launch(
+        dev,
+        "maxpool2_backward",
+        (h, w, c),
+        h=h,
+        w=w,
+        c=c,
+        x_width=x.shape[1],
+        x=x,
+        grad_out=grad_out,
+        grad_x=grad_x,
+    )
+
+
+def upsample2_forward(dev: Device, x: Array, out: Array, *, tiles: Tiles | None = None) -> None:
+    """out (2H, 2W, C) = x (H, W, C), bilinear, align_corners False, border repeated."""
+    h, w, c = _check_double(x, out)
+    _launch(
+        dev,
+        "upsample2_forward",
+        (h, w, c),
+        h=h,
+        w=w,
+        c=c,
+        x=x,
+        out=out,
+        tile_count=checked_tiles(dev, tiles, 2 * h, 2 * w).count,
+    )
+
+
+def upsample2_backward(
+    dev: Device, grad_out: Array, grad_x: Array, *, tiles: Tiles | None = None
+) -> None:
+    """grad_x (H, W, C) = gradient of upsample2_forward, given grad_out (2H, 2W, C)."""
+    h, w, c = _check_double(grad_x, grad_out)
+    _launch(
+        dev,
+        "upsample2_backward",
+        (h, w, c),
+        h=h,
+        w=w,
+        c=c,
+        grad_out=grad_out,
+        grad_x=grad_x,
+        tile_count=checked_tiles(dev, tiles, h, w).count,
+    )
+
+
+def output_forward(dev: Device, image: Array, features: Array | None) -> None:
+    """image (H, W, 3) = 0.5 + 0.5 * image, and SHARE * (the first three of the features (H, W, C)
+    - the background's 1), if they are given: a residual connection past the network.
+    """
+    height, width, channels = _check_image(image if features is None else features, image)
+    dev.program("layers/output").launch(
+        "output_forward",
+        height * width,
+        n=height * width,
+        channels=channels,
+        residual=features is not None,
+        share=SHARE,
+        features=image if features is None else features,
+        image=image,
+    )
+
+
+def output_backward(dev: Device, grad_image: Array, grad_out: Array) -> None:
+    """grad_out (H, W, 3) of the network's output, of grad_image (H, W, 3)."""
+    _check_image(grad_out, grad_image)
+    n = grad_image.size
+    dev.program("layers/output").launch(
+        "output_backward", n, n=n, grad_image=grad_image, grad_out=grad_out
+    )
+
+
+def residual_backward(dev: Device, grad_image: Array, grad_features: Array) -> None:
+    """Adds what passes around the network to grad_features (H, W, C), of grad_image (H, W, 3)."""
+    height, width, channels = _check_image(grad_features, grad_image)
+    dev.program("layers/output").launch(
+        "residual_backward",
+        height * width,
+        n=height * width,
+        channels=channels,
+        share=SHARE,
+        grad_image=grad_image,
+        grad_features=grad_features,
+    )
+
+
+def _launch(dev, kernel, shape, **arguments):
+    size, work_group = channel_ranges(dev, *shape)
+    dev.program("layers/resample", LANES=lanes(dev)).launch(kernel, size, work_group, **arguments)
+
+
+def _check_double(small, large):
+    h, w, c = small.shape
+    if large.shape != (2 * h, 2 * w, c):
+        raise ValueError(
+            f"a layer between {small.shape} and {large.shape}: expected {(2 * h, 2 * w, c)}"
+        )
+    return h, w, c
+
+
+def _check_half(large, small):
+    h, w, c = small.shape
+    if (large.shape[0] // 2, large.shape[1] // 2, large.shape[2]) != small.shape:
+        raise ValueError(f"max pooling of {large.shape} to {small.shape}")
+    return h, w, c
+
+
+def _check_gate(x, out):
+    h, w, c = out.shape
+    if x.shape != (h, w, 2 * c):
+        raise ValueError(f"a gate from {x.shape} to {out.shape}: expected {(h, w, 2 * c)}")
+    return h, w, c
+
+
+def _check_image(features, image):
+    height, width, channels = features.shape
+    if channels < 3 or image.shape != (height, width, 3):
+        raise ValueError(f"an image {image.shape} is none of features {features.shape}")
+    return features.shape
