@@ -153,7 +153,7 @@ def check_target(path: Path) -> None:
         _remove(_temporary(tried))
 
 
-def check_writable(folder: Path | str, mend: str = "choose another --out") -> None:
+def check_writable(folder: Path | str) -> None:
     """Raise UserError where a folder, or the one in which it would be made, may not be written."""
     there = Path(folder).absolute()
     while not there.exists() and there != there.parent:
@@ -161,7 +161,7 @@ def check_writable(folder: Path | str, mend: str = "choose another --out") -> No
     if not os.access(there, os.W_OK | os.X_OK):
         raise UserError(
             f"{folder}: may not be written (check the permissions of {there}, and that its file"
-            f" system is not read-only); {mend}"
+            " system is not read-only); choose another --out"
         )
 
 

@@ -18,6 +18,7 @@ import numpy as np
 
 from pp_cl.errors import Diverged, UserError, quoted, shown
 from pp_cl.files.atomic import atomic_file
+from pp_cl.files.untrusted import strict_json
 
 FORMAT = 1  # raised when the arrays change meaning
 MOST_HEADER = 2**24  # bytes; the measurements of a tuned device take some 100,000
@@ -135,7 +136,7 @@ class Checkpoint:
         form = self.forms.get("header")
         if form is None or form.dtype != np.uint8 or math.prod(form.shape) > MOST_HEADER:
             raise ValueError("it has no header")
-        header = json.loads(self._read("header").tobytes(), parse_constant=_refuse_constant)
+        header = strict_json(self._read("header").tobytes())
         if not isinstance(header, dict):
             raise ValueError("its header is no JSON object")
         if header.get("format") != FORMAT:
@@ -178,10 +179,6 @@ def _read_form(member):
     kind, sizes = (text.decode() for text in found.groups())
     shape = tuple(int(size) for size in sizes.split(",") if size.strip())
     return Form(shape, np.dtype(kind)), len(start) + length
-
-
-def _refuse_constant(name):
-    raise ValueError(f"its header holds {name}")
 
 
 @contextmanager

@@ -54,22 +54,13 @@ def tiles(images: Sequence[np.ndarray], columns: int) -> np.ndarray:
     the largest; what is transparent, or beside a smaller image, shows white.
     """
     height, width = _cell(images)
-    opaque = [_over_white(image) for image in images]
-    opaque = [
-        np.pad(
-            image,
-            ((0, height - image.shape[0]), (0, width - image.shape[1]), (0, 0)),
-            constant_values=255,
-        )
-        for image in opaque
-    ]
-    blank = np.full_like(opaque[0], 255)
-    rows = -(-len(opaque) // columns)
-    opaque += [blank] * (rows * columns - len(opaque))
-    table = np.pad(opaque, ((0, 0), (0, GAP), (0, GAP), (0, 0)), constant_values=LINE)
-    _, height, width, _ = table.shape
-    table = table.reshape(rows, columns, height, width, 3).transpose(0, 2, 1, 3, 4)
-    return table.reshape(rows * height, columns * width, 3)[:-GAP, :-GAP]
+    rows = -(-len(images) // columns)
+    table = np.full((rows, height + GAP, columns, width + GAP, 3), LINE, np.uint8)
+    table[:, :height, :, :width] = 255
+    for i, image in enumerate(images):
+        y, x = image.shape[:2]
+        table[i // columns, :y, i % columns, :x] = _over_white(image)
+    return table.reshape(rows * (height + GAP), -1, 3)[:-GAP, :-GAP]
 
 
 def _cell(images):

@@ -16,7 +16,7 @@ from filelock import FileLock, Timeout
 from pp_cl.errors import UserError, shown
 from pp_cl.files.atomic import mend, remove_leftovers, write_text
 from pp_cl.files.checkpoint import Rows, save_checkpoint
-from pp_cl.files.untrusted import read_regular
+from pp_cl.files.untrusted import read_regular, strict_json
 
 MASKS_PICTURE = "masks.png"
 MOST_OWNER = 1000  # bytes of the line that names the owner
@@ -162,7 +162,7 @@ def read_row(line: bytes | str) -> dict[str, Any] | None:
     something else.
     """
     try:
-        row = json.loads(line, parse_constant=_refuse_constant) if len(line) <= MOST_LINE else None
+        row = strict_json(line) if len(line) <= MOST_LINE else None
         if not isinstance(row, dict) or not _is_kept(row):
             return None
     except (ValueError, RecursionError):
@@ -179,10 +179,6 @@ def _is_kept(value):
     if isinstance(value, (list, dict)):
         return all(map(_is_kept, value.values() if isinstance(value, dict) else value))
     return not isinstance(value, (int, float)) or abs(value) < MOST_NUMBER
-
-
-def _refuse_constant(name):
-    raise ValueError(f"{name} is no number")
 
 
 def _rows(path, step=math.inf):

@@ -1,12 +1,13 @@
 """Files that other programs wrote: checked to be regular and small enough before they are read."""
 
 import errno
+import json
 import os
 import stat
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import BinaryIO
+from typing import Any, BinaryIO
 
 from pp_cl.errors import UserError, shown
 
@@ -47,6 +48,15 @@ def read_json_text(path: Path | str, most: int, encoding: str = "utf-8") -> str:
     if sum(map(text.count, ",[{")) > MOST_VALUES:
         raise ValueError(f"more than {MOST_VALUES} values")
     return text
+
+
+def strict_json(text: bytes | str) -> Any:
+    """The value of JSON. Raises ValueError for what is none, NaN and Infinity among it."""
+    return json.loads(text, parse_constant=_refuse_constant)
+
+
+def _refuse_constant(name):
+    raise ValueError(f"holds {name}, which is no number")
 
 
 def refusal(path: Path | str, error: Exception, kind: str, mend: str = "copy it anew") -> UserError:

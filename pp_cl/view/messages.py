@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from pp_cl.errors import UserError
+from pp_cl.files.untrusted import strict_json
 from pp_cl.scene.camera import Camera
 from pp_cl.scene.readers.frame import GL_FROM_CV
 
@@ -55,7 +56,7 @@ def packed(facts: dict[str, Any], image: bytes) -> bytes:
 def read_request(text: str) -> ViewRequest:
     """The request in a message. Raises UserError in one line for whatever is no such request."""
     try:
-        message = json.loads(text, parse_constant=_refuse_constant)
+        message = strict_json(text)
     except (ValueError, RecursionError):
         raise UserError("the message is no JSON of finite numbers; reload the page") from None
     if not isinstance(message, dict):
@@ -102,10 +103,6 @@ def _pose(rows):
     if not np.array_equal(matrix[3], [0, 0, 0, 1]):
         raise UserError(f"{name}: its last row must be 0, 0, 0, 1")
     return np.column_stack([turn, matrix[:3, 3]]) @ GL_FROM_CV
-
-
-def _refuse_constant(word):
-    raise ValueError(word)
 
 
 def _is_number(value):

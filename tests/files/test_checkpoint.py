@@ -29,6 +29,8 @@ def test_round_trip_and_equal_bytes(tmp_path):
     save_checkpoint(a, {"step": 3}, ARRAYS)
     save_checkpoint(b, {"step": 3}, ARRAYS)
     assert a.read_bytes() == b.read_bytes()
+    with zipfile.ZipFile(a) as stored:  # compressed bytes could change with the version of zlib
+        assert {entry.compress_type for entry in stored.infolist()} == {zipfile.ZIP_STORED}
     header, arrays = load_checkpoint(a)
     assert header["step"] == 3 and set(arrays) == set(ARRAYS)
     for name, array in ARRAYS.items():
@@ -104,18 +106,12 @@ def test_arrays_in_pieces_give_the_bytes_of_whole_ones(dev, tmp_path):
     assert (tmp_path / "a.npz").read_bytes() == (tmp_path / "b.npz").read_bytes()
 
 
-@pytest.mark.parametrize("damage", ["truncate", "flip", "empty", "text"])
-def test_corrupt_checkpoint_is_one_clear_line(tmp_path, damage):
+@pytest.mark.parametrize("kept", [0, 0.5, 0.99])
+def test_a_cut_checkpoint_is_one_clear_line(tmp_path, kept):
     path = tmp_path / "checkpoint.npz"
     save_checkpoint(path, {}, ARRAYS)
-    content = bytearray(path.read_bytes())
-    if damage == "flip":
-        content[content.find(b"\x93NUMPY") + 140] ^= 0xFF
-    path.write_bytes(
-        {"truncate": content[: len(content) // 2], "flip": content, "empty": b"", "text": b"hello"}[
-            damage
-        ]
-    )
+    content = path.read_bytes()
+    path.write_bytes(content[: int(kept * len(content))])
     with pytest.raises(UserError, match="corrupt checkpoint") as caught:
         load_checkpoint(path)
     assert str(path) in str(caught.value) and "\n" not in str(caught.value)
@@ -168,10 +164,3 @@ def test_json_never_holds_nan(tmp_path):
     with pytest.raises(ValueError, match="JSON compliant"):
         write_json(tmp_path / "a.json", {"x": float("nan")})
     assert not (tmp_path / "a.json").exists()
-
-
-def test_arrays_are_stored_without_compression(tmp_path):
-    """Compressed bytes could change with the version of zlib."""
-    save_checkpoint(tmp_path / "a.npz", {"step": 1}, {"a": np.zeros(1000)})
-    with zipfile.ZipFile(tmp_path / "a.npz") as stored:
-        assert {entry.compress_type for entry in stored.infolist()} == {zipfile.ZIP_STORED}

@@ -151,21 +151,6 @@ def test_images_that_are_refused(tmp_path, case):
     assert str(tmp_path / "a.exr") in str(caught.value) and "\n" not in str(caught.value)
 
 
-@pytest.mark.parametrize("share", [0.0, 0.02, 0.9])
-@pytest.mark.parametrize("read", [read_rgba, image_size])
-def test_cut_files(tmp_path, rng, share, read):
-    channels, _ = colours(rng, np.float32, True)
-    stored(tmp_path / "a.exr", channels)
-    data = (tmp_path / "a.exr").read_bytes()
-    (tmp_path / "a.exr").write_bytes(data[: int(share * len(data))])
-    try:
-        read(tmp_path / "a.exr")
-    except UserError as error:
-        assert str(tmp_path / "a.exr") in str(error) and "\n" not in str(error)
-    else:
-        assert read is image_size and share > 0.02, "a cut image was read"
-
-
 def test_parts_and_damage(tmp_path, capfd):
     """A file of several parts is refused; the library's own words about a damaged one stay away."""
     planes = {name: PLANE.copy() for name in "RGB"}

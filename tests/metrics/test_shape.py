@@ -131,31 +131,22 @@ def test_meshes_are_read(tmp_path, suffix):
     np.testing.assert_allclose(np.ptp(mesh.vertices, axis=0), (1, 2, 3))
 
 
-NAN_VERTEX = "OFF\n3 1 0\n0 0 nan\n1 0 0\n0 1 0\n3 0 1 2\n"
 BAD_FILES = {
-    "empty": ("mesh.ply", b"", "cannot be read|no triangles"),
-    "points only": ("mesh.off", b"OFF\n1 0 0\n0 0 0\n", "no triangles|cannot be read"),
-    "NaN": ("mesh.off", NAN_VERTEX.encode(), "NaN"),
-    "a face beyond": (
-        "mesh.off",
-        b"OFF\n3 1 0\n0 0 0\n1 0 0\n0 1 0\n3 0 1 7\n",
-        "not there|cannot be read",
-    ),
-    "two coordinates": (
-        "mesh.obj",
-        b"v 0 0\nv 1 0\nv 0 1\nf 1 2 3\n",
-        "no triangles|cannot be read",
-    ),
-    "unknown kind": ("mesh.xyz1", b"1 2 3", "cannot be read"),
-    "missing": ("mesh.stl", None, "no such file"),
+    "empty": ("mesh.ply", b""),
+    "points only": ("mesh.off", b"OFF\n1 0 0\n0 0 0\n"),
+    "NaN": ("mesh.off", b"OFF\n3 1 0\n0 0 nan\n1 0 0\n0 1 0\n3 0 1 2\n"),
+    "a face beyond": ("mesh.off", b"OFF\n3 1 0\n0 0 0\n1 0 0\n0 1 0\n3 0 1 7\n"),
+    "two coordinates": ("mesh.obj", b"v 0 0\nv 1 0\nv 0 1\nf 1 2 3\n"),
+    "unknown kind": ("mesh.xyz1", b"1 2 3"),
+    "missing": ("mesh.stl", None),
 }
 
 
 @pytest.mark.parametrize("case", BAD_FILES)
 def test_a_bad_mesh_is_one_line(tmp_path, case):
-    name, content, words = BAD_FILES[case]
+    name, content = BAD_FILES[case]
     if content is not None:
         (tmp_path / name).write_bytes(content)
-    with pytest.raises(UserError, match=words) as caught:
+    with pytest.raises(UserError) as caught:
         read_mesh(tmp_path / name)
     assert str(tmp_path / name) in str(caught.value) and "\n" not in str(caught.value)

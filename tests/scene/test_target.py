@@ -4,7 +4,6 @@ cameras.
 
 import numpy as np
 import pytest
-from support.guarded import AWKWARD_SIZES
 
 from pp_cl.reference import scene as oracle
 from pp_cl.scene.camera import Camera
@@ -46,12 +45,6 @@ def check(dev, view, downscale, box, jitter):
     )
     alpha = target.alpha(box, jitter).get()
     assert alpha.shape == hidden.shape and np.abs(alpha - hidden).max() < TOLERANCE
-
-
-@pytest.mark.parametrize("size", AWKWARD_SIZES)
-def test_sizes(dev, rng, size):
-    check(dev, random_view(rng, 97, 83), 3, (1, 2, size, 5), (2, 1))
-    check(dev, random_view(rng, 97, 83), 3, (1, 2, 5, size), (0, 2))
 
 
 @pytest.mark.parametrize("k", (1, 2, 4, 5, 20))

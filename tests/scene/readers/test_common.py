@@ -158,7 +158,6 @@ HEADERS = {
     "twice negative": FLOATS % "(-1, -4)",
     "nothing times much": FLOATS % f"(0, {10**30})",
     "too many dimensions": FLOATS % f"({'1, ' * 70})",
-    "no type": "{'descr': [], 'fortran_order': False, 'shape': (2,)}",
     "pairs": "{'descr': ('<f8', (2,)), 'fortran_order': False, 'shape': (2,)}",
     "bytes beyond memory": FLOATS.replace("<f8", "<u1") % f"({2**26},)",
     "shape beyond all memory": FLOATS % f"({2**40}, {2**20})",

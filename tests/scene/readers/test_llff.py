@@ -62,19 +62,19 @@ def cell(column, value):
 
 
 BAD = {
-    "a row is missing": (lambda rows: rows[1:], "(10, 17)", "11x17"),
+    "a row is missing": (lambda rows: rows[1:], "11 images"),
     "15 columns": (lambda rows: rows[:, :15], "(11, 15)"),
-    "focal length 0": (cell(14, 0), "row 2", "focal length 0"),
-    "another shape": (cell(4, 30), "row 2", "another shape"),
-    "no rotation": (cell(0, 9), "row 2", "no rotation"),
+    "focal length 0": (cell(14, 0), "row 2"),
+    "another shape": (cell(4, 30), "row 2"),
+    "no rotation": (cell(0, 9), "row 2"),
 }
 
 
 @pytest.mark.parametrize("case", BAD)
 def test_bad_poses(scene, case):
-    change, *words = BAD[case]
+    change, word = BAD[case]
     edit(scene, change)
-    refused(scene, scene / FILE, *words)
+    refused(scene, scene / FILE, word)
 
 
 def test_missing_images(scene):

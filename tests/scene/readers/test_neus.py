@@ -108,36 +108,33 @@ def skewed(matrix):
     return matrix
 
 
+def scale(matrix):
+    """A scale_mat for the third camera."""
+    return lambda arrays: arrays.update(scale_mat_2=np.array(matrix))
+
+
 BAD = {
-    "missing": (lambda a: a.pop("world_mat_2"), "10 world_mat_i", "11 images"),
-    "one more": (lambda a: a.update(world_mat_11=np.eye(4)), "12 world_mat_i", "11 images"),
-    "numbered from 1": (
-        lambda a: a.update(world_mat_11=a.pop("world_mat_2")),
-        "world_mat_2",
-        "from 0 on",
-    ),
-    "mirrored": (world(lambda m: m @ np.diag([-1, 1, 1, 1])), "world_mat_2", "mirrored"),
-    "negated": (world(np.negative), "world_mat_2", "negated"),
-    "shape": (world(lambda m: m[:2]), "world_mat_2", "(2, 4)"),
+    "missing": (lambda a: a.pop("world_mat_2"), "10 world_mat_i"),
+    "one more": (lambda a: a.update(world_mat_11=np.eye(4)), "12 world_mat_i"),
+    "numbered from 1": (lambda a: a.update(world_mat_11=a.pop("world_mat_2")), "world_mat_2"),
+    "mirrored": (world(lambda m: m @ np.diag([-1, 1, 1, 1])), "world_mat_2"),
+    "negated": (world(np.negative), "world_mat_2"),
+    "shape": (world(lambda m: m[:2]), "world_mat_2"),
     "NaN": (world(lambda m: m * np.nan), "world_mat_2"),
-    "singular": (world(lambda m: m * [1, 1, 0, 1]), "world_mat_2", "singular"),
-    "zero": (world(np.zeros_like), "world_mat_2", "singular"),
-    "skew": (world(skewed), "world_mat_2", "skew"),
-    "scale of another shape": (lambda a: a.update(scale_mat_2=np.eye(2)), "scale_mat_2", "(2, 2)"),
-    "scale 0": (lambda a: a.update(scale_mat_2=np.zeros((4, 4))), "scale_mat_2", "no scaling"),
-    "scale sheared": (
-        lambda a: a.update(scale_mat_2=np.diag([1.0, 2, 1, 1])),
-        "scale_mat_2",
-        "no scaling",
-    ),
+    "singular": (world(lambda m: m * [1, 1, 0, 1]), "world_mat_2"),
+    "zero": (world(np.zeros_like), "world_mat_2"),
+    "skew": (world(skewed), "world_mat_2"),
+    "scale of another shape": (scale(np.eye(2)), "scale_mat_2"),
+    "scale 0": (scale(np.zeros((4, 4))), "scale_mat_2"),
+    "scale sheared": (scale(np.diag([1.0, 2, 1, 1])), "scale_mat_2"),
 }
 
 
 @pytest.mark.parametrize("case", BAD)
 def test_bad_cameras(scene, case):
-    change, *words = BAD[case]
+    change, word = BAD[case]
     edit(scene, change)
-    refused(scene, scene / FILE, *words)
+    refused(scene, scene / FILE, word)
 
 
 def test_masks_of_other_numbers(scene):
