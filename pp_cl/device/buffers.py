@@ -1,5 +1,5 @@
-"""Device arrays declared as a table, {name: (shape, dtype)}: what a stage allocates and what the
-memory plan counts; and arrays that are packed into one buffer.
+"""The buffers of a stage, declared as a table {name: (shape, dtype)} from which they are allocated
+and the memory plan is summed; and arrays packed into one buffer for one transfer.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ def table_bytes(table: Table) -> int:
 
 
 def grown(capacity: int, needed: int) -> int:
-    """The capacity, or a quarter more than `needed` where that is more than it holds."""
+    """The capacity if it holds `needed`, else a quarter more than `needed`."""
     return capacity if needed <= capacity else needed + needed // 4
 
 

@@ -1,5 +1,5 @@
-"""Kernels launched by argument name, with shapes checked against the comments of their signatures;
-and how many values a work-item takes, on CPUs and on GPUs.
+"""Launches kernels by argument name, checking shapes against the comments in their signatures; and
+says how many values a work-item takes on CPUs and on GPUs.
 """
 
 import math

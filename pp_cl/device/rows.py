@@ -1,4 +1,4 @@
-"""Rows of device arrays: gathered, kept at an array's front, and read by the host piece by piece.
+"""Rows of device arrays: gathered by index, compacted after pruning, and downloaded in pieces.
 
 None of it takes a second array of a model's size, which may not fit into memory.
 """
@@ -27,7 +27,7 @@ def compact_table(n: int, row_bytes: int) -> Table:
 
 
 def compact_rows(dev: Device, array: Array, keep: Array) -> Array:
-    """The rows `keep` of `array`, which is overwritten.
+    """The rows `keep` of `array`; the content of `array` is lost.
 
     Rows that fit SCRATCH_BYTES become an array of their own. Others move to the front of the same
     buffer, piece by piece: ascending indices never lie before their new place, so a piece

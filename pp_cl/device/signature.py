@@ -1,7 +1,7 @@
 """The signatures of kernels, parsed from their source: names, types, and the shapes of buffers.
 
-So they are known on drivers that give no argument info as well; the tests compare them with the
-driver's own (-cl-kernel-arg-info).
+Parsing works on drivers that give no argument info, too; the tests compare it with the driver's own
+(-cl-kernel-arg-info).
 """
 
 import functools

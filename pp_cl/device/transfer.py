@@ -1,4 +1,4 @@
-"""Transfers that do not wait for the device: the host goes on, and asks for what it needs later."""
+"""Asynchronous downloads: the host goes on, and waits only when it asks for the values."""
 
 from __future__ import annotations
 
@@ -15,16 +15,16 @@ T = TypeVar("T")
 
 
 class Reading(Generic[T]):
-    """Something that the host knows once numbers have come from the device.
+    """A value that the host gets from a download under way.
 
-    values: on their way until the event. convert: what they mean.
+    values: the target of the download, filled at the event. convert: makes the value of them.
     """
 
     def __init__(self, event: cl.Event, values: np.ndarray, convert: Callable[[np.ndarray], T]):
         self._event, self._values, self._convert = event, values, convert
 
     def get(self) -> T:
-        """What the numbers mean; waits until they are there."""
+        """The value; waits for the download."""
         if self._event is not None:
             self._event.wait()
             self._values = self._convert(self._values)

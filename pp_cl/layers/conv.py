@@ -1,5 +1,5 @@
-"""What the three ways to compute a convolution share: how weights are laid out, how work is cut,
-and checks.
+"""What the three convolution variants share: the layout of weights, the sizes of work-items
+(Blocking) and checks of shapes.
 
 conv_direct.py, conv_winograd.py and conv_local.py have the same five functions: scratch_floats,
 lay_out, forward, backward_input and backward_weights, which conv_direct.py describes. All are

@@ -1,5 +1,5 @@
-"""The features of each pixel, blended of its hits by their weights, and the gradients of that,
-gathered by point.
+"""Blending: the features of each pixel as the weighted sum over its hits; and the backward pass,
+which sums the gradients of each point over its pixels without atomics.
 """
 
 from __future__ import annotations
@@ -60,8 +60,8 @@ def blend_backward(
     mean: bool = False,
 ) -> tuple[Array, Array]:
     """(grad_point_features (N, 16), grad_opacity (N,)) float32, valid until the next call; points
-    that are not shaded get zeros. b.pair_gain or b.pixel_rest then hold what the gains of the pairs
-    are, or follow from (cl/raster/blend.cl).
+    that are not shaded get zeros. b.pair_gain (alpha) or b.pixel_rest (softmax) are left for
+    bench/spheres.py: the gains, and what they follow from (cl/raster/blend.cl).
 
     point_features, features: of blend_forward(). grad_features: dL/dfeatures (H, W, 16).
     grad_alpha: (HW,), dL/d(1 - transmittance); None: 0. spread_weight: adds this times sum_ij b_i

@@ -21,8 +21,8 @@ def shade_forward(
 ) -> None:
     """Write the rows `shaded` of point_features (N, 16) float32.
 
-    The direction of a point is normalize(point - eye) in world axes. shaded: (S,) uint32. sh: of
-    PointCloud.
+    The direction of a point is normalize(point - eye) in world axes. shaded: (S,) uint32, the
+    visible points. sh: of PointCloud.
     """
     sh_0, sh_1, sh_2a, sh_2b = four_blocks(sh)
     dev.program("raster/shade", LANES=lanes(dev), DEGREE=stored_degree(sh)).launch(

@@ -1,5 +1,5 @@
-"""The training loss: smooth L1 and SSIM of an image with their gradient, and the sum with all other
-terms.
+"""The training loss: smooth L1 and SSIM of the rendered crop with their gradient, and the sum with
+the other terms, which all stay on the device until they are read.
 """
 
 import math

@@ -1,7 +1,8 @@
-"""The mask term of the loss: the rendered alpha should be the photograph's.
+"""The mask term of the loss: the squared difference of the rendered alpha and the photograph's
+mask.
 
-Without it points spread half a spacing beyond the outline, and the network hides them; what looks
-like the white that it paints over stays transparent.
+Without it the points reach half a spacing beyond the outline, where the network paints them white,
+and white parts of the object stay transparent.
 """
 
 import numpy as np

@@ -1,5 +1,5 @@
-"""Whether a training fits the memory of device and host: the buffer tables of its stages, summed
-before anything is allocated, against what there is.
+"""The memory plan: sums the buffer tables of all stages of a training before anything is allocated,
+and compares the sum with the memory of device and host.
 """
 
 import math

@@ -1,4 +1,4 @@
-"""Which points to drop because they contribute nothing."""
+"""Pruning: which points to keep, by their highest blend weight and their opacity."""
 
 import numpy as np
 from pyopencl.array import Array
@@ -10,12 +10,13 @@ from pp_cl.training.state import PointState
 
 
 def points_to_keep(dev: Device, state: PointState, opacity: Array, settings: TrainConfig) -> Array:
-    """(M,) uint32, ascending: the points that stay in the course of training. One that was seen in
-    train.prune_looks steps must have weighed train.prune_weight in one of them, and have
-    train.prune_opacity; its counts start anew. Others stay.
+    """(M,) uint32, ascending: the points that are kept during training. A point is judged once
+    train.prune_looks steps had it in their image: it is kept if its blend weight reached
+    train.prune_weight in one of them and its opacity is at least train.prune_opacity, and its
+    counts start anew. Points seen less often are kept.
 
-    A mean over the steps would drop what few views see, such as the inside of a gap. Raises
-    Diverged for weights and opacities that are not finite: nothing would tell of them later.
+    The maximum decides, as a mean would drop what few views see, such as the inside of a gap.
+    Raises Diverged for weights and opacities that are not finite, which nothing later would find.
     """
     weight, seen, opacity = map(dev.download, (state.max_weight, state.times_seen, opacity))
     broken = int((~np.isfinite(weight) | ~np.isfinite(opacity)).sum())
@@ -42,7 +43,7 @@ def final_points_to_keep(
 
 
 def _listed(dev, keep, weight):
-    """Indices of the points to keep; the heaviest (the first of several) where none would be."""
+    """Indices of the points to keep; if there are none, that of the highest weight."""
     indices = np.flatnonzero(keep)
     if indices.size == 0:
         indices = [np.argmax(np.nan_to_num(weight, nan=-np.inf))]

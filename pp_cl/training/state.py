@@ -1,5 +1,5 @@
-"""What training keeps for each point beside what is learned: moments, averages, and how much the
-point has weighed.
+"""The training state of each point: optimiser moments, EMA, and the highest blend weight and view
+count that pruning reads.
 """
 
 from __future__ import annotations
@@ -14,9 +14,9 @@ from pp_cl.raster.points import PointCloud, ShBlock
 
 
 class PointState:
-    """Rows as in the cloud; all but the averages start as zeros.
+    """Arrays with one row per point of the cloud, in its order; they start as zeros.
 
-    averages: {name of PointCloud.learned(): EMA}, empty before Optimiser.update_ema().
+    averages: {name as in PointCloud.learned(): EMA}, empty until Optimiser.update_ema().
     """
 
     def __init__(self, dev: Device, cloud: PointCloud):
@@ -44,14 +44,14 @@ class PointState:
 
     @property
     def max_weight(self) -> Array:
-        """(N) float32: the highest blend weight in an image since the point was last judged, summed
-        over the pixels.
+        """(N) float32: the sum over an image's pixels of the point's blend weights, the highest of
+        all images since pruning last judged the point.
         """
         return self._arrays["max_weight"]
 
     @property
     def times_seen(self) -> Array:
-        """(N) float32: steps since then that had the point in their image, hidden or not."""
+        """(N) float32: number of those images that had a hit of the point, occluded or not."""
         return self._arrays["times_seen"]
 
     @property
@@ -61,7 +61,7 @@ class PointState:
 
     @property
     def last_step(self) -> Array:
-        """(N,) uint32: the step of each point's last gradient of its features, 0: none."""
+        """(N,) uint32: the last step in which the point's features had a gradient; 0: none yet."""
         return self._arrays["last_step"]
 
     @property
@@ -76,8 +76,8 @@ class PointState:
                 arrays[name] = compact_rows(dev, arrays[name], keep)
 
     def refine(self, dev: Device, parents: Array) -> None:
-        """Become the state of points that each take over that of point parents[i], (M,) uint32, but
-        for weights and looks, which start anew.
+        """Become the state of a refined cloud: point i takes over the state of parents[i], (M,)
+        uint32, but max_weight and times_seen start anew.
         """
         for arrays in (self._arrays, self.averages):
             for name in arrays:
@@ -92,8 +92,8 @@ class PointState:
 
 
 def split_opacity(dev: Device, opacity: Array) -> None:
-    """Replace every opacity o in [0, 1], (N,) float32, by 1 - sqrt(1 - o), in place: of the points
-    of a refined grid two lie behind one another in place of one, and let as much light through.
+    """Replace every opacity o in [0, 1], (N,) float32, by 1 - sqrt(1 - o), in place. On a refined
+    grid a ray crosses two points where it crossed one, and their transmittances multiply to 1 - o.
     """
     n = len(opacity)
     dev.program("training/refine").launch("split_opacity", n, n=n, opacity=opacity)
