@@ -49,8 +49,8 @@ OnStep = Callable[[int, dict[str, Any] | None], None]
 class HullFacts(NamedTuple):
     """What a new training says of its visual hull.
 
-    capped: the hull has fewer points than asked for, as the grid may not be finer. seconds: it
-    took. picture: of the masks that disagree with the others, None if all agree.
+    capped: it has fewer points than asked for, as the grid may not be finer. seconds: time that
+    carving took. picture: of the masks that disagree with the others, None if all agree.
     """
 
     capped: bool

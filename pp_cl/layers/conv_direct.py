@@ -1,4 +1,4 @@
-"""Direct convolutions: any channels, 1x1 and 3x3."""
+"""Direct convolutions, 1x1 and 3x3 with any numbers of channels; the variant that always runs."""
 
 import math
 
@@ -40,7 +40,7 @@ def scratch_floats(
 
 
 def lay_out(_dev: Device, _blocking: Blocking, _weight: Array) -> None:
-    """None: the kernels read the weights as they are."""
+    """Nothing to transform in advance: the kernels read the weights as they are."""
 
 
 def forward(

@@ -1,5 +1,5 @@
-"""From the last layer's output to the image, with or without a residual connection that takes the
-first three features past the network.
+"""The network's last step: scales the output of its last layer to the image, and with a residual
+connection adds the first three blended features.
 """
 
 from pyopencl.array import Array
@@ -27,7 +27,7 @@ def output_forward(dev: Device, image: Array, features: Array | None) -> None:
 
 
 def output_backward(dev: Device, grad_image: Array, grad_out: Array) -> None:
-    """grad_out (H, W, 3) of the network's output, of grad_image (H, W, 3)."""
+    """Write grad_out (H, W, 3), dL/d(last layer's output), from grad_image (H, W, 3)."""
     _checked(grad_out, grad_image)
     n = grad_image.size
     dev.program("layers/output").launch(
@@ -36,7 +36,9 @@ def output_backward(dev: Device, grad_image: Array, grad_out: Array) -> None:
 
 
 def residual_backward(dev: Device, grad_image: Array, grad_features: Array) -> None:
-    """Adds what passes around the network to grad_features (H, W, C), of grad_image (H, W, 3)."""
+    """Add the gradient through the residual connection, of grad_image (H, W, 3), to grad_features
+    (H, W, C).
+    """
     height, width, channels = _checked(grad_features, grad_image)
     dev.program("layers/output").launch(
         "residual_backward",
