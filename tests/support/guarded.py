@@ -89,13 +89,13 @@ class TracedDevice(GuardedDevice):
         super().__init__(device)
         self._log, self._reported = log, 0
         program = cl.Program(self.context, self.SOURCE).build()
-        self._fill, self._copy = program.fill, program.copy
+        self._fill_kernel, self._copy_kernel = program.fill, program.copy
 
     def fill(self, array, value):
         """As Device.fill."""
         if array.size:
             value = self.upload(np.full(1, value, array.dtype))
-            self._fill(
+            self._fill_kernel(
                 self.queue, (array.nbytes,), None, array.data, value.data, np.uint32(value.nbytes)
             )
 
@@ -103,7 +103,7 @@ class TracedDevice(GuardedDevice):
         """As Device.copy_rows."""
         row_bytes = source[:1].nbytes
         if count:
-            self._copy(
+            self._copy_kernel(
                 self.queue,
                 (count * row_bytes,),
                 None,

@@ -97,36 +97,38 @@ def zero_weights():
 @pytest.mark.parametrize(
     "changes", [*WAYS[:5], *(pytest.param(way, marks=pytest.mark.slow) for way in WAYS[5:])]
 )
-def test_the_plan_is_what_a_training_takes(dev, tmp_path, monkeypatch, changes):
+def test_the_plan_is_what_a_training_takes(plain, tmp_path, monkeypatch, changes):
     monkeypatch.setattr("pp_cl.metrics.lpips.load_weights", zero_weights)
-    trainer, plan, peak = trained(dev, tmp_path / "ball", changes)
+    trainer, plan, peak = trained(plain, tmp_path / "ball", changes)
     points = trainer.model.cloud.count
     assert plan.peak.points == points and 0.8 * POINTS < points <= POINTS
     assert 0.96 * peak < plan.peak.device < 1.04 * peak
-    held = trainer.model.cloud.arrays(dev) | trainer.optimiser.arrays()
+    held = trainer.model.cloud.arrays(plain) | trainer.optimiser.arrays()
     kept = ("points", "training state of the points", "averages of the points", "optimiser")
     planned = sum(table_bytes(plan.phases[-1].tables[name]) for name in kept)
     assert sum(array.nbytes for array in held.values()) == planned
 
 
-def test_pruning_stays_within_the_plan(dev, tmp_path, monkeypatch):
+def test_pruning_stays_within_the_plan(plain, tmp_path, monkeypatch):
     monkeypatch.setattr("pp_cl.device.rows.SCRATCH_BYTES", 10**6)
-    others = dev.bytes  # what fixtures of other tests hold
-    trainer, plan, _ = trained(dev, tmp_path / "ball", {"raster.radius": "0.75"})
+    others = plain.bytes  # what fixtures of other tests hold
+    trainer, plan, _ = trained(plain, tmp_path / "ball", {"raster.radius": "0.75"})
     pruning = table_bytes(compact_table(POINTS, 192))
     assert pruning == POINTS * 4 + 10**6
-    before, dev.peak_bytes = dev.bytes, dev.bytes
+    before, plain.peak_bytes = plain.bytes, plain.bytes
     trainer.state.max_weight.set(np.arange(POINTS, dtype=np.float32))
     trainer.state.times_seen.set(np.full(POINTS, 100, np.float32))
     trainer.prune()
     assert trainer.model.cloud.count == POINTS - 1
-    assert dev.peak_bytes <= before + 10**6 + 2 * 4 * POINTS  # the weights and the list of the kept
-    assert dev.peak_bytes - others <= plan.peak.device + pruning
+    assert (
+        plain.peak_bytes <= before + 10**6 + 2 * 4 * POINTS
+    )  # the weights and the list of the kept
+    assert plain.peak_bytes - others <= plan.peak.device + pruning
 
 
-def test_the_papers_scale_fits_six_gibibytes(dev, tmp_path):
+def test_the_papers_scale_fits_six_gibibytes(plain, tmp_path):
     """Of a training scaled down: its points and hits take their share."""
-    _, _, peak = trained(dev, tmp_path, {"train.crop": 24}, base="paper")
+    _, _, peak = trained(plain, tmp_path, {"train.crop": 24}, base="paper")
     assert peak < 6 * 2**30 * POINTS / PAPER_POINTS
 
 
