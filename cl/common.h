@@ -1,4 +1,4 @@
-// Shared by every kernel file. Layouts and names: docs/conventions.md.
+// Macros that every kernel file needs. Layouts and names: docs/conventions.md.
 #ifndef PP_COMMON_H
 #define PP_COMMON_H
 

@@ -1,4 +1,4 @@
-// Work-items that work together through local memory: GROUP neighbours, a power of two on GPUs; 1
+// Sums and scans by work-items that share local memory: GROUP neighbours, a power of two on GPUs; 1
 // on CPUs, where nothing is shared (pp_cl/device/launch.py). A work-group holds one or more of them
 // as a whole, and all its work-items call these functions together.
 #ifndef PP_GROUP_H

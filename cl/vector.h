@@ -1,5 +1,4 @@
-// Sixteen neighbouring values as one vector, where arrays or channels need not come in multiples of
-// 16.
+// Loads and stores of 16 neighbouring values as one vector, of which the last ones may not exist.
 #ifndef PP_VECTOR_H
 #define PP_VECTOR_H
 

@@ -1,4 +1,4 @@
-"""`python -m pp_cl` is `pp-cl`."""
+"""Lets `python -m pp_cl` run the command line `pp-cl`."""
 
 import sys
 

@@ -1,4 +1,6 @@
-"""The settings of a run, from presets, texts and its config.json; errors name the key."""
+"""Reads the settings of a run from presets, command-line texts and config.json, and checks them;
+errors name the setting.
+"""
 
 import dataclasses
 import json

@@ -1,4 +1,4 @@
-"""The exceptions whose one line a user sees, and what keeps foreign text on that line."""
+"""The exceptions that a user sees as one line, and the quoting of text from files in that line."""
 
 import difflib
 from collections.abc import Iterable

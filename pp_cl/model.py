@@ -1,5 +1,5 @@
-"""All that is learned: the points on the grid, and the U-Net that turns their features into
-colours.
+"""The model: points on a grid with opacities and SH coefficients, and the U-Net that turns blended
+features into colours.
 """
 
 from __future__ import annotations
@@ -68,8 +68,9 @@ class Model:
         return camera.packed(depth_range or self.depth_range, self.grid.centre)
 
     def refine(self) -> Array:
-        """Replace every point by the eight around it on the grid of half the spacing, which take
-        over what it has learned. Returns the point that each one comes from, (8 N,) uint32.
+        """Densify: replace every point by the eight around it on the grid of half the spacing,
+        which take over its opacity and SH coefficients. Returns the point that each one comes from,
+        (8 N,) uint32.
 
         Raises ValueError as Grid.children does.
         """

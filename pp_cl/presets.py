@@ -1,4 +1,4 @@
-"""The presets, and the short names of settings: data only."""
+"""The presets tiny, small, full and paper, and the short names of settings: data only."""
 
 # What differs from the defaults in settings.py, which are the tiny preset: minutes on a CPU.
 PRESETS = {

@@ -1,5 +1,5 @@
-"""From a model and a camera to an image, and back to gradients: the one place that writes the order
-of the stages.
+"""The renderer: from a model and a camera to an image, and back to gradients. This is the
+one place that writes the order of the stages.
 
 project -> pairs -> blend weights -> shade the visible points -> blend their features -> U-Net
 """
@@ -44,11 +44,12 @@ class RenderResult:
     """What the stages of a view have made, up to the one that was asked for; arrays are valid until
     the next view.
 
-    camera: of the view. offset: (left, top) of the view in its padded image of H x W pixels, size.
-    points: the N points in the padded camera. tiles: those of the padded image that have hits.
-    point_features: (N, 16) float32, of which the rows weights.shaded are set. features: (H, W, 16)
-    float32, blended of them. image: (H, W, 3) float32, unclamped. computed_fraction: of the
-    network's multiplications; the rest saw only background.
+    camera: of the view. size: (H, W) of the image that is rendered, padded to multiples of 4.
+    offset: (left, top) of the view in it. points: the N points as the padded camera sees them.
+    tiles: (rows, columns) bool, the 4x4 tiles of the padded image that have hits. point_features:
+    (N, 16) float32, of which only the rows weights.shaded are set. features: (H, W, 16) float32,
+    blended from them. image: (H, W, 3) float32, unclamped. computed_fraction: share of the
+    network's multiplications that was done; the others would have seen only background.
     """
 
     camera: Camera
@@ -81,15 +82,16 @@ class Renderer:
         self.model = model
         self.settings = settings
         self._buffers = Buffers(dev)
-        self._room = 1  # for the pairs of a view; grows
-        self._radius = None  # in b.point_radius
+        self._room = 1  # capacity of the arrays of pairs; grows with the views
+        self._radius = None  # what b.point_radius holds
 
     @staticmethod
     def tables(
         settings: RasterConfig, n: int, size: tuple[int, int], pairs: int
     ) -> dict[str, Table]:
-        """{what for: the renderer's buffers} for n points, a padded image of size (height, width)
-        and an estimated number of pairs: the true one is known once a view has been projected.
+        """The renderer's buffers, grouped by their line in the memory plan, for n points, a padded
+        image of size (height, width) and an estimated number of pairs; the true number is known
+        once a view has been projected.
         """
         pixels, has_roles = size[0] * size[1], settings.early_stop > 0 or settings.max_tracked > 0
         return {
@@ -116,10 +118,11 @@ class Renderer:
         """Render a camera, which is padded to multiples of 4 pixels.
 
         until: the last stage wanted: blend weights, blended features or the network's image.
-        dropout: share of the points left out, at random by `seed`. early_stop: instead of the
-        settings'. depth_range: instead of the model's, for cameras that see beyond that; a softmax
-        of depth needs the model's. training: keep what backward() needs. gradient_tiles: of
-        UNet.plan_tiles(), asked once the device was waited for.
+        gamma: depth sharpness of the softmax, unused by alpha compositing. dropout: share of the
+        points left out, at random by `seed`. early_stop: instead of the settings'. depth_range:
+        instead of the model's, for cameras that see beyond it; the softmax needs the model's.
+        training: keep what backward() needs. gradient_tiles: returns that argument of
+        UNet.plan_tiles(); called after the wait for the device.
         """
         dev, b, cloud, net = self.dev, self._buffers, self.model.cloud, self.model.net
         padded, *offset = camera.padded(NETWORK_MULTIPLE)
@@ -159,7 +162,9 @@ class Renderer:
         return result
 
     def _pairs_and_weights(self, points, size, gamma, early_stop):
-        """(Pairs, BlendWeights, tiles that have hits): anew if there was no room for all pairs."""
+        """(Pairs, BlendWeights, tiles that have hits). Both stages are enqueued before the number
+        of pairs is known, and run again with more room if it was too small.
+        """
         settings = self.settings
         while True:
             with self.dev.stage("pairs"):
@@ -184,7 +189,7 @@ class Renderer:
             del pairs, weights  # else their arrays would stay beside the larger ones
 
     def _set_radius(self):
-        """The radius in b.point_radius, which changes when the grid is refined."""
+        """Send the points' radius to b.point_radius if it changed: refining halves the spacing."""
         model = self.model
         radius = point_radius(self.settings, model.grid.edge, model.depth_range)
         if radius != self._radius:
@@ -198,13 +203,14 @@ class Renderer:
         grad_alpha: Array | None = None,
         spread_weight: float = 0.0,
     ) -> tuple[Array, Array]:
-        """(grad_point_features (N, 16), grad_opacity (N,)) from dL/dimage of result.image and, of a
-        blend with a transmittance, dL/dalpha (H * W,) and the weight in the loss of the spread of
-        every pixel's hits (cl/raster/blend.cl).
+        """(grad_point_features (N, 16), grad_opacity (N,)) from dL/dimage of result.image; with
+        alpha compositing also from dL/dalpha (H * W,), and of the spread of each pixel's hits with
+        this weight in the loss (cl/raster/blend.cl).
 
-        result: the last one of forward(training=True). The gradients of the network's parameters
-        are in model.net.gradients; those of the SH coefficients are rank one in
-        grad_point_features, and the optimiser never forms them.
+        result: of the last forward(training=True). The gradients of the network's parameters are
+        left in model.net.gradients. Those of the SH coefficients are grad_point_features times the
+        basis functions in the view's direction; the optimiser multiplies them as it moves each
+        coefficient, and never stores them.
         """
         with self.dev.stage("network backward"):
             grad_features = self.model.net.backward(grad_image)
@@ -217,7 +223,9 @@ class Renderer:
         grad_alpha: Array | None = None,
         spread_weight: float = 0.0,
     ) -> tuple[Array, Array]:
-        """The same from dL/dfeatures (H, W, 16) of result.features."""
+        """What backward() does, from dL/dfeatures (H, W, 16) of result.features, without the
+        network.
+        """
         with self.dev.stage("backward"):
             return blend_backward(
                 self.dev,
@@ -253,7 +261,7 @@ class Renderer:
 
 
 def _view_table(n, size):
-    """What each view overwrites, beside the buffers of the stages."""
+    """Buffers that each view overwrites and that belong to no single stage."""
     return {
         "camera_buffer": ((20,), np.float32),
         "point_radius": ((1,), np.float32),

@@ -1,4 +1,4 @@
-"""A trained model in the folder of a run: load it, render it from anywhere, evaluate it."""
+"""A trained model in the folder of a run: load it, render any camera, evaluate it on views."""
 
 import math
 import os

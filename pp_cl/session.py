@@ -1,4 +1,6 @@
-"""A training that starts or goes on in the folder of a run."""
+"""Runs a training in the folder of a run: the initial hull or a checkpoint, then Trainer's steps
+with log, previews and checkpoints.
+"""
 
 import math
 import time
@@ -45,8 +47,10 @@ OnStep = Callable[[int, dict[str, Any] | None], None]
 
 
 class HullFacts(NamedTuple):
-    """How the initial grid was found. capped: the largest grid allowed has fewer points than asked
-    for. picture: of masks that disagree with the others, None where all agree.
+    """What a new training says of its visual hull.
+
+    capped: it has fewer points than asked for, as the grid may not be finer. seconds: time that
+    carving took. picture: of the masks that disagree with the others, None if all agree.
     """
 
     capped: bool
@@ -58,9 +62,10 @@ class HullFacts(NamedTuple):
 class Training:
     """A training that is ready to begin or to go on.
 
-    info: what its checkpoints' headers hold beside the model's. room: the memory there is, and the
-    plan of what is taken. hull: None if it goes on from a checkpoint. origin: of the choice of
-    convolutions, a line of text. measured: the views that train.eval_every measures.
+    info: what a checkpoint's header holds beside the model's. room: the available memory and the
+    plan of what the training takes. hull: None if it resumes from a checkpoint. origin: a line of
+    text that says where the choice of convolutions comes from. measured: the views on which
+    train.eval_every measures PSNR.
     """
 
     folder: RunFolder
@@ -84,11 +89,11 @@ class Training:
         those before an interruption included.
 
         on_step(step, row) is called after each step, with its row of the log where it has one.
-        is_stopped() is asked after each step: where it is true, a checkpoint is written and the
-        training ends there, to be gone on with. Raises UserError, before anything is written, where
-        another process trains into the folder; later on where a refinement or the averages take
-        more memory than there is, with a checkpoint, and where numbers are no longer finite: then
-        the last checkpoint stays.
+        is_stopped() is asked after each step: if it is true, a checkpoint is written and the
+        training ends, to be resumed later. Raises UserError before anything is written if another
+        process trains into the folder; later, after writing a checkpoint, if a refinement or the
+        EMA needs more memory than there is; and if numbers are no longer finite, keeping the last
+        checkpoint.
         """
         with self.folder.owned():
             self._check_unchanged()
@@ -140,18 +145,19 @@ class Training:
                 if is_stopped() and trainer.step < settings.iterations:
                     self._save(finished=False)
                     return seconds
-            check_finite(trainer.arrays())  # before averages take their place
+            check_finite(trainer.arrays())  # before the EMA replaces the parameters
             start = time.perf_counter()
             trainer.finish()
             seconds += time.perf_counter() - start
-            # in front of the checkpoint: a row that has none is made again, a finished run is not
+            # Before the checkpoint: a log row without its checkpoint is made again by resuming,
+            # but a finished run is not resumed.
             log.write(self._row(seconds) | {"points": trainer.model.cloud.count, "finished": True})
             self._save(finished=True)
         return seconds
 
     def _after_step(self, log, terms, seconds):
-        """Row of the log, preview and checkpoint, where they are due; returns the row or None. The
-        checkpoint is the last: what it stands for is not made again.
+        """Write the log's row, the preview and the checkpoint that are due; return the row or None.
+        The checkpoint comes last: resuming from it does not make the others again.
         """
         trainer, settings = self.trainer, self.config.train
         step, last, row = trainer.step, trainer.step == settings.iterations, None
@@ -183,7 +189,7 @@ class Training:
         return self.config.train.previews and not any(self.folder.previews.glob("*.png"))
 
     def _expect_save(self):
-        """Be due a checkpoint by the clock, which no step depends on."""
+        """Set the time of the next checkpoint; the clock influences nothing else."""
         minutes = self.config.train.checkpoint_minutes
         self._save_by = time.monotonic() + 60 * minutes if minutes else math.inf
 
@@ -214,9 +220,9 @@ def open_training(
 ) -> Training:
     """A training in `folder`, from its checkpoint `stored` where it has one. Nothing is written.
 
-    That of a finished training is gone on with up to config.train.iterations, with new moments and
-    without refinements. Raises UserError for a scene or checkpoint that does not fit, for too
-    little memory, and for a folder that may not be written.
+    A finished training is extended to config.train.iterations, with new moments and without
+    refinements. Raises UserError for a scene or checkpoint that does not fit, for too little
+    memory, and for a folder that may not be written.
     """
     check_writable(folder.path)
     tolerance, begun, goal = config.network.tolerance, 0, config
@@ -259,7 +265,8 @@ def _start(config, views, net, room):
     hull = build_grid(dev, views, points.count, scene_box(config))
     near_far = depth_range(views, hull)
     room.check_points(hull.grid, len(hull.ids), near_far)
-    facts = HullFacts(hull.capped, time.perf_counter() - start, _told_of_masks(dev, views, hull))
+    seconds = time.perf_counter() - start
+    facts = HullFacts(hull.capped, seconds, _picture_of_disagreements(dev, views, hull))
     model = Model.create(
         dev,
         hull.grid,
@@ -272,8 +279,8 @@ def _start(config, views, net, room):
     return Trainer(dev, config, model, views), facts
 
 
-def _told_of_masks(dev, views, hull):
-    """Warn of masks that disagree with the others; their picture, None where all agree."""
+def _picture_of_disagreements(dev, views, hull):
+    """Warn of masks that disagree with the others; return their picture, None if all agree."""
     found = disagreements(views, hull.grid.box)
     if not found:
         return None
@@ -287,13 +294,15 @@ def _told_of_masks(dev, views, hull):
 
 
 def _resume(config, views, net, stored, begun, *, file):
-    """Trainer of a training that goes on. begun: the step of the finished training that it extends,
-    0: of none.
+    """Trainer of a training that resumes. begun: the last step of the finished training that it
+    extends, 0 if it extends none.
     """
     header, arrays = stored
     path = config.scene.path
-    if told := difference(header, views, views):
-        raise UserError(f"{file}: belongs to another scene than {path} ({told}); use another --out")
+    if mismatch := difference(header, views, views):
+        raise UserError(
+            f"{file}: belongs to another scene than {path} ({mismatch}); use another --out"
+        )
     for name, array in arrays.items():
         if array.dtype == np.float16:  # of a compressed run
             arrays[name] = array.astype(np.float32)
@@ -345,11 +354,10 @@ def run_config(
     given settings. Where these do not say scene.downscale, a new one reduces the images to about
     the preset's size.
 
-    scene: a folder, or the word demo. given: (key, value or its text, origin), which a run with a
-    checkpoint must agree with; without one there is nothing that other settings would spoil.
-    extends: a finished run may have train.iterations given anew: with more of them it goes on, with
-    fewer it stays finished. Raises UserError naming the first setting that differs or makes no
-    sense, or what is wrong with the scene's files.
+    scene: a folder, or the word demo. given: (key, value or its text, origin); a run that has a
+    checkpoint must have the same values. extends: whether train.iterations of a finished run may
+    change: with more of them it goes on, with fewer it stays finished. Raises UserError naming the
+    first setting that differs or makes no sense, or what is wrong with the scene's files.
     """
     stored = load_config(folder.config) if folder.config.exists() else None
     if stored and preset_name not in (None, stored.preset):
@@ -408,5 +416,5 @@ def stored_state(folder: RunFolder, config: Config) -> Stored | None:
 
 
 def is_finished(stored: Stored | None, config: Config) -> bool:
-    """Whether a checkpoint is that of the last step."""
+    """Whether there is a checkpoint and it is of the last step."""
     return stored is not None and stored[0]["step"] == config.train.iterations

@@ -1,4 +1,4 @@
-"""The settings themselves: one dataclass a section, one line a setting."""
+"""Every setting with its default, help text and limits: one dataclass for each section."""
 
 from dataclasses import dataclass, field
 from typing import Any

@@ -1,4 +1,6 @@
-"""The training loop: what one step does, in the order of the paper."""
+"""One step of training: draw a crop of a view, render it, loss, backward, optimiser; then
+smoothing, EMA, pruning and refining where they are due. session.py has the loop around it.
+"""
 
 import numpy as np
 
@@ -37,8 +39,8 @@ class Trainer:
     """Optimises a model on views; every random choice is a function of (seed, step), so a run can
     start at any step.
 
-    step: number of steps done; begun: of those, how many were done when the moments began. state:
-    what training keeps for each point.
+    step: number of steps done. begun: the step at which the optimiser's moments started; above 0
+    if a finished training is extended. state: what training keeps for each point.
     """
 
     def __init__(self, dev: Device, config: Config, model: Model, views: list[View]):
@@ -70,7 +72,9 @@ class Trainer:
         return sum(self.step < step for step in self._refine_steps)
 
     def _set_level(self):
-        """The images of this step: halved once for every refinement of the grid to come."""
+        """Set images, crop size and object boxes for the present level of the grid: the images are
+        halved once for every refinement still to come.
+        """
         to_come = self.refinements_to_come
         self._reduced = _halved(self.views, to_come)
         self._crop = crop_side(self.config.crop, to_come)
@@ -79,8 +83,8 @@ class Trainer:
     # ----------------------------------------------------------------------------------------------
 
     def train_step(self) -> Reading[dict[str, float]]:
-        """One step, which the device may still be at; returns the terms of its loss. Raises
-        Diverged if one of the step before is not finite.
+        """Enqueue one step, which the device may not have finished on return; returns the terms of
+        its loss. Raises Diverged if a term of the previous step is not finite.
         """
         t, config = self.step, self.config
         rng = np.random.default_rng((config.seed, t))
@@ -93,7 +97,7 @@ class Trainer:
             self._target.load(view)
             target = self._target.crop(box, jitter)
             target_alpha = self._target.alpha(box, jitter) if view.has_mask else None
-            differs = self._gradient_tiles(target, camera)
+            tiles_of_gradient = self._gradient_tiles(target, camera)
 
         rendered = self.renderer.forward(
             camera,
@@ -101,7 +105,7 @@ class Trainer:
             dropout=config.dropout,
             seed=int(rng.integers(2**32)),
             training=True,
-            gradient_tiles=differs,
+            gradient_tiles=tiles_of_gradient,
         )
         with self.dev.stage("loss"):
             grad_image, grad_alpha, spread_weight = self._losses(rendered, target, target_alpha)
@@ -130,12 +134,13 @@ class Trainer:
         self.step = t + 1
         self.check()
         self._terms = self.loss.read(self.step)
-        self._regularise(rates)
+        self._after_update(rates)
         return self._terms
 
     def _losses(self, rendered, target, target_alpha):
-        """(dL/dimage, dL/dalpha or None, weight of each pixel's spread for depths in world units)
-        of what is rendered; the loss and its terms are in self.loss.
+        """(dL/dimage, dL/dalpha or None, weight of the spread of a pixel's depths in world units).
+
+        The value of the loss and of its terms goes to self.loss, which stays on the device.
         """
         config, loss, steps = self.config, self.loss, self.config.iterations
         image, weights, offset = rendered.image, rendered.weights, rendered.offset
@@ -189,7 +194,9 @@ class Trainer:
             self._terms.get()
 
     def _gradient_tiles(self, target, camera):
-        """UNet.plan_tiles()'s gradient_tiles, to be asked for once the device was waited for."""
+        """A function that returns gradient_tiles of UNet.plan_tiles(); called once the device has
+        been waited for anyway, so that looking at the target costs no wait of its own.
+        """
         padded, *offset = camera.padded(NETWORK_MULTIPLE)
         size = padded.height, padded.width
         if self.perceptual_loss or not self.model.net.is_planned(size):
@@ -199,8 +206,10 @@ class Trainer:
 
     # ----------------------------------------------------------------------------------------------
 
-    def _regularise(self, rates):
-        """Smoothing, averaging, pruning and refining, where they are due after this step."""
+    def _after_update(self, rates):
+        """Smooth the SH coefficients, update the EMA, prune and refine, each if due after this
+        step.
+        """
         config, t = self.config, self.step
         if config.sh_smoothing > 0 and t % config.sh_smoothing_every == 0:
             with self.dev.stage("smoothing"):
@@ -226,7 +235,7 @@ class Trainer:
                 self._smoother.smooth(sh, pull * rates.sh[block.degree])
 
     def prune(self) -> None:
-        """Drop the points that were seen often enough and weigh too little."""
+        """Drop the points that were in enough images and had too low a blend weight or opacity."""
         self._keep(points_to_keep(self.dev, self.state, self.model.cloud.opacity, self.config))
 
     def _keep(self, rows):
@@ -237,7 +246,7 @@ class Trainer:
             self.state.compact(self.dev, rows)
 
     def _refine(self):
-        """Go on to images of twice the size and points of half the spacing."""
+        """Densify: replace each point by eight at half the spacing, and double the images."""
         self._smoother = None
         with self.dev.stage("refining"):
             self.state.refine(self.dev, self.model.refine())
@@ -248,8 +257,8 @@ class Trainer:
         self._set_level()
 
     def finish(self) -> None:
-        """Adopt the averages, and drop the points that hardly weigh anything in any training
-        view.
+        """End the training: take the EMA as parameters, and drop the points whose opacity is too
+        low or whose blend weight is too low in every training view.
         """
         self.optimiser.apply_ema()
         if self.config.final_prune_weight > 0:
@@ -282,9 +291,9 @@ class Trainer:
         return self.model.arrays() | self.optimiser.arrays()
 
     def restore(self, step: int, arrays: dict[str, np.ndarray], begun: int) -> None:
-        """Go on after `step` steps with the arrays of a checkpoint, which are taken out of
-        `arrays`; the model has been loaded already. Those of a finished training hold no more than
-        it: moments, and averages where they are due, begin there.
+        """Resume after `step` steps with the training state of a checkpoint, which is taken out of
+        `arrays`; the model has been loaded already. A finished training stores no such state: its
+        moments start anew, and its EMA if that is due.
         """
         self.step, self.begun = step, begun
         self._set_level()

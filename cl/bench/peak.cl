@@ -1,5 +1,5 @@
-// The most that a device does: multiply-adds, and bytes copied. What the speed of kernels is
-// measured against.
+// Peak rates of a device, against which the speed of kernels is measured: multiply-adds in
+// registers, and bytes copied.
 #include "common.h"
 
 #ifndef CHAINS

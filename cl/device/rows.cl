@@ -1,4 +1,4 @@
-// Compaction of arrays, and arrays of rows of others.
+// Gathering rows of an array by index: to compact it after pruning, or to repeat rows for refining.
 #include "group.h"
 
 // GROUP work-items per row of the result: copy it from its old place.

@@ -1,5 +1,5 @@
-// Exclusive prefix sums of uint32, and the list of the non-zero entries. A sum above the largest
-// uint is the largest uint.
+// Exclusive prefix sums of uint32, and stream compaction: the indices of non-zero flags. A sum
+// above the largest uint is the largest uint.
 #include "group.h"
 
 #ifndef BLOCK

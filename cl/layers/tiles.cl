@@ -1,4 +1,4 @@
-// Tiles of a feature map (tiles.h): those that hold something, and copying one to another.
+// Tiles of a feature map (tiles.h): which ones are not background, and copying one to another.
 #include "lanes.h"
 #include "layers/tiles.h"
 

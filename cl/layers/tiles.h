@@ -1,5 +1,5 @@
-// A feature map cut into tiles of SIDE x SIDE pixels, numbered row by row; which of them a kernel
-// computes (pp_cl/layers/tiles.py).
+// A feature map cut into tiles of SIDE x SIDE pixels, numbered row by row, and the list of those
+// that a kernel computes (pp_cl/layers/tiles.py).
 #ifndef PP_TILES_H
 #define PP_TILES_H
 

@@ -1,4 +1,5 @@
-// The blend weights of front-to-back alpha compositing.
+// The blend weights of front-to-back alpha compositing, with opacity o, closeness d and
+// transmittance T of the hits of a pixel:
 //
 // alpha_i = o_i d_i,  b_i = T_i alpha_i,  T_(i+1) = T_i (1 - alpha_i),  T_1 = 1
 //
@@ -21,9 +22,9 @@
 // One work-item per pixel: reads its hits, nearest first, writes their weights by pair and, with
 // their points, by pixel.
 //
-// By pair: b, and T d, whose product with the gain is dL/do (blend.cl). A pixel drops the hits
-// behind the depth where T falls below early_stop, as they could weigh no more than T in all; one
-// more entry follows, with no point.
+// By pair: b, and s = T d, with which dL/do = s * gain (blend.cl). Early stop: a pixel drops the
+// hits behind the depth where T falls below early_stop, as they could weigh no more than T in all;
+// one more entry, without a point, then ends its list.
 kernel void alpha_weights(
     const uint hw,                             // pixels
     const float early_stop,                    // T behind which hits are dropped; 0: none

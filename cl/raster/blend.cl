@@ -1,19 +1,20 @@
-// Features blended by the weights of alpha.cl or softmax.cl, and gradients by gathering.
+// Features blended by the weights of alpha.cl or softmax.cl, and the backward pass, in which each
+// point gathers the gradients of its pixels: no atomics.
 //
 // F = sum b_i f_i + b_0 BACKGROUND, with G = dL/dF
 // dL/df_i = sum b_i G,  dL/do_i = sum s_i gain_i
 //
-// s_i is the second value of pair_weight. The gain of a hit is G.f_i minus G times what takes its
-// place where it fades.
+// Both blends share this form. s_i is the second value of pair_weight. The gain of a hit is the
+// change of the loss per unit of weight that moves to it from whatever would show in its place:
 //
-// In the softmax that is the blend of all hits: gain_i = G.f_i - G.F, of which the latter is the
-// pixel's rest.
+// Softmax: in its place shows the blend of all hits, so gain_i = G.f_i - G.F; pixel_rest is G.F.
 //
-// In alpha compositing it is B_i, G times the features composited of all that lies behind the hit:
-// gain_i = G.f_i - B_i, with nothing divided by 1 - alpha. A gradient g of the pixel's alpha, 1 -
-// T, is that of a feature which all points have and the background has not: G.f becomes G.f + g.
-// The spread of the pixel, w sum_ij b_i b_j |z_i - z_j| (Mip-NeRF 360, Eq. 15, its distortion),
-// adds its derivative with respect to b_i in the same way.
+// Alpha compositing: in its place shows what lies behind it, composited to R_i, so gain_i = G.f_i -
+// B_i with B_i = G.R_i, and dL/dalpha_i = T_i gain_i. B_i is accumulated back to front, which never
+// divides by 1 - alpha. A gradient g of the pixel's alpha, 1 - T, acts as one more feature that is
+// 1 at all points and 0 at the background: G.f becomes G.f + g. The spread of the pixel, w sum_ij
+// b_i b_j |z_i - z_j| (the distortion loss of Mip-NeRF 360, Eq. 15), adds its derivative with
+// respect to b_i to G.f_i in the same way.
 //
 // vec_type_hint: the vectors are written out; Intel's compiler would merge work-items into wider
 // ones, up to 8 times slower.
@@ -58,7 +59,7 @@ kernel void blend_forward(
     store_part(sum + (1.0f - weights) * BACKGROUND, features, q);
 }
 
-// One work-item per pixel: writes G.F, its rest in the softmax.
+// One work-item per pixel: writes G.F for the gains of the softmax.
 kernel void softmax_rest(
     const uint hw,                        // pixels
     global const float16 *features,       // (H, W, 16) F

@@ -1,4 +1,4 @@
-// Alpha and depth of a view, from the blend weights of its pixels.
+// Alpha, mean depth and median depth of each pixel, from the blend weights of its hits.
 //
 // A hit's depth is where the pixel's ray meets the point: the front of its sphere, or of the ball
 // of its radius where footprints are soft. Points stand for what surrounds them, so the surface

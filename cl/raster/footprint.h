@@ -1,5 +1,5 @@
-// Which pixels a point covers, how centrally, and at what depth: the one place that knows the three
-// kinds of footprint.
+// Footprints: which pixels a point covers, its closeness d there (1 in the centre, 0 at the rim)
+// and its depth. The one place that knows the three kinds.
 #ifndef PP_FOOTPRINT_H
 #define PP_FOOTPRINT_H
 
@@ -40,7 +40,7 @@ typedef struct {
     float per_fx, per_fy;
 } Footprints;
 
-// Writes what follows from the rest.
+// Fills in the fields that follow from the others.
 ALWAYS_INLINE void footprints_prepare(const Camera *cam, Footprints *f) {
     f->columns = f->rows = 0;
     UNROLLED for (uint j = 0; j < LANES; j++) {
@@ -78,8 +78,8 @@ ALWAYS_INLINE ints footprints_hit(
     const floats rho2 = ex * ex + ey * ey + ez * ez;
     ints hit = x <= LANES_FROM(f->box[2]) && y <= LANES_FROM(f->box[3]);
 #if FOOTPRINT != SPHERE
-    // differs from Pulsar: its depth is the front's, up to R nearer, and from a radius of a pixel
-    // on no d is constant.
+    // Differs from Pulsar, whose depth is that of the sphere's front, up to a radius nearer, and
+    // whose d varies within every footprint of at least a pixel.
     const floats reach = fmax(f->radius, f->least);
     hit = hit && rho2 < reach * reach;
     *closeness = FOOTPRINT == DISC ? (floats)(1.0f) : 1.0f - sqrt(rho2) * f->per_reach;

@@ -1,6 +1,6 @@
-// Pairs: every (point, pixel) hit. Those of one point lie together, in the order of the points;
-// each pixel has a list of keys (depth << 32 | pair), sorted by depth, then by pair and so by
-// point.
+// Pairs: every hit of a point in a pixel. pairs_fill writes them point by point and counts them by
+// pixel; pairs_scatter writes a key (depth << 32 | pair) of each into the list of its pixel; the
+// sorts order each list by depth, then by pair and so by point.
 //
 // vec_type_hint: the vectors are written out; Intel's compiler would merge work-items into wider
 // ones, which is slower.
@@ -11,8 +11,8 @@
 #define RUN 64  // keys ranked at once by comparing all with all, 8 a step; longer lists are merged
 #endif
 
-// Pixels of a box that are tested before their hits are written, at most 32. With few, the pairs of
-// 16 points grow by turns, each in memory of its own, which is slow where they are many.
+// Pixels of a box that are tested before their hits are written, at most 32 (bits of a uint). With
+// fewer, writing alternates more often between the pairs of 16 points, which lie far apart.
 #define CELLS (LANES > 1 ? 32 : 1)
 
 // Reads the footprints of the points from `first` on, of which `count` exist; the others have empty

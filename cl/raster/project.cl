@@ -1,4 +1,5 @@
-// Points to camera axes, which of them are culled, and how many pixels each one hits.
+// Projection: points to camera axes, culling, the box of pixels that each may cover, and how many
+// pixels it hits.
 #include "common.h"
 #include "camera.h"
 #include "grid.h"
@@ -9,8 +10,8 @@
 // the eye.
 #define LEAST_COSINE 1e-6f
 
-// First and last pixel that may be hit along one axis, from -2 to size + 1: before they are cut to
-// the image.
+// First and last pixel that may be hit along one axis, before clipping to the image: -2 to size +
+// 1.
 //
 // The tangents from the eye to a circle of radius r at (u, z), u = x or y, have slopes m with (m z
 // - u)^2 = r^2 (1 + m^2); a circle that reaches the eye's plane has no bounds.
@@ -86,7 +87,7 @@ ALWAYS_INLINE Footprints project(
     return f;
 }
 
-// The number of pixels that each point hits.
+// The number of pixels that each point hits, by testing all pixels of its box.
 ALWAYS_INLINE ints count_hits(const Camera *cam, const Footprints *f) {
     ints hits = 0;
     floats closeness, depth;
@@ -96,7 +97,7 @@ ALWAYS_INLINE ints count_hits(const Camera *cam, const Footprints *f) {
     return hits;
 }
 
-// Writes where `count` points are, their boxes and numbers of hits.
+// Writes the camera-space positions of `count` points, their boxes and numbers of hits.
 ALWAYS_INLINE void store_points(
     const Camera *cam,
     const Footprints *f,

@@ -1,4 +1,5 @@
-// View-dependent features: spherical harmonics of the direction from the eye.
+// Shading: the features of the visible points, from their spherical harmonics coefficients in the
+// direction from the eye.
 #include "common.h"
 #include "lanes.h"
 #include "sh.h"

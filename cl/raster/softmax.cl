@@ -1,5 +1,6 @@
 // The blend weights of Eq. (1) of the PlenopticPoints supplemental: each pixel's softmax over its
-// hits, and which of them are dropped.
+// hits, and which of them are dropped. Hit i has opacity o, closeness d, and z, which is 1 at the
+// near sphere and 0 at the far one. Index 0 stands for the background.
 //
 // a_i = o_i z_i/gamma,  b_i = o_i d_i exp(a_i - M)/D,  b_0 = exp(EPS/gamma - M)/D
 //
@@ -55,12 +56,11 @@ ALWAYS_INLINE Hits load_hits(
 // One work-item per pixel: reads its hits, nearest first, writes their weights by pair and, with
 // their points, by pixel.
 //
-// By pair: b, and b (1/o + z/gamma), finite at o = 0, whose product with the gain is dL/do
-// (blend.cl). Only the MAX_TRACKED nearest hits get gradients. A hit is dropped, with weight 0 and
-// with all behind it, once even an opaque, centred hit (o = d = 1) would have less than the share
-// early_stop of the weight; differs from Pulsar: it looks only when its buffer is flushed.
-// By pixel: the hits that are not dropped, by depth. If any were dropped, one more entry follows,
-// with no point.
+// By pair: b, and s = b (1/o + z/gamma), finite at o = 0, with which dL/do = s * gain (blend.cl).
+// Only the MAX_TRACKED nearest hits get gradients. A hit is dropped, with weight 0 and with all
+// behind it, once even an opaque, centred hit (o = d = 1) would have less than the share early_stop
+// of the weight; differs from Pulsar: it looks only when its buffer is flushed. By pixel: the hits
+// that are not dropped, by depth. If any were dropped, one more entry follows, with no point.
 kernel __attribute__((vec_type_hint(floats))) void softmax_weights(
     const uint hw,  // pixels
     const float gamma,

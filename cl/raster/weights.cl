@@ -1,5 +1,5 @@
-// What the weights of either blend say of the points: which ones are visible, and how much each
-// weighs.
+// What follows for the points from the blend weights of their hits: which ones are visible, and
+// each one's highest weight, by which it is pruned.
 #include "common.h"
 #include "raster/pair_role.h"
 
@@ -22,8 +22,8 @@ kernel void find_shaded_points(
         point_is_shaded[(uint)pixel_entry[i]] = 1;
 }
 
-// One work-item per point: reads the weights of its pairs, keeps their sum if it is the highest so
-// far, and counts the view if there is a pair.
+// One work-item per point: sums the weights of its pairs, keeps the sum if it is the highest so
+// far, and counts the view if the point has a pair.
 kernel void record_weights(
     const uint n,                      // points
     global const uint *point_offset,   // (N+1)

@@ -1,6 +1,7 @@
 // The mask term of the loss: weight * mean of (a - m)^2 of the rendered alpha a = 1 - T and the
-// photograph's alpha m, where a < m times `shortfall`: at first the points in front of the hull
-// fill the mask, and would be held there.
+// photograph's alpha m. Where a < m it counts `shortfall` times, which rises from 0 to 1 in the
+// course of a training: at first it would hold the points of the hull that lie in front of the
+// surface.
 #include "group.h"
 
 // GROUP work-items per row of the padded image: write dL/da, 0 outside of the target, and the sum

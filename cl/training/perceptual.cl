@@ -1,5 +1,5 @@
 // The perceptual term of the loss: weight * LPIPS, where LPIPS is the sum over the blocks of VGG16
-// of the mean of their pixels' distances.
+// of the mean of their pixels' distances (metrics/lpips.cl computes these and their gradients).
 #include "group.h"
 #include "lanes.h"
 

@@ -1,7 +1,7 @@
-// Opacities of a refined grid.
+// The opacities after refining the grid, when a ray crosses two points where it crossed one.
 
-// One work-item per point: replaces o by 1 - sqrt(1 - o), of which two in a row hide as much. The
-// form without a difference keeps small opacities exact.
+// One work-item per point: replaces o by 1 - sqrt(1 - o): two of these in a row have the same
+// transmittance 1 - o. Written as o / (1 + sqrt(1 - o)), small opacities stay exact.
 kernel void split_opacity(
     const uint n,           // points
     global float *opacity)  // (N)

@@ -1,5 +1,5 @@
-// The step of the SH coefficients: RMSprop (Tieleman & Hinton 2012), that is Adam without a first
-// moment (beta1 = 0), with Adam's bias correction folded into rate and eps on the host.
+// The optimiser of the SH coefficients: RMSprop (Tieleman & Hinton 2012), that is Adam without a
+// first moment (beta1 = 0), with Adam's bias correction folded into rate and eps on the host.
 //
 // The gradient of coefficient k is Y_k(direction) G, G being that of the point's features, and is
 // never stored. The squares of the harmonics of a degree add up to the same in all directions

@@ -1,4 +1,5 @@
-// Smoothing of the SH coefficients over the grid: f += amount * (mean of the neighbours - f).
+// Smoothing of the SH coefficients over the grid: f += amount * (mean of the up to 6 neighbours -
+// f).
 #include "common.h"
 #include "lanes.h"
 

@@ -1,1 +1,1 @@
-"""Timing of kernels, layers, the network and the rasteriser, with their errors."""
+"""Benchmarks of kernels, layers, network, rasteriser and training, with their errors."""

@@ -1,4 +1,4 @@
-"""The command pp-cl bench."""
+"""`pp-cl bench`: time and error of convolutions, network, rasteriser and training steps."""
 
 import argparse
 from functools import partial

@@ -1,4 +1,4 @@
-"""The command pp-cl compare."""
+"""`pp-cl compare`: PSNR, SSIM and LPIPS of images against the ground truth."""
 
 import argparse
 

@@ -1,4 +1,4 @@
-"""The command pp-cl compress."""
+"""`pp-cl compress`: makes a trained model smaller and faster within a stated loss of quality."""
 
 import argparse
 from pathlib import Path

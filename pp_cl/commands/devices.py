@@ -1,4 +1,4 @@
-"""The command pp-cl devices."""
+"""`pp-cl devices`: lists the OpenCL devices and whether each one works."""
 
 import argparse
 

@@ -1,4 +1,4 @@
-"""The command pp-cl eval."""
+"""`pp-cl eval`: renders the views of a run and measures them."""
 
 import argparse
 from pathlib import Path

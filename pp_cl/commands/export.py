@@ -1,4 +1,4 @@
-"""The command pp-cl export."""
+"""`pp-cl export`: writes a run in a format that other programs open."""
 
 import argparse
 from pathlib import Path

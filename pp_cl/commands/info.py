@@ -1,4 +1,4 @@
-"""The command pp-cl info."""
+"""`pp-cl info`: facts about a run or a scene."""
 
 import argparse
 

@@ -1,4 +1,4 @@
-"""The command pp-cl render."""
+"""`pp-cl render`: renders a run along a path of cameras, as a film or as frames."""
 
 import argparse
 import math

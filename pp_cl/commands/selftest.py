@@ -1,4 +1,4 @@
-"""The command pp-cl selftest."""
+"""`pp-cl selftest`: compares the kernels on a device with float64."""
 
 import argparse
 

@@ -1,4 +1,4 @@
-"""The command pp-cl shape."""
+"""`pp-cl shape`: measures how well the points of a run fill the surface of a mesh."""
 
 import argparse
 

@@ -1,4 +1,4 @@
-"""The command pp-cl sweep."""
+"""`pp-cl sweep`: trains and measures many scenes, settings and seeds, with one table."""
 
 import argparse
 import sys

@@ -1,4 +1,4 @@
-"""The command pp-cl train."""
+"""`pp-cl train`: trains a scene into the folder of a run, or resumes the training there."""
 
 import argparse
 import math
@@ -94,7 +94,7 @@ def run(options: argparse.Namespace) -> None:
 
 
 def _first_line(training):
-    """What the training begins with: a grid, or a checkpoint."""
+    """A line of text: the grid that the training starts from, or the step it resumes at."""
     from pp_cl.scene.hull import CELL_CAP, spacing_pixels
 
     hull, trainer = training.hull, training.trainer
@@ -117,7 +117,7 @@ def _first_line(training):
 
 
 def _left_out_line(train):
-    """That refinements are left out, where some are."""
+    """A line of text if some refinements of train.refine_at are left out, else an empty one."""
     from pp_cl.training.schedule import refine_steps
 
     wanted, made = sum(share < 1 for share in train.refine_at), len(refine_steps(train))
@@ -130,7 +130,7 @@ def _left_out_line(train):
 
 
 def _images_line(training, chosen):
-    """The size of the images. chosen: whether the preset chose it."""
+    """A line of text: the size of the images. chosen: whether the preset chose the downscale."""
     views = training.trainer.views
     view = views[0]
     stored, used = (

@@ -1,4 +1,4 @@
-"""The command pp-cl tune."""
+"""`pp-cl tune`: times the convolution variants on a device and stores the result."""
 
 import argparse
 import time

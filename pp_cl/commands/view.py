@@ -1,4 +1,4 @@
-"""The command pp-cl view."""
+"""`pp-cl view`: shows a run in the browser."""
 
 import argparse
 import html

@@ -1,1 +1,1 @@
-"""Smaller and faster models out of trained ones, within a stated loss."""
+"""Makes trained models smaller and faster within a stated loss of quality."""

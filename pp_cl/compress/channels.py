@@ -1,5 +1,5 @@
-"""Channels of a trained network that hardly contribute: a ReLU that never opens gives zeros, and
-what only computes or reads zeros can go.
+"""Finds channels of a trained network that hardly contribute, such as those of a ReLU that is
+always 0, and removes them with all that only computes or reads them.
 """
 
 from __future__ import annotations

@@ -1,5 +1,5 @@
-"""A trained model with fewer points, channels or harmonics, or coefficients of 16 bits: what can be
-taken from it, and the run that is left.
+"""Reduces a trained model: fewer points, network channels or SH degrees, coefficients of 16 bits;
+and writes the reduced model as a run.
 """
 
 from __future__ import annotations

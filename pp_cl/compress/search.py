@@ -1,4 +1,4 @@
-"""The smallest and fastest reduction of a model within a loss."""
+"""Searches the smallest and fastest reduction of a model within a given loss of PSNR."""
 
 from __future__ import annotations
 

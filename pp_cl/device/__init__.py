@@ -1,1 +1,1 @@
-"""OpenCL: choosing a device, launching kernels, allocating buffers."""
+"""The layer over OpenCL: devices, kernel launches, buffers, transfers, prefix sums."""

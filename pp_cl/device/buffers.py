@@ -30,7 +30,7 @@ def table_bytes(table: Table) -> int:
 
 
 def grown(capacity: int, needed: int) -> int:
-    """The capacity, or a quarter more than `needed` where that is more than it holds."""
+    """The capacity if it holds `needed`, else a quarter more than `needed`."""
     return capacity if needed <= capacity else needed + needed // 4
 
 
@@ -104,16 +104,16 @@ class PackedArrays:
 
 
 class Reading(Generic[T]):
-    """Something that the host knows once numbers have come from the device.
+    """A value that the host gets from a download under way.
 
-    values: on their way until the event. convert: what they mean.
+    values: the target of the download, filled at the event. convert: makes the value of them.
     """
 
     def __init__(self, event: cl.Event, values: np.ndarray, convert: Callable[[np.ndarray], T]):
         self._event, self._values, self._convert = event, values, convert
 
     def get(self) -> T:
-        """What the numbers mean; waits until they are there."""
+        """The value; waits for the download."""
         if self._event is not None:
             self._event.wait()
             self._values = self._convert(self._values)
@@ -155,7 +155,7 @@ def compact_table(n: int, row_bytes: int) -> Table:
 
 
 def compact_rows(dev: Device, array: Array, keep: Array) -> Array:
-    """The rows `keep` of `array`, which is overwritten.
+    """The rows `keep` of `array`; the content of `array` is lost.
 
     Rows that fit SCRATCH_BYTES become an array of their own. Others move to the front of the same
     buffer, piece by piece: ascending indices never lie before their new place, so a piece

@@ -1,5 +1,5 @@
-"""An OpenCL device: builds programs, allocates and copies buffers, times stages and kernels. All
-vendor quirks live here.
+"""An OpenCL device: builds programs, allocates and copies buffers, times stages and kernels, and
+works around the faults of drivers.
 """
 
 import atexit
@@ -126,14 +126,14 @@ def _debug_level():
 
 
 def _released(device, nbytes):
-    """Memory of a device has ended. device: a weak reference."""
+    """Count freed memory off the device's total. device: a weak reference."""
     alive = device()
     if alive is not None:
         alive.bytes -= nbytes
 
 
 class Memory(cl.Buffer):
-    """A buffer whose end can be noticed: cl.Buffer takes no weak reference."""
+    """A cl.Buffer that takes weak references, so that its release can be counted."""
 
 
 class Device:
@@ -248,7 +248,9 @@ class Device:
             self._upload(array, values, is_blocking=True)
 
     def send(self, array: Array, values: np.ndarray) -> None:
-        """The same after what is enqueued, without waiting: `values` must not change any more."""
+        """Overwrite an array once what is enqueued is done, without waiting for it: `values` must
+        not change any more.
+        """
         self._sent.append(self._upload(array, values, is_blocking=False))
         # an event that is dropped waits for the end of its transfer
         while len(self._sent) > 1 and _is_complete(self._sent[0]):
@@ -310,8 +312,8 @@ class Device:
         self.queue.finish()
 
     def attempt(self, what: str, function: Callable[..., Any], *args, **kwargs) -> Any:
-        """function(*args, **kwargs); UserError when the driver gives up (many allocate only at the
-        first use).
+        """Call function(*args, **kwargs); UserError if the driver fails for lack of memory, which
+        many allocate only at a buffer's first use.
         """
         try:
             return function(*args, **kwargs)

@@ -324,7 +324,7 @@ def cut(
 
 @contextmanager
 def quiet_compiler() -> Iterator[None]:
-    """Ignores that a compiler said something: Intel's does at every build, a good one too.
+    """Silences the warning about compiler output, which Intel's compiler gives at every build.
     PYOPENCL_COMPILER_OUTPUT=1 shows what it said.
     """
     with warnings.catch_warnings():
@@ -434,8 +434,8 @@ def channel_ranges(
 
 
 def group_ranges(dev: Any, groups: int, members: int) -> tuple[int, int | None]:
-    """(work-items, work-group) of a kernel in which `members` work together, `groups` times; on
-    CPUs one work-item each. A work-group holds groups as a whole.
+    """(work-items, work-group) of a kernel in which groups of `members` work-items cooperate; on
+    CPUs a group is one work-item. A work-group holds one or more groups as a whole.
     """
     return (groups, None) if dev.is_cpu else (groups * members, max(members, SMALL_GROUP))
 

@@ -1,4 +1,4 @@
-"""Exclusive prefix sums on the device, and the list of the non-zero entries."""
+"""Exclusive prefix sums on the device, and stream compaction (the indices of non-zero flags)."""
 
 import numpy as np
 from pyopencl.array import Array

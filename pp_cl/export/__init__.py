@@ -1,1 +1,1 @@
-"""What a run becomes in other programs: point clouds, meshes, a web page, renderings."""
+"""Exports a run to other programs: films, point clouds, meshes, a web page, rendered views."""

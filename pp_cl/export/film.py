@@ -1,5 +1,5 @@
-"""Renders a run along a path of cameras: frames in a folder, which a later call goes on with, and
-films of them.
+"""Renders a run along a camera path: frames in a folder, resumed by a later call, and films of
+them.
 """
 
 import hashlib

@@ -1,4 +1,4 @@
-"""The formats of an export: what each writes, under which names."""
+"""The formats of `pp-cl export`: which files each one writes."""
 
 from __future__ import annotations
 

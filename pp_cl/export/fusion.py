@@ -1,5 +1,5 @@
-"""The depths of the training views, fused into one field of signed distances (Curless and Levoy
-1996).
+"""Fuses the depth maps of the training views into one signed distance field, a TSDF (Curless and
+Levoy 1996).
 """
 
 from __future__ import annotations

@@ -1,5 +1,5 @@
-"""Colours that need no network: harmonics of each point's colour, fitted to what the network
-shows.
+"""Fits spherical harmonics of colour to each point, so that viewers can draw a run without the
+network.
 
 An image is linear in the points' coefficients: the blend weights of its pixels, which are known,
 times the colours of the points in the directions from the eye. The coefficients minimise the

@@ -1,4 +1,4 @@
-"""The training views as the run renders them, and what each point contributes to them."""
+"""Renders the training views of a run, with the blend weights of each point in them."""
 
 from __future__ import annotations
 

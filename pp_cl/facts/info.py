@@ -1,4 +1,4 @@
-"""Facts about a run or a scene for `pp-cl info`, in numbers that JSON can hold."""
+"""The facts about a run or a scene that `pp-cl info` prints, as numbers for JSON."""
 
 import json
 import math

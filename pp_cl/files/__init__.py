@@ -1,1 +1,3 @@
-"""Files of a run and images, written atomically, read without trust."""
+"""Reads and writes files: checkpoints, images, films, the folder of a run; written atomically and
+checked when read.
+"""

@@ -1,6 +1,4 @@
-"""Files written to a temporary name, synced, renamed: all of one or nothing. And the folder that
-keeps what is fetched or measured once.
-"""
+"""Atomic writes: to a temporary name, synced, then renamed; and the user's cache folder."""
 
 import errno
 import json

@@ -1,5 +1,5 @@
-"""Checkpoints: .npz files as numpy's savez writes them, of uncompressed arrays and a JSON header;
-written to a temporary name, synced, renamed; read without trust.
+"""The file format of checkpoints: a .npz of uncompressed arrays and a JSON header, written
+atomically and checked when read.
 """
 
 import errno

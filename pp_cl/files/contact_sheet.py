@@ -1,4 +1,6 @@
-"""Pictures of many images: how well views are predicted, and what photographs there are."""
+"""Contact sheets: many images in one picture, predictions beside the truth or photographs of a
+scene.
+"""
 
 from collections.abc import Sequence
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""Images on disk, as 8 bits a channel."""
+"""Reads and writes 8-bit image files."""
 
 import io
 import warnings

@@ -1,4 +1,4 @@
-"""The folder of a run: the names in it, its checkpoint, its log."""
+"""The folder of a run: its file names, config, checkpoint, log and lock."""
 
 import json
 import math

@@ -1,4 +1,4 @@
-"""Scalars of a training for TensorBoard, by the package tensorboardX."""
+"""Writes the curves of a training for TensorBoard, with the package tensorboardX."""
 
 from collections.abc import Iterator
 from pathlib import Path

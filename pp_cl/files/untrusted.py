@@ -1,4 +1,4 @@
-"""Files that other programs wrote: checked to be regular and small enough before they are read."""
+"""Opens files of other programs, after checking that they are regular files and small enough."""
 
 import errno
 import json

@@ -1,1 +1,1 @@
-"""Convolutions and resampling: the network's operations, in variants."""
+"""The operations of the network: convolutions in variants, pooling, upsampling, gates, tiles."""

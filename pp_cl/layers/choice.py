@@ -1,5 +1,6 @@
-"""Which of conv_direct, conv_winograd and conv_local computes a convolution: as measured by
-`pp-cl tune`, else as shipped, and always within a tolerance.
+"""Chooses the variant (direct, Winograd or local) of each convolution: by the times that `pp-cl
+tune` measured, else by the shipped choice for the kind of device, and always within an error
+tolerance.
 
 A tuning is what `pp-cl tune` measured on a device, stored in the user's cache: a dictionary (JSON)
 of FORMAT, the device's key, "tile_shapes" (fields of conv.Blocking that differ from the shipped

@@ -136,7 +136,7 @@ def scratch_floats(
 
 
 def lay_out(_dev: Device, _blocking: Blocking, _weight: Array) -> None:
-    """None: the kernels read the weights as they are."""
+    """Nothing to transform in advance: the kernels read the weights as they are."""
 
 
 def forward(

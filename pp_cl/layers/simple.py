@@ -177,7 +177,7 @@ def output_forward(dev: Device, image: Array, features: Array | None) -> None:
 
 
 def output_backward(dev: Device, grad_image: Array, grad_out: Array) -> None:
-    """grad_out (H, W, 3) of the network's output, of grad_image (H, W, 3)."""
+    """Write grad_out (H, W, 3), dL/d(last layer's output), from grad_image (H, W, 3)."""
     _check_image(grad_out, grad_image)
     n = grad_image.size
     dev.program("layers/output").launch(
@@ -186,7 +186,9 @@ def output_backward(dev: Device, grad_image: Array, grad_out: Array) -> None:
 
 
 def residual_backward(dev: Device, grad_image: Array, grad_features: Array) -> None:
-    """Adds what passes around the network to grad_features (H, W, C), of grad_image (H, W, 3)."""
+    """Add the gradient through the residual connection, of grad_image (H, W, 3), to grad_features
+    (H, W, C).
+    """
     height, width, channels = _check_image(grad_features, grad_image)
     dev.program("layers/output").launch(
         "residual_backward",

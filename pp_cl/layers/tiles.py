@@ -1,5 +1,5 @@
-"""Tiles of 4 x 4 pixels of a feature map: which of them a kernel computes, which hold something,
-and copies among them.
+"""Tiles of 4 x 4 pixels of a feature map: lists of those that a kernel computes, tests for tiles
+that are not background, and copies from tile to tile.
 
 A feature map of (height, width) pixels has ceil(height / 4) x ceil(width / 4) tiles, numbered row
 by row; the last ones may be cut off by the border.
@@ -68,7 +68,7 @@ def all_tiles_buffers(height: int, width: int) -> Table:
 
 
 def checked_tiles(dev: Device, tiles: Tiles | None, height: int, width: int) -> Tiles:
-    """`tiles`; all of them, made for this call, if None. Raises ValueError for those of a feature
+    """`tiles`, or all tiles of the feature map if None. Raises ValueError for tiles of a feature
     map of another size.
     """
     if tiles is None:

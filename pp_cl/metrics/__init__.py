@@ -1,1 +1,1 @@
-"""PSNR, SSIM and LPIPS."""
+"""Image metrics (PSNR, SSIM, LPIPS) and the completeness of points against a mesh."""

@@ -1,4 +1,4 @@
-"""Metrics of an image, or of a folder of images, against the truth."""
+"""PSNR, SSIM and LPIPS of an image, or of a folder of images, against the ground truth."""
 
 import mimetypes
 from pathlib import Path

@@ -1,1 +1,1 @@
-"""The U-Net and the buffers it shares."""
+"""The U-Net: its layers, its memory, its forward and backward pass, and how it skips background."""

@@ -1,5 +1,5 @@
-"""The network that turns feature maps into images, as a list of layers: a U-Net of three levels
-(PlenopticPoints supplemental, decoder).
+"""The architecture of the U-Net as a list of layers: three levels, as the decoder of the
+PlenopticPoints supplemental; and which of its feature maps share memory.
 
 Each level is a block: two 3x3 convolutions with ReLU, or one of the others that the supplemental
 compares with them. Levels are joined by 2x2 average pooling on the way down, by bilinear upsampling
@@ -52,7 +52,7 @@ class Layer:
         return self.channels, sum(self.sources), self.kernel_size, self.kernel_size
 
     def shape(self, direction: Direction, source: int | None, height: int, width: int) -> ConvShape:
-        """By which a convolution's variant is chosen in an image of this size."""
+        """What a convolution's variant is chosen by, in an image of this size."""
         pixels = (height >> self.level) * (width >> self.level)
         return ConvShape(direction, self.kernel_size, self.sources, self.channels, pixels, source)
 
@@ -140,7 +140,9 @@ def convolutions(layers: list[Layer]) -> list[Layer]:
 
 
 def computations(layer: Layer, training: bool) -> list[tuple[Direction, int | None]]:
-    """(direction, input or None) of all computations of a convolution in a pass."""
+    """(direction, input or None) of all that is computed for a convolution: forward, and for
+    training the gradients of its weights and of each input.
+    """
     found = [(Direction.FORWARD, None)]
     if training:
         found.append((Direction.BACKWARD_WEIGHTS, None))
@@ -192,8 +194,8 @@ def multiplications(layers: list[Layer], height: int, width: int) -> int:
 
 
 def lifetimes(layers: list[Layer], training: bool) -> list[tuple[str, int, int]]:
-    """[(name, first, last)] of a network's arrays, in layers of its forward and backward pass, by
-    first use.
+    """[(name, first, last)]: the first and last layer, counted through the forward and the backward
+    pass, at which each array is in use; by first use.
 
     The network's input "x" is not among them: it belongs to the caller.
     """

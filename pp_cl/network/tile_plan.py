@@ -1,4 +1,5 @@
-"""Which tiles of the network's feature maps are computed where much of the image is background.
+"""Skips background in the U-Net: plans which 4x4 tiles of each feature map are computed, and which
+are copies of a computed one.
 
 Where the network sees nothing but background, its output depends only on the distance from the
 borders of the image, which it sees as zeros. So the tiles that see only background fall into
@@ -43,8 +44,8 @@ LOSS_RADIUS, LOSS_BORDER = 10, 48
 
 
 def distance(tiles: np.ndarray) -> np.ndarray:
-    """(rows, columns) int: how many tiles away, diagonals included, the nearest one that is set is;
-    more than any number of them where none is.
+    """(rows, columns) int: the distance to the nearest tile that is set, in tiles, diagonals
+    counting as 1 (chessboard distance); the largest int32 if none is set.
     """
     if not tiles.any():
         return np.full(tiles.shape, np.iinfo(np.int32).max)
@@ -79,8 +80,9 @@ def double(tiles: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
 
 
 def gradient_tiles(found: np.ndarray, size: tuple[int, int], offset: tuple[int, int]) -> np.ndarray:
-    """The tiles of an image of `size` = (height, width) whose gradient of the loss depends on more
-    than an image of one colour before a white target, borders aside.
+    """The tiles of an image of `size` = (height, width) where the gradient of the loss may differ
+    from that of background over a white target: those within the loss's reach of a tile of the
+    target that is not white. Borders are left to BackwardPlan.
 
     found: (?, ?) bool, the target's tiles that are not all white. offset: (left, top) of the target
     in the image, less than a tile.
@@ -96,7 +98,7 @@ def _tiles_of(pixels):
 
 
 def receptive_radius(layers: list[Layer]) -> dict[str, int]:
-    """{name: pixels}: how far from its place a change of x changes the output of a layer."""
+    """{name: pixels}: radius of the receptive field of each layer's output in the input x."""
     radius = {"x": 0}
     for layer in layers:
         radius[layer.name] = max(radius[name] for name in layer.inputs) + _forward_radius(layer)
@@ -104,8 +106,8 @@ def receptive_radius(layers: list[Layer]) -> dict[str, int]:
 
 
 def gradient_radius(layers: list[Layer]) -> dict[str, int]:
-    """{name: pixels}: how far from its place a change of the image's gradient changes the gradient
-    of a layer's output, or of x.
+    """{name: pixels}: radius of the receptive field, in the image's gradient, of the gradient of
+    each layer's output and of x.
     """
     radius = dict.fromkeys([gradient_of(layer.name) for layer in layers], 0)
     for layer in reversed(layers):
@@ -116,7 +118,7 @@ def gradient_radius(layers: list[Layer]) -> dict[str, int]:
 
 
 def _forward_radius(layer):
-    """How far from its place a change of the input changes the output, in pixels of the image."""
+    """Radius of the receptive field of one layer, in pixels of the image."""
     if layer.kind == "conv":
         return layer.kernel_size // 2 << layer.level
     return {"gate": 0, "pool": 1, "upsample": 2}[layer.kind] << layer.level >> 1
@@ -200,7 +202,7 @@ def _classes(length, level, border):
 
 
 class AllTiles:
-    """A pass that computes all tiles."""
+    """The plan that skips nothing: a pass that computes all tiles."""
 
     def __init__(self, dev: Device, size: tuple[int, int], layers: list[Layer]):
         levels = levels_of(layers)
@@ -284,9 +286,9 @@ class ForwardPlan(TilePlan):
     """The forward pass over an image of `size`, where x differs from the background in the tiles
     `active`.
 
-    gradient_tiles: the tiles of the image whose gradient may be another than that of others which
-    see only background; None: all. affected: the tiles of the image that see more than background.
-    computed_fraction: of the network's multiplications.
+    gradient_tiles: as gradient_tiles() returns it; None: all tiles. affected: the tiles of the
+    image whose receptive field holds more than background. computed_fraction: share of the
+    network's multiplications that is left.
     """
 
     def __init__(

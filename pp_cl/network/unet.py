@@ -1,5 +1,5 @@
-"""The U-Net on a device: its parameters, the memory it works in, and its layers run in order,
-forward and backward.
+"""The U-Net on a device: its parameters and feature maps, and its forward and backward pass, which
+launch the kernels layer by layer.
 """
 
 import math
@@ -89,14 +89,13 @@ class FeatureMaps:
 class UNet:
     """The network, its parameters and gradients, and the buffers it works in.
 
-    widths: channels of the three levels. blocks: what a level computes, of layers.BLOCKS.
-    channels: as unet_layers() takes them. residual: adds output.SHARE of the first three features
-    to the image. policy: which variants its convolutions take from the next image on, None = as
-    shipped, whatever their error. layers: in the order of the forward pass. parameters, gradients:
-    {"enc0.a.weight": (ceil(CO/16), K, K, CI, 16), "enc0.a.bias": (ceil(CO/16) * 16,), ...} float32
-    on the device.
-    Weights and biases start uniform in +-1/sqrt(CI K K) (PyTorch's default for Conv2d), output
-    channels beyond CO at 0, with gradient 0.
+    widths: channels of the three levels. blocks: what a level computes, of layers.BLOCKS. channels:
+    as unet_layers() takes them. residual: adds output.SHARE of the first three features to the
+    image. policy: chooses the variant of each convolution; may be replaced between images; None =
+    as shipped, whatever their error. layers: in the order of the forward pass. parameters,
+    gradients: {"enc0.a.weight": (ceil(CO/16), K, K, CI, 16), "enc0.a.bias": (ceil(CO/16) * 16,),
+    ...} float32 on the device. Weights and biases start uniform in +-1/sqrt(CI K K) (PyTorch's
+    default for Conv2d), output channels beyond CO at 0, with gradient 0.
     """
 
     def __init__(
@@ -168,9 +167,9 @@ class UNet:
         tiles but the `active` ones, (rows, columns) bool; None = all, as few would be saved.
 
         Where the network sees only this background, one tile is computed in place of many equal
-        ones (tile_plan.py). The result is the same. gradient_tiles: the tiles whose gradient of the
-        image may not be that of others which see only background; None: all. Valid until the next
-        plan.
+        ones (tile_plan.py). The result is the same. gradient_tiles: (rows, columns) bool, the tiles
+        where dL/dimage may differ from that of other background tiles, for the backward pass; None:
+        all. Valid until the next plan.
         """
         if not self.is_planned(size):
             return None
@@ -303,7 +302,7 @@ class UNet:
         return self._modules[key]
 
     def _laid_out(self, layer, module):
-        """The weights as the module transforms them, once frozen; None = not in advance."""
+        """The weights in the module's own layout, made once after freeze(); None before."""
         if self._frozen is None:
             return None
         key = layer.name, module

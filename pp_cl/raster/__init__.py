@@ -1,1 +1,1 @@
-"""From points to blended features, and back to gradients."""
+"""The rasteriser: from points to the blended features of each pixel, and back to gradients."""

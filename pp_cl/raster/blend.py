@@ -28,8 +28,8 @@ def shade_forward(
 ) -> None:
     """Write the rows `shaded` of point_features (N, 16) float32.
 
-    The direction of a point is normalize(point - eye) in world axes. shaded: (S,) uint32. sh: of
-    PointCloud.
+    The direction of a point is normalize(point - eye) in world axes. shaded: (S,) uint32, the
+    visible points. sh: of PointCloud.
     """
     sh_0, sh_1, sh_2a, sh_2b = four_blocks(sh)
     dev.program("raster/shade", LANES=lanes(dev), DEGREE=stored_degree(sh)).launch(
@@ -91,8 +91,8 @@ def blend_backward(
     mean: bool = False,
 ) -> tuple[Array, Array]:
     """(grad_point_features (N, 16), grad_opacity (N,)) float32, valid until the next call; points
-    that are not shaded get zeros. b.pair_gain or b.pixel_rest then hold what the gains of the pairs
-    are, or follow from (cl/raster/blend.cl).
+    that are not shaded get zeros. b.pair_gain (alpha) or b.pixel_rest (softmax) are left for
+    bench/spheres.py: the gains, and what they follow from (cl/raster/blend.cl).
 
     point_features, features: of blend_forward(). grad_features: dL/dfeatures (H, W, 16).
     grad_alpha: (HW,), dL/d(1 - transmittance); None: 0. spread_weight: adds this times sum_ij b_i

@@ -1,4 +1,4 @@
-"""Alpha and depth of a view, from the blend weights of its pixels, without the network."""
+"""Alpha, mean depth and median depth of each pixel, from its blend weights; no network."""
 
 from __future__ import annotations
 

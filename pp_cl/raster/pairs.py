@@ -1,4 +1,6 @@
-"""All hits of one view, a hit being a pair of a point and a pixel: listed by point and by pixel."""
+"""Pairs (hits) of a point and a pixel that it covers in a view: listed by point for the backward
+pass, and by pixel sorted by depth for blending.
+"""
 
 from __future__ import annotations
 
@@ -23,8 +25,8 @@ LONG_LIST = RUN * RUN  # keys of lists that GPUs merge in more than one pass
 class Pairs:
     """The hits of a view of N points and HW pixels, valid until the next ones are found.
 
-    There is room for P pairs. If there are more, the pixels have none, and the other arrays must
-    not be read: find them again with more room.
+    The arrays have room for P pairs. If the view has more, pixel_offset is all zeros and the other
+    arrays must not be read: find the pairs again with more room (room_needed()).
 
     count: how many pairs there are.
     point_offset: (N+1,) uint32, point i owns pairs point_offset[i] to point_offset[i+1].
@@ -71,7 +73,8 @@ def pairs_table(n: int, pixels: int, pairs: int) -> Table:
         "pair_pixel": ((pairs,), np.uint32),
         "pair_point_closeness": ((pairs, 2), np.uint32),
         "pair_key": ((pairs,), np.uint64),
-        # depths and places in the pixels' lists until the keys are written, then for sorting them
+        # (depth, place in the pixel's list) of each pair until the keys are written, then for
+        # sorting them
         "pair_scratch": ((pairs,), np.uint64),
     }
 
@@ -136,8 +139,8 @@ def find_pairs(
 
 
 def room_needed(pairs: Pairs) -> int:
-    """The room that these pairs have, or a larger one with which they fit. Waits until their number
-    is known. Raises UserError for more than can be numbered.
+    """The capacity of these pairs if all fitted, else a larger one with which they fit. Waits until
+    their number is known. Raises UserError for more pairs than uint32 can number.
     """
     total = pairs.total
     if total >= MOST_PAIRS:

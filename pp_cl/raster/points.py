@@ -1,4 +1,4 @@
-"""The points: what is learned of each, and how its spherical harmonics are stored."""
+"""The point cloud on the device: grid ids, opacities, and SH coefficients in arrays by degree."""
 
 from __future__ import annotations
 
@@ -53,8 +53,8 @@ def stored_degree(sh: list[Array]) -> int:
 
 
 def four_blocks(sh: list[Array]) -> list[Array]:
-    """Arrays of all SH_BLOCKS for a kernel's arguments: the first one stands for those that are
-    absent, which a kernel built for the stored degree does not read.
+    """Four arrays for a kernel's arguments. Where the degree is lower, the first one takes the
+    place of the missing ones, which a kernel built for that degree does not read.
     """
     return [*sh, *[sh[0]] * (len(SH_BLOCKS) - len(sh))]
 

@@ -1,4 +1,6 @@
-"""Points in camera axes, which of them are culled, and the box of pixels that each may cover."""
+"""Projection and culling: points to camera axes, the box of pixels that each may cover, and how
+many pixels it hits.
+"""
 
 from __future__ import annotations
 
@@ -54,7 +56,7 @@ def project_grid(
     dropout: float = 0.0,
     seed: int = 0,
 ) -> ProjectedPoints:
-    """Project vertices of a grid.
+    """Project the points, which are vertices of a grid, into a camera.
 
     grid_buffer: (8,) float32, Grid.packed(). point_id: (N,) uint32. point_radius: (1,). dropout:
     probability in [0, 1) with which a point is left out, at random by (seed, id). seed: uint32.

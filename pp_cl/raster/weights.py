@@ -1,5 +1,5 @@
-"""The blend weight of each hit in its pixel, by alpha compositing or by the paper's softmax; which
-points they make visible, and how much each one weighs.
+"""The blend weight of each hit in its pixel, by alpha compositing or by the paper's softmax; the
+list of visible points, and each point's highest weight for pruning.
 """
 
 from __future__ import annotations
@@ -23,13 +23,13 @@ DROPPED = 2  # cl/raster/pair_role.h
 class BlendWeights:
     """The blend weights of a Pairs object, valid until the next ones are computed.
 
-    blend: one of BLENDS. has_roles: some pairs may be untracked or dropped; else all are tracked
-    and pair_role is unread. pair_weight: (P, 2) float32, the weight b, and s, which times the
-    pair's gain is dL/do (cl/raster/blend.cl); undefined where the pair is dropped. pair_role: (P,)
-    uint8, cl/raster/pair_role.h. pixel_entry: (P,) uint64, weight bits << 32 | point, each pixel's
-    hits by depth; where hits are dropped, an entry of no point ends a pixel's list. shaded_list:
-    `shaded` before its length is known. transmittance: (HW,) float32 behind all hits, None of a
-    softmax.
+    blend: one of BLENDS. has_roles: some pairs may be untracked (no gradient) or dropped (behind
+    the early stop); else pair_role is unread. pair_weight: (P, 2) float32, the blend weight b, and
+    a factor s for the backward pass, dL/dopacity = s * gain (cl/raster/blend.cl); undefined where
+    the pair is dropped. pair_role: (P,) uint8, cl/raster/pair_role.h. pixel_entry: (P,) uint64,
+    weight bits << 32 | point, each pixel's hits by depth; where hits are dropped, an entry without
+    a point ends the pixel's list. shaded_list: `shaded`, whose length is still on its way.
+    transmittance: (HW,) float32 behind all hits, None with the softmax.
     """
 
     blend: str
@@ -42,8 +42,8 @@ class BlendWeights:
 
     @property
     def shaded(self) -> Array:
-        """(S,) uint32, ascending, the points with a hit that is not dropped: no other point's
-        features are read, no other point gets a gradient. Waits until their number is known.
+        """(S,) uint32, ascending: the visible points, those with a hit that is not dropped. Only
+        they are shaded and get gradients. Waits until their number is known.
         """
         return self.shaded_list.get()
 
@@ -105,7 +105,9 @@ def blend_weights(
 
 
 def _alpha_weights(dev, b, pairs, opacity, max_tracked, early_stop):
-    """T o d: no hit behind early_stop could weigh more than that, nor all of them together."""
+    """Front to back, weight = transmittance * opacity * closeness; early_stop is the transmittance
+    below which the hits behind are dropped.
+    """
     if early_stop > 0:
         dev.fill(b.pair_role, DROPPED)
     program = dev.program("raster/alpha", DROPS=int(early_stop > 0), MAX_TRACKED=max_tracked)
@@ -126,7 +128,7 @@ def _alpha_weights(dev, b, pairs, opacity, max_tracked, early_stop):
 
 
 def _softmax_weights(dev, b, pairs, camera_buffer, opacity, gamma, max_tracked, early_stop):
-    """Eq. (1); early_stop is Pulsar's percent_allowed_difference."""
+    """Eq. (1) of the supplemental; early_stop is Pulsar's percent_allowed_difference."""
     program = dev.program(
         "raster/softmax", LANES=lanes(dev), DROPS=int(early_stop > 0), MAX_TRACKED=max_tracked
     )
@@ -150,8 +152,9 @@ def _softmax_weights(dev, b, pairs, camera_buffer, opacity, gamma, max_tracked, 
 def record_weights(
     dev: Device, pairs: Pairs, weights: BlendWeights, max_weight: Array, times_seen: Array
 ) -> None:
-    """Raise max_weight to each point's blend weights, summed over the pixels, where they are
-    higher, and add 1 to times_seen where it has a hit, dropped or not; both (N,) float32.
+    """Update what pruning looks at, both (N,) float32: max_weight, the highest sum over an image's
+    pixels of a point's blend weights so far, and times_seen, how many images had a hit of the
+    point, dropped or not.
     """
     dev.program("raster/weights", HAS_ROLES=int(weights.has_roles)).launch(
         "record_weights",

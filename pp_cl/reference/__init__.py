@@ -1,1 +1,1 @@
-"""Float64 twins: what benches and the selftest measure errors against, and most tests."""
+"""Float64 numpy versions of the kernels: the truth for tests, selftest and bench."""

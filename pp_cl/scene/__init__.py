@@ -1,1 +1,1 @@
-"""Photographs, cameras, the visual hull."""
+"""Scenes: photographs with cameras and masks, and the visual hull where the points start."""

@@ -1,4 +1,4 @@
-"""Masks that contradict those of the other views, and what to say of them."""
+"""Finds masks that contradict those of the other views, and words the warning."""
 
 from collections.abc import Sequence
 from typing import NamedTuple

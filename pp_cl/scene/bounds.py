@@ -1,4 +1,4 @@
-"""The box around the object that cameras and masks allow."""
+"""A bounding box of the object, from cameras and masks."""
 
 import math
 from collections.abc import Sequence

@@ -1,4 +1,4 @@
-"""The pinhole camera of cl/camera.h."""
+"""The pinhole camera, and how it is packed for the kernels (cl/camera.h)."""
 
 import math
 from collections.abc import Sequence

@@ -1,4 +1,4 @@
-"""Paths of a camera around an object, made from the cameras that photographed it."""
+"""Camera paths around an object (orbit, spiral, ...), made from the cameras of its photographs."""
 
 import math
 from collections.abc import Sequence

@@ -1,4 +1,4 @@
-"""Lens distortion, and photographs freed of it."""
+"""Lens distortion models, and undistorting photographs."""
 
 from dataclasses import astuple, dataclass
 

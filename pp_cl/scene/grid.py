@@ -1,4 +1,4 @@
-"""The regular grid whose vertices are the points."""
+"""The regular grid on whose vertices the points lie, and its refinement to half the spacing."""
 
 import math
 from dataclasses import dataclass, replace

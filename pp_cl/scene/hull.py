@@ -1,4 +1,4 @@
-"""The initial points: vertices of a regular grid inside the visual hull of the training masks."""
+"""The visual hull: the grid vertices inside all training masks, where the points start."""
 
 import math
 from collections.abc import Sequence

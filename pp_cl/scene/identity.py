@@ -1,5 +1,5 @@
-"""The names, cameras and pixel digests of the training views that a checkpoint keeps: to render
-without the scene, and to recognise it in another place.
+"""The names, cameras and pixel digests of the training views in a checkpoint: to render without the
+scene, and to check that a training resumes with the same photographs.
 """
 
 import base64

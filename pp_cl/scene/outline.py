@@ -1,4 +1,6 @@
-"""Points drawn over photographs: their outline, and what masks that disagree reject of them."""
+"""Pictures for checking a scene: the outline of the points drawn over photographs, and where masks
+disagree.
+"""
 
 import math
 from collections.abc import Sequence

@@ -1,5 +1,5 @@
-"""The image that a rendering is compared with: a photograph on the device, reduced by area on
-premultiplied colour, over white.
+"""The training target on the device: a photograph reduced by area on premultiplied colour, over
+white.
 """
 
 import numpy as np

@@ -1,4 +1,4 @@
-"""Photographs with their cameras: listed by a scene, read with their pixels, and reduced."""
+"""Views: photographs with their cameras, listed by a scene, loaded, and reduced."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace

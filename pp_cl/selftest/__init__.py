@@ -1,1 +1,1 @@
-"""The numerical hard cases and comparisons with float64 that `pp-cl selftest` runs."""
+"""The cases of `pp-cl selftest`: every kernel against float64, numerically hard inputs included."""

@@ -1,4 +1,4 @@
-"""A case of the selftest, and how its results are measured against what they should be."""
+"""A case of the selftest, and how the error of its results is measured."""
 
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass

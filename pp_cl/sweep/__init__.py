@@ -1,1 +1,1 @@
-"""Many trainings with one table: scenes x settings x seeds, shared out by Dask."""
+"""Sweeps: many trainings (scenes x settings x seeds), run by Dask, with one table of results."""

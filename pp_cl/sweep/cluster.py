@@ -1,4 +1,4 @@
-"""Runs of a sweep shared out by Dask: to workers on this machine, or to a scheduler's."""
+"""Runs the trainings of a sweep with Dask: on workers of this machine, or on a given scheduler."""
 
 import asyncio
 import logging

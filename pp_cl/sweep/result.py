@@ -1,4 +1,4 @@
-"""A run's row of the table, and how far it is, by the files in its folder."""
+"""Reads a run's row of the sweep's table, and its progress, from the files in its folder."""
 
 from typing import Any
 

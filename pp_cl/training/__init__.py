@@ -1,1 +1,3 @@
-"""What changes the parameters."""
+"""The parts of a training step after rendering: losses, optimiser, pruning, schedules, EMA; and
+checkpoints and the memory plan.
+"""

@@ -1,5 +1,5 @@
-"""What the checkpoint of a run must hold by its settings: everybody who reads one reads it here,
-and nothing in it is believed before it was checked.
+"""Reads the checkpoint of a run and checks its arrays against the run's settings before anything
+uses them.
 """
 
 import math

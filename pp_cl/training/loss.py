@@ -1,5 +1,5 @@
-"""The training loss: smooth L1 and SSIM of an image with their gradient, the mask term, and the sum
-of all terms.
+"""The training loss: smooth L1 and SSIM of the rendered crop with their gradient, the mask term, and
+the sum of all terms, which stay on the device until they are read.
 """
 
 import math

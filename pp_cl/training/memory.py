@@ -1,5 +1,5 @@
-"""Whether a training fits the memory of device and host: the buffer tables of its stages, summed
-before anything is allocated, against what there is.
+"""The memory plan: sums the buffer tables of all stages of a training before anything is allocated,
+and compares the sum with the memory of device and host.
 """
 
 import math
@@ -44,7 +44,7 @@ DRIVER_BYTES = {"Portable Computing Language": 80 * MIB, "Intel(R) OpenCL": 620 
 
 
 class MemoryPhase(NamedTuple):
-    """What is allocated at once in a part of a training.
+    """What is allocated at the same time in one phase of a training.
 
     tables: {what the buffers are for: their table}. host: bytes of numpy arrays.
     """
@@ -94,7 +94,8 @@ class Plan(NamedTuple):
 
 
 class Room:
-    """The memory there is for a training; made before anything of it is allocated.
+    """Checks that a training fits the available memory; made before the training allocates
+    anything.
 
     photographs: of the training views. plan: that of the last check, None before.
     """
@@ -115,8 +116,8 @@ class Room:
         return self._program + self.plan.host(self.dev.is_cpu)
 
     def check_unseen(self) -> None:
-        """Before the photographs are read and the hull is known: raise UserError as check_points
-        does where the least that the training can take does not fit.
+        """Raise UserError as check_points() does if even the least memory that the training can
+        take does not fit; called before the photographs are read and the hull is known.
         """
         points = self._config.points.count
         self._check(self._planned(points, 0.0, points ** (1 / 3), step=0))
@@ -130,8 +131,8 @@ class Room:
         self._check(self.plan_points(grid, points, depth_range, step))
 
     def check_growth(self, model: Model, step: int) -> None:
-        """Before the step after `step`: the same where it refines the grid or begins the averages,
-        as it is known only now how many points are left.
+        """Check again if the step after `step` refines the grid or begins the EMA: only now it is
+        known how many points pruning has left.
         """
         train, points = self._config.train, model.cloud.count
         if step + 1 in refine_steps(train) or (train.ema and step + 1 == _averages(train)):
@@ -163,7 +164,7 @@ class Room:
         self.plan = plan
 
     def _problem(self, plan):
-        """(what of the plan is too much, what to do about it); ("", "") where all fits."""
+        """(what does not fit, what to do about it); ("", "") if all fits."""
         dev, info, (what, largest) = self.dev, self.dev.info, plan.largest
         device, host, available = plan.peak.device, plan.host(dev.is_cpu), available_bytes()
         lower = "lower --points or train.crop, or raise --downscale"
@@ -203,7 +204,9 @@ class Room:
         )
 
     def _phases(self, n, radius, layers, step):
-        """From the step on: each level of refinement, refining it, and the averages of the last."""
+        """The phases from a step on: each level of refinement, each refining, and the EMA at the
+        end.
+        """
         train, phases = self._config.train, []
         averages, refinements = _averages(train), refine_steps(train)
         for level, end in enumerate([*refinements, train.iterations]):
@@ -226,7 +229,7 @@ class Room:
         return phases
 
     def _level(self, name, n, is_averaged, prunes, **stages):
-        """A level of refinement with its prunings and checkpoints."""
+        """The phase of one level of refinement, with its prunings and checkpoints."""
         tables = self._point_tables(n, is_averaged) | self._stages(n, **stages)
         if prunes:
             tables["pruning (at most)"] = compact_table(n, 64 * self._most_coefficients)

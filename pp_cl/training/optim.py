@@ -1,9 +1,9 @@
-"""The update of everything that is learned: RMSprop of the SH coefficients, Adam of the opacities
-and of the network, and the moving average (EMA) of all.
+"""The optimiser: RMSprop for the SH coefficients, Adam for the opacities and the network, and the
+exponential moving average (EMA) of all parameters.
 
-Adam is torch's: every value moves in every step by its momentum, whether it received a gradient or
-not. A point whose features have no gradient does not move, so RMSprop touches only what the image
-shows; cl/training/rmsprop.cl has its formulas, docs/maths.md the reasons.
+Adam is dense as in PyTorch: momentum moves every value in every step, with or without a gradient.
+RMSprop is sparse: it touches only visible points with a gradient. cl/training/rmsprop.cl has its
+formulas, docs/maths.md the reasons.
 """
 
 from __future__ import annotations
@@ -70,9 +70,8 @@ class Optimiser:
         """One step by the gradients of the points' features (N, 16) and opacities (N,), and by
         those of the network, which lie in model.net.gradients.
 
-        step: from 1. points: in the image that the gradients belong to. shaded: (S) uint32, those
-        that make it up; no others have a gradient of their features. sh_eps: eps of the SH
-        coefficients' step.
+        step: from 1. points: as projected into the rendered view. shaded: (S) uint32, the visible
+        ones; no others have a gradient of their features. sh_eps: eps of RMSprop.
         """
         cloud, net, state = self.model.cloud, self.model.net, self.state
         rmsprop_update(
@@ -109,8 +108,8 @@ class Optimiser:
             )
 
     def update_ema(self, weight: float) -> None:
-        """Move the averages of points and network towards the present values by `weight`; a weight
-        of 1 starts them there.
+        """Update the EMA of points and network: average += weight * (parameter - average); the
+        first call starts them as copies.
         """
         for averages, parameters in self._averaged():
             for name, parameter in parameters.items():
@@ -121,7 +120,7 @@ class Optimiser:
                     ema_update(self.dev, averages[name], parameter, weight)
 
     def apply_ema(self) -> None:
-        """Make the averages, where there are any, the model's values, and release them."""
+        """Copy the EMA, if there is one, into the model's parameters, and release it."""
         for averages, parameters in self._averaged():
             for name in list(averages):
                 self.dev.copy(parameters[name], averages.pop(name))
@@ -239,8 +238,8 @@ def rmsprop_update(
     step: from 1 on. points, shaded: as Optimiser.update() takes them. grad_point_features: (N, 16),
     of which only the shaded rows are read. sh: arrays (N, count, 16) of SH_BLOCKS up to the end of
     one degree. v: (N, 16) float32, second moments, of each feature. last_step: (N,) uint32, of each
-    point's last gradient, 0: none. Both start as zeros. rates: of the degrees 0, 1, 2. eps: of the
-    gradient's unit.
+    point's last gradient, 0: none. Both start as zeros. rates: of the degrees 0, 1, 2. eps: added
+    to the root of v, in the gradient's unit.
     """
     degree = max((d for d in range(stored_degree(sh) + 1) if rates[d] > 0), default=None)
     if degree is None:

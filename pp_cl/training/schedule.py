@@ -1,5 +1,5 @@
-"""What changes in the course of a training, as functions of the step, which counts from 0 to
-steps - 1: learning rates, gamma, weights, refinements, averages, and the crop that a step sees.
+"""The schedules of a training, as functions of the step (0 to steps - 1): learning rates, gamma,
+loss weights, pruning, refining, EMA, and the crop that a step trains on.
 """
 
 from __future__ import annotations
@@ -69,7 +69,9 @@ def learning_rate(
 
 
 def prunings(train: TrainConfig, start: int, end: int) -> int:
-    """How often points may be pruned after the steps `start` to `end`, looked at since `start`."""
+    """How many prunings between the steps `start` and `end` may drop points, if the points are seen
+    in every step since `start`.
+    """
     if not _prunes(train):
         return 0
     every, last = train.prune_every, min(end, train.iterations - 1)
@@ -81,10 +83,10 @@ def _prunes(train):
 
 
 def refine_steps(train: TrainConfig) -> list[int]:
-    """The numbers of steps done, ascending, after which the grid is refined.
+    """The steps after which the grid is refined, ascending.
 
-    Each makes eight points of one. So a training that prunes leaves a further one out where nothing
-    would be pruned since the one before.
+    Each refinement makes eight points of one. So a training that prunes leaves out a refinement
+    before which nothing could have been pruned since the last one.
     """
     shares = (share for share in train.refine_at if share < 1)
     steps = sorted({max(1, round(share * train.iterations)) for share in shares})
@@ -96,19 +98,21 @@ def refine_steps(train: TrainConfig) -> list[int]:
 
 
 def gamma_at(step: int, steps: int, first: float = 0.1, last: float = 0.01) -> float:
-    """The blend's softness, exponential from `first` to `last` (PlenopticPoints supplemental)."""
+    """Depth sharpness gamma of the softmax, exponential from `first` to `last` (PlenopticPoints
+    supplemental).
+    """
     return learning_rate(step, steps, first, last)
 
 
 def rising_weight(step: int, steps: int, last: float = 1.0) -> float:
-    """A weight that rises linearly from 0 to `last`: the spread's and that of alphas below the
-    mask, as there is no surface yet to be made sharp or opaque at first.
+    """A loss weight that rises linearly from 0 to `last`: of the spread, and of alphas below the
+    mask. At first there is no surface that these could make sharp or opaque.
     """
     return last * step / steps
 
 
 def ema_start(steps: int) -> int:
-    """The step after which the averages begin."""
+    """The step after which the EMA begins."""
     return 17 * steps // 20
 
 

@@ -1,5 +1,5 @@
-"""Smoothing of the SH coefficients over the grid, beside the optimiser, whose moments it leaves
-alone.
+"""Smoothing: pulls the SH coefficients of each point towards the mean of its grid neighbours, apart
+from the optimiser, whose moments stay as they are.
 """
 
 import numpy as np
@@ -17,8 +17,8 @@ MOST_COEFFICIENTS = max(block.count for block in SH_BLOCKS)  # of one point in o
 
 
 def chunk_points(n: int, furthest: int) -> int:
-    """How many of n points are smoothed at a time where neighbours lie up to `furthest` rows apart:
-    a chunk is written back once the next one is computed, so no neighbour may lie further away.
+    """How many of n points are smoothed at a time, if neighbours lie up to `furthest` rows apart: a
+    chunk is written back after the next one is computed, so it must be at least that long.
     """
     return min(max(furthest, CHUNK), n)
 
@@ -43,7 +43,7 @@ class Smoother:
         self._buffers.require(self.table(n, self.chunk))
 
     def _furthest(self, n):
-        """How many rows the furthest of all neighbours lies after its point."""
+        """The largest distance of two neighbours, in rows."""
         runs = -(-n // REACH_RUN)
         furthest = self.dev.empty((runs,), np.uint32)
         _program(self.dev).launch(

@@ -1,5 +1,5 @@
-"""What training keeps for each point beside what is learned: moments, averages, and how much the
-point has weighed; and which points are pruned by it.
+"""The training state of each point: optimiser moments, EMA, highest blend weight and view count; and
+which points are pruned by the last two.
 """
 
 from __future__ import annotations
@@ -15,9 +15,9 @@ from pp_cl.settings import TrainConfig
 
 
 class PointState:
-    """Rows as in the cloud; all but the averages start as zeros.
+    """Arrays with one row per point of the cloud, in its order; they start as zeros.
 
-    averages: {name of PointCloud.learned(): EMA}, empty before Optimiser.update_ema().
+    averages: {name as in PointCloud.learned(): EMA}, empty until Optimiser.update_ema().
     """
 
     def __init__(self, dev: Device, cloud: PointCloud):
@@ -45,14 +45,14 @@ class PointState:
 
     @property
     def max_weight(self) -> Array:
-        """(N) float32: the highest blend weight in an image since the point was last judged, summed
-        over the pixels.
+        """(N) float32: the sum over an image's pixels of the point's blend weights, the highest of
+        all images since pruning last judged the point.
         """
         return self._arrays["max_weight"]
 
     @property
     def times_seen(self) -> Array:
-        """(N) float32: steps since then that had the point in their image, hidden or not."""
+        """(N) float32: number of those images that had a hit of the point, occluded or not."""
         return self._arrays["times_seen"]
 
     @property
@@ -62,7 +62,7 @@ class PointState:
 
     @property
     def last_step(self) -> Array:
-        """(N,) uint32: the step of each point's last gradient of its features, 0: none."""
+        """(N,) uint32: the last step in which the point's features had a gradient; 0: none yet."""
         return self._arrays["last_step"]
 
     @property
@@ -77,8 +77,8 @@ class PointState:
                 arrays[name] = compact_rows(dev, arrays[name], keep)
 
     def refine(self, dev: Device, parents: Array) -> None:
-        """Become the state of points that each take over that of point parents[i], (M,) uint32, but
-        for weights and looks, which start anew.
+        """Become the state of a refined cloud: point i takes over the state of parents[i], (M,)
+        uint32, but max_weight and times_seen start anew.
         """
         for arrays in (self._arrays, self.averages):
             for name in arrays:
@@ -93,20 +93,21 @@ class PointState:
 
 
 def split_opacity(dev: Device, opacity: Array) -> None:
-    """Replace every opacity o in [0, 1], (N,) float32, by 1 - sqrt(1 - o), in place: of the points
-    of a refined grid two lie behind one another in place of one, and let as much light through.
+    """Replace every opacity o in [0, 1], (N,) float32, by 1 - sqrt(1 - o), in place. On a refined
+    grid a ray crosses two points where it crossed one, and their transmittances multiply to 1 - o.
     """
     n = len(opacity)
     dev.program("training/refine").launch("split_opacity", n, n=n, opacity=opacity)
 
 
 def points_to_keep(dev: Device, state: PointState, opacity: Array, settings: TrainConfig) -> Array:
-    """(M,) uint32, ascending: the points that stay in the course of training. One that was seen in
-    train.prune_looks steps must have weighed train.prune_weight in one of them, and have
-    train.prune_opacity; its counts start anew. Others stay.
+    """(M,) uint32, ascending: the points that are kept during training. A point is judged once
+    train.prune_looks steps had it in their image: it is kept if its blend weight reached
+    train.prune_weight in one of them and its opacity is at least train.prune_opacity, and its
+    counts start anew. Points seen less often are kept.
 
-    A mean over the steps would drop what few views see, such as the inside of a gap. Raises
-    Diverged for weights and opacities that are not finite: nothing would tell of them later.
+    The maximum decides, as a mean would drop what few views see, such as the inside of a gap.
+    Raises Diverged for weights and opacities that are not finite, which nothing later would find.
     """
     weight, seen, opacity = map(dev.download, (state.max_weight, state.times_seen, opacity))
     broken = int((~np.isfinite(weight) | ~np.isfinite(opacity)).sum())
@@ -133,7 +134,7 @@ def final_points_to_keep(
 
 
 def _listed(dev, keep, weight):
-    """Indices of the points to keep; the heaviest (the first of several) where none would be."""
+    """Indices of the points to keep; if there are none, that of the highest weight."""
     indices = np.flatnonzero(keep)
     if indices.size == 0:
         indices = [np.argmax(np.nan_to_num(weight, nan=-np.inf))]

@@ -1,1 +1,1 @@
-"""A run in the browser: `pp-cl view`."""
+"""The viewer of `pp-cl view`: a run in the browser, also while it trains."""

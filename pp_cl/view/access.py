@@ -1,4 +1,4 @@
-"""Who may talk to the server: token, Host and Origin are checked before anything else.
+"""Access control of the viewer's server: token, Host and Origin are checked before anything else.
 
 A page of another site can make a browser send requests here, and a name that its owner points at
 127.0.0.1 makes them look like requests of the same site (DNS rebinding). Such requests lack the

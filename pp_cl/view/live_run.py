@@ -1,5 +1,5 @@
-"""What the viewer shows: the last checkpoint of a run, drawn for a camera, and the log; both are
-read again when they change.
+"""The run that the viewer shows: renders its last checkpoint and reads its log, again when they
+change.
 """
 
 from __future__ import annotations

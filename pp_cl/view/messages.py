@@ -1,4 +1,4 @@
-"""Reads what a browser tab asks for, trusting nothing of it, and packs the answers."""
+"""The websocket messages of the viewer: checks what a browser asks for, and packs the answers."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Depth, normals, hits and errors of a view as 8-bit images, DARK where there is no object."""
+"""Turns depth, normals, hits and errors of a view into 8-bit images; DARK without an object."""
 
 import io
 
