@@ -1,5 +1,5 @@
-"""The training loss: smooth L1 and SSIM of the rendered crop with their gradient, the mask term, and
-the sum of all terms, which stay on the device until they are read.
+"""The training loss: smooth L1 and SSIM of the rendered crop with their gradient, the mask term,
+and the sum of all terms, which stay on the device until they are read.
 """
 
 import math
@@ -239,8 +239,8 @@ class MaskLoss:
     """weight * mean (alpha - mask)^2, where pixels whose alpha is below the mask count less if a
     call says so; holds its scratch buffers.
 
-    Without it points spread half a spacing beyond the outline, and the network hides them; what
-    looks like the white that it paints over stays transparent.
+    Without it the points reach half a spacing beyond the outline, where the network paints them
+    white, and white parts of the object stay transparent.
     """
 
     def __init__(self, dev: Device, weight: float):

@@ -1,5 +1,5 @@
-"""The training state of each point: optimiser moments, EMA, highest blend weight and view count; and
-which points are pruned by the last two.
+"""The training state of each point: optimiser moments, EMA, highest blend weight and view count;
+and which points are pruned by the last two.
 """
 
 from __future__ import annotations
