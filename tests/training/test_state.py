@@ -88,7 +88,7 @@ def test_only_what_was_seen_is_judged(dev):
     state = PointState(dev, cloud)
     state.max_weight.set(np.float32([0, 0, 0.09, 0.1, 100, 0]))
     state.times_seen.set(np.float32([9, 10, 10, 10, 1000, 10]))
-    opacity = dev.upload(np.float32([0, 1, 1, 1, 1, 1]))
+    opacity = dev.upload(np.float32([0, 1, 1, 0.01, 1, 1]))
     assert points_to_keep(dev, state, opacity, settings).get().tolist() == [0, 3, 4]
     assert state.times_seen.get().tolist() == [9, 0, 0, 0, 0, 0]
     assert not state.max_weight.get().any()
