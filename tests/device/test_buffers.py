@@ -16,6 +16,8 @@ from pp_cl.device.buffers import (
     table_bytes,
 )
 
+pytestmark = pytest.mark.kernels  # of rows.cl
+
 TABLE = {"place": ((5, 4), np.float32), "box": ((5, 4), np.uint16)}
 
 

@@ -17,6 +17,8 @@ from pp_cl.layers.simple import (
 from pp_cl.network.unet import UNet
 from pp_cl.reference import network
 
+pytestmark = pytest.mark.kernels  # of gate.cl, output.cl and resample.cl
+
 
 def run(dev, x, grad_out):
     """(output, gradient of x) from the device, as float32."""

@@ -16,6 +16,8 @@ from pp_cl.session import open_training
 from pp_cl.settings import TrainConfig
 from pp_cl.training.state import PointState, final_points_to_keep, points_to_keep
 
+pytestmark = pytest.mark.kernels  # of refine.cl
+
 
 def kept(dev, weights, least_weight, opacities, least_opacity):
     settings = TrainConfig(final_prune_weight=least_weight, prune_opacity=least_opacity)
