@@ -22,6 +22,7 @@ PRESETS = {
         # Stated by the supplemental, as are the defaults of raster.gamma, train.sh_rate and its
         # decay, and the delays of 0, 500 and 1000 steps.
         "points.count": 4_000_000,
+        "points.spacing": 0.0,
         "points.opacity": 1.0,
         "raster.blend": "softmax",
         "raster.footprint": "disc",

@@ -29,7 +29,7 @@ from pp_cl.presets import SHORT
 from pp_cl.run import Run, load_run
 from pp_cl.scene.agreement import disagreements, listing
 from pp_cl.scene.grid import Grid
-from pp_cl.scene.hull import build_grid, depth_range
+from pp_cl.scene.hull import agreeing, build_grid, depth_range, spacing_pixels
 from pp_cl.scene.identity import difference, identity
 from pp_cl.scene.load import measured_split, open_scene, preset_downscale, scene_box, scene_frames
 from pp_cl.scene.outline import picture
@@ -37,10 +37,15 @@ from pp_cl.scene.views import View
 from pp_cl.train import Trainer
 from pp_cl.training.checkpoint import load_run_state, opened_run
 from pp_cl.training.memory import Room
+from pp_cl.training.schedule import refine_steps
 
 FIRST_PREVIEW = 10.0  # seconds; with a slow step and its writing it shows within 20
 MEASURED_VIEWS = 4
 NEVER = (1.0, 1.0)  # train.refine_at
+# train.refine_at of a training that must refine so many times to reach points.spacing, and how much
+# finer than that it may end
+REFINE_AT = {1: (0.3, 1.0), 2: (0.33, 0.67)}
+LEAST_SPACING = 0.85
 
 Stored = tuple[dict[str, Any], dict[str, np.ndarray]]  # header and arrays of a checkpoint
 OnStep = Callable[[int, dict[str, Any] | None], None]
@@ -248,23 +253,34 @@ def open_training(
     if config.train.eval_every:
         split = measured_split(config.scene.path)  # val, else test
         measured = open_scene(dev, config, (split,), most=MEASURED_VIEWS).splits[split]
+    if stored and (mismatch := difference(header, views, views)):
+        raise UserError(
+            f"{folder.checkpoint}: belongs to another scene than {config.scene.path} ({mismatch});"
+            " use another --out"
+        )
+    info = identity(views)
+    views, left_out, forgiven = agreeing(dev, views, scene_box(config))
+    if left_out:
+        worst = listing([f"{name} ({share:.0%} of it)" for name, share in left_out.items()])
+        warnings.warn(
+            f"masks beside the object that the others show, left out of the training: {worst}",
+            stacklevel=2,
+        )
     if stored is None:
-        trainer, hull = _start(config, views, net, room)
+        trainer, hull = _start(config, views, net, room, forgiven)
         points = trainer.model.cloud.count
     else:
-        trainer, hull = _resume(goal, views, net, stored, begun, file=folder.checkpoint), None
+        trainer, hull = _resume(goal, views, net, stored, begun), None
         points = header["initial_points"]
-    info = identity(views) | {"initial_points": points, "tuning": policy.tuning}
+    info |= {"initial_points": points, "tuning": policy.tuning}
     info |= {"extended_from": begun} if begun else {}
     return Training(folder, config, trainer, info, room, hull, policy.origin, measured)
 
 
-def _start(config, views, net, room):
+def _start(config, views, net, room, forgiven):
     """(Trainer, HullFacts) of a training from its beginning."""
     dev, points, start = net.dev, config.points, time.perf_counter()
-    hull = build_grid(dev, views, points.count, scene_box(config))
-    near_far = depth_range(views, hull)
-    room.check_points(hull.grid, len(hull.ids), near_far)
+    hull, near_far = _first_level(dev, config, views, room, forgiven)
     seconds = time.perf_counter() - start
     facts = HullFacts(hull.capped, seconds, _picture_of_disagreements(dev, views, hull))
     model = Model.create(
@@ -277,6 +293,33 @@ def _start(config, views, net, room):
         opacity=points.opacity,
     )
     return Trainer(dev, config, model, views), facts
+
+
+def _first_level(dev, config, views, room, forgiven):
+    """(Hull, (near, far)) to start from. Where points.count points would end with a spacing above
+    points.spacing, config.train.refine_at becomes that of more refinements, and the hull that from
+    which they lead there, if there is memory for it.
+    """
+    points, train, box = config.points, config.train, scene_box(config)
+    hull = build_grid(dev, views, points.count, box, forgiven)
+    spacing = spacing_pixels(hull.grid, [view.camera for view in views])
+    times = 0
+    if points.spacing:
+        times = max(0, min(math.ceil(math.log2(spacing / points.spacing)), max(REFINE_AT)))
+    asked = train.refine_at
+    if times > len(refine_steps(train)):
+        train.refine_at = REFINE_AT[times]
+        first = np.clip(spacing, *(2**times * points.spacing * np.array([LEAST_SPACING, 1])))
+        finer = build_grid(dev, views, round(points.count * (spacing / first) ** 3), box, forgiven)
+        near_far = depth_range(views, finer)
+        try:
+            room.check_points(finer.grid, len(finer.ids), near_far)
+            return finer, near_far
+        except UserError:
+            train.refine_at = asked
+    near_far = depth_range(views, hull)
+    room.check_points(hull.grid, len(hull.ids), near_far)
+    return hull, near_far
 
 
 def _picture_of_disagreements(dev, views, hull):
@@ -293,16 +336,11 @@ def _picture_of_disagreements(dev, views, hull):
     return picture(dev, views, hull, found)
 
 
-def _resume(config, views, net, stored, begun, *, file):
+def _resume(config, views, net, stored, begun):
     """Trainer of a training that resumes. begun: the last step of the finished training that it
     extends, 0 if it extends none.
     """
     header, arrays = stored
-    path = config.scene.path
-    if mismatch := difference(header, views, views):
-        raise UserError(
-            f"{file}: belongs to another scene than {path} ({mismatch}); use another --out"
-        )
     for name, array in arrays.items():
         if array.dtype == np.float16:  # of a compressed run
             arrays[name] = array.astype(np.float32)

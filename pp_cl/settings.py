@@ -53,6 +53,13 @@ class PointsConfig:
     """The point cloud."""
 
     count: int = setting(250_000, "points wanted in the visual hull", 1, 2**27)
+    spacing: float = setting(
+        1.5,
+        "pixels, at most, between points of the last level: coarser scenes are refined more often"
+        " than train.refine_at says (0: never)",
+        0,
+        1e6,
+    )
     opacity: float = setting(0.1, "opacity of all points before training", 0, 1)
     sh_degree: int = setting(
         2, "degree of the spherical harmonics (SH): 0 (the same from all sides), 1 or 2", 0, 2

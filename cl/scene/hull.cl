@@ -29,14 +29,17 @@ kernel void pack_mask(
 }
 
 // One work-item per word of 32 vertices along x: projects them into the views, one view after the
-// other until all are rejected, writes the set of those that some image sees and no mask rejects. A
-// vertex outside of an image or behind its camera is not rejected by it.
+// other until all are rejected too often, writes the set of those that at least `least` images see
+// and that no more masks reject than `forgiven` of all views, or the same share of those that see
+// it. A vertex outside of an image or behind its camera is not seen by it.
 kernel void carve(
     const uint nx,
     const uint ny,
     const uint rows,   // grid rows: ny * nz
     const uint words,  // words per grid row
     const uint views,
+    const uint least,                  // images
+    const uint forgiven,               // masks
     global const float4 *projections,  // (views, 3, 4) (i, j, k, 1) -> (u w, v w, w)
     global const uint4 *view_masks,    // (views, 4) width, height, words per row, first word
     global const uint *masks,          // (M)
@@ -45,28 +48,33 @@ kernel void carve(
     const uint word = get_global_id(0), row = get_global_id(1);
     if (word >= words || row >= rows) return;
     const float4 first = (float4)(32.0f * word, row % ny, row / ny, 1.0f);
-    uint alive = nx - 32 * word < 32 ? (1u << (nx - 32 * word)) - 1 : ~0u;
-    uint seen = 0;
+    const uint count = min(nx - 32 * word, 32u);
+    ushort seen[32], rejected[32];
+    for (uint b = 0; b < 32; b++)
+        seen[b] = rejected[b] = 0;
+    uint alive = 1;
     for (uint view = 0; view < views && alive; view++) {
         const float4 pu = projections[3 * view], pv = projections[3 * view + 1],
                      pw = projections[3 * view + 2];
         const float u0 = dot(pu, first), v0 = dot(pv, first), w0 = dot(pw, first);
         const uint4 mask = view_masks[view];
         const float width = mask.x, height = mask.y;
-        uint rejected = 0, inside = 0;
+        alive = 0;
         for (uint b = 0; b < 32; b++) {
             const float w = w0 + pw.x * b;
             const float u = (u0 + pu.x * b) / w, v = (v0 + pv.x * b) / w;
             const uint in = w > 0 && u >= 0 && u < width && v >= 0 && v < height;
             const uint x = in ? (uint)u : 0, y = in ? (uint)v : 0;
             const uint on = masks[mask.w + y * mask.z + (x >> 5)] >> (x & 31);
-            inside |= in << b;
-            rejected |= (in & ~on & 1) << b;
+            seen[b] += in;
+            rejected[b] += in & ~on & 1;
+            alive |= rejected[b] <= forgiven;
         }
-        seen |= inside;
-        alive &= ~rejected;
     }
-    bits[row * words + word] = alive & seen;
+    uint kept = 0;
+    for (uint b = 0; b < count; b++)
+        kept |= (uint)(seen[b] >= least && views * rejected[b] <= forgiven * seen[b]) << b;
+    bits[row * words + word] = kept;
 }
 
 // One work-item per grid row: reads its words, writes how many vertices are set, the first and the

@@ -3,9 +3,11 @@
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 from pyopencl.array import Array
+from skimage.morphology import closing, dilation, disk
 
 from pp_cl.device.device import Device
 from pp_cl.errors import UserError
@@ -13,7 +15,7 @@ from pp_cl.scene.agreement import explain_empty_hull
 from pp_cl.scene.bounds import bounding_box, reach_of
 from pp_cl.scene.camera import Camera
 from pp_cl.scene.grid import Grid, smallest_edge
-from pp_cl.scene.views import MASK_THRESHOLD, View
+from pp_cl.scene.views import MASK_THRESHOLD, View, fitting_downscale
 
 # PlenopticPoints supplemental, Table 4: all grids stay below it, one of them short of points
 CELL_CAP = 2**27
@@ -24,6 +26,14 @@ TOLERANCE = 1.02  # a count of 1 to this many times the points asked for ends th
 # half-diagonals of the hull from its centre to near and to far: about the published range of 4 for
 # lego
 DEPTH_MARGIN = 1.25
+LEAST_SEEING = 3  # images that see a vertex: what lies behind the object is in few
+# A view is left out if more than this share of its mask, and several times the usual, is beside
+# the hull: masks moved by 3 % of the image have 0.05 to 0.2 there, right ones 0.04 at most.
+MOST_BESIDE, TIMES_USUAL = 0.06, 3.0
+# The mean share beside the hull for which masks are forgiven, one more until it is less or one
+# in FORGIVING is: rendered masks have 0.002, those of photographs up to 0.1.
+MOST_MISSED, FORGIVING = 0.005, 8
+COMPARED_POINTS, COMPARED_SIZE = 60_000, 128  # pixels of the images in which this is looked up
 VERTEX_WORK = 10  # multiply-adds that project a vertex into a view, and find its pixel
 CORNER_BITS = 16  # the corner that carving counts from: whole 2^-16 of the size of the eyes' box
 
@@ -101,8 +111,10 @@ class Carver:
             )
         self.view_masks = dev.upload(table, np.uint32)
 
-    def carve(self, grid: Grid) -> Carving:
-        """The vertices of a grid that some image sees and no mask rejects."""
+    def carve(self, grid: Grid, forgiven: int = 0) -> Carving:
+        """The vertices of a grid that enough images see and no more masks than `forgiven` reject,
+        or the same share of those that see one.
+        """
         nx, ny, nz = grid.dims
         rows, words = ny * nz, -(-nx // 32)
         projections = self.dev.upload(
@@ -120,6 +132,8 @@ class Carver:
             rows=rows,
             words=words,
             views=len(self.cameras),
+            least=min(LEAST_SEEING, len(self.cameras)),
+            forgiven=forgiven,
             projections=projections,
             view_masks=self.view_masks,
             masks=self.masks,
@@ -154,15 +168,19 @@ class Carver:
 
 
 def build_grid(
-    dev: Device, views: Sequence[View], points: int, box: np.ndarray | None = None
+    dev: Device,
+    views: Sequence[View],
+    points: int,
+    box: np.ndarray | None = None,
+    forgiven: int = 0,
 ) -> Hull:
     """Hull with about `points` vertices: the rule that fits Table 4 of the PlenopticPoints
     supplemental.
 
     views: of any sizes; their stored images and cameras are used. box: (2, 3), which holds all
     vertices; None: what the masks allow, and where no view has one what all cameras see. A vertex
-    is inside if some image sees it and each one that does has an alpha above MASK_THRESHOLD in the
-    3x3 pixels around it.
+    is inside if LEAST_SEEING images see it and each one that does has an alpha above MASK_THRESHOLD
+    in the 3x3 pixels around it, but for `forgiven` of all views (agreeing()).
     The search starts from the box that the masks allow and rescales the edge from the measured
     count, until the count is `points` to 1.02 points. At CELL_CAP vertices of the grid, or after
     8 rounds, the best carving is taken: the smallest with enough points, else the largest. Raises
@@ -179,8 +197,20 @@ def build_grid(
         )
     corner = _corner(views, reach_of(views))
     near = [view.moved(-corner) for view in views]
-    hull = _search(dev, near, points, bounding_box(near) if box is None else box - corner)
+    box = _box(near, None if box is None else box - corner)
+    hull = _search(dev, near, points, box, forgiven)
     return replace(hull, grid=hull.grid.moved(corner))
+
+
+def _box(views, given):
+    """The box to search: what the masks allow of the given one, or it alone where there are none."""
+    if given is not None and not views[0].has_mask:
+        return given
+    box = bounding_box(views)
+    if given is None:
+        return box
+    shared = np.stack([np.maximum(box[0], given[0]), np.minimum(box[1], given[1])])
+    return shared if (shared[0] < shared[1]).all() else given
 
 
 def _corner(views, reach):
@@ -192,12 +222,12 @@ def _corner(views, reach):
     return unit * np.floor(eyes.min(0) / unit)
 
 
-def _search(dev, views, points, box):
+def _search(dev, views, points, box, forgiven):
     """The Hull of build_grid() in a box."""
     carver = Carver(dev, _farthest_point_order(views, box.mean(0)))
 
     def carve(edge):
-        return carver.carve(Grid.centred_in(box, edge).rounded())
+        return carver.carve(Grid.centred_in(box, edge).rounded(), forgiven)
 
     best = last = carve(smallest_edge(box, min(COARSE_CELLS, CELL_CAP)))
     capped, rounds = False, 0
@@ -246,6 +276,81 @@ def spacing_pixels(grid: Grid, cameras: Sequence[Camera]) -> float:
     distances = [np.linalg.norm(camera.eye - grid.centre) for camera in cameras]
     pixels = [c.fx * grid.edge / d for c, d in zip(cameras, distances, strict=True)]
     return float(np.mean(pixels))
+
+
+def silhouette(grid: Grid, ids: np.ndarray, camera: Camera) -> np.ndarray:
+    """(H, W) bool: the pixels that the points with these ids (N,) cover, gaps between neighbours
+    closed.
+    """
+    gap = math.ceil(spacing_pixels(grid, [camera])) + 1
+    x, y, depth = project(camera, grid.positions(ids))
+    columns, rows = np.floor(x) + gap, np.floor(y) + gap
+    marked = np.zeros((camera.height + 2 * gap, camera.width + 2 * gap), bool)
+    inside = (depth > 0) & (columns >= 0) & (columns < marked.shape[1])
+    inside &= (rows >= 0) & (rows < marked.shape[0])
+    marked[rows[inside].astype(int), columns[inside].astype(int)] = True
+    return closing(marked, disk(gap))[gap:-gap, gap:-gap]
+
+
+def project(camera: Camera, positions: np.ndarray) -> np.ndarray:
+    """(3, N) float64: x and y in pixels and the depth of (N, 3) world positions; those that are not
+    in front of the camera are in its centre.
+    """
+    right, down, depth = camera.pose[:, :3].T @ (positions - camera.eye).T
+    ahead = np.where(depth > 0, depth, np.inf)
+    return np.stack(
+        [camera.fx * right / ahead + camera.cx, camera.fy * down / ahead + camera.cy, depth]
+    )
+
+
+class Agreement(NamedTuple):
+    """views: those whose masks agree. left_out: {name: share of its mask} of the others. forgiven:
+    how many masks may reject a vertex, as build_grid() takes it.
+    """
+
+    views: list[View]
+    left_out: dict[str, float]
+    forgiven: int
+
+
+def agreeing(dev: Device, views: Sequence[View], box: np.ndarray | None = None) -> Agreement:
+    """How far masks agree, by what share of each lies where their hull does not.
+
+    The hull of masks that agree covers all of them. Where a mask lies beside it by MOST_BESIDE and
+    several times the usual share, it belongs to another place or another camera, and is left out.
+    Where all do a little, masks are wrong here and there: then as many are forgiven as it takes.
+    box: as build_grid() takes it. Raises UserError as build_grid() does.
+    """
+    kept, left_out = list(views), {}
+    if not kept[0].has_mask or _shares_beside(dev, kept, box, 0).max() <= MOST_BESIDE / 2:
+        return Agreement(kept, left_out, 0)
+    most = len(kept) // FORGIVING
+    while len(left_out) < most:
+        shares = _shares_beside(dev, kept, box, most // 2)
+        worst = int(shares.argmax())
+        if shares[worst] <= max(MOST_BESIDE, TIMES_USUAL * np.median(shares)):
+            break
+        left_out[kept.pop(worst).name] = float(shares[worst])
+    for forgiven in range(most + 1):
+        if _shares_beside(dev, kept, box, forgiven).mean() <= MOST_MISSED:
+            break
+    return Agreement(kept, left_out, forgiven)
+
+
+def _shares_beside(dev, views, box, forgiven):
+    """(V,) the share of each view's mask that is further than a pixel of its image, reduced to
+    COMPARED_SIZE, from the silhouette of their hull.
+    """
+    hull = build_grid(dev, views, COMPARED_POINTS, box, forgiven)
+    shares = []
+    for view in views:
+        size = view.stored_camera.width, view.stored_camera.height
+        small = replace(view, downscale=fitting_downscale(size, COMPARED_SIZE))
+        camera, k = small.camera, small.downscale
+        mask = view.image[: camera.height * k : k, : camera.width * k : k, 3] > 127
+        covered = dilation(silhouette(hull.grid, hull.ids, camera), disk(1))
+        shares.append((mask & ~covered).sum() / max(mask.sum(), 1))
+    return np.array(shares)
 
 
 def _farthest_point_order(views, centre):

@@ -37,8 +37,9 @@ from pp_cl.scene.views import (
 DEMO = "demo"  # the word that names the scene which the program makes itself
 
 # One module per format. FILES names the files it reads, recognises(folder) tells whether a folder
-# holds such files, splits(folder) names its splits, and read_split(folder, split) gives a list of
-# Photograph of one of them without reading pixels. The first that recognises a folder reads it.
+# holds such files, splits(folder) names its splits, read_split(folder, split) gives a list of
+# Photograph of one of them without reading pixels, and box(folder), which only some have, the box
+# that the files state around the object. The first that recognises a folder reads it.
 READERS = (transforms, co3d, neus, nsvf, colmap, llff)
 
 # Bytes per pixel of what reading takes at its peak, measured with 12 megapixels: decoding and a
@@ -112,12 +113,14 @@ def mask_rule(config: Config) -> MaskRule:
 
 
 def scene_box(config: Config) -> np.ndarray | None:
-    """(2, 3) lower and upper corner of the setting scene.box, None where there is none. Raises
-    UserError for a box without volume.
+    """(2, 3) lower and upper corner of the setting scene.box, else of the box that the scene's
+    format states, None where there is none. Raises UserError for a box without volume.
     """
     corners = np.array(config.scene.box, np.float64).reshape(2, 3)
     if not corners.any():
-        return None
+        path = config.scene.path
+        stated = None if path == DEMO else getattr(find_reader(path), "box", None)
+        return stated and stated(Path(path))
     box = np.stack([corners.min(0), corners.max(0)])
     if not (box[1] > box[0]).all():
         raise UserError("scene.box: its corners must differ in x, y and z")

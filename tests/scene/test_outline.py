@@ -6,7 +6,8 @@ from support.ball_views import CENTRE, RADIUS, ball_camera, ball_view
 
 from pp_cl.scene.camera import Camera
 from pp_cl.scene.grid import Grid
-from pp_cl.scene.outline import outline, silhouette
+from pp_cl.scene.hull import silhouette
+from pp_cl.scene.outline import outline
 
 
 def ball_points(per_radius, shell=False):

@@ -68,6 +68,11 @@ def find_image(folder: Path, given: str, fail: Fail, endings: Sequence[str] = ("
     raise fail(f"no image at {given[:80]!r}{tried}; copy it there or remove the frame")
 
 
+def first_folder(folder: Path, names: Sequence[str]) -> str:
+    """The first of the names that is a folder there; where none is, the first."""
+    return next((name for name in names if (folder / name).is_dir()), names[0])
+
+
 def folder_images(folder: Path, name: str) -> list[str]:
     """Paths relative to the scene's folder of the images in its folder `name`, sorted,
     hidden files left out. Raises UserError where there are none.
@@ -84,11 +89,15 @@ def folder_images(folder: Path, name: str) -> list[str]:
 
 
 def mask_names(image: str) -> list[str]:
-    """What the mask of an image may be called in a folder of masks: its path there with .png added,
-    or with any ending of an image in place of its own.
+    """What the mask of an image may be called in a folder of masks, as programs write them: its
+    path there with .png added, or its stem, maybe with _mask behind or mask_ before it, with the
+    ending of any image.
     """
     path = PurePosixPath(image)
-    return [f"{image}.png", *(str(path.with_suffix(ending)) for ending in ENDINGS)]
+    endings = [cased for ending in ENDINGS for cased in (ending, ending.upper())]
+    stems = (path.stem, f"{path.stem}_mask", f"mask_{path.stem}")
+    names = (f"{stem}{ending}" for stem in stems for ending in endings)
+    return [f"{image}.png", *(str(path.with_name(name)) for name in names)]
 
 
 def find_mask(folder: Path, masks: str, image: str, fail: Fail) -> str | None:

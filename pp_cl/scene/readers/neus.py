@@ -1,5 +1,6 @@
 """Reader of scenes as IDR and NeuS have them, DTU among them: cameras_sphere.npz or cameras.npz
-with world_mat_i = K [R | t], images in image/, masks in mask/, all in the order of their names.
+with world_mat_i = K [R | t], images in image/ (or images/), masks in mask/ (or masks/), all in the
+order of their names.
 """
 
 import re
@@ -14,6 +15,7 @@ from pp_cl.scene.camera import Camera
 from pp_cl.scene.readers.common import (
     SPLITS,
     fail_at,
+    first_folder,
     folder_images,
     hold_out,
     read_npz,
@@ -22,7 +24,7 @@ from pp_cl.scene.views import Photograph
 
 FILES = "cameras_sphere.npz (NeuS, DTU)"
 CAMERAS = ("cameras_sphere.npz", "cameras.npz")
-IMAGES, MASKS = "image", "mask"
+IMAGES, MASKS = ("image", "images"), ("mask", "masks")
 MOST_SKEW = 1e-3  # pixels of shear over the image; more is no camera of ours
 
 
@@ -45,11 +47,12 @@ def read_split(folder: Path, split: str) -> list[Photograph]:
     """
     file = _file(folder)
     cameras, scales = read_npz(file, "world_mat_"), read_npz(file, "scale_mat_")
-    names = folder_images(folder, IMAGES)
+    images = first_folder(folder, IMAGES)
+    names = folder_images(folder, images)
     count = sum(re.fullmatch(r"world_mat_\d+", key) is not None for key in cameras)
     if count != len(names):
         raise UserError(
-            f"{file}: has {count} world_mat_i, but {IMAGES}/ has {len(names)} images; copy both"
+            f"{file}: has {count} world_mat_i, but {images}/ has {len(names)} images; copy both"
             " anew"
         )
     masks = _masks(folder, names)
@@ -67,6 +70,19 @@ def read_split(folder: Path, split: str) -> list[Photograph]:
     return read
 
 
+def box(folder: Path) -> np.ndarray | None:
+    """(2, 3) box around the sphere that holds the object, of the first camera: scale_mat makes it
+    of the unit sphere. None where the file has none. Raises UserError as read_split does.
+    """
+    file = _file(folder)
+    scales = read_npz(file, "scale_mat_")
+    if not scales:
+        return None
+    key = min(scales)
+    middle, radius = _sphere(scales[key], fail_at(file, key))
+    return np.stack([middle - radius, middle + radius])
+
+
 def _file(folder):
     return next((folder / name for name in CAMERAS if (folder / name).is_file()), None)
 
@@ -75,13 +91,14 @@ def _masks(folder, names):
     """The mask of each image, None where there is no folder of masks. The order pairs them, since
     DTU has image/000000.png and mask/000.png. Raises UserError for numbers that do not agree.
     """
-    if not (folder / MASKS).is_dir():
+    place = first_folder(folder, MASKS)
+    if not (folder / place).is_dir():
         return [None] * len(names)
-    masks = folder_images(folder, MASKS)
+    masks = folder_images(folder, place)
     if len(masks) != len(names):
         raise UserError(
-            f"{folder / MASKS}: has {len(masks)} masks, but {IMAGES}/ has {len(names)} images; add"
-            " the missing ones, or remove the folder"
+            f"{folder / place}: has {len(masks)} masks for {len(names)} images; add the missing"
+            " ones, or remove the folder"
         )
     for name, mask in zip(names, masks, strict=True):
         stems = [Path(path).stem for path in (name, mask)]
@@ -116,13 +133,21 @@ def _camera(matrix, size, fail):
 
 
 def _depth_range(matrix, camera, fail):
-    """(near, far) of the sphere that the matrix makes of the unit sphere. Raises fail(text)."""
+    """(near, far) of the sphere around the object. Raises fail(text)."""
+    middle, radius = _sphere(matrix, fail)
+    distance = np.linalg.norm(camera.eye - middle)
+    return float(max(distance - radius, 1e-3 * radius)), float(distance + radius)
+
+
+def _sphere(matrix, fail):
+    """((3,) middle, radius) of the sphere that a matrix makes of the unit sphere. Raises
+    fail(text).
+    """
     if matrix.shape != (4, 4):
         raise fail(f"has shape {matrix.shape}; must be 4x4 numbers")
     radius = abs(np.linalg.det(matrix[:3, :3])) ** (1 / 3)
-    distance = np.linalg.norm(camera.eye - matrix[:3, 3])
     if radius == 0 or not np.allclose(
         matrix[:3, :3] @ matrix[:3, :3].T, radius**2 * np.eye(3), atol=1e-3 * radius**2
     ):
         raise fail("is no scaling; leave it out")
-    return float(max(distance - radius, 1e-3 * radius)), float(distance + radius)
+    return matrix[:3, 3], radius

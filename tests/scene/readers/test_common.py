@@ -120,7 +120,7 @@ def test_images_of_a_folder_are_sorted_and_nothing_else_is_one(tmp_path):
     assert folder_images(tmp_path, "images") == ["images/a.PNG", "images/b.png"]
 
 
-@pytest.mark.parametrize("mask", ["a.jpg.png", "a.png", "a.jpeg"])
+@pytest.mark.parametrize("mask", ["a.jpg.png", "a.png", "a.jpeg", "a_mask.JPG", "mask_a.png"])
 def test_a_mask_is_named_like_its_image(tmp_path, mask):
     assert find_mask(tmp_path, "masks", "sub/a.jpg", FAIL) is None
     (tmp_path / "masks" / "sub").mkdir(parents=True)
