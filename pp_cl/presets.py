@@ -7,7 +7,6 @@ PRESETS = {
     "small": {
         "points.count": 170_000,
         "train.iterations": 6_000,
-        "train.refine_at": (0.35, 1.0),
         "train.crop": 160,
     },
     # for 800 x 800: begins at a quarter of the size, where fog clears at little cost
@@ -15,14 +14,12 @@ PRESETS = {
         "points.count": 170_000,
         "raster.radius": 0.75,  # 1 takes longer here, for 0.2 dB less
         "train.iterations": 11_000,
-        "train.refine_at": (0.33, 0.67),
         "train.crop": 256,
     },
     "paper": {
         # Stated by the supplemental, as are the defaults of raster.gamma, train.sh_rate and its
         # decay, and the delays of 0, 500 and 1000 steps.
         "points.count": 4_000_000,
-        "points.spacing": 0.0,
         "points.opacity": 1.0,
         "raster.blend": "softmax",
         "raster.footprint": "disc",
@@ -49,6 +46,7 @@ PRESETS = {
         "train.mask_weight": 0.0,
         "train.spread_weight": 0.0,
         "train.prune_every": 500,
+        "train.refine_at": (1.0, 1.0),
         "train.checkpoint_every": 5000,
     },
 }

@@ -37,15 +37,14 @@ from pp_cl.scene.views import View
 from pp_cl.train import Trainer
 from pp_cl.training.checkpoint import load_run_state, opened_run
 from pp_cl.training.memory import Room
-from pp_cl.training.schedule import refine_steps
 
 FIRST_PREVIEW = 10.0  # seconds; with a slow step and its writing it shows within 20
 MEASURED_VIEWS = 4
-NEVER = (1.0, 1.0)  # train.refine_at
-# train.refine_at of a training that must refine so many times to reach points.spacing, and how much
-# finer than that it may end
-REFINE_AT = {1: (0.3, 1.0), 2: (0.33, 0.67)}
-LEAST_SPACING = 0.85
+OPEN, NEVER = (0.0, 0.0), (1.0, 1.0)  # train.refine_at
+# train.refine_at by how often the grid is refined, until points are FINEST to COARSEST pixels apart
+REFINE_AT = (NEVER, (0.35, 1.0), (0.33, 0.67))
+FINEST, COARSEST = 1.25, 1.5
+LEAST_SIDE = 48  # pixels of the images that a training begins on, if it is to refine
 
 Stored = tuple[dict[str, Any], dict[str, np.ndarray]]  # header and arrays of a checkpoint
 OnStep = Callable[[int, dict[str, Any] | None], None]
@@ -259,30 +258,24 @@ def open_training(
             " use another --out"
         )
     info = identity(views)
-    views, left_out, forgiven = agreeing(dev, views, scene_box(config))
-    if left_out:
-        worst = listing([f"{name} ({share:.0%} of it)" for name, share in left_out.items()])
-        warnings.warn(
-            f"masks beside the object that the others show, left out of the training: {worst}",
-            stacklevel=2,
-        )
+    agreement = agreeing(dev, views, scene_box(config))
     if stored is None:
-        trainer, hull = _start(config, views, net, room, forgiven)
+        trainer, hull = _start(config, agreement, views, net, room)
         points = trainer.model.cloud.count
     else:
-        trainer, hull = _resume(goal, views, net, stored, begun), None
+        trainer, hull = _resume(goal, agreement.views, net, stored, begun), None
         points = header["initial_points"]
     info |= {"initial_points": points, "tuning": policy.tuning}
     info |= {"extended_from": begun} if begun else {}
     return Training(folder, config, trainer, info, room, hull, policy.origin, measured)
 
 
-def _start(config, views, net, room, forgiven):
+def _start(config, agreement, views, net, room):
     """(Trainer, HullFacts) of a training from its beginning."""
     dev, points, start = net.dev, config.points, time.perf_counter()
-    hull, near_far = _first_level(dev, config, views, room, forgiven)
+    hull, near_far = _first_level(dev, config, agreement, room)
     seconds = time.perf_counter() - start
-    facts = HullFacts(hull.capped, seconds, _picture_of_disagreements(dev, views, hull))
+    facts = HullFacts(hull.capped, seconds, _picture_of_masks(dev, views, hull, agreement.left_out))
     model = Model.create(
         dev,
         hull.grid,
@@ -292,48 +285,55 @@ def _start(config, views, net, room, forgiven):
         degree=points.sh_degree,
         opacity=points.opacity,
     )
-    return Trainer(dev, config, model, views), facts
+    return Trainer(dev, config, model, agreement.views), facts
 
 
-def _first_level(dev, config, views, room, forgiven):
-    """(Hull, (near, far)) to start from. Where points.count points would end with a spacing above
-    points.spacing, config.train.refine_at becomes that of more refinements, and the hull that from
-    which they lead there, if there is memory for it.
+def _first_level(dev, config, agreement, room):
+    """(Hull, (near, far)) to start from. Where train.refine_at leaves it open, it becomes what the
+    spacing asks for, and the hull has the spacing from which that leads to FINEST to COARSEST, as
+    far as there is memory for it.
     """
-    points, train, box = config.points, config.train, scene_box(config)
-    hull = build_grid(dev, views, points.count, box, forgiven)
-    spacing = spacing_pixels(hull.grid, [view.camera for view in views])
+    points, train, box = config.points.count, config.train, scene_box(config)
+    views, _, forgiven = agreement
+    hull = build_grid(dev, views, points, box, forgiven)
     times = 0
-    if points.spacing:
-        times = max(0, min(math.ceil(math.log2(spacing / points.spacing)), max(REFINE_AT)))
-    asked = train.refine_at
-    if times > len(refine_steps(train)):
+    if train.refine_at == OPEN:
+        spacing = spacing_pixels(hull.grid, [view.camera for view in views])
+        smallest = min(min(view.camera.width, view.camera.height) for view in views)
+        possible = [n for n in range(len(REFINE_AT)) if smallest >= LEAST_SIDE << n]
+        times = sum(spacing > COARSEST * 2**n for n in possible[:-1])
         train.refine_at = REFINE_AT[times]
-        first = np.clip(spacing, *(2**times * points.spacing * np.array([LEAST_SPACING, 1])))
-        finer = build_grid(dev, views, round(points.count * (spacing / first) ** 3), box, forgiven)
-        near_far = depth_range(views, finer)
+    if times:
+        first = min(max(spacing, 2**times * FINEST), 2**times * COARSEST)
+        fitting = round(points * (spacing / first) ** 3)
         try:
-            room.check_points(finer.grid, len(finer.ids), near_far)
-            return finer, near_far
+            return _checked(room, views, build_grid(dev, views, fitting, box, forgiven))
         except UserError:
-            train.refine_at = asked
+            train.refine_at = NEVER
+    return _checked(room, views, hull)
+
+
+def _checked(room, views, hull):
+    """(hull, its (near, far)). Raises UserError where a training with it does not fit."""
     near_far = depth_range(views, hull)
     room.check_points(hull.grid, len(hull.ids), near_far)
     return hull, near_far
 
 
-def _picture_of_disagreements(dev, views, hull):
+def _picture_of_masks(dev, views, hull, left_out):
     """Warn of masks that disagree with the others; return their picture, None if all agree."""
     found = disagreements(views, hull.grid.box)
-    if not found:
-        return None
-    worst = listing([f"{one.view.name} ({one.share:.0%} of it)" for one in found])
-    warnings.warn(
-        f"masks reject what the other views agree on: {worst}; see {MASKS_PICTURE} in the run's"
-        " folder",
-        stacklevel=2,
-    )
-    return picture(dev, views, hull, found)
+    rejecting = {one.view.name: one.share for one in found if one.view.name not in left_out}
+    for what, shares in (
+        ("lie beside what the other views agree on, and are left out of the training", left_out),
+        ("reject what the other views agree on", rejecting),
+    ):
+        if shares:
+            worst = listing([f"{name} ({share:.0%} of it)" for name, share in shares.items()])
+            warnings.warn(
+                f"masks {what}: {worst}; see {MASKS_PICTURE} in the run's folder", stacklevel=2
+            )
+    return picture(dev, views, hull, found) if found or left_out else None
 
 
 def _resume(config, views, net, stored, begun):

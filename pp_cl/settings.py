@@ -53,13 +53,6 @@ class PointsConfig:
     """The point cloud."""
 
     count: int = setting(250_000, "points wanted in the visual hull", 1, 2**27)
-    spacing: float = setting(
-        1.5,
-        "pixels, at most, between points of the last level: coarser scenes are refined more often"
-        " than train.refine_at says (0: never)",
-        0,
-        1e6,
-    )
     opacity: float = setting(0.1, "opacity of all points before training", 0, 1)
     sh_degree: int = setting(
         2, "degree of the spherical harmonics (SH): 0 (the same from all sides), 1 or 2", 0, 2
@@ -219,9 +212,10 @@ class TrainConfig:
         100, "steps that must have had a point in view before it may be pruned", 1, 10**8
     )
     refine_at: tuple = setting(
-        (1.0, 1.0),
-        "shares of the iterations after which images double in size and a point becomes eight"
-        " (1: never); training begins on images that much smaller",
+        (0.0, 0.0),
+        "shares of the iterations after which images double in size and a point becomes eight;"
+        " training begins on images that much smaller (1: never; 0,0: as often as it takes to have"
+        " points at most 1.5 pixels apart)",
         0,
         1,
     )

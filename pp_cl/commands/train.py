@@ -120,7 +120,7 @@ def _left_out_line(train):
     """A line of text if some refinements of train.refine_at are left out, else an empty one."""
     from pp_cl.training.schedule import refine_steps
 
-    wanted, made = sum(share < 1 for share in train.refine_at), len(refine_steps(train))
+    wanted, made = sum(0 < share < 1 for share in train.refine_at), len(refine_steps(train))
     if made < wanted:
         return (
             f"refinements: {made} of the {wanted} of train.refine_at, since in {train.iterations}"

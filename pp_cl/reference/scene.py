@@ -21,13 +21,13 @@ def dilated_mask(alpha: np.ndarray, threshold: int) -> np.ndarray:
 
 
 def kept(
-    views: Sequence[Any], positions: np.ndarray, threshold: int
+    views: Sequence[Any], positions: np.ndarray, threshold: int, *, least: int, forgiven: int
 ) -> tuple[np.ndarray, np.ndarray]:
-    """((N,) bool kept, (N,) pixels to the nearest pixel border of any view that has the position
+    """((N,) bool kept: seen by `least` views and rejected by no larger share of them than
+    `forgiven` of all, (N,) pixels to the nearest pixel border of any view that has the position
     before it).
     """
-    seen = np.zeros(len(positions), bool)
-    alive = np.ones(len(positions), bool)
+    seen, rejecting = np.zeros((2, len(positions)), int)
     border = np.full(len(positions), np.inf)
     for view in views:
         camera, mask = view.stored_camera, dilated_mask(view.image[..., 3], threshold)
@@ -39,9 +39,9 @@ def kept(
         border[front] = np.minimum(border[front], away)
         inside = (u >= 0) & (u < camera.width) & (v >= 0) & (v < camera.height)
         front, u, v = front[inside], u[inside].astype(int), v[inside].astype(int)
-        seen[front] = True
-        alive[front] &= mask[v, u]
-    return alive & seen, border
+        seen[front] += 1
+        rejecting[front] += ~mask[v, u]
+    return (seen >= least) & (rejecting * len(views) <= forgiven * seen), border
 
 
 def target_forward(

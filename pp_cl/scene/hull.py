@@ -84,12 +84,16 @@ class Carving:
 
 
 class Carver:
-    """Masks and cameras of the stored images, on the device, to carve any grid with."""
+    """Masks and cameras of the stored images, on the device, to carve any grid with.
+
+    least: images that must see a vertex.
+    """
 
     def __init__(self, dev: Device, views: Sequence[View]):
         self.dev = dev
         self.program = dev.program("scene/hull")
         self.cameras = [view.stored_camera for view in views]
+        self.least = min(LEAST_SEEING, len(views)) if views[0].has_mask else 1
         words = [-(-c.width // 32) for c in self.cameras]
         starts = np.cumsum([0, *(c.height * w for c, w in zip(self.cameras, words, strict=True))])
         self.masks = dev.empty((int(starts[-1]),), np.uint32)
@@ -132,7 +136,7 @@ class Carver:
             rows=rows,
             words=words,
             views=len(self.cameras),
-            least=min(LEAST_SEEING, len(self.cameras)),
+            least=self.least,
             forgiven=forgiven,
             projections=projections,
             view_masks=self.view_masks,
@@ -203,7 +207,7 @@ def build_grid(
 
 
 def _box(views, given):
-    """The box to search: what the masks allow of the given one, or it alone where there are none."""
+    """The box to search: the given one as far as the masks allow it, whole if there are none."""
     if given is not None and not views[0].has_mask:
         return given
     box = bounding_box(views)
@@ -341,7 +345,7 @@ def _shares_beside(dev, views, box, forgiven):
     """(V,) the share of each view's mask that is further than a pixel of its image, reduced to
     COMPARED_SIZE, from the silhouette of their hull.
     """
-    hull = build_grid(dev, views, COMPARED_POINTS, box, forgiven)
+    hull = build_grid(dev, views, min(COMPARED_POINTS, CELL_CAP), box, forgiven)
     shares = []
     for view in views:
         size = view.stored_camera.width, view.stored_camera.height

@@ -91,7 +91,7 @@ class StoredRun:
         ids = self.forms.get("points.ids")
         n = ids.shape[0] if ids and len(ids.shape) == 1 else 0
         header, mend = self.header, "its config.json may belong to another run"
-        refined = sum(share < 1 for share in config.train.refine_at)
+        refined = sum(0 < share < 1 for share in config.train.refine_at)
         most = min(math.prod(header["grid"]["dims"]), header["initial_points"] * 8**refined)
         if not 0 < n <= most:
             self._refuse(f"points.ids is {ids or 'missing'}, expected 1 to {most} points")

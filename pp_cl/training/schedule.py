@@ -88,7 +88,7 @@ def refine_steps(train: TrainConfig) -> list[int]:
     Each refinement makes eight points of one. So a training that prunes leaves out a refinement
     before which nothing could have been pruned since the last one.
     """
-    shares = (share for share in train.refine_at if share < 1)
+    shares = (share for share in train.refine_at if 0 < share < 1)
     steps = sorted({max(1, round(share * train.iterations)) for share in shares})
     found = steps[:1]
     for step in steps[1:]:

@@ -91,5 +91,5 @@ def test_the_scenes_facts_name_it_and_the_picture_shows_it_first(dev, scene, tmp
 def test_a_training_warns_and_leaves_the_picture(scene, tmp_path, capsys):
     assert main(arguments(scene, tmp_path / "run", 1, train__iterations=2, points__count=500)) == 0
     error = capsys.readouterr().err
-    assert "masks reject what the other views agree on: train/r_4.png (" in error
+    assert "left out of the training: train/r_4.png (" in error
     assert read_rgba(tmp_path / "run" / "masks.png").shape[1] > 48

@@ -75,8 +75,8 @@ def carvings(monkeypatch):
     """The list of all Carvings of a test, in their order."""
     made, carve = [], Carver.carve
 
-    def recorded(self, grid):
-        made.append(carve(self, grid))
+    def recorded(self, grid, forgiven=0):
+        made.append(carve(self, grid, forgiven))
         return made[-1]
 
     monkeypatch.setattr(Carver, "carve", recorded)

@@ -232,7 +232,7 @@ def test_a_box_that_is_given_holds_the_points(dev, tmp_path):
     found = build_grid(dev, views, 3000, box).grid.box
     assert (found >= box[0] - 1e-9).all() and (found <= box[1] + 1e-9).all()
     np.testing.assert_allclose(np.ptp(found, axis=0), np.ptp(box, axis=0), rtol=0.2)
-    assert scene_box(preset("tiny")) is None
+    assert scene_box(configure(preset("tiny"), "demo")) is None
 
 
 def test_a_mask_for_some_photographs_only(dev, tmp_path):

@@ -20,6 +20,7 @@ SETTINGS = {
     "points.count": 1500,
     "network.widths": "16,16,16",
     "train.crop": 24,
+    "train.refine_at": "1,1",
     "train.prune_every": 10,
     "train.checkpoint_every": 10,
     "train.log_every": 5,

@@ -146,23 +146,32 @@ def room(dev, base="tiny", images=3, size=(800, 600), **changes):
     return Room(config, net, [Photograph(f"{i}.png", camera) for i in range(images)])
 
 
+ONCE = {"train__refine_at": "0.35,1"}
+
+
 def planned(dev, base="tiny", points=171_262, step=0, **changes):
     return room(dev, base, **changes).plan_points(GRID, points, (2, 6), step)
 
 
 @pytest.mark.parametrize(
-    "name, first, most",
-    [("tiny", 252_312, 252_312), ("small", 171_262, 94_523 * 8), ("full", 171_262, 455_094 * 8)],
+    "name, shares, first, most",
+    [
+        ("tiny", "1,1", 252_312, 252_312),
+        ("small", "0.35,1", 171_262, 94_523 * 8),
+        ("full", "0.33,0.67", 171_262, 455_094 * 8),
+    ],
 )
-def test_the_most_points_of_a_plan_are_near_those_of_lego(dev, name, first, most):
-    plan = planned(dev, name, first)
+def test_the_most_points_of_a_plan_are_near_those_of_lego(dev, name, shares, first, most):
+    plan = planned(dev, name, first, train__refine_at=shares)
     assert max(phase.points for phase in plan.phases) == pytest.approx(most, rel=0.1)
 
 
 def test_a_plan_that_goes_on_counts_no_pruning_twice(dev):
-    halfway = planned(dev, "small", points=118_025, step=600)
-    assert halfway.peak.points < planned(dev, "small").peak.points  # so it goes on where it began
-    last = planned(dev, "small", points=600_000, step=4000)
+    halfway = planned(dev, "small", points=118_025, step=600, **ONCE)
+    assert (
+        halfway.peak.points < planned(dev, "small", **ONCE).peak.points
+    )  # so it goes on where it began
+    last = planned(dev, "small", points=600_000, step=4000, **ONCE)
     assert [p.name for p in last.phases] == ["from step 4000 on", "averages, from step 5100 on"]
     assert last.phases[0].points == 600_000
 

@@ -65,22 +65,27 @@ def test_the_spread_weight_rises_from_nothing():
 
 
 @pytest.mark.parametrize(
-    "name, iterations, changes, expected",
+    "shares, iterations, changes, expected",
     [
-        ("full", 11_000, {}, [3630, 7370]),
-        ("full", 1000, {}, [330, 670]),
-        ("full", 60, {}, [20]),  # 64 times as many points, of which none was pruned
-        ("full", 500, {}, [165]),  # the pruning at 250 finds points that were seen 85 times
-        ("full", 2, {}, [1]),
-        ("small", 100, {}, [35]),
-        ("full", 60, {"train.prune_weight": 0, "train.prune_opacity": 0}, [20, 40]),
-        ("full", 100, {"train.refine_at": "0.5,0.5", "train.prune_weight": 0}, [50]),
-        ("tiny", 8000, {}, []),
+        ("0.33,0.67", 11_000, {}, [3630, 7370]),
+        ("0.33,0.67", 1000, {}, [330, 670]),
+        ("0.33,0.67", 60, {}, [20]),  # 64 times as many points, of which none was pruned
+        ("0.33,0.67", 500, {}, [165]),  # the pruning at 250 finds points that were seen 85 times
+        ("0.33,0.67", 2, {}, [1]),
+        ("0.35,1", 100, {}, [35]),
+        ("0.33,0.67", 60, {"train.prune_weight": 0, "train.prune_opacity": 0}, [20, 40]),
+        ("0.5,0.5", 100, {"train.prune_weight": 0}, [50]),
+        ("1,1", 8000, {}, []),
+        ("0,0", 8000, {}, []),  # not known yet
     ],
 )
-def test_a_refinement_needs_a_pruning_since_the_one_before(name, iterations, changes, expected):
-    config = preset(name)
-    for key, value in {"train.iterations": iterations, **changes}.items():
+def test_a_refinement_needs_a_pruning_since_the_one_before(shares, iterations, changes, expected):
+    config = preset("tiny")
+    for key, value in {
+        "train.refine_at": shares,
+        "train.iterations": iterations,
+        **changes,
+    }.items():
         assign(config, key, value, "test")
     assert refine_steps(config.train) == expected
 
