@@ -29,7 +29,7 @@ from pp_cl.presets import SHORT
 from pp_cl.run import Run, load_run
 from pp_cl.scene.agreement import disagreements, listing
 from pp_cl.scene.grid import Grid
-from pp_cl.scene.hull import agreeing, build_grid, depth_range, spacing_pixels
+from pp_cl.scene.hull import Agreement, Hull, agreeing, build_grid, depth_range, spacing_pixels
 from pp_cl.scene.identity import difference, identity
 from pp_cl.scene.load import measured_split, open_scene, preset_downscale, scene_box, scene_frames
 from pp_cl.scene.outline import picture
@@ -288,29 +288,46 @@ def _start(config, agreement, views, net, room):
     return Trainer(dev, config, model, agreement.views), facts
 
 
-def _first_level(dev, config, agreement, room):
-    """(Hull, (near, far)) to start from. Where train.refine_at leaves it open, it becomes what the
-    spacing asks for, and the hull has the spacing from which that leads to FINEST to COARSEST, as
-    far as there is memory for it.
+def first_hull(
+    dev: Device, config: Config, agreement: Agreement
+) -> tuple[Hull, tuple[float, float]]:
+    """(the hull that a training starts from, its train.refine_at).
+
+    Where the settings leave train.refine_at open, there are as many refinements as bring points
+    COARSEST pixels of the images close, and the hull has the spacing from which these lead to
+    FINEST to COARSEST.
     """
-    points, train, box = config.points.count, config.train, scene_box(config)
+    points, shares, box = config.points.count, config.train.refine_at, scene_box(config)
     views, _, forgiven = agreement
     hull = build_grid(dev, views, points, box, forgiven)
-    times = 0
-    if train.refine_at == OPEN:
-        spacing = spacing_pixels(hull.grid, [view.camera for view in views])
-        smallest = min(min(view.camera.width, view.camera.height) for view in views)
-        possible = [n for n in range(len(REFINE_AT)) if smallest >= LEAST_SIDE << n]
-        times = sum(spacing > COARSEST * 2**n for n in possible[:-1])
-        train.refine_at = REFINE_AT[times]
-    if times:
-        first = min(max(spacing, 2**times * FINEST), 2**times * COARSEST)
-        fitting = round(points * (spacing / first) ** 3)
-        try:
-            return _checked(room, views, build_grid(dev, views, fitting, box, forgiven))
-        except UserError:
-            train.refine_at = NEVER
-    return _checked(room, views, hull)
+    if shares != OPEN:
+        return hull, shares
+    cameras = [view.camera for view in views]
+    spacing, smallest = (
+        spacing_pixels(hull.grid, cameras),
+        min(min(c.width, c.height) for c in cameras),
+    )
+    possible = [n for n in range(1, len(REFINE_AT)) if smallest >= LEAST_SIDE << n]
+    times = sum(spacing > COARSEST * 2 ** (n - 1) for n in possible)
+    first = min(max(spacing, 2**times * FINEST), 2**times * COARSEST)
+    if times and first != spacing:
+        hull = build_grid(dev, views, round(points * (spacing / first) ** 3), box, forgiven)
+    return hull, REFINE_AT[times]
+
+
+def _first_level(dev, config, agreement, room):
+    """first_hull() and its (near, far); config.train.refine_at becomes what it says, or NEVER if
+    there is too little memory for it. Raises UserError as Room.check_points() does.
+    """
+    is_open, train = config.train.refine_at == OPEN, config.train
+    hull, train.refine_at = first_hull(dev, config, agreement)
+    try:
+        return _checked(room, agreement.views, hull)
+    except UserError:
+        if not is_open or train.refine_at == NEVER:
+            raise
+        train.refine_at = NEVER
+        return _checked(room, agreement.views, first_hull(dev, config, agreement)[0])
 
 
 def _checked(room, views, hull):

@@ -32,6 +32,7 @@ from pp_cl.training.schedule import (
 from pp_cl.training.smooth import Smoother
 from pp_cl.training.state import PointState, final_points_to_keep, points_to_keep, split_opacity
 
+MANY_VIEWS = 24  # so many show every place several times
 WHITE = 1.0  # of a target where its photograph is transparent
 
 
@@ -258,16 +259,22 @@ class Trainer:
 
     def finish(self) -> None:
         """End the training: take the EMA as parameters, and drop the points whose opacity is too
-        low or whose blend weight is too low in every training view.
+        low or whose blend weight is too low in every training view; where there are many views, in
+        all but two: what one or two photographs show is mostly a speck in others.
         """
         self.optimiser.apply_ema()
-        if self.config.final_prune_weight > 0:
+        least_weight = self.config.final_prune_weight
+        if least_weight > 0:
             cloud = self.model.cloud
-            max_weight, times_seen = (self.dev.zeros((cloud.count,)) for _ in range(2))
+            max_weight, seen = (self.dev.zeros((cloud.count,)) for _ in range(2))
             for view in self.views:
-                seen = self.renderer.forward(view.camera, self.gamma[1], until="weights")
-                record_weights(self.dev, seen.pairs, seen.weights, max_weight, times_seen)
-            self._keep(final_points_to_keep(self.dev, max_weight, cloud.opacity, self.config))
+                drawn = self.renderer.forward(view.camera, self.gamma[1], until="weights")
+                record_weights(self.dev, drawn.pairs, drawn.weights, max_weight, seen, least_weight)
+            least = 3 if len(self.views) >= MANY_VIEWS else 1
+            opacity = cloud.opacity
+            self._keep(
+                final_points_to_keep(self.dev, max_weight, seen, opacity, self.config, least)
+            )
 
     def rates(self) -> dict:
         """The learning rates of the last step, for the log."""

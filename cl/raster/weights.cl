@@ -23,9 +23,10 @@ kernel void find_shaded_points(
 }
 
 // One work-item per point: sums the weights of its pairs, keeps the sum if it is the highest so
-// far, and counts the view if the point has a pair.
+// far, and counts the view if the point has a pair and the sum is `least`.
 kernel void record_weights(
     const uint n,                      // points
+    const float least,                 // weight of a point that counts as seen
     global const uint *point_offset,   // (N+1)
     global const float2 *pair_weight,  // (P, 2)
     global const uchar *pair_role,     // (?) P with HAS_ROLES
@@ -38,5 +39,5 @@ kernel void record_weights(
     for (uint pair = point_offset[i]; pair < point_offset[i + 1]; pair++)
         if (!HAS_ROLES || pair_role[pair] != DROPPED) sum += pair_weight[pair].x;
     max_weight[i] = fmax(max_weight[i], sum);
-    if (point_offset[i] < point_offset[i + 1]) times_seen[i] += 1.0f;
+    if (point_offset[i] < point_offset[i + 1] && sum >= least) times_seen[i] += 1.0f;
 }

@@ -128,6 +128,10 @@ def _scene_lines(facts):
             _line("", f"{one['view']}: its mask rejects {one['share']:.0%} of what others agree on")
             for one in masks["disagreeing"]
         ),
+        *(
+            _line("", f"{name}: {share:.0%} of its mask lies beside the object; it is left out")
+            for name, share in masks.get("left_out", {}).items()
+        ),
         _line("depth range", _range(stated, ".3f") if stated else "none stated"),
         _line("cameras", f"{_range(facts['distances'], '.3f')} from {_vector(facts['looked_at'])}"),
         _line("up", f"{_vector(facts['up'])} (estimated)"),
@@ -139,11 +143,15 @@ def _hull_lines(facts):
     hull = facts["hull"]
     if hull is None:
         return [_line("hull", f"none: {facts['problem']}")]
+    lines = [f"{hull['points']} points{' (capped)' * hull['capped']}, {_grid_text(hull)}"]
+    if times := hull["refinements"]:
+        pixels = " and ".join(f"{hull['edge_pixels'] / 2**n:.2f}" for n in range(1, times + 1))
+        lines.append(f"to be refined to {pixels} pixels")
+    if forgiven := facts["masks"]["forgiven"]:
+        lines.append(f"up to {forgiven} masks may reject a point, as they contradict each other")
     low, high = map(_vector, hull["box"])
-    return [
-        _line("hull", f"{hull['points']} points{' (capped)' * hull['capped']}, {_grid_text(hull)}"),
-        _line("box", f"{low} to {high}"),
-    ]
+    texts = zip(["hull", "", ""], lines)
+    return [*(_line(*text) for text in texts), _line("box", f"{low} to {high}")]
 
 
 def _range(values, form):

@@ -108,9 +108,12 @@ def _first_line(training):
         f"\nhull: only {points} of the {asked} points asked for, since a finer grid would have"
         f" more than {CELL_CAP} cells"
     )
+    finer = "".join(
+        f", then {spacing / 2**n:.2f}" for n in range(1, trainer.refinements_to_come + 1)
+    )
     return (
         f"hull: {points} points on a {'x'.join(map(str, grid.dims))} grid, edge"
-        f" {grid.edge:.6g} ({spacing:.2f} pixels), depth {near:.3f} to {far:.3f}"
+        f" {grid.edge:.6g} ({spacing:.2f} pixels{finer}), depth {near:.3f} to {far:.3f}"
         f" ({hull.seconds:.1f} s)"
         f"{capped if hull.capped else ''}"
     )

@@ -16,7 +16,7 @@ from pp_cl.files.untrusted import read_json_text, refusal
 from pp_cl.scene.agreement import Disagreement, disagreements
 from pp_cl.scene.camera_path import looked_at, up_of
 from pp_cl.scene.grid import Grid
-from pp_cl.scene.hull import Hull, build_grid, spacing_pixels
+from pp_cl.scene.hull import Hull, agreeing, spacing_pixels
 from pp_cl.scene.load import (
     open_scene,
     preset_downscale,
@@ -27,6 +27,7 @@ from pp_cl.scene.load import (
 )
 from pp_cl.scene.outline import SHOWN_VIEWS, picture
 from pp_cl.scene.views import MASK_THRESHOLD, View
+from pp_cl.session import first_hull
 from pp_cl.training.checkpoint import opened_run
 
 Facts = dict[str, Any]
@@ -161,7 +162,8 @@ def describe_scene(
     views = open_scene(dev, config, ("train",)).splits["train"]
     hull, problem = None, None
     try:
-        hull = build_grid(dev, views, config.points.count, scene_box(config))
+        agreement = agreeing(dev, views, scene_box(config))
+        hull, shares = first_hull(dev, config, agreement)
     except UserError as error:
         problem = str(error)
     found = disagreements(views, hull.grid.box) if hull else []
@@ -176,7 +178,8 @@ def describe_scene(
         "images": dict(sizes),
         **_lenses([view.file_camera for view in views]),
         "masks": _masks(views)
-        | {"disagreeing": [{"view": one.view.name, "share": one.share} for one in found]},
+        | {"disagreeing": [{"view": one.view.name, "share": one.share} for one in found]}
+        | ({"left_out": agreement.left_out, "forgiven": agreement.forgiven} if hull else {}),
         "depth_range": [float(ranges.min()), float(ranges.max())] if len(ranges) else None,
         "looked_at": centre.tolist(),
         "distances": _range([np.linalg.norm(camera.eye - centre) for camera in stored]),
@@ -193,6 +196,7 @@ def describe_scene(
             "dims": list(hull.grid.dims),
             "edge": hull.grid.edge,
             "edge_pixels": spacing_pixels(hull.grid, cameras),
+            "refinements": sum(0 < share < 1 for share in shares),
             "box": hull.grid.box.tolist(),
         }
     return facts, views, hull, found

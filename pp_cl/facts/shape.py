@@ -15,9 +15,10 @@ from pp_cl.files.run_folder import RunFolder
 from pp_cl.metrics.shape import Mesh, overlap, sample_surface
 from pp_cl.scene.demo import demo_mesh
 from pp_cl.scene.grid import Grid, smallest_edge
-from pp_cl.scene.hull import CELL_CAP, build_grid
+from pp_cl.scene.hull import CELL_CAP, agreeing, hull_on
 from pp_cl.scene.load import DEMO, open_scene, scene_box
 from pp_cl.training.checkpoint import opened_run
+from pp_cl.training.schedule import refine_steps
 
 DEMO_RESOLUTION = 512  # vertices of the demo's mesh along its longest side
 
@@ -60,7 +61,8 @@ def run_shape(
         mesh = Mesh(*demo_mesh(dev, DEMO_RESOLUTION))
     with opened_run(folder, config) as stored:
         grid, after = Grid.of_header(stored.header["grid"]), stored.array("points.ids")
-    before = _points_before(dev, config, grid)
+        count = stored.header["initial_points"]
+    before = _points_before(dev, config, grid, count)
     surface = _sampled(dev, mesh, grid, samples)
     return _facts(grid, surface, samples) | {
         "before": asdict(overlap(surface, grid, before)),
@@ -68,20 +70,22 @@ def run_shape(
     }
 
 
-def _points_before(dev, config: Config, grid):
-    """Ids on a run's last grid of the points that it began with; of a refined run, of what they
-    would be refined to without pruning.
+def _points_before(dev, config: Config, grid, count):
+    """Ids on a run's last grid of the `count` points that it began with; of a refined run, of what
+    they would be refined to without pruning.
     """
+    times, first = len(refine_steps(config.train)), grid
+    for _ in range(times):
+        first = first.coarsened()
     views = open_scene(dev, config, ("train",)).splits["train"]
-    hull = build_grid(dev, views, config.points.count, scene_box(config))
-    first, ids = hull.grid, hull.ids
-    while first.edge > 1.5 * grid.edge:
-        ids, _ = first.children(ids)
-        first = first.refined()
-    steps = np.abs(np.subtract(first.origin, grid.origin)) / grid.edge
-    if first.dims != grid.dims or steps.max() > 1e-3:
+    agreement = agreeing(dev, views, scene_box(config))
+    ids = hull_on(dev, agreement.views, first, agreement.forgiven)
+    if len(ids) != count:
         raise UserError(
             f"{config.scene.path}: its hull is not the one that the run began with; say where the"
             " scene is with --scene"
         )
+    for _ in range(times):
+        ids, _ = first.children(ids)
+        first = first.refined()
     return ids

@@ -150,16 +150,22 @@ def _softmax_weights(dev, b, pairs, camera_buffer, opacity, gamma, max_tracked, 
 
 
 def record_weights(
-    dev: Device, pairs: Pairs, weights: BlendWeights, max_weight: Array, times_seen: Array
+    dev: Device,
+    pairs: Pairs,
+    weights: BlendWeights,
+    max_weight: Array,
+    times_seen: Array,
+    least: float = 0.0,
 ) -> None:
     """Update what pruning looks at, both (N,) float32: max_weight, the highest sum over an image's
     pixels of a point's blend weights so far, and times_seen, how many images had a hit of the
-    point, dropped or not.
+    point, dropped or not, and such a sum of at least `least`.
     """
     dev.program("raster/weights", HAS_ROLES=int(weights.has_roles)).launch(
         "record_weights",
         pairs.points,
         n=pairs.points,
+        least=least,
         point_offset=pairs.point_offset,
         pair_weight=weights.pair_weight,
         pair_role=weights.pair_role,

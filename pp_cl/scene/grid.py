@@ -52,6 +52,11 @@ class Grid:
         origin = tuple(x - self.edge / 4 for x in self.origin)
         return Grid(origin, self.edge / 2, tuple(2 * n for n in self.dims))
 
+    def coarsened(self) -> "Grid":
+        """The grid whose refined() this is."""
+        origin = tuple(x + self.edge / 2 for x in self.origin)
+        return Grid(origin, 2 * self.edge, tuple(n // 2 for n in self.dims))
+
     def children(self, ids: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """(vertices of refined(), ascending, the place in `ids` of each one's parent), (8 N) uint32
         both. Raises ValueError where refined() has more vertices than 32 bits can number.

@@ -206,6 +206,16 @@ def build_grid(
     return replace(hull, grid=hull.grid.moved(corner))
 
 
+def hull_on(dev: Device, views: Sequence[View], grid: Grid, forgiven: int = 0) -> np.ndarray:
+    """(N,) ascending ids of the vertices of a grid inside the hull, as build_grid() has it."""
+    corner = _corner(views, reach_of(views))
+    near = [view.moved(-corner) for view in views]
+    carver = Carver(dev, _farthest_point_order(near, grid.centre - corner))
+    bits = carver.carve(grid.moved(-corner), forgiven).bits.get()
+    inside = np.unpackbits(bits.view(np.uint8), axis=1, bitorder="little")[:, : grid.dims[0]]
+    return np.flatnonzero(inside)
+
+
 def _box(views, given):
     """The box to search: the given one as far as the masks allow it, whole if there are none."""
     if given is not None and not views[0].has_mask:

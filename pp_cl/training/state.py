@@ -121,16 +121,23 @@ def points_to_keep(dev: Device, state: PointState, opacity: Array, settings: Tra
 
 
 def final_points_to_keep(
-    dev: Device, max_weight: Array, opacity: Array, settings: TrainConfig
+    dev: Device,
+    max_weight: Array,
+    times_seen: Array,
+    opacity: Array,
+    settings: TrainConfig,
+    least: int,
 ) -> Array:
     """(M,) uint32, ascending: the points of a finished training that weigh at least
-    train.final_prune_weight and have train.prune_opacity. NaN counts as too little.
+    train.final_prune_weight in `least` training views and have train.prune_opacity. NaN counts as
+    too little.
 
-    max_weight: (N,) float32, the highest blend weight in a training view.
+    max_weight, times_seen: (N,) float32, the highest blend weight in a training view, and in how
+    many it is train.final_prune_weight.
     """
-    weight, opacity = dev.download(max_weight), dev.download(opacity)
-    keep = (weight >= settings.final_prune_weight) & (opacity >= settings.prune_opacity)
-    return _listed(dev, keep, weight)
+    weight, seen, opacity = map(dev.download, (max_weight, times_seen, opacity))
+    keep = (weight >= settings.final_prune_weight) & (seen >= least)
+    return _listed(dev, keep & (opacity >= settings.prune_opacity), weight)
 
 
 def _listed(dev, keep, weight):

@@ -19,10 +19,11 @@ from pp_cl.training.state import PointState, final_points_to_keep, points_to_kee
 pytestmark = pytest.mark.kernels  # of refine.cl
 
 
-def kept(dev, weights, least_weight, opacities, least_opacity):
+def kept(dev, weights, least_weight, opacities, least_opacity, seen=None, least=1):
     settings = TrainConfig(final_prune_weight=least_weight, prune_opacity=least_opacity)
-    weights, opacities = (dev.upload(np.asarray(a, np.float32)) for a in (weights, opacities))
-    indices = final_points_to_keep(dev, weights, opacities, settings)
+    arrays = weights, seen or [1] * len(weights), opacities
+    arrays = (dev.upload(np.asarray(a, np.float32)) for a in arrays)
+    indices = final_points_to_keep(dev, *arrays, settings, least)
     assert indices.dtype == np.uint32
     return indices.get().tolist()
 
@@ -37,6 +38,7 @@ def test_keep_needs_weight_and_opacity(dev):
     assert kept(dev, [1, 0, 1, 0.5, 2], 0.5, [1, 1, 0, 0.5, 0.6], 0.5) == [0, 3, 4]
     assert kept(dev, [1, 0, 1], 0, [1, 1, 0], 0) == [0, 1, 2]
     assert kept(dev, [np.nan, 1, 1], 0, [1, 1, np.nan], 0) == [1]
+    assert kept(dev, [1, 1, 1], 0.5, [1, 1, 1], 0, seen=[1, 2, 0], least=2) == [1]
 
 
 @pytest.mark.parametrize(
