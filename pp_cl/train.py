@@ -259,10 +259,15 @@ class Trainer:
 
     def finish(self) -> None:
         """End the training: take the EMA as parameters, and drop the points whose opacity is too
-        low or whose blend weight is too low in every training view; where there are many views, in
-        all but two: what one or two photographs show is mostly a speck in others.
+        low or that too few training views show.
         """
         self.optimiser.apply_ema()
+        self._prune_unseen()
+
+    def _prune_unseen(self):
+        """Drop the points that reach train.final_prune_weight in no training view; where there are
+        many views, in all but one: what a single photograph shows is mostly a speck in others.
+        """
         least_weight = self.config.final_prune_weight
         if least_weight > 0:
             cloud = self.model.cloud
@@ -270,7 +275,7 @@ class Trainer:
             for view in self.views:
                 drawn = self.renderer.forward(view.camera, self.gamma[1], until="weights")
                 record_weights(self.dev, drawn.pairs, drawn.weights, max_weight, seen, least_weight)
-            least = 3 if len(self.views) >= MANY_VIEWS else 1
+            least = 2 if len(self.views) >= MANY_VIEWS else 1
             opacity = cloud.opacity
             self._keep(
                 final_points_to_keep(self.dev, max_weight, seen, opacity, self.config, least)

@@ -150,8 +150,10 @@ def _hull_lines(facts):
     if forgiven := facts["masks"]["forgiven"]:
         lines.append(f"up to {forgiven} masks may reject a point, as they contradict each other")
     low, high = map(_vector, hull["box"])
-    texts = zip(["hull", "", ""], lines)
-    return [*(_line(*text) for text in texts), _line("box", f"{low} to {high}")]
+    return [
+        *(_line("" if index else "hull", text) for index, text in enumerate(lines)),
+        _line("box", f"{low} to {high}"),
+    ]
 
 
 def _range(values, form):

@@ -201,7 +201,7 @@ def build_grid(
         )
     corner = _corner(views, reach_of(views))
     near = [view.moved(-corner) for view in views]
-    box = _box(near, None if box is None else box - corner)
+    box = _box(near, None if box is None else box - corner, forgiven)
     hull = _search(dev, near, points, box, forgiven)
     return replace(hull, grid=hull.grid.moved(corner))
 
@@ -216,11 +216,15 @@ def hull_on(dev: Device, views: Sequence[View], grid: Grid, forgiven: int = 0) -
     return np.flatnonzero(inside)
 
 
-def _box(views, given):
-    """The box to search: the given one as far as the masks allow it, whole if there are none."""
+def _box(views, given, forgiven):
+    """The box to search: the given one as far as the masks allow it, whole if there are none. Where
+    masks are forgiven, twice what they allow, as a wrong one bounds it too.
+    """
     if given is not None and not views[0].has_mask:
         return given
     box = bounding_box(views)
+    if forgiven:
+        box = box.mean(0) + np.array([[-1], [1]]) * np.ptp(box, axis=0)
     if given is None:
         return box
     shared = np.stack([np.maximum(box[0], given[0]), np.minimum(box[1], given[1])])

@@ -58,6 +58,18 @@ def test_a_vertex_no_image_sees_is_dropped(dev):
     assert carver.carve(Grid((5, 0, 0), 0.1, (1, 1, 1))).count == 0  # behind
 
 
+def test_what_two_of_many_images_see_is_dropped(dev):
+    """Two cameras look at one place, three at another."""
+    here, there, one = np.zeros(3), np.array([9.0, 9, 9]), Grid((0, 0, 0), 0.1, (1, 1, 1))
+    ahead = [(place, place + 4 * axis) for place in (here, there) for axis in np.eye(3)][1:]
+    image = np.full((64, 64, 4), 255, np.uint8)
+    image[0, 0] = 0  # so that there is a mask
+    views = [View("full", ball_camera(eye, place), image) for place, eye in ahead]
+    carver = Carver(dev, views)
+    assert carver.carve(one).count == 0
+    assert carver.carve(one.moved(there)).count == 1
+
+
 @pytest.mark.exact
 def test_the_left_and_upper_borders_belong_to_an_image(dev):
     """Numbers that float32 holds exactly: the 5x5 vertices project to pixels 0, 16, 32, 48, 64 of
@@ -184,6 +196,14 @@ def test_spacing_is_what_two_projected_neighbours_are_apart(dev):
     assert spacing_pixels(found.grid, [views[0].reduced(4).camera]) == pytest.approx(
         expected / 4, rel=1e-3
     )
+
+
+@pytest.mark.large
+def test_a_box_that_is_stated_bounds_what_the_masks_allow(dev):
+    box = np.stack([CENTRE, CENTRE + [3, 0.4, 3]])
+    found = build_grid(dev, ball_views(), 2000, box)
+    assert (found.grid.box[0] > box[0] - 2 * found.grid.edge).all()
+    assert (found.grid.box[1] < CENTRE + [1.6, 0.4 + 2 * found.grid.edge, 1.6]).all()
 
 
 @pytest.mark.parametrize("points", (0, -3, 2**27 + 1))

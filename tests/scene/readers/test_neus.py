@@ -5,8 +5,10 @@ import pytest
 from support.same_scene import held_out, same, views
 from support.transforms_scenes import refused
 
+from pp_cl.config import assign, configure, preset
 from pp_cl.files.image import write_png
-from pp_cl.scene.readers.neus import read_split
+from pp_cl.scene.load import scene_box
+from pp_cl.scene.readers.neus import box, read_split
 from tools.scene_formats import neus
 
 FILE = "cameras_sphere.npz"
@@ -54,6 +56,22 @@ def test_a_projection_by_hand(tmp_path):
     np.testing.assert_allclose(camera.eye, (1, 2, 3), atol=1e-12)
     np.testing.assert_allclose((camera.fx, camera.fy, camera.cx, camera.cy), (50, 40, 16, 10))
     assert photograph.depth_range is None
+
+
+def test_folders_may_have_the_other_names(scene):
+    (scene / "image").rename(scene / "images")
+    (scene / "mask").rename(scene / "masks")
+    assert read_split(scene, "test")[0].mask == "masks/000000.png"
+
+
+def test_the_box_is_that_of_the_stated_sphere(scene):
+    assert box(scene) is None
+    edit(scene, lambda a: a.update(scale_mat_0=np.diag([2.0, 2, 2, 1]) + 0))
+    np.testing.assert_allclose(box(scene), [[-2] * 3, [2] * 3])
+    config = configure(preset("tiny"), str(scene))
+    np.testing.assert_allclose(scene_box(config), [[-2] * 3, [2] * 3])
+    assign(config, "scene.box", "0,0,0,1,1,1", "test")
+    np.testing.assert_allclose(scene_box(config), [[0] * 3, [1] * 3])
 
 
 def test_masks_may_be_numbered_with_fewer_digits(tmp_path):
