@@ -40,7 +40,7 @@ def quiet(work: Path) -> Iterator[Any]:
     colmap.logging.minloglevel = colmap.logging.FATAL
     try:
         yield colmap
-    except (RuntimeError, ValueError) as error:
+    except RuntimeError as error:
         raise UserError(
             f"{work}: pycolmap stopped ({shown(str(error), 160)}); check the disk and its free"
             " space; the same command goes on"
@@ -142,6 +142,13 @@ def match(database: Path, is_film: bool) -> int:
         bar.close()
         listed.unlink(missing_ok=True)
         return db.num_verified_image_pairs()
+
+
+def forget_matches(database: Path) -> None:
+    """Remove all matches, so that match() begins anew."""
+    with quiet(database), opened(database) as db:
+        db.clear_matches()
+        db.clear_two_view_geometries()
 
 
 def verification(colmap: Any) -> Any:

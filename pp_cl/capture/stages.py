@@ -13,7 +13,7 @@ from filelock import FileLock, Timeout
 from pp_cl.capture import box, features, frames, masks, poses, still
 from pp_cl.capture.packages import needed
 from pp_cl.errors import UserError
-from pp_cl.files.atomic import atomic_file, atomic_folder, remove_leftovers, write_json
+from pp_cl.files.atomic import atomic_folder, atomic_path, remove_leftovers, write_json
 from pp_cl.files.image import read_rgba, write_png
 from pp_cl.scene.agreement import listing
 from pp_cl.scene.masks import MaskRule, cut_out
@@ -22,6 +22,7 @@ from pp_cl.scene.readers.frame import frame_keys
 from pp_cl.scene.readers.transforms import SINGLE
 
 STAGES = ("frames", "features", "matches", "poses", "box", "masks", "scene")
+RESUMED = ("features", "matches", "masks")  # stages that keep what was done when they are stopped
 # what each stage leaves beside its JSON, in the scene's folder
 LEFT = {
     "frames": ("images",),
@@ -49,6 +50,7 @@ class Capture:
         self.source, self.scene, self.given, self.tell = source, scene, given, tell
         self.work, self.images = scene / "capture", scene / "images"
         self.database, self.model = self.work / "database.db", self.work / "model"
+        self.still = self.work / "still.npz"
 
     def run(self, begin: str | None = None) -> None:
         """Do all stages that are not done, or one of them and all after it. Raises UserError."""
@@ -56,14 +58,13 @@ class Capture:
             remove_leftovers(self.scene)
             first = self._first(begin)
             for stage in reversed(STAGES[first:]):
-                self._undo(stage)
+                if stage not in RESUMED or stage != STAGES[first] or self._file(stage).is_file():
+                    self._undo(stage)
             for stage in STAGES[:first]:
                 self.tell(f"{stage}: {self._found(stage)['line']} (done before)")
             for stage in STAGES[first:]:
                 found = getattr(self, f"_{stage}")()
-                write_json(
-                    self.work / f"{stage}.json", {"given": self._given(stage), "found": found}
-                )
+                write_json(self._file(stage), {"given": self._given(stage), "found": found})
                 self.tell(f"{stage}: {found['line']}")
 
     @contextmanager
@@ -87,21 +88,23 @@ class Capture:
     def _first(self, begin):
         """The number of the first stage to be done."""
         for number, stage in enumerate(STAGES):
-            file = self.work / f"{stage}.json"
-            if stage == begin or not file.is_file():
+            if stage == begin or not self._file(stage).is_file():
                 return number
-            if read_json(file)["given"] != self._given(stage):
+            before = read_json(self._file(stage))["given"]
+            if before != self._given(stage):
                 if stage == "frames":
                     raise UserError(
-                        f"{self.scene}: was made from {read_json(file)['given']['source']}; choose"
-                        " another --out, or begin anew with --from frames"
+                        f"{self.scene}: was made from {before['source']}; choose another --out, or"
+                        " begin anew with --from frames"
                     )
                 return number
         return len(STAGES)
 
     def _undo(self, stage):
         """Remove what a stage has left."""
-        (self.work / f"{stage}.json").unlink(missing_ok=True)
+        self._file(stage).unlink(missing_ok=True)
+        if stage == "matches" and self.database.exists():
+            features.forget_matches(self.database)
         for name in LEFT[stage]:
             path = self.scene / name
             if path.is_dir():
@@ -110,7 +113,10 @@ class Capture:
                 path.unlink(missing_ok=True)
 
     def _found(self, stage):
-        return read_json(self.work / f"{stage}.json")["found"]
+        return read_json(self._file(stage))["found"]
+
+    def _file(self, stage):
+        return self.work / f"{stage}.json"
 
     # ---- the stages
 
@@ -146,14 +152,11 @@ class Capture:
     def _matches(self):
         pairs = features.match(self.database, not self.source.is_dir())
         turntable = self.given["features"]["turntable"]
-        stays = still.remove_still(self.database, turntable)
-        if stays:
-            with atomic_file(self.work / "still.npz") as file:
-                np.savez(file, **stays)
+        turns = still.remove_still(self.database, self.still, turntable)
         line = f"{pairs} pairs of images"
-        if stays:
+        if turns:
             line += "; the object turns before a background that stands still, which is left out"
-        return {"line": line, "turns": bool(stays)}
+        return {"line": line, "turns": turns}
 
     def _poses(self):
         taken = self._found("frames")["images"]
@@ -182,8 +185,7 @@ class Capture:
 
     def _masks(self):
         model, corners = self._world()
-        stays = self.work / "still.npz"
-        pixels = np.load(stays) if stays.exists() else {}
+        pixels = np.load(self.still) if self.still.exists() else {}
         given = self.given["masks"]
         line = masks.write_masks(
             self.scene,
@@ -212,7 +214,8 @@ class Capture:
         with atomic_folder(self.scene / "sparse") as unfinished:
             (unfinished / "0").mkdir()
             model.write(unfinished / "0")
-        model.export_PLY(self.scene / "points.ply")
+        with atomic_path(self.scene / "points.ply") as unfinished:
+            model.export_PLY(unfinished)
         write_json(
             self.scene / SINGLE,
             {

@@ -9,6 +9,7 @@ import numpy as np
 from scipy.sparse import coo_matrix
 
 from pp_cl.capture.features import opened, quiet, verification
+from pp_cl.files.atomic import atomic_file
 
 SAMPLED = 30  # matches of a pair
 LEAST_MATCHES = 15  # of a pair, of which at least a half stand still
@@ -18,13 +19,13 @@ ROUNDS, WIDEST, NARROWER = 30, 0.05, 0.7  # of the alignment: matches that it be
 HELD = 0.001  # how strongly images without such matches are kept in place
 
 
-def remove_still(database: Path, is_turntable: bool) -> dict[str, np.ndarray]:
-    """Where most pairs of images share what stands still, remove its matches from the database and
-    check the pairs anew.
+def remove_still(database: Path, kept: Path, is_turntable: bool) -> bool:
+    """Where most pairs of images share what stands still, remove its matches from the database,
+    check the pairs anew, and return True.
 
-    Images are aligned by shifts, turns and scales, so that the camera may be moved a little.
-    is_turntable: the object is known to turn. Returns {image: (N, 2) pixels of the features that
-    stand still}, empty if it does not turn.
+    Images are aligned by shifts, turns and scales, so that the camera may be moved a little. kept:
+    the file for {image: (N, 2) pixels of the features that stand still}; where it exists, this was
+    stopped, and goes on. is_turntable: the object is known to turn.
     """
     with quiet(database) as colmap, opened(database) as db:
         images = db.read_all_images()
@@ -40,19 +41,22 @@ def remove_still(database: Path, is_turntable: bool) -> dict[str, np.ndarray]:
             if len(matches):
                 pairs.append((ids, index[ids[0]], index[ids[1]], np.array(matches)))
         if not pairs:
-            return {}
+            return False
         scales, shifts = _aligned(places, pairs)
         moved = [s * place + t for s, t, place in zip(scales, shifts, places, strict=True)]
         still = [abs(moved[i][m[:, 0]] - moved[j][m[:, 1]]) < STILL for _, i, j, m in pairs]
         counted = [one for one in still if len(one) >= LEAST_MATCHES]
         shared = sum(one.sum() >= max(LEAST_MATCHES, len(one) / 2) for one in counted)
-        if not is_turntable and shared < LEAST_PAIRS * len(counted):
-            return {}
+        if not (is_turntable or kept.exists()) and shared < LEAST_PAIRS * len(counted):
+            return False
         votes = [np.zeros((len(place), 2), int) for place in places]
         for (_, i, j, m), one in zip(pairs, still, strict=True):
             np.add.at(votes[i], (m[:, 0], one.astype(int)), 1)
             np.add.at(votes[j], (m[:, 1], one.astype(int)), 1)
         stays = [(v[:, 1] > 1) & (v[:, 1] > v[:, 0]) for v in votes]
+        if not kept.exists():
+            with atomic_file(kept) as file:
+                np.savez(file, **{i.name: pixels[k][stays[k]] for k, i in enumerate(images)})
         with colmap.DatabaseTransaction(db):
             for (ids, i, j, m), one in zip(pairs, still, strict=True):
                 left = m[~(one | stays[i][m[:, 0]] | stays[j][m[:, 1]])]
@@ -60,7 +64,7 @@ def remove_still(database: Path, is_turntable: bool) -> dict[str, np.ndarray]:
                 db.write_matches(*ids, left)
             db.clear_two_view_geometries()
         colmap.geometric_verification(database, two_view_geometry_options=verification(colmap))
-    return {image.name: pixels[k][stays[k]] for k, image in enumerate(images)}
+    return True
 
 
 def _places(pixels, camera):

@@ -4,6 +4,8 @@ goes wrong ends in one line.
 
 import json
 import shutil
+import subprocess
+import sys
 
 import numpy as np
 import pytest
@@ -187,3 +189,18 @@ def test_films(shot, tmp_path):
     for name in ("black.mp4", "none.mp4", "missing.mp4"):
         status, lines = capture(tmp_path / name, tmp_path / "other")
         assert status == 2 and len(lines) == 1 and name in lines[0]
+
+
+def test_a_full_disk(shot, tmp_path):
+    """The database may not grow: one line that names it; with room again the command goes on."""
+    scene = tmp_path / "scene"
+    words = ["capture", str(shot[0]), "--out", str(scene), "--masks", str(shot[1])]
+    limited = "import resource as r; r.setrlimit(r.RLIMIT_FSIZE, (2**20, 2**20))"
+    code = f"import sys; {limited}; from pp_cl.cli import program; sys.exit(program({words}))"
+    ended = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, check=False
+    )
+    lines = [line for line in ended.stderr.splitlines() if line.startswith("pp-cl")]
+    assert ended.returncode == 2 and len(lines) == 1 and str(scene) in lines[0], ended.stderr
+    assert (scene / "capture" / "frames.json").exists()
+    assert capture(*words[1:2], scene, *words[4:]) == (0, []) and off(scene).position < 0.03
