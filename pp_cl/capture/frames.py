@@ -22,7 +22,7 @@ from pp_cl.files.image import EIGHT_BIT_MODES
 from pp_cl.files.untrusted import opened_regular
 
 ENDINGS = (".jpg", ".jpeg", ".png", ".webp", ".tif", ".tiff", ".heic", ".heif")
-FORMATS = ("JPEG", "MPO", "PNG", "WEBP", "TIFF", "HEIF")
+FORMATS = ("JPEG", "PNG", "WEBP", "TIFF", "HEIF")  # JPEG opens MPO, which phones write, too
 KEPT = {"JPEG": ".jpg", "MPO": ".jpg", "PNG": ".png"}  # formats that are copied as they are
 MODES = (*EIGHT_BIT_MODES, "CMYK", "YCbCr")
 ORIENTATION, MAKE, MODEL, EXIF = 0x0112, 0x010F, 0x0110, 0x8769
@@ -35,7 +35,7 @@ EMPTY = 1.0  # sharpness, levels squared: noise alone has more
 NEIGHBOURS = 10  # on either side
 ALIKE = 0.15  # of the neighbours' usual difference
 SAME = 0.3  # levels of 255 by which small copies of one photograph differ at most
-FRAMES = 120  # of a film
+FRAMES, GROUP = 120, 12  # of a film
 LOCAL = ["-protocol_whitelist", "file,pipe"]  # a film names no other machine
 EACH_ONCE = ["-fps_mode", "passthrough"]
 
@@ -143,7 +143,10 @@ def _take(file, target):
 def _frames(film, images):
     """The facts of the sharpest frame of each interval, written to `images`."""
     chosen = _sharpest(film)
-    wanted = "+".join(f"eq(n,{one['number']})" for one in chosen)
+    equal = [f"eq(n,{one['number']})" for one in chosen]
+    # in groups, since ffmpeg sums no more than a hundred
+    some = ["+".join(equal[i : i + GROUP]) for i in range(0, len(equal), GROUP)]
+    wanted = "+".join(f"({one})" for one in some)
     meta, frames = _decoded(film, f"select='{wanted}'", "rgb24", 3)
     frames = zip(chosen, frames, strict=False)
     for one, frame in tqdm(frames, "frames", len(chosen), unit="image", leave=False, disable=None):

@@ -11,7 +11,7 @@ import numpy as np
 from filelock import FileLock, Timeout
 
 from pp_cl.capture import box, features, frames, masks, poses, still
-from pp_cl.capture.packages import needed
+from pp_cl.capture.packages import isolated, needed
 from pp_cl.errors import UserError
 from pp_cl.files.atomic import atomic_folder, atomic_path, remove_leftovers, write_json
 from pp_cl.files.image import read_rgba, write_png
@@ -131,7 +131,9 @@ class Capture:
         inside = None
         if self.given["features"]["turntable"]:
             inside = self._inside([one["name"] for one in taken])
-        counts = features.find_features(self.database, self.images, taken, inside)
+        counts = isolated(
+            self.work, features.find_features, self.database, self.images, taken, inside
+        )
         middle = int(np.median(list(counts.values())))
         return {"line": f"{middle} in an image", "counts": counts}
 
@@ -150,9 +152,10 @@ class Capture:
         return folder
 
     def _matches(self):
-        pairs = features.match(self.database, not self.source.is_dir())
+        is_film = not self.source.is_dir()
+        pairs = isolated(self.work, features.match, self.database, is_film)
         turntable = self.given["features"]["turntable"]
-        turns = still.remove_still(self.database, self.still, turntable)
+        turns = isolated(self.work, still.remove_still, self.database, self.still, turntable)
         line = f"{pairs} pairs of images"
         if turns:
             line += "; the object turns before a background that stands still, which is left out"
@@ -160,7 +163,7 @@ class Capture:
 
     def _poses(self):
         taken = self._found("frames")["images"]
-        found = poses.place(self.database, self.images, self.model, taken)
+        found = isolated(self.work, poses.place, self.database, self.images, self.model, taken)
         unplaced = [f"{name} {why}" for name, why in found["unplaced"].items()]
         line = (
             f"{found['placed']} of {len(taken)} images, {found['points']} points, reprojection"

@@ -20,7 +20,7 @@ from pp_cl.scene.load import load_scene, scene_format, scene_frames
 from tools.capture_demo import align, cameras, room
 
 pytest.importorskip("pycolmap")
-NEAR = (4, 9, 14, 17, 22, 25, 30, 35, 38, 43, 51, 56)  # of the demo's cameras, side by side
+NEAR = range(12)  # of the cameras around the demo, 10 degrees apart
 SIZE = 300
 
 
@@ -31,7 +31,7 @@ def shot(session_device, tmp_path_factory):
     for name in ("photographs", "masks"):
         (folder / name).mkdir()
     for i in NEAR:
-        camera = cameras(SIZE)[i]
+        camera = cameras(SIZE, "turntable")[i]
         rgba = render(session_device, camera)
         alpha = rgba[..., 3:] / 255
         write_png(
@@ -67,7 +67,7 @@ def changed(scene):
 def off(scene, names=NEAR):
     """How far the scene's cameras are from the true ones."""
     placed = [one for split in ("train", "test") for one in scene_frames(scene, split)]
-    true = {f"images/{i:03d}": cameras(SIZE)[i] for i in names}
+    true = {f"images/{i:03d}": cameras(SIZE, "turntable")[i] for i in names}
     return align([p.camera for p in placed], [true[p.name.rpartition(".")[0]] for p in placed])
 
 
