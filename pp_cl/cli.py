@@ -19,6 +19,7 @@ from pp_cl.files.atomic import mend
 
 COMMANDS = (
     "devices",
+    "capture",
     "train",
     "eval",
     "sweep",

@@ -477,7 +477,7 @@ def test_a_command_line(world, data):
     options = st.sampled_from(re.findall(r"--[\w-]+", parser.format_help())) | damage.words
     with world.watched() as folder:
         words = [world.run(folder)]
-        if name in ("train", "sweep"):
+        if name in ("train", "sweep", "capture"):
             words = [world.scene(), "--out", folder / "out"]
         elif name == "compare":
             words = [world.scene() / "train"] * 2

@@ -229,7 +229,7 @@ def _found_instead(folder):
     found = ", ".join(found) + f" and {len(others) - 3} more" * (len(others) > 3)
     return (
         f": {found or 'nothing'}, but no file of cameras that is known, such as"
-        " transforms.json or sparse/0; docs/scenes.md has the formats, and how to make cameras"
+        " transforms.json or sparse/0; `pp-cl capture` makes one of photographs"
     )
 
 

@@ -13,11 +13,11 @@ from support.transforms_scenes import refused
 from pp_cl.files.image import write_png
 from pp_cl.scene.distortion import Distortion
 from pp_cl.scene.readers.colmap import read_model, read_split
-from tools.colmap_demo import align, cameras
+from tools.capture_demo import align, cameras
 from tools.scene_formats import colmap
 
 SIZE = (30, 22)
-# What COLMAP 3.8 found of photographs by tools/colmap_demo.py: six of the 64 images with their
+# What COLMAP 3.8 found of photographs by tools/capture_demo.py: six of the 64 images with their
 # first 2D points, one with none, which COLMAP's model_converter then wrote in both forms.
 BY_COLMAP = Path(__file__).parent / "colmap_models"
 

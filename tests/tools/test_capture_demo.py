@@ -1,4 +1,4 @@
-"""The photographs for COLMAP belong to one world, and cameras are compared up to a similarity."""
+"""The photographs for capture belong to one world, and cameras are compared up to a similarity."""
 
 from dataclasses import replace
 
@@ -7,7 +7,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from pp_cl.files.image import read_rgba
-from tools.colmap_demo import ROOM, align, cameras, room, write_photographs
+from tools.capture_demo import ROOM, align, cameras, room, write_photographs
 
 pytestmark = pytest.mark.slow
 
@@ -41,7 +41,7 @@ def test_photographs_and_masks(dev, tmp_path):
     names = sorted(file.name for file in (tmp_path / "a" / "images").iterdir())
     assert len(names) == 64 and names[0] == "000.png"
     image = read_rgba(tmp_path / "a" / "images" / "007.png")
-    mask = read_rgba(tmp_path / "a" / "masks" / "007.png.png")[..., 0]
+    mask = read_rgba(tmp_path / "a" / "masks" / "007.png")[..., 0]
     assert (image[..., 3] == 255).all() and 0.02 < (mask > 127).mean() < 0.5
 
 

@@ -1,0 +1,128 @@
+"""The box of the object that all cameras look at, from sparse points, and the world in which it is
+upright, centred and of unit size.
+"""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from pp_cl.errors import UserError
+from pp_cl.scene.camera import Camera
+from pp_cl.scene.camera_path import looked_at, up_of
+
+SEEN = 0.75  # of the cameras that see what most of them see: what the object's points have
+NEIGHBOURS, LONELY = 8, 3.0  # a point's distance to these, in medians, from which on it is alone
+CUT = 0.005  # of the points at each end of an axis: what may be wrong
+MARGIN = 0.06  # of the box's diagonal, added on every side: smooth parts have no points
+LEAST_POINTS = 30
+TRIED, TILT = (
+    500,
+    np.cos(np.radians(10)),
+)  # planes, and how level the one is that carries the object
+THICK = 0.01  # of the cameras' distance: points of a plane are no further from it
+TABLE, BELOW = 0.08, 0.03  # of the points: on a table at least, and below it at most
+LEAST_SPREAD = 0.7  # of the width of what stands on it
+
+
+class World(NamedTuple):
+    """A similarity to the scene's world, x -> scale * rotation @ x + shift, and there the (2, 3)
+    lower and upper corner of the object.
+    """
+
+    scale: float
+    rotation: np.ndarray
+    shift: np.ndarray
+    box: np.ndarray
+
+    def points(self, points: np.ndarray) -> np.ndarray:
+        """(N, 3) points there."""
+        return self.scale * points @ self.rotation.T + self.shift
+
+
+def find_world(cameras: Sequence[Camera], points: np.ndarray) -> World:
+    """The world whose z axis is up, whose origin is the middle of the object, and where its box
+    fits into [-1, 1]. points: (N, 3). Raises UserError where too few are on the object.
+    """
+    up = up_of(cameras)
+    centre = looked_at(cameras)
+    eyes = np.stack([camera.eye for camera in cameras])
+    reach = float(np.median(np.linalg.norm(eyes - centre, axis=1)))
+    rotation = _upright(up, eyes - centre)
+    upright = (points - centre) @ rotation.T / reach
+    kept = _on_object(upright, _seen_share(cameras, points))
+    if len(kept) < LEAST_POINTS:
+        raise UserError(
+            f"only {len(kept)} points lie on what the cameras look at; photograph the object from"
+            " all sides, in the middle of the images, or say where it is with --box"
+        )
+    low, high = np.quantile(kept, [CUT, 1 - CUT], axis=0)
+    margin = MARGIN * np.linalg.norm(high - low)
+    low, high = low - margin, high + margin
+    middle, size = (low + high) / 2, (high - low).max() / 2
+    scale = 1 / (reach * size)
+    shift = -scale * rotation @ centre - middle / size
+    return World(scale, rotation, shift, np.stack([low - middle, high - middle]) / size)
+
+
+def _upright(up, offsets):
+    """(3, 3) rotation that turns `up` to z, and the first camera to the side of x."""
+    ahead = offsets[0] - offsets[0] @ up * up
+    if np.linalg.norm(ahead) < 1e-6 * np.linalg.norm(offsets[0]):
+        ahead = np.cross(up, np.eye(3)[np.argmin(np.abs(up))])
+    ahead /= np.linalg.norm(ahead)
+    return np.stack([ahead, np.cross(up, ahead), up])
+
+
+def _seen_share(cameras, points):
+    """(N,) share of the cameras whose image has room for each point."""
+    seen = np.zeros(len(points))
+    for camera in cameras:
+        x, y, z = camera.pose[:, :3].T @ (points.T - camera.eye[:, None])
+        ahead = z > 0
+        z = np.where(ahead, z, 1)
+        u, v = camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy
+        seen += ahead & (u >= 0) & (u < camera.width) & (v >= 0) & (v < camera.height)
+    return seen / len(cameras)
+
+
+def _on_object(points, seen):
+    """(M, 3) of the points: those that nearly all cameras see and that are not alone, without the
+    table that they stand on. points: (N, 3), z up, the cameras at a distance of 1 from the origin.
+    """
+    near = np.linalg.norm(points, axis=1) < 1
+    if not near.any():
+        return points[near]
+    kept = points[near & (seen >= SEEN * np.quantile(seen[near], 0.95))]
+    if len(kept) <= NEIGHBOURS:
+        return kept
+    away = cKDTree(kept).query(kept, NEIGHBOURS + 1)[0][:, -1]
+    kept = kept[away < LONELY * np.median(away)]
+    table = _table(kept)
+    return kept if table is None else kept[kept @ table[:3] > table[3] + THICK]
+
+
+def _table(points):
+    """(4,) normal and height of the level plane that the points stand on, None without one."""
+    rng, best, found = np.random.default_rng(0), TABLE * len(points), None
+    for _ in range(TRIED):
+        a, b, c = points[rng.integers(0, len(points), 3)]
+        normal = np.cross(b - a, c - a)
+        length = np.linalg.norm(normal)
+        if length < 1e-12 or abs(normal[2]) < TILT * length:
+            continue
+        normal *= np.sign(normal[2]) / length
+        height = points @ normal - a @ normal
+        on = np.abs(height) < THICK
+        above = height > THICK
+        if on.sum() <= best or (height < -THICK).sum() > BELOW * len(points) or not above.any():
+            continue
+        if (_spread(points[on]) > LEAST_SPREAD * _spread(points[above])).all():
+            best, found = on.sum(), np.append(normal, a @ normal)
+    return found
+
+
+def _spread(points):
+    """(2,) width of points in x and y, but for some at the ends."""
+    return np.ptp(np.quantile(points[:, :2], [0.05, 0.95], axis=0), axis=0)

@@ -1,0 +1,170 @@
+"""Features of the images and their matches, by pycolmap on the CPU, kept in its database."""
+
+import os
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from itertools import combinations, groupby
+from pathlib import Path
+from typing import Any
+
+from tqdm import tqdm
+
+from pp_cl.capture.packages import needed
+from pp_cl.errors import UserError, shown
+from pp_cl.files.atomic import mend
+
+LENS = "OPENCV"
+LARGEST = 1600  # pixels, longer side; larger images are reduced for their features
+FEATURES = 8192  # of an image, at most
+AT_ONCE = 32  # images, between two states of the bar and where a stopped run goes on
+PAIRS_AT_ONCE = 200
+EXHAUSTIVE = 150  # photographs of which each is compared with each
+OVERLAP = 10  # frames before and after that one is compared with
+LOOPS = 50  # frames that are compared with each other wherever they are in the film
+
+
+@contextmanager
+def opened(database: Path) -> Iterator[Any]:
+    """pycolmap's database, closed at the end."""
+    db = needed("pycolmap").Database.open(database)
+    try:
+        yield db
+    finally:
+        db.close()
+
+
+@contextmanager
+def quiet(work: Path) -> Iterator[Any]:
+    """pycolmap without its log. What it says of a disk that cannot be written is a UserError."""
+    colmap = needed("pycolmap")
+    colmap.logging.minloglevel = colmap.logging.FATAL
+    try:
+        yield colmap
+    except RuntimeError as error:
+        raise UserError(
+            f"{work}: pycolmap stopped ({shown(str(error), 160)}); check the disk and its free"
+            " space; the same command goes on"
+        ) from error
+    except OSError as error:
+        raise UserError(f"{work}: cannot be written ({error.strerror}); {mend(error)}") from error
+
+
+def find_features(
+    database: Path, images: Path, taken: Sequence[dict[str, Any]], masks: Path | None = None
+) -> dict[str, int]:
+    """Add the features of each image to the database, where they are not there yet.
+
+    taken: what take_images() says of the images; those of equal lens and size have one camera.
+    masks: NAME.png of each image, black where no features are wanted. Returns {name: features}.
+    """
+    with quiet(database) as colmap, opened(database) as db:
+        bar = tqdm(total=len(taken), desc="features", unit="image", leave=False, disable=None)
+        by_camera = sorted(taken, key=_camera)
+        for _, group in groupby(by_camera, _camera):
+            names, camera = [one["name"] for one in group], None
+            known = {image.name: image for image in db.read_all_images()}
+            for name in names:
+                camera = known[name].camera_id if name in known else camera
+            missing = [name for name in names if not _has_features(db, known.get(name))]
+            bar.update(len(names) - len(missing))
+            while missing:
+                some, missing = missing[:AT_ONCE], missing[AT_ONCE:]
+                colmap.extract_features(
+                    database,
+                    images,
+                    some,
+                    colmap.CameraMode.SINGLE,
+                    _reading(colmap, camera, masks),
+                    _extraction(colmap),
+                )
+                camera = db.read_image_with_name(some[0]).camera_id
+                bar.update(len(some))
+        bar.close()
+        return {
+            image.name: db.num_keypoints_for_image(image.image_id) for image in db.read_all_images()
+        }
+
+
+def _camera(one):
+    return one["lens"], tuple(one["size"])
+
+
+def _has_features(db, image):
+    return image is not None and db.exists_descriptors(image.image_id)
+
+
+def _reading(colmap, camera, masks):
+    """How images are read. camera: the id of theirs, None for a new one."""
+    options = colmap.ImageReaderOptions(camera_model=LENS)
+    if camera is not None:
+        options.existing_camera_id = camera
+    if masks is not None:
+        options.mask_path = masks
+    return options
+
+
+def _extraction(colmap):
+    options = colmap.FeatureExtractionOptions(
+        max_image_size=LARGEST, use_gpu=False, num_threads=cores()
+    )
+    options.sift.max_num_features = FEATURES
+    return options
+
+
+def cores() -> int:
+    """How many cores this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def match(database: Path, is_film: bool) -> int:
+    """Match the features of pairs of images, where that is not done yet, and keep the pairs whose
+    matches fit one motion of the camera. Returns their number.
+    """
+    with quiet(database) as colmap, opened(database) as db:
+        images = sorted(db.read_all_images(), key=lambda image: image.name)
+        ids = {image.name: image.image_id for image in images}
+        pairs = pairs_of([image.name for image in images], is_film)
+        missing = [pair for pair in pairs if not db.exists_matches(*(ids[name] for name in pair))]
+        bar = tqdm(total=len(pairs), desc="matches", unit="pair", leave=False, disable=None)
+        bar.update(len(pairs) - len(missing))
+        matching = colmap.FeatureMatchingOptions(use_gpu=False, num_threads=cores())
+        listed = database.with_name("pairs.txt")
+        while missing:
+            some, missing = missing[:PAIRS_AT_ONCE], missing[PAIRS_AT_ONCE:]
+            listed.write_text("".join(f"{a} {b}\n" for a, b in some))
+            colmap.match_image_pairs(
+                database,
+                matching,
+                colmap.ImportedPairingOptions(match_list_path=listed),
+                verification(colmap),
+            )
+            bar.update(len(some))
+        bar.close()
+        listed.unlink(missing_ok=True)
+        return db.num_verified_image_pairs()
+
+
+def forget_matches(database: Path) -> None:
+    """Remove all matches, so that match() begins anew."""
+    with quiet(database), opened(database) as db:
+        db.clear_matches()
+        db.clear_two_view_geometries()
+
+
+def verification(colmap: Any) -> Any:
+    """How pairs are checked; with a seed, so that the same matches give the same pairs."""
+    options = colmap.TwoViewGeometryOptions()
+    options.ransac.random_seed = 0
+    return options
+
+
+def pairs_of(names: Sequence[str], is_film: bool) -> list[tuple[str, str]]:
+    """The pairs to match: all of them, or for films and many photographs those that follow each
+    other, and for loops each of some with each.
+    """
+    count = len(names)
+    if count <= EXHAUSTIVE and not is_film:
+        return list(combinations(names, 2))
+    near = {(i, j) for i, j in combinations(range(count), 2) if j - i <= OVERLAP}
+    some = set(combinations(range(0, count, -(-count // LOOPS)), 2))
+    return [(names[i], names[j]) for i, j in sorted(near | some)]

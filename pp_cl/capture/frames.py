@@ -1,0 +1,254 @@
+"""The images of a scene from what a camera gives: upright copies of photographs, or the sharpest
+frames of a film; what is blurred, broken or there twice is left out.
+"""
+
+import os
+import re
+import warnings
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from PIL import Image, ImageOps
+from tqdm import tqdm
+
+from pp_cl.capture.packages import needed
+from pp_cl.errors import UserError, shown
+from pp_cl.files.atomic import atomic_file, atomic_folder
+from pp_cl.files.image import EIGHT_BIT_MODES
+from pp_cl.files.untrusted import opened_regular
+
+ENDINGS = (".jpg", ".jpeg", ".png", ".webp", ".tif", ".tiff", ".heic", ".heif")
+FORMATS = ("JPEG", "PNG", "WEBP", "TIFF", "HEIF")  # JPEG opens MPO, which phones write, too
+KEPT = {"JPEG": ".jpg", "MPO": ".jpg", "PNG": ".png"}  # formats that are copied as they are
+MODES = (*EIGHT_BIT_MODES, "CMYK", "YCbCr")
+ORIENTATION, MAKE, MODEL, EXIF = 0x0112, 0x010F, 0x0110, 0x8769
+FOCAL, FOCAL_35 = 0x920A, 0xA405  # of the part of EXIF about the exposure
+QUALITY = {"quality": 95, "subsampling": 0}  # of JPEGs
+LEAST = 8  # photographs
+SEEN, SMALL = 640, 64  # pixels, longer side, at which sharpness and likeness are measured
+BLURRED = 0.2  # of the neighbours' median sharpness
+EMPTY = 1.0  # sharpness, levels squared: noise alone has more
+NEIGHBOURS = 10  # on either side
+ALIKE = 0.15  # of the neighbours' usual difference
+SAME = 0.3  # levels of 255 by which small copies of one photograph differ at most
+FRAMES, GROUP = 120, 12  # of a film
+LOCAL = ["-protocol_whitelist", "file,pipe"]  # a film names no other machine
+EACH_ONCE = ["-fps_mode", "passthrough"]
+
+
+def take_images(source: Path, images: Path) -> dict[str, Any]:
+    """Write the photographs of a folder, or the sharpest frame of each of FRAMES intervals of a
+    film, to the new folder `images`, upright, as JPEG or PNG.
+
+    Returns {"images": [{name, source, lens, size, sharpness}], "left_out": [{source, reason}]};
+    lens is equal for photographs of one camera at one focal length. Raises UserError where too few
+    are usable.
+    """
+    with atomic_folder(images) as unfinished:
+        found = list((_photographs if source.is_dir() else _frames)(source, unfinished))
+        _leave_out(found)
+        for one in found:
+            if "reason" in one and "name" in one:
+                (unfinished / one["name"]).unlink()
+        kept = [one for one in found if "reason" not in one]
+        left_out = [one for one in found if "reason" in one]
+        if len(kept) < LEAST:
+            why = [f"{one['source']} {one['reason']}" for one in left_out[:3]]
+            raise UserError(
+                f"{source}: {len(kept)} of {len(found)} images can be used, at least {LEAST} are"
+                f" needed ({'; '.join(why) or 'nothing is wrong with them'}); take 30 or more all"
+                " around the object"
+            )
+    return {
+        "images": [_of(one, ("name", "source", "lens", "size", "sharpness")) for one in kept],
+        "left_out": [_of(one, ("source", "reason")) for one in left_out],
+    }
+
+
+def _of(facts, keys):
+    return {key: facts[key] for key in keys}
+
+
+# Photographs --------------------------------------------------------------------------------------
+
+
+def _photographs(folder, images):
+    """The facts of each photograph, written to `images` where it can be read."""
+    needed("pillow_heif").register_heif_opener()
+    files = sorted(
+        file
+        for file in folder.iterdir()
+        if file.suffix.lower() in ENDINGS and not file.name.startswith(".")
+    )
+    if not files:
+        raise UserError(
+            f"{folder}: no photographs in it ({', '.join(ENDINGS)}); give the folder that has them,"
+            " or a film"
+        )
+    targets, taken = [], set()
+    for file in files:
+        name = re.sub(r"\s+", "_", file.stem)  # COLMAP's lists of pairs know no spaces
+        if name.lower() in taken:
+            name = re.sub(r"[\s.]+", "_", file.name)
+        taken.add(name.lower())
+        targets.append(images / name)
+    with ThreadPoolExecutor(os.cpu_count()) as pool:
+        made = pool.map(_take, files, targets)
+        yield from tqdm(made, "frames", len(files), unit="image", leave=False, disable=None)
+
+
+def _take(file, target):
+    """A photograph's facts; it is written under target and a suffix."""
+    facts = {"source": file.name}
+    try:
+        with opened_regular(file) as opened, warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # Pillow's, of odd EXIF
+            image = Image.open(opened, formats=FORMATS)
+            image.load()
+            exif = image.getexif()
+            if image.mode not in MODES:
+                raise ValueError(f"{image.mode} has not 8 bits a channel")
+            is_kept = image.format in KEPT and image.mode in ("RGB", "RGBA", "L")
+            is_kept = is_kept and exif.get(ORIENTATION, 1) == 1
+            content = opened.seek(0) or opened.read() if is_kept else None
+    except Image.DecompressionBombError:
+        return facts | {"reason": "has more than 178 million pixels"}
+    except Exception as error:  # decoders meet broken bytes with whatever comes up
+        return facts | {"reason": f"cannot be read ({shown(str(error), 80)})"}
+    exposure = exif.get_ifd(EXIF)
+    lens = [exif.get(MAKE), exif.get(MODEL), exposure.get(FOCAL), exposure.get(FOCAL_35)]
+    upright = ImageOps.exif_transpose(image)
+    facts |= _look(upright) | {"lens": " ".join(shown(str(part), 40) for part in lens)}
+    has_alpha = image.mode in ("RGBA", "LA", "PA") or "transparency" in image.info
+    suffix = KEPT[image.format] if is_kept else ".png" if has_alpha else ".jpg"
+    facts["name"] = target.name + suffix
+    with atomic_file(target.with_name(facts["name"])) as copy:
+        if is_kept:
+            copy.write(content)
+        elif has_alpha:
+            upright.convert("RGBA").save(copy, "PNG")
+        else:
+            exif[ORIENTATION] = 1
+            upright.convert("RGB").save(copy, "JPEG", exif=exif, **QUALITY)
+    return facts
+
+
+# Films --------------------------------------------------------------------------------------------
+
+
+def _frames(film, images):
+    """The facts of the sharpest frame of each interval, written to `images`."""
+    chosen = _sharpest(film)
+    equal = [f"eq(n,{one['number']})" for one in chosen]
+    # in groups, since ffmpeg sums no more than a hundred
+    some = ["+".join(equal[i : i + GROUP]) for i in range(0, len(equal), GROUP)]
+    wanted = "+".join(f"({one})" for one in some)
+    meta, frames = _decoded(film, f"select='{wanted}'", "rgb24", 3)
+    frames = zip(chosen, frames, strict=False)
+    for one, frame in tqdm(frames, "frames", len(chosen), unit="image", leave=False, disable=None):
+        seconds = one["number"] / meta["fps"]
+        one |= {"name": f"{one['number']:06d}.jpg", "source": f"{seconds:.2f} s", "lens": "film"}
+        image = Image.fromarray(frame)
+        one["size"] = image.size
+        with atomic_file(images / one["name"]) as file:
+            image.save(file, "JPEG", **QUALITY)
+        yield one
+
+
+def _sharpest(film):
+    """The looks of the sharpest frame of each interval, and the numbers of these frames."""
+    meta, frames = _decoded(film, f"scale=w='min({SEEN},iw)':h=-2", "gray", 1)
+    total = round(meta["duration"] * meta["fps"])
+    best = {}
+    for number, frame in enumerate(
+        tqdm(frames, "looking at frames", total, unit="frame", leave=False, disable=None)
+    ):
+        interval = min(number, total - 1) * FRAMES // max(total, FRAMES)
+        look = _look(Image.fromarray(frame[..., 0]))
+        if interval not in best or look["sharpness"] > best[interval]["sharpness"]:
+            best[interval] = look | {"number": number}
+    if not best:
+        raise UserError(f"{film}: holds no frames; give another film")
+    return list(best.values())
+
+
+def _decoded(film: Path, filters: str, pixels: str, channels: int) -> tuple[dict, Iterator]:
+    """(what ffmpeg says of the film, its frames after the filters, (H, W, channels) uint8)."""
+    reading = needed("imageio_ffmpeg").read_frames(
+        film,
+        pixels,
+        bits_per_pixel=8 * channels,
+        input_params=LOCAL,
+        output_params=["-vf", filters, *EACH_ONCE],
+    )
+
+    def refused(error):
+        return UserError(
+            f"{film}: cannot be read as a film ({shown(str(error), 100)}); give an MP4, MOV or"
+            " WebM, or a folder of photographs"
+        )
+
+    try:
+        meta = next(reading)
+        shape = (*meta["size"][::-1], channels)
+    except (OSError, RuntimeError, ValueError, IndexError, KeyError, StopIteration) as error:
+        raise refused(error) from None
+
+    def frames():
+        try:
+            for content in reading:
+                yield np.frombuffer(content, np.uint8).reshape(shape)
+        except (OSError, RuntimeError) as error:
+            raise refused(error) from None
+
+    return meta, frames()
+
+
+# What is left out ---------------------------------------------------------------------------------
+
+
+def _look(image):
+    """What is compared of an image: its sharpness (the variance of its Laplacian), its size and a
+    small copy.
+    """
+    cv2 = needed("cv2")
+    gray = image.convert("L")
+    gray.thumbnail((SEEN, SEEN), Image.Resampling.BOX)
+    sharpness = float(cv2.Laplacian(np.array(gray), cv2.CV_64F).var())
+    small = np.array(gray.resize((SMALL, SMALL), Image.Resampling.BOX), np.float32)
+    return {"sharpness": round(sharpness, 2), "size": image.size, "small": small}
+
+
+def _leave_out(found):
+    """Give a reason to each image that is empty, blurred or there twice."""
+    good = [one for one in found if "reason" not in one]
+    sharpness = np.array([one["sharpness"] for one in good])
+    for i, one in enumerate(good):
+        usual = np.median(sharpness[max(0, i - NEIGHBOURS) : i + NEIGHBOURS + 1])
+        if one["sharpness"] < EMPTY:
+            one["reason"] = "shows nothing sharp"
+        elif one["sharpness"] < BLURRED * usual:
+            one["reason"] = f"is blurred (sharpness {one['sharpness'] / usual:.0%} of the usual)"
+    good = [one for one in good if "reason" not in one]
+    steps = [_difference(*two) for two in pairwise(good)]
+    last = good[0] if good else None
+    for i, one in enumerate(good[1:]):
+        usual = np.median(steps[max(0, i - NEIGHBOURS) : i + NEIGHBOURS + 1])
+        if _difference(last, one) < max(SAME, ALIKE * usual):
+            one["reason"] = f"shows the same as {last['source']}"
+        else:
+            last = one
+
+
+def _difference(one, other):
+    """Mean difference of the small copies, in levels, which a change of brightness does not raise;
+    infinite for images of different size.
+    """
+    if one["size"] != other["size"]:
+        return np.inf
+    a, b = (image["small"] - image["small"].mean() for image in (one, other))
+    return float(np.abs(a - b).mean())

@@ -1,0 +1,195 @@
+"""Masks of photographs with known cameras: given, of their alpha, of a uniform background, of a
+program of the user's; else cut out by colour around the sparse points and voted on by all views.
+"""
+
+import shlex
+import subprocess
+import tempfile
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+from tqdm import tqdm
+
+from pp_cl.capture.cut import cut_out_all, whole_mask, window
+from pp_cl.errors import UserError, shown
+from pp_cl.files.image import read_gray, read_rgba, write_png
+from pp_cl.scene.agreement import disagreements, listing
+from pp_cl.scene.distortion import undistort
+from pp_cl.scene.masks import MaskRule, cut_out
+from pp_cl.scene.views import Photograph, View, fitting_downscale, shrink
+
+UNIFORM = 0.9  # of a photograph's border, and of the photographs, that show the background alone
+ON_MASK = 0.9  # of the object's points, that a mask of a uniform background holds
+CHECKED_SIDE = 200  # pixels of the masks that are compared
+SECONDS = 600  # that a program may take for a mask
+
+
+def mask_file(folder: Path, name: str) -> Path:
+    """Where write_masks() writes the mask of a photograph."""
+    return folder / f"{Path(name).stem}.png"
+
+
+def write_masks(
+    scene: Path,
+    folder: Path,
+    photographs: Sequence[Photograph],
+    box: np.ndarray,
+    points: np.ndarray,
+    seen: Sequence[np.ndarray],
+    *,
+    given: Path | None = None,
+    command: str | None = None,
+    behind: Mapping[str, np.ndarray] | None = None,
+) -> str:
+    """Write the mask of each photograph as mask_file(), 8-bit gray, white where the object is; what
+    lies there is kept, and helps to make the others. Returns one line on what was done.
+
+    scene: the folder that the photographs' names are relative to. box: (2, 3) around the object.
+    points: (N, 3) in the scene's world. seen: for each photograph the indices (M,) of the points
+    that it shows. given: a folder of masks. command: of a program that makes masks, which {image}
+    and {mask} stand for. behind: (M, 2) pixels of photographs, by name, that show the background.
+    Raises UserError for masks that are given and missing or broken, a program that fails, a box in
+    which nothing is seen.
+    """
+    words = None if command is None else program_words(command)
+    folder.mkdir(parents=True, exist_ok=True)
+    kept = [mask_file(folder, one.name).is_file() for one in photographs]
+    left = [one for one, is_kept in zip(photographs, kept, strict=True) if not is_kept]
+    how = {"kept": sum(kept)}
+    for one in tqdm(left, "masks", unit="image", leave=False, disable=None):
+        source, mask = _found(scene, one, given, words)
+        if mask is not None:
+            write_png(mask_file(folder, one.name), mask)
+            how[source] = how.get(source, 0) + 1
+    inside = ((points > box[0]) & (points < box[1])).all(1)
+    windows = [_window(scene, folder, one, box) for one in photographs]
+    if any(window.mask is None for window in windows):
+        how |= _uniform(scene, folder, photographs, windows, points[inside])
+        if any(window.mask is None for window in windows):
+            pixels = [(behind or {}).get(one.name, np.empty((0, 2))) for one in photographs]
+            how |= _cut(scene, folder, photographs, windows, box, points, inside, seen, pixels)
+    counts = ", ".join(f"{count} {source}" for source, count in how.items() if count)
+    return f"{counts}{_contradictions(scene, folder, photographs, box)}"
+
+
+def _found(scene, photograph, given, words):
+    """(where from, (H, W) uint8 mask) of a photograph that has one without the others; (none, None)
+    if it has not.
+    """
+    image = read_rgba(scene / photograph.name)
+    if given is not None:
+        name = Path(photograph.name).name
+        return "given", MaskRule(folder=str(given)).apply(image, name, None)[..., 3]
+    if words is not None:
+        return "by the program", _of_program(words, scene / photograph.name, image.shape[:2])
+    if (image[..., 3] < 255).any():
+        return "of their alpha", image[..., 3]
+    return "none", None
+
+
+def _of_program(words, image, shape):
+    """The mask that a program makes of a photograph. Raises UserError."""
+    who = f"--mask-command: {shown(words[0])}: {image.name}"
+    with tempfile.TemporaryDirectory(prefix="pp-cl-") as folder:
+        mask = Path(folder) / "mask.png"
+        for key, path in (("{image}", image.resolve()), ("{mask}", mask)):
+            words = [word.replace(key, str(path)) for word in words]
+        try:
+            done = subprocess.run(words, capture_output=True, timeout=SECONDS, check=False)
+        except (OSError, subprocess.TimeoutExpired) as error:
+            raise UserError(f"{who}: {error}; mend the command") from None
+        if done.returncode or not mask.is_file():
+            said = done.stderr.decode(errors="replace").strip().splitlines() or ["no word of it"]
+            what = f"status {done.returncode}" if done.returncode else "no mask written"
+            raise UserError(f"{who}: {what}: {shown(said[-1])}; mend the command")
+        found = read_gray(mask)
+    if found.shape != shape:
+        raise UserError(f"{who}: its mask has another size than the photograph; mend the command")
+    return found
+
+
+def program_words(command: str) -> list[str]:
+    """The words of --mask-command. Raises UserError unless they name a program, {image}, {mask}."""
+    try:
+        words = shlex.split(command)
+    except ValueError as error:
+        raise UserError(f"--mask-command {command}: {error}; mend the quotes") from None
+    if not words or "{image}" not in command or "{mask}" not in command:
+        raise UserError(f"--mask-command {command}: write it as 'PROGRAM {{image}} {{mask}}'")
+    return words
+
+
+def _window(scene, folder, photograph, box):
+    """The Window of a photograph, with its mask if that is written."""
+    found = window(read_rgba(scene / photograph.name)[..., :3], photograph, box)
+    if mask_file(folder, photograph.name).is_file():
+        found.mask = found.reduced(read_gray(mask_file(folder, photograph.name))) > 127
+    return found
+
+
+def _uniform(scene, folder, photographs, windows, points):
+    """Write the masks of photographs before a uniform background, where nearly all of those without
+    a mask are. points: (M, 3) of the object. Returns {what: how many}.
+    """
+    left = [i for i, one in enumerate(windows) if one.mask is None]
+    found = [i for i in left if _is_uniform(windows[i], points)]
+    if len(found) < UNIFORM * len(left):
+        return {}
+    for i in tqdm(found, "masks", unit="image", leave=False, disable=None):
+        name = photographs[i].name
+        mask = uniform_mask(read_rgba(scene / name), name)
+        if mask is not None:
+            write_png(mask_file(folder, name), mask)
+            windows[i].mask = windows[i].reduced(mask) > 127
+    return {"before a uniform background": sum(windows[i].mask is not None for i in found)}
+
+
+def uniform_mask(image: np.ndarray, name: str) -> np.ndarray | None:
+    """(H, W) uint8 mask of a photograph (H, W, 4), None where its border shows more than one
+    colour.
+    """
+    try:
+        mask = cut_out(image, name, MaskRule.tolerance)[..., 3]
+    except UserError:
+        return None
+    border = np.concatenate([mask[0], mask[-1], mask[:, 0], mask[:, -1]])
+    return mask if (border < 128).mean() >= UNIFORM else None
+
+
+def _is_uniform(window, points):
+    """Whether the background of a window is, and all points of the object stand out from it."""
+    opaque = np.full((*window.image.shape[:2], 1), 255, np.uint8)
+    mask = uniform_mask(np.concatenate([window.image, opaque], axis=2), window.name)
+    if mask is None:
+        return False
+    _, rows, columns = window.inside(points)
+    return bool((mask[rows, columns] > 127).mean() >= ON_MASK) if len(rows) else bool(mask.any())
+
+
+def _cut(scene, folder, photographs, windows, box, points, inside, seen, behind):
+    """Cut out what has no mask, and write it. Returns {what: how many}."""
+    if not any(inside[some].any() for some in seen):
+        raise UserError(f"{scene}: no point lies in the object's box; give another with --box")
+    left = [i for i, one in enumerate(windows) if one.mask is None]
+    cut_out_all(windows, box, points, inside, seen, behind)
+    for i in tqdm(left, "masks", unit="image", leave=False, disable=None):
+        name = photographs[i].name
+        mask = whole_mask(windows[i], read_rgba(scene / name)[..., :3])
+        write_png(mask_file(folder, name), mask)
+    return {"cut out": len(left)}
+
+
+def _contradictions(scene, folder, photographs, box):
+    """`; 2 contradict the others: A (8%), B (6%)`, empty where none does."""
+    views = []
+    for one in photographs:
+        mask = read_gray(mask_file(folder, one.name))
+        factor = fitting_downscale(mask.shape, CHECKED_SIDE)
+        image = shrink(np.dstack([mask, mask, mask, mask]), factor)
+        camera = one.camera.downscaled(factor)
+        if one.distortion:
+            image = undistort(image, camera, one.distortion)
+        views.append(View(one.name, camera, image))
+    wrong = [f"{Path(one.view.name).name} ({one.share:.0%})" for one in disagreements(views, box)]
+    return f"; {len(wrong)} contradict the others: {listing(wrong)}" if wrong else ""

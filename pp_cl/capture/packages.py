@@ -1,0 +1,72 @@
+"""The packages of the extra `capture`: imported where they are needed, pycolmap in a process of its
+own.
+"""
+
+import importlib
+import os
+import signal
+import sys
+import threading
+import time
+from collections.abc import Callable
+from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
+from multiprocessing import get_context
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+from PIL import Image  # noqa: F401  before pycolmap, whose zlib would otherwise be taken for Pillow's
+
+from pp_cl.errors import UserError
+
+DISTRIBUTIONS = {
+    "pycolmap": "pycolmap",
+    "cv2": "opencv-python-headless",
+    "pillow_heif": "pillow-heif",
+    "imageio_ffmpeg": "imageio-ffmpeg",
+}
+
+
+def needed(module: str) -> ModuleType:
+    """The imported module. Raises UserError with the command that installs it where it is
+    missing.
+    """
+    try:
+        return importlib.import_module(module)
+    except ImportError as error:
+        raise UserError(
+            f"capture needs the package {DISTRIBUTIONS[module]} ({error}):"
+            " pip install pp-cl[capture]"
+        ) from None
+
+
+def isolated(folder: Path, function: Callable, *arguments: Any) -> Any:
+    """What a function returns that runs in a process of its own: of a full disk pycolmap's threads
+    end their process. Raises UserError naming the folder where that happens.
+    """
+    needed("pycolmap")
+    with ProcessPoolExecutor(1, get_context("spawn"), _begin, (os.getpid(),)) as pool:
+        try:
+            return pool.submit(function, *arguments).result()
+        except BrokenProcessPool:
+            raise UserError(
+                f"{folder}: pycolmap ended in the middle of its work; free some space on the disk,"
+                " or some memory: the same command goes on"
+            ) from None
+
+
+def _begin(parent):
+    """Ctrl-C ends the process at once, and so does the end of its parent; only Python writes to
+    stderr.
+    """
+    signal.signal(signal.SIGINT, signal.SIG_DFL)
+    sys.stderr = os.fdopen(os.dup(2), "w")
+    os.dup2(os.open(os.devnull, os.O_WRONLY), 2)
+
+    def watch():
+        while os.getppid() == parent:
+            time.sleep(0.5)
+        os._exit(1)
+
+    threading.Thread(target=watch, daemon=True).start()

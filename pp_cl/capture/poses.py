@@ -1,0 +1,125 @@
+"""Where each image was taken, by pycolmap's incremental mapping, and why some have no place."""
+
+import shutil
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from tqdm import tqdm
+
+from pp_cl.capture.features import cores, opened, quiet
+from pp_cl.errors import UserError
+from pp_cl.files.atomic import atomic_folder
+from pp_cl.scene.camera import Camera
+from pp_cl.scene.distortion import Distortion
+from pp_cl.scene.views import Photograph
+
+LEAST_SHARE = 0.5  # of the images that have a place
+FEW_FEATURES, FEW_MATCHES = 200, 30
+BLURRED = 0.4  # of the median sharpness
+
+
+def place(database: Path, images: Path, model: Path, taken: Sequence[dict]) -> dict[str, Any]:
+    """Write the largest model that the matches give to the new folder `model`.
+
+    taken: what take_images() says of the images. Returns the numbers of images and points, the
+    reprojection error in pixels, and {image: reason} of those without a place. Raises UserError
+    where more than a half have none.
+    """
+    with atomic_folder(model) as unfinished:
+        found = _mapped(database, images, unfinished, len(taken))
+        if found:
+            best = max(found.values(), key=lambda one: (one.num_reg_images(), one.num_points3D()))
+            for folder in list(unfinished.iterdir()):
+                shutil.rmtree(folder)
+            best.write(unfinished)
+        placed = {image.name for image in best.images.values() if image.has_pose} if found else ()
+        reasons = _reasons(database, taken, placed)
+        if len(placed) < max(3, LEAST_SHARE * len(taken)):
+            some = "; ".join(f"{name} {why}" for name, why in list(reasons.items())[:3])
+            raise UserError(
+                f"{images}: only {len(placed)} of {len(taken)} images could be placed ({some});"
+                " take more of them with more overlap (10 degrees apart or less), sharp and of an"
+                " object that has some texture"
+            )
+        return {
+            "placed": len(placed),
+            "points": best.num_points3D(),
+            "error": round(best.compute_mean_reprojection_error(), 3),
+            "unplaced": reasons,
+        }
+
+
+def _mapped(database, images, folder, count):
+    """{number: pycolmap's model} of what fits together."""
+    with quiet(database) as colmap:
+        options = colmap.IncrementalPipelineOptions(
+            min_model_size=3, num_threads=cores(), random_seed=0
+        )
+        with tqdm(total=count, desc="poses", unit="image", leave=False, disable=None) as bar:
+            return colmap.incremental_mapping(
+                database, images, folder, options, next_image_callback=lambda: bar.update()
+            )
+
+
+def _reasons(database, taken, placed):
+    """{image: why it has no place}."""
+    with opened(database) as db:
+        ids = {image.name: image.image_id for image in db.read_all_images()}
+        best = dict.fromkeys(ids.values(), 0)
+        for pair, matches in zip(*db.read_two_view_geometry_num_inliers(), strict=True):
+            for one in _images_of(pair):
+                best[one] = max(best[one], matches)
+        features = {name: db.num_keypoints_for_image(i) for name, i in ids.items()}
+    usual = np.median([one["sharpness"] for one in taken])
+    reasons = {}
+    for one in taken:
+        name = one["name"]
+        if name in placed:
+            continue
+        matches = best.get(ids.get(name), 0)
+        if one["sharpness"] < BLURRED * usual:
+            reasons[name] = f"is blurred (sharpness {one['sharpness'] / usual:.0%} of the usual)"
+        elif features.get(name, 0) < FEW_FEATURES:
+            reasons[name] = f"has few features ({features.get(name, 0)}): blurred, dark or plain"
+        elif matches < FEW_MATCHES:
+            reasons[name] = f"has few matches with any other ({matches}): too little overlap"
+        else:
+            reasons[name] = f"fits no others that are placed (at most {matches} matches)"
+    return reasons
+
+
+def _images_of(pair):
+    from pycolmap import pair_id_to_image_pair
+
+    return pair_id_to_image_pair(pair)
+
+
+def photographs(model: Any, folder: str) -> list[Photograph]:
+    """The images of pycolmap's model that have a place, in the order of their names, as a scene
+    lists them that has them in its folder `folder`.
+    """
+    found = []
+    for image in sorted(model.images.values(), key=lambda image: image.name):
+        if not image.has_pose:
+            continue
+        lens = model.cameras[image.camera_id]
+        fx, fy, cx, cy, k1, k2, p1, p2 = lens.params  # OPENCV
+        world = image.cam_from_world().inverse().matrix()
+        camera = Camera(np.array(world), fx, fy, cx, cy, lens.width, lens.height)
+        found.append(
+            Photograph(f"{folder}/{image.name}", camera, distortion=Distortion(k1, k2, p1, p2))
+        )
+    return found
+
+
+def points(model: Any) -> tuple[np.ndarray, list[np.ndarray]]:
+    """((N, 3) points of pycolmap's model, for each of photographs() the indices of those in it)."""
+    index = {number: k for k, number in enumerate(model.points3D)}
+    shown = [
+        np.array([index[p.point3D_id] for p in image.points2D if p.has_point3D()], int)
+        for image in sorted(model.images.values(), key=lambda image: image.name)
+        if image.has_pose
+    ]
+    return np.array([point.xyz for point in model.points3D.values()]), shown

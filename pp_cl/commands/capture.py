@@ -1,0 +1,73 @@
+"""`pp-cl capture`: a scene from photographs or a film, with cameras, box and masks."""
+
+import argparse
+
+HELP = "make a scene from photographs or a film: cameras, box and masks"
+EPILOG = """stages, each done once; the same command goes on where it stopped:
+  frames      upright photographs, the sharpest frames of a film
+  features    what can be found again in other images
+  matches     pairs of images that show the same
+  poses       where each image was taken
+  box         what the cameras look at
+  masks       the object in each image
+  scene       transforms.json, COLMAP's model in sparse/0, points.ply"""
+STAGES = ("frames", "features", "matches", "poses", "box", "masks", "scene")
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the command's options."""
+    add = parser.add_argument
+    add("source", metavar="INPUT", help="folder of photographs, or a film")
+    add("--out", required=True, metavar="SCENE", help="folder of the scene")
+    add("--from", dest="begin", choices=STAGES, help="do this stage anew, and all after it")
+    add(
+        "--turntable",
+        action="store_true",
+        help="the camera stands still and the object turns (found out, but for plain objects)",
+    )
+    add("--masks", metavar="FOLDER", help="masks named like the photographs, white on the object")
+    add(
+        "--mask-command",
+        metavar="PROGRAM",
+        help="a program that makes masks, as 'rembg i {image} {mask}'",
+    )
+    add(
+        "--box",
+        type=_box,
+        metavar="X0,Y0,Z0,X1,Y1,Z1",
+        help="where the object is, in the units of the scene",
+    )
+
+
+def _box(text):
+    """The type of --box: six numbers, two corners that differ in x, y and z."""
+    from pp_cl.commands.options import number
+
+    corners = [number(-1e6, 1e6)(word) for word in text.split(",")]
+    if len(corners) != 6 or any(a == b for a, b in zip(corners, corners[3:], strict=False)):
+        raise argparse.ArgumentTypeError(f"{text}: write two corners, as -1,-1,-1,1,1,1")
+    return corners
+
+
+def run(options: argparse.Namespace) -> None:
+    """Do the stages that are left."""
+    from pathlib import Path
+
+    from pp_cl.capture.stages import Capture
+    from pp_cl.errors import UserError
+
+    source = Path(options.source)
+    if not source.exists():
+        raise UserError(f"{source}: no such folder or film; give the photographs")
+    given = {
+        "features": {"turntable": options.turntable},
+        "box": {"box": options.box},
+        "masks": {
+            "masks": options.masks and str(Path(options.masks).resolve()),
+            "command": options.mask_command,
+        },
+    }
+    Capture(source, Path(options.out), given, lambda line: print(line, flush=True)).run(
+        options.begin
+    )
+    print(f"look at it with `pp-cl info {options.out} --picture look.png`, then `pp-cl train`")

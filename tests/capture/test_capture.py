@@ -1,0 +1,206 @@
+"""From photographs and films to scenes: known cameras are found, each stage is done once, and what
+goes wrong ends in one line.
+"""
+
+import json
+import shutil
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+from PIL import Image, ImageFilter
+from support.runs import spoken
+
+from pp_cl.capture.frames import take_images
+from pp_cl.files.image import to_8bit, write_png
+from pp_cl.files.video import write_video
+from pp_cl.scene.demo import render
+from pp_cl.scene.load import load_scene, scene_format, scene_frames
+from tools.capture_demo import align, cameras, room
+
+pytest.importorskip("pycolmap")
+NEAR = range(12)  # of the cameras around the demo, 10 degrees apart
+SIZE = 300
+
+
+@pytest.fixture(scope="module")
+def shot(session_device, tmp_path_factory):
+    """A folder with photographs of the demo in a room, and the folder of their masks."""
+    folder = tmp_path_factory.mktemp("shot")
+    for name in ("photographs", "masks"):
+        (folder / name).mkdir()
+    for i in NEAR:
+        camera = cameras(SIZE, "turntable")[i]
+        rgba = render(session_device, camera)
+        alpha = rgba[..., 3:] / 255
+        write_png(
+            folder / "photographs" / f"{i:03d}.png",
+            rgba[..., :3] / 255 * alpha + room(camera) * (1 - alpha),
+        )
+        write_png(folder / "masks" / f"{i:03d}.png", rgba[..., 3])
+    return folder / "photographs", folder / "masks"
+
+
+@pytest.fixture(scope="module")
+def captured(shot, tmp_path_factory):
+    """The scene made of them."""
+    scene = tmp_path_factory.mktemp("captured") / "scene"
+    assert capture(shot[0], scene, "--masks", shot[1]) == (0, [])
+    return scene
+
+
+def capture(source, scene, *more):
+    """(exit status, lines on stderr) of the command."""
+    return spoken(["capture", source, "--out", scene, *more])
+
+
+def found(scene, stage):
+    return json.loads((scene / "capture" / f"{stage}.json").read_text())["found"]
+
+
+def changed(scene):
+    """{path: time of its last change} of the scene's files."""
+    return {p: p.stat().st_mtime_ns for p in scene.rglob("*") if p.is_file() and p.name[0] != "."}
+
+
+def off(scene, names=NEAR):
+    """How far the scene's cameras are from the true ones."""
+    placed = [one for split in ("train", "test") for one in scene_frames(scene, split)]
+    true = {f"images/{i:03d}": cameras(SIZE, "turntable")[i] for i in names}
+    return align([p.camera for p in placed], [true[p.name.rpartition(".")[0]] for p in placed])
+
+
+def test_photographs_become_a_scene(captured):
+    """Cameras agree with the true ones; the object is upright, in the middle, and of unit size."""
+    assert scene_format(captured) == "transforms" and off(captured).position < 0.03
+    assert off(captured).degrees < 0.5
+    views = load_scene(captured, ("train", "test")).splits
+    assert (len(views["train"]), len(views["test"])) == (10, 2)
+    box = np.array(json.loads((captured / "transforms.json").read_text())["aabb"])
+    assert np.abs(box).max() == pytest.approx(1) and np.abs(box).min() > 0.3
+    for view in (*views["train"], *views["test"]):
+        rows, columns = np.nonzero(view.image[..., 3] > 127)
+        middle = np.array([[0, 0, 0]]) - view.camera.eye
+        x, y, z = (view.camera.pose[:, :3].T @ middle.T)[:, 0]
+        assert (
+            np.hypot(
+                view.camera.fx * x / z + view.camera.cx - columns.mean(),
+                view.camera.fy * y / z + view.camera.cy - rows.mean(),
+            )
+            < 0.1 * SIZE
+        )
+        assert -view.camera.pose[2, 1] > 0  # the image's upper edge is up
+
+
+def test_what_is_done_is_not_done_again(captured, shot, tmp_path):
+    scene = shutil.copytree(captured, tmp_path / "scene")
+    words = shot[0], scene, "--masks", shot[1]
+    before = changed(scene)
+    assert capture(*words) == (0, []) and changed(scene) == before
+    for name in ("masks.json", "scene.json"):  # killed before they were written
+        (scene / "capture" / name).unlink()
+    assert capture(*words) == (0, [])
+    after = changed(scene)
+    assert after[scene / "capture" / "poses.json"] == before[scene / "capture" / "poses.json"]
+    assert after[scene / "capture" / "masks.json"] > before[scene / "capture" / "masks.json"]
+    box = "-0.5,-0.5,-0.5,0.5,0.5,0.5"
+    assert capture(*words, "--box", box, "--from", "scene") == (0, [])
+    assert json.loads((scene / "transforms.json").read_text())["aabb"] == [[-0.5] * 3, [0.5] * 3]
+    status, lines = capture(shot[1], scene)
+    assert status == 2 and len(lines) == 1 and str(scene) in lines[0]
+
+
+def test_photographs_as_they_come(shot, tmp_path):
+    """Turned ones with EXIF, HEIC, another size, one cut off: the others find their places."""
+    heif = pytest.importorskip("pillow_heif")
+    heif.register_heif_opener()
+    mixed = tmp_path / "mixed"
+    mixed.mkdir()
+    for k, file in enumerate(sorted(shot[0].iterdir())):
+        image, to = Image.open(file), mixed / file.name
+        if k % 4 == 0:
+            exif = Image.Exif()
+            exif[0x0112] = 6  # turned to the right when it is shown
+            image.rotate(90, expand=True).save(to.with_suffix(".jpg"), quality=95, exif=exif)
+        elif k % 4 == 1:
+            image.save(to.with_suffix(".heic"), quality=95)
+        elif k % 4 == 2:
+            image.resize((240, 240), Image.Resampling.LANCZOS).save(to)
+        else:
+            shutil.copy(file, to)
+    (mixed / "cut off.jpg").write_bytes(next(mixed.glob("*.jpg")).read_bytes()[:9000])
+    shutil.copy(mixed / "004.jpg", mixed / "again.jpg")
+    scene = tmp_path / "scene"
+    status, _ = capture(mixed, scene, "--from", "frames")  # no masks: it ends there
+    assert status in (0, 2)
+    left_out = {one["source"]: one["reason"] for one in found(scene, "frames")["left_out"]}
+    assert set(left_out) >= {"cut off.jpg"} and found(scene, "poses")["placed"] >= 11
+    sizes = {tuple(one["size"]) for one in found(scene, "frames")["images"]}
+    assert sizes == {(SIZE, SIZE), (240, 240)}
+
+
+def blurred(files, folder):
+    for file in files:
+        Image.open(file).filter(ImageFilter.GaussianBlur(25)).save(folder / file.name)
+
+
+def strangers(files, folder):
+    """Photographs of different things."""
+    for k, file in enumerate(files):
+        colours = np.random.default_rng(k).integers(0, 255, (40, 40, 3), np.uint8)
+        Image.fromarray(colours).resize((SIZE, SIZE), Image.Resampling.BICUBIC).save(
+            folder / file.name
+        )
+
+
+def three(files, folder):
+    for file in files[:3]:
+        shutil.copy(file, folder)
+
+
+def nothing(files, folder):
+    (folder / "notes.txt").write_text("none")
+
+
+@pytest.mark.parametrize("make", [blurred, strangers, three, nothing])
+def test_photographs_of_no_use(shot, tmp_path, make):
+    folder, scene = tmp_path / "folder", tmp_path / "scene"
+    folder.mkdir()
+    make(sorted(shot[0].iterdir()), folder)
+    status, lines = capture(folder, scene)
+    assert status == 2 and len(lines) == 1 and str(tmp_path) in lines[0]
+    assert not (scene / "transforms.json").exists()
+
+
+def test_films(shot, tmp_path):
+    """The sharpest frames are taken; a black film, and what is none, end in one line."""
+    pytest.importorskip("imageio_ffmpeg")
+    sharp = [np.array(Image.open(file)) for file in sorted(shot[0].iterdir())]
+    soft = [np.array(Image.fromarray(one).filter(ImageFilter.GaussianBlur(3))) for one in sharp]
+    frames = [frame for two in zip(soft, sharp, strict=True) for frame in two] * 10
+    write_video(tmp_path / "film.mp4", frames, 24)  # 240 frames, of which each second one is sharp
+    taken = take_images(tmp_path / "film.mp4", tmp_path / "images")["images"]
+    chosen = [int(one["name"][:6]) for one in taken]
+    assert len(chosen) > 100 and all(number % 2 for number in chosen)
+    black = [to_8bit(np.zeros((64, 96, 3)))] * 30
+    write_video(tmp_path / "black.mp4", black, 24)
+    (tmp_path / "none.mp4").write_bytes(b"no film" * 100)
+    for name in ("black.mp4", "none.mp4", "missing.mp4"):
+        status, lines = capture(tmp_path / name, tmp_path / "other")
+        assert status == 2 and len(lines) == 1 and name in lines[0]
+
+
+def test_a_full_disk(shot, tmp_path):
+    """The database may not grow: one line that names it; with room again the command goes on."""
+    scene = tmp_path / "scene"
+    words = ["capture", str(shot[0]), "--out", str(scene), "--masks", str(shot[1])]
+    limited = "import resource as r; r.setrlimit(r.RLIMIT_FSIZE, (2**20, 2**20))"
+    code = f"import sys; {limited}; from pp_cl.cli import program; sys.exit(program({words}))"
+    ended = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, check=False
+    )
+    lines = [line for line in ended.stderr.splitlines() if line.startswith("pp-cl")]
+    assert ended.returncode == 2 and len(lines) == 1 and str(scene) in lines[0], ended.stderr
+    assert (scene / "capture" / "frames.json").exists()
+    assert capture(*words[1:2], scene, *words[4:]) == (0, []) and off(scene).position < 0.03
