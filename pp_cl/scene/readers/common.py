@@ -13,7 +13,7 @@ from typing import Any, TypeVar
 import numpy as np
 from tqdm import tqdm
 
-from pp_cl.errors import UserError, shown
+from pp_cl.errors import UserError, quoted, shown
 from pp_cl.files.checkpoint import opened_zip
 from pp_cl.files.image import ENDINGS
 from pp_cl.files.untrusted import opened_regular, read_json_text, read_regular, refusal
@@ -130,6 +130,22 @@ def scaled(stated: Sequence[float], size: tuple[int, int], fail: Fail) -> tuple[
             " another shape; copy the images anew"
         )
     return size[0] / stated[0], size[1] / stated[1]
+
+
+def checked_box(corners: object, fail: Fail) -> np.ndarray:
+    """(2, 3) lower and upper corner of a box that a file states. Raises fail(text) for what is
+    none.
+    """
+    try:
+        box = np.array(corners, np.float64)
+    except (TypeError, ValueError):  # no numbers, or lists of different lengths
+        box = np.empty(0)
+    if box.shape != (2, 3) or not (np.abs(box) < MOST).all() or not (box[1] > box[0]).all():
+        raise fail(
+            f"is {quoted(corners, 60)}; must be two corners of three numbers, the upper one larger"
+            " in x, y and z"
+        )
+    return box
 
 
 # Files of numbers ---------------------------------------------------------------------------------

@@ -6,11 +6,15 @@ and a writer of the former.
 import math
 from pathlib import Path, PurePosixPath
 
+import numpy as np
+
 from pp_cl.errors import UserError
 from pp_cl.files.atomic import atomic_folder, write_json
 from pp_cl.files.image import image_size, write_png
 from pp_cl.scene.readers.common import (
     SPLITS,
+    checked_box,
+    fail_at,
     hold_out,
     listing,
     read_json,
@@ -55,6 +59,15 @@ def read_split(folder: Path, split: str) -> list[Photograph]:
         read[photograph.name] = photograph
     frames = list(read.values())
     return _of_split(file, data, frames, split) if file.name == SINGLE else frames
+
+
+def box(folder: Path) -> np.ndarray | None:
+    """(2, 3) box around the object that a transforms.json states as its `aabb`, None where there is
+    none. Raises UserError naming the file.
+    """
+    file = folder / SINGLE
+    corners = None if _split_files(folder) else _read(file).get("aabb")
+    return None if corners is None else checked_box(corners, fail_at(file, "aabb"))
 
 
 def _split_files(folder):

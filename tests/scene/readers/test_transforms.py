@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from support.transforms_scenes import SIZE, opengl_pose, refused, train_views, write_scene
 
+from pp_cl.errors import UserError
 from pp_cl.files.image import read_rgba, write_png
 from pp_cl.scene.load import load_scene
 from pp_cl.scene.readers import transforms
@@ -78,6 +79,18 @@ def test_nerfstudio_names(tmp_path):
         [33, 32.5, 11.25, 0, 1.5, 5],
         [31, 32.5, 11.25, 8.5, 2, 5],
     ]
+
+
+@pytest.mark.parametrize("corners", [[0, 1], [[0, 0, 0], [1, 1, 0]], [["a"] * 3] * 2, [[0] * 3]])
+def test_the_box_of_a_single_file(tmp_path, corners):
+    data, file = write_scene(tmp_path), tmp_path / "transforms.json"
+    (tmp_path / "transforms_train.json").rename(file)
+    assert transforms.box(tmp_path) is None
+    file.write_text(json.dumps(data | {"aabb": [[-1, -2, -3], [1, 2, 4]]}))
+    np.testing.assert_array_equal(transforms.box(tmp_path), [[-1, -2, -3], [1, 2, 4]])
+    file.write_text(json.dumps(data | {"aabb": corners}))
+    with pytest.raises(UserError, match=f"^{file}: aabb: "):
+        transforms.box(tmp_path)
 
 
 def test_angle_of_height_and_single_focal_length(tmp_path):
