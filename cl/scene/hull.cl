@@ -31,7 +31,8 @@ kernel void pack_mask(
 // One work-item per word of 32 vertices along x: projects them into the views, one view after the
 // other until all are rejected too often, writes the set of those that at least `least` images see
 // and that no more masks reject than `forgiven` of all views, or the same share of those that see
-// it. A vertex outside of an image or behind its camera is not seen by it.
+// it. A vertex outside of an image is not seen by it; where the mask ends within the image, the
+// object does, and that rejects the vertex.
 kernel void carve(
     const uint nx,
     const uint ny,
@@ -42,6 +43,7 @@ kernel void carve(
     const uint forgiven,               // masks
     global const float4 *projections,  // (views, 3, 4) (i, j, k, 1) -> (u w, v w, w)
     global const uint4 *view_masks,    // (views, 4) width, height, words per row, first word
+    global const uint *view_is_whole,  // (views) 1: the mask touches no border of its image
     global const uint *masks,          // (M)
     global uint *bits)                 // (rows, words)
 {
@@ -66,8 +68,9 @@ kernel void carve(
             const uint in = w > 0 && u >= 0 && u < width && v >= 0 && v < height;
             const uint x = in ? (uint)u : 0, y = in ? (uint)v : 0;
             const uint on = masks[mask.w + y * mask.z + (x >> 5)] >> (x & 31);
-            seen[b] += in;
-            rejected[b] += in & ~on & 1;
+            const uint counts = in | view_is_whole[view];
+            seen[b] += counts;
+            rejected[b] += counts & ~(in & on);
             alive |= rejected[b] <= forgiven;
         }
     }

@@ -39,8 +39,15 @@ def kept(
         border[front] = np.minimum(border[front], away)
         inside = (u >= 0) & (u < camera.width) & (v >= 0) & (v < camera.height)
         front, u, v = front[inside], u[inside].astype(int), v[inside].astype(int)
-        seen[front] += 1
-        rejecting[front] += ~mask[v, u]
+        held = np.zeros(len(positions), bool)
+        held[front] = mask[v, u]
+        counted = np.zeros(len(positions), bool)
+        counted[front] = True
+        alpha = view.image[..., 3]
+        if max(alpha[[0, -1]].max(), alpha[:, [0, -1]].max()) <= threshold:
+            counted[:] = True  # the object ends within the image
+        seen += counted
+        rejecting += counted & ~held
     return (seen >= least) & (rejecting * len(views) <= forgiven * seen), border
 
 

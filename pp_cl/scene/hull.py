@@ -114,6 +114,7 @@ class Carver:
                 masks=self.masks,
             )
         self.view_masks = dev.upload(table, np.uint32)
+        self.view_is_whole = dev.upload([_is_whole(view) for view in views], np.uint32)
 
     def carve(self, grid: Grid, forgiven: int = 0) -> Carving:
         """The vertices of a grid that enough images see and no more masks than `forgiven` reject,
@@ -140,6 +141,7 @@ class Carver:
             forgiven=forgiven,
             projections=projections,
             view_masks=self.view_masks,
+            view_is_whole=self.view_is_whole,
             masks=self.masks,
             bits=bits,
         )
@@ -169,6 +171,12 @@ class Carver:
         )
         origin = np.asarray(carving.grid.origin) + carving.grid.edge * low
         return Grid(tuple(float(x) for x in origin), carving.grid.edge, (nx, ny, nz)), ids.get()
+
+
+def _is_whole(view):
+    """Whether the mask touches no border of its image."""
+    mask = view.image[..., 3] > MASK_THRESHOLD
+    return not (mask[[0, -1]].any() or mask[:, [0, -1]].any())
 
 
 def build_grid(

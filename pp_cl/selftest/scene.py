@@ -34,6 +34,8 @@ def _views(rng, share):
             eye, (0, 0, 0), (0.3, 0.2, 1), fx=1.5 * width, width=width, height=height
         )
         inside = rng.random((height, width, 1)) < share
+        if width == height - 2:
+            inside[[0, -1]] = inside[:, [0, -1]] = False  # the object ends within the image
         image = np.where(inside, MASK_THRESHOLD + 1, MASK_THRESHOLD).repeat(4, 2).astype(np.uint8)
         views.append(View("noise", camera, image))
     return views
