@@ -91,7 +91,7 @@ def test_equals_the_dense_network(dev, rng, always, name, variant, blocks):
     if variant == "direct":  # Winograd mixes the last bits of a tile
         np.testing.assert_array_equal(actual[0], expected[0])
     for a, b in zip(actual[:2], expected[:2], strict=True):
-        assert np.abs(a - b).max() <= 1e-6 * np.abs(b).max()
+        assert np.abs(a - b).max() <= 2e-6 * np.abs(b).max()
     # sums over 26,640 pixels, added up in another order
     for a, b in zip(actual[2:], expected[2:], strict=True):
         assert relative_error(a, b) < 5e-6

@@ -40,7 +40,8 @@ CHUNKS = [b"tRNS", b"PLTE", b"acTL", b"fcTL", b"fdAT", b"eXIf", b"iCCP", b"zTXt"
 
 numbers = st.sampled_from(NUMBERS) | st.floats() | st.integers()
 texts = st.sampled_from(TEXTS) | st.text(max_size=8)
-odd_values = st.one_of(numbers, st.sampled_from(VALUES), texts)
+# copies: what is put into a damaged value may be damaged in its turn
+odd_values = st.one_of(numbers, st.sampled_from(VALUES).map(copy.deepcopy), texts)
 words = st.one_of(
     st.sampled_from(TEXTS),
     st.lists(numbers.map(repr), min_size=1, max_size=6).map(",".join),

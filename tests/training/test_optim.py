@@ -11,6 +11,8 @@ from pp_cl.selftest.optim import Cloud, gradients
 from pp_cl.training.optim import Optimiser, adam_update, ema_update
 from pp_cl.training.state import PointState
 
+pytestmark = pytest.mark.kernels  # of adam.cl and rmsprop.cl
+
 
 def moments(dev, parameter):
     """Adam's, of a parameter: zeros."""
