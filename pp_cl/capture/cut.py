@@ -4,7 +4,6 @@ views share, from the sparse points, then two rounds in which the views vote by 
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 from tqdm import tqdm
@@ -19,14 +18,16 @@ from pp_cl.scene.views import Photograph
 cv2 = needed("cv2")
 
 CUT_SIDE = 400  # pixels of what is cut: the projected box and what is around it
+ENLARGED = 2.0  # times at most: GrabCut favours short borders, which takes thin parts away
 AROUND = 0.2  # of the projected box, on each side: shows what the background looks like
+FOOT = 0.04  # of the box's diagonal: points lower in it may be on what the object stands on
 SEED = 1 / 150  # radius of a sparse point, of CUT_SIDE
 NEAR = 1 / 10  # of CUT_SIDE: sparse points so close show a surface between them
 SAMPLES = 160  # squared: pixels of each side that the colours are learned from
+FITTED = 3  # times that the colours are fitted to their samples
 ROUNDS = 2  # of votes
 CELLS = 112**3  # vertices that are voted on
 FORGIVEN = 0.1  # of the views that see a vertex: their masks may reject it
-RESTORING = 16  # views; each of fewer may be the only one that sees through a hole
 LEAST_SEEING = 3  # views that see a vertex, or all of fewer
 BEYOND = 0.5  # of an image's size: further out a lens model says nothing
 SOFT = 1.5  # pixels of the cut image over which a border is refined
@@ -69,7 +70,8 @@ class Window:
         """The part of an image of the photograph's size, (H, W) or (H, W, C), reduced to this."""
         x0, y0, x1, y1 = self.place
         size = self.camera.width, self.camera.height
-        return cv2.resize(image[y0:y1, x0:x1], size, interpolation=cv2.INTER_AREA)
+        how = cv2.INTER_AREA if size[0] < x1 - x0 else cv2.INTER_LINEAR
+        return cv2.resize(image[y0:y1, x0:x1], size, interpolation=how)
 
     def of_photograph(self, pixels: np.ndarray) -> np.ndarray:
         """(N, 2) pixels of the photograph as pixels of this."""
@@ -98,7 +100,7 @@ def window(image: np.ndarray, photograph: Photograph, box: np.ndarray) -> Window
     y0, y1 = _grown(y, camera.height)
     if x1 - x0 < 2 or y1 - y0 < 2:
         raise UserError(f"{photograph.name}: the object's box is outside; give another with --box")
-    scale = min(1, CUT_SIDE / max(x1 - x0, y1 - y0))
+    scale = min(ENLARGED, CUT_SIDE / max(x1 - x0, y1 - y0))
     width, height = (max(2, round(scale * n)) for n in (x1 - x0, y1 - y0))
     sx, sy = width / (x1 - x0), height / (y1 - y0)
     camera = camera.crop(x0, y0, width, height)
@@ -135,20 +137,19 @@ def cut_out_all(
     """
     cv2.setNumThreads(1)
     left = [i for i, one in enumerate(windows) if one.mask is None]
-    cut, is_restored = [windows[i] for i in left], len(windows) >= RESTORING
-    seeds = [_seeds(windows[i], box, points, inside, seen[i], behind[i]) for i in left]
-    with tqdm(total=(1 + ROUNDS) * len(cut), leave=False, disable=None) as bar:
-        bar.set_description("cutting out")
-        labels = seeds
-        for number in range(1 + ROUNDS):
-            if number:
-                hull, edge = _hull(windows, box)
-                pairs = zip(cut, seeds, strict=True)
-                labels = [_relabelled(one, s, hull, edge, is_restored) for one, s in pairs]
-            colours = _colours(cut, labels)
-            for one, label in zip(cut, labels, strict=True):
-                one.mask = _grab_cut(one, label, colours)
-                bar.update()
+    seeds = {i: _seeds(windows[i], box, points, inside, seen[i], behind[i]) for i in left}
+    labels = [
+        seeds[i] if i in seeds else one.mask.astype(np.uint8) for i, one in enumerate(windows)
+    ]
+
+    for number in range(1 + ROUNDS):
+        if number:
+            hull = _hull(windows, box)
+            for i in left:
+                labels[i] = _relabelled(windows[i], seeds[i], *hull)
+        colours = _colours(windows, labels)
+        for i in tqdm(left, "cutting out", unit="image", leave=False, disable=None):
+            windows[i].mask = _grab_cut(windows[i], labels[i], colours)
 
 
 def _seeds(one, box, points, inside, seen, behind):
@@ -163,13 +164,15 @@ def _seeds(one, box, points, inside, seen, behind):
         outline = cv2.convexHull(outline.astype(np.float32)).round().astype(np.int32)
         cv2.fillConvexPoly(labels, outline, cv2.GC_PR_BGD)
     radius = max(1, round(SEED * CUT_SIDE))
-    near = _dots(one, one.pixels(points[inside]), radius)
+    foot = box[0, 2] + FOOT * np.linalg.norm(box[1] - box[0])
+    near = _dots(one, one.pixels(points[inside & (points[:, 2] > foot)]), radius)
     near = _closed(near, round(NEAR * CUT_SIDE))
     labels[near & (labels == cv2.GC_PR_BGD)] = cv2.GC_PR_FGD
     shown_inside = inside[seen]
+    sure = seen[shown_inside & (points[seen, 2] > foot)]
     beside = np.concatenate([one.pixels(points[seen[~shown_inside]]), one.of_photograph(behind)])
     labels[_dots(one, beside, radius)] = cv2.GC_BGD
-    labels[_dots(one, one.pixels(points[seen[shown_inside]]), radius)] = cv2.GC_FGD
+    labels[_dots(one, one.pixels(points[sure]), radius)] = cv2.GC_FGD
     return labels
 
 
@@ -201,9 +204,11 @@ def _closed(marked, radius):
     return closed[radius:-radius, radius:-radius] > 0
 
 
-def _colours(windows: Sequence[Window], labels: Sequence[np.ndarray]) -> tuple[Any, Any]:
-    """(background's, object's) colours, as GrabCut's mixtures of five normal distributions, of
-    SAMPLES^2 pixels of each of them from all windows.
+def _colours(
+    windows: Sequence[Window], labels: Sequence[np.ndarray]
+) -> tuple[np.ndarray, np.ndarray]:
+    """(the background's, the object's) colours, (1, 65) float64 each: GrabCut's mixture of five
+    normal distributions, fitted to SAMPLES^2 pixels of all windows.
     """
     rng, drawn = np.random.default_rng(0), []
     each = -(-(SAMPLES**2) // len(windows))
@@ -212,32 +217,25 @@ def _colours(windows: Sequence[Window], labels: Sequence[np.ndarray]) -> tuple[A
         found = np.concatenate([f[rng.integers(0, len(f), each)] for f in found if len(f)])
         drawn.append(found[rng.integers(0, len(found), SAMPLES**2)])
     image = np.concatenate(drawn).reshape(2 * SAMPLES, SAMPLES, 3)
-    sure = np.repeat([cv2.GC_BGD, cv2.GC_FGD], SAMPLES).astype(np.uint8)
-    background, object_ = np.zeros((1, 65)), np.zeros((1, 65))
+    sure = np.zeros(image.shape[:2], np.uint8)
+    sure[:SAMPLES], sure[SAMPLES:] = cv2.GC_BGD, cv2.GC_FGD
+    background, front = np.zeros((2, 1, 65))
     cv2.setRNGSeed(0)
-    cv2.grabCut(
-        image,
-        np.repeat(sure[:, None], SAMPLES, axis=1),
-        None,
-        background,
-        object_,
-        3,
-        cv2.GC_INIT_WITH_MASK,
-    )
-    return background, object_
+    cv2.grabCut(image, sure, None, background, front, FITTED, cv2.GC_INIT_WITH_MASK)
+    return background, front
 
 
 def _grab_cut(one, labels, colours):
     """(H, W) bool: the object, by colours that are not changed."""
-    labels = labels.copy()
-    background, object_ = (c.copy() for c in colours)
-    cv2.grabCut(one.image, labels, None, background, object_, 1, cv2.GC_EVAL_FREEZE_MODEL)
+    labels, (background, front) = labels.copy(), (some.copy() for some in colours)
+    how = cv2.GC_EVAL_FREEZE_MODEL
+    cv2.grabCut(one.image, labels, None, background, front, 1, how)
     return labels & 1 == 1
 
 
-def _hull(windows: Sequence[Window], box: np.ndarray) -> tuple[np.ndarray, float]:
+def _hull(windows: Sequence[Window], box: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:
     """((N, 3) positions in the box that no more than FORGIVEN of the masks reject of the windows
-    that see them, their spacing).
+    that see them, (N,) how many do, the positions' spacing).
     """
     grid = Grid.centred_in(box, smallest_edge(box, CELLS))
     positions = grid.positions(np.arange(np.prod(grid.dims)))
@@ -255,25 +253,26 @@ def _hull(windows: Sequence[Window], box: np.ndarray) -> tuple[np.ndarray, float
             "the photographs have no part of the box in common that stands out from what is behind"
             " it; give masks with --masks, or another box with --box"
         )
-    return positions[left[kept]], grid.edge
+    return positions[left[kept]], rejected[kept], grid.edge
 
 
-def _relabelled(one, seeds, hull, edge, is_restored):
+def _relabelled(one, seeds, hull, rejections, edge):
     """(H, W) uint8 of GrabCut's labels of a window from what all views agree on: what is well
-    outside the hull is background, what is well within it the object, unless the window's own mask
-    rejects it and is_restored is false.
+    outside the hull is background, what is well within what no other view rejects is the object.
     """
     middle = np.linalg.norm(hull.mean(0) - one.camera.eye)
     gap = max(1, int(np.ceil(edge * one.camera.fx / middle)))  # pixels between vertices
-    _, rows, columns = one.inside(hull)
-    held = np.zeros(seeds.shape, bool)
+    found, rows, columns = one.inside(hull)
+    held, core = np.zeros((2, *seeds.shape), bool)
     held[rows, columns] = True
-    held = _closed(held, gap)
-    labels = np.where(held, cv2.GC_PR_FGD, cv2.GC_PR_BGD).astype(np.uint8)
+    agreed = rejections[found] == ~one.mask[rows, columns]
+    core[rows[agreed], columns[agreed]] = True
+    held, core = _closed(held, gap), _closed(core, gap)
+    labels = np.where(held & one.mask, cv2.GC_PR_FGD, cv2.GC_PR_BGD).astype(np.uint8)
     labels[_eroded(held, gap) & (seeds == cv2.GC_FGD)] = cv2.GC_FGD
     labels[seeds == cv2.GC_BGD] = cv2.GC_BGD
     labels[~_dilated(held, 2 * gap)] = cv2.GC_BGD
-    labels[_eroded(held if is_restored else held & one.mask, 2 * gap + 1)] = cv2.GC_FGD
+    labels[_eroded(core, 2 * gap + 1)] = cv2.GC_FGD
     return labels
 
 

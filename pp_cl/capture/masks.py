@@ -9,16 +9,20 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
+from skimage.segmentation import find_boundaries
 from tqdm import tqdm
 
 from pp_cl.capture.cut import cut_out_all, whole_mask, window
 from pp_cl.errors import UserError, shown
+from pp_cl.files.contact_sheet import contact_sheet
 from pp_cl.files.image import read_gray, read_rgba, write_png
 from pp_cl.scene.agreement import disagreements, listing
 from pp_cl.scene.distortion import undistort
 from pp_cl.scene.masks import MaskRule, cut_out
-from pp_cl.scene.views import Photograph, View, fitting_downscale, shrink
+from pp_cl.scene.outline import OUTLINE, SHOWN_SIZE, SHOWN_VIEWS
+from pp_cl.scene.views import Photograph, View, evenly, fitting_downscale, shrink
 
+OPAQUE = (".jpg", ".jpeg")  # files that have no alpha need not be read for it
 UNIFORM = 0.9  # of a photograph's border, and of the photographs, that show the background alone
 ON_MASK = 0.9  # of the object's points, that a mask of a uniform background holds
 CHECKED_SIDE = 200  # pixels of the masks that are compared
@@ -54,29 +58,34 @@ def write_masks(
     """
     words = None if command is None else program_words(command)
     folder.mkdir(parents=True, exist_ok=True)
-    kept = [mask_file(folder, one.name).is_file() for one in photographs]
-    left = [one for one, is_kept in zip(photographs, kept, strict=True) if not is_kept]
-    how = {"kept": sum(kept)}
+    left = _without_mask(folder, photographs)
+    how = {"kept": len(photographs) - len(left)}
     for one in tqdm(left, "masks", unit="image", leave=False, disable=None):
         source, mask = _found(scene, one, given, words)
         if mask is not None:
             write_png(mask_file(folder, one.name), mask)
             how[source] = how.get(source, 0) + 1
-    inside = ((points > box[0]) & (points < box[1])).all(1)
-    windows = [_window(scene, folder, one, box) for one in photographs]
-    if any(window.mask is None for window in windows):
+    if _without_mask(folder, photographs):
+        inside = ((points > box[0]) & (points < box[1])).all(1)
+        windows = [_window(scene, folder, one, box) for one in photographs]
         how |= _uniform(scene, folder, photographs, windows, points[inside])
-        if any(window.mask is None for window in windows):
+        if _without_mask(folder, photographs):
             pixels = [(behind or {}).get(one.name, np.empty((0, 2))) for one in photographs]
             how |= _cut(scene, folder, photographs, windows, box, points, inside, seen, pixels)
     counts = ", ".join(f"{count} {source}" for source, count in how.items() if count)
     return f"{counts}{_contradictions(scene, folder, photographs, box)}"
 
 
+def _without_mask(folder, photographs):
+    return [one for one in photographs if not mask_file(folder, one.name).is_file()]
+
+
 def _found(scene, photograph, given, words):
     """(where from, (H, W) uint8 mask) of a photograph that has one without the others; (none, None)
     if it has not.
     """
+    if given is None and words is None and photograph.name.lower().endswith(OPAQUE):
+        return "none", None
     image = read_rgba(scene / photograph.name)
     if given is not None:
         name = Path(photograph.name).name
@@ -180,13 +189,34 @@ def _cut(scene, folder, photographs, windows, box, points, inside, seen, behind)
     return {"cut out": len(left)}
 
 
+def picture(
+    scene: Path, folder: Path, photographs: Sequence[Photograph], first: Sequence[str] = ()
+) -> np.ndarray:
+    """uint8 (H, W, 3) contact sheet of up to 12 photographs with the outlines of their masks drawn
+    over them. first: names of those that come first; the others are spread evenly.
+    """
+    wrong = [one for one in photographs if one.name in first][:SHOWN_VIEWS]
+    others = [one for one in photographs if one.name not in first]
+    chosen = wrong + evenly(others, SHOWN_VIEWS - len(wrong))
+    images = []
+    for one in chosen:
+        photograph, mask = read_rgba(scene / one.name), read_gray(mask_file(folder, one.name))
+        factor = fitting_downscale(mask.shape, SHOWN_SIZE)
+        image = shrink(photograph, factor)[..., :3]
+        held = shrink(np.dstack([mask] * 4), factor)[..., 3] > 127
+        image[~held] //= 2
+        image[find_boundaries(held, mode="thick")] = OUTLINE
+        images.append(image)
+    return contact_sheet(images, [Path(one.name).name for one in chosen])
+
+
 def _contradictions(scene, folder, photographs, box):
     """`; 2 contradict the others: A (8%), B (6%)`, empty where none does."""
     views = []
     for one in photographs:
         mask = read_gray(mask_file(folder, one.name))
         factor = fitting_downscale(mask.shape, CHECKED_SIDE)
-        image = shrink(np.dstack([mask, mask, mask, mask]), factor)
+        image = shrink(np.dstack([mask] * 4), factor)
         camera = one.camera.downscaled(factor)
         if one.distortion:
             image = undistort(image, camera, one.distortion)

@@ -17,7 +17,7 @@ from pp_cl.files.image import to_8bit, write_png
 from pp_cl.files.video import write_video
 from pp_cl.scene.demo import render
 from pp_cl.scene.load import load_scene, scene_format, scene_frames
-from tools.capture_demo import align, cameras, room
+from tools.capture_demo import align, cameras, room, write_photographs
 
 pytest.importorskip("pycolmap")
 NEAR = range(12)  # of the cameras around the demo, 10 degrees apart
@@ -204,3 +204,15 @@ def test_a_full_disk(shot, tmp_path):
     assert ended.returncode == 2 and len(lines) == 1 and str(scene) in lines[0], ended.stderr
     assert (scene / "capture" / "frames.json").exists()
     assert capture(*words[1:2], scene, *words[4:]) == (0, []) and off(scene).position < 0.03
+
+
+@pytest.mark.slow
+def test_an_object_that_turns(dev, tmp_path):
+    """Before a wall that stands still and has texture: the wall does not hold the cameras."""
+    write_photographs(dev, tmp_path / "turn", SIZE, "turntable")
+    scene = tmp_path / "scene"
+    words = tmp_path / "turn" / "images", scene, "--masks", tmp_path / "turn" / "masks"
+    assert capture(*words) == (0, []) and found(scene, "matches")["turns"]
+    assert found(scene, "poses")["placed"] > 33
+    agreement = off(scene, range(36))
+    assert agreement.position < 0.03 and agreement.degrees < 0.6
