@@ -2,6 +2,7 @@
 
 import json
 import math
+import warnings
 from collections import Counter
 from collections.abc import Iterable
 from typing import Any
@@ -13,10 +14,12 @@ from pp_cl.device.device import Device
 from pp_cl.errors import UserError
 from pp_cl.files.run_folder import MOST_METRICS, RunFolder
 from pp_cl.files.untrusted import read_json_text, refusal
+from pp_cl.run import load_run, scene_is_there
 from pp_cl.scene.agreement import Disagreement, disagreements
 from pp_cl.scene.camera_path import looked_at, up_of
 from pp_cl.scene.grid import Grid
 from pp_cl.scene.hull import Hull, build_grid, spacing_pixels
+from pp_cl.scene.identity import kept_views
 from pp_cl.scene.load import (
     open_scene,
     preset_downscale,
@@ -26,7 +29,7 @@ from pp_cl.scene.load import (
     scene_splits,
 )
 from pp_cl.scene.outline import SHOWN_VIEWS, picture
-from pp_cl.scene.views import MASK_THRESHOLD, View
+from pp_cl.scene.views import MASK_THRESHOLD, View, evenly
 from pp_cl.training.checkpoint import opened_run
 
 Facts = dict[str, Any]
@@ -48,6 +51,8 @@ def run_facts(folder: RunFolder, scene: str | None = None) -> Facts:
         "run": str(folder),
         "preset": config.preset,
         "scene": config.scene.path,
+        "scene_is_there": scene_is_there(config.scene.path),
+        "views": None,
         "downscale": config.scene.downscale,
         "iterations": config.train.iterations,
         "network": {
@@ -65,6 +70,7 @@ def run_facts(folder: RunFolder, scene: str | None = None) -> Facts:
         "psnr": next((row["psnr"] for row in reversed(rows) if "psnr" in row), None),
         "metrics": measured and measured["mean"],
         "metrics_step": measured and measured["step"],
+        "files": _files(folder.path),
     }
     if folder.checkpoint.exists():
         with opened_run(folder, config) as stored:
@@ -72,22 +78,36 @@ def run_facts(folder: RunFolder, scene: str | None = None) -> Facts:
         sizes = (math.prod(f.shape) for name, f in forms.items() if name.startswith("net."))
         facts["network"]["parameters"] = sum(sizes)
         facts |= {"step": header["step"], "finished": header["finished"]}
+        photographs = kept_views(header["views"])
+        facts["views"] = {"count": len(photographs), "images": _image_sizes(photographs)}
         left, grid = forms["points.ids"].shape[0], header["grid"]
         facts["points"] = {"initial": header["initial_points"], "left": left}
-        facts["grid"] = grid | {"edge_pixels": _edge_pixels(config, Grid.of_header(grid))}
+        cameras = [one.camera.downscaled(config.scene.downscale) for one in photographs]
+        facts["grid"] = grid | {"edge_pixels": spacing_pixels(Grid.of_header(grid), cameras)}
         facts["checkpoint_bytes"] = folder.checkpoint.stat().st_size
     return facts
 
 
 def run_picture(dev: Device, folder: RunFolder, scene: str | None = None) -> np.ndarray:
-    """picture() of the points that a run has left. Raises UserError as run_facts does, and for a
-    scene that is missing or broken.
+    """picture() of the points that a run has left, over renderings where its scene is missing.
+    Raises UserError as run_facts does, and for a scene that is broken.
     """
     config = _config(folder, scene)
     with opened_run(folder, config) as stored:
         grid = Grid.of_header(stored.header["grid"])
         points = Hull(grid, stored.array("points.ids"), capped=False)
-    return picture(dev, open_scene(dev, config, ("train",), SHOWN_VIEWS).splits["train"], points)
+    if scene_is_there(config.scene.path):
+        return picture(
+            dev, open_scene(dev, config, ("train",), SHOWN_VIEWS).splits["train"], points
+        )
+    warnings.warn(
+        f"{config.scene.path}: is not there; the picture shows the run's renderings in place of"
+        " photographs",
+        stacklevel=2,
+    )
+    run = load_run(dev, folder.path)
+    shown = evenly(run.photographs("train"), SHOWN_VIEWS)
+    return picture(dev, run.rendered(shown, opaque=True), points)
 
 
 def _config(folder, scene):
@@ -95,14 +115,18 @@ def _config(folder, scene):
     return configure(config, scene or config.scene.path)
 
 
-def _edge_pixels(config, grid):
-    """The grid's edge in pixels of the run's images; None where the scene cannot be read."""
-    try:
-        frames = scene_frames(config.scene.path)
-    except UserError:
-        return None
-    cameras = [frame.camera.downscaled(config.scene.downscale) for frame in frames]
-    return spacing_pixels(grid, cameras)
+def _files(folder):
+    """{name: bytes} of what lies in a folder, of a folder in it the sum."""
+    files = [file for file in sorted(folder.rglob("*")) if file.is_file()]
+    sizes = Counter()
+    for file in files:
+        sizes[file.relative_to(folder).parts[0]] += file.stat().st_size
+    return {name: size for name, size in sizes.items() if not name.startswith(".")}
+
+
+def _image_sizes(photographs):
+    """{WxH: how many images have it}."""
+    return dict(Counter(f"{p.camera.width}x{p.camera.height}" for p in photographs))
 
 
 def read_metrics(folder: RunFolder) -> Facts | None:
@@ -165,7 +189,6 @@ def describe_scene(
     except UserError as error:
         problem = str(error)
     found = disagreements(views, hull.grid.box) if hull else []
-    sizes = Counter(f"{f.camera.width}x{f.camera.height}" for fs in frames.values() for f in fs)
     ranges = np.array([view.depth_range for view in views if view.depth_range])
     cameras, stored = ([getattr(v, name) for v in views] for name in ("camera", "stored_camera"))
     centre = looked_at(stored)
@@ -173,7 +196,7 @@ def describe_scene(
         "scene": path,
         "format": scene_format(path),
         "splits": {split: len(listed) for split, listed in frames.items()},
-        "images": dict(sizes),
+        "images": _image_sizes([frame for listed in frames.values() for frame in listed]),
         **_lenses([view.file_camera for view in views]),
         "masks": _masks(views)
         | {"disagreeing": [{"view": one.view.name, "share": one.share} for one in found]},
