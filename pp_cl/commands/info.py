@@ -19,7 +19,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--picture",
         type=shared.output_file(".png"),
         metavar="FILE",
-        help="write photographs with the outline of the points (PNG)",
+        help="write photographs with outlines of points and masks, of a scene also the cameras from"
+        " two sides (PNG)",
     )
     shared.add_open(parser)
     add("--preset", choices=PRESETS, help="of a scene: whose hull (tiny)")
@@ -33,7 +34,7 @@ def run(options: argparse.Namespace) -> None:
     """Print the facts, write the picture. Raises UserError for options that do not fit."""
     from pp_cl.config import nearby_run
     from pp_cl.device.discover import open_device
-    from pp_cl.facts.info import describe_scene, picture, run_facts, run_picture
+    from pp_cl.facts.info import describe_scene, run_facts, run_picture, scene_picture
     from pp_cl.files.image import write_png
     from pp_cl.files.run_folder import RunFolder
     from pp_cl.scene.load import DEMO
@@ -56,7 +57,8 @@ def run(options: argparse.Namespace) -> None:
         dev = open_device(options.device)
         given = shared.read_short(options, ("masks", "mask_from")) + options.set
         facts, *shown = describe_scene(dev, options.subject, options.preset or "tiny", given)
-        image = picture(dev, *shown) if options.picture else None
+        if options.picture:
+            image = scene_picture(dev, options.subject, facts, *shown)
     lines = (_run_lines if is_run else _scene_lines)(facts)
     if image is not None:
         write_png(options.picture, image)
@@ -144,8 +146,19 @@ def _scene_lines(facts):
         _line("depth range", _range(stated, ".3f") if stated else "none stated"),
         _line("cameras", f"{_range(facts['distances'], '.3f')} from {_vector(facts['looked_at'])}"),
         _line("up", f"{_vector(facts['up'])} (estimated)"),
+        *_edit_lines(facts),
         *_hull_lines(facts),
     ]
+
+
+def _edit_lines(facts):
+    lines = []
+    if facts["box"]:
+        lines.append(_line("given box", " to ".join(map(_vector, facts["box"]))))
+    if dropped := facts["dropped"]:
+        more = f" and {len(dropped) - 3} more" * (len(dropped) > 3)
+        lines.append(_line("dropped", f"{', '.join(dropped[:3])}{more} (pp_cl.json)"))
+    return lines
 
 
 def _hull_lines(facts):

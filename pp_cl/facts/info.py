@@ -5,6 +5,7 @@ import math
 import warnings
 from collections import Counter
 from collections.abc import Iterable
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -14,13 +15,15 @@ from pp_cl.device.device import Device
 from pp_cl.errors import UserError
 from pp_cl.files.run_folder import MOST_METRICS, RunFolder
 from pp_cl.files.untrusted import read_json_text, refusal
-from pp_cl.run import load_run, scene_is_there
+from pp_cl.run import check_scene, load_run, scene_is_there
 from pp_cl.scene.agreement import Disagreement, disagreements
 from pp_cl.scene.camera_path import looked_at, up_of
+from pp_cl.scene.edits import read_edits
 from pp_cl.scene.grid import Grid
 from pp_cl.scene.hull import Hull, build_grid, spacing_pixels
 from pp_cl.scene.identity import kept_views
 from pp_cl.scene.load import (
+    DEMO,
     open_scene,
     preset_downscale,
     scene_box,
@@ -29,8 +32,14 @@ from pp_cl.scene.load import (
     scene_splits,
 )
 from pp_cl.scene.outline import SHOWN_VIEWS, picture
+from pp_cl.scene.overview import overview
+from pp_cl.scene.sparse import sparse_points
 from pp_cl.scene.views import MASK_THRESHOLD, View, evenly
 from pp_cl.training.checkpoint import opened_run
+
+SHOWN_POINTS = 20_000  # of a hull
+HULL_COLOUR = (230, 140, 200)
+LEAST_WIDTH = 640  # pixels of a picture
 
 Facts = dict[str, Any]
 Given = tuple[str, Any, str]  # a setting: key, value or its text, origin
@@ -111,6 +120,8 @@ def run_picture(dev: Device, folder: RunFolder, scene: str | None = None) -> np.
 
 
 def _config(folder, scene):
+    if scene is not None:
+        check_scene(scene)
     config = load_config(folder.config)
     return configure(config, scene or config.scene.path)
 
@@ -183,9 +194,9 @@ def describe_scene(
     names = sorted(scene_splits(path), key=lambda split: (split == "test", split))
     frames = {split: scene_frames(path, split) for split in names}
     views = open_scene(dev, config, ("train",)).splits["train"]
-    hull, problem = None, None
+    hull, problem, box = None, None, scene_box(config)
     try:
-        hull = build_grid(dev, views, config.points.count, scene_box(config))
+        hull = build_grid(dev, views, config.points.count, box)
     except UserError as error:
         problem = str(error)
     found = disagreements(views, hull.grid.box) if hull else []
@@ -206,6 +217,8 @@ def describe_scene(
         "up": up_of(stored).tolist(),
         "preset": preset_name,
         "downscale": config.scene.downscale,
+        "box": None if box is None else box.tolist(),
+        "dropped": [] if path == DEMO else sorted(read_edits(Path(path)).dropped),
         "hull": None,
         "problem": problem,
     }
@@ -219,6 +232,35 @@ def describe_scene(
             "box": hull.grid.box.tolist(),
         }
     return facts, views, hull, found
+
+
+def scene_picture(
+    dev: Device,
+    scene: str,
+    facts: Facts,
+    views: list[View],
+    hull: Hull | None,
+    found: list[Disagreement],
+) -> np.ndarray:
+    """uint8 picture of what describe_scene() gave: the sparse points, or else the hull's, with
+    cameras and box from two sides, above picture() of the masks.
+    """
+    points, colours = np.empty((0, 3)), np.empty((0, 3), np.uint8)
+    if scene != DEMO:
+        points, colours = sparse_points(Path(scene))
+    if not len(points) and hull:
+        points = hull.grid.positions(hull.ids[:: 1 + len(hull.ids) // SHOWN_POINTS])
+        colours = np.full(points.shape, HULL_COLOUR, np.uint8)
+    box = facts["box"] or (facts["hull"] and facts["hull"]["box"])
+    sheet = picture(dev, views, hull, found)
+    cameras = [view.stored_camera for view in views]
+    width = max(LEAST_WIDTH, sheet.shape[1])
+    drawn = overview(cameras, box and np.array(box), points, colours, width)
+    rows = [
+        np.pad(part, ((0, 0), (0, width - part.shape[1]), (0, 0)), constant_values=255)
+        for part in (drawn, sheet)
+    ]
+    return np.concatenate(rows)
 
 
 def _range(values):
