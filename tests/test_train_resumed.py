@@ -92,6 +92,7 @@ ENDLESS = {
     "train__ema": "false",
     "train__final_prune_weight": 0,
     "train__prune_looks": 4,
+    "train__refine_at": "1,1",
 }
 
 

@@ -2,7 +2,8 @@ import { fromFacts, orbit, pan, project, zoom } from "./camera.js";
 import { drawFrustums, frustumAt, frustums } from "./frustums.js";
 
 const RADIANS_PER_PIXEL = 0.008, ZOOM_PER_PIXEL = 0.0012, CLICK = 5, NEAR_DOT = 12; // pixels
-const OVERVIEW = 2.5; // of the first camera's distance: from there the others are seen
+const OVERVIEW = 2, RAISED = 0.4; // distance, of the farthest camera's; radians above the first one
+const LENS = 0.9; // focal length, of the shorter side: wide enough to see all cameras from there
 const LEAST_SIDE = 1e-3; // of a box, in radii
 const AXES = ["x", "y", "z"];
 const $ = (id) => document.getElementById(id);
@@ -41,8 +42,11 @@ function reset() {
   const size = Math.hypot(...AXES.map((_, a) => box[1][a] - box[0][a]));
   around = { radius: size / 2, views: scene.views };
   pivot = middle();
-  camera = fromFacts(scene.views[0].camera);
-  camera = zoom(camera, pivot, OVERVIEW, around.radius);
+  const away = (eye) => Math.hypot(...AXES.map((_, a) => eye[a] - pivot[a]));
+  const eyes = scene.views.map((view) => fromFacts(view.camera).eye), first = fromFacts(scene.views[0].camera);
+  const focal = LENS * Math.min(first.w, first.h);
+  camera = orbit({ ...first, fx: focal, fy: focal }, pivot, scene.up, 0, RAISED);
+  camera = zoom(camera, pivot, (OVERVIEW * Math.max(...eyes.map(away))) / Math.max(away(camera.eye), 1e-9), around.radius);
   changed();
 }
 
