@@ -164,14 +164,18 @@ def _check(value, where, *, least, most, choices, **_):
 
 
 def configure(config: Config, scene: str, given: Iterable[tuple[str, Any, str]] = ()) -> Config:
-    """The config with another scene and the given settings: (key, value or its text, origin).
+    """The config with another scene, to which masks in its folder move along, and the given
+    settings: (key, value or its text, origin).
 
     Raises UserError naming the first that makes no sense, and for scene.path among them.
     """
     given = list(given)
     for origin in (origin for key, _, origin in given if key == "scene.path"):
         raise UserError(f"{origin}: scene.path is what SCENE or --scene says; leave it out")
-    path = scene if scene == "demo" else str(Path(scene).resolve())
+    path, masks = scene if scene == "demo" else str(Path(scene).resolve()), config.scene.masks
+    if masks and config.scene.path and Path(masks).is_relative_to(config.scene.path):
+        moved = Path(path) / Path(masks).relative_to(config.scene.path)
+        assign(config, "scene.masks", str(moved), "settings")
     assign(config, "scene.path", path, "settings")
     for key, value, origin in given:
         assign(config, key, value, origin)

@@ -5,13 +5,14 @@ import os
 import shutil
 import time
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path, PurePosixPath
 from typing import Any, NamedTuple
 
 import numpy as np
+from tqdm import tqdm
 
 from pp_cl.config import Config, configure, load_config
 from pp_cl.device.device import Device
@@ -19,7 +20,7 @@ from pp_cl.device.discover import open_device
 from pp_cl.errors import UserError
 from pp_cl.files.atomic import check_writable, remove_leftovers, write_json
 from pp_cl.files.contact_sheet import write_comparison
-from pp_cl.files.image import write_png
+from pp_cl.files.image import to_8bit, write_png
 from pp_cl.files.picture import Picture, mean_picture
 from pp_cl.files.run_folder import RunFolder
 from pp_cl.layers.choice import ConvolutionPolicy, load_policy
@@ -117,6 +118,18 @@ class Run:
         downscale = self.config.scene.downscale
         return [one.camera.downscaled(downscale) for one in self.photographs(split)]
 
+    def rendered(self, photographs: Sequence[Photograph], *, opaque: bool) -> list[View]:
+        """Views at the resolution of the run whose images are its own renderings. opaque: over
+        white, as it was trained; else straight RGBA. A progress bar shows on a terminal.
+        """
+        views = []
+        for one in tqdm(photographs, "rendering", unit="view", leave=False, disable=None):
+            camera = one.camera.downscaled(self.config.scene.downscale)
+            picture = self.render(camera)
+            image = _over_white(picture) if opaque else picture.rgba()
+            views.append(View(one.name, camera, to_8bit(image), one.depth_range))
+        return views
+
     @cached_property
     def ball(self) -> tuple[np.ndarray, float]:
         """(centre (3,), radius), world units, of the smallest ball around the middle of the box of
@@ -168,9 +181,18 @@ class Run:
         return max(distance - radius, NEAREST * radius), distance + radius
 
 
+def _over_white(picture):
+    return np.pad(picture.colour, ((0, 0), (0, 0), (0, 1)), constant_values=1)
+
+
+def scene_is_there(path: str) -> bool:
+    """Whether a run's scene can be read, or made by the program."""
+    return path == DEMO or Path(path).is_dir()
+
+
 def check_scene(path: str) -> None:
     """Raise UserError where the folder of a run's scene is not there."""
-    if path != DEMO and not Path(path).is_dir():
+    if not scene_is_there(path):
         raise UserError(f"{path}: the run's scene is not there; say where with --scene")
 
 

@@ -37,6 +37,7 @@ from pp_cl.scene.views import View
 from pp_cl.train import Trainer
 from pp_cl.training.checkpoint import load_run_state, opened_run
 from pp_cl.training.memory import Room
+from pp_cl.training.schedule import bound_to_end
 
 FIRST_PREVIEW = 10.0  # seconds; with a slow step and its writing it shows within 20
 MEASURED_VIEWS = 4
@@ -45,6 +46,7 @@ OPEN, NEVER = (0.0, 0.0), (1.0, 1.0)  # train.refine_at
 REFINE_AT = (NEVER, (0.35, 1.0), (0.33, 0.67))
 FINEST, COARSEST = 1.25, 1.5
 LEAST_SIDE = 48  # pixels of the images that a training begins on, if it is to refine
+PLACES = (("scene", "path"), ("scene", "masks"))
 
 Stored = tuple[dict[str, Any], dict[str, np.ndarray]]  # header and arrays of a checkpoint
 OnStep = Callable[[int, dict[str, Any] | None], None]
@@ -200,7 +202,9 @@ class Training:
     def _save(self, finished):
         trainer = self.trainer
         header = trainer.model.header() | self.info | {"step": trainer.step, "finished": finished}
-        self.folder.save(header, trainer.model.arrays() if finished else trainer.arrays())
+        config = self.config
+        is_whole = finished and bound_to_end(config.network, config.raster, config.train)
+        self.folder.save(header, trainer.model.arrays() if is_whole else trainer.arrays())
         self._expect_save()
         self._saved = trainer.step
 
@@ -224,7 +228,8 @@ def open_training(
 ) -> Training:
     """A training in `folder`, from its checkpoint `stored` where it has one. Nothing is written.
 
-    A finished training is extended to config.train.iterations, with new moments and without
+    A finished training is extended to config.train.iterations: as if it had been asked for them
+    from its beginning, if its checkpoint holds its state, else with new moments and without
     refinements. Raises UserError for a scene or checkpoint that does not fit, for too little
     memory, and for a folder that may not be written.
     """
@@ -235,7 +240,9 @@ def open_training(
     else:
         header, arrays = stored
         policy = policy_of_run(dev, tolerance, header.get("tuning"), folder.checkpoint)
-        begun = header["step"] if header["finished"] else header.get("extended_from", 0)
+        begun = header.get("extended_from", 0)
+        if header["finished"] and not any(name.startswith("state.") for name in arrays):
+            begun = header["step"]
         if begun:
             goal = replace(config, train=replace(config.train, refine_at=NEVER))
     net = UNet.of_settings(dev, config.network, policy, seed=config.train.seed)
@@ -364,6 +371,8 @@ def _resume(config, views, net, stored, begun):
     model = Model.load(net.dev, header, arrays, net, degree=config.points.sh_degree)
     trainer = Trainer(net.dev, config, model, views)
     trainer.restore(header["step"], arrays, begun)
+    if header["finished"] and trainer.step % config.train.prune_every == 0:
+        trainer.prune()  # the last step of a training leaves that to its end
     return trainer
 
 
@@ -440,13 +449,13 @@ def run_config(
 
 
 def _check_same(asked, stored, folder):
-    """Raise UserError naming the first setting that differs, the place of the scene aside: a
-    checkpoint knows its scene by more than that.
+    """Raise UserError naming the first setting that differs, the places of the scene and of its
+    masks aside: a checkpoint knows them by more than that.
     """
     for (section, ours), (_, theirs) in zip(sections(asked), sections(stored), strict=True):
         for name, value in vars(ours).items():
             there = getattr(theirs, name)
-            if value != there and (section, name) != ("scene", "path"):
+            if value != there and (section, name) not in PLACES:
                 _refuse_setting(folder, f"{section}.{name}", there, value)
 
 

@@ -5,7 +5,7 @@ import os
 
 import pytest
 
-from pp_cl.config import Config, assign, help_lines, load_config, preset, validate
+from pp_cl.config import Config, assign, configure, help_lines, load_config, preset, validate
 from pp_cl.errors import UserError
 from pp_cl.network.layers import convolutions, unet_layers
 from pp_cl.presets import PRESETS
@@ -223,3 +223,11 @@ def test_channels_are_those_of_the_convolutions(blocks, channels, count):
     assert config.network.channel_numbers == (48,) * count
     layers = unet_layers((16, 16, 16), blocks=blocks, channels=config.network.channel_numbers)
     assert len(convolutions(layers)) == count + 1
+
+
+def test_masks_in_the_folder_of_a_scene_move_with_it(tmp_path):
+    here, there = tmp_path / "here", tmp_path / "there"
+    config = configure(preset("tiny"), here, [("scene.masks", here / "masks", "--masks")])
+    assert configure(config, there).scene.masks == str(there / "masks")
+    config = configure(config, there, [("scene.masks", tmp_path / "masks", "--masks")])
+    assert configure(config, here).scene.masks == str(tmp_path / "masks")

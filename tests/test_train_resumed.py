@@ -27,7 +27,10 @@ def test_a_finished_run_is_left_alone(scene, finished, capsys):
 def test_settings_are_taken_from_the_run_and_may_not_change(scene, finished, capsys):
     words = ["train", scene, "--out", str(finished)]
     assert main(words) == main([*words, "--iterations", "59"]) == 0
-    assert capsys.readouterr().out.count("is finished (60 steps)") == 2
+    assert main(["train", "--out", str(finished)]) == 0  # the scene, too
+    assert capsys.readouterr().out.count("is finished (60 steps)") == 3
+    assert main(["train", "--out", str(finished / "other")]) == 2
+    assert capsys.readouterr().err.startswith("pp-cl: SCENE: ")
     assert main([*words, "--points", "1600", "--iterations", "61"]) == 2
     assert "points.count is 1500 there, 1600 asked for" in capsys.readouterr().err
 
@@ -47,13 +50,16 @@ def refined(scene, tmp_path_factory):
 
 @pytest.mark.parametrize("iterations, stop", [(22, 21), (80, 69)])
 def test_a_finished_run_is_extended_and_resumes_to_the_same_bytes(
-    refined, tmp_path, monkeypatch, iterations, stop
+    refined, tmp_path, monkeypatch, capsys, iterations, stop
 ):
     """To averages that are due at once, and to a step by which another refinement would be due."""
+    capsys.readouterr()
     (whole, stopped), (out, words) = [tmp_path / name for name in ("whole", "stopped")], refined
     for folder in (whole, stopped):
         shutil.copytree(out, folder)
     assert main(words(whole, iterations)) == 0
+    told = "learning rates, the mask's and the spread's weights, refinements, averages"
+    assert told in capsys.readouterr().out
     header, _ = load_checkpoint(whole / "checkpoint.npz")
     assert header["finished"] and (header["step"], header["extended_from"]) == (iterations, 20)
     config = json.loads((whole / "config.json").read_text())
@@ -72,6 +78,33 @@ def test_a_finished_run_is_extended_and_resumes_to_the_same_bytes(
     assert main(words(stopped, iterations)) == 0
     name = "checkpoint.npz"
     assert (stopped / name).read_bytes() == (whole / name).read_bytes()
+
+
+# nothing depends on the number of steps
+ENDLESS = {
+    "network__rate": "1e-3,1e-3",
+    "train__opacity_rate": "0.1,0.1",
+    "train__opacity_rate_steps": 0,
+    "train__sh_rate_decay": 1,
+    "train__sh_delay": "0,0,0",
+    "train__mask_weight": 0,
+    "train__spread_weight": 0,
+    "train__ema": "false",
+    "train__final_prune_weight": 0,
+    "train__prune_looks": 4,
+    "train__refine_at": "1,1",
+}
+
+
+def test_without_schedules_an_extended_run_is_the_longer_one(scene, tmp_path, capsys):
+    """The last step of the first one is one after which points are pruned."""
+    out, whole = tmp_path / "extended", tmp_path / "whole"
+    for folder, steps in ((whole, 50), (out, 30), (out, 50)):
+        assert main(arguments(scene, folder, **ENDLESS, train__iterations=steps)) == 0
+    header, arrays = load_checkpoint(whole / "checkpoint.npz")
+    assert len(arrays["points.ids"]) < header["initial_points"]
+    assert (out / "checkpoint.npz").read_bytes() == (whole / "checkpoint.npz").read_bytes()
+    assert "differ" not in capsys.readouterr().out
 
 
 def interrupted_after(step, train_step=Trainer.train_step):

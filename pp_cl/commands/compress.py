@@ -11,7 +11,7 @@ EPILOG = """Tried in turn, each kept where the views below lose no more: coeffic
 channels of the network that are dead or hardly weigh, stopping earlier along a pixel, fewer
 harmonics, and at last fewer points, those that weigh least in any training view going first. The
 loss is measured on the split val, without one on every eighth training view; never on the test
-views."""
+views. Without the scene it is estimated from the run's own renderings of these."""
 COLUMNS = "{:20s} {:>8s} {:>8s} {:>10s} {:>10s} {:>7s}  {}".format
 
 
@@ -51,9 +51,9 @@ def run(options: argparse.Namespace) -> None:
     whole = load_run(open_device(options.device), options.run_folder, scene=options.scene)
     if not whole.header["finished"]:
         raise UserError(f"{whole.folder}: its training is not finished; finish it first")
-    which, views = validation_views(whole)
+    which, views, error = validation_views(whole)
     original = Original.of(whole)
-    search = Search(original, views, options.max_loss)
+    search = Search(original, views, options.max_loss, error)
     trials = _trials(search, which, options.verbose)
     ms, sizes = frame_ms([whole, search.run], views), [nbytes(whole), nbytes(search.run)]
     report = {

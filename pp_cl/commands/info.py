@@ -19,7 +19,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--picture",
         type=shared.output_file(".png"),
         metavar="FILE",
-        help="write photographs with the outline of the points (PNG)",
+        help="write photographs with outlines of points and masks, of a scene also the cameras from"
+        " two sides (PNG)",
     )
     shared.add_open(parser)
     add("--preset", choices=PRESETS, help="of a scene: whose hull (tiny)")
@@ -33,7 +34,7 @@ def run(options: argparse.Namespace) -> None:
     """Print the facts, write the picture. Raises UserError for options that do not fit."""
     from pp_cl.config import nearby_run
     from pp_cl.device.discover import open_device
-    from pp_cl.facts.info import describe_scene, picture, run_facts, run_picture
+    from pp_cl.facts.info import describe_scene, run_facts, run_picture, scene_picture
     from pp_cl.files.image import write_png
     from pp_cl.files.run_folder import RunFolder
     from pp_cl.scene.load import DEMO
@@ -56,7 +57,8 @@ def run(options: argparse.Namespace) -> None:
         dev = open_device(options.device)
         given = shared.read_short(options, ("masks", "mask_from")) + options.set
         facts, *shown = describe_scene(dev, options.subject, options.preset or "tiny", given)
-        image = picture(dev, *shown) if options.picture else None
+        if options.picture:
+            image = scene_picture(dev, options.subject, facts, *shown)
     lines = (_run_lines if is_run else _scene_lines)(facts)
     if image is not None:
         write_png(options.picture, image)
@@ -67,22 +69,30 @@ def run(options: argparse.Namespace) -> None:
         shared.show(options.picture)
 
 
+def _sizes(images):
+    return ", ".join(f"{count} of {size}" for size, count in images.items())
+
+
+def _bytes(count):
+    return f"{count / MIB:.1f} MiB" if count >= MIB / 10 else f"{count / 1024:.1f} KiB"
+
+
 def _line(name, text):
     return f"{name:12s}{text}"
 
 
 def _grid_text(grid):
-    pixels = grid["edge_pixels"]
-    in_pixels = "" if pixels is None else f" ({pixels:.2f} pixels)"
-    return f"{'x'.join(map(str, grid['dims']))}, edge {grid['edge']:.6g}{in_pixels}"
+    dims, edge = "x".join(map(str, grid["dims"])), f"edge {grid['edge']:.6g}"
+    return f"{dims}, {edge} ({grid['edge_pixels']:.2f} pixels)"
 
 
 def _run_lines(facts):
     state = "finished" if facts["finished"] else "not finished"
     reduced = f", images reduced {facts['downscale']} times" * (facts["downscale"] > 1)
+    gone = "" if facts["scene_is_there"] else " (not there; only train and eval need it)"
     lines = [
         _line("run", f"{facts['run']}, preset {facts['preset']}"),
-        _line("scene", f"{facts['scene']}{reduced}"),
+        _line("scene", f"{facts['scene']}{gone}{reduced}"),
         _line("training", f"step {facts['step']} of {facts['iterations']}, {state}"),
     ]
     if facts["seconds"] is not None:
@@ -97,9 +107,9 @@ def _run_lines(facts):
         lines[-1] += f", {network['parameters']} parameters"
         initial, left = facts["points"]["initial"], facts["points"]["left"]
         lines += [
+            _line("views", f"{_sizes(facts['views']['images'])}, kept with their cameras"),
             _line("points", f"{left} ({initial} at the start)"),
             _line("grid", _grid_text(facts["grid"])),
-            _line("checkpoint", f"{facts['checkpoint_bytes'] / MIB:.1f} MiB"),
         ]
     else:
         lines.append(_line("checkpoint", "none yet"))
@@ -107,12 +117,17 @@ def _run_lines(facts):
     values = ", ".join(f"{name} {value:.4f}" for name, value in measured.items())
     step = facts["metrics_step"]
     early = f" (unfinished, at step {step})" * (step is not None and step < facts["iterations"])
-    return [*lines, _line("test views", f"{values or 'not evaluated yet'}{early}")]
+    files = ", ".join(f"{name} {_bytes(size)}" for name, size in facts["files"].items())
+    return [
+        *lines,
+        _line("test views", f"{values or 'not evaluated yet'}{early}"),
+        _line("files", f"{files}; {_bytes(sum(facts['files'].values()))} in all"),
+    ]
 
 
 def _scene_lines(facts):
     splits = ", ".join(f"{name} {count}" for name, count in facts["splits"].items())
-    sizes = ", ".join(f"{count} of {size}" for size, count in facts["images"].items())
+    reduced = f"preset {facts['preset']}: reduced {facts['downscale']} times"
     angle_x, angle_y = (_range(facts["field_of_view"][axis], ".1f") for axis in "xy")
     masks = facts["masks"]
     share = "" if masks["object"] is None else f", {masks['object']:.1%} of the image is object"
@@ -120,7 +135,7 @@ def _scene_lines(facts):
     return [
         _line("scene", f"{facts['scene']}, format {facts['format']}"),
         _line("splits", splits),
-        _line("images", f"{sizes}; preset {facts['preset']}: reduced {facts['downscale']} times"),
+        _line("images", f"{_sizes(facts['images'])}; {reduced}"),
         _line("focal", f"{_range(facts['focal_pixels'], '.1f')} pixels"),
         _line("view", f"{angle_x} x {angle_y} degrees"),
         _line("masks", f"{masks['with_alpha']:.0%} of the training views have one{share}"),
@@ -135,8 +150,19 @@ def _scene_lines(facts):
         _line("depth range", _range(stated, ".3f") if stated else "none stated"),
         _line("cameras", f"{_range(facts['distances'], '.3f')} from {_vector(facts['looked_at'])}"),
         _line("up", f"{_vector(facts['up'])} (estimated)"),
+        *_edit_lines(facts),
         *_hull_lines(facts),
     ]
+
+
+def _edit_lines(facts):
+    lines = []
+    if facts["box"]:
+        lines.append(_line("given box", " to ".join(map(_vector, facts["box"]))))
+    if dropped := facts["dropped"]:
+        more = f" and {len(dropped) - 3} more" * (len(dropped) > 3)
+        lines.append(_line("dropped", f"{', '.join(dropped[:3])}{more} (pp_cl.json)"))
+    return lines
 
 
 def _hull_lines(facts):

@@ -6,7 +6,8 @@ import signal
 from contextlib import ExitStack, nullcontext
 
 from pp_cl.commands import options as shared
-from pp_cl.config import help_lines
+from pp_cl.config import help_lines, load_config
+from pp_cl.errors import UserError
 from pp_cl.presets import PRESETS, SHORT
 
 HELP = "learn a scene; the same command resumes an unfinished run"
@@ -16,7 +17,7 @@ EPILOG = "\n".join(("settings (--set), with tiny's values and those that differ:
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the command's options."""
     add = parser.add_argument
-    add("scene", metavar="SCENE", help="folder of a scene, or the word demo")
+    add("scene", metavar="SCENE", nargs="?", help="folder of a scene, or the word demo (RUN's own)")
     add("--out", required=True, metavar="RUN", help="folder of the run")
     add(
         "--preset",
@@ -64,7 +65,10 @@ def run(options: argparse.Namespace) -> None:
         writer_class()  # refuses before the work where it is missing
     folder = RunFolder(options.out)
     given, is_new = shared.read_short(options, SHORT) + options.set, not folder.config.exists()
-    config = run_config(folder, options.scene, options.preset, given, extends=True)
+    if options.scene is None and is_new:
+        raise UserError("SCENE: name the folder of a scene, or the word demo")
+    scene = options.scene or load_config(folder.config).scene.path
+    config = run_config(folder, scene, options.preset, given, extends=True)
     stored = stored_state(folder, config)
     if is_finished(stored, config):
         print(
@@ -79,6 +83,8 @@ def run(options: argparse.Namespace) -> None:
     chosen = is_new and "scene.downscale" not in [key for key, _, _ in given]
     print(_images_line(training, chosen))
     print(_first_line(training))
+    if training.trainer.begun:
+        print(_extended_line(training))
     if training.hull and (told := _left_out_line(config.train)):
         print(told)
     lines = plan_lines(training.room.plan, dev)
@@ -116,6 +122,19 @@ def _first_line(training):
         f" {grid.edge:.6g} ({spacing:.2f} pixels{finer}), depth {near:.3f} to {far:.3f}"
         f" ({hull.seconds:.1f} s)"
         f"{capped if hull.capped else ''}"
+    )
+
+
+def _extended_line(training):
+    """A line of text: how an extended training differs from one that was as long from its start."""
+    from pp_cl.training.schedule import bound_to_end
+
+    config, begun = training.config, training.trainer.begun
+    bound = ["the optimiser's moments, which begin anew"]
+    bound += bound_to_end(config.network, config.raster, config.train)
+    return (
+        f"extends a finished training of {begun} steps; {config.train.iterations} from the start"
+        f" differ in {', '.join(bound)}"
     )
 
 

@@ -1,4 +1,4 @@
-"""`pp-cl view`: shows a run in the browser."""
+"""`pp-cl view`: shows a run or a scene in the browser."""
 
 import argparse
 import html
@@ -13,7 +13,9 @@ from pathlib import Path
 
 from pp_cl.commands import options as shared
 
-HELP = "look at a run in the browser, also while it is trained"
+HELP = "look at a run, also while it is trained, or at a scene in the browser"
+EPILOG = """A scene: its cameras and sparse points. Its box can be moved and views dropped; both are
+written to pp_cl.json in its folder, which training, info and all other commands obey."""
 LOOPBACK = "127.0.0.1"
 PORT = 8733
 
@@ -21,7 +23,7 @@ PORT = 8733
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the command's options."""
     add = parser.add_argument
-    add("run_folder", metavar="RUN", help="folder of the run, finished or not")
+    add("run_folder", metavar="RUN|SCENE", help="folder of a run, finished or not, or of a scene")
     add(
         "--port",
         type=shared.integer(0, 65535),

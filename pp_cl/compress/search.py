@@ -9,9 +9,11 @@ import numpy as np
 
 from pp_cl.bench.timing import interleave
 from pp_cl.compress.reduction import Original, Reduction, measured_psnr, nbytes
-from pp_cl.run import Run, check_scene
+from pp_cl.errors import UserError
+from pp_cl.facts.info import read_metrics
+from pp_cl.run import Run, scene_is_there
 from pp_cl.scene.load import scene_splits
-from pp_cl.scene.views import View
+from pp_cl.scene.views import View, evenly
 
 # What is tried in turn: the share of the loss that all so far may take, and the field's values,
 # from mild to harsh; the first that is too harsh ends it. What only makes rendering faster must do
@@ -49,13 +51,19 @@ class Trial:
 class Search:
     """Finds a reduction that loses at most `most_loss` dB over the validation views.
 
+    error: mean square by which the views, where they are the original's own renderings, are wrong.
     psnr: of the original. reduction, run, loss: what was taken so far, and what it loses.
     """
 
-    def __init__(self, original: Original, views: list[View], most_loss: float):
+    def __init__(self, original: Original, views: list[View], most_loss: float, error: float = 0.0):
         self.original, self.views, self.most_loss = original, views, most_loss
         self.reduction, self.run, self.loss = Reduction.of(original.run), original.run, 0.0
-        self.psnr = measured_psnr(original.run, views)
+        self.error = error
+        self.psnr = self._measured(original.run)
+
+    def _measured(self, run):
+        """PSNR against the photographs: errors of renderings and of what reduces them add up."""
+        return -10 * float(np.log10(10 ** (-measured_psnr(run, self.views) / 10) + self.error))
 
     def trials(self) -> Iterator[Trial]:
         """What is tried, in turn; afterwards `reduction` is the one found."""
@@ -77,7 +85,7 @@ class Search:
         """Measure a change of the present reduction, and adopt it where it serves."""
         changed = replace(self.reduction, **changes)
         run = self.original.reduced(changed)
-        psnr = measured_psnr(run, self.views)
+        psnr = self._measured(run)
         loss = self.psnr - psnr
         fits, speed = loss <= share * self.most_loss, None
         if fits and not {*changes} & {*SMALLER, "keep"}:
@@ -100,20 +108,39 @@ class Search:
                 fails = middle
 
 
-def validation_views(run: Run) -> tuple[str, list[View]]:
-    """(which they are, views) to measure a loss on, at most MOST_VIEWS: those of the split val,
-    where the scene has none every eighth of the training views. Never those of a test. Raises
-    UserError where the scene is missing or broken.
+def validation_views(run: Run) -> tuple[str, list[View], float]:
+    """(which they are, views, their error as Search has it) to measure a loss on, at most
+    MOST_VIEWS: those of the split val, where the scene has none every eighth of the training views;
+    where the scene is missing, the run's renderings of these. Never those of a test. Raises
+    UserError where the scene is broken.
     """
-    check_scene(run.config.scene.path)
-    present = scene_splits(run.config.scene.path)
-    split = "val" if "val" in present else "train"
+    path = run.config.scene.path
+    if not scene_is_there(path):
+        psnr = _known_psnr(run)
+        shown = evenly(run.photographs("train")[::HELD_EVERY], MOST_VIEWS)
+        views = run.rendered(shown, opaque=True)
+        which = f"{len(views)} renderings of train, taken to have {psnr:.2f} dB ({path} is missing)"
+        return which, views, 10 ** (-psnr / 10)
+    split = "val" if "val" in scene_splits(path) else "train"
     views = run.scene(split).splits[split]
-    if split == "train":
-        views = views[::HELD_EVERY]
-    count = min(MOST_VIEWS, len(views))
-    views = [views[i * len(views) // count] for i in range(count)]
-    return f"{count} views of {split}", views
+    views = evenly(views[::HELD_EVERY] if split == "train" else views, MOST_VIEWS)
+    return f"{len(views)} views of {split}", views, 0.0
+
+
+def _known_psnr(run):
+    """Of the run against photographs, as its last evaluation or else the log of its training
+    says.
+    """
+    measured = read_metrics(run.folder)
+    if measured and "psnr" in measured["mean"] and measured["step"] == run.header["step"]:
+        return measured["mean"]["psnr"]
+    for row in reversed(run.folder.rows()):
+        if "psnr" in row:
+            return row["psnr"]
+    raise UserError(
+        f"{run.config.scene.path}: the run's scene is not there, and {run.folder} keeps no PSNR;"
+        " say where the scene is with --scene"
+    )
 
 
 def frame_ms(runs: list[Run], views: list[View]) -> list[float]:

@@ -3,16 +3,14 @@
 from __future__ import annotations
 
 import warnings
+from dataclasses import replace
 from pathlib import Path
-
-from tqdm import tqdm
 
 from pp_cl.errors import UserError
 from pp_cl.export.mesh import coloured_mesh, write_mesh
 from pp_cl.export.page import page_text
 from pp_cl.export.points import coloured_points, write_glb, write_ply
 from pp_cl.files.atomic import check_file, check_new_folder, write_text
-from pp_cl.files.image import to_8bit
 from pp_cl.run import Run, image_files
 from pp_cl.scene.readers.transforms import write_scene
 from pp_cl.scene.views import View
@@ -87,12 +85,7 @@ def renderings(run: Run) -> dict[str, list[View]]:
 
 
 def _rendered(run, split, photographs):
-    """The views of a split."""
+    """The views of a split, named after their files in its folder."""
     files = image_files([one.name for one in photographs])
-    bar = tqdm(photographs, f"rendering {split}", unit="view", leave=False, disable=None)
-    views = []
-    for one, file in zip(bar, files, strict=True):
-        camera = one.camera.downscaled(run.config.scene.downscale)
-        image = to_8bit(run.render(camera).rgba())
-        views.append(View(f"{split}/{file}", camera, image, one.depth_range))
-    return views
+    views = run.rendered(photographs, opaque=False)
+    return [replace(v, name=f"{split}/{file}") for v, file in zip(views, files, strict=True)]

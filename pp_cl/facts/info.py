@@ -2,8 +2,10 @@
 
 import json
 import math
+import warnings
 from collections import Counter
 from collections.abc import Iterable
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -13,11 +15,15 @@ from pp_cl.device.device import Device
 from pp_cl.errors import UserError
 from pp_cl.files.run_folder import MOST_METRICS, RunFolder
 from pp_cl.files.untrusted import read_json_text, refusal
+from pp_cl.run import check_scene, load_run, scene_is_there
 from pp_cl.scene.agreement import Disagreement, disagreements
 from pp_cl.scene.camera_path import looked_at, up_of
+from pp_cl.scene.edits import read_edits
 from pp_cl.scene.grid import Grid
 from pp_cl.scene.hull import Hull, agreeing, spacing_pixels
+from pp_cl.scene.identity import kept_views
 from pp_cl.scene.load import (
+    DEMO,
     open_scene,
     preset_downscale,
     scene_box,
@@ -26,9 +32,15 @@ from pp_cl.scene.load import (
     scene_splits,
 )
 from pp_cl.scene.outline import SHOWN_VIEWS, picture
-from pp_cl.scene.views import MASK_THRESHOLD, View
+from pp_cl.scene.overview import overview
+from pp_cl.scene.sparse import sparse_points
+from pp_cl.scene.views import MASK_THRESHOLD, View, evenly
 from pp_cl.session import first_hull
 from pp_cl.training.checkpoint import opened_run
+
+SHOWN_POINTS = 20_000  # of a hull
+HULL_COLOUR = (230, 140, 200)
+LEAST_WIDTH = 640  # pixels of a picture
 
 Facts = dict[str, Any]
 Given = tuple[str, Any, str]  # a setting: key, value or its text, origin
@@ -49,6 +61,8 @@ def run_facts(folder: RunFolder, scene: str | None = None) -> Facts:
         "run": str(folder),
         "preset": config.preset,
         "scene": config.scene.path,
+        "scene_is_there": scene_is_there(config.scene.path),
+        "views": None,
         "downscale": config.scene.downscale,
         "iterations": config.train.iterations,
         "network": {
@@ -66,6 +80,7 @@ def run_facts(folder: RunFolder, scene: str | None = None) -> Facts:
         "psnr": next((row["psnr"] for row in reversed(rows) if "psnr" in row), None),
         "metrics": measured and measured["mean"],
         "metrics_step": measured and measured["step"],
+        "files": _files(folder.path),
     }
     if folder.checkpoint.exists():
         with opened_run(folder, config) as stored:
@@ -73,37 +88,57 @@ def run_facts(folder: RunFolder, scene: str | None = None) -> Facts:
         sizes = (math.prod(f.shape) for name, f in forms.items() if name.startswith("net."))
         facts["network"]["parameters"] = sum(sizes)
         facts |= {"step": header["step"], "finished": header["finished"]}
+        photographs = kept_views(header["views"])
+        facts["views"] = {"count": len(photographs), "images": _image_sizes(photographs)}
         left, grid = forms["points.ids"].shape[0], header["grid"]
         facts["points"] = {"initial": header["initial_points"], "left": left}
-        facts["grid"] = grid | {"edge_pixels": _edge_pixels(config, Grid.of_header(grid))}
+        cameras = [one.camera.downscaled(config.scene.downscale) for one in photographs]
+        facts["grid"] = grid | {"edge_pixels": spacing_pixels(Grid.of_header(grid), cameras)}
         facts["checkpoint_bytes"] = folder.checkpoint.stat().st_size
     return facts
 
 
 def run_picture(dev: Device, folder: RunFolder, scene: str | None = None) -> np.ndarray:
-    """picture() of the points that a run has left. Raises UserError as run_facts does, and for a
-    scene that is missing or broken.
+    """picture() of the points that a run has left, over renderings where its scene is missing.
+    Raises UserError as run_facts does, and for a scene that is broken.
     """
     config = _config(folder, scene)
     with opened_run(folder, config) as stored:
         grid = Grid.of_header(stored.header["grid"])
         points = Hull(grid, stored.array("points.ids"), capped=False)
-    return picture(dev, open_scene(dev, config, ("train",), SHOWN_VIEWS).splits["train"], points)
+    if scene_is_there(config.scene.path):
+        return picture(
+            dev, open_scene(dev, config, ("train",), SHOWN_VIEWS).splits["train"], points
+        )
+    warnings.warn(
+        f"{config.scene.path}: is not there; the picture shows the run's renderings in place of"
+        " photographs",
+        stacklevel=2,
+    )
+    run = load_run(dev, folder.path)
+    shown = evenly(run.photographs("train"), SHOWN_VIEWS)
+    return picture(dev, run.rendered(shown, opaque=True), points)
 
 
 def _config(folder, scene):
+    if scene is not None:
+        check_scene(scene)
     config = load_config(folder.config)
     return configure(config, scene or config.scene.path)
 
 
-def _edge_pixels(config, grid):
-    """The grid's edge in pixels of the run's images; None where the scene cannot be read."""
-    try:
-        frames = scene_frames(config.scene.path)
-    except UserError:
-        return None
-    cameras = [frame.camera.downscaled(config.scene.downscale) for frame in frames]
-    return spacing_pixels(grid, cameras)
+def _files(folder):
+    """{name: bytes} of what lies in a folder, of a folder in it the sum."""
+    files = [file for file in sorted(folder.rglob("*")) if file.is_file()]
+    sizes = Counter()
+    for file in files:
+        sizes[file.relative_to(folder).parts[0]] += file.stat().st_size
+    return {name: size for name, size in sizes.items() if not name.startswith(".")}
+
+
+def _image_sizes(photographs):
+    """{WxH: how many images have it}."""
+    return dict(Counter(f"{p.camera.width}x{p.camera.height}" for p in photographs))
 
 
 def read_metrics(folder: RunFolder) -> Facts | None:
@@ -160,14 +195,13 @@ def describe_scene(
     names = sorted(scene_splits(path), key=lambda split: (split == "test", split))
     frames = {split: scene_frames(path, split) for split in names}
     views = open_scene(dev, config, ("train",)).splits["train"]
-    hull, problem = None, None
+    hull, problem, box = None, None, scene_box(config)
     try:
-        agreement = agreeing(dev, views, scene_box(config))
+        agreement = agreeing(dev, views, box)
         hull, shares = first_hull(dev, config, agreement)
     except UserError as error:
         problem = str(error)
     found = disagreements(views, hull.grid.box) if hull else []
-    sizes = Counter(f"{f.camera.width}x{f.camera.height}" for fs in frames.values() for f in fs)
     ranges = np.array([view.depth_range for view in views if view.depth_range])
     cameras, stored = ([getattr(v, name) for v in views] for name in ("camera", "stored_camera"))
     centre = looked_at(stored)
@@ -175,7 +209,7 @@ def describe_scene(
         "scene": path,
         "format": scene_format(path),
         "splits": {split: len(listed) for split, listed in frames.items()},
-        "images": dict(sizes),
+        "images": _image_sizes([frame for listed in frames.values() for frame in listed]),
         **_lenses([view.file_camera for view in views]),
         "masks": _masks(views)
         | {"disagreeing": [{"view": one.view.name, "share": one.share} for one in found]}
@@ -186,6 +220,8 @@ def describe_scene(
         "up": up_of(stored).tolist(),
         "preset": preset_name,
         "downscale": config.scene.downscale,
+        "box": None if box is None else box.tolist(),
+        "dropped": [] if path == DEMO else sorted(read_edits(Path(path)).dropped),
         "hull": None,
         "problem": problem,
     }
@@ -200,6 +236,35 @@ def describe_scene(
             "box": hull.grid.box.tolist(),
         }
     return facts, views, hull, found
+
+
+def scene_picture(
+    dev: Device,
+    scene: str,
+    facts: Facts,
+    views: list[View],
+    hull: Hull | None,
+    found: list[Disagreement],
+) -> np.ndarray:
+    """uint8 picture of what describe_scene() gave: the sparse points, or else the hull's, with
+    cameras and box from two sides, above picture() of the masks.
+    """
+    points, colours = np.empty((0, 3)), np.empty((0, 3), np.uint8)
+    if scene != DEMO:
+        points, colours = sparse_points(Path(scene))
+    if not len(points) and hull:
+        points = hull.grid.positions(hull.ids[:: 1 + len(hull.ids) // SHOWN_POINTS])
+        colours = np.full(points.shape, HULL_COLOUR, np.uint8)
+    box = facts["box"] or (facts["hull"] and facts["hull"]["box"])
+    sheet = picture(dev, views, hull, found)
+    cameras = [view.stored_camera for view in views]
+    width = max(LEAST_WIDTH, sheet.shape[1])
+    drawn = overview(cameras, box and np.array(box), points, colours, width)
+    rows = [
+        np.pad(part, ((0, 0), (0, width - part.shape[1]), (0, 0)), constant_values=255)
+        for part in (drawn, sheet)
+    ]
+    return np.concatenate(rows)
 
 
 def _range(values):

@@ -209,8 +209,8 @@ def build_grid(
         )
     corner = _corner(views, reach_of(views))
     near = [view.moved(-corner) for view in views]
-    box = _box(near, None if box is None else box - corner, forgiven)
-    hull = _search(dev, near, points, box, forgiven)
+    limit = None if box is None else box - corner
+    hull = _search(dev, near, points, _box(near, limit, forgiven), forgiven, limit)
     return replace(hull, grid=hull.grid.moved(corner))
 
 
@@ -248,8 +248,8 @@ def _corner(views, reach):
     return unit * np.floor(eyes.min(0) / unit)
 
 
-def _search(dev, views, points, box, forgiven):
-    """The Hull of build_grid() in a box."""
+def _search(dev, views, points, box, forgiven, limit):
+    """The Hull of build_grid() in a box. limit: (2, 3) that it may not leave, or None."""
     carver = Carver(dev, _farthest_point_order(views, box.mean(0)))
 
     def carve(edge):
@@ -261,6 +261,8 @@ def _search(dev, views, points, box, forgiven):
         raise UserError(explain_empty_hull(views, box))
     while rounds < ROUNDS and not points <= last.count <= TOLERANCE * points:
         box = last.box() if last.count else box
+        if limit is not None:
+            box = np.stack([np.maximum(box[0], limit[0]), np.minimum(box[1], limit[1])])
         wanted = last.grid.edge * (max(last.count, 0.5) / (AIM * points)) ** (1 / 3)
         edge = max(wanted, smallest_edge(box, CELL_CAP))
         capped = edge > wanted

@@ -20,6 +20,8 @@ from pp_cl.files.image import ENDINGS, read_rgba
 from pp_cl.presets import IMAGE_SIZES
 from pp_cl.scene import demo
 from pp_cl.scene.distortion import undistort
+from pp_cl.scene.edits import FILE as EDITS
+from pp_cl.scene.edits import read_edits
 from pp_cl.scene.identity import pixel_digest
 from pp_cl.scene.masks import AS_GIVEN, MaskRule
 from pp_cl.scene.readers import co3d, colmap, llff, neus, nsvf, transforms
@@ -113,14 +115,16 @@ def mask_rule(config: Config) -> MaskRule:
 
 
 def scene_box(config: Config) -> np.ndarray | None:
-    """(2, 3) lower and upper corner of the setting scene.box, else of the box that the scene's
-    format states, None where there is none. Raises UserError for a box without volume.
+    """(2, 3) lower and upper corner of the setting scene.box, else of what the user has edited,
+    else of what the scene's format states; None where there is none. Raises UserError for a box
+    without volume.
     """
-    corners = np.array(config.scene.box, np.float64).reshape(2, 3)
+    corners, path = np.array(config.scene.box, np.float64).reshape(2, 3), config.scene.path
     if not corners.any():
-        path = config.scene.path
-        stated = None if path == DEMO else getattr(find_reader(path), "box", None)
-        return stated and stated(Path(path))
+        if path == DEMO:
+            return None
+        edited, stated = read_edits(Path(path)).box, getattr(find_reader(path), "box", None)
+        return stated(Path(path)) if edited is None and stated else edited
     box = np.stack([corners.min(0), corners.max(0)])
     if not (box[1] > box[0]).all():
         raise UserError("scene.box: its corners must differ in x, y and z")
@@ -139,9 +143,11 @@ def scene_splits(path: str) -> list[str]:
     return list(demo.SPLITS) if path == DEMO else find_reader(path).splits(Path(path))
 
 
-def scene_frames(path: str | Path, split: str = "train") -> list[Photograph]:
-    """The photographs of a split, without their pixels. Raises UserError where there are none, and
-    for a camera that shows nothing in float32.
+def scene_frames(
+    path: str | Path, split: str = "train", *, edited: bool = True
+) -> list[Photograph]:
+    """The photographs of a split, without their pixels; edited: but for those that the user has
+    dropped. Raises UserError where there are none, and for a camera that shows nothing in float32.
     """
     if path == DEMO:
         return demo.demo_frames(split)
@@ -149,9 +155,13 @@ def scene_frames(path: str | Path, split: str = "train") -> list[Photograph]:
     present = reader.splits(folder)
     if split not in present:
         raise UserError(f"{folder}: no split {split}; its splits are {', '.join(present)}")
-    photographs = reader.read_split(folder, split)
+    photographs, dropped = reader.read_split(folder, split), frozenset()
+    if edited:
+        dropped = read_edits(folder).dropped
+        photographs = [one for one in photographs if one.name not in dropped]
     if not photographs:
-        raise UserError(f"{folder}: split {split} has no photographs; add some")
+        lacks = f"; {EDITS} drops some" if dropped else ""
+        raise UserError(f"{folder}: split {split} has no photographs{lacks}; add some")
     for one in photographs:
         _check_lens(folder / one.name, one.camera)
     return photographs
@@ -211,6 +221,11 @@ def check_folder(folder: Path) -> None:
         raise UserError(f"{folder}: no such folder; SCENE is a folder, or the word demo")
     if not os.access(folder, os.R_OK | os.X_OK):
         raise UserError(f"{folder}: cannot be read; check its permissions")
+
+
+def is_scene(folder: str | Path) -> bool:
+    """Whether a folder holds a scene."""
+    return Path(folder).is_dir() and _reader_of(Path(folder)) is not None
 
 
 def _reader_of(folder):

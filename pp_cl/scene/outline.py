@@ -16,10 +16,11 @@ from pp_cl.scene.camera import Camera
 from pp_cl.scene.grid import Grid
 from pp_cl.scene.hull import Hull, silhouette
 from pp_cl.scene.target import Target
-from pp_cl.scene.views import View, evenly, fitting_downscale
+from pp_cl.scene.views import MASK_THRESHOLD, View, evenly, fitting_downscale, shrink
 
 SHOWN_VIEWS, SHOWN_SIZE = 12, 320  # photographs of the picture, and their longer side in pixels
 OUTLINE = (255, 0, 160)  # a colour that few objects have
+MASK_OUTLINE = (0, 150, 255)
 REJECTED = np.array([127, 60, 0], np.uint8)  # added to what a mask should have held
 
 
@@ -35,7 +36,7 @@ def picture(
     disagreeing: Sequence[Disagreement] = (),
 ) -> np.ndarray:
     """uint8 (H, W, 3) contact sheet of up to 12 photographs over white, spread evenly over the
-    views, with the outline of the points drawn over them.
+    views, with the outlines of the mask and, over it, of the points drawn over them.
 
     disagreeing: their views come first, tinted where they reject what the others agree on.
     """
@@ -51,6 +52,9 @@ def picture(
         if view.name in tinted:
             rejected = silhouette(*tinted[view.name][2:], small.camera)
             image[rejected] = image[rejected] // 2 + REJECTED
+        if view.has_mask:
+            mask = shrink(view.image, small.downscale)[..., 3] > MASK_THRESHOLD
+            image[find_boundaries(mask, mode="inner")] = MASK_OUTLINE
         if points:
             image[outline(points.grid, points.ids, small.camera)] = OUTLINE
         images.append(image)

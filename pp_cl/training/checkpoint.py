@@ -18,7 +18,7 @@ from pp_cl.layers.choice import check_form
 from pp_cl.network.layers import parameter_table, unet_layers
 from pp_cl.raster.points import SH_DEGREES, sh_blocks
 from pp_cl.scene.identity import DIGITS, kept_views
-from pp_cl.training.schedule import ema_start
+from pp_cl.training.schedule import bound_to_end, ema_start
 from pp_cl.training.state import PointState
 
 MOST_VERTICES = 2**32  # an id has 32 bits
@@ -96,7 +96,9 @@ class StoredRun:
         if not 0 < n <= most:
             self._refuse(f"points.ids is {ids or 'missing'}, expected 1 to {most} points")
         half = self.forms.get("points.sh0", ids).dtype == np.float16
-        step = None if header["finished"] else header["step"]
+        ends = header["finished"] and bound_to_end(config.network, config.raster, config.train)
+        is_bare = ends or (header["finished"] and "state.last_step" not in self.forms)
+        step = None if is_bare else header["step"]
         expected = stored_forms(config, n, step, half and header["finished"])
         for name in sorted(expected.keys() | self.forms.keys()):
             found, wanted = self.forms.get(name), expected.get(name)

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pp_cl.settings import NetworkConfig, TrainConfig
+from pp_cl.settings import NetworkConfig, RasterConfig, TrainConfig
 
 EMA_UPDATES = 200  # times the averages would be updated in all steps; the last 15 % do
 BOX_MARGIN = 8  # pixels around the object from which crops are drawn
@@ -44,6 +44,26 @@ class Rates:
             scale * learning_rate(step, steps, *train.opacity_rate),
             learning_rate(step, steps, *network.rate),
         )
+
+
+def bound_to_end(network: NetworkConfig, raster: RasterConfig, train: TrainConfig) -> list[str]:
+    """What of a training depends on its number of steps, in words; nothing where a longer one goes
+    through the same steps first.
+    """
+    constant = network.rate[0] == network.rate[1] and train.opacity_rate[0] == train.opacity_rate[1]
+    constant = constant and train.sh_rate_decay == 1 and not train.opacity_rate_steps
+    delayed = any(r and d for r, d in zip(train.sh_rate, train.sh_delay, strict=True))
+    is_alpha = raster.blend == "alpha"
+    depends = {
+        "learning rates": not constant or delayed,
+        "gamma": not is_alpha and raster.gamma[0] != raster.gamma[1],
+        "the mask's and the spread's weights": is_alpha
+        and (train.mask_weight > 0 or train.spread_weight > 0),
+        "refinements": any(share < 1 for share in train.refine_at),
+        "averages": train.ema,
+        "the last pruning": train.final_prune_weight > 0,
+    }
+    return [what for what, does in depends.items() if does]
 
 
 def learning_rate(

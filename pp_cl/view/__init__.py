@@ -1,1 +1,1 @@
-"""The viewer of `pp-cl view`: a run in the browser, also while it trains."""
+"""The viewer of `pp-cl view`: a run in the browser, also while it trains, or a scene."""

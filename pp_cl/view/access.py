@@ -32,16 +32,17 @@ class Access:
         name = {"0.0.0.0": LOOPBACK[0], "::": "::1"}.get(self.host, self.host)  # noqa: S104
         return f"http://{_bracketed(name)}:{self.port}/{self.token}/"
 
-    def refusal(self, path: str, host: str, origin: str | None, *, socket: bool) -> str | None:
+    def refusal(self, path: str, host: str, origin: str | None, *, strict: bool) -> str | None:
         """Why a request is refused, one line, or None. path: decoded; host, origin: the headers;
-        socket: whether a websocket is asked for, which a browser always sends its Origin with.
+        strict: whether it must have an Origin, as browsers send it for websockets and for what
+        changes something.
         """
         if not self._knows(host):
             return "Host is not the address of this server"
         given = path.split("/", 2)[1] if path.startswith("/") else ""
         if not hmac.compare_digest(given.encode("utf-8", "replace"), self.token.encode()):
             return "the token is missing or wrong; open the address that pp-cl view printed"
-        if (socket or origin is not None) and origin != f"http://{host}":
+        if (strict or origin is not None) and origin != f"http://{host}":
             return "Origin is not the address of this server"
         return None
 

@@ -15,11 +15,11 @@ export function frustums(around, at, perPixel) {
   });
 }
 
-export function drawFrustums(g, found, hovered) {
+export function drawFrustums(g, found, hovered, colour = "#3d7fd8a0") {
   found.forEach((points, i) => {
     if (!points) return;
     const [eye, ...corners] = points;
-    g.strokeStyle = i === hovered ? "#ff8a1f" : "#3d7fd8a0";
+    g.strokeStyle = i === hovered ? "#ff8a1f" : colour;
     g.lineWidth = i === hovered ? 2 : 1;
     g.beginPath();
     corners.forEach((corner, k) => {

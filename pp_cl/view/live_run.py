@@ -100,6 +100,7 @@ class LiveRun:
                 "finished": run.header["finished"],
                 "points": run.model.cloud.count,
                 "early_stop": run.config.raster.early_stop,
+                "photographs": bool(self._views),
             }
         return facts
 
@@ -110,13 +111,14 @@ class LiveRun:
         if self._run is None:
             return None
         centre, radius = self._run.ball
-        cameras = self._run.cameras("train")
+        cameras, photographs = self._run.cameras("train"), self._run.photographs("train")
+        named = zip(photographs, cameras, strict=True)
         return {
             "centre": centre.tolist(),
             "radius": radius,
             "up": up_of(cameras).tolist(),
             "camera": frame_keys(cameras[0]),
-            "views": [{"name": v.name, "camera": frame_keys(v.camera)} for v in self._views],
+            "views": [{"name": one.name, "camera": frame_keys(c)} for one, c in named],
         }
 
     def draw(self, request: ViewRequest) -> tuple[dict[str, Any], bytes]:
@@ -206,7 +208,7 @@ def _training_views(run):
     try:
         return run.scene("train").splits["train"], None
     except UserError as error:
-        return [], f"no training views: {error}"
+        return [], f"no photographs: {error}"
 
 
 def _stamp(path):

@@ -298,7 +298,7 @@ function onUp(event) {
 
 function flip() {
   if (!around) return;
-  if (!around.views.length) { note(facts.notice || "there are no training views", true); return; }
+  if (!facts.photographs) { note(facts.notice, true); return; }
   photograph = !photograph;
   mark();
   ask(false);

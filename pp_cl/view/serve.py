@@ -19,6 +19,7 @@ from pp_cl.device.discover import open_device
 from pp_cl.errors import UserError
 from pp_cl.files.run_folder import RunFolder
 from pp_cl.run import check_scene
+from pp_cl.scene.load import is_scene
 from pp_cl.view.access import Access
 from pp_cl.view.live_run import LiveRun
 
@@ -42,17 +43,24 @@ def serve(
     scene: str | None = None,
     wait: bool = False,
 ) -> None:
-    """Show the run in a folder in the browser until Ctrl-C or a signal to terminate, which end it
-    without an exception.
+    """Show the run in a folder, or the scene, in the browser until Ctrl-C or a signal to terminate,
+    which end it without an exception.
 
     port: 0 takes a free one. announce: called with the address once it listens. device: as `pp-cl
     devices` lists them. scene: where the run's scene is now. wait: for the folder to become a run,
-    and end with the process that has started this one. Raises UserError for a folder that is no
-    run, and for a host or port that cannot be had.
+    and end with the process that has started this one. Raises UserError for a folder that is
+    neither, and for a host or port that cannot be had.
     """
     parent = os.getppid() if wait else None  # first of all: it may be gone once it is answered
     check_installed()
-    if not wait:
+    shown = None
+    if not wait and not RunFolder(folder).config.exists() and is_scene(folder):
+        from pp_cl.view.scene_server import ShownScene
+
+        if scene is not None:
+            raise UserError("--scene: only of a run; leave it out")
+        shown = ShownScene(Path(folder))
+    elif not wait:
         load_config(RunFolder(folder).config)
     if scene is not None:
         check_scene(scene)
@@ -63,7 +71,7 @@ def serve(
         # asyncio ends its tasks one by one at Ctrl-C, and knows no other signal
         signal.signal(signal.SIGTERM, lambda *_: signal.raise_signal(signal.SIGINT))
         access = Access(host, listening.getsockname()[1])
-        live = LiveRun(open_device(device), folder, scene)
+        live = shown or LiveRun(open_device(device), folder, scene)
         asyncio.run(_serve(live, access, listening, announce=announce, parent=parent))
 
 
@@ -105,14 +113,15 @@ def _listen(host, port):
 
 
 async def _serve(live, access, listening, *, announce, parent):
-    """Serve until cancelled, until drawing fails, which is a bug, or until the parent, a process,
-    is gone; None: that does not matter.
+    """Serve a LiveRun or a ShownScene until cancelled, until drawing fails, which is a bug, or
+    until the parent, a process, is gone; None: that does not matter.
     """
     from aiohttp import web
 
+    from pp_cl.view.scene_server import SceneServer
     from pp_cl.view.server import ViewServer
 
-    server = ViewServer(live, access)
+    server = (ViewServer if isinstance(live, LiveRun) else SceneServer)(live, access)
     runner = server.runner()
     await runner.setup()
     try:

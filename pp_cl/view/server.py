@@ -1,37 +1,26 @@
-"""The server of the page: its files, a websocket for each tab, and the drawing for all of them."""
+"""The server of the page of a run: a websocket for each tab, and the drawing for all of them."""
 
 from __future__ import annotations
 
 import asyncio
 import contextlib
 import json
-import logging
 import time
 from collections import deque
-from importlib.resources import files
 from typing import Any
 
 from aiohttp import WSMsgType, web
-from aiohttp.http_exceptions import HttpProcessingError
 
 from pp_cl.errors import UserError
 from pp_cl.view.access import Access
 from pp_cl.view.live_run import LiveRun
 from pp_cl.view.messages import MOST_BYTES, ViewRequest, packed, read_request
+from pp_cl.view.pages import application, runner
 
-FILES = {
-    "": ("page.html", "text/html"),
-    "page.css": ("page.css", "text/css"),
-    "page.js": ("page.js", "text/javascript"),
-    "camera.js": ("camera.js", "text/javascript"),
-    "curve.js": ("curve.js", "text/javascript"),
-    "frustums.js": ("frustums.js", "text/javascript"),
-    "icon.svg": ("icon.svg", "image/svg+xml"),
-}
+SCRIPTS = ("page.js", "curve.js")
 SOCKET = "socket"  # its path
 MOST_TABS = 16
 POLL_SECONDS = 1.0  # between two looks at checkpoint and log
-GRACE_SECONDS = 1.0  # for requests in work when the server ends
 PULSE_SECONDS = 20.0  # a tab that answers no ping for so long is gone
 RATE_SECONDS = 2.0  # of frames that the rate is counted over
 
@@ -85,21 +74,13 @@ class ViewServer:
         # the newest request of each kind, oldest first; a replaced one keeps its place
         self._asked: dict[tuple[Tab, str], ViewRequest] = {}
         self._waits = asyncio.Event()  # is set where there are some
-        self._files = {
-            name: (files("pp_cl.view").joinpath(file).read_bytes(), kind)
-            for name, (file, kind) in FILES.items()
-        }
 
     def runner(self) -> web.AppRunner:
         """Runs the server, while draw() runs beside it."""
-        logger = logging.getLogger(__name__)
-        logger.addFilter(_is_a_bug)
-        app = web.Application(middlewares=[self._guard], client_max_size=MOST_BYTES)
-        app.on_response_prepare.append(self._set_headers)
+        routes = [web.get("/{token}/" + SOCKET, self._socket)]
+        app = application(self.access, "page.html", SCRIPTS, routes, MOST_BYTES)
         app.on_shutdown.append(self._close_tabs)
-        app.router.add_get("/{token}/" + SOCKET, self._socket)
-        app.router.add_get("/{token}/{name:[^/]*}", self._file)
-        return web.AppRunner(app, access_log=None, logger=logger, shutdown_timeout=GRACE_SECONDS)
+        return runner(app)
 
     async def draw(self) -> None:
         """Draw for ever what tabs ask for, and tell them of new checkpoints and rows of the log:
@@ -145,24 +126,6 @@ class ViewServer:
         self.drawn += 1
         tab.show(request.kind, facts, image)
 
-    @web.middleware
-    async def _guard(self, request, handler):
-        host, origin = request.headers.get("Host", ""), request.headers.get("Origin")
-        socket = "Upgrade" in request.headers
-        refusal = self.access.refusal(request.path, host, origin, socket=socket)
-        if refusal:
-            raise web.HTTPForbidden(text=f"403: {refusal}\n")
-        return await handler(request)
-
-    async def _set_headers(self, request, response):
-        response.headers.update(self.access.headers(request.headers.get("Host", "")))
-
-    async def _file(self, request):
-        if request.match_info["name"] not in self._files:
-            raise web.HTTPNotFound
-        body, kind = self._files[request.match_info["name"]]
-        return web.Response(body=body, content_type=kind, charset="utf-8")
-
     async def _socket(self, request):
         if len(self.tabs) >= MOST_TABS:
             raise web.HTTPServiceUnavailable(text=f"{MOST_TABS} tabs are open; close one\n")
@@ -201,8 +164,3 @@ class ViewServer:
     async def _close_tabs(self, _app):
         for tab in list(self.tabs):
             await tab.socket.close(code=1001, message=b"pp-cl view has ended")
-
-
-def _is_a_bug(record):
-    """Whether a record of the log is worth its traceback: broken HTTP of a stranger is not."""
-    return not (record.exc_info and isinstance(record.exc_info[1], HttpProcessingError))

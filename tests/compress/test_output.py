@@ -15,15 +15,15 @@ from pp_cl.run import load_run
 
 def test_validation_views_are_never_those_of_the_test(dev, ball_run, tmp_path):
     run = load_run(dev, ball_run)
-    which, views = validation_views(run)
-    assert which == "2 views of train"
+    which, views, error = validation_views(run)
+    assert which == "2 views of train" and error == 0
     train = run.scene("train").splits["train"]
     assert [view.name for view in views] == [train[0].name, train[8].name]
     scene = tmp_path / "scene"
     shutil.copytree(run.config.scene.path, scene)
     shutil.copy(scene / "transforms_test.json", scene / "transforms_val.json")
     with_val = load_run(dev, ball_run, scene=str(scene))
-    which, views = validation_views(with_val)
+    which, views, _ = validation_views(with_val)
     assert which == f"{len(views)} views of val"
 
 

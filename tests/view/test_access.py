@@ -7,8 +7,8 @@ from pp_cl.view.access import Access
 HERE = Access("127.0.0.1", 8733, "secret")
 
 
-def refusal(access=HERE, path="/secret/", host="127.0.0.1:8733", origin=None, socket=False):
-    return access.refusal(path, host, origin, socket=socket)
+def refusal(access=HERE, path="/secret/", host="127.0.0.1:8733", origin=None, strict=False):
+    return access.refusal(path, host, origin, strict=strict)
 
 
 def test_the_printed_address_is_let_in():
@@ -16,7 +16,7 @@ def test_the_printed_address_is_let_in():
     for path in ("/secret/", "/secret/page.js", "/secret/socket"):
         assert refusal(path=path) is None
     assert refusal(host="localhost:8733") is None
-    assert refusal(origin="http://127.0.0.1:8733", socket=True) is None
+    assert refusal(origin="http://127.0.0.1:8733", strict=True) is None
 
 
 @pytest.mark.parametrize("path", ["/", "", "/secre/", "/secret2/", "//secret/", "/\u00e9/", "*"])
@@ -45,12 +45,12 @@ def test_another_host_is_refused(host):
     "origin", ["http://evil.example", "null", "", "https://127.0.0.1:8733", "http://localhost:8733"]
 )
 def test_another_origin_is_refused(origin):
-    assert "Origin" in refusal(origin=origin, socket=True)
+    assert "Origin" in refusal(origin=origin, strict=True)
     assert "Origin" in refusal(origin=origin)
 
 
 def test_a_websocket_without_an_origin_is_refused():
-    assert "Origin" in refusal(origin=None, socket=True)
+    assert "Origin" in refusal(origin=None, strict=True)
 
 
 def test_on_all_interfaces_numbers_are_let_in_and_names_are_not():
@@ -65,7 +65,7 @@ def test_on_all_interfaces_numbers_are_let_in_and_names_are_not():
 def test_on_all_of_ipv6_the_address_is_one_of_ipv6():
     everywhere = Access("::", 8733, "secret")
     assert everywhere.address == "http://[::1]:8733/secret/"
-    assert refusal(everywhere, host="[::1]:8733", origin="http://[::1]:8733", socket=True) is None
+    assert refusal(everywhere, host="[::1]:8733", origin="http://[::1]:8733", strict=True) is None
 
 
 def test_other_addresses_know_themselves_only():

@@ -141,12 +141,12 @@ def test_a_run_whose_photographs_are_gone_is_still_shown(dev, copied):
     live = LiveRun(dev, copied)
     assert live.refresh() and "/nowhere/at/all" in live.notice
     around = live.surroundings()
-    assert around["views"] == []
-    first = load_run(dev, copied).cameras("train")[0]
-    assert around["camera"] == asking(first)["camera"]
+    cameras = load_run(dev, copied).cameras("train")
+    assert [one["camera"] for one in around["views"]] == [asking(c)["camera"] for c in cameras]
+    assert around["camera"] == around["views"][0]["camera"]
     _, image = drawn(live, around["camera"])
     assert (image < 200).any()
-    with pytest.raises(UserError, match="no training views"):
+    with pytest.raises(UserError, match="no photographs"):
         drawn(live, around["camera"], show="error")
 
 

@@ -8,6 +8,7 @@ over, since they are nearly all of a file.
 import os
 import struct
 import unicodedata
+from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path, PurePosixPath
 from typing import NamedTuple
@@ -61,6 +62,7 @@ MOST_NAME = 1024  # bytes of an image's name
 MOST_LINE = 2**22  # characters of a line: 150,000 2D points
 UNKNOWN = "is no known camera model; undistort with `colmap image_undistorter`, or copy it anew"
 POINT2D_BYTES = 24  # x, y and the id of a 3D point
+TRACK_BYTES = 8  # the ids of an image and of a point in it
 
 
 class Lens(NamedTuple):
@@ -83,7 +85,7 @@ class Image(NamedTuple):
 
 def recognises(folder: Path) -> bool:
     """True if the folder has a model in one of the usual places."""
-    return _model_folder(folder) is not None
+    return model_folder(folder) is not None
 
 
 def splits(folder: Path) -> list[str]:
@@ -97,7 +99,7 @@ def read_split(folder: Path, split: str) -> list[Photograph]:
     An image's mask is masks/NAME.png, as COLMAP has it, or masks/NAME with any ending of an image;
     with a folder of masks, every image needs one. Raises UserError naming the file, and the image.
     """
-    model = _model_folder(folder)
+    model = model_folder(folder)
     lenses, images = read_model(model)
     ordered = sorted(images, key=lambda image: image.name)
     return [
@@ -106,7 +108,8 @@ def read_split(folder: Path, split: str) -> list[Photograph]:
     ]
 
 
-def _model_folder(folder):
+def model_folder(folder: Path) -> Path | None:
+    """Where a scene's model lies; None where it has none."""
     places = (folder / place for place in PLACES)
     return next((place for place in places if _suffix(place)), None)
 
@@ -286,6 +289,19 @@ def _text_images(file):
         yield _image(where, name, camera, numbers)
 
 
+def text_points(file: Path) -> Iterator[tuple[float, ...]]:
+    """Each (x, y, z, red, green, blue) of points3D.txt. Raises UserError naming file and line."""
+    for number, line in _lines(file):
+        if line and not line.startswith("#"):
+            try:
+                _, x, y, z, red, green, blue, *_ = map(float, line.split(maxsplit=8)[:8])
+                yield x, y, z, red, green, blue
+            except ValueError:
+                raise UserError(
+                    f"{file}: line {number}: is not POINT3D_ID X Y Z R G B; copy the file anew"
+                ) from None
+
+
 # Binary -------------------------------------------------------------------------------------------
 
 
@@ -344,3 +360,13 @@ def _binary_images(file):
             (points,) = _take(opened, "Q")
             opened.seek(points * POINT2D_BYTES, os.SEEK_CUR)
             yield _image(f"{file}: image {identity}", name, camera, numbers)
+
+
+def binary_points(file: Path) -> Iterator[tuple[float, ...]]:
+    """Each (x, y, z, red, green, blue) of points3D.bin. Raises UserError naming the file."""
+    with _opened(file) as opened:
+        (count,) = _take(opened, "Q")
+        for _ in range(count):
+            _, *row, _, track = _take(opened, "QdddBBBdQ")
+            opened.seek(track * TRACK_BYTES, os.SEEK_CUR)
+            yield tuple(row)

@@ -1,0 +1,61 @@
+"""What a user has decided about a scene: the object's box and the views to leave out, in a small
+file in its folder that scenes of every format obey.
+"""
+
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from pp_cl.errors import UserError
+from pp_cl.files.atomic import write_json
+from pp_cl.scene.readers.common import checked_box, fail_at, read_json
+
+FILE = "pp_cl.json"
+
+
+class Edits(NamedTuple):
+    """box: (2, 3) lower and upper corner in world units, None where the user has given none.
+    dropped: names of photographs, as a scene lists them.
+    """
+
+    box: np.ndarray | None = None
+    dropped: frozenset[str] = frozenset()
+
+
+def read_edits(folder: Path) -> Edits:
+    """The edits of a scene. Raises UserError naming the file and the key that is wrong."""
+    file = folder / FILE
+    return checked_edits(read_json(file), file) if file.exists() else Edits()
+
+
+def checked_edits(found: object, file: Path) -> Edits:
+    """The Edits that a JSON object {"box": ..., "dropped": ...} holds. Raises UserError naming the
+    file and the key that is wrong.
+    """
+    if not isinstance(found, dict) or not found.keys() <= {"box", "dropped"}:
+        raise fail_at(file)('must be a JSON object with the keys "box" and "dropped"; correct it')
+    corners, dropped = found.get("box"), found.get("dropped", [])
+    if not isinstance(dropped, list) or not all(type(name) is str for name in dropped):
+        raise fail_at(file, "dropped")("must be a list of names of photographs; correct it")
+    return Edits(
+        None if corners is None else checked_box(corners, fail_at(file, "box")), frozenset(dropped)
+    )
+
+
+def write_edits(folder: Path, edits: Edits) -> None:
+    """Write the edits into a scene's folder; none at all remove the file. Raises UserError where
+    that cannot be done.
+    """
+    file, kept = folder / FILE, {}
+    if edits.box is not None:
+        kept["box"] = edits.box.tolist()
+    if edits.dropped:
+        kept["dropped"] = sorted(edits.dropped)
+    if kept:
+        write_json(file, kept)
+        return
+    try:
+        file.unlink(missing_ok=True)
+    except OSError as error:
+        raise UserError(f"{file}: cannot be removed ({error.strerror})") from error

@@ -1,0 +1,91 @@
+"""A drawing of a whole scene from the side and from above: points, cameras as small frusta, and the
+object's box.
+"""
+
+import itertools
+from collections.abc import Sequence
+
+import numpy as np
+from PIL import Image, ImageDraw
+
+from pp_cl.scene.camera import Camera
+from pp_cl.scene.camera_path import up_of
+
+FINER = 2  # times the drawing is larger before it is reduced, each way, against jagged lines
+MARGIN = 0.08  # of a panel's width around what must be in it
+FRUSTUM = 0.12  # depth of a frustum, of the median distance of the cameras from their middle
+CAMERA, BOX, INK = (40, 90, 200), (220, 90, 0), (60, 60, 60)
+MOST_POINTS = 100_000  # drawn
+EDGES = [(a, b) for a, b in itertools.combinations(range(8), 2) if (a ^ b).bit_count() == 1]
+
+
+def overview(
+    cameras: Sequence[Camera],
+    box: np.ndarray | None,
+    points: np.ndarray,
+    colours: np.ndarray,
+    width: int,
+) -> np.ndarray:
+    """uint8 (width // 2, width, 3): the scene from the side and from above, white behind.
+
+    box: (2, 3) in world units, or None. points: (N, 3); colours: (N, 3) uint8. What is far beyond
+    the cameras is cut off.
+    """
+    up, eyes = up_of(cameras), np.stack([camera.eye for camera in cameras])
+    aside = np.cross(cameras[0].pose[:, 2], up)
+    if np.linalg.norm(aside) < 1e-6:  # it looks straight down
+        aside = cameras[0].pose[:, 0] - (cameras[0].pose[:, 0] @ up) * up
+    aside /= np.linalg.norm(aside)
+    corners = np.empty((0, 3)) if box is None else _corners(box)
+    frusta = _frusta(cameras, eyes)
+    step = max(1, len(points) // MOST_POINTS)
+    panels = []
+    for title, down in (("from the side", -up), ("from above", np.cross(aside, up))):
+        axes, side = np.stack([aside, down], axis=1), FINER * (width // 2)
+        shown = np.concatenate([frusta.reshape(-1, 3), corners]) @ axes
+        low, high = shown.min(0), shown.max(0)
+        scale = side * (1 - 2 * MARGIN) / max(float((high - low).max()), 1e-30)
+        offset = side / 2 - scale * (low + high) / 2
+
+        def place(positions, axes=axes, scale=scale, offset=offset):
+            return scale * (positions @ axes) + offset
+
+        image = _dots(place(points[::step]), colours[::step], side)
+        draw = ImageDraw.Draw(image)
+        for frustum in place(frusta):
+            eye, *ends = map(tuple, frustum)
+            for i, end in enumerate(ends):
+                draw.line([eye, end, ends[(i + 1) % 4]], CAMERA, FINER)
+        lines = place(corners)
+        for a, b in EDGES if len(corners) else ():
+            draw.line([tuple(lines[a]), tuple(lines[b])], BOX, 2 * FINER)
+        image = image.resize((width // 2, width // 2), Image.Resampling.BOX)
+        ImageDraw.Draw(image).text((4, 2), title, fill=INK)
+        panels.append(np.array(image))
+    return np.concatenate(panels, axis=1)
+
+
+def _corners(box):
+    """(8, 3): bit i of a row's number says whether it lies on the upper side of axis i."""
+    return np.array([[box[n >> axis & 1][axis] for axis in range(3)] for n in range(8)])
+
+
+def _frusta(cameras, eyes):
+    """(V, 5, 3): eye and image corners of each camera."""
+    size = FRUSTUM * (np.median(np.linalg.norm(eyes - eyes.mean(0), axis=1)) or 1.0)
+    found = []
+    for c in cameras:
+        wide, high = np.array([0, c.width, c.width, 0]), np.array([0, 0, c.height, c.height])
+        rays = np.stack([(wide - c.cx) / c.fx, (high - c.cy) / c.fy, np.ones(4)], axis=1)
+        found.append(np.concatenate([[c.eye], c.eye + size * rays @ c.pose[:, :3].T]))
+    return np.array(found)
+
+
+def _dots(places, colours, side):
+    """Image of FINER x FINER pixels for every place, (N, 2), inside of it."""
+    image = np.full((side, side, 3), 255, np.uint8)
+    for dx, dy in itertools.product(range(FINER), repeat=2):
+        x, y = np.floor(places).T + [[dx], [dy]]
+        inside = (x >= 0) & (x < side) & (y >= 0) & (y < side)
+        image[y[inside].astype(int), x[inside].astype(int)] = colours[inside]
+    return Image.fromarray(image)

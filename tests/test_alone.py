@@ -1,0 +1,95 @@
+"""A run folder by itself: what works without the scene, and on another machine."""
+
+import asyncio
+import json
+import shutil
+
+import pytest
+from support.runs import arguments, spoken
+from support.scenes import write_ball_scene
+from support.viewing import asking, served
+
+from pp_cl.cli import main
+from pp_cl.files.image import read_rgba
+from pp_cl.scene.outline import OUTLINE
+
+
+@pytest.fixture(scope="module")
+def alone(tmp_path_factory):
+    """Folder of a finished run that was sent without its scene."""
+    folder = tmp_path_factory.mktemp("alone")
+    scene = write_ball_scene(folder / "here" / "ball")
+    assert main(arguments(scene, folder / "here" / "run", train__iterations=80)) == 0
+    shutil.move(folder / "here" / "run", folder / "run")
+    shutil.rmtree(folder / "here")
+    return folder / "run"
+
+
+@pytest.mark.parametrize("kind", ["ply", "glb", "mesh", "html", "scene"])
+def test_a_run_alone_is_exported(alone, kind, tmp_path):
+    out = tmp_path / f"out{'.ply' if kind == 'mesh' else '' if kind == 'scene' else '.' + kind}"
+    assert main(["export", str(alone), "--format", kind, "--out", str(out)]) == 0
+    assert out.is_dir() == (kind == "scene")
+    if kind == "scene":
+        frames = json.loads((out / "transforms_train.json").read_text())["frames"]
+        assert len(frames) == 8 and len(list((out / "train").iterdir())) == 8
+
+
+def test_a_run_alone_is_rendered_from_where_it_was_photographed(alone, tmp_path):
+    for path in ("orbit", "train"):
+        words = ["render", alone, "--path", path, "--out", tmp_path / path, "--seconds", "0.1"]
+        assert spoken(words[:6] if path == "train" else words)[0] == 0
+    assert len(list((tmp_path / "train").glob("*.png"))) == 8
+
+
+def test_a_run_alone_says_what_is_in_it(alone, tmp_path, capsys):
+    picture = tmp_path / "points.png"
+    assert main(["info", str(alone), "--picture", str(picture), "--json"]) == 0
+    found = json.loads(capsys.readouterr().out)
+    assert found["grid"]["edge_pixels"] > 0 and not found["scene_is_there"]
+    assert found["views"] == {"count": 8, "images": {"48x48": 8}}
+    assert found["files"]["checkpoint.npz"] == (alone / "checkpoint.npz").stat().st_size
+    assert sum(found["files"].values()) == sum(
+        file.stat().st_size for file in alone.rglob("*") if file.is_file() and file.name[0] != "."
+    )
+    image = read_rgba(picture)[..., :3]
+    drawn = (image == OUTLINE).all(-1)
+    assert drawn.any() and image[~drawn].std() > 20, "the outline lies over renderings"
+    assert main(["info", str(alone)]) == 0
+    text = capsys.readouterr().out
+    assert "8 of 48x48" in text and "not there" in text
+
+
+def test_a_run_alone_is_compressed_by_what_it_rendered(alone, tmp_path):
+    out = tmp_path / "small"
+    assert main(["compress", str(alone), "--max-loss", "1", "--out", str(out)]) == 0
+    report = json.loads((out / "compress.json").read_text())
+    assert report["bytes"][1] < 0.8 * report["bytes"][0]
+    rows = [json.loads(line) for line in (alone / "log.jsonl").read_text().splitlines()]
+    logged = [row["psnr"] for row in rows if "psnr" in row][-1]
+    assert report["psnr"] == pytest.approx(logged, abs=0.05)
+    losses = [trial["loss"] for trial in report["trials"] if trial["taken"]]
+    assert losses[-1] == report["loss"] <= 1 and max(losses) > 0.05
+    assert spoken(["info", out])[0] == 0
+
+
+def test_a_run_alone_is_viewed_with_its_cameras(dev, alone):
+    async def scenario():
+        async with served(dev, alone) as here, here.tab() as socket:
+            client = await here.ready(socket)
+            around = client.last["surroundings"]
+            assert [view["name"] for view in around["views"]] == [
+                f"train/r_{i}.png" for i in range(8)
+            ]
+            _, image = await client.ask(around["views"][3]["camera"])
+            assert (image < 200).any()
+            await socket.send_str(json.dumps(asking(around["camera"], show="photograph")))
+            assert "ball" in (await client.receive("refused"))["line"]
+
+    asyncio.run(scenario())
+
+
+@pytest.mark.parametrize("words", [["eval"], ["render", "--path", "test"]])
+def test_what_needs_photographs_says_so_in_one_line(alone, words):
+    status, lines = spoken([words[0], alone, *words[1:]])
+    assert status == 2 and len(lines) == 1 and "ball" in lines[0] and "--scene" in lines[0]
