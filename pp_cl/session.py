@@ -196,6 +196,7 @@ class Training:
     def _save(self, finished):
         trainer = self.trainer
         header = trainer.model.header() | self.info | {"step": trainer.step, "finished": finished}
+        header |= {"exposed": True} if trainer.is_exposed else {}
         self.folder.save(header, trainer.model.arrays() if finished else trainer.arrays())
         self._expect_save()
         self._saved = trainer.step
