@@ -24,7 +24,7 @@ from pp_cl.files.image import to_8bit, write_png
 from pp_cl.files.picture import Picture, mean_picture
 from pp_cl.files.run_folder import RunFolder
 from pp_cl.layers.choice import ConvolutionPolicy, load_policy
-from pp_cl.metrics.psnr_ssim import Metrics, mean
+from pp_cl.metrics.psnr_ssim import Metrics, exposed_alike, mean
 from pp_cl.metrics.published import differences, published_rows
 from pp_cl.model import Model
 from pp_cl.network.unet import UNet
@@ -235,13 +235,14 @@ MARK = ".evaluation"  # file in a folder that evaluations may replace
 class Rendered(NamedTuple):
     """A view as the run renders it.
 
-    image, truth: (H, W, 3) float32 in [0, 1]. computed: fraction of the network's multiplications
-    that were computed; the others would have seen background alone.
+    image, truth: (H, W, 3) float32 in [0, 1]. alpha: (H, W) of the truth. computed: fraction of the
+    network's multiplications that were computed; the others would have seen background alone.
     """
 
     name: str
     image: np.ndarray
     truth: np.ndarray
+    alpha: np.ndarray
     seconds: float
     computed: float
 
@@ -275,7 +276,8 @@ def evaluate(
     on_view: Callable[[int, int], None] = lambda _measured, _views: None,
 ) -> dict[str, Any]:
     """Measure a run; writes metrics.json and comparison.png into the folder `out`, if not given
-    RUN/eval, or RUN/eval/SPLIT for other splits than test, and returns the former.
+    RUN/eval, or RUN/eval/SPLIT for other splits than test, and returns the former. Where the
+    run's photographs had gains, views are also measured after the best ones, exposed_alike().
 
     metrics: names out of psnr, ssim, lpips. save_images: write every view to images/ there, in
     place of what an earlier evaluation left. published: put published results beside also where
@@ -299,6 +301,9 @@ def evaluate(
     for i, rendered in enumerate(render_views(run, views)):
         image, truth = rendered.image, rendered.truth
         rows.append({"name": rendered.name} | measure(image, truth))
+        if "exposed" in run.header:
+            matched = exposed_alike(truth, image, rendered.alpha)
+            rows[-1]["after_gains"] = measure(image, matched)
         costs.append((rendered.seconds, rendered.computed))
         if i in {len(views) * row // SHOWN_VIEWS for row in range(SHOWN_VIEWS)}:
             shown.append((image, truth))
@@ -309,6 +314,8 @@ def evaluate(
         on_view(i + 1, len(views))
     means = mean([{name: row[name] for name in metrics} for row in rows])
     result = {"split": split, "device": run.dev.name, "mean": means, "per_image": rows}
+    if "exposed" in run.header:
+        result["mean_after_gains"] = mean([row["after_gains"] for row in rows])
     result |= _about(run, costs) | _published(scene, split, views, anyway=published)
     write_json(target / "metrics.json", result)
     write_comparison(target / "comparison.png", *zip(*shown, strict=True))
@@ -377,4 +384,5 @@ def render_views(run: Run, views: list[View]) -> Iterator[Rendered]:
         seconds = time.perf_counter() - start
         target.load(view)
         truth = target.whole()
-        yield Rendered(view.name, image, truth, seconds, result.computed_fraction)
+        alpha = target.alpha((0, 0, view.camera.width, view.camera.height)).get()
+        yield Rendered(view.name, image, truth, alpha, seconds, result.computed_fraction)

@@ -202,6 +202,7 @@ class Training:
     def _save(self, finished):
         trainer = self.trainer
         header = trainer.model.header() | self.info | {"step": trainer.step, "finished": finished}
+        header |= {"exposed": True} if trainer.is_exposed else {}
         config = self.config
         is_whole = finished and bound_to_end(config.network, config.raster, config.train)
         self.folder.save(header, trainer.model.arrays() if is_whole else trainer.arrays())

@@ -146,6 +146,12 @@ class TrainConfig:
     )
     ssim_weight: float = setting(0.2, "loss = smooth L1 + ssim_weight * (1 - SSIM)", 0, 10)
     smooth_l1: float = setting(0.05, "errors below this count by their square (0: L1)", 0, 1)
+    exposure: str = setting(
+        "auto",
+        "find a gain for each view and channel, as photographs differ in exposure; auto: where"
+        " that explains a quarter of the error",
+        choices=("auto", "on", "off"),
+    )
     mask_weight: float = setting(
         0.5,
         "mask term of the loss: mean square of rendered alpha minus mask; where alpha is too"

@@ -2,6 +2,8 @@
 smoothing, EMA, pruning and refining where they are due. session.py has the loop around it.
 """
 
+import warnings
+
 import numpy as np
 
 from pp_cl.config import Config
@@ -15,6 +17,7 @@ from pp_cl.raster.weights import record_weights
 from pp_cl.render import NETWORK_MULTIPLE, Renderer
 from pp_cl.scene.target import Target
 from pp_cl.scene.views import View
+from pp_cl.training.exposure import LEAST_SHARE, Exposure, decided_at
 from pp_cl.training.loss import Loss, MaskLoss
 from pp_cl.training.optim import Optimiser
 from pp_cl.training.perceptual import PerceptualLoss
@@ -56,6 +59,9 @@ class Trainer:
         self.renderer = Renderer(dev, model, config.raster)
         self.loss = Loss(dev, self.config.ssim_weight, self.config.smooth_l1)
         self.mask_loss = MaskLoss(dev, self.config.mask_weight)
+        self.exposure = None
+        if self.config.exposure != "off":
+            self.exposure = Exposure(dev, len(views), self.config.exposure == "on")
         self.perceptual_loss = None
         if weight := self.config.perceptual_weight:
             self.perceptual_loss = PerceptualLoss(dev, weight, model.net.policy)
@@ -71,6 +77,11 @@ class Trainer:
     def refinements_to_come(self) -> int:
         """How often the grid will still be refined."""
         return sum(self.step < step for step in self._refine_steps)
+
+    @property
+    def is_exposed(self) -> bool:
+        """Whether photographs are divided by gains."""
+        return self.exposure is not None and self.exposure.is_applied
 
     def _set_level(self):
         """Set images, crop size and object boxes for the present level of the grid: the images are
@@ -96,8 +107,11 @@ class Trainer:
         camera = view.crop_camera(box, jitter)
         with self.dev.stage("target"):
             self._target.load(view)
-            target = self._target.crop(box, jitter)
-            target_alpha = self._target.alpha(box, jitter) if view.has_mask else None
+            target = photograph = self._target.crop(box, jitter)
+            is_masked = view.has_mask or self.exposure
+            target_alpha = self._target.alpha(box, jitter) if is_masked else None
+            if self.is_exposed:
+                target = self.exposure.target(view_index, photograph, target_alpha)
             tiles_of_gradient = self._gradient_tiles(target, camera)
 
         rendered = self.renderer.forward(
@@ -109,7 +123,12 @@ class Trainer:
             gradient_tiles=tiles_of_gradient,
         )
         with self.dev.stage("loss"):
-            grad_image, grad_alpha, spread_weight = self._losses(rendered, target, target_alpha)
+            mask = target_alpha if view.has_mask else None
+            grad_image, grad_alpha, spread_weight = self._losses(rendered, target, mask)
+            if self.exposure:
+                self.exposure.fit(
+                    view_index, rendered.image, photograph, target_alpha, rendered.offset
+                )
         grad_point_features, grad_opacity = self.renderer.backward(
             rendered, grad_image, grad_alpha, spread_weight
         )
@@ -212,6 +231,8 @@ class Trainer:
         step.
         """
         config, t = self.config, self.step
+        if self.exposure and t == decided_at(self.begun, len(self.views)) and not self.is_exposed:
+            self._decide_exposure()
         if config.sh_smoothing > 0 and t % config.sh_smoothing_every == 0:
             with self.dev.stage("smoothing"):
                 self._smooth(rates)
@@ -224,6 +245,19 @@ class Trainer:
                 self.prune()
         if t in self._refine_steps:
             self._refine()
+
+    def _decide_exposure(self):
+        """Apply the gains from now on, or forget them."""
+        share = self.exposure.explained()
+        if share > LEAST_SHARE:
+            self.exposure.is_applied = True
+            warnings.warn(
+                f"the photographs differ in exposure or white balance ({share:.0%} of their error);"
+                " a gain of each view and channel is found beside the model (train.exposure)",
+                stacklevel=2,
+            )
+        else:
+            self.exposure = None
 
     def _smooth(self, rates):
         """Pull every SH coefficient towards the mean of its grid neighbours."""
@@ -300,7 +334,8 @@ class Trainer:
         as check().
         """
         self.check()
-        return self.model.arrays() | self.optimiser.arrays()
+        exposure = {"exposure": DeviceRows(self.dev, self.exposure.state)} if self.exposure else {}
+        return self.model.arrays() | self.optimiser.arrays() | exposure
 
     def restore(self, step: int, arrays: dict[str, np.ndarray], begun: int) -> None:
         """Resume after `step` steps with the training state of a checkpoint, which is taken out of
@@ -311,6 +346,11 @@ class Trainer:
         self._set_level()
         if arrays:
             self.optimiser.restore(arrays)
+            if "exposure" not in arrays:
+                self.exposure = None
+            else:
+                self.dev.write(self.exposure.state, arrays.pop("exposure"))
+                self.exposure.is_applied |= step >= decided_at(begun, len(self.views))
         elif self.config.ema and step >= ema_start(self.config.iterations):
             self.optimiser.update_ema(1.0)
 

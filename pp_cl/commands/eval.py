@@ -6,6 +6,7 @@ from pathlib import Path
 from pp_cl.commands import options as shared
 
 HELP = "render a run's views and measure them"
+AFTER_GAINS = "after the views' best gains"
 OTHER_LPIPS = "lpips_alex"
 
 
@@ -66,6 +67,8 @@ def run(options: argparse.Namespace) -> None:
     state = "" if result["finished"] else f", unfinished, step {result['step']}"
     own = f"{folder} ({len(result['per_image'])} views{state})"
     ranked = [(own, result["mean"]), *result["published"].items()]
+    if "mean_after_gains" in result:
+        ranked.append((AFTER_GAINS, result["mean_after_gains"]))
     if "psnr" in metrics:
         ranked.sort(key=lambda row: -row[1]["psnr"])
     if figure:

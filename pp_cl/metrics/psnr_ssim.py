@@ -48,6 +48,19 @@ def ssim(a: np.ndarray, b: np.ndarray) -> float:
     )
 
 
+def exposed_alike(truth: np.ndarray, prediction: np.ndarray, alpha: np.ndarray) -> np.ndarray:
+    """(H, W, 3) the truth, the object in it divided by the gain of each channel that brings the
+    prediction nearest to it: as the photograph would be at the exposure that was learned.
+
+    truth, prediction: (H, W, 3) in [0, 1], over white. alpha: (H, W) of the truth.
+    """
+    white = 1 - alpha[..., None].astype(np.float64)
+    p, t = prediction - white, truth - white
+    weighted = alpha[..., None] * p
+    gains = (weighted * t).sum((0, 1)) / np.maximum((weighted * p).sum((0, 1)), 1e-12)
+    return np.clip(t / np.maximum(gains, 1e-3) + white, 0, 1)
+
+
 class Metrics:
     """The named metrics of image pairs. names: out of psnr, ssim, lpips; only lpips needs dev.
     policy: whose blocking the convolutions of lpips take, None = as shipped. Their variants are

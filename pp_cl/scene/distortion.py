@@ -13,13 +13,17 @@ PROBED = 65  # places along each axis
 
 @dataclass(frozen=True)
 class Distortion:
-    """Coefficients of OpenCV's model, radial (k1, k2, k3) and tangential (p1, p2)."""
+    """Coefficients of OpenCV's models: radial (k1, k2, k3) and tangential (p1, p2) of a perspective
+    lens, k1 to k4 of a fisheye.
+    """
 
     k1: float = 0.0
     k2: float = 0.0
     p1: float = 0.0
     p2: float = 0.0
     k3: float = 0.0
+    k4: float = 0.0
+    fisheye: bool = False
 
     def __bool__(self) -> bool:
         """Whether it changes anything."""
@@ -27,6 +31,12 @@ class Distortion:
 
     def apply(self, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Where the lens puts the points (x / z, y / z) of the camera's axes, float64 arrays."""
+        if self.fisheye:
+            r = np.maximum(np.hypot(x, y), 1e-30)
+            t = np.arctan(r)
+            t2 = t * t
+            polynomial = 1 + t2 * (self.k1 + t2 * (self.k2 + t2 * (self.k3 + t2 * self.k4)))
+            return x * t / r * polynomial, y * t / r * polynomial
         xx, yy, xy = x * x, y * y, x * y
         r2 = xx + yy
         radial = 1 + r2 * (self.k1 + r2 * (self.k2 + r2 * self.k3))

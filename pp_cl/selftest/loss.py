@@ -10,6 +10,7 @@ from pp_cl.layers.choice import make_policy
 from pp_cl.reference import loss as reference_loss
 from pp_cl.reference.lpips import lpips, lpips_gradient, random_weights
 from pp_cl.selftest.case import EPS, SIZES, Case, Check, absolute, each, exact, relative
+from pp_cl.training.exposure import KEPT, PRIOR, Exposure
 from pp_cl.training.loss import FURTHER, Loss, MaskLoss
 from pp_cl.training.perceptual import PerceptualLoss
 
@@ -136,6 +137,35 @@ def _spread(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
         yield absolute(spread.get(), expected, 64 * EPS)  # of up to 28 products below 1, twice
 
 
+def _exposure(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
+    """The gains of three views, of which one is seen twice and one never, and photographs that are
+    divided by them.
+    """
+    known, left, top = np.zeros((3, 3, 3)), 3, 1
+    exposure = Exposure(dev, 3, is_applied=True)
+    for view, side in zip((0, 2, 0), (1, 33, 257), strict=True):
+        alpha = rng.random((side, 29))
+        prediction = rng.random((side + 3, 36, 3))
+        inside = prediction[top : top + side, left : left + 29] - (1 - alpha[..., None])
+        photograph = rng.uniform(0.5, 1.5, 3) * inside + (1 - alpha[..., None])
+        images = [dev.upload(image, np.float32) for image in (prediction, photograph, alpha)]
+        target = exposure.target(view, *images[1:]).get()
+        gains = exposure.state.get()[:, :, 3].astype(np.float64)
+        expected = (photograph - (1 - alpha[..., None])) / gains[view] + (1 - alpha[..., None])
+        yield relative(target, expected, 8 * EPS)
+        exposure.fit(view, *images, (left, top))
+        weighted = alpha[..., None] * inside
+        shown = photograph - 1 + alpha[..., None]
+        sums = [(weighted * shown).sum((0, 1)), (weighted * inside).sum((0, 1))]
+        sums.append((alpha[..., None] * shown**2).sum((0, 1)))
+        known[view] = KEPT * known[view] + np.stack(sums, axis=1)
+        pull = PRIOR * alpha.size
+        gains = (known[..., 0] + pull) / (known[..., 1] + pull)
+        gains /= np.exp(np.log(gains).mean(axis=0))
+        yield relative(exposure.state.get()[..., :3], known, 16 * EPS)
+        yield each(exposure.state.get()[..., 3], gains, 32 * EPS)
+
+
 def _perceptual_loss(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
     weights = random_weights(np.random.default_rng(5))
     for size in ((16, 16), (17, 33)):
@@ -155,6 +185,7 @@ CASES = (
     Case("loss: flat and equal images", _hard_loss),
     Case("loss: mask", _mask_loss),
     Case("loss: spread", _spread),
+    Case("loss: exposure", _exposure),
     Case("loss: sum of its terms", _sum_of_terms),
     Case("loss: perceptual", _perceptual_loss),
 )

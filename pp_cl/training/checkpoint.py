@@ -18,6 +18,7 @@ from pp_cl.layers.choice import check_form
 from pp_cl.network.layers import parameter_table, unet_layers
 from pp_cl.raster.points import SH_DEGREES, sh_blocks
 from pp_cl.scene.identity import DIGITS, kept_views
+from pp_cl.training.exposure import decided_at
 from pp_cl.training.schedule import bound_to_end, ema_start
 from pp_cl.training.state import PointState
 
@@ -26,7 +27,7 @@ LEAST_LENGTH, MOST_LENGTH = 1e-30, 1e30  # world units; float32 would hold no pr
 LEAST_SHARE = 1e-6  # of far, between it and near: float32 would hold them as one
 MOST_TEXT = 1000
 DIGEST = re.compile(f"[0-9a-f]{{{DIGITS}}}")
-OPTIONAL = {"format", "tuning", "extended_from"}  # keys of a header
+OPTIONAL = {"format", "tuning", "extended_from", "exposed"}  # keys of a header
 GRID = ("origin", "edge", "dims")
 
 
@@ -73,6 +74,8 @@ class StoredRun:
                 lambda x: type(x) is int and 1 <= x <= header["step"],  # which is checked before
                 "a step that is done",
             )
+        if "exposed" in header:
+            rules["exposed"] = (lambda x: x is True, "true")
         for key, (is_right, expected) in rules.items():
             if not is_right(header[key]):
                 self._refuse(f"{key} in its header is {quoted(header[key])}, expected {expected}")
@@ -99,7 +102,8 @@ class StoredRun:
         ends = header["finished"] and bound_to_end(config.network, config.raster, config.train)
         is_bare = ends or (header["finished"] and "state.last_step" not in self.forms)
         step = None if is_bare else header["step"]
-        expected = stored_forms(config, n, step, half and header["finished"])
+        gains = 0 if step is None else _views_with_gains(header, config)
+        expected = stored_forms(config, n, step, half and header["finished"], gains)
         for name in sorted(expected.keys() | self.forms.keys()):
             found, wanted = self.forms.get(name), expected.get(name)
             if wanted is None:
@@ -127,9 +131,21 @@ def load_run_state(
         return stored.header, stored.arrays()
 
 
-def stored_forms(config: Config, n: int, step: int | None, half: bool = False) -> dict[str, Form]:
+def _views_with_gains(header, config):
+    """How many views have gains in the checkpoint of an unfinished training, which are kept until
+    it is decided that it needs none.
+    """
+    views, begun = len(header["views"]), header.get("extended_from", 0)
+    is_open = config.train.exposure != "off" and header["step"] < decided_at(begun, views)
+    return views if is_open or "exposed" in header else 0
+
+
+def stored_forms(
+    config: Config, n: int, step: int | None, half: bool = False, gains: int = 0
+) -> dict[str, Form]:
     """{name: Form} of the arrays that a checkpoint holds after `step` steps, None: of a finished
     training, with n points left. half: with coefficients of 16 bits, as a compressed run has them.
+    gains: the views that have them.
     """
     degree, colours = config.points.sh_degree, np.float16 if half else np.float32
     settings = config.network
@@ -140,6 +156,8 @@ def stored_forms(config: Config, n: int, step: int | None, half: bool = False) -
     table |= {f"net.{name}": row for name, row in network.items()}
     if step is not None:
         table |= _training_state(config, n, step, network)
+    if gains:
+        table["exposure"] = ((gains, 3, 4), np.float32)
     return {name: Form(tuple(shape), np.dtype(dtype)) for name, (shape, dtype) in table.items()}
 
 
@@ -235,6 +253,8 @@ def _array_rule(name: str, header: dict[str, Any]) -> Rule | None:
         return lambda a: a.min() >= 0 and a.max() <= 1, "opacities from 0 to 1"
     if name == "state.last_step":
         return lambda a: a.max() <= header["step"], "steps that are done"
+    if name == "exposure":
+        return lambda a: a[..., 1:3].min() >= 0 and a[..., 3].min() > 0, "gains above 0"
     if name in ("state.max_weight", "state.times_seen") or name.startswith(
         ("state.v.", "moment.v.")
     ):

@@ -22,6 +22,7 @@ from pp_cl.render import NETWORK_MULTIPLE, Renderer, point_radius
 from pp_cl.scene.grid import Grid
 from pp_cl.scene.load import DEMO, mask_rule, reading
 from pp_cl.scene.views import Photograph, kept_bytes, shrink_factor
+from pp_cl.training.exposure import Exposure
 from pp_cl.training.loss import Loss, MaskLoss, lanes_of_loss
 from pp_cl.training.optim import Optimiser
 from pp_cl.training.perceptual import PerceptualLoss
@@ -290,6 +291,9 @@ class Room:
             tables["smoothing (estimate)"] = Smoother.table(n, chunk)
         if train.mask_weight > 0:
             tables["mask loss"] = MaskLoss.table(*crop)
+        if train.exposure != "off":
+            state = {"state": ((len(self._photographs), 3, 4), np.float32)}
+            tables["exposure"] = Exposure.table(height, width) | state
         if train.perceptual_weight > 0:
             tables["perceptual loss"] = PerceptualLoss.table(target)
             tables["network of LPIPS"] = Lpips.table(net.dev, net.policy, target[:2])

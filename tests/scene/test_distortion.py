@@ -1,4 +1,4 @@
-"""Lens distortion: OpenCV's formula by hand, and images that were distorted come back."""
+"""Lens distortion: OpenCV's formulas by hand, and images that were distorted come back."""
 
 import json
 
@@ -18,6 +18,8 @@ LENSES = {
     "pincushion": Distortion(k1=0.15),
     "tangential": Distortion(p1=0.01, p2=-0.008),
     "all": Distortion(-0.15, 0.04, 0.004, -0.003, 0.01),
+    "fisheye": Distortion(fisheye=True),
+    "bent fisheye": Distortion(k1=0.04, k2=-0.02, k3=0.01, k4=-0.004, fisheye=True),
 }
 
 
@@ -27,6 +29,20 @@ def test_the_formula_by_hand():
     radial = 1 + 0.1 * 0.13 + 0.01 * 0.13**2 + 0.5 * 0.13**3
     assert x == pytest.approx(0.3 * radial + 2 * 0.002 * -0.06 - 0.003 * (0.13 + 2 * 0.09))
     assert y == pytest.approx(-0.2 * radial + 0.002 * (0.13 + 2 * 0.04) + 2 * -0.003 * -0.06)
+
+
+def test_a_fisheye_by_hand_and_by_opencv(rng):
+    """A direction t radians off the axis lies t + k1 t^3 + ... + k4 t^9 focal lengths off the
+    centre.
+    """
+    lens, turn = LENSES["bent fisheye"], np.array([np.cos(0.7), np.sin(0.7)])
+    for t in (0, 0.3, 1.2):
+        expected = t + 0.04 * t**3 - 0.02 * t**5 + 0.01 * t**7 - 0.004 * t**9
+        assert lens.apply(*(np.tan(t) * turn)) == pytest.approx(expected * turn, abs=1e-14)
+    cv2 = pytest.importorskip("cv2")
+    points = rng.normal(0, 1, (1, 50, 2))
+    expected = cv2.fisheye.distortPoints(points, np.eye(3), np.array([0.04, -0.02, 0.01, -0.004]))
+    np.testing.assert_allclose(np.stack(lens.apply(*points[0].T), 1), expected[0], atol=1e-12)
 
 
 def test_without_coefficients_nothing_changes(rng):

@@ -46,6 +46,8 @@ FLIPS = [
     ("layers/tiles", "line[i] != background", "line[i] == background", "layers: tiles"),
     ("training/loss", "* slope + slope_0", "* slope - slope_0", "loss: L1 and SSIM"),
     ("training/mask", "1.0f - transmittance", "1.0f + transmittance", "loss: mask"),
+    ("training/exposure", "+ prior) / (known.y", "- prior) / (known.y", "loss: exposure"),
+    ("training/exposure", "gain + white", "gain - white", "loss: exposure"),
     ("training/loss", "weights - depths", "weights + depths", "loss: spread"),
     ("training/loss", "terms[0] += weight", "terms[0] -= weight", "loss: sum of its terms"),
     ("training/perceptual", "= of_row /", "= -of_row /", "loss: perceptual"),

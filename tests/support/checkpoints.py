@@ -13,6 +13,7 @@ from pp_cl.files.checkpoint import save_checkpoint
 from pp_cl.scene.demo import demo_frames
 from pp_cl.scene.identity import packed_camera
 from pp_cl.training.checkpoint import load_run_state, stored_forms
+from pp_cl.training.exposure import decided_at
 
 POINTS, STEP, STEPS = 40, 50, 60
 HEADER = {
@@ -49,7 +50,9 @@ def contents(config, step=STEP, n=POINTS):
     """(header, {name: array}) that a run could have after `step` steps."""
     rng, arrays = np.random.default_rng(5), {}
     finished = step == config.train.iterations
-    for name, form in stored_forms(config, n, None if finished else step).items():
+    views = len(HEADER["views"])
+    gains = 0 if finished or step >= decided_at(0, views) else views
+    for name, form in stored_forms(config, n, None if finished else step, gains=gains).items():
         arrays[name] = rng.random(form.shape).astype(form.dtype)
     arrays["points.ids"] = np.sort(rng.choice(9 * 8 * 7, n, replace=False)).astype(np.uint32)
     if "state.last_step" in arrays:

@@ -33,6 +33,7 @@ from pp_cl.files.checkpoint import load_checkpoint, save_checkpoint
 from pp_cl.files.run_folder import RunFolder
 from pp_cl.run import load_run
 from pp_cl.training.checkpoint import load_run_state, opened_run, stored_forms
+from pp_cl.training.exposure import decided_at
 from pp_cl.view.live_run import LiveRun
 from pp_cl.view.messages import read_request
 
@@ -88,9 +89,10 @@ def test_what_fits_is_read_as_it_was_written(folder, config, step):
     [
         (10, {}),
         (53, {}),  # the averages have begun
-        (53, {"train__ema": "false"}),
+        (53, {"train__ema": "false", "train__exposure": "off"}),
         (53, {"points__sh_degree": 0, "network__blocks": "gated"}),
         (10, {"points__sh_degree": 1, "network__widths": "16,24,40"}),
+        (30, {}),  # gains are not yet decided on
         (53, {"train__refine_at": "0.5,1", "downscale": 1}),
     ],
 )
@@ -99,8 +101,10 @@ def test_a_training_writes_what_is_expected(scene, tmp_path, monkeypatch, every,
     changes = {"points__count": 300, "train__checkpoint_every": every, **changes}
     train_and_interrupt(scene, folder.path, 58, monkeypatch, **changes)
     header, arrays = load_checkpoint(folder.checkpoint)
-    assert header["step"] == (50 if every == 10 else 53)
-    expected = stored_forms(load_config(folder.config), len(arrays["points.ids"]), header["step"])
+    assert header["step"] == {10: 50, 53: 53, 30: 30}[every]
+    config, n = load_config(folder.config), len(arrays["points.ids"])
+    undecided = config.train.exposure == "auto" and header["step"] < decided_at(0, 8)
+    expected = stored_forms(config, n, header["step"], gains=8 if undecided else 0)
     assert {name: (a.shape, a.dtype) for name, a in arrays.items()} == expected
     load_run_state(folder, load_config(folder.config))
 

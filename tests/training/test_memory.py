@@ -29,7 +29,7 @@ SMOOTHED = {"train.sh_smoothing_every": "4"}  # so that the last few of 30 steps
 WAYS = [
     {},
     {"raster.early_stop": "0"},
-    {"train.ema": "false", "train.sh_smoothing": "0"},
+    {"train.ema": "false", "train.sh_smoothing": "0", "train.exposure": "off"},
     {"points.sh_degree": "1"},
     # discs of 1.5 spacings
     {"raster.footprint": "disc", "raster.radius": "0.09"},

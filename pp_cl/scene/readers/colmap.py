@@ -56,6 +56,12 @@ MODELS = {
     "FISHEYE": 4,
     "EUCM": 6,
 }
+# those that are read: with one focal length, with two
+ONE_FOCAL = (
+    *("SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL"),
+    *("SIMPLE_FISHEYE", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE"),
+)
+TWO_FOCALS = ("PINHOLE", "OPENCV", "FISHEYE", "OPENCV_FISHEYE")
 MOST_PIXELS = 2**20  # a side; beyond it a number is no size
 MOST_ENTRIES = 2**17  # of a file, cameras or images
 MOST_NAME = 1024  # bytes of an image's name
@@ -142,22 +148,17 @@ def _photograph(folder, model, image, lens):
 
 def _intrinsics(folder, model, lens):
     """(fx, fy, cx, cy, Distortion). Raises UserError for a model that is not one of OpenCV's."""
-    p = lens.parameters
-    if lens.model == "SIMPLE_PINHOLE":
-        found = p[0], p[0], p[1], p[2], Distortion()
-    elif lens.model == "PINHOLE":
-        found = *p, Distortion()
-    elif lens.model in ("SIMPLE_RADIAL", "RADIAL"):
-        found = p[0], p[0], p[1], p[2], Distortion(*p[3:])
-    elif lens.model == "OPENCV":
-        found = *p[:4], Distortion(*p[4:])
-    else:
+    if lens.model not in ONE_FOCAL + TWO_FOCALS:
         raise UserError(
             f"{model}: camera model {lens.model} is not read; convert with `colmap"
             f" image_undistorter --image_path {folder / IMAGES} --input_path {model} --output_path"
             " NEW` and give NEW"
         )
-    return found
+    p = lens.parameters if lens.model in TWO_FOCALS else (lens.parameters[0], *lens.parameters)
+    is_fisheye = lens.model.endswith("FISHEYE")
+    names = ("k1", "k2", "k3", "k4") if is_fisheye else ("k1", "k2", "p1", "p2")
+    coefficients = dict(zip(names, p[4:], strict=False))
+    return *p[:4], Distortion(**coefficients, fisheye=is_fisheye)
 
 
 # The model ----------------------------------------------------------------------------------------

@@ -15,15 +15,16 @@ from pp_cl.scene.camera import Camera
 from pp_cl.scene.distortion import Distortion
 from pp_cl.scene.readers.common import MOST, Fail, find_image
 
-COEFFICIENTS = ("k1", "k2", "p1", "p2", "k3")  # of Distortion
-# values of camera_model that are pinhole cameras when those coefficients are 0
+# values of camera_model: perspective lenses, and fisheyes
 PINHOLES = ("PERSPECTIVE", "PINHOLE", "SIMPLE_PINHOLE", "OPENCV", "SIMPLE_RADIAL", "RADIAL")
-# keys by which nerfstudio and instant-ngp name lenses, and the values that are perspective; null,
+FISHEYES = ("OPENCV_FISHEYE", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE")
+# keys by which nerfstudio and instant-ngp name lenses, and the values that are modelled; null,
 # false and 0 are too
 LENS_KEYS = {
-    "camera_model": PINHOLES,
+    "camera_model": PINHOLES + FISHEYES,
     "camera_type": ("PERSPECTIVE",),
-    **dict.fromkeys(("is_fisheye", "ftheta_p0", "latlong", "equirectangular", "orthographic"), ()),
+    "is_fisheye": ("TRUE", "1"),
+    **dict.fromkeys(("ftheta_p0", "latlong", "equirectangular", "orthographic"), ()),
 }
 UNDISTORT = "undistort the images to PINHOLE, as `colmap image_undistorter` does"
 
@@ -139,16 +140,19 @@ def _focal_length(frame, length_key, angle_key, size):
 
 def distortion(frame: Frame) -> Distortion:
     """The lens distortion of a frame in the format of nerfstudio or instant-ngp. Raises UserError
-    for a lens other than OpenCV's perspective one.
+    for a lens other than OpenCV's perspective one and its fisheye.
     """
     for key, known in LENS_KEYS.items():
         value = frame.get(key)
         if value and str(value).upper() not in known:
             raise frame.error(key, f"{quoted(value, 40)} is not modelled; {UNDISTORT}")
-    if frame.number("k4"):
-        raise frame.error("k4", f"a fourth radial coefficient is not modelled; {UNDISTORT}")
-    given = {key: frame.number(key) for key in COEFFICIENTS}
-    return Distortion(**{key: value for key, value in given.items() if value is not None})
+    model = str(frame.get("camera_model")).upper()
+    is_fisheye = bool(frame.get("is_fisheye")) or model in FISHEYES
+    for key in ("p1", "p2") if is_fisheye else ("k4",):
+        if frame.number(key):
+            raise frame.error(key, f"is not modelled with this lens; {UNDISTORT}")
+    keys = ("k1", "k2", "p1", "p2", "k3", "k4")
+    return Distortion(*(frame.number(key) or 0.0 for key in keys), fisheye=is_fisheye)
 
 
 def numbers(value: Any) -> np.ndarray | None:

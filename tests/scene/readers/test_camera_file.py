@@ -105,7 +105,7 @@ def changed(name, key, value):
         (changed("cameras.json", "height", 1e9), "height"),
         (changed("camera_path.json", "fov", 200), "fov"),
         (changed("camera_path.json", "camera_type", "fisheye"), "camera_type"),
-        (changed("transforms.json", "is_fisheye", True), "is_fisheye"),
+        (changed("transforms.json", "latlong", True), "latlong"),
         (changed("camera_path.json", "fov", 5e-324), "fov"),
         (changed("camera_path.json", "fov", None), "fov: is missing"),
         (changed("camera_path.json", "camera_to_world", [1] * 15), "camera_to_world"),

@@ -77,19 +77,27 @@ def test_a_projection_by_hand(tmp_path):
 
 
 @pytest.mark.parametrize(
-    "line, focal, k",
+    "line, focal, distortion",
     [
-        ("SIMPLE_PINHOLE 30 22 40 15 11", (40, 40), (0, 0)),
-        ("PINHOLE 30 22 40 42 15 11", (40, 42), (0, 0)),
-        ("SIMPLE_RADIAL 30 22 40 15 11 .2", (40, 40), (0.2, 0)),
-        ("RADIAL 30 22 40 15 11 .2 -.1", (40, 40), (0.2, -0.1)),
+        ("SIMPLE_PINHOLE 30 22 40 15 11", (40, 40), Distortion()),
+        ("PINHOLE 30 22 40 42 15 11", (40, 42), Distortion()),
+        ("SIMPLE_RADIAL 30 22 40 15 11 .2", (40, 40), Distortion(0.2)),
+        ("RADIAL 30 22 40 15 11 .2 -.1", (40, 40), Distortion(0.2, -0.1)),
+        ("FISHEYE 30 22 40 42 15 11", (40, 42), Distortion(fisheye=True)),
+        ("SIMPLE_RADIAL_FISHEYE 30 22 40 15 11 .2", (40, 40), Distortion(0.2, fisheye=True)),
+        ("RADIAL_FISHEYE 30 22 40 15 11 .2 -.1", (40, 40), Distortion(0.2, -0.1, fisheye=True)),
+        (
+            "OPENCV_FISHEYE 30 22 40 42 15 11 .2 -.1 .3 -.4",
+            (40, 42),
+            Distortion(0.2, -0.1, k3=0.3, k4=-0.4, fisheye=True),
+        ),
     ],
 )
-def test_models(text, line, focal, k):
+def test_models(text, line, focal, distortion):
     edit(text, "cameras.txt", lambda lines: [f"{i + 1} {line}" for i in range(11)])
     for photograph in read_split(text, "train"):
-        camera, d = photograph.camera, photograph.distortion
-        assert (camera.fx, camera.fy) == focal and (d.k1, d.k2) == k
+        camera = photograph.camera
+        assert (camera.fx, camera.fy) == focal and photograph.distortion == distortion
         assert (camera.cx, camera.cy) == (15, 11)
 
 
@@ -197,9 +205,9 @@ def test_bad_text(text, case):
 
 
 def test_other_models_are_named_with_the_command_that_converts_them(text):
-    edit(text, "cameras.txt", replaced(1, "OPENCV_FISHEYE"))
-    edit(text, "cameras.txt", second(lambda w: [*w, "0", "0", "0", "0"]))
-    refused(text, "OPENCV_FISHEYE", "colmap image_undistorter", f"--image_path {text / 'images'}")
+    edit(text, "cameras.txt", replaced(1, "FULL_OPENCV"))
+    edit(text, "cameras.txt", second(lambda w: [*w, *8 * "0"]))
+    refused(text, "FULL_OPENCV", "colmap image_undistorter", f"--image_path {text / 'images'}")
 
 
 def test_models_of_later_versions_are_named(binary):

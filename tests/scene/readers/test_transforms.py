@@ -10,6 +10,7 @@ from support.transforms_scenes import SIZE, opengl_pose, refused, train_views, w
 
 from pp_cl.errors import UserError
 from pp_cl.files.image import read_rgba, write_png
+from pp_cl.scene.distortion import Distortion
 from pp_cl.scene.load import load_scene
 from pp_cl.scene.readers import transforms
 
@@ -163,8 +164,8 @@ BAD_FRAMES = {
     "angle over pi": ("camera_angle_x", 40),
     "width": ("w", 48),
     "distortion": ("k4", 0.01),
-    "fisheye": ("camera_model", "OPENCV_FISHEYE"),
-    "fisheye of instant-ngp": ("is_fisheye", True),
+    "panorama": ("camera_model", "EQUIRECTANGULAR"),
+    "fisheye of instant-ngp": ("ftheta_p0", 0.1),
 }
 
 
@@ -232,6 +233,17 @@ def test_a_copy_beside_transforms_json_is_no_split(tmp_path):
 def test_what_is_perspective_by_its_keys_is_read(tmp_path):
     keys = {"is_fisheye": False, "camera_type": "perspective", "orthographic": None}
     assert len(train_views(tmp_path, **keys)) == 3
+
+
+@pytest.mark.parametrize("keys", ({"camera_model": "OPENCV_FISHEYE"}, {"is_fisheye": True}))
+def test_fisheyes_of_nerfstudio_and_colmap2nerf(tmp_path, keys):
+    """The latter writes the tangential coefficients as zeros beside."""
+    keys |= {"k1": 0.1, "k2": 0.2, "k3": 0.3, "k4": 0.4, "p1": 0, "p2": 0}
+    write_scene(tmp_path, edit=lambda data: data.update(keys))
+    [one, *_] = transforms.read_split(tmp_path, "train")
+    assert one.distortion == Distortion(k1=0.1, k2=0.2, k3=0.3, k4=0.4, fisheye=True)
+    write_scene(tmp_path, edit=lambda data: data.update(keys, p2=0.1))
+    refused(tmp_path, tmp_path / "transforms_train.json", "p2:")
 
 
 def test_a_pipe_is_no_file_of_cameras(tmp_path):
