@@ -266,15 +266,19 @@ def open_training(
             " use another --out"
         )
     info = identity(views)
-    agreement = agreeing(dev, views, scene_box(config))
     if stored is None:
+        agreement = agreeing(dev, views, scene_box(config))
         trainer, hull = _start(config, agreement, views, net, room)
+        left_out = list(agreement.left_out)
         points = trainer.model.cloud.count
     else:
-        trainer, hull = _resume(goal, agreement.views, net, stored, begun), None
+        left_out = header.get("left_out", [])
+        kept = [view for view in views if view.name not in left_out]
+        trainer, hull = _resume(goal, kept, net, stored, begun), None
         points = header["initial_points"]
     info |= {"initial_points": points, "tuning": policy.tuning}
     info |= {"extended_from": begun} if begun else {}
+    info |= {"left_out": left_out} if left_out else {}
     return Training(folder, config, trainer, info, room, hull, policy.origin, measured)
 
 

@@ -27,7 +27,7 @@ LEAST_LENGTH, MOST_LENGTH = 1e-30, 1e30  # world units; float32 would hold no pr
 LEAST_SHARE = 1e-6  # of far, between it and near: float32 would hold them as one
 MOST_TEXT = 1000
 DIGEST = re.compile(f"[0-9a-f]{{{DIGITS}}}")
-OPTIONAL = {"format", "tuning", "extended_from", "exposed"}  # keys of a header
+OPTIONAL = {"format", "tuning", "extended_from", "exposed", "left_out"}  # keys of a header
 GRID = ("origin", "edge", "dims")
 
 
@@ -76,6 +76,11 @@ class StoredRun:
             )
         if "exposed" in header:
             rules["exposed"] = (lambda x: x is True, "true")
+        if "left_out" in header:
+            rules["left_out"] = (
+                lambda x: _are_some(x, kept_views(header["views"])),  # which is checked before
+                "names of some of its views",
+            )
         for key, (is_right, expected) in rules.items():
             if not is_right(header[key]):
                 self._refuse(f"{key} in its header is {quoted(header[key])}, expected {expected}")
@@ -135,7 +140,8 @@ def _views_with_gains(header, config):
     """How many views have gains in the checkpoint of an unfinished training, which are kept until
     it is decided that it needs none.
     """
-    views, begun = len(header["views"]), header.get("extended_from", 0)
+    views = len(header["views"]) - len(header.get("left_out", []))
+    begun = header.get("extended_from", 0)
     is_open = config.train.exposure != "off" and header["step"] < decided_at(begun, views)
     return views if is_open or "exposed" in header else 0
 
@@ -197,6 +203,15 @@ def _are_views(views):
         return bool(kept_views(views))
     except ValueError:
         return False
+
+
+def _are_some(names, views):
+    known = {view.name for view in views}
+    return (
+        isinstance(names, list)
+        and all(type(name) is str for name in names)
+        and 0 < len(set(names) & known) == len(names) < len(known)
+    )
 
 
 def _are_digests(pixels):

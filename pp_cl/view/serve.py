@@ -68,7 +68,9 @@ def serve(
         contextlib.closing(_listen(host, port)) as listening,
         contextlib.suppress(KeyboardInterrupt),
     ):
-        # asyncio ends its tasks one by one at Ctrl-C, and knows no other signal
+        # asyncio ends its tasks one by one at Ctrl-C, and knows no other signal; a shell's job in the
+        # background ignores Ctrl-C
+        signal.signal(signal.SIGINT, signal.default_int_handler)
         signal.signal(signal.SIGTERM, lambda *_: signal.raise_signal(signal.SIGINT))
         access = Access(host, listening.getsockname()[1])
         live = shown or LiveRun(open_device(device), folder, scene)

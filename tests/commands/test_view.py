@@ -75,10 +75,12 @@ def test_a_signal_to_terminate_in_the_midst_of_a_task_ends_cleanly(begun, caplog
         tasks.append(asyncio.get_running_loop().create_task(terminated()))
 
     before = signal.getsignal(signal.SIGTERM)
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # as of a shell's job in the background
     try:
         serve(begun, host="127.0.0.1", port=0, announce=announce)
     finally:
         signal.signal(signal.SIGTERM, before)
+        signal.signal(signal.SIGINT, signal.default_int_handler)
     assert tasks[0].done() and tasks[0].exception() is None and not caplog.records
 
 

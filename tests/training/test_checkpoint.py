@@ -131,6 +131,8 @@ HEADERS = {
     "finished of 1": ({"finished": 1}, "finished"),
     "extended from nowhere": ({"extended_from": 0}, "extended_from"),
     "extended from a step to come": ({"extended_from": STEP + 1}, "extended_from"),
+    "a view left out that it never had": ({"left_out": ["nobody"]}, "left_out"),
+    "names of nothing": ({"left_out": 3}, "left_out"),
     "not finished at its end": ({"step": STEPS}, "not finished at step 60"),
     "no points at the start": ({"initial_points": 0}, "initial_points"),
     "fewer points at the start than now": ({"initial_points": 39}, "points.ids"),
