@@ -90,6 +90,7 @@ def test_equals_the_dense_network(dev, rng, always, name, variant, blocks):
     np.testing.assert_array_equal(net.forward(device_x, False, plan).get(), actual[0])
     if variant == "direct":  # Winograd mixes the last bits of a tile
         np.testing.assert_array_equal(actual[0], expected[0])
+    # so through seven layers two of its results differ, on Intel's runtime by up to 1.1e-6
     for a, b in zip(actual[:2], expected[:2], strict=True):
         assert np.abs(a - b).max() <= 2e-6 * np.abs(b).max()
     # sums over 26,640 pixels, added up in another order
