@@ -134,8 +134,8 @@ def _views_with_gains(header, config):
     it is decided that it needs none.
     """
     views, begun = len(header["views"]), header.get("extended_from", 0)
-    is_open = config.train.exposure != "off" and header["step"] < decided_at(begun, views)
-    return views if is_open or "exposed" in header else 0
+    is_kept = "exposed" in header or header["step"] < decided_at(begun, views)
+    return views if is_kept and config.train.exposure != "off" else 0
 
 
 def stored_forms(
