@@ -142,8 +142,8 @@ def _views_with_gains(header, config):
     """
     views = len(header["views"]) - len(header.get("left_out", []))
     begun = header.get("extended_from", 0)
-    is_open = config.train.exposure != "off" and header["step"] < decided_at(begun, views)
-    return views if is_open or "exposed" in header else 0
+    is_kept = "exposed" in header or header["step"] < decided_at(begun, views)
+    return views if is_kept and config.train.exposure != "off" else 0
 
 
 def stored_forms(

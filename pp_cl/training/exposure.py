@@ -10,7 +10,9 @@ from pp_cl.training.loss import corner_of
 
 KEPT = 0.7  # of a view's sums from one of its steps to the next
 PRIOR = 1e-3  # squares per pixel: black objects tell no gains
-LOOKS = 4  # steps on each view after which it is known whether photographs differ
+# steps on each view, and in all, after which it is known whether photographs differ: before,
+# gains explain much of what a small model has not learned yet
+LOOKS, LEAST_STEPS = 2, 100
 LEAST_SHARE = 0.25  # of the squared error that gains must explain
 TINY = 1e-12
 
@@ -116,4 +118,4 @@ def decided_at(begun: int, views: int) -> int:
     """The step after which it is known whether the photographs of a training differ. begun: the
     step at which its moments started.
     """
-    return begun + LOOKS * views
+    return begun + max(LOOKS * views, LEAST_STEPS)

@@ -15,10 +15,10 @@ from pp_cl.files.checkpoint import load_checkpoint
 from pp_cl.metrics.psnr_ssim import exposed_alike
 from pp_cl.scene.demo import demo_views
 from pp_cl.scene.readers.transforms import write_scene
-from pp_cl.training.exposure import LOOKS
+from pp_cl.training.exposure import decided_at
 
-VIEWS, STEPS = 40, 500
-DECIDED = LOOKS * VIEWS
+VIEWS, STEPS = 64, 500
+DECIDED = decided_at(0, VIEWS)
 GAINS = np.exp(np.random.default_rng(4).uniform(np.log(0.25), 0, (VIEWS, 3)))
 SETTINGS = {"downscale": 1, "train__iterations": STEPS, "train__checkpoint_every": 100}
 
@@ -52,7 +52,7 @@ def test_gains_are_found(exposed, tmp_path, monkeypatch):
     _, arrays = load_checkpoint(tmp_path / "run" / "checkpoint.npz")
     error = np.log(arrays["exposure"][..., 3] / GAINS)
     error -= error.mean(axis=0)
-    assert error.std() < 0.3 * np.log(GAINS).std()
+    assert error.std() < 0.4 * np.log(GAINS).std()
 
 
 @pytest.mark.parametrize("stop", [DECIDED - 1, DECIDED, STEPS - 1])
