@@ -8,7 +8,6 @@ from typing import NamedTuple
 import numpy as np
 from scipy.spatial import cKDTree
 
-from pp_cl.errors import UserError
 from pp_cl.scene.camera import Camera
 from pp_cl.scene.camera_path import looked_at, up_of
 
@@ -16,7 +15,7 @@ SEEN = 0.75  # of the cameras that see what most of them see: what the object's 
 NEIGHBOURS, LONELY = 8, 3.0  # a point's distance to these, in medians, from which on it is alone
 CUT = 0.005  # of the points at each end of an axis: what may be wrong
 MARGIN = 0.06  # of the box's diagonal, added on every side: smooth parts have no points
-LEAST_POINTS = 30
+LEAST_POINTS = 100
 TRIED, TILT = (
     500,
     np.cos(np.radians(10)),
@@ -43,7 +42,7 @@ class World(NamedTuple):
 
 def find_world(cameras: Sequence[Camera], points: np.ndarray) -> World:
     """The world whose z axis is up, whose origin is the middle of the object, and where its box
-    fits into [-1, 1]. points: (N, 3). Raises UserError where too few are on the object.
+    fits into [-1, 1]. points: (N, 3).
     """
     up = up_of(cameras)
     centre = looked_at(cameras)
@@ -52,14 +51,17 @@ def find_world(cameras: Sequence[Camera], points: np.ndarray) -> World:
     rotation = _upright(up, eyes - centre)
     upright = (points - centre) @ rotation.T / reach
     kept = _on_object(upright, _seen_share(cameras, points))
-    if len(kept) < LEAST_POINTS:
-        raise UserError(
-            f"only {len(kept)} points lie on what the cameras look at; photograph the object from"
-            " all sides, in the middle of the images, or say where it is with --box"
+    if len(kept) < LEAST_POINTS:  # a plain object: the ball that all cameras see
+        seen = min(
+            np.linalg.norm(camera.eye - centre)
+            * np.sin(np.arctan(min(camera.width / camera.fx, camera.height / camera.fy) / 2))
+            for camera in cameras
         )
-    low, high = np.quantile(kept, [CUT, 1 - CUT], axis=0)
-    margin = MARGIN * np.linalg.norm(high - low)
-    low, high = low - margin, high + margin
+        low, high = np.outer([-1, 1], np.full(3, seen / reach))
+    else:
+        low, high = np.quantile(kept, [CUT, 1 - CUT], axis=0)
+        margin = MARGIN * np.linalg.norm(high - low)
+        low, high = low - margin, high + margin
     middle, size = (low + high) / 2, (high - low).max() / 2
     scale = 1 / (reach * size)
     shift = -scale * rotation @ centre - middle / size

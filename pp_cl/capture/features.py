@@ -13,7 +13,7 @@ from pp_cl.capture.packages import needed
 from pp_cl.errors import UserError, shown
 from pp_cl.files.atomic import mend
 
-LENS = "OPENCV"
+LENS = "SIMPLE_RADIAL"  # with more, few photographs agree on a wrong focal length
 LARGEST = 1600  # pixels, longer side; larger images are reduced for their features
 FEATURES = 8192  # of an image, at most
 AT_ONCE = 32  # images, between two states of the bar and where a stopped run goes on

@@ -245,10 +245,8 @@ def _leave_out(found):
 
 
 def _difference(one, other):
-    """Mean difference of the small copies, in levels, which a change of brightness does not raise;
-    infinite for images of different size.
+    """Mean difference of the small copies, in levels, which a change of brightness does not
+    raise.
     """
-    if one["size"] != other["size"]:
-        return np.inf
     a, b = (image["small"] - image["small"].mean() for image in (one, other))
     return float(np.abs(a - b).mean())

@@ -108,12 +108,10 @@ def photographs(model: Any, folder: str) -> list[Photograph]:
         if not image.has_pose:
             continue
         lens = model.cameras[image.camera_id]
-        fx, fy, cx, cy, k1, k2, p1, p2 = lens.params  # OPENCV
+        focal, cx, cy, k1 = lens.params  # of features.LENS
         world = image.cam_from_world().inverse().matrix()
-        camera = Camera(np.array(world), fx, fy, cx, cy, lens.width, lens.height)
-        found.append(
-            Photograph(f"{folder}/{image.name}", camera, distortion=Distortion(k1, k2, p1, p2))
-        )
+        camera = Camera(np.array(world), focal, focal, cx, cy, lens.width, lens.height)
+        found.append(Photograph(f"{folder}/{image.name}", camera, distortion=Distortion(k1)))
     return found
 
 

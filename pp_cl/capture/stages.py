@@ -210,7 +210,7 @@ class Capture:
                 "file_path": one.name,
                 "mask_path": masks.mask_file(Path("masks"), one.name).as_posix(),
                 **frame_keys(one.camera),
-                **{key: getattr(one.distortion, key) for key in ("k1", "k2", "p1", "p2")},
+                "k1": one.distortion.k1,
             }
             for one in found
         ]
