@@ -18,16 +18,15 @@ from pp_cl.scene.views import Photograph
 cv2 = needed("cv2")
 
 CUT_SIDE = 400  # pixels of what is cut: the projected box and what is around it
-ENLARGED = 2.0  # times at most: GrabCut favours short borders, which takes thin parts away
 AROUND = 0.2  # of the projected box, on each side: shows what the background looks like
 FOOT = 0.04  # of the box's diagonal: points lower in it may be on what the object stands on
 SEED = 1 / 150  # radius of a sparse point, of CUT_SIDE
-NEAR = 1 / 10  # of CUT_SIDE: sparse points so close show a surface between them
+NEAR = 1 / 20  # of CUT_SIDE: sparse points so close show a surface between them
 SAMPLES = 160  # squared: pixels of each side that the colours are learned from
 FITTED = 3  # times that the colours are fitted to their samples
 ROUNDS = 2  # of votes
 CELLS = 112**3  # vertices that are voted on
-FORGIVEN = 0.1  # of the views that see a vertex: their masks may reject it
+FORGIVEN = 0.15  # of the views that see a vertex: their masks may reject it
 LEAST_SEEING = 3  # views that see a vertex, or all of fewer
 BEYOND = 0.5  # of an image's size: further out a lens model says nothing
 SOFT = 1.5  # pixels of the cut image over which a border is refined
@@ -70,8 +69,7 @@ class Window:
         """The part of an image of the photograph's size, (H, W) or (H, W, C), reduced to this."""
         x0, y0, x1, y1 = self.place
         size = self.camera.width, self.camera.height
-        how = cv2.INTER_AREA if size[0] < x1 - x0 else cv2.INTER_LINEAR
-        return cv2.resize(image[y0:y1, x0:x1], size, interpolation=how)
+        return cv2.resize(image[y0:y1, x0:x1], size, interpolation=cv2.INTER_AREA)
 
     def of_photograph(self, pixels: np.ndarray) -> np.ndarray:
         """(N, 2) pixels of the photograph as pixels of this."""
@@ -100,7 +98,7 @@ def window(image: np.ndarray, photograph: Photograph, box: np.ndarray) -> Window
     y0, y1 = _grown(y, camera.height)
     if x1 - x0 < 2 or y1 - y0 < 2:
         raise UserError(f"{photograph.name}: the object's box is outside; give another with --box")
-    scale = min(ENLARGED, CUT_SIDE / max(x1 - x0, y1 - y0))
+    scale = min(1, CUT_SIDE / max(x1 - x0, y1 - y0))
     width, height = (max(2, round(scale * n)) for n in (x1 - x0, y1 - y0))
     sx, sy = width / (x1 - x0), height / (y1 - y0)
     camera = camera.crop(x0, y0, width, height)

@@ -124,7 +124,6 @@ def test_thin_parts_are_cut_out(dev, tmp_path):
     views = [(camera, render(dev, camera)) for camera in wider]
     capture = Capture(tmp_path / "scene", views, box, surface)
     capture.write()
-    print(capture.agreement())
     assert capture.agreement().mean() > 0.65
 
 
@@ -141,20 +140,21 @@ def share_held(capture, place, wanted):
         shares.append((read_gray(capture.file(0)) > 127)[place][chosen].mean())
         for number in range(VIEWS):
             capture.file(number).unlink()
-    print(shares)
     return shares
 
 
 def test_the_other_views_carve_what_one_takes_for_the_object(tmp_path):
-    """A bystander of the object's colours in one photograph, beside the object."""
+    """What looks like the object stands beside it in one photograph."""
     place = np.s_[20:40, 16:40]
 
     def bystander(photograph):
-        photograph[place] = photograph[48, 48]
+        photograph[place] = photograph[38:58, 36:60]
 
-    alone, voted = share_held(ball(tmp_path / "scene", bystander), place, wanted=False)
+    capture = ball(tmp_path / "scene", bystander)
+    capture.seen[0] = capture.seen[0][capture.seen[0] < capture.count]  # it hides the wall
+    alone, voted = share_held(capture, place, wanted=False)
     assert alone > 0.5
-    assert voted < alone / 2
+    assert voted < 0.6 * alone
 
 
 def test_the_other_views_restore_what_one_takes_for_the_background(tmp_path):
