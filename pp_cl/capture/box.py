@@ -16,6 +16,7 @@ NEIGHBOURS, LONELY = 8, 3.0  # a point's distance to these, in medians, from whi
 CUT = 0.005  # of the points at each end of an axis: what may be wrong
 MARGIN = 0.06  # of the box's diagonal, added on every side: smooth parts have no points
 LEAST_POINTS = 100
+FILLED = 0.55  # of the images, by an object whose sides may have no points
 TRIED, TILT = (
     500,
     np.cos(np.radians(10)),
@@ -51,17 +52,23 @@ def find_world(cameras: Sequence[Camera], points: np.ndarray) -> World:
     rotation = _upright(up, eyes - centre)
     upright = (points - centre) @ rotation.T / reach
     kept = _on_object(upright, _seen_share(cameras, points))
-    if len(kept) < LEAST_POINTS:  # a plain object: the ball that all cameras see
-        seen = min(
+    ball = (
+        min(  # radius of what all cameras see
             np.linalg.norm(camera.eye - centre)
             * np.sin(np.arctan(min(camera.width / camera.fx, camera.height / camera.fy) / 2))
             for camera in cameras
         )
-        low, high = np.outer([-1, 1], np.full(3, seen / reach))
-    else:
-        low, high = np.quantile(kept, [CUT, 1 - CUT], axis=0)
-        margin = MARGIN * np.linalg.norm(high - low)
-        low, high = low - margin, high + margin
+        / reach
+    )
+    low, high = np.outer([-ball, ball], np.ones(3))
+    if len(kept) >= LEAST_POINTS:
+        ends = np.quantile(kept, [CUT, 1 - CUT], axis=0)
+        margin = MARGIN * np.linalg.norm(ends[1] - ends[0])
+        low, high = (
+            np.minimum(ends[0] - margin, FILLED * low),
+            np.maximum(ends[1] + margin, FILLED * high),
+        )
+        low[2] = ends[0, 2] - margin  # what it stands on
     middle, size = (low + high) / 2, (high - low).max() / 2
     scale = 1 / (reach * size)
     shift = -scale * rotation @ centre - middle / size

@@ -35,7 +35,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--box",
         type=_box,
         metavar="X0,Y0,Z0,X1,Y1,Z1",
-        help="where the object is, in the units of the scene",
+        help="where the object is, in the units of the scene; write --box=-1,-1,...",
     )
 
 
