@@ -71,11 +71,6 @@ class Window:
         size = self.camera.width, self.camera.height
         return cv2.resize(image[y0:y1, x0:x1], size, interpolation=cv2.INTER_AREA)
 
-    def of_photograph(self, pixels: np.ndarray) -> np.ndarray:
-        """(N, 2) pixels of the photograph as pixels of this."""
-        low, high = np.reshape(self.place, (2, 2))
-        return (pixels - low) / (high - low) * [self.camera.width, self.camera.height]
-
     def inside(self, positions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """((M,) indices of the positions that lie in the image, their rows, their columns)."""
         x, y = np.floor(np.nan_to_num(self.pixels(positions), nan=-1)).T
@@ -126,16 +121,14 @@ def cut_out_all(
     points: np.ndarray,
     inside: np.ndarray,
     seen: Sequence[np.ndarray],
-    behind: Sequence[np.ndarray],
 ) -> None:
     """Set the masks of the windows that have none.
 
     box, points, seen: as write_masks() takes them. inside: (N,) bool, the points in the box.
-    behind: for each window (M, 2) pixels of its photograph that show the background.
     """
     cv2.setNumThreads(1)
     left = [i for i, one in enumerate(windows) if one.mask is None]
-    seeds = {i: _seeds(windows[i], box, points, inside, seen[i], behind[i]) for i in left}
+    seeds = {i: _seeds(windows[i], box, points, inside, seen[i]) for i in left}
     labels = [
         seeds[i] if i in seeds else one.mask.astype(np.uint8) for i, one in enumerate(windows)
     ]
@@ -150,7 +143,7 @@ def cut_out_all(
             windows[i].mask = _grab_cut(windows[i], labels[i], colours)
 
 
-def _seeds(one, box, points, inside, seen, behind):
+def _seeds(one, box, points, inside, seen):
     """(H, W) uint8 of GrabCut's labels: points of the object that the photograph shows, those of
     the background, what is outside the box; what is close to the object's points is probable.
     """
@@ -168,8 +161,7 @@ def _seeds(one, box, points, inside, seen, behind):
     labels[near & (labels == cv2.GC_PR_BGD)] = cv2.GC_PR_FGD
     shown_inside = inside[seen]
     sure = seen[shown_inside & (points[seen, 2] > foot)]
-    beside = np.concatenate([one.pixels(points[seen[~shown_inside]]), one.of_photograph(behind)])
-    labels[_dots(one, beside, radius)] = cv2.GC_BGD
+    labels[_dots(one, one.pixels(points[seen[~shown_inside]]), radius)] = cv2.GC_BGD
     labels[_dots(one, one.pixels(points[sure]), radius)] = cv2.GC_FGD
     return labels
 

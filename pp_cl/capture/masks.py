@@ -5,7 +5,7 @@ program of the user's; else cut out by colour around the sparse points and voted
 import shlex
 import subprocess
 import tempfile
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -44,7 +44,6 @@ def write_masks(
     *,
     given: Path | None = None,
     command: str | None = None,
-    behind: Mapping[str, np.ndarray] | None = None,
 ) -> str:
     """Write the mask of each photograph as mask_file(), 8-bit gray, white where the object is; what
     lies there is kept, and helps to make the others. Returns one line on what was done.
@@ -52,9 +51,8 @@ def write_masks(
     scene: the folder that the photographs' names are relative to. box: (2, 3) around the object.
     points: (N, 3) in the scene's world. seen: for each photograph the indices (M,) of the points
     that it shows. given: a folder of masks. command: of a program that makes masks, which {image}
-    and {mask} stand for. behind: (M, 2) pixels of photographs, by name, that show the background.
-    Raises UserError for masks that are given and missing or broken, a program that fails, a box in
-    which nothing is seen.
+    and {mask} stand for. Raises UserError for masks that are given and missing or broken, a program
+    that fails, a box in which nothing is seen.
     """
     words = None if command is None else program_words(command)
     folder.mkdir(parents=True, exist_ok=True)
@@ -70,8 +68,7 @@ def write_masks(
         windows = [_window(scene, folder, one, box) for one in photographs]
         how |= _uniform(scene, folder, photographs, windows, points[inside])
         if _without_mask(folder, photographs):
-            pixels = [(behind or {}).get(one.name, np.empty((0, 2))) for one in photographs]
-            how |= _cut(scene, folder, photographs, windows, box, points, inside, seen, pixels)
+            how |= _cut(scene, folder, photographs, windows, box, points, inside, seen)
     counts = ", ".join(f"{count} {source}" for source, count in how.items() if count)
     return f"{counts}{_contradictions(scene, folder, photographs, box)}"
 
@@ -176,12 +173,12 @@ def _is_uniform(window, points):
     return bool((mask[rows, columns] > 127).mean() >= ON_MASK) if len(rows) else bool(mask.any())
 
 
-def _cut(scene, folder, photographs, windows, box, points, inside, seen, behind):
+def _cut(scene, folder, photographs, windows, box, points, inside, seen):
     """Cut out what has no mask, and write it. Returns {what: how many}."""
     if not any(inside[some].any() for some in seen):
         raise UserError(f"{scene}: no point lies in the object's box; give another with --box")
     left = [i for i, one in enumerate(windows) if one.mask is None]
-    cut_out_all(windows, box, points, inside, seen, behind)
+    cut_out_all(windows, box, points, inside, seen)
     for i in tqdm(left, "masks", unit="image", leave=False, disable=None):
         name = photographs[i].name
         mask = whole_mask(windows[i], read_rgba(scene / name)[..., :3])

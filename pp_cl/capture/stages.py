@@ -32,7 +32,7 @@ LEFT = {
         "capture/database.db-shm",
         "capture/database.db-wal",
     ),
-    "matches": ("capture/still.npz",),
+    "matches": ("capture/turns",),
     "poses": ("capture/model",),
     "box": (),
     "masks": ("masks",),
@@ -50,7 +50,7 @@ class Capture:
         self.source, self.scene, self.given, self.tell = source, scene, given, tell
         self.work, self.images = scene / "capture", scene / "images"
         self.database, self.model = self.work / "database.db", self.work / "model"
-        self.still = self.work / "still.npz"
+        self.turns = self.work / "turns"
 
     def run(self, begin: str | None = None) -> None:
         """Do all stages that are not done, or one of them and all after it. Raises UserError."""
@@ -155,7 +155,7 @@ class Capture:
         is_film = not self.source.is_dir()
         pairs = isolated(self.work, features.match, self.database, is_film)
         turntable = self.given["features"]["turntable"]
-        turns = isolated(self.work, still.remove_still, self.database, self.still, turntable)
+        turns = isolated(self.work, still.remove_still, self.database, self.turns, turntable)
         line = f"{pairs} pairs of images"
         if turns:
             line += "; the object turns before a background that stands still, which is left out"
@@ -188,7 +188,6 @@ class Capture:
 
     def _masks(self):
         model, corners = self._world()
-        pixels = np.load(self.still) if self.still.exists() else {}
         given = self.given["masks"]
         line = masks.write_masks(
             self.scene,
@@ -198,7 +197,6 @@ class Capture:
             *poses.points(model),
             given=given["masks"] and Path(given["masks"]),
             command=given["command"],
-            behind={f"images/{name}": pixels[name] for name in pixels},
         )
         return {"line": line}
 

@@ -9,7 +9,6 @@ import numpy as np
 from scipy.sparse import coo_matrix
 
 from pp_cl.capture.features import opened, quiet, verification
-from pp_cl.files.atomic import atomic_file
 
 SAMPLED = 30  # matches of a pair
 LEAST_MATCHES = 15  # of a pair, of which at least a half stand still
@@ -19,21 +18,22 @@ ROUNDS, WIDEST, NARROWER = 30, 0.05, 0.7  # of the alignment: matches that it be
 HELD = 0.001  # how strongly images without such matches are kept in place
 
 
-def remove_still(database: Path, kept: Path, is_turntable: bool) -> bool:
+def remove_still(database: Path, begun: Path, is_turntable: bool) -> bool:
     """Where most pairs of images share what stands still, remove its matches from the database,
     check the pairs anew, and return True.
 
-    Images are aligned by shifts, turns and scales, so that the camera may be moved a little. kept:
-    the file for {image: (N, 2) pixels of the features that stand still}; where it exists, this was
-    stopped, and goes on. is_turntable: the object is known to turn.
+    Images are aligned by shifts, turns and scales, so that the camera may be moved a little.
+    begun: a file that says so before anything is removed; where it exists, this was stopped, and
+    goes on. is_turntable: the object is known to turn.
     """
+    is_turntable = is_turntable or begun.exists()
     with quiet(database) as colmap, opened(database) as db:
         images = db.read_all_images()
         sizes = {i.camera_id: i for i in db.read_all_cameras()}
         index = {image.image_id: k for k, image in enumerate(images)}
-        pixels = [db.read_keypoints(image.image_id)[:, :2].astype(float) for image in images]
         places = [
-            _places(p, sizes[image.camera_id]) for p, image in zip(pixels, images, strict=True)
+            _places(db.read_keypoints(image.image_id)[:, :2].astype(float), sizes[image.camera_id])
+            for image in images
         ]
         pairs = []
         for number, matches in zip(*db.read_all_matches(), strict=True):
@@ -47,16 +47,14 @@ def remove_still(database: Path, kept: Path, is_turntable: bool) -> bool:
         still = [abs(moved[i][m[:, 0]] - moved[j][m[:, 1]]) < STILL for _, i, j, m in pairs]
         counted = [one for one in still if len(one) >= LEAST_MATCHES]
         shared = sum(one.sum() >= max(LEAST_MATCHES, len(one) / 2) for one in counted)
-        if not (is_turntable or kept.exists()) and shared < LEAST_PAIRS * len(counted):
+        if not is_turntable and shared < LEAST_PAIRS * len(counted):
             return False
         votes = [np.zeros((len(place), 2), int) for place in places]
         for (_, i, j, m), one in zip(pairs, still, strict=True):
             np.add.at(votes[i], (m[:, 0], one.astype(int)), 1)
             np.add.at(votes[j], (m[:, 1], one.astype(int)), 1)
         stays = [(v[:, 1] > 1) & (v[:, 1] > v[:, 0]) for v in votes]
-        if not kept.exists():
-            with atomic_file(kept) as file:
-                np.savez(file, **{i.name: pixels[k][stays[k]] for k, i in enumerate(images)})
+        begun.touch()
         with colmap.DatabaseTransaction(db):
             for (ids, i, j, m), one in zip(pairs, still, strict=True):
                 left = m[~(one | stays[i][m[:, 0]] | stays[j][m[:, 1]])]

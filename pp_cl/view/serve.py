@@ -68,8 +68,8 @@ def serve(
         contextlib.closing(_listen(host, port)) as listening,
         contextlib.suppress(KeyboardInterrupt),
     ):
-        # asyncio ends its tasks one by one at Ctrl-C, which a shell's job in the background ignores,
-        # and knows no other signal
+        # asyncio ends its tasks one by one at Ctrl-C, which a job in the background ignores, and
+        # knows no other signal
         signal.signal(signal.SIGINT, signal.default_int_handler)
         signal.signal(signal.SIGTERM, lambda *_: signal.raise_signal(signal.SIGINT))
         access = Access(host, listening.getsockname()[1])

@@ -228,5 +228,5 @@ def test_an_object_that_turns(dev, tmp_path):
         alpha = rgba[..., 3:] / 255
         write_png(folder / f"{i:03d}.png", rgba[..., :3] / 255 * alpha + wall * (1 - alpha))
     status, lines = capture(folder, scene)
-    assert found(scene, "matches")["turns"] and (scene / "capture" / "still.npz").exists()
+    assert found(scene, "matches")["turns"] and (scene / "capture" / "turns").exists()
     assert status == 2 and len(lines) == 1 and str(scene) in lines[0]
