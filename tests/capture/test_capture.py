@@ -122,6 +122,7 @@ def test_what_is_done_is_not_done_again(captured, shot, tmp_path):
     assert status == 2 and len(lines) == 1 and str(scene) in lines[0]
 
 
+@pytest.mark.slow
 def test_photographs_as_they_come(shot, tmp_path):
     """Turned ones with EXIF, HEIC, another size, one cut off: the others find their places."""
     heif = pytest.importorskip("pillow_heif")
@@ -202,6 +203,7 @@ def test_films(shot, tmp_path):
         assert status == 2 and len(lines) == 1 and name in lines[0]
 
 
+@pytest.mark.slow
 def test_a_full_disk(shot, tmp_path):
     """The database may not grow: one line that names it; with room again the command goes on."""
     scene = tmp_path / "scene"
