@@ -24,6 +24,7 @@ SEED = 1 / 150  # radius of a sparse point, of CUT_SIDE
 NEAR = 1 / 20  # of CUT_SIDE: sparse points so close show a surface between them
 SAMPLES = 160  # squared: pixels of each side that the colours are learned from
 FITTED = 3  # times that the colours are fitted to their samples
+ISLAND = 0.02  # of the largest region: smaller ones of a mask are dropped
 ROUNDS = 2  # of votes
 CELLS = 112**3  # vertices that are voted on
 FORGIVEN = 0.15  # of the views that see a vertex: their masks may reject it
@@ -141,6 +142,18 @@ def cut_out_all(
         colours = _colours(windows, labels)
         for i in tqdm(left, "cutting out", unit="image", leave=False, disable=None):
             windows[i].mask = _grab_cut(windows[i], labels[i], colours)
+    for i in left:
+        windows[i].mask = without_islands(windows[i].mask)
+
+
+def without_islands(mask: np.ndarray) -> np.ndarray:
+    """(H, W) bool: the mask but for regions smaller than ISLAND times the largest, which are mostly
+    things beside the object in its colours.
+    """
+    _, regions, facts, _ = cv2.connectedComponentsWithStats(mask.astype(np.uint8), connectivity=8)
+    areas = facts[:, cv2.CC_STAT_AREA]
+    areas[0] = 0  # the background
+    return (areas >= max(1, ISLAND * areas.max()))[regions]
 
 
 def _seeds(one, box, points, inside, seen):

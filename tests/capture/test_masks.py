@@ -171,6 +171,17 @@ def test_the_other_views_restore_what_one_takes_for_the_background(tmp_path):
     assert voted > 0.8
 
 
+def test_small_regions_beside_the_object_go():
+    mask = np.zeros((60, 80), bool)
+    mask[10:50, 10:40] = True
+    parts = mask.copy()
+    parts[20:30, 50:60] = True  # a part of the object
+    stained = parts.copy()
+    stained[40:43, 70:73] = True
+    np.testing.assert_array_equal(cut.without_islands(stained), parts)
+    assert not cut.without_islands(np.zeros((3, 4), bool)).any()
+
+
 def test_what_is_there_is_kept_and_helps(capture):
     """A second start makes what is missing, the same but for what the kept masks change."""
     capture.write()
