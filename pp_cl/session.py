@@ -315,10 +315,8 @@ def first_hull(
     if shares != OPEN:
         return hull, shares
     cameras = [view.camera for view in views]
-    spacing, smallest = (
-        spacing_pixels(hull.grid, cameras),
-        min(min(c.width, c.height) for c in cameras),
-    )
+    spacing = spacing_pixels(hull.grid, cameras)
+    smallest = min(min(camera.width, camera.height) for camera in cameras)
     possible = [n for n in range(1, len(REFINE_AT)) if smallest >= LEAST_SIDE << n]
     times = sum(spacing > COARSEST * 2 ** (n - 1) for n in possible)
     first = min(max(spacing, 2**times * FINEST), 2**times * COARSEST)

@@ -108,8 +108,8 @@ class Trainer:
         with self.dev.stage("target"):
             self._target.load(view)
             target = photograph = self._target.crop(box, jitter)
-            is_masked = view.has_mask or self.exposure
-            target_alpha = self._target.alpha(box, jitter) if is_masked else None
+            wants_alpha = view.has_mask or self.exposure
+            target_alpha = self._target.alpha(box, jitter) if wants_alpha else None
             if self.is_exposed:
                 target = self.exposure.target(view_index, photograph, target_alpha)
             tiles_of_gradient = self._gradient_tiles(target, camera)

@@ -17,10 +17,8 @@ CUT = 0.005  # of the points at each end of an axis: what may be wrong
 MARGIN = 0.06  # of the box's diagonal, added on every side: smooth parts have no points
 LEAST_POINTS = 100
 FILLED = 0.55  # of the images, by an object whose sides may have no points
-TRIED, TILT = (
-    500,
-    np.cos(np.radians(10)),
-)  # planes, and how level the one is that carries the object
+TRIED = 500  # planes
+TILT = np.cos(np.radians(10))  # how level the plane is that carries the object
 THICK = 0.01  # of the cameras' distance: points of a plane are no further from it
 TABLE, BELOW = 0.08, 0.03  # of the points: on a table at least, and below it at most
 LEAST_SPREAD = 0.7  # of the width of what stands on it
@@ -52,14 +50,7 @@ def find_world(cameras: Sequence[Camera], points: np.ndarray) -> World:
     rotation = _upright(up, eyes - centre)
     upright = (points - centre) @ rotation.T / reach
     kept = _on_object(upright, _seen_share(cameras, points))
-    ball = (
-        min(  # radius of what all cameras see
-            np.linalg.norm(camera.eye - centre)
-            * np.sin(np.arctan(min(camera.width / camera.fx, camera.height / camera.fy) / 2))
-            for camera in cameras
-        )
-        / reach
-    )
+    ball = min(_seen_radius(camera, centre) for camera in cameras) / reach
     low, high = np.outer([-ball, ball], np.ones(3))
     if len(kept) >= LEAST_POINTS:
         ends = np.quantile(kept, [CUT, 1 - CUT], axis=0)
@@ -73,6 +64,12 @@ def find_world(cameras: Sequence[Camera], points: np.ndarray) -> World:
     scale = 1 / (reach * size)
     shift = -scale * rotation @ centre - middle / size
     return World(scale, rotation, shift, np.stack([low - middle, high - middle]) / size)
+
+
+def _seen_radius(camera, centre):
+    """Radius of the ball around the centre that the camera sees as a whole."""
+    angle = np.arctan(min(camera.width / camera.fx, camera.height / camera.fy) / 2)
+    return np.linalg.norm(camera.eye - centre) * np.sin(angle)
 
 
 def _upright(up, offsets):

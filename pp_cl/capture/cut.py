@@ -10,6 +10,7 @@ from tqdm import tqdm
 
 from pp_cl.capture.packages import needed
 from pp_cl.errors import UserError
+from pp_cl.scene.bounds import corners_of
 from pp_cl.scene.camera import Camera
 from pp_cl.scene.distortion import Distortion
 from pp_cl.scene.grid import Grid, smallest_edge
@@ -87,7 +88,7 @@ def window(image: np.ndarray, photograph: Photograph, box: np.ndarray) -> Window
     """
     camera = photograph.camera
     whole = Window(photograph.name, image, camera, photograph.distortion, (0, 0, 0, 0))
-    x, y = whole.pixels(_corners(box)).T
+    x, y = whole.pixels(corners_of(box)).T
     if np.isnan(x).any():  # the box is around the camera, or ends far outside the image
         x, y = np.array([0, camera.width]), np.array([0, camera.height])
     x0, x1 = _grown(x, camera.width)
@@ -109,11 +110,6 @@ def _grown(places, size):
     """(first, last + 1) pixel of the places, grown by AROUND, within an image's side."""
     margin = AROUND * np.ptp(places)
     return max(0, int(places.min() - margin)), min(size, int(places.max() + margin) + 1)
-
-
-def _corners(box):
-    """(8, 3) of a (2, 3) box."""
-    return np.stack(np.meshgrid(*box.T, indexing="ij"), -1).reshape(-1, 3)
 
 
 def cut_out_all(
@@ -161,7 +157,7 @@ def _seeds(one, box, points, inside, seen):
     the background, what is outside the box; what is close to the object's points is probable.
     """
     labels = np.full(one.image.shape[:2], cv2.GC_BGD, np.uint8)
-    outline = one.pixels(_corners(box))
+    outline = one.pixels(corners_of(box))
     if np.isnan(outline).any():
         labels[:] = cv2.GC_PR_BGD
     else:

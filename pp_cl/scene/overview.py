@@ -8,6 +8,7 @@ from collections.abc import Sequence
 import numpy as np
 from PIL import Image, ImageDraw
 
+from pp_cl.scene.bounds import corners_of
 from pp_cl.scene.camera import Camera
 from pp_cl.scene.camera_path import up_of
 
@@ -36,7 +37,7 @@ def overview(
     if np.linalg.norm(aside) < 1e-6:  # it looks straight down
         aside = cameras[0].pose[:, 0] - (cameras[0].pose[:, 0] @ up) * up
     aside /= np.linalg.norm(aside)
-    corners = np.empty((0, 3)) if box is None else _corners(box)
+    corners = np.empty((0, 3)) if box is None else corners_of(box)
     frusta = _frusta(cameras, eyes)
     step = max(1, len(points) // MOST_POINTS)
     panels = []
@@ -63,11 +64,6 @@ def overview(
         ImageDraw.Draw(image).text((4, 2), title, fill=INK)
         panels.append(np.array(image))
     return np.concatenate(panels, axis=1)
-
-
-def _corners(box):
-    """(8, 3): bit i of a row's number says whether it lies on the upper side of axis i."""
-    return np.array([[box[n >> axis & 1][axis] for axis in range(3)] for n in range(8)])
 
 
 def _frusta(cameras, eyes):
