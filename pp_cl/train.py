@@ -36,6 +36,7 @@ from pp_cl.training.smooth import Smoother
 from pp_cl.training.state import PointState, final_points_to_keep, points_to_keep, split_opacity
 
 MANY_VIEWS = 24  # so many show every place several times
+SPECK = 50  # points: a patch of about 7 x 7 pixels where they are a pixel apart
 WHITE = 1.0  # of a target where its photograph is transparent
 
 
@@ -293,27 +294,30 @@ class Trainer:
 
     def finish(self) -> None:
         """End the training: take the EMA as parameters, and drop the points whose opacity is too
-        low or that too few training views show.
+        low or that too few training views show, and those that then hang in the air by few.
         """
         self.optimiser.apply_ema()
-        self._prune_unseen()
+        if self.config.final_prune_weight > 0:
+            self._prune_unseen()
+            self._prune_specks()
 
     def _prune_unseen(self):
         """Drop the points that reach train.final_prune_weight in no training view; where there are
         many views, in all but one: what a single photograph shows is mostly a speck in others.
         """
-        least_weight = self.config.final_prune_weight
-        if least_weight > 0:
-            cloud = self.model.cloud
-            max_weight, seen = (self.dev.zeros((cloud.count,)) for _ in range(2))
-            for view in self.views:
-                drawn = self.renderer.forward(view.camera, self.gamma[1], until="weights")
-                record_weights(self.dev, drawn.pairs, drawn.weights, max_weight, seen, least_weight)
-            least = 2 if len(self.views) >= MANY_VIEWS else 1
-            opacity = cloud.opacity
-            self._keep(
-                final_points_to_keep(self.dev, max_weight, seen, opacity, self.config, least)
-            )
+        cloud, least_weight = self.model.cloud, self.config.final_prune_weight
+        max_weight, seen = (self.dev.zeros((cloud.count,)) for _ in range(2))
+        for view in self.views:
+            drawn = self.renderer.forward(view.camera, self.gamma[1], until="weights")
+            record_weights(self.dev, drawn.pairs, drawn.weights, max_weight, seen, least_weight)
+        least = 2 if len(self.views) >= MANY_VIEWS else 1
+        opacity = cloud.opacity
+        self._keep(final_points_to_keep(self.dev, max_weight, seen, opacity, self.config, least))
+
+    def _prune_specks(self):
+        """Drop the points of parts that are too small to be of the object."""
+        is_kept = self.model.grid.in_large_parts(self.dev.download(self.model.cloud.ids), SPECK)
+        self._keep(self.dev.upload(np.flatnonzero(is_kept), np.uint32))
 
     def rates(self) -> dict:
         """The learning rates of the last step, for the log."""

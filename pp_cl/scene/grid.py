@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
+from scipy.ndimage import label
 
 from pp_cl.scene.camera import Camera
 
@@ -116,6 +117,20 @@ class Grid:
         ids = np.asarray(ids, np.int64)
         ijk = np.stack([ids % nx, ids // nx % ny, ids // (nx * ny)], -1)
         return np.asarray(self.origin) + self.edge * ijk
+
+    def in_large_parts(self, ids: np.ndarray, least: int) -> np.ndarray:
+        """(N,) bool: which of the vertices with ids (N,) are in a connected part (edges, diagonals)
+        of at least `least`; where there is none, those in the largest.
+        """
+        nx, ny, _ = self.dims
+        ids = np.asarray(ids, np.int64)
+        kji = np.stack([ids // (nx * ny), ids // nx % ny, ids % nx])
+        kji -= kji.min(1, keepdims=True)
+        occupied = np.zeros(kji.max(1) + 1, bool)
+        occupied[tuple(kji)] = True
+        part = label(occupied, np.ones((3, 3, 3)))[0][tuple(kji)]
+        size = np.bincount(part)
+        return size[part] >= min(least, size.max())
 
     def projection(self, camera: Camera) -> np.ndarray:
         """(3, 4) float64: vertex (i, j, k, 1) -> (u w, v w, w), with pixel (u, v) of the camera and

@@ -66,3 +66,14 @@ def test_a_header_of_huge_integers_is_one_of_floats():
     grid = Grid.of_header({"origin": [10**25, 0, -1], "edge": 1, "dims": [2, 3, 4]})
     assert grid == Grid((1e25, 0.0, -1.0), 1.0, (2, 3, 4))
     assert grid.centre.dtype == np.float64 and grid.packed(grid.centre).dtype == np.float32
+
+
+def test_small_parts_are_told_from_large_ones():
+    grid = Grid((0.0, 0.0, 0.0), 1.0, (9, 8, 7))
+    cells = np.zeros((7, 8, 9), bool)
+    cells[0, :3, 0] = cells[1, 3, 1] = True  # four, the last across a corner
+    cells[1, 6, 1:4] = cells[6, 7, 8] = True  # three, one
+    ids = np.flatnonzero(cells)
+    parts = np.array([4, 4, 4, 4, 3, 3, 3, 1])
+    for least, smallest in ((1, 1), (2, 3), (4, 4), (5, 4)):
+        assert (grid.in_large_parts(ids, least) == (parts >= smallest)).all()
