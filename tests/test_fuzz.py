@@ -31,6 +31,7 @@ from support.fuzz_world import (
     strict_json,
     taken,
 )
+from support.sparse import write_model, write_ply, write_some_edits
 
 from pp_cl.cli import COMMANDS
 from pp_cl.config import Config, load_config, sections
@@ -49,12 +50,14 @@ from pp_cl.layers.choice import (
 )
 from pp_cl.metrics.compare import compare
 from pp_cl.metrics.shape import overlap, read_mesh, sample_surface
+from pp_cl.scene.edits import read_edits
 from pp_cl.scene.grid import Grid
 from pp_cl.scene.hull import build_grid, depth_range, spacing_pixels
 from pp_cl.scene.load import find_reader, load_scene
 from pp_cl.scene.masks import MaskRule
 from pp_cl.scene.readers.camera_file import read_cameras
 from pp_cl.scene.readers.frame import frame_keys
+from pp_cl.scene.sparse import sparse_points
 from pp_cl.session import run_config
 from pp_cl.sweep.plan import Job, plan, read_varied
 from pp_cl.sweep.result import finished_row, progress
@@ -140,6 +143,26 @@ def test_a_scene(world, name, data):
             assert view.depth_range is None or 0 < view.depth_range[0] < view.depth_range[1] < 1e300
         if taken(lambda: carve(world.device, views)) and rarely(data.draw, 30):
             train(folder, scene)
+
+
+@fuzzed()
+@given(data=st.data())
+def test_sparse_points_and_edits(world, data):
+    kind = one(data.draw, "ply", "binary", "text")
+    with world.watched() as folder:
+        write_some_edits(folder)
+        if kind == "ply":
+            write_ply(folder)
+        else:
+            write_model(folder / "sparse" / "0", binary=kind == "binary")
+        files = sorted(path for path in folder.rglob("*") if path.stat().st_size)
+        damage.damage_file(data.draw, one(data.draw, *(path for path in files if path.is_file())))
+        edits = taken(lambda: read_edits(folder))
+        assert edits is None or edits.box is None or (edits.box[0] < edits.box[1]).all()
+        if read := taken(lambda: sparse_points(folder)):
+            points, colours = read
+            check_finite(points=points)
+            assert points.shape == colours.shape == (len(points), 3) and colours.dtype == np.uint8
 
 
 def picture(draw, folder):

@@ -70,7 +70,8 @@ def _reductions(run):
         for value in values:
             if (name == "degree" and value >= present.degree) or value == getattr(present, name):
                 continue
-            yield f"{name} {value}", replace(present, **{name: value})
+            what = name if value is True else f"{name} {value}"
+            yield what, replace(present, **{name: value})
 
 
 def line(row: dict[str, Any]) -> str:

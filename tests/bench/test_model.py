@@ -32,9 +32,9 @@ def test_rows_of_two_runs(dev, trained, monkeypatch):
     picked = [views[i * len(views) // min(8, len(views))] for i in range(min(8, len(views)))]
     assert first["psnr"] == pytest.approx(measured_psnr(runs[0], picked))
     assert second["bytes"] < first["bytes"]
-    saved = first["bytes"] - by_name["half True"]["bytes"]
+    saved = first["bytes"] - by_name["half"]["bytes"]
     assert saved == first["points"] * 9 * 16 * 2
-    assert abs(by_name["half True"]["loss"]) < 0.05
+    assert abs(by_name["half"]["loss"]) < 0.05
     assert by_name["keep 0.5"]["points"] == round(first["points"] / 2)
     assert by_name["degree 0"]["bytes"] < by_name["degree 1"]["bytes"] < first["bytes"]
     assert by_name["early_stop 0.03"]["loss"] != 0
@@ -51,4 +51,4 @@ def test_the_command(trained, tmp_path, capsys, monkeypatch):
     assert main(["bench", "model", "--runs", str(trained / "a"), "--json", str(file)]) == 0
     rows = json.loads(file.read_text())["rows"]
     printed = capsys.readouterr().out
-    assert all(row["what"] in printed for row in rows) and rows[1]["what"] == "half True"
+    assert all(row["what"] in printed for row in rows) and rows[1]["what"] == "half"
