@@ -12,6 +12,8 @@ from support.runs import arguments, train_and_interrupt
 from pp_cl import load
 from pp_cl.cli import main
 from pp_cl.files.checkpoint import load_checkpoint
+from pp_cl.scene.grid import Grid
+from pp_cl.train import SPECK
 
 
 def rows(out):
@@ -27,6 +29,7 @@ def test_a_run_learns_and_leaves_its_files(finished):
     assert {"step_000030.png", "step_000060.png"} <= previews and len(previews) <= 3
     header, arrays = load_checkpoint(finished / "checkpoint.npz")
     assert header["finished"] and header["step"] == 60
+    assert Grid.of_header(header["grid"]).in_large_parts(arrays["points.ids"], SPECK).all()
     assert 0 < len(arrays["points.ids"]) < header["initial_points"]
     assert not any(name.startswith(("moment", "state", "average")) for name in arrays)
     assert (np.diff(arrays["points.ids"].astype(np.int64)) > 0).all()
