@@ -86,7 +86,7 @@ def separate_devices() -> list[str]:
     if os.environ.get("PP_DEVICE"):
         return [os.environ["PP_DEVICE"]]
     working = [(i, device) for i, device, problem in list_devices() if problem is None]
-    gpus = {}  # name: {platform: indices}
+    gpus: dict[str, dict[str, list[str]]] = {}  # name: {platform: indices}
     for index, device in working:
         if device.type & cl.device_type.GPU:
             platforms = gpus.setdefault(device.name.strip(), {})
@@ -104,6 +104,8 @@ def _give_cache():
     """
     # pyopencl 2026.1 reads this variable, unset or not, where its cache cannot be written: KeyError
     os.environ.setdefault("PYOPENCL_CACHE_FAILURE_FATAL", "")
+    if sys.platform == "win32":
+        return  # which has caches elsewhere
     folder = os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache")
     try:
         os.makedirs(folder, exist_ok=True)

@@ -56,7 +56,7 @@ def find_drivers() -> dict[str, str]:
     and of Intel's runtime if it came with pp-cl, whose name is its library.
     """
     chosen = next((os.environ[name] for name in CHOSEN if os.environ.get(name)), "")
-    drivers = {}
+    drivers: dict[str, str] = {}
     if sys.platform == "linux" and (not chosen or os.path.isdir(chosen)):
         conda = Path(sys.prefix, "etc/OpenCL/vendors") if in_conda() else None
         places = [Path(chosen)] if chosen else [conda, Path("/etc/OpenCL/vendors")]
@@ -136,17 +136,17 @@ def load(tried: dict[str, list[list[Any]]]) -> list[cl.Platform]:
     harmful = {name for name in drivers if any(row[:2] == ["", ""] for row in tried[name])}
     good = {name: library for name, library in drivers.items() if name not in harmful}
     untouched = {row[0] for rows in tried.values() for row in rows if not row[1] and row[3]}
-    platforms = _platforms(good, alone=bool(harmful))
+    platforms = _platforms(good)
     return [platform for platform in platforms if platform.name.strip() not in untouched]
 
 
-def _platforms(drivers, *, alone):
-    """The platforms of some drivers. alone: the loader is shown no others."""
+def _platforms(drivers):
+    """The platforms of some drivers; the loader is shown no others."""
     runtime = [library for name, library in drivers.items() if library == name]
     rest = [library for name, library in drivers.items() if library != name]
     found = []
     if rest:
-        with _only(rest) if alone and any(rest) else nullcontext(), suppress(cl.Error):
+        with _only(rest) if any(rest) else nullcontext(), suppress(cl.Error):
             found += cl.get_platforms()  # none is an error
     return found + [platform for library in runtime for platform in _direct(library)]
 
@@ -261,7 +261,7 @@ def report(name: str, library: str, first: int, log: str) -> None:
         def say(*line):
             file.write(json.dumps(line) + "\n")
 
-        for i, platform in enumerate(_platforms({name: library}, alone=True)):
+        for i, platform in enumerate(_platforms({name: library})):
             if i >= first:
                 say(i, platform.name.strip())
                 for device in devices_of(platform):

@@ -165,4 +165,4 @@ def test_without_a_driver_nothing_is_listed(monkeypatch):
         raise cl.LogicError("clGetPlatformIDs failed: PLATFORM_NOT_FOUND_KHR")
 
     monkeypatch.setattr(cl, "get_platforms", none)
-    assert drivers._platforms({drivers.REST: ""}, alone=False) == []
+    assert drivers._platforms({drivers.REST: ""}) == []
