@@ -20,7 +20,7 @@ ON_OCLGRIND := OCL_ICD_VENDORS=/usr/lib/oclgrind/liboclgrind-rt-icd.so OCLGRIND_
 	OCLGRIND_NUM_THREADS=1 OCLGRIND_BUILD_OPTIONS="-cl-opt-disable -DALWAYS_INLINE=static" PYOPENCL_NO_CACHE=1 \
 	PP_DEVICE=Oclgrind PP_DATA=/nonexistent
 
-.PHONY: help setup demo test test-slow test-intel bench lint format docs wheel oclgrind gpu-check fuzz faults test-coarse test-gpu-form clean
+.PHONY: help setup demo test test-slow test-intel test-no-unix bench lint format docs wheel oclgrind gpu-check fuzz faults test-coarse test-gpu-form clean
 
 help: ## print this list
 	@sed -n 's/^\([a-z-]*\):.*## \(.*\)/\1	\2/p' Makefile | expand -t 12
@@ -51,6 +51,9 @@ test-coarse: $(READY) ## run the tests of all kernels on PoCL with the coarse di
 	@PYOPENCL_BUILD_OPTIONS=-cl-fast-relaxed-math PP_DEVICE="Portable Computing Language" \
 		$(BIN)/python -m pytest $(ON_ALL_CORES) -m "not large and not exact" $(ARGS) $(sort $(OCLGRIND) tests/device/test_rounding.py)
 
+test-no-unix: $(READY) ## run the tests without fcntl, resource, os.fork and the signals that Windows lacks
+	@PYTHONPATH=$(CURDIR)/tests/support/hidden $(BIN)/python -m pytest $(ON_ALL_CORES) $(ARGS)
+
 # Drivers and kernels work in one way on CPUs and in another on GPUs (pp_cl/device/launch.py).
 test-gpu-form: $(READY) ## run the tests on PoCL with all drivers and kernels working as on GPUs
 	@PP_FORM=gpu PP_DEVICE="Portable Computing Language" $(BIN)/python -m pytest $(ON_ALL_CORES) $(ARGS)
@@ -59,9 +62,10 @@ bench: $(READY) ## time and error of the network and of its layers; ARGS="--size
 	$(BIN)/pp-cl bench unet $(ARGS)
 	$(BIN)/pp-cl bench conv $(ARGS)
 
-lint: $(READY) ## check the Python files (ruff, import-linter) and the format of the kernels (clang-format)
+lint: $(READY) ## check the Python files (ruff, mypy for three systems, import-linter) and the format of the kernels (clang-format)
 	@$(BIN)/ruff check
 	@$(BIN)/ruff format --check
+	@for system in linux win32 darwin; do $(BIN)/mypy --platform $$system || exit; done
 	@$(BIN)/lint-imports --no-logo --no-cache
 	@$(BIN)/clang-format --dry-run --Werror $(KERNELS)
 

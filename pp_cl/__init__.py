@@ -1,29 +1,57 @@
 """pp-cl: PlenopticPoints (VMV 2023) as portable OpenCL kernels with a thin Python driver."""
 
 import importlib
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from pp_cl.device.discover import open_device
+    from pp_cl.errors import UserError
+    from pp_cl.export.formats import export as export_run
+    from pp_cl.files.picture import Picture
+    from pp_cl.run import Run, evaluate_run, load
+    from pp_cl.scene.camera import Camera
+    from pp_cl.scene.load import Scene, load_scene
+    from pp_cl.session import train_scene
 
 __version__ = "0.1.0"
 
-# what `from pp_cl import ...` gives, and the module that is imported for it when it is asked for
+__all__ = [
+    "Camera",
+    "Picture",
+    "Run",
+    "Scene",
+    "UserError",
+    "__version__",
+    "evaluate_run",
+    "export_run",
+    "load",
+    "load_scene",
+    "open_device",
+    "train_scene",
+]
+
+# where each of them is, which is imported when it is asked for
 _MODULES = {
-    "open_device": "pp_cl.device.discover",
-    "train_scene": "pp_cl.session",
-    "load": "pp_cl.run",
-    "load_run": "pp_cl.run",
-    "evaluate_run": "pp_cl.run",
-    "Camera": "pp_cl.scene.camera",
-    "Picture": "pp_cl.files.picture",
-    "UserError": "pp_cl.errors",
+    "Camera": "scene.camera",
+    "Picture": "files.picture",
+    "Run": "run",
+    "Scene": "scene.load",
+    "UserError": "errors",
+    "evaluate_run": "run",
+    "export_run": "export.formats",
+    "load": "run",
+    "load_scene": "scene.load",
+    "open_device": "device.discover",
+    "train_scene": "session",
 }
 
-__all__ = ["__version__", *_MODULES]
 
-
-def __getattr__(name):
+def __getattr__(name: str) -> Any:
     if name not in _MODULES:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    return getattr(importlib.import_module(_MODULES[name]), name)
+    module = importlib.import_module(f"{__name__}.{_MODULES[name]}")
+    return getattr(module, "export" if name == "export_run" else name)
 
 
-def __dir__():
+def __dir__() -> list[str]:
     return sorted({*globals(), *_MODULES})

@@ -1,7 +1,9 @@
 """The presets tiny, small, full and paper, and the short names of settings: data only."""
 
+from typing import Any
+
 # What differs from the defaults in settings.py, which are the tiny preset: minutes on a CPU.
-PRESETS = {
+PRESETS: dict[str, dict[str, Any]] = {
     "tiny": {},
     # for 400 x 400: begins at half the size; 20 minutes on a CPU
     "small": {

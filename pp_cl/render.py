@@ -8,12 +8,12 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 from pyopencl.array import Array
 
-from pp_cl.device.buffers import Buffers, Reading, Table
+from pp_cl.device.buffers import Buffers, Table
 from pp_cl.device.device import Device
 from pp_cl.files.picture import Picture
 from pp_cl.layers.tiles import tiles_hit
@@ -58,10 +58,10 @@ class RenderResult:
     points: ProjectedPoints
     pairs: Pairs
     weights: BlendWeights
-    tiles: Reading[np.ndarray]
-    point_features: Array | None = None
-    features: Array | None = None
-    image: Array | None = None
+    tiles: Any
+    point_features: Any = None
+    features: Any = None
+    image: Any = None
     computed_fraction: float = 1.0
 
     def clamped(self) -> np.ndarray:
@@ -125,7 +125,7 @@ class Renderer:
         UNet.plan_tiles(); called after the wait for the device.
         """
         dev, b, cloud, net = self.dev, self._buffers, self.model.cloud, self.model.net
-        padded, *offset = camera.padded(NETWORK_MULTIPLE)
+        padded, left, top = camera.padded(NETWORK_MULTIPLE)
         size = (padded.height, padded.width)
         b.require(_view_table(cloud.count, size))
         dev.send(b.camera_buffer, self.model.packed(padded, depth_range))
@@ -143,7 +143,7 @@ class Renderer:
                 seed=seed,
             )
         pairs, weights, tiles = self._pairs_and_weights(points, size, gamma, early_stop)
-        result = RenderResult(camera, tuple(offset), size, points, pairs, weights, tiles)
+        result = RenderResult(camera, (left, top), size, points, pairs, weights, tiles)
         if until == "weights":
             return result
         with dev.stage("shade"):
@@ -154,7 +154,7 @@ class Renderer:
         if until == "features":
             return result
         with dev.stage("network"):
-            plan = None
+            plan: Any = None
             if net.is_planned(size):
                 plan = net.plan_tiles(size, tiles.get(), gradient_tiles())
                 result.computed_fraction = plan.computed_fraction

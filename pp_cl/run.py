@@ -112,8 +112,8 @@ class Run:
         return listed
 
     def cameras(self, split: str = "test") -> list[Camera]:
-        """The cameras of a split's views at the resolution of the run. Raises UserError as
-        photographs() does.
+        """The cameras of a split's views at the resolution of the run. Raises UserError where the
+        scene is not there.
         """
         downscale = self.config.scene.downscale
         return [one.camera.downscaled(downscale) for one in self.photographs(split)]
@@ -141,19 +141,19 @@ class Run:
         return centre, float(radius)
 
     def render(self, camera: Camera, *, samples: int = 1, features: bool = False) -> Picture:
-        """The model as the camera sees it.
-
-        samples: a square number of images, shifted by fractions of a pixel, whose mean it is.
-        features: with the network's input. Raises ValueError for another number of samples,
-        UserError as checked() does.
+        """The model as the camera sees it. samples: a square number of images, shifted by fractions
+        of a pixel, whose mean it is. features: with the network's input. Raises ValueError for
+        another number of samples, UserError where the image holds NaN.
         """
         side = math.isqrt(samples)
         if samples < 1 or side * side != samples:
             raise ValueError(f"{samples} samples are no square number")
         shifts = (np.arange(side) + 0.5) / side - 0.5
-        options = {"features": features, "depth_range": self.depth_range(camera)}
+        depths = self.depth_range(camera)
         pictures = [
-            self.renderer.picture(camera.shifted(dx, dy), self.gamma, **options)
+            self.renderer.picture(
+                camera.shifted(dx, dy), self.gamma, features=features, depth_range=depths
+            )
             for dy in shifts
             for dx in shifts
         ]
@@ -210,22 +210,29 @@ def load_run(
     """
     if scene is not None:
         check_scene(scene)
-    folder = RunFolder(folder)
-    config = load_config(folder.config)
+    place = RunFolder(folder)
+    config = load_config(place.config)
     given = [] if tolerance is None else [("network.tolerance", tolerance, "tolerance")]
     configure(config, scene or config.scene.path, given)
-    header, arrays = load_run_state(folder, config)
+    header, arrays = load_run_state(place, config)
     policy = load_policy(dev, config.network.tolerance)
     net = UNet.of_settings(dev, config.network, policy)
     model = Model.load(dev, header, arrays, net, degree=config.points.sh_degree)
-    return Run(dev, folder, config, header, model, policy)
+    return Run(dev, place, config, header, model, policy)
 
 
-def load(folder: Path | str, device: str | None = None) -> Run:
-    """The run in a folder, on a device: as `pp-cl devices` lists them, else the default one. Raises
-    UserError naming the file that is missing or broken.
+def load(
+    folder: Path | str,
+    device: str | None = None,
+    *,
+    scene: str | None = None,
+    tolerance: float | None = None,
+) -> Run:
+    """The run in a folder, finished or not. device: as `pp-cl devices` lists them, else the default
+    one. scene: the folder of its scene, if that has moved. tolerance: in place of its
+    network.tolerance. Raises UserError naming the file that is missing or broken.
     """
-    return load_run(open_device(device), folder)
+    return load_run(open_device(device), folder, scene=scene, tolerance=tolerance)
 
 
 SHOWN_VIEWS = 4  # rows of the comparison image
@@ -258,10 +265,11 @@ def evaluate_run(
     scene: str | None = None,
     out: Path | str | None = None,
 ) -> dict[str, Any]:
-    """evaluate() of the run in a folder. device: as `pp-cl eval --device`; tolerance, scene: as
-    load_run takes them.
+    """Measure the run in a folder as `pp-cl eval` does, into `out`, else into its own folder;
+    returns what metrics.json holds. metrics: out of psnr, ssim, lpips. save_images: write every
+    view, too. device, tolerance, scene: as load() takes them.
     """
-    run = load_run(open_device(device), folder, tolerance=tolerance, scene=scene)
+    run = load(folder, device, tolerance=tolerance, scene=scene)
     return evaluate(run, split, metrics, save_images=save_images, out=out)
 
 
@@ -297,7 +305,8 @@ def evaluate(
     if save_images and (target / "images").exists():
         shutil.rmtree(target / "images")
     files = image_files([view.name for view in views])
-    rows, costs, shown = [], [], []
+    rows: list[dict[str, Any]] = []
+    costs, shown = [], []
     for i, rendered in enumerate(render_views(run, views)):
         image, truth = rendered.image, rendered.truth
         rows.append({"name": rendered.name} | measure(image, truth))

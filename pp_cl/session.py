@@ -393,8 +393,8 @@ def train_scene(
     alone, unless more iterations are asked for than it has.
 
     scene: a folder, or the word demo. device: as `pp-cl train --device`. settings: {"section.key":
-    value}; options: the same by the short names of presets.SHORT, such as iterations. on_step: see
-    Training.run. Raises UserError as `pp-cl train` reports it.
+    value}; options: the same by the names of the command's options, such as iterations.
+    on_step(step, row): called after each step, with its row of the log or None. Raises UserError.
     """
     unknown = set(options) - set(SHORT)
     if unknown:

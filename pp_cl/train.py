@@ -3,6 +3,7 @@ smoothing, EMA, pruning and refining where they are due. session.py has the loop
 """
 
 import warnings
+from typing import Any
 
 import numpy as np
 
@@ -60,7 +61,7 @@ class Trainer:
         self.renderer = Renderer(dev, model, config.raster)
         self.loss = Loss(dev, self.config.ssim_weight, self.config.smooth_l1)
         self.mask_loss = MaskLoss(dev, self.config.mask_weight)
-        self.exposure = None
+        self.exposure: Any = None
         if self.config.exposure != "off":
             self.exposure = Exposure(dev, len(views), self.config.exposure == "on")
         self.perceptual_loss = None
@@ -200,7 +201,8 @@ class Trainer:
         view = self._reduced[index]
         camera = view.camera
         offsets = view.downscale if config.pixel_jitter else 1
-        jitter = tuple(int(p) for p in rng.integers(offsets, size=2))
+        across, down = rng.integers(offsets, size=2)
+        jitter = int(across), int(down)
         if self._crop == 0:
             return index, (0, 0, camera.width, camera.height), jitter
         x0, y0, x1, y1 = self._boxes[index]
@@ -258,7 +260,7 @@ class Trainer:
                 stacklevel=2,
             )
         else:
-            self.exposure = None
+            self.exposure: Any = None
 
     def _smooth(self, rates):
         """Pull every SH coefficient towards the mean of its grid neighbours."""

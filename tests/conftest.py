@@ -34,6 +34,13 @@ settings.register_profile(
 settings.load_profile("short")
 
 
+def pytest_collection_modifyitems(items):
+    """Leave out what needs Unix where this is none."""
+    for item in items if not hasattr(os, "fork") else ():
+        if item.get_closest_marker("unix"):
+            item.add_marker(pytest.mark.skip(reason="needs Unix"))
+
+
 @pytest.fixture(scope="session", autouse=True)
 def cache_of_its_own(tmp_path_factory):
     """What the user has tuned stays unread: a cache folder for the session, with nothing in it but

@@ -15,6 +15,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+
+if not hasattr(os, "fork"):
+    pytest.skip("needs Unix", allow_module_level=True)
+
 from support.faults import (
     Faults,
     content,

@@ -17,6 +17,10 @@ import trimesh
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from PIL import Image
+
+if not hasattr(os, "fork"):
+    pytest.skip("needs Unix", allow_module_level=True)
+
 from support import damage
 from support.damage import one, rarely
 from support.fuzz_world import (

@@ -36,10 +36,9 @@ def test_python_and_the_command_line_train_the_same_bytes(scene, trained, tmp_pa
 
 
 def test_a_run_renders_what_the_evaluation_saves(trained, capsys):
-    from pp_cl import evaluate_run, load_run, open_device
+    from pp_cl import evaluate_run, load
 
-    dev = open_device()
-    run = load_run(dev, trained[1])
+    run = load(trained[1])
     images = [run.render(camera).colour for camera in run.cameras("test")]
     assert all(image.shape == (24, 24, 3) and image.dtype == np.float32 for image in images)
     result = evaluate_run(trained[1], save_images=True)

@@ -4,7 +4,8 @@
 
 A generated part stands between the lines `<!-- table: NAME -->` and `<!-- end table -->` of a
 Markdown file. NAME is `settings` (from pp_cl/settings.py and presets.py), `commands` (from the
-parsers of pp_cl/commands/), or that of a file docs/results/NAME.json, which holds
+parsers of pp_cl/commands/), `api` (from pp_cl's docstrings), or that of a file
+docs/results/NAME.json, which holds
 
     measured   what the numbers are; machine, command, version, commit: how they were obtained
     columns    [{"head": text, "cell": format}]: format is a str.format of the row's keys
@@ -16,7 +17,9 @@ parsers of pp_cl/commands/), or that of a file docs/results/NAME.json, which hol
 import argparse
 import dataclasses
 import importlib
+import inspect
 import json
+import operator
 import re
 import string
 import sys
@@ -24,9 +27,11 @@ from collections import defaultdict
 from collections.abc import Sequence
 from pathlib import Path
 
+import pp_cl
 from pp_cl.cli import COMMANDS
 from pp_cl.config import Config, sections, text_of
 from pp_cl.presets import PRESETS
+from pp_cl.scene.masks import MaskRule
 
 ROOT = Path(__file__).parents[1]
 BLOCK = re.compile(r"^(<!-- table: (\S+) -->\n).*?^(<!-- end table -->)$", re.DOTALL | re.MULTILINE)
@@ -110,6 +115,33 @@ def _command(name: str) -> tuple[str, list[tuple[str, str]]]:
     return module.HELP, [(_written(a), a.help.replace("%%", "%")) for a in parser._actions]
 
 
+def api() -> str:
+    """What `from pp_cl import` gives, in the order of use, by signature and docstring."""
+    names = [
+        "train_scene",
+        "load",
+        "Run.cameras",
+        "Run.render",
+        "Picture",
+        "evaluate_run",
+        "export_run",
+    ]
+    names += ["Camera", "Camera.look_at", "Scene"]
+    return "\n".join(line for name in names for line in _entry(name)).rstrip()
+
+
+def _entry(name: str) -> list[str]:
+    """The call or the class, and the docstring."""
+    thing = operator.attrgetter(name)(pp_cl)
+    written = name
+    if inspect.isroutine(thing):
+        signature = inspect.signature(thing)
+        shown = [p.replace(annotation=p.empty) for p in signature.parameters.values()]
+        shown = [p for p in shown if p.name != "self" and not isinstance(p.default, MaskRule)]
+        written += str(inspect.Signature(shown))
+    return [f"    {written}", "", inspect.getdoc(thing), ""]
+
+
 def _written(action: argparse.Action) -> str:
     """An argument as the command line has it, such as `--seed S`."""
     if action.nargs == 0:
@@ -130,7 +162,7 @@ def read_results(folder: Path) -> dict[str, dict]:
 def read_tables(folder: Path) -> dict[str, str]:
     """{name: Markdown} of all that can be generated; folder: of the results."""
     measured = {name: table(results) for name, results in read_results(folder).items()}
-    return measured | {"settings": settings(), "commands": commands()}
+    return measured | {"settings": settings(), "commands": commands(), "api": api()}
 
 
 def with_tables(text: str, tables: dict[str, str]) -> str:

@@ -1,8 +1,8 @@
 """Makes sure that this virtual environment has a working OpenCL device; `make setup` runs it.
 
 A device counts when a test build runs on it. Tried in turn until one does: what is there already,
-Debian's PoCL (as root), Intel's CPU runtime (x86-64), PyPI's PoCL 3.0. With --intel: Intel's
-runtime, whatever else is there.
+Debian's PoCL (as root), Intel's CPU runtime (x86-64). With --intel: Intel's runtime, whatever else
+is there.
 """
 
 import argparse
@@ -11,17 +11,12 @@ import platform
 import shutil
 import subprocess
 import sys
-from importlib.metadata import PackageNotFoundError, files
-from importlib.util import find_spec
-from pathlib import Path
 
 LIST = """
 from pp_cl.device.discover import list_devices
-for index, device, problem in list_devices():
+for index, device, problem in list_devices(again=True):
     print(index, device.platform.name, device.name, problem or "works")
 """
-INTEL = ("intel-opencl-rt", "intel-cmplr-lib-rt")
-POCL = "pocl-binary-distribution"
 
 
 def devices():
@@ -55,43 +50,10 @@ def install_debian():
         )
 
 
-def pip(*arguments):
-    """Run the pip of this virtual environment."""
-    subprocess.run(
-        [sys.executable, "-m", "pip", "--disable-pip-version-check", "--quiet", *arguments],
-        check=True,
-    )
-
-
 def install_intel():
-    """Intel's CPU runtime, inside the virtual environment."""
-    pip("install", *INTEL)
-    register_intel()
-
-
-def register_intel():
-    """Write the .icd file by which pyopencl's own loader finds Intel's runtime; the one in Intel's
-    wheel has a wrong path.
-
-    The loader of pyopencl's wheels reads pyopencl/.libs besides the system's folder, so no variable
-    needs setting.
-    """
-    library = next(f.locate().resolve() for f in files(INTEL[0]) if f.name == "libintelocl.so")
-    folder = Path(find_spec("pyopencl").origin).parent / ".libs"
-    if folder.is_dir():
-        (folder / "intel-cpu.icd").write_text(f"{library}\n")
-    else:
-        print(
-            f"this pyopencl uses the system's OpenCL loader: set OCL_ICD_VENDORS={library}",
-            file=sys.stderr,
-        )
-
-
-def install_pocl():
-    """PyPI's PoCL 3.0: old, and unknown to it are current processors."""
-    pip("install", POCL)
-    if not works(devices()):
-        pip("uninstall", "--yes", POCL)
+    """Intel's CPU runtime, inside the virtual environment, where pp-cl finds it."""
+    pip = [sys.executable, "-m", "pip", "--disable-pip-version-check", "--quiet"]
+    subprocess.run([*pip, "install", "--editable", ".[cpu]"], check=True)
 
 
 def main():
@@ -108,8 +70,6 @@ def main():
         steps.append(install_debian)
     if platform.machine() == "x86_64":
         steps.append(install_intel)
-    if not only_intel:
-        steps.append(install_pocl)
 
     found = devices()
     for step in steps:
@@ -118,13 +78,13 @@ def main():
         print(f"no working OpenCL device yet; trying: {step.__doc__.splitlines()[0]}", flush=True)
         try:
             step()
-        except (subprocess.CalledProcessError, PackageNotFoundError, StopIteration) as error:
+        except subprocess.CalledProcessError as error:
             print(f"  that did not work: {error}", file=sys.stderr)
         found = devices()
     print("\n".join(found) or "no OpenCL device found")
     if works(found, wanted):
         return 0
-    print("no working OpenCL device: docs/devices.md says how to install one", file=sys.stderr)
+    print("no working OpenCL device: docs/install.md says how to install one", file=sys.stderr)
     return 1
 
 

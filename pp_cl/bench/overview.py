@@ -33,7 +33,8 @@ def bench_overview(
     budget: seconds, which the least of each bench may exceed. tell: called with each line of the
     tables as soon as it is measured.
     """
-    start, result = time.perf_counter(), {}
+    start = time.perf_counter()
+    result: dict[str, Any] = {}
     for name, steps, factor, columns in (
         ("conv", bench_conv(dev, CONV_SIZE, WIDTHS, policy), 1, timing),
         ("unet", network_steps(dev, policy), GROWTH, timing),

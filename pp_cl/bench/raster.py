@@ -135,7 +135,7 @@ def line(row: dict) -> str:
 
 def curves(rows: list[dict]) -> dict[tuple[int, str], list[dict]]:
     """{(side, blend): its rows by number of points}."""
-    found = {}
+    found: dict[tuple[int, str], list[dict]] = {}
     for row in sorted(rows, key=lambda row: row["points"]):
         found.setdefault((row["size"], row["blend"]), []).append(row)
     return found

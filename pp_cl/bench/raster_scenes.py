@@ -4,6 +4,7 @@ sampled pixels.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 from functools import cached_property
 
@@ -43,6 +44,16 @@ class BenchScene:
     """
 
     radius = 0.0015
+    size: int
+    count: int
+    camera: Camera
+    positions: np.ndarray
+    opacity: np.ndarray
+    gamma: float
+    footprint: str
+    depth_range: tuple[float, float]
+    forward: Callable[[str], RenderResult]
+    exact_features: Callable[[np.ndarray], np.ndarray]
 
     def error(self, blend: str, features: np.ndarray) -> float:
         """Largest difference of features (H, W, 16) from float64, over their range, at SAMPLES
@@ -200,7 +211,7 @@ class PulsarScene(BenchScene):
         self.dev, self.size, self.gamma, self.count = dev, size, gamma, n
         self.camera = Camera(np.eye(3, 4), size, size, size / 2, size / 2, size, size)
         self.opacity = np.ones(n, np.float32)
-        self.positions = rng.random((n, 3), np.float32) + np.float32([-0.5, -0.5, 1])
+        self.positions = rng.random((n, 3), np.float32) + np.array([-0.5, -0.5, 1], np.float32)
         self.point_features = rng.random((n, CHANNELS), np.float32)
         self.buffers, self.room = {blend: Buffers(dev) for blend in BLENDS}, 1
         self.camera_buffer = dev.upload(self.camera.packed(self.depth_range))

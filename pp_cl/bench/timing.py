@@ -7,6 +7,7 @@ slows all of them.
 
 import time
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 
@@ -26,15 +27,15 @@ COPY_BYTES = 2**28
 
 
 def interleave(
-    runs: dict[object, Callable], rounds: int | None = None, pause: float = 0.0
-) -> dict[object, list[float]]:
+    runs: dict[Any, Callable], rounds: int | None = None, pause: float = 0.0
+) -> dict[Any, list[float]]:
     """{name: [milliseconds]} of functions that return when their work is done, called in turn,
     after one round unmeasured.
 
     rounds: their number; None = LEAST_ROUNDS to MOST_ROUNDS, within SECONDS. pause: seconds before
     each call, for threads of the previous one that still spin, waiting for work.
     """
-    times = {name: [] for name in runs}
+    times: dict[Any, list[float]] = {name: [] for name in runs}
     for run in runs.values():
         run()
     start, done = time.perf_counter(), 0

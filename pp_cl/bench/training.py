@@ -97,7 +97,8 @@ def bench_step(
     are whole images at the last gamma, dL/dfeatures is random. views: evenly spread over the
     scene's. Times are medians over the views of all rounds; backward_ms includes the update.
     """
-    trainer = _trainer(dev, config, *_open(dev, config), UNet(dev, widths=WIDTHS))
+    scene_views, hull = _open(dev, config)
+    trainer = _trainer(dev, config, scene_views, hull, UNet(dev, widths=WIDTHS))
     cloud, renderer = trainer.model.cloud, trainer.renderer
     opacity = np.random.default_rng(0).uniform(0.3, 1, cloud.count).astype(np.float32)
     cloud.opacity.set(opacity)

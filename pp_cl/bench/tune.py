@@ -10,6 +10,7 @@ from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -83,7 +84,7 @@ class Case:
 
 def network_cases(layers: list[Layer], train_side: int, evaluated_side: int) -> list[Case]:
     """All distinct convolutions of a training step and of an evaluation's picture."""
-    found = {}
+    found: dict[Any, Any] = {}
     for side, training in ((train_side, True), (evaluated_side, False)):
         for layer in convolutions(layers):
             for direction, source in computations(layer, training):
@@ -91,10 +92,13 @@ def network_cases(layers: list[Layer], train_side: int, evaluated_side: int) -> 
                 key = (direction, layer.kernel_size, sources, layer.channels, side >> layer.level)
                 name, count, before = found.get(key, (layer.name, 0, training))
                 found[key] = (name, count + (training == before), before)
-    return [Case(name, *key, count, training) for key, (name, count, training) in found.items()]
+    return [
+        Case(name, direction, k, sources, co, side, count, training)
+        for (direction, k, sources, co, side), (name, count, training) in found.items()
+    ]
 
 
-def time_runs(runs: dict[object, Callable]) -> dict[object, float]:
+def time_runs(runs: dict[Any, Callable]) -> dict[Any, float]:
     """{name: median milliseconds} of functions run in turn; hopeless ones run PROBES times only."""
     times = interleave(runs, rounds=PROBES)
     limit = HOPELESS * min(min(t) for t in times.values())
@@ -158,7 +162,9 @@ def measure(
     found = {name: errors(*conv.result(name, case.direction, tuned))[0] for name in names}
     ms = time_runs(runs)
     first = order[0]
-    again = {name: runs[name] for name in runs if name == first or ms[name] * MARGIN < ms[first]}
+    again: dict[Any, Callable] = {
+        name: runs[name] for name in runs if name == first or ms[name] * MARGIN < ms[first]
+    }
     if tuned.blocking != shipped.blocking:
         again[None] = conv.runner(first, case.direction, shipped)
     if len(again) > 1:
@@ -190,14 +196,17 @@ def run_tune(
         tell(f"blocking of {name}, ms: {', '.join(values)}")
     tell(COLUMNS("layer", "shape", "direction", "milliseconds", "rel. L2", "taken"))
     tuned = _with_blocking(shipped, blocking)
-    rows, shipped_ms, conv, layer = [], [], None, None
+    rows: list[dict] = []
+    shipped_ms: list[float] = []
+    conv: Any = None
+    layer = None
     for case in cases:
         if case.layer != layer:
             conv, layer = None, case.layer  # frees the old one first
             conv = RandomConv(dev, *case.layer)
-        row, ms = measure(case, conv, shipped, tuned)
+        row, as_shipped = measure(case, conv, shipped, tuned)
         rows.append(row)
-        shipped_ms.append(ms)
+        shipped_ms.append(as_shipped)
         tell(_line(dev, tolerance, case, row))
     tuning = {"format": FORMAT, "device": device_key(dev), "tile_shapes": blocking, "rows": rows}
     return tuning, shipped_ms
@@ -261,7 +270,7 @@ def total_times(
     """{"a training step", "a picture of the evaluation": (milliseconds as shipped, as tuned)} of
     the convolutions. Raises UserError where no variant keeps the policy's tolerance.
     """
-    found = {}
+    found: dict[str, tuple[float, float]] = {}
     for case, row, ms in zip(cases, rows, shipped_ms, strict=True):
         what = "a training step" if case.training else "a picture of the evaluation"
         shipped, tuned = found.get(what, (0.0, 0.0))

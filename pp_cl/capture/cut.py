@@ -4,6 +4,7 @@ views share, from the sparse points, then two rounds in which the views vote by 
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from tqdm import tqdm
@@ -48,7 +49,7 @@ class Window:
     camera: Camera
     distortion: Distortion
     place: tuple[int, int, int, int]
-    mask: np.ndarray | None = None
+    mask: Any = None
 
     def pixels(self, positions: np.ndarray) -> np.ndarray:
         """(N, 2) x and y of world positions (N, 3); NaN far outside the image."""
@@ -212,8 +213,8 @@ def _colours(
     rng, drawn = np.random.default_rng(0), []
     each = -(-(SAMPLES**2) // len(windows))
     for wanted in (0, 1):  # the lowest bit of a label says whether it is the object's
-        found = [one.image[label & 1 == wanted] for one, label in zip(windows, labels, strict=True)]
-        found = np.concatenate([f[rng.integers(0, len(f), each)] for f in found if len(f)])
+        of = [one.image[label & 1 == wanted] for one, label in zip(windows, labels, strict=True)]
+        found = np.concatenate([f[rng.integers(0, len(f), each)] for f in of if len(f)])
         drawn.append(found[rng.integers(0, len(found), SAMPLES**2)])
     image = np.concatenate(drawn).reshape(2 * SAMPLES, SAMPLES, 3)
     sure = np.zeros(image.shape[:2], np.uint8)

@@ -131,7 +131,7 @@ def match(database: Path, is_film: bool) -> int:
         listed = database.with_name("pairs.txt")
         while missing:
             some, missing = missing[:PAIRS_AT_ONCE], missing[PAIRS_AT_ONCE:]
-            listed.write_text("".join(f"{a} {b}\n" for a, b in some))
+            listed.write_text("".join(f"{a} {b}\n" for a, b in some), "utf-8")
             colmap.match_image_pairs(
                 database,
                 matching,

@@ -76,14 +76,12 @@ def _aligned(places: list[np.ndarray], pairs: list[Any]) -> tuple[np.ndarray, np
     where most pairs agree, by least squares with weights that fall off.
     """
     rng, count = np.random.default_rng(0), len(places)
-    first, second, one, other = [], [], [], []
+    drawn = []
     for _, i, j, matches in pairs:
         some = matches[rng.permutation(len(matches))[:SAMPLED]]
-        first.append(np.full(len(some), i))
-        second.append(np.full(len(some), j))
-        one.append(places[i][some[:, 0]])
-        other.append(places[j][some[:, 1]])
-    first, second, one, other = map(np.concatenate, (first, second, one, other))
+        ends = np.full(len(some), i), np.full(len(some), j)
+        drawn.append((*ends, places[i][some[:, 0]], places[j][some[:, 1]]))
+    first, second, one, other = map(np.concatenate, zip(*drawn, strict=True))
     rows = np.tile(np.arange(len(one)), 4)
     columns = np.concatenate([first, first + count, second, second + count])
     scales, shifts = np.ones(count, complex), np.zeros(count, complex)

@@ -56,9 +56,11 @@ def run(options: argparse.Namespace) -> None:
     else:
         dev = open_device(options.device)
         given = shared.read_short(options, ("masks", "mask_from")) + options.set
-        facts, *shown = describe_scene(dev, options.subject, options.preset or "tiny", given)
+        facts, views, hull, found = describe_scene(
+            dev, options.subject, options.preset or "tiny", given
+        )
         if options.picture:
-            image = scene_picture(dev, options.subject, facts, *shown)
+            image = scene_picture(dev, options.subject, facts, views, hull, found)
     lines = (_run_lines if is_run else _scene_lines)(facts)
     if image is not None:
         write_png(options.picture, image)

@@ -70,7 +70,7 @@ def run(options: argparse.Namespace) -> None:
     scene = options.scene or load_config(folder.config).scene.path
     config = run_config(folder, scene, options.preset, given, extends=True)
     stored = stored_state(folder, config)
-    if is_finished(stored, config):
+    if stored and is_finished(stored, config):
         print(
             f"{folder} is finished ({stored[0]['step']} steps); `pp-cl eval {folder} --metrics`"
             " measures it"

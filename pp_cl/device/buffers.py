@@ -21,7 +21,7 @@ PIECE_BYTES = 2**26  # that the host reads at a time
 CHANNELS = 16  # words of a row of features
 
 T = TypeVar("T")
-Table = dict[str, tuple[tuple[int, ...], type]]
+Table = dict[str, tuple[tuple[int, ...], Any]]  # {name: (shape, dtype)}
 
 
 def table_bytes(table: Table) -> int:
@@ -74,7 +74,9 @@ class PackedArrays:
     def __init__(self, dev: Device):
         self._dev = dev
         self._rows: list[tuple[tuple[int, ...], type]] = []
-        self._starts, self._whole, self._arrays = [], None, []
+        self._starts: list[int] = []
+        self._arrays: list[Array] = []
+        self._whole: Any = None
 
     def send(
         self, rows: list[tuple[tuple[int, ...], type]], values: Sequence[np.ndarray]
@@ -110,7 +112,9 @@ class Reading(Generic[T]):
     """
 
     def __init__(self, event: cl.Event, values: np.ndarray, convert: Callable[[np.ndarray], T]):
-        self._event, self._values, self._convert = event, values, convert
+        self._event: cl.Event | None = event
+        self._values: Any = values
+        self._convert = convert
 
     def get(self) -> T:
         """The value; waits for the download."""

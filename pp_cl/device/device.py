@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 import pyopencl as cl
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, DTypeLike
 from pyopencl.array import Array
 
 from pp_cl.device.launch import Kernel, Program
@@ -36,7 +36,7 @@ SPILLING_ON_INTEL = frozenset(
 )
 
 
-def vendor_options(info: dict[str, str | int], name: str) -> tuple[str, ...]:
+def vendor_options(info: dict[str, Any], name: str) -> tuple[str, ...]:
     """Options of cl/<name>.cl on devices of one vendor. info: of describe()."""
     intel_gpu = info["type"] == "GPU" and info["platform"].startswith(INTEL_PLATFORM)
     large = intel_gpu and name in SPILLING_ON_INTEL
@@ -68,7 +68,7 @@ def kernel_folder() -> Path:
     return inside if inside.is_dir() else Path(__file__).parents[2] / "cl"
 
 
-def describe(device: cl.Device) -> dict[str, str | int]:
+def describe(device: cl.Device) -> dict[str, Any]:
     """A cl.Device's "name", "platform", "version", "driver", "type", "compute_units",
     "memory_bytes", "max_allocation_bytes", "cache_bytes" (of the last cache) in a dictionary.
     """
@@ -150,14 +150,20 @@ class Device:
         self.has_watchdog = not self.is_cpu and has_watchdog(device)
         self.debug = _debug_level()
         self.context = cl.Context([device])
-        properties = cl.command_queue_properties.PROFILING_ENABLE if self.debug else 0
-        self.queue = cl.CommandQueue(self.context, properties=properties)
+        profiling = cl.command_queue_properties.PROFILING_ENABLE
+        self.queue = (
+            cl.CommandQueue(self.context, properties=profiling)
+            if self.debug
+            else cl.CommandQueue(self.context)
+        )
         self.bytes = self.peak_bytes = 0
-        self._sent = deque()  # events of send()
-        self._scratch = {}  # {name: array} of scratch()
-        self._programs = {}
-        self._seconds = defaultdict(list)
-        self._stage_seconds = defaultdict(list) if self.debug else None
+        self._sent: deque[Any] = deque()  # events of send()
+        self._scratch: dict[Hashable, Any] = {}  # {name: array} of scratch()
+        self._programs: dict[Any, Program] = {}
+        self._seconds: dict[str, list[float]] = defaultdict(list)
+        self._stage_seconds: dict[str, list[float]] | None = None
+        if self.debug:
+            self._stage_seconds = defaultdict(list)
         if self.debug:
             atexit.register(self.print_profile)
 
@@ -192,7 +198,7 @@ class Device:
                     *self.build_options,
                     *vendor_options(self.info, name),
                     "-I",
-                    str(folder),
+                    folder.as_posix(),
                     *macros,
                 ],
                 defines=defines,
@@ -204,7 +210,7 @@ class Device:
                 )
         return self._programs[key]
 
-    def empty(self, shape: int | tuple[int, ...], dtype: type = np.float32) -> Array:
+    def empty(self, shape: int | tuple[int, ...], dtype: DTypeLike = np.float32) -> Array:
         """Uninitialised array on the device; zeros under PP_DEBUG=3, so that its scan sees only
         what kernels wrote.
         """
@@ -402,8 +408,8 @@ class Device:
         """A table on stderr, longest first: passes, median and total time of stages and, at
         PP_DEBUG 1, of kernel files, else of kernels.
         """
-        rows = defaultdict(list)
-        rows |= {f"stage {name}": seconds for name, seconds in self._stage_seconds.items()}
+        rows: dict[str, list[float]] = defaultdict(list)
+        rows |= {f"stage {name}": seconds for name, seconds in (self._stage_seconds or {}).items()}
         for label, seconds in self._seconds.items():
             rows[label if self.debug >= 2 else label.partition(":")[0]] += seconds
         for label, seconds in sorted(rows.items(), key=lambda r: -sum(r[1])):

@@ -2,52 +2,80 @@
 
 import atexit
 import os
+import platform
 import shutil
+import sys
 import tempfile
 import warnings
 
-import numpy as np
 import pyopencl as cl
-import pyopencl.array as cl_array
 
 from pp_cl.device.device import Device
-from pp_cl.device.launch import quiet_compiler
+from pp_cl.device.drivers import (
+    RUNTIME,
+    devices_of,
+    identity,
+    in_conda,
+    left_out,
+    load,
+    runtime_library,
+    try_drivers,
+)
 from pp_cl.errors import UserError
 
-MEND = (
-    "install one with `apt install pocl-opencl-icd` (Debian, Ubuntu), `conda install pocl` or your"
-    " GPU vendor's driver; without root, `make setup` in a checkout puts Intel's CPU runtime into"
-    " .venv"
-)
-
-
 TEMPORARY_CACHE = "pp-cl-cache-"
+UNSEEN = "was not seen when its driver was tried"
 
 
-LEAST_CONSTANT = 64  # bytes of constant memory, which the kernels' tables take
+def mend() -> str:
+    """What to do where nothing works: the one command that brings this system a device."""
+    managers = {
+        "apt-get": "sudo apt install pocl-opencl-icd",
+        "dnf": "sudo dnf install pocl",
+        "pacman": "sudo pacman -S pocl",
+    }
+    found = [command for name, command in managers.items() if shutil.which(name)]
+    intel = platform.machine() in ("x86_64", "AMD64") and sys.platform != "darwin"
+    if intel and not in_conda() and not runtime_library():
+        command = f"pip install {RUNTIME} intel-cmplr-lib-rt"
+    elif found and sys.platform == "linux" and not in_conda():
+        command = found[0]
+    else:
+        command = "conda install -c conda-forge pyopencl pocl"
+    return f"install a driver with `{command}`; docs/install.md names those of GPUs"
 
-# A device is accepted only after this ran on it: PyPI's PoCL 3.0 is listed on current CPUs and
-# fails every build.
-PROBE = "kernel void probe(global float *x) { x[get_global_id(0)] *= 2.0f; }"
 
-
-def list_devices() -> list[tuple[str, cl.Device, str | None]]:
-    """[(index "platform:device", cl.Device, problem or None)] of all OpenCL devices; each is probed
-    with a test build.
+def list_devices(*, again: bool = False) -> list[tuple[str, cl.Device, str | None]]:
+    """[(index "platform:device", cl.Device, problem or None)] of all OpenCL devices whose drivers
+    neither crash nor hang. again: drivers are tried anew, not only those that are not known yet.
     """
     _give_cache()
-    try:
-        platforms = cl.get_platforms()
-    except cl.Error:
-        return []
-    found = []
-    for p, platform in enumerate(platforms):
-        try:
-            devices = platform.get_devices()
-        except cl.Error:
-            continue  # a platform without devices says so with an error
-        found += [(f"{p}:{d}", device, _probe(device)) for d, device in enumerate(devices)]
-    return found
+    tried = try_drivers(again=again)
+    devices = [
+        (f"{p}:{d}", device)
+        for p, found in enumerate(load(tried))
+        for d, device in enumerate(devices_of(found))
+    ]
+    problems = _problems(tried, devices)
+    if not again and UNSEEN in problems:  # another version, or a device more
+        problems = _problems(try_drivers(again=True), devices)
+    return [
+        (index, device, problem) for (index, device), problem in zip(devices, problems, strict=True)
+    ]
+
+
+def _problems(tried, devices):
+    """The problem of each device, of several that are alike in their order."""
+    known = {}
+    for *name, problem in (row for rows in tried.values() for row in rows):
+        known.setdefault(tuple(name), []).append(problem)
+    alike = (known.get(identity(device), []) for _, device in devices)
+    return [problems.pop(0) if problems else UNSEEN for problems in alike]
+
+
+def list_left_out() -> list[tuple[str, str]]:
+    """[(driver, problem)] of the drivers that crash or hang."""
+    return left_out(try_drivers())
 
 
 def separate_devices() -> list[str]:
@@ -58,7 +86,7 @@ def separate_devices() -> list[str]:
     if os.environ.get("PP_DEVICE"):
         return [os.environ["PP_DEVICE"]]
     working = [(i, device) for i, device, problem in list_devices() if problem is None]
-    gpus = {}  # name: {platform: indices}
+    gpus: dict[str, dict[str, list[str]]] = {}  # name: {platform: indices}
     for index, device in working:
         if device.type & cl.device_type.GPU:
             platforms = gpus.setdefault(device.name.strip(), {})
@@ -70,29 +98,14 @@ def separate_devices() -> list[str]:
     return [working[0][0]]
 
 
-def _probe(device):
-    if device.max_constant_buffer_size < LEAST_CONSTANT:
-        return (
-            f"holds {device.max_constant_buffer_size} bytes of constants, {LEAST_CONSTANT} needed"
-        )
-    try:
-        context = cl.Context([device])
-        queue = cl.CommandQueue(context)
-        x = cl_array.to_device(queue, np.arange(4, dtype=np.float32))
-        with quiet_compiler():
-            program = cl.Program(context, PROBE).build()
-        program.probe(queue, (4,), None, x.data)
-        return None if np.array_equal(x.get(), [0, 2, 4, 6]) else "computes a wrong result"
-    except cl.Error as error:
-        return "does not run: " + " ".join(str(error).split())[:160]
-
-
 def _give_cache():
     """Drivers and pyopencl fail where the user's cache cannot be written (containers, service
     accounts): a temporary one.
     """
     # pyopencl 2026.1 reads this variable, unset or not, where its cache cannot be written: KeyError
     os.environ.setdefault("PYOPENCL_CACHE_FAILURE_FATAL", "")
+    if sys.platform == "win32":
+        return  # which has caches elsewhere
     folder = os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache")
     try:
         os.makedirs(folder, exist_ok=True)
@@ -123,13 +136,16 @@ def open_device(choice: str | None = None) -> Device:
         if problem is None:
             return Device(device)
     listed = "; ".join(
-        f"{i} {d.name.strip()} ({d.platform.name.strip()}) {problem or 'works'}"
-        for i, d, problem in found
+        [
+            f"{i} {d.name.strip()} ({d.platform.name.strip()}) {problem or 'works'}"
+            for i, d, problem in found
+        ]
+        + [f"{driver} {problem}" for driver, problem in list_left_out()]
     )
     if choice and not wanted and found:
         raise UserError(f"device {choice!r}: no such OpenCL device; found {listed}")
     asked = f"device {choice!r}: " if choice else ""
-    raise UserError(f"{asked}no working OpenCL device (found {listed or 'none'}): {MEND}")
+    raise UserError(f"{asked}no working OpenCL device (found {listed or 'none'}): {mend()}")
 
 
 def _rank(found, choice):

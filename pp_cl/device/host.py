@@ -1,14 +1,11 @@
 """Memory of the machine that the program runs on."""
 
+import importlib
 import os
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-
-try:
-    import resource
-except ImportError:  # Windows
-    resource = None
+from typing import Any
 
 GROUP = Path("/sys/fs/cgroup")  # of this process, as a container shows it
 PROC = Path("/proc")
@@ -46,6 +43,7 @@ def at_most_more(most: int) -> Iterator[None]:
     a MemoryError, where the system tells what it has.
     """
     mapped = _own_bytes(0)
+    resource = _resource()
     if not mapped or resource is None:
         yield
         return
@@ -56,6 +54,14 @@ def at_most_more(most: int) -> Iterator[None]:
         yield
     finally:
         resource.setrlimit(resource.RLIMIT_AS, (soft, hard))
+
+
+def _resource() -> Any:
+    """The module of that name, which Windows has not."""
+    try:
+        return importlib.import_module("resource")
+    except ImportError:
+        return None
 
 
 def _free_in_group():

@@ -179,8 +179,8 @@ class Kernel:
             )
             for p in parameters
         ]
-        self._checked = set()  # shapes and sizes already found right
-        self._ranges = {}  # {(size, work-group) as given: as enqueued}
+        self._checked: set[Any] = set()  # shapes and sizes already found right
+        self._ranges: dict[Any, Any] = {}  # {(size, work-group) as given: as enqueued}
 
     def arguments(self, values: dict[str, Any]) -> list[Any]:
         """OpenCL arguments in order, from {name: pyopencl Array, number or cl.LocalMemory}. Raises

@@ -41,10 +41,9 @@ def check_target(name: str, folder: Path, out: Path | None) -> Path:
 
 
 def export(run: Run, name: str, path: Path, min_weight: float = 0.0) -> str:
-    """Write a run in the format FORMATS[name]; returns what was written, in words. min_weight: of
-    coloured_points, where the format is one of points.
-
-    Raises UserError for what cannot be written, before which nothing is.
+    """Write a run in the format `name` of `pp-cl export`; returns what was written, in words.
+    min_weight: as --min-weight. Raises UserError for what cannot be written, before which nothing
+    is.
     """
     count = run.model.cloud.count
     if name == "mesh":

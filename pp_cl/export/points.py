@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import plyfile
@@ -102,7 +103,7 @@ def write_ply(path: Path | str, points: ColouredPoints, cloud: PointCloud) -> No
     columns = place_and_colour(points.positions, points.colours)
     columns |= {"opacity": points.opacity, "weight": points.weight}
     for block, array in zip(cloud.blocks, cloud.sh, strict=True):
-        values = np.float32(array.get()[points.rows])
+        values = array.get()[points.rows].astype(np.float32)
         for k in range(block.count):
             order = block.first + k - block.degree**2  # within its degree
             named = {f"feature_{c}_{block.degree}_{order}": values[:, k, c] for c in range(16)}
@@ -134,9 +135,7 @@ def write_glb(path: Path | str, points: ColouredPoints) -> None:
         file.write(data)
 
 
-def glb_data(
-    positions: np.ndarray, make: Callable[[np.ndarray], trimesh.parent.Geometry3D]
-) -> bytes:
+def glb_data(positions: np.ndarray, make: Callable[[np.ndarray], Any]) -> bytes:
     """The GLB file of what make() makes of (M, 3) positions. glTF 2.0 keeps these in float32, so
     those of float64 are moved to the origin, and the file's node moves them back.
     """

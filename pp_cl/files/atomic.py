@@ -5,8 +5,10 @@ import json
 import os
 import re
 import shutil
+import sys
+import time
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager, nullcontext, suppress
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -15,6 +17,7 @@ from platformdirs import user_cache_dir
 from pp_cl.errors import UserError
 
 LEFTOVER = re.compile(r"\..+\.(\d+)\.tmp(\..*)?", re.DOTALL)  # with the number of its process
+READER_SECONDS = 5  # which a viewer takes to read a large checkpoint
 # what file systems say that cannot sync a folder, and folders that may be written, not read
 UNKNOWN_TO_FOLDERS = (
     errno.EINVAL,
@@ -41,12 +44,24 @@ def atomic_file(path: Path | str) -> Iterator[BinaryIO]:
             yield file
             file.flush()
             os.fsync(file.fileno())
-        os.replace(temporary, path)
+        _replace(temporary, path)
         _sync_folder(path.parent)
     except OSError as error:
         raise _refusal(path, error) from error
     finally:
         _remove(temporary)
+
+
+def _replace(temporary, path):
+    """os.replace(), which Windows refuses as long as another process reads what is there."""
+    end = time.monotonic() + (READER_SECONDS if sys.platform == "win32" else 0)
+    while True:
+        try:
+            return os.replace(temporary, path)
+        except PermissionError:
+            if time.monotonic() >= end:
+                raise
+            time.sleep(0.1)
 
 
 def _temporary(path):
@@ -91,7 +106,7 @@ def atomic_path(path: Path) -> Iterator[Path]:
     temporary = path.with_name(f".{path.stem}.{os.getpid()}.tmp{path.suffix}")
     try:
         yield temporary
-        os.replace(temporary, path)
+        _replace(temporary, path)
     except (OSError, RuntimeError) as error:  # libraries in C++ raise the latter
         raise _refusal(path, error) from error
     finally:
@@ -111,7 +126,9 @@ def atomic_folder(folder: Path) -> Iterator[Path]:
     try:
         unfinished.mkdir(parents=True)
         yield unfinished
-        os.replace(unfinished, folder)
+        if folder.is_dir():
+            folder.rmdir()  # it is empty; Windows replaces no folder
+        _replace(unfinished, folder)
     except OSError as error:
         raise _refusal(folder, error) from error
     except UserError as error:
@@ -197,10 +214,12 @@ def remove_leftovers(folder: Path | str) -> None:
         named = LEFTOVER.fullmatch(leftover.name)
         if not named or _lives(int(named[1])):
             continue
-        if leftover.is_dir() and not leftover.is_symlink():
-            shutil.rmtree(leftover)
-        else:
-            leftover.unlink(missing_ok=True)
+        # Windows cannot tell who lives, but refuses what a process has open
+        with suppress(PermissionError) if sys.platform == "win32" else nullcontext():
+            if leftover.is_dir() and not leftover.is_symlink():
+                shutil.rmtree(leftover)
+            else:
+                leftover.unlink(missing_ok=True)
 
 
 def _lives(process):

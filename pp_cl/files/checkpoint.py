@@ -66,7 +66,7 @@ def save_checkpoint(
                 facts = {"descr": kind, "fortran_order": False, "shape": tuple(array.shape)}
                 np.lib.format.write_array_header_1_0(member, facts)
                 for piece in _finite_pieces(name, array):
-                    member.write(np.ascontiguousarray(piece).reshape(-1).view(np.uint8))
+                    member.write(np.ascontiguousarray(piece).reshape(-1).view(np.uint8).data)
 
 
 def check_finite(arrays: Mapping[str, np.ndarray | Rows]) -> None:
@@ -227,8 +227,8 @@ def _refused(path):
 class _Pieces(io.FileIO):
     """An opened file, of which at most MOST_DIRECTORY bytes are read at once."""
 
-    def read(self, size: int = -1) -> bytes:
-        if size > MOST_DIRECTORY:
+    def read(self, size: int | None = -1) -> bytes:
+        if size is not None and size > MOST_DIRECTORY:
             raise ValueError(f"its directory is larger than {MOST_DIRECTORY} bytes")
         return super().read(size)
 

@@ -39,7 +39,7 @@ class Picture:
             return self.colour
         rgba = self.rgba()
         alpha = rgba[..., 3:]
-        return rgba[..., :3] * alpha + (1 - alpha) * np.float32(background)
+        return rgba[..., :3] * alpha + (1 - alpha) * np.asarray(background, np.float32)
 
     def rgba(self) -> np.ndarray:
         """(H, W, 4) float32 in [0, 1]: straight (not premultiplied) colour, and alpha."""
@@ -85,7 +85,7 @@ def mean_picture(pictures: list[Picture]) -> Picture:
     """The mean of several samples of one view; depths and features are those of the first."""
     first = pictures[0]
     colour, alpha = (
-        np.mean([getattr(p, name) for p in pictures], axis=0, dtype=np.float32)
+        np.asarray(np.mean([getattr(p, name) for p in pictures], axis=0, dtype=np.float32))
         for name in ("colour", "alpha")
     )
     return Picture(colour, alpha, first.depth, first.median_depth, first.features)

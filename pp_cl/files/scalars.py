@@ -31,7 +31,7 @@ class Scalars:
     def __init__(self, folder: Path, step: int) -> None:
         make = writer_class()
         self._make = lambda: make(str(folder), purge_step=step)
-        self._writer = None
+        self._writer: Any = None
 
     def __enter__(self) -> "Scalars":
         return self

@@ -21,7 +21,9 @@ def opened_regular(path: Path | str) -> Iterator[BinaryIO]:
     """The opened file. Raises OSError where there is none, or where a folder is in its place, or a
     pipe or a device, which may never end.
     """
-    descriptor = os.open(path, os.O_RDONLY | getattr(os, "O_NONBLOCK", 0))
+    # Windows has no pipes with names in folders, but translates line ends unless told not to
+    flags = getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0)
+    descriptor = os.open(path, os.O_RDONLY | flags)
     if not stat.S_ISREG(os.fstat(descriptor).st_mode):
         os.close(descriptor)
         raise OSError(errno.EINVAL, "Not a regular file", str(path))

@@ -17,6 +17,7 @@ import warnings
 from dataclasses import dataclass, replace
 from pathlib import Path
 from types import ModuleType
+from typing import Any
 
 from pp_cl import __version__
 from pp_cl.device.device import Device
@@ -45,7 +46,7 @@ SHIPPED = {
     "GPU": Blocking((4, 1, (16, 4, 1)), (4, 1, (16, 4, 1)), 6, None),
 }
 # {class of device: {field of Blocking: the values that `pp-cl tune` tries, the shipped one first}}
-CHOICES = {
+CHOICES: dict[str, dict[str, Any]] = {
     "CPU": {
         "winograd": ((64, 8), (32, 8), (128, 8), (64, 4), (64, 2)),
         "winograd_narrow": ((12, 12), (16, 8), (32, 8), (16, 4), (16, 2)),
@@ -168,7 +169,7 @@ class ConvolutionPolicy:
         }
         exact = [name for name in order if errors[name] <= self.tolerance]
         if not exact:
-            best = min(order, key=errors.get)
+            best = min(order, key=lambda name: errors[name])
             known = (
                 "measured on this device"
                 if best in row["rel_l2"]
@@ -269,11 +270,11 @@ def nearest_row(rows: list[dict], shape: ConvShape) -> dict | None:
     return row if distance <= math.log(LARGEST_RATIO) * (1 + 1e-9) else None
 
 
-def fastest(ms: dict, shipped: object) -> object:
+def fastest(ms: dict, shipped: Any) -> Any:
     """The name with the least time; `shipped` where nothing else is faster by more than MARGIN, or
     nothing was timed.
     """
-    best = min(ms, key=ms.get, default=shipped)
+    best = min(ms, key=lambda name: ms[name], default=shipped)
     return best if shipped not in ms or ms[best] * MARGIN < ms[shipped] else shipped
 
 

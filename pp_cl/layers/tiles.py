@@ -45,7 +45,7 @@ def some_tiles(dev: Device, size: tuple[int, int], count: np.ndarray) -> Tiles:
 
     Raises ValueError when no count is above 0.
     """
-    return Tiles(size, np.count_nonzero(count), *map(dev.upload, tile_arrays(size, count)))
+    return Tiles(size, int(np.count_nonzero(count)), *map(dev.upload, tile_arrays(size, count)))
 
 
 def tile_arrays(size: tuple[int, int], count: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

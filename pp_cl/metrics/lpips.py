@@ -7,6 +7,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from itertools import cycle
 from types import ModuleType
+from typing import Any
 
 import numpy as np
 from pyopencl.array import Array
@@ -57,7 +58,8 @@ def size_of(size: Size, block: int) -> Size:
 
 def vgg_layers(widths: tuple[int, ...] = WIDTHS) -> list[VggConv]:
     """The convolutions in the order of the forward pass. widths: channels of the blocks."""
-    layers, ci, source = [], 3, "input"
+    layers: list[VggConv] = []
+    ci, source = 3, "input"
     for block, (convolutions, co) in enumerate(zip(BLOCKS, widths, strict=True)):
         for i in range(convolutions):
             last = i == convolutions - 1
@@ -132,7 +134,7 @@ class Lpips:
         """The device buffers of a network that is trained with, for images of `size`: weights, work
         and tiles, without feature maps.
         """
-        floats = {}
+        floats: dict[str, int] = {}
         for layer in vgg_layers(widths):
             forward, backward = _scratch_floats(dev, policy, layer, size)
             for name, needed in (*forward.items(), *backward.items()):
@@ -140,7 +142,7 @@ class Lpips:
             floats[f"weights of {layer.name}"] = math.prod(layer.weight_shape())
             floats[f"bias of {layer.name}"] = layer.co
             floats[f"transformed weights of {layer.name}"] = forward.get(TRANSFORMED, 0)
-        table = {name: ((number,), np.float32) for name, number in floats.items()}
+        table: Table = {name: ((number,), np.float32) for name, number in floats.items()}
         for block, width in enumerate(widths):
             table[f"head {block}"] = (width,), np.float32
             tiles = all_tiles_buffers(*size_of(size, block))
@@ -168,9 +170,9 @@ class Lpips:
             for name, image in (("a", a), ("b", b))
         ]
         total, place = 0.0, self._place("distance")
-        for block, pair in enumerate(zip(*features, strict=True)):
+        for block, (one, other) in enumerate(zip(*features, strict=True)):
             distance = place("features", size_of((height, width), block))
-            self.compare(block, *pair, distance)
+            self.compare(block, one, other, distance)
             total += float(distance.get().mean(dtype=np.float64))
         return total
 
@@ -234,7 +236,8 @@ class Lpips:
         features(). targets: the features that it is compared with, of each block. place, corner: as
         features() takes them; a gradient of the name "gradient" is computed from the one before.
         """
-        grad, layers = None, vgg_layers(self.widths)[::-1]
+        grad: Any = None
+        layers = vgg_layers(self.widths)[::-1]
         for block in reversed(range(len(BLOCKS))):
             x = maps[f"features{block}"]
             pooled_grad, grad = grad, place("gradient", x.shape)

@@ -1,11 +1,11 @@
 """PSNR, SSIM and LPIPS of 8-bit images, with the settings behind the tables of this field."""
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 from skimage.metrics import structural_similarity
 
-from pp_cl.device.device import Device
 from pp_cl.errors import UserError
 from pp_cl.files.image import to_8bit
 from pp_cl.layers.choice import AUTO, ConvolutionPolicy
@@ -70,7 +70,7 @@ class Metrics:
 
     def __init__(
         self,
-        dev: Device | None,
+        dev: Any,
         names: tuple[str, ...],
         policy: ConvolutionPolicy | None = None,
     ) -> None:

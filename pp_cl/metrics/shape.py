@@ -4,6 +4,7 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import trimesh
@@ -45,7 +46,7 @@ def read_mesh(path: Path | str) -> Mesh:
     try:
         # the warnings are of numbers that are refused below
         with np.errstate(all="ignore"), at_most_more(MULTIPLE * size + BESIDES):
-            mesh = trimesh.load(path, force="mesh", process=False)
+            mesh: Any = trimesh.load(path, force="mesh", process=False)
             made = Mesh(np.array(mesh.vertices, np.float64), np.array(mesh.faces, np.int64))
     except MemoryError:
         raise UserError(
@@ -127,7 +128,7 @@ def sample_surface(
     rows, words = ny * nz, -(-nx // 32)
     bits = dev.zeros((rows, words), np.uint32)
     program = dev.program("metrics/shape", RUN=RUN)
-    buffers = {"area_end": dev.upload(area_end), "corners": dev.upload(corners)}
+    area_end_device, corners_device = dev.upload(area_end), dev.upload(corners)
     for first in range(0, samples, LAUNCH):
         count = min(LAUNCH, samples - first)
         program.launch(
@@ -142,7 +143,8 @@ def sample_surface(
             nz=nz,
             words=words,
             bits=bits,
-            **buffers,
+            area_end=area_end_device,
+            corners=corners_device,
         )
         dev.finish()
         advance(count)

@@ -11,7 +11,7 @@ upsampling weights of a pixel add up to 1, so they commute, bias included, and i
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 
@@ -143,7 +143,7 @@ def computations(layer: Layer, training: bool) -> list[tuple[Direction, int | No
     """(direction, input or None) of all that is computed for a convolution: forward, and for
     training the gradients of its weights and of each input.
     """
-    found = [(Direction.FORWARD, None)]
+    found: list[tuple[Direction, int | None]] = [(Direction.FORWARD, None)]
     if training:
         found.append((Direction.BACKWARD_WEIGHTS, None))
         found += [(Direction.BACKWARD_INPUT, i) for i in range(len(layer.sources))]
@@ -154,7 +154,7 @@ def parameter_table(layers: list[Layer]) -> Table:
     """{name: (shape, dtype)} of the parameters: "enc0.a.weight" (ceil(CO/16), K, K, CI, 16),
     "enc0.a.bias" (ceil(CO/16) * 16,), ...
     """
-    table = {}
+    table: Table = {}
     for layer in convolutions(layers):
         co, ci, k, _ = layer.weight_shape()
         blocks = -(-co // VECTOR)
@@ -205,7 +205,7 @@ def lifetimes(layers: list[Layer], training: bool) -> list[tuple[str, int, int]]
             read = layer.inputs if layer.reads_input_backward else ()
             written = [gradient_of(name) for name in layer.inputs]
             schedule.append((*read, gradient_of(layer.name), *written))
-    found = {}
+    found: dict[str, Any] = {}
     for time, names in enumerate(schedule):
         for name in names:
             found[name] = (found.get(name, (time,))[0], time)
@@ -234,7 +234,7 @@ def share_buffers(
     lifetimes: [(name, first, last)] by first use. An array takes the free buffer that fits it best;
     if none is large enough, the largest free one grows.
     """
-    buffers = []
+    buffers: list[SharedBuffer] = []
     for name, first, last in lifetimes:
         floats = math.prod(shapes[name])
         free = [b for b in buffers if b.free_from <= first]

@@ -4,6 +4,7 @@ launch the kernels layer by layer.
 
 import math
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 from pyopencl.array import Array
@@ -54,10 +55,10 @@ class FeatureMaps:
 
     def __init__(self, dev: Device, layers: list[Layer], training: bool):
         self.dev, self.layers, self.training = dev, layers, training
-        self.size: tuple[int, int] | None = None
+        self.size: Any = None  # (height, width)
         self.arrays: dict[str, Array] = {}
-        self._buffers: list[Array | None] = []
-        self._all_tiles = None
+        self._buffers: list[Any] = []
+        self._all_tiles: AllTiles | None = None
 
     def resize(self, size: tuple[int, int]) -> None:
         """Make room for images of this size, in the same buffers where they are large enough:
@@ -127,11 +128,13 @@ class UNet:
         table = parameter_table(self.layers)
         self.gradients = {name: dev.zeros(*row) for name, row in table.items()}
         self._relu_outputs = {layer.name for layer in self.layers if layer.relu}
-        self._maps = {}  # {training: FeatureMaps}
-        self._modules = {}  # {(policy, layer, direction, source, size): module of a convolution}
+        self._maps: dict[bool, FeatureMaps] = {}  # {training: FeatureMaps}
+        self._modules: dict[
+            Any, Any
+        ] = {}  # of a convolution: {(policy, layer, direction, source, size): module}
         self._tile_lists = {name: PackedArrays(dev) for name in ("forward", "backward")}
-        self._trained = None  # (size, arrays, tiles) of the last forward(training=True)
-        self._frozen = None  # {(layer, module): weights} once frozen
+        self._trained: Any = None  # (size, arrays, tiles) of the last forward(training=True)
+        self._frozen: dict[Any, Array] | None = None  # {(layer, module): weights} once frozen
 
     @classmethod
     def of_settings(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -47,12 +48,12 @@ def sh_blocks(degree: int) -> tuple[ShBlock, ...]:
     return tuple(block for block in SH_BLOCKS if block.degree <= degree)
 
 
-def stored_degree(sh: list[Array]) -> int:
+def stored_degree(sh: Sequence[Array]) -> int:
     """The highest degree of coefficients in arrays of the first SH_BLOCKS."""
     return SH_BLOCKS[len(sh) - 1].degree
 
 
-def four_blocks(sh: list[Array]) -> list[Array]:
+def four_blocks(sh: Sequence[Array]) -> list[Array]:
     """Four arrays for a kernel's arguments. Where the degree is lower, the first one takes the
     place of the missing ones, which a kernel built for that degree does not read.
     """

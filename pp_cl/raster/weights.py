@@ -5,6 +5,7 @@ list of visible points, and each point's highest weight for pruning.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from pyopencl.array import Array
@@ -38,7 +39,7 @@ class BlendWeights:
     pair_role: Array
     pixel_entry: Array
     shaded_list: Reading[Array]
-    transmittance: Array | None
+    transmittance: Any
 
     @property
     def shaded(self) -> Array:

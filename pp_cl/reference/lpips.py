@@ -1,5 +1,7 @@
 """Float64 numpy twin of LPIPS v0.1 with VGG16."""
 
+from typing import Any
+
 import numpy as np
 
 from pp_cl.reference.network import convolution, flipped
@@ -78,7 +80,7 @@ def lpips_gradient(a: np.ndarray, b: np.ndarray, weights: Weights) -> np.ndarray
     """Gradient of lpips(a, b, weights) by a, (H, W, 3)."""
     (inputs, features_a), (_, features_b) = _features(a, weights), _features(b, weights)
     layer = len(inputs)
-    grad = None
+    grad: Any = None
     for block in reversed(range(len(BLOCKS))):
         x, y = features_a[block], features_b[block]
         here = pixel_distance_gradient(x, y, weights[f"head{block}"]) / (x.shape[0] * x.shape[1])

@@ -1,6 +1,7 @@
 """Float64 convolutions and U-Nets in numpy: what `pp-cl bench` measures errors against."""
 
 from collections import defaultdict
+from typing import Any
 
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
@@ -113,7 +114,8 @@ def network_gradients(
     about that, and one such place weighs more than the rounding of all others: pass those of the
     network that is to be judged.
     """
-    gradients, grads = {}, defaultdict(float)  # of parameters; of outputs, summed over their uses
+    gradients: dict[str, Any] = {}  # of parameters
+    grads: dict[str, Any] = defaultdict(float)  # of outputs, summed over their uses
     grads[layers[-1].name] = 0.5 * np.asarray(grad_image, np.float64)
     for layer in reversed(layers):
         grad = grads.pop(layer.name)

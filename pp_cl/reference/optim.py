@@ -71,7 +71,7 @@ def smoothed(
     old = np.asarray(values, np.float64)
     new = old.copy()
     for i, around in enumerate(neighbours(ids, dims)):
-        around = [j for j in around if j is not None]
-        if around:
-            new[i] += amount * (old[around].mean(axis=0) - old[i])
+        known = [j for j in around if j is not None]
+        if known:
+            new[i] += amount * (old[known].mean(axis=0) - old[i])
     return new

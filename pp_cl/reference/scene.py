@@ -17,7 +17,7 @@ ECLIPTIC = np.cos(np.pi / 3) * MERIDIAN + np.sin(np.pi / 3) * WHEEL_V
 
 def dilated_mask(alpha: np.ndarray, threshold: int) -> np.ndarray:
     """(H, W) bool: some pixel of the 3x3 neighbourhood has an alpha above the threshold."""
-    return sliding_window_view(np.pad(alpha > threshold, 1), (3, 3)).any((2, 3))
+    return np.asarray(sliding_window_view(np.pad(alpha > threshold, 1), (3, 3)).any((2, 3)))
 
 
 def kept(
@@ -132,5 +132,5 @@ def coverage(camera: Any) -> tuple[np.ndarray, np.ndarray]:
         closest[marching] = np.minimum(closest[marching], d)
         t[marching] += d
         marching = marching[(d > 1e-5) & (t[marching] < 8)]
-    closest = closest.reshape(camera.height, 4, camera.width, 4)
-    return (closest < 4e-4).mean((1, 3)), (closest <= 1e-5).mean((1, 3))
+    tiles = closest.reshape(camera.height, 4, camera.width, 4)
+    return (tiles < 4e-4).mean((1, 3)), (tiles <= 1e-5).mean((1, 3))

@@ -67,9 +67,9 @@ def explain_empty_hull(views: Sequence[View], box: np.ndarray) -> str:
             f"{listing(names)}: the mask rejects every place that the other views agree on: check"
             " its alpha and its camera"
         )
-    names = listing([view.name for view in views])
     return (
-        f"{names}: the masks leave no point, at most {agreeing} of {len(views)} meet in one place:"
+        f"{listing([view.name for view in views])}: the masks leave no point, at most {agreeing} of"
+        f" {len(views)} meet in one place:"
         " check the masks and the camera poses (camera-to-world; in transforms files x right, y"
         " up, z backward)"
     )

@@ -38,7 +38,7 @@ class Camera:
     ) -> "Camera":
         """A camera at `eye` whose image shows `target` in its centre, the principal point.
 
-        up: as in the function look_at. fy: fx if not given.
+        up: world direction that points up in the image. fy: fx if not given.
         """
         pose = look_at(eye, target, up)
         return cls(pose, fx, fx if fy is None else fy, width / 2, height / 2, width, height)
@@ -120,6 +120,6 @@ def look_at(eye: ArrayLike, target: ArrayLike, up: ArrayLike = (0.0, 0.0, 1.0)) 
     up: world direction, not parallel to the line of sight, that points up in the image.
     """
     forward = np.subtract(target, eye) / np.linalg.norm(np.subtract(target, eye))
-    right = np.cross(forward, up)
+    right = np.cross(forward, np.asarray(up))
     right /= np.linalg.norm(right)
     return np.column_stack([right, np.cross(forward, right), forward, eye])

@@ -45,12 +45,11 @@ class Surroundings:
         self.centre = (points.min(axis=0) + points.max(axis=0)) / 2
         step = max(1, len(points) // SAMPLED_POINTS)
         self._points = points[::step] - self.centre
-        first, *offsets = (camera.eye - self.centre for camera in cameras)
-        offsets = np.array([first, *offsets])
+        offsets = np.array([camera.eye - self.centre for camera in cameras])
         self.distance = float(np.median(np.linalg.norm(offsets, axis=1)))
         heights = offsets @ self.up / np.linalg.norm(offsets, axis=1)
         self.elevations = np.clip(np.arcsin(np.clip(heights, -1, 1)), -HIGHEST, HIGHEST)
-        self._ahead = _unit(first - first @ self.up * self.up, self.up)
+        self._ahead = _unit(offsets[0] - offsets[0] @ self.up * self.up, self.up)
         self._aside = np.cross(self.up, self._ahead)
 
     def orbit(self, camera: Camera, frames: int) -> list[Camera]:

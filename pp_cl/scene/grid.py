@@ -21,9 +21,9 @@ class Grid:
     along x, y and z.
     """
 
-    origin: tuple[float, float, float]
+    origin: tuple[float, ...]
     edge: float
-    dims: tuple[int, int, int]
+    dims: tuple[int, ...]
 
     @classmethod
     def centred_in(cls, box: np.ndarray, edge: float) -> "Grid":
@@ -67,13 +67,13 @@ class Grid:
         nx, ny, _ = self.dims
         ids = np.asarray(ids, np.int64)
         i, j, k = ids % nx, ids // nx % ny, ids // (nx * ny)
-        found = [
+        corners = [
             2 * i + a + 2 * nx * (2 * j + b + 2 * ny * (2 * k + c))
             for c in (0, 1)
             for b in (0, 1)
             for a in (0, 1)
         ]
-        found = np.concatenate(found)
+        found = np.concatenate(corners)
         order = np.argsort(found)
         return found[order].astype(np.uint32), (order % len(ids)).astype(np.uint32)
 

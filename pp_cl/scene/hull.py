@@ -3,7 +3,7 @@
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from pyopencl.array import Array
@@ -349,7 +349,8 @@ def agreeing(dev: Device, views: Sequence[View], box: np.ndarray | None = None) 
     Where all do a little, masks are wrong here and there: then as many are forgiven as it takes.
     box: as build_grid() takes it. Raises UserError as build_grid() does.
     """
-    kept, left_out = list(views), {}
+    kept = list(views)
+    left_out: dict[str, Any] = {}
     if not kept[0].has_mask or _shares_beside(dev, kept, box, 0).max() <= MOST_BESIDE / 2:
         return Agreement(kept, left_out, 0)
     most = len(kept) // FORGIVING

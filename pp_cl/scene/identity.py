@@ -19,7 +19,7 @@ MOST_SIDE, MOST_NUMBER = 2**24, 1e30  # what float32 holds as whole numbers, and
 
 def pixel_digest(image: np.ndarray) -> str:
     """Hex digest of the pixels of a uint8 image, its mask among them."""
-    return hashlib.sha256(np.ascontiguousarray(image)).hexdigest()[:DIGITS]
+    return hashlib.sha256(np.ascontiguousarray(image).data).hexdigest()[:DIGITS]
 
 
 def identity(views: Sequence[View]) -> dict[str, Any]:
@@ -37,7 +37,7 @@ def packed_camera(camera: Camera, depth_range: tuple[float, float] | None = None
     """A camera and its depth range as text: float64, half as long as in JSON's digits."""
     numbers = [camera.fx, camera.fy, camera.cx, camera.cy, camera.width, camera.height]
     numbers = [*camera.pose.ravel(), *numbers, *(depth_range or ())]
-    return base64.b64encode(np.array(numbers, "<f8")).decode()
+    return base64.b64encode(np.array(numbers, "<f8").data).decode()
 
 
 def kept_views(views: Any) -> list[Photograph]:

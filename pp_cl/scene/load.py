@@ -4,7 +4,7 @@ READERS knows, or made by the program.
 
 import os
 import warnings
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence, Set
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -93,8 +93,8 @@ def open_scene(
     """
     path, downscale = config.scene.path, config.scene.downscale
     if path == DEMO:
-        views = {split: demo.demo_views(dev, split, most) for split in splits}
-        return Scene(DEMO, None, views).reduced(downscale)
+        rendered = {split: demo.demo_views(dev, split, most) for split in splits}
+        return Scene(DEMO, None, rendered).reduced(downscale)
     scene = load_scene(path, splits, most, mask_rule(config), downscale=downscale, listed=listed)
     views = scene.splits.get("train", [])
     is_box_wanted = most is not None or config.scene.mask_from == "box"
@@ -138,7 +138,7 @@ def scene_format(path: str) -> str:
     return DEMO if path == DEMO else find_reader(path).__name__.rpartition(".")[2]
 
 
-def scene_splits(path: str) -> list[str]:
+def scene_splits(path: Path | str) -> list[str]:
     """The names of a scene's splits. Raises UserError where there is no scene."""
     return list(demo.SPLITS) if path == DEMO else find_reader(path).splits(Path(path))
 
@@ -155,7 +155,8 @@ def scene_frames(
     present = reader.splits(folder)
     if split not in present:
         raise UserError(f"{folder}: no split {split}; its splits are {', '.join(present)}")
-    photographs, dropped = reader.read_split(folder, split), frozenset()
+    photographs = reader.read_split(folder, split)
+    dropped: Set[str] = frozenset()
     if edited:
         dropped = read_edits(folder).dropped
         photographs = [one for one in photographs if one.name not in dropped]
@@ -269,8 +270,9 @@ def load_scene(
     chosen = {s: evenly(listed.get(s) or scene_frames(folder, s), most) for s in splits}
     photographs = [one for some in chosen.values() for one in some]
     _check_alike(folder, photographs)
-    for one in photographs if downscale else ():
-        check_downscale(one.name, one.camera, downscale)
+    if downscale:
+        for one in photographs:
+            check_downscale(one.name, one.camera, downscale)
     factor = shrink_factor(_sizes(photographs), downscale or 1)
     with ThreadPoolExecutor(reading(photographs, masks)[0]) as pool:
         found = pool.map(lambda one: _read_view(folder, one, masks, factor), photographs)

@@ -2,6 +2,8 @@
 white.
 """
 
+from typing import Any
+
 import numpy as np
 from pyopencl.array import Array
 
@@ -20,7 +22,8 @@ class Target:
     def __init__(self, dev: Device):
         self.dev = dev
         self.program = dev.program("scene/target")
-        self._view = self._image = None  # the view loaded, and its image on the device
+        self._view: Any = None  # the View loaded, and its image on the device
+        self._image: Any = None
         self._buffers = Buffers(dev)
 
     def load(self, view: View) -> None:

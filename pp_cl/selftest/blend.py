@@ -4,6 +4,7 @@ gradients, and where a naive formula overflows, divides by zero or hangs.
 
 from collections.abc import Iterator
 from functools import partial
+from typing import Any
 
 import numpy as np
 
@@ -66,7 +67,7 @@ def _forward(rule: str, kind: str, dev: Device, rng: np.random.Generator) -> Ite
 
 def _backward(rule: str, kind: str, dev: Device, rng: np.random.Generator) -> Iterator[Check]:
     for gamma, mean, tracked in ((0.1, False, 0), (0.01, False, 3), (0.01, True, 0)):
-        options = {"mean": mean, "max_tracked": tracked, "rule": rule}
+        options: dict[str, Any] = {"mean": mean, "max_tracked": tracked, "rule": rule}
         blended = Blended(dev, rng, kind=kind, gamma=gamma, **options)
         gradients, expected = blended.gradients(), blended.reference_gradients(tracked, mean)
         yield relative(gradients["features"], expected[0], GRADIENT)
@@ -78,9 +79,9 @@ def _backward(rule: str, kind: str, dev: Device, rng: np.random.Generator) -> It
 def _check_blended(blended: Blended) -> Iterator[Check]:
     expected = dense.features(blended.blend, blended.point_features)
     yield relative(blended.features, expected, GRADIENT)
-    gradients, expected = blended.gradients(), blended.reference_gradients()
-    yield relative(gradients["features"], expected[0], GRADIENT)
-    yield relative(gradients["opacity"], expected[1], GRADIENT)
+    gradients, references = blended.gradients(), blended.reference_gradients()
+    yield relative(gradients["features"], references[0], GRADIENT)
+    yield relative(gradients["opacity"], references[1], GRADIENT)
 
 
 def _sizes(rule: str, dev: Device, rng: np.random.Generator) -> Iterator[Check]:
@@ -92,7 +93,7 @@ def _sizes(rule: str, dev: Device, rng: np.random.Generator) -> Iterator[Check]:
 def _early_stop(rule: str, dev: Device, rng: np.random.Generator) -> Iterator[Check]:
     """Nothing in front of the stop is dropped, all behind it is."""
     for stop in (0.001, 0.05, 0.5):
-        options = {"gamma": 0.02, "radius": 0.4, "rule": rule, "early_stop": stop}
+        options: dict[str, Any] = {"gamma": 0.02, "radius": 0.4, "rule": rule, "early_stop": stop}
         blended = Blended(dev, rng, 500, **options)
         hit, kept = blended.geometry["hit"], blended.blend["hit"]
         yield exact(hit & (blended.role == DROPPED), hit & ~kept)
@@ -103,7 +104,7 @@ def _early_stop(rule: str, dev: Device, rng: np.random.Generator) -> Iterator[Ch
 def _zero_opacity(rule: str, dev: Device, rng: np.random.Generator) -> Iterator[Check]:
     """The picture is the background; every opacity has a gradient by which it can come back."""
     for gamma, stop in ((0.1, 0.0), (0.01, 0.0), (1e-5, 0.0), (0.1, 1e-3)):
-        options = {"rule": rule, "early_stop": stop}
+        options: dict[str, Any] = {"rule": rule, "early_stop": stop}
         scene, weight = blend_on_axis(dev, [0.9, 0.5, 0.2], [0.0] * 3, gamma, **options)
         yield exact(weight, np.zeros(3))
         yield exact(scene.features.get(), np.ones((1, 1, 16)))
@@ -119,9 +120,9 @@ def _zero_opacity(rule: str, dev: Device, rng: np.random.Generator) -> Iterator[
 def _spheres(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
     """Gradients of positions and radii, against finite differences; one sphere is below a pixel."""
     camera, n, gamma = make_camera(), 30, 0.1
-    positions, radius = make_points(rng, n), np.float32(rng.uniform(0.05, 0.5, n))
+    positions, radius = make_points(rng, n), rng.uniform(0.05, 0.5, n).astype(np.float32)
     positions[-1], radius[-1] = 0, 0.01
-    opacity, features = np.float32(rng.uniform(0, 1, n)), rng.normal(size=(n, 16))
+    opacity, features = rng.uniform(0, 1, n).astype(np.float32), rng.normal(size=(n, 16))
     scene = PairedPoints(dev, camera, positions, radius, kind="sphere")
     hit, grad = scene.hits(), rng.normal(size=(camera.width * camera.height, 16))
     for rule in BLENDS:
@@ -145,7 +146,7 @@ def _smallest_gamma(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
     for opacity in (1.0, 0.3, 1e-3, 1e-38):
         scene, weight = blend_on_axis(dev, [0.9, 0.8, 0.1], [opacity] * 3, 1e-5)
         yield finite(*scene.gradients(np.ones((1, 1, 16))).values())
-        expected = dense.blend(scene.geometry(), [np.float32(opacity)] * 3, 1e-5)["weight"]
+        expected = dense.blend(scene.geometry(), np.full(3, opacity, np.float32), 1e-5)["weight"]
         yield each(weight, expected[:, 0], 1e-2, floor=1e-28)
 
 
@@ -201,7 +202,7 @@ def _equal_depths_softmax(dev: Device, rng: np.random.Generator) -> Iterator[Che
 
 
 def _many_hits(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
-    z, opacity = rng.uniform(0.1, 0.99, 20_000), np.float32(rng.uniform(0, 1, 20_000))
+    z, opacity = rng.uniform(0.1, 0.99, 20_000), rng.uniform(0, 1, 20_000).astype(np.float32)
     for gamma in (0.1, 0.01):
         scene, weight = blend_on_axis(dev, z, opacity, gamma)
         blend = dense.blend(scene.geometry(), opacity, gamma)
@@ -254,12 +255,12 @@ def _empty(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
 
 def _gradient_of_alpha(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
     """One of alpha is one of a feature that is 0 in all points, since the background's is 1."""
-    for options in ({"early_stop": 0.0}, {"early_stop": 0.05}):
-        blended = Blended(dev, rng, rule="alpha", **options)
+    for stop in (0.0, 0.05):
+        blended = Blended(dev, rng, rule="alpha", early_stop=stop)
         grad_alpha = rng.normal(size=len(blended.grad))
         blended.point_features[:, 15] = 0
         features = blended.point_features
-        blended.scene.blend(blended.opacity, 0.1, features, rule="alpha", **options)
+        blended.scene.blend(blended.opacity, 0.1, features, rule="alpha", early_stop=stop)
         blended.grad[:, 15] = -grad_alpha
         expected = blended.reference_gradients()
         blended.grad[:, 15] = 0
@@ -277,7 +278,7 @@ def _spread(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
         (33, 0, 0.0, True),
         (31, 0, 0.0, False),
     ):
-        options = {"max_tracked": tracked, "early_stop": stop, "mean": mean}
+        options: dict[str, Any] = {"max_tracked": tracked, "early_stop": stop, "mean": mean}
         blended = Blended(dev, rng, n, rule="alpha", **options)
         blended.grad[:] = 0
         expected = blended.reference_gradients(tracked, mean, spread_weight=3.0)[1]
@@ -312,7 +313,7 @@ def _equal_depths_alpha(dev: Device, rng: np.random.Generator) -> Iterator[Check
 
 def _underflow(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
     """20000 hits: the transmittance falls below the smallest number, with nothing not finite."""
-    z, opacity = rng.uniform(0.1, 0.99, 20_000), np.float32(rng.uniform(0, 1, 20_000))
+    z, opacity = rng.uniform(0.1, 0.99, 20_000), rng.uniform(0, 1, 20_000).astype(np.float32)
     order = np.argsort(-z)
     through = np.concatenate([[1], np.cumprod(1 - opacity[order].astype(np.float64))[:-1]])
     for least in (0.0, 1e-3):

@@ -148,12 +148,14 @@ def _exposure(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
         prediction = rng.random((side + 3, 36, 3))
         inside = prediction[top : top + side, left : left + 29] - (1 - alpha[..., None])
         photograph = rng.uniform(0.5, 1.5, 3) * inside + (1 - alpha[..., None])
-        images = [dev.upload(image, np.float32) for image in (prediction, photograph, alpha)]
-        target = exposure.target(view, *images[1:]).get()
+        shown_as, shot, mask = (
+            dev.upload(image, np.float32) for image in (prediction, photograph, alpha)
+        )
+        target = exposure.target(view, shot, mask).get()
         gains = exposure.state.get()[:, :, 3].astype(np.float64)
         expected = (photograph - (1 - alpha[..., None])) / gains[view] + (1 - alpha[..., None])
         yield relative(target, expected, 8 * EPS)
-        exposure.fit(view, *images, (left, top))
+        exposure.fit(view, shown_as, shot, mask, (left, top))
         weighted = alpha[..., None] * inside
         shown = photograph - 1 + alpha[..., None]
         sums = [(weighted * shown).sum((0, 1)), (weighted * inside).sum((0, 1))]
@@ -172,12 +174,12 @@ def _perceptual_loss(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
         target = rng.uniform(0, 1, (*size, 3))
         prediction = target + rng.normal(0, 0.2, target.shape)
         loss = PerceptualLoss(dev, 0.3, make_policy(dev, variant="direct"), weights)
-        images = [dev.upload(image, np.float32) for image in (prediction, target)]
+        one, other = (dev.upload(image, np.float32) for image in (prediction, target))
         grad = dev.zeros(target.shape)
-        distances = loss.add_gradient(*images, (0, 0), grad).get()
-        given = [image.get().astype(np.float64) for image in images]
-        yield relative(distances.sum(dtype=np.float64), lpips(*given, weights), DEEP)
-        yield relative(grad.get(), 0.3 * lpips_gradient(*given, weights), DEEP)
+        distances = loss.add_gradient(one, other, (0, 0), grad).get()
+        a, b = (image.get().astype(np.float64) for image in (one, other))
+        yield relative(distances.sum(dtype=np.float64), lpips(a, b, weights), DEEP)
+        yield relative(grad.get(), 0.3 * lpips_gradient(a, b, weights), DEEP)
 
 
 CASES = (

@@ -1,6 +1,7 @@
 """Cases of the metrics: LPIPS, and points against a mesh."""
 
 from collections.abc import Iterator
+from typing import Any
 
 import numpy as np
 
@@ -49,8 +50,8 @@ def _distance(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
             head = rng.uniform(0, 1, channels).astype(np.float32)
             exact_a, exact_b, exact_head = (v.astype(np.float64) for v in (a, b, head))
             distance, grad_a = dev.empty((n,)), dev.empty((n, channels))
-            arrays = {"a": dev.upload(a), "b": dev.upload(b), "head": dev.upload(head)}
-            arrays |= {"n": n, "c": channels}
+            arrays: dict[str, Any] = {"a": dev.upload(a), "b": dev.upload(b), "n": n, "c": channels}
+            arrays["head"] = dev.upload(head)
             program, ranges = lpips_program(dev), group_ranges(dev, n, row_parts(dev))
             program.launch("lpips_distance", *ranges, distance=distance, **arrays)
             # sums over 512 channels in 16 lanes: 32 roundings in a row, and those of a root

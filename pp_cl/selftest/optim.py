@@ -214,7 +214,7 @@ def _smooth(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
 def _refine(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
     """1 - sqrt(1 - o), which cancels for small opacities."""
     for n in SIZES:
-        opacity = np.float32(rng.uniform(0, 1, n))
+        opacity = rng.uniform(0, 1, n).astype(np.float32)
         opacity[::5], opacity[1::5], opacity[2::5] = 0, 1, 1e-7
         array = dev.upload(opacity)
         split_opacity(dev, array)

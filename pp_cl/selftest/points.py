@@ -2,7 +2,9 @@
 hand. The tests use it too.
 """
 
+from collections.abc import Sequence
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -49,7 +51,7 @@ class PairedPoints:
         dev: Device,
         camera: Camera,
         positions: np.ndarray,
-        radius: ArrayLike,
+        radius: np.ndarray | float,
         *,
         kind: str = "soft",
         depth_range: tuple[float, float] = dense.DEPTH_RANGE,
@@ -73,9 +75,12 @@ class PairedPoints:
         """(?,) the points with a pair, ascending."""
         return np.flatnonzero(np.diff(self.pairs.point_offset.get()))
 
+    def _counts(self):
+        return np.diff(self.pairs.point_offset.get().astype(np.int64))
+
     def pair_points(self) -> np.ndarray:
         """(P,) the point of each pair, from the offsets alone."""
-        return np.repeat(np.arange(self.n), np.diff(self.pairs.point_offset.get().astype(np.int64)))
+        return np.repeat(np.arange(self.n), self._counts())
 
     def dense(self, pair_values: np.ndarray, missing: float = 0.0) -> np.ndarray:
         """(N, HW) of values by pair: (P, ...) on the host."""
@@ -112,7 +117,7 @@ class PairedPoints:
         *,
         mean: bool = False,
         rule: str = "softmax",
-        **drops: float,
+        **drops: Any,
     ) -> np.ndarray:
         """(H, W, 16) blended features; those of the points that are not shaded are set to NaN
         first. rule: of BLENDS. drops: max_tracked and early_stop.
@@ -155,8 +160,7 @@ class PairedPoints:
         """{"features": (N, 16), "opacity": (N,)} of sum(features * grad_features) and, where given,
         sum(alpha * grad_alpha) and the pixels' spread times its weight, after blend().
         """
-        if grad_alpha is not None:
-            grad_alpha = self.dev.upload(grad_alpha, np.float32)
+        alphas = None if grad_alpha is None else self.dev.upload(grad_alpha, np.float32)
         features, opacity = blend_backward(
             self.dev,
             self.buffers,
@@ -165,7 +169,7 @@ class PairedPoints:
             point_features=self.point_features,
             features=self.features,
             grad_features=self._uploaded(grad_features),
-            grad_alpha=grad_alpha,
+            grad_alpha=alphas,
             spread_weight=spread_weight,
             mean=self.mean,
         )
@@ -204,14 +208,14 @@ def depth_at(z: ArrayLike) -> np.ndarray:
 
 
 def blend_on_axis(
-    dev: Device, z: ArrayLike, opacity: ArrayLike, gamma: float, **options: float | str
+    dev: Device, z: Sequence[float] | np.ndarray, opacity: ArrayLike, gamma: float, **options: Any
 ) -> tuple[PairedPoints, np.ndarray]:
     """(PairedPoints, weights): points at normalised depths z ahead of a one-pixel camera, each
     in its own channel.
     """
     positions = np.stack([np.zeros(len(z)), np.zeros(len(z)), depth_at(z)], -1)
     scene = PairedPoints(dev, AXIS, positions, AXIS_RADIUS)
-    scene.blend(np.asarray(opacity), gamma, np.resize(np.eye(16), (len(z), 16)), **options)
+    scene.blend(np.asarray(opacity), gamma, np.eye(16)[np.arange(len(z)) % 16], **options)
     return scene, scene.weight()[:, 0]
 
 
@@ -231,14 +235,13 @@ class Blended:
         radius: float | None = None,
         size: tuple[int, int] = (24, 20),
         rule: str = "softmax",
-        **blend: float,
+        **blend: Any,
     ):
         self.camera, self.gamma, self.kind, self.rule = make_camera(*size), gamma, kind, rule
         self.positions = make_points(rng, n)
-        self.radius = np.float32(
-            rng.uniform(0.05, 0.5, n) if radius is None else np.full(n, radius)
-        )
-        self.opacity = np.float32(rng.uniform(0, 1, n))
+        radii = rng.uniform(0.05, 0.5, n) if radius is None else np.full(n, radius)
+        self.radius = radii.astype(np.float32)
+        self.opacity = rng.uniform(0, 1, n).astype(np.float32)
         self.opacity[::7] = 0
         self.opacity[1::7] = 1
         self.point_features = rng.normal(size=(n, 16))

@@ -4,6 +4,7 @@ from collections.abc import Iterator
 from dataclasses import replace
 from functools import partial
 from itertools import product
+from typing import Any
 
 import numpy as np
 
@@ -91,7 +92,7 @@ def _pairs(kind: str, dev: Device, rng: np.random.Generator) -> Iterator[Check]:
     """Which pixels a point hits, how close to its centre, at which depth, in which order."""
     camera = replace(make_camera(33, 31), fy=26.0)
     for n in SIZES:
-        positions, radius = make_points(rng, n), np.float32(10.0 ** rng.uniform(-3, 0, n))
+        positions, radius = make_points(rng, n), (10.0 ** rng.uniform(-3, 0, n)).astype(np.float32)
         scene = PairedPoints(dev, camera, positions, radius, kind=kind)
         yield from _check_pairs(scene, dense.geometry(camera, positions, radius, kind))
 
@@ -211,7 +212,7 @@ def _depths(dev, scene):
 
 def _record(rule: str, dev: Device, rng: np.random.Generator) -> Iterator[Check]:
     """The highest weight of each point, and how often it was seen."""
-    options = {"early_stop": 0.05, "max_tracked": 2}
+    options: dict[str, Any] = {"early_stop": 0.05, "max_tracked": 2}
     blended = Blended(dev, rng, 500, gamma=0.02, radius=0.4, rule=rule, **options)
     before, seen = (dev.upload(x * np.arange(500), np.float32) for x in (2e-3, 1))
     highest, scene = before.copy(), blended.scene

@@ -66,8 +66,8 @@ def run_case(dev: Device, case: Case) -> Row:
         with np.errstate(all="ignore"):  # what is not finite is a result here
             checks = case.run(dev, np.random.default_rng(SEED))
             worst = max(checks, key=lambda check: check.share)
-    except Exception as error:
-        words = " ".join(f"{type(error).__name__}: {error}".split())[:300]
+    except Exception as fault:
+        words = " ".join(f"{type(fault).__name__}: {fault}".split())[:300]
         return Row(case.name, None, None, False, words, time.perf_counter() - start)
     error, bound = float(worst.error), float(worst.bound)
     reason = "" if np.isfinite(error) else "NaN, Inf or a value where there may be none"

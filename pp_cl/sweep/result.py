@@ -46,8 +46,9 @@ def finished_row(job: Job) -> dict[str, Any] | None:
         result = read_metrics(folder)
     except UserError:
         return None  # is measured again
-    is_current = result and result["finished"] and result["step"] == header["step"]
-    if not (header["finished"] and is_current and {*job.metrics} <= result["mean"].keys()):
+    if not (result and result["finished"] and result["step"] == header["step"]):
+        return None
+    if not (header["finished"] and {*job.metrics} <= result["mean"].keys()):
         return None
     log = [row for row in folder.rows() if row.get("finished")]
     means = {name: result["mean"][name] for name in job.metrics}

@@ -36,7 +36,7 @@ class Loss:
         self.beta = beta
         self.ssim_weight = ssim_weight
         self.terms = dev.zeros((8,))
-        self._added = []  # of FURTHER, in this step
+        self._added: list[str] = []  # of FURTHER, in this step
         self._buffers = Buffers(dev)
 
     @staticmethod

@@ -4,7 +4,7 @@ and compares the sum with the memory of device and host.
 
 import math
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -103,7 +103,7 @@ class Room:
 
     def __init__(self, config: Config, net: UNet, photographs: Sequence[Photograph]):
         self.dev = net.dev
-        self.plan: Plan | None = None
+        self.plan: Any = None
         self._config, self._net, self._photographs = config, net, photographs
         cameras = [one.camera for one in photographs]
         self._largest = max(cameras, key=lambda camera: (camera.width * camera.height, camera.fx))

@@ -50,7 +50,7 @@ class PerceptualLoss:
                 f" needs {LEAST_SIZE}x{LEAST_SIZE}: raise train.crop, or set"
                 " train.perceptual_weight=0"
             )
-        shapes = {}
+        shapes: dict[str, tuple[int, ...]] = {}
         for layer in vgg_layers(widths):
             shape = *size_of((height, width), layer.block), layer.co
             shapes[f"prediction_{layer.name}"] = shape

@@ -109,8 +109,9 @@ def points_to_keep(dev: Device, state: PointState, opacity: Array, settings: Tra
     The maximum decides, as a mean would drop what few views see, such as the inside of a gap.
     Raises Diverged for weights and opacities that are not finite, which nothing later would find.
     """
-    weight, seen, opacity = map(dev.download, (state.max_weight, state.times_seen, opacity))
-    broken = int((~np.isfinite(weight) | ~np.isfinite(opacity)).sum())
+    weight, seen = dev.download(state.max_weight), dev.download(state.times_seen)
+    opacities = dev.download(opacity)
+    broken = int((~np.isfinite(weight) | ~np.isfinite(opacities)).sum())
     if broken:
         raise Diverged(f"{broken} points have a weight or an opacity that is not finite")
     judged = seen >= settings.prune_looks
@@ -135,9 +136,9 @@ def final_points_to_keep(
     max_weight, times_seen: (N,) float32, the highest blend weight in a training view, and in how
     many it is train.final_prune_weight.
     """
-    weight, seen, opacity = map(dev.download, (max_weight, times_seen, opacity))
+    weight, seen = dev.download(max_weight), dev.download(times_seen)
     keep = (weight >= settings.final_prune_weight) & (seen >= least)
-    return _listed(dev, keep & (opacity >= settings.prune_opacity), weight)
+    return _listed(dev, keep & (dev.download(opacity) >= settings.prune_opacity), weight)
 
 
 def _listed(dev, keep, weight):

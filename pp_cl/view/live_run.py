@@ -39,12 +39,12 @@ class LiveRun:
     def __init__(self, dev: Device, folder: Path | str, scene: str | None = None) -> None:
         self.dev = dev
         self.folder = RunFolder(folder)
-        self.waiting: str | None = f"{folder}: no checkpoint yet; waiting for the first one"
-        self.notice: str | None = None
+        self.waiting: Any = f"{folder}: no checkpoint yet; waiting for the first one"
+        self.notice: Any = None
         self.loads = 0
         self._scene_path = scene
         self._run: Run | None = None
-        self._views: list | None = None
+        self._views: Any = None
         self._stamp = self._log_stamp = None
         self._fewer = None  # (share, Renderer) of the points last kept
         self._target = Target(dev)

@@ -203,6 +203,7 @@ def test_films(shot, tmp_path):
         assert status == 2 and len(lines) == 1 and name in lines[0]
 
 
+@pytest.mark.unix
 @pytest.mark.slow
 def test_a_full_disk(shot, tmp_path):
     """The database may not grow: one line that names it; with room again the command goes on."""

@@ -2,7 +2,6 @@
 
 import io
 import os
-import pty
 from contextlib import suppress
 from types import SimpleNamespace
 
@@ -82,7 +81,10 @@ def test_a_terminal_has_one_line(training, monkeypatch):
     assert last.rstrip().endswith(", PSNR 27.31 (test 25.50), 1200 points, 1.50 GiB")
 
 
+@pytest.mark.unix
 def test_a_terminal_that_tells_no_size_shows_the_line(training, monkeypatch):
+    import pty
+
     """As those of containers and of `script` do, whose size is 0 x 0."""
     master, slave = pty.openpty()
     monkeypatch.setattr("pp_cl.commands.progress.REDRAWN", 0)

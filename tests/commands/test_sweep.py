@@ -115,6 +115,7 @@ def undisturbed(dev, job):
     return evaluate(load_run(dev, folder.path), "test", job.metrics)
 
 
+@pytest.mark.unix
 @pytest.mark.slow
 def test_a_sweep_survives_the_death_of_a_worker(scenes, tmp_path, capsys, monkeypatch):
     """The table is that of trainings that nobody disturbed, in this process."""

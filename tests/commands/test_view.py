@@ -144,6 +144,7 @@ def wait_for_the_browser(monkeypatch, noted):
     monkeypatch.setattr(Trainer, "train_step", waiting)
 
 
+@pytest.mark.unix
 def test_a_waiting_server_ends_with_its_parent(tmp_path):
     """A parent that is killed cannot end its child itself."""
     child = [sys.executable, "-m", "pp_cl", "view", str(tmp_path / "run"), "--wait", "--port", "0"]

@@ -8,7 +8,13 @@ from pathlib import Path
 import pytest
 
 from pp_cl.errors import UserError
-from pp_cl.files.atomic import atomic_file, check_writable, remove_leftovers, write_text
+from pp_cl.files.atomic import (
+    atomic_file,
+    atomic_folder,
+    check_writable,
+    remove_leftovers,
+    write_text,
+)
 
 DEAD = 2**22 + 1  # the number of no process: Linux has none above 2^22
 
@@ -101,3 +107,26 @@ def test_a_place_that_may_not_be_written_is_named(tmp_path, monkeypatch):
     assert message.startswith(f"{tmp_path}/a/b: ") and f"permissions of {tmp_path}," in message
     (tmp_path / "a").mkdir()
     check_writable(tmp_path / "a" / "b")
+
+
+def test_windows_waits_for_a_reader_and_replaces_no_folder(tmp_path, monkeypatch):
+    """As it refuses to rename over what another process reads, and over folders."""
+    refusals, real = [1, 1], os.replace
+
+    def replace(source, target):
+        if Path(target).is_dir() or (refusals and refusals.pop()):
+            raise PermissionError(errno.EACCES, "Access is denied", str(target))
+        real(source, target)
+
+    monkeypatch.setattr(os, "replace", replace)
+    monkeypatch.setattr("sys.platform", "win32")
+    write_text(tmp_path / "a", "text")
+    assert (tmp_path / "a").read_text() == "text" and not refusals
+    (tmp_path / "folder").mkdir()
+    with atomic_folder(tmp_path / "folder") as folder:
+        (folder / "b").touch()
+    assert [path.name for path in (tmp_path / "folder").iterdir()] == ["b"]
+    refusals[:] = [1] * 99
+    monkeypatch.setattr("pp_cl.files.atomic.READER_SECONDS", 0.2)
+    with pytest.raises(UserError, match="cannot be written"):
+        write_text(tmp_path / "a", "other")

@@ -86,6 +86,7 @@ def test_a_broken_animation_is_read_without_a_word(tmp_path, rgba, recwarn):
     assert np.array_equal(read_rgba(path), rgba) and not recwarn.list
 
 
+@pytest.mark.unix
 @pytest.mark.parametrize("read", (read_rgba, image_size))
 @pytest.mark.parametrize("name", ("a.png", "a.exr"))
 def test_a_pipe_is_not_waited_for(tmp_path, read, name):

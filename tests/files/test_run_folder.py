@@ -3,7 +3,6 @@
 import errno
 import json
 import os
-import resource
 import signal
 
 import pytest
@@ -101,7 +100,10 @@ def test_a_row_that_is_being_written_is_not_there_yet(folder, recwarn):
     assert folder.rows() == ROWS and not recwarn.list
 
 
+@pytest.mark.unix
 def test_a_full_disk_is_one_line_that_names_the_log(folder):
+    import resource
+
     limits = resource.getrlimit(resource.RLIMIT_FSIZE)
     signal.signal(signal.SIGXFSZ, signal.SIG_IGN)  # as Python does, but Intel's runtime undoes it
     with folder.open_log(10) as log:

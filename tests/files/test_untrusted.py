@@ -20,6 +20,7 @@ def test_a_file_of_at_most_so_many_bytes(tmp_path):
         assert opened.read(3) == b"\xef\xbb\xbf" and opened.seek(0) == 0
 
 
+@pytest.mark.unix
 def test_what_is_no_file_is_not_waited_for(tmp_path):
     os.mkfifo(tmp_path / "pipe")
     for path in (tmp_path / "pipe", tmp_path, "/dev/zero"):
@@ -28,6 +29,15 @@ def test_what_is_no_file_is_not_waited_for(tmp_path):
         assert caught.value.errno == errno.EINVAL
     with pytest.raises(FileNotFoundError):
         read_regular(tmp_path / "none", 100)
+
+
+def test_windows_is_told_not_to_translate_line_ends(tmp_path, monkeypatch):
+    (tmp_path / "file").write_bytes(b"a\r\n\x1a")
+    flags, real = [], os.open
+    monkeypatch.setattr(os, "O_BINARY", 1 << 15, raising=False)
+    monkeypatch.setattr(os, "open", lambda path, *given: flags.extend(given) or real(path, 0))
+    assert read_regular(tmp_path / "file", 9) == "a\r\n\x1a"
+    assert flags[0] & os.O_BINARY
 
 
 def test_the_mend_fits_the_reason():

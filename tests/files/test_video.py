@@ -64,6 +64,7 @@ def test_a_place_that_cannot_be_written_is_one_line(tmp_path):
         write_video(tmp_path / "missing" / "film.mp4", frames(), 10)
 
 
+@pytest.mark.unix
 @pytest.mark.parametrize("suffix", ["mp4", "gif"])
 def test_a_full_disk_is_one_line_and_leaves_no_film(tmp_path, suffix):
     """A limit on the size of a file stands for it, in a process of its own."""

@@ -7,6 +7,8 @@ import sys
 from importlib.metadata import packages_distributions
 from pathlib import Path
 
+from pp_cl import __version__
+
 ROOT = Path(__file__).parents[2]
 KERNEL_FILES = sorted((ROOT / "cl").rglob("*.cl"))
 
@@ -27,7 +29,7 @@ def test_setup_cfg_declares_every_package_that_is_imported():
     setup = configparser.ConfigParser()
     setup.read(ROOT / "setup.cfg")
     lists = setup["options"]["install_requires"], *setup["options.extras_require"].values()
-    declared = {re.split("[<>=]", line)[0] for text in lists for line in text.split()}
+    declared = {re.split("[<>=;]", line)[0] for text in lists for line in text.split("\n")}
     found, names = packages_distributions(), set()
     for path in (p for top in ("pp_cl", "tests", "tools") for p in (ROOT / top).rglob("*.py")):
         for node in ast.walk(ast.parse(path.read_text("utf-8"))):
@@ -39,3 +41,17 @@ def test_setup_cfg_declares_every_package_that_is_imported():
     packages = {name: found.get(name, [name])[0].lower().replace("_", "-") for name in names}
     assert "numpy" in names
     assert set(packages.values()) <= {name.lower() for name in declared}
+
+
+def test_the_conda_recipe_asks_for_what_setup_cfg_does():
+    setup = configparser.ConfigParser()
+    setup.read(ROOT / "setup.cfg")
+    wanted = {
+        re.sub("^OpenEXR", "openexr-python", line)
+        for line in setup["options"]["install_requires"].split()
+    }
+    text = (ROOT / "packaging/recipe.yaml").read_text("utf-8")
+    run = text.partition("  run:\n")[2].partition("\ntests:")[0]
+    lines = {line.replace(" ", "") for line in re.findall("(?m)^    - ([a-z-]+ >=.*)$", run)}
+    assert wanted == lines - {"python>=3.10", "pocl>=5.0"}
+    assert f'version: "{__version__}"' in text

@@ -166,6 +166,7 @@ def test_the_nearest_view_counts_place_and_direction():
     assert nearest_view([away, cameras[2]], cameras[2], centre) == 1
 
 
+@pytest.mark.unix
 def test_rows_of_the_log_that_are_no_rows_are_left_out(dev, copied):
     lines = (copied / "log.jsonl").read_text().splitlines(keepends=True)
     live = LiveRun(dev, copied)

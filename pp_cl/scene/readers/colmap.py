@@ -105,7 +105,7 @@ def read_split(folder: Path, split: str) -> list[Photograph]:
     An image's mask is masks/NAME.png, as COLMAP has it, or masks/NAME with any ending of an image;
     with a folder of masks, every image needs one. Raises UserError naming the file, and the image.
     """
-    model = model_folder(folder)
+    model = model_folder(folder) or folder
     lenses, images = read_model(model)
     ordered = sorted(images, key=lambda image: image.name)
     return [

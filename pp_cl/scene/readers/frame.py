@@ -151,8 +151,8 @@ def distortion(frame: Frame) -> Distortion:
     for key in ("p1", "p2") if is_fisheye else ("k4",):
         if frame.number(key):
             raise frame.error(key, f"is not modelled with this lens; {UNDISTORT}")
-    keys = ("k1", "k2", "p1", "p2", "k3", "k4")
-    return Distortion(*(frame.number(key) or 0.0 for key in keys), fisheye=is_fisheye)
+    numbers = {key: frame.number(key) or 0.0 for key in ("k1", "k2", "p1", "p2", "k3", "k4")}
+    return Distortion(**numbers, fisheye=is_fisheye)
 
 
 def numbers(value: Any) -> np.ndarray | None:

@@ -218,6 +218,7 @@ def test_annotations_beyond_all_bounds(sequence, monkeypatch):
     refused(sequence, "more than 1000 characters")
 
 
+@pytest.mark.unix
 def test_a_set_list_that_is_a_pipe_is_not_waited_for(sequence):
     file = next((sequence.parent / "set_lists").iterdir())
     file.unlink()

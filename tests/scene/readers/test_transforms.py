@@ -246,6 +246,7 @@ def test_fisheyes_of_nerfstudio_and_colmap2nerf(tmp_path, keys):
     refused(tmp_path, tmp_path / "transforms_train.json", "p2:")
 
 
+@pytest.mark.unix
 def test_a_pipe_is_no_file_of_cameras(tmp_path):
     """Nor is it waited for."""
     write_scene(tmp_path)
