@@ -6,6 +6,7 @@ import numpy as np
 import plyfile
 import pytest
 import trimesh
+from scipy.spatial import cKDTree
 from support.ball_views import ball_camera
 from support.runs import arguments
 from support.scenes import move_scene, write_ball_scene
@@ -13,10 +14,12 @@ from support.scenes import move_scene, write_ball_scene
 from pp_cl.cli import main
 from pp_cl.export.mesh import Mesh, write_mesh
 from pp_cl.export.points import coloured_points, in_world, write_glb, write_ply
+from pp_cl.export.splat import splats, write_splat_glb
 from pp_cl.files.checkpoint import load_checkpoint
 from pp_cl.metrics.shape import read_mesh
 from pp_cl.model import Model
 from pp_cl.run import load_run
+from pp_cl.scene.camera_path import up_of
 
 FAR = np.array([1e6, -1e6, 1e6])
 UNIT = 2.0**-24  # of the eyes: float64 holds them exactly 1e6 away, and the grid too
@@ -110,6 +113,18 @@ def test_exported_points_keep_their_places_in_the_world(far_run, tmp_path):
     place, _ = cloud.graph[name]
     [read] = cloud.geometry.values()
     np.testing.assert_allclose(read.vertices + place[:3, 3], positions, rtol=0, atol=1e-6)
+
+
+def test_exported_splats_keep_their_places_in_the_world(far_run, tmp_path):
+    up = up_of(far_run.cameras("train"))
+    table, origin = splats(far_run, up)
+    write_splat_glb(tmp_path / "a.glb", table, origin)
+    cloud = trimesh.load(tmp_path / "a.glb")
+    [name] = cloud.graph.nodes_geometry
+    place, _ = cloud.graph[name]
+    [read] = cloud.geometry.values()
+    away, _ = cKDTree(far_run.model.positions()).query(read.vertices + place[:3, 3])
+    assert away.max() < 1e-3 * far_run.model.grid.edge < 1e-6 * np.abs(origin).max()
 
 
 @pytest.mark.parametrize("suffix", ["ply", "glb"])

@@ -4,25 +4,36 @@ import argparse
 from pathlib import Path
 
 from pp_cl.commands import options as shared
+from pp_cl.errors import UserError
 
 HELP = "write a run in a format that other programs open"
 EPILOG = """formats:
-  ply    all points with colour, opacity and everything learned
-  glb    the coloured points
-  mesh   the surface with coloured vertices, .ply or .glb by --out
-  html   one page that a browser draws without network or installation
-  scene  renderings of the train and test views as a NeRF-synthetic folder
+  splat      the .ply of 3D Gaussian splatting, for SuperSplat, Blender and all other viewers
+  splat-glb  the same as glTF (KHR_gaussian_splatting)
+  ply        all points with colour, opacity and everything learned
+  glb        the coloured points
+  mesh       the surface with coloured vertices, .ply or .glb by --out
+  html       one page that a browser draws without network or installation
+  gallery    a folder of such pages, one a run, with an index and stills
+  scene      renderings of the train and test views as a NeRF-synthetic folder
 docs/export.md says more."""
-FORMATS = ("ply", "glb", "mesh", "html", "scene")
+FORMATS = ("splat", "splat-glb", "ply", "glb", "mesh", "html", "gallery", "scene")
 OF_POINTS = ("ply", "glb")
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the command's options."""
-    parser.add_argument("run_folder", metavar="RUN", help="folder of the run")
+    parser.add_argument(
+        "run_folders",
+        metavar="RUN",
+        nargs="+",
+        help="folder of the run; several for a gallery",
+    )
     parser.add_argument("--format", required=True, choices=FORMATS, help="see below")
     parser.add_argument(
-        "--out", metavar="PATH", help="file, or folder of a scene (default: in RUN/export)"
+        "--out",
+        metavar="PATH",
+        help="file, or folder of scene and gallery (default: in RUN/export)",
     )
     parser.add_argument(
         "--min-weight",
@@ -41,14 +52,23 @@ def run(options: argparse.Namespace) -> None:
     from pp_cl.export.formats import check_target, export
     from pp_cl.run import load_run
 
-    name, folder = options.format, Path(options.run_folder)
+    name, folder = options.format, Path(options.run_folders[0])
     if name not in OF_POINTS:
         shared.refuse(options, ("min_weight",), f"only {' and '.join(OF_POINTS)} leave out points")
+    if name != "gallery" and len(options.run_folders) > 1:
+        raise UserError(f"RUN {options.run_folders[1]}: only a gallery has several runs; name one")
     path = check_target(name, folder, Path(options.out) if options.out else None)
-    run = load_run(open_device(options.device), folder, scene=options.scene)
-    if not run.header["finished"]:
-        print(
-            f"{folder}: unfinished, step {run.header['step']} of {run.config.train.iterations}; its"
-            " last checkpoint is exported"
-        )
-    print(f"wrote {path}: {export(run, name, path, options.min_weight or 0.0)}")
+    device = open_device(options.device)
+
+    def loaded(folder):
+        run = load_run(device, folder, scene=options.scene)
+        if not run.header["finished"]:
+            print(
+                f"{folder}: unfinished, step {run.header['step']} of"
+                f" {run.config.train.iterations}; its last checkpoint is exported"
+            )
+        return run
+
+    run, *others = options.run_folders
+    written = export(loaded(run), name, path, options.min_weight or 0.0, map(loaded, others))
+    print(f"wrote {path}: {written}")

@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import warnings
+from collections.abc import Iterable
 from dataclasses import replace
+from itertools import chain
 from pathlib import Path
 
 from pp_cl.errors import UserError
 from pp_cl.export.mesh import coloured_mesh, write_mesh
-from pp_cl.export.page import page_text
+from pp_cl.export.page import page_text, write_gallery
 from pp_cl.export.points import coloured_points, write_glb, write_ply
+from pp_cl.export.splat import Y_DOWN, Y_UP, splats, write_splat_glb, write_splat_ply
 from pp_cl.files.atomic import check_file, check_new_folder, write_text
 from pp_cl.run import Run, image_files
 from pp_cl.scene.readers.transforms import write_scene
@@ -17,10 +20,13 @@ from pp_cl.scene.views import View
 
 # {format: (name below RUN/export, where no path is given; suffixes of the file, none of a folder)}
 FORMATS = {
+    "splat": ("splat.ply", (".ply",)),
+    "splat-glb": ("splat.glb", (".glb",)),
     "ply": ("cloud.ply", (".ply",)),
     "glb": ("cloud.glb", (".glb",)),
     "mesh": ("mesh.ply", (".ply", ".glb")),
     "html": ("view.html", (".html",)),
+    "gallery": ("gallery", ()),
     "scene": ("scene", ()),
 }
 
@@ -40,10 +46,12 @@ def check_target(name: str, folder: Path, out: Path | None) -> Path:
     return path
 
 
-def export(run: Run, name: str, path: Path, min_weight: float = 0.0) -> str:
+def export(
+    run: Run, name: str, path: Path, min_weight: float = 0.0, others: Iterable[Run] = ()
+) -> str:
     """Write a run in the format `name` of `pp-cl export`; returns what was written, in words.
-    min_weight: as --min-weight. Raises UserError for what cannot be written, before which nothing
-    is.
+    min_weight: as --min-weight. others: further runs of a gallery. Raises UserError for what cannot
+    be written, before which nothing is.
     """
     count = run.model.cloud.count
     if name == "mesh":
@@ -56,11 +64,21 @@ def export(run: Run, name: str, path: Path, min_weight: float = 0.0) -> str:
         path.parent.mkdir(exist_ok=True)
         write_text(path, text)
         return f"{count} points, {len(text) / 1e6:.1f} MB"
+    if name == "gallery":
+        return f"{write_gallery(path, chain([run], others))} pages and their index"
     if name == "scene":
         splits = renderings(run)
         path.parent.mkdir(exist_ok=True)
         write_scene(splits, path)
         return ", ".join(f"{len(views)} {split} views" for split, views in splits.items())
+    if name in ("splat", "splat-glb"):
+        table, origin = splats(run, Y_DOWN if name == "splat" else Y_UP)
+        path.parent.mkdir(exist_ok=True)
+        if name == "splat":
+            write_splat_ply(path, table)
+        else:
+            write_splat_glb(path, table, origin)
+        return f"{len(table)} Gaussians"
     points = coloured_points(run, min_weight)
     path.parent.mkdir(exist_ok=True)
     if name == "ply":

@@ -230,14 +230,14 @@ function makeDrawer(gl) {
 }
 
 // ---- cameras ----
-// A look: eye, target and up in world axes, fov in degrees over the height, and the size of the
-// image where it is not that of the window.
+// A look: eye, target and up in world axes, fov in degrees across the shorter side, and the size of
+// the image where it is not that of the window.
 const first = { eye: header.eye, target: header.centre, up: header.up, fov: header.fov };
 
 function cameraOf(look, width, height) {
   const forward = unit(add(look.target, look.eye, -1));
   const right = unit(cross(forward, look.up)), down = cross(forward, right);
-  const focal = height / 2 / Math.tan(look.fov * Math.PI / 360);
+  const focal = Math.min(width, height) / 2 / Math.tan(look.fov * Math.PI / 360);
   const pose = [0, 1, 2].flatMap((i) => [right[i], down[i], forward[i], look.eye[i]]);
   return { pose, fx: focal, fy: focal, cx: width / 2, cy: height / 2, width, height };
 }
@@ -282,7 +282,7 @@ function show() {
   if (!gl) return;
   const fixed = look.w && look.h, ratio = fixed ? 1 : window.devicePixelRatio || 1;
   const width = fixed ? look.w : innerWidth, height = fixed ? look.h : innerHeight;
-  hint.hidden = Boolean(fixed);
+  document.body.classList.toggle("bare", Boolean(fixed));
   setCamera(cameraOf(look, Math.round(width * ratio), Math.round(height * ratio)));
   canvas.style.width = `${width}px`;
   canvas.style.height = `${height}px`;
@@ -306,7 +306,7 @@ function turn(dx, dy) {
 function move(dx, dy) {
   const p = cameraOf(look, 1, 1).pose;
   const world = 2 * Math.tan(look.fov * Math.PI / 360)
-    * Math.hypot(...add(look.eye, look.target, -1)) / innerHeight;
+    * Math.hypot(...add(look.eye, look.target, -1)) / Math.min(innerWidth, innerHeight);
   const shift = [0, 1, 2].map((i) => -world * (p[4 * i] * dx + p[4 * i + 1] * dy));
   look.eye = add(look.eye, shift);
   look.target = add(look.target, shift);
@@ -346,11 +346,13 @@ canvas.addEventListener("wheel", (event) => {
   approach(Math.exp(Math.max(-100, Math.min(100, event.deltaY)) / 500));
   soon();
 }, { passive: false });
+const back = () => { look = { ...first }; soon(); };
+canvas.addEventListener("dblclick", back);
 const STEPS = { ArrowLeft: [0.1, 0], ArrowRight: [-0.1, 0], ArrowUp: [0, 0.1], ArrowDown: [0, -0.1] };
 addEventListener("keydown", (event) => {
   if (STEPS[event.key]) turn(...STEPS[event.key]);
   else if (event.key === "+" || event.key === "-") approach(event.key === "+" ? 0.9 : 1 / 0.9);
-  else if (event.key === "r" || event.key === "R") look = { ...first };
+  else if (event.key === "r" || event.key === "R") back();
   else return;
   soon();
 });

@@ -1,4 +1,4 @@
-"""A run as one HTML file that a browser draws with WebGL2, without the network."""
+"""Runs as HTML files that a browser draws with WebGL2, without the network; a gallery of them."""
 
 from __future__ import annotations
 
@@ -6,18 +6,25 @@ import base64
 import html
 import json
 import os
+import re
+from collections.abc import Iterable
 from pathlib import Path
 
 import numpy as np
 
 from pp_cl.errors import UserError
 from pp_cl.export.harmonics import COUNT, fit_harmonics
+from pp_cl.files.atomic import atomic_folder, write_text
+from pp_cl.files.image import to_8bit, write_png
 from pp_cl.run import NEAREST, Run
+from pp_cl.scene.camera import Camera
+from pp_cl.scene.camera_path import up_of
 
 # Bytes of a point: vertex (3, uint16), opacity (uint16), coefficients (27 and 1 unused, uint8).
 POINT = np.dtype([("vertex", "<u2", 3), ("opacity", "<u2"), ("colour", "u1", 28)])
 OUTLIERS = 1e-3  # share of the coefficients at either end that is clipped: they would coarsen all
-FIELD_OF_VIEW = 40.0  # degrees from the top of the page to its bottom
+FIELD_OF_VIEW = 40.0  # degrees across the shorter side of the page
+STILL = 600, 315  # pixels; the least that is shown large beside a link
 
 
 def pack(run: Run, coefficients: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -38,34 +45,82 @@ def pack(run: Run, coefficients: np.ndarray) -> tuple[np.ndarray, np.ndarray, np
     return rows, low, span
 
 
-def page_text(run: Run) -> str:
-    """The page. Raises UserError as check_drawable does."""
+def page_text(run: Run, still: str = "") -> str:
+    """The page. still: the file of a picture that stands for it where it is linked to, if any.
+    Raises UserError as check_drawable does.
+    """
     check_drawable(run)
     rows, low, span = pack(run, fit_harmonics(run))
-    folder = Path(__file__).parent
-    page = (folder / "page.html").read_text("utf-8")
-    name = run.folder.path.resolve().name  # which may be no UTF-8
-    parts = {
-        "title": html.escape(os.fsencode(name).decode(errors="replace")),
-        "header": json.dumps(_header(run, low, span)).replace("<", "\\u003c"),
-        "points": base64.b64encode(rows.tobytes()).decode(),
-        "script": (folder / "page.js").read_text("utf-8"),
-    }
+    points = base64.b64encode(rows.tobytes()).decode()
+    return _filled(
+        "page.html",
+        {
+            "title": html.escape(_name(run)),
+            "card": _card(still),
+            "about": f"{len(rows):,} points, {len(points) / 1e6:.1f} MB",
+            "header": json.dumps(_header(run, low, span)).replace("<", "\\u003c"),
+            "points": points,
+            "script": (Path(__file__).parent / "page.js").read_text("utf-8"),
+        },
+    )
+
+
+def _card(still):
+    """What programs that show links read of a page's picture."""
+    large = '<meta name="twitter:card" content="summary_large_image">'
+    return f'<meta property="og:image" content="{still}">\n{large}' if still else ""
+
+
+def _filled(template, parts):
+    """A template of this folder with its parts, {name: text}."""
+    page = (Path(__file__).parent / template).read_text("utf-8")
     for name, text in parts.items():
         page = page.replace(f"<!-- {name} -->", text)
     return page
 
 
+def _name(run):
+    """Of a run's folder, which may be no UTF-8."""
+    return os.fsencode(run.folder.path.resolve().name).decode(errors="replace")
+
+
+def write_gallery(folder: Path, runs: Iterable[Run]) -> int:
+    """Write a page and a still of each run into a folder, with an index of them; returns their
+    number. Raises UserError as check_drawable and atomic_folder do.
+    """
+    cards = {}
+    with atomic_folder(folder) as unfinished:
+        for run in runs:
+            stem = re.sub(r"[^A-Za-z0-9_-]+", "-", _name(run)).strip("-") or "run"
+            while stem in cards or stem == "index":
+                stem += "-2"
+            centre, _ = run.ball
+            eye, up = first_look(run)
+            width, height = STILL
+            focal = height / 2 / np.tan(np.radians(FIELD_OF_VIEW) / 2)
+            camera = Camera.look_at(eye, centre, up, fx=focal, width=width, height=height)
+            write_text(unfinished / f"{stem}.html", page_text(run, f"{stem}.png"))
+            write_png(unfinished / f"{stem}.png", to_8bit(run.render(camera).colour))
+            cards[stem] = html.escape(_name(run))
+        figures = [
+            f'<a href="{stem}.html"><img src="{stem}.png" alt="">{name}</a>'
+            for stem, name in cards.items()
+        ]
+        parts = {"card": _card(f"{next(iter(cards))}.png"), "figures": "\n".join(figures)}
+        write_text(unfinished / "index.html", _filled("gallery.html", parts))
+    return len(cards)
+
+
 def check_drawable(run: Run) -> None:
-    """Raise UserError unless the run's points are composited by alpha, with soft footprints: the
-    page draws no others.
+    """Raise UserError unless the run's points are composited by alpha, with soft footprints: no
+    others are drawn without the network.
     """
     raster = run.config.raster
     if (raster.blend, raster.footprint) != ("alpha", "soft"):
         raise UserError(
             f"{run.folder.config}: raster.blend {raster.blend} with raster.footprint"
-            f" {raster.footprint} cannot be drawn by the page, only alpha with soft; choose another"
-            " --format"
+            f" {raster.footprint} can only be drawn by the run itself, unlike alpha with soft;"
+            " choose another --format"
         )
 
 
@@ -74,10 +129,7 @@ def _header(run, low, span):
     grid = run.model.grid
     centre, radius = run.ball
     cameras = run.cameras("train")
-    poses = np.stack([camera.pose for camera in cameras])
-    up = -poses[:, :, 1].mean(0)
-    up = up / np.linalg.norm(up) if np.linalg.norm(up) > 1e-3 else np.array([0.0, 0.0, 1.0])
-    eye = centre + _first_offset(poses[0, :, 3] - centre, up) * radius
+    eye, up = first_look(run)
     return {
         "count": run.model.cloud.count,
         "stride": POINT.itemsize,
@@ -93,6 +145,14 @@ def _header(run, low, span):
         "up": up.tolist(),
         "fov": FIELD_OF_VIEW,
     }
+
+
+def first_look(run: Run) -> tuple[np.ndarray, np.ndarray]:
+    """(eye, up), both (3,), with which a page begins; it looks at the middle of run.ball."""
+    centre, radius = run.ball
+    cameras = run.cameras("train")
+    up = up_of(cameras)
+    return centre + _first_offset(cameras[0].eye - centre, up) * radius, up
 
 
 def _pixel_width(camera, centre):

@@ -25,7 +25,7 @@ COMMENTS = (
     "pp-cl: points of a run, world axes and units of its scene",
     "red, green, blue: sRGB, as the run shows the point in the training view where it weighs most",
     "weight: blend weights of the point in that view, summed over its pixels",
-    "opacity: of the point's centre, 0 to 1",
+    "point_opacity: of its centre, 0 to 1",
     "feature_C_D_K: coefficient K of degree D of the spherical harmonics of feature C, C from 0 to",
     "15; basis and signs of PlenOctrees; features are the input of the run's network, no colours",
 )
@@ -101,7 +101,7 @@ def write_ply(path: Path | str, points: ColouredPoints, cloud: PointCloud) -> No
     UserError as atomic_file does.
     """
     columns = place_and_colour(points.positions, points.colours)
-    columns |= {"opacity": points.opacity, "weight": points.weight}
+    columns |= {"point_opacity": points.opacity, "weight": points.weight}
     for block, array in zip(cloud.blocks, cloud.sh, strict=True):
         values = array.get()[points.rows].astype(np.float32)
         for k in range(block.count):

@@ -98,6 +98,7 @@ REFUSED = [
     ("bench raster --widths 16,16,16", "--widths"),
     ("bench train --plot b.png", "--plot"),
     ("bench model", "--runs"),
+    ("export run other --format html", "other"),
     ("export run --format html --min-weight 1", "--min-weight"),
     ("render run --background transparent --out a.mp4", "--background"),
     ("render run --background black --format exr --out new", "--background"),

@@ -13,8 +13,8 @@ from support.browser import ask, image_of
 from pp_cl.errors import UserError
 from pp_cl.export.harmonics import basis
 from pp_cl.export.observe import directions, observe
-from pp_cl.export.page import POINT, check_drawable, pack, page_text
-from pp_cl.files.image import to_8bit
+from pp_cl.export.page import POINT, check_drawable, pack, page_text, write_gallery
+from pp_cl.files.image import read_rgba, to_8bit
 from pp_cl.metrics.psnr_ssim import psnr
 from pp_cl.run import load_run
 from pp_cl.scene.camera import Camera
@@ -215,6 +215,59 @@ def test_mouse_and_keys_move_the_camera(page, tmp_path):
     assert rise[0] - rise[1] == pytest.approx(20 / 200, abs=1e-4)
 
 
+PINCH = """
+    const seen = [], see = () => { ppcl.show(); seen.push(ppcl.canvas.toDataURL()); };
+    const send = (type, id, x) => ppcl.canvas.dispatchEvent(new PointerEvent(
+        type, { pointerId: id, pointerType: "touch", clientX: x, clientY: 100, bubbles: true }));
+    see();
+    send("pointerdown", 1, 100); send("pointerdown", 2, 140);
+    send("pointermove", 2, 180); see();
+    send("pointerup", 2, 180); send("pointermove", 1, 120); see();
+    ppcl.canvas.dispatchEvent(new MouseEvent("dblclick")); see();
+    return { seen, address: location.hash };"""
+
+
+def test_fingers_move_the_camera(page, tmp_path):
+    found = ask(page, PINCH, tmp_path)
+    assert len(set(found["seen"])) == 3 and found["seen"][0] == found["seen"][3]
+    eye, target = (
+        np.array([float(x) for x in re.search(rf"{name}=([^&]+)", found["address"])[1].split(",")])
+        for name in ("eye", "target")
+    )
+    header = kept(page)[0]
+    first = np.linalg.norm(np.subtract(header["eye"], header["centre"]))
+    assert np.linalg.norm(eye - target) == pytest.approx(first / 2, rel=1e-4)
+
+
+def test_a_phone_shows_the_whole_object(page, tmp_path):
+    script = "ppcl.show(); return ppcl.canvas.toDataURL();"
+    image = image_of(ask(page, script, tmp_path, "#w=60&h=130"))
+    assert image.shape == (130, 60, 3) and image.min() < 200
+    assert (image[:, [0, -1]] == 255).all() and (image[[0, -1]] == 255).all()
+
+
+def test_it_says_what_it_is(run, page):
+    text = page.read_text("utf-8")
+    visible = re.search(r"<header>(.*)</header>", text)[1]
+    assert "<b>run</b>" in visible and f"{run.model.cloud.count:,} points" in visible
+    assert "og:image" not in text  # nobody knows the address of one
+
+
+def test_a_gallery_is_pages_with_stills_and_an_index(run, tmp_path):
+    assert write_gallery(tmp_path / "all", [run, run]) == 2
+    names = {path.name for path in (tmp_path / "all").iterdir()}
+    assert names == {"index.html", "run.html", "run.png", "run-2.html", "run-2.png"}
+    text = (tmp_path / "all" / "index.html").read_text("utf-8")
+    linked = re.findall(r'(?:href|src|:image" content)="([^"]+)"', text)
+    assert set(linked) == names - {"index.html"}
+    for stem in ("run", "run-2"):
+        page = (tmp_path / "all" / f"{stem}.html").read_text("utf-8")
+        assert f'<meta property="og:image" content="{stem}.png">' in page
+        still = read_rgba(tmp_path / "all" / f"{stem}.png")
+        assert still.shape[:2] == (315, 600) and still[..., :3].min() < 200
+        assert (still[:, [0, -1], :3] > 250).all()
+
+
 def test_the_runs_name_is_text(run_folder, session_device, tmp_path):
     folder = tmp_path / "<b> & </script>".replace("/", "")
     shutil.copytree(run_folder, folder)
@@ -226,5 +279,5 @@ def test_the_runs_name_is_text(run_folder, session_device, tmp_path):
 def test_runs_that_it_cannot_draw_are_one_line(run, settings):
     raster = replace(run.config.raster, **settings)
     other = replace(run, config=replace(run.config, raster=raster))
-    with pytest.raises(UserError, match="config.json: raster.blend .* cannot be drawn by the page"):
+    with pytest.raises(UserError, match="config.json: raster.blend .* can only be drawn"):
         check_drawable(other)

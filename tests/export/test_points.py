@@ -62,7 +62,7 @@ def test_the_ply_reads_back_by_plyfile(run, written):
         assert vertex[name].dtype == "f4" and (vertex[name] == points.positions[:, axis]).all()
     for channel, name in enumerate(("red", "green", "blue")):
         assert vertex[name].dtype == "u1" and (vertex[name] == points.colours[:, channel]).all()
-    assert (vertex["opacity"] == points.opacity).all()
+    assert (vertex["point_opacity"] == points.opacity).all()
     assert (vertex["weight"] == points.weight).all()
     stored = run.model.cloud.arrays(run.dev)
     by_degree = [stored[f"points.sh{degree}"].get()[points.rows] for degree in range(3)]
@@ -72,7 +72,7 @@ def test_the_ply_reads_back_by_plyfile(run, written):
                 assert (vertex[f"feature_{c}_{degree}_{k}"] == by_degree[degree][:, k, c]).all()
     assert len(vertex.properties) == 8 + 9 * 16
     comments = " ".join(data.comments)
-    for name in ("red, green, blue:", "weight:", "opacity:", "feature_C_D_K:"):
+    for name in ("red, green, blue:", "weight:", "point_opacity:", "feature_C_D_K:"):
         assert name in comments
 
 

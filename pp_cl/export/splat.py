@@ -1,0 +1,175 @@
+"""A run as 3D Gaussians without a network: the .ply of 3D Gaussian splatting, and glTF."""
+
+from __future__ import annotations
+
+import json
+import struct
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import plyfile
+from scipy.spatial.transform import Rotation
+
+from pp_cl.export.harmonics import COUNT, basis, fit_harmonics
+from pp_cl.export.page import check_drawable
+from pp_cl.export.points import gltf_colours, in_world, table_of
+from pp_cl.files.atomic import atomic_file
+from pp_cl.files.image import to_8bit
+from pp_cl.model import Model
+from pp_cl.run import Run
+from pp_cl.scene.camera_path import up_of
+
+DEVIATION = 0.39  # of a Gaussian, in radii of the soft disc: its second moment
+THINNED = 0.7
+MOST_OPAQUE, LEAST_OPAQUE = 0.99, 1 / 255  # what 3D Gaussian splatting clamps to, and leaves out
+ZOOMS = (1, 2)
+CONSTANT = 0.28209479177387814  # the first of the functions below
+# 3D Gaussian splatting's functions of degrees 0 to 2 are basis()'s in this order, times these.
+ORDER = [0, 2, 3, 1, 4, 5, 7, 6, 8]
+FACTORS = np.array(
+    [
+        CONSTANT,
+        *(-0.4886025119029199, 0.4886025119029199, -0.4886025119029199),
+        *(1.0925484305920792, -1.0925484305920792, 0.31539156525252005),
+        *(-1.0925484305920792, 0.5462742152960396),
+    ]
+)
+STORED = 16  # functions in a .ply: many programs read no file but of degree 3
+Y_DOWN, Y_UP = (0.0, -1.0, 0.0), (0.0, 1.0, 0.0)  # what is up in a .ply, and in glTF
+
+SPLAT = np.dtype(
+    [
+        ("position", "<f4", 3),
+        ("harmonics", "<f4", (COUNT, 3)),
+        ("opacity", "<f4"),
+        ("deviation", "<f4"),
+    ]
+)
+
+
+def splats(run: Run, up: tuple[float, float, float]) -> tuple[np.ndarray, np.ndarray]:
+    """((M,) records of SPLAT, (3,) origin): the run's points as Gaussians, in the world of its
+    scene turned so that its up, as far as the photographs tell, is `up`. Positions are relative to
+    the origin, which is 0 unless float32 is too coarse there. harmonics: in the order and with the
+    signs of 3D Gaussian splatting, of colours less 0.5, opacity: after the sigmoid. Points that no
+    training view shows are left out.
+    """
+    check_drawable(run)
+    drawn = as_gaussians(run)
+    coefficients = fit_harmonics(run, drawn=drawn, zooms=ZOOMS)
+    opacity = drawn.model.cloud.opacity.get()
+    rows = np.flatnonzero((opacity > LEAST_OPAQUE) & coefficients.any((1, 2)))
+    turn = Rotation.align_vectors([up], [up_of(run.cameras("train"))])[0].as_matrix()
+    positions = run.model.positions()[rows] @ turn.T
+    near = in_world(positions, run.model.grid.edge).dtype == np.float32
+    origin = np.zeros(3) if near else np.rint(positions.mean(0))
+    table = np.zeros(len(rows), SPLAT)
+    table["position"] = positions - origin
+    table["harmonics"] = _turned(coefficients[rows], turn)
+    table["opacity"] = opacity[rows]
+    table["deviation"] = drawn.config.raster.radius * run.model.grid.edge
+    return table, origin
+
+
+def as_gaussians(run: Run) -> Run:
+    """The run with Gaussians in place of its soft discs."""
+    raster = run.config.raster
+    raster = replace(raster, footprint="gaussian", radius=DEVIATION * raster.radius)
+    model, dev = run.model, run.dev
+    opacity = dev.upload(np.minimum(THINNED * model.cloud.opacity.get(), MOST_OPAQUE))
+    cloud = replace(model.cloud, opacity=opacity)
+    model = Model(dev, model.grid, model.depth_range, cloud, net=model.net)
+    return replace(run, config=replace(run.config, raster=raster), model=model)
+
+
+def _turned(coefficients, turn):
+    """(M, 9, 3) of basis() to those of 3D Gaussian splatting, of directions that are turned."""
+    seen = np.random.default_rng(0).normal(size=(64, 3))
+    seen /= np.linalg.norm(seen, axis=1, keepdims=True)
+    theirs = basis(seen @ turn.T)[:, ORDER] * FACTORS
+    matrix = np.linalg.lstsq(theirs, basis(seen), rcond=None)[0]
+    found = np.einsum("jk,nkc->njc", matrix, coefficients)
+    found[:, 0] -= 0.5 / CONSTANT
+    return found
+
+
+def write_splat_ply(path: Path | str, table: np.ndarray) -> None:
+    """Write splats() as the training code of 3D Gaussian splatting does. Raises UserError as
+    atomic_file does.
+    """
+    nothing = np.zeros(len(table), np.float32)
+    columns = dict(zip(("x", "y", "z"), table["position"].T, strict=True))
+    columns |= dict.fromkeys(("nx", "ny", "nz"), nothing)
+    harmonics = np.zeros((len(table), STORED, 3), np.float32)
+    harmonics[:, :COUNT] = table["harmonics"]
+    columns |= {f"f_dc_{c}": harmonics[:, 0, c] for c in range(3)}
+    rest = harmonics[:, 1:].transpose(2, 1, 0).reshape(-1, len(table))  # all of a channel together
+    columns |= {f"f_rest_{i}": column for i, column in enumerate(rest)}
+    columns["opacity"] = np.log(table["opacity"] / (1 - table["opacity"]))
+    columns |= dict.fromkeys(("scale_0", "scale_1", "scale_2"), np.log(table["deviation"]))
+    columns |= {"rot_0": nothing + 1} | dict.fromkeys(("rot_1", "rot_2", "rot_3"), nothing)
+    element = plyfile.PlyElement.describe(table_of(columns), "vertex")
+    with atomic_file(path) as file:
+        plyfile.PlyData([element], byte_order="<").write(file)
+
+
+def write_splat_glb(path: Path | str, table: np.ndarray, origin: np.ndarray) -> None:
+    """Write splats() and their origin as glTF 2.0 with KHR_gaussian_splatting. Raises UserError as
+    atomic_file does.
+    """
+    prefix, positions = "KHR_gaussian_splatting:", table["position"]
+    arrays = {
+        "POSITION": positions,
+        # of programs that draw points instead
+        "COLOR_0": gltf_colours(to_8bit(0.5 + CONSTANT * table["harmonics"][:, 0])),
+        prefix + "ROTATION": np.tile(np.float32([0, 0, 0, 1]), (len(table), 1)),
+        prefix + "SCALE": table["deviation"].repeat(3).reshape(-1, 3),
+        prefix + "OPACITY": table["opacity"],
+    }
+    for k in range(COUNT):
+        degree = int(k**0.5)
+        name = f"{prefix}SH_DEGREE_{degree}_COEF_{k - degree**2}"
+        arrays[name] = table["harmonics"][:, k]
+    data = [np.ascontiguousarray(array).tobytes() for array in arrays.values()]
+    starts = np.cumsum([0, *map(len, data)]).tolist()
+    views = [
+        {"buffer": 0, "byteOffset": start, "byteLength": len(part)}
+        for start, part in zip(starts, data, strict=False)
+    ]
+    accessors = [
+        {
+            "bufferView": i,
+            "componentType": 5126 if array.dtype == np.float32 else 5121,  # float, unsigned byte
+            "type": {1: "SCALAR", 3: "VEC3", 4: "VEC4"}[array.size // len(table)],
+            "count": len(table),
+        }
+        for i, array in enumerate(arrays.values())
+    ]
+    accessors[0] |= {"min": positions.min(0).tolist(), "max": positions.max(0).tolist()}
+    accessors[1]["normalized"] = True
+    kernel = {"kernel": "ellipse", "colorSpace": "srgb_rec709_display"}
+    primitive = {
+        "mode": 0,
+        "attributes": {name: i for i, name in enumerate(arrays)},
+        "extensions": {prefix[:-1]: kernel},
+    }
+    gltf = {
+        "asset": {"version": "2.0", "generator": "pp-cl"},
+        "extensionsUsed": [prefix[:-1]],
+        "scene": 0,
+        "scenes": [{"nodes": [0]}],
+        "nodes": [{"mesh": 0, "translation": origin.tolist()}],
+        "meshes": [{"primitives": [primitive]}],
+        "accessors": accessors,
+        "bufferViews": views,
+        "buffers": [{"byteLength": starts[-1]}],
+    }
+    text = json.dumps(gltf).encode()
+    text += b" " * (-len(text) % 4)
+    with atomic_file(path) as file:
+        length = 12 + 8 + len(text) + 8 + starts[-1]
+        file.write(struct.pack("<4sII", b"glTF", 2, length))
+        file.write(struct.pack("<I4s", len(text), b"JSON") + text)
+        file.write(struct.pack("<I4s", starts[-1], b"BIN\0"))
+        file.writelines(data)

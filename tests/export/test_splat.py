@@ -1,0 +1,140 @@
+"""Splat files: the layout that others read, and what they show when drawn as others draw them."""
+
+import json
+import struct
+from dataclasses import replace
+
+import numpy as np
+import plyfile
+import pytest
+import trimesh
+from scipy.spatial.transform import Rotation
+from support.splats import colours, draw_splats, read_splats
+
+from pp_cl.export.observe import observe
+from pp_cl.export.splat import Y_DOWN, Y_UP, as_gaussians, splats, write_splat_glb, write_splat_ply
+from pp_cl.files.image import to_8bit
+from pp_cl.metrics.psnr_ssim import psnr
+from pp_cl.scene.camera_path import up_of
+
+# of the training code of 3D Gaussian splatting, for its degree 3
+LAYOUT = ["x", "y", "z", "nx", "ny", "nz", *(f"f_dc_{i}" for i in range(3))]
+LAYOUT += [*(f"f_rest_{i}" for i in range(45)), "opacity", *(f"scale_{i}" for i in range(3))]
+LAYOUT += [f"rot_{i}" for i in range(4)]
+
+
+@pytest.fixture(scope="module")
+def ply(run, tmp_path_factory):
+    path = tmp_path_factory.mktemp("splat") / "a.ply"
+    write_splat_ply(path, splats(run, Y_DOWN)[0])
+    return path
+
+
+def turned(run, camera):
+    """The camera in the world of the .ply."""
+    up = up_of(run.cameras("train"))
+    turn = Rotation.align_vectors([(0, -1, 0)], [up])[0].as_matrix()
+    return replace(camera, pose=turn @ camera.pose)
+
+
+def test_the_header_is_that_of_the_training_code(ply):
+    header = ply.read_bytes().partition(b"end_header\n")[0].decode().splitlines()
+    count = len(plyfile.PlyData.read(str(ply))["vertex"])
+    assert header == [
+        "ply",
+        "format binary_little_endian 1.0",
+        f"element vertex {count}",
+        *(f"property float {name}" for name in LAYOUT),
+    ]
+
+
+def test_what_is_no_colour(run, ply):
+    vertex, found = plyfile.PlyData.read(str(ply))["vertex"], read_splats(ply)
+    up = up_of(run.cameras("train"))
+    positions = {tuple(p) for p in run.model.positions().round(4)}
+    turn = Rotation.align_vectors([(0, -1, 0)], [up])[0].as_matrix()
+    back = found["positions"] @ turn
+    assert {tuple(p) for p in back.round(4)} <= positions and len(back) > 0.3 * len(positions)
+    assert turn @ up == pytest.approx([0, -1, 0])
+    assert found["opacity"].min() > 1 / 255 and found["opacity"].max() < 0.991
+    deviation = as_gaussians(run).config.raster.radius * run.model.grid.edge
+    assert np.ptp(found["covariance"], axis=0).max() < 1e-6 * deviation**2
+    assert found["covariance"][0] == pytest.approx(deviation**2 * np.eye(3))
+    assert all((vertex[f"n{axis}"] == 0).all() for axis in "xyz")
+
+
+def test_gaussians_look_like_the_run(run, ply):
+    found = read_splats(ply)
+    for camera in run.cameras("test"):
+        drawn = to_8bit(draw_splats(found, turned(run, camera)))
+        assert psnr(drawn, to_8bit(run.render(camera).colour)) > 25
+
+
+def test_the_rasteriser_draws_the_same_gaussians(run, ply):
+    """What the colours are fitted with is what others draw."""
+    found, camera = read_splats(ply), run.cameras("test")[0]
+    drawn = as_gaussians(run)
+    (seen,) = observe(drawn, [camera], "")
+    alpha = seen.blend_matrix().sum(1).reshape(camera.height, camera.width)
+    white = found | {"harmonics": np.full((len(found["positions"]), 16, 3), 0.0)}
+    white["harmonics"][:, 0] = -0.5 / 0.28209479177387814
+    black = 1 - draw_splats(white, turned(run, camera))[..., 0]
+    assert np.abs(alpha - black).mean() < 0.01
+
+
+def glb(path):
+    """(JSON, {attribute: array}) of a file."""
+    data = path.read_bytes()
+    magic, version, length = struct.unpack_from("<4sII", data)
+    assert (magic, version, length) == (b"glTF", 2, len(data))
+    size, kind = struct.unpack_from("<I4s", data, 12)
+    assert kind == b"JSON" and size % 4 == 0
+    gltf, body = json.loads(data[20 : 20 + size]), data[28 + size :]
+    assert struct.unpack_from("<I4s", data, 20 + size) == (len(body), b"BIN\0")
+    arrays = {}
+    for name, i in gltf["meshes"][0]["primitives"][0]["attributes"].items():
+        accessor = gltf["accessors"][i]
+        view = gltf["bufferViews"][accessor["bufferView"]]
+        dtype = {5126: "<f4", 5121: "u1"}[accessor["componentType"]]
+        width = {"SCALAR": 1, "VEC3": 3, "VEC4": 4}[accessor["type"]]
+        assert view["byteOffset"] % 4 == 0
+        found = np.frombuffer(
+            body[view["byteOffset"] : view["byteOffset"] + view["byteLength"]], dtype
+        )
+        arrays[name] = found.reshape(accessor["count"], width)
+    return gltf, arrays
+
+
+def test_the_glb_says_the_same_with_y_up(run, ply, tmp_path, rng):
+    table, origin = splats(run, Y_UP)
+    write_splat_glb(tmp_path / "a.glb", table, origin)
+    gltf, arrays = glb(tmp_path / "a.glb")
+    (primitive,) = gltf["meshes"][0]["primitives"]
+    assert primitive["mode"] == 0 and gltf["extensionsUsed"] == ["KHR_gaussian_splatting"]
+    assert primitive["extensions"]["KHR_gaussian_splatting"] == {
+        "kernel": "ellipse",
+        "colorSpace": "srgb_rec709_display",
+    }
+    prefix, found = "KHR_gaussian_splatting:", read_splats(ply)
+    flip = np.array([1, -1, -1])  # half a turn around x
+    assert arrays["POSITION"] * flip == pytest.approx(found["positions"], abs=1e-5)
+    assert gltf["accessors"][0]["max"] == pytest.approx(arrays["POSITION"].max(0))
+    assert arrays[prefix + "OPACITY"][:, 0] == pytest.approx(found["opacity"], abs=1e-5)
+    variances = found["covariance"][:, range(3), range(3)]
+    assert arrays[prefix + "SCALE"] ** 2 == pytest.approx(variances)
+    assert (arrays[prefix + "ROTATION"] == [0, 0, 0, 1]).all()
+    names = [(d, k) for d in range(3) for k in range(2 * d + 1)]
+    harmonics = np.stack([arrays[f"{prefix}SH_DEGREE_{d}_COEF_{k}"] for d, k in names], 1)
+    assert len(arrays) == 5 + 9
+    towards = rng.normal(size=(len(harmonics), 3))
+    towards /= np.linalg.norm(towards, axis=1, keepdims=True)
+    ours, theirs = colours(harmonics, towards), colours(found["harmonics"], towards * flip)
+    assert ours == pytest.approx(theirs, abs=1e-4)
+
+
+def test_programs_that_draw_points_read_the_glb(run, tmp_path):
+    table, origin = splats(run, Y_UP)
+    write_splat_glb(tmp_path / "a.glb", table, origin)
+    (cloud,) = trimesh.load(tmp_path / "a.glb").geometry.values()
+    assert isinstance(cloud, trimesh.PointCloud) and len(cloud.vertices) == len(table)
+    assert cloud.colors.shape == (len(table), 4)

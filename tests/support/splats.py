@@ -1,0 +1,89 @@
+"""Draws the .ply of 3D Gaussian splatting as its paper and code do: project, sort, blend."""
+
+import numpy as np
+import plyfile
+
+LOW_PASS, LEAST, MOST, NEAR = 0.3, 1 / 255, 0.99, 0.2
+
+
+def read_splats(path):
+    """{name: array} of a file: positions (N, 3), harmonics (N, 16, 3), opacity (N,), covariance
+    (N, 3, 3).
+    """
+    vertex = plyfile.PlyData.read(str(path))["vertex"]
+
+    def columns(name, count):
+        return np.stack([vertex[f"{name}_{i}"] for i in range(count)], 1).astype(np.float64)
+
+    rest = columns("f_rest", 45).reshape(-1, 3, 15).transpose(0, 2, 1)
+    w, x, y, z = columns("rot", 4).T
+    norm = w * w + x * x + y * y + z * z
+    turn = np.array(
+        [
+            [w * w + x * x - y * y - z * z, 2 * (x * y - w * z), 2 * (x * z + w * y)],
+            [2 * (x * y + w * z), w * w - x * x + y * y - z * z, 2 * (y * z - w * x)],
+            [2 * (x * z - w * y), 2 * (y * z + w * x), w * w - x * x - y * y + z * z],
+        ]
+    )
+    axes = np.moveaxis(turn / norm, 2, 0) * np.exp(columns("scale", 3))[:, None]
+    return {
+        "positions": np.stack([vertex[name] for name in "xyz"], 1).astype(np.float64),
+        "harmonics": np.concatenate([columns("f_dc", 3)[:, None], rest], 1),
+        "opacity": 1 / (1 + np.exp(-vertex["opacity"].astype(np.float64))),
+        "covariance": axes @ axes.transpose(0, 2, 1),
+    }
+
+
+def colours(harmonics, towards):
+    """(N, 3), of degrees 0 to 2, in unit directions (N, 3) from the eye."""
+    x, y, z = towards.T
+    basis = [0.28209479177387814 + 0 * x]
+    basis += [-0.4886025119029199 * y, 0.4886025119029199 * z, -0.4886025119029199 * x]
+    basis += [1.0925484305920792 * x * y, -1.0925484305920792 * y * z]
+    basis += [0.31539156525252005 * (2 * z * z - x * x - y * y)]
+    basis += [-1.0925484305920792 * x * z, 0.5462742152960396 * (x * x - y * y)]
+    return np.maximum(0.5 + np.einsum("kn,nkc->nc", basis, harmonics[:, :9]), 0)
+
+
+def draw_splats(splats, camera):
+    """(H, W, 3): what a Camera sees of read_splats() before white."""
+    axes = camera.pose[:, :3].T
+    at = (splats["positions"] - camera.eye) @ axes.T
+    order = np.argsort(at[:, 2], kind="stable")
+    order = order[at[order, 2] > NEAR]
+    (x, y, z), n = at[order].T, len(order)
+    limits = 1.3 * np.array([camera.width / 2 / camera.fx, camera.height / 2 / camera.fy])
+    jacobian = np.zeros((n, 2, 3))
+    for axis, focal in enumerate((camera.fx, camera.fy)):
+        slope = np.clip(at[order, axis] / z, -limits[axis], limits[axis])
+        jacobian[:, axis, axis], jacobian[:, axis, 2] = focal / z, -focal * slope / z
+    jacobian = jacobian @ axes
+    flat = jacobian @ splats["covariance"][order] @ jacobian.transpose(0, 2, 1)
+    inverse = np.linalg.inv(flat + LOW_PASS * np.eye(2))
+    centre = np.stack([camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy], 1)
+    first = np.floor(centre).astype(int)
+    reach = int(np.ceil(3.4 * np.sqrt(flat[:, [0, 1], [0, 1]].max() + LOW_PASS)))
+    parts = []
+    for dy in range(-reach, reach + 1):
+        for dx in range(-reach, reach + 1):
+            column, row = (first + (dx, dy)).T
+            away = np.stack([column, row], 1) + 0.5 - centre
+            falloff = np.exp(-0.5 * np.einsum("ni,nij,nj->n", away, inverse, away))
+            alpha = np.minimum(MOST, splats["opacity"][order] * falloff)
+            inside = (column >= 0) & (column < camera.width) & (row >= 0) & (row < camera.height)
+            hit = np.flatnonzero(inside & (alpha >= LEAST))
+            parts.append((row[hit] * camera.width + column[hit], hit, alpha[hit]))
+    pixel, rank, alpha = (np.concatenate(part) for part in zip(*parts, strict=True))
+    sort = np.lexsort((rank, pixel))
+    pixel, rank, alpha = pixel[sort], rank[sort], alpha[sort]
+    through = np.concatenate([[0], np.cumsum(np.log1p(-alpha))])  # of the light, logarithm
+    count = camera.width * camera.height
+    begin = np.searchsorted(pixel, np.arange(count + 1))
+    weight = alpha * np.exp(through[:-1] - through[begin[pixel]])
+    towards = splats["positions"][order] - camera.eye
+    colour = colours(
+        splats["harmonics"][order], towards / np.linalg.norm(towards, axis=1, keepdims=True)
+    )[rank]
+    image = [np.bincount(pixel, weight * colour[:, c], minlength=count) for c in range(3)]
+    white = 1 - np.bincount(pixel, weight, minlength=count)
+    return (np.stack(image, 1) + white[:, None]).reshape(camera.height, camera.width, 3).clip(0, 1)
