@@ -46,7 +46,8 @@ class RenderResult:
 
     camera: of the view. size: (H, W) of the image that is rendered, padded to multiples of 4.
     offset: (left, top) of the view in it. points: the N points as the padded camera sees them.
-    tiles: (rows, columns) bool, the 4x4 tiles of the padded image that have hits. point_features:
+    tiles: (rows, columns) bool, the 4x4 tiles of the padded image that have hits; None where the
+    network computes all. point_features:
     (N, 16) float32, of which only the rows weights.shaded are set. features: (H, W, 16) float32,
     blended from them. image: (H, W, 3) float32, unclamped. computed_fraction: share of the
     network's multiplications that was done; the others would have seen only background.
@@ -58,10 +59,10 @@ class RenderResult:
     points: ProjectedPoints
     pairs: Pairs
     weights: BlendWeights
-    tiles: Any
-    point_features: Any = None
-    features: Any = None
-    image: Any = None
+    tiles: Reading[np.ndarray] | None
+    point_features: Array | None = None
+    features: Array | None = None
+    image: Array | None = None
     computed_fraction: float = 1.0
 
     def clamped(self) -> np.ndarray:
@@ -157,12 +158,12 @@ class Renderer:
             plan: Any = None
             if net.is_planned(size):
                 plan = net.plan_tiles(size, tiles.get(), gradient_tiles())
-                result.computed_fraction = plan.computed_fraction
+                result.computed_fraction = plan.computed_fraction if plan else 1.0
             result.image = net.forward(b.features, training, plan)
         return result
 
     def _pairs_and_weights(self, points, size, gamma, early_stop):
-        """(Pairs, BlendWeights, tiles that have hits). Both stages are enqueued before the number
+        """(Pairs, BlendWeights, RenderResult.tiles). Both stages are enqueued before the number
         of pairs is known, and run again with more room if it was too small.
         """
         settings = self.settings
@@ -181,9 +182,10 @@ class Renderer:
                     max_tracked=settings.max_tracked,
                     early_stop=settings.early_stop if early_stop is None else early_stop,
                 )
-            tiles = tiles_hit(self.dev, pairs.pixel_offset, size)
-            tiles.get()  # the host's one wait for the device
-            self._room = room_needed(pairs)
+            tiles = None
+            if self.model.net.is_planned(size):
+                tiles = tiles_hit(self.dev, pairs.pixel_offset, size)
+            self._room = room_needed(pairs)  # waits for the device
             if self._room == pairs.capacity:
                 return pairs, weights, tiles
             del pairs, weights  # else their arrays would stay beside the larger ones

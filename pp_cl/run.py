@@ -391,7 +391,6 @@ def render_views(run: Run, views: list[View]) -> Iterator[Rendered]:
         result = run.renderer.forward(view.camera, run.gamma)
         image = run.checked(result.clamped())
         seconds = time.perf_counter() - start
-        target.load(view)
-        truth = target.whole()
-        alpha = target.alpha((0, 0, view.camera.width, view.camera.height)).get()
+        whole = target.crop(view, (0, 0, view.camera.width, view.camera.height))
+        truth, alpha = (array.get() for array in whole)
         yield Rendered(view.name, image, truth, alpha, seconds, result.computed_fraction)

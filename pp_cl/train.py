@@ -85,6 +85,14 @@ class Trainer:
         """Whether photographs are divided by gains."""
         return self.exposure is not None and self.exposure.is_applied
 
+    @property
+    def network_size(self) -> tuple[int, int]:
+        """(height, width) of the network's image for a crop of the first view."""
+        view = self._reduced[0]
+        camera = view.crop_camera((0, 0, *view.crop_size(self._crop)))
+        padded, _, _ = camera.padded(NETWORK_MULTIPLE)
+        return padded.height, padded.width
+
     def _set_level(self):
         """Set images, crop size and object boxes for the present level of the grid: the images are
         halved once for every refinement still to come.
@@ -108,10 +116,8 @@ class Trainer:
         view = self._reduced[view_index]
         camera = view.crop_camera(box, jitter)
         with self.dev.stage("target"):
-            self._target.load(view)
-            target = photograph = self._target.crop(box, jitter)
-            wants_alpha = view.has_mask or self.exposure
-            target_alpha = self._target.alpha(box, jitter) if wants_alpha else None
+            photograph, target_alpha = self._target.crop(view, box, jitter)
+            target = photograph
             if self.is_exposed:
                 target = self.exposure.target(view_index, photograph, target_alpha)
             tiles_of_gradient = self._gradient_tiles(target, camera)
@@ -332,8 +338,7 @@ class Trainer:
 
     def target(self, view: View) -> np.ndarray:
         """(H, W, 3) float32 in [0, 1]: what render(view) should be."""
-        self._target.load(view)
-        return self._target.whole()
+        return self._target.whole(view)
 
     def arrays(self) -> dict[str, DeviceRows]:
         """{name in a checkpoint: array} of the model and of the training's state. Raises UserError

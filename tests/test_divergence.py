@@ -63,7 +63,7 @@ def _poison(monkeypatch, after, what):
             arrays = {
                 "points": cloud.sh[0],
                 "opacity": cloud.opacity,
-                "moment": next(iter(self.moments.values()))["m"],
+                "moment": self.moments["m"],
             }
             self.dev.fill(arrays[what], np.nan)
 

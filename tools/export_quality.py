@@ -76,10 +76,8 @@ def page_rows(run: Run) -> list[dict]:
     views.
     """
     views = run.scene("test").splits["test"]
-    target, truths = Target(run.dev), []
-    for view in views:
-        target.load(view)
-        truths.append(to_8bit(target.whole()))
+    target = Target(run.dev)
+    truths = [to_8bit(target.whole(view)) for view in views]
     cameras = [view.camera for view in views]
     images = [to_8bit(run.render(camera).colour) for camera in cameras]
     network = np.mean([psnr(*pair) for pair in zip(images, truths, strict=True)])

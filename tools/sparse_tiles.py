@@ -52,8 +52,7 @@ class Comparison:
         camera = view.camera
         view_raster = self.renderer.forward(camera, self.config.raster.gamma[1], until="features")
         x = view_raster.features
-        self.target.load(view)
-        target = self.target.crop((0, 0, camera.width, camera.height))
+        target, _ = self.target.crop(view, (0, 0, camera.width, camera.height))
 
         def plan():
             found = tiles_find(self.dev, target, WHITE).get()

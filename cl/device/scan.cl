@@ -3,8 +3,18 @@
 #include "group.h"
 
 #ifndef BLOCK
-#define BLOCK 512  // values that GROUP work-items scan together: a million take two levels
+#define BLOCK 2048  // values that GROUP work-items scan together
 #endif
+
+// The sum of the blocks before `block`, by GROUP work-items together.
+#define SUM_BEFORE(block, block_sum, shared, sum)                                                  \
+    uint sum;                                                                                      \
+    {                                                                                              \
+        ulong part = 0;                                                                            \
+        for (uint i = MEMBER; i < (block); i += GROUP)                                             \
+            part += (block_sum)[i];                                                                \
+        group_scan((uint)min(part, (ulong)UINT_MAX), shared, &sum);                                \
+    }
 
 // GROUP work-items per block of BLOCK values: read them, write their sum.
 kernel void scan_sums(
@@ -43,20 +53,20 @@ kernel void count_nonzero(
     if (MEMBER == 0) block_sum[block] = total;
 }
 
-// GROUP work-items per block of BLOCK values: read them and where the block starts, write where
-// each value starts; those of the last block also write the total behind them.
+// GROUP work-items per block of BLOCK values: read them and the sums of the blocks before, write
+// where each value starts; those of the last block also write the total behind them.
 kernel void scan_offsets(
-    const uint n,                     // values
-    const uint b,                     // blocks
-    global const uint *values,        // (N)
-    global const uint *block_offset,  // (B+1)
-    global uint *offsets)             // (N+1)
+    const uint n,                  // values
+    const uint b,                  // blocks
+    global const uint *values,     // (N)
+    global const uint *block_sum,  // (B)
+    global uint *offsets)          // (N+1)
 {
     SHARED(uint, shared, 2 * GROUP);
     const uint block = GROUP_ID;
     if (block >= b) return;
     const uint end = min(n, (block + 1) * BLOCK);
-    uint sum = block_offset[block];
+    SUM_BEFORE(block, block_sum, shared, sum)
     for (uint first = block * BLOCK; first < end; first += GROUP) {
         const uint i = first + MEMBER;
         uint total;
@@ -67,25 +77,27 @@ kernel void scan_offsets(
     if (MEMBER == 0 && block == b - 1) offsets[n] = sum;
 }
 
-// GROUP work-items per block of BLOCK flags: read them and how many before the block are not zero,
-// write the indices of those that are not.
+// GROUP work-items per block of BLOCK flags: read them and how many of each block before are not
+// zero, write the indices of those that are not; those of the last block also write how many.
 kernel void scan_nonzero(
-    const uint n,                     // flags
-    const uint b,                     // blocks
-    global const uchar *flags,        // (N)
-    global const uint *block_offset,  // (B+1) prefix sums of what count_nonzero wrote
-    global uint *indices)             // (N); the first block_offset[b] are written
+    const uint n,                  // flags
+    const uint b,                  // blocks
+    global const uchar *flags,     // (N)
+    global const uint *block_sum,  // (B) of count_nonzero
+    global uint *indices,          // (N); the first `found` are written
+    global uint *found)            // (1)
 {
     SHARED(uint, shared, 2 * GROUP);
     const uint block = GROUP_ID;
     if (block >= b) return;
     const uint end = min(n, (block + 1) * BLOCK);
-    uint listed = block_offset[block];
+    SUM_BEFORE(block, block_sum, shared, listed)
     for (uint first = block * BLOCK; first < end; first += GROUP) {
-        const uint i = first + MEMBER, found = i < end && flags[i] != 0;
+        const uint i = first + MEMBER, is_listed = i < end && flags[i] != 0;
         uint total;
-        const uint before = group_scan(found, shared, &total);
-        if (found) indices[listed + before] = i;
+        const uint before = group_scan(is_listed, shared, &total);
+        if (is_listed) indices[listed + before] = i;
         listed += total;
     }
+    if (MEMBER == 0 && block == b - 1) *found = listed;
 }

@@ -27,10 +27,10 @@ static inline Vectors scene_normal(const Vectors p) {
 }
 
 // Share of the key light that reaches p: a soft shadow, its penumbra from the closest approach to
-// another part.
-static inline floats key_visibility(const Vectors p) {
+// another part. Anything in lanes that are not `asked`.
+static inline floats key_visibility(const Vectors p, const ints asked) {
     floats lit = 1.0f, t = 0.02f;
-    for (int step = 0; step < SHADOW_STEPS; step++) {
+    for (int step = 0; step < SHADOW_STEPS && ANY_LANE(asked & (lit > 0.0f)); step++) {
         const floats d =
             scene_distance((Vectors){p.x + t * KEY.x, p.y + t * KEY.y, p.z + t * KEY.z});
         lit = min(lit, 12.0f * d / t);
@@ -118,18 +118,19 @@ static inline floats displayed(const floats linear) {
     return sqrt(clamp(linear, 0.0f, 1.0f));
 }
 
-// Displayed colour of places p seen along unit rays: two lights, the environment's reflection,
+// Displayed colour of places p that were `hit`, seen along unit rays: two lights, the environment's reflection,
 // Schlick's Fresnel term.
-static inline Vectors shade(const Vectors p, const Vectors ray) {
+static inline Vectors shade(const Vectors p, const Vectors ray, const ints hit) {
     ints metal;
     const Vectors colour = surface_colour(p, &metal);
     const Vectors n = scene_normal(p);
-    const floats open = openness(p, n), lit = key_visibility(advance(p, n, 4e-3f));
+    const floats towards = max(dot_axis(n, KEY), 0.0f), open = openness(p, n);
+    const floats lit = key_visibility(advance(p, n, 4e-3f), hit & (towards > 0.0f));
     const floats facing = max(-dot_lanes(n, ray), 0.0f);
     const Vectors reflected = advance(ray, n, 2.0f * facing);
 
     const floats soft = open * (0.30f + 0.15f * n.z + 0.22f * max(dot_axis(n, FILL), 0.0f));
-    const floats diffuse = soft + 0.85f * lit * max(dot_axis(n, KEY), 0.0f);
+    const floats diffuse = soft + 0.85f * lit * towards;
     const floats grazing = 1.0f - facing, grazing2 = grazing * grazing;
     const floats fresnel = grazing2 * grazing2 * grazing;
     const Vectors mirror = environment(reflected);
@@ -183,7 +184,7 @@ kernel void render_demo(
             marching &= ~hit & (t < end);
         }
         if (!ANY_LANE(hit)) continue;
-        const Vectors colour = shade(advance(eye, ray, t), ray);
+        const Vectors colour = shade(advance(eye, ray, t), ray, hit);
         const floats weight = select((floats)0.0f, (floats)1.0f, hit);
         hits += SUM_LANES(weight);
         sum += (float3)(SUM_LANES(weight * colour.x), SUM_LANES(weight * colour.y),

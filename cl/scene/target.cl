@@ -2,8 +2,8 @@
 #include "common.h"
 
 // One work-item per target pixel: reads its block of downscale x downscale stored pixels, writes
-// the mean colour of those that exist, white if none does. Straight alpha: colour over white = rgb
-// * a + (1 - a).
+// the mean colour of those that exist, white if none does, and their mean alpha, 0 if none does.
+// Straight alpha: colour over white = rgb * a + (1 - a).
 kernel void target_forward(
     const int width,  // of the target, pixels
     const int height,
@@ -13,7 +13,8 @@ kernel void target_forward(
     const int image_width,
     const int image_height,
     global const uchar4 *image,  // (image_height, image_width, 4) straight RGBA
-    global float *target)        // (height, width, 3)
+    global float *target,        // (height, width, 3)
+    global float *alpha)         // (height, width)
 {
     const int x = get_global_id(0), y = get_global_id(1);
     if (x >= width || y >= height) return;
@@ -21,39 +22,18 @@ kernel void target_forward(
     const int y0 = max(top + downscale * y, 0), y1 = min(top + downscale * (y + 1), image_height);
     // of colours in units of 1 / 255^2; exact up to downscale = 16, where it reaches 2^24
     float4 sum = 0.0f;
+    uint opaque = 0;
     for (int v = y0; v < y1; v++) {
         uint4 row = 0;
         for (int u = x0; u < x1; u++) {
             const uint4 c = convert_uint4(image[v * image_width + u]);
             row += c * c.w + 255 * (255 - c.w);
+            opaque += c.w;
         }
         sum += convert_float4(row);
     }
     const int count = max(x1 - x0, 0) * max(y1 - y0, 0);
     const float4 mean = count > 0 ? sum / (65025.0f * count) : (float4)(1.0f);
     vstore3(mean.xyz, y * width + x, target);
-}
-
-// One work-item per target pixel: writes the mean alpha of its block, 0 where no stored pixel is.
-kernel void target_alpha(
-    const int width,  // of the target, pixels
-    const int height,
-    const int downscale,  // as for target_forward, also the next four
-    const int left,
-    const int top,
-    const int image_width,
-    const int image_height,
-    global const uchar4 *image,  // (image_height, image_width, 4) straight RGBA
-    global float *alpha)         // (height, width)
-{
-    const int x = get_global_id(0), y = get_global_id(1);
-    if (x >= width || y >= height) return;
-    const int x0 = max(left + downscale * x, 0), x1 = min(left + downscale * (x + 1), image_width);
-    const int y0 = max(top + downscale * y, 0), y1 = min(top + downscale * (y + 1), image_height);
-    uint sum = 0;
-    for (int v = y0; v < y1; v++)
-        for (int u = x0; u < x1; u++)
-            sum += image[v * image_width + u].w;
-    const int count = max(x1 - x0, 0) * max(y1 - y0, 0);
-    alpha[y * width + x] = count > 0 ? sum / (255.0f * count) : 0.0f;
+    alpha[y * width + x] = count > 0 ? opaque / (255.0f * count) : 0.0f;
 }

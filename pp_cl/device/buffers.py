@@ -5,7 +5,7 @@ too; packed into one buffer; read without waiting; and their rows gathered, kept
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import Any, Generic, TypeVar
 
 import numpy as np
@@ -68,13 +68,28 @@ class Buffers:
             raise AttributeError(f"no buffer {name!r} was required yet") from None
 
 
+def packed_arrays(
+    dev: Device, rows: Iterable[tuple[tuple[int, ...], type]]
+) -> tuple[Array, list[Array]]:
+    """(octets, arrays of these shapes and dtypes that lie in them), all zeros: one launch or
+    transfer handles them all. The arrays are valid as long as the octets are held.
+    """
+    align = dev.device.mem_base_addr_align // 8
+    rows = [(shape, dtype, max(1, table_bytes({"": (shape, dtype)}))) for shape, dtype in rows]
+    *starts, end = np.cumsum([0, *(-(-size // align) * align for *_, size in rows)])
+    whole, arrays = dev.zeros((int(end),), np.uint8), []
+    for start, (shape, dtype, size) in zip(starts, rows, strict=True):
+        region = whole.base_data.get_sub_region(int(start), size)
+        arrays.append(Array(dev.queue, shape, dtype, data=region))
+    return whole, arrays
+
+
 class PackedArrays:
     """Device arrays in one buffer, which one transfer overwrites."""
 
     def __init__(self, dev: Device):
         self._dev = dev
         self._rows: list[tuple[tuple[int, ...], type]] = []
-        self._starts: list[int] = []
         self._arrays: list[Array] = []
         self._whole: Any = None
 
@@ -86,23 +101,15 @@ class PackedArrays:
         ones is undefined.
         """
         if rows != self._rows:
-            self._allocate(rows)
+            self._rows, self._whole, self._arrays = rows, None, []  # frees the old ones first
+            self._whole, self._arrays = packed_arrays(self._dev, rows)
         packed = np.empty(self._whole.shape, np.uint8)
-        for start, value in zip(self._starts, values, strict=True):
+        for array, value in zip(self._arrays, values, strict=True):
             octets = np.ascontiguousarray(value).reshape(-1).view(np.uint8)
+            start = array.base_data.offset
             packed[start : start + value.nbytes] = octets
         self._dev.send(self._whole, packed)
         return self._arrays
-
-    def _allocate(self, rows):
-        self._rows, self._whole, self._arrays = rows, None, []  # frees the old ones first
-        align = self._dev.device.mem_base_addr_align // 8
-        sizes = [max(1, math.prod(shape) * np.dtype(dtype).itemsize) for shape, dtype in rows]
-        *self._starts, end = np.cumsum([0, *(-(-size // align) * align for size in sizes)])
-        self._whole = self._dev.empty((int(end),), np.uint8)
-        for (shape, dtype), start, size in zip(rows, self._starts, sizes, strict=True):
-            region = self._whole.base_data.get_sub_region(int(start), size)
-            self._arrays.append(Array(self._dev.queue, shape, dtype, data=region))
 
 
 class Reading(Generic[T]):

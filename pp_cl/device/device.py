@@ -160,12 +160,18 @@ class Device:
         self._sent: deque[Any] = deque()  # events of send()
         self._scratch: dict[Hashable, Any] = {}  # {name: array} of scratch()
         self._programs: dict[Any, Program] = {}
+        self.build_seconds = 0.0  # of all programs
         self._seconds: dict[str, list[float]] = defaultdict(list)
         self._stage_seconds: dict[str, list[float]] | None = None
         if self.debug:
             self._stage_seconds = defaultdict(list)
         if self.debug:
             atexit.register(self.print_profile)
+
+    @property
+    def programs_built(self) -> int:
+        """How many programs were built."""
+        return len(self._programs)
 
     @property
     def build_options(self) -> list[str]:
@@ -203,9 +209,11 @@ class Device:
                 ],
                 defines=defines,
             )
+            seconds = time.perf_counter() - start
+            self.build_seconds += seconds
             if self.debug:
                 print(
-                    f"cl/{name}.cl {' '.join(macros)} built in {time.perf_counter() - start:.2f} s",
+                    f"cl/{name}.cl {' '.join(macros)} built in {seconds:.2f} s",
                     file=sys.stderr,
                 )
         return self._programs[key]

@@ -7,13 +7,7 @@ from pp_cl.device.buffers import Reading, read_later
 from pp_cl.device.device import Device
 from pp_cl.device.launch import launch_groups
 
-BLOCK = 512  # values that a work-item of a CPU scans
-BLOCK_ON_GPU = 2048  # values that a work-group scans: four million take two levels
-
-
-def block_values(dev: Device) -> int:
-    """BLOCK of its kernels: values that one work-item, or on GPUs one work-group, scans."""
-    return BLOCK if dev.is_cpu else BLOCK_ON_GPU
+BLOCK = 2048  # values that a work-item of a CPU, or a work-group of a GPU, scans
 
 
 def exclusive_scan(dev: Device, values: Array, offsets: Array) -> None:
@@ -22,47 +16,28 @@ def exclusive_scan(dev: Device, values: Array, offsets: Array) -> None:
 
     values: (N) uint32, N >= 1. offsets: (N+1) uint32.
     """
-    _scan(dev, values, offsets, level=0)
-
-
-def _scan(dev, values, offsets, level):
-    """exclusive_scan() of the values or, from level 1 on, of sums of blocks."""
     n = values.size
-    blocks = -(-n // block_values(dev))
-    if blocks > 1:
-        block_offset = _block_offsets(dev, "scan_sums", n, blocks, level=level, values=values)
-    else:
-        block_offset = _scratch(dev, ("scan offset", level), 2)
-        dev.fill(block_offset, 0)
-    _launch(
-        dev,
-        "scan_offsets",
-        blocks,
-        n=n,
-        b=blocks,
-        values=values,
-        block_offset=block_offset,
-        offsets=offsets,
+    block_sum = _block_sums(dev, "scan_sums", n, values=values)
+    _launch(dev, "scan_offsets", n, values=values, block_sum=block_sum, offsets=offsets)
+
+
+def _block_sums(dev, kernel, n, **entries):
+    """(blocks,) what the kernel finds in each block of n entries."""
+    # of a power of two: numbers of pairs differ from step to step
+    held = dev.scratch("scan", 1 << (_blocks(n) - 1).bit_length(), np.uint32)
+    _launch(dev, kernel, n, block_sum=held[: _blocks(n)], **entries)
+    return held[: _blocks(n)]
+
+
+def _blocks(n):
+    return -(-n // BLOCK)
+
+
+def _launch(dev, kernel, n, **arguments):
+    blocks = _blocks(n)
+    launch_groups(
+        dev, "device/scan", kernel, blocks, defines={"BLOCK": BLOCK}, n=n, b=blocks, **arguments
     )
-
-
-def _block_offsets(dev, kernel, n, blocks, *, level, **entries):
-    """(blocks + 1,) prefix sums of what the kernel finds in each block of n entries."""
-    block_offset = _scratch(dev, ("scan offset", level), blocks + 1)
-    block_sum = _scratch(dev, ("scan sum", level), blocks)
-    _launch(dev, kernel, blocks, n=n, b=blocks, block_sum=block_sum, **entries)
-    _scan(dev, block_sum, block_offset, level + 1)
-    return block_offset
-
-
-def _scratch(dev, name, n):
-    """(n,) uint32, of a power of two: numbers of pairs differ from step to step."""
-    return dev.scratch(name, 1 << (n - 1).bit_length(), np.uint32)[:n]
-
-
-def _launch(dev, kernel, blocks, **arguments):
-    defines = {"BLOCK": block_values(dev)}
-    launch_groups(dev, "device/scan", kernel, blocks, defines=defines, **arguments)
 
 
 def read_total(dev: Device, offsets: Array) -> Reading[int]:
@@ -75,17 +50,7 @@ def nonzero(dev: Device, flags: Array, indices: Array) -> Reading[Array]:
 
     flags: (N) uint8, N >= 1. indices: (N) uint32.
     """
-    n = flags.size
-    blocks = -(-n // block_values(dev))
-    block_offset = _block_offsets(dev, "count_nonzero", n, blocks, level=0, flags=flags)
-    _launch(
-        dev,
-        "scan_nonzero",
-        blocks,
-        n=n,
-        b=blocks,
-        flags=flags,
-        block_offset=block_offset,
-        indices=indices,
-    )
-    return read_later(dev, block_offset, blocks, lambda total: indices[: int(total[0])])
+    n, found = flags.size, dev.scratch("found", 1, np.uint32)
+    block_sum = _block_sums(dev, "count_nonzero", n, flags=flags)
+    _launch(dev, "scan_nonzero", n, flags=flags, block_sum=block_sum, indices=indices, found=found)
+    return read_later(dev, found, convert=lambda total: indices[: int(total[0])])

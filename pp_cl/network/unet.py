@@ -3,13 +3,14 @@ launch the kernels layer by layer.
 """
 
 import math
+import subprocess
 from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 from pyopencl.array import Array
 
-from pp_cl.device.buffers import PackedArrays, Table
+from pp_cl.device.buffers import PackedArrays, Table, packed_arrays
 from pp_cl.device.device import Device
 from pp_cl.layers.choice import ConvolutionPolicy, make_policy
 from pp_cl.layers.conv_direct import Direction, pack_bias, pack_weights
@@ -43,6 +44,7 @@ from pp_cl.settings import NetworkConfig
 # Background tiles are skipped only in images of at least LEAST_PIXELS pixels, and only if at most
 # MOST_COMPUTED of the multiplications remain: finding them costs time too.
 LEAST_PIXELS, MOST_COMPUTED = 1 << 16, 0.8
+PARAMETERS = "parameters", "gradients of parameters"  # in the memory plan
 MULTIPLE = 4  # pixels: two poolings halve the height and the width
 
 
@@ -95,7 +97,8 @@ class UNet:
     image. policy: chooses the variant of each convolution; may be replaced between images; None =
     as shipped, whatever their error. layers: in the order of the forward pass. parameters,
     gradients: {"enc0.a.weight": (ceil(CO/16), K, K, CI, 16), "enc0.a.bias": (ceil(CO/16) * 16,),
-    ...} float32 on the device. Weights and biases start uniform in +-1/sqrt(CI K K) (PyTorch's
+    ...} float32 on the device; all_parameters, all_gradients: the 1-D array that they lie in, with
+    zeros between them. Weights and biases start uniform in +-1/sqrt(CI K K) (PyTorch's
     default for Conv2d), output channels beyond CO at 0, with gradient 0.
     """
 
@@ -117,16 +120,16 @@ class UNet:
         self.layers = unet_layers(widths, channels_in, channels_out, blocks, channels=channels)
         self.channels_in = channels_in
         self.policy = policy or make_policy(dev)
-        self.parameters = {}
+        self.all_parameters, self.parameters = self._packed()
+        self.all_gradients, self.gradients = self._packed()
         rng = np.random.default_rng(seed)
         for layer in convolutions(self.layers):
             shape = layer.weight_shape()
             bound = 1 / np.sqrt(math.prod(shape[1:]))
             weight, bias = rng.uniform(-bound, bound, shape), rng.uniform(-bound, bound, shape[0])
-            self.parameters[layer.name + ".weight"] = dev.upload(pack_weights(weight))
-            self.parameters[layer.name + ".bias"] = dev.upload(pack_bias(bias))
-        table = parameter_table(self.layers)
-        self.gradients = {name: dev.zeros(*row) for name, row in table.items()}
+            dev.write(self.parameters[layer.name + ".weight"], pack_weights(weight))
+            dev.write(self.parameters[layer.name + ".bias"], pack_bias(bias))
+        self.builders: list[subprocess.Popen] = []  # of its kernels, before the first forward pass
         self._relu_outputs = {layer.name for layer in self.layers if layer.relu}
         self._maps: dict[bool, FeatureMaps] = {}  # {training: FeatureMaps}
         self._modules: dict[
@@ -150,6 +153,20 @@ class UNet:
             seed=seed,
             policy=policy,
         )
+
+    def _packed(self):
+        """(zeros like all_parameters, {name: array in them}) of the parameters."""
+        table = parameter_table(self.layers)
+        whole, arrays = packed_arrays(self.dev, table.values())
+        return whole.view(np.float32), dict(zip(table, arrays, strict=True))
+
+    def split(self, whole: Array) -> dict[str, Array]:
+        """{name of a parameter: its part of an array that is laid out as all_parameters}."""
+        parts = {}
+        for name, parameter in self.parameters.items():
+            start = parameter.base_data.offset // parameter.dtype.itemsize
+            parts[name] = whole[start : start + parameter.size].reshape(parameter.shape)
+        return parts
 
     def freeze(self) -> None:
         """From now on the parameters do not change: their weights are transformed for the kernels
@@ -196,6 +213,8 @@ class UNet:
             raise ValueError(
                 f"the network takes (4n, 4m, {self.channels_in}) features, not {x.shape}"
             )
+        while self.builders:
+            self.builders.pop().wait()
         if training not in self._maps:
             self._maps[training] = FeatureMaps(self.dev, self.layers, training)
         if training:
@@ -212,6 +231,24 @@ class UNet:
         if training:
             self._trained = size, arrays, tiles
         return out
+
+    def build(self, size: tuple[int, int], of_weights: bool) -> None:
+        """Run each layer once on crops of `size` = (height, width) that hold anything, which builds
+        its kernels: those of the gradients of weights, or the others.
+        """
+        maps = FeatureMaps(self.dev, self.layers, training=True)
+        maps.resize(size)
+        arrays = maps.arrays | {"x": self.dev.zeros((*size, self.channels_in))}
+        for layer in self.layers:
+            tiles = maps.all_tiles.tiles
+            if not of_weights:
+                sources = tuple(arrays[name] for name in layer.inputs)
+                self._forward(size, layer, sources, arrays[layer.name], tiles(layer.name))
+                for i, name in enumerate(layer.inputs):
+                    self._backward_input(size, layer, i, arrays, tiles(name))
+            elif layer.kind == "conv":
+                self._backward_weights(size, layer, arrays, tiles(layer.name))
+        self.dev.finish()
 
     def backward(self, grad_y: Array) -> Array:
         """(H, W, channels_in) gradient of x in the last forward(x, training=True), given dL/dy (H,
@@ -327,11 +364,11 @@ class UNet:
         Gradients of parameters are among them without training too: they are made with the network.
         Raises UserError where no variant is as exact as the policy's tolerance.
         """
-        size, parameters = (height, width), parameter_table(self.layers)
+        size = (height, width)
         shared = share_buffers(lifetimes(self.layers, training), array_shapes(self.layers, size))
         floats = {" = ".join(buffer.names): buffer.floats for buffer in shared}
         for layer in convolutions(self.layers):
-            weight_shape, _ = parameters[layer.name + ".weight"]
+            weight_shape = self.parameters[layer.name + ".weight"].shape
             for direction, source in computations(layer, training):
                 needed = self._module(layer, direction, source, size).scratch_floats(
                     self.dev,
@@ -343,8 +380,8 @@ class UNet:
                 )
                 for name, number in needed.items():
                     floats[name] = max(number, floats.get(name, 0))
-        table = {name: ((number,), np.float32) for name, number in floats.items()} | parameters
-        table |= {gradient_of(name): row for name, row in parameters.items()}
+        table = {name: ((number,), np.float32) for name, number in floats.items()}
+        table |= dict.fromkeys(PARAMETERS, (self.all_parameters.shape, np.float32))
         for level in set(levels_of(self.layers).values()):
             tiles = all_tiles_buffers(height >> level, width >> level)
             table |= {f"tiles of level {level}, {name}": row for name, row in tiles.items()}

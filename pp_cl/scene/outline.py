@@ -47,8 +47,7 @@ def picture(
     for view in shown:
         size = view.stored_camera.width, view.stored_camera.height
         small = view.reduced(fitting_downscale(size, SHOWN_SIZE))
-        target.load(small)
-        image = to_8bit(target.whole())
+        image = to_8bit(target.whole(small))
         if view.name in tinted:
             rejected = silhouette(*tinted[view.name][2:], small.camera)
             image[rejected] = image[rejected] // 2 + REJECTED

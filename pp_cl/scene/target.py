@@ -13,7 +13,7 @@ from pp_cl.scene.views import View
 
 
 class Target:
-    """Makes targets from the view that was loaded last.
+    """Makes targets from views.
 
     A target pixel is the mean of the stored pixels of its block; where a block reaches outside of
     the image only those inside count, and wholly outside the target is white.
@@ -21,56 +21,44 @@ class Target:
 
     def __init__(self, dev: Device):
         self.dev = dev
-        self.program = dev.program("scene/target")
-        self._view: Any = None  # the View loaded, and its image on the device
-        self._image: Any = None
         self._buffers = Buffers(dev)
 
-    def load(self, view: View) -> None:
-        """Bring a view's image to the device, unless it is there."""
-        if self._view is None or self._view.image is not view.image:
-            if self._image is None or self._image.shape != view.image.shape:
-                self._image = self.dev.empty(view.image.shape, np.uint8)
-            self.dev.send(self._image, view.image)
-        self._view = view
-
-    def crop(self, box: tuple[int, int, int, int], jitter: tuple[int, int] = (0, 0)) -> Array:
-        """(height, width, 3) float32: a part of the loaded view's reduced image, valid until the
-        next call.
+    def crop(
+        self, view: View, box: tuple[int, int, int, int], jitter: tuple[int, int] = (0, 0)
+    ) -> tuple[Array, Array]:
+        """(colour (height, width, 3), alpha (height, width)), float32: a part of a view's reduced
+        image, and the mean alpha of its pixels, 0 outside of the image; valid until the next call.
 
         box: (x0, y0, width, height), reduced pixels; may reach outside of the image. jitter: stored
         pixels by which all blocks lie further right and down. View.crop_camera gives the camera.
         """
-        self._buffers.require({"target": ((box[3], box[2], 3), np.float32)})
-        self._launch("target_forward", box, jitter, target=self._buffers.target)
-        return self._buffers.target
-
-    def alpha(self, box: tuple[int, int, int, int], jitter: tuple[int, int] = (0, 0)) -> Array:
-        """(height, width) float32: the mean alpha of the same pixels, 0 outside of the image; valid
-        until the next call.
-        """
-        self._buffers.require({"alpha": ((box[3], box[2]), np.float32)})
-        self._launch("target_alpha", box, jitter, alpha=self._buffers.alpha)
-        return self._buffers.alpha
-
-    def _launch(self, kernel, box, jitter, **output):
         x0, y0, width, height = box
-        downscale = self._view.downscale
-        self.program.launch(
-            kernel,
+        shapes = {"target": (height, width, 3), "alpha": (height, width)}
+        self._buffers.require({name: (shape, np.float32) for name, shape in shapes.items()})
+        left, top = (view.downscale * c + d for c, d in zip((x0, y0), jitter, strict=True))
+        stored_height, stored_width, _ = view.image.shape
+        # only rows that the crop reads go to the device, at least one
+        first = min(max(top, 0), stored_height - 1)
+        rows = view.image[first : max(top + view.downscale * height, first + 1)]
+        most = min(view.downscale * height, stored_height) * stored_width * 4
+        image = self.dev.scratch("photograph", most, np.uint8)[: rows.size].reshape(rows.shape)
+        self.dev.send(image, rows)
+        self.dev.program("scene/target").launch(
+            "target_forward",
             (width, height),
             width=width,
             height=height,
-            downscale=downscale,
-            left=downscale * x0 + jitter[0],
-            top=downscale * y0 + jitter[1],
-            image_width=self._image.shape[1],
-            image_height=self._image.shape[0],
-            image=self._image,
-            **output,
+            downscale=view.downscale,
+            left=left,
+            top=top - first,
+            image_width=stored_width,
+            image_height=len(rows),
+            image=image,
+            target=self._buffers.target,
+            alpha=self._buffers.alpha,
         )
+        return self._buffers.target, self._buffers.alpha
 
-    def whole(self) -> np.ndarray:
-        """(height, width, 3) float32, on the host: the loaded view's whole reduced image."""
-        camera = self._view.camera
-        return self.crop((0, 0, camera.width, camera.height)).get()
+    def whole(self, view: View) -> np.ndarray:
+        """(height, width, 3) float32, on the host: a view's whole reduced image."""
+        return self.crop(view, (0, 0, view.camera.width, view.camera.height))[0].get()

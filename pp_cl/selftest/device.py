@@ -8,20 +8,19 @@ import numpy as np
 from pp_cl.device.buffers import compact_rows, gather_rows
 from pp_cl.device.device import Device
 from pp_cl.device.launch import LARGEST_GROUP
-from pp_cl.device.scan import block_values, exclusive_scan, nonzero
+from pp_cl.device.scan import BLOCK, exclusive_scan, nonzero
 from pp_cl.selftest.case import SIZES, Case, Check, exact
 
 
 def _scan(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
-    """One block, its edges, two levels and three; sums beyond 32 bits."""
-    block = block_values(dev)
-    for n in (*SIZES, block, block + 1, block * block + 1):
+    """One block, its edges, and many; sums beyond 32 bits."""
+    for n in (*SIZES, BLOCK, BLOCK + 1, 700 * BLOCK + 1):
         values = rng.integers(0, 9, n, dtype=np.uint32)
         offsets = dev.empty((n + 1,), np.uint32)
         exclusive_scan(dev, dev.upload(values), offsets)
         yield exact(offsets.get(), np.concatenate([[0], np.cumsum(values)]))
     # within a group, and from one block to the next, sums above the largest uint stay there
-    for n in (3, LARGEST_GROUP, 2 * block + 7):
+    for n in (3, LARGEST_GROUP, 2 * BLOCK + 7):
         for value in (2**31 - 1, 2**29 + 1):
             offsets = dev.empty((n + 1,), np.uint32)
             exclusive_scan(dev, dev.upload(np.full(n, value), np.uint32), offsets)
@@ -29,7 +28,7 @@ def _scan(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
 
 
 def _nonzero(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
-    for n, share in product((*SIZES, block_values(dev) + 1), (0.0, 0.3, 1.0)):
+    for n, share in product((*SIZES, BLOCK + 1), (0.0, 0.3, 1.0)):
         flags = rng.integers(1, 256, n) * (rng.random(n) < share)
         indices = dev.empty((n,), np.uint32)
         listed = nonzero(dev, dev.upload(flags, np.uint8), indices)

@@ -78,16 +78,16 @@ def _target(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
     image[..., 3] = rng.choice([0, 255, 7, 130], (83, 97), p=[0.33, 0.33, 0.17, 0.17])
     view = View("noise", Camera(np.eye(3, 4), 90.0, 95.0, 45.6, 45.7, 97, 83), image)
     target = Target(dev)
-    target.load(view.reduced(3))
     black = np.concatenate([np.zeros_like(image[..., :3]), image[..., 3:]], axis=2)
     for width, height in ((1, 5), (31, 5), (33, 5), (5, 31), (257, 5)):
         crop = {"width": width, "height": height}
         box = (1, 2, width, height)
         expected = target_forward(image, 3, 3 + 2, 6 + 1, **crop)
-        yield absolute(target.crop(box, (2, 1)).get(), expected, TARGET)
+        colour, alpha = target.crop(view.reduced(3), box, (2, 1))
+        yield absolute(colour.get(), expected, TARGET)
         # over white, the object's share is what a black object would hide
         hidden = 1 - target_forward(black, 3, 3 + 2, 6 + 1, **crop)[..., 0]
-        yield absolute(target.alpha(box, (2, 1)).get(), hidden, TARGET)
+        yield absolute(alpha.get(), hidden, TARGET)
 
 
 def _demo(dev: Device, rng: np.random.Generator) -> Iterator[Check]:

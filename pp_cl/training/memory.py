@@ -15,8 +15,7 @@ from pp_cl.device.host import available_bytes, resident_bytes
 from pp_cl.errors import UserError
 from pp_cl.metrics.lpips import Lpips
 from pp_cl.model import Model
-from pp_cl.network.layers import gradient_of
-from pp_cl.network.unet import UNet
+from pp_cl.network.unet import PARAMETERS, UNet
 from pp_cl.raster.points import PointCloud, sh_blocks
 from pp_cl.render import NETWORK_MULTIPLE, Renderer, point_radius
 from pp_cl.scene.grid import Grid
@@ -262,7 +261,7 @@ class Room:
             "points": PointCloud.table(n, self._blocks),
             "training state of the points": PointState.table(n),
             "averages of the points": averages,
-            "optimiser": Optimiser.table(self._net.parameters, is_averaged),
+            "optimiser": Optimiser.table(self._net.all_parameters, is_averaged),
         }
 
     def _stages(self, n, *, radius, layers, left):
@@ -327,9 +326,8 @@ def _padded(width, height):
 
 def _preview_table(net, size):
     """The buffers of whole images that are rendered, beside the network's parameters."""
-    own = {name for p in net.parameters for name in (p, gradient_of(p))}
     plan = net.memory_plan(*size, False)
-    return {name: row for name, row in plan.items() if name not in own}
+    return {name: row for name, row in plan.items() if name not in PARAMETERS}
 
 
 def _size(size):

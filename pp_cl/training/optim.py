@@ -33,28 +33,22 @@ class Optimiser:
     """Updates points and network; owns the network's moments and averages, the points' are in
     `state`.
 
-    moments: {name of a parameter: Adam's {"m": array, "v": array}}. averages: {name: array}, empty
-    before update_ema().
+    moments: Adam's {"m": array, "v": array} of all parameters of the network. averages: {"network":
+    array} of them, empty before update_ema().
     """
 
     def __init__(self, dev: Device, model: Model, state: PointState):
         self.dev = dev
         self.model = model
         self.state = state
-        self.moments = {
-            name: {kind: dev.zeros(array.shape) for kind in "mv"}
-            for name, array in model.net.parameters.items()
-        }
+        self.moments = {kind: dev.zeros(model.net.all_parameters.shape) for kind in "mv"}
         self.averages: dict[str, Array] = {}
 
     @staticmethod
-    def table(parameters: dict[str, Array], ema: bool) -> Table:
-        """The arrays for these parameters of a network. ema: averages among them."""
-        return {
-            f"{kind}.{name}": (array.shape, np.float32)
-            for name, array in parameters.items()
-            for kind in (("m", "v", "ema") if ema else ("m", "v"))
-        }
+    def table(parameters: Array, ema: bool) -> Table:
+        """The arrays for all parameters of a network. ema: averages among them."""
+        kinds = ("m", "v", "ema") if ema else ("m", "v")
+        return dict.fromkeys(kinds, (parameters.shape, np.float32))
 
     def update(
         self,
@@ -96,16 +90,15 @@ class Optimiser:
             eps=OPACITY_EPS,
             bounded=True,
         )
-        for name, parameter in net.parameters.items():
-            adam_update(
-                self.dev,
-                parameter,
-                net.gradients[name],
-                self.moments[name],
-                step=step,
-                rate=rates.network,
-                eps=NETWORK_EPS,
-            )
+        adam_update(
+            self.dev,
+            net.all_parameters,
+            net.all_gradients,
+            self.moments,
+            step=step,
+            rate=rates.network,
+            eps=NETWORK_EPS,
+        )
 
     def update_ema(self, weight: float) -> None:
         """Update the EMA of points and network: average += weight * (parameter - average); the
@@ -129,17 +122,17 @@ class Optimiser:
         """[(averages, the parameters of the same names)] of the points and of the network."""
         return [
             (self.state.averages, self.model.cloud.learned()),
-            (self.averages, self.model.net.parameters),
+            (self.averages, {"network": self.model.net.all_parameters}),
         ]
 
     def arrays(self) -> dict[str, DeviceRows]:
         """{name in a checkpoint: array} of all but the model's own arrays."""
-        network = {
-            f"moment.{kind}.{name}": array
-            for name, arrays in self.moments.items()
-            for kind, array in arrays.items()
-        }
-        network |= {f"average.{name}": array for name, array in self.averages.items()}
+        split, network = self.model.net.split, {}
+        moments = {kind: split(array) for kind, array in self.moments.items()}
+        for name in self.model.net.parameters:
+            network |= {f"moment.{kind}.{name}": parts[name] for kind, parts in moments.items()}
+        for array in self.averages.values():
+            network |= {f"average.{name}": part for name, part in split(array).items()}
         return {
             name: DeviceRows(self.dev, array)
             for name, array in (self.state.arrays() | network).items()
@@ -147,15 +140,18 @@ class Optimiser:
 
     def restore(self, arrays: dict[str, np.ndarray]) -> None:
         """Take the state, as written by arrays(), out of the arrays of a checkpoint."""
-        for averages, parameters in self._averaged():
-            prefix = "average." if averages is self.averages else "state.a."
-            for name, parameter in parameters.items():
-                if prefix + name in arrays:
-                    stored = arrays.pop(prefix + name)
-                    averages[name] = self.dev.upload(stored.reshape(parameter.shape))
-        for name, moments in self.moments.items():
-            for kind, array in moments.items():
-                self.dev.write(array, arrays.pop(f"moment.{kind}.{name}"))
+        net, averages = self.model.net, self.state.averages
+        for name, parameter in self.model.cloud.learned().items():
+            if f"state.a.{name}" in arrays:
+                stored = arrays.pop(f"state.a.{name}")
+                averages[name] = self.dev.upload(stored.reshape(parameter.shape))
+        whole = {f"moment.{kind}": array for kind, array in self.moments.items()}
+        if any(name.startswith("average.") for name in arrays):
+            self.averages = {"network": self.dev.zeros(net.all_parameters.shape)}
+            whole["average"] = self.averages["network"]
+        for kind, array in whole.items():
+            for name, part in net.split(array).items():
+                self.dev.write(part, arrays.pop(f"{kind}.{name}"))
         for name, array in self.state.arrays().items():
             if not name.startswith("state.a."):
                 self.dev.write(array, arrays.pop(name))

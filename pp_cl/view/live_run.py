@@ -199,8 +199,7 @@ class LiveRun:
 
     def _photograph(self, view, factor):
         """(H, W, 3) float32 of a view, reduced `factor` times more than the run's."""
-        self._target.load(view.reduced(view.downscale * factor))
-        return self._target.whole()
+        return self._target.whole(view.reduced(view.downscale * factor))
 
 
 def _training_views(run):

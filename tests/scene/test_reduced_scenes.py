@@ -106,10 +106,7 @@ def test_targets_of_a_large_scene_are_within_its_rounding(dev, scene, monkeypatc
     large(monkeypatch)
     target = Target(dev)
     for view, before in zip(opened(dev, scene, 4), whole, strict=True):
-        images = []
-        for one in (view, before):
-            target.load(one)
-            images.append(target.whole())
+        images = [target.whole(one) for one in (view, before)]
         error = np.abs(images[0] - images[1])
         # alpha and colour are rounded by half a level each
         assert error.max() <= 1 / 255 and error.mean() < 0.2 / 255

@@ -31,9 +31,9 @@ def random_view(rng, width, height):
 
 def check(dev, view, downscale, box, jitter):
     """Compare one crop with the oracle."""
-    target = Target(dev)
-    target.load(view.reduced(downscale))
-    result = target.crop(box, jitter).get()
+    result, alpha = (
+        array.get() for array in Target(dev).crop(view.reduced(downscale), box, jitter)
+    )
     left, top = (downscale * first + moved for first, moved in zip(box, jitter, strict=False))
     expected = oracle.target_forward(view.image, downscale, left, top, width=box[2], height=box[3])
     assert result.shape == expected.shape
@@ -43,7 +43,6 @@ def check(dev, view, downscale, box, jitter):
     hidden = (
         1 - oracle.target_forward(black, downscale, left, top, width=box[2], height=box[3])[..., 0]
     )
-    alpha = target.alpha(box, jitter).get()
     assert alpha.shape == hidden.shape and np.abs(alpha - hidden).max() < TOLERANCE
 
 
@@ -67,18 +66,16 @@ def test_crop_reaching_outside_counts_pixels_inside(dev, rng):
 @pytest.mark.parametrize(("x0", "y0"), ((-9, 0), (30, 0), (0, -9), (0, 30), (1000, 1000)))
 def test_wholly_outside_is_white(dev, x0, y0):
     view = make_view(np.zeros((32, 32, 4), np.uint8) + np.array([9, 8, 7, 255], np.uint8))
-    target = Target(dev)
-    target.load(view.reduced(2))
-    assert (target.crop((x0, y0, 8, 8)).get() == 1).all()
-    assert (np.abs(target.crop((4, 4, 8, 8)).get() - np.array([9, 8, 7]) / 255) < TOLERANCE).all()
+    target, view = Target(dev), view.reduced(2)
+    assert (target.crop(view, (x0, y0, 8, 8))[0].get() == 1).all()
+    inside = target.crop(view, (4, 4, 8, 8))[0].get()
+    assert (np.abs(inside - np.array([9, 8, 7]) / 255) < TOLERANCE).all()
 
 
 def test_transparent_is_exactly_white_whatever_its_colour(dev, rng):
     image = rng.integers(0, 256, (64, 64, 4), np.uint8)
     image[..., 3] = 0
-    target = Target(dev)
-    target.load(make_view(image).reduced(4))
-    assert (target.whole() == 1).all() and (target.crop((0, 0, 16, 16)).get() == 1).all()
+    assert (Target(dev).whole(make_view(image).reduced(4)) == 1).all()
 
 
 @pytest.mark.parametrize("jitter", ((0, 0), (1, 0), (0, 3), (3, 2)))
@@ -89,10 +86,9 @@ def test_camera_sees_what_the_target_shows(dev, jitter):
     x, y = np.meshgrid(np.arange(80), np.arange(64))
     image = np.stack([3 * x, 4 * y, x + y, np.full_like(x, 255)], -1).astype(np.uint8)
     view, box = make_view(image).reduced(4), (2, 1, 12, 9)
-    target, stored = Target(dev), view.stored_camera
-    target.load(view)
+    stored = view.stored_camera
     camera = view.crop_camera(box, jitter)
-    result = target.crop(box, jitter).get()
+    result = Target(dev).crop(view, box, jitter)[0].get()
     assert (camera.height, camera.width, 3) == result.shape
     for row, column in np.ndindex(result.shape[:2]):
         u = (column + 0.5 - camera.cx) / camera.fx * stored.fx + stored.cx - 0.5
@@ -101,20 +97,18 @@ def test_camera_sees_what_the_target_shows(dev, jitter):
     assert (camera.pose == stored.pose).all()
 
 
-def test_loading_another_view_replaces_the_first(dev, rng):
+def test_views_of_other_sizes_one_after_the_other(dev, rng):
     sizes = ((40, 40), (40, 40), (50, 60))
     first, second, larger = (random_view(rng, *size).reduced(2) for size in sizes)
     target = Target(dev)
     for view in (first, second, second, first, larger, first):
-        target.load(view)
         expected = oracle.target_forward(view.image, 2, 0, 0, width=20, height=20)
-        assert np.abs(target.crop((0, 0, 20, 20)).get() - expected).max() < TOLERANCE
+        assert np.abs(target.crop(view, (0, 0, 20, 20))[0].get() - expected).max() < TOLERANCE
 
 
-def test_another_reduction_of_the_view_that_is_loaded(dev, rng):
+def test_reductions_of_a_view_one_after_the_other(dev, rng):
     view, target = random_view(rng, 48, 48), Target(dev)
     for downscale in (1, 3, 2):
-        target.load(view.reduced(downscale))
         side = 48 // downscale
         expected = oracle.target_forward(view.image, downscale, 0, 0, width=side, height=side)
-        assert np.abs(target.whole() - expected).max() < TOLERANCE
+        assert np.abs(target.whole(view.reduced(downscale)) - expected).max() < TOLERANCE
