@@ -157,7 +157,7 @@ class Renderer:
             plan = None
             if net.is_planned(size):
                 plan = net.plan_tiles(size, tiles.get(), gradient_tiles())
-                result.computed_fraction = plan.computed_fraction
+                result.computed_fraction = plan.computed_fraction if plan else 1.0
             result.image = net.forward(b.features, training, plan)
         return result
 
