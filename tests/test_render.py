@@ -11,6 +11,7 @@ from support.models import GRID, make_model
 from support.networks import plain_parameters
 from support.scenes import ring_cameras
 
+import pp_cl.network.unet
 from pp_cl.raster.weights import BLENDS
 from pp_cl.reference import dense as oracle_raster
 from pp_cl.reference.network import network, network_gradients
@@ -137,6 +138,14 @@ def test_padding_does_not_move_the_picture(dev, rng):
     left, top = result.offset
     inner = result.features.get()[top : top + 19, left : left + 21]
     np.testing.assert_allclose(inner, whole[7:26, 5:26], atol=2e-5)
+
+
+def test_a_view_in_which_few_tiles_could_be_skipped_is_computed_whole(dev, rng, monkeypatch):
+    renderer, camera = Renderer(dev, make_model(dev, rng), RasterConfig()), ring_cameras(1, 32)[0]
+    whole = renderer.render(camera, GAMMA)
+    monkeypatch.setattr(pp_cl.network.unet, "LEAST_PIXELS", 0)
+    monkeypatch.setattr(pp_cl.network.unet, "MOST_COMPUTED", 0)
+    np.testing.assert_array_equal(renderer.render(camera, GAMMA), whole)
 
 
 def test_an_empty_view_is_the_background(dev, rng):
