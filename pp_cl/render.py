@@ -13,7 +13,7 @@ from typing import Any, Literal
 import numpy as np
 from pyopencl.array import Array
 
-from pp_cl.device.buffers import Buffers, Table
+from pp_cl.device.buffers import Buffers, Reading, Table
 from pp_cl.device.device import Device
 from pp_cl.files.picture import Picture
 from pp_cl.layers.tiles import tiles_hit

@@ -2,8 +2,6 @@
 white.
 """
 
-from typing import Any
-
 import numpy as np
 from pyopencl.array import Array
 
