@@ -13,7 +13,7 @@ from typing import Any, Literal
 import numpy as np
 from pyopencl.array import Array
 
-from pp_cl.device.buffers import Buffers, Reading, Table
+from pp_cl.device.buffers import Buffers, Table
 from pp_cl.device.device import Device
 from pp_cl.files.picture import Picture
 from pp_cl.layers.tiles import tiles_hit
@@ -59,10 +59,10 @@ class RenderResult:
     points: ProjectedPoints
     pairs: Pairs
     weights: BlendWeights
-    tiles: Reading[np.ndarray] | None
-    point_features: Array | None = None
-    features: Array | None = None
-    image: Array | None = None
+    tiles: Any
+    point_features: Any = None
+    features: Any = None
+    image: Any = None
     computed_fraction: float = 1.0
 
     def clamped(self) -> np.ndarray:

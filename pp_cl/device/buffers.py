@@ -75,10 +75,10 @@ def packed_arrays(
     transfer handles them all. The arrays are valid as long as the octets are held.
     """
     align = dev.device.mem_base_addr_align // 8
-    rows = [(shape, dtype, max(1, table_bytes({"": (shape, dtype)}))) for shape, dtype in rows]
-    *starts, end = np.cumsum([0, *(-(-size // align) * align for *_, size in rows)])
+    sized = [(shape, dtype, max(1, table_bytes({"": (shape, dtype)}))) for shape, dtype in rows]
+    *starts, end = np.cumsum([0, *(-(-size // align) * align for *_, size in sized)])
     whole, arrays = dev.zeros((int(end),), np.uint8), []
-    for start, (shape, dtype, size) in zip(starts, rows, strict=True):
+    for start, (shape, dtype, size) in zip(starts, sized, strict=True):
         region = whole.base_data.get_sub_region(int(start), size)
         arrays.append(Array(dev.queue, shape, dtype, data=region))
     return whole, arrays

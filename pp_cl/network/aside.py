@@ -6,6 +6,7 @@ import json
 import subprocess
 import sys
 from dataclasses import asdict
+from typing import IO, cast
 
 from pp_cl.device.discover import open_device
 from pp_cl.layers.choice import make_policy
@@ -36,8 +37,8 @@ def build_aside(net: UNet, settings: NetworkConfig, size: tuple[int, int]) -> No
             stdout=subprocess.DEVNULL,
             stderr=subprocess.DEVNULL,
         )
-        process.stdin.write(json.dumps(given | {"of_weights": of_weights}).encode())
-        process.stdin.close()
+        with cast(IO[bytes], process.stdin) as stdin:
+            stdin.write(json.dumps(given | {"of_weights": of_weights}).encode())
         net.builders.append(process)
 
 

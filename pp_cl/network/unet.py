@@ -380,7 +380,7 @@ class UNet:
                 )
                 for name, number in needed.items():
                     floats[name] = max(number, floats.get(name, 0))
-        table = {name: ((number,), np.float32) for name, number in floats.items()}
+        table: Table = {name: ((number,), np.float32) for name, number in floats.items()}
         table |= dict.fromkeys(PARAMETERS, (self.all_parameters.shape, np.float32))
         for level in set(levels_of(self.layers).values()):
             tiles = all_tiles_buffers(height >> level, width >> level)

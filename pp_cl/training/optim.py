@@ -127,7 +127,8 @@ class Optimiser:
 
     def arrays(self) -> dict[str, DeviceRows]:
         """{name in a checkpoint: array} of all but the model's own arrays."""
-        split, network = self.model.net.split, {}
+        split = self.model.net.split
+        network: dict[str, Array] = {}
         moments = {kind: split(array) for kind, array in self.moments.items()}
         for name in self.model.net.parameters:
             network |= {f"moment.{kind}.{name}": parts[name] for kind, parts in moments.items()}
