@@ -68,13 +68,14 @@ kernel void scan_offsets(
 }
 
 // GROUP work-items per block of BLOCK flags: read them and how many before the block are not zero,
-// write the indices of those that are not.
+// write the indices of those that are not, and the place of each among these.
 kernel void scan_nonzero(
     const uint n,                     // flags
     const uint b,                     // blocks
     global const uchar *flags,        // (N)
     global const uint *block_offset,  // (B+1) prefix sums of what count_nonzero wrote
-    global uint *indices)             // (N); the first block_offset[b] are written
+    global uint *indices,             // (N); the first block_offset[b] are written
+    global uint *places)              // (N); not written where the flag is zero
 {
     SHARED(uint, shared, 2 * GROUP);
     const uint block = GROUP_ID;
@@ -85,7 +86,10 @@ kernel void scan_nonzero(
         const uint i = first + MEMBER, found = i < end && flags[i] != 0;
         uint total;
         const uint before = group_scan(found, shared, &total);
-        if (found) indices[listed + before] = i;
+        if (found) {
+            indices[listed + before] = i;
+            places[i] = listed + before;
+        }
         listed += total;
     }
 }

@@ -70,10 +70,11 @@ def read_total(dev: Device, offsets: Array) -> Reading[int]:
     return read_later(dev, offsets, len(offsets) - 1, lambda last: int(last[0]))
 
 
-def nonzero(dev: Device, flags: Array, indices: Array) -> Reading[Array]:
+def nonzero(dev: Device, flags: Array, indices: Array, places: Array) -> Reading[Array]:
     """(S,) uint32 on the device, the front of `indices`: where flags are not zero, ascending.
 
-    flags: (N) uint8, N >= 1. indices: (N) uint32.
+    flags: (N) uint8, N >= 1. indices: (N) uint32. places: (N) uint32, where each of them stands in
+    `indices`; others are left alone.
     """
     n = flags.size
     blocks = -(-n // block_values(dev))
@@ -87,5 +88,6 @@ def nonzero(dev: Device, flags: Array, indices: Array) -> Reading[Array]:
         flags=flags,
         block_offset=block_offset,
         indices=indices,
+        places=places,
     )
     return read_later(dev, block_offset, blocks, lambda total: indices[: int(total[0])])
