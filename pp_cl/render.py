@@ -167,7 +167,7 @@ class Renderer:
         with dev.stage("shade"):
             shaded = weights.shaded
             room = self._shaded_room[by_pair] = grown(self._shaded_room[by_pair], shaded.size)
-            b.require(_shaded_table(room))
+            b.require(_shaded_table(min(room, cloud.count)))
             shade_forward(dev, points, shaded, cloud.sh, shaded_features=b.shaded_features)
         with dev.stage("blend"):
             blend_forward(dev, pairs, weights, b.shaded_features, b.features)
