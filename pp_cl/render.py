@@ -13,12 +13,12 @@ from typing import Any, Literal
 import numpy as np
 from pyopencl.array import Array
 
-from pp_cl.device.buffers import Buffers, Table
+from pp_cl.device.buffers import Buffers, Table, grown
 from pp_cl.device.device import Device
 from pp_cl.files.picture import Picture
 from pp_cl.layers.tiles import tiles_hit
 from pp_cl.model import Model
-from pp_cl.raster.blend import blend_backward, blend_backward_table, blend_forward, shade_forward
+from pp_cl.raster.blend import blend_backward, blend_forward, shade_forward
 from pp_cl.raster.depth import depth_forward
 from pp_cl.raster.pairs import Pairs, find_pairs, pairs_table, room_needed
 from pp_cl.raster.project import ProjectedPoints, project_grid, projection_table
@@ -47,10 +47,10 @@ class RenderResult:
     camera: of the view. size: (H, W) of the image that is rendered, padded to multiples of 4.
     offset: (left, top) of the view in it. points: the N points as the padded camera sees them.
     tiles: (rows, columns) bool, the 4x4 tiles of the padded image that have hits; None where the
-    network computes all. point_features:
-    (N, 16) float32, of which only the rows weights.shaded are set. features: (H, W, 16) float32,
-    blended from them. image: (H, W, 3) float32, unclamped. computed_fraction: share of the
-    network's multiplications that was done; the others would have seen only background.
+    network computes all. shaded_features: float32, one row of 16 for each point of weights.shaded,
+    then room for more. features: (H, W, 16) float32, blended from them. image: (H, W, 3) float32,
+    unclamped. computed_fraction: share of the network's multiplications that was done; the others
+    would have seen only background.
     """
 
     camera: Camera
@@ -60,7 +60,7 @@ class RenderResult:
     pairs: Pairs
     weights: BlendWeights
     tiles: Any
-    point_features: Any = None
+    shaded_features: Any = None
     features: Any = None
     image: Any = None
     computed_fraction: float = 1.0
@@ -82,25 +82,38 @@ class Renderer:
         self.dev = dev
         self.model = model
         self.settings = settings
-        self._buffers = Buffers(dev)
-        self._room = 1  # capacity of the arrays of pairs; grows with the views
+        # Images and what needs weights by pair take turns in memory, as a training's previews are
+        # larger than its crops. Of each: capacities of the arrays of pairs and of visible points,
+        # which grow with the views.
+        self._by_pair = False
+        self._room, self._shaded_room = [1, 1], [1, 1]
+        self.release()
+
+    def release(self) -> None:
+        """Free the buffers; the next view makes them anew."""
+        self._buffers = Buffers(self.dev)
         self._radius = None  # what b.point_radius holds
 
     @staticmethod
     def tables(
-        settings: RasterConfig, n: int, size: tuple[int, int], pairs: int
+        settings: RasterConfig,
+        n: int,
+        size: tuple[int, int],
+        pairs: int,
+        shaded: int,
+        by_pair: bool,
     ) -> dict[str, Table]:
         """The renderer's buffers, grouped by their line in the memory plan, for n points, a padded
-        image of size (height, width) and an estimated number of pairs; the true number is known
-        once a view has been projected.
+        image of size (height, width) and estimated numbers of pairs and of visible points; the true
+        ones are known once a view has been projected. by_pair: as forward() has it for training.
         """
-        pixels, has_roles = size[0] * size[1], settings.early_stop > 0 or settings.max_tracked > 0
+        pixels, room = size[0] * size[1], pairs if by_pair else 1
+        roles = room if settings.early_stop > 0 or settings.max_tracked > 0 else 1
         return {
             "projection": projection_table(n),
             "pairs (estimate)": pairs_table(n, pixels, pairs),
-            "blend weights (estimate)": weights_table(n, pixels, pairs, has_roles),
-            "features": _view_table(n, size),
-            "gradients (estimate)": blend_backward_table(n, pixels, pairs, settings.blend),
+            "blend weights (estimate)": weights_table(n, pixels, room, roles),
+            "features (estimate)": _view_table(size) | _shaded_table(shaded),
         }
 
     def forward(
@@ -125,10 +138,15 @@ class Renderer:
         training: keep what backward() needs. gradient_tiles: returns that argument of
         UNet.plan_tiles(); called after the wait for the device.
         """
-        dev, b, cloud, net = self.dev, self._buffers, self.model.cloud, self.model.net
+        dev, cloud, net = self.dev, self.model.cloud, self.model.net
         padded, left, top = camera.padded(NETWORK_MULTIPLE)
         size = (padded.height, padded.width)
-        b.require(_view_table(cloud.count, size))
+        by_pair = training or until != "image"
+        if by_pair != self._by_pair:
+            self._by_pair = by_pair
+            self.release()
+        b = self._buffers
+        b.require(_view_table(size))
         dev.send(b.camera_buffer, self.model.packed(padded, depth_range))
         self._set_radius()
         with dev.stage("project"):
@@ -148,10 +166,13 @@ class Renderer:
         if until == "weights":
             return result
         with dev.stage("shade"):
-            shade_forward(dev, points, weights.shaded, cloud.sh, point_features=b.point_features)
+            shaded = weights.shaded
+            room = self._shaded_room[by_pair] = grown(self._shaded_room[by_pair], shaded.size)
+            b.require(_shaded_table(min(room, cloud.count)))
+            shade_forward(dev, points, shaded, cloud.sh, shaded_features=b.shaded_features)
         with dev.stage("blend"):
-            blend_forward(dev, pairs, weights, b.point_features, b.features)
-        result.point_features, result.features = b.point_features, b.features
+            blend_forward(dev, pairs, weights, b.shaded_features, b.features)
+        result.shaded_features, result.features = b.shaded_features, b.features
         if until == "features":
             return result
         with dev.stage("network"):
@@ -166,10 +187,10 @@ class Renderer:
         """(Pairs, BlendWeights, RenderResult.tiles). Both stages are enqueued before the number
         of pairs is known, and run again with more room if it was too small.
         """
-        settings = self.settings
+        settings, by_pair = self.settings, self._by_pair
         while True:
             with self.dev.stage("pairs"):
-                pairs = find_pairs(self.dev, self._buffers, points, size, self._room)
+                pairs = find_pairs(self.dev, self._buffers, points, size, self._room[by_pair])
             with self.dev.stage("weights"):
                 weights = blend_weights(
                     self.dev,
@@ -181,12 +202,14 @@ class Renderer:
                     gamma=gamma,
                     max_tracked=settings.max_tracked,
                     early_stop=settings.early_stop if early_stop is None else early_stop,
+                    by_pair=by_pair,
                 )
             tiles = None
             if self.model.net.is_planned(size):
                 tiles = tiles_hit(self.dev, pairs.pixel_offset, size)
-            self._room = room_needed(pairs)  # waits for the device
-            if self._room == pairs.capacity:
+            (tiles or weights.shaded_list).get()  # the host's one wait for the device
+            self._room[by_pair] = room_needed(pairs)
+            if self._room[by_pair] == pairs.capacity:
                 return pairs, weights, tiles
             del pairs, weights  # else their arrays would stay beside the larger ones
 
@@ -205,12 +228,12 @@ class Renderer:
         grad_alpha: Array | None = None,
         spread_weight: float = 0.0,
     ) -> tuple[Array, Array]:
-        """(grad_point_features (N, 16), grad_opacity (N,)) from dL/dimage of result.image; with
-        alpha compositing also from dL/dalpha (H * W,), and of the spread of each pixel's hits with
-        this weight in the loss (cl/raster/blend.cl).
+        """(grad_shaded_features (S, 16) or longer, grad_opacity (N,)) from dL/dimage of
+        result.image; with alpha compositing also from dL/dalpha (H * W,), and of the spread of each
+        pixel's hits with this weight in the loss (cl/raster/blend.cl).
 
         result: of the last forward(training=True). The gradients of the network's parameters are
-        left in model.net.gradients. Those of the SH coefficients are grad_point_features times the
+        left in model.net.gradients. Those of the SH coefficients are grad_shaded_features times the
         basis functions in the view's direction; the optimiser multiplies them as it moves each
         coefficient, and never stores them.
         """
@@ -234,7 +257,7 @@ class Renderer:
                 self._buffers,
                 result.pairs,
                 result.weights,
-                point_features=result.point_features,
+                shaded_features=result.shaded_features,
                 features=result.features,
                 grad_features=grad_features,
                 grad_alpha=grad_alpha,
@@ -262,11 +285,15 @@ class Renderer:
         return Picture(result.clamped(), alpha, depth, median, features=shown)
 
 
-def _view_table(n, size):
+def _view_table(size):
     """Buffers that each view overwrites and that belong to no single stage."""
     return {
         "camera_buffer": ((20,), np.float32),
         "point_radius": ((1,), np.float32),
-        "point_features": ((n, 16), np.float32),
         "features": ((*size, 16), np.float32),
     }
+
+
+def _shaded_table(shaded):
+    """Features of a number of visible points."""
+    return {"shaded_features": ((shaded, 16), np.float32)}

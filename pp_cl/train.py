@@ -137,14 +137,14 @@ class Trainer:
                 self.exposure.fit(
                     view_index, rendered.image, photograph, target_alpha, rendered.offset
                 )
-        grad_point_features, grad_opacity = self.renderer.backward(
+        grad_shaded_features, grad_opacity = self.renderer.backward(
             rendered, grad_image, grad_alpha, spread_weight
         )
         with self.dev.stage("update"):
             self.optimiser.update(
                 t + 1 - self.begun,
                 rates,
-                grad_point_features,
+                grad_shaded_features,
                 grad_opacity,
                 points=rendered.points,
                 shaded=rendered.weights.shaded,
@@ -162,6 +162,7 @@ class Trainer:
         self.step = t + 1
         self.check()
         self._terms = self.loss.read(self.step)
+        del rendered, grad_shaded_features, grad_opacity  # the renderer may release them now
         self._after_update(rates)
         return self._terms
 
@@ -286,12 +287,14 @@ class Trainer:
         """Drop all points but `rows`, with their training state."""
         if len(rows) < self.model.cloud.count:
             self._smoother = None
+            self.renderer.release()  # rows are moved through scratch memory
             self.model.cloud.compact(self.dev, rows)
             self.state.compact(self.dev, rows)
 
     def _refine(self):
         """Densify: replace each point by eight at half the spacing, and double the images."""
         self._smoother = None
+        self.renderer.release()
         with self.dev.stage("refining"):
             self.state.refine(self.dev, self.model.refine())
             if self._composited:
@@ -306,6 +309,7 @@ class Trainer:
         """
         self.optimiser.apply_ema()
         if self.config.final_prune_weight > 0:
+            self.renderer.release()  # for whole views with weights by pair
             self._prune_unseen()
             self._prune_specks()
 

@@ -20,7 +20,8 @@
 // One work-item per sphere: reads what blend_backward reads, writes dL/dl and dL/dd of its pairs.
 kernel void spheres_backward_pairs(
     const uint n,                              // spheres
-    global const float16 *point_features,      // (N, 16)
+    global const uint *point_slot,             // (N) row of a visible point
+    global const float16 *shaded_features,     // (?, 16) of the visible points
     global const uint *point_offset,           // (N+1)
     global const uint *pair_pixel,             // (P)
     global const float2 *pair_weight,          // (P, 2)
@@ -42,9 +43,10 @@ kernel void spheres_backward_pairs(
         const float b = pair_weight[pair].x, d = as_float(pair_point_closeness[pair].y);
         float dL_dl = 0.0f;
         if (!HAS_ROLES || pair_role[pair] == TRACKED) {
-            const float gain = HAS_PAIR_GAIN
-                                   ? pair_gain[pair]
-                                   : dot16(grad_features[q], point_features[i]) - pixel_rest[q];
+            const float gain =
+                HAS_PAIR_GAIN
+                    ? pair_gain[pair]
+                    : dot16(grad_features[q], shaded_features[point_slot[i]]) - pixel_rest[q];
             dL_dl = scale * b * gain;
         }
         grad_pair[pair] = (float2)(dL_dl, d > 0.0f ? dL_dl / d : 0.0f);

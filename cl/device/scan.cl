@@ -78,13 +78,15 @@ kernel void scan_offsets(
 }
 
 // GROUP work-items per block of BLOCK flags: read them and how many of each block before are not
-// zero, write the indices of those that are not; those of the last block also write how many.
+// zero, write the indices of those that are not, and the place of each among these; those of the
+// last block also write how many.
 kernel void scan_nonzero(
     const uint n,                  // flags
     const uint b,                  // blocks
     global const uchar *flags,     // (N)
     global const uint *block_sum,  // (B) of count_nonzero
     global uint *indices,          // (N); the first `found` are written
+    global uint *places,           // (N); not written where the flag is zero
     global uint *found)            // (1)
 {
     SHARED(uint, shared, 2 * GROUP);
@@ -96,7 +98,10 @@ kernel void scan_nonzero(
         const uint i = first + MEMBER, is_listed = i < end && flags[i] != 0;
         uint total;
         const uint before = group_scan(is_listed, shared, &total);
-        if (is_listed) indices[listed + before] = i;
+        if (is_listed) {
+            indices[listed + before] = i;
+            places[i] = listed + before;
+        }
         listed += total;
     }
     if (MEMBER == 0 && block == b - 1) *found = listed;

@@ -11,6 +11,9 @@
 #ifndef DROPS
 #define DROPS 1  // hits may be dropped; their roles are DROPPED before alpha_weights
 #endif
+#ifndef BY_PAIR
+#define BY_PAIR 1  // 0: no weights by pair, which only gradients and pruning need
+#endif
 #ifndef MAX_TRACKED
 #define MAX_TRACKED 0  // nearest hits of a pixel that get gradients; 0: all
 #endif
@@ -32,8 +35,8 @@ kernel void alpha_weights(
     global const ulong *pair_key,              // (P) depth << 32 | pair, sorted within a pixel
     global const uint2 *pair_point_closeness,  // (P, 2) point, bits of d
     global const float *opacity,               // (N)
-    global float2 *pair_weight,                // (P, 2) not written where dropped
-    global uchar *pair_role,                   // (?) P with HAS_ROLES, not written where dropped
+    global float2 *pair_weight,                // (?, 2) P with BY_PAIR, not written where dropped
+    global uchar *pair_role,                   // (?) P with both, not written where dropped
     global ulong *pixel_entry,                 // (P) weight << 32 | point, in the order of the keys
     global float *transmittance)               // (HW) of all hits that are not dropped
 {
@@ -47,8 +50,8 @@ kernel void alpha_weights(
         const uint2 hit = pair_point_closeness[pair];
         const float d = as_float(hit.y), alpha = opacity[hit.x] * d;
         const bool tracked = !MAX_TRACKED || i - begin < MAX_TRACKED;
-        pair_weight[pair] = (float2)(T * alpha, tracked ? T * d : 0.0f);
-        if (HAS_ROLES) pair_role[pair] = tracked ? TRACKED : UNTRACKED;
+        if (BY_PAIR) pair_weight[pair] = (float2)(T * alpha, tracked ? T * d : 0.0f);
+        if (BY_PAIR && HAS_ROLES) pair_role[pair] = tracked ? TRACKED : UNTRACKED;
         pixel_entry[i] = upsample(as_uint(T * alpha), hit.x);
         T *= fmax(1.0f - alpha, LEAST_THROUGH);
     }

@@ -1,5 +1,5 @@
 // Features blended by the weights of alpha.cl or softmax.cl, and the backward pass, in which each
-// point gathers the gradients of its pixels: no atomics.
+// visible point gathers the gradients of its pixels: no atomics.
 //
 // F = sum b_i f_i + b_0 BACKGROUND, with G = dL/dF
 // dL/df_i = sum b_i G,  dL/do_i = sum s_i gain_i
@@ -41,11 +41,12 @@ static inline float upper_float(const ulong word) {
 // One work-item per part of a pixel: reads its hits and their points' features, writes the blended
 // features.
 kernel void blend_forward(
-    const uint hw,                         // pixels
-    global const uint *pixel_offset,       // (HW+1)
-    global const ulong *pixel_entry,       // (P) weight << 32 | point; no point: the list ends
-    global const float16 *point_features,  // (N, 16)
-    global float16 *features)              // (H, W, 16)
+    const uint hw,                          // pixels
+    global const uint *pixel_offset,        // (HW+1)
+    global const ulong *pixel_entry,        // (P) weight << 32 | point; no point: the list ends
+    global const uint *point_slot,          // (N) row of a visible point
+    global const float16 *shaded_features,  // (?, 16) of the visible points
+    global float16 *features)               // (H, W, 16)
 {
     const uint q = get_global_id(0) / ROW_PARTS;
     if (q >= hw) return;
@@ -53,7 +54,7 @@ kernel void blend_forward(
     float weights = 0.0f;
     for (uint i = pixel_offset[q]; i < pixel_offset[q + 1] && (uint)pixel_entry[i] != NONE; i++) {
         const float b = upper_float(pixel_entry[i]);
-        sum += b * load_part(point_features, (uint)pixel_entry[i]);
+        sum += b * load_part(shaded_features, point_slot[(uint)pixel_entry[i]]);
         weights += b;
     }
     store_part(sum + (1.0f - weights) * BACKGROUND, features, q);
@@ -76,15 +77,16 @@ kernel void softmax_rest(
 kernel __attribute__((vec_type_hint(float16))) void alpha_gain(
     const uint hw,  // pixels
     const int has_grad_alpha,
-    const float spread_weight,             // w, 0: none
-    global const uint *pixel_offset,       // (HW+1)
-    global const ulong *pair_key,          // (P) depth << 32 | pair
-    global const ulong *pixel_entry,       // (P) weight << 32 | point; no point: the list ends
-    global const float *transmittance,     // (HW)
-    global const float16 *point_features,  // (N, 16)
-    global const float16 *grad_features,   // (H, W, 16) G
-    global const float *grad_alpha,        // (HW) g, not read without has_grad_alpha
-    global float *pair_gain)               // (P)
+    const float spread_weight,              // w, 0: none
+    global const uint *pixel_offset,        // (HW+1)
+    global const ulong *pair_key,           // (P) depth << 32 | pair
+    global const ulong *pixel_entry,        // (P) weight << 32 | point; no point: the list ends
+    global const float *transmittance,      // (HW)
+    global const uint *point_slot,          // (N) row of a visible point
+    global const float16 *shaded_features,  // (?, 16) of the visible points
+    global const float16 *grad_features,    // (H, W, 16) G
+    global const float *grad_alpha,         // (HW) g, not read without has_grad_alpha
+    global float *pair_gain)                // (P)
 {
     const uint q = get_global_id(0);
     if (q >= hw) return;
@@ -104,7 +106,7 @@ kernel __attribute__((vec_type_hint(float16))) void alpha_gain(
     float B = dot16(G, (float16)(BACKGROUND));
     for (uint i = end; i-- > begin;) {
         const float b = upper_float(pixel_entry[i]);
-        float own = dot16(G, point_features[(uint)pixel_entry[i]]);
+        float own = dot16(G, shaded_features[point_slot[(uint)pixel_entry[i]]]);
         if (spread_weight > 0.0f) {
             const float z = upper_float(pair_key[i]) - nearest;
             front -= b * (float2)(1.0f, z);
@@ -120,23 +122,25 @@ kernel __attribute__((vec_type_hint(float16))) void alpha_gain(
     }
 }
 
-// One work-item per part of a point: reads its pairs and their pixels' gradients, writes the
-// gradients of its features and, the first one, of its opacity.
+// One work-item per part of a visible point: reads its pairs and their pixels' gradients, writes
+// the gradients of its features and, the first one, of its opacity.
 kernel __attribute__((vec_type_hint(floats))) void blend_backward(
-    const uint n,                          // points
-    global const float16 *point_features,  // (N, 16)
-    global const uint *point_offset,       // (N+1)
-    global const uint *pair_pixel,         // (P)
-    global const float2 *pair_weight,      // (P, 2)
-    global const uchar *pair_role,         // (?) P with HAS_ROLES
-    global const float *pair_gain,         // (?) P with HAS_PAIR_GAIN
-    global const float *pixel_rest,        // (?) HW without
-    global const float16 *grad_features,   // (H, W, 16) G
-    global float16 *grad_point_features,   // (N, 16)
-    global float *grad_opacity)            // (N)
+    const uint s,                           // visible points
+    global const uint *shaded,              // (S) their indices
+    global const float16 *shaded_features,  // (?, 16) a row for each
+    global const uint *point_offset,        // (N+1)
+    global const uint *pair_pixel,          // (P)
+    global const float2 *pair_weight,       // (P, 2)
+    global const uchar *pair_role,          // (?) P with HAS_ROLES
+    global const float *pair_gain,          // (?) P with HAS_PAIR_GAIN
+    global const float *pixel_rest,         // (?) HW without
+    global const float16 *grad_features,    // (H, W, 16) G
+    global float16 *grad_shaded_features,   // (?, 16) a row for each
+    global float *grad_opacity)             // (N) of the visible
 {
-    const uint i = get_global_id(0) / ROW_PARTS;
-    if (i >= n) return;
+    const uint g = get_global_id(0) / ROW_PARTS;
+    if (g >= s) return;
+    const uint i = shaded[g];
     floats dL_df = 0.0f;
     float dL_do = 0.0f;
     uint tracked = 0;
@@ -146,12 +150,12 @@ kernel __attribute__((vec_type_hint(floats))) void blend_backward(
         const uint q = pair_pixel[pair];
         const float gain = HAS_PAIR_GAIN
                                ? pair_gain[pair]
-                               : dot16(grad_features[q], point_features[i]) - pixel_rest[q];
+                               : dot16(grad_features[q], shaded_features[g]) - pixel_rest[q];
         dL_df += weight.x * load_part(grad_features, q);
         dL_do += weight.y * gain;
         tracked++;
     }
     const float scale = MEAN && tracked ? 1.0f / tracked : 1.0f;
-    store_part(scale * dL_df, grad_point_features, i);
+    store_part(scale * dL_df, grad_shaded_features, g);
     if (ROW_PART == 0) grad_opacity[i] = scale * dL_do;
 }

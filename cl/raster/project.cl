@@ -43,16 +43,34 @@ ALWAYS_INLINE void tangents(
     *last = LANED(convert_int)(to + 2.0f) - 2 + round_last;
 }
 
-// Points in world axes to camera axes, each with the box of pixels that it may hit. A point is
+// Whether circles around (u, z), u = x or y, come so near to the image along that axis that they
+// may hit a pixel. Their distance from the plane through the eye and one of its sides, of slope m,
+// is (u - m z) / sqrt(1 + m^2).
+ALWAYS_INLINE ints reaches_image(
+    const floats u,
+    const floats z,
+    const floats reach,
+    const float focal,
+    const float centre,
+    const float size) {
+    const float low = -centre / focal, high = (size - centre) / focal;
+    const floats wide = 1.25f * reach;  // far above rounding
+    return (u - low * z >= -(1.0f + fabs(low)) * wide) &
+           (high * z - u >= -(1.0f + fabs(high)) * wide);
+}
+
+// Points in world axes to camera axes, each with the box of pixels that it may hit; false if none
+// hits any, as it is for most points of a crop, and nothing else is known of them then. A point is
 // culled, with (0, 0, 0, -1) and no pixel, if it is too near or too far (measured at the sphere's
 // front, as in Pulsar), behind the eye, or not finite, for which every comparison is false.
-ALWAYS_INLINE Footprints project(
+ALWAYS_INLINE bool project(
     const Camera *cam,
     const floats x,
     const floats y,
     const floats z,
     const floats radius,
-    const ints wanted) {
+    const ints wanted,
+    Footprints *f) {
     const floats vx = x - cam->eye.x, vy = y - cam->eye.y, vz = z - cam->eye.z;
     const floats cx = cam->right.x * vx + cam->right.y * vy + cam->right.z * vz;
     const floats cy = cam->down.x * vx + cam->down.y * vy + cam->down.z * vz;
@@ -61,8 +79,11 @@ ALWAYS_INLINE Footprints project(
     const floats front = t - radius;
     const ints kept =
         wanted & (front >= cam->near) & (front <= cam->far) & (t > 0.0f) & (cz >= LEAST_COSINE * t);
-    const floats reach =
-        FOOTPRINT == SPHERE ? radius : footprint_reach(radius, t / least_focal(cam));
+    const floats wide = fmax(radius, LEAST_RADIUS * t / least_focal(cam));
+    const floats reach = FOOTPRINT == SPHERE ? radius : wide;
+    const ints near_image = reaches_image(cx, cz, wide, cam->fx, cam->cx, cam->width) &
+                            reaches_image(cy, cz, wide, cam->fy, cam->cy, cam->height);
+    if (!ANY_LANE(kept & near_image)) return false;
     ints x0, y0, x1, y1;
     tangents(cx, cz, reach, cam->fx, cam->cx, cam->width, &x0, &x1);
     tangents(cy, cz, reach, cam->fy, cam->cy, cam->height, &y0, &y1);
@@ -72,19 +93,18 @@ ALWAYS_INLINE Footprints project(
     y1 = min(y1, (ints)(cam->height - 1));
     const ints visible = kept & (x1 >= x0) & (y1 >= y0);
 
-    Footprints f;
-    f.x = select((floats)(0.0f), cx, kept);
-    f.y = select((floats)(0.0f), cy, kept);
-    f.z = select((floats)(0.0f), cz, kept);
-    f.t = select((floats)(-1.0f), t, kept);
-    f.radius = radius;
+    f->x = select((floats)(0.0f), cx, kept);
+    f->y = select((floats)(0.0f), cy, kept);
+    f->z = select((floats)(0.0f), cz, kept);
+    f->t = select((floats)(-1.0f), t, kept);
+    f->radius = radius;
     // no pixel: last before first
-    LANES_INTO(f.box[0], select((ints)(1), x0, visible));
-    LANES_INTO(f.box[1], select((ints)(1), y0, visible));
-    LANES_INTO(f.box[2], select((ints)(0), x1, visible));
-    LANES_INTO(f.box[3], select((ints)(0), y1, visible));
-    footprints_prepare(cam, &f);
-    return f;
+    LANES_INTO(f->box[0], select((ints)(1), x0, visible));
+    LANES_INTO(f->box[1], select((ints)(1), y0, visible));
+    LANES_INTO(f->box[2], select((ints)(0), x1, visible));
+    LANES_INTO(f->box[3], select((ints)(0), y1, visible));
+    footprints_prepare(cam, f);
+    return true;
 }
 
 // The number of pixels that each point hits, by testing all pixels of its box.
@@ -97,14 +117,22 @@ ALWAYS_INLINE ints count_hits(const Camera *cam, const Footprints *f) {
     return hits;
 }
 
-// Writes the camera-space positions of `count` points, their boxes and numbers of hits.
+// Writes the camera-space positions of `count` points from `first` on, their boxes and numbers of
+// hits; of points of which none hits a pixel, only these numbers.
 ALWAYS_INLINE void store_points(
     const Camera *cam,
     const Footprints *f,
+    const bool any_hit,
+    const uint first,
     const uint count,
     global float4 *point_camera,
     global ushort4 *point_box,
     global uint *point_count) {
+    if (!any_hit) {
+        for (uint j = 0; j < count; j++)
+            point_count[first + j] = 0;
+        return;
+    }
     float place[4][LANES];
     int hits[LANES];
     LANES_INTO(place[0], f->x);
@@ -113,10 +141,20 @@ ALWAYS_INLINE void store_points(
     LANES_INTO(place[3], f->t);
     LANES_INTO(hits, count_hits(cam, f));
     for (uint j = 0; j < count; j++) {
-        point_camera[j] = (float4)(place[0][j], place[1][j], place[2][j], place[3][j]);
-        point_box[j] = (ushort4)(f->box[0][j], f->box[1][j], f->box[2][j], f->box[3][j]);
-        point_count[j] = hits[j];
+        const uint i = first + j;
+        point_camera[i] = (float4)(place[0][j], place[1][j], place[2][j], place[3][j]);
+        point_box[i] = (ushort4)(f->box[0][j], f->box[1][j], f->box[2][j], f->box[3][j]);
+        point_count[i] = hits[j];
     }
+}
+
+// id / n lane by lane, which no vector instruction does; *id becomes the remainder.
+ALWAYS_INLINE uints divide(uints *id, const uint n) {
+    const uints low = mul_hi(*id, (uints)(UINT_MAX / n));  // at most 1 too small
+    const uints rest = *id - low * n;
+    const uints more = select((uints)(0), (uints)(1), rest >= n);
+    *id = rest - more * n;
+    return low + more;
 }
 
 // One work-item per LANES points: reads their grid indices, writes their camera-space positions and
@@ -137,20 +175,22 @@ kernel __attribute__((vec_type_hint(floats))) void project_grid(
     if (first >= n) return;
     const uint count = min((uint)LANES, n - first), stream = scramble(seed);
     const Camera cam = camera_load(camera);
-    float x[LANES], y[LANES], z[LANES];
+    uint id[LANES];
     int wanted[LANES];
     for (uint j = 0; j < LANES; j++) {
-        const uint id = point_id[first + min(j, count - 1)];
-        const float3 position = grid_position(grid, id);
-        x[j] = position.x;
-        y[j] = position.y;
-        z[j] = position.z;
-        wanted[j] = -(scramble(id + stream) >= dropout);
+        id[j] = point_id[first + min(j, count - 1)];
+        wanted[j] = -(scramble(id[j] + stream) >= dropout);
     }
-    const Footprints f = project(
-        &cam, LANES_FROM(x), LANES_FROM(y), LANES_FROM(z), (floats)(point_radius[0]),
-        LANES_FROM(wanted));
-    store_points(&cam, &f, count, point_camera + first, point_box + first, point_count + first);
+    // as grid_position() has it
+    uints i = LANES_FROM(id);
+    uints j = divide(&i, (uint)grid[4]);
+    const uints k = divide(&j, (uint)grid[5]);
+    Footprints f;
+    const bool any_hit = project(
+        &cam, grid[0] + grid[3] * LANED(convert_float)(i),
+        grid[1] + grid[3] * LANED(convert_float)(j), grid[2] + grid[3] * LANED(convert_float)(k),
+        (floats)(point_radius[0]), LANES_FROM(wanted), &f);
+    store_points(&cam, &f, any_hit, first, count, point_camera, point_box, point_count);
 }
 
 // One work-item per LANES spheres: reads their positions and radii, writes the same as
@@ -177,7 +217,8 @@ kernel __attribute__((vec_type_hint(floats))) void project_spheres(
         z[j] = positions[3 * i + 2];
         radius[j] = point_radius[radii == 1 ? 0 : i];
     }
-    const Footprints f =
-        project(&cam, LANES_FROM(x), LANES_FROM(y), LANES_FROM(z), LANES_FROM(radius), (ints)(-1));
-    store_points(&cam, &f, count, point_camera + first, point_box + first, point_count + first);
+    Footprints f;
+    const bool any_hit = project(
+        &cam, LANES_FROM(x), LANES_FROM(y), LANES_FROM(z), LANES_FROM(radius), (ints)(-1), &f);
+    store_points(&cam, &f, any_hit, first, count, point_camera, point_box, point_count);
 }

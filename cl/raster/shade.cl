@@ -38,13 +38,13 @@ kernel void shade_forward(
     global const float16 *sh_1,         // (?, ?, 16) (N, 3, 16), not read at degree 0
     global const float16 *sh_2a,        // (?, ?, 16) (N, 3, 16), not read below degree 2
     global const float16 *sh_2b,        // (?, ?, 16) (N, 2, 16), not read below degree 2
-    global float16 *point_features)     // (N, 16) only the shaded rows are written
+    global float16 *shaded_features)    // (?, 16) a row for each
 {
     const uint g = get_global_id(0) / ROW_PARTS;
     if (g >= s) return;
     const uint i = shaded[g];
     SHADE(LOAD_FLOAT, i, features)
-    store_part(features, point_features, i);
+    store_part(features, shaded_features, g);
 }
 
 // The same from coefficients of 16 bits.
@@ -57,11 +57,11 @@ kernel void shade_forward_half(
     global const half *sh_1,            // (?, ?, 16) (N, 3, 16), not read at degree 0
     global const half *sh_2a,           // (?, ?, 16) (N, 3, 16), not read below degree 2
     global const half *sh_2b,           // (?, ?, 16) (N, 2, 16), not read below degree 2
-    global float16 *point_features)     // (N, 16) only the shaded rows are written
+    global float16 *shaded_features)    // (?, 16) a row for each
 {
     const uint g = get_global_id(0) / ROW_PARTS;
     if (g >= s) return;
     const uint i = shaded[g];
     SHADE(LOAD_HALF, i, features)
-    store_part(features, point_features, i);
+    store_part(features, shaded_features, g);
 }

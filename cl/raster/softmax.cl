@@ -18,6 +18,9 @@
 #ifndef DROPS
 #define DROPS 1  // early_stop may be above 0
 #endif
+#ifndef BY_PAIR
+#define BY_PAIR 1  // 0: no weights by pair, which only gradients and pruning need
+#endif
 #ifndef MAX_TRACKED
 #define MAX_TRACKED 0  // nearest hits of a pixel that get gradients; 0: all
 #endif
@@ -70,8 +73,8 @@ kernel __attribute__((vec_type_hint(floats))) void softmax_weights(
     global const ulong *pair_key,              // (P) depth << 32 | pair, sorted within a pixel
     global const uint2 *pair_point_closeness,  // (P, 2) point, bits of d
     global const float *opacity,               // (N)
-    global float2 *pair_weight,                // (P, 2)
-    global uchar *pair_role,                   // (?) P with HAS_ROLES
+    global float2 *pair_weight,                // (?, 2) P with BY_PAIR
+    global uchar *pair_role,                   // (?) P with both
     global ulong *pixel_entry)                 // (P) weight << 32 | point, in the order of the keys
 {
     const uint q = get_global_id(0);
@@ -111,13 +114,13 @@ kernel __attribute__((vec_type_hint(floats))) void softmax_weights(
         for (uint j = 0; j < min(count, stop - first); j++) {
             const uint i = first + j, pair = (uint)pair_key[i];
             const bool tracked = !MAX_TRACKED || i - begin < MAX_TRACKED;
-            pair_weight[pair] = (float2)(b[j], tracked ? slope[j] : 0.0f);
-            if (HAS_ROLES) pair_role[pair] = tracked ? TRACKED : UNTRACKED;
+            if (BY_PAIR) pair_weight[pair] = (float2)(b[j], tracked ? slope[j] : 0.0f);
+            if (BY_PAIR && HAS_ROLES) pair_role[pair] = tracked ? TRACKED : UNTRACKED;
             pixel_entry[i] = upsample(as_uint(b[j]), pair_point_closeness[pair].x);
         }
     }
     if (DROPS) {
-        for (uint i = stop; i < end; i++) {
+        for (uint i = stop; BY_PAIR && i < end; i++) {
             pair_weight[(uint)pair_key[i]] = 0.0f;
             pair_role[(uint)pair_key[i]] = DROPPED;
         }

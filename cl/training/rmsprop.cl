@@ -40,22 +40,22 @@ kernel void rmsprop_move(
     const float rate_0,  // learning rate * sqrt(1 - beta2^step), by degree
     const float rate_1,
     const float rate_2,
-    global const uint *shaded,                  // (S) their indices
-    global const float *camera,                 // (20) camera.h
-    global const float4 *point_camera,          // (N, 4) x, y, z, distance
-    global const float16 *grad_point_features,  // (N, 16) G, of the shaded
-    global const uint *last_step,               // (N) of each point's last gradient, 0: none
-    global float16 *v,                          // (N, 16)
-    global float16 *sh_0,                       // (N, 1, 16)
-    global float16 *sh_1,                       // (?, ?, 16) (N, 3, 16), untouched at degree 0
-    global float16 *sh_2a,                      // (?, ?, 16) (N, 3, 16), untouched below degree 2
-    global float16 *sh_2b)                      // (?, ?, 16) (N, 2, 16), untouched below degree 2
+    global const uint *shaded,                   // (S) their indices
+    global const float *camera,                  // (20) camera.h
+    global const float4 *point_camera,           // (N, 4) x, y, z, distance
+    global const float16 *grad_shaded_features,  // (?, 16) G, a row for each shaded point
+    global const uint *last_step,                // (N) of each point's last gradient, 0: none
+    global float16 *v,                           // (N, 16)
+    global float16 *sh_0,                        // (N, 1, 16)
+    global float16 *sh_1,                        // (?, ?, 16) (N, 3, 16), untouched at degree 0
+    global float16 *sh_2a,                       // (?, ?, 16) (N, 3, 16), untouched below degree 2
+    global float16 *sh_2b)                       // (?, ?, 16) (N, 2, 16), untouched below degree 2
 {
     const size_t g = get_global_id(0) / ROW_PARTS;
     if (g >= s) return;
     const size_t i = shaded[g];
-    if (!any(grad_point_features[i] != 0.0f)) return;  // a NaN is a gradient
-    const floats G = load_part(grad_point_features, i);
+    if (!any(grad_shaded_features[g] != 0.0f)) return;  // a NaN is a gradient
+    const floats G = load_part(grad_shaded_features, g);
     const floats moment =
         exp2((step - last_step[i]) * LOG_BETA2) * load_part(v, i) + DECAY2 * MEAN_SQUARE * (G * G);
     store_part(moment, v, i);
@@ -72,14 +72,13 @@ kernel void rmsprop_move(
 
 // One work-item per shaded point: writes the step of its gradient, once all its parts have moved.
 kernel void rmsprop_mark(
-    const uint s,                               // shaded points
-    const uint step,                            // from 1
-    global const uint *shaded,                  // (S) their indices
-    global const float16 *grad_point_features,  // (N, 16) G, of the shaded
-    global uint *last_step)                     // (N)
+    const uint s,                                // shaded points
+    const uint step,                             // from 1
+    global const uint *shaded,                   // (S) their indices
+    global const float16 *grad_shaded_features,  // (?, 16) G, a row for each shaded point
+    global uint *last_step)                      // (N)
 {
     const uint g = get_global_id(0);
     if (g >= s) return;
-    const uint i = shaded[g];
-    if (any(grad_point_features[i] != 0.0f)) last_step[i] = step;
+    if (any(grad_shaded_features[g] != 0.0f)) last_step[shaded[g]] = step;
 }

@@ -11,7 +11,7 @@ from functools import cached_property
 import numpy as np
 
 from pp_cl.bench.spheres import find_all_pairs, project_spheres, spheres_backward
-from pp_cl.device.buffers import Buffers
+from pp_cl.device.buffers import Buffers, gather_rows
 from pp_cl.device.device import Device
 from pp_cl.model import Model
 from pp_cl.network.unet import UNet
@@ -110,7 +110,7 @@ class BenchScene:
         Rasterises the scene.
         """
         result = self.forward("softmax")
-        rows = result.point_features.get()[result.weights.shaded.get()]
+        rows = result.shaded_features.get()[: result.weights.shaded.size]
         return np.maximum(rows.max(axis=0), 1) - np.minimum(rows.min(axis=0), 1)
 
     def moved_bytes(self, blend: str, result: RenderResult) -> dict[str, int]:
@@ -126,7 +126,7 @@ class BenchScene:
             "pairs": n * search + 5 * 4 * n + 2 * p * pair + 2 * 8 * p + 4 * 4 * hw,
             "weights": p * (8 + 8 + 8 + 8) + 4 * n + 4 * hw,
             "blend": 8 * p + ROW * shaded + (ROW + 4) * hw,
-            "backward": p * (4 + 8) + ROW * shaded + (ROW + 8) * n + (ROW + 4) * hw + rest,
+            "backward": p * (4 + 8) + 2 * ROW * shaded + 4 * n + (ROW + 4) * hw + rest,
         }
 
 
@@ -247,7 +247,8 @@ class PulsarScene(BenchScene):
                 gamma=self.gamma,
             )
         with dev.stage("blend"):
-            blend_forward(dev, pairs, weights, self.device_features, self.features)
+            features = gather_rows(dev, self.device_features, weights.shaded)
+            blend_forward(dev, pairs, weights, features, self.features)
         return RenderResult(
             self.camera,
             (0, 0),
@@ -256,7 +257,7 @@ class PulsarScene(BenchScene):
             pairs,
             weights,
             None,
-            self.device_features,
+            features,
             self.features,
         )
 
@@ -268,7 +269,7 @@ class PulsarScene(BenchScene):
                 self.buffers[blend],
                 result.pairs,
                 result.weights,
-                point_features=result.point_features,
+                shaded_features=result.shaded_features,
                 features=result.features,
                 grad_features=self.grad,
             )
@@ -281,7 +282,7 @@ class PulsarScene(BenchScene):
                 self.buffers[blend],
                 opacity=self.point_opacity,
                 gamma=self.gamma,
-                point_features=result.point_features,
+                shaded_features=result.shaded_features,
                 grad_features=self.grad,
             )
 

@@ -67,13 +67,13 @@ def spheres_backward(
     *,
     opacity: Array,
     gamma: float,
-    point_features: Array,
+    shaded_features: Array,
     grad_features: Array,
     mean: bool = False,
 ) -> tuple[Array, Array]:
     """(grad_positions (N, 3) in world axes, grad_radius (N,)) float32 of explicit spheres.
 
-    points, pairs, weights, opacity (N,), gamma, point_features (N, 16): those of the forward pass.
+    points, pairs, weights, opacity (N,), gamma, shaded_features (S, 16): those of the forward pass.
     b, grad_features (H, W, 16): of blend_backward(), which has run. mean: divide a point's
     gradients by its number of tracked pixels, as Pulsar does.
     """
@@ -90,7 +90,8 @@ def spheres_backward(
         "spheres_backward_pairs",
         n,
         n=n,
-        point_features=point_features,
+        point_slot=weights.point_slot,
+        shaded_features=shaded_features,
         point_offset=pairs.point_offset,
         pair_pixel=pairs.pair_pixel,
         pair_weight=weights.pair_weight,

@@ -45,12 +45,22 @@ def read_total(dev: Device, offsets: Array) -> Reading[int]:
     return read_later(dev, offsets, len(offsets) - 1, lambda last: int(last[0]))
 
 
-def nonzero(dev: Device, flags: Array, indices: Array) -> Reading[Array]:
+def nonzero(dev: Device, flags: Array, indices: Array, places: Array) -> Reading[Array]:
     """(S,) uint32 on the device, the front of `indices`: where flags are not zero, ascending.
 
-    flags: (N) uint8, N >= 1. indices: (N) uint32.
+    flags: (N) uint8, N >= 1. indices: (N) uint32. places: (N) uint32, where each of them stands in
+    `indices`; others are left alone.
     """
     n, found = flags.size, dev.scratch("found", 1, np.uint32)
     block_sum = _block_sums(dev, "count_nonzero", n, flags=flags)
-    _launch(dev, "scan_nonzero", n, flags=flags, block_sum=block_sum, indices=indices, found=found)
+    _launch(
+        dev,
+        "scan_nonzero",
+        n,
+        flags=flags,
+        block_sum=block_sum,
+        indices=indices,
+        places=places,
+        found=found,
+    )
     return read_later(dev, found, convert=lambda total: indices[: int(total[0])])

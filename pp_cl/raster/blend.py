@@ -1,5 +1,5 @@
 """Features of the visible points from their spherical harmonics, blended into the pixels by the
-weights of the hits; and the gradients of the blend, gathered by point.
+weights of the hits; and the gradients of the blend, gathered by visible point.
 """
 
 from __future__ import annotations
@@ -24,9 +24,9 @@ def shade_forward(
     shaded: Array,
     sh: list[Array],
     *,
-    point_features: Array,
+    shaded_features: Array,
 ) -> None:
-    """Write the rows `shaded` of point_features (N, 16) float32.
+    """Write shaded_features, (S, 16) float32 or longer.
 
     The direction of a point is normalize(point - eye) in world axes. shaded: (S,) uint32, the
     visible points. sh: of PointCloud.
@@ -43,36 +43,34 @@ def shade_forward(
         sh_1=sh_1,
         sh_2a=sh_2a,
         sh_2b=sh_2b,
-        point_features=point_features,
+        shaded_features=shaded_features,
     )
 
 
 def blend_forward(
-    dev: Device, pairs: Pairs, weights: BlendWeights, point_features: Array, features: Array
+    dev: Device, pairs: Pairs, weights: BlendWeights, shaded_features: Array, features: Array
 ) -> None:
-    """Write features (H, W, 16) from point_features (N, 16), both float32.
-
-    Of point_features only the rows weights.shaded are read.
-    """
+    """Write features (H, W, 16) from shaded_features, (S, 16) or longer, both float32."""
     _program(dev, weights).launch(
         "blend_forward",
         pairs.pixels * row_parts(dev, ON_GPU),
         hw=pairs.pixels,
         pixel_offset=pairs.pixel_offset,
         pixel_entry=weights.pixel_entry,
-        point_features=point_features,
+        point_slot=weights.point_slot,
+        shaded_features=shaded_features,
         features=features,
     )
 
 
-def blend_backward_table(n: int, pixels: int, pairs: int, blend: str) -> Table:
-    """The buffers of the backward pass for n points, a number of pixels and room for a number of
-    pairs. blend: one of BLENDS.
+def blend_backward_table(n: int, shaded: int, pixels: int, pairs: int, blend: str) -> Table:
+    """The buffers of the backward pass for n points, a number of pixels, and room for numbers of
+    visible points and of pairs. blend: one of BLENDS.
     """
     return {
         "pair_gain": ((pairs if blend == "alpha" else 1,), np.float32),
         "pixel_rest": ((pixels if blend == "softmax" else 1,), np.float32),
-        "grad_point_features": ((n, 16), np.float32),
+        "grad_shaded_features": ((shaded, 16), np.float32),
         "grad_opacity": ((n,), np.float32),
     }
 
@@ -83,25 +81,27 @@ def blend_backward(
     pairs: Pairs,
     weights: BlendWeights,
     *,
-    point_features: Array,
+    shaded_features: Array,
     features: Array,
     grad_features: Array,
     grad_alpha: Array | None = None,
     spread_weight: float = 0.0,
     mean: bool = False,
 ) -> tuple[Array, Array]:
-    """(grad_point_features (N, 16), grad_opacity (N,)) float32, valid until the next call; points
-    that are not shaded get zeros. b.pair_gain (alpha) or b.pixel_rest (softmax) are left for
-    bench/spheres.py: the gains, and what they follow from (cl/raster/blend.cl).
+    """(grad_shaded_features (S, 16) or longer, grad_opacity (N,)) float32, valid until the next
+    call: the gradients of the points weights.shaded; those of all others are 0. b.pair_gain (alpha)
+    or b.pixel_rest (softmax) are left for bench/spheres.py: the gains, and what they follow from
+    (cl/raster/blend.cl).
 
-    point_features, features: of blend_forward(). grad_features: dL/dfeatures (H, W, 16).
+    shaded_features, features: of blend_forward(). grad_features: dL/dfeatures (H, W, 16).
     grad_alpha: (HW,), dL/d(1 - transmittance); None: 0. spread_weight: adds this times sum_ij b_i
     b_j |z_i - z_j| of every pixel to the loss, with b and z the weights and depths (world units) of
     its hits; no gradient of the depths is formed. mean: a point's gradients are divided by its
     number of tracked pixels, as Pulsar does. Raises ValueError for grad_alpha or a spread of a
     softmax, which has no transmittance.
     """
-    b.require(blend_backward_table(pairs.points, pairs.pixels, pairs.capacity, weights.blend))
+    n, rows, shaded = pairs.points, len(shaded_features), weights.shaded
+    b.require(blend_backward_table(n, rows, pairs.pixels, pairs.capacity, weights.blend))
     program = _program(dev, weights, mean)
     if weights.blend == "softmax":
         if grad_alpha is not None or spread_weight > 0:
@@ -125,16 +125,19 @@ def blend_backward(
             pair_key=pairs.pair_key,
             pixel_entry=weights.pixel_entry,
             transmittance=weights.transmittance,
-            point_features=point_features,
+            point_slot=weights.point_slot,
+            shaded_features=shaded_features,
             grad_features=grad_features,
             grad_alpha=weights.transmittance if grad_alpha is None else grad_alpha,
             pair_gain=b.pair_gain,
         )
+    dev.fill(b.grad_opacity, 0)
     program.launch(
         "blend_backward",
-        pairs.points * row_parts(dev, ON_GPU),
-        n=pairs.points,
-        point_features=point_features,
+        shaded.size * row_parts(dev, ON_GPU),
+        s=shaded.size,
+        shaded=shaded,
+        shaded_features=shaded_features,
         point_offset=pairs.point_offset,
         pair_pixel=pairs.pair_pixel,
         pair_weight=weights.pair_weight,
@@ -142,10 +145,10 @@ def blend_backward(
         pair_gain=b.pair_gain,
         pixel_rest=b.pixel_rest,
         grad_features=grad_features,
-        grad_point_features=b.grad_point_features,
+        grad_shaded_features=b.grad_shaded_features,
         grad_opacity=b.grad_opacity,
     )
-    return b.grad_point_features, b.grad_opacity
+    return b.grad_shaded_features, b.grad_opacity
 
 
 def _program(dev, weights, mean=False):

@@ -74,7 +74,7 @@ def pairs_table(n: int, pixels: int, pairs: int) -> Table:
         "pair_point_closeness": ((pairs, 2), np.uint32),
         "pair_key": ((pairs,), np.uint64),
         # (depth, place in the pixel's list) of each pair until the keys are written, then for
-        # sorting them
+        # sorting them, at last the entries of weights.py
         "pair_scratch": ((pairs,), np.uint64),
     }
 

@@ -27,9 +27,11 @@ class BlendWeights:
     blend: one of BLENDS. has_roles: some pairs may be untracked (no gradient) or dropped (behind
     the early stop); else pair_role is unread. pair_weight: (P, 2) float32, the blend weight b, and
     a factor s for the backward pass, dL/dopacity = s * gain (cl/raster/blend.cl); undefined where
-    the pair is dropped. pair_role: (P,) uint8, cl/raster/pair_role.h. pixel_entry: (P,) uint64,
+    the pair is dropped. pair_role: (P,) uint8, cl/raster/pair_role.h. Neither is there without
+    by_pair. point_is_shaded: (N,) uint8, 1 for visible points. pixel_entry: (P,) uint64,
     weight bits << 32 | point, each pixel's hits by depth; where hits are dropped, an entry without
     a point ends the pixel's list. shaded_list: `shaded`, whose length is still on its way.
+    point_slot: (N,) uint32, where a visible point stands in `shaded`, undefined for others.
     transmittance: (HW,) float32 behind all hits, None with the softmax.
     """
 
@@ -38,7 +40,9 @@ class BlendWeights:
     pair_weight: Array
     pair_role: Array
     pixel_entry: Array
+    point_is_shaded: Array
     shaded_list: Reading[Array]
+    point_slot: Array
     transmittance: Any
 
     @property
@@ -49,17 +53,17 @@ class BlendWeights:
         return self.shaded_list.get()
 
 
-def weights_table(n: int, pixels: int, pairs: int, has_roles: bool) -> Table:
-    """The buffers for n points, a number of pixels and room for a number of pairs. has_roles: see
-    BlendWeights.
+def weights_table(n: int, pixels: int, by_pair: int, roles: int) -> Table:
+    """The buffers for n points and a number of pixels, with room for numbers of weights and of
+    roles by pair; those by pixel lie in pairs_table()'s pair_scratch.
     """
     return {
-        "pair_weight": ((pairs, 2), np.float32),
-        "pair_role": ((pairs if has_roles else 1,), np.uint8),
-        "pixel_entry": ((pairs,), np.uint64),
+        "pair_weight": ((by_pair, 2), np.float32),
+        "pair_role": ((roles,), np.uint8),
         "transmittance": ((pixels,), np.float32),
         "point_is_shaded": ((n,), np.uint8),
         "shaded": ((n,), np.uint32),
+        "point_slot": ((n,), np.uint32),
     }
 
 
@@ -74,45 +78,55 @@ def blend_weights(
     gamma: float,
     max_tracked: int = 0,
     early_stop: float = 0.0,
+    by_pair: bool = True,
 ) -> BlendWeights:
-    """The weights of all pairs.
+    """The weights of all pairs, in the buffers b of find_pairs().
 
     opacity: (N,) float32 in [0, 1]. blend: one of BLENDS. gamma: depth sharpness of the softmax.
     max_tracked: only this many nearest hits of a pixel get gradients (64 in the paper); 0: all.
     early_stop: in [0, 1): a pixel drops all hits behind the depth where no hit can have this share
-    any more (0.001 in the paper); 0: none.
+    any more (0.001 in the paper); 0: none. by_pair: write what the backward pass and
+    record_weights() read.
     """
     has_roles = early_stop > 0 or max_tracked > 0
-    n, pixels = pairs.points, pairs.pixels
-    b.require(weights_table(n, pixels, pairs.capacity, has_roles))
+    n, pixels, room = pairs.points, pairs.pixels, pairs.capacity if by_pair else 1
+    b.require(weights_table(n, pixels, room, room if has_roles else 1))
+    drops = {"MAX_TRACKED": max_tracked, "DROPS": int(early_stop > 0), "BY_PAIR": int(by_pair)}
     if blend == "alpha":
-        _alpha_weights(dev, b, pairs, opacity, max_tracked, early_stop)
+        _alpha_weights(dev, b, pairs, opacity, early_stop, drops)
     else:
-        _softmax_weights(dev, b, pairs, camera_buffer, opacity, gamma, max_tracked, early_stop)
+        _softmax_weights(dev, b, pairs, camera_buffer, opacity, gamma, early_stop, drops)
     dev.fill(b.point_is_shaded, 0)
     dev.program("raster/weights", HAS_ROLES=int(has_roles)).launch(
         "find_shaded_points",
         pixels,
         hw=pixels,
         pixel_offset=pairs.pixel_offset,
-        pixel_entry=b.pixel_entry,
+        pixel_entry=b.pair_scratch,
         point_is_shaded=b.point_is_shaded,
     )
-    shaded_list = nonzero(dev, b.point_is_shaded, b.shaded)
+    shaded_list = nonzero(dev, b.point_is_shaded, b.shaded, b.point_slot)
     transmittance = b.transmittance if blend == "alpha" else None
     return BlendWeights(
-        blend, has_roles, b.pair_weight, b.pair_role, b.pixel_entry, shaded_list, transmittance
+        blend,
+        has_roles,
+        b.pair_weight,
+        b.pair_role,
+        b.pair_scratch,
+        b.point_is_shaded,
+        shaded_list,
+        b.point_slot,
+        transmittance,
     )
 
 
-def _alpha_weights(dev, b, pairs, opacity, max_tracked, early_stop):
+def _alpha_weights(dev, b, pairs, opacity, early_stop, drops):
     """Front to back, weight = transmittance * opacity * closeness; early_stop is the transmittance
     below which the hits behind are dropped.
     """
     if early_stop > 0:
         dev.fill(b.pair_role, DROPPED)
-    program = dev.program("raster/alpha", DROPS=int(early_stop > 0), MAX_TRACKED=max_tracked)
-    program.launch(
+    dev.program("raster/alpha", **drops).launch(
         "alpha_weights",
         pairs.pixels,
         hw=pairs.pixels,
@@ -123,17 +137,14 @@ def _alpha_weights(dev, b, pairs, opacity, max_tracked, early_stop):
         opacity=opacity,
         pair_weight=b.pair_weight,
         pair_role=b.pair_role,
-        pixel_entry=b.pixel_entry,
+        pixel_entry=b.pair_scratch,
         transmittance=b.transmittance,
     )
 
 
-def _softmax_weights(dev, b, pairs, camera_buffer, opacity, gamma, max_tracked, early_stop):
+def _softmax_weights(dev, b, pairs, camera_buffer, opacity, gamma, early_stop, drops):
     """Eq. (1) of the supplemental; early_stop is Pulsar's percent_allowed_difference."""
-    program = dev.program(
-        "raster/softmax", LANES=lanes(dev), DROPS=int(early_stop > 0), MAX_TRACKED=max_tracked
-    )
-    program.launch(
+    dev.program("raster/softmax", LANES=lanes(dev), **drops).launch(
         "softmax_weights",
         pairs.pixels,
         hw=pairs.pixels,
@@ -146,7 +157,7 @@ def _softmax_weights(dev, b, pairs, camera_buffer, opacity, gamma, max_tracked, 
         opacity=opacity,
         pair_weight=b.pair_weight,
         pair_role=b.pair_role,
-        pixel_entry=b.pixel_entry,
+        pixel_entry=b.pair_scratch,
     )
 
 
@@ -168,6 +179,7 @@ def record_weights(
         n=pairs.points,
         least=least,
         point_offset=pairs.point_offset,
+        point_is_shaded=weights.point_is_shaded,
         pair_weight=weights.pair_weight,
         pair_role=weights.pair_role,
         max_weight=max_weight,

@@ -31,8 +31,11 @@ def _nonzero(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
     for n, share in product((*SIZES, BLOCK + 1), (0.0, 0.3, 1.0)):
         flags = rng.integers(1, 256, n) * (rng.random(n) < share)
         indices = dev.empty((n,), np.uint32)
-        listed = nonzero(dev, dev.upload(flags, np.uint8), indices)
+        places = dev.upload(np.full(n, 7), np.uint32)
+        listed = nonzero(dev, dev.upload(flags, np.uint8), indices, places)
         yield exact(listed.get().get(), np.flatnonzero(flags))
+        expected = np.where(flags, np.cumsum(flags != 0) - 1, 7)
+        yield exact(places.get(), expected)
 
 
 def _compact(dev: Device, rng: np.random.Generator) -> Iterator[Check]:

@@ -47,12 +47,12 @@ class Cloud:
         *,
         rates: Sequence[float] = RATES,
     ) -> None:
-        """One step, or that of another number. grad_features: (N, 16); the kernels must not read
-        those of points that are not shaded, which are NaN.
+        """One step, or that of another number. grad_features: (N, 16), of which those of `shaded`
+        count.
         """
         self.steps = step or self.steps + 1
         seen = np.isin(np.arange(self.n), shaded)[:, None]
-        features = self.dev.upload(np.where(seen, grad_features, np.nan), np.float32)
+        features = self.dev.upload(grad_features[shaded], np.float32)
         rmsprop_update(
             self.dev,
             self.steps,

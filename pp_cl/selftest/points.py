@@ -119,9 +119,7 @@ class PairedPoints:
         rule: str = "softmax",
         **drops: Any,
     ) -> np.ndarray:
-        """(H, W, 16) blended features; those of the points that are not shaded are set to NaN
-        first. rule: of BLENDS. drops: max_tracked and early_stop.
-        """
+        """(H, W, 16) blended features. rule: of BLENDS. drops: max_tracked and early_stop."""
         self.gamma, self.mean, self.opacity = gamma, mean, self.dev.upload(opacity, np.float32)
         self.weights = blend_weights(
             self.dev,
@@ -133,12 +131,12 @@ class PairedPoints:
             gamma=gamma,
             **drops,
         )
-        shaded = np.isin(np.arange(self.n), self.weights.shaded.get())
-        self.point_features = self.dev.upload(
-            np.where(shaded[:, None], point_features, np.nan), np.float32
-        )
+        shaded = self.weights.shaded.get()
+        rows = np.full((len(shaded) + 1, 16), np.nan)  # as if there was room for one more
+        rows[:-1] = np.asarray(point_features)[shaded]
+        self.shaded_features = self.dev.upload(rows, np.float32)
         self.features = self.dev.empty((*self.shape, 16))
-        blend_forward(self.dev, self.pairs, self.weights, self.point_features, self.features)
+        blend_forward(self.dev, self.pairs, self.weights, self.shaded_features, self.features)
         return self.features.get()
 
     def weight(self) -> np.ndarray:
@@ -166,14 +164,16 @@ class PairedPoints:
             self.buffers,
             self.pairs,
             self.weights,
-            point_features=self.point_features,
+            shaded_features=self.shaded_features,
             features=self.features,
             grad_features=self._uploaded(grad_features),
             grad_alpha=alphas,
             spread_weight=spread_weight,
             mean=self.mean,
         )
-        return {"features": features.get(), "opacity": opacity.get()}
+        shaded, of_points = self.weights.shaded.get(), np.zeros((self.n, 16), np.float32)
+        of_points[shaded] = features.get()[: len(shaded)]
+        return {"features": of_points, "opacity": opacity.get()}
 
     def sphere_gradients(self, grad_features: np.ndarray) -> Gradients:
         """{"positions": (N, 3), "radius": (N,)} of the same, and those of gradients()."""
@@ -186,7 +186,7 @@ class PairedPoints:
             self.buffers,
             opacity=self.opacity,
             gamma=self.gamma,
-            point_features=self.point_features,
+            shaded_features=self.shaded_features,
             grad_features=self._uploaded(grad_features),
             mean=self.mean,
         )

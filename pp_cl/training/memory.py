@@ -16,6 +16,7 @@ from pp_cl.errors import UserError
 from pp_cl.metrics.lpips import Lpips
 from pp_cl.model import Model
 from pp_cl.network.unet import PARAMETERS, UNet
+from pp_cl.raster.blend import blend_backward_table
 from pp_cl.raster.points import PointCloud, sh_blocks
 from pp_cl.render import NETWORK_MULTIPLE, Renderer, point_radius
 from pp_cl.scene.grid import Grid
@@ -38,6 +39,12 @@ KEPT_BY_PRUNING = 0.6
 # written in pieces
 PRUNING_BYTES, REFINING_BYTES = 24, 320
 LEAST_RADIUS = 0.75  # pixels, as cl/raster/footprint.h has it
+# How many times its share of an image's pixels a crop sees of the points: up to 4 times on lego,
+# where an image shows the object on a third of its pixels.
+CROP_SHARE = 4
+# The share of the points that an image shows, with room for more: 0.25 of a ball of fog, 0.46 of
+# lego's surface; all where no hits are dropped.
+SHOWN = 0.4
 # What a driver's compiler takes of the host until all kernels of a training are built, measured;
 # of a platform that is not listed the most.
 DRIVER_BYTES = {"Portable Computing Language": 80 * MIB, "Intel(R) OpenCL": 620 * MIB}
@@ -57,7 +64,7 @@ class MemoryPhase(NamedTuple):
     @property
     def device(self) -> int:
         """Bytes of all buffers."""
-        return sum(map(table_bytes, self.tables.values()))
+        return _bytes(self.tables)
 
 
 class Plan(NamedTuple):
@@ -230,15 +237,17 @@ class Room:
 
     def _level(self, name, n, is_averaged, prunes, **stages):
         """The phase of one level of refinement, with its prunings and checkpoints."""
-        tables = self._point_tables(n, is_averaged) | self._stages(n, **stages)
-        if prunes:
-            tables["pruning (at most)"] = compact_table(n, 64 * self._most_coefficients)
+        views = self._views(n, **stages)
+        if prunes:  # the renderer has released its buffers then
+            pruning = {"pruning (at most)": compact_table(n, 64 * self._most_coefficients)}
+            views = max(views, pruning, key=_bytes)
+        tables = self._point_tables(n, is_averaged) | self._stages(n, **stages) | views
         host = PRUNING_BYTES * n * prunes + 2 * min(PIECE_BYTES, 64 * 8 * n)
         return MemoryPhase(name, n, tables, host)
 
     def _refining(self, step, n, is_averaged, **stages):
         """Old and new arrays of the points live together, one array after the other, beside the
-        buffers of the stages for the old points.
+        buffers of the stages but the renderer's.
         """
         old = (n, self._most_coefficients, 16), np.float32
         tables = self._point_tables(8 * n, is_averaged) | self._stages(n, **stages)
@@ -264,17 +273,36 @@ class Room:
             "optimiser": Optimiser.table(self._net.all_parameters, is_averaged),
         }
 
+    def _sizes_seen(self, left):
+        """(height, width) of a step's crop, of that padded, of a padded preview."""
+        camera, downscale = self._largest, self._config.scene.downscale
+        side = crop_side(self._config.train.crop, left)
+        width, height = _crop(camera.downscaled(downscale << left), side)
+        full = _padded(*_crop(camera.downscaled(downscale), 0))
+        return (height, width), _padded(width, height), full
+
+    def _views(self, n, *, radius, layers, left):
+        """What the renderer takes for a step or for a preview, whichever is more."""
+        raster, (_, crop, full) = self._config.raster, self._sizes_seen(left)
+        area = math.pi * max(LEAST_RADIUS, radius / self._config.scene.downscale) ** 2
+        share = min(1.0, CROP_SHARE * math.prod(crop) / math.prod(full))
+        pairs = n * min(area, math.prod(full))
+        few, many = (grown(0, round(s * pairs)) for s in (share, 1.0))
+        shown = n if raster.early_stop == 0 else round(SHOWN * n)
+        shaded = round(share * shown)
+        step = Renderer.tables(raster, n, crop, few, shaded, by_pair=True)
+        gradients = blend_backward_table(n, shaded, math.prod(crop), few, raster.blend)
+        step["gradients (estimate)"] = gradients
+        return max(step, Renderer.tables(raster, n, full, many, shown, by_pair=False), key=_bytes)
+
     def _stages(self, n, *, radius, layers, left):
-        """What the stages of a step and of a rendered preview take. left: refinements to come."""
+        """What the other stages of a step and of a rendered preview take. left: refinements to
+        come.
+        """
         config, net, camera = self._config, self._net, self._largest
-        train, raster, downscale = config.train, config.raster, config.scene.downscale
-        width, height = _crop(camera.downscaled(downscale << left), crop_side(train.crop, left))
-        crop, full = _padded(width, height), _padded(*_crop(camera.downscaled(downscale), 0))
-        area = math.pi * max(LEAST_RADIUS, radius / downscale) ** 2
-        pairs = grown(0, round(n * min(area, full[0] * full[1])))
+        train, ((height, width), crop, full) = config.train, self._sizes_seen(left)
         target, shrunk = (height, width, 3), self._shrunk()
         tables = {
-            **Renderer.tables(raster, n, full, pairs),
             f"network at {crop[1]}x{crop[0]}": net.memory_plan(*crop, True),
             f"previews at {full[1]}x{full[0]}": _preview_table(net, full),
             "loss": Loss.table((*crop, 3), target, train.ssim_weight, lanes_of_loss(net.dev)),
@@ -307,6 +335,11 @@ class Room:
     def _sizes(self):
         """[(width, height)] of the photographs in their files."""
         return [(one.camera.width, one.camera.height) for one in self._photographs]
+
+
+def _bytes(tables):
+    """Of all buffers of several tables."""
+    return sum(map(table_bytes, tables.values()))
 
 
 def _averages(train):

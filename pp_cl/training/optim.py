@@ -54,18 +54,18 @@ class Optimiser:
         self,
         step: int,
         rates: Rates,
-        grad_point_features: Array,
+        grad_shaded_features: Array,
         grad_opacity: Array,
         *,
         points: ProjectedPoints,
         shaded: Array,
         sh_eps: float,
     ) -> None:
-        """One step by the gradients of the points' features (N, 16) and opacities (N,), and by
-        those of the network, which lie in model.net.gradients.
+        """One step by the gradients of the visible points' features, (S, 16) or longer, and of all
+        opacities, (N,), and by those of the network, which lie in model.net.gradients.
 
         step: from 1. points: as projected into the rendered view. shaded: (S) uint32, the visible
-        ones; no others have a gradient of their features. sh_eps: eps of RMSprop.
+        ones. sh_eps: eps of RMSprop.
         """
         cloud, net, state = self.model.cloud, self.model.net, self.state
         rmsprop_update(
@@ -73,7 +73,7 @@ class Optimiser:
             step,
             points,
             shaded,
-            grad_point_features,
+            grad_shaded_features,
             cloud.sh,
             v=state.sh_v,
             last_step=state.last_step,
@@ -220,7 +220,7 @@ def rmsprop_update(
     step: int,
     points: ProjectedPoints,
     shaded: Array,
-    grad_point_features: Array,
+    grad_shaded_features: Array,
     sh: Sequence[Array],
     *,
     v: Array,
@@ -232,11 +232,11 @@ def rmsprop_update(
     gradient is the product of the harmonics in the direction from the eye to the point and the
     gradient of the point's features; it is never formed.
 
-    step: from 1 on. points, shaded: as Optimiser.update() takes them. grad_point_features: (N, 16),
-    of which only the shaded rows are read. sh: arrays (N, count, 16) of SH_BLOCKS up to the end of
-    one degree. v: (N, 16) float32, second moments, of each feature. last_step: (N,) uint32, of each
-    point's last gradient, 0: none. Both start as zeros. rates: of the degrees 0, 1, 2. eps: added
-    to the root of v, in the gradient's unit.
+    step: from 1 on. points, shaded, grad_shaded_features: as Optimiser.update() takes them. sh:
+    arrays (N, count, 16) of SH_BLOCKS up to the end of one degree. v: (N, 16) float32, second
+    moments, of each feature. last_step: (N,) uint32, of each point's last gradient, 0: none. Both
+    start as zeros. rates: of the degrees 0, 1, 2. eps: added to the root of v, in the gradient's
+    unit.
     """
     degree = max((d for d in range(stored_degree(sh) + 1) if rates[d] > 0), default=None)
     if degree is None:
@@ -261,7 +261,7 @@ def rmsprop_update(
         shaded=shaded,
         camera=points.camera_buffer,
         point_camera=points.point_camera,
-        grad_point_features=grad_point_features,
+        grad_shaded_features=grad_shaded_features,
         last_step=last_step,
         v=v,
         sh_0=sh_0,
@@ -275,7 +275,7 @@ def rmsprop_update(
         s=len(shaded),
         step=step,
         shaded=shaded,
-        grad_point_features=grad_point_features,
+        grad_shaded_features=grad_shaded_features,
         last_step=last_step,
     )
 

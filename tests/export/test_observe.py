@@ -40,9 +40,9 @@ def test_it_blends_what_the_rasteriser_blends(run):
     (seen,) = observe(run, [camera], "test")
     matrix = seen.blend_matrix()
     raster = run.renderer.forward(camera, run.gamma, until="features")
-    points = np.zeros(raster.point_features.shape, np.float32)
     shaded = raster.weights.shaded.get()
-    points[shaded] = raster.point_features.get()[shaded]
+    points = np.zeros((run.model.cloud.count, 16), np.float32)
+    points[shaded] = raster.shaded_features.get()[: len(shaded)]
     blended = matrix @ points + (1 - matrix.sum(1))[:, None]  # the background's features are 1
     features = run.render(camera, features=True).features.reshape(-1, 16)
     assert blended == pytest.approx(features, abs=1e-4)
