@@ -185,7 +185,8 @@ class Renderer:
             tiles = None
             if self.model.net.is_planned(size):
                 tiles = tiles_hit(self.dev, pairs.pixel_offset, size)
-            self._room = room_needed(pairs)  # waits for the device
+            (tiles or weights.shaded_list).get()  # the host's one wait for the device
+            self._room = room_needed(pairs)
             if self._room == pairs.capacity:
                 return pairs, weights, tiles
             del pairs, weights  # else their arrays would stay beside the larger ones

@@ -8,7 +8,7 @@ import sys
 import time
 import weakref
 from collections import defaultdict, deque
-from collections.abc import Callable, Hashable, Iterator
+from collections.abc import Callable, Hashable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -155,7 +155,7 @@ class Device:
         self.bytes = self.peak_bytes = 0
         self._sent = deque()  # events of send()
         self._scratch = {}  # {name: array} of scratch()
-        self._programs = {}
+        self._programs, self._constants = {}, {}
         self.build_seconds = 0.0  # of all programs
         self._seconds = defaultdict(list)
         self._stage_seconds = defaultdict(list) if self.debug else None
@@ -233,6 +233,13 @@ class Device:
             if zeros:
                 self.fill(held[:zeros], 0)
         return held
+
+    def constant(self, rows: Sequence[tuple[int, ...]]) -> Array:
+        """The rows as an int32 array on the device, which is made once."""
+        key = tuple(rows)
+        if key not in self._constants:
+            self._constants[key] = self.upload(key, np.int32)
+        return self._constants[key]
 
     def zeros(self, shape: int | tuple[int, ...], dtype: type = np.float32) -> Array:
         """Array of zeros on the device."""
