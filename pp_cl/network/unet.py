@@ -14,6 +14,7 @@ from pp_cl.device.buffers import PackedArrays, Table, packed_arrays, packed_byte
 from pp_cl.device.device import Device
 from pp_cl.layers.choice import ConvolutionPolicy, lay_out_forward, make_policy
 from pp_cl.layers.conv_direct import (
+    FLIPPED,
     PARTIAL,
     Direction,
     pack_bias,
@@ -21,6 +22,7 @@ from pp_cl.layers.conv_direct import (
     sum_parts,
     table_of_sums,
 )
+from pp_cl.layers.conv_winograd import TRANSFORMED
 from pp_cl.layers.simple import (
     avgpool2_backward,
     avgpool2_forward,
@@ -462,19 +464,16 @@ class UNet:
                     weight_shape,
                     layer.shape(direction, source, *size).ci,
                 )
-                needed.pop(PARTIAL, None)  # of all layers, below
                 for name, number in needed.items():
-                    floats[name] = max(number, floats.get(name, 0))
+                    if not training or name not in (FLIPPED, PARTIAL, TRANSFORMED):  # see below
+                        floats[name] = max(number, floats.get(name, 0))
         table = {name: ((number,), np.float32) for name, number in floats.items()}
         table |= dict.fromkeys(PARAMETERS, (self.all_parameters.shape, np.float32))
         if training:
             rows = [row for _, row in self._work_table(size).values()]
             sums = (len(convolutions(self.layers)), 8), np.int32
-            table["weights laid out, parts of gradients"] = (
-                (packed_bytes(self.dev, rows),),
-                np.uint8,
-            )
-            table["sums of gradients"] = (packed_bytes(self.dev, [sums]),), np.uint8
+            for name, packed in (("laid out", rows), ("sums of gradients", [sums])):
+                table[name] = (packed_bytes(self.dev, packed),), np.uint8
         for level in set(levels_of(self.layers).values()):
             tiles = all_tiles_buffers(height >> level, width >> level)
             table |= {f"tiles of level {level}, {name}": row for name, row in tiles.items()}
