@@ -11,9 +11,11 @@ import pp_cl.network.unet
 from pp_cl.config import configure, preset
 from pp_cl.device.buffers import Reading
 from pp_cl.device.device import Device
+from pp_cl.device.launch import Program
 from pp_cl.files.run_folder import RunFolder
 from pp_cl.session import open_training
 
+MOST_LAUNCHES = 75  # of a step of tiny: each takes the host 30 us
 COMPLETE = cl.command_execution_status.COMPLETE
 EVERY_STEP = {  # so that a step of any number does what most do
     "points.count": 300,
@@ -38,13 +40,14 @@ def make_trainer(dev, scene, folder, name):
 
 
 class Recorder:
-    """Counts what waits for the device, and what is allocated there."""
+    """Counts what waits for the device, what is launched and what is allocated there."""
 
     def __init__(self, monkeypatch):
         self.counts = collections.Counter()
         self._follow(monkeypatch, cl, "enqueue_copy", self._copies)
         self._follow(monkeypatch, Device, "_allocate", "allocations")
         self._follow(monkeypatch, Device, "finish", "waits")
+        self._follow(monkeypatch, Program, "launch", "launches")
         self._follow(monkeypatch, Reading, "get", self._gets)
 
     def _follow(self, monkeypatch, owner, name, counted):
@@ -93,6 +96,8 @@ def test_a_step_waits_once_and_allocates_nothing(dev, scene, tmp_path, monkeypat
             trainer.train_step()
             assert recorder.counts["waits"] <= step, recorder.counts
     assert recorder.counts["allocations"] == 0, recorder.counts
+    if name == "tiny" and not planned and dev.is_cpu:
+        assert recorder.counts["launches"] <= 5 * MOST_LAUNCHES
     assert recorder.counts["read"] > 0
 
 

@@ -18,26 +18,33 @@
 // pixels of a row summed in registers: one sum over an image of background would lose digits
 #define SUMMED 128
 
-// One work-item per (output channel, ky * K + kx, 16 input channels from `first` on): reads 16
-// weights, writes them as one vector at the mirrored place. Lanes beyond c are 0.
+// One work-item per (weights, output channel, tap, 16 input channels): reads 16 weights, writes them
+// as one vector at the mirrored place. Lanes beyond the channels taken are 0. Rows of `table`: first
+// work-item, taps (K * K), output channels, input channels taken, the first of them, input channels
+// of the weights, where weights and vectors begin.
 kernel __attribute__((vec_type_hint(float16))) void conv_flip_weights(
-    const int c,  // channels taken
-    const int co,
-    const int first,             // first channel taken
-    const int ci,                // channels of weight
-    global const float *weight,  // (?, KERNEL_SIZE, KERNEL_SIZE, ci, 16)
-    global float16 *flipped)     // (?, KERNEL_SIZE, KERNEL_SIZE, co, 16)
+    const uint n,  // work-items
+    const uint rows,
+    global const int *table,      // (rows, 8)
+    global const float *weights,  // (?) of all rows, each (blocks, K, K, ci, 16)
+    global float16 *flipped)      // (...) of all rows, each (?, K, K, co, 16)
 {
-    const int o = get_global_id(0), tap = get_global_id(1), block = get_global_id(2);
-    if (o >= co || tap >= TAPS) return;
+    const int item = get_global_id(0);
+    if (item >= n) return;
+    global const int *row = table;
+    for (uint r = 1; r < rows && table[8 * r] <= item; r++)
+        row += 8;
+    const int taps = row[1], co = row[2], c = row[3], at = item - row[0];
+    const int o = at % co, tap = at / co % taps, block = at / co / taps;
+    global const float *weight = weights + row[6];
     float lane[16];
     for (int i = 0; i < 16; i++) {
         const int channel = block * 16 + i;
         lane[i] = channel < c
-                      ? weight[(((o / 16) * TAPS + tap) * ci + first + channel) * 16 + o % 16]
+                      ? weight[(((o / 16) * taps + tap) * row[5] + row[4] + channel) * 16 + o % 16]
                       : 0.0f;
     }
-    flipped[(block * TAPS + TAPS - 1 - tap) * co + o] = vload16(0, lane);
+    flipped[row[7] + (block * taps + taps - 1 - tap) * co + o] = vload16(0, lane);
 }
 
 // The gradients of 16 channels, `count` times; 0 where count is, whatever they are.
@@ -124,23 +131,30 @@ kernel __attribute__((vec_type_hint(float16))) void conv_backward_weights(
     }
 }
 
-// One work-item per part of (row of partial, 16 output channels): adds the parts in order; writes
-// LANES values of a gradient.
+// One work-item per part of (weights, row of partial, 16 output channels): adds the parts in order;
+// writes LANES values of a gradient. Rows of `table`: first row of partial of all weights, rows of
+// one part and group of 16 output channels (K * K * ci + 1), such groups, parts, where the parts,
+// the gradient of the weights and that of the biases begin.
 kernel __attribute__((vec_type_hint(floats))) void conv_sum_parts(
-    const int per_block,  // K * K * ci, rows of one block of weights
-    const int blocks,
-    const int parts,
+    const uint n,  // rows of partial, of one part of all weights
+    const uint rows,
+    global const int *table,        // (rows, 8)
     global const float16 *partial,  // (...) as above
-    global float16 *grad_weight,    // (blocks, KERNEL_SIZE, KERNEL_SIZE, ?, 16)
-    global float16 *grad_bias)      // (?)
+    global float16 *grad_weights,   // (...)
+    global float16 *grad_biases)    // (...)
 {
-    const int row = get_global_id(0) / ROW_PARTS, block = get_global_id(1);
-    if (row > per_block || block >= blocks) return;
+    const int item = get_global_id(0) / ROW_PARTS;
+    if (item >= n) return;
+    global const int *of = table;
+    for (uint r = 1; r < rows && table[8 * r] <= item; r++)
+        of += 8;
+    const int per_block = of[1], blocks = of[2], parts = of[3];
+    const int row = (item - of[0]) % per_block, block = (item - of[0]) / per_block;
     floats sum = 0.0f;
     for (int part = 0; part < parts; part++)
-        sum += load_part(partial, ((size_t)part * blocks + block) * (per_block + 1) + row);
-    if (row < per_block)
-        store_part(sum, grad_weight, block * per_block + row);
+        sum += load_part(partial, of[4] + ((size_t)part * blocks + block) * per_block + row);
+    if (row < per_block - 1)
+        store_part(sum, grad_weights, of[5] + block * (per_block - 1) + row);
     else
-        store_part(sum, grad_bias, block);
+        store_part(sum, grad_biases, of[6] + block);
 }

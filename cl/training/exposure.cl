@@ -59,24 +59,29 @@ kernel void exposure_products(
     }
 }
 
-// One work-item per channel: adds the sums of a view's crop to those before, which it lets fade,
-// and writes the gains of all views. Their geometric mean is 1, as only what views differ by is
-// known.
+// One work-item per channel: sums the rows' products, adds the sums to those before of the view,
+// which it lets fade, and writes the gains of all views. Their geometric mean is 1, as only what
+// views differ by is known.
 kernel void exposure_fit(
     const uint views,
     const uint view,
-    const float kept,          // of the sums before
-    const float prior,         // of a gain of 1, as a sum of squares
-    global const float *sums,  // (3, 4) of the rows' products
-    global float4 *exposure)   // (VIEWS, 3, 4) the sums of three products, and the gain
+    const uint h,                      // rows
+    const float kept,                  // of the sums before
+    const float prior,                 // of a gain of 1, as a sum of squares
+    global const float *row_products,  // (3, H, 4)
+    global float4 *exposure)           // (VIEWS, 3, 4) the sums of three products, and the gain
 {
     const uint c = get_global_id(0);
     if (c >= 3) return;
+    float3 products = 0.0f;
+    for (uint y = 0; y < h; y++)
+        products += (float3)(row_products[4 * y + c], row_products[4 * (h + y) + c],
+                             row_products[4 * (2 * h + y) + c]);
     float sum = 0.0f;
     for (uint v = 0; v < views; v++) {
         global float4 *channel = exposure + 3 * v + c;
         float4 known = *channel;
-        if (v == view) known.xyz = kept * known.xyz + (float3)(sums[c], sums[4 + c], sums[8 + c]);
+        if (v == view) known.xyz = kept * known.xyz + products;
         const float gain = (known.x + prior) / (known.y + prior);  // clamp() would hide a NaN
         known.w = gain > MOST ? MOST : gain < 1.0f / MOST ? 1.0f / MOST : gain;
         sum += log(known.w);

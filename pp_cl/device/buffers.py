@@ -5,7 +5,7 @@ too; packed into one buffer; read without waiting; and their rows gathered, kept
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any, Generic, TypeVar
 
 import numpy as np
@@ -21,12 +21,17 @@ PIECE_BYTES = 2**26  # that the host reads at a time
 CHANNELS = 16  # words of a row of features
 
 T = TypeVar("T")
-Table = dict[str, tuple[tuple[int, ...], Any]]  # {name: (shape, dtype)}
+Row = tuple[tuple[int, ...], Any]  # (shape, dtype)
+Table = dict[str, Row]
 
 
 def table_bytes(table: Table) -> int:
     """Bytes of all arrays of a table."""
-    return sum(math.prod(shape) * np.dtype(dtype).itemsize for shape, dtype in table.values())
+    return sum(_row_bytes(*row) for row in table.values())
+
+
+def _row_bytes(shape, dtype):
+    return math.prod(shape) * np.dtype(dtype).itemsize
 
 
 def grown(capacity: int, needed: int) -> int:
@@ -68,20 +73,27 @@ class Buffers:
             raise AttributeError(f"no buffer {name!r} was required yet") from None
 
 
-def packed_arrays(
-    dev: Device, rows: Iterable[tuple[tuple[int, ...], type]]
-) -> tuple[Array, list[Array]]:
+def packed_arrays(dev: Device, rows: Sequence[Row]) -> tuple[Array, list[Array]]:
     """(octets, arrays of these shapes and dtypes that lie in them), all zeros: one launch or
     transfer handles them all. The arrays are valid as long as the octets are held.
     """
-    align = dev.device.mem_base_addr_align // 8
-    sized = [(shape, dtype, max(1, table_bytes({"": (shape, dtype)}))) for shape, dtype in rows]
-    *starts, end = np.cumsum([0, *(-(-size // align) * align for *_, size in sized)])
-    whole, arrays = dev.zeros((int(end),), np.uint8), []
-    for start, (shape, dtype, size) in zip(starts, sized, strict=True):
-        region = whole.base_data.get_sub_region(int(start), size)
+    whole, arrays = dev.zeros((packed_bytes(dev, rows),), np.uint8), []
+    for start, (shape, dtype) in zip(_packed_starts(dev, rows), rows, strict=False):
+        region = whole.base_data.get_sub_region(start, max(1, _row_bytes(shape, dtype)))
         arrays.append(Array(dev.queue, shape, dtype, data=region))
     return whole, arrays
+
+
+def packed_bytes(dev: Device, rows: Sequence[Row]) -> int:
+    """The octets that packed_arrays() takes."""
+    return _packed_starts(dev, rows)[-1]
+
+
+def _packed_starts(dev, rows):
+    """Where each of the rows begins, aligned as the device needs, and the end."""
+    align = dev.device.mem_base_addr_align // 8
+    sizes = [-(-max(1, _row_bytes(*row)) // align) * align for row in rows]
+    return [0, *map(int, np.cumsum(sizes))]
 
 
 class PackedArrays:
@@ -89,13 +101,11 @@ class PackedArrays:
 
     def __init__(self, dev: Device):
         self._dev = dev
-        self._rows: list[tuple[tuple[int, ...], type]] = []
+        self._rows: list[Row] = []
         self._arrays: list[Array] = []
         self._whole: Any = None
 
-    def send(
-        self, rows: list[tuple[tuple[int, ...], type]], values: Sequence[np.ndarray]
-    ) -> list[Array]:
+    def send(self, rows: list[Row], values: Sequence[np.ndarray]) -> list[Array]:
         """Arrays of these shapes and dtypes, in the same memory as those before if these were the
         same, overwritten after what is enqueued. values: of these dtypes; what is behind shorter
         ones is undefined.

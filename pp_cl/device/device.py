@@ -8,7 +8,7 @@ import sys
 import time
 import weakref
 from collections import defaultdict, deque
-from collections.abc import Callable, Hashable, Iterator
+from collections.abc import Callable, Hashable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -160,6 +160,7 @@ class Device:
         self._sent: deque[Any] = deque()  # events of send()
         self._scratch: dict[Hashable, Any] = {}  # {name: array} of scratch()
         self._programs: dict[Any, Program] = {}
+        self._constants: dict[Any, Any] = {}
         self.build_seconds = 0.0  # of all programs
         self._seconds: dict[str, list[float]] = defaultdict(list)
         self._stage_seconds: dict[str, list[float]] | None = None
@@ -239,6 +240,13 @@ class Device:
             if zeros:
                 self.fill(held[:zeros], 0)
         return held
+
+    def constant(self, rows: Sequence[tuple[int, ...]]) -> Array:
+        """The rows as an int32 array on the device, which is made once."""
+        key = tuple(rows)
+        if key not in self._constants:
+            self._constants[key] = self.upload(key, np.int32)
+        return self._constants[key]
 
     def zeros(self, shape: int | tuple[int, ...], dtype: type = np.float32) -> Array:
         """Array of zeros on the device."""

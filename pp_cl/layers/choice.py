@@ -19,6 +19,8 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
+from pyopencl.array import Array
+
 from pp_cl import __version__
 from pp_cl.device.device import Device
 from pp_cl.errors import UserError, quoted, shown
@@ -26,6 +28,7 @@ from pp_cl.files.atomic import cache_folder
 from pp_cl.files.untrusted import read_regular
 from pp_cl.layers import conv_direct, conv_local, conv_winograd
 from pp_cl.layers.conv_direct import Blocking, Direction
+from pp_cl.layers.tiles import VECTOR
 
 AUTO = "auto"
 FORWARD, INPUT, WEIGHTS = Direction
@@ -110,6 +113,17 @@ class ConvShape:
     def ci(self) -> int:
         """Input channels; of a gradient of the input, those of its one source."""
         return sum(self.sources) if self.source is None else self.sources[self.source]
+
+
+def lay_out_forward(dev: Device, module: ModuleType, weight: Array) -> Array | None:
+    """A layer's weights as a module's forward() reads them, in a new array; None: as they are."""
+    blocks, _, _, ci, _ = weight.shape
+    floats = module.laid_out_floats(FORWARD, weight.shape, ci)
+    if not floats:
+        return None
+    laid_out, layer = dev.empty((floats,)), (0, 0, weight.shape, None, ci, blocks * VECTOR)
+    module.lay_out(dev, weight.reshape(-1), [layer], laid_out)
+    return laid_out
 
 
 def can_run(variant: str, k: int, *channels: int) -> bool:

@@ -1,12 +1,13 @@
 """Direct convolutions, of any channels, 1x1 and 3x3; and what all convolutions share: the layout of
 weights, the cutting of work, checks.
 
-conv_winograd.py and conv_local.py have the same five functions: scratch_floats, lay_out, forward,
-backward_input and backward_weights. All are convolutions K x K (K = 1 or 3) of stride 1 with zero
-padding K // 2; choice.py says which module computes one.
+conv_winograd.py and conv_local.py have the same six functions: scratch_floats, laid_out_floats,
+lay_out, forward, backward_input and backward_weights. All are convolutions K x K (K = 1 or 3) of
+stride 1 with zero padding K // 2; choice.py says which module computes one.
 """
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import Enum
 
@@ -22,6 +23,12 @@ from pp_cl.layers.tiles import SIDE, VECTOR, Tiles, checked_tiles
 ROWS_PER_PART = 8
 # The partial sums take at most this many floats (64 MiB), or one part if that is larger.
 PARTIAL_FLOATS = 1 << 24
+# Weights to lay out: first float in the weights and in what they become, shape, first input channel
+# (None: for the forward pass), input channels and output channels that a pass computes.
+Layout = tuple[int, int, tuple[int, ...], int | None, int, int]
+# Gradients of weights to sum: shape, parts, first float of the parts, of the weights' gradient and
+# of the biases'.
+Sums = tuple[tuple[int, ...], int, int, int, int]
 # Names of the memory that convolutions share (Device.scratch()).
 FLIPPED, PARTIAL = "flipped weights", "parts of the weights' gradients"
 
@@ -96,23 +103,39 @@ def check_weights(sources: tuple[Array, ...], weight: Array, bias: Array, out: A
         )
 
 
+def table_of_sums(jobs: Sequence[Sums]) -> tuple[list[tuple[int, ...]], int]:
+    """(rows, number of sums of 16) of the table that sum_parts() takes."""
+    rows, n = [], 0
+    for (blocks, k, _, ci, _), parts, *places in jobs:
+        rows.append((n, k * k * ci + 1, blocks, parts, *(place // VECTOR for place in places), 0))
+        n += (k * k * ci + 1) * blocks
+    return rows, n
+
+
 def sum_parts(
-    dev: Device, partial: Array, grad_weight: Array, grad_bias: Array, *, parts: int
+    dev: Device, table: Array, n: int, partial: Array, grad_weights: Array, grad_biases: Array
 ) -> None:
-    """grad_weight (blocks, K, K, CI, 16) and grad_bias (blocks * 16,) = sums, in order, of the
-    parts of an image, partial (parts, blocks, K * K * CI + 1, 16) or longer.
+    """Gradients = sums, in order, of the parts of an image, of all weights in one launch.
+
+    table, n: of table_of_sums(). partial, grad_weights, grad_biases: (?,) float32; of each weights
+    (parts, blocks, K * K * CI + 1, 16), (blocks, K, K, CI, 16) and (blocks, 16).
     """
-    blocks, k, _, ci, _ = grad_weight.shape
-    dev.program("layers/conv_backward_weights", KERNEL_SIZE=k, LANES=lanes(dev)).launch(
+    dev.program("layers/conv_backward_weights", LANES=lanes(dev)).launch(
         "conv_sum_parts",
-        (row_parts(dev) * (k * k * ci + 1), blocks),
-        per_block=k * k * ci,
-        blocks=blocks,
-        parts=parts,
+        n * row_parts(dev),
+        n=n,
+        rows=len(table),
+        table=table,
         partial=partial,
-        grad_weight=grad_weight,
-        grad_bias=grad_bias,
+        grad_weights=grad_weights,
+        grad_biases=grad_biases,
     )
+
+
+def summed(dev: Device, partial: Array, parts: int, grad_weight: Array, grad_bias: Array) -> None:
+    """sum_parts() of one layer's weights."""
+    rows, n = table_of_sums([(grad_weight.shape, parts, 0, 0, 0)])
+    sum_parts(dev, dev.constant(rows), n, partial, grad_weight, grad_bias)
 
 
 def scratch_floats(
@@ -135,8 +158,36 @@ def scratch_floats(
     return {}
 
 
-def lay_out(_dev: Device, _blocking: Blocking, _weight: Array) -> None:
-    """Nothing to transform in advance: the kernels read the weights as they are."""
+def laid_out_floats(direction: Direction, weight_shape: tuple, c: int) -> int:
+    """Floats of a layer's weights as the kernels of FORWARD or BACKWARD_INPUT read them; 0 where
+    they read them as they are. weight_shape, c: as scratch_floats() takes them.
+    """
+    if direction is Direction.FORWARD:
+        return 0
+    return math.prod(_flipped_shape(weight_shape, c, weight_shape[0] * VECTOR))
+
+
+def lay_out(dev: Device, weights: Array, jobs: Sequence[Layout], laid_out: Array) -> None:
+    """Lay out weights in one launch: those of input gradients with the kernel mirrored and the
+    roles of input and output channels exchanged, (ceil(c/16), K, K, co, 16).
+
+    weights, laid_out: (?,) float32.
+    """
+    rows, n = [], 0
+    for start, target, (_, k, _, ci, _), first, c, co in jobs:
+        blocks = -(-c // VECTOR)
+        taken = min(ci - first, blocks * VECTOR)
+        rows.append((n, k * k, co, taken, first, ci, start, target // VECTOR))
+        n += co * k * k * blocks
+    dev.program("layers/conv_backward_weights", LANES=lanes(dev)).launch(
+        "conv_flip_weights",
+        n,
+        n=n,
+        rows=len(rows),
+        table=dev.constant(rows),
+        weights=weights,
+        flipped=laid_out,
+    )
 
 
 def forward(
@@ -155,7 +206,7 @@ def forward(
 
     sources: one or two of (H, W, C1), (H, W, C2); weight: (ceil(CO/16), K, K, C1 + C2, 16); bias:
     (ceil(CO/16) * 16,); out: (H, W, CO), all float32; tiles: those of out to compute, None = all;
-    laid_out: lay_out(weight), None = computed here if it is needed. Raises ValueError when shapes
+    laid_out: of lay_out(), None = computed here if it is needed. Raises ValueError when shapes
     do not fit together.
     """
     height, width, co = out.shape
@@ -194,16 +245,18 @@ def backward_input(
     *,
     mask: Array | None,
     tiles: Tiles | None = None,
+    laid_out: Array | None = None,
 ) -> None:
     """grad_x = gradient of a convolution's input, 0 where mask <= 0.
 
     weight: of forward(); first: its input channel that is grad_x's first; grad_out: (H, W, CO),
     dL/dout before the ReLU; grad_x: (H, W, C); mask: (H, W, C), the input where it is a ReLU's
     output, so that grad_x is the gradient of the ReLU's input, or None; tiles: those of grad_x to
-    compute, None = all. Raises ValueError when shapes do not fit together.
+    compute, None = all; laid_out: of lay_out(), None = computed here. Raises ValueError when shapes
+    do not fit together.
     """
     height, width, c = grad_x.shape
-    flipped = flip_weights(dev, blocking, weight, first, c, grad_out.shape[2])
+    flipped = flipped_weights(dev, weight, first, c, grad_out.shape[2], laid_out)
     tiles = checked_tiles(dev, tiles, height, width)
     program, size, work_group = _program(dev, blocking, flipped.shape[1], grad_x.shape)
     program.launch(
@@ -234,17 +287,24 @@ def backward_weights(
     grad_bias: Array,
     *,
     tiles: Tiles | None = None,
-) -> None:
+    partial: Array | None = None,
+) -> int:
     """Overwrite grad_weight and grad_bias, shaped as forward()'s, with the gradients of forward(
     sources, ...), given dL/dout (H, W, CO) before the ReLU.
 
     tiles: those of grad_out to sum, each as often as it counts, None = all, once. The order of the
-    sums depends on the shapes alone. Raises ValueError when shapes do not fit together.
+    sums depends on the shapes alone. partial: (?,) of scratch_floats()[PARTIAL], to leave the sums
+    of the image's parts for sum_parts() instead. Returns how many parts. Raises ValueError when
+    shapes do not fit together.
     """
     height, width, co = grad_out.shape
     blocks, k, _, ci, _ = grad_weight.shape
     check_weights(sources, grad_weight, grad_bias, grad_out)
-    partial = dev.scratch(PARTIAL, partial_floats(height, grad_weight.shape))
+    held = (
+        dev.scratch(PARTIAL, partial_floats(height, grad_weight.shape))
+        if partial is None
+        else partial
+    )
     tiles = checked_tiles(dev, tiles, height, width)
     parts, rows = image_parts(height, grad_weight.shape)
     first = 0
@@ -267,35 +327,27 @@ def backward_weights(
             x=source,
             grad_out=grad_out,
             tile_count=tiles.count,
-            partial=partial,
+            partial=held,
         )
         first += c
-    sum_parts(dev, partial, grad_weight, grad_bias, parts=parts)
+    if partial is None:
+        summed(dev, held, parts, grad_weight, grad_bias)
+    return parts
 
 
-def flip_weights(
-    dev: Device, blocking: Blocking, weight: Array, first: int, c: int, co: int
+def flipped_weights(
+    dev: Device, weight: Array, first: int, c: int, co: int, laid_out: Array | None
 ) -> Array:
-    """(ceil(c/16), K, K, co, 16) in scratch: the weights with the kernel mirrored and the roles of
-    input and output channels exchanged.
+    """(ceil(c/16), K, K, co, 16): `laid_out` or, where it is None, scratch that lay_out() fills.
 
     weight: (ceil(CO/16), K, K, CI, 16); c: input channels taken from `first` on, CI - first or
     less, a multiple of 16 unless they reach CI.
     """
-    k, ci = weight.shape[1], weight.shape[3]
     shape = _flipped_shape(weight.shape, c, co)
-    flipped = dev.scratch(FLIPPED, math.prod(shape))[: math.prod(shape)].reshape(shape)
-    _weights_program(dev, blocking, k, ci)[0].launch(
-        "conv_flip_weights",
-        (co, k * k, shape[0]),
-        c=min(ci - first, shape[0] * VECTOR),
-        co=co,
-        first=first,
-        ci=ci,
-        weight=weight,
-        flipped=flipped,
-    )
-    return flipped
+    if laid_out is None:
+        laid_out = dev.scratch(FLIPPED, math.prod(shape))
+        lay_out(dev, weight.reshape(-1), [(0, 0, weight.shape, first, c, co)], laid_out)
+    return laid_out[: math.prod(shape)].reshape(shape)
 
 
 def partial_floats(height: int, weight_shape: tuple) -> int:

@@ -11,16 +11,24 @@ from pp_cl.layers.conv_direct import (
     PARTIAL,
     Blocking,
     check_weights,
-    flip_weights,
+    flipped_weights,
     image_parts,
+    laid_out_floats,
     lay_out,
     partial_floats,
     scratch_floats,
-    sum_parts,
+    summed,
 )
 from pp_cl.layers.tiles import SIDE, VECTOR, Tiles, checked_tiles
 
-__all__ = ["backward_input", "backward_weights", "forward", "lay_out", "scratch_floats"]
+__all__ = [
+    "backward_input",
+    "backward_weights",
+    "forward",
+    "laid_out_floats",
+    "lay_out",
+    "scratch_floats",
+]
 
 QUAD = 4  # channels of a work-item
 # Pixels of a work-item: two lines of a tile, ROWS in cl/layers/conv_local.cl.
@@ -76,7 +84,7 @@ def forward(
 
 def backward_input(
     dev: Device,
-    blocking: Blocking,
+    _blocking: Blocking,
     weight: Array,
     first: int,
     grad_out: Array,
@@ -84,11 +92,12 @@ def backward_input(
     *,
     mask: Array | None,
     tiles: Tiles | None = None,
+    laid_out: Array | None = None,
 ) -> None:
     """See conv_direct.backward_input."""
     height, width, c = grad_x.shape
     co = grad_out.shape[2]
-    flipped = flip_weights(dev, blocking, weight, first, c, co)
+    flipped = flipped_weights(dev, weight, first, c, co, laid_out)
     tiles = checked_tiles(dev, tiles, height, width)
     program, size, work_group = _program(
         dev, "conv_local_backward_input", flipped.shape[1], tiles, c, [co]
@@ -118,14 +127,19 @@ def backward_weights(
     grad_bias: Array,
     *,
     tiles: Tiles | None = None,
-) -> None:
+    partial: Array | None = None,
+) -> int:
     """See conv_direct.backward_weights. The order of the sums depends on the shapes and the number
     of tiles alone.
     """
     height, width, co = grad_out.shape
     blocks, k, _, ci, _ = grad_weight.shape
     check_weights(sources, grad_weight, grad_bias, grad_out)
-    partial = dev.scratch(PARTIAL, partial_floats(height, grad_weight.shape))
+    held = (
+        dev.scratch(PARTIAL, partial_floats(height, grad_weight.shape))
+        if partial is None
+        else partial
+    )
     tiles = checked_tiles(dev, tiles, height, width)
     run = max(SUMMED, -(-tiles.number // image_parts(height, grad_weight.shape)[0]))
     parts = -(-tiles.number // run)
@@ -148,7 +162,7 @@ def backward_weights(
             grad_out=grad_out,
             tile_list=tiles.list,
             tile_count=tiles.count,
-            partial=partial,
+            partial=held,
         )
         first += c
     program.launch(
@@ -161,9 +175,11 @@ def backward_weights(
         grad_out=grad_out,
         tile_list=tiles.list,
         tile_count=tiles.count,
-        partial=partial,
+        partial=held,
     )
-    sum_parts(dev, partial, grad_weight, grad_bias, parts=parts)
+    if partial is None:
+        summed(dev, held, parts, grad_weight, grad_bias)
+    return parts
 
 
 def _is_aligned(*channels):

@@ -2,10 +2,19 @@
 than the direct ones, at two or three times the error. Channels come in multiples of 16.
 """
 
+from collections.abc import Sequence
+
 from pyopencl.array import Array
 
 from pp_cl.device.device import Device
-from pp_cl.layers.conv_direct import PARTIAL, Blocking, Direction, check_weights, sum_parts
+from pp_cl.layers.conv_direct import (
+    PARTIAL,
+    Blocking,
+    Direction,
+    Layout,
+    check_weights,
+    summed,
+)
 from pp_cl.layers.tiles import SIDE, VECTOR, Tiles, checked_tiles
 
 POSITIONS = (SIDE + 2) ** 2  # values of a transformed tile
@@ -56,12 +65,31 @@ def transformed_floats(ci: int, co: int) -> int:
     return POSITIONS * (ci * co + VECTOR)
 
 
-def lay_out(dev: Device, _blocking: Blocking, weight: Array) -> Array:
-    """The weights (CO/16, 3, 3, CI, 16) transformed, in a new array."""
-    blocks, _, _, ci, _ = weight.shape
-    laid_out = dev.empty(transformed_floats(ci, blocks * VECTOR))
-    _transform(dev, weight, laid_out)
-    return laid_out
+def laid_out_floats(_direction: Direction, weight_shape: tuple, c: int) -> int:
+    """See conv_direct.laid_out_floats."""
+    return transformed_floats(c, weight_shape[0] * VECTOR)
+
+
+def lay_out(dev: Device, weights: Array, jobs: Sequence[Layout], laid_out: Array) -> None:
+    """Transform weights in one launch, see conv_direct.lay_out."""
+    rows, n = [], 0
+    for start, target, (blocks, _, _, ci, _), first, c, co in jobs:
+        flipped = first is not None
+        if flipped and (first % VECTOR or first + c > ci):
+            raise ValueError(f"Winograd input gradient of {c} channels from {first} on, of {ci}")
+        channels, groups = (co, c // VECTOR) if flipped else (ci, blocks)
+        rows.append((n, channels, groups, start, target // VECTOR, first or 0, ci, int(flipped)))
+        n += channels * groups
+    dev.program("layers/winograd_transform").launch(
+        "winograd_transform",
+        n,
+        local=VECTOR,
+        n=n,
+        rows=len(rows),
+        table=dev.constant(rows),
+        weights=weights,
+        transformed=laid_out,
+    )
 
 
 def forward(
@@ -82,8 +110,7 @@ def forward(
     _check_channels(*channels, co)
     check_weights(sources, weight, bias, out)
     if laid_out is None:
-        laid_out = dev.scratch(TRANSFORMED, transformed_floats(sum(channels), co))
-        _transform(dev, weight, laid_out)
+        laid_out = _transformed(dev, weight, None, sum(channels), co)
     tiles = checked_tiles(dev, tiles, height, width)
     _program(dev, blocking, sum(channels), co).launch(
         "winograd_forward",
@@ -113,13 +140,14 @@ def backward_input(
     *,
     mask: Array | None,
     tiles: Tiles | None = None,
+    laid_out: Array | None = None,
 ) -> None:
     """See conv_direct.backward_input."""
     height, width, c = grad_x.shape
     co = grad_out.shape[2]
     _check_channels(c, co)
-    flipped = dev.scratch(TRANSFORMED, transformed_floats(co, c))
-    _transform_flipped(dev, weight, first, c, flipped)
+    if laid_out is None:
+        laid_out = _transformed(dev, weight, first, c, co)
     tiles = checked_tiles(dev, tiles, height, width)
     _program(dev, blocking, co, c).launch(
         "winograd_backward_input",
@@ -129,7 +157,7 @@ def backward_input(
         co=co,
         masked=mask is not None,
         x=grad_x if mask is None else mask,
-        flipped=flipped,
+        flipped=laid_out,
         grad_out=grad_out,
         tile_list=tiles.list,
         grad_x=grad_x,
@@ -146,7 +174,8 @@ def backward_weights(
     grad_bias: Array,
     *,
     tiles: Tiles | None = None,
-) -> None:
+    partial: Array | None = None,
+) -> int:
     """See conv_direct.backward_weights. The order of the sums depends on the shapes and the number
     of tiles alone.
     """
@@ -159,7 +188,7 @@ def backward_weights(
     tile_parts = _tile_parts(tiles.number, ci, co)
     ci_part = ci if tile_parts > 1 else _ci_part(dev, ci, co)
     parts = tile_parts * -(-ci // ci_part) * -(-co // CO_PART)
-    partial = dev.scratch(PARTIAL, _partial_floats(ci, co))
+    held = dev.scratch(PARTIAL, _partial_floats(ci, co)) if partial is None else partial
     dev.program(
         "layers/winograd_backward_weights",
         TILES=blocking.winograd_weights,
@@ -179,43 +208,19 @@ def backward_weights(
         grad_out=grad_out,
         tile_list=tiles.list,
         tile_count=tiles.count,
-        partial=partial,
+        partial=held,
         scratch=dev.scratch(SLICES, _gradient_slices(dev, blocking, ci, co), zeros=COUNTERS),
     )
-    sum_parts(dev, partial, grad_weight, grad_bias, parts=tile_parts)
+    if partial is None:
+        summed(dev, held, tile_parts, grad_weight, grad_bias)
+    return tile_parts
 
 
-def _transform(dev, weight, transformed):
-    """Fill transformed from weight (CO/16, 3, 3, CI, 16) for the forward pass."""
-    blocks, _, _, ci, _ = weight.shape
-    dev.program("layers/winograd_transform").launch(
-        "winograd_transform_weights",
-        (ci, blocks),
-        local=(VECTOR, 1),
-        ci=ci,
-        blocks=blocks,
-        weight=weight,
-        transformed=transformed,
-    )
-
-
-def _transform_flipped(dev, weight, first, c, transformed):
-    """Fill transformed for the gradient of the c input channels from `first` on."""
-    blocks, _, _, ci, _ = weight.shape
-    co = blocks * VECTOR
-    if first % VECTOR or first + c > ci:
-        raise ValueError(f"Winograd input gradient of {c} channels from {first} on, of {ci}")
-    dev.program("layers/winograd_transform").launch(
-        "winograd_transform_flipped_weights",
-        (co, c // VECTOR),
-        local=(VECTOR, 1),
-        co=co,
-        blocks=c // VECTOR,
-        first=first,
-        ci=ci,
-        weight=weight,
-        transformed=transformed,
-    )
+def _transformed(dev, weight, first, c, co):
+    """lay_out() of one layer's weights, in scratch."""
+    laid_out = dev.scratch(TRANSFORMED, transformed_floats(c, co))
+    lay_out(dev, weight.reshape(-1), [(0, 0, weight.shape, first, c, co)], laid_out)
+    return laid_out
 
 
 def _check_channels(*channels):

@@ -16,7 +16,7 @@ from pp_cl.device.buffers import Table
 from pp_cl.device.device import Device
 from pp_cl.device.launch import Program, group_ranges, lanes, row_parts
 from pp_cl.errors import UserError
-from pp_cl.layers.choice import ConvolutionPolicy, ConvShape, make_policy
+from pp_cl.layers.choice import ConvolutionPolicy, ConvShape, lay_out_forward, make_policy
 from pp_cl.layers.conv_direct import Direction, pack_weights
 from pp_cl.layers.conv_winograd import TRANSFORMED
 from pp_cl.layers.simple import maxpool2_backward, maxpool2_forward
@@ -270,8 +270,8 @@ class Lpips:
         self._size, self._laid_out, self._tiles = None, {}, []
         for layer in vgg_layers(self.widths):
             forward, _ = self._choices[layer.name] = _variants(self.policy, layer, size)
-            self._laid_out[layer.name] = forward.lay_out(
-                self.dev, self.policy.blocking, self._weights[layer.name]
+            self._laid_out[layer.name] = lay_out_forward(
+                self.dev, forward, self._weights[layer.name]
             )
         self._tiles = [all_tiles(self.dev, *size_of(size, i)) for i in range(len(BLOCKS))]
         self._size = size

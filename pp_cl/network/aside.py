@@ -22,7 +22,7 @@ def build_aside(net: UNet, settings: NetworkConfig, size: tuple[int, int]) -> No
     is built when it is needed.
     """
     dev = net.dev
-    if not dev.is_cpu or dev.build_seconds < COLD * dev.programs_built:
+    if not dev.is_cpu or dev.build_seconds <= COLD * dev.programs_built:
         return
     given = {
         "device": dev.name,

@@ -4,16 +4,26 @@ launch the kernels layer by layer.
 
 import math
 import subprocess
+from collections import defaultdict
 from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 from pyopencl.array import Array
 
-from pp_cl.device.buffers import PackedArrays, Table, packed_arrays
+from pp_cl.device.buffers import PackedArrays, Table, packed_arrays, packed_bytes
 from pp_cl.device.device import Device
-from pp_cl.layers.choice import ConvolutionPolicy, make_policy
-from pp_cl.layers.conv_direct import Direction, pack_bias, pack_weights
+from pp_cl.layers.choice import ConvolutionPolicy, lay_out_forward, make_policy
+from pp_cl.layers.conv_direct import (
+    FLIPPED,
+    PARTIAL,
+    Direction,
+    pack_bias,
+    pack_weights,
+    sum_parts,
+    table_of_sums,
+)
+from pp_cl.layers.conv_winograd import TRANSFORMED
 from pp_cl.layers.simple import (
     avgpool2_backward,
     avgpool2_forward,
@@ -138,6 +148,11 @@ class UNet:
         self._tile_lists = {name: PackedArrays(dev) for name in ("forward", "backward")}
         self._trained: Any = None  # (size, arrays, tiles) of the last forward(training=True)
         self._frozen: dict[Any, Array] | None = None  # {(layer, module): weights} once frozen
+        self._planned: Any = (None,)  # of the last training pass: (policy, size), _plan()
+        self._work: dict[Any, Any] = {}  # of the last pass: arrays of _plan(), if for training
+        self._sums = PackedArrays(dev)
+        self._sum_rows: Any = None
+        self._sum_table: Any = None
 
     @classmethod
     def of_settings(
@@ -157,7 +172,7 @@ class UNet:
     def _packed(self):
         """(zeros like all_parameters, {name: array in them}) of the parameters."""
         table = parameter_table(self.layers)
-        whole, arrays = packed_arrays(self.dev, table.values())
+        whole, arrays = packed_arrays(self.dev, [*table.values()])
         return whole.view(np.float32), dict(zip(table, arrays, strict=True))
 
     def split(self, whole: Array) -> dict[str, Array]:
@@ -223,6 +238,7 @@ class UNet:
         maps.resize(size)
         arrays = maps.arrays | {"x": x}
         tiles = plan or maps.all_tiles
+        self._prepare(size if training else None)
         for layer in self.layers:
             sources, out = tuple(arrays[name] for name in layer.inputs), arrays[layer.name]
             self._forward(size, layer, sources, out, tiles.tiles(layer.name))
@@ -239,6 +255,8 @@ class UNet:
         maps = FeatureMaps(self.dev, self.layers, training=True)
         maps.resize(size)
         arrays = maps.arrays | {"x": self.dev.zeros((*size, self.channels_in))}
+        self._prepare(size)
+        sums = []
         for layer in self.layers:
             tiles = maps.all_tiles.tiles
             if not of_weights:
@@ -247,7 +265,9 @@ class UNet:
                 for i, name in enumerate(layer.inputs):
                     self._backward_input(size, layer, i, arrays, tiles(name))
             elif layer.kind == "conv":
-                self._backward_weights(size, layer, arrays, tiles(layer.name))
+                sums.append(self._backward_weights(size, layer, arrays, tiles(layer.name)))
+        if sums:
+            self._sum_parts(sums)
         self.dev.finish()
 
     def backward(self, grad_y: Array) -> Array:
@@ -261,19 +281,21 @@ class UNet:
         if self._trained is None:
             raise RuntimeError("UNet.backward needs a forward(training=True) before it")
         (size, arrays, tiles), self._trained = self._trained, None
+        _, self._work, _, _ = self._planned
         output_backward(self.dev, grad_y, arrays[gradient_of(self.layers[-1].name)])
-        tiles = tiles.backward(arrays, self._tile_lists["backward"])
+        tiles, sums = tiles.backward(arrays, self._tile_lists["backward"]), []
         for layer in reversed(self.layers):
             grad = gradient_of(layer.name)
             tiles.fill_copies(grad, arrays[grad])
             if layer.kind == "conv":
-                self._backward_weights(size, layer, arrays, tiles.tiles(grad))
+                sums.append(self._backward_weights(size, layer, arrays, tiles.tiles(grad)))
             for i, name in enumerate(layer.inputs):
                 self._backward_input(size, layer, i, arrays, tiles.tiles(gradient_of(name)))
         grad_x = arrays[gradient_of("x")]
         tiles.fill_copies(gradient_of("x"), grad_x)
         if self._residual:
             residual_backward(self.dev, grad_y, grad_x)
+        self._sum_parts(sums)
         return grad_x
 
     def _forward(self, size, layer, sources, out, tiles):
@@ -320,19 +342,34 @@ class UNet:
                 grad_x,
                 mask=mask,
                 tiles=tiles,
+                laid_out=self._work.get((layer.name, source)),
             )
 
     def _backward_weights(self, size, layer, arrays, tiles):
-        """Overwrite the gradients of a convolution's parameters."""
-        self._module(layer, Direction.BACKWARD_WEIGHTS, None, size).backward_weights(
+        """Leave the gradients of a convolution's parameters in parts; returns what sums them."""
+        weight, bias = (self.gradients[f"{layer.name}.{kind}"] for kind in ("weight", "bias"))
+        partial = self._work[layer.name, PARTIAL]
+        parts = self._module(layer, Direction.BACKWARD_WEIGHTS, None, size).backward_weights(
             self.dev,
             self.policy.blocking,
             tuple(arrays[name] for name in layer.inputs),
             arrays[gradient_of(layer.name)],
-            self.gradients[layer.name + ".weight"],
-            self.gradients[layer.name + ".bias"],
+            weight,
+            bias,
             tiles=tiles,
+            partial=partial,
         )
+        return weight.shape, parts, *(a.base_data.offset // 4 for a in (partial, weight, bias))
+
+    def _sum_parts(self, sums):
+        """Overwrite the gradients of all parameters; sums: of _backward_weights()."""
+        rows, n = table_of_sums(sums)
+        if rows != self._sum_rows:
+            self._sum_rows = rows
+            shape = (len(rows), 8), np.int32
+            [self._sum_table] = self._sums.send([shape], [np.array(rows, np.int32)])
+        _, _, whole, _ = self._planned
+        sum_parts(self.dev, self._sum_table, n, whole, self.all_gradients, self.all_gradients)
 
     def _module(self, layer, direction, source, size):
         """The module that computes a convolution in an image of a size."""
@@ -342,14 +379,68 @@ class UNet:
         return self._modules[key]
 
     def _laid_out(self, layer, module):
-        """The weights in the module's own layout, made once after freeze(); None before."""
+        """The weights in the module's own layout: of this training pass, or made once after
+        freeze(); else None.
+        """
         if self._frozen is None:
-            return None
+            return self._work.get((layer.name, None))
         key = layer.name, module
         if key not in self._frozen:
             weight = self.parameters[layer.name + ".weight"]
-            self._frozen[key] = module.lay_out(self.dev, self.policy.blocking, weight)
+            self._frozen[key] = lay_out_forward(self.dev, module, weight)
         return self._frozen[key]
+
+    def _prepare(self, size):
+        """Set what a training pass over images of `size` works with, None: another pass; and lay
+        out all weights, in a launch for each kind of layout.
+        """
+        self._work = {}
+        if size is None:
+            return
+        if self._planned[0] != (self.policy, size):
+            self._planned = (None,)  # frees the old arrays first
+            self._planned = (self.policy, size), *self._plan(size)
+        _, self._work, whole, jobs = self._planned
+        for lay_out, of_layers in jobs.items():
+            lay_out(self.dev, self.all_parameters, of_layers, whole)
+
+    def _plan(self, size):
+        """({(layer, input, None or PARTIAL): array}, the one that they lie in, {lay_out(): jobs}):
+        of the weights as passes read them, and of the parts of their gradients.
+        """
+        table = self._work_table(size)
+        whole, arrays = packed_arrays(self.dev, [row for _, row in table.values()])
+        jobs = defaultdict(list)
+        for ((layer, source), (module, _)), array in zip(table.items(), arrays, strict=True):
+            if source == PARTIAL:
+                continue
+            weight = self.parameters[layer.name + ".weight"]
+            first = None if source is None else sum(layer.sources[:source])
+            c = sum(layer.sources) if source is None else layer.sources[source]
+            start, target = (part.base_data.offset // 4 for part in (weight, array))
+            jobs[module.lay_out].append((start, target, weight.shape, first, c, layer.channels))
+        work = {(layer.name, i): a for (layer, i), a in zip(table, arrays, strict=True)}
+        return work, whole.view(np.float32), jobs
+
+    def _work_table(self, size):
+        """{(layer, input, None or PARTIAL): (module, (shape, dtype))} of the arrays of _plan()."""
+        table = {}
+        for layer in convolutions(self.layers):
+            shape = self.parameters[layer.name + ".weight"].shape
+            for direction, source in computations(layer, True):
+                module = self._module(layer, direction, source, size)
+                c = layer.shape(direction, source, *size).ci
+                if direction is Direction.BACKWARD_WEIGHTS:
+                    height, source = size[0] >> layer.level, PARTIAL
+                    scratch = module.scratch_floats(
+                        self.dev, self.policy.blocking, direction, height, shape, c
+                    )
+                    floats = scratch[PARTIAL]
+                else:
+                    floats = module.laid_out_floats(direction, shape, c)
+                if floats:
+                    table[layer, source] = module, ((floats,), np.float32)
+        return table
 
     def output(self, name: str) -> Array:
         """(H, W, C) output of the layer `name` in the last forward(training=True), until its
@@ -379,9 +470,15 @@ class UNet:
                     layer.shape(direction, source, *size).ci,
                 )
                 for name, number in needed.items():
-                    floats[name] = max(number, floats.get(name, 0))
+                    if not training or name not in (FLIPPED, PARTIAL, TRANSFORMED):  # see below
+                        floats[name] = max(number, floats.get(name, 0))
         table: Table = {name: ((number,), np.float32) for name, number in floats.items()}
         table |= dict.fromkeys(PARAMETERS, (self.all_parameters.shape, np.float32))
+        if training:
+            rows = [row for _, row in self._work_table(size).values()]
+            sums = (len(convolutions(self.layers)), 8), np.int32
+            for name, packed in (("laid out", rows), ("sums of gradients", [sums])):
+                table[name] = (packed_bytes(self.dev, packed),), np.uint8
         for level in set(levels_of(self.layers).values()):
             tiles = all_tiles_buffers(height >> level, width >> level)
             table |= {f"tiles of level {level}, {name}": row for name, row in tiles.items()}

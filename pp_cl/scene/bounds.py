@@ -4,7 +4,6 @@ import math
 from collections.abc import Sequence
 
 import numpy as np
-from scipy.optimize import linprog
 
 from pp_cl.errors import UserError
 from pp_cl.scene.agreement import explain_empty_hull
@@ -67,6 +66,8 @@ def bounding_box(views: Sequence[View]) -> np.ndarray:
     mask, images end at their borders. Raises UserError when the pyramids do not meet, do not end or
     meet in a point, and as reach_of does.
     """
+    from scipy.optimize import linprog  # takes long to import
+
     unit = 2.0 ** math.frexp(reach_of(views))[1]  # the solver's tolerances are absolute
     masked = any(view.has_mask for view in views)
     for margin in (None, CROPPED_MARGIN) if masked else (0.0, CROPPED_MARGIN):

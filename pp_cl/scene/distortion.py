@@ -3,7 +3,6 @@
 from dataclasses import astuple, dataclass
 
 import numpy as np
-from skimage.transform import warp
 
 from pp_cl.scene.camera import Camera
 
@@ -73,6 +72,8 @@ def undistort(image: np.ndarray, camera: Camera, distortion: Distortion) -> np.n
 
     Interpolated on premultiplied colour; beyond the photograph's border its edge goes on.
     """
+    from skimage.transform import warp  # takes long to import
+
     alpha = image[..., 3:].astype(np.float64) / 255
     planes = np.concatenate([image[..., :3] / 255 * alpha, alpha], axis=2)
     source = distortion.source_pixels(camera)

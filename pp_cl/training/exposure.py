@@ -34,7 +34,7 @@ class Exposure:
     @staticmethod
     def table(height: int, width: int) -> Table:
         """The scratch for a photograph of this size."""
-        shapes = {"target": (height, width, 3), "row_products": (3, height, 4), "sums": (3, 4)}
+        shapes = {"target": (height, width, 3), "row_products": (3, height, 4)}
         return {name: (shape, np.float32) for name, shape in shapes.items()}
 
     def target(self, view: int, photograph: Array, alpha: Array) -> Array:
@@ -83,24 +83,15 @@ class Exposure:
             alpha=alpha,
             row_products=b.row_products,
         )
-        launch_groups(
-            self.dev,
-            "training/loss",
-            "loss_sum",
-            3,
-            rows=3,
-            m=height,
-            terms=b.row_products,
-            sums=b.sums,
-        )
         self.dev.program("training/exposure").launch(
             "exposure_fit",
             3,
             views=len(self.state),
             view=view,
+            h=height,
             kept=KEPT,
             prior=PRIOR * height * width,
-            sums=b.sums,
+            row_products=b.row_products,
             exposure=self.state,
         )
 

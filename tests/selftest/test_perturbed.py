@@ -38,7 +38,7 @@ FLIPS = [
     ("layers/conv_local_backward_weights", "[0] += v", "[0] -= v", "conv: local, hard inputs"),
     ("layers/winograd", "[i] += value", "[i] -= value", "conv: winograd, hard inputs"),
     ("layers/winograd_backward_weights", "[i] += v", "[i] -= v", "conv: winograd, hard inputs"),
-    ("layers/winograd_transform", "= weight[(block * 9", "= -weight[(block * 9", "conv: winograd"),
+    ("layers/winograd_transform", ": vload16((block", ": -vload16((block", "conv: winograd"),
     ("layers/resample", "+ 0.25f * line", "- 0.25f * line", "layers: upsampling"),
     ("layers/resample", "+ 0.25f * dL_dout", "- 0.25f * dL_dout", "layers: mean pooling"),
     ("layers/output", "c] - BACK", "c] + BACK", "layers: output"),
