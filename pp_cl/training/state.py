@@ -115,7 +115,7 @@ def points_to_keep(dev: Device, state: PointState, opacity: Array, settings: Tra
     if broken:
         raise Diverged(f"{broken} points have a weight or an opacity that is not finite")
     judged = seen >= settings.prune_looks
-    passes = (weight >= settings.prune_weight) & (opacity >= settings.prune_opacity)
+    passes = (weight >= settings.prune_weight) & (opacities >= settings.prune_opacity)
     dev.write(state.max_weight, np.where(judged, np.float32(0), weight))
     dev.write(state.times_seen, np.where(judged, np.float32(0), seen))
     return _listed(dev, ~judged | passes, weight)

@@ -38,6 +38,7 @@ def test_a_file_system_that_cannot_sync_folders_still_takes_files(tmp_path, monk
     assert (tmp_path / "a").read_text() == "text"
 
 
+@pytest.mark.unix
 @pytest.mark.parametrize("number", [errno.EIO, errno.ENOSPC])
 def test_a_disk_that_fails_to_sync_a_folder_is_told(tmp_path, monkeypatch, number):
     failing_folder_sync(monkeypatch, number)

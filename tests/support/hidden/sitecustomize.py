@@ -29,7 +29,7 @@ def hiding(function):
 
 builtins.__import__ = hiding(builtins.__import__)
 importlib.import_module = hiding(importlib.import_module)
-for name in ("fork", "forkpty", "mkfifo", "killpg", "O_DIRECTORY", "O_NONBLOCK"):
+for name in ("fork", "forkpty", "mkfifo", "killpg", "O_DIRECTORY"):
     delattr(os, name)
 killing = signal.SIGKILL
 subprocess.Popen.kill = lambda self: self.send_signal(killing)
