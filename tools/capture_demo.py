@@ -9,7 +9,7 @@ scene agree with the true ones.
 
 import argparse
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -66,8 +66,10 @@ def _around(turn, elevation, width, height):
     return Camera.look_at(DISTANCE * np.array(eye), (0, 0, 0), fx=focal, width=width, height=height)
 
 
-def room(camera: Camera) -> np.ndarray:
-    """(H, W, 3) colours in [0, 1] of the room's wall: noise on a sphere around the origin."""
+def room(camera: Camera, octaves: Sequence[float] = OCTAVES) -> np.ndarray:
+    """(H, W, 3) colours in [0, 1] of the room's wall: noise on a sphere around the origin, of so
+    many cells per world unit in each of its layers.
+    """
     rays = pixel_rays(camera)
     rays /= np.linalg.norm(rays, axis=-1, keepdims=True)
     along = rays @ camera.eye
@@ -75,7 +77,7 @@ def room(camera: Camera) -> np.ndarray:
     places = camera.eye + distance[..., None] * rays
     rng = np.random.default_rng(0)
     layers = []
-    for cells in OCTAVES:
+    for cells in octaves:
         noise = rng.uniform(0, 1, (3, NOISE_CELLS, NOISE_CELLS, NOISE_CELLS))
         at = np.moveaxis(places * cells, -1, 0)
         layers.append([map_coordinates(one, at, order=1, mode="grid-wrap") for one in noise])

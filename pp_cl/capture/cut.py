@@ -3,24 +3,19 @@ views share, from the sparse points, then two rounds in which the views vote by 
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 from tqdm import tqdm
 
+from pp_cl.capture import backdrop
 from pp_cl.capture.packages import needed
+from pp_cl.capture.window import CUT_SIDE, Window, dilated, disc
 from pp_cl.errors import UserError
 from pp_cl.scene.bounds import corners_of
-from pp_cl.scene.camera import Camera
-from pp_cl.scene.distortion import Distortion
 from pp_cl.scene.grid import Grid, smallest_edge
-from pp_cl.scene.views import Photograph
 
 cv2 = needed("cv2")
 
-CUT_SIDE = 400  # pixels of what is cut: the projected box and what is around it
-AROUND = 0.2  # of the projected box, on each side: shows what the background looks like
 FOOT = 0.04  # of the box's diagonal: points lower in it may be on what the object stands on
 SEED = 1 / 150  # radius of a sparse point, of CUT_SIDE
 NEAR = 1 / 20  # of CUT_SIDE: sparse points so close show a surface between them
@@ -28,89 +23,12 @@ SAMPLES = 160  # squared: pixels of each side that the colours are learned from
 FITTED = 3  # times that the colours are fitted to their samples
 ISLAND = 0.02  # of the largest region: smaller ones of a mask are dropped
 ROUNDS = 2  # of votes
+SURE = 3.0  # log-odds of standing out from the background, or not, that overrule colours
 CELLS = 112**3  # vertices that are voted on
 FORGIVEN = 0.15  # of the views that see a vertex: their masks may reject it
 LEAST_SEEING = 3  # views that see a vertex, or all of fewer
-BEYOND = 0.5  # of an image's size: further out a lens model says nothing
 SOFT = 1.5  # pixels of the cut image over which a border is refined
 FLAT = 1e-4  # variance of brightness, of 1, below which a border follows no edge
-
-
-@dataclass(eq=False)
-class Window:
-    """The part of a photograph around the projected box, reduced for cutting.
-
-    image: (H, W, 3) uint8. camera: of it. place: (x0, y0, x1, y1) in the photograph. mask: (H, W)
-    bool, None until it is known.
-    """
-
-    name: str
-    image: np.ndarray
-    camera: Camera
-    distortion: Distortion
-    place: tuple[int, int, int, int]
-    mask: Any = None
-
-    def pixels(self, positions: np.ndarray) -> np.ndarray:
-        """(N, 2) x and y of world positions (N, 3); NaN far outside the image."""
-        c = self.camera
-        right, down, depth = c.pose[:, :3].T @ (positions - c.eye).T
-        depth = np.where(depth > 0, depth, np.nan)
-        x, y = right / depth, down / depth
-        if self.distortion:
-            far_x, far_y = (
-                np.abs(f * v + m - n / 2) > (0.5 + BEYOND) * n * scale
-                for f, v, m, n, scale in (
-                    (c.fx, x, c.cx, c.width, 1),
-                    (c.fy, y, c.cy, c.height, 1),
-                )
-            )
-            x, y = self.distortion.apply(*(np.where(far_x | far_y, np.nan, v) for v in (x, y)))
-        return np.stack([c.fx * x + c.cx, c.fy * y + c.cy], axis=1)
-
-    def reduced(self, image: np.ndarray) -> np.ndarray:
-        """The part of an image of the photograph's size, (H, W) or (H, W, C), reduced to this."""
-        x0, y0, x1, y1 = self.place
-        size = self.camera.width, self.camera.height
-        return cv2.resize(image[y0:y1, x0:x1], size, interpolation=cv2.INTER_AREA)
-
-    def inside(self, positions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """((M,) indices of the positions that lie in the image, their rows, their columns)."""
-        x, y = np.floor(np.nan_to_num(self.pixels(positions), nan=-1)).T
-        found = np.flatnonzero(
-            (x >= 0) & (y >= 0) & (x < self.camera.width) & (y < self.camera.height)
-        )
-        return found, y[found].astype(int), x[found].astype(int)
-
-
-def window(image: np.ndarray, photograph: Photograph, box: np.ndarray) -> Window:
-    """The Window of a photograph, (H, W, 3) uint8. Raises UserError where it does not show the box
-    (2, 3).
-    """
-    camera = photograph.camera
-    whole = Window(photograph.name, image, camera, photograph.distortion, (0, 0, 0, 0))
-    x, y = whole.pixels(corners_of(box)).T
-    if np.isnan(x).any():  # the box is around the camera, or ends far outside the image
-        x, y = np.array([0, camera.width]), np.array([0, camera.height])
-    x0, x1 = _grown(x, camera.width)
-    y0, y1 = _grown(y, camera.height)
-    if x1 - x0 < 2 or y1 - y0 < 2:
-        raise UserError(f"{photograph.name}: the object's box is outside; give another with --box")
-    scale = min(1, CUT_SIDE / max(x1 - x0, y1 - y0))
-    width, height = (max(2, round(scale * n)) for n in (x1 - x0, y1 - y0))
-    sx, sy = width / (x1 - x0), height / (y1 - y0)
-    camera = camera.crop(x0, y0, width, height)
-    camera = replace(
-        camera, fx=sx * camera.fx, fy=sy * camera.fy, cx=sx * camera.cx, cy=sy * camera.cy
-    )
-    found = replace(whole, camera=camera, place=(x0, y0, x1, y1))
-    return replace(found, image=found.reduced(image))
-
-
-def _grown(places, size):
-    """(first, last + 1) pixel of the places, grown by AROUND, within an image's side."""
-    margin = AROUND * np.ptp(places)
-    return max(0, int(places.min() - margin)), min(size, int(places.max() + margin) + 1)
 
 
 def cut_out_all(
@@ -135,10 +53,17 @@ def cut_out_all(
         if number:
             hull = _hull(windows, box)
             for i in left:
-                labels[i] = _relabelled(windows[i], seeds[i], *hull)
+                labels[i] = _relabelled(windows[i], seeds[i], *hull, number == ROUNDS)
         colours = _colours(windows, labels)
         for i in tqdm(left, "cutting out", unit="image", leave=False, disable=None):
             windows[i].mask = _grab_cut(windows[i], labels[i], colours)
+        if number == 0:
+            differences = backdrop.differences(windows, points[~inside])
+            continue
+        standing_out = backdrop.evidence(differences, windows)
+        for i in left:
+            windows[i].mask[(standing_out[i] > SURE) & (labels[i] != cv2.GC_BGD)] = True
+            windows[i].mask[(standing_out[i] < -SURE) & (labels[i] != cv2.GC_FGD)] = False
     for i in left:
         windows[i].mask = without_islands(windows[i].mask)
 
@@ -182,25 +107,17 @@ def _dots(one, places, radius):
     x, y = np.floor(np.nan_to_num(places, nan=-1)).astype(int).T
     found = (x >= 0) & (y >= 0) & (x < marked.shape[1]) & (y < marked.shape[0])
     marked[y[found], x[found]] = 1
-    return _dilated(marked, radius)
-
-
-def _dilated(marked, radius):
-    return cv2.dilate(marked.astype(np.uint8), _disc(radius)) > 0
+    return dilated(marked, radius)
 
 
 def _eroded(marked, radius):
-    return cv2.erode(marked.astype(np.uint8), _disc(radius)) > 0
-
-
-def _disc(radius):
-    return cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * radius + 1, 2 * radius + 1))
+    return cv2.erode(marked.astype(np.uint8), disc(radius)) > 0
 
 
 def _closed(marked, radius):
     """(H, W) bool with gaps narrower than two radii closed; nothing is beyond the border."""
     padded = np.pad(marked.astype(np.uint8), radius)
-    closed = cv2.morphologyEx(padded, cv2.MORPH_CLOSE, _disc(radius))
+    closed = cv2.morphologyEx(padded, cv2.MORPH_CLOSE, disc(radius))
     return closed[radius:-radius, radius:-radius] > 0
 
 
@@ -256,7 +173,7 @@ def _hull(windows: Sequence[Window], box: np.ndarray) -> tuple[np.ndarray, np.nd
     return positions[left[kept]], rejected[kept], grid.edge
 
 
-def _relabelled(one, seeds, hull, rejections, edge):
+def _relabelled(one, seeds, hull, rejections, edge, is_last):
     """(H, W) uint8 of GrabCut's labels of a window from what all views agree on: what is well
     outside the hull is background, what is well within what no other view rejects is the object.
     """
@@ -271,7 +188,8 @@ def _relabelled(one, seeds, hull, rejections, edge):
     labels = np.where(held & one.mask, cv2.GC_PR_FGD, cv2.GC_PR_BGD).astype(np.uint8)
     labels[_eroded(held, gap) & (seeds == cv2.GC_FGD)] = cv2.GC_FGD
     labels[seeds == cv2.GC_BGD] = cv2.GC_BGD
-    labels[~_dilated(held, 2 * gap)] = cv2.GC_BGD
+    if is_last:  # before, thin parts may be missing in the hull
+        labels[~dilated(held, 2 * gap)] = cv2.GC_BGD
     labels[_eroded(core, 2 * gap + 1)] = cv2.GC_FGD
     return labels
 
@@ -292,6 +210,7 @@ def whole_mask(one: Window, photograph: np.ndarray) -> np.ndarray:
     variance = mean(guide * guide) - means[0] ** 2
     slope = (mean(guide * rough) - means[0] * means[1]) / (variance + FLAT)
     refined = mean(slope) * guide + mean(means[1] - slope * means[0])
+    refined = (rough + refined) / 2  # so that parts thinner than the filter stay
     mask = np.zeros(photograph.shape[:2], np.uint8)
     mask[y0:y1, x0:x1] = np.clip(255 * refined + 0.5, 0, 255)
     return mask

@@ -12,7 +12,8 @@ import numpy as np
 from skimage.segmentation import find_boundaries
 from tqdm import tqdm
 
-from pp_cl.capture.cut import cut_out_all, whole_mask, window
+from pp_cl.capture.cut import cut_out_all, whole_mask
+from pp_cl.capture.window import window
 from pp_cl.errors import UserError, shown
 from pp_cl.files.contact_sheet import contact_sheet
 from pp_cl.files.image import read_gray, read_rgba, write_png
@@ -44,9 +45,10 @@ def write_masks(
     *,
     given: Path | None = None,
     command: str | None = None,
-) -> str:
+) -> tuple[str, list[str]]:
     """Write the mask of each photograph as mask_file(), 8-bit gray, white where the object is; what
-    lies there is kept, and helps to make the others. Returns one line on what was done.
+    lies there is kept, and helps to make the others. Returns one line on what was done, and the
+    names of photographs whose masks contradict the others, the worst first.
 
     scene: the folder that the photographs' names are relative to. box: (2, 3) around the object.
     points: (N, 3) in the scene's world. seen: for each photograph the indices (M,) of the points
@@ -70,7 +72,11 @@ def write_masks(
         if _without_mask(folder, photographs):
             how |= _cut(scene, folder, photographs, windows, box, points, inside, seen)
     counts = ", ".join(f"{count} {source}" for source, count in how.items() if count)
-    return f"{counts}{_contradictions(scene, folder, photographs, box)}"
+    wrong = _contradicting(scene, folder, photographs, box)
+    if wrong:
+        shares = [f"{Path(name).name} ({share:.0%})" for name, share in wrong.items()]
+        counts += f"; {len(wrong)} contradict the others: {listing(shares)}"
+    return counts, list(wrong)
 
 
 def _without_mask(folder, photographs):
@@ -207,8 +213,8 @@ def picture(
     return contact_sheet(images, [Path(one.name).name for one in chosen])
 
 
-def _contradictions(scene, folder, photographs, box):
-    """`; 2 contradict the others: A (8%), B (6%)`, empty where none does."""
+def _contradicting(scene, folder, photographs, box):
+    """{name: share of the object that its mask alone rejects} of those that contradict others."""
     views = []
     for one in photographs:
         mask = read_gray(mask_file(folder, one.name))
@@ -218,5 +224,4 @@ def _contradictions(scene, folder, photographs, box):
         if one.distortion:
             image = undistort(image, camera, one.distortion)
         views.append(View(one.name, camera, image))
-    wrong = [f"{Path(one.view.name).name} ({one.share:.0%})" for one in disagreements(views, box)]
-    return f"; {len(wrong)} contradict the others: {listing(wrong)}" if wrong else ""
+    return {one.view.name: one.share for one in disagreements(views, box)}

@@ -1,5 +1,5 @@
 """The stages from photographs or a film to a scene, each of which is done once: what it found lies
-in SCENE/capture/STAGE.json, and the same command goes on after the last of these.
+in SCENE/capture/STAGE.json, a picture of it in STAGE.png; the same command goes on after these.
 """
 
 import shutil
@@ -14,14 +14,20 @@ from pp_cl.capture import box, features, frames, masks, poses, still
 from pp_cl.capture.packages import isolated, needed
 from pp_cl.errors import UserError
 from pp_cl.files.atomic import atomic_folder, atomic_path, remove_leftovers, write_json
+from pp_cl.files.contact_sheet import contact_sheet
 from pp_cl.files.image import read_rgba, write_png
 from pp_cl.scene.agreement import listing
+from pp_cl.scene.edits import read_edits
 from pp_cl.scene.masks import MaskRule, cut_out
+from pp_cl.scene.outline import SHOWN_SIZE, SHOWN_VIEWS
+from pp_cl.scene.overview import overview
 from pp_cl.scene.readers.common import read_json
 from pp_cl.scene.readers.frame import frame_keys
 from pp_cl.scene.readers.transforms import SINGLE
+from pp_cl.scene.views import evenly, fitting_downscale, shrink
 
 STAGES = ("frames", "features", "matches", "poses", "box", "masks", "scene")
+SHOWN_WIDTH = 1000  # pixels of the pictures of points and cameras
 RESUMED = ("features", "matches", "masks")  # stages that keep what was done when they are stopped
 # what each stage leaves beside its JSON, in the scene's folder
 LEFT = {
@@ -103,6 +109,7 @@ class Capture:
     def _undo(self, stage):
         """Remove what a stage has left."""
         self._file(stage).unlink(missing_ok=True)
+        self._file(stage).with_suffix(".png").unlink(missing_ok=True)
         if stage == "matches" and self.database.exists():
             features.forget_matches(self.database)
         for name in LEFT[stage]:
@@ -111,6 +118,9 @@ class Capture:
                 shutil.rmtree(path)
             else:
                 path.unlink(missing_ok=True)
+
+    def _show(self, stage, picture):
+        write_png(self._file(stage).with_suffix(".png"), picture)
 
     def _found(self, stage):
         return read_json(self._file(stage))["found"]
@@ -122,6 +132,10 @@ class Capture:
 
     def _frames(self):
         found = frames.take_images(self.source, self.images)
+        names = [one["name"] for one in evenly(found["images"], SHOWN_VIEWS)]
+        shown = [read_rgba(self.images / name) for name in names]
+        shown = [shrink(one, fitting_downscale(one.shape[:2], SHOWN_SIZE)) for one in shown]
+        self._show("frames", contact_sheet(shown, names))
         left_out = [f"{one['source']} {one['reason']}" for one in found["left_out"]]
         line = f"{len(found['images'])} images" + _left_out(left_out, "left out")
         return {"line": line, **found}
@@ -164,6 +178,8 @@ class Capture:
     def _poses(self):
         taken = self._found("frames")["images"]
         found = isolated(self.work, poses.place, self.database, self.images, self.model, taken)
+        model = needed("pycolmap").Reconstruction(self.model)
+        self._show("poses", _seen_from_outside(model, None))
         unplaced = [f"{name} {why}" for name, why in found["unplaced"].items()]
         line = (
             f"{found['placed']} of {len(taken)} images, {found['points']} points, reprojection"
@@ -178,6 +194,8 @@ class Capture:
         corners = self.given["box"]["box"]
         chosen = world.box if corners is None else np.sort(np.reshape(corners, (2, 3)), axis=0)
         size = " x ".join(f"{side:.2f}" for side in np.ptp(chosen, axis=0))
+        _move(model, world.scale, world.rotation, world.shift)
+        self._show("box", _seen_from_outside(model, chosen))
         return {
             "line": f"{size}, the cameras {_distance(cameras, world):.2f} from its middle",
             "scale": float(world.scale),
@@ -188,16 +206,27 @@ class Capture:
 
     def _masks(self):
         model, corners = self._world()
-        given = self.given["masks"]
-        line = masks.write_masks(
-            self.scene,
-            self.scene / "masks",
-            poses.photographs(model, "images"),
-            corners,
-            *poses.points(model),
-            given=given["masks"] and Path(given["masks"]),
-            command=given["command"],
-        )
+        given, dropped = self.given["masks"], read_edits(self.scene).dropped
+        photographs, folder = poses.photographs(model, "images"), self.scene / "masks"
+        points, seen = poses.points(model)
+        kept = [i for i, one in enumerate(photographs) if one.name not in dropped]
+
+        def write(chosen):
+            return masks.write_masks(
+                self.scene,
+                folder,
+                [photographs[i] for i in chosen],
+                corners,
+                points,
+                [seen[i] for i in chosen],
+                given=given["masks"] and Path(given["masks"]),
+                command=given["command"],
+            )
+
+        line, wrong = write(kept)
+        if dropped:  # they have had no say in the others
+            write(range(len(photographs)))
+        self._show("masks", masks.picture(self.scene, folder, photographs, wrong))
         return {"line": line}
 
     def _scene(self):
@@ -229,12 +258,26 @@ class Capture:
         return {"line": f"wrote {self.scene / SINGLE} with {len(found)} photographs"}
 
     def _world(self):
-        """(pycolmap's model in the scene's world, (2, 3) box of the object there)."""
-        colmap, found = needed("pycolmap"), self._found("box")
-        model = colmap.Reconstruction(self.model)
-        rotation = colmap.Rotation3d(np.array(found["rotation"]))
-        model.transform(colmap.Sim3d(found["scale"], rotation, np.array(found["shift"])))
-        return model, np.array(found["box"])
+        """(pycolmap's model in the scene's world, (2, 3) box of the object there: the user's, if
+        one was chosen in the page of `pp-cl view`).
+        """
+        model, found = needed("pycolmap").Reconstruction(self.model), self._found("box")
+        _move(model, found["scale"], np.array(found["rotation"]), np.array(found["shift"]))
+        edited = read_edits(self.scene).box
+        return model, np.array(found["box"]) if edited is None else edited
+
+
+def _move(model, scale, rotation, shift):
+    """Move pycolmap's model by a similarity."""
+    colmap = needed("pycolmap")
+    model.transform(colmap.Sim3d(scale, colmap.Rotation3d(rotation), shift))
+
+
+def _seen_from_outside(model, box):
+    """The picture of a model's points and cameras, and a box (2, 3), from two sides."""
+    cameras = [one.camera for one in poses.photographs(model, "images")]
+    colours = np.array([point.color for point in model.points3D.values()])
+    return overview(cameras, box, poses.points(model)[0], colours, SHOWN_WIDTH)
 
 
 def _left_out(lines: Sequence[str], what: str) -> str:

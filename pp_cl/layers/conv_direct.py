@@ -10,6 +10,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import Enum
+from typing import Any
 
 import numpy as np
 from pyopencl.array import Array
@@ -25,7 +26,7 @@ ROWS_PER_PART = 8
 PARTIAL_FLOATS = 1 << 24
 # Weights to lay out: first float in the weights and in what they become, shape, first input channel
 # (None: for the forward pass), input channels and output channels that a pass computes.
-Layout = tuple[int, int, tuple[int, ...], int | None, int, int]
+Layout = tuple[int, int, tuple[int, ...], Any, int, int]
 # Gradients of weights to sum: shape, parts, first float of the parts, of the weights' gradient and
 # of the biases'.
 Sums = tuple[tuple[int, ...], int, int, int, int]

@@ -4,8 +4,10 @@ goes wrong ends in one line.
 
 import json
 import shutil
+import signal
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import numpy as np
@@ -218,6 +220,61 @@ def test_a_full_disk(shot, tmp_path):
     assert ended.returncode == 2 and len(lines) == 1 and str(scene) in lines[0], ended.stderr
     assert (scene / "capture" / "frames.json").exists()
     assert capture(*words[1:2], scene, *words[4:]) == (0, []) and off(scene).position < 0.03
+
+
+@pytest.mark.slow
+def test_half_of_the_images_have_no_place(shot, tmp_path):
+    """They are named, and the scene is made of the others."""
+    folder, scene = tmp_path / "folder", tmp_path / "scene"
+    shutil.copytree(shot[0], folder)
+    names = [f"x{k:02d}.png" for k in range(COUNT)]
+    strangers([Path(name) for name in names], folder)
+    assert capture(folder, scene, "--masks", shot[1]) == (0, [])
+    placed = found(scene, "poses")
+    assert placed["placed"] == COUNT and sorted(placed["unplaced"]) == names
+    assert f"{COUNT} of {2 * COUNT} " in placed["line"] and names[0] in placed["line"]
+    assert off(scene).position < 0.03
+
+
+@pytest.mark.slow
+def test_a_killed_capture_goes_on(shot, tmp_path):
+    """In the middle of three stages; the same command ends with the scene of one that was not."""
+    scene = tmp_path / "scene"
+    words = ["capture", str(shot[0]), "--out", str(scene), "--masks", str(shot[1])]
+    for begun in ("capture/database.db", "capture/pairs.txt", "masks"):
+        process = subprocess.Popen(
+            [sys.executable, "-m", "pp_cl", *words], stdout=subprocess.DEVNULL
+        )
+        while not (scene / begun).exists() and process.poll() is None:
+            time.sleep(0.01)
+        process.kill()
+        assert process.wait() == -signal.SIGKILL, begun
+        assert not (scene / "transforms.json").exists()
+    before = changed(scene)
+    assert capture(*words[1:2], scene, *words[4:]) == (0, [])
+    after = changed(scene)
+    for stage in ("frames", "poses"):
+        file = scene / "capture" / f"{stage}.json"
+        assert after[file] == before[file]
+    assert off(scene).position < 0.03 and len(list((scene / "masks").iterdir())) == COUNT
+
+
+def test_what_the_page_changed_is_obeyed(captured, shot, tmp_path):
+    """A box of the user's becomes the scene's, and a view that was dropped keeps its mask."""
+    scene = shutil.copytree(captured, tmp_path / "scene")
+    edits = {"box": [[-0.6] * 3, [0.7] * 3], "dropped": ["images/003.png"]}
+    (scene / "pp_cl.json").write_text(json.dumps(edits))
+    assert capture(shot[0], scene, "--masks", shot[1], "--from", "masks") == (0, [])
+    assert json.loads((scene / "transforms.json").read_text())["aabb"] == edits["box"]
+    assert len(list((scene / "masks").iterdir())) == COUNT
+    assert found(scene, "masks")["line"].startswith(f"{COUNT - 1} given")
+
+
+def test_each_stage_leaves_a_picture(captured):
+    """But for those whose result is not to be seen."""
+    for stage in ("frames", "poses", "box", "masks"):
+        width, height = Image.open(captured / "capture" / f"{stage}.png").size
+        assert width >= 1000 and height >= 300
 
 
 def test_an_object_that_turns(dev, tmp_path):

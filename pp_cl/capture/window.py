@@ -1,0 +1,117 @@
+"""The part of a photograph around the projected box of the object, in which it is cut out."""
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from pp_cl.capture.packages import needed
+from pp_cl.errors import UserError
+from pp_cl.scene.bounds import corners_of
+from pp_cl.scene.camera import Camera
+from pp_cl.scene.distortion import Distortion
+from pp_cl.scene.views import Photograph
+
+cv2 = needed("cv2")
+
+CUT_SIDE = 400  # pixels of what is cut: the projected box and what is around it
+AROUND = 0.2  # of the projected box, on each side: shows what the background looks like
+BEYOND = 0.5  # of an image's size: further out a lens model says nothing
+INVERTED = 8  # steps of the search for the direction that a lens puts into a pixel
+
+
+@dataclass(eq=False)
+class Window:
+    """The part of a photograph around the projected box, reduced for cutting.
+
+    image: (H, W, 3) uint8. camera: of it. place: (x0, y0, x1, y1) in the photograph. mask: (H, W)
+    bool, None until it is known.
+    """
+
+    name: str
+    image: np.ndarray
+    camera: Camera
+    distortion: Distortion
+    place: tuple[int, int, int, int]
+    mask: Any = None
+
+    def pixels(self, positions: np.ndarray) -> np.ndarray:
+        """(N, 2) x and y of world positions (N, 3); NaN far outside the image."""
+        c = self.camera
+        right, down, depth = c.pose[:, :3].T @ (positions - c.eye).T
+        depth = np.where(depth > 0, depth, np.nan)
+        x, y = right / depth, down / depth
+        if self.distortion:
+            far_x, far_y = (
+                np.abs(f * v + m - n / 2) > (0.5 + BEYOND) * n * scale
+                for f, v, m, n, scale in (
+                    (c.fx, x, c.cx, c.width, 1),
+                    (c.fy, y, c.cy, c.height, 1),
+                )
+            )
+            x, y = self.distortion.apply(*(np.where(far_x | far_y, np.nan, v) for v in (x, y)))
+        return np.stack([c.fx * x + c.cx, c.fy * y + c.cy], axis=1)
+
+    def directions(self, x: np.ndarray, y: np.ndarray) -> np.ndarray:
+        """(..., 3) along the camera's axes, of depth 1, of pixels x and y."""
+        c = self.camera
+        wanted = np.stack([(x - c.cx) / c.fx, (y - c.cy) / c.fy])
+        found = wanted
+        if self.distortion:
+            for _ in range(INVERTED):
+                found = found + wanted - self.distortion.apply(*found)
+        return np.stack([*found, np.ones_like(found[0])], axis=-1)
+
+    def reduced(self, image: np.ndarray) -> np.ndarray:
+        """The part of an image of the photograph's size, (H, W) or (H, W, C), reduced to this."""
+        x0, y0, x1, y1 = self.place
+        size = self.camera.width, self.camera.height
+        return cv2.resize(image[y0:y1, x0:x1], size, interpolation=cv2.INTER_AREA)
+
+    def inside(self, positions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """((M,) indices of the positions that lie in the image, their rows, their columns)."""
+        x, y = np.floor(np.nan_to_num(self.pixels(positions), nan=-1)).T
+        found = np.flatnonzero(
+            (x >= 0) & (y >= 0) & (x < self.camera.width) & (y < self.camera.height)
+        )
+        return found, y[found].astype(int), x[found].astype(int)
+
+
+def window(image: np.ndarray, photograph: Photograph, box: np.ndarray) -> Window:
+    """The Window of a photograph, (H, W, 3) uint8. Raises UserError where it does not show the box
+    (2, 3).
+    """
+    camera = photograph.camera
+    whole = Window(photograph.name, image, camera, photograph.distortion, (0, 0, 0, 0))
+    x, y = whole.pixels(corners_of(box)).T
+    if np.isnan(x).any():  # the box is around the camera, or ends far outside the image
+        x, y = np.array([0, camera.width]), np.array([0, camera.height])
+    x0, x1 = _grown(x, camera.width)
+    y0, y1 = _grown(y, camera.height)
+    if x1 - x0 < 2 or y1 - y0 < 2:
+        raise UserError(f"{photograph.name}: the object's box is outside; give another with --box")
+    scale = min(1, CUT_SIDE / max(x1 - x0, y1 - y0))
+    width, height = (max(2, round(scale * n)) for n in (x1 - x0, y1 - y0))
+    sx, sy = width / (x1 - x0), height / (y1 - y0)
+    camera = camera.crop(x0, y0, width, height)
+    camera = replace(
+        camera, fx=sx * camera.fx, fy=sy * camera.fy, cx=sx * camera.cx, cy=sy * camera.cy
+    )
+    found = replace(whole, camera=camera, place=(x0, y0, x1, y1))
+    return replace(found, image=found.reduced(image))
+
+
+def _grown(places, size):
+    """(first, last + 1) pixel of the places, grown by AROUND, within an image's side."""
+    margin = AROUND * np.ptp(places)
+    return max(0, int(places.min() - margin)), min(size, int(places.max() + margin) + 1)
+
+
+def dilated(marked: np.ndarray, radius: int) -> np.ndarray:
+    """(H, W) bool: the marked pixels and those no further than a radius from one."""
+    return cv2.dilate(marked.astype(np.uint8), disc(radius)) > 0
+
+
+def disc(radius: int) -> np.ndarray:
+    """A filled circle for OpenCV's morphology."""
+    return cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * radius + 1, 2 * radius + 1))
