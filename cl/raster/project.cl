@@ -62,7 +62,7 @@ ALWAYS_INLINE Footprints project(
     const ints kept =
         wanted & (front >= cam->near) & (front <= cam->far) & (t > 0.0f) & (cz >= LEAST_COSINE * t);
     const floats reach =
-        FOOTPRINT == SPHERE ? radius : footprint_reach(radius, t / least_focal(cam));
+        FOOTPRINT == SPHERE ? radius : fmax(radius, LEAST_RADIUS * t / least_focal(cam));
     ints x0, y0, x1, y1;
     tangents(cx, cz, reach, cam->fx, cam->cx, cam->width, &x0, &x1);
     tangents(cy, cz, reach, cam->fy, cam->cy, cam->height, &y0, &y1);

@@ -4,9 +4,8 @@ import numpy as np
 import pytest
 
 from pp_cl.export.harmonics import basis, fit_harmonics
-from pp_cl.export.observe import directions, observe
+from pp_cl.export.observe import Observation, directions, observe
 from pp_cl.files.picture import Picture
-from pp_cl.run import Run
 
 
 def test_the_functions_of_the_basis_are_orthogonal():
@@ -31,13 +30,13 @@ def test_images_of_known_harmonics_are_reproduced(run, rng, monkeypatch):
         [np.full((n, 1, 3), 0.5), rng.normal(scale=0.02, size=(n, 8, 3))], axis=1
     ).astype(np.float32)
 
-    def render(run, camera):
-        (seen,) = observe(run, [camera], "")
-        image, alpha = drawn(run, known, seen).reshape(30, 30, 3), np.ones((30, 30))
+    def picture(self):
+        image = drawn(run, known, self).reshape(30, 30, 3)
+        alpha = self.blend_matrix().sum(1).reshape(30, 30)
         return Picture(image, alpha, alpha, alpha)
 
     with monkeypatch.context() as patch:
-        patch.setattr(Run, "render", render)
+        patch.setattr(Observation, "picture", picture)
         found = fit_harmonics(run)
     for seen in observe(run, run.cameras("train")[::4], ""):
         error = np.abs(drawn(run, found, seen) - drawn(run, known, seen))
