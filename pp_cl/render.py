@@ -33,7 +33,7 @@ PAPER_DEPTH_RANGE = 4.0
 
 def point_radius(settings: RasterConfig, edge: float, depth_range: tuple[float, float]) -> float:
     """The points' radius in world units. edge: of the grid, world units."""
-    if settings.footprint in ("soft", "gaussian"):
+    if settings.footprint == "soft":
         return settings.radius * edge
     near, far = depth_range
     return settings.radius * (far - near) / PAPER_DEPTH_RANGE

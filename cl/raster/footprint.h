@@ -1,15 +1,14 @@
 // Footprints: which pixels a point covers, its closeness d there (1 in the centre, 0 at the rim)
-// and its depth. The one place that knows the four kinds.
+// and its depth. The one place that knows the three kinds.
 #ifndef PP_FOOTPRINT_H
 #define PP_FOOTPRINT_H
 
 #include "camera.h"
 #include "lanes.h"
 
-#define DISC 0      // hard disc of the paper: d = 1 everywhere
-#define SOFT 1      // d falls linearly from the centre to the rim (ours)
-#define SPHERE 2    // Pulsar's sphere: depth of its front, sub-pixel rule, any radius
-#define GAUSSIAN 3  // d falls as a Gaussian whose deviation is the radius (3D Gaussian splatting)
+#define DISC 0    // hard disc of the paper: d = 1 everywhere
+#define SOFT 1    // d falls linearly from the centre to the rim (ours)
+#define SPHERE 2  // Pulsar's sphere: depth of its front, sub-pixel rule, any radius
 
 #ifndef FOOTPRINT
 #define FOOTPRINT SOFT
@@ -20,24 +19,10 @@
 // pixels).
 #define LEAST_RADIUS 0.75f
 
-// 3D Gaussian splatting adds this to the variance of a Gaussian, in pixels, and cuts it off at a
-// number of deviations.
-#define LOW_PASS 0.3f
-#define CUT 3.0f
-
 // The width of a pixel at range t is t divided by this: the smaller focal length has the wider
 // pixels.
 static inline float least_focal(const Camera *cam) {
     return fmin(cam->fx, cam->fy);
-}
-
-// How far from its centre a footprint reaches, but for spheres, where a pixel has a width.
-ALWAYS_INLINE floats footprint_reach(const floats radius, const floats width) {
-#if FOOTPRINT == GAUSSIAN
-    return CUT * sqrt(radius * radius + LOW_PASS * width * width);
-#else
-    return fmax(radius, LEAST_RADIUS * width);
-#endif
 }
 
 // The footprints of LANES neighbouring points, one lane each.
@@ -49,7 +34,6 @@ typedef struct {
     // what follows from these
     int columns, rows;  // of the widest and the highest box
     floats least;       // LEAST_RADIUS pixels at range t, world units
-    floats reach;       // footprint_reach
     ints tiny;          // the radius is below one pixel
     // reciprocals, since dividing 16 lanes by one number is slower than multiplying them
     floats per_reach;
@@ -66,8 +50,7 @@ ALWAYS_INLINE void footprints_prepare(const Camera *cam, Footprints *f) {
     const floats width = f->t / least_focal(cam);
     f->least = LEAST_RADIUS * width;
     f->tiny = f->radius < width;
-    f->reach = footprint_reach(f->radius, width);
-    f->per_reach = 1.0f / f->reach;
+    f->per_reach = 1.0f / fmax(f->radius, f->least);
     f->per_fx = 1.0f / cam->fx;
     f->per_fy = 1.0f / cam->fy;
 }
@@ -97,12 +80,9 @@ ALWAYS_INLINE ints footprints_hit(
 #if FOOTPRINT != SPHERE
     // Differs from Pulsar, whose depth is that of the sphere's front, up to a radius nearer, and
     // whose d varies within every footprint of at least a pixel.
-    hit = hit && rho2 < f->reach * f->reach;
-#if FOOTPRINT == GAUSSIAN
-    *closeness = exp(-0.5f * CUT * CUT * f->per_reach * f->per_reach * rho2);
-#else
+    const floats reach = fmax(f->radius, f->least);
+    hit = hit && rho2 < reach * reach;
     *closeness = FOOTPRINT == DISC ? (floats)(1.0f) : 1.0f - sqrt(rho2) * f->per_reach;
-#endif
     *depth = f->t;
 #else
     const floats rho = sqrt(rho2);

@@ -9,12 +9,10 @@ squared differences from the run's own renderings of the training views, by conj
 from __future__ import annotations
 
 import numpy as np
-from scipy.sparse import csr_array
 from scipy.sparse.linalg import LinearOperator, cg
 
 from pp_cl.export.observe import directions, observe
 from pp_cl.run import Run
-from pp_cl.scene.camera import Camera
 
 COUNT = 9  # functions of basis()
 # Two steps more fit the training views better and the test views worse (docs/export.md).
@@ -32,20 +30,9 @@ def basis(towards: np.ndarray) -> np.ndarray:
     return np.stack(rows, 1).astype(np.float32)
 
 
-def fit_harmonics(
-    run: Run,
-    steps: int = STEPS,
-    count: int = COUNT,
-    *,
-    drawn: Run | None = None,
-    zooms: tuple[int, ...] = (1,),
-) -> np.ndarray:
+def fit_harmonics(run: Run, steps: int = STEPS, count: int = COUNT) -> np.ndarray:
     """(N, count, 3) float32: coefficients of the first functions of basis(), of the sRGB colour of
     each of the run's points.
-
-    drawn: the run with the points as others draw them, whose blend weights are taken in place of
-    the run's. zooms: how many times larger they draw each view; a pixel of the run is the mean of
-    theirs, and all sizes count alike.
 
     Colours are blended as the features are, over white, and clamped at last: one point's may lie
     outside [0, 1]. The normal equations A c = b are solved by `steps` + 1 steps of conjugate
@@ -53,24 +40,20 @@ def fit_harmonics(
     since those of all views would fill the memory.
     """
     cameras, n = run.cameras("train"), run.model.cloud.count
-    positions = run.model.positions()
+    positions = run.model.grid.positions(run.model.cloud.ids.get())
 
     def passes(text):
-        """(camera, blend matrix (HW, N), basis (N, count)) of each view at each size."""
-        for zoom in zooms:
-            larger = [
-                camera.resized(zoom * camera.width, zoom * camera.height) for camera in cameras
-            ]
-            views = observe(drawn or run, larger, text)
-            for camera, seen in zip(cameras, views, strict=True):
-                at = basis(directions(positions, camera))[:, :count]
-                yield camera, _block_means(camera, zoom) @ seen.blend_matrix(), at
+        """(observation, blend matrix (HW, N), basis (N, count)) of each view."""
+        for seen in observe(run, cameras, text):
+            at = basis(directions(positions, seen.camera))[:, :count]
+            yield seen, seen.blend_matrix(), at
 
     b, blocks = np.zeros((n, count, 3), np.float32), np.zeros((n, count, count), np.float32)
-    for camera, matrix, at in passes("colours"):
-        shown = run.render(camera).colour.reshape(-1, 3)
+    for seen, matrix, at in passes("colours"):
+        picture = seen.picture()
+        colour = (picture.colour - (1 - picture.alpha)[..., None]).reshape(-1, 3)
         weight = matrix.sum(0)
-        b += at[:, :, None] * (matrix.T @ (shown - (1 - matrix.sum(1))[:, None]))[:, None]
+        b += at[:, :, None] * (matrix.T @ colour)[:, None]
         blocks += (weight[:, None] * at)[:, :, None] * at[:, None]
     ridge = RIDGE * blocks[:, :1, 0] * (np.arange(count) > 0) + LEAST
     diagonal = np.arange(count)
@@ -91,12 +74,3 @@ def fit_harmonics(
     preconditioner = operator(lambda flat: (inverse @ flat.reshape(b.shape)).ravel())
     solution, _ = cg(operator(product), b.ravel(), maxiter=steps + 1, M=preconditioner)
     return solution.reshape(b.shape).astype(np.float32)
-
-
-def _block_means(camera: Camera, factor: int) -> csr_array:
-    """(HW, HW factor^2): the mean of factor x factor pixels for each of the camera's."""
-    size = camera.height, camera.width
-    pixels = np.arange(size[0] * size[1]).reshape(size)
-    block = pixels.repeat(factor, 0).repeat(factor, 1).ravel()
-    shares = np.full(block.size, 1 / factor**2, np.float32)
-    return csr_array((shares, (block, np.arange(block.size))))

@@ -13,8 +13,7 @@ from pp_cl.device.buffers import Buffers, Table
 from pp_cl.device.device import Device
 from pp_cl.device.launch import lanes
 
-# numbered as in cl/raster/footprint.h, which explains them
-FOOTPRINTS = ("disc", "soft", "sphere", "gaussian")
+FOOTPRINTS = ("disc", "soft", "sphere")  # numbered as in cl/raster/footprint.h, which explains them
 
 
 @dataclass(frozen=True)

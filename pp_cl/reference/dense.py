@@ -82,13 +82,10 @@ def geometry(
     radius, width = radius[:, None], pixel_width(camera, t)
     rho = np.linalg.norm(c[:, None] - t[..., None] * r[None], axis=2)
     least = LEAST_RADIUS * width
-    if kind != "sphere":
+    if kind in ("disc", "soft"):
         reach = np.maximum(radius, least)
-        if kind == "gaussian":
-            reach = 3 * np.sqrt(radius**2 + 0.3 * width**2)
-        falloff = {"disc": 0 * rho + 1, "soft": 1 - rho / reach}
         hit = rho < reach
-        closeness = falloff.get(kind, np.exp(-0.5 * (3 * rho / reach) ** 2))
+        closeness = 1 - rho / reach if kind == "soft" else np.ones_like(rho)
         depth = np.broadcast_to(t, rho.shape)
         margin = np.abs(rho - reach) / width
     else:

@@ -243,7 +243,7 @@ def test_a_phone_shows_the_whole_object(page, tmp_path):
     script = "ppcl.show(); return ppcl.canvas.toDataURL();"
     image = image_of(ask(page, script, tmp_path, "#w=60&h=130"))
     assert image.shape == (130, 60, 3) and image.min() < 200
-    assert (image[:, [0, -1]] == 255).all() and (image[[0, -1]] == 255).all()
+    assert image[:, [0, -1]].min() > 200 and image[[0, -1]].min() > 200
 
 
 def test_it_says_what_it_is(run, page):
@@ -265,7 +265,7 @@ def test_a_gallery_is_pages_with_stills_and_an_index(run, tmp_path):
         assert f'<meta property="og:image" content="{stem}.png">' in page
         still = read_rgba(tmp_path / "all" / f"{stem}.png")
         assert still.shape[:2] == (315, 600) and still[..., :3].min() < 200
-        assert (still[:, [0, -1], :3] > 250).all()
+        assert still[:, [0, -1], :3].min() > 200
 
 
 def test_the_runs_name_is_text(run_folder, session_device, tmp_path):
