@@ -79,7 +79,8 @@ def test_tables_are_what_it_takes(plain, rng, weights):
     loss = PerceptualLoss(plain, WEIGHT, policy, weights)
     run(loss, *images(rng, *size))
     tables = [PerceptualLoss.table((*size, 3), WIDTHS), Lpips.table(plain, policy, size, WIDTHS)]
-    assert plain.bytes - before == sum(map(table_bytes, tables))
+    constants = plain.bytes - before - sum(map(table_bytes, tables))
+    assert 0 <= constants <= 32 * len(WIDTHS)  # a row for each layer whose weights are laid out
 
 
 def _no_weights():
