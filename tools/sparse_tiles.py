@@ -21,7 +21,7 @@ from pp_cl.device.discover import open_device
 from pp_cl.errors import UserError
 from pp_cl.files.atomic import write_json
 from pp_cl.layers.choice import make_policy
-from pp_cl.layers.tiles import tiles_find
+from pp_cl.layers.tiles import tiles_find, tiles_hit
 from pp_cl.network.tile_plan import gradient_tiles
 from pp_cl.render import Renderer
 from pp_cl.run import load_run
@@ -57,7 +57,8 @@ class Comparison:
         def plan():
             found = tiles_find(self.dev, target, WHITE).get()
             differs = gradient_tiles(found, x.shape[:2], view_raster.offset)
-            return self.net.plan_tiles(x.shape[:2], view_raster.tiles.get(), differs)
+            hit = tiles_hit(self.dev, view_raster.pairs.pixel_offset, x.shape[:2]).get()
+            return self.net.plan_tiles(x.shape[:2], hit, differs)
 
         chosen = plan()
         # of the image that has equal tiles: those of a dense one differ by rounding, of which the

@@ -341,7 +341,7 @@ def test_a_refinement_that_does_not_fit_keeps_what_is_learned(plain, tmp_path, m
     monkeypatch.setattr(
         "pp_cl.training.memory.prunings", lambda train, start, end: int(end > start + 1)
     )
-    plain.info["memory_bytes"] = 50 * MIB
+    plain.info["memory_bytes"] = 25 * MIB
 
     def train(name, points):
         words = arguments(scene, tmp_path / name, downscale=1, points__count=points, **settings)
