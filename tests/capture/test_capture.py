@@ -211,7 +211,7 @@ def test_a_full_disk(shot, tmp_path):
     """The database may not grow: one line that names it; with room again the command goes on."""
     scene = tmp_path / "scene"
     words = ["capture", str(shot[0]), "--out", str(scene), "--masks", str(shot[1])]
-    limited = "import resource as r; r.setrlimit(r.RLIMIT_FSIZE, (2**22, 2**22))"
+    limited = "import resource as r; r.setrlimit(r.RLIMIT_FSIZE, (3 << 20, 3 << 20))"
     code = f"import sys; {limited}; from pp_cl.cli import program; sys.exit(program({words}))"
     ended = subprocess.run(
         [sys.executable, "-c", code], capture_output=True, text=True, check=False
