@@ -11,6 +11,7 @@ from pp_cl.cli import main
 from pp_cl.config import assign, preset
 from pp_cl.device.buffers import compact_table, table_bytes
 from pp_cl.device.device import Device
+from pp_cl.device.host import resident_bytes
 from pp_cl.errors import UserError
 from pp_cl.files.checkpoint import load_checkpoint
 from pp_cl.metrics.lpips import WIDTHS, vgg_layers
@@ -299,7 +300,7 @@ def test_the_hosts_memory(plain, monkeypatch):
     """Of photographs and of a CPU's buffers; a system that does not tell refuses nothing."""
     photographs = {"images": 300, "size": (4000, 3000), "scene__downscale": "1"}
     available = "pp_cl.training.memory.available_bytes"
-    monkeypatch.setattr(available, lambda: 2 * GIB)
+    monkeypatch.setattr(available, lambda: resident_bytes() + GIB)
     assert "of the host's memory" in refusal(room(plain, **photographs))
     check(room(plain))
     monkeypatch.setattr(available, lambda: None)
