@@ -166,7 +166,6 @@ class Device:
         self._stage_seconds: dict[str, list[float]] | None = None
         if self.debug:
             self._stage_seconds = defaultdict(list)
-        if self.debug:
             atexit.register(self.print_profile)
 
     @property

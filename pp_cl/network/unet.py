@@ -142,9 +142,8 @@ class UNet:
         self.builders: list[subprocess.Popen] = []  # of its kernels, before the first forward pass
         self._relu_outputs = {layer.name for layer in self.layers if layer.relu}
         self._maps: dict[bool, FeatureMaps] = {}  # {training: FeatureMaps}
-        self._modules: dict[
-            Any, Any
-        ] = {}  # of a convolution: {(policy, layer, direction, source, size): module}
+        # {(policy, layer, direction, source, size): module of a convolution}
+        self._modules: dict[Any, Any] = {}
         self._tile_lists = {name: PackedArrays(dev) for name in ("forward", "backward")}
         self._trained: Any = None  # (size, arrays, tiles) of the last forward(training=True)
         self._frozen: dict[Any, Array] | None = None  # {(layer, module): weights} once frozen
