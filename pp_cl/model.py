@@ -18,7 +18,7 @@ from pp_cl.scene.grid import Grid
 class Model:
     """Points and network on a device.
 
-    grid: the vertices that points lie on; grid_buffer: the same, packed, (8) float32 on the
+    grid: the vertices in whose cells points lie; grid_buffer: the same, packed, (8) float32 on the
     device. depth_range: (near, far), distances from the eye in world units, of all cameras. What
     the device gets is relative to the grid's centre, which refinement keeps.
     """
@@ -51,7 +51,8 @@ class Model:
         degree: int = SH_DEGREES[-1],
         opacity: float = 1.0,
     ) -> Model:
-        """Fresh model: points of one opacity with SH coefficients of 0, and a network.
+        """Fresh model: points of one opacity on their vertices with SH coefficients of 0, and a
+        network.
 
         ids: (N) ascending grid vertices. degree: of the SH, 0 to 2.
         """
@@ -59,7 +60,8 @@ class Model:
 
     def positions(self) -> np.ndarray:
         """(N, 3) float64 world positions of the points."""
-        return self.grid.positions(self.dev.download(self.cloud.ids))
+        vertices = self.grid.positions(self.dev.download(self.cloud.ids))
+        return vertices + self.grid.edge * self.dev.download(self.cloud.offset)
 
     def packed(self, camera: Camera, depth_range: tuple[float, float] | None = None) -> np.ndarray:
         """(20,) float32: a camera that sees the points of grid_buffer. depth_range: instead of the
@@ -69,8 +71,8 @@ class Model:
 
     def refine(self) -> Array:
         """Densify: replace every point by the eight around it on the grid of half the spacing,
-        which take over its opacity and SH coefficients. Returns the point that each one comes from,
-        (8 N,) uint32.
+        which take over its offset, opacity and SH coefficients. Returns the point that each one
+        comes from, (8 N,) uint32.
 
         Raises ValueError as Grid.children does.
         """

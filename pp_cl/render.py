@@ -18,7 +18,7 @@ from pp_cl.device.device import Device
 from pp_cl.files.picture import Picture
 from pp_cl.layers.tiles import tiles_hit
 from pp_cl.model import Model
-from pp_cl.raster.blend import blend_backward, blend_forward, shade_forward
+from pp_cl.raster.blend import blend_backward, blend_forward, offset_backward, shade_forward
 from pp_cl.raster.depth import depth_forward
 from pp_cl.raster.pairs import Pairs, find_pairs, pairs_table, room_needed
 from pp_cl.raster.project import ProjectedPoints, project_grid, projection_table
@@ -37,6 +37,11 @@ def point_radius(settings: RasterConfig, edge: float, depth_range: tuple[float, 
         return settings.radius * edge
     near, far = depth_range
     return settings.radius * (far - near) / PAPER_DEPTH_RANGE
+
+
+def can_move(settings: RasterConfig) -> bool:
+    """Whether there are gradients of where points lie beside their vertices."""
+    return (settings.blend, settings.footprint) == ("alpha", "soft")
 
 
 @dataclass
@@ -157,6 +162,7 @@ class Renderer:
                 b.camera_buffer,
                 self.model.grid_buffer,
                 point_id=cloud.ids,
+                point_offset=cloud.offset,
                 point_radius=b.point_radius,
                 dropout=dropout,
                 seed=seed,
@@ -227,10 +233,11 @@ class Renderer:
         grad_image: Array,
         grad_alpha: Array | None = None,
         spread_weight: float = 0.0,
-    ) -> tuple[Array, Array]:
-        """(grad_shaded_features (S, 16) or longer, grad_opacity (N,)) from dL/dimage of
-        result.image; with alpha compositing also from dL/dalpha (H * W,), and of the spread of each
-        pixel's hits with this weight in the loss (cl/raster/blend.cl).
+    ) -> tuple[Array, Array, Array | None]:
+        """(grad_shaded_features (S, 16) or longer, grad_opacity (N,), grad_offset (N, 3) if points
+        may leave the grid) from dL/dimage of result.image; with alpha compositing also from
+        dL/dalpha (H * W,), and of the spread of each pixel's hits with this weight in the loss
+        (cl/raster/blend.cl).
 
         result: of the last forward(training=True). The gradients of the network's parameters are
         left in model.net.gradients. Those of the SH coefficients are grad_shaded_features times the
@@ -247,12 +254,12 @@ class Renderer:
         grad_features: Array,
         grad_alpha: Array | None = None,
         spread_weight: float = 0.0,
-    ) -> tuple[Array, Array]:
+    ) -> tuple[Array, Array, Array | None]:
         """What backward() does, from dL/dfeatures (H, W, 16) of result.features, without the
         network.
         """
         with self.dev.stage("backward"):
-            return blend_backward(
+            grad_shaded_features, grad_opacity = blend_backward(
                 self.dev,
                 self._buffers,
                 result.pairs,
@@ -264,6 +271,18 @@ class Renderer:
                 spread_weight=spread_weight,
                 mean=self.settings.mean_gradient,
             )
+            grad_offset = None
+            if can_move(self.settings):
+                grad_offset = offset_backward(
+                    self.dev,
+                    self._buffers,
+                    result.points,
+                    result.pairs,
+                    result.weights,
+                    opacity=self.model.cloud.opacity,
+                    edge=self.model.grid.edge,
+                )
+            return grad_shaded_features, grad_opacity, grad_offset
 
     def render(self, camera: Camera, gamma: float, **options) -> np.ndarray:
         """(H, W, 3) float32 numpy image of the camera, clamped to [0, 1]. options: of forward()."""

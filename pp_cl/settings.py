@@ -189,6 +189,13 @@ class TrainConfig:
     opacity_rate: tuple = setting(
         (1e-1, 1e-2), "Adam's learning rate at the first and the last step", 1e-12, 100
     )
+    offset_rate: tuple = setting(
+        (1e-2, 1e-3),
+        "Adam's learning rate at the first and the last step of where points lie in their cells of"
+        " the grid, in edges; needs raster.blend=alpha and raster.footprint=soft (0: on the grid)",
+        0,
+        1,
+    )
     opacity_rate_steps: int = setting(
         1000,
         "steps that opacity_rate is meant for: longer trainings multiply it by the square root"

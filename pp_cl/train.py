@@ -137,15 +137,12 @@ class Trainer:
                 self.exposure.fit(
                     view_index, rendered.image, photograph, target_alpha, rendered.offset
                 )
-        grad_shaded_features, grad_opacity = self.renderer.backward(
-            rendered, grad_image, grad_alpha, spread_weight
-        )
+        gradients = self.renderer.backward(rendered, grad_image, grad_alpha, spread_weight)
         with self.dev.stage("update"):
             self.optimiser.update(
                 t + 1 - self.begun,
                 rates,
-                grad_shaded_features,
-                grad_opacity,
+                *gradients,
                 points=rendered.points,
                 shaded=rendered.weights.shaded,
                 sh_eps=config.sh_eps / target.size,
@@ -162,7 +159,7 @@ class Trainer:
         self.step = t + 1
         self.check()
         self._terms = self.loss.read(self.step)
-        del rendered, grad_shaded_features, grad_opacity  # the renderer may release them now
+        del rendered, gradients  # the renderer may release them now
         self._after_update(rates)
         return self._terms
 

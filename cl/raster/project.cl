@@ -157,8 +157,8 @@ ALWAYS_INLINE uints divide(uints *id, const uint n) {
     return low + more;
 }
 
-// One work-item per LANES points: reads their grid indices, writes their camera-space positions and
-// distances, their boxes and numbers of hits.
+// One work-item per LANES points: reads their grid indices and where they lie beside these vertices,
+// writes their camera-space positions and distances, their boxes and numbers of hits.
 kernel __attribute__((vec_type_hint(floats))) void project_grid(
     const uint n,                      // points
     const uint dropout,                // a point is left out where its random uint is below this
@@ -166,6 +166,7 @@ kernel __attribute__((vec_type_hint(floats))) void project_grid(
     global const float *camera,        // (20) camera.h
     global const float *grid,          // (8) grid.h
     global const uint *point_id,       // (N)
+    global const float *point_offset,  // (N, 3) from the vertex, in edges of the grid
     global const float *point_radius,  // (1) of every point
     global float4 *point_camera,       // (N, 4) x, y, z, t; t = -1: culled or dropped out
     global ushort4 *point_box,  // (N, 4) first x, first y, last x, last y; none where last < first
@@ -176,9 +177,13 @@ kernel __attribute__((vec_type_hint(floats))) void project_grid(
     const uint count = min((uint)LANES, n - first), stream = scramble(seed);
     const Camera cam = camera_load(camera);
     uint id[LANES];
+    float offset[3][LANES];
     int wanted[LANES];
     for (uint j = 0; j < LANES; j++) {
-        id[j] = point_id[first + min(j, count - 1)];
+        const size_t row = first + min(j, count - 1);
+        id[j] = point_id[row];
+        for (uint axis = 0; axis < 3; axis++)
+            offset[axis][j] = point_offset[3 * row + axis];
         wanted[j] = -(scramble(id[j] + stream) >= dropout);
     }
     // as grid_position() has it
@@ -187,8 +192,9 @@ kernel __attribute__((vec_type_hint(floats))) void project_grid(
     const uints k = divide(&j, (uint)grid[5]);
     Footprints f;
     const bool any_hit = project(
-        &cam, grid[0] + grid[3] * LANED(convert_float)(i),
-        grid[1] + grid[3] * LANED(convert_float)(j), grid[2] + grid[3] * LANED(convert_float)(k),
+        &cam, grid[0] + grid[3] * (LANED(convert_float)(i) + LANES_FROM(offset[0])),
+        grid[1] + grid[3] * (LANED(convert_float)(j) + LANES_FROM(offset[1])),
+        grid[2] + grid[3] * (LANED(convert_float)(k) + LANES_FROM(offset[2])),
         (floats)(point_radius[0]), LANES_FROM(wanted), &f);
     store_points(&cam, &f, any_hit, first, count, point_camera, point_box, point_count);
 }

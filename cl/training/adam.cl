@@ -12,7 +12,13 @@
 #endif
 
 #ifndef BOUNDED
-#define BOUNDED 0  // 1: the parameter stays in [0, 1]
+#define BOUNDED 0  // 1: the parameter stays in [LEAST, MOST]
+#endif
+#ifndef LEAST
+#define LEAST 0.0f
+#endif
+#ifndef MOST
+#define MOST 1.0f
 #endif
 
 // One work-item per LANES values: moves a parameter and its two moments one step.
@@ -36,7 +42,7 @@ kernel void adam_update(
     store_lanes(v_new, v + i, count);
     floats moved = load_lanes(parameter + i, count) - rate * m_new / (sqrt(v_new) + eps);
     if (BOUNDED)  // clamp() would hide a NaN
-        moved = moved < 0.0f ? (floats)(0.0f) : moved > 1.0f ? (floats)(1.0f) : moved;
+        moved = moved < LEAST ? (floats)(LEAST) : moved > MOST ? (floats)(MOST) : moved;
     store_lanes(moved, parameter + i, count);
 }
 

@@ -40,7 +40,7 @@ def fit_harmonics(run: Run, steps: int = STEPS, count: int = COUNT) -> np.ndarra
     since those of all views would fill the memory.
     """
     cameras, n = run.cameras("train"), run.model.cloud.count
-    positions = run.model.grid.positions(run.model.cloud.ids.get())
+    positions = run.model.positions()
 
     def passes(text):
         """(observation, blend matrix (HW, N), basis (N, count)) of each view."""

@@ -28,7 +28,7 @@ const positions = new Float32Array(3 * header.count);
 const words = new Uint16Array(bytes.buffer);
 for (let i = 0; i < header.count; i++)
   for (let k = 0; k < 3; k++)
-    positions[3 * i + k] = header.edge * words[i * header.stride / 2 + k];
+    positions[3 * i + k] = header.unit * words[i * header.stride / 2 + k];
 
 const BUCKETS = 1 << 16;
 const order = new Uint32Array(header.count);
@@ -71,7 +71,7 @@ function magnification(camera, eye) {
 // ---- shaders ----
 const VERTEX = `#version 300 es
 precision highp float;
-layout(location = 0) in vec3 vertex;    // of the grid
+layout(location = 0) in vec3 place;     // in units
 layout(location = 1) in float opacity;
 // coefficients, three colours of each function
 layout(location = 2) in vec4 b0;
@@ -82,7 +82,7 @@ layout(location = 6) in vec4 b4;
 layout(location = 7) in vec4 b5;
 layout(location = 8) in vec4 b6;
 uniform vec3 eye;                       // from the grid's origin
-uniform float edge, radius, nearest, low[9], span[9];
+uniform float unit, radius, nearest, low[9], span[9];
 uniform float least;                    // half the width of the smallest footprint, in pixels
 uniform float grown;                    // footprints that fill the gaps between points
 uniform mat3 axes;                      // columns: right, down, forward
@@ -93,7 +93,7 @@ flat out float t, reach;
 flat out vec4 colour;
 vec3 value(int k, vec3 stored) { return low[k] + span[k] * stored; }
 void main() {
-  vec3 towards = edge * vertex - eye;
+  vec3 towards = unit * place - eye;
   centre = towards * axes;
   t = length(towards);
   reach = grown * max(radius, least * t / min(focal.x, focal.y));
@@ -179,7 +179,7 @@ function makeDrawer(gl) {
   gl.useProgram(program);
   gl.uniform1fv(place("low"), header.low);
   gl.uniform1fv(place("span"), header.span);
-  for (const name of ["edge", "radius", "nearest"]) gl.uniform1f(place(name), header[name]);
+  for (const name of ["unit", "radius", "nearest"]) gl.uniform1f(place(name), header[name]);
   const target = deep ? gl.createFramebuffer() : null;
   let texture = null, targetSize = "";
 

@@ -19,10 +19,12 @@ from pp_cl.files.image import to_8bit, write_png
 from pp_cl.run import NEAREST, Run
 from pp_cl.scene.camera import Camera
 from pp_cl.scene.camera_path import up_of
+from pp_cl.scene.grid import Grid
 
-# Bytes of a point: vertex (3, uint16), opacity (uint16), coefficients (27 and 1 unused, uint8).
-POINT = np.dtype([("vertex", "<u2", 3), ("opacity", "<u2"), ("colour", "u1", 28)])
+# Bytes of a point: place (3, uint16), opacity (uint16), coefficients (27 and 1 unused, uint8).
+POINT = np.dtype([("place", "<u2", 3), ("opacity", "<u2"), ("colour", "u1", 28)])
 OUTLIERS = 1e-3  # share of the coefficients at either end that is clipped: they would coarsen all
+PLACES = np.iinfo(np.uint16).max
 FIELD_OF_VIEW = 40.0  # degrees across the shorter side of the page
 STILL = 600, 315  # pixels; the least that is shown large beside a link
 
@@ -32,17 +34,24 @@ def pack(run: Run, coefficients: np.ndarray) -> tuple[np.ndarray, np.ndarray, np
     rows of POINT; low and span, (9,) float32: byte v of coefficient k stands for low[k] + span[k] v
     / 255.
     """
-    nx, ny, _ = run.model.grid.dims
-    ids = run.model.cloud.ids.get().astype(np.int64)
-    rows = np.zeros(len(ids), POINT)
-    rows["vertex"] = np.stack([ids % nx, ids // nx % ny, ids // (nx * ny)], 1)
+    origin, unit = lattice(run.model.grid)
+    positions = run.model.positions()
+    rows = np.zeros(len(positions), POINT)
+    rows["place"] = np.rint((positions - origin) / unit)
     rows["opacity"] = np.rint(run.model.cloud.opacity.get() * 65535)
     by_function = coefficients.transpose(1, 0, 2).reshape(COUNT, -1)
     low, high = np.quantile(by_function, [OUTLIERS, 1 - OUTLIERS], axis=1).astype(np.float32)
     span = np.maximum(high - low, np.float32(1e-6))
     scaled = (coefficients - low[:, None]) / span[:, None] * 255
-    rows["colour"][:, : 3 * COUNT] = np.rint(scaled.clip(0, 255)).reshape(len(ids), -1)
+    rows["colour"][:, : 3 * COUNT] = np.rint(scaled.clip(0, 255)).reshape(len(rows), -1)
     return rows, low, span
+
+
+def lattice(grid: Grid) -> tuple[np.ndarray, float]:
+    """(origin (3,), unit), in the world: places in the cells of a grid are kept as whole units from
+    there, as small as 16 bits allow.
+    """
+    return np.array(grid.origin) - grid.edge / 2, grid.edge / (PLACES // max(grid.dims))
 
 
 def page_text(run: Run, still: str = "") -> str:
@@ -127,14 +136,15 @@ def check_drawable(run: Run) -> None:
 def _header(run, low, span):
     """What the page must know beside the points."""
     grid = run.model.grid
+    origin, unit = lattice(grid)
     centre, radius = run.ball
     cameras = run.cameras("train")
     eye, up = first_look(run)
     return {
         "count": run.model.cloud.count,
         "stride": POINT.itemsize,
-        "origin": [float(x) for x in grid.origin],
-        "edge": float(grid.edge),
+        "origin": origin.tolist(),
+        "unit": unit,
         "radius": float(run.config.raster.radius * grid.edge),
         "nearest": float(NEAREST * radius),
         "centre": centre.tolist(),

@@ -57,7 +57,7 @@ def coloured_points(run: Run, min_weight: float = 0.0) -> ColouredPoints:
     UserError where no point is left.
     """
     cloud = run.model.cloud
-    positions = run.model.grid.positions(cloud.ids.get())
+    positions = run.model.positions()
     colours, best = np.zeros((cloud.count, 3), np.uint8), np.zeros(cloud.count, np.float32)
     for seen in observe(run, run.cameras("train"), "colours"):
         weights = seen.point_weights()  # before the picture, which weighs the view anew

@@ -72,6 +72,7 @@ def blend_backward_table(n: int, shaded: int, pixels: int, pairs: int, blend: st
         "pixel_rest": ((pixels if blend == "softmax" else 1,), np.float32),
         "grad_shaded_features": ((shaded, 16), np.float32),
         "grad_opacity": ((n,), np.float32),
+        "grad_offset": ((n if blend == "alpha" else 1, 3), np.float32),
     }
 
 
@@ -149,6 +150,43 @@ def blend_backward(
         grad_opacity=b.grad_opacity,
     )
     return b.grad_shaded_features, b.grad_opacity
+
+
+def offset_backward(
+    dev: Device,
+    b: Buffers,
+    points: ProjectedPoints,
+    pairs: Pairs,
+    weights: BlendWeights,
+    *,
+    opacity: Array,
+    edge: float,
+) -> Array:
+    """grad_offset (N, 3) float32, valid until the next call, after blend_backward(): of soft points
+    that are composited by alpha, of what the closeness of their hits changes.
+
+    opacity: (N,). edge: of the grid that offsets are counted in, world units.
+    """
+    dev.fill(b.grad_offset, 0)
+    dev.program("raster/offset", HAS_ROLES=int(weights.has_roles)).launch(
+        "offset_backward",
+        weights.shaded.size,
+        s=weights.shaded.size,
+        edge=edge,
+        shaded=weights.shaded,
+        camera=points.camera_buffer,
+        point_radius=points.point_radius,
+        point_camera=points.point_camera,
+        opacity=opacity,
+        point_offset=pairs.point_offset,
+        pair_pixel=pairs.pair_pixel,
+        pair_point_closeness=pairs.pair_point_closeness,
+        pair_weight=weights.pair_weight,
+        pair_role=weights.pair_role,
+        pair_gain=b.pair_gain,
+        grad_offset=b.grad_offset,
+    )
+    return b.grad_offset
 
 
 def _program(dev, weights, mean=False):

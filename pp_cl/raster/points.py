@@ -1,4 +1,6 @@
-"""The point cloud on the device: grid ids, opacities, and SH coefficients in arrays by degree."""
+"""The point cloud on the device: grid ids, offsets from these vertices, opacities, and SH
+coefficients in arrays by degree.
+"""
 
 from __future__ import annotations
 
@@ -41,6 +43,7 @@ SH_BLOCKS = (
     ShBlock("sh_2b", 7, 2),
 )
 SH_DEGREES = (0, 1, 2)
+MOST_OFFSET = 0.5  # edges of the grid, along each axis: a point stays in the cell of its vertex
 
 
 def sh_blocks(degree: int) -> tuple[ShBlock, ...]:
@@ -64,12 +67,14 @@ def four_blocks(sh: Sequence[Array]) -> list[Array]:
 class PointCloud:
     """The points, one row each; device arrays.
 
-    ids: (N) uint32, vertices of the grid, ascending. opacity: (N) float32 in [0, 1]. sh: the SH
-    coefficients, (N, count, 16) of each block: float32, or float16 where they are not trained any
-    more.
+    ids: (N) uint32, vertices of the grid, ascending. offset: (N, 3) float32, from the vertex to the
+    point in its cell, in edges of the grid, up to MOST_OFFSET. opacity: (N) float32 in [0, 1]. sh:
+    the SH coefficients, (N, count, 16) of each block: float32, or float16 where they are not
+    trained any more.
     """
 
     ids: Array
+    offset: Array
     opacity: Array
     sh: list[Array]
 
@@ -86,39 +91,44 @@ class PointCloud:
     @staticmethod
     def table(n: int, blocks: tuple[ShBlock, ...]) -> Table:
         """The arrays of n points."""
-        table = {"ids": ((n,), np.uint32), "opacity": ((n,), np.float32)}
+        table: Table = {"ids": ((n,), np.uint32), "offset": ((n, 3), np.float32)}
+        table["opacity"] = (n,), np.float32
         return table | {block.name: ((n, block.count, 16), np.float32) for block in blocks}
 
     @classmethod
     def create(cls, dev: Device, ids: np.ndarray, degree: int, opacity: float = 1.0) -> PointCloud:
-        """Points of one opacity with SH coefficients of 0. ids: (N), ascending."""
+        """Points of one opacity on their vertices, SH coefficients of 0. ids: (N), ascending."""
         n = len(ids)
         opacities = dev.upload(np.full(n, opacity, np.float32))
         sh = [dev.zeros((n, block.count, 16)) for block in sh_blocks(degree)]
-        return cls(dev.upload(ids, np.uint32), opacities, sh)
+        return cls(dev.upload(ids, np.uint32), dev.zeros((n, 3)), opacities, sh)
 
     def learned(self) -> dict[str, Array]:
-        """{name: array} of all that training changes: "opacity", and the SH by block."""
+        """{name: array} of all that training changes: "offset", "opacity", and the SH by block."""
         names = (block.name for block in self.blocks)
-        return {"opacity": self.opacity} | dict(zip(names, self.sh, strict=True))
+        places = {"offset": self.offset, "opacity": self.opacity}
+        return places | dict(zip(names, self.sh, strict=True))
 
     def compact(self, dev: Device, keep: Array) -> None:
         """Drop all rows but `keep`, (M) uint32, ascending; one array after the other."""
         self.ids = compact_rows(dev, self.ids, keep)
+        self.offset = compact_rows(dev, self.offset, keep)
         self.opacity = compact_rows(dev, self.opacity, keep)
         for i in range(len(self.sh)):
             self.sh[i] = compact_rows(dev, self.sh[i], keep)
 
     def rows(self, dev: Device, keep: Array) -> PointCloud:
         """A copy of the rows `keep`, (M) uint32, ascending."""
-        ids, opacity, *sh = (gather_rows(dev, a, keep) for a in (self.ids, self.opacity, *self.sh))
-        return PointCloud(ids, opacity, sh)
+        arrays = self.ids, self.offset, self.opacity, *self.sh
+        ids, offset, opacity, *sh = (gather_rows(dev, array, keep) for array in arrays)
+        return PointCloud(ids, offset, opacity, sh)
 
     def replace_by(self, dev: Device, ids: np.ndarray, rows: Array) -> None:
         """Become the points `ids`, (M) ascending, each with what point rows[i] of the present ones
         has learned; one array after the other. rows: (M,) uint32.
         """
         self.ids = dev.upload(ids, np.uint32)
+        self.offset = gather_rows(dev, self.offset, rows)
         self.opacity = gather_rows(dev, self.opacity, rows)
         for i in range(len(self.sh)):
             self.sh[i] = gather_rows(dev, self.sh[i], rows)
@@ -127,7 +137,8 @@ class PointCloud:
         """The arrays as a checkpoint names them; the SH by degree, (N, 1, 16), (N, 3, 16),
         (N, 5, 16).
         """
-        stored = {"ids": DeviceRows(dev, self.ids), "opacity": DeviceRows(dev, self.opacity)}
+        learned = {"ids": self.ids, "offset": self.offset, "opacity": self.opacity}
+        stored = {name: DeviceRows(dev, array) for name, array in learned.items()}
         blocks = list(zip(self.blocks, self.sh, strict=True))
         for degree in range(stored_degree(self.sh) + 1):
             parts = [array for block, array in blocks if block.degree == degree]
@@ -137,10 +148,11 @@ class PointCloud:
     @classmethod
     def load(cls, dev: Device, arrays: dict[str, np.ndarray], degree: int) -> PointCloud:
         """The points of a checkpoint's arrays, which are taken out of `arrays`."""
-        ids, opacity = (arrays.pop(f"points.{name}") for name in ("ids", "opacity"))
+        names = "ids", "offset", "opacity"
+        ids, offset, opacity = (dev.upload(arrays.pop(f"points.{name}")) for name in names)
         by_degree = [arrays.pop(f"points.sh{d}") for d in SH_DEGREES[: degree + 1]]
         sh = []
         for block in sh_blocks(degree):
             start = block.first - block.degree**2  # within its degree
             sh.append(dev.upload(by_degree[block.degree][:, start : start + block.count]))
-        return cls(dev.upload(ids), dev.upload(opacity), sh)
+        return cls(ids, offset, opacity, sh)

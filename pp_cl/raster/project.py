@@ -52,14 +52,16 @@ def project_grid(
     grid_buffer: Array,
     *,
     point_id: Array,
+    point_offset: Array,
     point_radius: Array,
     dropout: float = 0.0,
     seed: int = 0,
 ) -> ProjectedPoints:
-    """Project the points, which are vertices of a grid, into a camera.
+    """Project the points, each in the cell of a grid's vertex, into a camera.
 
-    grid_buffer: (8,) float32, Grid.packed(). point_id: (N,) uint32. point_radius: (1,). dropout:
-    probability in [0, 1) with which a point is left out, at random by (seed, id). seed: uint32.
+    grid_buffer: (8,) float32, Grid.packed(). point_id: (N,) uint32. point_offset: (N, 3) float32,
+    from the vertex, in edges of the grid. point_radius: (1,). dropout: probability in [0, 1) with
+    which a point is left out, at random by (seed, id). seed: uint32.
     """
     n = point_id.size
     b.require(projection_table(n))
@@ -73,6 +75,7 @@ def project_grid(
         camera=camera_buffer,
         grid=grid_buffer,
         point_id=point_id,
+        point_offset=point_offset,
         point_radius=point_radius,
         point_camera=b.point_camera,
         point_box=b.point_box,

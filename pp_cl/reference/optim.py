@@ -15,8 +15,15 @@ class Adam:
         self.m, self.v, self.t = np.zeros_like(self.parameter), np.zeros_like(self.parameter), 0
         self.betas = beta1, beta2
 
-    def step(self, grad: np.ndarray, rate: float, eps: float, *, bounded: bool = False) -> None:
-        """One step. bounded: the parameter stays in [0, 1]."""
+    def step(
+        self,
+        grad: np.ndarray,
+        rate: float,
+        eps: float,
+        *,
+        bounds: tuple[float, float] = (-np.inf, np.inf),
+    ) -> None:
+        """One step. bounds: what the parameter stays between."""
         beta1, beta2 = self.betas
         self.t += 1
         grad = np.asarray(grad, np.float64)
@@ -24,7 +31,7 @@ class Adam:
         self.v += (1 - beta2) * (grad * grad - self.v)
         c1, c2 = 1 - beta1**self.t, 1 - beta2**self.t
         moved = self.parameter - rate / c1 * self.m / (np.sqrt(self.v / c2) + eps)
-        self.parameter = np.clip(moved, 0, 1) if bounded else moved
+        self.parameter = np.clip(moved, *bounds)
 
 
 class RmsProp:

@@ -141,6 +141,28 @@ def _spheres(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
         yield relative(gradients["radius"], numeric, DIFFERENCES)
 
 
+def _offsets(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
+    """Gradients of offsets, against finite differences of what the closeness changes."""
+    camera, n, edge = make_camera(), 40, 0.3
+    positions, opacity = make_points(rng, n), rng.uniform(0, 1, n).astype(np.float32)
+    features = rng.normal(size=(n, 16))
+    grad = rng.normal(size=(camera.width * camera.height, 16))
+    for radius, stop in ((0.4, 0.0), (0.4, 0.05), (1e-3, 0.0)):  # the last: of the least size
+        scene = PairedPoints(dev, camera, positions, radius)
+        scene.blend(opacity, 0.1, features, rule="alpha", early_stop=stop)
+        gradients = scene.offset_gradients(grad, edge)
+        exact_geometry = scene.geometry()
+        used = dense.alpha(exact_geometry, opacity, stop)["hit"]
+
+        def loss(offset, radius=radius, exact_geometry=exact_geometry, used=used):
+            moved = dense.geometry(camera, positions + edge * offset, radius, "soft")
+            moved |= {"hit": used, "depth": exact_geometry["depth"]}
+            return (dense.features(dense.alpha(moved, opacity), features) * grad).sum()
+
+        numeric = numeric_gradient(loss, np.zeros((n, 3)), STEP)
+        yield relative(gradients.ravel(), numeric, DIFFERENCES)
+
+
 def _smallest_gamma(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
     """gamma = 1e-5 makes exponents of 1e5, which are off by 1e-2: so are the weights."""
     for opacity in (1.0, 0.3, 1e-3, 1e-38):
@@ -358,6 +380,7 @@ CASES = (
     Case("softmax: an empty view", _empty),
     Case("alpha: gradient of alpha", _gradient_of_alpha),
     Case("alpha: spread", _spread),
+    Case("alpha: offsets of points", _offsets),
     Case("alpha: opacities of 1", _opaque),
     Case("alpha: equal depths", _equal_depths_alpha),
     Case("alpha: transmittance that underflows", _underflow),

@@ -174,14 +174,15 @@ def _rmsprop_extremes(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
     yield exact(np.nan_to_num(cloud.coefficients()), np.nan_to_num(expected))
 
 
-def _bounded_opacity(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
-    """Huge gradients keep it in [0, 1], at the values of float64."""
-    grads = 1e4 * (rng.standard_normal((20, 257)) + np.linspace(-2, 2, 257))
-    options = {"rate": 0.03, "eps": 1e-15, "bounded": True}
-    twin, moved, _ = _adam_steps(dev, rng.random(257), grads, **options)
-    yield finite(moved)
-    yield exact([moved.min(), moved.max()], [0, 1])
-    yield absolute(moved, twin.parameter, 2e-6)  # twenty moves of 0.03
+def _bounded(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
+    """Huge gradients keep opacities and offsets in their bounds, at the values of float64."""
+    for bounds in ((0.0, 1.0), (-0.5, 0.5)):
+        grads = 1e4 * (rng.standard_normal((20, 257)) + np.linspace(-2, 2, 257))
+        options = {"rate": 0.03, "eps": 1e-15, "bounds": bounds}
+        twin, moved, _ = _adam_steps(dev, rng.uniform(*bounds, 257), grads, **options)
+        yield finite(moved)
+        yield exact([moved.min(), moved.max()], bounds)
+        yield absolute(moved, twin.parameter, 2e-6)  # twenty moves of 0.03
 
 
 def _ema(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
@@ -225,7 +226,7 @@ def _refine(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
 CASES = (
     Case("adam: arrays", _adam),
     Case("adam: gradients of 0, 1e-20 and 1e10", _adam_extremes),
-    Case("adam: opacities at their bounds", _bounded_opacity),
+    Case("adam: at the bounds", _bounded),
     *(Case(f"rmsprop: degree {d}", partial(_rmsprop, d)) for d in SH_DEGREES),
     Case("rmsprop: gradients of 0, 1e-20, 1e10 and NaN", _rmsprop_extremes),
     Case("training: moving average", _ema),

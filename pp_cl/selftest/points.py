@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 from pp_cl.bench.spheres import find_all_pairs, project_spheres, spheres_backward
 from pp_cl.device.buffers import Buffers
 from pp_cl.device.device import Device
-from pp_cl.raster.blend import blend_backward, blend_forward
+from pp_cl.raster.blend import blend_backward, blend_forward, offset_backward
 from pp_cl.raster.weights import DROPPED, blend_weights
 from pp_cl.reference import dense
 from pp_cl.scene.camera import Camera, look_at
@@ -191,6 +191,19 @@ class PairedPoints:
             mean=self.mean,
         )
         return gradients | {"positions": positions.get(), "radius": radius.get()}
+
+    def offset_gradients(self, grad_features: np.ndarray, edge: float) -> np.ndarray:
+        """(N, 3) of the same, on a grid of this edge; of soft points composited by alpha."""
+        self.gradients(grad_features)
+        return offset_backward(
+            self.dev,
+            self.buffers,
+            self.projected,
+            self.pairs,
+            self.weights,
+            opacity=self.opacity,
+            edge=edge,
+        ).get()
 
     def _uploaded(self, grad_features):
         return self.dev.upload(np.reshape(grad_features, (*self.shape, 16)), np.float32)

@@ -39,13 +39,15 @@ SUMMED = 1e-5  # a sum of up to 80 weights, half EPS each, over another one
 
 
 def _project(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
-    """Vertices of a grid; spheres of which the depth range culls some, by their front. Where points
-    are is known of those that hit a pixel, and all hit one that lie in the image.
+    """Points in the cells of a grid; spheres of which the depth range culls some, by their front.
+    Where points are is known of those that hit a pixel, and all hit one that lie in the image.
     """
     camera, depth_range = make_camera(), (3.5, 4.8)
     for n in SIZES:
         ids = rng.choice(np.prod(GRID.dims), n, replace=False)
         ids[0] = np.prod(GRID.dims) - 1
+        offset = rng.uniform(-0.5, 0.5, (n, 3)).astype(np.float32)
+        positions = GRID.positions(ids) + GRID.edge * offset
         points = project_grid(
             dev,
             Buffers(dev),
@@ -53,9 +55,10 @@ def _project(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
             dev.upload(camera.packed(dense.DEPTH_RANGE)),
             dev.upload(GRID.packed()),
             point_id=dev.upload(ids, np.uint32),
+            point_offset=dev.upload(offset),
             point_radius=dev.zeros((1,)),
         )
-        place, hit = dense.camera_space(camera, GRID.positions(ids)), points.point_count.get() > 0
+        place, hit = dense.camera_space(camera, positions), points.point_count.get() > 0
         yield exact(hit | ~_inside(camera, place), np.ones(n, bool))
         yield relative(points.point_camera.get()[hit, :3], place[hit], PLACED)
         yield relative(

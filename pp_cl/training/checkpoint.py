@@ -16,7 +16,7 @@ from pp_cl.files.checkpoint import MEND, Checkpoint, Form, opened_checkpoint
 from pp_cl.files.run_folder import RunFolder
 from pp_cl.layers.choice import check_form
 from pp_cl.network.layers import parameter_table, unet_layers
-from pp_cl.raster.points import SH_DEGREES, sh_blocks
+from pp_cl.raster.points import MOST_OFFSET, SH_DEGREES, sh_blocks
 from pp_cl.scene.identity import DIGITS, kept_views
 from pp_cl.training.exposure import decided_at
 from pp_cl.training.schedule import bound_to_end, ema_start
@@ -158,6 +158,7 @@ def stored_forms(
     layers = unet_layers(settings.widths, blocks=settings.blocks, channels=settings.channel_numbers)
     network = parameter_table(layers)
     table: dict[str, Any] = {"points.ids": ((n,), np.uint32), "points.opacity": ((n,), np.float32)}
+    table["points.offset"] = (n, 3), np.float32
     table |= {f"points.sh{d}": ((n, 2 * d + 1, 16), colours) for d in SH_DEGREES[: degree + 1]}
     table |= {f"net.{name}": row for name, row in network.items()}
     if step is not None:
@@ -263,6 +264,11 @@ def _array_rule(name: str, header: dict[str, Any]) -> Rule | None:
         return (
             lambda a: bool((a[1:] > a[:-1]).all() and a[-1] < vertices),
             "vertices of its grid in ascending order",
+        )
+    if name in ("points.offset", "state.a.offset"):
+        return (
+            lambda a: np.abs(a).max() <= MOST_OFFSET,
+            f"offsets of up to {MOST_OFFSET}",
         )
     if name in ("points.opacity", "state.a.opacity"):
         return lambda a: a.min() >= 0 and a.max() <= 1, "opacities from 0 to 1"

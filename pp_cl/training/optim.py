@@ -1,5 +1,5 @@
-"""The optimiser: RMSprop for the SH coefficients, Adam for the opacities and the network, and the
-exponential moving average (EMA) of all parameters.
+"""The optimiser: RMSprop for the SH coefficients, Adam for the points' offsets and opacities and
+for the network, and the exponential moving average (EMA) of all parameters.
 
 Adam is dense as in PyTorch: momentum moves every value in every step, with or without a gradient.
 RMSprop is sparse: it touches only visible points with a gradient. cl/training/rmsprop.cl has its
@@ -18,14 +18,14 @@ from pp_cl.device.buffers import DeviceRows, Table
 from pp_cl.device.device import Device
 from pp_cl.device.launch import lanes, row_parts
 from pp_cl.model import Model
-from pp_cl.raster.points import four_blocks, stored_degree
+from pp_cl.raster.points import MOST_OFFSET, four_blocks, stored_degree
 from pp_cl.raster.project import ProjectedPoints
 from pp_cl.training.schedule import Rates
 from pp_cl.training.state import PointState
 
 BETA1, BETA2 = 0.9, 0.999  # Kingma & Ba 2015
 DECAY1, DECAY2 = f"{1 - BETA1:.9g}f", f"{1 - BETA2:.9g}f"
-OPACITY_EPS = 1e-15  # opacity gradients span many decades; clamping bounds the step instead
+POINT_EPS = 1e-15  # gradients of points span many decades; clamping bounds the step instead
 NETWORK_EPS = 1e-8  # PyTorch's default
 
 
@@ -56,13 +56,15 @@ class Optimiser:
         rates: Rates,
         grad_shaded_features: Array,
         grad_opacity: Array,
+        grad_offset: Array | None,
         *,
         points: ProjectedPoints,
         shaded: Array,
         sh_eps: float,
     ) -> None:
-        """One step by the gradients of the visible points' features, (S, 16) or longer, and of all
-        opacities, (N,), and by those of the network, which lie in model.net.gradients.
+        """One step by the gradients of the visible points' features, (S, 16) or longer, of all
+        opacities, (N,), and offsets, (N, 3), and by those of the network, which lie in
+        model.net.gradients.
 
         step: from 1. points: as projected into the rendered view. shaded: (S) uint32, the visible
         ones. sh_eps: eps of RMSprop.
@@ -80,15 +82,26 @@ class Optimiser:
             rates=rates.sh,
             eps=sh_eps,
         )
+        if grad_offset is not None and rates.offset > 0:
+            adam_update(
+                self.dev,
+                cloud.offset,
+                grad_offset,
+                state.moments("offset"),
+                step=step,
+                rate=rates.offset,
+                eps=POINT_EPS,
+                bounds=(-MOST_OFFSET, MOST_OFFSET),
+            )
         adam_update(
             self.dev,
             cloud.opacity,
             grad_opacity,
-            state.opacity_moments,
+            state.moments("opacity"),
             step=step,
             rate=rates.opacity,
-            eps=OPACITY_EPS,
-            bounded=True,
+            eps=POINT_EPS,
+            bounds=(0.0, 1.0),
         )
         adam_update(
             self.dev,
@@ -167,19 +180,26 @@ def adam_update(
     step: int,
     rate: float,
     eps: float,
-    bounded: bool = False,
+    bounds: tuple[float, float] | None = None,
 ) -> None:
     """One dense Adam step of `parameter`, in place.
 
     parameter, grad, moments "m" and "v": float32 arrays of one shape, any; the moments start as
-    zeros. step: from 1 on. bounded: the parameter stays in [0, 1]. Raises ValueError when the
+    zeros. step: from 1 on. bounds: what the parameter stays between. Raises ValueError when the
     shapes differ.
     """
     _same_shape(parameter, grad, *moments.values())
     # rate (m / c1) / (sqrt(v / c2) + eps) = (rate root / c1) m / (sqrt(v) + eps root)
     root = math.sqrt(1 - BETA2**step)
+    least, most = bounds or (0.0, 0.0)
     program = dev.program(
-        "training/adam", LANES=lanes(dev), DECAY1=DECAY1, DECAY2=DECAY2, BOUNDED=int(bounded)
+        "training/adam",
+        LANES=lanes(dev),
+        DECAY1=DECAY1,
+        DECAY2=DECAY2,
+        BOUNDED=int(bounds is not None),
+        LEAST=f"{least}f",
+        MOST=f"{most}f",
     )
     program.launch(
         "adam_update",

@@ -19,9 +19,12 @@ END_SHARE = 0.25  # of the crops that show one end of the object, at least
 
 @dataclass(frozen=True)
 class Rates:
-    """The learning rates of one step. sh: of the degrees 0, 1, 2."""
+    """The learning rates of one step. sh: of the degrees 0, 1, 2. offset: 0 for points that stay
+    on the grid.
+    """
 
     sh: tuple[float, ...]
+    offset: float
     opacity: float
     network: float
 
@@ -41,6 +44,7 @@ class Rates:
         scale = math.sqrt(min(1.0, train.opacity_rate_steps / steps or 1.0))
         return cls(
             sh,
+            learning_rate(step, steps, *train.offset_rate) if train.offset_rate[0] else 0.0,
             scale * learning_rate(step, steps, *train.opacity_rate),
             learning_rate(step, steps, *network.rate),
         )
@@ -50,7 +54,8 @@ def bound_to_end(network: NetworkConfig, raster: RasterConfig, train: TrainConfi
     """What of a training depends on its number of steps, in words; nothing where a longer one goes
     through the same steps first.
     """
-    constant = network.rate[0] == network.rate[1] and train.opacity_rate[0] == train.opacity_rate[1]
+    rates = network.rate, train.opacity_rate, train.offset_rate
+    constant = all(first == last for first, last in rates)
     constant = constant and train.sh_rate_decay == 1 and not train.opacity_rate_steps
     delayed = any(r and d for r, d in zip(train.sh_rate, train.sh_delay, strict=True))
     is_alpha = raster.blend == "alpha"

@@ -30,6 +30,8 @@ class PointState:
         return {
             "max_weight": ((n,), np.float32),
             "times_seen": ((n,), np.float32),
+            "m.offset": ((n, 3), np.float32),
+            "v.offset": ((n, 3), np.float32),
             "m.opacity": ((n,), np.float32),
             "v.opacity": ((n,), np.float32),
             "v.sh": ((n, 16), np.float32),
@@ -65,10 +67,9 @@ class PointState:
         """(N,) uint32: the last step in which the point's features had a gradient; 0: none yet."""
         return self._arrays["last_step"]
 
-    @property
-    def opacity_moments(self) -> dict[str, Array]:
-        """Adam's "m" and "v", (N,) each."""
-        return {kind: self._arrays[f"{kind}.opacity"] for kind in "mv"}
+    def moments(self, name: str) -> dict[str, Array]:
+        """Adam's "m" and "v" of the points' "offset" or "opacity"."""
+        return {kind: self._arrays[f"{kind}.{name}"] for kind in "mv"}
 
     def compact(self, dev: Device, keep: Array) -> None:
         """Drop all rows but `keep`, (M) uint32, ascending; one array after the other."""

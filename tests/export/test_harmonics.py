@@ -19,7 +19,7 @@ def test_the_functions_of_the_basis_are_orthogonal():
 
 def drawn(run, coefficients, seen):
     """(HW, 3): coefficients (N, 9, 3), blended over white."""
-    positions = run.model.grid.positions(run.model.cloud.ids.get())
+    positions = run.model.positions()
     at, matrix = basis(directions(positions, seen.camera)), seen.blend_matrix()
     return matrix @ np.einsum("nk,nkc->nc", at, coefficients) + (1 - matrix.sum(1))[:, None]
 

@@ -44,7 +44,7 @@ def kept(page):
 def predicted(run, page, camera):
     """(H, W, 3) uint8: what the page is to draw, by the run's own blend weights."""
     _, _, coefficients, _ = kept(page)
-    positions = run.model.grid.positions(run.model.cloud.ids.get())
+    positions = run.model.positions()
     at = basis(directions(positions, camera))
     (seen,) = observe(run, [camera], "")
     matrix = seen.blend_matrix()
@@ -69,9 +69,8 @@ def test_it_needs_nothing_but_itself(page):
 
 def test_points_are_kept_to_within_a_step(run, page):
     header, rows, _, opacity = kept(page)
-    nx, ny, _ = run.model.grid.dims
-    i, j, k = rows["vertex"].astype(np.int64).T
-    assert (i + nx * (j + ny * k)).tolist() == run.model.cloud.ids.get().tolist()
+    places = header["origin"] + header["unit"] * rows["place"].astype(float)
+    assert places == pytest.approx(run.model.positions(), abs=0.6 * header["unit"])
     assert header["count"] == len(rows) and header["stride"] == POINT.itemsize == 36
     assert opacity == pytest.approx(run.model.cloud.opacity.get(), abs=0.6 / 65535)
 

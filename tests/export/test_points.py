@@ -20,7 +20,7 @@ def test_colours_are_those_of_the_best_view(run, points):
     cameras = run.cameras("train")
     weights = np.stack([seen.point_weights() for seen in observe(run, cameras, "")])
     images = [to_8bit(run.render(camera).rgba()[..., :3]) for camera in cameras]
-    positions = run.model.grid.positions(run.model.cloud.ids.get())
+    positions = run.model.positions()
     assert points.rows.tolist() == np.flatnonzero(weights.max(0) > 0).tolist()
     for row, colour in list(zip(points.rows, points.colours, strict=True))[::40]:
         best = weights[:, row].argmax()

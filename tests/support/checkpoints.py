@@ -55,6 +55,8 @@ def contents(config, step=STEP, n=POINTS):
     for name, form in stored_forms(config, n, None if finished else step, gains=gains).items():
         arrays[name] = rng.random(form.shape).astype(form.dtype)
     arrays["points.ids"] = np.sort(rng.choice(9 * 8 * 7, n, replace=False)).astype(np.uint32)
+    for name in {"points.offset", "state.a.offset"} & arrays.keys():
+        arrays[name] -= np.float32(0.5)
     if "state.last_step" in arrays:
         arrays["state.last_step"] = rng.integers(0, step + 1, n).astype(np.uint32)
     return HEADER | {"step": step, "finished": finished}, arrays

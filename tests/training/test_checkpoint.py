@@ -201,6 +201,7 @@ ARRAYS = {
     "no ids": ("points.ids", None, "points.ids is missing"),
     "an id less than opacities": ("points.ids", lambda a: a[:-1], "expected float32 (39,"),
     "negative opacity": ("points.opacity", lambda a: a - 1, "opacities from 0 to 1"),
+    "another's cell": ("points.offset", lambda a: a + 1, "offsets of up to"),
     "opacity of NaN": ("points.opacity", lambda a: a * np.float32("nan"), "NaN or Inf"),
     "colours of doubles": ("points.sh1", lambda a: a.astype(float), "float64 (40, 3, 16)"),
     "no degree 2": ("points.sh2", None, "points.sh2 is missing, expected float32 (40, 5, 16)"),

@@ -47,7 +47,7 @@ def test_refuses_different_shapes(dev):
 def test_a_nan_is_not_hidden(dev):
     opacity, grad = dev.zeros((31,)), dev.upload(np.full(31, np.nan), np.float32)
     state = moments(dev, opacity)
-    adam_update(dev, opacity, grad, state, step=1, rate=0.03, eps=1e-15, bounded=True)
+    adam_update(dev, opacity, grad, state, step=1, rate=0.03, eps=1e-15, bounds=(0.0, 1.0))
     assert np.isnan(opacity.get()).all()
 
 

@@ -1,0 +1,53 @@
+// Gradients of the offsets of soft points, composited by alpha: what moving a point changes by the
+// closeness d of its hits. How the order of hits and the harmonics change is left out.
+//
+// d = 1 - rho / h with rho = |e|, e = c - t r: of the centre c at range t = |c| from the unit ray r
+// dd/dc = (c/t (r.e) - e) / (rho h),   dL/dd = o T gain (alpha.cl, blend.cl)
+#include "common.h"
+#include "camera.h"
+#include "raster/footprint.h"
+#include "raster/pair_role.h"
+
+#ifndef HAS_ROLES
+#define HAS_ROLES 1  // 0: every pair is tracked, and pair_role is not read
+#endif
+
+#define LEAST_RHO 1e-3f  // of h: nearer to its ray a point has no direction away from it
+
+// One work-item per visible point: reads its pairs, writes the gradient of its offset.
+kernel void offset_backward(
+    const uint s,                              // visible points
+    const float edge,                          // of the grid, world units
+    global const uint *shaded,                 // (S) their indices
+    global const float *camera,                // (20) camera.h
+    global const float *point_radius,          // (1) of every point
+    global const float4 *point_camera,         // (N, 4) x, y, z, distance
+    global const float *opacity,               // (N)
+    global const uint *point_offset,           // (N+1)
+    global const uint *pair_pixel,             // (P)
+    global const uint2 *pair_point_closeness,  // (P, 2) point, bits of d
+    global const float2 *pair_weight,          // (P, 2) b, T d
+    global const uchar *pair_role,             // (?) P with HAS_ROLES
+    global const float *pair_gain,             // (P)
+    global float *grad_offset)                 // (N, 3) of the visible
+{
+    const uint g = get_global_id(0);
+    if (g >= s) return;
+    const uint i = shaded[g];
+    const Camera cam = camera_load(camera);
+    const float3 c = point_camera[i].xyz;
+    const float t = point_camera[i].w;
+    const float h = fmax(point_radius[0], LEAST_RADIUS * t / least_focal(&cam));
+    float3 dL_dc = 0.0f;
+    for (uint pair = point_offset[i]; pair < point_offset[i + 1]; pair++) {
+        if (HAS_ROLES && pair_role[pair] != TRACKED) continue;
+        const float d = as_float(pair_point_closeness[pair].y);
+        if (d <= 0.0f) continue;  // the very rim
+        const uint q = pair_pixel[pair];
+        const float3 r = camera_ray(&cam, q % cam.width, q / cam.width), e = c - t * r;
+        const float dL_dd = opacity[i] * pair_weight[pair].y / d * pair_gain[pair];
+        dL_dc += dL_dd / (fmax(1.0f - d, LEAST_RHO) * h * h) * (dot(r, e) / t * c - e);
+    }
+    const float3 world = edge * (dL_dc.x * cam.right + dL_dc.y * cam.down + dL_dc.z * cam.forward);
+    vstore3(world, i, grad_offset);
+}
