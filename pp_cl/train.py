@@ -92,6 +92,13 @@ class Trainer:
         padded, _, _ = camera.padded(NETWORK_MULTIPLE)
         return padded.height, padded.width
 
+    def take_plan(self) -> None:
+        """Take up another number of steps, in which there may be room for other refinements."""
+        before = self.refinements_to_come
+        self._refine_steps = refine_steps(self.config)
+        if self.refinements_to_come != before:
+            self._set_level()
+
     def _set_level(self):
         """Set images, crop size and object boxes for the present level of the grid: the images are
         halved once for every refinement still to come.
