@@ -32,13 +32,12 @@ def begun(tmp_path):
 
 
 def started(*words):
-    """A process `pp-cl view`, whose SIGINT is Ctrl-C's."""
+    """A process `pp-cl view`."""
     return subprocess.Popen(
         [sys.executable, "-m", "pp_cl", "view", *map(str, words)],
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
         text=True,
-        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.default_int_handler),
     )
 
 
@@ -50,6 +49,7 @@ def status(address):
         return error.code
 
 
+@pytest.mark.unix
 def test_the_address_works_and_ctrl_c_ends_cleanly(begun):
     process = started(begun, "--port", "0")
     try:
