@@ -46,7 +46,7 @@ def overall_means(means: Sequence[Row]) -> list[Row]:
 
 def _groups(rows, keys):
     """Lists of the rows whose values under the keys are the same."""
-    groups: dict[str, list[Row]] = {}
+    groups = {}
     for row in rows:
         groups.setdefault(repr([row[key] for key in keys]), []).append(row)
     return groups.values()

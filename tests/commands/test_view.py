@@ -144,13 +144,13 @@ def wait_for_the_browser(monkeypatch, noted):
     monkeypatch.setattr(Trainer, "train_step", waiting)
 
 
-@pytest.mark.unix
 def test_a_waiting_server_ends_with_its_parent(tmp_path):
     """A parent that is killed cannot end its child itself."""
     child = [sys.executable, "-m", "pp_cl", "view", str(tmp_path / "run"), "--wait", "--port", "0"]
     script = (
         "import subprocess, sys, os\n"
-        f"child = subprocess.Popen({child!r}, stdout=subprocess.PIPE, text=True)\n"
+        "pipes = dict.fromkeys(('stdin', 'stdout'), subprocess.PIPE)\n"
+        f"child = subprocess.Popen({child!r}, **pipes, text=True)\n"
         "print(child.pid, child.stdout.readline().split()[1], flush=True)\n"
         "os.kill(os.getpid(), 9)\n"
     )
@@ -164,7 +164,7 @@ def test_a_waiting_server_ends_with_its_parent(tmp_path):
             assert time.monotonic() < deadline
             time.sleep(0.1)
     except AssertionError:
-        os.kill(int(pid), signal.SIGKILL)
+        os.kill(int(pid), signal.SIGTERM)
         raise
 
 
