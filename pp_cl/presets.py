@@ -61,6 +61,7 @@ IMAGE_SIZES = {"tiny": 200, "small": 400, "full": None, "paper": None}
 # Settings with a short name on the command line and in session.train_scene().
 SHORT = {
     "iterations": "train.iterations",
+    "minutes": "train.minutes",
     "points": "points.count",
     "downscale": "scene.downscale",
     "masks": "scene.masks",

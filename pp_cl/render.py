@@ -7,13 +7,13 @@ project -> pairs -> blend weights -> shade the visible points -> blend their fea
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, Literal
 
 import numpy as np
 from pyopencl.array import Array
 
-from pp_cl.device.buffers import Buffers, Table, grown
+from pp_cl.device.buffers import Buffers, Reading, Table, grown
 from pp_cl.device.device import Device
 from pp_cl.files.picture import Picture
 from pp_cl.layers.tiles import tiles_hit
@@ -64,10 +64,10 @@ class RenderResult:
     points: ProjectedPoints
     pairs: Pairs
     weights: BlendWeights
-    tiles: Any
-    shaded_features: Any = None
-    features: Any = None
-    image: Any = None
+    tiles: Reading[np.ndarray] | None
+    shaded_features: Array = field(init=False)
+    features: Array = field(init=False)
+    image: Array = field(init=False)
     computed_fraction: float = 1.0
 
     def clamped(self) -> np.ndarray:

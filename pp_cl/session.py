@@ -36,6 +36,7 @@ from pp_cl.scene.load import measured_split, open_scene, preset_downscale, scene
 from pp_cl.scene.outline import picture
 from pp_cl.scene.views import View
 from pp_cl.train import Trainer
+from pp_cl.training.budget import Budget
 from pp_cl.training.checkpoint import load_run_state, opened_run
 from pp_cl.training.memory import Room
 from pp_cl.training.schedule import bound_to_end
@@ -132,7 +133,7 @@ class Training:
     def _run(self, on_step, is_stopped):
         trainer, settings = self.trainer, self.config.train
         with self.folder.open_log(trainer.step) as log:
-            seconds = log.seconds
+            seconds, budget = log.seconds, Budget(settings)
             first = trainer.step + 1
             self._expect_save()
             while trainer.step < settings.iterations:
@@ -143,7 +144,12 @@ class Training:
                     raise
                 start = time.perf_counter()
                 terms = trainer.train_step()
-                seconds += time.perf_counter() - start
+                took = time.perf_counter() - start
+                seconds += took
+                is_planned = settings.minutes and not trainer.begun
+                if is_planned and budget.plan(trainer.step, seconds, took):
+                    trainer.take_plan()
+                    self.folder.configure(self.config.to_json())
                 if trainer.step == first and self._lacks_previews():  # the kernels are built
                     self._preview_by = time.monotonic() + FIRST_PREVIEW
                 row = self._after_step(log, terms, seconds)
@@ -439,16 +445,24 @@ def run_config(
     config = load_config(folder.config) if stored else preset(preset_name or "tiny")
     given = list(given)
     configure(config, scene, given)
-    if not stored and "scene.downscale" not in [key for key, _, _ in given]:
+    origins = {key: origin for key, _, origin in given}
+    if "train.iterations" in origins and "train.minutes" in origins:
+        raise UserError(
+            f"{origins['train.minutes']}: the iterations follow from the minutes; leave one out"
+        )
+    if not stored and "scene.downscale" not in origins:
         downscale = preset_downscale(config.scene.path, config.preset)
         assign(config, "scene.downscale", downscale, "preset")
     if stored and folder.checkpoint.exists():
+        if stored.train.minutes:  # planned meanwhile, as train.iterations are
+            config.train.refine_at = stored.train.refine_at
         if extends and config.train.iterations != stored.train.iterations:
             with opened_run(folder, stored) as run:
                 if run.header["step"] == stored.train.iterations:
                     most = max(config.train.iterations, stored.train.iterations)
                     for one in (config, stored):
                         assign(one, "train.iterations", most, "settings")
+                        assign(one, "train.minutes", 0, "settings")
         _check_same(config, stored, folder)
     return config
 

@@ -137,6 +137,12 @@ class TrainConfig:
     """The optimisation."""
 
     iterations: int = setting(8_000, "training steps; every schedule ends at the last", 1, 10**8)
+    minutes: float = setting(
+        0.0,
+        "minutes of training: iterations follow from the measured speed (0: as set)",
+        0,
+        1440,
+    )
     seed: int = setting(0, "seed of all random choices", 0, 2**32 - 1)
     crop: int = setting(
         128, "side in pixels of the square crop of a step (0: whole images)", 0, 2**14

@@ -3,7 +3,6 @@ smoothing, EMA, pruning and refining where they are due. session.py has the loop
 """
 
 import warnings
-from typing import Any
 
 import numpy as np
 
@@ -61,7 +60,7 @@ class Trainer:
         self.renderer = Renderer(dev, model, config.raster)
         self.loss = Loss(dev, self.config.ssim_weight, self.config.smooth_l1)
         self.mask_loss = MaskLoss(dev, self.config.mask_weight)
-        self.exposure: Any = None
+        self.exposure: Exposure | None = None
         if self.config.exposure != "off":
             self.exposure = Exposure(dev, len(views), self.config.exposure == "on")
         self.perceptual_loss = None
@@ -93,6 +92,13 @@ class Trainer:
         padded, _, _ = camera.padded(NETWORK_MULTIPLE)
         return padded.height, padded.width
 
+    def take_plan(self) -> None:
+        """Take up another number of steps, in which there may be room for other refinements."""
+        before = self.refinements_to_come
+        self._refine_steps = refine_steps(self.config)
+        if self.refinements_to_come != before:
+            self._set_level()
+
     def _set_level(self):
         """Set images, crop size and object boxes for the present level of the grid: the images are
         halved once for every refinement still to come.
@@ -118,7 +124,7 @@ class Trainer:
         with self.dev.stage("target"):
             photograph, target_alpha = self._target.crop(view, box, jitter)
             target = photograph
-            if self.is_exposed:
+            if self.exposure and self.exposure.is_applied:
                 target = self.exposure.target(view_index, photograph, target_alpha)
             tiles_of_gradient = self._gradient_tiles(target, camera)
 
@@ -264,7 +270,7 @@ class Trainer:
                 stacklevel=2,
             )
         else:
-            self.exposure: Any = None
+            self.exposure = None
 
     def _smooth(self, rates):
         """Pull every SH coefficient towards the mean of its grid neighbours."""
@@ -360,7 +366,7 @@ class Trainer:
             self.optimiser.restore(arrays)
             if "exposure" not in arrays:
                 self.exposure = None
-            else:
+            elif self.exposure:
                 self.dev.write(self.exposure.state, arrays.pop("exposure"))
                 self.exposure.is_applied |= step >= decided_at(begun, len(self.views))
         elif self.config.ema and step >= ema_start(self.config.iterations):

@@ -64,7 +64,7 @@ def test_a_finished_run_is_left_alone_and_steps_are_told(scene, trained, tmp_pat
 
 
 def test_wrong_words_are_refused(scene, tmp_path):
-    with pytest.raises(TypeError, match="no iteration; it has iterations, points"):
+    with pytest.raises(TypeError, match="no iteration; it has iterations, "):
         pp_cl.train_scene(scene, tmp_path / "run", iteration=5)
     with pytest.raises(pp_cl.UserError, match="settings: unknown key 'train.x'"):
         pp_cl.train_scene(scene, tmp_path / "run", settings={"train.x": 1})

@@ -9,7 +9,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from pp_cl.scene.camera import Camera
-from pp_cl.scene.camera_path import looked_at, up_of
+from pp_cl.scene.camera_path import level, looked_at, up_of
 
 SEEN = 0.75  # of the cameras that see what most of them see: what the object's points have
 NEIGHBOURS, LONELY = 8, 3.0  # a point's distance to these, in medians, from which on it is alone
@@ -47,7 +47,8 @@ def find_world(cameras: Sequence[Camera], points: np.ndarray) -> World:
     centre = looked_at(cameras)
     eyes = np.stack([camera.eye for camera in cameras])
     reach = float(np.median(np.linalg.norm(eyes - centre, axis=1)))
-    rotation = _upright(up, eyes - centre)
+    ahead = level(eyes[0] - centre, up)
+    rotation = np.stack([ahead, np.cross(up, ahead), up])  # the first camera to the side of x
     upright = (points - centre) @ rotation.T / reach
     kept = _on_object(upright, _seen_share(cameras, points))
     ball = min(_seen_radius(camera, centre) for camera in cameras) / reach
@@ -70,15 +71,6 @@ def _seen_radius(camera, centre):
     """Radius of the ball around the centre that the camera sees as a whole."""
     angle = np.arctan(min(camera.width / camera.fx, camera.height / camera.fy) / 2)
     return np.linalg.norm(camera.eye - centre) * np.sin(angle)
-
-
-def _upright(up, offsets):
-    """(3, 3) rotation that turns `up` to z, and the first camera to the side of x."""
-    ahead = offsets[0] - offsets[0] @ up * up
-    if np.linalg.norm(ahead) < 1e-6 * np.linalg.norm(offsets[0]):
-        ahead = np.cross(up, np.eye(3)[np.argmin(np.abs(up))])
-    ahead /= np.linalg.norm(ahead)
-    return np.stack([ahead, np.cross(up, ahead), up])
 
 
 def _seen_share(cameras, points):

@@ -7,11 +7,10 @@ import os
 import signal
 import sys
 import threading
-import time
 from collections.abc import Callable
 from concurrent.futures import ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
-from multiprocessing import get_context
+from multiprocessing import get_context, parent_process
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -46,7 +45,7 @@ def isolated(folder: Path, function: Callable, *arguments: Any) -> Any:
     end their process. Raises UserError naming the folder where that happens.
     """
     needed("pycolmap")
-    with ProcessPoolExecutor(1, get_context("spawn"), _begin, (os.getpid(),)) as pool:
+    with ProcessPoolExecutor(1, get_context("spawn"), _begin) as pool:
         try:
             return pool.submit(function, *arguments).result()
         except BrokenProcessPool:
@@ -56,7 +55,7 @@ def isolated(folder: Path, function: Callable, *arguments: Any) -> Any:
             ) from None
 
 
-def _begin(parent):
+def _begin():
     """Ctrl-C ends the process at once, and so does the end of its parent; only Python writes to
     stderr.
     """
@@ -65,8 +64,7 @@ def _begin(parent):
     os.dup2(os.open(os.devnull, os.O_WRONLY), 2)
 
     def watch():
-        while os.getppid() == parent:
-            time.sleep(0.5)
+        parent_process().join()
         os._exit(1)
 
     threading.Thread(target=watch, daemon=True).start()

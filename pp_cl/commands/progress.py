@@ -12,6 +12,7 @@ from typing import Any, TextIO
 
 from tqdm import tqdm
 
+from pp_cl.config import preset
 from pp_cl.session import Training
 
 BUILDING = 2  # steps in which nearly all kernels are built, if the driver has not kept them
@@ -34,7 +35,8 @@ class Progress:
     def __init__(self, training: Training, stream: TextIO | None = None) -> None:
         self._dev, self._stream = training.trainer.dev, stream or sys.stderr
         self._built = training.trainer.step + BUILDING
-        self._steps = training.config.train.iterations
+        self._config, self._steps = training.config, training.config.train.iterations
+        self._is_told = False  # how many steps train.minutes allow
         self._bar, self._test, self._start, self._next = None, "", 0.0, 0.0
 
     def __enter__(self) -> "Progress":
@@ -54,6 +56,8 @@ class Progress:
                 self._bar = self._opened(step)
         elif self._bar is not None:
             self._bar.update()
+        if self._config.train.iterations != self._steps:
+            self._replan()
         if step <= self._built or row is None:
             return
         if "test_psnr" in row:
@@ -68,6 +72,18 @@ class Progress:
             left = tqdm.format_interval((self._steps - step) / rate)
             line = f"step {step} of {self._steps}, {rate:.3g} steps/s, {left} left, {text}"
             _print(line, self._stream)
+
+    def _replan(self):
+        """Take up the steps that train.minutes allow; the first time, tell of them."""
+        name, train = self._config.preset, self._config.train
+        if not self._is_told:
+            own = preset(name).train.iterations
+            minutes = f"{train.minutes:g} min"
+            text = f"{minutes}: {name}, about {train.iterations} steps (its own are {own})"
+            tqdm.write(text, self._stream)
+        self._steps, self._is_told = train.iterations, True
+        if self._bar is not None:
+            self._bar.total = self._steps
 
     def _opened(self, step):
         columns, rows = shutil.get_terminal_size(SIZE)

@@ -28,6 +28,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         ),
     )
     add("--iterations", metavar="N", help="steps of training; more of them extend a finished run")
+    add(
+        "--minutes",
+        metavar="N",
+        help=(
+            "instead of iterations: as many as take so long here, within a quarter (reading the"
+            " scene and `pp-cl eval` come on top)"
+        ),
+    )
     add("--points", metavar="N", help="wanted points on the grid")
     add(
         "--downscale", metavar="K", help="reduce the images K times (default: to the preset's size)"

@@ -78,8 +78,9 @@ def packed_arrays(dev: Device, rows: Sequence[Row]) -> tuple[Array, list[Array]]
     transfer handles them all. The arrays are valid as long as the octets are held.
     """
     whole, arrays = dev.zeros((packed_bytes(dev, rows),), np.uint8), []
+    data: Any = whole.base_data
     for start, (shape, dtype) in zip(_packed_starts(dev, rows), rows, strict=False):
-        region = whole.base_data.get_sub_region(start, max(1, _row_bytes(shape, dtype)))
+        region = data.get_sub_region(start, max(1, _row_bytes(shape, dtype)))
         arrays.append(Array(dev.queue, shape, dtype, data=region))
     return whole, arrays
 
@@ -116,8 +117,8 @@ class PackedArrays:
         packed = np.empty(self._whole.shape, np.uint8)
         for array, value in zip(self._arrays, values, strict=True):
             octets = np.ascontiguousarray(value).reshape(-1).view(np.uint8)
-            start = array.base_data.offset
-            packed[start : start + value.nbytes] = octets
+            data: Any = array.base_data
+            packed[data.offset : data.offset + value.nbytes] = octets
         self._dev.send(self._whole, packed)
         return self._arrays
 

@@ -12,13 +12,16 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cached_property
 from types import CodeType
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pyopencl as cl
 import pyopencl.array as cl_array
 
 from pp_cl.errors import BuildError, UserError
+
+if TYPE_CHECKING:
+    from pp_cl.device.device import Device
 
 # Work-group sizes when the caller names none. They are fixed, and the global size is rounded up to
 # them, because PoCL compiles a kernel again for every new work-group size; hence the tail guards.
@@ -161,7 +164,7 @@ class Kernel:
         kernel.set_scalar_arg_dtypes([None if p.space else p.dtype for p in parameters])
         self.kernel = kernel
         limit = cl.kernel_work_group_info.WORK_GROUP_SIZE
-        self.largest_group = kernel.get_work_group_info(limit, device)  # work-items
+        self.largest_group: Any = kernel.get_work_group_info(limit, device)  # work-items
         self.parameters = parameters
         self.names = {p.name for p in parameters}
         self.label = label
@@ -333,11 +336,11 @@ def quiet_compiler() -> Iterator[None]:
 
 
 class Program:
-    """One built cl/*.cl file. device: the pp_cl.device.device.Device that builds and runs it."""
+    """One built cl/*.cl file."""
 
     def __init__(
         self,
-        device: Any,
+        device: "Device",
         name: str,
         source: str,
         *,
@@ -404,10 +407,10 @@ class Program:
                 self.device.observe(kernel, event, arguments)
 
 
-# ---- how much a work-item does; dev: a pp_cl.device.device.Device
+# ---- how much a work-item does
 
 
-def lanes(dev: Any, on_gpu: int = 1) -> int:
+def lanes(dev: "Device", on_gpu: int = 1) -> int:
     """LANES of kernels (cl/lanes.h): neighbouring values that one work-item takes. on_gpu: how many
     on GPUs, 1 or 4.
 
@@ -418,13 +421,13 @@ def lanes(dev: Any, on_gpu: int = 1) -> int:
     return 16 if dev.is_cpu else on_gpu
 
 
-def row_parts(dev: Any, on_gpu: int = 1) -> int:
+def row_parts(dev: "Device", on_gpu: int = 1) -> int:
     """Work-items for the 16 channels of a row, LANES each. on_gpu: as for lanes()."""
     return 16 // lanes(dev, on_gpu)
 
 
 def channel_ranges(
-    dev: Any, height: int, width: int, channels: int
+    dev: "Device", height: int, width: int, channels: int
 ) -> tuple[tuple[int, int, int], tuple[int, int, int]]:
     """(work-items, work-group) of a kernel with an item per (LANES channels, x, y) of a feature map
     (height, width, channels). On GPUs those in step are neighbours in memory.
@@ -433,14 +436,14 @@ def channel_ranges(
     return size, (1, 16, 4) if dev.is_cpu else (16, 4, 1)
 
 
-def group_ranges(dev: Any, groups: int, members: int) -> tuple[int, int | None]:
+def group_ranges(dev: "Device", groups: int, members: int) -> tuple[int, int | None]:
     """(work-items, work-group) of a kernel in which groups of `members` work-items cooperate; on
     CPUs a group is one work-item. A work-group holds one or more groups as a whole.
     """
     return (groups, None) if dev.is_cpu else (groups * members, max(members, SMALL_GROUP))
 
 
-def group_items(dev: Any) -> int:
+def group_items(dev: "Device") -> int:
     """GROUP of kernels (cl/group.h): work-items that sum or scan together; a power of two on GPUs,
     1 on CPUs. Of kernels that the device runs in fewer, launch_groups() takes less.
     """
@@ -450,7 +453,7 @@ def group_items(dev: Any) -> int:
 
 
 def launch_groups(
-    dev: Any,
+    dev: "Device",
     name: str,
     kernel: str,
     groups: int,

@@ -68,7 +68,6 @@ def export(
         return f"{write_gallery(path, chain([run], others))} pages and their index"
     if name == "scene":
         splits = renderings(run)
-        path.parent.mkdir(exist_ok=True)
         write_scene(splits, path)
         return ", ".join(f"{len(views)} {split} views" for split, views in splits.items())
     if name in ("splat", "splat-glb"):

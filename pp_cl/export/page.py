@@ -18,7 +18,7 @@ from pp_cl.files.atomic import atomic_folder, write_text
 from pp_cl.files.image import to_8bit, write_png
 from pp_cl.run import NEAREST, Run
 from pp_cl.scene.camera import Camera
-from pp_cl.scene.camera_path import up_of
+from pp_cl.scene.camera_path import level, up_of
 from pp_cl.scene.grid import Grid
 
 # Bytes of a point: place (3, uint16), opacity (uint16), coefficients (27 and 1 unused, uint8).
@@ -138,7 +138,6 @@ def _header(run, low, span):
     grid = run.model.grid
     origin, unit = lattice(grid)
     centre, radius = run.ball
-    cameras = run.cameras("train")
     eye, up = first_look(run)
     return {
         "count": run.model.cloud.count,
@@ -148,7 +147,11 @@ def _header(run, low, span):
         "radius": float(run.config.raster.radius * grid.edge),
         "nearest": float(NEAREST * radius),
         "centre": centre.tolist(),
-        "pixel": min(_pixel_width(camera, centre) for camera in cameras),
+        # of the finest camera, in world units at the distance of the centre
+        "pixel": min(
+            float(np.linalg.norm(camera.eye - centre)) / min(camera.fx, camera.fy)
+            for camera in run.cameras("train")
+        ),
         "low": low.tolist(),
         "span": span.tolist(),
         "eye": eye.tolist(),
@@ -158,26 +161,11 @@ def _header(run, low, span):
 
 
 def first_look(run: Run) -> tuple[np.ndarray, np.ndarray]:
-    """(eye, up), both (3,), with which a page begins; it looks at the middle of run.ball."""
+    """(eye, up), both (3,), with which a page begins: it looks at the middle of run.ball from the
+    side of the first training view, 20 degrees above the horizon, and shows the whole ball.
+    """
     centre, radius = run.ball
     cameras = run.cameras("train")
-    up = up_of(cameras)
-    return centre + _first_offset(cameras[0].eye - centre, up) * radius, up
-
-
-def _pixel_width(camera, centre):
-    """Of a camera's pixel, in world units at the distance of the centre."""
-    return float(np.linalg.norm(camera.eye - centre)) / min(camera.fx, camera.fy)
-
-
-def _first_offset(towards, up):
-    """Where the page's first eye is from the centre, in radii: at the side of the first training
-    view, 20 degrees above the horizon, at a distance from which the page shows the whole ball.
-    """
-    level = towards - towards @ up * up
-    if np.linalg.norm(level) < 1e-6:
-        level = np.cross(up, np.eye(3)[np.abs(up).argmin()])
-    level /= np.linalg.norm(level)
-    rise = np.radians(20)
-    distance = 1 / np.sin(np.radians(FIELD_OF_VIEW) / 2)
-    return distance * (np.cos(rise) * level + np.sin(rise) * up)
+    up, rise = up_of(cameras), np.radians(20)
+    towards = np.cos(rise) * level(cameras[0].eye - centre, up) + np.sin(rise) * up
+    return centre + radius / np.sin(np.radians(FIELD_OF_VIEW) / 2) * towards, up

@@ -112,7 +112,7 @@ def write_splat_glb(path: Path | str, table: np.ndarray, origin: np.ndarray) -> 
         "POSITION": positions,
         # of programs that draw points instead
         "COLOR_0": gltf_colours(to_8bit(0.5 + CONSTANT * table["harmonics"][:, 0])),
-        prefix + "ROTATION": np.tile(np.float32([0, 0, 0, 1]), (len(table), 1)),
+        prefix + "ROTATION": np.tile(np.array([0, 0, 0, 1], np.float32), (len(table), 1)),
         prefix + "SCALE": table["deviation"].repeat(3).reshape(-1, 3),
         prefix + "OPACITY": table["opacity"],
     }

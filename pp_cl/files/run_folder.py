@@ -102,8 +102,12 @@ class RunFolder:
         if not self.checkpoint.exists():
             for picture in (self.path / MASKS_PICTURE, *self.previews.glob("step_*.png")):
                 picture.unlink(missing_ok=True)
-        write_text(self.config, config_json + "\n")
+        self.configure(config_json)
         self.previews.mkdir(exist_ok=True)
+
+    def configure(self, config_json: str) -> None:
+        """Write config.json."""
+        write_text(self.config, config_json + "\n")
 
     def rows(self) -> list[dict[str, Any]]:
         """The rows of the log, up to the first that is broken."""

@@ -67,7 +67,7 @@ class FeatureMaps:
 
     def __init__(self, dev: Device, layers: list[Layer], training: bool):
         self.dev, self.layers, self.training = dev, layers, training
-        self.size: Any = None  # (height, width)
+        self.size = (0, 0)  # (height, width)
         self.arrays: dict[str, Array] = {}
         self._buffers: list[Any] = []
         self._all_tiles: AllTiles | None = None
@@ -78,7 +78,7 @@ class FeatureMaps:
         """
         if size == self.size:
             return
-        self.size, self.arrays, self._all_tiles = None, {}, None
+        self.size, self.arrays, self._all_tiles = (0, 0), {}, None
         shapes = array_shapes(self.layers, size)
         shared = share_buffers(lifetimes(self.layers, self.training), shapes)
         self._buffers += [None] * (len(shared) - len(self._buffers))

@@ -5,7 +5,6 @@ list of visible points, and each point's highest weight for pruning.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from pyopencl.array import Array
@@ -43,7 +42,7 @@ class BlendWeights:
     point_is_shaded: Array
     shaded_list: Reading[Array]
     point_slot: Array
-    transmittance: Any
+    transmittance: Array | None
 
     @property
     def shaded(self) -> Array:

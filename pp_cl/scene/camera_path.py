@@ -49,7 +49,7 @@ class Surroundings:
         self.distance = float(np.median(np.linalg.norm(offsets, axis=1)))
         heights = offsets @ self.up / np.linalg.norm(offsets, axis=1)
         self.elevations = np.clip(np.arcsin(np.clip(heights, -1, 1)), -HIGHEST, HIGHEST)
-        self._ahead = _unit(offsets[0] - offsets[0] @ self.up * self.up, self.up)
+        self._ahead = level(offsets[0], self.up)
         self._aside = np.cross(self.up, self._ahead)
 
     def orbit(self, camera: Camera, frames: int) -> list[Camera]:
@@ -90,10 +90,9 @@ class Surroundings:
         return float(max(across.max(), down.max()))
 
 
-def _unit(vector, up):
-    """The vector at length 1; where it is 0, some unit vector across `up`."""
-    length = np.linalg.norm(vector)
-    if length > 1e-9:
-        return vector / length
-    across = np.cross(up, np.eye(3)[np.argmin(np.abs(up))])
+def level(vector: np.ndarray, up: np.ndarray) -> np.ndarray:
+    """(3,) unit vector across `up` towards which a vector leans, some other where it does not."""
+    across = vector - vector @ up * up
+    if np.linalg.norm(across) <= 1e-6 * np.linalg.norm(vector):
+        across = np.cross(up, np.eye(3)[np.argmin(np.abs(up))])
     return across / np.linalg.norm(across)

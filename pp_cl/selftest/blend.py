@@ -61,8 +61,9 @@ def _forward(rule: str, kind: str, dev: Device, rng: np.random.Generator) -> Ite
         yield exact(blended.features[empty], np.ones((empty.sum(), 16)))
         yield exact(weights.shaded.get(), blended.scene.seen)
         if rule == "alpha":
+            transmittance: Any = weights.transmittance
             background = blended.blend["background"]
-            yield absolute(weights.transmittance.get(), background, WEIGHT[rule])
+            yield absolute(transmittance.get(), background, WEIGHT[rule])
 
 
 def _backward(rule: str, kind: str, dev: Device, rng: np.random.Generator) -> Iterator[Check]:

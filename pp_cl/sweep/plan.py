@@ -20,7 +20,8 @@ TAKEN = {"train.seed": "--seeds", "scene.path": "more scenes as arguments"}
 class Job:
     """A run of a sweep. scene: absolute folder, or demo; name: the scene in the table. varied:
     (key, text of the value) of what differs between the settings; given: all that is set. folder:
-    of the run, absolute; iterations: of its training.
+    of the run, absolute; iterations: of its training, 0 where minutes are
+    given.
     """
 
     scene: str
@@ -120,7 +121,7 @@ def plan(
                     preset=preset_name,
                     given=(*own, ("train.seed", str(seed), "--seeds")),
                     metrics=tuple(metrics),
-                    iterations=config.train.iterations,
+                    iterations=0 if config.train.minutes else config.train.iterations,
                 )
                 for seed in seeds
             ]

@@ -68,4 +68,5 @@ def progress(job: Job) -> str:
     if rows[-1].get("finished"):
         return "evaluating"
     psnr = f", PSNR {rows[-1]['psnr']:.1f}" if "psnr" in rows[-1] else ""
-    return f"step {rows[-1]['step']} of {job.iterations}{psnr}"
+    steps = f" of {job.iterations}" if job.iterations else ""
+    return f"step {rows[-1]['step']}{steps}{psnr}"

@@ -1,6 +1,6 @@
-"""The table of a sweep: means over seeds, means over scenes, as text, Markdown and JSON."""
+"""The table of a sweep: means and spread over seeds, means over scenes; as text, Markdown, JSON."""
 
-import math
+import statistics
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -20,14 +20,15 @@ COLUMNS = {
 
 
 def scene_means(rows: Sequence[Row]) -> list[Row]:
-    """{"scene", "settings", "runs", "failed"} and the means over the seeds that went well, for each
-    scene and setting, in the order of the rows.
+    """{"scene", "settings", "runs", "failed"}, means over the seeds that went well, and "spread",
+    {key: standard deviation} of several, for each scene and setting, in the order of the rows.
     """
     means = []
     for group in _groups(rows, ("scene", "settings")):
         good = [row for row in group if "error" not in row]
         head = {"scene": group[0]["scene"], "settings": group[0]["settings"]}
-        means.append(head | {"runs": len(good), "failed": len(group) - len(good)} | _mean(good))
+        head |= {"runs": len(good), "failed": len(group) - len(good)} | _over(good)
+        means.append(head | {"spread": _over(good, statistics.stdev) if good[1:] else {}})
     return means
 
 
@@ -39,25 +40,23 @@ def overall_means(means: Sequence[Row]) -> list[Row]:
     for group in _groups(means, ("settings",)):
         good = [row for row in group if row["runs"]]
         counts = {"scenes": len(good), "missing": len(group) - len(good)}
-        overall.append({"settings": group[0]["settings"]} | counts | _mean(good))
+        overall.append({"settings": group[0]["settings"]} | counts | _over(good))
     return overall
 
 
 def _groups(rows, keys):
     """Lists of the rows whose values under the keys are the same."""
-    groups: dict[str, list[Row]] = {}
+    groups = {}
     for row in rows:
         groups.setdefault(repr([row[key] for key in keys]), []).append(row)
     return groups.values()
 
 
-def _mean(rows):
-    """{key: mean} of what is measured; a key that a row lacks is left out."""
+def _over(rows, measure=statistics.fmean):
+    """{key: mean} of what is measured, or another measure; a key that a row lacks is left out."""
     columns = {key: [row.get(key) for row in rows] for key in COLUMNS}
     return {
-        key: math.fsum(values) / len(values)
-        for key, values in columns.items()
-        if values and None not in values
+        key: measure(values) for key, values in columns.items() if values and None not in values
     }
 
 
@@ -75,9 +74,15 @@ def cells(rows: Sequence[Row]) -> list[list[str]]:
         entries += [("mean", row["scenes"], row["missing"], " scenes", row) for row in overall]
     for name, good, bad, what, row in entries:
         count = f"{good} of {good + bad}{what}" if bad else f"{good}{what}"
-        values = [format(row[key], COLUMNS[key][1]) if key in row else "-" for key in shown]
+        values = [_cell(row, key) for key in shown]
         lines.append([name, *[_setting_text(row)] * varies, count, *values])
     return lines
+
+
+def _cell(row, key):
+    """A column's mean and, of several seeds, its spread."""
+    parts = (row, row.get("spread", {}))
+    return " ± ".join(format(part[key], COLUMNS[key][1]) for part in parts if key in part) or "-"
 
 
 def _setting_text(row):

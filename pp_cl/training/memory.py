@@ -4,7 +4,7 @@ and compares the sum with the memory of device and host.
 
 import math
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -104,12 +104,12 @@ class Room:
     """Checks that a training fits the available memory; made before the training allocates
     anything.
 
-    photographs: of the training views. plan: that of the last check, None before.
+    photographs: of the training views. plan: that of the last check.
     """
 
     def __init__(self, config: Config, net: UNet, photographs: Sequence[Photograph]):
         self.dev = net.dev
-        self.plan: Any = None
+        self.plan: Plan
         self._config, self._net, self._photographs = config, net, photographs
         cameras = [one.camera for one in photographs]
         self._largest = max(cameras, key=lambda camera: (camera.width * camera.height, camera.fx))

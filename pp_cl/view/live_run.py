@@ -21,6 +21,7 @@ from pp_cl.scene.camera import Camera
 from pp_cl.scene.camera_path import up_of
 from pp_cl.scene.readers.frame import frame_keys
 from pp_cl.scene.target import Target
+from pp_cl.scene.views import View
 from pp_cl.view import shown
 from pp_cl.view.messages import LEAST_SIDE, ViewRequest
 
@@ -44,7 +45,7 @@ class LiveRun:
         self.loads = 0
         self._scene_path = scene
         self._run: Run | None = None
-        self._views: Any = None
+        self._views: list[View] = []
         self._stamp = self._log_stamp = None
         self._fewer = None  # (share, Renderer) of the points last kept
         self._target = Target(dev)
@@ -65,7 +66,7 @@ class LiveRun:
             else:
                 self.notice = str(error)
             return True
-        if self._views is None:
+        if not self.loads:
             self._views, self.notice = _training_views(run)
         self._run, self._fewer, self.waiting = run, None, None
         self.loads += 1

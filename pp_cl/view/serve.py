@@ -9,6 +9,7 @@ import importlib.util
 import os
 import signal
 import socket
+import stat
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
@@ -23,7 +24,6 @@ from pp_cl.scene.load import is_scene
 from pp_cl.view.access import Access
 from pp_cl.view.live_run import LiveRun
 
-WAIT_SECONDS = 0.5  # between two looks for what is waited for
 GRACE_SECONDS = 10.0  # for a server in the background to end
 
 
@@ -48,10 +48,9 @@ def serve(
 
     port: 0 takes a free one. announce: called with the address once it listens. device: as `pp-cl
     devices` lists them. scene: where the run's scene is now. wait: for the folder to become a run,
-    and end with the process that has started this one. Raises UserError for a folder that is
-    neither, and for a host or port that cannot be had.
+    and end with the process that has started this one, if that keeps a pipe to its input. Raises
+    UserError for a folder that is neither, and for a host or port that cannot be had.
     """
-    parent = os.getppid() if wait else None  # first of all: it may be gone once it is answered
     check_installed()
     shown = None
     if not wait and not RunFolder(folder).config.exists() and is_scene(folder):
@@ -74,7 +73,7 @@ def serve(
         signal.signal(signal.SIGTERM, lambda *_: signal.raise_signal(signal.SIGINT))
         access = Access(host, listening.getsockname()[1])
         live = shown or LiveRun(open_device(device), folder, scene)
-        asyncio.run(_serve(live, access, listening, announce=announce, parent=parent))
+        asyncio.run(_serve(live, access, listening, announce=announce, wait=wait))
 
 
 @contextlib.contextmanager
@@ -87,13 +86,13 @@ def serve_in_background(folder: Path | str, device: str | None = None) -> Iterat
     check_installed()
     words = [sys.executable, "-m", "pp_cl", "view", str(folder), "--wait", "--open", "--port", "0"]
     words += [] if device is None else ["--device", device]
-    process = subprocess.Popen(words, stdin=subprocess.DEVNULL)
+    process = subprocess.Popen(words, stdin=subprocess.PIPE)
     try:
         yield
     finally:
         process.terminate()
         try:
-            process.wait(GRACE_SECONDS)
+            process.communicate(timeout=GRACE_SECONDS)
         except subprocess.TimeoutExpired:
             process.kill()
             process.wait()
@@ -114,9 +113,9 @@ def _listen(host, port):
         raise UserError(line) from None
 
 
-async def _serve(live, access, listening, *, announce, parent):
+async def _serve(live, access, listening, *, announce, wait):
     """Serve a LiveRun or a ShownScene until cancelled, until drawing fails, which is a bug, or
-    until the parent, a process, is gone; None: that does not matter.
+    until a pipe to our input ends, if wait.
     """
     from aiohttp import web
 
@@ -130,15 +129,9 @@ async def _serve(live, access, listening, *, announce, parent):
         await web.SockSite(runner, listening).start()
         announce(access.address)
         ends = [asyncio.create_task(server.draw())]
-        if parent is not None:
-            ends.append(asyncio.create_task(_ended(parent)))
+        if wait and stat.S_ISFIFO(os.fstat(0).st_mode):
+            ends.append(asyncio.create_task(asyncio.to_thread(os.read, 0, 1)))
         done, _ = await asyncio.wait(ends, return_when=asyncio.FIRST_COMPLETED)
         done.pop().result()
     finally:
         await runner.cleanup()
-
-
-async def _ended(parent):
-    """Wait until the process that has started this one is gone."""
-    while os.getppid() == parent:
-        await asyncio.sleep(WAIT_SECONDS)

@@ -1,7 +1,6 @@
 """The command pp-cl export: what it writes where, and one line for whatever is wrong."""
 
 import json
-import os
 import shutil
 
 import pytest
@@ -25,7 +24,7 @@ def unfinished(tmp_path_factory):
 @pytest.fixture
 def copied(unfinished, tmp_path):
     """A copy of it, in a folder whose name is no UTF-8, and whose scene is gone."""
-    run = tmp_path / os.fsdecode(b"run \xff")
+    run = tmp_path / "run \udcff"
     shutil.copytree(unfinished, run)
     config = json.loads((run / "config.json").read_text())
     config["scene"]["path"] = "/nowhere/at/all"

@@ -1,7 +1,6 @@
 """`pp-cl render`: films and frames as asked for, what is taken up again, what is refused."""
 
 import json
-import os
 import shutil
 from pathlib import Path
 
@@ -64,7 +63,7 @@ def test_a_film_that_was_interrupted_goes_on(trained, tmp_path, capsys, monkeypa
 def test_sizes_have_folders_of_their_own_and_need_no_scene(trained, capsys):
     """The run's name is no UTF-8, and its scene is gone."""
     run = Path(trained)
-    run = shutil.copytree(run, run.with_name(os.fsdecode(b"run \xff")))
+    run = shutil.copytree(run, run.with_name("run \udcff"))
     config = json.loads((run / "config.json").read_text())
     config["scene"]["path"] = "/nowhere/at/all"
     (run / "config.json").write_text(json.dumps(config))

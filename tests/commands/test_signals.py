@@ -1,6 +1,5 @@
 """Ctrl-C and SIGTERM: the step is finished and a checkpoint written."""
 
-import os
 import signal
 from pathlib import Path
 
@@ -90,7 +89,7 @@ def test_ignored_signals_stay_ignored(monkeypatch):
     before = signal.signal(signal.SIGINT, signal.SIG_IGN)
     try:
         with first_signal() as caught:
-            os.kill(os.getpid(), signal.SIGINT)
+            signal.raise_signal(signal.SIGINT)
             assert signal.getsignal(signal.SIGINT) is signal.SIG_IGN and not caught
     finally:
         signal.signal(signal.SIGINT, before)

@@ -163,6 +163,7 @@ def scheduler():
             process.stderr.close()
 
 
+@pytest.mark.unix
 @pytest.mark.slow
 def test_a_scheduler_started_by_hand(scenes, scheduler, tmp_path, capsys):
     """A run that fails leaves the others alone; Ctrl-C ends a training with its checkpoint."""

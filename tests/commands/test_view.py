@@ -32,13 +32,12 @@ def begun(tmp_path):
 
 
 def started(*words):
-    """A process `pp-cl view`, whose SIGINT is Ctrl-C's."""
+    """A process `pp-cl view`."""
     return subprocess.Popen(
         [sys.executable, "-m", "pp_cl", "view", *map(str, words)],
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
         text=True,
-        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.default_int_handler),
     )
 
 
@@ -50,6 +49,7 @@ def status(address):
         return error.code
 
 
+@pytest.mark.unix
 def test_the_address_works_and_ctrl_c_ends_cleanly(begun):
     process = started(begun, "--port", "0")
     try:
@@ -144,13 +144,13 @@ def wait_for_the_browser(monkeypatch, noted):
     monkeypatch.setattr(Trainer, "train_step", waiting)
 
 
-@pytest.mark.unix
 def test_a_waiting_server_ends_with_its_parent(tmp_path):
     """A parent that is killed cannot end its child itself."""
     child = [sys.executable, "-m", "pp_cl", "view", str(tmp_path / "run"), "--wait", "--port", "0"]
     script = (
         "import subprocess, sys, os\n"
-        f"child = subprocess.Popen({child!r}, stdout=subprocess.PIPE, text=True)\n"
+        "pipes = dict.fromkeys(('stdin', 'stdout'), subprocess.PIPE)\n"
+        f"child = subprocess.Popen({child!r}, **pipes, text=True)\n"
         "print(child.pid, child.stdout.readline().split()[1], flush=True)\n"
         "os.kill(os.getpid(), 9)\n"
     )
@@ -164,7 +164,7 @@ def test_a_waiting_server_ends_with_its_parent(tmp_path):
             assert time.monotonic() < deadline
             time.sleep(0.1)
     except AssertionError:
-        os.kill(int(pid), signal.SIGKILL)
+        os.kill(int(pid), signal.SIGTERM)
         raise
 
 

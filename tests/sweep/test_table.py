@@ -30,8 +30,13 @@ ROWS = [
 ]
 
 
+APART = {"psnr": 3.0, "ssim": 0.25, "points": 3, "seconds": 1.0}  # of the runs of a
+
+
 def test_means_over_seeds_then_over_scenes():
-    """By hand: a (20 + 23) / 2, b 31 alone; scenes count the same whatever their runs."""
+    """By hand: a (20 + 23) / 2, b 31 alone; scenes count the same whatever their runs. Of two
+    values the standard deviation is the distance over the root of 2.
+    """
     a, b = scene_means(ROWS)
     assert a == {
         "scene": "a",
@@ -42,8 +47,9 @@ def test_means_over_seeds_then_over_scenes():
         "ssim": 0.625,
         "points": 101.5,
         "seconds": 1.5,
+        "spread": pytest.approx({k: v / 2**0.5 for k, v in APART.items()}),
     }
-    assert (b["runs"], b["failed"], b["psnr"]) == (1, 1, 31.0)
+    assert (b["runs"], b["failed"], b["psnr"], b["spread"]) == (1, 1, 31.0, {})
     (overall,) = overall_means([a, b])
     assert overall == {
         "settings": {},
@@ -98,10 +104,10 @@ def test_unknown_seconds_make_no_mean():
 
 def test_the_printed_table():
     assert text_table(ROWS).splitlines() == [
-        "scene  runs       PSNR    SSIM  points  seconds",
-        "a      2         21.50  0.6250     102      1.5",
-        "b      1 of 2    31.00  0.2500      11     10.0",
-        "mean   2 scenes  26.25  0.4375      56      5.8",
+        "scene  runs              PSNR             SSIM   points    seconds",
+        "a      2         21.50 ± 2.12  0.6250 ± 0.1768  102 ± 2  1.5 ± 0.7",
+        "b      1 of 2           31.00           0.2500       11       10.0",
+        "mean   2 scenes         26.25           0.4375       56        5.8",
     ]
 
 
@@ -111,7 +117,7 @@ def test_markdown_names_what_failed():
     assert text[:3] == [
         "| scene | runs | PSNR | SSIM | points | seconds |",
         "| --- | --- | ---: | ---: | ---: | ---: |",
-        "| a | 2 | 21.50 | 0.6250 | 102 | 1.5 |",
+        "| a | 2 | 21.50 ± 2.12 | 0.6250 ± 0.1768 | 102 ± 2 | 1.5 ± 0.7 |",
     ]
     assert text[-3:] == ["Failed:", "", "- b\\|c seed 2: x \\| y"]
     assert "Failed" not in markdown(ROWS[:3])

@@ -166,7 +166,6 @@ def test_the_nearest_view_counts_place_and_direction():
     assert nearest_view([away, cameras[2]], cameras[2], centre) == 1
 
 
-@pytest.mark.unix
 def test_rows_of_the_log_that_are_no_rows_are_left_out(dev, copied):
     lines = (copied / "log.jsonl").read_text().splitlines(keepends=True)
     live = LiveRun(dev, copied)
@@ -176,5 +175,6 @@ def test_rows_of_the_log_that_are_no_rows_are_left_out(dev, copied):
     (copied / "log.jsonl").write_text(lines[0] + lines[1][:9])
     assert live.new_rows() == rows[:1]
     (copied / "log.jsonl").unlink()
-    os.mkfifo(copied / "log.jsonl")  # is not waited for
+    if hasattr(os, "mkfifo"):
+        os.mkfifo(copied / "log.jsonl")  # is not waited for
     assert not live.new_rows()

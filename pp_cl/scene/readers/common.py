@@ -136,11 +136,8 @@ def checked_box(corners: object, fail: Fail) -> np.ndarray:
     """(2, 3) lower and upper corner of a box that a file states. Raises fail(text) for what is
     none.
     """
-    try:
-        box = np.array(corners, np.float64)
-    except (TypeError, ValueError):  # no numbers, or lists of different lengths
-        box = np.empty(0)
-    if box.shape != (2, 3) or not (np.abs(box) < MOST).all() or not (box[1] > box[0]).all():
+    box = numbers(corners, (2, 3))
+    if box is None or not (box[1] > box[0]).all():
         raise fail(
             f"is {quoted(corners, 60)}; must be two corners of three numbers, the upper one larger"
             " in x, y and z"
@@ -149,6 +146,21 @@ def checked_box(corners: object, fail: Fail) -> np.ndarray:
 
 
 # Files of numbers ---------------------------------------------------------------------------------
+
+
+def numbers(value: Any, shape: tuple[int, ...] | None = None) -> np.ndarray | None:
+    """float64 array of nested lists of numbers, or of an array; None for anything else, as words
+    and truth values. shape: the only one allowed, of numbers that are finite and not huge.
+    """
+    try:
+        leaves = np.array(value, object).ravel()
+        if any(isinstance(leaf, (str, bytes, bool)) for leaf in leaves):
+            return None
+        array = np.array(value, np.float64)
+    except (TypeError, ValueError, OverflowError):
+        return None
+    fits = shape is None or (array.shape == shape and (np.abs(array) < MOST).all())
+    return array if fits else None
 
 
 def read_json(file: Path) -> Any:

@@ -13,7 +13,7 @@ import numpy as np
 from pp_cl.errors import UserError, quoted
 from pp_cl.scene.camera import Camera
 from pp_cl.scene.distortion import Distortion
-from pp_cl.scene.readers.common import MOST, Fail, find_image
+from pp_cl.scene.readers.common import MOST, Fail, find_image, numbers
 
 # values of camera_model: perspective lenses, and fisheyes
 PINHOLES = ("PERSPECTIVE", "PINHOLE", "SIMPLE_PINHOLE", "OPENCV", "SIMPLE_RADIAL", "RADIAL")
@@ -75,8 +75,8 @@ class Frame:
 
     def array(self, key: str, shape: tuple[int, ...]) -> np.ndarray:
         """Finite float64 array of a shape. Raises UserError where there is none."""
-        array = numbers(self.get(key))
-        if array is None or array.shape != shape or not (np.abs(array) < MOST).all():
+        array = numbers(self.get(key), shape)
+        if array is None:
             raise self.error(key, f"must be {'x'.join(map(str, shape))} finite numbers")
         return array
 
@@ -88,10 +88,6 @@ class Frame:
         if not isinstance(given, str) or not given:
             raise self.error(key, "must be the path of an image")
         return find_image(folder, given, partial(self.error, key), endings)
-
-    def pose(self, key: str) -> np.ndarray:
-        """rigid() of the value of a key."""
-        return rigid(self.get(key), partial(self.error, key))
 
 
 def frame_keys(camera: Camera) -> dict[str, Any]:
@@ -117,9 +113,9 @@ def pinhole(frame: Frame, width: int, height: int) -> Camera:
     if fx is None:
         raise frame.error("fl_x", "is missing, and so is camera_angle_x; add one of them")
     fy = _focal_length(frame, "fl_y", "camera_angle_y", height)
-    cx, cy = frame.number("cx"), frame.number("cy")
+    cx, cy, key = frame.number("cx"), frame.number("cy"), "transform_matrix"
     return Camera(
-        frame.pose("transform_matrix") @ GL_FROM_CV,
+        rigid(frame.get(key), partial(frame.error, key)) @ GL_FROM_CV,
         fx,
         fx if fy is None else fy,
         width / 2 if cx is None else cx,
@@ -153,19 +149,6 @@ def distortion(frame: Frame) -> Distortion:
             raise frame.error(key, f"is not modelled with this lens; {UNDISTORT}")
     numbers = {key: frame.number(key) or 0.0 for key in ("k1", "k2", "p1", "p2", "k3", "k4")}
     return Distortion(**numbers, fisheye=is_fisheye)
-
-
-def numbers(value: Any) -> np.ndarray | None:
-    """float64 array of nested lists of numbers, or of an array; None for anything else, as words
-    and truth values.
-    """
-    try:
-        leaves = np.array(value, object).ravel()
-        if any(isinstance(leaf, (str, bytes, bool)) for leaf in leaves):
-            return None
-        return np.array(value, np.float64)
-    except (TypeError, ValueError, OverflowError):
-        return None
 
 
 def rigid(value: Any, fail: Fail) -> np.ndarray:

@@ -9,7 +9,7 @@ import pytest
 from support.transforms_scenes import SIZE, opengl_pose, refused, train_views, write_scene
 
 from pp_cl.errors import UserError
-from pp_cl.files.image import read_rgba, write_png
+from pp_cl.files.image import read_rgba
 from pp_cl.scene.distortion import Distortion
 from pp_cl.scene.load import load_scene
 from pp_cl.scene.readers import transforms
@@ -146,8 +146,6 @@ MATRIX = opengl_pose([3, 0, 1])
 BAD_FRAMES = {
     "no path": ("file_path", None),
     "no such image": ("file_path", "./train_9"),
-    "parent folder": ("file_path", "../secret.png"),
-    "link out": ("file_path", "link_out"),
     "an image twice": ("file_path", "train_0.png"),
     "no matrix": ("transform_matrix", None),
     "NaN": ("transform_matrix", np.where(np.eye(4) == 1, np.nan, MATRIX).tolist()),
@@ -172,13 +170,9 @@ BAD_FRAMES = {
 @pytest.mark.parametrize("case", BAD_FRAMES)
 def test_bad_frame(tmp_path, case):
     """The message names the file, the frame and the key."""
-    folder = tmp_path / "scene"
-    folder.mkdir()
-    write_png(tmp_path / "secret.png", np.zeros((SIZE[1], SIZE[0], 4), np.uint8))
-    (folder / "link_out.png").symlink_to(tmp_path / "secret.png")
     key, value = BAD_FRAMES[case]
-    write_scene(folder, edit=lambda data: data["frames"][1].update({key: value}))
-    refused(folder, folder / "transforms_train.json", f"frames[1].{key}:")
+    write_scene(tmp_path, edit=lambda data: data["frames"][1].update({key: value}))
+    refused(tmp_path, tmp_path / "transforms_train.json", f"frames[1].{key}:")
 
 
 @pytest.mark.parametrize(

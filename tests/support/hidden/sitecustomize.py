@@ -4,6 +4,7 @@ start lack what only Unix has; of the modules, other packages keep theirs.
 
 import asyncio  # noqa: F401, as it would not be imported later
 import builtins
+import functools
 import importlib
 import multiprocessing
 import os
@@ -31,8 +32,34 @@ builtins.__import__ = hiding(builtins.__import__)
 importlib.import_module = hiding(importlib.import_module)
 for name in ("fork", "forkpty", "mkfifo", "killpg", "O_DIRECTORY"):
     delattr(os, name)
-killing = signal.SIGKILL
-subprocess.Popen.kill = lambda self: self.send_signal(killing)
+killing, kill, send = signal.SIGKILL, os.kill, subprocess.Popen.send_signal
+
+
+def ending(process, number):
+    """os.kill(), which ends processes as Windows does: no handler is asked."""
+    if number and process == os.getpid():
+        os._exit(number)
+    kill(process, number and killing)
+
+
+def sending(process, number):
+    """Popen.send_signal(), which knows one signal there."""
+    if number != signal.SIGTERM:
+        raise ValueError(f"Unsupported signal: {number}")
+    send(process, killing)
+
+
+def starting(*words, real=subprocess.Popen._execute_child, **more):
+    """What Popen.__init__() calls, with preexec_fn as the third after self."""
+    if words[3] is not None:
+        raise ValueError("preexec_fn is not supported on Windows platforms")
+    return real(*words, **more)
+
+
+os.kill, os.getppid = ending, functools.partial(int, os.getppid())
+subprocess.Popen._execute_child = starting
+subprocess.Popen.send_signal = sending
+subprocess.Popen.terminate = subprocess.Popen.kill = lambda self: send(self, killing)
 for name, number in list(vars(signal).items()):
     if isinstance(number, signal.Signals) and name not in ELSEWHERE:
         delattr(signal, name)
