@@ -65,8 +65,10 @@ def quoted(value: object, most: int = 100) -> str:
 
 
 def suggestion(word: str, words: Iterable[str]) -> str:
-    """`did you mean X? ` for the nearest of the words, to stand before the list of them all; empty
-    where none is near.
+    """`did you mean X? ` for the one of the nearest words with the longest run of the same
+    letters, to stand before the list of them all; empty where none is near.
     """
-    near = difflib.get_close_matches(word[:100], list(words), n=1)
+    word = word[:100]
+    near = difflib.get_close_matches(word, list(words))
+    near.sort(key=lambda one: -difflib.SequenceMatcher(None, word, one).find_longest_match().size)
     return f"did you mean {near[0]}? " if near else ""

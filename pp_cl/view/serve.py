@@ -90,9 +90,8 @@ def serve_in_background(folder: Path | str, device: str | None = None) -> Iterat
     try:
         yield
     finally:
-        process.terminate()
         try:
-            process.communicate(timeout=GRACE_SECONDS)
+            process.communicate(timeout=GRACE_SECONDS)  # the end of its input ends it
         except subprocess.TimeoutExpired:
             process.kill()
             process.wait()

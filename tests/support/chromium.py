@@ -168,7 +168,10 @@ async def chromium():
                 yield Browser(place, session)
         finally:
             with contextlib.suppress(ProcessLookupError):
-                os.killpg(process.pid, signal.SIGKILL)  # the group that it leads
+                if hasattr(os, "killpg"):
+                    os.killpg(process.pid, signal.SIGKILL)  # the group that it leads
+                else:
+                    process.kill()
             await process.wait()
             if reader:
                 await reader
