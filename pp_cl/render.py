@@ -227,10 +227,10 @@ class Renderer:
         grad_image: Array,
         grad_alpha: Array | None = None,
         spread_weight: float = 0.0,
-    ) -> tuple[Array, Array]:
-        """(grad_shaded_features (S, 16) or longer, grad_opacity (N,)) from dL/dimage of
-        result.image; with alpha compositing also from dL/dalpha (H * W,), and of the spread of each
-        pixel's hits with this weight in the loss (cl/raster/blend.cl).
+    ) -> tuple[Array, Array, Array]:
+        """(grad_shaded_features (S, 16) or longer, grad_opacity (N,), pixel_spread (H * W,)) from
+        dL/dimage of result.image; with alpha compositing also from dL/dalpha (H * W,), and of the
+        spread of each pixel's hits with this weight in the loss (cl/raster/blend.cl).
 
         result: of the last forward(training=True). The gradients of the network's parameters are
         left in model.net.gradients. Those of the SH coefficients are grad_shaded_features times the
@@ -247,7 +247,7 @@ class Renderer:
         grad_features: Array,
         grad_alpha: Array | None = None,
         spread_weight: float = 0.0,
-    ) -> tuple[Array, Array]:
+    ) -> tuple[Array, Array, Array]:
         """What backward() does, from dL/dfeatures (H, W, 16) of result.features, without the
         network.
         """
