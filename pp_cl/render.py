@@ -233,11 +233,11 @@ class Renderer:
         grad_image: Array,
         grad_alpha: Array | None = None,
         spread_weight: float = 0.0,
-    ) -> tuple[Array, Array, Array | None]:
+    ) -> tuple[Array, Array, Array | None, Array]:
         """(grad_shaded_features (S, 16) or longer, grad_opacity (N,), grad_offset (N, 3) if points
-        may leave the grid) from dL/dimage of result.image; with alpha compositing also from
-        dL/dalpha (H * W,), and of the spread of each pixel's hits with this weight in the loss
-        (cl/raster/blend.cl).
+        may leave the grid, pixel_spread (H * W,)) from dL/dimage of result.image; with alpha
+        compositing also from dL/dalpha (H * W,), and of the spread of each pixel's hits with this
+        weight in the loss (cl/raster/blend.cl).
 
         result: of the last forward(training=True). The gradients of the network's parameters are
         left in model.net.gradients. Those of the SH coefficients are grad_shaded_features times the
@@ -254,12 +254,12 @@ class Renderer:
         grad_features: Array,
         grad_alpha: Array | None = None,
         spread_weight: float = 0.0,
-    ) -> tuple[Array, Array, Array | None]:
+    ) -> tuple[Array, Array, Array | None, Array]:
         """What backward() does, from dL/dfeatures (H, W, 16) of result.features, without the
         network.
         """
         with self.dev.stage("backward"):
-            grad_shaded_features, grad_opacity = blend_backward(
+            grad_shaded_features, grad_opacity, pixel_spread = blend_backward(
                 self.dev,
                 self._buffers,
                 result.pairs,
@@ -282,7 +282,7 @@ class Renderer:
                     opacity=self.model.cloud.opacity,
                     edge=self.model.grid.edge,
                 )
-            return grad_shaded_features, grad_opacity, grad_offset
+            return grad_shaded_features, grad_opacity, grad_offset, pixel_spread
 
     def render(self, camera: Camera, gamma: float, **options) -> np.ndarray:
         """(H, W, 3) float32 numpy image of the camera, clamped to [0, 1]. options: of forward()."""

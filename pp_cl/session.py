@@ -377,7 +377,7 @@ def _resume(config, views, net, stored, begun):
     """
     header, arrays = stored
     for name, array in arrays.items():
-        if array.dtype == np.float16:  # of a compressed run
+        if name.startswith("points.") and array.dtype == np.float16:  # of a compressed run
             arrays[name] = array.astype(np.float32)
     model = Model.load(net.dev, header, arrays, net, degree=config.points.sh_degree)
     trainer = Trainer(net.dev, config, model, views)

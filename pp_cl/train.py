@@ -138,12 +138,17 @@ class Trainer:
         )
         with self.dev.stage("loss"):
             mask = target_alpha if view.has_mask else None
-            grad_image, grad_alpha, spread_weight = self._losses(rendered, target, mask)
+            grad_image, grad_alpha = self._losses(rendered, target, mask)
             if self.exposure:
                 self.exposure.fit(
                     view_index, rendered.image, photograph, target_alpha, rendered.offset
                 )
-        gradients = self.renderer.backward(rendered, grad_image, grad_alpha, spread_weight)
+        spread_weight, all_depths = self._spread_weight(target)
+        *gradients, pixel_spread = self.renderer.backward(
+            rendered, grad_image, grad_alpha, spread_weight / all_depths
+        )
+        if spread_weight > 0:
+            self.loss.add("spread", pixel_spread, spread_weight, 1 / all_depths)
         with self.dev.stage("update"):
             self.optimiser.update(
                 t + 1 - self.begun,
@@ -165,19 +170,19 @@ class Trainer:
         self.step = t + 1
         self.check()
         self._terms = self.loss.read(self.step)
-        del rendered, gradients  # the renderer may release them now
+        del rendered, gradients, pixel_spread  # the renderer may release them now
         self._after_update(rates)
         return self._terms
 
     def _losses(self, rendered, target, target_alpha):
-        """(dL/dimage, dL/dalpha or None, weight of the spread of a pixel's depths in world units).
+        """(dL/dimage, dL/dalpha or None) of all terms but the spread.
 
         The value of the loss and of its terms goes to self.loss, which stays on the device.
         """
         config, loss, steps = self.config, self.loss, self.config.iterations
         image, weights, offset = rendered.image, rendered.weights, rendered.offset
         pixels = target.shape[0] * target.shape[1]
-        grad_alpha, pixel_weight = None, 0.0
+        grad_alpha = None
 
         grad_image = loss.forward_backward(image, target, *offset)
         if self.perceptual_loss:
@@ -192,12 +197,16 @@ class Trainer:
                 shortfall=rising_weight(self.step, steps),
             )
             loss.add("mask", squares, config.mask_weight, 1 / pixels)
-        if self._composited and config.spread_weight > 0:
-            spread_weight = rising_weight(self.step, steps, config.spread_weight)
-            all_depths = pixels * self.model.grid.diagonal
-            loss.add_spread(rendered.pairs, weights, spread_weight, 1 / all_depths)
-            pixel_weight = spread_weight / all_depths
-        return grad_image, grad_alpha, pixel_weight
+        return grad_image, grad_alpha
+
+    def _spread_weight(self, target):
+        """(weight of the spread in the loss, what the sum over the pixels is divided by: their
+        number times the diagonal of the grid).
+        """
+        weight = self.config.spread_weight if self._composited else 0.0
+        pixels = target.shape[0] * target.shape[1]
+        all_depths = pixels * self.model.grid.diagonal
+        return rising_weight(self.step, self.config.iterations, weight), all_depths
 
     def draw(
         self, rng: np.random.Generator
@@ -280,7 +289,7 @@ class Trainer:
         pull = self.config.sh_smoothing * self.config.sh_smoothing_every
         for block, sh in zip(cloud.blocks, cloud.sh, strict=True):
             if rates.sh[block.degree] > 0:
-                self._smoother.smooth(sh, pull * rates.sh[block.degree])
+                self._smoother.smooth(sh, min(1.0, pull * rates.sh[block.degree]))
 
     def prune(self) -> None:
         """Drop the points that were in enough images and had too low a blend weight or opacity."""

@@ -91,7 +91,7 @@ def test_picture_and_gradients(dev, rng, name, early_stop, blend):
     assert picture.shape == (20, 24, 3) and relative_error(picture, expected) < 1e-5
 
     grad = rng.normal(size=picture.shape).astype(np.float32)
-    grad_features, grad_opacity, _ = renderer.backward(result, dev.upload(grad))
+    grad_features, grad_opacity, *_ = renderer.backward(result, dev.upload(grad))
     shaded = result.weights.shaded.get()
     want_features, want_opacity, _, want_net = backward(grad)
     assert np.abs(want_features).max() > 0 and np.abs(want_opacity).max() > 0
@@ -157,7 +157,7 @@ def test_an_empty_view_is_the_background(dev, rng):
     result = renderer.forward(away, GAMMA, training=True)
     np.testing.assert_array_equal(result.features.get(), np.ones((16, 16, 16), np.float32))
     assert np.isfinite(result.image.get()).all()
-    _, grad_opacity, _ = renderer.backward(result, dev.upload(np.ones((16, 16, 3), np.float32)))
+    _, grad_opacity, *_ = renderer.backward(result, dev.upload(np.ones((16, 16, 3), np.float32)))
     assert result.weights.shaded.size == 0 and not grad_opacity.get().any()
 
 

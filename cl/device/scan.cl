@@ -66,15 +66,16 @@ kernel void scan_offsets(
     const uint block = GROUP_ID;
     if (block >= b) return;
     const uint end = min(n, (block + 1) * BLOCK);
-    SUM_BEFORE(block, block_sum, shared, sum)
+    SUM_BEFORE(block, block_sum, shared, before_block)
+    ulong sum = before_block;
     for (uint first = block * BLOCK; first < end; first += GROUP) {
         const uint i = first + MEMBER;
         uint total;
         const uint before = group_scan(i < end ? values[i] : 0, shared, &total);
-        if (i < end) offsets[i] = add_sat(sum, before);
-        sum = add_sat(sum, total);
+        if (i < end) offsets[i] = min(sum + before, (ulong)UINT_MAX);
+        sum += total;
     }
-    if (MEMBER == 0 && block == b - 1) offsets[n] = sum;
+    if (MEMBER == 0 && block == b - 1) offsets[n] = min(sum, (ulong)UINT_MAX);
 }
 
 // GROUP work-items per block of BLOCK flags: read them and how many of each block before are not

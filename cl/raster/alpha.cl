@@ -23,13 +23,14 @@
 #define LEAST_THROUGH 0x1p-24f  // of 1 - alpha, far below what an image shows
 
 // One work-item per pixel: reads its hits, nearest first, writes their weights by pair and, with
-// their points, by pixel.
+// their points, by pixel, and marks these points; pixels share points, so some write the same 1.
 //
 // By pair: b, and s = T d, with which dL/do = s * gain (blend.cl). Early stop: a pixel drops the
 // hits behind the depth where T falls below early_stop, as they could weigh no more than T in all;
 // one more entry, without a point, then ends its list.
 kernel void alpha_weights(
     const uint hw,                             // pixels
+    const uint w,                              // of a row
     const float early_stop,                    // T behind which hits are dropped; 0: none
     global const uint *pixel_offset,           // (HW+1)
     global const ulong *pair_key,              // (P) depth << 32 | pair, sorted within a pixel
@@ -38,10 +39,11 @@ kernel void alpha_weights(
     global float2 *pair_weight,                // (?, 2) P with BY_PAIR, not written where dropped
     global uchar *pair_role,                   // (?) P with both, not written where dropped
     global ulong *pixel_entry,                 // (P) weight << 32 | point, in the order of the keys
-    global float *transmittance)               // (HW) of all hits that are not dropped
+    global float *transmittance,               // (HW) of all hits that are not dropped
+    global uchar *point_is_shaded)             // (N) 1: has a hit that is not dropped
 {
-    const uint q = get_global_id(0);
-    if (q >= hw) return;
+    const uint x = get_global_id(0), q = get_global_id(1) * w + x;
+    if (x >= w || q >= hw) return;
     const uint begin = pixel_offset[q], end = pixel_offset[q + 1];
     float T = 1.0f;
     uint i = begin;
@@ -53,6 +55,7 @@ kernel void alpha_weights(
         if (BY_PAIR) pair_weight[pair] = (float2)(T * alpha, tracked ? T * d : 0.0f);
         if (BY_PAIR && HAS_ROLES) pair_role[pair] = tracked ? TRACKED : UNTRACKED;
         pixel_entry[i] = upsample(as_uint(T * alpha), hit.x);
+        point_is_shaded[hit.x] = 1;
         T *= fmax(1.0f - alpha, LEAST_THROUGH);
     }
     if (i < end) pixel_entry[i] = NONE;

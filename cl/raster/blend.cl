@@ -42,14 +42,15 @@ static inline float upper_float(const ulong word) {
 // features.
 kernel void blend_forward(
     const uint hw,                          // pixels
+    const uint w,                           // of a row
     global const uint *pixel_offset,        // (HW+1)
     global const ulong *pixel_entry,        // (P) weight << 32 | point; no point: the list ends
     global const uint *point_slot,          // (N) row of a visible point
     global const float16 *shaded_features,  // (?, 16) of the visible points
     global float16 *features)               // (H, W, 16)
 {
-    const uint q = get_global_id(0) / ROW_PARTS;
-    if (q >= hw) return;
+    const uint x = get_global_id(0) / ROW_PARTS, q = get_global_id(1) * w + x;
+    if (x >= w || q >= hw) return;
     floats sum = 0.0f;
     float weights = 0.0f;
     for (uint i = pixel_offset[q]; i < pixel_offset[q + 1] && (uint)pixel_entry[i] != NONE; i++) {
@@ -73,11 +74,12 @@ kernel void softmax_rest(
 }
 
 // One work-item per pixel: reads its hits, farthest first, and their points' features, writes the
-// gain of each pair that is not dropped, with those of alpha and of the spread.
+// gain of each pair that is not dropped, with those of alpha and of the spread, and the spread.
 kernel __attribute__((vec_type_hint(float16))) void alpha_gain(
     const uint hw,  // pixels
+    const uint w,   // of a row
     const int has_grad_alpha,
-    const float spread_weight,              // w, 0: none
+    const float spread_weight,              // 0: none, and pixel_spread is not written
     global const uint *pixel_offset,        // (HW+1)
     global const ulong *pair_key,           // (P) depth << 32 | pair
     global const ulong *pixel_entry,        // (P) weight << 32 | point; no point: the list ends
@@ -86,10 +88,11 @@ kernel __attribute__((vec_type_hint(float16))) void alpha_gain(
     global const float16 *shaded_features,  // (?, 16) of the visible points
     global const float16 *grad_features,    // (H, W, 16) G
     global const float *grad_alpha,         // (HW) g, not read without has_grad_alpha
-    global float *pair_gain)                // (P)
+    global float *pair_gain,                // (P)
+    global float *pixel_spread)             // (HW) without its weight
 {
-    const uint q = get_global_id(0);
-    if (q >= hw) return;
+    const uint x = get_global_id(0), q = get_global_id(1) * w + x;
+    if (x >= w || q >= hw) return;
     const float16 G = grad_features[q];
     const float g = has_grad_alpha ? grad_alpha[q] : 0.0f;
     const uint begin = pixel_offset[q];
@@ -102,7 +105,7 @@ kernel __attribute__((vec_type_hint(float16))) void alpha_gain(
             const float z = upper_float(pair_key[end]) - nearest;
             front += upper_float(pixel_entry[end]) * (float2)(1.0f, z);
         }
-    float T = transmittance[q];
+    float T = transmittance[q], spread = 0.0f;
     float B = dot16(G, (float16)(BACKGROUND));
     for (uint i = end; i-- > begin;) {
         const float b = upper_float(pixel_entry[i]);
@@ -110,7 +113,9 @@ kernel __attribute__((vec_type_hint(float16))) void alpha_gain(
         if (spread_weight > 0.0f) {
             const float z = upper_float(pair_key[i]) - nearest;
             front -= b * (float2)(1.0f, z);
-            own += 2.0f * spread_weight * (z * (front.x - behind.x) - (front.y - behind.y));
+            const float distances = z * (front.x - behind.x) - (front.y - behind.y);
+            own += 2.0f * spread_weight * distances;
+            spread += b * distances;
             behind += b * (float2)(1.0f, z);
         }
         const float gain = own + g - B;
@@ -120,6 +125,7 @@ kernel __attribute__((vec_type_hint(float16))) void alpha_gain(
             B += b / T * gain;
         }
     }
+    if (spread_weight > 0.0f) pixel_spread[q] = spread;
 }
 
 // One work-item per part of a visible point: reads its pairs and their pixels' gradients, writes

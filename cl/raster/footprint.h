@@ -34,6 +34,7 @@ typedef struct {
     // what follows from these
     int columns, rows;  // of the widest and the highest box
     floats least;       // LEAST_RADIUS pixels at range t, world units
+    floats reach;       // from the ray to the rim, world units
     ints tiny;          // the radius is below one pixel
     // reciprocals, since dividing 16 lanes by one number is slower than multiplying them
     floats per_reach;
@@ -50,9 +51,16 @@ ALWAYS_INLINE void footprints_prepare(const Camera *cam, Footprints *f) {
     const floats width = f->t / least_focal(cam);
     f->least = LEAST_RADIUS * width;
     f->tiny = f->radius < width;
-    f->per_reach = 1.0f / fmax(f->radius, f->least);
+    f->reach = fmax(f->radius, f->least);
+    f->per_reach = 1.0f / f->reach;
     f->per_fx = 1.0f / cam->fx;
     f->per_fy = 1.0f / cam->fy;
+}
+
+// The squared length. A function of vectors: else PoCL splits them in those that it is called from.
+ALWAYS_INLINE floats square(const floats x, const floats y, const floats z) {
+#pragma OPENCL FP_CONTRACT OFF
+    return x * x + y * y + z * z;
 }
 
 // Tests pixel (column, row) of each point's box: lanes that hit are not 0.
@@ -70,22 +78,22 @@ ALWAYS_INLINE ints footprints_hit(
     const floats px = LANED(convert_float)(x), py = LANED(convert_float)(y);
     const floats mx = (px + (0.5f - cam->cx)) * f->per_fx;
     const floats my = (py + (0.5f - cam->cy)) * f->per_fy;
-    // the unit ray is (mx, my, 1) * inverse
-    const floats inverse = 1.0f / sqrt(mx * mx + my * my + 1.0f);
-    const floats range = f->t * inverse;
-    const floats ex = f->x - range * mx, ey = f->y - range * my, ez = f->z - range;
-    // |c - t r|^2; the expanded square would cancel
-    const floats rho2 = ex * ex + ey * ey + ez * ez;
+    const floats m2 = mx * mx + my * my + 1.0f;  // of (mx, my, 1), along the ray
     ints hit = x <= LANES_FROM(f->box[2]) && y <= LANES_FROM(f->box[3]);
 #if FOOTPRINT != SPHERE
-    // Differs from Pulsar, whose depth is that of the sphere's front, up to a radius nearer, and
-    // whose d varies within every footprint of at least a pixel.
-    const floats reach = fmax(f->radius, f->least);
-    hit = hit && rho2 < reach * reach;
-    *closeness = FOOTPRINT == DISC ? (floats)(1.0f) : 1.0f - sqrt(rho2) * f->per_reach;
+    // Differs from Pulsar, whose distance from the ray is that at the centre's range, whose depth is
+    // that of the sphere's front, up to a radius nearer, and whose d varies within every footprint of
+    // at least a pixel.
+    const floats ex = f->y - f->z * my, ey = f->z * mx - f->x, ez = f->x * my - f->y * mx;
+    const floats across2 = square(ex, ey, ez);  // the distance, squared, times m2
+    hit = hit && across2 < f->reach * f->reach * m2 && f->x * mx + f->y * my + f->z > 0.0f;
+    *closeness = FOOTPRINT == DISC ? (floats)(1.0f) : 1.0f - sqrt(across2 / m2) * f->per_reach;
     *depth = f->t;
 #else
-    const floats rho = sqrt(rho2);
+    const floats inverse = 1.0f / sqrt(m2);
+    const floats range = f->t * inverse;
+    const floats dx = f->x - range * mx, dy = f->y - range * my, dz = f->z - range;
+    const floats rho = sqrt(square(dx, dy, dz));  // the expanded square would cancel
     const ints through = rho < f->least;
     hit = hit && (rho <= f->radius || through);
     *closeness = clamp(1.0f - rho / f->radius, 0.0f, 1.0f);
@@ -94,7 +102,7 @@ ALWAYS_INLINE ints footprints_hit(
     const floats wx = f->x - along * inverse * mx, wy = f->y - along * inverse * my;
     const floats wz = f->z - along * inverse;
     // distance of the centre from the ray
-    const floats w = sqrt(wx * wx + wy * wy + wz * wz);
+    const floats w = sqrt(square(wx, wy, wz));
     *depth = fmax(along - sqrt((f->radius + w) * fmax(f->radius - w, 0.0f)), 0.0f);
 #endif
     return hit;

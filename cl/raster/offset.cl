@@ -1,8 +1,8 @@
 // Gradients of the offsets of soft points, composited by alpha: what moving a point changes by the
 // closeness d of its hits. How the order of hits and the harmonics change is left out.
 //
-// d = 1 - rho / h with rho = |e|, e = c - t r: of the centre c at range t = |c| from the unit ray r
-// dd/dc = (c/t (r.e) - e) / (rho h),   dL/dd = o T gain (alpha.cl, blend.cl)
+// d = 1 - rho / h with rho = |e|, e = c - (c.r) r: of the centre c from the unit ray r
+// dd/dc = -e / (rho h),   dL/dd = o T gain (alpha.cl, blend.cl)
 #include "common.h"
 #include "camera.h"
 #include "raster/footprint.h"
@@ -36,17 +36,16 @@ kernel void offset_backward(
     const uint i = shaded[g];
     const Camera cam = camera_load(camera);
     const float3 c = point_camera[i].xyz;
-    const float t = point_camera[i].w;
-    const float h = fmax(point_radius[0], LEAST_RADIUS * t / least_focal(&cam));
+    const float h = fmax(point_radius[0], LEAST_RADIUS * point_camera[i].w / least_focal(&cam));
     float3 dL_dc = 0.0f;
     for (uint pair = point_offset[i]; pair < point_offset[i + 1]; pair++) {
         if (HAS_ROLES && pair_role[pair] != TRACKED) continue;
         const float d = as_float(pair_point_closeness[pair].y);
         if (d <= 0.0f) continue;  // the very rim
         const uint q = pair_pixel[pair];
-        const float3 r = camera_ray(&cam, q % cam.width, q / cam.width), e = c - t * r;
+        const float3 r = camera_ray(&cam, q % cam.width, q / cam.width), e = c - dot(c, r) * r;
         const float dL_dd = opacity[i] * pair_weight[pair].y / d * pair_gain[pair];
-        dL_dc += dL_dd / (fmax(1.0f - d, LEAST_RHO) * h * h) * (dot(r, e) / t * c - e);
+        dL_dc -= dL_dd / (fmax(1.0f - d, LEAST_RHO) * h * h) * e;
     }
     const float3 world = edge * (dL_dc.x * cam.right + dL_dc.y * cam.down + dL_dc.z * cam.forward);
     vstore3(world, i, grad_offset);

@@ -1,6 +1,9 @@
-// Pairs: every hit of a point in a pixel. pairs_fill writes them point by point and counts them by
-// pixel; pairs_scatter writes a key (depth << 32 | pair) of each into the list of its pixel; the
-// sorts order each list by depth, then by pair and so by point.
+// Pairs: every hit of a point in a pixel. pairs_fill writes them point by point and, on GPUs, counts
+// them by pixel; pairs_scatter writes a key (depth << 32 | pair) of each into the list of its pixel;
+// the sorts order each list by depth, then by pair and so by point.
+//
+// On CPUs, where an atomic addition takes as long as the rest of a pair, pairs_count counts them, in
+// the order of the pairs.
 //
 // vec_type_hint: the vectors are written out; Intel's compiler would merge work-items into wider
 // ones, which is slower.
@@ -8,12 +11,19 @@
 #include "raster/footprint.h"
 
 #ifndef RUN
-#define RUN 64  // keys ranked at once by comparing all with all, 8 a step; longer lists are merged
+#define RUN 64  // keys ranked at once by comparing all with all; longer lists are merged
 #endif
 
 // Pixels of a box that are tested before their hits are written, at most 32 (bits of a uint). With
 // fewer, writing alternates more often between the pairs of 16 points, which lie far apart.
 #define CELLS (LANES > 1 ? 32 : 1)
+
+// The place of a pair in the list of its pixel; CPUs find it later.
+#define PLACE(pixel) (LANES > 1 ? 0u : atomic_inc(&pixel_count[pixel]))
+
+// Whether a pixel is one of this work-item's, which is one of a power of two: they take turns, 2048
+// pixels at a time, so that neighbouring pairs mostly belong to one.
+#define IS_MINE(pixel) ((((pixel) / 2048) & (get_global_size(0) - 1)) == get_global_id(0))
 
 // Reads the footprints of the points from `first` on, of which `count` exist; the others have empty
 // boxes.
@@ -51,7 +61,7 @@ ALWAYS_INLINE Footprints footprints_load(
 }
 
 // One work-item per LANES points: finds their hits again (project.cl counted them), writes them as
-// pairs and counts them at their pixels; does nothing where not all pairs have room.
+// pairs and, on GPUs, counts them at their pixels; does nothing where not all pairs have room.
 //
 // A compiler that rounds otherwise here than in project.cl finds one hit more or less of a point in
 // a million: one too many is left out, one that is missing becomes a pair without weight.
@@ -66,8 +76,8 @@ kernel __attribute__((vec_type_hint(floats))) void pairs_fill(
     global const uint *point_offset,     // (N+1) first pair of each point
     global uint *pair_pixel,             // (P)
     global uint2 *pair_point_closeness,  // (P, 2) point, bits of d in [0, 1]
-    global ulong *pair_place,            // (P) depth << 32 | place in the list of the pixel
-    global volatile uint *pixel_count)   // (HW) accumulates
+    global ulong *pair_place,            // (P) depth << 32 | place in the list of the pixel, or 0
+    global volatile uint *pixel_count)   // (HW) accumulates, not touched on CPUs
 {
     const uint first = get_global_id(0) * LANES;
     if (first >= n || point_offset[n] > p) return;
@@ -108,7 +118,7 @@ kernel __attribute__((vec_type_hint(floats))) void pairs_fill(
                 const uint pixel = corner[j] + offset[k];
                 pair_pixel[pair] = pixel;
                 pair_point_closeness[pair] = (uint2)(first + j, as_uint(closeness[k][j]));
-                pair_place[pair] = upsample(as_uint(depth[k][j]), atomic_inc(&pixel_count[pixel]));
+                pair_place[pair] = upsample(as_uint(depth[k][j]), PLACE(pixel));
             }
     }
     for (uint j = 0; j < count; j++)
@@ -116,8 +126,28 @@ kernel __attribute__((vec_type_hint(floats))) void pairs_fill(
             const float depth = point_camera[first + j].w;
             pair_pixel[pair] = corner[j];
             pair_point_closeness[pair] = (uint2)(first + j, as_uint(0.0f));
-            pair_place[pair] = upsample(as_uint(depth), atomic_inc(&pixel_count[corner[j]]));
+            pair_place[pair] = upsample(as_uint(depth), PLACE(corner[j]));
         }
+}
+
+// One work-item per compute unit: reads the pixels of all pairs, counts those at its own and writes
+// their places.
+kernel void pairs_count(
+    const uint n,                     // points
+    const uint p,                     // pairs for which there is room
+    const uint hw,                    // pixels
+    global const uint *point_offset,  // (N+1)
+    global const uint *pair_pixel,    // (P)
+    global ulong *pair_place,         // (P) depth << 32, becomes depth << 32 | place
+    global uint *pixel_count)         // (HW)
+{
+    for (uint q = 0; q < hw; q++)
+        if (IS_MINE(q)) pixel_count[q] = 0;
+    const uint total = point_offset[n] > p ? 0 : point_offset[n];
+    for (uint pair = 0; pair < total; pair++) {
+        const uint q = pair_pixel[pair];
+        if (IS_MINE(q)) pair_place[pair] |= pixel_count[q]++;
+    }
 }
 
 // One work-item per pair: writes its key at its place. Bits of floats >= 0 sort like the floats.
@@ -138,24 +168,37 @@ kernel void pairs_scatter(
     pair_key[pixel_offset[pair_pixel[pair]] + (uint)place] = upsample((uint)(place >> 32), pair);
 }
 
-// Sorts `count` <= RUN keys into `sorted`, which may be the same memory: each key's place is the
-// number of smaller keys. No key has its highest bit set, the sign of a depth, so that of a
-// difference says which one is smaller.
+// Minus the number of depths in [first, end) that are smaller than each of z. A function of vectors:
+// else PoCL splits them.
+ALWAYS_INLINE int16 smaller(const uint16 z, const uint *depth, const uint first, const uint end) {
+    int16 found = 0;
+    for (uint j = first; j < end; j++)
+        found += (uint16)(depth[j]) < z;
+    return found;
+}
+
+// Sorts `count` <= RUN keys, which are ordered by pair, into `sorted`, which may be the same memory:
+// each key's place is the number of smaller depths, and of equal ones before it.
 static inline void sort_run(global const ulong *keys, const uint count, global ulong *sorted) {
-    ulong run[RUN + 8];
-    for (uint i = 0; i < count; i++)
+    const uint16 lane = (uint16)(0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15);
+    ulong run[RUN];
+    uint depth[RUN + 16];
+    for (uint i = 0; i < count; i++) {
         run[i] = keys[i];
-    // the lanes behind the last key
-    vstore8((ulong8)(ULONG_MAX), 0, run + count);
-    for (uint i = 0; i < count; i += 8) {
-        const ulong8 key = vload8(0, run + i);
-        ulong8 place = 0;
-        for (uint j = 0; j < count; j++)
-            place += ((ulong8)(run[j]) - key) >> 63;
-        ulong places[8];
-        vstore8(place, 0, places);
-        for (uint j = 0; j < min(8u, count - i); j++)
-            sorted[places[j]] = run[i + j];
+        depth[i] = (uint)(run[i] >> 32);
+    }
+    vstore16((uint16)(0), 0, depth + count);  // the lanes behind the last one
+    for (uint i = 0; i < count; i += 16) {
+        const uint16 z = vload16(0, depth + i);
+        const uint end = min(i + 16, count);
+        // of equal ones those before it are smaller by the least step
+        int16 place = smaller(z + 1, depth, 0, i) + smaller(z, depth, end, count);
+        for (uint j = i; j < end; j++)
+            place += (uint16)(depth[j]) < z + select((uint16)(0), (uint16)(1), lane > j - i);
+        int places[16];
+        vstore16(place, 0, places);
+        for (uint j = i; j < end; j++)
+            sorted[-places[j - i]] = run[j];
     }
 }
 
@@ -171,7 +214,7 @@ merge(global const ulong *keys, const uint middle, const uint count, global ulon
 
 // One work-item per pixel: sorts its keys in place. GPUs, on which its arrays would lie in the
 // device's memory, run the two kernels below instead.
-kernel __attribute__((vec_type_hint(ulong8))) void pairs_sort(
+kernel __attribute__((vec_type_hint(uint16))) void pairs_sort(
     const uint hw,                    // pixels
     global const uint *pixel_offset,  // (HW+1)
     global ulong *scratch,            // (P)

@@ -57,7 +57,7 @@ ALWAYS_INLINE Hits load_hits(
 }
 
 // One work-item per pixel: reads its hits, nearest first, writes their weights by pair and, with
-// their points, by pixel.
+// their points, by pixel, and marks these points; pixels share points, so some write the same 1.
 //
 // By pair: b, and s = b (1/o + z/gamma), finite at o = 0, with which dL/do = s * gain (blend.cl).
 // Only the MAX_TRACKED nearest hits get gradients. A hit is dropped, with weight 0 and with all
@@ -66,6 +66,7 @@ ALWAYS_INLINE Hits load_hits(
 // that are not dropped, by depth. If any were dropped, one more entry follows, with no point.
 kernel __attribute__((vec_type_hint(floats))) void softmax_weights(
     const uint hw,  // pixels
+    const uint w,   // of a row
     const float gamma,
     const float early_stop,                    // 0: none
     global const float *camera,                // (20) camera.h
@@ -75,10 +76,11 @@ kernel __attribute__((vec_type_hint(floats))) void softmax_weights(
     global const float *opacity,               // (N)
     global float2 *pair_weight,                // (?, 2) P with BY_PAIR
     global uchar *pair_role,                   // (?) P with both
-    global ulong *pixel_entry)                 // (P) weight << 32 | point, in the order of the keys
+    global ulong *pixel_entry,                 // (P) weight << 32 | point, in the order of the keys
+    global uchar *point_is_shaded)             // (N) 1: has a hit that is not dropped
 {
-    const uint q = get_global_id(0);
-    if (q >= hw) return;
+    const uint x = get_global_id(0), q = get_global_id(1) * w + x;
+    if (x >= w || q >= hw) return;
     const Camera cam = camera_load(camera);
     const uint begin = pixel_offset[q], end = pixel_offset[q + 1];
     uint stop = end;
@@ -116,7 +118,9 @@ kernel __attribute__((vec_type_hint(floats))) void softmax_weights(
             const bool tracked = !MAX_TRACKED || i - begin < MAX_TRACKED;
             if (BY_PAIR) pair_weight[pair] = (float2)(b[j], tracked ? slope[j] : 0.0f);
             if (BY_PAIR && HAS_ROLES) pair_role[pair] = tracked ? TRACKED : UNTRACKED;
-            pixel_entry[i] = upsample(as_uint(b[j]), pair_point_closeness[pair].x);
+            const uint point = pair_point_closeness[pair].x;
+            pixel_entry[i] = upsample(as_uint(b[j]), point);
+            point_is_shaded[point] = 1;
         }
     }
     if (DROPS) {

@@ -1,26 +1,11 @@
-// What follows for the points from the blend weights of their hits: which ones are visible, and
-// each one's highest weight, by which it is pruned.
+// What follows for the points from the blend weights of their hits: each one's highest weight, by
+// which it is pruned.
 #include "common.h"
 #include "raster/pair_role.h"
 
 #ifndef HAS_ROLES
 #define HAS_ROLES 1  // 0: every pair is tracked, and pair_role is not read
 #endif
-
-// One work-item per pixel: marks the points of its hits that are not dropped. Pixels share points,
-// so some write the same 1 to the same place.
-kernel void find_shaded_points(
-    const uint hw,                    // pixels
-    global const uint *pixel_offset,  // (HW+1)
-    global const ulong *pixel_entry,  // (P) weight << 32 | point; no point: the list ends
-    global uchar *point_is_shaded)    // (N) 1: yes; not written: no
-{
-    const uint q = get_global_id(0);
-    if (q >= hw) return;
-    const uint end = pixel_offset[q + 1];
-    for (uint i = pixel_offset[q]; i < end && (uint)pixel_entry[i] != NONE; i++)
-        point_is_shaded[(uint)pixel_entry[i]] = 1;
-}
 
 // One work-item per point with a pair: sums the weights of its pairs, keeps the sum if it is the
 // highest so far, and counts the view if the sum is `least`.
@@ -40,8 +25,11 @@ kernel void record_weights(
     if (begin == end) return;
     float sum = 0.0f;
     if (point_is_shaded[i]) {
-        for (uint pair = begin; pair < end; pair++)
-            if (!HAS_ROLES || pair_role[pair] != DROPPED) sum += pair_weight[pair].x;
+        for (uint pair = begin; pair < end; pair++) {
+            const float weight = pair_weight[pair].x;
+            // no branch, which processors could not foresee
+            sum += HAS_ROLES && pair_role[pair] == DROPPED ? 0.0f : weight;
+        }
         max_weight[i] = fmax(max_weight[i], sum);
     }
     if (sum >= least) times_seen[i] += 1.0f;

@@ -194,31 +194,6 @@ kernel void loss_gradient(
     partial_terms[(size_t)blocks * (v + y) + b] = (float4)(smooth, absolute, 0.0f, squared);
 }
 
-// One work-item per pixel: reads its hits, nearest first, writes its spread sum_ij b_i b_j |z_i -
-// z_j| of their weights and depths (Mip-NeRF 360, Eq. 15, its distortion), whose gradient the blend
-// computes.
-kernel void loss_pixel_spread(
-    const uint hw,                    // pixels
-    global const uint *pixel_offset,  // (HW+1)
-    global const ulong *pair_key,     // (P) depth << 32 | pair
-    global const ulong *pixel_entry,  // (P) weight << 32 | point; no point: the list ends
-    global float *pixel_spread)       // (HW)
-{
-    const uint q = get_global_id(0);
-    if (q >= hw) return;
-    const uint begin = pixel_offset[q], end = pixel_offset[q + 1];
-    float nearest = 0.0f, weights = 0.0f, depths = 0.0f, spread = 0.0f;
-    for (uint i = begin; i < end && (uint)pixel_entry[i] != NONE; i++) {
-        const float b = as_float((uint)(pixel_entry[i] >> 32));
-        const float z = as_float((uint)(pair_key[i] >> 32));
-        if (i == begin) nearest = z;  // depths count from here, so that sums of them keep digits
-        spread += 2.0f * b * ((z - nearest) * weights - depths);
-        weights += b;
-        depths += b * (z - nearest);
-    }
-    pixel_spread[q] = spread;
-}
-
 // GROUP work-items per row: the sum of its terms.
 kernel void loss_sum(
     const uint rows,

@@ -32,7 +32,8 @@
         }                                                                                          \
     }
 
-// One work-item per part of a shaded point: takes its gradient into v, and moves its coefficients.
+// One work-item per part of a shaded point: takes its gradient into v, moves its coefficients; the
+// first one writes the step of the gradient.
 kernel void rmsprop_move(
     const uint s,        // shaded points
     const uint step,     // from 1
@@ -44,20 +45,25 @@ kernel void rmsprop_move(
     global const float *camera,                  // (20) camera.h
     global const float4 *point_camera,           // (N, 4) x, y, z, distance
     global const float16 *grad_shaded_features,  // (?, 16) G, a row for each shaded point
-    global const uint *last_step,                // (N) of each point's last gradient, 0: none
+    global uint *last_step,                      // (N) of each point's last gradient, 0: none
     global float16 *v,                           // (N, 16)
     global float16 *sh_0,                        // (N, 1, 16)
     global float16 *sh_1,                        // (?, ?, 16) (N, 3, 16), untouched at degree 0
     global float16 *sh_2a,                       // (?, ?, 16) (N, 3, 16), untouched below degree 2
     global float16 *sh_2b)                       // (?, ?, 16) (N, 2, 16), untouched below degree 2
 {
-    const size_t g = get_global_id(0) / ROW_PARTS;
-    if (g >= s) return;
-    const size_t i = shaded[g];
-    if (!any(grad_shaded_features[g] != 0.0f)) return;  // a NaN is a gradient
+    const uint row = get_global_id(0) / ROW_PARTS;
+    const size_t g = min(row, s - 1), i = shaded[g];
+    const uint last = last_step[i];
+#if ROW_PARTS > 1
+    barrier(CLK_GLOBAL_MEM_FENCE);  // all parts of a point have read it
+#endif
+    // a NaN is a gradient
+    if (row >= s || !any(grad_shaded_features[g] != 0.0f)) return;
+    if (ROW_PART == 0) last_step[i] = step;
     const floats G = load_part(grad_shaded_features, g);
     const floats moment =
-        exp2((step - last_step[i]) * LOG_BETA2) * load_part(v, i) + DECAY2 * MEAN_SQUARE * (G * G);
+        exp2((step - last) * LOG_BETA2) * load_part(v, i) + DECAY2 * MEAN_SQUARE * (G * G);
     store_part(moment, v, i);
     const floats scaled = G / (sqrt(moment) + eps);
     float basis[9];
@@ -68,17 +74,4 @@ kernel void rmsprop_move(
         MOVE(sh_2a, 4, 3, rate_2)
         MOVE(sh_2b, 7, 2, rate_2)
     }
-}
-
-// One work-item per shaded point: writes the step of its gradient, once all its parts have moved.
-kernel void rmsprop_mark(
-    const uint s,                                // shaded points
-    const uint step,                             // from 1
-    global const uint *shaded,                   // (S) their indices
-    global const float16 *grad_shaded_features,  // (?, 16) G, a row for each shaded point
-    global uint *last_step)                      // (N)
-{
-    const uint g = get_global_id(0);
-    if (g >= s) return;
-    if (any(grad_shaded_features[g] != 0.0f)) last_step[shaded[g]] = step;
 }

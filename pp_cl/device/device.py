@@ -18,10 +18,12 @@ import pyopencl as cl
 from numpy.typing import ArrayLike, DTypeLike
 from pyopencl.array import Array
 
+from pp_cl.device.host import ask_for_huge_pages
 from pp_cl.device.launch import Kernel, Program
 from pp_cl.errors import UserError
 
 SMALLER = "lower --points or raise --downscale"
+HUGE = 2**22  # bytes of a buffer for which pages of 2 MiB are worth asking
 STANDARD = ("-cl-std=CL1.2", "-cl-kernel-arg-info")  # options of every build
 # Of Intel's driver of GPUs; others of that vendor refuse options that they do not know.
 INTEL_PLATFORM = "Intel(R) OpenCL"
@@ -156,6 +158,7 @@ class Device:
             if self.debug
             else cl.CommandQueue(self.context)
         )
+        self._maps = cl.CommandQueue(self.context)  # no map waits for kernels
         self.bytes = self.peak_bytes = 0
         self._sent: deque[Any] = deque()  # events of send()
         self._scratch: dict[Hashable, Any] = {}  # {name: array} of scratch()
@@ -397,7 +400,14 @@ class Device:
         return memory
 
     def _memory(self, nbytes):
-        return Memory(self.context, cl.mem_flags.READ_WRITE, nbytes)
+        memory = Memory(self.context, cl.mem_flags.READ_WRITE, nbytes)
+        if self.is_cpu and nbytes >= HUGE:  # the host's memory: a map shows where it lies
+            flags = cl.map_flags.WRITE_INVALIDATE_REGION
+            place = 0, (nbytes,), np.uint8
+            mapped, _ = cl.enqueue_map_buffer(self._maps, memory, flags, *place)
+            ask_for_huge_pages(mapped.ctypes.data, nbytes)
+            mapped.base.release(self._maps)
+        return memory
 
     def observe(self, kernel: Kernel, event: cl.Event, arguments: dict[str, Any]) -> None:
         """PP_DEBUG 1, 2: wait, note the kernel's time. PP_DEBUG 3: stop at the first NaN or Inf in

@@ -1,7 +1,10 @@
 """Memory of the machine that the program runs on."""
 
+import ctypes
 import importlib
+import mmap
 import os
+import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -26,6 +29,18 @@ def available_bytes() -> int | None:
 def resident_bytes() -> int:
     """Memory that this process holds; 0 where the system does not tell."""
     return _own_bytes(1)
+
+
+def ask_for_huge_pages(address: int, nbytes: int) -> None:
+    """Ask Linux for pages of 2 MiB in memory that is not in use yet: among those of 4 KiB, which
+    most systems give to those who do not ask, random accesses spend much of their time looking up
+    pages. Does nothing elsewhere.
+    """
+    if sys.platform == "linux":
+        first = -(-address // mmap.PAGESIZE) * mmap.PAGESIZE
+        size = (address + nbytes - first) // mmap.PAGESIZE * mmap.PAGESIZE
+        madvise = ctypes.CDLL(None).madvise
+        madvise(ctypes.c_void_p(first), ctypes.c_size_t(size), mmap.MADV_HUGEPAGE)
 
 
 def _own_bytes(field):

@@ -53,8 +53,9 @@ def blend_forward(
     """Write features (H, W, 16) from shaded_features, (S, 16) or longer, both float32."""
     _program(dev, weights).launch(
         "blend_forward",
-        pairs.pixels * row_parts(dev, ON_GPU),
+        (pairs.size[1] * row_parts(dev, ON_GPU), pairs.size[0]),
         hw=pairs.pixels,
+        w=pairs.size[1],
         pixel_offset=pairs.pixel_offset,
         pixel_entry=weights.pixel_entry,
         point_slot=weights.point_slot,
@@ -70,6 +71,7 @@ def blend_backward_table(n: int, shaded: int, pixels: int, pairs: int, blend: st
     return {
         "pair_gain": ((pairs if blend == "alpha" else 1,), np.float32),
         "pixel_rest": ((pixels if blend == "softmax" else 1,), np.float32),
+        "pixel_spread": ((pixels if blend == "alpha" else 1,), np.float32),
         "grad_shaded_features": ((shaded, 16), np.float32),
         "grad_opacity": ((n,), np.float32),
         "grad_offset": ((n if blend == "alpha" else 1, 3), np.float32),
@@ -88,10 +90,11 @@ def blend_backward(
     grad_alpha: Array | None = None,
     spread_weight: float = 0.0,
     mean: bool = False,
-) -> tuple[Array, Array]:
-    """(grad_shaded_features (S, 16) or longer, grad_opacity (N,)) float32, valid until the next
-    call: the gradients of the points weights.shaded; those of all others are 0. b.pair_gain (alpha)
-    or b.pixel_rest (softmax) are left for bench/spheres.py: the gains, and what they follow from
+) -> tuple[Array, Array, Array]:
+    """(grad_shaded_features (S, 16) or longer, grad_opacity (N,), pixel_spread (HW,)), float32,
+    valid until the next call: the gradients of the points weights.shaded, while those of all others
+    are 0; and the spread of each pixel, undefined without spread_weight. b.pair_gain (alpha) or
+    b.pixel_rest (softmax) are left for bench/spheres.py: the gains, and what they follow from
     (cl/raster/blend.cl).
 
     shaded_features, features: of blend_forward(). grad_features: dL/dfeatures (H, W, 16).
@@ -118,8 +121,9 @@ def blend_backward(
     else:
         program.launch(
             "alpha_gain",
-            pairs.pixels,
+            pairs.size[::-1],
             hw=pairs.pixels,
+            w=pairs.size[1],
             has_grad_alpha=int(grad_alpha is not None),
             spread_weight=spread_weight,
             pixel_offset=pairs.pixel_offset,
@@ -131,6 +135,7 @@ def blend_backward(
             grad_features=grad_features,
             grad_alpha=weights.transmittance if grad_alpha is None else grad_alpha,
             pair_gain=b.pair_gain,
+            pixel_spread=b.pixel_spread,
         )
     dev.fill(b.grad_opacity, 0)
     program.launch(
@@ -149,7 +154,7 @@ def blend_backward(
         grad_shaded_features=b.grad_shaded_features,
         grad_opacity=b.grad_opacity,
     )
-    return b.grad_shaded_features, b.grad_opacity
+    return b.grad_shaded_features, b.grad_opacity, b.pixel_spread
 
 
 def offset_backward(

@@ -17,7 +17,8 @@ from pp_cl.errors import UserError
 from pp_cl.raster.project import FOOTPRINTS, ProjectedPoints
 
 MOST_PAIRS = 2**32 - 1  # pairs are numbered by uint32
-RUN = 64  # keys ranked at once by comparing all with all; longer lists are merged
+# keys ranked at once by comparing all with all, on CPUs 16 a step; longer lists are merged
+RUN, CPU_RUN = 64, 128
 LONG_LIST = RUN * RUN  # keys of lists that GPUs merge in more than one pass
 
 
@@ -28,7 +29,7 @@ class Pairs:
     The arrays have room for P pairs. If the view has more, pixel_offset is all zeros and the other
     arrays must not be read: find the pairs again with more room (room_needed()).
 
-    count: how many pairs there are.
+    size: (H, W) of the image. count: how many pairs there are.
     point_offset: (N+1,) uint32, point i owns pairs point_offset[i] to point_offset[i+1].
     pixel_offset: (HW+1,) uint32, pixel q owns keys pixel_offset[q] to pixel_offset[q+1].
     pair_pixel: (P,) uint32, y*W + x. pair_point_closeness: (P, 2) uint32, the point, and the bits
@@ -36,6 +37,7 @@ class Pairs:
     each pixel by depth, then by point.
     """
 
+    size: tuple[int, int]
     count: Reading[int]
     point_offset: Array
     pixel_offset: Array
@@ -61,7 +63,7 @@ class Pairs:
     @property
     def pixels(self) -> int:
         """HW."""
-        return self.pixel_offset.size - 1
+        return self.size[0] * self.size[1]
 
 
 def pairs_table(n: int, pixels: int, pairs: int) -> Table:
@@ -89,11 +91,15 @@ def find_pairs(
     b.require(pairs_table(n, pixels, room))
     pair_place = b.pair_scratch
     program = dev.program(
-        "raster/pairs", LANES=lanes(dev), RUN=RUN, FOOTPRINT=FOOTPRINTS.index(points.footprint)
+        "raster/pairs",
+        LANES=lanes(dev),
+        RUN=CPU_RUN if dev.is_cpu else RUN,
+        FOOTPRINT=FOOTPRINTS.index(points.footprint),
     )
     exclusive_scan(dev, points.point_count, b.point_offset)
     count = read_total(dev, b.point_offset)
-    dev.fill(b.pixel_count, 0)
+    if not dev.is_cpu:
+        dev.fill(b.pixel_count, 0)
     program.launch(
         "pairs_fill",
         -(-n // lanes(dev)),
@@ -110,7 +116,29 @@ def find_pairs(
         pair_place=pair_place,
         pixel_count=b.pixel_count,
     )
+    if dev.is_cpu:
+        program.launch(
+            "pairs_count",
+            1 << (dev.info["compute_units"].bit_length() - 1),
+            local=1,
+            n=n,
+            p=room,
+            hw=pixels,
+            point_offset=b.point_offset,
+            pair_pixel=b.pair_pixel,
+            pair_place=pair_place,
+            pixel_count=b.pixel_count,
+        )
     exclusive_scan(dev, b.pixel_count, b.pixel_offset)
+    pairs = Pairs(
+        size,
+        count,
+        b.point_offset,
+        b.pixel_offset,
+        b.pair_pixel,
+        b.pair_point_closeness,
+        b.pair_key,
+    )
     program.launch(
         "pairs_scatter",
         room,
@@ -120,9 +148,6 @@ def find_pairs(
         pair_place=pair_place,
         pixel_offset=b.pixel_offset,
         pair_key=b.pair_key,
-    )
-    pairs = Pairs(
-        count, b.point_offset, b.pixel_offset, b.pair_pixel, b.pair_point_closeness, b.pair_key
     )
     if dev.is_cpu:
         program.launch(

@@ -91,19 +91,11 @@ def blend_weights(
     n, pixels, room = pairs.points, pairs.pixels, pairs.capacity if by_pair else 1
     b.require(weights_table(n, pixels, room, room if has_roles else 1))
     drops = {"MAX_TRACKED": max_tracked, "DROPS": int(early_stop > 0), "BY_PAIR": int(by_pair)}
+    dev.fill(b.point_is_shaded, 0)
     if blend == "alpha":
         _alpha_weights(dev, b, pairs, opacity, early_stop, drops)
     else:
         _softmax_weights(dev, b, pairs, camera_buffer, opacity, gamma, early_stop, drops)
-    dev.fill(b.point_is_shaded, 0)
-    dev.program("raster/weights", HAS_ROLES=int(has_roles)).launch(
-        "find_shaded_points",
-        pixels,
-        hw=pixels,
-        pixel_offset=pairs.pixel_offset,
-        pixel_entry=b.pair_scratch,
-        point_is_shaded=b.point_is_shaded,
-    )
     shaded_list = nonzero(dev, b.point_is_shaded, b.shaded, b.point_slot)
     transmittance = b.transmittance if blend == "alpha" else None
     return BlendWeights(
@@ -127,8 +119,9 @@ def _alpha_weights(dev, b, pairs, opacity, early_stop, drops):
         dev.fill(b.pair_role, DROPPED)
     dev.program("raster/alpha", **drops).launch(
         "alpha_weights",
-        pairs.pixels,
+        pairs.size[::-1],
         hw=pairs.pixels,
+        w=pairs.size[1],
         early_stop=early_stop,
         pixel_offset=pairs.pixel_offset,
         pair_key=pairs.pair_key,
@@ -138,6 +131,7 @@ def _alpha_weights(dev, b, pairs, opacity, early_stop, drops):
         pair_role=b.pair_role,
         pixel_entry=b.pair_scratch,
         transmittance=b.transmittance,
+        point_is_shaded=b.point_is_shaded,
     )
 
 
@@ -145,8 +139,9 @@ def _softmax_weights(dev, b, pairs, camera_buffer, opacity, gamma, early_stop, d
     """Eq. (1) of the supplemental; early_stop is Pulsar's percent_allowed_difference."""
     dev.program("raster/softmax", LANES=lanes(dev), **drops).launch(
         "softmax_weights",
-        pairs.pixels,
+        pairs.size[::-1],
         hw=pairs.pixels,
+        w=pairs.size[1],
         gamma=gamma,
         early_stop=early_stop,
         camera=camera_buffer,
@@ -157,6 +152,7 @@ def _softmax_weights(dev, b, pairs, camera_buffer, opacity, gamma, early_stop, d
         pair_weight=b.pair_weight,
         pair_role=b.pair_role,
         pixel_entry=b.pair_scratch,
+        point_is_shaded=b.point_is_shaded,
     )
 
 

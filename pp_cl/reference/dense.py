@@ -80,15 +80,16 @@ def geometry(
     c = np.where(ok[:, None], c, [0.0, 0.0, 1.0])
     t = np.linalg.norm(c, axis=1)[:, None]
     radius, width = radius[:, None], pixel_width(camera, t)
-    rho = np.linalg.norm(c[:, None] - t[..., None] * r[None], axis=2)
     least = LEAST_RADIUS * width
     if kind in ("disc", "soft"):
-        reach = np.maximum(radius, least)
+        reach, ahead = np.maximum(radius, least), np.maximum(c @ r.T, 0)
+        rho = np.linalg.norm(c[:, None] - ahead[..., None] * r[None], axis=2)
         hit = rho < reach
         closeness = 1 - rho / reach if kind == "soft" else np.ones_like(rho)
         depth = np.broadcast_to(t, rho.shape)
         margin = np.abs(rho - reach) / width
     else:
+        rho = np.linalg.norm(c[:, None] - t[..., None] * r[None], axis=2)
         through = rho < least
         hit = (rho <= radius) | through
         closeness = np.where(through & (radius < width), 1.0, np.clip(1 - rho / radius, 0, 1))

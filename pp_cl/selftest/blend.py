@@ -308,6 +308,8 @@ def _spread(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
         gradients = blended.gradients(spread_weight=3.0)
         yield relative(gradients["opacity"], expected, GRADIENT)
         yield exact(gradients["features"], np.zeros((n, 16)))
+        spread = dense.spread(blended.geometry, blended.blend)
+        yield relative(blended.scene.pixel_spread.get(), spread, GRADIENT)
 
 
 def _opaque(dev: Device, rng: np.random.Generator) -> Iterator[Check]:

@@ -1,6 +1,5 @@
-"""Cases of the losses: L1 and SSIM, masks, the spread, LPIPS, and their sum."""
+"""Cases of the losses: L1 and SSIM, masks, exposure, LPIPS, and their sum."""
 
-import itertools
 from collections.abc import Iterator
 
 import numpy as np
@@ -9,7 +8,7 @@ from pp_cl.device.device import Device
 from pp_cl.layers.choice import make_policy
 from pp_cl.reference import loss as reference_loss
 from pp_cl.reference.lpips import lpips, lpips_gradient, random_weights
-from pp_cl.selftest.case import EPS, SIZES, Case, Check, absolute, each, exact, relative
+from pp_cl.selftest.case import EPS, SIZES, Case, Check, each, exact, relative
 from pp_cl.training.exposure import KEPT, PRIOR, Exposure
 from pp_cl.training.loss import FURTHER, Loss, MaskLoss
 from pp_cl.training.perceptual import PerceptualLoss
@@ -108,35 +107,6 @@ def _sum_of_terms(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
         yield each(loss.terms.get(), expected, LOSS)
 
 
-def _spread(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
-    """sum_ij b_i b_j |z_i - z_j| of each pixel's hits; some have none, some lists end early."""
-    for pixels in SIZES:
-        lengths = rng.integers(0, 9, pixels)
-        offset = np.concatenate([[0], np.cumsum(lengths)])
-        b, z = rng.random((2, offset[-1])).astype(np.float32)
-        order = np.lexsort((z, np.repeat(np.arange(pixels), lengths)))
-        z = (100 + z[order]).astype(np.float32)
-        entry = b.view(np.uint32).astype(np.uint64) << np.uint64(32)
-        entry[rng.random(len(entry)) < 0.1] += np.uint64(2**32 - 1)
-        ended = (entry & np.uint64(2**32 - 1)) > 0
-        expected = []
-        for first, end in itertools.pairwise(offset):
-            stop = first + np.argmax(np.append(ended[first:end], True))
-            weights, depths = b[first:stop].astype(np.float64), z[first:stop].astype(np.float64)
-            expected.append(weights @ np.abs(depths[:, None] - depths) @ weights)
-        spread = dev.empty((pixels,))
-        dev.program("training/loss").launch(
-            "loss_pixel_spread",
-            pixels,
-            hw=pixels,
-            pixel_offset=dev.upload(offset, np.uint32),
-            pair_key=dev.upload(z.view(np.uint32).astype(np.uint64) << np.uint64(32)),
-            pixel_entry=dev.upload(entry),
-            pixel_spread=spread,
-        )
-        yield absolute(spread.get(), expected, 64 * EPS)  # of up to 28 products below 1, twice
-
-
 def _exposure(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
     """The gains of three views, of which one is seen twice and one never, and photographs that are
     divided by them.
@@ -186,7 +156,6 @@ CASES = (
     Case("loss: L1 and SSIM", _loss),
     Case("loss: flat and equal images", _hard_loss),
     Case("loss: mask", _mask_loss),
-    Case("loss: spread", _spread),
     Case("loss: exposure", _exposure),
     Case("loss: sum of its terms", _sum_of_terms),
     Case("loss: perceptual", _perceptual_loss),

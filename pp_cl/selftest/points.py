@@ -159,7 +159,7 @@ class PairedPoints:
         sum(alpha * grad_alpha) and the pixels' spread times its weight, after blend().
         """
         alphas = None if grad_alpha is None else self.dev.upload(grad_alpha, np.float32)
-        features, opacity = blend_backward(
+        features, opacity, self.pixel_spread = blend_backward(
             self.dev,
             self.buffers,
             self.pairs,

@@ -11,8 +11,6 @@ from pp_cl.device.buffers import Buffers, Reading, Table, read_later
 from pp_cl.device.device import Device
 from pp_cl.device.launch import group_items, lanes, launch_groups
 from pp_cl.errors import Diverged
-from pp_cl.raster.pairs import Pairs
-from pp_cl.raster.weights import BlendWeights
 
 TAPS = 11  # pixels, the side of an SSIM window
 MARGIN = 32  # values by which a scratch row is longer than needed, >= 3 * (TAPS - 1)
@@ -61,7 +59,6 @@ class Loss:
             "partial_terms": (window_rows + height, blocks, 4),
             "row_terms": (window_rows + height, 4),
             "grad_prediction": tuple(prediction_shape),
-            "pixel_spread": (math.prod(prediction_shape[:2]),),
         }
         return {name: (shape, np.float32) for name, shape in shapes.items()}
 
@@ -153,24 +150,6 @@ class Loss:
             values=values,
             terms=self.terms,
         )
-
-    def add_spread(self, pairs: Pairs, weights: BlendWeights, weight: float, scale: float) -> None:
-        """Add weight times the spread, scale times the sum over a view's pixels, to the loss; after
-        forward_backward() of the same view. Renderer.backward(spread_weight=weight * scale) has its
-        gradient.
-        """
-        pixel_spread = self._buffers.pixel_spread
-        program = self.dev.program("training/loss", GROUP=group_items(self.dev), **self._defines)
-        program.launch(
-            "loss_pixel_spread",
-            pairs.pixels,
-            hw=pairs.pixels,
-            pixel_offset=pairs.pixel_offset,
-            pair_key=pairs.pair_key,
-            pixel_entry=weights.pixel_entry,
-            pixel_spread=pixel_spread,
-        )
-        self.add("spread", pixel_spread, weight, scale)
 
     def read(self, step: int) -> Reading[dict[str, float]]:
         """{"loss", "l1", "ssim", "psnr"} of the crop of a step, from 1 on, and the terms that were

@@ -117,19 +117,20 @@ class Optimiser:
         """Update the EMA of points and network: average += weight * (parameter - average); the
         first call starts them as copies.
         """
+        rows = PointState.ema_table(self.model.cloud.count, self.model.cloud.blocks)
+        rows["network"] = self.model.net.all_parameters.shape, np.float32
         for averages, parameters in self._averaged():
             for name, parameter in parameters.items():
-                if name not in averages:
-                    averages[name] = self.dev.empty(parameter.shape)
-                    self.dev.copy(averages[name], parameter)
-                else:
-                    ema_update(self.dev, averages[name], parameter, weight)
+                first = name not in averages
+                if first:
+                    averages[name] = self.dev.empty(*rows[name])
+                ema_update(self.dev, averages[name], parameter, 1.0 if first else weight)
 
     def apply_ema(self) -> None:
         """Copy the EMA, if there is one, into the model's parameters, and release it."""
         for averages, parameters in self._averaged():
             for name in list(averages):
-                self.dev.copy(parameters[name], averages.pop(name))
+                ema_take(self.dev, averages.pop(name), parameters[name])
 
     def _averaged(self):
         """[(averages, the parameters of the same names)] of the points and of the network."""
@@ -218,21 +219,30 @@ def ema_update(dev: Device, ema: Array, parameter: Array, weight: float) -> None
     """Move an EMA, in place: ema += weight * (parameter - ema). A weight of 1 copies, whatever it
     held.
 
-    ema, parameter: float32 arrays of one shape, any. Raises ValueError when the shapes differ.
+    ema, parameter: float32 arrays of one shape, any; or an EMA of float16, of a multiple of 16
+    values. Raises ValueError when the shapes differ.
     """
     _same_shape(ema, parameter)
-    if weight == 1:
+    if ema.dtype == np.float16:
+        _launch_ema(dev, "ema_update_half", parameter, ema, weight=weight)
+    elif weight == 1:
         dev.copy(ema, parameter)
-        return
+    else:
+        _launch_ema(dev, "ema_update", parameter, ema, weight=weight)
+
+
+def ema_take(dev: Device, ema: Array, parameter: Array) -> None:
+    """Overwrite a parameter by its EMA, both as ema_update() takes them."""
+    if ema.dtype == np.float16:
+        _launch_ema(dev, "ema_take_half", parameter, ema)
+    else:
+        dev.copy(parameter, ema)
+
+
+def _launch_ema(dev, kernel, parameter, ema, **weight):
+    n = parameter.size
     program = dev.program("training/adam", LANES=lanes(dev), DECAY1=DECAY1, DECAY2=DECAY2)
-    program.launch(
-        "ema_update",
-        -(-parameter.size // lanes(dev)),
-        n=parameter.size,
-        weight=weight,
-        parameter=parameter,
-        ema=ema,
-    )
+    program.launch(kernel, -(-n // lanes(dev)), n=n, parameter=parameter, ema=ema, **weight)
 
 
 def rmsprop_update(
@@ -262,14 +272,13 @@ def rmsprop_update(
     if degree is None:
         return
     root, (sh_0, sh_1, sh_2a, sh_2b) = math.sqrt(1 - BETA2**step), four_blocks(sh)
-    program = dev.program(
+    dev.program(
         "training/rmsprop",
         LANES=lanes(dev),
         DEGREE=degree,
         DECAY2=DECAY2,
         LOG_BETA2=f"{math.log2(BETA2):.9g}f",
-    )
-    program.launch(
+    ).launch(
         "rmsprop_move",
         len(shaded) * row_parts(dev),
         s=len(shaded),
@@ -288,15 +297,6 @@ def rmsprop_update(
         sh_1=sh_1,
         sh_2a=sh_2a,
         sh_2b=sh_2b,
-    )
-    program.launch(
-        "rmsprop_mark",
-        len(shaded),
-        s=len(shaded),
-        step=step,
-        shaded=shaded,
-        grad_shaded_features=grad_shaded_features,
-        last_step=last_step,
     )
 
 

@@ -1,13 +1,17 @@
 """The memory of the machine, as Linux and a container tell it."""
 
 import mmap
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 from pp_cl.device import host
+from pp_cl.device.device import Device
+from pp_cl.device.discover import open_device
 
 MIB = 2**20
+THP = Path("/sys/kernel/mm/transparent_hugepage/enabled")
 
 
 @pytest.fixture
@@ -61,3 +65,25 @@ def test_this_machine():
     grown = host.resident_bytes() - before
     assert 0.9 * block.nbytes < grown < 1.2 * block.nbytes
     assert host.available_bytes() > host.resident_bytes()
+
+
+def asked_bytes():
+    """Memory of this process for which huge pages were asked for."""
+    found = size = 0
+    for line in Path("/proc/self/smaps").read_text().splitlines():
+        words = line.split()
+        if words[0] == "Size:":
+            size = 1024 * int(words[1])
+        elif words[0] == "VmFlags:" and "hg" in words:
+            found += size
+    return found
+
+
+@pytest.mark.skipif(not THP.exists(), reason="no huge pages")
+def test_large_buffers_of_a_cpu_lie_on_huge_pages():
+    dev = Device(open_device().device)  # without guards
+    if not dev.is_cpu:
+        pytest.skip("a GPU's memory is its own")
+    before = asked_bytes()
+    held = dev.empty((64 * MIB,), np.uint8)
+    assert asked_bytes() - before > 63 * MIB, held

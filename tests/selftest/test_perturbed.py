@@ -12,7 +12,7 @@ KERNELS = device_module.kernel_folder()
 # (kernel file, text that stands there once, what it becomes, the case that must fail)
 FLIPS = [
     ("device/rows", "to[c] = from[c]", "to[c] = -from[c]", "device: compact and gather rows"),
-    ("device/scan", "sum = add_sat(sum, total)", "sum = add_sat(sum, -total)", "device: scan"),
+    ("device/scan", "sum += total", "sum -= total", "device: scan"),
     ("scene/demo", "y[lane] = p.y", "y[lane] = -p.y", "scene: demo"),
     ("scene/hull", "alive & seen", "alive | seen", "scene: hull"),
     ("scene/target", "255 * (255 - c.w)", "255 * (255 + c.w)", "scene: target"),
@@ -22,7 +22,7 @@ FLIPS = [
     ("raster/shade", "features += basis[4 + b]", "features -= basis[4 + b]", "raster: shade"),
     ("raster/depth", "depth += b *", "depth -= b *", "raster: depth, softmax"),
     ("raster/depth", "before + share", "before - share", "raster: depth, alpha"),
-    ("raster/weights", "sum += pair", "sum -= pair", "raster: highest weights, alpha"),
+    ("raster/weights", "sum += HAS", "sum -= HAS", "raster: highest weights, alpha"),
     ("raster/softmax", "a - M, 0.0f)) / D", "a + M, 0.0f)) / D", "softmax: forward, disc"),
     ("raster/softmax", "share * (1.0f + a)", "share * (1.0f - a)", "softmax: backward, soft"),
     ("raster/alpha", "fmax(1.0f - alpha", "fmax(1.0f + alpha", "alpha: forward, soft"),
@@ -48,7 +48,7 @@ FLIPS = [
     ("training/mask", "1.0f - transmittance", "1.0f + transmittance", "loss: mask"),
     ("training/exposure", "+ prior) / (known.y", "- prior) / (known.y", "loss: exposure"),
     ("training/exposure", "gain + white", "gain - white", "loss: exposure"),
-    ("training/loss", "weights - depths", "weights + depths", "loss: spread"),
+    ("raster/blend", "spread += b", "spread -= b", "alpha: spread"),
     ("training/loss", "terms[0] += weight", "terms[0] -= weight", "loss: sum of its terms"),
     ("training/perceptual", "= of_row /", "= -of_row /", "loss: perceptual"),
     ("training/adam", "(g - m_new)", "(g + m_new)", "adam: arrays"),

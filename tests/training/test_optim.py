@@ -65,7 +65,8 @@ def test_averages_start_as_copies_and_are_applied_and_released(dev, rng):
     optimiser.apply_ema()
     assert dev.bytes == before
     for name, array in parameters.items():
-        np.testing.assert_allclose(array.get(), 0.75 * start[name], rtol=1e-6)
+        rounding = 2**-10 if name.startswith("sh") else 1e-6  # of 16 bits, twice
+        np.testing.assert_allclose(array.get(), 0.75 * start[name], rtol=rounding)
         dev.fill(array, 0)
     optimiser.apply_ema()  # there are none any more
     assert not any(array.get().any() for array in parameters.values())

@@ -59,7 +59,8 @@ def test_compacting_never_takes_more_than_its_scratch(dev, rng, monkeypatch, sha
         array.set(rng.random(array.shape).astype(np.float32))
     del array  # else it is not released
     state = PointState(dev, cloud)
-    state.averages |= {name: dev.empty(array.shape) for name, array in cloud.learned().items()}
+    averages = PointState.ema_table(1000, cloud.blocks)
+    state.averages |= {name: dev.empty(*row) for name, row in averages.items()}
     fill(state, rng)
     host = fetched(cloud.arrays(dev) | state.arrays())
     assert len(host) == 6 + 2 + 4 + 6 + 1
@@ -142,8 +143,8 @@ def test_the_state_follows(dev, rng):
     """Each point's rows, averages among them; weights and looks start anew."""
     model = make_model(dev, rng)
     state = PointState(dev, model.cloud)
-    learned = model.cloud.learned().items()
-    state.averages |= {name: dev.empty(array.shape) for name, array in learned}
+    averages = PointState.ema_table(model.cloud.count, model.cloud.blocks)
+    state.averages |= {name: dev.empty(*row) for name, row in averages.items()}
     for array in state.arrays().values():
         array.set((99 * rng.random(array.shape)).astype(array.dtype))
     grid, before = model.grid, fetched(model.cloud.arrays(dev) | state.arrays())
