@@ -9,6 +9,7 @@ import numpy as np
 from tqdm import tqdm
 
 from pp_cl.capture.features import cores, opened, quiet
+from pp_cl.capture.packages import needed
 from pp_cl.errors import UserError
 from pp_cl.files.atomic import atomic_folder
 from pp_cl.scene.camera import Camera
@@ -18,6 +19,8 @@ from pp_cl.scene.views import Photograph
 LEAST_SHARE = 0.5  # of the images that have a place
 FEW_FEATURES, FEW_MATCHES = 200, 30
 GROWTH = 1.4  # COLMAP's 1.1 takes twice the time
+BELIEVED = 2.0  # of the points' median error: observations that are further off count less
+CONVERGED = 1e-5  # relative change of the sum of errors
 BLURRED = 0.4  # of the median sharpness
 
 
@@ -34,6 +37,7 @@ def place(database: Path, images: Path, model: Path, taken: Sequence[dict]) -> d
             best = max(found.values(), key=lambda one: (one.num_reg_images(), one.num_points3D()))
             for folder in list(unfinished.iterdir()):
                 shutil.rmtree(folder)
+            refine(best)
             best.write(unfinished)
         placed = {image.name for image in best.images.values() if image.has_pose} if found else ()
         reasons = _reasons(database, taken, placed)
@@ -64,6 +68,22 @@ def _mapped(database, images, folder, count):
             return colmap.incremental_mapping(
                 database, images, folder, options, next_image_callback=lambda: bar.update()
             )
+
+
+def refine(model: Any) -> None:
+    """Adjust all cameras and points once more, with a loss by which the few wrong matches, mostly
+    of patterns that repeat, no longer pull at the cameras.
+    """
+    colmap = needed("pycolmap")
+    model.update_point_3d_errors()
+    error = np.median([point.error for point in model.points3D.values()])
+    options = colmap.BundleAdjustmentOptions(print_summary=False)
+    options.ceres.loss_function_type = colmap.LossFunctionType.CAUCHY
+    options.ceres.loss_function_scale = BELIEVED * error
+    options.ceres.solver_options.function_tolerance = CONVERGED
+    options.ceres.solver_options.num_threads = cores()
+    colmap.bundle_adjustment(model, options)
+    model.update_point_3d_errors()
 
 
 def _reasons(database, taken, placed):

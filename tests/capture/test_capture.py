@@ -15,6 +15,7 @@ import pytest
 from PIL import Image, ImageFilter
 from support.runs import spoken
 
+from pp_cl.capture import poses
 from pp_cl.capture.frames import take_images
 from pp_cl.files.image import to_8bit, write_png
 from pp_cl.files.video import write_video
@@ -23,7 +24,7 @@ from pp_cl.scene.demo import render
 from pp_cl.scene.load import load_scene, scene_format, scene_frames
 from tools.capture_demo import align, cameras, room
 
-pytest.importorskip("pycolmap")
+colmap = pytest.importorskip("pycolmap")
 SIZE, COUNT = 300, 12
 
 
@@ -104,6 +105,23 @@ def test_photographs_become_a_scene(captured):
             < 0.1 * SIZE
         )
         assert -view.camera.pose[2, 1] > 0  # the image's upper edge is up
+
+
+def test_wrong_matches_do_not_pull_at_the_cameras():
+    """One point of twenty is another in each photograph, some pixels away, as in a pattern."""
+    colmap.set_random_seed(0)
+    model = colmap.synthesize_dataset(
+        colmap.SyntheticDatasetOptions(num_rigs=1, num_frames_per_rig=12, num_points3D=400)
+    )
+    true = [one.camera for one in poses.photographs(model, "")]
+    rng = np.random.default_rng(0)
+    for image in model.images.values():
+        for one in image.points2D:
+            if one.has_point3D():
+                one.xy = one.xy + rng.normal(0, 4 if one.point3D_id % 20 == 0 else 0.2, 2)
+    poses.refine(model)
+    found = align([one.camera for one in poses.photographs(model, "")], true)
+    assert found.position < 0.001 and found.degrees < 0.02
 
 
 def test_what_is_done_is_not_done_again(captured, shot, tmp_path):
