@@ -33,6 +33,7 @@ def test_a_run_learns_and_leaves_its_files(finished):
     assert 0 < len(arrays["points.ids"]) < header["initial_points"]
     assert not any(name.startswith(("moment", "state", "average")) for name in arrays)
     assert (np.diff(arrays["points.ids"].astype(np.int64)) > 0).all()
+    assert arrays["points.offset"].any(axis=1).all() and arrays["points.offset"].std() > 0.01
 
 
 def test_the_same_seed_gives_the_same_bytes_and_another_does_not(scene, finished, tmp_path):
@@ -76,11 +77,11 @@ def test_the_networks_other_blocks_learn_and_resume_to_the_same_bytes(
     assert f"network.blocks is {blocks} there, single asked for" in capsys.readouterr().err
 
 
-def test_a_degree_of_rate_0_is_left_alone(scene, tmp_path, monkeypatch):
-    changes = {"train__sh_rate": "0.5,0.25,0"}
+def test_what_has_a_rate_of_0_is_left_alone(scene, tmp_path, monkeypatch):
+    changes = {"train__sh_rate": "0.5,0.25,0", "train__offset_rate": "0,0"}
     train_and_interrupt(scene, tmp_path / "run", 25, monkeypatch, **changes)
     _, arrays = load_checkpoint(tmp_path / "run" / "checkpoint.npz")
-    assert not arrays["points.sh2"].any()
+    assert not arrays["points.sh2"].any() and not arrays["points.offset"].any()
     assert arrays["points.sh0"].any() and arrays["points.sh1"].any()
     assert main(arguments(scene, tmp_path / "run", **changes)) == 0
 

@@ -84,6 +84,7 @@ def test_a_finished_run_is_extended_and_resumes_to_the_same_bytes(
 ENDLESS = {
     "network__rate": "1e-3,1e-3",
     "train__opacity_rate": "0.1,0.1",
+    "train__offset_rate": "0.01,0.01",
     "train__opacity_rate_steps": 0,
     "train__sh_rate_decay": 1,
     "train__sh_delay": "0,0,0",

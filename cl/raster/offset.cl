@@ -3,6 +3,8 @@
 //
 // d = 1 - rho / h with rho = |e|, e = c - (c.r) r: of the centre c from the unit ray r
 // dd/dc = -e / (rho h),   dL/dd = o T gain (alpha.cl, blend.cl)
+//
+// The least h grows with the range t = |c|: then dd/dc has rho/h^2 dh/dc = (1 - d) c/t^2 more.
 #include "common.h"
 #include "camera.h"
 #include "raster/footprint.h"
@@ -36,7 +38,9 @@ kernel void offset_backward(
     const uint i = shaded[g];
     const Camera cam = camera_load(camera);
     const float3 c = point_camera[i].xyz;
-    const float h = fmax(point_radius[0], LEAST_RADIUS * point_camera[i].w / least_focal(&cam));
+    const float t = point_camera[i].w;
+    const float h = fmax(point_radius[0], LEAST_RADIUS * t / least_focal(&cam));
+    const float growth = h > point_radius[0] ? 1.0f / (t * t) : 0.0f;
     float3 dL_dc = 0.0f;
     for (uint pair = point_offset[i]; pair < point_offset[i + 1]; pair++) {
         if (HAS_ROLES && pair_role[pair] != TRACKED) continue;
@@ -45,7 +49,8 @@ kernel void offset_backward(
         const uint q = pair_pixel[pair];
         const float3 r = camera_ray(&cam, q % cam.width, q / cam.width), e = c - dot(c, r) * r;
         const float dL_dd = opacity[i] * pair_weight[pair].y / d * pair_gain[pair];
-        dL_dc -= dL_dd / (fmax(1.0f - d, LEAST_RHO) * h * h) * e;
+        const float per_rho_h = 1.0f / (fmax(1.0f - d, LEAST_RHO) * h * h);
+        dL_dc += dL_dd * (growth * (1.0f - d) * c - per_rho_h * e);
     }
     const float3 world = edge * (dL_dc.x * cam.right + dL_dc.y * cam.down + dL_dc.z * cam.forward);
     vstore3(world, i, grad_offset);
