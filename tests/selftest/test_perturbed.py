@@ -31,6 +31,7 @@ FLIPS = [
     ("raster/blend", "sum + (1.0f - weights)", "sum + (1.0f + weights)", "softmax: forward, soft"),
     ("raster/blend", "+ g - B;", "+ g + B;", "alpha: backward, disc"),
     ("raster/blend", "front.x - behind.x", "front.x + behind.x", "alpha: spread"),
+    ("raster/offset", "- per_rho_h * e", "+ per_rho_h * e", "alpha: offsets of points"),
     ("bench/spheres", "dL_dR -= dL_ddepth", "dL_dR += dL_ddepth", "softmax: gradients of spheres"),
     ("layers/conv", "[p] += value", "[p] -= value", "conv: direct, hard inputs"),
     ("layers/conv_backward_weights", "[i] += value", "[i] -= value", "conv: direct, hard inputs"),
