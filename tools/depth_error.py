@@ -7,7 +7,8 @@ exact one, and the intersection over union of alpha and mask.
 """
 
 import argparse
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
+from pathlib import Path
 
 import numpy as np
 from scipy.ndimage import map_coordinates
@@ -15,6 +16,7 @@ from scipy.ndimage import map_coordinates
 from pp_cl import load
 from pp_cl.device.device import Device
 from pp_cl.errors import UserError
+from pp_cl.files.atomic import write_json
 from pp_cl.run import Run
 from pp_cl.scene.camera import Camera
 from pp_cl.scene.demo import OBJECT_BOX, distances
@@ -106,9 +108,13 @@ def main() -> None:
     """Print the error of a run."""
     parser = argparse.ArgumentParser(description=__doc__.partition("\n\n")[0])
     parser.add_argument("run_folder", metavar="RUN")
-    error = depth_error(load(parser.parse_args().run_folder))
+    parser.add_argument("--json", type=Path, metavar="FILE", help="write it there too")
+    options = parser.parse_args()
+    error = depth_error(load(options.run_folder))
     print(f"within {NEAR} spacings: mean depth {error.mean:.3f}, median depth {error.median:.3f}")
     print(f"alpha and mask: intersection over union {error.overlap:.3f}")
+    if options.json:
+        write_json(options.json, asdict(error))
 
 
 if __name__ == "__main__":

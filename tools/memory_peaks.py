@@ -1,6 +1,6 @@
 """Compare the memory plan of trainings with the peaks of device and host that they reach.
 
-    python tools/memory_peaks.py [--scene FOLDER] [--only NAME ...] --out docs/results/memory.json
+    python tools/memory_peaks.py [--scene FOLDER] [--only NAME ...] [--json FILE]
 
 Each training is a process of its own, a few steps long: what is allocated does not change between
 prunings. Refinements come early, so that none is left out. The row `phone` trains on 300
@@ -19,7 +19,6 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
-from pp_cl import __version__
 from pp_cl.device.discover import open_device
 from pp_cl.files.atomic import write_json
 from pp_cl.files.run_folder import RunFolder
@@ -40,15 +39,6 @@ TRAININGS = {
     "paper in full": ("paper", {"train.iterations": 3}),  # 12 GiB on lego
     "phone": ("tiny", {"scene.downscale": 8}),
 }
-COLUMNS = [
-    {"head": "training", "cell": "{name}"},
-    {"head": "points at the peak", "cell": "{points:,}"},
-    {"head": "device: plan", "cell": "{device_plan:.0f} MiB"},
-    {"head": "measured", "cell": "{device:.0f} MiB"},
-    {"head": "host: plan", "cell": "{host_plan:.0f} MiB"},
-    {"head": "measured", "cell": "{host:.0f} MiB"},
-    {"head": "plan / measured: device, host", "cell": "{device_ratio:.2f}, {host_ratio:.2f}"},
-]
 
 
 def write_phone_scene(folder: Path, count: int = PHONES) -> str:
@@ -120,7 +110,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--scene", default="demo", help="folder of a scene (demo)")
     parser.add_argument("--only", nargs="+", choices=TRAININGS, default=list(TRAININGS))
-    parser.add_argument("--out", help="file of the results")
+    parser.add_argument("--json", type=Path, metavar="FILE", help="write the rows there too")
     parser.add_argument("--child", choices=TRAININGS, help=argparse.SUPPRESS)
     options = parser.parse_args()
     if options.child:
@@ -128,19 +118,8 @@ def main() -> None:
         return
     rows = [row(name, options.scene) for name in options.only]
     print(json.dumps(rows, indent=1))
-    if options.out:
-        write_json(Path(options.out), results(rows))
-
-
-def results(rows: list[dict]) -> dict:
-    """A file of results for tools/docs_tables.py."""
-    return {
-        "measured": "the most memory of device and process that trainings of the presets take",
-        "command": "python tools/memory_peaks.py",
-        "version": __version__,
-        "columns": COLUMNS,
-        "rows": rows,
-    }
+    if options.json:
+        write_json(options.json, rows)
 
 
 if __name__ == "__main__":

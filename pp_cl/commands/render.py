@@ -16,7 +16,7 @@ EPILOG = """paths:
   SPLIT       the cameras of a split of the scene: train, val, test
   FILE        nerfstudio's camera_path.json, a transforms.json, or cameras.json of 3D Gaussian
               Splatting and brush, in the world of the scene"""
-FILMS, IMAGES = ("mp4", "webm", "gif"), ("png", "exr")
+FILMS, IMAGES = ("mp4", "webm", "webp", "gif"), ("png", "exr")
 COLOURS = {"white": (1.0, 1.0, 1.0), "black": (0.0, 0.0, 0.0), "transparent": None}
 MADE = ("orbit", "spiral")  # paths that the program makes
 SECONDS, FPS = 4, 30
@@ -45,13 +45,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add(
         "--out",
         metavar="NAME",
-        help="a film, by its suffix .mp4, .webm or .gif, else a folder for frames (default: in"
-        " RUN/render, named after path and size)",
+        help="a film, by its suffix .mp4, .webm, .webp or .gif, else a folder for frames (default:"
+        " in RUN/render, named after path and size)",
     )
     add(
         "--format",
         choices=(*FILMS, *IMAGES),
-        help="a film (mp4, webm, gif) or frames (png, exr); by --out, else mp4",
+        help="a film (mp4, webm, webp, gif) or frames (png, exr); by --out, else mp4",
     )
     add("--size", type=shared.size, metavar="WxH", help="pixels (default: those of the training)")
     add(
@@ -150,8 +150,8 @@ def _format(options):
         return suffix or options.format or FILMS[0]
     if (mimetypes.guess_type(options.out)[0] or "").startswith(("video/", "image/")):
         raise UserError(
-            f"--out {options.out}: films end in .mp4, .webm or .gif, frames go into a folder; name"
-            " one of these"
+            f"--out {options.out}: films end in .mp4, .webm, .webp or .gif, frames go into a"
+            " folder; name one of these"
         )
     return options.format or IMAGES[0]
 

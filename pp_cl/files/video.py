@@ -1,4 +1,6 @@
-"""Films from frames, by imageio: MP4 and WebM with the ffmpeg of its wheel, GIF with Pillow."""
+"""Films from frames, by imageio: MP4 and WebM with the ffmpeg of its wheel, GIF and WebP with
+Pillow.
+"""
 
 from collections.abc import Iterable
 from itertools import chain
@@ -10,13 +12,14 @@ from PIL import Image
 from pp_cl.errors import UserError
 from pp_cl.files.atomic import atomic_path
 
-FORMATS = ("mp4", "webm", "gif")
+LOOPED = ("gif", "webp")  # as pages show without a player
+FORMATS = ("mp4", "webm", *LOOPED)
 MISSING = "films need the packages imageio and imageio-ffmpeg: pip install pp-cl[video]"
 
 
 def check_video(suffix: str) -> None:
     """Raise UserError with the command that mends it where a film of this format cannot be made."""
-    if suffix == "gif":
+    if suffix in LOOPED:
         return
     try:
         import imageio.v2  # noqa: F401
@@ -24,7 +27,7 @@ def check_video(suffix: str) -> None:
 
         imageio_ffmpeg.get_ffmpeg_exe()
     except (ImportError, RuntimeError):
-        raise UserError(f"{MISSING}; or write --format gif, or png for frames") from None
+        raise UserError(f"{MISSING}; or write --format webp, or png for frames") from None
 
 
 def write_video(path: Path, frames: Iterable[np.ndarray], fps: float) -> None:
@@ -36,11 +39,12 @@ def write_video(path: Path, frames: Iterable[np.ndarray], fps: float) -> None:
     cannot be written.
     """
     frames = (_even(frame) for frame in frames)
+    looped = path.suffix.lower()[1:] in LOOPED
     with atomic_path(path) as temporary:
-        (_write_gif if path.suffix.lower() == ".gif" else _write)(temporary, frames, fps)
+        (_write_looped if looped else _write)(temporary, frames, fps)
 
 
-def _write_gif(path, frames, fps):
+def _write_looped(path, frames, fps):
     images = map(Image.fromarray, frames)
     options = {"save_all": True, "duration": 1000 / fps, "loop": 0}
     next(images).save(path, append_images=images, **options)

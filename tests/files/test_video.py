@@ -10,7 +10,7 @@ import pytest
 from PIL import Image
 
 from pp_cl.errors import UserError
-from pp_cl.files.video import check_video, write_video
+from pp_cl.files.video import LOOPED, check_video, write_video
 
 
 def frames(height=50, width=64, channels=3, count=9):
@@ -40,9 +40,11 @@ def test_a_film_is_read_back(tmp_path, suffix, size):
         assert difference.mean() < 6
 
 
-def test_a_gif_loops_at_its_speed(tmp_path):
-    write_video(tmp_path / "film.gif", frames(), 12.5)
-    with Image.open(tmp_path / "film.gif") as film:
+@pytest.mark.parametrize("suffix", LOOPED)
+def test_a_film_for_pages_loops_at_its_speed(tmp_path, suffix):
+    write_video(tmp_path / f"film.{suffix}", frames(), 12.5)
+    with Image.open(tmp_path / f"film.{suffix}") as film:
+        film.load()
         assert film.n_frames == 9 and film.size == (64, 50)
         assert film.info["duration"] == 80 and film.info["loop"] == 0
 

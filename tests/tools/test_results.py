@@ -1,0 +1,67 @@
+"""tools/results.py: what was measured is kept for the code that it was measured of, and fits the
+tables; a training and its evaluation become a row.
+"""
+
+import pytest
+
+from tools import docs_tables
+from tools import results as TOOL
+
+ROW = {"name": "lego", "size": "200x200", "preset": "tiny", "steps": 300, "views": 200}
+ROW |= {"minutes": 0.5, "psnr": 28.1234, "ssim": 0.95, "lpips": 0.05, "points": 90000}
+ROW |= {"frame_ms": 14.0, "computed": 1.0}
+RASTER = {"points": 250336, "size": 200, "blend": "alpha", "forward_ms": 13.7, "backward_ms": 2.1}
+RASTER |= {"ms": 15.8, "max_err": 8e-8, **dict.fromkeys(TOOL.STAGES, 1.5)}
+NET = {"widths": "32,64,128", "side": 200, "variant": "auto", "direction": "forward"}
+NET |= {"ms": 13.1, "gflops": 900.0, "rel_l2": 4e-7}
+MEMORY = {"name": "tiny", "points": 253464, "device_plan": 7e2, "device": 7e2}
+MEMORY |= {"host_plan": 1e3, "host": 1e3}
+FOUND = dict.fromkeys(TOOL.PARTS, ROW)
+FOUND |= {"demo": [{"what": "mesh", "result": "0.76"}]}
+FOUND |= {"rasteriser": [RASTER], "network": [NET], "memory": [MEMORY]}
+
+
+@pytest.fixture
+def kept(tmp_path, monkeypatch):
+    """A folder for what is measured."""
+    monkeypatch.setattr(TOOL, "KEPT", tmp_path / "kept")
+    return tmp_path / "kept"
+
+
+def test_what_was_found_is_kept_until_the_code_changes(kept, monkeypatch):
+    calls = []
+    monkeypatch.setattr(TOOL, "PARTS", {"a": lambda: calls.append(1) or {"n": len(calls)}})
+    TOOL.begin("one")
+    assert TOOL.measure("a") == TOOL.measure("a") == {"n": 1}
+    TOOL.begin("one")
+    assert TOOL.measure("a") == {"n": 1}
+    TOOL.begin("two")
+    assert TOOL.measure("a") == {"n": 2}
+
+
+def test_tables_and_plots(tmp_path):
+    about = {"version": "1", "machine": "a machine", "command": "make results"}
+    for contents in TOOL.tables(FOUND).values():
+        written = docs_tables.table(about | contents)
+        last = written.splitlines()[-1].split("|")[1:-1]
+        assert len(last) == len(contents["columns"]) and all(cell.strip() for cell in last)
+    pytest.importorskip("matplotlib", reason="pictures need the extra `plot`")
+    TOOL.draw(TOOL.trained(FOUND), TOOL.timed(FOUND), tmp_path)
+    assert len({*tmp_path.glob("*.png")}) == 4
+
+
+@pytest.mark.slow
+def test_a_training_becomes_a_row(kept):
+    TOOL.begin("one")
+    row = TOOL.train(TOOL.Training("demo", "demo", "tiny", 4))
+    assert row.keys() == ROW.keys()
+    assert (row["size"], row["steps"], row["views"]) == ("200x200", 4, 16)
+    assert row["psnr"] > 5 and row["minutes"] > 0 and row["points"] > 1000
+
+
+def test_a_program_that_fails_is_told(kept, monkeypatch, capsys):
+    monkeypatch.setattr(TOOL, "PARTS", {"a": lambda: TOOL.run_program(*TOOL.PP_CL, "eval", "/no")})
+    monkeypatch.setattr(TOOL, "origin", lambda: {"commit": "one"})
+    monkeypatch.setattr("sys.argv", ["results"])
+    assert TOOL.main() == 2
+    assert "/no" in capsys.readouterr().err

@@ -1,0 +1,393 @@
+"""Measure what README.md and docs/ state as results of this code: `make results`.
+
+Every part is a process: a training with its evaluation, a bench, a tool. What it found is kept in
+runs/results/, so that the same command goes on where it was stopped; for other code everything is
+measured anew. Then docs/results/ and the plots are written; `make docs` puts them into the pages.
+Scenes are looked for in PP_DATA (../shared/data). It takes hours in which nothing else should run.
+"""
+
+import argparse
+import json
+import os
+import shutil
+import subprocess
+import sys
+from collections.abc import Callable
+from dataclasses import dataclass
+from datetime import date
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, TypeAlias
+
+from pp_cl import __version__
+from pp_cl.device.discover import open_device
+from pp_cl.errors import UserError
+from pp_cl.files.atomic import write_json
+from pp_cl.metrics.published import tables as published
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+ROOT = Path(__file__).parents[1]
+KEPT = ROOT / "runs" / "results"
+DATA = Path(os.environ.get("PP_DATA", ROOT.parent / "shared" / "data"))
+CODE = ("pp_cl", "cl")  # what decides the numbers
+
+LEGO, ALL_VIEWS = "nerf_synthetic/lego", "nerf_synthetic/lego_all"
+HEAD = "ethiopian_head"
+TOOL = (sys.executable, "-m")
+PP_CL = (*TOOL, "pp_cl")
+OPENSPLAT = [(3.6, 24.2), (14.0, 29.9)]  # minutes on one core, PSNR; its CPU build, 15b7e80
+# published, lego at 800x800: which side of its line the name stands on
+DRAWN = dict.fromkeys(("PlenopticPoints", "Plenoxels", "TensoRF"), "bottom")
+DRAWN |= {"Instant-NGP": "top"}
+
+
+Found: TypeAlias = dict | list[dict]
+
+
+@dataclass(frozen=True)
+class Training:
+    """A training and the scene of its test views, if that is another one."""
+
+    name: str
+    scene: str
+    preset: str
+    steps: int | None = None  # None: the preset's
+    downscale: int | None = None
+    test: str | None = None
+
+
+def lego(preset: str, downscale: int, *steps: int) -> list[Training]:
+    """Trainings of several lengths, each with schedules of its own."""
+    return [Training("lego", LEGO, preset, n, downscale, ALL_VIEWS) for n in steps]
+
+
+TRAININGS = [
+    Training("demo", "demo", "tiny", 1500),
+    Training("demo", "demo", "tiny", 12000),
+    *lego("tiny", 4, 300, 1150, 3000, 8000),
+    *lego("small", 2, 1500, 6000),
+    *lego("full", 1, 2000, 4600, 11000),
+    Training("ethiopian_head, 57 photographs", HEAD, "tiny"),
+    Training("ethiopian_head, 57 photographs", HEAD, "small", 6000),
+    Training("mary_rose, 60 photographs", "real/mary_rose", "tiny"),
+    Training("DTU scan37, 42 photographs", "real/dtu_scan37", "tiny"),
+]
+# of README.md
+SHOWN = ("demo_1500", "lego_8000", "lego_6000", "lego_11000", "ethiopian_head_6000", "dtu_scan37")
+
+QUALITY = [
+    {"head": "scene", "cell": "{name}"},
+    {"head": "size", "cell": "{size}"},
+    {"head": "preset, steps", "cell": "`{preset}`, {steps:,}"},
+    {"head": "test views", "cell": "{views}"},
+    {"head": "minutes", "cell": "{minutes:.1f}"},
+    {"head": "PSNR", "cell": "{psnr:.2f}"},
+    {"head": "SSIM", "cell": "{ssim:.4f}"},
+    {"head": "LPIPS", "cell": "{lpips:.4f}"},
+    {"head": "points", "cell": "{points:,}"},
+    {"head": "ms a frame", "cell": "{frame_ms:.0f}"},
+]
+STAGES = ("project", "pairs", "weights", "shade", "blend")
+RASTERISER = [
+    {"head": "points", "cell": "{points:,}"},
+    {"head": "side", "cell": "{size}"},
+    {"head": "blend", "cell": "{blend}"},
+    *({"head": stage, "cell": f"{{{stage}:.1f}}"} for stage in STAGES),
+    {"head": "forward", "cell": "{forward_ms:.1f}"},
+    {"head": "backward", "cell": "{backward_ms:.1f}"},
+    {"head": "error", "cell": "{max_err:.1e}"},
+]
+NETWORK = [
+    {"head": "widths", "cell": "{widths}"},
+    {"head": "side", "cell": "{side}"},
+    {"head": "variant", "cell": "`{variant}`"},
+    {"head": "pass", "cell": "{direction}"},
+    {"head": "ms", "cell": "{ms:.1f}"},
+    {"head": "GFLOP/s", "cell": "{gflops:.0f}"},
+    {"head": "relative L2 error", "cell": "{rel_l2:.1e}"},
+]
+MEMORY = [
+    {"head": "training", "cell": "{name}"},
+    {"head": "points at the peak", "cell": "{points:,}"},
+    {"head": "device: plan", "cell": "{device_plan:.0f} MiB"},
+    {"head": "measured", "cell": "{device:.0f} MiB"},
+    {"head": "host: plan", "cell": "{host_plan:.0f} MiB"},
+    {"head": "measured", "cell": "{host:.0f} MiB"},
+]
+DEMO = [{"head": "measured on", "cell": "{what}"}, {"head": "result", "cell": "{result}"}]
+
+
+# ---- parts: each returns what it found
+
+
+def run_program(*words: object) -> None:
+    """Run a program; raises UserError with its last lines if it fails."""
+    print("$", *words[1:], flush=True)
+    done = subprocess.run([str(w) for w in words], cwd=ROOT, stderr=subprocess.PIPE, text=True)
+    if done.returncode:
+        raise UserError(f"{' '.join(map(str, words[1:]))}: {done.stderr[-2000:].strip()}")
+
+
+def read_found(name: str, *words: object) -> dict:
+    """What a program writes with --json."""
+    file = KEPT / f"{name}.found"
+    run_program(*words, "--json", file)
+    return json.loads(file.read_text("utf-8"))
+
+
+def key_of(training: Training) -> str:
+    """The name of a training's part, and of its run."""
+    name = Path(training.scene).name
+    return f"{name}_{training.steps}" if training.steps else name
+
+
+def train(training: Training) -> dict:
+    """A row of QUALITY."""
+    run = KEPT / key_of(training)
+    words = ["--preset", training.preset, "--seed", 1, "--out", run]
+    if training.steps:
+        words += ["--iterations", training.steps]
+    if training.downscale:
+        words += ["--downscale", training.downscale]
+    run_program(*PP_CL, "train", scene_of(training.scene), *words)
+    words = ["--scene", scene_of(training.test)] if training.test else []
+    found = read_found("eval", *PP_CL, "eval", run, "--metrics", "--out", run / "all", *words)
+    about = read_found("info", *PP_CL, "info", run)
+    (size,) = about["views"]["images"]
+    width, height = (int(side) // about["downscale"] for side in size.split("x"))
+    return {
+        "name": training.name,
+        "size": f"{width}x{height}",
+        "preset": training.preset,
+        "steps": about["iterations"],
+        "views": len(found["per_image"]),
+        "minutes": round(about["seconds"] / 60, 2),
+        **{name: round(value, 4) for name, value in found["mean"].items()},
+        "points": about["points"]["left"],
+        "frame_ms": round(found["seconds_per_frame"] * 1e3, 1),
+        "computed": round(found["computed_fraction"], 2),
+    }
+
+
+def rasteriser() -> list[dict]:
+    """Rows of RASTERISER."""
+    words = ["--points", "250000,4000000", "--size", "200,800"]
+    rows = read_found("raster", *PP_CL, "bench", "raster", *words)["rows"]
+    return [row | {name: row["stages_ms"].get(name, 0) for name in STAGES} for row in rows]
+
+
+def network() -> list[dict]:
+    """Rows of NETWORK: the paper's network, and that of the other presets."""
+    rows = []
+    for widths, side, blocks in (("128,256,512", 256, "double"), ("32,64,128", 200, "single")):
+        words = ["--widths", widths, "--size", side, "--blocks", blocks]
+        found = read_found("unet", *PP_CL, "bench", "unet", *words)["rows"]
+        rows += [row | {"widths": widths, "side": side} for row in found]
+    return rows
+
+
+def memory() -> list[dict]:
+    """Rows of MEMORY."""
+    return read_found("memory", *TOOL, "tools.memory_peaks")
+
+
+def demo() -> list[dict]:
+    """Rows of DEMO: depth, mesh, page and compression of the demo's runs."""
+    rows = []
+    short, long = (KEPT / key_of(training) for training in TRAININGS[:2])
+    for run, steps in ((short, "1,500"), (long, "12,000")):
+        found = read_found("depth", *TOOL, "tools.depth_error", run)
+        shares = f"median {found['median']:.1%}, mean {found['mean']:.1%}"
+        rows.append({"what": f"depths within 1.5 spacings, {steps} steps", "result": shares})
+        rows.append({"what": f"IoU of alpha, {steps} steps", "result": f"{found['overlap']:.3f}"})
+    found = read_found("export", *TOOL, "tools.export_quality", short)
+    mesh = next(row for row in found["mesh"] if "as exported" in row["field"])
+    page = next(row for row in found["page"] if "as exported" in row["what"])
+    near = f"{mesh['mean']} on average, median {mesh['median']}"
+    rows.append({"what": "exported mesh, spacings from the surface", "result": near})
+    rows.append({"what": "exported page against the run's images", "result": f"{page['run']} dB"})
+    run_program(*PP_CL, "compress", short, "--max-loss", "0.1dB", "--out", KEPT / "smaller")
+    before, after = (read_found("info", *PP_CL, "info", r) for r in (short, KEPT / "smaller"))
+    mib = [about["checkpoint_bytes"] / 2**20 for about in (before, after)]
+    rows.append({"what": "compressed by 0.1 dB", "result": f"{mib[0]:.1f} to {mib[1]:.1f} MiB"})
+    return rows
+
+
+PARTS: dict[str, Callable[[], Found]] = {
+    **{key_of(training): partial(train, training) for training in TRAININGS},
+    "demo": demo,
+    "rasteriser": rasteriser,
+    "network": network,
+    "memory": memory,
+}
+
+
+def scene_of(name: str) -> Path | str:
+    """The scene's folder. Raises UserError if it is not there."""
+    if name != "demo" and not (DATA / name).is_dir():
+        raise UserError(f"{DATA / name}: not found; set PP_DATA to the folder of the scenes")
+    return name if name == "demo" else DATA / name
+
+
+# ---- from parts to documents
+
+
+def git(*words: str) -> str:
+    """What git prints."""
+    return subprocess.run(
+        [shutil.which("git") or "git", *words],
+        cwd=ROOT,
+        check=True,
+        stdout=subprocess.PIPE,
+        text=True,
+    ).stdout.strip()
+
+
+def origin() -> dict[str, str]:
+    """Where, when and of which code. Raises UserError for code that is not committed."""
+    if git("status", "--porcelain", "--", *CODE):
+        raise UserError("pp_cl/ or cl/ differ from the last commit: commit first")
+    dev = open_device()
+    processor = dev.name.replace("(R)", "").split("-", 2)[-1]
+    driver = f"{dev.info['platform']} {dev.info['driver']}"
+    return {
+        "version": __version__,
+        "commit": git("log", "-1", "--format=%h", "--", *CODE),
+        "date": date.today().isoformat(),
+        "machine": f"{os.cpu_count()} cores of {processor}, {driver}",
+        "command": "make results",
+    }
+
+
+def begin(commit: str) -> None:
+    """Make the folder of what is kept, empty if what is in it is of another commit."""
+    mark = KEPT / "commit"
+    if not (mark.exists() and mark.read_text("utf-8") == commit):
+        shutil.rmtree(KEPT, ignore_errors=True)
+        KEPT.mkdir(parents=True)
+        mark.write_text(commit, "utf-8")
+
+
+def measure(name: str) -> Found:
+    """What a part found, now or before."""
+    file = KEPT / f"{name}.json"
+    if not file.exists():
+        write_json(file, PARTS[name]())
+    return json.loads(file.read_text("utf-8"))
+
+
+def trained(found: dict[str, Found]) -> list[dict]:
+    """The rows of all trainings."""
+    return [found[key_of(t)] for t in TRAININGS]
+
+
+def timed(found: dict[str, Found]) -> list[dict]:
+    """What plot_speed() draws."""
+    raster = (
+        {"label": f"rasteriser, {r['blend']}", "ms": r["ms"], "error": r["max_err"]}
+        for r in found["rasteriser"]
+    )
+    net = (
+        {"label": f"network, {r['variant']}", "ms": r["ms"], "error": r["rel_l2"]}
+        for r in found["network"]
+    )
+    return [*raster, *net]
+
+
+def tables(found: dict[str, Found]) -> dict[str, dict]:
+    """{name: contents} of docs/results/, but for origin()."""
+    quality = "means over the held-out views, 8-bit images over white; minutes of training alone"
+    stages = "milliseconds, medians in turn, and the largest error against float64"
+    passes = "medians in turn; GFLOP/s count the multiplications of the direct convolution"
+    parts = {
+        "scenes": (quality, QUALITY, [found[name] for name in SHOWN]),
+        "trainings": (quality, QUALITY, trained(found)),
+        "rasteriser": (stages, RASTERISER, found["rasteriser"]),
+        "network": (passes, NETWORK, found["network"]),
+        "memory": ("the most memory that a few steps take", MEMORY, found["memory"]),
+        "demo": ("runs of the demo", DEMO, found["demo"]),
+    }
+    return {
+        name: {"measured": measured, "columns": columns, "rows": rows}
+        for name, (measured, columns, rows) in parts.items()
+    }
+
+
+def draw(trained: list[dict], timed: list[dict], folder: Path) -> None:
+    """quality.png and speed.png, and the same for dark pages."""
+    from matplotlib import style
+    from matplotlib.figure import Figure
+
+    plots = {"quality": (plot_quality, trained), "speed": (plot_speed, timed)}
+    for suffix, look in (("", "default"), ("_dark", "dark_background")):
+        for name, (plot, rows) in plots.items():
+            with style.context(look):
+                figure = Figure(figsize=(8, 4), layout="constrained")
+                axes = figure.subplots()
+                plot(axes, rows)
+                axes.grid(alpha=0.3)
+                axes.legend(fontsize=8)
+                figure.savefig(folder / f"{name}{suffix}.png", dpi=120)
+
+
+def plot_quality(axes: "Axes", trained: list[dict]) -> None:
+    """PSNR of lego's test views against minutes of training, a line for each image size."""
+    axes.set(xscale="log", xlabel="minutes of training on two CPU cores", ylabel="PSNR, dB")
+    rows = [row for row in trained if row["name"] == "lego"]
+    for size in dict.fromkeys(row["size"] for row in rows):
+        some = [row for row in rows if row["size"] == size]
+        minutes, psnr = [row["minutes"] for row in some], [row["psnr"] for row in some]
+        axes.plot(minutes, psnr, "o-", label=f"pp-cl, {size}")
+    axes.plot(
+        *zip(*OPENSPLAT, strict=True), "x--", color="grey", label="OpenSplat on a CPU, 200x200"
+    )
+    table = published()["synthetic"]
+    lego_column = table["scenes"].index("lego")
+    for method, side in DRAWN.items():
+        psnr = table["methods"][method]["psnr"][lego_column]
+        axes.axhline(psnr, color="grey", linewidth=0.7)
+        place = {"xycoords": ("axes fraction", "data"), "va": side, "fontsize": 7}
+        axes.annotate(f"{method} (GPU), 800x800", (0.01, psnr), **place)
+    axes.xaxis.set_major_formatter("{x:g}")
+    axes.margins(y=0.08)
+
+
+def plot_speed(axes: "Axes", timed: list[dict]) -> None:
+    """Time against error, a colour for each variant. timed: {"label", "ms", "error"}."""
+    axes.set(xscale="log", yscale="log", xlabel="milliseconds", ylabel="error against float64")
+    for i, label in enumerate(dict.fromkeys(row["label"] for row in timed)):
+        some = [row for row in timed if row["label"] == label]
+        axes.plot([r["ms"] for r in some], [r["error"] for r in some], "os^Dv"[i % 5], label=label)
+
+
+def film(path: Path) -> None:
+    """A film around a real object, for README.md."""
+    run = KEPT / key_of(next(t for t in TRAININGS if t.preset == "small" and t.scene == HEAD))
+    look = ("--size", "320x320", "--seconds", 5, "--fps", 12, "--out", path)
+    run_program(*PP_CL, "render", run, *look)
+
+
+def main() -> int:
+    """Measure what is missing, write the documents; returns the exit status."""
+    parser = argparse.ArgumentParser(description=__doc__.partition("\n\n")[0])
+    parser.add_argument("--only", nargs="+", choices=PARTS, default=list(PARTS), metavar="PART")
+    options = parser.parse_args()
+    try:
+        about = origin()
+        begin(about["commit"])
+        found = {name: measure(name) for name in options.only}
+    except UserError as error:
+        print(f"results: {error}", file=sys.stderr)
+        return 2
+    if found.keys() == PARTS.keys():
+        for name, contents in tables(found).items():
+            write_json(ROOT / "docs" / "results" / f"{name}.json", about | contents)
+        draw(trained(found), timed(found), ROOT / "docs")
+        film(ROOT / "docs" / "film.webp")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
