@@ -26,7 +26,6 @@ from pp_cl.training.memory import GIB, MIB, MemoryPhase, Plan, Room, plan_lines
 
 POINTS = 27_000
 PAPER_POINTS = 4_040_533  # lego, supplemental Table 4
-SMOOTHED = {"train.sh_smoothing_every": "4"}  # so that the last few of 30 steps smooth too
 WAYS = [
     {},
     {"raster.early_stop": "0"},
@@ -38,11 +37,10 @@ WAYS = [
     # to points that are eight, then 64 times as many, which are smoothed
     {
         "train.refine_at": "0.4,0.7",
-        **SMOOTHED,
         "train.prune_weight": "0",
         "train.prune_opacity": "0",
     },
-    {"train.refine_at": "1.0,0.9", **SMOOTHED},  # with the averages
+    {"train.refine_at": "1.0,0.9"},  # with the averages
 ]
 
 
@@ -68,6 +66,7 @@ def trained(dev, folder, changes, base="tiny"):
         "network.widths": "16,16,16",
         "train.iterations": 30,
         "train.prune_every": 1000,
+        "train.sh_smoothing_every": 4,  # so that the last few of 30 steps smooth too
     } | changes
     for key, value in settings.items():
         assign(config, key, value, "test")
