@@ -28,7 +28,7 @@ from pp_cl.session import open_training, run_config
 
 MIB = 2**20
 PHONE, PHONES, SHRUNK = (4000, 3000), 300, 4  # pixels, photographs, times the drawing is enlarged
-EARLY = {"train.iterations": 30, "train.eval_every": 0}
+EARLY = {"train.iterations": 30, "train.eval_every": 0, "train.sh_smoothing_every": 4}
 # what is trained: preset, settings
 TRAININGS = {
     "tiny": ("tiny", {}),

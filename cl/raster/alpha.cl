@@ -30,7 +30,6 @@
 // one more entry, without a point, then ends its list.
 kernel void alpha_weights(
     const uint hw,                             // pixels
-    const uint w,                              // of a row
     const float early_stop,                    // T behind which hits are dropped; 0: none
     global const uint *pixel_offset,           // (HW+1)
     global const ulong *pair_key,              // (P) depth << 32 | pair, sorted within a pixel
@@ -42,8 +41,8 @@ kernel void alpha_weights(
     global float *transmittance,               // (HW) of all hits that are not dropped
     global uchar *point_is_shaded)             // (N) 1: has a hit that is not dropped
 {
-    const uint x = get_global_id(0), q = get_global_id(1) * w + x;
-    if (x >= w || q >= hw) return;
+    const uint q = get_global_id(0);
+    if (q >= hw) return;
     const uint begin = pixel_offset[q], end = pixel_offset[q + 1];
     float T = 1.0f;
     uint i = begin;

@@ -42,15 +42,14 @@ static inline float upper_float(const ulong word) {
 // features.
 kernel void blend_forward(
     const uint hw,                          // pixels
-    const uint w,                           // of a row
     global const uint *pixel_offset,        // (HW+1)
     global const ulong *pixel_entry,        // (P) weight << 32 | point; no point: the list ends
     global const uint *point_slot,          // (N) row of a visible point
     global const float16 *shaded_features,  // (?, 16) of the visible points
     global float16 *features)               // (H, W, 16)
 {
-    const uint x = get_global_id(0) / ROW_PARTS, q = get_global_id(1) * w + x;
-    if (x >= w || q >= hw) return;
+    const uint q = get_global_id(0) / ROW_PARTS;
+    if (q >= hw) return;
     floats sum = 0.0f;
     float weights = 0.0f;
     for (uint i = pixel_offset[q]; i < pixel_offset[q + 1] && (uint)pixel_entry[i] != NONE; i++) {
@@ -77,7 +76,6 @@ kernel void softmax_rest(
 // gain of each pair that is not dropped, with those of alpha and of the spread, and the spread.
 kernel __attribute__((vec_type_hint(float16))) void alpha_gain(
     const uint hw,  // pixels
-    const uint w,   // of a row
     const int has_grad_alpha,
     const float spread_weight,              // 0: none, and pixel_spread is not written
     global const uint *pixel_offset,        // (HW+1)
@@ -91,8 +89,8 @@ kernel __attribute__((vec_type_hint(float16))) void alpha_gain(
     global float *pair_gain,                // (P)
     global float *pixel_spread)             // (HW) without its weight
 {
-    const uint x = get_global_id(0), q = get_global_id(1) * w + x;
-    if (x >= w || q >= hw) return;
+    const uint q = get_global_id(0);
+    if (q >= hw) return;
     const float16 G = grad_features[q];
     const float g = has_grad_alpha ? grad_alpha[q] : 0.0f;
     const uint begin = pixel_offset[q];

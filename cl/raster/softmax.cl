@@ -66,7 +66,6 @@ ALWAYS_INLINE Hits load_hits(
 // that are not dropped, by depth. If any were dropped, one more entry follows, with no point.
 kernel __attribute__((vec_type_hint(floats))) void softmax_weights(
     const uint hw,  // pixels
-    const uint w,   // of a row
     const float gamma,
     const float early_stop,                    // 0: none
     global const float *camera,                // (20) camera.h
@@ -79,8 +78,8 @@ kernel __attribute__((vec_type_hint(floats))) void softmax_weights(
     global ulong *pixel_entry,                 // (P) weight << 32 | point, in the order of the keys
     global uchar *point_is_shaded)             // (N) 1: has a hit that is not dropped
 {
-    const uint x = get_global_id(0), q = get_global_id(1) * w + x;
-    if (x >= w || q >= hw) return;
+    const uint q = get_global_id(0);
+    if (q >= hw) return;
     const Camera cam = camera_load(camera);
     const uint begin = pixel_offset[q], end = pixel_offset[q + 1];
     uint stop = end;

@@ -53,9 +53,8 @@ def blend_forward(
     """Write features (H, W, 16) from shaded_features, (S, 16) or longer, both float32."""
     _program(dev, weights).launch(
         "blend_forward",
-        (pairs.size[1] * row_parts(dev, ON_GPU), pairs.size[0]),
+        pairs.pixels * row_parts(dev, ON_GPU),
         hw=pairs.pixels,
-        w=pairs.size[1],
         pixel_offset=pairs.pixel_offset,
         pixel_entry=weights.pixel_entry,
         point_slot=weights.point_slot,
@@ -121,9 +120,8 @@ def blend_backward(
     else:
         program.launch(
             "alpha_gain",
-            pairs.size[::-1],
+            pairs.pixels,
             hw=pairs.pixels,
-            w=pairs.size[1],
             has_grad_alpha=int(grad_alpha is not None),
             spread_weight=spread_weight,
             pixel_offset=pairs.pixel_offset,

@@ -29,7 +29,7 @@ class Pairs:
     The arrays have room for P pairs. If the view has more, pixel_offset is all zeros and the other
     arrays must not be read: find the pairs again with more room (room_needed()).
 
-    size: (H, W) of the image. count: how many pairs there are.
+    count: how many pairs there are.
     point_offset: (N+1,) uint32, point i owns pairs point_offset[i] to point_offset[i+1].
     pixel_offset: (HW+1,) uint32, pixel q owns keys pixel_offset[q] to pixel_offset[q+1].
     pair_pixel: (P,) uint32, y*W + x. pair_point_closeness: (P, 2) uint32, the point, and the bits
@@ -37,7 +37,6 @@ class Pairs:
     each pixel by depth, then by point.
     """
 
-    size: tuple[int, int]
     count: Reading[int]
     point_offset: Array
     pixel_offset: Array
@@ -63,7 +62,7 @@ class Pairs:
     @property
     def pixels(self) -> int:
         """HW."""
-        return self.size[0] * self.size[1]
+        return self.pixel_offset.size - 1
 
 
 def pairs_table(n: int, pixels: int, pairs: int) -> Table:
@@ -131,13 +130,7 @@ def find_pairs(
         )
     exclusive_scan(dev, b.pixel_count, b.pixel_offset)
     pairs = Pairs(
-        size,
-        count,
-        b.point_offset,
-        b.pixel_offset,
-        b.pair_pixel,
-        b.pair_point_closeness,
-        b.pair_key,
+        count, b.point_offset, b.pixel_offset, b.pair_pixel, b.pair_point_closeness, b.pair_key
     )
     program.launch(
         "pairs_scatter",

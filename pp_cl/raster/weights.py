@@ -119,9 +119,8 @@ def _alpha_weights(dev, b, pairs, opacity, early_stop, drops):
         dev.fill(b.pair_role, DROPPED)
     dev.program("raster/alpha", **drops).launch(
         "alpha_weights",
-        pairs.size[::-1],
+        pairs.pixels,
         hw=pairs.pixels,
-        w=pairs.size[1],
         early_stop=early_stop,
         pixel_offset=pairs.pixel_offset,
         pair_key=pairs.pair_key,
@@ -139,9 +138,8 @@ def _softmax_weights(dev, b, pairs, camera_buffer, opacity, gamma, early_stop, d
     """Eq. (1) of the supplemental; early_stop is Pulsar's percent_allowed_difference."""
     dev.program("raster/softmax", LANES=lanes(dev), **drops).launch(
         "softmax_weights",
-        pairs.size[::-1],
+        pairs.pixels,
         hw=pairs.pixels,
-        w=pairs.size[1],
         gamma=gamma,
         early_stop=early_stop,
         camera=camera_buffer,
