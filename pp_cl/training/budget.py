@@ -11,6 +11,7 @@ from pp_cl.training.schedule import refine_steps
 
 PLANS = 50  # in the minutes given
 KEPT = 0.8  # share of the steps after which their number stays: soon the averages begin
+FOG = 0.35  # of the first step's time, which later ones save: a third of the steps clears it
 DEARER = 2.3  # times that a step takes longer once the grid is refined: 2 to 3 where measured
 FEWEST, MOST = 10, 100  # last steps whose median time counts: first ones may build kernels
 
@@ -34,13 +35,14 @@ class Budget:
             return False
         self._next = seconds + 60 * train.minutes / PLANS
         left = 60 * train.minutes - seconds
-        replan(train, step, left / statistics.median(self._times))
+        clearing = 1 - FOG * max(0.0, 1 - 3 * step / train.iterations)
+        replan(train, step, left / (clearing * statistics.median(self._times)))
         return True
 
 
 def replan(train: TrainConfig, step: int, left: float) -> None:
-    """Set train.iterations for a training that has time for so many more steps, each as long as one
-    after `step`; and the shares of train.refine_at, so that past refinements stay where they were.
+    """Set train.iterations of a training that has time for `left` more steps if it is not refined
+    further; and shares of train.refine_at, so that past refinements stay where they were.
     """
     steps, shares = train.iterations, [share for share in train.refine_at if 0 < share < 1]
     past = {share: at for share in shares if (at := max(1, round(share * steps))) <= step}
