@@ -133,7 +133,8 @@ class Training:
     def _run(self, on_step, is_stopped):
         trainer, settings = self.trainer, self.config.train
         with self.folder.open_log(trainer.step) as log:
-            seconds, budget = log.seconds, Budget(settings)
+            pixels = sum(view.camera.width * view.camera.height for view in trainer.views)
+            seconds, budget = log.seconds, Budget(settings, pixels)
             first = trainer.step + 1
             self._expect_save()
             while trainer.step < settings.iterations:

@@ -23,14 +23,14 @@ def simulated(minutes, refine_at, seconds_of, built=0.0):
     seconds_of(share of the steps done, refinements done), after kernels were built.
     """
     train = TrainConfig(iterations=8000, minutes=minutes, refine_at=refine_at)
-    budget, step, total, refined = Budget(train), 0, 0.0, []
+    budget, step, total, refined = Budget(train, 48 * 200**2), 0, 0.0, []
     while step < train.iterations:
         took = seconds_of(step / train.iterations, len(refined)) + built * (step == 0)
         step, total = step + 1, total + took
         refined += [step] if step in refine_steps(train) else []
         budget.plan(step, total, took)
         assert [at for at in refine_steps(train) if at <= step] == refined
-    return total, train, refined
+    return total + 18 * seconds_of(1.0, len(refined)), train, refined
 
 
 @pytest.mark.parametrize("minutes", [1, 5, 60])
