@@ -29,7 +29,7 @@ from tools.depth_error import pixel_rays
 
 WIDER = 1.6  # angle of view, so that the room is seen around the object
 ROOM = 6.0  # radius of the room, world units; the cameras are 3.4 from its middle
-TURNED, STEPS = 0.35, 36  # elevation of the turntable's camera, radians; photographs of a turn
+TURNED, STEPS = 0.35, 72  # elevation of the turntable's camera, radians; photographs of a turn
 FILM_FRAMES, FPS, ROUNDS = 240, 24, 2
 NOISE_CELLS, OCTAVES = 48, (1.5, 4.0, 10.0)  # cells per world unit of each layer of noise
 
@@ -46,10 +46,11 @@ class Alignment:
 
 def cameras(size: int, kind: str = "photographs") -> list[Camera]:
     """Where the photographs are taken, with a wider angle of view: the demo's training cameras;
-    those of a turntable, around the object that turns; or those of a film of 16:9.
+    those of a turntable, around the object that turns and fills the image; or those of a film of
+    16:9.
     """
     if kind == "turntable":
-        return [_around(turn, TURNED, size, size) for turn in np.arange(STEPS) / STEPS]
+        return [_around(turn, TURNED, size, size, ANGLE) for turn in np.arange(STEPS) / STEPS]
     if kind == "film":
         shares = np.arange(FILM_FRAMES) / FILM_FRAMES
         return [_around(ROUNDS * s, 0.9 * s, size, size * 9 // 32 * 2) for s in shares]
@@ -58,11 +59,11 @@ def cameras(size: int, kind: str = "photographs") -> list[Camera]:
     return [camera.with_angle(WIDER * angle) for camera in found]
 
 
-def _around(turn, elevation, width, height):
-    """A camera that looks at the object. turn: share of a round."""
+def _around(turn, elevation, width, height, angle=WIDER * ANGLE):
+    """A camera that looks at the object. turn: share of a round. angle: of view, radians."""
     azimuth, level = 2 * np.pi * turn, np.cos(elevation)
     eye = [np.cos(azimuth) * level, np.sin(azimuth) * level, np.sin(elevation)]
-    focal = 0.5 * min(width, height) / np.tan(0.5 * WIDER * ANGLE)
+    focal = 0.5 * min(width, height) / np.tan(0.5 * angle)
     return Camera.look_at(DISTANCE * np.array(eye), (0, 0, 0), fx=focal, width=width, height=height)
 
 
