@@ -144,7 +144,7 @@ class Trainer:
                     view_index, rendered.image, photograph, target_alpha, rendered.offset
                 )
         spread_weight, all_depths = self._spread_weight(target)
-        *gradients, pixel_spread = self.renderer.backward(
+        features, opacities, offsets, pixel_spread = self.renderer.backward(
             rendered, grad_image, grad_alpha, spread_weight / all_depths
         )
         if spread_weight > 0:
@@ -153,7 +153,9 @@ class Trainer:
             self.optimiser.update(
                 t + 1 - self.begun,
                 rates,
-                *gradients,
+                features,
+                opacities,
+                offsets,
                 points=rendered.points,
                 shaded=rendered.weights.shaded,
                 sh_eps=config.sh_eps / target.size,
@@ -170,7 +172,8 @@ class Trainer:
         self.step = t + 1
         self.check()
         self._terms = self.loss.read(self.step)
-        del rendered, gradients, pixel_spread  # the renderer may release them now
+        # the renderer may release them now
+        del rendered, features, opacities, offsets, pixel_spread
         self._after_update(rates)
         return self._terms
 
