@@ -1,5 +1,6 @@
 """The memory of the machine, as Linux and a container tell it."""
 
+import ctypes
 import mmap
 from pathlib import Path
 
@@ -79,11 +80,20 @@ def asked_bytes():
     return found
 
 
-@pytest.mark.skipif(not THP.exists(), reason="no huge pages")
-def test_large_buffers_of_a_cpu_lie_on_huge_pages():
+def test_large_buffers_of_a_cpu_ask_for_huge_pages(monkeypatch):
+    asked = []
+    monkeypatch.setattr(
+        "pp_cl.device.device.ask_for_huge_pages", lambda *place: asked.append(place)
+    )
     dev = Device(open_device().device)  # without guards
-    if not dev.is_cpu:
-        pytest.skip("a GPU's memory is its own")
+    held = [dev.empty((size,), np.uint8) for size in (MIB, 64 * MIB)]
+    assert [nbytes for _, nbytes in asked] == [64 * MIB] * dev.is_cpu
+    assert all(place for place, _ in asked), held
+
+
+@pytest.mark.skipif(not THP.exists(), reason="no huge pages")
+def test_memory_that_asks_for_huge_pages_is_marked():
+    memory = mmap.mmap(-1, 64 * MIB, mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS)
     before = asked_bytes()
-    held = dev.empty((64 * MIB,), np.uint8)
-    assert asked_bytes() - before > 63 * MIB, held
+    host.ask_for_huge_pages(ctypes.addressof(ctypes.c_char.from_buffer(memory)), 64 * MIB)
+    assert asked_bytes() - before > 63 * MIB
