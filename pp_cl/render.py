@@ -39,11 +39,6 @@ def point_radius(settings: RasterConfig, edge: float, depth_range: tuple[float, 
     return settings.radius * (far - near) / PAPER_DEPTH_RANGE
 
 
-def can_move(settings: RasterConfig) -> bool:
-    """Whether there are gradients of where points lie beside their vertices."""
-    return (settings.blend, settings.footprint) == ("alpha", "soft")
-
-
 @dataclass
 class RenderResult:
     """What the stages of a view have made, up to the one that was asked for; arrays are valid until
@@ -233,11 +228,13 @@ class Renderer:
         grad_image: Array,
         grad_alpha: Array | None = None,
         spread_weight: float = 0.0,
+        with_offsets: bool = False,
     ) -> tuple[Array, Array, Array | None, Array]:
-        """(grad_shaded_features (S, 16) or longer, grad_opacity (N,), grad_offset (N, 3) if points
-        may leave the grid, pixel_spread (H * W,)) from dL/dimage of result.image; with alpha
-        compositing also from dL/dalpha (H * W,), and of the spread of each pixel's hits with this
-        weight in the loss (cl/raster/blend.cl).
+        """(grad_shaded_features (S, 16) or longer, grad_opacity (N,), grad_offset (N, 3),
+        pixel_spread (H * W,)) from dL/dimage of result.image; with alpha compositing also from
+        dL/dalpha (H * W,), and of the spread of each pixel's hits with this weight in the loss
+        (cl/raster/blend.cl). with_offsets: without it, or unless soft points are composited by
+        alpha, grad_offset is None.
 
         result: of the last forward(training=True). The gradients of the network's parameters are
         left in model.net.gradients. Those of the SH coefficients are grad_shaded_features times the
@@ -246,7 +243,9 @@ class Renderer:
         """
         with self.dev.stage("network backward"):
             grad_features = self.model.net.backward(grad_image)
-        return self.backward_features(result, grad_features, grad_alpha, spread_weight)
+        return self.backward_features(
+            result, grad_features, grad_alpha, spread_weight, with_offsets
+        )
 
     def backward_features(
         self,
@@ -254,6 +253,7 @@ class Renderer:
         grad_features: Array,
         grad_alpha: Array | None = None,
         spread_weight: float = 0.0,
+        with_offsets: bool = False,
     ) -> tuple[Array, Array, Array | None, Array]:
         """What backward() does, from dL/dfeatures (H, W, 16) of result.features, without the
         network.
@@ -271,8 +271,8 @@ class Renderer:
                 spread_weight=spread_weight,
                 mean=self.settings.mean_gradient,
             )
-            grad_offset = None
-            if can_move(self.settings):
+            grad_offset, form = None, (self.settings.blend, self.settings.footprint)
+            if with_offsets and form == ("alpha", "soft"):
                 grad_offset = offset_backward(
                     self.dev,
                     self._buffers,

@@ -82,7 +82,7 @@ class Optimiser:
             rates=rates.sh,
             eps=sh_eps,
         )
-        if grad_offset is not None and rates.offset > 0:
+        if grad_offset is not None:
             adam_update(
                 self.dev,
                 cloud.offset,
