@@ -12,6 +12,7 @@ import socket
 import stat
 import subprocess
 import sys
+import threading
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
@@ -127,10 +128,24 @@ async def _serve(live, access, listening, *, announce, wait):
     try:
         await web.SockSite(runner, listening).start()
         announce(access.address)
-        ends = [asyncio.create_task(server.draw())]
+        ends: list[asyncio.Future[None]] = [asyncio.create_task(server.draw())]
         if wait and stat.S_ISFIFO(os.fstat(0).st_mode):
-            ends.append(asyncio.create_task(asyncio.to_thread(os.read, 0, 1)))
+            ends.append(_input_ends())
         done, _ = await asyncio.wait(ends, return_when=asyncio.FIRST_COMPLETED)
         done.pop().result()
     finally:
         await runner.cleanup()
+
+
+def _input_ends():
+    """A future that is done when our input ends; a daemon reads it, as no exit waits for these."""
+    loop = asyncio.get_running_loop()
+    ended = loop.create_future()
+
+    def read():
+        os.read(0, 1)
+        with contextlib.suppress(RuntimeError):  # the loop has ended before
+            loop.call_soon_threadsafe(ended.set_result, None)
+
+    threading.Thread(target=read, daemon=True).start()
+    return ended

@@ -168,6 +168,20 @@ def test_a_waiting_server_ends_with_its_parent(tmp_path):
         raise
 
 
+@pytest.mark.unix
+def test_a_waiting_server_is_ended_by_a_signal_though_its_input_is_open(tmp_path):
+    child = [sys.executable, "-m", "pp_cl", "view", str(tmp_path / "run"), "--wait", "--port", "0"]
+    pipes = dict.fromkeys(("stdin", "stdout", "stderr"), subprocess.PIPE)
+    with subprocess.Popen(child, **pipes, text=True) as server:
+        assert is_served(server.stdout.readline().split()[1])
+        server.terminate()
+        try:
+            assert server.wait(SECONDS) in (0, 143)
+        finally:
+            server.kill()
+        assert not server.stderr.read()
+
+
 def is_served(address):
     try:
         return status(address) == 200
