@@ -61,7 +61,7 @@ class Model:
     def positions(self) -> np.ndarray:
         """(N, 3) float64 world positions of the points."""
         vertices = self.grid.positions(self.dev.download(self.cloud.ids))
-        return vertices + self.grid.edge * self.dev.download(self.cloud.offset)
+        return vertices + self.grid.edge * self.dev.download(self.cloud.offset)[:, :3]
 
     def packed(self, camera: Camera, depth_range: tuple[float, float] | None = None) -> np.ndarray:
         """(20,) float32: a camera that sees the points of grid_buffer. depth_range: instead of the

@@ -32,7 +32,7 @@ PAPER_DEPTH_RANGE = 4.0
 
 
 def point_radius(settings: RasterConfig, edge: float, depth_range: tuple[float, float]) -> float:
-    """The points' radius in world units. edge: of the grid, world units."""
+    """The radius in world units of points whose offset is 0. edge: of the grid, world units."""
     if settings.footprint == "soft":
         return settings.radius * edge
     near, far = depth_range
@@ -92,7 +92,6 @@ class Renderer:
     def release(self) -> None:
         """Free the buffers; the next view makes them anew."""
         self._buffers = Buffers(self.dev)
-        self._radius = None  # what b.point_radius holds
 
     @staticmethod
     def tables(
@@ -148,7 +147,6 @@ class Renderer:
         b = self._buffers
         b.require(_view_table(size))
         dev.send(b.camera_buffer, self.model.packed(padded, depth_range))
-        self._set_radius()
         with dev.stage("project"):
             points = project_grid(
                 dev,
@@ -157,8 +155,8 @@ class Renderer:
                 b.camera_buffer,
                 self.model.grid_buffer,
                 point_id=cloud.ids,
-                point_offset=cloud.offset,
-                point_radius=b.point_radius,
+                cloud_offset=cloud.offset,
+                radius=point_radius(self.settings, self.model.grid.edge, self.model.depth_range),
                 dropout=dropout,
                 seed=seed,
             )
@@ -214,14 +212,6 @@ class Renderer:
                 return pairs, weights, tiles
             del pairs, weights  # else their arrays would stay beside the larger ones
 
-    def _set_radius(self):
-        """Send the points' radius to b.point_radius if it changed: refining halves the spacing."""
-        model = self.model
-        radius = point_radius(self.settings, model.grid.edge, model.depth_range)
-        if radius != self._radius:
-            self.dev.send(self._buffers.point_radius, np.array([radius], np.float32))
-            self._radius = radius
-
     def backward(
         self,
         result: RenderResult,
@@ -230,7 +220,7 @@ class Renderer:
         spread_weight: float = 0.0,
         with_offsets: bool = False,
     ) -> tuple[Array, Array, Array | None, Array]:
-        """(grad_shaded_features (S, 16) or longer, grad_opacity (N,), grad_offset (N, 3),
+        """(grad_shaded_features (S, 16) or longer, grad_opacity (N,), grad_offset (N, 4),
         pixel_spread (H * W,)) from dL/dimage of result.image; with alpha compositing also from
         dL/dalpha (H * W,), and of the spread of each pixel's hits with this weight in the loss
         (cl/raster/blend.cl). with_offsets: without it, or unless soft points are composited by
@@ -308,7 +298,6 @@ def _view_table(size):
     """Buffers that each view overwrites and that belong to no single stage."""
     return {
         "camera_buffer": ((20,), np.float32),
-        "point_radius": ((1,), np.float32),
         "features": ((*size, 16), np.float32),
     }
 

@@ -56,11 +56,10 @@ kernel void spheres_backward_pairs(
 // One work-item per sphere: reads the gradients of its pairs, writes those of its position and
 // radius.
 kernel void spheres_backward(
-    const uint n,      // spheres
-    const uint radii,  // 1 (all alike) or n
+    const uint n,  // spheres
     const float gamma,
     global const float *camera,         // (20) camera.h
-    global const float *point_radius,   // (radii)
+    global const float *point_radius,   // (N)
     global const float4 *point_camera,  // (N, 4) x, y, z, t
     global const float *opacity,        // (N)
     global const uint *point_offset,    // (N+1)
@@ -73,7 +72,7 @@ kernel void spheres_backward(
     if (i >= n) return;
     const Camera cam = camera_load(camera);
     const float3 centre = point_camera[i].xyz;
-    const float t = point_camera[i].w, radius = point_radius[radii == 1 ? 0 : i];
+    const float t = point_camera[i].w, radius = point_radius[i];
     const float width = t / least_focal(&cam), least = LEAST_RADIUS * width;
     const float dl_ddepth = -opacity[i] / (gamma * (cam.far - cam.near));
     float3 dL_dc = 0.0f;

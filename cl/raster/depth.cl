@@ -16,9 +16,8 @@ static inline float surface_range(const float range, const float radius, const f
 // of the weight is reached, which grows evenly from hit to hit.
 kernel void depth_forward(
     const uint hw,                             // pixels
-    const uint radii,                          // 1 (all alike) or N
     global const float *camera,                // (20) camera.h
-    global const float *point_radius,          // (radii)
+    global const float *point_radius,          // (N)
     global const uint *pixel_offset,           // (HW+1)
     global const ulong *pair_key,              // (P) depth << 32 | pair, sorted within a pixel
     global const uint2 *pair_point_closeness,  // (P, 2) point, bits of d
@@ -41,8 +40,7 @@ kernel void depth_forward(
         const uint2 hit = pair_point_closeness[(uint)pair_key[i]];
         const float b = as_float((uint)(pixel_entry[i] >> 32));
         const float range = as_float((uint)(pair_key[i] >> 32));
-        const float radius = point_radius[radii == 1 ? 0 : hit.x];
-        const float z = axis * surface_range(range, radius, as_float(hit.y));
+        const float z = axis * surface_range(range, point_radius[hit.x], as_float(hit.y));
         depth += b * z;
         if (reached < 0.5f * alpha) {
             const float share = b > 0.0f ? fmin((0.5f * alpha - reached) / b, 1.0f) : 1.0f;

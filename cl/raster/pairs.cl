@@ -31,7 +31,6 @@ ALWAYS_INLINE Footprints footprints_load(
     const Camera *cam,
     const uint first,
     const uint count,
-    const uint radii,
     global const float *point_radius,
     global const float4 *point_camera,
     global const ushort4 *point_box) {
@@ -45,7 +44,7 @@ ALWAYS_INLINE Footprints footprints_load(
         place[1][j] = at.y;
         place[2][j] = at.z;
         place[3][j] = at.w;
-        radius[j] = point_radius[radii == 1 ? 0 : i];
+        radius[j] = point_radius[i];
         f.box[0][j] = box.x;
         f.box[1][j] = box.y;
         f.box[2][j] = box.z;
@@ -68,9 +67,8 @@ ALWAYS_INLINE Footprints footprints_load(
 kernel __attribute__((vec_type_hint(floats))) void pairs_fill(
     const uint n,                        // points
     const uint p,                        // pairs for which there is room
-    const uint radii,                    // 1 (all alike) or n
     global const float *camera,          // (20) camera.h
-    global const float *point_radius,    // (radii)
+    global const float *point_radius,    // (N)
     global const float4 *point_camera,   // (N, 4) x, y, z, t
     global const ushort4 *point_box,     // (N, 4) first x, first y, last x, last y
     global const uint *point_offset,     // (N+1) first pair of each point
@@ -84,8 +82,7 @@ kernel __attribute__((vec_type_hint(floats))) void pairs_fill(
     const uint count = min((uint)LANES, n - first);
     if (point_offset[first] == point_offset[first + count]) return;
     const Camera cam = camera_load(camera);
-    const Footprints f =
-        footprints_load(&cam, first, count, radii, point_radius, point_camera, point_box);
+    const Footprints f = footprints_load(&cam, first, count, point_radius, point_camera, point_box);
     // of each point: its next pair, where they end, the first pixel of its box
     uint next[LANES], end[LANES], corner[LANES];
     for (uint j = 0; j < count; j++) {

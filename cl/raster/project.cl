@@ -157,18 +157,19 @@ ALWAYS_INLINE uints divide(uints *id, const uint n) {
     return low + more;
 }
 
-// One work-item per LANES points: reads their grid indices and where they lie beside these vertices,
-// writes their camera-space positions and distances, their boxes and numbers of hits.
+// One work-item per LANES points: reads their grid indices and offsets, writes their radii,
+// camera-space positions and distances, boxes and numbers of hits.
 kernel __attribute__((vec_type_hint(floats))) void project_grid(
-    const uint n,                      // points
-    const uint dropout,                // a point is left out where its random uint is below this
-    const uint seed,                   // of the random uints
-    global const float *camera,        // (20) camera.h
-    global const float *grid,          // (8) grid.h
-    global const uint *point_id,       // (N)
-    global const float *point_offset,  // (N, 3) from the vertex, in edges of the grid
-    global const float *point_radius,  // (1) of every point
-    global float4 *point_camera,       // (N, 4) x, y, z, t; t = -1: culled or dropped out
+    const uint n,                       // points
+    const uint dropout,                 // a point is left out where its random uint is below this
+    const uint seed,                    // of the random uints
+    global const float *camera,         // (20) camera.h
+    global const float *grid,           // (8) grid.h
+    global const uint *point_id,        // (N)
+    const float radius,                 // of a point without offsets, world units
+    global const float4 *cloud_offset,  // (N, 4) from the vertex, in edges; log of the radius
+    global float *point_radius,         // (N) not written where none of LANES hits a pixel
+    global float4 *point_camera,        // (N, 4) x, y, z, t; t = -1: culled or dropped out
     global ushort4 *point_box,  // (N, 4) first x, first y, last x, last y; none where last < first
     global uint *point_count)   // (N)
 {
@@ -177,13 +178,15 @@ kernel __attribute__((vec_type_hint(floats))) void project_grid(
     const uint count = min((uint)LANES, n - first), stream = scramble(seed);
     const Camera cam = camera_load(camera);
     uint id[LANES];
-    float offset[3][LANES];
+    float offset[4][LANES], radii[LANES];
     int wanted[LANES];
     for (uint j = 0; j < LANES; j++) {
         const size_t row = first + min(j, count - 1);
         id[j] = point_id[row];
-        for (uint axis = 0; axis < 3; axis++)
-            offset[axis][j] = point_offset[3 * row + axis];
+        offset[0][j] = cloud_offset[row].x;
+        offset[1][j] = cloud_offset[row].y;
+        offset[2][j] = cloud_offset[row].z;
+        offset[3][j] = cloud_offset[row].w;
         wanted[j] = -(scramble(id[j] + stream) >= dropout);
     }
     // as grid_position() has it
@@ -195,18 +198,21 @@ kernel __attribute__((vec_type_hint(floats))) void project_grid(
         &cam, grid[0] + grid[3] * (LANED(convert_float)(i) + LANES_FROM(offset[0])),
         grid[1] + grid[3] * (LANED(convert_float)(j) + LANES_FROM(offset[1])),
         grid[2] + grid[3] * (LANED(convert_float)(k) + LANES_FROM(offset[2])),
-        (floats)(point_radius[0]), LANES_FROM(wanted), &f);
+        radius * exp(LANES_FROM(offset[3])), LANES_FROM(wanted), &f);
     store_points(&cam, &f, any_hit, first, count, point_camera, point_box, point_count);
+    if (!any_hit) return;
+    LANES_INTO(radii, f.radius);
+    for (uint j = 0; j < count; j++)
+        point_radius[first + j] = radii[j];
 }
 
 // One work-item per LANES spheres: reads their positions and radii, writes the same as
 // project_grid.
 kernel __attribute__((vec_type_hint(floats))) void project_spheres(
     const uint n,                      // spheres
-    const uint radii,                  // 1 (all alike) or n
     global const float *camera,        // (20) camera.h
     global const float *positions,     // (N, 3) world
-    global const float *point_radius,  // (radii)
+    global const float *point_radius,  // (N)
     global float4 *point_camera,       // (N, 4) x, y, z, t; t = -1: culled or dropped out
     global ushort4 *point_box,  // (N, 4) first x, first y, last x, last y; none where last < first
     global uint *point_count)   // (N)
@@ -221,7 +227,7 @@ kernel __attribute__((vec_type_hint(floats))) void project_spheres(
         x[j] = positions[3 * i];
         y[j] = positions[3 * i + 1];
         z[j] = positions[3 * i + 2];
-        radius[j] = point_radius[radii == 1 ? 0 : i];
+        radius[j] = point_radius[i];
     }
     Footprints f;
     const bool any_hit = project(

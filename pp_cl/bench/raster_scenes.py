@@ -215,7 +215,7 @@ class PulsarScene(BenchScene):
         self.point_features = rng.random((n, CHANNELS), np.float32)
         self.buffers, self.room = {blend: Buffers(dev) for blend in BLENDS}, 1
         self.camera_buffer = dev.upload(self.camera.packed(self.depth_range))
-        self.point_radius = dev.upload([self.radius], np.float32)
+        self.point_radius = dev.upload(np.full(n, self.radius), np.float32)
         self.point_positions, self.point_opacity = map(dev.upload, (self.positions, self.opacity))
         self.device_features = dev.upload(self.point_features)
         self.features = dev.empty((size, size, CHANNELS))

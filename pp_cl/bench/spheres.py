@@ -23,7 +23,7 @@ def project_spheres(
     *,
     point_radius: Array,
 ) -> ProjectedPoints:
-    """Project points anywhere. positions: (N, 3) float32, world. point_radius: (1,) or (N,)."""
+    """Project points anywhere. positions: (N, 3) float32, world. point_radius: (N,)."""
     n = len(positions)
     b.require(projection_table(n))
     program = dev.program("raster/project", LANES=lanes(dev), FOOTPRINT=FOOTPRINTS.index(footprint))
@@ -31,7 +31,6 @@ def project_spheres(
         "project_spheres",
         -(-n // lanes(dev)),
         n=n,
-        radii=point_radius.size,
         camera=camera_buffer,
         positions=positions,
         point_radius=point_radius,
@@ -106,7 +105,6 @@ def spheres_backward(
         "spheres_backward",
         n,
         n=n,
-        radii=points.point_radius.size,
         gamma=math.inf if is_alpha else gamma,  # alpha depends on the order of the hits alone
         camera=points.camera_buffer,
         point_radius=points.point_radius,

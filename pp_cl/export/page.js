@@ -80,7 +80,7 @@ layout(location = 4) in vec4 b2;
 layout(location = 5) in vec4 b3;
 layout(location = 6) in vec4 b4;
 layout(location = 7) in vec4 b5;
-layout(location = 8) in vec4 b6;
+layout(location = 8) in vec4 b6;        // w: log of the radius over the uniform one, plus 0.5
 uniform vec3 eye;                       // from the grid's origin
 uniform float unit, radius, nearest, low[9], span[9];
 uniform float least;                    // half the width of the smallest footprint, in pixels
@@ -96,11 +96,12 @@ void main() {
   vec3 towards = unit * place - eye;
   centre = towards * axes;
   t = length(towards);
-  reach = grown * max(radius, least * t / min(focal.x, focal.y));
+  float own = radius * exp(b6.w - 0.5);
+  reach = grown * max(own, least * t / min(focal.x, focal.y));
   gl_Position = vec4(2.0, 2.0, 2.0, 1.0);  // outside
   gl_PointSize = 1.0;
   float scale = centre.z * centre.z - reach * reach;
-  if (t - radius < nearest || centre.z <= reach) return;
+  if (t - own < nearest || centre.z <= reach) return;
   vec2 at = focal.xy * centre.xy / centre.z + focal.zw;
   // the ellipse that the footprint covers, and how far its middle is from the centre's pixel
   vec2 half_width = focal.xy * reach * sqrt(centre.xy * centre.xy + scale) / scale;

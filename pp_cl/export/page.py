@@ -16,13 +16,15 @@ from pp_cl.errors import UserError
 from pp_cl.export.harmonics import COUNT, fit_harmonics
 from pp_cl.files.atomic import atomic_folder, write_text
 from pp_cl.files.image import to_8bit, write_png
+from pp_cl.raster.points import MOST_OFFSET
 from pp_cl.run import NEAREST, Run
 from pp_cl.scene.camera import Camera
 from pp_cl.scene.camera_path import level, up_of
 from pp_cl.scene.grid import Grid
 
-# Bytes of a point: place (3, uint16), opacity (uint16), coefficients (27 and 1 unused, uint8).
-POINT = np.dtype([("place", "<u2", 3), ("opacity", "<u2"), ("colour", "u1", 28)])
+# Bytes of a point: place (3, uint16), opacity (uint16), coefficients (27, uint8), logarithm of the
+# radius (uint8).
+POINT = np.dtype([("place", "<u2", 3), ("opacity", "<u2"), ("colour", "u1", 27), ("radius", "u1")])
 OUTLIERS = 1e-3  # share of the coefficients at either end that is clipped: they would coarsen all
 PLACES = np.iinfo(np.uint16).max
 FIELD_OF_VIEW = 40.0  # degrees across the shorter side of the page
@@ -43,7 +45,8 @@ def pack(run: Run, coefficients: np.ndarray) -> tuple[np.ndarray, np.ndarray, np
     low, high = np.quantile(by_function, [OUTLIERS, 1 - OUTLIERS], axis=1).astype(np.float32)
     span = np.maximum(high - low, np.float32(1e-6))
     scaled = (coefficients - low[:, None]) / span[:, None] * 255
-    rows["colour"][:, : 3 * COUNT] = np.rint(scaled.clip(0, 255)).reshape(len(rows), -1)
+    rows["radius"] = np.rint((run.model.cloud.offset.get()[:, 3] + MOST_OFFSET) * 255)
+    rows["colour"] = np.rint(scaled.clip(0, 255)).reshape(len(rows), -1)
     return rows, low, span
 
 

@@ -69,6 +69,7 @@ def splats(run: Run, up: tuple[float, float, float]) -> tuple[np.ndarray, np.nda
     table["harmonics"] = _turned(coefficients[rows], turn)
     table["opacity"] = opacity[rows]
     table["deviation"] = DEVIATION * run.config.raster.radius * run.model.grid.edge
+    table["deviation"] *= np.exp(run.model.cloud.offset.get()[rows, 3])
     return table, origin
 
 

@@ -73,7 +73,7 @@ def blend_backward_table(n: int, shaded: int, pixels: int, pairs: int, blend: st
         "pixel_spread": ((pixels if blend == "alpha" else 1,), np.float32),
         "grad_shaded_features": ((shaded, 16), np.float32),
         "grad_opacity": ((n,), np.float32),
-        "grad_offset": ((n if blend == "alpha" else 1, 3), np.float32),
+        "grad_offset": ((n if blend == "alpha" else 1, 4), np.float32),
     }
 
 
@@ -165,7 +165,7 @@ def offset_backward(
     opacity: Array,
     edge: float,
 ) -> Array:
-    """grad_offset (N, 3) float32, valid until the next call, after blend_backward(): of soft points
+    """grad_offset (N, 4) float32, valid until the next call, after blend_backward(): of soft points
     that are composited by alpha, of what the closeness of their hits changes.
 
     opacity: (N,). edge: of the grid that offsets are counted in, world units.

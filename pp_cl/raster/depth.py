@@ -28,7 +28,6 @@ def depth_forward(
         "depth_forward",
         pairs.pixels,
         hw=pairs.pixels,
-        radii=points.point_radius.size,
         camera=points.camera_buffer,
         point_radius=points.point_radius,
         pixel_offset=pairs.pixel_offset,

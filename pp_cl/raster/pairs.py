@@ -104,7 +104,6 @@ def find_pairs(
         -(-n // lanes(dev)),
         n=n,
         p=room,
-        radii=points.point_radius.size,
         camera=points.camera_buffer,
         point_radius=points.point_radius,
         point_camera=points.point_camera,

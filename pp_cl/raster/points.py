@@ -43,7 +43,7 @@ SH_BLOCKS = (
     ShBlock("sh_2b", 7, 2),
 )
 SH_DEGREES = (0, 1, 2)
-MOST_OFFSET = 0.5  # edges of the grid, along each axis: a point stays in the cell of its vertex
+MOST_OFFSET = 0.5  # edges along each axis: a point stays in its cell; radii times 0.61 to 1.65
 
 
 def sh_blocks(degree: int) -> tuple[ShBlock, ...]:
@@ -67,10 +67,11 @@ def four_blocks(sh: Sequence[Array]) -> list[Array]:
 class PointCloud:
     """The points, one row each; device arrays.
 
-    ids: (N) uint32, vertices of the grid, ascending. offset: (N, 3) float32, from the vertex to the
-    point in its cell, in edges of the grid, up to MOST_OFFSET. opacity: (N) float32 in [0, 1]. sh:
-    the SH coefficients, (N, count, 16) of each block: float32, or float16 where they are not
-    trained any more.
+    ids: (N) uint32, vertices of the grid, ascending. offset: (N, 4) float32, from the vertex to the
+    point in its cell, in edges of the grid, and the logarithm of its radius over
+    point_radius() of the settings; up to MOST_OFFSET. opacity: (N) float32 in [0, 1]. sh: the
+    SH coefficients, (N, count, 16) of each block: float32, or float16 where they are not trained
+    any more.
     """
 
     ids: Array
@@ -91,7 +92,7 @@ class PointCloud:
     @staticmethod
     def table(n: int, blocks: tuple[ShBlock, ...]) -> Table:
         """The arrays of n points."""
-        table: Table = {"ids": ((n,), np.uint32), "offset": ((n, 3), np.float32)}
+        table: Table = {"ids": ((n,), np.uint32), "offset": ((n, 4), np.float32)}
         table["opacity"] = (n,), np.float32
         return table | {block.name: ((n, block.count, 16), np.float32) for block in blocks}
 
@@ -101,7 +102,7 @@ class PointCloud:
         n = len(ids)
         opacities = dev.upload(np.full(n, opacity, np.float32))
         sh = [dev.zeros((n, block.count, 16)) for block in sh_blocks(degree)]
-        return cls(dev.upload(ids, np.uint32), dev.zeros((n, 3)), opacities, sh)
+        return cls(dev.upload(ids, np.uint32), dev.zeros((n, 4)), opacities, sh)
 
     def learned(self) -> dict[str, Array]:
         """{name: array} of all that training changes: "offset", "opacity", and the SH by block."""

@@ -23,7 +23,7 @@ class ProjectedPoints:
     footprint: one of FOOTPRINTS. camera_buffer: (20,) float32, cl/camera.h. point_camera: (N, 4)
     float32, x, y, z in camera axes and the distance from the eye; (0, 0, 0, -1) for a culled point.
     point_box: (N, 4) uint16, first x, first y, last x, last y of the pixels that may be hit; last <
-    first means none. point_count: (N,) uint32, pixels that are hit. point_radius: (1,) or (N,)
+    first means none. point_count: (N,) uint32, pixels that are hit. point_radius: (N,)
     float32, world units.
     """
 
@@ -41,6 +41,7 @@ def projection_table(n: int) -> Table:
         "point_camera": ((n, 4), np.float32),
         "point_box": ((n, 4), np.uint16),
         "point_count": ((n,), np.uint32),
+        "point_radius": ((n,), np.float32),
     }
 
 
@@ -52,16 +53,16 @@ def project_grid(
     grid_buffer: Array,
     *,
     point_id: Array,
-    point_offset: Array,
-    point_radius: Array,
+    cloud_offset: Array,
+    radius: float,
     dropout: float = 0.0,
     seed: int = 0,
 ) -> ProjectedPoints:
     """Project the points, each in the cell of a grid's vertex, into a camera.
 
-    grid_buffer: (8,) float32, Grid.packed(). point_id: (N,) uint32. point_offset: (N, 3) float32,
-    from the vertex, in edges of the grid. point_radius: (1,). dropout: probability in [0, 1) with
-    which a point is left out, at random by (seed, id). seed: uint32.
+    grid_buffer: (8,) float32, Grid.packed(). point_id: (N,) uint32. cloud_offset: (N, 4) float32,
+    PointCloud.offset. radius: of points without offsets, world units. dropout: probability in
+    [0, 1) with which a point is left out, at random by (seed, id). seed: uint32.
     """
     n = point_id.size
     b.require(projection_table(n))
@@ -75,12 +76,13 @@ def project_grid(
         camera=camera_buffer,
         grid=grid_buffer,
         point_id=point_id,
-        point_offset=point_offset,
-        point_radius=point_radius,
+        radius=radius,
+        cloud_offset=cloud_offset,
+        point_radius=b.point_radius,
         point_camera=b.point_camera,
         point_box=b.point_box,
         point_count=b.point_count,
     )
     return ProjectedPoints(
-        footprint, camera_buffer, b.point_camera, b.point_box, b.point_count, point_radius
+        footprint, camera_buffer, b.point_camera, b.point_box, b.point_count, b.point_radius
     )

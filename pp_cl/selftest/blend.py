@@ -156,11 +156,12 @@ def _offsets(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
         used = dense.alpha(exact_geometry, opacity, stop)["hit"]
 
         def loss(offset, radius=radius, exact_geometry=exact_geometry, used=used):
-            moved = dense.geometry(camera, positions + edge * offset, radius, "soft")
+            wide = radius * np.exp(offset[:, 3])
+            moved = dense.geometry(camera, positions + edge * offset[:, :3], wide, "soft")
             moved |= {"hit": used, "depth": exact_geometry["depth"]}
             return (dense.features(dense.alpha(moved, opacity), features) * grad).sum()
 
-        numeric = numeric_gradient(loss, np.zeros((n, 3)), STEP)
+        numeric = numeric_gradient(loss, np.zeros((n, 4)), STEP)
         yield relative(gradients.ravel(), numeric, DIFFERENCES)
 
 

@@ -66,7 +66,7 @@ class PairedPoints:
             kind,
             dev.upload(camera.packed(depth_range)),
             dev.upload(positions, np.float32),
-            point_radius=dev.upload(np.atleast_1d(radius), np.float32),
+            point_radius=dev.upload(np.broadcast_to(radius, self.n), np.float32),
         )
         self.pairs = find_all_pairs(dev, self.buffers, self.projected, self.shape)
 
@@ -193,7 +193,7 @@ class PairedPoints:
         return gradients | {"positions": positions.get(), "radius": radius.get()}
 
     def offset_gradients(self, grad_features: np.ndarray, edge: float) -> np.ndarray:
-        """(N, 3) of the same, on a grid of this edge; of soft points composited by alpha."""
+        """(N, 4) of the same, on a grid of this edge; of soft points composited by alpha."""
         self.gradients(grad_features)
         return offset_backward(
             self.dev,

@@ -46,8 +46,8 @@ def _project(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
     for n in SIZES:
         ids = rng.choice(np.prod(GRID.dims), n, replace=False)
         ids[0] = np.prod(GRID.dims) - 1
-        offset = rng.uniform(-0.5, 0.5, (n, 3)).astype(np.float32)
-        positions = GRID.positions(ids) + GRID.edge * offset
+        offset = rng.uniform(-0.5, 0.5, (n, 4)).astype(np.float32)
+        positions = GRID.positions(ids) + GRID.edge * offset[:, :3]
         points = project_grid(
             dev,
             Buffers(dev),
@@ -55,11 +55,13 @@ def _project(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
             dev.upload(camera.packed(dense.DEPTH_RANGE)),
             dev.upload(GRID.packed()),
             point_id=dev.upload(ids, np.uint32),
-            point_offset=dev.upload(offset),
-            point_radius=dev.zeros((1,)),
+            cloud_offset=dev.upload(offset),
+            radius=0.01,
         )
         place, hit = dense.camera_space(camera, positions), points.point_count.get() > 0
         yield exact(hit | ~_inside(camera, place), np.ones(n, bool))
+        radius = 0.01 * np.exp(offset[hit, 3])
+        yield relative(points.point_radius.get()[hit], radius, PLACED)
         yield relative(points.point_camera.get()[hit, :3], place[hit], PLACED)
         yield relative(
             points.point_camera.get()[hit, 3], np.linalg.norm(place[hit], axis=1), PLACED

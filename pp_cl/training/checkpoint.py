@@ -158,7 +158,7 @@ def stored_forms(
     layers = unet_layers(settings.widths, blocks=settings.blocks, channels=settings.channel_numbers)
     network = parameter_table(layers)
     table: dict[str, Any] = {"points.ids": ((n,), np.uint32), "points.opacity": ((n,), np.float32)}
-    table["points.offset"] = (n, 3), np.float32
+    table["points.offset"] = (n, 4), np.float32
     table |= {f"points.sh{d}": ((n, 2 * d + 1, 16), colours) for d in SH_DEGREES[: degree + 1]}
     table |= {f"net.{name}": row for name, row in network.items()}
     if step is not None:

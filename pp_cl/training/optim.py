@@ -63,7 +63,7 @@ class Optimiser:
         sh_eps: float,
     ) -> None:
         """One step by the gradients of the visible points' features, (S, 16) or longer, of all
-        opacities, (N,), and offsets, (N, 3), and by those of the network, which lie in
+        opacities, (N,), and offsets, (N, 4), and by those of the network, which lie in
         model.net.gradients.
 
         step: from 1. points: as projected into the rendered view. shaded: (S) uint32, the visible

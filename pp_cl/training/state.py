@@ -30,8 +30,8 @@ class PointState:
         return {
             "max_weight": ((n,), np.float32),
             "times_seen": ((n,), np.float32),
-            "m.offset": ((n, 3), np.float32),
-            "v.offset": ((n, 3), np.float32),
+            "m.offset": ((n, 4), np.float32),
+            "v.offset": ((n, 4), np.float32),
             "m.opacity": ((n,), np.float32),
             "v.opacity": ((n,), np.float32),
             "v.sh": ((n, 16), np.float32),

@@ -36,7 +36,7 @@ def kept(page):
     """(header, rows of POINT, coefficients (N, 9, 3), opacity (N,)) that the page holds."""
     header = json.loads(element(page, "header"))
     rows = np.frombuffer(base64.b64decode(element(page, "points")), POINT)
-    values = rows["colour"][:, :27].reshape(-1, 9, 3) / np.float32(255)
+    values = rows["colour"].reshape(-1, 9, 3) / np.float32(255)
     low, span = (np.float32(header[name])[:, None] for name in ("low", "span"))
     return header, rows, low + span * values, rows["opacity"] / np.float32(65535)
 
@@ -73,12 +73,14 @@ def test_points_are_kept_to_within_a_step(run, page):
     assert places == pytest.approx(run.model.positions(), abs=0.6 * header["unit"])
     assert header["count"] == len(rows) and header["stride"] == POINT.itemsize == 36
     assert opacity == pytest.approx(run.model.cloud.opacity.get(), abs=0.6 / 65535)
+    growth = rows["radius"] / 255 - 0.5
+    assert growth == pytest.approx(run.model.cloud.offset.get()[:, 3], abs=0.6 / 255)
 
 
 def test_coefficients_are_kept_to_within_a_step(run, rng):
     known = rng.normal(size=(run.model.cloud.count, 9, 3)).astype(np.float32)
     rows, low, span = pack(run, known)
-    values = rows["colour"][:, :27].reshape(-1, 9, 3)
+    values = rows["colour"].reshape(-1, 9, 3)
     found = low[:, None] + span[:, None] * (values / np.float32(255))
     inside = (known > low[:, None]) & (known < (low + span)[:, None])
     assert 0.99 < inside.mean() < 1

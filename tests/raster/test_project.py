@@ -24,8 +24,8 @@ def seen_vertices(dev, camera, ids, **options):
         dev.upload(camera.packed(oracle.DEPTH_RANGE)),
         dev.upload(GRID.packed()),
         point_id=dev.upload(ids, np.uint32),
-        point_offset=dev.zeros((len(ids), 3)),
-        point_radius=dev.zeros((1,)),
+        cloud_offset=dev.zeros((len(ids), 4)),
+        radius=0.0,
         **options,
     )
     return points.point_count.get() > 0
