@@ -70,7 +70,7 @@ class RasterConfig:
         choices=("soft", "disc", "sphere"),
     )
     radius: float = setting(
-        1.0,
+        0.85,
         "soft: in point spacings; disc, sphere: in world units at a depth range of 4",
         1e-6,
         100,
@@ -198,7 +198,8 @@ class TrainConfig:
     offset_rate: tuple = setting(
         (1e-2, 1e-3),
         "Adam's learning rate at the first and the last step of where points lie in their cells of"
-        " the grid, in edges; needs raster.blend=alpha and raster.footprint=soft (0: on the grid)",
+        " the grid, in edges, and of the logarithm of their radii; needs raster.blend=alpha and"
+        " raster.footprint=soft (0: on the grid, all alike)",
         0,
         1,
     )
