@@ -85,7 +85,7 @@ results: $(READY) ## measure what README.md and docs/ state, and write it there:
 dist: $(READY) ## build the wheel and the source archive into dist/, check both, train the demo with each from an empty folder
 	@rm -rf build dist
 	@$(BIN)/python -m pip install --quiet --disable-pip-version-check build twine
-	@$(BIN)/python -m build
+	@$(BIN)/python -m build -q
 	@$(BIN)/python -m twine check --strict dist/*
 	@set -e; unset PYTHONPATH; for archive in $(CURDIR)/dist/*; do \
 		empty=$$(mktemp -d); cd $$empty; \
