@@ -20,7 +20,7 @@ ON_OCLGRIND := OCL_ICD_VENDORS=/usr/lib/oclgrind/liboclgrind-rt-icd.so OCLGRIND_
 	OCLGRIND_NUM_THREADS=1 OCLGRIND_BUILD_OPTIONS="-cl-opt-disable -DALWAYS_INLINE=static" PYOPENCL_NO_CACHE=1 \
 	PP_DEVICE=Oclgrind PP_DATA=/nonexistent
 
-.PHONY: help setup demo test test-slow test-intel test-no-unix bench lint format docs results wheel oclgrind gpu-check fuzz faults test-coarse test-gpu-form clean
+.PHONY: help setup demo test test-slow test-intel test-no-unix bench lint format docs results dist oclgrind gpu-check fuzz faults test-coarse test-gpu-form clean
 
 help: ## print this list
 	@sed -n 's/^\([a-z-]*\):.*## \(.*\)/\1	\2/p' Makefile | expand -t 12
@@ -82,10 +82,19 @@ results: $(READY) ## measure what README.md and docs/ state, and write it there:
 	@$(BIN)/python -m tools.results $(ARGS)
 	@$(BIN)/python tools/docs_tables.py
 
-wheel: $(READY) ## build the wheel into dist/
+dist: $(READY) ## build the wheel and the source archive into dist/, check both, train the demo with each from an empty folder
 	@rm -rf build dist
-	@$(BIN)/python -m pip wheel --quiet --no-deps --wheel-dir dist .
-	@ls dist
+	@$(BIN)/python -m pip install --quiet --disable-pip-version-check build twine
+	@$(BIN)/python -m build -q
+	@$(BIN)/python -m twine check --strict dist/*
+	@set -e; unset PYTHONPATH; for archive in $(CURDIR)/dist/*; do \
+		empty=$$(mktemp -d); cd $$empty; \
+		$(CURDIR)/$(BIN)/python -m venv venv; \
+		venv/bin/pip install --quiet --disable-pip-version-check $$archive; \
+		venv/bin/pp-cl train demo --iterations 20 --out run; \
+		venv/bin/pp-cl eval run; \
+		rm -r $$empty; \
+	done
 
 oclgrind: $(READY) ## run the tests of all kernels in Oclgrind (Debian's package): stray accesses, data races, uninitialised reads
 	@printf '%s\n' $(OCLGRIND) | $(ON_OCLGRIND) xargs -P $$(nproc) -I{} \

@@ -14,7 +14,7 @@ from pp_cl.files.atomic import atomic_path
 
 LOOPED = ("gif", "webp")  # as pages show without a player
 FORMATS = ("mp4", "webm", *LOOPED)
-MISSING = "films need the packages imageio and imageio-ffmpeg: pip install pp-cl[video]"
+MISSING = 'films need imageio and imageio-ffmpeg; install them with `pip install "pp-cl[video]"`'
 
 
 def check_video(suffix: str) -> None:
@@ -27,7 +27,7 @@ def check_video(suffix: str) -> None:
 
         imageio_ffmpeg.get_ffmpeg_exe()
     except (ImportError, RuntimeError):
-        raise UserError(f"{MISSING}; or write --format webp, or png for frames") from None
+        raise UserError(f"{MISSING}, or write --format webp, or png for frames") from None
 
 
 def write_video(path: Path, frames: Iterable[np.ndarray], fps: float) -> None:

@@ -241,7 +241,8 @@ def _record(rule: str, dev: Device, rng: np.random.Generator) -> Iterator[Check]
     yield exact(seen.get() - np.arange(500), blended.geometry["hit"].any(axis=1))
     weight = blended.blend["weight"].sum(axis=1)
     least = float(np.sort(weight)[-100:-98].mean())  # 99 points have more
-    record_weights(dev, scene.pairs, scene.weights, highest, seen.fill(0), least)
+    dev.fill(seen, 0)
+    record_weights(dev, scene.pairs, scene.weights, highest, seen, least)
     yield exact(seen.get(), weight > least)
     yield relative(highest.get(), np.maximum(before.get(), weight), PLACED)
 
