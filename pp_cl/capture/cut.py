@@ -25,6 +25,7 @@ FITTED = 3  # times that the colours are fitted to their samples
 ISLAND = 0.02  # of the largest region: smaller ones of a mask are dropped
 ROUNDS = 2  # of votes
 STANDS_OUT, IS_WALL = 3.0, -4.0  # log-odds above and below which colours are overruled
+CROWDED = 0.3  # of 3x3 pixels that look like the background: the object has single ones
 CELLS = 112**3  # vertices that are voted on
 FORGIVEN = 0.15  # of the views that see a vertex: their masks may reject it
 LEAST_SEEING = 3  # views that see a vertex, or all of fewer
@@ -200,8 +201,9 @@ def _marked(labels, standing_out):
     """The labels, where what stands out from the background, or does not, is no longer open."""
     labels = labels.copy()
     labels[(standing_out > STANDS_OUT) & (labels != cv2.GC_BGD)] = cv2.GC_FGD
-    wall = cv2.medianBlur(standing_out, 3) < IS_WALL  # single pixels of the object look like it
-    labels[wall & (labels != cv2.GC_FGD)] = cv2.GC_BGD
+    wall = standing_out < IS_WALL
+    crowded = cv2.blur(wall.astype(np.float32), (3, 3)) > CROWDED
+    labels[wall & crowded & (labels != cv2.GC_FGD)] = cv2.GC_BGD
     return labels
 
 
