@@ -87,19 +87,21 @@ def _places_behind(one, background):
     return camera.eye + ahead @ camera.pose[:, :3].T / between(x, y)[..., None]
 
 
-def evidence(found: Sequence[np.ndarray], windows: Sequence[Window]) -> list[np.ndarray]:
-    """For each window (H, W) float64: how much likelier its differences are on the objects of all
-    masks than beside them, as a logarithm; 0 where they are UNSEEN.
+def evidence(
+    found: Sequence[np.ndarray], windows: Sequence[Window], surely: Sequence[np.ndarray]
+) -> list[np.ndarray]:
+    """For each window (H, W) float32: how much likelier its differences are on the object than
+    beside the masks, as a logarithm; 0 where they are UNSEEN.
 
+    surely: (H, W) bool each, what shows the object for sure; masks may hold gaps between its parts.
     What cannot be predicted says nothing: its differences are the same on the masks and beside.
     """
     counts = np.zeros((2, UNSEEN + 1))
-    for difference, one in zip(found, windows, strict=True):
-        for is_object in (0, 1):
-            some = difference[one.mask == is_object]
-            counts[is_object] += np.bincount(some, minlength=UNSEEN + 1)
+    for difference, one, on in zip(found, windows, surely, strict=True):
+        counts[0] += np.bincount(difference[~one.mask], minlength=UNSEEN + 1)
+        counts[1] += np.bincount(difference[on], minlength=UNSEEN + 1)
     shares = gaussian_filter1d(counts[:, :UNSEEN], BLUR, axis=1) + 1
     shares /= shares.sum(1, keepdims=True)
     beside, on = np.log((1 - RARE) * shares + RARE / UNSEEN)
-    odds = np.append(on - beside, 0.0)
+    odds = np.append(on - beside, 0.0).astype(np.float32)
     return [odds[difference] for difference in found]

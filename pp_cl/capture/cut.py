@@ -1,5 +1,6 @@
 """Cuts an object out of photographs with known cameras: GrabCut by view, with colours that all
-views share, from the sparse points, then two rounds in which the views vote by a forgiving hull.
+views share, from the sparse points, then by what stands out from the background, then by a vote of
+the views with a forgiving hull.
 """
 
 from collections.abc import Sequence
@@ -23,12 +24,13 @@ SAMPLES = 160  # squared: pixels of each side that the colours are learned from
 FITTED = 3  # times that the colours are fitted to their samples
 ISLAND = 0.02  # of the largest region: smaller ones of a mask are dropped
 ROUNDS = 2  # of votes
-SURE = 3.0  # log-odds of standing out from the background, or not, that overrule colours
+STANDS_OUT, IS_WALL = 3.0, -4.0  # log-odds above and below which colours are overruled
+CROWDED = 0.3  # of 3x3 pixels that look like the background: the object has single ones
 CELLS = 112**3  # vertices that are voted on
 FORGIVEN = 0.15  # of the views that see a vertex: their masks may reject it
 LEAST_SEEING = 3  # views that see a vertex, or all of fewer
-SOFT = 1.5  # pixels of the cut image over which a border is refined
-FLAT = 1e-4  # variance of brightness, of 1, below which a border follows no edge
+SOFT = 1.0  # pixels of the cut image over which a border is refined
+FLAT = 1e-3  # variance of colours, of 1, below which a border follows no edge
 
 
 def cut_out_all(
@@ -49,21 +51,23 @@ def cut_out_all(
         seeds[i] if i in seeds else one.mask.astype(np.uint8) for i, one in enumerate(windows)
     ]
 
+    def cut():
+        colours = _colours(windows, labels)
+        for i in tqdm(left, "cutting out", unit="image", leave=False, disable=None):
+            windows[i].mask = _grab_cut(windows[i], labels[i], colours)
+
+    cut()
+    differences = backdrop.differences(windows, points[~inside])
     for number in range(1 + ROUNDS):
         if number:
             hull = _hull(windows, box)
             for i in left:
-                labels[i] = _relabelled(windows[i], seeds[i], *hull, number == ROUNDS)
-        colours = _colours(windows, labels)
-        for i in tqdm(left, "cutting out", unit="image", leave=False, disable=None):
-            windows[i].mask = _grab_cut(windows[i], labels[i], colours)
-        if number == 0:
-            differences = backdrop.differences(windows, points[~inside])
-            continue
-        standing_out = backdrop.evidence(differences, windows)
+                labels[i] = _relabelled(windows[i], seeds[i], *hull)
+        surely = [some == cv2.GC_FGD for some in labels]
+        standing_out = backdrop.evidence(differences, windows, surely)
         for i in left:
-            windows[i].mask[(standing_out[i] > SURE) & (labels[i] != cv2.GC_BGD)] = True
-            windows[i].mask[(standing_out[i] < -SURE) & (labels[i] != cv2.GC_FGD)] = False
+            labels[i] = _marked(labels[i], standing_out[i])
+        cut()
     for i in left:
         windows[i].mask = without_islands(windows[i].mask)
 
@@ -173,7 +177,7 @@ def _hull(windows: Sequence[Window], box: np.ndarray) -> tuple[np.ndarray, np.nd
     return positions[left[kept]], rejected[kept], grid.edge
 
 
-def _relabelled(one, seeds, hull, rejections, edge, is_last):
+def _relabelled(one, seeds, hull, rejections, edge):
     """(H, W) uint8 of GrabCut's labels of a window from what all views agree on: what is well
     outside the hull is background, what is well within what no other view rejects is the object.
     """
@@ -188,9 +192,18 @@ def _relabelled(one, seeds, hull, rejections, edge, is_last):
     labels = np.where(held & one.mask, cv2.GC_PR_FGD, cv2.GC_PR_BGD).astype(np.uint8)
     labels[_eroded(held, gap) & (seeds == cv2.GC_FGD)] = cv2.GC_FGD
     labels[seeds == cv2.GC_BGD] = cv2.GC_BGD
-    if is_last:  # before, thin parts may be missing in the hull
-        labels[~dilated(held, 2 * gap)] = cv2.GC_BGD
+    labels[~dilated(held, 2 * gap)] = cv2.GC_BGD
     labels[_eroded(core, 2 * gap + 1)] = cv2.GC_FGD
+    return labels
+
+
+def _marked(labels, standing_out):
+    """The labels, where what stands out from the background, or does not, is no longer open."""
+    labels = labels.copy()
+    labels[(standing_out > STANDS_OUT) & (labels != cv2.GC_BGD)] = cv2.GC_FGD
+    wall = standing_out < IS_WALL
+    crowded = cv2.blur(wall.astype(np.float32), (3, 3)) > CROWDED
+    labels[wall & crowded & (labels != cv2.GC_FGD)] = cv2.GC_BGD
     return labels
 
 
@@ -199,18 +212,21 @@ def whole_mask(one: Window, photograph: np.ndarray) -> np.ndarray:
     photograph's edges (guided filter, He et al. 2010) and is soft where they are.
     """
     x0, y0, x1, y1 = one.place
-    guide = cv2.cvtColor(photograph[y0:y1, x0:x1], cv2.COLOR_RGB2GRAY).astype(np.float32) / 255
+    guide = photograph[y0:y1, x0:x1].astype(np.float32) / 255
     rough = cv2.resize(one.mask.astype(np.float32), (x1 - x0, y1 - y0))
     side = 2 * max(1, round(SOFT * (x1 - x0) / one.mask.shape[1])) + 1
 
     def mean(values):
         return cv2.blur(values, (side, side), borderType=cv2.BORDER_REFLECT)
 
-    means = mean(guide), mean(rough)
-    variance = mean(guide * guide) - means[0] ** 2
-    slope = (mean(guide * rough) - means[0] * means[1]) / (variance + FLAT)
-    refined = mean(slope) * guide + mean(means[1] - slope * means[0])
-    refined = (rough + refined) / 2  # so that parts thinner than the filter stay
+    colour, level = mean(guide), mean(rough)
+    band = (level > 0) & (level < 1)
+    products = [mean(guide * guide[..., c : c + 1])[band] for c in range(3)]
+    variance = np.stack(products, axis=1) - colour[band][:, None] * colour[band][..., None]
+    along = mean(guide * rough[..., None])[band] - colour[band] * level[band][:, None]
+    slope = np.zeros_like(guide)
+    slope[band] = np.linalg.solve(variance + FLAT * np.eye(3), along[..., None])[..., 0]
+    refined = (mean(slope) * guide).sum(2) + mean(level - (slope * colour).sum(2))
     mask = np.zeros(photograph.shape[:2], np.uint8)
     mask[y0:y1, x0:x1] = np.clip(255 * refined + 0.5, 0, 255)
     return mask

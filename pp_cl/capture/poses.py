@@ -135,12 +135,15 @@ def photographs(model: Any, folder: str) -> list[Photograph]:
     return found
 
 
-def points(model: Any) -> tuple[np.ndarray, list[np.ndarray]]:
-    """((N, 3) points of pycolmap's model, for each of photographs() the indices of those in it)."""
-    index = {number: k for k, number in enumerate(model.points3D)}
+def points(model: Any, least: int = 2) -> tuple[np.ndarray, list[np.ndarray]]:
+    """((N, 3) points of pycolmap's model that at least so many images show, for each of
+    photographs() the indices of those in it).
+    """
+    kept = [number for number, one in model.points3D.items() if one.track.length() >= least]
+    index = {number: k for k, number in enumerate(kept)}
     shown = [
-        np.array([index[p.point3D_id] for p in image.points2D if p.has_point3D()], int)
+        np.array([index[p.point3D_id] for p in image.points2D if p.point3D_id in index], int)
         for image in sorted(model.images.values(), key=lambda image: image.name)
         if image.has_pose
     ]
-    return np.array([point.xyz for point in model.points3D.values()]), shown
+    return np.array([model.points3D[number].xyz for number in kept]), shown

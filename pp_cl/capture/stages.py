@@ -27,6 +27,7 @@ from pp_cl.scene.readers.transforms import SINGLE
 from pp_cl.scene.views import evenly, fitting_downscale, shrink
 
 STAGES = ("frames", "features", "matches", "poses", "box", "masks", "scene")
+FOLLOWED = 4  # images that show a point: wrong matches are seldom found again in so many
 SHOWN_WIDTH = 1000  # pixels of the pictures of points and cameras
 RESUMED = ("features", "matches", "masks")  # stages that keep what was done when they are stopped
 # what each stage leaves beside its JSON, in the scene's folder
@@ -208,7 +209,7 @@ class Capture:
         model, corners = self._world()
         given, dropped = self.given["masks"], read_edits(self.scene).dropped
         photographs, folder = poses.photographs(model, "images"), self.scene / "masks"
-        points, seen = poses.points(model)
+        points, seen = poses.points(model, FOLLOWED)
         kept = [i for i, one in enumerate(photographs) if one.name not in dropped]
 
         def write(chosen):

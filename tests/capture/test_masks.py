@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from PIL import Image
-from scipy.ndimage import binary_opening, gaussian_filter
+from scipy.ndimage import binary_closing, binary_dilation, binary_opening, gaussian_filter
 from support.scenes import ball_image, ring_cameras
 
 from pp_cl.errors import UserError
@@ -114,8 +114,8 @@ def test_the_object_is_cut_out_of_any_background(capture):
     assert len(np.unique(read_gray(capture.file(0)))) > 4, "no soft border"
 
 
-def test_thin_parts_stand_out_from_the_wall(dev, tmp_path):
-    """The demo's spokes are a pixel wide here, which is more than a cut by colour finds."""
+def test_thin_parts_and_gaps_are_told_by_the_wall(dev, tmp_path):
+    """The demo's spokes are a pixel wide here, and masks by colour lose them or fill the gaps."""
     around = [one.with_angle(1.6 * ANGLE) for one in cameras(4 * SIZE, "turntable")]
     views = [(one, render(dev, one)) for one in around[: 2 * VIEWS : 2]]
     middle, wall = np.zeros((1, 3)), lambda camera: room(camera, (1.0, 2.0))
@@ -126,13 +126,23 @@ def test_thin_parts_stand_out_from_the_wall(dev, tmp_path):
     truth = [
         one.reduced(np.uint8(mask)) > 0 for one, mask in zip(windows, capture.truth, strict=True)
     ]
-    for one, mask in zip(windows, truth, strict=True):
-        one.mask = binary_opening(mask, iterations=3)
-    differences = backdrop.differences(windows, capture.points[capture.count :])
-    odds = np.concatenate([one.ravel() for one in backdrop.evidence(differences, windows)])
-    mask = np.concatenate([one.ravel() for one in truth])
-    missing = mask & ~np.concatenate([one.mask.ravel() for one in windows])
-    assert (odds[missing] > cut.SURE).mean() > 0.8 and (odds[~mask] < 0).mean() > 0.95
+    surely = [binary_opening(mask, iterations=3) for mask in truth]
+    filled = [binary_closing(mask, iterations=3) for mask in truth]
+
+    def flat(images):
+        return np.concatenate([one.ravel() for one in images])
+
+    def odds(masks):
+        for one, mask in zip(windows, masks, strict=True):
+            one.mask = mask
+        differences = backdrop.differences(windows, capture.points[capture.count :])
+        return flat(backdrop.evidence(differences, windows, surely))
+
+    of_thin, of_filled, shown = odds(surely), odds(filled), flat(truth)
+    assert (of_thin[shown & ~flat(surely)] > cut.STANDS_OUT).mean() > 0.8
+    assert (of_thin[~shown] < 0).mean() > 0.95
+    beside = ~flat([binary_dilation(mask) for mask in truth])
+    assert (of_filled[flat(filled) & beside] < cut.IS_WALL).mean() > 0.8
 
 
 def share_held(capture, place, wanted):
