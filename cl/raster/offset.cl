@@ -3,9 +3,10 @@
 //
 // d = 1 - rho / h with rho = |e|, e = c - (c.r) r: of the centre c from the unit ray r
 // dd/dc = -e / (rho h),   dL/dd = o T gain (alpha.cl, blend.cl)
+// With m along the ray, of any length: e = c - (c.m)/(m.m) m, which takes no root.
 //
-// dd/d(log h) = rho / h = 1 - d. The least h is not the point's radius and grows with the range t =
-// |c|: then dd/dc has rho/h^2 dh/dc = (1 - d) c/t^2 more instead.
+// dd/d(log h) = rho / h = 1 - d. The least h is not the point's own and grows with the range t = |c|:
+// then dd/dc has rho/h^2 dh/dc = (1 - d) c/t^2 more instead.
 #include "common.h"
 #include "camera.h"
 #include "raster/footprint.h"
@@ -43,6 +44,7 @@ kernel void offset_backward(
     const float t = point_camera[i].w;
     const float h = fmax(point_radius[i], LEAST_RADIUS * t / least_focal(&cam));
     const float growth = h > point_radius[i] ? 1.0f / (t * t) : 0.0f;
+    const float per_fx = 1.0f / cam.fx, per_fy = 1.0f / cam.fy;
     float3 dL_dc = 0.0f;
     float dL_dlog = 0.0f;  // of h
     for (uint pair = point_offset[i]; pair < point_offset[i + 1]; pair++) {
@@ -50,7 +52,9 @@ kernel void offset_backward(
         const float d = as_float(pair_point_closeness[pair].y);
         if (d <= 0.0f) continue;  // the very rim
         const uint q = pair_pixel[pair];
-        const float3 r = camera_ray(&cam, q % cam.width, q / cam.width), e = c - dot(c, r) * r;
+        const float mx = (q % cam.width + 0.5f - cam.cx) * per_fx;
+        const float my = (q / cam.width + 0.5f - cam.cy) * per_fy;
+        const float3 m = (float3)(mx, my, 1.0f), e = c - dot(c, m) / dot(m, m) * m;
         const float dL_dd = opacity[i] * pair_weight[pair].y / d * pair_gain[pair];
         const float per_rho_h = 1.0f / (fmax(1.0f - d, LEAST_RHO) * h * h);
         dL_dlog += dL_dd * (1.0f - d);

@@ -14,6 +14,8 @@
 #define RUN 64  // keys ranked at once by comparing all with all; longer lists are merged
 #endif
 
+#define FEW 6  // keys of a list that are sorted fastest one by one
+
 // Pixels of a box that are tested before their hits are written, at most 32 (bits of a uint). With
 // fewer, writing alternates more often between the pairs of 16 points, which lie far apart.
 #define CELLS (LANES > 1 ? 32 : 1)
@@ -221,6 +223,16 @@ kernel __attribute__((vec_type_hint(uint16))) void pairs_sort(
     if (q >= hw) return;
     const uint begin = pixel_offset[q], count = pixel_offset[q + 1] - begin;
     global ulong *keys = pair_key + begin, *other = scratch + begin;
+    if (count <= FEW) {
+        for (uint i = 1; i < count; i++) {
+            const ulong key = keys[i];
+            uint j = i;
+            for (; j > 0 && keys[j - 1] > key; j--)
+                keys[j] = keys[j - 1];
+            keys[j] = key;
+        }
+        return;
+    }
     uint passes = 0;
     for (uint width = RUN; width < count; width *= 2)
         passes++;
