@@ -67,7 +67,8 @@ def test_a_finished_run_is_extended_and_resumes_to_the_same_bytes(
     rows = [json.loads(line) for line in (whole / "log.jsonl").read_text().splitlines()]
     assert [row["step"] for row in rows[:4]] == [5, 10, 15, 20] and rows[-2]["step"] == iterations
     assert all(a["points"] >= b["points"] for a, b in itertools.pairwise(rows[3:]))
-    assert np.mean([row["loss"] for row in rows[-3:-1]]) < 1.1 * rows[3]["loss"]
+    # a view has twice the loss of another
+    assert np.mean([row["loss"] for row in rows[-3:-1]]) < 0.8 * rows[0]["loss"]
     for step in (20, stop):  # before the first step, and later on
         with monkeypatch.context() as patch:
             patch.setattr(Trainer, "train_step", interrupted_after(step))

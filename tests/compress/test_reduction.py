@@ -59,7 +59,7 @@ def test_fewer_points_of_16_bits_and_a_lower_degree(original):
         assert np.abs(found - exact).max() <= np.abs(exact).max() * 2**-11
     network = sum(a.nbytes for name, a in arrays.items() if name.startswith("net."))
     run = original.reduced(reduction)
-    assert nbytes(run) == len(kept) * (4 + 12 + 4 + 4 * 16 * 2) + network
+    assert nbytes(run) == len(kept) * (4 + 16 + 4 + 4 * 16 * 2) + network
     assert run.model.cloud.count == len(kept) and run.config.points.sh_degree == 1
     assert run.renderer.settings.early_stop == 0.01 != original.run.config.raster.early_stop
     camera = run.cameras("train")[0]
