@@ -11,14 +11,14 @@ ROW = {"name": "lego", "size": "200x200", "preset": "tiny", "steps": 300, "views
 ROW |= {"minutes": 0.5, "psnr": 28.1234, "ssim": 0.95, "lpips": 0.05, "points": 90000}
 ROW |= {"frame_ms": 14.0, "computed": 1.0}
 RASTER = {"points": 250336, "size": 200, "blend": "alpha", "forward_ms": 13.7, "backward_ms": 2.1}
-RASTER |= {"ms": 15.8, "max_err": 8e-8, **dict.fromkeys(TOOL.STAGES, 1.5)}
+RASTER |= {"ms": 15.8, "max_err": 8e-8, "stages_ms": dict.fromkeys(TOOL.STAGES, 1.5)}
 NET = {"widths": "32,64,128", "side": 200, "variant": "auto", "direction": "forward"}
 NET |= {"ms": 13.1, "gflops": 900.0, "rel_l2": 4e-7}
 MEMORY = {"name": "tiny", "points": 253464, "device_plan": 7e2, "device": 7e2}
 MEMORY |= {"host_plan": 1e3, "host": 1e3}
 FOUND = dict.fromkeys(TOOL.PARTS, ROW)
 FOUND |= {"demo": [{"what": "mesh", "result": "0.76"}]}
-FOUND |= {"rasteriser": [RASTER], "network": [NET], "memory": [MEMORY]}
+FOUND |= {"rasteriser": [TOOL.by_stage(RASTER)], "network": [NET], "memory": [MEMORY]}
 
 
 @pytest.fixture
@@ -45,6 +45,8 @@ def test_tables_and_plots(tmp_path):
         written = docs_tables.table(about | contents)
         last = written.splitlines()[-1].split("|")[1:-1]
         assert len(last) == len(contents["columns"]) and all(cell.strip() for cell in last)
+    (row,) = TOOL.tables(FOUND)["rasteriser"]["rows"]
+    assert row["blend"] == "alpha" and row["blend_ms"] == 1.5
     pytest.importorskip("matplotlib", reason="pictures need the extra `plot`")
     TOOL.draw(TOOL.trained(FOUND), TOOL.timed(FOUND), tmp_path)
     assert len({*tmp_path.glob("*.png")}) == 4
