@@ -6,9 +6,9 @@
 #include "common.h"
 #include "raster/footprint.h"
 
-// Distance from the eye. range: the pair's depth. d: its closeness.
+// Distance from the eye. range: the pair's depth. d: its closeness, at the rim a rounding below 0.
 static inline float surface_range(const float range, const float radius, const float d) {
-    return FOOTPRINT == SOFT ? range - radius * sqrt(d * (2.0f - d)) : range;
+    return FOOTPRINT == SOFT && !(d < 0.0f) ? range - radius * sqrt(d * (2.0f - d)) : range;
 }
 
 // One work-item per pixel: reads its hits, nearest first, and writes the share of the pixel that is
@@ -49,7 +49,7 @@ kernel void depth_forward(
         reached += b;
         before = z;
     }
-    pixel_alpha[q] = fmin(alpha, 1.0f);
+    pixel_alpha[q] = alpha > 1.0f ? 1.0f : alpha;  // fmin() would hide a NaN
     pixel_depth[q] = alpha > 0.0f ? depth / alpha : INFINITY;
     pixel_median[q] = alpha > 0.0f ? median : INFINITY;
 }

@@ -1,10 +1,13 @@
 """Depth of what is seen, against the exact intersection of rays and balls."""
 
+from dataclasses import replace
+
 import numpy as np
+import pytest
 
 from pp_cl.raster.depth import depth_forward
 from pp_cl.reference import dense
-from pp_cl.selftest.points import PairedPoints, make_camera
+from pp_cl.selftest.points import PairedPoints, blend_on_axis, make_camera
 
 
 def test_soft_points_are_balls(dev, rng):
@@ -25,3 +28,21 @@ def test_soft_points_are_balls(dev, rng):
         front = (along - np.sqrt(radius**2 - np.minimum(across, radius) ** 2)) * ray[:, 2]
         np.testing.assert_allclose(depth[inside], front[inside], atol=0.05 * radius)
         np.testing.assert_allclose(median[inside], depth[inside], rtol=1e-6)
+
+
+def test_a_closeness_that_is_rounded_below_0_has_a_depth(dev):
+    """Of the nearest of two hits, as a GPU's square roots and quotients may round it at the rim."""
+    scene, _ = blend_on_axis(dev, [0.9, 0.5], [1.0, 1.0], 0.1, rule="alpha")
+    hits = scene.pairs.pair_point_closeness.get()
+    hits[0, 1] = np.float32(-(2.0**-23)).view(np.uint32)
+    scene.pairs = replace(scene.pairs, pair_point_closeness=dev.upload(hits))
+    scene.blend([1.0, 1.0], 0.1, np.zeros((2, 16)), rule="alpha")
+    arrays = depth_forward(dev, scene.projected, scene.pairs, scene.weights, scene.shape)
+    assert scene.weight()[0, 0] < 0 and all(np.isfinite(array.get()).all() for array in arrays)
+
+
+@pytest.mark.exact
+def test_a_nan_is_not_hidden(dev):
+    scene, _ = blend_on_axis(dev, [0.9], [np.nan], 0.1, rule="alpha")
+    alpha, *_ = depth_forward(dev, scene.projected, scene.pairs, scene.weights, scene.shape)
+    assert np.isnan(alpha.get())
