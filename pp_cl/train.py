@@ -337,6 +337,7 @@ class Trainer:
         for view in self.views:
             drawn = self.renderer.forward(view.camera, self.gamma[1], until="weights")
             record_weights(self.dev, drawn.pairs, drawn.weights, max_weight, seen, least_weight)
+            del drawn  # else its arrays would stay beside the larger ones of the next view
         least = 2 if len(self.views) >= MANY_VIEWS else 1
         opacity = cloud.opacity
         self._keep(final_points_to_keep(self.dev, max_weight, seen, opacity, self.config, least))

@@ -1,6 +1,7 @@
 """A training step in its steady state: the device is waited for once, and nothing is allocated."""
 
 import collections
+import weakref
 
 import numpy as np
 import pyopencl as cl
@@ -109,6 +110,27 @@ def test_a_step_keeps_no_copy_of_the_points_on_the_host(dev, scene, tmp_path, mo
         monkeypatch.setattr(Array, name, None)
     trainer.train_step()
     trainer.finish()
+
+
+def test_the_end_holds_no_view_beside_another(dev, scene, tmp_path, monkeypatch):
+    """Nor when rows of points are moved: their arrays are the largest of a training."""
+    trainer, drawn = make_trainer(dev, scene, tmp_path / "run", "tiny"), []
+    forward, keep = trainer.renderer.forward, trainer._keep
+
+    def drawing(*args, **named):
+        assert not any(view() for view in drawn)
+        result = forward(*args, **named)
+        drawn.append(weakref.ref(result))
+        return result
+
+    def keeping(rows):
+        assert not any(view() for view in drawn)
+        keep(rows)
+
+    monkeypatch.setattr(trainer.renderer, "forward", drawing)
+    monkeypatch.setattr(trainer, "_keep", keeping)
+    trainer.finish()
+    assert len(drawn) == len(trainer.views)
 
 
 def test_planned_steps_learn_the_same(dev, scene, tmp_path, monkeypatch):

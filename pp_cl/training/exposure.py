@@ -97,12 +97,12 @@ class Exposure:
 
     def explained(self) -> float:
         """The share of the last steps' squared error after the best gain of each channel that the
-        views' own gains explain.
+        views' own gains explain; 0 where there is none.
         """
         pt, pp, tt, _ = np.moveaxis(self.dev.download(self.state).astype(np.float64), -1, 0)
         common = (tt.sum(0) - pt.sum(0) ** 2 / np.maximum(pp.sum(0), TINY)).sum()
         own = (tt - pt**2 / np.maximum(pp, TINY)).sum()
-        return float(1 - own / max(common, TINY))
+        return float(1 - own / common) if common > TINY else 0.0
 
 
 def decided_at(begun: int, views: int) -> int:

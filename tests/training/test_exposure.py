@@ -15,7 +15,7 @@ from pp_cl.files.checkpoint import load_checkpoint
 from pp_cl.metrics.psnr_ssim import exposed_alike
 from pp_cl.scene.demo import demo_views
 from pp_cl.scene.readers.transforms import write_scene
-from pp_cl.training.exposure import decided_at
+from pp_cl.training.exposure import Exposure, decided_at
 
 VIEWS, STEPS = 64, 500
 DECIDED = decided_at(0, VIEWS)
@@ -75,6 +75,14 @@ def test_views_are_compared_without_and_with_their_best_gains(exposed, capsys):
     assert after["psnr"] == pytest.approx(
         np.mean([row["after_gains"]["psnr"] for row in result["per_image"]])
     )
+
+
+def test_gains_explain_nothing_where_there_is_no_error(dev):
+    """As of an object that is black in all photographs."""
+    exposure, alpha = Exposure(dev, 2, is_applied=False), dev.upload(np.ones((5, 7)), np.float32)
+    for view in range(2):
+        exposure.fit(view, dev.zeros((5, 7, 3)), dev.zeros((5, 7, 3)), alpha, (0, 0))
+    assert exposure.explained() == 0
 
 
 def test_the_best_gains_are_those_of_the_object(rng):
