@@ -297,7 +297,7 @@ kernel void pairs_merge_runs(
         if (first == own) continue;
         uint low = first, high = min(first + width, end);  // the smaller ones end between them
         while (low < high) {
-            const uint middle = (low + high) / 2;
+            const uint middle = low + (high - low) / 2;  // their sum may pass 2^32
             if (sorted[middle] < key)
                 low = middle + 1;
             else

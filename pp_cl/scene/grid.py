@@ -11,6 +11,7 @@ from scipy.ndimage import label
 from pp_cl.scene.camera import Camera
 
 FLOAT32_BITS = 24
+MOST_VERTICES = 2**32  # an id has 32 bits
 
 
 @dataclass(frozen=True)
@@ -62,7 +63,7 @@ class Grid:
         """(vertices of refined(), ascending, the place in `ids` of each one's parent), (8 N) uint32
         both. Raises ValueError where refined() has more vertices than 32 bits can number.
         """
-        if 8 * math.prod(self.dims) > 2**32:
+        if 8 * math.prod(self.dims) > MOST_VERTICES:
             raise ValueError(f"a grid of {self.dims} vertices cannot be refined")
         nx, ny, _ = self.dims
         ids = np.asarray(ids, np.int64)

@@ -17,12 +17,12 @@ from pp_cl.files.run_folder import RunFolder
 from pp_cl.layers.choice import check_form
 from pp_cl.network.layers import parameter_table, unet_layers
 from pp_cl.raster.points import MOST_OFFSET, SH_DEGREES, sh_blocks
+from pp_cl.scene.grid import MOST_VERTICES
 from pp_cl.scene.identity import DIGITS, kept_views
 from pp_cl.training.exposure import decided_at
 from pp_cl.training.schedule import bound_to_end, ema_start
 from pp_cl.training.state import PointState
 
-MOST_VERTICES = 2**32  # an id has 32 bits
 LEAST_LENGTH, MOST_LENGTH = 1e-30, 1e30  # world units; float32 would hold no products of others
 LEAST_SHARE = 1e-6  # of far, between it and near: float32 would hold them as one
 MOST_TEXT = 1000

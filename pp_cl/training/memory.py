@@ -19,7 +19,7 @@ from pp_cl.network.unet import PARAMETERS, UNet
 from pp_cl.raster.blend import blend_backward_table
 from pp_cl.raster.points import PointCloud, sh_blocks
 from pp_cl.render import NETWORK_MULTIPLE, Renderer, point_radius
-from pp_cl.scene.grid import Grid
+from pp_cl.scene.grid import MOST_VERTICES, Grid
 from pp_cl.scene.load import DEMO, mask_rule, reading
 from pp_cl.scene.views import Photograph, kept_bytes, shrink_factor
 from pp_cl.training.exposure import Exposure
@@ -133,8 +133,14 @@ class Room:
         self, grid: Grid, points: int, depth_range: tuple[float, float], step: int = 0
     ) -> None:
         """Raise UserError, naming the settings to change, where a training with these points of a
-        grid does not fit from a step on.
+        grid does not fit from a step on, or would refine the grid beyond what ids can number.
         """
+        to_come = sum(step < at for at in refine_steps(self._config.train))
+        if math.prod(grid.dims) * 8**to_come > MOST_VERTICES:
+            raise UserError(
+                f"refined {to_come} times, the grid has more than {MOST_VERTICES} vertices:"
+                " refine less often (train.refine_at), or lower --points"
+            )
         self._check(self.plan_points(grid, points, depth_range, step))
 
     def check_growth(self, model: Model, step: int) -> None:

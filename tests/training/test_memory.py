@@ -167,6 +167,15 @@ def test_the_most_points_of_a_plan_are_near_those_of_lego(dev, name, shares, fir
     assert max(phase.points for phase in plan.phases) == pytest.approx(most, rel=0.1)
 
 
+def test_a_grid_is_not_refined_beyond_what_ids_can_number(dev):
+    """Of a thin object, whose few points lie in the largest grid."""
+    made = room(dev, "full", train__refine_at="0.3,0.6")
+    largest, larger = (Grid((0, 0, 0), 1e-3, (n, 512, 512)) for n in (256, 257))
+    made.check_points(largest, 1000, (2, 6))
+    with pytest.raises(UserError, match="train.refine_at"):
+        made.check_points(larger, 1000, (2, 6))
+
+
 def test_a_plan_that_goes_on_counts_no_pruning_twice(dev):
     halfway = planned(dev, "small", points=118_025, step=600, **ONCE)
     assert (
