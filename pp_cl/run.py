@@ -389,8 +389,9 @@ def render_views(run: Run, views: list[View]) -> Iterator[Rendered]:
     for view in views:
         start = time.perf_counter()
         result = run.renderer.forward(view.camera, run.gamma)
-        image = run.checked(result.clamped())
+        image, computed = run.checked(result.clamped()), result.computed_fraction
         seconds = time.perf_counter() - start
+        del result  # else its arrays would stay beside the larger ones of the next view
         whole = target.crop(view, (0, 0, view.camera.width, view.camera.height))
         truth, alpha = (array.get() for array in whole)
-        yield Rendered(view.name, image, truth, alpha, seconds, result.computed_fraction)
+        yield Rendered(view.name, image, truth, alpha, seconds, computed)

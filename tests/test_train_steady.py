@@ -1,12 +1,12 @@
 """A training step in its steady state: the device is waited for once, and nothing is allocated."""
 
 import collections
-import weakref
 
 import numpy as np
 import pyopencl as cl
 import pytest
 from pyopencl.array import Array
+from support.models import drawn_alone
 
 import pp_cl.network.unet
 from pp_cl.config import configure, preset
@@ -114,20 +114,13 @@ def test_a_step_keeps_no_copy_of_the_points_on_the_host(dev, scene, tmp_path, mo
 
 def test_the_end_holds_no_view_beside_another(dev, scene, tmp_path, monkeypatch):
     """Nor when rows of points are moved: their arrays are the largest of a training."""
-    trainer, drawn = make_trainer(dev, scene, tmp_path / "run", "tiny"), []
-    forward, keep = trainer.renderer.forward, trainer._keep
-
-    def drawing(*args, **named):
-        assert not any(view() for view in drawn)
-        result = forward(*args, **named)
-        drawn.append(weakref.ref(result))
-        return result
+    trainer = make_trainer(dev, scene, tmp_path / "run", "tiny")
+    drawn, keep = drawn_alone(monkeypatch, trainer.renderer), trainer._keep
 
     def keeping(rows):
         assert not any(view() for view in drawn)
         keep(rows)
 
-    monkeypatch.setattr(trainer.renderer, "forward", drawing)
     monkeypatch.setattr(trainer, "_keep", keeping)
     trainer.finish()
     assert len(drawn) == len(trainer.views)

@@ -1,4 +1,6 @@
-"""Models of a few points."""
+"""Models of a few points, and what a renderer has made of them."""
+
+import weakref
 
 import numpy as np
 
@@ -27,3 +29,19 @@ def make_model(dev, rng, n=90):
 def fetched(arrays):
     """{name: numpy array} of {name: DeviceRows}."""
     return {name: rows.get() for name, rows in arrays.items()}
+
+
+def drawn_alone(monkeypatch, renderer):
+    """[weak references to all results of renderer.forward() from now on]. While one is held, no
+    further view may be drawn: its arrays would lie beside the others.
+    """
+    forward, drawn = renderer.forward, []
+
+    def drawing(*args, **named):
+        assert not any(result() for result in drawn)
+        result = forward(*args, **named)
+        drawn.append(weakref.ref(result))
+        return result
+
+    monkeypatch.setattr(renderer, "forward", drawing)
+    return drawn
