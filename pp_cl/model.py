@@ -1,5 +1,5 @@
-"""The model: points on a grid with opacities and SH coefficients, and the U-Net that turns blended
-features into colours.
+"""The model: points in the cells of a grid with radii, opacities and SH coefficients, and the U-Net
+that turns blended features into colours.
 """
 
 from __future__ import annotations

@@ -71,7 +71,8 @@ class RasterConfig:
     )
     radius: float = setting(
         0.85,
-        "soft: in point spacings; disc, sphere: in world units at a depth range of 4",
+        "before points learn their own (train.offset_rate). soft: in point spacings; disc, sphere:"
+        " in world units at a depth range of 4",
         1e-6,
         100,
     )

@@ -1,6 +1,5 @@
 // Four neighbouring channels as one vector, and how the convolutions through local memory cut a
-// feature map (conv_local.cl,
-// conv_local_backward_weights.cl).
+// feature map (conv_local.cl, conv_local_backward_weights.cl).
 #ifndef PP_LOCAL_H
 #define PP_LOCAL_H
 

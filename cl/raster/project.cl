@@ -157,8 +157,8 @@ ALWAYS_INLINE uints divide(uints *id, const uint n) {
     return low + more;
 }
 
-// One work-item per LANES points: reads their grid indices and offsets, writes their radii,
-// camera-space positions and distances, boxes and numbers of hits.
+// One work-item per LANES points: reads their grid indices and offsets, writes their numbers of hits
+// and, if any is above 0, their radii, camera-space positions and distances, and boxes.
 kernel __attribute__((vec_type_hint(floats))) void project_grid(
     const uint n,                       // points
     const uint dropout,                 // a point is left out where its random uint is below this
@@ -168,7 +168,7 @@ kernel __attribute__((vec_type_hint(floats))) void project_grid(
     global const uint *point_id,        // (N)
     const float radius,                 // of a point without offsets, world units
     global const float4 *cloud_offset,  // (N, 4) from the vertex, in edges; log of the radius
-    global float *point_radius,         // (N) not written where none of LANES hits a pixel
+    global float *point_radius,         // (N)
     global float4 *point_camera,        // (N, 4) x, y, z, t; t = -1: culled or dropped out
     global ushort4 *point_box,  // (N, 4) first x, first y, last x, last y; none where last < first
     global uint *point_count)   // (N)

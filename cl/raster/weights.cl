@@ -8,7 +8,7 @@
 #endif
 
 // One work-item per point with a pair: sums the weights of its pairs, keeps the sum if it is the
-// highest so far, and counts the view if the sum is `least`.
+// highest so far, and counts the view if the sum is at least `least`.
 kernel void record_weights(
     const uint n,                         // points
     const float least,                    // weight of a point that counts as seen

@@ -448,8 +448,8 @@ class UNet:
         return self._trained[1][name]
 
     def memory_plan(self, height: int, width: int, training: bool) -> Table:
-        """All device buffers of this network once it has run at this
-        size, what its convolutions share with others among them.
+        """All device buffers of this network once it has run at this size, what its convolutions
+        share with others among them.
 
         Gradients of parameters are among them without training too: they are made with the network.
         Raises UserError where no variant is as exact as the policy's tolerance.
@@ -469,7 +469,7 @@ class UNet:
                     layer.shape(direction, source, *size).ci,
                 )
                 for name, number in needed.items():
-                    if not training or name not in (FLIPPED, PARTIAL, TRANSFORMED):  # see below
+                    if not training or name not in (FLIPPED, PARTIAL, TRANSFORMED):  # of _plan()
                         floats[name] = max(number, floats.get(name, 0))
         table: Table = {name: ((number,), np.float32) for name, number in floats.items()}
         table |= dict.fromkeys(PARAMETERS, (self.all_parameters.shape, np.float32))

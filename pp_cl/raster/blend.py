@@ -93,8 +93,8 @@ def blend_backward(
     """(grad_shaded_features (S, 16) or longer, grad_opacity (N,), pixel_spread (HW,)), float32,
     valid until the next call: the gradients of the points weights.shaded, while those of all others
     are 0; and the spread of each pixel, undefined without spread_weight. b.pair_gain (alpha) or
-    b.pixel_rest (softmax) are left for bench/spheres.py: the gains, and what they follow from
-    (cl/raster/blend.cl).
+    b.pixel_rest (softmax) are left for offset_backward() and bench/spheres.py: the gains, and what
+    they follow from (cl/raster/blend.cl).
 
     shaded_features, features: of blend_forward(). grad_features: dL/dfeatures (H, W, 16).
     grad_alpha: (HW,), dL/d(1 - transmittance); None: 0. spread_weight: adds this times sum_ij b_i

@@ -1,4 +1,4 @@
-"""The point cloud on the device: grid ids, offsets from these vertices, opacities, and SH
+"""The point cloud on the device: vertices of a grid, offsets from them, radii, opacities, and SH
 coefficients in arrays by degree.
 """
 

@@ -66,8 +66,8 @@ class Optimiser:
         opacities, (N,), and offsets, (N, 4), and by those of the network, which lie in
         model.net.gradients.
 
-        step: from 1. points: as projected into the rendered view. shaded: (S) uint32, the visible
-        ones. sh_eps: eps of RMSprop.
+        step: from 1. grad_offset: None where offsets stay. points: as projected into the rendered
+        view. shaded: (S) uint32, the visible ones. sh_eps: eps of RMSprop.
         """
         cloud, net, state = self.model.cloud, self.model.net, self.state
         rmsprop_update(
