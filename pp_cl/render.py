@@ -213,40 +213,33 @@ class Renderer:
             del pairs, weights  # else their arrays would stay beside the larger ones
 
     def backward(
-        self,
-        result: RenderResult,
-        grad_image: Array,
-        grad_alpha: Array | None = None,
-        spread_weight: float = 0.0,
-        with_offsets: bool = False,
+        self, result: RenderResult, grad_image: Array, **options: Any
     ) -> tuple[Array, Array, Array | None, Array]:
-        """(grad_shaded_features (S, 16) or longer, grad_opacity (N,), grad_offset (N, 4),
-        pixel_spread (H * W,)) from dL/dimage of result.image; with alpha compositing also from
-        dL/dalpha (H * W,), and of the spread of each pixel's hits with this weight in the loss
-        (cl/raster/blend.cl). with_offsets: without it, or unless soft points are composited by
-        alpha, grad_offset is None.
-
-        result: of the last forward(training=True). The gradients of the network's parameters are
-        left in model.net.gradients. Those of the SH coefficients are grad_shaded_features times the
-        basis functions in the view's direction; the optimiser multiplies them as it moves each
-        coefficient, and never stores them.
+        """What backward_features() returns, from dL/dimage of result.image. The gradients of the
+        network's parameters are left in model.net.gradients. options: of backward_features().
         """
         with self.dev.stage("network backward"):
             grad_features = self.model.net.backward(grad_image)
-        return self.backward_features(
-            result, grad_features, grad_alpha, spread_weight, with_offsets
-        )
+        return self.backward_features(result, grad_features, **options)
 
     def backward_features(
         self,
         result: RenderResult,
         grad_features: Array,
+        *,
         grad_alpha: Array | None = None,
         spread_weight: float = 0.0,
         with_offsets: bool = False,
     ) -> tuple[Array, Array, Array | None, Array]:
-        """What backward() does, from dL/dfeatures (H, W, 16) of result.features, without the
-        network.
+        """(grad_shaded_features (S, 16) or longer, grad_opacity (N,), grad_offset (N, 4),
+        pixel_spread (H * W,)) from dL/dfeatures (H, W, 16) of result.features; with alpha
+        compositing also from dL/dalpha (H * W,), and of the spread of each pixel's hits with this
+        weight in the loss (cl/raster/blend.cl). with_offsets: without it, or unless soft points are
+        composited by alpha, grad_offset is None.
+
+        result: of the last forward(training=True). The gradients of the SH coefficients are
+        grad_shaded_features times the basis functions in the view's direction; the optimiser
+        multiplies them as it moves each coefficient, and never stores them.
         """
         with self.dev.stage("backward"):
             grad_shaded_features, grad_opacity, pixel_spread = blend_backward(

@@ -145,7 +145,11 @@ class Trainer:
                 )
         spread_weight, all_depths = self._spread_weight(target)
         features, opacities, offsets, pixel_spread = self.renderer.backward(
-            rendered, grad_image, grad_alpha, spread_weight / all_depths, rates.offset > 0
+            rendered,
+            grad_image,
+            grad_alpha=grad_alpha,
+            spread_weight=spread_weight / all_depths,
+            with_offsets=rates.offset > 0,
         )
         if spread_weight > 0:
             self.loss.add("spread", pixel_spread, spread_weight, 1 / all_depths)

@@ -6,14 +6,15 @@ import numpy as np
 
 from pp_cl.reference.dense import sh_basis
 
+BETA2 = 0.999  # of both
+
 
 class Adam:
     """torch.optim.Adam without weight decay, for one array."""
 
-    def __init__(self, parameter: np.ndarray, beta1: float = 0.9, beta2: float = 0.999):
-        self.parameter = np.array(parameter, np.float64)
+    def __init__(self, parameter: np.ndarray, beta1: float = 0.9):
+        self.parameter, self.beta1 = np.array(parameter, np.float64), beta1
         self.m, self.v, self.t = np.zeros_like(self.parameter), np.zeros_like(self.parameter), 0
-        self.betas = beta1, beta2
 
     def step(
         self,
@@ -24,12 +25,11 @@ class Adam:
         bounds: tuple[float, float] = (-np.inf, np.inf),
     ) -> None:
         """One step. bounds: what the parameter stays between."""
-        beta1, beta2 = self.betas
         self.t += 1
         grad = np.asarray(grad, np.float64)
-        self.m += (1 - beta1) * (grad - self.m)
-        self.v += (1 - beta2) * (grad * grad - self.v)
-        c1, c2 = 1 - beta1**self.t, 1 - beta2**self.t
+        self.m += (1 - self.beta1) * (grad - self.m)
+        self.v += (1 - BETA2) * (grad * grad - self.v)
+        c1, c2 = 1 - self.beta1**self.t, 1 - BETA2**self.t
         moved = self.parameter - rate / c1 * self.m / (np.sqrt(self.v / c2) + eps)
         self.parameter = np.clip(moved, *bounds)
 
@@ -40,8 +40,8 @@ class RmsProp:
     sh: (N, count, 16) coefficients. basis: (N, count), their harmonics.
     """
 
-    def __init__(self, sh: np.ndarray, basis: np.ndarray, beta2: float = 0.999):
-        self.sh, self.basis, self.beta2 = np.array(sh, np.float64), basis, beta2
+    def __init__(self, sh: np.ndarray, basis: np.ndarray):
+        self.sh, self.basis = np.array(sh, np.float64), basis
         self.v, self.t = np.zeros((len(sh), 16)), 0
 
     def step(self, t: int, grad_features: np.ndarray, rates: np.ndarray, eps: float) -> None:
@@ -49,10 +49,10 @@ class RmsProp:
         gradients of 0. rates: of the basis functions.
         """
         grad = np.asarray(grad_features, np.float64)
-        self.v = self.beta2 ** (t - self.t) * self.v
-        self.v += (1 - self.beta2) * grad**2 / (4 * np.pi)
+        self.v = BETA2 ** (t - self.t) * self.v
+        self.v += (1 - BETA2) * grad**2 / (4 * np.pi)
         self.t = t
-        scaled = grad / (np.sqrt(self.v / (1 - self.beta2**t)) + eps)
+        scaled = grad / (np.sqrt(self.v / (1 - BETA2**t)) + eps)
         moves = np.asarray(rates)[: self.basis.shape[1]] * self.basis
         self.sh -= moves[:, :, None] * scaled[:, None, :]
 

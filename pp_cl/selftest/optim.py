@@ -4,8 +4,10 @@ smoothing, the opacities of split points.
 
 from collections.abc import Iterator, Sequence
 from functools import partial
+from typing import Any
 
 import numpy as np
+from pyopencl.array import Array
 
 from pp_cl.device.device import Device
 from pp_cl.raster.points import SH_DEGREES, sh_blocks
@@ -100,20 +102,24 @@ def _adam(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
     for n in SIZES:
         grads = 1e-3 * rng.standard_normal((20, n))
         for eps in (1e-8, 1e-15):
-            twin, parameter, state = _adam_steps(
+            twin, parameter, state = adam_steps(
                 dev, rng.standard_normal(n), grads, rate=0.01, eps=eps
             )
             # the parameter is rounded in each step, by half EPS of its size; rarely the same way
             yield relative(parameter, twin.parameter, 3e-7)
             yield each(state["m"].get(), twin.m, 8 * EPS, floor=1e-3)
             yield each(state["v"].get(), twin.v, 8 * EPS)
-    _, parameter, _ = _adam_steps(dev, np.zeros(257), np.full((1, 257), -3e-4), rate=0.5, eps=1e-15)
+    _, parameter, _ = adam_steps(dev, np.zeros(257), np.full((1, 257), -3e-4), rate=0.5, eps=1e-15)
     # what 1 - beta2 in float32 would miss by 7e-6
     yield each(parameter, np.full(257, 0.5), 4e-7)
 
 
-def _adam_steps(dev, start, grads, **options):
-    """(float64 twin, parameter, moments) after a step with each gradient."""
+def adam_steps(
+    dev: Device, start: np.ndarray, grads: np.ndarray, **options: Any
+) -> tuple[optim.Adam, np.ndarray, dict[str, Array]]:
+    """(float64 twin, parameter, moments) after a step with each gradient. options: of
+    adam_update().
+    """
     parameter = dev.upload(start, np.float32)
     twin, state = optim.Adam(parameter.get()), {kind: dev.zeros(parameter.shape) for kind in "mv"}
     for step, grad in enumerate(grads.astype(np.float32), 1):
@@ -127,11 +133,11 @@ def _adam_extremes(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
     for scale in (1e-20, 1e-12, 1e-3, 1e10):
         for eps in (1e-8, 1e-15):
             grads = scale * rng.standard_normal((10, 31))
-            twin, parameter, _ = _adam_steps(dev, np.zeros(31), grads, rate=0.1, eps=eps)
+            twin, parameter, _ = adam_steps(dev, np.zeros(31), grads, rate=0.1, eps=eps)
             # m / (sqrt(v) + eps): a few roundings, each step
             yield relative(parameter, twin.parameter, 1e-5)
     start = rng.standard_normal(33).astype(np.float32)
-    _, parameter, state = _adam_steps(dev, start, np.zeros((3, 33)), rate=0.5, eps=1e-15)
+    _, parameter, state = adam_steps(dev, start, np.zeros((3, 33)), rate=0.5, eps=1e-15)
     yield exact(parameter, start)
     yield exact(state["v"].get(), np.zeros(33))
 
@@ -179,7 +185,7 @@ def _bounded(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
     for bounds in ((0.0, 1.0), (-0.5, 0.5)):
         grads = 1e4 * (rng.standard_normal((20, 257)) + np.linspace(-2, 2, 257))
         options = {"rate": 0.03, "eps": 1e-15, "bounds": bounds}
-        twin, moved, _ = _adam_steps(dev, rng.uniform(*bounds, 257), grads, **options)
+        twin, moved, _ = adam_steps(dev, rng.uniform(*bounds, 257), grads, **options)
         yield finite(moved)
         yield exact([moved.min(), moved.max()], bounds)
         yield absolute(moved, twin.parameter, 2e-6)  # twenty moves of 0.03

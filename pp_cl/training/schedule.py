@@ -14,6 +14,7 @@ from pp_cl.settings import NetworkConfig, RasterConfig, TrainConfig
 EMA_UPDATES = 200  # times the averages would be updated in all steps; the last 15 % do
 BOX_MARGIN = 8  # pixels around the object from which crops are drawn
 CROP_LOSS = 0.25  # of the crop's side for every halving of the images
+DELAYED = 0.01  # of a learning rate, at the first step of its warm-up
 END_SHARE = 0.25  # of the crops that show one end of the object, at least
 
 
@@ -72,25 +73,17 @@ def bound_to_end(network: NetworkConfig, raster: RasterConfig, train: TrainConfi
 
 
 def learning_rate(
-    step: int,
-    steps: int,
-    first: float,
-    last: float,
-    *,
-    delay_steps: int = 0,
-    delay_factor: float = 0.01,
+    step: int, steps: int, first: float, last: float, *, delay_steps: int = 0
 ) -> float:
     """Exponential decay from `first` to `last` with a warm-up (mip-NeRF's learning_rate_decay).
 
-    The warm-up multiplies by `delay_factor` at step 0 and rises to 1 at `delay_steps` as a quarter
-    sine; delay_steps 0: none.
+    The warm-up multiplies by DELAYED at step 0 and rises to 1 at `delay_steps` as a quarter sine;
+    delay_steps 0: none.
     """
     rate = first * (last / first) ** min(step / steps, 1)
     if delay_steps == 0:
         return rate
-    return rate * (
-        delay_factor + (1 - delay_factor) * math.sin(math.pi / 2 * min(step / delay_steps, 1))
-    )
+    return rate * (DELAYED + (1 - DELAYED) * math.sin(math.pi / 2 * min(step / delay_steps, 1)))
 
 
 def prunings(train: TrainConfig, start: int, end: int) -> int:
@@ -122,7 +115,7 @@ def refine_steps(train: TrainConfig) -> list[int]:
     return found
 
 
-def gamma_at(step: int, steps: int, first: float = 0.1, last: float = 0.01) -> float:
+def gamma_at(step: int, steps: int, first: float, last: float) -> float:
     """Depth sharpness gamma of the softmax, exponential from `first` to `last` (PlenopticPoints
     supplemental).
     """
