@@ -29,6 +29,7 @@ DIVERGENCES = {
         "test/r_0.png holds NaN after step 15",
     ),
     "checkpoint": (20, "moment", {"train__previews": 0}, "holds NaN or Inf"),
+    "offsets": (15, "offset", {"train__previews": 0}, "points.offset holds NaN or Inf"),
     "pruning": (20, "opacity", {"train__previews": 0, "train__prune_looks": 10**6}, "an opacity"),
 }
 
@@ -62,6 +63,7 @@ def _poison(monkeypatch, after, what):
             cloud = self.model.cloud
             arrays = {
                 "points": cloud.sh[0],
+                "offset": cloud.offset,
                 "opacity": cloud.opacity,
                 "moment": self.moments["m"],
             }

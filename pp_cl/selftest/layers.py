@@ -216,7 +216,7 @@ def _gate(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
     """Sizes; features and gates from 1e-12 to 60, where expm1 would cancel and exp overflow."""
     for h, w, c in PLANES:
         x, grad_out = 3 * _normal(rng, h, w, 2 * c), _normal(rng, h, w, c)
-        out, grad_x = _gated(dev, x, grad_out)
+        out, grad_x = gated(dev, x, grad_out)
         exact_x, exact_grad = x.astype(np.float64), grad_out.astype(np.float64)
         yield relative(out, network.gate(exact_x), GATED)
         yield relative(grad_x, network.gate_backward(exact_x, exact_grad), GATED)
@@ -224,14 +224,15 @@ def _gate(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
     values = [*-powers, 0, *powers, -40, 40, -60, 60]
     x = np.stack(np.meshgrid(values, values), -1).reshape(1, -1, 2).astype(np.float32)
     ones = np.ones((1, x.shape[1], 1), np.float32)
-    out, grad_x = _gated(dev, x, ones)
+    out, grad_x = gated(dev, x, ones)
     x = x.astype(np.float64)
     # OpenCL allows exp and expm1 three units each; what float32 holds as a subnormal may be 0
     yield each(out, network.gate(x), 3e-6, floor=1e-32)
     yield each(grad_x, network.gate_backward(x, ones.astype(np.float64)), 3e-6, floor=1e-32)
 
 
-def _gated(dev, x, grad_out):
+def gated(dev: Device, x: np.ndarray, grad_out: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """(output, gradient of x) of a gate, from the device; x, grad_out: float32."""
     out, grad_x, device_x = dev.empty(grad_out.shape), dev.empty(x.shape), dev.upload(x)
     gate_forward(dev, device_x, out)
     gate_backward(dev, device_x, dev.upload(grad_out), grad_x)

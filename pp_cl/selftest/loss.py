@@ -21,12 +21,12 @@ DEEP = 1e-5  # thirteen convolutions one after another, each within 3e-6
 def _loss(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
     """L1 and SSIM; at sizes below a window L1 alone."""
     for size in ((11, 11), (12, 33), (33, 31), (40, 257), (1, 1), (1, 257), (10, 40)):
-        prediction, target = _images(rng, *size)
+        prediction, target = images(rng, *size)
         for weight, beta in ((0.2, 0.0), (1.0, 0.0), (0.1, 0.05)):
             yield from _loss_checks(dev, prediction, target, (weight, beta), LOSS)
 
 
-def _images(rng, height, width):
+def images(rng: np.random.Generator, height: int, width: int) -> tuple[np.ndarray, np.ndarray]:
     """A smooth target with texture, and a prediction that leaves [0, 1]."""
     y, x = np.mgrid[:height, :width][..., None] / 9.0
     noise = rng.standard_normal((2, height, width, 3))
@@ -93,7 +93,7 @@ def _mask_loss(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
 
 def _sum_of_terms(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
     """The loss is that of the image and the weighted sums of all that is added."""
-    prediction, target = _images(rng, 12, 33)
+    prediction, target = images(rng, 12, 33)
     for n in SIZES:
         loss, expected = Loss(dev, 0.2), np.zeros(8)
         expected[:4], _ = reference_loss.loss(prediction, target, 0.2)

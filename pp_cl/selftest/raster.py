@@ -12,7 +12,7 @@ from pp_cl.device.buffers import Buffers
 from pp_cl.device.device import Device
 from pp_cl.raster.blend import shade_forward
 from pp_cl.raster.depth import depth_forward
-from pp_cl.raster.points import SH_BLOCKS
+from pp_cl.raster.points import SH_DEGREES, sh_blocks
 from pp_cl.raster.project import FOOTPRINTS, project_grid
 from pp_cl.raster.weights import BLENDS, DROPPED, record_weights
 from pp_cl.reference import dense
@@ -153,17 +153,16 @@ def _equal_depths(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
 
 
 def _shade(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
-    """Harmonics of all degrees, stored in 32 and in 16 bits; no row is written for points that are
-    not listed.
+    """Harmonics of all degrees; those of 16 bits give what the same numbers in 32 bits give. No row
+    is written for points that are not listed.
     """
     camera = make_camera()
-    for n in SIZES:
+    for n, degree in product(SIZES, SH_DEGREES):
         positions = make_points(rng, n)
         scene = PairedPoints(dev, camera, positions, 0.1)
-        seen = scene.seen[::2]
-        for degree, dtype in product(range(3), (np.float32, np.float16)):
-            blocks = [block for block in SH_BLOCKS if block.degree <= degree]
-            sh = [rng.normal(size=(n, block.count, 16)).astype(dtype) for block in blocks]
+        seen, sh = scene.seen[::2], [rng.normal(size=(n, b.count, 16)) for b in sh_blocks(degree)]
+
+        def shaded(sh, scene=scene, seen=seen):
             features = dev.upload(np.full((len(seen) + 3, 16), 7.0), np.float32)
             shade_forward(
                 dev,
@@ -172,11 +171,16 @@ def _shade(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
                 [dev.upload(block) for block in sh],
                 shaded_features=features,
             )
-            stored = np.concatenate(sh, axis=1).astype(np.float64)
-            expected = dense.shade(positions, camera.eye, stored)
-            # nine products of a direction's squares: 5 roundings each, of values of up to 4
-            yield relative(features.get()[:-3], expected[seen], 1e-5)
-            yield exact(features.get()[-3:], np.full((3, 16), 7))
+            return features.get()
+
+        features = shaded([block.astype(np.float32) for block in sh])
+        expected = dense.shade(positions, camera.eye, np.concatenate(sh, axis=1))
+        # nine products of a direction's squares: 5 roundings each, of values of up to 4
+        yield relative(features[:-3], expected[seen], 1e-5)
+        yield exact(features[-3:], np.full((3, 16), 7))
+        sh[0][:, 0, :4] = 0, -6e-8, 65504, 1e-5  # denormal halves and the largest
+        half = [block.astype(np.float16) for block in sh]
+        yield exact(shaded(half), shaded([block.astype(np.float32) for block in half]))
 
 
 def _depth(rule: str, dev: Device, rng: np.random.Generator) -> Iterator[Check]:

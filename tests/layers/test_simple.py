@@ -16,25 +16,17 @@ from pp_cl.layers.simple import (
 )
 from pp_cl.network.unet import UNet
 from pp_cl.reference import network
+from pp_cl.selftest.layers import gated
 
 pytestmark = pytest.mark.kernels  # of gate.cl, output.cl and resample.cl
-
-
-def run(dev, x, grad_out):
-    """(output, gradient of x) from the device, as float32."""
-    out, grad_x = dev.empty(grad_out.shape), dev.empty(x.shape)
-    device_x = dev.upload(x, np.float32)
-    gate_forward(dev, device_x, out)
-    gate_backward(dev, device_x, dev.upload(grad_out, np.float32), grad_x)
-    return out.get(), grad_x.get()
 
 
 @pytest.mark.exact
 def test_huge_values_saturate(dev):
     values = [-3e38, -1e4, -80, 0, 80, 1e4, 3e38]
     x = np.stack(np.meshgrid(values, values), -1).reshape(1, -1, 2).astype(np.float32)
-    ones = np.ones((1, x.shape[1], 1))
-    out, grad_x = run(dev, x, ones)
+    ones = np.ones((1, x.shape[1], 1), np.float32)
+    out, grad_x = gated(dev, x, ones)
     assert np.isfinite(out).all() and np.isfinite(grad_x).all()
     wide = x.astype(np.float64)
     np.testing.assert_allclose(out, network.gate(wide), rtol=1e-6, atol=1e-30)
@@ -50,7 +42,7 @@ def test_huge_values_saturate(dev):
 def test_nan_comes_through(dev, place):
     x = np.ones((1, 3, 2), np.float32)
     x[0, 1, place] = np.nan
-    out, grad_x = run(dev, x, np.ones((1, 3, 1)))
+    out, grad_x = gated(dev, x, np.ones((1, 3, 1), np.float32))
     np.testing.assert_array_equal(np.isnan(out[0, :, 0]), [False, True, False])
     assert np.isnan(grad_x[0, 1]).any() and np.isfinite(grad_x[0, ::2]).all()
 

@@ -1,13 +1,11 @@
 """Both blends: gradients against finite differences of the float64 twins with which the selftest
-compares them, weights by hand, the bits; coefficients of 16 bits and the basis of the shading.
+compares them, weights by hand, the bits; the basis of the shading.
 """
 
 import numpy as np
 import pytest
 from support.comparisons import relative_error
 
-from pp_cl.raster.blend import shade_forward
-from pp_cl.raster.points import SH_BLOCKS
 from pp_cl.raster.weights import BLENDS
 from pp_cl.reference import dense as oracle
 from pp_cl.reference.differences import numeric_gradient
@@ -16,8 +14,6 @@ from pp_cl.selftest.points import (
     Blended,
     PairedPoints,
     blend_on_axis,
-    make_camera,
-    make_points,
 )
 
 UNTRACKED = 1  # cl/raster/pair_role.h
@@ -116,33 +112,6 @@ def test_a_point_at_the_eye(dev):
     """It has no direction, and is left out even where near = 0 would let it in."""
     scene = PairedPoints(dev, AXIS, np.zeros((1, 3)), 0.0, depth_range=(0.0, 6.0))
     assert scene.pairs.total == 0
-
-
-def shade(dev, sh):
-    """(S, 16) features of those of N random points that are in view, by coefficients."""
-    n, camera = len(sh[0]), make_camera()
-    positions = make_points(np.random.default_rng(1), n)
-    scene = PairedPoints(dev, camera, positions, 0.1)
-    seen = scene.seen
-    features = dev.empty((len(seen), 16))
-    sh = [dev.upload(c, c.dtype) for c in sh]
-    shade_forward(dev, scene.projected, dev.upload(seen, np.uint32), sh, shaded_features=features)
-    return features.get()
-
-
-def coefficients(rng, n):
-    """Random ones of all degrees."""
-    return [np.float32(rng.normal(size=(n, b.count, 16))) for b in SH_BLOCKS]
-
-
-@pytest.mark.parametrize("degree", [0, 1, 2])
-def test_coefficients_of_16_bits(dev, rng, degree):
-    """The same features as from their float32 values, to the last bits."""
-    sh = [c for c, b in zip(coefficients(rng, 257), SH_BLOCKS, strict=True) if b.degree <= degree]
-    sh[0][:3, 0, :4] = [0, -6e-8, 65504, 1e-5]  # denormal halves and the largest
-    half = [np.float16(c) for c in sh]
-    found = [shade(dev, stored) for stored in (half, [np.float32(c) for c in half])]
-    assert np.array_equal(*found) and np.isfinite(found[0]).all() and len(found[0])
 
 
 def test_the_basis_is_orthonormal(rng):

@@ -9,10 +9,8 @@ from pp_cl.device.buffers import Buffers
 from pp_cl.raster import project
 from pp_cl.raster.project import FOOTPRINTS
 from pp_cl.reference import dense as oracle
-from pp_cl.scene.grid import Grid
 from pp_cl.selftest.points import PairedPoints, make_camera, make_points
-
-GRID = Grid((-1.1, -0.9, -0.7), 0.05, (45, 37, 29))
+from pp_cl.selftest.raster import GRID
 
 
 def seen_vertices(dev, camera, ids, **options):

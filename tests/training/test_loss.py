@@ -15,19 +15,8 @@ from pp_cl.cli import main
 from pp_cl.errors import Diverged
 from pp_cl.reference import loss as oracle_loss
 from pp_cl.reference.differences import numeric_gradient
+from pp_cl.selftest.loss import images
 from pp_cl.training.loss import Loss
-
-
-def images(rng, height, width, noise=0.1):
-    """A smooth target with texture, and a prediction that leaves [0, 1]."""
-    y, x = np.mgrid[:height, :width][..., None] / 9.0
-    target = (
-        0.5
-        + 0.4 * np.sin(x + y + np.arange(3)) * np.cos(2 * y)
-        + 0.05 * rng.standard_normal((height, width, 3))
-    )
-    prediction = target + noise * rng.standard_normal(target.shape)
-    return prediction.astype(np.float32), target.astype(np.float32)
 
 
 def run(dev, prediction, target, weight, beta=0.0, **offset):
