@@ -7,9 +7,6 @@
 #include "reduce.h"
 
 // as in raster/blend.cl
-#ifndef HAS_ROLES
-#define HAS_ROLES 1
-#endif
 #ifndef HAS_PAIR_GAIN
 #define HAS_PAIR_GAIN 1
 #endif

@@ -6,19 +6,7 @@
 // The background gets the transmittance T behind all hits. An opaque hit lets LEAST_THROUGH pass,
 // so that what lies behind it is known when gradients are computed.
 #include "common.h"
-#include "raster/pair_role.h"
-
-#ifndef DROPS
-#define DROPS 1  // hits may be dropped; their roles are DROPPED before alpha_weights
-#endif
-#ifndef BY_PAIR
-#define BY_PAIR 1  // 0: no weights by pair, which only gradients and pruning need
-#endif
-#ifndef MAX_TRACKED
-#define MAX_TRACKED 0  // nearest hits of a pixel that get gradients; 0: all
-#endif
-#define HAS_ROLES                                                                                  \
-    (DROPS || MAX_TRACKED)  // else every pair is TRACKED, and pair_role is not touched
+#include "raster/drops.h"
 
 #define LEAST_THROUGH 0x1p-24f  // of 1 - alpha, far below what an image shows
 
@@ -36,7 +24,7 @@ kernel void alpha_weights(
     global const uint2 *pair_point_closeness,  // (P, 2) point, bits of d
     global const float *opacity,               // (N)
     global float2 *pair_weight,                // (?, 2) P with BY_PAIR, not written where dropped
-    global uchar *pair_role,                   // (?) P with both, not written where dropped
+    global uchar *pair_role,                   // (?) P with both; with DROPS all DROPPED before
     global ulong *pixel_entry,                 // (P) weight << 32 | point, in the order of the keys
     global float *transmittance,               // (HW) of all hits that are not dropped
     global uchar *point_is_shaded)             // (N) 1: has a hit that is not dropped

@@ -23,9 +23,6 @@
 #include "raster/pair_role.h"
 #include "reduce.h"
 
-#ifndef HAS_ROLES
-#define HAS_ROLES 1  // 0: every pair is tracked, and pair_role is not read
-#endif
 #ifndef HAS_PAIR_GAIN
 #define HAS_PAIR_GAIN 1  // 0: the gains of a softmax follow from pixel_rest
 #endif

@@ -12,10 +12,6 @@
 #include "raster/footprint.h"
 #include "raster/pair_role.h"
 
-#ifndef HAS_ROLES
-#define HAS_ROLES 1  // 0: every pair is tracked, and pair_role is not read
-#endif
-
 #define LEAST_RHO 1e-3f  // of h: nearer to its ray a point has no direction away from it
 
 // One work-item per visible point: reads its pairs, writes the gradient of its offset and of the

@@ -6,4 +6,8 @@
 #define UNTRACKED 1  // contributes to the image only
 #define DROPPED 2    // contributes to nothing
 
+#ifndef HAS_ROLES
+#define HAS_ROLES 1  // 0: every pair is tracked, and pair_role is neither read nor written
+#endif
+
 #endif

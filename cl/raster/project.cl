@@ -157,8 +157,8 @@ ALWAYS_INLINE uints divide(uints *id, const uint n) {
     return low + more;
 }
 
-// One work-item per LANES points: reads their grid indices and offsets, writes their numbers of hits
-// and, if any is above 0, their radii, camera-space positions and distances, and boxes.
+// One work-item per LANES points: reads their grid indices and offsets, writes their numbers of
+// hits and, if any is above 0, their radii, camera-space positions and distances, and boxes.
 kernel __attribute__((vec_type_hint(floats))) void project_grid(
     const uint n,                       // points
     const uint dropout,                 // a point is left out where its random uint is below this

@@ -13,19 +13,7 @@
 #include "common.h"
 #include "camera.h"
 #include "lanes.h"
-#include "raster/pair_role.h"
-
-#ifndef DROPS
-#define DROPS 1  // early_stop may be above 0
-#endif
-#ifndef BY_PAIR
-#define BY_PAIR 1  // 0: no weights by pair, which only gradients and pruning need
-#endif
-#ifndef MAX_TRACKED
-#define MAX_TRACKED 0  // nearest hits of a pixel that get gradients; 0: all
-#endif
-#define HAS_ROLES                                                                                  \
-    (DROPS || MAX_TRACKED)  // else every pair is TRACKED, and pair_role is not touched
+#include "raster/drops.h"
 
 #define EPS 1e-6f  // depth of the background, as a z (Pulsar's background_normalized_depth)
 

@@ -3,10 +3,6 @@
 #include "common.h"
 #include "raster/pair_role.h"
 
-#ifndef HAS_ROLES
-#define HAS_ROLES 1  // 0: every pair is tracked, and pair_role is not read
-#endif
-
 // One work-item per point with a pair: sums the weights of its pairs, keeps the sum if it is the
 // highest so far, and counts the view if the sum is at least `least`.
 kernel void record_weights(

@@ -3,7 +3,6 @@
 import numpy as np
 import pytest
 import trimesh
-from support.guarded import AWKWARD_SIZES
 
 from pp_cl.errors import UserError
 from pp_cl.metrics.shape import (
@@ -15,6 +14,7 @@ from pp_cl.metrics.shape import (
     sample_surface,
 )
 from pp_cl.scene.grid import Grid
+from pp_cl.selftest.case import SIZES
 
 SQUARE = Mesh(
     np.array([[0.0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]]), np.array([[0, 1, 2], [0, 2, 3]])
@@ -42,7 +42,7 @@ def oracle(mesh, grid, samples):
     return (weights[:, :, None] * chosen).sum(1)
 
 
-@pytest.mark.parametrize("samples", [*AWKWARD_SIZES, RUN, RUN + 1, 3000])
+@pytest.mark.parametrize("samples", [*SIZES, RUN, RUN + 1, 3000])
 def test_every_sample_marks_its_nearest_vertex(dev, rng, samples):
     mesh = Mesh(rng.normal(size=(30, 3)), rng.integers(0, 30, (17, 3)))
     mesh = Mesh(mesh.vertices, mesh.faces[[len(set(f)) == 3 for f in mesh.faces]])

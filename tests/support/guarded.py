@@ -14,7 +14,6 @@ DATA = Path(
     os.environ.get("PP_DATA") or Path(__file__).parents[2] / ".." / "shared" / "data"
 ).resolve()
 
-AWKWARD_SIZES = (1, 31, 33, 257)  # below, at and beside every vector width and work-group size
 CANARY_BYTES = 256
 CANARY = 0xA5
 MOST_UNCHECKED = 2**28  # bytes of buffers that are gone and wait for a check

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 from skimage.metrics import structural_similarity
 from support.comparisons import relative_error
-from support.guarded import AWKWARD_SIZES
 from support.runs import arguments
 from support.scenes import write_ball_scene
 
@@ -15,6 +14,7 @@ from pp_cl.cli import main
 from pp_cl.errors import Diverged
 from pp_cl.reference import loss as oracle_loss
 from pp_cl.reference.differences import numeric_gradient
+from pp_cl.selftest.case import SIZES
 from pp_cl.selftest.loss import images
 from pp_cl.training.loss import Loss
 
@@ -110,7 +110,7 @@ def float32_sum(terms, group):
     return sums[0]
 
 
-@pytest.mark.parametrize("m", [*AWKWARD_SIZES, 1590])
+@pytest.mark.parametrize("m", [*SIZES, 1590])
 @pytest.mark.parametrize("group", [1, 2, 256])
 def test_terms_are_summed_in_a_fixed_order(dev, rng, m, group):
     terms = rng.uniform(0, 1, (3, m, 4)).astype(np.float32)
