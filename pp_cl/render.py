@@ -231,11 +231,11 @@ class Renderer:
         spread_weight: float = 0.0,
         with_offsets: bool = False,
     ) -> tuple[Array, Array, Array | None, Array]:
-        """(grad_shaded_features (S, 16) or longer, grad_opacity (N,), grad_offset (N, 4),
-        pixel_spread (H * W,)) from dL/dfeatures (H, W, 16) of result.features; with alpha
-        compositing also from dL/dalpha (H * W,), and of the spread of each pixel's hits with this
-        weight in the loss (cl/raster/blend.cl). with_offsets: without it, or unless soft points are
-        composited by alpha, grad_offset is None.
+        """(grad_shaded_features (S, 16), grad_opacity (S,), grad_offset (S, 4), each or longer, of
+        the visible points; pixel_spread (H * W,)) from dL/dfeatures (H, W, 16) of result.features;
+        with alpha compositing also from dL/dalpha (H * W,), and of the spread of each pixel's hits
+        with this weight in the loss (cl/raster/blend.cl). with_offsets: without it, or unless soft
+        points are composited by alpha, grad_offset is None.
 
         result: of the last forward(training=True). The gradients of the SH coefficients are
         grad_shaded_features times the basis functions in the view's direction; the optimiser

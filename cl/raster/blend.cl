@@ -137,7 +137,7 @@ kernel __attribute__((vec_type_hint(floats))) void blend_backward(
     global const float *pixel_rest,         // (?) HW without
     global const float16 *grad_features,    // (H, W, 16) G
     global float16 *grad_shaded_features,   // (?, 16) a row for each
-    global float *grad_opacity)             // (N) of the visible
+    global float *grad_opacity)             // (?) alike
 {
     const uint g = get_global_id(0) / ROW_PARTS;
     if (g >= s) return;
@@ -158,5 +158,5 @@ kernel __attribute__((vec_type_hint(floats))) void blend_backward(
     }
     const float scale = MEAN && tracked ? 1.0f / tracked : 1.0f;
     store_part(scale * dL_df, grad_shaded_features, g);
-    if (ROW_PART == 0) grad_opacity[i] = scale * dL_do;
+    if (ROW_PART == 0) grad_opacity[g] = scale * dL_do;
 }

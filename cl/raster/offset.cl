@@ -30,7 +30,7 @@ kernel void offset_backward(
     global const float2 *pair_weight,          // (P, 2) b, T d
     global const uchar *pair_role,             // (?) P with HAS_ROLES
     global const float *pair_gain,             // (P)
-    global float4 *grad_offset)                // (N, 4) of the visible
+    global float4 *grad_offset)                // (?, 4) a row for each of them
 {
     const uint g = get_global_id(0);
     if (g >= s) return;
@@ -57,5 +57,5 @@ kernel void offset_backward(
         dL_dc += dL_dd * (growth * (1.0f - d) * c - per_rho_h * e);
     }
     const float3 world = edge * (dL_dc.x * cam.right + dL_dc.y * cam.down + dL_dc.z * cam.forward);
-    grad_offset[i] = (float4)(world, growth > 0.0f ? 0.0f : dL_dlog);
+    grad_offset[g] = (float4)(world, growth > 0.0f ? 0.0f : dL_dlog);
 }

@@ -11,16 +11,6 @@
 #define DECAY2 0.001f
 #endif
 
-#ifndef BOUNDED
-#define BOUNDED 0  // 1: the parameter stays in [LEAST, MOST]
-#endif
-#ifndef LEAST
-#define LEAST 0.0f
-#endif
-#ifndef MOST
-#define MOST 1.0f
-#endif
-
 // One work-item per LANES values: moves a parameter and its two moments one step.
 kernel void adam_update(
     const uint n,              // values
@@ -40,9 +30,7 @@ kernel void adam_update(
     v_new += DECAY2 * (g * g - v_new);
     store_lanes(m_new, m + i, count);
     store_lanes(v_new, v + i, count);
-    floats moved = load_lanes(parameter + i, count) - rate * m_new / (sqrt(v_new) + eps);
-    if (BOUNDED)  // clamp() would hide a NaN
-        moved = moved < LEAST ? (floats)(LEAST) : moved > MOST ? (floats)(MOST) : moved;
+    const floats moved = load_lanes(parameter + i, count) - rate * m_new / (sqrt(v_new) + eps);
     store_lanes(moved, parameter + i, count);
 }
 

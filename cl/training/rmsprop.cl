@@ -1,13 +1,14 @@
-// The optimiser of the SH coefficients: RMSprop (Tieleman & Hinton 2012), that is Adam without a
-// first moment (beta1 = 0), with Adam's bias correction folded into rate and eps on the host.
+// The optimiser of the points: RMSprop (Tieleman & Hinton 2012), that is Adam without a first moment
+// (beta1 = 0), with Adam's bias correction folded into rates and eps on the host.
 //
-// The gradient of coefficient k is Y_k(direction) G, G being that of the point's features, and is
-// never stored. The squares of the harmonics of a degree add up to the same in all directions
+// The gradient of coefficient k of the SH is Y_k(direction) G, G being that of the point's features,
+// and is never stored. The squares of the harmonics of a degree add up to the same in all directions
 // (Unsoeld 1927), so all coefficients of a feature share one second moment v, an average of
 // G^2 / (4 pi), which is the mean of Y_k^2 G^2 over the directions. They move by
-// rate Y_k G / (sqrt(v) + eps).
+// rate Y_k G / (sqrt(v) + eps); offset and opacity, each with a second moment of its own, alike.
 //
-// A point without a gradient stays where it is; the decay of its v waits until it has one.
+// A point without a gradient stays where it is; the decay of its second moments waits until it has
+// one.
 #include "common.h"
 #include "lanes.h"
 #include "sh.h"
@@ -21,6 +22,12 @@
 #ifndef LOG_BETA2
 #define LOG_BETA2 -0.00144342f  // log2(beta2)
 #endif
+#ifndef MOVES_OFFSET
+#define MOVES_OFFSET 1  // 0: there is no gradient of the offsets
+#endif
+#ifndef MOST_OFFSET
+#define MOST_OFFSET 0.5f
+#endif
 #define MEAN_SQUARE 0.07957747f  // 1 / (4 pi), of each harmonic over all directions
 
 // Moves `count` coefficients of point i, from basis function `first` on.
@@ -32,21 +39,34 @@
         }                                                                                          \
     }
 
-// One work-item per part of a shaded point: takes its gradient into v, moves its coefficients; the
-// first one writes the step of the gradient.
+// A value in [least, most]; clamp() would hide a NaN.
+#define BOUNDED(value, least, most)                                                                \
+    ((value) < (least) ? (least) : (value) > (most) ? (most) : (value))
+
+// One work-item per part of a visible point: takes its gradients into the second moments, moves its
+// coefficients; the first one moves offset and opacity, and writes the step of the gradient.
 kernel void rmsprop_move(
-    const uint s,        // shaded points
+    const uint s,        // visible points
     const uint step,     // from 1
-    const float eps,     // eps * sqrt(1 - beta2^step)
+    const float eps,     // of the coefficients: eps * sqrt(1 - beta2^step)
     const float rate_0,  // learning rate * sqrt(1 - beta2^step), by degree
     const float rate_1,
     const float rate_2,
+    const float point_eps,  // of offset and opacity, as the next two
+    const float rate_offset,
+    const float rate_opacity,
     global const uint *shaded,                   // (S) their indices
     global const float *camera,                  // (20) camera.h
     global const float4 *point_camera,           // (N, 4) x, y, z, distance
-    global const float16 *grad_shaded_features,  // (?, 16) G, a row for each shaded point
+    global const float16 *grad_shaded_features,  // (?, 16) G, a row for each visible point
+    global const float4 *grad_offset,            // (?, 4) alike, unread without MOVES_OFFSET
+    global const float *grad_opacity,            // (?) alike
     global uint *last_step,                      // (N) of each point's last gradient, 0: none
     global float16 *v,                           // (N, 16)
+    global float4 *v_offset,                     // (N, 4)
+    global float *v_opacity,                     // (N)
+    global float4 *offset,                       // (N, 4)
+    global float *opacity,                       // (N)
     global float16 *sh_0,                        // (N, 1, 16)
     global float16 *sh_1,                        // (?, ?, 16) (N, 3, 16), untouched at degree 0
     global float16 *sh_2a,                       // (?, ?, 16) (N, 3, 16), untouched below degree 2
@@ -58,12 +78,26 @@ kernel void rmsprop_move(
 #if ROW_PARTS > 1
     barrier(CLK_GLOBAL_MEM_FENCE);  // all parts of a point have read it
 #endif
+    const float4 o = MOVES_OFFSET ? grad_offset[g] : (float4)(0.0f);
+    const float a = grad_opacity[g];
     // a NaN is a gradient
-    if (row >= s || !any(grad_shaded_features[g] != 0.0f)) return;
-    if (ROW_PART == 0) last_step[i] = step;
+    if (row >= s || !(any(grad_shaded_features[g] != 0.0f) || any(o != 0.0f) || a != 0.0f)) return;
+    const float decay = exp2((step - last) * LOG_BETA2);
+    if (ROW_PART == 0) {
+        last_step[i] = step;
+        const float w = decay * v_opacity[i] + DECAY2 * a * a;
+        v_opacity[i] = w;
+        const float moved = opacity[i] - rate_opacity * a / (sqrt(w) + point_eps);
+        opacity[i] = BOUNDED(moved, 0.0f, 1.0f);
+        if (MOVES_OFFSET) {
+            const float4 u = decay * v_offset[i] + DECAY2 * o * o, most = MOST_OFFSET;
+            v_offset[i] = u;
+            const float4 shifted = offset[i] - rate_offset * o / (sqrt(u) + point_eps);
+            offset[i] = BOUNDED(shifted, -most, most);
+        }
+    }
     const floats G = load_part(grad_shaded_features, g);
-    const floats moment =
-        exp2((step - last) * LOG_BETA2) * load_part(v, i) + DECAY2 * MEAN_SQUARE * (G * G);
+    const floats moment = decay * load_part(v, i) + DECAY2 * MEAN_SQUARE * (G * G);
     store_part(moment, v, i);
     const floats scaled = G / (sqrt(moment) + eps);
     float basis[9];

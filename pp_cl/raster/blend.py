@@ -63,17 +63,17 @@ def blend_forward(
     )
 
 
-def blend_backward_table(n: int, shaded: int, pixels: int, pairs: int, blend: str) -> Table:
-    """The buffers of the backward pass for n points, a number of pixels, and room for numbers of
-    visible points and of pairs. blend: one of BLENDS.
+def blend_backward_table(shaded: int, pixels: int, pairs: int, blend: str) -> Table:
+    """The buffers of the backward pass for a number of pixels, and room for numbers of visible
+    points and of pairs. blend: one of BLENDS.
     """
     return {
         "pair_gain": ((pairs if blend == "alpha" else 1,), np.float32),
         "pixel_rest": ((pixels if blend == "softmax" else 1,), np.float32),
         "pixel_spread": ((pixels if blend == "alpha" else 1,), np.float32),
         "grad_shaded_features": ((shaded, 16), np.float32),
-        "grad_opacity": ((n,), np.float32),
-        "grad_offset": ((n if blend == "alpha" else 1, 4), np.float32),
+        "grad_opacity": ((shaded,), np.float32),
+        "grad_offset": ((shaded if blend == "alpha" else 1, 4), np.float32),
     }
 
 
@@ -90,11 +90,11 @@ def blend_backward(
     spread_weight: float = 0.0,
     mean: bool = False,
 ) -> tuple[Array, Array, Array]:
-    """(grad_shaded_features (S, 16) or longer, grad_opacity (N,), pixel_spread (HW,)), float32,
-    valid until the next call: the gradients of the points weights.shaded, while those of all others
-    are 0; and the spread of each pixel, undefined without spread_weight. b.pair_gain (alpha) or
-    b.pixel_rest (softmax) are left for offset_backward() and bench/spheres.py: the gains, and what
-    they follow from (cl/raster/blend.cl).
+    """(grad_shaded_features (S, 16), grad_opacity (S,), both or longer, pixel_spread (HW,)),
+    float32, valid until the next call: the gradients of the points weights.shaded, while those of
+    all others are 0; and the spread of each pixel, undefined without spread_weight. b.pair_gain
+    (alpha) or b.pixel_rest (softmax) are left for offset_backward() and bench/spheres.py: the
+    gains, and what they follow from (cl/raster/blend.cl).
 
     shaded_features, features: of blend_forward(). grad_features: dL/dfeatures (H, W, 16).
     grad_alpha: (HW,), dL/d(1 - transmittance); None: 0. spread_weight: adds this times sum_ij b_i
@@ -103,8 +103,8 @@ def blend_backward(
     number of tracked pixels, as Pulsar does. Raises ValueError for grad_alpha or a spread of a
     softmax, which has no transmittance.
     """
-    n, rows, shaded = pairs.points, len(shaded_features), weights.shaded
-    b.require(blend_backward_table(n, rows, pairs.pixels, pairs.capacity, weights.blend))
+    rows, shaded = len(shaded_features), weights.shaded
+    b.require(blend_backward_table(rows, pairs.pixels, pairs.capacity, weights.blend))
     program = _program(dev, weights, mean)
     if weights.blend == "softmax":
         if grad_alpha is not None or spread_weight > 0:
@@ -135,7 +135,6 @@ def blend_backward(
             pair_gain=b.pair_gain,
             pixel_spread=b.pixel_spread,
         )
-    dev.fill(b.grad_opacity, 0)
     program.launch(
         "blend_backward",
         shaded.size * row_parts(dev, ON_GPU),
@@ -165,12 +164,11 @@ def offset_backward(
     opacity: Array,
     edge: float,
 ) -> Array:
-    """grad_offset (N, 4) float32, valid until the next call, after blend_backward(): of soft points
-    that are composited by alpha, of what the closeness of their hits changes.
+    """grad_offset (S, 4) float32 or longer, valid until the next call, after blend_backward(): of
+    soft points that are composited by alpha, of what the closeness of their hits changes.
 
     opacity: (N,). edge: of the grid that offsets are counted in, world units.
     """
-    dev.fill(b.grad_offset, 0)
     dev.program("raster/offset", HAS_ROLES=int(weights.has_roles)).launch(
         "offset_backward",
         weights.shaded.size,

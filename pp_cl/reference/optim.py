@@ -1,9 +1,10 @@
-"""Float64 twins of what changes parameters: Adam as torch computes it, RMSprop of the SH
-coefficients, grid smoothing.
+"""Float64 twins of what changes parameters: Adam as torch computes it, RMSprop of the points, grid
+smoothing.
 """
 
 import numpy as np
 
+from pp_cl.raster.points import MOST_OFFSET
 from pp_cl.reference.dense import sh_basis
 
 BETA2 = 0.999  # of both
@@ -16,45 +17,51 @@ class Adam:
         self.parameter, self.beta1 = np.array(parameter, np.float64), beta1
         self.m, self.v, self.t = np.zeros_like(self.parameter), np.zeros_like(self.parameter), 0
 
-    def step(
-        self,
-        grad: np.ndarray,
-        rate: float,
-        eps: float,
-        *,
-        bounds: tuple[float, float] = (-np.inf, np.inf),
-    ) -> None:
-        """One step. bounds: what the parameter stays between."""
+    def step(self, grad: np.ndarray, rate: float, eps: float) -> None:
+        """One step."""
         self.t += 1
         grad = np.asarray(grad, np.float64)
         self.m += (1 - self.beta1) * (grad - self.m)
         self.v += (1 - BETA2) * (grad * grad - self.v)
         c1, c2 = 1 - self.beta1**self.t, 1 - BETA2**self.t
-        moved = self.parameter - rate / c1 * self.m / (np.sqrt(self.v / c2) + eps)
-        self.parameter = np.clip(moved, *bounds)
+        self.parameter -= rate / c1 * self.m / (np.sqrt(self.v / c2) + eps)
 
 
 class RmsProp:
     """The step of cl/training/rmsprop.cl, written out for all points in every step.
 
-    sh: (N, count, 16) coefficients. basis: (N, count), their harmonics.
+    sh: (N, count, 16) coefficients. basis: (N, count), their harmonics. offset: (N, 4). opacity:
+    (N,). v: {"sh": (N, 16), "offset", "opacity"}.
     """
 
-    def __init__(self, sh: np.ndarray, basis: np.ndarray):
-        self.sh, self.basis = np.array(sh, np.float64), basis
-        self.v, self.t = np.zeros((len(sh), 16)), 0
+    def __init__(self, basis: np.ndarray, sh: np.ndarray, offset: np.ndarray, opacity: np.ndarray):
+        self.basis = basis
+        self.sh, self.offset, self.opacity = (
+            np.array(a, np.float64) for a in (sh, offset, opacity)
+        )
+        self.v = {"sh": np.zeros((len(sh), 16)), "offset": np.zeros_like(self.offset)}
+        self.v["opacity"], self.t = np.zeros_like(self.opacity), 0
 
-    def step(self, t: int, grad_features: np.ndarray, rates: np.ndarray, eps: float) -> None:
-        """Step t with gradients (N, 16) of the features; those between it and the last had
-        gradients of 0. rates: of the basis functions.
+    def step(
+        self, t: int, gradients: dict[str, np.ndarray], rates: dict, eps: dict[str, float]
+    ) -> None:
+        """Step t with gradients "sh", (N, 16) of the features, "offset" and "opacity"; those
+        between it and the last were 0. rates: {"sh": of the basis functions, "offset", "opacity"}.
         """
-        grad = np.asarray(grad_features, np.float64)
-        self.v = BETA2 ** (t - self.t) * self.v
-        self.v += (1 - BETA2) * grad**2 / (4 * np.pi)
+        moves = {}
+        for name, values in gradients.items():
+            grad = np.asarray(values, np.float64)
+            v = BETA2 ** (t - self.t) * self.v[name]
+            v += (1 - BETA2) * grad**2 / (4 * np.pi if name == "sh" else 1)
+            self.v[name] = v
+            moves[name] = grad / (np.sqrt(v / (1 - BETA2**t)) + eps[name])
         self.t = t
-        scaled = grad / (np.sqrt(self.v / (1 - BETA2**t)) + eps)
-        moves = np.asarray(rates)[: self.basis.shape[1]] * self.basis
-        self.sh -= moves[:, :, None] * scaled[:, None, :]
+        by_basis = np.asarray(rates["sh"])[: self.basis.shape[1]] * self.basis
+        self.sh -= by_basis[:, :, None] * moves["sh"][:, None, :]
+        self.offset = np.clip(
+            self.offset - rates["offset"] * moves["offset"], -MOST_OFFSET, MOST_OFFSET
+        )
+        self.opacity = np.clip(self.opacity - rates["opacity"] * moves["opacity"], 0, 1)
 
 
 def basis(positions: np.ndarray, eye: np.ndarray) -> np.ndarray:

@@ -1,8 +1,7 @@
-"""Cases of what changes parameters: Adam, RMSprop of the SH coefficients, moving averages,
-smoothing, the opacities of split points.
-"""
+"""Cases of what changes parameters: Adam, RMSprop of the points, moving averages, smoothing, the opacities of split points."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
+from dataclasses import replace
 from functools import partial
 from typing import Any
 
@@ -10,75 +9,91 @@ import numpy as np
 from pyopencl.array import Array
 
 from pp_cl.device.device import Device
-from pp_cl.raster.points import SH_DEGREES, sh_blocks
+from pp_cl.raster.points import MOST_OFFSET, SH_DEGREES, PointCloud
 from pp_cl.raster.project import ProjectedPoints
 from pp_cl.reference import optim
 from pp_cl.scene.camera import Camera
 from pp_cl.scene.grid import Grid
 from pp_cl.selftest.case import EPS, SIZES, Case, Check, absolute, each, exact, finite, relative
-from pp_cl.training.optim import adam_update, ema_take, ema_update, rmsprop_update
+from pp_cl.training.optim import POINT_EPS, adam_update, ema_take, ema_update, rmsprop_update
+from pp_cl.training.schedule import Rates
 from pp_cl.training.smooth import Smoother
-from pp_cl.training.state import split_opacity
+from pp_cl.training.state import PointState, split_opacity
 
 GRID = Grid((-0.7, -0.5, -0.6), 0.05, (23, 19, 31))
-SH_EPS = 4e-7  # of the tiny preset
-RATES = (0.1, 0.05, 0.025)
+EPSILONS = {"sh": 4e-7, "offset": POINT_EPS, "opacity": POINT_EPS}  # of the tiny preset
+RATES = Rates(sh=(0.1, 0.05, 0.025), offset=0.01, opacity=0.1, network=0.0)
+Gradients = dict[str, np.ndarray]
 EYE = np.array([1.5, -2.5, 1.2])
 CAMERA = Camera.look_at(EYE, (0.1, 0.2, -0.3), fx=100, width=100, height=100)
 
 
 class Cloud:
-    """n points on the grid with random coefficients up to a degree, and their float64 twin."""
+    """n points on the grid, with random offsets, opacities and coefficients up to a degree, and
+    their float64 twin. start, learned(): of "sh" (N, count, 16), "offset" (N, 4), "opacity" (N,).
+    """
 
     def __init__(self, dev: Device, rng: np.random.Generator, n: int, degree: int = SH_DEGREES[-1]):
         self.dev, self.n, self.steps = dev, n, 0
-        self.blocks = sh_blocks(degree)
         ids = np.sort(rng.choice(np.prod(GRID.dims), n, replace=False)).astype(np.uint32)
-        count = sum(block.count for block in self.blocks)
-        self.start = rng.standard_normal((n, count, 16)).astype(np.float32)
-        self.twin = optim.RmsProp(self.start, optim.basis(GRID.positions(ids), EYE)[:, :count])
-        self.sh = [dev.upload(self.start[:, b.first : b.first + b.count]) for b in self.blocks]
-        self.v, self.last_step = dev.zeros((n, 16)), dev.zeros((n,), np.uint32)
+        self.cloud = PointCloud.create(dev, ids, degree)
+        count = sum(block.count for block in self.cloud.blocks)
+        self.start = {
+            "sh": rng.standard_normal((n, count, 16)).astype(np.float32),
+            "offset": rng.uniform(-MOST_OFFSET, MOST_OFFSET, (n, 4)).astype(np.float32),
+            "opacity": rng.uniform(0, 1, n).astype(np.float32),
+        }
+        for block, array in zip(self.cloud.blocks, self.cloud.sh, strict=True):
+            array.set(self.start["sh"][:, block.first : block.first + block.count].copy())
+        self.cloud.offset.set(self.start["offset"])
+        self.cloud.opacity.set(self.start["opacity"])
+        basis = optim.basis(GRID.positions(ids), EYE)[:, :count]
+        self.twin = optim.RmsProp(basis, **self.start)
+        self.state = PointState(dev, self.cloud)
         self._points = seen_points(dev, GRID.positions(ids), CAMERA)
 
     def step(
         self,
-        grad_features: np.ndarray,
+        grads: Gradients,
         shaded: np.ndarray,
         step: int | None = None,
         *,
-        rates: Sequence[float] = RATES,
+        rates: Rates = RATES,
     ) -> None:
-        """One step, or that of another number. grad_features: (N, 16), of which those of `shaded`
+        """One step, or that of another number. grads: as gradients() has them; those of `shaded`
         count.
         """
         self.steps = step or self.steps + 1
-        seen = np.isin(np.arange(self.n), shaded)[:, None]
-        features = self.dev.upload(grad_features[shaded], np.float32)
+        rows = {name: self.dev.upload(g[shaded], np.float32) for name, g in grads.items()}
         rmsprop_update(
             self.dev,
             self.steps,
-            self._points,
-            self.dev.upload(shaded, np.uint32),
-            features,
-            self.sh,
-            v=self.v,
-            last_step=self.last_step,
-            rates=rates,
-            eps=SH_EPS,
+            rates,
+            rows["sh"],
+            rows["opacity"],
+            rows["offset"] if rates.offset else None,
+            points=self._points,
+            shaded=self.dev.upload(shaded, np.uint32),
+            cloud=self.cloud,
+            state=self.state,
+            sh_eps=EPSILONS["sh"],
         )
+        seen = np.isin(np.arange(self.n), shaded)
+        grads = {name: np.where(seen, g.T, 0).T for name, g in grads.items()}
+        grads["offset"] = grads["offset"] * (rates.offset > 0)
         self.twin.step(
-            self.steps, np.where(seen, grad_features, 0), np.repeat(rates, (1, 3, 5)), SH_EPS
+            self.steps, grads, vars(rates) | {"sh": np.repeat(rates.sh, (1, 3, 5))}, EPSILONS
         )
 
-    def coefficients(self) -> np.ndarray:
-        """(N, count, 16) float32 on the host."""
-        return np.concatenate([array.get() for array in self.sh], axis=1)
+    def learned(self) -> dict[str, np.ndarray]:
+        """float32 on the host."""
+        sh = np.concatenate([array.get() for array in self.cloud.sh], axis=1)
+        return {"sh": sh, "offset": self.cloud.offset.get(), "opacity": self.cloud.opacity.get()}
 
-    def second_moment(self) -> np.ndarray:
-        """(N, 16) float64: with the decay that waits."""
-        waited = self.steps - self.last_step.get().astype(np.float64)
-        return self.v.get() * 0.999 ** waited[:, None]
+    def second_moments(self) -> dict[str, np.ndarray]:
+        """float64: with the decay that waits."""
+        waited = 0.999 ** (self.steps - self.state.last_step.get().astype(np.float64))
+        return {name: (v.get().T * waited).T for name, v in self.state.second_moments.items()}
 
 
 def seen_points(dev: Device, positions: np.ndarray, camera: Camera) -> ProjectedPoints:
@@ -90,11 +105,15 @@ def seen_points(dev: Device, positions: np.ndarray, camera: Camera) -> Projected
     return ProjectedPoints("soft", dev.upload(camera.packed((2.0, 6.0))), dev.upload(rows), *absent)
 
 
-def gradients(rng: np.random.Generator, n: int) -> np.ndarray:
-    """(n, 16) float32 of the features; every third point's are 0."""
-    features = 1e-4 * rng.standard_normal((n, 16))
-    features[::3] = 0
-    return features.astype(np.float32)
+def gradients(rng: np.random.Generator, n: int, scale: float = 1e-4) -> Gradients:
+    """{"sh": (n, 16) of the features, "offset": (n, 4), "opacity": (n,)} float32; every third
+    point's are 0.
+    """
+    grads = {}
+    for name, shape in (("sh", (n, 16)), ("offset", (n, 4)), ("opacity", (n,))):
+        grads[name] = (scale * rng.standard_normal(shape)).astype(np.float32)
+        grads[name][::3] = 0
+    return grads
 
 
 def _adam(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
@@ -156,39 +175,55 @@ def _rmsprop(degree: int, dev: Device, rng: np.random.Generator) -> Iterator[Che
         for at in (1, step, step + 1):
             cloud.step(gradients(rng, 33), np.arange(33), at)
         yield from _rmsprop_checks(cloud)
+    cloud = Cloud(dev, rng, 33, degree)
+    cloud.step(gradients(rng, 33), np.arange(33), rates=replace(RATES, offset=0.0))
+    yield from _rmsprop_checks(cloud)
 
 
 def _rmsprop_checks(cloud):
-    yield relative(cloud.coefficients(), cloud.twin.sh, 1e-6)
-    yield relative(cloud.second_moment(), cloud.twin.v, 3e-6)  # a sum of squares
+    moments = cloud.second_moments()
+    for name, values in cloud.learned().items():
+        yield relative(values, getattr(cloud.twin, name), 1e-6)
+        yield relative(moments[name], cloud.twin.v[name], 3e-6)  # a sum of squares
 
 
 def _rmsprop_extremes(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
-    """Gradients of 1e-20 to 1e10, of which float32 cannot square all; of 0 and -0; NaN stays."""
+    """Gradients of 1e-20 to 1e10, of which float32 cannot square all; of 0 and -0; NaN stays; a
+    gradient of one parameter alone moves it alone.
+    """
     for scale in (1e-20, 1e-12, 1e-3, 1e10):
         cloud = Cloud(dev, rng, 31)
         for _ in range(10):
-            cloud.step(scale / 1e-4 * gradients(rng, 31), np.arange(31))
-        yield relative(cloud.coefficients(), cloud.twin.sh, 1e-6)
-    cloud = Cloud(dev, rng, 33)
-    grad = np.zeros((33, 16))
-    grad[1], grad[2, 5] = -0.0, np.nan
-    cloud.step(grad, np.arange(33))
-    expected = cloud.start.copy()
-    expected[2, :, 5] = np.nan
-    yield exact(np.isnan(cloud.coefficients()), np.isnan(expected))
-    yield exact(np.nan_to_num(cloud.coefficients()), np.nan_to_num(expected))
+            cloud.step(gradients(rng, 31, scale), np.arange(31))
+        yield relative(cloud.learned()["sh"], cloud.twin.sh, 1e-6)
+        yield relative(cloud.learned()["offset"], cloud.twin.offset, 1e-5)
+        yield relative(cloud.learned()["opacity"], cloud.twin.opacity, 1e-5)
+    cloud, grads = Cloud(dev, rng, 33), gradients(rng, 33, 0.0)
+    grads["sh"][1], grads["sh"][2, 5], grads["opacity"][4], grads["offset"][7, 1] = (
+        -0.0,
+        *[np.nan] * 3,
+    )
+    grads["opacity"][10], grads["offset"][13, 3] = 1e-4, -1e-4
+    cloud.step(grads, np.arange(33))
+    expected = {name: values.copy() for name, values in cloud.start.items()}
+    expected["sh"][2, :, 5] = expected["opacity"][4] = expected["offset"][7, 1] = np.nan
+    expected["opacity"][10] = max(expected["opacity"][10] - RATES.opacity, 0)
+    expected["offset"][13, 3] = min(expected["offset"][13, 3] + RATES.offset, MOST_OFFSET)
+    for name, values in cloud.learned().items():
+        yield exact(np.isnan(values), np.isnan(expected[name]))
+        yield absolute(np.nan_to_num(values), np.nan_to_num(expected[name]), 1e-6 * RATES.opacity)
 
 
 def _bounded(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
     """Huge gradients keep opacities and offsets in their bounds, at the values of float64."""
-    for bounds in ((0.0, 1.0), (-0.5, 0.5)):
-        grads = 1e4 * (rng.standard_normal((20, 257)) + np.linspace(-2, 2, 257))
-        options = {"rate": 0.03, "eps": 1e-15, "bounds": bounds}
-        twin, moved, _ = adam_steps(dev, rng.uniform(*bounds, 257), grads, **options)
+    cloud = Cloud(dev, rng, 257)
+    for _ in range(60):
+        cloud.step(gradients(rng, 257, 1e4), np.arange(257))
+    for name, bounds in (("offset", (-MOST_OFFSET, MOST_OFFSET)), ("opacity", (0.0, 1.0))):
+        moved = cloud.learned()[name]
         yield finite(moved)
         yield exact([moved.min(), moved.max()], bounds)
-        yield absolute(moved, twin.parameter, 2e-6)  # twenty moves of 0.03
+        yield absolute(moved, getattr(cloud.twin, name), 1e-5)  # sixty moves
 
 
 def _ema(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
@@ -239,9 +274,9 @@ def _refine(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
 CASES = (
     Case("adam: arrays", _adam),
     Case("adam: gradients of 0, 1e-20 and 1e10", _adam_extremes),
-    Case("adam: at the bounds", _bounded),
     *(Case(f"rmsprop: degree {d}", partial(_rmsprop, d)) for d in SH_DEGREES),
     Case("rmsprop: gradients of 0, 1e-20, 1e10 and NaN", _rmsprop_extremes),
+    Case("rmsprop: at the bounds", _bounded),
     Case("training: moving average", _ema),
     Case("training: smoothing", _smooth),
     Case("training: split opacities", _refine),

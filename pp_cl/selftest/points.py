@@ -171,9 +171,7 @@ class PairedPoints:
             spread_weight=spread_weight,
             mean=self.mean,
         )
-        shaded, of_points = self.weights.shaded.get(), np.zeros((self.n, 16), np.float32)
-        of_points[shaded] = features.get()[: len(shaded)]
-        return {"features": of_points, "opacity": opacity.get()}
+        return {"features": self._of_points(features), "opacity": self._of_points(opacity)}
 
     def sphere_gradients(self, grad_features: np.ndarray) -> Gradients:
         """{"positions": (N, 3), "radius": (N,)} of the same, and those of gradients()."""
@@ -195,7 +193,7 @@ class PairedPoints:
     def offset_gradients(self, grad_features: np.ndarray, edge: float) -> np.ndarray:
         """(N, 4) of the same, on a grid of this edge; of soft points composited by alpha."""
         self.gradients(grad_features)
-        return offset_backward(
+        rows = offset_backward(
             self.dev,
             self.buffers,
             self.projected,
@@ -203,7 +201,17 @@ class PairedPoints:
             self.weights,
             opacity=self.opacity,
             edge=edge,
-        ).get()
+        )
+        return self._of_points(rows)
+
+    def _of_points(self, rows):
+        """(N, ...): those of the visible points, 0 for all others."""
+        shaded, of_points = (
+            self.weights.shaded.get(),
+            np.zeros((self.n, *rows.shape[1:]), np.float32),
+        )
+        of_points[shaded] = rows.get()[: len(shaded)]
+        return of_points
 
     def _uploaded(self, grad_features):
         return self.dev.upload(np.reshape(grad_features, (*self.shape, 16)), np.float32)

@@ -297,7 +297,7 @@ class Room:
         shown = n if raster.early_stop == 0 else round(SHOWN * n)
         shaded = round(share * shown)
         step = Renderer.tables(raster, n, crop, few, shaded, by_pair=True)
-        gradients = blend_backward_table(n, shaded, math.prod(crop), few, raster.blend)
+        gradients = blend_backward_table(shaded, math.prod(crop), few, raster.blend)
         step["gradients (estimate)"] = gradients
         return max(step, Renderer.tables(raster, n, full, many, shown, by_pair=False), key=_bytes)
 

@@ -1,7 +1,6 @@
-"""The optimiser: RMSprop for the SH coefficients, Adam for the points' offsets and opacities and
-for the network, and the exponential moving average (EMA) of all parameters.
+"""The optimiser: RMSprop for the points, Adam for the network, and the exponential moving average
+(EMA) of all parameters.
 
-Adam is dense as in PyTorch: momentum moves every value in every step, with or without a gradient.
 RMSprop is sparse: it touches only visible points with a gradient. cl/training/rmsprop.cl has its
 formulas, docs/maths.md the reasons.
 """
@@ -9,7 +8,6 @@ formulas, docs/maths.md the reasons.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 
 import numpy as np
 from pyopencl.array import Array
@@ -18,7 +16,7 @@ from pp_cl.device.buffers import DeviceRows, Table
 from pp_cl.device.device import Device
 from pp_cl.device.launch import lanes, row_parts
 from pp_cl.model import Model
-from pp_cl.raster.points import MOST_OFFSET, four_blocks, stored_degree
+from pp_cl.raster.points import MOST_OFFSET, PointCloud, four_blocks, stored_degree
 from pp_cl.raster.project import ProjectedPoints
 from pp_cl.training.schedule import Rates
 from pp_cl.training.state import PointState
@@ -62,46 +60,26 @@ class Optimiser:
         shaded: Array,
         sh_eps: float,
     ) -> None:
-        """One step by the gradients of the visible points' features, (S, 16) or longer, of all
-        opacities, (N,), and offsets, (N, 4), and by those of the network, which lie in
+        """One step by the gradients of the visible points' features (S, 16), opacities (S,) and
+        offsets (S, 4), each or longer, and by those of the network, which lie in
         model.net.gradients.
 
         step: from 1. grad_offset: None where offsets stay. points: as projected into the rendered
-        view. shaded: (S) uint32, the visible ones. sh_eps: eps of RMSprop.
+        view. shaded: (S) uint32, the visible ones. sh_eps: eps of the SH coefficients.
         """
-        cloud, net, state = self.model.cloud, self.model.net, self.state
+        net = self.model.net
         rmsprop_update(
             self.dev,
             step,
-            points,
-            shaded,
+            rates,
             grad_shaded_features,
-            cloud.sh,
-            v=state.sh_v,
-            last_step=state.last_step,
-            rates=rates.sh,
-            eps=sh_eps,
-        )
-        if grad_offset is not None:
-            adam_update(
-                self.dev,
-                cloud.offset,
-                grad_offset,
-                state.moments("offset"),
-                step=step,
-                rate=rates.offset,
-                eps=POINT_EPS,
-                bounds=(-MOST_OFFSET, MOST_OFFSET),
-            )
-        adam_update(
-            self.dev,
-            cloud.opacity,
             grad_opacity,
-            state.moments("opacity"),
-            step=step,
-            rate=rates.opacity,
-            eps=POINT_EPS,
-            bounds=(0.0, 1.0),
+            grad_offset,
+            points=points,
+            shaded=shaded,
+            cloud=self.model.cloud,
+            state=self.state,
+            sh_eps=sh_eps,
         )
         adam_update(
             self.dev,
@@ -181,28 +159,16 @@ def adam_update(
     step: int,
     rate: float,
     eps: float,
-    bounds: tuple[float, float] | None = None,
 ) -> None:
     """One dense Adam step of `parameter`, in place.
 
     parameter, grad, moments "m" and "v": float32 arrays of one shape, any; the moments start as
-    zeros. step: from 1 on. bounds: what the parameter stays between. Raises ValueError when the
-    shapes differ.
+    zeros. step: from 1 on. Raises ValueError when the shapes differ.
     """
     _same_shape(parameter, grad, *moments.values())
     # rate (m / c1) / (sqrt(v / c2) + eps) = (rate root / c1) m / (sqrt(v) + eps root)
     root = math.sqrt(1 - BETA2**step)
-    least, most = bounds or (0.0, 0.0)
-    program = dev.program(
-        "training/adam",
-        LANES=lanes(dev),
-        DECAY1=DECAY1,
-        DECAY2=DECAY2,
-        BOUNDED=int(bounds is not None),
-        LEAST=f"{least}f",
-        MOST=f"{most}f",
-    )
-    program.launch(
+    dev.program("training/adam", LANES=lanes(dev), DECAY1=DECAY1, DECAY2=DECAY2).launch(
         "adam_update",
         -(-parameter.size // lanes(dev)),
         n=parameter.size,
@@ -248,51 +214,58 @@ def _launch_ema(dev, kernel, parameter, ema, **weight):
 def rmsprop_update(
     dev: Device,
     step: int,
+    rates: Rates,
+    grad_shaded_features: Array,
+    grad_opacity: Array,
+    grad_offset: Array | None,
+    *,
     points: ProjectedPoints,
     shaded: Array,
-    grad_shaded_features: Array,
-    sh: Sequence[Array],
-    *,
-    v: Array,
-    last_step: Array,
-    rates: Sequence[float],
-    eps: float,
+    cloud: PointCloud,
+    state: PointState,
+    sh_eps: float,
 ) -> None:
-    """One step of the SH coefficients of all points with a gradient, in place. The coefficients'
-    gradient is the product of the harmonics in the direction from the eye to the point and the
-    gradient of the point's features; it is never formed.
+    """One step of what the visible points learn, in place. The gradient of a SH coefficient is the
+    product of its harmonic in the direction from the eye to the point and the gradient of the
+    point's feature; it is never formed.
 
-    step: from 1 on. points, shaded, grad_shaded_features: as Optimiser.update() takes them. sh:
-    arrays (N, count, 16) of SH_BLOCKS up to the end of one degree. v: (N, 16) float32, second
-    moments, of each feature. last_step: (N,) uint32, of each point's last gradient, 0: none. Both
-    start as zeros. rates: of the degrees 0, 1, 2. eps: added to the root of v, in the gradient's
-    unit.
+    step: from 1 on. The gradients, points, shaded and sh_eps: as Optimiser.update() takes them.
     """
-    degree = max((d for d in range(stored_degree(sh) + 1) if rates[d] > 0), default=None)
-    if degree is None:
-        return
-    root, (sh_0, sh_1, sh_2a, sh_2b) = math.sqrt(1 - BETA2**step), four_blocks(sh)
+    degree = max((d for d in range(stored_degree(cloud.sh) + 1) if rates.sh[d] > 0), default=0)
+    root, (sh_0, sh_1, sh_2a, sh_2b) = math.sqrt(1 - BETA2**step), four_blocks(cloud.sh)
+    v = state.second_moments
     dev.program(
         "training/rmsprop",
         LANES=lanes(dev),
         DEGREE=degree,
         DECAY2=DECAY2,
         LOG_BETA2=f"{math.log2(BETA2):.9g}f",
+        MOVES_OFFSET=int(grad_offset is not None),
+        MOST_OFFSET=f"{MOST_OFFSET}f",
     ).launch(
         "rmsprop_move",
         len(shaded) * row_parts(dev),
         s=len(shaded),
         step=step,
-        eps=root * eps,
-        rate_0=root * rates[0],
-        rate_1=root * rates[1],
-        rate_2=root * rates[2],
+        eps=root * sh_eps,
+        rate_0=root * rates.sh[0],
+        rate_1=root * rates.sh[1],
+        rate_2=root * rates.sh[2],
+        point_eps=root * POINT_EPS,
+        rate_offset=root * rates.offset,
+        rate_opacity=root * rates.opacity,
         shaded=shaded,
         camera=points.camera_buffer,
         point_camera=points.point_camera,
         grad_shaded_features=grad_shaded_features,
-        last_step=last_step,
-        v=v,
+        grad_offset=v["offset"] if grad_offset is None else grad_offset,
+        grad_opacity=grad_opacity,
+        last_step=state.last_step,
+        v=v["sh"],
+        v_offset=v["offset"],
+        v_opacity=v["opacity"],
+        offset=cloud.offset,
+        opacity=cloud.opacity,
         sh_0=sh_0,
         sh_1=sh_1,
         sh_2a=sh_2a,

@@ -30,9 +30,7 @@ class PointState:
         return {
             "max_weight": ((n,), np.float32),
             "times_seen": ((n,), np.float32),
-            "m.offset": ((n, 4), np.float32),
             "v.offset": ((n, 4), np.float32),
-            "m.opacity": ((n,), np.float32),
             "v.opacity": ((n,), np.float32),
             "v.sh": ((n, 16), np.float32),
             "last_step": ((n,), np.uint32),
@@ -60,18 +58,16 @@ class PointState:
         return self._arrays["times_seen"]
 
     @property
-    def sh_v(self) -> Array:
-        """(N, 16) float32: RMSprop's second moments of the SH coefficients, of each feature."""
-        return self._arrays["v.sh"]
+    def second_moments(self) -> dict[str, Array]:
+        """RMSprop's: of "offset", (N, 4), "opacity", (N,), and "sh", (N, 16), of each feature; all
+        float32.
+        """
+        return {name: self._arrays[f"v.{name}"] for name in ("offset", "opacity", "sh")}
 
     @property
     def last_step(self) -> Array:
-        """(N,) uint32: the last step in which the point's features had a gradient; 0: none yet."""
+        """(N,) uint32: the last step in which the point had a gradient; 0: none yet."""
         return self._arrays["last_step"]
-
-    def moments(self, name: str) -> dict[str, Array]:
-        """Adam's "m" and "v" of the points' "offset" or "opacity"."""
-        return {kind: self._arrays[f"{kind}.{name}"] for kind in "mv"}
 
     def compact(self, dev: Device, keep: Array) -> None:
         """Drop all rows but `keep`, (M) uint32, ascending; one array after the other."""
