@@ -1,4 +1,6 @@
-"""Cases of what changes parameters: Adam, RMSprop of the points, moving averages, smoothing, the opacities of split points."""
+"""Cases of what changes parameters: Adam, RMSprop of the points, moving averages, smoothing, the
+opacities of split points.
+"""
 
 from collections.abc import Iterator
 from dataclasses import replace
