@@ -219,7 +219,7 @@ class TrainConfig:
         0,
         0.25,
     )
-    sh_smoothing_every: int = setting(32, "steps between two smoothings", 1, 10**8)
+    sh_smoothing_every: int = setting(64, "steps between two smoothings", 1, 10**8)
     prune_weight: float = setting(
         0.05,
         "prune points whose blend weight, summed over the pixels, reached this in none of the"

@@ -81,11 +81,14 @@ def neighbours(ids: np.ndarray, dims: tuple[int, int, int]) -> list[list[int | N
 def smoothed(
     values: np.ndarray, ids: np.ndarray, dims: tuple[int, int, int], amount: float
 ) -> np.ndarray:
-    """Array (N, ...) moved by `amount` towards the mean of their neighbours."""
-    old = np.asarray(values, np.float64)
-    new = old.copy()
-    for i, around in enumerate(neighbours(ids, dims)):
-        known = [j for j in around if j is not None]
+    """Array (N, ...) moved by `amount` towards the mean of their neighbours: first the points whose
+    grid indices have an even sum, then the others.
+    """
+    new, (nx, ny, _) = np.array(values, np.float64), dims
+    around = neighbours(ids, dims)
+    colours = [(int(i) % nx + int(i) // nx % ny + int(i) // (nx * ny)) % 2 for i in ids]
+    for i in np.argsort(colours, kind="stable"):
+        known = [j for j in around[i] if j is not None]
         if known:
-            new[i] += amount * (old[known].mean(axis=0) - old[i])
+            new[i] += amount * (new[known].mean(axis=0) - new[i])
     return new

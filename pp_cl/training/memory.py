@@ -27,7 +27,7 @@ from pp_cl.training.loss import Loss, MaskLoss, lanes_of_loss
 from pp_cl.training.optim import Optimiser
 from pp_cl.training.perceptual import PerceptualLoss
 from pp_cl.training.schedule import crop_side, ema_start, prunings, refine_steps
-from pp_cl.training.smooth import Smoother, chunk_points
+from pp_cl.training.smooth import Smoother
 from pp_cl.training.state import PointState
 
 MIB, GIB = 2**20, 2**30
@@ -127,7 +127,7 @@ class Room:
         take does not fit; called before the photographs are read and the hull is known.
         """
         points = self._config.points.count
-        self._check(self._planned(points, 0.0, points ** (1 / 3), step=0))
+        self._check(self._planned(points, 0.0, step=0))
 
     def check_points(
         self, grid: Grid, points: int, depth_range: tuple[float, float], step: int = 0
@@ -168,7 +168,7 @@ class Room:
         growth = 1 + (grid.diagonal / middle) ** 2 / 9
         radius = point_radius(self._config.raster, grid.edge, depth_range)
         pixels = radius * self._largest.fx / middle * math.sqrt(growth)
-        return self._planned(points, pixels, grid.dims[2], step)
+        return self._planned(points, pixels, step)
 
     def _check(self, plan):
         problem, lower = self._problem(plan)
@@ -205,18 +205,16 @@ class Room:
 
     # ---- the plan
 
-    def _planned(self, points, radius, layers, step):
-        """radius: of the footprints, pixels of the largest photograph as it is stored. layers: of
-        the grid, on which points may lie.
-        """
+    def _planned(self, points, radius, step):
+        """radius: of the footprints, pixels of the largest photograph as it is stored."""
         _, beside = reading(self._photographs, mask_rule(self._config))
         return Plan(
-            self._phases(points, radius, layers, step),
+            self._phases(points, radius, step),
             photographs=kept_bytes(self._sizes, self._shrunk()),
             reading=0 if self._config.scene.path == DEMO else beside,
         )
 
-    def _phases(self, n, radius, layers, step):
+    def _phases(self, n, radius, step):
         """The phases from a step on: each level of refinement, each refining, and the EMA at the
         end.
         """
@@ -228,13 +226,13 @@ class Room:
                 continue
             now, left = max(start, step), len(refinements) - level
             prunes, to_come = prunings(train, start, end), prunings(train, now, end)
-            stages = {"radius": radius, "layers": layers, "left": left}
+            stages = {"radius": radius, "left": left}
             name = f"from step {now} on"
             phases.append(self._level(name, n, averages <= now, prunes > 0, **stages))
             n = round(n * KEPT_BY_PRUNING ** (to_come / max(1, prunes)))
             if left:
                 phases.append(self._refining(end, n, averages <= end, **stages))
-                n, layers = 8 * n, 2 * layers
+                n *= 8
                 radius /= 2 if self._config.raster.footprint == "soft" else 1
             elif now < averages < end:
                 name = f"averages, from step {averages} on"
@@ -287,7 +285,7 @@ class Room:
         full = _padded(*_crop(camera.downscaled(downscale), 0))
         return (height, width), _padded(width, height), full
 
-    def _views(self, n, *, radius, layers, left):
+    def _views(self, n, *, radius, left):
         """What the renderer takes for a step or for a preview, whichever is more."""
         raster, (_, crop, full) = self._config.raster, self._sizes_seen(left)
         area = math.pi * max(LEAST_RADIUS, radius / self._config.scene.downscale) ** 2
@@ -301,7 +299,7 @@ class Room:
         step["gradients (estimate)"] = gradients
         return max(step, Renderer.tables(raster, n, full, many, shown, by_pair=False), key=_bytes)
 
-    def _stages(self, n, *, radius, layers, left):
+    def _stages(self, n, *, radius, left):
         """What the other stages of a step and of a rendered preview take. left: refinements to
         come.
         """
@@ -319,9 +317,7 @@ class Room:
             },
         }
         if train.sh_smoothing > 0:
-            # its chunk follows from the neighbours, which lie about a layer of the grid apart
-            chunk = chunk_points(n, round(n / layers))
-            tables["smoothing (estimate)"] = Smoother.table(n, chunk)
+            tables["smoothing"] = Smoother.table(n)
         if train.mask_weight > 0:
             tables["mask loss"] = MaskLoss.table(*crop)
         if train.exposure != "off":

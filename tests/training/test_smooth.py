@@ -47,22 +47,11 @@ def test_table_of_a_huge_grid(dev):
 
 
 @pytest.mark.parametrize("dims", [(6, 5, 40), (3, 2, 100), (40, 30, 1), (600, 1, 1)])
-def test_chunks_read_old_values_only(dev, rng, monkeypatch, dims):
-    """Chunks as short as the neighbours allow, and an amount that shows every new value read too
-    early.
-    """
-    monkeypatch.setattr("pp_cl.training.smooth.CHUNK", 1)
+def test_neighbours_are_of_the_other_colour(dev, rng, dims):
+    """With an amount that shows every value that is read too early or too late."""
     n = np.prod(dims) * 9 // 10
     ids = some_ids(rng, n, dims)
-    reaches = [j - i for i, row in enumerate(expected_table(ids, dims)) for j in row if j != NONE]
-    smoother = Smoother(*cloud(dev, ids, dims))
-    assert smoother.chunk == max(reaches) < n / 10
     values = rng.standard_normal((n, 3, 16)).astype(np.float32)
     sh, expected = dev.upload(values), oracle_optim.smoothed(values, ids, dims, 1.0)
-    smoother.smooth(sh, 1.0)
+    Smoother(*cloud(dev, ids, dims)).smooth(sh, 1.0)
     assert relative_error(sh.get(), expected) < 5e-7
-
-
-def test_refuses_what_its_scratch_cannot_hold(dev):
-    with pytest.raises(ValueError, match="at most 3"):
-        Smoother(*cloud(dev, [0, 1], (2, 1, 1))).smooth(dev.zeros((2, 9, 16)), 0.1)
