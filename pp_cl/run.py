@@ -141,9 +141,9 @@ class Run:
         return centre, float(radius)
 
     def render(self, camera: Camera, *, samples: int = 1, features: bool = False) -> Picture:
-        """The model as the camera sees it. samples: a square number of images, shifted by fractions
-        of a pixel, whose mean it is. features: with the network's input. Raises ValueError for
-        another number of samples, UserError where the image holds NaN.
+        """The model as the camera sees it. samples: it is the mean of so many images, a square
+        number, shifted by fractions of a pixel. features: with the network's input. Raises
+        ValueError for another number of samples, UserError where the image holds NaN.
         """
         side = math.isqrt(samples)
         if samples < 1 or side * side != samples:
@@ -229,7 +229,7 @@ def load(
     tolerance: float | None = None,
 ) -> Run:
     """The run in a folder, finished or not. device: as `pp-cl devices` lists them, else the default
-    one. scene: the folder of its scene, if that has moved. tolerance: in place of its
+    one. scene: the folder of its scene, if that has moved. tolerance: instead of the run's
     network.tolerance. Raises UserError naming the file that is missing or broken.
     """
     return load_run(open_device(device), folder, scene=scene, tolerance=tolerance)

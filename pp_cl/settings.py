@@ -86,7 +86,7 @@ class RasterConfig:
     )
     max_tracked: int = setting(
         0,
-        "number of a pixel's nearest hits that receive gradients (0: all; paper: 64)",
+        "number of a pixel's nearest hits that receive gradients (0: all)",
         0,
         2**31 - 1,
     )
@@ -118,7 +118,7 @@ class NetworkConfig:
     )
     residual: bool = setting(True, "add a quarter of the first three features to the colours")
     rate: tuple = setting(
-        (1e-3, 1e-4), "Adam's learning rate at the first and the last step", 1e-12, 100
+        (1e-3, 1e-4), "learning rate of the network, first and last step", 1e-12, 100
     )
     tolerance: float = setting(
         1e-5,
@@ -194,13 +194,13 @@ class TrainConfig:
         1e3,
     )
     opacity_rate: tuple = setting(
-        (1e-1, 1e-2), "Adam's learning rate at the first and the last step", 1e-12, 100
+        (1e-1, 1e-2), "learning rate of the opacities, first and last step", 1e-12, 100
     )
     offset_rate: tuple = setting(
         (1e-2, 1e-3),
-        "Adam's learning rate at the first and the last step of where points lie in their cells of"
-        " the grid, in edges, and of the logarithm of their radii; needs raster.blend=alpha and"
-        " raster.footprint=soft (0: on the grid, all alike)",
+        "learning rate of the points' offsets in edges, and of the logarithm of their radii,"
+        " first and last step; needs raster.blend=alpha and raster.footprint=soft (0: points stay"
+        " on the grid, with one radius)",
         0,
         1,
     )
@@ -222,8 +222,8 @@ class TrainConfig:
     sh_smoothing_every: int = setting(64, "steps between two smoothings", 1, 10**8)
     prune_weight: float = setting(
         0.05,
-        "prune points whose blend weight, summed over the pixels, reached this in none of the"
-        " steps that had them in view (0: off)",
+        "prune points whose blend weight, summed over a step's pixels, has not reached this in any"
+        " step (0: off)",
         0,
         1e6,
     )
@@ -235,8 +235,8 @@ class TrainConfig:
     refine_at: tuple = setting(
         (0.0, 0.0),
         "shares of the iterations after which images double in size and a point becomes eight;"
-        " training begins on images that much smaller (1: never; 0,0: as often as it takes to have"
-        " points at most 1.5 pixels apart)",
+        " training begins on images that much smaller (1: never; 0,0: until points are at most 1.5"
+        " pixels apart)",
         0,
         1,
     )

@@ -31,7 +31,6 @@ import pp_cl
 from pp_cl.cli import COMMANDS
 from pp_cl.config import Config, sections, text_of
 from pp_cl.presets import PRESETS
-from pp_cl.scene.masks import MaskRule
 
 ROOT = Path(__file__).parents[1]
 BLOCK = re.compile(r"^(<!-- table: (\S+) -->\n).*?^(<!-- end table -->)$", re.DOTALL | re.MULTILINE)
@@ -91,19 +90,17 @@ def commands() -> str:
     for name, (_, arguments) in found.items():
         for argument in arguments:
             users.setdefault(argument, []).append(name)
-    common = {
-        option: names
-        for option, names in users.items()
-        if len(names) >= 3 and option[0].startswith("-")
-    }
+    common = [
+        option for option, names in users.items() if len(names) >= 3 and option[0].startswith("-")
+    ]
     lines = []
     for name, (what, arguments) in found.items():
-        others = ", ".join(f"`{a}`" for a, text in arguments if (a, text) in common)
+        others = ", ".join(f"`{a.split()[0]}`" for a, text in arguments if (a, text) in common)
         lines += [f"## pp-cl {name}", "", f"{what[0].upper()}{what[1:]}. Also: {others}.", ""]
         lines += [f"- `{a}`: {text}" for a, text in arguments if (a, text) not in common]
         lines += [""] * bool(lines[-1])
     lines += ["## Options of several commands", ""]
-    lines += [f"- `{a}` ({', '.join(names)}): {text}" for (a, text), names in common.items()]
+    lines += [f"- `{a}`: {text}" for a, text in common]
     return "\n".join(lines)
 
 
@@ -126,7 +123,7 @@ def api() -> str:
         "evaluate_run",
         "export_run",
     ]
-    names += ["Camera", "Camera.look_at", "Scene"]
+    names += ["Camera", "Camera.look_at"]
     return "\n".join(line for name in names for line in _entry(name)).rstrip()
 
 
@@ -137,7 +134,7 @@ def _entry(name: str) -> list[str]:
     if inspect.isroutine(thing):
         signature = inspect.signature(thing)
         shown = [p.replace(annotation=p.empty) for p in signature.parameters.values()]
-        shown = [p for p in shown if p.name != "self" and not isinstance(p.default, MaskRule)]
+        shown = [p for p in shown if p.name != "self"]
         written += str(inspect.Signature(shown))
     return [f"    {written}", "", inspect.getdoc(thing), ""]
 

@@ -57,7 +57,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--budget",
         type=_seconds,
         metavar="T",
-        help="all: seconds that it may take, as 120 or 120s (120)",
+        help="all: seconds, as 120 or 120s (120)",
     )
     add(
         "--blend",

@@ -19,17 +19,17 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
     add("source", metavar="INPUT", help="folder of photographs, or a film")
     add("--out", required=True, metavar="SCENE", help="folder of the scene")
-    add("--from", dest="begin", choices=STAGES, help="do this stage anew, and all after it")
+    add("--from", dest="begin", choices=STAGES, help="repeat this stage and all after it")
     add(
         "--turntable",
         action="store_true",
-        help="the camera stands still and the object turns (found out, but for plain objects)",
+        help="the camera stands still and the object turns (say so where it is not noticed)",
     )
     add("--masks", metavar="FOLDER", help="masks named like the photographs, white on the object")
     add(
         "--mask-command",
         metavar="PROGRAM",
-        help="a program that makes masks, as 'rembg i {image} {mask}'",
+        help="program that makes masks, as 'rembg i {image} {mask}'",
     )
     add(
         "--box",

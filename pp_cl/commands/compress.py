@@ -34,7 +34,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--out", metavar="DIR", help="new folder of the compressed run (RUN-compressed)"
     )
     shared.add_run_scene(parser)
-    parser.add_argument("-v", "--verbose", action="store_true", help="print what is tried, too")
+    parser.add_argument("-v", "--verbose", action="store_true", help="also print what is tried")
     shared.add_device(parser)
 
 

@@ -19,7 +19,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--out",
         metavar="FOLDER",
-        help="write there, not into RUN/eval, which then stays as it is",
+        help="folder to write to, instead of RUN/eval",
     )
     parser.add_argument(
         "--save-images", action="store_true", help="write every view to RUN/eval/images/"
@@ -27,7 +27,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--published",
         action="store_true",
-        help="put published results beside also where those are of other sizes or views",
+        help="show published results even of other sizes or views",
     )
     parser.add_argument(
         "--chart",

@@ -39,8 +39,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--min-weight",
         type=shared.number(0, 1e6),
         metavar="W",
-        help="of ply and glb: leave out points whose blend weights sum to no more than W in every"
-        " training view (0: those that none shows)",
+        help="ply, glb: leave out points whose blend weights add up to at most W in every training"
+        " view (0: points that no view shows)",
     )
     shared.add_run_scene(parser)
     shared.add_device(parser)

@@ -6,7 +6,7 @@ from pp_cl.commands import options as shared
 from pp_cl.errors import UserError
 from pp_cl.presets import PRESETS
 
-HELP = "say what a run or a scene is; --picture draws its points over photographs"
+HELP = "describe a run or a scene; --picture draws its points over photographs"
 MIB = 2**20
 
 
@@ -23,7 +23,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         " two sides (PNG)",
     )
     shared.add_open(parser)
-    add("--preset", choices=PRESETS, help="of a scene: whose hull (tiny)")
+    add("--preset", choices=PRESETS, help="of a scene: preset of the hull (tiny)")
     shared.add_masks(parser)
     shared.add_set(parser, "of a scene: another setting, such as scene.box")
     shared.add_run_scene(parser)

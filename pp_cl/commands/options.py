@@ -206,7 +206,7 @@ def add_metrics(parser: argparse.ArgumentParser) -> None:
         default="psnr,ssim",
         type=words(METRICS),
         metavar="A,B",
-        help="of psnr, ssim, lpips; bare = all three (default psnr,ssim)",
+        help="out of psnr, ssim, lpips; without names all three (default psnr,ssim)",
     )
 
 

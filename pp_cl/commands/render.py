@@ -45,8 +45,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add(
         "--out",
         metavar="NAME",
-        help="a film, by its suffix .mp4, .webm, .webp or .gif, else a folder for frames (default:"
-        " in RUN/render, named after path and size)",
+        help="a film (.mp4, .webm, .webp, .gif), else a folder for frames (default: in RUN/render,"
+        " named after path and size)",
     )
     add(
         "--format",
@@ -58,13 +58,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--fov",
         type=shared.number(1, 150),
         metavar="DEGREES",
-        help="angle of view across the image (default: the scene's)",
+        help="horizontal angle of view (default: the scene's)",
     )
     add(
         "--seconds",
         type=shared.number(1e-3, 1e5),
         metavar="S",
-        help=f"of an orbit or spiral ({SECONDS})",
+        help=f"length of an orbit or spiral ({SECONDS})",
     )
     add(
         "--fps",
@@ -85,9 +85,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         choices=(1, 4, 9, 16),
         default=1,
         metavar="N",
-        help="per pixel: 1, 4, 9 or 16",
+        help="samples per pixel: 1, 4, 9 or 16",
     )
-    add("--features", action="store_true", help="in exr: the 16 features of each pixel too")
+    add("--features", action="store_true", help="exr: also the 16 features of each pixel")
     shared.add_run_scene(parser)
     shared.add_device(parser)
 

@@ -9,7 +9,7 @@ from pp_cl.commands import options as shared
 from pp_cl.errors import Stopped, UserError
 from pp_cl.presets import PRESETS, SHORT
 
-HELP = "train and measure scenes x settings x seeds, with one table; the same command goes on"
+HELP = "train and measure scenes x settings x seeds, with one table; the same command resumes"
 EPILOG = """\
 Each run is a folder DIR/SCENE/[SETTING/]seed-S, as `pp-cl train` and `pp-cl eval` leave it, with
 what its processes said beside it in seed-S.log. A run that is trained and measured is not run
@@ -45,26 +45,26 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         type=shared.several(shared.integer(0, 2**32 - 1)),
         default="0",
         metavar="A,B",
-        help="a run for each (0)",
+        help="one run for each (0)",
     )
-    add("--preset", choices=PRESETS, help="as of `pp-cl train` (tiny)")
+    add("--preset", choices=PRESETS, help="as for `pp-cl train` (tiny)")
     add("--iterations", metavar="N", help="steps of each training")
-    shared.add_set(parser, "a setting of all runs, as of `pp-cl train`")
+    shared.add_set(parser, "a setting of all runs")
     add(
         "--vary",
         action="append",
         default=[],
         metavar="SECTION.KEY=A,B",
-        help="a run for each value; / separates values that are lists; several --vary: every"
+        help="one run for each value; / separates values that are lists; several --vary: every"
         " combination",
     )
     add(
         "--workers",
         type=shared.integer(1, MOST_WORKERS),
         metavar="N",
-        help="runs at the same time (one for each device that works)",
+        help="runs at the same time (one on each GPU, else one)",
     )
-    add("--scheduler", metavar="ADDRESS", help="of a Dask cluster, instead of own workers")
+    add("--scheduler", metavar="ADDRESS", help="a Dask cluster, instead of own workers")
     shared.add_metrics(parser)
     add("--dry-run", action="store_true", help="list the runs, start nothing")
     shared.add_json(parser)

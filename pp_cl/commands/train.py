@@ -27,25 +27,25 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
             " of 800, longer; paper: the paper's numbers"
         ),
     )
-    add("--iterations", metavar="N", help="steps of training; more of them extend a finished run")
+    add("--iterations", metavar="N", help="training steps; more of them extend a finished run")
     add(
         "--minutes",
         metavar="N",
         help=(
-            "instead of iterations: as many as take so long here, within a quarter (reading the"
+            "minutes for the steps, instead of --iterations; kept within a quarter (reading the"
             " scene and `pp-cl eval` come on top)"
         ),
     )
-    add("--points", metavar="N", help="wanted points on the grid")
+    add("--points", metavar="N", help="points wanted in the visual hull")
     add(
         "--downscale", metavar="K", help="reduce the images K times (default: to the preset's size)"
     )
     shared.add_masks(parser)
-    add("--seed", metavar="S", help="of everything random (0)")
+    add("--seed", metavar="S", help="seed of all random choices (0)")
     add(
         "--memory",
         metavar="GIB",
-        help="device memory to use at most",
+        help="most device memory to use",
     )
     add("--eval-every", metavar="N", help="measure a few test views every N steps (never)")
     add(
@@ -53,10 +53,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         action="store_true",
         help="also write the curves to RUN/tensorboard (needs pp-cl[tensorboard])",
     )
-    add("--view", action="store_true", help="look on in the browser, as with `pp-cl view RUN`")
+    add("--view", action="store_true", help="watch in the browser, as with `pp-cl view RUN`")
     add("-v", "--verbose", action="store_true", help="print the memory plan buffer by buffer")
     shared.add_tolerance(parser)
-    shared.add_set(parser, "any other setting, see below")
+    shared.add_set(parser, "any other setting, listed by --help")
     shared.add_device(parser)
 
 

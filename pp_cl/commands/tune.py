@@ -15,7 +15,7 @@ HELP = "time the variants of the convolutions on this device, keep the fastest"
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the command's options."""
-    parser.add_argument("--preset", choices=PRESETS, help="whose network and sizes (tiny)")
+    parser.add_argument("--preset", choices=PRESETS, help="preset of network and sizes (tiny)")
     shared.add_widths(parser, "channels of the levels, if not the preset's")
     parser.add_argument(
         "--size",

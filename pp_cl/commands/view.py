@@ -38,7 +38,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help=f"address to listen on (default {LOOPBACK}: this machine only)",
     )
     add("--open", action="store_true", help="open the page in the default browser")
-    add("--wait", action="store_true", help="wait for RUN to begin; end with a pipe to the input")
+    add("--wait", action="store_true", help="wait for RUN to begin; end when a piped input ends")
     shared.add_run_scene(parser)
     shared.add_device(parser)
 

@@ -14,7 +14,7 @@ from pp_cl.scene.grid import Grid
 
 TRUNCATION = 4.0  # of the distances, in grid edges: depths scatter by one or two
 # What a view in which a vertex is hidden says for its being inside, in views. Without it, one ray
-# that slips between the points hollows out what all other views hide (docs/export.md).
+# that slips between the points hollows out what all other views hide.
 HIDDEN = 0.03
 COVERED = 0.5  # alpha from which a pixel shows the object
 MARGIN = 2  # vertices around the points, so that the surface is closed

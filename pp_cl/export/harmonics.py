@@ -15,7 +15,7 @@ from pp_cl.export.observe import directions, observe
 from pp_cl.run import Run
 
 COUNT = 9  # functions of basis()
-# Two steps more fit the training views better and the test views worse (docs/export.md).
+# Two steps more fit the training views better and the test views worse.
 STEPS = 3
 # Ridge on all but the constant function, per blend weight: a point that few views show has no
 # slopes. On the demo's test views, 0.003 is 0.8 dB better than 0.03.
