@@ -4,7 +4,6 @@ smoothing.
 
 import numpy as np
 
-from pp_cl.raster.points import MOST_OFFSET
 from pp_cl.reference.dense import sh_basis
 
 BETA2 = 0.999  # of both
@@ -58,9 +57,8 @@ class RmsProp:
         self.t = t
         by_basis = np.asarray(rates["sh"])[: self.basis.shape[1]] * self.basis
         self.sh -= by_basis[:, :, None] * moves["sh"][:, None, :]
-        self.offset = np.clip(
-            self.offset - rates["offset"] * moves["offset"], -MOST_OFFSET, MOST_OFFSET
-        )
+        shifted = self.offset - rates["offset"] * moves["offset"]
+        self.offset = np.clip(shifted, -self.most, self.most)
         self.opacity = np.clip(self.opacity - rates["opacity"] * moves["opacity"], 0, 1)
 
 

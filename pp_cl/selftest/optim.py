@@ -50,7 +50,7 @@ class Cloud:
         self.cloud.offset.set(self.start["offset"])
         self.cloud.opacity.set(self.start["opacity"])
         basis = optim.basis(GRID.positions(ids), EYE)[:, :count]
-        self.twin = optim.RmsProp(basis, **self.start)
+        self.twin = optim.RmsProp(basis, MOST_OFFSET, **self.start)
         self.state = PointState(dev, self.cloud)
         self._points = seen_points(dev, GRID.positions(ids), CAMERA)
 

@@ -63,7 +63,7 @@ def test_rmsprop_is_adam_without_a_first_moment_on_the_average_over_directions(r
     basis = optim.basis(directions, np.zeros(3))
     grad = 1e-4 * np.ones((len(basis), 16))
     others = {"offset": np.zeros((len(basis), 4)), "opacity": np.zeros(len(basis))}
-    twin = optim.RmsProp(basis, np.zeros((len(basis), 9, 16)), **others)
+    twin = optim.RmsProp(basis, 0.5, sh=np.zeros((len(basis), 9, 16)), **others)
     adam = optim.Adam(np.zeros((len(basis), 9, 16)), beta1=0.0)
     rates = {"sh": np.ones(9), "offset": 0, "opacity": 0}
     twin.step(1, {"sh": grad} | others, rates, {"sh": 0.0, "offset": 1.0, "opacity": 1.0})
