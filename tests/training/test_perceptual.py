@@ -1,10 +1,8 @@
 """The perceptual term beside what the selftest compares with float64; trainings with it."""
 
-import json
-
 import numpy as np
 import pytest
-from support.runs import arguments
+from support.runs import arguments, rows
 
 from pp_cl.cli import main
 from pp_cl.device.buffers import table_bytes
@@ -88,10 +86,6 @@ def _no_weights():
 
 
 # ---- trainings
-
-
-def rows(out):
-    return [json.loads(line) for line in (out / "log.jsonl").read_text().splitlines()]
 
 
 @pytest.mark.large
