@@ -12,7 +12,7 @@ import numpy as np
 import pyopencl as cl
 from pyopencl.array import Array
 
-from pp_cl.device.device import Device
+from pp_cl.device.device import Device, QueuedArray
 from pp_cl.device.launch import row_parts
 
 # bytes of the scratch that rows are moved through: 1.4 % of a training with 4 million points
@@ -81,7 +81,7 @@ def packed_arrays(dev: Device, rows: Sequence[Row]) -> tuple[Array, list[Array]]
     data: Any = whole.base_data
     for start, (shape, dtype) in zip(_packed_starts(dev, rows), rows, strict=False):
         region = data.get_sub_region(start, max(1, _row_bytes(shape, dtype)))
-        arrays.append(Array(dev.queue, shape, dtype, data=region))
+        arrays.append(QueuedArray(dev.queue, shape, dtype, data=region))
     return whole, arrays
 
 

@@ -138,6 +138,15 @@ class Memory(cl.Buffer):
     """A cl.Buffer that takes weak references, so that its release can be counted."""
 
 
+class QueuedArray(Array):
+    """An Array whose queue works in order, so that it keeps no events: with those of its transfers
+    it would keep the last dozen numpy arrays that it was copied to.
+    """
+
+    def add_event(self, evt: cl.Event) -> None:
+        """Nothing."""
+
+
 class Device:
     """One OpenCL device with its queue, programs and buffers. debug: PP_DEBUG
     (docs/devices.md). is_cpu: drivers and kernels work as they do on CPUs. has_watchdog: long
@@ -264,10 +273,7 @@ class Device:
         return array
 
     def write(self, array: Array, values: np.ndarray) -> None:
-        """Overwrite an array of this device by a numpy array of its shape and dtype.
-
-        Array.set, as Array.get, would keep the numpy array alive as long as the device's.
-        """
+        """Overwrite an array of this device by a numpy array of its shape and dtype."""
         if array.size:
             self._upload(array, values, is_blocking=True)
 
@@ -388,7 +394,7 @@ class Device:
                 f" in use: {SMALLER}"
             )
         what = f"allocate {nbytes / 2**20:.0f} MiB"
-        return self.attempt(what, Array, self.queue, shape, dtype, allocator=self._counted)
+        return self.attempt(what, QueuedArray, self.queue, shape, dtype, allocator=self._counted)
 
     def _counted(self, nbytes):
         """Memory that is counted until the last array on it is gone, be it a slice or a view."""
