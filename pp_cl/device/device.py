@@ -23,6 +23,7 @@ from pp_cl.device.launch import Kernel, Program
 from pp_cl.errors import UserError
 
 SMALLER = "lower --points or raise --downscale"
+FINISH = "finish its work"  # what drivers of GPUs often fail at, for lack of memory
 HUGE = 2**22  # bytes of a buffer for which pages of 2 MiB are worth asking
 STANDARD = ("-cl-std=CL1.2", "-cl-kernel-arg-info")  # options of every build
 # Of Intel's driver of GPUs; others of that vendor refuse options that they do not know.
@@ -339,7 +340,7 @@ class Device:
 
     def finish(self) -> None:
         """Wait until everything enqueued is done."""
-        self.queue.finish()
+        self.attempt(FINISH, self.queue.finish)
 
     def attempt(self, what: str, function: Callable[..., Any], *args, **kwargs) -> Any:
         """Call function(*args, **kwargs); UserError if the driver fails for lack of memory, which

@@ -3,8 +3,10 @@ second array; the selftest has sizes and gathers.
 """
 
 import weakref
+from types import SimpleNamespace
 
 import numpy as np
+import pyopencl as cl
 import pytest
 
 from pp_cl.device.buffers import (
@@ -15,6 +17,7 @@ from pp_cl.device.buffers import (
     read_later,
     table_bytes,
 )
+from pp_cl.errors import UserError
 
 pytestmark = pytest.mark.kernels  # of rows.cl
 
@@ -88,6 +91,22 @@ def test_a_reading_is_what_the_kernels_before_it_left(dev, rng):
     dev.fill(array, 0)
     assert np.array_equal(after.get(), second[250:]) and np.array_equal(before.get(), first)
     assert before.get() is before.get()
+
+
+def test_kernels_that_fail_on_the_device_are_told_of(dev, monkeypatch):
+    """Where the host waits for them, as GPUs find many faults then."""
+
+    def failing():
+        raise cl.RuntimeError("clWaitForEvents failed: EXEC_STATUS_ERROR_FOR_EVENTS_IN_WAIT_LIST")
+
+    reading = read_later(dev, dev.zeros((3,)))
+    reading._event = SimpleNamespace(wait=failing)
+    with pytest.raises(UserError, match="cannot finish its work .*EXEC_STATUS"):
+        reading.get()
+    with monkeypatch.context() as patch:
+        patch.setattr(dev, "queue", SimpleNamespace(finish=failing))
+        with pytest.raises(UserError, match="cannot finish its work"):
+            dev.finish()
 
 
 def test_what_is_sent_may_be_dropped_at_once(dev, rng):
