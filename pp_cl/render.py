@@ -53,6 +53,7 @@ class RenderResult:
     would have seen only background.
     """
 
+    dev: Device
     camera: Camera
     offset: tuple[int, int]
     size: tuple[int, int]
@@ -67,7 +68,7 @@ class RenderResult:
 
     def clamped(self) -> np.ndarray:
         """(height, width, 3) float32 image without the padding, clamped to [0, 1]."""
-        return np.clip(self.cropped(self.image.get()), 0, 1)
+        return np.clip(self.cropped(self.dev.download(self.image)), 0, 1)
 
     def cropped(self, array: np.ndarray) -> np.ndarray:
         """(height, width, ...): an array of the padded pixels without the padding."""
@@ -161,7 +162,7 @@ class Renderer:
                 seed=seed,
             )
         pairs, weights, tiles = self._pairs_and_weights(points, size, gamma, early_stop)
-        result = RenderResult(camera, (left, top), size, points, pairs, weights, tiles)
+        result = RenderResult(dev, camera, (left, top), size, points, pairs, weights, tiles)
         if until == "weights":
             return result
         with dev.stage("shade"):
@@ -277,13 +278,11 @@ class Renderer:
         """Colour, alpha and depth of the camera; with its features where asked for. options: of
         forward().
         """
-        result = self.forward(camera, gamma, **options)
-        with self.dev.stage("depth"):
-            arrays = depth_forward(
-                self.dev, result.points, result.pairs, result.weights, result.size
-            )
-        alpha, depth, median = (result.cropped(array.get()) for array in arrays)
-        shown = result.cropped(result.features.get()) if features else None
+        dev, result = self.dev, self.forward(camera, gamma, **options)
+        with dev.stage("depth"):
+            arrays = depth_forward(dev, result.points, result.pairs, result.weights, result.size)
+        alpha, depth, median = (result.cropped(dev.download(array)) for array in arrays)
+        shown = result.cropped(dev.download(result.features)) if features else None
         return Picture(result.clamped(), alpha, depth, median, features=shown)
 
 

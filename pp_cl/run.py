@@ -150,14 +150,13 @@ class Run:
             raise ValueError(f"{samples} samples are no square number")
         shifts = (np.arange(side) + 0.5) / side - 0.5
         depths = self.depth_range(camera)
-        pictures = [
+        picture = mean_picture(
             self.renderer.picture(
                 camera.shifted(dx, dy), self.gamma, features=features, depth_range=depths
             )
             for dy in shifts
             for dx in shifts
-        ]
-        picture = mean_picture(pictures)
+        )
         self.checked(picture.colour)
         return picture
 

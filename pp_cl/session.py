@@ -195,9 +195,11 @@ class Training:
 
     def _measure(self):
         """{"test_psnr": mean over the measured views, of 8-bit images} of the present model."""
-        trainer = self.trainer
-        pairs = [(self._rendered(view), trainer.target(view)) for view in self.measured]
-        return {"test_psnr": float(np.mean([psnr(to_8bit(a), to_8bit(b)) for a, b in pairs]))}
+        found = [
+            psnr(to_8bit(self._rendered(view)), to_8bit(self.trainer.target(view)))
+            for view in self.measured
+        ]
+        return {"test_psnr": float(np.mean(found))}
 
     def _lacks_previews(self):
         return self.config.train.previews and not any(self.folder.previews.glob("*.png"))

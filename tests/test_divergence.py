@@ -6,16 +6,11 @@ import json
 
 import numpy as np
 import pytest
-from support.runs import arguments
+from support.runs import arguments, rows
 
 from pp_cl.cli import main
 from pp_cl.files.checkpoint import load_checkpoint
 from pp_cl.training.optim import Optimiser
-
-
-def rows(out):
-    return [json.loads(line) for line in (out / "log.jsonl").read_text().splitlines()]
-
 
 KEPT = "checkpoint.npz of step 10 is kept: train into another --out with a lower network.rate"
 # {what happens: (the step after which, to what, other settings, what is said)}

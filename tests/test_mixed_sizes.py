@@ -4,7 +4,7 @@ import json
 
 import numpy as np
 import pytest
-from support.runs import arguments, train_and_interrupt
+from support.runs import arguments, checkpoint, train_and_interrupt
 from support.scenes import ball_image, ring_cameras
 
 from pp_cl.cli import main
@@ -58,8 +58,7 @@ def test_a_training_learns_and_resumes_to_the_same_bytes(scene, trained, tmp_pat
     crop = json.loads((trained / "config.json").read_text())["train"]["crop"]
     train_and_interrupt(scene, tmp_path / "run", 33, monkeypatch, downscale=1, train__crop=crop)
     assert main(arguments(scene, tmp_path / "run", 1, train__crop=crop)) == 0
-    checkpoint = (tmp_path / "run" / "checkpoint.npz").read_bytes()
-    assert checkpoint == (trained / "checkpoint.npz").read_bytes()
+    assert checkpoint(tmp_path / "run") == checkpoint(trained)
     psnr = [row["psnr"] for row in RunFolder(trained).rows() if "psnr" in row]
     assert psnr[-1] > psnr[0] + 3
 

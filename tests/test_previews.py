@@ -4,7 +4,7 @@ import json
 from pathlib import Path
 
 import pytest
-from support.runs import arguments, train_and_interrupt
+from support.runs import arguments, checkpoint, rows, train_and_interrupt
 from support.scenes import write_ball_scene
 
 from pp_cl.cli import main
@@ -16,12 +16,11 @@ def test_views_are_measured_on_the_way_without_a_change_of_the_run(tmp_path, cap
     last = {"train__final_prune_weight": 0}
     assert main(arguments(scene, plain, **last)) == 0
     assert main([*arguments(scene, measured, **last), "--eval-every", "12"]) == 0
-    one, other = ((run / "checkpoint.npz").read_bytes() for run in (plain, measured))
-    assert one == other
-    rows = [json.loads(line) for line in (measured / "log.jsonl").read_text().splitlines()]
-    tests = {row["step"]: row["test_psnr"] for row in rows if "test_psnr" in row}
+    assert checkpoint(plain) == checkpoint(measured)
+    log = rows(measured)
+    tests = {row["step"]: row["test_psnr"] for row in log if "test_psnr" in row}
     assert list(tests) == [12, 24, 36, 48, 60] and tests[60] > tests[12] + 3
-    assert all("psnr" in row for row in rows[:-1])
+    assert all("psnr" in row for row in log[:-1])
     capsys.readouterr()
     assert main(["eval", str(measured), "--metrics", "psnr"]) == 0
     mean = json.loads((measured / "eval" / "metrics.json").read_text())["mean"]["psnr"]
@@ -63,8 +62,7 @@ def test_previews_leave_the_run_as_it_is(tmp_path, monkeypatch, changes):
     names = [[p.name for p in sorted((run / "previews").iterdir())] for run in (none, many)]
     assert names[0] == ["step_000060.png"]
     assert names[1] == [f"step_{step:06d}.png" for step in (1, *range(9, 60, 9), 60)]
-    one, other = ((run / "checkpoint.npz").read_bytes() for run in (none, many))
-    assert one == other
+    assert checkpoint(none) == checkpoint(many)
 
 
 def test_a_run_that_has_a_preview_needs_no_early_one(tmp_path, monkeypatch):

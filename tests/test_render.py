@@ -21,15 +21,13 @@ from pp_cl.settings import RasterConfig
 GAMMA = 0.03
 
 
-def chained(model, settings, camera, opacity=None, sh=None, tracked=0):
-    """Float64 (picture, function from its gradient to (grad_opacity, grad_sh, network gradients))
-    of the padded camera.
+def chained(model, settings, camera):
+    """Float64 (picture, function from its gradient to those of the points' features, of their
+    opacities and of the network) of the padded camera.
     """
     padded, _, _ = camera.padded(4)
-    positions = GRID.positions(model.cloud.ids.get())
-    opacity = model.cloud.opacity.get().astype(np.float64) if opacity is None else opacity
-    if sh is None:
-        sh = np.concatenate([array.get() for array in model.cloud.sh], 1).astype(np.float64)
+    positions, opacity = GRID.positions(model.cloud.ids.get()), model.cloud.opacity.get()
+    sh = np.concatenate([array.get() for array in model.cloud.sh], 1)
     unit = GRID.edge if settings.footprint == "soft" else np.ptp(model.depth_range) / 4
     geometry = oracle_raster.geometry(padded, positions, settings.radius * unit, settings.footprint)
     blend = oracle_raster.blend_by_rule(
@@ -46,19 +44,9 @@ def chained(model, settings, camera, opacity=None, sh=None, tracked=0):
     def backward(grad_picture):
         grad_net = network_gradients(layers, parameters, outputs, active, grad_image=grad_picture)
         grad_features = grad_net.pop("x").reshape(-1, 16)
-        grad_shaded, grad_opacity = oracle_raster.gradients(
-            geometry,
-            blend,
-            shaded,
-            grad_features,
-            max_tracked=tracked,
-            mean=settings.mean_gradient,
-        )
-        directions = positions - padded.eye
-        basis = oracle_raster.sh_basis(
-            directions / np.linalg.norm(directions, axis=1, keepdims=True)
-        )
-        return grad_shaded, grad_opacity, basis[:, :, None] * grad_shaded[:, None], grad_net
+        options = {"max_tracked": settings.max_tracked, "mean": settings.mean_gradient}
+        of_points = oracle_raster.gradients(geometry, blend, shaded, grad_features, **options)
+        return *of_points, grad_net
 
     return outputs["image"], backward
 
@@ -87,13 +75,13 @@ def test_picture_and_gradients(dev, rng, name, early_stop, blend):
     renderer = Renderer(dev, model, settings)
     result = renderer.forward(camera, GAMMA, training=True)
     picture = result.image.get()
-    expected, backward = chained(model, settings, camera, tracked=settings.max_tracked)
+    expected, backward = chained(model, settings, camera)
     assert picture.shape == (20, 24, 3) and relative_error(picture, expected) < 1e-5
 
     grad = rng.normal(size=picture.shape).astype(np.float32)
     grad_features, grad_opacity, *_ = renderer.backward(result, dev.upload(grad))
     shaded = result.weights.shaded.get()
-    want_features, want_opacity, _, want_net = backward(grad)
+    want_features, want_opacity, want_net = backward(grad)
     assert np.abs(want_features).max() > 0 and np.abs(want_opacity).max() > 0
     assert not np.delete(want_features, shaded, axis=0).any()
     assert not np.delete(want_opacity, shaded).any()
@@ -101,31 +89,6 @@ def test_picture_and_gradients(dev, rng, name, early_stop, blend):
     assert relative_error(grad_opacity.get()[: len(shaded)], want_opacity[shaded]) < 5e-5
     for key, value in plain_parameters(model.net, model.net.gradients).items():
         assert relative_error(value, want_net[key]) < 5e-5, key
-
-
-def test_the_chain_is_the_derivative(dev, rng):
-    model, camera = make_model(dev, rng, 40), ring_cameras(1, 20)[0].crop(4, 4, 12, 12)
-    settings, n = RasterConfig(), 40
-    grad = rng.normal(size=(12, 12, 3))
-    _, backward = chained(model, settings, camera)
-    _, grad_opacity, grad_sh, _ = backward(grad)
-    opacity = model.cloud.opacity.get().astype(np.float64)
-    sh = np.concatenate([array.get() for array in model.cloud.sh], 1).astype(np.float64)
-
-    def loss(o, s):
-        return (chained(model, settings, camera, o, s)[0] * grad).sum()
-
-    for direction in rng.normal(size=(3, n)):
-        direction = np.where((opacity > 0) & (opacity < 1), direction, 0)
-        numeric = (
-            loss(opacity + 1e-6 * direction, sh) - loss(opacity - 1e-6 * direction, sh)
-        ) / 2e-6
-        assert numeric == pytest.approx((grad_opacity * direction).sum(), rel=1e-4)
-    for direction in rng.normal(size=(3, *sh.shape)):
-        numeric = (
-            loss(opacity, sh + 1e-6 * direction) - loss(opacity, sh - 1e-6 * direction)
-        ) / 2e-6
-        assert numeric == pytest.approx((grad_sh * direction).sum(), rel=1e-4)
 
 
 def test_padding_does_not_move_the_picture(dev, rng):

@@ -2,22 +2,17 @@
 not.
 """
 
-import json
 import re
 
 import numpy as np
 import pytest
-from support.runs import arguments, train_and_interrupt
+from support.runs import arguments, checkpoint, rows, train_and_interrupt
 
 from pp_cl import load
 from pp_cl.cli import main
 from pp_cl.files.checkpoint import load_checkpoint
 from pp_cl.scene.grid import Grid
 from pp_cl.train import SPECK
-
-
-def rows(out):
-    return [json.loads(line) for line in (out / "log.jsonl").read_text().splitlines()]
 
 
 def test_a_run_learns_and_leaves_its_files(finished):
@@ -38,13 +33,9 @@ def test_a_run_learns_and_leaves_its_files(finished):
 
 def test_the_same_seed_gives_the_same_bytes_and_another_does_not(scene, finished, tmp_path):
     assert main(arguments(scene, tmp_path / "again")) == 0
-    assert (tmp_path / "again" / "checkpoint.npz").read_bytes() == (
-        finished / "checkpoint.npz"
-    ).read_bytes()
+    assert checkpoint(tmp_path / "again") == checkpoint(finished)
     assert main(arguments(scene, tmp_path / "other", train__seed=1)) == 0
-    assert (tmp_path / "other" / "checkpoint.npz").read_bytes() != (
-        finished / "checkpoint.npz"
-    ).read_bytes()
+    assert checkpoint(tmp_path / "other") != checkpoint(finished)
 
 
 @pytest.mark.parametrize("steps", [25, 59])
@@ -53,9 +44,7 @@ def test_stopped_at_any_step_it_resumes_to_the_same_bytes(
 ):
     train_and_interrupt(scene, tmp_path / "run", steps, monkeypatch)
     assert main(arguments(scene, tmp_path / "run")) == 0
-    assert (tmp_path / "run" / "checkpoint.npz").read_bytes() == (
-        finished / "checkpoint.npz"
-    ).read_bytes()
+    assert checkpoint(tmp_path / "run") == checkpoint(finished)
     strip = [{k: v for k, v in r.items() if k != "seconds"} for r in rows(tmp_path / "run")]
     assert strip == [{k: v for k, v in r.items() if k != "seconds"} for r in rows(finished)]
 
@@ -71,7 +60,7 @@ def test_the_networks_other_blocks_learn_and_resume_to_the_same_bytes(
     assert np.mean(losses[-3:]) < 0.6 * losses[0]
     train_and_interrupt(scene, run, 47, monkeypatch, **changes)
     assert main(["train", scene, "--out", str(run)]) == 0  # the settings are the run's
-    assert (run / "checkpoint.npz").read_bytes() == (whole / "checkpoint.npz").read_bytes()
+    assert checkpoint(run) == checkpoint(whole)
     capsys.readouterr()
     assert main(arguments(scene, run, network__blocks="single")) == 2
     assert f"network.blocks is {blocks} there, single asked for" in capsys.readouterr().err
@@ -107,9 +96,7 @@ def test_bounded_memory_gives_the_same_bytes(scene, tmp_path, capsys, monkeypatc
     monkeypatch.setattr("pp_cl.device.buffers.SCRATCH_BYTES", 100_000)
     monkeypatch.setenv("PP_MAX_ALLOCATION", str(200 * points / 2**20))
     assert main(arguments(scene, tmp_path / "bounded", **changes)) == 0
-    assert (tmp_path / "bounded" / "checkpoint.npz").read_bytes() == (
-        tmp_path / "free" / "checkpoint.npz"
-    ).read_bytes()
+    assert checkpoint(tmp_path / "bounded") == checkpoint(tmp_path / "free")
     monkeypatch.setenv("PP_MAX_ALLOCATION", str(150 * points / 2**20))
     assert main(arguments(scene, tmp_path / "smaller", **changes)) == 2
     assert "at once" in capsys.readouterr().err

@@ -9,7 +9,7 @@ import shutil
 import numpy as np
 import pytest
 from PIL import Image
-from support.runs import arguments, train_and_interrupt
+from support.runs import arguments, checkpoint, rows, train_and_interrupt
 from support.scenes import write_ball_scene
 
 from pp_cl.cli import main
@@ -65,10 +65,10 @@ def test_a_finished_run_is_extended_and_resumes_to_the_same_bytes(
     assert header["finished"] and (header["step"], header["extended_from"]) == (iterations, 20)
     config = json.loads((whole / "config.json").read_text())
     assert config["train"]["iterations"] == iterations
-    rows = [json.loads(line) for line in (whole / "log.jsonl").read_text().splitlines()]
-    assert [row["step"] for row in rows[:4]] == [5, 10, 15, 20] and rows[-2]["step"] == iterations
-    assert all(a["points"] >= b["points"] for a, b in itertools.pairwise(rows[3:]))
-    assert np.mean([row["loss"] for row in rows[-3:-1]]) < 1.1 * rows[3]["loss"]
+    log = rows(whole)
+    assert [row["step"] for row in log[:4]] == [5, 10, 15, 20] and log[-2]["step"] == iterations
+    assert all(a["points"] >= b["points"] for a, b in itertools.pairwise(log[3:]))
+    assert np.mean([row["loss"] for row in log[-3:-1]]) < 1.1 * log[3]["loss"]
     for step in (20, stop):  # before the first step, and later on
         with monkeypatch.context() as patch:
             patch.setattr(Trainer, "train_step", interrupted_after(step))
@@ -77,8 +77,7 @@ def test_a_finished_run_is_extended_and_resumes_to_the_same_bytes(
         assert main(["eval", str(stopped), "--metrics", "psnr"]) == 0
     assert main(words(stopped, 20)) == 2  # it is on its way to more
     assert main(words(stopped, iterations)) == 0
-    name = "checkpoint.npz"
-    assert (stopped / name).read_bytes() == (whole / name).read_bytes()
+    assert checkpoint(stopped) == checkpoint(whole)
 
 
 # nothing depends on the number of steps
@@ -105,7 +104,7 @@ def test_without_schedules_an_extended_run_is_the_longer_one(scene, tmp_path, ca
         assert main(arguments(scene, folder, **ENDLESS, train__iterations=steps)) == 0
     header, arrays = load_checkpoint(whole / "checkpoint.npz")
     assert len(arrays["points.ids"]) < header["initial_points"]
-    assert (out / "checkpoint.npz").read_bytes() == (whole / "checkpoint.npz").read_bytes()
+    assert checkpoint(out) == checkpoint(whole)
     assert "differ" not in capsys.readouterr().out
 
 
@@ -124,9 +123,7 @@ def test_a_scene_that_has_moved_is_known_by_its_views(scene, finished, tmp_path,
     train_and_interrupt(scene, tmp_path / "run", 25, monkeypatch)
     shutil.copytree(scene, tmp_path / "moved")
     assert main(arguments(str(tmp_path / "moved"), tmp_path / "run")) == 0
-    assert (tmp_path / "run" / "checkpoint.npz").read_bytes() == (
-        finished / "checkpoint.npz"
-    ).read_bytes()
+    assert checkpoint(tmp_path / "run") == checkpoint(finished)
     config = json.loads((tmp_path / "run" / "config.json").read_text())
     assert config["scene"]["path"] == str(tmp_path / "moved")
 
@@ -135,14 +132,14 @@ def test_a_scene_whose_pixels_have_changed_is_refused(scene, tmp_path, capsys, m
     folder, out = tmp_path / "ball", tmp_path / "run"
     shutil.copytree(scene, folder)
     train_and_interrupt(str(folder), out, 15, monkeypatch)
-    before = (out / "checkpoint.npz").read_bytes()
+    before = checkpoint(out)
     pixels = np.array(Image.open(folder / "train" / "r_3.png"))
     pixels[0, 0, 0] ^= 1
     Image.fromarray(pixels).save(folder / "train" / "r_3.png")
     assert main(arguments(str(folder), out)) == 2
     error = capsys.readouterr().err.splitlines()[-1]
     assert "belongs to another scene" in error and "train/r_3.png: other pixels" in error
-    assert (out / "checkpoint.npz").read_bytes() == before
+    assert checkpoint(out) == before
 
 
 @pytest.mark.parametrize("steps", [25, 5, 60])
@@ -169,13 +166,12 @@ def test_a_refined_run_resumes_to_the_same_bytes(tmp_path, monkeypatch, share, s
     changes = {"train__refine_at": f"{share},1", "points__count": 300, "train__prune_looks": 4}
     changes["downscale"] = 1
     assert main(arguments(scene, tmp_path / "whole", **changes)) == 0
-    whole = (tmp_path / "whole" / "checkpoint.npz").read_bytes()
-    log = (tmp_path / "whole" / "log.jsonl").read_text().splitlines()
-    points = {row["step"]: row["points"] for row in map(json.loads, log[:-1])}
+    whole = checkpoint(tmp_path / "whole")
+    points = {row["step"]: row["points"] for row in rows(tmp_path / "whole")[:-1]}
     after = round(60 * share) // 5 * 5 + 5
     assert points[after] > 4 * points[after - 5]
     for steps in stops:
         out = tmp_path / str(steps)
         train_and_interrupt(scene, out, steps, monkeypatch, **changes)
         assert main(arguments(scene, out, **changes)) == 0
-        assert (out / "checkpoint.npz").read_bytes() == whole
+        assert checkpoint(out) == whole

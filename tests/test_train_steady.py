@@ -5,7 +5,6 @@ import collections
 import numpy as np
 import pyopencl as cl
 import pytest
-from pyopencl.array import Array
 from support.models import drawn_alone
 
 import pp_cl.network.unet
@@ -100,16 +99,6 @@ def test_a_step_waits_once_and_allocates_nothing(dev, scene, tmp_path, monkeypat
     if name == "tiny" and not planned and dev.is_cpu:
         assert recorder.counts["launches"] <= 5 * MOST_LAUNCHES
     assert recorder.counts["read"] > 0
-
-
-def test_a_step_keeps_no_copy_of_the_points_on_the_host(dev, scene, tmp_path, monkeypatch):
-    """As Array's get() and set() do, for as long as the device's array lives."""
-    trainer = make_trainer(dev, scene, tmp_path / "run", "tiny")
-    trainer.config.prune_every = trainer.config.sh_smoothing_every = 1
-    for name in ("get", "set"):
-        monkeypatch.setattr(Array, name, None)
-    trainer.train_step()
-    trainer.finish()
 
 
 def test_the_end_holds_no_view_beside_another(dev, scene, tmp_path, monkeypatch):

@@ -13,7 +13,16 @@ import numpy as np
 from pp_cl.bench.timing import PeakFlops, errors, variant_rows
 from pp_cl.device.device import Device
 from pp_cl.layers.choice import OFFERED, VARIANTS, ConvolutionPolicy, can_run, device_class
-from pp_cl.layers.conv_direct import Blocking, Direction, pack_bias, pack_weights, unpack_weights
+from pp_cl.layers.conv_direct import (
+    PARTIAL,
+    Blocking,
+    Direction,
+    pack_bias,
+    pack_weights,
+    sum_parts,
+    table_of_sums,
+    unpack_weights,
+)
 from pp_cl.layers.tiles import Tiles, all_tiles
 from pp_cl.network.layers import convolutions, unet_layers
 from pp_cl.reference import network as reference
@@ -112,8 +121,15 @@ class UploadedLayer:
                 dev, blocking, parts, weight, self.bias, self.out, relu=self.relu, tiles=tiles
             )
         elif direction == Direction.BACKWARD_WEIGHTS:
-            gradients = self.grad_weight, self.grad_bias
-            conv.backward_weights(dev, blocking, parts, grad_out, *gradients, tiles=tiles)
+            shape, height = weight.shape, len(grad_out)
+            floats = conv.scratch_floats(dev, blocking, direction, height, shape, shape[3])
+            partial = dev.scratch(PARTIAL, floats[PARTIAL])
+            count = conv.backward_weights(
+                dev, blocking, parts, grad_out, shape, partial, tiles=tiles
+            )
+            rows, n = table_of_sums([(shape, count, 0, 0, 0)])
+            table = dev.constant(rows)
+            sum_parts(dev, table, n, partial, self.grad_weight, self.grad_bias)
         else:
             first = 0
             for part, grad in zip(parts, self.grad_parts, strict=True):

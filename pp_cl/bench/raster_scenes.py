@@ -249,7 +249,7 @@ class PulsarScene(BenchScene):
         with dev.stage("blend"):
             features = gather_rows(dev, self.device_features, weights.shaded)
             blend_forward(dev, pairs, weights, features, self.features)
-        result = RenderResult(self.camera, (0, 0), size, points, pairs, weights, None)
+        result = RenderResult(dev, self.camera, (0, 0), size, points, pairs, weights, None)
         result.shaded_features, result.features = features, self.features
         return result
 

@@ -12,7 +12,7 @@ import numpy as np
 import pyopencl as cl
 from pyopencl.array import Array
 
-from pp_cl.device.device import Device
+from pp_cl.device.device import FINISH, Device, QueuedArray
 from pp_cl.device.launch import row_parts
 
 # bytes of the scratch that rows are moved through: 1.4 % of a training with 4 million points
@@ -81,7 +81,7 @@ def packed_arrays(dev: Device, rows: Sequence[Row]) -> tuple[Array, list[Array]]
     data: Any = whole.base_data
     for start, (shape, dtype) in zip(_packed_starts(dev, rows), rows, strict=False):
         region = data.get_sub_region(start, max(1, _row_bytes(shape, dtype)))
-        arrays.append(Array(dev.queue, shape, dtype, data=region))
+        arrays.append(QueuedArray(dev.queue, shape, dtype, data=region))
     return whole, arrays
 
 
@@ -129,15 +129,22 @@ class Reading(Generic[T]):
     values: the target of the download, filled at the event. convert: makes the value of them.
     """
 
-    def __init__(self, event: cl.Event, values: np.ndarray, convert: Callable[[np.ndarray], T]):
+    def __init__(
+        self,
+        dev: Device,
+        event: cl.Event,
+        values: np.ndarray,
+        convert: Callable[[np.ndarray], T],
+    ):
+        self._dev = dev
         self._event: cl.Event | None = event
         self._values: Any = values
         self._convert = convert
 
     def get(self) -> T:
-        """The value; waits for the download."""
+        """The value; waits for the download. Raises UserError as Device.attempt() does."""
         if self._event is not None:
-            self._event.wait()
+            self._dev.attempt(FINISH, self._event.wait)
             self._values = self._convert(self._values)
             self._event = None
         return self._values
@@ -162,7 +169,7 @@ def read_later(
         src_offset=array.offset + start * array.dtype.itemsize,
         is_blocking=False,
     )
-    return Reading(event, values, convert)
+    return Reading(dev, event, values, convert)
 
 
 # ---- rows; none of it takes a second array of a model's size, which may not fit into memory

@@ -23,6 +23,7 @@ from pp_cl.device.launch import Kernel, Program
 from pp_cl.errors import UserError
 
 SMALLER = "lower --points or raise --downscale"
+FINISH = "finish its work"  # what drivers of GPUs often fail at, for lack of memory
 HUGE = 2**22  # bytes of a buffer for which pages of 2 MiB are worth asking
 STANDARD = ("-cl-std=CL1.2", "-cl-kernel-arg-info")  # options of every build
 # Of Intel's driver of GPUs; others of that vendor refuse options that they do not know.
@@ -136,6 +137,15 @@ def _released(device, nbytes):
 
 class Memory(cl.Buffer):
     """A cl.Buffer that takes weak references, so that its release can be counted."""
+
+
+class QueuedArray(Array):
+    """An Array whose queue works in order, so that it keeps no events: with those of its transfers
+    it would keep the last dozen numpy arrays that it was copied to.
+    """
+
+    def add_event(self, evt: cl.Event) -> None:
+        """Nothing."""
 
 
 class Device:
@@ -264,10 +274,7 @@ class Device:
         return array
 
     def write(self, array: Array, values: np.ndarray) -> None:
-        """Overwrite an array of this device by a numpy array of its shape and dtype.
-
-        Array.set, as Array.get, would keep the numpy array alive as long as the device's.
-        """
+        """Overwrite an array of this device by a numpy array of its shape and dtype."""
         if array.size:
             self._upload(array, values, is_blocking=True)
 
@@ -333,7 +340,7 @@ class Device:
 
     def finish(self) -> None:
         """Wait until everything enqueued is done."""
-        self.queue.finish()
+        self.attempt(FINISH, self.queue.finish)
 
     def attempt(self, what: str, function: Callable[..., Any], *args, **kwargs) -> Any:
         """Call function(*args, **kwargs); UserError if the driver fails for lack of memory, which
@@ -388,7 +395,7 @@ class Device:
                 f" in use: {SMALLER}"
             )
         what = f"allocate {nbytes / 2**20:.0f} MiB"
-        return self.attempt(what, Array, self.queue, shape, dtype, allocator=self._counted)
+        return self.attempt(what, QueuedArray, self.queue, shape, dtype, allocator=self._counted)
 
     def _counted(self, nbytes):
         """Memory that is counted until the last array on it is gone, be it a slice or a view."""

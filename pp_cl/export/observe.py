@@ -18,9 +18,9 @@ from pp_cl.scene.camera import Camera
 NO_POINT = 0xFFFFFFFF  # of a pixel entry: the hits behind it were dropped
 
 
-@dataclass(frozen=True)
+@dataclass
 class Observation:
-    """A run's N points in a view of H x W pixels; valid until the next view is weighed."""
+    """A run's N points in a view of H x W pixels; gone once the next view is asked for."""
 
     run: Run
     camera: Camera
@@ -58,8 +58,12 @@ def observe(run: Run, cameras: list[Camera], text: str) -> Iterator[Observation]
     """What the points contribute to each camera's view, in turn; a progress bar with a text shows
     on a terminal.
     """
+    seen = None
     for camera in tqdm(cameras, desc=text, unit="view", leave=False, disable=None):
-        yield Observation(run, camera, run.renderer.forward(camera, run.gamma, until="weights"))
+        if seen:
+            del seen.view  # else its arrays would stay beside the larger ones of this view
+        seen = Observation(run, camera, run.renderer.forward(camera, run.gamma, until="weights"))
+        yield seen
 
 
 def directions(positions: np.ndarray, camera: Camera) -> np.ndarray:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -81,11 +82,15 @@ class Picture:
         return encoded.getvalue()
 
 
-def mean_picture(pictures: list[Picture]) -> Picture:
-    """The mean of several samples of one view; depths and features are those of the first."""
-    first = pictures[0]
-    colour, alpha = (
-        np.asarray(np.mean([getattr(p, name) for p in pictures], axis=0, dtype=np.float32))
-        for name in ("colour", "alpha")
-    )
+def mean_picture(pictures: Iterable[Picture]) -> Picture:
+    """The mean of several samples of one view, each of which is forgotten before the next is taken;
+    depths and features are those of the first.
+    """
+    taken = iter(pictures)
+    first, n = next(taken), 1
+    colour, alpha = first.colour, first.alpha
+    for sample in taken:
+        colour, alpha, n = colour + sample.colour, alpha + sample.alpha, n + 1
+        del sample
+    colour, alpha = ((total / np.float64(n)).astype(np.float32) for total in (colour, alpha))
     return Picture(colour, alpha, first.depth, first.median_depth, first.features)

@@ -30,7 +30,7 @@ Layout = tuple[int, int, tuple[int, ...], Any, int, int]
 # Gradients of weights to sum: shape, parts, first float of the parts, of the weights' gradient and
 # of the biases'.
 Sums = tuple[tuple[int, ...], int, int, int, int]
-# Names of the memory that convolutions share (Device.scratch()).
+# Names of the memory that convolutions work in.
 FLIPPED, PARTIAL = "flipped weights", "parts of the weights' gradients"
 
 
@@ -89,18 +89,20 @@ def pack_bias(bias: np.ndarray, dtype: type = np.float32) -> np.ndarray:
     return np.pad(np.asarray(bias, dtype), (0, -len(bias) % VECTOR))
 
 
-def check_weights(sources: tuple[Array, ...], weight: Array, bias: Array, out: Array) -> None:
-    """Raise ValueError unless weight (ceil(CO/16), K, K, CI, 16) and bias (ceil(CO/16) * 16,), or
-    their gradients, are those of a convolution of the sources (H, W, C1), (H, W, C2) to out (H, W,
-    CO).
+def check_weights(
+    sources: tuple[Array, ...], weight_shape: tuple, out: Array, bias: Array | None = None
+) -> None:
+    """Raise ValueError unless weights (ceil(CO/16), K, K, CI, 16), and a bias (ceil(CO/16) * 16,),
+    are those of a convolution of the sources (H, W, C1), (H, W, C2) to out (H, W, CO).
     """
     co, channels = out.shape[2], [source.shape[2] for source in sources]
     blocks = -(-co // VECTOR)
+    of_bias = (blocks * VECTOR,) if bias is None else bias.shape
     expected = blocks, sum(channels), (blocks * VECTOR,)
-    if (weight.shape[0], weight.shape[3], bias.shape) != expected:
+    if (weight_shape[0], weight_shape[3], of_bias) != expected:
         raise ValueError(
             f"convolution of {' + '.join(map(str, channels))} to {co} channels: weight is"
-            f" {weight.shape}, bias {bias.shape}"
+            f" {weight_shape}, bias {of_bias}"
         )
 
 
@@ -131,12 +133,6 @@ def sum_parts(
         grad_weights=grad_weights,
         grad_biases=grad_biases,
     )
-
-
-def summed(dev: Device, partial: Array, parts: int, grad_weight: Array, grad_bias: Array) -> None:
-    """sum_parts() of one layer's weights."""
-    rows, n = table_of_sums([(grad_weight.shape, parts, 0, 0, 0)])
-    sum_parts(dev, dev.constant(rows), n, partial, grad_weight, grad_bias)
 
 
 def scratch_floats(
@@ -211,7 +207,7 @@ def forward(
     do not fit together.
     """
     height, width, co = out.shape
-    check_weights(sources, weight, bias, out)
+    check_weights(sources, weight.shape, out, bias)
     channels = [source.shape[2] for source in sources]
     tiles = checked_tiles(dev, tiles, height, width)
     program, size, work_group = _program(dev, blocking, weight.shape[1], out.shape)
@@ -284,30 +280,24 @@ def backward_weights(
     blocking: Blocking,
     sources: tuple[Array, ...],
     grad_out: Array,
-    grad_weight: Array,
-    grad_bias: Array,
+    weight_shape: tuple,
+    partial: Array,
     *,
     tiles: Tiles | None = None,
-    partial: Array | None = None,
 ) -> int:
-    """Overwrite grad_weight and grad_bias, shaped as forward()'s, with the gradients of forward(
-    sources, ...), given dL/dout (H, W, CO) before the ReLU.
+    """Write the gradients of forward(sources, ...)'s weights and biases, given dL/dout (H, W, CO)
+    before the ReLU, as sums of the image's parts, which sum_parts() sums.
 
-    tiles: those of grad_out to sum, each as often as it counts, None = all, once. The order of the
-    sums depends on the shapes alone. partial: (?,) of scratch_floats()[PARTIAL], to leave the sums
-    of the image's parts for sum_parts() instead. Returns how many parts. Raises ValueError when
-    shapes do not fit together.
+    weight_shape: of forward()'s weight. partial: (?,) float32 of scratch_floats()[PARTIAL]. tiles:
+    those of grad_out to sum, each as often as it counts, None = all, once. The order of the sums
+    depends on the shapes alone. Returns how many parts. Raises ValueError when shapes do not fit
+    together.
     """
     height, width, co = grad_out.shape
-    blocks, k, _, ci, _ = grad_weight.shape
-    check_weights(sources, grad_weight, grad_bias, grad_out)
-    held = (
-        dev.scratch(PARTIAL, partial_floats(height, grad_weight.shape))
-        if partial is None
-        else partial
-    )
+    blocks, k, _, ci, _ = weight_shape
+    check_weights(sources, weight_shape, grad_out)
     tiles = checked_tiles(dev, tiles, height, width)
-    parts, rows = image_parts(height, grad_weight.shape)
+    parts, rows = image_parts(height, weight_shape)
     first = 0
     for source in sources:
         c = source.shape[2]
@@ -328,11 +318,9 @@ def backward_weights(
             x=source,
             grad_out=grad_out,
             tile_count=tiles.count,
-            partial=held,
+            partial=partial,
         )
         first += c
-    if partial is None:
-        summed(dev, held, parts, grad_weight, grad_bias)
     return parts
 
 

@@ -8,16 +8,13 @@ from pyopencl.array import Array
 
 from pp_cl.device.device import Device
 from pp_cl.layers.conv_direct import (
-    PARTIAL,
     Blocking,
     check_weights,
     flipped_weights,
     image_parts,
     laid_out_floats,
     lay_out,
-    partial_floats,
     scratch_floats,
-    summed,
 )
 from pp_cl.layers.tiles import SIDE, VECTOR, Tiles, checked_tiles
 
@@ -58,7 +55,7 @@ def forward(
 ) -> None:
     """See conv_direct.forward."""
     height, width, co = out.shape
-    check_weights(sources, weight, bias, out)
+    check_weights(sources, weight.shape, out, bias)
     channels = [source.shape[2] for source in sources]
     tiles = checked_tiles(dev, tiles, height, width)
     program, size, work_group = _program(
@@ -123,25 +120,19 @@ def backward_weights(
     _blocking: Blocking,
     sources: tuple[Array, ...],
     grad_out: Array,
-    grad_weight: Array,
-    grad_bias: Array,
+    weight_shape: tuple,
+    partial: Array,
     *,
     tiles: Tiles | None = None,
-    partial: Array | None = None,
 ) -> int:
     """See conv_direct.backward_weights. The order of the sums depends on the shapes and the number
     of tiles alone.
     """
     height, width, co = grad_out.shape
-    blocks, k, _, ci, _ = grad_weight.shape
-    check_weights(sources, grad_weight, grad_bias, grad_out)
-    held = (
-        dev.scratch(PARTIAL, partial_floats(height, grad_weight.shape))
-        if partial is None
-        else partial
-    )
+    blocks, k, _, ci, _ = weight_shape
+    check_weights(sources, weight_shape, grad_out)
     tiles = checked_tiles(dev, tiles, height, width)
-    run = max(SUMMED, -(-tiles.number // image_parts(height, grad_weight.shape)[0]))
+    run = max(SUMMED, -(-tiles.number // image_parts(height, weight_shape)[0]))
     parts = -(-tiles.number // run)
     first = 0
     for source in sources:
@@ -162,7 +153,7 @@ def backward_weights(
             grad_out=grad_out,
             tile_list=tiles.list,
             tile_count=tiles.count,
-            partial=held,
+            partial=partial,
         )
         first += c
     program.launch(
@@ -175,10 +166,8 @@ def backward_weights(
         grad_out=grad_out,
         tile_list=tiles.list,
         tile_count=tiles.count,
-        partial=held,
+        partial=partial,
     )
-    if partial is None:
-        summed(dev, held, parts, grad_weight, grad_bias)
     return parts
 
 

@@ -13,7 +13,6 @@ from pp_cl.layers.conv_direct import (
     Direction,
     Layout,
     check_weights,
-    summed,
 )
 from pp_cl.layers.tiles import SIDE, VECTOR, Tiles, checked_tiles
 
@@ -108,7 +107,7 @@ def forward(
     height, width, co = out.shape
     channels = [source.shape[2] for source in sources]
     _check_channels(*channels, co)
-    check_weights(sources, weight, bias, out)
+    check_weights(sources, weight.shape, out, bias)
     if laid_out is None:
         laid_out = _transformed(dev, weight, None, sum(channels), co)
     tiles = checked_tiles(dev, tiles, height, width)
@@ -170,11 +169,10 @@ def backward_weights(
     blocking: Blocking,
     sources: tuple[Array, ...],
     grad_out: Array,
-    grad_weight: Array,
-    grad_bias: Array,
+    weight_shape: tuple,
+    partial: Array,
     *,
     tiles: Tiles | None = None,
-    partial: Array | None = None,
 ) -> int:
     """See conv_direct.backward_weights. The order of the sums depends on the shapes and the number
     of tiles alone.
@@ -182,13 +180,12 @@ def backward_weights(
     height, width, co = grad_out.shape
     channels = [source.shape[2] for source in sources]
     _check_channels(*channels, co)
-    check_weights(sources, grad_weight, grad_bias, grad_out)
+    check_weights(sources, weight_shape, grad_out)
     ci = sum(channels)
     tiles = checked_tiles(dev, tiles, height, width)
     tile_parts = _tile_parts(tiles.number, ci, co)
     ci_part = ci if tile_parts > 1 else _ci_part(dev, ci, co)
     parts = tile_parts * -(-ci // ci_part) * -(-co // CO_PART)
-    held = dev.scratch(PARTIAL, _partial_floats(ci, co)) if partial is None else partial
     dev.program(
         "layers/winograd_backward_weights",
         TILES=blocking.winograd_weights,
@@ -208,11 +205,9 @@ def backward_weights(
         grad_out=grad_out,
         tile_list=tiles.list,
         tile_count=tiles.count,
-        partial=held,
+        partial=partial,
         scratch=dev.scratch(SLICES, _gradient_slices(dev, blocking, ci, co), zeros=COUNTERS),
     )
-    if partial is None:
-        summed(dev, held, tile_parts, grad_weight, grad_bias)
     return tile_parts
 
 

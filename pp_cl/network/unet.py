@@ -353,10 +353,9 @@ class UNet:
             self.policy.blocking,
             tuple(arrays[name] for name in layer.inputs),
             arrays[gradient_of(layer.name)],
-            weight,
-            bias,
+            weight.shape,
+            partial,
             tiles=tiles,
-            partial=partial,
         )
         return weight.shape, parts, *(a.base_data.offset // 4 for a in (partial, weight, bias))
 

@@ -143,8 +143,12 @@ class Grid:
 
 
 def smallest_edge(box: np.ndarray, cells: int) -> float:
-    """Edge, within 0.1 %, of the finest grid over a (2, 3) box with at most `cells` vertices."""
+    """Edge, within 0.1 %, of the finest grid over a (2, 3) box with at most `cells` vertices; 1
+    where the box is one place.
+    """
     size = box[1] - box[0]
+    if not size.any():
+        return 1.0
     size = np.maximum(size, 1e-6 * size.max())  # a box may be flat
     edge = (size.prod() / cells) ** (1 / 3)
     while (excess := np.prod(size // edge + 1) / cells) > 1:

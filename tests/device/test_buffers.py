@@ -3,8 +3,10 @@ second array; the selftest has sizes and gathers.
 """
 
 import weakref
+from types import SimpleNamespace
 
 import numpy as np
+import pyopencl as cl
 import pytest
 
 from pp_cl.device.buffers import (
@@ -15,6 +17,7 @@ from pp_cl.device.buffers import (
     read_later,
     table_bytes,
 )
+from pp_cl.errors import UserError
 
 pytestmark = pytest.mark.kernels  # of rows.cl
 
@@ -90,6 +93,22 @@ def test_a_reading_is_what_the_kernels_before_it_left(dev, rng):
     assert before.get() is before.get()
 
 
+def test_kernels_that_fail_on_the_device_are_told_of(dev, monkeypatch):
+    """Where the host waits for them, as GPUs find many faults then."""
+
+    def failing():
+        raise cl.RuntimeError("clWaitForEvents failed: EXEC_STATUS_ERROR_FOR_EVENTS_IN_WAIT_LIST")
+
+    reading = read_later(dev, dev.zeros((3,)))
+    reading._event = SimpleNamespace(wait=failing)
+    with pytest.raises(UserError, match="cannot finish its work .*EXEC_STATUS"):
+        reading.get()
+    with monkeypatch.context() as patch:
+        patch.setattr(dev, "queue", SimpleNamespace(finish=failing))
+        with pytest.raises(UserError, match="cannot finish its work"):
+            dev.finish()
+
+
 def test_what_is_sent_may_be_dropped_at_once(dev, rng):
     """The host's copy lives until it has arrived, and no longer."""
     array, expected = dev.empty((31, 7), np.int32), None
@@ -137,11 +156,13 @@ def test_parts_are_joined(dev, rng, monkeypatch, n, piece):
 
 
 def test_what_was_fetched_or_written_is_not_kept(dev):
-    """pyopencl's own get and set tie the numpy array to the device's."""
-    array = dev.upload(np.arange(9, dtype=np.float32))
-    fetched, written = dev.download(array), np.zeros(9, np.float32)
-    dev.write(array, written)
-    dead = [weakref.ref(fetched), weakref.ref(written)]
-    del fetched, written
-    assert [ref() for ref in dead] == [None, None]
+    """A preview or a film would keep a dozen of its images beside the one that is shown."""
+    array, zeros = dev.upload(np.arange(9, dtype=np.float32)), np.zeros(9, np.float32)
+    [packed] = PackedArrays(dev).send([((9,), np.float32)], [zeros])
+    hosts = [dev.download(array), array.get(), array[:5].get(), packed.get(), zeros]
+    dev.write(array, zeros)
+    packed.set(zeros)
+    dead = [weakref.ref(host) for host in hosts]
+    del hosts, zeros
+    assert [ref() for ref in dead] == [None] * 5
     assert not dev.download(array).any()

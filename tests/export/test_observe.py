@@ -5,6 +5,7 @@ import shutil
 
 import numpy as np
 import pytest
+from support.models import drawn_alone
 
 from pp_cl.export.observe import directions, observe
 from pp_cl.run import load_run
@@ -52,3 +53,10 @@ def test_directions_are_unit_vectors_from_the_eye(run, rng):
     camera, ahead = run.cameras("test")[0], rng.normal(size=(20, 3))
     found = directions(camera.eye + ahead, camera)
     assert found * np.linalg.norm(ahead, axis=1)[:, None] == pytest.approx(ahead)
+
+
+def test_views_are_observed_one_at_a_time(run, monkeypatch):
+    drawn = drawn_alone(monkeypatch, run.renderer)
+    for seen in observe(run, run.cameras("train"), "test"):
+        assert seen.blend_matrix().nnz
+    assert len(drawn) == len(run.cameras("train"))

@@ -1,6 +1,8 @@
 """A rendered view over any background, transparent, in linear light."""
 
 import io
+import weakref
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -64,9 +66,22 @@ def test_it_is_saved_and_shown_in_a_notebook(rng, tmp_path):
     np.testing.assert_array_equal(there, white[..., :3])
 
 
-def test_the_mean_of_samples(rng):
-    (one, _), (two, _) = picture(rng), picture(rng)
-    mean = mean_picture([one, two])
-    np.testing.assert_allclose(mean.colour, (one.colour + two.colour) / 2, rtol=1e-6)
-    np.testing.assert_allclose(mean.alpha, (one.alpha + two.alpha) / 2, rtol=1e-6)
-    np.testing.assert_array_equal(mean.depth, one.depth)
+@pytest.mark.parametrize("n", [1, 4, 9])
+def test_the_mean_of_samples(rng, n):
+    """Of which the first is held, and one more."""
+    samples, held = [picture(rng)[0] for _ in range(n)], []
+
+    def drawn():
+        for sample in samples:
+            assert sum(alive() is not None for alive in held) <= 2
+            copied = replace(sample)
+            held.append(weakref.ref(copied))
+            yield copied
+            del copied
+
+    mean = mean_picture(drawn())
+    for name in ("colour", "alpha"):
+        of_all = np.mean([getattr(sample, name) for sample in samples], axis=0)
+        np.testing.assert_array_equal(getattr(mean, name), of_all)
+        assert getattr(mean, name).dtype == np.float32
+    np.testing.assert_array_equal(mean.depth, samples[0].depth)

@@ -162,8 +162,8 @@ def test_what_does_not_fit_together_is_refused(dev, module, k):
     def backward_input(first=0, weight=weight, grad_out=out, tiles=None):
         module.backward_input(dev, CPU, weight, first, grad_out, x, mask=None, tiles=tiles)
 
-    def backward_weights(sources=(x,), grad_bias=bias, tiles=None):
-        module.backward_weights(dev, CPU, sources, out, weight, grad_bias, tiles=tiles)
+    def backward_weights(sources=(x,), shape=weight.shape, tiles=None):
+        module.backward_weights(dev, CPU, sources, out, shape, zeros(2**17), tiles=tiles)
 
     for call in (forward, backward_input, backward_weights):
         call()
@@ -174,7 +174,7 @@ def test_what_does_not_fit_together_is_refused(dev, module, k):
         partial(forward, tiles=grown),
         partial(backward_input, tiles=grown),
         partial(backward_weights, (x, x)),
-        partial(backward_weights, grad_bias=zeros(16)),
+        partial(backward_weights, shape=(1, k, k, 16, 16)),
         partial(backward_weights, tiles=grown),
     ]
     if module is WINOGRAD:

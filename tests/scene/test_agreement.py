@@ -32,6 +32,11 @@ def test_masks_of_one_object_agree(count):
     assert disagreements(ball_views(count), BOX) == []
 
 
+def test_a_hull_of_one_point_is_looked_at():
+    """Its box has no size."""
+    assert disagreements(ball_views(8), np.stack([CENTRE, CENTRE])) == []
+
+
 @pytest.mark.parametrize("count", [24, 60])
 @pytest.mark.parametrize("bad", [0, 5])
 def test_a_shifted_mask_is_named(dev, count, bad):

@@ -35,6 +35,16 @@ def arguments(scene, out, downscale=2, **changes):
     return ["train", scene, "--out", str(out), "--downscale", str(downscale), *sets]
 
 
+def rows(out):
+    """The rows of a run's log, whole or not."""
+    return [json.loads(line) for line in (out / "log.jsonl").read_text().splitlines()]
+
+
+def checkpoint(out):
+    """The bytes of a run's checkpoint."""
+    return (out / "checkpoint.npz").read_bytes()
+
+
 def set_words(settings, **changes):
     """--set words of settings; train__crop=8 sets train.crop."""
     settings = settings | {key.replace("__", "."): value for key, value in changes.items()}

@@ -1,10 +1,8 @@
 """The perceptual term beside what the selftest compares with float64; trainings with it."""
 
-import json
-
 import numpy as np
 import pytest
-from support.runs import arguments
+from support.runs import arguments, rows
 
 from pp_cl.cli import main
 from pp_cl.device.buffers import table_bytes
@@ -12,6 +10,7 @@ from pp_cl.errors import UserError
 from pp_cl.layers.choice import make_policy
 from pp_cl.metrics.lpips import Lpips
 from pp_cl.reference.lpips import WIDTHS, random_weights
+from pp_cl.selftest.loss import images
 from pp_cl.training.perceptual import PerceptualLoss
 
 WEIGHT = 0.3
@@ -21,13 +20,6 @@ WEIGHT = 0.3
 def weights():
     """Of a small network of VGG16's shape."""
     return random_weights(np.random.default_rng(5))
-
-
-def images(rng, height, width):
-    """A target in [0, 1], and a prediction that leaves it."""
-    target = rng.uniform(0, 1, (height, width, 3))
-    prediction = target + rng.normal(0, 0.2, target.shape)
-    return prediction.astype(np.float32), target.astype(np.float32)
 
 
 def run(loss, prediction, target, offset=(0, 0), start=0.0):
@@ -88,10 +80,6 @@ def _no_weights():
 
 
 # ---- trainings
-
-
-def rows(out):
-    return [json.loads(line) for line in (out / "log.jsonl").read_text().splitlines()]
 
 
 @pytest.mark.large

@@ -28,10 +28,14 @@ def kept(dev, weights, least_weight, opacities, least_opacity, seen=None, least=
     return indices.get().tolist()
 
 
-def fill(state, rng):
-    """Random numbers in all arrays of a point state."""
+def filled(dev, cloud, rng):
+    """A state of the cloud, averages among it, of random numbers."""
+    state = PointState(dev, cloud)
+    averages = PointState.ema_table(cloud.count, cloud.blocks)
+    state.averages |= {name: dev.empty(*row) for name, row in averages.items()}
     for array in state.arrays().values():
         array.set((1e3 * rng.random(array.shape)).astype(array.dtype))
+    return state
 
 
 def test_keep_needs_weight_and_opacity(dev):
@@ -58,10 +62,7 @@ def test_compacting_never_takes_more_than_its_scratch(dev, rng, monkeypatch, sha
     for array in cloud.learned().values():
         array.set(rng.random(array.shape).astype(np.float32))
     del array  # else it is not released
-    state = PointState(dev, cloud)
-    averages = PointState.ema_table(1000, cloud.blocks)
-    state.averages |= {name: dev.empty(*row) for name, row in averages.items()}
-    fill(state, rng)
+    state = filled(dev, cloud, rng)
     host = fetched(cloud.arrays(dev) | state.arrays())
     assert len(host) == 6 + 2 + 4 + 6 + 2
     keep = np.arange(0, 1000, share, dtype=np.uint32)
@@ -142,11 +143,7 @@ def test_a_grid_beyond_32_bits_is_refused():
 def test_the_state_follows(dev, rng):
     """Each point's rows, averages among them; weights and looks start anew."""
     model = make_model(dev, rng)
-    state = PointState(dev, model.cloud)
-    averages = PointState.ema_table(model.cloud.count, model.cloud.blocks)
-    state.averages |= {name: dev.empty(*row) for name, row in averages.items()}
-    for array in state.arrays().values():
-        array.set((99 * rng.random(array.shape)).astype(array.dtype))
+    state = filled(dev, model.cloud, rng)
     grid, before = model.grid, fetched(model.cloud.arrays(dev) | state.arrays())
     ids, parents = grid.children(before["points.ids"])
     state.refine(dev, model.refine())
