@@ -6,7 +6,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
-from PIL import Image
+from PIL import Image, UnidentifiedImageError
 
 from pp_cl.errors import UserError
 from pp_cl.files.atomic import atomic_file
@@ -33,10 +33,12 @@ def read_rgba(path: Path | str) -> np.ndarray:
     if _is_exr(path):
         return read_exr_rgba(path)
     with _opened(path) as image:
-        if image.mode not in EIGHT_BIT_MODES or _is_deep_png(path):
+        is_deep = is_deep_png(path)
+        if image.mode not in EIGHT_BIT_MODES or is_deep:
+            found = "16 bits" if is_deep else image.mode
             raise UserError(
-                f"{path}: not 8 bits a channel of gray or RGB ({image.mode}); convert it to 8-bit"
-                " RGBA PNG"
+                f"{path}: not 8 bits a channel of gray or RGB ({found}); convert it to 8-bit RGBA"
+                " PNG"
             )
         return np.array(image if image.mode == "RGBA" else image.convert("RGBA"))
 
@@ -76,13 +78,17 @@ def _opened(path, checked=True):
         raise
     except Image.DecompressionBombError:
         raise UserError(f"{path}: more than {MOST_PIXELS} pixels; reduce the image") from None
+    except UnidentifiedImageError:  # by its first bytes, whatever it is called
+        raise UserError(
+            f"{path}: is no {', '.join(FORMATS)}; convert it, or copy it anew"
+        ) from None
     # decoders meet broken bytes with whatever comes up: OSError, SyntaxError, struct.error
     except Exception as error:
         raise refusal(path, error, ", ".join(FORMATS)) from error
 
 
-def _is_deep_png(path):
-    """True for a PNG of 16 bits a channel, of which Pillow silently drops the low byte."""
+def is_deep_png(path: Path | str) -> bool:
+    """Whether it is a PNG of 16 bits a channel, of which Pillow silently drops the low byte."""
     with open(path, "rb") as file:
         head = file.read(PNG_DEPTH_BYTE + 1)
     return head.startswith(PNG_SIGNATURE) and head[PNG_DEPTH_BYTE] == 16

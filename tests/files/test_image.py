@@ -99,6 +99,9 @@ def test_a_pipe_is_not_waited_for(tmp_path, read, name):
 def test_not_an_image(tmp_path, read):
     (tmp_path / "text.png").write_text("not an image")
     (tmp_path / "empty.png").touch()
+    Image.new("RGB", (5, 7)).save(tmp_path / "a.tif")
+    with pytest.raises(UserError, match=r"a\.tif: is no PNG, JPEG, WEBP; convert it"):
+        read(tmp_path / "a.tif")
     for path in (tmp_path, *(tmp_path / f"{name}.png" for name in ("text", "empty", "none"))):
         with pytest.raises(UserError) as caught:
             read(path)
