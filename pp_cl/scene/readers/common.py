@@ -24,6 +24,7 @@ MOST_JSON = 2**26  # bytes of a JSON file: 100,000 frames of 670
 MOST_ARRAYS = 2**25  # bytes of all arrays of a file, as float64: 100,000 cameras need 25 million
 MOST_TEXT = 2**20  # bytes of a file with the numbers of one camera
 MOST = 1e30  # larger numbers are refused: float32 could not hold their products
+CASED_ENDINGS = [cased for ending in ENDINGS for cased in (ending, ending.upper())]
 KINDS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)  # of numpy's savez and savez_compressed
 
 Item = TypeVar("Item")
@@ -49,23 +50,27 @@ def listing(items: Sequence[Item]) -> Iterable[Item]:
 
 def find_image(folder: Path, given: str, fail: Fail, endings: Sequence[str] = ("",)) -> str:
     """Path relative to the scene's folder of the image that a file there calls `given`, with the
-    first of the endings that exists.
+    first of the endings that exists; as Windows writes paths, too.
 
     Raises fail(text) for a path that leaves the folder, by a symbolic link or otherwise, and for
     one where no image is.
     """
     try:
         root = os.path.realpath(folder)
-        for ending in endings:
-            path = os.path.realpath(os.path.join(root, given + ending))
-            if os.path.commonpath([root, path]) != root:
-                raise fail(f"{given!r} leaves the scene's folder; move the image into it")
-            if os.path.isfile(path):
-                return os.path.relpath(path, root).replace(os.sep, "/")
+        for form in (given, given.replace("\\", "/")):
+            for ending in endings:
+                path = os.path.realpath(os.path.join(root, form + ending))
+                if os.path.commonpath([root, path]) != root:
+                    raise fail(
+                        f"{given[:80]!r} leaves the scene's folder; copy the image into it and"
+                        " write its path from there"
+                    )
+                if os.path.isfile(path):
+                    return os.path.relpath(path, root).replace(os.sep, "/")
     except (OSError, ValueError) as error:  # a name too long, a zero byte
         raise fail(f"{given[:80]!r} is not a usable path ({error})") from error
-    tried = "".join(f", nor with {ending} added" for ending in endings if ending)
-    raise fail(f"no image at {given[:80]!r}{tried}; copy it there or remove the frame")
+    bare = ", with or without the ending of an image" * (len(endings) > 1)
+    raise fail(f"no image at {given[:80]!r}{bare}; copy it there or remove the frame")
 
 
 def first_folder(folder: Path, names: Sequence[str]) -> str:
@@ -94,9 +99,8 @@ def mask_names(image: str) -> list[str]:
     ending of any image.
     """
     path = PurePosixPath(image)
-    endings = [cased for ending in ENDINGS for cased in (ending, ending.upper())]
     stems = (path.stem, f"{path.stem}_mask", f"mask_{path.stem}")
-    names = (f"{stem}{ending}" for stem in stems for ending in endings)
+    names = (f"{stem}{ending}" for stem in stems for ending in CASED_ENDINGS)
     return [f"{image}.png", *(str(path.with_name(name)) for name in names)]
 
 
@@ -127,7 +131,7 @@ def scaled(stated: Sequence[float], size: tuple[int, int], fail: Fail) -> tuple[
     if abs(size[0] * stated[1] - size[1] * stated[0]) > max(stated):
         raise fail(
             f"is for {stated[0]:g}x{stated[1]:g} pixels, but an image has {size[0]}x{size[1]},"
-            " another shape; copy the images anew"
+            " another shape; copy the images anew, neither turned nor cropped"
         )
     return size[0] / stated[0], size[1] / stated[1]
 
@@ -238,7 +242,7 @@ def read_numbers(file: Path) -> list[list[float]]:
     the line.
     """
     try:
-        lines = read_regular(file, MOST_TEXT).split("\n")
+        lines = read_regular(file, MOST_TEXT, "utf-8-sig").split("\n")
     except (OSError, ValueError) as error:
         raise refusal(file, error, "text") from None
     rows = []

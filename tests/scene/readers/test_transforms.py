@@ -82,6 +82,30 @@ def test_nerfstudio_names(tmp_path):
     ]
 
 
+def test_images_that_were_reduced(tmp_path):
+    """After w and h were written: what is in pixels is scaled to them, angles need not be."""
+    keys = {"fl_x": 60.0, "fl_y": 62.0, "cx": 25.0, "cy": 17.0}
+    write_scene(tmp_path, edit=lambda data: data.update(keys, w=2 * SIZE[0], h=2.0 * SIZE[1]))
+    camera = load_scene(tmp_path).splits["train"][0].camera
+    assert (camera.fx, camera.fy, camera.cx, camera.cy) == (30, 31, 12.5, 8.5)
+    assert (camera.width, camera.height) == SIZE
+    camera = train_views(tmp_path, w=2 * SIZE[0], h=2 * SIZE[1])[0].camera
+    assert camera.fx == pytest.approx(0.5 * SIZE[0] / math.tan(0.35))
+    assert (camera.cx, camera.cy) == (SIZE[0] / 2, SIZE[1] / 2)
+
+
+@pytest.mark.parametrize("ending", (".JPG", ".jpeg", ".webp"))
+def test_a_path_without_the_ending_of_its_image(tmp_path, ending):
+    data = write_scene(tmp_path)
+    (tmp_path / "train_1.png").rename(tmp_path / f"train_1{ending}")
+    data["frames"][0]["file_path"] = r".\train_0.png"
+    data |= {"train_filenames": [r".\train_0.png", f"train_1{ending}"]}
+    (tmp_path / "transforms_train.json").unlink()
+    (tmp_path / "transforms.json").write_text(json.dumps(data))
+    names = [one.name for one in load_scene(tmp_path).splits["train"]]
+    assert names == ["train_0.png", f"train_1{ending}"]
+
+
 @pytest.mark.parametrize("corners", [[0, 1], [[0, 0, 0], [1, 1, 0]], [["a"] * 3] * 2, [[0] * 3]])
 def test_the_box_of_a_single_file(tmp_path, corners):
     data, file = write_scene(tmp_path), tmp_path / "transforms.json"
