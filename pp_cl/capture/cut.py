@@ -51,12 +51,12 @@ def cut_out_all(
         seeds[i] if i in seeds else one.mask.astype(np.uint8) for i, one in enumerate(windows)
     ]
 
-    def cut():
-        colours = _colours(windows, labels)
-        for i in tqdm(left, "cutting out", unit="image", leave=False, disable=None):
+    def cut(number):
+        colours, text = _colours(windows, labels), f"cutting out, {number} of {2 + ROUNDS}"
+        for i in tqdm(left, text, unit="image", leave=False, disable=None):
             windows[i].mask = _grab_cut(windows[i], labels[i], colours)
 
-    cut()
+    cut(1)
     differences = backdrop.differences(windows, points[~inside])
     for number in range(1 + ROUNDS):
         if number:
@@ -67,7 +67,7 @@ def cut_out_all(
         standing_out = backdrop.evidence(differences, windows, surely)
         for i in left:
             labels[i] = _marked(labels[i], standing_out[i])
-        cut()
+        cut(2 + number)
     for i in left:
         windows[i].mask = without_islands(windows[i].mask)
 

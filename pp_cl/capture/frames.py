@@ -93,9 +93,10 @@ def _photographs(folder, images):
         )
     targets, taken = [], set()
     for file in files:
-        name = re.sub(r"\s+", "_", file.stem)  # COLMAP's lists of pairs know no spaces
-        if name.lower() in taken:
-            name = re.sub(r"[\s.]+", "_", file.name)
+        # COLMAP's lists of pairs know no spaces, and take lines that begin with # for comments
+        name = re.sub(r"\s+|^#", "_", file.stem)
+        while name.lower() in taken:
+            name += "_"
         taken.add(name.lower())
         targets.append(images / name)
     with ThreadPoolExecutor(os.cpu_count()) as pool:

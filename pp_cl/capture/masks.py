@@ -67,7 +67,8 @@ def write_masks(
             how[source] = how.get(source, 0) + 1
     if _without_mask(folder, photographs):
         inside = ((points > box[0]) & (points < box[1])).all(1)
-        windows = [_window(scene, folder, one, box) for one in photographs]
+        bar = tqdm(photographs, "reading images", unit="image", leave=False, disable=None)
+        windows = [_window(scene, folder, one, box) for one in bar]
         how |= _uniform(scene, folder, photographs, windows, points[inside])
         if _without_mask(folder, photographs):
             how |= _cut(scene, folder, photographs, windows, box, points, inside, seen)

@@ -3,6 +3,7 @@ in SCENE/capture/STAGE.json, a picture of it in STAGE.png; the same command goes
 """
 
 import shutil
+import time
 from collections.abc import Callable, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -70,9 +71,10 @@ class Capture:
             for stage in STAGES[:first]:
                 self.tell(f"{stage}: {self._found(stage)['line']} (done before)")
             for stage in STAGES[first:]:
+                start = time.monotonic()
                 found = getattr(self, f"_{stage}")()
                 write_json(self._file(stage), {"given": self._given(stage), "found": found})
-                self.tell(f"{stage}: {found['line']}")
+                self.tell(f"{stage}: {found['line']} ({time.monotonic() - start:.0f} s)")
 
     @contextmanager
     def _locked(self):

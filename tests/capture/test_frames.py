@@ -54,6 +54,17 @@ def test_photographs_of_other_programs(shots, tmp_path):
     assert copy.get_ifd(frames.EXIF)[FOCAL] == pytest.approx(4.2)
 
 
+def test_names_that_colmap_can_list(shots, tmp_path):
+    """Without spaces or a leading #, each once whatever the case of its letters."""
+    pytest.importorskip("pillow_heif")
+    names = ["#a.png", "_a.png", "b c.png", "b  c.png", "b_c.png", "B_C.PNG", "d.png", "d.jpg"]
+    for name, image in zip([*names, "e.png"], shots, strict=False):
+        Image.fromarray(image).save(tmp_path / name)
+    taken = [one["name"].lower() for one in take_images(tmp_path, tmp_path / "images")["images"]]
+    assert len({name.rpartition(".")[0] for name in taken}) == len(names) + 1
+    assert not any(" " in name or name.startswith("#") for name in taken)
+
+
 @pytest.fixture
 def film(shots, tmp_path):
     """A film of 48 frames."""
