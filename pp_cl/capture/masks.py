@@ -13,7 +13,7 @@ from skimage.segmentation import find_boundaries
 from tqdm import tqdm
 
 from pp_cl.capture.cut import cut_out_all, whole_mask
-from pp_cl.capture.window import window
+from pp_cl.capture.window import place_of, window
 from pp_cl.errors import UserError, shown
 from pp_cl.files.contact_sheet import contact_sheet
 from pp_cl.files.image import read_gray, read_rgba, write_png
@@ -60,18 +60,26 @@ def write_masks(
     folder.mkdir(parents=True, exist_ok=True)
     left = _without_mask(folder, photographs)
     how = {"kept": len(photographs) - len(left)}
+    shown = [i for i, one in enumerate(photographs) if place_of(one, box)] or range(
+        len(photographs)
+    )
+    beside = {one.name for one in photographs} - {photographs[i].name for i in shown}
     for one in tqdm(left, "masks", unit="image", leave=False, disable=None):
         source, mask = _found(scene, one, given, words)
+        if mask is None and one.name in beside:  # as films have, where they begin or end
+            source = "empty, as the object is outside"
+            mask = np.zeros((one.camera.height, one.camera.width), np.uint8)
         if mask is not None:
             write_png(mask_file(folder, one.name), mask)
             how[source] = how.get(source, 0) + 1
     if _without_mask(folder, photographs):
         inside = ((points > box[0]) & (points < box[1])).all(1)
-        bar = tqdm(photographs, "reading images", unit="image", leave=False, disable=None)
+        in_view, seen = [photographs[i] for i in shown], [seen[i] for i in shown]
+        bar = tqdm(in_view, "reading images", unit="image", leave=False, disable=None)
         windows = [_window(scene, folder, one, box) for one in bar]
-        how |= _uniform(scene, folder, photographs, windows, points[inside])
-        if _without_mask(folder, photographs):
-            how |= _cut(scene, folder, photographs, windows, box, points, inside, seen)
+        how |= _uniform(scene, folder, in_view, windows, points[inside])
+        if _without_mask(folder, in_view):
+            how |= _cut(scene, folder, in_view, windows, box, points, inside, seen)
     counts = ", ".join(f"{count} {source}" for source, count in how.items() if count)
     wrong = _contradicting(scene, folder, photographs, box)
     if wrong:
@@ -182,8 +190,6 @@ def _is_uniform(window, points):
 
 def _cut(scene, folder, photographs, windows, box, points, inside, seen):
     """Cut out what has no mask, and write it. Returns {what: how many}."""
-    if not any(inside[some].any() for some in seen):
-        raise UserError(f"{scene}: no point lies in the object's box; give another with --box")
     left = [i for i, one in enumerate(windows) if one.mask is None]
     cut_out_all(windows, box, points, inside, seen)
     for i in tqdm(left, "masks", unit="image", leave=False, disable=None):

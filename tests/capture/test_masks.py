@@ -2,6 +2,7 @@
 
 import shlex
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -12,6 +13,7 @@ from support.scenes import ball_image, ring_cameras
 
 from pp_cl.errors import UserError
 from pp_cl.files.image import read_gray, read_rgba
+from pp_cl.scene.camera import Camera
 from pp_cl.scene.demo import ANGLE, OBJECT_BOX, render
 from pp_cl.scene.outline import OUTLINE
 from pp_cl.scene.views import Photograph
@@ -310,11 +312,31 @@ def test_a_command_that_cannot_be_one_is_refused(command):
         program_words(command)
 
 
-def test_a_box_without_points_is_refused(capture):
+BOXES = {
+    "nothing in it": [[2.0, 2.0, 2.0], [2.1, 2.1, 2.1]],
+    "flat things on its floor alone": [[-0.8, -0.8, 0.76], [0.8, 0.8, 1.6]],
+    "no photograph shows it": [[0, 0, 40.0], [1, 1, 41.0]],
+}
+
+
+@pytest.mark.parametrize("case", BOXES)
+def test_a_box_without_an_object_is_refused(capture, case):
     """There is nothing to begin with."""
-    capture.box = np.array([[2.0, 2.0, 2.0], [2.1, 2.1, 2.1]])
+    capture.box = np.array(BOXES[case])
     with pytest.raises(UserError, match="--box"):
         capture.write()
+
+
+def test_a_photograph_beside_the_object_has_an_empty_mask(capture):
+    """As films have them, where they begin or end; the others are cut out all the same."""
+    one = capture.photographs[3]
+    eye, ahead = 3 * one.camera.eye, one.camera.pose[:, 2] + 0.84 * one.camera.pose[:, 0]
+    camera = Camera.look_at(eye, eye + ahead, fx=one.camera.fx, width=SIZE, height=SIZE)
+    capture.photographs[3] = replace(one, camera=camera)
+    line = capture.write()
+    assert f"1 empty, as the object is outside, {VIEWS - 1} cut out" in line
+    assert not read_gray(capture.file(3)).any()
+    assert np.delete(capture.agreement(), 3).min() > 0.9
 
 
 def test_the_picture_shows_outlines(capture, tmp_path):
