@@ -340,4 +340,5 @@ def _read_view(folder, photograph, masks, factor):
         digest=pixel_digest(image),
         shrunk=factor,
         unshrunk_camera=camera if factor > 1 else None,
+        is_masked=bool(masks.folder or (masks.source == "given" and photograph.mask)),
     )
