@@ -118,9 +118,8 @@ def test_lego(data):
 
 def alpha_at(view, point):
     """Alpha of the pixel that shows a world point."""
-    camera = view.camera
-    x, y, z = camera.pose[:, :3].T @ (point - camera.eye)
-    return view.image[int(camera.fy * y / z + camera.cy), int(camera.fx * x / z + camera.cx), 3]
+    column, row, _ = view.camera.project(point).astype(int)
+    return view.image[row, column, 3]
 
 
 def test_a_folder_that_may_not_be_read(tmp_path, monkeypatch):

@@ -39,15 +39,8 @@ def test_projection_follows_opengl(tmp_path, rng):
         point = rng.normal(size=3) * 0.3
         x, y, z, _ = np.linalg.inv(frame["transform_matrix"]) @ [*point, 1]
         expected = [SIZE[0] / 2 + focal * x / -z, SIZE[1] / 2 - focal * y / -z]
-        camera = view.camera
-        x, y, z = camera.pose[:, :3].T @ (point - camera.eye)
-        assert z > 0
-        assert np.allclose(
-            [camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy],
-            expected,
-            rtol=0,
-            atol=1e-9,
-        )
+        *found, depth = view.camera.project(point)
+        assert depth > 0 and np.allclose(found, expected, rtol=0, atol=1e-9)
 
 
 def test_defaults_of_nerf_synthetic(tmp_path):
