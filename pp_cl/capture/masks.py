@@ -16,7 +16,7 @@ from pp_cl.capture.cut import cut_out_all, whole_mask
 from pp_cl.capture.window import place_of, window
 from pp_cl.errors import UserError, shown
 from pp_cl.files.contact_sheet import contact_sheet
-from pp_cl.files.image import read_gray, read_rgba, write_png
+from pp_cl.files.image import read_mask, read_rgba, write_png
 from pp_cl.scene.agreement import disagreements, listing
 from pp_cl.scene.distortion import undistort
 from pp_cl.scene.masks import MaskRule, cut_out
@@ -124,7 +124,7 @@ def _of_program(words, image, shape):
             said = done.stderr.decode(errors="replace").strip().splitlines() or ["no word of it"]
             what = f"status {done.returncode}" if done.returncode else "no mask written"
             raise UserError(f"{who}: {what}: {shown(said[-1])}; mend the command")
-        found = read_gray(mask)
+        found = read_mask(mask)
     if found.shape != shape:
         raise UserError(f"{who}: its mask has another size than the photograph; mend the command")
     return found
@@ -145,7 +145,7 @@ def _window(scene, folder, photograph, box):
     """The Window of a photograph, with its mask if that is written."""
     found = window(read_rgba(scene / photograph.name)[..., :3], photograph, box)
     if mask_file(folder, photograph.name).is_file():
-        found.mask = found.reduced(read_gray(mask_file(folder, photograph.name))) > 127
+        found.mask = found.reduced(read_mask(mask_file(folder, photograph.name))) > 127
     return found
 
 
@@ -210,7 +210,7 @@ def picture(
     chosen = wrong + evenly(others, SHOWN_VIEWS - len(wrong))
     images = []
     for one in chosen:
-        photograph, mask = read_rgba(scene / one.name), read_gray(mask_file(folder, one.name))
+        photograph, mask = read_rgba(scene / one.name), read_mask(mask_file(folder, one.name))
         factor = fitting_downscale(mask.shape, SHOWN_SIZE)
         image = shrink(photograph, factor)[..., :3]
         held = shrink(np.dstack([mask] * 4), factor)[..., 3] > 127
@@ -224,7 +224,7 @@ def _contradicting(scene, folder, photographs, box):
     """{name: share of the object that its mask alone rejects} of those that contradict others."""
     views = []
     for one in photographs:
-        mask = read_gray(mask_file(folder, one.name))
+        mask = read_mask(mask_file(folder, one.name))
         factor = fitting_downscale(mask.shape, CHECKED_SIDE)
         image = shrink(np.dstack([mask] * 4), factor)
         camera = one.camera.downscaled(factor)

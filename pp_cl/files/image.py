@@ -19,6 +19,7 @@ FORMATS = ("PNG", "JPEG", "WEBP")
 ENDINGS = (".png", ".jpg", ".jpeg", ".webp", ".exr")  # of the files that read_rgba reads
 # Pillow's names of what converts to RGBA without loss
 EIGHT_BIT_MODES = ("RGBA", "RGB", "LA", "L", "PA", "P", "1")
+COLOURLESS = 16  # by how much the channels of a gray image may differ, where it was a JPEG
 # bits per channel stand in the header chunk, the first of all
 PNG_SIGNATURE, PNG_DEPTH_BYTE = b"\x89PNG\r\n\x1a\n", 24
 
@@ -43,12 +44,20 @@ def read_rgba(path: Path | str) -> np.ndarray:
         return np.array(image if image.mode == "RGBA" else image.convert("RGBA"))
 
 
-def read_gray(path: Path | str) -> np.ndarray:
-    """(H, W) uint8 of an image file that is gray, such as a mask; colours become their luminance.
-    Raises UserError as read_rgba does.
+def read_mask(path: Path | str) -> np.ndarray:
+    """(H, W) uint8, 255 where the object is: the alpha of an image that has transparent pixels, as
+    a cut-out, else its gray. Raises UserError as read_rgba does, and for one that is neither.
     """
     rgba = read_rgba(path)
-    return np.array(Image.fromarray(rgba[..., :3]).convert("L"))
+    if (rgba[..., 3] < 255).any():
+        return rgba[..., 3]
+    red, green, blue = rgba[..., :3].astype(np.int16).transpose(2, 0, 1)
+    if max(np.abs(red - green).max(), np.abs(green - blue).max()) > COLOURLESS:
+        raise UserError(f"{path}: has colours; write a gray mask, white where the object is")
+    gray = np.array(Image.fromarray(rgba[..., :3]).convert("L"))
+    if gray.max() == 1:
+        raise UserError(f"{path}: its largest value is 1 of 255; write 255 where the object is")
+    return gray
 
 
 def image_size(path: Path | str) -> tuple[int, int]:

@@ -9,7 +9,7 @@ from skimage.color import rgb2lab
 from skimage.measure import label
 
 from pp_cl.errors import UserError
-from pp_cl.files.image import read_gray
+from pp_cl.files.image import read_mask
 from pp_cl.scene.readers.common import mask_names
 
 BORDER_SHARE = 0.5  # of the border's pixels that must have its median colour
@@ -61,8 +61,8 @@ def _named(folder, name):
 
 
 def _with_file(image, mask):
-    """The image with the brightness of a mask's pixels as alpha. Raises UserError."""
-    alpha = read_gray(mask)
+    """The image with a mask as alpha. Raises UserError."""
+    alpha = read_mask(mask)
     if alpha.shape != image.shape[:2]:
         sizes = "{1}x{0} pixels, but its image has {3}x{2}".format(*alpha.shape, *image.shape)
         raise UserError(f"{mask}: {sizes}; make it the image's size")

@@ -12,7 +12,7 @@ from scipy.ndimage import binary_closing, binary_dilation, binary_opening, gauss
 from support.scenes import ball_image, ring_cameras
 
 from pp_cl.errors import UserError
-from pp_cl.files.image import read_gray, read_rgba
+from pp_cl.files.image import read_mask, read_rgba
 from pp_cl.scene.camera import Camera
 from pp_cl.scene.demo import ANGLE, OBJECT_BOX, render
 from pp_cl.scene.outline import OUTLINE
@@ -70,7 +70,7 @@ class Capture:
 
     def agreement(self):
         """(V,) intersection over union of each mask with the true one."""
-        found = [read_gray(self.file(i)) > 127 for i in range(VIEWS)]
+        found = [read_mask(self.file(i)) > 127 for i in range(VIEWS)]
         pairs = zip(found, self.truth, strict=True)
         return np.array([(a & b).sum() / (a | b).sum() for a, b in pairs])
 
@@ -113,7 +113,7 @@ def test_the_object_is_cut_out_of_any_background(capture):
     line = capture.write()
     assert f"{VIEWS} cut out" in line
     assert capture.agreement().min() > 0.95
-    assert len(np.unique(read_gray(capture.file(0)))) > 4, "no soft border"
+    assert len(np.unique(read_mask(capture.file(0)))) > 4, "no soft border"
 
 
 def test_thin_parts_and_gaps_are_told_by_the_wall(dev, tmp_path):
@@ -157,7 +157,7 @@ def share_held(capture, place, wanted):
             patch.setattr(cut, "ROUNDS", rounds)
             capture.write()
         chosen = capture.truth[0][place] == wanted
-        shares.append((read_gray(capture.file(0)) > 127)[place][chosen].mean())
+        shares.append((read_mask(capture.file(0)) > 127)[place][chosen].mean())
         for number in range(VIEWS):
             capture.file(number).unlink()
     return shares
@@ -284,7 +284,17 @@ def test_a_program_makes_the_masks(capture, tmp_path):
     capture.seen = capture.seen[:2]
     assert "2 by the program" in capture.write(command=program(tmp_path, PROGRAM))
     gray = np.array(Image.open(capture.folder / "images/01.png").convert("L"))
-    assert (read_gray(capture.file(1)) == np.where(gray > 90, 255, 0)).all()
+    assert (read_mask(capture.file(1)) == np.where(gray > 90, 255, 0)).all()
+
+
+def test_a_program_may_make_cut_outs(capture, tmp_path):
+    """As rembg does: the alpha is the mask, whatever the colours."""
+    capture.photographs, capture.seen = capture.photographs[:2], capture.seen[:2]
+    cut_out = "cut = Image.open(sys.argv[1]).convert('RGB')\ncut.putalpha(mask)\ncut.save"
+    text = PROGRAM.replace("mask.save", cut_out)
+    capture.write(command=program(tmp_path, text))
+    gray = np.array(Image.open(capture.folder / "images/01.png").convert("L"))
+    assert (read_mask(capture.file(1)) == np.where(gray > 90, 255, 0)).all()
 
 
 @pytest.mark.parametrize(
@@ -335,7 +345,7 @@ def test_a_photograph_beside_the_object_has_an_empty_mask(capture):
     capture.photographs[3] = replace(one, camera=camera)
     line = capture.write()
     assert f"1 empty, as the object is outside, {VIEWS - 1} cut out" in line
-    assert not read_gray(capture.file(3)).any()
+    assert not read_mask(capture.file(3)).any()
     assert np.delete(capture.agreement(), 3).min() > 0.9
 
 
