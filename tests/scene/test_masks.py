@@ -254,6 +254,16 @@ def test_a_mask_for_some_photographs_only(dev, tmp_path):
     )
 
 
+def test_inverted_masks_are_told(dev, tmp_path):
+    scene = write_ball_scene(tmp_path / "ball", views=6, size=40)
+    for file in (tmp_path / "ball").rglob("*.png"):
+        rgba = read_rgba(file)
+        rgba[..., 3] = 255 - rgba[..., 3]
+        write_png(file, rgba)
+    with pytest.warns(UserWarning, match="as if they were inverted.* white on the object"):
+        open_scene(dev, configure(preset("tiny"), scene), ("train",))
+
+
 def test_the_choice_is_kept_with_the_run(tmp_path, monkeypatch):
     """A relative folder of masks becomes an absolute path."""
     scene = opaque_ball(tmp_path / "white", (20, 220, 40))
