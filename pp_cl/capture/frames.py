@@ -81,15 +81,12 @@ def _of(facts, keys):
 def _photographs(folder, images):
     """The facts of each photograph, written to `images` where it can be read."""
     needed("pillow_heif").register_heif_opener()
-    files = sorted(
-        file
-        for file in folder.iterdir()
-        if file.suffix.lower() in ENDINGS and not file.name.startswith(".")
-    )
+    files = _listed(folder)
     if not files:
+        near = next((one for one in sorted(folder.iterdir()) if one.is_dir() and _listed(one)), "")
         raise UserError(
-            f"{folder}: no photographs in it ({', '.join(ENDINGS)}); give the folder that has them,"
-            " or a film"
+            f"{folder}: no photographs in it ({', '.join(ENDINGS)}); give the folder that has them"
+            f"{near and f', maybe {near}'}, or a film"
         )
     targets, taken = [], set()
     for file in files:
@@ -102,6 +99,15 @@ def _photographs(folder, images):
     with ThreadPoolExecutor(os.cpu_count()) as pool:
         made = pool.map(_take, files, targets)
         yield from tqdm(made, "frames", len(files), unit="image", leave=False, disable=None)
+
+
+def _listed(folder):
+    """The photographs of a folder, sorted by name."""
+    return sorted(
+        file
+        for file in folder.iterdir()
+        if file.suffix.lower() in ENDINGS and not file.name.startswith(".")
+    )
 
 
 def _take(file, target):

@@ -2,6 +2,7 @@
 READERS knows, or made by the program.
 """
 
+import mimetypes
 import os
 import warnings
 from collections.abc import Iterable, Mapping, Sequence, Set
@@ -230,9 +231,10 @@ def find_reader(path: str | Path) -> ModuleType:
 def check_folder(folder: Path) -> None:
     """Raise UserError where a scene's folder is missing, no folder, or cannot be read."""
     if folder.is_file():
-        raise UserError(
-            f"{folder}: is a file; a scene is a folder, maybe {folder.absolute().parent}"
-        )
+        is_film = (mimetypes.guess_type(folder.name)[0] or "").startswith("video/")
+        mend = f"a scene is a folder, maybe {folder.absolute().parent}"
+        mend = f"`pp-cl capture {folder} --out SCENE` makes a scene of it" if is_film else mend
+        raise UserError(f"{folder}: is a file; {mend}")
     if not folder.is_dir():
         raise UserError(f"{folder}: no such folder; SCENE is a folder, or the word demo")
     if not os.access(folder, os.R_OK | os.X_OK):

@@ -23,6 +23,8 @@ def test_missing_folder_format_and_split(tmp_path):
     refused(scene, scene, "no scene in it: 1 image, 'images'", "pp-cl capture")
     write_scene(scene)
     refused(scene / "transforms_train.json", "is a file", scene)
+    (scene / "a.mov").touch()
+    refused(scene / "a.mov", "is a file", f"pp-cl capture {scene / 'a.mov'} --out SCENE")
     refused(scene / "images", f"no scene in it; {scene} is one")
     refused(above, f"no scene in it; {scene} is one")
     write_scene(scene, "val")
