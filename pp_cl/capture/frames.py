@@ -81,9 +81,9 @@ def _of(facts, keys):
 def _photographs(folder, images):
     """The facts of each photograph, written to `images` where it can be read."""
     needed("pillow_heif").register_heif_opener()
-    files = _listed(folder)
+    files = listed(folder)
     if not files:
-        near = next((one for one in sorted(folder.iterdir()) if one.is_dir() and _listed(one)), "")
+        near = next((one for one in sorted(folder.iterdir()) if one.is_dir() and listed(one)), "")
         raise UserError(
             f"{folder}: no photographs in it ({', '.join(ENDINGS)}); give the folder that has them"
             f"{near and f', maybe {near}'}, or a film"
@@ -101,7 +101,7 @@ def _photographs(folder, images):
         yield from tqdm(made, "frames", len(files), unit="image", leave=False, disable=None)
 
 
-def _listed(folder):
+def listed(folder: Path) -> list[Path]:
     """The photographs of a folder, sorted by name."""
     return sorted(
         file

@@ -17,6 +17,7 @@ from support.runs import spoken
 
 from pp_cl.capture import poses
 from pp_cl.capture.frames import take_images
+from pp_cl.cli import main
 from pp_cl.files.image import to_8bit, write_png
 from pp_cl.files.video import write_video
 from pp_cl.scene.camera import Camera
@@ -133,6 +134,18 @@ def test_what_is_done_is_not_done_again(captured, shot, tmp_path):
     assert json.loads((scene / "transforms.json").read_text())["aabb"] == [[-0.5] * 3, [0.5] * 3]
     status, lines = capture(shot[1], scene)
     assert status == 2 and len(lines) == 1 and str(scene) in lines[0]
+
+
+def test_photographs_that_came_later_are_told(captured, shot, tmp_path, capsys):
+    """As they are not taken: the masks that the user has mended would be gone."""
+    scene, later = shutil.copytree(captured, tmp_path / "scene"), shot[0] / "later.jpg"
+    later.touch()
+    try:
+        assert main(["capture", str(shot[0]), "--out", str(scene), "--masks", str(shot[1])]) == 0
+    finally:
+        later.unlink()
+    told = f"frames: {COUNT} images (done before; later.jpg came later: --from frames takes all"
+    assert told in capsys.readouterr().out
 
 
 @pytest.mark.slow
