@@ -88,7 +88,8 @@ def _camera(facts):
 def _pose(rows):
     """(3, 4) float64 with OpenCV axes of a 4 x 4 matrix with OpenGL axes."""
     name = "camera.transform_matrix"
-    pose = rigid(rows, fail_at(name)) @ GL_FROM_CV
+    rigid(rows, fail_at(name))  # refuses; what is rendered has the bits that were sent
+    pose = np.array(rows, np.float64)[:3] @ GL_FROM_CV
     if np.abs(pose[:, 3]).max() > MOST_DISTANCE:
         raise UserError(f"{name}: the eye is more than {MOST_DISTANCE:g} from the origin")
     return pose
