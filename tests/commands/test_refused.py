@@ -123,6 +123,7 @@ REFUSED = [
     ("sweep demo --out new --vary points.count", "--vary points.count"),
     ("sweep demo --out new --workers 0", "--workers"),
     ("sweep demo --out new --set train.seed=1", "--seeds"),
+    ("train demo --out new --masks run", "--masks"),
     ("sweep demo --out new --set points.sh_degree=3", "points.sh_degree"),
     ("eval run --metrics beauty", "--metrics"),
     ("view run --port 70000", "--port"),
