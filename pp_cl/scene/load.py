@@ -241,11 +241,6 @@ def check_folder(folder: Path) -> None:
         raise UserError(f"{folder}: cannot be read; check its permissions")
 
 
-def is_scene(folder: str | Path) -> bool:
-    """Whether a folder holds a scene."""
-    return Path(folder).is_dir() and _reader_of(Path(folder)) is not None
-
-
 def _reader_of(folder):
     return next((reader for reader in READERS if reader.recognises(folder)), None)
 

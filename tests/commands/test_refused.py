@@ -28,6 +28,7 @@ REFUSED = [
     *((f"{command} young", "checkpoint.npz") for command in (*OF_RUNS, SHAPE) if command != "view"),
     *((f"{command} corrupt", "corrupt/checkpoint.npz") for command in ("eval", "info", "render")),
     *((f"{command} run --scene gone", "gone") for command in (*OF_RUNS, SHAPE)),
+    ("view full", "no scene in it: 1 image"),
     ("eval run --split val", "val"),
     ("eval unknown", "unknown/config.json"),
     ("train none --out new", "none"),
