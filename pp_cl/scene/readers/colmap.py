@@ -28,9 +28,9 @@ from pp_cl.scene.readers.common import (
     fail_at,
     find_image,
     find_mask,
+    fitted,
     hold_out,
     listing,
-    scaled,
 )
 from pp_cl.scene.views import Photograph
 
@@ -143,13 +143,12 @@ def _suffix(folder):
 def _photograph(folder, model, image, lens):
     fail = fail_at(model, image.name)
     name = find_image(folder, f"{IMAGES}/{image.name}", fail)
-    size = image_size(folder / name)
-    across, down = scaled((lens.width, lens.height), size, fail)
     fx, fy, cx, cy, distortion = _intrinsics(folder, model, lens)
     w, x, y, z = image.rotation
     rotation = Rotation.from_quat([x, y, z, w]).as_matrix().T
     pose = np.column_stack([rotation, -rotation @ image.translation])
-    camera = Camera(pose, across * fx, down * fy, across * cx, down * cy, *size)
+    camera = Camera(pose, fx, fy, cx, cy, lens.width, lens.height)
+    camera = fitted(camera, image_size(folder / name), fail)
     mask = find_mask(folder, MASKS, image.name, fail)
     return Photograph(name, camera, mask=mask, distortion=distortion)
 

@@ -17,6 +17,7 @@ from pp_cl.errors import UserError, quoted, shown
 from pp_cl.files.checkpoint import opened_zip
 from pp_cl.files.image import ENDINGS
 from pp_cl.files.untrusted import opened_regular, read_json_text, read_regular, refusal
+from pp_cl.scene.camera import Camera
 
 HELD_OUT = 8  # one photograph of so many, the first among them, as LLFF and 3DGS do
 SPLITS = ["test", "train"]  # of a format that knows none
@@ -124,16 +125,19 @@ def fail_at(*place: object) -> Fail:
     return lambda text: UserError(f"{': '.join(map(str, place))}: {text}")
 
 
-def scaled(stated: Sequence[float], size: tuple[int, int], fail: Fail) -> tuple[float, float]:
-    """(x, y) from pixels of images of the stated (width, height) to pixels of an image of `size`,
-    which must have their shape but for rounding. Raises fail(text).
+def fitted(camera: Camera, size: tuple[int, int], fail: Fail) -> Camera:
+    """The camera of an image of `size`, which was reduced or enlarged after the camera was found,
+    and must have its shape but for rounding. Raises fail(text).
     """
-    if abs(size[0] * stated[1] - size[1] * stated[0]) > max(stated):
+    width, height = camera.width, camera.height
+    if abs(size[0] * height - size[1] * width) > max(width, height):
         raise fail(
-            f"is for {stated[0]:g}x{stated[1]:g} pixels, but an image has {size[0]}x{size[1]},"
-            " another shape; copy the images anew, neither turned nor cropped"
+            f"is for {width:g}x{height:g} pixels, but an image has {size[0]}x{size[1]}, another"
+            " shape; copy the images anew, neither turned nor cropped"
         )
-    return size[0] / stated[0], size[1] / stated[1]
+    x, y = size[0] / width, size[1] / height
+    fx, fy, cx, cy = x * camera.fx, y * camera.fy, x * camera.cx, y * camera.cy
+    return Camera(camera.pose, fx, fy, cx, cy, *size)
 
 
 def checked_box(corners: object, fail: Fail) -> np.ndarray:

@@ -11,10 +11,10 @@ from pp_cl.scene.readers.common import (
     SPLITS,
     fail_at,
     find_mask,
+    fitted,
     folder_images,
     hold_out,
     read_npy,
-    scaled,
 )
 from pp_cl.scene.readers.frame import rigid
 from pp_cl.scene.views import Photograph
@@ -64,6 +64,6 @@ def _camera(matrix, size, fail):
     height, width, focal = matrix[:, 4]
     if not (height > 0 and width > 0 and focal > 0):
         raise fail(f"height {height:g}, width {width:g}, focal length {focal:g} must be above 0")
-    focal *= scaled((width, height), size, fail)[0]
-    pose = np.column_stack([matrix[:, :3] @ LLFF_FROM_CV, matrix[:, 3]])
-    return Camera(rigid(pose, fail), focal, focal, size[0] / 2, size[1] / 2, *size)
+    pose = rigid(np.column_stack([matrix[:, :3] @ LLFF_FROM_CV, matrix[:, 3]]), fail)
+    camera = Camera(pose, focal, focal, width / 2, height / 2, width, height)
+    return fitted(camera, size, fail)

@@ -17,10 +17,10 @@ from pp_cl.scene.readers.common import (
     SPLITS,
     checked_box,
     fail_at,
+    fitted,
     hold_out,
     listing,
     read_json,
-    scaled,
 )
 from pp_cl.scene.readers.frame import Frame, distortion, frame_keys, pinhole
 from pp_cl.scene.views import Photograph, View
@@ -124,15 +124,10 @@ def _read_frame(folder, frame):
 
 
 def _camera(folder, name, frame):
-    """The Camera; of an image that was reduced or enlarged after w and h were written, scaled to
-    its size.
-    """
+    """The Camera, of the image's size."""
     size = image_size(folder / name)
     stated = [frame.number(key, above=0) or side for key, side in zip("wh", size, strict=True)]
-    scaled(stated, size, partial(frame.error, "w"))
-    if stated == [*size]:
-        return pinhole(frame, *size)
-    return pinhole(frame, *stated).resized(*size)
+    return fitted(pinhole(frame, *stated), size, partial(frame.error, "w"))
 
 
 def _depth_range(frame):
