@@ -5,7 +5,7 @@ program of the user's; else cut out by colour around the sparse points and voted
 import shlex
 import subprocess
 import tempfile
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -19,7 +19,7 @@ from pp_cl.files.contact_sheet import contact_sheet
 from pp_cl.files.image import read_mask, read_rgba, write_png
 from pp_cl.scene.agreement import disagreements, listing
 from pp_cl.scene.distortion import undistort
-from pp_cl.scene.masks import MaskRule, cut_out
+from pp_cl.scene.masks import MaskRule, cut_out, named_mask
 from pp_cl.scene.outline import OUTLINE, SHOWN_SIZE, SHOWN_VIEWS
 from pp_cl.scene.views import Photograph, View, evenly, fitting_downscale, shrink
 
@@ -44,6 +44,7 @@ def write_masks(
     seen: Sequence[np.ndarray],
     *,
     given: Path | None = None,
+    sources: Mapping[str, str] | None = None,
     command: str | None = None,
 ) -> tuple[str, list[str]]:
     """Write the mask of each photograph as mask_file(), 8-bit gray, white where the object is; what
@@ -52,7 +53,8 @@ def write_masks(
 
     scene: the folder that the photographs' names are relative to. box: (2, 3) around the object.
     points: (N, 3) in the scene's world. seen: for each photograph the indices (M,) of the points
-    that it shows. given: a folder of masks. command: of a program that makes masks, which {image}
+    that it shows. given: a folder of masks, which may be named like the photographs' sources, as
+    {name: source} has them. command: of a program that makes masks, which {image}
     and {mask} stand for. Raises UserError for masks that are given and missing or broken, a program
     that fails, a box in which nothing is seen.
     """
@@ -65,7 +67,7 @@ def write_masks(
     )
     beside = {one.name for one in photographs} - {photographs[i].name for i in shown}
     for one in tqdm(left, "masks", unit="image", leave=False, disable=None):
-        source, mask = _found(scene, one, given, words)
+        source, mask = _found(scene, one, given, sources or {}, words)
         if mask is None and one.name in beside:  # as films have, where they begin or end
             source = "empty, as the object is outside"
             mask = np.zeros((one.camera.height, one.camera.width), np.uint8)
@@ -92,7 +94,7 @@ def _without_mask(folder, photographs):
     return [one for one in photographs if not mask_file(folder, one.name).is_file()]
 
 
-def _found(scene, photograph, given, words):
+def _found(scene, photograph, given, sources, words):
     """(where from, (H, W) uint8 mask) of a photograph that has one without the others; (none, None)
     if it has not.
     """
@@ -101,7 +103,8 @@ def _found(scene, photograph, given, words):
     image = read_rgba(scene / photograph.name)
     if given is not None:
         name = Path(photograph.name).name
-        return "given", MaskRule(folder=str(given)).apply(image, name, None)[..., 3]
+        mask = named_mask(given, sources.get(name, name), name)
+        return "given", MaskRule().apply(image, name, mask)[..., 3]
     if words is not None:
         return "by the program", _of_program(words, scene / photograph.name, image.shape[:2])
     if (image[..., 3] < 255).any():

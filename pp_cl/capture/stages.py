@@ -221,6 +221,8 @@ class Capture:
         photographs, folder = poses.photographs(model, "images"), self.scene / "masks"
         points, seen = poses.points(model, FOLLOWED)
         kept = [i for i, one in enumerate(photographs) if one.name not in dropped]
+        taken = self._found("frames")["images"] if self.source.is_dir() else []
+        sources = {one["name"]: one["source"] for one in taken}
 
         def write(chosen):
             return masks.write_masks(
@@ -231,6 +233,7 @@ class Capture:
                 points,
                 [seen[i] for i in chosen],
                 given=given["masks"] and Path(given["masks"]),
+                sources=sources,
                 command=given["command"],
             )
 

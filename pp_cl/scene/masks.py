@@ -38,7 +38,7 @@ class MaskRule:
         be read or has another size, or a photograph without a uniform border.
         """
         if self.folder:
-            return _with_file(image, _named(Path(self.folder), name))
+            return _with_file(image, named_mask(Path(self.folder), name))
         if self.source in ("box", "none"):
             return _with_alpha(image, OPAQUE)
         if self.source == "color":
@@ -49,15 +49,16 @@ class MaskRule:
 AS_GIVEN = MaskRule()
 
 
-def _named(folder, name):
-    """The mask of a photograph in a folder, by the photograph's path or by its name alone. Raises
-    UserError.
+def named_mask(folder: Path, *names: str) -> Path:
+    """The mask of a photograph in a folder, by one of the names of the photograph: a path or a name
+    alone. Raises UserError.
     """
-    path = PurePosixPath(name)
-    for given in (*mask_names(name), *mask_names(path.name)):
-        if (folder / given).is_file():
-            return folder / given
-    raise UserError(f"{folder}: no mask for {name}; add {path.stem}.png, white where the object is")
+    for name in names:
+        for given in (*mask_names(name), *mask_names(PurePosixPath(name).name)):
+            if (folder / given).is_file():
+                return folder / given
+    usual = PurePosixPath(names[0]).stem
+    raise UserError(f"{folder}: no mask for {names[0]}; add {usual}.png, white where the object is")
 
 
 def _with_file(image, mask):

@@ -221,6 +221,14 @@ def test_given_masks_come_first(capture, tmp_path):
     assert (capture.agreement() == 1).all()
 
 
+def test_masks_named_like_the_sources(capture, tmp_path):
+    """Whose copies have other names, as spaces are none of COLMAP's."""
+    folder = given_masks(capture, tmp_path / "given")
+    (folder / "03.png").rename(folder / "my photo (3).png")
+    assert f"{VIEWS} given" in capture.write(given=folder, sources={"03.png": "my photo (3).JPG"})
+    assert (capture.agreement() == 1).all()
+
+
 def test_masks_that_contradict_the_others_are_named(capture, tmp_path):
     """One is shifted by a third of the image."""
     folder = given_masks(capture, tmp_path / "given")
