@@ -131,9 +131,11 @@ def fitted(camera: Camera, size: tuple[int, int], fail: Fail) -> Camera:
     """
     width, height = camera.width, camera.height
     if abs(size[0] * height - size[1] * width) > max(width, height):
+        is_turned = abs(size[1] * height - size[0] * width) <= max(width, height)
+        what = "another shape; copy the images anew"
+        what = "turned, maybe by its EXIF; write the images upright" if is_turned else what
         raise fail(
-            f"is for {width:g}x{height:g} pixels, but an image has {size[0]}x{size[1]}, another"
-            " shape; copy the images anew, neither turned nor cropped"
+            f"is for {width:g}x{height:g} pixels, but an image has {size[0]}x{size[1]}, {what}"
         )
     x, y = size[0] / width, size[1] / height
     fx, fy, cx, cy = x * camera.fx, y * camera.fy, x * camera.cx, y * camera.cy

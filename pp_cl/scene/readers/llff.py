@@ -48,7 +48,7 @@ def read_split(folder: Path, split: str) -> list[Photograph]:
     if rows.shape != (len(names), NUMBERS):
         raise UserError(
             f"{file}: has shape {rows.shape}, but {IMAGES}/ has {len(names)} images; must be"
-            f" {len(names)}x{NUMBERS} numbers; remove the images that have no pose, or find poses anew"
+            f" {len(names)}x{NUMBERS} numbers; remove the images without a pose, or find poses anew"
         )
     read = []
     for index, name in hold_out(list(enumerate(names)), split):

@@ -87,6 +87,12 @@ def test_images_that_were_reduced(tmp_path):
     assert (camera.cx, camera.cy) == (SIZE[0] / 2, SIZE[1] / 2)
 
 
+def test_an_image_that_is_turned(tmp_path):
+    """By what EXIF says of it, as phones do; its pixels are those of the other shape."""
+    write_scene(tmp_path, edit=lambda data: data.update(w=SIZE[1], h=SIZE[0]))
+    refused(tmp_path, tmp_path / "transforms_train.json", "w: is for", "EXIF", "upright")
+
+
 @pytest.mark.parametrize("ending", (".JPG", ".jpeg", ".webp"))
 def test_a_path_without_the_ending_of_its_image(tmp_path, ending):
     data = write_scene(tmp_path)
