@@ -21,6 +21,7 @@ MOST_BYTES = 2**20  # of a config.json
 MOST_TEXT = 4096  # characters of a setting
 # by network.blocks, how many convolutions there are but the last
 CONVOLUTIONS = {"double": 12, "single": 7, "gated": 7}
+OF_MASKS = ("scene.masks", "scene.mask_from", "scene.mask_tolerance")
 MEND_SETTINGS = "restore it or start a new run"
 
 
@@ -178,6 +179,8 @@ def configure(config: Config, scene: str, given: Iterable[tuple[str, Any, str]] 
         assign(config, "scene.masks", str(moved), "settings")
     assign(config, "scene.path", path, "settings")
     for key, value, origin in given:
+        if path == "demo" and key in OF_MASKS:
+            raise UserError(f"{origin}: the demo has masks of its own; leave it out")
         assign(config, key, value, origin)
     if config.scene.masks:
         assign(config, "scene.masks", str(Path(config.scene.masks).resolve()), "settings")

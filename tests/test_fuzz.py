@@ -41,7 +41,7 @@ from pp_cl.cli import COMMANDS
 from pp_cl.config import Config, load_config, sections
 from pp_cl.files.checkpoint import load_checkpoint
 from pp_cl.files.exr import write_exr
-from pp_cl.files.image import image_size, read_gray, read_rgba
+from pp_cl.files.image import image_size, read_mask, read_rgba
 from pp_cl.files.run_folder import Log, RunFolder
 from pp_cl.layers.choice import (
     OFFERED,
@@ -204,14 +204,13 @@ def test_an_image(world, data):
         elif how == "bytes":
             file.write_bytes(damage.damaged_bytes(data.draw, whole))
         size = taken(lambda: image_size(file))
-        read = taken(lambda: (read_rgba(file), read_gray(file)))
+        rgba, mask = (taken(lambda read=read: read(file)) for read in (read_rgba, read_mask))
         if how == "whole" and pixels is not None:
-            assert read is not None
-        if read is None:
+            assert rgba is not None
+        if rgba is None:
             return
-        rgba, gray = read
-        assert size and rgba.shape == (size[1], size[0], 4) and gray.shape == rgba.shape[:2]
-        assert rgba.dtype == gray.dtype == np.uint8
+        assert size and rgba.shape == (size[1], size[0], 4) and rgba.dtype == np.uint8
+        assert mask is None or (mask.shape == rgba.shape[:2] and mask.dtype == np.uint8)
         assert rgba.nbytes < MOST_MEMORY or file.stat().st_size * 2000 > rgba.nbytes
         if pixels is not None and file.read_bytes().startswith(whole[:8]):  # with its checksums
             assert np.array_equal(rgba, pixels)

@@ -25,7 +25,6 @@ from pp_cl.files.video import write_video
 from pp_cl.scene.camera import Camera
 from pp_cl.scene.demo import ANGLE, DISTANCE, demo_frames, render
 from pp_cl.scene.load import scene_frames
-from tools.depth_error import pixel_rays
 
 WIDER = 1.6  # angle of view, so that the room is seen around the object
 ROOM = 6.0  # radius of the room, world units; the cameras are 3.4 from its middle
@@ -71,7 +70,7 @@ def room(camera: Camera, octaves: Sequence[float] = OCTAVES) -> np.ndarray:
     """(H, W, 3) colours in [0, 1] of the room's wall: noise on a sphere around the origin, of so
     many cells per world unit in each of its layers.
     """
-    rays = pixel_rays(camera)
+    rays = camera.rays()
     rays /= np.linalg.norm(rays, axis=-1, keepdims=True)
     along = rays @ camera.eye
     distance = -along + np.sqrt(along**2 + ROOM**2 - camera.eye @ camera.eye)

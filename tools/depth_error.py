@@ -39,7 +39,7 @@ class DemoSurface:
         """(H, W) float64 depth along the camera's axis at the pixels' centres, infinite where
         their rays miss.
         """
-        rays = pixel_rays(camera)
+        rays = camera.rays()
         lengths = np.linalg.norm(rays, axis=-1)
         directions = rays / lengths[..., None]
         travelled = np.full(lengths.shape, np.linalg.norm(camera.eye) - 1.5)
@@ -55,13 +55,6 @@ class DemoSurface:
         places = (points - self.grid.origin) / self.grid.edge
         inside = ((places >= 0) & (places <= np.array(self.grid.dims) - 1)).all(axis=-1)
         return map_coordinates(self.field, places.T[::-1].swapaxes(1, 2), order=1), inside
-
-
-def pixel_rays(camera: Camera) -> np.ndarray:
-    """(H, W, 3) world directions through the pixels' centres, of depth 1."""
-    y, x = np.mgrid[: camera.height, : camera.width] + 0.5
-    flat = (x - camera.cx) / camera.fx, (y - camera.cy) / camera.fy, np.ones_like(x)
-    return np.stack(flat, -1) @ camera.pose[:, :3].T
 
 
 @dataclass(frozen=True)

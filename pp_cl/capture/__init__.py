@@ -1,1 +1,12 @@
 """From photographs or a film of an object to a scene: cameras, box and masks."""
+
+# {stage: what it finds}, in their order
+STAGES = {
+    "frames": "upright photographs, the sharpest frames of a film",
+    "features": "what can be found again in other images",
+    "matches": "pairs of images that show the same",
+    "poses": "where each image was taken",
+    "box": "what the cameras look at",
+    "masks": "the object in each image",
+    "scene": "transforms.json, COLMAP's model in sparse/0, points.ply",
+}

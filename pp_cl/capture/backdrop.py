@@ -8,6 +8,7 @@ import numpy as np
 from scipy.interpolate import LinearNDInterpolator
 from scipy.ndimage import gaussian_filter1d
 from scipy.spatial import cKDTree
+from tqdm import tqdm
 
 from pp_cl.capture.packages import needed
 from pp_cl.capture.window import Window, dilated
@@ -33,7 +34,7 @@ def differences(windows: Sequence[Window], background: np.ndarray) -> list[np.nd
     """
     eyes = np.stack([one.camera.eye for one in windows])
     found = []
-    for one in windows:
+    for one in tqdm(windows, "backgrounds", unit="image", leave=False, disable=None):
         order = np.argsort(np.linalg.norm(eyes - one.camera.eye, axis=1), kind="stable")
         others = [windows[i] for i in order[1 : 1 + NEAREST]]
         found.append(_difference(one, others, background))

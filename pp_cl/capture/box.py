@@ -77,11 +77,9 @@ def _seen_share(cameras, points):
     """(N,) share of the cameras whose image has room for each point."""
     seen = np.zeros(len(points))
     for camera in cameras:
-        x, y, z = camera.pose[:, :3].T @ (points.T - camera.eye[:, None])
-        ahead = z > 0
-        z = np.where(ahead, z, 1)
-        u, v = camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy
-        seen += ahead & (u >= 0) & (u < camera.width) & (v >= 0) & (v < camera.height)
+        x, y, depth = camera.project(points)
+        inside = (x >= 0) & (x < camera.width) & (y >= 0) & (y < camera.height)
+        seen += inside & (depth > 0)
     return seen / len(cameras)
 
 

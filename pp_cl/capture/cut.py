@@ -40,7 +40,8 @@ def cut_out_all(
     inside: np.ndarray,
     seen: Sequence[np.ndarray],
 ) -> None:
-    """Set the masks of the windows that have none.
+    """Set the masks of the windows that have none. Raises UserError for a box in which nothing
+    stands.
 
     box, points, seen: as write_masks() takes them. inside: (N,) bool, the points in the box.
     """
@@ -51,12 +52,17 @@ def cut_out_all(
         seeds[i] if i in seeds else one.mask.astype(np.uint8) for i, one in enumerate(windows)
     ]
 
-    def cut():
-        colours = _colours(windows, labels)
-        for i in tqdm(left, "cutting out", unit="image", leave=False, disable=None):
+    if not any((label & 1).any() for label in labels):  # the lowest bit: it is the object's
+        raise UserError(
+            "no point lies in the object's box above what it stands on; give another with --box"
+        )
+
+    def cut(number):
+        colours, text = _colours(windows, labels), f"cutting out, {number} of {2 + ROUNDS}"
+        for i in tqdm(left, text, unit="image", leave=False, disable=None):
             windows[i].mask = _grab_cut(windows[i], labels[i], colours)
 
-    cut()
+    cut(1)
     differences = backdrop.differences(windows, points[~inside])
     for number in range(1 + ROUNDS):
         if number:
@@ -67,7 +73,7 @@ def cut_out_all(
         standing_out = backdrop.evidence(differences, windows, surely)
         for i in left:
             labels[i] = _marked(labels[i], standing_out[i])
-        cut()
+        cut(2 + number)
     for i in left:
         windows[i].mask = without_islands(windows[i].mask)
 
@@ -133,7 +139,7 @@ def _colours(
     """
     rng, drawn = np.random.default_rng(0), []
     each = -(-(SAMPLES**2) // len(windows))
-    for wanted in (0, 1):  # the lowest bit of a label says whether it is the object's
+    for wanted in (0, 1):  # the lowest bit of a label
         of = [one.image[label & 1 == wanted] for one, label in zip(windows, labels, strict=True)]
         found = np.concatenate([f[rng.integers(0, len(f), each)] for f in of if len(f)])
         drawn.append(found[rng.integers(0, len(found), SAMPLES**2)])

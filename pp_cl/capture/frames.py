@@ -2,12 +2,13 @@
 frames of a film; what is blurred, broken or there twice is left out.
 """
 
+import logging
 import os
 import re
 import warnings
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
-from itertools import pairwise
+from itertools import groupby, pairwise
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +19,7 @@ from tqdm import tqdm
 from pp_cl.capture.packages import needed
 from pp_cl.errors import UserError, shown
 from pp_cl.files.atomic import atomic_file, atomic_folder
-from pp_cl.files.image import EIGHT_BIT_MODES
+from pp_cl.files.image import EIGHT_BIT_MODES, is_deep_png
 from pp_cl.files.untrusted import opened_regular
 
 ENDINGS = (".jpg", ".jpeg", ".png", ".webp", ".tif", ".tiff", ".heic", ".heif")
@@ -27,6 +28,7 @@ KEPT = {"JPEG": ".jpg", "MPO": ".jpg", "PNG": ".png"}  # formats that are copied
 MODES = (*EIGHT_BIT_MODES, "CMYK", "YCbCr")
 ORIENTATION, MAKE, MODEL, EXIF = 0x0112, 0x010F, 0x0110, 0x8769
 FOCAL, FOCAL_35 = 0x920A, 0xA405  # of the part of EXIF about the exposure
+SENSOR = (0xA002, 0xA20E, 0xA210)  # there, too: pixels across, pixels per unit, the unit
 QUALITY = {"quality": 95, "subsampling": 0}  # of JPEGs
 LEAST = 8  # photographs
 SEEN, SMALL = 640, 64  # pixels, longer side, at which sharpness and likeness are measured
@@ -79,26 +81,33 @@ def _of(facts, keys):
 def _photographs(folder, images):
     """The facts of each photograph, written to `images` where it can be read."""
     needed("pillow_heif").register_heif_opener()
-    files = sorted(
-        file
-        for file in folder.iterdir()
-        if file.suffix.lower() in ENDINGS and not file.name.startswith(".")
-    )
+    files = listed(folder)
     if not files:
+        near = next((one for one in sorted(folder.iterdir()) if one.is_dir() and listed(one)), "")
         raise UserError(
-            f"{folder}: no photographs in it ({', '.join(ENDINGS)}); give the folder that has them,"
-            " or a film"
+            f"{folder}: no photographs in it ({', '.join(ENDINGS)}); give the folder that has them"
+            f"{near and f', maybe {near}'}, or a film"
         )
     targets, taken = [], set()
     for file in files:
-        name = re.sub(r"\s+", "_", file.stem)  # COLMAP's lists of pairs know no spaces
-        if name.lower() in taken:
-            name = re.sub(r"[\s.]+", "_", file.name)
+        # COLMAP's lists of pairs know no spaces, and take lines that begin with # for comments
+        name = re.sub(r"\s+|^#", "_", file.stem)
+        while name.lower() in taken:
+            name += "_"
         taken.add(name.lower())
         targets.append(images / name)
     with ThreadPoolExecutor(os.cpu_count()) as pool:
         made = pool.map(_take, files, targets)
         yield from tqdm(made, "frames", len(files), unit="image", leave=False, disable=None)
+
+
+def listed(folder: Path) -> list[Path]:
+    """The photographs of a folder, sorted by name."""
+    return sorted(
+        file
+        for file in folder.iterdir()
+        if file.suffix.lower() in ENDINGS and not file.name.startswith(".")
+    )
 
 
 def _take(file, target):
@@ -109,20 +118,18 @@ def _take(file, target):
             warnings.simplefilter("ignore")  # Pillow's, of odd EXIF
             image = Image.open(opened, formats=FORMATS)
             image.load()
-            exif = image.getexif()
             if image.mode not in MODES:
                 raise ValueError(f"{image.mode} has not 8 bits a channel")
             is_kept = image.format in KEPT and image.mode in ("RGB", "RGBA", "L")
-            is_kept = is_kept and exif.get(ORIENTATION, 1) == 1
+            is_kept = is_kept and image.getexif().get(ORIENTATION, 1) == 1 and not is_deep_png(file)
             content = opened.seek(0) or opened.read() if is_kept else None
+            facts["lens"], exif = _lens(image.getexif())
+            upright = ImageOps.exif_transpose(image)
     except Image.DecompressionBombError:
         return facts | {"reason": "has more than 178 million pixels"}
     except Exception as error:  # decoders meet broken bytes with whatever comes up
         return facts | {"reason": f"cannot be read ({shown(str(error), 80)})"}
-    exposure = exif.get_ifd(EXIF)
-    lens = [exif.get(MAKE), exif.get(MODEL), exposure.get(FOCAL), exposure.get(FOCAL_35)]
-    upright = ImageOps.exif_transpose(image)
-    facts |= _look(upright) | {"lens": " ".join(shown(str(part), 40) for part in lens)}
+    facts |= _look(upright)
     has_alpha = image.mode in ("RGBA", "LA", "PA") or "transparency" in image.info
     suffix = KEPT[image.format] if is_kept else ".png" if has_alpha else ".jpg"
     facts["name"] = target.name + suffix
@@ -132,9 +139,20 @@ def _take(file, target):
         elif has_alpha:
             upright.convert("RGBA").save(copy, "PNG")
         else:
-            exif[ORIENTATION] = 1
             upright.convert("RGB").save(copy, "JPEG", exif=exif, **QUALITY)
     return facts
+
+
+def _lens(exif):
+    """(what tells cameras and focal lengths apart, the EXIF by which COLMAP guesses a focal
+    length): the rest may be broken, or longer than a JPEG has room for.
+    """
+    exposure, kept = exif.get_ifd(EXIF), Image.Exif()
+    kept.update({tag: exif[tag] for tag in (MAKE, MODEL) if tag in exif})
+    wanted = (FOCAL, FOCAL_35, *SENSOR)
+    kept.get_ifd(EXIF).update({tag: exposure[tag] for tag in wanted if tag in exposure})
+    lens = [exif.get(MAKE), exif.get(MODEL), exposure.get(FOCAL), exposure.get(FOCAL_35)]
+    return " ".join(shown(str(part), 40) for part in lens), kept.tobytes()
 
 
 # Films --------------------------------------------------------------------------------------------
@@ -143,41 +161,39 @@ def _take(file, target):
 def _frames(film, images):
     """The facts of the sharpest frame of each interval, written to `images`."""
     chosen = _sharpest(film)
-    equal = [f"eq(n,{one['number']})" for one in chosen]
+    equal = [f"eq(n,{number})" for number in chosen]
     # in groups, since ffmpeg sums no more than a hundred
     some = ["+".join(equal[i : i + GROUP]) for i in range(0, len(equal), GROUP)]
     wanted = "+".join(f"({one})" for one in some)
-    meta, frames = _decoded(film, f"select='{wanted}'", "rgb24", 3)
+    _, frames = _decoded(film, f"select='{wanted}'", "rgb24", 3)
     frames = zip(chosen, frames, strict=False)
-    for one, frame in tqdm(frames, "frames", len(chosen), unit="image", leave=False, disable=None):
-        seconds = one["number"] / meta["fps"]
-        one |= {"name": f"{one['number']:06d}.jpg", "source": f"{seconds:.2f} s", "lens": "film"}
-        image = Image.fromarray(frame)
-        one["size"] = image.size
-        with atomic_file(images / one["name"]) as file:
+    for number, frame in tqdm(
+        frames, "frames", len(chosen), unit="image", leave=False, disable=None
+    ):
+        image, name = Image.fromarray(frame), f"{number:06d}.jpg"
+        with atomic_file(images / name) as file:
             image.save(file, "JPEG", **QUALITY)
-        yield one
+        yield _look(image) | {"name": name, "source": f"frame {number}", "lens": "film"}
 
 
 def _sharpest(film):
-    """The looks of the sharpest frame of each interval, and the numbers of these frames."""
+    """The number of the sharpest frame of each of FRAMES intervals."""
     meta, frames = _decoded(film, f"scale=w='min({SEEN},iw)':h=-2", "gray", 1)
-    total = round(meta["duration"] * meta["fps"])
-    best = {}
-    for number, frame in enumerate(
-        tqdm(frames, "looking at frames", total, unit="frame", leave=False, disable=None)
-    ):
-        interval = min(number, total - 1) * FRAMES // max(total, FRAMES)
-        look = _look(Image.fromarray(frame[..., 0]))
-        if interval not in best or look["sharpness"] > best[interval]["sharpness"]:
-            best[interval] = look | {"number": number}
-    if not best:
+    # an estimate, for the bar alone: what browsers record states no length
+    total = round(meta["duration"] * meta["fps"]) or None
+    bar = tqdm(frames, "looking at frames", total, unit="frame", leave=False, disable=None)
+    sharpness = [_look(Image.fromarray(frame[..., 0]))["sharpness"] for frame in bar]
+    if not sharpness:
         raise UserError(f"{film}: holds no frames; give another film")
-    return list(best.values())
+    count = len(sharpness)
+    intervals = groupby(range(count), lambda number: number * FRAMES // max(count, FRAMES))
+    return [max(numbers, key=sharpness.__getitem__) for _, numbers in intervals]
 
 
 def _decoded(film: Path, filters: str, pixels: str, channels: int) -> tuple[dict, Iterator]:
     """(what ffmpeg says of the film, its frames after the filters, (H, W, channels) uint8)."""
+    # which tells of a film that is shown turned, as phones make them
+    logging.getLogger("imageio_ffmpeg").setLevel(logging.ERROR)
     reading = needed("imageio_ffmpeg").read_frames(
         film,
         pixels,

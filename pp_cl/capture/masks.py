@@ -5,7 +5,7 @@ program of the user's; else cut out by colour around the sparse points and voted
 import shlex
 import subprocess
 import tempfile
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -13,13 +13,13 @@ from skimage.segmentation import find_boundaries
 from tqdm import tqdm
 
 from pp_cl.capture.cut import cut_out_all, whole_mask
-from pp_cl.capture.window import window
+from pp_cl.capture.window import place_of, window
 from pp_cl.errors import UserError, shown
 from pp_cl.files.contact_sheet import contact_sheet
-from pp_cl.files.image import read_gray, read_rgba, write_png
+from pp_cl.files.image import read_mask, read_rgba, write_png
 from pp_cl.scene.agreement import disagreements, listing
 from pp_cl.scene.distortion import undistort
-from pp_cl.scene.masks import MaskRule, cut_out
+from pp_cl.scene.masks import MaskRule, cut_out, named_mask
 from pp_cl.scene.outline import OUTLINE, SHOWN_SIZE, SHOWN_VIEWS
 from pp_cl.scene.views import Photograph, View, evenly, fitting_downscale, shrink
 
@@ -44,6 +44,7 @@ def write_masks(
     seen: Sequence[np.ndarray],
     *,
     given: Path | None = None,
+    sources: Mapping[str, str] | None = None,
     command: str | None = None,
 ) -> tuple[str, list[str]]:
     """Write the mask of each photograph as mask_file(), 8-bit gray, white where the object is; what
@@ -52,7 +53,8 @@ def write_masks(
 
     scene: the folder that the photographs' names are relative to. box: (2, 3) around the object.
     points: (N, 3) in the scene's world. seen: for each photograph the indices (M,) of the points
-    that it shows. given: a folder of masks. command: of a program that makes masks, which {image}
+    that it shows. given: a folder of masks, which may be named like the photographs' sources, as
+    {name: source} has them. command: of a program that makes masks, which {image}
     and {mask} stand for. Raises UserError for masks that are given and missing or broken, a program
     that fails, a box in which nothing is seen.
     """
@@ -60,17 +62,26 @@ def write_masks(
     folder.mkdir(parents=True, exist_ok=True)
     left = _without_mask(folder, photographs)
     how = {"kept": len(photographs) - len(left)}
+    shown = [i for i, one in enumerate(photographs) if place_of(one, box)] or range(
+        len(photographs)
+    )
+    beside = {one.name for one in photographs} - {photographs[i].name for i in shown}
     for one in tqdm(left, "masks", unit="image", leave=False, disable=None):
-        source, mask = _found(scene, one, given, words)
+        source, mask = _found(scene, one, given, sources or {}, words)
+        if mask is None and one.name in beside:  # as films have, where they begin or end
+            source = "empty, as the object is outside"
+            mask = np.zeros((one.camera.height, one.camera.width), np.uint8)
         if mask is not None:
             write_png(mask_file(folder, one.name), mask)
             how[source] = how.get(source, 0) + 1
     if _without_mask(folder, photographs):
         inside = ((points > box[0]) & (points < box[1])).all(1)
-        windows = [_window(scene, folder, one, box) for one in photographs]
-        how |= _uniform(scene, folder, photographs, windows, points[inside])
-        if _without_mask(folder, photographs):
-            how |= _cut(scene, folder, photographs, windows, box, points, inside, seen)
+        in_view, seen = [photographs[i] for i in shown], [seen[i] for i in shown]
+        bar = tqdm(in_view, "reading images", unit="image", leave=False, disable=None)
+        windows = [_window(scene, folder, one, box) for one in bar]
+        how |= _uniform(scene, folder, in_view, windows, points[inside])
+        if _without_mask(folder, in_view):
+            how |= _cut(scene, folder, in_view, windows, box, points, inside, seen)
     counts = ", ".join(f"{count} {source}" for source, count in how.items() if count)
     wrong = _contradicting(scene, folder, photographs, box)
     if wrong:
@@ -83,7 +94,7 @@ def _without_mask(folder, photographs):
     return [one for one in photographs if not mask_file(folder, one.name).is_file()]
 
 
-def _found(scene, photograph, given, words):
+def _found(scene, photograph, given, sources, words):
     """(where from, (H, W) uint8 mask) of a photograph that has one without the others; (none, None)
     if it has not.
     """
@@ -92,7 +103,8 @@ def _found(scene, photograph, given, words):
     image = read_rgba(scene / photograph.name)
     if given is not None:
         name = Path(photograph.name).name
-        return "given", MaskRule(folder=str(given)).apply(image, name, None)[..., 3]
+        mask = named_mask(given, sources.get(name, name), name)
+        return "given", MaskRule().apply(image, name, mask)[..., 3]
     if words is not None:
         return "by the program", _of_program(words, scene / photograph.name, image.shape[:2])
     if (image[..., 3] < 255).any():
@@ -115,7 +127,7 @@ def _of_program(words, image, shape):
             said = done.stderr.decode(errors="replace").strip().splitlines() or ["no word of it"]
             what = f"status {done.returncode}" if done.returncode else "no mask written"
             raise UserError(f"{who}: {what}: {shown(said[-1])}; mend the command")
-        found = read_gray(mask)
+        found = read_mask(mask)
     if found.shape != shape:
         raise UserError(f"{who}: its mask has another size than the photograph; mend the command")
     return found
@@ -136,7 +148,7 @@ def _window(scene, folder, photograph, box):
     """The Window of a photograph, with its mask if that is written."""
     found = window(read_rgba(scene / photograph.name)[..., :3], photograph, box)
     if mask_file(folder, photograph.name).is_file():
-        found.mask = found.reduced(read_gray(mask_file(folder, photograph.name))) > 127
+        found.mask = found.reduced(read_mask(mask_file(folder, photograph.name))) > 127
     return found
 
 
@@ -181,8 +193,6 @@ def _is_uniform(window, points):
 
 def _cut(scene, folder, photographs, windows, box, points, inside, seen):
     """Cut out what has no mask, and write it. Returns {what: how many}."""
-    if not any(inside[some].any() for some in seen):
-        raise UserError(f"{scene}: no point lies in the object's box; give another with --box")
     left = [i for i, one in enumerate(windows) if one.mask is None]
     cut_out_all(windows, box, points, inside, seen)
     for i in tqdm(left, "masks", unit="image", leave=False, disable=None):
@@ -203,7 +213,7 @@ def picture(
     chosen = wrong + evenly(others, SHOWN_VIEWS - len(wrong))
     images = []
     for one in chosen:
-        photograph, mask = read_rgba(scene / one.name), read_gray(mask_file(folder, one.name))
+        photograph, mask = read_rgba(scene / one.name), read_mask(mask_file(folder, one.name))
         factor = fitting_downscale(mask.shape, SHOWN_SIZE)
         image = shrink(photograph, factor)[..., :3]
         held = shrink(np.dstack([mask] * 4), factor)[..., 3] > 127
@@ -217,7 +227,7 @@ def _contradicting(scene, folder, photographs, box):
     """{name: share of the object that its mask alone rejects} of those that contradict others."""
     views = []
     for one in photographs:
-        mask = read_gray(mask_file(folder, one.name))
+        mask = read_mask(mask_file(folder, one.name))
         factor = fitting_downscale(mask.shape, CHECKED_SIDE)
         image = shrink(np.dstack([mask] * 4), factor)
         camera = one.camera.downscaled(factor)

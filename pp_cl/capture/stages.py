@@ -3,6 +3,7 @@ in SCENE/capture/STAGE.json, a picture of it in STAGE.png; the same command goes
 """
 
 import shutil
+import time
 from collections.abc import Callable, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -10,7 +11,7 @@ from pathlib import Path
 import numpy as np
 from filelock import FileLock, Timeout
 
-from pp_cl.capture import box, features, frames, masks, poses, still
+from pp_cl.capture import STAGES, box, features, frames, masks, poses, still
 from pp_cl.capture.packages import isolated, needed
 from pp_cl.errors import UserError
 from pp_cl.files.atomic import atomic_folder, atomic_path, remove_leftovers, write_json
@@ -26,7 +27,6 @@ from pp_cl.scene.readers.frame import frame_keys
 from pp_cl.scene.readers.transforms import SINGLE
 from pp_cl.scene.views import evenly, fitting_downscale, shrink
 
-STAGES = ("frames", "features", "matches", "poses", "box", "masks", "scene")
 FOLLOWED = 4  # images that show a point: wrong matches are seldom found again in so many
 SHOWN_WIDTH = 1000  # pixels of the pictures of points and cameras
 RESUMED = ("features", "matches", "masks")  # stages that keep what was done when they are stopped
@@ -63,16 +63,26 @@ class Capture:
         """Do all stages that are not done, or one of them and all after it. Raises UserError."""
         with self._locked():
             remove_leftovers(self.scene)
-            first = self._first(begin)
-            for stage in reversed(STAGES[first:]):
-                if stage not in RESUMED or stage != STAGES[first] or self._file(stage).is_file():
+            first, stages = self._first(begin), list(STAGES)
+            for stage in reversed(stages[first:]):
+                if stage not in RESUMED or stage != stages[first] or self._file(stage).is_file():
                     self._undo(stage)
-            for stage in STAGES[:first]:
-                self.tell(f"{stage}: {self._found(stage)['line']} (done before)")
-            for stage in STAGES[first:]:
+            for stage in stages[:first]:
+                new = self._new() if stage == "frames" else ""
+                self.tell(f"{stage}: {self._found(stage)['line']} (done before{new})")
+            for stage in stages[first:]:
+                start = time.monotonic()
                 found = getattr(self, f"_{stage}")()
                 write_json(self._file(stage), {"given": self._given(stage), "found": found})
-                self.tell(f"{stage}: {found['line']}")
+                self.tell(f"{stage}: {found['line']} ({time.monotonic() - start:.0f} s)")
+
+    def _new(self):
+        """What photographs have come since they were taken, in words."""
+        found = self._found("frames")
+        known = {one["source"] for one in (*found["images"], *found["left_out"])}
+        files = frames.listed(self.source) if self.source.is_dir() else []
+        new = [file.name for file in files if file.name not in known]
+        return f"; {listing(new)} came later: --from frames takes all anew" if new else ""
 
     @contextmanager
     def _locked(self):
@@ -211,6 +221,8 @@ class Capture:
         photographs, folder = poses.photographs(model, "images"), self.scene / "masks"
         points, seen = poses.points(model, FOLLOWED)
         kept = [i for i, one in enumerate(photographs) if one.name not in dropped]
+        taken = self._found("frames")["images"] if self.source.is_dir() else []
+        sources = {one["name"]: one["source"] for one in taken}
 
         def write(chosen):
             return masks.write_masks(
@@ -221,6 +233,7 @@ class Capture:
                 points,
                 [seen[i] for i in chosen],
                 given=given["masks"] and Path(given["masks"]),
+                sources=sources,
                 command=given["command"],
             )
 

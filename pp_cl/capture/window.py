@@ -77,27 +77,37 @@ class Window:
         return found, y[found].astype(int), x[found].astype(int)
 
 
+def place_of(photograph: Photograph, box: np.ndarray) -> tuple[int, int, int, int] | None:
+    """(x0, y0, x1, y1) around the projected box (2, 3) in a photograph; None where it is
+    outside.
+    """
+    camera, nothing = photograph.camera, np.empty(0)
+    whole = Window(photograph.name, nothing, camera, photograph.distortion, (0, 0, 0, 0))
+    x, y = whole.pixels(corners_of(box)).T
+    if np.isnan(x).any():  # the box is around the camera, or ends far outside the image
+        x, y = np.array([0, camera.width]), np.array([0, camera.height])
+    if x.max() < 1 or y.max() < 1 or x.min() > camera.width - 1 or y.min() > camera.height - 1:
+        return None
+    (x0, x1), (y0, y1) = _grown(x, camera.width), _grown(y, camera.height)
+    return x0, y0, x1, y1
+
+
 def window(image: np.ndarray, photograph: Photograph, box: np.ndarray) -> Window:
     """The Window of a photograph, (H, W, 3) uint8. Raises UserError where it does not show the box
     (2, 3).
     """
-    camera = photograph.camera
-    whole = Window(photograph.name, image, camera, photograph.distortion, (0, 0, 0, 0))
-    x, y = whole.pixels(corners_of(box)).T
-    if np.isnan(x).any():  # the box is around the camera, or ends far outside the image
-        x, y = np.array([0, camera.width]), np.array([0, camera.height])
-    x0, x1 = _grown(x, camera.width)
-    y0, y1 = _grown(y, camera.height)
-    if x1 - x0 < 2 or y1 - y0 < 2:
+    place = place_of(photograph, box)
+    if place is None:
         raise UserError(f"{photograph.name}: the object's box is outside; give another with --box")
+    x0, y0, x1, y1 = place
     scale = min(1, CUT_SIDE / max(x1 - x0, y1 - y0))
     width, height = (max(2, round(scale * n)) for n in (x1 - x0, y1 - y0))
     sx, sy = width / (x1 - x0), height / (y1 - y0)
-    camera = camera.crop(x0, y0, width, height)
+    camera = photograph.camera.crop(x0, y0, width, height)
     camera = replace(
         camera, fx=sx * camera.fx, fy=sy * camera.fy, cx=sx * camera.cx, cy=sy * camera.cy
     )
-    found = replace(whole, camera=camera, place=(x0, y0, x1, y1))
+    found = Window(photograph.name, image, camera, photograph.distortion, place)
     return replace(found, image=found.reduced(image))
 
 

@@ -2,16 +2,15 @@
 
 import argparse
 
+from pp_cl.capture import STAGES
+
 HELP = "make a scene from photographs or a film: cameras, box and masks"
-EPILOG = """stages, each done once; the same command goes on where it stopped:
-  frames      upright photographs, the sharpest frames of a film
-  features    what can be found again in other images
-  matches     pairs of images that show the same
-  poses       where each image was taken
-  box         what the cameras look at
-  masks       the object in each image
-  scene       transforms.json, COLMAP's model in sparse/0, points.ply"""
-STAGES = ("frames", "features", "matches", "poses", "box", "masks", "scene")
+EPILOG = "\n".join(
+    (
+        "stages, each done once; the same command goes on where it stopped:",
+        *(f"  {stage:10}  {what}" for stage, what in STAGES.items()),
+    )
+)
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

@@ -89,9 +89,8 @@ def in_world(positions: np.ndarray, edge: float) -> np.ndarray:
 
 def _colours(picture: Picture, camera: Camera, positions):
     """(M, 3) uint8: a point whose centre is just outside the image takes the nearest pixel."""
-    x, y, z = ((positions - camera.eye) @ camera.pose[:, :3]).T
-    column, row = camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy
-    column = column.clip(0, camera.width - 1).astype(np.int64)  # a seen point has z > 0
+    column, row, _ = camera.project(positions)  # a seen point has a depth above 0
+    column = column.clip(0, camera.width - 1).astype(np.int64)
     row = row.clip(0, camera.height - 1).astype(np.int64)
     return to_8bit(picture.rgba()[row, column, :3])
 

@@ -6,7 +6,6 @@ import errno
 import io
 import json
 import math
-import re
 import stat
 import zipfile
 from collections.abc import Iterator, Mapping
@@ -24,13 +23,6 @@ FORMAT = 1  # raised when the arrays change meaning
 MOST_HEADER = 2**24  # bytes; the measurements of a tuned device take some 100,000
 MEND = "delete it to train anew, or restore a copy"
 
-MAGIC = b"\x93NUMPY\x01\x00"
-MOST_ARRAY_HEADER = 1024  # bytes; ours have 118
-# as numpy writes it of numbers, row by row; to read it by this alone evaluates nothing
-ARRAY_HEADER = re.compile(
-    rb"\{'descr': '([<|][fiu][1248])', 'fortran_order': False,"
-    rb" 'shape': \(((?:\d{1,15}, ?)*(?:\d{1,15})?)\), \} *\n"
-)
 PIECE_BYTES = 2**24
 # bytes of a zip's directory: each entry takes about ten times its part of it as zipfile keeps it
 MOST_DIRECTORY = 2**24
@@ -169,16 +161,12 @@ class Checkpoint:
 
 def _read_form(member):
     """(Form, bytes before the values) of an opened array."""
-    start = member.read(len(MAGIC) + 2)
-    length = int.from_bytes(start[len(MAGIC) :], "little")
-    if not start.startswith(MAGIC) or length > MOST_ARRAY_HEADER:
-        raise ValueError("holds a file that is no array")
-    found = ARRAY_HEADER.fullmatch(member.read(length))
-    if not found:
+    if np.lib.format.read_magic(member) != (1, 0):  # others have headers of up to 4 GiB
+        raise ValueError("holds an array of another version than 1.0")
+    shape, by_columns, dtype = np.lib.format.read_array_header_1_0(member)
+    if by_columns or dtype.kind not in "fiu" or dtype.byteorder == ">" or min(shape, default=0) < 0:
         raise ValueError("holds an array of another kind than numbers row by row")
-    kind, sizes = (text.decode() for text in found.groups())
-    shape = tuple(int(size) for size in sizes.split(",") if size.strip())
-    return Form(shape, np.dtype(kind)), len(start) + length
+    return Form(shape, dtype), member.tell()
 
 
 @contextmanager

@@ -6,7 +6,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
-from PIL import Image
+from PIL import Image, UnidentifiedImageError
 
 from pp_cl.errors import UserError
 from pp_cl.files.atomic import atomic_file
@@ -19,6 +19,7 @@ FORMATS = ("PNG", "JPEG", "WEBP")
 ENDINGS = (".png", ".jpg", ".jpeg", ".webp", ".exr")  # of the files that read_rgba reads
 # Pillow's names of what converts to RGBA without loss
 EIGHT_BIT_MODES = ("RGBA", "RGB", "LA", "L", "PA", "P", "1")
+COLOURLESS = 16  # by how much the channels of a gray image may differ, where it was a JPEG
 # bits per channel stand in the header chunk, the first of all
 PNG_SIGNATURE, PNG_DEPTH_BYTE = b"\x89PNG\r\n\x1a\n", 24
 
@@ -33,20 +34,30 @@ def read_rgba(path: Path | str) -> np.ndarray:
     if _is_exr(path):
         return read_exr_rgba(path)
     with _opened(path) as image:
-        if image.mode not in EIGHT_BIT_MODES or _is_deep_png(path):
+        is_deep = is_deep_png(path)
+        if image.mode not in EIGHT_BIT_MODES or is_deep:
+            found = "16 bits" if is_deep else image.mode
             raise UserError(
-                f"{path}: not 8 bits a channel of gray or RGB ({image.mode}); convert it to 8-bit"
-                " RGBA PNG"
+                f"{path}: not 8 bits a channel of gray or RGB ({found}); convert it to 8-bit RGBA"
+                " PNG"
             )
         return np.array(image if image.mode == "RGBA" else image.convert("RGBA"))
 
 
-def read_gray(path: Path | str) -> np.ndarray:
-    """(H, W) uint8 of an image file that is gray, such as a mask; colours become their luminance.
-    Raises UserError as read_rgba does.
+def read_mask(path: Path | str) -> np.ndarray:
+    """(H, W) uint8, 255 where the object is: the alpha of an image that has transparent pixels, as
+    a cut-out, else its gray. Raises UserError as read_rgba does, and for one that is neither.
     """
     rgba = read_rgba(path)
-    return np.array(Image.fromarray(rgba[..., :3]).convert("L"))
+    if (rgba[..., 3] < 255).any():
+        return rgba[..., 3]
+    red, green, blue = rgba[..., :3].astype(np.int16).transpose(2, 0, 1)
+    if max(np.abs(red - green).max(), np.abs(green - blue).max()) > COLOURLESS:
+        raise UserError(f"{path}: has colours; write a gray mask, white where the object is")
+    gray = np.array(Image.fromarray(rgba[..., :3]).convert("L"))
+    if gray.max() == 1:
+        raise UserError(f"{path}: its largest value is 1 of 255; write 255 where the object is")
+    return gray
 
 
 def image_size(path: Path | str) -> tuple[int, int]:
@@ -76,13 +87,17 @@ def _opened(path, checked=True):
         raise
     except Image.DecompressionBombError:
         raise UserError(f"{path}: more than {MOST_PIXELS} pixels; reduce the image") from None
+    except UnidentifiedImageError:  # by its first bytes, whatever it is called
+        raise UserError(
+            f"{path}: is no {', '.join(FORMATS)}; convert it, or copy it anew"
+        ) from None
     # decoders meet broken bytes with whatever comes up: OSError, SyntaxError, struct.error
     except Exception as error:
         raise refusal(path, error, ", ".join(FORMATS)) from error
 
 
-def _is_deep_png(path):
-    """True for a PNG of 16 bits a channel, of which Pillow silently drops the low byte."""
+def is_deep_png(path: Path | str) -> bool:
+    """Whether it is a PNG of 16 bits a channel, of which Pillow silently drops the low byte."""
     with open(path, "rb") as file:
         head = file.read(PNG_DEPTH_BYTE + 1)
     return head.startswith(PNG_SIGNATURE) and head[PNG_DEPTH_BYTE] == 16

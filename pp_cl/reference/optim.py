@@ -29,17 +29,24 @@ class Adam:
 class RmsProp:
     """The step of cl/training/rmsprop.cl, written out for all points in every step.
 
-    sh: (N, count, 16) coefficients. basis: (N, count), their harmonics. offset: (N, 4). opacity:
-    (N,). v: {"sh": (N, 16), "offset", "opacity"}.
+    basis: (N, count), harmonics of the coefficients sh, (N, count, 16). most: of an offset. offset:
+    (N, 4). opacity: (N,). v: {"sh": (N, 16), "offset", "opacity"}.
     """
 
-    def __init__(self, basis: np.ndarray, sh: np.ndarray, offset: np.ndarray, opacity: np.ndarray):
-        self.basis = basis
-        self.sh, self.offset, self.opacity = (
-            np.array(a, np.float64) for a in (sh, offset, opacity)
-        )
-        self.v = {"sh": np.zeros((len(sh), 16)), "offset": np.zeros_like(self.offset)}
-        self.v["opacity"], self.t = np.zeros_like(self.opacity), 0
+    def __init__(
+        self,
+        basis: np.ndarray,
+        most: float,
+        *,
+        sh: np.ndarray,
+        offset: np.ndarray,
+        opacity: np.ndarray,
+    ):
+        self.basis, self.most, self.t = basis, most, 0
+        self.sh, self.offset = np.array(sh, np.float64), np.array(offset, np.float64)
+        self.opacity = np.array(opacity, np.float64)
+        self.v = {name: np.zeros_like(getattr(self, name)) for name in ("offset", "opacity")}
+        self.v["sh"] = np.zeros((len(sh), 16))
 
     def step(
         self, t: int, gradients: dict[str, np.ndarray], rates: dict, eps: dict[str, float]

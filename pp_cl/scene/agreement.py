@@ -33,7 +33,7 @@ def disagreements(views: Sequence[View], box: np.ndarray) -> list[Disagreement]:
 
     box: (2, 3), around the hull; its double is searched, since a wrong mask has carved it.
     """
-    if not all(view.has_mask for view in views):
+    if not any(view.has_mask for view in views):
         return []
     middle, reach = box.mean(0), np.ptp(box, axis=0)
     grid, on_mask, beside = mask_votes(views, np.stack([middle - reach, middle + reach]))

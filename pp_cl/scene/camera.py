@@ -52,6 +52,19 @@ class Camera:
         """The camera with its eye moved by (3,) world units."""
         return replace(self, pose=np.column_stack([self.pose[:, :3], np.add(self.eye, by)]))
 
+    def project(self, positions: ArrayLike) -> np.ndarray:
+        """(3, ...) of world positions (..., 3): x and y in pixels, and depth along the camera's
+        axis.
+        """
+        x, y, z = np.moveaxis((positions - self.eye) @ self.pose[:, :3], -1, 0)
+        return np.stack([self.fx * x / z + self.cx, self.fy * y / z + self.cy, z])
+
+    def rays(self) -> np.ndarray:
+        """(H, W, 3) through the pixels' centres, along the world's axes, of depth 1."""
+        y, x = np.mgrid[: self.height, : self.width] + 0.5
+        axes = (x - self.cx) / self.fx, (y - self.cy) / self.fy, np.ones_like(x)
+        return np.stack(axes, -1) @ self.pose[:, :3].T
+
     def packed(
         self, depth_range: Sequence[float], centre: ArrayLike = (0.0, 0.0, 0.0)
     ) -> np.ndarray:

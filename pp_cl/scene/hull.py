@@ -93,7 +93,7 @@ class Carver:
         self.dev = dev
         self.program = dev.program("scene/hull")
         self.cameras = [view.stored_camera for view in views]
-        self.least = min(LEAST_SEEING, len(views)) if views[0].has_mask else 1
+        self.least = min(LEAST_SEEING, len(views)) if any(v.has_mask for v in views) else 1
         words = [-(-c.width // 32) for c in self.cameras]
         starts = np.cumsum([0, *(c.height * w for c, w in zip(self.cameras, words, strict=True))])
         self.masks = dev.empty((int(starts[-1]),), np.uint32)
@@ -201,7 +201,7 @@ def build_grid(
     """
     if not 1 <= points <= CELL_CAP:
         raise UserError(f"--points {points}: must be between 1 and {CELL_CAP}")
-    masked = [view.has_mask for view in views]
+    masked = [view.has_mask or view.is_masked for view in views]
     if any(masked) and not all(masked):
         raise UserError(
             f"{views[masked.index(False)].name}: has no transparent pixel, but other photographs"
@@ -228,7 +228,7 @@ def _box(views, given, forgiven):
     """The box to search: the given one as far as the masks allow it, whole if there are none. Where
     masks are forgiven, twice what they allow, as a wrong one bounds it too.
     """
-    if given is not None and not views[0].has_mask:
+    if given is not None and not any(view.has_mask for view in views):
         return given
     box = bounding_box(views)
     if forgiven:
@@ -351,7 +351,10 @@ def agreeing(dev: Device, views: Sequence[View], box: np.ndarray | None = None) 
     """
     kept = list(views)
     left_out: dict[str, Any] = {}
-    if not kept[0].has_mask or _shares_beside(dev, kept, box, 0).max() <= MOST_BESIDE / 2:
+    if (
+        not any(one.has_mask for one in kept)
+        or _shares_beside(dev, kept, box, 0).max() <= MOST_BESIDE / 2
+    ):
         return Agreement(kept, left_out, 0)
     most = len(kept) // FORGIVING
     while len(left_out) < most:

@@ -2,6 +2,7 @@
 READERS knows, or made by the program.
 """
 
+import mimetypes
 import os
 import warnings
 from collections.abc import Iterable, Mapping, Sequence, Set
@@ -51,6 +52,7 @@ READING_BYTES = 3 * 2**28  # of the photographs that are read side by side
 
 LEAST_FOCAL, MOST_FOCAL = 1e-2, 1e7  # pixels; docs/scenes.md says what is measured
 
+INVERTED = 0.95  # of the border of an image: hardly any object ends inside and holds so much
 NEARBY = 100  # entries of a folder without a scene in which one is looked for
 
 Listed = Mapping[str, Sequence[Photograph]]  # photographs by the name of their split
@@ -98,7 +100,14 @@ def open_scene(
     scene = load_scene(path, splits, most, mask_rule(config), downscale=downscale, listed=listed)
     views = scene.splits.get("train", [])
     is_box_wanted = most is not None or config.scene.mask_from == "box"
-    if views and not is_box_wanted and not any(view.has_mask for view in views):
+    masked = [view for view in views if view.has_mask]
+    if masked and np.median([_share_of_border(view) for view in masked]) > INVERTED:
+        warnings.warn(
+            f"{path}: most masks hold the border of their image, as if they were inverted: they"
+            " must be white on the object and black around it",
+            stacklevel=2,
+        )
+    if views and not is_box_wanted and not masked:
         warnings.warn(
             f"{path}: no photograph has a mask: points fill the box that all cameras see;"
             " --mask-from color cuts out a uniform background, --masks FOLDER takes masks,"
@@ -106,6 +115,13 @@ def open_scene(
             stacklevel=2,
         )
     return scene
+
+
+def _share_of_border(view):
+    """Of the image, that the mask holds."""
+    alpha = view.image[..., 3]
+    border = np.concatenate([alpha[0], alpha[-1], alpha[:, 0], alpha[:, -1]])
+    return (border > 127).mean()
 
 
 def mask_rule(config: Config) -> MaskRule:
@@ -215,18 +231,14 @@ def find_reader(path: str | Path) -> ModuleType:
 def check_folder(folder: Path) -> None:
     """Raise UserError where a scene's folder is missing, no folder, or cannot be read."""
     if folder.is_file():
-        raise UserError(
-            f"{folder}: is a file; a scene is a folder, maybe {folder.absolute().parent}"
-        )
+        is_film = (mimetypes.guess_type(folder.name)[0] or "").startswith("video/")
+        mend = f"a scene is a folder, maybe {folder.absolute().parent}"
+        mend = f"`pp-cl capture {folder} --out SCENE` makes a scene of it" if is_film else mend
+        raise UserError(f"{folder}: is a file; {mend}")
     if not folder.is_dir():
         raise UserError(f"{folder}: no such folder; SCENE is a folder, or the word demo")
     if not os.access(folder, os.R_OK | os.X_OK):
         raise UserError(f"{folder}: cannot be read; check its permissions")
-
-
-def is_scene(folder: str | Path) -> bool:
-    """Whether a folder holds a scene."""
-    return Path(folder).is_dir() and _reader_of(Path(folder)) is not None
 
 
 def _reader_of(folder):
@@ -340,4 +352,5 @@ def _read_view(folder, photograph, masks, factor):
         digest=pixel_digest(image),
         shrunk=factor,
         unshrunk_camera=camera if factor > 1 else None,
+        is_masked=bool(masks.folder or (masks.source == "given" and photograph.mask)),
     )

@@ -9,7 +9,7 @@ from skimage.color import rgb2lab
 from skimage.measure import label
 
 from pp_cl.errors import UserError
-from pp_cl.files.image import read_gray
+from pp_cl.files.image import read_mask
 from pp_cl.scene.readers.common import mask_names
 
 BORDER_SHARE = 0.5  # of the border's pixels that must have its median colour
@@ -38,7 +38,7 @@ class MaskRule:
         be read or has another size, or a photograph without a uniform border.
         """
         if self.folder:
-            return _with_file(image, _named(Path(self.folder), name))
+            return _with_file(image, named_mask(Path(self.folder), name))
         if self.source in ("box", "none"):
             return _with_alpha(image, OPAQUE)
         if self.source == "color":
@@ -49,20 +49,21 @@ class MaskRule:
 AS_GIVEN = MaskRule()
 
 
-def _named(folder, name):
-    """The mask of a photograph in a folder, by the photograph's path or by its name alone. Raises
-    UserError.
+def named_mask(folder: Path, *names: str) -> Path:
+    """The mask of a photograph in a folder, by one of the names of the photograph: a path or a name
+    alone. Raises UserError.
     """
-    path = PurePosixPath(name)
-    for given in (*mask_names(name), *mask_names(path.name)):
-        if (folder / given).is_file():
-            return folder / given
-    raise UserError(f"{folder}: no mask for {name}; add {path.stem}.png, white where the object is")
+    for name in names:
+        for given in (*mask_names(name), *mask_names(PurePosixPath(name).name)):
+            if (folder / given).is_file():
+                return folder / given
+    usual = PurePosixPath(names[0]).stem
+    raise UserError(f"{folder}: no mask for {names[0]}; add {usual}.png, white where the object is")
 
 
 def _with_file(image, mask):
-    """The image with the brightness of a mask's pixels as alpha. Raises UserError."""
-    alpha = read_gray(mask)
+    """The image with a mask as alpha. Raises UserError."""
+    alpha = read_mask(mask)
     if alpha.shape != image.shape[:2]:
         sizes = "{1}x{0} pixels, but its image has {3}x{2}".format(*alpha.shape, *image.shape)
         raise UserError(f"{mask}: {sizes}; make it the image's size")

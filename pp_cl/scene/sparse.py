@@ -20,14 +20,15 @@ GREY = 150  # of points without colour
 
 
 def sparse_points(folder: Path) -> tuple[np.ndarray, np.ndarray]:
-    """((N, 3) float64 world positions, (N, 3) uint8 colours), none where the scene has none. Raises
-    UserError naming a file that is broken.
+    """((N, 3) float64 world positions, (N, 3) uint8 colours), none where the scene has none, or not
+    the file that it names. Raises UserError naming a file that is broken.
     """
     shared = {}
     if (file := folder / transforms.SINGLE).is_file():
         shared = read_json(file)
-        if named := shared.get("ply_file_path") if isinstance(shared, dict) else None:
-            return _read_ply(folder / find_image(folder, str(named), fail_at(file)))
+        named = str(shared.get("ply_file_path") or "") if isinstance(shared, dict) else ""
+        if os.path.isfile(folder / named):
+            return _read_ply(folder / find_image(folder, named, fail_at(file)))
     model = colmap.model_folder(folder)
     if model is None:
         return np.empty((0, 3)), np.empty((0, 3), np.uint8)

@@ -56,7 +56,7 @@ class View:
     in world units, if the dataset states one. digest: of the file's pixels, see scene/identity.py;
     None for one that the program makes itself. shrunk: how many times the stored image was reduced
     while it was read from its file (shrink()). unshrunk_camera: of the file's image, where
-    that is another one.
+    that is another one. is_masked: a mask of its own says so where the object fills the image.
     """
 
     name: str
@@ -67,6 +67,7 @@ class View:
     digest: str | None = None
     shrunk: int = 1
     unshrunk_camera: Camera | None = None
+    is_masked: bool = False
 
     @property
     def file_camera(self) -> Camera:

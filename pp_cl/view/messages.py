@@ -12,13 +12,13 @@ import numpy as np
 from pp_cl.errors import UserError
 from pp_cl.files.untrusted import strict_json
 from pp_cl.scene.camera import Camera
-from pp_cl.scene.readers.frame import GL_FROM_CV
+from pp_cl.scene.readers.common import fail_at
+from pp_cl.scene.readers.frame import GL_FROM_CV, rigid
 
 MOST_BYTES = 8192  # of a message: a camera in full precision takes a tenth of it
 KINDS = ("frame", "snapshot")
 SHOWN = ("colour", "alpha", "depth", "normals", "hits", "error", "photograph")
 LEAST_SIDE, MOST_SIDE, MOST_PIXELS = 16, 4096, 2**23  # of a picture, as page.js
-ROTATION_TOLERANCE = 1e-4  # largest element of R^T R - 1; a browser counts in float64
 MOST_NUMBER = 2**53 - 1  # what a browser counts to exactly
 # {name: (least, most)}; exposure in stops, kept as a share of the points
 RANGES = {"early_stop": (0, 0.5), "kept": (0.001, 1), "exposure": (-6, 6)}
@@ -88,21 +88,11 @@ def _camera(facts):
 def _pose(rows):
     """(3, 4) float64 with OpenCV axes of a 4 x 4 matrix with OpenGL axes."""
     name = "camera.transform_matrix"
-    shaped = isinstance(rows, list) and len(rows) == 4
-    if not shaped or not all(isinstance(row, list) and len(row) == 4 for row in rows):
-        raise UserError(f"{name}: must be 4 rows of 4 numbers")
-    if not all(_is_number(value) for row in rows for value in row):
-        raise UserError(f"{name}: holds what is no finite number")
-    matrix = np.array(rows, np.float64)
-    if np.abs(matrix[:3, 3]).max() > MOST_DISTANCE:
+    rigid(rows, fail_at(name))  # refuses; what is rendered has the bits that were sent
+    pose = np.array(rows, np.float64)[:3] @ GL_FROM_CV
+    if np.abs(pose[:, 3]).max() > MOST_DISTANCE:
         raise UserError(f"{name}: the eye is more than {MOST_DISTANCE:g} from the origin")
-    turn = matrix[:3, :3]
-    off = np.abs(turn.T @ turn - np.eye(3)).max() if np.abs(turn).max() <= 2 else math.inf
-    if off > ROTATION_TOLERANCE or np.linalg.det(turn) < 0:
-        raise UserError(f"{name}: its axes are not orthonormal and right-handed")
-    if not np.array_equal(matrix[3], [0, 0, 0, 1]):
-        raise UserError(f"{name}: its last row must be 0, 0, 0, 1")
-    return np.column_stack([turn, matrix[:3, 3]]) @ GL_FROM_CV
+    return pose
 
 
 def _is_number(value):

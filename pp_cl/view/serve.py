@@ -21,7 +21,6 @@ from pp_cl.device.discover import open_device
 from pp_cl.errors import UserError
 from pp_cl.files.run_folder import RunFolder
 from pp_cl.run import check_scene
-from pp_cl.scene.load import is_scene
 from pp_cl.view.access import Access
 from pp_cl.view.live_run import LiveRun
 
@@ -54,7 +53,7 @@ def serve(
     """
     check_installed()
     shown = None
-    if not wait and not RunFolder(folder).config.exists() and is_scene(folder):
+    if not wait and not RunFolder(folder).config.exists() and Path(folder).is_dir():
         from pp_cl.view.scene_server import ShownScene
 
         if scene is not None:

@@ -42,10 +42,8 @@ def normals_from_depth(depth: np.ndarray, camera: Camera) -> np.ndarray:
     depth: (H, W) along the camera's axis, world units; infinite or NaN: none. Of the two neighbours
     in each direction the one of the nearer depth is taken, so that edges stay sharp.
     """
-    y, x = np.mgrid[: camera.height, : camera.width] + 0.5
     depth = np.where(np.isfinite(depth), depth, np.nan).astype(np.float64)
-    rays = [(x - camera.cx) / camera.fx, (y - camera.cy) / camera.fy, np.ones_like(x)]
-    positions = depth[..., None] * np.stack(rays, axis=2)
+    positions = depth[..., None] * (camera.rays() @ camera.pose[:, :3])
     along_x, along_y = _difference(positions, axis=1), _difference(positions, axis=0)
     normals = np.cross(along_y, along_x)  # x right, y down: their product points at the camera
     with np.errstate(invalid="ignore"):

@@ -17,6 +17,7 @@ from support.runs import spoken
 
 from pp_cl.capture import poses
 from pp_cl.capture.frames import take_images
+from pp_cl.cli import main
 from pp_cl.files.image import to_8bit, write_png
 from pp_cl.files.video import write_video
 from pp_cl.scene.camera import Camera
@@ -95,15 +96,8 @@ def test_photographs_become_a_scene(captured):
     assert np.abs(box).max() == pytest.approx(1) and np.abs(box).min() > 0.3
     for view in (*views["train"], *views["test"]):
         rows, columns = np.nonzero(view.image[..., 3] > 127)
-        middle = np.array([[0, 0, 0]]) - view.camera.eye
-        x, y, z = (view.camera.pose[:, :3].T @ middle.T)[:, 0]
-        assert (
-            np.hypot(
-                view.camera.fx * x / z + view.camera.cx - columns.mean(),
-                view.camera.fy * y / z + view.camera.cy - rows.mean(),
-            )
-            < 0.1 * SIZE
-        )
+        middle = view.camera.project(np.zeros(3))[:2]
+        assert np.linalg.norm(middle - [columns.mean(), rows.mean()]) < 0.1 * SIZE
         assert -view.camera.pose[2, 1] > 0  # the image's upper edge is up
 
 
@@ -140,6 +134,18 @@ def test_what_is_done_is_not_done_again(captured, shot, tmp_path):
     assert json.loads((scene / "transforms.json").read_text())["aabb"] == [[-0.5] * 3, [0.5] * 3]
     status, lines = capture(shot[1], scene)
     assert status == 2 and len(lines) == 1 and str(scene) in lines[0]
+
+
+def test_photographs_that_came_later_are_told(captured, shot, tmp_path, capsys):
+    """As they are not taken: the masks that the user has mended would be gone."""
+    scene, later = shutil.copytree(captured, tmp_path / "scene"), shot[0] / "later.jpg"
+    later.touch()
+    try:
+        assert main(["capture", str(shot[0]), "--out", str(scene), "--masks", str(shot[1])]) == 0
+    finally:
+        later.unlink()
+    told = f"frames: {COUNT} images (done before; later.jpg came later: --from frames takes all"
+    assert told in capsys.readouterr().out
 
 
 @pytest.mark.slow
@@ -195,13 +201,18 @@ def nothing(files, folder):
     (folder / "notes.txt").write_text("none")
 
 
-@pytest.mark.parametrize("make", [blurred, strangers, three, nothing])
+def deeper(files, folder):
+    shutil.copytree(files[0].parent, folder / "DCIM")
+
+
+@pytest.mark.parametrize("make", [blurred, strangers, three, nothing, deeper])
 def test_photographs_of_no_use(shot, tmp_path, make):
     folder, scene = tmp_path / "folder", tmp_path / "scene"
     folder.mkdir()
     make(sorted(shot[0].iterdir()), folder)
     status, lines = capture(folder, scene)
     assert status == 2 and len(lines) == 1 and str(tmp_path) in lines[0]
+    assert make is not deeper or f"maybe {folder / 'DCIM'}" in lines[0]
     assert not (scene / "transforms.json").exists()
 
 

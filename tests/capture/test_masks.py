@@ -2,6 +2,7 @@
 
 import shlex
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -11,7 +12,8 @@ from scipy.ndimage import binary_closing, binary_dilation, binary_opening, gauss
 from support.scenes import ball_image, ring_cameras
 
 from pp_cl.errors import UserError
-from pp_cl.files.image import read_gray, read_rgba
+from pp_cl.files.image import read_mask, read_rgba
+from pp_cl.scene.camera import Camera
 from pp_cl.scene.demo import ANGLE, OBJECT_BOX, render
 from pp_cl.scene.outline import OUTLINE
 from pp_cl.scene.views import Photograph
@@ -68,7 +70,7 @@ class Capture:
 
     def agreement(self):
         """(V,) intersection over union of each mask with the true one."""
-        found = [read_gray(self.file(i)) > 127 for i in range(VIEWS)]
+        found = [read_mask(self.file(i)) > 127 for i in range(VIEWS)]
         pairs = zip(found, self.truth, strict=True)
         return np.array([(a & b).sum() / (a | b).sum() for a, b in pairs])
 
@@ -111,7 +113,7 @@ def test_the_object_is_cut_out_of_any_background(capture):
     line = capture.write()
     assert f"{VIEWS} cut out" in line
     assert capture.agreement().min() > 0.95
-    assert len(np.unique(read_gray(capture.file(0)))) > 4, "no soft border"
+    assert len(np.unique(read_mask(capture.file(0)))) > 4, "no soft border"
 
 
 def test_thin_parts_and_gaps_are_told_by_the_wall(dev, tmp_path):
@@ -155,7 +157,7 @@ def share_held(capture, place, wanted):
             patch.setattr(cut, "ROUNDS", rounds)
             capture.write()
         chosen = capture.truth[0][place] == wanted
-        shares.append((read_gray(capture.file(0)) > 127)[place][chosen].mean())
+        shares.append((read_mask(capture.file(0)) > 127)[place][chosen].mean())
         for number in range(VIEWS):
             capture.file(number).unlink()
     return shares
@@ -216,6 +218,14 @@ def test_given_masks_come_first(capture, tmp_path):
     """And they are copied as they are."""
     line = capture.write(given=given_masks(capture, tmp_path / "given"))
     assert f"{VIEWS} given" in line
+    assert (capture.agreement() == 1).all()
+
+
+def test_masks_named_like_the_sources(capture, tmp_path):
+    """Whose copies have other names, as spaces are none of COLMAP's."""
+    folder = given_masks(capture, tmp_path / "given")
+    (folder / "03.png").rename(folder / "my photo (3).png")
+    assert f"{VIEWS} given" in capture.write(given=folder, sources={"03.png": "my photo (3).JPG"})
     assert (capture.agreement() == 1).all()
 
 
@@ -282,7 +292,17 @@ def test_a_program_makes_the_masks(capture, tmp_path):
     capture.seen = capture.seen[:2]
     assert "2 by the program" in capture.write(command=program(tmp_path, PROGRAM))
     gray = np.array(Image.open(capture.folder / "images/01.png").convert("L"))
-    assert (read_gray(capture.file(1)) == np.where(gray > 90, 255, 0)).all()
+    assert (read_mask(capture.file(1)) == np.where(gray > 90, 255, 0)).all()
+
+
+def test_a_program_may_make_cut_outs(capture, tmp_path):
+    """As rembg does: the alpha is the mask, whatever the colours."""
+    capture.photographs, capture.seen = capture.photographs[:2], capture.seen[:2]
+    cut_out = "cut = Image.open(sys.argv[1]).convert('RGB')\ncut.putalpha(mask)\ncut.save"
+    text = PROGRAM.replace("mask.save", cut_out)
+    capture.write(command=program(tmp_path, text))
+    gray = np.array(Image.open(capture.folder / "images/01.png").convert("L"))
+    assert (read_mask(capture.file(1)) == np.where(gray > 90, 255, 0)).all()
 
 
 @pytest.mark.parametrize(
@@ -310,11 +330,31 @@ def test_a_command_that_cannot_be_one_is_refused(command):
         program_words(command)
 
 
-def test_a_box_without_points_is_refused(capture):
+BOXES = {
+    "nothing in it": [[2.0, 2.0, 2.0], [2.1, 2.1, 2.1]],
+    "flat things on its floor alone": [[-0.8, -0.8, 0.76], [0.8, 0.8, 1.6]],
+    "no photograph shows it": [[0, 0, 40.0], [1, 1, 41.0]],
+}
+
+
+@pytest.mark.parametrize("case", BOXES)
+def test_a_box_without_an_object_is_refused(capture, case):
     """There is nothing to begin with."""
-    capture.box = np.array([[2.0, 2.0, 2.0], [2.1, 2.1, 2.1]])
+    capture.box = np.array(BOXES[case])
     with pytest.raises(UserError, match="--box"):
         capture.write()
+
+
+def test_a_photograph_beside_the_object_has_an_empty_mask(capture):
+    """As films have them, where they begin or end; the others are cut out all the same."""
+    one = capture.photographs[3]
+    eye, ahead = 3 * one.camera.eye, one.camera.pose[:, 2] + 0.84 * one.camera.pose[:, 0]
+    camera = Camera.look_at(eye, eye + ahead, fx=one.camera.fx, width=SIZE, height=SIZE)
+    capture.photographs[3] = replace(one, camera=camera)
+    line = capture.write()
+    assert f"1 empty, as the object is outside, {VIEWS - 1} cut out" in line
+    assert not read_mask(capture.file(3)).any()
+    assert np.delete(capture.agreement(), 3).min() > 0.9
 
 
 def test_the_picture_shows_outlines(capture, tmp_path):

@@ -17,13 +17,11 @@ GRID = Grid((-1.0, -1.05, -1.1), 0.06, (34, 36, 38))
 
 def ball_picture(camera):
     """What a perfect run shows of a ball at the origin."""
-    y, x = np.mgrid[: camera.height, : camera.width] + 0.5
-    axes = [(x - camera.cx) / camera.fx, (y - camera.cy) / camera.fy, np.ones_like(x)]
-    rays = np.stack(axes, -1) @ camera.pose[:, :3].T  # as long as their depth is 1
+    rays = camera.rays()
     a, b = (rays**2).sum(-1), rays @ camera.eye
     disc = b**2 - a * (camera.eye @ camera.eye - RADIUS**2)
     depth = np.where(disc > 0, (-b - np.sqrt(np.maximum(disc, 0))) / a, np.inf)
-    return Picture(np.ones((*x.shape, 3)), np.float32(disc > 0), depth, depth)
+    return Picture(np.ones_like(rays), np.float32(disc > 0), depth, depth)
 
 
 @pytest.fixture(scope="module")

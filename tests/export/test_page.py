@@ -92,11 +92,11 @@ def test_what_it_keeps_shows_what_the_run_shows(run, page):
         assert psnr(predicted(run, page, camera), to_8bit(run.render(camera).colour)) > 25
 
 
-def test_a_browser_draws_what_the_run_shows(run, page, tmp_path):
+def test_a_browser_draws_what_the_run_shows(run, page):
     cameras = run.cameras("test")
     script = f"""return [{",".join(page_camera(camera) for camera in cameras)}].map(
         (camera) => {{ ppcl.setCamera(camera); return ppcl.canvas.toDataURL(); }});"""
-    for url, camera in zip(ask(page, script, tmp_path), cameras, strict=True):
+    for url, camera in zip(ask(page, script), cameras, strict=True):
         image = image_of(url)
         assert psnr(image, to_8bit(run.render(camera).colour)) > 25
         assert psnr(image, predicted(run, page, camera)) > 45
@@ -115,16 +115,16 @@ def test_a_browser_draws_the_same_far_from_the_origin(run, page, tmp_path):
     images = []
     for file, seen in ((page, camera), (other, camera.moved(by))):
         script = f"ppcl.setCamera({page_camera(seen)}); return ppcl.canvas.toDataURL();"
-        images.append(image_of(ask(file, script, tmp_path)).astype(int))
+        images.append(image_of(ask(file, script)).astype(int))
     assert np.abs(images[0] - images[1]).max() <= 1 and images[0].min() < 200
 
 
-def test_a_browser_sorts_the_points_from_far_to_near(page, tmp_path):
+def test_a_browser_sorts_the_points_from_far_to_near(page):
     script = """const eye = [0.3, 4, 1]; ppcl.sortPoints(eye);
         return Array.from(ppcl.order, (i) => Math.hypot(
             ...[0, 1, 2].map((k) => ppcl.positions[3 * i + k] - eye[k]))).concat([ppcl.order.length,
             new Set(ppcl.order).size]);"""
-    *distances, count, different = ask(page, script, tmp_path)
+    *distances, count, different = ask(page, script)
     assert count == different == kept(page)[0]["count"]
     assert np.diff(distances).max() < 1.1 * np.ptp(distances) / 65535
 
@@ -135,45 +135,45 @@ def looking(eye, target, up, fov):
     return Camera.look_at(eye, target, up, fx=focal, width=48, height=30)
 
 
-def check_address(page, fragment, camera, tmp_path):
+def check_address(page, fragment, camera):
     """The page at an address shows what a camera sees; returns that, (H, W, 3) uint8."""
     script = f"""ppcl.show(); const shown = ppcl.canvas.toDataURL();
         ppcl.setCamera({page_camera(camera)}); return [shown, ppcl.canvas.toDataURL()];"""
-    urls = ask(page, script, tmp_path, fragment + "&w=48&h=30")
+    urls = ask(page, script, fragment + "&w=48&h=30")
     shown, set_ = (image_of(url) for url in urls)
     assert shown.shape == (30, 48, 3) and shown.min() < 230
     assert psnr(shown, set_) > 50
     return shown
 
 
-def test_the_address_says_the_camera(run, page, tmp_path):
+def test_the_address_says_the_camera(run, page):
     camera = looking((1, -3.5, 1.2), (0.1, 0, 0), (0, 0.1, 1), 40)
     fragment = "#eye=1,-3.5,1.2&target=0.1,0,0&up=0,0.1,1&fov=40"
-    shown = check_address(page, fragment, camera, tmp_path)
+    shown = check_address(page, fragment, camera)
     assert psnr(shown, predicted(run, page, camera)) > 40  # nearer than a test view: more edges
 
 
 @pytest.mark.parametrize("fragment", ["#eye=1,2&target=x&up=,,&fov=-3", "#eye=1,2,3&target=1,2,3"])
-def test_a_broken_address_shows_the_first_look(page, fragment, tmp_path):
+def test_a_broken_address_shows_the_first_look(page, fragment):
     header = kept(page)[0]
     camera = looking(header["eye"], header["centre"], header["up"], header["fov"])
-    check_address(page, fragment, camera, tmp_path)
+    check_address(page, fragment, camera)
 
 
-def test_footprints_are_never_smaller_than_a_pixel(run, page, tmp_path):
+def test_footprints_are_never_smaller_than_a_pixel(run, page):
     near = run.cameras("test")[0]
     far = replace(near, fx=near.fx / 4, fy=near.fy / 4)
     script = f"ppcl.setCamera({page_camera(far)}); return ppcl.canvas.toDataURL();"
-    drawn = image_of(ask(page, script, tmp_path)).astype(int)
+    drawn = image_of(ask(page, script)).astype(int)
     assert np.abs(drawn - predicted(run, page, far)).max() <= 3
 
 
-def test_footprints_grow_where_the_object_is_larger_than_in_training(run, page, tmp_path):
+def test_footprints_grow_where_the_object_is_larger_than_in_training(run, page):
     """They close gaps: the page covers more than the rasteriser does."""
     far = run.cameras("test")[0]
     near = replace(far, fx=2 * far.fx, fy=2 * far.fy)
     script = f"ppcl.setCamera({page_camera(near)}); return ppcl.canvas.toDataURL();"
-    drawn = image_of(ask(page, script, tmp_path)).astype(int)
+    drawn = image_of(ask(page, script)).astype(int)
     assert np.mean(drawn < 250) > np.mean(predicted(run, page, near) < 250)
 
 
@@ -195,8 +195,8 @@ CONTROLS = """
     return { seen, address };"""
 
 
-def test_mouse_and_keys_move_the_camera(page, tmp_path):
-    found = ask(page, CONTROLS, tmp_path)
+def test_mouse_and_keys_move_the_camera(page):
+    found = ask(page, CONTROLS)
     assert len(set(found["seen"])) == 4 and found["seen"][0] == found["seen"][4]
     header = kept(page)[0]
     eye, target = (
@@ -228,8 +228,8 @@ PINCH = """
     return { seen, address: location.hash };"""
 
 
-def test_fingers_move_the_camera(page, tmp_path):
-    found = ask(page, PINCH, tmp_path)
+def test_fingers_move_the_camera(page):
+    found = ask(page, PINCH)
     assert len(set(found["seen"])) == 3 and found["seen"][0] == found["seen"][3]
     eye, target = (
         np.array([float(x) for x in re.search(rf"{name}=([^&]+)", found["address"])[1].split(",")])
@@ -240,9 +240,9 @@ def test_fingers_move_the_camera(page, tmp_path):
     assert np.linalg.norm(eye - target) == pytest.approx(first / 2, rel=1e-4)
 
 
-def test_a_phone_shows_the_whole_object(page, tmp_path):
+def test_a_phone_shows_the_whole_object(page):
     script = "ppcl.show(); return ppcl.canvas.toDataURL();"
-    image = image_of(ask(page, script, tmp_path, "#w=60&h=130"))
+    image = image_of(ask(page, script, "#w=60&h=130"))
     assert image.shape == (130, 60, 3) and image.min() < 200
     assert image[:, [0, -1]].min() > 200 and image[[0, -1]].min() > 200
 

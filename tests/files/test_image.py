@@ -9,7 +9,7 @@ import pytest
 from PIL import Image
 
 from pp_cl.errors import UserError
-from pp_cl.files.image import image_size, read_rgba, to_8bit, write_png
+from pp_cl.files.image import image_size, read_mask, read_rgba, to_8bit, write_png
 
 
 @pytest.fixture
@@ -44,6 +44,24 @@ def test_modes_become_rgba(tmp_path, rgba):
         assert image_size(path) == (7, 5), name
         result = read_rgba(path)
         assert result.dtype == np.uint8 and np.array_equal(result, expected), name
+
+
+def test_masks_of_other_programs(tmp_path, rgba):
+    """Gray ones; cut-outs, whose alpha is the mask; what is neither is refused with the mend."""
+    gray, path = rgba[..., 0], tmp_path / "a.png"
+    for image in (gray, np.dstack([gray] * 3), np.dstack([rgba[..., :3], gray])):
+        Image.fromarray(image).save(path)
+        assert np.array_equal(read_mask(path), gray)
+    labels = Image.fromarray((gray > 127).astype(np.uint8))
+    labels.save(path)
+    with pytest.raises(UserError, match=r"a\.png: .* 1 .* write 255"):
+        read_mask(path)
+    labels.putpalette([0, 0, 0, 128, 0, 0])  # as programs that follow objects write them
+    labels.save(path)
+    with pytest.raises(UserError, match=r"a\.png: .*colours.* white where the object is"):
+        read_mask(path)
+    Image.fromarray(np.zeros_like(gray)).save(path)
+    assert not read_mask(path).any()
 
 
 def test_sixteen_bits_are_refused(tmp_path, rgba):
@@ -99,6 +117,9 @@ def test_a_pipe_is_not_waited_for(tmp_path, read, name):
 def test_not_an_image(tmp_path, read):
     (tmp_path / "text.png").write_text("not an image")
     (tmp_path / "empty.png").touch()
+    Image.new("RGB", (5, 7)).save(tmp_path / "a.tif")
+    with pytest.raises(UserError, match=r"a\.tif: is no PNG, JPEG, WEBP; convert it"):
+        read(tmp_path / "a.tif")
     for path in (tmp_path, *(tmp_path / f"{name}.png" for name in ("text", "empty", "none"))):
         with pytest.raises(UserError) as caught:
             read(path)

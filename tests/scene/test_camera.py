@@ -34,6 +34,16 @@ def test_packed_layout(rng):
     np.testing.assert_allclose(packed[12:], [50, 55, 19, 16.5, 1, 5, 40, 30])
 
 
+def test_places_in_the_image_and_rays_through_pixels(rng):
+    camera = make_camera(rng)
+    points = points_in_front(camera, rng)
+    *found, depth = camera.project(points)
+    np.testing.assert_allclose(np.transpose(found), project(camera, points))
+    np.testing.assert_allclose(depth, (points - camera.eye) @ camera.pose[:, 2])
+    x, y, depth = camera.project(camera.eye + 2.5 * camera.rays())
+    np.testing.assert_allclose([x[3, 7], y[3, 7], depth[3, 7]], [7.5, 3.5, 2.5])
+
+
 def test_look_at_centres_the_target_and_points_up(rng):
     for eye, target, up in rng.normal(size=(20, 3, 3)):
         camera = Camera.look_at(eye, target, up, fx=50.0, fy=55.0, width=40, height=30)

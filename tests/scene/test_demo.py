@@ -95,9 +95,7 @@ def test_the_scene_shows_the_whole_mesh(dev):
         assert not alpha[[1, -2]].any() and not alpha[:, [1, -2]].any(), (
             f"{view.name} cuts the object off"
         )
-        x, y, z = camera.pose[:, :3].T @ (vertices - camera.eye).T
-        u = (camera.fx * x / z + camera.cx).astype(int) + 1
-        v = (camera.fy * y / z + camera.cy).astype(int) + 1
+        u, v, _ = camera.project(vertices).astype(int) + 1
         around = np.max([alpha[v + dv, u + du] for dv in (-1, 0, 1) for du in (-1, 0, 1)], axis=0)
         assert (around > 0).all()
         eyes.append(camera.eye)

@@ -23,6 +23,8 @@ def test_missing_folder_format_and_split(tmp_path):
     refused(scene, scene, "no scene in it: 1 image, 'images'", "pp-cl capture")
     write_scene(scene)
     refused(scene / "transforms_train.json", "is a file", scene)
+    (scene / "a.mov").touch()
+    refused(scene / "a.mov", "is a file", f"pp-cl capture {scene / 'a.mov'} --out SCENE")
     refused(scene / "images", f"no scene in it; {scene} is one")
     refused(above, f"no scene in it; {scene} is one")
     write_scene(scene, "val")
@@ -118,9 +120,8 @@ def test_lego(data):
 
 def alpha_at(view, point):
     """Alpha of the pixel that shows a world point."""
-    camera = view.camera
-    x, y, z = camera.pose[:, :3].T @ (point - camera.eye)
-    return view.image[int(camera.fy * y / z + camera.cy), int(camera.fx * x / z + camera.cx), 3]
+    column, row, _ = view.camera.project(point).astype(int)
+    return view.image[row, column, 3]
 
 
 def test_a_folder_that_may_not_be_read(tmp_path, monkeypatch):

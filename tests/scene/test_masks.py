@@ -17,7 +17,8 @@ from pp_cl.device.discover import open_device
 from pp_cl.errors import UserError
 from pp_cl.files.image import read_rgba, write_png
 from pp_cl.run import load_run
-from pp_cl.scene.hull import build_grid
+from pp_cl.scene.agreement import disagreements
+from pp_cl.scene.hull import agreeing, build_grid
 from pp_cl.scene.load import load_scene, open_scene, scene_box
 from pp_cl.scene.masks import MaskRule, cut_out
 from pp_cl.scene.views import MASK_THRESHOLD
@@ -144,7 +145,7 @@ def masked(tmp_path):
 BAD = {
     "missing": (lambda m: (m / "train_1.png").unlink(), "no mask for train_1.png"),
     "another size": (lambda m: write_png(m / "train_1.png", np.ones((4, 5))), "5x4 pixels"),
-    "text": (lambda m: (m / "train_1.png").write_text("white"), "cannot be read"),
+    "text": (lambda m: (m / "train_1.png").write_text("white"), "is no PNG"),
     "a folder": (
         lambda m: ((m / "train_1.png").unlink(), (m / "train_1.png").mkdir()),
         "no mask for train_1.png",
@@ -241,6 +242,26 @@ def test_a_mask_for_some_photographs_only(dev, tmp_path):
     views = load_scene(tmp_path / "ball").splits["train"]
     with pytest.raises(UserError, match=r"train/r_2\.png: has no transparent pixel, but other"):
         build_grid(dev, views, 1000)
+    (tmp_path / "masks").mkdir()
+    for i, camera in enumerate(ring_cameras(6, 40)):
+        mask = ball_image(camera)[..., 3] if i != 2 else np.full((40, 40), 255, np.uint8)
+        write_png(tmp_path / "masks" / f"r_{i}.png", mask)
+    rule = MaskRule(folder=str(tmp_path / "masks"))
+    views = load_scene(tmp_path / "ball", masks=rule).splits["train"]
+    agreed = agreeing(dev, views)  # a mask that is white says that the object fills the image
+    assert (
+        agreed.views == views and disagreements(views, build_grid(dev, views, 1000).grid.box) == []
+    )
+
+
+def test_inverted_masks_are_told(dev, tmp_path):
+    scene = write_ball_scene(tmp_path / "ball", views=6, size=40)
+    for file in (tmp_path / "ball").rglob("*.png"):
+        rgba = read_rgba(file)
+        rgba[..., 3] = 255 - rgba[..., 3]
+        write_png(file, rgba)
+    with pytest.warns(UserWarning, match="as if they were inverted.* white on the object"):
+        open_scene(dev, configure(preset("tiny"), scene), ("train",))
 
 
 def test_the_choice_is_kept_with_the_run(tmp_path, monkeypatch):

@@ -32,6 +32,8 @@ def test_points_of_nerfstudio(tmp_path):
     (tmp_path / "sparse_pc.ply").write_bytes(data[:-3])
     with pytest.raises(UserError, match=r"sparse_pc\.ply"):
         sparse_points(tmp_path)
+    (tmp_path / "sparse_pc.ply").rename(tmp_path.parent / "a.ply")
+    assert not len(sparse_points(tmp_path)[0]), "what is drawn beside the cameras is no need"
     (tmp_path / "transforms.json").write_text(json.dumps({"ply_file_path": "../a.ply"}))
     with pytest.raises(UserError, match=r"transforms\.json"):
         sparse_points(tmp_path)

@@ -17,9 +17,7 @@ def ball_camera(eye, target, size=(64, 64), focal=1.5):
 
 def ball_view(name, camera, centre=CENTRE, radius=RADIUS):
     """View of a ball: alpha 255 where the ray through the pixel's centre meets it."""
-    x, y = np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5)
-    rays = np.stack([(x - camera.cx) / camera.fx, (y - camera.cy) / camera.fy, np.ones_like(x)], -1)
-    to_centre = camera.pose[:, :3].T @ (centre - camera.eye)
+    rays, to_centre = camera.rays(), centre - camera.eye
     along = rays @ to_centre
     hit = (along > 0) & (to_centre @ to_centre - along**2 / (rays**2).sum(-1) <= radius**2)
     return View(name, camera, np.where(hit, 255, 0)[..., None].repeat(4, -1).astype(np.uint8))

@@ -1,49 +1,29 @@
-"""What a page draws, in Chromium without a window."""
+"""What an exported page draws, in Chromium without a window."""
 
+import asyncio
 import base64
 import io
-import json
-import re
-import subprocess
 
 import numpy as np
 from PIL import Image
-from support.chromium import find_chromium
+from support.chromium import chromium
 
 # WebGL on the CPU, so that no graphics card is needed
-OPTIONS = (
-    "--headless=new",
-    "--no-sandbox",
-    "--use-gl=angle",
-    "--use-angle=swiftshader",
-    "--enable-unsafe-swiftshader",
-    "--virtual-time-budget=20000",
-    "--dump-dom",
-)
-# `found` of a script becomes the page's whole content
-PROBE = """<script>
-const pre = document.createElement("pre");
-try { pre.textContent = "found" + JSON.stringify((() => { %s })()) + "end"; }
-catch (error) { pre.textContent = `error ${error}`; }
-document.body.replaceChildren(pre);
-document.querySelectorAll("script").forEach((script) => script.remove());
-</script>"""
+WEBGL = ("--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader")
 
 
-def ask(page, script, tmp_path, fragment=""):
-    """What a script returns that runs in a page after it has loaded, as JSON says it.
+def ask(file, script, fragment=""):
+    """What a script returns that runs in a page after it has loaded.
 
-    page: the file. script: the body of a function. fragment: of the page's address, from # on.
+    file: the page. script: the body of a function. fragment: of the page's address, from # on.
     """
-    probe = tmp_path / "probe.html"
-    probe.write_text(page.read_text("utf-8") + PROBE % script, "utf-8")
-    words = [find_chromium(), *OPTIONS, f"--user-data-dir={tmp_path / 'profile'}"]
-    done = subprocess.run(
-        [*words, f"{probe.as_uri()}{fragment}"], capture_output=True, text=True, timeout=120
-    )
-    found = re.search(r"<pre>found(.*)end</pre>", done.stdout, re.DOTALL)
-    assert found, done.stdout[-500:] + done.stderr[-500:]
-    return json.loads(found[1].replace("&amp;", "&").replace("&lt;", "<").replace("&gt;", ">"))
+
+    async def scenario():
+        async with chromium(*WEBGL) as browser, browser.page() as page:
+            await page.open(f"{file.as_uri()}{fragment}")
+            return await page.evaluate(f"(() => {{ {script} }})()")
+
+    return asyncio.run(scenario())
 
 
 def image_of(url):

@@ -149,13 +149,14 @@ class Browser:
 
 
 @contextlib.asynccontextmanager
-async def chromium():
+async def chromium(*options):
     """A Browser with a profile of its own; skips the test where there is none."""
     program = find_chromium()
     with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as profile:
         process = await asyncio.create_subprocess_exec(
             program,
             *OPTIONS,
+            *options,
             f"--user-data-dir={profile}",
             stderr=asyncio.subprocess.PIPE,
             start_new_session=True,

@@ -24,11 +24,7 @@ def ball_image(camera, radius=0.8):
     """(H, W, 4) uint8 image of a ball at the origin whose colour varies with the surface
     position.
     """
-    y, x = np.mgrid[: camera.height, : camera.width] + 0.5
-    rays = (
-        np.stack([(x - camera.cx) / camera.fx, (y - camera.cy) / camera.fy, np.ones_like(x)], -1)
-        @ camera.pose[:, :3].T
-    )
+    rays = camera.rays()
     rays /= np.linalg.norm(rays, axis=-1, keepdims=True)
     b = rays @ camera.eye
     disc = b**2 - (camera.eye @ camera.eye - radius**2)

@@ -118,8 +118,8 @@ def test_a_scene_that_is_not_there(tmp_path):
     refused(lambda: jobs_of([tmp_path / "none"], tmp_path), str(tmp_path / "none"), "no such")
 
 
-def test_each_value_has_a_folder_of_its_own_in_the_sweeps(tmp_path):
+def test_each_value_has_a_folder_of_its_own_in_the_sweeps(tmp_path, scenes):
     values = ["a/b", "a:b", "..", "a b"]
-    jobs = jobs_of(["demo"], tmp_path, varied=[("scene.masks", values)])
+    jobs = jobs_of(scenes[:1], tmp_path, varied=[("scene.masks", values)])
     parents = {Path(job.folder).parent for job in jobs}
-    assert len(parents) == len(values) and {p.parent for p in parents} == {tmp_path / "demo"}
+    assert len(parents) == len(values) and {p.parent for p in parents} == {tmp_path / "a"}

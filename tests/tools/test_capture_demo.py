@@ -17,16 +17,11 @@ def test_the_wall_is_the_same_from_everywhere():
     one, two = cameras(200)[20], cameras(200)[23]
     images, checked = (room(one), room(two)), 0
     for row, column in np.random.default_rng(0).integers(10, 190, (300, 2)):
-        ray = one.pose[:, :3] @ [
-            (column + 0.5 - one.cx) / one.fx,
-            (row + 0.5 - one.cy) / one.fy,
-            1,
-        ]
+        ray = one.rays()[row, column]
         ray /= np.linalg.norm(ray)
         b = ray @ one.eye
         place = one.eye + (-b + np.sqrt(b**2 + ROOM**2 - one.eye @ one.eye)) * ray
-        x, y, z = two.pose[:, :3].T @ (place - two.eye)
-        u, v = two.fx * x / z + two.cx - 0.5, two.fy * y / z + two.cy - 0.5
+        u, v, z = two.project(place) - [0.5, 0.5, 0]
         if z > 0 and 1 < u < 198 and 1 < v < 198:
             c, r = int(u), int(v)
             patch = images[1][r : r + 2, c : c + 2].reshape(4, 3)

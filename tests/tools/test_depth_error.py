@@ -5,7 +5,7 @@ import pytest
 import trimesh
 
 from pp_cl.scene.demo import demo_frames, demo_mesh
-from tools.depth_error import DemoSurface, near_share, overlap, pixel_rays
+from tools.depth_error import DemoSurface, near_share, overlap
 
 pytestmark = pytest.mark.slow
 
@@ -14,7 +14,7 @@ def test_the_depth_is_where_rays_meet_the_mesh(dev, rng):
     camera = demo_frames("test", 48)[3].camera
     depth = DemoSurface(dev).depth(camera)
     vertices, faces = demo_mesh(dev, 256)
-    rays = pixel_rays(camera)
+    rays = camera.rays()
     chosen = [tuple(p) for p in rng.integers(0, 48, (60, 2))]
     mesh = trimesh.Trimesh(vertices, faces, process=False)
     directions = np.array([rays[p] for p in chosen])

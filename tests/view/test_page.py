@@ -163,25 +163,6 @@ async def copied_camera(page):
     return json.loads(await page.until("document.getElementById('camera').value"))
 
 
-def test_a_wrong_token_and_a_foreign_page_are_refused(dev, trained):
-    async def scenario():
-        async with served(dev, trained) as here, chromium() as browser, browser.page() as page:
-            await page.open(f"{here.origin}/wrong/")
-            await page.until("document.body && document.body.innerText.includes('403')")
-            # another page of this machine has the same host and another port
-            await page.open("data:text/html,<p>foreign</p>")
-            await page.until("document.body && document.body.innerText == 'foreign'")
-            socket = f"{here.access.address}socket".replace("http:", "ws:")
-            opened = await page.evaluate(
-                f"new Promise((done) => {{ const s = new WebSocket('{socket}');"
-                " s.onopen = () => done('open'); s.onerror = () => done('refused'); })"
-            )
-            assert opened == "refused" and not here.server.tabs
-            assert any("403" in line for line in page.said)
-
-    asyncio.run(scenario())
-
-
 def test_the_page_waits_for_a_checkpoint_and_shows_the_curve(dev, copied):
     whole = (copied / "checkpoint.npz").read_bytes()
     (copied / "checkpoint.npz").unlink()

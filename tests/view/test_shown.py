@@ -14,10 +14,7 @@ CAMERA = ring_cameras(2, 40)[1]
 
 def plane_depth(camera, normal, distance):
     """(H, W) depth of the plane normal . x = distance (world axes) along the camera's axis."""
-    y, x = np.mgrid[: camera.height, : camera.width] + 0.5
-    rays = np.stack([(x - camera.cx) / camera.fx, (y - camera.cy) / camera.fy, np.ones_like(x)], 2)
-    towards = rays @ camera.pose[:, :3].T @ normal
-    return (distance - normal @ camera.eye) / towards
+    return (distance - normal @ camera.eye) / (camera.rays() @ normal)
 
 
 @pytest.mark.parametrize("tilt", [(0, 0, 0), (0.3, 0, 0), (0, 0.4, 0), (0.2, -0.3, 0.1)])

@@ -8,6 +8,7 @@ over, since they are nearly all of a file.
 import os
 import struct
 import unicodedata
+import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path, PurePosixPath
@@ -27,6 +28,7 @@ from pp_cl.scene.readers.common import (
     fail_at,
     find_image,
     find_mask,
+    fitted,
     hold_out,
     listing,
 )
@@ -102,15 +104,25 @@ def splits(folder: Path) -> list[str]:
 def read_split(folder: Path, split: str) -> list[Photograph]:
     """The photographs of a split: test is every eighth in the order of their names.
 
-    An image's mask is masks/NAME.png, as COLMAP has it, or masks/NAME with any ending of an image;
-    with a folder of masks, every image needs one. Raises UserError naming the file, and the image.
+    Where images were reduced or enlarged after COLMAP saw them, their cameras are scaled to them;
+    images that are gone are left out with a warning. An image's mask is masks/NAME.png, as COLMAP
+    has it, or masks/NAME with any ending of an image; with a folder of masks, every image needs
+    one. Raises UserError naming the file, and the image.
     """
     model = model_folder(folder) or folder
     lenses, images = read_model(model)
     ordered = sorted(images, key=lambda image: image.name)
+    there = {one.name for one in images if os.path.isfile(folder / IMAGES / one.name)}
+    if there and (gone := [one.name for one in ordered if one.name not in there]):
+        warnings.warn(
+            f"{folder / IMAGES}: {len(gone)} of the {len(images)} images of {model} are not there,"
+            f" {gone[0]!r} among them; they are left out",
+            stacklevel=2,
+        )
     return [
         _photograph(folder, model, image, lenses[image.camera])
         for image in listing(hold_out(ordered, split))
+        if image.name in there or not there
     ]
 
 
@@ -131,17 +143,12 @@ def _suffix(folder):
 def _photograph(folder, model, image, lens):
     fail = fail_at(model, image.name)
     name = find_image(folder, f"{IMAGES}/{image.name}", fail)
-    size = image_size(folder / name)
-    if size != (lens.width, lens.height):
-        raise fail(
-            f"has {size[0]}x{size[1]} pixels, but its camera {lens.width}x{lens.height}; restore"
-            " the images that COLMAP was given"
-        )
     fx, fy, cx, cy, distortion = _intrinsics(folder, model, lens)
     w, x, y, z = image.rotation
     rotation = Rotation.from_quat([x, y, z, w]).as_matrix().T
     pose = np.column_stack([rotation, -rotation @ image.translation])
-    camera = Camera(pose, fx, fy, cx, cy, *size)
+    camera = Camera(pose, fx, fy, cx, cy, lens.width, lens.height)
+    camera = fitted(camera, image_size(folder / name), fail)
     mask = find_mask(folder, MASKS, image.name, fail)
     return Photograph(name, camera, mask=mask, distortion=distortion)
 

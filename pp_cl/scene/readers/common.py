@@ -17,6 +17,7 @@ from pp_cl.errors import UserError, quoted, shown
 from pp_cl.files.checkpoint import opened_zip
 from pp_cl.files.image import ENDINGS
 from pp_cl.files.untrusted import opened_regular, read_json_text, read_regular, refusal
+from pp_cl.scene.camera import Camera
 
 HELD_OUT = 8  # one photograph of so many, the first among them, as LLFF and 3DGS do
 SPLITS = ["test", "train"]  # of a format that knows none
@@ -24,6 +25,7 @@ MOST_JSON = 2**26  # bytes of a JSON file: 100,000 frames of 670
 MOST_ARRAYS = 2**25  # bytes of all arrays of a file, as float64: 100,000 cameras need 25 million
 MOST_TEXT = 2**20  # bytes of a file with the numbers of one camera
 MOST = 1e30  # larger numbers are refused: float32 could not hold their products
+CASED_ENDINGS = [cased for ending in ENDINGS for cased in (ending, ending.upper())]
 KINDS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)  # of numpy's savez and savez_compressed
 
 Item = TypeVar("Item")
@@ -49,23 +51,27 @@ def listing(items: Sequence[Item]) -> Iterable[Item]:
 
 def find_image(folder: Path, given: str, fail: Fail, endings: Sequence[str] = ("",)) -> str:
     """Path relative to the scene's folder of the image that a file there calls `given`, with the
-    first of the endings that exists.
+    first of the endings that exists; as Windows writes paths, too.
 
     Raises fail(text) for a path that leaves the folder, by a symbolic link or otherwise, and for
     one where no image is.
     """
     try:
         root = os.path.realpath(folder)
-        for ending in endings:
-            path = os.path.realpath(os.path.join(root, given + ending))
-            if os.path.commonpath([root, path]) != root:
-                raise fail(f"{given!r} leaves the scene's folder; move the image into it")
-            if os.path.isfile(path):
-                return os.path.relpath(path, root).replace(os.sep, "/")
+        for form in (given, given.replace("\\", "/")):
+            for ending in endings:
+                path = os.path.realpath(os.path.join(root, form + ending))
+                if os.path.commonpath([root, path]) != root:
+                    raise fail(
+                        f"{given[:80]!r} leaves the scene's folder; copy the image into it and"
+                        " write its path from there"
+                    )
+                if os.path.isfile(path):
+                    return os.path.relpath(path, root).replace(os.sep, "/")
     except (OSError, ValueError) as error:  # a name too long, a zero byte
         raise fail(f"{given[:80]!r} is not a usable path ({error})") from error
-    tried = "".join(f", nor with {ending} added" for ending in endings if ending)
-    raise fail(f"no image at {given[:80]!r}{tried}; copy it there or remove the frame")
+    bare = ", with or without the ending of an image" * (len(endings) > 1)
+    raise fail(f"no image at {given[:80]!r}{bare}; copy it there or remove the frame")
 
 
 def first_folder(folder: Path, names: Sequence[str]) -> str:
@@ -94,9 +100,8 @@ def mask_names(image: str) -> list[str]:
     ending of any image.
     """
     path = PurePosixPath(image)
-    endings = [cased for ending in ENDINGS for cased in (ending, ending.upper())]
     stems = (path.stem, f"{path.stem}_mask", f"mask_{path.stem}")
-    names = (f"{stem}{ending}" for stem in stems for ending in endings)
+    names = (f"{stem}{ending}" for stem in stems for ending in CASED_ENDINGS)
     return [f"{image}.png", *(str(path.with_name(name)) for name in names)]
 
 
@@ -120,16 +125,21 @@ def fail_at(*place: object) -> Fail:
     return lambda text: UserError(f"{': '.join(map(str, place))}: {text}")
 
 
-def scaled(stated: Sequence[float], size: tuple[int, int], fail: Fail) -> tuple[float, float]:
-    """(x, y) from pixels of images of the stated (width, height) to pixels of an image of `size`,
-    which must have their shape but for rounding. Raises fail(text).
+def fitted(camera: Camera, size: tuple[int, int], fail: Fail) -> Camera:
+    """The camera of an image of `size`, which was reduced or enlarged after the camera was found,
+    and must have its shape but for rounding. Raises fail(text).
     """
-    if abs(size[0] * stated[1] - size[1] * stated[0]) > max(stated):
+    width, height = camera.width, camera.height
+    if abs(size[0] * height - size[1] * width) > max(width, height):
+        is_turned = abs(size[1] * height - size[0] * width) <= max(width, height)
+        what = "another shape; copy the images anew"
+        what = "turned, maybe by its EXIF; write the images upright" if is_turned else what
         raise fail(
-            f"is for {stated[0]:g}x{stated[1]:g} pixels, but an image has {size[0]}x{size[1]},"
-            " another shape; copy the images anew"
+            f"is for {width:g}x{height:g} pixels, but an image has {size[0]}x{size[1]}, {what}"
         )
-    return size[0] / stated[0], size[1] / stated[1]
+    x, y = size[0] / width, size[1] / height
+    fx, fy, cx, cy = x * camera.fx, y * camera.fy, x * camera.cx, y * camera.cy
+    return Camera(camera.pose, fx, fy, cx, cy, *size)
 
 
 def checked_box(corners: object, fail: Fail) -> np.ndarray:
@@ -238,7 +248,7 @@ def read_numbers(file: Path) -> list[list[float]]:
     the line.
     """
     try:
-        lines = read_regular(file, MOST_TEXT).split("\n")
+        lines = read_regular(file, MOST_TEXT, "utf-8-sig").split("\n")
     except (OSError, ValueError) as error:
         raise refusal(file, error, "text") from None
     rows = []

@@ -11,10 +11,10 @@ from pp_cl.scene.readers.common import (
     SPLITS,
     fail_at,
     find_mask,
+    fitted,
     folder_images,
     hold_out,
     read_npy,
-    scaled,
 )
 from pp_cl.scene.readers.frame import rigid
 from pp_cl.scene.views import Photograph
@@ -48,7 +48,7 @@ def read_split(folder: Path, split: str) -> list[Photograph]:
     if rows.shape != (len(names), NUMBERS):
         raise UserError(
             f"{file}: has shape {rows.shape}, but {IMAGES}/ has {len(names)} images; must be"
-            f" {len(names)}x{NUMBERS} numbers"
+            f" {len(names)}x{NUMBERS} numbers; remove the images without a pose, or find poses anew"
         )
     read = []
     for index, name in hold_out(list(enumerate(names)), split):
@@ -64,6 +64,6 @@ def _camera(matrix, size, fail):
     height, width, focal = matrix[:, 4]
     if not (height > 0 and width > 0 and focal > 0):
         raise fail(f"height {height:g}, width {width:g}, focal length {focal:g} must be above 0")
-    focal *= scaled((width, height), size, fail)[0]
-    pose = np.column_stack([matrix[:, :3] @ LLFF_FROM_CV, matrix[:, 3]])
-    return Camera(rigid(pose, fail), focal, focal, size[0] / 2, size[1] / 2, *size)
+    pose = rigid(np.column_stack([matrix[:, :3] @ LLFF_FROM_CV, matrix[:, 3]]), fail)
+    camera = Camera(pose, focal, focal, width / 2, height / 2, width, height)
+    return fitted(camera, size, fail)

@@ -10,7 +10,7 @@ import numpy as np
 from pp_cl.errors import UserError
 from pp_cl.files.image import image_size
 from pp_cl.scene.camera import Camera
-from pp_cl.scene.readers.common import fail_at, folder_images, read_numbers, scaled
+from pp_cl.scene.readers.common import fail_at, fitted, folder_images, read_numbers
 from pp_cl.scene.readers.frame import rigid
 from pp_cl.scene.views import Photograph
 
@@ -44,9 +44,8 @@ def read_split(folder: Path, split: str) -> list[Photograph]:
     read = []
     for name in names[split]:
         pose, size = _pose(folder / POSES / f"{Path(name).stem}.txt"), image_size(folder / name)
-        x, y = scaled(stated or size, size, fail_at(file))
-        camera = Camera(pose, x * fx, y * fy, x * cx, y * cy, *size)
-        read.append(Photograph(name, camera, depth_range))
+        camera = Camera(pose, fx, fy, cx, cy, *(stated or size))
+        read.append(Photograph(name, fitted(camera, size, fail_at(file)), depth_range))
     return read
 
 

@@ -4,6 +4,7 @@ and a writer of the former.
 """
 
 import math
+from functools import partial
 from pathlib import Path, PurePosixPath
 
 import numpy as np
@@ -12,9 +13,11 @@ from pp_cl.errors import UserError
 from pp_cl.files.atomic import atomic_folder, write_json
 from pp_cl.files.image import image_size, write_png
 from pp_cl.scene.readers.common import (
+    CASED_ENDINGS,
     SPLITS,
     checked_box,
     fail_at,
+    fitted,
     hold_out,
     listing,
     read_json,
@@ -22,7 +25,6 @@ from pp_cl.scene.readers.common import (
 from pp_cl.scene.readers.frame import Frame, distortion, frame_keys, pinhole
 from pp_cl.scene.views import Photograph, View
 
-ENDINGS = ("", ".png", ".exr")  # of a file_path
 FILES = "transforms_train.json or transforms.json"
 SINGLE = "transforms.json"
 NAMED = ("train", "val", "test")  # splits that transforms.json may list as <split>_filenames
@@ -100,7 +102,7 @@ def _of_split(file, data, photographs, split):
         return hold_out(ordered, split)
     if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
         raise UserError(f"{file}: {split}_filenames: must be a list of images' paths")
-    wanted = {PurePosixPath(name).as_posix() for name in names}
+    wanted = {PurePosixPath(name.replace("\\", "/")).as_posix() for name in names}
     missing = wanted - {photograph.name for photograph in ordered}
     if missing or not wanted:
         what = f"{min(missing)!r} is the path of no frame" if missing else "is empty"
@@ -110,27 +112,22 @@ def _of_split(file, data, photographs, split):
 
 def _read_frame(folder, frame):
     """The Photograph of one frame."""
-    name, mask = frame.image("file_path", folder, ENDINGS), frame.image("mask_path", folder)
+    name, mask = (
+        frame.image("file_path", folder, ["", *CASED_ENDINGS]),
+        frame.image("mask_path", folder),
+    )
     if name is None:
         raise frame.error("file_path", "is missing; add the path of the image")
-    camera = pinhole(frame, *_size(folder, name, frame))
-    return Photograph(name, camera, _depth_range(frame), mask, distortion(frame))
+    return Photograph(
+        name, _camera(folder, name, frame), _depth_range(frame), mask, distortion(frame)
+    )
 
 
-def _size(folder, name, frame):
-    """(width, height) of the image; w and h must agree, since the other intrinsics are in the same
-    pixels.
-    """
+def _camera(folder, name, frame):
+    """The Camera, of the image's size."""
     size = image_size(folder / name)
-    for key, actual in zip(("w", "h"), size, strict=True):
-        stated = frame.number(key)
-        if stated is not None and stated != actual:
-            raise frame.error(
-                key,
-                f"is {stated:g}, but {name} has {size[0]}x{size[1]} pixels; restore the image's"
-                " size, or scale fl_x, fl_y, cx, cy, w and h to it",
-            )
-    return size
+    stated = [frame.number(key, above=0) or side for key, side in zip("wh", size, strict=True)]
+    return fitted(pinhole(frame, *stated), size, partial(frame.error, "w"))
 
 
 def _depth_range(frame):

@@ -99,8 +99,20 @@ def test_the_first_ending_that_exists(tmp_path):
     write_png(tmp_path / "a.png", np.zeros((2, 2)))
     assert find_image(tmp_path, "a", FAIL, ("", ".jpg", ".png")) == "a.png"
     assert find_image(tmp_path, "./b/../a.png", FAIL) == "a.png"
-    with pytest.raises(UserError, match=r"'a', nor with \.jpg"):
+    with pytest.raises(UserError, match="'a', with or without the ending"):
         find_image(tmp_path, "a", FAIL, ("", ".jpg"))
+
+
+@pytest.mark.unix
+def test_paths_as_windows_writes_them(tmp_path):
+    """Also as the name of a file, where a zip of Windows was unpacked elsewhere."""
+    (tmp_path / "images").mkdir()
+    write_png(tmp_path / "images" / "a.png", np.zeros((2, 2)))
+    assert find_image(tmp_path, r".\images\a.png", FAIL) == "images/a.png"
+    write_png(tmp_path / r"images\b.png", np.zeros((2, 2)))
+    assert find_image(tmp_path, r"images\b.png", FAIL) == r"images\b.png"
+    with pytest.raises(UserError, match="leaves the scene's folder"):
+        find_image(tmp_path / "images", r"..\images\..\a.png", FAIL)
 
 
 @pytest.mark.parametrize("given", ["../a.png", "/etc/hostname", "link.png", "a" * 999, "a\0b"])
@@ -147,7 +159,7 @@ def test_what_numpy_writes(tmp_path, rng):
 
 
 def test_lines_of_numbers(tmp_path):
-    (tmp_path / "a.txt").write_text("1 2.5\n\n-3e2\n")
+    (tmp_path / "a.txt").write_bytes(b"\xef\xbb\xbf1 2.5\r\n\r\n-3e2\r\n")  # as Windows does
     assert read_numbers(tmp_path / "a.txt") == [[1, 2.5], [-300]]
 
 

@@ -77,6 +77,12 @@ def test_bad_poses(scene, case):
     refused(scene, scene / FILE, word)
 
 
+def test_sizes_are_whole_numbers(scene):
+    """Those of the file are float64, and stand in digests of cameras as they are."""
+    camera = read_split(scene, "train")[0].camera
+    assert (type(camera.width), type(camera.height)) == (int, int)
+
+
 def test_missing_images(scene):
     (scene / "images" / "000003.png").unlink()
     refused(scene, scene / FILE, "10 images")

@@ -39,15 +39,8 @@ def test_projection_follows_opengl(tmp_path, rng):
         point = rng.normal(size=3) * 0.3
         x, y, z, _ = np.linalg.inv(frame["transform_matrix"]) @ [*point, 1]
         expected = [SIZE[0] / 2 + focal * x / -z, SIZE[1] / 2 - focal * y / -z]
-        camera = view.camera
-        x, y, z = camera.pose[:, :3].T @ (point - camera.eye)
-        assert z > 0
-        assert np.allclose(
-            [camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy],
-            expected,
-            rtol=0,
-            atol=1e-9,
-        )
+        *found, depth = view.camera.project(point)
+        assert depth > 0 and np.allclose(found, expected, rtol=0, atol=1e-9)
 
 
 def test_defaults_of_nerf_synthetic(tmp_path):
@@ -80,6 +73,36 @@ def test_nerfstudio_names(tmp_path):
         [33, 32.5, 11.25, 0, 1.5, 5],
         [31, 32.5, 11.25, 8.5, 2, 5],
     ]
+
+
+def test_images_that_were_reduced(tmp_path):
+    """After w and h were written: what is in pixels is scaled to them, angles need not be."""
+    keys = {"fl_x": 60.0, "fl_y": 62.0, "cx": 25.0, "cy": 17.0}
+    write_scene(tmp_path, edit=lambda data: data.update(keys, w=2 * SIZE[0], h=2.0 * SIZE[1]))
+    camera = load_scene(tmp_path).splits["train"][0].camera
+    assert (camera.fx, camera.fy, camera.cx, camera.cy) == (30, 31, 12.5, 8.5)
+    assert (camera.width, camera.height) == SIZE
+    camera = train_views(tmp_path, w=2 * SIZE[0], h=2 * SIZE[1])[0].camera
+    assert camera.fx == pytest.approx(0.5 * SIZE[0] / math.tan(0.35))
+    assert (camera.cx, camera.cy) == (SIZE[0] / 2, SIZE[1] / 2)
+
+
+def test_an_image_that_is_turned(tmp_path):
+    """By what EXIF says of it, as phones do; its pixels are those of the other shape."""
+    write_scene(tmp_path, edit=lambda data: data.update(w=SIZE[1], h=SIZE[0]))
+    refused(tmp_path, tmp_path / "transforms_train.json", "w: is for", "EXIF", "upright")
+
+
+@pytest.mark.parametrize("ending", (".JPG", ".jpeg", ".webp"))
+def test_a_path_without_the_ending_of_its_image(tmp_path, ending):
+    data = write_scene(tmp_path)
+    (tmp_path / "train_1.png").rename(tmp_path / f"train_1{ending}")
+    data["frames"][0]["file_path"] = r".\train_0.png"
+    data |= {"train_filenames": [r".\train_0.png", f"train_1{ending}"]}
+    (tmp_path / "transforms_train.json").unlink()
+    (tmp_path / "transforms.json").write_text(json.dumps(data))
+    names = [one.name for one in load_scene(tmp_path).splits["train"]]
+    assert names == ["train_0.png", f"train_1{ending}"]
 
 
 @pytest.mark.parametrize("corners", [[0, 1], [[0, 0, 0], [1, 1, 0]], [["a"] * 3] * 2, [[0] * 3]])

@@ -1,0 +1,100 @@
+"""Photographs and films as cameras, phones and other programs write them: all are taken, or left
+out with a reason.
+"""
+
+import subprocess
+
+import numpy as np
+import pytest
+from PIL import Image, TiffImagePlugin
+
+from pp_cl.capture import frames
+from pp_cl.capture.frames import take_images
+from pp_cl.files.image import read_rgba
+from pp_cl.files.video import write_video
+
+cv2 = pytest.importorskip("cv2")
+MAKER_NOTE, FOCAL = 0x927C, 0x920A
+SIZE = 96, 64
+
+
+@pytest.fixture
+def shots():
+    """Twelve sharp (64, 96, 3) images of which none is like another."""
+    return np.random.default_rng(0).integers(0, 256, (12, *SIZE[::-1], 3), np.uint8)
+
+
+def test_photographs_of_other_programs(shots, tmp_path):
+    """16 bits a channel, CMYK, a TIFF whose tags have no room in a JPEG, EXIF that is broken."""
+    pytest.importorskip("pillow_heif")
+    folder = tmp_path / "photographs"
+    folder.mkdir()
+    for i, image in enumerate(shots):
+        Image.fromarray(image).save(folder / f"{i:02d}.png")
+    cv2.imwrite(str(folder / "deep.png"), shots[0, ::-1].astype(np.uint16) * 257)
+    Image.fromarray(shots[1, ::-1]).convert("CMYK").save(folder / "print.jpg")
+    tags = TiffImagePlugin.ImageFileDirectory_v2()
+    tags[34377] = bytes(100_000)  # Photoshop's
+    Image.fromarray(shots[2, ::-1]).save(folder / "layers.tif", tiffinfo=tags)
+    exif = Image.Exif()
+    exif[frames.ORIENTATION] = 6
+    exif.get_ifd(frames.EXIF).update({FOCAL: 4.2, MAKER_NOTE: b"x" * 60_000})
+    Image.fromarray(shots[3, ::-1]).save(folder / "turned.jpg", exif=exif)
+    content = (folder / "turned.jpg").read_bytes()
+    (folder / "broken.jpg").write_bytes(content[:30] + b"\xff" * 40 + content[70:])
+    taken = take_images(folder, tmp_path / "images")
+    made = {one["source"]: one for one in taken["images"]}
+    assert {"deep.png", "print.jpg", "layers.tif", "turned.jpg"} <= set(made)
+    assert {one["source"] for one in taken["left_out"]} <= {"broken.jpg"}
+    for one in made.values():
+        size = read_rgba(tmp_path / "images" / one["name"]).shape[1::-1]
+        assert size == tuple(one["size"]) == (SIZE if one["source"] != "turned.jpg" else SIZE[::-1])
+    copy = Image.open(tmp_path / "images" / made["turned.jpg"]["name"]).getexif()
+    assert copy.get(frames.ORIENTATION, 1) == 1
+    assert copy.get_ifd(frames.EXIF)[FOCAL] == pytest.approx(4.2)
+
+
+def test_names_that_colmap_can_list(shots, tmp_path):
+    """Without spaces or a leading #, each once whatever the case of its letters."""
+    pytest.importorskip("pillow_heif")
+    names = ["#a.png", "_a.png", "b c.png", "b  c.png", "b_c.png", "B_C.PNG", "d.png", "d.jpg"]
+    for name, image in zip([*names, "e.png"], shots, strict=False):
+        Image.fromarray(image).save(tmp_path / name)
+    taken = [one["name"].lower() for one in take_images(tmp_path, tmp_path / "images")["images"]]
+    assert len({name.rpartition(".")[0] for name in taken}) == len(names) + 1
+    assert not any(" " in name or name.startswith("#") for name in taken)
+
+
+@pytest.fixture
+def film(shots, tmp_path):
+    """A film of 48 frames."""
+    pytest.importorskip("imageio_ffmpeg")
+    write_video(tmp_path / "film.webm", [np.roll(one, k, 0) for one in shots for k in range(4)], 24)
+    return tmp_path / "film.webm"
+
+
+def remade(film, name, *options):
+    """The film written anew by ffmpeg."""
+    import imageio_ffmpeg
+
+    command = [imageio_ffmpeg.get_ffmpeg_exe(), "-v", "error", *options[:-1], "-i", film]
+    target = film.with_name(name)
+    with target.open("wb") as file:
+        subprocess.run([*command, *options[-1], "pipe:1"], stdout=file, check=True)
+    return target
+
+
+def test_a_film_that_states_no_length(film, tmp_path):
+    """As browsers record them."""
+    live = remade(film, "live.webm", ["-c", "copy", "-f", "webm", "-live", "1"])
+    whole, found = (take_images(one, tmp_path / one.stem)["images"] for one in (film, live))
+    assert [one["name"] for one in found] == [one["name"] for one in whole] and len(found) > 40
+
+
+def test_a_film_that_is_shown_turned(film, tmp_path, caplog):
+    """As phones make them: upright, without a word of ffmpeg's."""
+    fragments = ["-c:v", "libx264", "-f", "mp4", "-movflags", "frag_keyframe+empty_moov"]
+    flat = remade(film, "flat.mp4", fragments)
+    turned = remade(flat, "turned.mp4", "-display_rotation", "90", ["-c", "copy", *fragments[2:]])
+    found = take_images(turned, tmp_path / "images")["images"]
+    assert {tuple(one["size"]) for one in found} == {SIZE[::-1]} and not caplog.records
