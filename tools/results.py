@@ -94,6 +94,7 @@ FORWARD = ("project", "pairs", "weights", "shade", "blend")
 # by preset, the training whose last steps are timed; a paper's begins
 STEPS = {"tiny": "lego_8000", "full": "lego_11000", "paper": "lego_paper"}
 RASTERISER = [
+    {"head": "scene", "cell": "{scene}"},
     {"head": "points", "cell": "{points:,}"},
     {"head": "side", "cell": "{size}"},
     {"head": "blend", "cell": "{blend}"},
@@ -194,8 +195,13 @@ def train(training: Training) -> dict:
 
 def rasteriser() -> list[dict]:
     """Rows of RASTERISER."""
-    words = ["--points", "250000,4000000", "--size", "200,800"]
-    rows = read_found("raster", *PP_CL, "bench", "raster", *words)["rows"]
+    rows = []
+    for scene, points, sizes in (
+        ("grid", "250000,4000000", "200,800"),
+        ("pulsar", "100000", "400,800"),
+    ):
+        words = ["--scene", scene, "--points", points, "--size", sizes]
+        rows += read_found("raster", *PP_CL, "bench", "raster", *words)["rows"]
     return [by_stage(row) for row in rows]
 
 

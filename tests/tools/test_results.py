@@ -10,7 +10,14 @@ from tools import results as TOOL
 ROW = {"name": "lego", "size": "200x200", "preset": "tiny", "steps": 300, "views": 200}
 ROW |= {"minutes": 0.5, "psnr": 28.1234, "ssim": 0.95, "lpips": 0.05, "points": 90000}
 ROW |= {"frame_ms": 14.0, "computed": 1.0}
-RASTER = {"points": 250336, "size": 200, "blend": "alpha", "forward_ms": 13.7, "backward_ms": 2.1}
+RASTER = {
+    "scene": "grid",
+    "points": 250336,
+    "size": 200,
+    "blend": "alpha",
+    "forward_ms": 13.7,
+    "backward_ms": 2.1,
+}
 RASTER |= {"ms": 15.8, "max_err": 8e-8, "stages_ms": dict.fromkeys(TOOL.FORWARD, 1.5)}
 NET = {"widths": "32,64,128", "side": 200, "variant": "auto", "direction": "forward"}
 NET |= {"ms": 13.1, "gflops": 900.0, "rel_l2": 4e-7}
