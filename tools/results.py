@@ -41,6 +41,7 @@ OPENSPLAT = [(3.6, 24.2), (14.0, 29.9)]  # minutes on one core, PSNR; its CPU bu
 # published, lego at 800x800: which side of its line the name stands on
 DRAWN = dict.fromkeys(("PlenopticPoints", "Plenoxels", "TensoRF"), "bottom")
 DRAWN |= {"Instant-NGP": "top"}
+NETWORKS = (("128,256,512", 256), ("32,64,128", 200))  # widths, side of the image
 
 
 Found: TypeAlias = dict | list[dict]
@@ -89,12 +90,15 @@ QUALITY = [
     {"head": "points", "cell": "{points:,}"},
     {"head": "ms a frame", "cell": "{frame_ms:.0f}"},
 ]
-STAGES = ("project", "pairs", "weights", "shade", "blend")
+FORWARD = ("project", "pairs", "weights", "shade", "blend")
+# by preset, the training whose last steps are timed; a paper's begins
+STEPS = {"tiny": "lego_8000", "full": "lego_11000", "paper": "lego_paper"}
 RASTERISER = [
+    {"head": "scene", "cell": "{scene}"},
     {"head": "points", "cell": "{points:,}"},
     {"head": "side", "cell": "{size}"},
     {"head": "blend", "cell": "{blend}"},
-    *({"head": f"{stage}, ms", "cell": f"{{{stage}_ms:.1f}}"} for stage in STAGES),
+    *({"head": f"{stage}, ms", "cell": f"{{{stage}_ms:.1f}}"} for stage in FORWARD),
     {"head": "forward", "cell": "{forward_ms:.1f}"},
     {"head": "backward", "cell": "{backward_ms:.1f}"},
     {"head": "error", "cell": "{max_err:.1e}"},
@@ -107,6 +111,24 @@ NETWORK = [
     {"head": "ms", "cell": "{ms:.1f}"},
     {"head": "GFLOP/s", "cell": "{gflops:.0f}"},
     {"head": "relative L2 error", "cell": "{rel_l2:.1e}"},
+]
+PYTORCH = [
+    {"head": "widths", "cell": "{widths}"},
+    {"head": "side", "cell": "{size}"},
+    {"head": "variant", "cell": "`{variant}`"},
+    {"head": "forward, ms", "cell": "{forward_ours_ms:.1f}, {forward_torch_ms:.1f}"},
+    {"head": "ratio", "cell": "{forward_ratio:.2f}"},
+    {"head": "with backward, ms", "cell": "{train_ours_ms:.1f}, {train_torch_ms:.1f}"},
+    {"head": "ratio", "cell": "{train_ratio:.2f}"},
+    {"head": "relative L2 error", "cell": "{rel_l2:.1e}, {torch_rel_l2:.1e}"},
+]
+STAGES = [
+    {"head": "stage", "cell": "{stage}"},
+    *(
+        {"head": head.format(preset), "cell": f"{{{key}_{preset}:.1f}}"}
+        for preset in STEPS
+        for head, key in (("{}, ms", "ms"), ("at least", "least"))
+    ),
 ]
 MEMORY = [
     {"head": "training", "cell": "{name}"},
@@ -173,24 +195,61 @@ def train(training: Training) -> dict:
 
 def rasteriser() -> list[dict]:
     """Rows of RASTERISER."""
-    words = ["--points", "250000,4000000", "--size", "200,800"]
-    rows = read_found("raster", *PP_CL, "bench", "raster", *words)["rows"]
+    rows = []
+    for scene, points, sizes in (
+        ("grid", "250000,4000000", "200,800"),
+        ("pulsar", "100000", "400,800"),
+    ):
+        words = ["--scene", scene, "--points", points, "--size", sizes]
+        rows += read_found("raster", *PP_CL, "bench", "raster", *words)["rows"]
     return [by_stage(row) for row in rows]
 
 
 def by_stage(row: dict) -> dict:
     """A row of the bench with the time of each stage; `blend` alone is the rule."""
-    return row | {f"{stage}_ms": row["stages_ms"].get(stage, 0) for stage in STAGES}
+    return row | {f"{stage}_ms": row["stages_ms"].get(stage, 0) for stage in FORWARD}
 
 
 def network() -> list[dict]:
     """Rows of NETWORK: the paper's network, and that of the other presets."""
     rows = []
-    for widths, side, blocks in (("128,256,512", 256, "double"), ("32,64,128", 200, "single")):
+    for (widths, side), blocks in zip(NETWORKS, ("double", "single"), strict=True):
         words = ["--widths", widths, "--size", side, "--blocks", blocks]
         found = read_found("unet", *PP_CL, "bench", "unet", *words)["rows"]
+        # auto is one of the others, and which are fast depends on the device
+        found = [row for row in found if row["variant"] in ("direct", "auto")]
         rows += [row | {"widths": widths, "side": side} for row in found]
     return rows
+
+
+def pytorch() -> list[dict]:
+    """Rows of PYTORCH: the paper's network and a narrow one, both of double blocks."""
+    rows = []
+    for widths, side in NETWORKS:
+        for variant in ("direct", "auto"):
+            words = ("--widths", widths, "--size", side, "--variant", variant)
+            found = read_found("torch", *TOOL, "tools.compare_torch", *words)
+            times = {f"{p}_{key}": found[p][key] for p in ("forward", "train") for key in found[p]}
+            rows.append(found | times | {"widths": widths})
+    return rows
+
+
+def stages() -> dict[str, dict]:
+    """{preset: what tools/stages.py says}."""
+    words = {name: (scene_of(LEGO), "--out", KEPT / run) for name, run in STEPS.items()}
+    words["paper"] += ("--preset", "paper")
+    return {name: read_found("stages", *TOOL, "tools.stages", *w) for name, w in words.items()}
+
+
+def by_preset(found: dict) -> list[dict]:
+    """Rows of STAGES."""
+    rows = {}
+    for preset, steps in found.items():
+        for row in steps["stages"]:
+            cells = {f"ms_{preset}": row["ms"]}
+            cells |= {f"least_{preset}": row["least_ms"]} if "least_ms" in row else {}
+            rows[row["stage"]] = rows.get(row["stage"], {"stage": row["stage"]}) | cells
+    return list(rows.values())
 
 
 def memory() -> list[dict]:
@@ -225,6 +284,8 @@ PARTS: dict[str, Callable[[], Found]] = {
     "demo": demo,
     "rasteriser": rasteriser,
     "network": network,
+    "pytorch": pytorch,
+    "stages": stages,
     "memory": memory,
 }
 
@@ -297,20 +358,33 @@ def timed(found: dict[str, Found]) -> list[dict]:
     net = (
         {"label": f"network, {r['variant']}", "ms": r["ms"], "error": r["rel_l2"]}
         for r in found["network"]
+        if r["direction"] == "forward"
     )
-    return [*raster, *net]
+    torch = (
+        {"label": "network, PyTorch", "ms": r["forward_torch_ms"], "error": r["torch_rel_l2"]}
+        for r in found["pytorch"]
+        if r["variant"] == "direct"
+    )
+    return [*raster, *net, *torch]
 
 
 def tables(found: dict[str, Found]) -> dict[str, dict]:
     """{name: contents} of docs/results/, but for origin()."""
     quality = "means over the held-out views, 8-bit images over white; minutes of training alone"
-    stages = "milliseconds, medians in turn, and the largest error against float64"
+    blended = "milliseconds, medians in turn, and the largest error against float64"
+    steps = "; ".join(
+        f"{preset}: {run['points']:,} points, {run['size']} pixels, {run['copy_gbs']:.1f} GB/s,"
+        f" {run['gflops']:.0f} GFLOP/s"
+        for preset, run in found["stages"].items()
+    )
     passes = "medians in turn; GFLOP/s count the multiplications of the direct convolution"
     parts = {
         "scenes": (quality, QUALITY, [found[name] for name in SHOWN]),
         "trainings": (quality, QUALITY, trained(found)),
-        "rasteriser": (stages, RASTERISER, found["rasteriser"]),
+        "rasteriser": (blended, RASTERISER, found["rasteriser"]),
         "network": (passes, NETWORK, found["network"]),
+        "pytorch": ("ours and PyTorch's, medians in turn", PYTORCH, found["pytorch"]),
+        "stages": (f"medians of a step on lego ({steps})", STAGES, by_preset(found["stages"])),
         "memory": ("the most memory that a few steps take", MEMORY, found["memory"]),
         "demo": ("runs of the demo", DEMO, found["demo"]),
     }

@@ -1,0 +1,32 @@
+"""tools/stages.py: a finished run goes on, is left as it is, and every stage has its times."""
+
+from support.scenes import write_ball_scene
+
+from pp_cl.session import train_scene
+from tools import stages as TOOL
+
+SETTINGS = {"points.count": 400, "network.widths": (16, 16, 16), "train.iterations": 4}
+
+
+def test_stages_of_a_finished_run(tmp_path, monkeypatch):
+    monkeypatch.setattr(TOOL, "UNTIMED", 1)
+    monkeypatch.setattr(TOOL, "TIMED", 2)
+    scene, out = write_ball_scene(tmp_path / "ball"), tmp_path / "run"
+    train_scene(scene, out, settings=SETTINGS)
+    before = {path: path.read_bytes() for path in out.rglob("*") if path.is_file()}
+    found = TOOL.measure(scene, out, None)
+    assert {path: path.read_bytes() for path in out.rglob("*") if path.is_file()} == before
+    least = {row["stage"]: row.get("least_ms") for row in found["stages"]}
+    assert all(row["ms"] > 0 for row in found["stages"])
+    assert {name for name, ms in least.items() if ms} == {*TOOL.least_bytes(*[1] * 6)} | {
+        "network",
+        "network backward",
+    }
+    assert found["points"] < 500 and found["copy_gbs"] > 0.1 and found["gflops"] > 1
+
+
+def test_bytes_grow_with_what_is_drawn():
+    few = TOOL.least_bytes(n=100, visible=10, hits=50, front=20, pixels=64, sh=576)
+    assert few["shade"] == 10 * (576 + 64)
+    more = TOOL.least_bytes(n=100, visible=20, hits=100, front=40, pixels=64, sh=576)
+    assert all(few[name] < more[name] < 2 * few[name] + 1 for name in few)

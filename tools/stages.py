@@ -1,0 +1,134 @@
+"""Time of a training's steps by stage, beside the time that its bytes and multiplications need.
+
+    python -m tools.stages SCENE --out RUN [--preset P] [--json FILE]
+
+A finished run goes on for some steps, with the points that it ended with; without a run in RUN the
+training begins. Nothing is written there. A stage that only moves data is compared with the copy of
+what it must read or write once; the network with its multiplications as direct convolutions. Both
+speeds are measured in the same process.
+"""
+
+import argparse
+import json
+import statistics
+import sys
+from pathlib import Path
+
+from pp_cl.bench.timing import CopyBandwidth, PeakFlops, interleave
+from pp_cl.device.discover import open_device
+from pp_cl.errors import UserError
+from pp_cl.files.atomic import write_json
+from pp_cl.files.run_folder import RunFolder
+from pp_cl.network.layers import multiplications
+from pp_cl.raster.weights import DROPPED
+from pp_cl.session import open_training, run_config, stored_state
+
+UNTIMED, TIMED = 4, 15  # steps; the first ones build kernels and grow buffers
+WORD, ROW = 4, 64  # bytes of a number, and of a point's or pixel's 16 features
+
+
+def least_bytes(n: int, visible: int, hits: int, front: int, pixels: int, sh: int) -> dict:
+    """{stage: bytes that it reads or writes once}.
+
+    n: points. visible: those with a hit before the early stop. hits: pairs of a point and a pixel.
+    front: hits before the early stop. sh: bytes of a point's SH coefficients.
+    """
+    cloud = 5 * WORD  # id and offset
+    projected = 8 * WORD  # axes, box, count, radius
+    adam = 7 * WORD  # gradient; parameter and both moments, read and written
+    return {
+        "project": n * (cloud + WORD) + visible * projected,
+        "pairs": visible * projected + hits * 5 * WORD + pixels * WORD,
+        "weights": front * (2 + 2 + 1 + 2 + 2) * WORD + front,
+        "shade": visible * (sh + ROW),
+        "blend": front * 2 * WORD + visible * ROW + pixels * ROW,
+        "backward": front * (1 + 2 + 2 + 2) * WORD + (2 * visible + pixels) * ROW + n * cloud,
+        "update": visible * (2 * sh + 3 * ROW + 2 * WORD) + n * 5 * adam,
+        "max weights": front * 3 * WORD + visible * 4 * WORD,
+    }
+
+
+def counts(result) -> dict:
+    """The arguments of least_bytes() that a rendered view decides."""
+    pairs, weights = result.pairs, result.weights
+    front = pairs.total
+    if weights.has_roles:
+        front = int((weights.pair_role.get()[:front] != DROPPED).sum())
+    shown = {"visible": weights.shaded.size, "hits": pairs.total, "front": front}
+    return shown | {"n": pairs.points, "pixels": pairs.pixels}
+
+
+def measure(scene: str, out: Path, preset: str | None) -> dict:
+    """{"points", "pixels", "copy_gbs", "gflops", "stages": rows of {"stage", "ms", "least_ms"}},
+    medians of the timed steps. Raises UserError as `pp-cl train`.
+    """
+    folder, steps, given = RunFolder(out), UNTIMED + TIMED, []
+    if folder.checkpoint.exists():
+        made = json.loads(folder.config.read_text("utf-8"))["train"]["iterations"]
+        given = [("train.iterations", made + steps, "stages")]
+    config = run_config(folder, scene, preset, given, extends=True)
+    dev = open_device()
+    trainer = open_training(dev, folder, config, stored_state(folder, config)).trainer
+    net, cloud, seen = trainer.model.net, trainer.model.cloud, []
+    sh, backward = sum(array.nbytes for array in cloud.sh) // cloud.count, trainer.renderer.backward
+
+    def watched(result, *others):
+        products = multiplications(net.layers, *result.size) * result.computed_fraction
+        seen.append(least_bytes(**counts(result), sh=sh) | {"products": products})
+        return backward(result, *others)
+
+    trainer.renderer.backward = watched
+    for _ in range(UNTIMED):
+        trainer.train_step()
+    seen.clear()
+    with dev.timed_stages() as seconds:
+        for _ in range(TIMED):
+            trainer.train_step()
+    copy, peak = CopyBandwidth(dev), PeakFlops(dev)
+    times = interleave({"copy": copy.run, "peak": peak.run})
+    copied = copy.bytes / statistics.median(times["copy"])  # a millisecond
+    computed = peak.flops / statistics.median(times["peak"])
+    need = {name: statistics.median(row[name] for row in seen) for name in seen[0]}
+    network = 2 * need.pop("products") / computed  # a multiply-add counts as two
+    least = {name: moved / copied for name, moved in need.items()}
+    least |= {"network": network, "network backward": 2 * network}
+    rows = [
+        {"stage": name, "ms": 1e3 * statistics.median(taken)}
+        | ({"least_ms": least[name]} if name in least else {})
+        for name, taken in seconds.items()
+        if len(taken) >= TIMED  # what every step does; pairs anew where there was too little room
+    ]
+    size = trainer.network_size
+    return {
+        "points": cloud.count,
+        "size": f"{size[1]}x{size[0]}",
+        "copy_gbs": copied * 1e-6,
+        "gflops": computed * 1e-6,
+        "stages": rows,
+    }
+
+
+def main() -> int:
+    """Measure, print, write; returns the exit status."""
+    parser = argparse.ArgumentParser(description=__doc__.partition("\n\n")[0])
+    parser.add_argument("scene", help="folder of a scene, or demo")
+    parser.add_argument("--out", type=Path, required=True, metavar="RUN", help="a run, if any")
+    parser.add_argument("--preset", help="of a training that begins (tiny)")
+    parser.add_argument("--json", type=Path, metavar="FILE", help="write the result there too")
+    options = parser.parse_args()
+    try:
+        found = measure(options.scene, options.out, options.preset)
+    except UserError as error:
+        print(f"stages: {error}", file=sys.stderr)
+        return 2
+    print("{points:,} points, {size}: {copy_gbs:.1f} GB/s, {gflops:.0f} GFLOP/s".format_map(found))
+    for row in found["stages"]:
+        least = f"{row['least_ms']:8.2f}" if "least_ms" in row else ""
+        print(f"{row['stage']:18} {row['ms']:8.2f} {least}")
+    if options.json:
+        write_json(options.json, found)
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
