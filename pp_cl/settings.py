@@ -194,7 +194,7 @@ class TrainConfig:
         1e3,
     )
     opacity_rate: tuple = setting(
-        (1e-1, 1e-2), "learning rate of the opacities, first and last step", 1e-12, 100
+        (3e-2, 1e-2), "learning rate of the opacities, first and last step", 1e-12, 100
     )
     offset_rate: tuple = setting(
         (1e-2, 1e-3),

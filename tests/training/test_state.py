@@ -64,7 +64,7 @@ def test_compacting_never_takes_more_than_its_scratch(dev, rng, monkeypatch, sha
     del array  # else it is not released
     state = filled(dev, cloud, rng)
     host = fetched(cloud.arrays(dev) | state.arrays())
-    assert len(host) == 6 + 2 + 4 + 6 + 2
+    assert len(host) == 6 + 2 + 2 + 6 + 2
     keep = np.arange(0, 1000, share, dtype=np.uint32)
     indices = dev.upload(keep)
     before, dev.peak_bytes = dev.bytes, dev.bytes
