@@ -72,10 +72,10 @@ def measure(scene: str, out: Path, preset: str | None) -> dict:
     net, cloud, seen = trainer.model.net, trainer.model.cloud, []
     sh, backward = sum(array.nbytes for array in cloud.sh) // cloud.count, trainer.renderer.backward
 
-    def watched(result, *others):
+    def watched(result, grad_image, **options):
         products = multiplications(net.layers, *result.size) * result.computed_fraction
         seen.append(least_bytes(**counts(result), sh=sh) | {"products": products})
-        return backward(result, *others)
+        return backward(result, grad_image, **options)
 
     trainer.renderer.backward = watched
     for _ in range(UNTIMED):

@@ -20,6 +20,7 @@ SETTINGS = {
     "points.count": 1500,
     "network.widths": "16,16,16",
     "train.crop": 24,
+    "train.opacity_rate": "0.1,0.01",  # in 60 steps something is to become opaque
     "train.refine_at": "1,1",
     "train.prune_every": 10,
     "train.checkpoint_every": 10,
