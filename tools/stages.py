@@ -35,15 +35,17 @@ def least_bytes(n: int, visible: int, hits: int, front: int, pixels: int, sh: in
     """
     cloud = 5 * WORD  # id and offset
     projected = 8 * WORD  # axes, box, count, radius
-    adam = 7 * WORD  # gradient; parameter and both moments, read and written
+    moved = 5 * WORD  # gradient; parameter and second moment, read and written
     return {
         "project": n * (cloud + WORD) + visible * projected,
         "pairs": visible * projected + hits * 5 * WORD + pixels * WORD,
         "weights": front * (2 + 2 + 1 + 2 + 2) * WORD + front,
         "shade": visible * (sh + ROW),
         "blend": front * 2 * WORD + visible * ROW + pixels * ROW,
-        "backward": front * (1 + 2 + 2 + 2) * WORD + (2 * visible + pixels) * ROW + n * cloud,
-        "update": visible * (2 * sh + 3 * ROW + 2 * WORD) + n * 5 * adam,
+        "backward": front * (1 + 2 + 2 + 2) * WORD
+        + (2 * visible + pixels) * ROW
+        + visible * 5 * WORD,
+        "update": visible * (2 * sh + 3 * ROW + 2 * WORD + 5 * moved),
         "max weights": front * 3 * WORD + visible * 4 * WORD,
     }
 
