@@ -211,13 +211,14 @@ def compile_build(target: str, build: Build, sources: Path, folder: Path) -> str
 
 def complaints(said: str) -> list[str]:
     """A line for each kernel that spills or takes too much local memory, by what ptxas, clang for
-    AMD or ocloc printed.
+    AMD or ocloc printed. AMD's scratch memory has arrays, too, whose index is not constant; scalar
+    registers spill into vector registers.
     """
     found, kernel = [], ""
     for line in said.splitlines():
         named = re.search(r"entry function '(\w+)'|Function Name: (\w+)|kernel (\w+)\s", line)
         kernel = next(filter(None, named.groups())) if named else kernel
-        spill = re.search(r"(\d+) bytes spill stores|Spill: (\d+)|spilled around (\d+)", line)
+        spill = re.search(r"(\d+) bytes spill st|ScratchSize.*: (\d+)|spilled around (\d+)", line)
         local = re.search(r"(\d+) bytes smem|LDS Size \[bytes/block\]: (\d+)", line)
         if spill and int(next(filter(None, spill.groups()))):
             found.append(f"{kernel}: spills {spill[0]}")

@@ -51,9 +51,9 @@ kernel void carve(
     if (word >= words || row >= rows) return;
     const float4 first = (float4)(32.0f * word, row % ny, row / ny, 1.0f);
     const uint count = min(nx - 32 * word, 32u);
-    ushort seen[32], rejected[32];
+    uint tally[32];  // views that see the vertex, and from bit 16 on those that reject it
     for (uint b = 0; b < 32; b++)
-        seen[b] = rejected[b] = 0;
+        tally[b] = 0;
     uint alive = 1;
     for (uint view = 0; view < views && alive; view++) {
         const float4 pu = projections[3 * view], pv = projections[3 * view + 1],
@@ -69,15 +69,16 @@ kernel void carve(
             const uint x = in ? (uint)u : 0, y = in ? (uint)v : 0;
             const uint on = masks[mask.w + y * mask.z + (x >> 5)] >> (x & 31);
             const uint counts = in | view_is_whole[view];
-            seen[b] += counts;
-            rejected[b] += counts & ~(in & on);
-            alive |= rejected[b] <= forgiven;
+            tally[b] += counts + ((counts & ~(in & on)) << 16);
+            alive |= tally[b] >> 16 <= forgiven;
         }
     }
     uint kept = 0;
-    for (uint b = 0; b < count; b++)
-        kept |= (uint)(seen[b] >= least && views * rejected[b] <= forgiven * seen[b]) << b;
-    bits[row * words + word] = kept;
+    for (uint b = 0; b < 32; b++) {
+        const uint seen = tally[b] & 0xffff, rejected = tally[b] >> 16;
+        kept |= (uint)(seen >= least && views * rejected <= forgiven * seen) << b;
+    }
+    bits[row * words + word] = kept & (0xffffffff >> (32 - count));
 }
 
 // One work-item per grid row: reads its words, writes how many vertices are set, the first and the

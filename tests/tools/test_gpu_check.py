@@ -15,7 +15,7 @@ PTXAS = """ptxas info    : Compiling entry function 'one' for 'sm_90'
 ptxas info    : Used 255 registers, used 1 barriers, {} bytes smem, 400 bytes cmem[0]
 """
 REMARKS = """x.cl:98:1: remark: Function Name: one [-Rpass-analysis=kernel-resource-usage]
-x.cl:98:1: remark:     VGPRs Spill: {} [-Rpass-analysis=kernel-resource-usage]
+x.cl:98:1: remark:     ScratchSize [bytes/lane]: {} [-Rpass-analysis=kernel-resource-usage]
 x.cl:98:1: remark:     LDS Size [bytes/block]: {} [-Rpass-analysis=kernel-resource-usage]
 """
 OCLOC = "warning: kernel one  compiled SIMD8 allocated 128 regs and spilled around 157\n"
