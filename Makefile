@@ -78,7 +78,7 @@ docs: $(READY) ## write the tables, settings and commands in README.md and docs/
 	@$(BIN)/python tools/docs_tables.py
 
 results: $(READY) ## measure what README.md and docs/ state, and write it there: hours, with the scenes of PP_DATA
-	@$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[plot]'
+	@$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[plot,torch]'
 	@$(BIN)/python -m tools.results $(ARGS)
 	@$(BIN)/python tools/docs_tables.py
 

@@ -4,14 +4,13 @@
 
 A generated part stands between the lines `<!-- table: NAME -->` and `<!-- end table -->` of a
 Markdown file. NAME is `settings` (from pp_cl/settings.py and presets.py), `commands` (from the
-parsers of pp_cl/commands/), `api` (from pp_cl's docstrings), or that of a file
-docs/results/NAME.json, which holds
+parsers of pp_cl/commands/), `api` (from pp_cl's docstrings), `origin` (of what code all results
+are, and of what machine), or that of a file docs/results/NAME.json, which holds
 
-    measured   what the numbers are; machine, command, version, commit: how they were obtained
+    version, commit, date, machine    in all files the same
+    measured   what the numbers are
     columns    [{"head": text, "cell": format}]: format is a str.format of the row's keys
-    rows       [{key: value}]; a cell of which a row has no key is empty, and a text that a row
-               lacks is printed as nothing
-    notes      sentences below the table, optional
+    rows       [{key: value}]; a cell of which a row lacks a key is empty
 """
 
 import argparse
@@ -23,7 +22,6 @@ import operator
 import re
 import string
 import sys
-from collections import defaultdict
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -38,15 +36,14 @@ MARKER = re.compile(r"^<!-- (?:end )?table", re.MULTILINE)
 
 
 class TableError(Exception):
-    """What is wrong with a marker or with a file of results."""
+    """What is wrong with a marker or with the files of results."""
 
 
 def cell(template: str, row: dict) -> str:
-    """The template filled from the row; empty if the row has none of its keys."""
-    keys = {name for _, name, _, _ in string.Formatter().parse(template) if name}
-    if keys and not keys & row.keys():
+    """The template filled from the row; empty if the row lacks one of its keys."""
+    if not {name for _, name, _, _ in string.Formatter().parse(template) if name} <= row.keys():
         return ""
-    text = template.format_map(defaultdict(str, row))
+    text = template.format_map(row)
     text = re.sub(r"\b0\.?0*e[+]00", "0", text)  # 0.0e+00 -> 0
     return re.sub(r"e([+-])0+(\d)", r"e\1\2", text).strip()  # 1e-06 -> 1e-6
 
@@ -58,17 +55,20 @@ def markdown(heads: Sequence[str], rows: Sequence[Sequence[str]]) -> list[str]:
 
 
 def table(results: dict) -> str:
-    """Markdown of a file of results: what was measured and how, the table, the notes."""
-    origin = f"Measured with version {results['version']}"
-    origin += f" on {results['machine']}" if "machine" in results else ""
-    origin += f": `{results['command']}`" if "command" in results else ""
+    """Markdown of a file of results: what was measured, and the table."""
     what = results["measured"]
     heads = [column["head"] for column in results["columns"]]
     rows = [[cell(column["cell"], row) for column in results["columns"]] for row in results["rows"]]
-    lines = [f"{what[0].upper()}{what[1:]}. {origin}.", "", *markdown(heads, rows)]
-    for note in results.get("notes", ()):
-        lines += ["", note]
-    return "\n".join(lines)
+    return "\n".join([f"{what[0].upper()}{what[1:]}.", "", *markdown(heads, rows)])
+
+
+def origin(results: dict[str, dict]) -> str:
+    """Of what code the results are, and of what machine. Raises TableError where files differ."""
+    template = "Version {version}, commit {commit}, {date}, {machine}."
+    found = {template.format(**contents) for contents in results.values()}
+    if len(found) > 1:
+        raise TableError("results of several commits or machines: run make results")
+    return next(iter(found), "")
 
 
 def settings() -> str:
@@ -157,8 +157,10 @@ def read_results(folder: Path) -> dict[str, dict]:
 
 
 def read_tables(folder: Path) -> dict[str, str]:
-    """{name: Markdown} of all that can be generated; folder: of the results."""
-    measured = {name: table(results) for name, results in read_results(folder).items()}
+    """{name: Markdown} of all that can be generated; folder: of the results. Raises TableError."""
+    results = read_results(folder)
+    measured = {name: table(contents) for name, contents in results.items()}
+    measured["origin"] = origin(results)
     return measured | {"settings": settings(), "commands": commands(), "api": api()}
 
 
@@ -188,17 +190,18 @@ def main(root: Path = ROOT) -> int:
     """Rewrite the tables of all documents, print the files that changed; returns the exit
     status.
     """
-    tables = read_tables(root / "docs" / "results")
-    for path in documents(root):
-        old = path.read_text("utf-8")
-        try:
+    path = root / "docs" / "results"
+    try:
+        tables = read_tables(path)
+        for path in documents(root):
+            old = path.read_text("utf-8")
             new = with_tables(old, tables)
-        except TableError as error:
-            print(f"{path}: {error}", file=sys.stderr)
-            return 2
-        if new != old:
-            path.write_text(new, "utf-8")
-            print(f"wrote {path.relative_to(root)}")
+            if new != old:
+                path.write_text(new, "utf-8")
+                print(f"wrote {path.relative_to(root)}")
+    except TableError as error:
+        print(f"{path}: {error}", file=sys.stderr)
+        return 2
     return 0
 
 

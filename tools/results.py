@@ -316,14 +316,14 @@ def origin() -> dict[str, str]:
     if git("status", "--porcelain", "--", *CODE):
         raise UserError("pp_cl/ or cl/ differ from the last commit: commit first")
     dev = open_device()
-    processor = dev.name.replace("(R)", "").split("-", 2)[-1]
+    # PoCL's: pthread-skylake-avx512-Intel(R) Xeon(R) Processor
+    processor = dev.name.replace("(R)", "").removeprefix("pthread-")
     driver = f"{dev.info['platform']} {dev.info['driver']}"
     return {
         "version": __version__,
         "commit": git("log", "-1", "--format=%h", "--", *CODE),
         "date": date.today().isoformat(),
-        "machine": f"{os.cpu_count()} cores of {processor}, {driver}",
-        "command": "make results",
+        "machine": f"{os.cpu_count()} cores ({processor}), {driver}",
     }
 
 
@@ -355,10 +355,10 @@ def timed(found: dict[str, Found]) -> list[dict]:
         {"label": f"rasteriser, {r['blend']}", "ms": r["ms"], "error": r["max_err"]}
         for r in found["rasteriser"]
     )
+    # of the same network as PyTorch's
     net = (
-        {"label": f"network, {r['variant']}", "ms": r["ms"], "error": r["rel_l2"]}
-        for r in found["network"]
-        if r["direction"] == "forward"
+        {"label": f"network, {r['variant']}", "ms": r["forward_ours_ms"], "error": r["rel_l2"]}
+        for r in found["pytorch"]
     )
     torch = (
         {"label": "network, PyTorch", "ms": r["forward_torch_ms"], "error": r["torch_rel_l2"]}

@@ -16,20 +16,19 @@ TABLES = TOOL.read_tables(ROOT / "docs" / "results")
 RESULTS = {
     "measured": "times",
     "machine": "a machine",
+    "date": "2026-01-01",
+    "commit": "abc",
     "version": "1",
-    "columns": [{"head": "n", "cell": "{n:,} {unit}"}, {"head": "error", "cell": "{error:.1e}"}],
-    "rows": [{"n": 1000, "error": 2e-6}, {"n": 2, "unit": "points", "error": 0.0}, {"n": 3}],
-    "notes": ["A note."],
+    "columns": [{"head": "n", "cell": "{n:,} points"}, {"head": "error", "cell": "{error:.1e}"}],
+    "rows": [{"n": 1000, "error": 2e-6}, {"n": 2, "error": 0.0}, {"n": 3}],
 }
-TABLE = """Times. Measured with version 1 on a machine.
+TABLE = """Times.
 
 | n | error |
 |---|---|
-| 1,000 | 2.0e-6 |
+| 1,000 points | 2.0e-6 |
 | 2 points | 0 |
-| 3 |  |
-
-A note."""
+| 3 points |  |"""
 
 
 def test_a_table():
@@ -42,11 +41,27 @@ def test_documents_are_up_to_date(path):
     assert TOOL.with_tables(text, TABLES) == text
 
 
-def test_all_results_are_shown_once_or_linked():
+def test_all_results_are_shown_once():
     text = "".join(path.read_text("utf-8") for path in TOOL.documents(ROOT))
-    shown = re.findall(r"(?m)^<!-- table: (\S+) -->$", text)
-    linked = set(re.findall(r"results/(\w+)\.json", text)) - set(shown)
-    assert sorted([*shown, *linked]) == sorted(TABLES)
+    assert sorted(re.findall(r"(?m)^<!-- table: (\S+) -->$", text)) == sorted(TABLES)
+
+
+def test_results_are_of_one_commit(tmp_path, capsys):
+    folder = tmp_path / "docs" / "results"
+    folder.mkdir(parents=True)
+    for commit in ("abc", "def"):
+        (folder / f"{commit}.json").write_text(json.dumps(RESULTS | {"commit": commit}))
+    assert TOOL.main(tmp_path) == 2
+    assert "several commits" in capsys.readouterr().err
+
+
+def test_the_first_results_a_reader_sees_are_the_demos():
+    """What the README shows of the programs' output is the row of its table."""
+    row = TOOL.read_results(ROOT / "docs" / "results")["scenes"]["rows"][0]
+    readme = " ".join((ROOT / "README.md").read_text("utf-8").split())
+    assert "{psnr:.4f} {ssim:.4f} {lpips:.4f}".format(**row) in readme
+    assert "trained {steps} steps in".format(**row) in readme
+    assert "{points} points (".format(**row) in readme
 
 
 def test_settings_and_commands_are_complete():

@@ -54,9 +54,8 @@ def test_what_was_found_is_kept_until_the_code_changes(kept, monkeypatch):
 
 
 def test_tables_and_plots(tmp_path):
-    about = {"version": "1", "machine": "a machine", "command": "make results"}
     for contents in TOOL.tables(FOUND).values():
-        written = docs_tables.table(about | contents)
+        written = docs_tables.table(contents)
         last = written.splitlines()[-1].split("|")[1:-1]
         assert len(last) == len(contents["columns"]) and all(cell.strip() for cell in last)
     (row,) = TOOL.tables(FOUND)["rasteriser"]["rows"]
