@@ -439,6 +439,8 @@ def plot_speed(axes: "Axes", timed: list[dict]) -> None:
     for i, label in enumerate(dict.fromkeys(row["label"] for row in timed)):
         some = [row for row in timed if row["label"] == label]
         axes.plot([r["ms"] for r in some], [r["error"] for r in some], "os^Dv"[i % 5], label=label)
+    axes.set_xticks([10, 20, 50, 100, 200, 500], labels=["10", "20", "50", "100", "200", "500"])
+    axes.minorticks_off()
 
 
 def film(path: Path) -> None:
