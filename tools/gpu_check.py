@@ -47,6 +47,8 @@ LIBRARIES = {"sm_": "nvptx64--nvidiacl.bc", "gfx": "amdgcn--amdhsa.bc"}
 PACKAGES = {CLANG: "clang-19", LINKER: "lld-19", OCLOC: "intel-opencl-icd"}
 PACKAGES |= dict.fromkeys(LIBRARIES.values(), "libclc-19")
 CUDA = Path("/usr/local/cuda/bin")
+# of ptxas, of clang for AMD, of ocloc
+SPILL = r"(\d+) bytes spill stores|ScratchSize.*: (\d+)|spilled around (\d+)"
 # What OpenCL asks of a division and of a square root, as NVIDIA's driver takes it.
 ULP = ("-mllvm", "-nvptx-prec-divf32=1", "-mllvm", "-nvptx-prec-sqrtf32=0")
 
@@ -218,7 +220,7 @@ def complaints(said: str) -> list[str]:
     for line in said.splitlines():
         named = re.search(r"entry function '(\w+)'|Function Name: (\w+)|kernel (\w+)\s", line)
         kernel = next(filter(None, named.groups())) if named else kernel
-        spill = re.search(r"(\d+) bytes spill st|ScratchSize.*: (\d+)|spilled around (\d+)", line)
+        spill = re.search(SPILL, line)
         local = re.search(r"(\d+) bytes smem|LDS Size \[bytes/block\]: (\d+)", line)
         if spill and int(next(filter(None, spill.groups()))):
             found.append(f"{kernel}: spills {spill[0]}")

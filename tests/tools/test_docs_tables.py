@@ -55,8 +55,7 @@ def test_results_are_of_one_commit(tmp_path, capsys):
     assert "several commits" in capsys.readouterr().err
 
 
-def test_the_first_results_a_reader_sees_are_the_demos():
-    """What the README shows of the programs' output is the row of its table."""
+def test_the_output_in_the_readme_is_that_of_the_demo_in_its_table():
     row = TOOL.read_results(ROOT / "docs" / "results")["scenes"]["rows"][0]
     readme = " ".join((ROOT / "README.md").read_text("utf-8").split())
     assert "{psnr:.4f} {ssim:.4f} {lpips:.4f}".format(**row) in readme
