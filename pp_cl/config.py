@@ -182,8 +182,9 @@ def configure(config: Config, scene: str, given: Iterable[tuple[str, Any, str]] 
         if path == "demo" and key in OF_MASKS:
             raise UserError(f"{origin}: the demo has masks of its own; leave it out")
         assign(config, key, value, origin)
-    if config.scene.masks:
-        assign(config, "scene.masks", str(Path(config.scene.masks).resolve()), "settings")
+    for owner, name in ((config.scene, "masks"), (config.network, "start")):
+        if place := getattr(owner, name):
+            setattr(owner, name, str(Path(place).resolve()))
     validate(config, "settings", {key: origin for key, _, origin in given})
     return config
 

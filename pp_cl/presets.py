@@ -69,5 +69,6 @@ SHORT = {
     "eval_every": "train.eval_every",
     "seed": "train.seed",
     "memory": "train.memory_gib",
+    "network": "network.start",
     "tolerance": "network.tolerance",
 }

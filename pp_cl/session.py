@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from pp_cl.config import Config, assign, configure, load_config, preset, sections
+from pp_cl.config import Config, assign, configure, load_config, preset, sections, text_of
 from pp_cl.device.device import Device
 from pp_cl.device.discover import open_device
 from pp_cl.errors import Diverged, UserError
@@ -257,6 +257,8 @@ def open_training(
         if begun:
             goal = replace(config, train=replace(config.train, refine_at=NEVER))
     net = UNet.of_settings(dev, config.network, policy, seed=config.train.seed)
+    if config.network.start and stored is None:
+        _take_network(net, config.network)
     photographs = scene_frames(config.scene.path)
     room = Room(goal, net, photographs)
     if stored is None:
@@ -291,6 +293,23 @@ def open_training(
     info |= {"left_out": left_out} if left_out else {}
     build_aside(net, config.network, trainer.network_size)
     return Training(folder, config, trainer, info, room, hull, policy.origin, measured)
+
+
+def _take_network(net, settings):
+    """Give net the parameters of the run settings.start. Raises UserError if they do not fit."""
+    folder = RunFolder(settings.start)
+    other = load_config(folder.config)
+    for name in ("widths", "blocks", "channels", "residual"):
+        theirs, ours = getattr(other.network, name), getattr(settings, name)
+        if theirs != ours:
+            key = f"network.{name}"
+            raise UserError(
+                f"network.start: {folder.config} has {key}={text_of(theirs)}, this training"
+                f" {text_of(ours)}; set {key} alike, or name another run"
+            )
+    with opened_run(folder, other) as run:
+        for name, parameter in net.parameters.items():
+            net.dev.write(parameter, run.array(f"net.{name}"))
 
 
 def _start(config, agreement, views, net, room):

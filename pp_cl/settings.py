@@ -117,6 +117,9 @@ class NetworkConfig:
         "channels of each convolution but the last, of a compressed model (none)",
     )
     residual: bool = setting(True, "add a quarter of the first three features to the colours")
+    start: str = setting(
+        "", "folder of another run, whose network this training begins with (random numbers)"
+    )
     rate: tuple = setting(
         (1e-3, 1e-4), "learning rate of the network, first and last step", 1e-12, 100
     )

@@ -3,6 +3,7 @@ not.
 """
 
 import re
+import shutil
 
 import numpy as np
 import pytest
@@ -64,6 +65,35 @@ def test_the_networks_other_blocks_learn_and_resume_to_the_same_bytes(
     capsys.readouterr()
     assert main(arguments(scene, run, network__blocks="single")) == 2
     assert f"network.blocks is {blocks} there, single asked for" in capsys.readouterr().err
+
+
+def test_a_training_begins_with_the_network_of_another_run(
+    scene, finished, tmp_path, monkeypatch, capsys
+):
+    run, whole = tmp_path / "run", tmp_path / "whole"
+    shutil.copytree(finished, tmp_path / "other")
+    words = ["--network", str(tmp_path / "other")]
+    given = {"network__rate": "1e-12,1e-12", "train__ema": "false"}
+    assert main([*arguments(scene, whole, **given), *words]) == 0
+    _, expected = load_checkpoint(finished / "checkpoint.npz")
+    _, arrays = load_checkpoint(whole / "checkpoint.npz")
+    for name in (name for name in expected if name.startswith("net.")):
+        np.testing.assert_allclose(arrays[name], expected[name], rtol=0, atol=1e-9)
+    losses = [[r["loss"] for r in rows(out)[:5]] for out in (whole, finished)]
+    assert np.mean(losses[0]) < 0.9 * np.mean(losses[1])
+
+    train_and_interrupt(scene, run, 25, monkeypatch, **given, network__start=tmp_path / "other")
+    shutil.rmtree(tmp_path / "other")
+    assert main(["train", "--out", str(run)]) == 0
+    assert checkpoint(run) == checkpoint(whole)
+
+    capsys.readouterr()
+    assert main([*arguments(scene, tmp_path / "no", network__widths="16,16,32"), *words]) == 2
+    assert "other/config.json: No such file" in capsys.readouterr().err
+    words[1] = str(finished)
+    assert main([*arguments(scene, tmp_path / "no", network__widths="16,16,32"), *words]) == 2
+    assert "network.widths=16,16,16, this training 16,16,32" in capsys.readouterr().err
+    assert not (tmp_path / "no").exists()
 
 
 def test_what_has_a_rate_of_0_is_left_alone(scene, tmp_path, monkeypatch):

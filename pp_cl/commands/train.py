@@ -41,6 +41,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--downscale", metavar="K", help="reduce the images K times (default: to the preset's size)"
     )
     shared.add_masks(parser)
+    add(
+        "--network",
+        metavar="RUN",
+        help="begin with the network of another run of yours: good in fewer steps",
+    )
     add("--seed", metavar="S", help="seed of all random choices (0)")
     add(
         "--memory",

@@ -20,7 +20,8 @@ from pp_cl.training.exposure import Exposure, decided_at
 VIEWS, STEPS = 64, 500
 DECIDED = decided_at(0, VIEWS)
 GAINS = np.exp(np.random.default_rng(4).uniform(np.log(0.25), 0, (VIEWS, 3)))
-SETTINGS = {"downscale": 1, "train__iterations": STEPS, "train__checkpoint_every": 100}
+EVERY = DECIDED // 2  # steps of a checkpoint
+SETTINGS = {"downscale": 1, "train__iterations": STEPS, "train__checkpoint_every": EVERY}
 
 
 def write_demo(dev, folder, gains):
@@ -45,22 +46,19 @@ def exposed(tmp_path_factory):
     return scene, folder / "run"
 
 
-def test_gains_are_found(exposed, tmp_path, monkeypatch):
-    """But for what harmonics of the direction take for the object's."""
-    scene, _ = exposed
-    train_and_interrupt(scene, tmp_path / "run", STEPS - 1, monkeypatch, **SETTINGS)
-    _, arrays = load_checkpoint(tmp_path / "run" / "checkpoint.npz")
+def test_gains_are_found_and_a_training_goes_on_with_them(exposed, tmp_path, monkeypatch):
+    """They are right but for what harmonics of the direction take for the object's."""
+    (scene, finished), run, kept = exposed, tmp_path / "run", 0
+    for stop in (DECIDED - 1, DECIDED, STEPS - 1):
+        train_and_interrupt(scene, run, stop - kept, monkeypatch, **SETTINGS)
+        header, arrays = load_checkpoint(run / "checkpoint.npz")
+        kept = header["step"]
+        assert kept == stop // EVERY * EVERY
     error = np.log(arrays["exposure"][..., 3] / GAINS)
     error -= error.mean(axis=0)
     assert error.std() < 0.4 * np.log(GAINS).std()
-
-
-@pytest.mark.parametrize("stop", [DECIDED - 1, DECIDED, STEPS - 1])
-def test_a_training_goes_on_with_its_gains(exposed, tmp_path, monkeypatch, stop):
-    scene, finished = exposed
-    train_and_interrupt(scene, tmp_path / "run", stop, monkeypatch, **SETTINGS)
-    assert main(["train", scene, "--out", str(tmp_path / "run")]) == 0
-    checkpoints = [run / "checkpoint.npz" for run in (finished, tmp_path / "run")]
+    assert main(["train", scene, "--out", str(run)]) == 0
+    checkpoints = [folder / "checkpoint.npz" for folder in (finished, run)]
     assert checkpoints[0].read_bytes() == checkpoints[1].read_bytes()
 
 
@@ -94,9 +92,10 @@ def test_the_best_gains_are_those_of_the_object(rng):
 
 
 def test_equal_exposures_change_no_bit(dev, tmp_path):
-    scene = write_demo(dev, tmp_path / "scene", np.ones((VIEWS, 3)))
-    assert main(arguments(scene, tmp_path / "auto", **SETTINGS)) == 0
-    assert main(arguments(scene, tmp_path / "off", train__exposure="off", **SETTINGS)) == 0
+    scene, settings = write_demo(dev, tmp_path / "scene", np.ones((VIEWS, 3))), dict(SETTINGS)
+    settings["train__iterations"] = DECIDED + 22
+    assert main(arguments(scene, tmp_path / "auto", **settings)) == 0
+    assert main(arguments(scene, tmp_path / "off", train__exposure="off", **settings)) == 0
     auto, off = (load_checkpoint(tmp_path / run / "checkpoint.npz") for run in ("auto", "off"))
     assert auto[0] == off[0] and auto[1].keys() == off[1].keys()
     for name, array in off[1].items():
