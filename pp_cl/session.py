@@ -32,9 +32,17 @@ from pp_cl.scene.agreement import disagreements, listing
 from pp_cl.scene.grid import Grid
 from pp_cl.scene.hull import Agreement, Hull, agreeing, build_grid, depth_range, spacing_pixels
 from pp_cl.scene.identity import difference, identity
-from pp_cl.scene.load import measured_split, open_scene, preset_downscale, scene_box, scene_frames
+from pp_cl.scene.load import (
+    DEMO,
+    measured_split,
+    open_scene,
+    preset_downscale,
+    scene_box,
+    scene_frames,
+)
 from pp_cl.scene.outline import picture
 from pp_cl.scene.views import View
+from pp_cl.settings import NetworkConfig
 from pp_cl.train import Trainer
 from pp_cl.training.budget import Budget
 from pp_cl.training.checkpoint import load_run_state, opened_run
@@ -48,6 +56,9 @@ OPEN, NEVER = (0.0, 0.0), (1.0, 1.0)  # train.refine_at
 REFINE_AT = (NEVER, (0.35, 1.0), (0.33, 0.67))
 FINEST, COARSEST = 1.25, 1.5
 LEAST_SIDE = 48  # pixels of the images that a training begins on, if it is to refine
+RANDOM = "random"  # network.start, as is DEMO
+# what `make network` keeps: {"net.NAME": as UNet.parameters, float16}
+DEMO_NETWORK = Path(__file__).with_name("network") / "demo.npz"
 PLACES = (("scene", "path"), ("scene", "masks"))
 
 Stored = tuple[dict[str, Any], dict[str, np.ndarray]]  # header and arrays of a checkpoint
@@ -257,8 +268,8 @@ def open_training(
         if begun:
             goal = replace(config, train=replace(config.train, refine_at=NEVER))
     net = UNet.of_settings(dev, config.network, policy, seed=config.train.seed)
-    if config.network.start and stored is None:
-        _take_network(net, config.network)
+    if stored is None:
+        _begin(net, config)
     photographs = scene_frames(config.scene.path)
     room = Room(goal, net, photographs)
     if stored is None:
@@ -295,21 +306,32 @@ def open_training(
     return Training(folder, config, trainer, info, room, hull, policy.origin, measured)
 
 
-def _take_network(net, settings):
-    """Give net the parameters of the run settings.start. Raises UserError if they do not fit."""
-    folder = RunFolder(settings.start)
-    other = load_config(folder.config)
-    for name in ("widths", "blocks", "channels", "residual"):
-        theirs, ours = getattr(other.network, name), getattr(settings, name)
-        if theirs != ours:
-            key = f"network.{name}"
+def _begin(net, config):
+    """Give net the parameters that network.start names: those of the demo's only where they fit.
+    Raises UserError for a run whose network has another shape.
+    """
+    settings, folder = config.network, RunFolder(config.network.start)
+    if settings.start == DEMO:
+        if config.scene.path != DEMO and not _unlike(settings, NetworkConfig()):
+            with np.load(DEMO_NETWORK) as stored:
+                for name, parameter in net.parameters.items():
+                    net.dev.write(parameter, stored[f"net.{name}"].astype(np.float32))
+    elif settings.start != RANDOM:
+        other = load_config(folder.config)
+        for key, ours, theirs in _unlike(settings, other.network):
             raise UserError(
-                f"network.start: {folder.config} has {key}={text_of(theirs)}, this training"
-                f" {text_of(ours)}; set {key} alike, or name another run"
+                f"network.start: {folder} has {key}={theirs}, this training {ours}; set {key}"
+                " alike, or begin with another network"
             )
-    with opened_run(folder, other) as run:
-        for name, parameter in net.parameters.items():
-            net.dev.write(parameter, run.array(f"net.{name}"))
+        with opened_run(folder, other) as run:
+            for name, parameter in net.parameters.items():
+                net.dev.write(parameter, run.array(f"net.{name}"))
+
+
+def _unlike(ours, theirs):
+    """[(key, our value, their value)] of the settings by which two networks differ in shape."""
+    pairs = [(n, getattr(ours, n), getattr(theirs, n)) for n in ("widths", "blocks", "channels")]
+    return [(f"network.{n}", text_of(a), text_of(b)) for n, a, b in pairs if a != b]
 
 
 def _start(config, agreement, views, net, room):

@@ -118,7 +118,10 @@ class NetworkConfig:
     )
     residual: bool = setting(True, "add a quarter of the first three features to the colours")
     start: str = setting(
-        "", "folder of another run, whose network this training begins with (random numbers)"
+        "demo",
+        "what the network begins with. demo: what one has learned of the demo, if the scene is"
+        " another and the network has the default shape; random: numbers; a folder: the network of"
+        " that run",
     )
     rate: tuple = setting(
         (1e-3, 1e-4), "learning rate of the network, first and last step", 1e-12, 100

@@ -70,11 +70,11 @@ def test_the_networks_other_blocks_learn_and_resume_to_the_same_bytes(
 def test_a_training_begins_with_the_network_of_another_run(
     scene, finished, tmp_path, monkeypatch, capsys
 ):
-    run, whole = tmp_path / "run", tmp_path / "whole"
-    shutil.copytree(finished, tmp_path / "other")
-    words = ["--network", str(tmp_path / "other")]
+    """Which it needs no more once it has begun."""
+    run, whole, other = tmp_path / "run", tmp_path / "whole", tmp_path / "other"
+    shutil.copytree(finished, other)
     given = {"network__rate": "1e-12,1e-12", "train__ema": "false"}
-    assert main([*arguments(scene, whole, **given), *words]) == 0
+    assert main([*arguments(scene, whole, **given), "--network", str(other)]) == 0
     _, expected = load_checkpoint(finished / "checkpoint.npz")
     _, arrays = load_checkpoint(whole / "checkpoint.npz")
     for name in (name for name in expected if name.startswith("net.")):
@@ -82,18 +82,34 @@ def test_a_training_begins_with_the_network_of_another_run(
     losses = [[r["loss"] for r in rows(out)[:5]] for out in (whole, finished)]
     assert np.mean(losses[0]) < 0.9 * np.mean(losses[1])
 
-    train_and_interrupt(scene, run, 25, monkeypatch, **given, network__start=tmp_path / "other")
-    shutil.rmtree(tmp_path / "other")
+    train_and_interrupt(scene, run, 25, monkeypatch, **given, network__start=other)
+    shutil.rmtree(other)
     assert main(["train", "--out", str(run)]) == 0
     assert checkpoint(run) == checkpoint(whole)
 
     capsys.readouterr()
-    assert main([*arguments(scene, tmp_path / "no", network__widths="16,16,32"), *words]) == 2
+    words = arguments(scene, tmp_path / "no", network__widths="16,16,32")
+    assert main([*words, "--network", str(other)]) == 2
     assert "other/config.json: No such file" in capsys.readouterr().err
-    words[1] = str(finished)
-    assert main([*arguments(scene, tmp_path / "no", network__widths="16,16,32"), *words]) == 2
-    assert "network.widths=16,16,16, this training 16,16,32" in capsys.readouterr().err
+    assert main([*words, "--network", str(finished)]) == 2
+    assert "has network.widths=16,16,16, this training 16,16,32" in capsys.readouterr().err
     assert not (tmp_path / "no").exists()
+
+
+def test_a_training_begins_with_the_network_of_the_demo(scene, finished, tmp_path):
+    """Which helps, where its shape is the default one and the scene is another; else it begins at
+    random.
+    """
+    default = {"network__widths": "32,64,128", "train__iterations": 20}
+    for start in ("demo", "random"):
+        assert main([*arguments(scene, tmp_path / start, **default), "--network", start]) == 0
+        words = arguments("demo", tmp_path / f"of-{start}", **default | {"train__iterations": 2})
+        assert main([*words, "--network", start]) == 0
+    losses = [[r["loss"] for r in rows(tmp_path / start)[:-1]] for start in ("demo", "random")]
+    assert np.mean(losses[0]) < 0.8 * np.mean(losses[1])
+    assert checkpoint(tmp_path / "of-demo") == checkpoint(tmp_path / "of-random")
+    assert main([*arguments(scene, tmp_path / "narrow"), "--network", "random"]) == 0
+    assert checkpoint(tmp_path / "narrow") == checkpoint(finished)
 
 
 def test_what_has_a_rate_of_0_is_left_alone(scene, tmp_path, monkeypatch):

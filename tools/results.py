@@ -168,7 +168,7 @@ def key_of(training: Training) -> str:
 def train(training: Training) -> dict:
     """A row of QUALITY."""
     run = KEPT / key_of(training)
-    words = ["--preset", training.preset, "--seed", 1, "--out", run]
+    words = ["--preset", training.preset, "--network", "random", "--seed", 1, "--out", run]
     if training.steps:
         words += ["--iterations", training.steps]
     if training.downscale:

@@ -44,7 +44,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add(
         "--network",
         metavar="RUN",
-        help="begin with the network of another run of yours: good in fewer steps",
+        help="begin with the network of another run of yours (default: the demo's), or random",
     )
     add("--seed", metavar="S", help="seed of all random choices (0)")
     add(

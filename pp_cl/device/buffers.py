@@ -77,8 +77,9 @@ def packed_arrays(dev: Device, rows: Sequence[Row]) -> tuple[Array, list[Array]]
     """(octets, arrays of these shapes and dtypes that lie in them), all zeros: one launch or
     transfer handles them all. The arrays are valid as long as the octets are held.
     """
-    whole, arrays = dev.zeros((packed_bytes(dev, rows),), np.uint8), []
+    whole = dev.zeros((packed_bytes(dev, rows),), np.uint8)
     data: Any = whole.base_data
+    arrays: list[Array] = []
     for start, (shape, dtype) in zip(_packed_starts(dev, rows), rows, strict=False):
         region = data.get_sub_region(start, max(1, _row_bytes(shape, dtype)))
         arrays.append(QueuedArray(dev.queue, shape, dtype, data=region))
