@@ -269,7 +269,7 @@ def open_training(
             goal = replace(config, train=replace(config.train, refine_at=NEVER))
     net = UNet.of_settings(dev, config.network, policy, seed=config.train.seed)
     if stored is None:
-        _begin(net, config)
+        begin_network(net, config)
     photographs = scene_frames(config.scene.path)
     room = Room(goal, net, photographs)
     if stored is None:
@@ -306,7 +306,7 @@ def open_training(
     return Training(folder, config, trainer, info, room, hull, policy.origin, measured)
 
 
-def _begin(net, config):
+def begin_network(net: UNet, config: Config) -> None:
     """Give net the parameters that network.start names: those of the demo's only where they fit.
     Raises UserError for a run whose network has another shape.
     """
