@@ -39,7 +39,7 @@ demo: $(READY) ## train the demo scene into runs/demo and evaluate it: minutes o
 test: $(READY) ## run the tests on the device of PP_DEVICE, else on the default one, a process a core
 	@$(BIN)/python -m pytest $(ON_ALL_CORES) $(ARGS)
 
-test-slow: $(READY) ## run the tests that `make test` leaves out: long ones of tools and Dask, and what others show in part
+test-slow: $(READY) ## run the tests that `make test` leaves out: long ones of tools, Dask and faults, and what others show in part
 	@$(BIN)/python -m pytest $(ON_ALL_CORES) -m slow $(ARGS)
 
 test-intel: $(READY) ## the same on Intel's CPU runtime, installed into .venv if need be (x86-64)
@@ -112,7 +112,7 @@ fuzz: $(READY) ## try damaged and odd input on all that pp-cl reads: COUNT (5000
 		$(ARGS) tests/test_fuzz.py tests/test_properties.py
 
 faults: $(READY) ## fail every call that changes a file of a training and an evaluation, kill them: minutes
-	@FAULTS=all $(BIN)/python -m pytest $(ON_ALL_CORES) tests/test_faults.py $(ARGS)
+	@FAULTS=all $(BIN)/python -m pytest $(ON_ALL_CORES) -m slow tests/test_faults.py $(ARGS)
 
 clean: ## remove .venv and everything built; runs/ stays
 	rm -rf .venv build dist *.egg-info .pytest_cache .ruff_cache

@@ -35,6 +35,7 @@ ALL = os.environ.get("FAULTS") == "all"
 PARTS = range(8 if ALL else 1)  # that workers share
 KILLS = 8 if ALL else 2  # of a part
 pytestmark = [
+    pytest.mark.slow,
     pytest.mark.skipif(not sys.platform.startswith("linux"), reason="asks /proc"),
     pytest.mark.filterwarnings("error::pytest.PytestUnraisableExceptionWarning"),
 ]

@@ -4,6 +4,7 @@ import ast
 import json
 from pathlib import Path
 
+import pytest
 from PIL import Image
 
 from pp_cl.files.picture import Picture
@@ -11,6 +12,7 @@ from pp_cl.files.picture import Picture
 NOTEBOOK = Path(__file__).parents[1] / "docs" / "tour.ipynb"
 
 
+@pytest.mark.slow
 def test_the_notebook_makes_a_film_and_a_page(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     cells = json.loads(NOTEBOOK.read_text("utf-8"))["cells"]

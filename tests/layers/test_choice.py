@@ -300,6 +300,7 @@ def tuned():
     return store
 
 
+@pytest.mark.slow
 def test_tuning_does_not_change_a_run_under_way(scene, tmp_path, monkeypatch, tuned):
     outs = {name: tmp_path / name for name in ("plain", "tuned", "plain cut", "tuned cut")}
     assert main(arguments(scene, outs["plain"], **SHORT)) == 0
