@@ -21,7 +21,7 @@ MOST_BYTES = 2**20  # of a config.json
 MOST_TEXT = 4096  # characters of a setting
 # by network.blocks, how many convolutions there are but the last
 CONVOLUTIONS = {"double": 12, "single": 7, "gated": 7}
-STARTS = ("random", "demo")  # of network.start, beside a folder
+RANDOM = "random"  # of network.start, beside demo and a folder
 OF_MASKS = ("scene.masks", "scene.mask_from", "scene.mask_tolerance")
 MEND_SETTINGS = "restore it or start a new run"
 
@@ -184,7 +184,7 @@ def configure(config: Config, scene: str, given: Iterable[tuple[str, Any, str]] 
             raise UserError(f"{origin}: the demo has masks of its own; leave it out")
         assign(config, key, value, origin)
     for owner, name in ((config.scene, "masks"), (config.network, "start")):
-        if getattr(owner, name) not in ("", *STARTS):
+        if getattr(owner, name) not in ("", RANDOM, "demo"):
             setattr(owner, name, str(Path(getattr(owner, name)).resolve()))
     validate(config, "settings", {key: origin for key, _, origin in given})
     return config

@@ -12,7 +12,16 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from pp_cl.config import Config, assign, configure, load_config, preset, sections, text_of
+from pp_cl.config import (
+    RANDOM,
+    Config,
+    assign,
+    configure,
+    load_config,
+    preset,
+    sections,
+    text_of,
+)
 from pp_cl.device.device import Device
 from pp_cl.device.discover import open_device
 from pp_cl.errors import Diverged, UserError
@@ -56,7 +65,6 @@ OPEN, NEVER = (0.0, 0.0), (1.0, 1.0)  # train.refine_at
 REFINE_AT = (NEVER, (0.35, 1.0), (0.33, 0.67))
 FINEST, COARSEST = 1.25, 1.5
 LEAST_SIDE = 48  # pixels of the images that a training begins on, if it is to refine
-RANDOM = "random"  # network.start, as is DEMO
 # what `make network` keeps: {"net.NAME": as UNet.parameters, float16}
 DEMO_NETWORK = Path(__file__).with_name("network") / "demo.npz"
 PLACES = (("scene", "path"), ("scene", "masks"))
@@ -307,8 +315,8 @@ def open_training(
 
 
 def begin_network(net: UNet, config: Config) -> None:
-    """Give net the parameters that network.start names: those of the demo's only where they fit.
-    Raises UserError for a run whose network has another shape.
+    """Give net the parameters that network.start names; those of the demo only where the scene is
+    another and they fit. Raises UserError for a run whose network has another shape.
     """
     settings, folder = config.network, RunFolder(config.network.start)
     if settings.start == DEMO:

@@ -92,8 +92,8 @@ def test_the_best_gains_are_those_of_the_object(rng):
 
 
 def test_equal_exposures_change_no_bit(dev, tmp_path):
-    scene, settings = write_demo(dev, tmp_path / "scene", np.ones((VIEWS, 3))), dict(SETTINGS)
-    settings["train__iterations"] = DECIDED + 22
+    scene = write_demo(dev, tmp_path / "scene", np.ones((VIEWS, 3)))
+    settings = SETTINGS | {"train__iterations": DECIDED + 22}
     assert main(arguments(scene, tmp_path / "auto", **settings)) == 0
     assert main(arguments(scene, tmp_path / "off", train__exposure="off", **settings)) == 0
     auto, off = (load_checkpoint(tmp_path / run / "checkpoint.npz") for run in ("auto", "off"))
