@@ -22,6 +22,7 @@ from tools.capture_demo import ROOM, cameras, room
 pytest.importorskip("cv2")
 
 from pp_cl.capture import backdrop, cut
+from pp_cl.capture.box import MARGIN
 from pp_cl.capture.masks import mask_file, picture, program_words, write_masks
 from pp_cl.capture.window import Window, window
 
@@ -114,6 +115,19 @@ def test_the_object_is_cut_out_of_any_background(capture):
     assert f"{VIEWS} cut out" in line
     assert capture.agreement().min() > 0.95
     assert len(np.unique(read_mask(capture.file(0)))) > 4, "no soft border"
+
+
+def test_what_lies_around_the_object_is_no_seed(capture):
+    """Labels on the table are on nobody's side, so that colours decide."""
+    reach = 0.78 * (1 + 2 * MARGIN * np.sqrt(3))  # as find_world() has it around the ball
+    box = np.array([[-reach] * 3, [reach] * 3])
+    lying, own = [0.7, 0, -0.75], [0, 0, 0.5]
+    one = window(np.zeros((SIZE, SIZE, 3), np.uint8), capture.photographs[0], box)
+    points, both = np.array([lying, own]), np.array([0, 1])
+    labels = cut._seeds(one, box, points, np.array([True, True]), both)
+    _, rows, columns = one.inside(points)
+    assert labels[rows[0], columns[0]] != cut.cv2.GC_FGD
+    assert labels[rows[1], columns[1]] == cut.cv2.GC_FGD
 
 
 def test_thin_parts_and_gaps_are_told_by_the_wall(dev, tmp_path):
