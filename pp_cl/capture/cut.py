@@ -17,8 +17,8 @@ from pp_cl.scene.grid import Grid, smallest_edge
 
 cv2 = needed("cv2")
 
-# Of the box's diagonal: points lower in it may be on what the object stands on, or lies around it;
-# its own lowest are at 0.05, as box.MARGIN is below them.
+# Of the box's diagonal: points lower in it may be on what the object stands on, or on what lies
+# around it. The object's own lowest are at 0.05, as box.MARGIN is below them.
 FOOT = 0.08
 SEED = 1 / 150  # radius of a sparse point, of CUT_SIDE
 NEAR = 1 / 20  # of CUT_SIDE: sparse points so close show a surface between them
