@@ -3,6 +3,7 @@ upright, centred and of unit size.
 """
 
 from collections.abc import Sequence
+from itertools import product
 from typing import NamedTuple
 
 import numpy as np
@@ -17,8 +18,7 @@ CUT = 0.005  # of the points at each end of an axis: what may be wrong
 MARGIN = 0.06  # of the box's diagonal, added on every side: smooth parts have no points
 LEAST_POINTS = 100
 FILLED = 0.55  # of the images, by an object whose sides may have no points
-TRIED = 500  # planes
-TILT = np.cos(np.radians(10))  # how level the plane is that carries the object
+SLOPES = np.tan(np.radians(np.arange(-10, 11, 2)))  # of the plane that carries the object
 THICK = 0.01  # of the cameras' distance: points of a plane are no further from it
 TABLE, BELOW = 0.08, 0.03  # of the points: on a table at least, and below it at most
 LEAST_SPREAD = 0.7  # of the width of what stands on it
@@ -101,21 +101,19 @@ def _on_object(points, seen):
 
 def _table(points):
     """(4,) normal and height of the level plane that the points stand on, None without one."""
-    rng, best, found = np.random.default_rng(0), TABLE * len(points), None
-    for _ in range(TRIED):
-        a, b, c = points[rng.integers(0, len(points), 3)]
-        normal = np.cross(b - a, c - a)
-        length = np.linalg.norm(normal)
-        if length < 1e-12 or abs(normal[2]) < TILT * length:
+    best, found = TABLE * len(points), None
+    for x, y in product(SLOPES, SLOPES):
+        normal = np.array([x, y, 1]) / np.sqrt(x * x + y * y + 1)
+        height = points @ normal
+        order = np.sort(height)
+        first = order[: int(BELOW * len(points)) + 1]  # as the lowest point of the layer
+        inside = np.searchsorted(order, first + 2 * THICK) - np.arange(len(first))
+        if inside.max() <= best:
             continue
-        normal *= np.sign(normal[2]) / length
-        height = points @ normal - a @ normal
-        on = np.abs(height) < THICK
-        above = height > THICK
-        if on.sum() <= best or (height < -THICK).sum() > BELOW * len(points) or not above.any():
-            continue
-        if (_spread(points[on]) > LEAST_SPREAD * _spread(points[above])).all():
-            best, found = on.sum(), np.append(normal, a @ normal)
+        middle = first[inside.argmax()] + THICK
+        on, above = np.abs(height - middle) <= THICK, height > middle + THICK
+        if above.any() and (_spread(points[on]) > LEAST_SPREAD * _spread(points[above])).all():
+            best, found = inside.max(), np.append(normal, middle)
     return found
 
 
