@@ -19,20 +19,26 @@ from pp_cl.scene.views import Photograph
 LEAST_SHARE = 0.5  # of the images that have a place
 FEW_FEATURES, FEW_MATCHES = 200, 30
 GROWTH = 1.4  # COLMAP's 1.1 takes twice the time
+CLOSER = 8.0  # degrees between the two images of a turned object that the mapping begins with
+FEW = 0.15  # of the matches that images have with their best: pairs of a turned object with fewer
+# are far apart, or look alike where a pattern repeats
 BELIEVED = 2.0  # of the points' median error: observations that are further off count less
 CONVERGED = 1e-5  # relative change of the sum of errors
 BLURRED = 0.4  # of the median sharpness
 
 
-def place(database: Path, images: Path, model: Path, taken: Sequence[dict]) -> dict[str, Any]:
+def place(
+    database: Path, images: Path, model: Path, taken: Sequence[dict], turns: bool
+) -> dict[str, Any]:
     """Write the largest model that the matches give to the new folder `model`.
 
-    taken: what take_images() says of the images. Returns the numbers of images and points, the
+    taken: what take_images() says of the images. turns: the object turns before a camera that
+    stays, and all matches are its own. Returns the numbers of images and points, the
     reprojection error in pixels, and {image: reason} of those without a place. Raises UserError
     where more than a half have none.
     """
     with atomic_folder(model) as unfinished:
-        found = _mapped(database, images, unfinished, len(taken))
+        found = _mapped(database, images, unfinished, len(taken), turns)
         if found:
             best = max(found.values(), key=lambda one: (one.num_reg_images(), one.num_points3D()))
             for folder in list(unfinished.iterdir()):
@@ -56,14 +62,23 @@ def place(database: Path, images: Path, model: Path, taken: Sequence[dict]) -> d
         }
 
 
-def _mapped(database, images, folder, count):
-    """{number: pycolmap's model} of what fits together."""
+def _mapped(database, images, folder, count, turns):
+    """{number: pycolmap's model} of what fits together.
+
+    Without a background, images that are as far apart as those that COLMAP begins with have fewer
+    matches than a pattern has with itself, and closer ones do not tell focal length from lens.
+    """
     with quiet(database) as colmap:
         options = colmap.IncrementalPipelineOptions(
             min_model_size=3, num_threads=cores(), random_seed=0
         )
         # all cameras are refined at the end, and before that whenever there are so many more
         options.ba_global_frames_ratio = options.ba_global_points_ratio = GROWTH
+        if turns:
+            usual = np.median(list(_most_matches(database).values()))
+            options.min_num_matches = max(options.min_num_matches, int(FEW * usual))
+            options.mapper.init_min_tri_angle = CLOSER
+            options.ba_refine_extra_params = False  # refine() finds them
         with tqdm(total=count, desc="poses", unit="image", leave=False, disable=None) as bar:
             return colmap.incremental_mapping(
                 database, images, folder, options, next_image_callback=lambda: bar.update()
@@ -88,12 +103,9 @@ def refine(model: Any) -> None:
 
 def _reasons(database, taken, placed):
     """{image: why it has no place}."""
+    best = _most_matches(database)
     with opened(database) as db:
         ids = {image.name: image.image_id for image in db.read_all_images()}
-        best = dict.fromkeys(ids.values(), 0)
-        for pair, matches in zip(*db.read_two_view_geometry_num_inliers(), strict=True):
-            for one in _images_of(pair):
-                best[one] = max(best[one], matches)
         features = {name: db.num_keypoints_for_image(i) for name, i in ids.items()}
     usual = np.median([one["sharpness"] for one in taken])
     reasons = {}
@@ -111,6 +123,16 @@ def _reasons(database, taken, placed):
         else:
             reasons[name] = f"fits no others that are placed (at most {matches} matches)"
     return reasons
+
+
+def _most_matches(database):
+    """{image's id: its matches with the image with which it has most}."""
+    with opened(database) as db:
+        best = {image.image_id: 0 for image in db.read_all_images()}
+        for pair, matches in zip(*db.read_two_view_geometry_num_inliers(), strict=True):
+            for one in _images_of(pair):
+                best[one] = max(best[one], matches)
+    return best
 
 
 def _images_of(pair):

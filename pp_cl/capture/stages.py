@@ -188,7 +188,10 @@ class Capture:
 
     def _poses(self):
         taken = self._found("frames")["images"]
-        found = isolated(self.work, poses.place, self.database, self.images, self.model, taken)
+        turns = self._found("matches")["turns"]
+        found = isolated(
+            self.work, poses.place, self.database, self.images, self.model, taken, turns
+        )
         model = needed("pycolmap").Reconstruction(self.model)
         self._show("poses", _seen_from_outside(model, None))
         unplaced = [f"{name} {why}" for name, why in found["unplaced"].items()]

@@ -306,16 +306,33 @@ def test_each_stage_leaves_a_picture(captured):
         assert width >= 1000 and height >= 300
 
 
-def test_an_object_that_turns(dev, tmp_path):
-    """Before a wall that stands still: it is noticed, and no cameras are found by the wall."""
-    folder, scene = tmp_path / "folder", tmp_path / "scene"
-    folder.mkdir()
-    turned = cameras(SIZE, "turntable")[::8]
-    wall = room(turned[0])
-    for i, camera in enumerate(turned):
-        rgba = render(dev, camera)
+def turned(dev, folder, steps):
+    """Photographs of the demo on a turntable before a wall that stands still, and their masks."""
+    true = cameras(SIZE, "turntable")
+    wall = room(true[0])
+    for name in ("photographs", "masks"):
+        (folder / name).mkdir()
+    for i in steps:
+        rgba = render(dev, true[i])
         alpha = rgba[..., 3:] / 255
-        write_png(folder / f"{i:03d}.png", rgba[..., :3] / 255 * alpha + wall * (1 - alpha))
-    status, lines = capture(folder, scene)
+        photograph = rgba[..., :3] / 255 * alpha + wall * (1 - alpha)
+        write_png(folder / "photographs" / f"{i:03d}.png", photograph)
+        write_png(folder / "masks" / f"{i:03d}.png", rgba[..., 3])
+    return folder / "photographs", folder / "masks"
+
+
+def test_an_object_that_turns(dev, tmp_path):
+    """It is noticed, and its cameras are found though its pattern is that of other steps, too."""
+    scene = tmp_path / "scene"
+    photographs, masks = turned(dev, tmp_path, range(14))
+    assert capture(photographs, scene, "--masks", masks) == (0, [])
+    assert found(scene, "matches")["turns"] and found(scene, "poses")["placed"] == 14
+    assert off(scene, cameras(SIZE, "turntable")).position < 0.01
+
+
+def test_a_wall_places_no_cameras(dev, tmp_path):
+    """Of an object that turns by too much between its photographs."""
+    scene = tmp_path / "scene"
+    status, lines = capture(turned(dev, tmp_path, range(0, 72, 8))[0], scene)
     assert found(scene, "matches")["turns"] and (scene / "capture" / "turns").exists()
     assert status == 2 and len(lines) == 1 and str(scene) in lines[0]
