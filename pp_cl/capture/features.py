@@ -60,7 +60,8 @@ def find_features(
     with quiet(database) as colmap, opened(database) as db:
         bar = tqdm(total=len(taken), desc="features", unit="image", leave=False, disable=None)
         by_camera = sorted(taken, key=_camera)
-        for _, group in groupby(by_camera, _camera):
+        for _, of_camera in groupby(by_camera, _camera):
+            group = list(of_camera)
             names, camera = [one["name"] for one in group], None
             known = {image.name: image for image in db.read_all_images()}
             for name in names:
@@ -74,7 +75,7 @@ def find_features(
                     images,
                     some,
                     colmap.CameraMode.SINGLE,
-                    _reading(colmap, camera, masks),
+                    _reading(colmap, camera, masks, group[0]),
                     _extraction(colmap),
                 )
                 camera = db.read_image_with_name(some[0]).camera_id
@@ -93,11 +94,14 @@ def _has_features(db, image):
     return image is not None and db.exists_descriptors(image.image_id)
 
 
-def _reading(colmap, camera, masks):
-    """How images are read. camera: the id of theirs, None for a new one."""
+def _reading(colmap, camera, masks, one):
+    """How images like one are read. camera: the id of theirs, None for a new one."""
     options = colmap.ImageReaderOptions(camera_model=LENS)
     if camera is not None:
         options.existing_camera_id = camera
+    elif one["focal"]:
+        width, height = one["size"]
+        options.camera_params = f"{one['focal']},{width / 2},{height / 2},0"
     if masks is not None:
         options.mask_path = masks
     return options

@@ -28,7 +28,11 @@ KEPT = {"JPEG": ".jpg", "MPO": ".jpg", "PNG": ".png"}  # formats that are copied
 MODES = (*EIGHT_BIT_MODES, "CMYK", "YCbCr")
 ORIENTATION, MAKE, MODEL, EXIF = 0x0112, 0x010F, 0x0110, 0x8769
 FOCAL, FOCAL_35 = 0x920A, 0xA405  # of the part of EXIF about the exposure
-SENSOR = (0xA002, 0xA20E, 0xA210)  # there, too: pixels across, pixels per unit, the unit
+# there, too: pixels across and down, pixels per unit, the unit
+SENSOR = (0xA002, 0xA003, 0xA20E, 0xA210)
+PER_MM = {2: 25.4, 3: 10.0, 4: 1.0}  # millimetres in a unit
+REDUCED = 0.01  # difference of sizes, of the one in EXIF
+POSSIBLE = 0.2, 20.0  # focal lengths, of the longer side
 QUALITY = {"quality": 95, "subsampling": 0}  # of JPEGs
 LEAST = 8  # photographs
 SEEN, SMALL = 640, 64  # pixels, longer side, at which sharpness and likeness are measured
@@ -46,9 +50,9 @@ def take_images(source: Path, images: Path) -> dict[str, Any]:
     """Write the photographs of a folder, or the sharpest frame of each of FRAMES intervals of a
     film, to the new folder `images`, upright, as JPEG or PNG.
 
-    Returns {"images": [{name, source, lens, size, sharpness}], "left_out": [{source, reason}]};
-    lens is equal for photographs of one camera at one focal length. Raises UserError where too few
-    are usable.
+    Returns {"images": [{name, source, lens, focal, size, sharpness}], "left_out": [{source,
+    reason}]}; lens is equal for photographs of one camera at one focal length; focal, in pixels, is
+    None where COLMAP may guess it by EXIF. Raises UserError where too few are usable.
     """
     with atomic_folder(images) as unfinished:
         found = list((_photographs if source.is_dir() else _frames)(source, unfinished))
@@ -65,8 +69,9 @@ def take_images(source: Path, images: Path) -> dict[str, Any]:
                 f" needed ({'; '.join(why) or 'nothing is wrong with them'}); take 30 or more all"
                 " around the object"
             )
+    told = ("name", "source", "lens", "focal", "size", "sharpness")
     return {
-        "images": [_of(one, ("name", "source", "lens", "size", "sharpness")) for one in kept],
+        "images": [_of(one, told) for one in kept],
         "left_out": [_of(one, ("source", "reason")) for one in left_out],
     }
 
@@ -124,6 +129,7 @@ def _take(file, target):
             is_kept = is_kept and image.getexif().get(ORIENTATION, 1) == 1 and not is_deep_png(file)
             content = opened.seek(0) or opened.read() if is_kept else None
             facts["lens"], exif = _lens(image.getexif())
+            facts["focal"] = _focal_of_larger(image.getexif().get_ifd(EXIF), image.size)
             upright = ImageOps.exif_transpose(image)
     except Image.DecompressionBombError:
         return facts | {"reason": "has more than 178 million pixels"}
@@ -155,6 +161,21 @@ def _lens(exif):
     return " ".join(shown(str(part), 40) for part in lens), kept.tobytes()
 
 
+def _focal_of_larger(exposure, size):
+    """The focal length in pixels of a photograph that was reduced, or cropped to another shape and
+    reduced, while its EXIF still tells of the sensor's pixels, which COLMAP takes for the
+    photograph's; None where EXIF says nothing of the kind.
+    """
+    try:
+        across, down, density, unit = (float(exposure[tag]) for tag in SENSOR)
+        reduced = max(size[0] / across, size[1] / down)
+        focal = float(exposure[FOCAL]) * density / PER_MM[unit] * reduced
+    except (KeyError, TypeError, ValueError, ZeroDivisionError):
+        return None  # not told, or broken
+    is_told = not exposure.get(FOCAL_35) and abs(reduced - 1) > REDUCED
+    return focal if is_told and POSSIBLE[0] < focal / max(size) < POSSIBLE[1] else None
+
+
 # Films --------------------------------------------------------------------------------------------
 
 
@@ -173,7 +194,8 @@ def _frames(film, images):
         image, name = Image.fromarray(frame), f"{number:06d}.jpg"
         with atomic_file(images / name) as file:
             image.save(file, "JPEG", **QUALITY)
-        yield _look(image) | {"name": name, "source": f"frame {number}", "lens": "film"}
+        facts = {"name": name, "source": f"frame {number}", "lens": "film", "focal": None}
+        yield _look(image) | facts
 
 
 def _sharpest(film):

@@ -9,6 +9,7 @@ import pytest
 from PIL import Image, TiffImagePlugin
 
 from pp_cl.capture import frames
+from pp_cl.capture.features import find_features, opened
 from pp_cl.capture.frames import take_images
 from pp_cl.files.image import read_rgba
 from pp_cl.files.video import write_video
@@ -52,6 +53,33 @@ def test_photographs_of_other_programs(shots, tmp_path):
     copy = Image.open(tmp_path / "images" / made["turned.jpg"]["name"]).getexif()
     assert copy.get(frames.ORIENTATION, 1) == 1
     assert copy.get_ifd(frames.EXIF)[FOCAL] == pytest.approx(4.2)
+
+
+def test_the_focal_length_of_reduced_photographs(shots, tmp_path):
+    """EXIF tells of the sensor as it was before they were cropped to a square and reduced: 5184 by
+    3456 pixels, of which 5728 are an inch. COLMAP would begin with 46 / 25.4 * 5728 = 10374 pixels.
+    """
+    pytest.importorskip("pillow_heif")
+    pytest.importorskip("pycolmap")
+    sensor = dict(zip(frames.SENSOR, (5184, 3456, 5728.0, 2), strict=True))
+    lens = {FOCAL: 46.0}
+    whole = dict(zip(frames.SENSOR, (64, 64, 30.0, 2), strict=True))
+    told = [lens | sensor, lens | whole, lens, lens | sensor | {FOCAL: 0.0}]
+    told += [lens | sensor | {frames.SENSOR[3]: 7}, lens | sensor | {frames.FOCAL_35: 50}]
+    folder = tmp_path / "photographs"
+    folder.mkdir()
+    for i, image in enumerate(shots):
+        exif = Image.Exif()
+        exif.get_ifd(frames.EXIF).update(told[i] if i < len(told) else {})
+        Image.fromarray(image).resize((64, 64)).save(folder / f"{i:02d}.jpg", exif=exif)
+    taken = take_images(folder, tmp_path / "images")["images"]
+    focal = 46 / 25.4 * 5728 * 64 / 3456
+    assert [one["focal"] for one in taken] == [pytest.approx(focal)] + [None] * (len(shots) - 1)
+    database = tmp_path / "database.db"
+    find_features(database, tmp_path / "images", taken[:1])
+    with opened(database) as db:
+        (camera,) = db.read_all_cameras()
+    assert camera.params == pytest.approx([focal, 32, 32, 0])
 
 
 def test_names_that_colmap_can_list(shots, tmp_path):
