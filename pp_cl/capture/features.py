@@ -155,6 +155,22 @@ def forget_matches(database: Path) -> None:
         db.clear_two_view_geometries()
 
 
+def forget_focal_lengths(database: Path) -> bool:
+    """Where EXIF told any, begin with COLMAP's guess, check the pairs anew, and return True."""
+    with quiet(database) as colmap, opened(database) as db:
+        factor = colmap.ImageReaderOptions().default_focal_length_factor
+        told = [camera for camera in db.read_all_cameras() if camera.has_prior_focal_length]
+        for one in told:
+            size = one.width, one.height
+            db.update_camera(
+                colmap.Camera.create_from_model_name(one.camera_id, LENS, factor * max(size), *size)
+            )
+        if told:
+            db.clear_two_view_geometries()
+            colmap.geometric_verification(database, two_view_geometry_options=verification(colmap))
+    return bool(told)
+
+
 def verification(colmap: Any) -> Any:
     """How pairs are checked; with a seed, so that the same matches give the same pairs."""
     options = colmap.TwoViewGeometryOptions()

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from tqdm import tqdm
 
-from pp_cl.capture.features import cores, opened, quiet
+from pp_cl.capture.features import cores, forget_focal_lengths, opened, quiet
 from pp_cl.capture.packages import needed
 from pp_cl.errors import UserError
 from pp_cl.files.atomic import atomic_folder
@@ -37,17 +37,23 @@ def place(
     reprojection error in pixels, and {image: reason} of those without a place. Raises UserError
     where more than a half have none.
     """
+    least = max(3, LEAST_SHARE * len(taken))
     with atomic_folder(model) as unfinished:
         found = _mapped(database, images, unfinished, len(taken), turns)
+        if all(one.num_reg_images() < least for one in found):  # EXIF may be of another size
+            (again := unfinished / "again").mkdir()
+            copy = Path(shutil.copy(database, again))  # a stopped run finds its own as it was
+            if forget_focal_lengths(copy):
+                found += _mapped(copy, images, again, len(taken), turns)
         if found:
-            best = max(found.values(), key=lambda one: (one.num_reg_images(), one.num_points3D()))
+            best = max(found, key=lambda one: (one.num_reg_images(), one.num_points3D()))
             for folder in list(unfinished.iterdir()):
                 shutil.rmtree(folder)
             refine(best)
             best.write(unfinished)
         placed = {image.name for image in best.images.values() if image.has_pose} if found else ()
         reasons = _reasons(database, taken, placed)
-        if len(placed) < max(3, LEAST_SHARE * len(taken)):
+        if len(placed) < least:
             some = "; ".join(f"{name} {why}" for name, why in list(reasons.items())[:3])
             raise UserError(
                 f"{images}: only {len(placed)} of {len(taken)} images could be placed ({some});"
@@ -63,7 +69,7 @@ def place(
 
 
 def _mapped(database, images, folder, count, turns):
-    """{number: pycolmap's model} of what fits together.
+    """pycolmap's models of what fits together.
 
     Without a background, images that are as far apart as those that COLMAP begins with have fewer
     matches than a pattern has with itself, and closer ones do not tell focal length from lens.
@@ -80,9 +86,10 @@ def _mapped(database, images, folder, count, turns):
             options.mapper.init_min_tri_angle = CLOSER
             options.ba_refine_extra_params = False  # refine() finds them
         with tqdm(total=count, desc="poses", unit="image", leave=False, disable=None) as bar:
-            return colmap.incremental_mapping(
+            models = colmap.incremental_mapping(
                 database, images, folder, options, next_image_callback=lambda: bar.update()
             )
+            return list(models.values())
 
 
 def refine(model: Any) -> None:

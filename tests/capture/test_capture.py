@@ -16,6 +16,7 @@ from PIL import Image, ImageFilter
 from support.runs import spoken
 
 from pp_cl.capture import poses
+from pp_cl.capture.features import opened, quiet, verification
 from pp_cl.capture.frames import take_images
 from pp_cl.cli import main
 from pp_cl.files.image import to_8bit, write_png
@@ -27,6 +28,7 @@ from tools.capture_demo import align, cameras, room
 
 colmap = pytest.importorskip("pycolmap")
 SIZE, COUNT = 300, 12
+WRONG = 6.0  # of the true focal length
 
 
 def near():
@@ -99,6 +101,24 @@ def test_photographs_become_a_scene(captured):
         middle = view.camera.project(np.zeros(3))[:2]
         assert np.linalg.norm(middle - [columns.mean(), rows.mean()]) < 0.1 * SIZE
         assert -view.camera.pose[2, 1] > 0  # the image's upper edge is up
+
+
+def test_a_focal_length_that_is_wrong_is_forgotten(captured, tmp_path):
+    """That of larger photographs, which EXIF may keep: with it, few images have a place."""
+    work = captured / "capture"
+    database = Path(shutil.copy(work / "database.db", tmp_path))
+    with quiet(database), opened(database) as db:
+        for one in db.read_all_cameras():
+            params = [WRONG * cameras(SIZE)[0].fx, SIZE / 2, SIZE / 2, 0]
+            one.params, one.has_prior_focal_length = params, True
+            db.update_camera(one)
+        db.clear_two_view_geometries()
+        colmap.geometric_verification(database, two_view_geometry_options=verification(colmap))
+    taken = found(captured, "frames")["images"]
+    told = poses.place(database, captured / "images", tmp_path / "model", taken, False)
+    assert told["placed"] == COUNT
+    lens = colmap.Reconstruction(tmp_path / "model").cameras.values()
+    assert [one.params[0] for one in lens] == pytest.approx([cameras(SIZE)[0].fx] * len(lens), 0.1)
 
 
 def test_wrong_matches_do_not_pull_at_the_cameras():
