@@ -64,6 +64,7 @@ OPEN, NEVER = (0.0, 0.0), (1.0, 1.0)  # train.refine_at
 # train.refine_at by how often the grid is refined, until points are FINEST to COARSEST pixels apart
 REFINE_AT = (NEVER, (0.35, 1.0), (0.33, 0.67))
 FINEST, COARSEST = 1.25, 1.5
+COARSER = 1.2  # times the spacing at the next try, where memory is too small: 1.7 times less points
 LEAST_SIDE = 48  # pixels of the images that a training begins on, if it is to refine
 # what `make network` keeps: {"net.NAME": as UNet.parameters, float16}
 DEMO_NETWORK = Path(__file__).with_name("network") / "demo.npz"
@@ -361,13 +362,13 @@ def _start(config, agreement, views, net, room):
 
 
 def first_hull(
-    dev: Device, config: Config, agreement: Agreement
+    dev: Device, config: Config, agreement: Agreement, coarsest: float = COARSEST
 ) -> tuple[Hull, tuple[float, float]]:
     """(the hull that a training starts from, its train.refine_at).
 
     Where the settings leave train.refine_at open, there are as many refinements as bring points
-    COARSEST pixels of the images close, and the hull has the spacing from which these lead to
-    FINEST to COARSEST.
+    `coarsest` pixels of the images close, and the hull has the spacing from which these lead to
+    FINEST to `coarsest`.
     """
     points, shares, box = config.points.count, config.train.refine_at, scene_box(config)
     views, _, forgiven = agreement
@@ -378,26 +379,27 @@ def first_hull(
     spacing = spacing_pixels(hull.grid, cameras)
     smallest = min(min(camera.width, camera.height) for camera in cameras)
     possible = [n for n in range(1, len(REFINE_AT)) if smallest >= LEAST_SIDE << n]
-    times = sum(spacing > COARSEST * 2 ** (n - 1) for n in possible)
-    first = min(max(spacing, 2**times * FINEST), 2**times * COARSEST)
+    times = sum(spacing > coarsest * 2 ** (n - 1) for n in possible)
+    first = min(max(spacing, 2**times * FINEST), 2**times * coarsest)
     if times and first != spacing:
         hull = build_grid(dev, views, round(points * (spacing / first) ** 3), box, forgiven)
     return hull, REFINE_AT[times]
 
 
 def _first_level(dev, config, agreement, room):
-    """first_hull() and its (near, far); config.train.refine_at becomes what it says, or NEVER if
-    there is too little memory for it. Raises UserError as Room.check_points() does.
+    """first_hull() and its (near, far); config.train.refine_at becomes what it says. Where memory
+    is too small for points COARSEST pixels apart in the end, they are as close as it allows. Raises
+    UserError as Room.check_points() does.
     """
-    is_open, train = config.train.refine_at == OPEN, config.train
-    hull, train.refine_at = first_hull(dev, config, agreement)
-    try:
-        return _checked(room, agreement.views, hull)
-    except UserError:
-        if not is_open or train.refine_at == NEVER:
-            raise
-        train.refine_at = NEVER
-        return _checked(room, agreement.views, first_hull(dev, config, agreement)[0])
+    is_open, train, coarsest = config.train.refine_at == OPEN, config.train, COARSEST
+    while True:
+        hull, train.refine_at = first_hull(dev, config, agreement, coarsest)
+        try:
+            return _checked(room, agreement.views, hull)
+        except UserError:
+            if not is_open or train.refine_at == NEVER:
+                raise
+        train.refine_at, coarsest = OPEN, COARSER * coarsest
 
 
 def _checked(room, views, hull):
