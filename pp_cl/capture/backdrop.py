@@ -1,5 +1,6 @@
 """What stands out from the background: a photograph against what others show of the wall behind the
-object, which they see beside it. Parts too thin for a cut by colour are found in this way.
+object, which they see beside it; or at the same pixels, where the object turns before a wall that
+stands still. Parts and gaps too thin for a cut by colour are found in this way.
 """
 
 from collections.abc import Sequence
@@ -12,6 +13,7 @@ from tqdm import tqdm
 
 from pp_cl.capture.packages import needed
 from pp_cl.capture.window import Window, dilated
+from pp_cl.scene.views import evenly
 
 cv2 = needed("cv2")
 
@@ -22,44 +24,91 @@ LEAST, MOST = 50, 800  # sparse points behind a window: needed, and looked at
 AMONG = 6  # points whose median depth each has, since some are wrong
 HIDING = 2  # pixels around a mask that may show the object
 UNSEEN = 255  # as a difference: no other photograph shows the background
+# Of an object that turns
+COMPARED = 64  # photographs that one is compared with
+ALIKE, SLIGHT = 2.0, 3.0  # times what is usual, and levels: differences of the same still wall
+LEAST_ALIKE = 5  # photographs that show the same
+SHOWN, NEARLY_ALL = 0.4, 0.9  # shares of them that show the wall in a gap, and a plain part
 BLUR = 2.0  # levels over which differences are counted
 RARE = 1e-3  # share of the pixels that are spread over all levels
 
 
-def differences(windows: Sequence[Window], background: np.ndarray) -> list[np.ndarray]:
+def differences(
+    windows: Sequence[Window],
+    background: np.ndarray,
+    beside: Sequence[np.ndarray] | None = None,
+) -> list[np.ndarray]:
     """For each window (H, W) uint8, by how many levels its most different channel differs from what
-    the nearest others show behind it, beside their masks, the median of these; or UNSEEN.
+    others show of the background there; or UNSEEN.
 
-    background: (N, 3) sparse points around the object.
+    background: (N, 3) sparse points around the object. beside: where the object turns before a
+    background that stands still, and that others show at the same pixels: (H, W) bool each, what
+    surely shows it.
     """
     eyes = np.stack([one.camera.eye for one in windows])
     found = []
-    for one in tqdm(windows, "backgrounds", unit="image", leave=False, disable=None):
+    for i, one in enumerate(tqdm(windows, "backgrounds", unit="image", leave=False, disable=None)):
         order = np.argsort(np.linalg.norm(eyes - one.camera.eye, axis=1), kind="stable")
-        others = [windows[i] for i in order[1 : 1 + NEAREST]]
-        found.append(_difference(one, others, background))
+        others = [windows[k] for k in order[1:]]
+        if beside is not None:
+            found.append(_difference_of_still(one, evenly(others, COMPARED), beside[i]))
+        else:
+            found.append(_difference(one, others[:NEAREST], background))
     return found
 
 
 def _difference(one, others, background):
+    """From what the others show at the same places, beside their masks: the median."""
     places = _places_behind(one, background)
     height, width = one.mask.shape
     if places is None:
         return np.full((height, width), UNSEEN, np.uint8)
     rows, columns = places.shape[:2]
-    found = np.full((len(others), height, width), UNSEEN, np.uint8)
-    for differs, other in zip(found, others, strict=True):
+    found = []
+    for other in others:
         at = other.pixels(places.reshape(-1, 3)).reshape(rows, columns, 2).astype(np.float32) - 0.5
         at = cv2.resize(np.nan_to_num(at, nan=-1e6), (width, height))
-        beside = 255 * (~dilated(other.mask, HIDING)).astype(np.uint8)
-        is_seen = cv2.remap(beside, at, None, cv2.INTER_LINEAR, borderValue=0) == 255
-        behind = cv2.remap(other.image, at, None, cv2.INTER_LINEAR)
-        levels = np.maximum.reduce(cv2.split(cv2.absdiff(one.image, behind)))
-        differs[is_seen] = np.minimum(levels, UNSEEN - 1)[is_seen]
-    found = np.sort(found.reshape(len(others), -1).T)
-    seen = (found < UNSEEN).sum(1)
-    middle = found[np.arange(len(found)), np.maximum(seen - 1, 0) // 2]
-    return middle.reshape(height, width)
+        found.append(_levels(one, other, at, ~dilated(other.mask, HIDING)))
+    return _smallest(found, 0.5)
+
+
+def _difference_of_still(one, others, beside):
+    """From those that show the same wall: what SHOWN of them do not exceed, whatever their masks
+    say, as these may hold the gaps. UNSEEN where nearly all show the same: that may be a part of
+    the object without a pattern.
+    """
+    found, off = [], []
+    for other in others:
+        levels = _levels(one, other, one.pixels_in(other), np.ones(other.mask.shape, bool))
+        seen = beside & (levels < UNSEEN)
+        found.append(levels)
+        off.append(np.median(levels[seen]) if seen.any() else UNSEEN)
+    most = min(max(SLIGHT, ALIKE * np.sort(off)[:LEAST_ALIKE].mean()), UNSEEN - 1)
+    found = [levels for levels, by in zip(found, off, strict=True) if by <= most]
+    if len(found) < LEAST_ALIKE:
+        return np.full(beside.shape, UNSEEN, np.uint8)
+    stays, all_stay = _smallest(found, SHOWN), _smallest(found, NEARLY_ALL)
+    quiet = ALIKE * np.median(all_stay[beside]) + SLIGHT
+    stays[~beside & (all_stay <= quiet)] = UNSEEN
+    return stays
+
+
+def _levels(one, other, at, usable):
+    """(H, W) uint8 differences from what another window shows at places (H, W, 2) of its pixels
+    that are usable, (H, W) bool of the other; elsewhere UNSEEN.
+    """
+    usable = cv2.remap(255 * usable.astype(np.uint8), at, None, cv2.INTER_LINEAR, borderValue=0)
+    behind = cv2.remap(other.image, at, None, cv2.INTER_LINEAR)
+    levels = np.maximum.reduce(cv2.split(cv2.absdiff(one.image, behind)))
+    return np.where(usable == 255, np.minimum(levels, UNSEEN - 1), np.uint8(UNSEEN))
+
+
+def _smallest(found, share):
+    """(H, W) uint8: the difference that a share of those that are seen do not exceed."""
+    found = np.sort(np.stack(found, axis=-1), axis=-1)
+    seen = (found < UNSEEN).sum(-1, keepdims=True)
+    at = np.maximum(np.ceil(share * seen).astype(int) - 1, 0)
+    return np.take_along_axis(found, at, axis=-1)[..., 0]
 
 
 def _places_behind(one, background):
@@ -89,20 +138,20 @@ def _places_behind(one, background):
 
 
 def evidence(
-    found: Sequence[np.ndarray], windows: Sequence[Window], surely: Sequence[np.ndarray]
+    found: Sequence[np.ndarray], beside: Sequence[np.ndarray], surely: Sequence[np.ndarray]
 ) -> list[np.ndarray]:
     """For each window (H, W) float32: how much likelier its differences are on the object than
-    beside the masks, as a logarithm; 0 where they are UNSEEN.
+    beside it, as a logarithm; 0 where they are UNSEEN.
 
-    surely: (H, W) bool each, what shows the object for sure; masks may hold gaps between its parts.
-    What cannot be predicted says nothing: its differences are the same on the masks and beside.
+    beside, surely: (H, W) bool each, what shows the background and the object for sure.
+    What cannot be predicted says nothing: its differences are the same on both.
     """
     counts = np.zeros((2, UNSEEN + 1))
-    for difference, one, on in zip(found, windows, surely, strict=True):
-        counts[0] += np.bincount(difference[~one.mask], minlength=UNSEEN + 1)
-        counts[1] += np.bincount(difference[on], minlength=UNSEEN + 1)
+    for difference, *sides in zip(found, beside, surely, strict=True):
+        for count, side in zip(counts, sides, strict=True):
+            count += np.bincount(difference[side], minlength=UNSEEN + 1)
     shares = gaussian_filter1d(counts[:, :UNSEEN], BLUR, axis=1) + 1
     shares /= shares.sum(1, keepdims=True)
-    beside, on = np.log((1 - RARE) * shares + RARE / UNSEEN)
-    odds = np.append(on - beside, 0.0).astype(np.float32)
+    off, on = np.log((1 - RARE) * shares + RARE / UNSEEN)
+    odds = np.append(on - off, 0.0).astype(np.float32)
     return [odds[difference] for difference in found]

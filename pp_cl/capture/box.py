@@ -21,7 +21,7 @@ FILLED = 0.55  # of the images, by an object whose sides may have no points
 SLOPES = np.tan(np.radians(np.arange(-10, 11, 2)))  # of the plane that carries the object
 THICK = 0.01  # of the cameras' distance: points of a plane are no further from it
 TABLE, BELOW = 0.08, 0.03  # of the points: on a table at least, and below it at most
-LEAST_SPREAD = 0.7  # of the width of what stands on it
+LEAST_SPREAD = 0.9  # of the width of what stands on it
 
 
 class World(NamedTuple):

@@ -21,6 +21,7 @@ cv2 = needed("cv2")
 # around it. The object's own lowest are at 0.05, as box.MARGIN is below them.
 FOOT = 0.08
 SEED = 1 / 150  # radius of a sparse point, of CUT_SIDE
+ROUGH = 2  # pixels at the border of what is surely the object that may show the background
 NEAR = 1 / 20  # of CUT_SIDE: sparse points so close show a surface between them
 SAMPLES = 160  # squared: pixels of each side that the colours are learned from
 FITTED = 3  # times that the colours are fitted to their samples
@@ -41,11 +42,12 @@ def cut_out_all(
     points: np.ndarray,
     inside: np.ndarray,
     seen: Sequence[np.ndarray],
+    turns: bool,
 ) -> None:
     """Set the masks of the windows that have none. Raises UserError for a box in which nothing
     stands.
 
-    box, points, seen: as write_masks() takes them. inside: (N,) bool, the points in the box.
+    box, points, seen, turns: as write_masks() takes them. inside: (N,) bool, the points in the box.
     """
     cv2.setNumThreads(1)
     left = [i for i, one in enumerate(windows) if one.mask is None]
@@ -65,14 +67,19 @@ def cut_out_all(
             windows[i].mask = _grab_cut(windows[i], labels[i], colours)
 
     cut(1)
-    differences = backdrop.differences(windows, points[~inside])
+    outside = [some == cv2.GC_BGD for some in labels]
+
+    def beside():
+        return [some & ~one.mask for some, one in zip(outside, windows, strict=True)]
+
+    differences = backdrop.differences(windows, points[~inside], beside() if turns else None)
     for number in range(1 + ROUNDS):
         if number:
             hull = _hull(windows, box)
             for i in left:
                 labels[i] = _relabelled(windows[i], seeds[i], *hull)
-        surely = [some == cv2.GC_FGD for some in labels]
-        standing_out = backdrop.evidence(differences, windows, surely)
+        surely = [_eroded(some == cv2.GC_FGD, ROUGH) for some in labels]
+        standing_out = backdrop.evidence(differences, beside(), surely)
         for i in left:
             labels[i] = _marked(labels[i], standing_out[i])
         cut(2 + number)

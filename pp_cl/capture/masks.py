@@ -46,6 +46,7 @@ def write_masks(
     given: Path | None = None,
     sources: Mapping[str, str] | None = None,
     command: str | None = None,
+    turns: bool = False,
 ) -> tuple[str, list[str]]:
     """Write the mask of each photograph as mask_file(), 8-bit gray, white where the object is; what
     lies there is kept, and helps to make the others. Returns one line on what was done, and the
@@ -54,9 +55,9 @@ def write_masks(
     scene: the folder that the photographs' names are relative to. box: (2, 3) around the object.
     points: (N, 3) in the scene's world. seen: for each photograph the indices (M,) of the points
     that it shows. given: a folder of masks, which may be named like the photographs' sources, as
-    {name: source} has them. command: of a program that makes masks, which {image}
-    and {mask} stand for. Raises UserError for masks that are given and missing or broken, a program
-    that fails, a box in which nothing is seen.
+    {name: source} has them. command: of a program that makes masks, which {image} and {mask} stand
+    for. turns: the object turns before a background that stands still. Raises UserError for masks
+    that are given and missing or broken, a program that fails, a box in which nothing is seen.
     """
     words = None if command is None else program_words(command)
     folder.mkdir(parents=True, exist_ok=True)
@@ -81,7 +82,7 @@ def write_masks(
         windows = [_window(scene, folder, one, box) for one in bar]
         how |= _uniform(scene, folder, in_view, windows, points[inside])
         if _without_mask(folder, in_view):
-            how |= _cut(scene, folder, in_view, windows, box, points, inside, seen)
+            how |= _cut(scene, folder, in_view, windows, box, points, inside, seen, turns)
     counts = ", ".join(f"{count} {source}" for source, count in how.items() if count)
     wrong = _contradicting(scene, folder, photographs, box)
     if wrong:
@@ -191,10 +192,10 @@ def _is_uniform(window, points):
     return bool((mask[rows, columns] > 127).mean() >= ON_MASK) if len(rows) else bool(mask.any())
 
 
-def _cut(scene, folder, photographs, windows, box, points, inside, seen):
+def _cut(scene, folder, photographs, windows, box, points, inside, seen, turns):
     """Cut out what has no mask, and write it. Returns {what: how many}."""
     left = [i for i, one in enumerate(windows) if one.mask is None]
-    cut_out_all(windows, box, points, inside, seen)
+    cut_out_all(windows, box, points, inside, seen, turns)
     for i in tqdm(left, "masks", unit="image", leave=False, disable=None):
         name = photographs[i].name
         mask = whole_mask(windows[i], read_rgba(scene / name)[..., :3])

@@ -238,6 +238,7 @@ class Capture:
                 given=given["masks"] and Path(given["masks"]),
                 sources=sources,
                 command=given["command"],
+                turns=self._found("matches")["turns"],
             )
 
         line, wrong = write(kept)

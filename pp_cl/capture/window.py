@@ -62,6 +62,18 @@ class Window:
                 found = found + wanted - self.distortion.apply(*found)
         return np.stack([*found, np.ones_like(found[0])], axis=-1)
 
+    def pixels_in(self, other: "Window") -> np.ndarray:
+        """(H, W, 2) float32 x and y of this one's pixels in another window that lies at the same
+        places of its photograph, 0 in the middle of the first pixel.
+        """
+        at = []
+        for axis in (0, 1):
+            (begin, end), (first, last) = self.place[axis::2], other.place[axis::2]
+            size, others = self.image.shape[1 - axis], other.image.shape[1 - axis]
+            places = begin + (np.arange(size) + 0.5) * (end - begin) / size
+            at.append((places - first) * others / (last - first) - 0.5)
+        return np.stack(np.meshgrid(*at), axis=-1).astype(np.float32)
+
     def reduced(self, image: np.ndarray) -> np.ndarray:
         """The part of an image of the photograph's size, (H, W) or (H, W, C), reduced to this."""
         x0, y0, x1, y1 = self.place

@@ -33,3 +33,16 @@ def test_a_table_is_no_part_of_the_object(share, tilt):
     assert np.mean(sizes, axis=0) == pytest.approx(
         2 * RADIUS * (1 + 2 * MARGIN * np.sqrt(3)), abs=0.1
     )
+
+
+def test_a_base_is_part_of_the_object():
+    """It is narrower than what stands on it."""
+    rng = np.random.default_rng(0)
+    ball = rng.normal(size=(2000, 3))
+    ball *= RADIUS / np.linalg.norm(ball, axis=1, keepdims=True)
+    base = 0.8 * RADIUS * rng.uniform(-1, 1, (660, 3))
+    base[:, 2] = -RADIUS
+    base[:60, 2] -= rng.uniform(0, 0.4, 60)  # its side has few points
+    world = find_world(ring_cameras(12, 100), np.concatenate([ball, base]))
+    low = (world.box[0, 2] - world.shift[2]) / world.scale
+    assert low < -RADIUS - 0.3

@@ -8,13 +8,19 @@ from pathlib import Path
 import numpy as np
 import pytest
 from PIL import Image
-from scipy.ndimage import binary_closing, binary_dilation, binary_opening, gaussian_filter
+from scipy.ndimage import (
+    binary_closing,
+    binary_dilation,
+    binary_erosion,
+    binary_opening,
+    gaussian_filter,
+)
 from support.scenes import ball_image, ring_cameras
 
 from pp_cl.errors import UserError
 from pp_cl.files.image import read_mask, read_rgba
 from pp_cl.scene.camera import Camera
-from pp_cl.scene.demo import ANGLE, OBJECT_BOX, render
+from pp_cl.scene.demo import ANGLE, OBJECT_BOX, demo_mesh, render
 from pp_cl.scene.outline import OUTLINE
 from pp_cl.scene.views import Photograph
 from tools.capture_demo import ROOM, cameras, room
@@ -71,7 +77,7 @@ class Capture:
 
     def agreement(self):
         """(V,) intersection over union of each mask with the true one."""
-        found = [read_mask(self.file(i)) > 127 for i in range(VIEWS)]
+        found = [read_mask(self.file(i)) > 127 for i in range(len(self.truth))]
         pairs = zip(found, self.truth, strict=True)
         return np.array([(a & b).sum() / (a | b).sum() for a, b in pairs])
 
@@ -152,13 +158,62 @@ def test_thin_parts_and_gaps_are_told_by_the_wall(dev, tmp_path):
         for one, mask in zip(windows, masks, strict=True):
             one.mask = mask
         differences = backdrop.differences(windows, capture.points[capture.count :])
-        return flat(backdrop.evidence(differences, windows, surely))
+        beside = [~mask for mask in masks]
+        return flat(backdrop.evidence(differences, beside, surely))
 
     of_thin, of_filled, shown = odds(surely), odds(filled), flat(truth)
     assert (of_thin[shown & ~flat(surely)] > cut.STANDS_OUT).mean() > 0.8
     assert (of_thin[~shown] < 0).mean() > 0.95
     beside = ~flat([binary_dilation(mask) for mask in truth])
     assert (of_filled[flat(filled) & beside] < cut.IS_WALL).mean() > 0.8
+
+
+def turned(folder, views, box, surface, wall):
+    """A Capture of an object that turns, whose wall has no points, as it stands still."""
+    capture = Capture(folder, views, box, surface, wall=wall)
+    capture.points = capture.points[: capture.count]
+    capture.seen = [seen[seen < capture.count] for seen in capture.seen]
+    return capture
+
+
+def test_an_object_that_turns_is_told_from_the_wall(dev, tmp_path):
+    """Which shows between the demo's rings in every photograph."""
+    around = cameras(2 * SIZE, "turntable")
+    views = [(one, render(dev, one)) for one in around[::2]]
+    surface, still = demo_mesh(dev, 64)[0][::20], room(around[0])
+    capture = turned(tmp_path / "scene", views, OBJECT_BOX, surface, lambda _: still)
+    capture.write(turns=True)
+    assert capture.agreement().min() > 0.88
+
+
+def test_what_looks_the_same_while_the_object_turns_may_be_its_part(tmp_path):
+    """A plain ball upon one with a pattern, before a camera at each of two heights."""
+    middle, views, plain = np.array([0, 0, 1.05]), [], []
+    for camera in ring_cameras(2 * VIEWS, SIZE, distance=6.0):
+        image = ball_image(camera)
+        from_below = replace(camera, pose=camera.pose - np.outer(middle, [0, 0, 0, 1]))
+        plain.append(ball_image(from_below, 0.35)[..., 3] > 0)
+        image[plain[-1]] = [60, 30, 40, 255]
+        views.append((camera, image))
+
+    def wall(camera):
+        noise = np.random.default_rng(int(100 * camera.eye[2])).uniform(0, 1, (SIZE, SIZE, 3))
+        return 1.2 * (gaussian_filter(noise, (1.5, 1.5, 0)) - 0.5) + WALL
+
+    box = [[-0.8, -0.8, -0.8], [0.8, 0.8, 1.4]]
+    capture = turned(tmp_path / "scene", views, box, np.zeros((1, 3)), wall)
+    windows, masks = [], []
+    for one, *images in zip(capture.photographs, capture.truth, plain, strict=True):
+        windows.append(window(read_rgba(capture.folder / one.name)[..., :3], one, capture.box))
+        masks.append([windows[-1].reduced(np.uint8(image)) > 0 for image in images])
+        windows[-1].mask = masks[-1][0]
+    beside = [~binary_dilation(mask, iterations=3) for mask, _ in masks]
+    for found, (mask, same), out in zip(
+        backdrop.differences(windows, capture.points, beside), masks, beside, strict=True
+    ):
+        assert (found[out] <= backdrop.SLIGHT).all()
+        assert (found[mask & ~binary_dilation(same, iterations=2)] > 50).all()
+        assert (found[binary_erosion(same, iterations=2)] == backdrop.UNSEEN).all()
 
 
 def share_held(capture, place, wanted):
