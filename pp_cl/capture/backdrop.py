@@ -28,7 +28,7 @@ UNSEEN = 255  # as a difference: no other photograph shows the background
 COMPARED = 64  # photographs that one is compared with
 ALIKE, SLIGHT = 2.0, 3.0  # times what is usual, and levels: differences of the same still wall
 LEAST_ALIKE = 5  # photographs that show the same
-SHOWN, NEARLY_ALL = 0.4, 0.9  # shares of them that show the wall in a gap, and a plain part
+SHOWN = 0.15, 0.4, 0.9  # few, some and nearly all of them
 BLUR = 2.0  # levels over which differences are counted
 RARE = 1e-3  # share of the pixels that are spread over all levels
 
@@ -73,9 +73,9 @@ def _difference(one, others, background):
 
 
 def _difference_of_still(one, others, beside):
-    """From those that show the same wall: what SHOWN of them do not exceed, whatever their masks
-    say, as these may hold the gaps. UNSEEN where nearly all show the same: that may be a part of
-    the object without a pattern.
+    """From those that show the same wall: what some of them do not exceed, whatever their masks
+    say, as these may hold the gaps. UNSEEN where few show the same, the wall that is mostly hidden;
+    or nearly all, as that may be a part of the object without a pattern.
     """
     found, off = [], []
     for other in others:
@@ -83,14 +83,16 @@ def _difference_of_still(one, others, beside):
         seen = beside & (levels < UNSEEN)
         found.append(levels)
         off.append(np.median(levels[seen]) if seen.any() else UNSEEN)
-    most = min(max(SLIGHT, ALIKE * np.sort(off)[:LEAST_ALIKE].mean()), UNSEEN - 1)
-    found = [levels for levels, by in zip(found, off, strict=True) if by <= most]
+    least = np.sort(off)[:LEAST_ALIKE].mean()
+    alike = min(max(SLIGHT, ALIKE * least), UNSEEN - 1)
+    found = [levels for levels, by in zip(found, off, strict=True) if by <= alike]
     if len(found) < LEAST_ALIKE:
         return np.full(beside.shape, UNSEEN, np.uint8)
-    stays, all_stay = _smallest(found, SHOWN), _smallest(found, NEARLY_ALL)
-    quiet = ALIKE * np.median(all_stay[beside]) + SLIGHT
-    stays[~beside & (all_stay <= quiet)] = UNSEEN
-    return stays
+    few, some, nearly_all = (_smallest(found, share) for share in SHOWN)
+    usual, most = (ALIKE * np.median(one[beside]) + SLIGHT for one in (some, nearly_all))
+    rarely, always = (few <= usual) & (some > usual), nearly_all <= most
+    some[rarely | (always & ~beside)] = UNSEEN
+    return some
 
 
 def _levels(one, other, at, usable):

@@ -75,7 +75,7 @@ def cut_out_all(
     differences = backdrop.differences(windows, points[~inside], beside() if turns else None)
     for number in range(1 + ROUNDS):
         if number:
-            hull = _hull(windows, box)
+            hull = forgiving_hull(windows, box)
             for i in left:
                 labels[i] = _relabelled(windows[i], seeds[i], *hull)
         surely = [_eroded(some == cv2.GC_FGD, ROUGH) for some in labels]
@@ -169,7 +169,9 @@ def _grab_cut(one, labels, colours):
     return labels & 1 == 1
 
 
-def _hull(windows: Sequence[Window], box: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:
+def forgiving_hull(
+    windows: Sequence[Window], box: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, float]:
     """((N, 3) positions in the box that no more than FORGIVEN of the masks reject of the windows
     that see them, (N,) how many do, the positions' spacing).
     """
@@ -196,20 +198,31 @@ def _relabelled(one, seeds, hull, rejections, edge):
     """(H, W) uint8 of GrabCut's labels of a window from what all views agree on: what is well
     outside the hull is background, what is well within what no other view rejects is the object.
     """
-    middle = np.linalg.norm(hull.mean(0) - one.camera.eye)
-    gap = max(1, int(np.ceil(edge * one.camera.fx / middle)))  # pixels between vertices
+    gap = gap_of(one, hull, edge)
     found, rows, columns = one.inside(hull)
-    held, core = np.zeros((2, *seeds.shape), bool)
-    held[rows, columns] = True
-    agreed = rejections[found] == ~one.mask[rows, columns]
-    core[rows[agreed], columns[agreed]] = True
-    held, core = _closed(held, gap), _closed(core, gap)
+    agreed = found[rejections[found] == ~one.mask[rows, columns]]
+    held, core = silhouette(one, hull, gap), silhouette(one, hull[agreed], gap)
     labels = np.where(held & one.mask, cv2.GC_PR_FGD, cv2.GC_PR_BGD).astype(np.uint8)
     labels[_eroded(held, gap) & (seeds == cv2.GC_FGD)] = cv2.GC_FGD
     labels[seeds == cv2.GC_BGD] = cv2.GC_BGD
     labels[~dilated(held, 2 * gap)] = cv2.GC_BGD
     labels[_eroded(core, 2 * gap + 1)] = cv2.GC_FGD
     return labels
+
+
+def gap_of(one: Window, hull: np.ndarray, edge: float) -> int:
+    """Pixels between the vertices of a hull, (N, 3) with a spacing `edge`, in a window."""
+    return max(
+        1, int(np.ceil(edge * one.camera.fx / np.linalg.norm(hull.mean(0) - one.camera.eye)))
+    )
+
+
+def silhouette(one: Window, hull: np.ndarray, gap: int) -> np.ndarray:
+    """(H, W) bool: where a window shows vertices of a hull (N, 3), so many pixels apart."""
+    held = np.zeros(one.image.shape[:2], bool)
+    _, rows, columns = one.inside(hull)
+    held[rows, columns] = True
+    return _closed(held, gap)
 
 
 def _marked(labels, standing_out):

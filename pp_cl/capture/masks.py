@@ -9,11 +9,14 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
+from scipy.ndimage import binary_fill_holes
+from skimage.measure import label
 from skimage.segmentation import find_boundaries
 from tqdm import tqdm
 
-from pp_cl.capture.cut import cut_out_all, whole_mask
-from pp_cl.capture.window import place_of, window
+from pp_cl.capture.cut import FORGIVEN, cut_out_all, forgiving_hull, gap_of, silhouette, whole_mask
+from pp_cl.capture.packages import needed
+from pp_cl.capture.window import dilated, place_of, window
 from pp_cl.errors import UserError, shown
 from pp_cl.files.contact_sheet import contact_sheet
 from pp_cl.files.image import read_mask, read_rgba, write_png
@@ -23,8 +26,12 @@ from pp_cl.scene.masks import MaskRule, cut_out, named_mask
 from pp_cl.scene.outline import OUTLINE, SHOWN_SIZE, SHOWN_VIEWS
 from pp_cl.scene.views import Photograph, View, evenly, fitting_downscale, shrink
 
+cv2 = needed("cv2")
+
 OPAQUE = (".jpg", ".jpeg")  # files that have no alpha need not be read for it
+KEYED_SIDE = 1600  # pixels of what a uniform background is told from
 UNIFORM = 0.9  # of a photograph's border, and of the photographs, that show the background alone
+SPOT = 0.5  # of a region that a mask encloses, behind which others see the object
 ON_MASK = 0.9  # of the object's points, that a mask of a uniform background holds
 CHECKED_SIDE = 200  # pixels of the masks that are compared
 SECONDS = 600  # that a program may take for a mask
@@ -80,7 +87,8 @@ def write_masks(
         in_view, seen = [photographs[i] for i in shown], [seen[i] for i in shown]
         bar = tqdm(in_view, "reading images", unit="image", leave=False, disable=None)
         windows = [_window(scene, folder, one, box) for one in bar]
-        how |= _uniform(scene, folder, in_view, windows, points[inside])
+        of_object = [points[some[inside[some]]] for some in seen]
+        how |= _uniform(scene, folder, in_view, windows, box, of_object)
         if _without_mask(folder, in_view):
             how |= _cut(scene, folder, in_view, windows, box, points, inside, seen, turns)
     counts = ", ".join(f"{count} {source}" for source, count in how.items() if count)
@@ -153,33 +161,64 @@ def _window(scene, folder, photograph, box):
     return found
 
 
-def _uniform(scene, folder, photographs, windows, points):
+def _uniform(scene, folder, photographs, windows, box, points):
     """Write the masks of photographs before a uniform background, where nearly all of those without
-    a mask are. points: (M, 3) of the object. Returns {what: how many}.
+    a mask are. points: (M, 3) of the object that each shows. Returns {what: how many}.
     """
     left = [i for i, one in enumerate(windows) if one.mask is None]
-    found = [i for i in left if _is_uniform(windows[i], points)]
+    found = [i for i in left if _is_uniform(windows[i], points[i])]
     if len(found) < UNIFORM * len(left):
         return {}
+    with_holes = len(windows) * FORGIVEN >= 1  # as one that is a spot has one view against it
+    done = []
     for i in tqdm(found, "masks", unit="image", leave=False, disable=None):
         name = photographs[i].name
-        mask = uniform_mask(read_rgba(scene / name), name)
+        mask = uniform_mask(read_rgba(scene / name), name, with_holes)
         if mask is not None:
             write_png(mask_file(folder, name), mask)
             windows[i].mask = windows[i].reduced(mask) > 127
-    return {"before a uniform background": sum(windows[i].mask is not None for i in found)}
+            done.append(i)
+    if with_holes and done:
+        _close_spots(folder, photographs, windows, done, box)
+    return {"before a uniform background": len(done)}
 
 
-def uniform_mask(image: np.ndarray, name: str) -> np.ndarray | None:
-    """(H, W) uint8 mask of a photograph (H, W, 4), None where its border shows more than one
-    colour.
+def _close_spots(folder, photographs, windows, done, box):
+    """Of the regions in the background's colour that masks enclose, close those behind which the
+    other views see the object: spots on it.
     """
+    hull, _, edge = forgiving_hull([one for one in windows if one.mask is not None], box)
+    for i in done:
+        one, file = windows[i], mask_file(folder, photographs[i].name)
+        regions = label(binary_fill_holes(one.mask) & ~one.mask, connectivity=1)
+        held = silhouette(one, hull, gap_of(one, hull, edge))
+        counts = np.bincount(regions.ravel())
+        spots = np.bincount(regions.ravel(), held.ravel()) > SPOT * counts
+        spots[0] = False
+        if not spots.any():
+            continue
+        closed = dilated(spots[regions], 1)
+        one.mask = one.mask | closed
+        (x0, y0, x1, y1), mask = one.place, read_mask(file)
+        size = x1 - x0, y1 - y0
+        mask[y0:y1, x0:x1][cv2.resize(closed.astype(np.uint8), size) > 0] = 255
+        write_png(file, mask)
+
+
+def uniform_mask(image: np.ndarray, name: str, with_holes: bool = False) -> np.ndarray | None:
+    """(H, W) uint8 mask of a photograph (H, W, 4), None where its border shows more than one
+    colour. with_holes: as cut_out() takes it.
+    """
+    height, width = image.shape[:2]
+    scale = min(1, KEYED_SIDE / max(height, width))
+    size = max(1, round(scale * width)), max(1, round(scale * height))
+    small = image if scale == 1 else cv2.resize(image, size, interpolation=cv2.INTER_AREA)
     try:
-        mask = cut_out(image, name, MaskRule.tolerance)[..., 3]
+        mask = cut_out(small, name, MaskRule.tolerance, with_holes)[..., 3]
     except UserError:
         return None
     border = np.concatenate([mask[0], mask[-1], mask[:, 0], mask[:, -1]])
-    return mask if (border < 128).mean() >= UNIFORM else None
+    return cv2.resize(mask, (width, height)) if (border < 128).mean() >= UNIFORM else None
 
 
 def _is_uniform(window, points):

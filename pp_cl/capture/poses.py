@@ -17,6 +17,7 @@ from pp_cl.scene.distortion import Distortion
 from pp_cl.scene.views import Photograph
 
 LEAST_SHARE = 0.5  # of the images that have a place
+MANY = 0.75  # of the images of a turned object; with fewer they are placed as others are, too
 FEW_FEATURES, FEW_MATCHES = 200, 30
 GROWTH = 1.4  # COLMAP's 1.1 takes twice the time
 CLOSER = 8.0  # degrees between the two images of a turned object that the mapping begins with
@@ -40,6 +41,9 @@ def place(
     least = max(3, LEAST_SHARE * len(taken))
     with atomic_folder(model) as unfinished:
         found = _mapped(database, images, unfinished, len(taken), turns)
+        if turns and all(one.num_reg_images() < MANY * len(taken) for one in found):
+            (usual := unfinished / "usual").mkdir()
+            found += _mapped(database, images, usual, len(taken), False)
         if all(one.num_reg_images() < least for one in found):  # EXIF may be of another size
             (again := unfinished / "again").mkdir()
             copy = Path(shutil.copy(database, again))  # a stopped run finds its own as it was

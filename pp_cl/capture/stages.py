@@ -19,7 +19,6 @@ from pp_cl.files.contact_sheet import contact_sheet
 from pp_cl.files.image import read_rgba, write_png
 from pp_cl.scene.agreement import listing
 from pp_cl.scene.edits import read_edits
-from pp_cl.scene.masks import MaskRule, cut_out
 from pp_cl.scene.outline import SHOWN_SIZE, SHOWN_VIEWS
 from pp_cl.scene.overview import overview
 from pp_cl.scene.readers.common import read_json
@@ -170,8 +169,10 @@ class Capture:
         try:
             with atomic_folder(folder) as unfinished:
                 for name in names:
-                    alpha = cut_out(read_rgba(self.images / name), name, MaskRule.tolerance)[..., 3]
-                    write_png(unfinished / f"{name}.png", alpha)
+                    mask = masks.uniform_mask(read_rgba(self.images / name), name)
+                    if mask is None:
+                        raise UserError(name)
+                    write_png(unfinished / f"{name}.png", mask)
         except UserError:
             return None
         return folder

@@ -14,6 +14,7 @@ from pp_cl.scene.readers.common import mask_names
 
 BORDER_SHARE = 0.5  # of the border's pixels that must have its median colour
 OPAQUE = np.uint8(255)
+HOLE = 5e-5  # of the image, at least
 EDGE = 2.5  # pixels: the lens and its demosaicing mix no further
 
 
@@ -76,14 +77,15 @@ def _with_alpha(image, alpha):
     return image
 
 
-def cut_out(image: np.ndarray, name: str, tolerance: float) -> np.ndarray:
+def cut_out(image: np.ndarray, name: str, tolerance: float, with_holes: bool = False) -> np.ndarray:
     """(H, W, 4) uint8: the image without the uniform background that its border shows.
 
     The background's colour is the median of the border; it is what reaches the border and is no
     further than `tolerance` from it, a distance in CIELAB. Places of that colour which the object
-    encloses are opaque, since nothing tells a hole from a spot. Pixels at the edge are a mixture of
-    the background and of the nearest colour within the object. Raises UserError naming the
-    photograph where its border is of several colours.
+    encloses are opaque, since nothing tells a hole from a spot; with_holes: but for the smallest
+    they are holes. Pixels at the edge are a mixture of the background and of the nearest colour
+    within the object. Raises UserError naming the photograph where its border is of several
+    colours.
     """
     colour = image[..., :3] / 255.0
     behind = np.median(_border(colour), axis=0)
@@ -94,7 +96,7 @@ def cut_out(image: np.ndarray, name: str, tolerance: float) -> np.ndarray:
             f"{name}: only {share:.0%} of its border have one colour, so --mask-from color finds no"
             " background; give masks with --masks FOLDER, or a higher scene.mask_tolerance"
         )
-    outside = _touching_border(distance < tolerance)
+    outside = _regions(distance < tolerance, with_holes)
     within = distance_transform_edt(~outside) > EDGE
     alpha = np.where(outside, 0, np.clip(distance / tolerance - 1, 0, 1))
     alpha[within] = 1
@@ -119,8 +121,13 @@ def _share_of(mixture, front, behind):
     return np.clip(((mixture - behind) * step).sum(-1) / length, 0, 1)
 
 
-def _touching_border(places):
-    """(H, W) bool: the connected regions of `places` that reach the image's border."""
+def _regions(places, with_holes):
+    """(H, W) bool: the connected regions of `places` that reach the image's border, or are large
+    enough for holes.
+    """
     regions = label(places, connectivity=1)
-    reaching = np.unique(np.concatenate([regions[0], regions[-1], regions[:, 0], regions[:, -1]]))
-    return places & np.isin(regions, reaching[reaching > 0])
+    kept = np.concatenate([regions[0], regions[-1], regions[:, 0], regions[:, -1]])
+    if with_holes:
+        large = np.flatnonzero(np.bincount(regions.ravel()) > HOLE * regions.size)
+        kept = np.append(kept, large)
+    return places & np.isin(regions, np.unique(kept[kept > 0]))

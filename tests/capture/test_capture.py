@@ -326,10 +326,10 @@ def test_each_stage_leaves_a_picture(captured):
         assert width >= 1000 and height >= 300
 
 
-def turned(dev, folder, steps):
+def turned(dev, folder, steps, wall=None):
     """Photographs of the demo on a turntable before a wall that stands still, and their masks."""
     true = cameras(SIZE, "turntable")
-    wall = room(true[0])
+    wall = room(true[0]) if wall is None else wall
     for name in ("photographs", "masks"):
         (folder / name).mkdir()
     for i in steps:
@@ -341,11 +341,15 @@ def turned(dev, folder, steps):
     return folder / "photographs", folder / "masks"
 
 
-def test_an_object_that_turns(dev, tmp_path):
-    """It is noticed, and its cameras are found though its pattern is that of other steps, too."""
+@pytest.mark.parametrize("wall", [None, 0.8])
+def test_an_object_that_turns(dev, tmp_path, wall):
+    """Its cameras are found though its pattern is that of other steps, too. It is noticed, but for
+    a uniform wall.
+    """
     scene = tmp_path / "scene"
-    photographs, masks = turned(dev, tmp_path, range(14))
-    assert capture(photographs, scene, "--masks", masks) == (0, [])
+    photographs, masks = turned(dev, tmp_path, range(14), wall)
+    told = ["--turntable"] if wall else []
+    assert capture(photographs, scene, "--masks", masks, *told) == (0, [])
     assert found(scene, "matches")["turns"] and found(scene, "poses")["placed"] == 14
     assert off(scene, cameras(SIZE, "turntable")).position < 0.01
 

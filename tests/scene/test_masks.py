@@ -77,6 +77,7 @@ def test_spots_of_the_backgrounds_colour_stay():
     image = over(alpha, (0.6, 0.1, 0.1), (1, 1, 1))
     image[26:34, 26:34, :3] = 255
     assert (cut_out(image, "a.png", TOLERANCE)[26:34, 26:34, 3] == 255).all()
+    assert (cut_out(image, "a.png", TOLERANCE, with_holes=True)[26:34, 26:34, 3] == 0).all()
 
 
 def test_a_larger_tolerance_takes_more():
