@@ -34,9 +34,9 @@ def place(
     """Write the largest model that the matches give to the new folder `model`.
 
     taken: what take_images() says of the images. turns: the object turns before a camera that
-    stays, and all matches are its own. Returns the numbers of images and points, the
-    reprojection error in pixels, and {image: reason} of those without a place. Raises UserError
-    where more than a half have none.
+    stays, and all matches are its own; where few images fit so, they are placed as usual. Returns
+    the numbers of images and points, the reprojection error in pixels, and {image: reason} of those
+    without a place. Raises UserError where more than a half have none.
     """
     least = max(3, LEAST_SHARE * len(taken))
     with atomic_folder(model) as unfinished:

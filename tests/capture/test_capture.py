@@ -103,6 +103,22 @@ def test_photographs_become_a_scene(captured):
         assert -view.camera.pose[2, 1] > 0  # the image's upper edge is up
 
 
+def test_images_of_which_few_fit_as_of_a_turned_object_they_are_placed_as_usual(
+    captured, tmp_path, monkeypatch
+):
+    """As pairs with few matches are left out there, which may be all between two rounds."""
+    work, mapped = captured / "capture", poses._mapped
+    taken = found(captured, "frames")["images"]
+    monkeypatch.setattr(
+        poses, "_mapped", lambda *given: [] if given[-1] else mapped(*given[:-1], turns=False)
+    )
+    database, images = work / "database.db", captured / "images"
+    placed = poses.place(database, images, tmp_path / "model", taken, turns=True)
+    assert placed["placed"] == COUNT
+    assert {one.name for one in (tmp_path / "model").iterdir()} >= {"cameras.bin", "images.bin"}
+    assert not (tmp_path / "model" / "usual").exists()
+
+
 def test_a_focal_length_that_is_wrong_is_forgotten(captured, tmp_path):
     """That of larger photographs, which EXIF may keep: with it, few images have a place."""
     work = captured / "capture"
