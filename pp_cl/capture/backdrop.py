@@ -69,7 +69,7 @@ def _difference(one, others, background):
         at = other.pixels(places.reshape(-1, 3)).reshape(rows, columns, 2).astype(np.float32) - 0.5
         at = cv2.resize(np.nan_to_num(at, nan=-1e6), (width, height))
         found.append(_levels(one, other, at, ~dilated(other.mask, HIDING)))
-    return _smallest(found, 0.5)
+    return _smallest(found, [0.5])[0]
 
 
 def _difference_of_still(one, others, beside):
@@ -88,7 +88,7 @@ def _difference_of_still(one, others, beside):
     found = [levels for levels, by in zip(found, off, strict=True) if by <= alike]
     if len(found) < LEAST_ALIKE:
         return np.full(beside.shape, UNSEEN, np.uint8)
-    few, some, nearly_all = (_smallest(found, share) for share in SHOWN)
+    few, some, nearly_all = _smallest(found, SHOWN)
     usual, most = (ALIKE * np.median(one[beside]) + SLIGHT for one in (some, nearly_all))
     rarely, always = (few <= usual) & (some > usual), nearly_all <= most
     some[rarely | (always & ~beside)] = UNSEEN
@@ -105,12 +105,12 @@ def _levels(one, other, at, usable):
     return np.where(usable == 255, np.minimum(levels, UNSEEN - 1), np.uint8(UNSEEN))
 
 
-def _smallest(found, share):
-    """(H, W) uint8: the difference that a share of those that are seen do not exceed."""
+def _smallest(found, shares):
+    """(H, W) uint8 each: the difference that a share of those that are seen do not exceed."""
     found = np.sort(np.stack(found, axis=-1), axis=-1)
     seen = (found < UNSEEN).sum(-1, keepdims=True)
-    at = np.maximum(np.ceil(share * seen).astype(int) - 1, 0)
-    return np.take_along_axis(found, at, axis=-1)[..., 0]
+    places = (np.maximum(np.ceil(share * seen).astype(int) - 1, 0) for share in shares)
+    return [np.take_along_axis(found, at, axis=-1)[..., 0] for at in places]
 
 
 def _places_behind(one, background):

@@ -166,43 +166,42 @@ def _uniform(scene, folder, photographs, windows, box, points):
     a mask are. points: (M, 3) of the object that each shows. Returns {what: how many}.
     """
     left = [i for i, one in enumerate(windows) if one.mask is None]
-    found = [i for i in left if _is_uniform(windows[i], points[i])]
+    with_holes = len(windows) * FORGIVEN >= 1  # as one that is a spot has one view against it
+    found = {i: _before_uniform(windows[i], points[i], with_holes) for i in left}
+    found = {i: mask for i, mask in found.items() if mask is not None}
     if len(found) < UNIFORM * len(left):
         return {}
-    with_holes = len(windows) * FORGIVEN >= 1  # as one that is a spot has one view against it
-    done = []
+    for i, mask in found.items():
+        windows[i].mask = mask
+    spots = _spots(windows, found, box) if with_holes and found else {}
     for i in tqdm(found, "masks", unit="image", leave=False, disable=None):
-        name = photographs[i].name
-        mask = uniform_mask(read_rgba(scene / name), name, with_holes)
-        if mask is not None:
-            write_png(mask_file(folder, name), mask)
-            windows[i].mask = windows[i].reduced(mask) > 127
-            done.append(i)
-    if with_holes and done:
-        _close_spots(folder, photographs, windows, done, box)
-    return {"before a uniform background": len(done)}
+        name, one = photographs[i].name, windows[i]
+        mask, one.mask = uniform_mask(read_rgba(scene / name), name, with_holes), None
+        if mask is None:
+            continue
+        if i in spots:
+            x0, y0, x1, y1 = one.place
+            closed = cv2.resize(spots[i].astype(np.uint8), (x1 - x0, y1 - y0)) > 0
+            mask[y0:y1, x0:x1][closed] = 255
+        write_png(mask_file(folder, name), mask)
+        one.mask = one.reduced(mask) > 127
+    return {"before a uniform background": sum(windows[i].mask is not None for i in found)}
 
 
-def _close_spots(folder, photographs, windows, done, box):
-    """Of the regions in the background's colour that masks enclose, close those behind which the
-    other views see the object: spots on it.
+def _spots(windows, numbers, box):
+    """{number of a window: (H, W) bool, the regions in the background's colour that its mask
+    encloses, but behind which the other views see the object}.
     """
     hull, _, edge = forgiving_hull([one for one in windows if one.mask is not None], box)
-    for i in done:
-        one, file = windows[i], mask_file(folder, photographs[i].name)
+    found = {}
+    for i in numbers:
+        one = windows[i]
         regions = label(binary_fill_holes(one.mask) & ~one.mask, connectivity=1)
         held = silhouette(one, hull, gap_of(one, hull, edge))
-        counts = np.bincount(regions.ravel())
-        spots = np.bincount(regions.ravel(), held.ravel()) > SPOT * counts
-        spots[0] = False
-        if not spots.any():
-            continue
-        closed = dilated(spots[regions], 1)
-        one.mask = one.mask | closed
-        (x0, y0, x1, y1), mask = one.place, read_mask(file)
-        size = x1 - x0, y1 - y0
-        mask[y0:y1, x0:x1][cv2.resize(closed.astype(np.uint8), size) > 0] = 255
-        write_png(file, mask)
+        is_spot = np.bincount(regions.ravel(), held.ravel()) > SPOT * np.bincount(regions.ravel())
+        is_spot[0] = False
+        found[i] = dilated(is_spot[regions], 1)
+    return found
 
 
 def uniform_mask(image: np.ndarray, name: str, with_holes: bool = False) -> np.ndarray | None:
@@ -221,14 +220,19 @@ def uniform_mask(image: np.ndarray, name: str, with_holes: bool = False) -> np.n
     return cv2.resize(mask, (width, height)) if (border < 128).mean() >= UNIFORM else None
 
 
-def _is_uniform(window, points):
-    """Whether the background of a window is, and all points of the object stand out from it."""
+def _before_uniform(window, points, with_holes):
+    """(H, W) bool: the mask of a window whose background is uniform, and from which all points
+    (M, 3) of the object stand out; else None.
+    """
     opaque = np.full((*window.image.shape[:2], 1), 255, np.uint8)
-    mask = uniform_mask(np.concatenate([window.image, opaque], axis=2), window.name)
+    image = np.concatenate([window.image, opaque], axis=2)
+    mask = uniform_mask(image, window.name, with_holes)
     if mask is None:
-        return False
+        return None
+    mask = mask > 127
     _, rows, columns = window.inside(points)
-    return bool((mask[rows, columns] > 127).mean() >= ON_MASK) if len(rows) else bool(mask.any())
+    held = mask[rows, columns].mean() if len(rows) else mask.any()
+    return mask if held >= ON_MASK else None
 
 
 def _cut(scene, folder, photographs, windows, box, points, inside, seen, turns):

@@ -14,7 +14,7 @@ from pp_cl.scene.readers.common import mask_names
 
 BORDER_SHARE = 0.5  # of the border's pixels that must have its median colour
 OPAQUE = np.uint8(255)
-HOLE = 5e-5  # of the image, at least
+HOLE = 5e-5  # of the image: smaller regions are none
 EDGE = 2.5  # pixels: the lens and its demosaicing mix no further
 
 
