@@ -26,6 +26,7 @@ PRESETS: dict[str, dict[str, Any]] = {
         "raster.blend": "softmax",
         "raster.footprint": "disc",
         "raster.radius": 0.0015,
+        "raster.early_stop": 0.001,
         "raster.max_tracked": 64,
         "network.widths": (128, 256, 512),
         "network.blocks": "double",

@@ -91,7 +91,7 @@ class RasterConfig:
         2**31 - 1,
     )
     early_stop: float = setting(
-        0.001,
+        0.01,
         "stop blending a pixel once no further hit can weigh more than this share (0: never)",
         0,
         0.5,

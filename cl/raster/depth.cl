@@ -13,7 +13,8 @@ static inline float surface_range(const float range, const float radius, const f
 
 // One work-item per pixel: reads its hits, nearest first, and writes the share of the pixel that is
 // not background, and the depth of that along the camera's axis: the mean by weight, and where half
-// of the weight is reached, which grows evenly from hit to hit.
+// of the weight is reached, which grows evenly from hit to hit. A pixel whose list an early stop has
+// ended is opaque: the dropped hits would let less than the stop pass.
 kernel void depth_forward(
     const uint hw,                             // pixels
     global const float *camera,                // (20) camera.h
@@ -49,7 +50,8 @@ kernel void depth_forward(
         reached += b;
         before = z;
     }
-    pixel_alpha[q] = alpha > 1.0f ? 1.0f : alpha;  // fmin() would hide a NaN
+    const bool stopped = end < pixel_offset[q + 1] && alpha > 0.0f;
+    pixel_alpha[q] = alpha > 1.0f || stopped ? 1.0f : alpha;  // fmin() would hide a NaN
     pixel_depth[q] = alpha > 0.0f ? depth / alpha : INFINITY;
     pixel_median[q] = alpha > 0.0f ? median : INFINITY;
 }

@@ -23,7 +23,7 @@ TRIED = {
     "half": (True,),
     "channels": (0.001, 0.01, 0.1),
     "degree": (1, 0),
-    "early_stop": (0.003, 0.01, 0.03),
+    "early_stop": (0.01, 0.03, 0.1),
 }
 COLUMNS = "{:28} {:>9} {:>9} {:>8} {:>8} {:>7} {:>7}".format
 HEAD = COLUMNS("what", "points", "MiB", "PSNR", "loss", "ms", "speed")

@@ -21,7 +21,7 @@ from pp_cl.scene.views import View, evenly
 TRIALS = (
     (0.2, "half", (True,)),
     (0.5, "channels", (0.001, 0.01, 0.03, 0.1)),
-    (0.6, "early_stop", (0.003, 0.01, 0.03)),
+    (0.6, "early_stop", (0.01, 0.03, 0.1)),
     (0.6, "degree", (1, 0)),
 )
 SMALLER = ("half", "degree")  # these take memory as well

@@ -19,9 +19,9 @@ def depth_forward(
 ) -> tuple[Array, Array, Array]:
     """(alpha, depth, median) of the view that points, pairs and weights belong to, float32 (H, W).
 
-    alpha: share of the pixel that is not background, in [0, 1]. depth: of the surface, along the
-    camera's axis, world units, mean by blend weight; median: where half of the weight is reached,
-    interpolated between hits; both infinite where alpha is 0. size: (H, W).
+    alpha: share of the pixel that is not background, in [0, 1]; 1 after an early stop. depth: of
+    the surface, along the camera's axis, world units, mean by blend weight; median: where half of
+    the weight is reached, interpolated between hits; both infinite where alpha is 0. size: (H, W).
     """
     alpha, depth, median = (dev.empty(size) for _ in range(3))
     dev.program("raster/depth", FOOTPRINT=FOOTPRINTS.index(points.footprint)).launch(

@@ -195,7 +195,8 @@ def _depth(rule: str, dev: Device, rng: np.random.Generator) -> Iterator[Check]:
         z = dense.surface_depth(scene.camera, blended.geometry, blended.radius, kind)
         total = weight.sum(axis=0)
         hit = total > 0
-        yield each(alpha, np.minimum(total, 1), SUMMED, floor=1e-2)
+        stopped = (blended.geometry["hit"] & (blended.role == DROPPED)).any(axis=0)
+        yield each(alpha, np.where(stopped, 1, np.minimum(total, 1)), SUMMED, floor=1e-2)
         yield exact(np.isinf(depth), ~hit)
         mean = (weight * z).sum(axis=0)[hit] / total[hit]
         yield relative(depth[hit], mean, SUMMED)

@@ -61,7 +61,7 @@ def test_a_compressed_run_is_not_tried_again(original, views, monkeypatch):
     small = replace(
         Reduction.of(original.run),
         half=True,
-        early_stop=0.03,
+        early_stop=0.1,
         degree=0,
         channels=0.1,
     )
