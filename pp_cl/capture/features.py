@@ -69,7 +69,10 @@ def find_features(
             missing = [name for name in names if not _has_features(db, known.get(name))]
             bar.update(len(names) - len(missing))
             while missing:
-                some, missing = missing[:AT_ONCE], missing[AT_ONCE:]
+                count = 1 if camera is None else AT_ONCE  # the first makes the camera
+                some, missing = missing[:count], missing[count:]
+                if camera is not None:
+                    _number(colmap, db, some, camera)
                 colmap.extract_features(
                     database,
                     images,
@@ -84,6 +87,21 @@ def find_features(
         return {
             image.name: db.num_keypoints_for_image(image.image_id) for image in db.read_all_images()
         }
+
+
+def _number(colmap, db, names, camera):
+    """Give images their numbers in this order; COLMAP would, as their features happen to be found,
+    and matches and poses depend on them.
+    """
+    rig = db.read_rig_with_sensor(colmap.sensor_t(colmap.SensorType.CAMERA, camera)).rig_id
+    with colmap.DatabaseTransaction(db):
+        for name in names:
+            if not db.exists_image(name):
+                image, frame = colmap.Image(name=name, camera_id=camera), colmap.Frame()
+                image.image_id = db.write_image(image)
+                frame.rig_id = rig
+                frame.add_data_id(image.data_id)
+                db.write_frame(frame)
 
 
 def _camera(one):

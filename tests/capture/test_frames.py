@@ -82,6 +82,20 @@ def test_the_focal_length_of_reduced_photographs(shots, tmp_path):
     assert camera.params == pytest.approx([focal, 32, 32, 0])
 
 
+def test_images_are_numbered_by_name_whichever_is_done_first(tmp_path, rng):
+    """As matches and poses depend on the numbers; the second takes longest."""
+    pytest.importorskip("pycolmap")
+    taken = [{"name": f"{i}.png", "lens": "", "size": (600, 600), "focal": None} for i in range(9)]
+    for i, one in enumerate(taken):
+        values = rng.integers(0, 256, (75, 75), np.uint8) if i == 1 else np.full((75, 75), 100 + i)
+        pixels = np.kron(values, np.ones((8, 8))).astype(np.uint8)
+        Image.fromarray(pixels).save(tmp_path / one["name"])
+    found = find_features(tmp_path / "database.db", tmp_path, taken)
+    assert list(found) == [one["name"] for one in taken] and found["1.png"] > 100
+    with opened(tmp_path / "database.db") as db:
+        assert db.num_frames() == db.num_images() == 9
+
+
 def test_names_that_colmap_can_list(shots, tmp_path):
     """Without spaces or a leading #, each once whatever the case of its letters."""
     pytest.importorskip("pillow_heif")

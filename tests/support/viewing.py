@@ -23,7 +23,7 @@ def asking(camera, **changes):
     """A request for a camera's picture, as the page writes it."""
     facts = camera if isinstance(camera, dict) else frame_keys(camera)
     request = {"number": 1, "kind": "frame", "show": "colour", "draft": False, "camera": facts}
-    return request | {"early_stop": 0.001, "kept": 1, "exposure": 0} | changes
+    return request | {"early_stop": 0.01, "kept": 1, "exposure": 0} | changes
 
 
 def decoded(data):
