@@ -212,9 +212,8 @@ def _relabelled(one, seeds, hull, rejections, edge):
 
 def gap_of(one: Window, hull: np.ndarray, edge: float) -> int:
     """Pixels between the vertices of a hull, (N, 3) with a spacing `edge`, in a window."""
-    return max(
-        1, int(np.ceil(edge * one.camera.fx / np.linalg.norm(hull.mean(0) - one.camera.eye)))
-    )
+    middle = np.linalg.norm(hull.mean(0) - one.camera.eye)
+    return max(1, int(np.ceil(edge * one.camera.fx / middle)))
 
 
 def silhouette(one: Window, hull: np.ndarray, gap: int) -> np.ndarray:

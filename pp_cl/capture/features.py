@@ -69,10 +69,12 @@ def find_features(
             missing = [name for name in names if not _has_features(db, known.get(name))]
             bar.update(len(names) - len(missing))
             while missing:
-                count = 1 if camera is None else AT_ONCE  # the first makes the camera
-                some, missing = missing[:count], missing[count:]
-                if camera is not None:
+                if camera is None:
+                    some = missing[:1]  # makes the camera
+                else:
+                    some = missing[:AT_ONCE]
                     _number(colmap, db, some, camera)
+                missing = missing[len(some) :]
                 colmap.extract_features(
                     database,
                     images,
