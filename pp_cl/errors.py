@@ -25,6 +25,16 @@ class UserError(Exception):
         super().__init__(one_line(message))
 
 
+class Unusable(UserError):
+    """What makes one view of a scene unusable, while the others may do without it. why: in a few
+    words, the same for all views of a kind.
+    """
+
+    def __init__(self, message: str, why: str) -> None:
+        super().__init__(message)
+        self.why = why
+
+
 class Diverged(UserError):
     """A training has come to numbers that are none. The message says where."""
 

@@ -44,11 +44,11 @@ from pp_cl.scene.identity import difference, identity
 from pp_cl.scene.kept import KeptViews
 from pp_cl.scene.load import (
     DEMO,
+    list_split,
     measured_split,
     open_scene,
     preset_downscale,
     scene_box,
-    scene_frames,
 )
 from pp_cl.scene.outline import picture
 from pp_cl.scene.views import View
@@ -283,25 +283,27 @@ def open_training(
     net = UNet.of_settings(dev, config.network, policy, seed=config.train.seed)
     if stored is None:
         begin_network(net, config)
-    photographs = scene_frames(config.scene.path)
+    listing = list_split(config.scene.path)
+    photographs = listing.photographs
     room = Room(goal, net, photographs)
     if stored is None:
         room.check_unseen()
     else:
         grid, points = Grid.of_header(header["grid"]), len(arrays["points.ids"])
         room.check_points(grid, points, header["depth_range"], header["step"])
-    listed, read = {"train": photographs}, KeptViews(folder.views)
-    views = open_scene(dev, config, ("train",), listed=listed, kept=read).splits["train"]
+    listed, read = {"train": listing}, KeptViews(folder.views)
+    scene = open_scene(dev, config, ("train",), listed=listed, kept=read)
+    views = scene.splits["train"]
     measured = []
     if config.train.eval_every:
         split = measured_split(config.scene.path)  # val, else test
         measured = open_scene(dev, config, (split,), most=MEASURED_VIEWS).splits[split]
-    if stored and (mismatch := difference(header, views, views)):
+    if stored and (mismatch := difference(header, photographs, views)):
         raise UserError(
             f"{folder.checkpoint}: belongs to another scene than {config.scene.path} ({mismatch});"
             " use another --out"
         )
-    info = identity(views)
+    info = identity(views, photographs) | ({"notes": scene.notes} if scene.notes else {})
     if stored is None:
         agreement = agreeing(dev, views, scene_box(config))
         trainer, hull = _start(config, agreement, views, net, room)

@@ -2,23 +2,26 @@
 
 import io
 import warnings
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 import numpy as np
-from PIL import Image, UnidentifiedImageError
+from PIL import Image, ImageCms, UnidentifiedImageError
 
-from pp_cl.errors import UserError
+from pp_cl.errors import Unusable, UserError
 from pp_cl.files.atomic import atomic_file
 from pp_cl.files.exr import exr_size, read_exr_rgba
 from pp_cl.files.untrusted import MOST_PIXELS, opened_regular, refusal
 
 # Pillow warns of pixels by the hundred million, and of broken animations, in words of its own
 warnings.filterwarnings("ignore", module=r"PIL\.")
-FORMATS = ("PNG", "JPEG", "WEBP")
-ENDINGS = (".png", ".jpg", ".jpeg", ".webp", ".exr")  # of the files that read_rgba reads
+FORMATS = ("PNG", "JPEG", "WEBP", "TIFF", "BMP", "AVIF")  # JPEG opens MPO, which phones write, too
+# of the files that read_rgba reads, those that may have alpha first
+ENDINGS = (".png", ".webp", ".tif", ".tiff", ".avif", ".jpg", ".jpeg", ".jfif", ".bmp", ".exr")
 # Pillow's names of what converts to RGBA without loss
 EIGHT_BIT_MODES = ("RGBA", "RGB", "LA", "L", "PA", "P", "1")
+PRINTED = ("CMYK", "YCbCr")  # what becomes RGB first
+UNREADABLE = "an image that cannot be read"
 # A mask may have been a JPEG with subsampled colours: means of blocks, of which the shorter side
 # has this many, differ by no more than so many levels between the channels
 COLOUR_SIDE, COLOURLESS = 16, 16
@@ -27,27 +30,58 @@ PNG_SIGNATURE, PNG_DEPTH_BYTE = b"\x89PNG\r\n\x1a\n", 24
 
 
 def read_rgba(path: Path | str) -> np.ndarray:
-    """(H, W, 4) uint8 straight RGBA of an image file; gray and palette colours are expanded, no
-    alpha means 255; OpenEXR as read_exr_rgba has it.
+    """(H, W, 4) uint8 straight sRGB and alpha of an image file; gray and palette colours are
+    expanded, 16 bits a channel become 8, other colour spaces sRGB, no alpha means 255; OpenEXR as
+    read_exr_rgba has it.
 
-    Raises UserError naming a file that is missing, truncated, no image, larger than MOST_PIXELS, or
-    has other than 8 bits a channel.
+    Raises Unusable naming a file that is missing, truncated, no image, larger than MOST_PIXELS, or
+    of another kind of numbers.
     """
     if _is_exr(path):
         return read_exr_rgba(path)
     with _opened(path) as image:
-        _check_depth(path, image)
+        image = _in_srgb(path, image)
         return np.array(image if image.mode == "RGBA" else image.convert("RGBA"))
 
 
-def _check_depth(path, image):
-    """Raise UserError where an opened image has other than 8 bits a channel of gray or RGB."""
-    is_deep = is_deep_png(path)
-    if image.mode not in EIGHT_BIT_MODES or is_deep:
-        found = "16 bits" if is_deep else image.mode
-        raise UserError(
-            f"{path}: not 8 bits a channel of gray or RGB ({found}); convert it to 8-bit RGBA PNG"
+def _in_srgb(path, image):
+    """The opened image in one of EIGHT_BIT_MODES, in sRGB. Raises Unusable."""
+    if image.mode.startswith("I"):  # 16 bits of gray
+        levels = np.array(image)
+        if levels.min() < 0 or levels.max() > 65535:
+            raise Unusable(f"{path}: holds more than 16 bits; write 8", "numbers of another kind")
+        _tell(path, "images of 16 bits a channel are read as 8")
+        return Image.fromarray(((levels.astype(np.uint32) + 128) // 257).astype(np.uint8))
+    if is_deep_png(path):
+        _tell(path, "images of 16 bits a channel are read as 8")
+    if image.mode not in EIGHT_BIT_MODES + PRINTED:
+        raise Unusable(
+            f"{path}: not 8 or 16 bits a channel of gray or RGB ({image.mode}); convert it to 8-bit"
+            " RGBA PNG",
+            "numbers of another kind",
         )
+    if (profile := image.info.get("icc_profile")) and image.mode in ("RGB", "RGBA", "CMYK"):
+        with suppress(ImageCms.PyCMSError, OSError):  # a broken profile is none
+            known = ImageCms.ImageCmsProfile(io.BytesIO(profile))
+            if "srgb" not in ImageCms.getProfileDescription(known).lower():
+                mode = "RGBA" if image.mode == "RGBA" else "RGB"
+                srgb = ImageCms.createProfile("sRGB")
+                image = ImageCms.profileToProfile(image, known, srgb, outputMode=mode)
+                _tell(path, "images with a colour profile of their own are read as sRGB")
+    return image.convert("RGB") if image.mode in PRINTED else image
+
+
+def _tell(path, what):
+    """Warn of what is done to images, once for a folder."""
+    warnings.warn(f"{Path(path).parent}: {what}", stacklevel=3)
+
+
+def has_alpha(path: Path | str) -> bool:
+    """Whether an image file has an alpha channel, or a colour that is transparent."""
+    if _is_exr(path):
+        return True
+    with _opened(path, checked=False) as image:
+        return image.mode in ("RGBA", "LA", "PA") or "transparency" in image.info
 
 
 def read_mask(path: Path | str) -> np.ndarray:
@@ -58,8 +92,7 @@ def read_mask(path: Path | str) -> np.ndarray:
     if _is_exr(path):
         return _mask_of(path, Image.fromarray(read_exr_rgba(path)))
     with _opened(path) as image:
-        _check_depth(path, image)
-        return _mask_of(path, image)
+        return _mask_of(path, _in_srgb(path, image))
 
 
 def _mask_of(path, image):
@@ -105,14 +138,14 @@ def _opened(path, checked=True):
     except UserError:
         raise
     except Image.DecompressionBombError:
-        raise UserError(f"{path}: more than {MOST_PIXELS} pixels; reduce the image") from None
+        text = f"{path}: more than {MOST_PIXELS} pixels; reduce the image"
+        raise Unusable(text, UNREADABLE) from None
     except UnidentifiedImageError:  # by its first bytes, whatever it is called
-        raise UserError(
-            f"{path}: is no {', '.join(FORMATS)}; convert it, or copy it anew"
-        ) from None
+        text = f"{path}: is no {', '.join(FORMATS)}; convert it, or copy it anew"
+        raise Unusable(text, UNREADABLE) from None
     # decoders meet broken bytes with whatever comes up: OSError, SyntaxError, struct.error
     except Exception as error:
-        raise refusal(path, error, ", ".join(FORMATS)) from error
+        raise Unusable(str(refusal(path, error, ", ".join(FORMATS))), UNREADABLE) from error
 
 
 def is_deep_png(path: Path | str) -> bool:

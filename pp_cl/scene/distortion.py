@@ -19,8 +19,8 @@ ROWS_PROBED = 9  # of a band, to find the rows of the photograph that it shows
 
 @dataclass(frozen=True)
 class Distortion:
-    """Coefficients of OpenCV's models: radial (k1, k2, k3) and tangential (p1, p2) of a perspective
-    lens, k1 to k4 of a fisheye.
+    """Coefficients of OpenCV's models: radial (k1, k2, k3, over k4, k5, k6) and tangential (p1, p2)
+    of a perspective lens, k1 to k4 of a fisheye.
     """
 
     k1: float = 0.0
@@ -29,6 +29,8 @@ class Distortion:
     p2: float = 0.0
     k3: float = 0.0
     k4: float = 0.0
+    k5: float = 0.0
+    k6: float = 0.0
     fisheye: bool = False
 
     def __bool__(self) -> bool:
@@ -46,6 +48,7 @@ class Distortion:
         xx, yy, xy = x * x, y * y, x * y
         r2 = xx + yy
         radial = 1 + r2 * (self.k1 + r2 * (self.k2 + r2 * self.k3))
+        radial = radial / (1 + r2 * (self.k4 + r2 * (self.k5 + r2 * self.k6)))
         return (
             x * radial + 2 * self.p1 * xy + self.p2 * (r2 + 2 * xx),
             y * radial + self.p1 * (r2 + 2 * yy) + 2 * self.p2 * xy,

@@ -28,15 +28,15 @@ def pixel_digest(image: np.ndarray, distortion: Distortion = STRAIGHT) -> str:
     return digest.hexdigest()[:DIGITS]
 
 
-def identity(views: Sequence[View]) -> dict[str, Any]:
+def identity(views: Sequence[View], listed: Sequence[View | Photograph]) -> dict[str, Any]:
     """{"scene": digest of the names and cameras, "pixels": {name: digest} of the views, None where
     the program makes them, "views": for kept_views()}: what the header of a checkpoint holds of its
-    training views.
+    training views. listed: those that the scene lists, of which some could not be read.
     """
     made = any(view.digest is None for view in views)
     pixels = None if made else {view.name: view.digest for view in views}
     kept = [[view.name, packed_camera(view.file_camera, view.depth_range)] for view in views]
-    return {"scene": fingerprint(views), "pixels": pixels, "views": kept}
+    return {"scene": fingerprint(listed), "pixels": pixels, "views": kept}
 
 
 def packed_camera(camera: Camera, depth_range: tuple[float, float] | None = None) -> str:

@@ -8,10 +8,12 @@ import os
 import warnings
 from collections.abc import Iterable, Mapping, Sequence, Set
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from threading import Lock
 from types import ModuleType
+from typing import NamedTuple
 
 import numpy as np
 from tqdm import tqdm
@@ -19,8 +21,8 @@ from tqdm import tqdm
 from pp_cl.config import Config
 from pp_cl.device.device import Device
 from pp_cl.device.discover import open_device
-from pp_cl.errors import UserError, quoted
-from pp_cl.files.image import ENDINGS, read_rgba
+from pp_cl.errors import Unusable, UserError, quoted
+from pp_cl.files.image import ENDINGS, has_alpha, read_rgba
 from pp_cl.presets import IMAGE_SIZES
 from pp_cl.scene import demo
 from pp_cl.scene.distortion import BAND_BYTES, undistort
@@ -30,6 +32,7 @@ from pp_cl.scene.identity import pixel_digest
 from pp_cl.scene.kept import KeptViews
 from pp_cl.scene.masks import AS_GIVEN, MaskRule, cut_out
 from pp_cl.scene.readers import co3d, colmap, llff, neus, nsvf, transforms
+from pp_cl.scene.readers.found import Notes, find_masks
 from pp_cl.scene.views import (
     MIN_SIDE,
     Photograph,
@@ -58,9 +61,15 @@ READING_BYTES = 3 * 2**28  # of the photographs that are read side by side
 LEAST_FOCAL, MOST_FOCAL = 1e-2, 1e7  # pixels; docs/scenes.md says what is measured
 
 INVERTED = 0.95  # of the border of an image: hardly any object ends inside and holds so much
+LEAST_VIEWS = 8  # for training that are left where some are left out
 NEARBY = 100  # entries of a folder without a scene in which one is looked for
 
-Listed = Mapping[str, Sequence[Photograph]]  # photographs by the name of their split
+
+class Listing(NamedTuple):
+    """The photographs of a split, and a line for each kind of thing that was done to use them."""
+
+    photographs: list[Photograph]
+    notes: list[str]
 
 
 @dataclass(frozen=True)
@@ -68,12 +77,14 @@ class Scene:
     """Views of one object.
 
     folder: None for a scene that the program makes itself. splits: views by split name ("train",
-    "val", "test"). Either all views have a depth range or none has.
+    "val", "test"). Either all views have a depth range or none has. notes: a line for each kind of
+    thing that was done to use them, such as views that were left out.
     """
 
     name: str
     folder: Path | None
     splits: dict[str, list[View]]
+    notes: Sequence[str] = ()
 
     def reduced(self, downscale: int) -> "Scene":
         """The same scene, its images reduced `downscale` times. Raises UserError as View.reduced
@@ -91,7 +102,7 @@ def open_scene(
     config: Config,
     splits: tuple[str, ...],
     most: int | None = None,
-    listed: Listed | None = None,
+    listed: Mapping[str, Listing] | None = None,
     kept: KeptViews | None = None,
 ) -> Scene:
     """Scene of config.scene.path with the given splits, reduced config.scene.downscale times;
@@ -177,42 +188,79 @@ def scene_splits(path: Path | str) -> list[str]:
 def scene_frames(
     path: str | Path, split: str = "train", *, edited: bool = True
 ) -> list[Photograph]:
+    """list_split()'s photographs; what it notes becomes warnings."""
+    photographs, notes = list_split(path, split, edited=edited)
+    _warn(path, split, notes)
+    return photographs
+
+
+def _warn(path, split, notes):
+    for line in notes:
+        warnings.warn(f"{path}: {split}: {line}", stacklevel=3)
+
+
+def list_split(path: str | Path, split: str = "train", *, edited: bool = True) -> Listing:
     """The photographs of a split, without their pixels; edited: but for those that the user has
-    dropped. Raises UserError where there are none, and for a camera that shows nothing in float32.
+    dropped. Those that cannot be used are left out. Raises UserError where there are none, where
+    too few are left (Notes.check), and for a camera that shows nothing in float32.
     """
     if path == DEMO:
-        return demo.demo_frames(split)
-    folder, reader = Path(path), find_reader(path)
+        return Listing(demo.demo_frames(split), [])
+    folder, reader, notes = Path(path), find_reader(path), Notes()
     present = reader.splits(folder)
     if split not in present:
         raise UserError(f"{folder}: no split {split}; its splits are {', '.join(present)}")
-    photographs = reader.read_split(folder, split)
+    photographs = reader.read_split(folder, split, notes)
     dropped: Set[str] = frozenset()
     if edited:
         dropped = read_edits(folder).dropped
         photographs = [one for one in photographs if one.name not in dropped]
     if not photographs:
+        notes.check(0)
         lacks = f"; {EDITS} drops some" if dropped else ""
         raise UserError(f"{folder}: split {split} has no photographs{lacks}; add some")
-    for one in photographs:
-        _check_lens(folder / one.name, one)
-    return photographs
+    lensed = notes.usable(photographs, lambda one: _checked(folder, one), lambda one: one.name)
+    photographs = list(lensed)
+    notes.check(len(photographs), LEAST_VIEWS if split == "train" else 1)
+    photographs = _masked(folder, reader, photographs, notes)
+    return Listing(photographs, notes.lines(len(photographs)))
 
 
-def _check_lens(image, photograph):
-    camera = photograph.camera
+def _masked(folder, reader, photographs, notes):
+    """The photographs, with the masks of a folder of masks where the format names none; images of a
+    transforms.json have their own alpha, if they have one.
+    """
+    if any(one.mask for one in photographs):
+        return photographs
+    if reader is transforms and has_alpha(folder / photographs[0].name):
+        return photographs
+    masks = find_masks(folder, [one.name for one in photographs])
+    if not masks:
+        return photographs
+    if reader is transforms:
+        place = PurePosixPath(next(iter(masks.values()))).parts[0]
+        notes.done[f"masks are taken from {folder / place}, which no frame names"] = list(masks)
+    return [replace(one, mask=masks.get(one.name)) for one in photographs]
+
+
+def _checked(folder, photograph):
+    """The photograph. Raises UserError for a camera that shows nothing in float32, Unusable where
+    its distortion folds.
+    """
+    image, camera = folder / photograph.name, photograph.camera
     focal, middle = (camera.fx, camera.fy), (camera.cx, camera.cy)
     if not LEAST_FOCAL <= min(focal) <= max(focal) <= MOST_FOCAL:
         what, least = f"focal lengths of {focal[0]:.3g} and {focal[1]:.3g}", LEAST_FOCAL
     elif not -MOST_FOCAL <= min(middle) <= max(middle) <= MOST_FOCAL:
         what, least = f"its principal point at {middle[0]:.3g}, {middle[1]:.3g}", -MOST_FOCAL
     elif photograph.distortion.folds(camera):
-        raise UserError(
+        raise Unusable(
             f"{image}: its distortion coefficients fold the image over; correct them, or undistort"
-            " the images with the program that found them"
+            " the images with the program that found them",
+            "distortion that folds",
         )
     else:
-        return
+        return photograph
     raise UserError(
         f"{image}: its camera has {what} pixels, which must be {least:g} to {MOST_FOCAL:g}; correct"
         " the scene's file of cameras"
@@ -289,7 +337,7 @@ def load_scene(
     masks: MaskRule = AS_GIVEN,
     *,
     downscale: int | None = None,
-    listed: Listed | None = None,
+    listed: Mapping[str, Listing] | None = None,
     dev: Device | None = None,
     kept: KeptViews | None = None,
 ) -> Scene:
@@ -297,14 +345,18 @@ def load_scene(
 
     most: views to read of each split, spread evenly; None: all. downscale: how many times its
     images are reduced, those of a large scene in part while they are read; None: as they are
-    stored. listed: what scene_frames() gave of some splits, so that their files are not read again.
+    stored. listed: what list_split() gave of some splits, so that their files are not read again.
     dev: where distortion is removed; the default device is opened for it where none is given.
     kept: where images that are reduced while they are read are looked for first. Raises UserError
     naming the file, and the key where there is one, for whatever is missing, broken or
     contradictory.
     """
-    folder, listed = Path(path), listed or {}
-    chosen = {s: evenly(listed.get(s) or scene_frames(folder, s), most) for s in splits}
+    folder, listed, lines = Path(path), listed or {}, []
+    chosen = {}
+    for split in splits:
+        listing = listed.get(split) or list_split(folder, split)
+        chosen[split] = evenly(listing.photographs, most)
+        lines += [f"{split}: {line}" for line in listing.notes]
     photographs = [one for some in chosen.values() for one in some]
     _check_alike(folder, photographs)
     if downscale:
@@ -321,12 +373,17 @@ def load_scene(
         bar = tqdm(
             found, "reading images", len(photographs), unit="image", leave=False, disable=None
         )
-        views = iter(list(bar))
-    scene = Scene(
-        folder.resolve().name,
-        folder,
-        {split: [next(views) for _ in some] for split, some in chosen.items()},
-    )
+        found = iter(list(bar))
+    read, is_some = {}, masks.source == "given" and any(one.mask for one in photographs)
+    for split, some in chosen.items():
+        notes = Notes()
+        pairs = [(folder, one, next(found), is_some) for one in some]
+        read[split] = list(notes.usable(pairs, lambda all: _usable(*all), lambda all: all[1].name))
+        notes.check(len(read[split]), LEAST_VIEWS if split == "train" and most is None else 1)
+        lines += [f"{split}: {line}" for line in notes.lines(len(read[split]))]
+    for line in lines:
+        warnings.warn(f"{folder}: {line}", stacklevel=2)
+    scene = Scene(folder.resolve().name, folder, read, lines)
     return scene.reduced(downscale // factor) if downscale else scene
 
 
@@ -360,25 +417,52 @@ def _check_alike(folder, photographs):
             )
 
 
+def _usable(folder, photograph, view, is_some):
+    """The view of a photograph that was read. is_some: others have masks. Raises Unusable."""
+    if isinstance(view, Unusable):
+        raise view
+    if is_some and photograph.mask is None:
+        image = folder / photograph.name
+        raise Unusable(f"{image}: has no mask, as others have; add it, or remove all", "no mask")
+    return view
+
+
+@contextmanager
+def _unusable(why):
+    """A UserError in the block becomes an Unusable."""
+    try:
+        yield
+    except UserError as error:
+        raise Unusable(str(error), why) from error
+
+
 def _read_view(dev, lock, folder, photograph, masks, factor, kept):
-    """The View of a photograph, with its mask, free of distortion and reduced `factor` times. lock:
-    held by the one of several threads that uses the device. Raises UserError.
+    """The View of a photograph, with its mask, free of distortion and reduced `factor` times; the
+    error of a view that cannot be used. lock: held by the one of several threads that uses the
+    device.
     """
     file, camera, lens = folder / photograph.name, photograph.camera, photograph.distortion
-    mask = masks.file(photograph.name, photograph.mask and folder / photograph.mask)
-    found = kept and factor > 1 and kept.find(photograph, [file, mask], (masks, factor))
-    if found:
-        image, digest = found
-    else:
-        image = masks.apply(read_rgba(file), mask)
-        digest = pixel_digest(image, lens)
-        if lens:
-            with lock:
-                image = undistort(dev, image, camera, lens, factor)
+    try:
+        with _unusable("no mask"):
+            mask = masks.file(photograph.name, photograph.mask and folder / photograph.mask)
+        found = kept and factor > 1 and kept.find(photograph, [file, mask], (masks, factor))
+        if found:
+            image, digest = found
         else:
-            image = shrink(image, factor)
-        if masks.is_by_colour:
-            image = cut_out(image, photograph.name, masks.tolerance)
+            image = read_rgba(file)
+            with _unusable("a mask that cannot be used"):
+                image = masks.apply(image, mask)
+            digest = pixel_digest(image, lens)
+            if lens:
+                with lock:
+                    image = undistort(dev, image, camera, lens, factor)
+            else:
+                image = shrink(image, factor)
+            if masks.is_by_colour:
+                with _unusable("no uniform background"):
+                    image = cut_out(image, photograph.name, masks.tolerance)
+    except Unusable as error:
+        return error
     view = View(
         photograph.name,
         camera.downscaled(factor) if factor > 1 else camera,

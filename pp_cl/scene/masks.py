@@ -1,16 +1,18 @@
 """The mask of a photograph: from a file, from its alpha, from a uniform background, or none."""
 
+import warnings
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 
 import numpy as np
+from PIL import Image
 from scipy.ndimage import distance_transform_edt
 from skimage.color import rgb2lab
 from skimage.measure import label
 
 from pp_cl.errors import UserError
 from pp_cl.files.image import read_mask
-from pp_cl.scene.readers.common import mask_names
+from pp_cl.scene.readers.found import mask_names
 
 BORDER_SHARE = 0.5  # of the border's pixels that must have its median colour
 OPAQUE = 255
@@ -54,12 +56,7 @@ class MaskRule:
         """
         if mask is not None:
             alpha = read_mask(mask)
-            if alpha.shape != image.shape[:2]:
-                sizes = "{1}x{0} pixels, but its image has {3}x{2}".format(
-                    *alpha.shape, *image.shape
-                )
-                raise UserError(f"{mask}: {sizes}; make it the image's size")
-            image[..., 3] = alpha
+            image[..., 3] = _of_size(alpha, image.shape[1::-1], mask)
         elif self.source in ("box", "none"):
             image[..., 3] = OPAQUE
         return image
@@ -78,6 +75,22 @@ def named_mask(folder: Path, *names: str) -> Path:
                 return folder / given
     usual = PurePosixPath(names[0]).stem
     raise UserError(f"{folder}: no mask for {names[0]}; add {usual}.png, white where the object is")
+
+
+def _of_size(alpha, size, file):
+    """A mask resized to an image of (width, height) pixels, whose shape it must have but for
+    rounding. Raises UserError.
+    """
+    height, width = alpha.shape
+    if size == (width, height):
+        return alpha
+    if abs(size[0] * height - size[1] * width) > max(width, height):
+        raise UserError(
+            f"{file}: {width}x{height} pixels, but its image has {size[0]}x{size[1]}; make it the"
+            " image's size"
+        )
+    warnings.warn(f"{file.parent}: masks are resized to their images", stacklevel=2)
+    return np.array(Image.fromarray(alpha).resize(size, Image.Resampling.BILINEAR))
 
 
 def cut_out(image: np.ndarray, name: str, tolerance: float, with_holes: bool = False) -> np.ndarray:

@@ -11,7 +11,8 @@ from plyfile import PlyData
 from pp_cl.errors import UserError
 from pp_cl.files.untrusted import opened_regular, refusal
 from pp_cl.scene.readers import colmap, transforms
-from pp_cl.scene.readers.common import MOST, fail_at, find_image, read_json
+from pp_cl.scene.readers.common import MOST, fail_at, read_json
+from pp_cl.scene.readers.found import find_image
 
 MOST_POINTS = 2**20  # that are read
 MOST_PLY = 2**28  # bytes

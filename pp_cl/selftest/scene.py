@@ -22,6 +22,7 @@ ROUNDED = 0.5 + 0.05  # levels: to 8 bits; and 1e-4 pixels, of a place in float3
 LENSES = (
     Distortion(-0.15, 0.04, 0.004, -0.003, 0.01),
     Distortion(k1=0.3),
+    Distortion(k1=0.5, k2=0.1, k4=0.4, k5=0.05, k6=-0.01),
     Distortion(0.04, -0.02, 0.0, 0.0, 0.01, -0.004, fisheye=True),
 )
 DEMO = 2e-6  # distances of up to 2, by some ten roundings

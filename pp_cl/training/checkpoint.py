@@ -27,7 +27,7 @@ LEAST_LENGTH, MOST_LENGTH = 1e-30, 1e30  # world units; float32 would hold no pr
 LEAST_SHARE = 1e-6  # of far, between it and near: float32 would hold them as one
 MOST_TEXT = 1000
 DIGEST = re.compile(f"[0-9a-f]{{{DIGITS}}}")
-OPTIONAL = {"format", "tuning", "extended_from", "exposed", "left_out"}  # keys of a header
+OPTIONAL = {"format", "tuning", "extended_from", "exposed", "left_out", "notes"}  # keys of a header
 GRID = ("origin", "edge", "dims")
 
 
@@ -76,6 +76,8 @@ class StoredRun:
             )
         if "exposed" in header:
             rules["exposed"] = (lambda x: x is True, "true")
+        if "notes" in header:
+            rules["notes"] = (_are_texts, "lines of text")
         if "left_out" in header:
             rules["left_out"] = (
                 lambda x: _are_some(x, kept_views(header["views"])),  # which is checked before
@@ -212,6 +214,12 @@ def _are_some(names, views):
         isinstance(names, list)
         and all(type(name) is str for name in names)
         and 0 < len(set(names) & known) == len(names) < len(known)
+    )
+
+
+def _are_texts(lines):
+    return isinstance(lines, list) and all(
+        type(line) is str and len(line) <= MOST_TEXT for line in lines
     )
 
 

@@ -6,9 +6,9 @@ import zlib
 
 import numpy as np
 import pytest
-from PIL import Image
+from PIL import Image, ImageCms
 
-from pp_cl.errors import UserError
+from pp_cl.errors import Unusable, UserError
 from pp_cl.files.image import image_size, read_mask, read_rgba, to_8bit, write_png
 
 
@@ -83,16 +83,35 @@ def test_colour_noise_and_coloured_rims_are_no_colours(tmp_path, rng):
         read_mask(tmp_path / "a.png")
 
 
-def test_sixteen_bits_are_refused(tmp_path, rgba):
-    Image.fromarray(rgba[..., 0].astype(np.uint16) * 257).save(tmp_path / "gray.png")
+def test_sixteen_bits_become_eight(tmp_path, rgba):
+    Image.fromarray(rgba[..., 0].astype(np.uint16) * 257 + 128).save(tmp_path / "gray.png")
+    with pytest.warns(UserWarning, match="16 bits a channel are read as 8"):
+        assert np.array_equal(read_rgba(tmp_path / "gray.png")[..., 1], rgba[..., 0])
+    Image.fromarray(rgba[..., 0].astype(np.float32)).save(tmp_path / "float.tif")
+    with pytest.raises(Unusable, match=r"float\.tif: not 8 or 16 bits a channel"):
+        read_rgba(tmp_path / "float.tif")
+
+
+def test_colours_of_other_spaces_become_srgb(tmp_path):
+    """A colour with a wide profile is brighter in sRGB; what prints is made of four inks."""
+    wide = ImageCms.ImageCmsProfile(ImageCms.createProfile("sRGB")).tobytes()
+    image = Image.new("RGB", (40, 30), (200, 90, 60))
+    image.save(tmp_path / "srgb.jpg", icc_profile=wide, quality=95, subsampling=0)
+    assert np.abs(read_rgba(tmp_path / "srgb.jpg")[..., :3].astype(int) - (200, 90, 60)).max() <= 2
+    image.convert("CMYK").save(tmp_path / "inks.jpg", quality=95)
+    assert np.abs(read_rgba(tmp_path / "inks.jpg")[..., :3].astype(int) - (200, 90, 60)).max() <= 4
+    image.save(tmp_path / "broken.png", icc_profile=b"no profile")
+    assert (read_rgba(tmp_path / "broken.png")[..., :3] == (200, 90, 60)).all()
+
+
+def test_sixteen_bits_of_a_damaged_header_are_no_image(tmp_path, rgba):
     Image.fromarray(rgba).save(tmp_path / "rgba.png")
     content = bytearray((tmp_path / "rgba.png").read_bytes())
     content[24] = 16  # bits a channel; the header chunk ends with its CRC
     content[29:33] = zlib.crc32(content[12:29]).to_bytes(4, "big")
     (tmp_path / "rgba.png").write_bytes(content)
-    for name in ("gray", "rgba"):
-        with pytest.raises(UserError, match=rf"{name}\.png: not 8 bits a channel.*convert"):
-            read_rgba(tmp_path / f"{name}.png")
+    with pytest.raises(UserError, match=r"rgba\.png: cannot be read"):
+        read_rgba(tmp_path / "rgba.png")
 
 
 def test_a_checksum_that_is_wrong_is_refused(tmp_path):
@@ -136,9 +155,9 @@ def test_a_pipe_is_not_waited_for(tmp_path, read, name):
 def test_not_an_image(tmp_path, read):
     (tmp_path / "text.png").write_text("not an image")
     (tmp_path / "empty.png").touch()
-    Image.new("RGB", (5, 7)).save(tmp_path / "a.tif")
-    with pytest.raises(UserError, match=r"a\.tif: is no PNG, JPEG, WEBP; convert it"):
-        read(tmp_path / "a.tif")
+    Image.new("RGB", (5, 7)).save(tmp_path / "a.gif")
+    with pytest.raises(UserError, match=r"a\.gif: is no PNG, JPEG, WEBP, .*; convert it"):
+        read(tmp_path / "a.gif")
     for path in (tmp_path, *(tmp_path / f"{name}.png" for name in ("text", "empty", "none"))):
         with pytest.raises(UserError) as caught:
             read(path)

@@ -40,7 +40,7 @@ def test_a_digest_is_that_of_the_pixels(folder):
 
 
 def test_the_same_scene_elsewhere_and_in_other_files(folder):
-    views, header = views_of(folder), identity(views_of(folder))
+    views, header = views_of(folder), identity(views_of(folder), views_of(folder))
     assert header["pixels"] == {view.name: view.digest for view in views}
     assert header["scene"] == fingerprint(views) == fingerprint(scene_frames(str(folder)))
     Image.open(folder / "train/r_1.png").save(folder / "train/r_1.png", compress_level=0)
@@ -53,7 +53,7 @@ def test_names_cameras_and_depth_ranges_come_back_to_the_bit(folder):
     views = [replace(view, depth_range=None) for view in views_of(folder)]
     views[1] = replace(views[1], depth_range=(0.1, 7.3))
     listed[1] = replace(listed[1], depth_range=(0.1, 7.3))
-    kept = kept_views(json.loads(json.dumps(identity(views)["views"])))
+    kept = kept_views(json.loads(json.dumps(identity(views, views)["views"])))
     for one, photograph in zip(kept, listed, strict=True):
         assert np.array_equal(one.camera.pose, photograph.camera.pose)
         lens = [replace(p, camera=replace(p.camera, pose=None)) for p in (one, photograph)]
@@ -62,7 +62,7 @@ def test_names_cameras_and_depth_ranges_come_back_to_the_bit(folder):
 
 @pytest.mark.parametrize("channel", [0, 3], ids=["colour", "mask"])
 def test_other_pixels_are_named(folder, channel):
-    header = identity(views_of(folder))
+    header = identity(views_of(folder), views_of(folder))
     repaint(folder / "train/r_1.png", channel)
     views = views_of(folder)
     assert difference(header, views, views).startswith("train/r_1.png: other pixels")
@@ -79,7 +79,7 @@ def test_masks_of_their_own_belong_to_the_pixels(folder, tmp_path):
         mask[:, : 4 + i] = 0
         Image.fromarray(mask).save(tmp_path / "masks" / f"r_{i}.png")
     rule = MaskRule(folder=str(tmp_path / "masks"))
-    header = identity(views_of(folder, masks=rule))
+    header = identity(views_of(folder, masks=rule), views_of(folder))
     pixels = np.array(Image.open(tmp_path / "masks/r_2.png"))
     Image.fromarray(255 - pixels).save(tmp_path / "masks/r_2.png")
     views = views_of(folder, masks=rule)
@@ -88,7 +88,7 @@ def test_masks_of_their_own_belong_to_the_pixels(folder, tmp_path):
 
 def test_other_cameras_and_names_are_told(folder):
     views = views_of(folder)
-    header = identity(views)
+    header = identity(views, views)
     told = "its training views have other names or cameras"
     assert difference(header, views[1:], []) == told
     assert difference(header, [replace(views[0], name="train/x.png"), *views[1:]], []) == told
@@ -99,7 +99,7 @@ def test_other_cameras_and_names_are_told(folder):
 def test_views_that_the_program_makes_have_no_digests(folder):
     views = views_of(folder)
     made = [replace(view, digest=None) for view in views]
-    header = identity(made)
+    header = identity(made, made)
     assert header["scene"] == fingerprint(views) and header["pixels"] is None
     assert difference(header, made, made) == ""
     assert difference(header, views, views) == ""

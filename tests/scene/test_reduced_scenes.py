@@ -93,9 +93,9 @@ def test_a_large_scene_is_kept_reduced_and_stays_itself(dev, scene, monkeypatch)
         assert same(view.file_camera, before.stored_camera)
         assert before.file_camera is before.stored_camera
         assert view.digest == hashlib.sha256(pixels.tobytes()).hexdigest()[:16]
-    assert identity(views) == identity(whole)
+    assert identity(views, views) == identity(whole, whole)
     assert fingerprint(views) == fingerprint(scene_frames(scene))
-    header = identity(whole)
+    header = identity(whole, whole)
     assert difference(header, scene_frames(scene), views) == ""
     moved = views[0].moved((1, 2, 3))
     assert same(moved.file_camera, whole[0].moved((1, 2, 3)).stored_camera)

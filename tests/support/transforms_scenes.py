@@ -1,6 +1,7 @@
 """Scenes in the format of NeRF-synthetic, with random images, right and wrong ones."""
 
 import json
+import os
 
 import numpy as np
 import pytest
@@ -46,7 +47,8 @@ def train_views(folder, **keys):
 
 def escape(file):
     """Move a file out of its scene's folder and leave a symbolic link to it."""
-    outside = file.parents[2] / f"outside-{file.name}"
+    above = file.parents[2]
+    outside = above / f"outside-{len(os.listdir(above))}{file.suffix}"
     file.rename(outside)
     file.symlink_to(outside)
 

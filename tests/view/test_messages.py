@@ -9,6 +9,7 @@ from support.scenes import ring_cameras
 from support.viewing import asking
 
 from pp_cl.errors import UserError
+from pp_cl.scene.readers.found import Notes
 from pp_cl.scene.readers.frame import frame_keys
 from pp_cl.scene.readers.transforms import read_split
 from pp_cl.view.messages import RANGES, packed, read_request
@@ -30,7 +31,7 @@ def test_a_copied_camera_is_a_frame_of_a_transforms_file(tmp_path):
     Image.new("RGBA", (48, 40)).save(tmp_path / "a.png")
     frame = frame_keys(CAMERA) | {"file_path": "a.png"}
     (tmp_path / "transforms_train.json").write_text(json.dumps({"frames": [frame]}))
-    [photograph] = read_split(tmp_path, "train")
+    [photograph] = read_split(tmp_path, "train", Notes())
     camera = photograph.camera
     np.testing.assert_allclose(camera.pose, CAMERA.pose, atol=1e-12)
     assert (camera.fx, camera.fy, camera.cx, camera.cy) == (CAMERA.fx, 61.0, 20.5, CAMERA.cy)

@@ -20,11 +20,11 @@ from pp_cl.scene.camera import Camera
 from pp_cl.scene.readers.common import (
     MOST,
     SPLITS,
-    find_image,
     hold_out,
     listing,
     read_json,
 )
+from pp_cl.scene.readers.found import Notes, find_image
 from pp_cl.scene.readers.frame import Frame, rigid
 from pp_cl.scene.views import Photograph
 
@@ -53,7 +53,7 @@ def splits(folder: Path) -> list[str]:
     return sorted(listed) if listed else SPLITS
 
 
-def read_split(folder: Path, split: str) -> list[Photograph]:
+def read_split(folder: Path, split: str, notes: Notes) -> list[Photograph]:
     """The photographs of a split, in the order of their frame numbers.
 
     Version 1: frames that set_lists.json calls known are for training, unseen ones for testing.
@@ -76,7 +76,11 @@ def read_split(folder: Path, split: str) -> list[Photograph]:
         chosen = hold_out(chosen, split)
     else:
         chosen = [frame for frame in chosen if _path(frame, "image") in listed[split]]
-    return [_photograph(folder, frame) for frame in listing(chosen)]
+    return list(
+        notes.usable(
+            listing(chosen), partial(_photograph, folder), lambda one: f"frame {one.index}"
+        )
+    )
 
 
 def _whole(folder):
@@ -177,7 +181,7 @@ def _found(folder, frame, key):
     path, fail = PurePosixPath(_path(frame, key)), partial(frame.error, key)
     if path.parts[:2] != (folder.parent.name, folder.name):
         raise fail(f"{str(path)!r} is not in {folder.parent.name}/{folder.name}; move it there")
-    return find_image(folder, PurePosixPath(*path.parts[2:]).as_posix(), fail)
+    return find_image(folder, PurePosixPath(*path.parts[2:]).as_posix(), fail, kind=key)
 
 
 def _camera(frame, size):

@@ -8,9 +8,9 @@ over, since they are nearly all of a file.
 import os
 import struct
 import unicodedata
-import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path, PurePosixPath
 from typing import NamedTuple
 
@@ -26,17 +26,17 @@ from pp_cl.scene.readers.common import (
     MOST,
     SPLITS,
     fail_at,
-    find_image,
-    find_mask,
     fitted,
     hold_out,
     listing,
 )
+from pp_cl.scene.readers.found import Notes, find_image
 from pp_cl.scene.views import Photograph
 
 FILES = "a sparse model of COLMAP beside images"
-PLACES = ("sparse/0", "sparse", "colmap/sparse/0", ".")
-IMAGES, MASKS = "images", "masks"
+# and in numbered folders in them; the folder itself has the model of RealityScan
+PLACES = ("sparse", "colmap/sparse", "dense/sparse", "dense/0/sparse", ".")
+IMAGES = "images"
 
 # number of parameters of every model of COLMAP that has a focal length, in the order of their ids
 MODELS = {
@@ -63,7 +63,7 @@ ONE_FOCAL = (
     *("SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL"),
     *("SIMPLE_FISHEYE", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE"),
 )
-TWO_FOCALS = ("PINHOLE", "OPENCV", "FISHEYE", "OPENCV_FISHEYE")
+TWO_FOCALS = ("PINHOLE", "OPENCV", "FULL_OPENCV", "FISHEYE", "OPENCV_FISHEYE")
 MOST_PIXELS = 2**20  # a side; beyond it a number is no size
 MOST_ENTRIES = 2**17  # of a file, cameras or images
 MOST_NAME = 1024  # bytes of an image's name
@@ -101,35 +101,34 @@ def splits(folder: Path) -> list[str]:
     return SPLITS
 
 
-def read_split(folder: Path, split: str) -> list[Photograph]:
+def read_split(folder: Path, split: str, notes: Notes) -> list[Photograph]:
     """The photographs of a split: test is every eighth in the order of their names.
 
-    Where images were reduced or enlarged after COLMAP saw them, their cameras are scaled to them;
-    images that are gone are left out with a warning. An image's mask is masks/NAME.png, as COLMAP
-    has it, or masks/NAME with any ending of an image; with a folder of masks, every image needs
-    one. Raises UserError naming the file, and the image.
+    Where images were reduced or enlarged after COLMAP saw them, their cameras are scaled to them.
+    Raises UserError naming the file, and the image.
     """
     model = model_folder(folder) or folder
     lenses, images = read_model(model)
     ordered = sorted(images, key=lambda image: image.name)
-    there = {one.name for one in images if os.path.isfile(folder / IMAGES / one.name)}
-    if there and (gone := [one.name for one in ordered if one.name not in there]):
-        warnings.warn(
-            f"{folder / IMAGES}: {len(gone)} of the {len(images)} images of {model} are not there,"
-            f" {gone[0]!r} among them; they are left out",
-            stacklevel=2,
-        )
-    return [
-        _photograph(folder, model, image, lenses[image.camera])
-        for image in listing(hold_out(ordered, split))
-        if image.name in there or not there
-    ]
+    read = partial(_photograph, folder, model, lenses)
+    return list(notes.usable(listing(hold_out(ordered, split)), read, lambda one: one.name))
 
 
 def model_folder(folder: Path) -> Path | None:
-    """Where a scene's model lies; None where it has none."""
-    places = (folder / place for place in PLACES)
-    return next((place for place in places if _suffix(place)), None)
+    """Where a scene's model lies, of several that with most images; None where it has none."""
+    places = [folder / place for place in PLACES]
+    several = [near for place in places[:-1] for near in sorted(place.glob("[0-9]*"))]
+    models = [place for place in (*several, *places) if _suffix(place)]
+    return max(models, key=_count, default=None) if len(models) > 1 else next(iter(models), None)
+
+
+def _count(model):
+    """How many images a model has, by its header or its lines."""
+    file = model / f"images{_suffix(model)}"
+    with file.open("rb") as opened:
+        if file.suffix == ".bin":
+            return int.from_bytes(opened.read(8), "little")
+        return sum(not line.startswith(b"#") for line in opened) // 2
 
 
 def _suffix(folder):
@@ -140,17 +139,16 @@ def _suffix(folder):
     return None
 
 
-def _photograph(folder, model, image, lens):
+def _photograph(folder, model, lenses, image):
     fail = fail_at(model, image.name)
-    name = find_image(folder, f"{IMAGES}/{image.name}", fail)
+    name, lens = find_image(folder, f"{IMAGES}/{image.name}", fail), lenses[image.camera]
     fx, fy, cx, cy, distortion = _intrinsics(folder, model, lens)
     w, x, y, z = image.rotation
     rotation = Rotation.from_quat([x, y, z, w]).as_matrix().T
     pose = np.column_stack([rotation, -rotation @ image.translation])
     camera = Camera(pose, fx, fy, cx, cy, lens.width, lens.height)
     camera = fitted(camera, image_size(folder / name), fail)
-    mask = find_mask(folder, MASKS, image.name, fail)
-    return Photograph(name, camera, mask=mask, distortion=distortion)
+    return Photograph(name, camera, distortion=distortion)
 
 
 def _intrinsics(folder, model, lens):
@@ -163,7 +161,8 @@ def _intrinsics(folder, model, lens):
         )
     p = lens.parameters if lens.model in TWO_FOCALS else (lens.parameters[0], *lens.parameters)
     is_fisheye = lens.model.endswith("FISHEYE")
-    names = ("k1", "k2", "k3", "k4") if is_fisheye else ("k1", "k2", "p1", "p2")
+    perspective = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
+    names = ("k1", "k2", "k3", "k4") if is_fisheye else perspective
     coefficients = dict(zip(names, p[4:], strict=False))
     return *p[:4], Distortion(**coefficients, fisheye=is_fisheye)
 

@@ -1,13 +1,12 @@
-"""What readers share: images and masks that files name, numbers in files of JSON, of numpy and of
-text, and the splits of formats that know none.
+"""What readers share: folders of images, numbers in files of JSON, of numpy and of text, and the
+splits of formats that know none.
 """
 
 import json
 import math
-import os
 import zipfile
-from collections.abc import Callable, Iterable, Sequence
-from pathlib import Path, PurePosixPath
+from collections.abc import Iterable, Sequence
+from pathlib import Path
 from typing import Any, TypeVar
 
 import numpy as np
@@ -18,6 +17,7 @@ from pp_cl.files.checkpoint import opened_zip
 from pp_cl.files.image import ENDINGS
 from pp_cl.files.untrusted import opened_regular, read_json_text, read_regular, refusal
 from pp_cl.scene.camera import Camera
+from pp_cl.scene.readers.found import Fail
 
 HELD_OUT = 8  # one photograph of so many, the first among them, as LLFF and 3DGS do
 SPLITS = ["test", "train"]  # of a format that knows none
@@ -25,11 +25,9 @@ MOST_JSON = 2**26  # bytes of a JSON file: 100,000 frames of 670
 MOST_ARRAYS = 2**25  # bytes of all arrays of a file, as float64: 100,000 cameras need 25 million
 MOST_TEXT = 2**20  # bytes of a file with the numbers of one camera
 MOST = 1e30  # larger numbers are refused: float32 could not hold their products
-CASED_ENDINGS = [cased for ending in ENDINGS for cased in (ending, ending.upper())]
 KINDS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)  # of numpy's savez and savez_compressed
 
 Item = TypeVar("Item")
-Fail = Callable[[str], UserError]  # makes the error that names the file and the key
 
 
 # Splits -------------------------------------------------------------------------------------------
@@ -46,32 +44,7 @@ def listing(items: Sequence[Item]) -> Iterable[Item]:
     return tqdm(items, "listing", unit="image", leave=False, disable=None, delay=2)
 
 
-# Images and masks ---------------------------------------------------------------------------------
-
-
-def find_image(folder: Path, given: str, fail: Fail, endings: Sequence[str] = ("",)) -> str:
-    """Path relative to the scene's folder of the image that a file there calls `given`, with the
-    first of the endings that exists; as Windows writes paths, too.
-
-    Raises fail(text) for a path that leaves the folder, by a symbolic link or otherwise, and for
-    one where no image is.
-    """
-    try:
-        root = os.path.realpath(folder)
-        for form in (given, given.replace("\\", "/")):
-            for ending in endings:
-                path = os.path.realpath(os.path.join(root, form + ending))
-                if os.path.commonpath([root, path]) != root:
-                    raise fail(
-                        f"{given[:80]!r} leaves the scene's folder; copy the image into it and"
-                        " write its path from there"
-                    )
-                if os.path.isfile(path):
-                    return os.path.relpath(path, root).replace(os.sep, "/")
-    except (OSError, ValueError) as error:  # a name too long, a zero byte
-        raise fail(f"{given[:80]!r} is not a usable path ({error})") from error
-    bare = ", with or without the ending of an image" * (len(endings) > 1)
-    raise fail(f"no image at {given[:80]!r}{bare}; copy it there or remove the frame")
+# Images -------------------------------------------------------------------------------------------
 
 
 def first_folder(folder: Path, names: Sequence[str]) -> str:
@@ -90,34 +63,7 @@ def folder_images(folder: Path, name: str) -> list[str]:
     ]
     if not found:
         raise UserError(f"{folder / name}: no images in it; copy them there")
-    fail = fail_at(folder / name)
-    return [find_image(folder, f"{name}/{image}", fail) for image in found]
-
-
-def mask_names(image: str) -> list[str]:
-    """What the mask of an image may be called in a folder of masks, as programs write them: its
-    path there with .png added, or its stem, maybe with _mask behind or mask_ before it, with the
-    ending of any image.
-    """
-    path = PurePosixPath(image)
-    stems = (path.stem, f"{path.stem}_mask", f"mask_{path.stem}")
-    names = (f"{stem}{ending}" for stem in stems for ending in CASED_ENDINGS)
-    return [f"{image}.png", *(str(path.with_name(name)) for name in names)]
-
-
-def find_mask(folder: Path, masks: str, image: str, fail: Fail) -> str | None:
-    """Path relative to the scene's folder of the mask of an image in its folder `masks`; None where
-    there is no such folder. image: relative to the folder of images. Raises fail(text) for a mask
-    that is missing, or lies elsewhere.
-    """
-    if not (folder / masks).is_dir():
-        return None
-    for name in mask_names(image):
-        # a name that is too long with .png is no file, where Path.is_file raises
-        if os.path.isfile(folder / masks / name):
-            return find_image(folder, f"{masks}/{name}", fail)
-    usual = PurePosixPath(image).with_suffix(".png")
-    raise fail(f"no mask {masks}/{image}.png or {masks}/{usual}; add one, or remove {masks}")
+    return [f"{name}/{image}" for image in found]
 
 
 def fail_at(*place: object) -> Fail:

@@ -10,10 +10,11 @@ from typing import Any
 
 import numpy as np
 
-from pp_cl.errors import UserError, quoted
+from pp_cl.errors import Unusable, UserError, quoted
 from pp_cl.scene.camera import Camera
 from pp_cl.scene.distortion import Distortion
-from pp_cl.scene.readers.common import MOST, Fail, find_image, numbers
+from pp_cl.scene.readers.common import MOST, numbers
+from pp_cl.scene.readers.found import Fail, find_image
 
 # values of camera_model: perspective lenses, and fisheyes
 PINHOLES = ("PERSPECTIVE", "PINHOLE", "SIMPLE_PINHOLE", "OPENCV", "SIMPLE_RADIAL", "RADIAL")
@@ -87,7 +88,8 @@ class Frame:
             return None
         if not isinstance(given, str) or not given:
             raise self.error(key, "must be the path of an image")
-        return find_image(folder, given, partial(self.error, key), endings)
+        kind = "mask" if key == "mask_path" else "image"
+        return find_image(folder, given, partial(self.error, key), endings, kind)
 
 
 def frame_keys(camera: Camera) -> dict[str, Any]:
@@ -152,22 +154,28 @@ def distortion(frame: Frame) -> Distortion:
 
 
 def rigid(value: Any, fail: Fail) -> np.ndarray:
-    """(3, 4) float64 pose of a 4x4 or 3x4 matrix, its rotation made orthonormal. Raises fail(text)
-    where it holds no rotation and place.
+    """(3, 4) float64 pose of a 4x4 or 3x4 matrix, its rotation made orthonormal, free of a scale
+    that is the same along all axes. Raises Unusable with the text of fail() where it holds no
+    rotation and place.
     """
+
+    def unusable(text):
+        return Unusable(str(fail(text)), "no pose")
+
     matrix = numbers(value)
     if matrix is None:
-        raise fail("must be 4x4 or 3x4 numbers")
+        raise unusable("must be 4x4 or 3x4 numbers")
     if matrix.shape not in ((4, 4), (3, 4)):
-        raise fail(f"has shape {matrix.shape}; must be 4x4 or 3x4 numbers")
+        raise unusable(f"has shape {matrix.shape}; must be 4x4 or 3x4 numbers")
     if not (np.abs(matrix) < MOST).all():
-        raise fail("holds NaN, Inf or a huge number; must be a camera-to-world matrix")
+        raise unusable("holds NaN, Inf or a huge number; must be a camera-to-world matrix")
     if np.abs(matrix[3:] - [0, 0, 0, 1]).max(initial=0) > 1e-6:
-        raise fail(f"its last row is {matrix[3].tolist()}; must be [0, 0, 0, 1]")
+        raise unusable(f"its last row is {matrix[3].tolist()}; must be [0, 0, 0, 1]")
     u, scale, vt = np.linalg.svd(matrix[:3, :3])
-    if np.abs(scale**2 - 1).max() > ROTATION_TOLERANCE or np.linalg.det(u @ vt) < 0:
-        raise fail(
+    alike = np.abs((scale / max(scale.mean(), 1 / MOST)) ** 2 - 1).max() <= ROTATION_TOLERANCE
+    if not alike or np.linalg.det(u @ vt) < 0:
+        raise unusable(
             f"its 3x3 part is no rotation (scales {scale.round(4).tolist()}, "
-            f"determinant {np.linalg.det(matrix[:3, :3]):.4f}); remove scale, shear and mirroring",
+            f"determinant {np.linalg.det(matrix[:3, :3]):.4f}); remove shear and mirroring",
         )
     return np.hstack([u @ vt, matrix[:3, 3:]])

@@ -1,26 +1,27 @@
-"""Reader of scenes as LLFF has them: poses_bounds.npy beside images/, and masks/ for objects."""
+"""Reader of scenes as LLFF has them: poses_bounds.npy beside images/."""
 
 from pathlib import Path
 
 import numpy as np
 
-from pp_cl.errors import UserError
+from pp_cl.errors import Unusable, UserError
 from pp_cl.files.image import image_size
 from pp_cl.scene.camera import Camera
 from pp_cl.scene.readers.common import (
     SPLITS,
     fail_at,
-    find_mask,
+    first_folder,
     fitted,
     folder_images,
     hold_out,
     read_npy,
 )
+from pp_cl.scene.readers.found import IMAGE_FOLDERS, Notes, numbered
 from pp_cl.scene.readers.frame import rigid
 from pp_cl.scene.views import Photograph
 
 FILES = "poses_bounds.npy (LLFF)"
-IMAGES, MASKS, POSES = "images", "masks", "poses_bounds.npy"
+POSES = "poses_bounds.npy"
 NUMBERS = 17  # 3x4 pose, (height, width, focal length) as its fifth column; near, far
 # LLFF: down, right, backwards; OpenCV: right, down, forwards
 LLFF_FROM_CV = np.array([[0, 1, 0], [1, 0, 0], [0, 0, -1]])
@@ -36,27 +37,31 @@ def splits(folder: Path) -> list[str]:
     return SPLITS
 
 
-def read_split(folder: Path, split: str) -> list[Photograph]:
+def read_split(folder: Path, split: str, notes: Notes) -> list[Photograph]:
     """The photographs of a split, in the order of their names.
 
     Where the images are smaller or larger than the poses say, the focal length is scaled. Near and
-    far bound all that was photographed, not the object, and are left out. Raises UserError naming
-    the file and the image.
+    far bound all that was photographed, not the object, and are left out. Where images are gone,
+    the numbers in the names of the others tell their poses. Raises UserError naming the file and
+    the image.
     """
-    file, names = folder / POSES, folder_images(folder, IMAGES)
-    rows = read_npy(file)
-    if rows.shape != (len(names), NUMBERS):
+    file, images = folder / POSES, first_folder(folder, IMAGE_FOLDERS)
+    names, rows = folder_images(folder, images), read_npy(file)
+    count = rows.shape[0] if rows.ndim == 2 and rows.shape[1] == NUMBERS else 0
+    if (places := numbered(names, count)) is None:
         raise UserError(
-            f"{file}: has shape {rows.shape}, but {IMAGES}/ has {len(names)} images; must be"
+            f"{file}: has shape {rows.shape}, but {images}/ has {len(names)} images; must be"
             f" {len(names)}x{NUMBERS} numbers; remove the images without a pose, or find poses anew"
         )
-    read = []
-    for index, name in hold_out(list(enumerate(names)), split):
+
+    def read(index):
+        if index not in places:
+            raise Unusable(f"{file}: row {index}: its image is gone from {images}", "no image")
+        size, name = image_size(folder / places[index]), places[index]
         fail = fail_at(file, f"row {index}")
-        camera = _camera(rows[index, :15].reshape(3, 5), image_size(folder / name), fail)
-        mask = find_mask(folder, MASKS, Path(name).name, fail_at(folder / name))
-        read.append(Photograph(name, camera, mask=mask))
-    return read
+        return Photograph(name, _camera(rows[index, :15].reshape(3, 5), size, fail))
+
+    return list(notes.usable(hold_out(range(count), split), read, "row {}".format))
 
 
 def _camera(matrix, size, fail):

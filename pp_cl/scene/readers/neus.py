@@ -1,6 +1,5 @@
 """Reader of scenes as IDR and NeuS have them, DTU among them: cameras_sphere.npz or cameras.npz
-with world_mat_i = K [R | t], images in image/ (or images/), masks in mask/ (or masks/), all in the
-order of their names.
+with world_mat_i = K [R | t], images in image/ (or images/) in the order of their names.
 """
 
 import re
@@ -9,7 +8,7 @@ from pathlib import Path
 import numpy as np
 from scipy.linalg import rq
 
-from pp_cl.errors import UserError
+from pp_cl.errors import Unusable, UserError
 from pp_cl.files.image import image_size
 from pp_cl.scene.camera import Camera
 from pp_cl.scene.readers.common import (
@@ -20,11 +19,12 @@ from pp_cl.scene.readers.common import (
     hold_out,
     read_npz,
 )
+from pp_cl.scene.readers.found import Notes, numbered
 from pp_cl.scene.views import Photograph
 
 FILES = "cameras_sphere.npz (NeuS, DTU)"
 CAMERAS = ("cameras_sphere.npz", "cameras.npz")
-IMAGES, MASKS = ("image", "images"), ("mask", "masks")
+IMAGES = ("image", "images")
 MOST_SKEW = 1e-3  # pixels of shear over the image; more is no camera of ours
 
 
@@ -38,7 +38,7 @@ def splits(folder: Path) -> list[str]:
     return SPLITS
 
 
-def read_split(folder: Path, split: str) -> list[Photograph]:
+def read_split(folder: Path, split: str, notes: Notes) -> list[Photograph]:
     """The photographs of a split: test is every eighth in the order of the images' names.
 
     The world is that of world_mat, in its own units. scale_mat, where it is there, moves the unit
@@ -50,24 +50,25 @@ def read_split(folder: Path, split: str) -> list[Photograph]:
     images = first_folder(folder, IMAGES)
     names = folder_images(folder, images)
     count = sum(re.fullmatch(r"world_mat_\d+", key) is not None for key in cameras)
-    if count != len(names):
+    if (places := numbered(names, count)) is None:
         raise UserError(
             f"{file}: has {count} world_mat_i, but {images}/ has {len(names)} images; copy both"
             " anew"
         )
-    masks = _masks(folder, names)
-    read = []
-    for index, name in hold_out(list(enumerate(names)), split):
-        key = f"world_mat_{index}"
+
+    def read(index):
+        key, scale = f"world_mat_{index}", f"scale_mat_{index}"
         if key not in cameras:
             raise UserError(f"{file}: {key}: is missing; number the cameras from 0 on")
-        camera = _camera(cameras[key], image_size(folder / name), fail_at(file, key))
-        key = f"scale_mat_{index}"
-        depth_range = None
-        if key in scales:
-            depth_range = _depth_range(scales[key], camera, fail_at(file, key))
-        read.append(Photograph(name, camera, depth_range, masks[index]))
-    return read
+        if index not in places:
+            raise Unusable(f"{file}: {key}: its image is gone from {images}", "no image")
+        size = image_size(folder / places[index])
+        camera, depth_range = _camera(cameras[key], size, fail_at(file, key)), None
+        if scale in scales:
+            depth_range = _depth_range(scales[scale], camera, fail_at(file, scale))
+        return Photograph(places[index], camera, depth_range)
+
+    return list(notes.usable(hold_out(range(count), split), read, "world_mat_{}".format))
 
 
 def box(folder: Path) -> np.ndarray | None:
@@ -85,29 +86,6 @@ def box(folder: Path) -> np.ndarray | None:
 
 def _file(folder):
     return next((folder / name for name in CAMERAS if (folder / name).is_file()), None)
-
-
-def _masks(folder, names):
-    """The mask of each image, None where there is no folder of masks. The order pairs them, since
-    DTU has image/000000.png and mask/000.png. Raises UserError for numbers that do not agree.
-    """
-    place = first_folder(folder, MASKS)
-    if not (folder / place).is_dir():
-        return [None] * len(names)
-    masks = folder_images(folder, place)
-    if len(masks) != len(names):
-        raise UserError(
-            f"{folder / place}: has {len(masks)} masks for {len(names)} images; add the missing"
-            " ones, or remove the folder"
-        )
-    for name, mask in zip(names, masks, strict=True):
-        stems = [Path(path).stem for path in (name, mask)]
-        if all(stem.isdecimal() for stem in stems) and int(stems[0]) != int(stems[1]):
-            raise UserError(
-                f"{folder / mask}: is the mask of {name} in the order of the names; give masks the"
-                " numbers of their images"
-            )
-    return masks
 
 
 def _camera(matrix, size, fail):

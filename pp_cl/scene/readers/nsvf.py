@@ -7,10 +7,11 @@ from pathlib import Path
 
 import numpy as np
 
-from pp_cl.errors import UserError
+from pp_cl.errors import Unusable, UserError
 from pp_cl.files.image import image_size
 from pp_cl.scene.camera import Camera
 from pp_cl.scene.readers.common import fail_at, fitted, folder_images, read_numbers
+from pp_cl.scene.readers.found import Notes
 from pp_cl.scene.readers.frame import rigid
 from pp_cl.scene.views import Photograph
 
@@ -33,7 +34,7 @@ def splits(folder: Path) -> list[str]:
     return sorted(_names(folder))
 
 
-def read_split(folder: Path, split: str) -> list[Photograph]:
+def read_split(folder: Path, split: str, notes: Notes) -> list[Photograph]:
     """The photographs of a split, in the order of their names. Poses are camera-to-world with
     OpenCV's axes; near and far are Euclidean distances. Raises UserError naming the file.
     """
@@ -41,12 +42,13 @@ def read_split(folder: Path, split: str) -> list[Photograph]:
     file = folder / INTRINSICS
     (fx, fy, cx, cy), stated = _lens(file)
     depth_range = _depth_range(folder / "near_and_far.txt")
-    read = []
-    for name in names[split]:
+
+    def read(name):
         pose, size = _pose(folder / POSES / f"{Path(name).stem}.txt"), image_size(folder / name)
         camera = Camera(pose, fx, fy, cx, cy, *(stated or size))
-        read.append(Photograph(name, fitted(camera, size, fail_at(file)), depth_range))
-    return read
+        return Photograph(name, fitted(camera, size, fail_at(file)), depth_range)
+
+    return list(notes.usable(names[split], read, str))
 
 
 def _names(folder):
@@ -68,6 +70,8 @@ def _names(folder):
 
 def _pose(file):
     """(3, 4) of a file of 4x4 numbers."""
+    if not file.exists():
+        raise Unusable(f"{file}: no such file; copy it there", "no pose")
     rows = read_numbers(file)
     if [len(row) for row in rows] != [4] * 4:
         raise UserError(f"{file}: must be 4x4 numbers, a camera-to-world matrix")

@@ -9,11 +9,10 @@ from pathlib import Path, PurePosixPath
 
 import numpy as np
 
-from pp_cl.errors import UserError
+from pp_cl.errors import Unusable, UserError
 from pp_cl.files.atomic import atomic_folder, write_json
 from pp_cl.files.image import image_size, write_png
 from pp_cl.scene.readers.common import (
-    CASED_ENDINGS,
     SPLITS,
     checked_box,
     fail_at,
@@ -22,6 +21,7 @@ from pp_cl.scene.readers.common import (
     listing,
     read_json,
 )
+from pp_cl.scene.readers.found import CASED_ENDINGS, Notes
 from pp_cl.scene.readers.frame import Frame, distortion, frame_keys, pinhole
 from pp_cl.scene.views import Photograph, View
 
@@ -44,7 +44,7 @@ def splits(folder: Path) -> list[str]:
     return sorted(listed) or SPLITS
 
 
-def read_split(folder: Path, split: str) -> list[Photograph]:
+def read_split(folder: Path, split: str, notes: Notes) -> list[Photograph]:
     """The photographs of transforms_<split>.json; or those of transforms.json that its
     <split>_filenames names, and where it has no such lists every eighth for test, the others for
     train.
@@ -54,13 +54,20 @@ def read_split(folder: Path, split: str) -> list[Photograph]:
     file = folder / (f"transforms_{split}.json" if _split_files(folder) else SINGLE)
     data, read = _read(file), {}
     for index, own in enumerate(listing(data["frames"])):
-        frame = Frame(file, data, own, index)
-        photograph = _read_frame(folder, frame)
-        if photograph.name in read:
-            raise frame.error("file_path", f"{photograph.name!r} stands there twice; remove one")
-        read[photograph.name] = photograph
-    frames = list(read.values())
-    return _of_split(file, data, frames, split) if file.name == SINGLE else frames
+        frame, one = Frame(file, data, own, index), None
+        name = given = _plain(str(frame.get("file_path")))
+        try:
+            one = _read_frame(folder, frame)
+            name = one.name
+        except Unusable as error:
+            one = error
+        if name in read:
+            raise frame.error("file_path", f"{name!r} stands there twice; remove one")
+        read[name] = given, one
+    chosen = list(read)
+    if file.name == SINGLE:
+        chosen = _of_split(file, data, {name: given for name, (given, _) in read.items()}, split)
+    return list(notes.usable(chosen, lambda name: _usable(read[name][1]), str))
 
 
 def box(folder: Path) -> np.ndarray | None:
@@ -92,22 +99,32 @@ def _read(file):
     return data
 
 
-def _of_split(file, data, photographs, split):
-    """Those of a transforms.json's photographs that belong to a split, in the order of their
-    names.
+def _plain(path):
+    return PurePosixPath(path.replace("\\", "/")).as_posix()
+
+
+def _usable(found):
+    if isinstance(found, Unusable):
+        raise found
+    return found
+
+
+def _of_split(file, data, given, split):
+    """Those of a transforms.json's names, {name: as its frame has it}, that belong to a split, in
+    their order.
     """
-    ordered = sorted(photographs, key=lambda photograph: photograph.name)
+    ordered = sorted(given)
     names = data.get(f"{split}_filenames")
     if names is None:
         return hold_out(ordered, split)
     if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
         raise UserError(f"{file}: {split}_filenames: must be a list of images' paths")
-    wanted = {PurePosixPath(name.replace("\\", "/")).as_posix() for name in names}
-    missing = wanted - {photograph.name for photograph in ordered}
+    wanted = set(map(_plain, names))
+    missing = wanted - {*ordered, *given.values()}
     if missing or not wanted:
         what = f"{min(missing)!r} is the path of no frame" if missing else "is empty"
         raise UserError(f"{file}: {split}_filenames: {what}; list images of the frames")
-    return [photograph for photograph in ordered if photograph.name in wanted]
+    return [name for name in ordered if wanted & {name, given[name]}]
 
 
 def _read_frame(folder, frame):

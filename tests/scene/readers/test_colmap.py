@@ -12,7 +12,9 @@ from support.transforms_scenes import refused
 
 from pp_cl.files.image import write_png
 from pp_cl.scene.distortion import Distortion
+from pp_cl.scene.load import scene_frames
 from pp_cl.scene.readers.colmap import read_model, read_split
+from pp_cl.scene.readers.found import Notes
 from tools.capture_demo import align, cameras
 from tools.scene_formats import colmap
 
@@ -66,7 +68,7 @@ def test_a_projection_by_hand(tmp_path):
     half = np.sqrt(0.5)
     (tmp_path / "cameras.txt").write_text("# c\n7 OPENCV 30 22 40 41 14 12 .1 .01 .002 -.003\n")
     (tmp_path / "images.txt").write_text(f"1 {half} 0 0 {half} 1 2 5 7 sub/a b.png\n1 2 -1\n")
-    [photograph] = read_split(tmp_path, "test")
+    [photograph] = read_split(tmp_path, "test", Notes())
     camera, d = photograph.camera, photograph.distortion
     point = np.array([0.3, -0.2, 0.7])
     expected = np.array([0.2 + 1, 0.3 + 2, 0.7 + 5])  # (x, y) -> (-y, x), then t
@@ -95,7 +97,7 @@ def test_a_projection_by_hand(tmp_path):
 )
 def test_models(text, line, focal, distortion):
     edit(text, "cameras.txt", lambda lines: [f"{i + 1} {line}" for i in range(11)])
-    for photograph in read_split(text, "train"):
+    for photograph in read_split(text, "train", Notes()):
         camera = photograph.camera
         assert (camera.fx, camera.fy) == focal and photograph.distortion == distortion
         assert (camera.cx, camera.cy) == (15, 11)
@@ -109,7 +111,7 @@ def test_a_model_that_colmap_wrote(tmp_path, form):
     numbers = (0, 9, 20, 31, 42, 53)
     for i in numbers:
         write_png(tmp_path / "images" / f"{i:03d}.png", np.zeros((400, 400)))
-    found = [one for split in ("test", "train") for one in read_split(tmp_path, split)]
+    found = [one for split in ("test", "train") for one in read_split(tmp_path, split, Notes())]
     assert [one.name for one in found] == [f"images/{i:03d}.png" for i in numbers]
     for one in found:
         camera, k1 = one.camera, -0.0025245658661648311
@@ -123,17 +125,17 @@ def test_a_model_that_colmap_wrote(tmp_path, form):
 def test_binary_goes_before_text(binary):
     for name in ("cameras", "images"):
         (binary / "sparse" / "0" / f"{name}.txt").write_text("no model")
-    assert len(read_split(binary, "train")) == 9
+    assert len(read_split(binary, "train", Notes())) == 9
 
 
 def test_text_as_other_programs_write_it(text):
     """A byte order mark, CR LF, empty lines and comments before an image, 2D points."""
-    before = read_split(text, "train")
+    before = read_split(text, "train", Notes())
     for name in ("cameras.txt", "images.txt"):
         file = text / "sparse" / "0" / name
         lines = file.read_text().replace(".png\n\n", ".png\n1.5 2 -1 3 4.5 17\n\n# next\n\n")
         file.write_bytes(b"\xef\xbb\xbf" + lines.replace("\n", "\r\n").encode())
-    for got, expected in zip(read_split(text, "train"), before, strict=True):
+    for got, expected in zip(read_split(text, "train", Notes()), before, strict=True):
         assert got.name == expected.name and np.array_equal(got.camera.pose, expected.camera.pose)
 
 
@@ -143,7 +145,7 @@ def test_images_that_were_reduced(written):
     for file in (folder / "images").iterdir():
         write_png(file, np.zeros((SIZE[1] // 2, SIZE[0] // 2)))
     for split, expected in splits.items():
-        for got, view in zip(read_split(folder, split), expected, strict=True):
+        for got, view in zip(read_split(folder, split, Notes()), expected, strict=True):
             half = view.stored_camera.downscaled(2)
             np.testing.assert_allclose(got.camera.packed((1, 2)), half.packed((1, 2)), atol=1e-5)
 
@@ -151,10 +153,10 @@ def test_images_that_were_reduced(written):
 def test_images_that_are_gone(written):
     """They are left out, the others keep their splits; where all are, one line says so."""
     folder, _ = written
-    before = [one.name for one in read_split(folder, "train")]
+    before = [one.name for one in read_split(folder, "train", Notes())]
     (folder / before[2]).unlink()
-    with pytest.warns(UserWarning, match=f"1 of the 11 images .*{Path(before[2]).name}"):
-        assert [one.name for one in read_split(folder, "train")] == before[:2] + before[3:]
+    with pytest.warns(UserWarning, match="1 of 9 views left out: no image .000003.png"):
+        assert [one.name for one in scene_frames(folder)] == before[:2] + before[3:]
     shutil.rmtree(folder / "images")
     refused(folder, "no image at 'images/000001.png'")
 
@@ -226,9 +228,39 @@ def test_bad_text(text, case):
 
 
 def test_other_models_are_named_with_the_command_that_converts_them(text):
+    edit(text, "cameras.txt", replaced(1, "FOV"))
+    edit(text, "cameras.txt", second(lambda w: [*w, "0.1"]))
+    refused(text, "FOV", "colmap image_undistorter", f"--image_path {text / 'images'}")
+
+
+def test_the_rational_model_of_opencv(text):
     edit(text, "cameras.txt", replaced(1, "FULL_OPENCV"))
-    edit(text, "cameras.txt", second(lambda w: [*w, *8 * "0"]))
-    refused(text, "FULL_OPENCV", "colmap image_undistorter", f"--image_path {text / 'images'}")
+    edit(text, "cameras.txt", second(lambda w: [*w, *"12345678"]))
+    [lens] = {one.distortion for one in read_split(text, "train", Notes()) if one.distortion}
+    assert lens == Distortion(k1=1, k2=2, p1=3, p2=4, k3=5, k4=6, k5=7, k6=8)
+
+
+def test_of_several_models_the_largest_is_read(written, tmp_path):
+    """As COLMAP leaves sparse/0 with two images where the rest is in sparse/1."""
+    folder, _ = written
+    (folder / "sparse/0").rename(folder / "sparse/3")
+    for kind in ("cameras", "images"):
+        for file in (folder / "sparse/3").glob(f"{kind}.*"):
+            (folder / "sparse/0").mkdir(exist_ok=True)
+            content = file.read_bytes()
+            if file.name == "images.txt":
+                content = b"\n".join(content.split(b"\n")[:8]) + b"\n"
+            elif file.name == "images.bin":
+                content = (1).to_bytes(8, "little") + content[8 : 8 + 64 + len("000000.png") + 9]
+            (folder / "sparse/0" / file.name).write_bytes(content)
+    assert len(scene_frames(folder)) == 9
+
+
+def test_a_model_beside_its_images_as_realityscan_writes_it(text):
+    for file in (*(text / "images").iterdir(), *(text / "sparse/0").iterdir()):
+        file.rename(text / file.name)
+    names = [one.name for one in scene_frames(text)]
+    assert len(names) == 9 and names[0] == "000001.png"
 
 
 def test_models_of_later_versions_are_named(binary):

@@ -2,27 +2,29 @@
 programs, all read without trust.
 """
 
+import shutil
 import zipfile
+from pathlib import Path
 
 import numpy as np
 import pytest
+from PIL import Image
 from support.same_scene import held_out, views
 from support.transforms_scenes import escape, refused
 
-from pp_cl.errors import UserError
+from pp_cl.errors import Unusable, UserError
 from pp_cl.files.image import write_png
 from pp_cl.scene.load import load_scene
 from pp_cl.scene.readers import common
 from pp_cl.scene.readers.common import (
     fail_at,
-    find_image,
-    find_mask,
     folder_images,
     hold_out,
     read_npy,
     read_npz,
     read_numbers,
 )
+from pp_cl.scene.readers.found import find_image, find_masks, numbered
 from tools.convert_scene import convert
 
 FAIL = fail_at("file")
@@ -52,39 +54,69 @@ def test_an_unknown_split_is_told_with_those_there_are(scene):
     refused(scene[0], "no split eval", "test, train", splits=("eval",))
 
 
-def test_links_that_leave_the_folder(scene):
+def test_links_of_the_user_are_followed(scene):
+    """Of one image, and of whole folders, as large data lies on another disk."""
     folder, *places = scene
+    before = load_scene(folder).splits["train"]
+    escape(sorted(places[0].iterdir())[2])
     for place in filter(None, places):
-        file = sorted(place.iterdir())[2]
-        kept = file.read_bytes()
-        escape(file)
-        refused(folder, "leaves the scene's folder")
-        file.unlink()
-        file.write_bytes(kept)
+        escape(place)
+    for one, other in zip(before, load_scene(folder).splits["train"], strict=True):
+        assert one.name == other.name
+        np.testing.assert_array_equal(one.image, other.image)
 
 
-def test_a_mask_that_is_missing_and_no_masks_at_all(scene):
-    """A folder of masks must have them all; without one the images' own alpha counts."""
+def cut(file):
+    file.write_bytes(file.read_bytes()[:-200])
+
+
+HARM = {
+    "gone": (Path.unlink, "no (image|mask)"),
+    "cut": (cut, "(an image|a mask) that cannot be used|an image that cannot be read"),
+    "another shape": (lambda file: write_png(file, np.zeros((4, 4))), ""),
+}
+
+
+@pytest.mark.parametrize("harm", ("gone", "cut"))
+@pytest.mark.parametrize("place", (1, 2))
+def test_a_view_that_cannot_be_used_is_left_out_and_two_of_nine_are_too_many(scene, place, harm):
+    """By its image, or by its mask; of nine views for training eight must be left."""
+    folder, where, (do, why) = scene[0], scene[place], HARM[harm]
+    if where is None or (harm == "gone" and where.name == "rgb"):
+        return  # nothing but the images lists them
+    before = load_scene(folder).splits["train"]
+    do(sorted(where.iterdir())[2])
+    with pytest.warns(UserWarning, match=f"train: 1 of 9 views left out: ({why})") as told:
+        left = load_scene(folder)
+    assert len(told) == 1 and len(left.notes) == 1
+    names = [view.name for view in left.splits["train"]]
+    assert names == [view.name for view in before if view.name in names] and len(names) == 8
+    do(sorted(where.iterdir())[4])
+    refused(folder, folder.parent if folder.name == "sequence" else folder)
+
+
+def test_masks_of_another_size_and_of_another_shape(scene):
     folder, _, masks = scene
     if masks is None:
         return
-    file = sorted(masks.iterdir())[3]
-    file.unlink()
-    refused(folder, masks.name)
-    for file in masks.iterdir():
-        file.unlink()
-    masks.rmdir()
-    if folder.name != "sequence" and not (folder / "transforms.json").exists():
-        for view in load_scene(folder).splits["train"]:
-            assert (view.image[..., 3] == 255).all()
+    file = sorted(masks.iterdir())[2]
+    mask = Image.open(file)
+    mask.resize((2 * mask.width, 2 * mask.height)).save(file)
+    with pytest.warns(UserWarning, match="masks are resized to their images"):
+        assert len(load_scene(folder).splits["train"]) == 9
+    write_png(file, np.zeros((4, 4)))
+    with pytest.warns(UserWarning, match="1 of 9 views left out: a mask that cannot be used"):
+        load_scene(folder)
 
 
-def test_a_mask_of_another_size(scene):
+def test_no_folder_of_masks_at_all(scene):
+    """The images' own alpha counts."""
     folder, _, masks = scene
-    if masks:
-        file = sorted(masks.iterdir())[3]
-        write_png(file, np.zeros((4, 4)))
-        refused(folder, file, "4x4")
+    if masks is None or folder.name == "sequence" or (folder / "transforms.json").exists():
+        return
+    shutil.rmtree(masks)
+    for view in load_scene(folder).splits["train"]:
+        assert (view.image[..., 3] == 255).all()
 
 
 # --------------------------------------------------------------------------------------------------
@@ -99,8 +131,53 @@ def test_the_first_ending_that_exists(tmp_path):
     write_png(tmp_path / "a.png", np.zeros((2, 2)))
     assert find_image(tmp_path, "a", FAIL, ("", ".jpg", ".png")) == "a.png"
     assert find_image(tmp_path, "./b/../a.png", FAIL) == "a.png"
-    with pytest.raises(UserError, match="'a', with or without the ending"):
-        find_image(tmp_path, "a", FAIL, ("", ".jpg"))
+    with pytest.raises(UserError, match="'b', with or without the ending"):
+        find_image(tmp_path, "b", FAIL, ("", ".jpg"))
+
+
+@pytest.mark.parametrize(
+    "given, there",
+    [
+        ("/home/ada/mug/images/a.png", "images/a.png"),
+        (r"C:\Users\ada\mug\images\a.png", "images/a.png"),
+        ("images/a.jpg", "images/a.png"),
+        ("images/A.PNG", "images/a.png"),
+        ("images/a.png.png", "images/a.png"),
+        ("images/a", "images/a.png"),
+        ("a.png", "images/a.png"),
+        ("a.png", "a.png"),
+        ("images/a.png", "a.png"),
+        ("images/a.png", "input/a.png"),
+        ("images/a.png", "images_4/a.png"),
+        ("images/low/a.png", "images_2/low/a.png"),
+        ("a.png", "dense/0/images/a.png"),
+    ],
+)
+def test_which_image_a_name_means(tmp_path, given, there):
+    """As other programs write them on other machines; masks and depths are never taken for one."""
+    for path in ("masks/a.png", "depth/a.png", there):
+        (tmp_path / path).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / path).write_bytes(b"")
+    assert find_image(tmp_path, given, FAIL) == there
+    (tmp_path / there).unlink()
+    with pytest.raises(Unusable, match="no image at"):
+        find_image(tmp_path, given, FAIL)
+
+
+def test_alpha_goes_before_and_two_that_differ_in_case_are_none(tmp_path):
+    for name in ("a.jpg", "a.png", "bC.jpg", "Bc.jpg"):
+        (tmp_path / name).write_bytes(b"")
+    assert find_image(tmp_path, "a", FAIL) == "a.png"
+    with pytest.raises(Unusable):
+        find_image(tmp_path, "bc.jpg", FAIL)
+
+
+def test_places_in_a_list_of_which_some_are_gone():
+    names = [f"images/f_{i:02d}.png" for i in (3, 4, 6, 7)]
+    assert numbered(names, 4) == dict(enumerate(names))
+    assert numbered(names, 5) == dict(zip((0, 1, 3, 4), names, strict=True))
+    assert numbered(names, 6) is None, "the first or the last may be gone"
+    assert numbered(["a.png", "b.png"], 3) is None
 
 
 @pytest.mark.unix
@@ -115,11 +192,10 @@ def test_paths_as_windows_writes_them(tmp_path):
         find_image(tmp_path / "images", r"..\images\..\a.png", FAIL)
 
 
-@pytest.mark.parametrize("given", ["../a.png", "/etc/hostname", "link.png", "a" * 999, "a\0b"])
+@pytest.mark.parametrize("given", ["../a.png", "b/../../a.png", "/etc/hostname", "a" * 999, "a\0b"])
 def test_paths_that_cannot_be_used(tmp_path, given):
     (tmp_path / "scene").mkdir()
     write_png(tmp_path / "a.png", np.zeros((2, 2)))
-    (tmp_path / "scene" / "link.png").symlink_to(tmp_path / "a.png")
     with pytest.raises(UserError, match="^file: ") as caught:
         find_image(tmp_path / "scene", given, FAIL)
     assert "\n" not in str(caught.value)
@@ -134,14 +210,13 @@ def test_images_of_a_folder_are_sorted_and_nothing_else_is_one(tmp_path):
 
 @pytest.mark.parametrize("mask", ["a.jpg.png", "a.png", "a.jpeg", "a_mask.JPG", "mask_a.png"])
 def test_a_mask_is_named_like_its_image(tmp_path, mask):
-    assert find_mask(tmp_path, "masks", "sub/a.jpg", FAIL) is None
+    images = ["images/sub/a.jpg", "images/b.jpg", "images/" + "x" * 251 + ".png"]
+    assert find_masks(tmp_path, images) is None
     (tmp_path / "masks" / "sub").mkdir(parents=True)
     with pytest.raises(UserError, match=r"masks/sub/a\.jpg\.png"):
-        find_mask(tmp_path, "masks", "sub/a.jpg", FAIL)
-    with pytest.raises(UserError, match="masks"):
-        find_mask(tmp_path, "masks", "x" * 251 + ".png", FAIL)
+        find_masks(tmp_path, images)
     (tmp_path / "masks" / "sub" / mask).write_bytes(b"")
-    assert find_mask(tmp_path, "masks", "sub/a.jpg", FAIL) == f"masks/sub/{mask}"
+    assert find_masks(tmp_path, images) == {images[0]: f"masks/sub/{mask}"}
 
 
 # --------------------------------------------------------------------------------------------------

@@ -1,5 +1,7 @@
 """The reader of NeuS's and DTU's format."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 from support.same_scene import held_out, same, views
@@ -7,7 +9,8 @@ from support.transforms_scenes import refused
 
 from pp_cl.config import assign, configure, preset
 from pp_cl.files.image import write_png
-from pp_cl.scene.load import scene_box
+from pp_cl.scene.load import load_scene, scene_box, scene_frames
+from pp_cl.scene.readers.found import Notes
 from pp_cl.scene.readers.neus import box, read_split
 from tools.scene_formats import neus
 
@@ -50,7 +53,7 @@ def test_a_projection_by_hand(tmp_path):
     (tmp_path / "image").mkdir()
     write_png(tmp_path / "image" / "0.png", np.zeros((22, 30, 3)))
     np.savez(tmp_path / FILE, world_mat_0=world, world_mat_inv_0=np.eye(4))
-    [photograph] = read_split(tmp_path, "test")
+    [photograph] = read_split(tmp_path, "test", Notes())
     camera = photograph.camera
     np.testing.assert_allclose(camera.pose[:, :3], rotation.T, atol=1e-12)
     np.testing.assert_allclose(camera.eye, (1, 2, 3), atol=1e-12)
@@ -61,7 +64,7 @@ def test_a_projection_by_hand(tmp_path):
 def test_folders_may_have_the_other_names(scene):
     (scene / "image").rename(scene / "images")
     (scene / "mask").rename(scene / "masks")
-    assert read_split(scene, "test")[0].mask == "masks/000000.png"
+    assert scene_frames(scene, "test")[0].mask == "masks/000000.png"
 
 
 def test_the_box_is_that_of_the_stated_sphere(scene):
@@ -95,16 +98,16 @@ def test_the_sphere_gives_the_depth_range(scene):
     matrix = np.diag([0.5, 0.5, 0.5, 1])
     matrix[:3, 3] = 0.1, 0, 0.2
     edit(scene, lambda a: a.update({f"scale_mat_{i}": matrix for i in range(11)}))
-    for photograph in read_split(scene, "train"):
+    for photograph in read_split(scene, "train", Notes()):
         distance = np.linalg.norm(photograph.camera.eye - [0.1, 0, 0.2])
         assert photograph.depth_range == pytest.approx((distance - 0.5, distance + 0.5))
-    assert read_split(scene, "test")[0].mask == "mask/000000.png"
+    assert scene_frames(scene, "test")[0].mask == "mask/000000.png"
 
 
 def test_a_camera_within_the_sphere_sees_from_its_eye_on(scene):
     matrix = np.diag([10.0, 10, 10, 1])
     edit(scene, lambda a: a.update({f"scale_mat_{i}": matrix for i in range(11)}))
-    near, far = read_split(scene, "train")[0].depth_range
+    near, far = read_split(scene, "train", Notes())[0].depth_range
     assert near == pytest.approx(1e-2) and far > 10
 
 
@@ -155,6 +158,14 @@ def test_bad_cameras(scene, case):
     refused(scene, scene / FILE, word)
 
 
-def test_masks_of_other_numbers(scene):
-    (scene / "mask" / "000010.png").rename(scene / "mask" / "000011.png")
-    refused(scene, scene / "mask" / "000011.png", "image/000010.png")
+def test_masks_belong_to_images_of_their_number(scene):
+    """DTU has image/000000.png and mask/000.png; one of another number is none."""
+    before = [one.name for one in scene_frames(scene)]
+    for file in (scene / "mask").iterdir():
+        file.rename(file.with_name(f"{int(file.stem):03d}.png"))
+    assert [Path(one.mask).stem for one in scene_frames(scene)] == [
+        Path(name).stem[3:] for name in before
+    ]
+    (scene / "mask" / "010.png").rename(scene / "mask" / "011.png")
+    with pytest.warns(UserWarning, match=r"1 of 9 views left out: no mask .image/000010\.png"):
+        assert len(load_scene(scene).splits["train"]) == 8

@@ -13,6 +13,7 @@ from pp_cl.files.image import read_rgba
 from pp_cl.scene.distortion import Distortion
 from pp_cl.scene.load import load_scene
 from pp_cl.scene.readers import transforms
+from pp_cl.scene.readers.found import Notes
 
 # -------------------------------------------------------------------------------------------------
 
@@ -149,11 +150,11 @@ def test_json_in_utf8_with_byte_order_mark(tmp_path):
 
 
 def test_rows_and_rounding_of_the_pose(tmp_path, rng):
-    """3x4 is read as 4x4 is; a rotation that is off by rounding comes out orthonormal."""
+    """3x4 is read as 4x4 is; a rotation that is rounded, or scaled, comes out orthonormal."""
     exact = opengl_pose([1, 2, 0.5])
-    rough = exact.copy()
+    rough, scaled = exact.copy(), exact * [3.7, 3.7, 3.7, 1]
     rough[:3, :3] += rng.uniform(-1e-4, 1e-4, (3, 3))
-    for matrix in (exact[:3], rough):
+    for matrix in (exact[:3], rough, scaled):
         pose = train_views(tmp_path, transform_matrix=matrix.tolist())[0].camera.pose
         rotation = pose[:, :3]
         assert (
@@ -175,7 +176,7 @@ BAD_FRAMES = {
     "3x3": ("transform_matrix", MATRIX[:3, :3].tolist()),
     "words": ("transform_matrix", "unknown"),
     "truths": ("transform_matrix", np.eye(4, dtype=bool).tolist()),
-    "scaled": ("transform_matrix", (MATRIX * [1.01, 1.01, 1.01, 1]).tolist()),
+    "scaled": ("transform_matrix", (MATRIX * [1.01, 1.01, 1.05, 1]).tolist()),
     "mirrored": ("transform_matrix", (MATRIX * [-1, 1, 1, 1]).tolist()),
     "transposed": ("transform_matrix", MATRIX.T.tolist()),
     "negative focal length": ("fl_x", -5),
@@ -257,7 +258,7 @@ def test_fisheyes_of_nerfstudio_and_colmap2nerf(tmp_path, keys):
     """The latter writes the tangential coefficients as zeros beside."""
     keys |= {"k1": 0.1, "k2": 0.2, "k3": 0.3, "k4": 0.4, "p1": 0, "p2": 0}
     write_scene(tmp_path, edit=lambda data: data.update(keys))
-    [one, *_] = transforms.read_split(tmp_path, "train")
+    [one, *_] = transforms.read_split(tmp_path, "train", Notes())
     assert one.distortion == Distortion(k1=0.1, k2=0.2, k3=0.3, k4=0.4, fisheye=True)
     write_scene(tmp_path, edit=lambda data: data.update(keys, p2=0.1))
     refused(tmp_path, tmp_path / "transforms_train.json", "p2:")
