@@ -110,6 +110,7 @@ def _run_lines(facts):
         initial, left = facts["points"]["initial"], facts["points"]["left"]
         lines += [
             _line("views", f"{_sizes(facts['views']['images'])}, kept with their cameras"),
+            *(_line("", note) for note in facts["notes"]),
             _line("points", f"{left} ({initial} at the start)"),
             _line("grid", _grid_text(facts["grid"])),
         ]
@@ -137,6 +138,7 @@ def _scene_lines(facts):
     return [
         _line("scene", f"{facts['scene']}, format {facts['format']}"),
         _line("splits", splits),
+        *(_line("", note) for note in facts["notes"]),
         _line("images", f"{_sizes(facts['images'])}; {reduced}"),
         _line("focal", f"{_range(facts['focal_pixels'], '.1f')} pixels"),
         _line("view", f"{angle_x} x {angle_y} degrees"),

@@ -72,6 +72,7 @@ def run_facts(folder: RunFolder, scene: str | None = None) -> Facts:
         },
         "step": 0,
         "finished": False,
+        "notes": [],
         "points": None,
         "grid": None,
         "checkpoint_bytes": None,
@@ -88,6 +89,7 @@ def run_facts(folder: RunFolder, scene: str | None = None) -> Facts:
         sizes = (math.prod(f.shape) for name, f in forms.items() if name.startswith("net."))
         facts["network"]["parameters"] = sum(sizes)
         facts |= {"step": header["step"], "finished": header["finished"]}
+        facts["notes"] = header.get("notes", [])
         photographs = kept_views(header["views"])
         facts["views"] = {"count": len(photographs), "images": _image_sizes(photographs)}
         left, grid = forms["points.ids"].shape[0], header["grid"]
@@ -194,7 +196,8 @@ def describe_scene(
         assign(config, "scene.downscale", preset_downscale(path, preset_name), "preset")
     names = sorted(scene_splits(path), key=lambda split: (split == "test", split))
     frames = {split: scene_frames(path, split) for split in names}
-    views = open_scene(dev, config, ("train",)).splits["train"]
+    opened = open_scene(dev, config, ("train",))
+    views = opened.splits["train"]
     hull, problem, box = None, None, scene_box(config)
     try:
         agreement = agreeing(dev, views, box)
@@ -209,6 +212,7 @@ def describe_scene(
         "scene": path,
         "format": scene_format(path),
         "splits": {split: len(listed) for split, listed in frames.items()},
+        "notes": list(opened.notes),
         "images": _image_sizes([frame for listed in frames.values() for frame in listed]),
         **_lenses([view.file_camera for view in views]),
         "masks": _masks(views)

@@ -7,8 +7,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pp_cl.errors import UserError
+from pp_cl.errors import UserError, quoted
 from pp_cl.files.atomic import write_json
+from pp_cl.scene.convention import AXES
 from pp_cl.scene.readers.common import checked_box, fail_at, read_json
 
 FILE = "pp_cl.json"
@@ -16,11 +17,13 @@ FILE = "pp_cl.json"
 
 class Edits(NamedTuple):
     """box: (2, 3) lower and upper corner in world units, None where the user has given none.
-    dropped: names of photographs, as a scene lists them.
+    dropped: names of photographs, as a scene lists them. axes: how the matrices of its cameras are
+    to be read, out of AXES; None where the user has not said so.
     """
 
     box: np.ndarray | None = None
     dropped: frozenset[str] = frozenset()
+    axes: str | None = None
 
 
 def read_edits(folder: Path) -> Edits:
@@ -30,16 +33,21 @@ def read_edits(folder: Path) -> Edits:
 
 
 def checked_edits(found: object, file: Path) -> Edits:
-    """The Edits that a JSON object {"box": ..., "dropped": ...} holds. Raises UserError naming the
-    file and the key that is wrong.
+    """The Edits that a JSON object {"box": ..., "dropped": ..., "axes": ...} holds. Raises
+    UserError naming the file and the key that is wrong.
     """
-    if not isinstance(found, dict) or not found.keys() <= {"box", "dropped"}:
-        raise fail_at(file)('must be a JSON object with the keys "box" and "dropped"; correct it')
+    if not isinstance(found, dict) or not found.keys() <= set(Edits._fields):
+        keys = " and ".join(f'"{key}"' for key in Edits._fields)
+        raise fail_at(file)(f"must be a JSON object with no other keys than {keys}; correct it")
+    if (axes := found.get("axes")) is not None and axes not in AXES:
+        raise fail_at(file, "axes")(f"is {quoted(axes, 40)}; must be one of {', '.join(AXES)}")
     corners, dropped = found.get("box"), found.get("dropped", [])
     if not isinstance(dropped, list) or not all(type(name) is str for name in dropped):
         raise fail_at(file, "dropped")("must be a list of names of photographs; correct it")
     return Edits(
-        None if corners is None else checked_box(corners, fail_at(file, "box")), frozenset(dropped)
+        None if corners is None else checked_box(corners, fail_at(file, "box")),
+        frozenset(dropped),
+        axes,
     )
 
 
@@ -52,6 +60,8 @@ def write_edits(folder: Path, edits: Edits) -> None:
         kept["box"] = edits.box.tolist()
     if edits.dropped:
         kept["dropped"] = sorted(edits.dropped)
+    if edits.axes:
+        kept["axes"] = edits.axes
     if kept:
         write_json(file, kept)
         return

@@ -25,6 +25,7 @@ from pp_cl.errors import Unusable, UserError, quoted
 from pp_cl.files.image import ENDINGS, has_alpha, read_rgba
 from pp_cl.presets import IMAGE_SIZES
 from pp_cl.scene import demo
+from pp_cl.scene.convention import STATED, other_axes, read_as
 from pp_cl.scene.distortion import BAND_BYTES, undistort
 from pp_cl.scene.edits import FILE as EDITS
 from pp_cl.scene.edits import read_edits
@@ -211,10 +212,17 @@ def list_split(path: str | Path, split: str = "train", *, edited: bool = True) -
     if split not in present:
         raise UserError(f"{folder}: no split {split}; its splits are {', '.join(present)}")
     photographs = reader.read_split(folder, split, notes)
-    dropped: Set[str] = frozenset()
-    if edited:
-        dropped = read_edits(folder).dropped
-        photographs = [one for one in photographs if one.name not in dropped]
+    edits = read_edits(folder)
+    dropped: Set[str] = edits.dropped if edited else frozenset()
+    photographs = [one for one in photographs if one.name not in dropped]
+    if edits.axes:
+        photographs = [replace(o, camera=read_as(o.camera, edits.axes)) for o in photographs]
+    elif axes := other_axes([one.camera for one in photographs]):
+        raise UserError(
+            f"{folder}: its cameras do not look at one place; they would if their matrices were of"
+            f' the kind "{axes}". If so, write {{"axes": "{axes}"}} into {folder / EDITS}; if they'
+            f' are right, {{"axes": "{STATED}"}}'
+        )
     if not photographs:
         notes.check(0)
         lacks = f"; {EDITS} drops some" if dropped else ""

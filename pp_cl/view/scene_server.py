@@ -19,7 +19,7 @@ from pp_cl.errors import UserError
 from pp_cl.files.image import read_rgba
 from pp_cl.files.untrusted import strict_json
 from pp_cl.scene.camera_path import looked_at, up_of
-from pp_cl.scene.edits import FILE, Edits, checked_edits, read_edits, write_edits
+from pp_cl.scene.edits import FILE, checked_edits, read_edits, write_edits
 from pp_cl.scene.load import scene_box, scene_frames, scene_splits
 from pp_cl.scene.readers.frame import frame_keys
 from pp_cl.scene.sparse import sparse_points
@@ -102,7 +102,7 @@ class ShownScene:
         if gone := {split for split, _ in self.views} - kept:
             raise UserError(f"no view of split {min(gone)} would be left; keep one")
         known = edits.dropped & {one.name for _, one in self.views}
-        write_edits(self.folder, Edits(edits.box, known))
+        write_edits(self.folder, edits._replace(dropped=known, axes=read_edits(self.folder).axes))
 
     def photograph(self, index: int) -> bytes:
         """JPEG file of a view, reduced. Raises UserError for a photograph that cannot be read."""

@@ -46,8 +46,8 @@ def test_training_and_info_obey_the_box_and_leave_out_what_was_dropped(folder, t
 def test_no_edits_leave_no_file(folder):
     edits = Edits(np.array(BOX), frozenset({"train/r_2.png"}))
     write_edits(folder, edits)
-    box, dropped = read_edits(folder)
-    assert box.tolist() == BOX and dropped == edits.dropped
+    box, dropped, axes = read_edits(folder)
+    assert box.tolist() == BOX and dropped == edits.dropped and axes is None
     write_edits(folder, Edits())
     assert not (folder / "pp_cl.json").exists() and read_edits(folder) == Edits()
 

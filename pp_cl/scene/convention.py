@@ -1,0 +1,63 @@
+"""Whether the cameras of a scene look at one place, and which other reading of their matrices would
+make them do so: files in the form of NeRF-synthetic come with axes of OpenCV, and inverted.
+"""
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from pp_cl.scene.camera import Camera
+from pp_cl.scene.camera_path import looked_at
+
+STATED = "stated"
+FLIPPED, INVERSE = "opencv", "world-to-camera"
+# {name: (whether the matrices are those from the world, whether their y and z axes point the other
+# way than the format has it)}
+AXES = {
+    STATED: (False, False),
+    FLIPPED: (False, True),
+    INVERSE: (True, False),
+    f"{FLIPPED} {INVERSE}": (True, True),
+}
+LEAST_CAMERAS = 4
+MOST = 0.9  # of the cameras, that have before them what all look at
+ASIDE = 35.0  # degrees between a camera's axis and what all look at, in the median
+SPREAD = 0.2  # of the distance to what they look at, by which eyes differ around an object
+GL_FROM_CV = np.diag([1.0, -1.0, -1.0, 1.0])
+
+
+def read_as(camera: Camera, axes: str) -> Camera:
+    """The camera that the same matrix gives in a convention out of AXES."""
+    inverted, flipped = AXES[axes]
+    stored = np.vstack([camera.pose, [0, 0, 0, 1]]) @ GL_FROM_CV
+    stored = np.linalg.inv(stored) if inverted else stored
+    pose = stored if flipped else stored @ GL_FROM_CV
+    return replace(camera, pose=pose[:3])
+
+
+def meeting(cameras: Sequence[Camera]) -> float:
+    """How far apart cameras are that look at one place from around it, in world units; 0 where they
+    do not.
+    """
+    place = looked_at(cameras)
+    towards = place - np.stack([camera.eye for camera in cameras])
+    distance = np.linalg.norm(towards, axis=1)
+    along = np.stack([camera.pose[:, 2] for camera in cameras])
+    cosine = (along * towards).sum(1) / np.maximum(distance, 1e-30)
+    spread = float(np.linalg.norm(towards - towards.mean(0), axis=1).mean())
+    is_around = spread > SPREAD * np.median(distance)
+    is_ahead = (cosine > 0).mean() >= MOST and np.median(cosine) > np.cos(np.radians(ASIDE))
+    return spread if is_around and is_ahead else 0.0
+
+
+def other_axes(cameras: Sequence[Camera]) -> str | None:
+    """The one of AXES by which the cameras would look at one place, of several that by which they
+    are furthest apart: matrices that are inverted put all in one place, where everything meets.
+    None where they do so as they are, or no other reading makes them.
+    """
+    if len(cameras) < LEAST_CAMERAS or meeting(cameras):
+        return None
+    found = {axes: meeting([read_as(one, axes) for one in cameras]) for axes in AXES}
+    best = max(found, key=lambda axes: found[axes])
+    return best if found[best] else None
