@@ -57,7 +57,7 @@ kernel void spline_columns(
 
 // Where the lens puts the point (x / z, y / z): OpenCV's models, as Distortion.apply has them.
 // lens: fx, fy, cx, cy, k1, k2, p1, p2, k3, k4, k5, k6, and whether it is a fisheye.
-static inline float2 distorted(constant const float *lens, const float x, const float y) {
+static inline float2 distorted(global const float *lens, const float x, const float y) {
     const float k1 = lens[4], k2 = lens[5], p1 = lens[6], p2 = lens[7], k3 = lens[8];
     const float xx = x * x, yy = y * y, xy = x * y, r2 = xx + yy;
     if (lens[12] != 0.0f) {
@@ -65,7 +65,7 @@ static inline float2 distorted(constant const float *lens, const float x, const 
         return (float2)(x, y) * (t / r) * (1.0f + t2 * (k1 + t2 * (k2 + t2 * (k3 + t2 * lens[9]))));
     }
     const float radial = (1.0f + r2 * (k1 + r2 * (k2 + r2 * k3))) /
-        (1.0f + r2 * (lens[9] + r2 * (lens[10] + r2 * lens[11])));
+                         (1.0f + r2 * (lens[9] + r2 * (lens[10] + r2 * lens[11])));
     return (float2)(x * radial + 2.0f * p1 * xy + p2 * (r2 + 2.0f * xx),
                     y * radial + p1 * (r2 + 2.0f * yy) + 2.0f * p2 * xy);
 }
@@ -87,7 +87,7 @@ kernel void undistort(
     const int columns,
     const int rows,
     const int first,                    // row of the photograph whose coefficients are the first
-    constant const float *lens,         // (13)
+    global const float *lens,           // (13)
     global const float4 *coefficients,  // (rows, columns, 4)
     global uchar4 *image)               // (height, width, 4)
 {

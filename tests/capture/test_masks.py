@@ -316,7 +316,7 @@ def test_a_given_mask_that_is_no_use_is_named(capture, tmp_path, broken):
     elif broken == "truncated":
         (folder / "07.png").write_bytes((folder / "07.png").read_bytes()[:60])
     else:
-        Image.new("L", (8, 8)).save(folder / "07.png")
+        Image.new("L", (8, 5)).save(folder / "07.png")
     with pytest.raises(UserError, match=r"07\.png"):
         capture.write(given=folder)
     assert not capture.file(7).exists()

@@ -46,8 +46,8 @@ def test_every_image_of_a_folder_is_compared_or_refused(folders):
     result = compare(*folders, ("psnr",))
     assert [row["name"] for row in result["per_image"]] == ["a.png", "b.png", "c.webp", "d.JPG"]
     assert result["per_image"][2]["psnr"] == result["per_image"][0]["psnr"]
-    Image.open(folders[1] / "a.png").save(folders[1] / "e.tif")
-    with pytest.raises(UserError, match="truth/e.tif: "):
+    Image.open(folders[1] / "a.png").save(folders[1] / "e.gif")
+    with pytest.raises(UserError, match="truth/e.gif: "):
         compare(*folders, ("psnr",))
 
 
