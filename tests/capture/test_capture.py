@@ -15,7 +15,7 @@ import pytest
 from PIL import Image, ImageFilter
 from support.runs import spoken
 
-from pp_cl.capture import poses
+from pp_cl.capture import STAGES, poses
 from pp_cl.capture.features import opened, quiet, verification
 from pp_cl.capture.frames import take_images
 from pp_cl.cli import main
@@ -73,7 +73,7 @@ def capture(source, scene, *more):
 
 
 def found(scene, stage):
-    return json.loads((scene / "capture" / f"{stage}.json").read_text())["found"]
+    return json.loads((scene / "capture" / f"{stage}.json").read_text())
 
 
 def changed(scene):
@@ -165,11 +165,78 @@ def test_what_is_done_is_not_done_again(captured, shot, tmp_path):
     after = changed(scene)
     assert after[scene / "capture" / "poses.json"] == before[scene / "capture" / "poses.json"]
     assert after[scene / "capture" / "masks.json"] > before[scene / "capture" / "masks.json"]
-    box = "-0.5,-0.5,-0.5,0.5,0.5,0.5"
-    assert capture(*words, f"--box={box}", "--from", "scene") == (0, [])
-    assert json.loads((scene / "transforms.json").read_text())["aabb"] == [[-0.5] * 3, [0.5] * 3]
     status, lines = capture(shot[1], scene)
     assert status == 2 and len(lines) == 1 and str(scene) in lines[0]
+
+
+def test_options_are_kept_for_the_next_capture(captured, shot, tmp_path, capsys):
+    """Others redo what depends on them, and say so; a word takes them back."""
+    scene = shutil.copytree(captured, tmp_path / "scene")
+    words, before = ["capture", str(shot[0]), "--out", str(scene)], changed(scene)
+    assert main(words) == 0 and changed(scene) == before
+    capsys.readouterr()
+    assert main([*words, "--box=-0.5,-0.5,-0.5,0.5,0.5,0.5"]) == 0
+    told = capsys.readouterr().out
+    assert "--box is another than before: box and on anew" in told and "poses: 12 of 12" in told
+    assert found(scene, "masks")["line"].startswith(f"{COUNT} given")
+    assert main([*words, "--from", "scene"]) == 0
+    assert json.loads((scene / "transforms.json").read_text())["aabb"] == [[-0.5] * 3, [0.5] * 3]
+    assert main([*words, "--box", "auto"]) == 0
+    box = json.loads((captured / "transforms.json").read_text())["aabb"]
+    assert json.loads((scene / "transforms.json").read_text())["aabb"] == box
+
+
+def test_a_folder_that_no_capture_has_made_is_left_alone(shot, tmp_path):
+    """Also where its photographs are called like our own folder."""
+    mug = tmp_path / "mug"
+    for name in ("capture", "images", "masks"):
+        (mug / name).mkdir(parents=True)
+    shutil.copy(shot[0] / "000.png", mug / "capture")
+    for name in ("images/0.png", "masks/0.png", "transforms.json", "capture/frames.json"):
+        (mug / name).write_text("mine")
+    before = changed(mug)
+    status, lines = capture(mug / "capture", mug)
+    assert status == 2 and len(lines) == 1 and str(mug) in lines[0] and changed(mug) == before
+
+
+@pytest.mark.parametrize("words", [[], *(["--from", stage] for stage in STAGES)])
+def test_what_is_the_users_stays(captured, shot, tmp_path, words):
+    """Files beside those of the capture, and what the user has changed of these, but for masks."""
+    scene = shutil.copytree(captured, tmp_path / "scene")
+    own = scene / "images" / "003.png"
+    own.write_bytes(own.read_bytes() + b"mine")
+    before = changed(scene)
+    assert capture(shot[0], scene, "--from", "frames") == (
+        2,
+        [f"pp-cl: {own}: pp-cl did not write this, or not as it is now; move it away"],
+    )
+    assert changed(scene) == before
+    shutil.copy(captured / "images" / "003.png", own)
+    kept = {}
+    for folder in [scene, *(path for path in scene.rglob("*") if path.is_dir())]:
+        for name in ("mine.png", ".own", "pairs.txt"):
+            (folder / name).write_text("mine")
+            kept[folder / name] = (folder / name).stat().st_mtime_ns
+    status, lines = capture(shot[0], scene, *words)
+    assert (status, len(lines)) == ((2, 1) if words else (0, 0)), lines
+    assert {path: changed(scene).get(path, kept[path]) for path in kept} == kept
+    assert all(path.read_text() == "mine" for path in kept)
+    assert (scene / "transforms.json").exists()
+
+
+def test_masks_that_the_user_has_mended_are_kept(captured, shot, tmp_path):
+    """And refused by name where their images are made anew; one option replaces them."""
+    scene = shutil.copytree(captured, tmp_path / "scene")
+    mended = scene / "masks" / "003.png"
+    Image.new("L", (SIZE, SIZE), 255).save(mended)
+    mine = mended.read_bytes()
+    assert capture(shot[0], scene, "--from", "box") == (0, []) and mended.read_bytes() == mine
+    assert found(scene, "masks")["line"].startswith(f"1 kept, {COUNT - 1} given")
+    before = changed(scene)
+    status, lines = capture(shot[0], scene, "--from", "frames")
+    assert status == 2 and len(lines) == 1 and str(mended) in lines[0] and changed(scene) == before
+    assert capture(shot[0], scene, "--from", "masks", "--replace-masks") == (0, [])
+    assert mended.read_bytes() == (captured / "masks" / "003.png").read_bytes()
 
 
 def test_photographs_that_came_later_are_told(captured, shot, tmp_path, capsys):
@@ -306,7 +373,7 @@ def test_a_killed_capture_goes_on(shot, tmp_path):
     """In the middle of three stages; the same command ends with the scene of one that was not."""
     scene = tmp_path / "scene"
     words = ["capture", str(shot[0]), "--out", str(scene), "--masks", str(shot[1])]
-    for begun in ("capture/database.db", "capture/pairs.txt", "masks"):
+    for begun in ("capture/database.db", "capture/features.json", "masks"):
         process = subprocess.Popen(
             [sys.executable, "-m", "pp_cl", *words], stdout=subprocess.DEVNULL
         )
