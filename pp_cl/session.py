@@ -41,6 +41,7 @@ from pp_cl.scene.agreement import disagreements, listing
 from pp_cl.scene.grid import Grid
 from pp_cl.scene.hull import Agreement, Hull, agreeing, build_grid, depth_range, spacing_pixels
 from pp_cl.scene.identity import difference, identity
+from pp_cl.scene.kept import KeptViews
 from pp_cl.scene.load import (
     DEMO,
     measured_split,
@@ -93,7 +94,7 @@ class Training:
     info: what a checkpoint's header holds beside the model's. room: the available memory and the
     plan of what the training takes. hull: None if it resumes from a checkpoint. origin: a line of
     text that says where the choice of convolutions comes from. measured: the views on which
-    train.eval_every measures PSNR.
+    train.eval_every measures PSNR. kept: images that a resume need not read again.
     """
 
     folder: RunFolder
@@ -104,6 +105,7 @@ class Training:
     hull: HullFacts | None
     origin: str
     measured: list[View]
+    kept: KeptViews
     _preview_by: float = field(default=math.inf, init=False)  # time.monotonic()'s seconds
     _save_by: float = field(default=math.inf, init=False)
     _saved: int = field(default=0, init=False)  # step of the checkpoint; 0: there is none
@@ -126,6 +128,7 @@ class Training:
         with self.folder.owned():
             self._check_unchanged()
             self.folder.create(self.config.to_json())
+            self.kept.write()
             if self.hull and self.hull.picture is not None:
                 write_png(self.folder.path / MASKS_PICTURE, self.hull.picture)
             self._saved = self.trainer.step
@@ -187,6 +190,7 @@ class Training:
             # but a finished run is not resumed.
             log.write(self._row(seconds) | {"points": trainer.model.cloud.count, "finished": True})
             self._save(finished=True)
+            self.kept.remove()
         return seconds
 
     def _after_step(self, log, terms, seconds):
@@ -287,8 +291,8 @@ def open_training(
     else:
         grid, points = Grid.of_header(header["grid"]), len(arrays["points.ids"])
         room.check_points(grid, points, header["depth_range"], header["step"])
-    listed = {"train": photographs}
-    views = open_scene(dev, config, ("train",), listed=listed).splits["train"]
+    listed, read = {"train": photographs}, KeptViews(folder.views)
+    views = open_scene(dev, config, ("train",), listed=listed, kept=read).splits["train"]
     measured = []
     if config.train.eval_every:
         split = measured_split(config.scene.path)  # val, else test
@@ -313,7 +317,7 @@ def open_training(
     info |= {"extended_from": begun} if begun else {}
     info |= {"left_out": left_out} if left_out else {}
     build_aside(net, config.network, trainer.network_size)
-    return Training(folder, config, trainer, info, room, hull, policy.origin, measured)
+    return Training(folder, config, trainer, info, room, hull, policy.origin, measured, read)
 
 
 def begin_network(net: UNet, config: Config) -> None:

@@ -58,7 +58,7 @@ from pp_cl.scene.edits import read_edits
 from pp_cl.scene.grid import Grid
 from pp_cl.scene.hull import build_grid, depth_range, spacing_pixels
 from pp_cl.scene.load import find_reader, load_scene
-from pp_cl.scene.masks import MaskRule
+from pp_cl.scene.masks import MaskRule, cut_out
 from pp_cl.scene.readers.camera_file import read_cameras
 from pp_cl.scene.readers.frame import frame_keys
 from pp_cl.scene.sparse import sparse_points
@@ -231,7 +231,9 @@ def test_a_mask(world, data):
         source = one(draw, "given", "alpha", "color", "box", "none")
         rule = MaskRule(source, one(draw, "", str(folder)), one(draw, 10.0, 1e-6, 1.0, 100.0))
         name = f"{draw(damage.words)}.png" if draw(st.booleans()) else "images/a.png"
-        made = taken(lambda: rule.apply(image, name, file))
+        made = taken(lambda: rule.apply(image.copy(), rule.file(name, file)))
+        if made is not None and rule.is_by_colour:
+            made = taken(lambda: cut_out(made, name, rule.tolerance))
         assert made is None or (made.shape == image.shape and made.dtype == np.uint8)
 
 

@@ -113,7 +113,7 @@ def _found(scene, photograph, given, sources, words):
     if given is not None:
         name = Path(photograph.name).name
         mask = named_mask(given, sources.get(name, name), name)
-        return "given", MaskRule().apply(image, name, mask)[..., 3]
+        return "given", MaskRule().apply(image, mask)[..., 3]
     if words is not None:
         return "by the program", _of_program(words, scene / photograph.name, image.shape[:2])
     if (image[..., 3] < 255).any():

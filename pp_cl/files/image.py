@@ -19,7 +19,9 @@ FORMATS = ("PNG", "JPEG", "WEBP")
 ENDINGS = (".png", ".jpg", ".jpeg", ".webp", ".exr")  # of the files that read_rgba reads
 # Pillow's names of what converts to RGBA without loss
 EIGHT_BIT_MODES = ("RGBA", "RGB", "LA", "L", "PA", "P", "1")
-COLOURLESS = 16  # by how much the channels of a gray image may differ, where it was a JPEG
+# A mask may have been a JPEG with subsampled colours: means of blocks, of which the shorter side
+# has this many, differ by no more than so many levels between the channels
+COLOUR_SIDE, COLOURLESS = 16, 16
 # bits per channel stand in the header chunk, the first of all
 PNG_SIGNATURE, PNG_DEPTH_BYTE = b"\x89PNG\r\n\x1a\n", 24
 
@@ -34,30 +36,47 @@ def read_rgba(path: Path | str) -> np.ndarray:
     if _is_exr(path):
         return read_exr_rgba(path)
     with _opened(path) as image:
-        is_deep = is_deep_png(path)
-        if image.mode not in EIGHT_BIT_MODES or is_deep:
-            found = "16 bits" if is_deep else image.mode
-            raise UserError(
-                f"{path}: not 8 bits a channel of gray or RGB ({found}); convert it to 8-bit RGBA"
-                " PNG"
-            )
+        _check_depth(path, image)
         return np.array(image if image.mode == "RGBA" else image.convert("RGBA"))
+
+
+def _check_depth(path, image):
+    """Raise UserError where an opened image has other than 8 bits a channel of gray or RGB."""
+    is_deep = is_deep_png(path)
+    if image.mode not in EIGHT_BIT_MODES or is_deep:
+        found = "16 bits" if is_deep else image.mode
+        raise UserError(
+            f"{path}: not 8 bits a channel of gray or RGB ({found}); convert it to 8-bit RGBA PNG"
+        )
 
 
 def read_mask(path: Path | str) -> np.ndarray:
     """(H, W) uint8, 255 where the object is: the alpha of an image that has transparent pixels, as
-    a cut-out, else its gray. Raises UserError as read_rgba does, and for one that is neither.
+    a cut-out, else its gray, of which colour that JPEG or a camera's program left in noise and rims
+    is no part. Raises UserError as read_rgba does, and for one with areas of colour.
     """
-    rgba = read_rgba(path)
-    if (rgba[..., 3] < 255).any():
-        return rgba[..., 3]
-    red, green, blue = rgba[..., :3].astype(np.int16).transpose(2, 0, 1)
-    if max(np.abs(red - green).max(), np.abs(green - blue).max()) > COLOURLESS:
-        raise UserError(f"{path}: has colours; write a gray mask, white where the object is")
-    gray = np.array(Image.fromarray(rgba[..., :3]).convert("L"))
-    if gray.max() == 1:
+    if _is_exr(path):
+        return _mask_of(path, Image.fromarray(read_exr_rgba(path)))
+    with _opened(path) as image:
+        _check_depth(path, image)
+        return _mask_of(path, image)
+
+
+def _mask_of(path, image):
+    if image.mode != "L":
+        rgba = image.convert("RGBA")
+        alpha = rgba.getchannel("A")
+        if alpha.getextrema()[0] < 255:
+            return np.array(alpha)
+        image = rgba.convert("RGB")
+        block = max(1, min(image.size) // COLOUR_SIDE)
+        colours = np.array(image.reduce(block), np.int16)
+        if np.ptp(colours, axis=2).max() > COLOURLESS:
+            raise UserError(f"{path}: has colours; write a gray mask, white where the object is")
+        image = image.convert("L")
+    if image.getextrema()[1] == 1:
         raise UserError(f"{path}: its largest value is 1 of 255; write 255 where the object is")
-    return gray
+    return np.array(image)
 
 
 def image_size(path: Path | str) -> tuple[int, int]:

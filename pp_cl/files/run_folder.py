@@ -28,7 +28,9 @@ MOST_NUMBER = 1e300  # in a row
 
 
 class RunFolder:
-    """path: the folder; config, checkpoint, log, previews: paths in it, which need not exist."""
+    """path: the folder; config, checkpoint, log, previews, views: paths in it, which need not
+    exist.
+    """
 
     def __init__(self, path: Path | str) -> None:
         self.path = Path(path)
@@ -36,6 +38,7 @@ class RunFolder:
         self.checkpoint = self.path / "checkpoint.npz"
         self.log = self.path / "log.jsonl"
         self.previews = self.path / "previews"
+        self.views = self.path / "views"
 
     def __str__(self) -> str:
         return str(self.path)

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
+from scipy.ndimage import map_coordinates
 
 CENTRE = np.array([0, 0, 0.15])  # of the globe
 MERIDIAN = np.array([0.819152, 0.573576, 0])
@@ -49,6 +50,27 @@ def kept(
         seen += counted
         rejecting += counted & ~held
     return (seen >= least) & (rejecting * len(views) <= forgiven * seen), border
+
+
+def undistorted(image: np.ndarray, camera: Any, distortion: Any, factor: int = 1) -> np.ndarray:
+    """(H // factor, W // factor, 4) float64, of 255 levels: a photograph (H, W, 4) uint8, read by
+    cubic splines where the lens puts the pixels of a pinhole camera, on premultiplied colour, then
+    reduced by area.
+    """
+    height, width = (side // factor for side in image.shape[:2])
+    x = (np.arange(factor * width) + 0.5 - camera.cx) / camera.fx
+    y = (np.arange(factor * height) + 0.5 - camera.cy) / camera.fy
+    x, y = distortion.apply(*np.meshgrid(x, y))
+    places = [camera.fy * y + camera.cy - 0.5, camera.fx * x + camera.cx - 0.5]
+    alpha = image[..., 3:] / 255.0
+    planes = np.concatenate([image[..., :3] / 255.0 * alpha, alpha], axis=2)
+    planes = np.stack(
+        [map_coordinates(planes[..., i], places, order=3, mode="nearest") for i in range(4)]
+    )
+    planes /= np.maximum(planes[3], 1)  # what overshoots beside a mask's border keeps its colour
+    blocks = np.clip(planes, 0, 1).reshape(4, height, factor, width, factor)
+    colour, alpha = np.split(blocks.mean((2, 4)).transpose(1, 2, 0), [3], axis=2)
+    return 255 * np.concatenate([np.clip(colour / np.maximum(alpha, 1e-3), 0, 1), alpha], axis=2)
 
 
 def target_forward(

@@ -4,10 +4,17 @@ from dataclasses import astuple, dataclass
 
 import numpy as np
 
+from pp_cl.device.device import Device
 from pp_cl.scene.camera import Camera
 
-CUBIC = 3  # order of interpolation
 PROBED = 65  # places along each axis
+BAND_BYTES = 2**23  # of the spline's coefficients that are on the device at a time
+MARGIN = (
+    8  # coefficients beyond the image's left and right border, as cl/scene/distortion.cl has it
+)
+# rows beyond those that are read, after which nothing is left of where the recursion began (3e-7)
+RUN_UP = 12
+ROWS_PROBED = 9  # of a band, to find the rows of the photograph that it shows
 
 
 @dataclass(frozen=True)
@@ -57,30 +64,72 @@ class Distortion:
         # NaN counts as a fold
         return not (along_x[0] * along_y[1] - along_x[1] * along_y[0] > 0).all()
 
-    def source_pixels(self, camera: Camera) -> np.ndarray:
-        """(2, H, W) float64: for each pixel of the camera without distortion, row and column of
-        the photograph, in pixel indices (a centre is whole), where its content lies.
-        """
-        x = (np.arange(camera.width) + 0.5 - camera.cx) / camera.fx
-        y = (np.arange(camera.height) + 0.5 - camera.cy) / camera.fy
-        x, y = self.apply(*np.meshgrid(x, y))
-        return np.stack([camera.fy * y + camera.cy, camera.fx * x + camera.cx]) - 0.5
 
+def undistort(
+    dev: Device, image: np.ndarray, camera: Camera, distortion: Distortion, factor: int = 1
+) -> np.ndarray:
+    """(H // factor, W // factor, 4) uint8 straight RGBA that the camera would have taken without
+    distortion, reduced `factor` times: means of factor x factor samples, each by cubic spline on
+    premultiplied colour; beyond the photograph's border its edge goes on.
 
-def undistort(image: np.ndarray, camera: Camera, distortion: Distortion) -> np.ndarray:
-    """(H, W, 4) uint8 straight RGBA that the camera would have taken without distortion.
-
-    Interpolated on premultiplied colour; beyond the photograph's border its edge goes on.
+    image: (H, W, 4) uint8 straight RGBA, as the lens has it. camera: of H x W pixels.
     """
-    from skimage.transform import warp  # takes long to import
+    width, height = camera.width // factor, camera.height // factor
+    program, columns = dev.program("scene/distortion"), camera.width + 2 * MARGIN
+    lens = [camera.fx, camera.fy, camera.cx, camera.cy, *astuple(distortion)]
+    numbers, found = dev.upload(lens, np.float32), np.empty((height, width, 4), np.uint8)
+    most = max(1, BAND_BYTES // (16 * columns * factor))
+    for top in range(0, height, most):
+        bottom = min(top + most, height)
+        first, last = _source_rows(camera, distortion, factor * top, factor * bottom)
+        shape = last - first, columns, 4
+        there = image[max(first, 0) : min(last, camera.height)]
+        coefficients = dev.empty(shape)
+        program.launch(
+            "spline_rows",
+            (shape[0],),
+            width=camera.width,
+            rows=shape[0],
+            first=min(first, 0),
+            image_rows=len(there),
+            image=dev.upload(there),
+            coefficients=coefficients,
+        )
+        program.launch(
+            "spline_columns",
+            (columns,),
+            columns=columns,
+            rows=shape[0],
+            coefficients=coefficients,
+        )
+        band = dev.empty((bottom - top, width, 4), np.uint8)
+        program.launch(
+            "undistort",
+            (width, bottom - top),
+            width=width,
+            height=bottom - top,
+            top=top,
+            factor=factor,
+            columns=columns,
+            rows=shape[0],
+            first=first,
+            lens=numbers,
+            coefficients=coefficients,
+            image=band,
+        )
+        found[top:bottom] = dev.download(band)
+    return found
 
-    alpha = image[..., 3:].astype(np.float64) / 255
-    planes = np.concatenate([image[..., :3] / 255 * alpha, alpha], axis=2)
-    source = distortion.source_pixels(camera)
-    planes = np.stack(
-        [warp(planes[..., i], source, order=CUBIC, mode="edge", clip=True) for i in range(4)],
-        axis=2,
-    )
-    alpha = np.clip(planes[..., 3:], 0, 1)
-    colour = np.clip(planes[..., :3] / np.maximum(alpha, 1e-3), 0, 1)
-    return (np.concatenate([colour, alpha], axis=2) * 255 + 0.5).astype(np.uint8)
+
+def _source_rows(camera, distortion, top, bottom):
+    """(first, last + 1) row of a photograph that the rows top to bottom of the camera without
+    distortion need, the RUN_UP on both sides included; both may lie outside of the image, by as
+    little as its edge takes to be constant.
+    """
+    x = (np.arange(camera.width + 1) - camera.cx) / camera.fx
+    y = (np.linspace(top, bottom, ROWS_PROBED) - camera.cy) / camera.fy
+    rows = camera.fy * distortion.apply(*np.meshgrid(x, y))[1] + camera.cy
+    beyond = MARGIN + RUN_UP
+    first = int(np.clip(rows.min() - 3, -MARGIN, camera.height - 1)) - RUN_UP
+    last = int(np.clip(rows.max() + 4, 1, camera.height + MARGIN)) + RUN_UP
+    return max(first, -beyond), min(last, camera.height + beyond)

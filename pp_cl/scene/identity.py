@@ -10,16 +10,22 @@ from typing import Any
 import numpy as np
 
 from pp_cl.scene.camera import Camera
+from pp_cl.scene.distortion import Distortion
 from pp_cl.scene.views import Photograph, View
 
+STRAIGHT = Distortion()  # of a lens without distortion
 DIGITS = 16  # of a view's digest, hexadecimal: enough to tell pixels that were changed, not forged
 POSE, LENS, SIZE, RANGE = 12, 4, 2, 2  # numbers of a kept view; it may have no depth range
 MOST_SIDE, MOST_NUMBER = 2**24, 1e30  # what float32 holds as whole numbers, and as products
 
 
-def pixel_digest(image: np.ndarray) -> str:
-    """Hex digest of the pixels of a uint8 image, its mask among them."""
-    return hashlib.sha256(np.ascontiguousarray(image).data).hexdigest()[:DIGITS]
+def pixel_digest(image: np.ndarray, distortion: Distortion = STRAIGHT) -> str:
+    """Hex digest of the pixels of a uint8 image, its mask among them, and of the distortion that
+    is removed from it.
+    """
+    digest = hashlib.sha256(np.ascontiguousarray(image).data)
+    digest.update(repr(distortion).encode() if distortion else b"")
+    return digest.hexdigest()[:DIGITS]
 
 
 def identity(views: Sequence[View]) -> dict[str, Any]:

@@ -2,6 +2,7 @@
 READERS knows, or made by the program.
 """
 
+import math
 import mimetypes
 import os
 import warnings
@@ -9,6 +10,7 @@ from collections.abc import Iterable, Mapping, Sequence, Set
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
+from threading import Lock
 from types import ModuleType
 
 import numpy as np
@@ -16,15 +18,17 @@ from tqdm import tqdm
 
 from pp_cl.config import Config
 from pp_cl.device.device import Device
+from pp_cl.device.discover import open_device
 from pp_cl.errors import UserError, quoted
 from pp_cl.files.image import ENDINGS, read_rgba
 from pp_cl.presets import IMAGE_SIZES
 from pp_cl.scene import demo
-from pp_cl.scene.distortion import undistort
+from pp_cl.scene.distortion import BAND_BYTES, undistort
 from pp_cl.scene.edits import FILE as EDITS
 from pp_cl.scene.edits import read_edits
 from pp_cl.scene.identity import pixel_digest
-from pp_cl.scene.masks import AS_GIVEN, MaskRule
+from pp_cl.scene.kept import KeptViews
+from pp_cl.scene.masks import AS_GIVEN, MaskRule, cut_out
 from pp_cl.scene.readers import co3d, colmap, llff, neus, nsvf, transforms
 from pp_cl.scene.views import (
     MIN_SIDE,
@@ -46,8 +50,9 @@ DEMO = "demo"  # the word that names the scene which the program makes itself
 READERS = (transforms, co3d, neus, nsvf, colmap, llff)
 
 # Bytes per pixel of what reading takes at its peak, measured with 12 megapixels: decoding and a
-# mask, cubic interpolation without distortion, a mask by colour (both in float64)
-DECODED, UNDISTORTED, CUT_OUT = 18, 125, 160
+# mask; a mask by colour of the reduced image, in float64
+DECODED, CUT_OUT = 18, 160
+BAND_COPIES = 2  # BAND_BYTES of a spline's coefficients, and the pixels before and after
 READING_BYTES = 3 * 2**28  # of the photographs that are read side by side
 
 LEAST_FOCAL, MOST_FOCAL = 1e-2, 1e7  # pixels; docs/scenes.md says what is measured
@@ -87,17 +92,27 @@ def open_scene(
     splits: tuple[str, ...],
     most: int | None = None,
     listed: Listed | None = None,
+    kept: KeptViews | None = None,
 ) -> Scene:
     """Scene of config.scene.path with the given splits, reduced config.scene.downscale times;
     `demo` is rendered on the device.
 
-    most, listed: as load_scene() takes them.
+    most, listed, kept: as load_scene() takes them.
     """
     path, downscale = config.scene.path, config.scene.downscale
     if path == DEMO:
         rendered = {split: demo.demo_views(dev, split, most) for split in splits}
         return Scene(DEMO, None, rendered).reduced(downscale)
-    scene = load_scene(path, splits, most, mask_rule(config), downscale=downscale, listed=listed)
+    scene = load_scene(
+        path,
+        splits,
+        most,
+        mask_rule(config),
+        downscale=downscale,
+        listed=listed,
+        dev=dev,
+        kept=kept,
+    )
     views = scene.splits.get("train", [])
     is_box_wanted = most is not None or config.scene.mask_from == "box"
     masked = [view for view in views if view.has_mask]
@@ -180,16 +195,22 @@ def scene_frames(
         lacks = f"; {EDITS} drops some" if dropped else ""
         raise UserError(f"{folder}: split {split} has no photographs{lacks}; add some")
     for one in photographs:
-        _check_lens(folder / one.name, one.camera)
+        _check_lens(folder / one.name, one)
     return photographs
 
 
-def _check_lens(image, camera):
+def _check_lens(image, photograph):
+    camera = photograph.camera
     focal, middle = (camera.fx, camera.fy), (camera.cx, camera.cy)
     if not LEAST_FOCAL <= min(focal) <= max(focal) <= MOST_FOCAL:
         what, least = f"focal lengths of {focal[0]:.3g} and {focal[1]:.3g}", LEAST_FOCAL
     elif not -MOST_FOCAL <= min(middle) <= max(middle) <= MOST_FOCAL:
         what, least = f"its principal point at {middle[0]:.3g}, {middle[1]:.3g}", -MOST_FOCAL
+    elif photograph.distortion.folds(camera):
+        raise UserError(
+            f"{image}: its distortion coefficients fold the image over; correct them, or undistort"
+            " the images with the program that found them"
+        )
     else:
         return
     raise UserError(
@@ -269,14 +290,18 @@ def load_scene(
     *,
     downscale: int | None = None,
     listed: Listed | None = None,
+    dev: Device | None = None,
+    kept: KeptViews | None = None,
 ) -> Scene:
     """Scene of the given splits from a folder; a progress bar shows on a terminal.
 
     most: views to read of each split, spread evenly; None: all. downscale: how many times its
     images are reduced, those of a large scene in part while they are read; None: as they are
     stored. listed: what scene_frames() gave of some splits, so that their files are not read again.
-    Raises UserError naming the file, and the key where there is one, for whatever is missing,
-    broken or contradictory.
+    dev: where distortion is removed; the default device is opened for it where none is given.
+    kept: where images that are reduced while they are read are looked for first. Raises UserError
+    naming the file, and the key where there is one, for whatever is missing, broken or
+    contradictory.
     """
     folder, listed = Path(path), listed or {}
     chosen = {s: evenly(listed.get(s) or scene_frames(folder, s), most) for s in splits}
@@ -286,8 +311,13 @@ def load_scene(
         for one in photographs:
             check_downscale(one.name, one.camera, downscale)
     factor = shrink_factor(_sizes(photographs), downscale or 1)
-    with ThreadPoolExecutor(reading(photographs, masks)[0]) as pool:
-        found = pool.map(lambda one: _read_view(folder, one, masks, factor), photographs)
+    if dev is None and any(one.distortion for one in photographs):
+        dev = open_device()
+    lock = Lock()
+    with ThreadPoolExecutor(reading(photographs, masks, factor)[0]) as pool:
+        found = pool.map(
+            lambda one: _read_view(dev, lock, folder, one, masks, factor, kept), photographs
+        )
         bar = tqdm(
             found, "reading images", len(photographs), unit="image", leave=False, disable=None
         )
@@ -300,19 +330,19 @@ def load_scene(
     return scene.reduced(downscale // factor) if downscale else scene
 
 
-def reading(photographs: Sequence[Photograph], masks: MaskRule = AS_GIVEN) -> tuple[int, int]:
+def reading(
+    photographs: Sequence[Photograph], masks: MaskRule = AS_GIVEN, factor: int = 1
+) -> tuple[int, int]:
     """(how many photographs are read side by side, bytes that this takes beside the images that
-    stay): as many as there are cores, but no more than READING_BYTES hold.
+    stay): as many as there are cores, but no more than READING_BYTES hold. factor: how many times
+    they are reduced meanwhile.
     """
-    is_cut_out = masks.source == "color" and not masks.folder
-    most = max(
-        (CUT_OUT if is_cut_out else UNDISTORTED if one.distortion else DECODED)
-        * one.camera.width
-        * one.camera.height
-        for one in photographs
-    )
+    per_pixel = DECODED + (CUT_OUT / factor**2 if masks.is_by_colour else 0)
+    pixels = max(one.camera.width * one.camera.height for one in photographs)
+    most = math.ceil(per_pixel * pixels)
     workers = max(1, min(os.cpu_count() or 1, READING_BYTES // most, len(photographs)))
-    return workers, workers * most
+    is_bent = any(one.distortion for one in photographs)
+    return workers, workers * most + (BAND_COPIES * BAND_BYTES if is_bent else 0)
 
 
 def _sizes(photographs):
@@ -330,27 +360,35 @@ def _check_alike(folder, photographs):
             )
 
 
-def _read_view(folder, photograph, masks, factor):
-    """The View of a photograph: with its mask, freed of distortion and reduced `factor` times; the
-    digest is of its pixels before that. Raises UserError.
+def _read_view(dev, lock, folder, photograph, masks, factor, kept):
+    """The View of a photograph, with its mask, free of distortion and reduced `factor` times. lock:
+    held by the one of several threads that uses the device. Raises UserError.
     """
-    file, camera, distortion = folder / photograph.name, photograph.camera, photograph.distortion
-    image = read_rgba(file)
-    image = masks.apply(image, photograph.name, photograph.mask and folder / photograph.mask)
-    if distortion.folds(camera):
-        raise UserError(
-            f"{file}: its distortion coefficients fold the image over; correct them, or undistort"
-            " the images with the program that found them"
-        )
-    if distortion:
-        image = undistort(image, camera, distortion)
-    return View(
+    file, camera, lens = folder / photograph.name, photograph.camera, photograph.distortion
+    mask = masks.file(photograph.name, photograph.mask and folder / photograph.mask)
+    found = kept and factor > 1 and kept.find(photograph, [file, mask], (masks, factor))
+    if found:
+        image, digest = found
+    else:
+        image = masks.apply(read_rgba(file), mask)
+        digest = pixel_digest(image, lens)
+        if lens:
+            with lock:
+                image = undistort(dev, image, camera, lens, factor)
+        else:
+            image = shrink(image, factor)
+        if masks.is_by_colour:
+            image = cut_out(image, photograph.name, masks.tolerance)
+    view = View(
         photograph.name,
         camera.downscaled(factor) if factor > 1 else camera,
-        shrink(image, factor),
+        image,
         photograph.depth_range,
-        digest=pixel_digest(image),
+        digest=digest,
         shrunk=factor,
         unshrunk_camera=camera if factor > 1 else None,
-        is_masked=bool(masks.folder or (masks.source == "given" and photograph.mask)),
+        is_masked=mask is not None,
     )
+    if kept and factor > 1 and not found:
+        kept.take(view)
+    return view

@@ -13,7 +13,7 @@ from pp_cl.files.image import read_mask
 from pp_cl.scene.readers.common import mask_names
 
 BORDER_SHARE = 0.5  # of the border's pixels that must have its median colour
-OPAQUE = np.uint8(255)
+OPAQUE = 255
 HOLE = 5e-5  # of the image: smaller regions are none
 EDGE = 2.5  # pixels: the lens and its demosaicing mix no further
 
@@ -31,20 +31,38 @@ class MaskRule:
     folder: str = ""
     tolerance: float = 10.0
 
-    def apply(self, image: np.ndarray, name: str, mask: Path | None) -> np.ndarray:
-        """(H, W, 4) uint8: the image with its mask as alpha.
-
-        image: (H, W, 4) uint8. name: of the photograph, relative to its scene. mask: the file that
-        the format names for it, if it does. Raises UserError naming a mask that is missing, cannot
-        be read or has another size, or a photograph without a uniform border.
+    def file(self, name: str, mask: Path | None) -> Path | None:
+        """The file of a photograph's mask, None where its mask is none of its own. name: of the
+        photograph, relative to its scene. mask: the file that the format names for it, if it does.
+        Raises UserError where it is missing.
         """
         if self.folder:
-            return _with_file(image, named_mask(Path(self.folder), name))
-        if self.source in ("box", "none"):
-            return _with_alpha(image, OPAQUE)
-        if self.source == "color":
-            return cut_out(image, name, self.tolerance)
-        return image if mask is None or self.source == "alpha" else _with_file(image, mask)
+            return named_mask(Path(self.folder), name)
+        return mask if self.source == "given" else None
+
+    @property
+    def is_by_colour(self) -> bool:
+        """Whether cut_out() makes the masks, of the images as they are used: it takes long, and
+        large ones take no better masks.
+        """
+        return self.source == "color" and not self.folder
+
+    def apply(self, image: np.ndarray, mask: Path | None) -> np.ndarray:
+        """The image (H, W, 4) uint8, its alpha overwritten by the mask that file() gives, or by
+        what the rule says without one. Raises UserError naming a mask that cannot be read or has
+        another size.
+        """
+        if mask is not None:
+            alpha = read_mask(mask)
+            if alpha.shape != image.shape[:2]:
+                sizes = "{1}x{0} pixels, but its image has {3}x{2}".format(
+                    *alpha.shape, *image.shape
+                )
+                raise UserError(f"{mask}: {sizes}; make it the image's size")
+            image[..., 3] = alpha
+        elif self.source in ("box", "none"):
+            image[..., 3] = OPAQUE
+        return image
 
 
 AS_GIVEN = MaskRule()
@@ -60,21 +78,6 @@ def named_mask(folder: Path, *names: str) -> Path:
                 return folder / given
     usual = PurePosixPath(names[0]).stem
     raise UserError(f"{folder}: no mask for {names[0]}; add {usual}.png, white where the object is")
-
-
-def _with_file(image, mask):
-    """The image with a mask as alpha. Raises UserError."""
-    alpha = read_mask(mask)
-    if alpha.shape != image.shape[:2]:
-        sizes = "{1}x{0} pixels, but its image has {3}x{2}".format(*alpha.shape, *image.shape)
-        raise UserError(f"{mask}: {sizes}; make it the image's size")
-    return _with_alpha(image, alpha)
-
-
-def _with_alpha(image, alpha):
-    image = image.copy()
-    image[..., 3] = alpha
-    return image
 
 
 def cut_out(image: np.ndarray, name: str, tolerance: float, with_holes: bool = False) -> np.ndarray:

@@ -6,9 +6,10 @@ from collections.abc import Iterator
 import numpy as np
 
 from pp_cl.device.device import Device
-from pp_cl.reference.scene import dilated_mask, distance, kept, target_forward
+from pp_cl.reference.scene import dilated_mask, distance, kept, target_forward, undistorted
 from pp_cl.scene.camera import Camera
 from pp_cl.scene.demo import distances
+from pp_cl.scene.distortion import Distortion, undistort
 from pp_cl.scene.grid import Grid
 from pp_cl.scene.hull import Carver
 from pp_cl.scene.target import Target
@@ -17,6 +18,12 @@ from pp_cl.selftest.case import SIZES, Case, Check, absolute, exact
 
 BORDER = 1e-4  # pixels to a pixel border within which float32 may choose the other pixel
 TARGET = 5e-7  # a few roundings of a float32 in [0, 1]
+ROUNDED = 0.5 + 0.05  # levels: to 8 bits; and 1e-4 pixels, of a place in float32, in steep noise
+LENSES = (
+    Distortion(-0.15, 0.04, 0.004, -0.003, 0.01),
+    Distortion(k1=0.3),
+    Distortion(0.04, -0.02, 0.0, 0.0, 0.01, -0.004, fisheye=True),
+)
 DEMO = 2e-6  # distances of up to 2, by some ten roundings
 
 
@@ -90,6 +97,20 @@ def _target(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
         yield absolute(alpha.get(), hidden, TARGET)
 
 
+def _distortion(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
+    """Noise without distortion, at its size and at a half and a third; a tall image takes several
+    bands.
+    """
+    sizes = [(n, 31) for n in SIZES] + [(33, 257), (1030, 700)]
+    for (width, height), lens in itertools.product(sizes, LENSES):
+        camera = Camera(np.eye(3, 4), 0.9 * height, 0.8 * height, 0.53 * width, 14.2, width, height)
+        image = rng.integers(0, 256, (height, width, 4), np.uint8)
+        image[..., 3] = rng.integers(128, 256, (height, width))
+        for factor in range(1, 2 if width < 3 or height > 300 else 4):
+            found = undistort(dev, image, camera, lens, factor)
+            yield absolute(found, undistorted(image, camera, lens, factor), ROUNDED)
+
+
 def _demo(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
     for n in SIZES:
         for start in ((-0.8, 0.02, 0.1), (-0.5, -0.45, -0.9)):
@@ -102,5 +123,6 @@ CASES = (
     Case("scene: masks", _masks),
     Case("scene: hull", _hull),
     Case("scene: target", _target),
+    Case("scene: distortion", _distortion),
     Case("scene: demo", _demo),
 )

@@ -207,7 +207,7 @@ class Room:
 
     def _planned(self, points, radius, step):
         """radius: of the footprints, pixels of the largest photograph as it is stored."""
-        _, beside = reading(self._photographs, mask_rule(self._config))
+        _, beside = reading(self._photographs, mask_rule(self._config), self._shrunk())
         return Plan(
             self._phases(points, radius, step),
             photographs=kept_bytes(self._sizes, self._shrunk()),

@@ -64,6 +64,25 @@ def test_masks_of_other_programs(tmp_path, rgba):
     assert not read_mask(path).any()
 
 
+def test_colour_noise_and_coloured_rims_are_no_colours(tmp_path, rng):
+    """As JPEG's subsampled colours leave them (NeRD's captures, 36 levels), and programs that blend
+    (DTU as NeuS has it); a quarter of an image in colour is another thing.
+    """
+    y, x = np.mgrid[:600, :800]
+    gray = np.where(np.hypot(y - 300, x - 400) < 200, 255, 0)
+    rim = np.abs(np.hypot(y - 300, x - 400) - 200) < 1
+    noisy = np.dstack([gray] * 3) + rng.integers(-40, 41, (600, 800, 3))
+    noisy[rim] = (250, 120, 60)
+    Image.fromarray(np.clip(noisy, 0, 255).astype(np.uint8)).save(tmp_path / "a.png")
+    assert (read_mask(tmp_path / "a.png") > 127)[~rim].mean() == (gray > 127)[~rim].mean()
+    Image.open(tmp_path / "a.png").save(tmp_path / "a.jpg", quality=75)
+    assert ((read_mask(tmp_path / "a.jpg") > 127) == (gray > 127))[~rim].mean() > 0.99
+    noisy[gray > 127] = (255, 255, 200)
+    Image.fromarray(np.clip(noisy, 0, 255).astype(np.uint8)).save(tmp_path / "a.png")
+    with pytest.raises(UserError, match="has colours"):
+        read_mask(tmp_path / "a.png")
+
+
 def test_sixteen_bits_are_refused(tmp_path, rgba):
     Image.fromarray(rgba[..., 0].astype(np.uint16) * 257).save(tmp_path / "gray.png")
     Image.fromarray(rgba).save(tmp_path / "rgba.png")

@@ -8,8 +8,8 @@ from support.transforms_scenes import refused, write_scene
 from pp_cl.errors import UserError
 from pp_cl.files.image import write_png
 from pp_cl.scene.camera import Camera
-from pp_cl.scene.distortion import Distortion
-from pp_cl.scene.load import load_scene, reading, scene_frames
+from pp_cl.scene.distortion import BAND_BYTES, Distortion
+from pp_cl.scene.load import BAND_COPIES, load_scene, reading, scene_frames
 from pp_cl.scene.masks import MaskRule
 from pp_cl.scene.views import Photograph
 from tools.scene_formats import nerfstudio
@@ -56,23 +56,24 @@ def test_some_views_of_a_split_are_read_and_no_others(tmp_path):
 
 
 @pytest.mark.parametrize(
-    "distortion, source, workers, per_pixel",
+    "distortion, source, factor, workers, per_pixel",
     [
-        (Distortion(), "given", 3, 18),
-        (Distortion(k1=0.1), "given", 1, 125),
-        (Distortion(), "color", 1, 160),
-        (Distortion(k1=0.1), "color", 1, 160),
+        (Distortion(), "given", 1, 3, 18),
+        (Distortion(k1=0.1), "given", 3, 3, 18),
+        (Distortion(), "color", 1, 1, 178),
+        (Distortion(k1=0.1), "color", 4, 2, 28),
     ],
 )
 def test_as_many_photographs_are_read_at_once_as_memory_holds(
-    monkeypatch, distortion, source, workers, per_pixel
+    monkeypatch, distortion, source, factor, workers, per_pixel
 ):
     """12 megapixels of float64 beside one another would take gigabytes on many cores."""
     monkeypatch.setattr("pp_cl.scene.load.os.cpu_count", lambda: 64)
     camera = Camera(np.eye(3, 4), 4000, 4000, 2000, 1500, 4000, 3000)
     phone = Photograph("a.jpg", camera, distortion=distortion)
-    told = reading([phone] * 300, MaskRule(source))
-    assert told == (workers, workers * per_pixel * 12_000_000)
+    told = reading([phone] * 300, MaskRule(source), factor)
+    bands = BAND_COPIES * BAND_BYTES if distortion else 0
+    assert told == (workers, workers * per_pixel * 12_000_000 + bands)
     small = Photograph("b.jpg", camera.downscaled(10))
     assert reading([small] * 300)[0] == 64 and reading([small] * 5)[0] == 5
 
