@@ -5,14 +5,17 @@ in SCENE/capture/STAGE.json, a picture of it in STAGE.png; the same command goes
 import time
 from collections.abc import Callable, Sequence
 from contextlib import contextmanager
+from dataclasses import replace
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from filelock import FileLock, Timeout
 
-from pp_cl.capture import STAGES, box, features, frames, masks, poses, still
+from pp_cl.capture import STAGES, box, features, frames, masks, pinhole, poses, still
 from pp_cl.capture.packages import isolated, needed
+from pp_cl.device.discover import open_device
 from pp_cl.errors import UserError
 from pp_cl.files.atomic import atomic_folder, atomic_path, remove_leftovers, write_json
 from pp_cl.files.contact_sheet import contact_sheet
@@ -26,6 +29,7 @@ from pp_cl.files.manifest import (
     remove_ours,
 )
 from pp_cl.scene.agreement import listing
+from pp_cl.scene.distortion import Distortion
 from pp_cl.scene.edits import read_edits
 from pp_cl.scene.outline import SHOWN_SIZE, SHOWN_VIEWS
 from pp_cl.scene.overview import overview
@@ -36,13 +40,15 @@ from pp_cl.scene.views import evenly, fitting_downscale, shrink
 
 FOLLOWED = 4  # images that show a point: wrong matches are seldom found again in so many
 SHOWN_WIDTH = 1000  # pixels of the pictures of points and cameras
-RESUMED = ("features", "matches", "masks")  # stages that keep what was done when they are stopped
+# stages that keep what was done when they are stopped
+RESUMED = ("features", "matches", "images", "masks")
 # what each stage leaves beside its JSON and its picture, in the scene's folder
 LEFT = {
-    "frames": ("images",),
+    "frames": ("capture/frames",),
     "features": ("capture/inside", *(f"capture/database.db{end}" for end in ("", "-shm", "-wal"))),
     "matches": ("capture/turns",),
     "poses": ("capture/model",),
+    "images": ("images",),
     "box": (),
     "masks": ("masks",),
     "scene": (SINGLE, "sparse", "points.ply"),
@@ -68,6 +74,7 @@ class Capture:
     def __init__(self, scene: Path, given: dict[str, Any], tell: Callable[[str], None]) -> None:
         self.scene, self.given, self.tell = scene, given, tell
         self.work, self.images = scene / "capture", scene / "images"
+        self.frames = self.work / "frames"
         self.database, self.model = self.work / "database.db", self.work / "model"
         self.turns = self.work / "turns"
         self.kept = self.work / "options.json"
@@ -92,7 +99,7 @@ class Capture:
                 first += 1
             done, left = stages[:first], stages[first:]
             mended = self._mended() if "masks" in left else []
-            if mended and "frames" in left and not replace_masks:
+            if mended and "images" in left and not replace_masks:
                 raise UserError(
                     f"{mended[0]}: was made or changed by hand, for images that are made anew; move"
                     " it away, or add --replace-masks"
@@ -194,12 +201,17 @@ class Capture:
     def _file(self, stage):
         return self.work / f"{stage}.json"
 
+    @cached_property
+    def _dev(self):
+        """Where distortion is removed."""
+        return open_device()
+
     # ---- the stages
 
     def _frames(self):
-        found = frames.take_images(self.source, self.images)
+        found = frames.take_images(self.source, self.frames)
         names = [one["name"] for one in evenly(found["images"], SHOWN_VIEWS)]
-        shown = [read_rgba(self.images / name) for name in names]
+        shown = [read_rgba(self.frames / name) for name in names]
         shown = [shrink(one, fitting_downscale(one.shape[:2], SHOWN_SIZE)) for one in shown]
         self._show("frames", contact_sheet(shown, names))
         left_out = [f"{one['source']} {one['reason']}" for one in found["left_out"]]
@@ -212,7 +224,7 @@ class Capture:
         if self.options["turntable"]:
             inside = self._inside([one["name"] for one in taken])
         counts = isolated(
-            self.work, features.find_features, self.database, self.images, taken, inside
+            self.work, features.find_features, self.database, self.frames, taken, inside
         )
         middle = int(np.median(list(counts.values())))
         return {"line": f"{middle} in an image", "counts": counts}
@@ -225,7 +237,7 @@ class Capture:
         try:
             with atomic_folder(folder) as unfinished:
                 for name in names:
-                    mask = masks.uniform_mask(read_rgba(self.images / name), name)
+                    mask = masks.uniform_mask(read_rgba(self.frames / name), name)
                     if mask is None:
                         raise UserError(name)
                     write_png(unfinished / f"{name}.png", mask)
@@ -247,7 +259,7 @@ class Capture:
         taken = self._found("frames")["images"]
         turns = self._found("matches")["turns"]
         found = isolated(
-            self.work, poses.place, self.database, self.images, self.model, taken, turns
+            self.work, poses.place, self.database, self.frames, self.model, taken, turns
         )
         model = needed("pycolmap").Reconstruction(self.model)
         self._show("poses", _seen_from_outside(model, None))
@@ -257,6 +269,13 @@ class Capture:
             f" error {found['error']:.2f} pixels"
         )
         return {"line": line + _left_out(unplaced, "without a place"), **found}
+
+    def _images(self):
+        model = needed("pycolmap").Reconstruction(self.model)
+        taken = poses.photographs(model, "images")
+        made = pinhole.write_images(self._dev, self.frames, self.images, taken)
+        kept = f", {len(taken) - made} of them before" if made < len(taken) else ""
+        return {"line": f"{len(taken)} without distortion{kept}"}
 
     def _box(self):
         model = needed("pycolmap").Reconstruction(self.model)
@@ -278,11 +297,16 @@ class Capture:
     def _masks(self):
         model, corners = self._world()
         given, dropped = self.options["masks"], read_edits(self.scene).dropped
-        photographs, folder = poses.photographs(model, "images"), self.scene / "masks"
+        taken = {one.name: one for one in poses.photographs(model, "images")}
+        photographs = [replace(one, distortion=Distortion()) for one in taken.values()]
+        folder = self.scene / "masks"
         points, seen = poses.points(model, FOLLOWED)
         kept = [i for i, one in enumerate(photographs) if one.name not in dropped]
-        taken = self._found("frames")["images"] if self.source.is_dir() else []
-        sources = {one["name"]: one["source"] for one in taken}
+        files = self._found("frames")["images"] if self.source.is_dir() else []
+        sources = {one["name"]: one["source"] for one in files}
+
+        def fitted(name, mask):
+            return pinhole.undistorted_mask(self._dev, mask, taken[name])
 
         def write(chosen):
             return masks.write_masks(
@@ -294,6 +318,7 @@ class Capture:
                 [seen[i] for i in chosen],
                 given=given and Path(given),
                 sources=sources,
+                fitted=fitted,
                 command=self.options["mask_command"],
                 turns=self._found("matches")["turns"],
             )
@@ -312,10 +337,10 @@ class Capture:
                 "file_path": one.name,
                 "mask_path": masks.mask_file(Path("masks"), one.name).as_posix(),
                 **frame_keys(one.camera),
-                "k1": one.distortion.k1,
             }
             for one in found
         ]
+        pinhole.undistort_model(model)
         with atomic_folder(self.scene / "sparse") as unfinished:
             (unfinished / "0").mkdir()
             model.write(unfinished / "0")
