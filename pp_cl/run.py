@@ -2,7 +2,6 @@
 
 import math
 import os
-import shutil
 import time
 import warnings
 from collections.abc import Callable, Iterator, Sequence
@@ -21,6 +20,7 @@ from pp_cl.errors import UserError
 from pp_cl.files.atomic import check_writable, remove_leftovers, write_json
 from pp_cl.files.contact_sheet import write_comparison
 from pp_cl.files.image import to_8bit, write_png
+from pp_cl.files.manifest import begin_manifest, check_ours, has_manifest, remove_ours
 from pp_cl.files.picture import Picture, mean_picture
 from pp_cl.files.run_folder import RunFolder
 from pp_cl.layers.choice import ConvolutionPolicy, load_policy
@@ -235,7 +235,7 @@ def load(
 
 
 SHOWN_VIEWS = 4  # rows of the comparison image
-MARK = ".evaluation"  # file in a folder that evaluations may replace
+MOVE = "move it away, or choose another --out"
 
 
 class Rendered(NamedTuple):
@@ -290,20 +290,21 @@ def evaluate(
     place of what an earlier evaluation left. published: put published results beside also where
     they were measured on other views or sizes. on_view: called after each view with the number of
     those measured and of all. Raises UserError for a missing or broken split, a folder that may not
-    be written, and an `out` that holds something else than an evaluation.
+    be written, an `out` that holds something else than an evaluation, and a file in the place of
+    one that it writes which no evaluation has written as it is now.
     """
     target = run.folder.evaluation(split) if out is None else Path(out)
     _check_target(target, is_new=out is not None)
     scene = run.scene(split)
     views = scene.splits[split]
+    images = [target / "images" / file for file in image_files([view.name for view in views])]
+    if save_images:
+        check_ours(images, MOVE)
     measure = Metrics(run.dev, metrics, run.policy)
-    target.mkdir(parents=True, exist_ok=True)
-    if out is not None:
-        (target / MARK).touch()
+    begin_manifest(target)
     remove_leftovers(target)
-    if save_images and (target / "images").exists():
-        shutil.rmtree(target / "images")
-    files = image_files([view.name for view in views])
+    if save_images:
+        remove_ours((target / "images").rglob("*"))
     rows: list[dict[str, Any]] = []
     costs, shown = [], []
     for i, rendered in enumerate(render_views(run, views)):
@@ -316,9 +317,8 @@ def evaluate(
         if i in {len(views) * row // SHOWN_VIEWS for row in range(SHOWN_VIEWS)}:
             shown.append((image, truth))
         if save_images:
-            path = target / "images" / files[i]
-            path.parent.mkdir(parents=True, exist_ok=True)
-            write_png(path, image)
+            images[i].parent.mkdir(parents=True, exist_ok=True)
+            write_png(images[i], image)
         on_view(i + 1, len(views))
     means = mean([{name: row[name] for name in metrics} for row in rows])
     result = {"split": split, "device": run.dev.name, "mean": means, "per_image": rows}
@@ -332,13 +332,14 @@ def evaluate(
 
 def _check_target(target, *, is_new):
     """Raise UserError where an evaluation cannot be written into a folder. is_new: nor if it holds
-    files of others, of which images/ would be removed.
+    files and no evaluation.
     """
     if target.exists() and not target.is_dir():
         raise UserError(f"{target}: is not a folder; choose another --out")
     check_writable(target)
-    if is_new and target.exists() and not (target / MARK).exists() and any(target.iterdir()):
+    if is_new and target.exists() and not has_manifest(target) and any(target.iterdir()):
         raise UserError(f"{target}: holds other files; choose a new or empty folder for --out")
+    check_ours([target / "metrics.json", target / "comparison.png"], MOVE)
 
 
 def _published(scene, split, views, *, anyway):

@@ -266,9 +266,10 @@ def open_training(
     A finished training is extended to config.train.iterations: as if it had been asked for them
     from its beginning, if its checkpoint holds its state, else with new moments and without
     refinements. Raises UserError for a scene or checkpoint that does not fit, for too little
-    memory, and for a folder that may not be written.
+    memory, for a folder that may not be written, and for pictures in it that would be lost.
     """
     check_writable(folder.path)
+    folder.check_pictures(stored[0]["step"] if stored else 0)
     tolerance, begun, goal = config.network.tolerance, 0, config
     if stored is None:
         policy = load_policy(dev, tolerance)

@@ -12,7 +12,7 @@ from support.scenes import write_ball_scene
 
 from pp_cl import load
 from pp_cl.cli import main
-from pp_cl.files.image import read_rgba
+from pp_cl.files.image import read_rgba, write_png
 from pp_cl.metrics.psnr_ssim import psnr
 from pp_cl.run import image_files, render_views
 
@@ -59,13 +59,17 @@ def test_views_are_drawn_one_at_a_time(run, monkeypatch):
 
 
 def test_what_an_earlier_evaluation_left_goes_with_the_next(run):
-    stale = run / "eval" / "images" / "cam0" / "r_7.png"
-    killed = run / "eval" / "images" / f".r_0.png.{2**22 + 1}.tmp"
+    """Though not what is the user's."""
+    stale, own = run / "eval" / "images" / "cam0" / "r_7.png", run / "eval" / "images" / "own.png"
+    killed = run / "eval" / "images" / f".r_0.png.{2**22 + 1}.pp-cl.tmp"
     stale.parent.mkdir(parents=True, exist_ok=True)
-    for file in (stale, killed):
+    write_png(stale, np.zeros((8, 8, 3)))
+    for file in (own, killed):
         file.write_bytes(b"")
     assert main(["eval", str(run), "--save-images"]) == 0
-    assert [p.name for p in sorted((run / "eval" / "images").rglob("*"))] == ["r_0.png", "r_1.png"]
+    left = [p.name for p in sorted((run / "eval" / "images").rglob("*"))]
+    assert left == ["own.png", "r_0.png", "r_1.png"]
+    own.unlink()
 
 
 @pytest.mark.parametrize(
@@ -147,8 +151,10 @@ def test_an_unfinished_run_is_marked(tmp_path, capsys, monkeypatch):
 
 
 def files_of(folder):
-    """{path: bytes} of all files below a folder, the time of metrics.json left out."""
-    files = {p.relative_to(folder).as_posix(): p.read_bytes() for p in folder.rglob("*.*")}
+    """{path: bytes} of all files below a folder, the time of metrics.json and what is hidden left
+    out.
+    """
+    files = {p.relative_to(folder).as_posix(): p.read_bytes() for p in folder.rglob("[!.]*.*")}
     if "metrics.json" in files:
         result = json.loads(files["metrics.json"])
         files["metrics.json"] = {**result, "seconds_per_frame": None}
@@ -164,7 +170,6 @@ def test_an_evaluation_is_written_elsewhere_on_request(run, tmp_path, capsys):
     assert f"wrote {out / 'metrics.json'}" in capsys.readouterr().out and files_of(copy) == before
     first = files_of(out)
     assert main(["eval", str(copy), "--save-images"]) == 0
-    assert files_of(copy / "eval") == {k: v for k, v in first.items() if k != ".evaluation"}
-    (out / "images" / "old.png").write_bytes(b"")
+    assert files_of(copy / "eval") == first
     assert main(["eval", str(copy), "--save-images", "--out", str(out)]) == 0
     assert files_of(out) == first

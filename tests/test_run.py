@@ -92,7 +92,7 @@ def test_a_folder_has_one_training_at_a_time(scene, tmp_path, capsys):
         assert f"{out}: process {os.getpid()} on {socket.gethostname()} trains into it" in error
     assert not (out / "config.json").exists(), "nothing was written beside the owner's"
     assert main(arguments(scene, out, train__iterations=2)) == 0
-    assert not (out / ".owner").exists()
+    assert not (out / ".pp-cl.owner").exists()
 
 
 def test_a_killed_owner_owns_nothing_any_more(scene, tmp_path):
@@ -106,7 +106,7 @@ def test_a_killed_owner_owns_nothing_any_more(scene, tmp_path):
         assert process.poll() is None, "the second start ended the first"
         process.kill()
     with RunFolder(out).owned():
-        assert (out / ".owner").read_text().startswith(f"process {os.getpid()} ")
+        assert (out / ".pp-cl.owner").read_text().startswith(f"process {os.getpid()} ")
 
 
 def test_a_folder_that_went_on_since_it_was_looked_at(scene, tmp_path, monkeypatch):

@@ -6,6 +6,7 @@ STAGES = {
     "features": "what can be found again in other images",
     "matches": "pairs of images that show the same",
     "poses": "where each image was taken",
+    "images": "the photographs without the distortion of their lens",
     "box": "what the cameras look at",
     "masks": "the object in each image",
     "scene": "transforms.json, COLMAP's model in sparse/0, points.ply",

@@ -1,6 +1,7 @@
 """Features of the images and their matches, by pycolmap on the CPU, kept in its database."""
 
 import os
+import tempfile
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from itertools import combinations, groupby
@@ -152,19 +153,19 @@ def match(database: Path, is_film: bool) -> int:
         bar = tqdm(total=len(pairs), desc="matches", unit="pair", leave=False, disable=None)
         bar.update(len(pairs) - len(missing))
         matching = colmap.FeatureMatchingOptions(use_gpu=False, num_threads=cores())
-        listed = database.with_name("pairs.txt")
-        while missing:
-            some, missing = missing[:PAIRS_AT_ONCE], missing[PAIRS_AT_ONCE:]
-            listed.write_text("".join(f"{a} {b}\n" for a, b in some), "utf-8")
-            colmap.match_image_pairs(
-                database,
-                matching,
-                colmap.ImportedPairingOptions(match_list_path=listed),
-                verification(colmap),
-            )
-            bar.update(len(some))
+        with tempfile.TemporaryDirectory(prefix="pp-cl-") as folder:
+            listed = Path(folder) / "pairs.txt"
+            while missing:
+                some, missing = missing[:PAIRS_AT_ONCE], missing[PAIRS_AT_ONCE:]
+                listed.write_text("".join(f"{a} {b}\n" for a, b in some), "utf-8")
+                colmap.match_image_pairs(
+                    database,
+                    matching,
+                    colmap.ImportedPairingOptions(match_list_path=listed),
+                    verification(colmap),
+                )
+                bar.update(len(some))
         bar.close()
-        listed.unlink(missing_ok=True)
         return db.num_verified_image_pairs()
 
 

@@ -5,7 +5,7 @@ program of the user's; else cut out by colour around the sparse points and voted
 import shlex
 import subprocess
 import tempfile
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -21,7 +21,6 @@ from pp_cl.errors import UserError, shown
 from pp_cl.files.contact_sheet import contact_sheet
 from pp_cl.files.image import read_mask, read_rgba, write_png
 from pp_cl.scene.agreement import disagreements, listing
-from pp_cl.scene.distortion import undistort
 from pp_cl.scene.masks import MaskRule, cut_out, named_mask
 from pp_cl.scene.outline import OUTLINE, SHOWN_SIZE, SHOWN_VIEWS
 from pp_cl.scene.views import Photograph, View, evenly, fitting_downscale, shrink
@@ -52,6 +51,7 @@ def write_masks(
     *,
     given: Path | None = None,
     sources: Mapping[str, str] | None = None,
+    fitted: Callable[[str, np.ndarray], np.ndarray] = lambda _, mask: mask,
     command: str | None = None,
     turns: bool = False,
 ) -> tuple[str, list[str]]:
@@ -59,12 +59,14 @@ def write_masks(
     lies there is kept, and helps to make the others. Returns one line on what was done, and the
     names of photographs whose masks contradict the others, the worst first.
 
-    scene: the folder that the photographs' names are relative to. box: (2, 3) around the object.
-    points: (N, 3) in the scene's world. seen: for each photograph the indices (M,) of the points
-    that it shows. given: a folder of masks, which may be named like the photographs' sources, as
-    {name: source} has them. command: of a program that makes masks, which {image} and {mask} stand
-    for. turns: the object turns before a background that stands still. Raises UserError for masks
-    that are given and missing or broken, a program that fails, a box in which nothing is seen.
+    scene: the folder that the photographs' names are relative to; their images have no distortion.
+    box: (2, 3) around the object. points: (N, 3) in the scene's world. seen: for each photograph
+    the indices (M,) of the points that it shows. given: a folder of masks of the photographs as
+    they were taken, which may be named like the photographs' sources, as {name: source} has them;
+    fitted(name, mask) is such a mask, (H, W) uint8, for the image. command: of a program that makes
+    masks, which {image} and {mask} stand for. turns: the object turns before a background that
+    stands still. Raises UserError for masks that are given and missing or broken, a program that
+    fails, a box in which nothing is seen.
     """
     words = None if command is None else program_words(command)
     folder.mkdir(parents=True, exist_ok=True)
@@ -75,7 +77,7 @@ def write_masks(
     )
     beside = {one.name for one in photographs} - {photographs[i].name for i in shown}
     for one in tqdm(left, "masks", unit="image", leave=False, disable=None):
-        source, mask = _found(scene, one, given, sources or {}, words)
+        source, mask = _found(scene, one, given, sources or {}, fitted, words)
         if mask is None and one.name in beside:  # as films have, where they begin or end
             source = "empty, as the object is outside"
             mask = np.zeros((one.camera.height, one.camera.width), np.uint8)
@@ -103,7 +105,7 @@ def _without_mask(folder, photographs):
     return [one for one in photographs if not mask_file(folder, one.name).is_file()]
 
 
-def _found(scene, photograph, given, sources, words):
+def _found(scene, photograph, given, sources, fitted, words):
     """(where from, (H, W) uint8 mask) of a photograph that has one without the others; (none, None)
     if it has not.
     """
@@ -113,7 +115,7 @@ def _found(scene, photograph, given, sources, words):
     if given is not None:
         name = Path(photograph.name).name
         mask = named_mask(given, sources.get(name, name), name)
-        return "given", MaskRule().apply(image, mask)[..., 3]
+        return "given", fitted(photograph.name, MaskRule().apply(image, mask)[..., 3])
     if words is not None:
         return "by the program", _of_program(words, scene / photograph.name, image.shape[:2])
     if (image[..., 3] < 255).any():
@@ -274,8 +276,5 @@ def _contradicting(scene, folder, photographs, box):
         mask = read_mask(mask_file(folder, one.name))
         factor = fitting_downscale(mask.shape, CHECKED_SIDE)
         image = shrink(np.dstack([mask] * 4), factor)
-        camera = one.camera.downscaled(factor)
-        if one.distortion:
-            image = undistort(image, camera, one.distortion)
-        views.append(View(one.name, camera, image))
+        views.append(View(one.name, one.camera.downscaled(factor), image))
     return {one.view.name: one.share for one in disagreements(views, box)}

@@ -2,22 +2,34 @@
 in SCENE/capture/STAGE.json, a picture of it in STAGE.png; the same command goes on after these.
 """
 
-import shutil
 import time
 from collections.abc import Callable, Sequence
 from contextlib import contextmanager
+from dataclasses import replace
+from functools import cached_property
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from filelock import FileLock, Timeout
 
-from pp_cl.capture import STAGES, box, features, frames, masks, poses, still
+from pp_cl.capture import STAGES, box, features, frames, masks, pinhole, poses, still
 from pp_cl.capture.packages import isolated, needed
+from pp_cl.device.discover import open_device
 from pp_cl.errors import UserError
 from pp_cl.files.atomic import atomic_folder, atomic_path, remove_leftovers, write_json
 from pp_cl.files.contact_sheet import contact_sheet
 from pp_cl.files.image import read_rgba, write_png
+from pp_cl.files.manifest import (
+    begin_manifest,
+    check_ours,
+    has_manifest,
+    note_in_place,
+    ours,
+    remove_ours,
+)
 from pp_cl.scene.agreement import listing
+from pp_cl.scene.distortion import Distortion
 from pp_cl.scene.edits import read_edits
 from pp_cl.scene.outline import SHOWN_SIZE, SHOWN_VIEWS
 from pp_cl.scene.overview import overview
@@ -28,52 +40,97 @@ from pp_cl.scene.views import evenly, fitting_downscale, shrink
 
 FOLLOWED = 4  # images that show a point: wrong matches are seldom found again in so many
 SHOWN_WIDTH = 1000  # pixels of the pictures of points and cameras
-RESUMED = ("features", "matches", "masks")  # stages that keep what was done when they are stopped
-# what each stage leaves beside its JSON, in the scene's folder
+# stages that keep what was done when they are stopped
+RESUMED = ("features", "matches", "images", "masks")
+# what each stage leaves beside its JSON and its picture, in the scene's folder
 LEFT = {
-    "frames": ("images",),
-    "features": (
-        "capture/inside",
-        "capture/database.db",
-        "capture/database.db-shm",
-        "capture/database.db-wal",
-    ),
+    "frames": ("capture/frames",),
+    "features": ("capture/inside", *(f"capture/database.db{end}" for end in ("", "-shm", "-wal"))),
     "matches": ("capture/turns",),
     "poses": ("capture/model",),
+    "images": ("images",),
     "box": (),
     "masks": ("masks",),
     "scene": (SINGLE, "sparse", "points.ply"),
 }
+CHANGING = (*LEFT["features"][1:], *LEFT["matches"])  # in place
+# {option: (the stage that depends on it, what it is where it is not given)}
+OPTIONS: dict[str, tuple[str, Any]] = {
+    "source": ("frames", None),
+    "turntable": ("features", False),
+    "box": ("box", None),
+    "masks": ("masks", None),
+    "mask_command": ("masks", None),
+}
 
 
 class Capture:
-    """A capture in progress: what it is made from, and the folder of its scene.
+    """A capture in progress in the folder of a scene.
 
-    given: the options that a stage depends on. tell: prints a line of a stage.
+    given: {name: value} of the OPTIONS that are given; others are as in the captures before. tell:
+    prints a line of a stage.
     """
 
-    def __init__(self, source: Path, scene: Path, given: dict, tell: Callable[[str], None]) -> None:
-        self.source, self.scene, self.given, self.tell = source, scene, given, tell
+    def __init__(self, scene: Path, given: dict[str, Any], tell: Callable[[str], None]) -> None:
+        self.scene, self.given, self.tell = scene, given, tell
         self.work, self.images = scene / "capture", scene / "images"
+        self.frames = self.work / "frames"
         self.database, self.model = self.work / "database.db", self.work / "model"
         self.turns = self.work / "turns"
+        self.kept = self.work / "options.json"
+        self.options: dict[str, Any] = {}
 
-    def run(self, begin: str | None = None) -> None:
-        """Do all stages that are not done, or one of them and all after it. Raises UserError."""
+    @property
+    def source(self) -> Path:
+        """The photographs or the film."""
+        return Path(self.options["source"])
+
+    def run(self, begin: str | None = None, *, replace_masks: bool = False) -> None:
+        """Do all stages that are not done, or one of them and all after it, and those that depend
+        on an option that has changed. Masks that the user has changed are kept, or replaced, too.
+        Raises UserError, before anything is removed, where a file of the user's would be lost.
+        """
         with self._locked():
+            changed = self._take_options(begin)
+            anew = {begin, *(OPTIONS[name][0] for name in changed)}
+            anew |= {"masks"} if replace_masks else set()
+            stages, first = list(STAGES), 0
+            while first < len(stages) and not self._is_due(stages[first], anew):
+                first += 1
+            done, left = stages[:first], stages[first:]
+            mended = self._mended() if "masks" in left else []
+            if mended and "images" in left and not replace_masks:
+                raise UserError(
+                    f"{mended[0]}: was made or changed by hand, for images that are made anew; move"
+                    " it away, or add --replace-masks"
+                )
+            files = {stage: self._files(stage) for stage in left}
+            for stage in left:
+                check_ours(files[stage])
+            note_in_place(self.scene, [self.scene / name for name in CHANGING])
             remove_leftovers(self.scene)
-            first, stages = self._first(begin), list(STAGES)
-            for stage in reversed(stages[first:]):
-                if stage not in RESUMED or stage != stages[first] or self._file(stage).is_file():
-                    self._undo(stage)
-            for stage in stages[:first]:
+            for path in mended if replace_masks else ():
+                path.unlink()
+            for stage in reversed(left):
+                if stage != stages[first] or stage in anew or stage not in RESUMED:
+                    if stage == "matches" and self.database.exists():
+                        features.forget_matches(self.database)
+                    remove_ours(files[stage])
+            if changed or not self.kept.exists():
+                write_json(self.kept, self.options)
+            for stage in done:
                 new = self._new() if stage == "frames" else ""
                 self.tell(f"{stage}: {self._found(stage)['line']} (done before{new})")
-            for stage in stages[first:]:
+            for name in changed:
+                self.tell(f"{_option(name)} is another than before: {OPTIONS[name][0]} and on anew")
+            for stage in left:
                 start = time.monotonic()
                 found = getattr(self, f"_{stage}")()
-                write_json(self._file(stage), {"given": self._given(stage), "found": found})
+                write_json(self._file(stage), found)
                 self.tell(f"{stage}: {found['line']} ({time.monotonic() - start:.0f} s)")
+
+    def _is_due(self, stage, anew):
+        return stage in anew or not self._file(stage).is_file()
 
     def _new(self):
         """What photographs have come since they were taken, in words."""
@@ -86,64 +143,75 @@ class Capture:
     @contextmanager
     def _locked(self):
         """While it is entered, no other process captures into the folder, which is made."""
-        if self.scene.exists() and not self.work.exists() and any(self.scene.iterdir()):
+        if self.scene.exists() and not has_manifest(self.scene) and any(self.scene.iterdir()):
             raise UserError(f"{self.scene}: exists already; choose a new or empty folder")
         try:
-            self.work.mkdir(parents=True, exist_ok=True)
-            lock = FileLock(self.work / ".lock", timeout=0)
-            with lock:
+            begin_manifest(self.scene)
+            self.work.mkdir(exist_ok=True)
+            with FileLock(self.work / ".pp-cl.lock", timeout=0):
                 yield
         except Timeout:
             raise UserError(f"{self.scene}: another process captures into it; wait") from None
 
-    def _given(self, stage):
-        """The options on which a stage's result depends."""
-        given = {"frames": {"source": str(self.source.resolve())}}
-        return given.get(stage) or self.given.get(stage, {})
+    def _take_options(self, begin):
+        """Fill in the options of this capture; returns the names of those that have changed."""
+        before = {name: value for name, (_, value) in OPTIONS.items()}
+        self.options = before | self.given
+        if not self.kept.exists():
+            return []
+        before = read_json(self.kept)
+        if not isinstance(before, dict) or before.keys() != OPTIONS.keys():
+            raise UserError(
+                f"{self.kept}: does not have the options {', '.join(OPTIONS)}; delete it, and give"
+                " them again"
+            )
+        self.options = before | self.given
+        changed = [name for name in OPTIONS if self.options[name] != before[name]]
+        if "source" in changed and begin != "frames" and self._file("frames").is_file():
+            raise UserError(
+                f"{self.scene}: was made from {before['source']}; choose another --out, or begin"
+                " anew with --from frames"
+            )
+        return changed
 
-    def _first(self, begin):
-        """The number of the first stage to be done."""
-        for number, stage in enumerate(STAGES):
-            if stage == begin or not self._file(stage).is_file():
-                return number
-            before = read_json(self._file(stage))["given"]
-            if before != self._given(stage):
-                if stage == "frames":
-                    raise UserError(
-                        f"{self.scene}: was made from {before['source']}; choose another --out, or"
-                        " begin anew with --from frames"
-                    )
-                return number
-        return len(STAGES)
+    def _files(self, stage):
+        """What a stage has left, and what else lies in its folders, but for masks of others. Its
+        JSON comes first: without it the stage is not done.
+        """
+        found = [self._file(stage), self._file(stage).with_suffix(".png")]
+        for path in (self.scene / name for name in LEFT[stage]):
+            inside = path.rglob("*") if path.is_dir() else [path]
+            inside = [one for one in inside if one.is_symlink() or not one.is_dir()]
+            found += ours(inside) if stage == "masks" else inside
+        return found
 
-    def _undo(self, stage):
-        """Remove what a stage has left."""
-        self._file(stage).unlink(missing_ok=True)
-        self._file(stage).with_suffix(".png").unlink(missing_ok=True)
-        if stage == "matches" and self.database.exists():
-            features.forget_matches(self.database)
-        for name in LEFT[stage]:
-            path = self.scene / name
-            if path.is_dir():
-                shutil.rmtree(path)
-            else:
-                path.unlink(missing_ok=True)
+    def _mended(self):
+        """The masks of the images that the user has made or changed, which are kept."""
+        taken = self._found("frames")["images"] if self._file("frames").is_file() else []
+        named = [masks.mask_file(self.scene / "masks", one["name"]) for one in taken]
+        there = [path for path in named if path.is_file()]
+        return sorted(set(there) - set(ours(there)))
 
     def _show(self, stage, picture):
         write_png(self._file(stage).with_suffix(".png"), picture)
 
     def _found(self, stage):
-        return read_json(self._file(stage))["found"]
+        return read_json(self._file(stage))
 
     def _file(self, stage):
         return self.work / f"{stage}.json"
 
+    @cached_property
+    def _dev(self):
+        """Where distortion is removed."""
+        return open_device()
+
     # ---- the stages
 
     def _frames(self):
-        found = frames.take_images(self.source, self.images)
+        found = frames.take_images(self.source, self.frames)
         names = [one["name"] for one in evenly(found["images"], SHOWN_VIEWS)]
-        shown = [read_rgba(self.images / name) for name in names]
+        shown = [read_rgba(self.frames / name) for name in names]
         shown = [shrink(one, fitting_downscale(one.shape[:2], SHOWN_SIZE)) for one in shown]
         self._show("frames", contact_sheet(shown, names))
         left_out = [f"{one['source']} {one['reason']}" for one in found["left_out"]]
@@ -153,10 +221,10 @@ class Capture:
     def _features(self):
         taken = self._found("frames")["images"]
         inside = None
-        if self.given["features"]["turntable"]:
+        if self.options["turntable"]:
             inside = self._inside([one["name"] for one in taken])
         counts = isolated(
-            self.work, features.find_features, self.database, self.images, taken, inside
+            self.work, features.find_features, self.database, self.frames, taken, inside
         )
         middle = int(np.median(list(counts.values())))
         return {"line": f"{middle} in an image", "counts": counts}
@@ -169,7 +237,7 @@ class Capture:
         try:
             with atomic_folder(folder) as unfinished:
                 for name in names:
-                    mask = masks.uniform_mask(read_rgba(self.images / name), name)
+                    mask = masks.uniform_mask(read_rgba(self.frames / name), name)
                     if mask is None:
                         raise UserError(name)
                     write_png(unfinished / f"{name}.png", mask)
@@ -180,7 +248,7 @@ class Capture:
     def _matches(self):
         is_film = not self.source.is_dir()
         pairs = isolated(self.work, features.match, self.database, is_film)
-        turntable = self.given["features"]["turntable"]
+        turntable = self.options["turntable"]
         turns = isolated(self.work, still.remove_still, self.database, self.turns, turntable)
         line = f"{pairs} pairs of images"
         if turns:
@@ -191,7 +259,7 @@ class Capture:
         taken = self._found("frames")["images"]
         turns = self._found("matches")["turns"]
         found = isolated(
-            self.work, poses.place, self.database, self.images, self.model, taken, turns
+            self.work, poses.place, self.database, self.frames, self.model, taken, turns
         )
         model = needed("pycolmap").Reconstruction(self.model)
         self._show("poses", _seen_from_outside(model, None))
@@ -202,11 +270,18 @@ class Capture:
         )
         return {"line": line + _left_out(unplaced, "without a place"), **found}
 
+    def _images(self):
+        model = needed("pycolmap").Reconstruction(self.model)
+        taken = poses.photographs(model, "images")
+        made = pinhole.write_images(self._dev, self.frames, self.images, taken)
+        kept = f", {len(taken) - made} of them before" if made < len(taken) else ""
+        return {"line": f"{len(taken)} without distortion{kept}"}
+
     def _box(self):
         model = needed("pycolmap").Reconstruction(self.model)
         cameras = [one.camera for one in poses.photographs(model, "images")]
         world = box.find_world(cameras, poses.points(model)[0])
-        corners = self.given["box"]["box"]
+        corners = self.options["box"]
         chosen = world.box if corners is None else np.sort(np.reshape(corners, (2, 3)), axis=0)
         size = " x ".join(f"{side:.2f}" for side in np.ptp(chosen, axis=0))
         _move(model, world.scale, world.rotation, world.shift)
@@ -221,12 +296,17 @@ class Capture:
 
     def _masks(self):
         model, corners = self._world()
-        given, dropped = self.given["masks"], read_edits(self.scene).dropped
-        photographs, folder = poses.photographs(model, "images"), self.scene / "masks"
+        given, dropped = self.options["masks"], read_edits(self.scene).dropped
+        taken = {one.name: one for one in poses.photographs(model, "images")}
+        photographs = [replace(one, distortion=Distortion()) for one in taken.values()]
+        folder = self.scene / "masks"
         points, seen = poses.points(model, FOLLOWED)
         kept = [i for i, one in enumerate(photographs) if one.name not in dropped]
-        taken = self._found("frames")["images"] if self.source.is_dir() else []
-        sources = {one["name"]: one["source"] for one in taken}
+        files = self._found("frames")["images"] if self.source.is_dir() else []
+        sources = {one["name"]: one["source"] for one in files}
+
+        def fitted(name, mask):
+            return pinhole.undistorted_mask(self._dev, mask, taken[name])
 
         def write(chosen):
             return masks.write_masks(
@@ -236,9 +316,10 @@ class Capture:
                 corners,
                 points,
                 [seen[i] for i in chosen],
-                given=given["masks"] and Path(given["masks"]),
+                given=given and Path(given),
                 sources=sources,
-                command=given["command"],
+                fitted=fitted,
+                command=self.options["mask_command"],
                 turns=self._found("matches")["turns"],
             )
 
@@ -256,10 +337,10 @@ class Capture:
                 "file_path": one.name,
                 "mask_path": masks.mask_file(Path("masks"), one.name).as_posix(),
                 **frame_keys(one.camera),
-                "k1": one.distortion.k1,
             }
             for one in found
         ]
+        pinhole.undistort_model(model)
         with atomic_folder(self.scene / "sparse") as unfinished:
             (unfinished / "0").mkdir()
             model.write(unfinished / "0")
@@ -284,6 +365,11 @@ class Capture:
         _move(model, found["scale"], np.array(found["rotation"]), np.array(found["shift"]))
         edited = read_edits(self.scene).box
         return model, np.array(found["box"]) if edited is None else edited
+
+
+def _option(name):
+    """What an option is called on the command line."""
+    return "INPUT" if name == "source" else f"--{name.replace('_', '-')}"
 
 
 def _move(model, scale, rotation, shift):

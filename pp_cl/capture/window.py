@@ -9,15 +9,12 @@ from pp_cl.capture.packages import needed
 from pp_cl.errors import UserError
 from pp_cl.scene.bounds import corners_of
 from pp_cl.scene.camera import Camera
-from pp_cl.scene.distortion import Distortion
 from pp_cl.scene.views import Photograph
 
 cv2 = needed("cv2")
 
 CUT_SIDE = 400  # pixels of what is cut: the projected box and what is around it
 AROUND = 0.2  # of the projected box, on each side: shows what the background looks like
-BEYOND = 0.5  # of an image's size: further out a lens model says nothing
-INVERTED = 8  # steps of the search for the direction that a lens puts into a pixel
 
 
 @dataclass(eq=False)
@@ -31,36 +28,21 @@ class Window:
     name: str
     image: np.ndarray
     camera: Camera
-    distortion: Distortion
     place: tuple[int, int, int, int]
     mask: Any = None
 
     def pixels(self, positions: np.ndarray) -> np.ndarray:
-        """(N, 2) x and y of world positions (N, 3); NaN far outside the image."""
+        """(N, 2) x and y of world positions (N, 3); NaN behind the camera."""
         c = self.camera
         right, down, depth = c.pose[:, :3].T @ (positions - c.eye).T
         depth = np.where(depth > 0, depth, np.nan)
-        x, y = right / depth, down / depth
-        if self.distortion:
-            far_x, far_y = (
-                np.abs(f * v + m - n / 2) > (0.5 + BEYOND) * n * scale
-                for f, v, m, n, scale in (
-                    (c.fx, x, c.cx, c.width, 1),
-                    (c.fy, y, c.cy, c.height, 1),
-                )
-            )
-            x, y = self.distortion.apply(*(np.where(far_x | far_y, np.nan, v) for v in (x, y)))
-        return np.stack([c.fx * x + c.cx, c.fy * y + c.cy], axis=1)
+        return np.stack([c.fx * right / depth + c.cx, c.fy * down / depth + c.cy], axis=1)
 
     def directions(self, x: np.ndarray, y: np.ndarray) -> np.ndarray:
         """(..., 3) along the camera's axes, of depth 1, of pixels x and y."""
         c = self.camera
-        wanted = np.stack([(x - c.cx) / c.fx, (y - c.cy) / c.fy])
-        found = wanted
-        if self.distortion:
-            for _ in range(INVERTED):
-                found = found + wanted - self.distortion.apply(*found)
-        return np.stack([*found, np.ones_like(found[0])], axis=-1)
+        x, y = (x - c.cx) / c.fx, (y - c.cy) / c.fy
+        return np.stack([x, y, np.ones_like(x)], axis=-1)
 
     def pixels_in(self, other: "Window") -> np.ndarray:
         """(H, W, 2) float32 x and y of this one's pixels in another window that lies at the same
@@ -94,9 +76,9 @@ def place_of(photograph: Photograph, box: np.ndarray) -> tuple[int, int, int, in
     outside.
     """
     camera, nothing = photograph.camera, np.empty(0)
-    whole = Window(photograph.name, nothing, camera, photograph.distortion, (0, 0, 0, 0))
+    whole = Window(photograph.name, nothing, camera, (0, 0, 0, 0))
     x, y = whole.pixels(corners_of(box)).T
-    if np.isnan(x).any():  # the box is around the camera, or ends far outside the image
+    if np.isnan(x).any():  # the box is around the camera
         x, y = np.array([0, camera.width]), np.array([0, camera.height])
     if x.max() < 1 or y.max() < 1 or x.min() > camera.width - 1 or y.min() > camera.height - 1:
         return None
@@ -119,7 +101,7 @@ def window(image: np.ndarray, photograph: Photograph, box: np.ndarray) -> Window
     camera = replace(
         camera, fx=sx * camera.fx, fy=sy * camera.fy, cx=sx * camera.cx, cy=sy * camera.cy
     )
-    found = Window(photograph.name, image, camera, photograph.distortion, place)
+    found = Window(photograph.name, image, camera, place)
     return replace(found, image=found.reduced(image))
 
 

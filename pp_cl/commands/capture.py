@@ -1,6 +1,7 @@
 """`pp-cl capture`: a scene from photographs or a film, with cameras, box and masks."""
 
 import argparse
+from typing import Any
 
 from pp_cl.capture import STAGES
 
@@ -9,8 +10,12 @@ EPILOG = "\n".join(
     (
         "stages, each done once; the same command goes on where it stopped:",
         *(f"  {stage:10}  {what}" for stage, what in STAGES.items()),
+        "",
+        "--turntable, --masks, --mask-command and --box are kept in SCENE/capture/options.json for",
+        "the next command, until others are given; --no-turntable, and the word auto, undo them.",
     )
 )
+AUTO = "auto"
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -21,14 +26,22 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("--from", dest="begin", choices=STAGES, help="repeat this stage and all after it")
     add(
         "--turntable",
-        action="store_true",
+        action=argparse.BooleanOptionalAction,
         help="the camera stands still and the object turns (say so where it is not noticed)",
     )
-    add("--masks", metavar="FOLDER", help="masks named like the photographs, white on the object")
-    add(
+    masks = parser.add_mutually_exclusive_group()
+    masks.add_argument(
+        "--masks", metavar="FOLDER", help="masks named like the photographs, white on the object"
+    )
+    masks.add_argument(
         "--mask-command",
         metavar="PROGRAM",
         help="program that makes masks, as 'rembg i {image} {mask}'",
+    )
+    add(
+        "--replace-masks",
+        action="store_true",
+        help="make the masks anew, also those that were mended by hand",
     )
     add(
         "--box",
@@ -39,9 +52,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def _box(text):
-    """The type of --box: six numbers, two corners that differ in x, y and z."""
+    """The type of --box: AUTO, or six numbers, two corners that differ in x, y and z."""
     from pp_cl.commands.options import number
 
+    if text == AUTO:
+        return text
     corners = [number(-1e6, 1e6)(word) for word in text.split(",")]
     if len(corners) != 6 or any(a == b for a, b in zip(corners, corners[3:], strict=False)):
         raise argparse.ArgumentTypeError(f"{text}: write two corners, as -1,-1,-1,1,1,1")
@@ -58,15 +73,15 @@ def run(options: argparse.Namespace) -> None:
     source = Path(options.source)
     if not source.exists():
         raise UserError(f"{source}: no such folder or film; give the photographs")
-    given = {
-        "features": {"turntable": options.turntable},
-        "box": {"box": options.box},
-        "masks": {
-            "masks": options.masks and str(Path(options.masks).resolve()),
-            "command": options.mask_command,
-        },
-    }
-    Capture(source, Path(options.out), given, lambda line: print(line, flush=True)).run(
-        options.begin
-    )
+    given: dict[str, Any] = {"source": str(source.resolve())}
+    if options.turntable is not None:
+        given["turntable"] = options.turntable
+    if options.box:
+        given["box"] = None if options.box == AUTO else options.box
+    if options.masks or options.mask_command:  # one takes the place of the other
+        own = None if options.masks in (None, AUTO) else str(Path(options.masks).resolve())
+        command = None if options.mask_command == AUTO else options.mask_command
+        given |= {"masks": own, "mask_command": command}
+    capture = Capture(Path(options.out), given, lambda line: print(line, flush=True))
+    capture.run(options.begin, replace_masks=options.replace_masks)
     print(f"look at it with `pp-cl info {options.out} --picture look.png`, then `pp-cl train`")

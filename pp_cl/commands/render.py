@@ -98,6 +98,7 @@ def run(options: argparse.Namespace) -> None:
 
     from pp_cl.device.discover import open_device
     from pp_cl.export.film import render_film, render_frames
+    from pp_cl.files.manifest import begin_manifest, check_ours
     from pp_cl.files.video import check_video
     from pp_cl.run import load_run
 
@@ -114,6 +115,9 @@ def run(options: argparse.Namespace) -> None:
             " WxH, or --format png"
         )
     out = Path(options.out) if options.out else _default(run, options.path, sizes, kind)
+    if kind in FILMS and not options.out:
+        check_ours([out], "move it away, or choose another --out")
+        begin_manifest(out.parent)
     seconds = []
     with tqdm(total=len(cameras), unit="frame", disable=None) as bar:
 

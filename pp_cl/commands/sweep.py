@@ -72,8 +72,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> None:
     """Run what is missing, print the table. Raises Stopped where runs failed."""
+    from pp_cl.files.manifest import begin_manifest, check_ours, note_in_place
     from pp_cl.sweep.result import finished_row
-    from pp_cl.sweep.table import text_table, write_tables
+    from pp_cl.sweep.table import TABLES, text_table, write_tables
 
     jobs, out = _jobs(options), Path(options.out)
     if options.dry_run:
@@ -86,13 +87,15 @@ def run(options: argparse.Namespace) -> None:
                 rows[job.folder] = row
     missing = [job for job in jobs if job.folder not in rows]
     print(f"{len(jobs)} runs, {len(rows)} of them finished already", flush=True)
-    out.mkdir(parents=True, exist_ok=True)
+    check_ours([out / name for name in TABLES])
+    begin_manifest(out)
+    note_in_place(out.resolve(), [job.log for job in missing])
     if missing:
         rows |= _run(options, missing, len(rows))
     ordered = [_relative(rows[job.folder], out) for job in jobs]
     shared.write_json_option(options.json, write_tables(out, ordered))
     print(text_table(ordered))
-    print(f"wrote {out / 'sweep.json'} and {out / 'sweep.md'}")
+    print("wrote " + " and ".join(str(out / name) for name in TABLES))
     failed = sum("error" in row for row in ordered)
     if failed:
         raise Stopped(f"{failed} of {len(jobs)} runs failed; the same command tries them again", 1)

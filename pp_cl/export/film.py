@@ -17,6 +17,7 @@ from pp_cl.errors import UserError
 from pp_cl.files.atomic import check_file, check_target, remove_leftovers, write_json
 from pp_cl.files.exr import write_exr
 from pp_cl.files.image import read_rgba, write_png
+from pp_cl.files.manifest import NAME, begin_manifest, check_ours, remove_ours
 from pp_cl.files.picture import WHITE
 from pp_cl.files.untrusted import read_regular
 from pp_cl.files.video import write_video
@@ -25,6 +26,7 @@ from pp_cl.scene.camera import Camera
 
 MOST_IDENTITY = 1000  # bytes of it
 IDENTITY = "frames.json"  # in the folder of the frames: what they show
+LOCK = ".pp-cl.lock"
 OnFrame = Callable[[float | None], None]
 
 
@@ -72,8 +74,9 @@ def render_frames(
                     f"{folder}: holds frames of another model or path; choose another --out, or"
                     " delete it"
                 )
-            for frame in folder.glob(f"*.{style.suffix}"):
-                frame.unlink()
+            check_ours([*paths, folder / IDENTITY])
+            remove_ours(folder.iterdir())
+        begin_manifest(folder)
         remove_leftovers(folder)
         write_json(folder / IDENTITY, identity)
         for camera, path in zip(cameras, paths, strict=True):
@@ -101,7 +104,9 @@ def render_film(
     if style.background is not None:
         images = (image[..., :3] for image in images)
     write_video(film, images, fps)
-    shutil.rmtree(folder)
+    remove_ours(folder.iterdir())
+    if {path.name for path in folder.iterdir()} <= {LOCK, NAME}:
+        shutil.rmtree(folder)
 
 
 def _digest(run, cameras, style):
@@ -138,7 +143,7 @@ def _owned(folder) -> Iterator[None]:
     check_target(folder / IDENTITY)
     folder.mkdir(parents=True, exist_ok=True)
     try:
-        with FileLock(folder / ".lock", timeout=0):
+        with FileLock(folder / LOCK, timeout=0):
             yield
     except Timeout:
         raise UserError(

@@ -14,6 +14,7 @@ from pp_cl.export.page import page_text, write_gallery
 from pp_cl.export.points import coloured_points, write_glb, write_ply
 from pp_cl.export.splat import Y_DOWN, Y_UP, splats, write_splat_glb, write_splat_ply
 from pp_cl.files.atomic import check_file, check_new_folder, write_text
+from pp_cl.files.manifest import begin_manifest, check_ours
 from pp_cl.run import Run, image_files
 from pp_cl.scene.readers.transforms import write_scene
 from pp_cl.scene.views import View
@@ -34,13 +35,16 @@ FORMATS = {
 def check_target(name: str, folder: Path, out: Path | None) -> Path:
     """Where the format FORMATS[name] of the run in `folder` is written. out: as --out says.
 
-    Raises UserError unless it can be written there.
+    Raises UserError unless it can be written there, and no other file is lost that `out` does not
+    name.
     """
     default, suffixes = FORMATS[name]
     path = folder / "export" / default if out is None else out
     if suffixes and path.suffix.lower() not in suffixes:
         raise UserError(f"--out {path}: name a file that ends in {' or '.join(suffixes)}")
     check_file(path) if suffixes else check_new_folder(path)
+    if out is None and suffixes:
+        check_ours([path], "move it away, or choose another --out")
     if out is not None and not path.parent.is_dir():
         raise UserError(f"--out {path}: {path.parent} is no folder; make it first")
     return path
@@ -56,12 +60,12 @@ def export(
     count = run.model.cloud.count
     if name == "mesh":
         mesh = coloured_mesh(run)
-        path.parent.mkdir(exist_ok=True)
+        _begin_default(name, path)
         write_mesh(path, mesh)
         return f"{len(mesh.vertices)} vertices, {len(mesh.faces)} faces"
     if name == "html":
         text = page_text(run)
-        path.parent.mkdir(exist_ok=True)
+        _begin_default(name, path)
         write_text(path, text)
         return f"{count} points, {len(text) / 1e6:.1f} MB"
     if name == "gallery":
@@ -72,19 +76,25 @@ def export(
         return ", ".join(f"{len(views)} {split} views" for split, views in splits.items())
     if name in ("splat", "splat-glb"):
         table, origin = splats(run, Y_DOWN if name == "splat" else Y_UP)
-        path.parent.mkdir(exist_ok=True)
+        _begin_default(name, path)
         if name == "splat":
             write_splat_ply(path, table)
         else:
             write_splat_glb(path, table, origin)
         return f"{len(table)} Gaussians"
     points = coloured_points(run, min_weight)
-    path.parent.mkdir(exist_ok=True)
+    _begin_default(name, path)
     if name == "ply":
         write_ply(path, points, run.model.cloud)
     else:
         write_glb(path, points)
     return f"{len(points.rows)} of {count} points"
+
+
+def _begin_default(name, path):
+    """Make the folder of a file that has no --out, as its name says."""
+    if path.parts[-2:] == ("export", FORMATS[name][0]):
+        begin_manifest(path.parent)
 
 
 def renderings(run: Run) -> dict[str, list[View]]:

@@ -3,7 +3,6 @@
 import errno
 import json
 import os
-import re
 import shutil
 import sys
 import time
@@ -15,8 +14,8 @@ from typing import Any, BinaryIO
 from platformdirs import user_cache_dir
 
 from pp_cl.errors import UserError
+from pp_cl.files.manifest import TEMPORARY, note
 
-LEFTOVER = re.compile(r"\..+\.(\d+)\.tmp(\..*)?", re.DOTALL)  # with the number of its process
 READER_SECONDS = 5  # which a viewer takes to read a large checkpoint
 # what file systems say that cannot sync a folder, and folders that may be written, not read
 UNKNOWN_TO_FOLDERS = (
@@ -31,11 +30,11 @@ UNKNOWN_TO_FOLDERS = (
 
 
 @contextmanager
-def atomic_file(path: Path | str) -> Iterator[BinaryIO]:
+def atomic_file(path: Path | str, *, noted: bool = True) -> Iterator[BinaryIO]:
     """A binary file object whose content appears under `path` only when the block ends well.
 
-    Raises UserError naming the file when the disk is full or may not be written; nothing
-    half-written stays behind.
+    noted: in the manifest of the folder that the program fills, if it is one. Raises UserError
+    naming the file when the disk is full or may not be written; nothing half-written stays behind.
     """
     path = Path(path)
     temporary = _temporary(path)
@@ -44,6 +43,8 @@ def atomic_file(path: Path | str) -> Iterator[BinaryIO]:
             yield file
             file.flush()
             os.fsync(file.fileno())
+        if noted:
+            note(temporary, path)
         _replace(temporary, path)
         _sync_folder(path.parent)
     except OSError as error:
@@ -66,7 +67,7 @@ def _replace(temporary, path):
 
 def _temporary(path):
     """The name under which a file is written."""
-    return path.parent / f".{path.name}.{os.getpid()}.tmp"  # `.` and `/` have no name
+    return path.parent / f".{path.name}.{os.getpid()}.pp-cl.tmp"  # `.` and `/` have no name
 
 
 def mend(error: OSError) -> str:
@@ -103,9 +104,10 @@ def atomic_path(path: Path) -> Iterator[Path]:
 
     Raises UserError naming the file when the library cannot write it.
     """
-    temporary = path.with_name(f".{path.stem}.{os.getpid()}.tmp{path.suffix}")
+    temporary = path.with_name(f".{path.stem}.{os.getpid()}.pp-cl.tmp{path.suffix}")
     try:
         yield temporary
+        note(temporary, path)
         _replace(temporary, path)
     except (OSError, RuntimeError) as error:  # libraries in C++ raise the latter
         raise _refusal(path, error) from error
@@ -122,10 +124,11 @@ def atomic_folder(folder: Path) -> Iterator[Path]:
     """
     folder = folder.resolve()
     check_new_folder(folder)
-    unfinished = folder.with_name(f".{folder.name}.{os.getpid()}.tmp")
+    unfinished = _temporary(folder)
     try:
         unfinished.mkdir(parents=True)
         yield unfinished
+        note(unfinished, folder)
         if folder.is_dir():
             folder.rmdir()  # it is empty; Windows replaces no folder
         _replace(unfinished, folder)
@@ -210,8 +213,8 @@ def remove_leftovers(folder: Path | str) -> None:
     """Delete temporary files and folders that killed processes left in the folder and below it, not
     those of processes that live.
     """
-    for leftover in list(Path(folder).rglob(".*.tmp*")):
-        named = LEFTOVER.fullmatch(leftover.name)
+    for leftover in list(Path(folder).rglob(".*.pp-cl.tmp*")):
+        named = TEMPORARY.fullmatch(leftover.name)
         if not named or _lives(int(named[1])):
             continue
         # Windows cannot tell who lives, but refuses what a process has open

@@ -51,7 +51,7 @@ def save_checkpoint(
             f"{path}: its header would have {len(text)} bytes, more than the {MOST_HEADER} that are"
             " read; train on fewer photographs"
         )
-    with atomic_file(path) as file, zipfile.ZipFile(file, "w") as archive:
+    with atomic_file(path, noted=False) as file, zipfile.ZipFile(file, "w") as archive:
         for name, array in {"header": np.frombuffer(text, np.uint8), **arrays}.items():
             with archive.open(f"{name}.npy", "w", force_zip64=True) as member:
                 kind = np.lib.format.dtype_to_descr(array.dtype)

@@ -16,6 +16,7 @@ from filelock import FileLock, Timeout
 from pp_cl.errors import UserError, shown
 from pp_cl.files.atomic import mend, remove_leftovers, write_text
 from pp_cl.files.checkpoint import Rows, save_checkpoint
+from pp_cl.files.manifest import begin_manifest, check_ours, remove_ours
 from pp_cl.files.untrusted import read_regular, strict_json
 
 MASKS_PICTURE = "masks.png"
@@ -70,7 +71,7 @@ class RunFolder:
         Raises UserError naming the process that owns the folder.
         """
         self.path.mkdir(parents=True, exist_ok=True)
-        owner, lock = self.path / ".owner", FileLock(self.path / ".lock", timeout=0)
+        owner, lock = self.path / ".pp-cl.owner", FileLock(self.path / ".pp-cl.lock", timeout=0)
         try:
             lock.acquire()
         except Timeout:
@@ -96,15 +97,22 @@ class RunFolder:
             with suppress(OSError):
                 lock.release()
 
+    def check_pictures(self, step: int) -> None:
+        """Raise UserError for a picture that training from this step on would replace, or create()
+        remove, and that no training has written as it is now.
+        """
+        begun = "" if step == 0 else f"step_{step:06d}.png"
+        previews = [one for one in self.previews.glob("step_*.png") if one.name > begun]
+        check_ours([self.path / MASKS_PICTURE] * (step == 0) + previews)
+
     def create(self, config_json: str) -> None:
         """Make the folders, remove what a killed process left unfinished, and pictures that belong
         to no checkpoint; write config.json, which makes the folder one of a run, before the rest.
         """
-        self.path.mkdir(parents=True, exist_ok=True)
+        begin_manifest(self.path)
         remove_leftovers(self.path)
         if not self.checkpoint.exists():
-            for picture in (self.path / MASKS_PICTURE, *self.previews.glob("step_*.png")):
-                picture.unlink(missing_ok=True)
+            remove_ours([self.path / MASKS_PICTURE, *self.previews.glob("step_*.png")])
         self.configure(config_json)
         self.previews.mkdir(exist_ok=True)
 

@@ -19,6 +19,7 @@ from PIL.PngImagePlugin import PngInfo
 from pp_cl.errors import UserError
 from pp_cl.files.atomic import atomic_file
 from pp_cl.files.image import read_rgba
+from pp_cl.files.manifest import remove_ours
 from pp_cl.scene.views import Photograph, View
 
 DIGITS = 32  # of a file's name, hexadecimal
@@ -80,8 +81,8 @@ class KeptViews:
             file.write(encoded.getbuffer())
 
     def remove(self) -> None:
-        """Remove the images of this training, and their folder where nothing else is in it."""
+        """Remove the images of this training, as far as it has written them, and their folder where
+        nothing else is in it.
+        """
         with suppress(OSError):
-            for file in self._files.values():
-                file.unlink(missing_ok=True)
-            self.folder.rmdir()
+            remove_ours(self._files.values())

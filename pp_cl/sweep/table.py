@@ -7,6 +7,7 @@ from typing import Any
 
 from pp_cl.files.atomic import write_json, write_text
 
+TABLES = ("sweep.json", "sweep.md")
 Row = dict[str, Any]  # of a run, see sweep/result.py, or of means
 
 # {key of a row: (column, format of a number)}
@@ -132,9 +133,10 @@ def values_text(row: Row) -> str:
 
 
 def write_tables(out: Path, rows: Sequence[Row]) -> dict[str, Any]:
-    """Write sweep.json and sweep.md of the rows to the folder; returns what the former holds."""
+    """Write the rows as TABLES to the folder; returns what the first holds."""
     means = scene_means(rows)
     content = {"runs": list(rows), "scenes": means, "mean": overall_means(means)}
-    write_json(out / "sweep.json", content)
-    write_text(out / "sweep.md", markdown(rows))
+    in_json, in_markdown = (out / name for name in TABLES)
+    write_json(in_json, content)
+    write_text(in_markdown, markdown(rows))
     return content

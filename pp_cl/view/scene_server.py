@@ -46,6 +46,7 @@ class ShownScene:
             (split, one) for split in names for one in scene_frames(folder, split, edited=False)
         ]
         self._points, self._colours = sparse_points(folder)
+        self._known = self._stored()
 
     @cached_property
     def _cameras(self):
@@ -53,6 +54,7 @@ class ShownScene:
 
     def facts(self) -> dict[str, Any]:
         """What the page shows, JSON-able. box: of the user or the format, else a suggestion."""
+        self._known = self._stored()
         edits, box = read_edits(self.folder), scene_box(configure(preset("tiny"), str(self.folder)))
         is_given, box = box is not None, self._suggested() if box is None else box
         step = 1 + len(self._points) // SHOWN_POINTS
@@ -75,6 +77,11 @@ class ShownScene:
             ],
         }
 
+    def _stored(self):
+        """The bytes of the edits, none where there is no file."""
+        file = self.folder / FILE
+        return file.read_bytes() if file.exists() else b""
+
     def _suggested(self):
         """(2, 3) box where nothing states one: of the sparse points near what the cameras look
         at, else around that.
@@ -91,7 +98,7 @@ class ShownScene:
 
     def change(self, text: str) -> None:
         """Write the edits that a page sends, {"box", "dropped"}. Raises UserError for others, and
-        where they cannot be written.
+        where they cannot be written, or others than these have changed them meanwhile.
         """
         try:
             found = strict_json(text)
@@ -101,8 +108,11 @@ class ShownScene:
         kept = {split for split, one in self.views if one.name not in edits.dropped}
         if gone := {split for split, _ in self.views} - kept:
             raise UserError(f"no view of split {min(gone)} would be left; keep one")
+        if self._stored() != self._known:
+            raise UserError(f"{self.folder / FILE}: was changed meanwhile; reload the page")
         known = edits.dropped & {one.name for _, one in self.views}
         write_edits(self.folder, edits._replace(dropped=known, axes=read_edits(self.folder).axes))
+        self._known = self._stored()
 
     def photograph(self, index: int) -> bytes:
         """JPEG file of a view, reduced. Raises UserError for a photograph that cannot be read."""

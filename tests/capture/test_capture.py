@@ -15,14 +15,16 @@ import pytest
 from PIL import Image, ImageFilter
 from support.runs import spoken
 
-from pp_cl.capture import poses
+from pp_cl.capture import STAGES, poses
 from pp_cl.capture.features import opened, quiet, verification
 from pp_cl.capture.frames import take_images
 from pp_cl.cli import main
-from pp_cl.files.image import to_8bit, write_png
+from pp_cl.device.discover import open_device
+from pp_cl.files.image import read_rgba, to_8bit, write_png
 from pp_cl.files.video import write_video
 from pp_cl.scene.camera import Camera
 from pp_cl.scene.demo import render
+from pp_cl.scene.distortion import Distortion, undistort
 from pp_cl.scene.load import load_scene, scene_format, scene_frames
 from tools.capture_demo import align, cameras, room
 
@@ -73,7 +75,7 @@ def capture(source, scene, *more):
 
 
 def found(scene, stage):
-    return json.loads((scene / "capture" / f"{stage}.json").read_text())["found"]
+    return json.loads((scene / "capture" / f"{stage}.json").read_text())
 
 
 def changed(scene):
@@ -103,6 +105,26 @@ def test_photographs_become_a_scene(captured):
         assert -view.camera.pose[2, 1] > 0  # the image's upper edge is up
 
 
+def test_nothing_in_the_scene_is_distorted(captured):
+    """Images, cameras, masks and what COLMAP's model says of its points are of pinholes."""
+    splits = [scene_frames(captured, split) for split in ("train", "test")]
+    one = splits[0][0]
+    assert not any(view.distortion for split in splits for view in split)
+    model = colmap.Reconstruction(captured / "sparse" / "0")
+    assert {str(camera.model) for camera in model.cameras.values()} == {"CameraModelId.PINHOLE"}
+    focal, _, cx, cy = model.camera(1).params
+    assert (focal, cx, cy) == pytest.approx((one.camera.fx, one.camera.cx, one.camera.cy))
+    model.update_point_3d_errors()
+    error = found(captured, "poses")["error"]
+    assert model.compute_mean_reprojection_error() == pytest.approx(error, abs=0.01)
+    bent = colmap.Reconstruction(captured / "capture" / "model")
+    k1 = bent.camera(1).params[3]
+    assert abs(k1) > 1e-5
+    frame = read_rgba(captured / "capture" / "frames" / Path(one.name).name)
+    straight = undistort(open_device(), frame, one.camera, Distortion(k1))
+    np.testing.assert_array_equal(read_rgba(captured / one.name), straight)
+
+
 def test_images_of_which_few_fit_as_of_a_turned_object_they_are_placed_as_usual(
     captured, tmp_path, monkeypatch
 ):
@@ -112,7 +134,7 @@ def test_images_of_which_few_fit_as_of_a_turned_object_they_are_placed_as_usual(
     monkeypatch.setattr(
         poses, "_mapped", lambda *given: [] if given[-1] else mapped(*given[:-1], turns=False)
     )
-    database, images = work / "database.db", captured / "images"
+    database, images = work / "database.db", work / "frames"
     placed = poses.place(database, images, tmp_path / "model", taken, turns=True)
     assert placed["placed"] == COUNT
     assert {one.name for one in (tmp_path / "model").iterdir()} >= {"cameras.bin", "images.bin"}
@@ -131,7 +153,7 @@ def test_a_focal_length_that_is_wrong_is_forgotten(captured, tmp_path):
         db.clear_two_view_geometries()
         colmap.geometric_verification(database, two_view_geometry_options=verification(colmap))
     taken = found(captured, "frames")["images"]
-    told = poses.place(database, captured / "images", tmp_path / "model", taken, False)
+    told = poses.place(database, work / "frames", tmp_path / "model", taken, False)
     assert told["placed"] == COUNT
     lens = colmap.Reconstruction(tmp_path / "model").cameras.values()
     assert [one.params[0] for one in lens] == pytest.approx([cameras(SIZE)[0].fx] * len(lens), 0.1)
@@ -165,11 +187,78 @@ def test_what_is_done_is_not_done_again(captured, shot, tmp_path):
     after = changed(scene)
     assert after[scene / "capture" / "poses.json"] == before[scene / "capture" / "poses.json"]
     assert after[scene / "capture" / "masks.json"] > before[scene / "capture" / "masks.json"]
-    box = "-0.5,-0.5,-0.5,0.5,0.5,0.5"
-    assert capture(*words, f"--box={box}", "--from", "scene") == (0, [])
-    assert json.loads((scene / "transforms.json").read_text())["aabb"] == [[-0.5] * 3, [0.5] * 3]
     status, lines = capture(shot[1], scene)
     assert status == 2 and len(lines) == 1 and str(scene) in lines[0]
+
+
+def test_options_are_kept_for_the_next_capture(captured, shot, tmp_path, capsys):
+    """Others redo what depends on them, and say so; a word takes them back."""
+    scene = shutil.copytree(captured, tmp_path / "scene")
+    words, before = ["capture", str(shot[0]), "--out", str(scene)], changed(scene)
+    assert main(words) == 0 and changed(scene) == before
+    capsys.readouterr()
+    assert main([*words, "--box=-0.5,-0.5,-0.5,0.5,0.5,0.5"]) == 0
+    told = capsys.readouterr().out
+    assert "--box is another than before: box and on anew" in told and "poses: 12 of 12" in told
+    assert found(scene, "masks")["line"].startswith(f"{COUNT} given")
+    assert main([*words, "--from", "scene"]) == 0
+    assert json.loads((scene / "transforms.json").read_text())["aabb"] == [[-0.5] * 3, [0.5] * 3]
+    assert main([*words, "--box", "auto"]) == 0
+    box = json.loads((captured / "transforms.json").read_text())["aabb"]
+    assert json.loads((scene / "transforms.json").read_text())["aabb"] == box
+
+
+def test_a_folder_that_no_capture_has_made_is_left_alone(shot, tmp_path):
+    """Also where its photographs are called like our own folder."""
+    mug = tmp_path / "mug"
+    for name in ("capture", "images", "masks"):
+        (mug / name).mkdir(parents=True)
+    shutil.copy(shot[0] / "000.png", mug / "capture")
+    for name in ("images/0.png", "masks/0.png", "transforms.json", "capture/frames.json"):
+        (mug / name).write_text("mine")
+    before = changed(mug)
+    status, lines = capture(mug / "capture", mug)
+    assert status == 2 and len(lines) == 1 and str(mug) in lines[0] and changed(mug) == before
+
+
+@pytest.mark.parametrize("words", [[], *(["--from", stage] for stage in STAGES)])
+def test_what_is_the_users_stays(captured, shot, tmp_path, words):
+    """Files beside those of the capture, and what the user has changed of these, but for masks."""
+    scene = shutil.copytree(captured, tmp_path / "scene")
+    own = scene / "capture" / "frames" / "003.png"
+    own.write_bytes(own.read_bytes() + b"mine")
+    before = changed(scene)
+    assert capture(shot[0], scene, "--from", "frames") == (
+        2,
+        [f"pp-cl: {own}: pp-cl did not write this, or not as it is now; move it away"],
+    )
+    assert changed(scene) == before
+    shutil.copy(captured / "capture" / "frames" / "003.png", own)
+    kept = {}
+    for folder in [scene, *(path for path in scene.rglob("*") if path.is_dir())]:
+        for name in ("mine.png", ".own", "pairs.txt"):
+            (folder / name).write_text("mine")
+            kept[folder / name] = (folder / name).stat().st_mtime_ns
+    status, lines = capture(shot[0], scene, *words)
+    assert (status, len(lines)) == ((2, 1) if words else (0, 0)), lines
+    assert {path: changed(scene).get(path, kept[path]) for path in kept} == kept
+    assert all(path.read_text() == "mine" for path in kept)
+    assert (scene / "transforms.json").exists()
+
+
+def test_masks_that_the_user_has_mended_are_kept(captured, shot, tmp_path):
+    """And refused by name where their images are made anew; one option replaces them."""
+    scene = shutil.copytree(captured, tmp_path / "scene")
+    mended = scene / "masks" / "003.png"
+    Image.new("L", (SIZE, SIZE), 255).save(mended)
+    mine = mended.read_bytes()
+    assert capture(shot[0], scene, "--from", "box") == (0, []) and mended.read_bytes() == mine
+    assert found(scene, "masks")["line"].startswith(f"1 kept, {COUNT - 1} given")
+    before = changed(scene)
+    status, lines = capture(shot[0], scene, "--from", "images")
+    assert status == 2 and len(lines) == 1 and str(mended) in lines[0] and changed(scene) == before
+    assert capture(shot[0], scene, "--from", "masks", "--replace-masks") == (0, [])
+    assert mended.read_bytes() == (captured / "masks" / "003.png").read_bytes()
 
 
 def test_photographs_that_came_later_are_told(captured, shot, tmp_path, capsys):
@@ -306,7 +395,7 @@ def test_a_killed_capture_goes_on(shot, tmp_path):
     """In the middle of three stages; the same command ends with the scene of one that was not."""
     scene = tmp_path / "scene"
     words = ["capture", str(shot[0]), "--out", str(scene), "--masks", str(shot[1])]
-    for begun in ("capture/database.db", "capture/pairs.txt", "masks"):
+    for begun in ("capture/database.db", "capture/features.json", "images", "masks"):
         process = subprocess.Popen(
             [sys.executable, "-m", "pp_cl", *words], stdout=subprocess.DEVNULL
         )

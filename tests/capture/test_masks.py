@@ -63,9 +63,8 @@ class Capture:
             Image.fromarray(np.uint8(255 * np.clip(photograph, 0, 1))).save(folder / one.name)
             self.photographs.append(one)
             self.truth.append(rgba[..., 3] > 0.5)
-            found, rows, columns = Window(
-                "", photograph, camera, one.distortion, (0, 0, SIZE, SIZE)
-            ).inside(self.points)
+            whole = Window("", photograph, camera, (0, 0, SIZE, SIZE))
+            found, rows, columns = whole.inside(self.points)
             is_shown = self.truth[-1][rows, columns] == (found < self.count)
             self.seen.append(found[is_shown & (rng.uniform(size=len(found)) < 0.5)])
 
@@ -297,6 +296,15 @@ def test_masks_named_like_the_sources(capture, tmp_path):
     (folder / "03.png").rename(folder / "my photo (3).png")
     assert f"{VIEWS} given" in capture.write(given=folder, sources={"03.png": "my photo (3).JPG"})
     assert (capture.agreement() == 1).all()
+
+
+def test_given_masks_are_fitted_to_the_images(capture, tmp_path):
+    """As they are of the photographs before their distortion was removed."""
+    folder = given_masks(capture, tmp_path / "given")
+    names = []
+    capture.write(given=folder, fitted=lambda name, mask: names.append(name) or mask[::-1])
+    capture.truth = [mask[::-1] for mask in capture.truth]
+    assert (capture.agreement() == 1).all() and len(set(names)) == VIEWS
 
 
 def test_masks_that_contradict_the_others_are_named(capture, tmp_path):

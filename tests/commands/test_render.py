@@ -48,7 +48,7 @@ def test_a_film_that_was_interrupted_goes_on(trained, tmp_path, capsys, monkeypa
         patch.setattr(film, "write_png", stopping)
         assert main(words) == 130
     assert not (tmp_path / "film.gif").exists()
-    with FileLock(done[0].parent / ".lock"):
+    with FileLock(done[0].parent / ".pp-cl.lock"):
         assert main(words) == 2
     assert "film.gif.frames: another process" in capsys.readouterr().err
     assert main(words) == 0
@@ -56,6 +56,9 @@ def test_a_film_that_was_interrupted_goes_on(trained, tmp_path, capsys, monkeypa
     assert list(tmp_path.iterdir()) == [tmp_path / "film.gif"]
     assert main([*words, "--background", "black"]) == 0  # a film is made anew
     assert "rendered 4 of 4 frames" in capsys.readouterr().out
+    done[0].parent.mkdir()
+    (done[0].parent / ".mine.png").write_bytes(b"mine")
+    assert main(words) == 0 and (done[0].parent / ".mine.png").read_bytes() == b"mine"
     with imageio.get_reader(str(tmp_path / "film.gif")) as read:
         assert read.get_length() == 4
 
@@ -70,7 +73,7 @@ def test_sizes_have_folders_of_their_own_and_need_no_scene(trained, capsys):
     words = ["render", str(run), "--seconds", "0.1", "--fps", "10"]
     for more in ([], ["--size", "32x32"], ["--format", "png"], ["--path", "spiral"]):
         assert main([*words, *more]) == 0
-    names = {path.name for path in (run / "render").iterdir()}
+    names = {path.name for path in (run / "render").iterdir() if path.name[0] != "."}
     assert names == {"orbit_24x24.mp4", "orbit_32x32.mp4", "orbit_24x24", "spiral_24x24.mp4"}
     capsys.readouterr()
     for more, told in ((["--path", "test"], "/nowhere"), (["--format", "exr"], "choose another")):
@@ -90,7 +93,7 @@ def test_frames_that_are_there_are_not_rendered_again(trained, tmp_path, capsys)
     assert main(words) == 0
     whole = {p.name: p.read_bytes() for p in (tmp_path / "o").iterdir()}
     (tmp_path / "o" / "00002.png").unlink()
-    (tmp_path / "o" / ".00003.png.999999999.tmp").write_bytes(b"half")
+    (tmp_path / "o" / ".00003.png.999999999.pp-cl.tmp").write_bytes(b"half")
     capsys.readouterr()
     assert main(words) == 0
     assert "rendered 1 of 4 frames" in capsys.readouterr().out

@@ -2,12 +2,14 @@
 
 import json
 
+import numpy as np
 import pytest
 from support.runs import arguments
 from support.scenes import write_ball_scene
 
 from pp_cl.cli import main
 from pp_cl.errors import UserError
+from pp_cl.files.image import write_png
 from pp_cl.files.run_folder import RunFolder
 from pp_cl.session import run_config
 
@@ -72,7 +74,7 @@ def test_a_start_without_a_checkpoint_takes_other_settings(tmp_path, capsys, mon
     with monkeypatch.context() as patch:
         patch.setattr("pp_cl.train.Trainer.train_step", failing_step)
         assert main(arguments(scene, out, network__rate="100,100")) == 2
-    (out / "previews" / "step_000001.png").write_bytes(b"of other settings")
+    write_png(out / "previews" / "step_000001.png", np.zeros((8, 8, 3)))  # of other settings
     words = {"network__rate": "0.002,0.001", "train__iterations": 12, "train__refine_at": "1,1"}
     assert main([*arguments(scene, out, **words), "--preset", "small"]) == 0
     assert main([*arguments(scene, plain, **words), "--preset", "small"]) == 0

@@ -74,14 +74,16 @@ def test_a_temporary_file_that_stays_hides_no_error(tmp_path, monkeypatch):
 
 
 def test_leftovers_below_a_folder_go_and_other_files_stay(tmp_path):
-    gone = [f".a.png.{DEAD}.tmp", f"x/y/.b.{DEAD}.tmp", f"x/.film.{DEAD}.tmp.mp4"]
-    gone.append(f".own.{os.getpid()}.tmp")  # of another process that had our number
-    kept = [".tmp", ".a.tmp", ".a.b.tmp", f"a.{DEAD}.tmp", f".a.{DEAD}.tmpfile", "x/log.jsonl"]
-    kept += [f".a.{os.getppid()}.tmp"] * (os.name == "posix")  # it is still being written
+    own = "pp-cl.tmp"
+    gone = [f".a.png.{DEAD}.{own}", f"x/y/.b.{DEAD}.{own}", f"x/.film.{DEAD}.{own}.mp4"]
+    gone.append(f".own.{os.getpid()}.{own}")  # of another process that had our number
+    kept = [f".{own}", f".a.{own}", f".a.b.{own}", f"a.{DEAD}.{own}", f".a.{DEAD}.{own}file"]
+    kept += ["x/log.jsonl", f".a.{DEAD}.tmp"]  # of another program
+    kept += [f".a.{os.getppid()}.{own}"] * (os.name == "posix")  # it is still being written
     for name in gone + kept:
         (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
         (tmp_path / name).write_text("half")
-    folder = tmp_path / "x" / f".page.{DEAD}.tmp"
+    folder = tmp_path / "x" / f".page.{DEAD}.pp-cl.tmp"
     folder.mkdir()
     (folder / "index.html").write_text("half")
     remove_leftovers(tmp_path)
@@ -93,7 +95,7 @@ def test_a_link_named_like_a_leftover_loses_nothing_behind_it(tmp_path):
     (tmp_path / "far").mkdir()
     (tmp_path / "far" / "photo.png").write_text("mine")
     (tmp_path / "run").mkdir()
-    (tmp_path / "run" / f".a.{DEAD}.tmp").symlink_to(tmp_path / "far")
+    (tmp_path / "run" / f".a.{DEAD}.pp-cl.tmp").symlink_to(tmp_path / "far")
     remove_leftovers(tmp_path / "run")
     assert (tmp_path / "far" / "photo.png").exists() and not list((tmp_path / "run").iterdir())
 

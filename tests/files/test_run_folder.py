@@ -5,9 +5,11 @@ import json
 import os
 import signal
 
+import numpy as np
 import pytest
 
 from pp_cl.errors import UserError
+from pp_cl.files.image import write_png
 from pp_cl.files.run_folder import RunFolder
 
 ROWS = [{"step": step, "seconds": step / 10, "loss": 1.0} for step in (5, 10, 15)]
@@ -121,9 +123,10 @@ def test_leftovers_are_removed_from_the_folder_and_the_previews(tmp_path):
     folder = RunFolder(tmp_path / "run")
     folder.previews.mkdir(parents=True)
     for place in (folder.path, folder.previews):
-        (place / ".step.png.999999999.tmp").write_bytes(b"half")
+        (place / ".step.png.999999999.pp-cl.tmp").write_bytes(b"half")
     folder.create("{}")
-    assert [p.name for p in folder.path.rglob("*") if p.is_file()] == ["config.json"]
+    files = {p.name for p in folder.path.rglob("*") if p.is_file()}
+    assert files == {"config.json", ".pp-cl-files.jsonl"}
 
 
 def test_a_start_that_fails_early_leaves_a_folder_of_a_run_or_an_empty_one(tmp_path, monkeypatch):
@@ -144,12 +147,16 @@ def test_a_start_that_fails_early_leaves_a_folder_of_a_run_or_an_empty_one(tmp_p
 
 
 def test_pictures_without_a_checkpoint_go_and_others_stay(tmp_path):
-    """They may show other settings; a file of the user is none of them."""
+    """They may show other settings; a file of the user is none of them, nor is one that the user
+    has changed.
+    """
     folder = RunFolder(tmp_path)
-    folder.previews.mkdir()
+    folder.create("{}")
     ours = [tmp_path / "masks.png", folder.previews / "step_000030.png"]
     others = [tmp_path / "notes.png", folder.previews / "mine.png"]
-    for path in ours + others:
+    for path in ours:
+        write_png(path, np.zeros((8, 8, 3)))
+    for path in others:
         path.write_bytes(b"picture")
     folder.checkpoint.write_bytes(b"whole")
     folder.create("{}")
@@ -157,6 +164,11 @@ def test_pictures_without_a_checkpoint_go_and_others_stay(tmp_path):
     folder.checkpoint.unlink()
     folder.create("{}")
     assert not any(path.exists() for path in ours) and all(path.exists() for path in others)
+    write_png(ours[1], np.zeros((8, 8, 3)))
+    ours[1].write_bytes(b"with an arrow")
+    folder.check_pictures(30)  # it would not be made again
+    with pytest.raises(UserError, match=f"{ours[1]}: pp-cl did not write this"):
+        folder.check_pictures(29)
 
 
 def test_a_file_system_without_locks_is_one_line(tmp_path, monkeypatch):
@@ -164,7 +176,7 @@ def test_a_file_system_without_locks_is_one_line(tmp_path, monkeypatch):
         raise OSError(errno.ENOLCK, "No locks available")
 
     monkeypatch.setattr("pp_cl.files.run_folder.FileLock.acquire", acquire)
-    with pytest.raises(UserError, match="run/.lock: cannot be locked .No locks available"):
+    with pytest.raises(UserError, match="run/.pp-cl.lock: cannot be locked .No locks available"):
         RunFolder(tmp_path / "run").owned().__enter__()
 
 
@@ -178,8 +190,8 @@ def test_the_name_of_the_owner_is_not_worth_a_finished_training(tmp_path, monkey
         with folder.owned():
             pass
     with folder.owned():
-        assert (tmp_path / ".owner").read_text().startswith(f"process {os.getpid()} ")
-    assert not (tmp_path / ".owner").exists()
+        assert (tmp_path / ".pp-cl.owner").read_text().startswith(f"process {os.getpid()} ")
+    assert not (tmp_path / ".pp-cl.owner").exists()
 
 
 def test_a_log_that_fails_when_it_is_closed_is_one_line(folder):

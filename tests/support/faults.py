@@ -25,7 +25,8 @@ from pp_cl.files.run_folder import read_row
 
 WRITING = os.O_WRONLY | os.O_RDWR | os.O_CREAT
 TIMES = ("seconds", "seconds_per_frame")  # what no two runs have in common
-BESIDE = (".lock", ".owner")  # marks without content of their own
+# marks without content of their own, and what knows of a try that failed, too
+BESIDE = (".pp-cl.lock", ".pp-cl.owner", ".pp-cl-files.jsonl")
 LEFTOVER = re.compile(r"\..*\.tmp")
 PREVIEW = re.compile(r"previews/step_\d+\.png")  # the clock asks for an early one
 

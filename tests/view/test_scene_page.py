@@ -75,6 +75,12 @@ def test_who_has_the_token_reads_and_who_is_the_page_writes(folder):
             async with session.post(f"{access.address}edits", json=edits, headers=headers) as post:
                 assert post.status == 204
             assert json.loads((folder / "pp_cl.json").read_text()) == edits
+            (folder / "pp_cl.json").write_text('{"dropped": ["train/r_4.png"]}')  # in an editor
+            async with session.post(f"{access.address}edits", json={}, headers=headers) as post:
+                assert post.status == 400 and "reload the page" in await post.text()
+            assert "r_4" in (folder / "pp_cl.json").read_text()
+            async with session.get(f"{access.address}scene.json") as answer:
+                assert answer.status == 200
             async with session.post(f"{access.address}edits", json={}, headers=headers) as post:
                 assert post.status == 204 and not (folder / "pp_cl.json").exists()
 

@@ -1,0 +1,106 @@
+"""What a user has in the folders that commands write to stays as it is: a command leaves it alone,
+or refuses in one line.
+"""
+
+import os
+import shutil
+from pathlib import Path
+
+import pytest
+from support.runs import arguments, spoken
+from support.sweeps import jobs_of, pretend, words_of
+
+from pp_cl.cli import main
+from pp_cl.export.formats import FORMATS
+
+FILM = ["render", "run", "--seconds", "0.2", "--fps", "10"]
+OF_BALL = ["compare", "BALL/test", "BALL/test", "--metrics", "psnr", "--json"]
+RASTER = ["bench", "raster", "--size", "16", "--points", "100", "--blend", "alpha"]
+# {name: (words, BALL stands for a scene; files that the words name, which may be replaced)}
+COMMANDS = {
+    "train": (None, ()),
+    "eval": (["eval", "run", "--save-images"], ()),
+    "eval of a split": (["eval", "run", "--save-images", "--split", "train"], ()),
+    "eval elsewhere": (["eval", "run", "--save-images", "--out", "there"], ()),
+    "eval in JSON": (["eval", "run", "--json", "a.json"], ("a.json",)),
+    "eval in a chart": (["eval", "run", "--chart", "a.svg"], ("a.svg",)),
+    "film": (FILM, ()),
+    "film elsewhere": ([*FILM, "--out", "a.gif"], ("a.gif",)),
+    "frames": ([*FILM, "--format", "png"], ()),
+    "frames elsewhere": ([*FILM, "--format", "exr", "--out", "there"], ()),
+    **{f"export {name}": (["export", "run", "--format", name], ()) for name in FORMATS},
+    **{
+        f"export {name} elsewhere": (["export", "run", "--format", name, "--out", f"a{end}"], named)
+        for name, (_, ends) in FORMATS.items()
+        for end in (ends or ("",))[:1]
+        for named in ((f"a{end}",) if end else (),)
+    },
+    "compress": (["compress", "run", "--max-loss", "0.01"], ()),
+    "compress elsewhere": (["compress", "run", "--max-loss", "0.01", "--out", "there"], ()),
+    "info": (["info", "run", "--picture", "a.png", "--json", "a.json"], ("a.png", "a.json")),
+    "compare": ([*OF_BALL, "a.json"], ("a.json",)),
+    "bench": ([*RASTER, "--json", "a.json"], ("a.json",)),
+    "bench in a plot": ([*RASTER, "--plot", "a.svg"], ("a.svg",)),
+    "sweep": (None, ()),
+}
+STATE = ("config.json", "checkpoint.npz", "log.jsonl")  # of a run, which is what its name says
+OLD = 1_000_000_000
+
+
+@pytest.fixture
+def work(finished, tmp_path, monkeypatch):
+    """The folder that one is in, with a run."""
+    shutil.copytree(finished, tmp_path / "run")
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+def words_for(name, scene):
+    if name == "train":
+        return arguments(scene, Path("run"))
+    if name == "sweep":
+        for job in jobs_of([scene], "there"):
+            pretend(job, 20.0)
+        return words_of([scene], "there")
+    return [word.replace("BALL", scene) for word in COMMANDS[name][0]]
+
+
+def files(folder):
+    """{path: (bytes, time)} of the files below a folder."""
+    paths = [path for path in folder.rglob("*") if path.is_file()]
+    return {path: (path.read_bytes(), path.stat().st_mtime_ns) for path in paths}
+
+
+def made(paths, folder):
+    """Make files of the user's, or change them; returns files() of them."""
+    for path in paths:
+        with path.open("ab") as file:
+            file.write(b"mine")
+        os.utime(path, (OLD, OLD))
+    return {path: there for path, there in files(folder).items() if path in paths}
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+def test_what_is_the_users_stays(work, scene, name, capsys):
+    """Files beside those of the command, and those of the command that the user has changed."""
+    if "a.svg" in COMMANDS[name][1]:
+        pytest.importorskip("matplotlib")
+    before, words = files(work), words_for(name, scene)
+    assert main(words) == 0
+    written = files(work)
+    folders = {path for path in work.rglob("*") if path.is_dir()} | {work}
+    others = ("mine.png", "notes.txt", ".own.txt", "step_999999.png", ".lock", ".a.7.tmp")
+    beside = made([folder / other for folder in folders for other in others], work)
+
+    def again(kept):
+        status, lines = spoken(words)
+        told = [line for line in lines if line.startswith("pp-cl: ")]
+        assert (status, len(told)) in ((0, 0), (2, 1)), lines
+        assert {path: files(work).get(path) for path in kept} == kept
+
+    again(beside)
+    new = [path for path, there in written.items() if before.get(path) != there]
+    new = [path for path in new if path.name[0] != "." and path.name not in STATE]
+    changed = made([path for path in new if path.name not in COMMANDS[name][1]], work)
+    assert changed or COMMANDS[name][1] or name == "train"
+    again(beside | changed)
