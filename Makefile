@@ -1,6 +1,7 @@
 # Everything runs in .venv, which the first target makes; the system Python is only needed for that.
 PYTHON ?= python3
 BIN := .venv/bin
+INSTALLED := .venv/.installed
 READY := .venv/.ready
 KERNELS = $(shell find cl -name "*.cl" -o -name "*.h")
 
@@ -27,8 +28,11 @@ help: ## print this list
 
 setup: $(READY) ## make .venv with pp-cl in it, and see to a working OpenCL device
 
-$(READY): setup.cfg setup.py pyproject.toml tools/setup_venv.sh tools/setup_opencl.py
+$(INSTALLED): setup.cfg setup.py pyproject.toml tools/setup_venv.sh
 	@tools/setup_venv.sh $(PYTHON)
+	@touch $@
+
+$(READY): $(INSTALLED) tools/setup_opencl.py
 	@$(BIN)/python tools/setup_opencl.py
 	@touch $@
 
@@ -62,14 +66,14 @@ bench: $(READY) ## time and error of the network and of its layers; ARGS="--size
 	$(BIN)/pp-cl bench unet $(ARGS)
 	$(BIN)/pp-cl bench conv $(ARGS)
 
-lint: $(READY) ## check the Python files (ruff, mypy for three systems, import-linter) and the format of the kernels (clang-format)
+lint: $(INSTALLED) ## check the Python files (ruff, mypy for three systems, import-linter) and the format of the kernels (clang-format)
 	@$(BIN)/ruff check
 	@$(BIN)/ruff format --check
 	@for system in linux win32 darwin; do $(BIN)/mypy --platform $$system || exit; done
 	@$(BIN)/lint-imports --no-logo --no-cache
 	@$(BIN)/clang-format --dry-run --Werror $(KERNELS)
 
-format: $(READY) ## format the Python files and the kernels
+format: $(INSTALLED) ## format the Python files and the kernels
 	@$(BIN)/ruff check --fix
 	@$(BIN)/ruff format
 	@$(BIN)/clang-format -i $(KERNELS)

@@ -3,9 +3,12 @@
 import ast
 import configparser
 import re
+import subprocess
 import sys
 from importlib.metadata import packages_distributions
 from pathlib import Path
+
+import pytest
 
 from pp_cl import __version__
 
@@ -55,3 +58,10 @@ def test_the_conda_recipe_asks_for_what_setup_cfg_does():
     lines = {line.replace(" ", "") for line in re.findall("(?m)^    - ([a-z-]+ >=.*)$", run)}
     assert wanted == lines - {"python>=3.10", "pocl>=5.0"}
     assert f'version: "{__version__}"' in text
+
+
+@pytest.mark.unix
+def test_lint_installs_no_driver():
+    command = ["make", "--always-make", "--dry-run", "lint"]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=True)
+    assert "setup_venv.sh" in done.stdout and "setup_opencl.py" not in done.stdout
