@@ -68,7 +68,6 @@ def test_all_prints_its_tables_and_writes_its_numbers(tmp_path, capsys, monkeypa
 
 @pytest.mark.parametrize("what", SMALL)
 def test_a_plot_is_drawn(tmp_path, what):
-    pytest.importorskip("matplotlib", reason="pictures need the extra `plot`")
     file = tmp_path / "b.png"
     assert main(["bench", what, *SMALL[what], "--plot", str(file)]) == 0
     assert file.read_bytes().startswith(b"\x89PNG")
