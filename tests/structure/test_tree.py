@@ -3,6 +3,7 @@
 import ast
 import configparser
 import re
+import shutil
 import subprocess
 import sys
 from importlib.metadata import packages_distributions
@@ -65,3 +66,30 @@ def test_lint_installs_no_driver():
     command = ["make", "--always-make", "--dry-run", "lint"]
     done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=True)
     assert "setup_venv.sh" in done.stdout and "setup_opencl.py" not in done.stdout
+
+
+def packed(folder, tmp_path):
+    """The files that setuptools packs into the source archive of a folder."""
+    command = [sys.executable, "setup.py", "-q", "egg_info", "--egg-base", str(tmp_path)]
+    subprocess.run(command, cwd=folder, capture_output=True, check=True)
+    return set((tmp_path / "pp_cl.egg-info" / "SOURCES.txt").read_text("utf-8").splitlines())
+
+
+def test_the_source_archive_lacks_what_is_not_free(tmp_path):
+    """Pictures of photographs under CC BY-NC-SA; their pages say so."""
+    found = packed(ROOT, tmp_path)
+    assert {"docs/demo.png", "cl/common.h", "pp_cl/train.py"} <= found
+    assert not {"docs/film.webp", "docs/orbits.png"} & found
+
+
+def test_docker_gets_all_that_is_installed(tmp_path):
+    lines = (ROOT / ".dockerignore").read_text("utf-8").splitlines()
+    nothing, *names, last = [line for line in lines if line[0] != "#"]
+    assert (nothing, last) == ("*", "**/__pycache__")
+    for path in (ROOT / name.removeprefix("!") for name in names):
+        copy = shutil.copytree if path.is_dir() else shutil.copy
+        copy(path, tmp_path / path.name)
+    expected = {name for name in packed(ROOT, tmp_path) if name.startswith(("cl/", "pp_cl/"))}
+    expected |= {"LICENSE", "README.md", "pyproject.toml", "setup.cfg", "setup.py"}
+    shutil.rmtree(tmp_path / "pp_cl.egg-info")
+    assert expected <= packed(tmp_path, tmp_path)
