@@ -35,8 +35,8 @@ def needed(module: str) -> ModuleType:
         return importlib.import_module(module)
     except ImportError as error:
         raise UserError(
-            f"capture needs the package {DISTRIBUTIONS[module]} ({error}):"
-            ' pip install "pp-cl[capture]"'
+            f"capture needs the package {DISTRIBUTIONS[module]} ({error});"
+            f" install what it needs with `pip install {' '.join(DISTRIBUTIONS.values())}`"
         ) from None
 
 

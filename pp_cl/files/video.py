@@ -14,7 +14,7 @@ from pp_cl.files.atomic import atomic_path
 
 LOOPED = ("gif", "webp")  # as pages show without a player
 FORMATS = ("mp4", "webm", *LOOPED)
-MISSING = 'films need imageio and imageio-ffmpeg; install them with `pip install "pp-cl[video]"`'
+MISSING = "films need more packages; install them with `pip install imageio imageio-ffmpeg`"
 
 
 def check_video(suffix: str) -> None:

@@ -12,6 +12,7 @@ from pathlib import Path
 import pytest
 
 from pp_cl import __version__
+from pp_cl.capture.packages import DISTRIBUTIONS
 
 ROOT = Path(__file__).parents[2]
 KERNEL_FILES = sorted((ROOT / "cl").rglob("*.cl"))
@@ -45,6 +46,26 @@ def test_setup_cfg_declares_every_package_that_is_imported():
     packages = {name: found.get(name, [name])[0].lower().replace("_", "-") for name in names}
     assert "numpy" in names
     assert set(packages.values()) <= {name.lower() for name in declared}
+
+
+def test_commands_that_install_work_in_a_checkout_and_with_the_wheel():
+    """Messages name the packages of an extra themselves: pp-cl is on no index, and what it was
+    installed from is not known.
+    """
+    setup = configparser.ConfigParser()
+    setup.read(ROOT / "setup.cfg")
+    extras = {
+        name: {re.split("[<>=;]", line)[0] for line in lines.split("\n") if line}
+        for name, lines in setup["options.extras_require"].items()
+    }
+    named = [set(DISTRIBUTIONS.values())]
+    for path in (ROOT / "pp_cl").rglob("*.py"):
+        found = re.findall("pip install ([^`{]+)`", path.read_text("utf-8"))
+        named += [set(packages.split(" ")) for packages in found]
+    wanted = [extras[name] for name in ("capture", "plot", "sweep", "tensorboard", "video", "view")]
+    assert sorted(map(sorted, named)) == sorted(map(sorted, wanted))
+    pages = [ROOT / "README.md", *(ROOT / "docs").glob("*.md"), *(ROOT / "docs").glob("*.ipynb")]
+    assert not [page.name for page in pages if "pp-cl[" in page.read_text("utf-8")]
 
 
 def test_the_conda_recipe_asks_for_what_setup_cfg_does():
