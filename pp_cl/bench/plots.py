@@ -126,7 +126,8 @@ def plot_ranks(figure: Any, names: list[str], rows: list[tuple[str, dict]], own:
         axes.barh(range(len(labels)), values, color=colours)
         axes.set_yticks(range(len(labels)), labels, fontsize="x-small")
         low, high = min(values), max(values)
-        axes.set_xlim(max(0.0, low - 0.2 * (high - low)), high + 0.05 * (high - low) or None)
+        span = high - low or high or 1.0  # of one bar, or of equal ones: its length
+        axes.set_xlim(max(0.0, low - 0.2 * span), high + 0.05 * span)
 
 
 def save_figure(figure: Any, path: str) -> None:

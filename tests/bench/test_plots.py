@@ -1,6 +1,6 @@
 """What is drawn, and that matplotlib can draw it."""
 
-from pp_cl.bench.plots import figure_of, plot_models, plot_overview, save_figure
+from pp_cl.bench.plots import figure_of, plot_models, plot_overview, plot_ranks, save_figure
 
 
 def network_row(variant, direction, ms, side):
@@ -61,3 +61,11 @@ def test_each_way_to_make_a_run_smaller_is_one_series(tmp_path):
     assert drawn == {"a": [0], "keep": [1, 2]}
     save_figure(figure, str(file))
     assert "<svg" in file.read_text()
+
+
+def test_a_bar_alone_is_drawn_without_a_warning(tmp_path, recwarn):
+    figure = figure_of(str(tmp_path / "ranks.png"))
+    plot_ranks(figure, ["psnr", "lpips"], [("mine", {"psnr": 30.0, "lpips": 0.0})], "mine")
+    save_figure(figure, str(tmp_path / "ranks.png"))
+    assert not recwarn.list
+    assert [axes.get_xlim() for axes in figure.axes] == [(24.0, 31.5), (0.0, 0.05)]
