@@ -20,7 +20,7 @@ ON_OCLGRIND := OCL_ICD_VENDORS=/usr/lib/oclgrind/liboclgrind-rt-icd.so OCLGRIND_
 	OCLGRIND_NUM_THREADS=1 OCLGRIND_BUILD_OPTIONS="-cl-opt-disable -DALWAYS_INLINE=static" PYOPENCL_NO_CACHE=1 \
 	PP_DEVICE=Oclgrind PP_DATA=/nonexistent
 
-.PHONY: help setup demo test test-slow test-intel test-no-unix bench lint format docs results network dist oclgrind gpu-check fuzz faults test-coarse test-gpu-form clean
+.PHONY: help setup demo test test-slow test-intel test-no-unix bench lint format docs results readme network dist oclgrind gpu-check fuzz faults test-coarse test-gpu-form clean
 
 help: ## print this list
 	@sed -n 's/^\([a-z-]*\):.*## \(.*\)/\1	\2/p' Makefile | expand -t 12
@@ -75,12 +75,16 @@ format: $(READY) ## format the Python files and the kernels
 	@$(BIN)/clang-format -i $(KERNELS)
 
 docs: $(READY) ## write the tables, settings and commands in README.md and docs/
-	@$(BIN)/python tools/docs_tables.py
+	@$(BIN)/python -m tools.docs_tables
 
 results: $(READY) ## measure what README.md and docs/ state, and write it there: hours, with the scenes of PP_DATA
 	@$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[plot,torch]'
 	@$(BIN)/python -m tools.results $(ARGS)
-	@$(BIN)/python tools/docs_tables.py
+	@$(BIN)/python -m tools.docs_tables
+
+readme: $(READY) ## type README.md's commands in an empty folder, on each driver that is here, and write their lines there: minutes
+	@$(BIN)/python -m tools.readme_lines
+	@$(BIN)/python -m tools.docs_tables
 
 network: $(READY) ## train the demo and keep its network as what `--network demo` begins with
 	@$(BIN)/pp-cl train demo --iterations 1500 --seed 1 --out runs/network
