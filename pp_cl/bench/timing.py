@@ -63,6 +63,11 @@ def errors(actual: np.ndarray, expected: np.ndarray) -> tuple[float, float]:
     return float(np.linalg.norm(difference) / scale), float(np.abs(difference).max())
 
 
+# By the floats of a vector register. A core needs 2 units x 4 cycles of registers under way; it has
+# 32 registers of 16 floats, or 16 smaller ones, of which a chain of 16 lanes takes 2 or 4.
+CPU_CHAINS = {16: 16, 8: 6, 4: 3}
+
+
 class PeakFlops:
     """A loop of multiply-adds in registers, long enough to be timed. flops: floating-point
     operations of one run().
@@ -70,11 +75,11 @@ class PeakFlops:
 
     def __init__(self, dev: Device):
         self.dev = dev
-        # A CPU core needs 2 units x 4 cycles of chains and has 32 vector registers. On a GPU the 16
-        # lanes of one chain are 16 chains already, and many work-items share a unit.
-        self.chains, per_unit, self.local = {"CPU": (16, 64, 1), "GPU": (2, 2048, 64)}[
-            device_class(dev)
-        ]
+        # On a GPU the 16 lanes of one chain are 16 chains already, and many work-items share a unit
+        self.chains, per_unit, self.local = 2, 2048, 64
+        if device_class(dev) == "CPU":
+            self.chains = CPU_CHAINS.get(dev.device.native_vector_width_float, CPU_CHAINS[8])
+            per_unit, self.local = 64, 1
         self.out = dev.empty((per_unit * dev.info["compute_units"], VECTOR))
         self.rounds = 64
         self.run()  # builds the kernel

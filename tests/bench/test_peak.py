@@ -1,0 +1,67 @@
+"""The peak that benches compare with is that of a loop in C."""
+
+import shutil
+import subprocess
+
+import pytest
+
+from pp_cl.bench.timing import PeakFlops
+from pp_cl.layers.choice import device_class
+
+# multiply-adds in registers: CHAINS vectors of WIDTH floats, for SECONDS on each of THREADS
+SOURCE = r"""
+#include <pthread.h>
+#include <stdio.h>
+#include <time.h>
+typedef float vector __attribute__((vector_size(4 * WIDTH)));
+static double rate[THREADS];
+static double now(void) {
+    struct timespec t;
+    clock_gettime(CLOCK_MONOTONIC, &t);
+    return t.tv_sec + 1e-9 * t.tv_nsec;
+}
+static void *work(void *at) {
+    vector x[CHAINS], sum = {0}, factor = sum + 0.5f, term = sum + 1.0f;
+    for (int c = 0; c < CHAINS; c++) x[c] = sum + (float)c;
+    const double start = now();
+    long rounds = 0;
+    while (now() - start < SECONDS) {
+        for (int i = 0; i < 100000; i++)
+#pragma GCC unroll 16
+            for (int c = 0; c < CHAINS; c++) x[c] = x[c] * factor + term;
+        rounds += 100000;
+    }
+    *(double *)at = 2.0 * WIDTH * CHAINS * rounds / (now() - start);
+    for (int c = 0; c < CHAINS; c++) sum += x[c];
+    return (void *)(long)(sum[0] > 1e9f);
+}
+int main(void) {
+    pthread_t threads[THREADS];
+    double all = 0;
+    for (int i = 0; i < THREADS; i++) pthread_create(&threads[i], 0, work, &rate[i]);
+    for (int i = 0; i < THREADS; i++) pthread_join(threads[i], 0), all += rate[i];
+    printf("%f", all * 1e-9);
+}
+"""
+
+
+@pytest.mark.slow
+def test_the_peak_is_that_of_a_loop_in_c(session_device, tmp_path):
+    """Within 10 %, the best of rounds in turn: chains that do not fit the registers halve it."""
+    dev, compiler = session_device, shutil.which("gcc")
+    width = dev.device.native_vector_width_float
+    if device_class(dev) != "CPU" or compiler is None or width not in (8, 16):
+        pytest.skip("needs gcc, and a CPU with AVX2 or AVX-512")
+    (tmp_path / "loop.c").write_text(SOURCE)
+    given = {"WIDTH": width, "CHAINS": 12 if width == 16 else 10, "THREADS": dev.info["compute_units"], "SECONDS": 0.3}
+    words = [f"-D{name}={value}" for name, value in given.items()]
+    words += ["-O3", "-march=native", f"-mprefer-vector-width={32 * width}", "-pthread"]
+    words += ["-mno-avx512f"] if width == 8 else []
+    program = str(tmp_path / "loop")
+    subprocess.run([compiler, *words, str(tmp_path / "loop.c"), "-o", program], check=True)
+    peak = PeakFlops(dev)
+    ours, loop = [], []
+    for _ in range(12):
+        ours.append(peak.flops / peak._seconds() * 1e-9)
+        loop.append(float(subprocess.run([program], check=True, capture_output=True).stdout))
+    assert max(ours) / max(loop) == pytest.approx(1, abs=0.1)
