@@ -2,6 +2,8 @@
 PYTHON ?= python3
 BIN := .venv/bin
 READY := .venv/.ready
+# the packages alone, without an OpenCL driver
+MADE := .venv/.made
 KERNELS = $(shell find cl -name "*.cl" -o -name "*.h")
 
 # of `make fuzz`
@@ -27,9 +29,12 @@ help: ## print this list
 
 setup: $(READY) ## make .venv with pp-cl in it, and see to a working OpenCL device
 
-$(READY): setup.cfg setup.py pyproject.toml tools/setup_venv.sh tools/setup_opencl.py
-	@tools/setup_venv.sh $(PYTHON)
+$(READY): $(MADE) tools/setup_opencl.py
 	@$(BIN)/python tools/setup_opencl.py
+	@touch $@
+
+$(MADE): setup.cfg setup.py pyproject.toml tools/setup_venv.sh
+	@tools/setup_venv.sh $(PYTHON)
 	@touch $@
 
 demo: $(READY) ## train the demo scene into runs/demo and evaluate it: minutes on a CPU
@@ -62,14 +67,14 @@ bench: $(READY) ## time and error of the network and of its layers; ARGS="--size
 	$(BIN)/pp-cl bench unet $(ARGS)
 	$(BIN)/pp-cl bench conv $(ARGS)
 
-lint: $(READY) ## check the Python files (ruff, mypy for three systems, import-linter) and the format of the kernels (clang-format)
+lint: $(MADE) ## check the Python files (ruff, mypy for three systems, import-linter) and the format of the kernels (clang-format)
 	@$(BIN)/ruff check
 	@$(BIN)/ruff format --check
 	@for system in linux win32 darwin; do $(BIN)/mypy --platform $$system || exit; done
 	@$(BIN)/lint-imports --no-logo --no-cache
 	@$(BIN)/clang-format --dry-run --Werror $(KERNELS)
 
-format: $(READY) ## format the Python files and the kernels
+format: $(MADE) ## format the Python files and the kernels
 	@$(BIN)/ruff check --fix
 	@$(BIN)/ruff format
 	@$(BIN)/clang-format -i $(KERNELS)
@@ -95,6 +100,7 @@ dist: $(READY) ## build the wheel and the source archive into dist/, check both,
 	@$(BIN)/python -m pip install --quiet --disable-pip-version-check build twine
 	@$(BIN)/python -m build -q
 	@$(BIN)/python -m twine check --strict dist/*
+	@! tar tf dist/*.tar.gz | grep -E 'film\.webp|orbits\.png'  # pictures that MIT does not cover
 	@set -e; unset PYTHONPATH; for archive in $(CURDIR)/dist/*; do \
 		empty=$$(mktemp -d); cd $$empty; \
 		$(CURDIR)/$(BIN)/python -m venv venv; \

@@ -83,8 +83,6 @@ def made(paths, folder):
 @pytest.mark.parametrize("name", COMMANDS)
 def test_what_is_the_users_stays(work, scene, name, capsys):
     """Files beside those of the command, and those of the command that the user has changed."""
-    if "a.svg" in COMMANDS[name][1]:
-        pytest.importorskip("matplotlib")
     before, words = files(work), words_for(name, scene)
     assert main(words) == 0
     written = files(work)

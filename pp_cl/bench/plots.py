@@ -24,7 +24,7 @@ def figure_of(file: str | None, option: str = "--plot") -> Any | None:
         from matplotlib.figure import Figure
     except ImportError:
         raise UserError(
-            f'{option} {file}: needs matplotlib; install it with `pip install "pp-cl[plot]"`'
+            f"{option} {file}: needs matplotlib; install it with `pip install matplotlib`"
         ) from None
     return Figure(figsize=(8, 6), layout="constrained")
 

@@ -36,7 +36,8 @@ def needed(module: str) -> ModuleType:
     except ImportError as error:
         raise UserError(
             f"capture needs the package {DISTRIBUTIONS[module]} ({error}):"
-            ' pip install "pp-cl[capture]"'
+            " pip install {"
+            ".join(DISTRIBUTIONS.values())}"
         ) from None
 
 

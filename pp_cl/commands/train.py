@@ -56,7 +56,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add(
         "--tensorboard",
         action="store_true",
-        help="also write the curves to RUN/tensorboard (needs pp-cl[tensorboard])",
+        help="also write the curves to RUN/tensorboard (needs tensorboardX)",
     )
     add("--view", action="store_true", help="watch in the browser, as with `pp-cl view RUN`")
     add("-v", "--verbose", action="store_true", help="print the memory plan buffer by buffer")

@@ -24,7 +24,7 @@ from pp_cl.errors import UserError
 from pp_cl.files.atomic import cache_folder, make_cache_folder, write_json
 from pp_cl.files.untrusted import read_regular
 
-RUNTIME = "intel-opencl-rt"  # Intel's CPU runtime, which `pip install pp-cl[cpu]` brings
+RUNTIME = "intel-opencl-rt"  # Intel's CPU runtime, which the extra `cpu` brings
 RUNTIME_LIBRARIES = ("libintelocl.so", "intelocl64.dll")
 CHOSEN = ("OCL_ICD_VENDORS", "OPENCL_VENDOR_PATH")  # where users name drivers
 REST = "the system's OpenCL drivers"  # where nobody tells them apart before they are loaded

@@ -15,7 +15,7 @@ def writer_class() -> type:
         from tensorboardX import SummaryWriter
     except ImportError:
         raise UserError(
-            '--tensorboard: needs tensorboardX; install it with `pip install "pp-cl[tensorboard]"`'
+            "--tensorboard: needs tensorboardX; install it with `pip install tensorboardX`"
         ) from None
     return SummaryWriter
 

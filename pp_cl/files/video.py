@@ -19,7 +19,9 @@ MOST_FRAMES = 100_000  # of a film for pages
 CONVERTED = "scale=out_color_matrix=bt709:out_range=tv"
 TAGGED = "setparams=color_primaries=bt709:color_trc=bt709:colorspace=bt709:range=tv"
 COLOURS = ["-vf", f"{CONVERTED},{TAGGED}"]
-MISSING = 'films need imageio and imageio-ffmpeg; install them with `pip install "pp-cl[video]"`'
+MISSING = (
+    "films need imageio and imageio-ffmpeg; install them with `pip install imageio imageio-ffmpeg`"
+)
 
 
 def check_video(suffix: str) -> None:

