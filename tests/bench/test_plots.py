@@ -4,7 +4,7 @@ from unittest.mock import MagicMock
 
 import pytest
 
-from pp_cl.bench.plots import figure_of, plot_models, plot_overview, save_figure
+from pp_cl.bench.plots import figure_of, plot_models, plot_overview, plot_ranks, save_figure
 
 
 def network_row(variant, direction, ms, side):
@@ -61,3 +61,15 @@ def test_matplotlib_draws_them(tmp_path):
     plot_models(figure.add_subplot(), rows)
     save_figure(figure, str(models))
     assert whole.read_bytes().startswith(b"\x89PNG") and "<svg" in models.read_text()
+
+
+def test_a_run_alone_has_a_chart_too(tmp_path):
+    """Without bars, which exaggerate where they do not begin at 0."""
+    pytest.importorskip("matplotlib", reason="pictures need the extra `plot`")
+    chart = tmp_path / "chart.png"
+    figure = figure_of(str(chart))
+    plot_ranks(figure, ["psnr"], [("runs/mine", {"psnr": 30.0})], "runs/mine")
+    save_figure(figure, str(chart))
+    (axes,) = figure.axes
+    low, high = axes.get_xlim()
+    assert low < 30 < high and not axes.patches
