@@ -48,13 +48,6 @@ def test_all_benches_are_on_one_picture():
     assert names == ["update", "network", "project"]
 
 
-def test_a_single_row_is_a_dot_in_the_middle_of_its_chart():
-    figure = figure_of("a.png")
-    plot_ranks(figure, ["psnr"], [("ours", {"psnr": 30.0})], "ours")
-    low, high = figure.axes[0].get_xlim()
-    assert low < 30 < high and figure.axes[0].collections[0].get_offsets().tolist() == [[30, 0]]
-
-
 def test_matplotlib_draws_them(tmp_path):
     rows = [{"what": what, "speed": 1.0, "loss": 0.1} for what in ("a", "keep 0.5", "keep 0.25")]
     whole, models = tmp_path / "whole.png", tmp_path / "models.svg"
@@ -65,3 +58,14 @@ def test_matplotlib_draws_them(tmp_path):
     plot_models(figure.add_subplot(), rows)
     save_figure(figure, str(models))
     assert whole.read_bytes().startswith(b"\x89PNG") and "<svg" in models.read_text()
+
+
+def test_a_run_alone_has_a_chart_too(tmp_path):
+    """Without bars, which exaggerate where they do not begin at 0."""
+    chart = tmp_path / "chart.png"
+    figure = figure_of(str(chart))
+    plot_ranks(figure, ["psnr"], [("runs/mine", {"psnr": 30.0})], "runs/mine")
+    save_figure(figure, str(chart))
+    (axes,) = figure.axes
+    low, high = axes.get_xlim()
+    assert low < 30 < high and not axes.patches
