@@ -1,8 +1,9 @@
 # Everything runs in .venv, which the first target makes; the system Python is only needed for that.
 PYTHON ?= python3
 BIN := .venv/bin
-INSTALLED := .venv/.installed
 READY := .venv/.ready
+# the packages alone, without an OpenCL driver
+MADE := .venv/.made
 KERNELS = $(shell find cl -name "*.cl" -o -name "*.h")
 
 # of `make fuzz`
@@ -21,19 +22,19 @@ ON_OCLGRIND := OCL_ICD_VENDORS=/usr/lib/oclgrind/liboclgrind-rt-icd.so OCLGRIND_
 	OCLGRIND_NUM_THREADS=1 OCLGRIND_BUILD_OPTIONS="-cl-opt-disable -DALWAYS_INLINE=static" PYOPENCL_NO_CACHE=1 \
 	PP_DEVICE=Oclgrind PP_DATA=/nonexistent
 
-.PHONY: help setup demo test test-slow test-intel test-no-unix bench lint format docs results network dist oclgrind gpu-check fuzz faults test-coarse test-gpu-form clean
+.PHONY: help setup demo test test-slow test-intel test-no-unix bench lint format docs results readme network dist oclgrind gpu-check fuzz faults test-coarse test-gpu-form clean
 
 help: ## print this list
 	@sed -n 's/^\([a-z-]*\):.*## \(.*\)/\1	\2/p' Makefile | expand -t 12
 
 setup: $(READY) ## make .venv with pp-cl in it, and see to a working OpenCL device
 
-$(INSTALLED): setup.cfg setup.py pyproject.toml tools/setup_venv.sh
-	@tools/setup_venv.sh $(PYTHON)
+$(READY): $(MADE) tools/setup_opencl.py
+	@$(BIN)/python tools/setup_opencl.py
 	@touch $@
 
-$(READY): $(INSTALLED) tools/setup_opencl.py
-	@$(BIN)/python tools/setup_opencl.py
+$(MADE): setup.cfg setup.py pyproject.toml tools/setup_venv.sh
+	@tools/setup_venv.sh $(PYTHON)
 	@touch $@
 
 demo: $(READY) ## train the demo scene into runs/demo and evaluate it: minutes on a CPU
@@ -66,25 +67,29 @@ bench: $(READY) ## time and error of the network and of its layers; ARGS="--size
 	$(BIN)/pp-cl bench unet $(ARGS)
 	$(BIN)/pp-cl bench conv $(ARGS)
 
-lint: $(INSTALLED) ## check the Python files (ruff, mypy for three systems, import-linter) and the format of the kernels (clang-format)
+lint: $(MADE) ## check the Python files (ruff, mypy for three systems, import-linter) and the format of the kernels (clang-format)
 	@$(BIN)/ruff check
 	@$(BIN)/ruff format --check
 	@for system in linux win32 darwin; do $(BIN)/mypy --platform $$system || exit; done
 	@$(BIN)/lint-imports --no-logo --no-cache
 	@$(BIN)/clang-format --dry-run --Werror $(KERNELS)
 
-format: $(INSTALLED) ## format the Python files and the kernels
+format: $(MADE) ## format the Python files and the kernels
 	@$(BIN)/ruff check --fix
 	@$(BIN)/ruff format
 	@$(BIN)/clang-format -i $(KERNELS)
 
 docs: $(READY) ## write the tables, settings and commands in README.md and docs/
-	@$(BIN)/python tools/docs_tables.py
+	@$(BIN)/python -m tools.docs_tables
 
 results: $(READY) ## measure what README.md and docs/ state, and write it there: hours, with the scenes of PP_DATA
 	@$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[plot,torch]'
 	@$(BIN)/python -m tools.results $(ARGS)
-	@$(BIN)/python tools/docs_tables.py
+	@$(BIN)/python -m tools.docs_tables
+
+readme: $(READY) ## type README.md's commands in an empty folder, on each driver that is here, and write their lines there: minutes
+	@$(BIN)/python -m tools.readme_lines
+	@$(BIN)/python -m tools.docs_tables
 
 network: $(READY) ## train the demo and keep its network as what `--network demo` begins with
 	@$(BIN)/pp-cl train demo --iterations 1500 --seed 1 --out runs/network

@@ -12,6 +12,7 @@ import sys
 import warnings
 from collections.abc import Sequence
 from contextlib import nullcontext, redirect_stdout, suppress
+from itertools import pairwise
 
 from pp_cl import __version__
 from pp_cl.errors import BuildError, Stopped, UserError, one_line, quoted, suggestion
@@ -155,16 +156,25 @@ def _fail(message, status=2):
 
 
 def _parse(argv):
-    """The options. A word after --json is no FILE where the command would lack its RUN, as in
-    `pp-cl info --json RUN`.
+    """The options. A word after --json is no FILE where it has neither an ending nor a folder, as
+    in `pp-cl bench --json conv`, nor where the command would lack its RUN, as in `pp-cl info --json
+    RUN`; a folder after --metrics is no metric.
     """
-    parser = _parser()
+    from pp_cl.commands.options import METRICS
+
+    parser, bare = _parser(), {"--json": "--json=-", "--metrics": f"--metrics={','.join(METRICS)}"}
+    words = list(argv)
+    for i, (word, value) in enumerate(pairwise(words)):
+        if word == "--json" and value.strip("-") and not {".", "/", os.sep} & {*value}:
+            words[i] = bare[word]
+        if word == "--metrics" and os.path.isdir(value):
+            words[i] = bare[word]
     try:
-        return parser.parse_args(argv)
+        return parser.parse_args(words)
     except _UsageError as error:
         with suppress(_UsageError):
-            if "--json" in argv:
-                return parser.parse_args([("--json=-" if w == "--json" else w) for w in argv])
+            if "--json" in words:
+                return parser.parse_args([bare["--json"] if w == "--json" else w for w in words])
         raise error
 
 

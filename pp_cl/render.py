@@ -15,6 +15,7 @@ from pyopencl.array import Array
 
 from pp_cl.device.buffers import Buffers, Reading, Table, grown
 from pp_cl.device.device import Device
+from pp_cl.errors import UserError
 from pp_cl.files.picture import Picture
 from pp_cl.layers.tiles import tiles_hit
 from pp_cl.model import Model
@@ -27,6 +28,7 @@ from pp_cl.scene.camera import Camera
 from pp_cl.settings import RasterConfig
 
 NETWORK_MULTIPLE = 4  # the U-Net halves its input twice
+MOST_SIDE = 2**16 - 1  # pixels of an image: the boxes of points have 16 bits
 # far - near of the scenes for which the paper's radius of 0.0015 was chosen
 PAPER_DEPTH_RANGE = 4.0
 
@@ -141,6 +143,11 @@ class Renderer:
         dev, cloud, net = self.dev, self.model.cloud, self.model.net
         padded, left, top = camera.padded(NETWORK_MULTIPLE)
         size = (padded.height, padded.width)
+        if max(size) > MOST_SIDE:
+            raise UserError(
+                f"an image of {camera.width}x{camera.height} pixels: at most {MOST_SIDE} each way"
+                " are rendered; render parts of it"
+            )
         by_pair = training or until != "image"
         if by_pair != self._by_pair:
             self._by_pair = by_pair

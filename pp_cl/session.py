@@ -33,7 +33,6 @@ from pp_cl.files.run_folder import MASKS_PICTURE, RunFolder
 from pp_cl.layers.choice import load_policy, policy_of_run
 from pp_cl.metrics.psnr_ssim import psnr
 from pp_cl.model import Model
-from pp_cl.network.aside import build_aside
 from pp_cl.network.unet import UNet
 from pp_cl.presets import SHORT
 from pp_cl.run import Run, load_run
@@ -318,7 +317,6 @@ def open_training(
     info |= {"initial_points": points, "tuning": policy.tuning}
     info |= {"extended_from": begun} if begun else {}
     info |= {"left_out": left_out} if left_out else {}
-    build_aside(net, config.network, trainer.network_size)
     return Training(folder, config, trainer, info, room, hull, policy.origin, measured, read)
 
 

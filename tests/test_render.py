@@ -12,6 +12,7 @@ from support.networks import plain_parameters
 from support.scenes import ring_cameras
 
 import pp_cl.network.unet
+from pp_cl.errors import UserError
 from pp_cl.raster.weights import BLENDS
 from pp_cl.reference import dense as oracle_raster
 from pp_cl.reference.network import network, network_gradients
@@ -172,3 +173,11 @@ def test_arrays_without_room_are_released_before_larger_ones_are_made(dev, rng, 
     second = renderer.forward(near, GAMMA, until="weights").pairs.capacity
     assert 0 < 2 * first < second
     assert dev.peak_bytes == dev.bytes
+
+
+def test_an_image_beyond_the_boxes_of_points_is_refused(dev, rng):
+    """Before anything is launched: they would wrap."""
+    camera = replace(ring_cameras(1, 16)[0], width=2**16)
+    renderer = Renderer(dev, make_model(dev, rng), RasterConfig())
+    with pytest.raises(UserError, match="65536x16 pixels: at most 65535 each way"):
+        renderer.forward(camera, GAMMA)

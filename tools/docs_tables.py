@@ -1,13 +1,15 @@
 """Write the generated parts of README.md and docs/: tables of measurements, settings, commands.
 
-    python tools/docs_tables.py            # or make docs
+    python -m tools.docs_tables            # or make docs
 
 A generated part stands between the lines `<!-- table: NAME -->` and `<!-- end table -->` of a
 Markdown file. NAME is `settings` (from pp_cl/settings.py and presets.py), `commands` (from the
-parsers of pp_cl/commands/), `api` (from pp_cl's docstrings), `origin` (of what code all results
-are, and of what machine), or that of a file docs/results/NAME.json, which holds
+parsers of pp_cl/commands/), `api` (from pp_cl's docstrings), `trained` and `evaluated` (what the
+commands of README.md print, of docs/results/readme.json), or that of another file
+docs/results/NAME.json, which holds
 
-    version, commit, date, machine    in all files the same
+    commit, date, machine, how    of what code it is, where and how it was measured
+    decides    digest of what decides a training in that code (tools/provenance.py)
     measured   what the numbers are
     columns    [{"head": text, "cell": format}]: format is a str.format of the row's keys
     rows       [{key: value}]; a cell of which a row lacks a key is empty
@@ -29,8 +31,8 @@ import pp_cl
 from pp_cl.cli import COMMANDS
 from pp_cl.config import Config, sections, text_of
 from pp_cl.presets import PRESETS
+from tools.provenance import ROOT, digest, sentence
 
-ROOT = Path(__file__).parents[1]
 BLOCK = re.compile(r"^(<!-- table: (\S+) -->\n).*?^(<!-- end table -->)$", re.DOTALL | re.MULTILINE)
 MARKER = re.compile(r"^<!-- (?:end )?table", re.MULTILINE)
 
@@ -54,21 +56,33 @@ def markdown(heads: Sequence[str], rows: Sequence[Sequence[str]]) -> list[str]:
     return [lines[0], "|---" * len(heads) + "|", *lines[1:]]
 
 
-def table(results: dict) -> str:
-    """Markdown of a file of results: what was measured, and the table."""
+def table(results: dict, now: str) -> str:
+    """Markdown of a file of results: what was measured, the table, and of which code it is. now:
+    the digest of the present code.
+    """
     what = results["measured"]
     heads = [column["head"] for column in results["columns"]]
     rows = [[cell(column["cell"], row) for column in results["columns"]] for row in results["rows"]]
-    return "\n".join([f"{what[0].upper()}{what[1:]}.", "", *markdown(heads, rows)])
+    lines = [f"{what[0].upper()}{what[1:]}.", "", *markdown(heads, rows)]
+    return "\n".join([*lines, "", f"*{sentence(results, now)}*"])
 
 
-def origin(results: dict[str, dict]) -> str:
-    """Of what code the results are, and of what machine. Raises TableError where files differ."""
-    template = "Version {version}, commit {commit}, {date}, {machine}."
-    found = {template.format(**contents) for contents in results.values()}
-    if len(found) > 1:
-        raise TableError("results of several commits or machines: run make results")
-    return next(iter(found), "")
+def readme(results: dict, now: str) -> dict[str, str]:
+    """The lines that README's commands print: {trained, evaluated}, on the first driver; the others
+    beside it.
+    """
+    first, *others = results["rows"]
+    beside = [
+        f"{one['driver']}: {one['points']} points; {one['psnr']}, {one['ssim']}, {one['lpips']}"
+        for one in others
+    ]
+    about = f"{first['driver']}, {first['kind']}"
+    about = f"These lines are of {about}" + "".join(f"; {one}" for one in beside) + "."
+    lines = ["    " + line for line in first["table"]]
+    return {
+        "trained": f"    {first['trained']}",
+        "evaluated": "\n".join([*lines, "", f"{about} {sentence(results, now)}"]),
+    }
 
 
 def settings() -> str:
@@ -159,8 +173,9 @@ def read_results(folder: Path) -> dict[str, dict]:
 def read_tables(folder: Path) -> dict[str, str]:
     """{name: Markdown} of all that can be generated; folder: of the results. Raises TableError."""
     results = read_results(folder)
-    measured = {name: table(contents) for name, contents in results.items()}
-    measured["origin"] = origin(results)
+    now = digest()
+    measured = readme(results.pop("readme"), now) if "readme" in results else {}
+    measured |= {name: table(contents, now) for name, contents in results.items()}
     return measured | {"settings": settings(), "commands": commands(), "api": api()}
 
 

@@ -19,11 +19,11 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, TypeAlias
 
-from pp_cl import __version__
 from pp_cl.device.discover import open_device
 from pp_cl.errors import UserError
 from pp_cl.files.atomic import write_json
 from pp_cl.metrics.published import tables as published
+from tools.provenance import digest
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -168,7 +168,7 @@ def key_of(training: Training) -> str:
 def train(training: Training) -> dict:
     """A row of QUALITY."""
     run = KEPT / key_of(training)
-    words = ["--preset", training.preset, "--network", "random", "--seed", 1, "--out", run]
+    words = ["--preset", training.preset, "--out", run]
     if training.steps:
         words += ["--iterations", training.steps]
     if training.downscale:
@@ -320,10 +320,10 @@ def origin() -> dict[str, str]:
     processor = dev.name.replace("(R)", "").removeprefix("pthread-")
     driver = f"{dev.info['platform']} {dev.info['driver']}"
     return {
-        "version": __version__,
         "commit": git("log", "-1", "--format=%h", "--", *CODE),
         "date": date.today().isoformat(),
         "machine": f"{os.cpu_count()} cores ({processor}), {driver}",
+        "decides": digest(),
     }
 
 

@@ -4,7 +4,7 @@
 
 #ifndef CHAINS
 // independent sums of 16 lanes: enough to hide an FMA's latency, few enough for the registers
-#define CHAINS 16
+#define CHAINS 6
 #endif
 
 // One work-item per row of out: does `rounds` times `CHAINS` multiply-adds x = x * factor + term in

@@ -123,11 +123,10 @@ def plot_ranks(figure: Any, names: list[str], rows: list[tuple[str, dict]], own:
         measured = [(label, values[name]) for label, values in reversed(rows) if name in values]
         labels, values = zip(*measured, strict=True)
         colours = ["C1" if label == own else "C0" for label in labels]
-        axes.barh(range(len(labels)), values, color=colours)
+        # dots, as bars that do not begin at 0 exaggerate
+        axes.scatter(values, range(len(labels)), color=colours)
         axes.set_yticks(range(len(labels)), labels, fontsize="x-small")
-        low, high = min(values), max(values)
-        span = high - low or high or 1.0  # of one bar, or of equal ones: its length
-        axes.set_xlim(max(0.0, low - 0.2 * span), high + 0.05 * span)
+        axes.margins(0.1)
 
 
 def save_figure(figure: Any, path: str) -> None:

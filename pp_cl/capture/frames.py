@@ -44,6 +44,13 @@ SAME = 0.3  # levels of 255 by which small copies of one photograph differ at mo
 FRAMES, GROUP = 120, 12  # of a film
 LOCAL = ["-protocol_whitelist", "file,pipe"]  # a film names no other machine
 EACH_ONCE = ["-fps_mode", "passthrough"]
+HDR = ("arib-std-b67", "smpte2084")  # transfers of phones: HLG and PQ
+WHITE = 203  # candela per square metre, of BT.2408's diffuse white
+# to sRGB: brighter than 0.7 of white is compressed
+TONE_MAPPED = (
+    f",zscale=t=linear:npl={WHITE},format=gbrpf32le,zscale=p=bt709,tonemap=mobius:param=0.7:desat=0"
+    ",zscale=t=iec61966-2-1:m=gbr:r=full"
+)
 
 
 def take_images(source: Path, images: Path) -> dict[str, Any]:
@@ -181,12 +188,12 @@ def _focal_of_larger(exposure, size):
 
 def _frames(film, images):
     """The facts of the sharpest frame of each interval, written to `images`."""
-    chosen = _sharpest(film)
+    chosen, is_hdr = _sharpest(film)
     equal = [f"eq(n,{number})" for number in chosen]
     # in groups, since ffmpeg sums no more than a hundred
     some = ["+".join(equal[i : i + GROUP]) for i in range(0, len(equal), GROUP)]
     wanted = "+".join(f"({one})" for one in some)
-    _, frames = _decoded(film, f"select='{wanted}'", "rgb24", 3)
+    _, frames = _decoded(film, f"select='{wanted}'" + TONE_MAPPED * is_hdr, "rgb24", 3)
     frames = zip(chosen, frames, strict=False)
     for number, frame in tqdm(
         frames, "frames", len(chosen), unit="image", leave=False, disable=None
@@ -199,7 +206,7 @@ def _frames(film, images):
 
 
 def _sharpest(film):
-    """The number of the sharpest frame of each of FRAMES intervals."""
+    """(the number of the sharpest frame of each of FRAMES intervals, whether the film is HDR)."""
     meta, frames = _decoded(film, f"scale=w='min({SEEN},iw)':h=-2", "gray", 1)
     # an estimate, for the bar alone: what browsers record states no length
     total = round(meta["duration"] * meta["fps"]) or None
@@ -209,7 +216,8 @@ def _sharpest(film):
         raise UserError(f"{film}: holds no frames; give another film")
     count = len(sharpness)
     intervals = groupby(range(count), lambda number: number * FRAMES // max(count, FRAMES))
-    return [max(numbers, key=sharpness.__getitem__) for _, numbers in intervals]
+    is_hdr = any(transfer in meta.get("pix_fmt", "") for transfer in HDR)
+    return [max(numbers, key=sharpness.__getitem__) for _, numbers in intervals], is_hdr
 
 
 def _decoded(film: Path, filters: str, pixels: str, channels: int) -> tuple[dict, Iterator]:
@@ -225,9 +233,12 @@ def _decoded(film: Path, filters: str, pixels: str, channels: int) -> tuple[dict
     )
 
     def refused(error):
+        # ffmpeg's last line that says what is wrong, without its banner
+        lines = [line for line in str(error).splitlines() if "rror" in line or "nvalid" in line]
+        said = re.sub(r"^\[[^]]*\]\s*", "", lines[-1]) if lines else str(error).partition("\n")[0]
         return UserError(
-            f"{film}: cannot be read as a film ({shown(str(error), 100)}); give an MP4, MOV or"
-            " WebM, or a folder of photographs"
+            f"{film}: cannot be read as a film ({shown(said, 100)}); give an MP4, MOV or WebM, or a"
+            " folder of photographs"
         )
 
     try:

@@ -2,6 +2,8 @@
 program of the user's; else cut out by colour around the sparse points and voted on by all views.
 """
 
+import os
+import re
 import shlex
 import subprocess
 import tempfile
@@ -147,7 +149,8 @@ def _of_program(words, image, shape):
 def program_words(command: str) -> list[str]:
     """The words of --mask-command. Raises UserError unless they name a program, {image}, {mask}."""
     try:
-        words = shlex.split(command)
+        words = shlex.split(command, posix=os.name != "nt")  # where \\ parts folders
+        words = [re.sub(r"^([\"'])(.*)\1$", r"\2", word) for word in words]
     except ValueError as error:
         raise UserError(f"--mask-command {command}: {error}; mend the quotes") from None
     if not words or "{image}" not in command or "{mask}" not in command:

@@ -195,6 +195,7 @@ def _frame_count(options, kind):
         return 0
     count = round((seconds or SECONDS) * fps)
     if not 1 <= count <= MOST_FRAMES:
+        seconds = seconds or SECONDS
         raise UserError(
             f"--seconds {seconds:g}: {seconds * fps:g} frames at {fps:g} a second; ask for 1 to"
             f" {MOST_FRAMES}"

@@ -17,6 +17,7 @@ HELP = "look at a run, also while it is trained, or at a scene in the browser"
 EPILOG = """A scene: its cameras and sparse points. Its box can be moved and views dropped; both are
 written to pp_cl.json in its folder, which training, info and all other commands obey."""
 LOOPBACK = "127.0.0.1"
+LOOPBACKS = (LOOPBACK, "localhost", "::1")
 PORT = 8733
 
 
@@ -47,7 +48,7 @@ def run(options: argparse.Namespace) -> None:
     """Serve until Ctrl-C."""
     from pp_cl.view.serve import serve
 
-    if options.host != LOOPBACK:
+    if options.host not in LOOPBACKS:
         print(
             f"pp-cl: --host {options.host}: whoever can reach this address and learns the token can"
             " look on; nothing is encrypted",
@@ -82,9 +83,12 @@ def _has_windows():
 @contextmanager
 def _redirect(address) -> Iterator[Path]:
     """A page that leads to the address, for this user alone to read: everybody sees the arguments
-    of a browser, and the address holds the token. It is there until the block ends.
+    of a browser, and the address holds the token. It is there until the block ends. It lies in the
+    user's home, where there is one: browsers in a sandbox (snap) see neither /tmp nor hidden files.
     """
-    number, name = tempfile.mkstemp(".html", "pp-cl-view-")  # of mode 0600
+    home = Path.home()
+    there = home if os.access(home, os.W_OK) else None
+    number, name = tempfile.mkstemp(".html", "pp-cl-view-", there)  # of mode 0600
     address = html.escape(address)
     with open(number, "w", encoding="utf-8") as file:
         file.write(

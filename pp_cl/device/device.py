@@ -174,17 +174,11 @@ class Device:
         self._scratch: dict[Hashable, Any] = {}  # {name: array} of scratch()
         self._programs: dict[Any, Program] = {}
         self._constants: dict[Any, Any] = {}
-        self.build_seconds = 0.0  # of all programs
         self._seconds: dict[str, list[float]] = defaultdict(list)
         self._stage_seconds: dict[str, list[float]] | None = None
         if self.debug:
             self._stage_seconds = defaultdict(list)
             atexit.register(self.print_profile)
-
-    @property
-    def programs_built(self) -> int:
-        """How many programs were built."""
-        return len(self._programs)
 
     @property
     def build_options(self) -> list[str]:
@@ -222,9 +216,8 @@ class Device:
                 ],
                 defines=defines,
             )
-            seconds = time.perf_counter() - start
-            self.build_seconds += seconds
             if self.debug:
+                seconds = time.perf_counter() - start
                 print(
                     f"cl/{name}.cl {' '.join(macros)} built in {seconds:.2f} s",
                     file=sys.stderr,
@@ -344,14 +337,18 @@ class Device:
 
     def attempt(self, what: str, function: Callable[..., Any], *args, **kwargs) -> Any:
         """Call function(*args, **kwargs); UserError if the driver fails for lack of memory, which
-        many allocate only at a buffer's first use.
+        many allocate only at a buffer's first use, or with OUT_OF_RESOURCES, which NVIDIA's says of
+        kernels that fault or run too long as well.
         """
         try:
             return function(*args, **kwargs)
         except (cl.MemoryError, cl.RuntimeError) as error:
+            unsaid = "OUT_OF_RESOURCES" in str(error)
+            why = " for want of memory, or since the driver ended a kernel" if unsaid else ""
             raise UserError(
-                f"{self.name} cannot {what} ({error}; {self.bytes / 2**20:.0f} MiB in use):"
+                f"{self.name} cannot {what}{why} ({error}; {self.bytes / 2**20:.0f} MiB in use):"
                 f" {SMALLER}, or choose another device (`pp-cl devices`)"
+                f"{'; the log of the system may say more' if unsaid else ''}"
             ) from error
 
     @contextmanager
@@ -414,6 +411,7 @@ class Device:
             mapped, _ = cl.enqueue_map_buffer(self._maps, memory, flags, *place)
             ask_for_huge_pages(mapped.ctypes.data, nbytes)
             mapped.base.release(self._maps)
+            self._maps.finish()  # other queues use the memory next
         return memory
 
     def observe(self, kernel: Kernel, event: cl.Event, arguments: dict[str, Any]) -> None:

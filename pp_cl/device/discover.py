@@ -126,12 +126,12 @@ def open_device(choice: str | None = None) -> Device:
 
     choice: "platform:device" as printed by `pp-cl devices`, or a part of the platform's or device's
     name; a platform's comes first, as PoCL's devices carry the name of the processor ("intel" means
-    Intel's driver wherever there is one). Raises UserError when nothing matches or nothing works;
-    never takes another device than the one asked for.
+    Intel's driver wherever there is one), then the whole of a device's. Raises UserError when
+    nothing matches or nothing works; never takes another device than the one asked for.
     """
     choice = choice or os.environ.get("PP_DEVICE")
     found = list_devices()
-    wanted = sorted((f for f in found if _rank(f, choice)[0] < 3), key=lambda f: _rank(f, choice))
+    wanted = sorted((f for f in found if _rank(f, choice)[0] < 4), key=lambda f: _rank(f, choice))
     for _, device, problem in wanted:
         if problem is None:
             return Device(device)
@@ -149,7 +149,7 @@ def open_device(choice: str | None = None) -> Device:
 
 
 def _rank(found, choice):
-    """Sort key of one list_devices() entry: (0-2 how it matches `choice`, 3 not at all; GPUs
+    """Sort key of one list_devices() entry: (0-3 how it matches `choice`, 4 not at all; GPUs
     first).
     """
     index, device, _ = found
@@ -157,6 +157,8 @@ def _rank(found, choice):
         match = 0
     elif choice.lower() in device.platform.name.lower():
         match = 1
+    elif choice.lower() == device.name.strip().lower():
+        match = 2
     else:
-        match = 2 if choice.lower() in device.name.lower() else 3
+        match = 3 if choice.lower() in device.name.lower() else 4
     return match, not device.type & cl.device_type.GPU

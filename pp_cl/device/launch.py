@@ -182,6 +182,15 @@ class Kernel:
             )
             for p in parameters
         ]
+        # (parameter, axis, dimension as text, its formula), letters first: others are computed of
+        # them
+        dimensions = [
+            (p, axis, word, compile_formula(word))
+            for p in parameters
+            for axis, word in enumerate(p.shape or ())
+            if word != "?" and p.space in ("global", "constant")
+        ]
+        self._dimensions = sorted(dimensions, key=lambda d: not d[2].isidentifier())
         self._checked: set[Any] = set()  # shapes and sizes already found right
         self._ranges: dict[Any, Any] = {}  # {(size, work-group) as given: as enqueued}
 
@@ -276,32 +285,34 @@ class Kernel:
         """Compare the arrays with their parameters. sizes: {letter: size} of the scalars; the sizes
         of the other letters are added.
         """
-        dimensions = []  # (formula, number, what to say if they differ)
-        for p in self.parameters:
-            if p.space not in ("global", "constant"):
+        for p, dtype, _ in self._slots:
+            if dtype is None:
                 continue
             array = values[p.name]
-            has = f"{self.label}: {p.name} has shape {array.shape}"
             if not array.flags.c_contiguous:
-                raise ValueError(f"{has} and strides {array.strides}: not contiguous")
-            if p.shape is None:
-                continue
-            if len(array.shape) != len(p.shape):
-                raise ValueError(f"{has}, expected rank {len(p.shape)} {p.shape}")
-            has += f", expected {p.shape}"
-            dimensions += [(w, n, has) for w, n in zip(p.shape, array.shape, strict=True)]
-        # letters first: the formulas are computed from them
-        for word, size, has in sorted(dimensions, key=lambda d: not d[0].isidentifier()):
-            if word == "?":
-                continue
-            formula = compile_formula(word)
+                raise ValueError(
+                    f"{self.label}: {p.name} has shape {array.shape} and strides {array.strides}:"
+                    " not contiguous"
+                )
+            if p.shape is not None and len(array.shape) != len(p.shape):
+                raise ValueError(
+                    f"{self.label}: {p.name} has shape {array.shape}, expected rank"
+                    f" {len(p.shape)} {p.shape}"
+                )
+        for p, axis, word, formula in self._dimensions:
+            size = values[p.name].shape[axis]
             known = {n: self._macros.get(n, sizes.get(n.lower())) for n in formula.co_names}
             if None in known.values():  # a letter's first buffer
                 expected = sizes.setdefault(word.lower(), size)
+            elif word in known:
+                expected = known[word]
             else:
                 expected = eval(formula, {}, known)  # noqa: S307 - checked by compile_formula()
             if size != expected:
-                raise ValueError(f"{has} with {word} = {expected}")
+                raise ValueError(
+                    f"{self.label}: {p.name} has shape {values[p.name].shape}, expected {p.shape}"
+                    f" with {word} = {expected}"
+                )
 
 
 def _kind(value):

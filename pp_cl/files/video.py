@@ -3,7 +3,7 @@ Pillow.
 """
 
 from collections.abc import Iterable
-from itertools import chain
+from itertools import chain, pairwise
 from pathlib import Path
 
 import numpy as np
@@ -14,7 +14,14 @@ from pp_cl.files.atomic import atomic_path
 
 LOOPED = ("gif", "webp")  # as pages show without a player
 FORMATS = ("mp4", "webm", *LOOPED)
-MISSING = "films need more packages; install them with `pip install imageio imageio-ffmpeg`"
+MOST_FRAMES = 100_000  # of a film for pages
+# players take films without tags for BT.601 or BT.709 by their size; sRGB's primaries are BT.709's
+CONVERTED = "scale=out_color_matrix=bt709:out_range=tv"
+TAGGED = "setparams=color_primaries=bt709:color_trc=bt709:colorspace=bt709:range=tv"
+COLOURS = ["-vf", f"{CONVERTED},{TAGGED}"]
+MISSING = (
+    "films need imageio and imageio-ffmpeg; install them with `pip install imageio imageio-ffmpeg`"
+)
 
 
 def check_video(suffix: str) -> None:
@@ -46,7 +53,11 @@ def write_video(path: Path, frames: Iterable[np.ndarray], fps: float) -> None:
 
 def _write_looped(path, frames, fps):
     images = map(Image.fromarray, frames)
-    options = {"save_all": True, "duration": 1000 / fps, "loop": 0}
+    # whole units, whose sum is off by less than one wherever the film ends
+    unit = 10 if path.suffix.lower() == ".gif" else 1
+    ends = [round(i * 1000 / fps / unit) for i in range(MOST_FRAMES + 1)]
+    durations = [unit * (end - start) for start, end in pairwise(ends)]
+    options = {"save_all": True, "duration": durations, "loop": 0}
     next(images).save(path, append_images=images, **options)
 
 
@@ -78,9 +89,10 @@ def _options(suffix, frame, fps):
         "input_params": ["-threads", "2"],
     }
     if suffix == "mp4":
-        return options | {"codec": "libx264", "quality": 8, "pixelformat": "yuv420p"}
+        coded = {"codec": "libx264", "quality": 8, "pixelformat": "yuv420p"}
+        return options | coded | {"output_params": COLOURS}
     pixels = "yuva420p" if alpha else "yuv420p"
-    quality = ["-crf", "24", "-b:v", "0", "-auto-alt-ref", "0"]
+    quality = ["-crf", "24", "-b:v", "0", "-auto-alt-ref", "0", *COLOURS]
     return options | {
         "codec": "libvpx-vp9",
         "quality": None,

@@ -3,7 +3,6 @@ launch the kernels layer by layer.
 """
 
 import math
-import subprocess
 from collections import defaultdict
 from collections.abc import Sequence
 from typing import Any
@@ -139,7 +138,6 @@ class UNet:
             weight, bias = rng.uniform(-bound, bound, shape), rng.uniform(-bound, bound, shape[0])
             dev.write(self.parameters[layer.name + ".weight"], pack_weights(weight))
             dev.write(self.parameters[layer.name + ".bias"], pack_bias(bias))
-        self.builders: list[subprocess.Popen] = []  # of its kernels, before the first forward pass
         self._relu_outputs = {layer.name for layer in self.layers if layer.relu}
         self._maps: dict[bool, FeatureMaps] = {}  # {training: FeatureMaps}
         # {(policy, layer, direction, source, size): module of a convolution}
@@ -227,8 +225,6 @@ class UNet:
             raise ValueError(
                 f"the network takes (4n, 4m, {self.channels_in}) features, not {x.shape}"
             )
-        while self.builders:
-            self.builders.pop().wait()
         if training not in self._maps:
             self._maps[training] = FeatureMaps(self.dev, self.layers, training)
         if training:
@@ -246,28 +242,6 @@ class UNet:
         if training:
             self._trained = size, arrays, tiles
         return out
-
-    def build(self, size: tuple[int, int], of_weights: bool) -> None:
-        """Run each layer once on crops of `size` = (height, width) that hold anything, which builds
-        its kernels: those of the gradients of weights, or the others.
-        """
-        maps = FeatureMaps(self.dev, self.layers, training=True)
-        maps.resize(size)
-        arrays = maps.arrays | {"x": self.dev.zeros((*size, self.channels_in))}
-        self._prepare(size)
-        sums = []
-        for layer in self.layers:
-            tiles = maps.all_tiles.tiles
-            if not of_weights:
-                sources = tuple(arrays[name] for name in layer.inputs)
-                self._forward(size, layer, sources, arrays[layer.name], tiles(layer.name))
-                for i, name in enumerate(layer.inputs):
-                    self._backward_input(size, layer, i, arrays, tiles(name))
-            elif layer.kind == "conv":
-                sums.append(self._backward_weights(size, layer, arrays, tiles(layer.name)))
-        if sums:
-            self._sum_parts(sums)
-        self.dev.finish()
 
     def backward(self, grad_y: Array) -> Array:
         """(H, W, channels_in) gradient of x in the last forward(x, training=True), given dL/dy (H,

@@ -2,16 +2,20 @@
 
 import math
 from dataclasses import dataclass, replace
+from itertools import product
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.ndimage import label
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
 
 from pp_cl.scene.camera import Camera
 
 FLOAT32_BITS = 24
 MOST_VERTICES = 2**32  # an id has 32 bits
+# steps (x, y, z) to 13 of a vertex's 26 neighbours; the others are their opposites
+HALF_OF_NEIGHBOURS = [step for step in product((0, 1, -1), repeat=3) if step[::-1] > (0, 0, 0)]
 
 
 @dataclass(frozen=True)
@@ -120,16 +124,25 @@ class Grid:
         return np.asarray(self.origin) + self.edge * ijk
 
     def in_large_parts(self, ids: np.ndarray, least: int) -> np.ndarray:
-        """(N,) bool: which of the vertices with ids (N,) are in a connected part (edges, diagonals)
-        of at least `least`; where there is none, those in the largest.
+        """(N,) bool: which of the vertices with ids (N,), ascending, are in a connected part
+        (edges, diagonals) of at least `least`; where there is none, those in the largest. It takes
+        the memory of the vertices, not of the box around them.
         """
-        nx, ny, _ = self.dims
+        nx, ny, nz = self.dims
         ids = np.asarray(ids, np.int64)
-        kji = np.stack([ids // (nx * ny), ids // nx % ny, ids % nx])
-        kji -= kji.min(1, keepdims=True)
-        occupied = np.zeros(kji.max(1) + 1, bool)
-        occupied[tuple(kji)] = True
-        part = label(occupied, np.ones((3, 3, 3)))[0][tuple(kji)]
+        place = np.stack([ids % nx, ids // nx % ny, ids // (nx * ny)], -1)
+        edges = []
+        for step in HALF_OF_NEIGHBOURS:
+            there = place + step
+            inside = np.flatnonzero(((there >= 0) & (there < (nx, ny, nz))).all(1))
+            wanted = ids[inside] + np.dot(step, (1, nx, nx * ny))
+            found = np.searchsorted(ids, wanted)
+            found[found == len(ids)] = 0
+            known = ids[found] == wanted
+            edges.append(np.stack([inside[known], found[known]]).astype(np.int32))
+        one, other = np.concatenate(edges, 1)
+        graph = coo_array((np.ones(len(one), bool), (one, other)), (len(ids), len(ids)))
+        part = connected_components(graph, directed=False)[1]
         size = np.bincount(part)
         return size[part] >= min(least, size.max())
 

@@ -33,7 +33,7 @@ try:
 except ImportError as error:
     raise UserError(
         f"pp-cl sweep needs Dask ({error.name} is missing); install it with"
-        " `pip install cryptography dask distributed`"
+        " `pip install dask distributed cryptography`"
     ) from None
 
 LOOPBACK = "127.0.0.1"

@@ -1,20 +1,21 @@
-"""Access control of the viewer's server: token, Host and Origin are checked before anything else.
+"""Access control of the viewer's server: every path begins with a token, which is checked before
+anything else.
 
 A page of another site can make a browser send requests here, and a name that its owner points at
-127.0.0.1 makes them look like requests of the same site (DNS rebinding). Such requests lack the
-token, and carry that other name as Host or Origin.
+127.0.0.1 makes them look like requests of the same site (DNS rebinding). Neither knows the token.
+Host and Origin are not asked: behind ssh -L, JupyterHub or another proxy they are those of others.
 """
 
 from __future__ import annotations
 
 import hmac
-import ipaddress
+import re
 import secrets
+import socket
 from dataclasses import dataclass, field
 
-LOOPBACK = ("127.0.0.1", "localhost")
 ANY = ("0.0.0.0", "::")  # noqa: S104 compared with, not bound to
-HTTP_PORT = 80  # which browsers leave out of Host
+HOST = re.compile(r"[\w.:\[\]-]+")
 
 
 @dataclass(frozen=True)
@@ -28,31 +29,24 @@ class Access:
     @property
     def address(self) -> str:
         """What to open in a browser."""
-        # a socket of `::` takes no IPv4
-        name = {"0.0.0.0": LOOPBACK[0], "::": "::1"}.get(self.host, self.host)  # noqa: S104
+        name = socket.gethostname() if self.host in ANY else self.host
         return f"http://{_bracketed(name)}:{self.port}/{self.token}/"
 
-    def refusal(self, path: str, host: str, origin: str | None, *, strict: bool) -> str | None:
-        """Why a request is refused, one line, or None. path: decoded; host, origin: the headers;
-        strict: whether it must have an Origin, as browsers send it for websockets and for what
-        changes something.
-        """
-        if not self._knows(host):
-            return "Host is not the address of this server"
+    def refusal(self, path: str) -> str | None:
+        """Why a request of a decoded path is refused, one line, or None."""
         given = path.split("/", 2)[1] if path.startswith("/") else ""
         if not hmac.compare_digest(given.encode("utf-8", "replace"), self.token.encode()):
             return "the token is missing or wrong; open the address that pp-cl view printed"
-        if (strict or origin is not None) and origin != f"http://{host}":
-            return "Origin is not the address of this server"
         return None
 
     def headers(self, host: str) -> dict[str, str]:
         """Headers of every response. host: the request's."""
-        socket = f" ws://{host}" if self._knows(host) else ""
+        # which 'self' does not mean in every browser
+        own = f" ws://{host} wss://{host}" if HOST.fullmatch(host) else ""
         rules = (
             "default-src 'self'",
             "img-src 'self' blob:",
-            f"connect-src 'self'{socket}",
+            f"connect-src 'self'{own}",
             "object-src 'none'",
             "base-uri 'none'",
             "form-action 'none'",
@@ -67,31 +61,6 @@ class Access:
             "Server": "pp-cl",
         }
 
-    def _knows(self, host):
-        """Whether a Host header names this server. On all interfaces any number is an address of
-        it, since only names can be rebound.
-        """
-        if host in self._hosts([self.host, *LOOPBACK] if self._is_local else [self.host]):
-            return True
-        name, _, port = host.rpartition(":")
-        return self.host in ANY and port == str(self.port) and _is_number(name.strip("[]"))
-
-    @property
-    def _is_local(self):
-        return self.host in (*LOOPBACK, *ANY)
-
-    def _hosts(self, names):
-        hosts = {f"{_bracketed(name)}:{self.port}" for name in names}
-        return hosts | {_bracketed(name) for name in names if self.port == HTTP_PORT}
-
 
 def _bracketed(name):
     return f"[{name}]" if ":" in name else name
-
-
-def _is_number(name):
-    try:
-        ipaddress.ip_address(name)
-    except ValueError:
-        return False
-    return True

@@ -23,7 +23,7 @@ let rows = []; // of the log
 
 function connect() {
   const address = new URL("socket", location.href);
-  address.protocol = "ws:";
+  address.protocol = location.protocol === "https:" ? "wss:" : "ws:";
   socket = new WebSocket(address);
   socket.binaryType = "arraybuffer";
   socket.onopen = () => { say(""); loads = 0; };

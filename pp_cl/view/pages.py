@@ -36,11 +36,7 @@ def application(
 
     @web.middleware
     async def guard(request, handler):
-        host, origin = request.headers.get("Host", ""), request.headers.get("Origin")
-        # browsers send their Origin with whatever does more than read
-        more = "Upgrade" in request.headers or request.method not in ("GET", "HEAD")
-        refusal = access.refusal(request.path, host, origin, strict=more)
-        if refusal:
+        if refusal := access.refusal(request.path):
             raise web.HTTPForbidden(text=f"403: {refusal}\n")
         return await handler(request)
 

@@ -30,42 +30,44 @@ RESULT = {
 }
 
 
-def test_all_benches_are_on_one_picture(tmp_path):
-    file = tmp_path / "whole.png"
-    figure = figure_of(str(file))
+def test_all_benches_are_on_one_picture():
+    figure = figure_of("a.png")
     plot_overview(figure, RESULT)
     network, raster, quality, stages = figure.axes
     drawn = {line.get_label(): line.get_xydata().tolist() for line in network.lines}
     assert drawn["direct, forward"] == [[2.0, 1e-9]]  # of the largest image, error 0
     assert drawn["winograd, train"] == [[3.0, 1e-9]] and drawn["direct, train"] == []
-    ((line, _, (bars,)),) = raster.containers
-    assert line.get_xydata().tolist() == [[1000, 6.0], [2000, 8.0]]
-    assert [part[:, 1].tolist() for part in bars.get_segments()] == [[5.0, 8.0], [7.0, 10.0]]
+    (curve,) = raster.containers
+    line, _, (bars,) = curve.lines
+    assert line.get_xydata().tolist() == [[1000, 6], [2000, 8]]
+    assert [part[:, 1].tolist() for part in bars.get_segments()] == [[5, 8], [7, 10]]
     assert quality.lines[0].get_xydata().tolist() == [[4.5, 21.25]]
-    assert [[bar.get_width() for bar in some] for some in stages.containers] == [
-        [3, 2, 1], [1.5, 0.5]
-    ]  # fmt: skip
+    assert [[bar.get_width() for bar in bars] for bars in stages.containers] == [
+        [3, 2, 1],
+        [1.5, 0.5],
+    ]
     names = [label.get_text() for label in stages.get_yticklabels()]
     assert names == ["update", "network", "project"]
-    save_figure(figure, str(file))
-    assert file.read_bytes().startswith(b"\x89PNG")
 
 
-def test_each_way_to_make_a_run_smaller_is_one_series(tmp_path):
-    whats = ("a", "keep 0.5", "keep 0.25")
-    rows = [{"what": what, "speed": i, "loss": 0.1} for i, what in enumerate(whats)]
-    file = tmp_path / "models.svg"
-    figure = figure_of(str(file))
+def test_matplotlib_draws_them(tmp_path):
+    rows = [{"what": what, "speed": 1.0, "loss": 0.1} for what in ("a", "keep 0.5", "keep 0.25")]
+    whole, models = tmp_path / "whole.png", tmp_path / "models.svg"
+    figure = figure_of(str(whole))
+    plot_overview(figure, RESULT)
+    save_figure(figure, str(whole))
+    figure = figure_of(str(models))
     plot_models(figure.add_subplot(), rows)
-    drawn = {line.get_label(): list(line.get_xdata()) for line in figure.axes[0].lines}
-    assert drawn == {"a": [0], "keep": [1, 2]}
-    save_figure(figure, str(file))
-    assert "<svg" in file.read_text()
+    save_figure(figure, str(models))
+    assert whole.read_bytes().startswith(b"\x89PNG") and "<svg" in models.read_text()
 
 
-def test_a_bar_alone_is_drawn_without_a_warning(tmp_path, recwarn):
-    figure = figure_of(str(tmp_path / "ranks.png"))
-    plot_ranks(figure, ["psnr", "lpips"], [("mine", {"psnr": 30.0, "lpips": 0.0})], "mine")
-    save_figure(figure, str(tmp_path / "ranks.png"))
-    assert not recwarn.list
-    assert [axes.get_xlim() for axes in figure.axes] == [(24.0, 31.5), (0.0, 0.05)]
+def test_a_run_alone_has_a_chart_too(tmp_path):
+    """Without bars, which exaggerate where they do not begin at 0."""
+    chart = tmp_path / "chart.png"
+    figure = figure_of(str(chart))
+    plot_ranks(figure, ["psnr"], [("runs/mine", {"psnr": 30.0})], "runs/mine")
+    save_figure(figure, str(chart))
+    (axes,) = figure.axes
+    low, high = axes.get_xlim()
+    assert low < 30 < high and not axes.patches

@@ -11,6 +11,7 @@ from PIL import Image, TiffImagePlugin
 from pp_cl.capture import frames
 from pp_cl.capture.features import find_features, opened
 from pp_cl.capture.frames import take_images
+from pp_cl.errors import UserError
 from pp_cl.files.image import read_rgba
 from pp_cl.files.video import write_video
 
@@ -140,3 +141,66 @@ def test_a_film_that_is_shown_turned(film, tmp_path, caplog):
     turned = remade(flat, "turned.mp4", "-display_rotation", "90", ["-c", "copy", *fragments[2:]])
     found = take_images(turned, tmp_path / "images")["images"]
     assert {tuple(one["size"]) for one in found} == {SIZE[::-1]} and not caplog.records
+
+
+def display(colour, transfer):
+    """Signal in [0, 1] of BT.2020 by which a display in HLG or PQ shows an sRGB colour, white at
+    203 candela per square metre (BT.2100, BT.2408).
+    """
+    level = np.asarray(colour) / 255
+    light = np.where(level <= 0.04045, level / 12.92, ((level + 0.055) / 1.055) ** 2.4)
+    light = light @ np.array(
+        [[0.6274, 0.0691, 0.0164], [0.3293, 0.9195, 0.0880], [0.0433, 0.0114, 0.8956]]
+    )
+    if transfer == "smpte2084":
+        power = (light * 203 / 10_000) ** 0.1593017578125
+        return ((0.8359375 + 18.8515625 * power) / (1 + 18.6875 * power)) ** 78.84375
+    light = light * 203 / 1000
+    scene = light * (light @ [0.2627, 0.678, 0.0593])[..., None] ** (1 / 1.2 - 1)
+    a, b, c = 0.17883277, 0.28466892, 0.55991073
+    dark = np.sqrt(3 * np.minimum(scene, 1 / 12))
+    return np.where(scene <= 1 / 12, dark, a * np.log(np.maximum(12 * scene - b, 1e-9)) + c)
+
+
+@pytest.mark.parametrize("transfer, off", [("smpte2084", 5), ("arib-std-b67", 12)])
+def test_a_film_in_hdr_has_the_colours_of_one_in_sdr(tmp_path, rng, transfer, off):
+    """10 bits of BT.2020, as phones make them. Off by what HLG's system gamma, which ffmpeg applies
+    to each channel, makes of colours; without tone mapping they are washed out, by 30 and more.
+    """
+    imageio_ffmpeg = pytest.importorskip("imageio_ffmpeg")
+    colours = np.array([(180, 120, 60), (90, 140, 180), (128, 128, 128), (60, 100, 50)], np.uint8)
+    frames_ = [
+        np.kron(np.roll(colours, i, 0).reshape(2, 2, 3), np.ones((60, 80, 1))) for i in range(12)
+    ]
+    raw = b"".join(
+        (np.clip(display(one, transfer), 0, 1) * 65535 + 0.5).astype("<u2").tobytes()
+        for one in frames_
+    )
+    tags = f"color_primaries=bt2020:color_trc={transfer}:colorspace=bt2020nc:range=tv"
+    film = tmp_path / "film.mov"
+    subprocess.run(
+        [
+            *(imageio_ffmpeg.get_ffmpeg_exe(), "-loglevel", "error", "-f", "rawvideo"),
+            *("-pix_fmt", "rgb48le", "-s", "160x120", "-r", "24", "-i", "-", "-vf"),
+            "scale=out_color_matrix=bt2020:out_range=tv,format=yuv420p10le,setparams=" + tags,
+            *("-c:v", "libx265", "-x265-params", "log-level=error", str(film)),
+        ],
+        input=raw,
+        check=True,
+    )
+    found = take_images(film, tmp_path / "images")["images"]
+    for one in found:
+        image = read_rgba(tmp_path / "images" / one["name"])[..., :3].astype(float)
+        true = frames_[int(one["name"][:6])]
+        assert np.abs(image.mean((0, 1)) - true.mean((0, 1))).max() < off
+        for row, column in ((30, 40), (30, 120), (90, 40), (90, 120)):
+            assert np.abs(image[row, column] - true[row, column]).max() < 2 * off
+
+
+def test_what_is_no_film_is_one_line_without_the_programs_banner(tmp_path):
+    (tmp_path / "film.mov").write_bytes(b"no film" * 100)
+    with pytest.raises(
+        UserError, match=r"cannot be read as a film \(Error opening input"
+    ) as caught:
+        take_images(tmp_path / "film.mov", tmp_path / "images")
+    assert "ffmpeg version" not in str(caught.value)

@@ -4,6 +4,7 @@ import shlex
 import sys
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -470,3 +471,18 @@ def test_the_picture_shows_outlines(capture, tmp_path):
     alone = picture(capture.folder, capture.folder / "masks", capture.photographs[7:8])
     height, width = alone.shape[:2]
     assert (sheet[:height, :width] == alone).all()
+
+
+@pytest.mark.parametrize(
+    "system, command, program",
+    [
+        ("nt", r"C:\tools\rembg.exe {image} {mask}", r"C:\tools\rembg.exe"),
+        ("nt", r'"C:\my tools\rembg.exe" i {image} {mask}', r"C:\my tools\rembg.exe"),
+        ("posix", r"/my\ tools/rembg i {image} {mask}", "/my tools/rembg"),
+        ("posix", "'/my tools/rembg' i {image} {mask}", "/my tools/rembg"),
+    ],
+)
+def test_the_program_of_a_command_on_each_system(monkeypatch, system, command, program):
+    monkeypatch.setattr("pp_cl.capture.masks.os", SimpleNamespace(name=system))
+    words = program_words(command)
+    assert words[0] == program and words[-2:] == ["{image}", "{mask}"]

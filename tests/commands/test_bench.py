@@ -76,4 +76,4 @@ def test_a_plot_is_drawn(tmp_path, what):
 def test_without_matplotlib_a_plot_is_refused(tmp_path, monkeypatch, capsys):
     monkeypatch.setitem(sys.modules, "matplotlib.figure", None)
     assert main(["bench", "--plot", str(tmp_path / "b.png")]) == 2
-    assert "pip install matplotlib`" in capsys.readouterr().err
+    assert "pip install matplotlib" in capsys.readouterr().err

@@ -6,7 +6,7 @@ import sys
 
 import pytest
 
-from pp_cl.cli import main
+from pp_cl.cli import _parse, main
 from pp_cl.commands import options
 
 REFUSED = [
@@ -76,3 +76,24 @@ def test_an_empty_value_is_refused(words, capsys):
         assert main(given) == 2
         error = capsys.readouterr().err
         assert f"{words[-1]}: is empty" in error and error.count("\n") == 1
+
+
+@pytest.mark.parametrize(
+    "words, found",
+    [
+        ("bench --json conv", {"what": "conv", "json": "-"}),
+        ("bench --json a.json conv", {"what": "conv", "json": "a.json"}),
+        ("bench conv --json", {"what": "conv", "json": "-"}),
+        ("eval --metrics RUN", {"run_folder": "RUN", "metrics": options.METRICS}),
+        ("eval RUN --metrics psnr", {"run_folder": "RUN", "metrics": ("psnr",)}),
+        ("info --json RUN", {"subject": "RUN", "json": "-"}),
+    ],
+)
+def test_a_word_after_an_option_that_may_stand_alone(tmp_path, monkeypatch, words, found):
+    """It is what its form says."""
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "RUN").mkdir()
+    given = vars(_parse(words.split()))
+    given["json"] = "-" if given["json"] is sys.stdout else given["json"]
+    for name, value in found.items():
+        assert given[name] == value, name

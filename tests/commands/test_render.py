@@ -147,3 +147,9 @@ def test_cameras_of_a_file(trained, tmp_path):
     )
     assert main(["render", trained, *words, "--out", str(tmp_path / "file.gif")]) == 0
     assert (tmp_path / "file.gif").exists()
+
+
+def test_a_path_of_no_frame_is_refused(trained, capsys):
+    """Four seconds at a frame in ten."""
+    assert main(["render", str(trained), "--fps", "0.1"]) == 2
+    assert "--seconds 4: 0.4 frames at 0.1 a second; ask for 1 to" in capsys.readouterr().err

@@ -99,10 +99,10 @@ def test_another_host_warns_and_one_that_is_not_ours_is_refused(begun, capsys):
     assert "nothing is encrypted" in warning and "--host 192.0.2.1" in error
 
 
-def test_a_missing_framework_is_named(begun, capsys, monkeypatch):
+def test_a_missing_framework_names_the_extra(begun, capsys, monkeypatch):
     monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
     assert main(["view", str(begun)]) == 2
-    assert "pip install aiohttp`" in capsys.readouterr().err
+    assert "pip install aiohttp" in capsys.readouterr().err
 
 
 def test_a_training_shows_itself_and_ends_what_it_started(tmp_path, capfd, monkeypatch):

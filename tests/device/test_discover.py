@@ -109,6 +109,14 @@ def test_devices_that_can_work_side_by_side(listed, monkeypatch):
     assert separate_devices() == ["xeon"]
 
 
+def test_a_whole_name_goes_before_a_part_of_another(listed):
+    """PoCL's devices carry the name of the processor, which is Intel's name of it."""
+    pocl = fake("Portable Computing Language", "pthread-haswell-AMD EPYC")
+    intel = fake("Intel(R) OpenCL", "AMD EPYC", index="1:0")
+    listed(pocl, intel)
+    assert open_device("AMD EPYC") is intel[1] and open_device("EPYC") is pocl[1]
+
+
 def test_unknown_choice_lists_what_was_found(listed):
     listed(fake("Portable Computing Language", "cpu"))
     with pytest.raises(

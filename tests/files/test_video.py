@@ -1,5 +1,6 @@
 """Films have the frames, the size and the speed that were asked for."""
 
+import re
 import subprocess
 import sys
 
@@ -38,6 +39,48 @@ def test_a_film_is_read_back(tmp_path, suffix, size):
     for got, expected in zip(read, frames(*size), strict=True):
         difference = np.abs(got[: size[0], : size[1]].astype(int) - expected)
         assert difference.mean() < 6
+
+
+@pytest.mark.parametrize("suffix", ["mp4", "webm"])
+@pytest.mark.parametrize("size", [(48, 64), (720, 1280)])
+def test_colours_come_back_as_players_show_them(tmp_path, suffix, size):
+    """By the tags of the film, and none are left to guess at; a column each."""
+    path = tmp_path / f"film.{suffix}"
+    colours = np.array([(200, 60, 30), (30, 180, 60), (40, 70, 220), (230, 200, 40), (128,) * 3])
+    width = size[1] // len(colours)
+    frame = np.zeros((*size, 3), np.uint8)
+    for i, colour in enumerate(colours):
+        frame[:, i * width : (i + 1) * width] = colour
+    write_video(path, iter([frame] * 5), 10)
+    said = subprocess.run(
+        [imageio_ffmpeg.get_ffmpeg_exe(), "-hide_banner", "-i", str(path)],
+        capture_output=True,
+        text=True,
+        check=False,
+    ).stderr
+    assert re.search(r"yuv420p\(tv, bt709[,)]", said), said
+    read = imageio_ffmpeg.read_frames(
+        str(path), output_params=["-vf", "scale=in_color_matrix=bt709:out_range=pc"]
+    )
+    next(read)
+    found = np.frombuffer(next(read), np.uint8).reshape(*size, 3)
+    for i, colour in enumerate(colours):
+        middle = found[size[0] // 2, i * width + width // 2]
+        assert np.abs(middle.astype(int) - colour).max() <= 3, (i, middle)
+
+
+@pytest.mark.parametrize("suffix", LOOPED)
+@pytest.mark.parametrize("fps", (30, 24, 16))
+def test_a_film_for_pages_lasts_as_long_as_it_should(tmp_path, suffix, fps):
+    """A gif's frames last whole hundredths of a second."""
+    write_video(tmp_path / f"film.{suffix}", frames(count=9), fps)
+    lasts = []
+    with Image.open(tmp_path / f"film.{suffix}") as film:
+        for i in range(film.n_frames):
+            film.seek(i)
+            film.load()
+            lasts.append(film.info["duration"])
+    assert len(lasts) == 9 and sum(lasts) == pytest.approx(9000 / fps, abs=5.001)
 
 
 @pytest.mark.parametrize("suffix", LOOPED)
@@ -90,8 +133,8 @@ def test_a_full_disk_is_one_line_and_leaves_no_film(tmp_path, suffix):
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_missing_package_names_what_to_install(monkeypatch):
+def test_a_missing_package_names_the_extra(monkeypatch):
     monkeypatch.setitem(sys.modules, "imageio_ffmpeg", None)
-    with pytest.raises(UserError, match="pip install imageio imageio-ffmpeg`"):
+    with pytest.raises(UserError, match=r"pip install imageio imageio-ffmpeg"):
         check_video("mp4")
     check_video("gif")

@@ -32,12 +32,12 @@ def check(dev, rng, camera, positions, radius, kind, gamma=0.05, depth_range=ora
     assert inner.mean() > 0.5
     blend = oracle.blend(geometry | {"hit": hits}, opacity, gamma)
     features = scene.blend(opacity, gamma, point_features).reshape(-1, 16)
-    assert np.abs(features - oracle.features(blend, point_features))[inner].max() < 1e-3
+    assert np.abs(features - oracle.features(blend, point_features))[inner].max() < 1e-4
     grad = rng.normal(size=(len(inner), 16)) * inner[:, None]
     gradients = scene.gradients(grad)
     expected = oracle.gradients(geometry | {"hit": hits}, blend, point_features, grad)
-    assert relative_error(gradients["features"], expected[0]) < 1e-3
-    assert relative_error(gradients["opacity"], expected[1]) < 2e-3
+    assert relative_error(gradients["features"], expected[0]) < 1e-5
+    assert relative_error(gradients["opacity"], expected[1]) < 5e-5
     return scene
 
 

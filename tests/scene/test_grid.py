@@ -1,5 +1,6 @@
 """The grid's arithmetic near the world's origin and far from it."""
 
+import tracemalloc
 from fractions import Fraction
 
 import numpy as np
@@ -77,3 +78,13 @@ def test_small_parts_are_told_from_large_ones():
     parts = np.array([4, 4, 4, 4, 3, 3, 3, 1])
     for least, smallest in ((1, 1), (2, 3), (4, 4), (5, 4)):
         assert (grid.in_large_parts(ids, least) == (parts >= smallest)).all()
+
+
+def test_parts_of_a_wide_box_take_the_memory_of_their_vertices():
+    """A thin wide object: 10^9 vertices in its box, of which a row and some specks are taken."""
+    grid = Grid((0, 0, 0), 1.0, (1000, 1000, 1000))
+    ids = np.append(np.arange(500), [10**6 - 1, 5 * 10**8, 10**9 - 1])
+    tracemalloc.start()
+    assert np.array_equal(grid.in_large_parts(ids, 10), ids < 500)
+    assert tracemalloc.get_traced_memory()[1] < 2**20
+    tracemalloc.stop()

@@ -1,4 +1,4 @@
-"""The documents: what they name exists, the README names every page, and they stay short."""
+"""The documents: what they name exists, and the README names every page."""
 
 import re
 from pathlib import Path
@@ -14,7 +14,6 @@ DOCUMENTS = [
 ]
 PATH = re.compile(r"`((?:pp_cl|cl|tests|tools|docs)/[\w./]+)`")
 PLACEHOLDER = re.compile(r"\bW/|\b(?:test_)?x\.")  # as in cl/W/x.cl
-MOST_WORDS, OF_README = 20_000, 900  # of README.md and docs/, generated pages included
 
 
 def named_files(text: str, folder: Path) -> list[Path]:
@@ -78,14 +77,6 @@ def anchors(page: Path) -> set[str]:
     """The names by which links reach the headings of a page."""
     headings = re.findall(r"(?m)^#+ (.*)$", page.read_text("utf-8"))
     return {re.sub(r"[^\w -]", "", h.lower()).replace(" ", "-") for h in headings}
-
-
-def test_the_documents_stay_short():
-    words = {
-        path.name: len(path.read_text("utf-8").split())
-        for path in (ROOT / "README.md", *(ROOT / "docs").glob("*.md"))
-    }
-    assert words["README.md"] <= OF_README and sum(words.values()) <= MOST_WORDS
 
 
 @pytest.mark.parametrize(

@@ -12,7 +12,8 @@ from pathlib import Path
 import pytest
 
 from pp_cl import __version__
-from pp_cl.capture.packages import DISTRIBUTIONS
+from pp_cl.capture.packages import needed
+from pp_cl.errors import UserError
 
 ROOT = Path(__file__).parents[2]
 KERNEL_FILES = sorted((ROOT / "cl").rglob("*.cl"))
@@ -48,7 +49,7 @@ def test_setup_cfg_declares_every_package_that_is_imported():
     assert set(packages.values()) <= {name.lower() for name in declared}
 
 
-def test_commands_that_install_work_in_a_checkout_and_with_the_wheel():
+def test_commands_that_install_work_in_a_checkout_and_with_the_wheel(monkeypatch):
     """Messages name the packages of an extra themselves: pp-cl is on no index, and what it was
     installed from is not known.
     """
@@ -58,7 +59,10 @@ def test_commands_that_install_work_in_a_checkout_and_with_the_wheel():
         name: {re.split("[<>=;]", line)[0] for line in lines.split("\n") if line}
         for name, lines in setup["options.extras_require"].items()
     }
-    named = [set(DISTRIBUTIONS.values())]
+    monkeypatch.setitem(sys.modules, "pycolmap", None)
+    with pytest.raises(UserError) as caught:
+        needed("pycolmap")
+    named = [set(re.search("`pip install (.+)`", str(caught.value))[1].split(" "))]
     for path in (ROOT / "pp_cl").rglob("*.py"):
         found = re.findall("pip install ([^`{]+)`", path.read_text("utf-8"))
         named += [set(packages.split(" ")) for packages in found]

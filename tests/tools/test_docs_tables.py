@@ -2,6 +2,7 @@
 
 import json
 import re
+import subprocess
 from pathlib import Path
 
 import pytest
@@ -9,6 +10,7 @@ import pytest
 from pp_cl.cli import COMMANDS
 from pp_cl.config import Config, sections
 from tools import docs_tables as TOOL
+from tools import provenance
 
 ROOT = Path(__file__).parents[2]
 TABLES = TOOL.read_tables(ROOT / "docs" / "results")
@@ -18,7 +20,7 @@ RESULTS = {
     "machine": "a machine",
     "date": "2026-01-01",
     "commit": "abc",
-    "version": "1",
+    "decides": "0123",
     "columns": [{"head": "n", "cell": "{n:,} points"}, {"head": "error", "cell": "{error:.1e}"}],
     "rows": [{"n": 1000, "error": 2e-6}, {"n": 2, "error": 0.0}, {"n": 3}],
 }
@@ -28,11 +30,46 @@ TABLE = """Times.
 |---|---|
 | 1,000 points | 2.0e-6 |
 | 2 points | 0 |
-| 3 points |  |"""
+| 3 points |  |
+
+*Commit abc, 2026-01-01, a machine.*"""
+LATER = "Later commits have changed what decides a training."
 
 
 def test_a_table():
-    assert TOOL.table(RESULTS) == TABLE
+    assert TOOL.table(RESULTS, "0123") == TABLE
+
+
+def test_a_page_says_so_where_the_code_has_changed_since(tmp_path, monkeypatch):
+    """A digest is of all that decides a training, and of nothing else; a commit has one, too."""
+    assert TOOL.table(RESULTS, "4567").endswith(f"a machine. {LATER}*")
+    for name in ("cl/a.cl", "pp_cl/train.py", "pp_cl/raster/b.py", "pp_cl/view/c.py"):
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / name).write_text("one")
+    before = provenance.digest(tmp_path)
+    (tmp_path / "pp_cl/view/c.py").write_text("two")
+    (tmp_path / "pp_cl/raster/b.pyc").write_text("two")
+    assert provenance.digest(tmp_path) == before
+    for name in ("cl/a.cl", "pp_cl/train.py", "pp_cl/raster/b.py"):
+        (tmp_path / name).write_text("two")
+        assert provenance.digest(tmp_path) != before
+        (tmp_path / name).write_text("one")
+
+
+@pytest.mark.skipif(not (ROOT / ".git").exists(), reason="an archive without its history")
+def test_the_digest_of_a_commit_is_that_of_its_checkout(tmp_path):
+    words = ["git", "worktree", "add", "--detach", str(tmp_path / "tree"), "HEAD"]
+    subprocess.run(words, cwd=ROOT, check=True, capture_output=True)
+    try:
+        assert provenance.digest_at("HEAD") == provenance.digest(tmp_path / "tree")
+    finally:
+        words = ["git", "worktree", "remove", "--force", str(tmp_path / "tree")]
+        subprocess.run(words, cwd=ROOT, check=True, capture_output=True)
+
+
+def test_every_stated_figure_is_of_a_commit():
+    for name, contents in TOOL.read_results(ROOT / "docs" / "results").items():
+        assert {"commit", "date", "machine", "decides"} <= contents.keys(), name
 
 
 @pytest.mark.parametrize("path", TOOL.documents(ROOT), ids=lambda path: path.stem)
@@ -46,23 +83,6 @@ def test_all_results_are_shown_once():
     assert sorted(re.findall(r"(?m)^<!-- table: (\S+) -->$", text)) == sorted(TABLES)
 
 
-def test_results_are_of_one_commit(tmp_path, capsys):
-    folder = tmp_path / "docs" / "results"
-    folder.mkdir(parents=True)
-    for commit in ("abc", "def"):
-        (folder / f"{commit}.json").write_text(json.dumps(RESULTS | {"commit": commit}))
-    assert TOOL.main(tmp_path) == 2
-    assert "several commits" in capsys.readouterr().err
-
-
-def test_the_output_in_the_readme_is_that_of_the_demo_in_its_table():
-    row = TOOL.read_results(ROOT / "docs" / "results")["scenes"]["rows"][0]
-    readme = " ".join((ROOT / "README.md").read_text("utf-8").split())
-    assert "{psnr:.4f} {ssim:.4f} {lpips:.4f}".format(**row) in readme
-    assert "trained {steps} steps in".format(**row) in readme
-    assert "{points} points (".format(**row) in readme
-
-
 def test_settings_and_commands_are_complete():
     for section, values in sections(Config()):
         assert all(f"| `{section}.{name}` |" in TABLES["settings"] for name in vars(values))
@@ -70,7 +90,8 @@ def test_settings_and_commands_are_complete():
     assert "- `--seed S`: " in TABLES["commands"]
 
 
-def test_it_writes_what_changed_and_nothing_else(tmp_path, capsys):
+def test_it_writes_what_changed_and_nothing_else(tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr(TOOL, "digest", lambda: "0123")
     (tmp_path / "docs" / "results").mkdir(parents=True)
     (tmp_path / "docs" / "results" / "times.json").write_text(json.dumps(RESULTS))
     readme = tmp_path / "README.md"

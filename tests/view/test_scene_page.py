@@ -45,7 +45,7 @@ async def served(folder):
             await runner.cleanup()
 
 
-def test_who_has_the_token_reads_and_who_is_the_page_writes(folder):
+def test_who_has_the_token_reads_and_writes(folder):
     async def scenario():
         async with served(folder) as (access, session):
             origin = f"http://127.0.0.1:{access.port}"
@@ -60,12 +60,10 @@ def test_who_has_the_token_reads_and_who_is_the_page_writes(folder):
             async with session.get(f"{origin}/wrong/scene.json") as answer:
                 assert answer.status == 403
             edits = {"box": [[-1, -1, -1], [1, 1, 2]], "dropped": ["train/r_2.png"]}
-            for headers in ({}, {"Origin": "http://evil.example"}):
-                post = session.post(f"{access.address}edits", json=edits, headers=headers)
-                async with post as answer:
-                    assert answer.status == 403
+            async with session.post(f"{origin}/wrong/edits", json=edits) as answer:
+                assert answer.status == 403
             assert not (folder / "pp_cl.json").exists()
-            headers = {"Origin": origin}
+            headers = {"Host": "hub.example", "Origin": "https://hub.example"}  # behind a proxy
             names = [view["name"] for view in facts["views"] if view["split"] == "train"]
             wrong = {"box": [[1, 1, 1], [0, 2, 2]]}, {"box": 3}, {"dropped": names}, [], {"x": 1}
             for bad in wrong:

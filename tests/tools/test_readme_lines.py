@@ -1,0 +1,32 @@
+"""README.md's commands print README.md's lines."""
+
+import json
+
+import pytest
+
+from tools import readme_lines as TOOL
+
+ROWS = {row["driver"]: row for row in json.loads(TOOL.FILE.read_text("utf-8"))["rows"]}
+DRIVERS = TOOL.drivers()
+
+
+def test_the_commands_are_those_that_a_reader_types():
+    train, evaluate = TOOL.commands()
+    assert train.startswith("pp-cl train demo ") and evaluate == "pp-cl eval runs/demo --metrics"
+    assert not {"--seed", "--network", "--set"} & {*train.split(), *evaluate.split()}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("driver", ROWS)
+def test_the_lines_are_what_the_commands_print(driver):
+    """To the last digit, but for the seconds, on the kind of processor of the figures; elsewhere
+    within what another order of sums makes of a training.
+    """
+    if driver not in DRIVERS:
+        pytest.skip(f"{driver} is not installed")
+    stated, found = ROWS[driver], TOOL.row(driver, DRIVERS[driver])
+    if found["kind"] == stated["kind"]:
+        names = ("steps", "points", "initial", "psnr", "ssim", "lpips")
+        assert [found[name] for name in names] == [stated[name] for name in names]
+    assert float(found["psnr"]) == pytest.approx(float(stated["psnr"]), abs=0.15)
+    assert float(found["points"]) == pytest.approx(float(stated["points"]), rel=0.02)

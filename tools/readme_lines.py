@@ -1,0 +1,100 @@
+"""Type README.md's commands in an empty folder, on each OpenCL driver that is here, and keep what
+they print in docs/results/readme.json, from which `make docs` writes the lines of README.md.
+
+    python -m tools.readme_lines        # or make readme; minutes, in which nothing else should run
+"""
+
+import json
+import os
+import platform
+import re
+import subprocess
+import sys
+import tempfile
+from datetime import date
+from pathlib import Path
+
+from pp_cl.device.discover import list_devices
+from pp_cl.files.atomic import write_json
+from tools.provenance import ROOT, digest
+from tools.results import git
+
+FILE = ROOT / "docs" / "results" / "readme.json"
+COMMANDS = re.compile(r"(?m)^    (pp-cl train demo [^\n]*)$|`(pp-cl eval runs/demo --metrics)`")
+WIDTHS = {16: "AVX-512", 8: "AVX2", 4: "vectors of 128 bits"}  # floats in a vector of the device
+TRAINED = re.compile(
+    r"^trained (?P<steps>\d+) steps in (?P<seconds>[\d.]+) s; (?P<points>\d+) points"
+    r" \((?P<initial>\d+) at the start\); wrote runs/demo/checkpoint.npz$"
+)
+EVALUATED = re.compile(
+    r"^runs/demo \(16 views\) +(?P<psnr>[\d.]+) +(?P<ssim>[\d.]+) +(?P<lpips>[\d.]+)$"
+)
+
+
+def commands() -> list[str]:
+    """README's commands of the demo, as they stand there: the training and the evaluation."""
+    found = COMMANDS.findall((ROOT / "README.md").read_text("utf-8"))
+    return [train or evaluate for train, evaluate in found]
+
+
+def drivers() -> dict[str, int]:
+    """{platform: the floats of a vector} of the CPU devices that work."""
+    found = [device for _, device, problem in list_devices() if not problem]
+    return {one.platform.name: one.native_vector_width_float for one in found}
+
+
+def typed(driver: str) -> list[str]:
+    """What README's commands print on a driver, in an empty folder."""
+    said = []
+    environment = os.environ | {"PP_DEVICE": driver, "PYTHONPATH": str(ROOT)}
+    with tempfile.TemporaryDirectory() as folder:
+        for command in commands():
+            words = [sys.executable, "-m", "pp_cl", *command.split()[1:]]
+            done = subprocess.run(
+                words, cwd=folder, env=environment, check=True, stdout=subprocess.PIPE, text=True
+            )
+            said += done.stdout.splitlines()
+    return said
+
+
+def row(driver: str, width: int) -> dict:
+    """What README shows of a driver."""
+    lines = typed(driver)
+    numbers = {}
+    for form in (TRAINED, EVALUATED):
+        [found] = filter(None, map(form.match, lines))
+        numbers |= found.groupdict()
+    head = next(line for line in lines if line.split() == ["psnr", "ssim", "lpips"])
+    shown = [head, next(line for line in lines if EVALUATED.match(line))]
+    trained = next(line for line in lines if TRAINED.match(line))
+    return {"driver": driver, "kind": WIDTHS[width], **numbers, "trained": trained, "table": shown}
+
+
+def processor() -> str:
+    """The name of the processor."""
+    try:
+        text = Path("/proc/cpuinfo").read_text("utf-8")
+        name = re.search(r"(?m)^model name\s*: (.*)$", text)
+    except OSError:
+        name = None
+    return name[1].strip() if name else platform.processor() or platform.machine()
+
+
+def main() -> int:
+    """Measure on every driver, keep what was found; returns the exit status."""
+    rows = [row(driver, width) for driver, width in drivers().items()]
+    # README's own install line brings Intel's
+    rows.sort(key=lambda one: "Intel" not in one["driver"])
+    about = {
+        "commit": git("log", "-1", "--format=%h"),
+        "date": date.today().isoformat(),
+        "machine": f"{os.cpu_count()} cores of {processor()}",
+        "decides": digest(),
+    }
+    write_json(FILE, about | {"rows": rows})
+    print(json.dumps(rows, indent=1))
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
