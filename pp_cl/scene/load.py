@@ -29,7 +29,6 @@ from pp_cl.scene.convention import STATED, other_axes, read_as
 from pp_cl.scene.distortion import BAND_BYTES, undistort
 from pp_cl.scene.edits import FILE as EDITS
 from pp_cl.scene.edits import read_edits
-from pp_cl.scene.hull import LEAST_SEEING, agreeing, build_grid, silhouette
 from pp_cl.scene.identity import pixel_digest
 from pp_cl.scene.kept import KeptViews
 from pp_cl.scene.masks import AS_GIVEN, MaskRule, cut_out
@@ -63,7 +62,6 @@ READING_BYTES = 3 * 2**28  # of the photographs that are read side by side
 LEAST_FOCAL, MOST_FOCAL = 1e-2, 1e7  # pixels; docs/scenes.md says what is measured
 
 INVERTED = 0.95  # of the border of an image: hardly any object ends inside and holds so much
-SILHOUETTE_POINTS = 250_000  # of the hull that stands in for masks that are missing
 LEAST_VIEWS = 8  # for training that are left where some are left out
 NEARBY = 100  # entries of a folder without a scene in which one is looked for
 
@@ -375,35 +373,24 @@ def load_scene(
     factor = shrink_factor(_sizes(photographs), downscale or 1)
     if dev is None and any(one.distortion for one in photographs):
         dev = open_device()
-    is_some = masks.is_given and any(one.mask for one in photographs)
     lock = Lock()
     with ThreadPoolExecutor(reading(photographs, masks, factor)[0]) as pool:
         found = pool.map(
-            lambda one: _read_view(
-                dev, lock, folder, one, masks, factor, kept, is_some and one.mask is None
-            ),
-            photographs,
+            lambda one: _read_view(dev, lock, folder, one, masks, factor, kept), photographs
         )
         bar = tqdm(
             found, "reading images", len(photographs), unit="image", leave=False, disable=None
         )
         found = iter(list(bar))
-    read = {}
+    read, is_some = {}, masks.source == "given" and any(one.mask for one in photographs)
     for split, some in chosen.items():
         notes = Notes()
-        lacking = [one.name for one in some if is_some and one.mask is None]
-        if split == "train" and 0 < len(lacking) <= len(some) - LEAST_SEEING:
-            count = f"{len(lacking)} of {len(some)} views have no mask"
-            notes.done[f"{count}: the hull of the others' is theirs"] = lacking
-        is_needed = is_some and not notes.done
-        pairs = [(folder, one, next(found), is_needed) for one in some]
+        pairs = [(folder, one, next(found), is_some) for one in some]
         read[split] = list(notes.usable(pairs, lambda all: _usable(*all), lambda all: all[1].name))
         notes.check(len(read[split]), LEAST_VIEWS if split == "train" and most is None else 1)
         lines += [f"{split}: {line}" for line in notes.lines(len(read[split]))]
     for line in lines:
         warnings.warn(f"{folder}: {line}", stacklevel=2)
-    if any(view.lacks_mask for view in read.get("train", [])):
-        read["train"] = _with_silhouettes(dev or open_device(), read["train"])
     scene = Scene(folder.resolve().name, folder, read, lines)
     return scene.reduced(downscale // factor) if downscale else scene
 
@@ -438,30 +425,11 @@ def _check_alike(folder, photographs):
             )
 
 
-def _with_silhouettes(dev, views):
-    """The views, those without a mask with the silhouette of the hull of the others' in its
-    place.
-    """
-    agreement = agreeing(dev, [view for view in views if not view.lacks_mask])
-    hull = build_grid(dev, agreement.views, SILHOUETTE_POINTS, None, agreement.forgiven)
-    filled = []
-    for view in views:
-        if view.lacks_mask:
-            held = silhouette(hull.grid, hull.ids, view.stored_camera)
-            image = view.image.copy()
-            image[..., 3] = np.where(held, 255, 0)
-            view = replace(view, image=image)
-        filled.append(view)
-    return filled
-
-
-def _usable(folder, photograph, view, is_needed):
-    """The view of a photograph that was read. is_needed: a mask, as others have one. Raises
-    Unusable.
-    """
+def _usable(folder, photograph, view, is_some):
+    """The view of a photograph that was read. is_some: others have masks. Raises Unusable."""
     if isinstance(view, Unusable):
         raise view
-    if is_needed and photograph.mask is None:
+    if is_some and photograph.mask is None:
         image = folder / photograph.name
         raise Unusable(f"{image}: has no mask, as others have; add it, or remove all", "no mask")
     return view
@@ -476,10 +444,10 @@ def _unusable(why):
         raise Unusable(str(error), why) from error
 
 
-def _read_view(dev, lock, folder, photograph, masks, factor, kept, lacks_mask):
+def _read_view(dev, lock, folder, photograph, masks, factor, kept):
     """The View of a photograph, with its mask, free of distortion and reduced `factor` times; the
     error of a view that cannot be used. lock: held by the one of several threads that uses the
-    device. lacks_mask: as View has it.
+    device.
     """
     file, camera, lens = folder / photograph.name, photograph.camera, photograph.distortion
     try:
@@ -512,7 +480,6 @@ def _read_view(dev, lock, folder, photograph, masks, factor, kept, lacks_mask):
         shrunk=factor,
         unshrunk_camera=camera if factor > 1 else None,
         is_masked=mask is not None,
-        lacks_mask=lacks_mask,
     )
     if kept and factor > 1 and not found:
         kept.take(view)

@@ -43,11 +43,6 @@ class MaskRule:
         return mask if self.source == "given" else None
 
     @property
-    def is_given(self) -> bool:
-        """Whether masks are those that the format names."""
-        return self.source == "given" and not self.folder
-
-    @property
     def is_by_colour(self) -> bool:
         """Whether cut_out() makes the masks, of the images as they are used: it takes long, and
         large ones take no better masks.

@@ -57,7 +57,6 @@ class View:
     None for one that the program makes itself. shrunk: how many times the stored image was reduced
     while it was read from its file (shrink()). unshrunk_camera: of the file's image, where
     that is another one. is_masked: a mask of its own says so where the object fills the image.
-    lacks_mask: others of its scene have one.
     """
 
     name: str
@@ -69,7 +68,6 @@ class View:
     shrunk: int = 1
     unshrunk_camera: Camera | None = None
     is_masked: bool = False
-    lacks_mask: bool = False
 
     @property
     def file_camera(self) -> Camera:

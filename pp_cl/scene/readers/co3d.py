@@ -8,13 +8,12 @@ import json
 import os
 import re
 import zlib
-from contextlib import suppress
 from functools import lru_cache, partial
 from pathlib import Path, PurePosixPath
 
 import numpy as np
 
-from pp_cl.errors import Unusable, UserError, quoted
+from pp_cl.errors import UserError, quoted
 from pp_cl.files.image import image_size
 from pp_cl.files.untrusted import opened_regular, refusal
 from pp_cl.scene.camera import Camera
@@ -163,9 +162,7 @@ def _path(frame, key):
 
 
 def _photograph(folder, frame):
-    name, mask = _found(folder, frame, "image"), None
-    with suppress(Unusable):  # others may have one
-        mask = _found(folder, frame, "mask")
+    name, mask = (_found(folder, frame, key) for key in ("image", "mask"))
     size = image_size(folder / name)
     stated = frame.get("image").get("size")
     if stated is not None and stated != [size[1], size[0]]:

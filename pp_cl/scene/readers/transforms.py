@@ -4,7 +4,6 @@ and a writer of the former.
 """
 
 import math
-from contextlib import suppress
 from functools import partial
 from pathlib import Path, PurePosixPath
 
@@ -130,9 +129,10 @@ def _of_split(file, data, given, split):
 
 def _read_frame(folder, frame):
     """The Photograph of one frame."""
-    name, mask = frame.image("file_path", folder, ["", *CASED_ENDINGS]), None
-    with suppress(Unusable):  # others may have one
-        mask = frame.image("mask_path", folder)
+    name, mask = (
+        frame.image("file_path", folder, ["", *CASED_ENDINGS]),
+        frame.image("mask_path", folder),
+    )
     if name is None:
         raise frame.error("file_path", "is missing; add the path of the image")
     return Photograph(

@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 from PIL import Image
 from support.same_scene import held_out, views
-from support.scenes import ball_image, ring_cameras
 from support.transforms_scenes import escape, refused
 
 from pp_cl.errors import Unusable, UserError
@@ -26,7 +25,6 @@ from pp_cl.scene.readers.common import (
     read_numbers,
 )
 from pp_cl.scene.readers.found import find_image, find_masks, numbered
-from pp_cl.scene.views import View
 from tools.convert_scene import convert
 
 FAIL = fail_at("file")
@@ -73,12 +71,14 @@ def cut(file):
 
 
 HARM = {
-    "gone": (Path.unlink, "no image"),
+    "gone": (Path.unlink, "no (image|mask)"),
     "cut": (cut, "(an image|a mask) that cannot be used|an image that cannot be read"),
+    "another shape": (lambda file: write_png(file, np.zeros((4, 4))), ""),
 }
 
 
-@pytest.mark.parametrize("place, harm", ((1, "gone"), (1, "cut"), (2, "cut")))
+@pytest.mark.parametrize("harm", ("gone", "cut"))
+@pytest.mark.parametrize("place", (1, 2))
 def test_a_view_that_cannot_be_used_is_left_out_and_two_of_nine_are_too_many(scene, place, harm):
     """By its image, or by its mask; of nine views for training eight must be left."""
     folder, where, (do, why) = scene[0], scene[place], HARM[harm]
@@ -93,25 +93,6 @@ def test_a_view_that_cannot_be_used_is_left_out_and_two_of_nine_are_too_many(sce
     assert names == [view.name for view in before if view.name in names] and len(names) == 8
     do(sorted(where.iterdir())[4])
     refused(folder, folder.parent if folder.name == "sequence" else folder)
-
-
-def test_views_without_a_mask_have_the_hull_of_the_others(tmp_path):
-    """A ball, whose hull is close to it: the masks that are gone come back but for their rim."""
-    cameras = ring_cameras(27, 64)
-    truth = held_out(
-        [View(f"{i}.png", camera, ball_image(camera)) for i, camera in enumerate(cameras)]
-    )
-    convert(truth, tmp_path / "scene", "nerfstudio")
-    for file in sorted((tmp_path / "scene/masks").iterdir())[5::3]:
-        file.unlink()
-    with pytest.warns(UserWarning, match="8 of 23 views have no mask: the hull of the others'"):
-        found = load_scene(tmp_path / "scene").splits["train"]
-    filled = [one for one in found if one.lacks_mask]
-    assert len(found) == 23 and len(filled) == 8
-    for one, true in zip(found, truth["train"], strict=True):
-        differ = (one.image[..., 3] > 127) != (true.image[..., 3] > 127)
-        assert differ.mean() < (0.06 if one.lacks_mask else 1e-9)  # a rim of 1.5 pixels
-        assert not (differ & (true.image[..., 3] > 127)).any() or not one.lacks_mask
 
 
 def test_masks_of_another_size_and_of_another_shape(scene):
