@@ -22,9 +22,10 @@ ENDINGS = (".png", ".webp", ".tif", ".tiff", ".avif", ".jpg", ".jpeg", ".jfif", 
 EIGHT_BIT_MODES = ("RGBA", "RGB", "LA", "L", "PA", "P", "1")
 PRINTED = ("CMYK", "YCbCr")  # what becomes RGB first
 UNREADABLE = "an image that cannot be read"
-# A mask may have been a JPEG with subsampled colours: means of blocks, of which the shorter side
-# has this many, differ by no more than so many levels between the channels
-COLOUR_SIDE, COLOURLESS = 16, 16
+# A mask may have been a JPEG with subsampled colours, or have a coloured rim. It has colours where
+# in one of 16 x 16 blocks of 8 x 8 cells most cells' means differ by more than so many levels
+# between the channels; a cell has 4 x 4 pixels of the image at this size.
+COLOUR_SIDE, COLOURLESS = 512, 16
 # bits per channel stand in the header chunk, the first of all
 PNG_SIGNATURE, PNG_DEPTH_BYTE = b"\x89PNG\r\n\x1a\n", 24
 
@@ -102,9 +103,10 @@ def _mask_of(path, image):
         if alpha.getextrema()[0] < 255:
             return np.array(alpha)
         image = rgba.convert("RGB")
-        block = max(1, min(image.size) // COLOUR_SIDE)
-        colours = np.array(image.reduce(block), np.int16)
-        if np.ptp(colours, axis=2).max() > COLOURLESS:
+        sample = image.resize((COLOUR_SIDE, COLOUR_SIDE), Image.Resampling.NEAREST)
+        cells = np.array(sample).reshape(128, 4, 128, 4, 3).mean((1, 3))
+        coloured = np.ptp(cells, axis=2) > COLOURLESS
+        if coloured.reshape(16, 8, 16, 8).mean((1, 3)).max() > 0.5:
             raise UserError(f"{path}: has colours; write a gray mask, white where the object is")
         image = image.convert("L")
     if image.getextrema()[1] == 1:

@@ -68,10 +68,10 @@ def test_colour_noise_and_coloured_rims_are_no_colours(tmp_path, rng):
     """As JPEG's subsampled colours leave them (NeRD's captures, 36 levels), and programs that blend
     (DTU as NeuS has it); a quarter of an image in colour is another thing.
     """
-    y, x = np.mgrid[:600, :800]
-    gray = np.where(np.hypot(y - 300, x - 400) < 200, 255, 0)
-    rim = np.abs(np.hypot(y - 300, x - 400) - 200) < 1
-    noisy = np.dstack([gray] * 3) + rng.integers(-40, 41, (600, 800, 3))
+    y, x = np.mgrid[:300, :400]
+    gray = np.where(np.hypot(y - 150, x - 200) < 100, 255, 0)
+    rim = np.abs(np.hypot(y - 150, x - 200) - 100) < 1
+    noisy = np.dstack([gray] * 3) + rng.integers(-40, 41, (300, 400, 3))
     noisy[rim] = (250, 120, 60)
     Image.fromarray(np.clip(noisy, 0, 255).astype(np.uint8)).save(tmp_path / "a.png")
     assert (read_mask(tmp_path / "a.png") > 127)[~rim].mean() == (gray > 127)[~rim].mean()

@@ -28,7 +28,7 @@ def test_a_row_gives_a_curve_for_every_number():
 
 def test_without_the_package_one_line_names_the_extra(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "tensorboardX", None)
-    with pytest.raises(UserError, match=r'pip install tensorboardX'):
+    with pytest.raises(UserError, match=r"pip install tensorboardX"):
         Scalars(tmp_path / "tensorboard", 0)
     monkeypatch.setattr("pp_cl.device.discover.open_device", lambda _: pytest.fail("work"))
     assert main(["train", "demo", "--out", str(tmp_path / "run"), "--tensorboard"]) == 2

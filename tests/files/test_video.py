@@ -135,6 +135,6 @@ def test_a_full_disk_is_one_line_and_leaves_no_film(tmp_path, suffix):
 
 def test_a_missing_package_names_the_extra(monkeypatch):
     monkeypatch.setitem(sys.modules, "imageio_ffmpeg", None)
-    with pytest.raises(UserError, match=r'pip install imageio imageio-ffmpeg'):
+    with pytest.raises(UserError, match=r"pip install imageio imageio-ffmpeg"):
         check_video("mp4")
     check_video("gif")
