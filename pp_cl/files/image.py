@@ -23,9 +23,9 @@ EIGHT_BIT_MODES = ("RGBA", "RGB", "LA", "L", "PA", "P", "1")
 PRINTED = ("CMYK", "YCbCr")  # what becomes RGB first
 UNREADABLE = "an image that cannot be read"
 # A mask may have been a JPEG with subsampled colours, or have a coloured rim. It has colours where
-# in one of 16 x 16 blocks of 8 x 8 cells most cells' means differ by more than so many levels
-# between the channels; a cell has 4 x 4 pixels of the image at this size.
-COLOUR_SIDE, COLOURLESS = 512, 16
+# this share of the cells that are not dark differ by more than so many levels between the channels;
+# a cell is the mean of 4 x 4 pixels of the image at this size.
+COLOUR_SIDE, COLOURLESS, DARK, COLOURED = 512, 16, 64, 0.3
 # bits per channel stand in the header chunk, the first of all
 PNG_SIGNATURE, PNG_DEPTH_BYTE = b"\x89PNG\r\n\x1a\n", 24
 
@@ -105,8 +105,8 @@ def _mask_of(path, image):
         image = rgba.convert("RGB")
         sample = image.resize((COLOUR_SIDE, COLOUR_SIDE), Image.Resampling.NEAREST)
         cells = np.array(sample).reshape(128, 4, 128, 4, 3).mean((1, 3))
-        coloured = np.ptp(cells, axis=2) > COLOURLESS
-        if coloured.reshape(16, 8, 16, 8).mean((1, 3)).max() > 0.5:
+        shown = cells[cells.max(2) > DARK]
+        if len(shown) and (np.ptp(shown, axis=1) > COLOURLESS).mean() > COLOURED:
             raise UserError(f"{path}: has colours; write a gray mask, white where the object is")
         image = image.convert("L")
     if image.getextrema()[1] == 1:
