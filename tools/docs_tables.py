@@ -72,12 +72,12 @@ def readme(results: dict, now: str) -> dict[str, str]:
     beside it.
     """
     first, *others = results["rows"]
-    beside = [
-        f"{one['driver']}: {one['points']} points; {one['psnr']}, {one['ssim']}, {one['lpips']}"
+    beside = "".join(
+        f" With {one['driver']} it is {one['points']} points, and {one['psnr']}, {one['ssim']},"
+        f" {one['lpips']}."
         for one in others
-    ]
-    about = f"{first['driver']}, {first['kind']}"
-    about = f"These lines are of {about}" + "".join(f"; {one}" for one in beside) + "."
+    )
+    about = f"These lines are what the driver {first['driver']} gives with {first['kind']}.{beside}"
     lines = ["    " + line for line in first["table"]]
     return {
         "trained": f"    {first['trained']}",
