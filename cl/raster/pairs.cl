@@ -2,8 +2,9 @@
 // them by pixel; pairs_scatter writes a key (depth << 32 | pair) of each into the list of its pixel;
 // the sorts order each list by depth, then by pair and so by point.
 //
-// On CPUs, where an atomic addition takes as long as the rest of a pair, pairs_count counts them, in
-// the order of the pairs.
+// On CPUs, where an atomic addition takes as long as the rest of a pair, they are counted in the
+// order of the pairs, by a work-item per compute unit: pairs_band_sizes and pairs_split list the
+// pairs by bands of the image, pairs_count counts those of its band.
 //
 // vec_type_hint: the vectors are written out; Intel's compiler would merge work-items into wider
 // ones, which is slower.
@@ -23,9 +24,17 @@
 // The place of a pair in the list of its pixel; CPUs find it later.
 #define PLACE(pixel) (LANES > 1 ? 0u : atomic_inc(&pixel_count[pixel]))
 
-// Whether a pixel is one of this work-item's, which is one of a power of two: they take turns, 2048
-// pixels at a time, so that neighbouring pairs mostly belong to one.
-#define IS_MINE(pixel) ((((pixel) / 2048) & (get_global_size(0) - 1)) == get_global_id(0))
+#ifndef MOST_BANDS
+#define MOST_BANDS 64
+#endif
+
+// Of a pixel: bands, a power of two, take turns, STRIPE pixels at a time, so that neighbouring pairs
+// mostly belong to one.
+#define STRIPE 2048
+#define BAND(pixel) (((pixel) / STRIPE) & (bands - 1))
+
+// Of `total` pairs, the first one of a chunk; there are as many chunks as bands.
+#define CHUNK_START(chunk) ((uint)((ulong)total * (chunk) / bands))
 
 // Reads the footprints of the points from `first` on, of which `count` exist; the others have empty
 // boxes.
@@ -129,24 +138,69 @@ kernel __attribute__((vec_type_hint(floats))) void pairs_fill(
         }
 }
 
-// One work-item per compute unit: reads the pixels of all pairs, counts those at its own and writes
-// their places.
-kernel void pairs_count(
+// One work-item per chunk: reads the pixels of its pairs, writes how many each band has of them.
+kernel void pairs_band_sizes(
     const uint n,                     // points
     const uint p,                     // pairs for which there is room
-    const uint hw,                    // pixels
+    const uint bands,                 // and chunks
     global const uint *point_offset,  // (N+1)
     global const uint *pair_pixel,    // (P)
-    global ulong *pair_place,         // (P) depth << 32, becomes depth << 32 | place
-    global uint *pixel_count)         // (HW)
+    global uint *band_size)           // (?) of each band, by chunk
 {
-    for (uint q = 0; q < hw; q++)
-        if (IS_MINE(q)) pixel_count[q] = 0;
-    const uint total = point_offset[n] > p ? 0 : point_offset[n];
-    for (uint pair = 0; pair < total; pair++) {
-        const uint q = pair_pixel[pair];
-        if (IS_MINE(q)) pair_place[pair] |= pixel_count[q]++;
+    const uint chunk = get_global_id(0), total = point_offset[n] > p ? 0 : point_offset[n];
+    if (chunk >= bands) return;
+    uint size[MOST_BANDS] = {0};
+    for (uint pair = CHUNK_START(chunk); pair < CHUNK_START(chunk + 1); pair++)
+        size[BAND(pair_pixel[pair])]++;
+    for (uint band = 0; band < bands; band++)
+        band_size[band * bands + chunk] = size[band];
+}
+
+// One work-item per chunk: reads the pixels of its pairs, writes the pairs to the list of their band,
+// behind those of the chunks before.
+kernel void pairs_split(
+    const uint n,                     // points
+    const uint p,                     // pairs for which there is room
+    const uint bands,                 // and chunks
+    global const uint *point_offset,  // (N+1)
+    global const uint *pair_pixel,    // (P)
+    global const uint *band_size,     // (?) of each band, by chunk
+    global ulong *listed)             // (P) pixel << 32 | pair, by band
+{
+    const uint chunk = get_global_id(0), total = point_offset[n] > p ? 0 : point_offset[n];
+    if (chunk >= bands) return;
+    uint next[MOST_BANDS], start = 0;
+    for (uint i = 0; i < bands * bands; i++) {
+        if (i % bands == chunk) next[i / bands] = start;
+        start += band_size[i];
     }
+    for (uint pair = CHUNK_START(chunk); pair < CHUNK_START(chunk + 1); pair++) {
+        const uint pixel = pair_pixel[pair];
+        listed[next[BAND(pixel)]++] = upsample(pixel, pair);
+    }
+}
+
+// One work-item per band: reads its list, writes the places of its pairs and counts them by pixel.
+kernel void pairs_count(
+    const uint hw,                 // pixels
+    const uint bands,              // and chunks
+    global const uint *band_size,  // (?) of each band, by chunk
+    global const ulong *listed,    // (P) pixel << 32 | pair, by band
+    global ulong *pair_place,      // (P) depth << 32, becomes depth << 32 | place
+    global uint *pixel_count)      // (HW)
+{
+    const uint band = get_global_id(0);
+    if (band >= bands) return;
+    for (uint first = band * STRIPE; first < hw; first += bands * STRIPE)
+        for (uint q = first; q < min(first + STRIPE, hw); q++)
+            pixel_count[q] = 0;
+    uint i = 0, end = 0;
+    for (uint k = 0; k < (band + 1) * bands; k++) {
+        if (k == band * bands) i = end;
+        end += band_size[k];
+    }
+    for (; i < end; i++)
+        pair_place[(uint)listed[i]] |= pixel_count[listed[i] >> 32]++;
 }
 
 // One work-item per pair: writes its key at its place. Bits of floats >= 0 sort like the floats.

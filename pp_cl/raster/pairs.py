@@ -19,6 +19,7 @@ from pp_cl.raster.project import FOOTPRINTS, ProjectedPoints
 MOST_PAIRS = 2**32 - 1  # pairs are numbered by uint32
 # keys ranked at once by comparing all with all, on CPUs 16 a step; longer lists are merged
 RUN, CPU_RUN = 64, 128
+MOST_BANDS = 64  # of the image, in which CPUs count side by side
 LONG_LIST = RUN * RUN  # keys of lists that GPUs merge in more than one pass
 
 
@@ -93,6 +94,7 @@ def find_pairs(
         "raster/pairs",
         LANES=lanes(dev),
         RUN=CPU_RUN if dev.is_cpu else RUN,
+        MOST_BANDS=MOST_BANDS,
         FOOTPRINT=FOOTPRINTS.index(points.footprint),
     )
     exclusive_scan(dev, points.point_count, b.point_offset)
@@ -115,18 +117,7 @@ def find_pairs(
         pixel_count=b.pixel_count,
     )
     if dev.is_cpu:
-        program.launch(
-            "pairs_count",
-            1 << (dev.info["compute_units"].bit_length() - 1),
-            local=1,
-            n=n,
-            p=room,
-            hw=pixels,
-            point_offset=b.point_offset,
-            pair_pixel=b.pair_pixel,
-            pair_place=pair_place,
-            pixel_count=b.pixel_count,
-        )
+        _count_in_order(dev, program, b, n, pixels, room)
     exclusive_scan(dev, b.pixel_count, b.pixel_offset)
     pairs = Pairs(
         count, b.point_offset, b.pixel_offset, b.pair_pixel, b.pair_point_closeness, b.pair_key
@@ -153,6 +144,34 @@ def find_pairs(
     else:
         _sort_in_parallel(program, pairs, b.pair_scratch)
     return pairs
+
+
+def _count_in_order(dev, program, b, n, pixels, room):
+    """Write pixel_count, and the place of each pair in the list of its pixel."""
+    bands = min(MOST_BANDS, 1 << (dev.info["compute_units"].bit_length() - 1))
+    band_size = dev.scratch("bands", MOST_BANDS**2, np.uint32)
+    listed = b.pair_key  # written later
+    chunks = {
+        "n": n,
+        "p": room,
+        "bands": bands,
+        "point_offset": b.point_offset,
+        "pair_pixel": b.pair_pixel,
+        "band_size": band_size,
+    }
+    program.launch("pairs_band_sizes", bands, local=1, **chunks)
+    program.launch("pairs_split", bands, local=1, listed=listed, **chunks)
+    program.launch(
+        "pairs_count",
+        bands,
+        local=1,
+        hw=pixels,
+        bands=bands,
+        band_size=band_size,
+        listed=listed,
+        pair_place=b.pair_scratch,
+        pixel_count=b.pixel_count,
+    )
 
 
 def room_needed(pairs: Pairs) -> int:

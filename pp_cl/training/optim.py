@@ -233,8 +233,8 @@ def rmsprop_update(
     """
     degree = max((d for d in range(stored_degree(cloud.sh) + 1) if rates.sh[d] > 0), default=0)
     root, (sh_0, sh_1, sh_2a, sh_2b) = math.sqrt(1 - BETA2**step), four_blocks(cloud.sh)
-    v = state.second_moments
-    dev.program(
+    v, parts = state.second_moments, row_parts(dev)
+    program = dev.program(
         "training/rmsprop",
         LANES=lanes(dev),
         DEGREE=degree,
@@ -242,9 +242,12 @@ def rmsprop_update(
         LOG_BETA2=f"{math.log2(BETA2):.9g}f",
         MOVES_OFFSET=int(grad_offset is not None),
         MOST_OFFSET=f"{MOST_OFFSET}f",
-    ).launch(
+    )
+    fits = program.kernels["rmsprop_move"].largest_group >= parts
+    program.launch(
         "rmsprop_move",
-        len(shaded) * row_parts(dev),
+        len(shaded) * parts,
+        None if fits else parts,  # is refused: the parts of a point wait for each other
         s=len(shaded),
         step=step,
         eps=root * sh_eps,

@@ -1,5 +1,6 @@
 """Hits: those of crops, of miscounts and of long lists; buffers that are reused; the bits."""
 
+import time
 from dataclasses import replace
 
 import numpy as np
@@ -8,6 +9,7 @@ from support.guarded import large
 
 from pp_cl.bench.spheres import find_all_pairs
 from pp_cl.device.buffers import Buffers
+from pp_cl.raster.pairs import find_pairs
 from pp_cl.raster.project import FOOTPRINTS
 from pp_cl.reference import dense as oracle
 from pp_cl.selftest.points import PairedPoints, make_camera, make_points
@@ -82,3 +84,23 @@ def test_buffers_serve_views_of_any_size(dev, rng):
         scene = PairedPoints(dev, view, positions, 0.3)
         used = find_all_pairs(dev, buffers, scene.projected, scene.shape)
         assert all(map(np.array_equal, bits(scene.pairs), bits(used)))
+
+
+@pytest.mark.large
+def test_work_and_bits_do_not_depend_on_compute_units(dev, rng, monkeypatch):
+    """A unit that read all pairs made 64 units take several times as long in all."""
+    camera, units = make_camera(400, 400), (2, 64, 1, 3, 16, 1000)
+    camera = replace(camera, fx=300.0, fy=300.0, cx=200.0, cy=200.0)
+    positions = make_points(rng, 3000)
+    scene, seconds = PairedPoints(dev, camera, positions, 0.1, kind="disc"), {u: [] for u in units}
+    room, buffers = scene.pairs.total, Buffers(dev)
+    for _ in range(5):
+        for number in units:
+            monkeypatch.setitem(dev.info, "compute_units", number)
+            dev.queue.finish()
+            start = time.perf_counter()
+            pairs = find_pairs(dev, buffers, scene.projected, scene.shape, room)
+            dev.queue.finish()
+            seconds[number].append(time.perf_counter() - start)
+            assert all(map(np.array_equal, bits(scene.pairs), bits(pairs)))
+    assert min(seconds[64]) < 1.5 * min(seconds[2])

@@ -69,13 +69,26 @@ def test_as_on_gpus(dev, monkeypatch, name):
 @pytest.mark.parametrize("name", ["device: scan", "loss: L1 and SSIM", "loss: mask"])
 def test_groups_are_no_larger_than_a_kernel_allows(dev, monkeypatch, name):
     """Compilers allow fewer work-items of kernels that take many registers."""
+    limit_groups(dev, monkeypatch, 32)
+    assert run_case(dev, BY_NAME[name]).passed
+
+
+@pytest.mark.large
+def test_a_point_is_moved_by_one_group_or_not_at_all(dev, monkeypatch):
+    """Its 16 work-items wait for each other."""
+    limit_groups(dev, monkeypatch, 8)
+    row = run_case(dev, BY_NAME["rmsprop: degree 2"])
+    assert "rmsprop_move: a work-group of 16 work-items, but" in row.reason
+
+
+def limit_groups(dev, monkeypatch, most):
+    """Makes the device a GPU that runs so many work-items together of any kernel."""
     made = Kernel.__init__
 
     def limited(kernel, *args, **named):
         made(kernel, *args, **named)
-        kernel.largest_group = 32
+        kernel.largest_group = most
 
     monkeypatch.setattr(Kernel, "__init__", limited)
     monkeypatch.setattr(dev, "is_cpu", False)
     monkeypatch.setattr(dev, "_programs", {})
-    assert run_case(dev, BY_NAME[name]).passed
