@@ -49,6 +49,10 @@ int main(void) {
 """
 
 
+# of a median, within which half of the rounds lie where nothing else runs; how often that is waited
+# for
+UNREST, ATTEMPTS = 0.05, 12
+
 # what a process of its own prints: rates of our peak and of the loop, in turn
 RATES = """
 import json, subprocess, sys, time
@@ -88,6 +92,11 @@ def test_the_peak_is_that_of_a_loop_in_c(session_device, tmp_path, held):
     env = os.environ | {"PYOPENCL_NO_CACHE": "1"}  # which does not tell the targets apart
     env |= {"CL_CONFIG_CPU_TARGET_ARCH": "core-avx2"} if held else {}
     index = next(i for i, found, _ in list_devices() if found == dev.device)
-    told = subprocess.check_output([sys.executable, "-c", RATES, index, program], env=env)
-    ours, loop = (statistics.median(rates) for rates in json.loads(told))
-    assert ours / loop == pytest.approx(1, abs=0.1)
+    for _ in range(ATTEMPTS):
+        told = subprocess.check_output([sys.executable, "-c", RATES, index, program], env=env)
+        quartiles = [statistics.quantiles(rates) for rates in json.loads(told)]
+        if all(high - low < UNREST * middle for low, middle, high in quartiles):
+            (_, ours, _), (_, loop, _) = quartiles
+            assert ours / loop == pytest.approx(1, abs=0.1)
+            return
+    pytest.skip("other programs keep this machine busy")
