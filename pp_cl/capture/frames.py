@@ -6,7 +6,7 @@ import logging
 import os
 import re
 import warnings
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from itertools import groupby, pairwise
 from pathlib import Path
@@ -21,6 +21,7 @@ from pp_cl.errors import UserError, shown
 from pp_cl.files.atomic import atomic_file, atomic_folder
 from pp_cl.files.image import EIGHT_BIT_MODES, is_deep_png
 from pp_cl.files.untrusted import opened_regular
+from pp_cl.scene.readers.found import MASK_FOLDERS
 
 ENDINGS = (".jpg", ".jpeg", ".png", ".webp", ".tif", ".tiff", ".heic", ".heif")
 FORMATS = ("JPEG", "PNG", "WEBP", "TIFF", "HEIF")  # JPEG opens MPO, which phones write, too
@@ -35,6 +36,8 @@ REDUCED = 0.01  # difference of sizes, of the one in EXIF
 POSSIBLE = 0.2, 20.0  # focal lengths, of the longer side
 QUALITY = {"quality": 95, "subsampling": 0}  # of JPEGs
 LEAST = 8  # photographs
+RAW = (".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf", ".orf", ".rw2", ".pef")  # of cameras
+DIGITS = 6  # of numbers in names, where 10 is to stand behind 9
 SEEN, SMALL = 640, 64  # pixels, longer side, at which sharpness and likeness are measured
 BLURRED = 0.2  # of the neighbours' median sharpness
 EMPTY = 1.0  # sharpness, levels squared: noise alone has more
@@ -53,16 +56,17 @@ TONE_MAPPED = (
 )
 
 
-def take_images(source: Path, images: Path) -> dict[str, Any]:
+def take_images(source: Path, images: Path, scene: Path | None = None) -> dict[str, Any]:
     """Write the photographs of a folder, or the sharpest frame of each of FRAMES intervals of a
-    film, to the new folder `images`, upright, as JPEG or PNG.
+    film, to the new folder `images`, upright, as JPEG or PNG. scene: a folder that may lie in the
+    source, of which nothing is taken.
 
     Returns {"images": [{name, source, lens, focal, size, sharpness}], "left_out": [{source,
     reason}]}; lens is equal for photographs of one camera at one focal length; focal, in pixels, is
     None where COLMAP may guess it by EXIF. Raises UserError where too few are usable.
     """
     with atomic_folder(images) as unfinished:
-        found = list((_photographs if source.is_dir() else _frames)(source, unfinished))
+        found = list((_photographs if source.is_dir() else _frames)(source, unfinished, scene))
         _leave_out(found)
         for one in found:
             if "reason" in one and "name" in one:
@@ -90,41 +94,61 @@ def _of(facts, keys):
 # Photographs --------------------------------------------------------------------------------------
 
 
-def _photographs(folder, images):
-    """The facts of each photograph, written to `images` where it can be read."""
+def _photographs(folder, images, scene):
+    """The facts of each photograph, written to `images` where it can be read; of raw ones that they
+    are left out.
+    """
     needed("pillow_heif").register_heif_opener()
-    files = listed(folder)
+    files = listed(folder, scene)
     if not files:
-        near = next((one for one in sorted(folder.iterdir()) if one.is_dir() and listed(one)), "")
         raise UserError(
-            f"{folder}: no photographs in it ({', '.join(ENDINGS)}); give the folder that has them"
-            f"{near and f', maybe {near}'}, or a film"
+            f"{folder}: no photographs in it ({', '.join(ENDINGS)}); give the folder that has them,"
+            " or a film"
         )
+    stems = [file.relative_to(folder).with_suffix("").as_posix() for file in files]
+    if sorted(stems) != stems:  # 10 after 9: matching takes neighbours by name
+        stems = [re.sub(r"\d+", lambda digits: digits[0].zfill(DIGITS), stem) for stem in stems]
     targets, taken = [], set()
-    for file in files:
+    for stem in stems:
         # COLMAP's lists of pairs know no spaces, and take lines that begin with # for comments
-        name = re.sub(r"\s+|^#", "_", file.stem)
+        name = re.sub(r"\s+|^#|/", "_", stem)
         while name.lower() in taken:
             name += "_"
         taken.add(name.lower())
         targets.append(images / name)
     with ThreadPoolExecutor(os.cpu_count()) as pool:
-        made = pool.map(_take, files, targets)
+        made = pool.map(lambda file, target: _take(folder, file, target), files, targets)
         yield from tqdm(made, "frames", len(files), unit="image", leave=False, disable=None)
+    for file in listed(folder, scene, RAW):
+        source = file.relative_to(folder).as_posix()
+        yield {"source": source, "reason": f"is raw ({file.suffix}): write JPEGs of it"}
 
 
-def listed(folder: Path) -> list[Path]:
-    """The photographs of a folder, sorted by name."""
-    return sorted(
-        file
-        for file in folder.iterdir()
-        if file.suffix.lower() in ENDINGS and not file.name.startswith(".")
-    )
+def listed(folder: Path, scene: Path | None = None, endings: Sequence[str] = ENDINGS) -> list[Path]:
+    """The photographs of a folder and of those in it, hidden ones, folders of masks and the scene
+    left out; in the order of their names, 10 after 9.
+    """
+    found = []
+    for place, folders, files in os.walk(folder):
+        here = Path(place)
+        if scene and here != folder and here.resolve() == scene.resolve():
+            folders.clear()
+            continue
+        folders[:] = [f for f in folders if not f.startswith(".") and f.lower() not in MASK_FOLDERS]
+        found += [here / f for f in files if f.lower().endswith(tuple(endings)) and f[0] != "."]
+    return sorted(found, key=lambda file: _natural(file.relative_to(folder).as_posix()))
 
 
-def _take(file, target):
+def _natural(name):
+    """A key by which numbers in names sort as numbers."""
+    parts = re.split(r"(\d+)", name)
+    return [(int(part), "") if i % 2 else (0, part) for i, part in enumerate(parts)], name
+
+
+def _take(folder, file, target):
     """A photograph's facts; it is written under target and a suffix."""
-    facts = {"source": file.name}
+    source = file.relative_to(folder)
+    facts = {"source": source.as_posix()}
     try:
         with opened_regular(file) as opened, warnings.catch_warnings():
             warnings.simplefilter("ignore")  # Pillow's, of odd EXIF
@@ -135,7 +159,9 @@ def _take(file, target):
             is_kept = image.format in KEPT and image.mode in ("RGB", "RGBA", "L")
             is_kept = is_kept and image.getexif().get(ORIENTATION, 1) == 1 and not is_deep_png(file)
             content = opened.seek(0) or opened.read() if is_kept else None
-            facts["lens"], exif = _lens(image.getexif())
+            lens, exif = _lens(image.getexif())
+            # folders are of a round each, or of a camera
+            facts["lens"] = f"{source.parent.as_posix()}: {lens}" if len(source.parts) > 1 else lens
             facts["focal"] = _focal_of_larger(image.getexif().get_ifd(EXIF), image.size)
             upright = ImageOps.exif_transpose(image)
     except Image.DecompressionBombError:
@@ -186,7 +212,7 @@ def _focal_of_larger(exposure, size):
 # Films --------------------------------------------------------------------------------------------
 
 
-def _frames(film, images):
+def _frames(film, images, _):
     """The facts of the sharpest frame of each interval, written to `images`."""
     chosen, is_hdr = _sharpest(film)
     equal = [f"eq(n,{number})" for number in chosen]

@@ -204,3 +204,26 @@ def test_what_is_no_film_is_one_line_without_the_programs_banner(tmp_path):
     ) as caught:
         take_images(tmp_path / "film.mov", tmp_path / "images")
     assert "ffmpeg version" not in str(caught.value)
+
+
+def test_photographs_of_several_rounds(shots, tmp_path):
+    """In a folder each, beside some at the top, without leading zeros; masks, raw files and the
+    scene itself are none.
+    """
+    places = [f"{i}.png" for i in (1, 2, 9, 10)]
+    places += [f"{place}/{i}.png" for place in ("low", "high/1") for i in (8, 9, 10, 11)]
+    for place, image in zip(places, shots, strict=True):
+        (tmp_path / place).parent.mkdir(parents=True, exist_ok=True)
+        Image.fromarray(image).save(tmp_path / place)
+    for place in ("masks/1.png", "scene/images/1.png", ".hidden/1.png"):
+        (tmp_path / place).parent.mkdir(parents=True)
+        Image.fromarray(shots[0]).save(tmp_path / place)
+    (tmp_path / "low/7.DNG").write_bytes(b"raw")
+    taken = take_images(tmp_path, tmp_path / "scene/capture", tmp_path / "scene")
+    ordered = [*places[:4], *places[8:], *places[4:8]]
+    assert [one["source"] for one in taken["images"]] == ordered
+    names = [one["name"] for one in taken["images"]]
+    assert names == sorted(names) and names[3] == "000010.png"
+    assert len({one["lens"] for one in taken["images"]}) == 3, "a lens each"
+    [raw] = taken["left_out"]
+    assert raw["source"] == "low/7.DNG" and "is raw" in raw["reason"]
