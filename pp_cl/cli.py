@@ -15,6 +15,7 @@ from contextlib import nullcontext, redirect_stdout, suppress
 from itertools import pairwise
 
 from pp_cl import __version__
+from pp_cl.commands.options import METRICS
 from pp_cl.errors import BuildError, Stopped, UserError, one_line, quoted, suggestion
 from pp_cl.files.atomic import mend
 
@@ -37,6 +38,8 @@ COMMANDS = (
 )  # modules of pp_cl.commands
 
 
+# options whose value may be left out, and what it is then
+ALONE = {"--json": "-", "--metrics": ",".join(METRICS)}
 SIGPIPE = 13  # Windows has no name for it
 
 
@@ -156,26 +159,20 @@ def _fail(message, status=2):
 
 
 def _parse(argv):
-    """The options. A word after --json is no FILE where it has neither an ending nor a folder, as
-    in `pp-cl bench --json conv`, nor where the command would lack its RUN, as in `pp-cl info --json
-    RUN`; a folder after --metrics is no metric.
+    """The options. Where the words make no sense otherwise, the word after --json or --metrics is
+    what the command works on, as in `pp-cl info --json RUN`.
     """
-    from pp_cl.commands.options import METRICS
-
-    parser, bare = _parser(), {"--json": "--json=-", "--metrics": f"--metrics={','.join(METRICS)}"}
-    words = list(argv)
-    for i, (word, value) in enumerate(pairwise(words)):
-        if word == "--json" and value.strip("-") and not {".", "/", os.sep} & {*value}:
-            words[i] = bare[word]
-        if word == "--metrics" and os.path.isdir(value):
-            words[i] = bare[word]
-    try:
-        return parser.parse_args(words)
-    except _UsageError as error:
-        with suppress(_UsageError):
-            if "--json" in words:
-                return parser.parse_args([bare["--json"] if w == "--json" else w for w in words])
-        raise error
+    parser, errors = _parser(), []
+    for alone in ((), ("--json",), ("--metrics",), tuple(ALONE)):
+        words = list(argv)
+        for i, (word, value) in enumerate(pairwise(argv)):
+            if word in alone and not {*value.split(",")} <= {*METRICS}:
+                words[i] = f"{word}={ALONE[word]}"
+        try:
+            return parser.parse_args(words)
+        except _UsageError as error:
+            errors.append(error)
+    raise errors[0]
 
 
 def _parser():

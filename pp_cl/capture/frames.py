@@ -49,9 +49,10 @@ LOCAL = ["-protocol_whitelist", "file,pipe"]  # a film names no other machine
 EACH_ONCE = ["-fps_mode", "passthrough"]
 HDR = ("arib-std-b67", "smpte2084")  # transfers of phones: HLG and PQ
 WHITE = 203  # candela per square metre, of BT.2408's diffuse white
-# to sRGB: brighter than 0.7 of white is compressed
+# to sRGB: brighter than 0.7 of white is compressed; HLG and PQ are of BT.2020, tagged or not
 TONE_MAPPED = (
-    f",zscale=t=linear:npl={WHITE},format=gbrpf32le,zscale=p=bt709,tonemap=mobius:param=0.7:desat=0"
+    f",setparams=color_primaries=bt2020:colorspace=bt2020nc,zscale=t=linear:npl={WHITE}"
+    ",format=gbrpf32le,zscale=p=bt709,tonemap=mobius:param=0.7:desat=0"
     ",zscale=t=iec61966-2-1:m=gbr:r=full"
 )
 

@@ -3,7 +3,6 @@ program of the user's; else cut out by colour around the sparse points and voted
 """
 
 import os
-import re
 import shlex
 import subprocess
 import tempfile
@@ -148,9 +147,12 @@ def _of_program(words, image, shape):
 
 def program_words(command: str) -> list[str]:
     """The words of --mask-command. Raises UserError unless they name a program, {image}, {mask}."""
+    lexer = shlex.shlex(command, posix=True)
+    lexer.whitespace_split, lexer.commenters = True, ""
+    if os.name == "nt":  # where backslashes part folders, and names hold apostrophes
+        lexer.escape, lexer.quotes = "", '"'
     try:
-        words = shlex.split(command, posix=os.name != "nt")  # where \\ parts folders
-        words = [re.sub(r"^([\"'])(.*)\1$", r"\2", word) for word in words]
+        words = list(lexer)
     except ValueError as error:
         raise UserError(f"--mask-command {command}: {error}; mend the quotes") from None
     if not words or "{image}" not in command or "{mask}" not in command:

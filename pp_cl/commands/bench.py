@@ -72,7 +72,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="raster: depth sharpness of the blend (0.01)",
     )
     shared.add_set(parser, "train: a setting in place of the paper preset's")
-    shared.add_json(parser)
+    shared.add_json(parser, OPTIONS)
     add(
         "--plot",
         type=shared.figure_file,

@@ -7,7 +7,7 @@ import json
 import os
 import sys
 import webbrowser
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Container, Iterable, Sequence
 from pathlib import Path
 from typing import Any, TextIO
 
@@ -135,22 +135,25 @@ def refuse(options: argparse.Namespace, names: Iterable[str], why: str) -> None:
             raise UserError(f"--{name.replace('_', '-')}: {why}; leave it out")
 
 
-def add_json(parser: argparse.ArgumentParser) -> None:
+def add_json(parser: argparse.ArgumentParser, known: Container[str] = ()) -> None:
     """Add --json, for write_json_option and tell: the name of a file, or sys.stdout, which then
-    has nothing but the JSON: cli.main() sends what is printed meanwhile to stderr.
+    has nothing but the JSON: cli.main() sends what is printed meanwhile to stderr. known: words of
+    the command, which are no files.
     """
+
+    def target(text):
+        if text in known:
+            raise argparse.ArgumentTypeError(f"{text}: is a word of the command; write ./{text}")
+        return sys.stdout if text == "-" else output_file()(text)
+
     parser.add_argument(
         "--json",
         nargs="?",
         const="-",
-        type=_json_target,
+        type=target,
         metavar="FILE",
         help="write the result to FILE as JSON; without FILE (or -) print it in place of the text",
     )
-
-
-def _json_target(text):
-    return sys.stdout if text == "-" else output_file()(text)
 
 
 def write_json_option(target: str | TextIO | None, value: Any) -> None:

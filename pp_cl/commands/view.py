@@ -86,7 +86,7 @@ def _redirect(address) -> Iterator[Path]:
     of a browser, and the address holds the token. It is there until the block ends. It lies in the
     user's home, where there is one: browsers in a sandbox (snap) see neither /tmp nor hidden files.
     """
-    home = Path.home()
+    home = os.path.expanduser("~")  # which stays what it is without one
     there = home if os.access(home, os.W_OK) else None
     number, name = tempfile.mkstemp(".html", "pp-cl-view-", there)  # of mode 0600
     address = html.escape(address)

@@ -100,8 +100,9 @@ def serve_in_background(folder: Path | str, device: str | None = None) -> Iterat
 def _listen(host, port):
     """A socket that listens. Raises UserError in one line."""
     family = socket.AF_INET6 if ":" in host else socket.AF_INET
+    both = host == "::" and socket.has_dualstack_ipv6()  # of IPv4 and IPv6
     try:
-        return socket.create_server((host, port), family=family)
+        return socket.create_server((host, port), family=family, dualstack_ipv6=both)
     except OSError as error:
         if error.errno == errno.EADDRINUSE:
             line = f"--port {port}: another program uses it; choose another, or 0 for a free one"

@@ -478,6 +478,8 @@ def test_the_picture_shows_outlines(capture, tmp_path):
     [
         ("nt", r"C:\tools\rembg.exe {image} {mask}", r"C:\tools\rembg.exe"),
         ("nt", r'"C:\my tools\rembg.exe" i {image} {mask}', r"C:\my tools\rembg.exe"),
+        ("nt", r"C:\O'Neil\rembg.exe {image} {mask}", r"C:\O'Neil\rembg.exe"),
+        ("posix", """'"rembg"' i {image} {mask}""", '"rembg"'),
         ("posix", r"/my\ tools/rembg i {image} {mask}", "/my tools/rembg"),
         ("posix", "'/my tools/rembg' i {image} {mask}", "/my tools/rembg"),
     ],

@@ -84,15 +84,18 @@ def test_an_empty_value_is_refused(words, capsys):
         ("bench --json conv", {"what": "conv", "json": "-"}),
         ("bench --json a.json conv", {"what": "conv", "json": "a.json"}),
         ("bench conv --json", {"what": "conv", "json": "-"}),
+        ("bench conv --json out", {"what": "conv", "json": "out"}),
+        ("sweep --out S --json out demo", {"scenes": ["demo"], "json": "out"}),
+        ("compare --metrics A B", {"prediction": "A", "truth": "B", "metrics": options.METRICS}),
+        ("eval --json --metrics RUN", {"metrics": options.METRICS, "json": "-"}),
         ("eval --metrics RUN", {"run_folder": "RUN", "metrics": options.METRICS}),
         ("eval RUN --metrics psnr", {"run_folder": "RUN", "metrics": ("psnr",)}),
         ("info --json RUN", {"subject": "RUN", "json": "-"}),
     ],
 )
 def test_a_word_after_an_option_that_may_stand_alone(tmp_path, monkeypatch, words, found):
-    """It is what its form says."""
+    """It is its value, unless the command then lacks what it works on."""
     monkeypatch.chdir(tmp_path)
-    (tmp_path / "RUN").mkdir()
     given = vars(_parse(words.split()))
     given["json"] = "-" if given["json"] is sys.stdout else given["json"]
     for name, value in found.items():

@@ -64,6 +64,20 @@ def test_the_address_works_and_ctrl_c_ends_cleanly(begun):
     assert process.returncode == 0 and err == "" and out == ""
 
 
+@pytest.mark.unix
+@pytest.mark.parametrize("host", ["localhost", "0.0.0.0", "::"])  # noqa: S104
+def test_the_address_of_a_host_works(begun, host):
+    """Whichever of its numbers the name of this machine stands for; only others' reach warns."""
+    process = started(begun, "--host", host, "--port", "0")
+    try:
+        assert status(process.stdout.readline().split()[1]) == 200
+        process.send_signal(signal.SIGINT)
+        _, err = process.communicate(timeout=SECONDS)
+    finally:
+        process.kill()
+    assert ("nothing is encrypted" in err) == (host != "localhost")
+
+
 def test_a_signal_to_terminate_in_the_midst_of_a_task_ends_cleanly(begun, caplog):
     """What serves a tab, or the first lines of the server itself, may be interrupted by it."""
     tasks = []
@@ -116,6 +130,8 @@ def test_a_training_shows_itself_and_ends_what_it_started(tmp_path, capfd, monke
         "page = urllib.request.urlopen(address).status\n"
         f"open({str(noted)!r}, 'w').write(f'{{sys.argv[1]}} {{mode:o}} {{address}} {{page}}')\n"
     )
+    monkeypatch.setenv("HOME", str(tmp_path))
+    monkeypatch.setenv("USERPROFILE", str(tmp_path))
     monkeypatch.setenv("BROWSER", f"{sys.executable} {browser} %s")
     scene = write_ball_scene(tmp_path / "ball")
     wait_for_the_browser(monkeypatch, noted)
@@ -123,6 +139,7 @@ def test_a_training_shows_itself_and_ends_what_it_started(tmp_path, capfd, monke
     argument, mode, address, page = noted.read_text().split()
     assert page == "200" and address in capfd.readouterr().out
     assert mode == "600" and address.split("/")[-2] not in argument
+    assert argument.startswith((tmp_path / "pp-cl-view-").as_uri())  # not hidden, not in /tmp
     assert not os.path.exists(argument.removeprefix("file://"))
     with pytest.raises(urllib.error.URLError):
         status(address)
