@@ -97,7 +97,9 @@ class RasterConfig:
         0.5,
     )
     mean_gradient: bool = setting(
-        False, "divide a point's gradients by the number of its pixels, as Pulsar does"
+        False,
+        "divide the gradients of a point's features and opacity, not those of its offset, by the"
+        " number of its pixels, as Pulsar does",
     )
 
 
