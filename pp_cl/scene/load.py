@@ -48,9 +48,10 @@ from pp_cl.scene.views import (
 DEMO = "demo"  # the word that names the scene which the program makes itself
 
 # One module per format. FILES names the files it reads, recognises(folder) tells whether a folder
-# holds such files, splits(folder) names its splits, read_split(folder, split) gives a list of
-# Photograph of one of them without reading pixels, and box(folder), which only some have, the box
-# that the files state around the object. The first that recognises a folder reads it.
+# holds such files, splits(folder) names its splits, read_split(folder, split, notes) gives a list
+# of Photograph of one of them without reading pixels and tells notes what it leaves out, and
+# box(folder), which only some have, gives the box that the files state around the object. The first
+# that recognises a folder reads it.
 READERS = (transforms, co3d, neus, nsvf, colmap, llff)
 
 # Bytes per pixel of what reading takes at its peak, measured with 12 megapixels: decoding and a
@@ -191,13 +192,14 @@ def scene_frames(
 ) -> list[Photograph]:
     """list_split()'s photographs; what it notes becomes warnings."""
     photographs, notes = list_split(path, split, edited=edited)
-    _warn(path, split, notes)
+    _tell(Path(path), [f"{split}: {line}" for line in notes])
     return photographs
 
 
-def _warn(path, split, notes):
-    for line in notes:
-        warnings.warn(f"{path}: {split}: {line}", stacklevel=3)
+def _tell(folder, notes):
+    """Warn of each note once, however often a command asks: equal warnings of one line are one."""
+    for note in notes:
+        warnings.warn(f"{folder}: {note}", stacklevel=1)
 
 
 def list_split(path: str | Path, split: str = "train", *, edited: bool = True) -> Listing:
@@ -389,8 +391,7 @@ def load_scene(
         read[split] = list(notes.usable(pairs, lambda all: _usable(*all), lambda all: all[1].name))
         notes.check(len(read[split]), LEAST_VIEWS if split == "train" and most is None else 1)
         lines += [f"{split}: {line}" for line in notes.lines(len(read[split]))]
-    for line in lines:
-        warnings.warn(f"{folder}: {line}", stacklevel=2)
+    _tell(folder, lines)
     scene = Scene(folder.resolve().name, folder, read, lines)
     return scene.reduced(downscale // factor) if downscale else scene
 

@@ -89,7 +89,7 @@ def _of_size(alpha, size, file):
             f"{file}: {width}x{height} pixels, but its image has {size[0]}x{size[1]}; make it the"
             " image's size"
         )
-    warnings.warn(f"{file.parent}: masks are resized to their images", stacklevel=2)
+    warnings.warn(f"{file.parent}: masks are resized to their images", stacklevel=1)
     return np.array(Image.fromarray(alpha).resize(size, Image.Resampling.BILINEAR))
 
 

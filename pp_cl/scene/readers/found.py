@@ -118,8 +118,8 @@ def find_image(
 
 def numbered(names: Sequence[str], count: int) -> dict[int, str] | None:
     """{place: name} of sorted names in a list of `count`, of which some are gone: their places are
-    the numbers in their names, from the first one's on or as they are. None where these say
-    nothing: it may be all of the first, or of the last, that are gone.
+    the numbers in their names, counted from the first one's. None where these say nothing: it may
+    be all of the first, or of the last, that are gone.
     """
     if len(names) == count:
         return dict(enumerate(names))
