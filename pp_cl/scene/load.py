@@ -33,6 +33,7 @@ from pp_cl.scene.identity import pixel_digest
 from pp_cl.scene.kept import KeptViews
 from pp_cl.scene.masks import AS_GIVEN, OPAQUE, MaskRule, cut_out, of_size
 from pp_cl.scene.readers import co3d, colmap, llff, neus, nsvf, transforms
+from pp_cl.scene.readers.common import read_json
 from pp_cl.scene.readers.found import IGNORE_FOLDERS, MASK_FOLDERS, Notes, find_masks
 from pp_cl.scene.views import (
     MASK_THRESHOLD,
@@ -378,6 +379,10 @@ def _found_instead(folder):
     others = [quoted(e.name, 40) for e in inside if e.suffix.lower() not in ENDINGS]
     found = [f"{pictures} image{'s' * (pictures > 1)}"] * bool(pictures) + others[:3]
     found = ", ".join(found) + f" and {len(others) - 3} more" * (len(others) > 3)
+    for file in (entry for entry in inside if entry.suffix.lower() == ".json"):
+        with suppress(UserError):
+            if isinstance(data := read_json(file), dict) and "frames" in data:
+                return f": {quoted(file.name, 40)} has frames; is it a transforms.json? Rename it"
     return (
         f": {found or 'nothing'}, but no file of cameras that is known, such as"
         " transforms.json or sparse/0; `pp-cl capture` makes one of photographs"

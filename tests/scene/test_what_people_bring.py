@@ -187,7 +187,8 @@ TRAINS = {
         gone("images/000003.png"),
         "1 of 12 views left out: no image",
     ),
-    "two models": ("colmap", two_models, ""),
+    "two models": ("colmap", two_models, "of 2 models the largest is read"),
+    "transform.json": ("nerfstudio", moved(("transforms.json", "transform.json")), ""),
     "flat, as RealityScan has it": ("colmap", flat, ""),
     "masks for some images": (
         "colmap",
@@ -267,6 +268,11 @@ TRAINS = {
     ),
 }
 REFUSED = {
+    "cameras.json": (
+        "nerfstudio",
+        moved(("transforms.json", "cameras.json")),
+        "'cameras.json' has frames; is it a transforms.json?",
+    ),
     "most images are gone": (
         "nerfstudio",
         lambda folder: [file.unlink() for file in sorted((folder / "images").iterdir())[1:8]],

@@ -108,7 +108,10 @@ def read_split(folder: Path, split: str, notes: Notes) -> list[Photograph]:
     Where images were reduced or enlarged after COLMAP saw them, their cameras are scaled to them.
     Raises UserError naming the file, and the image.
     """
-    model = model_folder(folder) or folder
+    models = _models(folder)
+    model = _largest(models) or folder
+    if len(models) > 1:
+        notes.done[f"of {len(models)} models the largest is read"] = [str(model)]
     lenses, images = read_model(model)
     ordered = sorted(images, key=lambda image: image.name)
     read = partial(_photograph, folder, model, lenses)
@@ -117,10 +120,19 @@ def read_split(folder: Path, split: str, notes: Notes) -> list[Photograph]:
 
 def model_folder(folder: Path) -> Path | None:
     """Where a scene's model lies, of several that with most images; None where it has none."""
+    return _largest(_models(folder))
+
+
+def _models(folder):
+    """The folders of models in the usual places."""
     places = [folder / place for place in PLACES]
     several = [near for place in places[:-1] for near in sorted(place.glob("[0-9]*"))]
-    models = [place for place in (*several, *places) if _suffix(place)]
-    return max(models, key=_count, default=None) if len(models) > 1 else next(iter(models), None)
+    return [place for place in (*several, *places) if _suffix(place)]
+
+
+def _largest(models):
+    """Of several that with most images; None of none."""
+    return max(models, key=_count) if len(models) > 1 else next(iter(models), None)
 
 
 def _count(model):

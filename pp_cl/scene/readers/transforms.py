@@ -31,16 +31,17 @@ NAMED = ("train", "val", "test")  # splits that transforms.json may list as <spl
 
 
 def recognises(folder: Path) -> bool:
-    """True if the folder holds a transforms_<split>.json or a transforms.json."""
-    return (folder / SINGLE).is_file() or bool(_split_files(folder))
+    """True if the folder holds a transforms.json or a transforms_<split>.json; the s may be
+    missing.
+    """
+    return _single(folder) is not None or bool(_split_files(folder))
 
 
 def splits(folder: Path) -> list[str]:
     """The names of the splits that the folder holds."""
-    files = _split_files(folder)
-    if files:
-        return sorted(f.stem.removeprefix("transforms_") for f in files)
-    listed = [split for split in NAMED if f"{split}_filenames" in _read(folder / SINGLE)]
+    if files := _split_files(folder):
+        return sorted(files)
+    listed = [split for split in NAMED if f"{split}_filenames" in _read(_single(folder))]
     return sorted(listed) or SPLITS
 
 
@@ -51,7 +52,8 @@ def read_split(folder: Path, split: str, notes: Notes) -> list[Photograph]:
 
     Raises UserError naming the file and the key that is missing or wrong.
     """
-    file = folder / (f"transforms_{split}.json" if _split_files(folder) else SINGLE)
+    files = _split_files(folder)
+    file = files[split] if files else _single(folder)
     data, read = _read(file), {}
     for index, own in enumerate(listing(data["frames"])):
         frame, one = Frame(file, data, own, index), None
@@ -65,7 +67,7 @@ def read_split(folder: Path, split: str, notes: Notes) -> list[Photograph]:
             raise frame.error("file_path", f"{name!r} stands there twice; remove one")
         read[name] = given, one
     chosen = list(read)
-    if file.name == SINGLE:
+    if not files:
         chosen = _of_split(file, data, {name: given for name, (given, _) in read.items()}, split)
     return list(notes.usable(chosen, lambda name: _usable(read[name][1]), str))
 
@@ -74,18 +76,24 @@ def box(folder: Path) -> np.ndarray | None:
     """(2, 3) box around the object that a transforms.json states as its `aabb`, None where there is
     none. Raises UserError naming the file.
     """
-    file = folder / SINGLE
+    file = _single(folder)
     corners = None if _split_files(folder) else _read(file).get("aabb")
     return None if corners is None else checked_box(corners, fail_at(file, "aabb"))
 
 
+def _single(folder):
+    """The transforms.json, None without one."""
+    files = (folder / name for name in (SINGLE, "transform.json"))
+    return next((file for file in files if file.is_file()), None)
+
+
 def _split_files(folder):
-    """The transforms_<split>.json of a scene that has one for training, or no transforms.json: else
-    they are copies beside it.
+    """{split: transforms_<split>.json} of a scene that has one for training, or no transforms.json:
+    else they are copies beside it.
     """
-    if (folder / SINGLE).is_file() and not (folder / "transforms_train.json").is_file():
-        return []
-    return [file for file in folder.glob("transforms_*.json") if file.is_file()]
+    found = [file for file in sorted(folder.glob("transform*_*.json")) if file.is_file()]
+    files = {file.stem.partition("_")[2]: file for file in found}
+    return {} if _single(folder) and "train" not in files else files
 
 
 def _read(file):

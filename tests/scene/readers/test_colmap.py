@@ -260,7 +260,8 @@ def test_of_several_models_the_largest_is_read(written, tmp_path):
             elif file.name == "images.bin":
                 content = (1).to_bytes(8, "little") + content[8 : 8 + 64 + len("000000.png") + 9]
             (folder / "sparse/0" / file.name).write_bytes(content)
-    assert len(scene_frames(folder)) == 9
+    with pytest.warns(UserWarning, match="of 2 models the largest is read"):
+        assert len(scene_frames(folder)) == 9
 
 
 def test_a_model_beside_its_images_as_realityscan_writes_it(text):
