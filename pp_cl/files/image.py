@@ -22,6 +22,7 @@ ENDINGS = (".png", ".webp", ".tif", ".tiff", ".avif", ".jpg", ".jpeg", ".jfif", 
 EIGHT_BIT_MODES = ("RGBA", "RGB", "LA", "L", "PA", "P", "1")
 # Pillow's names of what becomes one of these first: inks, video, alpha that colours contain
 CONVERTED = {"CMYK": "RGB", "YCbCr": "RGB", "RGBa": "RGBA", "La": "LA"}
+LOSSY = (".jpg", ".jpeg", ".jfif")
 ORIENTATION = 0x0112  # the tag of EXIF
 ON_THEIR_SIDE = (5, 6, 7, 8)  # its values with which width and height change places
 UNREADABLE = "an image that cannot be read"
@@ -117,8 +118,11 @@ def _mask_of(path, image):
         if len(shown) and (np.ptp(shown, axis=1) > COLOURLESS).mean() > COLOURED:
             raise UserError(f"{path}: has colours; write a gray mask, white where the object is")
         image = image.convert("L")
-    if image.getextrema()[1] == 1:
-        raise UserError(f"{path}: its largest value is 1 of 255; write 255 where the object is")
+    if image.getextrema()[1] == 1:  # a JPEG may hold noise of that size
+        if Path(path).suffix.lower() in LOSSY:
+            raise UserError(f"{path}: its largest value is 1 of 255; write 255 where the object is")
+        _tell(path, "masks of 0 and 1 are read as 0 and 255")
+        return np.array(image) * np.uint8(255)
     return np.array(image)
 
 

@@ -34,7 +34,13 @@ from pp_cl.scene.kept import KeptViews
 from pp_cl.scene.masks import AS_GIVEN, OPAQUE, MaskRule, cut_out, of_size
 from pp_cl.scene.readers import co3d, colmap, llff, neus, nsvf, transforms
 from pp_cl.scene.readers.common import read_json
-from pp_cl.scene.readers.found import IGNORE_FOLDERS, MASK_FOLDERS, Notes, find_masks
+from pp_cl.scene.readers.found import (
+    IGNORE_FOLDERS,
+    MASK_FOLDERS,
+    Notes,
+    find_masks,
+    folder_named,
+)
 from pp_cl.scene.views import (
     MASK_THRESHOLD,
     MIN_SIDE,
@@ -270,7 +276,7 @@ def _are_besides(folder, photograph):
     """Whether an image has alpha of which the mask that its frame names is no part, or the scene
     has a folder of masks in which that mask does not lie.
     """
-    place = next((name for name in MASK_FOLDERS if (folder / name).is_dir()), None)
+    place = folder_named(folder, MASK_FOLDERS)
     if place and not photograph.mask.startswith(f"{place}/"):
         return True
     with suppress(UserError):
@@ -372,7 +378,7 @@ def _reader_of(folder):
 def _found_instead(folder):
     """What is in a folder without a scene, and where one is, in words."""
     inside = sorted(entry for entry in folder.iterdir() if not entry.name.startswith("."))
-    for near in (folder.absolute().parent, *filter(Path.is_dir, inside[:NEARBY])):
+    for near in (*folder.absolute().parents[:2], *filter(Path.is_dir, inside[:NEARBY])):
         if os.access(near, os.R_OK | os.X_OK) and (reader := _reader_of(near)):
             return f"; {near} is one ({reader.FILES}); give that"
     pictures = sum(entry.suffix.lower() in ENDINGS for entry in inside)

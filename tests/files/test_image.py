@@ -49,15 +49,20 @@ def test_modes_become_rgba(tmp_path, rgba):
 
 
 def test_masks_of_other_programs(tmp_path, rgba):
-    """Gray ones; cut-outs, whose alpha is the mask; what is neither is refused with the mend."""
+    """Gray ones; cut-outs, whose alpha is the mask; labels, of which a JPEG's may be noise; what is
+    none of these is refused with the mend.
+    """
     gray, path = rgba[..., 0], tmp_path / "a.png"
     for image in (gray, np.dstack([gray] * 3), np.dstack([rgba[..., :3], gray])):
         Image.fromarray(image).save(path)
         assert np.array_equal(read_mask(path), gray)
     labels = Image.fromarray((gray > 127).astype(np.uint8))
     labels.save(path)
-    with pytest.raises(UserError, match=r"a\.png: .* 1 .* write 255"):
-        read_mask(path)
+    with pytest.warns(UserWarning, match="masks of 0 and 1 are read as 0 and 255"):
+        assert np.array_equal(read_mask(path), np.where(gray > 127, 255, 0))
+    Image.fromarray(np.ones_like(gray)).save(tmp_path / "a.jpg")
+    with pytest.raises(UserError, match=r"a\.jpg: .* 1 .* write 255"):
+        read_mask(tmp_path / "a.jpg")
     labels.putpalette([0, 0, 0, 128, 0, 0])  # as programs that follow objects write them
     labels.save(path)
     with pytest.raises(UserError, match=r"a\.png: .*colours.* white where the object is"):

@@ -34,7 +34,12 @@ def looked_at(monkeypatch):
     from pp_cl.scene import load
 
     names, read = [], load.read_rgba
-    monkeypatch.setattr(load, "read_rgba", lambda file: names.append(file.name) or read(file))
+
+    def looked(file, size):
+        names.append(file.name)
+        return read(file, size)
+
+    monkeypatch.setattr(load, "read_rgba", looked)
     return names
 
 

@@ -145,7 +145,7 @@ def masked(tmp_path):
 
 BAD = {
     "missing": (lambda m: (m / "train_1.png").unlink(), "no mask for train_1.png"),
-    "another size": (lambda m: write_png(m / "train_1.png", np.ones((4, 5))), "5x4 pixels"),
+    "another size": (lambda m: write_png(m / "train_1.png", np.ones((4, 9))), "9x4 pixels"),
     "text": (lambda m: (m / "train_1.png").write_text("white"), "is no PNG"),
     "a folder": (
         lambda m: ((m / "train_1.png").unlink(), (m / "train_1.png").mkdir()),

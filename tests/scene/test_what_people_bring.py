@@ -220,6 +220,13 @@ TRAINS = {
         images(noisy_mask, ".jpg", "masks"),
         "masks are resized",
     ),
+    "masks of 0 and 1": (
+        "colmap",
+        images(lambda mask: mask.point(lambda level: level // 255), ".png", "masks"),
+        "masks of 0 and 1 are read as 0 and 255",
+    ),
+    "masks in a folder of another case": ("colmap", moved(("masks", "Masks")), ""),
+    "LLFF, reduced images alone": ("llff", moved(("images", "images_4")), ""),
     "masks that no frame names": ("nerfstudio", without_masks_named, "masks are taken from"),
     "paths of another machine": (
         "nerfstudio",

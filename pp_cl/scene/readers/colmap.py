@@ -30,7 +30,7 @@ from pp_cl.scene.readers.common import (
     hold_out,
     listing,
 )
-from pp_cl.scene.readers.found import Notes, find_image
+from pp_cl.scene.readers.found import Notes, find_image, holds_images
 from pp_cl.scene.views import Photograph
 
 FILES = "a sparse model of COLMAP beside images"
@@ -124,9 +124,9 @@ def model_folder(folder: Path) -> Path | None:
 
 
 def _models(folder):
-    """The folders of models in the usual places."""
-    places = [folder / place for place in PLACES]
-    several = [near for place in places[:-1] for near in sorted(place.glob("[0-9]*"))]
+    """The folders of models in the usual places; the folder itself where it has images, too."""
+    places = [folder / place for place in PLACES if place != "." or holds_images(folder)]
+    several = [near for place in PLACES[:-1] for near in sorted((folder / place).glob("[0-9]*"))]
     return [place for place in (*several, *places) if _suffix(place)]
 
 

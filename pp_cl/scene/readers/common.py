@@ -47,11 +47,6 @@ def listing(items: Sequence[Item]) -> Iterable[Item]:
 # Images -------------------------------------------------------------------------------------------
 
 
-def first_folder(folder: Path, names: Sequence[str]) -> str:
-    """The first of the names that is a folder there; where none is, the first."""
-    return next((name for name in names if (folder / name).is_dir()), names[0])
-
-
 def folder_images(folder: Path, name: str) -> list[str]:
     """Paths relative to the scene's folder of the images in its folder `name`, sorted,
     hidden files left out. Raises UserError where there are none.

@@ -189,11 +189,12 @@ def _alike(folder, name):
 def mask_names(image: str) -> list[str]:
     """What the mask of an image may be called in a folder of masks, as programs write them: its
     path there with .png added, or its stem, maybe with _mask behind or mask_ before it, with the
-    ending of any image.
+    ending of any image, of which .png may stand behind another.
     """
     path = PurePosixPath(image)
     stems = (path.stem, f"{path.stem}_mask", f"mask_{path.stem}")
-    names = (f"{stem}{ending}" for stem in stems for ending in CASED_ENDINGS)
+    names = [f"{stem}{ending}" for stem in stems for ending in CASED_ENDINGS]
+    names += [f"{path.stem}{ending}.png" for ending in CASED_ENDINGS]
     return [f"{image}.png", *(str(path.with_name(name)) for name in names)]
 
 
@@ -203,11 +204,11 @@ def find_masks(
     """{image: its mask} of those that have one in the scene's folder of masks, both relative to the
     scene's folder; None where there is no such folder. places: what it may be called.
 
-    A mask lies in the same tree and is named as mask_names() has it; where names of images are
-    there once only, it may also lie at the top of its folder, or have the same number as DTU has
-    it. Raises UserError where no image has one.
+    A mask lies in the same tree, with or without the folder of images above it, and is named as
+    mask_names() has it; where names of images are there once only, it may also lie at the top of
+    its folder, or have the same number as DTU has it. Raises UserError where no image has one.
     """
-    place = next((name for name in places if (folder / name).is_dir()), None)
+    place = folder_named(folder, places)
     if place is None:
         return None
     trees = {image: _in_tree(image) for image in images}
@@ -216,7 +217,8 @@ def find_masks(
     found = {}
     for image, tree in trees.items():
         name = PurePosixPath(tree).name
-        names = mask_names(tree) + (mask_names(name) if often[name] == 1 else [])
+        names = [*mask_names(tree), *mask_names(image)]
+        names += mask_names(name) if often[name] == 1 else []
         # a name that is too long with .png is no file, where Path.is_file raises
         mask = next((one for one in names if os.path.isfile(folder / place / one)), None)
         stem = PurePosixPath(name).stem
@@ -231,6 +233,27 @@ def find_masks(
             f" image; add them, or remove {place}"
         )
     return found
+
+
+def folder_named(folder: Path, names: Sequence[str]) -> str | None:
+    """What in a folder is a folder with one of the names, in their order, whatever their case."""
+    inside = {entry.lower(): entry for entry in sorted(os.listdir(folder), reverse=True)}
+    found = (inside.get(name, name) for name in names)
+    return next((name for name in found if (folder / name).is_dir()), None)
+
+
+def holds_images(folder: Path) -> bool:
+    """Whether there are images in a folder, or in a folder in it that is named as if."""
+    inside = (entry.lower().endswith(ENDINGS) for entry in os.listdir(folder))
+    return bool(_image_folders(folder)) or any(inside)
+
+
+def image_folder(folder: Path, names: Sequence[str] = IMAGE_FOLDERS) -> str:
+    """Where the images of a format lie that does not name them: the first of the names that is a
+    folder there, else images_N with the largest images; where none is, the first name.
+    """
+    reduced = [place for place in _image_folders(folder) if place not in IMAGE_FOLDERS]
+    return folder_named(folder, names) or next(iter(reduced), names[0])
 
 
 def _in_tree(image):

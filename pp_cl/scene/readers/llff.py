@@ -10,13 +10,12 @@ from pp_cl.scene.camera import Camera
 from pp_cl.scene.readers.common import (
     SPLITS,
     fail_at,
-    first_folder,
     fitted,
     folder_images,
     hold_out,
     read_npy,
 )
-from pp_cl.scene.readers.found import IMAGE_FOLDERS, Notes, numbered
+from pp_cl.scene.readers.found import Notes, image_folder, numbered
 from pp_cl.scene.readers.frame import rigid
 from pp_cl.scene.views import Photograph
 
@@ -45,7 +44,7 @@ def read_split(folder: Path, split: str, notes: Notes) -> list[Photograph]:
     the numbers in the names of the others tell their poses. Raises UserError naming the file and
     the image.
     """
-    file, images = folder / POSES, first_folder(folder, IMAGE_FOLDERS)
+    file, images = folder / POSES, image_folder(folder)
     names, rows = folder_images(folder, images), read_npy(file)
     count = rows.shape[0] if rows.ndim == 2 and rows.shape[1] == NUMBERS else 0
     if (places := numbered(names, count)) is None:

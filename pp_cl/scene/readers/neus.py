@@ -14,17 +14,16 @@ from pp_cl.scene.camera import Camera
 from pp_cl.scene.readers.common import (
     SPLITS,
     fail_at,
-    first_folder,
     folder_images,
     hold_out,
     read_npz,
 )
-from pp_cl.scene.readers.found import Notes, numbered
+from pp_cl.scene.readers.found import Notes, image_folder, numbered
 from pp_cl.scene.views import Photograph
 
 FILES = "cameras_sphere.npz (NeuS, DTU)"
 CAMERAS = ("cameras_sphere.npz", "cameras.npz")
-IMAGES = ("image", "images")
+IMAGES = ("image", "images", "rgb")
 MOST_SKEW = 1e-3  # pixels of shear over the image; more is no camera of ours
 
 
@@ -47,7 +46,7 @@ def read_split(folder: Path, split: str, notes: Notes) -> list[Photograph]:
     """
     file = _file(folder)
     cameras, scales = read_npz(file, "world_mat_"), read_npz(file, "scale_mat_")
-    images = first_folder(folder, IMAGES)
+    images = image_folder(folder, IMAGES)
     names = folder_images(folder, images)
     count = sum(re.fullmatch(r"world_mat_\d+", key) is not None for key in cameras)
     if (places := numbered(names, count)) is None:
