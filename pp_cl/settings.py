@@ -128,12 +128,6 @@ class NetworkConfig:
     rate: tuple = setting(
         (1e-3, 1e-4), "learning rate of the network, first and last step", 1e-12, 100
     )
-    tolerance: float = setting(
-        1e-5,
-        "relative L2 error allowed for a convolution; the fastest variant within it is taken",
-        0,
-        1,
-    )
 
     @property
     def channel_numbers(self) -> tuple[int, ...]:

@@ -65,7 +65,7 @@ class Trainer:
             self.exposure = Exposure(dev, len(views), self.config.exposure == "on")
         self.perceptual_loss = None
         if weight := self.config.perceptual_weight:
-            self.perceptual_loss = PerceptualLoss(dev, weight, model.net.policy)
+            self.perceptual_loss = PerceptualLoss(dev, weight)
         self.state = PointState(dev, model.cloud)
         self.optimiser = Optimiser(dev, model, self.state)
         self._target = Target(dev)

@@ -12,7 +12,7 @@ import numpy as np
 
 from pp_cl.bench.timing import PeakFlops, errors, variant_rows
 from pp_cl.device.device import Device
-from pp_cl.layers.choice import OFFERED, VARIANTS, ConvolutionPolicy, can_run, device_class
+from pp_cl.layers.choice import OFFERED, VARIANTS, blocking_of, can_run, device_class
 from pp_cl.layers.conv_direct import (
     PARTIAL,
     Blocking,
@@ -156,22 +156,22 @@ class RandomConv:
             name for name in OFFERED[device_class(dev)] if can_run(name, k, *sources, co)
         ]
 
-    def runner(self, variant: str, direction: Direction, policy: ConvolutionPolicy) -> Callable:
+    def runner(self, variant: str, direction: Direction, blocking: Blocking) -> Callable:
         """A function that computes a direction by a variant, as the network does, and waits for
-        it. policy: its blocking is used.
+        it.
         """
 
         def run():
-            self.uploaded.compute(VARIANTS[variant], policy.blocking, direction, self.tiles)
+            self.uploaded.compute(VARIANTS[variant], blocking, direction, self.tiles)
             self.uploaded.dev.finish()
 
         return run
 
     def result(
-        self, variant: str, direction: Direction, policy: ConvolutionPolicy
+        self, variant: str, direction: Direction, blocking: Blocking
     ) -> tuple[np.ndarray, np.ndarray]:
         """(computed, float64) values of the sample."""
-        self.runner(variant, direction, policy)()
+        self.runner(variant, direction, blocking)()
         layer, uploaded, at = self.layer, self.uploaded, self.pixels
         if direction == Direction.FORWARD:
             expected = reference.convolution_at(layer.x, layer.weight, layer.bias, at)
@@ -192,15 +192,14 @@ def bench_conv(
     dev: Device,
     size: int,
     widths: tuple[int, int, int],
-    policy: ConvolutionPolicy,
     *,
     blocks: str = "double",
 ) -> Iterator[list[dict]]:
     """Rows of every distinct convolution of the network at size x size, a list for each direction.
 
-    policy: its blocking is used; every variant is measured. blocks: as UNet takes them.
+    blocks: as UNet takes them.
     """
-    peak, seen = PeakFlops(dev), set()
+    peak, seen, blocking = PeakFlops(dev), set(), blocking_of(dev)
     for layer in convolutions(unet_layers(widths, blocks=blocks)):
         side = size >> layer.level
         key = (layer.kernel_size, side, layer.sources, layer.channels)
@@ -210,8 +209,8 @@ def bench_conv(
         conv = RandomConv(dev, layer.kernel_size, side, layer.sources, co=layer.channels)
         shape = [side, side, sum(layer.sources), layer.channels, layer.kernel_size]
         for direction in Direction:
-            runs = {v: conv.runner(v, direction, policy) for v in conv.variants}
-            found = {v: errors(*conv.result(v, direction, policy)) for v in conv.variants}
+            runs = {v: conv.runner(v, direction, blocking) for v in conv.variants}
+            found = {v: errors(*conv.result(v, direction, blocking)) for v in conv.variants}
             yield variant_rows(
                 {"layer": layer.name, "shape": shape, "direction": direction.value},
                 runs,

@@ -35,9 +35,7 @@ FLIPPED, PARTIAL = "flipped weights", "parts of the weights' gradients"
 
 
 class Direction(Enum):
-    """What of a convolution is computed. The values are the words in stored tunings and in bench
-    rows.
-    """
+    """What of a convolution is computed. The values are the words in rows of `pp-cl bench`."""
 
     FORWARD = "forward"
     BACKWARD_INPUT = "input"  # gradient of the input
@@ -52,19 +50,21 @@ class Blocking:
     direct: (pixels of a row, groups of 16 output channels, work-group) of a work-item of conv.cl,
     where the groups come in multiples of that number; direct_odd: the same for other channels.
     accumulators: float16 sums that a work-item of conv_backward_weights.cl keeps in registers;
-    work_group: its work-group, None = the launcher's default. winograd: (tiles transformed at a
-    time, tiles multiplied together) of winograd.cl; winograd_narrow: the same for few channels
-    (conv_winograd.NARROW). winograd_weights: tiles transformed at a time by
-    winograd_backward_weights.cl.
+    work_group: its work-group, None = the launcher's default. winograd_groups: groups of 16 output
+    channels that winograd.cl multiplies together, where the groups come in multiples of that
+    number. winograd: (tiles transformed at a time, tiles multiplied together) there;
+    winograd_narrow: the same for few channels (conv_winograd.NARROW). winograd_weights: tiles
+    transformed at a time by winograd_backward_weights.cl.
     """
 
     direct: tuple[int, int, tuple[int, int, int]]
     direct_odd: tuple[int, int, tuple[int, int, int]]
     accumulators: int
     work_group: tuple[int, int, int] | None
+    winograd_groups: int = 2
     # More tiles at a time use the transformed weights better, fewer leave more room in the caches.
-    # The second number divides the first: with 2 x 16 channels, 8 take 16 of AVX-512's 32 vectors,
-    # 12 take 24.
+    # The second number divides the first: with 2 groups of channels, 8 take 16 of AVX-512's 32
+    # vectors, 12 take 24.
     winograd: tuple[int, int] = (64, 8)
     winograd_narrow: tuple[int, int] = (12, 12)
     winograd_weights: int = 32

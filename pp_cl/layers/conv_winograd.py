@@ -190,7 +190,7 @@ def backward_weights(
         "layers/winograd_backward_weights",
         TILES=blocking.winograd_weights,
         CO_PART=min(CO_PART, co),
-        BLOCKS=_paired_blocks(co),
+        BLOCKS=_groups(blocking, co),
     ).launch(
         "winograd_backward_weights",
         min(dev.info["compute_units"], parts),
@@ -232,12 +232,15 @@ def _tiles_at_once(blocking, ci, co):
 
 def _program(dev, blocking, ci, co):
     tiles, together = _tiles_at_once(blocking, ci, co)
-    return dev.program("layers/winograd", TILES=tiles, TOGETHER=together, BLOCKS=_paired_blocks(co))
+    return dev.program(
+        "layers/winograd", TILES=tiles, TOGETHER=together, BLOCKS=_groups(blocking, co)
+    )
 
 
-def _paired_blocks(channels):
+def _groups(blocking, channels):
     """Groups of 16 output channels that are multiplied together."""
-    return 1 if channels // VECTOR % 2 else 2
+    groups = blocking.winograd_groups
+    return 1 if channels // VECTOR % groups else groups
 
 
 def _slices(dev, blocking, ci, co):

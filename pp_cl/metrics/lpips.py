@@ -16,7 +16,7 @@ from pp_cl.device.buffers import Table
 from pp_cl.device.device import Device
 from pp_cl.device.launch import Program, group_ranges, lanes, row_parts
 from pp_cl.errors import UserError
-from pp_cl.layers.choice import ConvolutionPolicy, ConvShape, lay_out_forward, make_policy
+from pp_cl.layers.choice import AUTO, VARIANTS, ConvShape, blocking_of, choose, lay_out_forward
 from pp_cl.layers.conv_direct import Direction, pack_weights
 from pp_cl.layers.conv_winograd import TRANSFORMED
 from pp_cl.layers.simple import maxpool2_backward, maxpool2_forward
@@ -70,25 +70,27 @@ def vgg_layers(widths: tuple[int, ...] = WIDTHS) -> list[VggConv]:
     return layers
 
 
-def _variants(policy, layer, size):
+def _variants(dev, variant, layer, size):
     """The modules that compute a convolution of an image of `size`: forward, and the gradient of
     its input.
     """
     pixels = math.prod(size_of(size, layer.block))
     return [
-        policy.convolution(ConvShape(direction, 3, (layer.ci,), layer.co, pixels, source))
-        for direction, source in DIRECTIONS
+        VARIANTS[choose(dev, ConvShape(way, 3, (layer.ci,), layer.co, pixels, source), variant)]
+        for way, source in DIRECTIONS
     ]
 
 
-def _scratch_floats(dev, policy, layer, size):
+def _scratch_floats(dev, variant, layer, size):
     """What _variants() need, as conv_direct.scratch_floats says it, [forward, backward]."""
     height, _ = size_of(size, layer.block)
     return [
-        variant.scratch_floats(
-            dev, policy.blocking, direction, height, layer.weight_shape(), layer.ci
+        module.scratch_floats(
+            dev, blocking_of(dev), direction, height, layer.weight_shape(), layer.ci
         )
-        for variant, (direction, _) in zip(_variants(policy, layer, size), DIRECTIONS, strict=True)
+        for module, (direction, _) in zip(
+            _variants(dev, variant, layer, size), DIRECTIONS, strict=True
+        )
     ]
 
 
@@ -102,19 +104,19 @@ def lpips_program(dev: Device) -> Program:
 class Lpips:
     """The network, prepared for images of one size at a time, and the distance of image pairs.
 
-    weights: as load_weights() returns them, which is the default (and may raise UserError). policy:
-    of the convolutions, None = as shipped.
+    weights: as load_weights() returns them, which is the default (and may raise UserError).
+    variant: of the convolutions, as choose() takes it.
     """
 
     def __init__(
         self,
         dev: Device,
         weights: dict[str, np.ndarray] | None = None,
-        policy: ConvolutionPolicy | None = None,
+        variant: str = AUTO,
     ):
         weights = load_weights() if weights is None else weights
         self.dev = dev
-        self.policy = policy or make_policy(dev)
+        self.variant, self.blocking = variant, blocking_of(dev)
         self.program = lpips_program(dev)
         self.heads = [dev.upload(weights[f"head{i}"]) for i in range(len(BLOCKS))]
         self.widths = tuple(head.size for head in self.heads)
@@ -129,14 +131,14 @@ class Lpips:
 
     @staticmethod
     def table(
-        dev: Device, policy: ConvolutionPolicy, size: Size, widths: tuple[int, ...] = WIDTHS
+        dev: Device, size: Size, widths: tuple[int, ...] = WIDTHS, variant: str = AUTO
     ) -> Table:
         """The device buffers of a network that is trained with, for images of `size`: weights, work
         and tiles, without feature maps.
         """
         floats: dict[str, int] = {}
         for layer in vgg_layers(widths):
-            forward, backward = _scratch_floats(dev, policy, layer, size)
+            forward, backward = _scratch_floats(dev, variant, layer, size)
             for name, needed in (*forward.items(), *backward.items()):
                 floats[name] = max(needed, floats.get(name, 0))
             floats[f"weights of {layer.name}"] = math.prod(layer.weight_shape())
@@ -269,7 +271,7 @@ class Lpips:
             return
         self._size, self._laid_out, self._tiles = None, {}, []
         for layer in vgg_layers(self.widths):
-            forward, _ = self._choices[layer.name] = _variants(self.policy, layer, size)
+            forward, _ = self._choices[layer.name] = _variants(self.dev, self.variant, layer, size)
             self._laid_out[layer.name] = lay_out_forward(
                 self.dev, forward, self._weights[layer.name]
             )
@@ -280,7 +282,7 @@ class Lpips:
         forward, _ = self._choices[layer.name]
         forward.forward(
             self.dev,
-            self.policy.blocking,
+            self.blocking,
             (x,),
             self._weights[layer.name],
             self._biases[layer.name],
@@ -294,7 +296,7 @@ class Lpips:
         _, backward = self._choices[layer.name]
         backward.backward_input(
             self.dev,
-            self.policy.blocking,
+            self.blocking,
             self._weights[layer.name],
             0,
             grad_out,

@@ -12,7 +12,7 @@ from pyopencl.array import Array
 
 from pp_cl.device.buffers import PackedArrays, Table, packed_arrays, packed_bytes
 from pp_cl.device.device import Device
-from pp_cl.layers.choice import ConvolutionPolicy, lay_out_forward, make_policy
+from pp_cl.layers.choice import AUTO, VARIANTS, blocking_of, choose, lay_out_forward
 from pp_cl.layers.conv_direct import (
     FLIPPED,
     PARTIAL,
@@ -103,11 +103,11 @@ class UNet:
 
     widths: channels of the three levels. blocks: what a level computes, of layers.BLOCKS. channels:
     as unet_layers() takes them. residual: adds output.SHARE of the first three features to the
-    image. policy: chooses the variant of each convolution; may be replaced between images; None =
-    as shipped, whatever their error. layers: in the order of the forward pass. parameters,
-    gradients: {"enc0.a.weight": (ceil(CO/16), K, K, CI, 16), "enc0.a.bias": (ceil(CO/16) * 16,),
-    ...} float32 on the device; all_parameters, all_gradients: the 1-D array that they lie in, with
-    zeros between them. Weights and biases start uniform in +-1/sqrt(CI K K) (PyTorch's
+    image. variant: of the convolutions, as choose() takes it; blocking: of their kernels, as
+    shipped for the device. layers: in the order of the forward pass. parameters, gradients:
+    {"enc0.a.weight": (ceil(CO/16), K, K, CI, 16), "enc0.a.bias": (ceil(CO/16) * 16,), ...} float32
+    on the device; all_parameters, all_gradients: the 1-D array that they lie in, with zeros between
+    them. Weights and biases start uniform in +-1/sqrt(CI K K) (PyTorch's
     default for Conv2d), output channels beyond CO at 0, with gradient 0.
     """
 
@@ -122,13 +122,13 @@ class UNet:
         channels: Sequence[int] = (),
         residual: bool = False,
         seed: int = 0,
-        policy: ConvolutionPolicy | None = None,
+        variant: str = AUTO,
     ):
         self.dev = dev
         self._residual = residual
         self.layers = unet_layers(widths, channels_in, channels_out, blocks, channels=channels)
         self.channels_in = channels_in
-        self.policy = policy or make_policy(dev)
+        self.variant, self.blocking = variant, blocking_of(dev)
         self.all_parameters, self.parameters = self._packed()
         self.all_gradients, self.gradients = self._packed()
         rng = np.random.default_rng(seed)
@@ -140,21 +140,19 @@ class UNet:
             dev.write(self.parameters[layer.name + ".bias"], pack_bias(bias))
         self._relu_outputs = {layer.name for layer in self.layers if layer.relu}
         self._maps: dict[bool, FeatureMaps] = {}  # {training: FeatureMaps}
-        # {(policy, layer, direction, source, size): module of a convolution}
+        # {(variant, layer, direction, source, size): module of a convolution}
         self._modules: dict[Any, Any] = {}
         self._tile_lists = {name: PackedArrays(dev) for name in ("forward", "backward")}
         self._trained: Any = None  # (size, arrays, tiles) of the last forward(training=True)
         self._frozen: dict[Any, Array] | None = None  # {(layer, module): weights} once frozen
-        self._planned: Any = (None,)  # of the last training pass: (policy, size), _plan()
+        self._planned: Any = (None,)  # of the last training pass: (variant, size), _plan()
         self._work: dict[Any, Any] = {}  # of the last pass: arrays of _plan(), if for training
         self._sums = PackedArrays(dev)
         self._sum_rows: Any = None
         self._sum_table: Any = None
 
     @classmethod
-    def of_settings(
-        cls, dev: Device, settings: NetworkConfig, policy: ConvolutionPolicy, *, seed: int = 0
-    ) -> "UNet":
+    def of_settings(cls, dev: Device, settings: NetworkConfig, *, seed: int = 0) -> "UNet":
         """The network of a run."""
         return cls(
             dev,
@@ -163,7 +161,6 @@ class UNet:
             channels=settings.channel_numbers,
             residual=settings.residual,
             seed=seed,
-            policy=policy,
         )
 
     def _packed(self):
@@ -283,7 +280,7 @@ class UNet:
             module = self._module(layer, Direction.FORWARD, None, size)
             module.forward(
                 self.dev,
-                self.policy.blocking,
+                self.blocking,
                 sources,
                 self.parameters[layer.name + ".weight"],
                 self.parameters[layer.name + ".bias"],
@@ -308,7 +305,7 @@ class UNet:
         else:
             self._module(layer, Direction.BACKWARD_INPUT, source, size).backward_input(
                 self.dev,
-                self.policy.blocking,
+                self.blocking,
                 self.parameters[layer.name + ".weight"],
                 sum(layer.sources[:source]),
                 grad_out,
@@ -324,7 +321,7 @@ class UNet:
         partial = self._work[layer.name, PARTIAL]
         parts = self._module(layer, Direction.BACKWARD_WEIGHTS, None, size).backward_weights(
             self.dev,
-            self.policy.blocking,
+            self.blocking,
             tuple(arrays[name] for name in layer.inputs),
             arrays[gradient_of(layer.name)],
             weight.shape,
@@ -345,9 +342,10 @@ class UNet:
 
     def _module(self, layer, direction, source, size):
         """The module that computes a convolution in an image of a size."""
-        key = self.policy, layer.name, direction, source, size
+        key = self.variant, layer.name, direction, source, size
         if key not in self._modules:
-            self._modules[key] = self.policy.convolution(layer.shape(direction, source, *size))
+            shape = layer.shape(direction, source, *size)
+            self._modules[key] = VARIANTS[choose(self.dev, shape, self.variant)]
         return self._modules[key]
 
     def _laid_out(self, layer, module):
@@ -369,9 +367,9 @@ class UNet:
         self._work = {}
         if size is None:
             return
-        if self._planned[0] != (self.policy, size):
+        if self._planned[0] != (self.variant, size):
             self._planned = (None,)  # frees the old arrays first
-            self._planned = (self.policy, size), *self._plan(size)
+            self._planned = (self.variant, size), *self._plan(size)
         _, self._work, whole, jobs = self._planned
         for lay_out, of_layers in jobs.items():
             lay_out(self.dev, self.all_parameters, of_layers, whole)
@@ -405,7 +403,7 @@ class UNet:
                 if direction is Direction.BACKWARD_WEIGHTS:
                     height, source = size[0] >> layer.level, PARTIAL
                     scratch = module.scratch_floats(
-                        self.dev, self.policy.blocking, direction, height, shape, c
+                        self.dev, self.blocking, direction, height, shape, c
                     )
                     floats = scratch[PARTIAL]
                 else:
@@ -425,7 +423,6 @@ class UNet:
         share with others among them.
 
         Gradients of parameters are among them without training too: they are made with the network.
-        Raises UserError where no variant is as exact as the policy's tolerance.
         """
         size = (height, width)
         shared = share_buffers(lifetimes(self.layers, training), array_shapes(self.layers, size))
@@ -435,7 +432,7 @@ class UNet:
             for direction, source in computations(layer, training):
                 needed = self._module(layer, direction, source, size).scratch_floats(
                     self.dev,
-                    self.policy.blocking,
+                    self.blocking,
                     direction,
                     height >> layer.level,
                     weight_shape,

@@ -7,7 +7,7 @@ import numpy as np
 
 from pp_cl.bench.conv import Layer
 from pp_cl.device.device import Device
-from pp_cl.layers.choice import ERRORS, OFFERED, SHIPPED, VARIANTS, device_class
+from pp_cl.layers.choice import OFFERED, VARIANTS, blocking_of, can_run
 from pp_cl.layers.simple import (
     SHARE,
     avgpool2_backward,
@@ -138,9 +138,9 @@ def within(actual: np.ndarray, expected: np.ndarray) -> Check:
 def _convolution(variant: str, dev: Device, rng: np.random.Generator) -> Iterator[Check]:
     """All directions; awkward sizes, two sources, a masked gradient."""
     module, bound = VARIANTS[variant], BOUNDS[variant]
-    layers = _layers() if 1 in ERRORS[variant] else _layers()[: len(SHAPES)]
+    layers = _layers() if can_run(variant, 1) else _layers()[: len(SHAPES)]
     for layer in layers:
-        results = layer.computed(dev, module, SHIPPED[device_class(dev)])
+        results = layer.computed(dev, module, blocking_of(dev))
         for actual, expected in zip(results, layer.expected, strict=True):
             of_weights = expected.ndim != 3
             yield relative(actual, expected, max(bound, WEIGHTS_BOUND) if of_weights else bound)
@@ -149,7 +149,7 @@ def _convolution(variant: str, dev: Device, rng: np.random.Generator) -> Iterato
 def _hard_convolution(variant: str, dev: Device, rng: np.random.Generator) -> Iterator[Check]:
     """Large means, weights over six decades, values of 6e4 and 1e-7, 512 channels, zeros."""
     for layer in _hard_layers().values():
-        results = layer.computed(dev, VARIANTS[variant], SHIPPED[device_class(dev)])
+        results = layer.computed(dev, VARIANTS[variant], blocking_of(dev))
         yield from map(within, results, layer.expected)
 
 

@@ -5,7 +5,6 @@ from collections.abc import Iterator
 import numpy as np
 
 from pp_cl.device.device import Device
-from pp_cl.layers.choice import make_policy
 from pp_cl.reference import loss as reference_loss
 from pp_cl.reference.lpips import lpips, lpips_gradient, random_weights
 from pp_cl.selftest.case import EPS, SIZES, Case, Check, each, exact, relative
@@ -143,7 +142,7 @@ def _perceptual_loss(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
     for size in ((16, 16), (17, 33)):
         target = rng.uniform(0, 1, (*size, 3))
         prediction = target + rng.normal(0, 0.2, target.shape)
-        loss = PerceptualLoss(dev, 0.3, make_policy(dev, variant="direct"), weights)
+        loss = PerceptualLoss(dev, 0.3, weights, "direct")
         one, other = (dev.upload(image, np.float32) for image in (prediction, target))
         grad = dev.zeros(target.shape)
         distances = loss.add_gradient(one, other, (0, 0), grad).get()

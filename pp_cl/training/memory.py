@@ -325,7 +325,7 @@ class Room:
             tables["exposure"] = Exposure.table(height, width) | state
         if train.perceptual_weight > 0:
             tables["perceptual loss"] = PerceptualLoss.table(target)
-            tables["network of LPIPS"] = Lpips.table(net.dev, net.policy, target[:2])
+            tables["network of LPIPS"] = Lpips.table(net.dev, target[:2])
         return tables
 
     def _shrunk(self):

@@ -9,7 +9,7 @@ from pp_cl.device.buffers import Buffers, Table
 from pp_cl.device.device import Device
 from pp_cl.device.launch import lanes, launch_groups
 from pp_cl.errors import UserError
-from pp_cl.layers.choice import ConvolutionPolicy
+from pp_cl.layers.choice import AUTO
 from pp_cl.metrics.lpips import BLOCKS, LEAST_SIZE, WIDTHS, Lpips, size_of, vgg_layers
 from pp_cl.training.loss import corner_of
 
@@ -19,7 +19,7 @@ FEATURES = tuple(f"features{block}" for block in range(len(BLOCKS)))
 class PerceptualLoss:
     """weight * LPIPS(prediction, target); holds the network and its feature maps.
 
-    policy: of the convolutions. weights: of the network, None = load_weights()'s (which may raise
+    variant: of the convolutions. weights: of the network, None = load_weights()'s (which may raise
     UserError).
     """
 
@@ -27,12 +27,12 @@ class PerceptualLoss:
         self,
         dev: Device,
         weight: float,
-        policy: ConvolutionPolicy,
         weights: dict[str, np.ndarray] | None = None,
+        variant: str = AUTO,
     ):
         self.dev = dev
         self.weight = weight
-        self._network = Lpips(dev, weights, policy)
+        self._network = Lpips(dev, weights, variant)
         self._buffers = Buffers(dev)
 
     @staticmethod

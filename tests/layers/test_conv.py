@@ -2,7 +2,6 @@
 launches and blockings, NaN, wrong shapes.
 """
 
-from dataclasses import replace
 from functools import partial
 
 import numpy as np
@@ -14,12 +13,12 @@ from support.tiles import pixels_of, random_counts
 
 from pp_cl.bench.conv import Layer
 from pp_cl.layers import conv_direct
-from pp_cl.layers.choice import CHOICES, SHIPPED, VARIANTS
+from pp_cl.layers.choice import CPUS, GPU, VARIANTS
 from pp_cl.layers.tiles import some_tiles
 from pp_cl.network.tile_plan import grow
 from pp_cl.selftest.layers import within
 
-CPU = SHIPPED["CPU"]
+CPU = CPUS[16]
 DIRECT, LOCAL, WINOGRAD = (VARIANTS[name] for name in ("direct", "local", "winograd"))
 # (module, side of the kernel)
 ALL = [
@@ -64,7 +63,7 @@ def test_launches_in_parts_compute_the_same_bits(dev, rng, monkeypatch, module, 
             dev,
             monkeypatch,
             f"{prefix}_{direction}",
-            lambda: tuple(layer.computed(dev, module, SHIPPED["GPU"])),
+            lambda: tuple(layer.computed(dev, module, GPU)),
         )
         assert launched > 1, direction
 
@@ -112,31 +111,26 @@ def test_parts_grow_when_memory_is_short(dev, rng, monkeypatch, module, most):
         assert relative_error(results[i], layer.expected[i]) < 5e-6
 
 
-# The many builds of some take half a minute each.
-FIELDS = {
-    "direct": (DIRECT, [((13, 13), (32, 16), 32), ((7, 37), (16,), 48), ((3, 2), (3,), 20)]),
-    "winograd_weights": (WINOGRAD, [((50, 31), (256,), 128), ((7, 7), (16,), 48)]),
-    "winograd": (WINOGRAD, [((50, 45), (256,), 80)]),
-    "winograd_narrow": (WINOGRAD, [((50, 31), (16,), 16), ((13, 13), (32, 16), 32)]),
-}
-SLOW = ("winograd", "winograd_narrow")
-
-
 @pytest.mark.parametrize(
-    "field", [pytest.param(f, marks=pytest.mark.slow) if f in SLOW else f for f in FIELDS]
+    "module, blocking, shape",
+    [
+        pytest.param(module, blocking, shape, id=f"{name} {shape}")
+        for module, shapes in (
+            (DIRECT, [((13, 13), (32, 16), 32), ((7, 37), (16,), 48), ((3, 2), (3,), 20)]),
+            (WINOGRAD, [((50, 45), (256,), 80), ((50, 31), (16,), 16), ((13, 13), (32, 16), 32)]),
+        )
+        for name, blocking in (("16 floats", CPUS[16]), ("8 floats", CPUS[8]), ("GPU", GPU))
+        for shape in shapes
+        if module is DIRECT or blocking is not GPU
+    ],
 )
 @pytest.mark.large
-def test_every_blocking(dev, rng, field):
-    """Images of more tiles than are taken at a time, in no more memory than each asks for."""
-    module, shapes = FIELDS[field]
-    layers = [Layer.random(rng, *shape) for shape in shapes]
-    values = {value for choices in CHOICES.values() for value in choices.get(field, ())}
-    blockings = [replace(CPU, **{field: value}) for value in sorted(values)]
-    for blocking in [*blockings, *([SHIPPED["GPU"]] if module is DIRECT else [])]:
-        for layer in layers:
-            for result in map(within, layer.computed(dev, module, blocking), layer.expected):
-                assert result.share <= 1, blocking
-        dev.check()
+def test_every_row_of_the_table(dev, rng, module, blocking, shape):
+    """Images of more tiles than are taken at a time, in no more memory than each row asks for."""
+    layer = Layer.random(rng, *shape)
+    for result in map(within, layer.computed(dev, module, blocking), layer.expected):
+        assert result.share <= 1
+    dev.check()
 
 
 @pytest.mark.parametrize("module, k", OF_3X3)

@@ -7,7 +7,6 @@ from support.runs import arguments, rows
 from pp_cl.cli import main
 from pp_cl.device.buffers import table_bytes
 from pp_cl.errors import UserError
-from pp_cl.layers.choice import make_policy
 from pp_cl.metrics.lpips import Lpips
 from pp_cl.reference.lpips import WIDTHS, random_weights
 from pp_cl.selftest.loss import images
@@ -31,7 +30,7 @@ def run(loss, prediction, target, offset=(0, 0), start=0.0):
 
 def test_is_the_metric(dev, rng, weights):
     prediction, target = (np.clip(image, 0, 1) for image in images(rng, 35, 50))
-    loss = PerceptualLoss(dev, WEIGHT, make_policy(dev, variant="direct"), weights)
+    loss = PerceptualLoss(dev, WEIGHT, weights, "direct")
     found, grad = run(loss, prediction, target)
     assert found == pytest.approx(Lpips(dev, weights).distance(prediction, target), rel=1e-6)
     _, more = run(loss, prediction, target, start=2.0)
@@ -41,7 +40,7 @@ def test_is_the_metric(dev, rng, weights):
 @pytest.mark.parametrize(("left", "top"), [(0, 0), (1, 2), (3, 1)])
 def test_target_inside_a_larger_prediction(dev, rng, weights, left, top):
     prediction, target = images(rng, 22, 29)
-    loss = PerceptualLoss(dev, WEIGHT, make_policy(dev), weights)
+    loss = PerceptualLoss(dev, WEIGHT, weights)
     expected, expected_grad = run(loss, prediction, target)
     padded = np.full((24, 32, 3), np.nan, np.float32)  # poison: nothing outside may be read
     inner = np.s_[top : top + 22, left : left + 29]
@@ -57,7 +56,7 @@ def test_target_inside_a_larger_prediction(dev, rng, weights, left, top):
 
 @pytest.mark.large
 def test_sizes_may_change_between_calls_and_bits_stay(dev, rng, weights):
-    loss, seen = PerceptualLoss(dev, WEIGHT, make_policy(dev), weights), {}
+    loss, seen = PerceptualLoss(dev, WEIGHT, weights), {}
     pairs = [images(rng, *size) for size in [(20, 40), (33, 17)]]
     for i in (0, 1, 0, 1):
         found, grad = run(loss, *pairs[i])
@@ -67,10 +66,10 @@ def test_sizes_may_change_between_calls_and_bits_stay(dev, rng, weights):
 
 @pytest.mark.large
 def test_tables_are_what_it_takes(plain, rng, weights):
-    before, policy, size = plain.bytes, make_policy(plain), (64, 40)
-    loss = PerceptualLoss(plain, WEIGHT, policy, weights)
+    before, size = plain.bytes, (64, 40)
+    loss = PerceptualLoss(plain, WEIGHT, weights)
     run(loss, *images(rng, *size))
-    tables = [PerceptualLoss.table((*size, 3), WIDTHS), Lpips.table(plain, policy, size, WIDTHS)]
+    tables = [PerceptualLoss.table((*size, 3), WIDTHS), Lpips.table(plain, size, WIDTHS)]
     constants = plain.bytes - before - sum(map(table_bytes, tables))
     assert 0 <= constants <= 512  # a row of 32 bytes for each layer whose weights are laid out
 
