@@ -177,7 +177,6 @@ class TrainConfig:
         0,
         1e3,
     )
-    perceptual_weight: float = setting(0.0, "adds this times LPIPS to the loss (0: off)", 0, 10)
     sh_rate: tuple = setting(
         (0.5, 0.25, 0.125),
         "first learning rate of SH degrees 0, 1, 2; at rate 0 a degree stays 0",

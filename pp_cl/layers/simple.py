@@ -100,29 +100,10 @@ def avgpool2_backward(
 
 def maxpool2_forward(dev: Device, x: Array, out: Array) -> None:
     """out (H // 2, W // 2, C) = largest of 2x2 pixels of x (H, W, C)."""
-    h, w, c = _check_half(x, out)
+    h, w, c = out.shape
+    if (x.shape[0] // 2, x.shape[1] // 2, x.shape[2]) != out.shape:
+        raise ValueError(f"max pooling of {x.shape} to {out.shape}")
     _launch(dev, "maxpool2_forward", (h, w, c), h=h, w=w, c=c, x_width=x.shape[1], x=x, out=out)
-
-
-def maxpool2_backward(dev: Device, x: Array, grad_out: Array, grad_x: Array) -> None:
-    """Adds the gradient of maxpool2_forward to grad_x (H, W, C), where x > 0.
-
-    x: the ReLU's output that was pooled; grad_x: gradient of that ReLU's input, as far as the
-    output's other use goes; grad_out: (H // 2, W // 2, C).
-    """
-    h, w, c = _check_half(x, grad_out)
-    _launch(
-        dev,
-        "maxpool2_backward",
-        (h, w, c),
-        h=h,
-        w=w,
-        c=c,
-        x_width=x.shape[1],
-        x=x,
-        grad_out=grad_out,
-        grad_x=grad_x,
-    )
 
 
 def upsample2_forward(dev: Device, x: Array, out: Array, *, tiles: Tiles | None = None) -> None:
@@ -212,13 +193,6 @@ def _check_double(small, large):
         raise ValueError(
             f"a layer between {small.shape} and {large.shape}: expected {(2 * h, 2 * w, c)}"
         )
-    return h, w, c
-
-
-def _check_half(large, small):
-    h, w, c = small.shape
-    if (large.shape[0] // 2, large.shape[1] // 2, large.shape[2]) != small.shape:
-        raise ValueError(f"max pooling of {large.shape} to {small.shape}")
     return h, w, c
 
 

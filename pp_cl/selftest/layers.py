@@ -14,7 +14,6 @@ from pp_cl.layers.simple import (
     avgpool2_forward,
     gate_backward,
     gate_forward,
-    maxpool2_backward,
     maxpool2_forward,
     output_backward,
     output_forward,
@@ -168,16 +167,12 @@ def _pool(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
 
 
 def _max_pool(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
-    """The gradient goes to the first of equal ones, and not to cells of zeros; odd borders drop."""
+    """Cells of zeros and of equal values; odd borders drop."""
     for shape in ((2, 2, 16), (3, 5, 3), (31, 33, 17), (257, 2, 32)):
         x = np.maximum(rng.integers(-3, 3, shape), 0).astype(np.float32)
-        pooled, other = (shape[0] // 2, shape[1] // 2, shape[2]), _normal(rng, *shape)
-        grad_out, out, grad_x = _normal(rng, *pooled), dev.empty(pooled), dev.upload(other)
+        out = dev.empty((shape[0] // 2, shape[1] // 2, shape[2]))
         maxpool2_forward(dev, dev.upload(x), out)
         yield exact(out.get(), lpips.maxpool2(x))
-        maxpool2_backward(dev, dev.upload(x), dev.upload(grad_out), grad_x)
-        expected = other + lpips.maxpool2_gradient(x, grad_out) * (x > 0)
-        yield relative(grad_x.get(), expected, FOUR)
 
 
 def _upsample(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
