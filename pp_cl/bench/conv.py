@@ -4,7 +4,9 @@ Errors are against float64 (reference/network.py): of outputs and input gradient
 of weights' gradients at SAMPLE_CHANNELS x SAMPLE_CHANNELS channels and every tap.
 """
 
+import math
 from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
 from functools import cached_property
 from types import ModuleType
 
@@ -14,8 +16,8 @@ from pp_cl.bench.timing import PeakFlops, errors, variant_rows
 from pp_cl.device.device import Device
 from pp_cl.layers.choice import OFFERED, VARIANTS, blocking_of, can_run, device_class
 from pp_cl.layers.conv_direct import (
-    PARTIAL,
     Blocking,
+    ConvShape,
     Direction,
     pack_bias,
     pack_weights,
@@ -115,29 +117,39 @@ class UploadedLayer:
         self, conv: ModuleType, blocking: Blocking, direction: Direction, tiles: Tiles | None
     ) -> None:
         """Compute a direction by a module of convolutions, as the network does."""
-        dev, parts, weight, grad_out = self.dev, self.parts, self.weight, self.grad_out
+        dev, parts, grad_out = self.dev, self.parts, self.grad_out
+        channels = tuple(part.shape[2] for part in parts)
+        height, width, co = grad_out.shape
+        shape = ConvShape(direction, self.weight.shape[1], channels, co, (height, width))
         if direction == Direction.FORWARD:
+            weights = self._laid_out(conv, shape)
             conv.forward(
-                dev, blocking, parts, weight, self.bias, self.out, relu=self.relu, tiles=tiles
+                dev, blocking, parts, weights, self.bias, self.out, relu=self.relu, tiles=tiles
             )
         elif direction == Direction.BACKWARD_WEIGHTS:
-            shape, height = weight.shape, len(grad_out)
-            floats = conv.scratch_floats(dev, blocking, direction, height, shape, shape[3])
-            partial = dev.scratch(PARTIAL, floats[PARTIAL])
-            count = conv.backward_weights(
-                dev, blocking, parts, grad_out, shape, partial, tiles=tiles
-            )
-            rows, n = table_of_sums([(shape, count, 0, 0, 0)])
+            partial = self._work(conv.work_shape(shape))
+            count = conv.backward_weights(dev, blocking, parts, grad_out, partial, tiles=tiles)
+            rows, n = table_of_sums([(partial.shape, count, 0, 0, 0)])
             table = dev.constant(rows)
             sum_parts(dev, table, n, partial, self.grad_weight, self.grad_bias)
         else:
-            first = 0
-            for part, grad in zip(parts, self.grad_parts, strict=True):
+            for i, (part, grad) in enumerate(zip(parts, self.grad_parts, strict=True)):
                 mask = part if self.relu else None
-                conv.backward_input(
-                    dev, blocking, weight, first, grad_out, grad, mask=mask, tiles=tiles
-                )
-                first += part.shape[2]
+                weights = self._laid_out(conv, replace(shape, source=i))
+                conv.backward_input(dev, blocking, weights, grad_out, grad, mask=mask, tiles=tiles)
+
+    def _laid_out(self, conv, shape):
+        """The weights as a module reads them, laid out anew as each step of a training does."""
+        needed = conv.work_shape(shape)
+        if needed is None:
+            return self.weight
+        work = self._work(needed)
+        conv.lay_out(self.dev, self.weight.reshape(-1), [(shape, 0, 0)], work)
+        return work
+
+    def _work(self, shape):
+        n = math.prod(shape)
+        return self.dev.scratch("bench: weights and parts of their gradients", n)[:n].reshape(shape)
 
 
 class RandomConv:

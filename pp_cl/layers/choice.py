@@ -3,15 +3,14 @@ and the sizes that the kernels are built with. Both are shipped, by the kind of 
 CPUs, by the width of their vectors; `python -m tools.tune` measures a row of that table.
 """
 
-from dataclasses import dataclass
+import math
 from types import ModuleType
 
 from pyopencl.array import Array
 
 from pp_cl.device.device import Device
 from pp_cl.layers import conv_direct, conv_local, conv_winograd
-from pp_cl.layers.conv_direct import Blocking, Direction
-from pp_cl.layers.tiles import VECTOR
+from pp_cl.layers.conv_direct import Blocking, ConvShape, Direction
 
 AUTO = "auto"
 VARIANTS = {"local": conv_local, "direct": conv_direct, "winograd": conv_winograd}
@@ -66,27 +65,6 @@ GPU = Blocking(
 )
 
 
-@dataclass(frozen=True)
-class ConvShape:
-    """One direction of a convolution, as far as the choice of a variant goes.
-
-    k: side of the kernel. sources: channels of each input. co: output channels. pixels: of the
-    image. source: index of the input whose gradient is computed, None in the other directions.
-    """
-
-    direction: Direction
-    k: int
-    sources: tuple[int, ...]
-    co: int
-    pixels: int
-    source: int | None = None
-
-    @property
-    def ci(self) -> int:
-        """Input channels; of a gradient of the input, those of its one source."""
-        return sum(self.sources) if self.source is None else self.sources[self.source]
-
-
 def device_class(dev: Device) -> str:
     """The key of a device in OFFERED: "CPU", or "GPU" for every other device."""
     return "CPU" if dev.is_cpu else "GPU"
@@ -119,16 +97,17 @@ def choose(dev: Device, shape: ConvShape, variant: str = AUTO) -> str:
         return variant if can_run(variant, shape.k, *channels) else "direct"
     if not dev.is_cpu:
         return "local"
-    gains = shape.pixels >= WINOGRAD_FROM[shape.direction]
+    gains = math.prod(shape.size) >= WINOGRAD_FROM[shape.direction]
     return "winograd" if gains and can_run("winograd", shape.k, *channels) else "direct"
 
 
-def lay_out_forward(dev: Device, module: ModuleType, weight: Array) -> Array | None:
-    """A layer's weights as a module's forward() reads them, in a new array; None: as they are."""
-    blocks, _, _, ci, _ = weight.shape
-    floats = module.laid_out_floats(Direction.FORWARD, weight.shape, ci)
-    if not floats:
-        return None
-    laid_out, layer = dev.empty((floats,)), (0, 0, weight.shape, None, ci, blocks * VECTOR)
-    module.lay_out(dev, weight.reshape(-1), [layer], laid_out)
-    return laid_out
+def laid_out(dev: Device, module: ModuleType, weight: Array, shape: ConvShape) -> Array:
+    """A layer's weights as a module's kernels read them in one direction, in a new array or, where
+    they read them as they are, itself.
+    """
+    needed = module.work_shape(shape)
+    if needed is None:
+        return weight
+    array = dev.empty(needed)
+    module.lay_out(dev, weight.reshape(-1), [(shape, 0, 0)], array)
+    return array

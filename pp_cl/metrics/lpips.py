@@ -13,8 +13,8 @@ from pyopencl.array import Array
 from pp_cl.device.device import Device
 from pp_cl.device.launch import Program, group_ranges, lanes, row_parts
 from pp_cl.errors import UserError
-from pp_cl.layers.choice import VARIANTS, ConvShape, blocking_of, choose, lay_out_forward
-from pp_cl.layers.conv_direct import Direction, pack_weights
+from pp_cl.layers.choice import VARIANTS, blocking_of, choose, laid_out
+from pp_cl.layers.conv_direct import ConvShape, Direction, pack_weights
 from pp_cl.layers.simple import maxpool2_forward
 from pp_cl.layers.tiles import all_tiles
 from pp_cl.metrics.lpips_weights import load_weights
@@ -157,23 +157,22 @@ class Lpips:
         self._size, self._prepared = None, {}
         tiles = [all_tiles(self.dev, *size_of(size, block)) for block in range(len(BLOCKS))]
         for layer in self.layers:
-            pixels = math.prod(size_of(size, layer.block))
-            shape = ConvShape(Direction.FORWARD, 3, (layer.ci,), layer.co, pixels)
+            of_block = size_of(size, layer.block)
+            shape = ConvShape(Direction.FORWARD, 3, (layer.ci,), layer.co, of_block)
             module = VARIANTS[choose(self.dev, shape)]
-            laid_out = lay_out_forward(self.dev, module, self._weights[layer.name])
-            self._prepared[layer.name] = module, laid_out, tiles[layer.block]
+            weights = laid_out(self.dev, module, self._weights[layer.name], shape)
+            self._prepared[layer.name] = module, weights, tiles[layer.block]
         self._size = size
 
     def _convolve(self, layer, x, out):
-        module, laid_out, tiles = self._prepared[layer.name]
+        module, weights, tiles = self._prepared[layer.name]
         module.forward(
             self.dev,
             self.blocking,
             (x,),
-            self._weights[layer.name],
+            weights,
             self._biases[layer.name],
             out,
             relu=True,
             tiles=tiles,
-            laid_out=laid_out,
         )

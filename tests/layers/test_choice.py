@@ -11,12 +11,11 @@ from pp_cl.layers.choice import (
     GPU,
     OFFERED,
     VARIANTS,
-    ConvShape,
     blocking_of,
     can_run,
     choose,
 )
-from pp_cl.layers.conv_direct import Direction
+from pp_cl.layers.conv_direct import ConvShape, Direction
 
 FORWARD, INPUT, WEIGHTS = Direction
 # {variant: {K: bounds on the relative L2 error of each direction}}: the table of
@@ -33,7 +32,7 @@ ERRORS = {
 @pytest.mark.parametrize("direction", Direction)
 def test_the_shipped_choice(dev, monkeypatch, direction):
     def shipped(sources, co, pixels, k=3):
-        return choose(dev, ConvShape(direction, k, sources, co, pixels))
+        return choose(dev, ConvShape(direction, k, sources, co, (pixels, 1)))
 
     least = 64 if direction is WEIGHTS else 900
     assert shipped((128,), 128, least) == "winograd"
@@ -49,16 +48,16 @@ def test_the_shipped_choice(dev, monkeypatch, direction):
 def test_each_device_is_offered_what_it_takes(dev, monkeypatch):
     for is_cpu, name in ((True, "CPU"), (False, "GPU")):
         monkeypatch.setattr(dev, "is_cpu", is_cpu)
-        shapes = [ConvShape(FORWARD, 3, (16,), 16, pixels) for pixels in (64, 4096)]
+        shapes = [ConvShape(FORWARD, 3, (16,), 16, (side, side)) for side in (8, 64)]
         assert {choose(dev, shape) for shape in shapes} <= {*OFFERED[name]}
 
 
 def test_a_variant_asked_for_runs_where_it_can(dev):
-    assert choose(dev, ConvShape(FORWARD, 3, (16,), 16, 64), "winograd") == "winograd"
-    assert choose(dev, ConvShape(FORWARD, 3, (16, 3), 16, 64), "winograd") == "direct"
-    assert choose(dev, ConvShape(FORWARD, 1, (16,), 16, 64), "winograd") == "direct"
+    assert choose(dev, ConvShape(FORWARD, 3, (16,), 16, (8, 8)), "winograd") == "winograd"
+    assert choose(dev, ConvShape(FORWARD, 3, (16, 3), 16, (8, 8)), "winograd") == "direct"
+    assert choose(dev, ConvShape(FORWARD, 1, (16,), 16, (8, 8)), "winograd") == "direct"
     with pytest.raises(ValueError, match="fft.*auto, local, direct, winograd"):
-        choose(dev, ConvShape(FORWARD, 3, (16,), 16, 64), "fft")
+        choose(dev, ConvShape(FORWARD, 3, (16,), 16, (8, 8)), "fft")
 
 
 @pytest.mark.parametrize("width, row", [(32, 16), (16, 16), (8, 8), (4, 4), (1, 4)])
