@@ -77,7 +77,7 @@ def make_network(
     through the layers as they do in a trained network. With UNet's own initial weights they fade,
     and the error of an image that is 0.5 and little else says nothing.
     """
-    net = UNet(dev, widths, CHANNELS_IN, CHANNELS_OUT, blocks=blocks, variant=variant)
+    net = UNet(dev, widths, blocks=blocks, variant=variant)
     for name, parameter in net.parameters.items():
         if name.endswith(".weight"):
             dev.write(parameter, np.float32(np.sqrt(6)) * parameter.get())

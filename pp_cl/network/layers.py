@@ -16,7 +16,7 @@ from typing import Any, Literal
 import numpy as np
 
 from pp_cl.device.buffers import Table
-from pp_cl.layers.conv_direct import ConvShape, Direction, packed_shape
+from pp_cl.layers.conv_direct import packed_shape
 from pp_cl.layers.tiles import VECTOR
 
 
@@ -49,11 +49,6 @@ class Layer:
     def weight_shape(self) -> tuple[int, int, int, int]:
         """(CO, CI, K, K) of a convolution's weights."""
         return self.channels, sum(self.sources), self.kernel_size, self.kernel_size
-
-    def shape(self, direction: Direction, source: int | None, size: tuple[int, int]) -> ConvShape:
-        """A convolution in one direction, in an image of `size` = (height, width)."""
-        here = size[0] >> self.level, size[1] >> self.level
-        return ConvShape(direction, self.kernel_size, self.sources, self.channels, here, source)
 
     def multiplications(self, height: int, width: int) -> int:
         """Multiplications of weights by values in a forward pass over an image of this size,
@@ -136,17 +131,6 @@ def _of_channels(layers, channels_in, channels):
 def convolutions(layers: list[Layer]) -> list[Layer]:
     """The layers that have parameters."""
     return [layer for layer in layers if layer.kind == "conv"]
-
-
-def computations(layer: Layer, training: bool) -> list[tuple[Direction, int | None]]:
-    """(direction, input or None) of all that is computed for a convolution: forward, and for
-    training the gradients of its weights and of each input.
-    """
-    found: list[tuple[Direction, int | None]] = [(Direction.FORWARD, None)]
-    if training:
-        found.append((Direction.BACKWARD_WEIGHTS, None))
-        found += [(Direction.BACKWARD_INPUT, i) for i in range(len(layer.sources))]
-    return found
 
 
 def parameter_table(layers: list[Layer]) -> Table:
