@@ -51,9 +51,9 @@ class WinogradConv(DirectConv):
                 f"Winograd convolution of {channels} channels: they come in multiples of 16"
             )
         super().__init__(dev, blocking, shape)
-        # tiles transformed, and multiplied together, at a time
         narrow = shape.ci * shape.co <= NARROW
-        self.tiles = blocking.winograd_narrow if narrow else blocking.winograd
+        # tiles transformed at a time, and multiplied together
+        self._at_once, self._together = blocking.winograd_narrow if narrow else blocking.winograd
 
     def _work_shape(self):
         ci, co = self.shape.ci, self.shape.co
@@ -65,7 +65,7 @@ class WinogradConv(DirectConv):
     def scratch_floats(self) -> int:
         """See DirectConv; of SLICES."""
         ci, co = self.shape.ci, self.shape.co
-        vectors = POSITIONS * ((ci + co) // VECTOR * self.tiles[0] + 3)
+        vectors = POSITIONS * ((ci + co) // VECTOR * self._at_once + 3)
         if self.shape.direction is Direction.BACKWARD_WEIGHTS:
             ci_part, co_part = min(CI_PART, ci), min(CO_PART, co)
             values = (ci_part + co_part) // VECTOR * self.blocking.winograd_weights
@@ -134,9 +134,13 @@ class WinogradConv(DirectConv):
 
     def _launch(self, kernel, tiles, channels, **arguments):
         """Compute the tiles of a result of so many channels."""
-        at_once, together = self.tiles
-        defines = {"TILES": at_once, "TOGETHER": together, "BLOCKS": self._groups(channels)}
-        self.dev.program("layers/winograd", **defines).launch(
+        program = self.dev.program(
+            "layers/winograd",
+            TILES=self._at_once,
+            TOGETHER=self._together,
+            BLOCKS=self._groups(channels),
+        )
+        program.launch(
             kernel,
             min(self.dev.info["compute_units"], tiles.number),
             local=1,
