@@ -130,8 +130,8 @@ class Pass:
                 self.arrays[name] = self._buffers[i][:floats].reshape(shapes[name])
 
     def _place_work(self, size):
-        """{Work: (its convolution, array)}: the weights as the kernels read them, or the parts of
-        the gradients.
+        """{Work: (what computes it, its array)}: the weights as the kernels read them, or room for
+        the parts of the gradients.
         """
         convs, self._work, self._jobs = self.net.work(size, self.training), None, defaultdict(list)
         rows = _work_table(convs)
@@ -165,7 +165,7 @@ class Pass:
     # ---- launches
 
     def _compute(self, layer, planned, tiles):
-        """A layer's output. planned: (its convolution, weights) of one."""
+        """Compute a layer's output. planned: of a convolution, what computes it and its weights."""
         net, arrays, of_layer = self.net, self.arrays, tiles.tiles(layer.name)
         sources, out = tuple(arrays[name] for name in layer.inputs), arrays[layer.name]
         if layer.kind == "gate":
@@ -180,8 +180,8 @@ class Pass:
             conv.forward(sources, weights, bias, out, relu=layer.relu, tiles=of_layer)
 
     def _compute_gradient(self, layer, source, planned, tiles):
-        """The gradient of a layer's input of number `source`. planned: (its convolution,
-        weights) of one.
+        """Compute the gradient of a layer's input of number `source`. planned: of a convolution,
+        what computes it and its weights.
         """
         net, name = self.net, layer.inputs[source]
         x, grad_x = self.arrays[name], self.arrays[gradient_of(name)]
@@ -199,7 +199,9 @@ class Pass:
             conv.backward_input(weights, grad_out, grad_x, mask=mask, tiles=of_input)
 
     def _compute_gradient_of_weights(self, layer, planned, tiles):
-        """The parts of the gradients of a convolution's weights and bias. planned: (it, parts)."""
+        """Compute the parts of the gradients of a convolution's weights and bias. planned: what
+        computes them, and where they go.
+        """
         net, grad = self.net, gradient_of(layer.name)
         conv, parts = planned
         sources = tuple(self.arrays[name] for name in layer.inputs)
@@ -208,7 +210,7 @@ class Pass:
         self._sums.append((parts.shape, count, *map(_first_float, (parts, *gradients))))
 
     def _copy(self, name, tiles):
-        """The tiles of a feature map that were not computed."""
+        """Copy the tiles of a feature map that were not computed from equal ones."""
         tiles.fill_copies(name, self.arrays[name])
 
 
@@ -228,11 +230,12 @@ class UNet:
     widths: channels of the three levels. blocks: what a level computes, of layers.BLOCKS. channels:
     as unet_layers() takes them. residual: adds output.SHARE of the first three features to the
     image. variant: of the convolutions, as choose() takes it; blocking: of their kernels, as
-    shipped for the device. layers: in the order of the forward pass. parameters, gradients:
-    {"enc0.a.weight": (ceil(CO/16), K, K, CI, 16), "enc0.a.bias": (ceil(CO/16) * 16,), ...} float32
-    on the device; all_parameters, all_gradients: the 1-D array that they lie in, with zeros between
-    them. Weights and biases start uniform in +-1/sqrt(CI K K) (PyTorch's default for Conv2d),
-    output channels beyond CO at 0, with gradient 0.
+    shipped for the device; both may be replaced before the first pass. layers: in the order of the
+    forward pass. parameters, gradients: {"enc0.a.weight": (ceil(CO/16), K, K, CI, 16),
+    "enc0.a.bias": (ceil(CO/16) * 16,), ...} float32 on the device; all_parameters, all_gradients:
+    the 1-D array that they lie in, with zeros between them. Weights and biases start uniform in
+    +-1/sqrt(CI K K) (PyTorch's default for Conv2d), output channels beyond CO at 0, with gradient
+    0.
     """
 
     def __init__(
