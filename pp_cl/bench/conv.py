@@ -195,8 +195,8 @@ def bench_conv(
     policy: ConvolutionPolicy,
     *,
     blocks: str = "double",
-) -> Iterator[list[dict]]:
-    """Rows of every distinct convolution of the network at size x size, a list for each direction.
+) -> Iterator[dict]:
+    """Rows of every distinct convolution of the network at size x size, by direction and variant.
 
     policy: its blocking is used; every variant is measured. blocks: as UNet takes them.
     """
@@ -212,7 +212,7 @@ def bench_conv(
         for direction in Direction:
             runs = {v: conv.runner(v, direction, policy) for v in conv.variants}
             found = {v: errors(*conv.result(v, direction, policy)) for v in conv.variants}
-            yield variant_rows(
+            yield from variant_rows(
                 {"layer": layer.name, "shape": shape, "direction": direction.value},
                 runs,
                 found,
