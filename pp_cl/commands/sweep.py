@@ -2,7 +2,7 @@
 
 import argparse
 import sys
-from contextlib import ExitStack, suppress
+from contextlib import ExitStack
 from pathlib import Path
 
 from pp_cl.commands import options as shared
@@ -73,20 +73,27 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(options: argparse.Namespace) -> None:
     """Run what is missing, print the table. Raises Stopped where runs failed."""
     from pp_cl.files.manifest import begin_manifest, check_ours, note_in_place
-    from pp_cl.sweep.result import finished_row
-    from pp_cl.sweep.table import TABLES, markdown, write_tables
+    from pp_cl.files.run_folder import RunFolder
+    from pp_cl.sweep.result import failed_row, finished_row
+    from pp_cl.sweep.table import TABLES, markdown, run_text, values_text, write_tables
 
     jobs, out = _jobs(options), Path(options.out)
-    if options.dry_run:
-        _print_plan(jobs)
-        return
-    rows = {}
+    rows, states = {}, {}
     for job in jobs:
-        with suppress(UserError):  # which the job meets again, and tells in its row
+        states[job.folder] = "to go on" if RunFolder(job.folder).config.exists() else "to do"
+        try:
             if row := finished_row(job):
-                rows[job.folder] = row
+                rows[job.folder], states[job.folder] = row, f"finished: {values_text(row)}"
+        except UserError as error:  # which the job meets again, and tells in its row
+            states[job.folder] = f"will fail: {error}"
+    told = f"{len(jobs)} runs, {len(rows)} of them finished already"
+    if options.dry_run:
+        for job in jobs:
+            print(f"{run_text(failed_row(job, ''))}: {states[job.folder]}")
+        print(f"{told}; nothing was started")
+        return
+    print(told, flush=True)
     missing = [job for job in jobs if job.folder not in rows]
-    print(f"{len(jobs)} runs, {len(rows)} of them finished already", flush=True)
     check_ours([out / name for name in TABLES])
     begin_manifest(out)
     note_in_place(out.resolve(), [job.log for job in missing])
@@ -125,25 +132,6 @@ def _jobs(options):
         preset_name=options.preset,
         metrics=options.metrics,
     )
-
-
-def _print_plan(jobs):
-    """What would be run, and what has been."""
-    from pp_cl.files.run_folder import RunFolder
-    from pp_cl.sweep.result import failed_row, finished_row
-    from pp_cl.sweep.table import run_text, values_text
-
-    done = 0
-    for job in jobs:
-        state = "to go on" if RunFolder(job.folder).config.exists() else "to do"
-        try:
-            if row := finished_row(job):
-                state = f"finished: {values_text(row)}"
-                done += 1
-        except UserError as error:
-            state = f"will fail: {error}"
-        print(f"{run_text(failed_row(job, state))}: {state}")
-    print(f"{len(jobs)} runs, {done} of them finished already; nothing was started")
 
 
 def _run(options, jobs, total):
