@@ -12,7 +12,7 @@ HELP = "time against error of the convolutions, the network, the rasteriser, a t
 # the options that only some benches have
 OPTIONS = {
     "conv": ("size", "widths", "blocks", "plot"),
-    "unet": ("size", "widths", "blocks", "plot", "tolerance"),
+    "unet": ("size", "widths", "blocks", "plot"),
     "raster": ("size", "scene", "points", "blend", "gamma", "plot"),
     "train": ("scene", "points", "set"),
     "all": ("plot",),
@@ -77,7 +77,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="FILE",
         help="also draw time against error there (.png, .svg, .pdf)",
     )
-    shared.add_tolerance(parser)
     shared.add_device(parser)
 
 
@@ -88,11 +87,6 @@ def run(options: argparse.Namespace) -> None:
     from pp_cl.bench.plots import figure_of, plot_time_and_error, save_figure
     from pp_cl.device.discover import open_device
 
-    if options.what == "conv" and options.tolerance is not None:
-        raise UserError(
-            "--tolerance: bench conv shows every variant; give it to bench unet, whose auto picks"
-            " among them"
-        )
     foreign = set(chain(*OPTIONS.values())) - {*OPTIONS[options.what]}
     shared.refuse(options, foreign, f"bench {options.what} has no such option")
     figure = figure_of(options.plot)
@@ -126,21 +120,11 @@ def _network(name, options):
     from pp_cl.bench.conv import bench_conv
     from pp_cl.bench.timing import HEAD, line
     from pp_cl.bench.unet import bench_unet
-    from pp_cl.layers.choice import load_policy
 
     size = _one(options, "size") if options.size else 256
     widths, blocks = options.widths or (128, 256, 512), options.blocks or "double"
-    tolerance = options.tolerance
-    if tolerance is None:
-        tolerance = preset("tiny").network.tolerance
-
-    def measure(dev):
-        policy = load_policy(dev, tolerance)
-        print(policy.origin)
-        bench = bench_conv if name == "conv" else bench_unet
-        return HEAD, line, bench(dev, size, widths, policy, blocks=blocks)
-
-    return measure
+    bench = bench_conv if name == "conv" else bench_unet
+    return lambda dev: (HEAD, line, bench(dev, size, widths, blocks=blocks))
 
 
 def _raster(_, options):

@@ -60,7 +60,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     add("--view", action="store_true", help="watch in the browser, as with `pp-cl view RUN`")
     add("-v", "--verbose", action="store_true", help="print the memory plan buffer by buffer")
-    shared.add_tolerance(parser)
     shared.add_set(parser, "any other setting, listed by --help")
     shared.add_device(parser)
 
@@ -92,7 +91,6 @@ def run(options: argparse.Namespace) -> None:
     dev = open_device(options.device)
     print(f"device: {dev.name} [{dev.info['platform']}]")
     training = open_training(dev, folder, config, stored)
-    print(training.origin)
     chosen = is_new and "scene.downscale" not in [key for key, _, _ in given]
     print(_images_line(training, chosen))
     print(_first_line(training))

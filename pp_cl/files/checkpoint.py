@@ -20,7 +20,7 @@ from pp_cl.files.atomic import atomic_file
 from pp_cl.files.untrusted import strict_json
 
 FORMAT = 1  # raised when the arrays change meaning
-MOST_HEADER = 2**24  # bytes; the measurements of a tuned device take some 100,000
+MOST_HEADER = 2**24  # bytes
 MEND = "delete it to train anew, or restore a copy"
 
 PIECE_BYTES = 2**24

@@ -16,8 +16,7 @@ from typing import Any, Literal
 import numpy as np
 
 from pp_cl.device.buffers import Table
-from pp_cl.layers.choice import ConvShape
-from pp_cl.layers.conv_direct import Direction
+from pp_cl.layers.conv_direct import packed_shape
 from pp_cl.layers.tiles import VECTOR
 
 
@@ -50,11 +49,6 @@ class Layer:
     def weight_shape(self) -> tuple[int, int, int, int]:
         """(CO, CI, K, K) of a convolution's weights."""
         return self.channels, sum(self.sources), self.kernel_size, self.kernel_size
-
-    def shape(self, direction: Direction, source: int | None, height: int, width: int) -> ConvShape:
-        """What a convolution's variant is chosen by, in an image of this size."""
-        pixels = (height >> self.level) * (width >> self.level)
-        return ConvShape(direction, self.kernel_size, self.sources, self.channels, pixels, source)
 
     def multiplications(self, height: int, width: int) -> int:
         """Multiplications of weights by values in a forward pass over an image of this size,
@@ -139,17 +133,6 @@ def convolutions(layers: list[Layer]) -> list[Layer]:
     return [layer for layer in layers if layer.kind == "conv"]
 
 
-def computations(layer: Layer, training: bool) -> list[tuple[Direction, int | None]]:
-    """(direction, input or None) of all that is computed for a convolution: forward, and for
-    training the gradients of its weights and of each input.
-    """
-    found: list[tuple[Direction, int | None]] = [(Direction.FORWARD, None)]
-    if training:
-        found.append((Direction.BACKWARD_WEIGHTS, None))
-        found += [(Direction.BACKWARD_INPUT, i) for i in range(len(layer.sources))]
-    return found
-
-
 def parameter_table(layers: list[Layer]) -> Table:
     """{name: (shape, dtype)} of the parameters: "enc0.a.weight" (ceil(CO/16), K, K, CI, 16),
     "enc0.a.bias" (ceil(CO/16) * 16,), ...
@@ -157,9 +140,9 @@ def parameter_table(layers: list[Layer]) -> Table:
     table: Table = {}
     for layer in convolutions(layers):
         co, ci, k, _ = layer.weight_shape()
-        blocks = -(-co // VECTOR)
-        table[layer.name + ".weight"] = (blocks, k, k, ci, VECTOR), np.float32
-        table[layer.name + ".bias"] = (blocks * VECTOR,), np.float32
+        shape = packed_shape(k, ci, co)
+        table[layer.name + ".weight"] = shape, np.float32
+        table[layer.name + ".bias"] = (shape[0] * VECTOR,), np.float32
     return table
 
 

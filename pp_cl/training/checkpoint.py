@@ -14,7 +14,6 @@ from pp_cl.config import Config
 from pp_cl.errors import UserError, quoted, shown
 from pp_cl.files.checkpoint import MEND, Checkpoint, Form, opened_checkpoint
 from pp_cl.files.run_folder import RunFolder
-from pp_cl.layers.choice import check_form
 from pp_cl.network.layers import parameter_table, unet_layers
 from pp_cl.raster.points import MOST_OFFSET, SH_DEGREES, sh_blocks
 from pp_cl.scene.grid import MOST_VERTICES
@@ -27,7 +26,7 @@ LEAST_LENGTH, MOST_LENGTH = 1e-30, 1e30  # world units; float32 would hold no pr
 LEAST_SHARE = 1e-6  # of far, between it and near: float32 would hold them as one
 MOST_TEXT = 1000
 DIGEST = re.compile(f"[0-9a-f]{{{DIGITS}}}")
-OPTIONAL = {"format", "tuning", "extended_from", "exposed", "left_out", "notes"}  # keys of a header
+OPTIONAL = {"format", "extended_from", "exposed", "left_out", "notes"}  # keys of a header
 GRID = ("origin", "edge", "dims")
 
 
@@ -90,11 +89,6 @@ class StoredRun:
             self._refuse(
                 f"it is not finished at step {header['step']}, the last in its config.json"
             )
-        if header.get("tuning") is not None:
-            try:
-                check_form(header["tuning"])
-            except ValueError as error:
-                self._refuse(f"its tuning is broken ({shown(str(error))})")
 
     def _check_forms(self, config):
         """Compare names, shapes and dtypes with what the settings call for."""

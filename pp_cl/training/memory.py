@@ -13,7 +13,6 @@ from pp_cl.device.buffers import PIECE_BYTES, Table, compact_table, grown, table
 from pp_cl.device.device import Device
 from pp_cl.device.host import available_bytes, resident_bytes
 from pp_cl.errors import UserError
-from pp_cl.metrics.lpips import Lpips
 from pp_cl.model import Model
 from pp_cl.network.unet import PARAMETERS, UNet
 from pp_cl.raster.blend import blend_backward_table
@@ -25,7 +24,6 @@ from pp_cl.scene.views import Photograph, kept_bytes, shrink_factor
 from pp_cl.training.exposure import Exposure
 from pp_cl.training.loss import Loss, MaskLoss, lanes_of_loss
 from pp_cl.training.optim import Optimiser
-from pp_cl.training.perceptual import PerceptualLoss
 from pp_cl.training.schedule import crop_side, ema_start, prunings, refine_steps
 from pp_cl.training.smooth import Smoother
 from pp_cl.training.state import PointState
@@ -323,9 +321,6 @@ class Room:
         if train.exposure != "off":
             state = {"state": ((len(self._photographs), 3, 4), np.float32)}
             tables["exposure"] = Exposure.table(height, width) | state
-        if train.perceptual_weight > 0:
-            tables["perceptual loss"] = PerceptualLoss.table(target)
-            tables["network of LPIPS"] = Lpips.table(net.dev, net.policy, target[:2])
         return tables
 
     def _shrunk(self):

@@ -69,7 +69,7 @@ def test_all_measures_each_bench(tmp_path, capsys, monkeypatch):
     rows = bench(tmp_path, "--plot", str(plot))["rows"]
     assert list(dict.fromkeys(row["bench"] for row in rows)) == list(small)
     assert plot.read_bytes().startswith(b"\x89PNG")
-    assert capsys.readouterr().out.count("\n") == 1 + 4 + 2 + len(rows)
+    assert capsys.readouterr().out.count("\n") == 1 + 4 + len(rows)
 
 
 @pytest.mark.parametrize("what", SMALL)

@@ -144,7 +144,6 @@ HEADERS = {
     "pixels of another length": ({"pixels": {"r_0.png": "0" * 17}}, "pixels"),
     "pixels of other letters": ({"pixels": {"r_0.png": "g" * 16}}, "pixels"),
     "an unknown key": ({"col\nour\x1b[31m": 1}, "header holds col our?[31m"),
-    "tuning of a list": ({"tuning": []}, "tuning"),
     "another format": ({"format": 2}, "format 2"),
 }
 
@@ -156,7 +155,7 @@ def test_a_header_that_cannot_be_is_refused(folder, config, change, told):
     assert told in refusal(folder, config)
 
 
-@pytest.mark.parametrize("key", [key for key in HEADER if key != "tuning"])
+@pytest.mark.parametrize("key", HEADER)
 def test_a_header_that_lacks_a_key_is_refused(folder, config, key):
     header, arrays = contents(config)
     del header[key]
@@ -174,7 +173,7 @@ TEXTS = {
     "an infinite step": header_text(step="1e999"),
     "Infinity": header_text(step="Infinity"),
     "5000 digits": header_text(step="9" * 5000),
-    "a deep tuning": header_text(tuning='{"rows": ' + "[" * 900 + "]" * 900 + "}"),
+    "a deep grid": header_text(grid='{"origin": ' + "[" * 900 + "]" * 900 + "}"),
 }
 
 

@@ -14,7 +14,6 @@ from pp_cl.device.device import Device
 from pp_cl.device.host import resident_bytes
 from pp_cl.errors import UserError
 from pp_cl.files.checkpoint import load_checkpoint
-from pp_cl.metrics.lpips import WIDTHS, vgg_layers
 from pp_cl.model import Model
 from pp_cl.network.unet import UNet
 from pp_cl.scene.camera import Camera
@@ -33,7 +32,6 @@ WAYS = [
     {"points.sh_degree": "1"},
     # discs of 1.5 spacings
     {"raster.footprint": "disc", "raster.radius": "0.09"},
-    {"train.perceptual_weight": "0.1"},
     # to points that are eight, then 64 times as many, which are smoothed
     {
         "train.refine_at": "0.4,0.7",
@@ -85,19 +83,10 @@ def trained(dev, folder, changes, base="tiny"):
     return trainer, plan, dev.peak_bytes - before
 
 
-def zero_weights():
-    """Of LPIPS, in their shapes."""
-    layers = vgg_layers()
-    weights = {f"kernel{i}": np.zeros((x.co, x.ci, 3, 3)) for i, x in enumerate(layers)}
-    weights |= {f"bias{i}": np.zeros(x.co, np.float32) for i, x in enumerate(layers)}
-    return weights | {f"head{i}": np.zeros(width, np.float32) for i, width in enumerate(WIDTHS)}
-
-
 @pytest.mark.parametrize(
     "changes", [*WAYS[:5], *(pytest.param(way, marks=pytest.mark.slow) for way in WAYS[5:])]
 )
-def test_the_plan_is_what_a_training_takes(plain, tmp_path, monkeypatch, changes):
-    monkeypatch.setattr("pp_cl.metrics.lpips.load_weights", zero_weights)
+def test_the_plan_is_what_a_training_takes(plain, tmp_path, changes):
     trainer, plan, peak = trained(plain, tmp_path / "ball", changes)
     points = trainer.model.cloud.count
     assert plan.peak.points == points and 0.8 * POINTS < points <= POINTS
