@@ -5,8 +5,9 @@ from itertools import chain
 from typing import Any
 
 from pp_cl.commands import options as shared
-from pp_cl.config import CONVOLUTIONS, assign, preset
+from pp_cl.config import assign, preset
 from pp_cl.errors import UserError
+from pp_cl.settings import BLOCKS
 
 HELP = "time against error of the convolutions, the network, the rasteriser, a training"
 # the options that only some benches have
@@ -44,7 +45,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="side of the image in pixels, a multiple of 4 (256; raster: 200,400,800)",
     )
     shared.add_widths(parser, "conv, unet: channels of the levels (128,256,512: the paper's)")
-    add("--blocks", choices=CONVOLUTIONS, help="conv, unet: of a level (double)")
+    add("--blocks", choices=BLOCKS, help="conv, unet: of a level (double)")
     add(
         "--scene",
         metavar="SCENE",
