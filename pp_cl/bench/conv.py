@@ -214,8 +214,8 @@ def bench_conv(
     widths: tuple[int, int, int],
     *,
     blocks: str = "double",
-) -> Iterator[list[dict]]:
-    """Rows of every distinct convolution of the network at size x size, a list for each direction.
+) -> Iterator[dict]:
+    """Rows of every distinct convolution of the network at size x size, by direction and variant.
 
     blocks: as UNet takes them.
     """
@@ -231,7 +231,7 @@ def bench_conv(
         for direction in Direction:
             runs = {v: conv.runner(v, direction, blocking) for v in conv.variants}
             found = {v: errors(*conv.result(v, direction, blocking)) for v in conv.variants}
-            yield variant_rows(
+            yield from variant_rows(
                 {"layer": layer.name, "shape": shape, "direction": direction.value},
                 runs,
                 found,

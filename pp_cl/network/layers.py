@@ -9,8 +9,7 @@ upsampling weights of a pixel add up to 1, so they commute, bias included, and i
 """
 
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any, Literal
 
 import numpy as np
@@ -58,9 +57,6 @@ class Layer:
         return weights * (height >> self.level) * (width >> self.level)
 
 
-BLOCKS = ("double", "single", "gated")
-
-
 def _conv(name, inputs, level, channels, sources, kernel_size=3, relu=True):
     return Layer("conv", name, inputs, level, channels, sources, kernel_size, relu)
 
@@ -81,12 +77,9 @@ def unet_layers(
     channels_in: int = 16,
     channels_out: int = 3,
     blocks: str = "double",
-    *,
-    channels: Sequence[int] = (),
 ) -> list[Layer]:
     """The layers in the order of the forward pass. widths: channels of the three levels; blocks:
-    what a level computes, one of BLOCKS. channels: others, of each convolution but the last.
-    Raises ValueError for another number of them.
+    what a level computes, one of settings.BLOCKS.
     """
     w0, w1, w2 = widths
     enc0 = _block(blocks, "enc0", ("x",), 0, w0, (channels_in,))
@@ -95,7 +88,7 @@ def unet_layers(
     skip0, skip1 = enc0[-1].name, enc1[-1].name
     dec1 = _block(blocks, "dec1", ("wide1", skip1), 1, w1, (w1, w1))
     dec0 = _block(blocks, "dec0", ("wide0", skip0), 0, w0, (w0, w0))
-    layers = [
+    return [
         *enc0,
         Layer("pool", "pool0", (skip0,), 1, w0),
         *enc1,
@@ -109,23 +102,6 @@ def unet_layers(
         *dec0,
         _conv("out", (dec0[-1].name,), 0, channels_out, (w0,), kernel_size=1, relu=False),
     ]
-    return _of_channels(layers, channels_in, [*channels, channels_out]) if channels else layers
-
-
-def _of_channels(layers, channels_in, channels):
-    """The same layers with other numbers of channels, those of each convolution."""
-    if len(channels) != len(convolutions(layers)):
-        raise ValueError(f"{len(channels)} numbers of channels, not {len(convolutions(layers))}")
-    found, numbers, changed = {"x": channels_in}, iter(channels), []
-    for layer in layers:
-        sources = tuple(found[name] for name in layer.inputs)
-        if layer.kind == "conv":
-            layer = replace(layer, channels=next(numbers), sources=sources)
-        else:
-            layer = replace(layer, channels=sources[0] // (2 if layer.kind == "gate" else 1))
-        found[layer.name] = layer.channels
-        changed.append(layer)
-    return changed
 
 
 def convolutions(layers: list[Layer]) -> list[Layer]:

@@ -5,7 +5,7 @@ launches, made once for images of one size.
 import math
 import weakref
 from collections import defaultdict
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -227,8 +227,8 @@ def _first_float(array):
 class UNet:
     """The network, its parameters and gradients, and the buffers it works in.
 
-    widths: channels of the three levels. blocks: what a level computes, of layers.BLOCKS. channels:
-    as unet_layers() takes them. residual: adds output.SHARE of the first three features to the
+    widths: channels of the three levels. blocks: what a level computes, of settings.BLOCKS.
+    residual: adds output.SHARE of the first three features to the
     image. variant: of the convolutions, as choose() takes it; blocking: of their kernels, as
     shipped for the device; both may be replaced before the first pass. layers: in the order of the
     forward pass. parameters, gradients: {"enc0.a.weight": (ceil(CO/16), K, K, CI, 16),
@@ -244,14 +244,13 @@ class UNet:
         widths: tuple[int, int, int] = (16, 32, 64),
         *,
         blocks: str = "double",
-        channels: Sequence[int] = (),
         residual: bool = False,
         seed: int = 0,
         variant: str = AUTO,
     ):
         self.dev = dev
         self._residual = residual
-        self.layers = unet_layers(widths, blocks=blocks, channels=channels)
+        self.layers = unet_layers(widths, blocks=blocks)
         self.variant, self.blocking = variant, blocking_of(dev)
         self.all_parameters, self.parameters = self._packed()
         self.all_gradients, self.gradients = self._packed()
@@ -275,7 +274,6 @@ class UNet:
             dev,
             settings.widths,
             blocks=settings.blocks,
-            channels=settings.channel_numbers,
             residual=settings.residual,
             seed=seed,
         )
