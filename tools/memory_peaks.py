@@ -1,4 +1,4 @@
-"""Compare the memory plan of trainings with the peaks of device and host that they reach.
+"""Compare the memory that trainings are said to need with the peaks of device and host.
 
     python tools/memory_peaks.py [--scene FOLDER] [--only NAME ...] [--json FILE]
 
@@ -77,16 +77,16 @@ def peaks(name: str, scene: str) -> dict:
         training = open_training(dev, folder, config, None)
         training.run()
     host = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
-    plan, room = training.room.plan, training.room
+    need, host_need = training.room.need, training.room.host_bytes
     return {
         "name": name,
-        "points": plan.peak.points,
-        "device_plan": plan.peak.device / MIB,
+        "points": need.points,
+        "device_plan": need.device / MIB,
         "device": dev.peak_bytes / MIB,
-        "host_plan": room.host_bytes / MIB,
+        "host_plan": host_need / MIB,
         "host": host / MIB,
-        "device_ratio": plan.peak.device / dev.peak_bytes,
-        "host_ratio": room.host_bytes / host,
+        "device_ratio": need.device / dev.peak_bytes,
+        "host_ratio": host_need / host,
     }
 
 
