@@ -41,7 +41,7 @@ BALL = {"points.count": 4000, "scene.downscale": 1, "network.blocks": "double"}
     [
         ("demo", {}),
         ("ball", BALL | {"train.refine_at": "0.4,1"}),  # to eight times the points
-        ("ball", BALL | {"raster.blend": "softmax", "raster.footprint": "disc"}),
+        ("ball", BALL | {"raster.footprint": "disc", "raster.radius": 0.1}),
     ],
 )
 def test_it_is_within_15_percent_of_what_a_training_takes(plain, tmp_path, scene, settings):
