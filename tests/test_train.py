@@ -7,12 +7,12 @@ import shutil
 
 import numpy as np
 import pytest
+from support.checkpoints import load_checkpoint
 from support.runs import arguments, checkpoint, rows, train_and_interrupt
 
 from pp_cl import load
 from pp_cl.cli import main
 from pp_cl.config import preset
-from pp_cl.files.checkpoint import load_checkpoint
 from pp_cl.layers.choice import make_policy
 from pp_cl.network.unet import UNet
 from pp_cl.scene.grid import Grid

@@ -9,11 +9,11 @@ import shutil
 import numpy as np
 import pytest
 from PIL import Image
+from support.checkpoints import load_checkpoint
 from support.runs import arguments, checkpoint, rows, train_and_interrupt
 from support.scenes import write_ball_scene
 
 from pp_cl.cli import main
-from pp_cl.files.checkpoint import load_checkpoint
 from pp_cl.train import Trainer
 
 

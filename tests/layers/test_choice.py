@@ -6,6 +6,7 @@ import json
 
 import numpy as np
 import pytest
+from support.checkpoints import load_checkpoint
 from support.runs import arguments, train_and_interrupt
 from support.tunings import MS, REL_L2, row, tuning_of
 
@@ -16,7 +17,7 @@ from pp_cl.config import Config
 from pp_cl.device.discover import open_device
 from pp_cl.errors import UserError
 from pp_cl.files.atomic import write_json
-from pp_cl.files.checkpoint import load_checkpoint, save_checkpoint
+from pp_cl.files.checkpoint import save_checkpoint
 from pp_cl.layers.choice import (
     CHOICES,
     ERRORS,
