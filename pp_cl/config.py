@@ -22,7 +22,7 @@ MOST_TEXT = 4096  # characters of a setting
 # by network.blocks, how many convolutions there are but the last
 CONVOLUTIONS = {"double": 12, "single": 7, "gated": 7}
 RANDOM = "random"  # of network.start, beside demo and a folder
-OF_MASKS = ("scene.masks", "scene.mask_from", "scene.mask_tolerance")
+OF_MASKS = ("scene.masks", "scene.ignore", "scene.mask_from", "scene.mask_tolerance")
 MEND_SETTINGS = "restore it or start a new run"
 
 
@@ -174,16 +174,19 @@ def configure(config: Config, scene: str, given: Iterable[tuple[str, Any, str]] 
     given = list(given)
     for origin in (origin for key, _, origin in given if key == "scene.path"):
         raise UserError(f"{origin}: scene.path is what SCENE or --scene says; leave it out")
-    path, masks = scene if scene == "demo" else str(Path(scene).resolve()), config.scene.masks
-    if masks and config.scene.path and Path(masks).is_relative_to(config.scene.path):
-        moved = Path(path) / Path(masks).relative_to(config.scene.path)
-        assign(config, "scene.masks", str(moved), "settings")
+    path, before = scene if scene == "demo" else str(Path(scene).resolve()), config.scene.path
+    for name in ("masks", "ignore"):
+        folder = getattr(config.scene, name)
+        if folder and before and Path(folder).is_relative_to(before):
+            moved = Path(path) / Path(folder).relative_to(before)
+            assign(config, f"scene.{name}", str(moved), "settings")
     assign(config, "scene.path", path, "settings")
     for key, value, origin in given:
         if path == "demo" and key in OF_MASKS:
             raise UserError(f"{origin}: the demo has masks of its own; leave it out")
         assign(config, key, value, origin)
-    for owner, name in ((config.scene, "masks"), (config.network, "start")):
+    folders = (config.scene, "masks"), (config.scene, "ignore"), (config.network, "start")
+    for owner, name in folders:
         if getattr(owner, name) not in ("", RANDOM, "demo"):
             setattr(owner, name, str(Path(getattr(owner, name)).resolve()))
     validate(config, "settings", {key: origin for key, _, origin in given})

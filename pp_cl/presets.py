@@ -66,6 +66,7 @@ SHORT = {
     "points": "points.count",
     "downscale": "scene.downscale",
     "masks": "scene.masks",
+    "ignore": "scene.ignore",
     "mask_from": "scene.mask_from",
     "eval_every": "train.eval_every",
     "seed": "train.seed",

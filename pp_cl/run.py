@@ -394,4 +394,5 @@ def render_views(run: Run, views: list[View]) -> Iterator[Rendered]:
         del result  # else its arrays would stay beside the larger ones of the next view
         whole = target.crop(view, (0, 0, view.camera.width, view.camera.height))
         truth, alpha = (array.get() for array in whole)
+        truth = view.ignoring(truth, image)
         yield Rendered(view.name, image, truth, alpha, seconds, computed)

@@ -68,7 +68,7 @@ COARSER = 1.2  # times the spacing at the next try, where memory is too small: 1
 LEAST_SIDE = 48  # pixels of the images that a training begins on, if it is to refine
 # what `make network` keeps: {"net.NAME": as UNet.parameters, float16}
 DEMO_NETWORK = Path(__file__).with_name("network") / "demo.npz"
-PLACES = (("scene", "path"), ("scene", "masks"))
+PLACES = (("scene", "path"), ("scene", "masks"), ("scene", "ignore"))
 
 Stored = tuple[dict[str, Any], dict[str, np.ndarray]]  # header and arrays of a checkpoint
 OnStep = Callable[[int, dict[str, Any] | None], None]
@@ -219,8 +219,9 @@ class Training:
     def _measure(self):
         """{"test_psnr": mean over the measured views, of 8-bit images} of the present model."""
         found = [
-            psnr(to_8bit(self._rendered(view)), to_8bit(self.trainer.target(view)))
+            psnr(to_8bit(image), to_8bit(view.ignoring(self.trainer.target(view), image)))
             for view in self.measured
+            for image in [self._rendered(view)]
         ]
         return {"test_psnr": float(np.mean(found))}
 

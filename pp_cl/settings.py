@@ -34,6 +34,7 @@ class SceneConfig:
         choices=("given", "alpha", "color", "box", "none"),
     )
     masks: str = setting("", "folder of masks named like the photographs, white on the object")
+    ignore: str = setting("", "folder of masks that are white where photographs say nothing")
     mask_tolerance: float = setting(
         10.0,
         "largest CIELAB distance from the background's colour that still counts as background",

@@ -18,7 +18,7 @@ from pp_cl.render import NETWORK_MULTIPLE, Renderer
 from pp_cl.scene.target import Target
 from pp_cl.scene.views import View
 from pp_cl.training.exposure import LEAST_SHARE, Exposure, decided_at
-from pp_cl.training.loss import Loss, MaskLoss
+from pp_cl.training.loss import Loss, MaskLoss, ignore_gradient, ignore_target
 from pp_cl.training.optim import Optimiser
 from pp_cl.training.perceptual import PerceptualLoss
 from pp_cl.training.schedule import (
@@ -127,6 +127,7 @@ class Trainer:
             if self.exposure and self.exposure.is_applied:
                 target = self.exposure.target(view_index, photograph, target_alpha)
             tiles_of_gradient = self._gradient_tiles(target, camera)
+            ignored = view.ignored_crop(box, jitter)
 
         rendered = self.renderer.forward(
             camera,
@@ -138,11 +139,18 @@ class Trainer:
         )
         with self.dev.stage("loss"):
             mask = target_alpha if view.has_mask else None
-            grad_image, grad_alpha = self._losses(rendered, target, mask)
             if self.exposure:
                 self.exposure.fit(
                     view_index, rendered.image, photograph, target_alpha, rendered.offset
                 )
+            if ignored is not None:
+                ignored = self.dev.upload(ignored, np.uint8)
+                ignore_target(
+                    self.dev, ignored, rendered.image, target, target_alpha, rendered.offset
+                )
+            grad_image, grad_alpha = self._losses(rendered, target, mask)
+            if ignored is not None:
+                ignore_gradient(self.dev, ignored, grad_image, rendered.offset)
         spread_weight, all_depths = self._spread_weight(target)
         features, opacities, offsets, pixel_spread = self.renderer.backward(
             rendered,

@@ -67,7 +67,9 @@ def take_images(source: Path, images: Path, scene: Path | None = None) -> dict[s
     None where COLMAP may guess it by EXIF. Raises UserError where too few are usable.
     """
     with atomic_folder(images) as unfinished:
-        found = list((_photographs if source.is_dir() else _frames)(source, unfinished, scene))
+        is_film = not source.is_dir()
+        taken = _frames(source, unfinished) if is_film else _photographs(source, unfinished, scene)
+        found = list(taken)
         _leave_out(found)
         for one in found:
             if "reason" in one and "name" in one:
@@ -213,7 +215,7 @@ def _focal_of_larger(exposure, size):
 # Films --------------------------------------------------------------------------------------------
 
 
-def _frames(film, images, _):
+def _frames(film, images):
     """The facts of the sharpest frame of each interval, written to `images`."""
     chosen, is_hdr = _sharpest(film)
     equal = [f"eq(n,{number})" for number in chosen]

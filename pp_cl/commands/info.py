@@ -45,7 +45,7 @@ def run(options: argparse.Namespace) -> None:
     is_scene = options.subject == DEMO or folder.path.exists() or not nearby_run(folder.path)
     is_run = folder.config.exists() or not is_scene
     if is_run:
-        shared.refuse(options, ("masks", "mask_from", "set", "preset"), "only of a scene")
+        shared.refuse(options, ("masks", "ignore", "mask_from", "set", "preset"), "only of a scene")
     else:
         shared.refuse(options, ("scene",), "only of a run")
     image = None
@@ -55,7 +55,7 @@ def run(options: argparse.Namespace) -> None:
             image = run_picture(open_device(options.device), folder, options.scene)
     else:
         dev = open_device(options.device)
-        given = shared.read_short(options, ("masks", "mask_from")) + options.set
+        given = shared.read_short(options, ("masks", "ignore", "mask_from")) + options.set
         facts, views, hull, found = describe_scene(
             dev, options.subject, options.preset or "tiny", given
         )

@@ -214,9 +214,12 @@ def add_metrics(parser: argparse.ArgumentParser) -> None:
 
 
 def add_masks(parser: argparse.ArgumentParser) -> None:
-    """Add --masks and --mask-from, for read_short."""
+    """Add --masks, --ignore and --mask-from, for read_short."""
     parser.add_argument(
         "--masks", metavar="FOLDER", help="masks named like the photographs, white on the object"
+    )
+    parser.add_argument(
+        "--ignore", metavar="FOLDER", help="masks that are white where photographs say nothing"
     )
     parser.add_argument(
         "--mask-from",

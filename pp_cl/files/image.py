@@ -74,7 +74,7 @@ def _in_srgb(path, image):
 
 def _tell(path, what):
     """Warn of what is done to images, once for a folder."""
-    warnings.warn(f"{Path(path).parent}: {what}", stacklevel=3)
+    warnings.warn(f"{Path(path).parent}: {what}", stacklevel=1)
 
 
 def has_alpha(path: Path | str) -> bool:

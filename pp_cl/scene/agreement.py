@@ -52,7 +52,7 @@ def explain_empty_hull(views: Sequence[View], box: np.ndarray) -> str:
 
     It counts the masks that hold each of about 32^3 positions in a (2, 3) box.
     """
-    empty = [view.name for view in views if view.image[..., 3].max() <= MASK_THRESHOLD]
+    empty = [view.name for view in views if view.hull_alpha.max() <= MASK_THRESHOLD]
     if empty:
         return (
             f"{listing(empty)}: the mask is empty (no alpha above {MASK_THRESHOLD}): mend or remove"
@@ -87,7 +87,8 @@ def mask_votes(views: Sequence[View], box: np.ndarray) -> tuple[Grid, np.ndarray
 
 
 def _votes_of(view, projected):
-    """(2, N) bool: which positions fall onto the mask, and which into the image beside it.
+    """(2, N) bool: which positions fall onto the mask, and which into the image beside it; none
+    where it is ignored.
 
     projected: (3, N), as Grid.projection gives them.
     """
@@ -96,10 +97,10 @@ def _votes_of(view, projected):
     ahead = depth > 0
     x, y = (np.floor(np.divide(a, depth, where=ahead, out=np.full_like(a, -1))) for a in (u, v))
     inside = ahead & (x >= 0) & (x < width) & (y >= 0) & (y < height)
-    on = (
-        view.image[np.where(inside, y, 0).astype(int), np.where(inside, x, 0).astype(int), 3]
-        > MASK_THRESHOLD
-    )
+    place = np.where(inside, y, 0).astype(int), np.where(inside, x, 0).astype(int)
+    on = view.image[..., 3][place] > MASK_THRESHOLD
+    if view.ignored is not None:
+        inside &= ~view.ignored[place]
     return np.stack([inside & on, inside & ~on])
 
 

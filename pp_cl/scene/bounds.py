@@ -94,7 +94,7 @@ def _silhouette_planes(view, cropped_margin):
 
     Sides where it reaches the image border: left out, or cropped_margin image sizes further out.
     """
-    camera, mask = view.stored_camera, view.image[..., 3] > MASK_THRESHOLD
+    camera, mask = view.stored_camera, view.hull_alpha > MASK_THRESHOLD
     normals = []
     for axis, size, focal, centre in (
         (0, camera.width, camera.fx, camera.cx),

@@ -24,6 +24,9 @@ LEAST_CAMERAS = 4
 MOST = 0.9  # of the cameras, that have before them what all look at
 ASIDE = 35.0  # degrees between a camera's axis and what all look at, in the median
 SPREAD = 0.2  # of the distance to what they look at, by which eyes differ around an object
+# the length of the mean of the axes: of cameras that go 90 degrees around an object on an arc. Of
+# those that look the same way from a wall, 0.97 and more, the place all look at is of no use.
+ONE_WAY = 0.9
 GL_FROM_CV = np.diag([1.0, -1.0, -1.0, 1.0])
 
 
@@ -37,24 +40,24 @@ def read_as(camera: Camera, axes: str) -> Camera:
 
 
 def meeting(cameras: Sequence[Camera]) -> float:
-    """How far apart cameras are that look at one place from around it, in world units; 0 where they
-    do not.
+    """How well cameras look at one place from around it: the cosine between their axes and what
+    they look at, in the median; 0 where they do not, or look the same way.
     """
     place = looked_at(cameras)
     towards = place - np.stack([camera.eye for camera in cameras])
     distance = np.linalg.norm(towards, axis=1)
     along = np.stack([camera.pose[:, 2] for camera in cameras])
     cosine = (along * towards).sum(1) / np.maximum(distance, 1e-30)
-    spread = float(np.linalg.norm(towards - towards.mean(0), axis=1).mean())
-    is_around = spread > SPREAD * np.median(distance)
+    spread = np.linalg.norm(towards - towards.mean(0), axis=1).mean()
+    is_around = spread > SPREAD * np.median(distance) and np.linalg.norm(along.mean(0)) < ONE_WAY
     is_ahead = (cosine > 0).mean() >= MOST and np.median(cosine) > np.cos(np.radians(ASIDE))
-    return spread if is_around and is_ahead else 0.0
+    return float(np.median(cosine)) if is_around and is_ahead else 0.0
 
 
 def other_axes(cameras: Sequence[Camera]) -> str | None:
-    """The one of AXES by which the cameras would look at one place, of several that by which they
-    are furthest apart: matrices that are inverted put all in one place, where everything meets.
-    None where they do so as they are, or no other reading makes them.
+    """The one of AXES by which the cameras would look at one place from around it, of several the
+    one that meets it best. None where they do so as they are, or by no other reading, as those
+    that look the same way.
     """
     if len(cameras) < LEAST_CAMERAS or meeting(cameras):
         return None

@@ -110,7 +110,7 @@ class Carver:
                 words=row_words,
                 first=start,
                 threshold=MASK_THRESHOLD,
-                alpha=dev.upload(view.image[..., 3]),
+                alpha=dev.upload(view.hull_alpha),
                 masks=self.masks,
             )
         self.view_masks = dev.upload(table, np.uint32)
@@ -175,7 +175,7 @@ class Carver:
 
 def _is_whole(view):
     """Whether the mask touches no border of its image."""
-    mask = view.image[..., 3] > MASK_THRESHOLD
+    mask = view.hull_alpha > MASK_THRESHOLD
     return not (mask[[0, -1]].any() or mask[:, [0, -1]].any())
 
 

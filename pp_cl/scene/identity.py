@@ -19,12 +19,15 @@ POSE, LENS, SIZE, RANGE = 12, 4, 2, 2  # numbers of a kept view; it may have no 
 MOST_SIDE, MOST_NUMBER = 2**24, 1e30  # what float32 holds as whole numbers, and as products
 
 
-def pixel_digest(image: np.ndarray, distortion: Distortion = STRAIGHT) -> str:
-    """Hex digest of the pixels of a uint8 image, its mask among them, and of the distortion that
-    is removed from it.
+def pixel_digest(
+    image: np.ndarray, distortion: Distortion = STRAIGHT, ignored: np.ndarray | None = None
+) -> str:
+    """Hex digest of the pixels of a uint8 image, its mask among them, of the distortion that is
+    removed from it, and of which pixels are ignored.
     """
     digest = hashlib.sha256(np.ascontiguousarray(image).data)
     digest.update(repr(distortion).encode() if distortion else b"")
+    digest.update(b"" if ignored is None else np.packbits(ignored).data)
     return digest.hexdigest()[:DIGITS]
 
 

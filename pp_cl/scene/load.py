@@ -8,7 +8,7 @@ import os
 import warnings
 from collections.abc import Iterable, Mapping, Sequence, Set
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext, suppress
 from dataclasses import dataclass, replace
 from pathlib import Path, PurePosixPath
 from threading import Lock
@@ -22,7 +22,7 @@ from pp_cl.config import Config
 from pp_cl.device.device import Device
 from pp_cl.device.discover import open_device
 from pp_cl.errors import Unusable, UserError, quoted
-from pp_cl.files.image import ENDINGS, has_alpha, read_rgba
+from pp_cl.files.image import ENDINGS, has_alpha, read_mask, read_rgba
 from pp_cl.presets import IMAGE_SIZES
 from pp_cl.scene import demo
 from pp_cl.scene.convention import STATED, other_axes, read_as
@@ -31,10 +31,11 @@ from pp_cl.scene.edits import FILE as EDITS
 from pp_cl.scene.edits import read_edits
 from pp_cl.scene.identity import pixel_digest
 from pp_cl.scene.kept import KeptViews
-from pp_cl.scene.masks import AS_GIVEN, MaskRule, cut_out
+from pp_cl.scene.masks import AS_GIVEN, OPAQUE, MaskRule, cut_out, of_size
 from pp_cl.scene.readers import co3d, colmap, llff, neus, nsvf, transforms
-from pp_cl.scene.readers.found import Notes, find_masks
+from pp_cl.scene.readers.found import IGNORE_FOLDERS, MASK_FOLDERS, Notes, find_masks
 from pp_cl.scene.views import (
+    MASK_THRESHOLD,
     MIN_SIDE,
     Photograph,
     View,
@@ -48,9 +49,10 @@ from pp_cl.scene.views import (
 DEMO = "demo"  # the word that names the scene which the program makes itself
 
 # One module per format. FILES names the files it reads, recognises(folder) tells whether a folder
-# holds such files, splits(folder) names its splits, read_split(folder, split) gives a list of
-# Photograph of one of them without reading pixels, and box(folder), which only some have, the box
-# that the files state around the object. The first that recognises a folder reads it.
+# holds such files, splits(folder) names its splits, read_split(folder, split, notes) gives a list
+# of Photograph of one of them without reading pixels and tells notes what it leaves out, and
+# box(folder), which only some have, gives the box that the files state around the object. The first
+# that recognises a folder reads it.
 READERS = (transforms, co3d, neus, nsvf, colmap, llff)
 
 # Bytes per pixel of what reading takes at its peak, measured with 12 megapixels: decoding and a
@@ -62,6 +64,7 @@ READING_BYTES = 3 * 2**28  # of the photographs that are read side by side
 LEAST_FOCAL, MOST_FOCAL = 1e-2, 1e7  # pixels; docs/scenes.md says what is measured
 
 INVERTED = 0.95  # of the border of an image: hardly any object ends inside and holds so much
+BESIDE = 0.5  # of what is transparent, that a mask which is not of the object holds
 LEAST_VIEWS = 8  # for training that are left where some are left out
 NEARBY = 100  # entries of a folder without a scene in which one is looked for
 
@@ -154,7 +157,7 @@ def _share_of_border(view):
 def mask_rule(config: Config) -> MaskRule:
     """How the masks of the run's scene are made."""
     scene = config.scene
-    return MaskRule(scene.mask_from, scene.masks, scene.mask_tolerance)
+    return MaskRule(scene.mask_from, scene.masks, scene.mask_tolerance, scene.ignore)
 
 
 def scene_box(config: Config) -> np.ndarray | None:
@@ -191,13 +194,14 @@ def scene_frames(
 ) -> list[Photograph]:
     """list_split()'s photographs; what it notes becomes warnings."""
     photographs, notes = list_split(path, split, edited=edited)
-    _warn(path, split, notes)
+    _tell(Path(path), [f"{split}: {line}" for line in notes])
     return photographs
 
 
-def _warn(path, split, notes):
-    for line in notes:
-        warnings.warn(f"{path}: {split}: {line}", stacklevel=3)
+def _tell(folder, notes):
+    """Warn of each note once, however often a command asks: equal warnings of one line are one."""
+    for note in notes:
+        warnings.warn(f"{folder}: {note}", stacklevel=1)
 
 
 def list_split(path: str | Path, split: str = "train", *, edited: bool = True) -> Listing:
@@ -231,15 +235,25 @@ def list_split(path: str | Path, split: str = "train", *, edited: bool = True) -
     photographs = list(lensed)
     notes.check(len(photographs), LEAST_VIEWS if split == "train" else 1)
     photographs = _masked(folder, reader, photographs, notes)
+    photographs = _ignoring(folder, IGNORE_FOLDERS, photographs, split)
     return Listing(photographs, notes.lines(len(photographs)))
 
 
 def _masked(folder, reader, photographs, notes):
     """The photographs, with the masks of a folder of masks where the format names none; images of a
-    transforms.json have their own alpha, if they have one.
+    transforms.json have their own alpha, if they have one. Where masks are of the object, what a
+    transforms.json names besides says where images are of use, as nerfstudio takes it.
     """
-    if any(one.mask for one in photographs):
+    named = [one for one in photographs if one.mask]
+    if named and not (reader is transforms and _are_besides(folder, named[0])):
         return photographs
+    if named:
+        notes.done["masks that frames name are taken for where images are of use"] = [
+            one.name for one in named
+        ]
+        photographs = [
+            replace(one, mask=None, ignore=one.mask, ignores_black=True) for one in photographs
+        ]
     if reader is transforms and has_alpha(folder / photographs[0].name):
         return photographs
     masks = find_masks(folder, [one.name for one in photographs])
@@ -249,6 +263,37 @@ def _masked(folder, reader, photographs, notes):
         place = PurePosixPath(next(iter(masks.values()))).parts[0]
         notes.done[f"masks are taken from {folder / place}, which no frame names"] = list(masks)
     return [replace(one, mask=masks.get(one.name)) for one in photographs]
+
+
+def _are_besides(folder, photograph):
+    """Whether an image has alpha of which the mask that its frame names is no part, or the scene
+    has a folder of masks in which that mask does not lie.
+    """
+    place = next((name for name in MASK_FOLDERS if (folder / name).is_dir()), None)
+    if place and not photograph.mask.startswith(f"{place}/"):
+        return True
+    with suppress(UserError):
+        if has_alpha(folder / photograph.name):
+            alpha = read_rgba(folder / photograph.name)[..., 3]
+            mask = of_size(read_mask(folder / photograph.mask), alpha.shape[::-1], folder)
+            outside = alpha < OPAQUE // 2
+            return bool(outside.any() and (mask[outside] > OPAQUE // 2).mean() > BESIDE)
+    return False
+
+
+def _ignoring(folder, places, photographs, split):
+    """The photographs, with the masks of what says nothing that lie in one of the places in a
+    folder. Raises UserError where a place has none for any training photograph.
+    """
+    with suppress(UserError) if split != "train" else nullcontext():
+        found = find_masks(folder, [one.name for one in photographs], places) or {}
+        return [
+            replace(one, ignore=str(folder.absolute() / found[one.name]), ignores_black=False)
+            if one.name in found
+            else one
+            for one in photographs
+        ]
+    return photographs
 
 
 def _checked(folder, photograph):
@@ -365,6 +410,10 @@ def load_scene(
         listing = listed.get(split) or list_split(folder, split)
         chosen[split] = evenly(listing.photographs, most)
         lines += [f"{split}: {line}" for line in listing.notes]
+        if masks.ignore:
+            if not os.path.isdir(masks.ignore):
+                raise UserError(f"{masks.ignore}: no such folder; --ignore takes one of masks")
+            chosen[split] = _ignoring(Path(masks.ignore), ["."], chosen[split], split)
     photographs = [one for some in chosen.values() for one in some]
     _check_alike(folder, photographs)
     if downscale:
@@ -389,8 +438,7 @@ def load_scene(
         read[split] = list(notes.usable(pairs, lambda all: _usable(*all), lambda all: all[1].name))
         notes.check(len(read[split]), LEAST_VIEWS if split == "train" and most is None else 1)
         lines += [f"{split}: {line}" for line in notes.lines(len(read[split]))]
-    for line in lines:
-        warnings.warn(f"{folder}: {line}", stacklevel=2)
+    _tell(folder, lines)
     scene = Scene(folder.resolve().name, folder, read, lines)
     return scene.reduced(downscale // factor) if downscale else scene
 
@@ -453,14 +501,18 @@ def _read_view(dev, lock, folder, photograph, masks, factor, kept):
     try:
         with _unusable("no mask"):
             mask = masks.file(photograph.name, photograph.mask and folder / photograph.mask)
-        found = kept and factor > 1 and kept.find(photograph, [file, mask], (masks, factor))
+        ignore = photograph.ignore and folder / photograph.ignore
+        files = [file, mask, ignore]
+        found = kept and factor > 1 and kept.find(photograph, files, (masks, factor))
+        with _unusable("a mask that cannot be used"):
+            ignored = _read_ignored(dev, lock, ignore, photograph, factor) if ignore else None
         if found:
             image, digest = found
         else:
             image = read_rgba(file)
             with _unusable("a mask that cannot be used"):
                 image = masks.apply(image, mask)
-            digest = pixel_digest(image, lens)
+            digest = pixel_digest(image, lens, ignored)
             if lens:
                 with lock:
                     image = undistort(dev, image, camera, lens, factor)
@@ -469,6 +521,8 @@ def _read_view(dev, lock, folder, photograph, masks, factor, kept):
             if masks.is_by_colour:
                 with _unusable("no uniform background"):
                     image = cut_out(image, photograph.name, masks.tolerance)
+            if ignored is not None:
+                image = np.where(ignored[..., None], np.uint8(0), image)
     except Unusable as error:
         return error
     view = View(
@@ -480,7 +534,24 @@ def _read_view(dev, lock, folder, photograph, masks, factor, kept):
         shrunk=factor,
         unshrunk_camera=camera if factor > 1 else None,
         is_masked=mask is not None,
+        ignored=ignored,
     )
     if kept and factor > 1 and not found:
         kept.take(view)
     return view
+
+
+def _read_ignored(dev, lock, file, photograph, factor):
+    """(H // factor, W // factor) bool: the pixels of a view that a mask says nothing is known of,
+    in part or wholly.
+    """
+    camera = photograph.camera
+    mask = of_size(read_mask(file), (camera.width, camera.height), file) > OPAQUE // 2
+    mask = np.where(mask != photograph.ignores_black, np.uint8(OPAQUE), np.uint8(0))
+    image = np.dstack([mask] * 4)
+    if photograph.distortion:
+        with lock:
+            image = undistort(dev, image, camera, photograph.distortion, factor)
+    else:
+        image = shrink(image, factor)
+    return image[..., 3] > MASK_THRESHOLD

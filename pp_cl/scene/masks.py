@@ -26,12 +26,14 @@ class MaskRule:
     scene.mask_tolerance.
 
     source: given, alpha, color, box or none. folder: of masks named like the photographs, before
-    everything else; "" for none. tolerance: of color, in CIELAB's units.
+    everything else; "" for none. tolerance: of color, in CIELAB's units. ignore: folder of masks
+    of what says nothing, before those of the scene; "" for none.
     """
 
     source: str = "given"
     folder: str = ""
     tolerance: float = 10.0
+    ignore: str = ""
 
     def file(self, name: str, mask: Path | None) -> Path | None:
         """The file of a photograph's mask, None where its mask is none of its own. name: of the
@@ -56,7 +58,7 @@ class MaskRule:
         """
         if mask is not None:
             alpha = read_mask(mask)
-            image[..., 3] = _of_size(alpha, image.shape[1::-1], mask)
+            image[..., 3] = of_size(alpha, image.shape[1::-1], mask)
         elif self.source in ("box", "none"):
             image[..., 3] = OPAQUE
         return image
@@ -77,9 +79,9 @@ def named_mask(folder: Path, *names: str) -> Path:
     raise UserError(f"{folder}: no mask for {names[0]}; add {usual}.png, white where the object is")
 
 
-def _of_size(alpha, size, file):
-    """A mask resized to an image of (width, height) pixels, whose shape it must have but for
-    rounding. Raises UserError.
+def of_size(alpha: np.ndarray, size: tuple[int, int], file: Path) -> np.ndarray:
+    """The mask (H, W) of a file resized to an image of (width, height) pixels, whose shape it must
+    have but for rounding. Raises UserError.
     """
     height, width = alpha.shape
     if size == (width, height):
@@ -89,7 +91,7 @@ def _of_size(alpha, size, file):
             f"{file}: {width}x{height} pixels, but its image has {size[0]}x{size[1]}; make it the"
             " image's size"
         )
-    warnings.warn(f"{file.parent}: masks are resized to their images", stacklevel=2)
+    warnings.warn(f"{file.parent}: masks are resized to their images", stacklevel=1)
     return np.array(Image.fromarray(alpha).resize(size, Image.Resampling.BILINEAR))
 
 

@@ -35,7 +35,8 @@ class Photograph:
     name: path of the image relative to the scene's folder. camera: of the stored image, freed of
     distortion. depth_range: (near, far), Euclidean distances in world units, if the format states
     one. mask: path of its mask relative to the scene's folder, white where the object is; None: the
-    image's own alpha. distortion: of the image as it lies in the file.
+    image's own alpha. distortion: of the image as it lies in the file. ignore: path of an image
+    that is white where this one says nothing; if ignores_black, it is black there.
     """
 
     name: str
@@ -43,6 +44,8 @@ class Photograph:
     depth_range: tuple[float, float] | None = None
     mask: str | None = None
     distortion: Distortion = field(default_factory=Distortion)
+    ignore: str | None = None
+    ignores_black: bool = False
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,6 +60,8 @@ class View:
     None for one that the program makes itself. shrunk: how many times the stored image was reduced
     while it was read from its file (shrink()). unshrunk_camera: of the file's image, where
     that is another one. is_masked: a mask of its own says so where the object fills the image.
+    ignored: (H, W) bool, the pixels that say nothing, neither for the hull nor for the loss; the
+    image is 0 there. None: there are none.
     """
 
     name: str
@@ -68,6 +73,7 @@ class View:
     shrunk: int = 1
     unshrunk_camera: Camera | None = None
     is_masked: bool = False
+    ignored: np.ndarray | None = None
 
     @property
     def file_camera(self) -> Camera:
@@ -86,8 +92,38 @@ class View:
 
     @cached_property
     def has_mask(self) -> bool:
-        """Whether some pixel is not wholly opaque."""
-        return bool((self.image[..., 3] < 255).any())
+        """Whether some pixel that says something is not wholly opaque."""
+        return bool((self.hull_alpha < 255).any())
+
+    @property
+    def hull_alpha(self) -> np.ndarray:
+        """(H, W) uint8: the alpha of the stored image, 255 where it says nothing."""
+        alpha = self.image[..., 3]
+        return alpha if self.ignored is None else np.where(self.ignored, np.uint8(255), alpha)
+
+    def ignored_crop(
+        self, box: tuple[int, int, int, int], jitter: tuple[int, int] = (0, 0)
+    ) -> np.ndarray | None:
+        """(height, width) bool: the pixels of Target.crop(box, jitter) whose blocks have one that
+        is ignored; None where there are none.
+        """
+        if self.ignored is None:
+            return None
+        (x0, y0, width, height), k = box, self.downscale
+        left, top = k * x0 + jitter[0], k * y0 + jitter[1]
+        there = self.ignored[max(top, 0) : top + height * k, max(left, 0) : left + width * k]
+        before = max(-top, 0), max(-left, 0)
+        after = np.subtract((height * k, width * k), np.add(before, there.shape))
+        blocks = np.pad(there, list(zip(before, after, strict=True)))
+        found = np.logical_or.reduce(blocks.reshape(height, k, width, k), (1, 3))
+        return found if found.any() else None
+
+    def ignoring(self, truth: np.ndarray, image: np.ndarray) -> np.ndarray:
+        """(height, width, 3): what an image of this view should be, which is what it is where
+        pixels are ignored.
+        """
+        ignored = self.ignored_crop((0, 0, *truth.shape[1::-1]))
+        return truth if ignored is None else np.where(ignored[..., None], image, truth)
 
     def moved(self, by: ArrayLike) -> "View":
         """The same photograph, its camera moved by (3,) world units."""

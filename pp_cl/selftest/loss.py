@@ -10,10 +10,11 @@ from pp_cl.reference import loss as reference_loss
 from pp_cl.reference.lpips import lpips, lpips_gradient, random_weights
 from pp_cl.selftest.case import EPS, SIZES, Case, Check, each, exact, relative
 from pp_cl.training.exposure import KEPT, PRIOR, Exposure
-from pp_cl.training.loss import FURTHER, Loss, MaskLoss
+from pp_cl.training.loss import FURTHER, Loss, MaskLoss, ignore_gradient, ignore_target
 from pp_cl.training.perceptual import PerceptualLoss
 
 LOSS = 16 * EPS  # 22 taps of a window, in two passes, and the sums of rows and columns
+ONE = np.uint8(1)
 FLAT = 3e-6  # variances of nothing: rounding of Var[d] over C2 = 0.03^2
 DEEP = 1e-5  # thirteen convolutions one after another, each within 3e-6
 
@@ -74,14 +75,15 @@ def _mask_loss(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
     for side in SIZES:
         size, inside = (side + 3, 36), np.s_[top : top + side, left : left + width]
         transmittance, mask = rng.random(size), rng.random((side, width))
+        ignored = rng.random(mask.shape) < 0.2
         squares, grad = MaskLoss(dev, weight).forward_backward(
             dev.upload(transmittance.ravel(), np.float32),
-            dev.upload(mask, np.float32),
+            dev.upload(np.where(ignored, -1, mask), np.float32),
             size=size,
             offset=(left, top),
             shortfall=shortfall,
         )
-        difference = 1 - transmittance[inside] - mask
+        difference = np.where(ignored, 0, 1 - transmittance[inside] - mask)
         weighted = np.where(difference < 0, shortfall, 1) * difference
         sums = np.zeros(size[0])
         sums[top : top + side] = (weighted * difference).sum(axis=1)
@@ -89,6 +91,25 @@ def _mask_loss(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
         expected = np.zeros(size)
         expected[inside] = 2 * weight * weighted / mask.size
         yield relative(grad.get().reshape(size), expected, 8 * EPS)
+
+
+def _ignored(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
+    """What a part of an image is compared with where pixels are ignored, and no gradient there."""
+    for side in SIZES:
+        prediction, target = images(rng, side + 3, 36)[0], images(rng, side, 29)[1]
+        inside, offset = np.s_[1 : 1 + side, 3:32], (3, 1)
+        ignored, alpha = rng.random((2, side, 29)).astype(np.float32)
+        ignored = ignored < 0.3
+        shown, wanted, mask, where = map(dev.upload, (prediction, target, alpha, ignored * ONE))
+        ignore_target(dev, where, shown, wanted, mask, offset)
+        filled = np.where(ignored[..., None], prediction[inside], target)
+        yield exact(wanted.get(), filled)
+        yield exact(mask.get(), np.where(ignored, -1, alpha))
+        grad = dev.upload(prediction)
+        ignore_gradient(dev, where, grad, offset)
+        expected = prediction.copy()
+        expected[inside][ignored] = 0
+        yield exact(grad.get(), expected)
 
 
 def _sum_of_terms(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
@@ -156,6 +177,7 @@ CASES = (
     Case("loss: L1 and SSIM", _loss),
     Case("loss: flat and equal images", _hard_loss),
     Case("loss: mask", _mask_loss),
+    Case("loss: ignored pixels", _ignored),
     Case("loss: exposure", _exposure),
     Case("loss: sum of its terms", _sum_of_terms),
     Case("loss: perceptual", _perceptual_loss),

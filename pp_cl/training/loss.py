@@ -224,9 +224,9 @@ class MaskLoss:
         """(sums of the squares (PH,) by row, dL/dalpha (PH * PW,)), float32, valid until the next
         call.
 
-        transmittance: (PH * PW,) of the padded image. target_alpha: (H, W) in [0, 1]. size: (PH,
-        PW). offset: (left, top) of the target in it. shortfall: 0 to 1, weight of pixels whose
-        alpha is below the mask.
+        transmittance: (PH * PW,) of the padded image. target_alpha: (H, W) in [0, 1], below 0 where
+        a pixel is ignored. size: (PH, PW). offset: (left, top) of the target in it. shortfall: 0 to
+        1, weight of pixels whose alpha is below the mask.
         """
         (height, width), (h, w), (left, top) = size, target_alpha.shape, offset
         pixels = height * width
@@ -252,3 +252,48 @@ class MaskLoss:
             row_term=self._buffers.row_term,
         )
         return self._buffers.row_term, self._buffers.grad_alpha
+
+
+def ignore_target(
+    dev: Device,
+    ignored: Array,
+    prediction: Array,
+    target: Array,
+    target_alpha: Array,
+    offset: tuple[int, int],
+) -> None:
+    """Make a target (H, W, 3) what the prediction (PH, PW, 3) is, and target_alpha (H, W) -1, where
+    a pixel is ignored.
+
+    ignored: (H, W) uint8, 1 where it is. offset: (left, top) of the target in the prediction.
+    """
+    height, width = ignored.shape
+    dev.program("training/mask", GROUP=group_items(dev)).launch(
+        "ignore_target",
+        (width, height),
+        w=width,
+        h=height,
+        pw=prediction.shape[1],
+        corner=corner_of(prediction.shape, target.shape, *offset),
+        ignored=ignored,
+        prediction=prediction,
+        target=target,
+        target_alpha=target_alpha,
+    )
+
+
+def ignore_gradient(
+    dev: Device, ignored: Array, grad_prediction: Array, offset: tuple[int, int]
+) -> None:
+    """Make dL/dprediction (PH, PW, 3) 0 where a pixel is ignored; as ignore_target() takes it."""
+    height, width = ignored.shape
+    dev.program("training/mask", GROUP=group_items(dev)).launch(
+        "ignore_gradient",
+        (width, height),
+        w=width,
+        h=height,
+        pw=grad_prediction.shape[1],
+        corner=corner_of(grad_prediction.shape, (height, width, 3), *offset),
+        ignored=ignored,
+        grad_prediction=grad_prediction,
+    )

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from PIL import Image
 from support.checkpoints import load_checkpoint
-from support.runs import arguments, spoken
+from support.runs import SETTINGS, set_words, spoken
 from support.same_scene import held_out
 from support.scenes import ball_image, ring_cameras
 
@@ -255,7 +255,8 @@ REFUSED = {
 
 
 def train(folder, out):
-    return spoken(arguments(str(folder), out, downscale=1, train__iterations=3, train__previews=0))
+    sets = set_words(SETTINGS, train__iterations=3, train__previews=0)
+    return spoken(["train", folder, "--out", out, *sets])
 
 
 @pytest.mark.parametrize("report", TRAINS)

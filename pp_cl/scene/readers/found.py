@@ -17,6 +17,7 @@ from pp_cl.files.image import ENDINGS
 # where programs put the images that a name may mean, in their order, beside images_2, images_4 ...
 IMAGE_FOLDERS = ("images", "image", "input", "rgb", "dense/0/images", "dense/images")
 MASK_FOLDERS = ("masks", "mask")
+IGNORE_FOLDERS = ("ignore",)  # of masks that are white where an image says nothing
 SHOWN = 3  # names of a kind
 CASED_ENDINGS = [cased for ending in ENDINGS for cased in (ending, ending.upper())]
 
@@ -118,8 +119,8 @@ def find_image(
 
 def numbered(names: Sequence[str], count: int) -> dict[int, str] | None:
     """{place: name} of sorted names in a list of `count`, of which some are gone: their places are
-    the numbers in their names, from the first one's on or as they are. None where these say
-    nothing: it may be all of the first, or of the last, that are gone.
+    the numbers in their names, counted from the first one's. None where these say nothing: it may
+    be all of the first, or of the last, that are gone.
     """
     if len(names) == count:
         return dict(enumerate(names))
@@ -196,15 +197,17 @@ def mask_names(image: str) -> list[str]:
     return [f"{image}.png", *(str(path.with_name(name)) for name in names)]
 
 
-def find_masks(folder: Path, images: Sequence[str]) -> dict[str, str] | None:
+def find_masks(
+    folder: Path, images: Sequence[str], places: Sequence[str] = MASK_FOLDERS
+) -> dict[str, str] | None:
     """{image: its mask} of those that have one in the scene's folder of masks, both relative to the
-    scene's folder; None where there is no such folder.
+    scene's folder; None where there is no such folder. places: what it may be called.
 
     A mask lies in the same tree and is named as mask_names() has it; where names of images are
     there once only, it may also lie at the top of its folder, or have the same number as DTU has
     it. Raises UserError where no image has one.
     """
-    place = next((name for name in MASK_FOLDERS if (folder / name).is_dir()), None)
+    place = next((name for name in places if (folder / name).is_dir()), None)
     if place is None:
         return None
     trees = {image: _in_tree(image) for image in images}

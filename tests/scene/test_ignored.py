@@ -1,0 +1,139 @@
+"""Pixels that are said to show something else than the object, as a hand, change nothing."""
+
+import json
+
+import numpy as np
+import pytest
+from PIL import Image
+from support.runs import SETTINGS, set_words, spoken
+from support.scenes import write_ball_scene
+
+from pp_cl.files.checkpoint import load_checkpoint
+from pp_cl.scene.load import load_scene
+from pp_cl.scene.views import View
+
+HAND = np.s_[14:31, 20:29]  # rows, columns that cut the ball's outline
+SPLITS = ("train", "test")
+
+
+def with_hand(folder, colour):
+    """The ball's scene, something of an RGBA colour before every second image."""
+    write_ball_scene(folder)
+    for split in SPLITS:
+        for file in sorted((folder / split).iterdir())[::2]:
+            image = np.array(Image.open(file))
+            image[HAND] = colour
+            Image.fromarray(image).save(file)
+    return folder
+
+
+def hand_masks(folder, rest=0, hand=255):
+    """Masks of the hand in a folder, named like the images."""
+    for split in SPLITS:
+        (folder / split).mkdir(parents=True)
+        for i in range(0, 8 if split == "train" else 2, 2):
+            mask = np.full((48, 48), rest, np.uint8)
+            mask[HAND] = hand
+            Image.fromarray(mask).save(folder / split / f"r_{i}.png")
+
+
+def in_the_scene(scene):
+    hand_masks(scene / "ignore")
+    return []
+
+
+def elsewhere(scene):
+    hand_masks(scene.parent / "hands")
+    return ["--ignore", scene.parent / "hands"]
+
+
+def as_nerfstudio_names_them(scene):
+    """White where an image is of use, beside the object's alpha."""
+    hand_masks(scene / "of_use", 255, 0)
+    for split in SPLITS:
+        file = scene / f"transforms_{split}.json"
+        data = json.loads(file.read_text())
+        for frame in data["frames"][::2]:
+            frame["mask_path"] = f"of_use/{split}/{frame['file_path'].rpartition('/')[2]}.png"
+        file.write_text(json.dumps(data))
+    return []
+
+
+WAYS = (in_the_scene, elsewhere, as_nerfstudio_names_them)
+
+
+def trained(scene, out, words):
+    """(arrays, mean metrics) of a training that weighs all there is."""
+    sets = set_words(SETTINGS, train__iterations=20, train__exposure="on", train__ssim_weight=0.2)
+    status, lines = spoken(["train", scene, "--out", out, *words, "--downscale", "2", *sets])
+    assert status == 0, lines
+    assert spoken(["eval", out])[0] == 0
+    arrays = load_checkpoint(out / "checkpoint.npz")[1]
+    return arrays, json.loads((out / "eval/metrics.json").read_text())["mean"]
+
+
+@pytest.fixture(scope="module")
+def expected(tmp_path_factory):
+    """Of a hand that hides what is behind it."""
+    folder = tmp_path_factory.mktemp("hand")
+    scene = with_hand(folder / "scene", (255, 0, 90, 255))
+    return trained(scene, folder / "run", in_the_scene(scene))
+
+
+def same(one, other):
+    (arrays, means), (others, other_means) = one, other
+    return means == other_means and all(
+        np.array_equal(arrays[name], others[name]) for name in arrays
+    )
+
+
+@pytest.mark.parametrize("way", WAYS)
+def test_ignored_pixels_have_no_effect_on_a_bit(tmp_path, expected, way):
+    """Whether they are opaque, which adds to the hull, or transparent, which takes from it."""
+    scene = with_hand(tmp_path / "scene", (0, 200, 0, 0))
+    assert same(trained(scene, tmp_path / "run", way(scene)), expected)
+
+
+def test_without_masks_they_have(tmp_path, expected):
+    scene = with_hand(tmp_path / "scene", (0, 200, 0, 0))
+    assert not same(trained(scene, tmp_path / "run", []), expected)
+
+
+def test_the_lens_moves_them_as_it_moves_the_image(tmp_path):
+    """What is beside them is as without the hand, but for the ringing of the spline."""
+    scene = with_hand(tmp_path / "scene", (255, 0, 90, 255))
+    hand_masks(scene / "ignore")
+    write_ball_scene(tmp_path / "ball")
+    for folder in (scene, tmp_path / "ball"):
+        file = folder / "transforms_train.json"
+        data = json.loads(file.read_text()) | {"k1": 0.15, "p1": 0.02}
+        file.write_text(json.dumps(data))
+    views, right = (
+        load_scene(folder, downscale=2).splits["train"] for folder in (scene, tmp_path / "ball")
+    )
+    assert [view.ignored is not None for view in views] == [True, False] * 4
+    for view, other in zip(views, right, strict=True):
+        ignored = np.zeros((48, 48), bool) if view.ignored is None else view.ignored
+        assert (ignored.mean() > 0.066) == (view.ignored is not None)
+        assert ignored.mean() < 0.12
+        off = view.image.astype(int) - other.image
+        assert np.abs(off[~ignored & (other.image[..., 3] > 128)]).max() < 40
+
+
+def test_a_block_with_an_ignored_pixel_is_ignored(rng):
+    """At any crop and jitter, also where a crop reaches outside."""
+    ignored = rng.random((31, 33)) < 0.1
+    scene = View("a.png", None, np.zeros((31, 33, 4), np.uint8), downscale=3, ignored=ignored)
+    for box, jitter in (((0, 0, 11, 10), (0, 0)), ((-2, 3, 9, 9), (2, 1)), ((8, 7, 5, 6), (1, 0))):
+        found = scene.ignored_crop(box, jitter)
+        for y, x in np.ndindex(found.shape):
+            left, top = 3 * (box[0] + x) + jitter[0], 3 * (box[1] + y) + jitter[1]
+            block = ignored[max(top, 0) : max(top + 3, 0), max(left, 0) : max(left + 3, 0)]
+            assert found[y, x] == block.any()
+
+
+def test_a_folder_that_has_none(tmp_path):
+    scene = with_hand(tmp_path / "scene", (0, 0, 0, 255))
+    for folder, told in ((tmp_path / "none", "no such folder"), (tmp_path, "no mask")):
+        status, lines = spoken(["train", scene, "--out", tmp_path / "run", "--ignore", folder])
+        assert status == 2 and told in lines[-1]
