@@ -33,7 +33,6 @@ COMMANDS = (
     "shape",
     "compress",
     "bench",
-    "tune",
     "selftest",
 )  # modules of pp_cl.commands
 

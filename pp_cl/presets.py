@@ -72,5 +72,4 @@ SHORT = {
     "seed": "train.seed",
     "memory": "train.memory_gib",
     "network": "network.start",
-    "tolerance": "network.tolerance",
 }

@@ -23,7 +23,6 @@ from pp_cl.files.image import to_8bit, write_png
 from pp_cl.files.manifest import begin_manifest, check_ours, has_manifest, remove_ours
 from pp_cl.files.picture import Picture, mean_picture
 from pp_cl.files.run_folder import RunFolder
-from pp_cl.layers.choice import ConvolutionPolicy, load_policy
 from pp_cl.metrics.psnr_ssim import Metrics, exposed_alike, mean
 from pp_cl.metrics.published import differences, published_rows
 from pp_cl.model import Model
@@ -43,16 +42,13 @@ NEAREST = 0.05  # of a point to the eye, in radii of the object
 
 @dataclass
 class Run:
-    """The model of a run's last checkpoint. header: of the checkpoint, see files/run_folder.py.
-    policy: of the convolutions.
-    """
+    """The model of a run's last checkpoint. header: of the checkpoint, see files/run_folder.py."""
 
     dev: Device
     folder: RunFolder
     config: Config
     header: dict[str, Any]
     model: Model
-    policy: ConvolutionPolicy
 
     @cached_property
     def renderer(self) -> Renderer:
@@ -195,43 +191,27 @@ def check_scene(path: str) -> None:
         raise UserError(f"{path}: the run's scene is not there; say where with --scene")
 
 
-def load_run(
-    dev: Device,
-    folder: Path | str,
-    *,
-    tolerance: float | None = None,
-    scene: str | None = None,
-) -> Run:
-    """The run in a folder, finished or not.
-
-    tolerance: in place of its network.tolerance; scene: the folder of its scene, if that has moved.
+def load_run(dev: Device, folder: Path | str, *, scene: str | None = None) -> Run:
+    """The run in a folder, finished or not. scene: the folder of its scene, if that has moved.
     Raises UserError naming the file that is missing or broken.
     """
     if scene is not None:
         check_scene(scene)
     place = RunFolder(folder)
     config = load_config(place.config)
-    given = [] if tolerance is None else [("network.tolerance", tolerance, "tolerance")]
-    configure(config, scene or config.scene.path, given)
+    configure(config, scene or config.scene.path)
     header, arrays = load_run_state(place, config)
-    policy = load_policy(dev, config.network.tolerance)
-    net = UNet.of_settings(dev, config.network, policy)
+    net = UNet.of_settings(dev, config.network)
     model = Model.load(dev, header, arrays, net, degree=config.points.sh_degree)
-    return Run(dev, place, config, header, model, policy)
+    return Run(dev, place, config, header, model)
 
 
-def load(
-    folder: Path | str,
-    device: str | None = None,
-    *,
-    scene: str | None = None,
-    tolerance: float | None = None,
-) -> Run:
+def load(folder: Path | str, device: str | None = None, *, scene: str | None = None) -> Run:
     """The run in a folder, finished or not. device: as `pp-cl devices` lists them, else the default
-    one. scene: the folder of its scene, if that has moved. tolerance: instead of the run's
-    network.tolerance. Raises UserError naming the file that is missing or broken.
+    one. scene: the folder of its scene, if that has moved. Raises UserError naming the file that is
+    missing or broken.
     """
-    return load_run(open_device(device), folder, scene=scene, tolerance=tolerance)
+    return load_run(open_device(device), folder, scene=scene)
 
 
 SHOWN_VIEWS = 4  # rows of the comparison image
@@ -260,15 +240,14 @@ def evaluate_run(
     *,
     save_images: bool = False,
     device: str | None = None,
-    tolerance: float | None = None,
     scene: str | None = None,
     out: Path | str | None = None,
 ) -> dict[str, Any]:
     """Measure the run in a folder as `pp-cl eval` does, into `out`, else into its own folder;
     returns what metrics.json holds. metrics: out of psnr, ssim, lpips. save_images: write every
-    view, too. device, tolerance, scene: as load() takes them.
+    view, too. device, scene: as load() takes them.
     """
-    run = load(folder, device, tolerance=tolerance, scene=scene)
+    run = load(folder, device, scene=scene)
     return evaluate(run, split, metrics, save_images=save_images, out=out)
 
 
@@ -300,7 +279,7 @@ def evaluate(
     images = [target / "images" / file for file in image_files([view.name for view in views])]
     if save_images:
         check_ours(images, MOVE)
-    measure = Metrics(run.dev, metrics, run.policy)
+    measure = Metrics(run.dev, metrics)
     begin_manifest(target)
     remove_leftovers(target)
     if save_images:

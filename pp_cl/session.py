@@ -30,7 +30,6 @@ from pp_cl.files.checkpoint import check_finite
 from pp_cl.files.contact_sheet import write_comparison
 from pp_cl.files.image import to_8bit, write_png
 from pp_cl.files.run_folder import MASKS_PICTURE, RunFolder
-from pp_cl.layers.choice import load_policy, policy_of_run
 from pp_cl.metrics.psnr_ssim import psnr
 from pp_cl.model import Model
 from pp_cl.network.unet import UNet
@@ -91,9 +90,8 @@ class Training:
     """A training that is ready to begin or to go on.
 
     info: what a checkpoint's header holds beside the model's. room: the available memory and the
-    plan of what the training takes. hull: None if it resumes from a checkpoint. origin: a line of
-    text that says where the choice of convolutions comes from. measured: the views on which
-    train.eval_every measures PSNR. kept: images that a resume need not read again.
+    plan of what the training takes. hull: None if it resumes from a checkpoint. measured: the
+    views on which train.eval_every measures PSNR. kept: images that a resume need not read again.
     """
 
     folder: RunFolder
@@ -102,7 +100,6 @@ class Training:
     info: dict[str, Any]
     room: Room
     hull: HullFacts | None
-    origin: str
     measured: list[View]
     kept: KeptViews
     _preview_by: float = field(default=math.inf, init=False)  # time.monotonic()'s seconds
@@ -270,18 +267,15 @@ def open_training(
     """
     check_writable(folder.path)
     folder.check_pictures(stored[0]["step"] if stored else 0)
-    tolerance, begun, goal = config.network.tolerance, 0, config
-    if stored is None:
-        policy = load_policy(dev, tolerance)
-    else:
+    begun, goal = 0, config
+    if stored is not None:
         header, arrays = stored
-        policy = policy_of_run(dev, tolerance, header.get("tuning"), folder.checkpoint)
         begun = header.get("extended_from", 0)
         if header["finished"] and not any(name.startswith("state.") for name in arrays):
             begun = header["step"]
         if begun:
             goal = replace(config, train=replace(config.train, refine_at=NEVER))
-    net = UNet.of_settings(dev, config.network, policy, seed=config.train.seed)
+    net = UNet.of_settings(dev, config.network, seed=config.train.seed)
     if stored is None:
         begin_network(net, config)
     listing = list_split(config.scene.path)
@@ -315,10 +309,10 @@ def open_training(
         kept = [view for view in views if view.name not in left_out]
         trainer, hull = _resume(goal, kept, net, stored, begun), None
         points = header["initial_points"]
-    info |= {"initial_points": points, "tuning": policy.tuning}
+    info["initial_points"] = points
     info |= {"extended_from": begun} if begun else {}
     info |= {"left_out": left_out} if left_out else {}
-    return Training(folder, config, trainer, info, room, hull, policy.origin, measured, read)
+    return Training(folder, config, trainer, info, room, hull, measured, read)
 
 
 def begin_network(net: UNet, config: Config) -> None:

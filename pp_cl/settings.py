@@ -129,12 +129,6 @@ class NetworkConfig:
     rate: tuple = setting(
         (1e-3, 1e-4), "learning rate of the network, first and last step", 1e-12, 100
     )
-    tolerance: float = setting(
-        1e-5,
-        "relative L2 error allowed for a convolution; the fastest variant within it is taken",
-        0,
-        1,
-    )
 
     @property
     def channel_numbers(self) -> tuple[int, ...]:
@@ -184,7 +178,6 @@ class TrainConfig:
         0,
         1e3,
     )
-    perceptual_weight: float = setting(0.0, "adds this times LPIPS to the loss (0: off)", 0, 10)
     sh_rate: tuple = setting(
         (0.5, 0.25, 0.125),
         "first learning rate of SH degrees 0, 1, 2; at rate 0 a degree stays 0",

@@ -20,7 +20,6 @@ from pp_cl.scene.views import View
 from pp_cl.training.exposure import LEAST_SHARE, Exposure, decided_at
 from pp_cl.training.loss import Loss, MaskLoss, ignore_gradient, ignore_target
 from pp_cl.training.optim import Optimiser
-from pp_cl.training.perceptual import PerceptualLoss
 from pp_cl.training.schedule import (
     BOX_MARGIN,
     Rates,
@@ -63,9 +62,6 @@ class Trainer:
         self.exposure: Exposure | None = None
         if self.config.exposure != "off":
             self.exposure = Exposure(dev, len(views), self.config.exposure == "on")
-        self.perceptual_loss = None
-        if weight := self.config.perceptual_weight:
-            self.perceptual_loss = PerceptualLoss(dev, weight, model.net.policy)
         self.state = PointState(dev, model.cloud)
         self.optimiser = Optimiser(dev, model, self.state)
         self._target = Target(dev)
@@ -200,9 +196,6 @@ class Trainer:
         grad_alpha = None
 
         grad_image = loss.forward_backward(image, target, *offset)
-        if self.perceptual_loss:
-            distances = self.perceptual_loss.add_gradient(image, target, offset, grad_image)
-            loss.add("lpips", distances, config.perceptual_weight)
         if self._composited and config.mask_weight > 0 and target_alpha is not None:
             squares, grad_alpha = self.mask_loss.forward_backward(
                 weights.transmittance,
@@ -256,7 +249,7 @@ class Trainer:
         """
         padded, *offset = camera.padded(NETWORK_MULTIPLE)
         size = padded.height, padded.width
-        if self.perceptual_loss or not self.model.net.is_planned(size):
+        if not self.model.net.is_planned(size):
             return lambda: None
         found = tiles_find(self.dev, target, WHITE)
         return lambda: gradient_tiles(found.get(), size, offset)

@@ -49,8 +49,8 @@ def pytest_collection_modifyitems(items):
 
 @pytest.fixture(scope="session", autouse=True)
 def cache_of_its_own(tmp_path_factory):
-    """What the user has tuned stays unread: a cache folder for the session, with nothing in it but
-    the weights of LPIPS.
+    """What drivers showed the user stays unread: a cache folder for the session, with nothing in
+    it but the weights of LPIPS.
     """
     kept = cache_folder() / WEIGHTS_FILE
     folder = tmp_path_factory.mktemp("cache")

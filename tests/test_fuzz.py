@@ -43,15 +43,6 @@ from pp_cl.config import Config, load_config, sections
 from pp_cl.files.exr import write_exr
 from pp_cl.files.image import image_size, read_mask, read_rgba
 from pp_cl.files.run_folder import Log, RunFolder
-from pp_cl.layers.choice import (
-    OFFERED,
-    ConvShape,
-    Direction,
-    device_class,
-    device_key,
-    load_policy,
-    tuning_file,
-)
 from pp_cl.metrics.compare import compare
 from pp_cl.metrics.shape import overlap, read_mesh, sample_surface
 from pp_cl.scene.edits import read_edits
@@ -78,7 +69,7 @@ ENDING = {
     "shape": ["--samples", "100"],
     "sweep": ["--dry-run"],
     "bench": ["--points", "100", "--size", "16"],
-    **{name: ["--no-such"] for name in ("tune", "view", "selftest", "compress")},
+    **{name: ["--no-such"] for name in ("view", "selftest", "compress")},
 }
 
 
@@ -372,32 +363,6 @@ def test_metrics(world, data):
             assert isinstance(row["device"], str)
 
 
-def clear(file):
-    """Remove what an input has put in the cache."""
-    if file.is_dir() and not file.is_symlink():
-        file.rmdir()
-    file.unlink(missing_ok=True)
-
-
-@fuzzed()
-@given(data=st.data())
-def test_a_tuning(world, data):
-    """A broken one is left aside with a warning."""
-    layer = {"k": 3, "ci": 16, "co": 16, "pixels": 4096}
-    layer |= {"ms": {"direct": 3.0, "winograd": 1.0}, "rel_l2": {"direct": 2e-7, "winograd": 1e-7}}
-    rows = [{"direction": direction.value, **layer} for direction in Direction]
-    stored = {"format": 1, "device": device_key(world.device), "tile_shapes": {}, "rows": rows}
-    file = tuning_file(world.device)
-    with world.watched():
-        clear(file)
-        file.write_text(json.dumps(stored, indent=1))
-        damage.damage_file(data.draw, file)
-        policy = taken(lambda: load_policy(world.device, one(data.draw, 1e-5, 1e-3)))
-        shape = ConvShape(one(data.draw, *Direction), 3, (16,), 16, one(data.draw, 1, 4096, 2**20))
-        chosen = taken(lambda: policy.choose(shape))
-        assert chosen in (None, *OFFERED[device_class(world.device)])
-
-
 # --------------------------------------------------------------------------------------------------
 
 
@@ -509,7 +474,7 @@ def test_a_command_line(world, data):
             words = [world.scene(), "--out", folder / "out"]
         elif name == "compare":
             words = [world.scene() / "train"] * 2
-        elif name in ("devices", "bench", "tune", "selftest"):
+        elif name in ("devices", "bench", "selftest"):
             words = ["raster"] if name == "bench" else []
         if rarely(draw, 5):
             words = [draw(damage.words)]

@@ -13,7 +13,6 @@ from support.runs import arguments, checkpoint, rows, train_and_interrupt
 from pp_cl import load
 from pp_cl.cli import main
 from pp_cl.config import preset
-from pp_cl.layers.choice import make_policy
 from pp_cl.network.unet import UNet
 from pp_cl.scene.grid import Grid
 from pp_cl.session import DEMO_NETWORK, begin_network
@@ -120,7 +119,7 @@ def test_a_training_begins_with_the_network_of_the_demo(scene, tmp_path):
 def test_where_the_demos_network_is_taken(dev, scene, widths, is_taken):
     config = preset("tiny")
     config.scene.path, config.network.widths = scene, widths
-    net = UNet.of_settings(dev, config.network, make_policy(dev))
+    net = UNet.of_settings(dev, config.network)
     random = {name: dev.download(array).copy() for name, array in net.parameters.items()}
     begin_network(net, config)
     with np.load(DEMO_NETWORK) as kept:

@@ -17,7 +17,7 @@ from pp_cl.commands.options import integer, side, widths
 from pp_cl.device.discover import open_device
 from pp_cl.errors import UserError
 from pp_cl.files.atomic import write_json
-from pp_cl.layers.choice import AUTO, VARIANTS, make_policy
+from pp_cl.layers.choice import AUTO, VARIANTS
 
 # Seconds before each timed call. OpenMP's threads go on spinning for some milliseconds after
 # PyTorch is done, on cores that our device's threads need.
@@ -87,7 +87,7 @@ def compare(torch, dev, widths, size, *, variant, rounds):
     rng = np.random.default_rng(0)
     values = np.maximum(rng.normal(size=(size, size, bench.CHANNELS_IN)), 0).astype(np.float32)
     grads = rng.normal(size=(size, size, bench.CHANNELS_OUT)).astype(np.float32)
-    net = bench.make_network(dev, widths, make_policy(dev, variant=variant))
+    net = bench.make_network(dev, widths, variant)
     x, grad_image = dev.upload(values), dev.upload(grads)
     twin, exact = (TorchNetwork(torch, net, kind) for kind in (torch.float32, torch.float64))
     torch_x, torch_grad = twin.input(values), twin.input(grads).detach()
@@ -98,9 +98,9 @@ def compare(torch, dev, widths, size, *, variant, rounds):
     }
     times = interleave(
         {
-            ("forward", "ours"): bench.network_runner(net, net.policy, x),
+            ("forward", "ours"): bench.network_runner(net, x),
             ("forward", "torch"): lambda: twin.forward(torch_x),
-            ("train", "ours"): bench.network_runner(net, net.policy, x, grad_image),
+            ("train", "ours"): bench.network_runner(net, x, grad_image),
             ("train", "torch"): lambda: twin.train(torch_x, torch_grad),
         },
         rounds,

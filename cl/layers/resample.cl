@@ -76,43 +76,6 @@ kernel __attribute__((vec_type_hint(floats))) void maxpool2_forward(
     store_lanes(largest, out + ((size_t)row * w + column) * c + first, count);
 }
 
-// One work-item per (LANES channels, x, y) of out: ADDS grad_out to grad_x at the largest of the
-// 2x2 pixels that it covers, of equal ones at the first, as PyTorch does. x is the output of a
-// ReLU, and grad_x holds the gradient of its input from another use of x: nothing is added where x
-// is 0.
-kernel __attribute__((vec_type_hint(floats))) void maxpool2_backward(
-    const int h,  // of out
-    const int w,
-    const int c,
-    const int x_width,
-    global const float *x,         // (?, x_width, c)
-    global const float *grad_out,  // (h, w, c)
-    global float *grad_x)          // (?, x_width, c) accumulates
-{
-    const int first = get_global_id(0) * LANES, column = get_global_id(1), row = get_global_id(2),
-              count = c - first;
-    if (first >= c || column >= w || row >= h) return;
-    const size_t upper = ((size_t)row * 2 * x_width + column * 2) * c + first,
-                 lower = upper + x_width * c;
-    const size_t at[4] = {upper, upper + c, lower, lower + c};
-    floats value[4];
-    floats largest = 0.0f;
-#pragma unroll
-    for (int i = 0; i < 4; i++) {
-        value[i] = load_lanes(x + at[i], count);
-        largest = fmax(largest, value[i]);
-    }
-    const floats dL_dout = load_lanes(grad_out + ((size_t)row * w + column) * c + first, count);
-    ints open = largest > 0.0f;  // lanes whose largest value has not been met yet
-#pragma unroll
-    for (int i = 0; i < 4; i++) {
-        const ints taken = open & (value[i] == largest);
-        const floats others = load_lanes(grad_x + at[i], count);
-        store_lanes(select(others, others + dL_dout, taken), grad_x + at[i], count);
-        open &= ~taken;
-    }
-}
-
 // One work-item per (LANES channels, x, y) of x: writes the 2x2 pixels of out, which is twice as
 // high and wide, that lie in its pixel, and all of them in one tile. Each is the pixel of x that
 // its centre lies in and the nearest ones beside it, weighted 3/4 and 1/4 along each axis

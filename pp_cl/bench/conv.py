@@ -4,7 +4,9 @@ Errors are against float64 (reference/network.py): of outputs and input gradient
 of weights' gradients at SAMPLE_CHANNELS x SAMPLE_CHANNELS channels and every tap.
 """
 
+import math
 from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
 from functools import cached_property
 from types import ModuleType
 
@@ -12,10 +14,10 @@ import numpy as np
 
 from pp_cl.bench.timing import PeakFlops, errors, variant_rows
 from pp_cl.device.device import Device
-from pp_cl.layers.choice import OFFERED, VARIANTS, ConvolutionPolicy, can_run, device_class
+from pp_cl.layers.choice import OFFERED, VARIANTS, blocking_of, can_run, device_class
 from pp_cl.layers.conv_direct import (
-    PARTIAL,
     Blocking,
+    ConvShape,
     Direction,
     pack_bias,
     pack_weights,
@@ -115,29 +117,39 @@ class UploadedLayer:
         self, conv: ModuleType, blocking: Blocking, direction: Direction, tiles: Tiles | None
     ) -> None:
         """Compute a direction by a module of convolutions, as the network does."""
-        dev, parts, weight, grad_out = self.dev, self.parts, self.weight, self.grad_out
+        dev, parts, grad_out = self.dev, self.parts, self.grad_out
+        channels = tuple(part.shape[2] for part in parts)
+        height, width, co = grad_out.shape
+        shape = ConvShape(direction, self.weight.shape[1], channels, co, (height, width))
         if direction == Direction.FORWARD:
+            weights = self._laid_out(conv, shape)
             conv.forward(
-                dev, blocking, parts, weight, self.bias, self.out, relu=self.relu, tiles=tiles
+                dev, blocking, parts, weights, self.bias, self.out, relu=self.relu, tiles=tiles
             )
         elif direction == Direction.BACKWARD_WEIGHTS:
-            shape, height = weight.shape, len(grad_out)
-            floats = conv.scratch_floats(dev, blocking, direction, height, shape, shape[3])
-            partial = dev.scratch(PARTIAL, floats[PARTIAL])
-            count = conv.backward_weights(
-                dev, blocking, parts, grad_out, shape, partial, tiles=tiles
-            )
-            rows, n = table_of_sums([(shape, count, 0, 0, 0)])
+            partial = self._work(conv.work_shape(shape))
+            count = conv.backward_weights(dev, blocking, parts, grad_out, partial, tiles=tiles)
+            rows, n = table_of_sums([(partial.shape, count, 0, 0, 0)])
             table = dev.constant(rows)
             sum_parts(dev, table, n, partial, self.grad_weight, self.grad_bias)
         else:
-            first = 0
-            for part, grad in zip(parts, self.grad_parts, strict=True):
+            for i, (part, grad) in enumerate(zip(parts, self.grad_parts, strict=True)):
                 mask = part if self.relu else None
-                conv.backward_input(
-                    dev, blocking, weight, first, grad_out, grad, mask=mask, tiles=tiles
-                )
-                first += part.shape[2]
+                weights = self._laid_out(conv, replace(shape, source=i))
+                conv.backward_input(dev, blocking, weights, grad_out, grad, mask=mask, tiles=tiles)
+
+    def _laid_out(self, conv, shape):
+        """The weights as a module reads them, laid out anew as each step of a training does."""
+        needed = conv.work_shape(shape)
+        if needed is None:
+            return self.weight
+        work = self._work(needed)
+        conv.lay_out(self.dev, self.weight.reshape(-1), [(shape, 0, 0)], work)
+        return work
+
+    def _work(self, shape):
+        n = math.prod(shape)
+        return self.dev.scratch("bench: weights and parts of their gradients", n)[:n].reshape(shape)
 
 
 class RandomConv:
@@ -156,22 +168,22 @@ class RandomConv:
             name for name in OFFERED[device_class(dev)] if can_run(name, k, *sources, co)
         ]
 
-    def runner(self, variant: str, direction: Direction, policy: ConvolutionPolicy) -> Callable:
+    def runner(self, variant: str, direction: Direction, blocking: Blocking) -> Callable:
         """A function that computes a direction by a variant, as the network does, and waits for
-        it. policy: its blocking is used.
+        it.
         """
 
         def run():
-            self.uploaded.compute(VARIANTS[variant], policy.blocking, direction, self.tiles)
+            self.uploaded.compute(VARIANTS[variant], blocking, direction, self.tiles)
             self.uploaded.dev.finish()
 
         return run
 
     def result(
-        self, variant: str, direction: Direction, policy: ConvolutionPolicy
+        self, variant: str, direction: Direction, blocking: Blocking
     ) -> tuple[np.ndarray, np.ndarray]:
         """(computed, float64) values of the sample."""
-        self.runner(variant, direction, policy)()
+        self.runner(variant, direction, blocking)()
         layer, uploaded, at = self.layer, self.uploaded, self.pixels
         if direction == Direction.FORWARD:
             expected = reference.convolution_at(layer.x, layer.weight, layer.bias, at)
@@ -192,15 +204,14 @@ def bench_conv(
     dev: Device,
     size: int,
     widths: tuple[int, int, int],
-    policy: ConvolutionPolicy,
     *,
     blocks: str = "double",
 ) -> Iterator[list[dict]]:
     """Rows of every distinct convolution of the network at size x size, a list for each direction.
 
-    policy: its blocking is used; every variant is measured. blocks: as UNet takes them.
+    blocks: as UNet takes them.
     """
-    peak, seen = PeakFlops(dev), set()
+    peak, seen, blocking = PeakFlops(dev), set(), blocking_of(dev)
     for layer in convolutions(unet_layers(widths, blocks=blocks)):
         side = size >> layer.level
         key = (layer.kernel_size, side, layer.sources, layer.channels)
@@ -210,8 +221,8 @@ def bench_conv(
         conv = RandomConv(dev, layer.kernel_size, side, layer.sources, co=layer.channels)
         shape = [side, side, sum(layer.sources), layer.channels, layer.kernel_size]
         for direction in Direction:
-            runs = {v: conv.runner(v, direction, policy) for v in conv.variants}
-            found = {v: errors(*conv.result(v, direction, policy)) for v in conv.variants}
+            runs = {v: conv.runner(v, direction, blocking) for v in conv.variants}
+            found = {v: errors(*conv.result(v, direction, blocking)) for v in conv.variants}
             yield variant_rows(
                 {"layer": layer.name, "shape": shape, "direction": direction.value},
                 runs,

@@ -13,7 +13,7 @@ from typing import Any
 
 from pp_cl.compress.reduction import Original, Reduction, measured_psnr, nbytes
 from pp_cl.compress.search import frame_ms
-from pp_cl.layers.choice import OFFERED, make_policy
+from pp_cl.layers.choice import OFFERED, device_class
 from pp_cl.run import Run
 
 VIEWS = 8
@@ -57,9 +57,9 @@ def bench_models(runs: list[Run]) -> Iterator[dict[str, Any]]:
     original = Original.of(first)
     for what, reduction in _reductions(first):
         yield row(what, original.reduced(reduction))
-    for name in OFFERED[first.policy.device_class]:
+    for name in OFFERED[device_class(first.dev)]:
         run = original.reduced(Reduction.of(first))
-        run.model.net.policy = make_policy(first.dev, variant=name)
+        run.model.net.variant = name
         yield row(f"convolutions by {name}", run)
 
 

@@ -12,7 +12,6 @@ from pp_cl.bench.conv import bench_conv
 from pp_cl.bench.training import bench_demo, training_lines
 from pp_cl.bench.unet import bench_unet
 from pp_cl.device.device import Device
-from pp_cl.layers.choice import ConvolutionPolicy
 
 WIDTHS = (32, 64, 128)  # of the presets tiny, small and full
 CONV_SIZE = 128
@@ -24,10 +23,8 @@ TRAINED = 0.4  # of its share is the training itself; the rest is the demo, its 
 GROWTH = 3  # the next larger case takes so many times as long, or more
 
 
-def bench_overview(
-    dev: Device, policy: ConvolutionPolicy, budget: float, tell: Callable[[str], None]
-) -> dict[str, Any]:
-    """{"device", "platform", "driver", "version", "convolutions", "budget", "seconds", "conv",
+def bench_overview(dev: Device, budget: float, tell: Callable[[str], None]) -> dict[str, Any]:
+    """{"device", "platform", "driver", "version", "budget", "seconds", "conv",
     "unet", "raster", "growth", "training"}: the rows of all benches.
 
     budget: seconds, which the least of each bench may exceed. tell: called with each line of the
@@ -36,8 +33,8 @@ def bench_overview(
     start = time.perf_counter()
     result: dict[str, Any] = {}
     for name, steps, factor, columns in (
-        ("conv", bench_conv(dev, CONV_SIZE, WIDTHS, policy), 1, timing),
-        ("unet", network_steps(dev, policy), GROWTH, timing),
+        ("conv", bench_conv(dev, CONV_SIZE, WIDTHS), 1, timing),
+        ("unet", network_steps(dev), GROWTH, timing),
         ("raster", raster_steps(dev), GROWTH, raster),
     ):
         tell(f"\n{name}, about {budget * SHARES[name]:.0f} s\n{columns.HEAD}")
@@ -57,7 +54,6 @@ def bench_overview(
         "platform": dev.info["platform"],
         "driver": dev.info["driver"],
         "version": __version__,
-        "convolutions": policy.origin,
         "budget": budget,
         "seconds": time.perf_counter() - start,
     }
@@ -77,10 +73,10 @@ def within(steps: Iterator[list[dict]], seconds: float, factor: float) -> Iterat
         start = now
 
 
-def network_steps(dev: Device, policy: ConvolutionPolicy) -> Iterator[list[dict]]:
+def network_steps(dev: Device) -> Iterator[list[dict]]:
     """The rows of each size, ascending."""
     for size in UNET_SIZES:
-        yield list(bench_unet(dev, size, WIDTHS, policy))
+        yield list(bench_unet(dev, size, WIDTHS))
 
 
 def raster_steps(dev: Device) -> Iterator[list[dict]]:

@@ -12,7 +12,6 @@ import numpy as np
 from pp_cl.config import Config, assign, configure, preset
 from pp_cl.device.device import Device
 from pp_cl.files.image import to_8bit
-from pp_cl.layers.choice import load_policy
 from pp_cl.metrics.psnr_ssim import psnr
 from pp_cl.model import Model
 from pp_cl.network.unet import UNet
@@ -46,11 +45,10 @@ def bench_demo(dev: Device, seconds: float) -> dict[str, Any]:
     assign(config, "train.final_prune_weight", 0.0, "bench")
     views, hull = _open(dev, config)
     measured = open_scene(dev, config, ("test",), most=MEASURED_VIEWS).splits["test"]
-    policy = load_policy(dev, config.network.tolerance)
 
     def begin(steps):
         assign(config, "train.iterations", steps, "bench")
-        net = UNet.of_settings(dev, config.network, policy)
+        net = UNet.of_settings(dev, config.network)
         return _trainer(dev, config, views, hull, net)
 
     trial = begin(LEAST_STEPS)

@@ -5,7 +5,6 @@ high: of a larger image its upper left part, taken as an image of its own.
 """
 
 from collections.abc import Callable, Iterator
-from dataclasses import replace
 
 import numpy as np
 from pyopencl.array import Array
@@ -13,7 +12,7 @@ from pyopencl.array import Array
 from pp_cl.bench.timing import PeakFlops, errors, variant_rows
 from pp_cl.device.buffers import table_bytes
 from pp_cl.device.device import Device
-from pp_cl.layers.choice import AUTO, OFFERED, ConvolutionPolicy
+from pp_cl.layers.choice import AUTO, OFFERED, device_class
 from pp_cl.layers.conv_direct import unpack_weights
 from pp_cl.network.layers import multiplications
 from pp_cl.network.unet import UNet
@@ -27,34 +26,28 @@ def bench_unet(
     dev: Device,
     size: int,
     widths: tuple[int, int, int],
-    policy: ConvolutionPolicy,
     *,
     blocks: str = "double",
 ) -> Iterator[dict]:
-    """Rows of the whole network at size x size, by every variant and by `policy`: forward, and
-    train = forward and backward to the input and the weights.
+    """Rows of the whole network at size x size, as shipped and by every variant: forward, and train
+    = forward and backward to the input and the weights.
 
     The errors of train are those of the gradient (input's, or a weight's or bias's) where they are
-    largest. "memory_bytes" is the network's memory by `policy`. blocks: as UNet takes them.
+    largest. "memory_bytes" is the network's memory as shipped. blocks: as UNet takes them.
     """
     peak, rng = PeakFlops(dev), np.random.default_rng(0)
     x = np.maximum(rng.normal(size=(size, size, CHANNELS_IN)), 0).astype(np.float32)
     grad_image = rng.normal(size=(size, size, CHANNELS_OUT)).astype(np.float32)
-    # one network for all policies, so that large images fit
-    net = make_network(dev, widths, policy, blocks)
-    names = (AUTO, *OFFERED[policy.device_class])
-    policies = {name: replace(policy, variant=name) for name in names}
+    names = (AUTO, *OFFERED[device_class(dev)])
+    nets = {name: make_network(dev, widths, name, blocks) for name in names}
+    net = nets[AUTO]
     parameters = plain_parameters(net, net.parameters)
     outputs = reference.network(net.layers, parameters, x[:CHECK_SIZE, :CHECK_SIZE])
     part = grad_image[:CHECK_SIZE, :CHECK_SIZE]
-    found = {
-        name: network_errors(dev, net, p, outputs=outputs, grad_image=part)
-        for name, p in policies.items()
-    }
+    found = {name: network_errors(nets[name], outputs=outputs, grad_image=part) for name in names}
     device_x, device_grad = dev.upload(x), dev.upload(grad_image)
     flops = 2 * multiplications(net.layers, size, size)
     for direction, factor, grad in (("forward", 1, None), ("train", 3, device_grad)):
-        net.policy = policies[AUTO]
         memory = table_bytes(net.memory_plan(size, size, direction == "train"))
         about = {
             "layer": "network",
@@ -65,7 +58,7 @@ def bench_unet(
         }
         yield from variant_rows(
             about,
-            {name: network_runner(net, p, device_x, grad) for name, p in policies.items()},
+            {name: network_runner(nets[name], device_x, grad) for name in names},
             {name: found[name][direction] for name in names},
             flops=factor * flops,
             peak=peak,
@@ -75,31 +68,28 @@ def bench_unet(
 def make_network(
     dev: Device,
     widths: tuple[int, int, int],
-    policy: ConvolutionPolicy,
+    variant: str = AUTO,
     blocks: str = "double",
 ) -> UNet:
-    """A network by a policy; the parameters do not depend on it. blocks: as UNet takes them.
+    """A network by a variant; the parameters do not depend on it. blocks: as UNet takes them.
 
     The weights are uniform in +-sqrt(6 / (CI K K)) (He et al. 2015), so that values keep their size
     through the layers as they do in a trained network. With UNet's own initial weights they fade,
     and the error of an image that is 0.5 and little else says nothing.
     """
-    net = UNet(dev, widths, CHANNELS_IN, CHANNELS_OUT, blocks=blocks, policy=policy)
+    net = UNet(dev, widths, CHANNELS_IN, CHANNELS_OUT, blocks=blocks, variant=variant)
     for name, parameter in net.parameters.items():
         if name.endswith(".weight"):
             dev.write(parameter, np.float32(np.sqrt(6)) * parameter.get())
     return net
 
 
-def network_runner(
-    net: UNet, policy: ConvolutionPolicy, x: Array, grad_image: Array | None = None
-) -> Callable:
-    """A function that makes an image by a policy, as evaluation does, and waits for it; with an
-    image's gradient it makes all gradients, too, as training does.
+def network_runner(net: UNet, x: Array, grad_image: Array | None = None) -> Callable:
+    """A function that makes an image, as evaluation does, and waits for it; with an image's
+    gradient it makes all gradients, too, as training does.
     """
 
     def run():
-        net.policy = policy
         net.forward(x, training=grad_image is not None)
         if grad_image is not None:
             net.backward(grad_image)
@@ -118,13 +108,13 @@ def plain_parameters(net: UNet, arrays: dict[str, Array]) -> dict[str, np.ndarra
 
 
 def network_errors(
-    dev: Device, net: UNet, policy: ConvolutionPolicy, *, outputs: dict, grad_image: np.ndarray
+    net: UNet, *, outputs: dict, grad_image: np.ndarray
 ) -> dict[str, tuple[float, float]]:
-    """{"forward": errors, "train": errors} of the network by a policy. outputs: of
-    reference.network, in float64; grad_image: (H, W, 3).
+    """{"forward": errors, "train": errors} of the network. outputs: of reference.network, in
+    float64; grad_image: (H, W, 3).
     """
+    dev = net.dev
     parameters = plain_parameters(net, net.parameters)
-    net.policy = policy
     image = net.forward(dev.upload(outputs["x"], np.float32)).get()
     active = {layer.name: net.output(layer.name).get() > 0 for layer in net.layers if layer.relu}
     actual = {"x": net.backward(dev.upload(grad_image)).get()}

@@ -13,7 +13,7 @@ HELP = "time against error of the convolutions, the network, the rasteriser, a t
 OPTIONS = {
     "all": ("budget", "plot"),
     "conv": ("size", "widths", "blocks", "plot"),
-    "unet": ("size", "widths", "blocks", "plot", "tolerance"),
+    "unet": ("size", "widths", "blocks", "plot"),
     "raster": ("size", "scene", "points", "blend", "gamma", "plot"),
     "train": ("scene", "points", "set"),
     "model": ("runs", "plot"),
@@ -79,7 +79,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="FILE",
         help="also draw a picture there (.png, .svg, .pdf)",
     )
-    shared.add_tolerance(parser)
     shared.add_device(parser)
 
 
@@ -105,11 +104,6 @@ def run(options: argparse.Namespace) -> None:
 
 def _refuse_foreign(options):
     """Raise UserError for an option of another bench."""
-    if options.what == "conv" and options.tolerance is not None:
-        raise UserError(
-            "--tolerance: bench conv shows every variant; give it to bench unet, whose auto picks"
-            " among them"
-        )
     foreign = {name for names in OPTIONS.values() for name in names} - {*OPTIONS[options.what]}
     shared.refuse(options, foreign, f"bench {options.what} has no such option")
 
@@ -120,12 +114,9 @@ def _refuse_foreign(options):
 def _run_all(options):
     from pp_cl.bench.overview import bench_overview
     from pp_cl.bench.plots import plot_overview
-    from pp_cl.layers.choice import load_policy
 
     dev = _open_device(options)
-    policy = load_policy(dev, preset("tiny").network.tolerance)
-    print(policy.origin)
-    result = bench_overview(dev, policy, options.budget or 120, partial(print, flush=True))
+    result = bench_overview(dev, options.budget or 120, partial(print, flush=True))
     print(f"{result['seconds']:.0f} s")
 
     def draw(figure):
@@ -193,18 +184,14 @@ def _run_network(options):
     from pp_cl.bench.plots import plot_time_and_error
     from pp_cl.bench.timing import HEAD, line
     from pp_cl.bench.unet import bench_unet
-    from pp_cl.layers.choice import load_policy
 
     size = _one(options, "size") if options.size else 256
     widths, blocks = options.widths or (128, 256, 512), options.blocks or "double"
-    tolerance = options.tolerance
     dev = _open_device(options)
-    policy = load_policy(dev, preset("tiny").network.tolerance if tolerance is None else tolerance)
-    print(policy.origin)
     if options.what == "conv":
-        found = chain.from_iterable(bench_conv(dev, size, widths, policy, blocks=blocks))
+        found = chain.from_iterable(bench_conv(dev, size, widths, blocks=blocks))
     else:
-        found = bench_unet(dev, size, widths, policy, blocks=blocks)
+        found = bench_unet(dev, size, widths, blocks=blocks)
     rows = _print_rows(HEAD, line, found)
     for direction, memory in {r["direction"]: r.get("memory_bytes") for r in rows}.items():
         if memory:

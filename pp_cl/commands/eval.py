@@ -37,7 +37,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     shared.add_json(parser)
     shared.add_open(parser)
-    shared.add_tolerance(parser)
     shared.add_device(parser)
 
 
@@ -48,11 +47,10 @@ def run(options: argparse.Namespace) -> None:
     from pp_cl.device.discover import open_device
     from pp_cl.run import evaluate, load_run
 
-    metrics, tolerance = options.metrics, options.tolerance
+    metrics = options.metrics
     figure = figure_of(options.chart, "--chart")
     dev = open_device(options.device)
-    run = load_run(dev, options.run_folder, tolerance=tolerance, scene=options.scene)
-    print(run.policy.origin)
+    run = load_run(dev, options.run_folder, scene=options.scene)
     with counted("view") as on_view:
         result = evaluate(
             run,

@@ -185,16 +185,6 @@ def add_device(parser: argparse.ArgumentParser) -> None:
     )
 
 
-def add_tolerance(parser: argparse.ArgumentParser) -> None:
-    """Add --tolerance."""
-    parser.add_argument(
-        "--tolerance",
-        type=number(0, 1),
-        metavar="E",
-        help="relative L2 error allowed for a convolution (1e-5)",
-    )
-
-
 def add_widths(parser: argparse.ArgumentParser, text: str) -> None:
     """Add --widths. text: its help."""
     parser.add_argument("--widths", type=widths, metavar="A,B,C", help=text)

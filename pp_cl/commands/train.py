@@ -59,7 +59,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="also write the curves to RUN/tensorboard (needs tensorboardX)",
     )
     add("--view", action="store_true", help="watch in the browser, as with `pp-cl view RUN`")
-    shared.add_tolerance(parser)
     shared.add_set(parser, "any other setting, listed by --help")
     shared.add_device(parser)
 
@@ -91,7 +90,6 @@ def run(options: argparse.Namespace) -> None:
     dev = open_device(options.device)
     print(f"device: {dev.name} [{dev.info['platform']}]")
     training = open_training(dev, folder, config, stored)
-    print(training.origin)
     chosen = is_new and "scene.downscale" not in [key for key, _, _ in given]
     print(_images_line(training, chosen))
     print(_first_line(training))

@@ -29,7 +29,7 @@ def channel_weights(run: Run, cameras: Sequence[Camera]) -> Parameters:
     if any(layer.kind == "gate" for layer in layers):
         return {}
     # a copy, which keeps what its layers put out
-    net = UNet.of_settings(run.dev, run.config.network, run.policy)
+    net = UNet.of_settings(run.dev, run.config.network)
     for name, parameter in net.parameters.items():
         run.dev.copy(parameter, run.model.net.parameters[name])
     found = {x.name: np.zeros(x.channels) for x in convolutions(layers) if x.relu}

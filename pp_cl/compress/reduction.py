@@ -18,7 +18,6 @@ from pp_cl.config import Config
 from pp_cl.export.observe import observe
 from pp_cl.files.atomic import atomic_folder, write_json, write_text
 from pp_cl.files.run_folder import RunFolder
-from pp_cl.layers.choice import load_policy
 from pp_cl.metrics.psnr_ssim import Metrics
 from pp_cl.model import Model
 from pp_cl.network.layers import convolutions
@@ -102,11 +101,10 @@ class Original:
     def reduced(self, reduction: Reduction) -> Run:
         """The reduced run, on the same device."""
         run, config = self.run, self.config(reduction)
-        policy = load_policy(run.dev, config.network.tolerance)
-        net = UNet.of_settings(run.dev, config.network, policy)
+        net = UNet.of_settings(run.dev, config.network)
         arrays = self.reduced_arrays(reduction)
         model = Model.load(run.dev, run.header, arrays, net, degree=reduction.degree)
-        return replace(run, config=config, model=model, policy=policy)
+        return replace(run, config=config, model=model)
 
     def config(self, reduction: Reduction) -> Config:
         """The settings of a reduced run."""

@@ -1,16 +1,15 @@
 """Direct convolutions, of any channels, 1x1 and 3x3; and what all convolutions share: the layout of
 weights, the cutting of work, checks.
 
-conv_winograd.py and conv_local.py have the same six functions: scratch_floats, laid_out_floats,
-lay_out, forward, backward_input and backward_weights. All are convolutions K x K (K = 1 or 3) of
-stride 1 with zero padding K // 2; choice.py says which module computes one.
+conv_winograd.py and conv_local.py have the same six functions: work_shape, scratch_floats, lay_out,
+forward, backward_input and backward_weights. All are convolutions K x K (K = 1 or 3) of stride 1
+with zero padding K // 2; choice.py says which module computes one.
 """
 
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import Enum
-from typing import Any
 
 import numpy as np
 from pyopencl.array import Array
@@ -24,24 +23,48 @@ from pp_cl.layers.tiles import SIDE, VECTOR, Tiles, checked_tiles
 ROWS_PER_PART = 8
 # The partial sums take at most this many floats (64 MiB), or one part if that is larger.
 PARTIAL_FLOATS = 1 << 24
-# Weights to lay out: first float in the weights and in what they become, shape, first input channel
-# (None: for the forward pass), input channels and output channels that a pass computes.
-Layout = tuple[int, int, tuple[int, ...], Any, int, int]
-# Gradients of weights to sum: shape, parts, first float of the parts, of the weights' gradient and
-# of the biases'.
-Sums = tuple[tuple[int, ...], int, int, int, int]
-# Names of the memory that convolutions work in.
-FLIPPED, PARTIAL = "flipped weights", "parts of the weights' gradients"
 
 
 class Direction(Enum):
-    """What of a convolution is computed. The values are the words in stored tunings and in bench
-    rows.
-    """
+    """What of a convolution is computed. The values are the words in rows of `pp-cl bench`."""
 
     FORWARD = "forward"
     BACKWARD_INPUT = "input"  # gradient of the input
     BACKWARD_WEIGHTS = "weights"  # gradients of weights and bias
+
+
+@dataclass(frozen=True)
+class ConvShape:
+    """One direction of a convolution.
+
+    k: side of the kernel. sources: channels of each input. co: output channels. size: (height,
+    width) of the image. source: index of the input whose gradient is computed, None in the other
+    directions.
+    """
+
+    direction: Direction
+    k: int
+    sources: tuple[int, ...]
+    co: int
+    size: tuple[int, int]
+    source: int | None = None
+
+    @property
+    def ci(self) -> int:
+        """Input channels; of a gradient of the input, those of its one source."""
+        return sum(self.sources) if self.source is None else self.sources[self.source]
+
+    @property
+    def first(self) -> int:
+        """The input channel of the weights that is the first of `ci`."""
+        return sum(self.sources[: self.source or 0])
+
+
+# Weights to lay out: for which pass, their first float, and the first float of what they become.
+Layout = tuple[ConvShape, int, int]
+# Parts of gradients to sum: the shape of the array that they lie in, how many, the first float of
+# that array, of the weights' gradient and of the biases'.
+Sums = tuple[tuple[int, ...], int, int, int, int]
 
 
 @dataclass(frozen=True)
@@ -52,19 +75,21 @@ class Blocking:
     direct: (pixels of a row, groups of 16 output channels, work-group) of a work-item of conv.cl,
     where the groups come in multiples of that number; direct_odd: the same for other channels.
     accumulators: float16 sums that a work-item of conv_backward_weights.cl keeps in registers;
-    work_group: its work-group, None = the launcher's default. winograd: (tiles transformed at a
-    time, tiles multiplied together) of winograd.cl; winograd_narrow: the same for few channels
-    (conv_winograd.NARROW). winograd_weights: tiles transformed at a time by
-    winograd_backward_weights.cl.
+    work_group: its work-group, None = the launcher's default. winograd_groups: groups of 16 output
+    channels that winograd.cl multiplies together, where the groups come in multiples of that
+    number. winograd: (tiles transformed at a time, tiles multiplied together) there;
+    winograd_narrow: the same for few channels (conv_winograd.NARROW). winograd_weights: tiles
+    transformed at a time by winograd_backward_weights.cl.
     """
 
     direct: tuple[int, int, tuple[int, int, int]]
     direct_odd: tuple[int, int, tuple[int, int, int]]
     accumulators: int
     work_group: tuple[int, int, int] | None
+    winograd_groups: int = 2
     # More tiles at a time use the transformed weights better, fewer leave more room in the caches.
-    # The second number divides the first: with 2 x 16 channels, 8 take 16 of AVX-512's 32 vectors,
-    # 12 take 24.
+    # The second number divides the first: with 2 groups of channels, 8 take 16 of AVX-512's 32
+    # vectors, 12 take 24.
     winograd: tuple[int, int] = (64, 8)
     winograd_narrow: tuple[int, int] = (12, 12)
     winograd_weights: int = 32
@@ -89,29 +114,37 @@ def pack_bias(bias: np.ndarray, dtype: type = np.float32) -> np.ndarray:
     return np.pad(np.asarray(bias, dtype), (0, -len(bias) % VECTOR))
 
 
-def check_weights(
-    sources: tuple[Array, ...], weight_shape: tuple, out: Array, bias: Array | None = None
+def packed_shape(k: int, ci: int, co: int) -> tuple[int, int, int, int, int]:
+    """The shape of pack_weights()."""
+    return -(-co // VECTOR), k, k, ci, VECTOR
+
+
+def parts_shape(parts: int, k: int, ci: int, co: int) -> tuple[int, int, int, int]:
+    """The shape of an array for so many parts of the gradients of weights and biases."""
+    return parts, -(-co // VECTOR), k * k * ci + 1, VECTOR
+
+
+def check_shape(
+    channels: Sequence[int], co: int, found: Array, expected: tuple, bias: Array | None = None
 ) -> None:
-    """Raise ValueError unless weights (ceil(CO/16), K, K, CI, 16), and a bias (ceil(CO/16) * 16,),
-    are those of a convolution of the sources (H, W, C1), (H, W, C2) to out (H, W, CO).
+    """Raise ValueError unless the weights, or parts of their gradients, `found` are those of a
+    convolution from these channels to `co`, which have the shape `expected`, and so the bias.
     """
-    co, channels = out.shape[2], [source.shape[2] for source in sources]
-    blocks = -(-co // VECTOR)
-    of_bias = (blocks * VECTOR,) if bias is None else bias.shape
-    expected = blocks, sum(channels), (blocks * VECTOR,)
-    if (weight_shape[0], weight_shape[3], of_bias) != expected:
+    of_bias = (-(-co // VECTOR) * VECTOR,)
+    if found.shape != expected or (bias is not None and bias.shape != of_bias):
         raise ValueError(
-            f"convolution of {' + '.join(map(str, channels))} to {co} channels: weight is"
-            f" {weight_shape}, bias {of_bias}"
+            f"convolution of {' + '.join(map(str, channels))} to {co} channels: weights"
+            f" {found.shape}, expected {expected}"
+            + (f", bias {bias.shape}, expected {of_bias}" if bias is not None else "")
         )
 
 
 def table_of_sums(jobs: Sequence[Sums]) -> tuple[list[tuple[int, ...]], int]:
     """(rows, number of sums of 16) of the table that sum_parts() takes."""
     rows, n = [], 0
-    for (blocks, k, _, ci, _), parts, *places in jobs:
-        rows.append((n, k * k * ci + 1, blocks, parts, *(place // VECTOR for place in places), 0))
-        n += (k * k * ci + 1) * blocks
+    for (_, blocks, sums, _), parts, *places in jobs:
+        rows.append((n, sums, blocks, parts, *(place // VECTOR for place in places), 0))
+        n += sums * blocks
     return rows, n
 
 
@@ -135,33 +168,22 @@ def sum_parts(
     )
 
 
-def scratch_floats(
-    _dev: Device,
-    _blocking: Blocking,
-    direction: Direction,
-    height: int,
-    weight_shape: tuple,
-    c: int,
-) -> dict[str, int]:
-    """{name of Device.scratch(): floats} for an image `height` high.
-
-    weight_shape: (ceil(CO/16), K, K, CI, 16); c: input channels, of a gradient of the input those
-    of the one source.
+def work_shape(shape: ConvShape) -> tuple[int, ...] | None:
+    """The shape of the float32 array that a direction needs beside the layer's own: for FORWARD and
+    BACKWARD_INPUT the weights as the kernels read them, which lay_out() writes, None where they
+    read them as they are; for BACKWARD_WEIGHTS the parts of the sums.
     """
-    if direction is Direction.BACKWARD_WEIGHTS:
-        return {PARTIAL: partial_floats(height, weight_shape)}
-    if direction is Direction.BACKWARD_INPUT:
-        return {FLIPPED: math.prod(_flipped_shape(weight_shape, c, weight_shape[0] * VECTOR))}
-    return {}
+    if shape.direction is Direction.FORWARD:
+        return None
+    if shape.direction is Direction.BACKWARD_INPUT:
+        return packed_shape(shape.k, shape.co, shape.ci)
+    sizes = shape.k, shape.ci, shape.co
+    return parts_shape(image_parts(shape.size[0], *sizes)[0], *sizes)
 
 
-def laid_out_floats(direction: Direction, weight_shape: tuple, c: int) -> int:
-    """Floats of a layer's weights as the kernels of FORWARD or BACKWARD_INPUT read them; 0 where
-    they read them as they are. weight_shape, c: as scratch_floats() takes them.
-    """
-    if direction is Direction.FORWARD:
-        return 0
-    return math.prod(_flipped_shape(weight_shape, c, weight_shape[0] * VECTOR))
+def scratch_floats(_dev: Device, _blocking: Blocking, _shape: ConvShape) -> int:
+    """Floats of Device.scratch() that the kernels of a direction take."""
+    return 0
 
 
 def lay_out(dev: Device, weights: Array, jobs: Sequence[Layout], laid_out: Array) -> None:
@@ -171,11 +193,11 @@ def lay_out(dev: Device, weights: Array, jobs: Sequence[Layout], laid_out: Array
     weights, laid_out: (?,) float32.
     """
     rows, n = [], 0
-    for start, target, (_, k, _, ci, _), first, c, co in jobs:
-        blocks = -(-c // VECTOR)
-        taken = min(ci - first, blocks * VECTOR)
-        rows.append((n, k * k, co, taken, first, ci, start, target // VECTOR))
-        n += co * k * k * blocks
+    for shape, start, target in jobs:
+        blocks, ci, taps = -(-shape.ci // VECTOR), sum(shape.sources), shape.k**2
+        taken = min(ci - shape.first, blocks * VECTOR)
+        rows.append((n, taps, shape.co, taken, shape.first, ci, start, target // VECTOR))
+        n += shape.co * taps * blocks
     dev.program("layers/conv_backward_weights", LANES=lanes(dev)).launch(
         "conv_flip_weights",
         n,
@@ -191,31 +213,29 @@ def forward(
     dev: Device,
     blocking: Blocking,
     sources: tuple[Array, ...],
-    weight: Array,
+    weights: Array,
     bias: Array,
     out: Array,
     *,
     relu: bool,
     tiles: Tiles | None = None,
-    laid_out: Array | None = None,
 ) -> None:
     """out = convolution of the sources' concatenation + bias, then max(., 0) if relu.
 
-    sources: one or two of (H, W, C1), (H, W, C2); weight: (ceil(CO/16), K, K, C1 + C2, 16); bias:
-    (ceil(CO/16) * 16,); out: (H, W, CO), all float32; tiles: those of out to compute, None = all;
-    laid_out: of lay_out(), None = computed here if it is needed. Raises ValueError when shapes
-    do not fit together.
+    sources: one or two of (H, W, C1), (H, W, C2); weights: as work_shape() says, else
+    (ceil(CO/16), K, K, C1 + C2, 16); bias: (ceil(CO/16) * 16,); out: (H, W, CO), all float32;
+    tiles: those of out to compute, None = all. Raises ValueError when shapes do not fit together.
     """
     height, width, co = out.shape
-    check_weights(sources, weight.shape, out, bias)
-    channels = [source.shape[2] for source in sources]
+    k, channels = weights.shape[1], [source.shape[2] for source in sources]
+    check_shape(channels, co, weights, packed_shape(k, sum(channels), co), bias)
     tiles = checked_tiles(dev, tiles, height, width)
-    program, size, work_group = _program(dev, blocking, weight.shape[1], out.shape)
+    program, size, work_group = _program(dev, blocking, k, out.shape)
     program.launch(
         "conv_forward",
         size,
         local=work_group,
-        multiply_adds=tiles.number * SIDE**2 * weight.shape[1] ** 2 * sum(channels) * co,
+        multiply_adds=tiles.number * SIDE**2 * k**2 * sum(channels) * co,
         along=1,
         height=height,
         width=width,
@@ -225,7 +245,7 @@ def forward(
         relu=relu,
         x=sources[0],
         x2=sources[-1],
-        weight=weight,
+        weight=weights,
         bias=bias,
         out=out,
         tile_count=tiles.count,
@@ -235,40 +255,38 @@ def forward(
 def backward_input(
     dev: Device,
     blocking: Blocking,
-    weight: Array,
-    first: int,
+    weights: Array,
     grad_out: Array,
     grad_x: Array,
     *,
     mask: Array | None,
     tiles: Tiles | None = None,
-    laid_out: Array | None = None,
 ) -> None:
     """grad_x = gradient of a convolution's input, 0 where mask <= 0.
 
-    weight: of forward(); first: its input channel that is grad_x's first; grad_out: (H, W, CO),
-    dL/dout before the ReLU; grad_x: (H, W, C); mask: (H, W, C), the input where it is a ReLU's
-    output, so that grad_x is the gradient of the ReLU's input, or None; tiles: those of grad_x to
-    compute, None = all; laid_out: of lay_out(), None = computed here. Raises ValueError when shapes
-    do not fit together.
+    weights: as work_shape() says; grad_out: (H, W, CO), dL/dout before the ReLU; grad_x: (H, W, C);
+    mask: (H, W, C), the input where it is a ReLU's output, so that grad_x is the gradient of the
+    ReLU's input, or None; tiles: those of grad_x to compute, None = all. Raises ValueError when
+    shapes do not fit together.
     """
     height, width, c = grad_x.shape
-    flipped = flipped_weights(dev, weight, first, c, grad_out.shape[2], laid_out)
+    k, co = weights.shape[1], grad_out.shape[2]
+    check_shape([c], co, weights, packed_shape(k, co, c))
     tiles = checked_tiles(dev, tiles, height, width)
-    program, size, work_group = _program(dev, blocking, flipped.shape[1], grad_x.shape)
+    program, size, work_group = _program(dev, blocking, k, grad_x.shape)
     program.launch(
         "conv_backward_input",
         size,
         local=work_group,
-        multiply_adds=tiles.number * SIDE**2 * flipped.shape[1] ** 2 * grad_out.shape[2] * c,
+        multiply_adds=tiles.number * SIDE**2 * k**2 * co * c,
         along=1,
         height=height,
         width=width,
         c=c,
-        co=grad_out.shape[2],
+        co=co,
         masked=mask is not None,
         x=grad_x if mask is None else mask,
-        flipped=flipped,
+        flipped=weights,
         grad_out=grad_out,
         grad_x=grad_x,
         tile_count=tiles.count,
@@ -280,7 +298,6 @@ def backward_weights(
     blocking: Blocking,
     sources: tuple[Array, ...],
     grad_out: Array,
-    weight_shape: tuple,
     partial: Array,
     *,
     tiles: Tiles | None = None,
@@ -288,23 +305,23 @@ def backward_weights(
     """Write the gradients of forward(sources, ...)'s weights and biases, given dL/dout (H, W, CO)
     before the ReLU, as sums of the image's parts, which sum_parts() sums.
 
-    weight_shape: of forward()'s weight. partial: (?,) float32 of scratch_floats()[PARTIAL]. tiles:
-    those of grad_out to sum, each as often as it counts, None = all, once. The order of the sums
-    depends on the shapes alone. Returns how many parts. Raises ValueError when shapes do not fit
-    together.
+    partial: as work_shape() says. tiles: those of grad_out to sum, each as often as it counts, None
+    = all, once. The order of the sums depends on the shapes alone. Returns how many parts. Raises
+    ValueError when shapes do not fit together.
     """
     height, width, co = grad_out.shape
-    blocks, k, _, ci, _ = weight_shape
-    check_weights(sources, weight_shape, grad_out)
+    channels = [source.shape[2] for source in sources]
+    ci = sum(channels)
+    k = math.isqrt((partial.shape[2] - 1) // ci)
+    parts, rows = image_parts(height, k, ci, co)
+    check_shape(channels, co, partial, parts_shape(parts, k, ci, co))
     tiles = checked_tiles(dev, tiles, height, width)
-    parts, rows = image_parts(height, weight_shape)
     first = 0
-    for source in sources:
-        c = source.shape[2]
+    for source, c in zip(sources, channels, strict=True):
         program, group = _weights_program(dev, blocking, k, c)
         program.launch(
             "conv_backward_weights",
-            (c // group * k, blocks, parts),
+            (c // group * k, -(-co // VECTOR), parts),
             local=blocking.work_group,
             multiply_adds=height * width * k**2 * c * co,
             along=2,
@@ -324,37 +341,11 @@ def backward_weights(
     return parts
 
 
-def flipped_weights(
-    dev: Device, weight: Array, first: int, c: int, co: int, laid_out: Array | None
-) -> Array:
-    """(ceil(c/16), K, K, co, 16): `laid_out` or, where it is None, scratch that lay_out() fills.
-
-    weight: (ceil(CO/16), K, K, CI, 16); c: input channels taken from `first` on, CI - first or
-    less, a multiple of 16 unless they reach CI.
-    """
-    shape = _flipped_shape(weight.shape, c, co)
-    if laid_out is None:
-        laid_out = dev.scratch(FLIPPED, math.prod(shape))
-        lay_out(dev, weight.reshape(-1), [(0, 0, weight.shape, first, c, co)], laid_out)
-    return laid_out[: math.prod(shape)].reshape(shape)
-
-
-def partial_floats(height: int, weight_shape: tuple) -> int:
-    """Floats of PARTIAL that backward_weights() needs for an image `height` high."""
-    blocks, k, _, ci, _ = weight_shape
-    return image_parts(height, weight_shape)[0] * blocks * (k * k * ci + 1) * VECTOR
-
-
-def image_parts(height: int, weight_shape: tuple) -> tuple[int, int]:
+def image_parts(height: int, k: int, ci: int, co: int) -> tuple[int, int]:
     """(parts, rows of each) into which the sum over an image `height` high is cut."""
-    blocks, k, _, ci, _ = weight_shape
-    limit = max(1, PARTIAL_FLOATS // (blocks * (k * k * ci + 1) * VECTOR))
+    limit = max(1, PARTIAL_FLOATS // math.prod(parts_shape(1, k, ci, co)))
     rows = max(ROWS_PER_PART, -(-height // limit))
     return -(-height // rows), rows
-
-
-def _flipped_shape(weight_shape, c, co):
-    return -(-c // VECTOR), *weight_shape[1:3], co, VECTOR
 
 
 def _program(dev, blocking, k, shape):

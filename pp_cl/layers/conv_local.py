@@ -9,12 +9,13 @@ from pyopencl.array import Array
 from pp_cl.device.device import Device
 from pp_cl.layers.conv_direct import (
     Blocking,
-    check_weights,
-    flipped_weights,
+    check_shape,
     image_parts,
-    laid_out_floats,
     lay_out,
+    packed_shape,
+    parts_shape,
     scratch_floats,
+    work_shape,
 )
 from pp_cl.layers.tiles import SIDE, VECTOR, Tiles, checked_tiles
 
@@ -22,9 +23,9 @@ __all__ = [
     "backward_input",
     "backward_weights",
     "forward",
-    "laid_out_floats",
     "lay_out",
     "scratch_floats",
+    "work_shape",
 ]
 
 QUAD = 4  # channels of a work-item
@@ -45,34 +46,31 @@ def forward(
     dev: Device,
     _blocking: Blocking,
     sources: tuple[Array, ...],
-    weight: Array,
+    weights: Array,
     bias: Array,
     out: Array,
     *,
     relu: bool,
     tiles: Tiles | None = None,
-    laid_out: Array | None = None,
 ) -> None:
     """See conv_direct.forward."""
     height, width, co = out.shape
-    check_weights(sources, weight.shape, out, bias)
-    channels = [source.shape[2] for source in sources]
+    k, channels = weights.shape[1], [source.shape[2] for source in sources]
+    check_shape(channels, co, weights, packed_shape(k, sum(channels), co), bias)
     tiles = checked_tiles(dev, tiles, height, width)
-    program, size, work_group = _program(
-        dev, "conv_local_forward", weight.shape[1], tiles, co, channels
-    )
+    program, size, work_group = _program(dev, "conv_local_forward", k, tiles, co, channels)
     program.launch(
         "conv_local_forward",
         size,
         local=work_group,
-        multiply_adds=tiles.number * SIDE**2 * weight.shape[1] ** 2 * sum(channels) * co,
+        multiply_adds=tiles.number * SIDE**2 * k**2 * sum(channels) * co,
         c1=channels[0],
         c2=sum(channels[1:]),
         co=co,
         relu=relu,
         x=sources[0],
         x2=sources[-1],
-        weight=weight,
+        weight=weights,
         bias=bias,
         tile_list=tiles.list,
         out=out,
@@ -82,33 +80,29 @@ def forward(
 def backward_input(
     dev: Device,
     _blocking: Blocking,
-    weight: Array,
-    first: int,
+    weights: Array,
     grad_out: Array,
     grad_x: Array,
     *,
     mask: Array | None,
     tiles: Tiles | None = None,
-    laid_out: Array | None = None,
 ) -> None:
     """See conv_direct.backward_input."""
     height, width, c = grad_x.shape
-    co = grad_out.shape[2]
-    flipped = flipped_weights(dev, weight, first, c, co, laid_out)
+    k, co = weights.shape[1], grad_out.shape[2]
+    check_shape([c], co, weights, packed_shape(k, co, c))
     tiles = checked_tiles(dev, tiles, height, width)
-    program, size, work_group = _program(
-        dev, "conv_local_backward_input", flipped.shape[1], tiles, c, [co]
-    )
+    program, size, work_group = _program(dev, "conv_local_backward_input", k, tiles, c, [co])
     program.launch(
         "conv_local_backward_input",
         size,
         local=work_group,
-        multiply_adds=tiles.number * SIDE**2 * flipped.shape[1] ** 2 * co * c,
+        multiply_adds=tiles.number * SIDE**2 * k**2 * co * c,
         c=c,
         co=co,
         masked=mask is not None,
         x=grad_x if mask is None else mask,
-        flipped=flipped,
+        flipped=weights,
         grad_out=grad_out,
         tile_list=tiles.list,
         grad_x=grad_x,
@@ -120,7 +114,6 @@ def backward_weights(
     _blocking: Blocking,
     sources: tuple[Array, ...],
     grad_out: Array,
-    weight_shape: tuple,
     partial: Array,
     *,
     tiles: Tiles | None = None,
@@ -129,14 +122,16 @@ def backward_weights(
     of tiles alone.
     """
     height, width, co = grad_out.shape
-    blocks, k, _, ci, _ = weight_shape
-    check_weights(sources, weight_shape, grad_out)
+    channels = [source.shape[2] for source in sources]
+    ci = sum(channels)
+    k = math.isqrt((partial.shape[2] - 1) // ci)
+    most, _ = image_parts(height, k, ci, co)
+    check_shape(channels, co, partial, parts_shape(most, k, ci, co))
     tiles = checked_tiles(dev, tiles, height, width)
-    run = max(SUMMED, -(-tiles.number // image_parts(height, weight_shape)[0]))
+    run = max(SUMMED, -(-tiles.number // most))
     parts = -(-tiles.number // run)
     first = 0
-    for source in sources:
-        c = source.shape[2]
+    for source, c in zip(sources, channels, strict=True):
         program, in_group, items = _weights_program(dev, k, c, co)
         program.launch(
             "conv_local_backward_weights",
@@ -158,7 +153,7 @@ def backward_weights(
         first += c
     program.launch(
         "conv_local_backward_bias",
-        (blocks * VECTOR, parts),
+        (-(-co // VECTOR) * VECTOR, parts),
         per_block=k * k * ci,
         parts=parts,
         co=co,

@@ -8,11 +8,12 @@ from pyopencl.array import Array
 
 from pp_cl.device.device import Device
 from pp_cl.layers.conv_direct import (
-    PARTIAL,
     Blocking,
+    ConvShape,
     Direction,
     Layout,
-    check_weights,
+    check_shape,
+    parts_shape,
 )
 from pp_cl.layers.tiles import SIDE, VECTOR, Tiles, checked_tiles
 
@@ -28,8 +29,7 @@ CI_PART, CO_PART = 128, 128
 # The tiles are cut in their place, into 2, 4, 8 or 16 parts of LEAST_TILES or more.
 NARROW_SUMS = 64 * 128
 LEAST_TILES, MOST_PARTS = 80, 16
-# Names of the memory that convolutions share (Device.scratch()).
-SLICES, TRANSFORMED = "Winograd: slices of the compute units", "Winograd: transformed weights"
+SLICES = "Winograd: slices of the compute units"  # of Device.scratch()
 COUNTERS = VECTOR  # floats at the front of SLICES, 0 between kernels (cl/layers/winograd.h)
 
 
@@ -38,47 +38,30 @@ def fits(*channels: int) -> bool:
     return all(c and c % VECTOR == 0 for c in channels)
 
 
-def scratch_floats(
-    dev: Device,
-    blocking: Blocking,
-    direction: Direction,
-    _height: int,
-    weight_shape: tuple,
-    c: int,
-) -> dict[str, int]:
+def work_shape(shape: ConvShape) -> tuple[int, ...]:
+    """See conv_direct.work_shape. Transformed weights are as cl/layers/winograd.h lays them out."""
+    if shape.direction is Direction.BACKWARD_WEIGHTS:
+        most = MOST_PARTS if _is_narrow(shape.ci, shape.co) else 1
+        return parts_shape(most, 3, shape.ci, shape.co)
+    return (_transformed_floats(shape.ci, shape.co),)
+
+
+def scratch_floats(dev: Device, blocking: Blocking, shape: ConvShape) -> int:
     """See conv_direct.scratch_floats."""
-    blocks, _, _, ci, _ = weight_shape
-    co = blocks * VECTOR
-    if direction is Direction.BACKWARD_WEIGHTS:
-        return {
-            SLICES: _gradient_slices(dev, blocking, ci, co),
-            PARTIAL: _partial_floats(ci, co),
-        }
-    return {SLICES: _slices(dev, blocking, c, co), TRANSFORMED: transformed_floats(c, co)}
-
-
-def transformed_floats(ci: int, co: int) -> int:
-    """Floats of the transformed weights of ci to co channels, as cl/layers/winograd.h lays them
-    out.
-    """
-    return POSITIONS * (ci * co + VECTOR)
-
-
-def laid_out_floats(_direction: Direction, weight_shape: tuple, c: int) -> int:
-    """See conv_direct.laid_out_floats."""
-    return transformed_floats(c, weight_shape[0] * VECTOR)
+    is_of_weights = shape.direction is Direction.BACKWARD_WEIGHTS
+    return (_gradient_slices if is_of_weights else _slices)(dev, blocking, shape.ci, shape.co)
 
 
 def lay_out(dev: Device, weights: Array, jobs: Sequence[Layout], laid_out: Array) -> None:
     """Transform weights in one launch, see conv_direct.lay_out."""
     rows, n = [], 0
-    for start, target, (blocks, _, _, ci, _), first, c, co in jobs:
-        flipped = first is not None
-        if flipped and (first % VECTOR or first + c > ci):
-            raise ValueError(f"Winograd input gradient of {c} channels from {first} on, of {ci}")
-        channels, groups = (co, c // VECTOR) if flipped else (ci, blocks)
-        rows.append((n, channels, groups, start, target // VECTOR, first or 0, ci, int(flipped)))
-        n += channels * groups
+    for shape, start, target in jobs:
+        _check_channels(*shape.sources, shape.co)
+        flipped = shape.direction is Direction.BACKWARD_INPUT
+        channels, co = (shape.co, shape.ci) if flipped else (shape.ci, shape.co)
+        ci, place = sum(shape.sources), target // VECTOR
+        rows.append((n, channels, co // VECTOR, start, place, shape.first, ci, int(flipped)))
+        n += channels * co // VECTOR
     dev.program("layers/winograd_transform").launch(
         "winograd_transform",
         n,
@@ -95,21 +78,18 @@ def forward(
     dev: Device,
     blocking: Blocking,
     sources: tuple[Array, ...],
-    weight: Array,
+    weights: Array,
     bias: Array,
     out: Array,
     *,
     relu: bool,
     tiles: Tiles | None = None,
-    laid_out: Array | None = None,
 ) -> None:
     """See conv_direct.forward. The result does not depend on the number of compute units."""
     height, width, co = out.shape
     channels = [source.shape[2] for source in sources]
     _check_channels(*channels, co)
-    check_weights(sources, weight.shape, out, bias)
-    if laid_out is None:
-        laid_out = _transformed(dev, weight, None, sum(channels), co)
+    check_shape(channels, co, weights, (_transformed_floats(sum(channels), co),), bias)
     tiles = checked_tiles(dev, tiles, height, width)
     _program(dev, blocking, sum(channels), co).launch(
         "winograd_forward",
@@ -121,7 +101,7 @@ def forward(
         relu=relu,
         x=sources[0],
         x2=sources[-1],
-        transformed=laid_out,
+        transformed=weights,
         bias=bias,
         tile_list=tiles.list,
         out=out,
@@ -132,21 +112,18 @@ def forward(
 def backward_input(
     dev: Device,
     blocking: Blocking,
-    weight: Array,
-    first: int,
+    weights: Array,
     grad_out: Array,
     grad_x: Array,
     *,
     mask: Array | None,
     tiles: Tiles | None = None,
-    laid_out: Array | None = None,
 ) -> None:
     """See conv_direct.backward_input."""
     height, width, c = grad_x.shape
     co = grad_out.shape[2]
     _check_channels(c, co)
-    if laid_out is None:
-        laid_out = _transformed(dev, weight, first, c, co)
+    check_shape([c], co, weights, (_transformed_floats(c, co),))
     tiles = checked_tiles(dev, tiles, height, width)
     _program(dev, blocking, co, c).launch(
         "winograd_backward_input",
@@ -156,7 +133,7 @@ def backward_input(
         co=co,
         masked=mask is not None,
         x=grad_x if mask is None else mask,
-        flipped=laid_out,
+        flipped=weights,
         grad_out=grad_out,
         tile_list=tiles.list,
         grad_x=grad_x,
@@ -169,7 +146,6 @@ def backward_weights(
     blocking: Blocking,
     sources: tuple[Array, ...],
     grad_out: Array,
-    weight_shape: tuple,
     partial: Array,
     *,
     tiles: Tiles | None = None,
@@ -180,8 +156,9 @@ def backward_weights(
     height, width, co = grad_out.shape
     channels = [source.shape[2] for source in sources]
     _check_channels(*channels, co)
-    check_weights(sources, weight_shape, grad_out)
     ci = sum(channels)
+    most = MOST_PARTS if _is_narrow(ci, co) else 1
+    check_shape(channels, co, partial, parts_shape(most, 3, ci, co))
     tiles = checked_tiles(dev, tiles, height, width)
     tile_parts = _tile_parts(tiles.number, ci, co)
     ci_part = ci if tile_parts > 1 else _ci_part(dev, ci, co)
@@ -190,7 +167,7 @@ def backward_weights(
         "layers/winograd_backward_weights",
         TILES=blocking.winograd_weights,
         CO_PART=min(CO_PART, co),
-        BLOCKS=_paired_blocks(co),
+        BLOCKS=_groups(blocking, co),
     ).launch(
         "winograd_backward_weights",
         min(dev.info["compute_units"], parts),
@@ -211,11 +188,9 @@ def backward_weights(
     return tile_parts
 
 
-def _transformed(dev, weight, first, c, co):
-    """lay_out() of one layer's weights, in scratch."""
-    laid_out = dev.scratch(TRANSFORMED, transformed_floats(c, co))
-    lay_out(dev, weight.reshape(-1), [(0, 0, weight.shape, first, c, co)], laid_out)
-    return laid_out
+def _transformed_floats(ci, co):
+    """One vector more between two positions keeps these apart in the sets of a cache."""
+    return POSITIONS * (ci * co + VECTOR)
 
 
 def _check_channels(*channels):
@@ -232,12 +207,15 @@ def _tiles_at_once(blocking, ci, co):
 
 def _program(dev, blocking, ci, co):
     tiles, together = _tiles_at_once(blocking, ci, co)
-    return dev.program("layers/winograd", TILES=tiles, TOGETHER=together, BLOCKS=_paired_blocks(co))
+    return dev.program(
+        "layers/winograd", TILES=tiles, TOGETHER=together, BLOCKS=_groups(blocking, co)
+    )
 
 
-def _paired_blocks(channels):
+def _groups(blocking, channels):
     """Groups of 16 output channels that are multiplied together."""
-    return 1 if channels // VECTOR % 2 else 2
+    groups = blocking.winograd_groups
+    return 1 if channels // VECTOR % groups else groups
 
 
 def _slices(dev, blocking, ci, co):
@@ -252,11 +230,6 @@ def _gradient_slices(dev, blocking, ci, co):
     values = (ci_part + co_part) // VECTOR * blocking.winograd_weights
     vectors = POSITIONS * (values + 3 + ci_part * co_part // VECTOR) + co_part // VECTOR
     return COUNTERS + dev.info["compute_units"] * vectors * VECTOR
-
-
-def _partial_floats(ci, co):
-    """Floats of PARTIAL for backward_weights()."""
-    return (MOST_PARTS if _is_narrow(ci, co) else 1) * (9 * ci + 1) * co
 
 
 def _is_narrow(ci, co):

@@ -10,6 +10,7 @@ from pp_cl.device.device import Device
 from pp_cl.device.launch import channel_ranges, lanes
 from pp_cl.layers.tiles import Tiles, checked_tiles
 
+RESAMPLE = "layers/resample"
 SHARE = 0.25  # of a feature in its colour; features differ by about four times as much
 
 
@@ -17,55 +18,22 @@ def gate_forward(dev: Device, x: Array, out: Array, *, tiles: Tiles | None = Non
     """out (H, W, C) = ELU(features) * sigmoid(gates). x: (H, W, 2 C), the features of each pixel
     and then its gates.
     """
-    h, w, c = _check_gate(x, out)
-    size, work_group = channel_ranges(dev, h, w, c)
-    dev.program("layers/gate", LANES=lanes(dev)).launch(
-        "gate_forward",
-        size,
-        work_group,
-        h=h,
-        w=w,
-        c=c,
-        x=x,
-        out=out,
-        tile_count=checked_tiles(dev, tiles, h, w).count,
-    )
+    shape = _check_gate(x, out)
+    _launch(dev, "layers/gate", "gate_forward", shape, out, tiles=tiles, x=x, out=out)
 
 
 def gate_backward(
     dev: Device, x: Array, grad_out: Array, grad_x: Array, *, tiles: Tiles | None = None
 ) -> None:
     """grad_x (H, W, 2 C) = gradient of gate_forward, given grad_out (H, W, C)."""
-    h, w, c = _check_gate(x, grad_out)
-    size, work_group = channel_ranges(dev, h, w, c)
-    dev.program("layers/gate", LANES=lanes(dev)).launch(
-        "gate_backward",
-        size,
-        work_group,
-        h=h,
-        w=w,
-        c=c,
-        x=x,
-        grad_out=grad_out,
-        grad_x=grad_x,
-        tile_count=checked_tiles(dev, tiles, h, w).count,
-    )
+    shape, arrays = _check_gate(x, grad_out), {"x": x, "grad_out": grad_out, "grad_x": grad_x}
+    _launch(dev, "layers/gate", "gate_backward", shape, grad_x, tiles=tiles, **arrays)
 
 
 def avgpool2_forward(dev: Device, x: Array, out: Array, *, tiles: Tiles | None = None) -> None:
     """out (H, W, C) = mean of 2x2 pixels of x (2H, 2W, C)."""
-    h, w, c = _check_double(out, x)
-    _launch(
-        dev,
-        "avgpool2_forward",
-        (h, w, c),
-        h=h,
-        w=w,
-        c=c,
-        x=x,
-        out=out,
-        tile_count=checked_tiles(dev, tiles, h, w).count,
-    )
+    shape = _check_double(out, x)
+    _launch(dev, RESAMPLE, "avgpool2_forward", shape, out, tiles=tiles, x=x, out=out)
 
 
 def avgpool2_backward(
@@ -82,81 +50,44 @@ def avgpool2_backward(
     mask: what was pooled, where it is a ReLU's output, else None; grad_x: gradient of its other
     use; grad_out: (H, W, C).
     """
-    h, w, c = _check_double(grad_out, grad_x)
+    shape = _check_double(grad_out, grad_x)
     _launch(
         dev,
+        RESAMPLE,
         "avgpool2_backward",
-        (2 * h, 2 * w, c),
-        h=h,
-        w=w,
-        c=c,
+        shape,
+        grad_x,
+        grad_x.shape,
+        tiles=tiles,
         masked=mask is not None,
         x=grad_x if mask is None else mask,
         grad_out=grad_out,
         grad_x=grad_x,
-        tile_count=checked_tiles(dev, tiles, 2 * h, 2 * w).count,
     )
 
 
 def maxpool2_forward(dev: Device, x: Array, out: Array) -> None:
     """out (H // 2, W // 2, C) = largest of 2x2 pixels of x (H, W, C)."""
-    h, w, c = _check_half(x, out)
-    _launch(dev, "maxpool2_forward", (h, w, c), h=h, w=w, c=c, x_width=x.shape[1], x=x, out=out)
-
-
-def maxpool2_backward(dev: Device, x: Array, grad_out: Array, grad_x: Array) -> None:
-    """Adds the gradient of maxpool2_forward to grad_x (H, W, C), where x > 0.
-
-    x: the ReLU's output that was pooled; grad_x: gradient of that ReLU's input, as far as the
-    output's other use goes; grad_out: (H // 2, W // 2, C).
-    """
-    h, w, c = _check_half(x, grad_out)
-    _launch(
-        dev,
-        "maxpool2_backward",
-        (h, w, c),
-        h=h,
-        w=w,
-        c=c,
-        x_width=x.shape[1],
-        x=x,
-        grad_out=grad_out,
-        grad_x=grad_x,
-    )
+    h, w, c = out.shape
+    if (x.shape[0] // 2, x.shape[1] // 2, x.shape[2]) != out.shape:
+        raise ValueError(f"max pooling of {x.shape} to {out.shape}")
+    size, work_group = channel_ranges(dev, h, w, c)
+    sizes = {"h": h, "w": w, "c": c, "x_width": x.shape[1]}
+    _program(dev, RESAMPLE).launch("maxpool2_forward", size, work_group, x=x, out=out, **sizes)
 
 
 def upsample2_forward(dev: Device, x: Array, out: Array, *, tiles: Tiles | None = None) -> None:
     """out (2H, 2W, C) = x (H, W, C), bilinear, align_corners False, border repeated."""
-    h, w, c = _check_double(x, out)
-    _launch(
-        dev,
-        "upsample2_forward",
-        (h, w, c),
-        h=h,
-        w=w,
-        c=c,
-        x=x,
-        out=out,
-        tile_count=checked_tiles(dev, tiles, 2 * h, 2 * w).count,
-    )
+    shape = _check_double(x, out)
+    _launch(dev, RESAMPLE, "upsample2_forward", shape, out, tiles=tiles, x=x, out=out)
 
 
 def upsample2_backward(
     dev: Device, grad_out: Array, grad_x: Array, *, tiles: Tiles | None = None
 ) -> None:
     """grad_x (H, W, C) = gradient of upsample2_forward, given grad_out (2H, 2W, C)."""
-    h, w, c = _check_double(grad_x, grad_out)
-    _launch(
-        dev,
-        "upsample2_backward",
-        (h, w, c),
-        h=h,
-        w=w,
-        c=c,
-        grad_out=grad_out,
-        grad_x=grad_x,
-        tile_count=checked_tiles(dev, tiles, h, w).count,
-    )
+    shape, arrays = _check_double(grad_x, grad_out), {"grad_out": grad_out, "grad_x": grad_x}
+    _launch(dev, RESAMPLE, "upsample2_backward", shape, grad_x, tiles=tiles, **arrays)
 
 
 def output_forward(dev: Device, image: Array, features: Array | None) -> None:
@@ -201,9 +132,20 @@ def residual_backward(dev: Device, grad_image: Array, grad_features: Array) -> N
     )
 
 
-def _launch(dev, kernel, shape, **arguments):
-    size, work_group = channel_ranges(dev, *shape)
-    dev.program("layers/resample", LANES=lanes(dev)).launch(kernel, size, work_group, **arguments)
+def _launch(dev, file, kernel, shape, result, size=None, *, tiles, **arguments):
+    """Launch a kernel that computes the tiles of the array `result`. shape: its h, w, c, those of
+    the smaller map; size: over which (height, width, channels) it runs, if not these.
+    """
+    h, w, c = shape
+    size, work_group = channel_ranges(dev, *(size or shape))
+    count = checked_tiles(dev, tiles, *result.shape[:2]).count
+    _program(dev, file).launch(
+        kernel, size, work_group, h=h, w=w, c=c, tile_count=count, **arguments
+    )
+
+
+def _program(dev, file):
+    return dev.program(file, LANES=lanes(dev))
 
 
 def _check_double(small, large):
@@ -212,13 +154,6 @@ def _check_double(small, large):
         raise ValueError(
             f"a layer between {small.shape} and {large.shape}: expected {(2 * h, 2 * w, c)}"
         )
-    return h, w, c
-
-
-def _check_half(large, small):
-    h, w, c = small.shape
-    if (large.shape[0] // 2, large.shape[1] // 2, large.shape[2]) != small.shape:
-        raise ValueError(f"max pooling of {large.shape} to {small.shape}")
     return h, w, c
 
 

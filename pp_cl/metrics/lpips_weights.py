@@ -113,8 +113,7 @@ def _python(*words):
 
 def _failure(reason, mend="try again with a network connection"):
     return UserError(
-        f"LPIPS weights: {reason}; {mend}, or leave LPIPS out with train.perceptual_weight=0 or"
-        " --metrics psnr,ssim"
+        f"LPIPS weights: {reason}; {mend}, or leave LPIPS out with --metrics psnr,ssim"
     )
 
 

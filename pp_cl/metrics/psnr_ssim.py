@@ -1,6 +1,5 @@
 """PSNR, SSIM and LPIPS of 8-bit images, with the settings behind the tables of this field."""
 
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -8,7 +7,6 @@ from skimage.metrics import structural_similarity
 
 from pp_cl.errors import UserError
 from pp_cl.files.image import to_8bit
-from pp_cl.layers.choice import AUTO, ConvolutionPolicy
 from pp_cl.metrics.lpips import Lpips
 
 PSNR_CAP = 100.0  # dB of identical images: JSON has no infinity
@@ -62,21 +60,11 @@ def exposed_alike(truth: np.ndarray, prediction: np.ndarray, alpha: np.ndarray) 
 
 
 class Metrics:
-    """The named metrics of image pairs. names: out of psnr, ssim, lpips; only lpips needs dev.
-    policy: whose blocking the convolutions of lpips take, None = as shipped. Their variants are
-    those shipped for the device whatever its tolerance and tuning, so that a metric does not depend
-    on them.
-    """
+    """The named metrics of image pairs. names: out of psnr, ssim, lpips; only lpips needs dev."""
 
-    def __init__(
-        self,
-        dev: Any,
-        names: tuple[str, ...],
-        policy: ConvolutionPolicy | None = None,
-    ) -> None:
+    def __init__(self, dev: Any, names: tuple[str, ...]) -> None:
         self.names = names
-        shipped = policy and replace(policy, variant=AUTO, tolerance=None)
-        self._lpips = Lpips(dev, policy=shipped) if "lpips" in names else None
+        self._lpips = Lpips(dev) if "lpips" in names else None
 
     def __call__(self, prediction: np.ndarray, truth: np.ndarray) -> dict[str, float]:
         """{name: number} of two float (H, W, 3) images in [0, 1], both rounded to 8 bits first.

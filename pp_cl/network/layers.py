@@ -16,8 +16,7 @@ from typing import Any, Literal
 import numpy as np
 
 from pp_cl.device.buffers import Table
-from pp_cl.layers.choice import ConvShape
-from pp_cl.layers.conv_direct import Direction
+from pp_cl.layers.conv_direct import ConvShape, Direction, packed_shape
 from pp_cl.layers.tiles import VECTOR
 
 
@@ -51,10 +50,10 @@ class Layer:
         """(CO, CI, K, K) of a convolution's weights."""
         return self.channels, sum(self.sources), self.kernel_size, self.kernel_size
 
-    def shape(self, direction: Direction, source: int | None, height: int, width: int) -> ConvShape:
-        """What a convolution's variant is chosen by, in an image of this size."""
-        pixels = (height >> self.level) * (width >> self.level)
-        return ConvShape(direction, self.kernel_size, self.sources, self.channels, pixels, source)
+    def shape(self, direction: Direction, source: int | None, size: tuple[int, int]) -> ConvShape:
+        """A convolution in one direction, in an image of `size` = (height, width)."""
+        here = size[0] >> self.level, size[1] >> self.level
+        return ConvShape(direction, self.kernel_size, self.sources, self.channels, here, source)
 
     def multiplications(self, height: int, width: int) -> int:
         """Multiplications of weights by values in a forward pass over an image of this size,
@@ -157,9 +156,9 @@ def parameter_table(layers: list[Layer]) -> Table:
     table: Table = {}
     for layer in convolutions(layers):
         co, ci, k, _ = layer.weight_shape()
-        blocks = -(-co // VECTOR)
-        table[layer.name + ".weight"] = (blocks, k, k, ci, VECTOR), np.float32
-        table[layer.name + ".bias"] = (blocks * VECTOR,), np.float32
+        shape = packed_shape(k, ci, co)
+        table[layer.name + ".weight"] = shape, np.float32
+        table[layer.name + ".bias"] = (shape[0] * VECTOR,), np.float32
     return table
 
 

@@ -1,28 +1,30 @@
-"""The U-Net on a device: its parameters and feature maps, and its forward and backward pass, which
-launch the kernels layer by layer.
+"""The U-Net on a device: its parameters, and its forward and its backward pass, which are lists of
+launches, made once for images of one size.
 """
 
 import math
 from collections import defaultdict
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from functools import partial
+from types import ModuleType
 from typing import Any
 
 import numpy as np
 from pyopencl.array import Array
 
-from pp_cl.device.buffers import PackedArrays, Table, packed_arrays, packed_bytes
+from pp_cl.device.buffers import PackedArrays, Row, Table, packed_arrays, packed_bytes
 from pp_cl.device.device import Device
-from pp_cl.layers.choice import ConvolutionPolicy, lay_out_forward, make_policy
+from pp_cl.layers.choice import AUTO, VARIANTS, blocking_of, choose
 from pp_cl.layers.conv_direct import (
-    FLIPPED,
-    PARTIAL,
+    ConvShape,
     Direction,
+    Layout,
+    Sums,
     pack_bias,
     pack_weights,
     sum_parts,
     table_of_sums,
 )
-from pp_cl.layers.conv_winograd import TRANSFORMED
 from pp_cl.layers.simple import (
     avgpool2_backward,
     avgpool2_forward,
@@ -36,7 +38,6 @@ from pp_cl.layers.simple import (
 )
 from pp_cl.layers.tiles import all_tiles_buffers
 from pp_cl.network.layers import (
-    Layer,
     array_shapes,
     computations,
     convolutions,
@@ -56,46 +57,165 @@ LEAST_PIXELS, MOST_COMPUTED = 1 << 16, 0.8
 PARAMETERS = "parameters", "gradients of parameters"  # in the memory plan
 MULTIPLE = 4  # pixels: two poolings halve the height and the width
 
+Size = tuple[int, int]  # (height, width)
+Work = tuple[str, Direction, int | None]  # a layer, and of what its convolution computes
+Launch = Callable[[Any], None]  # of an AllTiles or TilePlan, which says what tiles to compute
 
-class FeatureMaps:
-    """The outputs of a network's layers and their gradients, for images of one size at a time.
 
-    training: with the backward pass. size: (height, width). arrays: {name: array}, gradients by
-    gradient_of(name), without x; some share a buffer, one after the other.
+class Pass:
+    """The forward pass over images of one size, or that and the backward pass: where the arrays
+    lie, and the launches in order.
+
+    training: with the backward pass. size: of the images. arrays: {name: feature map}, gradients by
+    gradient_of(name); some share a buffer, one after the other. "x", the caller's, is there while a
+    pass runs. forward, backward: the launches. all_tiles: every tile of every feature map.
     """
 
-    def __init__(self, dev: Device, layers: list[Layer], training: bool):
-        self.dev, self.layers, self.training = dev, layers, training
-        self.size = (0, 0)  # (height, width)
+    def __init__(self, net: "UNet", training: bool):
+        self.net, self.training = net, training
+        self.size: Size = (0, 0)
         self.arrays: dict[str, Array] = {}
+        self.forward: list[Launch] = []
+        self.backward: list[Launch] = []
+        self.all_tiles: Any = None
+        self.is_laid_out = False  # the weights, for the kernels
         self._buffers: list[Any] = []
-        self._all_tiles: AllTiles | None = None
+        self._work: Any = None  # all of what work_table() says, in one array
+        self._jobs: dict[Callable, list[Layout]] = {}  # {lay_out() of a module: what it lays out}
+        self._sums: list[Sums] = []
+        self._table = net.dev.empty((len(convolutions(net.layers)), 8), np.int32)
 
-    def resize(self, size: tuple[int, int]) -> None:
-        """Make room for images of this size, in the same buffers where they are large enough:
-        images of a film differ in size. The arrays are undefined then.
+    def plan(self, size: Size) -> None:
+        """Make room for images of this size, in the same buffers where they are large enough, and
+        list the launches. The arrays are undefined then.
         """
-        if size == self.size:
-            return
-        self.size, self.arrays, self._all_tiles = (0, 0), {}, None
-        shapes = array_shapes(self.layers, size)
-        shared = share_buffers(lifetimes(self.layers, self.training), shapes)
+        net, self.size, self.is_laid_out = self.net, (0, 0), False
+        self.forward, self.backward, self.all_tiles = [], [], None  # frees the old arrays first
+        self._place_feature_maps(size)
+        convs, self.all_tiles = self._place_work(size), AllTiles(net.dev, size, net.layers)
+        for layer in net.layers:
+            conv = convs.get((layer.name, Direction.FORWARD, None))
+            self.forward.append(partial(self._compute, layer, conv))
+        for layer in reversed(net.layers) if self.training else ():
+            self.backward.append(partial(self._copy, gradient_of(layer.name)))
+            if layer.kind == "conv":
+                conv = convs[layer.name, Direction.BACKWARD_WEIGHTS, None]
+                self.backward.append(partial(self._compute_gradient_of_weights, layer, conv))
+            for i in range(len(layer.inputs)):
+                conv = convs.get((layer.name, Direction.BACKWARD_INPUT, i))
+                self.backward.append(partial(self._compute_gradient, layer, i, conv))
+        self.size = size
+
+    def _place_feature_maps(self, size):
+        shapes = array_shapes(self.net.layers, size)
+        shared = share_buffers(lifetimes(self.net.layers, self.training), shapes)
+        self.arrays = {}
         self._buffers += [None] * (len(shared) - len(self._buffers))
         for i, buffer in enumerate(shared):
             if self._buffers[i] is None or self._buffers[i].size < buffer.floats:
                 self._buffers[i] = None  # frees the old one first
-                self._buffers[i] = self.dev.empty((buffer.floats,))
+                self._buffers[i] = self.net.dev.empty((buffer.floats,))
             for name in buffer.names:
                 floats = math.prod(shapes[name])
                 self.arrays[name] = self._buffers[i][:floats].reshape(shapes[name])
-        self.size = size
 
-    @property
-    def all_tiles(self) -> AllTiles:
-        """Of an image of this size."""
-        if self._all_tiles is None:
-            self._all_tiles = AllTiles(self.dev, self.size, self.layers)
-        return self._all_tiles
+    def _place_work(self, size):
+        """{Work: (module, array)} of the convolutions: the weights as the kernels read them, or the
+        parts of the gradients.
+        """
+        shapes, self._work, self._jobs = self.net.work(size, self.training), None, defaultdict(list)
+        rows = work_table(shapes)
+        whole, arrays = packed_arrays(self.net.dev, [*rows.values()])
+        self._work, work = whole.view(np.float32), dict(zip(rows, arrays, strict=True))
+        found = {}
+        for key, (module, shape) in shapes.items():
+            weight = self.net.parameters[f"{key[0]}.weight"]
+            found[key] = module, work.get(key, weight)
+            if key in work and shape.direction is not Direction.BACKWARD_WEIGHTS:
+                places = _first_float(weight), _first_float(work[key])
+                self._jobs[module.lay_out].append((shape, *places))
+        return found
+
+    def lay_out(self) -> None:
+        """Lay out the weights for the kernels, in a launch for each kind of layout."""
+        for lay_out, jobs in self._jobs.items():
+            lay_out(self.net.dev, self.net.all_parameters, jobs, self._work)
+        self.is_laid_out = True
+
+    def sum_parts(self) -> None:
+        """Overwrite the gradients of all parameters by the sums of the parts that `backward` has
+        left.
+        """
+        net = self.net
+        rows, n = table_of_sums(self._sums)
+        net.dev.send(self._table, np.array(rows, np.int32))
+        sum_parts(net.dev, self._table, n, self._work, net.all_gradients, net.all_gradients)
+        self._sums = []
+
+    # ---- launches
+
+    def _compute(self, layer, conv, tiles):
+        """A layer's output. conv: (module, weights) of a convolution."""
+        net, arrays, of_layer = self.net, self.arrays, tiles.tiles(layer.name)
+        sources, out = tuple(arrays[name] for name in layer.inputs), arrays[layer.name]
+        if layer.kind == "gate":
+            gate_forward(net.dev, sources[0], out, tiles=of_layer)
+        elif layer.kind == "pool":
+            avgpool2_forward(net.dev, sources[0], out, tiles=of_layer)
+        elif layer.kind == "upsample":
+            upsample2_forward(net.dev, sources[0], out, tiles=of_layer)
+        else:
+            module, weights = conv
+            given = sources, weights, net.parameters[f"{layer.name}.bias"], out
+            module.forward(net.dev, net.blocking, *given, relu=layer.relu, tiles=of_layer)
+        self._copy(layer.name, tiles)
+
+    def _compute_gradient(self, layer, source, conv, tiles):
+        """The gradient of a layer's input of number `source`. conv: (module, weights) of a
+        convolution.
+        """
+        net, name = self.net, layer.inputs[source]
+        x, grad_x = self.arrays[name], self.arrays[gradient_of(name)]
+        grad_out = self.arrays[gradient_of(layer.name)]
+        of_input = tiles.tiles(gradient_of(name))
+        mask = x if name in net.relu_outputs else None
+        if layer.kind == "gate":
+            gate_backward(net.dev, x, grad_out, grad_x, tiles=of_input)
+        elif layer.kind == "pool":  # adds to the gradient of the skip
+            avgpool2_backward(net.dev, mask, grad_out, grad_x, tiles=of_input)
+        elif layer.kind == "upsample":
+            upsample2_backward(net.dev, grad_out, grad_x, tiles=of_input)
+        else:
+            module, weights = conv
+            given = weights, grad_out, grad_x
+            module.backward_input(net.dev, net.blocking, *given, mask=mask, tiles=of_input)
+
+    def _compute_gradient_of_weights(self, layer, conv, tiles):
+        """The gradients of a convolution's weights and bias, in parts. conv: (module, parts)."""
+        net, grad = self.net, gradient_of(layer.name)
+        module, parts = conv
+        sources = tuple(self.arrays[name] for name in layer.inputs)
+        given = sources, self.arrays[grad], parts
+        count = module.backward_weights(net.dev, net.blocking, *given, tiles=tiles.tiles(grad))
+        gradients = (net.gradients[f"{layer.name}.{kind}"] for kind in ("weight", "bias"))
+        self._sums.append((parts.shape, count, *map(_first_float, (parts, *gradients))))
+
+    def _copy(self, name, tiles):
+        """The tiles of a feature map that were not computed."""
+        tiles.fill_copies(name, self.arrays[name])
+
+
+def work_table(shapes: dict[Work, tuple[ModuleType, ConvShape]]) -> dict[Work, Row]:
+    """{Work: (shape, dtype)} of the arrays that convolutions work with, beside the layers' own.
+    shapes: of UNet.work().
+    """
+    needed = {key: module.work_shape(shape) for key, (module, shape) in shapes.items()}
+    return {key: (shape, np.float32) for key, shape in needed.items() if shape}
+
+
+def _first_float(array):
+    """Where an array of packed_arrays() begins in the whole."""
+    return array.base_data.offset // array.dtype.itemsize
 
 
 class UNet:
@@ -103,11 +223,11 @@ class UNet:
 
     widths: channels of the three levels. blocks: what a level computes, of layers.BLOCKS. channels:
     as unet_layers() takes them. residual: adds output.SHARE of the first three features to the
-    image. policy: chooses the variant of each convolution; may be replaced between images; None =
-    as shipped, whatever their error. layers: in the order of the forward pass. parameters,
-    gradients: {"enc0.a.weight": (ceil(CO/16), K, K, CI, 16), "enc0.a.bias": (ceil(CO/16) * 16,),
-    ...} float32 on the device; all_parameters, all_gradients: the 1-D array that they lie in, with
-    zeros between them. Weights and biases start uniform in +-1/sqrt(CI K K) (PyTorch's
+    image. variant: of the convolutions, as choose() takes it; blocking: of their kernels, as
+    shipped for the device. layers: in the order of the forward pass. parameters, gradients:
+    {"enc0.a.weight": (ceil(CO/16), K, K, CI, 16), "enc0.a.bias": (ceil(CO/16) * 16,), ...} float32
+    on the device; all_parameters, all_gradients: the 1-D array that they lie in, with zeros between
+    them. Weights and biases start uniform in +-1/sqrt(CI K K) (PyTorch's
     default for Conv2d), output channels beyond CO at 0, with gradient 0.
     """
 
@@ -122,13 +242,13 @@ class UNet:
         channels: Sequence[int] = (),
         residual: bool = False,
         seed: int = 0,
-        policy: ConvolutionPolicy | None = None,
+        variant: str = AUTO,
     ):
         self.dev = dev
         self._residual = residual
         self.layers = unet_layers(widths, channels_in, channels_out, blocks, channels=channels)
         self.channels_in = channels_in
-        self.policy = policy or make_policy(dev)
+        self.variant, self.blocking = variant, blocking_of(dev)
         self.all_parameters, self.parameters = self._packed()
         self.all_gradients, self.gradients = self._packed()
         rng = np.random.default_rng(seed)
@@ -138,23 +258,14 @@ class UNet:
             weight, bias = rng.uniform(-bound, bound, shape), rng.uniform(-bound, bound, shape[0])
             dev.write(self.parameters[layer.name + ".weight"], pack_weights(weight))
             dev.write(self.parameters[layer.name + ".bias"], pack_bias(bias))
-        self._relu_outputs = {layer.name for layer in self.layers if layer.relu}
-        self._maps: dict[bool, FeatureMaps] = {}  # {training: FeatureMaps}
-        # {(policy, layer, direction, source, size): module of a convolution}
-        self._modules: dict[Any, Any] = {}
+        self.relu_outputs = {layer.name for layer in self.layers if layer.relu}
+        self._passes: dict[bool, Pass] = {}  # {training: Pass}
         self._tile_lists = {name: PackedArrays(dev) for name in ("forward", "backward")}
-        self._trained: Any = None  # (size, arrays, tiles) of the last forward(training=True)
-        self._frozen: dict[Any, Array] | None = None  # {(layer, module): weights} once frozen
-        self._planned: Any = (None,)  # of the last training pass: (policy, size), _plan()
-        self._work: dict[Any, Any] = {}  # of the last pass: arrays of _plan(), if for training
-        self._sums = PackedArrays(dev)
-        self._sum_rows: Any = None
-        self._sum_table: Any = None
+        self._trained: Any = None  # tiles of the last forward(training=True), until its backward()
+        self._is_frozen = False
 
     @classmethod
-    def of_settings(
-        cls, dev: Device, settings: NetworkConfig, policy: ConvolutionPolicy, *, seed: int = 0
-    ) -> "UNet":
+    def of_settings(cls, dev: Device, settings: NetworkConfig, *, seed: int = 0) -> "UNet":
         """The network of a run."""
         return cls(
             dev,
@@ -163,7 +274,6 @@ class UNet:
             channels=settings.channel_numbers,
             residual=settings.residual,
             seed=seed,
-            policy=policy,
         )
 
     def _packed(self):
@@ -176,16 +286,16 @@ class UNet:
         """{name of a parameter: its part of an array that is laid out as all_parameters}."""
         parts = {}
         for name, parameter in self.parameters.items():
-            start = parameter.base_data.offset // parameter.dtype.itemsize
+            start = _first_float(parameter)
             parts[name] = whole[start : start + parameter.size].reshape(parameter.shape)
         return parts
 
     def freeze(self) -> None:
-        """From now on the parameters do not change: their weights are transformed for the kernels
+        """From now on the parameters do not change: their weights are laid out for the kernels
         once, not for each image, and training is refused.
         """
-        self._frozen = {}
-        self._maps.clear()
+        self._is_frozen = True
+        self._passes.clear()
 
     @staticmethod
     def is_planned(size: tuple[int, int]) -> bool:
@@ -218,29 +328,31 @@ class UNet:
         backward needs. plan: of plan_tiles(), None = compute all tiles. Raises ValueError for other
         sizes, RuntimeError for training once frozen.
         """
-        if training and self._frozen is not None:
+        if training and self._is_frozen:
             raise RuntimeError("UNet.freeze() was called: the network can no longer be trained")
         height, width, channels = x.shape
         if height % MULTIPLE or width % MULTIPLE or channels != self.channels_in:
             raise ValueError(
                 f"the network takes (4n, 4m, {self.channels_in}) features, not {x.shape}"
             )
-        if training not in self._maps:
-            self._maps[training] = FeatureMaps(self.dev, self.layers, training)
+        if training not in self._passes:
+            self._passes[training] = Pass(self, training)
         if training:
             self._trained = None  # its arrays are overwritten
-        maps, size = self._maps[training], (height, width)
-        maps.resize(size)
-        arrays = maps.arrays | {"x": x}
-        tiles = plan or maps.all_tiles
-        self._prepare(size if training else None)
-        for layer in self.layers:
-            sources, out = tuple(arrays[name] for name in layer.inputs), arrays[layer.name]
-            self._forward(size, layer, sources, out, tiles.tiles(layer.name))
-            tiles.fill_copies(layer.name, out)
+        run = self._passes[training]
+        if run.size != (height, width):
+            run.plan((height, width))
+        if not (self._is_frozen and run.is_laid_out):
+            run.lay_out()
+        run.arrays["x"], tiles = x, plan or run.all_tiles
+        for launch in run.forward:
+            launch(tiles)
+        out = run.arrays[self.layers[-1].name]
         output_forward(self.dev, out, x if self._residual else None)
         if training:
-            self._trained = size, arrays, tiles
+            self._trained = tiles
+        else:
+            del run.arrays["x"]  # so that the caller can free it
         return out
 
     def backward(self, grad_y: Array) -> Array:
@@ -253,204 +365,51 @@ class UNet:
         """
         if self._trained is None:
             raise RuntimeError("UNet.backward needs a forward(training=True) before it")
-        (size, arrays, tiles), self._trained = self._trained, None
-        _, self._work, _, _ = self._planned
-        output_backward(self.dev, grad_y, arrays[gradient_of(self.layers[-1].name)])
-        tiles, sums = tiles.backward(arrays, self._tile_lists["backward"]), []
-        for layer in reversed(self.layers):
-            grad = gradient_of(layer.name)
-            tiles.fill_copies(grad, arrays[grad])
-            if layer.kind == "conv":
-                sums.append(self._backward_weights(size, layer, arrays, tiles.tiles(grad)))
-            for i, name in enumerate(layer.inputs):
-                self._backward_input(size, layer, i, arrays, tiles.tiles(gradient_of(name)))
-        grad_x = arrays[gradient_of("x")]
+        run, tiles, self._trained = self._passes[True], self._trained, None
+        output_backward(self.dev, grad_y, run.arrays[gradient_of(self.layers[-1].name)])
+        tiles = tiles.backward(run.arrays, self._tile_lists["backward"])
+        for launch in run.backward:
+            launch(tiles)
+        grad_x = run.arrays[gradient_of("x")]
         tiles.fill_copies(gradient_of("x"), grad_x)
         if self._residual:
             residual_backward(self.dev, grad_y, grad_x)
-        self._sum_parts(sums)
+        run.sum_parts()
+        del run.arrays["x"]
         return grad_x
-
-    def _forward(self, size, layer, sources, out, tiles):
-        """Compute the tiles of a layer's output from its inputs."""
-        if layer.kind == "gate":
-            gate_forward(self.dev, sources[0], out, tiles=tiles)
-        elif layer.kind == "pool":
-            avgpool2_forward(self.dev, sources[0], out, tiles=tiles)
-        elif layer.kind == "upsample":
-            upsample2_forward(self.dev, sources[0], out, tiles=tiles)
-        else:
-            module = self._module(layer, Direction.FORWARD, None, size)
-            module.forward(
-                self.dev,
-                self.policy.blocking,
-                sources,
-                self.parameters[layer.name + ".weight"],
-                self.parameters[layer.name + ".bias"],
-                out,
-                relu=layer.relu,
-                tiles=tiles,
-                laid_out=self._laid_out(layer, module),
-            )
-
-    def _backward_input(self, size, layer, source, arrays, tiles):
-        """Compute the tiles of the gradient of a layer's input of number `source`."""
-        name = layer.inputs[source]
-        x, grad_x = arrays[name], arrays[gradient_of(name)]
-        grad_out = arrays[gradient_of(layer.name)]
-        mask = x if name in self._relu_outputs else None
-        if layer.kind == "gate":
-            gate_backward(self.dev, x, grad_out, grad_x, tiles=tiles)
-        elif layer.kind == "pool":  # adds to the gradient of the skip
-            avgpool2_backward(self.dev, mask, grad_out, grad_x, tiles=tiles)
-        elif layer.kind == "upsample":
-            upsample2_backward(self.dev, grad_out, grad_x, tiles=tiles)
-        else:
-            self._module(layer, Direction.BACKWARD_INPUT, source, size).backward_input(
-                self.dev,
-                self.policy.blocking,
-                self.parameters[layer.name + ".weight"],
-                sum(layer.sources[:source]),
-                grad_out,
-                grad_x,
-                mask=mask,
-                tiles=tiles,
-                laid_out=self._work.get((layer.name, source)),
-            )
-
-    def _backward_weights(self, size, layer, arrays, tiles):
-        """Leave the gradients of a convolution's parameters in parts; returns what sums them."""
-        weight, bias = (self.gradients[f"{layer.name}.{kind}"] for kind in ("weight", "bias"))
-        partial = self._work[layer.name, PARTIAL]
-        parts = self._module(layer, Direction.BACKWARD_WEIGHTS, None, size).backward_weights(
-            self.dev,
-            self.policy.blocking,
-            tuple(arrays[name] for name in layer.inputs),
-            arrays[gradient_of(layer.name)],
-            weight.shape,
-            partial,
-            tiles=tiles,
-        )
-        return weight.shape, parts, *(a.base_data.offset // 4 for a in (partial, weight, bias))
-
-    def _sum_parts(self, sums):
-        """Overwrite the gradients of all parameters; sums: of _backward_weights()."""
-        rows, n = table_of_sums(sums)
-        if rows != self._sum_rows:
-            self._sum_rows = rows
-            shape = (len(rows), 8), np.int32
-            [self._sum_table] = self._sums.send([shape], [np.array(rows, np.int32)])
-        _, _, whole, _ = self._planned
-        sum_parts(self.dev, self._sum_table, n, whole, self.all_gradients, self.all_gradients)
-
-    def _module(self, layer, direction, source, size):
-        """The module that computes a convolution in an image of a size."""
-        key = self.policy, layer.name, direction, source, size
-        if key not in self._modules:
-            self._modules[key] = self.policy.convolution(layer.shape(direction, source, *size))
-        return self._modules[key]
-
-    def _laid_out(self, layer, module):
-        """The weights in the module's own layout: of this training pass, or made once after
-        freeze(); else None.
-        """
-        if self._frozen is None:
-            return self._work.get((layer.name, None))
-        key = layer.name, module
-        if key not in self._frozen:
-            weight = self.parameters[layer.name + ".weight"]
-            self._frozen[key] = lay_out_forward(self.dev, module, weight)
-        return self._frozen[key]
-
-    def _prepare(self, size):
-        """Set what a training pass over images of `size` works with, None: another pass; and lay
-        out all weights, in a launch for each kind of layout.
-        """
-        self._work = {}
-        if size is None:
-            return
-        if self._planned[0] != (self.policy, size):
-            self._planned = (None,)  # frees the old arrays first
-            self._planned = (self.policy, size), *self._plan(size)
-        _, self._work, whole, jobs = self._planned
-        for lay_out, of_layers in jobs.items():
-            lay_out(self.dev, self.all_parameters, of_layers, whole)
-
-    def _plan(self, size):
-        """({(layer, input, None or PARTIAL): array}, the one that they lie in, {lay_out(): jobs}):
-        of the weights as passes read them, and of the parts of their gradients.
-        """
-        table = self._work_table(size)
-        whole, arrays = packed_arrays(self.dev, [row for _, row in table.values()])
-        jobs = defaultdict(list)
-        for ((layer, source), (module, _)), array in zip(table.items(), arrays, strict=True):
-            if source == PARTIAL:
-                continue
-            weight = self.parameters[layer.name + ".weight"]
-            first = None if source is None else sum(layer.sources[:source])
-            c = sum(layer.sources) if source is None else layer.sources[source]
-            start, target = (part.base_data.offset // 4 for part in (weight, array))
-            jobs[module.lay_out].append((start, target, weight.shape, first, c, layer.channels))
-        work = {(layer.name, i): a for (layer, i), a in zip(table, arrays, strict=True)}
-        return work, whole.view(np.float32), jobs
-
-    def _work_table(self, size):
-        """{(layer, input, None or PARTIAL): (module, (shape, dtype))} of the arrays of _plan()."""
-        table = {}
-        for layer in convolutions(self.layers):
-            shape = self.parameters[layer.name + ".weight"].shape
-            for direction, source in computations(layer, True):
-                module = self._module(layer, direction, source, size)
-                c = layer.shape(direction, source, *size).ci
-                if direction is Direction.BACKWARD_WEIGHTS:
-                    height, source = size[0] >> layer.level, PARTIAL
-                    scratch = module.scratch_floats(
-                        self.dev, self.policy.blocking, direction, height, shape, c
-                    )
-                    floats = scratch[PARTIAL]
-                else:
-                    floats = module.laid_out_floats(direction, shape, c)
-                if floats:
-                    table[layer, source] = module, ((floats,), np.float32)
-        return table
 
     def output(self, name: str) -> Array:
         """(H, W, C) output of the layer `name` in the last forward(training=True), until its
         backward pass.
         """
-        return self._trained[1][name]
+        return self._passes[True].arrays[name]
+
+    def work(self, size: Size, training: bool) -> dict[Work, tuple[ModuleType, ConvShape]]:
+        """(the module that computes it, its shape) of all that is computed for the convolutions."""
+        found = {}
+        for layer in convolutions(self.layers):
+            for direction, source in computations(layer, training):
+                shape = layer.shape(direction, source, size)
+                module = VARIANTS[choose(self.dev, shape, self.variant)]
+                found[layer.name, direction, source] = module, shape
+        return found
 
     def memory_plan(self, height: int, width: int, training: bool) -> Table:
         """All device buffers of this network once it has run at this size, what its convolutions
         share with others among them.
 
         Gradients of parameters are among them without training too: they are made with the network.
-        Raises UserError where no variant is as exact as the policy's tolerance.
         """
         size = (height, width)
         shared = share_buffers(lifetimes(self.layers, training), array_shapes(self.layers, size))
-        floats = {" = ".join(buffer.names): buffer.floats for buffer in shared}
-        for layer in convolutions(self.layers):
-            weight_shape = self.parameters[layer.name + ".weight"].shape
-            for direction, source in computations(layer, training):
-                needed = self._module(layer, direction, source, size).scratch_floats(
-                    self.dev,
-                    self.policy.blocking,
-                    direction,
-                    height >> layer.level,
-                    weight_shape,
-                    layer.shape(direction, source, *size).ci,
-                )
-                for name, number in needed.items():
-                    if not training or name not in (FLIPPED, PARTIAL, TRANSFORMED):  # of _plan()
-                        floats[name] = max(number, floats.get(name, 0))
-        table: Table = {name: ((number,), np.float32) for name, number in floats.items()}
+        table: Table = {" = ".join(b.names): ((b.floats,), np.float32) for b in shared}
         table |= dict.fromkeys(PARAMETERS, (self.all_parameters.shape, np.float32))
-        if training:
-            rows = [row for _, row in self._work_table(size).values()]
-            sums = (len(convolutions(self.layers)), 8), np.int32
-            for name, packed in (("laid out", rows), ("sums of gradients", [sums])):
-                table[name] = (packed_bytes(self.dev, packed),), np.uint8
+        work = self.work(size, training)
+        scratch = [m.scratch_floats(self.dev, self.blocking, shape) for m, shape in work.values()]
+        table["scratch of convolutions"] = (max(scratch),), np.float32
+        octets = packed_bytes(self.dev, [*work_table(work).values()])
+        table["weights as kernels read them"] = (octets,), np.uint8
+        table["sums of gradients"] = (len(convolutions(self.layers)), 8), np.int32
         for level in set(levels_of(self.layers).values()):
             tiles = all_tiles_buffers(height >> level, width >> level)
             table |= {f"tiles of level {level}, {name}": row for name, row in tiles.items()}

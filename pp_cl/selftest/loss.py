@@ -1,17 +1,14 @@
-"""Cases of the losses: L1 and SSIM, masks, exposure, LPIPS, and their sum."""
+"""Cases of the losses: L1 and SSIM, masks, exposure, and their sum."""
 
 from collections.abc import Iterator
 
 import numpy as np
 
 from pp_cl.device.device import Device
-from pp_cl.layers.choice import make_policy
 from pp_cl.reference import loss as reference_loss
-from pp_cl.reference.lpips import lpips, lpips_gradient, random_weights
 from pp_cl.selftest.case import EPS, SIZES, Case, Check, each, exact, relative
 from pp_cl.training.exposure import KEPT, PRIOR, Exposure
 from pp_cl.training.loss import FURTHER, Loss, MaskLoss, ignore_gradient, ignore_target
-from pp_cl.training.perceptual import PerceptualLoss
 
 LOSS = 16 * EPS  # 22 taps of a window, in two passes, and the sums of rows and columns
 ONE = np.uint8(1)
@@ -159,20 +156,6 @@ def _exposure(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
         yield each(exposure.state.get()[..., 3], gains, 32 * EPS)
 
 
-def _perceptual_loss(dev: Device, rng: np.random.Generator) -> Iterator[Check]:
-    weights = random_weights(np.random.default_rng(5))
-    for size in ((16, 16), (17, 33)):
-        target = rng.uniform(0, 1, (*size, 3))
-        prediction = target + rng.normal(0, 0.2, target.shape)
-        loss = PerceptualLoss(dev, 0.3, make_policy(dev, variant="direct"), weights)
-        one, other = (dev.upload(image, np.float32) for image in (prediction, target))
-        grad = dev.zeros(target.shape)
-        distances = loss.add_gradient(one, other, (0, 0), grad).get()
-        a, b = (image.get().astype(np.float64) for image in (one, other))
-        yield relative(distances.sum(dtype=np.float64), lpips(a, b, weights), DEEP)
-        yield relative(grad.get(), 0.3 * lpips_gradient(a, b, weights), DEEP)
-
-
 CASES = (
     Case("loss: L1 and SSIM", _loss),
     Case("loss: flat and equal images", _hard_loss),
@@ -180,5 +163,4 @@ CASES = (
     Case("loss: ignored pixels", _ignored),
     Case("loss: exposure", _exposure),
     Case("loss: sum of its terms", _sum_of_terms),
-    Case("loss: perceptual", _perceptual_loss),
 )

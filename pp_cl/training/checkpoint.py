@@ -23,8 +23,7 @@ MOST_LENGTH = 1e30  # world units; float32 would hold no products of larger ones
 # {key of the header: its type as JSON has it}; those that it may lack
 NEEDED: dict[str, Any] = {"scene": str, "views": list, "step": int, "finished": bool}
 NEEDED |= {"initial_points": int, "grid": dict, "depth_range": list, "pixels": dict | None}
-OPTIONAL: dict[str, Any] = {"format": int, "tuning": dict | None, "extended_from": int}
-OPTIONAL |= {"exposed": bool, "left_out": list, "notes": list}
+OPTIONAL = {"format": int, "extended_from": int, "exposed": bool, "left_out": list, "notes": list}
 OTHER_RUN = "its config.json may belong to another run"
 
 

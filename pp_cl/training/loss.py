@@ -14,7 +14,7 @@ from pp_cl.errors import Diverged
 
 TAPS = 11  # pixels, the side of an SSIM window
 MARGIN = 32  # values by which a scratch row is longer than needed, >= 3 * (TAPS - 1)
-FURTHER = ("mask", "spread", "lpips")  # terms that not every training has
+FURTHER = ("mask", "spread")  # terms that not every training has
 
 
 class Loss:

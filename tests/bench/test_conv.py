@@ -6,7 +6,7 @@ from support.benches import KEYS
 
 from pp_cl.bench.conv import RandomConv, bench_conv
 from pp_cl.bench.timing import errors
-from pp_cl.layers.choice import OFFERED, device_class, make_policy
+from pp_cl.layers.choice import OFFERED, blocking_of, device_class
 from pp_cl.layers.conv_direct import Direction
 
 pytestmark = pytest.mark.usefixtures("quick")
@@ -18,17 +18,17 @@ pytestmark = pytest.mark.usefixtures("quick")
 )
 @pytest.mark.parametrize("direction", Direction)
 def test_a_layer_is_compared_with_the_truth(dev, direction, k, sources, co, choice):
-    conv, policy = RandomConv(dev, k, 13, sources, co=co), make_policy(dev)
+    conv, blocking = RandomConv(dev, k, 13, sources, co=co), blocking_of(dev)
     assert conv.variants == ([*OFFERED[device_class(dev)]] if choice else ["direct"])
     for variant in conv.variants:
-        actual, expected = conv.result(variant, direction, policy)
+        actual, expected = conv.result(variant, direction, blocking)
         assert actual.shape == expected.shape and expected.dtype == np.float64
         assert np.abs(expected).max() > 0.1
         assert errors(actual, expected)[0] < 1e-5
 
 
 def test_rows_of_the_layers(dev):
-    lists = list(bench_conv(dev, 8, (16, 16, 32), make_policy(dev)))
+    lists = list(bench_conv(dev, 8, (16, 16, 32)))
     assert [some[0]["direction"] for some in lists] == ["forward", "input", "weights"] * 9
     rows = [row for some in lists for row in some]
     assert all(row.keys() >= KEYS for row in rows)

@@ -6,7 +6,6 @@ import pytest
 
 from pp_cl.bench import overview, raster, timing
 from pp_cl.bench.overview import bench_overview, raster_steps, within
-from pp_cl.layers.choice import make_policy
 
 
 def steps_of(seconds):
@@ -51,7 +50,7 @@ def test_the_least_of_everything(dev, monkeypatch):
     monkeypatch.setattr(overview, "CONV_SIZE", 16)
     monkeypatch.setattr(overview, "WIDTHS", (16, 16, 16))
     told = []
-    found = bench_overview(dev, make_policy(dev), 1e-3, told.append)
+    found = bench_overview(dev, 1e-3, told.append)
     assert {(row["layer"], row["direction"]) for row in found["conv"]} == {("enc0.a", "forward")}
     assert {row["shape"][0] for row in found["unet"]} == {16}
     assert {(row["points"] > 9000, row["size"]) for row in found["raster"]} == {(True, 200)}

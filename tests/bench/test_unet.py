@@ -4,7 +4,7 @@ import pytest
 from support.benches import KEYS
 
 from pp_cl.bench import unet
-from pp_cl.layers.choice import OFFERED, device_class, make_policy
+from pp_cl.layers.choice import OFFERED, device_class
 from pp_cl.network.layers import multiplications, unet_layers
 
 pytestmark = pytest.mark.usefixtures("quick")
@@ -15,7 +15,7 @@ pytestmark = pytest.mark.usefixtures("quick")
 )
 def test_rows_of_the_network(dev, monkeypatch, check_size, blocks):
     monkeypatch.setattr(unet, "CHECK_SIZE", check_size)
-    rows = list(unet.bench_unet(dev, 16, (16, 16, 32), make_policy(dev), blocks=blocks))
+    rows = list(unet.bench_unet(dev, 16, (16, 16, 32), blocks=blocks))
     names = ["auto", *OFFERED[device_class(dev)]]
     assert [row["direction"] for row in rows] == ["forward"] * len(names) + ["train"] * len(names)
     assert [row["variant"] for row in rows] == names * 2

@@ -57,7 +57,7 @@ def test_train_prints_and_writes_its_row(tmp_path, capsys):
 
 
 def test_all_prints_its_tables_and_writes_its_numbers(tmp_path, capsys, monkeypatch):
-    def found(dev, policy, budget, tell):
+    def found(dev, budget, tell):
         tell("a table")
         return {"budget": budget, "seconds": 2.6}
 

@@ -14,12 +14,13 @@ from support.tiles import pixels_of, random_counts
 
 from pp_cl.bench.conv import Layer
 from pp_cl.layers import conv_direct
-from pp_cl.layers.choice import CHOICES, SHIPPED, VARIANTS
+from pp_cl.layers.choice import CPUS, GPU, VARIANTS, laid_out
+from pp_cl.layers.conv_direct import ConvShape, Direction
 from pp_cl.layers.tiles import some_tiles
 from pp_cl.network.tile_plan import grow
 from pp_cl.selftest.layers import within
 
-CPU = SHIPPED["CPU"]
+CPU = CPUS[16]
 DIRECT, LOCAL, WINOGRAD = (VARIANTS[name] for name in ("direct", "local", "winograd"))
 # (module, side of the kernel)
 ALL = [
@@ -64,7 +65,7 @@ def test_launches_in_parts_compute_the_same_bits(dev, rng, monkeypatch, module, 
             dev,
             monkeypatch,
             f"{prefix}_{direction}",
-            lambda: tuple(layer.computed(dev, module, SHIPPED["GPU"])),
+            lambda: tuple(layer.computed(dev, module, GPU)),
         )
         assert launched > 1, direction
 
@@ -104,39 +105,35 @@ def test_smaller_work_groups_compute_the_same_bits(dev, rng, monkeypatch, most):
 def test_parts_grow_when_memory_is_short(dev, rng, monkeypatch, module, most):
     """Up to a single one."""
     layer = Layer.random(rng, (33, 10), (16, 20), 48)
-    floats = conv_direct.partial_floats(33, (3, 3, 3, 36, 16))
+    shape = ConvShape(Direction.BACKWARD_WEIGHTS, 3, (16, 20), 48, (33, 10))
+    parts = module.work_shape(shape)[0]
     monkeypatch.setattr(conv_direct, "PARTIAL_FLOATS", most)
-    assert conv_direct.partial_floats(33, (3, 3, 3, 36, 16)) < floats
+    assert module.work_shape(shape)[0] < parts
     results = layer.computed(dev, module, CPU)
     for i in (1, 2):
         assert relative_error(results[i], layer.expected[i]) < 5e-6
 
 
-# The many builds of some take half a minute each.
-FIELDS = {
-    "direct": (DIRECT, [((13, 13), (32, 16), 32), ((7, 37), (16,), 48), ((3, 2), (3,), 20)]),
-    "winograd_weights": (WINOGRAD, [((50, 31), (256,), 128), ((7, 7), (16,), 48)]),
-    "winograd": (WINOGRAD, [((50, 45), (256,), 80)]),
-    "winograd_narrow": (WINOGRAD, [((50, 31), (16,), 16), ((13, 13), (32, 16), 32)]),
-}
-SLOW = ("winograd", "winograd_narrow")
-
-
 @pytest.mark.parametrize(
-    "field", [pytest.param(f, marks=pytest.mark.slow) if f in SLOW else f for f in FIELDS]
+    "module, blocking, shape",
+    [
+        pytest.param(module, blocking, shape, id=f"{name} {shape}")
+        for module, shapes in (
+            (DIRECT, [((13, 13), (32, 16), 32), ((7, 37), (16,), 48), ((3, 2), (3,), 20)]),
+            (WINOGRAD, [((50, 45), (256,), 80), ((50, 31), (16,), 16), ((13, 13), (32, 16), 32)]),
+        )
+        for name, blocking in (("16 floats", CPUS[16]), ("8 floats", CPUS[8]), ("GPU", GPU))
+        for shape in shapes
+        if module is DIRECT or blocking is not GPU
+    ],
 )
 @pytest.mark.large
-def test_every_blocking(dev, rng, field):
-    """Images of more tiles than are taken at a time, in no more memory than each asks for."""
-    module, shapes = FIELDS[field]
-    layers = [Layer.random(rng, *shape) for shape in shapes]
-    values = {value for choices in CHOICES.values() for value in choices.get(field, ())}
-    blockings = [replace(CPU, **{field: value}) for value in sorted(values)]
-    for blocking in [*blockings, *([SHIPPED["GPU"]] if module is DIRECT else [])]:
-        for layer in layers:
-            for result in map(within, layer.computed(dev, module, blocking), layer.expected):
-                assert result.share <= 1, blocking
-        dev.check()
+def test_every_row_of_the_table(dev, rng, module, blocking, shape):
+    """Images of more tiles than are taken at a time, in no more memory than each row asks for."""
+    layer = Layer.random(rng, *shape)
+    for result in map(within, layer.computed(dev, module, blocking), layer.expected):
+        assert result.share <= 1
+    dev.check()
 
 
 @pytest.mark.parametrize("module, k", OF_3X3)
@@ -153,17 +150,23 @@ def test_a_relu_hides_no_nan(dev, rng, module, k):
 @pytest.mark.parametrize("module, k", OF_3X3)
 def test_what_does_not_fit_together_is_refused(dev, module, k):
     zeros = dev.zeros
-    x, out, weight, bias = zeros((4, 4, 16)), zeros((4, 4, 32)), zeros((2, k, k, 16, 16)), zeros(32)
+    x, out, bias = zeros((4, 4, 16)), zeros((4, 4, 32)), zeros(32)
     grown = some_tiles(dev, (4, 8), np.ones((1, 2)))
+    shapes = [ConvShape(way, k, (16,), 32, (4, 4)) for way in Direction]
+    weights, of_input = (
+        laid_out(dev, module, zeros((2, k, k, 16, 16)), shape)
+        for shape in (shapes[0], replace(shapes[1], source=0))
+    )
+    parts = zeros(module.work_shape(shapes[2]))
 
-    def forward(sources=(x,), weight=weight, bias=bias, out=out, tiles=None):
-        module.forward(dev, CPU, sources, weight, bias, out, relu=False, tiles=tiles)
+    def forward(sources=(x,), weights=weights, bias=bias, out=out, tiles=None):
+        module.forward(dev, CPU, sources, weights, bias, out, relu=False, tiles=tiles)
 
-    def backward_input(first=0, weight=weight, grad_out=out, tiles=None):
-        module.backward_input(dev, CPU, weight, first, grad_out, x, mask=None, tiles=tiles)
+    def backward_input(weights=of_input, grad_out=out, grad_x=x, tiles=None):
+        module.backward_input(dev, CPU, weights, grad_out, grad_x, mask=None, tiles=tiles)
 
-    def backward_weights(sources=(x,), shape=weight.shape, tiles=None):
-        module.backward_weights(dev, CPU, sources, out, shape, zeros(2**17), tiles=tiles)
+    def backward_weights(sources=(x,), grad_out=out, parts=parts, tiles=None):
+        module.backward_weights(dev, CPU, sources, grad_out, parts, tiles=tiles)
 
     for call in (forward, backward_input, backward_weights):
         call()
@@ -172,17 +175,19 @@ def test_what_does_not_fit_together_is_refused(dev, module, k):
         partial(forward, bias=zeros(16)),
         partial(forward, out=zeros((4, 5, 32))),
         partial(forward, tiles=grown),
+        partial(backward_input, grad_x=zeros((4, 4, 32))),
         partial(backward_input, tiles=grown),
         partial(backward_weights, (x, x)),
-        partial(backward_weights, shape=(1, k, k, 16, 16)),
+        partial(backward_weights, grad_out=zeros((4, 4, 16))),
         partial(backward_weights, tiles=grown),
     ]
     if module is WINOGRAD:
+        odd = replace(shapes[1], sources=(8, 32), source=1)
         wrong += [
-            partial(forward, (zeros((4, 4, 3)),), zeros((2, k, k, 3, 16))),
+            partial(forward, (zeros((4, 4, 3)),)),
             partial(backward_input, grad_out=zeros((4, 4, 20))),
-            partial(backward_input, first=8, weight=zeros((2, k, k, 32, 16))),
-            partial(backward_input, first=16),
+            partial(backward_weights, (zeros((4, 4, 3)),)),
+            partial(laid_out, dev, module, zeros((2, k, k, 40, 16)), odd),
         ]
     for call in wrong:
         with pytest.raises(ValueError, match="tiles|channels|width"):

@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 
 from pp_cl.errors import UserError
-from pp_cl.layers.choice import VARIANTS, ConvolutionPolicy, make_policy, shipped_order
 from pp_cl.metrics import lpips
 from pp_cl.metrics.psnr_ssim import PSNR_CAP, Metrics, mean, psnr, ssim
 from pp_cl.reference.lpips import random_weights
@@ -91,22 +90,6 @@ def test_only_the_named_metrics_are_computed_in_their_order(dev, rng, pair, monk
     assert list(measured) == ["lpips", "psnr"]
     assert measured["lpips"] == lpips.Lpips(dev, weights).distance(a, b) > 0
     assert list(Metrics(None, ("ssim",))(a, b)) == ["ssim"]
-
-
-def test_lpips_takes_the_shipped_convolutions_whatever_the_run_has(dev, rng, monkeypatch):
-    """So that a metric depends neither on a run's tolerance nor on its tuning, nor is slow."""
-    monkeypatch.setattr(lpips, "load_weights", lambda: random_weights(rng))
-    chosen = []
-
-    def convolution(policy, shape):
-        chosen.append((policy.choose(shape), shipped_order(policy.device_class, shape)[0]))
-        return VARIANTS[chosen[-1][0]]
-
-    monkeypatch.setattr(ConvolutionPolicy, "convolution", convolution)
-    image = np.zeros((32, 32, 3))
-    for policy in (None, make_policy(dev, 1e-7), make_policy(dev, variant="direct")):
-        Metrics(dev, ("lpips",), policy)(image, image)
-    assert chosen and all(name == shipped for name, shipped in chosen)
 
 
 def test_mean_leaves_names_out():

@@ -7,7 +7,6 @@ import pytest
 from support.comparisons import relative_error
 
 import pp_cl.network.unet
-from pp_cl.layers.choice import make_policy
 from pp_cl.layers.tiles import SIDE, grid_shape
 from pp_cl.network.layers import BLOCKS, convolutions, gradient_of, unet_layers
 from pp_cl.network.tile_plan import (
@@ -80,8 +79,7 @@ def run(dev, net, x, grad_y, *, sparse):
 @pytest.mark.exact
 def test_equals_the_dense_network(dev, rng, always, name, variant, blocks):
     x, grad_y = scene(rng, OBJECTS[name])
-    policy = make_policy(dev, variant=variant)
-    net = UNet(dev, (16, 32, 48), blocks=blocks, seed=1, policy=policy)
+    net = UNet(dev, (16, 32, 48), blocks=blocks, seed=1, variant=variant)
     expected = run(dev, net, x, grad_y, sparse=False)
     actual = run(dev, net, x, grad_y, sparse=True)
     device_x = dev.upload(x)

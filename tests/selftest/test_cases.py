@@ -45,7 +45,6 @@ GPU_CASES = (
     "layers: tiles",
     "loss: L1 and SSIM",
     "loss: mask",
-    "loss: perceptual",
     "metrics: distance of LPIPS",
     "adam: arrays",
     "rmsprop: degree 2",

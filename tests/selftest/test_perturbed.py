@@ -54,7 +54,6 @@ FLIPS = [
     ("training/exposure", "gain + white", "gain - white", "loss: exposure"),
     ("raster/blend", "spread += b", "spread -= b", "alpha: spread"),
     ("training/loss", "terms[0] += weight", "terms[0] -= weight", "loss: sum of its terms"),
-    ("training/perceptual", "= of_row /", "= -of_row /", "loss: perceptual"),
     ("training/adam", "(g - m_new)", "(g + m_new)", "adam: arrays"),
     ("training/adam", "- rate * m_new", "+ rate * m_new", "adam: gradients of 0, 1e-20 and 1e10"),
     ("training/rmsprop", "- rate * basis", "+ rate * basis", "rmsprop: degree 2"),

@@ -25,7 +25,6 @@ HEADER = {
     "initial_points": 50,
     "grid": {"origin": [-1.0, -1.0, -1.0], "edge": 0.25, "dims": [9, 8, 7]},
     "depth_range": [2.0, 6.0],
-    "tuning": None,
 }
 
 

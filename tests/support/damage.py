@@ -31,7 +31,7 @@ NAMES = (
     "format fl_x cx w near far camera_angle_x k1 k4 p2 camera_model mask_path file_path frames fov"
     " test_filenames applied_transform aabb_scale path size intrinsics_format mass R focal_length"
     " frame_number camera_path camera_to_world render_width rotation position width fx scene train"
-    " points preset tuning grid step finished seconds psnr loss device mean ms rel_l2 rows kind"
+    " points preset grid step finished seconds psnr loss device mean ms rel_l2 rows kind"
 )
 KEYS = [*NAMES.split(), "", "__class__", "a\nb", "x" * 5000, "ä"]
 DTYPES = ["f2", "f4", "f8", ">f8", "i4", "u1", "i8", "c8", "U3", "?", "M8[s]", "S4"]

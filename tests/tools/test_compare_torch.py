@@ -10,7 +10,7 @@ import pytest
 from support.comparisons import relative_error
 
 from pp_cl.bench.unet import make_network, plain_parameters
-from pp_cl.layers.choice import AUTO, VARIANTS, make_policy
+from pp_cl.layers.choice import AUTO, VARIANTS
 from tools.compare_torch import TorchNetwork, main
 
 
@@ -24,7 +24,7 @@ def torch():
 
 @pytest.mark.parametrize("variant", [AUTO, *VARIANTS])
 def test_the_twin_is_the_same_network(torch, dev, rng, variant):
-    net = make_network(dev, (16, 32, 48), make_policy(dev, variant=variant))
+    net = make_network(dev, (16, 32, 48), variant)
     x, grad_image = (
         rng.normal(size=(16, 16, 16)).astype(np.float32),
         rng.normal(size=(16, 16, 3)).astype(np.float32),

@@ -1,0 +1,51 @@
+"""tools/tune.py: what it tries runs, and the row that it prints is the fastest of it."""
+
+from dataclasses import replace
+
+import pytest
+
+from pp_cl.bench.conv import RandomConv
+from pp_cl.bench.timing import errors
+from pp_cl.layers.choice import blocking_of
+from tools import tune as TOOL
+
+
+@pytest.mark.usefixtures("cpu_form")
+def test_the_fastest_candidates_make_the_row(dev, monkeypatch, capsys):
+    """As if fewer accumulators, and four tiles of one group together, were faster."""
+    tried = []
+
+    def runner(conv, variant, direction, blocking):
+        tried.append((variant, direction, blocking))
+        return lambda: blocking
+
+    def interleave(runs):
+        """{name: [milliseconds]}."""
+        return {
+            name: [run().accumulators + 100 * (run().winograd != (64, 4))]
+            for name, run in runs.items()
+        }
+
+    monkeypatch.setattr(RandomConv, "runner", runner)
+    monkeypatch.setattr(TOOL, "interleave", interleave)
+    found = TOOL.tuned(dev, [RandomConv(dev, 3, 8, (16,), co=16)])
+    assert found.winograd == (64, 4) and found.accumulators == 4
+    assert found.direct == TOOL.CANDIDATES["CPU"][2][2][0]["direct"]
+    assert {direction for _, direction, _ in tried} == {*TOOL.IMAGES, *TOOL.WEIGHTS}
+    assert len(capsys.readouterr().out.splitlines()) == sum(
+        len(candidates) for _, _, candidates in TOOL.CANDIDATES["CPU"]
+    )
+
+
+@pytest.mark.slow
+def test_every_candidate_is_right(dev):
+    """On a layer whose groups of channels come in pairs, and on one of three groups."""
+    for variants in TOOL.CANDIDATES.values():
+        for variant, directions, candidates in variants:
+            for co in (32, 48):
+                conv = RandomConv(dev, 3, 12, (32,), co=co)
+                for fields in candidates:
+                    for direction in directions:
+                        blocking = replace(blocking_of(dev), **fields)
+                        if variant in conv.variants:
+                            assert errors(*conv.result(variant, direction, blocking))[0] < 1e-5

@@ -1,0 +1,118 @@
+"""Times what a row of the table in pp_cl/layers/choice.py can hold, on the device at hand, and
+prints the best of it as such a row.
+
+    python -m tools.tune [--device D]
+
+Each field is timed with the best values of those before it, over the 3x3 convolutions of the preset
+tiny's network at SIDE x SIDE pixels. Times are medians of interleaved runs. Run it twice on a quiet
+machine: what differs between the two runs does not matter.
+"""
+
+import argparse
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from pp_cl.bench.conv import RandomConv
+from pp_cl.bench.timing import interleave
+from pp_cl.config import preset
+from pp_cl.device.device import Device
+from pp_cl.device.discover import open_device
+from pp_cl.layers.choice import blocking_of, device_class
+from pp_cl.layers.conv_direct import Blocking, Direction
+from pp_cl.network.layers import convolutions, unet_layers
+
+SIDE = 96
+IMAGES = Direction.FORWARD, Direction.BACKWARD_INPUT
+WEIGHTS = (Direction.BACKWARD_WEIGHTS,)
+ONE, TILE = (1, 1, 1), (16, 4, 1)  # work-groups
+# {class of device: [(variant, directions, the fields that are tried)]}
+CANDIDATES: dict[str, Any] = {
+    "CPU": [
+        (
+            "winograd",
+            IMAGES,
+            [
+                {"winograd_groups": groups, "winograd": (64, n), "winograd_narrow": narrow}
+                for groups, n, narrow in (
+                    (2, 8, (12, 12)),
+                    (2, 8, (16, 8)),
+                    (2, 4, (16, 4)),
+                    (2, 2, (16, 2)),
+                    (1, 8, (24, 8)),
+                    (1, 4, (24, 4)),
+                    (1, 4, (64, 4)),
+                    (1, 2, (24, 2)),
+                )
+            ],
+        ),
+        ("winograd", WEIGHTS, [{"winograd_weights": n} for n in (16, 32, 64)]),
+        (
+            "direct",
+            IMAGES,
+            [
+                {"direct": (*pair, ONE), "direct_odd": (*odd, ONE)}
+                for pair, odd in (
+                    ((8, 2), (12, 1)),
+                    ((4, 2), (8, 1)),
+                    ((2, 2), (4, 1)),
+                    ((6, 1), (6, 1)),
+                    ((4, 1), (4, 1)),
+                )
+            ],
+        ),
+        ("direct", WEIGHTS, [{"accumulators": n} for n in (24, 12, 6, 4)]),
+    ],
+    "GPU": [
+        (
+            "direct",
+            IMAGES,
+            [
+                {"direct": (4, 1, group), "direct_odd": (4, 1, group)}
+                for group in (TILE, (8, 8, 1), (32, 2, 1))
+            ],
+        ),
+        ("direct", WEIGHTS, [{"accumulators": n} for n in (6, 12)]),
+    ],
+}
+
+
+def network_convolutions(dev: Device, side: int = SIDE) -> list[RandomConv]:
+    """The 3x3 convolutions of the preset tiny's network, on random data."""
+    network = preset("tiny").network
+    return [
+        RandomConv(dev, 3, side >> layer.level, layer.sources, co=layer.channels)
+        for layer in convolutions(unet_layers(network.widths, blocks=network.blocks))
+        if layer.kernel_size == 3
+    ]
+
+
+def tuned(dev: Device, convs: Sequence[RandomConv]) -> Blocking:
+    """The shipped row of a device with the fastest of CANDIDATES, whose times are printed."""
+    blocking = blocking_of(dev)
+    for variant, directions, candidates in CANDIDATES[device_class(dev)]:
+        tried = [replace(blocking, **fields) for fields in candidates]
+        ms = np.zeros(len(tried))
+        for conv in (conv for conv in convs if variant in conv.variants):
+            for direction in directions:
+                runs = {i: conv.runner(variant, direction, b) for i, b in enumerate(tried)}
+                ms += [np.median(times) for times in interleave(runs).values()]
+        for fields, total in zip(candidates, ms, strict=True):
+            print(f"{variant} {'/'.join(d.value for d in directions)} {fields}: {total:.2f} ms")
+        blocking = tried[int(ms.argmin())]
+    return blocking
+
+
+def main() -> None:
+    """Measure, print the times and the row."""
+    parser = argparse.ArgumentParser(description=__doc__.split("\n\n")[0])
+    parser.add_argument("--device", help="as `pp-cl train` takes it")
+    dev = open_device(parser.parse_args().device)
+    print(f"{dev.name}, vectors of {dev.device.native_vector_width_float} floats")
+    print(tuned(dev, network_convolutions(dev)))
+
+
+if __name__ == "__main__":
+    main()
