@@ -102,8 +102,6 @@ class Renderer:
         gamma: float,
         *,
         until: Literal["weights", "features", "image"] = "image",
-        dropout: float = 0.0,
-        seed: int = 0,
         early_stop: float | None = None,
         depth_range: tuple[float, float] | None = None,
         training: bool = False,
@@ -112,9 +110,9 @@ class Renderer:
         """Render a camera, which is padded to multiples of 4 pixels.
 
         until: the last stage wanted: blend weights, blended features or the network's image.
-        gamma: depth sharpness of the softmax, unused by alpha compositing. dropout: share of the
-        points left out, at random by `seed`. early_stop: instead of the settings'. depth_range:
-        instead of the model's, for cameras that see beyond it; the softmax needs the model's.
+        gamma: depth sharpness of the softmax, unused by alpha compositing. early_stop: instead of
+        the settings'. depth_range: instead of the model's, for cameras that see beyond it; the
+        softmax needs the model's.
         training: keep what backward() needs. gradient_tiles: returns that argument of
         UNet.plan_tiles(); called after the wait for the device.
         """
@@ -143,8 +141,6 @@ class Renderer:
                 point_id=cloud.ids,
                 cloud_offset=cloud.offset,
                 radius=point_radius(self.settings, self.model.grid.edge, self.model.depth_range),
-                dropout=dropout,
-                seed=seed,
             )
         pairs, weights, tiles = self._pairs_and_weights(points, size, gamma, early_stop)
         result = RenderResult(dev, camera, (left, top), size, points, pairs, weights, tiles)

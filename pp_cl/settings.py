@@ -213,7 +213,6 @@ class TrainConfig:
         0,
         10**8,
     )
-    dropout: float = setting(0.0, "share of the points left out at random in each step", 0, 0.95)
     sh_smoothing: float = setting(
         0.03,
         "per step, pull the SH towards the mean of the grid neighbours by this times their"

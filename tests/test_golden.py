@@ -24,7 +24,6 @@ SETTINGS = {
     "network.rate": "3e-3,3e-4",
     "train.iterations": 60,
     "train.crop": 40,
-    "train.dropout": 0.3,
     "train.sh_smoothing": 0.25,
     "train.sh_smoothing_every": 1,
     "train.prune_every": 20,

@@ -157,7 +157,7 @@ def _trainer(dev, config, views, hull, net):
 
 def _train(trainer, measured):
     """(rows of the curve, time of the last steps by stage)."""
-    steps, curve, spent = trainer.config.iterations, [], 0.0
+    steps, curve, spent = trainer.config.train.iterations, [], 0.0
     due = {round(steps * (i + 1) / MEASURED) for i in range(MEASURED)}
     while trainer.step < steps - TIMED_STEPS:
         start = time.perf_counter()

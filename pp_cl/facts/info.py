@@ -35,8 +35,8 @@ from pp_cl.scene.outline import SHOWN_VIEWS, picture
 from pp_cl.scene.overview import overview
 from pp_cl.scene.sparse import sparse_points
 from pp_cl.scene.views import MASK_THRESHOLD, View, evenly
-from pp_cl.session import first_hull
 from pp_cl.training.checkpoint import opened_run
+from pp_cl.training.start import first_hull
 
 SHOWN_POINTS = 20_000  # of a hull
 HULL_COLOUR = (230, 140, 200)

@@ -1,5 +1,7 @@
 """Gains of photographs that differ in exposure or white balance, and whether they do."""
 
+import warnings
+
 import numpy as np
 from pyopencl.array import Array
 
@@ -97,6 +99,19 @@ class Exposure:
         common = (tt.sum(0) - pt.sum(0) ** 2 / np.maximum(pp.sum(0), TINY)).sum()
         own = (tt - pt**2 / np.maximum(pp, TINY)).sum()
         return float(1 - own / common) if common > TINY else 0.0
+
+    def decided(self) -> "Exposure | None":
+        """Itself, applied from now on, if gains explain enough of the error, else None."""
+        share = self.explained()
+        if share <= LEAST_SHARE:
+            return None
+        self.is_applied = True
+        warnings.warn(
+            f"the photographs differ in exposure or white balance ({share:.0%} of their error);"
+            " a gain of each view and channel is found beside the model (train.exposure)",
+            stacklevel=2,
+        )
+        return self
 
 
 def decided_at(begun: int, views: int) -> int:

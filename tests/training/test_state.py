@@ -14,7 +14,8 @@ from pp_cl.raster.points import PointCloud
 from pp_cl.scene.grid import Grid
 from pp_cl.session import open_training
 from pp_cl.settings import TrainConfig
-from pp_cl.training.state import PointState, final_points_to_keep, points_to_keep
+from pp_cl.training.prune import final_points_to_keep, points_to_keep
+from pp_cl.training.state import PointState
 
 pytestmark = pytest.mark.kernels  # of refine.cl
 
