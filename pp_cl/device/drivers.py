@@ -19,7 +19,7 @@ import numpy as np
 import pyopencl as cl
 import pyopencl.array as cl_array
 
-from pp_cl.device.launch import quiet_compiler
+from pp_cl.device.kernel import quiet_compiler
 from pp_cl.errors import UserError
 from pp_cl.files.atomic import cache_folder, make_cache_folder, write_json
 from pp_cl.files.untrusted import read_regular
