@@ -19,8 +19,9 @@ PRESETS: dict[str, dict[str, Any]] = {
         "train.crop": 256,
     },
     "paper": {
-        # Stated by the supplemental, as are the defaults of raster.gamma, train.sh_rate and its
-        # decay, and the delays of 0, 500 and 1000 steps.
+        # Stated by the supplemental, as are the default of train.sh_rate, and what is the same in
+        # all presets: gamma, the decay of the SH's rates and their delays of 0, 500 and 1000 steps
+        # (training/schedule.py).
         "points.count": 4_000_000,
         "points.opacity": 1.0,
         "raster.blend": "softmax",

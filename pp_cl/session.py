@@ -42,7 +42,6 @@ from pp_cl.train import Trainer
 from pp_cl.training.budget import Budget
 from pp_cl.training.checkpoint import load_run_state, opened_run
 from pp_cl.training.memory import Room
-from pp_cl.training.schedule import bound_to_end
 from pp_cl.training.start import NEVER, begin_network, fitting_hull, picture_of_masks
 
 FIRST_PREVIEW = 10.0  # seconds; with a slow step and its writing it shows within 20
@@ -214,9 +213,7 @@ class Training:
         trainer = self.trainer
         header = trainer.model.header() | self.info | {"step": trainer.step, "finished": finished}
         header |= {"exposed": True} if trainer.is_exposed else {}
-        config = self.config
-        is_whole = finished and bound_to_end(config.network, config.raster, config.train)
-        self.folder.save(header, trainer.model.arrays() if is_whole else trainer.arrays())
+        self.folder.save(header, trainer.model.arrays() if finished else trainer.arrays())
         self._expect_save()
         self._saved = trainer.step
 
@@ -291,16 +288,14 @@ def begin_training(dev: Device, folder: RunFolder, config: Config) -> Training:
 def resume_training(dev: Device, folder: RunFolder, config: Config, stored: Stored) -> Training:
     """The training in `folder` from its checkpoint on.
 
-    A finished one is extended to config.train.iterations: as if it had been asked for them from its
-    beginning, if its checkpoint holds its state, else with new moments and without refinements.
+    A finished one is extended to config.train.iterations, with new moments and without refinements:
+    every schedule ends at the last step, so it is not what it would have been from its beginning.
     Raises UserError as begin_training() does, and for a checkpoint of another scene.
     """
     header, arrays = stored
     check_writable(folder.path)
     folder.check_pictures(header["step"])
-    begun = header.get("extended_from", 0)
-    if header["finished"] and not any(name.startswith("state.") for name in arrays):
-        begun = header["step"]
+    begun = header["step"] if header["finished"] else header.get("extended_from", 0)
     extended = replace(config, train=replace(config.train, refine_at=NEVER)) if begun else config
 
     net = UNet.of_settings(dev, config.network)
@@ -322,8 +317,6 @@ def resume_training(dev: Device, folder: RunFolder, config: Config, stored: Stor
     left_out = header.get("left_out", [])
     trainer = Trainer(dev, extended, model, [view for view in views if view.name not in left_out])
     trainer.restore(header["step"], arrays, begun)
-    if header["finished"] and trainer.step % config.train.prune_every == 0:
-        trainer.prune()  # the last step of a training leaves that to its end
     info["initial_points"] = header["initial_points"]
     info |= {"extended_from": begun} if begun else {}
     info |= {"left_out": left_out} if left_out else {}

@@ -23,6 +23,7 @@ from pp_cl.training.loss import Loss, MaskLoss, ignore_gradient, ignore_target
 from pp_cl.training.optim import Optimiser
 from pp_cl.training.prune import points_of_large_parts, points_that_views_show, points_to_keep
 from pp_cl.training.schedule import (
+    SMOOTHING_EVERY,
     Rates,
     ema_start,
     ema_weight,
@@ -85,7 +86,7 @@ class Trainer:
     @property
     def gamma(self) -> float:
         """Depth sharpness of the softmax after the steps done."""
-        return gamma_at(self.step, self.config.train.iterations, *self.config.raster.gamma)
+        return gamma_at(self.step, self.config.train.iterations)
 
     # ---- a step ----------------------------------------------------------------------------------
 
@@ -207,14 +208,15 @@ class Trainer:
         is_open = self.exposure is not None and not self.exposure.is_applied
         if is_open and step == decided_at(self.begun, len(self.views)):
             self.exposure = self.exposure.decided()
-        if train.sh_smoothing > 0 and step % train.sh_smoothing_every == 0:
+        if train.sh_smoothing > 0 and step % SMOOTHING_EVERY == 0:
             with self.dev.stage("smoothing"):
                 self._smooth(rates)
         weight = ema_weight(step, train.iterations) if train.ema else 0
         if weight > 0:
             with self.dev.stage("averages"):
                 self.optimiser.update_ema(weight)
-        if step % train.prune_every == 0 and step < train.iterations:
+        is_judged = train.prune_weight > 0 and step % train.prune_every == 0
+        if is_judged and step < train.iterations:
             with self.dev.stage("pruning"):
                 self.prune()
         if step in self._refine_steps:
@@ -226,7 +228,7 @@ class Trainer:
         train, cloud = self.config.train, self.model.cloud
         if self._smoother is None:
             self._smoother = Smoother(self.dev, self.model.grid_buffer, cloud.ids)
-        pull = train.sh_smoothing * train.sh_smoothing_every
+        pull = train.sh_smoothing * SMOOTHING_EVERY
         for block, sh in zip(cloud.blocks, cloud.sh, strict=True):
             if rates.sh[block.degree] > 0:
                 self._smoother.smooth(sh, min(1.0, pull * rates.sh[block.degree]))

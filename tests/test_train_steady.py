@@ -20,7 +20,7 @@ EVERY_STEP = {  # so that a step of any number does what most do
     "points.count": 300,
     "train.iterations": 1000,
     "train.prune_every": 900,
-    "train.sh_smoothing_every": 900,
+    "train.sh_smoothing": 0,
 }
 SETTINGS = {
     "tiny": {},

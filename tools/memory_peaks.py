@@ -28,13 +28,13 @@ from pp_cl.session import open_training, run_config
 
 MIB = 2**20
 PHONE, PHONES, SHRUNK = (4000, 3000), 300, 4  # pixels, photographs, times the drawing is enlarged
-EARLY = {"train.iterations": 30, "train.eval_every": 0, "train.sh_smoothing_every": 4}
+EARLY = {"train.iterations": 70, "train.eval_every": 0}  # they are smoothed once
 # what is trained: preset, settings
 TRAININGS = {
     "tiny": ("tiny", {}),
     "small": ("small", {}),
     # without pruning, or its second refinement would be left out
-    "full": ("full", {"points.count": 30_000, "train.prune_weight": 0, "train.prune_opacity": 0}),
+    "full": ("full", {"points.count": 30_000, "train.prune_weight": 0}),
     "paper": ("paper", {"points.count": 1_500_000, "scene.downscale": 4, "train.iterations": 4}),
     "paper in full": ("paper", {"train.iterations": 3}),  # 12 GiB on lego
     "phone": ("tiny", {"scene.downscale": 8}),

@@ -18,7 +18,7 @@ from pp_cl.network.unet import UNet
 from pp_cl.scene.hull import build_grid, depth_range
 from pp_cl.scene.load import open_scene, scene_box
 from pp_cl.train import Trainer
-from pp_cl.training.schedule import Rates
+from pp_cl.training.schedule import GAMMA, Rates
 
 TRIED_STEPS = 4  # whose time says how many fit; the first builds the kernels and does not count
 TIMED_STEPS = 6  # the last ones, by stage
@@ -107,7 +107,7 @@ def bench_step(
                 seconds.clear()  # the first round builds the programs
             for i in range(views):
                 view = trainer.views[len(trainer.views) * i // views]
-                result = renderer.forward(view.camera, config.raster.gamma[1], until="features")
+                result = renderer.forward(view.camera, GAMMA[1], until="features")
                 if i not in grads:
                     values = np.random.default_rng(i).normal(size=result.features.shape) * 1e-6
                     grads[i] = dev.upload(values, np.float32)

@@ -136,14 +136,10 @@ def _first_line(training):
 
 def _extended_line(training):
     """A line of text: how an extended training differs from one that was as long from its start."""
-    from pp_cl.training.schedule import bound_to_end
-
-    config, begun = training.config, training.trainer.begun
-    bound = ["the optimiser's moments, which begin anew"]
-    bound += bound_to_end(config.network, config.raster, config.train)
     return (
-        f"extends a finished training of {begun} steps; {config.train.iterations} from the start"
-        f" differ in {', '.join(bound)}"
+        f"extends a finished training of {training.trainer.begun} steps;"
+        f" {training.config.train.iterations} from the start would differ, as all schedules end at"
+        " the last step and the optimiser's moments begin anew"
     )
 
 

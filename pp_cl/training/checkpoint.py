@@ -16,7 +16,7 @@ from pp_cl.raster.points import SH_DEGREES, sh_blocks
 from pp_cl.scene.grid import MOST_VERTICES, Grid
 from pp_cl.scene.identity import kept_views
 from pp_cl.training.exposure import decided_at
-from pp_cl.training.schedule import bound_to_end, ema_start
+from pp_cl.training.schedule import ema_start
 from pp_cl.training.state import PointState
 
 MOST_LENGTH = 1e30  # world units; float32 would hold no products of larger ones
@@ -101,9 +101,7 @@ def _problem_of_forms(stored, config):
     if not 0 < n <= most:
         return f"points.ids is {ids or 'missing'}, expected 1 to {most} points"
     half = forms.get("points.sh0", ids).dtype == np.float16
-    ends = header["finished"] and bound_to_end(config.network, config.raster, config.train)
-    is_bare = ends or (header["finished"] and "state.last_step" not in forms)
-    step = None if is_bare else header["step"]
+    step = None if header["finished"] else header["step"]
     gains = 0 if step is None else _views_with_gains(header, config)
     expected = stored_forms(config, n, step, half and header["finished"], gains)
     for name in sorted(expected.keys() | forms.keys()):

@@ -13,8 +13,10 @@ from pp_cl.raster.weights import record_weights
 from pp_cl.render import Renderer
 from pp_cl.scene.views import View
 from pp_cl.settings import TrainConfig
+from pp_cl.training.schedule import GAMMA
 from pp_cl.training.state import PointState
 
+LEAST_OPACITY = 0.01
 MANY_VIEWS = 24  # so many show every place several times
 SPECK = 50  # points: a patch of about 7 x 7 pixels where they are a pixel apart
 
@@ -22,7 +24,7 @@ SPECK = 50  # points: a patch of about 7 x 7 pixels where they are a pixel apart
 def points_to_keep(dev: Device, state: PointState, opacity: Array, train: TrainConfig) -> Array:
     """(M,) uint32, ascending: the points that are kept during training. A point is judged once
     train.prune_looks steps had it in their image: it is kept if its blend weight reached
-    train.prune_weight in one of them and its opacity is at least train.prune_opacity, and its
+    train.prune_weight in one of them and its opacity is at least LEAST_OPACITY, and its
     counts start anew. Points seen less often are kept.
 
     The maximum decides, as a mean would drop what few views see, such as the inside of a gap.
@@ -34,7 +36,7 @@ def points_to_keep(dev: Device, state: PointState, opacity: Array, train: TrainC
     if broken:
         raise Diverged(f"{broken} points have a weight or an opacity that is not finite")
     judged = seen >= train.prune_looks
-    passes = (weight >= train.prune_weight) & (opacities >= train.prune_opacity)
+    passes = (weight >= train.prune_weight) & (opacities >= LEAST_OPACITY)
     dev.write(state.max_weight, np.where(judged, np.float32(0), weight))
     dev.write(state.times_seen, np.where(judged, np.float32(0), seen))
     return _listed(dev, ~judged | passes, weight)
@@ -49,7 +51,7 @@ def final_points_to_keep(
     least: int,
 ) -> Array:
     """(M,) uint32, ascending: the points of a finished training that weigh at least
-    train.final_prune_weight in `least` training views and have train.prune_opacity. NaN counts as
+    train.final_prune_weight in `least` training views and have LEAST_OPACITY. NaN counts as
     too little.
 
     max_weight, times_seen: (N,) float32, the highest blend weight in a training view, and in how
@@ -57,7 +59,7 @@ def final_points_to_keep(
     """
     weight, seen = dev.download(max_weight), dev.download(times_seen)
     keep = (weight >= train.final_prune_weight) & (seen >= least)
-    return _listed(dev, keep & (dev.download(opacity) >= train.prune_opacity), weight)
+    return _listed(dev, keep & (dev.download(opacity) >= LEAST_OPACITY), weight)
 
 
 def points_that_views_show(renderer: Renderer, views: Sequence[View], config: Config) -> Array:
@@ -67,7 +69,7 @@ def points_that_views_show(renderer: Renderer, views: Sequence[View], config: Co
     dev, cloud, train = renderer.dev, renderer.model.cloud, config.train
     max_weight, seen = (dev.zeros((cloud.count,)) for _ in range(2))
     for view in views:
-        drawn = renderer.forward(view.camera, config.raster.gamma[1], until="weights")
+        drawn = renderer.forward(view.camera, GAMMA[1], until="weights")
         record_weights(dev, drawn.pairs, drawn.weights, max_weight, seen, train.final_prune_weight)
         del drawn  # else its arrays would stay beside the larger ones of the next view
     least = 2 if len(views) >= MANY_VIEWS else 1
