@@ -15,7 +15,7 @@ from pp_cl.cli import main
 from pp_cl.config import preset
 from pp_cl.network.unet import UNet
 from pp_cl.scene.grid import Grid
-from pp_cl.train import SPECK
+from pp_cl.training.prune import SPECK
 from pp_cl.training.start import DEMO_NETWORK, begin_network
 
 
