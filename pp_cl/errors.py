@@ -35,6 +35,9 @@ class Unusable(UserError):
         self.why = why
 
 
+BROKEN_CAMERA = "a camera that is broken"  # why of an Unusable
+
+
 class Diverged(UserError):
     """A training has come to numbers that are none. The message says where."""
 

@@ -5,7 +5,6 @@ frames of a film; what is blurred, broken or there twice is left out.
 import logging
 import os
 import re
-import warnings
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from itertools import groupby, pairwise
@@ -19,15 +18,25 @@ from tqdm import tqdm
 from pp_cl.capture.packages import needed
 from pp_cl.errors import UserError, shown
 from pp_cl.files.atomic import atomic_file, atomic_folder
-from pp_cl.files.image import EIGHT_BIT_MODES, is_deep_png
+from pp_cl.files.image import ORIENTATION, in_srgb, is_deep_png
 from pp_cl.files.untrusted import opened_regular
 from pp_cl.scene.readers.found import MASK_FOLDERS
 
-ENDINGS = (".jpg", ".jpeg", ".png", ".webp", ".tif", ".tiff", ".heic", ".heif")
-FORMATS = ("JPEG", "PNG", "WEBP", "TIFF", "HEIF")  # JPEG opens MPO, which phones write, too
+ENDINGS = (
+    *(".jpg", ".jpeg", ".jfif", ".png", ".webp", ".tif", ".tiff", ".bmp"),
+    *(".avif", ".heic", ".heif"),
+)
+FORMATS = (
+    "JPEG",
+    "PNG",
+    "WEBP",
+    "TIFF",
+    "BMP",
+    "AVIF",
+    "HEIF",
+)  # JPEG opens MPO, which phones write, too
 KEPT = {"JPEG": ".jpg", "MPO": ".jpg", "PNG": ".png"}  # formats that are copied as they are
-MODES = (*EIGHT_BIT_MODES, "CMYK", "YCbCr")
-ORIENTATION, MAKE, MODEL, EXIF = 0x0112, 0x010F, 0x0110, 0x8769
+MAKE, MODEL, EXIF = 0x010F, 0x0110, 0x8769
 FOCAL, FOCAL_35 = 0x920A, 0xA405  # of the part of EXIF about the exposure
 # there, too: pixels across and down, pixels per unit, the unit
 SENSOR = (0xA002, 0xA003, 0xA20E, 0xA210)
@@ -153,26 +162,25 @@ def _take(folder, file, target):
     source = file.relative_to(folder)
     facts = {"source": source.as_posix()}
     try:
-        with opened_regular(file) as opened, warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # Pillow's, of odd EXIF
+        with opened_regular(file) as opened:
             image = Image.open(opened, formats=FORMATS)
             image.load()
-            if image.mode not in MODES:
-                raise ValueError(f"{image.mode} has not 8 bits a channel")
-            is_kept = image.format in KEPT and image.mode in ("RGB", "RGBA", "L")
+            turned = ImageOps.exif_transpose(image)
+            upright = in_srgb(file, turned)
+            is_kept = image.format in KEPT and upright is turned
+            is_kept = is_kept and image.mode in ("RGB", "RGBA", "L")
             is_kept = is_kept and image.getexif().get(ORIENTATION, 1) == 1 and not is_deep_png(file)
             content = opened.seek(0) or opened.read() if is_kept else None
             lens, exif = _lens(image.getexif())
             # folders are of a round each, or of a camera
             facts["lens"] = f"{source.parent.as_posix()}: {lens}" if len(source.parts) > 1 else lens
             facts["focal"] = _focal_of_larger(image.getexif().get_ifd(EXIF), image.size)
-            upright = ImageOps.exif_transpose(image)
     except Image.DecompressionBombError:
         return facts | {"reason": "has more than 178 million pixels"}
     except Exception as error:  # decoders meet broken bytes with whatever comes up
         return facts | {"reason": f"cannot be read ({shown(str(error), 80)})"}
     facts |= _look(upright)
-    has_alpha = image.mode in ("RGBA", "LA", "PA") or "transparency" in image.info
+    has_alpha = upright.has_transparency_data
     suffix = KEPT[image.format] if is_kept else ".png" if has_alpha else ".jpg"
     facts["name"] = target.name + suffix
     with atomic_file(target.with_name(facts["name"])) as copy:

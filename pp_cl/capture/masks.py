@@ -227,6 +227,18 @@ def uniform_mask(image: np.ndarray, name: str, with_holes: bool = False) -> np.n
     return cv2.resize(mask, (width, height)) if (border < 128).mean() >= UNIFORM else None
 
 
+def inside(file: Path, is_turntable: bool) -> np.ndarray | None:
+    """(H, W) uint8: where a photograph shows the object by its alpha, which may hide a wall, or on
+    a turntable by its uniform background; None where neither tells.
+    """
+    if file.name.lower().endswith(OPAQUE) and not is_turntable:
+        return None
+    image = read_rgba(file)
+    if (image[..., 3] < 255).any():
+        return np.where(image[..., 3] > 127, np.uint8(255), np.uint8(0))
+    return uniform_mask(image, file.name) if is_turntable else None
+
+
 def _before_uniform(window, points, with_holes):
     """(H, W) bool: the mask of a window whose background is uniform, and from which all points
     (M, 3) of the object stand out; else None.

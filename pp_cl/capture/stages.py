@@ -221,9 +221,7 @@ class Capture:
 
     def _features(self):
         taken = self._found("frames")["images"]
-        inside = None
-        if self.options["turntable"]:
-            inside = self._inside([one["name"] for one in taken])
+        inside = self._inside([one["name"] for one in taken])
         counts = isolated(
             self.work, features.find_features, self.database, self.frames, taken, inside
         )
@@ -231,20 +229,24 @@ class Capture:
         return {"line": f"{middle} in an image", "counts": counts}
 
     def _inside(self, names):
-        """A folder of masks by the uniform background, in which features are looked for; None where
-        the background is not uniform, but stands still.
+        """A folder of masks in which features are looked for: the alpha of cut-outs, and on a
+        turntable what stands before a uniform background; None where it is not uniform, but stands
+        still, or where there are none.
         """
         folder = self.work / "inside"
+        if folder.is_dir():  # the stage was stopped, and goes on
+            return folder if any(folder.iterdir()) else None
         try:
             with atomic_folder(folder) as unfinished:
                 for name in names:
-                    mask = masks.uniform_mask(read_rgba(self.frames / name), name)
-                    if mask is None:
+                    mask = masks.inside(self.frames / name, self.options["turntable"])
+                    if mask is not None:
+                        write_png(unfinished / f"{name}.png", mask)
+                    elif self.options["turntable"]:
                         raise UserError(name)
-                    write_png(unfinished / f"{name}.png", mask)
         except UserError:
             return None
-        return folder
+        return folder if any(folder.iterdir()) else None
 
     def _matches(self):
         is_film = not self.source.is_dir()

@@ -6,7 +6,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 
 import numpy as np
-from PIL import Image, ImageCms, UnidentifiedImageError
+from PIL import Image, ImageCms, ImageOps, UnidentifiedImageError
 
 from pp_cl.errors import Unusable, UserError
 from pp_cl.files.atomic import atomic_file
@@ -20,7 +20,10 @@ FORMATS = ("PNG", "JPEG", "WEBP", "TIFF", "BMP", "AVIF")  # JPEG opens MPO, whic
 ENDINGS = (".png", ".webp", ".tif", ".tiff", ".avif", ".jpg", ".jpeg", ".jfif", ".bmp", ".exr")
 # Pillow's names of what converts to RGBA without loss
 EIGHT_BIT_MODES = ("RGBA", "RGB", "LA", "L", "PA", "P", "1")
-PRINTED = ("CMYK", "YCbCr")  # what becomes RGB first
+# Pillow's names of what becomes one of these first: inks, video, alpha that colours contain
+CONVERTED = {"CMYK": "RGB", "YCbCr": "RGB", "RGBa": "RGBA", "La": "LA"}
+ORIENTATION = 0x0112  # the tag of EXIF
+ON_THEIR_SIDE = (5, 6, 7, 8)  # its values with which width and height change places
 UNREADABLE = "an image that cannot be read"
 # A mask may have been a JPEG with subsampled colours, or have a coloured rim. It has colours where
 # this share of the cells that are not dark differ by more than so many levels between the channels;
@@ -30,23 +33,28 @@ COLOUR_SIDE, COLOURLESS, DARK, COLOURED = 512, 16, 64, 0.3
 PNG_SIGNATURE, PNG_DEPTH_BYTE = b"\x89PNG\r\n\x1a\n", 24
 
 
-def read_rgba(path: Path | str) -> np.ndarray:
+def read_rgba(path: Path | str, size: tuple[int, int] | None = None) -> np.ndarray:
     """(H, W, 4) uint8 straight sRGB and alpha of an image file; gray and palette colours are
     expanded, 16 bits a channel become 8, other colour spaces sRGB, no alpha means 255; OpenEXR as
     read_exr_rgba has it.
 
-    Raises Unusable naming a file that is missing, truncated, no image, larger than MOST_PIXELS, or
-    of another kind of numbers.
+    size: (width, height) that it is to have: where it lies on its side, it is turned as its EXIF
+    says. Raises Unusable naming a file that is missing, truncated, no image, larger than
+    MOST_PIXELS, or of another kind of numbers.
     """
     if _is_exr(path):
         return read_exr_rgba(path)
     with _opened(path) as image:
-        image = _in_srgb(path, image)
-        return np.array(image if image.mode == "RGBA" else image.convert("RGBA"))
+        if size is not None and size == image.size[::-1] != image.size:
+            ImageOps.exif_transpose(image, in_place=True)
+        srgb = in_srgb(path, image)
+        return np.array(srgb if srgb.mode == "RGBA" else srgb.convert("RGBA"))
 
 
-def _in_srgb(path, image):
-    """The opened image in one of EIGHT_BIT_MODES, in sRGB. Raises Unusable."""
+def in_srgb(path: Path | str, image: Image.Image) -> Image.Image:
+    """The image, opened from a file, in one of EIGHT_BIT_MODES, in sRGB, which may be itself.
+    Raises Unusable.
+    """
     if image.mode.startswith("I"):  # 16 bits of gray
         levels = np.array(image)
         if levels.min() < 0 or levels.max() > 65535:
@@ -55,7 +63,7 @@ def _in_srgb(path, image):
         return Image.fromarray(((levels.astype(np.uint32) + 128) // 257).astype(np.uint8))
     if is_deep_png(path):
         _tell(path, "images of 16 bits a channel are read as 8")
-    if image.mode not in EIGHT_BIT_MODES + PRINTED:
+    if image.mode not in (*EIGHT_BIT_MODES, *CONVERTED):
         raise Unusable(
             f"{path}: not 8 or 16 bits a channel of gray or RGB ({image.mode}); convert it to 8-bit"
             " RGBA PNG",
@@ -67,9 +75,9 @@ def _in_srgb(path, image):
             if "srgb" not in ImageCms.getProfileDescription(known).lower():
                 mode = "RGBA" if image.mode == "RGBA" else "RGB"
                 srgb = ImageCms.createProfile("sRGB")
-                image = ImageCms.profileToProfile(image, known, srgb, outputMode=mode)
+                image = ImageCms.profileToProfile(image, known, srgb, outputMode=mode) or image
                 _tell(path, "images with a colour profile of their own are read as sRGB")
-    return image.convert("RGB") if image.mode in PRINTED else image
+    return image.convert(CONVERTED[image.mode]) if image.mode in CONVERTED else image
 
 
 def _tell(path, what):
@@ -82,7 +90,7 @@ def has_alpha(path: Path | str) -> bool:
     if _is_exr(path):
         return True
     with _opened(path, checked=False) as image:
-        return image.mode in ("RGBA", "LA", "PA") or "transparency" in image.info
+        return image.has_transparency_data
 
 
 def read_mask(path: Path | str) -> np.ndarray:
@@ -93,7 +101,7 @@ def read_mask(path: Path | str) -> np.ndarray:
     if _is_exr(path):
         return _mask_of(path, Image.fromarray(read_exr_rgba(path)))
     with _opened(path) as image:
-        return _mask_of(path, _in_srgb(path, image))
+        return _mask_of(path, in_srgb(path, image))
 
 
 def _mask_of(path, image):
@@ -114,12 +122,24 @@ def _mask_of(path, image):
     return np.array(image)
 
 
-def image_size(path: Path | str) -> tuple[int, int]:
-    """(width, height) from the header of an image file. Raises UserError as read_rgba does."""
+def image_size(path: Path | str, stated: tuple[float, float] | None = None) -> tuple[int, int]:
+    """(width, height) from the header of an image file; as its EXIF turns it where only so it has
+    the shape of the size that is stated for it: the program that stated it saw it upright. Raises
+    UserError as read_rgba does.
+    """
     if _is_exr(path):
         return exr_size(path)
     with _opened(path, checked=False) as image:
-        return image.size
+        size = image.size
+        if stated and not same_shape(size, stated) and same_shape(size[::-1], stated):
+            is_turned = image.getexif().get(ORIENTATION) in ON_THEIR_SIDE
+            size = size[::-1] if is_turned else size
+        return size
+
+
+def same_shape(one: tuple[float, float], other: tuple[float, float]) -> bool:
+    """Whether two sizes are of one shape, but for rounding."""
+    return abs(one[0] * other[1] - one[1] * other[0]) <= max(other)
 
 
 def _is_exr(path):

@@ -21,7 +21,7 @@ from tqdm import tqdm
 from pp_cl.config import Config
 from pp_cl.device.device import Device
 from pp_cl.device.discover import open_device
-from pp_cl.errors import Unusable, UserError, quoted
+from pp_cl.errors import BROKEN_CAMERA, Unusable, UserError, quoted
 from pp_cl.files.image import ENDINGS, has_alpha, read_mask, read_rgba
 from pp_cl.presets import IMAGE_SIZES
 from pp_cl.scene import demo
@@ -297,8 +297,8 @@ def _ignoring(folder, places, photographs, split):
 
 
 def _checked(folder, photograph):
-    """The photograph. Raises UserError for a camera that shows nothing in float32, Unusable where
-    its distortion folds.
+    """The photograph. Raises Unusable for a camera that shows nothing in float32, and where its
+    distortion folds.
     """
     image, camera = folder / photograph.name, photograph.camera
     focal, middle = (camera.fx, camera.fy), (camera.cx, camera.cy)
@@ -314,9 +314,10 @@ def _checked(folder, photograph):
         )
     else:
         return photograph
-    raise UserError(
+    raise Unusable(
         f"{image}: its camera has {what} pixels, which must be {least:g} to {MOST_FOCAL:g}; correct"
-        " the scene's file of cameras"
+        " the scene's file of cameras",
+        BROKEN_CAMERA,
     )
 
 
@@ -509,7 +510,7 @@ def _read_view(dev, lock, folder, photograph, masks, factor, kept):
         if found:
             image, digest = found
         else:
-            image = read_rgba(file)
+            image = read_rgba(file, (camera.width, camera.height))
             with _unusable("a mask that cannot be used"):
                 image = masks.apply(image, mask)
             digest = pixel_digest(image, lens, ignored)

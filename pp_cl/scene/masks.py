@@ -11,7 +11,7 @@ from skimage.color import rgb2lab
 from skimage.measure import label
 
 from pp_cl.errors import UserError
-from pp_cl.files.image import read_mask
+from pp_cl.files.image import read_mask, same_shape
 from pp_cl.scene.readers.found import mask_names
 
 BORDER_SHARE = 0.5  # of the border's pixels that must have its median colour
@@ -86,7 +86,7 @@ def of_size(alpha: np.ndarray, size: tuple[int, int], file: Path) -> np.ndarray:
     height, width = alpha.shape
     if size == (width, height):
         return alpha
-    if abs(size[0] * height - size[1] * width) > max(width, height):
+    if not same_shape((width, height), size):
         raise UserError(
             f"{file}: {width}x{height} pixels, but its image has {size[0]}x{size[1]}; make it the"
             " image's size"

@@ -7,11 +7,14 @@ import subprocess
 import numpy as np
 import pytest
 from PIL import Image, TiffImagePlugin
+from support.profile import display_p3, in_srgb
 
 from pp_cl.capture import frames
 from pp_cl.capture.features import find_features, opened
 from pp_cl.capture.frames import take_images
+from pp_cl.capture.stages import Capture
 from pp_cl.errors import UserError
+from pp_cl.files.atomic import write_json
 from pp_cl.files.image import read_rgba
 from pp_cl.files.video import write_video
 
@@ -38,6 +41,8 @@ def test_photographs_of_other_programs(shots, tmp_path):
     tags = TiffImagePlugin.ImageFileDirectory_v2()
     tags[34377] = bytes(100_000)  # Photoshop's
     Image.fromarray(shots[2, ::-1]).save(folder / "layers.tif", tiffinfo=tags)
+    for i, name in enumerate(("a.avif", "b.bmp", "c.jfif"), 4):
+        Image.fromarray(shots[i, ::-1]).save(folder / name)
     exif = Image.Exif()
     exif[frames.ORIENTATION] = 6
     exif.get_ifd(frames.EXIF).update({FOCAL: 4.2, MAKER_NOTE: b"x" * 60_000})
@@ -47,6 +52,7 @@ def test_photographs_of_other_programs(shots, tmp_path):
     taken = take_images(folder, tmp_path / "images")
     made = {one["source"]: one for one in taken["images"]}
     assert {"deep.png", "print.jpg", "layers.tif", "turned.jpg"} <= set(made)
+    assert {"a.avif", "b.bmp", "c.jfif"} <= set(made)
     assert {one["source"] for one in taken["left_out"]} <= {"broken.jpg"}
     for one in made.values():
         size = read_rgba(tmp_path / "images" / one["name"]).shape[1::-1]
@@ -54,6 +60,47 @@ def test_photographs_of_other_programs(shots, tmp_path):
     copy = Image.open(tmp_path / "images" / made["turned.jpg"]["name"]).getexif()
     assert copy.get(frames.ORIENTATION, 1) == 1
     assert copy.get_ifd(frames.EXIF)[FOCAL] == pytest.approx(4.2)
+
+
+def test_colours_of_another_profile_become_srgb(tmp_path):
+    """Also of photographs that are turned."""
+    pytest.importorskip("pillow_heif")
+    (tmp_path / "photographs").mkdir()
+    noise = np.random.default_rng(0).integers(-9, 10, (12, 48, 64, 1))
+    for i, one in enumerate(noise):
+        image = Image.fromarray(([200, 90, 60] + one).astype(np.uint8))
+        exif = Image.Exif()
+        exif[frames.ORIENTATION] = 6 if i % 2 else 1
+        image.save(tmp_path / f"photographs/{i}.png", icc_profile=display_p3(), exif=exif)
+    with pytest.warns(UserWarning, match="colour profile of their own are read as sRGB"):
+        taken = take_images(tmp_path / "photographs", tmp_path / "images")
+    assert len(taken["images"]) == 12
+    for one in taken["images"]:
+        image = read_rgba(tmp_path / "images" / one["name"])
+        is_turned = int(one["source"].removesuffix(".png")) % 2
+        assert image.shape[:2] == ((64, 48) if is_turned else (48, 64))
+        assert np.abs(image[..., :3].mean((0, 1)) - in_srgb([200, 90, 60])).max() < 3
+
+
+def test_features_are_not_looked_for_where_alpha_is_0(shots, tmp_path):
+    """A cut-out may still hold the wall behind the object."""
+    pytest.importorskip("pycolmap")
+    folder = tmp_path / "photographs"
+    folder.mkdir()
+    sharp = np.kron(shots, np.ones((1, 4, 4, 1), np.uint8))
+    alpha = np.zeros((*sharp.shape[1:3], 1), np.uint8)
+    alpha[60:190, 100:300] = 255
+    for i, image in enumerate(sharp):
+        Image.fromarray(np.dstack([image, alpha])).save(folder / f"{i:02d}.png")
+    capture = Capture(tmp_path / "scene", {"source": str(folder)}, lambda line: None)
+    capture.options = {"source": str(folder), "turntable": False}
+    capture.work.mkdir(parents=True)
+    write_json(capture.work / "frames.json", take_images(folder, capture.frames))
+    capture._features()
+    with opened(capture.database) as db:
+        for image in db.read_all_images():
+            x, y = db.read_keypoints(image.image_id)[:, :2].T
+            assert len(x) > 50 and x.min() > 99 and x.max() < 301 and y.min() > 59 and y.max() < 191
 
 
 def test_the_focal_length_of_reduced_photographs(shots, tmp_path):

@@ -6,7 +6,9 @@ import zlib
 
 import numpy as np
 import pytest
+import tifffile
 from PIL import Image, ImageCms
+from support.profile import display_p3, in_srgb
 
 from pp_cl.errors import Unusable, UserError
 from pp_cl.files.image import image_size, read_mask, read_rgba, to_8bit, write_png
@@ -93,13 +95,21 @@ def test_sixteen_bits_become_eight(tmp_path, rgba):
 
 
 def test_colours_of_other_spaces_become_srgb(tmp_path):
-    """A colour with a wide profile is brighter in sRGB; what prints is made of four inks."""
-    wide = ImageCms.ImageCmsProfile(ImageCms.createProfile("sRGB")).tobytes()
+    """As phones write them, with sRGB's own profile, of four inks, or multiplied with alpha."""
+    own = ImageCms.ImageCmsProfile(ImageCms.createProfile("sRGB")).tobytes()
     image = Image.new("RGB", (40, 30), (200, 90, 60))
-    image.save(tmp_path / "srgb.jpg", icc_profile=wide, quality=95, subsampling=0)
+    image.save(tmp_path / "p3.png", icc_profile=display_p3())
+    with pytest.warns(UserWarning, match="a colour profile of their own are read as sRGB"):
+        found = read_rgba(tmp_path / "p3.png")[..., :3]
+    assert np.abs(found - in_srgb((200, 90, 60))).max() <= 1
+    image.save(tmp_path / "srgb.jpg", icc_profile=own, quality=95, subsampling=0)
     assert np.abs(read_rgba(tmp_path / "srgb.jpg")[..., :3].astype(int) - (200, 90, 60)).max() <= 2
     image.convert("CMYK").save(tmp_path / "inks.jpg", quality=95)
     assert np.abs(read_rgba(tmp_path / "inks.jpg")[..., :3].astype(int) - (200, 90, 60)).max() <= 4
+    half = np.tile(np.uint8([100, 45, 30, 128]), (30, 40, 1))
+    associated = {"photometric": "rgb", "extrasamples": ["assocalpha"]}
+    tifffile.imwrite(tmp_path / "multiplied.tif", half, **associated)
+    assert np.abs(read_rgba(tmp_path / "multiplied.tif").astype(int) - (200, 90, 60, 128)).max() < 2
     image.save(tmp_path / "broken.png", icc_profile=b"no profile")
     assert (read_rgba(tmp_path / "broken.png")[..., :3] == (200, 90, 60)).all()
 

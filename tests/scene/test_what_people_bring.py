@@ -14,6 +14,7 @@ from support.runs import SETTINGS, set_words, spoken
 from support.same_scene import held_out
 from support.scenes import ball_image, ring_cameras
 
+from pp_cl.files.image import ORIENTATION
 from pp_cl.scene.convention import GL_FROM_CV
 from pp_cl.scene.views import View
 from tools.convert_scene import convert
@@ -22,8 +23,8 @@ VIEWS = 14  # of which 12 are for training
 
 
 def a_ball(folder, form):
-    """The ball in a format, its masks in a folder of their own."""
-    cameras = ring_cameras(VIEWS, 48)
+    """The ball in a format, its masks in a folder of their own; images are broader than high."""
+    cameras = [camera.crop(0, 3, 48, 42) for camera in ring_cameras(VIEWS, 48)]
     views = [View(f"{i}.png", camera, ball_image(camera)) for i, camera in enumerate(cameras)]
     convert(held_out(views), folder, form)
     return folder
@@ -75,14 +76,21 @@ def with_options(image, **options):
     return image
 
 
+def turned(image):
+    """On its side, and EXIF says so."""
+    exif = Image.Exif()
+    exif[ORIENTATION] = 6
+    return with_options(image.transpose(Image.Transpose.ROTATE_90), exif=exif)
+
+
 def sixteen_bits(image):
     return Image.fromarray(np.array(image).astype(np.uint16) * 257)
 
 
 def noisy_mask(mask):
     """As a JPEG with subsampled colours has it, noise of 40 levels."""
-    wide = np.array(mask.resize((480, 480), Image.Resampling.NEAREST)).astype(int)
-    noise = np.random.default_rng(0).integers(-40, 41, (480, 480, 3))
+    wide = np.array(mask.resize((480, 420), Image.Resampling.NEAREST)).astype(int)
+    noise = np.random.default_rng(0).integers(-40, 41, (420, 480, 3))
     wide = np.clip(wide[..., None] + noise, 0, 255).astype(np.uint8)
     return with_options(Image.fromarray(wide), quality=75)
 
@@ -104,6 +112,24 @@ def flat(folder):
     for place in ("images", "sparse/0"):
         for file in (folder / place).iterdir():
             file.rename(folder / file.name)
+
+
+def model_line(name, line, place, word):
+    """Another word in a line of COLMAP's text model."""
+
+    def change(folder):
+        model = folder / "sparse/0"
+        pycolmap = pytest.importorskip("pycolmap")
+        pycolmap.Reconstruction(model).write_text(model)
+        for file in model.glob("*.bin"):
+            file.unlink()
+        lines = (model / name).read_text().splitlines()
+        at = [i for i, one in enumerate(lines) if one and one[0] != "#"][2 * line]
+        words = lines[at].split()
+        lines[at] = " ".join([*words[:place], word, *words[place + 1 :]])
+        (model / name).write_text("\n".join(lines) + "\n")
+
+    return change
 
 
 def linked(folder):
@@ -152,6 +178,7 @@ def failed_calibration(folder):
     frames(folder, change)
 
 
+NAN = float("nan")
 WINDOWS = r"C:\\Users\\ada\\mug\\"
 # {report: (format, what is done to the folder, what is said)}
 TRAINS = {
@@ -182,6 +209,7 @@ TRAINS = {
         "16 bits a channel",
     ),
     "inks": ("nerfstudio", images(lambda image: image.convert("CMYK"), ".jpg"), ""),
+    "turned by EXIF, which the program had done": ("nerfstudio", images(turned, ".jpg"), ""),
     "TIFF": ("nerfstudio", images(lambda image: image, ".tif"), ""),
     "BMP": ("nerfstudio", images(lambda image: image, ".bmp"), ""),
     "AVIF": ("nerfstudio", images(lambda image: image, ".avif"), ""),
@@ -208,6 +236,16 @@ TRAINS = {
         "nerfstudio",
         frame_by_frame("transform_matrix", lambda i, m: None if i == 3 else m),
         "1 of 12 views left out: no pose",
+    ),
+    "COLMAP's pose that is NaN": (
+        "colmap",
+        model_line("images.txt", 3, 5, "nan"),
+        "1 of 12 views left out: no pose",
+    ),
+    "a focal length that is NaN": (
+        "nerfstudio",
+        lambda folder: frames(folder, lambda i, frame: frame.update(fl_x=NAN if i == 3 else 60)),
+        "1 of 12 views left out: a camera that is broken",
     ),
     "a calibration that failed": ("nerfstudio", failed_calibration, "distortion that folds"),
     "LLFF without some images": (

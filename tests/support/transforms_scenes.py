@@ -6,10 +6,11 @@ import os
 import numpy as np
 import pytest
 
-from pp_cl.errors import UserError
+from pp_cl.errors import Unusable, UserError
 from pp_cl.files.image import write_png
 from pp_cl.scene.camera import look_at
-from pp_cl.scene.load import load_scene
+from pp_cl.scene.load import find_reader, load_scene
+from pp_cl.scene.readers.found import Notes
 
 SIZE = (24, 18)  # width, height of the images written here
 
@@ -51,6 +52,16 @@ def escape(file):
     outside = above / f"outside-{len(os.listdir(above))}{file.suffix}"
     file.rename(outside)
     file.symlink_to(outside)
+
+
+def left_out(folder, *words):
+    """Some views of the training split are left out; the error of the first has all the words."""
+    notes = Notes()
+    assert find_reader(folder).read_split(folder, "train", notes)
+    with pytest.raises(Unusable) as caught:
+        notes.check(0)
+    for word in words:
+        assert str(word) in str(caught.value)
 
 
 def refused(folder, *words, splits=("train",)):

@@ -13,7 +13,7 @@ from pathlib import Path, PurePosixPath
 
 import numpy as np
 
-from pp_cl.errors import UserError, quoted
+from pp_cl.errors import Unusable, UserError, quoted
 from pp_cl.files.image import image_size
 from pp_cl.files.untrusted import opened_regular, refusal
 from pp_cl.scene.camera import Camera
@@ -188,7 +188,7 @@ def _camera(frame, size):
     """The Camera of a viewpoint: x_camera = x_world R + T, in PyTorch3D's axes."""
     own = frame.get("viewpoint")
     if not isinstance(own, dict):
-        raise frame.error("viewpoint", "is missing; remove the frame")
+        raise Unusable(str(frame.error("viewpoint", "is missing; remove the frame")), "no pose")
     view = Frame(frame.file, {}, own, frame.index, "viewpoint of frame ")
     rotation, place = view.array("R", (3, 3)), view.array("T", (3,))
     focal, centre = view.array("focal_length", (2,)), view.array("principal_point", (2,))

@@ -17,7 +17,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from pp_cl.errors import UserError
+from pp_cl.errors import BROKEN_CAMERA, Unusable, UserError
 from pp_cl.files.image import image_size
 from pp_cl.files.untrusted import opened_regular, refusal
 from pp_cl.scene.camera import Camera
@@ -83,12 +83,13 @@ class Lens(NamedTuple):
 
 
 class Image(NamedTuple):
-    """An image of the model. rotation: (w, x, y, z) of a unit quaternion, world to camera."""
+    """An image of the model. pose: (7,) qw, qx, qy, qz, tx, ty, tz, world to camera, as the file
+    has it.
+    """
 
     name: str
     camera: int
-    rotation: np.ndarray
-    translation: np.ndarray
+    pose: np.ndarray
 
 
 def recognises(folder: Path) -> bool:
@@ -142,12 +143,17 @@ def _suffix(folder):
 def _photograph(folder, model, lenses, image):
     fail = fail_at(model, image.name)
     name, lens = find_image(folder, f"{IMAGES}/{image.name}", fail), lenses[image.camera]
+    if isinstance(lens, Unusable):
+        raise lens
     fx, fy, cx, cy, distortion = _intrinsics(folder, model, lens)
-    w, x, y, z = image.rotation
+    length = np.linalg.norm(image.pose[:4]) if _are_numbers(image.pose) else 0
+    if abs(length - 1) > 1e-3:
+        raise Unusable(str(fail("its pose is no unit quaternion and place; mend it")), "no pose")
+    w, x, y, z, *translation = image.pose
     rotation = Rotation.from_quat([x, y, z, w]).as_matrix().T
-    pose = np.column_stack([rotation, -rotation @ image.translation])
+    pose = np.column_stack([rotation, -rotation @ translation])
     camera = Camera(pose, fx, fy, cx, cy, lens.width, lens.height)
-    camera = fitted(camera, image_size(folder / name), fail)
+    camera = fitted(camera, image_size(folder / name, (lens.width, lens.height)), fail)
     return Photograph(name, camera, distortion=distortion)
 
 
@@ -170,9 +176,9 @@ def _intrinsics(folder, model, lens):
 # The model ----------------------------------------------------------------------------------------
 
 
-def read_model(folder: Path) -> tuple[dict[int, Lens], list[Image]]:
-    """(cameras by id, images) of the model in a folder; binary files go before text. Raises
-    UserError naming the file, and the line or the place in it.
+def read_model(folder: Path) -> tuple[dict[int, Lens | Unusable], list[Image]]:
+    """(cameras by id, or what is wrong with them, images) of the model in a folder; binary files go
+    before text. Raises UserError naming the file, and the line or the place in it.
     """
     suffix = _suffix(folder)
     read_cameras, read_images = (
@@ -210,28 +216,27 @@ def _bounded(file, read):
 
 
 def _lens(where, model, size, parameters):
-    """The Lens. Raises UserError beginning with `where`."""
+    """The Lens; what is wrong with its parameters, an Unusable. Raises UserError beginning with
+    `where`.
+    """
     if not all(1 <= side < MOST_PIXELS for side in size):
         raise UserError(f"{where}: {size[0]}x{size[1]} pixels is no size; copy the file anew")
     if len(parameters) != MODELS[model] or not _are_numbers(parameters):
-        raise UserError(
+        return Unusable(
             f"{where}: {model} has {MODELS[model]} parameters, finite and not huge; copy the file"
-            " anew"
+            " anew",
+            BROKEN_CAMERA,
         )
     return Lens(model, *size, tuple(parameters))
 
 
 def _image(where, name, camera, numbers):
-    """The Image; numbers: qw, qx, qy, qz, tx, ty, tz. Raises UserError beginning with `where`."""
+    """The Image; numbers: its pose. Raises UserError beginning with `where`."""
     # the name goes into messages of one line
     has_controls = any(unicodedata.category(letter) == "Cc" for letter in name)
     if has_controls or not 1 <= len(name) <= MOST_NAME:
         raise UserError(f"{where}: {name[:80]!r} is no name of an image; rename it")
-    numbers = np.array(numbers, np.float64)
-    length = np.linalg.norm(numbers[:4]) if _are_numbers(numbers) else 0
-    if abs(length - 1) > 1e-3:
-        raise UserError(f"{where}: {name}: its pose is no unit quaternion and place; mend it")
-    return Image(name, camera, numbers[:4] / length, numbers[4:])
+    return Image(name, camera, np.array(numbers, np.float64))
 
 
 def _are_numbers(values):

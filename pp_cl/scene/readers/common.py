@@ -13,7 +13,7 @@ import numpy as np
 from tqdm import tqdm
 
 from pp_cl.errors import UserError, quoted, shown
-from pp_cl.files.image import ENDINGS
+from pp_cl.files.image import ENDINGS, same_shape
 from pp_cl.files.untrusted import (
     opened_regular,
     opened_zip,
@@ -81,10 +81,10 @@ def fitted(camera: Camera, size: tuple[int, int], fail: Fail) -> Camera:
     and must have its shape but for rounding. Raises fail(text).
     """
     width, height = camera.width, camera.height
-    if abs(size[0] * height - size[1] * width) > max(width, height):
-        is_turned = abs(size[1] * height - size[0] * width) <= max(width, height)
+    if not same_shape(size, (width, height)):
+        is_turned = same_shape(size[::-1], (width, height))
         what = "another shape; copy the images anew"
-        what = "turned, maybe by its EXIF; write the images upright" if is_turned else what
+        what = "turned; write the images upright" if is_turned else what
         raise fail(
             f"is for {width:g}x{height:g} pixels, but an image has {size[0]}x{size[1]}, {what}"
         )

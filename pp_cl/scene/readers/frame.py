@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from pp_cl.errors import Unusable, UserError, quoted
+from pp_cl.errors import BROKEN_CAMERA, Unusable, UserError, quoted
 from pp_cl.scene.camera import Camera
 from pp_cl.scene.distortion import Distortion
 from pp_cl.scene.readers.common import MOST, numbers
@@ -62,7 +62,9 @@ class Frame:
         return UserError(f"{self.file}: {'' if is_shared else here}{key}: {text}")
 
     def number(self, key: str, above: float = -math.inf, below: float = math.inf) -> float | None:
-        """Finite float strictly between two bounds, or None if absent."""
+        """Finite float strictly between two bounds, or None if absent. Raises Unusable for anything
+        else.
+        """
         value = self.get(key)
         if value is None:
             return None
@@ -71,14 +73,16 @@ class Frame:
             bounds = f" above {above:g}" * (above > -math.inf) + f" and below {below:g}" * (
                 below < math.inf
             )
-            raise self.error(key, f"is {json.dumps(value)[:40]}; must be a finite number{bounds}")
+            text = f"is {json.dumps(value)[:40]}; must be a finite number{bounds}"
+            raise Unusable(str(self.error(key, text)), BROKEN_CAMERA)
         return float(value)
 
     def array(self, key: str, shape: tuple[int, ...]) -> np.ndarray:
-        """Finite float64 array of a shape. Raises UserError where there is none."""
+        """Finite float64 array of a shape. Raises Unusable where there is none."""
         array = numbers(self.get(key), shape)
         if array is None:
-            raise self.error(key, f"must be {'x'.join(map(str, shape))} finite numbers")
+            text = f"must be {'x'.join(map(str, shape))} finite numbers"
+            raise Unusable(str(self.error(key, text)), BROKEN_CAMERA)
         return array
 
     def image(self, key: str, folder: Path, endings: Sequence[str] = ("",)) -> str | None:

@@ -57,9 +57,9 @@ def read_split(folder: Path, split: str, notes: Notes) -> list[Photograph]:
     def read(index):
         if index not in places:
             raise Unusable(f"{file}: row {index}: its image is gone from {images}", "no image")
-        size, name = image_size(folder / places[index]), places[index]
-        fail = fail_at(file, f"row {index}")
-        return Photograph(name, _camera(rows[index, :15].reshape(3, 5), size, fail))
+        name, matrix = places[index], rows[index, :15].reshape(3, 5)
+        size = image_size(folder / name, (matrix[1, 4], matrix[0, 4]))
+        return Photograph(name, _camera(matrix, size, fail_at(file, f"row {index}")))
 
     return list(notes.usable(hold_out(range(count), split), read, "row {}".format))
 

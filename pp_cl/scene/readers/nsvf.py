@@ -44,7 +44,8 @@ def read_split(folder: Path, split: str, notes: Notes) -> list[Photograph]:
     depth_range = _depth_range(folder / "near_and_far.txt")
 
     def read(name):
-        pose, size = _pose(folder / POSES / f"{Path(name).stem}.txt"), image_size(folder / name)
+        pose = _pose(folder / POSES / f"{Path(name).stem}.txt")
+        size = image_size(folder / name, stated)
         camera = Camera(pose, fx, fy, cx, cy, *(stated or size))
         return Photograph(name, fitted(camera, size, fail_at(file)), depth_range)
 
@@ -74,7 +75,7 @@ def _pose(file):
         raise Unusable(f"{file}: no such file; copy it there", "no pose")
     rows = read_numbers(file)
     if [len(row) for row in rows] != [4] * 4:
-        raise UserError(f"{file}: must be 4x4 numbers, a camera-to-world matrix")
+        raise Unusable(f"{file}: must be 4x4 numbers, a camera-to-world matrix", "no pose")
     return rigid(rows, fail_at(file))
 
 

@@ -142,9 +142,10 @@ def _read_frame(folder, frame):
 
 def _camera(folder, name, frame):
     """The Camera, of the image's size."""
-    size = image_size(folder / name)
-    stated = [frame.number(key, above=0) or side for key, side in zip("wh", size, strict=True)]
-    return fitted(pinhole(frame, *stated), size, partial(frame.error, "w"))
+    stated = frame.number("w", above=0), frame.number("h", above=0)
+    size = image_size(folder / name, None if None in stated else stated)
+    whole = [one or side for one, side in zip(stated, size, strict=True)]
+    return fitted(pinhole(frame, *whole), size, partial(frame.error, "w"))
 
 
 def _depth_range(frame):

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from support.same_scene import held_out, same, views
-from support.transforms_scenes import refused
+from support.transforms_scenes import left_out, refused
 
 from pp_cl.files.image import write_png
 from pp_cl.scene.distortion import Distortion
@@ -219,12 +219,19 @@ BAD_TEXT = {
 }
 
 
+# the others train without these images
+LEFT_OUT = ("a parameter is missing", "huge principal point", "quaternion", "huge place")
+
+
 @pytest.mark.parametrize("case", BAD_TEXT)
 def test_bad_text(text, case):
     name, change, word = BAD_TEXT[case]
     write_png(text.parent / "x.png", np.zeros((22, 30, 3)))
     edit(text, name, change)
-    refused(text, text / "sparse" / "0", word, splits=("train", "test"))
+    if case in LEFT_OUT:
+        left_out(text, text / "sparse" / "0", word)
+    else:
+        refused(text, text / "sparse" / "0", word, splits=("train", "test"))
 
 
 def test_other_models_are_named_with_the_command_that_converts_them(text):
@@ -281,7 +288,6 @@ BAD_BYTES = {
     "model number": ("cameras.bin", lambda b: b[:12] + struct.pack("<i", 99) + b[16:]),
     "name": ("images.bin", lambda b: b[:72] + b"\xff" + b[73:]),
     "size": ("cameras.bin", lambda b: b[:16] + struct.pack("<Q", 2**40) + b[24:]),
-    "NaN": ("images.bin", lambda b: b[:12] + struct.pack("<d", np.nan) + b[20:]),
     "empty": ("cameras.bin", lambda b: b""),
     "camera twice": ("cameras.bin", lambda b: b[:64] + struct.pack("<I", 1) + b[68:]),
     "line break in a name": ("images.bin", lambda b: b[:72] + b"\n" + b[73:]),
