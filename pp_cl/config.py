@@ -19,8 +19,6 @@ from pp_cl.settings import NetworkConfig, PointsConfig, RasterConfig, SceneConfi
 FORMAT = 1  # of config.json: raised when keys are added, change meaning or are removed
 MOST_BYTES = 2**20  # of a config.json
 MOST_TEXT = 4096  # characters of a setting
-# by network.blocks, how many convolutions there are but the last
-CONVOLUTIONS = {"double": 12, "single": 7, "gated": 7}
 RANDOM = "random"  # of network.start, beside demo and a folder
 OF_MASKS = ("scene.masks", "scene.ignore", "scene.mask_from", "scene.mask_tolerance")
 MEND_SETTINGS = "restore it or start a new run"
@@ -136,23 +134,10 @@ def validate(config: Config, origin: str, origins: Mapping[str, str] | None = No
         for item in dataclasses.fields(values):
             key = f"{section}.{item.name}"
             _check(getattr(values, item.name), where(key), **item.metadata)
-    _check_channels(config.network, where("network.channels"))
     if config.train.crop % 4:
         raise UserError(
             f"{where('train.crop')} = {config.train.crop}; it must be a multiple of 4"
             " (0: whole images)"
-        )
-
-
-def _check_channels(network, where):
-    """Raise UserError for network.channels that no network of these blocks can have."""
-    numbers = network.channels.split(",") if network.channels else []
-    count = CONVOLUTIONS[network.blocks]
-    sound = all(n.isascii() and n.isdigit() and 1 <= len(n) <= 4 and int(n) for n in numbers)
-    if numbers and not (sound and len(numbers) == count):
-        raise UserError(
-            f"{where} = {quoted(network.channels)}; it must be {count} numbers"
-            f" from 1 to 9999 where network.blocks is {network.blocks}, or none"
         )
 
 

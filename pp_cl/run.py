@@ -256,7 +256,6 @@ def evaluate(
     *,
     save_images: bool = False,
     out: Path | str | None = None,
-    published: bool = False,
     on_view: Callable[[int, int], None] = lambda _measured, _views: None,
 ) -> dict[str, Any]:
     """Measure a run; writes metrics.json and comparison.png into the folder `out`, if not given
@@ -264,8 +263,7 @@ def evaluate(
     run's photographs had gains, views are also measured after the best ones, exposed_alike().
 
     metrics: names out of psnr, ssim, lpips. save_images: write every view to images/ there, in
-    place of what an earlier evaluation left. published: put published results beside also where
-    they were measured on other views or sizes. on_view: called after each view with the number of
+    place of what an earlier evaluation left. on_view: called after each view with the number of
     those measured and of all. Raises UserError for a missing or broken split, a folder that may not
     be written, an `out` that holds something else than an evaluation, and a file in the place of
     one that it writes which no evaluation has written as it is now.
@@ -301,7 +299,7 @@ def evaluate(
     result = {"split": split, "device": run.dev.name, "mean": means, "per_image": rows}
     if "exposed" in run.header:
         result["mean_after_gains"] = mean([row["after_gains"] for row in rows])
-    result |= _about(run, costs) | _published(scene, split, views, anyway=published)
+    result |= _about(run, costs) | _published(scene, split, views)
     write_json(target / "metrics.json", result)
     write_comparison(target / "comparison.png", *zip(*shown, strict=True))
     return result
@@ -319,15 +317,14 @@ def _check_target(target, *, is_new):
     check_ours([target / "metrics.json", target / "comparison.png"], MOVE)
 
 
-def _published(scene, split, views, *, anyway):
+def _published(scene, split, views):
     """{"published": rows of the scene, "published_differs": how this measurement differs from
-    them}. anyway: rows also where it does.
+    them}.
     """
     cameras = [view.file_camera for view in views]
     rows = published_rows(scene.name, cameras)
     differs = differences(scene.name, cameras, views[0].file_downscale, split) if rows else ""
-    shown = anyway or not differs
-    return {"published": rows if shown else {}, "published_differs": differs if shown else ""}
+    return {"published": rows, "published_differs": differs}
 
 
 def _about(run, costs):

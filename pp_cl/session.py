@@ -351,6 +351,7 @@ def train_scene(
     *,
     settings: dict[str, Any] | None = None,
     on_step: OnStep | None = None,
+    is_stopped: Callable[[], bool] | None = None,
     **options: Any,
 ) -> Run:
     """Train a scene into the folder `out`, or go on with the run there; a finished one is left
@@ -358,7 +359,8 @@ def train_scene(
 
     scene: a folder, or the word demo. device: as `pp-cl train --device`. settings: {"section.key":
     value}; options: the same by the names of the command's options, such as iterations.
-    on_step(step, row): called after each step, with its row of the log or None. Raises UserError.
+    on_step(step, row): called after each step, with its row of the log or None. is_stopped: asked
+    after each step; where it is true, training ends with a checkpoint. Raises UserError.
     """
     unknown = set(options) - set(SHORT)
     if unknown:
@@ -369,7 +371,7 @@ def train_scene(
     config = run_config(folder, str(scene), preset, given, extends=True)
     stored, dev = stored_state(folder, config), open_device(device)
     if not is_finished(stored, config):
-        open_training(dev, folder, config, stored).run(on_step)
+        open_training(dev, folder, config, stored).run(on_step, is_stopped or (lambda: False))
     return load_run(dev, out)
 
 

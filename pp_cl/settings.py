@@ -3,6 +3,8 @@
 from dataclasses import dataclass, field
 from typing import Any
 
+BLOCKS = ("double", "single", "gated")  # what a level of the network computes
+
 
 def setting(
     default: Any,
@@ -110,11 +112,7 @@ class NetworkConfig:
         "single",
         "of a level. double: two 3x3 convolutions with ReLU; single: one; gated: ELU of one"
         " times the sigmoid of another",
-        choices=("double", "single", "gated"),
-    )
-    channels: str = setting(
-        "",
-        "channels of each convolution but the last, of a compressed model (none)",
+        choices=BLOCKS,
     )
     residual: bool = setting(True, "add a quarter of the first three features to the colours")
     start: str = setting(
@@ -126,11 +124,6 @@ class NetworkConfig:
     rate: tuple = setting(
         (1e-3, 1e-4), "learning rate of the network, first and last step", 1e-12, 100
     )
-
-    @property
-    def channel_numbers(self) -> tuple[int, ...]:
-        """`channels` as numbers, () where there are none."""
-        return tuple(int(number) for number in self.channels.split(",")) if self.channels else ()
 
 
 @dataclass

@@ -6,7 +6,6 @@ import pytest
 
 from pp_cl.config import Config, assign, configure, help_lines, load_config, preset, validate
 from pp_cl.errors import UserError
-from pp_cl.network.layers import convolutions, unet_layers
 from pp_cl.presets import PRESETS
 from pp_cl.training import schedule
 
@@ -197,30 +196,6 @@ def test_help_covers_every_setting():
         key, _, rest = line.strip().partition(" = ")
         assign(config, key, rest.partition("  (")[0], "--help")
     assert config == Config(preset="paper")
-
-
-@pytest.mark.parametrize(
-    "blocks, channels, count",
-    [
-        ("double", "16,16", 12),
-        ("double", ",".join(["16"] * 11 + ["0"]), 12),
-        ("double", ",".join(["16"] * 11 + ["-3"]), 12),
-        ("double", ",".join(["16"] * 11 + ["1e3"]), 12),
-        ("single", ",".join(["16"] * 12), 7),
-        ("gated", "16,", 7),
-    ],
-)
-def test_channels_are_those_of_the_convolutions(blocks, channels, count):
-    config = preset("tiny")
-    assign(config, "network.blocks", blocks, "test")
-    assign(config, "network.channels", channels, "test")
-    with pytest.raises(UserError, match=rf"network.channels = .* must be {count} numbers from 1"):
-        validate(config, "test")
-    assign(config, "network.channels", ",".join(["48"] * count), "test")
-    validate(config, "test")
-    assert config.network.channel_numbers == (48,) * count
-    layers = unet_layers((16, 16, 16), blocks=blocks, channels=config.network.channel_numbers)
-    assert len(convolutions(layers)) == count + 1
 
 
 def test_masks_in_the_folder_of_a_scene_move_with_it(tmp_path):

@@ -123,17 +123,20 @@ def test_a_scene_without_training_views_is_measured_with_one_line(run, tmp_path,
     assert "cannot be compared with the scene of" in told and "no split train" in told
 
 
-def test_published_rows_stand_beside_what_compares_or_on_request(run, tmp_path, capsys):
+def test_published_rows_are_printed_beside_what_compares(run, tmp_path, capsys, monkeypatch):
     """The ball under the name of a CO3D sequence, whose images the run has reduced."""
     scene = json.loads((run / "config.json").read_text())["scene"]["path"]
     shutil.copytree(scene, tmp_path / "34_1479_4753")
     command = ["eval", str(run), "--scene", str(tmp_path / "34_1479_4753"), "--out"]
-    for asked, rows in (([], 0), (["--published"], 5)):
-        out = tmp_path / f"eval{rows}"
-        assert main([*command, str(out), *asked]) == 0
-        told = capsys.readouterr().out
-        assert len(json.loads((out / "metrics.json").read_text())["published"]) == rows
-        assert ("PlenopticPoints" in told) == ("reduced 2 times" in told) == bool(rows)
+    for compares in (False, True):
+        if compares:
+            monkeypatch.setattr("pp_cl.run.differences", lambda *_: "")
+        out = tmp_path / f"eval{compares}"
+        assert main([*command, str(out)]) == 0
+        result = json.loads((out / "metrics.json").read_text())
+        assert len(result["published"]) == 5
+        assert ("reduced 2 times" in result["published_differs"]) == (not compares)
+        assert ("PlenopticPoints" in capsys.readouterr().out) == compares
 
 
 def test_an_unfinished_run_is_marked(tmp_path, capsys, monkeypatch):

@@ -13,8 +13,9 @@ from support.runs import arguments
 from support.scenes import move_scene, write_ball_scene
 
 from pp_cl.cli import main
+from pp_cl.export.gltf import write_glb
 from pp_cl.export.mesh import Mesh, write_mesh
-from pp_cl.export.points import coloured_points, in_world, write_glb, write_ply
+from pp_cl.export.points import coloured_points, in_world, write_ply
 from pp_cl.export.splat import splats, write_splat_glb
 from pp_cl.metrics.shape import read_mesh
 from pp_cl.model import Model
@@ -107,7 +108,7 @@ def test_exported_points_keep_their_places_in_the_world(far_run, tmp_path):
     write_ply(tmp_path / "a.ply", points, far_run.model.cloud)
     vertex = plyfile.PlyData.read(str(tmp_path / "a.ply"))["vertex"]
     assert np.array_equal(np.stack([vertex[name] for name in "xyz"], 1), positions)
-    write_glb(tmp_path / "a.glb", points)
+    write_glb(tmp_path / "a.glb", {"POSITION": points.positions})
     cloud = trimesh.load(tmp_path / "a.glb")
     [name] = cloud.graph.nodes_geometry
     place, _ = cloud.graph[name]

@@ -55,7 +55,7 @@ from pp_cl.scene.readers.frame import frame_keys
 from pp_cl.scene.sparse import sparse_points
 from pp_cl.session import run_config
 from pp_cl.sweep.plan import Job, plan, read_varied
-from pp_cl.sweep.result import finished_row, progress
+from pp_cl.sweep.result import finished_row
 from pp_cl.training.checkpoint import load_run_state
 from pp_cl.view.messages import read_request
 
@@ -326,8 +326,8 @@ def test_a_config(world, data):
 def job(world, run):
     """The run as one of a sweep."""
     given = tuple((*word.split("=", 1), "--set") for word in set_words()[1::2])
-    paths = str(world.scene()), "ball", (), 0, str(run.path)
-    return Job(*paths, "tiny", given, ("psnr", "ssim"), iterations=4)
+    paths = str(world.scene()), "ball", {}, 0, str(run.path)
+    return Job(*paths, "tiny", given, ("psnr", "ssim"))
 
 
 @fuzzed(2)
@@ -339,7 +339,7 @@ def test_a_log(world, data):
         damage.damage_file(data.draw, run.log)
         for row in taken(run.rows) or ():
             check_finite(step=row["step"], seconds=row["seconds"])
-        taken(lambda: progress(job(world, run)))
+        taken(lambda: finished_row(job(world, run)))
         tell(run)
         log = taken(lambda: Log(run.log, one(data.draw, 0, 2, 4)))
         if log is not None:

@@ -23,7 +23,6 @@ COMMANDS = {
     "eval of a split": (["eval", "run", "--save-images", "--split", "train"], ()),
     "eval elsewhere": (["eval", "run", "--save-images", "--out", "there"], ()),
     "eval in JSON": (["eval", "run", "--json", "a.json"], ("a.json",)),
-    "eval in a chart": (["eval", "run", "--chart", "a.svg"], ("a.svg",)),
     "film": (FILM, ()),
     "film elsewhere": ([*FILM, "--out", "a.gif"], ("a.gif",)),
     "frames": ([*FILM, "--format", "png"], ()),

@@ -16,7 +16,6 @@ from pp_cl.files.checkpoint import save_checkpoint
 from pp_cl.files.run_folder import MOST_NUMBER, read_row
 from pp_cl.scene.readers.common import MOST, read_numbers
 from pp_cl.scene.readers.frame import rigid
-from pp_cl.sweep.plan import read_varied
 
 json_values = st.recursive(
     st.none() | st.booleans() | st.integers() | st.floats() | st.text(),
@@ -130,14 +129,3 @@ def test_what_is_taken_for_a_pose_is_rigid(matrix):
         assert np.allclose(pose[:, :3] @ pose[:, :3].T, np.eye(3), atol=1e-12)
         assert np.linalg.det(pose[:, :3]) > 0
         assert np.abs(pose - given_matrix).max() < 1e-3
-
-
-@given(given_settings())
-def test_a_value_that_is_varied_has_one_text(pair):
-    key, value = pair
-    text = text_of(value)
-    if key == "train.seed" or not text:  # nothing is no value to vary
-        return
-    ((found, texts),) = read_varied([f"{key}={text}"])
-    assert found == key and texts == [text]
-    assert read_varied([f"{key}={texts[0]}"]) == [(key, texts)]

@@ -8,7 +8,6 @@ import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from functools import cached_property
-from types import ModuleType
 
 import numpy as np
 
@@ -18,6 +17,7 @@ from pp_cl.layers.choice import OFFERED, VARIANTS, blocking_of, can_run, device_
 from pp_cl.layers.conv_direct import (
     Blocking,
     ConvShape,
+    DirectConv,
     Direction,
     pack_bias,
     pack_weights,
@@ -91,12 +91,16 @@ class Layer:
         ]
 
     def computed(
-        self, dev: Device, conv: ModuleType, blocking: Blocking, tiles: Tiles | None = None
+        self,
+        dev: Device,
+        variant: type[DirectConv],
+        blocking: Blocking,
+        tiles: Tiles | None = None,
     ) -> list[np.ndarray]:
-        """What `expected` lists, by a module of convolutions. tiles: of output and gradients."""
+        """What `expected` lists, by a variant. tiles: of output and gradients."""
         uploaded = UploadedLayer(dev, self)
         for direction in Direction:
-            uploaded.compute(conv, blocking, direction, tiles)
+            uploaded.compute(variant, blocking, direction, tiles)
         results = uploaded.out, uploaded.grad_weight, uploaded.grad_bias, *uploaded.grad_parts
         return [array.get() for array in results]
 
@@ -114,37 +118,41 @@ class UploadedLayer:
         self.grad_weight, self.grad_bias = dev.empty(self.weight.shape), dev.empty(self.bias.shape)
 
     def compute(
-        self, conv: ModuleType, blocking: Blocking, direction: Direction, tiles: Tiles | None
+        self,
+        variant: type[DirectConv],
+        blocking: Blocking,
+        direction: Direction,
+        tiles: Tiles | None,
     ) -> None:
-        """Compute a direction by a module of convolutions, as the network does."""
+        """Compute a direction by a variant, as the network does."""
         dev, parts, grad_out = self.dev, self.parts, self.grad_out
         channels = tuple(part.shape[2] for part in parts)
         height, width, co = grad_out.shape
         shape = ConvShape(direction, self.weight.shape[1], channels, co, (height, width))
+        tiles = tiles or all_tiles(dev, height, width)
         if direction == Direction.FORWARD:
-            weights = self._laid_out(conv, shape)
-            conv.forward(
-                dev, blocking, parts, weights, self.bias, self.out, relu=self.relu, tiles=tiles
-            )
+            conv = variant(dev, blocking, shape)
+            weights = self._laid_out(conv)
+            conv.forward(parts, weights, self.bias, self.out, relu=self.relu, tiles=tiles)
         elif direction == Direction.BACKWARD_WEIGHTS:
-            partial = self._work(conv.work_shape(shape))
-            count = conv.backward_weights(dev, blocking, parts, grad_out, partial, tiles=tiles)
+            conv = variant(dev, blocking, shape)
+            partial = self._work(conv.work_shape)
+            count = conv.backward_weights(parts, grad_out, partial, tiles=tiles)
             rows, n = table_of_sums([(partial.shape, count, 0, 0, 0)])
             table = dev.constant(rows)
             sum_parts(dev, table, n, partial, self.grad_weight, self.grad_bias)
         else:
             for i, (part, grad) in enumerate(zip(parts, self.grad_parts, strict=True)):
+                conv = variant(dev, blocking, replace(shape, source=i))
                 mask = part if self.relu else None
-                weights = self._laid_out(conv, replace(shape, source=i))
-                conv.backward_input(dev, blocking, weights, grad_out, grad, mask=mask, tiles=tiles)
+                conv.backward_input(self._laid_out(conv), grad_out, grad, mask=mask, tiles=tiles)
 
-    def _laid_out(self, conv, shape):
-        """The weights as a module reads them, laid out anew as each step of a training does."""
-        needed = conv.work_shape(shape)
-        if needed is None:
+    def _laid_out(self, conv):
+        """The weights as a convolution reads them, laid out anew as in each step of a training."""
+        if conv.work_shape is None:
             return self.weight
-        work = self._work(needed)
-        conv.lay_out(self.dev, self.weight.reshape(-1), [(shape, 0, 0)], work)
+        work = self._work(conv.work_shape)
+        conv.lay_out(self.dev, self.weight.reshape(-1), [(conv.shape, 0, 0)], work)
         return work
 
     def _work(self, shape):
@@ -206,8 +214,8 @@ def bench_conv(
     widths: tuple[int, int, int],
     *,
     blocks: str = "double",
-) -> Iterator[list[dict]]:
-    """Rows of every distinct convolution of the network at size x size, a list for each direction.
+) -> Iterator[dict]:
+    """Rows of every distinct convolution of the network at size x size, by direction and variant.
 
     blocks: as UNet takes them.
     """
@@ -223,7 +231,7 @@ def bench_conv(
         for direction in Direction:
             runs = {v: conv.runner(v, direction, blocking) for v in conv.variants}
             found = {v: errors(*conv.result(v, direction, blocking)) for v in conv.variants}
-            yield variant_rows(
+            yield from variant_rows(
                 {"layer": layer.name, "shape": shape, "direction": direction.value},
                 runs,
                 found,

@@ -14,6 +14,7 @@ of cl/bench/peak.cl once a round.
 
 from collections import defaultdict
 from collections.abc import Iterator, Sequence
+from pathlib import Path
 
 import numpy as np
 
@@ -54,7 +55,7 @@ def _rows(dev, bench, blends, *, copy, before):
         features, moved = result.features.get(), bench.moved_bytes(blend, result)
         forward = sum(ms for name, ms in stages.items() if name in bench.forward_stages)
         backward = sum(stages.values()) - forward
-        gbs = sum(moved.values()) / (forward + backward) * 1e-6
+        gbs = moved / (forward + backward) * 1e-6
         yield {
             "scene": bench.name,
             "points": bench.count,
@@ -68,9 +69,6 @@ def _rows(dev, bench, blends, *, copy, before):
             "ms": float(np.median(whole_ms[blend])),
             "ms_range": [min(whole_ms[blend]), max(whole_ms[blend])],
             "stages_ms": stages,
-            "stages_bytes": moved,
-            "gbs": gbs,
-            "copy_gbs": float(copied),
             "copy_share": float(gbs / copied),
             "peak_device_bytes": dev.peak_bytes - before,
             "max_err": bench.error(blend, features),
@@ -102,68 +100,22 @@ def _time(dev, bench, blends, copy):
 
 
 COLUMNS = "{:7} {:>8} {:>5} {:7} {:>9} {:>9} {:>9} {:>5} {:>8}  {}".format
-HEAD = COLUMNS(
-    "scene",
-    "points",
-    "side",
-    "blend",
-    "shaded",
-    "forward",
-    "backward",
-    "copy",
-    "max err",
-    "stages",
-)
+WORDS = "scene points side blend shaded forward backward copy max-err stages"
+HEAD = COLUMNS(*WORDS.split())
 
 
 def line(row: dict) -> str:
-    """One line of the printed table; times in milliseconds."""
+    """One line of the printed table, also of a step of bench_step(); times in milliseconds."""
     stages = ", ".join(f"{name} {ms:.2f}" for name, ms in row["stages_ms"].items())
     return COLUMNS(
-        row["scene"],
+        Path(row["scene"]).name,
         row["points"],
         row["size"],
         row["blend"],
         row["shaded"],
         f"{row['forward_ms']:.2f}",
         f"{row['backward_ms']:.2f}",
-        f"{row['copy_share']:.0%}",
-        f"{row['max_err']:.1e}",
+        f"{row['copy_share']:.0%}" if "copy_share" in row else "",
+        f"{row['max_err']:.1e}" if "max_err" in row else "",
         stages,
-    )
-
-
-def curves(rows: list[dict]) -> dict[tuple[int, str], list[dict]]:
-    """{(side, blend): its rows by number of points}."""
-    found: dict[tuple[int, str], list[dict]] = {}
-    for row in sorted(rows, key=lambda row: row["points"]):
-        found.setdefault((row["size"], row["blend"]), []).append(row)
-    return found
-
-
-def growth(rows: list[dict]) -> list[dict]:
-    """[{"size", "blend", "exponent", "steepest"}]: time ~ points^exponent, fitted over all, and
-    between two neighbours.
-    """
-    found = []
-    for (size, blend), some in curves(rows).items():
-        if len(some) > 1:
-            n = np.log([row["points"] for row in some])
-            ms = np.log([row["forward_ms"] + row["backward_ms"] for row in some])
-            found.append(
-                {
-                    "size": size,
-                    "blend": blend,
-                    "exponent": float(np.polyfit(n, ms, 1)[0]),
-                    "steepest": float((np.diff(ms) / np.diff(n)).max()),
-                }
-            )
-    return found
-
-
-def growth_line(fit: dict) -> str:
-    """One of growth() in words."""
-    return (
-        f"side {fit['size']}, {fit['blend']}: time grows as points^{fit['exponent']:.2f}, at most"
-        f" ^{fit['steepest']:.2f} from one number to the next"
     )

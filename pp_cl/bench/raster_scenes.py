@@ -113,21 +113,18 @@ class BenchScene:
         rows = result.shaded_features.get()[: result.weights.shaded.size]
         return np.maximum(rows.max(axis=0), 1) - np.minimum(rows.min(axis=0), 1)
 
-    def moved_bytes(self, blend: str, result: RenderResult) -> dict[str, int]:
-        """{stage: bytes} that the stages must read and write: every value used by each kernel,
-        once.
-        """
+    def moved_bytes(self, blend: str, result: RenderResult) -> int:
+        """Bytes that the stages must read and write: every value used by each kernel, once."""
         n, p, hw, shaded = self.count, result.pairs.total, self.size**2, result.weights.shaded.size
         # of a point: place, box, first pair; of a pair: pixel, point and closeness, place or key
         search, pair = 16 + 8 + 4, 4 + 8 + 8
         rest = (8 + 8 + 4 + 4) * p if blend == "alpha" else 2 * ROW * hw
-        return {
-            # find, scan, scatter, sort
-            "pairs": n * search + 5 * 4 * n + 2 * p * pair + 2 * 8 * p + 4 * 4 * hw,
-            "weights": p * (8 + 8 + 8 + 8) + 4 * n + 4 * hw,
-            "blend": 8 * p + ROW * shaded + (ROW + 4) * hw,
-            "backward": p * (4 + 8) + 2 * ROW * shaded + 4 * n + (ROW + 4) * hw + rest,
-        }
+        # find, scan, scatter, sort
+        pairs = n * search + 5 * 4 * n + 2 * p * pair + 2 * 8 * p + 4 * 4 * hw
+        weights = p * (8 + 8 + 8 + 8) + 4 * n + 4 * hw
+        forward = 8 * p + ROW * shaded + (ROW + 4) * hw
+        backward = p * (4 + 8) + 2 * ROW * shaded + 4 * n + (ROW + 4) * hw + rest
+        return pairs + weights + forward + backward
 
 
 class GridScene(BenchScene):
@@ -185,14 +182,11 @@ class GridScene(BenchScene):
         coefficients[:, 0] = self.sh_0[points, 0]
         return dense.shade(self.positions[points], self.camera.eye, coefficients)
 
-    def moved_bytes(self, blend: str, result: RenderResult) -> dict[str, int]:
-        """Bytes by stage, with the stages of a grid and of harmonics."""
-        shading = 4 + 16 + 9 * ROW + ROW
-        own = {
-            "project": self.count * (4 + 16 + 8 + 4),
-            "shade": result.weights.shaded.size * shading,
-        }
-        return own | super().moved_bytes(blend, result)
+    def moved_bytes(self, blend: str, result: RenderResult) -> int:
+        """With the stages `project` and `shade`."""
+        shade = result.weights.shaded.size * (4 + 16 + 9 * ROW + ROW)
+        project = self.count * (4 + 16 + 8 + 4)
+        return project + shade + super().moved_bytes(blend, result)
 
 
 class PulsarScene(BenchScene):
@@ -282,12 +276,11 @@ class PulsarScene(BenchScene):
         """(S, 16) float64 features of some points."""
         return self.point_features[points].astype(np.float64)
 
-    def moved_bytes(self, blend: str, result: RenderResult) -> dict[str, int]:
-        """Bytes by stage, with the stages of spheres."""
+    def moved_bytes(self, blend: str, result: RenderResult) -> int:
+        """With the stages `project` and `spheres`."""
         n, p, hw = self.count, result.pairs.total, self.size**2
         spheres = p * (4 + 8 + 8 + 8) + p * (4 + 8) + (ROW + 16 + 16) * n + 2 * (ROW + 4) * hw
-        own = {"project": n * (12 + 16 + 8 + 4), "spheres": spheres}
-        return own | super().moved_bytes(blend, result)
+        return n * (12 + 16 + 8 + 4) + spheres + super().moved_bytes(blend, result)
 
 
 SCENES = {scene.name: scene for scene in (GridScene, PulsarScene)}

@@ -157,16 +157,14 @@ def variant_rows(
     peak_gflops = peak.flops / np.median(times["peak"]) * 1e-6
     rows = []
     for variant in runs:
-        low, ms, high = np.percentile(times[variant], (25, 50, 75))
+        ms = np.median(times[variant])
         gflops = flops / ms * 1e-6
         rows.append(
             {"variant": variant}
             | about
             | {
                 "ms": float(ms),
-                "ms_quartiles": [float(low), float(high)],
                 "ms_range": [min(times[variant]), max(times[variant])],
-                "runs": len(times[variant]),
                 "gflops": float(gflops),
                 "peak_gflops": float(peak_gflops),
                 "peak_share": float(gflops / peak_gflops),

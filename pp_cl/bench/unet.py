@@ -10,7 +10,6 @@ import numpy as np
 from pyopencl.array import Array
 
 from pp_cl.bench.timing import PeakFlops, errors, variant_rows
-from pp_cl.device.buffers import table_bytes
 from pp_cl.device.device import Device
 from pp_cl.layers.choice import AUTO, OFFERED, device_class
 from pp_cl.layers.conv_direct import unpack_weights
@@ -33,7 +32,7 @@ def bench_unet(
     = forward and backward to the input and the weights.
 
     The errors of train are those of the gradient (input's, or a weight's or bias's) where they are
-    largest. "memory_bytes" is the network's memory as shipped. blocks: as UNet takes them.
+    largest. blocks: as UNet takes them.
     """
     peak, rng = PeakFlops(dev), np.random.default_rng(0)
     x = np.maximum(rng.normal(size=(size, size, CHANNELS_IN)), 0).astype(np.float32)
@@ -48,13 +47,11 @@ def bench_unet(
     device_x, device_grad = dev.upload(x), dev.upload(grad_image)
     flops = 2 * multiplications(net.layers, size, size)
     for direction, factor, grad in (("forward", 1, None), ("train", 3, device_grad)):
-        memory = table_bytes(net.memory_plan(size, size, direction == "train"))
         about = {
             "layer": "network",
             "shape": [size, size, CHANNELS_IN, *widths, CHANNELS_OUT],
             "blocks": blocks,
             "direction": direction,
-            "memory_bytes": memory,
         }
         yield from variant_rows(
             about,
@@ -77,7 +74,7 @@ def make_network(
     through the layers as they do in a trained network. With UNet's own initial weights they fade,
     and the error of an image that is 0.5 and little else says nothing.
     """
-    net = UNet(dev, widths, CHANNELS_IN, CHANNELS_OUT, blocks=blocks, variant=variant)
+    net = UNet(dev, widths, blocks=blocks, variant=variant)
     for name, parameter in net.parameters.items():
         if name.endswith(".weight"):
             dev.write(parameter, np.float32(np.sqrt(6)) * parameter.get())

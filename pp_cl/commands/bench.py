@@ -1,22 +1,29 @@
 """`pp-cl bench`: time and error of convolutions, network, rasteriser and training steps."""
 
 import argparse
-from functools import partial
 from itertools import chain
+from typing import Any
 
 from pp_cl.commands import options as shared
-from pp_cl.config import CONVOLUTIONS, assign, preset
+from pp_cl.config import assign, preset
 from pp_cl.errors import UserError
+from pp_cl.settings import BLOCKS
 
 HELP = "time against error of the convolutions, the network, the rasteriser, a training"
 # the options that only some benches have
 OPTIONS = {
-    "all": ("budget", "plot"),
     "conv": ("size", "widths", "blocks", "plot"),
     "unet": ("size", "widths", "blocks", "plot"),
     "raster": ("size", "scene", "points", "blend", "gamma", "plot"),
     "train": ("scene", "points", "set"),
-    "model": ("runs", "plot"),
+    "all": ("plot",),
+}
+# what `all` measures: about two minutes on two cores
+SMALL: dict[str, dict[str, Any]] = {
+    "conv": {"size": [128], "widths": (32, 64, 128)},
+    "unet": {"size": [128], "widths": (32, 64, 128)},
+    "raster": {"size": [200, 400], "points": [10_000, 250_000]},
+    "train": {"points": [250_000]},
 }
 
 
@@ -28,9 +35,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         nargs="?",
         default="all",
         choices=OPTIONS,
-        help="all (default): conv, unet, raster and a training of the demo, at sizes that fit a"
-        " budget of time; conv: every layer of the network; unet: all of it; raster: points; train:"
-        " a step without the network; model: frames per second against PSNR of a trained run",
+        help="all (default): each of the others at small sizes; conv: every layer of the network;"
+        " unet: all of it; raster: points; train: a step without the network",
     )
     add(
         "--size",
@@ -39,7 +45,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="side of the image in pixels, a multiple of 4 (256; raster: 200,400,800)",
     )
     shared.add_widths(parser, "conv, unet: channels of the levels (128,256,512: the paper's)")
-    add("--blocks", choices=CONVOLUTIONS, help="conv, unet: of a level (double)")
+    add("--blocks", choices=BLOCKS, help="conv, unet: of a level (double)")
     add(
         "--scene",
         metavar="SCENE",
@@ -51,13 +57,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         type=shared.several(shared.integer(8, 2**27)),
         metavar="N,...",
         help="raster: numbers of points (10 thousand to 4 million); train: one (4 million)",
-    )
-    add("--runs", metavar="RUN,...", help="model: folders of runs; the first is reduced as well")
-    add(
-        "--budget",
-        type=_seconds,
-        metavar="T",
-        help="all: seconds, as 120 or 120s (120)",
     )
     add(
         "--blend",
@@ -75,60 +74,62 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     shared.add_json(parser, OPTIONS)
     add(
         "--plot",
-        type=shared.figure_file,
+        type=shared.output_file(".png", ".svg", ".pdf"),
         metavar="FILE",
-        help="also draw a picture there (.png, .svg, .pdf)",
+        help="also draw time against error there (.png, .svg, .pdf)",
     )
     shared.add_device(parser)
-
-
-def _seconds(text):
-    return shared.number(1, 86400)(text.removesuffix("s"))
 
 
 def run(options: argparse.Namespace) -> None:
     """Measure, print the table, write the files asked for. Raises UserError, before anything is
     measured, for options that make no sense and files that cannot be written.
     """
-    from pp_cl.bench.plots import figure_of, save_figure
+    from pp_cl.bench.plots import figure_of, plot_time_and_error, save_figure
+    from pp_cl.device.discover import open_device
 
-    _refuse_foreign(options)
+    foreign = set(chain(*OPTIONS.values())) - {*OPTIONS[options.what]}
+    shared.refuse(options, foreign, f"bench {options.what} has no such option")
     figure = figure_of(options.plot)
-    own = {"all": _run_all, "raster": _run_raster, "train": _run_train, "model": _run_model}
-    result, draw = own.get(options.what, _run_network)(options)
+    given = {options.what: vars(options)}
+    if options.what == "all":
+        given = {name: vars(options) | changes for name, changes in SMALL.items()}
+    benches = [
+        (name, BENCHES[name](name, argparse.Namespace(**own))) for name, own in given.items()
+    ]
+    dev, rows = open_device(options.device), []
+    print(f"{dev.name} [{dev.info['platform']}]")
+    for name, measure in benches:
+        head, line, found = measure(dev)
+        print(head)
+        for row in found:
+            rows.append({"bench": name} | row)
+            print(line(row), flush=True)
+    result = {"device": dev.name, "platform": dev.info["platform"], "rows": rows}
     shared.write_json_option(options.json, result)
     if figure:
-        draw(figure)
+        figure.suptitle(dev.name)
+        plot_time_and_error(figure, rows)
         save_figure(figure, options.plot)
 
 
-def _refuse_foreign(options):
-    """Raise UserError for an option of another bench."""
-    foreign = {name for names in OPTIONS.values() for name in names} - {*OPTIONS[options.what]}
-    shared.refuse(options, foreign, f"bench {options.what} has no such option")
+# ---- each bench: its options are checked; the function of a device that it returns gives the head
+# of the table, what makes a line of a row, and the rows as they are measured
 
 
-# ---- each bench: (what --json writes, draws it into a figure)
+def _network(name, options):
+    from pp_cl.bench.conv import bench_conv
+    from pp_cl.bench.timing import HEAD, line
+    from pp_cl.bench.unet import bench_unet
+
+    size = _one(options, "size") if options.size else 256
+    widths, blocks = options.widths or (128, 256, 512), options.blocks or "double"
+    bench = bench_conv if name == "conv" else bench_unet
+    return lambda dev: (HEAD, line, bench(dev, size, widths, blocks=blocks))
 
 
-def _run_all(options):
-    from pp_cl.bench.overview import bench_overview
-    from pp_cl.bench.plots import plot_overview
-
-    dev = _open_device(options)
-    result = bench_overview(dev, options.budget or 120, partial(print, flush=True))
-    print(f"{result['seconds']:.0f} s")
-
-    def draw(figure):
-        figure.suptitle(dev.name)
-        plot_overview(figure, result)
-
-    return result, draw
-
-
-def _run_raster(options):
-    from pp_cl.bench.plots import plot_growth
-    from pp_cl.bench.raster import BLENDS, HEAD, bench_raster, growth, growth_line, line
+def _raster(_, options):
+    from pp_cl.bench.raster import BLENDS, HEAD, bench_raster, line
     from pp_cl.bench.raster_scenes import SCENES
 
     scene = options.scene or "grid"
@@ -137,85 +138,25 @@ def _run_raster(options):
     points = options.points or [10_000, 63_000, 250_000, 1_000_000, 4_000_000]
     sizes, blends = options.size or [200, 400, 800], options.blend or BLENDS
     gamma = options.gamma or 0.01  # the last one of a training, the sharpest
-    dev = _open_device(options)
-    found = bench_raster(dev, scene, points, sizes, blends=blends, gamma=gamma)
-    rows = _print_rows(HEAD, line, found)
-    fits = growth(rows)
-    for fit in fits:
-        print(growth_line(fit))
-    title = f"raster, {scene}, gamma {gamma:g}, {dev.name}"
-    return _result(dev, rows) | {"growth": fits}, partial(_draw, plot_growth, rows, title)
+    return lambda dev: (
+        HEAD,
+        line,
+        bench_raster(dev, scene, points, sizes, blends=blends, gamma=gamma),
+    )
 
 
-def _run_train(options):
+def _train(_, options):
+    from pp_cl.bench.raster import HEAD, line
     from pp_cl.bench.training import bench_step
     from pp_cl.config import configure
 
     config = configure(preset("paper"), options.scene or "demo", options.set)
     if options.points:
         assign(config, "points.count", _one(options, "points"), "--points")
-    dev = _open_device(options)
-    row = bench_step(dev, config)
-    print(
-        f"{row['points']} points, {row['pairs']} hits in a view, {row['shaded']:.0%} shaded,"
-        f" {row['peak_device_bytes'] / 2**30:.2f} GiB at the peak"
-    )
-    for name, ms in row["stages_ms"].items():
-        print(f"  {name:10s} {ms:9.2f} ms")
-    print(f"forward {row['forward_ms']:.2f} ms, backward and update {row['backward_ms']:.2f} ms")
-    return _result(dev, [row]), None
+    return lambda dev: (HEAD, line, bench_step(dev, config))
 
 
-def _run_model(options):
-    from pp_cl.bench.model import HEAD, bench_models, line
-    from pp_cl.bench.plots import plot_models
-    from pp_cl.run import load_run
-
-    if not options.runs:
-        raise UserError("--runs: missing; name the folder of a trained run")
-    dev = _open_device(options)
-    runs = [load_run(dev, folder) for folder in options.runs.split(",")]
-    rows = _print_rows(HEAD, line, bench_models(runs))
-    return _result(dev, rows), partial(_draw, plot_models, rows, f"{runs[0].folder}, {dev.name}")
-
-
-def _run_network(options):
-    from pp_cl.bench.conv import bench_conv
-    from pp_cl.bench.plots import plot_time_and_error
-    from pp_cl.bench.timing import HEAD, line
-    from pp_cl.bench.unet import bench_unet
-
-    size = _one(options, "size") if options.size else 256
-    widths, blocks = options.widths or (128, 256, 512), options.blocks or "double"
-    dev = _open_device(options)
-    if options.what == "conv":
-        found = chain.from_iterable(bench_conv(dev, size, widths, blocks=blocks))
-    else:
-        found = bench_unet(dev, size, widths, blocks=blocks)
-    rows = _print_rows(HEAD, line, found)
-    for direction, memory in {r["direction"]: r.get("memory_bytes") for r in rows}.items():
-        if memory:
-            print(f"the network's memory, {direction}: {memory / 2**20:.0f} MiB")
-    title = f"{options.what}, {size} x {size}, {dev.name}"
-    return _result(dev, rows), partial(_draw, plot_time_and_error, rows, title)
-
-
-def _print_rows(head, line, found):
-    """The rows, each printed as soon as it is measured."""
-    print(head)
-    rows = []
-    for row in found:
-        rows.append(row)
-        print(line(row), flush=True)
-    return rows
-
-
-def _draw(plot, rows, title, figure):
-    plot(figure.add_subplot(title=title), rows)
-
-
-def _result(dev, rows):
-    return {"device": dev.name, "platform": dev.info["platform"], "rows": rows}
+BENCHES = {"conv": _network, "unet": _network, "raster": _raster, "train": _train}
 
 
 def _one(options, name):
@@ -225,12 +166,3 @@ def _one(options, name):
         text = ",".join(map(str, numbers))
         raise UserError(f"--{name} {text}: write one number for bench {options.what}")
     return numbers[0]
-
-
-def _open_device(options):
-    """The device asked for, named on the first line."""
-    from pp_cl.device.discover import open_device
-
-    dev = open_device(options.device)
-    print(f"{dev.name} [{dev.info['platform']}]")
-    return dev

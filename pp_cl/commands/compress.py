@@ -1,4 +1,4 @@
-"""`pp-cl compress`: makes a trained model smaller and faster within a stated loss of quality."""
+"""`pp-cl compress`: makes a trained model smaller within a stated loss of quality."""
 
 import argparse
 from pathlib import Path
@@ -6,13 +6,11 @@ from pathlib import Path
 from pp_cl.commands import options as shared
 from pp_cl.errors import UserError
 
-HELP = "make a trained model smaller and faster within a stated loss"
-EPILOG = """Tried in turn, each kept where the views below lose no more: coefficients of 16 bits, no
-channels of the network that are dead or hardly weigh, stopping earlier along a pixel, fewer
-harmonics, and at last fewer points, those that weigh least in any training view going first. The
-loss is measured on the split val, without one on every eighth training view; never on the test
-views. Without the scene it is estimated from the run's own renderings of these."""
-COLUMNS = "{:20s} {:>8s} {:>8s} {:>10s} {:>10s} {:>7s}  {}".format
+HELP = "make a trained model smaller within a stated loss"
+EPILOG = """Coefficients of 16 bits, and fewer points, those that weigh least in any training view
+going first, as long as the views below lose no more. The loss is measured on the split val, without
+one on every eighth training view; never on the test views. Without the scene it is estimated from
+the run's own renderings of these."""
 
 
 def _decibels(text):
@@ -40,8 +38,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> None:
     """Search, write the compressed run, print what it saves and loses."""
+    from tqdm import tqdm
+
     from pp_cl.compress.reduction import REPORT, Original, nbytes
-    from pp_cl.compress.search import Search, frame_ms, validation_views
+    from pp_cl.compress.search import Search, validation_views
     from pp_cl.device.discover import open_device
     from pp_cl.files.atomic import check_new_folder
     from pp_cl.run import load_run
@@ -54,56 +54,30 @@ def run(options: argparse.Namespace) -> None:
     which, views, error = validation_views(whole)
     original = Original.of(whole)
     search = Search(original, views, options.max_loss, error)
-    trials = _trials(search, which, options.verbose)
-    ms, sizes = frame_ms([whole, search.run], views), [nbytes(whole), nbytes(search.run)]
+    if options.verbose:
+        print(f"{which}: {search.psnr:.2f} dB, may lose {search.most_loss:g}", flush=True)
+    trials = []
+    for trial in tqdm(search.trials(), "searching", unit="trial", leave=False, disable=None):
+        trials.append(trial)
+        if options.verbose:
+            state = "taken" if trial.taken else "loses too much"
+            tqdm.write(f"{trial}: {trial.psnr:.3f} dB, {trial.nbytes / 2**20:.1f} MiB, {state}")
+    found, before = search.found, nbytes(whole)
     report = {
         "of": str(whole.folder),
         "most_loss": options.max_loss,
         "views": which,
         "psnr": search.psnr,
-        "loss": search.loss,
-        "reduction": vars(search.reduction),
-        "bytes": sizes,
-        "points": [whole.model.cloud.count, search.run.model.cloud.count],
-        "frame_ms": ms,
+        "loss": found.loss,
+        "bytes": [before, found.nbytes],
+        "points": [whole.model.cloud.count, found.points],
         "device": whole.dev.name,
-        "trials": [vars(trial) | {"reduction": vars(trial.reduction)} for trial in trials],
+        "trials": [vars(trial) for trial in trials],
     }
-    original.write(search.reduction, out, report)
+    original.write(found.keep, found.half, out, report)
     print(
-        f"{sizes[0] / 2**20:.1f} to {sizes[1] / 2**20:.1f} MiB ({sizes[0] / sizes[1]:.1f} times"
-        f" less), {1e3 / ms[0]:.1f} to {1e3 / ms[1]:.1f} frames per second"
-        f" ({ms[0] / ms[1]:.2f} times), {search.loss:.3f} dB lost on {which}"
+        f"{before / 2**20:.1f} to {found.nbytes / 2**20:.1f} MiB"
+        f" ({before / found.nbytes:.1f} times less), {whole.model.cloud.count} to {found.points}"
+        f" points, {found.loss:.3f} dB lost on {which}"
     )
     print(f"wrote {out} and {out / REPORT}; pp-cl eval {out} measures its test views")
-
-
-def _trials(search, which, verbose):
-    """All that is tried, told while it is: as a table, or as a count on a terminal."""
-    from tqdm import tqdm
-
-    if verbose:
-        print(f"{which}: {search.psnr:.2f} dB, may lose {search.most_loss:g}")
-        print(COLUMNS("tried", "PSNR", "loss", "points", "MiB", "speed", ""), flush=True)
-    trials = []
-    disable = True if verbose else None  # None: where there is no terminal
-    with tqdm(desc="searching", unit="trial", leave=False, disable=disable) as bar:
-        for trial in search.trials():
-            trials.append(trial)
-            bar.update()
-            if verbose:
-                print(_line(trial), flush=True)
-    return trials
-
-
-def _line(trial):
-    speed = "" if trial.speed is None else f"{trial.speed:.2f}"
-    return COLUMNS(
-        trial.what,
-        f"{trial.psnr:.3f}",
-        f"{trial.loss:.3f}",
-        str(trial.points),
-        f"{trial.nbytes / 2**20:.1f}",
-        speed,
-        "taken" if trial.taken else "",
-    )

@@ -24,17 +24,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--save-images", action="store_true", help="write every view to RUN/eval/images/"
     )
-    parser.add_argument(
-        "--published",
-        action="store_true",
-        help="show published results even of other sizes or views",
-    )
-    parser.add_argument(
-        "--chart",
-        type=shared.figure_file,
-        metavar="FILE",
-        help="draw the run among the published results (PNG, SVG, PDF)",
-    )
     shared.add_json(parser)
     shared.add_open(parser)
     shared.add_device(parser)
@@ -42,13 +31,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> None:
     """Evaluate, print the table."""
-    from pp_cl.bench.plots import figure_of, plot_ranks, save_figure
     from pp_cl.commands.progress import counted
     from pp_cl.device.discover import open_device
     from pp_cl.run import evaluate, load_run
 
     metrics = options.metrics
-    figure = figure_of(options.chart, "--chart")
     dev = open_device(options.device)
     run = load_run(dev, options.run_folder, scene=options.scene)
     with counted("view") as on_view:
@@ -58,25 +45,19 @@ def run(options: argparse.Namespace) -> None:
             metrics,
             save_images=options.save_images,
             out=options.out,
-            published=options.published,
             on_view=on_view,
         )
     folder = run.folder
     state = "" if result["finished"] else f", unfinished, step {result['step']}"
     own = f"{folder} ({len(result['per_image'])} views{state})"
-    ranked = [(own, result["mean"]), *result["published"].items()]
+    published = {} if result["published_differs"] else result["published"]
+    ranked = [(own, result["mean"]), *published.items()]
     if "mean_after_gains" in result:
         ranked.append((AFTER_GAINS, result["mean_after_gains"]))
     if "psnr" in metrics:
         ranked.sort(key=lambda row: -row[1]["psnr"])
-    if figure:
-        figure.set_size_inches(4 * len(metrics), 6)
-        plot_ranks(figure, list(metrics), ranked, own)
-        save_figure(figure, options.chart)
     shared.write_json_option(options.json, result)
     print(_table(result, ranked, len(own)))
-    if options.published and not result["published"]:
-        print("--published: no results are known of this scene")
     print(_summary(result))
     written = Path(options.out or folder.evaluation(options.split))
     print(
@@ -94,8 +75,6 @@ def _table(result, ranked, width):
     for label, values in ranked:
         cells = (_cell(values, name) for name in names)
         lines.append(f"{label:{width}s}" + "".join(cells).rstrip())
-    if result["published_differs"]:
-        lines.append(result["published_differs"])
     if "lpips" in names and any(OTHER_LPIPS in values for _, values in ranked):
         lines.append("* LPIPS by AlexNet, which cannot be compared with the others, by VGG16")
     return "\n".join(lines)

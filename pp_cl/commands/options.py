@@ -120,10 +120,6 @@ def output_file(*suffixes: str) -> Callable[[str], str]:
     return read
 
 
-# a picture that matplotlib draws
-figure_file = output_file(".png", ".svg", ".pdf")
-
-
 # ---- options
 
 

@@ -2,12 +2,12 @@
 
 import argparse
 import sys
-from contextlib import ExitStack, suppress
+from contextlib import ExitStack
 from pathlib import Path
 
 from pp_cl.commands import options as shared
 from pp_cl.errors import Stopped, UserError
-from pp_cl.presets import PRESETS, SHORT
+from pp_cl.presets import PRESETS
 
 HELP = "train and measure scenes x settings x seeds, with one table; the same command resumes"
 EPILOG = """\
@@ -73,28 +73,39 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(options: argparse.Namespace) -> None:
     """Run what is missing, print the table. Raises Stopped where runs failed."""
     from pp_cl.files.manifest import begin_manifest, check_ours, note_in_place
-    from pp_cl.sweep.result import finished_row
-    from pp_cl.sweep.table import TABLES, text_table, write_tables
+    from pp_cl.files.run_folder import RunFolder
+    from pp_cl.sweep.result import failed_row, finished_row
+    from pp_cl.sweep.table import TABLES, markdown, run_text, values_text, write_tables
 
     jobs, out = _jobs(options), Path(options.out)
-    if options.dry_run:
-        _print_plan(jobs)
-        return
-    rows = {}
+    rows, states = {}, {}
     for job in jobs:
-        with suppress(UserError):  # which the job meets again, and tells in its row
+        states[job.folder] = "to go on" if RunFolder(job.folder).config.exists() else "to do"
+        try:
             if row := finished_row(job):
-                rows[job.folder] = row
+                rows[job.folder], states[job.folder] = row, f"finished: {values_text(row)}"
+        except UserError as error:  # which the job meets again, and tells in its row
+            states[job.folder] = f"will fail: {error}"
+    told = f"{len(jobs)} runs, {len(rows)} of them finished already"
+    if options.dry_run:
+        for job in jobs:
+            print(f"{run_text(failed_row(job, ''))}: {states[job.folder]}")
+        print(f"{told}; nothing was started")
+        return
+    print(told, flush=True)
     missing = [job for job in jobs if job.folder not in rows]
-    print(f"{len(jobs)} runs, {len(rows)} of them finished already", flush=True)
     check_ours([out / name for name in TABLES])
     begin_manifest(out)
     note_in_place(out.resolve(), [job.log for job in missing])
     if missing:
-        rows |= _run(options, missing, len(rows))
-    ordered = [_relative(rows[job.folder], out) for job in jobs]
+        rows |= _run(options, missing, len(jobs))
+    # folders as seen from `out`, which may be moved
+    ordered = [
+        rows[job.folder] | {"folder": Path(job.folder).relative_to(out.resolve()).as_posix()}
+        for job in jobs
+    ]
     shared.write_json_option(options.json, write_tables(out, ordered))
-    print(text_table(ordered))
+    print(markdown(ordered))
     print("wrote " + " and ".join(str(out / name) for name in TABLES))
     failed = sum("error" in row for row in ordered)
     if failed:
@@ -112,79 +123,39 @@ def _jobs(options):
         raise UserError("--json: a dry run measures nothing; leave one of both out")
     if RunFolder(options.out).config.exists():
         raise UserError(f"--out {options.out}: is the folder of a run; choose another")
-    given = options.set
-    if options.iterations:
-        given = [(SHORT["iterations"], options.iterations, "--iterations"), *given]
     return plan(
         options.scenes,
         options.out,
         options.seeds,
         read_varied(options.vary),
-        given=given,
+        given=[*shared.read_short(options, ["iterations"]), *options.set],
         preset_name=options.preset,
         metrics=options.metrics,
     )
 
 
-def _print_plan(jobs):
-    """What would be run, and what has been."""
-    from pp_cl.files.run_folder import RunFolder
-    from pp_cl.sweep.result import finished_row, progress
-    from pp_cl.sweep.table import values_text
-
-    done = 0
-    for job in jobs:
-        state = f"to go on: {progress(job)}" if RunFolder(job.folder).config.exists() else "to do"
-        try:
-            if row := finished_row(job):
-                state = f"finished: {values_text(row)}"
-                done += 1
-        except UserError as error:
-            state = f"will fail: {error}"
-        print(f"{job}: {state}")
-    print(f"{len(jobs)} runs, {done} of them finished already; nothing was started")
-
-
-def _run(options, jobs, done):
-    """{folder: row} of the jobs: a line for each that ends, and on a terminal below them a bar with
-    those at work. Raises Stopped after Ctrl-C or SIGTERM.
+def _run(options, jobs, total):
+    """{folder: row} of the jobs, with a line for each that ends. Raises Stopped after Ctrl-C or
+    SIGTERM.
     """
-    from tqdm import tqdm
-
     from pp_cl.commands.progress import first_signal
     from pp_cl.device.discover import separate_devices
     from pp_cl.sweep.cluster import client_of, local_client, run_jobs
-    from pp_cl.sweep.result import progress
     from pp_cl.sweep.table import run_text, values_text
 
-    rows, total = {}, done + len(jobs)
+    rows, devices = {}, [] if options.scheduler else separate_devices()
     with ExitStack() as stack:
         caught = stack.enter_context(first_signal())
         if options.scheduler:
             client = stack.enter_context(client_of(options.scheduler))
         else:
-            devices = separate_devices()
             workers = min(options.workers or len(devices), len(jobs))
-            client = stack.enter_context(local_client(devices, workers))
-        bar = stack.enter_context(tqdm(total=total, initial=done, unit="run", disable=None))
-
-        def on_row(job, row):
-            rows[job.folder] = row
-            text = f"[{done + len(rows)} of {total}] {run_text(row)}: {values_text(row)}"
-            tqdm.write(text, file=sys.stderr)
-            bar.update()
-
-        def on_tick(at_work):
-            if not bar.disable:
-                bar.set_postfix_str("; ".join(f"{job}: {progress(job)}" for job in at_work))
-
-        run_jobs(client, jobs, on_row=on_row, on_tick=on_tick, is_stopped=lambda: bool(caught))
-    if len(rows) < len(jobs):
-        left = len(jobs) - len(rows)
-        raise Stopped(f"stopped with {left} runs left; the same command goes on", 128 + caught[0])
+            client = stack.enter_context(local_client(workers))
+        for row in run_jobs(client, jobs, devices, lambda: bool(caught)):
+            rows[row["folder"]] = row
+            number = total - len(jobs) + len(rows)
+            text = f"[{number} of {total}] {run_text(row)}: {values_text(row)}"
+            print(text, file=sys.stderr, flush=True)
+    if caught and any("error" in row for row in rows.values()):
+        raise Stopped("stopped; the same command goes on", 128 + caught[0])
     return rows
-
-
-def _relative(row, out):
-    """The row with its folder as seen from `out`, which may be moved."""
-    return row | {"folder": Path(row["folder"]).relative_to(out.resolve()).as_posix()}

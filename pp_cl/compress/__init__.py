@@ -1,1 +1,1 @@
-"""Makes trained models smaller and faster within a stated loss of quality."""
+"""Makes trained models smaller within a stated loss of quality."""

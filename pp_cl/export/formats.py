@@ -9,9 +9,10 @@ from itertools import chain
 from pathlib import Path
 
 from pp_cl.errors import UserError
+from pp_cl.export.gltf import gltf_colours, write_glb
 from pp_cl.export.mesh import coloured_mesh, write_mesh
 from pp_cl.export.page import page_text, write_gallery
-from pp_cl.export.points import coloured_points, write_glb, write_ply
+from pp_cl.export.points import coloured_points, write_ply
 from pp_cl.export.splat import Y_DOWN, Y_UP, splats, write_splat_glb, write_splat_ply
 from pp_cl.files.atomic import check_file, check_new_folder, write_text
 from pp_cl.files.manifest import begin_manifest, check_ours
@@ -87,7 +88,8 @@ def export(
     if name == "ply":
         write_ply(path, points, run.model.cloud)
     else:
-        write_glb(path, points)
+        colours = gltf_colours(points.colours)
+        write_glb(path, {"POSITION": points.positions, "COLOR_0": colours})
     return f"{len(points.rows)} of {count} points"
 
 

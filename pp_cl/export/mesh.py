@@ -7,18 +7,16 @@ from pathlib import Path
 
 import numpy as np
 import plyfile
-import trimesh
 from scipy.spatial import cKDTree
 from skimage.measure import marching_cubes
 from tqdm import tqdm
 
 from pp_cl.errors import UserError
 from pp_cl.export.fusion import box_around, fuse
+from pp_cl.export.gltf import gltf_colours, write_glb
 from pp_cl.export.points import (
     ColouredPoints,
     coloured_points,
-    glb_data,
-    gltf_colours,
     in_world,
     place_and_colour,
     table_of,
@@ -75,13 +73,8 @@ def _colours(vertices, points: ColouredPoints, edge):
 def write_mesh(path: Path | str, mesh: Mesh) -> None:
     """Write a PLY or GLB file, by the suffix. Raises UserError as atomic_file does."""
     if Path(path).suffix.lower() == ".glb":
-        colours = gltf_colours(mesh.colours)
-
-        def make(vertices):
-            return trimesh.Trimesh(vertices, mesh.faces, vertex_colors=colours, process=False)
-
-        with atomic_file(path) as file:
-            file.write(glb_data(mesh.vertices, make))
+        attributes = {"POSITION": mesh.vertices, "COLOR_0": gltf_colours(mesh.colours)}
+        write_glb(path, attributes, faces=mesh.faces)
         return
     faces = np.empty(len(mesh.faces), [("vertex_indices", "<i4", (3,))])
     faces["vertex_indices"] = mesh.faces

@@ -1,20 +1,16 @@
-"""The points of a run with the colours that its network gives them, as PLY and GLB files."""
+"""The points of a run with the colours that its network gives them, as PLY files."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import plyfile
-import trimesh
 
 from pp_cl.errors import UserError
 from pp_cl.export.observe import observe
 from pp_cl.files.atomic import atomic_file
-from pp_cl.files.exr import srgb_to_linear
 from pp_cl.files.image import to_8bit
 from pp_cl.files.picture import Picture
 from pp_cl.raster.points import PointCloud
@@ -124,32 +120,3 @@ def table_of(columns: dict[str, np.ndarray]) -> np.ndarray:
     names = list(columns)
     formats = [column.dtype.newbyteorder("<") for column in columns.values()]
     return np.rec.fromarrays(list(columns.values()), dtype=list(zip(names, formats, strict=True)))
-
-
-def write_glb(path: Path | str, points: ColouredPoints) -> None:
-    """Write a GLB file of coloured points. Raises UserError as atomic_file does."""
-    colours = gltf_colours(points.colours)
-    data = glb_data(points.positions, lambda positions: trimesh.PointCloud(positions, colours))
-    with atomic_file(path) as file:
-        file.write(data)
-
-
-def glb_data(positions: np.ndarray, make: Callable[[np.ndarray], Any]) -> bytes:
-    """The GLB file of what make() makes of (M, 3) positions. glTF 2.0 keeps these in float32, so
-    those of float64 are moved to the origin, and the file's node moves them back.
-    """
-    if positions.dtype == np.float32:
-        return make(positions).export(file_type="glb")
-    centre = np.rint(positions.mean(0))
-    scene, place = trimesh.Scene(), np.eye(4)
-    place[:3, 3] = centre
-    scene.add_geometry(make(positions - centre), transform=place)
-    return scene.export(file_type="glb")
-
-
-def gltf_colours(colours: np.ndarray) -> np.ndarray:
-    """(M, 4) uint8 linear RGBA of (M, 3) uint8 sRGB: glTF 2.0 keeps vertex colours in linear
-    light.
-    """
-    linear = to_8bit(srgb_to_linear(colours / np.float32(255)))
-    return np.column_stack([linear, np.full(len(colours), 255, np.uint8)])

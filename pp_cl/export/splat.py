@@ -2,17 +2,16 @@
 
 from __future__ import annotations
 
-import json
-import struct
 from pathlib import Path
 
 import numpy as np
 import plyfile
 from scipy.spatial.transform import Rotation
 
+from pp_cl.export.gltf import gltf_colours, write_glb
 from pp_cl.export.harmonics import COUNT, basis, fit_harmonics
 from pp_cl.export.page import check_drawable
-from pp_cl.export.points import gltf_colours, in_world, table_of
+from pp_cl.export.points import in_world, table_of
 from pp_cl.files.atomic import atomic_file
 from pp_cl.files.image import to_8bit
 from pp_cl.run import Run
@@ -108,58 +107,18 @@ def write_splat_glb(path: Path | str, table: np.ndarray, origin: np.ndarray) -> 
     """Write splats() and their origin as glTF 2.0 with KHR_gaussian_splatting. Raises UserError as
     atomic_file does.
     """
-    prefix, positions = "KHR_gaussian_splatting:", table["position"]
-    arrays = {
-        "POSITION": positions,
+    extension, place = "KHR_gaussian_splatting", table["position"]
+    attributes = {
+        "POSITION": place + origin if origin.any() else place,
         # of programs that draw points instead
         "COLOR_0": gltf_colours(to_8bit(0.5 + CONSTANT * table["harmonics"][:, 0])),
-        prefix + "ROTATION": np.tile(np.array([0, 0, 0, 1], np.float32), (len(table), 1)),
-        prefix + "SCALE": table["deviation"].repeat(3).reshape(-1, 3),
-        prefix + "OPACITY": table["opacity"],
+        f"{extension}:ROTATION": np.tile(np.array([0, 0, 0, 1], np.float32), (len(table), 1)),
+        f"{extension}:SCALE": table["deviation"].repeat(3).reshape(-1, 3),
+        f"{extension}:OPACITY": table["opacity"],
     }
     for k in range(COUNT):
         degree = int(k**0.5)
-        name = f"{prefix}SH_DEGREE_{degree}_COEF_{k - degree**2}"
-        arrays[name] = table["harmonics"][:, k]
-    data = [np.ascontiguousarray(array).tobytes() for array in arrays.values()]
-    starts = np.cumsum([0, *map(len, data)]).tolist()
-    views = [
-        {"buffer": 0, "byteOffset": start, "byteLength": len(part)}
-        for start, part in zip(starts, data, strict=False)
-    ]
-    accessors = [
-        {
-            "bufferView": i,
-            "componentType": 5126 if array.dtype == np.float32 else 5121,  # float, unsigned byte
-            "type": {1: "SCALAR", 3: "VEC3", 4: "VEC4"}[array.size // len(table)],
-            "count": len(table),
-        }
-        for i, array in enumerate(arrays.values())
-    ]
-    accessors[0] |= {"min": positions.min(0).tolist(), "max": positions.max(0).tolist()}
-    accessors[1]["normalized"] = True
+        name = f"{extension}:SH_DEGREE_{degree}_COEF_{k - degree**2}"
+        attributes[name] = table["harmonics"][:, k]
     kernel = {"kernel": "ellipse", "colorSpace": "srgb_rec709_display"}
-    primitive = {
-        "mode": 0,
-        "attributes": {name: i for i, name in enumerate(arrays)},
-        "extensions": {prefix[:-1]: kernel},
-    }
-    gltf = {
-        "asset": {"version": "2.0", "generator": "pp-cl"},
-        "extensionsUsed": [prefix[:-1]],
-        "scene": 0,
-        "scenes": [{"nodes": [0]}],
-        "nodes": [{"mesh": 0, "translation": origin.tolist()}],
-        "meshes": [{"primitives": [primitive]}],
-        "accessors": accessors,
-        "bufferViews": views,
-        "buffers": [{"byteLength": starts[-1]}],
-    }
-    text = json.dumps(gltf).encode()
-    text += b" " * (-len(text) % 4)
-    with atomic_file(path) as file:
-        length = 12 + 8 + len(text) + 8 + starts[-1]
-        file.write(struct.pack("<4sII", b"glTF", 2, length))
-        file.write(struct.pack("<I4s", len(text), b"JSON") + text)
-        file.write(struct.pack("<I4s", starts[-1], b"BIN\0"))
-        file.writelines(data)
+    write_glb(path, attributes, extension=(extension, kernel))

@@ -4,16 +4,18 @@ CPUs, by the width of their vectors; `python -m tools.tune` measures a row of th
 """
 
 import math
-from types import ModuleType
-
-from pyopencl.array import Array
 
 from pp_cl.device.device import Device
-from pp_cl.layers import conv_direct, conv_local, conv_winograd
-from pp_cl.layers.conv_direct import Blocking, ConvShape, Direction
+from pp_cl.layers.conv_direct import Blocking, ConvShape, DirectConv, Direction
+from pp_cl.layers.conv_local import LocalConv
+from pp_cl.layers.conv_winograd import WinogradConv, fits
 
 AUTO = "auto"
-VARIANTS = {"local": conv_local, "direct": conv_direct, "winograd": conv_winograd}
+VARIANTS: dict[str, type[DirectConv]] = {
+    "local": LocalConv,
+    "direct": DirectConv,
+    "winograd": WinogradConv,
+}
 # {class of device: the variants that it is offered}. By what GPU compilers say of registers and
 # instructions, "local" is the faster one there, not timed; Winograd's groups would be one lane, and
 # spill 15 KB of registers.
@@ -82,32 +84,19 @@ def can_run(variant: str, k: int, *channels: int) -> bool:
     """Whether a variant takes a K x K kernel and these numbers of channels, of each source and of
     the output.
     """
-    return variant != "winograd" or (k == 3 and conv_winograd.fits(*channels))
+    return variant != "winograd" or (k == 3 and fits(*channels))
 
 
-def choose(dev: Device, shape: ConvShape, variant: str = AUTO) -> str:
-    """The name of the variant that computes a convolution. variant: a name in VARIANTS is taken
-    wherever it can run, "direct" elsewhere; AUTO takes the shipped choice. Raises ValueError for
-    another variant.
+def choose(dev: Device, shape: ConvShape, variant: str = AUTO) -> type[DirectConv]:
+    """What computes a convolution, of VARIANTS. variant: a name there is taken wherever it can run,
+    "direct" elsewhere; AUTO takes the shipped choice. Raises ValueError for another variant.
     """
     if variant not in (AUTO, *VARIANTS):
         raise ValueError(f"variant {variant!r}: must be one of {', '.join((AUTO, *VARIANTS))}")
     channels = *shape.sources, shape.co
-    if variant != AUTO:
-        return variant if can_run(variant, shape.k, *channels) else "direct"
-    if not dev.is_cpu:
-        return "local"
-    gains = math.prod(shape.size) >= WINOGRAD_FROM[shape.direction]
-    return "winograd" if gains and can_run("winograd", shape.k, *channels) else "direct"
-
-
-def laid_out(dev: Device, module: ModuleType, weight: Array, shape: ConvShape) -> Array:
-    """A layer's weights as a module's kernels read them in one direction, in a new array or, where
-    they read them as they are, itself.
-    """
-    needed = module.work_shape(shape)
-    if needed is None:
-        return weight
-    array = dev.empty(needed)
-    module.lay_out(dev, weight.reshape(-1), [(shape, 0, 0)], array)
-    return array
+    if variant == AUTO and not dev.is_cpu:
+        variant = "local"
+    elif variant == AUTO:
+        gains = math.prod(shape.size) >= WINOGRAD_FROM[shape.direction]
+        variant = "winograd" if gains else "direct"
+    return VARIANTS[variant if can_run(variant, shape.k, *channels) else "direct"]

@@ -1,9 +1,8 @@
 """Direct convolutions, of any channels, 1x1 and 3x3; and what all convolutions share: the layout of
 weights, the cutting of work, checks.
 
-conv_winograd.py and conv_local.py have the same six functions: work_shape, scratch_floats, lay_out,
-forward, backward_input and backward_weights. All are convolutions K x K (K = 1 or 3) of stride 1
-with zero padding K // 2; choice.py says which module computes one.
+All are convolutions K x K (K = 1 or 3) of stride 1 with zero padding K // 2. conv_winograd.py and
+conv_local.py compute them in other ways; choice.py says which one is taken.
 """
 
 import math
@@ -16,7 +15,7 @@ from pyopencl.array import Array
 
 from pp_cl.device.device import Device
 from pp_cl.device.launch import lanes, row_parts
-from pp_cl.layers.tiles import SIDE, VECTOR, Tiles, checked_tiles
+from pp_cl.layers.tiles import SIDE, VECTOR, Tiles
 
 # Rows of the image that one work-item sums for the gradient of the weights: few enough to stay in a
 # core's cache, and enough parts for all cores.
@@ -60,6 +59,7 @@ class ConvShape:
         return sum(self.sources[: self.source or 0])
 
 
+Sources = tuple[Array, ...]
 # Weights to lay out: for which pass, their first float, and the first float of what they become.
 Layout = tuple[ConvShape, int, int]
 # Parts of gradients to sum: the shape of the array that they lie in, how many, the first float of
@@ -124,21 +124,6 @@ def parts_shape(parts: int, k: int, ci: int, co: int) -> tuple[int, int, int, in
     return parts, -(-co // VECTOR), k * k * ci + 1, VECTOR
 
 
-def check_shape(
-    channels: Sequence[int], co: int, found: Array, expected: tuple, bias: Array | None = None
-) -> None:
-    """Raise ValueError unless the weights, or parts of their gradients, `found` are those of a
-    convolution from these channels to `co`, which have the shape `expected`, and so the bias.
-    """
-    of_bias = (-(-co // VECTOR) * VECTOR,)
-    if found.shape != expected or (bias is not None and bias.shape != of_bias):
-        raise ValueError(
-            f"convolution of {' + '.join(map(str, channels))} to {co} channels: weights"
-            f" {found.shape}, expected {expected}"
-            + (f", bias {bias.shape}, expected {of_bias}" if bias is not None else "")
-        )
-
-
 def table_of_sums(jobs: Sequence[Sums]) -> tuple[list[tuple[int, ...]], int]:
     """(rows, number of sums of 16) of the table that sum_parts() takes."""
     rows, n = [], 0
@@ -168,204 +153,197 @@ def sum_parts(
     )
 
 
-def work_shape(shape: ConvShape) -> tuple[int, ...] | None:
-    """The shape of the float32 array that a direction needs beside the layer's own: for FORWARD and
+class DirectConv:
+    """One direction of a convolution, whose kernels are conv.cl and conv_backward_weights.cl.
+
+    work_shape: of the float32 array that it needs beside the layer's own: for FORWARD and
     BACKWARD_INPUT the weights as the kernels read them, which lay_out() writes, None where they
-    read them as they are; for BACKWARD_WEIGHTS the parts of the sums.
+    read them as they are; for BACKWARD_WEIGHTS the parts of the sums. Its methods raise ValueError
+    for arrays and tiles of other shapes.
     """
-    if shape.direction is Direction.FORWARD:
-        return None
-    if shape.direction is Direction.BACKWARD_INPUT:
-        return packed_shape(shape.k, shape.co, shape.ci)
-    sizes = shape.k, shape.ci, shape.co
-    return parts_shape(image_parts(shape.size[0], *sizes)[0], *sizes)
 
+    def __init__(self, dev: Device, blocking: Blocking, shape: ConvShape):
+        self.dev, self.blocking, self.shape = dev, blocking, shape
+        self.work_shape = self._work_shape()
 
-def scratch_floats(_dev: Device, _blocking: Blocking, _shape: ConvShape) -> int:
-    """Floats of Device.scratch() that the kernels of a direction take."""
-    return 0
+    def _work_shape(self) -> tuple[int, ...] | None:
+        k, ci, co = self.shape.k, self.shape.ci, self.shape.co
+        if self.shape.direction is Direction.FORWARD:
+            return None
+        if self.shape.direction is Direction.BACKWARD_INPUT:
+            return packed_shape(k, co, ci)
+        return parts_shape(image_parts(self.shape)[0], k, ci, co)
 
+    def scratch_floats(self) -> int:
+        """Floats of Device.scratch() that the kernels take."""
+        return 0
 
-def lay_out(dev: Device, weights: Array, jobs: Sequence[Layout], laid_out: Array) -> None:
-    """Lay out weights in one launch: those of input gradients with the kernel mirrored and the
-    roles of input and output channels exchanged, (ceil(c/16), K, K, co, 16).
+    def laid_out(self, weight: Array) -> Array:
+        """A layer's weights (ceil(CO/16), K, K, CI, 16) as the kernels read them: a new array, or
+        itself where they read them as they are.
+        """
+        if self.work_shape is None:
+            return weight
+        array = self.dev.empty(self.work_shape)
+        self.lay_out(self.dev, weight.reshape(-1), [(self.shape, 0, 0)], array)
+        return array
 
-    weights, laid_out: (?,) float32.
-    """
-    rows, n = [], 0
-    for shape, start, target in jobs:
-        blocks, ci, taps = -(-shape.ci // VECTOR), sum(shape.sources), shape.k**2
-        taken = min(ci - shape.first, blocks * VECTOR)
-        rows.append((n, taps, shape.co, taken, shape.first, ci, start, target // VECTOR))
-        n += shape.co * taps * blocks
-    dev.program("layers/conv_backward_weights", LANES=lanes(dev)).launch(
-        "conv_flip_weights",
-        n,
-        n=n,
-        rows=len(rows),
-        table=dev.constant(rows),
-        weights=weights,
-        flipped=laid_out,
-    )
+    @staticmethod
+    def lay_out(dev: Device, weights: Array, jobs: Sequence[Layout], laid_out: Array) -> None:
+        """Lay out weights in one launch: those of input gradients with the kernel mirrored and the
+        roles of input and output channels exchanged, (ceil(c/16), K, K, co, 16).
 
+        weights, laid_out: (?,) float32.
+        """
+        rows, n = [], 0
+        for shape, start, target in jobs:
+            blocks, ci, taps = -(-shape.ci // VECTOR), sum(shape.sources), shape.k**2
+            taken = min(ci - shape.first, blocks * VECTOR)
+            rows.append((n, taps, shape.co, taken, shape.first, ci, start, target // VECTOR))
+            n += shape.co * taps * blocks
+        dev.program("layers/conv_backward_weights", LANES=lanes(dev)).launch(
+            "conv_flip_weights",
+            n,
+            n=n,
+            rows=len(rows),
+            table=dev.constant(rows),
+            weights=weights,
+            flipped=laid_out,
+        )
 
-def forward(
-    dev: Device,
-    blocking: Blocking,
-    sources: tuple[Array, ...],
-    weights: Array,
-    bias: Array,
-    out: Array,
-    *,
-    relu: bool,
-    tiles: Tiles | None = None,
-) -> None:
-    """out = convolution of the sources' concatenation + bias, then max(., 0) if relu.
+    def forward(
+        self, sources: Sources, weights: Array, bias: Array, out: Array, *, relu: bool, tiles: Tiles
+    ) -> None:
+        """out = convolution of the sources' concatenation + bias, then max(., 0) if relu.
 
-    sources: one or two of (H, W, C1), (H, W, C2); weights: as work_shape() says, else
-    (ceil(CO/16), K, K, C1 + C2, 16); bias: (ceil(CO/16) * 16,); out: (H, W, CO), all float32;
-    tiles: those of out to compute, None = all. Raises ValueError when shapes do not fit together.
-    """
-    height, width, co = out.shape
-    k, channels = weights.shape[1], [source.shape[2] for source in sources]
-    check_shape(channels, co, weights, packed_shape(k, sum(channels), co), bias)
-    tiles = checked_tiles(dev, tiles, height, width)
-    program, size, work_group = _program(dev, blocking, k, out.shape)
-    program.launch(
-        "conv_forward",
-        size,
-        local=work_group,
-        multiply_adds=tiles.number * SIDE**2 * k**2 * sum(channels) * co,
-        along=1,
-        height=height,
-        width=width,
-        c1=channels[0],
-        c2=sum(channels[1:]),
-        co=co,
-        relu=relu,
-        x=sources[0],
-        x2=sources[-1],
-        weight=weights,
-        bias=bias,
-        out=out,
-        tile_count=tiles.count,
-    )
-
-
-def backward_input(
-    dev: Device,
-    blocking: Blocking,
-    weights: Array,
-    grad_out: Array,
-    grad_x: Array,
-    *,
-    mask: Array | None,
-    tiles: Tiles | None = None,
-) -> None:
-    """grad_x = gradient of a convolution's input, 0 where mask <= 0.
-
-    weights: as work_shape() says; grad_out: (H, W, CO), dL/dout before the ReLU; grad_x: (H, W, C);
-    mask: (H, W, C), the input where it is a ReLU's output, so that grad_x is the gradient of the
-    ReLU's input, or None; tiles: those of grad_x to compute, None = all. Raises ValueError when
-    shapes do not fit together.
-    """
-    height, width, c = grad_x.shape
-    k, co = weights.shape[1], grad_out.shape[2]
-    check_shape([c], co, weights, packed_shape(k, co, c))
-    tiles = checked_tiles(dev, tiles, height, width)
-    program, size, work_group = _program(dev, blocking, k, grad_x.shape)
-    program.launch(
-        "conv_backward_input",
-        size,
-        local=work_group,
-        multiply_adds=tiles.number * SIDE**2 * k**2 * co * c,
-        along=1,
-        height=height,
-        width=width,
-        c=c,
-        co=co,
-        masked=mask is not None,
-        x=grad_x if mask is None else mask,
-        flipped=weights,
-        grad_out=grad_out,
-        grad_x=grad_x,
-        tile_count=tiles.count,
-    )
-
-
-def backward_weights(
-    dev: Device,
-    blocking: Blocking,
-    sources: tuple[Array, ...],
-    grad_out: Array,
-    partial: Array,
-    *,
-    tiles: Tiles | None = None,
-) -> int:
-    """Write the gradients of forward(sources, ...)'s weights and biases, given dL/dout (H, W, CO)
-    before the ReLU, as sums of the image's parts, which sum_parts() sums.
-
-    partial: as work_shape() says. tiles: those of grad_out to sum, each as often as it counts, None
-    = all, once. The order of the sums depends on the shapes alone. Returns how many parts. Raises
-    ValueError when shapes do not fit together.
-    """
-    height, width, co = grad_out.shape
-    channels = [source.shape[2] for source in sources]
-    ci = sum(channels)
-    k = math.isqrt((partial.shape[2] - 1) // ci)
-    parts, rows = image_parts(height, k, ci, co)
-    check_shape(channels, co, partial, parts_shape(parts, k, ci, co))
-    tiles = checked_tiles(dev, tiles, height, width)
-    first = 0
-    for source, c in zip(sources, channels, strict=True):
-        program, group = _weights_program(dev, blocking, k, c)
+        sources: one or two of (H, W, C1), (H, W, C2); weights: of lay_out(), else (ceil(CO/16), K,
+        K, C1 + C2, 16); bias: (ceil(CO/16) * 16,); out: (H, W, CO), all float32; tiles: those of
+        out to compute.
+        """
+        self._check(weights, tiles, bias)
+        (height, width), (c1, *others) = self.shape.size, self.shape.sources
+        program, size, work_group = self._program(self.shape.co)
         program.launch(
-            "conv_backward_weights",
-            (c // group * k, -(-co // VECTOR), parts),
-            local=blocking.work_group,
-            multiply_adds=height * width * k**2 * c * co,
-            along=2,
+            "conv_forward",
+            size,
+            local=work_group,
+            multiply_adds=self._multiply_adds(tiles),
+            along=1,
             height=height,
             width=width,
-            c=c,
-            co=co,
-            first=first,
-            ci=ci,
-            rows=rows,
-            x=source,
-            grad_out=grad_out,
+            c1=c1,
+            c2=sum(others),
+            co=self.shape.co,
+            relu=relu,
+            x=sources[0],
+            x2=sources[-1],
+            weight=weights,
+            bias=bias,
+            out=out,
             tile_count=tiles.count,
-            partial=partial,
         )
-        first += c
-    return parts
+
+    def backward_input(
+        self, weights: Array, grad_out: Array, grad_x: Array, *, mask: Array | None, tiles: Tiles
+    ) -> None:
+        """grad_x = gradient of the convolution's input, 0 where mask <= 0.
+
+        weights: of lay_out(); grad_out: (H, W, CO), dL/dout before the ReLU; grad_x: (H, W, C);
+        mask: (H, W, C), the input where it is a ReLU's output, so that grad_x is the gradient of
+        the ReLU's input, or None; tiles: those of grad_x to compute.
+        """
+        self._check(weights, tiles)
+        height, width = self.shape.size
+        program, size, work_group = self._program(self.shape.ci)
+        program.launch(
+            "conv_backward_input",
+            size,
+            local=work_group,
+            multiply_adds=self._multiply_adds(tiles),
+            along=1,
+            height=height,
+            width=width,
+            c=self.shape.ci,
+            co=self.shape.co,
+            masked=mask is not None,
+            x=grad_x if mask is None else mask,
+            flipped=weights,
+            grad_out=grad_out,
+            grad_x=grad_x,
+            tile_count=tiles.count,
+        )
+
+    def backward_weights(
+        self, sources: Sources, grad_out: Array, partial: Array, *, tiles: Tiles
+    ) -> int:
+        """Write the gradients of forward(sources, ...)'s weights and biases, given dL/dout (H, W,
+        CO) before the ReLU, as sums of the image's parts, which sum_parts() sums; returns how many.
+
+        partial: of work_shape. tiles: those of grad_out to sum, each as often as it counts. The
+        order of the sums depends on the shapes alone, with other variants on the number of tiles
+        too.
+        """
+        self._check(partial, tiles)
+        k, co, (height, width) = self.shape.k, self.shape.co, self.shape.size
+        (parts, rows), first = image_parts(self.shape), 0
+        for source, c in zip(sources, self.shape.sources, strict=True):
+            # input channels of a work-item, whose sums, k for each, fit the registers
+            group = next(
+                n for n in (16, 8, 4, 2, 1) if n * k <= self.blocking.accumulators and c % n == 0
+            )
+            self.dev.program("layers/conv_backward_weights", KERNEL_SIZE=k, CI_GROUP=group).launch(
+                "conv_backward_weights",
+                (c // group * k, -(-co // VECTOR), parts),
+                local=self.blocking.work_group,
+                multiply_adds=height * width * k**2 * c * co,
+                along=2,
+                height=height,
+                width=width,
+                c=c,
+                co=co,
+                first=first,
+                ci=self.shape.ci,
+                rows=rows,
+                x=source,
+                grad_out=grad_out,
+                tile_count=tiles.count,
+                partial=partial,
+            )
+            first += c
+        return parts
+
+    def _check(self, work: Array, tiles: Tiles, bias: Array | None = None) -> None:
+        """Raise ValueError for weights or parts, tiles or a bias of another shape."""
+        ci, co = self.shape.ci, self.shape.co
+        expected = self.work_shape or packed_shape(self.shape.k, ci, co)
+        biases = -(-co // VECTOR) * VECTOR
+        if work.shape != expected or (bias is not None and bias.shape != (biases,)):
+            raise ValueError(
+                f"convolution of {ci} to {co} channels: weights {work.shape}, expected {expected},"
+                f" and {biases} biases"
+            )
+        if tiles.size != self.shape.size:
+            raise ValueError(f"tiles of {tiles.size} for a feature map of {self.shape.size}")
+
+    def _multiply_adds(self, tiles):
+        return tiles.number * SIDE**2 * self.shape.k**2 * self.shape.ci * self.shape.co
+
+    def _program(self, channels):
+        """(program, global size, work-group) for a result of so many channels; no work-item
+        computes groups of channels or a row in vain.
+        """
+        (height, width), blocks = self.shape.size, -(-channels // VECTOR)
+        pixels, groups, work_group = self.blocking.direct
+        if blocks % groups:
+            pixels, groups, work_group = self.blocking.direct_odd
+        pixels = next(p for p in (pixels, 8, 4, 1) if p <= width)
+        size = (-(-width // pixels), height, -(-blocks // groups))
+        defines = {"KERNEL_SIZE": self.shape.k, "PIXELS": pixels, "BLOCKS": groups}
+        return self.dev.program("layers/conv", **defines), size, work_group
 
 
-def image_parts(height: int, k: int, ci: int, co: int) -> tuple[int, int]:
-    """(parts, rows of each) into which the sum over an image `height` high is cut."""
-    limit = max(1, PARTIAL_FLOATS // math.prod(parts_shape(1, k, ci, co)))
-    rows = max(ROWS_PER_PART, -(-height // limit))
-    return -(-height // rows), rows
-
-
-def _program(dev, blocking, k, shape):
-    """(program, global size, work-group) for a result of shape (H, W, C); no work-item computes
-    groups of channels or a row in vain.
-    """
-    height, width, channels = shape
-    pixels, groups, work_group = blocking.direct
-    if -(-channels // VECTOR) % groups:
-        pixels, groups, work_group = blocking.direct_odd
-    pixels = next(p for p in (pixels, 8, 4, 1) if p <= width)
-    size = (-(-width // pixels), height, -(-channels // (VECTOR * groups)))
-    return dev.program("layers/conv", KERNEL_SIZE=k, PIXELS=pixels, BLOCKS=groups), size, work_group
-
-
-def _weights_program(dev, blocking, k, channels):
-    """(program, input channels of one work-item): a divisor of the channels whose sums, k for each
-    channel, fit the registers.
-    """
-    group = next(
-        n for n in (16, 8, 4, 2, 1) if n * k <= blocking.accumulators and channels % n == 0
-    )
-    return dev.program("layers/conv_backward_weights", KERNEL_SIZE=k, CI_GROUP=group), group
+def image_parts(shape: ConvShape) -> tuple[int, int]:
+    """(parts, rows of each) into which the sum over an image for the gradient of weights is cut."""
+    limit = max(1, PARTIAL_FLOATS // math.prod(parts_shape(1, shape.k, shape.ci, shape.co)))
+    rows = max(ROWS_PER_PART, -(-shape.size[0] // limit))
+    return -(-shape.size[0] // rows), rows

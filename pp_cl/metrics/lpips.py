@@ -13,7 +13,7 @@ from pyopencl.array import Array
 from pp_cl.device.device import Device, Program
 from pp_cl.device.launch import group_ranges, lanes, row_parts
 from pp_cl.errors import UserError
-from pp_cl.layers.choice import VARIANTS, blocking_of, choose, laid_out
+from pp_cl.layers.choice import blocking_of, choose
 from pp_cl.layers.conv_direct import ConvShape, Direction, pack_weights
 from pp_cl.layers.simple import maxpool2_forward
 from pp_cl.layers.tiles import all_tiles
@@ -77,7 +77,9 @@ class Lpips:
             self._weights[layer.name] = dev.upload(pack_weights(weights[f"kernel{i}"]))
             self._biases[layer.name] = dev.upload(weights[f"bias{i}"])
         self._size = None
-        self._prepared: dict[str, tuple] = {}  # {layer: (module, weights as it reads them, tiles)}
+        self._prepared: dict[
+            str, tuple
+        ] = {}  # {layer: (convolution, weights as it reads them, tiles)}
 
     def distance(self, a: np.ndarray, b: np.ndarray) -> float:
         """LPIPS of two (H, W, 3) images in [0, 1].
@@ -159,20 +161,11 @@ class Lpips:
         for layer in self.layers:
             of_block = size_of(size, layer.block)
             shape = ConvShape(Direction.FORWARD, 3, (layer.ci,), layer.co, of_block)
-            module = VARIANTS[choose(self.dev, shape)]
-            weights = laid_out(self.dev, module, self._weights[layer.name], shape)
-            self._prepared[layer.name] = module, weights, tiles[layer.block]
+            conv = choose(self.dev, shape)(self.dev, self.blocking, shape)
+            weights = conv.laid_out(self._weights[layer.name])
+            self._prepared[layer.name] = conv, weights, tiles[layer.block]
         self._size = size
 
     def _convolve(self, layer, x, out):
-        module, weights, tiles = self._prepared[layer.name]
-        module.forward(
-            self.dev,
-            self.blocking,
-            (x,),
-            weights,
-            self._biases[layer.name],
-            out,
-            relu=True,
-            tiles=tiles,
-        )
+        conv, weights, tiles = self._prepared[layer.name]
+        conv.forward((x,), weights, self._biases[layer.name], out, relu=True, tiles=tiles)

@@ -9,14 +9,13 @@ upsampling weights of a pixel add up to 1, so they commute, bias included, and i
 """
 
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any, Literal
 
 import numpy as np
 
 from pp_cl.device.buffers import Table
-from pp_cl.layers.conv_direct import ConvShape, Direction, packed_shape
+from pp_cl.layers.conv_direct import packed_shape
 from pp_cl.layers.tiles import VECTOR
 
 
@@ -50,20 +49,12 @@ class Layer:
         """(CO, CI, K, K) of a convolution's weights."""
         return self.channels, sum(self.sources), self.kernel_size, self.kernel_size
 
-    def shape(self, direction: Direction, source: int | None, size: tuple[int, int]) -> ConvShape:
-        """A convolution in one direction, in an image of `size` = (height, width)."""
-        here = size[0] >> self.level, size[1] >> self.level
-        return ConvShape(direction, self.kernel_size, self.sources, self.channels, here, source)
-
     def multiplications(self, height: int, width: int) -> int:
         """Multiplications of weights by values in a forward pass over an image of this size,
         counted as direct convolutions.
         """
         weights = self.kernel_size**2 * sum(self.sources) * self.channels
         return weights * (height >> self.level) * (width >> self.level)
-
-
-BLOCKS = ("double", "single", "gated")
 
 
 def _conv(name, inputs, level, channels, sources, kernel_size=3, relu=True):
@@ -86,12 +77,9 @@ def unet_layers(
     channels_in: int = 16,
     channels_out: int = 3,
     blocks: str = "double",
-    *,
-    channels: Sequence[int] = (),
 ) -> list[Layer]:
     """The layers in the order of the forward pass. widths: channels of the three levels; blocks:
-    what a level computes, one of BLOCKS. channels: others, of each convolution but the last.
-    Raises ValueError for another number of them.
+    what a level computes, one of settings.BLOCKS.
     """
     w0, w1, w2 = widths
     enc0 = _block(blocks, "enc0", ("x",), 0, w0, (channels_in,))
@@ -100,7 +88,7 @@ def unet_layers(
     skip0, skip1 = enc0[-1].name, enc1[-1].name
     dec1 = _block(blocks, "dec1", ("wide1", skip1), 1, w1, (w1, w1))
     dec0 = _block(blocks, "dec0", ("wide0", skip0), 0, w0, (w0, w0))
-    layers = [
+    return [
         *enc0,
         Layer("pool", "pool0", (skip0,), 1, w0),
         *enc1,
@@ -114,39 +102,11 @@ def unet_layers(
         *dec0,
         _conv("out", (dec0[-1].name,), 0, channels_out, (w0,), kernel_size=1, relu=False),
     ]
-    return _of_channels(layers, channels_in, [*channels, channels_out]) if channels else layers
-
-
-def _of_channels(layers, channels_in, channels):
-    """The same layers with other numbers of channels, those of each convolution."""
-    if len(channels) != len(convolutions(layers)):
-        raise ValueError(f"{len(channels)} numbers of channels, not {len(convolutions(layers))}")
-    found, numbers, changed = {"x": channels_in}, iter(channels), []
-    for layer in layers:
-        sources = tuple(found[name] for name in layer.inputs)
-        if layer.kind == "conv":
-            layer = replace(layer, channels=next(numbers), sources=sources)
-        else:
-            layer = replace(layer, channels=sources[0] // (2 if layer.kind == "gate" else 1))
-        found[layer.name] = layer.channels
-        changed.append(layer)
-    return changed
 
 
 def convolutions(layers: list[Layer]) -> list[Layer]:
     """The layers that have parameters."""
     return [layer for layer in layers if layer.kind == "conv"]
-
-
-def computations(layer: Layer, training: bool) -> list[tuple[Direction, int | None]]:
-    """(direction, input or None) of all that is computed for a convolution: forward, and for
-    training the gradients of its weights and of each input.
-    """
-    found: list[tuple[Direction, int | None]] = [(Direction.FORWARD, None)]
-    if training:
-        found.append((Direction.BACKWARD_WEIGHTS, None))
-        found += [(Direction.BACKWARD_INPUT, i) for i in range(len(layer.sources))]
-    return found
 
 
 def parameter_table(layers: list[Layer]) -> Table:

@@ -3,20 +3,20 @@ launches, made once for images of one size.
 """
 
 import math
+import weakref
 from collections import defaultdict
-from collections.abc import Callable, Sequence
-from functools import partial
-from types import ModuleType
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 from pyopencl.array import Array
 
-from pp_cl.device.buffers import PackedArrays, Row, Table, packed_arrays, packed_bytes
+from pp_cl.device.buffers import PackedArrays, Table, packed_arrays, packed_bytes
 from pp_cl.device.device import Device
-from pp_cl.layers.choice import AUTO, VARIANTS, blocking_of, choose
+from pp_cl.layers.choice import AUTO, blocking_of, choose
 from pp_cl.layers.conv_direct import (
     ConvShape,
+    DirectConv,
     Direction,
     Layout,
     Sums,
@@ -39,7 +39,6 @@ from pp_cl.layers.simple import (
 from pp_cl.layers.tiles import all_tiles_buffers
 from pp_cl.network.layers import (
     array_shapes,
-    computations,
     convolutions,
     gradient_of,
     levels_of,
@@ -58,8 +57,9 @@ PARAMETERS = "parameters", "gradients of parameters"  # in the memory plan
 MULTIPLE = 4  # pixels: two poolings halve the height and the width
 
 Size = tuple[int, int]  # (height, width)
-Work = tuple[str, Direction, int | None]  # a layer, and of what its convolution computes
-Launch = Callable[[Any], None]  # of an AllTiles or TilePlan, which says what tiles to compute
+# What is computed for a convolution: its layer, a direction, the input whose gradient it is.
+Work = tuple[str, Direction, int | None]
+Launch = tuple[Any, ...]  # a method of Pass, and its arguments before the tiles
 
 
 class Pass:
@@ -72,7 +72,9 @@ class Pass:
     """
 
     def __init__(self, net: "UNet", training: bool):
-        self.net, self.training = net, training
+        # weakly: in a circle the buffers would live until the garbage collector runs
+        self.net: UNet = weakref.proxy(net)
+        self.training = training
         self.size: Size = (0, 0)
         self.arrays: dict[str, Array] = {}
         self.forward: list[Launch] = []
@@ -80,8 +82,8 @@ class Pass:
         self.all_tiles: Any = None
         self.is_laid_out = False  # the weights, for the kernels
         self._buffers: list[Any] = []
-        self._work: Any = None  # all of what work_table() says, in one array
-        self._jobs: dict[Callable, list[Layout]] = {}  # {lay_out() of a module: what it lays out}
+        self._work: Any = None  # all of _work_table(), in one array
+        self._jobs: dict[Callable, list[Layout]] = {}  # {lay_out() of a variant: what it lays out}
         self._sums: list[Sums] = []
         self._table = net.dev.empty((len(convolutions(net.layers)), 8), np.int32)
 
@@ -95,16 +97,24 @@ class Pass:
         convs, self.all_tiles = self._place_work(size), AllTiles(net.dev, size, net.layers)
         for layer in net.layers:
             conv = convs.get((layer.name, Direction.FORWARD, None))
-            self.forward.append(partial(self._compute, layer, conv))
+            self.forward += [(Pass._compute, layer, conv), (Pass._copy, layer.name)]
         for layer in reversed(net.layers) if self.training else ():
-            self.backward.append(partial(self._copy, gradient_of(layer.name)))
+            self.backward.append((Pass._copy, gradient_of(layer.name)))
             if layer.kind == "conv":
                 conv = convs[layer.name, Direction.BACKWARD_WEIGHTS, None]
-                self.backward.append(partial(self._compute_gradient_of_weights, layer, conv))
+                self.backward.append((Pass._compute_gradient_of_weights, layer, conv))
             for i in range(len(layer.inputs)):
                 conv = convs.get((layer.name, Direction.BACKWARD_INPUT, i))
-                self.backward.append(partial(self._compute_gradient, layer, i, conv))
+                self.backward.append((Pass._compute_gradient, layer, i, conv))
+        self.backward.append((Pass._copy, gradient_of("x")))
         self.size = size
+
+    def run(self, launches: list[Launch], tiles: Any) -> None:
+        """Launch `forward` or `backward`. tiles: an AllTiles or TilePlan, which says what tiles of
+        each feature map to compute.
+        """
+        for launch, *given in launches:
+            launch(self, *given, tiles)
 
     def _place_feature_maps(self, size):
         shapes = array_shapes(self.net.layers, size)
@@ -120,20 +130,20 @@ class Pass:
                 self.arrays[name] = self._buffers[i][:floats].reshape(shapes[name])
 
     def _place_work(self, size):
-        """{Work: (module, array)} of the convolutions: the weights as the kernels read them, or the
-        parts of the gradients.
+        """{Work: (its convolution, array)}: the weights as the kernels read them, or the parts of
+        the gradients.
         """
-        shapes, self._work, self._jobs = self.net.work(size, self.training), None, defaultdict(list)
-        rows = work_table(shapes)
+        convs, self._work, self._jobs = self.net.work(size, self.training), None, defaultdict(list)
+        rows = _work_table(convs)
         whole, arrays = packed_arrays(self.net.dev, [*rows.values()])
         self._work, work = whole.view(np.float32), dict(zip(rows, arrays, strict=True))
         found = {}
-        for key, (module, shape) in shapes.items():
+        for key, conv in convs.items():
             weight = self.net.parameters[f"{key[0]}.weight"]
-            found[key] = module, work.get(key, weight)
-            if key in work and shape.direction is not Direction.BACKWARD_WEIGHTS:
+            found[key] = conv, work.get(key, weight)
+            if key in work and conv.shape.direction is not Direction.BACKWARD_WEIGHTS:
                 places = _first_float(weight), _first_float(work[key])
-                self._jobs[module.lay_out].append((shape, *places))
+                self._jobs[conv.lay_out].append((conv.shape, *places))
         return found
 
     def lay_out(self) -> None:
@@ -154,8 +164,8 @@ class Pass:
 
     # ---- launches
 
-    def _compute(self, layer, conv, tiles):
-        """A layer's output. conv: (module, weights) of a convolution."""
+    def _compute(self, layer, planned, tiles):
+        """A layer's output. planned: (its convolution, weights) of one."""
         net, arrays, of_layer = self.net, self.arrays, tiles.tiles(layer.name)
         sources, out = tuple(arrays[name] for name in layer.inputs), arrays[layer.name]
         if layer.kind == "gate":
@@ -165,14 +175,13 @@ class Pass:
         elif layer.kind == "upsample":
             upsample2_forward(net.dev, sources[0], out, tiles=of_layer)
         else:
-            module, weights = conv
-            given = sources, weights, net.parameters[f"{layer.name}.bias"], out
-            module.forward(net.dev, net.blocking, *given, relu=layer.relu, tiles=of_layer)
-        self._copy(layer.name, tiles)
+            conv, weights = planned
+            bias = net.parameters[f"{layer.name}.bias"]
+            conv.forward(sources, weights, bias, out, relu=layer.relu, tiles=of_layer)
 
-    def _compute_gradient(self, layer, source, conv, tiles):
-        """The gradient of a layer's input of number `source`. conv: (module, weights) of a
-        convolution.
+    def _compute_gradient(self, layer, source, planned, tiles):
+        """The gradient of a layer's input of number `source`. planned: (its convolution,
+        weights) of one.
         """
         net, name = self.net, layer.inputs[source]
         x, grad_x = self.arrays[name], self.arrays[gradient_of(name)]
@@ -186,17 +195,15 @@ class Pass:
         elif layer.kind == "upsample":
             upsample2_backward(net.dev, grad_out, grad_x, tiles=of_input)
         else:
-            module, weights = conv
-            given = weights, grad_out, grad_x
-            module.backward_input(net.dev, net.blocking, *given, mask=mask, tiles=of_input)
+            conv, weights = planned
+            conv.backward_input(weights, grad_out, grad_x, mask=mask, tiles=of_input)
 
-    def _compute_gradient_of_weights(self, layer, conv, tiles):
-        """The gradients of a convolution's weights and bias, in parts. conv: (module, parts)."""
+    def _compute_gradient_of_weights(self, layer, planned, tiles):
+        """The parts of the gradients of a convolution's weights and bias. planned: (it, parts)."""
         net, grad = self.net, gradient_of(layer.name)
-        module, parts = conv
+        conv, parts = planned
         sources = tuple(self.arrays[name] for name in layer.inputs)
-        given = sources, self.arrays[grad], parts
-        count = module.backward_weights(net.dev, net.blocking, *given, tiles=tiles.tiles(grad))
+        count = conv.backward_weights(sources, self.arrays[grad], parts, tiles=tiles.tiles(grad))
         gradients = (net.gradients[f"{layer.name}.{kind}"] for kind in ("weight", "bias"))
         self._sums.append((parts.shape, count, *map(_first_float, (parts, *gradients))))
 
@@ -205,12 +212,9 @@ class Pass:
         tiles.fill_copies(name, self.arrays[name])
 
 
-def work_table(shapes: dict[Work, tuple[ModuleType, ConvShape]]) -> dict[Work, Row]:
-    """{Work: (shape, dtype)} of the arrays that convolutions work with, beside the layers' own.
-    shapes: of UNet.work().
-    """
-    needed = {key: module.work_shape(shape) for key, (module, shape) in shapes.items()}
-    return {key: (shape, np.float32) for key, shape in needed.items() if shape}
+def _work_table(convs):
+    """{Work: (shape, dtype)} of the arrays that convolutions take beside a layer's own."""
+    return {key: (c.work_shape, np.float32) for key, c in convs.items() if c.work_shape}
 
 
 def _first_float(array):
@@ -221,33 +225,29 @@ def _first_float(array):
 class UNet:
     """The network, its parameters and gradients, and the buffers it works in.
 
-    widths: channels of the three levels. blocks: what a level computes, of layers.BLOCKS. channels:
-    as unet_layers() takes them. residual: adds output.SHARE of the first three features to the
+    widths: channels of the three levels. blocks: what a level computes, of settings.BLOCKS.
+    residual: adds output.SHARE of the first three features to the
     image. variant: of the convolutions, as choose() takes it; blocking: of their kernels, as
     shipped for the device. layers: in the order of the forward pass. parameters, gradients:
     {"enc0.a.weight": (ceil(CO/16), K, K, CI, 16), "enc0.a.bias": (ceil(CO/16) * 16,), ...} float32
     on the device; all_parameters, all_gradients: the 1-D array that they lie in, with zeros between
-    them. Weights and biases start uniform in +-1/sqrt(CI K K) (PyTorch's
-    default for Conv2d), output channels beyond CO at 0, with gradient 0.
+    them. Weights and biases start uniform in +-1/sqrt(CI K K) (PyTorch's default for Conv2d),
+    output channels beyond CO at 0, with gradient 0.
     """
 
     def __init__(
         self,
         dev: Device,
         widths: tuple[int, int, int] = (16, 32, 64),
-        channels_in: int = 16,
-        channels_out: int = 3,
         *,
         blocks: str = "double",
-        channels: Sequence[int] = (),
         residual: bool = False,
         seed: int = 0,
         variant: str = AUTO,
     ):
         self.dev = dev
         self._residual = residual
-        self.layers = unet_layers(widths, channels_in, channels_out, blocks, channels=channels)
-        self.channels_in = channels_in
+        self.layers = unet_layers(widths, blocks=blocks)
         self.variant, self.blocking = variant, blocking_of(dev)
         self.all_parameters, self.parameters = self._packed()
         self.all_gradients, self.gradients = self._packed()
@@ -271,7 +271,6 @@ class UNet:
             dev,
             settings.widths,
             blocks=settings.blocks,
-            channels=settings.channel_numbers,
             residual=settings.residual,
             seed=seed,
         )
@@ -322,7 +321,7 @@ class UNet:
         return plan
 
     def forward(self, x: Array, training: bool = True, plan: ForwardPlan | None = None) -> Array:
-        """(H, W, 3) image of the features x (H, W, channels_in); H and W are multiples of 4.
+        """(H, W, 3) image of the features x (H, W, 16); H and W are multiples of 4.
 
         The result is in a buffer of the network: the next call overwrites it. training: keep what
         backward needs. plan: of plan_tiles(), None = compute all tiles. Raises ValueError for other
@@ -331,32 +330,30 @@ class UNet:
         if training and self._is_frozen:
             raise RuntimeError("UNet.freeze() was called: the network can no longer be trained")
         height, width, channels = x.shape
-        if height % MULTIPLE or width % MULTIPLE or channels != self.channels_in:
-            raise ValueError(
-                f"the network takes (4n, 4m, {self.channels_in}) features, not {x.shape}"
-            )
+        taken = sum(self.layers[0].sources)
+        if height % MULTIPLE or width % MULTIPLE or channels != taken:
+            raise ValueError(f"the network takes (4n, 4m, {taken}) features, not {x.shape}")
         if training not in self._passes:
             self._passes[training] = Pass(self, training)
         if training:
             self._trained = None  # its arrays are overwritten
-        run = self._passes[training]
-        if run.size != (height, width):
-            run.plan((height, width))
-        if not (self._is_frozen and run.is_laid_out):
-            run.lay_out()
-        run.arrays["x"], tiles = x, plan or run.all_tiles
-        for launch in run.forward:
-            launch(tiles)
-        out = run.arrays[self.layers[-1].name]
+        planned = self._passes[training]
+        if planned.size != (height, width):
+            planned.plan((height, width))
+        if not (self._is_frozen and planned.is_laid_out):
+            planned.lay_out()
+        planned.arrays["x"], tiles = x, plan or planned.all_tiles
+        planned.run(planned.forward, tiles)
+        out = planned.arrays[self.layers[-1].name]
         output_forward(self.dev, out, x if self._residual else None)
         if training:
             self._trained = tiles
         else:
-            del run.arrays["x"]  # so that the caller can free it
+            del planned.arrays["x"]  # so that the caller can free it
         return out
 
     def backward(self, grad_y: Array) -> Array:
-        """(H, W, channels_in) gradient of x in the last forward(x, training=True), given dL/dy (H,
+        """(H, W, 16) gradient of x in the last forward(x, training=True), given dL/dy (H,
         W, 3).
 
         Overwrites the gradients of all parameters; parameters and x must be as they were in
@@ -365,17 +362,15 @@ class UNet:
         """
         if self._trained is None:
             raise RuntimeError("UNet.backward needs a forward(training=True) before it")
-        run, tiles, self._trained = self._passes[True], self._trained, None
-        output_backward(self.dev, grad_y, run.arrays[gradient_of(self.layers[-1].name)])
-        tiles = tiles.backward(run.arrays, self._tile_lists["backward"])
-        for launch in run.backward:
-            launch(tiles)
-        grad_x = run.arrays[gradient_of("x")]
-        tiles.fill_copies(gradient_of("x"), grad_x)
+        planned, tiles, self._trained = self._passes[True], self._trained, None
+        output_backward(self.dev, grad_y, planned.arrays[gradient_of(self.layers[-1].name)])
+        tiles = tiles.backward(planned.arrays, self._tile_lists["backward"])
+        planned.run(planned.backward, tiles)
+        grad_x = planned.arrays[gradient_of("x")]
         if self._residual:
             residual_backward(self.dev, grad_y, grad_x)
-        run.sum_parts()
-        del run.arrays["x"]
+        planned.sum_parts()
+        del planned.arrays["x"]
         return grad_x
 
     def output(self, name: str) -> Array:
@@ -384,14 +379,22 @@ class UNet:
         """
         return self._passes[True].arrays[name]
 
-    def work(self, size: Size, training: bool) -> dict[Work, tuple[ModuleType, ConvShape]]:
-        """(the module that computes it, its shape) of all that is computed for the convolutions."""
+    def work(self, size: Size, training: bool) -> dict[Work, DirectConv]:
+        """All that is computed for convolutions: their outputs, and for training the gradients of
+        the weights and of each input.
+        """
         found = {}
         for layer in convolutions(self.layers):
-            for direction, source in computations(layer, training):
-                shape = layer.shape(direction, source, size)
-                module = VARIANTS[choose(self.dev, shape, self.variant)]
-                found[layer.name, direction, source] = module, shape
+            ways: list[tuple[Direction, int | None]] = [(Direction.FORWARD, None)]
+            if training:
+                ways.append((Direction.BACKWARD_WEIGHTS, None))
+                ways += [(Direction.BACKWARD_INPUT, i) for i in range(len(layer.sources))]
+            for direction, source in ways:
+                here = size[0] >> layer.level, size[1] >> layer.level
+                of_layer = layer.kernel_size, layer.sources, layer.channels
+                shape = ConvShape(direction, *of_layer, here, source)
+                conv = choose(self.dev, shape, self.variant)(self.dev, self.blocking, shape)
+                found[layer.name, direction, source] = conv
         return found
 
     def memory_plan(self, height: int, width: int, training: bool) -> Table:
@@ -405,9 +408,9 @@ class UNet:
         table: Table = {" = ".join(b.names): ((b.floats,), np.float32) for b in shared}
         table |= dict.fromkeys(PARAMETERS, (self.all_parameters.shape, np.float32))
         work = self.work(size, training)
-        scratch = [m.scratch_floats(self.dev, self.blocking, shape) for m, shape in work.values()]
-        table["scratch of convolutions"] = (max(scratch),), np.float32
-        octets = packed_bytes(self.dev, [*work_table(work).values()])
+        scratch = max(conv.scratch_floats() for conv in work.values())
+        table["scratch of convolutions"] = (scratch,), np.float32
+        octets = packed_bytes(self.dev, [*_work_table(work).values()])
         table["weights as kernels read them"] = (octets,), np.uint8
         table["sums of gradients"] = (len(convolutions(self.layers)), 8), np.int32
         for level in set(levels_of(self.layers).values()):

@@ -136,10 +136,10 @@ def within(actual: np.ndarray, expected: np.ndarray) -> Check:
 
 def _convolution(variant: str, dev: Device, rng: np.random.Generator) -> Iterator[Check]:
     """All directions; awkward sizes, two sources, a masked gradient."""
-    module, bound = VARIANTS[variant], BOUNDS[variant]
+    bound = BOUNDS[variant]
     layers = _layers() if can_run(variant, 1) else _layers()[: len(SHAPES)]
     for layer in layers:
-        results = layer.computed(dev, module, blocking_of(dev))
+        results = layer.computed(dev, VARIANTS[variant], blocking_of(dev))
         for actual, expected in zip(results, layer.expected, strict=True):
             of_weights = expected.ndim != 3
             yield relative(actual, expected, max(bound, WEIGHTS_BOUND) if of_weights else bound)

@@ -1,4 +1,4 @@
-"""The table of a sweep: means and spread over seeds, means over scenes; as text, Markdown, JSON."""
+"""The table of a sweep: means and spread over seeds, means over scenes; as Markdown and JSON."""
 
 import statistics
 from collections.abc import Sequence
@@ -61,23 +61,31 @@ def _over(rows, measure=statistics.fmean):
     }
 
 
-def cells(rows: Sequence[Row]) -> list[list[str]]:
-    """The table's lines, the head first: a line for each scene and setting, and for several scenes
-    a line for the mean of each setting.
+def markdown(rows: Sequence[Row]) -> str:
+    """The table: a line for each scene and setting, for several scenes one for the mean of each
+    setting, and below it what failed.
     """
     means = scene_means(rows)
     shown = [key for key in COLUMNS if any(key in row for row in means)]
-    varies = any(row["settings"] for row in means)
-    lines = [["scene", *["setting"] * varies, "runs", *(COLUMNS[key][0] for key in shown)]]
     entries = [(row["scene"], row["runs"], row["failed"], "", row) for row in means]
     if len({row["scene"] for row in means}) > 1:
         overall = overall_means(means)
         entries += [("mean", row["scenes"], row["missing"], " scenes", row) for row in overall]
+    lines = [["run", "number", *(COLUMNS[key][0] for key in shown)]]
     for name, good, bad, what, row in entries:
         count = f"{good} of {good + bad}{what}" if bad else f"{good}{what}"
-        values = [_cell(row, key) for key in shown]
-        lines.append([name, *[_setting_text(row)] * varies, count, *values])
-    return lines
+        cells = [_cell(row, key) for key in shown]
+        lines.append([f"{name} {_setting(row)}".strip().replace("|", "\\|"), count, *cells])
+    widths = [max(map(len, column)) for column in zip(*lines, strict=True)]
+    lines.insert(1, ["-" * widths[0], *("-" * (width - 1) + ":" for width in widths[1:])])
+    table = "".join(
+        f"| {line[0].ljust(widths[0])} | "
+        + " | ".join(map(str.rjust, line[1:], widths[1:]))
+        + " |\n"
+        for line in lines
+    )
+    failed = [f"- {run_text(row)}: {row['error']}\n" for row in rows if "error" in row]
+    return table + ("\nFailed:\n\n" + "".join(failed) if failed else "")
 
 
 def _cell(row, key):
@@ -86,42 +94,14 @@ def _cell(row, key):
     return " ± ".join(format(part[key], COLUMNS[key][1]) for part in parts if key in part) or "-"
 
 
-def _setting_text(row):
+def _setting(row):
     """What is varied in a row, as --vary takes it."""
     return " ".join(f"{key}={text}" for key, text in row["settings"].items())
 
 
-def text_table(rows: Sequence[Row]) -> str:
-    """The table in columns: words to the left, numbers to the right."""
-    lines = cells(rows)
-    words = lines[0].index("runs") + 1
-    widths = [max(map(len, column)) for column in zip(*lines, strict=True)]
-    return "\n".join(
-        "  ".join(
-            cell.ljust(width) if i < words else cell.rjust(width)
-            for i, (cell, width) in enumerate(zip(line, widths, strict=True))
-        ).rstrip()
-        for line in lines
-    )
-
-
-def markdown(rows: Sequence[Row]) -> str:
-    """The table as Markdown, and below it what failed."""
-    head, *lines = cells(rows)
-    words = head.index("runs") + 1
-    rule = ["---" if i < words else "---:" for i in range(len(head))]
-    table = "".join(f"| {' | '.join(map(_escaped, line))} |\n" for line in [head, rule, *lines])
-    failed = [f"- {_escaped(run_text(r))}: {_escaped(r['error'])}\n" for r in rows if "error" in r]
-    return table + ("\nFailed:\n\n" + "".join(failed) if failed else "")
-
-
-def _escaped(text):
-    return text.replace("|", "\\|")
-
-
 def run_text(row: Row) -> str:
     """The run of a row: scene, setting and seed."""
-    return " ".join(filter(None, [row["scene"], _setting_text(row), f"seed {row['seed']}"]))
+    return " ".join(filter(None, [row["scene"], _setting(row), f"seed {row['seed']}"]))
 
 
 def values_text(row: Row) -> str:

@@ -137,7 +137,7 @@ def stored_forms(
     """
     degree, colours = config.points.sh_degree, np.float16 if half else np.float32
     settings = config.network
-    layers = unet_layers(settings.widths, blocks=settings.blocks, channels=settings.channel_numbers)
+    layers = unet_layers(settings.widths, blocks=settings.blocks)
     network = parameter_table(layers)
     table: dict[str, Any] = {"points.ids": ((n,), np.uint32), "points.opacity": ((n,), np.float32)}
     table["points.offset"] = (n, 4), np.float32

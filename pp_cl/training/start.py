@@ -55,7 +55,7 @@ def begin_network(net: UNet, config: Config) -> None:
 
 def _unlike(ours, theirs):
     """[(key, our value, their value)] of the settings by which two networks differ in shape."""
-    pairs = [(n, getattr(ours, n), getattr(theirs, n)) for n in ("widths", "blocks", "channels")]
+    pairs = [(n, getattr(ours, n), getattr(theirs, n)) for n in ("widths", "blocks")]
     return [(f"network.{n}", text_of(a), text_of(b)) for n, a, b in pairs if a != b]
 
 

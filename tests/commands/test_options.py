@@ -64,7 +64,6 @@ def test_other_output_leaves_printed_json_alone(tmp_path, capsys, monkeypatch):
     "words",
     [
         ("compare", "a", "b", "--json"),
-        ("eval", "a", "--chart"),
         ("eval", "a", "--scene"),
         ("info", "a", "--device"),
         ("export", "a", "--format", "ply", "--out"),

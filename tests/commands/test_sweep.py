@@ -57,7 +57,7 @@ def test_a_dry_run_says_what_would_be_done(tmp_path, capsys, nothing_starts):
         "demo seed 1: to do",
         "demo seed 2: finished: PSNR 20.00, SSIM 0.5000, points 10, seconds 2.0",
     ]
-    assert lines[2].startswith("demo seed 3: to go on: ")
+    assert lines[2] == "demo seed 3: to go on"
     assert lines[3].startswith("demo seed 4: will fail: ") and "points.count" in lines[3]
     assert lines[4] == "4 runs, 1 of them finished already; nothing was started"
     assert {path: path.stat().st_mtime_ns for path in tmp_path.rglob("*")} == before
@@ -68,7 +68,7 @@ def test_a_finished_sweep_needs_no_dask(tmp_path, capsys, nothing_starts):
     for job, psnr in zip(jobs_of(["demo"], out, [1, 2]), (20.0, 23.0), strict=True):
         pretend(job, psnr)
     assert main(words_of(["demo"], out, "--seeds", "1,2")) == 0
-    assert "demo   2     21.50" in capsys.readouterr().out
+    assert "| demo |      2 | 21.50" in capsys.readouterr().out
     stored = json.loads((out / "sweep.json").read_text())
     assert [row["folder"] for row in stored["runs"]] == ["demo/seed-1", "demo/seed-2"]
 
@@ -176,7 +176,7 @@ def test_a_scheduler_started_by_hand(scenes, scheduler, tmp_path, capsys):
     bad, good = json.loads((out / "sweep.json").read_text())["runs"]
     assert "transforms_train.json" in bad["error"] and "psnr" not in bad
     assert 5 < good["psnr"] < 40
-    assert "broken  0 of 1" in told.out and "mean    1 of 2 scenes" in told.out
+    assert "| broken |        0 of 1 |" in told.out and "1 of 2 scenes" in told.out
 
     (job,) = jobs_of(scenes[1:], out)
     long = {"train.iterations": 100_000}

@@ -1,17 +1,9 @@
-"""Reduced models: which points stay, what their coefficients become, how they are rendered."""
-
-from dataclasses import replace
+"""Reduced models: which points stay, what their coefficients become."""
 
 import numpy as np
 import pytest
 
-from pp_cl.compress.reduction import (
-    Reduction,
-    heaviest,
-    measured_psnr,
-    nbytes,
-    point_weights,
-)
+from pp_cl.compress.reduction import heaviest, measured_psnr, nbytes, point_weights
 from pp_cl.metrics.psnr_ssim import Metrics
 
 
@@ -37,38 +29,32 @@ def test_weights_are_the_most_over_the_views(original):
 
 
 def test_a_run_as_it_is_stays_as_it_is(original):
-    reduction = Reduction.of(original.run)
-    same = original.reduced(reduction)
-    assert reduction.keep == 1 and not reduction.half
+    same = original.reduced(1.0, half=False)
     assert same.config == original.run.config
     for name, array in original.run.model.arrays().items():
         assert np.array_equal(same.model.arrays()[name].get(), array.get())
 
 
-def test_fewer_points_of_16_bits_and_a_lower_degree(original):
-    reduction = replace(Reduction.of(original.run), keep=0.5, half=True, degree=1, early_stop=0.02)
-    arrays = original.reduced_arrays(reduction)
+def test_fewer_points_of_16_bits(original):
+    arrays = original.reduced_arrays(0.5, half=True)
     kept = heaviest(original.weights, 0.5)
-    n = len(original.weights)
-    assert len(kept) == round(n / 2) and "points.sh2" not in arrays
+    assert len(kept) == round(len(original.weights) / 2)
     assert np.array_equal(arrays["points.ids"], original.arrays["points.ids"][kept])
-    for degree in (0, 1):
+    for degree in (0, 1, 2):
         exact = original.arrays[f"points.sh{degree}"][kept]
         found = arrays[f"points.sh{degree}"]
         assert found.dtype == np.float16
         assert np.abs(found - exact).max() <= np.abs(exact).max() * 2**-11
     network = sum(a.nbytes for name, a in arrays.items() if name.startswith("net."))
-    run = original.reduced(reduction)
-    assert nbytes(run) == len(kept) * (4 + 16 + 4 + 4 * 16 * 2) + network
-    assert run.model.cloud.count == len(kept) and run.config.points.sh_degree == 1
-    assert run.renderer.settings.early_stop == 0.02 != original.run.config.raster.early_stop
-    camera = run.cameras("train")[0]
-    assert np.isfinite(run.render(camera).colour).all()
+    run = original.reduced(0.5, half=True)
+    assert nbytes(run) == len(kept) * (4 + 16 + 4 + 9 * 16 * 2) + network
+    assert run.model.cloud.count == len(kept)
+    assert np.isfinite(run.render(run.cameras("train")[0]).colour).all()
 
 
 def test_16_bits_hold_what_is_larger(original):
     original.arrays["points.sh0"][0, 0, :2] = [1e6, -1e6]
-    arrays = original.reduced_arrays(replace(Reduction.of(original.run), half=True))
+    arrays = original.reduced_arrays(1.0, half=True)
     assert arrays["points.sh0"][0, 0, :2].tolist() == [65504, -65504]
 
 

@@ -6,8 +6,8 @@ import trimesh
 
 from pp_cl.errors import UserError
 from pp_cl.export import mesh as module
+from pp_cl.export.gltf import gltf_colours
 from pp_cl.export.mesh import coloured_mesh, surface, write_mesh
-from pp_cl.export.points import gltf_colours
 
 RADIUS = 0.8  # of the ball
 

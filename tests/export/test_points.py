@@ -6,8 +6,9 @@ import pytest
 import trimesh
 
 from pp_cl.errors import UserError
+from pp_cl.export.gltf import gltf_colours, write_glb
 from pp_cl.export.observe import observe
-from pp_cl.export.points import coloured_points, gltf_colours, write_glb, write_ply
+from pp_cl.export.points import coloured_points, write_ply
 from pp_cl.files.image import to_8bit
 
 
@@ -84,7 +85,8 @@ def test_the_ply_reads_back_by_trimesh(written):
 
 
 def test_the_glb_reads_back_by_trimesh(points, tmp_path):
-    write_glb(tmp_path / "a.glb", points)
+    colours = gltf_colours(points.colours)
+    write_glb(tmp_path / "a.glb", {"POSITION": points.positions, "COLOR_0": colours})
     (cloud,) = trimesh.load(tmp_path / "a.glb").geometry.values()
     assert isinstance(cloud, trimesh.PointCloud)
     assert np.array_equal(np.float32(cloud.vertices), points.positions)

@@ -6,7 +6,13 @@ from zipfile import BadZipFile
 
 import pytest
 
-from pp_cl.files.untrusted import MOST_REASON, opened_regular, read_regular, refusal
+from pp_cl.files.untrusted import (
+    MOST_REASON,
+    opened_regular,
+    read_json_text,
+    read_regular,
+    refusal,
+)
 
 
 def test_a_file_of_at_most_so_many_bytes(tmp_path):
@@ -18,6 +24,16 @@ def test_a_file_of_at_most_so_many_bytes(tmp_path):
         read_regular(file, 8)
     with opened_regular(file) as opened:
         assert opened.read(3) == b"\xef\xbb\xbf" and opened.seek(0) == 0
+
+
+def test_json_of_at_most_so_many_values(tmp_path, monkeypatch):
+    """Of transforms, paths of cameras and metrics: each value takes more memory than its text."""
+    monkeypatch.setattr("pp_cl.files.untrusted.MOST_VALUES", 6)
+    (tmp_path / "a.json").write_text("[{},[],[]]")
+    assert read_json_text(tmp_path / "a.json", 99) == "[{},[],[]]"
+    (tmp_path / "a.json").write_text("[{},[],[],[]]")
+    with pytest.raises(ValueError, match="more than 6 values"):
+        read_json_text(tmp_path / "a.json", 99)
 
 
 @pytest.mark.unix

@@ -8,7 +8,7 @@ from support.comparisons import relative_error
 
 import pp_cl.network.unet
 from pp_cl.layers.tiles import SIDE, grid_shape
-from pp_cl.network.layers import BLOCKS, convolutions, gradient_of, unet_layers
+from pp_cl.network.layers import convolutions, gradient_of, unet_layers
 from pp_cl.network.tile_plan import (
     LOSS_BORDER,
     LOSS_RADIUS,
@@ -19,6 +19,7 @@ from pp_cl.network.tile_plan import (
 )
 from pp_cl.network.unet import UNet
 from pp_cl.reference.network import network, network_gradients
+from pp_cl.settings import BLOCKS
 from pp_cl.training.loss import TAPS
 
 BACKGROUND = 1.0  # of a pixel without hits, cl/common.h

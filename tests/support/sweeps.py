@@ -15,9 +15,9 @@ SETS |= {"train.previews": 0, "scene.downscale": 2}
 GIVEN = [(key, str(value), "--set") for key, value in SETS.items()]
 
 
-def jobs_of(scenes, out, seeds=(0,), varied=(), **options):
+def jobs_of(scenes, out, seeds=(0,), varied=None, **options):
     """The planned runs of a sweep with the small settings."""
-    return plan([str(s) for s in scenes], out, seeds, varied, **{"given": GIVEN} | options)
+    return plan([str(s) for s in scenes], out, seeds, varied or {}, **{"given": GIVEN} | options)
 
 
 def words_of(scenes, out, *more, changes=None):
@@ -31,14 +31,14 @@ def pretend(job, psnr, ssim=0.5, *, points=10, seconds=2.0, step=None, finished=
     folder = RunFolder(job.folder)
     config = run_config(folder, job.scene, job.preset, job.given)
     folder.create(config.to_json())
-    folder.save(*contents(config, job.iterations if finished else job.iterations - 1, points))
+    folder.save(*contents(config, ITERATIONS if finished else ITERATIONS - 1, points))
     with folder.open_log(0) as log:
-        log.write({"step": job.iterations, "seconds": seconds, "finished": finished})
+        log.write({"step": ITERATIONS, "seconds": seconds, "finished": finished})
     folder.evaluation("test").mkdir()
     measured = {
         "mean": {"psnr": psnr, "ssim": ssim},
         "finished": finished,
-        "step": job.iterations if step is None else step,
+        "step": ITERATIONS - (not finished) if step is None else step,
         "points": {"final": points},
         "device": "a device",
     }

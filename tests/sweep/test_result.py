@@ -1,11 +1,11 @@
 """What a run's folder tells of it."""
 
 import pytest
-from support.sweeps import ITERATIONS, jobs_of, pretend
+from support.sweeps import jobs_of, pretend
 
 from pp_cl.errors import UserError
 from pp_cl.files.run_folder import RunFolder
-from pp_cl.sweep.result import finished_row, progress
+from pp_cl.sweep.result import finished_row
 
 
 @pytest.fixture
@@ -75,21 +75,3 @@ def test_other_settings_in_the_folder_are_refused(job, tmp_path):
     (other,) = jobs_of(["demo"], tmp_path / "out", [4], given=[("points.count", "9", "--set")])
     with pytest.raises(UserError, match="points.count is 1500 there, 9 asked for"):
         finished_row(other)
-
-
-def test_a_broken_checkpoint_is_refused(job):
-    pretend(job, 21.5)
-    RunFolder(job.folder).checkpoint.write_bytes(b"PK")
-    with pytest.raises(UserError, match=r"checkpoint\.npz"):
-        finished_row(job)
-
-
-def test_progress_by_the_log(job):
-    assert progress(job) == "beginning"
-    folder = RunFolder(job.folder)
-    folder.previews.mkdir(parents=True)
-    with folder.open_log(0) as log:
-        log.write({"step": 5, "seconds": 1.0, "psnr": 20.26})
-        assert progress(job) == f"step 5 of {ITERATIONS}, PSNR 20.3"
-        log.write({"step": ITERATIONS, "seconds": 2.0, "finished": True})
-    assert progress(job) == "evaluating"
